@@ -1,0 +1,92 @@
+// What the operator drivers (torch side) and the kernels (compiled once per tier) agree on: plain
+// argument structs and one table of function pointers a tier. No torch header, no STL.
+#pragma once
+
+#include <cstdint>
+
+namespace darswin {
+
+// Point (i, j) of image b stands at center[b] + radii[b, i] * (cos, sin)(azimuths[j]).
+template <typename T>
+struct PolarSampleArgs {
+  const T* image;  // (B, C, H, W), any strides; backward: contiguous, as grad_image is
+  int64_t channels, height, width;
+  int64_t image_stride[4];
+  const T* radii;  // (B or 1, num_radii) px
+  int64_t radii_stride, num_radii;
+  const T* cosines;  // (num_azimuths,)
+  const T* sines;    // (num_azimuths,)
+  int64_t num_azimuths;
+  const T* center;  // (B or 1, 2) px, x then y
+  int64_t center_stride;
+  int64_t patch_radii, patch_azimuths;  // S_r, S_phi
+  bool tokens;                          // layout: (B, R, A, S_r * S_phi * C), else (B, C, N_r, N_a)
+  double jitter;
+  uint64_t seed;
+
+  T* out;  // forward
+
+  const T* grad_out;    // backward; a null pointer below means "not wanted"
+  T* grad_image;        // (B, C, H, W), zero on entry
+  double* grad_radii;   // (B, num_radii), zero on entry; with it goes
+  double* grad_center;  // (B, 2), zero on entry
+};
+
+// Windows of a polar map; token (r, a) of the rolled map is token (r + shift_r, a + shift_a) of it.
+template <typename T>
+struct WindowAttentionArgs {
+  const T* qkv;   // (B, R, A, 3, heads, d)
+  const T* bias;  // (B or 1, heads, 2 M_r - 1, 2 M_a - 1)
+  int64_t bias_stride;
+  int64_t rings, sectors, heads, head_dim;
+  int64_t window_r, window_a, shift_r, shift_a;
+  bool periodic_r, periodic_a;
+  T scale;
+
+  T* out;  // forward: (B, R, A, heads, d)
+  T* lse;  // (B, R, A, heads): written forward, read backward
+
+  const T* grad_out;  // backward
+  T* grad_qkv;        // like qkv
+  double* grad_bias;  // (B, heads, 2 M_r - 1, 2 M_a - 1), zero on entry
+};
+
+// Kernels are serial over [begin, end) of their work items; the drivers own the threads.
+template <typename T>
+struct KernelTable {
+  // item: (image, radius index)
+  void (*polar_sample)(const PolarSampleArgs<T>&, int64_t begin, int64_t end);
+  // item: image
+  void (*polar_sample_backward)(const PolarSampleArgs<T>&, int64_t begin, int64_t end);
+  // elements of scratch that each thread needs in the two functions below
+  int64_t (*window_attention_scratch)(const WindowAttentionArgs<T>&);
+  // item: (image, window, head)
+  void (*window_attention)(const WindowAttentionArgs<T>&, int64_t begin, int64_t end, T* scratch);
+  // item: (image, head)
+  void (*window_attention_backward)(const WindowAttentionArgs<T>&, int64_t begin, int64_t end,
+                                    T* scratch);
+};
+
+struct Kernels {
+  const char* tier;
+  KernelTable<float> f32;
+  KernelTable<double> f64;
+
+  template <typename T>
+  const KernelTable<T>& table() const {
+    if constexpr (sizeof(T) == sizeof(float)) {
+      return f32;
+    } else {
+      return f64;
+    }
+  }
+};
+
+// The tier in use: the best one the CPU has, or what ATEN_CPU_CAPABILITY or set_tier asked for.
+const Kernels& kernels();
+
+const char* best_tier();              // what the CPU has
+bool set_tier(const char* tier);      // false where the CPU or the build lacks that tier
+bool tier_available(const char* tier);
+
+}  // namespace darswin

@@ -1,0 +1,195 @@
+// Polar bilinear sampling.
+//
+// A polar grid is separable: point (i, j) needs radius i and azimuth j, so two short vectors stand
+// for the whole (N_r, N_a, 2) mesh that grid_sample would read. Each point finds its four pixels and
+// their weights once (Corners) and then walks the channels. Jitter moves a point by a fraction of a
+// cell along both vectors, from a counter-based generator, so that backward finds the same point
+// again. A point outside the image, or at no number at all, has no corners: zeros forward, nothing
+// backward. Backward scatters into pixels that several points share, so one thread owns an image.
+#include "kernels.h"
+#include "math.h"
+#include "philox.h"
+
+namespace darswin::TIER {
+namespace {
+
+template <typename T>
+struct Point {
+  T x, y;            // px
+  T cos, sin;        // of its azimuth
+  T shift;           // radius = radii[i] + shift * (radii[above] - radii[below])
+  int64_t below, above;
+  bool moves;        // false where the radius was clamped at 0
+};
+
+template <typename T>
+Point<T> locate(const PolarSampleArgs<T>& args, int64_t b, int64_t i, int64_t j) {
+  const T* radii = args.radii + b * args.radii_stride;
+  const T* center = args.center + b * args.center_stride;
+  Point<T> p{0, 0, args.cosines[j], args.sines[j], 0, i, i, true};
+  T radius = radii[i];
+  if (args.jitter > 0) {
+    const PhiloxWords words = philox(args.seed, static_cast<uint64_t>(i * args.num_azimuths + j),
+                                     static_cast<uint64_t>(b));
+    const T jitter = static_cast<T>(args.jitter);
+    p.shift = centered_uniform<T>(words.word[0]) * jitter;
+    const int64_t last = args.num_radii - 1;
+    p.below = p.shift < 0 ? (i > 0 ? i - 1 : 0) : (i < last ? i : (last > 0 ? last - 1 : 0));
+    p.above = p.below < last ? p.below + 1 : last;
+    radius += p.shift * (radii[p.above] - radii[p.below]);
+    if (radius < 0) {
+      radius = 0;
+      p.moves = false;
+    }
+    const T turn = static_cast<T>(2 * 3.14159265358979323846 / args.num_azimuths);
+    const T angle = centered_uniform<T>(words.word[1]) * jitter * turn;
+    const T c = cosine(angle), s = sine(angle);
+    const T cos = p.cos * c - p.sin * s;
+    p.sin = p.sin * c + p.cos * s;
+    p.cos = cos;
+  }
+  p.x = center[0] + radius * p.cos;
+  p.y = center[1] + radius * p.sin;
+  return p;
+}
+
+// The four pixels around a point: those outside the image have inside = false and are never read.
+template <typename T>
+struct Corners {
+  int64_t offset[4];  // into one channel of the image: upper left, upper right, lower left, right
+  bool inside[4];
+  T weight[4];
+  T right, lower;  // fraction of the way to the right and to the lower pixel
+};
+
+// False where the point touches no pixel. Written so that NaN is false.
+template <typename T>
+bool find_corners(const PolarSampleArgs<T>& args, T x, T y, Corners<T>& c) {
+  if (!(x > -1 && x < static_cast<T>(args.width) && y > -1 && y < static_cast<T>(args.height))) {
+    return false;
+  }
+  const T left = floor_of(x), top = floor_of(y);
+  const int64_t x0 = static_cast<int64_t>(left), y0 = static_cast<int64_t>(top);
+  c.right = x - left;
+  c.lower = y - top;
+  const T wx[2] = {1 - c.right, c.right}, wy[2] = {1 - c.lower, c.lower};
+  for (int k = 0; k < 4; ++k) {
+    const int64_t column = x0 + (k & 1), row = y0 + (k >> 1);
+    c.inside[k] = column >= 0 && column < args.width && row >= 0 && row < args.height;
+    c.offset[k] = row * args.image_stride[2] + column * args.image_stride[3];
+    c.weight[k] = wx[k & 1] * wy[k >> 1];
+  }
+  return true;
+}
+
+// Where point (i, j) of image b lies in the output, and the step from a channel to the next.
+struct OutputPlace {
+  int64_t base, channel_stride;
+};
+
+template <typename T>
+OutputPlace output_place(const PolarSampleArgs<T>& args, int64_t b, int64_t i, int64_t j) {
+  if (!args.tokens) {
+    const int64_t plane = args.num_radii * args.num_azimuths;
+    return {b * args.channels * plane + i * args.num_azimuths + j, plane};
+  }
+  const int64_t rings = args.num_radii / args.patch_radii;
+  const int64_t sectors = args.num_azimuths / args.patch_azimuths;
+  const int64_t ring = i / args.patch_radii, sector = j / args.patch_azimuths;
+  const int64_t token = (b * rings + ring) * sectors + sector;
+  const int64_t sample = (i % args.patch_radii) * args.patch_azimuths + j % args.patch_azimuths;
+  return {(token * args.patch_radii * args.patch_azimuths + sample) * args.channels, 1};
+}
+
+template <typename T>
+void sample(const PolarSampleArgs<T>& args, int64_t begin, int64_t end) {
+  for (int64_t item = begin; item < end; ++item) {
+    const int64_t b = item / args.num_radii, i = item % args.num_radii;
+    const T* image = args.image + b * args.image_stride[0];
+    for (int64_t j = 0; j < args.num_azimuths; ++j) {
+      const OutputPlace place = output_place(args, b, i, j);
+      T* out = args.out + place.base;
+      const Point<T> p = locate(args, b, i, j);
+      Corners<T> c;
+      if (!find_corners(args, p.x, p.y, c)) {
+        for (int64_t k = 0; k < args.channels; ++k) out[k * place.channel_stride] = 0;
+        continue;
+      }
+      for (int64_t k = 0; k < args.channels; ++k) {
+        const T* channel = image + k * args.image_stride[1];
+        T value = 0;
+        for (int q = 0; q < 4; ++q) {
+          if (c.inside[q]) value += c.weight[q] * channel[c.offset[q]];
+        }
+        out[k * place.channel_stride] = value;
+      }
+    }
+  }
+}
+
+// Gradients of one point: into the pixels, and d(loss)/d(x, y).
+template <typename T>
+void scatter(const PolarSampleArgs<T>& args, int64_t b, const Corners<T>& c, const T* grad,
+             int64_t channel_stride, T* gx, T* gy) {
+  const T* image = args.image + b * args.image_stride[0];
+  const int64_t plane = args.height * args.width;
+  *gx = *gy = 0;
+  for (int64_t k = 0; k < args.channels; ++k) {
+    const T g = grad[k * channel_stride];
+    if (args.grad_image != nullptr) {
+      T* channel = args.grad_image + (b * args.channels + k) * plane;
+      for (int q = 0; q < 4; ++q) {
+        if (c.inside[q]) channel[c.offset[q]] += c.weight[q] * g;
+      }
+    }
+    if (args.grad_radii != nullptr) {
+      const T* channel = image + k * args.image_stride[1];
+      T pixel[4];
+      for (int q = 0; q < 4; ++q) pixel[q] = c.inside[q] ? channel[c.offset[q]] : T(0);
+      *gx += g * ((pixel[1] - pixel[0]) * (1 - c.lower) + (pixel[3] - pixel[2]) * c.lower);
+      *gy += g * ((pixel[2] - pixel[0]) * (1 - c.right) + (pixel[3] - pixel[1]) * c.right);
+    }
+  }
+}
+
+template <typename T>
+void sample_backward(const PolarSampleArgs<T>& args, int64_t begin, int64_t end) {
+  for (int64_t b = begin; b < end; ++b) {
+    for (int64_t i = 0; i < args.num_radii; ++i) {
+      for (int64_t j = 0; j < args.num_azimuths; ++j) {
+        const Point<T> p = locate(args, b, i, j);
+        Corners<T> c;
+        if (!find_corners(args, p.x, p.y, c)) continue;
+        const OutputPlace place = output_place(args, b, i, j);
+        T gx, gy;
+        scatter(args, b, c, args.grad_out + place.base, place.channel_stride, &gx, &gy);
+        if (args.grad_radii == nullptr) continue;
+        args.grad_center[b * 2] += gx;
+        args.grad_center[b * 2 + 1] += gy;
+        if (!p.moves) continue;
+        double* grad_radii = args.grad_radii + b * args.num_radii;
+        const double along = static_cast<double>(gx) * p.cos + static_cast<double>(gy) * p.sin;
+        grad_radii[i] += along;
+        grad_radii[p.above] += along * p.shift;
+        grad_radii[p.below] -= along * p.shift;
+      }
+    }
+  }
+}
+
+}  // namespace
+
+void polar_sample(const PolarSampleArgs<float>& args, int64_t begin, int64_t end) {
+  sample(args, begin, end);
+}
+void polar_sample(const PolarSampleArgs<double>& args, int64_t begin, int64_t end) {
+  sample(args, begin, end);
+}
+void polar_sample_backward(const PolarSampleArgs<float>& args, int64_t begin, int64_t end) {
+  sample_backward(args, begin, end);
+}
+void polar_sample_backward(const PolarSampleArgs<double>& args, int64_t begin, int64_t end) {
+  sample_backward(args, begin, end);
+}
+
+}  // namespace darswin::TIER

@@ -1,0 +1,260 @@
+// Windowed attention on a polar map.
+//
+// A window is never cut out of the map: token t of window (wr, wa) is found by index arithmetic that
+// includes the shift and the wrap around the border, and its q, k and v are packed into scratch that
+// fits L1. Keys are packed transposed, (d, n), so that one query against all keys is a sum of d
+// vectors of length n and needs no horizontal operation. Along an axis that is not periodic, tokens
+// that the shift brought together across the border carry different `side` marks and do not see
+// each other. Forward keeps the log-sum-exp of each row; backward finds the probabilities from it.
+// Every token lies in one window, so qkv gradients have one writer; the bias gradient of an (image,
+// head) is summed by one thread over all windows, in order.
+#include "kernels.h"
+#include "math.h"
+
+namespace darswin::TIER {
+namespace {
+
+template <typename T>
+struct Shape {
+  int64_t n, d;                 // tokens of a window, head dim
+  int64_t windows_r, windows_a;
+  int64_t table_a, table;       // width and size of one head's bias table
+
+  explicit Shape(const WindowAttentionArgs<T>& a)
+      : n(a.window_r * a.window_a),
+        d(a.head_dim),
+        windows_r(a.rings / a.window_r),
+        windows_a(a.sectors / a.window_a),
+        table_a(2 * a.window_a - 1),
+        table((2 * a.window_r - 1) * table_a) {}
+};
+
+// Scratch of one thread.
+template <typename T>
+struct Scratch {
+  T *q, *k, *v;     // (n, d)
+  T *kt, *vt;       // (d, n)
+  T *dk, *dv;       // (n, d): key and value gradients
+  T *row, *drow;    // (n,): one query's logits or probabilities, and their gradient
+  T* dq;            // (d,)
+  T* side;          // (n,): 0 to 3, see token_at
+
+  Scratch(T* base, int64_t n, int64_t d) {
+    T** pointers[] = {&q, &k, &v, &kt, &vt, &dk, &dv};
+    for (T** p : pointers) {
+      *p = base;
+      base += n * d;
+    }
+    row = base;
+    drow = row + n;
+    side = drow + n;
+    dq = side + n;
+  }
+
+  static int64_t size(int64_t n, int64_t d) { return 7 * n * d + 3 * n + d; }
+};
+
+// The map's token under token t of a window, as an index into (R, A), and its side of the borders.
+template <typename T>
+int64_t token_at(const WindowAttentionArgs<T>& a, int64_t wr, int64_t wa, int64_t t, int* side) {
+  int64_t r = wr * a.window_r + t / a.window_a + a.shift_r;
+  int64_t s = wa * a.window_a + t % a.window_a + a.shift_a;
+  *side = 0;
+  if (r >= a.rings) {
+    r -= a.rings;
+    if (!a.periodic_r) *side += 1;
+  }
+  if (s >= a.sectors) {
+    s -= a.sectors;
+    if (!a.periodic_a) *side += 2;
+  }
+  return r * a.sectors + s;
+}
+
+// Packs one of q, k, v (part 0, 1, 2) of a window: rows (n, d), and columns (d, n) where wanted.
+template <typename T>
+void pack(const WindowAttentionArgs<T>& a, const Shape<T>& shape, int64_t b, int64_t wr, int64_t wa,
+          int64_t head, int part, T* rows, T* columns) {
+  for (int64_t t = 0; t < shape.n; ++t) {
+    int side;
+    const int64_t token = b * a.rings * a.sectors + token_at(a, wr, wa, t, &side);
+    const T* from = a.qkv + ((token * 3 + part) * a.heads + head) * shape.d;
+    for (int64_t c = 0; c < shape.d; ++c) {
+      if (rows != nullptr) rows[t * shape.d + c] = from[c];
+      if (columns != nullptr) columns[c * shape.n + t] = from[c];
+    }
+  }
+}
+
+template <typename T>
+void pack_sides(const WindowAttentionArgs<T>& a, const Shape<T>& shape, int64_t wr, int64_t wa,
+                T* sides) {
+  for (int64_t t = 0; t < shape.n; ++t) {
+    int side;
+    token_at(a, wr, wa, t, &side);
+    sides[t] = static_cast<T>(side);
+  }
+}
+
+// row[k] = sum_c q[c] * columns[c, k]
+template <typename T>
+void row_times_columns(const T* q, const T* columns, const Shape<T>& shape, T* row) {
+  for (int64_t k = 0; k < shape.n; ++k) row[k] = 0;
+  for (int64_t c = 0; c < shape.d; ++c) {
+    const T* column = columns + c * shape.n;
+#pragma omp simd
+    for (int64_t k = 0; k < shape.n; ++k) row[k] += q[c] * column[k];
+  }
+}
+
+// Index of the bias of query t against key 0 of key ring `kr`; the next key's is one lower.
+template <typename T>
+int64_t bias_index(const WindowAttentionArgs<T>& a, const Shape<T>& shape, int64_t t, int64_t kr) {
+  const int64_t delta_r = t / a.window_a - kr + a.window_r - 1;
+  return delta_r * shape.table_a + t % a.window_a + a.window_a - 1;
+}
+
+// The logits of query t: scaled products, bias, and minus infinity across a border.
+template <typename T>
+void logits(const WindowAttentionArgs<T>& a, const Shape<T>& shape, const Scratch<T>& s,
+            const T* bias, int64_t t) {
+  row_times_columns(s.q + t * shape.d, s.kt, shape, s.row);
+  for (int64_t kr = 0; kr < a.window_r; ++kr) {
+    const T* biases = bias + bias_index(a, shape, t, kr);
+    T* row = s.row + kr * a.window_a;
+#pragma omp simd
+    for (int64_t ka = 0; ka < a.window_a; ++ka) row[ka] = row[ka] * a.scale + biases[-ka];
+  }
+  const T minus_infinity = static_cast<T>(-__builtin_inf());
+  const T side = s.side[t];
+  for (int64_t k = 0; k < shape.n; ++k) s.row[k] = s.side[k] == side ? s.row[k] : minus_infinity;
+}
+
+template <typename T>
+void attend(const WindowAttentionArgs<T>& a, int64_t begin, int64_t end, T* scratch) {
+  const Shape<T> shape(a);
+  const Scratch<T> s(scratch, shape.n, shape.d);
+  for (int64_t item = begin; item < end; ++item) {
+    const int64_t head = item % a.heads, window = item / a.heads;
+    const int64_t wa = window % shape.windows_a, wr = window / shape.windows_a % shape.windows_r;
+    const int64_t b = window / (shape.windows_a * shape.windows_r);
+    const T* bias = a.bias + b * a.bias_stride + head * shape.table;
+    pack(a, shape, b, wr, wa, head, 0, s.q, static_cast<T*>(nullptr));
+    pack(a, shape, b, wr, wa, head, 1, static_cast<T*>(nullptr), s.kt);
+    pack(a, shape, b, wr, wa, head, 2, s.v, static_cast<T*>(nullptr));
+    pack_sides(a, shape, wr, wa, s.side);
+    for (int64_t t = 0; t < shape.n; ++t) {
+      logits(a, shape, s, bias, t);
+      T largest = s.row[0];
+      for (int64_t k = 1; k < shape.n; ++k) largest = s.row[k] > largest ? s.row[k] : largest;
+      T sum = 0;
+      for (int64_t k = 0; k < shape.n; ++k) {
+        s.row[k] = exponential(s.row[k] - largest);
+        sum += s.row[k];
+      }
+      int side;
+      const int64_t token = b * a.rings * a.sectors + token_at(a, wr, wa, t, &side);
+      T* out = a.out + (token * a.heads + head) * shape.d;
+      const T inverse = 1 / sum;
+      for (int64_t c = 0; c < shape.d; ++c) out[c] = 0;
+      for (int64_t k = 0; k < shape.n; ++k) {
+        const T* value = s.v + k * shape.d;
+        const T weight = s.row[k] * inverse;
+#pragma omp simd
+        for (int64_t c = 0; c < shape.d; ++c) out[c] += weight * value[c];
+      }
+      a.lse[token * a.heads + head] = largest + logarithm(sum);
+    }
+  }
+}
+
+template <typename T>
+void attend_backward(const WindowAttentionArgs<T>& a, int64_t begin, int64_t end, T* scratch) {
+  const Shape<T> shape(a);
+  const Scratch<T> s(scratch, shape.n, shape.d);
+  const int64_t windows = shape.windows_r * shape.windows_a;
+  for (int64_t item = begin; item < end; ++item) {
+    const int64_t head = item % a.heads, b = item / a.heads;
+    const T* bias = a.bias + b * a.bias_stride + head * shape.table;
+    double* grad_bias = a.grad_bias + item * shape.table;
+    for (int64_t window = 0; window < windows; ++window) {
+      const int64_t wr = window / shape.windows_a, wa = window % shape.windows_a;
+      pack(a, shape, b, wr, wa, head, 0, s.q, static_cast<T*>(nullptr));
+      pack(a, shape, b, wr, wa, head, 1, s.k, s.kt);
+      pack(a, shape, b, wr, wa, head, 2, static_cast<T*>(nullptr), s.vt);
+      pack_sides(a, shape, wr, wa, s.side);
+      for (int64_t e = 0; e < shape.n * shape.d; ++e) s.dk[e] = s.dv[e] = 0;
+      for (int64_t t = 0; t < shape.n; ++t) {
+        int side;
+        const int64_t token = b * a.rings * a.sectors + token_at(a, wr, wa, t, &side);
+        const T* grad = a.grad_out + (token * a.heads + head) * shape.d;
+        const T lse = a.lse[token * a.heads + head];
+        // Probabilities p, their gradient dp = grad . v, and ds = p (dp - sum p dp).
+        logits(a, shape, s, bias, t);
+        row_times_columns(grad, s.vt, shape, s.drow);
+        T expected = 0;
+        for (int64_t k = 0; k < shape.n; ++k) {
+          s.row[k] = exponential(s.row[k] - lse);
+          expected += s.row[k] * s.drow[k];
+        }
+        for (int64_t k = 0; k < shape.n; ++k) s.drow[k] = s.row[k] * (s.drow[k] - expected);
+        for (int64_t kr = 0; kr < a.window_r; ++kr) {
+          double* grads = grad_bias + bias_index(a, shape, t, kr);
+          for (int64_t ka = 0; ka < a.window_a; ++ka) grads[-ka] += s.drow[kr * a.window_a + ka];
+        }
+        const T* query = s.q + t * shape.d;
+        for (int64_t c = 0; c < shape.d; ++c) s.dq[c] = 0;
+        for (int64_t k = 0; k < shape.n; ++k) {
+          const T p = s.row[k], ds = s.drow[k] * a.scale;
+          const T* key = s.k + k * shape.d;
+          T *dk = s.dk + k * shape.d, *dv = s.dv + k * shape.d;
+#pragma omp simd
+          for (int64_t c = 0; c < shape.d; ++c) {
+            s.dq[c] += ds * key[c];
+            dk[c] += ds * query[c];
+            dv[c] += p * grad[c];
+          }
+        }
+        T* to = a.grad_qkv + (token * 3 * a.heads + head) * shape.d;
+        for (int64_t c = 0; c < shape.d; ++c) to[c] = s.dq[c];
+      }
+      for (int64_t t = 0; t < shape.n; ++t) {
+        int side;
+        const int64_t token = b * a.rings * a.sectors + token_at(a, wr, wa, t, &side);
+        T* dk = a.grad_qkv + ((token * 3 + 1) * a.heads + head) * shape.d;
+        T* dv = dk + a.heads * shape.d;
+        for (int64_t c = 0; c < shape.d; ++c) {
+          dk[c] = s.dk[t * shape.d + c];
+          dv[c] = s.dv[t * shape.d + c];
+        }
+      }
+    }
+  }
+}
+
+}  // namespace
+
+int64_t window_attention_scratch(const WindowAttentionArgs<float>& args) {
+  return Scratch<float>::size(args.window_r * args.window_a, args.head_dim);
+}
+int64_t window_attention_scratch(const WindowAttentionArgs<double>& args) {
+  return Scratch<double>::size(args.window_r * args.window_a, args.head_dim);
+}
+void window_attention(const WindowAttentionArgs<float>& args, int64_t begin, int64_t end,
+                      float* scratch) {
+  attend(args, begin, end, scratch);
+}
+void window_attention(const WindowAttentionArgs<double>& args, int64_t begin, int64_t end,
+                      double* scratch) {
+  attend(args, begin, end, scratch);
+}
+void window_attention_backward(const WindowAttentionArgs<float>& args, int64_t begin, int64_t end,
+                               float* scratch) {
+  attend_backward(args, begin, end, scratch);
+}
+void window_attention_backward(const WindowAttentionArgs<double>& args, int64_t begin, int64_t end,
+                               double* scratch) {
+  attend_backward(args, begin, end, scratch);
+}
+
+}  // namespace darswin::TIER

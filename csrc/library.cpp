@@ -1,0 +1,63 @@
+// Table of contents of darswin._C: the operators' schemas, and the module's build facts.
+// The CPU implementations stand beside their drivers; fake kernels and autograd are in darswin/ops.
+#include <pybind11/pybind11.h>
+#include <torch/csrc/stable/library.h>
+
+#include <stdexcept>
+#include <string>
+
+#include "dispatch.h"
+
+STABLE_TORCH_LIBRARY(darswin, m) {
+  m.def(
+      "polar_sample(Tensor image, Tensor radii, Tensor azimuths, Tensor center, int[] patch, "
+      "float jitter, Tensor? seed, bool tokens) -> Tensor");
+  m.def(
+      "polar_sample_backward(Tensor grad_out, Tensor image, Tensor radii, Tensor azimuths, "
+      "Tensor center, int[] patch, float jitter, Tensor? seed, bool tokens, bool image_grad, "
+      "bool lens_grad) -> (Tensor, Tensor, Tensor)");
+  m.def(
+      "window_attention(Tensor qkv, Tensor bias, int[] window, int[] shift, bool[] periodic, "
+      "float scale) -> (Tensor, Tensor)");
+  m.def(
+      "window_attention_backward(Tensor grad_out, Tensor qkv, Tensor bias, Tensor lse, "
+      "int[] window, int[] shift, bool[] periodic, float scale) -> (Tensor, Tensor)");
+}
+
+PYBIND11_MODULE(_C, m) {
+  m.doc() = "Compiled operators of darswin and the instruction-set tier they run on.";
+  m.def(
+      "tier", [] { return std::string(darswin::kernels().tier); },
+      "The instruction-set tier in use: 'generic', 'avx2' or 'avx512'.");
+  m.def(
+      "tiers",
+      [] {
+        pybind11::list available;
+        for (const char* tier : {"generic", "avx2", "avx512"}) {
+          if (darswin::tier_available(tier)) available.append(tier);
+        }
+        return available;
+      },
+      "The tiers that this CPU and this build offer, from low to high.");
+  m.def(
+      "set_tier",
+      [](const std::string& tier) {
+        if (!darswin::set_tier(tier.c_str())) {
+          throw pybind11::value_error("tier must be one that this CPU and build offer (best: '" +
+                                      std::string(darswin::best_tier()) + "'), got '" + tier + "'");
+        }
+      },
+      pybind11::arg("tier"),
+      "Runs the operators on another tier from now on. Raises ValueError if the CPU lacks it.");
+  m.def(
+      "build_info",
+      [] {
+        pybind11::dict info;
+        info["compiler"] = "g++ " __VERSION__;
+        info["cxx_standard"] = static_cast<int64_t>(__cplusplus);
+        info["openmp"] = _OPENMP;
+        info["torch_abi"] = "stable, torch>=2.10";
+        return info;
+      },
+      "What this module was built with.");
+}

@@ -1,0 +1,47 @@
+// What both drivers need to be fast and still give the same bits for any number of threads: OpenMP
+// over contiguous ranges, and a sum of per-image rows in a fixed order.
+#pragma once
+
+#include <omp.h>
+#include <torch/csrc/stable/ops.h>
+#include <torch/csrc/stable/tensor.h>
+
+#include <algorithm>
+#include <cstdint>
+#include <vector>
+
+namespace darswin {
+
+inline int64_t num_threads(int64_t count) {
+  return std::clamp<int64_t>(count, 1, torch::stable::get_num_threads());
+}
+
+// body(begin, end, thread) with thread < num_threads(count). It must not throw.
+template <typename Body>
+void parallel_ranges(int64_t count, Body&& body) {
+  if (count == 0) return;
+  const int64_t threads = num_threads(count);
+#pragma omp parallel num_threads(threads) if (threads > 1)
+  {
+    const int64_t thread = omp_get_thread_num(), team = omp_get_num_threads();
+    const int64_t each = count / team, extra = count % team;
+    const int64_t begin = thread * each + std::min(thread, extra);
+    const int64_t end = begin + each + (thread < extra ? 1 : 0);
+    if (begin < end) body(begin, end, thread);
+  }
+}
+
+// The gradient of `like`, (B or 1, ...), from one row of doubles an image: summed over the images
+// where they share one row.
+template <typename T>
+torch::stable::Tensor fold_rows(const torch::stable::Tensor& like,
+                                const std::vector<double>& rows) {
+  const torch::stable::Tensor folded = torch::stable::new_zeros(like, like.sizes());
+  std::vector<double> sums(folded.numel(), 0.0);
+  for (size_t k = 0; k < rows.size(); ++k) sums[k % sums.size()] += rows[k];
+  T* to = folded.template mutable_data_ptr<T>();
+  for (size_t k = 0; k < sums.size(); ++k) to[k] = static_cast<T>(sums[k]);
+  return folded;
+}
+
+}  // namespace darswin

@@ -1,0 +1,1 @@
+"""Wide-angle and fisheye images for vision transformers, fast on CPUs."""

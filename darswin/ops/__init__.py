@@ -1,0 +1,7 @@
+"""The two operators: compiled on CPU, in plain PyTorch on other devices or under `use_reference`."""
+
+from darswin.ops._library import reference_in_use, use_reference
+from darswin.ops.polar_sample import polar_sample
+from darswin.ops.window_attention import window_attention
+
+__all__ = ["polar_sample", "reference_in_use", "use_reference", "window_attention"]

@@ -1,0 +1,58 @@
+"""Loads the compiled module, and decides between it and the PyTorch reference."""
+
+import contextlib
+import importlib
+from collections.abc import Iterator
+
+import torch  # before the module: both must share the libgomp that torch loads
+
+_reference = False
+
+
+def load_extension():
+    """Imports `darswin._C`; its ImportError says what was tried and how to rebuild."""
+    try:
+        return importlib.import_module("darswin._C")
+    except ImportError as error:
+        file = error.path or "darswin/_C.*.so (not found)"
+        raise ImportError(
+            f"cannot load the compiled module of darswin, {file}: {error}. It is built on "
+            f"libtorch's stable ABI for torch>=2.10; torch {torch.__version__} is running. "
+            "Rebuild it with `pip install --no-build-isolation --force-reinstall --no-deps darswin`"
+            ", or in a checkout with `make build`."
+        ) from error
+
+
+@contextlib.contextmanager
+def use_reference(enabled: bool = True) -> Iterator[None]:
+    """Within this context the operators run their PyTorch reference on every device, CPU included.
+
+    The switch is one for the process, not one a thread.
+    """
+    global _reference
+    before, _reference = _reference, enabled
+    try:
+        yield
+    finally:
+        _reference = before
+
+
+def reference_in_use() -> bool:
+    """Whether `use_reference` is in force."""
+    return _reference
+
+
+def compiled(tensor: torch.Tensor) -> bool:
+    """Whether an operator on `tensor` runs compiled code rather than the reference."""
+    return tensor.device.type == "cpu" and not _reference
+
+
+def without_autocast(*tensors: torch.Tensor) -> tuple[torch.Tensor, ...]:
+    """Under autocast, half-precision tensors as float32: the type the operators compute in."""
+    if not torch.is_autocast_enabled(tensors[0].device.type):
+        return tensors
+    half = (torch.bfloat16, torch.float16)
+    return tuple(t.float() if t.dtype in half else t for t in tensors)
+
+
+load_extension()

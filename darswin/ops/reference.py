@@ -1,0 +1,142 @@
+"""The operators in plain PyTorch: oracle of the tests, and what runs on other devices.
+
+Arguments come checked, as the compiled operators get them.
+"""
+
+import math
+
+import torch
+from torch import Tensor
+
+_WORD = 0xFFFFFFFF
+
+
+def philox(seed: Tensor, low: Tensor, high: Tensor) -> list[Tensor]:
+    """The four 32-bit words of Philox4x32-10 for key `seed` and counter (low, high), as int64.
+
+    Source: Salmon et al., "Parallel random numbers: as easy as 1, 2, 3", SC 2011.
+    """
+    k0, k1 = seed & _WORD, (seed >> 32) & _WORD
+    c0, c1, c2, c3 = torch.broadcast_tensors(
+        low & _WORD, (low >> 32) & _WORD, high & _WORD, (high >> 32) & _WORD
+    )
+    for _ in range(10):
+        (hi0, lo0), (hi1, lo1) = _multiply(0xD2511F53, c0), _multiply(0xCD9E8D57, c2)
+        c0, c1, c2, c3 = hi1 ^ c1 ^ k0, lo1, hi0 ^ c3 ^ k1, lo0
+        k0, k1 = (k0 + 0x9E3779B9) & _WORD, (k1 + 0xBB67AE85) & _WORD
+    return [c0, c1, c2, c3]
+
+
+def _multiply(a: int, b: Tensor) -> tuple[Tensor, Tensor]:
+    """Upper and lower word of a 32x32-bit product, in halves that int64 can hold."""
+    upper, lower = a * (b >> 16), a * (b & 0xFFFF)
+    total = ((upper & 0xFFFF) << 16) + lower
+    return (upper >> 16) + (total >> 32), total & _WORD
+
+
+def _centered_uniform(word: Tensor, dtype: torch.dtype) -> Tensor:
+    return (word >> 8).to(dtype) * 2.0**-24 - 0.5
+
+
+def _jittered(
+    radii: Tensor, azimuths: Tensor, batch: int, jitter: float, seed: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Radius and azimuth of each point, (B, N_r, N_a)."""
+    rows, columns, device = radii.shape[1], azimuths.shape[0], radii.device
+    point = torch.arange(rows * columns, device=device).reshape(1, rows, columns)
+    image = torch.arange(batch, device=device).reshape(-1, 1, 1)
+    words = philox(seed.to(device), point, image)
+    u, v = (_centered_uniform(word, radii.dtype) * jitter for word in words[:2])
+    # The step to the outer neighbour and from the inner one; at both ends the only one there is.
+    steps = radii.diff(dim=1) if rows > 1 else torch.zeros_like(radii)
+    outer = torch.cat((steps, steps[:, -1:]), 1)[:, :rows, None]
+    inner = torch.cat((steps[:, :1], steps), 1)[:, :rows, None]
+    moved = radii[:, :, None] + u * torch.where(u < 0, inner, outer)
+    return moved.clamp(min=0), azimuths + v * (2 * math.pi / columns)
+
+
+def polar_sample(
+    image: Tensor,
+    radii: Tensor,
+    azimuths: Tensor,
+    center: Tensor,
+    patch: tuple[int, int],
+    jitter: float,
+    seed: Tensor | None,
+    tokens: bool,
+) -> Tensor:
+    """See `darswin.ops.polar_sample`."""
+    batch, channels, height, width = image.shape
+    rows, columns = radii.shape[1], azimuths.shape[0]
+    r, a = radii[:, :, None], azimuths[None, None, :]
+    if jitter > 0 and rows > 0 and columns > 0:
+        r, a = _jittered(radii, azimuths, batch, jitter, seed)
+    x = center[:, 0, None, None] + r * torch.cos(a)  # (B or 1, N_r, N_a)
+    y = center[:, 1, None, None] + r * torch.sin(a)
+    touches = (x > -1) & (x < width) & (y > -1) & (y < height)  # NaN touches nothing
+    x, y = torch.where(touches, x, -1), torch.where(touches, y, -1)
+    left, top = x.detach().floor(), y.detach().floor()
+    right, lower = x - left, y - top
+    pixels = image.flatten(2)
+    out = 0
+    for down, wy in ((0, 1 - lower), (1, lower)):
+        for across, wx in ((0, 1 - right), (1, right)):
+            column, row = left.long() + across, top.long() + down
+            inside = touches & (column >= 0) & (column < width) & (row >= 0) & (row < height)
+            index = torch.where(inside, row * width + column, 0).flatten(1)
+            index = index[:, None].expand(batch, channels, -1)
+            corner = pixels.gather(2, index) if height * width else pixels.new_zeros(index.shape)
+            corner = corner.unflatten(2, (rows, columns))
+            # A pixel that is not there must not count, were it NaN.
+            corner = torch.where(inside[:, None], corner, 0)
+            out = out + (wx * wy)[:, None] * corner
+    if not tokens:
+        return out
+    rings, sectors = rows // patch[0], columns // patch[1]
+    out = out.reshape(batch, channels, rings, patch[0], sectors, patch[1])
+    samples = patch[0] * patch[1] * channels
+    return out.permute(0, 2, 4, 3, 5, 1).reshape(batch, rings, sectors, samples)
+
+
+def window_attention(
+    qkv: Tensor,
+    bias: Tensor,
+    window: tuple[int, int],
+    shift: tuple[int, int],
+    periodic: tuple[bool, bool],
+    scale: float,
+) -> Tensor:
+    """See `darswin.ops.window_attention`."""
+    batch, rings, sectors, _, heads, head_dim = qkv.shape
+    (mr, ma), (nr, na) = window, (rings // window[0], sectors // window[1])
+    x = qkv.roll((-shift[0], -shift[1]), (1, 2)).reshape(batch, nr, mr, na, ma, 3, heads, head_dim)
+    # (B, n_r, n_a, heads, M_r·M_φ, d)
+    q, k, v = x.permute(5, 0, 1, 3, 6, 2, 4, 7).flatten(5, 6)
+    logits = q @ k.transpose(-1, -2) * scale
+    logits = logits + _pairwise_bias(bias, window)[:, None, None]
+    visible = _visible(rings, sectors, window, shift, periodic, qkv.device)
+    logits = logits.masked_fill(~visible[:, :, None], -math.inf)
+    out = (logits.softmax(-1) @ v).unflatten(4, (mr, ma))
+    out = out.permute(0, 1, 4, 2, 5, 3, 6).reshape(batch, rings, sectors, heads * head_dim)
+    return out.roll(shift, (1, 2))
+
+
+def _pairwise_bias(bias: Tensor, window: tuple[int, int]) -> Tensor:
+    """(B or 1, heads, N, N) for the N = M_r·M_φ tokens of a window."""
+    r = torch.arange(window[0], device=bias.device)
+    a = torch.arange(window[1], device=bias.device)
+    delta_r = (r[:, None] - r[None, :] + window[0] - 1)[:, None, :, None]
+    delta_a = (a[:, None] - a[None, :] + window[1] - 1)[None, :, None, :]
+    return bias[:, :, delta_r, delta_a].flatten(4, 5).flatten(2, 3)
+
+
+def _visible(rings, sectors, window, shift, periodic, device) -> Tensor:
+    """(n_r, n_a, N, N): which pairs of a window's tokens the border does not part."""
+    side = torch.zeros(rings, sectors, dtype=torch.long, device=device)
+    if not periodic[0]:
+        side[rings - shift[0] :] += 1
+    if not periodic[1]:
+        side[:, sectors - shift[1] :] += 2
+    side = side.reshape(rings // window[0], window[0], sectors // window[1], window[1])
+    side = side.transpose(1, 2).flatten(2, 3)
+    return side[:, :, :, None] == side[:, :, None, :]

@@ -1,0 +1,108 @@
+"""window_attention: attention in the windows of a polar map. Public function, fake, autograd."""
+
+import torch
+from torch import Tensor
+
+from darswin.ops import _library, reference
+from darswin.ops.checks import check_pair, check_shape, check_tensor
+
+
+def window_attention(
+    qkv: Tensor,
+    bias: Tensor,
+    *,
+    window: tuple[int, int],
+    shift: tuple[int, int] = (0, 0),
+    periodic: tuple[bool, bool] = (False, True),
+    scale: float | None = None,
+) -> Tensor:
+    """Attends inside each window of a polar map: `softmax(q·k·scale + bias)·v`.
+
+    The windows tile the map rolled by `-shift`. Along an axis that is not periodic, tokens that the
+    roll brought together across the border do not see each other. Windows, shift and wrap are index
+    arithmetic: nothing is rolled, partitioned or masked in memory.
+
+    Args:
+        qkv: (B, R, A, 3, heads, d), float32 or float64. bfloat16 and float16 are taken as float32
+            under autocast.
+        bias: (B or 1, heads, 2·M_r-1, 2·M_φ-1): entry [Δr+M_r-1, Δφ+M_φ-1], Δ = query - key.
+        window: (M_r, M_φ), which divides (R, A).
+        shift: (s_r, s_φ), 0 ≤ s_r < R and 0 ≤ s_φ < A.
+        periodic: whether the map wraps around along (radius, azimuth). A plain Swin map is
+            (False, False).
+        scale: of the logits; None means d^-½.
+
+    Returns:
+        (B, R, A, heads·d).
+
+    Gradients go to qkv and bias; backward recomputes the probabilities from a saved log-sum-exp.
+    Results and gradients do not depend on the number of threads.
+
+    Raises:
+        TypeError: a tensor of another dtype, or an argument of another type.
+        ValueError: a shape, device or range that does not fit.
+
+    Source: DarSwin, ICCV 2023, sec. 4.4; Swin Transformer, ICCV 2021, sec. 3.2.
+    """
+    if isinstance(qkv, Tensor) and isinstance(bias, Tensor):
+        qkv, bias = _library.without_autocast(qkv, bias)
+    check_tensor("qkv", qkv)
+    check_tensor("bias", bias, like=qkv)
+    check_shape("qkv", qkv, "(B, R, A, 3, heads, d)", (None, None, None, 3, None, None))
+    batch, rings, sectors, _, heads, head_dim = qkv.shape
+    if rings == 0 or sectors == 0 or head_dim == 0:
+        raise ValueError(f"qkv must have rings, sectors and a head dim, got {tuple(qkv.shape)}")
+    window = check_pair("window", window, lowest=1)
+    if rings % window[0] or sectors % window[1]:
+        raise ValueError(f"window must divide (R, A) = ({rings}, {sectors}), got {window}")
+    shift = check_pair("shift", shift, lowest=0)
+    if shift[0] >= rings or shift[1] >= sectors:
+        raise ValueError(f"shift must lie inside (R, A) = ({rings}, {sectors}), got {shift}")
+    if not isinstance(periodic, (tuple, list)) or len(periodic) != 2:
+        raise TypeError(f"periodic must be a pair of bools, got {periodic!r}")
+    table = (2 * window[0] - 1, 2 * window[1] - 1)
+    check_shape(
+        "bias",
+        bias,
+        f"(B or 1, heads, 2·M_r-1, 2·M_φ-1) = ({batch} or 1, {heads}, {table[0]}, {table[1]})",
+        (batch, heads, *table),
+        (1, heads, *table),
+    )
+    scale = head_dim**-0.5 if scale is None else float(scale)
+    arguments = (qkv, bias, window, shift, tuple(bool(p) for p in periodic), scale)
+    if _library.compiled(qkv):
+        return torch.ops.darswin.window_attention(*arguments)[0]
+    return reference.window_attention(*arguments)
+
+
+@torch.library.register_fake("darswin::window_attention")
+def _fake(qkv, bias, window, shift, periodic, scale):
+    batch, rings, sectors, _, heads, head_dim = qkv.shape
+    return (
+        qkv.new_empty((batch, rings, sectors, heads * head_dim)),
+        qkv.new_empty((batch, rings, sectors, heads)),
+    )
+
+
+@torch.library.register_fake("darswin::window_attention_backward")
+def _fake_backward(grad_out, qkv, bias, lse, window, shift, periodic, scale):
+    return qkv.new_empty(qkv.shape), bias.new_empty(bias.shape)
+
+
+def _setup_context(ctx, inputs, output):
+    qkv, bias, window, shift, periodic, scale = inputs
+    ctx.save_for_backward(qkv, bias, output[1])
+    ctx.settings = (window, shift, periodic, scale)
+    ctx.mark_non_differentiable(output[1])
+
+
+def _backward(ctx, grad_out, _grad_lse):
+    grad_qkv, grad_bias = torch.ops.darswin.window_attention_backward(
+        grad_out, *ctx.saved_tensors, *ctx.settings
+    )
+    return grad_qkv, grad_bias, None, None, None, None
+
+
+torch.library.register_autograd(
+    "darswin::window_attention", _backward, setup_context=_setup_context
+)
