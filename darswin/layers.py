@@ -1,0 +1,388 @@
+"""The layers of DarSwin. A polar map is (B, R, A, D), channels last, from the embedding to the head."""
+
+import math
+from collections.abc import Callable
+from typing import Literal
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from darswin.grid import Placement, PolarGrid, Spacing, check_grid, polar_grid
+from darswin.lens import Lens
+from darswin.ops import polar_sample, window_attention
+
+PositionBias = Literal["angular_relative", "angular", "polar"]
+GridFunction = Callable[..., PolarGrid]
+
+
+class PolarSample(nn.Module):
+    """Samples images on the polar grid of their lenses: what `F.grid_sample` does, with the grid.
+
+    Args:
+        rings, sectors, samples, spacing, sample_spacing, placement: as `darswin.grid.polar_grid`.
+        jitter: in [0, 1], how far a sample may move, in cells; only in training. The seed of each
+            call comes from torch's generator.
+        layout: "image" gives (B, C, R·S_r, A·S_φ), "tokens" (B, R, A, S_r·S_φ·C).
+        grid: the function that makes the grid.
+
+    Raises:
+        ValueError: settings that make no grid, here; images and lenses that do not fit, in forward.
+
+    Source: DarSwin, ICCV 2023, sec. 4.2 and 4.3.
+    """
+
+    def __init__(
+        self,
+        rings: int,
+        sectors: int,
+        samples: tuple[int, int],
+        *,
+        spacing: Spacing = "theta",
+        sample_spacing: Spacing | None = None,
+        placement: Placement = "centers",
+        jitter: float = 0.0,
+        layout: Literal["tokens", "image"] = "image",
+        grid: GridFunction = polar_grid,
+    ):
+        super().__init__()
+        check_grid(rings, sectors, samples, spacing, sample_spacing or spacing, placement)
+        if not 0 <= jitter <= 1:
+            raise ValueError(f"jitter must be in [0, 1], got {jitter}")
+        if layout not in ("tokens", "image"):
+            raise ValueError(f"layout must be 'tokens' or 'image', got {layout!r}")
+        self.rings, self.sectors, self.samples = rings, sectors, tuple(samples)
+        self.spacing, self.sample_spacing = spacing, sample_spacing or spacing
+        self.placement, self.jitter, self.layout = placement, float(jitter), layout
+        self._grid = grid
+
+    def grid(self, lens: Lens, image_size: tuple[int, int]) -> PolarGrid:
+        """The grid of a lens in images of (H, W)."""
+        return self._grid(
+            lens,
+            image_size,
+            rings=self.rings,
+            sectors=self.sectors,
+            samples=self.samples,
+            spacing=self.spacing,
+            sample_spacing=self.sample_spacing,
+            placement=self.placement,
+        )
+
+    def sample(self, images: Tensor, grid: PolarGrid) -> Tensor:
+        """Images (B, C, H, W) on a grid that `grid` gave."""
+        jitter = self.jitter if self.training else 0.0
+        # 62 bits, so that the seed is a tensor that compiled training does not specialise on.
+        seed = torch.randint(2**62, ()) if jitter else 0
+        radii, azimuths, center, _ = (t.to(images.device, images.dtype) for t in grid)
+        return polar_sample(
+            images, radii, azimuths, center,
+            patch=self.samples, jitter=jitter, seed=seed, layout=self.layout,
+        )  # fmt: skip
+
+    def forward(self, images: Tensor, lens: Lens) -> Tensor:
+        """Images (B, C, H, W) and their lenses (B or 1) → the samples, in `layout`."""
+        check_images(images, lens)
+        return self.sample(images, self.grid(lens, images.shape[2:]))
+
+    def extra_repr(self) -> str:
+        return (
+            f"rings={self.rings}, sectors={self.sectors}, samples={self.samples}, "
+            f"spacing={self.spacing!r}, sample_spacing={self.sample_spacing!r}, "
+            f"placement={self.placement!r}, jitter={self.jitter}, layout={self.layout!r}"
+        )
+
+
+def check_images(images: Tensor, lens: Lens) -> None:
+    """TypeError or ValueError unless images are (B, C, H, W) and there is a lens for each, or one."""
+    if not isinstance(images, Tensor):
+        raise TypeError(f"images must be a tensor, got {type(images).__name__}")
+    if images.dim() != 4:
+        raise ValueError(f"images must have shape (B, C, H, W), got {tuple(images.shape)}")
+    if not isinstance(lens, Lens):
+        raise TypeError(f"lens must be a darswin.lens.Lens, got {type(lens).__name__}")
+    if len(lens) not in (1, images.shape[0]):
+        raise ValueError(
+            f"there must be one lens or one an image, {images.shape[0]}, got {len(lens)}"
+        )
+
+
+class PolarPatchEmbed(nn.Module):
+    """Image and lens → polar map: samples of each patch, a linear layer, a LayerNorm.
+
+    Args:
+        in_chans: C. embed_dim: D. Others: as `PolarSample`.
+
+    Source: DarSwin, ICCV 2023, sec. 4.3.
+    """
+
+    def __init__(
+        self,
+        rings: int,
+        sectors: int,
+        samples: tuple[int, int],
+        *,
+        in_chans: int = 3,
+        embed_dim: int = 96,
+        **grid_options,
+    ):
+        super().__init__()
+        self.in_chans = in_chans
+        self.sample = PolarSample(rings, sectors, samples, layout="tokens", **grid_options)
+        self.proj = nn.Linear(samples[0] * samples[1] * in_chans, embed_dim)
+        self.norm = nn.LayerNorm(embed_dim)
+
+    def forward(self, images: Tensor, grid: PolarGrid) -> Tensor:
+        """(B, C, H, W) → (B, R, A, D)."""
+        if images.shape[1] != self.in_chans:
+            raise ValueError(f"images must have {self.in_chans} channels, got {images.shape[1]}")
+        return self.norm(self.proj(self.sample.sample(images, grid)))
+
+
+class RelativeBias(nn.Module):
+    """B_θ + B_φ: a bias table from the angles between tokens. Subclasses say what one axis gives.
+
+    Args:
+        window: (M_r, M_φ). sectors: A of the map.
+    """
+
+    def __init__(self, window: tuple[int, int], sectors: int):
+        super().__init__()
+        self.window, self.turn = window, 2 * math.pi / sectors
+
+    def _coefficients(self, rows: int, heads: int) -> nn.Parameter:
+        return nn.Parameter(nn.init.trunc_normal_(torch.empty(rows, heads), std=0.02))
+
+    def _axis(self, angle: Tensor, a: Tensor, b: Tensor) -> Tensor:
+        """Angles (N, K) of Δ = -(K-1)/2 … (K-1)/2 → (N, K, heads)."""
+        raise NotImplementedError
+
+    def forward(self, radial: Tensor) -> Tensor:
+        """`radial` (N, at least M_r) rad: how far 0, 1, … rings reach.
+
+        Returns:
+            (N, heads, 2·M_r-1, 2·M_φ-1), the `bias` of `window_attention`.
+        """
+        outward = radial[:, : self.window[0]]
+        theta = torch.cat((-outward[:, 1:].flip(1), outward), 1)
+        reach = self.window[1]
+        phi = torch.arange(1 - reach, reach, device=radial.device, dtype=radial.dtype) * self.turn
+        along_r = self._axis(theta, self.a_theta, self.b_theta).transpose(1, 2)
+        along_phi = self._axis(phi[None], self.a_phi, self.b_phi).transpose(1, 2)
+        return along_r[..., None] + along_phi[..., None, :]
+
+
+class AngularRelativeBias(RelativeBias):
+    """B = a_Δ sin α + b_Δ cos α, α the angle between two tokens Δ apart.
+
+    Coefficients are stored by Δ modulo their number: Δ = 0, 1, …, -2, -1.
+
+    Args:
+        window, sectors: as `RelativeBias`. heads: attention heads.
+        periodic: φ coefficients by Δφ modulo M_φ rather than modulo 2·M_φ-1, which makes them, and
+            so the bias, periodic; for a window that spans the ring.
+
+    Source: DarSwin, ICCV 2023, eq. 9 to 11.
+    """
+
+    def __init__(self, window: tuple[int, int], heads: int, sectors: int, periodic: bool = False):
+        super().__init__(window, sectors)
+        rows_theta, rows_phi = 2 * window[0] - 1, window[1] if periodic else 2 * window[1] - 1
+        self.a_theta = self._coefficients(rows_theta, heads)
+        self.b_theta = self._coefficients(rows_theta, heads)
+        self.a_phi = self._coefficients(rows_phi, heads)
+        self.b_phi = self._coefficients(rows_phi, heads)
+
+    def _axis(self, angle: Tensor, a: Tensor, b: Tensor) -> Tensor:
+        reach = angle.shape[1] // 2
+        delta = torch.arange(-reach, reach + 1, device=angle.device) % a.shape[0]
+        angle = angle[..., None]
+        return a[delta] * torch.sin(angle) + b[delta] * torch.cos(angle)
+
+
+class FourierBias(RelativeBias):
+    """B = b_0 + (1/P) Σ_{p=1..P} (a_p sin pα + b_p cos pα), P harmonics.
+
+    α is the angle between two tokens ("angular"), or along the radius their distance in the image,
+    the circle's radius being π ("polar"): what `radial` holds decides.
+
+    Args:
+        window, sectors: as `RelativeBias`. heads: attention heads. harmonics: P.
+
+    Source: DarSwin, ICCV 2023, table 3, after Ning et al., IJCAI 2020.
+    """
+
+    def __init__(self, window: tuple[int, int], heads: int, sectors: int, harmonics: int = 16):
+        super().__init__(window, sectors)
+        self.a_theta = self._coefficients(harmonics, heads)
+        self.b_theta = self._coefficients(harmonics + 1, heads)
+        self.a_phi = self._coefficients(harmonics, heads)
+        self.b_phi = self._coefficients(harmonics + 1, heads)
+
+    def _axis(self, angle: Tensor, a: Tensor, b: Tensor) -> Tensor:
+        harmonics = a.shape[0]
+        waves = angle[..., None] * torch.arange(1, harmonics + 1, device=angle.device)
+        return b[0] + (torch.sin(waves) @ a + torch.cos(waves) @ b[1:]) / harmonics
+
+
+class PolarWindowAttention(nn.Module):
+    """Multi-head attention in the windows of a polar map, with a bias that knows the angles.
+
+    Args:
+        dim: D. num_heads: divides D. map_size: (R, A). window: (M_r, M_φ), which divides (R, A).
+        shift: (s_r, s_φ). periodic: whether the map wraps around along (radius, azimuth).
+        position_bias: "angular_relative", "angular" or "polar".
+        harmonics: of the last two. periodic_bias: see `AngularRelativeBias`; it acts where the
+            window spans the ring.
+
+    Raises:
+        ValueError: sizes that do not divide, or an unknown position bias.
+
+    Source: DarSwin, ICCV 2023, sec. 4.4 and 4.5.
+    """
+
+    def __init__(
+        self,
+        dim: int,
+        num_heads: int,
+        *,
+        map_size: tuple[int, int],
+        window: tuple[int, int],
+        shift: tuple[int, int] = (0, 0),
+        periodic: tuple[bool, bool] = (False, True),
+        position_bias: PositionBias = "angular_relative",
+        harmonics: int = 16,
+        periodic_bias: bool = False,
+        qkv_bias: bool = True,
+    ):
+        super().__init__()
+        if dim % num_heads:
+            raise ValueError(f"num_heads must divide dim = {dim}, got {num_heads}")
+        if map_size[0] % window[0] or map_size[1] % window[1]:
+            raise ValueError(f"window must divide the map (R, A) = {map_size}, got {window}")
+        self.num_heads, self.window, self.shift = num_heads, tuple(window), tuple(shift)
+        self.map_size, self.periodic = tuple(map_size), tuple(periodic)
+        self.qkv = nn.Linear(dim, 3 * dim, bias=qkv_bias)
+        self.proj = nn.Linear(dim, dim)
+        if position_bias == "angular_relative":
+            whole = periodic_bias and window[1] == map_size[1]
+            self.position_bias = AngularRelativeBias(self.window, num_heads, map_size[1], whole)
+        elif position_bias in ("angular", "polar"):
+            self.position_bias = FourierBias(self.window, num_heads, map_size[1], harmonics)
+        else:
+            raise ValueError(
+                "position_bias must be 'angular_relative', 'angular' or 'polar', "
+                f"got {position_bias!r}"
+            )
+
+    def forward(self, x: Tensor, radial: Tensor) -> Tensor:
+        """(B, R, A, D) → the same shape. `radial` (B or 1, R+1): see `radial_positions`."""
+        batch, rings, sectors, dim = x.shape
+        if (rings, sectors) != self.map_size:
+            raise ValueError(f"the map must be (R, A) = {self.map_size}, got {(rings, sectors)}")
+        qkv = self.qkv(x).reshape(batch, rings, sectors, 3, self.num_heads, dim // self.num_heads)
+        bias = self.position_bias(radial.to(x.device, self.proj.weight.dtype))
+        out = window_attention(
+            qkv, bias.to(qkv.dtype), window=self.window, shift=self.shift, periodic=self.periodic
+        )
+        return self.proj(out)
+
+    def extra_repr(self) -> str:
+        return (
+            f"map_size={self.map_size}, window={self.window}, shift={self.shift}, "
+            f"periodic={self.periodic}"
+        )
+
+
+def radial_positions(lens: Lens, grid: PolarGrid, rings: int, kind: PositionBias) -> Tensor:
+    """(N, rings+1): how far from the centre the borders of a map of `rings` rings are, in rad.
+
+    The angle θ, equally split; for "polar" the radius in the image, the circle's radius being π.
+    """
+    if kind == "polar":
+        step = (grid.borders.shape[1] - 1) // rings
+        borders = grid.borders[:, ::step]
+        return borders * (math.pi / borders[:, -1:])
+    fractions = torch.linspace(0, 1, rings + 1, device=lens.theta_max.device)
+    return lens.theta_max[:, None] * fractions
+
+
+class DropPath(nn.Module):
+    """Stochastic depth: in training, drops a residual branch for whole images with probability p."""
+
+    def __init__(self, p: float = 0.0):
+        super().__init__()
+        if not 0 <= p < 1:
+            raise ValueError(f"drop path must be in [0, 1), got {p}")
+        self.p = p
+
+    def forward(self, x: Tensor) -> Tensor:
+        if self.p == 0 or not self.training:
+            return x
+        keep = 1 - self.p
+        mask = torch.bernoulli(x.new_full((x.shape[0], *(1,) * (x.dim() - 1)), keep))
+        return x * (mask / keep)
+
+    def extra_repr(self) -> str:
+        return f"p={self.p}"
+
+
+class Mlp(nn.Module):
+    """Linear, GELU, Linear."""
+
+    def __init__(self, dim: int, hidden: int):
+        super().__init__()
+        self.fc1 = nn.Linear(dim, hidden)
+        self.fc2 = nn.Linear(hidden, dim)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.fc2(F.gelu(self.fc1(x)))
+
+
+class Block(nn.Module):
+    """Pre-norm transformer block: windowed attention, then an MLP, each behind a residual."""
+
+    def __init__(
+        self, dim: int, num_heads: int, *, mlp_ratio: float = 4.0, drop_path: float = 0.0, **attn
+    ):
+        super().__init__()
+        self.norm1 = nn.LayerNorm(dim)
+        self.attn = PolarWindowAttention(dim, num_heads, **attn)
+        self.norm2 = nn.LayerNorm(dim)
+        self.mlp = Mlp(dim, int(dim * mlp_ratio))
+        self.drop_path = DropPath(drop_path)
+
+    def forward(self, x: Tensor, radial: Tensor) -> Tensor:
+        """(B, R, A, D) → the same shape."""
+        x = x + self.drop_path(self.attn(self.norm1(x), radial))
+        return x + self.drop_path(self.mlp(self.norm2(x)))
+
+
+class PatchMerging(nn.Module):
+    """Joins m_r × m_φ neighbouring tokens into one of twice the width.
+
+    Args:
+        dim: D. merge: (m_r, m_φ): (1, 4) in DarSwin-A, (2, 2) in DarSwin-RA.
+
+    Source: DarSwin, ICCV 2023, sec. 4.4.
+    """
+
+    def __init__(self, dim: int, merge: tuple[int, int]):
+        super().__init__()
+        self.merge = tuple(merge)
+        joined = dim * merge[0] * merge[1]
+        self.norm = nn.LayerNorm(joined)
+        self.reduction = nn.Linear(joined, 2 * dim, bias=False)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(B, R, A, D) → (B, R/m_r, A/m_φ, 2·D)."""
+        batch, rings, sectors, dim = x.shape
+        mr, ma = self.merge
+        if rings % mr or sectors % ma:
+            raise ValueError(f"merge {self.merge} must divide (R, A) = {(rings, sectors)}")
+        # Inner order (φ, r, D): neighbours along the radius come first.
+        x = x.reshape(batch, rings // mr, mr, sectors // ma, ma, dim).permute(0, 1, 3, 4, 2, 5)
+        return self.reduction(self.norm(x.flatten(3)))
+
+    def extra_repr(self) -> str:
+        return f"merge={self.merge}"
