@@ -70,7 +70,7 @@ def polar_grid(
     sample_spacing = spacing if sample_spacing is None else sample_spacing
     check_grid(rings, sectors, samples, spacing, sample_spacing, placement)
     if "tan" in (spacing, sample_spacing):
-        _check_tan(lens)
+        check_tan(lens)
     theta_max = lens.theta_max[:, None]  # (N, 1)
     fractions = torch.linspace(0, 1, rings + 1, dtype=theta_max.dtype, device=theta_max.device)
     first, last = (_to_spacing(lens, t, spacing) for t in (torch.zeros_like(theta_max), theta_max))
@@ -115,7 +115,8 @@ def check_grid(
         raise ValueError(f"placement='edges' needs at least 2 samples an axis, got {samples!r}")
 
 
-def _check_tan(lens: Lens) -> None:
+def check_tan(lens: Lens) -> None:
+    """ValueError where tan θ ends before θ_max does."""
     if torch.compiler.is_compiling():
         return  # a value cannot be looked at in a graph; eager mode has checked this lens
     largest = lens.theta_max.max().item() if len(lens) else 0.0

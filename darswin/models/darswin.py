@@ -238,6 +238,8 @@ class DarSwin(nn.Module):
     def _stage_maps(self, images: Tensor, lens: Lens) -> list[Tensor]:
         check_images(images, lens)
         grid = self.patch_embed.sample.grid(lens, images.shape[2:])
+        if self.compat:
+            images = images.transpose(2, 3)  # its x runs down and its y to the right
         x = self.patch_embed(images, grid)
         maps = []
         for stage in self.stages:

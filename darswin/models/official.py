@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from darswin.grid import PolarGrid, Spacing, polar_grid
-from darswin.lens import Lens, Number
+from darswin.grid import PolarGrid, check_tan
+from darswin.lens import Lens, Number, Spherical
 
 if TYPE_CHECKING:
     from darswin.models.darswin import StagePlan
@@ -73,28 +73,76 @@ def grid(
     lens: Lens,
     image_size: tuple[int, int],
     *,
-    sample_spacing: Spacing,
-    spacing: Spacing,
-    **options,
+    rings: int,
+    sectors: int,
+    samples: tuple[int, int],
+    **_settings: str,
 ) -> PolarGrid:
-    """`polar_grid` as the released code makes it; ValueError unless images are square."""
+    """The grid of the released code, in place of `polar_grid`; ValueError unless images are square.
+
+    It is a grid of the transposed image: azimuth 0 points down there. Near 90° the rounding of
+    float32 tangents moves samples by 1e-4 px, so the released steps are followed one by one, and
+    the samples still depend that much on the maths library (MKL's differs between CPUs).
+    """
     height, width = image_size
     if height != width:
         raise ValueError(f"compat='official' needs square images, got (H, W) = {image_size}")
+    like = lens.theta_max
+    lens = lens.replace(theta_max=like[:1].expand(len(lens)))
+    along_r, along_phi = (_inclusive(count - 1, like) for count in samples)
+    ends = _last_angle(lens)[:, None] * _inclusive(rings, like)
     if isinstance(lens, OfficialPolynomial):
-        spacing, sample_spacing = "theta", "radius"
-    lens = lens.replace(theta_max=lens.theta_max[:1].expand(len(lens)))
-    made = polar_grid(lens, image_size, spacing=spacing, sample_spacing=sample_spacing, **options)
+        borders = lens.project(ends)
+        radii = _between(borders[:, :-1], borders[:, 1:], along_r)
+    else:
+        check_tan(lens)
+        borders = _radius(lens, ends)
+        inner, outer = borders[:, :-1], borders[:, :-1] + borders.diff(dim=1)
+        tangents = _between(_tangent(lens, inner), _tangent(lens, outer), along_r)
+        radii = _radius(lens, tangents)
+    step = (torch.tensor(2 * math.pi, dtype=like.dtype) / sectors).item()
+    # Half a step less than once around: the end itself must not come in by rounding.
+    start = torch.arange(0, (sectors - 0.5) * step, step, dtype=like.dtype, device=like.device)
+    azimuths = _between(start, step + start, along_phi)
     scale = (height - 1) / 2 / (height // 2)
-    return made._replace(radii=made.radii * scale, azimuths=math.pi / 2 - made.azimuths)
+    center = lens.center_in(image_size).flip(1)
+    return PolarGrid(radii * scale, azimuths, center, borders * scale)
+
+
+def _inclusive(count: int, like: Tensor) -> Tensor:
+    """0 … 1 in `count` equal steps."""
+    return torch.arange(count + 1, dtype=like.dtype, device=like.device) / count
+
+
+def _between(inner: Tensor, outer: Tensor, steps: Tensor) -> Tensor:
+    """Borders (..., R) and fractions (S,) → (..., R·S)."""
+    return (inner[..., None] + steps * (outer - inner)[..., None]).flatten(-2)
+
+
+def _radius(lens: Lens, tangent: Tensor) -> Tensor:
+    """r at tan θ."""
+    return lens.project(torch.atan(tangent))
+
+
+def _tangent(lens: Lens, radius: Tensor) -> Tensor:
+    """tan θ at r, in the released steps where the released code has the lens."""
+    if not isinstance(lens, Spherical):
+        return torch.tan(lens.unproject(radius))
+    xi, rho = lens.xi[:, None], radius / lens.focal[:, None]
+    sine = xi * radius / lens.focal[:, None] / torch.sqrt(1 + rho * rho)
+    return torch.tan(torch.asin(sine) + torch.atan(rho))
+
+
+def _last_angle(lens: Lens) -> Tensor:
+    """(N,): what the released code splits into rings and takes for θ_max in the bias."""
+    if isinstance(lens, OfficialPolynomial):
+        return lens.theta_max
+    return torch.tan(lens.theta_max)
 
 
 def radial_positions(lens: Lens, rings: int) -> Tensor:
     """(1, rings+1): equal steps up to tan θ_max of image 0, taken for an angle."""
-    last = lens.theta_max[:1]
-    if not isinstance(lens, OfficialPolynomial):
-        last = torch.tan(last)
-    return last[:, None] * torch.linspace(0, 1, rings + 1, device=last.device)
+    return _last_angle(lens[:1])[:, None] * _inclusive(rings, lens.theta_max)
 
 
 def plan(stage: "StagePlan", window: tuple[int, int]) -> "StagePlan":
