@@ -14,8 +14,8 @@ struct PolarSampleArgs {
   int64_t image_stride[4];
   const T* radii;  // (B or 1, num_radii) px
   int64_t radii_stride, num_radii;
-  const T* cosines;  // (num_azimuths,)
-  const T* sines;    // (num_azimuths,)
+  const double* cosines;  // (num_azimuths,)
+  const double* sines;    // (num_azimuths,)
   int64_t num_azimuths;
   const T* center;  // (B or 1, 2) px, x then y
   int64_t center_stride;

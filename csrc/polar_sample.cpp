@@ -24,7 +24,7 @@ using Sizes = std::vector<int64_t>;
 template <typename T>
 struct Call {
   Tensor image, radii, azimuths, center;
-  std::vector<T> cosines, sines;
+  std::vector<double> cosines, sines;
   PolarSampleArgs<T> args{};
   int64_t batch;
 
@@ -72,8 +72,8 @@ struct Call {
     }
     const T* angles = azimuths.template const_data_ptr<T>();
     for (int64_t j = 0; j < args.num_azimuths; ++j) {
-      cosines.push_back(std::cos(angles[j]));
-      sines.push_back(std::sin(angles[j]));
+      cosines.push_back(std::cos(static_cast<double>(angles[j])));
+      sines.push_back(std::sin(static_cast<double>(angles[j])));
     }
     args.cosines = cosines.data();
     args.sines = sines.data();
@@ -106,15 +106,12 @@ std::tuple<Tensor, Tensor, Tensor> backward(Call<T>&& call, const Tensor& grad_o
   STD_TORCH_CHECK(grad_out.sizes().vec() == call.output_sizes() &&
                       grad_out.scalar_type() == call.image.scalar_type(),
                   "polar_sample_backward: grad_out must look like the output");
-  const Sizes none = {0};
-  Tensor grad_image = torch::stable::new_empty(call.image, none);
-  Tensor grad_radii = grad_image, grad_center = grad_image;
+  const Sizes none = {0};  // what is not wanted comes back empty
+  const Tensor grad_image = torch::stable::new_zeros(
+      call.image, image_grad ? call.image.sizes() : torch::headeronly::IntHeaderOnlyArrayRef(none));
   std::vector<double> radii_rows, center_rows;
   call.args.grad_out = grad_out.template const_data_ptr<T>();
-  if (image_grad) {
-    grad_image = torch::stable::new_zeros(call.image, call.image.sizes());
-    call.args.grad_image = grad_image.template mutable_data_ptr<T>();
-  }
+  if (image_grad) call.args.grad_image = grad_image.template mutable_data_ptr<T>();
   if (lens_grad) {
     radii_rows.assign(call.batch * call.args.num_radii, 0.0);
     center_rows.assign(call.batch * 2, 0.0);
@@ -126,11 +123,12 @@ std::tuple<Tensor, Tensor, Tensor> backward(Call<T>&& call, const Tensor& grad_o
       kernels().table<T>().polar_sample_backward(call.args, begin, end);
     });
   }
-  if (lens_grad) {
-    grad_radii = fold_rows<T>(call.radii, radii_rows);
-    grad_center = fold_rows<T>(call.center, center_rows);
+  if (!lens_grad) {
+    return {grad_image, torch::stable::new_empty(call.radii, none),
+            torch::stable::new_empty(call.center, none)};
   }
-  return {grad_image, grad_radii, grad_center};
+  return {grad_image, fold_rows<T>(call.radii, radii_rows),
+          fold_rows<T>(call.center, center_rows)};
 }
 
 Tensor polar_sample(const Tensor& image, const Tensor& radii, const Tensor& azimuths,

@@ -27,10 +27,7 @@ inline PhiloxWords philox(uint64_t key, uint64_t counter_low, uint64_t counter_h
   return {{c0, c1, c2, c3}};
 }
 
-// Uniform in [-1/2, 1/2) from the upper 24 bits: the same number in float32 and float64.
-template <typename T>
-inline T centered_uniform(uint32_t word) {
-  return static_cast<T>(word >> 8) * static_cast<T>(0x1p-24) - static_cast<T>(0.5);
-}
+// Uniform in [-1/2, 1/2) from the upper 24 bits, so that it is exact in float32 as well.
+inline double centered_uniform(uint32_t word) { return (word >> 8) * 0x1p-24 - 0.5; }
 
 }  // namespace

@@ -49,10 +49,22 @@ def compiled(tensor: torch.Tensor) -> bool:
 
 def without_autocast(*tensors: torch.Tensor) -> tuple[torch.Tensor, ...]:
     """Under autocast, half-precision tensors as float32: the type the operators compute in."""
-    if not torch.is_autocast_enabled(tensors[0].device.type):
+    device = tensors[0].device.type
+    if not torch.amp.is_autocast_available(device) or not torch.is_autocast_enabled(device):
         return tensors
     half = (torch.bfloat16, torch.float16)
     return tuple(t.float() if t.dtype in half else t for t in tensors)
+
+
+def no_second_derivative(name: str) -> None:
+    """Makes an operator's backward raise where it is differentiated again, rather than be wrong."""
+
+    def raise_error(ctx, *grads):
+        raise NotImplementedError(
+            f"{name} has no second derivative; run it within darswin.ops.use_reference() for one"
+        )
+
+    torch.library.register_autograd(f"{name}_backward", raise_error)
 
 
 load_extension()

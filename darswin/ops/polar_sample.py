@@ -152,3 +152,4 @@ def _backward(ctx, grad_out):
 torch.library.register_autograd(
     "darswin::polar_sample", _backward, setup_context=_setup_context
 )
+_library.no_second_derivative("darswin::polar_sample")

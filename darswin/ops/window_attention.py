@@ -106,3 +106,4 @@ def _backward(ctx, grad_out, _grad_lse):
 torch.library.register_autograd(
     "darswin::window_attention", _backward, setup_context=_setup_context
 )
+_library.no_second_derivative("darswin::window_attention")

@@ -1,0 +1,27 @@
+import os
+
+import pytest
+import torch
+
+from darswin import _C
+
+
+def pytest_report_header(config):
+    return (
+        f"darswin: tier {_C.tier()} of {_C.tiers()}, ATEN_CPU_CAPABILITY="
+        f"{os.environ.get('ATEN_CPU_CAPABILITY', '')!r}, torch {torch.__version__}, "
+        f"{torch.get_num_threads()} threads"
+    )
+
+
+@pytest.fixture(autouse=True)
+def seeded():
+    torch.manual_seed(0)
+
+
+@pytest.fixture
+def threads():
+    """Sets torch's number of threads; the test's end restores it."""
+    before = torch.get_num_threads()
+    yield torch.set_num_threads
+    torch.set_num_threads(before)

@@ -1,0 +1,542 @@
+import math
+
+import pytest
+import torch
+import torch.nn.functional as F
+from helpers import assert_accurate, with_gradients
+
+from darswin.ops import polar_sample, reference_in_use, use_reference
+from darswin.ops.reference import philox
+
+LAYOUTS = ("tokens", "image")
+
+
+def make_inputs(
+    batch=2, channels=3, height=17, width=23, rows=6, columns=8, shared=False, dtype=torch.float32
+):
+    """Image, radii and center, and azimuths; points inside, on the border and outside."""
+    image = torch.randn(batch, channels, height, width, dtype=dtype)
+    lenses = 1 if shared else batch
+    radii = torch.rand(lenses, rows, dtype=dtype).sort(1).values * max(height, width) * 0.7
+    center = torch.tensor([(width - 1) / 2, (height - 1) / 2], dtype=dtype)
+    center = center + torch.rand(lenses, 2, dtype=dtype)
+    azimuths = (torch.arange(columns, dtype=dtype) + 0.37) * (2 * math.pi / max(columns, 1))
+    return image, radii, center, azimuths
+
+
+def sampler(azimuths, patch, **options):
+    """polar_sample as a function of its differentiable inputs."""
+    return lambda image, radii, center: polar_sample(
+        image, radii, azimuths.to(image.dtype), center, patch=patch, **options
+    )
+
+
+def away_from_borders(image, radii, center, azimuths, patch, layout):
+    """1 at points that are not within 1e-3 px of where a bilinear gradient jumps, else 0."""
+    r, a = radii.double()[:, :, None], azimuths.double()
+    xy = (center.double()[:, 0, None, None] + r * torch.cos(a),
+          center.double()[:, 1, None, None] + r * torch.sin(a))  # fmt: skip
+    smooth = torch.stack([(v - v.round()).abs() > 1e-3 for v in xy]).all(0).double()
+    points = smooth[:, None].expand(len(image), image.shape[1], -1, -1)
+    if layout == "image":
+        return points
+    rings, sectors = radii.shape[1] // patch[0], len(azimuths) // patch[1]
+    points = points.unflatten(3, (sectors, patch[1])).unflatten(2, (rings, patch[0]))
+    return points.permute(0, 2, 4, 3, 5, 1).flatten(3)
+
+
+SHAPES = {
+    "plain": (dict(), (3, 4)),
+    "shared lens": (dict(shared=True), (2, 2)),
+    "one ring, one sector": (dict(rows=4, columns=3), (4, 3)),
+    "one point": (dict(rows=1, columns=1), (1, 1)),
+    "one pixel": (dict(height=1, width=1), (3, 2)),
+    "thin image": (dict(height=1, width=37, channels=1), (1, 8)),
+    "many channels": (dict(channels=33, batch=1), (2, 4)),
+    "many points": (dict(rows=40, columns=64, height=31, width=33), (10, 8)),
+    "empty batch": (dict(batch=0, shared=True), (3, 4)),
+    "no points": (dict(rows=0, columns=8), (3, 4)),
+    "no channels": (dict(channels=0), (3, 4)),
+}
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+@pytest.mark.parametrize("jitter", [0.0, 0.8])
+@pytest.mark.parametrize("shape", SHAPES)
+def test_equals_reference_in_float64(shape, jitter, layout):
+    sizes, patch = SHAPES[shape]
+    *inputs, azimuths = make_inputs(**sizes, dtype=torch.float64)
+    run = sampler(azimuths, patch, jitter=jitter, seed=3, layout=layout)
+    ours = with_gradients(run, inputs)
+    with use_reference():
+        expected = with_gradients(run, inputs)
+    for got, want in zip(ours, expected, strict=True):
+        torch.testing.assert_close(got, want, rtol=1e-11, atol=1e-11)
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+@pytest.mark.parametrize("shape", SHAPES)
+def test_accuracy_rule(shape, layout):
+    sizes, patch = SHAPES[shape]
+    azimuths = make_inputs(**sizes)[-1]
+    assert_accurate(
+        sampler(azimuths, patch, layout=layout),
+        lambda: make_inputs(**sizes)[:-1],
+        lambda *inputs: away_from_borders(*inputs, azimuths, patch, layout),
+    )
+
+
+@pytest.mark.parametrize(
+    "scale", [1e-30, 1e30], ids=["tiny pixels", "huge pixels"]
+)
+def test_accuracy_rule_at_extreme_values(scale):
+    azimuths = make_inputs(rows=40, columns=32)[-1]
+
+    def make():
+        image, radii, center, _ = make_inputs(rows=40, columns=32)
+        return image * scale, radii, center
+
+    assert_accurate(
+        sampler(azimuths, (4, 4)),
+        make,
+        lambda *inputs: away_from_borders(*inputs, azimuths, (4, 4), "tokens"),
+    )
+
+
+def test_accuracy_rule_where_all_points_meet():
+    # Every point of the innermost rings falls into one pixel: the longest sums of all.
+    azimuths = make_inputs(columns=512)[-1]
+
+    def make():
+        image, _, center, _ = make_inputs(batch=1)
+        return image, torch.linspace(0, 0.4, 64)[None], center.round() + 0.5
+
+    assert_accurate(
+        sampler(azimuths, (8, 8)),
+        make,
+        lambda *inputs: away_from_borders(*inputs, azimuths, (8, 8), "tokens"),
+    )
+
+
+def test_equals_grid_sample():
+    image, radii, center, azimuths = make_inputs(rows=12, columns=16, dtype=torch.float64)
+    height, width = image.shape[2:]
+    x = center[:, 0, None, None] + radii[:, :, None] * torch.cos(azimuths)
+    y = center[:, 1, None, None] + radii[:, :, None] * torch.sin(azimuths)
+    mesh = torch.stack((2 * x / (width - 1) - 1, 2 * y / (height - 1) - 1), -1)
+    expected = F.grid_sample(image, mesh, align_corners=True)
+    got = polar_sample(image, radii, azimuths, center, patch=(1, 1), layout="image")
+    torch.testing.assert_close(got, expected, rtol=1e-10, atol=1e-10)
+
+
+def test_layouts_hold_the_same_samples():
+    image, radii, center, azimuths = make_inputs(rows=6, columns=8)
+    planes = polar_sample(image, radii, azimuths, center, patch=(3, 4), layout="image")
+    tokens = polar_sample(image, radii, azimuths, center, patch=(3, 4), layout="tokens")
+    assert tokens.shape == (2, 2, 2, 36) and planes.shape == (2, 3, 6, 8)
+    # Token (ring 1, sector 0), inner order (S_r, S_φ, C).
+    torch.testing.assert_close(
+        tokens[0, 1, 0].reshape(3, 4, 3), planes[0, :, 3:6, 0:4].permute(1, 2, 0), rtol=0, atol=0
+    )
+
+
+@pytest.mark.parametrize("jitter", [0.0, 0.6])
+def test_gradcheck(jitter):
+    *inputs, azimuths = make_inputs(height=7, width=8, rows=4, columns=6, dtype=torch.float64)
+    run = sampler(azimuths, (2, 3), jitter=jitter, seed=11)
+    assert torch.autograd.gradcheck(run, [t.requires_grad_() for t in inputs])
+
+
+@pytest.mark.parametrize("requires_grad", [False, True])
+@pytest.mark.parametrize("jitter", [0.0, 0.5])
+def test_opcheck(requires_grad, jitter):
+    image, radii, center, azimuths = make_inputs()
+    for tensor in (image, radii, center):
+        tensor.requires_grad_(requires_grad)
+    seed = torch.tensor(5) if jitter else None
+    arguments = (image, radii, azimuths, center, (3, 4), jitter, seed, True)
+    torch.library.opcheck(torch.ops.darswin.polar_sample.default, arguments)
+
+
+def test_opcheck_backward():
+    image, radii, center, azimuths = make_inputs()
+    grad = torch.randn(2, 2, 2, 36)
+    for wanted in ((True, True), (True, False), (False, True)):
+        arguments = (grad, image, radii, azimuths, center, (3, 4), 0.0, None, True, *wanted)
+        torch.library.opcheck(
+            torch.ops.darswin.polar_sample_backward.default,
+            arguments,
+            test_utils=("test_schema", "test_faketensor"),
+        )
+
+
+def test_no_second_derivative():
+    image, radii, center, azimuths = make_inputs()
+    for reference in (True, False):
+        with use_reference(reference):
+            out = polar_sample(image.requires_grad_(), radii, azimuths, center, patch=(3, 4))
+        (grad,) = torch.autograd.grad(out.square().sum(), image, create_graph=True)
+        if reference:
+            grad.sum().backward()
+            continue
+        with pytest.raises(NotImplementedError, match="no second derivative"):
+            grad.sum().backward()
+
+
+def test_only_the_gradients_asked_for():
+    image, radii, center, azimuths = make_inputs()
+    full = with_gradients(sampler(azimuths, (3, 4)), (image, radii, center))
+    names = ("image", "radii", "center")
+    for index, name in enumerate(names):
+        inputs = dict(zip(names, (image, radii, center), strict=True))
+        leaf = inputs[name] = inputs[name].detach().requires_grad_()
+        out = polar_sample(
+            inputs["image"], inputs["radii"], azimuths, inputs["center"], patch=(3, 4)
+        )
+        grad = torch.randn(out.shape, generator=torch.Generator().manual_seed(7))
+        (got,) = torch.autograd.grad(out, leaf, grad)
+        assert torch.equal(got, full[index + 1])
+
+
+@pytest.mark.parametrize("backend", ["aot_eager", "inductor"])
+def test_compile_fullgraph(backend):
+    *inputs, azimuths = make_inputs()
+    seed = torch.tensor(4)
+
+    def run(image, radii, center):
+        out = polar_sample(image, radii, azimuths, center, patch=(3, 4), jitter=0.5, seed=seed)
+        return out * 2
+
+    compiled = torch.compile(run, fullgraph=True, backend=backend)
+    for got, want in zip(
+        with_gradients(compiled, inputs), with_gradients(run, inputs), strict=True
+    ):
+        torch.testing.assert_close(got, want, rtol=1e-6, atol=1e-6)
+
+
+def test_compiled_training_does_not_respecialise_on_the_seed():
+    image, radii, center, azimuths = make_inputs()
+    counter = torch._dynamo.testing.CompileCounter()
+
+    @torch.compile(fullgraph=True, backend=counter)
+    def run(seed):
+        return polar_sample(image, radii, azimuths, center, patch=(3, 4), jitter=0.5, seed=seed)
+
+    outputs = [run(torch.tensor(seed)) for seed in range(3)]
+    assert counter.frame_count == 1
+    assert not torch.equal(outputs[0], outputs[1])
+
+
+def test_export():
+    class Module(torch.nn.Module):
+        def forward(self, image, radii, azimuths, center):
+            return polar_sample(image, radii, azimuths, center, patch=(3, 4))
+
+    image, radii, center, azimuths = make_inputs()
+    arguments = (image, radii, azimuths, center)
+    program = torch.export.export(Module(), arguments)
+    assert torch.equal(program.module()(*arguments), Module()(*arguments))
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("jitter", [0.0, 0.5])
+@pytest.mark.parametrize("shared", [False, True])
+def test_same_bits_for_any_number_of_threads(threads, dtype, jitter, shared):
+    *inputs, azimuths = make_inputs(batch=5, rows=30, columns=40, shared=shared, dtype=dtype)
+    run = sampler(azimuths, (3, 4), jitter=jitter, seed=1)
+    results = []
+    for count in (1, 2, 3):
+        threads(count)
+        results.append(with_gradients(run, inputs))
+    for other in results[1:]:
+        assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
+
+
+def test_strided_inputs():
+    image, radii, center, azimuths = make_inputs(dtype=torch.float64)
+    plain = with_gradients(sampler(azimuths, (3, 4)), (image, radii, center))
+    wide = torch.randn(2, 6, 34, 46, dtype=torch.float64)
+    wide[:, ::2, ::2, ::2] = image
+    strided = (
+        wide[:, ::2, ::2, ::2],
+        torch.stack((radii, radii), 2)[:, :, 0],
+        torch.stack((center, center), 2)[:, :, 0],
+    )
+    variants = [strided, (image.contiguous(memory_format=torch.channels_last), radii, center)]
+    for inputs in variants:
+        assert any(not t.is_contiguous() for t in inputs)
+        # As leaves they would be copied; a view of a leaf keeps its strides.
+        got = polar_sample(
+            inputs[0], inputs[1], azimuths.repeat_interleave(2)[::2], inputs[2], patch=(3, 4)
+        )
+        assert torch.equal(got, plain[0])
+        leaves = [t.requires_grad_() if t.is_leaf else t for t in inputs]
+        out = sampler(azimuths, (3, 4))(*leaves)
+        grad = torch.randn(out.shape, generator=torch.Generator().manual_seed(7)).double()
+        for a, b in zip(torch.autograd.grad(out, leaves, grad), plain[1:], strict=True):
+            torch.testing.assert_close(a, b, rtol=1e-12, atol=1e-12)
+
+
+def test_expanded_image_and_gradient():
+    image, radii, center, azimuths = make_inputs(batch=1)
+    image.requires_grad_()
+    many = polar_sample(image.expand(4, -1, -1, -1), radii, azimuths, center, patch=(3, 4))
+    one = polar_sample(image, radii, azimuths, center, patch=(3, 4))
+    assert torch.equal(many[3], one[0])
+    (grad,) = torch.autograd.grad(many.sum(), image)  # stride 0 comes back
+    (expected,) = torch.autograd.grad(one.sum(), image)
+    torch.testing.assert_close(grad, 4 * expected)
+
+
+@pytest.mark.parametrize("reference", [False, True])
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf, 1e30, -1e30])
+def test_points_at_no_number_sample_nothing(bad, reference):
+    image, radii, center, azimuths = make_inputs(rows=4, columns=6)
+    good = polar_sample(image, radii, azimuths, center, patch=(1, 1), layout="image")
+    broken = radii.clone()
+    broken[0, 2] = bad
+    with use_reference(reference):
+        out, grad_image, grad_radii, grad_center = with_gradients(
+            sampler(azimuths, (1, 1), layout="image"), (image, broken, center)
+        )
+        assert (out[0, :, 2] == 0).all()
+        torch.testing.assert_close(out[1], good[1])
+        assert grad_radii[0, 2] == 0
+        for grad in (grad_image, grad_radii, grad_center):
+            assert grad.isfinite().all()
+        lost = center.clone()
+        lost[1, 0] = bad
+        assert (polar_sample(image, radii, azimuths, lost, patch=(1, 1))[1] == 0).all()
+        for jitter in (0.0, 1.0):
+            turned = azimuths.clone()
+            turned[3] = bad
+            out = polar_sample(image, radii, turned, center, patch=(1, 1), jitter=jitter,
+                               layout="image")  # fmt: skip
+            assert (out[..., 3] == 0).all() or abs(bad) == 1e30
+            assert out.isfinite().all()
+
+
+@pytest.mark.parametrize("jitter", [0.0, 1.0])
+def test_jitter_keeps_bad_radii_to_themselves(jitter):
+    image, radii, center, azimuths = make_inputs(rows=6, columns=6)
+    radii[0, 2] = math.nan
+    out = polar_sample(image, radii, azimuths, center, patch=(1, 1), jitter=jitter, layout="image")
+    assert out.isfinite().all()
+    assert (out[0, :, 2] == 0).all()
+    assert (out[0, :, 0] != 0).any()
+
+
+@pytest.mark.parametrize("reference", [False, True])
+@pytest.mark.parametrize("bad", [math.nan, math.inf])
+def test_a_bad_pixel_spoils_only_the_points_that_touch_it(bad, reference):
+    image = torch.ones(1, 1, 9, 9)
+    image[0, 0, 4, 4] = bad
+    radii, center = torch.tensor([[0.5, 2.5, 4.5]]), torch.tensor([[4.0, 4.0]])
+    with use_reference(reference):
+        out = polar_sample(
+            image, radii, torch.tensor([0.1, 1.7]), center, patch=(1, 1), layout="image"
+        )
+    assert not out[0, 0, 0].isfinite().any()
+    assert out[0, 0, 1:].isfinite().all()
+
+
+def test_outside_is_zero():
+    image = torch.ones(1, 1, 5, 5)
+    radii = torch.tensor([[1.5, 2.25, 2.999, 3.0, 50.0]])
+    out = polar_sample(
+        image, radii, torch.zeros(1), torch.tensor([[2.0, 2.0]]), patch=(1, 1), layout="image"
+    )
+    torch.testing.assert_close(out.flatten(), torch.tensor([1.0, 0.75, 0.001, 0.0, 0.0]))
+
+
+def test_indices_beyond_two_to_the_31():
+    # The pages of a fresh tensor are not there before they are written: this costs little memory.
+    side = 46400
+    image = torch.empty(1, 1, side, side)
+    if image.numel() <= 2**31:
+        pytest.fail("the image must have more than 2^31 pixels")
+    image[0, 0, side - 4 :, side - 4 :] = torch.arange(16.0).reshape(4, 4)
+    center = torch.tensor([[side - 3.0, side - 3.0]])
+    out = polar_sample(
+        image, torch.tensor([[0.0, 1.0]]), torch.zeros(1), center, patch=(1, 1), layout="image"
+    )
+    assert out.flatten().tolist() == [5.0, 6.0]
+
+
+def test_sizes_beyond_two_to_the_31():
+    side = 2**31 + 8
+    image = torch.ones(1, 1, 1, 1, dtype=torch.float64).expand(1, 1, side, side)
+    center = torch.tensor([[2.0**31, 2.0**31]], dtype=torch.float64)
+    radii = torch.tensor([[0.0, 3.5, 100.0]], dtype=torch.float64)
+    azimuths = torch.zeros(1, dtype=torch.float64)
+    out = polar_sample(image, radii, azimuths, center, patch=(1, 1), layout="image")
+    assert out.flatten().tolist() == [1.0, 1.0, 0.0]
+
+
+# -- jitter ---------------------------------------------------------------------------------------
+
+
+def coordinates_image(size=64):
+    """An image whose channels are x and y: sampling it gives each point's place."""
+    y, x = torch.meshgrid(
+        torch.arange(size, dtype=torch.float64),
+        torch.arange(size, dtype=torch.float64),
+        indexing="ij",
+    )
+    return torch.stack((x, y))[None]
+
+
+def places(radii, azimuths, jitter, seed, size=64):
+    """Radius and azimuth at which the points of one image really stand, (N_r, N_a) each."""
+    middle = torch.full((1, 2), (size - 1) / 2, dtype=torch.float64)
+    out = polar_sample(coordinates_image(size), radii, azimuths, middle, patch=(1, 1),
+                       jitter=jitter, seed=seed, layout="image")  # fmt: skip
+    x, y = out[0] - (size - 1) / 2
+    return torch.hypot(x, y), torch.atan2(y, x)
+
+
+def test_jitter_moves_points_as_said():
+    radii = torch.tensor([[4.0, 7.0, 8.0, 20.0]], dtype=torch.float64)
+    azimuths = (torch.arange(16, dtype=torch.float64) + 0.5) * (2 * math.pi / 16) - math.pi
+    seed, jitter = 1234, 0.75
+    r, a = places(radii, azimuths, jitter, seed)
+    point = torch.arange(64).reshape(4, 16)
+    u, v = ((w >> 8) / 2**24 - 0.5 for w in philox(torch.tensor(seed), point, torch.tensor(0))[:2])
+    u, v = u.double() * jitter, v.double() * jitter
+    outer = torch.tensor([3.0, 1.0, 12.0, 12.0], dtype=torch.float64)[:, None]
+    inner = torch.tensor([3.0, 3.0, 1.0, 12.0], dtype=torch.float64)[:, None]
+    expected = radii.T + u * torch.where(u < 0, inner, outer)
+    torch.testing.assert_close(r, expected)
+    torch.testing.assert_close(a, azimuths + v * (2 * math.pi / 16))
+
+
+def test_jitter_is_uniform_and_independent():
+    radii = torch.arange(8.0, 24.0, dtype=torch.float64)[None]
+    azimuths = torch.linspace(-3, 3, 400, dtype=torch.float64)
+    r, a = places(radii, azimuths, 1.0, seed=9)
+    u = (r - radii.T)[1:-1].flatten()
+    v = ((a - azimuths) / (2 * math.pi / 400))[1:-1].flatten()
+    for offset in (u, v):
+        assert offset.min() >= -0.5 - 1e-9 and offset.max() < 0.5 + 1e-9
+        assert abs(offset.mean()) < 0.02 and abs(offset.std() - 12**-0.5) < 0.01
+    assert abs(torch.corrcoef(torch.stack((u, v)))[0, 1]) < 0.05
+
+
+def test_jitter_never_gives_a_negative_radius():
+    radii = torch.tensor([[0.0, 8.0]], dtype=torch.float64)
+    azimuths = torch.zeros(500, dtype=torch.float64)
+    r, _ = places(radii, azimuths, 1.0, seed=2)
+    assert (r[0] >= 0).all() and (r[0] < 1e-9).float().mean() > 0.3  # about half are clamped
+    assert r[0].max() > 1
+
+
+def test_seed_as_int_and_as_tensor_and_per_image():
+    image, radii, center, azimuths = make_inputs(batch=2, shared=True)
+    image = image[:1].expand(2, -1, -1, -1)
+
+    def run(seed, images=image):
+        return polar_sample(images, radii, azimuths, center, patch=(3, 4), jitter=1.0, seed=seed)
+
+    for seed in (0, 7, 2**62, -(2**63), 2**63 - 1):
+        assert torch.equal(run(seed), run(torch.tensor(seed)))
+    assert not torch.equal(run(7), run(8))
+    assert not torch.equal(run(7)[0], run(7)[1])  # each image has its own numbers
+    assert torch.equal(run(7)[:1], run(7, image[:1]))  # whatever else is in the batch
+    assert torch.equal(run(3), run(3))
+
+
+def test_without_jitter_the_seed_does_nothing():
+    image, radii, center, azimuths = make_inputs()
+    a, b = (polar_sample(image, radii, azimuths, center, patch=(3, 4), seed=s) for s in (0, 1))
+    assert torch.equal(a, b)
+
+
+# -- the switch, autocast, errors -------------------------------------------------------------------
+
+
+def test_reference_switch(monkeypatch):
+    image, radii, center, azimuths = make_inputs()
+    assert not reference_in_use()
+    with use_reference():
+        assert reference_in_use()
+        with use_reference(False):
+            assert not reference_in_use()
+        out = polar_sample(image.requires_grad_(), radii, azimuths, center, patch=(3, 4))
+        names, nodes = set(), [out.grad_fn]
+        while nodes:
+            node = nodes.pop()
+            names.add(type(node).__name__)
+            nodes += [n for n, _ in node.next_functions if n is not None]
+        assert any("Gather" in name for name in names)
+    assert not reference_in_use()
+
+
+def test_other_devices_run_the_reference():
+    image, radii, center, azimuths = (t.to("meta") for t in make_inputs())
+    out = polar_sample(image, radii, azimuths, center, patch=(3, 4))
+    assert out.shape == (2, 2, 2, 36) and out.device.type == "meta"
+
+
+def test_autocast_takes_half_precision_images_as_float32():
+    image, radii, center, azimuths = make_inputs()
+    half = image.bfloat16()
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        out = polar_sample(half, radii, azimuths, center, patch=(3, 4))
+    expected = polar_sample(half.float(), radii, azimuths, center, patch=(3, 4))
+    assert torch.equal(out, expected)
+    with pytest.raises(TypeError, match="image must be float32 or float64, got torch.bfloat16"):
+        polar_sample(half, radii, azimuths, center, patch=(3, 4))
+
+
+f32 = torch.float32
+
+
+@pytest.mark.parametrize("reference", [False, True])
+@pytest.mark.parametrize(
+    ("change", "error", "message"),
+    [
+        (dict(image="no"), TypeError, "image must be a tensor, got str"),
+        (dict(image=torch.zeros(2, 3, 17)), ValueError, r"\(B, C, H, W\), got \(2, 3, 17\)"),
+        (dict(image=torch.zeros(2, 3, 17, 23).int()), TypeError, "image must be float32"),
+        (dict(radii=torch.zeros(2, 6).double()), TypeError, "radii must have the same dtype"),
+        (dict(radii=torch.zeros(2, 6, device="meta")), ValueError, "radii must be on the same"),
+        (dict(radii=torch.zeros(3, 6)), ValueError, r"radii must have shape .*\(2 or 1, any\)"),
+        (dict(radii=torch.zeros(6)), ValueError, r"radii must have shape .*, got \(6,\)"),
+        (dict(radii=torch.zeros(2, 7)), ValueError, r"must divide .* \(7, 8\), got \(3, 4\)"),
+        (dict(radii=None), TypeError, "radii must be a tensor, got NoneType"),
+        (dict(azimuths=torch.zeros(1, 8)), ValueError, r"azimuths must have shape \(A·S_φ,\)"),
+        (dict(azimuths=torch.zeros(9)), ValueError, "must divide"),
+        (dict(center=torch.zeros(2)), ValueError, r"center must have shape .*, got \(2,\)"),
+        (dict(center=torch.zeros(2, 3)), ValueError, "center must have shape"),
+        (dict(center=torch.zeros(3, 2)), ValueError, "center must have shape"),
+        (dict(patch=(0, 4)), ValueError, "patch must be at least 1"),
+        (dict(patch=3), TypeError, "patch must be a pair of ints, got 3"),
+        (dict(patch=(3.0, 4)), TypeError, "patch must be a pair of ints"),
+        (dict(jitter=1.5), ValueError, r"jitter must be in \[0, 1\], got 1.5"),
+        (dict(jitter=-0.1), ValueError, r"jitter must be in \[0, 1\]"),
+        (dict(jitter=math.nan), ValueError, r"jitter must be in \[0, 1\]"),
+        (dict(jitter="much"), TypeError, "jitter must be a float"),
+        (dict(jitter=0.5, seed=1.5), TypeError, "seed must be an int"),
+        (dict(jitter=0.5, seed=2**63), ValueError, "seed must fit 64 bits"),
+        (dict(jitter=0.5, seed=torch.zeros(1).long()), ValueError, "0-dim int64 tensor"),
+        (dict(jitter=0.5, seed=torch.tensor(1.0)), ValueError, "0-dim int64 tensor"),
+        (dict(layout="planes"), ValueError, "layout must be one of"),
+    ],
+)
+def test_errors_say_what_was_expected(change, error, message, reference):
+    image, radii, center, azimuths = make_inputs()
+    arguments = dict(image=image, radii=radii, azimuths=azimuths, center=center, patch=(3, 4))
+    with use_reference(reference), pytest.raises(error, match=message):
+        polar_sample(**(arguments | change))
+
+
+def test_the_compiled_operator_itself_reads_nothing_outside():
+    # Without the checks of the public function, wrong sizes must still not crash.
+    image, radii, center, azimuths = make_inputs()
+    good = (image, radii, azimuths, center, (3, 4), 0.0, None, True)
+    for index, value in {
+        0: torch.zeros(3), 1: torch.zeros(3, 6), 3: torch.zeros(1, 1), 4: (0, 4), 5: 0.5,
+    }.items():  # fmt: skip
+        arguments = [value if k == index else v for k, v in enumerate(good)]
+        with pytest.raises(RuntimeError):
+            torch.ops.darswin.polar_sample(*arguments)
