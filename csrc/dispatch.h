@@ -43,8 +43,8 @@ struct WindowAttentionArgs {
   bool periodic_r, periodic_a;
   T scale;
 
-  T* out;  // forward: (B, R, A, heads, d)
-  T* lse;  // (B, R, A, heads): written forward, read backward
+  T* out;       // forward: (B, R, A, heads, d)
+  double* lse;  // (B, R, A, heads): written forward, read backward
 
   const T* grad_out;  // backward
   T* grad_qkv;        // like qkv
@@ -58,13 +58,14 @@ struct KernelTable {
   void (*polar_sample)(const PolarSampleArgs<T>&, int64_t begin, int64_t end);
   // item: image
   void (*polar_sample_backward)(const PolarSampleArgs<T>&, int64_t begin, int64_t end);
-  // elements of scratch that each thread needs in the two functions below
+  // doubles of scratch that each thread needs in the two functions below
   int64_t (*window_attention_scratch)(const WindowAttentionArgs<T>&);
   // item: (image, window, head)
-  void (*window_attention)(const WindowAttentionArgs<T>&, int64_t begin, int64_t end, T* scratch);
+  void (*window_attention)(const WindowAttentionArgs<T>&, int64_t begin, int64_t end,
+                           double* scratch);
   // item: (image, head)
   void (*window_attention_backward)(const WindowAttentionArgs<T>&, int64_t begin, int64_t end,
-                                    T* scratch);
+                                    double* scratch);
 };
 
 struct Kernels {
@@ -85,8 +86,8 @@ struct Kernels {
 // The tier in use: the best one the CPU has, or what ATEN_CPU_CAPABILITY or set_tier asked for.
 const Kernels& kernels();
 
-const char* best_tier();              // what the CPU has
-bool set_tier(const char* tier);      // false where the CPU or the build lacks that tier
+const char* best_tier();          // what the CPU has
+bool set_tier(const char* tier);  // false where the CPU or the build lacks that tier
 bool tier_available(const char* tier);
 
 }  // namespace darswin

@@ -127,8 +127,7 @@ std::tuple<Tensor, Tensor, Tensor> backward(Call<T>&& call, const Tensor& grad_o
     return {grad_image, torch::stable::new_empty(call.radii, none),
             torch::stable::new_empty(call.center, none)};
   }
-  return {grad_image, fold_rows<T>(call.radii, radii_rows),
-          fold_rows<T>(call.center, center_rows)};
+  return {grad_image, fold_rows<T>(call.radii, radii_rows), fold_rows<T>(call.center, center_rows)};
 }
 
 Tensor polar_sample(const Tensor& image, const Tensor& radii, const Tensor& azimuths,

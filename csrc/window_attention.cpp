@@ -69,7 +69,7 @@ struct Call {
   template <typename Kernel>
   void run(int64_t items, Kernel kernel) {
     const int64_t size = kernels().table<T>().window_attention_scratch(args);
-    std::vector<T> scratch(size * num_threads(items));
+    std::vector<double> scratch(size * num_threads(items));
     parallel_ranges(items, [&](int64_t begin, int64_t end, int64_t thread) {
       kernel(args, begin, end, scratch.data() + thread * size);
     });
@@ -82,10 +82,10 @@ std::tuple<Tensor, Tensor> forward(Call<T>&& call) {
   const Tensor out = torch::stable::new_empty(
       call.qkv, Sizes{call.batch, args.rings, args.sectors, args.heads * args.head_dim});
   const Tensor lse = torch::stable::new_empty(
-      call.qkv, Sizes{call.batch, args.rings, args.sectors, args.heads});
+      call.qkv, Sizes{call.batch, args.rings, args.sectors, args.heads}, ScalarType::Double);
   if (lse.numel() == 0) return {out, lse};
   args.out = out.template mutable_data_ptr<T>();
-  args.lse = lse.template mutable_data_ptr<T>();
+  args.lse = lse.template mutable_data_ptr<double>();
   call.run(call.batch * call.windows * args.heads, kernels().table<T>().window_attention);
   return {out, lse};
 }
@@ -99,12 +99,12 @@ std::tuple<Tensor, Tensor> backward(Call<T>&& call, const Tensor& grad_out_, con
   STD_TORCH_CHECK(grad_out.numel() * 3 == call.qkv.numel() &&
                       lse.numel() * args.head_dim == grad_out.numel() &&
                       grad_out.scalar_type() == call.qkv.scalar_type() &&
-                      lse.scalar_type() == call.qkv.scalar_type(),
+                      lse.scalar_type() == ScalarType::Double,
                   "window_attention_backward: grad_out and lse must look like the outputs");
   const Tensor grad_qkv = torch::stable::new_empty(call.qkv, call.qkv.sizes());
   std::vector<double> bias_rows(call.batch * args.heads * call.table_size(), 0.0);
   args.grad_out = grad_out.template const_data_ptr<T>();
-  args.lse = const_cast<T*>(lse.template const_data_ptr<T>());
+  args.lse = const_cast<double*>(lse.template const_data_ptr<double>());
   args.grad_qkv = grad_qkv.template mutable_data_ptr<T>();
   args.grad_bias = bias_rows.data();
   call.run(call.batch * args.heads, kernels().table<T>().window_attention_backward);

@@ -13,9 +13,10 @@ void polar_sample_backward(const PolarSampleArgs<double>&, int64_t begin, int64_
 
 int64_t window_attention_scratch(const WindowAttentionArgs<float>&);
 int64_t window_attention_scratch(const WindowAttentionArgs<double>&);
-void window_attention(const WindowAttentionArgs<float>&, int64_t, int64_t, float* scratch);
+void window_attention(const WindowAttentionArgs<float>&, int64_t, int64_t, double* scratch);
 void window_attention(const WindowAttentionArgs<double>&, int64_t, int64_t, double* scratch);
-void window_attention_backward(const WindowAttentionArgs<float>&, int64_t, int64_t, float* scratch);
+void window_attention_backward(const WindowAttentionArgs<float>&, int64_t, int64_t,
+                               double* scratch);
 void window_attention_backward(const WindowAttentionArgs<double>&, int64_t, int64_t,
                                double* scratch);
 

@@ -1,13 +1,13 @@
 // Polar bilinear sampling.
 //
 // A polar grid is separable: point (i, j) needs radius i and azimuth j, so two short vectors stand
-// for the whole (N_r, N_a, 2) mesh that grid_sample would read. Each point finds its four pixels and
-// their weights once (Corners) and then walks the channels. Places are computed in double: in float
-// a coordinate of 100 px is only good to 1e-5 px, the largest error of the whole operation. Jitter
-// moves a point by a fraction of a cell along both vectors, from a counter-based generator, so that
-// backward finds the same point again. A point outside the image, or at no number at all, has no
-// corners: zeros forward, nothing backward. Backward scatters into pixels that several points share,
-// so one thread owns an image.
+// for the whole (N_r, N_a, 2) mesh that grid_sample would read. Each point finds its four pixels
+// and their weights once (Corners) and then walks the channels. Places are computed in double: in
+// float a coordinate of 100 px is only good to 1e-5 px, the largest error of the whole operation.
+// Jitter moves a point by a fraction of a cell along both vectors, from a counter-based generator,
+// so that backward finds the same point again. A point outside the image, or at no number at all,
+// has no corners: zeros forward, nothing backward. Backward scatters into pixels that several
+// points share, so one thread owns an image.
 #include "kernels.h"
 #include "philox.h"
 
@@ -19,7 +19,7 @@ struct Point {
   double cos, sin;  // of its azimuth
   double shift;     // radius = radii[i] + shift * (radii[above] - radii[below])
   int64_t below, above;
-  bool moves;       // false where the radius was clamped at 0
+  bool moves;  // false where the radius was clamped at 0
 };
 
 template <typename T>

@@ -1,13 +1,14 @@
 // Windowed attention on a polar map.
 //
-// A window is never cut out of the map: token t of window (wr, wa) is found by index arithmetic that
-// includes the shift and the wrap around the border, and its q, k and v are packed into scratch that
-// fits L1. Keys are packed transposed, (d, n), so that one query against all keys is a sum of d
-// vectors of length n and needs no horizontal operation. Along an axis that is not periodic, tokens
-// that the shift brought together across the border carry different `side` marks and do not see
-// each other. Forward keeps the log-sum-exp of each row; backward finds the probabilities from it.
-// Every token lies in one window, so qkv gradients have one writer; the bias gradient of an (image,
-// head) is summed by one thread over all windows, in order.
+// A window is never cut out of the map: token t of window (wr, wa) is found by index arithmetic
+// that includes the shift and the wrap around the border, and its q, k and v are packed into
+// scratch that fits L1. Keys are packed transposed, (d, n), so that one query against all keys is a
+// sum of d vectors of length n and needs no horizontal operation. Along an axis that is not
+// periodic, tokens that the shift brought together across the border carry different `side` marks
+// and do not see each other. Forward keeps the log-sum-exp of each row, in double since its
+// rounding would enter every probability; backward finds the probabilities from it. Every token
+// lies in one window, so qkv gradients have one writer; the bias gradient of an (image, head) is
+// summed by one thread over all windows, in order.
 #include "kernels.h"
 #include "math.h"
 
@@ -16,9 +17,9 @@ namespace {
 
 template <typename T>
 struct Shape {
-  int64_t n, d;                 // tokens of a window, head dim
+  int64_t n, d;  // tokens of a window, head dim
   int64_t windows_r, windows_a;
-  int64_t table_a, table;       // width and size of one head's bias table
+  int64_t table_a, table;  // width and size of one head's bias table
 
   explicit Shape(const WindowAttentionArgs<T>& a)
       : n(a.window_r * a.window_a),
@@ -29,29 +30,34 @@ struct Shape {
         table((2 * a.window_r - 1) * table_a) {}
 };
 
-// Scratch of one thread.
+// Scratch of one thread. Sums over up to 1024 tokens are kept in double.
 template <typename T>
 struct Scratch {
+  double *dk, *dv;  // (n, d): key and value gradients
+  double* sum;      // (d,): one query's output, or its gradient
   T *q, *k, *v;     // (n, d)
   T *kt, *vt;       // (d, n)
-  T *dk, *dv;       // (n, d): key and value gradients
   T *row, *drow;    // (n,): one query's logits or probabilities, and their gradient
-  T* dq;            // (d,)
   T* side;          // (n,): 0 to 3, see token_at
 
-  Scratch(T* base, int64_t n, int64_t d) {
-    T** pointers[] = {&q, &k, &v, &kt, &vt, &dk, &dv};
-    for (T** p : pointers) {
-      *p = base;
-      base += n * d;
-    }
-    row = base;
+  Scratch(double* base, int64_t n, int64_t d) {
+    dk = base;
+    dv = dk + n * d;
+    sum = dv + n * d;
+    q = reinterpret_cast<T*>(sum + d);
+    k = q + n * d;
+    v = k + n * d;
+    kt = v + n * d;
+    vt = kt + n * d;
+    row = vt + n * d;
     drow = row + n;
     side = drow + n;
-    dq = side + n;
   }
 
-  static int64_t size(int64_t n, int64_t d) { return 7 * n * d + 3 * n + d; }
+  static int64_t doubles(int64_t n, int64_t d) {
+    const int64_t rest = 5 * n * d + 3 * n;
+    return 2 * n * d + d + (rest * static_cast<int64_t>(sizeof(T)) + 7) / 8;
+  }
 };
 
 // The map's token under token t of a window, as an index into (R, A), and its side of the borders.
@@ -131,7 +137,7 @@ void logits(const WindowAttentionArgs<T>& a, const Shape<T>& shape, const Scratc
 }
 
 template <typename T>
-void attend(const WindowAttentionArgs<T>& a, int64_t begin, int64_t end, T* scratch) {
+void attend(const WindowAttentionArgs<T>& a, int64_t begin, int64_t end, double* scratch) {
   const Shape<T> shape(a);
   const Scratch<T> s(scratch, shape.n, shape.d);
   for (int64_t item = begin; item < end; ++item) {
@@ -147,7 +153,7 @@ void attend(const WindowAttentionArgs<T>& a, int64_t begin, int64_t end, T* scra
       logits(a, shape, s, bias, t);
       T largest = s.row[0];
       for (int64_t k = 1; k < shape.n; ++k) largest = s.row[k] > largest ? s.row[k] : largest;
-      T sum = 0;
+      double sum = 0;
       for (int64_t k = 0; k < shape.n; ++k) {
         s.row[k] = exponential(s.row[k] - largest);
         sum += s.row[k];
@@ -155,21 +161,21 @@ void attend(const WindowAttentionArgs<T>& a, int64_t begin, int64_t end, T* scra
       int side;
       const int64_t token = b * a.rings * a.sectors + token_at(a, wr, wa, t, &side);
       T* out = a.out + (token * a.heads + head) * shape.d;
-      const T inverse = 1 / sum;
-      for (int64_t c = 0; c < shape.d; ++c) out[c] = 0;
+      for (int64_t c = 0; c < shape.d; ++c) s.sum[c] = 0;
       for (int64_t k = 0; k < shape.n; ++k) {
         const T* value = s.v + k * shape.d;
-        const T weight = s.row[k] * inverse;
+        const double weight = s.row[k];
 #pragma omp simd
-        for (int64_t c = 0; c < shape.d; ++c) out[c] += weight * value[c];
+        for (int64_t c = 0; c < shape.d; ++c) s.sum[c] += weight * value[c];
       }
-      a.lse[token * a.heads + head] = largest + logarithm(sum);
+      for (int64_t c = 0; c < shape.d; ++c) out[c] = static_cast<T>(s.sum[c] / sum);
+      a.lse[token * a.heads + head] = static_cast<double>(largest) + logarithm(sum);
     }
   }
 }
 
 template <typename T>
-void attend_backward(const WindowAttentionArgs<T>& a, int64_t begin, int64_t end, T* scratch) {
+void attend_backward(const WindowAttentionArgs<T>& a, int64_t begin, int64_t end, double* scratch) {
   const Shape<T> shape(a);
   const Scratch<T> s(scratch, shape.n, shape.d);
   const int64_t windows = shape.windows_r * shape.windows_a;
@@ -188,35 +194,36 @@ void attend_backward(const WindowAttentionArgs<T>& a, int64_t begin, int64_t end
         int side;
         const int64_t token = b * a.rings * a.sectors + token_at(a, wr, wa, t, &side);
         const T* grad = a.grad_out + (token * a.heads + head) * shape.d;
-        const T lse = a.lse[token * a.heads + head];
+        const double lse = a.lse[token * a.heads + head];
         // Probabilities p, their gradient dp = grad . v, and ds = p (dp - sum p dp).
         logits(a, shape, s, bias, t);
         row_times_columns(grad, s.vt, shape, s.drow);
-        T expected = 0;
+        double expected = 0;
         for (int64_t k = 0; k < shape.n; ++k) {
-          s.row[k] = exponential(s.row[k] - lse);
-          expected += s.row[k] * s.drow[k];
+          s.row[k] = exponential(static_cast<T>(s.row[k] - lse));
+          expected += static_cast<double>(s.row[k]) * s.drow[k];
         }
-        for (int64_t k = 0; k < shape.n; ++k) s.drow[k] = s.row[k] * (s.drow[k] - expected);
+        const T mean = static_cast<T>(expected);
+        for (int64_t k = 0; k < shape.n; ++k) s.drow[k] = s.row[k] * (s.drow[k] - mean);
         for (int64_t kr = 0; kr < a.window_r; ++kr) {
           double* grads = grad_bias + bias_index(a, shape, t, kr);
           for (int64_t ka = 0; ka < a.window_a; ++ka) grads[-ka] += s.drow[kr * a.window_a + ka];
         }
         const T* query = s.q + t * shape.d;
-        for (int64_t c = 0; c < shape.d; ++c) s.dq[c] = 0;
+        for (int64_t c = 0; c < shape.d; ++c) s.sum[c] = 0;
         for (int64_t k = 0; k < shape.n; ++k) {
-          const T p = s.row[k], ds = s.drow[k] * a.scale;
+          const double p = s.row[k], ds = s.drow[k] * a.scale;
           const T* key = s.k + k * shape.d;
-          T *dk = s.dk + k * shape.d, *dv = s.dv + k * shape.d;
+          double *dk = s.dk + k * shape.d, *dv = s.dv + k * shape.d;
 #pragma omp simd
           for (int64_t c = 0; c < shape.d; ++c) {
-            s.dq[c] += ds * key[c];
+            s.sum[c] += ds * key[c];
             dk[c] += ds * query[c];
             dv[c] += p * grad[c];
           }
         }
         T* to = a.grad_qkv + (token * 3 * a.heads + head) * shape.d;
-        for (int64_t c = 0; c < shape.d; ++c) to[c] = s.dq[c];
+        for (int64_t c = 0; c < shape.d; ++c) to[c] = static_cast<T>(s.sum[c]);
       }
       for (int64_t t = 0; t < shape.n; ++t) {
         int side;
@@ -224,8 +231,8 @@ void attend_backward(const WindowAttentionArgs<T>& a, int64_t begin, int64_t end
         T* dk = a.grad_qkv + ((token * 3 + 1) * a.heads + head) * shape.d;
         T* dv = dk + a.heads * shape.d;
         for (int64_t c = 0; c < shape.d; ++c) {
-          dk[c] = s.dk[t * shape.d + c];
-          dv[c] = s.dv[t * shape.d + c];
+          dk[c] = static_cast<T>(s.dk[t * shape.d + c]);
+          dv[c] = static_cast<T>(s.dv[t * shape.d + c]);
         }
       }
     }
@@ -235,13 +242,13 @@ void attend_backward(const WindowAttentionArgs<T>& a, int64_t begin, int64_t end
 }  // namespace
 
 int64_t window_attention_scratch(const WindowAttentionArgs<float>& args) {
-  return Scratch<float>::size(args.window_r * args.window_a, args.head_dim);
+  return Scratch<float>::doubles(args.window_r * args.window_a, args.head_dim);
 }
 int64_t window_attention_scratch(const WindowAttentionArgs<double>& args) {
-  return Scratch<double>::size(args.window_r * args.window_a, args.head_dim);
+  return Scratch<double>::doubles(args.window_r * args.window_a, args.head_dim);
 }
 void window_attention(const WindowAttentionArgs<float>& args, int64_t begin, int64_t end,
-                      float* scratch) {
+                      double* scratch) {
   attend(args, begin, end, scratch);
 }
 void window_attention(const WindowAttentionArgs<double>& args, int64_t begin, int64_t end,
@@ -249,7 +256,7 @@ void window_attention(const WindowAttentionArgs<double>& args, int64_t begin, in
   attend(args, begin, end, scratch);
 }
 void window_attention_backward(const WindowAttentionArgs<float>& args, int64_t begin, int64_t end,
-                               float* scratch) {
+                               double* scratch) {
   attend_backward(args, begin, end, scratch);
 }
 void window_attention_backward(const WindowAttentionArgs<double>& args, int64_t begin, int64_t end,

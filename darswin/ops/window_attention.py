@@ -80,7 +80,7 @@ def _fake(qkv, bias, window, shift, periodic, scale):
     batch, rings, sectors, _, heads, head_dim = qkv.shape
     return (
         qkv.new_empty((batch, rings, sectors, heads * head_dim)),
-        qkv.new_empty((batch, rings, sectors, heads)),
+        qkv.new_empty((batch, rings, sectors, heads), dtype=torch.float64),  # log-sum-exp
     )
 
 
