@@ -188,7 +188,8 @@ def stack(lenses: Sequence[Lens]) -> Lens:
     """One batch of all the lenses of a sequence, which must be of one model.
 
     Raises:
-        TypeError: several models. ValueError: none at all, or principal points given for only some.
+        TypeError: several models.
+        ValueError: no lens, polynomials of several degrees, or principal points for only some.
     """
     lenses = list(lenses)
     if not lenses:
@@ -201,6 +202,9 @@ def stack(lenses: Sequence[Lens]) -> Lens:
     tensors = {}
     for name in lenses[0]._names():
         values = [getattr(lens, name) for lens in lenses]
+        if values[0] is not None and len({value.shape[1:] for value in values}) > 1:
+            shapes = sorted({tuple(value.shape[1:]) for value in values})
+            raise ValueError(f"stack needs {name} of one degree, got {shapes}")
         tensors[name] = None if values[0] is None else torch.cat(values)
     return lenses[0]._from_tensors(tensors)
 

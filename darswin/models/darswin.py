@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-import torch
 from torch import Tensor, nn
 
 from darswin.grid import Placement, PolarGrid, Spacing, polar_grid
@@ -197,7 +196,7 @@ class DarSwin(nn.Module):
             jitter=0.0 if compat else jitter,
             grid=official.grid if compat else polar_grid,
         )
-        rates = torch.linspace(0, drop_path_rate, sum(depths)).tolist()
+        rates = [drop_path_rate * k / max(sum(depths) - 1, 1) for k in range(sum(depths))]
         self.stages = nn.ModuleList()
         for index, (plan, depth, heads) in enumerate(zip(plans, depths, num_heads, strict=True)):
             before = sum(depths[:index])

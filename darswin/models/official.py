@@ -56,13 +56,14 @@ class OfficialPolynomial(Lens):
     def project(self, theta: Number) -> Tensor:
         theta, radius = self._aligned(theta, "radius")
         x, angles = self._table()
-        flat = theta.expand(torch.broadcast_shapes(theta.shape, radius.shape)).flatten(1)
+        shape = torch.broadcast_shapes(theta.shape, radius.shape)
+        flat = theta.expand(shape).reshape(len(self), -1)
         above = torch.searchsorted(angles.contiguous(), flat.contiguous(), right=True)
         above = above.clamp(1, len(x) - 1)
         low, high = angles.gather(1, above - 1), angles.gather(1, above)
         fraction = (flat - low) / (high - low)
         rho = x[above - 1] + fraction * (x[above] - x[above - 1])
-        return rho.reshape(radius.shape[:1] + theta.shape[1:]) * radius
+        return rho.reshape(shape) * radius
 
     def unproject(self, radius: Number) -> Tensor:
         radius, full = self._aligned(radius, "radius")

@@ -1,0 +1,127 @@
+"""The compiled module: its tiers, what it links, and what happens when it is not there."""
+
+import os
+import subprocess
+import sys
+import sysconfig
+from pathlib import Path
+
+import pytest
+import torch
+
+from darswin import _C
+from darswin.ops import _library, polar_sample
+
+ROOT = Path(__file__).parent.parent
+OBJECTS = ROOT / "build" / f"cmake-{sysconfig.get_config_var('SOABI')}" / "CMakeFiles"
+
+
+def test_the_tier_in_use_is_the_one_asked_for():
+    asked = os.environ.get("ATEN_CPU_CAPABILITY", _C.tiers()[-1])
+    assert _C.tier() == {"default": "generic"}.get(asked, asked)
+
+
+def test_tiers_of_this_machine():
+    capability = torch.backends.cpu.get_cpu_capability()
+    expected = {"DEFAULT": 1, "AVX2": 2, "AVX512": 3}.get(capability, 1)
+    if "ATEN_CPU_CAPABILITY" in os.environ:
+        assert len(_C.tiers()) >= expected
+    else:
+        assert len(_C.tiers()) == expected
+
+
+@pytest.mark.parametrize(
+    ("asked", "expected"),
+    [("default", "generic"), ("avx2", "avx2"), ("avx512", "avx512"), ("nonsense", None)],
+)
+def test_environment_chooses_the_tier_at_load(asked, expected):
+    code = "from darswin import _C; print(_C.tier())"
+    environment = dict(os.environ, ATEN_CPU_CAPABILITY=asked)
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True
+    )
+    best = _C.tiers()[-1]
+    assert done.stdout.strip() == (expected if expected in _C.tiers() else best)
+
+
+def test_tiers_can_be_forced_and_agree():
+    before = _C.tier()
+    image, radii = torch.randn(1, 3, 40, 40), torch.linspace(0, 20, 32)[None]
+    azimuths, center = torch.linspace(0, 6, 48), torch.tensor([[19.5, 19.5]])
+    results = []
+    try:
+        for tier in _C.tiers():
+            _C.set_tier(tier)
+            assert _C.tier() == tier
+            results.append(polar_sample(image, radii, azimuths, center, patch=(4, 4), jitter=0.5))
+    finally:
+        _C.set_tier(before)
+    for other in results[1:]:
+        torch.testing.assert_close(other, results[0], rtol=1e-5, atol=1e-5)
+    with pytest.raises(ValueError, match="tier must be one that .* got 'sse9'"):
+        _C.set_tier("sse9")
+
+
+def test_build_info():
+    info = _C.build_info()
+    assert info["cxx_standard"] >= 202002 and info["openmp"] >= 201511
+    assert "stable" in info["torch_abi"]
+
+
+def symbols(file: Path, *options: str) -> list[str]:
+    out = subprocess.run(
+        ["nm", "-C", *options, str(file)], capture_output=True, text=True, check=True
+    )
+    return out.stdout.splitlines()
+
+
+def test_no_inline_function_leaks_from_a_tier():
+    # A weak symbol compiled with AVX could be the copy that the linker keeps for every CPU.
+    objects = sorted(OBJECTS.glob("kernels_*.dir/csrc/kernels/*.o"))
+    assert len(objects) == 3 * len({path.parts[-4] for path in objects}) >= 3
+    for path in objects:
+        weak = [line for line in symbols(path) if line.split()[-2:-1] and " W " in f" {line} "]
+        assert not weak, f"{path.name}: {weak}"
+
+
+def test_the_module_needs_no_unstable_symbol_of_torch():
+    undefined = symbols(Path(_C.__file__), "-D", "--undefined-only")
+    assert not [line for line in undefined if "at::" in line or "c10::" in line]
+    assert [line for line in undefined if "aoti_torch" in line or "torch_library" in line]
+
+
+def test_the_module_holds_no_path_of_the_build_machine():
+    dynamic = subprocess.run(
+        ["readelf", "-d", _C.__file__], capture_output=True, text=True, check=True
+    ).stdout
+    assert "RPATH" not in dynamic and "RUNPATH" not in dynamic
+    needed = [line for line in dynamic.splitlines() if "NEEDED" in line]
+    assert any("libtorch_cpu.so" in line for line in needed)
+    assert not any("/" in line.split("[")[1] for line in needed)
+
+
+def test_a_missing_module_is_explained(monkeypatch):
+    monkeypatch.setitem(sys.modules, "darswin._C", None)
+    with pytest.raises(ImportError) as caught:
+        _library.load_extension()
+    message = str(caught.value)
+    assert "darswin/_C" in message and torch.__version__ in message and "torch>=2.10" in message
+    assert "make build" in message and "pip install" in message
+    assert isinstance(caught.value.__cause__, ImportError)
+
+
+def test_a_broken_module_names_its_file(tmp_path):
+    package = tmp_path / "darswin"
+    package.mkdir()
+    for name in ("__init__.py", "ops"):
+        (package / name).symlink_to(ROOT / "darswin" / name)
+    suffix = sysconfig.get_config_var("EXT_SUFFIX")
+    (package / f"_C{suffix}").write_bytes(b"not a library")
+    code = "import darswin.ops"
+    (package / "__init__.py").unlink()
+    (package / "__init__.py").write_text("")
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True
+    )
+    assert done.returncode != 0
+    assert f"_C{suffix}" in done.stderr and "make build" in done.stderr

@@ -1,0 +1,238 @@
+import copy
+import math
+import pickle
+
+import pytest
+import torch
+from torch.utils import _pytree as pytree
+from torch.utils.data import DataLoader, Dataset
+
+from darswin.lens import Perspective, Polynomial, Spherical, stack
+
+f64 = torch.float64
+
+# Four lenses of each model, in float64; the last ones reach far.
+LENSES = {
+    "perspective": Perspective(torch.tensor([1.5, 20.0, 300.0, 40.0], dtype=f64),
+                               torch.tensor([1.52, 1.0, 0.3, 1.57], dtype=f64)),
+    "spherical": Spherical(torch.tensor([0.0, 0.35, 1.0, 2.2134], dtype=f64), 30.0,
+                           torch.tensor([1.55, 1.9, 3.1, 2.0], dtype=f64)),
+    "polynomial": Polynomial(
+        torch.tensor([[339.749, -31.988, 48.275, -7.201], [342.457, -22.4772, 28.5462, 1.78203],
+                      [1.0, 0.0, 0.0, 0.0], [0.01, 0.0, 5.0, 0.0]], dtype=f64),
+        torch.tensor([1.96, 1.9, 3.1, 1.2], dtype=f64)),
+    "polynomial of degree 1": Polynomial(torch.tensor([[20.0]] * 4, dtype=f64), 2.0),
+    "polynomial of degree 9": Polynomial(
+        torch.tensor([[30.0, 0, -1.1, 0, 0.4, 0, -0.05, 0, 0.003]] * 4, dtype=f64), 2.5),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", LENSES)
+def test_unproject_is_the_inverse_to_1e_9(name):
+    lens = LENSES[name]
+    fractions = torch.cat((torch.tensor([1e-12, 1e-6, 1e-3], dtype=f64),
+                           torch.linspace(0.01, 1, 500, dtype=f64)))  # fmt: skip
+    theta = lens.theta_max[:, None] * fractions
+    torch.testing.assert_close(lens.unproject(lens.project(theta)), theta, rtol=1e-9, atol=0)
+    radius = lens.r_max[:, None] * fractions
+    torch.testing.assert_close(lens.project(lens.unproject(radius)), radius, rtol=1e-9, atol=0)
+    assert (lens.unproject(0.0) == 0).all() and (lens.project(0.0) == 0).all()
+
+
+@pytest.mark.parametrize("name", LENSES)
+def test_project_rises_beyond_90_degrees_where_the_model_does(name):
+    lens = LENSES[name]
+    steps = torch.linspace(0, 1, 2001, dtype=f64)
+    assert (lens.project(lens.theta_max[:, None] * steps).diff(dim=1) > 0).all()
+    if name != "perspective":
+        assert (lens.theta_max > math.pi / 2).any()
+
+
+@pytest.mark.parametrize(
+    ("coefficients", "theta_deg", "radius"),
+    [  # valeoai/WoodScape front.json and SynWoodScape FV
+        ((339.749, -31.988, 48.275, -7.201), (10, 45, 75, 90, 95),
+         (58.573, 267.754, 477.055, 598.013, 641.012)),
+        ((341.725, -26.4448, 32.7864, 0.50499), (10, 45, 75, 90, 95),
+         (59.012, 268.154, 477.025, 601.678, 647.167)),
+    ],
+)  # fmt: skip
+def test_polynomial_gives_woodscape_radii(coefficients, theta_deg, radius):
+    lens = Polynomial(coefficients, math.radians(112))
+    theta = torch.deg2rad(torch.tensor(theta_deg, dtype=torch.float32))
+    torch.testing.assert_close(
+        lens.project(theta), torch.tensor(radius), rtol=0, atol=2e-3
+    )
+
+
+def test_spherical_has_the_papers_focal_lengths():
+    # The circle fills a 64 px image at a field of view of 174.63° (released data).
+    xi = torch.tensor([0.0, 0.05, 0.2, 0.35, 0.5, 0.7, 0.93, 1.0], dtype=f64)
+    lens = Spherical.from_fov(xi, 3.0479112779, 32.0)
+    expected = [1.5, 3.102, 7.907, 12.712, 17.518, 23.925, 31.293, 33.535]
+    torch.testing.assert_close(lens.focal, torch.tensor(expected, dtype=f64), rtol=0, atol=1e-3)
+    torch.testing.assert_close(lens.r_max, torch.full((8,), 32.0, dtype=f64))
+
+
+def test_spherical_is_perspective_at_0_and_stereographic_at_1():
+    theta = torch.linspace(0, 1.4, 50, dtype=f64)
+    flat, round_ = (Spherical(torch.tensor(x, dtype=f64), 10.0, 1.5) for x in (0.0, 1.0))
+    torch.testing.assert_close(flat.project(theta), 10 * torch.tan(theta))
+    torch.testing.assert_close(round_.project(theta), 10 * torch.tan(theta / 2))
+    torch.testing.assert_close(
+        Perspective.from_fov(2.8, 7.0).r_max, torch.tensor([7.0]), rtol=1e-5, atol=0
+    )
+
+
+def test_radii_where_nothing_lands_are_nan():
+    assert Spherical(2.0, 10.0, 1.5).unproject(1e3).isnan().all()
+    polynomial = Polynomial([20.0, 1.0], 1.5)
+    outside = polynomial.unproject(torch.tensor([-1.0, 1e3, math.nan, math.inf]))
+    assert outside.isnan().all()
+
+
+@pytest.mark.parametrize("name", LENSES)
+def test_gradients_of_both_directions(name):
+    lens = LENSES[name]
+    tensors = [getattr(lens, n).clone().requires_grad_() for n in lens._names() if n != "center"]
+    names = [n for n in lens._names() if n != "center"]
+    part = torch.linspace(0.1, 0.9, 4, dtype=f64)
+
+    def run(x, *values, direction="project"):
+        made = lens.replace(**dict(zip(names, values, strict=True)))
+        return getattr(made, direction)(x)
+
+    theta = (lens.theta_max[:, None] * part).requires_grad_()
+    assert torch.autograd.gradcheck(run, (theta, *tensors))
+    radius = lens.project(theta).detach().requires_grad_()
+    # gradcheck moves θ_max too, which no inverse depends on.
+    assert torch.autograd.gradcheck(
+        lambda x, *values: run(x, *values, direction="unproject"), (radius, *tensors)
+    )
+
+
+def test_a_parameter_can_be_learned():
+    xi = torch.nn.Parameter(torch.tensor(0.3))
+    lens = Spherical(xi, 10.0, 1.4)
+    lens.project(torch.tensor([0.5, 1.0])).sum().backward()
+    assert xi.grad is not None and xi.grad < 0
+    coefficients = torch.nn.Parameter(torch.tensor([20.0, 1.0]))
+    Polynomial(coefficients, 1.4).unproject(torch.tensor([5.0, 10.0])).sum().backward()
+    assert (coefficients.grad < 0).all()
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: Perspective(0.0, 1.0), "focal must be"),
+        (lambda: Perspective(-3.0, 1.0), r"focal must be .* got -3.0"),
+        (lambda: Perspective(math.inf, 1.0), "focal must be"),
+        (lambda: Perspective(1.0, math.pi / 2 + 1e-3), "theta_max must be below π/2"),
+        (lambda: Perspective(1.0, 0.0), r"theta_max must be in \(0, π\)"),
+        (lambda: Perspective(1.0, math.nan), "theta_max must be"),
+        (lambda: Spherical(-0.1, 1.0, 1.0), r"xi must be .* got -0.1"),
+        (lambda: Spherical(math.nan, 1.0, 1.0), "xi must be"),
+        (lambda: Spherical(0.5, 0.0, 1.0), "focal must be"),
+        (lambda: Spherical(0.0, 1.0, 1.6), "theta_max must be where r still rises"),
+        (lambda: Spherical(0.5, 1.0, 2.2), "theta_max must be where r still rises"),
+        (lambda: Spherical(2.0, 1.0, 2.2), "theta_max must be where r still rises"),
+        (lambda: Spherical([0.1, 0.2], [1.0, 2.0, 3.0], 1.0), "agree in the number of lenses"),
+        (lambda: Spherical([0.1, -0.2], 1.0, 1.0), r"xi must be .* got -0.2"),
+        (lambda: Spherical([[0.1]], 1.0, 1.0), r"xi must be a number or \(N,\)"),
+        (lambda: Polynomial([1.0, -5.0], 1.0), "coefficients must be such that r rises"),
+        (lambda: Polynomial([0.0, 1.0], 1.0), "coefficients must be such that r rises"),
+        (lambda: Polynomial([1.0, math.nan], 1.0), "coefficients must be finite"),
+        (lambda: Polynomial(1.0, 1.0), r"coefficients must be \(K,\) or \(N, K\)"),
+        (lambda: Polynomial([1.0], 3.2), r"theta_max must be in \(0, π\)"),
+        (lambda: Perspective(1.0, 1.0, center=[1.0, 2.0, 3.0]), "center must be"),
+        (lambda: Perspective(1.0, 1.0, center=3.0), r"center must be \(K,\) or \(N, K\)"),
+        (lambda: Perspective.from_fov(3.2, 10.0), "focal must be"),  # tan(θ_max) < 0
+        (lambda: Spherical.from_fov(0.5, 2.0, -1.0), "focal must be"),
+    ],
+)
+def test_a_parameter_out_of_range_is_named(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+def test_wrong_types():
+    with pytest.raises(TypeError, match="focal must be a number or a tensor, got 'wide'"):
+        Perspective("wide", 1.0)
+    with pytest.raises(TypeError, match="xi must be a number"):
+        Spherical(object(), 1.0, 1.0)
+
+
+def test_dtype_and_precision():
+    assert Spherical(0.3, 1.3, 1.0).focal.dtype == torch.float32
+    lens = Spherical(torch.tensor(0.3, dtype=f64), 1.3, 1.0)
+    assert lens.focal.dtype == f64 and lens.focal.item() == 1.3  # not rounded to float32 first
+    assert lens.to(torch.float32).xi.dtype == torch.float32
+    assert lens.to("meta").focal.device.type == "meta"
+
+
+def test_shapes_of_project():
+    one, many = Spherical(0.3, 10.0, 1.0), Spherical([0.3, 0.4, 0.5], 10.0, 1.0)
+    assert one.project(0.5).shape == (1,) and many.project(0.5).shape == (3,)
+    assert one.project(torch.zeros(7)).shape == (7,)
+    assert one.project(torch.zeros(7, 2)).shape == (7, 2)
+    assert many.project(torch.zeros(1, 5)).shape == (3, 5)
+    assert many.unproject(torch.zeros(3, 5, 2)).shape == (3, 5, 2)
+    for direction in (many.project, many.unproject):
+        with pytest.raises(ValueError, match=r"number of lenses, 3 or 1, got shape \(5,\)"):
+            direction(torch.zeros(5))
+
+
+def test_indexing_and_stacking():
+    lens = Spherical([0.0, 0.2, 0.4], [1.0, 2.0, 3.0], 1.2, center=[[1.0, 2.0]] * 3)
+    assert len(lens) == 3 and len(lens[1]) == 1 and lens[1].focal.item() == 2.0
+    assert lens[-1].xi.item() == pytest.approx(0.4)
+    assert lens[:2].xi.tolist() == pytest.approx([0.0, 0.2])
+    assert lens[torch.tensor([2, 0])].focal.tolist() == [3.0, 1.0]
+    assert lens[torch.tensor([True, False, True])].focal.tolist() == [1.0, 3.0]
+    with pytest.raises(IndexError):
+        lens[3]
+    again = stack([lens[k] for k in range(3)])
+    assert torch.equal(again.xi, lens.xi) and torch.equal(again.center, lens.center)
+    assert [x.focal.item() for x in lens] == [1.0, 2.0, 3.0]
+    assert len(lens[0].expand(5)) == 5
+    with pytest.raises(ValueError, match="cannot expand"):
+        lens.expand(4)
+    with pytest.raises(ValueError, match="at least one"):
+        stack([])
+    with pytest.raises(TypeError, match=r"one model, got \['Perspective', 'Spherical'\]"):
+        stack([lens[0], Perspective(1.0, 1.0)])
+    with pytest.raises(ValueError, match="center for all"):
+        stack([lens[0], Spherical(0.1, 1.0, 1.0)])
+    with pytest.raises(ValueError, match="degree"):
+        stack([Polynomial([1.0], 1.0), Polynomial([1.0, 0.1], 1.0)])
+
+
+def test_principal_point():
+    lens = Spherical(0.1, 10.0, 1.0)
+    assert lens.center_in((5, 8)).tolist() == [[3.5, 2.0]]  # (H, W) in, (x, y) out
+    assert Spherical(0.1, 10.0, 1.0, center=[3.0, 4.0]).center_in((5, 8)).tolist() == [[3.0, 4.0]]
+
+
+class Lenses(Dataset):
+    def __len__(self):
+        return 5
+
+    def __getitem__(self, index):
+        return {"image": torch.zeros(1), "lens": Spherical.from_fov(index / 5, 2.6, 16.0)}
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_a_dataloader_batches_lenses(workers):
+    batches = list(DataLoader(Lenses(), batch_size=3, num_workers=workers))
+    assert [len(b["lens"]) for b in batches] == [3, 2]
+    assert batches[1]["lens"].xi.tolist() == pytest.approx([0.6, 0.8])
+
+
+@pytest.mark.parametrize("name", LENSES)
+def test_pickle_copy_and_pytree(name):
+    lens = LENSES[name]
+    for other in (pickle.loads(pickle.dumps(lens)), copy.deepcopy(lens)):
+        assert torch.equal(other.r_max, lens.r_max)
+    leaves, spec = pytree.tree_flatten(lens)
+    assert torch.equal(pytree.tree_unflatten(leaves, spec).r_max, lens.r_max)
+    assert type(lens).__name__ in repr(lens)
