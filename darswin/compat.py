@@ -109,7 +109,12 @@ def _renamed(key: str) -> str:
         stage = int(index) + rest.startswith("downsample.")
         key = f"stages.{stage}.{rest}"
     # There a goes with the cosine and b with the sine; r is the radius and p the azimuth.
-    for theirs, ours in (("a_r", "b_theta"), ("b_r", "a_theta"), ("a_p", "b_phi"), ("b_p", "a_phi")):
+    for theirs, ours in (
+        ("a_r", "b_theta"),
+        ("b_r", "a_theta"),
+        ("a_p", "b_phi"),
+        ("b_p", "a_phi"),
+    ):
         if key.endswith(f".attn.{theirs}"):
             return key.removesuffix(theirs) + f"position_bias.{ours}"
     return key

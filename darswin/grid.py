@@ -1,4 +1,4 @@
-"""The polar grid: which rings a lens's image is cut into, and where the samples of each patch stand.
+"""The polar grid: the rings that a lens's image is cut into, and the samples of each patch.
 
 Rings and samples are each split into equal steps of some function of θ, the *spacing*:
 

@@ -1,4 +1,4 @@
-"""The layers of DarSwin. A polar map is (B, R, A, D), channels last, from the embedding to the head."""
+"""The layers of DarSwin. A polar map is (B, R, A, D) from the embedding to the head."""
 
 import math
 from collections.abc import Callable
@@ -94,7 +94,7 @@ class PolarSample(nn.Module):
 
 
 def check_images(images: Tensor, lens: Lens) -> None:
-    """TypeError or ValueError unless images are (B, C, H, W) and there is a lens for each, or one."""
+    """TypeError or ValueError unless images are (B, C, H, W) with a lens for each, or one."""
     if not isinstance(images, Tensor):
         raise TypeError(f"images must be a tensor, got {type(images).__name__}")
     if images.dim() != 4:
@@ -308,7 +308,7 @@ def radial_positions(lens: Lens, grid: PolarGrid, rings: int, kind: PositionBias
 
 
 class DropPath(nn.Module):
-    """Stochastic depth: in training, drops a residual branch for whole images with probability p."""
+    """Stochastic depth: in training, drops a branch for whole images with probability p."""
 
     def __init__(self, p: float = 0.0):
         super().__init__()

@@ -1,14 +1,14 @@
 """Lenses: how far from the principal point, r, a ray at incident angle θ lands, and back.
 
-Every lens is radially symmetric and a batch: its parameters are tensors with one entry a lens, and a
-plain number makes a batch of one. Parameters may require gradients; `project` and `unproject` are
+Every lens is radially symmetric and a batch: its parameters are tensors with one entry a lens, and
+a plain number makes a batch of one. Parameters may require gradients; `project` and `unproject` are
 differentiable in them. Angles are radians, lengths pixels.
 """
 
 import copy
 import math
-from functools import reduce
 from collections.abc import Sequence
+from functools import reduce
 from typing import ClassVar, Self
 
 import torch
@@ -27,11 +27,12 @@ class Lens:
         point. Pixel centres are integers, x to the right and y down; `center` is (x, y) in pixels,
         and None means the middle of whatever image the lens is used with.
 
-    Indexing gives lenses (`lens[3]` is a batch of one), `len` counts them, `stack` joins them, and a
-    DataLoader batches a dataset's lenses like its tensors.
+    Indexing gives lenses (`lens[3]` is a batch of one), `len` counts them, `stack` joins them, and
+    a DataLoader batches a dataset's lenses like its tensors.
     """
 
     parameters: ClassVar[tuple[str, ...]]
+    theta_limit: ClassVar[float] = math.pi
     theta_max: Tensor
     center: Tensor | None
 
@@ -69,7 +70,8 @@ class Lens:
             setattr(self, name, None if tensor is None else tensor.expand(count, *tensor.shape[1:]))
         if center is not None and self.center.shape[1] != 2:
             raise ValueError(f"center must be (x, y) or (N, 2), got {tuple(self.center.shape)}")
-        self._require("theta_max", (self.theta_max > 0) & (self.theta_max < math.pi), "in (0, π)")
+        self._require("theta_max", self.theta_max > 0, "greater than 0")
+        self._require("theta_max", self.theta_max < self.theta_limit, "below π")
         self._validate()
 
     def _validate(self) -> None:
@@ -276,13 +278,13 @@ class Spherical(Lens):
     xi: Tensor
     focal: Tensor
 
-    def __init__(
-        self, xi: Number, focal: Number, theta_max: Number, center: Number | None = None
-    ):
+    def __init__(self, xi: Number, focal: Number, theta_max: Number, center: Number | None = None):
         super().__init__(theta_max, center, xi=xi, focal=focal)
 
     @classmethod
-    def from_fov(cls, xi: Number, fov: Number, radius: Number, center: Number | None = None) -> Self:
+    def from_fov(
+        cls, xi: Number, fov: Number, radius: Number, center: Number | None = None
+    ) -> Self:
         """The lens of ξ whose full field of view `fov` (rad) fills a circle of `radius` px."""
         t = _as_tensors({"xi": xi, "fov": fov, "radius": radius})
         theta_max = t["fov"] / 2

@@ -141,7 +141,9 @@ def main() -> None:
         if name == "DarSwin-A":
             draw(model, scans[unseen[0]], args.out / "partition.png")
 
-    print(f"\nAccuracy (%), trained on ξ in {list(LEVELS['low'])}, {len(unseen)} test images a lens")
+    print(
+        f"\nAccuracy (%), trained on ξ in {list(LEVELS['low'])}, {len(unseen)} test images a lens"
+    )
     print("ξ".ljust(24) + "".join(f"{xi:7.1f}" for xi in XI))
     for name, row in table.items():
         print(name.ljust(24) + "".join(f"{value:7.1f}" for value in row))

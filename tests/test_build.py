@@ -58,7 +58,7 @@ def test_tiers_can_be_forced_and_agree():
         _C.set_tier(before)
     for other in results[1:]:
         torch.testing.assert_close(other, results[0], rtol=1e-5, atol=1e-5)
-    with pytest.raises(ValueError, match="tier must be one that .* got 'sse9'"):
+    with pytest.raises(ValueError, match=r"tier must be one that .* got 'sse9'"):
         _C.set_tier("sse9")
 
 

@@ -86,8 +86,10 @@ def test_sample_spacing_splits_each_ring_equally(sample_spacing):
         "theta": lambda t: t,
         "tan": torch.tan,
         "radius": lens.project,
-        "g": lambda t: 8.31578947368421 / 3 * (t / 1.4) ** 5
-        + 2 / 3 * (1 - (1 - (t / 1.4).clamp(max=1)) ** 2.288135593220339),
+        "g": lambda t: (
+            8.31578947368421 / 3 * (t / 1.4) ** 5
+            + 2 / 3 * (1 - (1 - (t / 1.4).clamp(max=1)) ** 2.288135593220339)
+        ),
     }[sample_spacing]
     steps = measure(theta).unflatten(1, (4, 6)).diff(dim=2)
     torch.testing.assert_close(steps, steps[..., :1].expand_as(steps), rtol=1e-6, atol=1e-9)

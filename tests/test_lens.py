@@ -60,9 +60,7 @@ def test_project_rises_beyond_90_degrees_where_the_model_does(name):
 def test_polynomial_gives_woodscape_radii(coefficients, theta_deg, radius):
     lens = Polynomial(coefficients, math.radians(112))
     theta = torch.deg2rad(torch.tensor(theta_deg, dtype=torch.float32))
-    torch.testing.assert_close(
-        lens.project(theta), torch.tensor(radius), rtol=0, atol=2e-3
-    )
+    torch.testing.assert_close(lens.project(theta), torch.tensor(radius), rtol=0, atol=2e-3)
 
 
 def test_spherical_has_the_papers_focal_lengths():
@@ -128,7 +126,7 @@ def test_a_parameter_can_be_learned():
         (lambda: Perspective(-3.0, 1.0), r"focal must be .* got -3.0"),
         (lambda: Perspective(math.inf, 1.0), "focal must be"),
         (lambda: Perspective(1.0, math.pi / 2 + 1e-3), "theta_max must be below π/2"),
-        (lambda: Perspective(1.0, 0.0), r"theta_max must be in \(0, π\)"),
+        (lambda: Perspective(1.0, 0.0), "theta_max must be greater than 0"),
         (lambda: Perspective(1.0, math.nan), "theta_max must be"),
         (lambda: Spherical(-0.1, 1.0, 1.0), r"xi must be .* got -0.1"),
         (lambda: Spherical(math.nan, 1.0, 1.0), "xi must be"),
@@ -143,7 +141,7 @@ def test_a_parameter_can_be_learned():
         (lambda: Polynomial([0.0, 1.0], 1.0), "coefficients must be such that r rises"),
         (lambda: Polynomial([1.0, math.nan], 1.0), "coefficients must be finite"),
         (lambda: Polynomial(1.0, 1.0), r"coefficients must be \(K,\) or \(N, K\)"),
-        (lambda: Polynomial([1.0], 3.2), r"theta_max must be in \(0, π\)"),
+        (lambda: Polynomial([1.0], 3.2), "theta_max must be below π"),
         (lambda: Perspective(1.0, 1.0, center=[1.0, 2.0, 3.0]), "center must be"),
         (lambda: Perspective(1.0, 1.0, center=3.0), r"center must be \(K,\) or \(N, K\)"),
         (lambda: Perspective.from_fov(3.2, 10.0), "focal must be"),  # tan(θ_max) < 0

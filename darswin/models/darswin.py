@@ -37,10 +37,10 @@ def plan_stages(
 ) -> list[StagePlan]:
     """The stages' sizes; ValueError where a window or a merging does not divide its map.
 
-    A window keeps its number of tokens when an axis runs out. DarSwin-A merges 4 along azimuth (once
-    the ring is used up, along the radius) and shifts by a quarter window along azimuth, or along the
-    radius by half where one window spans the ring. DarSwin-RA merges 2×2 and shifts by half the
-    window along both axes. No shift along an axis that one window spans.
+    A window keeps its number of tokens when an axis runs out. DarSwin-A merges 4 along azimuth,
+    once the ring is used up along the radius; it shifts by a quarter window along azimuth, or,
+    where one window spans the ring, by half along the radius. DarSwin-RA merges 2×2 and shifts by
+    half the window along both axes. There is no shift along an axis that one window spans.
     """
     plans: list[StagePlan] = []
     size, merge = (rings, sectors), None
@@ -119,8 +119,8 @@ class DarSwin(nn.Module):
     """The Distortion Aware Radial Swin Transformer.
 
     The image is cut into R × A polar patches along the lens's projection curve, each sampled at
-    S_r × S_φ points and embedded; blocks of windowed attention on the polar map follow, with merging
-    in between. Any image size works; R and A are those of the model.
+    S_r × S_φ points and embedded; blocks of windowed attention on the polar map follow, with
+    merging in between. Any image size works; R and A are those of the model.
 
     Args:
         num_classes: 0 leaves out the head. in_chans: C of the images.

@@ -1,4 +1,4 @@
-"""The two operators: compiled on CPU, in plain PyTorch on other devices or under `use_reference`."""
+"""The two operators: compiled on CPU, plain PyTorch elsewhere and under `use_reference`."""
 
 from darswin.ops._library import reference_in_use, use_reference
 from darswin.ops.polar_sample import polar_sample

@@ -1,4 +1,4 @@
-"""polar_sample: an image on a polar grid, bilinear, with jitter. Public function, fake, autograd."""
+"""polar_sample: an image on a polar grid, with jitter. Public function, fake, autograd."""
 
 from typing import Literal
 
@@ -65,9 +65,7 @@ def polar_sample(
         check_tensor(name, value, like=image)
     check_shape("image", image, "(B, C, H, W)", (None,) * 4)
     batch = image.shape[0]
-    check_shape(
-        "radii", radii, f"(B or 1, R·S_r) = ({batch} or 1, any)", (batch, None), (1, None)
-    )
+    check_shape("radii", radii, f"(B or 1, R·S_r) = ({batch} or 1, any)", (batch, None), (1, None))
     check_shape("azimuths", azimuths, "(A·S_φ,)", (None,))
     check_shape("center", center, f"(B or 1, 2) = ({batch} or 1, 2)", (batch, 2), (1, 2))
     patch = check_pair("patch", patch, lowest=1)
@@ -149,7 +147,5 @@ def _backward(ctx, grad_out):
     )  # fmt: skip
 
 
-torch.library.register_autograd(
-    "darswin::polar_sample", _backward, setup_context=_setup_context
-)
+torch.library.register_autograd("darswin::polar_sample", _backward, setup_context=_setup_context)
 _library.no_second_derivative("darswin::polar_sample")

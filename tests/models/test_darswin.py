@@ -271,7 +271,7 @@ def test_call_errors():
     model = nano()
     with pytest.raises(ValueError, match="images must have 3 channels, got 1"):
         model(torch.zeros(2, 1, 32, 32), LENS)
-    with pytest.raises(TypeError, match="lens must be a darswin.lens.Lens, got NoneType"):
+    with pytest.raises(TypeError, match=r"lens must be a darswin.lens.Lens, got NoneType"):
         model(images(), None)
     with pytest.raises(ValueError, match="one lens or one an image, 3, got 2"):
         model(images(3), LENS)

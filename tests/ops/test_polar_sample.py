@@ -86,9 +86,7 @@ def test_accuracy_rule(shape, layout):
     )
 
 
-@pytest.mark.parametrize(
-    "scale", [1e-30, 1e30], ids=["tiny pixels", "huge pixels"]
-)
+@pytest.mark.parametrize("scale", [1e-30, 1e30], ids=["tiny pixels", "huge pixels"])
 def test_accuracy_rule_at_extreme_values(scale):
     azimuths = make_inputs(rows=40, columns=32)[-1]
 
@@ -451,7 +449,7 @@ def test_without_jitter_the_seed_does_nothing():
     assert torch.equal(a, b)
 
 
-# -- the switch, autocast, errors -------------------------------------------------------------------
+# -- the switch, autocast, errors ----------------------------------------------------------------
 
 
 def test_reference_switch(monkeypatch):
@@ -484,7 +482,7 @@ def test_autocast_takes_half_precision_images_as_float32():
         out = polar_sample(half, radii, azimuths, center, patch=(3, 4))
     expected = polar_sample(half.float(), radii, azimuths, center, patch=(3, 4))
     assert torch.equal(out, expected)
-    with pytest.raises(TypeError, match="image must be float32 or float64, got torch.bfloat16"):
+    with pytest.raises(TypeError, match=r"image must be float32 or float64, got torch.bfloat16"):
         polar_sample(half, radii, azimuths, center, patch=(3, 4))
 
 

@@ -9,7 +9,14 @@ from darswin.ops import use_reference, window_attention
 
 
 def make_inputs(
-    batch=2, rings=4, sectors=8, heads=2, head_dim=5, window=(2, 4), bias_rows=1, dtype=torch.float32
+    batch=2,
+    rings=4,
+    sectors=8,
+    heads=2,
+    head_dim=5,
+    window=(2, 4),
+    bias_rows=1,
+    dtype=torch.float32,
 ):
     qkv = torch.randn(batch, rings, sectors, 3, heads, head_dim, dtype=dtype)
     bias = torch.randn(bias_rows, heads, 2 * window[0] - 1, 2 * window[1] - 1, dtype=dtype)
@@ -296,7 +303,7 @@ def test_autocast_takes_half_precision_as_float32():
     with torch.autocast("cpu", dtype=torch.bfloat16):
         out = window_attention(qkv.bfloat16(), bias, window=(2, 4))
     assert torch.equal(out, window_attention(qkv.bfloat16().float(), bias, window=(2, 4)))
-    with pytest.raises(TypeError, match="qkv must be float32 or float64, got torch.bfloat16"):
+    with pytest.raises(TypeError, match=r"qkv must be float32 or float64, got torch.bfloat16"):
         window_attention(qkv.bfloat16(), bias, window=(2, 4))
 
 

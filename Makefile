@@ -1,0 +1,52 @@
+# Every target sets up what it needs: a virtual environment in .venv with pinned packages, and the
+# compiled module beside the Python sources.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/installed
+
+.PHONY: help build demo test test-isa lint format bench dist clean
+
+help:  ## this list
+	@grep -E '^[a-z-]+:.*##' Makefile | sed -E 's/:.*## /\t/' | expand -t 12
+
+$(STAMP): requirements.txt pyproject.toml setup.py
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/pip install -q -r requirements.txt
+	PATH=$(CURDIR)/$(BIN):$$PATH $(BIN)/pip install -q --no-build-isolation --no-deps -e .
+	@touch $@
+
+build: $(STAMP)  ## (re)build darswin._C in place
+	@PATH=$(CURDIR)/$(BIN):$$PATH $(BIN)/python setup.py -q build_ext --inplace
+
+demo: build  ## train on digits through mild lenses, test on all, draw pictures (4 minutes)
+	$(BIN)/python examples/digits.py
+
+test: build  ## all tests
+	$(BIN)/python -m pytest
+
+test-isa: build  ## the operators' tests on every instruction-set tier of this machine
+	@set -e; for tier in $$($(BIN)/python -c 'from darswin import _C; print(*_C.tiers())'); do \
+	  echo "== $$tier"; \
+	  ATEN_CPU_CAPABILITY=$$(echo $$tier | sed s/generic/default/) \
+	    $(BIN)/python -m pytest tests/ops tests/test_build.py; \
+	done
+
+lint: $(STAMP)  ## ruff and clang-format, without changing anything
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/clang-format --dry-run --Werror csrc/*.cpp csrc/*.h csrc/kernels/*
+
+format: $(STAMP)  ## ruff and clang-format, in place
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+	$(BIN)/clang-format -i csrc/*.cpp csrc/*.h csrc/kernels/*
+
+bench: build  ## time both operators against their peers; nothing else should be running
+	$(BIN)/python benchmarks/operators.py
+
+dist: $(STAMP)  ## sdist and wheel in dist/
+	PATH=$(CURDIR)/$(BIN):$$PATH $(BIN)/python -m build --no-isolation --outdir dist
+
+clean:  ## remove what was built
+	rm -rf build dist darswin.egg-info darswin/_C*.so
