@@ -52,13 +52,15 @@ Point locate(const PolarSampleArgs<T>& args, int64_t b, int64_t i, int64_t j) {
   return p;
 }
 
-// The four pixels around a point: those outside the image have inside = false and are never read.
+// The four pixels around a point: those outside the image are not read and count as 0.
 template <typename T>
 struct Corners {
   int64_t offset[4];  // into one channel of the image: upper left, upper right, lower left, right
   bool inside[4];
   T weight[4];
   T right, lower;  // fraction of the way to the right and to the lower pixel
+
+  T pixel(const T* channel, int k) const { return inside[k] ? channel[offset[k]] : T(0); }
 };
 
 // False where the point touches no pixel. Written so that NaN is false.
@@ -80,23 +82,36 @@ bool find_corners(const PolarSampleArgs<T>& args, double x, double y, Corners<T>
   return true;
 }
 
-// Where point (i, j) of image b lies in the output, and the step from a channel to the next.
-struct OutputPlace {
-  int64_t base, channel_stride;
+// Where the points of one image and radius lie in the output: point (sector, s) of channel c at
+// base + sector * sector_stride + s * sample_stride + c * channel_stride.
+struct OutputRow {
+  int64_t base, sector_stride, sample_stride, channel_stride;
 };
 
 template <typename T>
-OutputPlace output_place(const PolarSampleArgs<T>& args, int64_t b, int64_t i, int64_t j) {
+OutputRow output_row(const PolarSampleArgs<T>& args, int64_t b, int64_t i) {
   if (!args.tokens) {
     const int64_t plane = args.num_radii * args.num_azimuths;
-    return {b * args.channels * plane + i * args.num_azimuths + j, plane};
+    return {b * args.channels * plane + i * args.num_azimuths, args.patch_azimuths, 1, plane};
   }
   const int64_t rings = args.num_radii / args.patch_radii;
   const int64_t sectors = args.num_azimuths / args.patch_azimuths;
-  const int64_t ring = i / args.patch_radii, sector = j / args.patch_azimuths;
-  const int64_t token = (b * rings + ring) * sectors + sector;
-  const int64_t sample = (i % args.patch_radii) * args.patch_azimuths + j % args.patch_azimuths;
-  return {(token * args.patch_radii * args.patch_azimuths + sample) * args.channels, 1};
+  const int64_t token = args.patch_radii * args.patch_azimuths * args.channels;
+  const int64_t ring = b * rings + i / args.patch_radii, row = i % args.patch_radii;
+  return {ring * sectors * token + row * args.patch_azimuths * args.channels, token, args.channels,
+          1};
+}
+
+// Calls visit(j, offset into the output) for the points of one image and radius.
+template <typename T, typename Visit>
+void for_each_point(const PolarSampleArgs<T>& args, const OutputRow& row, Visit visit) {
+  const int64_t sectors = args.num_azimuths / args.patch_azimuths;
+  for (int64_t sector = 0; sector < sectors; ++sector) {
+    for (int64_t s = 0; s < args.patch_azimuths; ++s) {
+      visit(sector * args.patch_azimuths + s,
+            row.base + sector * row.sector_stride + s * row.sample_stride);
+    }
+  }
 }
 
 template <typename T>
@@ -104,24 +119,22 @@ void sample(const PolarSampleArgs<T>& args, int64_t begin, int64_t end) {
   for (int64_t item = begin; item < end; ++item) {
     const int64_t b = item / args.num_radii, i = item % args.num_radii;
     const T* image = args.image + b * args.image_stride[0];
-    for (int64_t j = 0; j < args.num_azimuths; ++j) {
-      const OutputPlace place = output_place(args, b, i, j);
-      T* out = args.out + place.base;
+    const OutputRow row = output_row(args, b, i);
+    for_each_point(args, row, [&](int64_t j, int64_t offset) {
+      T* out = args.out + offset;
       const Point p = locate(args, b, i, j);
       Corners<T> c;
       if (!find_corners(args, p.x, p.y, c)) {
-        for (int64_t k = 0; k < args.channels; ++k) out[k * place.channel_stride] = 0;
-        continue;
+        for (int64_t k = 0; k < args.channels; ++k) out[k * row.channel_stride] = 0;
+        return;
       }
       for (int64_t k = 0; k < args.channels; ++k) {
         const T* channel = image + k * args.image_stride[1];
         T value = 0;
-        for (int q = 0; q < 4; ++q) {
-          if (c.inside[q]) value += c.weight[q] * channel[c.offset[q]];
-        }
-        out[k * place.channel_stride] = value;
+        for (int q = 0; q < 4; ++q) value += c.weight[q] * c.pixel(channel, q);
+        out[k * row.channel_stride] = value;
       }
-    }
+    });
   }
 }
 
@@ -129,21 +142,19 @@ void sample(const PolarSampleArgs<T>& args, int64_t begin, int64_t end) {
 template <typename T>
 void scatter(const PolarSampleArgs<T>& args, int64_t b, const Corners<T>& c, const T* grad,
              int64_t channel_stride, T* gx, T* gy) {
-  const T* image = args.image + b * args.image_stride[0];
   const int64_t plane = args.height * args.width;
   *gx = *gy = 0;
   for (int64_t k = 0; k < args.channels; ++k) {
     const T g = grad[k * channel_stride];
+    const int64_t channel = (b * args.channels + k) * plane;
     if (args.grad_image != nullptr) {
-      T* channel = args.grad_image + (b * args.channels + k) * plane;
       for (int q = 0; q < 4; ++q) {
-        if (c.inside[q]) channel[c.offset[q]] += c.weight[q] * g;
+        if (c.inside[q]) args.grad_image[channel + c.offset[q]] += c.weight[q] * g;
       }
     }
     if (args.grad_radii != nullptr) {
-      const T* channel = image + k * args.image_stride[1];
       T pixel[4];
-      for (int q = 0; q < 4; ++q) pixel[q] = c.inside[q] ? channel[c.offset[q]] : T(0);
+      for (int q = 0; q < 4; ++q) pixel[q] = c.pixel(args.image + channel, q);
       *gx += g * ((pixel[1] - pixel[0]) * (1 - c.lower) + (pixel[3] - pixel[2]) * c.lower);
       *gy += g * ((pixel[2] - pixel[0]) * (1 - c.right) + (pixel[3] - pixel[1]) * c.right);
     }
@@ -154,23 +165,23 @@ template <typename T>
 void sample_backward(const PolarSampleArgs<T>& args, int64_t begin, int64_t end) {
   for (int64_t b = begin; b < end; ++b) {
     for (int64_t i = 0; i < args.num_radii; ++i) {
-      for (int64_t j = 0; j < args.num_azimuths; ++j) {
+      const OutputRow row = output_row(args, b, i);
+      for_each_point(args, row, [&](int64_t j, int64_t offset) {
         const Point p = locate(args, b, i, j);
         Corners<T> c;
-        if (!find_corners(args, p.x, p.y, c)) continue;
-        const OutputPlace place = output_place(args, b, i, j);
+        if (!find_corners(args, p.x, p.y, c)) return;
         T gx, gy;
-        scatter(args, b, c, args.grad_out + place.base, place.channel_stride, &gx, &gy);
-        if (args.grad_radii == nullptr) continue;
+        scatter(args, b, c, args.grad_out + offset, row.channel_stride, &gx, &gy);
+        if (args.grad_radii == nullptr) return;
         args.grad_center[b * 2] += gx;
         args.grad_center[b * 2 + 1] += gy;
-        if (!p.moves) continue;
+        if (!p.moves) return;
         double* grad_radii = args.grad_radii + b * args.num_radii;
         const double along = gx * p.cos + gy * p.sin;
         grad_radii[i] += along;
         grad_radii[p.above] += along * p.shift;
         grad_radii[p.below] -= along * p.shift;
-      }
+      });
     }
   }
 }

@@ -113,15 +113,15 @@ def window_attention(
     # (B, n_r, n_a, heads, M_r·M_φ, d)
     q, k, v = x.permute(5, 0, 1, 3, 6, 2, 4, 7).flatten(5, 6)
     logits = q @ k.transpose(-1, -2) * scale
-    logits = logits + _pairwise_bias(bias, window)[:, None, None]
-    visible = _visible(rings, sectors, window, shift, periodic, qkv.device)
+    logits = logits + pairwise_bias(bias, window)[:, None, None]
+    visible = visible_pairs(rings, sectors, window, shift, periodic, qkv.device)
     logits = logits.masked_fill(~visible[:, :, None], -math.inf)
     out = (logits.softmax(-1) @ v).unflatten(4, (mr, ma))
     out = out.permute(0, 1, 4, 2, 5, 3, 6).reshape(batch, rings, sectors, heads * head_dim)
     return out.roll(shift, (1, 2))
 
 
-def _pairwise_bias(bias: Tensor, window: tuple[int, int]) -> Tensor:
+def pairwise_bias(bias: Tensor, window: tuple[int, int]) -> Tensor:
     """(B or 1, heads, N, N) for the N = M_r·M_φ tokens of a window."""
     r = torch.arange(window[0], device=bias.device)
     a = torch.arange(window[1], device=bias.device)
@@ -130,7 +130,7 @@ def _pairwise_bias(bias: Tensor, window: tuple[int, int]) -> Tensor:
     return bias[:, :, delta_r, delta_a].flatten(4, 5).flatten(2, 3)
 
 
-def _visible(rings, sectors, window, shift, periodic, device) -> Tensor:
+def visible_pairs(rings, sectors, window, shift, periodic, device) -> Tensor:
     """(n_r, n_a, N, N): which pairs of a window's tokens the border does not part."""
     side = torch.zeros(rings, sectors, dtype=torch.long, device=device)
     if not periodic[0]:
