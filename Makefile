@@ -29,7 +29,8 @@ test-isa: build  ## the operators' tests on every instruction-set tier of this m
 	@set -e; for tier in $$($(BIN)/python -c 'from darswin import _C; print(*_C.tiers())'); do \
 	  echo "== $$tier"; \
 	  ATEN_CPU_CAPABILITY=$$(echo $$tier | sed s/generic/default/) \
-	    $(BIN)/python -m pytest tests/ops tests/test_build.py; \
+	    $(BIN)/python -m pytest -q tests/ops \
+	      tests/test_build.py::test_the_tier_in_use_is_the_one_asked_for; \
 	done
 
 lint: $(STAMP)  ## ruff and clang-format, without changing anything

@@ -24,7 +24,7 @@ class CMakeBuild(build_ext):
         output = Path(self.get_ext_fullpath(ext.name)).resolve().parent
         build = ROOT / "build" / f"cmake-{sysconfig.get_config_var('SOABI')}"
         subprocess.check_call(
-            ["cmake", "-S", ROOT, "-B", build, "-G", "Ninja",
+            ["cmake", "--log-level=NOTICE", "-S", ROOT, "-B", build, "-G", "Ninja",
              f"-DTORCH_DIR={Path(torch.origin).parent}",
              f"-DDARSWIN_OUTPUT_DIR={output}",
              f"-DPython_EXECUTABLE={sys.executable}",

@@ -1,7 +1,7 @@
 """Trains DarSwin on handwritten digits seen through mild lenses, and tests it on all of them.
 
 The digits are scikit-learn's bundled scans. Each is taken for a perspective image with a field of
-view of 150° and warped through a Spherical lens. Two models are trained on ξ in [0.2, 0.35], the
+view of 165° and warped through a Spherical lens. Two models are trained on ξ in [0.2, 0.35], the
 paper's "low" distortion: DarSwin-A, and the same network without lens knowledge, whose rings are
 equal in pixels. Both are then tested on ξ = 0, 0.1, …, 1. Run it with `make demo`.
 """
@@ -30,7 +30,7 @@ from darswin.data import LEVELS, warp
 from darswin.models import DarSwin
 from darswin.plot import draw_accuracy, draw_grid
 
-FOV = math.radians(150)
+FOV = math.radians(165)
 SIZE = 32  # px, of the wide-angle images
 XI = [k / 10 for k in range(11)]
 MODELS = {
@@ -111,7 +111,7 @@ def draw(model: DarSwin, scan: np.ndarray, path: Path) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--epochs", type=int, default=24)
+    parser.add_argument("--epochs", type=int, default=16)
     parser.add_argument("--batch", type=int, default=48)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, default=Path("out/demo"))

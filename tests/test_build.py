@@ -125,3 +125,28 @@ def test_a_broken_module_names_its_file(tmp_path):
     )
     assert done.returncode != 0
     assert f"_C{suffix}" in done.stderr and "make build" in done.stderr
+
+
+def test_the_sdist_builds_a_wheel_that_runs_from_another_folder(tmp_path):
+    environment = dict(os.environ, PATH=f"{Path(sys.executable).parent}:{os.environ['PATH']}")
+
+    def python(*arguments, **options):
+        done = subprocess.run(
+            [sys.executable, *arguments], capture_output=True, text=True, **options
+        )
+        assert done.returncode == 0, done.stdout + done.stderr
+        return done.stdout
+
+    # `build` makes the wheel from the unpacked sdist, not from the checkout.
+    python("-m", "build", "--no-isolation", "--outdir", tmp_path, ROOT, env=environment)
+    (wheel,) = tmp_path.glob("*.whl")
+    elsewhere = tmp_path / "site"
+    python("-m", "pip", "install", "-q", "--no-deps", "--target", elsewhere, wheel)
+    code = (
+        "import torch, darswin; print(darswin.__file__, darswin.ops._library.load_extension());"
+        "lens = darswin.lens.Spherical.from_fov(0.4, 2.6, 16.0);"
+        "model = darswin.create_model('darswin_a_nano', num_classes=3);"
+        "print(model(torch.zeros(1, 3, 32, 32), lens).shape)"
+    )
+    out = python("-c", code, cwd=tmp_path, env=environment | {"PYTHONPATH": str(elsewhere)})
+    assert out.count(str(elsewhere)) == 2 and "torch.Size([1, 3])" in out
