@@ -35,16 +35,18 @@ template <typename T>
 struct Scratch {
   double *dk, *dv;  // (n, d): key and value gradients
   double* sum;      // (d,): one query's output, or its gradient
+  int64_t* token;   // (n,): places of the window's tokens in (B, R, A)
   T *q, *k, *v;     // (n, d)
   T *kt, *vt;       // (d, n)
   T *row, *drow;    // (n,): one query's logits or probabilities, and their gradient
-  T* side;          // (n,): 0 to 3, see token_at
+  T* side;          // (n,): 0 to 3, see find_tokens
 
   Scratch(double* base, int64_t n, int64_t d) {
     dk = base;
     dv = dk + n * d;
     sum = dv + n * d;
-    q = reinterpret_cast<T*>(sum + d);
+    token = reinterpret_cast<int64_t*>(sum + d);
+    q = reinterpret_cast<T*>(token + n);
     k = q + n * d;
     v = k + n * d;
     kt = v + n * d;
@@ -56,49 +58,40 @@ struct Scratch {
 
   static int64_t doubles(int64_t n, int64_t d) {
     const int64_t rest = 5 * n * d + 3 * n;
-    return 2 * n * d + d + (rest * static_cast<int64_t>(sizeof(T)) + 7) / 8;
+    return 2 * n * d + d + n + (rest * static_cast<int64_t>(sizeof(T)) + 7) / 8;
   }
 };
 
-// The map's token under token t of a window, as an index into (R, A), and its side of the borders.
+// Finds the tokens of window (wr, wa) of image b: their places in the map, and their sides of the
+// borders, 1 beyond that of the radius and 2 beyond that of the azimuth where these do not wrap.
 template <typename T>
-int64_t token_at(const WindowAttentionArgs<T>& a, int64_t wr, int64_t wa, int64_t t, int* side) {
-  int64_t r = wr * a.window_r + t / a.window_a + a.shift_r;
-  int64_t s = wa * a.window_a + t % a.window_a + a.shift_a;
-  *side = 0;
-  if (r >= a.rings) {
-    r -= a.rings;
-    if (!a.periodic_r) *side += 1;
-  }
-  if (s >= a.sectors) {
-    s -= a.sectors;
-    if (!a.periodic_a) *side += 2;
-  }
-  return r * a.sectors + s;
-}
-
-// Packs one of q, k, v (part 0, 1, 2) of a window: rows (n, d), and columns (d, n) where wanted.
-template <typename T>
-void pack(const WindowAttentionArgs<T>& a, const Shape<T>& shape, int64_t b, int64_t wr, int64_t wa,
-          int64_t head, int part, T* rows, T* columns) {
-  for (int64_t t = 0; t < shape.n; ++t) {
-    int side;
-    const int64_t token = b * a.rings * a.sectors + token_at(a, wr, wa, t, &side);
-    const T* from = a.qkv + ((token * 3 + part) * a.heads + head) * shape.d;
-    for (int64_t c = 0; c < shape.d; ++c) {
-      if (rows != nullptr) rows[t * shape.d + c] = from[c];
-      if (columns != nullptr) columns[c * shape.n + t] = from[c];
+void find_tokens(const WindowAttentionArgs<T>& a, int64_t b, int64_t wr, int64_t wa,
+                 const Scratch<T>& s) {
+  int64_t t = 0;
+  for (int64_t tr = 0; tr < a.window_r; ++tr) {
+    int64_t r = wr * a.window_r + tr + a.shift_r;
+    const bool over_r = r >= a.rings;
+    if (over_r) r -= a.rings;
+    for (int64_t ta = 0; ta < a.window_a; ++ta, ++t) {
+      int64_t sector = wa * a.window_a + ta + a.shift_a;
+      const bool over_a = sector >= a.sectors;
+      if (over_a) sector -= a.sectors;
+      s.token[t] = (b * a.rings + r) * a.sectors + sector;
+      s.side[t] = static_cast<T>((over_r && !a.periodic_r) + 2 * (over_a && !a.periodic_a));
     }
   }
 }
 
+// Packs one of q, k, v (part 0, 1, 2) of a window: rows (n, d), and columns (d, n) where wanted.
 template <typename T>
-void pack_sides(const WindowAttentionArgs<T>& a, const Shape<T>& shape, int64_t wr, int64_t wa,
-                T* sides) {
+void pack(const WindowAttentionArgs<T>& a, const Shape<T>& shape, const int64_t* tokens,
+          int64_t head, int part, T* rows, T* columns) {
   for (int64_t t = 0; t < shape.n; ++t) {
-    int side;
-    token_at(a, wr, wa, t, &side);
-    sides[t] = static_cast<T>(side);
+    const T* from = a.qkv + ((tokens[t] * 3 + part) * a.heads + head) * shape.d;
+    for (int64_t c = 0; c < shape.d; ++c) {
+      if (rows != nullptr) rows[t * shape.d + c] = from[c];
+      if (columns != nullptr) columns[c * shape.n + t] = from[c];
+    }
   }
 }
 
@@ -145,10 +138,10 @@ void attend(const WindowAttentionArgs<T>& a, int64_t begin, int64_t end, double*
     const int64_t wa = window % shape.windows_a, wr = window / shape.windows_a % shape.windows_r;
     const int64_t b = window / (shape.windows_a * shape.windows_r);
     const T* bias = a.bias + b * a.bias_stride + head * shape.table;
-    pack(a, shape, b, wr, wa, head, 0, s.q, static_cast<T*>(nullptr));
-    pack(a, shape, b, wr, wa, head, 1, static_cast<T*>(nullptr), s.kt);
-    pack(a, shape, b, wr, wa, head, 2, s.v, static_cast<T*>(nullptr));
-    pack_sides(a, shape, wr, wa, s.side);
+    find_tokens(a, b, wr, wa, s);
+    pack(a, shape, s.token, head, 0, s.q, static_cast<T*>(nullptr));
+    pack(a, shape, s.token, head, 1, static_cast<T*>(nullptr), s.kt);
+    pack(a, shape, s.token, head, 2, s.v, static_cast<T*>(nullptr));
     for (int64_t t = 0; t < shape.n; ++t) {
       logits(a, shape, s, bias, t);
       T largest = s.row[0];
@@ -158,8 +151,7 @@ void attend(const WindowAttentionArgs<T>& a, int64_t begin, int64_t end, double*
         s.row[k] = exponential(s.row[k] - largest);
         sum += s.row[k];
       }
-      int side;
-      const int64_t token = b * a.rings * a.sectors + token_at(a, wr, wa, t, &side);
+      const int64_t token = s.token[t];
       T* out = a.out + (token * a.heads + head) * shape.d;
       for (int64_t c = 0; c < shape.d; ++c) s.sum[c] = 0;
       for (int64_t k = 0; k < shape.n; ++k) {
@@ -185,14 +177,13 @@ void attend_backward(const WindowAttentionArgs<T>& a, int64_t begin, int64_t end
     double* grad_bias = a.grad_bias + item * shape.table;
     for (int64_t window = 0; window < windows; ++window) {
       const int64_t wr = window / shape.windows_a, wa = window % shape.windows_a;
-      pack(a, shape, b, wr, wa, head, 0, s.q, static_cast<T*>(nullptr));
-      pack(a, shape, b, wr, wa, head, 1, s.k, s.kt);
-      pack(a, shape, b, wr, wa, head, 2, static_cast<T*>(nullptr), s.vt);
-      pack_sides(a, shape, wr, wa, s.side);
+      find_tokens(a, b, wr, wa, s);
+      pack(a, shape, s.token, head, 0, s.q, static_cast<T*>(nullptr));
+      pack(a, shape, s.token, head, 1, s.k, s.kt);
+      pack(a, shape, s.token, head, 2, static_cast<T*>(nullptr), s.vt);
       for (int64_t e = 0; e < shape.n * shape.d; ++e) s.dk[e] = s.dv[e] = 0;
       for (int64_t t = 0; t < shape.n; ++t) {
-        int side;
-        const int64_t token = b * a.rings * a.sectors + token_at(a, wr, wa, t, &side);
+        const int64_t token = s.token[t];
         const T* grad = a.grad_out + (token * a.heads + head) * shape.d;
         const double lse = a.lse[token * a.heads + head];
         // Probabilities p, their gradient dp = grad . v, and ds = p (dp - sum p dp).
@@ -226,8 +217,7 @@ void attend_backward(const WindowAttentionArgs<T>& a, int64_t begin, int64_t end
         for (int64_t c = 0; c < shape.d; ++c) to[c] = static_cast<T>(s.sum[c]);
       }
       for (int64_t t = 0; t < shape.n; ++t) {
-        int side;
-        const int64_t token = b * a.rings * a.sectors + token_at(a, wr, wa, t, &side);
+        const int64_t token = s.token[t];
         T* dk = a.grad_qkv + ((token * 3 + 1) * a.heads + head) * shape.d;
         T* dv = dk + a.heads * shape.d;
         for (int64_t c = 0; c < shape.d; ++c) {
