@@ -1,7 +1,7 @@
 """Both operators, forward and forward+backward, against what a user would write without them.
 
-`make bench`, or `python benchmarks/operators.py [--quick]`. Writes benchmarks/results/*.json and a plot
-beside it, and prints the tables of the README.
+`make bench`, or `python benchmarks/operators.py [--quick]`. Writes benchmarks/results/*.json and a
+plot beside it, and prints the tables of the README.
 """
 
 import argparse
