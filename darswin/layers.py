@@ -194,10 +194,10 @@ class AngularRelativeBias(RelativeBias):
         self.b_phi = self._coefficients(rows_phi, heads)
 
     def _axis(self, angle: Tensor, a: Tensor, b: Tensor) -> Tensor:
-        reach = angle.shape[1] // 2
-        delta = torch.arange(-reach, reach + 1, device=angle.device) % a.shape[0]
-        angle = angle[..., None]
-        return a[delta] * torch.sin(angle) + b[delta] * torch.cos(angle)
+        reach, angle = angle.shape[1] // 2, angle[..., None]
+        # Rows Δ = -reach … reach. Slices: the gradient of an index would be a slow scatter.
+        a, b = (torch.cat((rows[len(rows) - reach :], rows[: reach + 1])) for rows in (a, b))
+        return a * torch.sin(angle) + b * torch.cos(angle)
 
 
 class FourierBias(RelativeBias):

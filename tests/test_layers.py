@@ -126,6 +126,24 @@ def test_window_attention_layer(position_bias):
         layer(x.transpose(1, 2), radial)
 
 
+@pytest.mark.parametrize("periodic_bias", [False, True])
+@pytest.mark.parametrize("position_bias", ["angular_relative", "angular"])
+def test_compiled_gradients_of_the_bias(position_bias, periodic_bias):
+    # torch 2.13's inductor miscompiles the gradient of an indexed table on CPU, wrong values and
+    # writes out of bounds (pytorch#191837): the bias must not be built by indexing.
+    layer = PolarWindowAttention(
+        16, 8, map_size=(2, 8), window=(1, 8), position_bias=position_bias,
+        periodic_bias=periodic_bias,
+    )  # fmt: skip
+    x, radial = torch.randn(2, 2, 8, 16), torch.rand(2, 3).cumsum(1)
+    layer(x, radial).square().sum().backward()
+    expected = {name: p.grad.clone() for name, p in layer.named_parameters()}
+    layer.zero_grad()
+    torch.compile(layer, fullgraph=True)(x, radial).square().sum().backward()
+    for name, parameter in layer.named_parameters():
+        torch.testing.assert_close(parameter.grad, expected[name], rtol=1e-3, atol=1e-4)
+
+
 def test_window_attention_layer_under_autocast():
     layer = PolarWindowAttention(8, 2, map_size=(2, 4), window=(2, 4))
     with torch.autocast("cpu", dtype=torch.bfloat16):
