@@ -26,7 +26,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from darswin import create_model, lens
-from darswin.data import LEVELS, warp
+from darswin.data import LEVELS, warp_map
 from darswin.models import DarSwin
 from darswin.plot import draw_accuracy, draw_grid
 
@@ -39,20 +39,16 @@ MODELS = {
 }
 
 
-def spherical(xi: float) -> lens.Spherical:
-    """The lens of ξ whose field of view fills the circle inside the image."""
-    return lens.Spherical.from_fov(xi, FOV, SIZE / 2)
-
-
 def through_lenses(scans: np.ndarray, xi: np.ndarray) -> tuple[Tensor, lens.Lens]:
     """Scans (N, 8, 8) and their ξ (N,) → images (N, 1, SIZE, SIZE) and lenses."""
     camera = lens.Perspective.from_fov(FOV, scans.shape[2] / 2)
-    lenses = [spherical(float(x)) for x in xi]
+    # The field of view fills the circle inside the image, whatever ξ is.
+    lenses = lens.Spherical.from_fov(torch.from_numpy(xi).float(), FOV, SIZE / 2)
+    maps = warp_map(camera, scans.shape[1:], lenses, (SIZE, SIZE))
     images = [
-        warp(scan, camera, one, (SIZE, SIZE), interpolation=cv2.INTER_CUBIC)
-        for scan, one in zip(scans, lenses, strict=True)
+        cv2.remap(scan, x, y, cv2.INTER_CUBIC) for scan, x, y in zip(scans, *maps, strict=True)
     ]
-    return torch.from_numpy(np.stack(images))[:, None], lens.stack(lenses)
+    return torch.from_numpy(np.stack(images))[:, None], lenses
 
 
 def train(

@@ -1,7 +1,5 @@
 """Shows an image taken with one lens as another lens would have taken it."""
 
-import math
-
 import cv2
 import numpy as np
 import torch
@@ -17,6 +15,42 @@ LEVELS = {
 }
 
 
+def warp_map(
+    source: Lens, source_size: tuple[int, int], target: Lens, size: tuple[int, int]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Where in `source`'s image each pixel of `target`'s lies: the maps of `cv2.remap`.
+
+    Convention:
+        Pixel centres are integers in both images, x to the right and y down.
+
+    Args:
+        source: one lens, or one each. source_size: (H, W) of its image.
+        target: N lenses. size: (H, W) of their images.
+
+    Returns:
+        x and y, (N, H, W) float32 each; outside the image where a ray is beyond either θ_max.
+    """
+    source, target = source.detach().to(torch.float64), target.detach().to(torch.float64)
+    height, width = size
+    y, x = torch.meshgrid(
+        torch.arange(height, dtype=torch.float64),
+        torch.arange(width, dtype=torch.float64),
+        indexing="ij",
+    )
+    cx, cy = target.center_in(size).T[..., None, None]
+    x, y = x - cx, y - cy  # (N or 1, H, W)
+    radius = torch.hypot(x, y).expand(len(target), -1, -1)
+    theta = target.unproject(radius)
+    limit = torch.minimum(source.theta_max, target.theta_max)[:, None, None]
+    seen = theta <= limit * (1 + 1e-9)  # False for NaN
+    there = source.project(torch.where(seen, theta, 0))
+    # r_source / r_target keeps the azimuth; at the axis both radii are 0.
+    ratio = there / radius.clamp(min=1e-12)
+    sx, sy = source.center_in(source_size).T[..., None, None]
+    maps = (torch.where(seen, s + d * ratio, -10) for s, d in ((sx, x), (sy, y)))
+    return tuple(m.to(torch.float32).numpy() for m in maps)
+
+
 def warp(
     image: np.ndarray,
     source: Lens,
@@ -27,34 +61,17 @@ def warp(
 ) -> np.ndarray:
     """The view of `target` on what `source` saw in `image`; black beyond either lens's θ_max.
 
-    Convention:
-        Pixel centres are integers in both images, x to the right and y down.
-
     Args:
         image: (H, W) or (H, W, C), uint8 or float32, taken with `source`.
         source, target: one lens each. size: (H, W) of the result.
         interpolation: of `cv2.remap`.
 
     Raises:
-        ValueError: more than one lens.
+        ValueError: more than one lens. See `warp_map` for many.
     """
     if len(source) != 1 or len(target) != 1:
         raise ValueError(f"warp takes one lens each, got {len(source)} and {len(target)}")
-    source, target = source.detach().to(torch.float64), target.detach().to(torch.float64)
-    height, width = size
-    cx, cy = target.center_in(size)[0].tolist()
-    y, x = np.mgrid[:height, :width].astype(np.float64)
-    x, y = x - cx, y - cy
-    radius = np.hypot(x, y)
-    theta = target.unproject(torch.from_numpy(radius)).numpy()
-    limit = min(source.theta_max.item(), target.theta_max.item())
-    seen = theta <= limit * (1 + 1e-9)  # False for NaN
-    there = source.project(torch.from_numpy(np.where(seen, theta, 0.0))).numpy()
-    sx, sy = source.center_in(image.shape[:2])[0].tolist()
-    # r_source / r_target keeps the azimuth; at the axis both radii are 0.
-    ratio = np.divide(there, radius, out=np.zeros_like(radius), where=radius > 0)
-    map_x = np.where(seen, sx + x * ratio, -math.inf).astype(np.float32)
-    map_y = np.where(seen, sy + y * ratio, -math.inf).astype(np.float32)
+    map_x, map_y = warp_map(source, image.shape[:2], target, size)
     return cv2.remap(
-        image, map_x.clip(-2), map_y.clip(-2), interpolation, borderMode=cv2.BORDER_CONSTANT
+        image, map_x[0], map_y[0], interpolation, borderMode=cv2.BORDER_CONSTANT, borderValue=0
     )

@@ -9,7 +9,7 @@ _TINY = dict(_SMALL, depths=(2, 2, 6, 2), drop_path_rate=0.1)
 _MICRO = dict(embed_dim=32, depths=(2, 2, 4, 2), num_heads=(1, 2, 4, 8), samples=(6, 6))
 _MICRO |= dict(drop_path_rate=0.05)
 # For tests and demos: 32×32 images, three stages, a minute of training on two cores.
-_NANO = dict(embed_dim=24, depths=(1, 2, 1), num_heads=(2, 4, 8), rings=8, sectors=32)
+_NANO = dict(embed_dim=24, depths=(1, 2, 1), num_heads=(1, 2, 4), rings=8, sectors=32)
 _NANO |= dict(samples=(4, 4), drop_path_rate=0.0)
 
 _MODELS: dict[str, tuple[type[nn.Module], dict]] = {

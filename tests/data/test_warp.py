@@ -2,15 +2,14 @@ import math
 
 import numpy as np
 import pytest
+import torch
 
-from darswin.data import LEVELS, warp
+from darswin.data import LEVELS, warp, warp_map
 from darswin.lens import Perspective, Polynomial, Spherical
 
 
 def wave(lens, size):
     """A smooth scene, in terms of the rays: an image of it through any lens can be computed."""
-    import torch
-
     y, x = np.mgrid[:size, :size] - (size - 1) / 2
     theta = lens.unproject(torch.from_numpy(np.hypot(x, y)).float()).numpy()
     image = 0.5 + 0.4 * np.cos(4 * theta) * np.cos(np.arctan2(y, x))
@@ -51,6 +50,16 @@ def test_beyond_the_source_is_black():
     theta = np.hypot(x, y) / 40
     assert (got[theta < math.radians(44)] == 1).all()
     assert (got[theta > math.radians(46)] == 0).all()
+
+
+def test_maps_of_many_lenses_are_those_of_each():
+    source = Perspective.from_fov(2.0, 50)
+    many = Spherical.from_fov([0.1, 0.5, 0.9], 2.0, 30, center=[[29.5, 30.0]] * 3)
+    together = warp_map(source, (100, 100), many, (60, 64))
+    for k in range(3):
+        alone = warp_map(source, (100, 100), many[k], (60, 64))
+        for a, b in zip(together, alone, strict=True):
+            assert a.shape == (3, 60, 64) and np.array_equal(a[k], b[0])
 
 
 def test_one_lens_at_a_time():
