@@ -204,7 +204,7 @@ def main() -> None:
     if not args.quick:
         path = save(results, "operators")
         plot(results, path.with_suffix(".png"))
-        print(path)
+        print(path.relative_to(path.parents[2]))
 
 
 if __name__ == "__main__":

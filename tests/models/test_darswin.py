@@ -237,6 +237,17 @@ def test_compile_fullgraph_and_export(lens):
     torch.testing.assert_close(program.module()(x, lens), model(x, lens))
 
 
+def test_compiled_training_step_with_the_default_backend():
+    model = nano(depths=(1, 2), num_heads=(1, 2), jitter=0.0)
+    x = images()
+    model(x, LENS).square().sum().backward()
+    expected = {name: p.grad.clone() for name, p in model.named_parameters()}
+    model.zero_grad()
+    torch.compile(model, fullgraph=True)(x, LENS).square().sum().backward()
+    for name, parameter in model.named_parameters():
+        torch.testing.assert_close(parameter.grad, expected[name], rtol=1e-3, atol=1e-4, msg=name)
+
+
 def test_autocast():
     model = nano().eval()
     x = images()
