@@ -9,6 +9,7 @@ import copy
 import math
 from collections.abc import Sequence
 from functools import reduce
+from numbers import Integral
 from typing import ClassVar, Self
 
 import torch
@@ -144,7 +145,7 @@ class Lens:
         return self.theta_max.shape[0]
 
     def __getitem__(self, index: int | slice | Tensor | Sequence[int]) -> Self:
-        if isinstance(index, int):
+        if isinstance(index, Integral):
             if not -len(self) <= index < len(self):
                 raise IndexError(f"index {index} is out of range for {len(self)} lenses")
             index %= len(self)

@@ -14,6 +14,13 @@ def pytest_report_header(config):
     )
 
 
+@pytest.fixture(scope="session", autouse=True)
+def inductor_cache(tmp_path_factory):
+    """An empty cache of compiled graphs: inductor's own is kept from run to run, and a graph made
+    for one ATEN_CPU_CAPABILITY does not compile under another."""
+    os.environ["TORCHINDUCTOR_CACHE_DIR"] = str(tmp_path_factory.mktemp("inductor"))
+
+
 @pytest.fixture(autouse=True)
 def seeded():
     torch.manual_seed(0)

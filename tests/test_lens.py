@@ -2,6 +2,7 @@ import copy
 import math
 import pickle
 
+import numpy as np
 import pytest
 import torch
 from torch.utils import _pytree as pytree
@@ -184,6 +185,7 @@ def test_indexing_and_stacking():
     lens = Spherical([0.0, 0.2, 0.4], [1.0, 2.0, 3.0], 1.2, center=[[1.0, 2.0]] * 3)
     assert len(lens) == 3 and len(lens[1]) == 1 and lens[1].focal.item() == 2.0
     assert lens[-1].xi.item() == pytest.approx(0.4)
+    assert len(lens[np.int64(1)]) == 1
     assert lens[:2].xi.tolist() == pytest.approx([0.0, 0.2])
     assert lens[torch.tensor([2, 0])].focal.tolist() == [3.0, 1.0]
     assert lens[torch.tensor([True, False, True])].focal.tolist() == [1.0, 3.0]

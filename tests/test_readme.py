@@ -1,0 +1,26 @@
+"""The README's code runs as it stands there."""
+
+import re
+from pathlib import Path
+
+import torch
+
+README = (Path(__file__).parent.parent / "README.md").read_text()
+
+
+def test_python_blocks():
+    blocks = re.findall(r"```python\n(.*?)```", README, flags=re.S)
+    assert len(blocks) == 2
+    scope = {}
+    with torch.no_grad():
+        for block in blocks:
+            exec(block, scope)
+    assert scope["logits"].shape == (2, 200)
+    assert scope["features"].shape == (2, 16, 1, 768)
+    assert scope["polar"].shape == (2, 3, 160, 640)
+
+
+def test_pictures_and_links_exist():
+    for target in re.findall(r"\]\(([^)#]+)\)", README):
+        if not target.startswith("http"):
+            assert (Path(__file__).parent.parent / target).is_file(), target
