@@ -14,6 +14,7 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor
 
+from darswin.inverse import inverse
 from darswin.lens import Lens
 
 Spacing = Literal["theta", "tan", "g", "radius"]
@@ -116,9 +117,10 @@ def check_grid(
 
 
 def check_tan(lens: Lens) -> None:
-    """ValueError where tan θ ends before θ_max does."""
+    """ValueError where tan θ ends before θ_max does. Compiled graphs cannot look at a value, so
+    they do not check."""
     if torch.compiler.is_compiling():
-        return  # a value cannot be looked at in a graph; eager mode has checked this lens
+        return
     largest = lens.theta_max.max().item() if len(lens) else 0.0
     if largest >= math.pi / 2:
         raise ValueError(
@@ -167,17 +169,7 @@ def _g(t: Tensor) -> Tensor:
 
 
 def _inverse_g(value: Tensor) -> Tensor:
-    """By Newton's method inside a bracket; the last step carries the gradient."""
-
     def slope(t: Tensor) -> Tensor:
         return G_C * G_B * G_N * t ** (G_N - 1) + (1 - G_C) * G_M * (1 - t) ** (G_M - 1)
 
-    with torch.no_grad():
-        low, high = torch.zeros_like(value), torch.ones_like(value)
-        t = (value / (G_C * G_B + 1 - G_C)).clamp(0, 1)
-        for _ in range(40):
-            error = _g(t) - value
-            low, high = torch.where(error < 0, t, low), torch.where(error > 0, t, high)
-            step = t - error / slope(t)
-            t = torch.where((step >= low) & (step <= high), step, (low + high) / 2)
-    return t - (_g(t) - value) / slope(t).detach()
+    return inverse(_g, slope, value, value.new_ones(()))

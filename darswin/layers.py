@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from darswin.grid import Placement, PolarGrid, Spacing, check_grid, polar_grid
 from darswin.lens import Lens
 from darswin.ops import polar_sample, window_attention
+from darswin.ops.checks import check_sampling
 
 PositionBias = Literal["angular_relative", "angular", "polar"]
 GridFunction = Callable[..., PolarGrid]
@@ -47,10 +48,7 @@ class PolarSample(nn.Module):
     ):
         super().__init__()
         check_grid(rings, sectors, samples, spacing, sample_spacing or spacing, placement)
-        if not 0 <= jitter <= 1:
-            raise ValueError(f"jitter must be in [0, 1], got {jitter}")
-        if layout not in ("tokens", "image"):
-            raise ValueError(f"layout must be 'tokens' or 'image', got {layout!r}")
+        check_sampling(jitter, layout)
         self.rings, self.sectors, self.samples = rings, sectors, tuple(samples)
         self.spacing, self.sample_spacing = spacing, sample_spacing or spacing
         self.placement, self.jitter, self.layout = placement, float(jitter), layout
@@ -283,7 +281,7 @@ class PolarWindowAttention(nn.Module):
         qkv = self.qkv(x).reshape(batch, rings, sectors, 3, self.num_heads, dim // self.num_heads)
         bias = self.position_bias(radial.to(x.device, self.proj.weight.dtype))
         out = window_attention(
-            qkv, bias.to(qkv.dtype), window=self.window, shift=self.shift, periodic=self.periodic
+            qkv, bias, window=self.window, shift=self.shift, periodic=self.periodic
         )
         return self.proj(out)
 

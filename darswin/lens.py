@@ -17,6 +17,8 @@ from torch import Tensor
 from torch.utils import _pytree as pytree
 from torch.utils.data._utils.collate import default_collate_fn_map
 
+from darswin.inverse import inverse
+
 Number = float | Sequence[float] | Tensor
 
 
@@ -351,23 +353,8 @@ class Polynomial(Lens):
 
     def unproject(self, radius: Number) -> Tensor:
         (radius,) = self._aligned(radius)
-        with torch.no_grad():
-            theta = self._solve(radius)
-        # One Newton step from the root: no change in value, and the gradients of the inverse.
-        return theta - (self.project(theta) - radius) / self._slope(theta).detach()
-
-    def _solve(self, radius: Tensor) -> Tensor:
-        """Newton's method, kept inside a bracket by bisection."""
         rank = (1,) * (radius.dim() - 1)
-        high = self.theta_max.reshape(-1, *rank).expand(torch.broadcast_shapes(
-            radius.shape, (len(self), *rank)))  # fmt: skip
-        low, end = torch.zeros_like(high), self.r_max.reshape(-1, *rank)
+        end, r_max = (t.detach().reshape(-1, *rank) for t in (self.theta_max, self.r_max))
         slack = 4 * torch.finfo(radius.dtype).eps
-        lands = (radius >= 0) & (radius <= end * (1 + slack))
-        theta = high * (radius / end).clamp(0, 1)
-        for _ in range(40):
-            error = self.project(theta) - radius
-            low, high = torch.where(error < 0, theta, low), torch.where(error > 0, theta, high)
-            step = theta - error / self._slope(theta)
-            theta = torch.where((step >= low) & (step <= high), step, (low + high) / 2)
-        return torch.where(lands, theta, torch.nan)
+        lands = (radius >= 0) & (radius <= r_max * (1 + slack))
+        return torch.where(lands, inverse(self.project, self._slope, radius, end), torch.nan)

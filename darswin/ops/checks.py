@@ -1,4 +1,7 @@
-"""The argument checks that both operators share. A message says what was expected and what came."""
+"""The argument checks that the operators and their layers share.
+
+A message says what was expected and what came.
+"""
 
 from collections.abc import Sequence
 
@@ -6,6 +9,7 @@ import torch
 from torch import Tensor
 
 DTYPES = (torch.float32, torch.float64)
+LAYOUTS = ("tokens", "image")
 
 
 def check_tensor(name: str, value: object, like: Tensor | None = None) -> None:
@@ -41,3 +45,13 @@ def check_pair(name: str, value: Sequence[int], lowest: int) -> tuple[int, int]:
         if item < lowest:
             raise ValueError(f"{name} must be at least {lowest} along both axes, got {value!r}")
     return tuple(value)
+
+
+def check_sampling(jitter: float, layout: str) -> None:
+    """TypeError or ValueError unless jitter is in [0, 1] and the layout one that there is."""
+    if layout not in LAYOUTS:
+        raise ValueError(f"layout must be one of {LAYOUTS}, got {layout!r}")
+    if not isinstance(jitter, (int, float)):
+        raise TypeError(f"jitter must be a float, got {type(jitter).__name__}")
+    if not 0 <= jitter <= 1:
+        raise ValueError(f"jitter must be in [0, 1], got {jitter}")

@@ -6,9 +6,7 @@ import torch
 from torch import Tensor
 
 from darswin.ops import _library, reference
-from darswin.ops.checks import check_pair, check_shape, check_tensor
-
-LAYOUTS = ("tokens", "image")
+from darswin.ops.checks import check_pair, check_sampling, check_shape, check_tensor
 
 
 def polar_sample(
@@ -58,7 +56,7 @@ def polar_sample(
 
     Source: DarSwin, ICCV 2023, sec. 4.3.
     """
-    if isinstance(image, Tensor) and isinstance(radii, Tensor) and isinstance(center, Tensor):
+    if isinstance(image, Tensor):
         (image,) = _library.without_autocast(image)
     check_tensor("image", image)
     for name, value in (("radii", radii), ("azimuths", azimuths), ("center", center)):
@@ -74,12 +72,7 @@ def polar_sample(
             f"patch = (S_r, S_φ) must divide (R·S_r, A·S_φ) = "
             f"({radii.shape[1]}, {azimuths.shape[0]}), got {patch}"
         )
-    if layout not in LAYOUTS:
-        raise ValueError(f"layout must be one of {LAYOUTS}, got {layout!r}")
-    if not isinstance(jitter, (int, float)):
-        raise TypeError(f"jitter must be a float, got {type(jitter).__name__}")
-    if not 0 <= jitter <= 1:
-        raise ValueError(f"jitter must be in [0, 1], got {jitter}")
+    check_sampling(jitter, layout)
     key = _seed_tensor(seed) if jitter > 0 else None
     arguments = (image, radii, azimuths, center, patch, float(jitter), key, layout == "tokens")
     if _library.compiled(image):

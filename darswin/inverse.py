@@ -1,0 +1,29 @@
+"""Inverts rising functions that have no closed inverse."""
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+Function = Callable[[Tensor], Tensor]
+
+
+def inverse(function: Function, slope: Function, value: Tensor, end: Tensor) -> Tensor:
+    """The x in [0, end] at which a function that rises from 0 takes a value.
+
+    Newton's method, kept inside a bracket by bisection. The last step is the one that carries the
+    gradients of the inverse, to `value` and to whatever `function` depends on.
+
+    Args:
+        function, slope: of x, elementwise. value: any shape. end: broadcasts to that of x.
+    """
+    with torch.no_grad():
+        last = function(end)
+        high = end.expand(torch.broadcast_shapes(value.shape, end.shape))
+        low, x = torch.zeros_like(high), high * (value / last).clamp(0, 1)
+        for _ in range(40):
+            error = function(x) - value
+            low, high = torch.where(error < 0, x, low), torch.where(error > 0, x, high)
+            step = x - error / slope(x)
+            x = torch.where((step >= low) & (step <= high), step, (low + high) / 2)
+    return x - (function(x) - value) / slope(x).detach()
