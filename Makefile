@@ -44,7 +44,8 @@ format: $(STAMP)  ## ruff and clang-format, in place
 	$(BIN)/clang-format -i csrc/*.cpp csrc/*.h csrc/kernels/*
 
 bench: build  ## time both operators against their peers; nothing else should be running
-	$(BIN)/python benchmarks/operators.py
+	$(BIN)/python benchmarks/sampling.py
+	$(BIN)/python benchmarks/attention.py
 
 dist: $(STAMP)  ## sdist and wheel in dist/
 	PATH=$(CURDIR)/$(BIN):$$PATH $(BIN)/python -m build --no-isolation --outdir dist

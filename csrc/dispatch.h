@@ -6,6 +6,10 @@
 
 namespace darswin {
 
+struct bfloat16 {
+  uint16_t bits;
+};
+
 // Point (i, j) of image b stands at center[b] + radii[b, i] * (cos, sin)(azimuths[j]).
 template <typename T>
 struct PolarSampleArgs {

@@ -8,6 +8,9 @@
 
 #include <algorithm>
 #include <cstdint>
+#include <cstdlib>
+#include <memory>
+#include <new>
 #include <vector>
 
 namespace darswin {
@@ -29,6 +32,24 @@ void parallel_ranges(int64_t count, Body&& body) {
     const int64_t end = begin + each + (thread < extra ? 1 : 0);
     if (begin < end) body(begin, end, thread);
   }
+}
+
+// This thread's working memory: at least `bytes`, aligned to cache lines, contents undefined. It is
+// kept from call to call, since fresh pages cost more than what the kernels do with them; a second
+// call of scratch() in the same thread hands out the same memory.
+inline void* scratch(size_t bytes) {
+  struct Free {
+    void operator()(void* memory) const { std::free(memory); }
+  };
+  static thread_local std::unique_ptr<void, Free> memory;
+  static thread_local size_t size = 0;
+  if (size < bytes) {
+    memory.reset();
+    size = (bytes + 4095) / 4096 * 4096;
+    memory.reset(std::aligned_alloc(64, size));
+    if (memory == nullptr) throw std::bad_alloc();
+  }
+  return memory.get();
 }
 
 // The gradient of `like`, (B or 1, ...), from one row of doubles an image: summed over the images
