@@ -10,16 +10,23 @@ struct bfloat16 {
   uint16_t bits;
 };
 
-// Point (i, j) of image b stands at center[b] + radii[b, i] * (cos, sin)(azimuths[j]).
+enum class Pixel { f32, f64, bf16, u8 };
+
+// Point (i, j) of image b stands at center[b] + radii[b, i] * (cos, sin)(azimuths[j]). T is the
+// type that is computed in: double for double pixels, else float.
 template <typename T>
 struct PolarSampleArgs {
-  const T* image;  // (B, C, H, W), any strides; backward: contiguous, as grad_image is
+  const void* image;  // (B, C, H, W), any strides
+  Pixel pixel;
   int64_t channels, height, width;
   int64_t image_stride[4];
-  const T* radii;  // (B or 1, num_radii) px
+  bool packed;            // whether images are sampled from a packed copy in cache
+  const T* pixel_scale;   // (C,): a pixel p of type u8 counts as p * scale + offset
+  const T* pixel_offset;  // (C,)
+  const T* radii;         // (B or 1, num_radii) px
   int64_t radii_stride, num_radii;
-  const double* cosines;  // (num_azimuths,)
-  const double* sines;    // (num_azimuths,)
+  const double* cosines;  // (num_azimuths,), readable for a register more
+  const double* sines;    // the same
   int64_t num_azimuths;
   const T* center;  // (B or 1, 2) px, x then y
   int64_t center_stride;
@@ -27,13 +34,44 @@ struct PolarSampleArgs {
   bool tokens;                          // layout: (B, R, A, S_r * S_phi * C), else (B, C, N_r, N_a)
   double jitter;
   uint64_t seed;
+  bool narrow;  // out and grad_out are bfloat16, else T
 
-  T* out;  // forward
+  void* out;  // forward
 
-  const T* grad_out;    // backward; a null pointer below means "not wanted"
-  T* grad_image;        // (B, C, H, W), zero on entry
-  double* grad_radii;   // (B, num_radii), zero on entry; with it goes
-  double* grad_center;  // (B, 2), zero on entry
+  const void* grad_out;  // backward
+  int64_t bands;         // into how many parts the rows of an image are cut
+  void* grad_image;      // (B, C, H, W) contiguous, of the pixel's type, zero on entry
+  double* grad_lens;     // (B, num_radii, kLensSums)
+};
+
+// What polar_sample_backward_lens sums over a row of points: d(loss)/dr, the same times the shift
+// of points that jitter moved inward and outward, and d(loss)/d(x, y).
+enum LensSum { kAlong, kInward, kOutward, kAcross, kDown, kLensSums };
+
+// The cells beside radius i, which jitter moves into: at both ends of the row the only one there
+// is.
+struct Steps {
+  int64_t below[2], above[2];  // radius = radii[i] + shift * (radii[above] - radii[below]),
+                               // [0] for negative shifts, [1] for others
+  Steps(int64_t i, int64_t count) {
+    const int64_t last = count - 1;
+    below[0] = i > 0 ? i - 1 : 0;
+    below[1] = i < last ? i : (last > 0 ? last - 1 : 0);
+    for (int side = 0; side < 2; ++side) above[side] = below[side] < last ? below[side] + 1 : last;
+  }
+};
+
+// Sampling and the linear layer behind it: out = samples of the token * weight^T + bias. Beside the
+// arguments of the sampling, whose layout is tokens and whose out and grad_out are (B, R, A, D).
+// Sizes are padded to kRowUnit values, so that rows are whole registers on every tier.
+constexpr int64_t kRowUnit = 16;
+template <typename T>
+struct PolarEmbedArgs {
+  int64_t features;     // D
+  const T* transposed;  // forward: the weight as (S_r * S_phi * C, padded D)
+  const T* bias;        // (D,) or null
+  const T* weight;      // backward: (D, padded S_r * S_phi * C)
+  T* grad_samples;      // (B, R, A, S_r * S_phi * C)
 };
 
 // Windows of a polar map; token (r, a) of the rolled map is token (r + shift_r, a + shift_a) of it.
@@ -58,10 +96,35 @@ struct WindowAttentionArgs {
 // Kernels are serial over [begin, end) of their work items; the drivers own the threads.
 template <typename T>
 struct KernelTable {
-  // item: (image, radius index)
-  void (*polar_sample)(const PolarSampleArgs<T>&, int64_t begin, int64_t end);
-  // item: image
-  void (*polar_sample_backward)(const PolarSampleArgs<T>&, int64_t begin, int64_t end);
+  // (n,) angles -> their cosines and sines, n a multiple of the lanes
+  void (*directions)(const double* angles, int64_t n, double* cosines, double* sines);
+  // bytes of scratch that each thread needs in the functions of polar_sample below
+  int64_t (*polar_sample_scratch)(const PolarSampleArgs<T>&);
+  // item: (image, ring)
+  void (*polar_sample)(const PolarSampleArgs<T>&, int64_t begin, int64_t end, void* scratch);
+  // item: (image, band)
+  void (*polar_sample_backward_image)(const PolarSampleArgs<T>&, int64_t begin, int64_t end,
+                                      void* scratch);
+  // item: (image, ring)
+  void (*polar_sample_backward_lens)(const PolarSampleArgs<T>&, int64_t begin, int64_t end,
+                                     void* scratch);
+  // (rows, columns) -> (columns, to_stride)
+  void (*transpose)(const T* from, int64_t rows, int64_t columns, T* to, int64_t to_stride);
+  // bytes of scratch that each thread needs in the functions of polar_embed below
+  int64_t (*polar_embed_scratch)(const PolarSampleArgs<T>&, const PolarEmbedArgs<T>&);
+  // item: (image, ring)
+  void (*polar_embed)(const PolarSampleArgs<T>&, const PolarEmbedArgs<T>&, int64_t begin,
+                      int64_t end, void* scratch);
+  // item: (image, ring); adds to weight (D, padded S_r * S_phi * C) and bias (D,)
+  void (*polar_embed_backward_weight)(const PolarSampleArgs<T>&, const PolarEmbedArgs<T>&,
+                                      int64_t begin, int64_t end, T* weight, T* bias,
+                                      void* scratch);
+  // item: (image, ring); writes grad_samples
+  void (*polar_embed_backward_samples)(const PolarSampleArgs<T>&, const PolarEmbedArgs<T>&,
+                                       int64_t begin, int64_t end, void* scratch);
+  // item: image, as one band; the gradients of the samples are used as soon as they are there
+  void (*polar_embed_backward_image)(const PolarSampleArgs<T>&, const PolarEmbedArgs<T>&,
+                                     int64_t begin, int64_t end, void* scratch);
   // doubles of scratch that each thread needs in the two functions below
   int64_t (*window_attention_scratch)(const WindowAttentionArgs<T>&);
   // item: (image, window, head)

@@ -1,7 +1,7 @@
 """The layers of DarSwin. A polar map is (B, R, A, D) from the embedding to the head."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Literal
 
 import torch
@@ -10,8 +10,8 @@ from torch import Tensor, nn
 
 from darswin.grid import Placement, PolarGrid, Spacing, check_grid, polar_grid
 from darswin.lens import Lens
-from darswin.ops import polar_sample, window_attention
-from darswin.ops.checks import check_sampling
+from darswin.ops import polar_embed, polar_sample, window_attention
+from darswin.ops.checks import channels_first, check_jitter, check_layout
 
 PositionBias = Literal["angular_relative", "angular", "polar"]
 GridFunction = Callable[..., PolarGrid]
@@ -25,6 +25,7 @@ class PolarSample(nn.Module):
         jitter: in [0, 1], how far a sample may move, in cells; only in training. The seed of each
             call comes from torch's generator.
         layout: "image" gives (B, C, R·S_r, A·S_φ), "tokens" (B, R, A, S_r·S_φ·C).
+        mean, std: of uint8 images, which count as `(pixel/255 - mean) / std`; others ignore them.
         grid: the function that makes the grid.
 
     Raises:
@@ -44,14 +45,18 @@ class PolarSample(nn.Module):
         placement: Placement = "centers",
         jitter: float = 0.0,
         layout: Literal["tokens", "image"] = "image",
+        mean: float | Sequence[float] = 0.0,
+        std: float | Sequence[float] = 1.0,
         grid: GridFunction = polar_grid,
     ):
         super().__init__()
         check_grid(rings, sectors, samples, spacing, sample_spacing or spacing, placement)
-        check_sampling(jitter, layout)
+        check_jitter(jitter)
+        check_layout(layout)
         self.rings, self.sectors, self.samples = rings, sectors, tuple(samples)
         self.spacing, self.sample_spacing = spacing, sample_spacing or spacing
         self.placement, self.jitter, self.layout = placement, float(jitter), layout
+        self.mean, self.std = mean, std
         self._grid = grid
 
     def grid(self, lens: Lens, image_size: tuple[int, int]) -> PolarGrid:
@@ -67,21 +72,24 @@ class PolarSample(nn.Module):
             placement=self.placement,
         )
 
-    def sample(self, images: Tensor, grid: PolarGrid) -> Tensor:
-        """Images (B, C, H, W) on a grid that `grid` gave."""
+    def arguments(self, images: Tensor, grid: PolarGrid) -> dict:
+        """What the operators sample images with, on a grid that `grid` gave."""
+        dtype = torch.float64 if images.dtype == torch.float64 else torch.float32
+        radii, azimuths, center, _ = (t.to(images.device, dtype) for t in grid)
         jitter = self.jitter if self.training else 0.0
         # 62 bits, so that the seed is a tensor that compiled training does not specialise on.
         seed = torch.randint(2**62, ()) if jitter else 0
-        radii, azimuths, center, _ = (t.to(images.device, images.dtype) for t in grid)
-        return polar_sample(
-            images, radii, azimuths, center,
-            patch=self.samples, jitter=jitter, seed=seed, layout=self.layout,
+        statistics = dict(mean=self.mean, std=self.std) if images.dtype == torch.uint8 else {}
+        return dict(
+            image=images, radii=radii, azimuths=azimuths, center=center, patch=self.samples,
+            jitter=jitter, seed=seed, **statistics,
         )  # fmt: skip
 
     def forward(self, images: Tensor, lens: Lens) -> Tensor:
         """Images (B, C, H, W) and their lenses (B or 1) → the samples, in `layout`."""
-        check_images(images, lens)
-        return self.sample(images, self.grid(lens, images.shape[2:]))
+        images = check_images(images, lens)
+        grid = self.grid(lens, images.shape[2:])
+        return polar_sample(**self.arguments(images, grid), layout=self.layout)
 
     def extra_repr(self) -> str:
         return (
@@ -91,8 +99,11 @@ class PolarSample(nn.Module):
         )
 
 
-def check_images(images: Tensor, lens: Lens) -> None:
-    """TypeError or ValueError unless images are (B, C, H, W) with a lens for each, or one."""
+def check_images(images: Tensor, lens: Lens) -> Tensor:
+    """The images as (B, C, H, W); TypeError or ValueError unless there is a lens for each, or one.
+
+    uint8 images may be (B, H, W, 3).
+    """
     if not isinstance(images, Tensor):
         raise TypeError(f"images must be a tensor, got {type(images).__name__}")
     if images.dim() != 4:
@@ -103,6 +114,7 @@ def check_images(images: Tensor, lens: Lens) -> None:
         raise ValueError(
             f"there must be one lens or one an image, {images.shape[0]}, got {len(lens)}"
         )
+    return channels_first(images)
 
 
 class PolarPatchEmbed(nn.Module):
@@ -134,7 +146,10 @@ class PolarPatchEmbed(nn.Module):
         """(B, C, H, W) → (B, R, A, D)."""
         if images.shape[1] != self.in_chans:
             raise ValueError(f"images must have {self.in_chans} channels, got {images.shape[1]}")
-        return self.norm(self.proj(self.sample.sample(images, grid)))
+        tokens = polar_embed(
+            **self.sample.arguments(images, grid), weight=self.proj.weight, bias=self.proj.bias
+        )
+        return self.norm(tokens)
 
 
 class RelativeBias(nn.Module):

@@ -6,10 +6,36 @@
 
 namespace darswin::TIER {
 
-void polar_sample(const PolarSampleArgs<float>&, int64_t begin, int64_t end);
-void polar_sample(const PolarSampleArgs<double>&, int64_t begin, int64_t end);
-void polar_sample_backward(const PolarSampleArgs<float>&, int64_t begin, int64_t end);
-void polar_sample_backward(const PolarSampleArgs<double>&, int64_t begin, int64_t end);
+void directions(const double* angles, int64_t n, double* cosines, double* sines);
+int64_t polar_sample_scratch(const PolarSampleArgs<float>&);
+int64_t polar_sample_scratch(const PolarSampleArgs<double>&);
+void polar_sample(const PolarSampleArgs<float>&, int64_t, int64_t, void* scratch);
+void polar_sample(const PolarSampleArgs<double>&, int64_t, int64_t, void* scratch);
+void polar_sample_backward_image(const PolarSampleArgs<float>&, int64_t, int64_t, void* scratch);
+void polar_sample_backward_image(const PolarSampleArgs<double>&, int64_t, int64_t, void* scratch);
+void polar_sample_backward_lens(const PolarSampleArgs<float>&, int64_t, int64_t, void* scratch);
+void polar_sample_backward_lens(const PolarSampleArgs<double>&, int64_t, int64_t, void* scratch);
+
+void transpose(const float*, int64_t rows, int64_t columns, float* to, int64_t to_stride);
+int64_t polar_embed_scratch(const PolarSampleArgs<float>&, const PolarEmbedArgs<float>&);
+void polar_embed(const PolarSampleArgs<float>&, const PolarEmbedArgs<float>&, int64_t, int64_t,
+                 void* scratch);
+void polar_embed_backward_weight(const PolarSampleArgs<float>&, const PolarEmbedArgs<float>&,
+                                 int64_t, int64_t, float* weight, float* bias, void* scratch);
+void polar_embed_backward_samples(const PolarSampleArgs<float>&, const PolarEmbedArgs<float>&,
+                                  int64_t, int64_t, void* scratch);
+void polar_embed_backward_image(const PolarSampleArgs<float>&, const PolarEmbedArgs<float>&,
+                                int64_t, int64_t, void* scratch);
+void transpose(const double*, int64_t rows, int64_t columns, double* to, int64_t to_stride);
+int64_t polar_embed_scratch(const PolarSampleArgs<double>&, const PolarEmbedArgs<double>&);
+void polar_embed(const PolarSampleArgs<double>&, const PolarEmbedArgs<double>&, int64_t, int64_t,
+                 void* scratch);
+void polar_embed_backward_weight(const PolarSampleArgs<double>&, const PolarEmbedArgs<double>&,
+                                 int64_t, int64_t, double* weight, double* bias, void* scratch);
+void polar_embed_backward_samples(const PolarSampleArgs<double>&, const PolarEmbedArgs<double>&,
+                                  int64_t, int64_t, void* scratch);
+void polar_embed_backward_image(const PolarSampleArgs<double>&, const PolarEmbedArgs<double>&,
+                                int64_t, int64_t, void* scratch);
 
 int64_t window_attention_scratch(const WindowAttentionArgs<float>&);
 int64_t window_attention_scratch(const WindowAttentionArgs<double>&);

@@ -1,33 +1,48 @@
 // Philox4x32-10, a counter-based generator: the words of (key, counter) depend on nothing else, so
 // any thread can make the jitter of any point, forward and again in backward.
 // Salmon, Moraes, Dror, Shaw: "Parallel random numbers: as easy as 1, 2, 3", SC 2011.
+//
+// A register of counters runs at once, each 32-bit word in the lower half of a 64-bit lane. The
+// upper halves hold whatever the last product left there: the next product does not read them.
 #pragma once
 
-#include <cstdint>
+#include "simd.h"
 
 namespace {
 
-struct PhiloxWords {
-  uint32_t word[4];
-};
+// Products of the lower halves of the lanes.
+inline Words lower_product(Words a, uint32_t b) {
+  const Words factor = splat<Words>(static_cast<uint64_t>(b));
+#if defined(__AVX512F__)
+  return (Words)_mm512_maskz_mul_epu32(0xFF, (__m512i)a, (__m512i)factor);
+#elif defined(__AVX2__)
+  return (Words)_mm256_mul_epu32((__m256i)a, (__m256i)factor);
+#elif defined(__SSE2__)
+  return (Words)_mm_mul_epu32((__m128i)a, (__m128i)factor);
+#else
+  return (a & 0xFFFFFFFF) * factor;
+#endif
+}
 
-inline PhiloxWords philox(uint64_t key, uint64_t counter_low, uint64_t counter_high) {
+// The four words for each counter, 128 bits in two parts, in the lower halves of word[0..3].
+inline void philox(uint64_t key, Words counter, uint64_t counter_upper, Words word[4]) {
   uint32_t k0 = static_cast<uint32_t>(key), k1 = static_cast<uint32_t>(key >> 32);
-  uint32_t c0 = static_cast<uint32_t>(counter_low), c1 = static_cast<uint32_t>(counter_low >> 32);
-  uint32_t c2 = static_cast<uint32_t>(counter_high), c3 = static_cast<uint32_t>(counter_high >> 32);
+  Words c0 = counter, c1 = counter >> 32;
+  Words c2 = splat<Words>(counter_upper), c3 = splat<Words>(counter_upper >> 32);
+#pragma GCC unroll 10
   for (int round = 0; round < 10; ++round) {
-    const uint64_t p0 = uint64_t{0xD2511F53} * c0, p1 = uint64_t{0xCD9E8D57} * c2;
-    c0 = static_cast<uint32_t>(p1 >> 32) ^ c1 ^ k0;
-    c1 = static_cast<uint32_t>(p1);
-    c2 = static_cast<uint32_t>(p0 >> 32) ^ c3 ^ k1;
-    c3 = static_cast<uint32_t>(p0);
+    const Words p0 = lower_product(c0, 0xD2511F53), p1 = lower_product(c2, 0xCD9E8D57);
+    c0 = (p1 >> 32) ^ c1 ^ splat<Words>(uint64_t{k0});
+    c2 = (p0 >> 32) ^ c3 ^ splat<Words>(uint64_t{k1});
+    c1 = p1;
+    c3 = p0;
     k0 += 0x9E3779B9;
     k1 += 0xBB67AE85;
   }
-  return {{c0, c1, c2, c3}};
+  word[0] = c0;
+  word[1] = c1;
+  word[2] = c2;
+  word[3] = c3;
 }
-
-// Uniform in [-1/2, 1/2) from the upper 24 bits, so that it is exact in float32 as well.
-inline double centered_uniform(uint32_t word) { return (word >> 8) * 0x1p-24 - 0.5; }
 
 }  // namespace

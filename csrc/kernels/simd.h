@@ -4,6 +4,10 @@
 // compiler.
 #pragma once
 
+#if defined(__SSE2__)
+#  include <immintrin.h>
+#endif
+
 #include <cstdint>
 
 #include "../dispatch.h"
@@ -32,17 +36,40 @@ constexpr int kRegister = 16;
 template <typename T>
 constexpr int kLanes = kRegister / static_cast<int>(sizeof(T));
 
-// Unaligned load and store. A store may be of another alignment than the vector's, never of
-// another type.
+using Doubles = Vector<double, kLanes<double>>;
+using Words = Vector<uint64_t, kLanes<uint64_t>>;
+constexpr int kDoubles = kLanes<double>;
+
+// Unaligned load and store of lanes that have the type of what is pointed to, so that the compiler
+// may assume that nothing else is touched.
+template <typename V>
+struct UnalignedOf {
+  typedef V type __attribute__((aligned(1)));
+};
 template <typename V, typename T>
 inline V load(const T* from) {
-  V v;
-  __builtin_memcpy(&v, from, sizeof(V));
-  return v;
+  static_assert(sizeof(V{}[0]) == sizeof(T));
+  return *reinterpret_cast<const typename UnalignedOf<V>::type*>(from);
 }
 template <typename V, typename T>
 inline void store(T* to, const V& v) {
-  __builtin_memcpy(to, &v, sizeof(V));
+  static_assert(sizeof(V{}[0]) == sizeof(T));
+  *reinterpret_cast<typename UnalignedOf<V>::type*>(to) = v;
+}
+
+// Copies short runs: whole registers, the last of them over the one before.
+template <typename T>
+inline void copy(const T* from, int64_t count, T* to) {
+  constexpr int64_t lanes = kLanes<T>;
+  using V = Vector<T, lanes>;
+  int64_t e = 0;
+  for (; e + lanes <= count; e += lanes) store(to + e, load<V>(from + e));
+  if (e == count) return;
+  if (count > lanes) {
+    store(to + count - lanes, load<V>(from + count - lanes));
+  } else {
+    for (; e < count; ++e) to[e] = from[e];
+  }
 }
 
 template <typename V, typename T>
@@ -54,6 +81,85 @@ inline V splat(T value) {
 template <typename M, typename V>
 inline V select(M mask, V a, V b) {
   return mask ? a : b;
+}
+
+// Halves of a register. The compiler's own shuffle for the upper one is a slow one.
+inline Vector<float, 4> lower_half(Vector<float, 8> v) {
+  return __builtin_shufflevector(v, v, 0, 1, 2, 3);
+}
+inline Vector<float, 4> upper_half(Vector<float, 8> v) {
+#if defined(__AVX__)
+  return (Vector<float, 4>)_mm256_extractf128_ps((__m256)v, 1);
+#else
+  return __builtin_shufflevector(v, v, 4, 5, 6, 7);
+#endif
+}
+
+// Four lanes, again and again in a register.
+template <typename V>
+inline V repeat(Vector<float, 4> v) {
+#if defined(__AVX512F__)
+  return (V)_mm512_maskz_broadcast_f32x4(0xFFFF, (__m128)v);
+#elif defined(__AVX__)
+  return (V)_mm256_set_m128((__m128)v, (__m128)v);
+#else
+  return v;
+#endif
+}
+
+// Integers as doubles; the compiler's own conversion goes by halves of a register.
+inline Doubles to_doubles(Vector<int32_t, kDoubles> x) {
+#if defined(__AVX512F__)
+  return (Doubles)_mm512_maskz_cvtepi32_pd(0xFF, (__m256i)x);
+#else
+  return __builtin_convertvector(x, Doubles);
+#endif
+}
+
+// The whole part of numbers below 2^63.
+inline Doubles whole_part(Doubles x) {
+#if defined(__AVX512F__)
+  return (Doubles)_mm512_maskz_roundscale_pd(0xFF, (__m512d)x, _MM_FROUND_TO_ZERO);
+#elif defined(__AVX2__)
+  return (Doubles)_mm256_round_pd((__m256d)x, _MM_FROUND_TO_ZERO | _MM_FROUND_NO_EXC);
+#else
+  return __builtin_convertvector(__builtin_convertvector(x, Vector<int64_t, kDoubles>), Doubles);
+#endif
+}
+
+// a0 b0 a1 b1 ... of the lower and of the upper halves of two registers of 64-bit lanes.
+template <typename V>
+inline V interleave_lower(V a, V b) {
+#if defined(__AVX512F__)
+  return __builtin_shufflevector(a, b, 0, 8, 1, 9, 2, 10, 3, 11);
+#elif defined(__AVX2__)
+  return __builtin_shufflevector(a, b, 0, 4, 1, 5);
+#else
+  return __builtin_shufflevector(a, b, 0, 2);
+#endif
+}
+template <typename V>
+inline V interleave_upper(V a, V b) {
+#if defined(__AVX512F__)
+  return __builtin_shufflevector(a, b, 4, 12, 5, 13, 6, 14, 7, 15);
+#elif defined(__AVX2__)
+  return __builtin_shufflevector(a, b, 2, 6, 3, 7);
+#else
+  return __builtin_shufflevector(a, b, 1, 3);
+#endif
+}
+
+// Writes the transpose of four rows of four, its rows `stride` apart.
+template <typename V, typename T>
+inline void transpose4(V a, V b, V c, V d, T* to, int64_t stride) {
+  const V ab = __builtin_shufflevector(a, b, 0, 4, 1, 5);
+  const V cd = __builtin_shufflevector(c, d, 0, 4, 1, 5);
+  const V ab2 = __builtin_shufflevector(a, b, 2, 6, 3, 7);
+  const V cd2 = __builtin_shufflevector(c, d, 2, 6, 3, 7);
+  store(to, __builtin_shufflevector(ab, cd, 0, 1, 4, 5));
+  store(to + stride, __builtin_shufflevector(ab, cd, 2, 3, 6, 7));
+  store(to + 2 * stride, __builtin_shufflevector(ab2, cd2, 0, 1, 4, 5));
+  store(to + 3 * stride, __builtin_shufflevector(ab2, cd2, 2, 3, 6, 7));
 }
 
 // bfloat16 is the upper half of a float32. Narrowing rounds to nearest, ties to even.

@@ -9,10 +9,14 @@ namespace darswin::TIER {
 extern const Kernels kernels;
 constexpr Kernels kernels = {
     STRINGIZE(TIER),
-              {polar_sample, polar_sample_backward, window_attention_scratch, window_attention,
-               window_attention_backward},
-              {polar_sample, polar_sample_backward, window_attention_scratch, window_attention,
-               window_attention_backward},
+        {directions, polar_sample_scratch, polar_sample, polar_sample_backward_image,
+         polar_sample_backward_lens, transpose, polar_embed_scratch, polar_embed,
+         polar_embed_backward_weight, polar_embed_backward_samples, polar_embed_backward_image,
+         window_attention_scratch, window_attention, window_attention_backward},
+        {directions, polar_sample_scratch, polar_sample, polar_sample_backward_image,
+         polar_sample_backward_lens, transpose, polar_embed_scratch, polar_embed,
+         polar_embed_backward_weight, polar_embed_backward_samples, polar_embed_backward_image,
+         window_attention_scratch, window_attention, window_attention_backward},
 };
 
 }  // namespace darswin::TIER

@@ -134,6 +134,7 @@ class DarSwin(nn.Module):
         jitter: in [0, 1], of the sample points in training; 0 is off.
         position_bias: "angular_relative", or the ablations "angular" and "polar" with `harmonics`.
         periodic_bias: see `AngularRelativeBias`.
+        mean, std: of uint8 images, which count as `(pixel/255 - mean) / std`; others ignore them.
         compat: "official" reproduces the authors' released DarSwin-A: its sampling grid, masks,
             shifts and bias angles. Overrides spacing, sample_spacing, placement and jitter.
 
@@ -165,6 +166,8 @@ class DarSwin(nn.Module):
         position_bias: PositionBias = "angular_relative",
         harmonics: int = 16,
         periodic_bias: bool = False,
+        mean: float | Sequence[float] = 0.0,
+        std: float | Sequence[float] = 1.0,
         compat: Literal["official"] | None = None,
     ):
         super().__init__()
@@ -194,6 +197,8 @@ class DarSwin(nn.Module):
             sample_spacing="tan" if compat else sample_spacing,
             placement="edges" if compat else placement,
             jitter=0.0 if compat else jitter,
+            mean=mean,
+            std=std,
             grid=official.grid if compat else polar_grid,
         )
         rates = [drop_path_rate * k / max(sum(depths) - 1, 1) for k in range(sum(depths))]
@@ -235,7 +240,7 @@ class DarSwin(nn.Module):
         return radial_positions(lens, grid, rings, self.position_bias)
 
     def _stage_maps(self, images: Tensor, lens: Lens) -> list[Tensor]:
-        check_images(images, lens)
+        images = check_images(images, lens)
         grid = self.patch_embed.sample.grid(lens, images.shape[2:])
         if self.compat:
             images = images.transpose(2, 3)  # its x runs down and its y to the right

@@ -1,7 +1,8 @@
 """The two operators: compiled on CPU, plain PyTorch elsewhere and under `use_reference`."""
 
 from darswin.ops._library import reference_in_use, use_reference
+from darswin.ops.polar_embed import polar_embed
 from darswin.ops.polar_sample import polar_sample
 from darswin.ops.window_attention import window_attention
 
-__all__ = ["polar_sample", "reference_in_use", "use_reference", "window_attention"]
+__all__ = ["polar_embed", "polar_sample", "reference_in_use", "use_reference", "window_attention"]

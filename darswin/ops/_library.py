@@ -56,6 +56,27 @@ def without_autocast(*tensors: torch.Tensor) -> tuple[torch.Tensor, ...]:
     return tuple(t.float() if t.dtype in half else t for t in tensors)
 
 
+def autocast_dtype(tensor: torch.Tensor) -> torch.dtype | None:
+    """What autocast, where it is on for the tensor's device, computes in."""
+    device = tensor.device.type
+    if not torch.amp.is_autocast_available(device) or not torch.is_autocast_enabled(device):
+        return None
+    return torch.get_autocast_dtype(device)
+
+
+def without_float16(tensor: torch.Tensor) -> torch.Tensor:
+    """Under autocast, a float16 tensor as float32: the operators have no float16."""
+    half = tensor.dtype == torch.float16 and autocast_dtype(tensor) is not None
+    return tensor.float() if half else tensor
+
+
+def output_bfloat16(image: torch.Tensor) -> bool:
+    """Whether an operator on `image` gives bfloat16: as the image is, or as autocast says."""
+    if image.dtype == torch.float64:
+        return False
+    return image.dtype == torch.bfloat16 or autocast_dtype(image) == torch.bfloat16
+
+
 def no_second_derivative(name: str) -> None:
     """Makes an operator's backward raise where it is differentiated again, rather than be wrong."""
 

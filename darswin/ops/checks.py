@@ -12,13 +12,23 @@ DTYPES = (torch.float32, torch.float64)
 LAYOUTS = ("tokens", "image")
 
 
-def check_tensor(name: str, value: object, like: Tensor | None = None) -> None:
-    """TypeError unless `value` is a float32/float64 tensor, with the type and device of `like`."""
+def check_tensor(
+    name: str,
+    value: object,
+    like: Tensor | None = None,
+    dtypes: Sequence[torch.dtype] | None = None,
+) -> None:
+    """TypeError or ValueError unless `value` is a tensor on the device of `like`.
+
+    Of one of `dtypes`; without them float32 or float64, the one of the two that `like` is.
+    """
     if not isinstance(value, Tensor):
         raise TypeError(f"{name} must be a tensor, got {type(value).__name__}")
-    if value.dtype not in DTYPES:
-        raise TypeError(f"{name} must be float32 or float64, got {value.dtype}")
-    if like is not None and value.dtype != like.dtype:
+    if value.dtype not in (dtypes or DTYPES):
+        names = [str(dtype).removeprefix("torch.") for dtype in dtypes or DTYPES]
+        known = " or ".join(filter(None, (", ".join(names[:-1]), names[-1])))
+        raise TypeError(f"{name} must be {known}, got {value.dtype}")
+    if like is not None and dtypes is None and value.dtype != like.dtype:
         raise TypeError(f"{name} must have the same dtype, {like.dtype}, got {value.dtype}")
     if like is not None and value.device != like.device:
         raise ValueError(f"{name} must be on the same device, {like.device}, got {value.device}")
@@ -47,10 +57,20 @@ def check_pair(name: str, value: Sequence[int], lowest: int) -> tuple[int, int]:
     return tuple(value)
 
 
-def check_sampling(jitter: float, layout: str) -> None:
-    """TypeError or ValueError unless jitter is in [0, 1] and the layout one that there is."""
+def channels_first(image: Tensor) -> Tensor:
+    """uint8 camera frames (B, H, W, 3) as a view (B, 3, H, W); other images as they are."""
+    frames = image.dtype == torch.uint8 and image.shape[3] == 3 != image.shape[1]
+    return image.permute(0, 3, 1, 2) if frames else image
+
+
+def check_layout(layout: str) -> None:
+    """ValueError unless the layout is one that there is."""
     if layout not in LAYOUTS:
         raise ValueError(f"layout must be one of {LAYOUTS}, got {layout!r}")
+
+
+def check_jitter(jitter: float) -> None:
+    """TypeError or ValueError unless jitter is in [0, 1]."""
     if not isinstance(jitter, (int, float)):
         raise TypeError(f"jitter must be a float, got {type(jitter).__name__}")
     if not 0 <= jitter <= 1:

@@ -1,12 +1,21 @@
 """polar_sample: an image on a polar grid, with jitter. Public function, fake, autograd."""
 
+from collections.abc import Sequence
 from typing import Literal
 
 import torch
 from torch import Tensor
 
 from darswin.ops import _library, reference
-from darswin.ops.checks import check_pair, check_sampling, check_shape, check_tensor
+from darswin.ops.checks import (
+    DTYPES,
+    channels_first,
+    check_jitter,
+    check_layout,
+    check_pair,
+    check_shape,
+    check_tensor,
+)
 
 
 def polar_sample(
@@ -19,6 +28,8 @@ def polar_sample(
     jitter: float = 0.0,
     seed: int | Tensor = 0,
     layout: Literal["tokens", "image"] = "tokens",
+    mean: float | Sequence[float] | None = None,
+    std: float | Sequence[float] | None = None,
 ) -> Tensor:
     """Samples an image bilinearly on a polar grid, zeros outside.
 
@@ -30,25 +41,33 @@ def polar_sample(
         points right, π/2 down. NaN and infinite radii sample nothing.
 
     Args:
-        image: (B, C, H, W), float32 or float64, any strides. bfloat16 and float16 images are
-            taken as float32 under autocast.
-        radii: (B or 1, R·S_r) px.
+        image: (B, C, H, W), any strides: float32, float64, bfloat16, or uint8 camera frames, which
+            may also be (B, H, W, 3).
+        radii: (B or 1, R·S_r) px. Like azimuths and center float64 if the image is, else float32.
         azimuths: (A·S_φ,) rad. They get no gradient.
         center: (B or 1, 2) px, x then y.
         patch: (S_r, S_φ), the samples of a patch along radius and azimuth.
         jitter: in [0, 1]. Moves each point by `u·jitter` cells along its row of radii (linear
             between neighbours, extrapolated at both ends, never below 0) and by
-            `v·jitter·2π/(A·S_φ)` in azimuth. u, v in [-½, ½) come from Philox4x32-10, key `seed`,
-            counter (i·A·S_φ + j, b).
+            `v·jitter·2π/(A·S_φ)` in azimuth. u and v, in [-½, ½), are the upper and the lower half
+            of one 32-bit word of Philox4x32-10: for point p = i·A·S_φ + j of image b word p mod 4
+            of key `seed`, counter (⌊p/4⌋, b).
         seed: int or 0-dim int64 tensor on the CPU. Without jitter it is not used.
         layout: "tokens" or "image".
+        mean, std: of uint8 images only, which count as `(pixel/255 - mean) / std`: one number, or
+            one a channel. None means 0 and 1. Outside the image is zero after this.
 
     Returns:
         "tokens": (B, R, A, S_r·S_φ·C), inner order (S_r, S_φ, C).
         "image": (B, C, R·S_r, A·S_φ), what `F.grid_sample` gives on such a grid.
+        bfloat16 where the image is, or under bfloat16 autocast; float64 where the image is; else
+        float32. bfloat16 is computed in float32 and rounded once.
 
-    Gradients go to image, radii and center; results and gradients do not depend on the number of
-    threads.
+    Gradients go to image (unless uint8), radii and center; results and gradients do not depend on
+    the number of threads.
+
+    A large fresh output costs its memory's first touch, about as much time as sampling. Where the
+    linear layer of a patch embedding comes next, `polar_embed` never writes the samples at all.
 
     Raises:
         TypeError: a tensor of another dtype, or an argument of another type.
@@ -56,13 +75,25 @@ def polar_sample(
 
     Source: DarSwin, ICCV 2023, sec. 4.3.
     """
+    sampling = sampling_arguments(image, radii, azimuths, center, patch, jitter, seed, mean, std)
+    check_layout(layout)
+    arguments = (*sampling, layout == "tokens", _library.output_bfloat16(sampling[0]))
+    if _library.compiled(image):
+        return torch.ops.darswin.polar_sample(*arguments)
+    return reference.polar_sample(*arguments)
+
+
+def sampling_arguments(image, radii, azimuths, center, patch, jitter, seed, mean, std) -> tuple:
+    """What `polar_sample` and `polar_embed` share, checked, as the operators take it."""
     if isinstance(image, Tensor):
-        (image,) = _library.without_autocast(image)
-    check_tensor("image", image)
-    for name, value in (("radii", radii), ("azimuths", azimuths), ("center", center)):
-        check_tensor(name, value, like=image)
+        image = _library.without_float16(image)
+    check_tensor("image", image, dtypes=(*DTYPES, torch.bfloat16, torch.uint8))
     check_shape("image", image, "(B, C, H, W)", (None,) * 4)
-    batch = image.shape[0]
+    image = channels_first(image)
+    geometry = None if image.dtype in DTYPES else (torch.float32,)
+    for name, value in (("radii", radii), ("azimuths", azimuths), ("center", center)):
+        check_tensor(name, value, like=image, dtypes=geometry)
+    batch, channels = image.shape[:2]
     check_shape("radii", radii, f"(B or 1, R·S_r) = ({batch} or 1, any)", (batch, None), (1, None))
     check_shape("azimuths", azimuths, "(A·S_φ,)", (None,))
     check_shape("center", center, f"(B or 1, 2) = ({batch} or 1, 2)", (batch, 2), (1, 2))
@@ -72,12 +103,25 @@ def polar_sample(
             f"patch = (S_r, S_φ) must divide (R·S_r, A·S_φ) = "
             f"({radii.shape[1]}, {azimuths.shape[0]}), got {patch}"
         )
-    check_sampling(jitter, layout)
+    check_jitter(jitter)
     key = _seed_tensor(seed) if jitter > 0 else None
-    arguments = (image, radii, azimuths, center, patch, float(jitter), key, layout == "tokens")
-    if _library.compiled(image):
-        return torch.ops.darswin.polar_sample(*arguments)
-    return reference.polar_sample(*arguments)
+    if image.dtype == torch.uint8:
+        mean = _per_channel("mean", 0.0 if mean is None else mean, channels)
+        std = _per_channel("std", 1.0 if std is None else std, channels)
+    elif mean is None and std is None:
+        mean = std = ()
+    else:
+        raise ValueError(f"mean and std go with uint8 images, got an image of {image.dtype}")
+    return image, radii, azimuths, center, patch, float(jitter), key, mean, std
+
+
+def _per_channel(name: str, value: float | Sequence[float], channels: int) -> tuple[float, ...]:
+    values = (value,) * channels if isinstance(value, (int, float)) else tuple(value)
+    if len(values) != channels:
+        raise ValueError(f"{name} must be one number or one a channel, {channels}, got {value!r}")
+    if name == "std" and not all(v > 0 for v in values):
+        raise ValueError(f"std must be positive, got {value!r}")
+    return tuple(float(v) for v in values)
 
 
 def _seed_tensor(seed: int | Tensor) -> Tensor:
@@ -96,20 +140,19 @@ def _seed_tensor(seed: int | Tensor) -> Tensor:
 
 
 @torch.library.register_fake("darswin::polar_sample")
-def _fake(image, radii, azimuths, center, patch, jitter, seed, tokens):
+def _fake(image, radii, azimuths, center, patch, jitter, seed, mean, std, tokens, bfloat16):
     batch, channels = image.shape[:2]
     rows, columns = radii.shape[1], azimuths.shape[0]
     if tokens:
         shape = (batch, rows // patch[0], columns // patch[1], patch[0] * patch[1] * channels)
     else:
         shape = (batch, channels, rows, columns)
-    return image.new_empty(shape)
+    return radii.new_empty(shape, dtype=torch.bfloat16 if bfloat16 else None)
 
 
 @torch.library.register_fake("darswin::polar_sample_backward")
-def _fake_backward(
-    grad_out, image, radii, azimuths, center, patch, jitter, seed, tokens, image_grad, lens_grad
-):
+def _fake_backward(grad_out, image, radii, azimuths, center, *settings):
+    image_grad, lens_grad = settings[-2:]
     return (
         image.new_empty(image.shape if image_grad else (0,)),
         radii.new_empty(radii.shape if lens_grad else (0,)),
@@ -118,26 +161,26 @@ def _fake_backward(
 
 
 def _setup_context(ctx, inputs, output):
-    image, radii, azimuths, center, patch, jitter, seed, tokens = inputs
+    image, radii, azimuths, center, patch, jitter, seed, *rest = inputs
     ctx.save_for_backward(image, radii, azimuths, center, seed)
-    ctx.settings = (patch, jitter, tokens)
+    ctx.settings = (patch, jitter, rest)
 
 
 def _backward(ctx, grad_out):
     image, radii, azimuths, center, seed = ctx.saved_tensors
-    patch, jitter, tokens = ctx.settings
+    patch, jitter, rest = ctx.settings
     wants_image, wants_radii, _, wants_center = ctx.needs_input_grad[:4]
     grad_image, grad_radii, grad_center = torch.ops.darswin.polar_sample_backward(
-        grad_out, image, radii, azimuths, center, patch, jitter, seed, tokens,
+        grad_out, image, radii, azimuths, center, patch, jitter, seed, *rest,
         wants_image, wants_radii or wants_center,
     )  # fmt: skip
-    return (
+    grads = (
         grad_image if wants_image else None,
         grad_radii if wants_radii else None,
         None,
         grad_center if wants_center else None,
-        None, None, None, None,
-    )  # fmt: skip
+    )
+    return (*grads, *(None,) * 7)
 
 
 torch.library.register_autograd("darswin::polar_sample", _backward, setup_context=_setup_context)

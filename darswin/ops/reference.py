@@ -4,8 +4,10 @@ Arguments come checked, as the compiled operators get them.
 """
 
 import math
+from collections.abc import Sequence
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 _WORD = 0xFFFFFFFF
@@ -34,10 +36,6 @@ def _multiply(a: int, b: Tensor) -> tuple[Tensor, Tensor]:
     return (upper >> 16) + (total >> 32), total & _WORD
 
 
-def _centered_uniform(word: Tensor, dtype: torch.dtype) -> Tensor:
-    return (word >> 8).to(dtype) * 2.0**-24 - 0.5
-
-
 def _jittered(
     radii: Tensor, azimuths: Tensor, batch: int, jitter: float, seed: Tensor
 ) -> tuple[Tensor, Tensor]:
@@ -45,8 +43,12 @@ def _jittered(
     rows, columns, device = radii.shape[1], azimuths.shape[0], radii.device
     point = torch.arange(rows * columns, device=device).reshape(1, rows, columns)
     image = torch.arange(batch, device=device).reshape(-1, 1, 1)
-    words = philox(seed.to(device), point, image)
-    u, v = (_centered_uniform(word, radii.dtype) * jitter for word in words[:2])
+    # Word p % 4 of counter p / 4; u and v in [-1/2, 1/2) are its halves.
+    words = torch.stack(philox(seed.to(device), point // 4, image))
+    word = words.gather(0, (point % 4).expand(1, batch, rows, columns))[0]
+    u, v = (
+        (half.to(radii.dtype) * 2.0**-16 - 0.5) * jitter for half in (word >> 16, word & 0xFFFF)
+    )
     # The step to the outer neighbour and from the inner one; at both ends the only one there is.
     steps = radii.diff(dim=1) if rows > 1 else torch.zeros_like(radii)
     outer = torch.cat((steps, steps[:, -1:]), 1)[:, :rows, None]
@@ -63,9 +65,16 @@ def polar_sample(
     patch: tuple[int, int],
     jitter: float,
     seed: Tensor | None,
+    mean: Sequence[float],
+    std: Sequence[float],
     tokens: bool,
+    bfloat16: bool,
 ) -> Tensor:
     """See `darswin.ops.polar_sample`."""
+    if image.dtype == torch.uint8:
+        m, s = (torch.tensor(v, device=image.device).reshape(-1, 1, 1) for v in (mean, std))
+        image = (image / 255 - m) / s
+    image = image.to(radii.dtype)  # bfloat16 is computed in float32
     batch, channels, height, width = image.shape
     rows, columns = radii.shape[1], azimuths.shape[0]
     r, a = radii[:, :, None], azimuths[None, None, :]
@@ -90,12 +99,37 @@ def polar_sample(
             # A pixel that is not there must not count, were it NaN.
             corner = torch.where(inside[:, None], corner, 0)
             out = out + (wx * wy)[:, None] * corner
+    out = out.bfloat16() if bfloat16 else out
     if not tokens:
         return out
     rings, sectors = rows // patch[0], columns // patch[1]
     out = out.reshape(batch, channels, rings, patch[0], sectors, patch[1])
     samples = patch[0] * patch[1] * channels
     return out.permute(0, 2, 4, 3, 5, 1).reshape(batch, rings, sectors, samples)
+
+
+def polar_embed(
+    image: Tensor,
+    radii: Tensor,
+    azimuths: Tensor,
+    center: Tensor,
+    weight: Tensor,
+    bias: Tensor | None,
+    patch: tuple[int, int],
+    jitter: float,
+    seed: Tensor | None,
+    mean: Sequence[float],
+    std: Sequence[float],
+    bfloat16: bool,
+) -> Tensor:
+    """See `darswin.ops.polar_embed`."""
+    settings = (patch, jitter, seed, mean, std, True, False)
+    samples = polar_sample(image, radii, azimuths, center, *settings)
+    weight = weight.to(samples.dtype)
+    bias = None if bias is None else bias.to(samples.dtype)
+    with torch.autocast(samples.device.type, enabled=False):
+        out = F.linear(samples, weight, bias)
+    return out.bfloat16() if bfloat16 else out
 
 
 def window_attention(

@@ -3,7 +3,7 @@ import math
 import pytest
 import torch
 
-from darswin import DarSwin, create_model, list_models
+from darswin import DarSwin, PolarSample, create_model, list_models
 from darswin.lens import Perspective, Polynomial, Spherical
 from darswin.models.darswin import plan_stages
 from darswin.ops import use_reference
@@ -292,3 +292,25 @@ def test_call_errors():
         nano(spacing="tan")(images(), Spherical(0.9, 10.0, 1.8))
     with pytest.raises(ValueError, match="unknown model 'darswin_b'; there are darswin_a_micro"):
         create_model("darswin_b")
+
+
+def test_camera_frames():
+    # uint8 frames, channels last, normalised by the model.
+    mean, std = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
+    model = create_model("darswin_a_nano", num_classes=5, mean=mean, std=std).eval()
+    frames = torch.randint(256, (2, 32, 40, 3), dtype=torch.uint8)
+    lens = Spherical.from_fov([0.3, 0.7], 2.6, 16.0)
+    planes = frames.permute(0, 3, 1, 2) / 255
+    planes = (planes - torch.tensor(mean)[:, None, None]) / torch.tensor(std)[:, None, None]
+    torch.testing.assert_close(model(frames, lens), model(planes, lens), rtol=1e-4, atol=1e-4)
+    polar = PolarSample(4, 8, (2, 2), mean=mean, std=std)
+    torch.testing.assert_close(polar(frames, lens), polar(planes, lens), rtol=1e-4, atol=1e-4)
+
+
+def test_bfloat16_model():
+    model = create_model("darswin_a_nano", num_classes=5).eval()
+    images, lens = torch.randn(2, 3, 32, 32), Spherical.from_fov(0.5, 2.6, 16.0)
+    expected = model(images, lens)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        half = model(images, lens)
+    torch.testing.assert_close(half.float(), expected, rtol=0.1, atol=0.05)

@@ -5,6 +5,7 @@ import torch
 import torch.nn.functional as F
 from helpers import assert_accurate, with_gradients
 
+from darswin import _C
 from darswin.ops import polar_sample, reference_in_use, use_reference
 from darswin.ops.reference import philox
 
@@ -27,7 +28,7 @@ def make_inputs(
 def sampler(azimuths, patch, **options):
     """polar_sample as a function of its differentiable inputs."""
     return lambda image, radii, center: polar_sample(
-        image, radii, azimuths.to(image.dtype), center, patch=patch, **options
+        image, radii, azimuths.to(radii.dtype), center, patch=patch, **options
     )
 
 
@@ -152,7 +153,7 @@ def test_opcheck(requires_grad, jitter):
     for tensor in (image, radii, center):
         tensor.requires_grad_(requires_grad)
     seed = torch.tensor(5) if jitter else None
-    arguments = (image, radii, azimuths, center, (3, 4), jitter, seed, True)
+    arguments = (image, radii, azimuths, center, (3, 4), jitter, seed, (), (), True, False)
     torch.library.opcheck(torch.ops.darswin.polar_sample.default, arguments)
 
 
@@ -160,7 +161,8 @@ def test_opcheck_backward():
     image, radii, center, azimuths = make_inputs()
     grad = torch.randn(2, 2, 2, 36)
     for wanted in ((True, True), (True, False), (False, True)):
-        arguments = (grad, image, radii, azimuths, center, (3, 4), 0.0, None, True, *wanted)
+        settings = ((3, 4), 0.0, None, (), (), True, False)
+        arguments = (grad, image, radii, azimuths, center, *settings, *wanted)
         torch.library.opcheck(
             torch.ops.darswin.polar_sample_backward.default,
             arguments,
@@ -398,9 +400,10 @@ def test_jitter_moves_points_as_said():
     azimuths = (torch.arange(16, dtype=torch.float64) + 0.5) * (2 * math.pi / 16) - math.pi
     seed, jitter = 1234, 0.75
     r, a = places(radii, azimuths, jitter, seed)
-    point = torch.arange(64).reshape(4, 16)
-    u, v = ((w >> 8) / 2**24 - 0.5 for w in philox(torch.tensor(seed), point, torch.tensor(0))[:2])
-    u, v = u.double() * jitter, v.double() * jitter
+    point = torch.arange(64)
+    words = torch.stack(philox(torch.tensor(seed), point // 4, torch.tensor(0)))
+    word = words[point % 4, point].reshape(4, 16)
+    u, v = ((half / 2**16 - 0.5).double() * jitter for half in (word >> 16, word & 0xFFFF))
     outer = torch.tensor([3.0, 1.0, 12.0, 12.0], dtype=torch.float64)[:, None]
     inner = torch.tensor([3.0, 3.0, 1.0, 12.0], dtype=torch.float64)[:, None]
     expected = radii.T + u * torch.where(u < 0, inner, outer)
@@ -475,15 +478,201 @@ def test_other_devices_run_the_reference():
     assert out.shape == (2, 2, 2, 36) and out.device.type == "meta"
 
 
-def test_autocast_takes_half_precision_images_as_float32():
-    image, radii, center, azimuths = make_inputs()
+# -- types -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+@pytest.mark.parametrize("jitter", [0.0, 0.7])
+def test_bfloat16_is_computed_in_float32_and_rounded_once(layout, jitter):
+    image, radii, center, azimuths = make_inputs(rows=30, columns=40)
     half = image.bfloat16()
+    run = sampler(azimuths, (3, 4), jitter=jitter, seed=2, layout=layout)
+    out, *grads = with_gradients(lambda *x: run(*x).float(), (half, radii, center))
+    expected, *expected_grads = with_gradients(run, (half.float(), radii, center))
+    assert run(half, radii, center).dtype == torch.bfloat16
+    assert torch.equal(out, expected.bfloat16().float())
+    assert [g.dtype for g in grads] == [torch.bfloat16, torch.float32, torch.float32]
+    # The gradient that arrives is rounded to bfloat16 as well.
+    for got, want in zip(grads, expected_grads, strict=True):
+        torch.testing.assert_close(got.float(), want, rtol=0.02, atol=0.02 * want.abs().max())
+    with use_reference():
+        reference, *reference_grads = with_gradients(
+            lambda *x: run(*x).float(), (half, radii, center)
+        )
+    torch.testing.assert_close(reference, out, rtol=2**-7, atol=1e-3)
+    for got, want in zip(grads, reference_grads, strict=True):
+        torch.testing.assert_close(
+            got.float(), want.float(), rtol=0.02, atol=0.02 * want.abs().max()
+        )
+
+
+def test_bfloat16_rounds_to_nearest_even_and_keeps_nan():
+    values = torch.tensor([1.0, 1.00390625, 1.01171875, 3.4e38, math.inf, math.nan, -1e-40, -0.0])
+    image = values.reshape(1, 1, 1, -1)
+    for columns in (8, 3):  # whole registers and less
+        center = torch.tensor([[0.0, 0.0]])
+        radii = torch.arange(float(columns))[None]
+        with torch.autocast("cpu", dtype=torch.bfloat16):
+            out = polar_sample(image, radii, torch.zeros(1), center, patch=(1, 1))
+        expected = polar_sample(image, radii, torch.zeros(1), center, patch=(1, 1)).bfloat16()
+        torch.testing.assert_close(out, expected, rtol=0, atol=0, equal_nan=True)
+
+
+def test_autocast_gives_bfloat16():
+    image, radii, center, azimuths = make_inputs()
+    expected = polar_sample(image, radii, azimuths, center, patch=(3, 4))
+    for reference in (False, True):
+        with use_reference(reference), torch.autocast("cpu", dtype=torch.bfloat16):
+            out = polar_sample(image.requires_grad_(), radii, azimuths, center, patch=(3, 4))
+        assert out.dtype == torch.bfloat16
+        torch.testing.assert_close(out.float(), expected, rtol=2**-7, atol=1e-3)
+        (grad,) = torch.autograd.grad(out.float().sum(), image)
+        assert grad.dtype == torch.float32
+    double = [t.double() for t in (image, radii, azimuths, center)]
     with torch.autocast("cpu", dtype=torch.bfloat16):
+        assert polar_sample(*double, patch=(3, 4)).dtype == torch.float64
+
+
+def test_autocast_takes_float16_as_float32():
+    image, radii, center, azimuths = make_inputs()
+    half = image.half()
+    with torch.autocast("cpu", dtype=torch.float16):
         out = polar_sample(half, radii, azimuths, center, patch=(3, 4))
     expected = polar_sample(half.float(), radii, azimuths, center, patch=(3, 4))
     assert torch.equal(out, expected)
-    with pytest.raises(TypeError, match=r"image must be float32 or float64, got torch.bfloat16"):
+    with pytest.raises(TypeError, match=r"image must be .* or uint8, got torch.float16"):
         polar_sample(half, radii, azimuths, center, patch=(3, 4))
+
+
+@pytest.mark.parametrize("rows", [6, 60])  # far and near, see csrc/kernels/polar_image.h
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_uint8_frames(layout, rows):
+    _, radii, center, azimuths = make_inputs(rows=rows, columns=40)
+    frames = torch.randint(256, (2, 17, 23, 3), dtype=torch.uint8)
+    mean, std = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
+    planes = frames.permute(0, 3, 1, 2)
+    normalised = (planes / 255 - torch.tensor(mean)[:, None, None]) / torch.tensor(std)[
+        :, None, None
+    ]
+    run = sampler(azimuths, (3, 4), layout=layout)
+    for image in (frames, planes, planes.contiguous()):
+        for reference in (False, True):
+            with use_reference(reference):
+                out = polar_sample(image, radii, azimuths, center, patch=(3, 4), layout=layout,
+                                   mean=mean, std=std)  # fmt: skip
+            torch.testing.assert_close(out, run(normalised, radii, center), rtol=1e-5, atol=1e-5)
+    plain = polar_sample(frames, radii, azimuths, center, patch=(3, 4), layout=layout)
+    torch.testing.assert_close(plain, run(planes / 255, radii, center), rtol=1e-5, atol=1e-6)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        half = polar_sample(frames, radii, azimuths, center, patch=(3, 4), layout=layout)
+    assert torch.equal(half, plain.bfloat16())
+
+
+def test_uint8_frames_have_lens_gradients():
+    _, radii, center, azimuths = make_inputs()
+    frames = torch.randint(256, (2, 3, 17, 23), dtype=torch.uint8)
+    run = lambda radii, center: polar_sample(frames, radii, azimuths, center, patch=(3, 4))  # noqa: E731
+    expected = with_gradients(
+        lambda r, c: sampler(azimuths, (3, 4))(frames / 255, r, c), (radii, center)
+    )
+    for got, want in zip(with_gradients(run, (radii, center)), expected, strict=True):
+        torch.testing.assert_close(got, want, rtol=1e-4, atol=1e-4)
+
+
+# -- near and far images, threads ------------------------------------------------------------------
+
+
+PATHS = {
+    # What csrc/kernels tells apart.
+    "cells": dict(height=31, width=33, rows=40, columns=64),
+    "cells, one channel": dict(height=31, width=33, rows=40, columns=64, channels=1),
+    "cells, two channels": dict(height=31, width=33, rows=40, columns=64, channels=2),
+    "cells, four channels": dict(height=31, width=33, rows=40, columns=64, channels=4),
+    "packed, six channels": dict(height=31, width=33, rows=40, columns=64, channels=6),
+    "packed, 64 channels": dict(height=16, width=17, rows=20, columns=32, channels=64, batch=1),
+    "packed, large": dict(height=200, width=180, rows=80, columns=160, batch=1),
+    "in place": dict(height=200, width=180, rows=8, columns=16),
+    "in place, large": dict(height=400, width=390, rows=20, columns=16, batch=1),
+    "many tokens": dict(height=31, width=33, rows=80, columns=640, batch=1),
+    "long rows": dict(height=31, width=33, rows=2, columns=3000, batch=1),
+    "long tokens": dict(height=31, width=33, rows=60, columns=120, batch=1),
+    "narrow patches": dict(height=31, width=33, rows=40, columns=63, channels=1),
+}
+PATCHES = {
+    "many tokens": (10, 10),
+    "long rows": (1, 3000),
+    "long tokens": (60, 60),
+    "narrow patches": (8, 3),
+}
+
+
+@pytest.mark.parametrize("jitter", [0.0, 1.0])
+@pytest.mark.parametrize("path", PATHS)
+def test_every_path_equals_the_reference_in_float64(path, jitter):
+    *inputs, azimuths = make_inputs(**PATHS[path], dtype=torch.float64)
+    run = sampler(azimuths, PATCHES.get(path, (4, 4)), jitter=jitter, seed=3)
+    ours = with_gradients(run, inputs)
+    with use_reference():
+        expected = with_gradients(run, inputs)
+    for got, want in zip(ours, expected, strict=True):
+        torch.testing.assert_close(got, want, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+@pytest.mark.parametrize("path", PATHS)
+def test_accuracy_rule_on_every_path(path, layout):
+    azimuths, patch = make_inputs(**PATHS[path])[-1], PATCHES.get(path, (4, 4))
+    assert_accurate(
+        sampler(azimuths, patch, layout=layout),
+        lambda: make_inputs(**PATHS[path])[:-1],
+        lambda *inputs: away_from_borders(*inputs, azimuths, patch, layout),
+    )
+
+
+@pytest.mark.parametrize("jitter", [0.0, 1.0])
+@pytest.mark.parametrize("path", PATHS)
+def test_same_bits_for_any_number_of_threads_on_every_path(threads, path, jitter):
+    # A batch of one is cut into as many bands of rows as there are threads.
+    *inputs, azimuths = make_inputs(**PATHS[path] | dict(batch=1))
+    run = sampler(azimuths, PATCHES.get(path, (4, 4)), jitter=jitter, seed=1)
+    results = []
+    for count in (1, 2, 3, 7):
+        threads(count)
+        results.append(with_gradients(run, inputs))
+    for other in results[1:]:
+        assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
+
+
+@pytest.mark.parametrize("columns", [16, 400])
+def test_jitter_is_the_same_on_every_path_and_tier(columns):
+    # Odd counts of points, so that rows begin in the middle of a group of four random words.
+    image, radii, center, azimuths = make_inputs(rows=9, columns=columns - 1)
+    results = []
+    best = _C.tier()
+    for tier in _C.tiers():
+        _C.set_tier(tier)
+        results.append(
+            polar_sample(image, radii, azimuths, center, patch=(3, 1), jitter=1.0, seed=5)
+        )
+    _C.set_tier(best)
+    with use_reference():
+        results.append(
+            polar_sample(image, radii, azimuths, center, patch=(3, 1), jitter=1.0, seed=5)
+        )
+    for other in results[1:]:
+        torch.testing.assert_close(other, results[0], rtol=1e-4, atol=1e-4)
+
+
+def test_nothing_is_written_beyond_the_last_token():
+    # Rows of three channels are stored four at a time.
+    image, radii, center, azimuths = make_inputs(batch=1, rows=40, columns=64, height=31, width=33)
+    for channels in (1, 2, 3):
+        for count in (1, 2, 3):  # rings that different threads may write
+            whole = polar_sample(image[:, :channels], radii, azimuths, center, patch=(4, 4))
+            part = polar_sample(
+                image[:, :channels], radii[:, : 4 * count], azimuths, center, patch=(4, 4)
+            )
+            assert torch.equal(part, whole[:, :count])
 
 
 f32 = torch.float32
@@ -531,7 +720,7 @@ def test_errors_say_what_was_expected(change, error, message, reference):
 def test_the_compiled_operator_itself_reads_nothing_outside():
     # Without the checks of the public function, wrong sizes must still not crash.
     image, radii, center, azimuths = make_inputs()
-    good = (image, radii, azimuths, center, (3, 4), 0.0, None, True)
+    good = (image, radii, azimuths, center, (3, 4), 0.0, None, (), (), True, False)
     for index, value in {
         0: torch.zeros(3), 1: torch.zeros(3, 6), 3: torch.zeros(1, 1), 4: (0, 4), 5: 0.5,
     }.items():  # fmt: skip

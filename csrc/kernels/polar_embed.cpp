@@ -1,0 +1,206 @@
+// The patch embedding: polar sampling and the linear layer behind it, a ring of tokens at a time.
+//
+// The samples of a ring are a matrix (A, S_r * S_phi * C) of a size that fits the second-level
+// cache. It is made, multiplied with the weight and forgotten, so samples are never written to
+// memory; backward makes it again. The gradient of the samples goes the same way, from the product
+// straight to the pixels.
+#include "kernels.h"
+#include "matmul.h"
+#include "polar_rows.h"
+#include "polar_sampler.h"
+#include "polar_scatter.h"
+
+namespace darswin::TIER {
+namespace {
+
+// Scratch of one thread, part after part.
+template <typename T>
+struct Scratch {
+  int64_t depth, row, wide;  // samples of a token, and padded; padded features
+  char *sampler, *scatter;
+  T* samples;   // (A, row)
+  T* products;  // (A, wide)
+  T* grads;     // (A, D)
+  int64_t bytes;
+
+  Scratch(const PolarSampleArgs<T>& a, const PolarEmbedArgs<T>& e, void* memory)
+      : depth(a.patch_radii * a.patch_azimuths * a.channels),
+        row(round_up(depth, kRowUnit)),
+        wide(round_up(e.features, kRowUnit)) {
+    char* next = static_cast<char*>(memory);
+    const auto take = [&next](int64_t size) {
+      char* part = next;
+      next += round_up(size, 64);
+      return part;
+    };
+    const int64_t sectors = a.num_azimuths / a.patch_azimuths;
+    const int64_t value = static_cast<int64_t>(sizeof(T));
+    sampler = scatter = take(Sampler<T>::bytes(a) > Scatter<T>::bytes(a) ? Sampler<T>::bytes(a)
+                                                                         : Scatter<T>::bytes(a));
+    samples = reinterpret_cast<T*>(take((sectors * row + kRowUnit) * value));
+    products = reinterpret_cast<T*>(take(sectors * wide * value));
+    grads = reinterpret_cast<T*>(take(sectors * e.features * value));
+    bytes = next - static_cast<char*>(memory);
+  }
+};
+
+template <typename T>
+int64_t sectors_of(const PolarSampleArgs<T>& a) {
+  return a.num_azimuths / a.patch_azimuths;
+}
+
+template <typename T>
+void embed(const PolarSampleArgs<T>& a, const PolarEmbedArgs<T>& e, int64_t begin, int64_t end,
+           void* scratch) {
+  const Scratch<T> s(a, e, scratch);
+  const int64_t rings = a.num_radii / a.patch_radii, sectors = sectors_of(a);
+  Sampler<T> sampler(a, s.row, a.patch_azimuths * a.channels, s.sampler);
+  for (int64_t item = begin; item < end; ++item) {
+    sampler.ring(item / rings, item % rings, s.samples);
+    for (int64_t t = 0; t < sectors; ++t) {
+      for (int64_t f = 0; f < e.features; ++f) {
+        s.products[t * s.wide + f] = e.bias == nullptr ? T(0) : e.bias[f];
+      }
+      for (int64_t f = e.features; f < s.wide; ++f) s.products[t * s.wide + f] = 0;
+    }
+    add_product(sectors, s.wide, s.depth, s.samples, s.row, 1, e.transposed, s.wide, s.products,
+                s.wide);
+    const int64_t first = item * sectors * e.features;
+    for (int64_t t = 0; t < sectors; ++t) {
+      const int64_t to = first + t * e.features;
+      const T* from = s.products + t * s.wide;
+      if (a.narrow) {
+        for (int64_t f = 0; f < e.features; ++f) {
+          convert(static_cast<bfloat16*>(a.out) + to + f, from[f]);
+        }
+      } else {
+        copy(from, e.features, static_cast<T*>(a.out) + to);
+      }
+    }
+  }
+}
+
+// The gradients (A, D) of a ring's tokens, in the type that is computed in.
+template <typename T>
+const T* ring_grads(const PolarSampleArgs<T>& a, const PolarEmbedArgs<T>& e, int64_t item,
+                    const Scratch<T>& s) {
+  const int64_t count = sectors_of(a) * e.features;
+  if (!a.narrow) return static_cast<const T*>(a.grad_out) + item * count;
+  if constexpr (sizeof(T) == sizeof(float)) {
+    const bfloat16* from = static_cast<const bfloat16*>(a.grad_out) + item * count;
+    for (int64_t n = 0; n < count; ++n) s.grads[n] = widen(from[n]);
+  }
+  return s.grads;
+}
+
+template <typename T>
+void backward_weight(const PolarSampleArgs<T>& a, const PolarEmbedArgs<T>& e, int64_t begin,
+                     int64_t end, T* weight, T* bias, void* scratch) {
+  const Scratch<T> s(a, e, scratch);
+  const int64_t rings = a.num_radii / a.patch_radii, sectors = sectors_of(a);
+  Sampler<T> sampler(a, s.row, a.patch_azimuths * a.channels, s.sampler);
+  for (int64_t item = begin; item < end; ++item) {
+    const T* grads = ring_grads(a, e, item, s);
+    sampler.ring(item / rings, item % rings, s.samples);
+    add_product(e.features, s.row, sectors, grads, 1, e.features, s.samples, s.row, weight, s.row);
+    for (int64_t t = 0; t < sectors; ++t) {
+#pragma omp simd
+      for (int64_t f = 0; f < e.features; ++f) bias[f] += grads[t * e.features + f];
+    }
+  }
+}
+
+// The gradients of a ring's samples, (A, row) in s.samples.
+template <typename T>
+void sample_grads(const PolarSampleArgs<T>& a, const PolarEmbedArgs<T>& e, int64_t item,
+                  const Scratch<T>& s) {
+  const int64_t sectors = sectors_of(a);
+  for (int64_t n = 0; n < sectors * s.row; ++n) s.samples[n] = 0;
+  add_product(sectors, s.row, e.features, ring_grads(a, e, item, s), e.features, 1, e.weight, s.row,
+              s.samples, s.row);
+}
+
+template <typename T>
+void backward_samples(const PolarSampleArgs<T>& a, const PolarEmbedArgs<T>& e, int64_t begin,
+                      int64_t end, void* scratch) {
+  const Scratch<T> s(a, e, scratch);
+  const int64_t sectors = sectors_of(a);
+  for (int64_t item = begin; item < end; ++item) {
+    sample_grads(a, e, item, s);
+    for (int64_t t = 0; t < sectors; ++t) {
+      copy(s.samples + t * s.row, s.depth, e.grad_samples + (item * sectors + t) * s.depth);
+    }
+  }
+}
+
+template <typename T>
+void backward_image(const PolarSampleArgs<T>& args, const PolarEmbedArgs<T>& e, int64_t begin,
+                    int64_t end, void* scratch) {
+  const Scratch<T> s(args, e, scratch);
+  PolarSampleArgs<T> a = args;
+  a.narrow = false;  // the gradients of the samples are not
+  const int64_t rings = a.num_radii / a.patch_radii, piece = a.patch_azimuths * a.channels;
+  for (int64_t b = begin; b < end; ++b) {
+    Scatter<T> scatter(a, b, 0, s.scatter);
+    for (int64_t ring = 0; ring < rings; ++ring) {
+      sample_grads(args, e, b * rings + ring, s);
+      for (int64_t n = 0; n < a.patch_radii; ++n) {
+        scatter.row(ring * a.patch_radii + n, s.samples, Row{n * piece, s.row, a.channels, 1});
+      }
+    }
+    scatter.finish();
+  }
+}
+
+template <typename T>
+void transposed(const T* from, int64_t rows, int64_t columns, T* to, int64_t to_stride) {
+  using V = Vector<T, 4>;
+  int64_t i = 0;
+  for (; i + 4 <= rows; i += 4) {
+    int64_t j = 0;
+    for (; j + 4 <= columns; j += 4) {
+      const T* block = from + i * columns + j;
+      const V a = load<V>(block), b = load<V>(block + columns);
+      const V c = load<V>(block + 2 * columns), d = load<V>(block + 3 * columns);
+      T* target = to + j * to_stride + i;
+      transpose4(a, b, c, d, target, to_stride);
+    }
+    for (; j < columns; ++j) {
+      for (int64_t r = i; r < i + 4; ++r) to[j * to_stride + r] = from[r * columns + j];
+    }
+  }
+  for (; i < rows; ++i) {
+    for (int64_t j = 0; j < columns; ++j) to[j * to_stride + i] = from[i * columns + j];
+  }
+}
+
+}  // namespace
+
+#define INSTANTIATE(T)                                                                        \
+  void transpose(const T* from, int64_t rows, int64_t columns, T* to, int64_t to_stride) {    \
+    transposed(from, rows, columns, to, to_stride);                                           \
+  }                                                                                           \
+  int64_t polar_embed_scratch(const PolarSampleArgs<T>& a, const PolarEmbedArgs<T>& e) {      \
+    return Scratch<T>(a, e, nullptr).bytes;                                                   \
+  }                                                                                           \
+  void polar_embed(const PolarSampleArgs<T>& a, const PolarEmbedArgs<T>& e, int64_t begin,    \
+                   int64_t end, void* s) {                                                    \
+    embed(a, e, begin, end, s);                                                               \
+  }                                                                                           \
+  void polar_embed_backward_weight(const PolarSampleArgs<T>& a, const PolarEmbedArgs<T>& e,   \
+                                   int64_t begin, int64_t end, T* weight, T* bias, void* s) { \
+    backward_weight(a, e, begin, end, weight, bias, s);                                       \
+  }                                                                                           \
+  void polar_embed_backward_samples(const PolarSampleArgs<T>& a, const PolarEmbedArgs<T>& e,  \
+                                    int64_t begin, int64_t end, void* s) {                    \
+    backward_samples(a, e, begin, end, s);                                                    \
+  }                                                                                           \
+  void polar_embed_backward_image(const PolarSampleArgs<T>& a, const PolarEmbedArgs<T>& e,    \
+                                  int64_t begin, int64_t end, void* s) {                      \
+    backward_image(a, e, begin, end, s);                                                      \
+  }
+INSTANTIATE(float)
+INSTANTIATE(double)
+#undef INSTANTIATE
+
+}  // namespace darswin::TIER

@@ -1,0 +1,228 @@
+// Pixels of an image, near and far.
+//
+// Near: an image that fits the second-level cache is first copied into a packed one: channels last,
+// padded to four, so that a pixel and its right neighbour are one load; with zeros around it, so
+// that no bounds test stands in the inner loop. A point outside the image finds zeros at the lower
+// right, where the border is two pixels wide. Far: a larger image, or one that few points look at,
+// is read where it lies, with whatever strides and type it has.
+#pragma once
+
+#include "polar_points.h"
+
+namespace {
+
+using darswin::Pixel;
+
+inline int64_t round_up(int64_t n, int64_t unit) { return (n + unit - 1) / unit * unit; }
+
+// An image with borders. Pixel (x, y) of the image is pixel (x + 1, y + 1) of this.
+struct Packed {
+  int64_t pixel, row, size;  // values of a pixel, of a row, of the image
+
+  template <typename T>
+  explicit Packed(const PolarSampleArgs<T>& a)
+      : pixel(round_up(a.channels, 4)), row((a.width + 3) * pixel), size((a.height + 3) * row) {}
+};
+
+// Places of a block of points. `lower` and `right` say how far on the way to the lower and to the
+// right neighbour a point is. The last register of a row may reach beyond the row.
+constexpr int kPlaces = kBlock + kDoubles;
+template <typename T>
+struct Places {
+  T right[kPlaces], lower[kPlaces];
+};
+template <typename T>
+struct PackedPlaces : Places<T> {
+  int32_t offset[kPlaces];  // of the upper left pixel in the packed image
+};
+template <typename T>
+struct FarPlaces : Places<T> {
+  int64_t column[kPlaces], row[kPlaces];  // of the upper left pixel; see place()
+};
+
+// Whole and fractional parts of coordinates, one pixel further as in a packed image. Coordinates
+// that touch no pixel, and NaN, become `outside`, unless all are known to be `inside`.
+template <bool inside, typename T>
+inline Doubles split(Doubles x, double size, double outside, T* fraction) {
+  Doubles moved = x + 1;
+  if constexpr (!inside) moved = select((x > -1) & (x < size), moved, splat<Doubles>(outside));
+  const Doubles whole = whole_part(moved);
+  store(fraction, __builtin_convertvector(moved - whole, Vector<T, kDoubles>));
+  return whole;
+}
+
+template <bool inside, typename T>
+inline void place(const PolarSampleArgs<T>& a, const Packed& packed, const Points& p, int64_t k,
+                  PackedPlaces<T>& places) {
+  const double width = static_cast<double>(a.width), height = static_cast<double>(a.height);
+  const Doubles column = split<inside>(p.x, width, width + 1, places.right + k);
+  const Doubles row = split<inside>(p.y, height, height + 1, places.lower + k);
+  const Doubles offset =
+      row * static_cast<double>(packed.row) + column * static_cast<double>(packed.pixel);
+  store(places.offset + k, __builtin_convertvector(offset, Vector<int32_t, kDoubles>));
+}
+
+// In a far image a point that touches no pixel is put at column or row -3.
+template <typename T>
+inline void place(const PolarSampleArgs<T>& a, const Points& p, int64_t k, FarPlaces<T>& places) {
+  using Ints = Vector<int64_t, kDoubles>;
+  const Doubles column = split<false>(p.x, static_cast<double>(a.width), -2, places.right + k) - 1;
+  const Doubles row = split<false>(p.y, static_cast<double>(a.height), -2, places.lower + k) - 1;
+  store(places.column + k, __builtin_convertvector(column, Ints));
+  store(places.row + k, __builtin_convertvector(row, Ints));
+}
+
+// A block of points, in the packed image or in the far one.
+template <typename T>
+struct PlacedPoints {
+  union {
+    PackedPlaces<T> near;
+    FarPlaces<T> far;
+  };
+  RandomWords random;
+
+  // Finds points j, j + 1, ... of radius i of image b, for places `first` on.
+  void find(const PolarSampleArgs<T>& a, const Packed& packed, bool in_packed, int64_t b, int64_t i,
+            int64_t j, int64_t count, int64_t first) {
+    if (!in_packed) {
+      locate(a, b, i, j, count, random,
+             [&](int64_t k, const Points& p) { place(a, p, first + k, far); });
+      return;
+    }
+    const double most = reach(a, b, i);
+    const T* center = a.center + b * a.center_stride;
+    if (center[0] - most > -1 && center[0] + most < a.width && center[1] - most > -1 &&
+        center[1] + most < a.height) {
+      locate(a, b, i, j, count, random,
+             [&](int64_t k, const Points& p) { place<true>(a, packed, p, first + k, near); });
+    } else {
+      locate(a, b, i, j, count, random,
+             [&](int64_t k, const Points& p) { place<false>(a, packed, p, first + k, near); });
+    }
+  }
+};
+
+// Calls visit<E>() with the type of the pixels.
+template <typename T, typename Visit>
+void with_pixel_type(Pixel pixel, Visit visit) {
+  if constexpr (sizeof(T) == sizeof(double)) {
+    visit.template operator()<double>();
+  } else if (pixel == Pixel::f32) {
+    visit.template operator()<float>();
+  } else if (pixel == Pixel::bf16) {
+    visit.template operator()<bfloat16>();
+  } else {
+    visit.template operator()<uint8_t>();
+  }
+}
+
+// The value of a pixel, in the type that is computed in.
+template <typename T>
+inline T value(const PolarSampleArgs<T>&, T pixel, int64_t) {
+  return pixel;
+}
+inline float value(const PolarSampleArgs<float>&, bfloat16 pixel, int64_t) { return widen(pixel); }
+inline float value(const PolarSampleArgs<float>& a, uint8_t pixel, int64_t channel) {
+  return pixel * a.pixel_scale[channel] + a.pixel_offset[channel];
+}
+
+// Interleaves planes of four channels: (4, width) -> (width, 4).
+template <typename T>
+void interleave(const T* const plane[4], int64_t width, T* to) {
+  using V = Vector<T, 4>;
+  int64_t x = 0;
+  for (; x + 4 <= width; x += 4) {
+    transpose4(load<V>(plane[0] + x), load<V>(plane[1] + x), load<V>(plane[2] + x),
+               load<V>(plane[3] + x), to + 4 * x, 4);
+  }
+  for (; x < width; ++x) {
+    for (int c = 0; c < 4; ++c) to[4 * x + c] = plane[c][x];
+  }
+}
+
+// Packs image b. `planes` has room for 4 rows of the image.
+template <typename T, typename E>
+void pack(const PolarSampleArgs<T>& a, const Packed& packed, int64_t b, T* planes, T* to) {
+  const E* image = static_cast<const E*>(a.image) + b * a.image_stride[0];
+  const int64_t channel_stride = a.image_stride[1], column_stride = a.image_stride[3];
+  for (int64_t y = 0; y < a.height; ++y) {
+    const E* from = image + y * a.image_stride[2];
+    T* row = to + (y + 1) * packed.row;
+    for (int64_t e = 0; e < packed.pixel; ++e) row[e] = 0;
+    row += packed.pixel;
+    for (int64_t first = 0; first < a.channels; first += 4) {
+      // Four channels as planes: where they lie, if they do, else a converted copy.
+      const T* plane[4];
+      for (int64_t c = 0; c < 4; ++c) {
+        T* copy = planes + c * a.width;
+        plane[c] = copy;
+        if (first + c >= a.channels) {
+          for (int64_t x = 0; x < a.width; ++x) copy[x] = 0;
+          continue;
+        }
+        const E* source = from + (first + c) * channel_stride;
+        if constexpr (sizeof(E) == sizeof(T)) {
+          if (column_stride == 1) {
+            plane[c] = source;
+            continue;
+          }
+        }
+        for (int64_t x = 0; x < a.width; ++x) {
+          copy[x] = value(a, source[x * column_stride], first + c);
+        }
+      }
+      if (packed.pixel == 4) {
+        interleave(plane, a.width, row);
+      } else {
+        for (int64_t x = 0; x < a.width; ++x) {
+          for (int64_t c = 0; c < 4; ++c) row[x * packed.pixel + first + c] = plane[c][x];
+        }
+      }
+    }
+    row += a.width * packed.pixel;
+    for (int64_t e = 0; e < 2 * packed.pixel; ++e) row[e] = 0;
+  }
+  for (int64_t e = 0; e < packed.row; ++e) to[e] = 0;
+  for (int64_t e = (a.height + 1) * packed.row; e < packed.size; ++e) to[e] = 0;
+}
+
+// The four pixels around a point of a far image, one channel after another.
+template <typename T, typename E>
+struct Corners {
+  const PolarSampleArgs<T>& args;
+  const E* image;
+  int64_t first;                   // offset of the upper left pixel, channel 0
+  bool left, right, upper, lower;  // which columns and rows are inside
+
+  Corners(const PolarSampleArgs<T>& a, int64_t b, int64_t column, int64_t row)
+      : args(a),
+        image(static_cast<const E*>(a.image) + b * a.image_stride[0]),
+        first(row * a.image_stride[2] + column * a.image_stride[3]),
+        left(column >= 0 && column < a.width),
+        right(column >= -1 && column + 1 < a.width),
+        upper(row >= 0 && row < a.height),
+        lower(row >= -1 && row + 1 < a.height) {}
+
+  bool inside() const { return left && right && upper && lower; }
+  bool outside() const { return !(left || right) || !(upper || lower); }
+
+  // Asks for both rows of a channel; a prefetch of an address that is not there does nothing.
+  void prefetch(int64_t channel) const {
+    const E* p = image + first + channel * args.image_stride[1];
+    __builtin_prefetch(p);
+    __builtin_prefetch(p + args.image_stride[2]);
+  }
+
+  // Upper left, upper right, lower left, lower right. Those outside count as 0, unless the caller
+  // knows that all are `inside`.
+  void read(int64_t channel, bool inside, T corner[4]) const {
+    const E* p = image + first + channel * args.image_stride[1];
+    const int64_t row = args.image_stride[2], column = args.image_stride[3];
+    corner[0] = inside || (upper && left) ? value(args, p[0], channel) : T(0);
+    corner[1] = inside || (upper && right) ? value(args, p[column], channel) : T(0);
+    corner[2] = inside || (lower && left) ? value(args, p[row], channel) : T(0);
+    corner[3] = inside || (lower && right) ? value(args, p[row + column], channel) : T(0);
+  }
+};
+
+}  // namespace

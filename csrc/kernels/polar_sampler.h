@@ -1,0 +1,230 @@
+// Samples of one token after another, forward. Interpolation is linear first downwards, then to the
+// right: two fused multiply-adds on pixels that hold all their channels.
+#pragma once
+
+#include "polar_image.h"
+
+namespace {
+
+// A pixel of four values between its neighbours, given it and the one below.
+inline Vector<float, 4> interpolate(const float* pixel, const float* below, float right,
+                                    float lower) {
+  // It and its right neighbour are one load.
+  using Pair = Vector<float, 8>;
+  const Pair top = load<Pair>(pixel), bottom = load<Pair>(below);
+  const Pair pair = top + lower * (bottom - top);
+  const Vector<float, 4> l = lower_half(pair), r = upper_half(pair);
+  return l + right * (r - l);
+}
+inline Vector<double, 4> interpolate(const double* pixel, const double* below, double right,
+                                     double lower) {
+  using V = Vector<double, 4>;
+  const V tl = load<V>(pixel), tr = load<V>(pixel + 4);
+  const V bl = load<V>(below), br = load<V>(below + 4);
+  const V l = tl + lower * (bl - tl), r = tr + lower * (br - tr);
+  return l + right * (r - l);
+}
+
+// Samples points of a packed image, point k to to[target[k]]. A function of its own, so that all it
+// needs stays in registers.
+template <typename T>
+[[gnu::noinline]] void sample_line(const T* pixels, int64_t row, const int32_t* offset,
+                                   const T* right, const T* lower, int64_t begin, int64_t end,
+                                   const int32_t* target, T* to) {
+  const T* below = pixels + row;
+#pragma GCC unroll 4
+  for (int64_t k = begin; k < end; ++k) {
+    store(to + target[k], interpolate(pixels + offset[k], below + offset[k], right[k], lower[k]));
+  }
+}
+
+template <typename T>
+class Sampler {
+ public:
+  static int64_t bytes(const PolarSampleArgs<T>& a) {
+    const int64_t values = a.packed ? Packed(a).size + 16 + 4 * a.width : 0;
+    return round_up(sizeof(State), 64) + values * static_cast<int64_t>(sizeof(T));
+  }
+
+  // Sample (row, s) of the token of a sector, channel c, will go to
+  // to[sector * sector_stride + row * row_stride + s * C + c]. Either a token is contiguous, or a
+  // row of all tokens is and has room for three values more.
+  Sampler(const PolarSampleArgs<T>& args, int64_t sector_stride, int64_t row_stride, void* scratch)
+      : a(args),
+        packed(args),
+        sector_stride(sector_stride),
+        row_stride(row_stride),
+        in_line(args.packed && args.channels <= 4 && args.patch_azimuths <= kBlock &&
+                args.patch_azimuths * args.channels >= 4),
+        state(*static_cast<State*>(scratch)),
+        points(state.points),
+        image(reinterpret_cast<T*>(static_cast<char*>(scratch) + round_up(sizeof(State), 64))) {
+    const int64_t columns = block_columns();
+    for (int64_t k = 0; k < kBlock; ++k) {
+      const int64_t column = k % columns;
+      state.to[k] = static_cast<int32_t>(k / columns * row_stride +
+                                         column / a.patch_azimuths * sector_stride +
+                                         column % a.patch_azimuths * a.channels);
+    }
+  }
+
+  // Samples the tokens of a ring of image b.
+  void ring(int64_t b, int64_t ring, T* to) {
+    if (a.packed && b != image_in_hand) {
+      with_pixel_type<T>(a.pixel, [&]<typename E>() {
+        pack<T, E>(a, packed, b, image + packed.size + 16, image);
+      });
+      image_in_hand = b;
+    }
+    const int64_t columns = block_columns(), rows = smaller(kBlock / columns, a.patch_radii);
+    for (int64_t j = 0; j < a.num_azimuths; j += columns) {
+      const int64_t count = smaller(columns, a.num_azimuths - j);
+      for (int64_t row = 0; row < a.patch_radii; row += rows) {
+        block(b, ring, j, count, row, smaller(rows, a.patch_radii - row), to);
+      }
+    }
+  }
+
+ private:
+  struct State {
+    PlacedPoints<T> points;
+    int32_t to[kBlock];  // where the points of a row of a block go
+  };
+
+  static int64_t smaller(int64_t x, int64_t y) { return x < y ? x : y; }
+
+  // A block is a few whole tokens: their pixels and their output stay in the nearest cache. Blocks
+  // are of equal size if that does not make them small. A token of more points than a block holds
+  // is cut.
+  int64_t block_columns() const {
+    const int64_t sectors = a.num_azimuths / a.patch_azimuths;
+    const int64_t most = kBlock / (a.patch_radii * a.patch_azimuths);
+    if (most < 1) return smaller(a.patch_azimuths, kBlock);
+    int64_t tokens = smaller(most, sectors);
+    while (sectors % tokens != 0 && 2 * tokens > most) --tokens;
+    return tokens * a.patch_azimuths;
+  }
+
+  // Points j to j + count of `rows` radii of a ring, from its radius `row` on.
+  void block(int64_t b, int64_t ring, int64_t j, int64_t count, int64_t row, int64_t rows, T* to) {
+    for (int64_t n = 0; n < rows; ++n) {
+      points.find(a, packed, a.packed, b, ring * a.patch_radii + row + n, j, count, n * count);
+      if (row_stride == a.patch_azimuths * a.channels && rows == a.patch_radii) {
+        const char* next =
+            reinterpret_cast<const char*>(to + (j + count) / a.patch_azimuths * sector_stride);
+        const int64_t bytes = count * row_stride / a.patch_azimuths * sizeof(T);
+        for (int64_t e = n * bytes; e < (n + 1) * bytes; e += 64) __builtin_prefetch(next + e, 1);
+      }
+    }
+    if (in_line && count == smaller(block_columns(), a.num_azimuths)) {
+      lines(rows, count, to + j / a.patch_azimuths * sector_stride + row * row_stride,
+            row + rows == a.patch_radii, j + count == a.num_azimuths);
+      return;
+    }
+    last_place = rows * count;
+    for (int64_t n = 0; n < rows; ++n) {
+      pieces(b, j, count, n * count, to + (row + n) * row_stride);
+    }
+  }
+
+  // Rows of a block, of up to four channels. Four values are stored where the point has fewer: the
+  // next point or row puts that right. Behind the last row of a token is the first of the next one,
+  // which is there already, so it is kept; behind the last token is what others may write to.
+  void lines(int64_t rows, int64_t count, T* to, bool last_row, bool last_token) {
+    const int64_t channels = a.channels, all = rows * count, tokens = count / a.patch_azimuths;
+    const int32_t* target = state.to;
+    const auto& near = points.near;
+    if (!last_row) {
+      sample_line(image, packed.row, near.offset, near.right, near.lower, 0, all, target, to);
+      return;
+    }
+    const int64_t before = all - count;
+    sample_line(image, packed.row, near.offset, near.right, near.lower, 0, before, target, to);
+    T* first = to + (rows - a.patch_radii) * row_stride;  // row 0 of the first token
+    T kept[kBlock / 4 + 1][4];
+    for (int64_t t = 1; t < tokens; ++t) {
+      store(kept[t], load<Vector<T, 4>>(first + t * sector_stride));
+    }
+    const int64_t whole = last_token && before < all - 4 ? all - 4 : last_token ? before : all;
+    sample_line(image, packed.row, near.offset, near.right, near.lower, before, whole, target, to);
+    for (int64_t k = whole; k < all; ++k) {
+      const Vector<T, 4> v =
+          interpolate(image + near.offset[k], image + packed.row + near.offset[k], near.right[k],
+                      near.lower[k]);
+      for (int64_t c = 0; c < channels; ++c) to[target[k] + c] = v[c];
+    }
+    for (int64_t t = 1; t < tokens; ++t) {
+      store(first + t * sector_stride, load<Vector<T, 4>>(kept[t]));
+    }
+  }
+
+  // Points j to j + count of one radius, whose places are `place` on, sector by sector.
+  void pieces(int64_t b, int64_t j, int64_t count, int64_t place, T* to) const {
+    int64_t sector = j / a.patch_azimuths, s = j % a.patch_azimuths;
+    for (int64_t k = 0; k < count; ++sector, s = 0) {
+      const int64_t piece = smaller(a.patch_azimuths - s, count - k);
+      T* out = to + sector * sector_stride + s * a.channels;
+      if (a.packed) {
+        near_piece(place + k, piece, out);
+      } else {
+        far_piece(b, place + k, piece, out);
+      }
+      k += piece;
+    }
+  }
+
+  void near_piece(int64_t k, int64_t piece, T* to) const {
+    for (int64_t n = k; n < k + piece; ++n, to += a.channels) {
+      const T* pixel = image + points.near.offset[n];
+      const T right = points.near.right[n], lower = points.near.lower[n];
+      const T *below = pixel + packed.row, *next = pixel + packed.pixel,
+              *opposite = below + packed.pixel;
+#pragma omp simd
+      for (int64_t c = 0; c < a.channels; ++c) {
+        const T l = pixel[c] + lower * (below[c] - pixel[c]);
+        const T r = next[c] + lower * (opposite[c] - next[c]);
+        to[c] = l + right * (r - l);
+      }
+    }
+  }
+
+  void far_piece(int64_t b, int64_t k, int64_t piece, T* to) const {
+    with_pixel_type<T>(a.pixel, [&]<typename E>() {
+      for (int64_t n = k; n < k + piece; ++n, to += a.channels) {
+        constexpr int64_t ahead = 16;
+        if (n + ahead < last_place) {
+          const Corners<T, E> next(a, b, points.far.column[n + ahead], points.far.row[n + ahead]);
+          for (int64_t c = 0; c < a.channels; ++c) next.prefetch(c);
+        }
+        const Corners<T, E> corners(a, b, points.far.column[n], points.far.row[n]);
+        const T right = points.far.right[n], lower = points.far.lower[n];
+        if (corners.inside()) {
+          far_point<true>(corners, right, lower, to);
+        } else {
+          far_point<false>(corners, right, lower, to);
+        }
+      }
+    });
+  }
+
+  template <bool kInside, typename E>
+  void far_point(const Corners<T, E>& corners, T right, T lower, T* to) const {
+    for (int64_t c = 0; c < a.channels; ++c) {
+      T p[4];
+      corners.read(c, kInside, p);
+      const T l = p[0] + lower * (p[2] - p[0]), r = p[1] + lower * (p[3] - p[1]);
+      to[c] = l + right * (r - l);
+    }
+  }
+
+  const PolarSampleArgs<T>& a;
+  const Packed packed;
+  const int64_t sector_stride, row_stride;
+  const bool in_line;
+  State& state;
+  PlacedPoints<T>& points;
+  T* image;  // packed, and after it the rows that pack() converts
+  int64_t image_in_hand = -1, last_place = 0;
+};
+
+}  // namespace

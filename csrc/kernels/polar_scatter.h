@@ -1,0 +1,233 @@
+// The image's gradient: every point adds its gradient, weighted, to four pixels.
+//
+// The sums of a small image are kept in cells: what goes to the four pixels around a point, four
+// channels each, is one cache line that is added to as a whole; at the end each pixel collects its
+// share of four cells. A larger image is kept packed (polar_image.h), a pixel a register; a still
+// larger one is added to in place. Neighbouring points often meet in one pixel, and an addition
+// must wait for the one before; so points are taken from several places of the circle in turn.
+#pragma once
+
+#include "polar_rows.h"
+
+namespace {
+
+constexpr int64_t kCellBytes = 1 << 20;
+
+template <typename T>
+class Scatter {
+ public:
+  static int64_t bytes(const PolarSampleArgs<T>& a) {
+    const int64_t sums = keeping(a) == kInPlace ? 0 : sums_layout(a).size;
+    return round_up(sizeof(PlacedPoints<T>), 64) + row_bytes(a) +
+           sums * static_cast<int64_t>(sizeof(T));
+  }
+
+  // Band `band` of image b.
+  Scatter(const PolarSampleArgs<T>& args, int64_t b, int64_t band, void* scratch)
+      : a(args),
+        keep(keeping(args)),
+        layout(sums_layout(args)),
+        image(b),
+        first_row(band_row(band)),
+        end_row(band_row(band + 1)),
+        points(*static_cast<PlacedPoints<T>*>(scratch)),
+        grads(reinterpret_cast<T*>(static_cast<char*>(scratch) +
+                                   round_up(sizeof(PlacedPoints<T>), 64))),
+        sums(grads + row_bytes(args) / sizeof(T)) {
+    if (keep == kInPlace) return;
+    for (int64_t e = first_kept() * layout.row; e < end_kept() * layout.row; ++e) sums[e] = 0;
+  }
+
+  // Whether points of radius i may touch the band.
+  bool touches(int64_t i) const {
+    if (a.bands == 1) return true;
+    const double y = a.center[image * a.center_stride + 1], most = reach(a, image, i) + 2;
+    // Written so that NaN touches.
+    return !(y + most < first_row || y - most > end_row);
+  }
+
+  // Adds the gradients of radius i, which lie at `row` of `grad`.
+  void row(int64_t i, const void* grad, const Row& row) {
+    read_row(a, grad, row, grads);
+    for (int64_t j = 0; j < a.num_azimuths; j += kBlock) {
+      const int64_t count = a.num_azimuths - j < kBlock ? a.num_azimuths - j : kBlock;
+      points.find(a, layout, keep != kInPlace, image, i, j, count, 0);
+      const T* block = grads + j * a.channels;
+      if (keep == kCells) {
+        add_to_cells(count, block);
+      } else if (keep == kPacked) {
+        add_to_packed(count, block);
+      } else {
+        for (int64_t k = 0; k < count; ++k) add_in_place(k, block + k * a.channels);
+      }
+    }
+  }
+
+  // Writes the sums to the image's gradient.
+  void finish() const {
+    if (keep == kInPlace) return;
+    with_pixel_type<T>(a.pixel, [&]<typename E>() {
+      if constexpr (sizeof(E) > 1) {
+        E* to = static_cast<E*>(a.grad_image) + image * a.channels * a.height * a.width;
+        for (int64_t y = first_row; y < end_row; ++y) {
+          const T* from = sums + (y + 1) * layout.row + layout.pixel;
+          if (keep == kCells) collect(from);
+          for (int64_t c = 0; c < a.channels; ++c) {
+            E* line = to + (c * a.height + y) * a.width;
+            for (int64_t x = 0; x < a.width; ++x) convert(line + x, from[x * layout.pixel + c]);
+          }
+        }
+      }
+    });
+  }
+
+ private:
+  enum Keeping { kCells, kPacked, kInPlace };
+
+  // Bands are rows of packed images. Gradients narrower than what is added up cannot be added to in
+  // place.
+  static Keeping keeping(const PolarSampleArgs<T>& a) {
+    if (!a.packed && a.pixel != Pixel::bf16) return kInPlace;
+    const bool cells =
+        sizeof(T) == sizeof(float) && a.channels <= 4 && Packed(a).size * 16 <= kCellBytes;
+    return cells ? kCells : kPacked;
+  }
+
+  static Packed sums_layout(const PolarSampleArgs<T>& a) {
+    Packed layout(a);
+    if (keeping(a) == kCells) {
+      layout.pixel *= 4;
+      layout.row *= 4;
+      layout.size *= 4;
+    }
+    return layout;
+  }
+
+  // The rows that the band keeps sums in: those of its pixels, the outermost bands the borders too;
+  // in cells also the row above, which two bands then keep.
+  int64_t band_row(int64_t band) const { return a.height * band / a.bands; }
+  int64_t first_kept() const { return first_row == 0 ? 0 : first_row + (keep == kCells ? 0 : 1); }
+  int64_t end_kept() const { return end_row == a.height ? a.height + 3 : end_row + 1; }
+
+  // Calls visit(k) for all k < count, from several places in turn.
+  template <typename Visit>
+  static void in_turn(int64_t count, Visit visit) {
+    constexpr int64_t places = 8;
+    const int64_t each = count / places;
+    for (int64_t k = 0; k < each; ++k) {
+#pragma GCC unroll 8
+      for (int64_t p = 0; p < places; ++p) visit(p * each + k);
+    }
+    for (int64_t k = each * places; k < count; ++k) visit(k);
+  }
+
+  // A cell is (upper left, upper right, lower left, lower right) of four channels each.
+  [[gnu::noinline]] void add_to_cells(int64_t count, const T* block) const {
+    const int64_t channels = a.channels;
+    const PackedPlaces<T>& places = points.near;
+    T* cells = sums;
+    const int64_t begin = first_kept() * layout.row, end = end_kept() * layout.row;
+    const bool banded = a.bands > 1;
+    in_turn(count, [=, &places](int64_t k) {
+      const int64_t offset = places.offset[k];
+      if (banded && (offset < begin || offset >= end)) return;
+      add_cell(cells + offset, block + k * channels, places.right[k], places.lower[k]);
+    });
+  }
+
+  static void add_cell(float* cell, const float* grad, float right, float lower) {
+    constexpr int lanes = kLanes<float>;
+    using V = Vector<float, lanes>;
+    // Weights are 1 - right, right, ... and 1 - lower, ..., lower, ...
+    constexpr float one_x[] = {1, 1, 1, 1, 0, 0, 0, 0, 1, 1, 1, 1, 0, 0, 0, 0};
+    constexpr float sign_x[] = {-1, -1, -1, -1, 1, 1, 1, 1, -1, -1, -1, -1, 1, 1, 1, 1};
+    constexpr float one_y[] = {1, 1, 1, 1, 1, 1, 1, 1, 0, 0, 0, 0, 0, 0, 0, 0};
+    constexpr float sign_y[] = {-1, -1, -1, -1, -1, -1, -1, -1, 1, 1, 1, 1, 1, 1, 1, 1};
+    const V g = repeat<V>(load<Vector<float, 4>>(grad));
+    for (int e = 0; e < 16; e += lanes) {
+      const V x = load<V>(one_x + e) + right * load<V>(sign_x + e);
+      const V y = load<V>(one_y + e) + lower * load<V>(sign_y + e);
+      store(cell + e, load<V>(cell + e) + g * x * y);
+    }
+  }
+  static void add_cell(double*, const double*, double, double) {}  // doubles are never in cells
+
+  // The pixels of a row, from the cells around each, into the front of their own cells.
+  void collect(const T* row) const {
+    using V = Vector<T, 4>;
+    T* cell = const_cast<T*>(row);
+    for (int64_t x = 0; x < a.width; ++x, cell += layout.pixel) {
+      const T *left = cell - layout.pixel, *above = cell - layout.row;
+      // The cell to the left has given its own part away, but not that for this pixel.
+      store(cell, load<V>(cell) + load<V>(left + 4) +
+                      (load<V>(above + 8) + load<V>(above - layout.pixel + 12)));
+    }
+  }
+
+  [[gnu::noinline]] void add_to_packed(int64_t count, const T* block) const {
+    if (a.bands > 1) {
+      in_turn(count, [=, this](int64_t k) { add_pixels<true>(k, block); });
+    } else {
+      in_turn(count, [=, this](int64_t k) { add_pixels<false>(k, block); });
+    }
+  }
+
+  // A point adds to the rows that are in the band.
+  template <bool kBanded>
+  void add_pixels(int64_t k, const T* block) const {
+    using V = Vector<T, 4>;
+    const T down = points.near.lower[k], right = points.near.right[k];
+    const int64_t offset = points.near.offset[k], pixel = layout.pixel;
+    const bool upper = !kBanded || in_band(offset);
+    const bool lower = !kBanded || in_band(offset + layout.row);
+    T* top = sums + offset;
+    T* bottom = top + layout.row;
+    const T* grad = block + k * a.channels;
+    for (int64_t c = 0; c < pixel; c += 4) {
+      const V g = load<V>(grad + c), below = g * down, above = g - below;
+      const V above_right = above * right, below_right = below * right;
+      if (upper) {
+        store(top + c, load<V>(top + c) + (above - above_right));
+        store(top + pixel + c, load<V>(top + pixel + c) + above_right);
+      }
+      if (lower) {
+        store(bottom + c, load<V>(bottom + c) + (below - below_right));
+        store(bottom + pixel + c, load<V>(bottom + pixel + c) + below_right);
+      }
+    }
+  }
+
+  // Whether a place in the packed image is in a row of the band.
+  bool in_band(int64_t offset) const {
+    return offset >= first_kept() * layout.row && offset < end_kept() * layout.row;
+  }
+
+  void add_in_place(int64_t k, const T* grad) const {
+    const int64_t column = points.far.column[k], row = points.far.row[k];
+    const T down = points.far.lower[k], right = points.far.right[k];
+    const int64_t plane = a.height * a.width;
+    T* pixel = static_cast<T*>(a.grad_image) + image * a.channels * plane + row * a.width + column;
+    const bool columns[2] = {column >= 0 && column < a.width, column >= -1 && column + 1 < a.width};
+    for (int64_t c = 0; c < a.channels; ++c, pixel += plane) {
+      const T below = grad[c] * down, above = grad[c] - below;
+      const T values[2][2] = {{above - above * right, above * right},
+                              {below - below * right, below * right}};
+      for (int v = 0; v < 2; ++v) {
+        if (row + v < first_row || row + v >= end_row) continue;
+        for (int h = 0; h < 2; ++h) {
+          if (columns[h]) pixel[v * a.width + h] += values[v][h];
+        }
+      }
+    }
+  }
+
+  const PolarSampleArgs<T>& a;
+  const Keeping keep;
+  const Packed layout;
+  const int64_t image, first_row, end_row;
+  PlacedPoints<T>& points;
+  T* grads;  // one row of gradients
+  T* sums;   // cells or packed image
+};
+
+}  // namespace

@@ -1,0 +1,94 @@
+// What a call of polar_sample or polar_embed brings, checked and laid out as the kernels want it.
+// The checks only keep memory safe; darswin/ops explains wrong arguments.
+#pragma once
+
+#include <torch/csrc/stable/ops.h>
+#include <torch/csrc/stable/tensor.h>
+#include <torch/headeronly/util/Exception.h>
+
+#include <optional>
+#include <tuple>
+#include <vector>
+
+#include "dispatch.h"
+
+namespace darswin {
+
+using Sizes = std::vector<int64_t>;
+
+// A packed copy of this many bytes stays in the second-level cache, as its points walk around the
+// circle; it pays where a pixel is looked at often enough.
+constexpr int64_t kPackedBytes = 3 << 19;
+constexpr int64_t kPackedPixelsPerPoint = 4;
+
+inline Pixel pixel_type(const torch::stable::Tensor& image) {
+  using torch::headeronly::ScalarType;
+  switch (image.scalar_type()) {
+    case ScalarType::Float:
+      return Pixel::f32;
+    case ScalarType::Double:
+      return Pixel::f64;
+    case ScalarType::BFloat16:
+      return Pixel::bf16;
+    case ScalarType::Byte:
+      return Pixel::u8;
+    default:
+      STD_TORCH_CHECK(false, "polar_sample: pixels must be float32, float64, bfloat16 or uint8");
+  }
+}
+
+// The tensors of one call. Owns what `args` points into.
+template <typename T>
+struct PolarCall {
+  torch::stable::Tensor image, radii, center;
+  std::vector<double> directions;
+  std::vector<T> scale, offset;
+  PolarSampleArgs<T> args{};
+  int64_t batch;
+
+  PolarCall(const torch::stable::Tensor& image, const torch::stable::Tensor& radii,
+            const torch::stable::Tensor& azimuths, const torch::stable::Tensor& center,
+            const Sizes& patch, double jitter, const std::optional<torch::stable::Tensor>& seed,
+            const std::vector<double>& mean, const std::vector<double>& std, bool bfloat16);
+
+  int64_t rings() const { return args.num_radii / args.patch_radii; }
+  int64_t sectors() const { return args.num_azimuths / args.patch_azimuths; }
+  int64_t samples() const { return args.patch_radii * args.patch_azimuths * args.channels; }
+  bool channels_and_points() const {
+    return args.channels > 0 && args.num_radii > 0 && args.num_azimuths > 0;
+  }
+};
+
+// Into how many bands of rows backward cuts an image, so that a small batch of large images uses
+// all threads.
+int64_t count_bands(int64_t batch, int64_t height);
+
+// The image's gradient, for backward kernels to fill: zeros unless they write all of it.
+template <typename T>
+torch::stable::Tensor new_image_gradient(PolarCall<T>& call);
+
+// Gradients of image, radii and center from args.grad_out; what is not wanted comes back empty.
+template <typename T>
+std::tuple<torch::stable::Tensor, torch::stable::Tensor, torch::stable::Tensor> polar_backward(
+    PolarCall<T>& call, bool image_grad, bool lens_grad);
+
+// Calls run(call) with a call of the image's type.
+template <typename Run>
+auto with_polar_call(const torch::stable::Tensor& image, const torch::stable::Tensor& radii,
+                     const torch::stable::Tensor& azimuths, const torch::stable::Tensor& center,
+                     const Sizes& patch, double jitter,
+                     const std::optional<torch::stable::Tensor>& seed,
+                     const std::vector<double>& mean, const std::vector<double>& std, bool bfloat16,
+                     Run run) {
+  if (pixel_type(image) == Pixel::f64) {
+    return run(PolarCall<double>(image, radii, azimuths, center, patch, jitter, seed, mean, std,
+                                 bfloat16));
+  }
+  return run(
+      PolarCall<float>(image, radii, azimuths, center, patch, jitter, seed, mean, std, bfloat16));
+}
+
+extern template struct PolarCall<float>;
+extern template struct PolarCall<double>;
+
+}  // namespace darswin

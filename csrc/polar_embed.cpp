@@ -1,0 +1,205 @@
+// polar_embed and its backward on CPU: allocate, thread, call the kernel.
+#include <torch/csrc/stable/library.h>
+
+#include <optional>
+#include <tuple>
+#include <vector>
+
+#include "parallel.h"
+#include "polar_call.h"
+
+namespace darswin {
+namespace {
+
+using torch::headeronly::ScalarType;
+using torch::stable::Tensor;
+
+int64_t padded(int64_t n) { return (n + kRowUnit - 1) / kRowUnit * kRowUnit; }
+
+// A weight (D, S_r * S_phi * C) or a bias (D,), contiguous and in the type that is computed in.
+template <typename T>
+Tensor parameter(const PolarCall<T>& call, const Tensor& value) {
+  STD_TORCH_CHECK(value.is_cpu(), "polar_embed: weight and bias must be on the CPU");
+  return torch::stable::contiguous(torch::stable::to(value, call.radii.scalar_type()));
+}
+
+template <typename T>
+void check_weight(const PolarCall<T>& call, const Tensor& weight) {
+  STD_TORCH_CHECK(weight.dim() == 2 && weight.size(1) == call.samples(),
+                  "polar_embed: weight does not fit the samples of a token");
+}
+
+template <typename T>
+Sizes output_sizes(const PolarCall<T>& call, int64_t features) {
+  return {call.batch, call.rings(), call.sectors(), features};
+}
+
+template <typename T>
+ScalarType output_type(const PolarCall<T>& call) {
+  return call.args.narrow ? ScalarType::BFloat16 : call.radii.scalar_type();
+}
+
+template <typename T>
+Tensor forward(PolarCall<T>&& call, const Tensor& weight_, const std::optional<Tensor>& bias_) {
+  check_weight(call, weight_);
+  const Tensor weight = parameter(call, weight_);
+  const auto& kernel = kernels().table<T>();
+  PolarSampleArgs<T>& args = call.args;
+  args.tokens = true;
+  PolarEmbedArgs<T> embed{};
+  embed.features = weight.size(0);
+  const Tensor bias = bias_.has_value() ? parameter(call, *bias_) : weight;
+  if (bias_.has_value()) {
+    STD_TORCH_CHECK(bias.dim() == 1 && bias.size(0) == embed.features,
+                    "polar_embed: bias does not fit the weight");
+    embed.bias = bias.template const_data_ptr<T>();
+  }
+  const Tensor out =
+      torch::stable::new_empty(call.radii, output_sizes(call, embed.features), output_type(call));
+  if (out.numel() == 0) return out;
+  args.out = out.mutable_data_ptr();
+  const int64_t wide = padded(embed.features);
+  std::vector<T> transposed(call.samples() * wide);
+  kernel.transpose(weight.template const_data_ptr<T>(), embed.features, call.samples(),
+                   transposed.data(), wide);
+  embed.transposed = transposed.data();
+  const int64_t bytes = kernel.polar_embed_scratch(args, embed);
+  parallel_ranges(call.batch * call.rings(), [&](int64_t begin, int64_t end, int64_t) {
+    kernel.polar_embed(args, embed, begin, end, scratch(bytes));
+  });
+  return out;
+}
+
+// Gradients of weight and bias: sums of chunks, as many as there are whatever the threads, added up
+// in their order.
+template <typename T>
+std::tuple<Tensor, Tensor> weight_gradients(const PolarCall<T>& call,
+                                            const PolarEmbedArgs<T>& embed) {
+  const auto& kernel = kernels().table<T>();
+  const int64_t depth = call.samples(), row = padded(depth), items = call.batch * call.rings();
+  const int64_t size = embed.features * (row + 1);  // of a chunk: weight, then bias
+  const int64_t chunks = std::min<int64_t>(items, 16);
+  std::vector<T> sums(chunks * size, T(0));
+  const int64_t bytes = kernel.polar_embed_scratch(call.args, embed);
+  parallel_ranges(chunks, [&](int64_t begin, int64_t end, int64_t) {
+    for (int64_t chunk = begin; chunk < end; ++chunk) {
+      T* sum = sums.data() + chunk * size;
+      kernel.polar_embed_backward_weight(call.args, embed, items * chunk / chunks,
+                                         items * (chunk + 1) / chunks, sum,
+                                         sum + embed.features * row, scratch(bytes));
+    }
+  });
+  const Tensor weight = torch::stable::new_empty(call.radii, Sizes{embed.features, depth});
+  const Tensor bias = torch::stable::new_empty(call.radii, Sizes{embed.features});
+  T *to_weight = weight.template mutable_data_ptr<T>(),
+    *to_bias = bias.template mutable_data_ptr<T>();
+  parallel_ranges(embed.features, [&](int64_t begin, int64_t end, int64_t) {
+    for (int64_t f = begin; f < end; ++f) {
+      for (int64_t k = 0; k < depth; ++k) to_weight[f * depth + k] = 0;
+      to_bias[f] = 0;
+      for (int64_t chunk = 0; chunk < chunks; ++chunk) {
+        const T* sum = sums.data() + chunk * size;
+        for (int64_t k = 0; k < depth; ++k) to_weight[f * depth + k] += sum[f * row + k];
+        to_bias[f] += sum[embed.features * row + f];
+      }
+    }
+  });
+  return {weight, bias};
+}
+
+// Gradients of image and lens, through those of the samples.
+template <typename T>
+std::tuple<Tensor, Tensor, Tensor> sampling_gradients(PolarCall<T>& call, PolarEmbedArgs<T>& embed,
+                                                      const Tensor& weight, bool image_grad,
+                                                      bool lens_grad) {
+  const auto& kernel = kernels().table<T>();
+  const int64_t depth = call.samples(), row = padded(depth);
+  std::vector<T> rows(embed.features * row, T(0));
+  const T* from = weight.template const_data_ptr<T>();
+  for (int64_t f = 0; f < embed.features; ++f) {
+    std::copy(from + f * depth, from + (f + 1) * depth, rows.begin() + f * row);
+  }
+  embed.weight = rows.data();
+  const int64_t bytes = kernel.polar_embed_scratch(call.args, embed);
+  const bool fused = !lens_grad && count_bands(call.batch, call.args.height) == 1;
+  if (fused) {
+    const Tensor grad_image = new_image_gradient(call);
+    call.args.bands = 1;
+    parallel_ranges(
+        call.channels_and_points() ? call.batch : 0, [&](int64_t begin, int64_t end, int64_t) {
+          kernel.polar_embed_backward_image(call.args, embed, begin, end, scratch(bytes));
+        });
+    const Sizes none = {0};
+    return {grad_image, torch::stable::new_empty(call.radii, none),
+            torch::stable::new_empty(call.center, none)};
+  }
+  const Tensor grad_samples = torch::stable::new_empty(call.radii, output_sizes(call, depth));
+  embed.grad_samples = grad_samples.template mutable_data_ptr<T>();
+  parallel_ranges(call.channels_and_points() ? call.batch * call.rings() : 0,
+                  [&](int64_t begin, int64_t end, int64_t) {
+                    kernel.polar_embed_backward_samples(call.args, embed, begin, end,
+                                                        scratch(bytes));
+                  });
+  call.args.grad_out = embed.grad_samples;
+  call.args.narrow = false;
+  return polar_backward(call, image_grad, lens_grad);
+}
+
+template <typename T>
+std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> backward(PolarCall<T>&& call,
+                                                            const Tensor& grad_out_,
+                                                            const Tensor& weight_, bool image_grad,
+                                                            bool lens_grad, bool weight_grad) {
+  check_weight(call, weight_);
+  const Tensor grad_out = torch::stable::contiguous(grad_out_);
+  const Tensor weight = parameter(call, weight_);
+  PolarSampleArgs<T>& args = call.args;
+  args.tokens = true;
+  args.bands = 1;
+  PolarEmbedArgs<T> embed{};
+  embed.features = weight.size(0);
+  STD_TORCH_CHECK(grad_out.sizes().vec() == output_sizes(call, embed.features) &&
+                      grad_out.scalar_type() == output_type(call),
+                  "polar_embed_backward: grad_out must look like the output");
+  args.grad_out = grad_out.const_data_ptr();
+  const Sizes none = {0};
+  Tensor grad_weight = torch::stable::new_empty(call.radii, none), grad_bias = grad_weight;
+  if (weight_grad) {
+    std::tie(grad_weight, grad_bias) = weight_gradients(call, embed);
+  }
+  Tensor grad_image = torch::stable::new_empty(call.image, none);
+  Tensor grad_radii = torch::stable::new_empty(call.radii, none);
+  Tensor grad_center = torch::stable::new_empty(call.center, none);
+  if (image_grad || lens_grad) {
+    std::tie(grad_image, grad_radii, grad_center) =
+        sampling_gradients(call, embed, weight, image_grad, lens_grad);
+  }
+  return {grad_image, grad_radii, grad_center, grad_weight, grad_bias};
+}
+
+Tensor polar_embed(const Tensor& image, const Tensor& radii, const Tensor& azimuths,
+                   const Tensor& center, const Tensor& weight, std::optional<Tensor> bias,
+                   Sizes patch, double jitter, std::optional<Tensor> seed, std::vector<double> mean,
+                   std::vector<double> std, bool bfloat16) {
+  return with_polar_call(image, radii, azimuths, center, patch, jitter, seed, mean, std, bfloat16,
+                         [&](auto&& call) { return forward(std::move(call), weight, bias); });
+}
+
+std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> polar_embed_backward(
+    const Tensor& grad_out, const Tensor& image, const Tensor& radii, const Tensor& azimuths,
+    const Tensor& center, const Tensor& weight, Sizes patch, double jitter,
+    std::optional<Tensor> seed, std::vector<double> mean, std::vector<double> std, bool bfloat16,
+    bool image_grad, bool lens_grad, bool weight_grad) {
+  return with_polar_call(
+      image, radii, azimuths, center, patch, jitter, seed, mean, std, bfloat16, [&](auto&& call) {
+        return backward(std::move(call), grad_out, weight, image_grad, lens_grad, weight_grad);
+      });
+}
+
+}  // namespace
+}  // namespace darswin
+
+STABLE_TORCH_LIBRARY_IMPL(darswin, CPU, m) {
+  m.impl("polar_embed", TORCH_BOX(&darswin::polar_embed));
+  m.impl("polar_embed_backward", TORCH_BOX(&darswin::polar_embed_backward));
+}
