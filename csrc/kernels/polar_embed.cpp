@@ -144,9 +144,9 @@ void backward_image(const PolarSampleArgs<T>& args, const PolarEmbedArgs<T>& e, 
     Scatter<T> scatter(a, b, 0, s.scatter);
     for (int64_t ring = 0; ring < rings; ++ring) {
       sample_grads(args, e, b * rings + ring, s);
-      for (int64_t n = 0; n < a.patch_radii; ++n) {
-        scatter.row(ring * a.patch_radii + n, s.samples, Row{n * piece, s.row, a.channels, 1});
-      }
+      scatter.ring(ring, [&](int64_t n, T* to) {
+        read_row(a, s.samples, Row{n * piece, s.row, a.channels, 1}, to);
+      });
     }
     scatter.finish();
   }

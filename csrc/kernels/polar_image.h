@@ -37,7 +37,8 @@ struct PackedPlaces : Places<T> {
 };
 template <typename T>
 struct FarPlaces : Places<T> {
-  int64_t column[kPlaces], row[kPlaces];  // of the upper left pixel; see place()
+  int64_t column[kPlaces], row[kPlaces];  // of the upper left pixel
+  int64_t offset[kPlaces];                // its offset, or -1 where not all four are inside
 };
 
 // Whole and fractional parts of coordinates, one pixel further as in a packed image. Coordinates
@@ -62,14 +63,23 @@ inline void place(const PolarSampleArgs<T>& a, const Packed& packed, const Point
   store(places.offset + k, __builtin_convertvector(offset, Vector<int32_t, kDoubles>));
 }
 
-// In a far image a point that touches no pixel is put at column or row -3.
+// In a far image a point that touches no pixel is put at column or row -3. `strides` are those of
+// the rows and columns of what is read or written.
 template <typename T>
-inline void place(const PolarSampleArgs<T>& a, const Points& p, int64_t k, FarPlaces<T>& places) {
+inline void place(const PolarSampleArgs<T>& a, const int64_t strides[2], const Points& p, int64_t k,
+                  FarPlaces<T>& places) {
   using Ints = Vector<int64_t, kDoubles>;
-  const Doubles column = split<false>(p.x, static_cast<double>(a.width), -2, places.right + k) - 1;
-  const Doubles row = split<false>(p.y, static_cast<double>(a.height), -2, places.lower + k) - 1;
+  const double width = static_cast<double>(a.width), height = static_cast<double>(a.height);
+  const Doubles column = split<false>(p.x, width, -2, places.right + k) - 1;
+  const Doubles row = split<false>(p.y, height, -2, places.lower + k) - 1;
+  // Exact in double below 2^53.
+  const Doubles offset =
+      row * static_cast<double>(strides[0]) + column * static_cast<double>(strides[1]);
+  const auto inside = (column >= 0) & (row >= 0) & (column < width - 1) & (row < height - 1);
   store(places.column + k, __builtin_convertvector(column, Ints));
   store(places.row + k, __builtin_convertvector(row, Ints));
+  store(places.offset + k,
+        __builtin_convertvector(select(inside, offset, splat<Doubles>(-1.0)), Ints));
 }
 
 // A block of points, in the packed image or in the far one.
@@ -82,17 +92,13 @@ struct PlacedPoints {
   RandomWords random;
 
   // Finds points j, j + 1, ... of radius i of image b, for places `first` on.
-  void find(const PolarSampleArgs<T>& a, const Packed& packed, bool in_packed, int64_t b, int64_t i,
-            int64_t j, int64_t count, int64_t first) {
-    if (!in_packed) {
-      locate(a, b, i, j, count, random,
-             [&](int64_t k, const Points& p) { place(a, p, first + k, far); });
-      return;
-    }
+  void find(const PolarSampleArgs<T>& a, const Packed& packed, int64_t b, int64_t i, int64_t j,
+            int64_t count, int64_t first) {
     const double most = reach(a, b, i);
     const T* center = a.center + b * a.center_stride;
-    if (center[0] - most > -1 && center[0] + most < a.width && center[1] - most > -1 &&
-        center[1] + most < a.height) {
+    const auto width = static_cast<double>(a.width), height = static_cast<double>(a.height);
+    if (center[0] - most > -1 && center[0] + most < width && center[1] - most > -1 &&
+        center[1] + most < height) {
       locate(a, b, i, j, count, random,
              [&](int64_t k, const Points& p) { place<true>(a, packed, p, first + k, near); });
     } else {
@@ -100,7 +106,40 @@ struct PlacedPoints {
              [&](int64_t k, const Points& p) { place<false>(a, packed, p, first + k, near); });
     }
   }
+
+  // The same in the far image.
+  void find_far(const PolarSampleArgs<T>& a, const int64_t strides[2], int64_t b, int64_t i,
+                int64_t j, int64_t count, int64_t first) {
+    locate(a, b, i, j, count, random,
+           [&](int64_t k, const Points& p) { place(a, strides, p, first + k, far); });
+  }
 };
+
+constexpr int64_t kAhead = 40;  // how many points ahead the pixels of a far image are asked for
+
+// The order to visit a block of a far image in, points j to j + count of `rows` radii, whose places
+// are `columns` apart; returns their number. Token after token, and in each along the rows of the
+// image: above and below the center these follow the azimuth, on both sides of it the radius.
+template <typename T>
+int64_t far_order(const PolarSampleArgs<T>& a, int64_t j, int64_t count, int64_t rows,
+                  int64_t columns, uint16_t* order) {
+  int64_t visited = 0;
+  for (int64_t k = 0; k < count; k += a.patch_azimuths) {
+    const int64_t end = k + a.patch_azimuths < count ? k + a.patch_azimuths : count;
+    const double sin = a.sines[j + k], cos = a.cosines[j + k];
+    if (sin * sin > cos * cos) {
+      for (int64_t n = 0; n < rows; ++n) {
+        for (int64_t s = k; s < end; ++s) order[visited++] = static_cast<uint16_t>(n * columns + s);
+      }
+    } else {
+      for (int64_t s = k; s < end; ++s) {
+        for (int64_t n = 0; n < rows; ++n)
+          order[visited++] = static_cast<uint16_t>(n * columns + s);
+      }
+    }
+  }
+  return visited;
+}
 
 // Calls visit<E>() with the type of the pixels.
 template <typename T, typename Visit>
@@ -186,7 +225,8 @@ void pack(const PolarSampleArgs<T>& a, const Packed& packed, int64_t b, T* plane
   for (int64_t e = (a.height + 1) * packed.row; e < packed.size; ++e) to[e] = 0;
 }
 
-// The four pixels around a point of a far image, one channel after another.
+// The four pixels around a point of a far image, where they may lie outside it, one channel after
+// another.
 template <typename T, typename E>
 struct Corners {
   const PolarSampleArgs<T>& args;
@@ -203,25 +243,16 @@ struct Corners {
         upper(row >= 0 && row < a.height),
         lower(row >= -1 && row + 1 < a.height) {}
 
-  bool inside() const { return left && right && upper && lower; }
   bool outside() const { return !(left || right) || !(upper || lower); }
 
-  // Asks for both rows of a channel; a prefetch of an address that is not there does nothing.
-  void prefetch(int64_t channel) const {
-    const E* p = image + first + channel * args.image_stride[1];
-    __builtin_prefetch(p);
-    __builtin_prefetch(p + args.image_stride[2]);
-  }
-
-  // Upper left, upper right, lower left, lower right. Those outside count as 0, unless the caller
-  // knows that all are `inside`.
-  void read(int64_t channel, bool inside, T corner[4]) const {
+  // Upper left, upper right, lower left, lower right. Those outside count as 0.
+  void read(int64_t channel, T corner[4]) const {
     const E* p = image + first + channel * args.image_stride[1];
     const int64_t row = args.image_stride[2], column = args.image_stride[3];
-    corner[0] = inside || (upper && left) ? value(args, p[0], channel) : T(0);
-    corner[1] = inside || (upper && right) ? value(args, p[column], channel) : T(0);
-    corner[2] = inside || (lower && left) ? value(args, p[row], channel) : T(0);
-    corner[3] = inside || (lower && right) ? value(args, p[row + column], channel) : T(0);
+    corner[0] = upper && left ? value(args, p[0], channel) : T(0);
+    corner[1] = upper && right ? value(args, p[column], channel) : T(0);
+    corner[2] = lower && left ? value(args, p[row], channel) : T(0);
+    corner[3] = lower && right ? value(args, p[row + column], channel) : T(0);
   }
 };
 

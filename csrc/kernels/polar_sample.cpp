@@ -50,9 +50,12 @@ void sample(const PolarSampleArgs<T>& a, int64_t begin, int64_t end, void* scrat
 template <typename T>
 void backward_image(const PolarSampleArgs<T>& a, int64_t begin, int64_t end, void* scratch) {
   for (int64_t item = begin; item < end; ++item) {
-    Scatter<T> scatter(a, item / a.bands, item % a.bands, scratch);
-    for (int64_t i = 0; i < a.num_radii; ++i) {
-      if (scatter.touches(i)) scatter.row(i, a.grad_out, output_row(a, item / a.bands, i));
+    const int64_t b = item / a.bands;
+    Scatter<T> scatter(a, b, item % a.bands, scratch);
+    for (int64_t ring = 0; ring < a.num_radii / a.patch_radii; ++ring) {
+      scatter.ring(ring, [&](int64_t n, T* to) {
+        read_row(a, a.grad_out, output_row(a, b, ring * a.patch_radii + n), to);
+      });
     }
     scatter.finish();
   }
@@ -64,7 +67,7 @@ void slope(const Corners<T, E>& corners, const T* grad, T right, T lower, T* gx,
   *gx = *gy = 0;
   for (int64_t c = 0; c < corners.args.channels; ++c) {
     T p[4];
-    corners.read(c, corners.inside(), p);
+    corners.read(c, p);
     *gx += grad[c] * ((p[1] - p[0]) * (1 - lower) + (p[3] - p[2]) * lower);
     *gy += grad[c] * ((p[2] - p[0]) * (1 - right) + (p[3] - p[1]) * right);
   }
@@ -89,7 +92,7 @@ void backward_lens(const PolarSampleArgs<T>& a, int64_t begin, int64_t end, void
     for (int64_t j = 0; j < a.num_azimuths; j += kBlock) {
       const int64_t count = a.num_azimuths - j < kBlock ? a.num_azimuths - j : kBlock;
       locate(a, b, i, j, count, points.random, [&](int64_t k, const Points& p) {
-        place(a, p, k, places);
+        place(a, a.image_stride + 2, p, k, places);
         // A radius that was clamped at 0 does not move.
         store(points.cos + k, select(p.clamped, Doubles{}, p.cos));
         store(points.sin + k, select(p.clamped, Doubles{}, p.sin));

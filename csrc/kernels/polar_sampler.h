@@ -77,8 +77,11 @@ class Sampler {
       image_in_hand = b;
     }
     const int64_t columns = block_columns(), rows = smaller(kBlock / columns, a.patch_radii);
-    for (int64_t j = 0; j < a.num_azimuths; j += columns) {
-      const int64_t count = smaller(columns, a.num_azimuths - j);
+    for (int64_t j = 0, count; j < a.num_azimuths; j += count) {
+      // A block ends where a token that is cut does.
+      const int64_t left =
+          columns < a.patch_azimuths ? a.patch_azimuths - j % a.patch_azimuths : a.num_azimuths - j;
+      count = smaller(columns, left);
       for (int64_t row = 0; row < a.patch_radii; row += rows) {
         block(b, ring, j, count, row, smaller(rows, a.patch_radii - row), to);
       }
@@ -88,7 +91,8 @@ class Sampler {
  private:
   struct State {
     PlacedPoints<T> points;
-    int32_t to[kBlock];  // where the points of a row of a block go
+    int32_t to[kBlock];               // where the points of a block go
+    uint16_t order[kBlock + kAhead];  // in which they are visited, if the image is far
   };
 
   static int64_t smaller(int64_t x, int64_t y) { return x < y ? x : y; }
@@ -107,9 +111,23 @@ class Sampler {
 
   // Points j to j + count of `rows` radii of a ring, from its radius `row` on.
   void block(int64_t b, int64_t ring, int64_t j, int64_t count, int64_t row, int64_t rows, T* to) {
+    const int64_t first = ring * a.patch_radii + row;
+    if (!a.packed) {
+      const int64_t columns = block_columns();
+      for (int64_t n = 0; n < rows; ++n) {
+        points.find_far(a, a.image_stride + 2, b, first + n, j, count, n * columns);
+      }
+      const int64_t visits = far_order(a, j, count, rows, columns, state.order);
+      for (int64_t v = visits; v < visits + kAhead; ++v) state.order[v] = state.order[visits - 1];
+      T* out = to + j / a.patch_azimuths * sector_stride + j % a.patch_azimuths * a.channels +
+               row * row_stride;
+      with_pixel_type<T>(a.pixel, [&]<typename E>() { far_block<E>(b, visits, out); });
+      return;
+    }
     for (int64_t n = 0; n < rows; ++n) {
-      points.find(a, packed, a.packed, b, ring * a.patch_radii + row + n, j, count, n * count);
+      points.find(a, packed, b, first + n, j, count, n * count);
       if (row_stride == a.patch_azimuths * a.channels && rows == a.patch_radii) {
+        // The tokens of the next block come behind these: their lines are asked for meanwhile.
         const char* next =
             reinterpret_cast<const char*>(to + (j + count) / a.patch_azimuths * sector_stride);
         const int64_t bytes = count * row_stride / a.patch_azimuths * sizeof(T);
@@ -121,9 +139,8 @@ class Sampler {
             row + rows == a.patch_radii, j + count == a.num_azimuths);
       return;
     }
-    last_place = rows * count;
     for (int64_t n = 0; n < rows; ++n) {
-      pieces(b, j, count, n * count, to + (row + n) * row_stride);
+      near_row(j, count, n * count, to + (row + n) * row_stride);
     }
   }
 
@@ -158,25 +175,13 @@ class Sampler {
     }
   }
 
-  // Points j to j + count of one radius, whose places are `place` on, sector by sector.
-  void pieces(int64_t b, int64_t j, int64_t count, int64_t place, T* to) const {
-    int64_t sector = j / a.patch_azimuths, s = j % a.patch_azimuths;
-    for (int64_t k = 0; k < count; ++sector, s = 0) {
-      const int64_t piece = smaller(a.patch_azimuths - s, count - k);
-      T* out = to + sector * sector_stride + s * a.channels;
-      if (a.packed) {
-        near_piece(place + k, piece, out);
-      } else {
-        far_piece(b, place + k, piece, out);
-      }
-      k += piece;
-    }
-  }
-
-  void near_piece(int64_t k, int64_t piece, T* to) const {
-    for (int64_t n = k; n < k + piece; ++n, to += a.channels) {
-      const T* pixel = image + points.near.offset[n];
-      const T right = points.near.right[n], lower = points.near.lower[n];
+  // Points j to j + count of one radius, whose places are `place` on, of any number of channels.
+  void near_row(int64_t j, int64_t count, int64_t place, T* row) const {
+    for (int64_t k = 0; k < count; ++k) {
+      T* to = row + (j + k) / a.patch_azimuths * sector_stride +
+              (j + k) % a.patch_azimuths * a.channels;
+      const T* pixel = image + points.near.offset[place + k];
+      const T right = points.near.right[place + k], lower = points.near.lower[place + k];
       const T *below = pixel + packed.row, *next = pixel + packed.pixel,
               *opposite = below + packed.pixel;
 #pragma omp simd
@@ -188,30 +193,75 @@ class Sampler {
     }
   }
 
-  void far_piece(int64_t b, int64_t k, int64_t piece, T* to) const {
-    with_pixel_type<T>(a.pixel, [&]<typename E>() {
-      for (int64_t n = k; n < k + piece; ++n, to += a.channels) {
-        constexpr int64_t ahead = 16;
-        if (n + ahead < last_place) {
-          const Corners<T, E> next(a, b, points.far.column[n + ahead], points.far.row[n + ahead]);
-          for (int64_t c = 0; c < a.channels; ++c) next.prefetch(c);
-        }
-        const Corners<T, E> corners(a, b, points.far.column[n], points.far.row[n]);
-        const T right = points.far.right[n], lower = points.far.lower[n];
-        if (corners.inside()) {
-          far_point<true>(corners, right, lower, to);
-        } else {
-          far_point<false>(corners, right, lower, to);
+  // The points of a block in the far image. The pixels of points to come are asked for, into the
+  // second-level cache: rows of an image share few sets of the first if its width is a power of
+  // two.
+  template <typename E>
+  [[gnu::noinline]] void far_block(int64_t b, int64_t visits, T* to) const {
+    const E* pixels = static_cast<const E*>(a.image) + b * a.image_stride[0];
+    const int64_t *offset = points.far.offset, below = a.image_stride[2];
+    const int64_t channels = a.channels, channel = a.image_stride[1];
+    const bool planes = kSame<E, float> && a.image_stride[3] == 1 && channels == 3;
+    for (int64_t v = 0; v < visits; ++v) {
+      const int64_t next = offset[state.order[v + kAhead]];
+      for (int64_t c = 0; c < channels && next >= 0; ++c) {
+        const E* pixel = pixels + next + c * channel;
+        __builtin_prefetch(pixel, 0, 2);
+        __builtin_prefetch(pixel + below, 0, 2);
+      }
+      const int64_t place = state.order[v];
+      T* out = to + state.to[place];
+      if (offset[place] < 0) {
+        border_point<E>(b, place, out);
+        continue;
+      }
+      if constexpr (kSame<E, float>) {
+        if (planes) {
+          planes_point(pixels + offset[place], channel, below, points.far.right[place],
+                       points.far.lower[place], out);
+          continue;
         }
       }
-    });
+      far_point(pixels + offset[place], place, out);
+    }
   }
 
-  template <bool kInside, typename E>
-  void far_point(const Corners<T, E>& corners, T right, T lower, T* to) const {
+  // Three planes of float: a pixel and its right neighbour are one load.
+  static void planes_point(const float* pixel, int64_t plane, int64_t below, float right,
+                           float lower, float* to) {
+    using V = Vector<float, 4>;
+    const float* third = pixel + 2 * plane;
+    const V top = two_pairs(pixel, pixel + plane);
+    const V bottom = two_pairs(pixel + below, pixel + plane + below);
+    const V top3 = two_pairs(third, third), bottom3 = two_pairs(third + below, third + below);
+    const V ab = top + lower * (bottom - top), c = top3 + lower * (bottom3 - top3);
+    const V l = __builtin_shufflevector(ab, c, 0, 2, 4, 6);
+    const V r = __builtin_shufflevector(ab, c, 1, 3, 5, 7);
+    const V v = l + right * (r - l);
+    to[0] = v[0];
+    to[1] = v[1];
+    to[2] = v[2];
+  }
+
+  template <typename E>
+  void far_point(const E* pixel, int64_t place, T* to) const {
+    const int64_t below = a.image_stride[2], next = a.image_stride[3];
+    const T right = points.far.right[place], lower = points.far.lower[place];
+    for (int64_t c = 0; c < a.channels; ++c, pixel += a.image_stride[1]) {
+      const T top = value(a, pixel[0], c), top_next = value(a, pixel[next], c);
+      const T l = top + lower * (value(a, pixel[below], c) - top);
+      const T r = top_next + lower * (value(a, pixel[below + next], c) - top_next);
+      to[c] = l + right * (r - l);
+    }
+  }
+
+  template <typename E>
+  void border_point(int64_t b, int64_t place, T* to) const {
+    const Corners<T, E> corners(a, b, points.far.column[place], points.far.row[place]);
+    const T right = points.far.right[place], lower = points.far.lower[place];
     for (int64_t c = 0; c < a.channels; ++c) {
       T p[4];
-      corners.read(c, kInside, p);
+      corners.read(c, p);
       const T l = p[0] + lower * (p[2] - p[0]), r = p[1] + lower * (p[3] - p[1]);
       to[c] = l + right * (r - l);
     }
@@ -224,7 +274,7 @@ class Sampler {
   State& state;
   PlacedPoints<T>& points;
   T* image;  // packed, and after it the rows that pack() converts
-  int64_t image_in_hand = -1, last_place = 0;
+  int64_t image_in_hand = -1;
 };
 
 }  // namespace

@@ -18,7 +18,7 @@ class Scatter {
  public:
   static int64_t bytes(const PolarSampleArgs<T>& a) {
     const int64_t sums = keeping(a) == kInPlace ? 0 : sums_layout(a).size;
-    return round_up(sizeof(PlacedPoints<T>), 64) + row_bytes(a) +
+    return round_up(sizeof(PlacedPoints<T>), 64) + a.patch_radii * row_bytes(a) +
            sums * static_cast<int64_t>(sizeof(T));
   }
 
@@ -33,32 +33,35 @@ class Scatter {
         points(*static_cast<PlacedPoints<T>*>(scratch)),
         grads(reinterpret_cast<T*>(static_cast<char*>(scratch) +
                                    round_up(sizeof(PlacedPoints<T>), 64))),
-        sums(grads + row_bytes(args) / sizeof(T)) {
+        sums(grads + args.patch_radii * row_bytes(args) / sizeof(T)) {
     if (keep == kInPlace) return;
     for (int64_t e = first_kept() * layout.row; e < end_kept() * layout.row; ++e) sums[e] = 0;
   }
 
-  // Whether points of radius i may touch the band.
-  bool touches(int64_t i) const {
-    if (a.bands == 1) return true;
-    const double y = a.center[image * a.center_stride + 1], most = reach(a, image, i) + 2;
-    // Written so that NaN touches.
-    return !(y + most < first_row || y - most > end_row);
-  }
-
-  // Adds the gradients of radius i, which lie at `row` of `grad`.
-  void row(int64_t i, const void* grad, const Row& row) {
-    read_row(a, grad, row, grads);
-    for (int64_t j = 0; j < a.num_azimuths; j += kBlock) {
-      const int64_t count = a.num_azimuths - j < kBlock ? a.num_azimuths - j : kBlock;
-      points.find(a, layout, keep != kInPlace, image, i, j, count, 0);
-      const T* block = grads + j * a.channels;
-      if (keep == kCells) {
-        add_to_cells(count, block);
-      } else if (keep == kPacked) {
-        add_to_packed(count, block);
-      } else {
-        for (int64_t k = 0; k < count; ++k) add_in_place(k, block + k * a.channels);
+  // Adds the gradients of a ring, whose radius n read(n, to) writes as (num_azimuths, C).
+  template <typename Read>
+  void ring(int64_t ring, Read read) {
+    const int64_t first = ring * a.patch_radii;
+    if (keep == kInPlace) {
+      bool any = false;
+      for (int64_t n = 0; n < a.patch_radii; ++n) any |= touches(first + n);
+      if (!any) return;
+      const int64_t line = row_bytes(a) / sizeof(T);
+      for (int64_t n = 0; n < a.patch_radii; ++n) read(n, grads + n * line);
+      add_in_place(first, line);
+      return;
+    }
+    for (int64_t n = 0; n < a.patch_radii; ++n) {
+      if (!touches(first + n)) continue;
+      read(n, grads);
+      for (int64_t j = 0; j < a.num_azimuths; j += kBlock) {
+        const int64_t count = smaller(kBlock, a.num_azimuths - j);
+        points.find(a, layout, image, first + n, j, count, 0);
+        if (keep == kCells) {
+          add_to_cells(count, grads + j * a.channels);
+        } else {
+          add_to_packed(count, grads + j * a.channels);
+        }
       }
     }
   }
@@ -184,8 +187,8 @@ class Scatter {
     T* bottom = top + layout.row;
     const T* grad = block + k * a.channels;
     for (int64_t c = 0; c < pixel; c += 4) {
-      const V g = load<V>(grad + c), below = g * down, above = g - below;
-      const V above_right = above * right, below_right = below * right;
+      const V g = load<V>(grad + c), below = rounded(g * down), above = g - below;
+      const V above_right = rounded(above * right), below_right = rounded(below * right);
       if (upper) {
         store(top + c, load<V>(top + c) + (above - above_right));
         store(top + pixel + c, load<V>(top + pixel + c) + above_right);
@@ -202,23 +205,71 @@ class Scatter {
     return offset >= first_kept() * layout.row && offset < end_kept() * layout.row;
   }
 
-  void add_in_place(int64_t k, const T* grad) const {
-    const int64_t column = points.far.column[k], row = points.far.row[k];
-    const T down = points.far.lower[k], right = points.far.right[k];
-    const int64_t plane = a.height * a.width;
-    T* pixel = static_cast<T*>(a.grad_image) + image * a.channels * plane + row * a.width + column;
-    const bool columns[2] = {column >= 0 && column < a.width, column >= -1 && column + 1 < a.width};
-    for (int64_t c = 0; c < a.channels; ++c, pixel += plane) {
-      const T below = grad[c] * down, above = grad[c] - below;
-      const T values[2][2] = {{above - above * right, above * right},
-                              {below - below * right, below * right}};
-      for (int v = 0; v < 2; ++v) {
-        if (row + v < first_row || row + v >= end_row) continue;
-        for (int h = 0; h < 2; ++h) {
-          if (columns[h]) pixel[v * a.width + h] += values[v][h];
+  // Blocks of points as in Sampler::far_block.
+  void add_in_place(int64_t first, int64_t line) {
+    const int64_t strides[2] = {a.width, 1};
+    const int64_t token = a.patch_radii * a.patch_azimuths;
+    const int64_t columns =
+        smaller(token < kBlock ? kBlock / token * a.patch_azimuths : a.patch_azimuths, kBlock);
+    const int64_t rows = smaller(a.patch_radii, kBlock / columns);
+    for (int64_t j = 0; j < a.num_azimuths; j += columns) {
+      const int64_t count = smaller(columns, a.num_azimuths - j);
+      for (int64_t row = 0; row < a.patch_radii; row += rows) {
+        const int64_t end = smaller(row + rows, a.patch_radii);
+        for (int64_t n = row; n < end; ++n) {
+          points.find_far(a, strides, image, first + n, j, count, (n - row) * columns);
+        }
+        uint16_t order[kBlock + kAhead];
+        const int64_t visits = far_order(a, j, count, end - row, columns, order);
+        for (int64_t v = 0; v < visits; ++v) {
+          if (v + kAhead < visits) fetch(order[v + kAhead]);
+          const int64_t n = order[v] / columns, k = order[v] % columns;
+          add_point(order[v], grads + (row + n) * line + (j + k) * a.channels);
         }
       }
     }
+  }
+
+  // Asks for the pixels of a point to come.
+  void fetch(int64_t place) const {
+    if (points.far.offset[place] < 0) return;
+    const int64_t plane = a.height * a.width;
+    const T* pixel =
+        static_cast<T*>(a.grad_image) + image * a.channels * plane + points.far.offset[place];
+    for (int64_t c = 0; c < a.channels; ++c, pixel += plane) {
+      __builtin_prefetch(pixel, 1, 2);
+      __builtin_prefetch(pixel + a.width, 1, 2);
+    }
+  }
+
+  void add_point(int64_t place, const T* grad) const {
+    const int64_t column = points.far.column[place], row = points.far.row[place];
+    const bool upper = row >= first_row && row < end_row;
+    const bool lower = row + 1 >= first_row && row + 1 < end_row;
+    if (!upper && !lower) return;
+    const bool left = column >= 0 && column < a.width;
+    const bool next = column >= -1 && column + 1 < a.width;
+    const T down = points.far.lower[place], right = points.far.right[place];
+    const int64_t plane = a.height * a.width;
+    T* pixel = static_cast<T*>(a.grad_image) + image * a.channels * plane + row * a.width + column;
+    for (int64_t c = 0; c < a.channels; ++c, pixel += plane) {
+      const T below = rounded(grad[c] * down), above = grad[c] - below;
+      const T above_right = rounded(above * right), below_right = rounded(below * right);
+      if (upper && left) pixel[0] += above - above_right;
+      if (upper && next) pixel[1] += above_right;
+      if (lower && left) pixel[a.width] += below - below_right;
+      if (lower && next) pixel[a.width + 1] += below_right;
+    }
+  }
+
+  static int64_t smaller(int64_t x, int64_t y) { return x < y ? x : y; }
+
+  // Whether points of radius i may touch the band.
+  bool touches(int64_t i) const {
+    if (a.bands == 1) return true;
+    const double y = a.center[image * a.center_stride + 1], most = reach(a, image, i) + 2;
+    // Written so that NaN touches.
+    return !(y + most < first_row || y - most > end_row);
   }
 
   const PolarSampleArgs<T>& a;

@@ -77,6 +77,18 @@ inline V splat(T value) {
   return value - V{};  // x - 0 is x for every x, -0 included
 }
 
+// A value that is rounded as it stands. The compiler may else fuse the product in it into a sum in
+// one copy of the code and not in another, and results would depend on which copy runs.
+template <typename V>
+inline V rounded(V value) {
+#if defined(__SSE2__)
+  asm("" : "+x"(value));
+#else
+  asm("" : "+m"(value));
+#endif
+  return value;
+}
+
 // a where the mask's lane is all ones, else b.
 template <typename M, typename V>
 inline V select(M mask, V a, V b) {
@@ -115,6 +127,20 @@ inline Doubles to_doubles(Vector<int32_t, kDoubles> x) {
   return __builtin_convertvector(x, Doubles);
 #endif
 }
+
+// Two floats from here and two from there.
+inline Vector<float, 4> two_pairs(const float* here, const float* there) {
+  using Pairs = Vector<double, 2>;
+  double first, second;
+  __builtin_memcpy(&first, here, 8);
+  __builtin_memcpy(&second, there, 8);
+  return (Vector<float, 4>)Pairs{first, second};
+}
+
+template <typename A, typename B>
+constexpr bool kSame = false;
+template <typename A>
+constexpr bool kSame<A, A> = true;
 
 // The whole part of numbers below 2^63.
 inline Doubles whole_part(Doubles x) {
