@@ -81,9 +81,9 @@ inline V splat(T value) {
 // one copy of the code and not in another, and results would depend on which copy runs.
 template <typename V>
 inline V rounded(V value) {
-#if defined(__SSE2__)
+#if defined(__FMA__)
   asm("" : "+x"(value));
-#else
+#elif !defined(__SSE2__)
   asm("" : "+m"(value));
 #endif
   return value;
