@@ -40,7 +40,7 @@ struct PolarSampleArgs {
 
   const void* grad_out;  // backward
   int64_t bands;         // into how many parts the rows of an image are cut
-  void* grad_image;      // (B, C, H, W) contiguous, of the pixel's type, zero on entry
+  void* grad_image;      // (B, C, H, W) contiguous, of the pixel's type; all of it is written
   double* grad_lens;     // (B, num_radii, kLensSums)
 };
 

@@ -3,6 +3,9 @@
 #pragma once
 
 #include <omp.h>
+#if defined(__linux__)
+#  include <sys/mman.h>
+#endif
 #include <torch/csrc/stable/ops.h>
 #include <torch/csrc/stable/tensor.h>
 
@@ -50,6 +53,21 @@ inline void* scratch(size_t bytes) {
     if (memory == nullptr) throw std::bad_alloc();
   }
   return memory.get();
+}
+
+// Memory that is new from the system costs more to be mapped, page by page, than to be written.
+// Large pages cost less; numpy too asks for them from 4 MB on.
+inline void ask_for_large_pages(const torch::stable::Tensor& tensor) {
+#if defined(__linux__) && defined(MADV_HUGEPAGE)
+  constexpr uintptr_t kPage = 4096, kLeast = uintptr_t{4} << 20;
+  const auto begin = reinterpret_cast<uintptr_t>(tensor.mutable_data_ptr());
+  const uintptr_t end = begin + tensor.numel() * tensor.element_size();
+  const uintptr_t first = (begin + kPage - 1) / kPage * kPage;
+  if (end - begin < kLeast) return;
+  madvise(reinterpret_cast<void*>(first), (end - first) / kPage * kPage, MADV_HUGEPAGE);
+#else
+  (void)tensor;
+#endif
 }
 
 // The gradient of `like`, (B or 1, ...), from one row of doubles an image: summed over the images

@@ -99,10 +99,11 @@ template <typename T>
 Tensor new_image_gradient(PolarCall<T>& call) {
   PolarSampleArgs<T>& args = call.args;
   STD_TORCH_CHECK(args.pixel != Pixel::u8, "polar_sample: uint8 pixels have no gradient");
-  // Sums that were kept apart are written to every pixel.
-  const bool written = call.channels_and_points() && (args.packed || args.pixel == Pixel::bf16);
-  const Tensor grad = written ? torch::stable::new_empty(call.image, call.image.sizes())
-                              : torch::stable::new_zeros(call.image, call.image.sizes());
+  // Where there are points the kernels write every pixel.
+  const Tensor grad = call.channels_and_points()
+                          ? torch::stable::new_empty(call.image, call.image.sizes())
+                          : torch::stable::new_zeros(call.image, call.image.sizes());
+  ask_for_large_pages(grad);
   args.grad_image = grad.mutable_data_ptr();
   return grad;
 }

@@ -63,7 +63,7 @@ struct PolarCall {
 // all threads.
 int64_t count_bands(int64_t batch, int64_t height);
 
-// The image's gradient, for backward kernels to fill: zeros unless they write all of it.
+// The image's gradient, for backward kernels to fill.
 template <typename T>
 torch::stable::Tensor new_image_gradient(PolarCall<T>& call);
 

@@ -29,6 +29,7 @@ Tensor forward(PolarCall<T>&& call, bool tokens) {
       torch::stable::new_empty(call.radii, output_sizes(call),
                                args.narrow ? ScalarType::BFloat16 : call.radii.scalar_type());
   if (out.numel() == 0) return out;
+  ask_for_large_pages(out);
   args.out = out.mutable_data_ptr();
   const auto& kernel = kernels().table<T>();
   const int64_t bytes = kernel.polar_sample_scratch(args);

@@ -55,18 +55,20 @@ void embed(const PolarSampleArgs<T>& a, const PolarEmbedArgs<T>& e, int64_t begi
   const Scratch<T> s(a, e, scratch);
   const int64_t rings = a.num_radii / a.patch_radii, sectors = sectors_of(a);
   Sampler<T> sampler(a, s.row, a.patch_azimuths * a.channels, s.sampler);
+  // Products go where they belong if rows there are whole registers of the type computed in.
+  const bool in_place = !a.narrow && e.features == s.wide;
   for (int64_t item = begin; item < end; ++item) {
+    const int64_t first = item * sectors * e.features;
+    T* products = in_place ? static_cast<T*>(a.out) + first : s.products;
     sampler.ring(item / rings, item % rings, s.samples);
     for (int64_t t = 0; t < sectors; ++t) {
-      for (int64_t f = 0; f < e.features; ++f) {
-        s.products[t * s.wide + f] = e.bias == nullptr ? T(0) : e.bias[f];
-      }
-      for (int64_t f = e.features; f < s.wide; ++f) s.products[t * s.wide + f] = 0;
+      T* to = products + t * s.wide;
+      if (e.bias != nullptr) copy(e.bias, e.features, to);
+      for (int64_t f = e.bias != nullptr ? e.features : 0; f < s.wide; ++f) to[f] = 0;
     }
-    add_product(sectors, s.wide, s.depth, s.samples, s.row, 1, e.transposed, s.wide, s.products,
+    add_product(sectors, s.wide, s.depth, s.samples, s.row, 1, e.transposed, s.wide, products,
                 s.wide);
-    const int64_t first = item * sectors * e.features;
-    for (int64_t t = 0; t < sectors; ++t) {
+    for (int64_t t = 0; t < sectors && !in_place; ++t) {
       const int64_t to = first + t * e.features;
       const T* from = s.products + t * s.wide;
       if (a.narrow) {

@@ -34,7 +34,14 @@ class Scatter {
         grads(reinterpret_cast<T*>(static_cast<char*>(scratch) +
                                    round_up(sizeof(PlacedPoints<T>), 64))),
         sums(grads + args.patch_radii * row_bytes(args) / sizeof(T)) {
-    if (keep == kInPlace) return;
+    if (keep == kInPlace) {
+      T* rows =
+          static_cast<T*>(a.grad_image) + (image * a.channels * a.height + first_row) * a.width;
+      for (int64_t c = 0; c < a.channels; ++c, rows += a.height * a.width) {
+        for (int64_t e = 0; e < (end_row - first_row) * a.width; ++e) rows[e] = 0;
+      }
+      return;
+    }
     for (int64_t e = first_kept() * layout.row; e < end_kept() * layout.row; ++e) sums[e] = 0;
   }
 
