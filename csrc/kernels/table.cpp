@@ -8,11 +8,10 @@ namespace darswin::TIER {
 
 extern const Kernels kernels;
 constexpr Kernels kernels = {
-    STRINGIZE(TIER),
-              {polar_sample, polar_sample_backward, window_attention_scratch, window_attention,
-               window_attention_backward},
-              {polar_sample, polar_sample_backward, window_attention_scratch, window_attention,
-               window_attention_backward},
+    STRINGIZE(TIER), {polar_sample, polar_sample_backward}, {polar_sample, polar_sample_backward},
+              {window_attention_scratch, window_attention, window_attention_backward},
+              {window_attention_scratch, window_attention, window_attention_backward},
+              {window_attention_scratch, window_attention, window_attention_backward},
 };
 
 }  // namespace darswin::TIER

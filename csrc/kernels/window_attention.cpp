@@ -1,257 +1,403 @@
 // Windowed attention on a polar map.
 //
-// A window is never cut out of the map: token t of window (wr, wa) is found by index arithmetic
-// that includes the shift and the wrap around the border, and its q, k and v are packed into
-// scratch that fits L1. Keys are packed transposed, (d, n), so that one query against all keys is a
-// sum of d vectors of length n and needs no horizontal operation. Along an axis that is not
-// periodic, tokens that the shift brought together across the border carry different `side` marks
-// and do not see each other. Forward keeps the log-sum-exp of each row, in double since its
-// rounding would enter every probability; backward finds the probabilities from it. Every token
-// lies in one window, so qkv gradients have one writer; the bias gradient of an (image, head) is
-// summed by one thread over all windows, in order.
+// A window is never cut out of the map: token t of a window is found by index arithmetic that
+// includes the shift and the wrap around the border, and the tiles of window_attention_tiles.h read
+// its rows where they are. One window is attended to by one head at a time; with 16 tokens all that
+// this needs stays in registers and the first cache. Logits stand as (key, query), queries in the
+// SIMD lanes. Along an axis that is not periodic, tokens that the shift brought together across the
+// border carry different `side` marks and do not see each other. Backward finds the probabilities
+// again, just as forward did, so forward saves nothing. Every token lies in one window, so qkv
+// gradients have one writer; bias gradients are summed over a chunk of windows, in order.
 #include "kernels.h"
 #include "math.h"
+#include "window_attention_tiles.h"
 
 namespace darswin::TIER {
 namespace {
 
-template <typename T>
-struct Shape {
-  int64_t n, d;  // tokens of a window, head dim
-  int64_t windows_r, windows_a;
-  int64_t table_a, table;  // width and size of one head's bias table
+// Up to this many tokens a window, tables of all pairs of tokens are kept for each head.
+constexpr int64_t kPairTokens = 64;
 
-  explicit Shape(const WindowAttentionArgs<T>& a)
+// The sizes of one call. A window of one sector counts as one of one ring: the same tokens in the
+// same order, but in one long run.
+template <typename S>
+struct Shape {
+  int64_t n, padded;  // tokens of a window; rounded up to whole groups
+  int64_t d, heads;
+  int64_t windows_r, windows_a, map_windows;  // windows along the axes, and of one image
+  int64_t runs, run;       // a window is `runs` times `run` tokens that follow each other
+  int64_t table_a, table;  // width and size of one head's bias table
+  bool pairs;              // whether there are tables of all pairs
+
+  explicit Shape(const WindowAttentionArgs<S>& a)
       : n(a.window_r * a.window_a),
+        padded((n + kGroup - 1) / kGroup * kGroup),
         d(a.head_dim),
+        heads(a.heads),
         windows_r(a.rings / a.window_r),
         windows_a(a.sectors / a.window_a),
-        table_a(2 * a.window_a - 1),
-        table((2 * a.window_r - 1) * table_a) {}
+        map_windows(windows_r * windows_a),
+        runs(a.window_a == 1 ? 1 : a.window_r),
+        run(n / runs),
+        table_a(2 * run - 1),
+        table((2 * runs - 1) * table_a),
+        pairs(n <= kPairTokens) {}
+
+  // body(key, query, count, index) for all keys and the queries of [begin, end), in runs of queries
+  // whose biases follow each other too: that of the first one stands at `index` of the table.
+  template <typename Body>
+  void for_pairs(int64_t begin, int64_t end, Body body) const {
+    const int64_t first_run = begin / run;
+    for (int64_t k_run = 0, key = 0; k_run < runs; ++k_run) {
+      for (int64_t k = 0; k < run; ++k, ++key) {
+        int64_t query = begin, place = begin - first_run * run;
+        int64_t row = (first_run - k_run + runs - 1) * table_a + run - 1 - k;
+        for (; query < end; row += table_a, place = 0) {
+          const int64_t count = run - place < end - query ? run - place : end - query;
+          body(key, query, count, row + place);
+          query += count;
+        }
+      }
+    }
+  }
 };
 
-// Scratch of one thread. Sums over up to 1024 tokens are kept in double.
-template <typename T>
+// Hands out pieces of a block of memory, and counts them.
+struct Arena {
+  char* memory;
+  int64_t used = 0;
+
+  template <typename T>
+  T* take(int64_t count) {
+    T* piece = reinterpret_cast<T*>(memory + used);
+    used += (count * static_cast<int64_t>(sizeof(T)) + 63) / 64 * 64;
+    return piece;
+  }
+};
+
+// Working memory of one thread; (padded,) and so on are the shapes.
+template <typename S>
 struct Scratch {
-  double *dk, *dv;  // (n, d): key and value gradients
-  double* sum;      // (d,): one query's output, or its gradient
-  int64_t* token;   // (n,): places of the window's tokens in (B, R, A)
-  T *q, *k, *v;     // (n, d)
-  T *kt, *vt;       // (d, n)
-  T *row, *drow;    // (n,): one query's logits or probabilities, and their gradient
-  T* side;          // (n,): 0 to 3, see find_tokens
+  using T = Arithmetic<S>;
+  static constexpr bool kCopies = sizeof(S) != sizeof(T);  // rows are widened, and narrowed again
 
-  Scratch(double* base, int64_t n, int64_t d) {
-    dk = base;
-    dv = dk + n * d;
-    sum = dv + n * d;
-    token = reinterpret_cast<int64_t*>(sum + d);
-    q = reinterpret_cast<T*>(token + n);
-    k = q + n * d;
-    v = k + n * d;
-    kt = v + n * d;
-    vt = kt + n * d;
-    row = vt + n * d;
-    drow = row + n;
-    side = drow + n;
-  }
+  int64_t *in, *out, *copy;  // (padded,): offsets of a token's row in qkv, in the output, in a copy
+  T* side;                   // (padded,): see find_tokens
+  T* columns;                // (d, group): queries or gradients of a group, transposed
+  T *p, *dp;                 // (padded, group): logits, then probabilities, and their gradient
+  T* bias;                   // (heads, n, padded): all pairs; else (n, group): those of a group
+  T* grad_bias;              // (heads, n, padded): summed over a chunk; else unused
+  int64_t* bias_row;         // (heads,): the row of the bias that `bias` holds
+  T *q, *k, *v, *g;          // (padded, d): copies of rows
+  T *dq, *dk, *dv;           // the same of results
 
-  static int64_t doubles(int64_t n, int64_t d) {
-    const int64_t rest = 5 * n * d + 3 * n;
-    return 2 * n * d + d + n + (rest * static_cast<int64_t>(sizeof(T)) + 7) / 8;
+  Scratch(Arena& arena, const Shape<S>& shape) {
+    const int64_t padded = shape.padded, copies = kCopies ? padded * shape.d : 0;
+    const int64_t pairs = shape.pairs ? shape.heads * shape.n * padded : 0;
+    in = arena.take<int64_t>(padded);
+    out = arena.take<int64_t>(padded);
+    copy = arena.take<int64_t>(padded);
+    side = arena.take<T>(padded);
+    columns = arena.take<T>(shape.d * kGroup);
+    p = arena.take<T>(padded * kGroup);
+    dp = arena.take<T>(padded * kGroup);
+    bias = arena.take<T>(shape.pairs ? pairs : shape.n * kGroup);
+    grad_bias = arena.take<T>(pairs);
+    bias_row = arena.take<int64_t>(shape.heads);
+    q = arena.take<T>(copies);
+    k = arena.take<T>(copies);
+    v = arena.take<T>(copies);
+    g = arena.take<T>(copies);
+    dq = arena.take<T>(copies);
+    dk = arena.take<T>(copies);
+    dv = arena.take<T>(copies);
   }
 };
 
-// Finds the tokens of window (wr, wa) of image b: their places in the map, and their sides of the
-// borders, 1 beyond that of the radius and 2 beyond that of the azimuth where these do not wrap.
-template <typename T>
-void find_tokens(const WindowAttentionArgs<T>& a, int64_t b, int64_t wr, int64_t wa,
-                 const Scratch<T>& s) {
-  int64_t t = 0;
-  for (int64_t tr = 0; tr < a.window_r; ++tr) {
-    int64_t r = wr * a.window_r + tr + a.shift_r;
-    const bool over_r = r >= a.rings;
-    if (over_r) r -= a.rings;
-    for (int64_t ta = 0; ta < a.window_a; ++ta, ++t) {
-      int64_t sector = wa * a.window_a + ta + a.shift_a;
-      const bool over_a = sector >= a.sectors;
-      if (over_a) sector -= a.sectors;
-      s.token[t] = (b * a.rings + r) * a.sectors + sector;
-      s.side[t] = static_cast<T>((over_r && !a.periodic_r) + 2 * (over_a && !a.periodic_a));
-    }
+// One thread's work on a call.
+template <typename S>
+struct Attention {
+  using T = Arithmetic<S>;
+  using V = Vector<T, kLanes<T>>;
+
+  const WindowAttentionArgs<S>& a;
+  Shape<S> shape;
+  Arena arena;
+  Scratch<S> s;
+  bool parted;  // whether a border parts the tokens of the window
+
+  Attention(const WindowAttentionArgs<S>& args, void* memory)
+      : a(args), shape(args), arena{static_cast<char*>(memory)}, s(arena, shape) {
+    for (int64_t head = 0; head < shape.heads; ++head) s.bias_row[head] = -1;
+    for (int64_t t = 0; t < shape.padded; ++t) s.copy[t] = (t < shape.n ? t : 0) * shape.d;
   }
-}
 
-// Packs one of q, k, v (part 0, 1, 2) of a window: rows (n, d), and columns (d, n) where wanted.
-template <typename T>
-void pack(const WindowAttentionArgs<T>& a, const Shape<T>& shape, const int64_t* tokens,
-          int64_t head, int part, T* rows, T* columns) {
-  for (int64_t t = 0; t < shape.n; ++t) {
-    const T* from = a.qkv + ((tokens[t] * 3 + part) * a.heads + head) * shape.d;
-    for (int64_t c = 0; c < shape.d; ++c) {
-      if (rows != nullptr) rows[t * shape.d + c] = from[c];
-      if (columns != nullptr) columns[c * shape.n + t] = from[c];
-    }
-  }
-}
-
-// row[k] = sum_c q[c] * columns[c, k]
-template <typename T>
-void row_times_columns(const T* q, const T* columns, const Shape<T>& shape, T* row) {
-  for (int64_t k = 0; k < shape.n; ++k) row[k] = 0;
-  for (int64_t c = 0; c < shape.d; ++c) {
-    const T* column = columns + c * shape.n;
-#pragma omp simd
-    for (int64_t k = 0; k < shape.n; ++k) row[k] += q[c] * column[k];
-  }
-}
-
-// Index of the bias of query t against key 0 of key ring `kr`; the next key's is one lower.
-template <typename T>
-int64_t bias_index(const WindowAttentionArgs<T>& a, const Shape<T>& shape, int64_t t, int64_t kr) {
-  const int64_t delta_r = t / a.window_a - kr + a.window_r - 1;
-  return delta_r * shape.table_a + t % a.window_a + a.window_a - 1;
-}
-
-// The logits of query t: scaled products, bias, and minus infinity across a border.
-template <typename T>
-void logits(const WindowAttentionArgs<T>& a, const Shape<T>& shape, const Scratch<T>& s,
-            const T* bias, int64_t t) {
-  row_times_columns(s.q + t * shape.d, s.kt, shape, s.row);
-  for (int64_t kr = 0; kr < a.window_r; ++kr) {
-    const T* biases = bias + bias_index(a, shape, t, kr);
-    T* row = s.row + kr * a.window_a;
-#pragma omp simd
-    for (int64_t ka = 0; ka < a.window_a; ++ka) row[ka] = row[ka] * a.scale + biases[-ka];
-  }
-  const T minus_infinity = static_cast<T>(-__builtin_inf());
-  const T side = s.side[t];
-  for (int64_t k = 0; k < shape.n; ++k) s.row[k] = s.side[k] == side ? s.row[k] : minus_infinity;
-}
-
-template <typename T>
-void attend(const WindowAttentionArgs<T>& a, int64_t begin, int64_t end, double* scratch) {
-  const Shape<T> shape(a);
-  const Scratch<T> s(scratch, shape.n, shape.d);
-  for (int64_t item = begin; item < end; ++item) {
-    const int64_t head = item % a.heads, window = item / a.heads;
+  // Finds the rows of a window's tokens, and their sides of the borders: 1 beyond that of the
+  // radius and 2 beyond that of the azimuth where these do not wrap. Token 0 pads the last group.
+  void find_tokens(int64_t window) {
     const int64_t wa = window % shape.windows_a, wr = window / shape.windows_a % shape.windows_r;
-    const int64_t b = window / (shape.windows_a * shape.windows_r);
-    const T* bias = a.bias + b * a.bias_stride + head * shape.table;
-    find_tokens(a, b, wr, wa, s);
-    pack(a, shape, s.token, head, 0, s.q, static_cast<T*>(nullptr));
-    pack(a, shape, s.token, head, 1, static_cast<T*>(nullptr), s.kt);
-    pack(a, shape, s.token, head, 2, s.v, static_cast<T*>(nullptr));
-    for (int64_t t = 0; t < shape.n; ++t) {
-      logits(a, shape, s, bias, t);
-      T largest = s.row[0];
-      for (int64_t k = 1; k < shape.n; ++k) largest = s.row[k] > largest ? s.row[k] : largest;
-      double sum = 0;
-      for (int64_t k = 0; k < shape.n; ++k) {
-        s.row[k] = exponential(s.row[k] - largest);
-        sum += s.row[k];
+    const int64_t image = window / shape.map_windows;
+    const int64_t out_row = shape.heads * shape.d;
+    parted = false;
+    int64_t t = 0;
+    for (int64_t tr = 0; tr < a.window_r; ++tr) {
+      int64_t r = wr * a.window_r + tr + a.shift_r;
+      const bool over_r = r >= a.rings;
+      if (over_r) r -= a.rings;
+      for (int64_t ta = 0; ta < a.window_a; ++ta, ++t) {
+        int64_t sector = wa * a.window_a + ta + a.shift_a;
+        const bool over_a = sector >= a.sectors;
+        if (over_a) sector -= a.sectors;
+        s.out[t] = ((image * a.rings + r) * a.sectors + sector) * out_row;
+        s.in[t] = 3 * s.out[t];
+        s.side[t] = static_cast<T>((over_r && !a.periodic_r) + 2 * (over_a && !a.periodic_a));
+        parted |= s.side[t] != s.side[0];
       }
-      const int64_t token = s.token[t];
-      T* out = a.out + (token * a.heads + head) * shape.d;
-      for (int64_t c = 0; c < shape.d; ++c) s.sum[c] = 0;
-      for (int64_t k = 0; k < shape.n; ++k) {
-        const T* value = s.v + k * shape.d;
-        const double weight = s.row[k];
-#pragma omp simd
-        for (int64_t c = 0; c < shape.d; ++c) s.sum[c] += weight * value[c];
-      }
-      for (int64_t c = 0; c < shape.d; ++c) out[c] = static_cast<T>(s.sum[c] / sum);
-      a.lse[token * a.heads + head] = static_cast<double>(largest) + logarithm(sum);
+    }
+    for (; t < shape.padded; ++t) {
+      s.out[t] = s.out[0];
+      s.in[t] = s.in[0];
+      s.side[t] = s.side[0];
     }
   }
-}
 
-template <typename T>
-void attend_backward(const WindowAttentionArgs<T>& a, int64_t begin, int64_t end, double* scratch) {
-  const Shape<T> shape(a);
-  const Scratch<T> s(scratch, shape.n, shape.d);
-  const int64_t windows = shape.windows_r * shape.windows_a;
-  for (int64_t item = begin; item < end; ++item) {
-    const int64_t head = item % a.heads, b = item / a.heads;
-    const T* bias = a.bias + b * a.bias_stride + head * shape.table;
-    double* grad_bias = a.grad_bias + item * shape.table;
-    for (int64_t window = 0; window < windows; ++window) {
-      const int64_t wr = window / shape.windows_a, wa = window % shape.windows_a;
-      find_tokens(a, b, wr, wa, s);
-      pack(a, shape, s.token, head, 0, s.q, static_cast<T*>(nullptr));
-      pack(a, shape, s.token, head, 1, s.k, s.kt);
-      pack(a, shape, s.token, head, 2, static_cast<T*>(nullptr), s.vt);
-      for (int64_t e = 0; e < shape.n * shape.d; ++e) s.dk[e] = s.dv[e] = 0;
-      for (int64_t t = 0; t < shape.n; ++t) {
-        const int64_t token = s.token[t];
-        const T* grad = a.grad_out + (token * a.heads + head) * shape.d;
-        const double lse = a.lse[token * a.heads + head];
-        // Probabilities p, their gradient dp = grad . v, and ds = p (dp - sum p dp).
-        logits(a, shape, s, bias, t);
-        row_times_columns(grad, s.vt, shape, s.drow);
-        double expected = 0;
-        for (int64_t k = 0; k < shape.n; ++k) {
-          s.row[k] = exponential(static_cast<T>(s.row[k] - lse));
-          expected += static_cast<double>(s.row[k]) * s.drow[k];
-        }
-        const T mean = static_cast<T>(expected);
-        for (int64_t k = 0; k < shape.n; ++k) s.drow[k] = s.row[k] * (s.drow[k] - mean);
-        for (int64_t kr = 0; kr < a.window_r; ++kr) {
-          double* grads = grad_bias + bias_index(a, shape, t, kr);
-          for (int64_t ka = 0; ka < a.window_a; ++ka) grads[-ka] += s.drow[kr * a.window_a + ka];
-        }
-        const T* query = s.q + t * shape.d;
-        for (int64_t c = 0; c < shape.d; ++c) s.sum[c] = 0;
-        for (int64_t k = 0; k < shape.n; ++k) {
-          const double p = s.row[k], ds = s.drow[k] * a.scale;
-          const T* key = s.k + k * shape.d;
-          double *dk = s.dk + k * shape.d, *dv = s.dv + k * shape.d;
-#pragma omp simd
-          for (int64_t c = 0; c < shape.d; ++c) {
-            s.sum[c] += ds * key[c];
-            dk[c] += ds * query[c];
-            dv[c] += p * grad[c];
-          }
-        }
-        T* to = a.grad_qkv + (token * 3 * a.heads + head) * shape.d;
-        for (int64_t c = 0; c < shape.d; ++c) to[c] = static_cast<T>(s.sum[c]);
+  // The rows of a window's tokens, of T: those of the map, or a widened copy.
+  Rows<const T> read(const S* map, const int64_t* offset, T* copy) const {
+    if constexpr (Scratch<S>::kCopies) {
+      for (int64_t t = 0; t < shape.n; ++t) widen(map + offset[t], shape.d, copy + t * shape.d);
+      return {copy, s.copy};
+    } else {
+      return {map, offset};
+    }
+  }
+  // Where to write rows; those that stand in a copy are rounded into the map by `finish`.
+  Rows<T> write(S* map, const int64_t* offset, T* copy) const {
+    if constexpr (Scratch<S>::kCopies) {
+      return {copy, s.copy};
+    } else {
+      return {map, offset};
+    }
+  }
+  void finish(Rows<T> rows, S* map, const int64_t* offset) const {
+    if constexpr (Scratch<S>::kCopies) {
+      for (int64_t t = 0; t < shape.n; ++t) narrow(rows[t], shape.d, map + offset[t]);
+    }
+  }
+
+  // Makes the table of the biases of all pairs, where it is not the one of this row already.
+  void prepare_bias(int64_t head, int64_t row) {
+    if (!shape.pairs || s.bias_row[head] == row) return;
+    s.bias_row[head] = row;
+    spread_bias(head, row, 0, shape.n, s.bias + head * shape.n * shape.padded, shape.padded);
+  }
+  // to[key * stride + query - begin] = the bias of (query, key)
+  void spread_bias(int64_t head, int64_t row, int64_t begin, int64_t end, T* to, int64_t stride) {
+    const T* table = a.bias + (row * shape.heads + head) * shape.table;
+    shape.for_pairs(begin, end, [&](int64_t key, int64_t query, int64_t count, int64_t index) {
+      T* biases = to + key * stride + query - begin;
+      for (int64_t i = 0; i < count; ++i) biases[i] = table[index + i];
+    });
+  }
+
+  // s.p = the probabilities of all keys for each query of the group.
+  void probabilities(Rows<const T> q, Rows<const T> k, int64_t head, int64_t row, int64_t group) {
+    const int64_t n = shape.n;
+    const T* biases = s.bias + head * n * shape.padded + group;
+    int64_t stride = shape.padded;
+    if (!shape.pairs) {
+      const int64_t end = group + kGroup < n ? group + kGroup : n;
+      spread_bias(head, row, group, end, s.bias, kGroup);
+      biases = s.bias;
+      stride = kGroup;
+    }
+    transpose(q.from(group), shape.d, s.columns);
+    products(s.columns, k, (n + 7) / 8 * 8, shape.d, s.p);
+    for (int lane = 0; lane < kGroup; lane += kLanes<T>) {
+      softmax(s.p + lane, biases + lane, stride, load<V>(s.side + group + lane));
+    }
+  }
+
+  // From products to probabilities, for the queries of one register.
+  void softmax(T* p, const T* biases, int64_t stride, V side) const {
+    const int64_t n = shape.n;
+    const V scale = splat<V>(a.scale), nothing = splat<V>(static_cast<T>(-__builtin_inf()));
+    V largest[2] = {nothing, nothing}, sum[2] = {};
+    for (int64_t k = 0; k < n; ++k) {
+      V logit = load<V>(p + k * kGroup) * scale + load<V>(biases + k * stride);
+      if (parted) logit = splat<V>(s.side[k]) == side ? logit : nothing;
+      largest[0] = larger(logit, largest[0]);
+      store(p + k * kGroup, logit);
+    }
+    for (int64_t k = 0; k < n; ++k) {
+      const V e = exponential_of_negative(load<V>(p + k * kGroup) - largest[0]);
+      sum[0] += e;
+      store(p + k * kGroup, e);
+    }
+    const V inverse = 1 / sum[0];
+    for (int64_t k = 0; k < n; ++k) store(p + k * kGroup, load<V>(p + k * kGroup) * inverse);
+  }
+
+  // One head of one window.
+  void forward(int64_t head, int64_t row) {
+    const int64_t d = shape.d, part = shape.heads * d;
+    prepare_bias(head, row);
+    const S* map = a.qkv + head * d;
+    S* to = a.out + head * d;
+    const Rows<const T> q = read(map, s.in, s.q);
+    const Rows<const T> k = read(map + part, s.in, s.k);
+    const Rows<const T> v = read(map + 2 * part, s.in, s.v);
+    const Rows<T> out = write(to, s.out, s.dq);
+    for (int64_t group = 0; group < shape.n; group += kGroup) {
+      probabilities(q, k, head, row, group);
+      weighted_sums(Weights<1, kGroup, T>{s.p}, v, shape.n, out.from(group), shape.n - group, d,
+                    T{1}, false);
+    }
+    finish(out, to, s.out);
+  }
+
+  // One head of one window; grad_bias is its row of bias gradients.
+  void backward(int64_t head, int64_t row, double* grad_bias) {
+    const int64_t d = shape.d, n = shape.n, part = shape.heads * d;
+    prepare_bias(head, row);
+    const S* map = a.qkv + head * d;
+    S* to = a.grad_qkv + head * d;
+    const Rows<const T> q = read(map, s.in, s.q);
+    const Rows<const T> k = read(map + part, s.in, s.k);
+    const Rows<const T> v = read(map + 2 * part, s.in, s.v);
+    const Rows<const T> g = read(a.grad_out + head * d, s.out, s.g);
+    const Rows<T> dq = write(to, s.in, s.dq);
+    const Rows<T> dk = write(to + part, s.in, s.dk);
+    const Rows<T> dv = write(to + 2 * part, s.in, s.dv);
+    for (int64_t group = 0; group < n; group += kGroup) {
+      const int64_t queries = n - group < kGroup ? n - group : kGroup;
+      probabilities(q, k, head, row, group);
+      transpose(g.from(group), d, s.columns);
+      products(s.columns, v, (n + 7) / 8 * 8, d, s.dp);
+      softmax_backward(head, group, queries, grad_bias);
+      const bool add = group > 0;
+      weighted_sums(Weights<kGroup, 1, T>{s.p}, g.from(group), queries, dv, n, d, T{1}, add);
+      weighted_sums(Weights<kGroup, 1, T>{s.dp}, q.from(group), queries, dk, n, d, a.scale, add);
+      weighted_sums(Weights<1, kGroup, T>{s.dp}, k, n, dq.from(group), queries, d, a.scale, false);
+    }
+    finish(dq, to, s.in);
+    finish(dk, to + part, s.in);
+    finish(dv, to + 2 * part, s.in);
+  }
+
+  // s.dp, from the gradient of probabilities to that of logits, p (dp - sum p dp), which is also
+  // the biases'.
+  void softmax_backward(int64_t head, int64_t group, int64_t queries, double* grad_bias) {
+    const int64_t n = shape.n;
+    for (int lane = 0; lane < kGroup; lane += kLanes<T>) {
+      const T* p = s.p + lane;
+      T* dp = s.dp + lane;
+      V mean = {};
+      for (int64_t k = 0; k < n; ++k) mean += load<V>(p + k * kGroup) * load<V>(dp + k * kGroup);
+      T* pairs = s.grad_bias + head * n * shape.padded + group + lane;
+      for (int64_t k = 0; k < n; ++k) {
+        const V ds = load<V>(p + k * kGroup) * (load<V>(dp + k * kGroup) - mean);
+        store(dp + k * kGroup, ds);
+        if (shape.pairs) store(pairs + k * shape.padded, load<V>(pairs + k * shape.padded) + ds);
       }
-      for (int64_t t = 0; t < shape.n; ++t) {
-        const int64_t token = s.token[t];
-        T* dk = a.grad_qkv + ((token * 3 + 1) * a.heads + head) * shape.d;
-        T* dv = dk + a.heads * shape.d;
-        for (int64_t c = 0; c < shape.d; ++c) {
-          dk[c] = static_cast<T>(s.dk[t * shape.d + c]);
-          dv[c] = static_cast<T>(s.dv[t * shape.d + c]);
-        }
+    }
+    if (!shape.pairs) fold_pairs(s.dp - group, kGroup, group, group + queries, grad_bias);
+  }
+
+  // Adds gradients of pairs, [key * stride + query], to a table.
+  void fold_pairs(const T* pairs, int64_t stride, int64_t begin, int64_t end, double* table) const {
+    shape.for_pairs(begin, end, [&](int64_t key, int64_t query, int64_t count, int64_t index) {
+      const T* grads = pairs + key * stride + query;
+      for (int64_t i = 0; i < count; ++i) table[index + i] += grads[i];
+    });
+  }
+
+  int64_t bias_row(int64_t window) const {
+    return a.bias_rows == 1 ? 0 : window / shape.map_windows;
+  }
+
+  void forward_range(int64_t begin, int64_t end) {
+    for (int64_t item = begin; item < end;) {
+      const int64_t window = item / shape.heads;
+      find_tokens(window);
+      for (; item < end && item / shape.heads == window; ++item) {
+        forward(item % shape.heads, bias_row(window));
       }
     }
   }
+
+  // Windows outside, heads inside: a token's heads stand side by side.
+  void backward_range(int64_t begin, int64_t end) {
+    const int64_t row_windows = a.windows / a.bias_rows;
+    for (int64_t item = begin; item < end;) {
+      const int64_t chunk = item / shape.heads, head_begin = item % shape.heads;
+      const int64_t left = shape.heads - head_begin;
+      const int64_t heads = end - item < left ? end - item : left;
+      double* grad_bias = a.grad_bias + item * shape.table;
+      const int64_t row = chunk % a.bias_rows, first = chunk / a.bias_rows * a.chunk;
+      const int64_t last = first + a.chunk < row_windows ? first + a.chunk : row_windows;
+      T* pairs = s.grad_bias + head_begin * shape.n * shape.padded;
+      if (shape.pairs) {
+        for (int64_t i = 0; i < heads * shape.n * shape.padded; ++i) pairs[i] = 0;
+      }
+      for (int64_t window = row * row_windows + first; window < row * row_windows + last;
+           ++window) {
+        find_tokens(window);
+        for (int64_t h = 0; h < heads; ++h) {
+          backward(head_begin + h, bias_row(window), grad_bias + h * shape.table);
+        }
+      }
+      if (shape.pairs) {
+        for (int64_t h = 0; h < heads; ++h) {
+          fold_pairs(pairs + h * shape.n * shape.padded, shape.padded, 0, shape.n,
+                     grad_bias + h * shape.table);
+        }
+      }
+      item += heads;
+    }
+  }
+};
+
+template <typename S>
+int64_t scratch_bytes(const WindowAttentionArgs<S>& args) {
+  Arena arena{nullptr};
+  Scratch<S>(arena, Shape<S>(args));
+  return arena.used;
 }
 
 }  // namespace
 
 int64_t window_attention_scratch(const WindowAttentionArgs<float>& args) {
-  return Scratch<float>::doubles(args.window_r * args.window_a, args.head_dim);
+  return scratch_bytes(args);
 }
 int64_t window_attention_scratch(const WindowAttentionArgs<double>& args) {
-  return Scratch<double>::doubles(args.window_r * args.window_a, args.head_dim);
+  return scratch_bytes(args);
+}
+int64_t window_attention_scratch(const WindowAttentionArgs<bfloat16>& args) {
+  return scratch_bytes(args);
 }
 void window_attention(const WindowAttentionArgs<float>& args, int64_t begin, int64_t end,
-                      double* scratch) {
-  attend(args, begin, end, scratch);
+                      void* scratch) {
+  Attention<float>(args, scratch).forward_range(begin, end);
 }
 void window_attention(const WindowAttentionArgs<double>& args, int64_t begin, int64_t end,
-                      double* scratch) {
-  attend(args, begin, end, scratch);
+                      void* scratch) {
+  Attention<double>(args, scratch).forward_range(begin, end);
+}
+void window_attention(const WindowAttentionArgs<bfloat16>& args, int64_t begin, int64_t end,
+                      void* scratch) {
+  Attention<bfloat16>(args, scratch).forward_range(begin, end);
 }
 void window_attention_backward(const WindowAttentionArgs<float>& args, int64_t begin, int64_t end,
-                               double* scratch) {
-  attend_backward(args, begin, end, scratch);
+                               void* scratch) {
+  Attention<float>(args, scratch).backward_range(begin, end);
 }
 void window_attention_backward(const WindowAttentionArgs<double>& args, int64_t begin, int64_t end,
-                               double* scratch) {
-  attend_backward(args, begin, end, scratch);
+                               void* scratch) {
+  Attention<double>(args, scratch).backward_range(begin, end);
+}
+void window_attention_backward(const WindowAttentionArgs<bfloat16>& args, int64_t begin,
+                               int64_t end, void* scratch) {
+  Attention<bfloat16>(args, scratch).backward_range(begin, end);
 }
 
 }  // namespace darswin::TIER

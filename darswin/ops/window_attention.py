@@ -71,32 +71,28 @@ def window_attention(
     scale = head_dim**-0.5 if scale is None else float(scale)
     arguments = (qkv, bias, window, shift, tuple(bool(p) for p in periodic), scale)
     if _library.compiled(qkv):
-        return torch.ops.darswin.window_attention(*arguments)[0]
+        return torch.ops.darswin.window_attention(*arguments)
     return reference.window_attention(*arguments)
 
 
 @torch.library.register_fake("darswin::window_attention")
 def _fake(qkv, bias, window, shift, periodic, scale):
     batch, rings, sectors, _, heads, head_dim = qkv.shape
-    return (
-        qkv.new_empty((batch, rings, sectors, heads * head_dim)),
-        qkv.new_empty((batch, rings, sectors, heads), dtype=torch.float64),  # log-sum-exp
-    )
+    return qkv.new_empty((batch, rings, sectors, heads * head_dim))
 
 
 @torch.library.register_fake("darswin::window_attention_backward")
-def _fake_backward(grad_out, qkv, bias, lse, window, shift, periodic, scale):
+def _fake_backward(grad_out, qkv, bias, window, shift, periodic, scale):
     return qkv.new_empty(qkv.shape), bias.new_empty(bias.shape)
 
 
 def _setup_context(ctx, inputs, output):
     qkv, bias, window, shift, periodic, scale = inputs
-    ctx.save_for_backward(qkv, bias, output[1])
+    ctx.save_for_backward(qkv, bias)
     ctx.settings = (window, shift, periodic, scale)
-    ctx.mark_non_differentiable(output[1])
 
 
-def _backward(ctx, grad_out, _grad_lse):
+def _backward(ctx, grad_out):
     grad_qkv, grad_bias = torch.ops.darswin.window_attention_backward(
         grad_out, *ctx.saved_tensors, *ctx.settings
     )
