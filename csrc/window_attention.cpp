@@ -1,5 +1,8 @@
 // window_attention and its backward on CPU: check, allocate, thread, call the kernel.
 // The checks here only keep memory safe; darswin/ops/window_attention.py explains wrong arguments.
+#if defined(__linux__)
+#include <sys/mman.h>
+#endif
 #include <torch/csrc/stable/library.h>
 #include <torch/csrc/stable/ops.h>
 #include <torch/csrc/stable/tensor.h>
@@ -23,6 +26,21 @@ using Sizes = std::vector<int64_t>;
 template <typename T>
 constexpr ScalarType type_of() {
   return sizeof(T) == sizeof(float) ? ScalarType::Float : ScalarType::Double;
+}
+
+// Memory that is new from the system costs more to be mapped, page by page, than to be written.
+// Large pages cost less; numpy too asks for them from 4 MB on.
+void ask_for_large_pages(const Tensor& tensor) {
+#if defined(__linux__) && defined(MADV_HUGEPAGE)
+  constexpr uintptr_t kPage = 4096, kLeast = uintptr_t{4} << 20;
+  const auto begin = reinterpret_cast<uintptr_t>(tensor.mutable_data_ptr());
+  const uintptr_t end = begin + tensor.numel() * tensor.element_size();
+  const uintptr_t first = (begin + kPage - 1) / kPage * kPage;
+  if (end - begin < kLeast) return;
+  madvise(reinterpret_cast<void*>(first), (end - first) / kPage * kPage, MADV_HUGEPAGE);
+#else
+  (void)tensor;
+#endif
 }
 
 // The arguments of one call, contiguous as the kernels want them. Owns what `args` points into.
@@ -84,6 +102,7 @@ Tensor forward(Call<T>&& call) {
   auto& args = call.args;
   const Tensor out = torch::stable::new_empty(
       call.qkv, Sizes{call.qkv.size(0), args.rings, args.sectors, args.heads * args.head_dim});
+  ask_for_large_pages(out);
   args.out = static_cast<T*>(out.mutable_data_ptr());
   call.run(args.windows * args.heads, kernels().attention<T>().forward);
   return out;
@@ -108,6 +127,7 @@ std::tuple<Tensor, Tensor> backward(Call<T>&& call, const Tensor& grad_out_) {
   const Tensor grad_bias = torch::stable::new_zeros(call.bias, call.bias.sizes());
   const int64_t row = grad_bias.numel();
   if (grad_qkv.numel() == 0) return {grad_qkv, grad_bias};
+  ask_for_large_pages(grad_qkv);
   args.chunk = chunk_size(args);
   const int64_t chunks = (args.windows / args.bias_rows + args.chunk - 1) / args.chunk;
   std::vector<double> rows(chunks * row, 0.0);

@@ -75,14 +75,29 @@ struct Arena {
   }
 };
 
+// The tokens of one window.
+template <typename T>
+struct Tokens {
+  int64_t *in, *out;  // (padded,): offsets of a token's row in qkv and in the output
+  T* side;            // (padded,): its side of the borders, see find_tokens
+  bool parted;        // whether they are on different sides
+  int64_t index = -1;
+
+  void take(Arena& arena, int64_t padded) {
+    in = arena.take<int64_t>(padded);
+    out = arena.take<int64_t>(padded);
+    side = arena.take<T>(padded);
+  }
+};
+
 // Working memory of one thread; (padded,) and so on are the shapes.
 template <typename S>
 struct Scratch {
   using T = Arithmetic<S>;
   static constexpr bool kCopies = sizeof(S) != sizeof(T);  // rows are widened, and narrowed again
 
-  int64_t *in, *out, *copy;  // (padded,): offsets of a token's row in qkv, in the output, in a copy
-  T* side;                   // (padded,): see find_tokens
+  Tokens<T> window, next;    // the one at work, and the one after it
+  int64_t* copy;             // (padded,): offsets of a token's row in a copy
   T* columns;                // (d, group): queries or gradients of a group, transposed
   T *p, *dp;                 // (padded, group): logits, then probabilities, and their gradient
   T* bias;                   // (heads, n, padded): all pairs; else (n, group): those of a group
@@ -94,10 +109,9 @@ struct Scratch {
   Scratch(Arena& arena, const Shape<S>& shape) {
     const int64_t padded = shape.padded, copies = kCopies ? padded * shape.d : 0;
     const int64_t pairs = shape.pairs ? shape.heads * shape.n * padded : 0;
-    in = arena.take<int64_t>(padded);
-    out = arena.take<int64_t>(padded);
+    window.take(arena, padded);
+    next.take(arena, padded);
     copy = arena.take<int64_t>(padded);
-    side = arena.take<T>(padded);
     columns = arena.take<T>(shape.d * kGroup);
     p = arena.take<T>(padded * kGroup);
     dp = arena.take<T>(padded * kGroup);
@@ -124,7 +138,6 @@ struct Attention {
   Shape<S> shape;
   Arena arena;
   Scratch<S> s;
-  bool parted;  // whether a border parts the tokens of the window
 
   Attention(const WindowAttentionArgs<S>& args, void* memory)
       : a(args), shape(args), arena{static_cast<char*>(memory)}, s(arena, shape) {
@@ -134,11 +147,12 @@ struct Attention {
 
   // Finds the rows of a window's tokens, and their sides of the borders: 1 beyond that of the
   // radius and 2 beyond that of the azimuth where these do not wrap. Token 0 pads the last group.
-  void find_tokens(int64_t window) {
+  void find_tokens(int64_t window, Tokens<T>& found) const {
     const int64_t wa = window % shape.windows_a, wr = window / shape.windows_a % shape.windows_r;
     const int64_t image = window / shape.map_windows;
+    found.index = window;
     const int64_t out_row = shape.heads * shape.d;
-    parted = false;
+    found.parted = false;
     int64_t t = 0;
     for (int64_t tr = 0; tr < a.window_r; ++tr) {
       int64_t r = wr * a.window_r + tr + a.shift_r;
@@ -148,16 +162,35 @@ struct Attention {
         int64_t sector = wa * a.window_a + ta + a.shift_a;
         const bool over_a = sector >= a.sectors;
         if (over_a) sector -= a.sectors;
-        s.out[t] = ((image * a.rings + r) * a.sectors + sector) * out_row;
-        s.in[t] = 3 * s.out[t];
-        s.side[t] = static_cast<T>((over_r && !a.periodic_r) + 2 * (over_a && !a.periodic_a));
-        parted |= s.side[t] != s.side[0];
+        found.out[t] = ((image * a.rings + r) * a.sectors + sector) * out_row;
+        found.in[t] = 3 * found.out[t];
+        found.side[t] = static_cast<T>((over_r && !a.periodic_r) + 2 * (over_a && !a.periodic_a));
+        found.parted |= found.side[t] != found.side[0];
       }
     }
     for (; t < shape.padded; ++t) {
-      s.out[t] = s.out[0];
-      s.in[t] = s.in[0];
-      s.side[t] = s.side[0];
+      found.out[t] = found.out[0];
+      found.in[t] = found.in[0];
+      found.side[t] = found.side[0];
+    }
+  }
+
+  // Makes `window` the one at work. The one after it is found as well, to be fetched meanwhile.
+  void enter(int64_t window) {
+    if (window != s.next.index) find_tokens(window, s.next);
+    const Tokens<T> last = s.window;
+    s.window = s.next;
+    s.next = last;
+    find_tokens(window + 1 < a.windows ? window + 1 : window, s.next);
+  }
+
+  // Asks for the same rows of the next window, a group at a time.
+  void fetch(const S* map, const int64_t* offset, int64_t group) const {
+    const int64_t end = group + kGroup < shape.n ? group + kGroup : shape.n;
+    constexpr int64_t kLine = 64 / sizeof(S);
+    for (int64_t t = group; t < end; ++t) {
+      const S* row = map + offset[t];
+      for (int64_t c = 0; c < shape.d; c += kLine) __builtin_prefetch(row + c);
     }
   }
 
@@ -213,7 +246,7 @@ struct Attention {
     transpose(q.from(group), shape.d, s.columns);
     products(s.columns, k, (n + 7) / 8 * 8, shape.d, s.p);
     for (int lane = 0; lane < kGroup; lane += kLanes<T>) {
-      softmax(s.p + lane, biases + lane, stride, load<V>(s.side + group + lane));
+      softmax(s.p + lane, biases + lane, stride, load<V>(s.window.side + group + lane));
     }
   }
 
@@ -224,7 +257,7 @@ struct Attention {
     V largest[2] = {nothing, nothing}, sum[2] = {};
     for (int64_t k = 0; k < n; ++k) {
       V logit = load<V>(p + k * kGroup) * scale + load<V>(biases + k * stride);
-      if (parted) logit = splat<V>(s.side[k]) == side ? logit : nothing;
+      if (s.window.parted) logit = splat<V>(s.window.side[k]) == side ? logit : nothing;
       largest[0] = larger(logit, largest[0]);
       store(p + k * kGroup, logit);
     }
@@ -243,16 +276,19 @@ struct Attention {
     prepare_bias(head, row);
     const S* map = a.qkv + head * d;
     S* to = a.out + head * d;
-    const Rows<const T> q = read(map, s.in, s.q);
-    const Rows<const T> k = read(map + part, s.in, s.k);
-    const Rows<const T> v = read(map + 2 * part, s.in, s.v);
-    const Rows<T> out = write(to, s.out, s.dq);
+    const Rows<const T> q = read(map, s.window.in, s.q);
+    const Rows<const T> k = read(map + part, s.window.in, s.k);
+    const Rows<const T> v = read(map + 2 * part, s.window.in, s.v);
+    const Rows<T> out = write(to, s.window.out, s.dq);
     for (int64_t group = 0; group < shape.n; group += kGroup) {
+      fetch(map, s.next.in, group);
+      fetch(map + part, s.next.in, group);
       probabilities(q, k, head, row, group);
+      fetch(map + 2 * part, s.next.in, group);
       weighted_sums(Weights<1, kGroup, T>{s.p}, v, shape.n, out.from(group), shape.n - group, d,
                     T{1}, false);
     }
-    finish(out, to, s.out);
+    finish(out, to, s.window.out);
   }
 
   // One head of one window; grad_bias is its row of bias gradients.
@@ -261,27 +297,34 @@ struct Attention {
     prepare_bias(head, row);
     const S* map = a.qkv + head * d;
     S* to = a.grad_qkv + head * d;
-    const Rows<const T> q = read(map, s.in, s.q);
-    const Rows<const T> k = read(map + part, s.in, s.k);
-    const Rows<const T> v = read(map + 2 * part, s.in, s.v);
-    const Rows<const T> g = read(a.grad_out + head * d, s.out, s.g);
-    const Rows<T> dq = write(to, s.in, s.dq);
-    const Rows<T> dk = write(to + part, s.in, s.dk);
-    const Rows<T> dv = write(to + 2 * part, s.in, s.dv);
+    const Rows<const T> q = read(map, s.window.in, s.q);
+    const Rows<const T> k = read(map + part, s.window.in, s.k);
+    const Rows<const T> v = read(map + 2 * part, s.window.in, s.v);
+    const Rows<const T> g = read(a.grad_out + head * d, s.window.out, s.g);
+    const Rows<T> dq = write(to, s.window.in, s.dq);
+    const Rows<T> dk = write(to + part, s.window.in, s.dk);
+    const Rows<T> dv = write(to + 2 * part, s.window.in, s.dv);
     for (int64_t group = 0; group < n; group += kGroup) {
       const int64_t queries = n - group < kGroup ? n - group : kGroup;
+      fetch(map, s.next.in, group);
+      fetch(map + part, s.next.in, group);
       probabilities(q, k, head, row, group);
+      fetch(map + 2 * part, s.next.in, group);
+      fetch(a.grad_out + head * d, s.next.out, group);
       transpose(g.from(group), d, s.columns);
       products(s.columns, v, (n + 7) / 8 * 8, d, s.dp);
       softmax_backward(head, group, queries, grad_bias);
       const bool add = group > 0;
+      fetch(to, s.next.in, group);
       weighted_sums(Weights<kGroup, 1, T>{s.p}, g.from(group), queries, dv, n, d, T{1}, add);
+      fetch(to + part, s.next.in, group);
       weighted_sums(Weights<kGroup, 1, T>{s.dp}, q.from(group), queries, dk, n, d, a.scale, add);
+      fetch(to + 2 * part, s.next.in, group);
       weighted_sums(Weights<1, kGroup, T>{s.dp}, k, n, dq.from(group), queries, d, a.scale, false);
     }
-    finish(dq, to, s.in);
-    finish(dk, to + part, s.in);
-    finish(dv, to + 2 * part, s.in);
+    finish(dq, to, s.window.in);
+    finish(dk, to + part, s.window.in);
+    finish(dv, to + 2 * part, s.window.in);
   }
 
   // s.dp, from the gradient of probabilities to that of logits, p (dp - sum p dp), which is also
@@ -318,7 +361,7 @@ struct Attention {
   void forward_range(int64_t begin, int64_t end) {
     for (int64_t item = begin; item < end;) {
       const int64_t window = item / shape.heads;
-      find_tokens(window);
+      enter(window);
       for (; item < end && item / shape.heads == window; ++item) {
         forward(item % shape.heads, bias_row(window));
       }
@@ -341,7 +384,7 @@ struct Attention {
       }
       for (int64_t window = row * row_windows + first; window < row * row_windows + last;
            ++window) {
-        find_tokens(window);
+        enter(window);
         for (int64_t h = 0; h < heads; ++h) {
           backward(head_begin + h, bias_row(window), grad_bias + h * shape.table);
         }
