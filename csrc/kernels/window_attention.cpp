@@ -62,6 +62,8 @@ struct Shape {
   }
 };
 
+inline int64_t eights(int64_t n) { return (n + 7) / 8 * 8; }
+
 // Hands out pieces of a block of memory, and counts them.
 struct Arena {
   char* memory;
@@ -96,15 +98,16 @@ struct Scratch {
   using T = Arithmetic<S>;
   static constexpr bool kCopies = sizeof(S) != sizeof(T);  // rows are widened, and narrowed again
 
-  Tokens<T> window, next;    // the one at work, and the one after it
-  int64_t* copy;             // (padded,): offsets of a token's row in a copy
-  T* columns;                // (d, group): queries or gradients of a group, transposed
-  T *p, *dp;                 // (padded, group): logits, then probabilities, and their gradient
-  T* bias;                   // (heads, n, padded): all pairs; else (n, group): those of a group
-  T* grad_bias;              // (heads, n, padded): summed over a chunk; else unused
-  int64_t* bias_row;         // (heads,): the row of the bias that `bias` holds
-  T *q, *k, *v, *g;          // (padded, d): copies of rows
-  T *dq, *dk, *dv;           // the same of results
+  Tokens<T> window, next;  // the one at work, and the one after it
+  int64_t* copy;           // (padded,): offsets of a token's row in a copy
+  T* columns;              // (d, group): queries or gradients of a group, transposed
+  T *largest, *inverse;    // (group,): of each query, the largest logit; 1 / sum of exponentials
+  T *p, *dp;               // (padded, group): logits, then probabilities, and their gradient
+  T* bias;                 // (heads, n, padded): all pairs; else (n, group): those of a group
+  T* grad_bias;            // (heads, n, padded): summed over a chunk; else unused
+  int64_t* bias_row;       // (heads,): the row of the bias that `bias` holds
+  T *q, *k, *v, *g;        // (padded, d): copies of rows
+  T *dq, *dk, *dv;         // the same of results
 
   Scratch(Arena& arena, const Shape<S>& shape) {
     const int64_t padded = shape.padded, copies = kCopies ? padded * shape.d : 0;
@@ -114,6 +117,8 @@ struct Scratch {
     copy = arena.take<int64_t>(padded);
     columns = arena.take<T>(shape.d * kGroup);
     p = arena.take<T>(padded * kGroup);
+    largest = arena.take<T>(kGroup);
+    inverse = arena.take<T>(kGroup);
     dp = arena.take<T>(padded * kGroup);
     bias = arena.take<T>(shape.pairs ? pairs : shape.n * kGroup);
     grad_bias = arena.take<T>(pairs);
@@ -133,6 +138,7 @@ template <typename S>
 struct Attention {
   using T = Arithmetic<S>;
   using V = Vector<T, kLanes<T>>;
+  static constexpr int kVectors = kGroup / kLanes<T>;
 
   const WindowAttentionArgs<S>& a;
   Shape<S> shape;
@@ -175,6 +181,11 @@ struct Attention {
     }
   }
 
+  // Queries of the group that begins with this one.
+  int64_t group_size(int64_t group) const {
+    return shape.n - group < kGroup ? shape.n - group : kGroup;
+  }
+
   // Makes `window` the one at work. The one after it is found as well, to be fetched meanwhile.
   void enter(int64_t window) {
     if (window != s.next.index) find_tokens(window, s.next);
@@ -186,7 +197,7 @@ struct Attention {
 
   // Asks for the same rows of the next window, a group at a time.
   void fetch(const S* map, const int64_t* offset, int64_t group) const {
-    const int64_t end = group + kGroup < shape.n ? group + kGroup : shape.n;
+    const int64_t end = group + group_size(group);
     constexpr int64_t kLine = 64 / sizeof(S);
     for (int64_t t = group; t < end; ++t) {
       const S* row = map + offset[t];
@@ -232,42 +243,65 @@ struct Attention {
     });
   }
 
-  // s.p = the probabilities of all keys for each query of the group.
-  void probabilities(Rows<const T> q, Rows<const T> k, int64_t head, int64_t row, int64_t group) {
+  // s.p = e^(logit - the largest logit) of all keys for each query of the group, and s.inverse =
+  // 1 / their sums.
+  void exponentials(Rows<const T> q, Rows<const T> k, int64_t head, int64_t row, int64_t group) {
     const int64_t n = shape.n;
     const T* biases = s.bias + head * n * shape.padded + group;
     int64_t stride = shape.padded;
     if (!shape.pairs) {
-      const int64_t end = group + kGroup < n ? group + kGroup : n;
-      spread_bias(head, row, group, end, s.bias, kGroup);
+      spread_bias(head, row, group, group + group_size(group), s.bias, kGroup);
       biases = s.bias;
       stride = kGroup;
     }
+    const S* map = a.qkv + head * shape.d;
+    const int64_t part = shape.heads * shape.d;
+    fetch(map, s.next.in, group);
     transpose(q.from(group), shape.d, s.columns);
-    products(s.columns, k, (n + 7) / 8 * 8, shape.d, s.p);
-    for (int lane = 0; lane < kGroup; lane += kLanes<T>) {
-      softmax(s.p + lane, biases + lane, stride, load<V>(s.window.side + group + lane));
+    fetch(map + part, s.next.in, group);
+    if (s.window.parted) {
+      logits<true>(k, biases, stride, group);
+    } else {
+      logits<false>(k, biases, stride, group);
     }
+    fetch(map + 2 * part, s.next.in, group);
+    for (int lane = 0; lane < kGroup; lane += kLanes<T>) exponentials(lane);
   }
 
-  // From products to probabilities, for the queries of one register.
-  void softmax(T* p, const T* biases, int64_t stride, V side) const {
-    const int64_t n = shape.n;
+  // s.p = the logits, s.largest = the largest of each query. Keys that pad the last eight have
+  // minus infinity, as those across a border do.
+  template <bool kParted>
+  __attribute__((noinline)) void logits(Rows<const T> k, const T* biases, int64_t stride,
+                                        int64_t group) {
     const V scale = splat<V>(a.scale), nothing = splat<V>(static_cast<T>(-__builtin_inf()));
-    V largest[2] = {nothing, nothing}, sum[2] = {};
-    for (int64_t k = 0; k < n; ++k) {
-      V logit = load<V>(p + k * kGroup) * scale + load<V>(biases + k * stride);
-      if (s.window.parted) logit = splat<V>(s.window.side[k]) == side ? logit : nothing;
-      largest[0] = larger(logit, largest[0]);
-      store(p + k * kGroup, logit);
+    V largest[kVectors];
+    for (int v = 0; v < kVectors; ++v) largest[v] = nothing;
+    const T* side = s.window.side;
+    products(s.columns, k, eights(shape.n), shape.d, [&](int64_t key, int v, V product) {
+      const int lane = v * kLanes<T>;
+      V logit = product * scale + load<V>(biases + key * stride + lane);
+      if (kParted) logit = splat<V>(side[key]) == load<V>(side + group + lane) ? logit : nothing;
+      if (key >= shape.n) logit = nothing;
+      largest[v] = larger(logit, largest[v]);
+      store(s.p + key * kGroup + lane, logit);
+    });
+    for (int v = 0; v < kVectors; ++v) store(s.largest + v * kLanes<T>, largest[v]);
+  }
+
+  // From logits to exponentials, for the queries of one register.
+  __attribute__((noinline)) void exponentials(int lane) {
+    T* p = s.p + lane;
+    const V largest = load<V>(s.largest + lane);
+    V sums[4] = {};
+    for (int64_t k = 0; k < shape.n; k += 4) {
+#pragma GCC unroll 4
+      for (int i = 0; i < 4; ++i) {
+        const V e = exponential_of_negative(load<V>(p + (k + i) * kGroup) - largest);
+        sums[i] += e;
+        store(p + (k + i) * kGroup, e);
+      }
     }
-    for (int64_t k = 0; k < n; ++k) {
-      const V e = exponential_of_negative(load<V>(p + k * kGroup) - largest[0]);
-      sum[0] += e;
-      store(p + k * kGroup, e);
-    }
-    const V inverse = 1 / sum[0];
-    for (int64_t k = 0; k < n; ++k) store(p + k * kGroup, load<V>(p + k * kGroup) * inverse);
+    store(s.inverse + lane, 1 / ((sums[0] + sums[1]) + (sums[2] + sums[3])));
   }
 
   // One head of one window.
@@ -281,12 +315,11 @@ struct Attention {
     const Rows<const T> v = read(map + 2 * part, s.window.in, s.v);
     const Rows<T> out = write(to, s.window.out, s.dq);
     for (int64_t group = 0; group < shape.n; group += kGroup) {
-      fetch(map, s.next.in, group);
-      fetch(map + part, s.next.in, group);
-      probabilities(q, k, head, row, group);
-      fetch(map + 2 * part, s.next.in, group);
-      weighted_sums(Weights<1, kGroup, T>{s.p}, v, shape.n, out.from(group), shape.n - group, d,
-                    T{1}, false);
+      exponentials(q, k, head, row, group);
+      fetch(to, s.next.out, group);
+      weighted_sums(
+          Weights<1, kGroup, T>{s.p}, v, shape.n, out.from(group), group_size(group), d,
+          [&](int64_t query) { return s.inverse[query]; }, false);
     }
     finish(out, to, s.window.out);
   }
@@ -305,45 +338,66 @@ struct Attention {
     const Rows<T> dk = write(to + part, s.window.in, s.dk);
     const Rows<T> dv = write(to + 2 * part, s.window.in, s.dv);
     for (int64_t group = 0; group < n; group += kGroup) {
-      const int64_t queries = n - group < kGroup ? n - group : kGroup;
-      fetch(map, s.next.in, group);
-      fetch(map + part, s.next.in, group);
-      probabilities(q, k, head, row, group);
-      fetch(map + 2 * part, s.next.in, group);
+      const int64_t queries = group_size(group);
+      exponentials(q, k, head, row, group);
       fetch(a.grad_out + head * d, s.next.out, group);
       transpose(g.from(group), d, s.columns);
-      products(s.columns, v, (n + 7) / 8 * 8, d, s.dp);
+      probability_gradients(v);
       softmax_backward(head, group, queries, grad_bias);
       const bool add = group > 0;
+      const auto one = [](int64_t) { return T{1}; };
+      const auto scale = [&](int64_t) { return a.scale; };
       fetch(to, s.next.in, group);
-      weighted_sums(Weights<kGroup, 1, T>{s.p}, g.from(group), queries, dv, n, d, T{1}, add);
+      weighted_sums(Weights<kGroup, 1, T>{s.p}, g.from(group), queries, dv, n, d, one, add);
       fetch(to + part, s.next.in, group);
-      weighted_sums(Weights<kGroup, 1, T>{s.dp}, q.from(group), queries, dk, n, d, a.scale, add);
+      weighted_sums(Weights<kGroup, 1, T>{s.dp}, q.from(group), queries, dk, n, d, scale, add);
       fetch(to + 2 * part, s.next.in, group);
-      weighted_sums(Weights<1, kGroup, T>{s.dp}, k, n, dq.from(group), queries, d, a.scale, false);
+      weighted_sums(Weights<1, kGroup, T>{s.dp}, k, n, dq.from(group), queries, d, scale, false);
     }
     finish(dq, to, s.window.in);
     finish(dk, to + part, s.window.in);
     finish(dv, to + 2 * part, s.window.in);
   }
 
-  // s.dp, from the gradient of probabilities to that of logits, p (dp - sum p dp), which is also
-  // the biases'.
+  // s.dp = the gradients of the probabilities.
+  __attribute__((noinline)) void probability_gradients(Rows<const T> v) {
+    products(s.columns, v, eights(shape.n), shape.d, [&](int64_t key, int r, V product) {
+      store(s.dp + key * kGroup + r * kLanes<T>, product);
+    });
+  }
+
+  // s.p = the probabilities p, and s.dp, from their gradients to those of the logits, which are
+  // the biases' as well: p (dp - sum p dp).
   void softmax_backward(int64_t head, int64_t group, int64_t queries, double* grad_bias) {
-    const int64_t n = shape.n;
+    T* pairs = s.grad_bias + head * shape.n * shape.padded + group;
     for (int lane = 0; lane < kGroup; lane += kLanes<T>) {
-      const T* p = s.p + lane;
-      T* dp = s.dp + lane;
-      V mean = {};
-      for (int64_t k = 0; k < n; ++k) mean += load<V>(p + k * kGroup) * load<V>(dp + k * kGroup);
-      T* pairs = s.grad_bias + head * n * shape.padded + group + lane;
-      for (int64_t k = 0; k < n; ++k) {
-        const V ds = load<V>(p + k * kGroup) * (load<V>(dp + k * kGroup) - mean);
-        store(dp + k * kGroup, ds);
-        if (shape.pairs) store(pairs + k * shape.padded, load<V>(pairs + k * shape.padded) + ds);
+      if (shape.pairs) {
+        softmax_backward<true>(lane, pairs + lane);
+      } else {
+        softmax_backward<false>(lane, nullptr);
       }
     }
     if (!shape.pairs) fold_pairs(s.dp - group, kGroup, group, group + queries, grad_bias);
+  }
+  template <bool kPairs>
+  __attribute__((noinline)) void softmax_backward(int lane, T* pairs) {
+    T *p = s.p + lane, *dp = s.dp + lane;
+    const V inverse = load<V>(s.inverse + lane);
+    V means[4] = {};
+    for (int64_t k = 0; k < shape.n; k += 4) {
+#pragma GCC unroll 4
+      for (int i = 0; i < 4; ++i) {
+        T* probability = p + (k + i) * kGroup;
+        store(probability, load<V>(probability) * inverse);
+        means[i] += load<V>(probability) * load<V>(dp + (k + i) * kGroup);
+      }
+    }
+    const V mean = (means[0] + means[1]) + (means[2] + means[3]);
+    for (int64_t k = 0; k < shape.n; ++k) {
+      const V ds = load<V>(p + k * kGroup) * (load<V>(dp + k * kGroup) - mean);
+      store(dp + k * kGroup, ds);
+      if (kPairs) store(pairs + k * shape.padded, load<V>(pairs + k * shape.padded) + ds);
+    }
   }
 
   // Adds gradients of pairs, [key * stride + query], to a table.

@@ -92,7 +92,7 @@ inline void transpose_square(Floats* rows) {
 
 // columns[c * kGroup + i] = rows[i][c] for the rows of a group.
 template <typename T>
-inline void transpose(Rows<const T> rows, int64_t d, T* columns) {
+__attribute__((noinline)) void transpose(Rows<const T> rows, int64_t d, T* columns) {
   int64_t begin = 0;
   if constexpr (sizeof(T) == sizeof(float)) {
     constexpr int kL = kLanes<float>;
@@ -112,10 +112,11 @@ inline void transpose(Rows<const T> rows, int64_t d, T* columns) {
   }
 }
 
-// products[k * kGroup + i] = sum_c columns[c * kGroup + i] * rows[k][c] for k < n, n a multiple of
-// 8. There are as many sums under way as the latency of the multiply-add asks for.
-template <typename T>
-inline void products(const T* columns, Rows<const T> rows, int64_t n, int64_t d, T* out) {
+// use(k, v, sum) for each key k < n, n a multiple of 8, and each register v of the group: the sums
+// over c of columns[c * kGroup + i] * rows[k][c]. There are as many sums under way as the latency
+// of the multiply-add asks for.
+template <typename T, typename Use>
+inline void products(const T* columns, Rows<const T> rows, int64_t n, int64_t d, Use use) {
   using V = Vector<T, kLanes<T>>;
   constexpr int kVectors = kGroup / kLanes<T>;
   constexpr int kRows = kVectors < 8 ? 8 / kVectors : 1;
@@ -140,7 +141,7 @@ inline void products(const T* columns, Rows<const T> rows, int64_t n, int64_t d,
 #pragma GCC unroll 8
     for (int r = 0; r < kRows; ++r) {
 #pragma GCC unroll 8
-      for (int v = 0; v < kVectors; ++v) store(out + (k + r) * kGroup + v * kLanes<T>, sums[r][v]);
+      for (int v = 0; v < kVectors; ++v) use(k + r, v, sums[r][v]);
     }
   }
 }
@@ -154,9 +155,9 @@ struct Weights {
 };
 
 // Channels [0, kColumns vectors) of the first kRows rows of `weighted_sums`.
-template <typename V, int kRows, int kColumns, typename W, typename T>
+template <typename V, int kRows, int kColumns, typename W, typename T, typename Factor>
 inline void weighted_tile(W weights, Rows<const T> from, int64_t summands, Rows<T> to, int64_t rows,
-                          T factor, bool add) {
+                          Factor factor, bool add) {
   constexpr int kL = sizeof(V) / sizeof(T);
   V sums[kRows][kColumns] = {};
   for (int64_t j = 0; j < summands; ++j) {
@@ -176,19 +177,20 @@ inline void weighted_tile(W weights, Rows<const T> from, int64_t summands, Rows<
 #pragma GCC unroll 4
     for (int v = 0; v < kColumns; ++v) {
       T* out = to[r] + v * kL;
-      V sum = sums[r][v] * splat<V>(factor);
+      V sum = sums[r][v] * splat<V>(factor(r));
       if (add) sum += load<V>(out);
       store(out, sum);
     }
   }
 }
 
-// to[i][c] = factor * sum_j weights(i, j) * from[j][c] for i < rows, added to what is there where
-// `add`. Weights are read up to the next multiple of 8 rows. Long sums are cut into pieces, since
-// the rounding of a sum grows with its length.
-template <typename W, typename T>
-inline void weighted_sums(W weights, Rows<const T> from, int64_t summands, Rows<T> to, int64_t rows,
-                          int64_t d, T factor, bool add) {
+// to[i][c] = factor(i) * sum_j weights(i, j) * from[j][c] for i < rows, added to what is there
+// where `add`. Weights are read up to the next multiple of 8 rows. Long sums are cut into pieces,
+// since the rounding of a sum grows with its length.
+template <typename W, typename T, typename Factor>
+__attribute__((noinline)) void weighted_sums(W weights, Rows<const T> from, int64_t summands,
+                                             Rows<T> to, int64_t rows, int64_t d, Factor factor,
+                                             bool add) {
   constexpr int kL = kLanes<T>, kRows = kRegister == 64 ? 8 : 4, kPiece = 64;
   for (int64_t j = 0; j < summands; j += kPiece, add = true) {
     const int64_t piece = summands - j < kPiece ? summands - j : kPiece;
@@ -196,8 +198,9 @@ inline void weighted_sums(W weights, Rows<const T> from, int64_t summands, Rows<
       const auto tile = [&]<typename V, int kColumns>(int64_t c) {
         const Rows<const T> source{from.base + c, from.offset + j};
         const Rows<T> target{to.base + c, to.offset + i};
-        weighted_tile<V, kRows, kColumns>(weights.from(i, j), source, piece, target, rows - i,
-                                          factor, add);
+        weighted_tile<V, kRows, kColumns>(
+            weights.from(i, j), source, piece, target, rows - i,
+            [&](int64_t r) { return factor(i + r); }, add);
       };
       int64_t c = 0;
       for (; c + 2 * kL <= d; c += 2 * kL) tile.template operator()<Vector<T, kL>, 2>(c);
