@@ -23,13 +23,13 @@ inline Vector<float, kLanes<float>> exponential_of_negative(Vector<float, kLanes
   const V shifted = bounded * 1.44269504f + shift;
   const V n = shifted - shift;
   const V r = (bounded - n * 0.693359375f) + n * 2.12194440e-4f;
-  V p = r * 1.9875691500e-4f + 1.3981999507e-3f;
-  p = p * r + 8.3334519073e-3f;
-  p = p * r + 4.1665795894e-2f;
-  p = p * r + 1.6666665459e-1f;
-  p = p * r + 5.0000001201e-1f;
-  p = p * (r * r) + r + 1.0f;
-  return p * (V)(((Bits)shifted + 127) << 23);
+  const V power = (V)(((Bits)shifted + 127) << 23);
+  // e^r = 1 + r + r^2 q(r), with q fitted for the least relative error; a tree, since a chain of
+  // products would keep the next ones waiting.
+  const V r2 = r * r;
+  const V tail = r2 * 1.3814536e-3f + (r * 8.368745e-3f + 4.1668393e-2f);
+  const V q = r2 * tail + (r * 0.16666521f + 0.49999994f);
+  return power + power * (r2 * q + r);
 }
 inline Vector<double, kLanes<double>> exponential_of_negative(Vector<double, kLanes<double>> x) {
   for (int i = 0; i < kLanes<double>; ++i) x[i] = __builtin_exp(x[i]);
