@@ -154,10 +154,19 @@ struct Weights {
   Weights from(int64_t i, int64_t j) const { return {weight + i * kRow + j * kSummand}; }
 };
 
+// Row i's factor is factor[i * step].
+template <typename T>
+struct Factors {
+  const T* factor;
+  int64_t step;
+  T operator()(int64_t i) const { return factor[i * step]; }
+  Factors from(int64_t i) const { return {factor + i * step, step}; }
+};
+
 // Channels [0, kColumns vectors) of the first kRows rows of `weighted_sums`.
-template <typename V, int kRows, int kColumns, typename W, typename T, typename Factor>
+template <typename V, int kRows, int kColumns, typename W, typename T>
 inline void weighted_tile(W weights, Rows<const T> from, int64_t summands, Rows<T> to, int64_t rows,
-                          Factor factor, bool add) {
+                          Factors<T> factors, bool add) {
   constexpr int kL = sizeof(V) / sizeof(T);
   V sums[kRows][kColumns] = {};
   for (int64_t j = 0; j < summands; ++j) {
@@ -177,20 +186,20 @@ inline void weighted_tile(W weights, Rows<const T> from, int64_t summands, Rows<
 #pragma GCC unroll 4
     for (int v = 0; v < kColumns; ++v) {
       T* out = to[r] + v * kL;
-      V sum = sums[r][v] * splat<V>(factor(r));
+      V sum = sums[r][v] * splat<V>(factors(r));
       if (add) sum += load<V>(out);
       store(out, sum);
     }
   }
 }
 
-// to[i][c] = factor(i) * sum_j weights(i, j) * from[j][c] for i < rows, added to what is there
+// to[i][c] = factors(i) * sum_j weights(i, j) * from[j][c] for i < rows, added to what is there
 // where `add`. Weights are read up to the next multiple of 8 rows. Long sums are cut into pieces,
 // since the rounding of a sum grows with its length.
-template <typename W, typename T, typename Factor>
+template <typename W, typename T>
 __attribute__((noinline)) void weighted_sums(W weights, Rows<const T> from, int64_t summands,
-                                             Rows<T> to, int64_t rows, int64_t d, Factor factor,
-                                             bool add) {
+                                             Rows<T> to, int64_t rows, int64_t d,
+                                             Factors<T> factors, bool add) {
   constexpr int kL = kLanes<T>, kRows = kRegister == 64 ? 8 : 4, kPiece = 64;
   for (int64_t j = 0; j < summands; j += kPiece, add = true) {
     const int64_t piece = summands - j < kPiece ? summands - j : kPiece;
@@ -198,9 +207,8 @@ __attribute__((noinline)) void weighted_sums(W weights, Rows<const T> from, int6
       const auto tile = [&]<typename V, int kColumns>(int64_t c) {
         const Rows<const T> source{from.base + c, from.offset + j};
         const Rows<T> target{to.base + c, to.offset + i};
-        weighted_tile<V, kRows, kColumns>(
-            weights.from(i, j), source, piece, target, rows - i,
-            [&](int64_t r) { return factor(i + r); }, add);
+        weighted_tile<V, kRows, kColumns>(weights.from(i, j), source, piece, target, rows - i,
+                                          factors.from(i), add);
       };
       int64_t c = 0;
       for (; c + 2 * kL <= d; c += 2 * kL) tile.template operator()<Vector<T, kL>, 2>(c);
