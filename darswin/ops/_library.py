@@ -56,6 +56,13 @@ def without_autocast(*tensors: torch.Tensor) -> tuple[torch.Tensor, ...]:
     return tuple(t.float() if t.dtype in half else t for t in tensors)
 
 
+def autocast_off(device: str) -> contextlib.AbstractContextManager:
+    """A context in which autocast does not touch the arithmetic of a reference."""
+    if not torch.amp.is_autocast_available(device):
+        return contextlib.nullcontext()
+    return torch.autocast(device, enabled=False)
+
+
 def no_second_derivative(name: str) -> None:
     """Makes an operator's backward raise where it is differentiated again, rather than be wrong."""
 

@@ -24,6 +24,15 @@ def check_tensor(name: str, value: object, like: Tensor | None = None) -> None:
         raise ValueError(f"{name} must be on the same device, {like.device}, got {value.device}")
 
 
+def check_dtype(name: str, value: object, dtypes: Sequence[torch.dtype]) -> None:
+    """TypeError unless `value` is a tensor of one of `dtypes`."""
+    if not isinstance(value, Tensor):
+        raise TypeError(f"{name} must be a tensor, got {type(value).__name__}")
+    if value.dtype not in dtypes:
+        *others, last = (str(dtype).removeprefix("torch.") for dtype in dtypes)
+        raise TypeError(f"{name} must be {', '.join(others)} or {last}, got {value.dtype}")
+
+
 def check_shape(name: str, value: Tensor, form: str, *allowed: Sequence[int | None]) -> None:
     """ValueError unless the shape is one of `allowed` (None: any size); `form` says it in words."""
     shape = tuple(value.shape)

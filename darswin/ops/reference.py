@@ -108,6 +108,7 @@ def window_attention(
 ) -> Tensor:
     """See `darswin.ops.window_attention`."""
     batch, rings, sectors, _, heads, head_dim = qkv.shape
+    dtype, qkv = qkv.dtype, qkv.to(bias.dtype)  # bfloat16 as float32, rounded once at the end
     (mr, ma), (nr, na) = window, (rings // window[0], sectors // window[1])
     x = qkv.roll((-shift[0], -shift[1]), (1, 2)).reshape(batch, nr, mr, na, ma, 3, heads, head_dim)
     # (B, n_r, n_a, heads, M_r·M_φ, d)
@@ -118,7 +119,7 @@ def window_attention(
     logits = logits.masked_fill(~visible[:, :, None], -math.inf)
     out = (logits.softmax(-1) @ v).unflatten(4, (mr, ma))
     out = out.permute(0, 1, 4, 2, 5, 3, 6).reshape(batch, rings, sectors, heads * head_dim)
-    return out.roll(shift, (1, 2))
+    return out.roll(shift, (1, 2)).to(dtype)
 
 
 def pairwise_bias(bias: Tensor, window: tuple[int, int]) -> Tensor:
