@@ -108,11 +108,13 @@ Tensor forward(Call<T>&& call) {
   return out;
 }
 
-// Windows that share one row of bias gradients: few rows to fold, yet work for many threads. Their
-// number must not depend on that of the threads, or the sums would.
+// Windows that share one row of bias gradients: few rows to fold, yet equal work for many threads.
+// Their number must not depend on that of the threads, or the sums would.
 template <typename T>
 int64_t chunk_size(const WindowAttentionArgs<T>& args) {
-  return std::clamp<int64_t>(args.windows * args.heads / 32, 1, 16);
+  const int64_t most = std::clamp<int64_t>(args.windows * args.heads / 32, 1, 16);
+  const int64_t windows = args.windows / args.bias_rows, chunks = (windows + most - 1) / most;
+  return (windows + chunks - 1) / chunks;
 }
 
 template <typename T>
