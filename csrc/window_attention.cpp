@@ -1,7 +1,7 @@
 // window_attention and its backward on CPU: check, allocate, thread, call the kernel.
 // The checks here only keep memory safe; darswin/ops/window_attention.py explains wrong arguments.
 #if defined(__linux__)
-#include <sys/mman.h>
+#  include <sys/mman.h>
 #endif
 #include <torch/csrc/stable/library.h>
 #include <torch/csrc/stable/ops.h>

@@ -8,8 +8,6 @@
 // border carry different `side` marks and do not see each other. Backward finds the probabilities
 // again, just as forward did, so forward saves nothing. Every token lies in one window, so qkv
 // gradients have one writer; bias gradients are summed over a chunk of windows, in order.
-#include <stdlib.h>
-
 #include "kernels.h"
 #include "math.h"
 #include "window_attention_scratch.h"
