@@ -1,83 +1,181 @@
 """window_attention, forward and forward+backward, against what a user would write without it.
 
-`make bench`, or `python benchmarks/attention.py [--quick]`. Writes benchmarks/results/*.json and a
-plot beside it, and prints the tables of the README and each ratio against its bar.
+`make bench`, or `python benchmarks/attention.py [--quick] [--only "A stage 1"]`. Writes
+benchmarks/results/*.json and a plot beside it, and prints the tables of the README, each ratio
+against its bar, and our rates against the machine's peaks.
 """
 
 import argparse
 import math
 
+import peaks
 import torch
 import torch.nn.functional as F
 from common import OURS, THREADS, Result, compare, finish, forward, forward_backward, machine
+from torch import Tensor
 from tqdm import tqdm
 
-from darswin.ops import reference, use_reference, window_attention
+from darswin.ops import reference, window_attention
 
+HEAD_DIM = 32
+# (R, A, heads), window, shift of the odd blocks, periodic
 ATTENTION = {
-    # (R, A, heads), window, shift
-    "A stage 1": ((16, 64, 3), (1, 16), (0, 4)),
-    "A stage 2": ((16, 16, 6), (1, 16), (0, 0)),
-    "A stage 3": ((16, 4, 12), (4, 4), (2, 0)),
-    "A stage 4": ((16, 1, 24), (16, 1), (0, 0)),
-    "RA stage 1": ((16, 64, 3), (4, 4), (2, 2)),
+    "A stage 1": ((16, 64, 3), (1, 16), (0, 4), (False, True)),
+    "A stage 2": ((16, 16, 6), (1, 16), (0, 0), (False, True)),
+    "A stage 3": ((16, 4, 12), (4, 4), (2, 0), (False, True)),
+    "A stage 4": ((16, 1, 24), (16, 1), (0, 0), (False, True)),
+    "RA stage 1": ((16, 64, 3), (4, 4), (2, 2), (False, True)),
+    "RA stage 2": ((8, 32, 6), (4, 4), (2, 2), (False, True)),
+    "RA stage 3": ((4, 16, 12), (4, 4), (0, 2), (False, True)),
+    "RA stage 4": ((2, 8, 24), (2, 8), (0, 0), (False, True)),
+    "32x128, windows of 64": ((32, 128, 3), (1, 64), (0, 32), (False, True)),
+    "Swin 4x4": ((32, 32, 3), (4, 4), (2, 2), (False, False)),
+    "Swin 8x8": ((32, 32, 3), (8, 8), (4, 4), (False, False)),
 }
+COMPILED = "compiled "
 
 
-def attention(case: str, batch: int, threads: int, seconds: float) -> list[Result]:
-    (rings, sectors, heads), window, shift = ATTENTION[case]
-    qkv = torch.randn(batch, rings, sectors, 3, heads, 32)
+def bars(mode: str, dtype: torch.dtype, batch: int, megabytes: float) -> tuple[float, float | None]:
+    """How much longer the best of the peers must at least take, and eager attention."""
+    if dtype == torch.bfloat16:
+        return 3.0, None
+    if mode == "forward":
+        return (3.0 if batch == 32 or megabytes < 1 else 4.0), None
+    return (2.5 if megabytes < 1 else 3.0), 4.0
+
+
+class Peers:
+    """Attention in windows as users write it: roll, partition, attend, reverse, roll back."""
+
+    def __init__(self, case: str, batch: int):
+        (rings, sectors, heads), window, self.shift, periodic = ATTENTION[case]
+        (mr, ma), (nr, na) = window, (rings // window[0], sectors // window[1])
+        self.window, self.rolls = window, any(self.shift)
+        self.parts = (batch, nr, mr, na, ma, 3, heads, HEAD_DIM)
+        visible = reference.visible_pairs(rings, sectors, window, self.shift, periodic, "cpu")
+        hidden = torch.zeros(visible.shape).masked_fill(~visible, -math.inf)[:, :, None]
+        self.hidden = None if visible.all() else hidden
+
+    def partition(self, qkv: Tensor) -> Tensor:
+        """(3, B, n_r, n_a, heads, N, d)"""
+        if self.rolls:
+            qkv = qkv.roll((-self.shift[0], -self.shift[1]), (1, 2))
+        return qkv.reshape(self.parts).permute(5, 0, 1, 3, 6, 2, 4, 7).flatten(5, 6)
+
+    def reverse(self, out: Tensor) -> Tensor:
+        batch, nr, mr, na, ma, _, heads, dim = self.parts
+        out = out.reshape(batch, nr, na, heads, mr, ma, dim).permute(0, 1, 4, 2, 5, 3, 6)
+        out = out.reshape(batch, nr * mr, na * ma, heads * dim)
+        return out.roll(self.shift, (1, 2)) if self.rolls else out
+
+    def mask(self, bias: Tensor, dtype: torch.dtype) -> Tensor:
+        """The bias of all pairs, hidden ones at minus infinity; 1 and 1 for n_r and n_a if all the
+        windows share it."""
+        # Not by an index: torch 2.13's inductor miscompiles the gradient of that (pytorch#191837).
+        pairs = pairs_by_slices(bias, self.window)[:, None, None]
+        return (pairs if self.hidden is None else pairs + self.hidden).to(dtype)
+
+    def eager(self, qkv: Tensor, bias: Tensor) -> Tensor:
+        q, k, v = self.partition(qkv)
+        logits = (q * HEAD_DIM**-0.5) @ k.transpose(-1, -2) + self.mask(bias, qkv.dtype)
+        return self.reverse(logits.softmax(-1) @ v)
+
+    def sdpa(self, qkv: Tensor, bias: Tensor) -> Tensor:
+        batch, nr, _, na, *_ = self.parts
+        q, k, v = (t.flatten(0, 2) for t in self.partition(qkv))
+        mask = self.mask(bias, qkv.dtype).expand(batch, nr, na, -1, -1, -1).flatten(0, 2)
+        return self.reverse(F.scaled_dot_product_attention(q, k, v, attn_mask=mask))
+
+
+def pairs_by_slices(bias: Tensor, window: tuple[int, int]) -> Tensor:
+    """`reference.pairwise_bias` without an index: (B or 1, heads, N, N)."""
+    mr, ma = window
+    table = bias.flip(2, 3)
+    table = torch.stack([table[..., ma - 1 - a : 2 * ma - 1 - a] for a in range(ma)], 3)
+    table = torch.stack([table[:, :, mr - 1 - r : 2 * mr - 1 - r] for r in range(mr)], 2)
+    return table.transpose(3, 4).reshape(*bias.shape[:2], mr * ma, mr * ma)
+
+
+def attention(
+    case: str, batch: int, threads: int, mode: str, dtype: torch.dtype, seconds: float
+) -> list[Result]:
+    (rings, sectors, heads), window, shift, periodic = ATTENTION[case]
+    qkv = torch.randn(batch, rings, sectors, 3, heads, HEAD_DIM).to(dtype)
     bias = torch.randn(1, heads, 2 * window[0] - 1, 2 * window[1] - 1)
-    options = dict(window=window, shift=shift)
-    mr, ma, nr, na = *window, rings // window[0], sectors // window[1]
-    visible = reference.visible_pairs(rings, sectors, window, shift, (False, True), qkv.device)
-    hidden = torch.zeros(visible.shape).masked_fill(~visible, -math.inf)[:, :, None]
+    peers = Peers(case, batch)
 
-    def ours(qkv, bias):
-        return window_attention(qkv, bias, **options)
+    def ours(qkv: Tensor, bias: Tensor) -> Tensor:
+        return window_attention(qkv, bias, window=window, shift=shift, periodic=periodic)
 
-    def eager(qkv, bias):
-        with use_reference():
-            return window_attention(qkv, bias, **options)
-
-    def sdpa(qkv, bias):
-        x = qkv.roll((-shift[0], -shift[1]), (1, 2)).reshape(batch, nr, mr, na, ma, 3, heads, 32)
-        q, k, v = x.permute(5, 0, 1, 3, 6, 2, 4, 7).flatten(5, 6)
-        mask = reference.pairwise_bias(bias, window)[:, None, None] + hidden
-        mask = mask.expand(batch, -1, -1, -1, -1, -1).flatten(0, 2)
-        q, k, v = (t.flatten(0, 2) for t in (q, k, v))
-        out = F.scaled_dot_product_attention(q, k, v, attn_mask=mask)
-        out = out.reshape(batch, nr, na, heads, mr, ma, 32).permute(0, 1, 4, 2, 5, 3, 6)
-        return out.reshape(batch, rings, sectors, heads * 32).roll(shift, (1, 2))
-
-    results = []
-    for mode, wrap in (("forward", forward), ("forward+backward", forward_backward)):
-        torch._dynamo.reset()
-        peers = {OURS: ours, "eager": eager, "F.sdpa": sdpa}
-        if mode == "forward":
-            peers["compiled F.sdpa"] = torch.compile(sdpa, dynamic=False)
-        candidates = {name: wrap(run, [qkv, bias]) for name, run in peers.items()}
-        results += compare(
-            "window_attention", f"{case}, batch {batch}", candidates,
-            mode=mode, threads=threads, min_run_time=seconds,
-        )  # fmt: skip
+    torch.set_num_threads(threads)  # inductor writes it into its code
+    torch._dynamo.reset()
+    runs = {OURS: ours, "eager": peers.eager, "F.sdpa": peers.sdpa}
+    for name in ("eager", "F.sdpa"):
+        runs[COMPILED + name] = torch.compile(runs[name], dynamic=False)
+    wrap = forward if mode == "forward" else forward_backward
+    half = dtype == torch.bfloat16
+    results = compare(
+        "window_attention, bfloat16" if half else "window_attention",
+        f"{case}, batch {batch}",
+        {name: wrap(run, [qkv, bias]) for name, run in runs.items()},
+        mode=mode, threads=threads, min_run_time=seconds,
+        tolerance=5e-2 if half else 1e-4,  # the peers round to bfloat16 at each step
+    )  # fmt: skip
+    best_bar, eager_bar = bars(mode, dtype, batch, 4 * qkv.numel() / 3 / 2**20)
+    by_name = {r.name: r for r in results}
+    by_name["eager"].bar = eager_bar
+    best = min((r for r in results if not r.name.startswith(OURS)), key=lambda r: r.median)
+    best.bar = max(best_bar, best.bar or 0)
     return results
+
+
+def rates(results: list[Result]) -> str:
+    """Our arithmetic and our traffic a second, against the machine's peaks."""
+    limits = {threads: peaks.measure(threads) for threads in sorted({r.threads for r in results})}
+    lines = [str(limit) for limit in limits.values()]
+    for r in results:
+        if r.name != OURS:
+            continue
+        case, batch = r.case.rsplit(", batch ", 1)
+        (rings, sectors, heads), window, *_ = ATTENTION[case]
+        numbers = int(batch) * rings * sectors * heads * HEAD_DIM
+        # Two products forward, five backward; a map of qkv read and one written, then two and a
+        # gradient read and the gradient of qkv written.
+        products, maps = (2, 4) if r.mode == "forward" else (7, 11)
+        gflops = 2e-9 * products * numbers * window[0] * window[1] / r.median
+        gbytes = 1e-9 * maps * numbers * (2 if "bfloat16" in r.operator else 4) / r.median
+        limit = limits[r.threads]
+        lines.append(
+            f"{r.operator}, {r.case}, {r.mode}, {r.threads} threads: "
+            f"{gflops:.0f} GFLOP/s ({gflops / limit.gflops:.0%} of the peak), "
+            f"{gbytes:.1f} GB/s ({gbytes / limit.memory_gbytes:.0%} of a copy in memory)"
+        )
+    return "\n".join(lines)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--quick", action="store_true", help="one small case, short runs")
+    parser.add_argument("--only", action="append", choices=ATTENTION, help="this case; repeatable")
+    parser.add_argument("--seconds", type=float, help="of each timing")
     args = parser.parse_args()
     torch.manual_seed(0)
-    cases = ["A stage 3"] if args.quick else list(ATTENTION)
+    cases = args.only or (["A stage 3"] if args.quick else list(ATTENTION))
     batches = [8] if args.quick else [8, 32]
-    seconds = 0.05 if args.quick else 0.5
+    seconds = args.seconds or (0.05 if args.quick else 0.5)
+    kinds = [
+        ("forward", torch.float32),
+        ("forward+backward", torch.float32),
+        ("forward+backward", torch.bfloat16),
+    ]
     print(" ".join(f"{k}={v}" for k, v in machine().items()))
     results: list[Result] = []
     for case, batch in tqdm([(c, b) for c in cases for b in batches], unit="case"):
-        for threads in THREADS:
-            results += attention(case, batch, threads, seconds)
-    finish(results, "attention", avx2_share=0.65, keep=not args.quick)
+        for mode, dtype in kinds:
+            for threads in THREADS:
+                results += attention(case, batch, threads, mode, dtype, seconds)
+    finish(results, "attention", avx2_share=0.65, keep=not (args.quick or args.only))
+    print(rates(results))
 
 
 if __name__ == "__main__":

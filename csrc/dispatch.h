@@ -74,23 +74,39 @@ struct PolarEmbedArgs {
   T* grad_samples;      // (B, R, A, S_r * S_phi * C)
 };
 
+// The type in which a storage type is computed.
+template <typename T>
+struct ArithmeticOf {
+  using type = T;
+};
+template <>
+struct ArithmeticOf<bfloat16> {
+  using type = float;
+};
+template <typename T>
+using Arithmetic = typename ArithmeticOf<T>::type;
+
 // Windows of a polar map; token (r, a) of the rolled map is token (r + shift_r, a + shift_a) of it.
+// Windows are counted over all images: window w lies in image w / (windows of an image).
 template <typename T>
 struct WindowAttentionArgs {
-  const T* qkv;   // (B, R, A, 3, heads, d)
-  const T* bias;  // (B or 1, heads, 2 M_r - 1, 2 M_a - 1)
-  int64_t bias_stride;
+  using Real = Arithmetic<T>;
+
+  const T* qkv;      // (B, R, A, 3, heads, d)
+  const Real* bias;  // (B or 1, heads, 2 M_r - 1, 2 M_a - 1)
+  int64_t bias_rows, windows;
   int64_t rings, sectors, heads, head_dim;
   int64_t window_r, window_a, shift_r, shift_a;
   bool periodic_r, periodic_a;
-  T scale;
+  Real scale;
 
-  T* out;       // forward: (B, R, A, heads, d)
-  double* lse;  // (B, R, A, heads): written forward, read backward
+  T* out;  // forward: (B, R, A, heads, d)
 
   const T* grad_out;  // backward
   T* grad_qkv;        // like qkv
-  double* grad_bias;  // (B, heads, 2 M_r - 1, 2 M_a - 1), zero on entry
+  double* grad_bias;  // (chunks of a bias row, B or 1, heads, 2 M_r - 1, 2 M_a - 1), to be summed
+                      // over the chunks; zero on entry
+  int64_t chunk;      // windows that share one row of bias gradients
 };
 
 // Kernels are serial over [begin, end) of their work items; the drivers own the threads.
@@ -125,20 +141,25 @@ struct KernelTable {
   // item: image, as one band; the gradients of the samples are used as soon as they are there
   void (*polar_embed_backward_image)(const PolarSampleArgs<T>&, const PolarEmbedArgs<T>&,
                                      int64_t begin, int64_t end, void* scratch);
-  // doubles of scratch that each thread needs in the two functions below
-  int64_t (*window_attention_scratch)(const WindowAttentionArgs<T>&);
-  // item: (image, window, head)
-  void (*window_attention)(const WindowAttentionArgs<T>&, int64_t begin, int64_t end,
-                           double* scratch);
-  // item: (image, head)
-  void (*window_attention_backward)(const WindowAttentionArgs<T>&, int64_t begin, int64_t end,
-                                    double* scratch);
+};
+
+template <typename T>
+struct WindowAttentionTable {
+  // bytes of scratch that each thread needs in the two functions below
+  int64_t (*scratch)(const WindowAttentionArgs<T>&);
+  // item: (window, head)
+  void (*forward)(const WindowAttentionArgs<T>&, int64_t begin, int64_t end, void* scratch);
+  // item: (chunk of windows, head)
+  void (*backward)(const WindowAttentionArgs<T>&, int64_t begin, int64_t end, void* scratch);
 };
 
 struct Kernels {
   const char* tier;
   KernelTable<float> f32;
   KernelTable<double> f64;
+  WindowAttentionTable<float> attention_f32;
+  WindowAttentionTable<double> attention_f64;
+  WindowAttentionTable<bfloat16> attention_bf16;
 
   template <typename T>
   const KernelTable<T>& table() const {
@@ -146,6 +167,17 @@ struct Kernels {
       return f32;
     } else {
       return f64;
+    }
+  }
+
+  template <typename T>
+  const WindowAttentionTable<T>& attention() const {
+    if constexpr (sizeof(T) == sizeof(float)) {
+      return attention_f32;
+    } else if constexpr (sizeof(T) == sizeof(double)) {
+      return attention_f64;
+    } else {
+      return attention_bf16;
     }
   }
 };

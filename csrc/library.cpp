@@ -28,10 +28,10 @@ STABLE_TORCH_LIBRARY(darswin, m) {
       "(Tensor, Tensor, Tensor, Tensor, Tensor)");
   m.def(
       "window_attention(Tensor qkv, Tensor bias, int[] window, int[] shift, bool[] periodic, "
-      "float scale) -> (Tensor, Tensor)");
+      "float scale) -> Tensor");
   m.def(
-      "window_attention_backward(Tensor grad_out, Tensor qkv, Tensor bias, Tensor lse, "
-      "int[] window, int[] shift, bool[] periodic, float scale) -> (Tensor, Tensor)");
+      "window_attention_backward(Tensor grad_out, Tensor qkv, Tensor bias, int[] window, "
+      "int[] shift, bool[] periodic, float scale) -> (Tensor, Tensor)");
 }
 
 PYBIND11_MODULE(_C, m) {

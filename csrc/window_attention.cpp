@@ -5,7 +5,9 @@
 #include <torch/csrc/stable/tensor.h>
 #include <torch/headeronly/util/Exception.h>
 
+#include <algorithm>
 #include <tuple>
+#include <utility>
 #include <vector>
 
 #include "dispatch.h"
@@ -18,23 +20,26 @@ using torch::headeronly::ScalarType;
 using torch::stable::Tensor;
 using Sizes = std::vector<int64_t>;
 
+template <typename T>
+constexpr ScalarType type_of() {
+  return sizeof(T) == sizeof(float) ? ScalarType::Float : ScalarType::Double;
+}
+
 // The arguments of one call, contiguous as the kernels want them. Owns what `args` points into.
 template <typename T>
 struct Call {
   Tensor qkv, bias;
   WindowAttentionArgs<T> args{};
-  int64_t batch, windows;
 
   Call(const Tensor& qkv_, const Tensor& bias_, const Sizes& window, const Sizes& shift,
        const std::vector<bool>& periodic, double scale)
-      : qkv(torch::stable::contiguous(qkv_)),
-        bias(torch::stable::contiguous(bias_)),
-        batch(qkv_.size(0)) {
+      : qkv(torch::stable::contiguous(qkv_)), bias(torch::stable::contiguous(bias_)) {
     STD_TORCH_CHECK(qkv.dim() == 6 && qkv.size(3) == 3 && bias.dim() == 4 && window.size() == 2 &&
                         shift.size() == 2 && periodic.size() == 2,
                     "window_attention: wrong number of dimensions");
-    STD_TORCH_CHECK(bias.scalar_type() == qkv.scalar_type() && bias.is_cpu(),
-                    "window_attention: bias must be on the CPU and have the type of qkv");
+    STD_TORCH_CHECK(bias.scalar_type() == type_of<Arithmetic<T>>() && bias.is_cpu(),
+                    "window_attention: bias must be on the CPU and have the type of qkv, float32 "
+                    "where that is bfloat16");
     for (int axis = 0; axis < 2; ++axis) {
       const int64_t size = qkv.size(1 + axis);
       STD_TORCH_CHECK(window[axis] > 0 && size > 0 && size % window[axis] == 0 &&
@@ -43,92 +48,113 @@ struct Call {
       STD_TORCH_CHECK(bias.size(2 + axis) == 2 * window[axis] - 1,
                       "window_attention: bias does not fit the window");
     }
+    const int64_t batch = qkv.size(0);
     STD_TORCH_CHECK((bias.size(0) == 1 || bias.size(0) == batch) && bias.size(1) == qkv.size(4),
                     "window_attention: bias does not fit the batch or the heads");
 
-    args.qkv = qkv.template const_data_ptr<T>();
-    args.bias = bias.template const_data_ptr<T>();
+    args.qkv = static_cast<const T*>(qkv.const_data_ptr());
+    args.bias = static_cast<const Arithmetic<T>*>(bias.const_data_ptr());
+    args.bias_rows = bias.size(0);
     args.rings = qkv.size(1);
     args.sectors = qkv.size(2);
     args.heads = qkv.size(4);
     args.head_dim = qkv.size(5);
     args.window_r = window[0];
     args.window_a = window[1];
+    args.windows = batch * (args.rings / args.window_r) * (args.sectors / args.window_a);
     args.shift_r = shift[0];
     args.shift_a = shift[1];
     args.periodic_r = periodic[0];
     args.periodic_a = periodic[1];
-    args.scale = static_cast<T>(scale);
-    args.bias_stride = bias.size(0) == 1 ? 0 : table_size() * args.heads;
-    windows = (args.rings / args.window_r) * (args.sectors / args.window_a);
+    args.scale = static_cast<Arithmetic<T>>(scale);
   }
-
-  int64_t table_size() const { return (2 * args.window_r - 1) * (2 * args.window_a - 1); }
 
   // Runs `kernel` over `items` work items, each thread with its own scratch.
   template <typename Kernel>
   void run(int64_t items, Kernel kernel) {
-    const int64_t size = kernels().table<T>().window_attention_scratch(args);
-    std::vector<double> scratch(size * num_threads(items));
-    parallel_ranges(items, [&](int64_t begin, int64_t end, int64_t thread) {
-      kernel(args, begin, end, scratch.data() + thread * size);
+    const int64_t bytes = kernels().attention<T>().scratch(args);
+    parallel_ranges(items, [&](int64_t begin, int64_t end, int64_t) {
+      kernel(args, begin, end, scratch(bytes));
     });
   }
 };
 
 template <typename T>
-std::tuple<Tensor, Tensor> forward(Call<T>&& call) {
+Tensor forward(Call<T>&& call) {
   auto& args = call.args;
   const Tensor out = torch::stable::new_empty(
-      call.qkv, Sizes{call.batch, args.rings, args.sectors, args.heads * args.head_dim});
-  const Tensor lse = torch::stable::new_empty(
-      call.qkv, Sizes{call.batch, args.rings, args.sectors, args.heads}, ScalarType::Double);
-  if (lse.numel() == 0) return {out, lse};
-  args.out = out.template mutable_data_ptr<T>();
-  args.lse = lse.template mutable_data_ptr<double>();
-  call.run(call.batch * call.windows * args.heads, kernels().table<T>().window_attention);
-  return {out, lse};
+      call.qkv, Sizes{call.qkv.size(0), args.rings, args.sectors, args.heads * args.head_dim});
+  ask_for_large_pages(out);
+  args.out = static_cast<T*>(out.mutable_data_ptr());
+  call.run(args.windows * args.heads, kernels().attention<T>().forward);
+  return out;
+}
+
+// Windows that share one row of bias gradients: few rows to fold, yet equal work for many threads.
+// Their number must not depend on that of the threads, or the sums would.
+template <typename T>
+int64_t chunk_size(const WindowAttentionArgs<T>& args) {
+  const int64_t most = std::clamp<int64_t>(args.windows * args.heads / 32, 1, 16);
+  const int64_t windows = args.windows / args.bias_rows, chunks = (windows + most - 1) / most;
+  return (windows + chunks - 1) / chunks;
 }
 
 template <typename T>
-std::tuple<Tensor, Tensor> backward(Call<T>&& call, const Tensor& grad_out_, const Tensor& lse_) {
+std::tuple<Tensor, Tensor> backward(Call<T>&& call, const Tensor& grad_out_) {
   // Gradients arrive expanded or strided: `.sum().backward()` gives stride 0.
   const Tensor grad_out = torch::stable::contiguous(grad_out_);
-  const Tensor lse = torch::stable::contiguous(lse_);
   auto& args = call.args;
   STD_TORCH_CHECK(grad_out.numel() * 3 == call.qkv.numel() &&
-                      lse.numel() * args.head_dim == grad_out.numel() &&
-                      grad_out.scalar_type() == call.qkv.scalar_type() &&
-                      lse.scalar_type() == ScalarType::Double,
-                  "window_attention_backward: grad_out and lse must look like the outputs");
+                      grad_out.scalar_type() == call.qkv.scalar_type() && grad_out.is_cpu(),
+                  "window_attention_backward: grad_out must look like the output");
   const Tensor grad_qkv = torch::stable::new_empty(call.qkv, call.qkv.sizes());
-  std::vector<double> bias_rows(call.batch * args.heads * call.table_size(), 0.0);
-  args.grad_out = grad_out.template const_data_ptr<T>();
-  args.lse = const_cast<double*>(lse.template const_data_ptr<double>());
-  args.grad_qkv = grad_qkv.template mutable_data_ptr<T>();
-  args.grad_bias = bias_rows.data();
-  call.run(call.batch * args.heads, kernels().table<T>().window_attention_backward);
-  return {grad_qkv, fold_rows<T>(call.bias, bias_rows)};
+  const Tensor grad_bias = torch::stable::new_zeros(call.bias, call.bias.sizes());
+  const int64_t row = grad_bias.numel();
+  if (grad_qkv.numel() == 0) return {grad_qkv, grad_bias};
+  ask_for_large_pages(grad_qkv);
+  args.chunk = chunk_size(args);
+  const int64_t chunks = (args.windows / args.bias_rows + args.chunk - 1) / args.chunk;
+  std::vector<double> rows(chunks * row, 0.0);
+  args.grad_out = static_cast<const T*>(grad_out.const_data_ptr());
+  args.grad_qkv = static_cast<T*>(grad_qkv.mutable_data_ptr());
+  args.grad_bias = rows.data();
+  call.run(chunks * args.bias_rows * args.heads, kernels().attention<T>().backward);
+
+  auto* sums = static_cast<Arithmetic<T>*>(grad_bias.mutable_data_ptr());
+  for (int64_t chunk = 1; chunk < chunks; ++chunk) {
+    for (int64_t k = 0; k < row; ++k) rows[k] += rows[chunk * row + k];
+  }
+  for (int64_t k = 0; k < row; ++k) sums[k] = static_cast<Arithmetic<T>>(rows[k]);
+  return {grad_qkv, grad_bias};
 }
 
-std::tuple<Tensor, Tensor> window_attention(const Tensor& qkv, const Tensor& bias, Sizes window,
-                                            Sizes shift, std::vector<bool> periodic, double scale) {
-  if (qkv.scalar_type() == ScalarType::Float) {
-    return forward(Call<float>(qkv, bias, window, shift, periodic, scale));
+// use(Call<T>) for the T of qkv.
+template <typename Use>
+auto with_call(Use use, const Tensor& qkv, const Tensor& bias, const Sizes& window,
+               const Sizes& shift, const std::vector<bool>& periodic, double scale) {
+  switch (qkv.scalar_type()) {
+    case ScalarType::Float:
+      return use(Call<float>(qkv, bias, window, shift, periodic, scale));
+    case ScalarType::Double:
+      return use(Call<double>(qkv, bias, window, shift, periodic, scale));
+    default:
+      STD_TORCH_CHECK(qkv.scalar_type() == ScalarType::BFloat16,
+                      "window_attention: qkv must be float32, float64 or bfloat16");
+      return use(Call<bfloat16>(qkv, bias, window, shift, periodic, scale));
   }
-  STD_TORCH_CHECK(qkv.scalar_type() == ScalarType::Double, "window_attention: float32 or float64");
-  return forward(Call<double>(qkv, bias, window, shift, periodic, scale));
+}
+
+Tensor window_attention(const Tensor& qkv, const Tensor& bias, Sizes window, Sizes shift,
+                        std::vector<bool> periodic, double scale) {
+  return with_call([](auto&& call) { return forward(std::move(call)); }, qkv, bias, window, shift,
+                   periodic, scale);
 }
 
 std::tuple<Tensor, Tensor> window_attention_backward(const Tensor& grad_out, const Tensor& qkv,
-                                                     const Tensor& bias, const Tensor& lse,
-                                                     Sizes window, Sizes shift,
+                                                     const Tensor& bias, Sizes window, Sizes shift,
                                                      std::vector<bool> periodic, double scale) {
-  if (qkv.scalar_type() == ScalarType::Float) {
-    return backward(Call<float>(qkv, bias, window, shift, periodic, scale), grad_out, lse);
-  }
-  STD_TORCH_CHECK(qkv.scalar_type() == ScalarType::Double, "window_attention: float32 or float64");
-  return backward(Call<double>(qkv, bias, window, shift, periodic, scale), grad_out, lse);
+  return with_call([&](auto&& call) { return backward(std::move(call), grad_out); }, qkv, bias,
+                   window, shift, periodic, scale);
 }
 
 }  // namespace

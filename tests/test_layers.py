@@ -13,6 +13,7 @@ from darswin.layers import (
     radial_positions,
 )
 from darswin.lens import Perspective, Spherical
+from darswin.ops import use_reference, window_attention
 
 LENS = Spherical.from_fov([0.2, 0.9], 2.6, 16.0)
 
@@ -149,6 +150,39 @@ def test_window_attention_layer_under_autocast():
     with torch.autocast("cpu", dtype=torch.bfloat16):
         out = layer(torch.randn(1, 2, 4, 8), torch.linspace(0, 1, 3)[None])
     assert out.dtype == torch.bfloat16 and out.isfinite().all()
+
+
+def test_autocast_makes_no_float32_map_of_the_window_attention_layer(monkeypatch):
+    taken = []
+
+    def record(qkv, bias, **options):
+        out = window_attention(qkv, bias, **options)
+        taken.append((qkv.dtype, bias.dtype, out.dtype))
+        return out
+
+    monkeypatch.setattr("darswin.layers.window_attention", record)
+    layer = PolarWindowAttention(8, 2, map_size=(2, 4), window=(2, 4))
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        out = layer(torch.randn(1, 2, 4, 8), torch.linspace(0, 1, 3)[None])
+        out.float().square().sum().backward()
+    assert taken == [(torch.bfloat16, torch.float32, torch.bfloat16)]
+    assert all(p.grad.dtype == torch.float32 for p in layer.parameters())
+
+
+def test_a_plain_swin_block_runs_on_the_layer():
+    # No axis wraps, windows are shifted along both, and the bias is any table.
+    layer = PolarWindowAttention(
+        8, 2, map_size=(8, 8), window=(4, 4), shift=(2, 2), periodic=(False, False)
+    )
+    x, radial = torch.randn(2, 8, 8, 8, requires_grad=True), torch.linspace(0, 1, 9)[None]
+    out = layer(x, radial)
+    with use_reference():
+        expected = layer(x, radial)
+    torch.testing.assert_close(out, expected)
+    (grad,) = torch.autograd.grad(out[0, 0, 0].sum(), x)
+    # The corner's window holds the four corners of the map; it sees only its own.
+    assert grad[0, :2, :2].ne(0).any(-1).all()
+    assert not grad[0, 2:].any() and not grad[0, :, 2:].any()
 
 
 @pytest.mark.parametrize(

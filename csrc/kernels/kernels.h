@@ -38,12 +38,18 @@ void polar_embed_backward_image(const PolarSampleArgs<double>&, const PolarEmbed
                                 int64_t, int64_t, void* scratch);
 
 int64_t window_attention_scratch(const WindowAttentionArgs<float>&);
+void window_attention(const WindowAttentionArgs<float>&, int64_t begin, int64_t end, void* scratch);
+void window_attention_backward(const WindowAttentionArgs<float>&, int64_t begin, int64_t end,
+                               void* scratch);
 int64_t window_attention_scratch(const WindowAttentionArgs<double>&);
-void window_attention(const WindowAttentionArgs<float>&, int64_t, int64_t, double* scratch);
-void window_attention(const WindowAttentionArgs<double>&, int64_t, int64_t, double* scratch);
-void window_attention_backward(const WindowAttentionArgs<float>&, int64_t, int64_t,
-                               double* scratch);
-void window_attention_backward(const WindowAttentionArgs<double>&, int64_t, int64_t,
-                               double* scratch);
+void window_attention(const WindowAttentionArgs<double>&, int64_t begin, int64_t end,
+                      void* scratch);
+void window_attention_backward(const WindowAttentionArgs<double>&, int64_t begin, int64_t end,
+                               void* scratch);
+int64_t window_attention_scratch(const WindowAttentionArgs<bfloat16>&);
+void window_attention(const WindowAttentionArgs<bfloat16>&, int64_t begin, int64_t end,
+                      void* scratch);
+void window_attention_backward(const WindowAttentionArgs<bfloat16>&, int64_t begin, int64_t end,
+                               void* scratch);
 
 }  // namespace darswin::TIER

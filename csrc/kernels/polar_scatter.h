@@ -194,8 +194,8 @@ class Scatter {
     T* bottom = top + layout.row;
     const T* grad = block + k * a.channels;
     for (int64_t c = 0; c < pixel; c += 4) {
-      const V g = load<V>(grad + c), below = rounded(g * down), above = g - below;
-      const V above_right = rounded(above * right), below_right = rounded(below * right);
+      const V g = load<V>(grad + c), below = unfused(g * down), above = g - below;
+      const V above_right = unfused(above * right), below_right = unfused(below * right);
       if (upper) {
         store(top + c, load<V>(top + c) + (above - above_right));
         store(top + pixel + c, load<V>(top + pixel + c) + above_right);
@@ -260,8 +260,8 @@ class Scatter {
     const int64_t plane = a.height * a.width;
     T* pixel = static_cast<T*>(a.grad_image) + image * a.channels * plane + row * a.width + column;
     for (int64_t c = 0; c < a.channels; ++c, pixel += plane) {
-      const T below = rounded(grad[c] * down), above = grad[c] - below;
-      const T above_right = rounded(above * right), below_right = rounded(below * right);
+      const T below = unfused(grad[c] * down), above = grad[c] - below;
+      const T above_right = unfused(above * right), below_right = unfused(below * right);
       if (upper && left) pixel[0] += above - above_right;
       if (upper && next) pixel[1] += above_right;
       if (lower && left) pixel[a.width] += below - below_right;

@@ -40,21 +40,39 @@ using Doubles = Vector<double, kLanes<double>>;
 using Words = Vector<uint64_t, kLanes<uint64_t>>;
 constexpr int kDoubles = kLanes<double>;
 
-// Unaligned load and store of lanes that have the type of what is pointed to, so that the compiler
-// may assume that nothing else is touched.
+// Unaligned load and store of lanes, or of one value, that have the type of what is pointed to, so
+// that the compiler may assume that nothing else is touched.
 template <typename V>
 struct UnalignedOf {
   typedef V type __attribute__((aligned(1)));
 };
+template <typename V>
+constexpr int64_t kLaneBytes = sizeof(V{}[0]);
+template <>
+constexpr int64_t kLaneBytes<float> = sizeof(float);
+template <>
+constexpr int64_t kLaneBytes<double> = sizeof(double);
 template <typename V, typename T>
 inline V load(const T* from) {
-  static_assert(sizeof(V{}[0]) == sizeof(T));
+  static_assert(kLaneBytes<V> == sizeof(T));
   return *reinterpret_cast<const typename UnalignedOf<V>::type*>(from);
 }
 template <typename V, typename T>
 inline void store(T* to, const V& v) {
-  static_assert(sizeof(V{}[0]) == sizeof(T));
+  static_assert(kLaneBytes<V> == sizeof(T));
   *reinterpret_cast<typename UnalignedOf<V>::type*>(to) = v;
+}
+
+// The same for lanes of another type than what is pointed to.
+template <typename V, typename T>
+inline V load_bits(const T* from) {
+  V v;
+  __builtin_memcpy(&v, from, sizeof(V));
+  return v;
+}
+template <typename V, typename T>
+inline void store_bits(T* to, const V& v) {
+  __builtin_memcpy(to, &v, sizeof(V));
 }
 
 // Copies short runs: whole registers, the last of them over the one before.
@@ -80,7 +98,7 @@ inline V splat(T value) {
 // A value that is rounded as it stands. The compiler may else fuse the product in it into a sum in
 // one copy of the code and not in another, and results would depend on which copy runs.
 template <typename V>
-inline V rounded(V value) {
+inline V unfused(V value) {
 #if defined(__FMA__)
   asm("" : "+x"(value));
 #elif !defined(__SSE2__)

@@ -11,12 +11,13 @@ constexpr Kernels kernels = {
     STRINGIZE(TIER),
         {directions, polar_sample_scratch, polar_sample, polar_sample_backward_image,
          polar_sample_backward_lens, transpose, polar_embed_scratch, polar_embed,
-         polar_embed_backward_weight, polar_embed_backward_samples, polar_embed_backward_image,
-         window_attention_scratch, window_attention, window_attention_backward},
+         polar_embed_backward_weight, polar_embed_backward_samples, polar_embed_backward_image},
         {directions, polar_sample_scratch, polar_sample, polar_sample_backward_image,
          polar_sample_backward_lens, transpose, polar_embed_scratch, polar_embed,
-         polar_embed_backward_weight, polar_embed_backward_samples, polar_embed_backward_image,
-         window_attention_scratch, window_attention, window_attention_backward},
+         polar_embed_backward_weight, polar_embed_backward_samples, polar_embed_backward_image},
+        {window_attention_scratch, window_attention, window_attention_backward},
+        {window_attention_scratch, window_attention, window_attention_backward},
+        {window_attention_scratch, window_attention, window_attention_backward},
 };
 
 }  // namespace darswin::TIER

@@ -1,257 +1,366 @@
 // Windowed attention on a polar map.
 //
-// A window is never cut out of the map: token t of window (wr, wa) is found by index arithmetic
-// that includes the shift and the wrap around the border, and its q, k and v are packed into
-// scratch that fits L1. Keys are packed transposed, (d, n), so that one query against all keys is a
-// sum of d vectors of length n and needs no horizontal operation. Along an axis that is not
-// periodic, tokens that the shift brought together across the border carry different `side` marks
-// and do not see each other. Forward keeps the log-sum-exp of each row, in double since its
-// rounding would enter every probability; backward finds the probabilities from it. Every token
-// lies in one window, so qkv gradients have one writer; the bias gradient of an (image, head) is
-// summed by one thread over all windows, in order.
+// A window is never cut out of the map: token t of a window is found by index arithmetic that
+// includes the shift and the wrap around the border, and the tiles of window_attention_tiles.h read
+// its rows where they are. One window is attended to by one head at a time; with 16 tokens all that
+// this needs stays in registers and the first cache. Logits stand as (key, query), queries in the
+// SIMD lanes. Along an axis that is not periodic, tokens that the shift brought together across the
+// border carry different `side` marks and do not see each other. Backward finds the probabilities
+// again, just as forward did, so forward saves nothing. Every token lies in one window, so qkv
+// gradients have one writer; bias gradients are summed over a chunk of windows, in order.
 #include "kernels.h"
 #include "math.h"
+#include "window_attention_scratch.h"
+#include "window_attention_tiles.h"
 
 namespace darswin::TIER {
 namespace {
 
-template <typename T>
-struct Shape {
-  int64_t n, d;  // tokens of a window, head dim
-  int64_t windows_r, windows_a;
-  int64_t table_a, table;  // width and size of one head's bias table
+// One thread's work on a call.
+template <typename S>
+struct Attention {
+  using T = Arithmetic<S>;
+  using V = Vector<T, kLanes<T>>;
+  static constexpr int kVectors = kGroup / kLanes<T>;
 
-  explicit Shape(const WindowAttentionArgs<T>& a)
-      : n(a.window_r * a.window_a),
-        d(a.head_dim),
-        windows_r(a.rings / a.window_r),
-        windows_a(a.sectors / a.window_a),
-        table_a(2 * a.window_a - 1),
-        table((2 * a.window_r - 1) * table_a) {}
+  const WindowAttentionArgs<S>& a;
+  Shape<S> shape;
+  Arena arena;
+  Scratch<S> s;
+  int64_t part;            // from a token's queries to its keys, and on to its values
+  int64_t bias_row, head;  // at work
+  Rows<const T> q, k, v;   // of the head
+
+  Attention(const WindowAttentionArgs<S>& args, void* memory)
+      : a(args),
+        shape(args),
+        arena{static_cast<char*>(memory)},
+        s(arena, shape),
+        part(shape.heads * shape.d) {
+    for (int64_t head = 0; head < shape.heads; ++head) s.bias_row[head] = -1;
+    for (int64_t t = 0; t < shape.padded; ++t) s.copy[t] = (t < shape.n ? t : 0) * shape.d;
+  }
+
+  // Queries of the group that begins with this one.
+  int64_t group_size(int64_t group) const {
+    return shape.n - group < kGroup ? shape.n - group : kGroup;
+  }
+
+  // Makes `window` the one at work. The one after it is found as well, to be fetched meanwhile.
+  void enter(int64_t window) {
+    s.next.find(a, shape, window);
+    const Tokens<T> last = s.window;
+    s.window = s.next;
+    s.next = last;
+    s.next.find(a, shape, window + 1 < a.windows ? window + 1 : window);
+    bias_row = a.bias_rows == 1 ? 0 : window / shape.map_windows;
+  }
+
+  // Asks for the same rows of the next window, a group at a time, two cache lines a step. Inlined,
+  // since the compiler takes a function that only prefetches for one without effect.
+  __attribute__((always_inline)) void fetch(const S* map, const int64_t* offset,
+                                            int64_t group) const {
+    if (!shape.far) return;
+    const int64_t end = group + group_size(group), row = shape.d * static_cast<int64_t>(sizeof(S));
+    for (int64_t t = group; t < end; ++t) {
+      const char* lines = reinterpret_cast<const char*>(map + offset[t]);
+      for (int64_t c = 0; c < row; c += 128) {
+        __builtin_prefetch(lines + c);
+        __builtin_prefetch(lines + c + 64);
+      }
+    }
+  }
+
+  // Where to read a window's rows as T: in the map, or in a widened copy.
+  Rows<const T> read(const S* map, const int64_t* offset, T* copy) const {
+    if constexpr (sizeof(S) == sizeof(T)) {
+      return {map, offset};
+    } else {
+      for (int64_t t = 0; t < shape.n; ++t) widen(map + offset[t], shape.d, copy + s.copy[t]);
+      return {copy, s.copy};
+    }
+  }
+  // Where to write them; `finish` rounds those of a copy into the map.
+  Rows<T> write(S* map, const int64_t* offset, T* copy) const {
+    if constexpr (sizeof(S) == sizeof(T)) {
+      return {map, offset};
+    } else {
+      return {copy, s.copy};
+    }
+  }
+  void finish(S* map, const int64_t* offset, const T* copy) const {
+    if constexpr (sizeof(S) != sizeof(T)) {
+      for (int64_t t = 0; t < shape.n; ++t) narrow(copy + s.copy[t], shape.d, map + offset[t]);
+    }
+  }
+
+  const S* queries() const { return a.qkv + head * shape.d; }
+  T* pairs(T* tables) const { return tables + head * shape.n * shape.padded; }
+
+  void begin(int64_t index) {
+    head = index;
+    q = read(queries(), s.window.in, s.q_copy);
+    k = read(queries() + part, s.window.in, s.k_copy);
+    v = read(queries() + 2 * part, s.window.in, s.v_copy);
+    if (shape.pairs && s.bias_row[head] != bias_row) {
+      s.bias_row[head] = bias_row;
+      spread_bias(0, shape.n, pairs(s.pair_bias), shape.padded);
+    }
+  }
+
+  // to[key * stride + query - begin] = the bias of (query, key)
+  void spread_bias(int64_t begin, int64_t end, T* to, int64_t stride) const {
+    const T* table = a.bias + (bias_row * shape.heads + head) * shape.table;
+    shape.for_pairs(begin, end, [&](int64_t key, int64_t query, int64_t count, int64_t index) {
+      T* biases = to + key * stride + query - begin;
+      for (int64_t i = 0; i < count; ++i) biases[i] = table[index + i];
+    });
+  }
+
+  void logits(int64_t group) const {
+    const T* biases = pairs(s.pair_bias) + group;
+    int64_t stride = shape.padded;
+    if (!shape.pairs) {
+      spread_bias(group, group + group_size(group), s.group_bias, kGroup);
+      biases = s.group_bias;
+      stride = kGroup;
+    }
+    if (s.window.parted) {
+      logits<true>(biases, stride, group);
+    } else {
+      logits<false>(biases, stride, group);
+    }
+  }
+
+  // s.p = the logits, s.largest = the largest of each query. Keys that pad the last eight
+  // have minus infinity, as those across a border do.
+  template <bool kParted>
+  __attribute__((noinline)) void logits(const T* biases, int64_t stride, int64_t group) const {
+    const V scale = splat<V>(a.scale), nothing = splat<V>(static_cast<T>(-__builtin_inf()));
+    V largest[kVectors];
+    for (int v = 0; v < kVectors; ++v) largest[v] = nothing;
+    T* p = s.p;
+    const T* side = s.window.side;
+    products(s.columns, k, shape.eights, shape.d, [&](int64_t key, int v, V product) {
+      const int lane = v * kLanes<T>;
+      V logit = product * scale + load<V>(biases + key * stride + lane);
+      if (kParted) logit = splat<V>(side[key]) == load<V>(side + group + lane) ? logit : nothing;
+      if (key >= shape.n) logit = nothing;
+      largest[v] = larger(logit, largest[v]);
+      store(p + key * kGroup + lane, logit);
+    });
+    for (int v = 0; v < kVectors; ++v) store(s.largest + v * kLanes<T>, largest[v]);
+  }
+
+  // s.p = e^(logit - the largest one), s.inverse = 1 / their sum.
+  __attribute__((noinline)) void exponentials() const {
+    for (int lane = 0; lane < kGroup; lane += kLanes<T>) {
+      T* p = s.p + lane;
+      const V largest = load<V>(s.largest + lane);
+      V sums[4] = {};
+      for (int64_t k = 0; k < shape.n; k += 4) {
+#pragma GCC unroll 4
+        for (int i = 0; i < 4; ++i) {
+          const V e = exponential_of_negative(load<V>(p + (k + i) * kGroup) - largest);
+          sums[i] += e;
+          store(p + (k + i) * kGroup, e);
+        }
+      }
+      store(s.inverse + lane, 1 / ((sums[0] + sums[1]) + (sums[2] + sums[3])));
+    }
+  }
+
+  // s.dp = the gradients of the probabilities.
+  __attribute__((noinline)) void probability_gradients() const {
+    T* dp = s.dp;
+    products(s.columns, v, shape.eights, shape.d, [&](int64_t key, int v, V product) {
+      store(dp + key * kGroup + v * kLanes<T>, product);
+    });
+  }
+
+  // s.p = the probabilities p; s.dp, from their gradients to those of the logits, which are
+  // the biases' as well: p (dp - sum p dp).
+  void softmax_backward(int64_t group, double* grad_bias) const {
+    if (shape.pairs) {
+      softmax_backward<true>(group);
+    } else {
+      softmax_backward<false>(group);
+      fold_pairs(s.dp - group, kGroup, group, group + group_size(group), grad_bias);
+    }
+  }
+  template <bool kPairs>
+  __attribute__((noinline)) void softmax_backward(int64_t group) const {
+    for (int lane = 0; lane < kGroup; lane += kLanes<T>) {
+      T *p = s.p + lane, *dp = s.dp + lane;
+      T* sums = pairs(s.pair_grad) + group + lane;
+      const V inverse = load<V>(s.inverse + lane);
+      V means[4] = {};
+      for (int64_t k = 0; k < shape.n; k += 4) {
+#pragma GCC unroll 4
+        for (int i = 0; i < 4; ++i) {
+          const V probability = load<V>(p + (k + i) * kGroup) * inverse;
+          store(p + (k + i) * kGroup, probability);
+          means[i] += probability * load<V>(dp + (k + i) * kGroup);
+        }
+      }
+      const V mean = (means[0] + means[1]) + (means[2] + means[3]);
+      for (int64_t k = 0; k < shape.n; ++k) {
+        const V ds = load<V>(p + k * kGroup) * (load<V>(dp + k * kGroup) - mean);
+        store(dp + k * kGroup, ds);
+        if (kPairs) store(sums + k * shape.padded, load<V>(sums + k * shape.padded) + ds);
+      }
+    }
+  }
+
+  // Adds gradients of pairs, pair_grad[key * stride + query], to a table.
+  void fold_pairs(const T* pair_grad, int64_t stride, int64_t begin, int64_t end,
+                  double* table) const {
+    shape.for_pairs(begin, end, [&](int64_t key, int64_t query, int64_t count, int64_t index) {
+      const T* grads = pair_grad + key * stride + query;
+      for (int64_t i = 0; i < count; ++i) table[index + i] += grads[i];
+    });
+  }
+
+  // The steps from queries and keys to the exponentials, for the queries of one group. In between,
+  // every few steps' worth of time, rows of the next window are asked for.
+  void weights(int64_t group) const {
+    fetch(queries(), s.next.in, group);
+    transpose(q.from(group), shape.d, s.columns);
+    fetch(queries() + part, s.next.in, group);
+    logits(group);
+    fetch(queries() + 2 * part, s.next.in, group);
+    exponentials();
+  }
+
+  // One head of the window at work.
+  void forward(int64_t index) {
+    begin(index);
+    S* to = a.out + head * shape.d;
+    const Rows<T> out = write(to, s.window.out, s.dq_copy);
+    for (int64_t group = 0; group < shape.n; group += kGroup) {
+      weights(group);
+      fetch(to, s.next.out, group);
+      weighted_sums(Weights<1, kGroup, T>{s.p}, v, shape.n, out.from(group), group_size(group),
+                    shape.d, Factors<T>{s.inverse, 1}, false);
+    }
+    finish(to, s.window.out, s.dq_copy);
+  }
+
+  // The same backward; grad_bias is the head's row of bias gradients.
+  void backward(int64_t index, double* grad_bias) {
+    begin(index);
+    const S* from = a.grad_out + head * shape.d;
+    S* to = a.grad_qkv + head * shape.d;
+    const Rows<const T> g = read(from, s.window.out, s.g_copy);
+    const Rows<T> dq = write(to, s.window.in, s.dq_copy);
+    const Rows<T> dk = write(to + part, s.window.in, s.dk_copy);
+    const Rows<T> dv = write(to + 2 * part, s.window.in, s.dv_copy);
+    const T unit = 1;
+    const Factors<T> scale{&a.scale, 0}, one{&unit, 0};
+    for (int64_t group = 0; group < shape.n; group += kGroup) {
+      const int64_t n = shape.n, d = shape.d, queries = group_size(group);
+      const Weights<kGroup, 1, T> p{s.p}, ds{s.dp};
+      const Weights<1, kGroup, T> ds_of_query{s.dp};
+      const bool add = group > 0;
+      weights(group);
+      fetch(from, s.next.out, group);
+      transpose(g.from(group), d, s.columns);
+      probability_gradients();
+      softmax_backward(group, grad_bias);
+      fetch(to + 2 * part, s.next.in, group);
+      weighted_sums(p, g.from(group), queries, dv, n, d, one, add);
+      fetch(to + part, s.next.in, group);
+      weighted_sums(ds, q.from(group), queries, dk, n, d, scale, add);
+      fetch(to, s.next.in, group);
+      weighted_sums(ds_of_query, k, n, dq.from(group), queries, d, scale, false);
+    }
+    finish(to, s.window.in, s.dq_copy);
+    finish(to + part, s.window.in, s.dk_copy);
+    finish(to + 2 * part, s.window.in, s.dv_copy);
+  }
+
+  // Windows outside, heads inside: a token's heads stand side by side in memory.
+  void forward_range(int64_t begin, int64_t end) {
+    for (int64_t item = begin; item < end;) {
+      const int64_t window = item / shape.heads, head = item % shape.heads;
+      const int64_t left = end - item, heads = shape.heads - head;
+      const int64_t count = left < heads ? left : heads;
+      enter(window);
+      for (int64_t h = head; h < head + count; ++h) forward(h);
+      item += count;
+    }
+  }
+
+  void backward_range(int64_t begin, int64_t end) {
+    const int64_t row_windows = a.windows / a.bias_rows;
+    for (int64_t item = begin; item < end;) {
+      const int64_t chunk = item / shape.heads, head = item % shape.heads;
+      const int64_t left = end - item, heads = shape.heads - head;
+      const int64_t count = left < heads ? left : heads;
+      const int64_t row = chunk % a.bias_rows * row_windows, first = chunk / a.bias_rows * a.chunk;
+      const int64_t last = first + a.chunk < row_windows ? first + a.chunk : row_windows;
+      backward_chunk(row + first, row + last, head, head + count, a.grad_bias + item * shape.table);
+      item += count;
+    }
+  }
+
+  // Windows [begin, end), heads [first, last); grad_bias has a row for each of these heads.
+  void backward_chunk(int64_t begin, int64_t end, int64_t first, int64_t last, double* grad_bias) {
+    const int64_t table = shape.pairs ? shape.n * shape.padded : 0;
+    for (int64_t i = first * table; i < last * table; ++i) s.pair_grad[i] = 0;
+    for (int64_t window = begin; window < end; ++window) {
+      enter(window);
+      for (int64_t h = first; h < last; ++h) backward(h, grad_bias + (h - first) * shape.table);
+    }
+    if (!shape.pairs) return;
+    for (int64_t head = first; head < last; ++head) {
+      fold_pairs(s.pair_grad + head * table, shape.padded, 0, shape.n,
+                 grad_bias + (head - first) * shape.table);
+    }
+  }
 };
 
-// Scratch of one thread. Sums over up to 1024 tokens are kept in double.
-template <typename T>
-struct Scratch {
-  double *dk, *dv;  // (n, d): key and value gradients
-  double* sum;      // (d,): one query's output, or its gradient
-  int64_t* token;   // (n,): places of the window's tokens in (B, R, A)
-  T *q, *k, *v;     // (n, d)
-  T *kt, *vt;       // (d, n)
-  T *row, *drow;    // (n,): one query's logits or probabilities, and their gradient
-  T* side;          // (n,): 0 to 3, see find_tokens
-
-  Scratch(double* base, int64_t n, int64_t d) {
-    dk = base;
-    dv = dk + n * d;
-    sum = dv + n * d;
-    token = reinterpret_cast<int64_t*>(sum + d);
-    q = reinterpret_cast<T*>(token + n);
-    k = q + n * d;
-    v = k + n * d;
-    kt = v + n * d;
-    vt = kt + n * d;
-    row = vt + n * d;
-    drow = row + n;
-    side = drow + n;
-  }
-
-  static int64_t doubles(int64_t n, int64_t d) {
-    const int64_t rest = 5 * n * d + 3 * n;
-    return 2 * n * d + d + n + (rest * static_cast<int64_t>(sizeof(T)) + 7) / 8;
-  }
-};
-
-// Finds the tokens of window (wr, wa) of image b: their places in the map, and their sides of the
-// borders, 1 beyond that of the radius and 2 beyond that of the azimuth where these do not wrap.
-template <typename T>
-void find_tokens(const WindowAttentionArgs<T>& a, int64_t b, int64_t wr, int64_t wa,
-                 const Scratch<T>& s) {
-  int64_t t = 0;
-  for (int64_t tr = 0; tr < a.window_r; ++tr) {
-    int64_t r = wr * a.window_r + tr + a.shift_r;
-    const bool over_r = r >= a.rings;
-    if (over_r) r -= a.rings;
-    for (int64_t ta = 0; ta < a.window_a; ++ta, ++t) {
-      int64_t sector = wa * a.window_a + ta + a.shift_a;
-      const bool over_a = sector >= a.sectors;
-      if (over_a) sector -= a.sectors;
-      s.token[t] = (b * a.rings + r) * a.sectors + sector;
-      s.side[t] = static_cast<T>((over_r && !a.periodic_r) + 2 * (over_a && !a.periodic_a));
-    }
-  }
-}
-
-// Packs one of q, k, v (part 0, 1, 2) of a window: rows (n, d), and columns (d, n) where wanted.
-template <typename T>
-void pack(const WindowAttentionArgs<T>& a, const Shape<T>& shape, const int64_t* tokens,
-          int64_t head, int part, T* rows, T* columns) {
-  for (int64_t t = 0; t < shape.n; ++t) {
-    const T* from = a.qkv + ((tokens[t] * 3 + part) * a.heads + head) * shape.d;
-    for (int64_t c = 0; c < shape.d; ++c) {
-      if (rows != nullptr) rows[t * shape.d + c] = from[c];
-      if (columns != nullptr) columns[c * shape.n + t] = from[c];
-    }
-  }
-}
-
-// row[k] = sum_c q[c] * columns[c, k]
-template <typename T>
-void row_times_columns(const T* q, const T* columns, const Shape<T>& shape, T* row) {
-  for (int64_t k = 0; k < shape.n; ++k) row[k] = 0;
-  for (int64_t c = 0; c < shape.d; ++c) {
-    const T* column = columns + c * shape.n;
-#pragma omp simd
-    for (int64_t k = 0; k < shape.n; ++k) row[k] += q[c] * column[k];
-  }
-}
-
-// Index of the bias of query t against key 0 of key ring `kr`; the next key's is one lower.
-template <typename T>
-int64_t bias_index(const WindowAttentionArgs<T>& a, const Shape<T>& shape, int64_t t, int64_t kr) {
-  const int64_t delta_r = t / a.window_a - kr + a.window_r - 1;
-  return delta_r * shape.table_a + t % a.window_a + a.window_a - 1;
-}
-
-// The logits of query t: scaled products, bias, and minus infinity across a border.
-template <typename T>
-void logits(const WindowAttentionArgs<T>& a, const Shape<T>& shape, const Scratch<T>& s,
-            const T* bias, int64_t t) {
-  row_times_columns(s.q + t * shape.d, s.kt, shape, s.row);
-  for (int64_t kr = 0; kr < a.window_r; ++kr) {
-    const T* biases = bias + bias_index(a, shape, t, kr);
-    T* row = s.row + kr * a.window_a;
-#pragma omp simd
-    for (int64_t ka = 0; ka < a.window_a; ++ka) row[ka] = row[ka] * a.scale + biases[-ka];
-  }
-  const T minus_infinity = static_cast<T>(-__builtin_inf());
-  const T side = s.side[t];
-  for (int64_t k = 0; k < shape.n; ++k) s.row[k] = s.side[k] == side ? s.row[k] : minus_infinity;
-}
-
-template <typename T>
-void attend(const WindowAttentionArgs<T>& a, int64_t begin, int64_t end, double* scratch) {
-  const Shape<T> shape(a);
-  const Scratch<T> s(scratch, shape.n, shape.d);
-  for (int64_t item = begin; item < end; ++item) {
-    const int64_t head = item % a.heads, window = item / a.heads;
-    const int64_t wa = window % shape.windows_a, wr = window / shape.windows_a % shape.windows_r;
-    const int64_t b = window / (shape.windows_a * shape.windows_r);
-    const T* bias = a.bias + b * a.bias_stride + head * shape.table;
-    find_tokens(a, b, wr, wa, s);
-    pack(a, shape, s.token, head, 0, s.q, static_cast<T*>(nullptr));
-    pack(a, shape, s.token, head, 1, static_cast<T*>(nullptr), s.kt);
-    pack(a, shape, s.token, head, 2, s.v, static_cast<T*>(nullptr));
-    for (int64_t t = 0; t < shape.n; ++t) {
-      logits(a, shape, s, bias, t);
-      T largest = s.row[0];
-      for (int64_t k = 1; k < shape.n; ++k) largest = s.row[k] > largest ? s.row[k] : largest;
-      double sum = 0;
-      for (int64_t k = 0; k < shape.n; ++k) {
-        s.row[k] = exponential(s.row[k] - largest);
-        sum += s.row[k];
-      }
-      const int64_t token = s.token[t];
-      T* out = a.out + (token * a.heads + head) * shape.d;
-      for (int64_t c = 0; c < shape.d; ++c) s.sum[c] = 0;
-      for (int64_t k = 0; k < shape.n; ++k) {
-        const T* value = s.v + k * shape.d;
-        const double weight = s.row[k];
-#pragma omp simd
-        for (int64_t c = 0; c < shape.d; ++c) s.sum[c] += weight * value[c];
-      }
-      for (int64_t c = 0; c < shape.d; ++c) out[c] = static_cast<T>(s.sum[c] / sum);
-      a.lse[token * a.heads + head] = static_cast<double>(largest) + logarithm(sum);
-    }
-  }
-}
-
-template <typename T>
-void attend_backward(const WindowAttentionArgs<T>& a, int64_t begin, int64_t end, double* scratch) {
-  const Shape<T> shape(a);
-  const Scratch<T> s(scratch, shape.n, shape.d);
-  const int64_t windows = shape.windows_r * shape.windows_a;
-  for (int64_t item = begin; item < end; ++item) {
-    const int64_t head = item % a.heads, b = item / a.heads;
-    const T* bias = a.bias + b * a.bias_stride + head * shape.table;
-    double* grad_bias = a.grad_bias + item * shape.table;
-    for (int64_t window = 0; window < windows; ++window) {
-      const int64_t wr = window / shape.windows_a, wa = window % shape.windows_a;
-      find_tokens(a, b, wr, wa, s);
-      pack(a, shape, s.token, head, 0, s.q, static_cast<T*>(nullptr));
-      pack(a, shape, s.token, head, 1, s.k, s.kt);
-      pack(a, shape, s.token, head, 2, static_cast<T*>(nullptr), s.vt);
-      for (int64_t e = 0; e < shape.n * shape.d; ++e) s.dk[e] = s.dv[e] = 0;
-      for (int64_t t = 0; t < shape.n; ++t) {
-        const int64_t token = s.token[t];
-        const T* grad = a.grad_out + (token * a.heads + head) * shape.d;
-        const double lse = a.lse[token * a.heads + head];
-        // Probabilities p, their gradient dp = grad . v, and ds = p (dp - sum p dp).
-        logits(a, shape, s, bias, t);
-        row_times_columns(grad, s.vt, shape, s.drow);
-        double expected = 0;
-        for (int64_t k = 0; k < shape.n; ++k) {
-          s.row[k] = exponential(static_cast<T>(s.row[k] - lse));
-          expected += static_cast<double>(s.row[k]) * s.drow[k];
-        }
-        const T mean = static_cast<T>(expected);
-        for (int64_t k = 0; k < shape.n; ++k) s.drow[k] = s.row[k] * (s.drow[k] - mean);
-        for (int64_t kr = 0; kr < a.window_r; ++kr) {
-          double* grads = grad_bias + bias_index(a, shape, t, kr);
-          for (int64_t ka = 0; ka < a.window_a; ++ka) grads[-ka] += s.drow[kr * a.window_a + ka];
-        }
-        const T* query = s.q + t * shape.d;
-        for (int64_t c = 0; c < shape.d; ++c) s.sum[c] = 0;
-        for (int64_t k = 0; k < shape.n; ++k) {
-          const double p = s.row[k], ds = s.drow[k] * a.scale;
-          const T* key = s.k + k * shape.d;
-          double *dk = s.dk + k * shape.d, *dv = s.dv + k * shape.d;
-#pragma omp simd
-          for (int64_t c = 0; c < shape.d; ++c) {
-            s.sum[c] += ds * key[c];
-            dk[c] += ds * query[c];
-            dv[c] += p * grad[c];
-          }
-        }
-        T* to = a.grad_qkv + (token * 3 * a.heads + head) * shape.d;
-        for (int64_t c = 0; c < shape.d; ++c) to[c] = static_cast<T>(s.sum[c]);
-      }
-      for (int64_t t = 0; t < shape.n; ++t) {
-        const int64_t token = s.token[t];
-        T* dk = a.grad_qkv + ((token * 3 + 1) * a.heads + head) * shape.d;
-        T* dv = dk + a.heads * shape.d;
-        for (int64_t c = 0; c < shape.d; ++c) {
-          dk[c] = static_cast<T>(s.dk[t * shape.d + c]);
-          dv[c] = static_cast<T>(s.dv[t * shape.d + c]);
-        }
-      }
-    }
-  }
+template <typename S>
+int64_t scratch_bytes(const WindowAttentionArgs<S>& args) {
+  Arena arena{nullptr};
+  Scratch<S>(arena, Shape<S>(args));
+  return arena.used;
 }
 
 }  // namespace
 
 int64_t window_attention_scratch(const WindowAttentionArgs<float>& args) {
-  return Scratch<float>::doubles(args.window_r * args.window_a, args.head_dim);
+  return scratch_bytes(args);
 }
 int64_t window_attention_scratch(const WindowAttentionArgs<double>& args) {
-  return Scratch<double>::doubles(args.window_r * args.window_a, args.head_dim);
+  return scratch_bytes(args);
+}
+int64_t window_attention_scratch(const WindowAttentionArgs<bfloat16>& args) {
+  return scratch_bytes(args);
 }
 void window_attention(const WindowAttentionArgs<float>& args, int64_t begin, int64_t end,
-                      double* scratch) {
-  attend(args, begin, end, scratch);
+                      void* scratch) {
+  Attention<float>(args, scratch).forward_range(begin, end);
 }
 void window_attention(const WindowAttentionArgs<double>& args, int64_t begin, int64_t end,
-                      double* scratch) {
-  attend(args, begin, end, scratch);
+                      void* scratch) {
+  Attention<double>(args, scratch).forward_range(begin, end);
+}
+void window_attention(const WindowAttentionArgs<bfloat16>& args, int64_t begin, int64_t end,
+                      void* scratch) {
+  Attention<bfloat16>(args, scratch).forward_range(begin, end);
 }
 void window_attention_backward(const WindowAttentionArgs<float>& args, int64_t begin, int64_t end,
-                               double* scratch) {
-  attend_backward(args, begin, end, scratch);
+                               void* scratch) {
+  Attention<float>(args, scratch).backward_range(begin, end);
 }
 void window_attention_backward(const WindowAttentionArgs<double>& args, int64_t begin, int64_t end,
-                               double* scratch) {
-  attend_backward(args, begin, end, scratch);
+                               void* scratch) {
+  Attention<double>(args, scratch).backward_range(begin, end);
+}
+void window_attention_backward(const WindowAttentionArgs<bfloat16>& args, int64_t begin,
+                               int64_t end, void* scratch) {
+  Attention<bfloat16>(args, scratch).backward_range(begin, end);
 }
 
 }  // namespace darswin::TIER

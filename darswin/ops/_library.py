@@ -47,15 +47,6 @@ def compiled(tensor: torch.Tensor) -> bool:
     return tensor.device.type == "cpu" and not _reference
 
 
-def without_autocast(*tensors: torch.Tensor) -> tuple[torch.Tensor, ...]:
-    """Under autocast, half-precision tensors as float32: the type the operators compute in."""
-    device = tensors[0].device.type
-    if not torch.amp.is_autocast_available(device) or not torch.is_autocast_enabled(device):
-        return tensors
-    half = (torch.bfloat16, torch.float16)
-    return tuple(t.float() if t.dtype in half else t for t in tensors)
-
-
 def autocast_dtype(tensor: torch.Tensor) -> torch.dtype | None:
     """What autocast, where it is on for the tensor's device, computes in."""
     device = tensor.device.type
@@ -75,6 +66,13 @@ def output_bfloat16(image: torch.Tensor) -> bool:
     if image.dtype == torch.float64:
         return False
     return image.dtype == torch.bfloat16 or autocast_dtype(image) == torch.bfloat16
+
+
+def autocast_off(device: str) -> contextlib.AbstractContextManager:
+    """A context in which autocast does not touch the arithmetic of a reference."""
+    if not torch.amp.is_autocast_available(device):
+        return contextlib.nullcontext()
+    return torch.autocast(device, enabled=False)
 
 
 def no_second_derivative(name: str) -> None:

@@ -58,7 +58,8 @@ def polar_embed(
     arguments = (*sampling[:4], weight, bias, *sampling[4:], _library.output_bfloat16(image))
     if _library.compiled(image):
         return torch.ops.darswin.polar_embed(*arguments)
-    return reference.polar_embed(*arguments)
+    with _library.autocast_off(image.device.type):
+        return reference.polar_embed(*arguments)
 
 
 @torch.library.register_fake("darswin::polar_embed")

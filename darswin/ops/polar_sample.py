@@ -80,7 +80,8 @@ def polar_sample(
     arguments = (*sampling, layout == "tokens", _library.output_bfloat16(sampling[0]))
     if _library.compiled(image):
         return torch.ops.darswin.polar_sample(*arguments)
-    return reference.polar_sample(*arguments)
+    with _library.autocast_off(image.device.type):
+        return reference.polar_sample(*arguments)
 
 
 def sampling_arguments(image, radii, azimuths, center, patch, jitter, seed, mean, std) -> tuple:

@@ -127,8 +127,7 @@ def polar_embed(
     samples = polar_sample(image, radii, azimuths, center, *settings)
     weight = weight.to(samples.dtype)
     bias = None if bias is None else bias.to(samples.dtype)
-    with torch.autocast(samples.device.type, enabled=False):
-        out = F.linear(samples, weight, bias)
+    out = F.linear(samples, weight, bias)
     return out.bfloat16() if bfloat16 else out
 
 
@@ -142,6 +141,7 @@ def window_attention(
 ) -> Tensor:
     """See `darswin.ops.window_attention`."""
     batch, rings, sectors, _, heads, head_dim = qkv.shape
+    dtype, qkv = qkv.dtype, qkv.to(bias.dtype)  # bfloat16 as float32, rounded once at the end
     (mr, ma), (nr, na) = window, (rings // window[0], sectors // window[1])
     x = qkv.roll((-shift[0], -shift[1]), (1, 2)).reshape(batch, nr, mr, na, ma, 3, heads, head_dim)
     # (B, n_r, n_a, heads, M_r·M_φ, d)
@@ -152,7 +152,7 @@ def window_attention(
     logits = logits.masked_fill(~visible[:, :, None], -math.inf)
     out = (logits.softmax(-1) @ v).unflatten(4, (mr, ma))
     out = out.permute(0, 1, 4, 2, 5, 3, 6).reshape(batch, rings, sectors, heads * head_dim)
-    return out.roll(shift, (1, 2))
+    return out.roll(shift, (1, 2)).to(dtype)
 
 
 def pairwise_bias(bias: Tensor, window: tuple[int, int]) -> Tensor:

@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 
 from darswin.ops import _library, reference
-from darswin.ops.checks import check_pair, check_shape, check_tensor
+from darswin.ops.checks import DTYPES, check_pair, check_shape, check_tensor
 
 
 def window_attention(
@@ -15,6 +15,7 @@ def window_attention(
     shift: tuple[int, int] = (0, 0),
     periodic: tuple[bool, bool] = (False, True),
     scale: float | None = None,
+    dropout: float = 0.0,
 ) -> Tensor:
     """Attends inside each window of a polar map: `softmax(q·k·scale + bias)·v`.
 
@@ -23,31 +24,37 @@ def window_attention(
     arithmetic: nothing is rolled, partitioned or masked in memory.
 
     Args:
-        qkv: (B, R, A, 3, heads, d), float32 or float64. bfloat16 and float16 are taken as float32
-            under autocast.
-        bias: (B or 1, heads, 2·M_r-1, 2·M_φ-1): entry [Δr+M_r-1, Δφ+M_φ-1], Δ = query - key.
+        qkv: (B, R, A, 3, heads, d), float32, float64 or bfloat16. With bfloat16 the arithmetic is
+            float32, and the result and the gradient of qkv are rounded once. float16 is taken as
+            float32 under autocast.
+        bias: (B or 1, heads, 2·M_r-1, 2·M_φ-1): entry [Δr+M_r-1, Δφ+M_φ-1], Δ = query - key. Of
+            the type of qkv; with bfloat16 it may as well be float32, and is used as such.
         window: (M_r, M_φ), which divides (R, A).
         shift: (s_r, s_φ), 0 ≤ s_r < R and 0 ≤ s_φ < A.
         periodic: whether the map wraps around along (radius, azimuth). A plain Swin map is
             (False, False).
         scale: of the logits; None means d^-½.
+        dropout: of the probabilities. Only 0 is there: it is what DarSwin was trained with, and
+            what Swin's recipes use.
 
     Returns:
         (B, R, A, heads·d).
 
-    Gradients go to qkv and bias; backward recomputes the probabilities from a saved log-sum-exp.
-    Results and gradients do not depend on the number of threads.
+    Gradients go to qkv and bias; backward recomputes the probabilities, nothing but the arguments
+    is kept. Results and gradients do not depend on the number of threads.
 
     Raises:
         TypeError: a tensor of another dtype, or an argument of another type.
         ValueError: a shape, device or range that does not fit.
+        NotImplementedError: a dropout other than 0.
 
     Source: DarSwin, ICCV 2023, sec. 4.4; Swin Transformer, ICCV 2021, sec. 3.2.
     """
     if isinstance(qkv, Tensor) and isinstance(bias, Tensor):
-        qkv, bias = _library.without_autocast(qkv, bias)
-    check_tensor("qkv", qkv)
-    check_tensor("bias", bias, like=qkv)
+        qkv, bias = _arithmetic_types(qkv, bias)
+    check_tensor("qkv", qkv, dtypes=(*DTYPES, torch.bfloat16))
+    half = qkv.dtype == torch.bfloat16
+    check_tensor("bias", bias, like=qkv, dtypes=(torch.float32,) if half else None)
     check_shape("qkv", qkv, "(B, R, A, 3, heads, d)", (None, None, None, 3, None, None))
     batch, rings, sectors, _, heads, head_dim = qkv.shape
     if rings == 0 or sectors == 0 or head_dim == 0:
@@ -68,35 +75,44 @@ def window_attention(
         (batch, heads, *table),
         (1, heads, *table),
     )
+    if dropout != 0:
+        raise NotImplementedError(
+            f"window_attention has no dropout: DarSwin's recipe uses 0, got {dropout!r}"
+        )
     scale = head_dim**-0.5 if scale is None else float(scale)
     arguments = (qkv, bias, window, shift, tuple(bool(p) for p in periodic), scale)
     if _library.compiled(qkv):
-        return torch.ops.darswin.window_attention(*arguments)[0]
-    return reference.window_attention(*arguments)
+        return torch.ops.darswin.window_attention(*arguments)
+    with _library.autocast_off(qkv.device.type):
+        return reference.window_attention(*arguments)
+
+
+def _arithmetic_types(qkv: Tensor, bias: Tensor) -> tuple[Tensor, Tensor]:
+    """What autocast may have made of the arguments, as the operator takes it: qkv in bfloat16
+    stays, since the operator widens it as it reads; a bias that goes with it is float32."""
+    qkv, bias = _library.without_float16(qkv), _library.without_float16(bias)
+    mixed = qkv.dtype == torch.bfloat16 or _library.autocast_dtype(qkv) is not None
+    return qkv, bias.float() if mixed and bias.dtype == torch.bfloat16 else bias
 
 
 @torch.library.register_fake("darswin::window_attention")
 def _fake(qkv, bias, window, shift, periodic, scale):
     batch, rings, sectors, _, heads, head_dim = qkv.shape
-    return (
-        qkv.new_empty((batch, rings, sectors, heads * head_dim)),
-        qkv.new_empty((batch, rings, sectors, heads), dtype=torch.float64),  # log-sum-exp
-    )
+    return qkv.new_empty((batch, rings, sectors, heads * head_dim))
 
 
 @torch.library.register_fake("darswin::window_attention_backward")
-def _fake_backward(grad_out, qkv, bias, lse, window, shift, periodic, scale):
+def _fake_backward(grad_out, qkv, bias, window, shift, periodic, scale):
     return qkv.new_empty(qkv.shape), bias.new_empty(bias.shape)
 
 
 def _setup_context(ctx, inputs, output):
     qkv, bias, window, shift, periodic, scale = inputs
-    ctx.save_for_backward(qkv, bias, output[1])
+    ctx.save_for_backward(qkv, bias)
     ctx.settings = (window, shift, periodic, scale)
-    ctx.mark_non_differentiable(output[1])
 
 
-def _backward(ctx, grad_out, _grad_lse):
+def _backward(ctx, grad_out):
     grad_qkv, grad_bias = torch.ops.darswin.window_attention_backward(
         grad_out, *ctx.saved_tensors, *ctx.settings
     )

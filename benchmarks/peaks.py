@@ -1,0 +1,56 @@
+"""What this machine can do at most: the rate of a matrix product and of a copy in memory.
+
+The operators' GFLOP/s and GB/s are read against these.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from torch.utils.benchmark import Timer
+
+
+@dataclass
+class Peaks:
+    """Of `threads` threads together."""
+
+    threads: int
+    gflops: float  # of a product whose matrices lie in the second cache
+    cached_gbytes: float  # a second, read and written, of a copy that lies in the caches
+    memory_gbytes: float  # of one that does not
+
+    def __str__(self) -> str:
+        return (
+            f"{self.threads} threads: {self.gflops:.0f} GFLOP/s of a float32 product, "
+            f"{self.cached_gbytes:.0f} GB/s copied in the caches, "
+            f"{self.memory_gbytes:.0f} GB/s in memory"
+        )
+
+
+def measure(threads: int) -> Peaks:
+    """Measures them. The product is oneDNN's where torch has it, else that of torch's BLAS."""
+    size = 384  # 0.6 MB a matrix
+    a, b = torch.randn(size * threads, size), torch.randn(size, size)
+    rate = 0.0
+    products = [lambda: torch.mm(a, b)]
+    if torch.backends.mkldnn.is_available():
+        products.append(lambda: torch.ops.mkldnn._linear_pointwise(a, b, None, "none", [], ""))
+    for product in products:
+        rate = max(rate, 2e-9 * a.shape[0] * size**2 / _seconds(product, threads))
+    return Peaks(threads, rate, _copied(2**20, threads), _copied(2**28, threads))
+
+
+def _copied(size: int, threads: int) -> float:
+    """GB/s of copying `size` bytes, read and written."""
+    source = torch.ones(size // 4)
+    target = torch.ones(size // 4)
+    return 2e-9 * size / _seconds(lambda: target.copy_(source), threads)
+
+
+def _seconds(run, threads: int) -> float:
+    timer = Timer("run()", globals={"run": run}, num_threads=threads)
+    return timer.blocked_autorange(min_run_time=0.3).median
+
+
+if __name__ == "__main__":
+    for count in sorted({1, torch.get_num_threads()}):
+        print(measure(count))

@@ -1,0 +1,163 @@
+// Sizes, places and working memory of window attention: everything but the arithmetic.
+#pragma once
+
+#include "../dispatch.h"
+#include "window_attention_tiles.h"
+
+namespace darswin::TIER {
+namespace {
+
+// Up to this many tokens a window, tables of all pairs of tokens are kept for each head.
+constexpr int64_t kPairTokens = 64;
+// Bytes of qkv from which on it pays to ask for rows before they are needed.
+constexpr int64_t kCache = int64_t{4} << 20;
+// The sizes of one call. A window of one sector counts as one of one ring: the same tokens in the
+// same order, but in one long run.
+template <typename S>
+struct Shape {
+  int64_t n, padded, eights;  // tokens of a window; rounded up to whole groups, and to eights
+  int64_t d, heads;
+  int64_t windows_r, windows_a, map_windows;  // windows along the axes, and of one image
+  int64_t runs, run;       // a window is `runs` times `run` tokens that follow each other
+  int64_t table_a, table;  // width and size of one head's bias table
+  bool pairs;              // whether there are tables of all pairs
+  bool far;                // whether the map is too large for the caches
+
+  explicit Shape(const WindowAttentionArgs<S>& a)
+      : n(a.window_r * a.window_a),
+        padded((n + kGroup - 1) / kGroup * kGroup),
+        eights((n + 7) / 8 * 8),
+        d(a.head_dim),
+        heads(a.heads),
+        windows_r(a.rings / a.window_r),
+        windows_a(a.sectors / a.window_a),
+        map_windows(windows_r * windows_a),
+        runs(a.window_a == 1 ? 1 : a.window_r),
+        run(n / runs),
+        table_a(2 * run - 1),
+        table((2 * runs - 1) * table_a),
+        pairs(n <= kPairTokens),
+        far(a.windows * n * 3 * heads * d * static_cast<int64_t>(sizeof(S)) > kCache) {}
+
+  // body(key, query, count, index) for all keys and the queries of [begin, end), in runs of queries
+  // whose biases follow each other too: that of the first one stands at `index` of the table.
+  template <typename Body>
+  void for_pairs(int64_t begin, int64_t end, Body body) const {
+    const int64_t first_run = begin / run;
+    for (int64_t k_run = 0, key = 0; k_run < runs; ++k_run) {
+      for (int64_t k = 0; k < run; ++k, ++key) {
+        int64_t query = begin, place = begin - first_run * run;
+        int64_t row = (first_run - k_run + runs - 1) * table_a + run - 1 - k;
+        for (; query < end; row += table_a, place = 0) {
+          const int64_t count = run - place < end - query ? run - place : end - query;
+          body(key, query, count, row + place);
+          query += count;
+        }
+      }
+    }
+  }
+};
+
+// Hands out pieces of a block of memory, and counts them.
+struct Arena {
+  char* memory;
+  int64_t used = 0;
+
+  template <typename T>
+  T* take(int64_t count) {
+    T* piece = reinterpret_cast<T*>(memory + used);
+    used += (count * static_cast<int64_t>(sizeof(T)) + 63) / 64 * 64;
+    return piece;
+  }
+};
+
+// The tokens of one window; (padded,) and so on are shapes.
+template <typename T>
+struct Tokens {
+  int64_t index = -1;  // of the window
+  int64_t *in, *out;   // (padded,): offsets of a token's row in qkv and in the output
+  T* side;             // (padded,): its side of the borders
+  bool parted;         // whether they are on different sides
+
+  void take(Arena& arena, int64_t padded) {
+    in = arena.take<int64_t>(padded);
+    out = arena.take<int64_t>(padded);
+    side = arena.take<T>(padded);
+  }
+
+  // Finds the rows of a window's tokens, and their sides of the borders: 1 beyond that of the
+  // radius and 2 beyond that of the azimuth where these do not wrap. Token 0 pads the last group.
+  template <typename S>
+  void find(const WindowAttentionArgs<S>& a, const Shape<S>& shape, int64_t window) {
+    if (window == index) return;
+    index = window;
+    const int64_t wa = window % shape.windows_a, wr = window / shape.windows_a % shape.windows_r;
+    const int64_t image = window / shape.map_windows, row = shape.heads * shape.d;
+    parted = false;
+    int64_t t = 0;
+    for (int64_t tr = 0; tr < a.window_r; ++tr) {
+      int64_t r = wr * a.window_r + tr + a.shift_r;
+      const bool over_r = r >= a.rings;
+      if (over_r) r -= a.rings;
+      for (int64_t ta = 0; ta < a.window_a; ++ta, ++t) {
+        int64_t sector = wa * a.window_a + ta + a.shift_a;
+        const bool over_a = sector >= a.sectors;
+        if (over_a) sector -= a.sectors;
+        out[t] = ((image * a.rings + r) * a.sectors + sector) * row;
+        in[t] = 3 * out[t];
+        side[t] = static_cast<T>((over_r && !a.periodic_r) + 2 * (over_a && !a.periodic_a));
+        parted |= side[t] != side[0];
+      }
+    }
+    for (; t < shape.padded; ++t) {
+      out[t] = out[0];
+      in[t] = in[0];
+      side[t] = side[0];
+    }
+  }
+};
+
+// Working memory of one thread.
+template <typename S>
+struct Scratch {
+  using T = Arithmetic<S>;
+
+  Tokens<T> window, next;    // the window at work, and the one after it
+  int64_t* copy;             // (padded,): offsets of a token's row in a copy
+  T* columns;                // (d, group): queries or gradients of a group, transposed
+  T *largest, *inverse;      // (group,): of each query, the largest logit; 1 / sum of exponentials
+  T *p, *dp;                 // (padded, group): logits, then probabilities, and their gradients
+  T *pair_bias, *pair_grad;  // (heads, n, padded): biases of all pairs, and gradients of a chunk
+  int64_t* bias_row;         // (heads,): the row of the bias that pair_bias holds
+  T* group_bias;             // (n, group): biases of a group, where there are no tables of pairs
+  T *q_copy, *k_copy, *v_copy, *g_copy;  // (padded, d): rows of a head, widened; g: the gradient
+  T *dq_copy, *dk_copy, *dv_copy;        // the same of results, yet to be rounded
+
+  Scratch(Arena& arena, const Shape<S>& shape) {
+    const int64_t n = shape.n, padded = shape.padded;
+    const int64_t pairs = shape.pairs ? shape.heads * n * padded : 0;
+    const int64_t rows = sizeof(S) == sizeof(T) ? 0 : padded * shape.d;
+    window.take(arena, padded);
+    next.take(arena, padded);
+    copy = arena.take<int64_t>(padded);
+    columns = arena.take<T>(shape.d * kGroup);
+    largest = arena.take<T>(kGroup);
+    inverse = arena.take<T>(kGroup);
+    p = arena.take<T>(padded * kGroup);
+    dp = arena.take<T>(padded * kGroup);
+    pair_bias = arena.take<T>(pairs);
+    pair_grad = arena.take<T>(pairs);
+    bias_row = arena.take<int64_t>(shape.heads);
+    group_bias = arena.take<T>(shape.pairs ? 0 : n * kGroup);
+    q_copy = arena.take<T>(rows);
+    k_copy = arena.take<T>(rows);
+    v_copy = arena.take<T>(rows);
+    g_copy = arena.take<T>(rows);
+    dq_copy = arena.take<T>(rows);
+    dk_copy = arena.take<T>(rows);
+    dv_copy = arena.take<T>(rows);
+  }
+};
+
+}  // namespace
+}  // namespace darswin::TIER

@@ -1,0 +1,250 @@
+// The three steps that attention is made of, each one tile of numbers in registers at a time.
+//
+// A group is 16 queries, one a SIMD lane: 1, 2 or 4 registers. `products` finds the products of a
+// group with every key as vectors over the queries, so that a softmax needs no horizontal
+// operation. It wants the queries transposed, channel by channel, which `transpose` does. The
+// probabilities then weight whole rows of values in `weighted_sums`, with channels in the lanes,
+// which needs no transpose back. Backward is made of the same three.
+#pragma once
+
+#include "simd.h"
+
+namespace {
+
+constexpr int kGroup = 16;
+
+// Rows of d numbers anywhere in memory.
+template <typename T>
+struct Rows {
+  T* base;
+  const int64_t* offset;
+
+  T* operator[](int64_t row) const { return base + offset[row]; }
+  Rows from(int64_t row) const { return {base, offset + row}; }
+};
+
+// a0 a2 .. b0 b2 .. within each 128 bits, and a1 a3 .. b1 b3 ..; the same of whole 128 bits.
+#if defined(__AVX512F__)
+using Floats = Vector<float, 16>;
+inline Floats even_lanes(Floats a, Floats b) {
+  return __builtin_shufflevector(a, b, 0, 2, 16, 18, 4, 6, 20, 22, 8, 10, 24, 26, 12, 14, 28, 30);
+}
+inline Floats odd_lanes(Floats a, Floats b) {
+  return __builtin_shufflevector(a, b, 1, 3, 17, 19, 5, 7, 21, 23, 9, 11, 25, 27, 13, 15, 29, 31);
+}
+inline Floats even_quads(Floats a, Floats b) {
+  return __builtin_shufflevector(a, b, 0, 1, 2, 3, 8, 9, 10, 11, 16, 17, 18, 19, 24, 25, 26, 27);
+}
+inline Floats odd_quads(Floats a, Floats b) {
+  return __builtin_shufflevector(a, b, 4, 5, 6, 7, 12, 13, 14, 15, 20, 21, 22, 23, 28, 29, 30, 31);
+}
+#elif defined(__AVX2__)
+using Floats = Vector<float, 8>;
+inline Floats even_lanes(Floats a, Floats b) {
+  return __builtin_shufflevector(a, b, 0, 2, 8, 10, 4, 6, 12, 14);
+}
+inline Floats odd_lanes(Floats a, Floats b) {
+  return __builtin_shufflevector(a, b, 1, 3, 9, 11, 5, 7, 13, 15);
+}
+inline Floats even_quads(Floats a, Floats b) {
+  return __builtin_shufflevector(a, b, 0, 1, 2, 3, 8, 9, 10, 11);
+}
+inline Floats odd_quads(Floats a, Floats b) {
+  return __builtin_shufflevector(a, b, 4, 5, 6, 7, 12, 13, 14, 15);
+}
+#else
+using Floats = Vector<float, 4>;
+inline Floats even_lanes(Floats a, Floats b) { return __builtin_shufflevector(a, b, 0, 2, 4, 6); }
+inline Floats odd_lanes(Floats a, Floats b) { return __builtin_shufflevector(a, b, 1, 3, 5, 7); }
+#endif
+
+// One step of the square transpose of N vectors: pairs are split into their even and odd parts,
+// these go to the lower and the upper half. After log2(N) steps row i of lane j is row j of lane i.
+template <int N, typename Even, typename Odd>
+inline void split_pairs(Floats* rows, int stride, Even even, Odd odd) {
+  Floats next[N];
+#pragma GCC unroll 8
+  for (int i = 0; i < N / 2; ++i) {
+    next[i] = even(rows[2 * i * stride], rows[(2 * i + 1) * stride]);
+    next[i + N / 2] = odd(rows[2 * i * stride], rows[(2 * i + 1) * stride]);
+  }
+#pragma GCC unroll 16
+  for (int i = 0; i < N; ++i) rows[i * stride] = next[i];
+}
+
+// The transpose of a square of kLanes x kLanes floats: of each 4 x 4 inside its 128 bits, then of
+// the 128 bits among themselves.
+inline void transpose_square(Floats* rows) {
+  constexpr int kQuads = kLanes<float> / 4;
+#pragma GCC unroll 4
+  for (int quad = 0; quad < kQuads; ++quad) {
+    split_pairs<4>(rows + 4 * quad, 1, even_lanes, odd_lanes);
+    split_pairs<4>(rows + 4 * quad, 1, even_lanes, odd_lanes);
+  }
+#if defined(__AVX2__)
+#  pragma GCC unroll 4
+  for (int lane = 0; lane < 4; ++lane) {
+    split_pairs<kQuads>(rows + lane, 4, even_quads, odd_quads);
+    if constexpr (kQuads == 4) split_pairs<kQuads>(rows + lane, 4, even_quads, odd_quads);
+  }
+#endif
+}
+
+// columns[c * kGroup + i] = rows[i][c] for the rows of a group.
+template <typename T>
+__attribute__((noinline)) void transpose(Rows<const T> rows, int64_t d, T* columns) {
+  int64_t begin = 0;
+  if constexpr (sizeof(T) == sizeof(float)) {
+    constexpr int kL = kLanes<float>;
+    for (; begin + kL <= d; begin += kL) {
+      for (int row = 0; row < kGroup; row += kL) {
+        Floats square[kL];
+#pragma GCC unroll 16
+        for (int i = 0; i < kL; ++i) square[i] = load<Floats>(rows[row + i] + begin);
+        transpose_square(square);
+#pragma GCC unroll 16
+        for (int i = 0; i < kL; ++i) store(columns + (begin + i) * kGroup + row, square[i]);
+      }
+    }
+  }
+  for (int i = 0; i < kGroup; ++i) {
+    for (int64_t c = begin; c < d; ++c) columns[c * kGroup + i] = rows[i][c];
+  }
+}
+
+// use(k, v, sum) for each key k < n, n a multiple of 8, and each register v of the group: the sums
+// over c of columns[c * kGroup + i] * rows[k][c]. There are as many sums under way as the latency
+// of the multiply-add asks for.
+template <typename T, typename Use>
+inline void products(const T* columns, Rows<const T> rows, int64_t n, int64_t d, Use use) {
+  using V = Vector<T, kLanes<T>>;
+  constexpr int kVectors = kGroup / kLanes<T>;
+  constexpr int kRows = kVectors < 8 ? 8 / kVectors : 1;
+  for (int64_t k = 0; k < n; k += kRows) {
+    V sums[kRows][kVectors] = {};
+    const T* row[kRows];
+#pragma GCC unroll 8
+    for (int r = 0; r < kRows; ++r) row[r] = rows[k + r];
+    for (int64_t c = 0; c < d; ++c) {
+      V column[kVectors];
+#pragma GCC unroll 8
+      for (int v = 0; v < kVectors; ++v) {
+        column[v] = load<V>(columns + c * kGroup + v * kLanes<T>);
+      }
+#pragma GCC unroll 8
+      for (int r = 0; r < kRows; ++r) {
+        const V factor = splat<V>(row[r][c]);
+#pragma GCC unroll 8
+        for (int v = 0; v < kVectors; ++v) sums[r][v] += column[v] * factor;
+      }
+    }
+#pragma GCC unroll 8
+    for (int r = 0; r < kRows; ++r) {
+#pragma GCC unroll 8
+      for (int v = 0; v < kVectors; ++v) use(k + r, v, sums[r][v]);
+    }
+  }
+}
+
+// Row i's weight of summand j is weight[i * kRow + j * kSummand].
+template <int kRow, int kSummand, typename T>
+struct Weights {
+  const T* weight;
+  T operator()(int64_t i, int64_t j) const { return weight[i * kRow + j * kSummand]; }
+  Weights from(int64_t i, int64_t j) const { return {weight + i * kRow + j * kSummand}; }
+};
+
+// Row i's factor is factor[i * step].
+template <typename T>
+struct Factors {
+  const T* factor;
+  int64_t step;
+  T operator()(int64_t i) const { return factor[i * step]; }
+  Factors from(int64_t i) const { return {factor + i * step, step}; }
+};
+
+// Channels [0, kColumns vectors) of the first kRows rows of `weighted_sums`.
+template <typename V, int kRows, int kColumns, typename W, typename T>
+inline void weighted_tile(W weights, Rows<const T> from, int64_t summands, Rows<T> to, int64_t rows,
+                          Factors<T> factors, bool add) {
+  constexpr int kL = sizeof(V) / sizeof(T);
+  V sums[kRows][kColumns] = {};
+  for (int64_t j = 0; j < summands; ++j) {
+    V x[kColumns];
+#pragma GCC unroll 4
+    for (int v = 0; v < kColumns; ++v) x[v] = load<V>(from[j] + v * kL);
+#pragma GCC unroll 8
+    for (int r = 0; r < kRows; ++r) {
+      const V weight = splat<V>(weights(r, j));
+#pragma GCC unroll 4
+      for (int v = 0; v < kColumns; ++v) sums[r][v] += weight * x[v];
+    }
+  }
+#pragma GCC unroll 8
+  for (int r = 0; r < kRows; ++r) {
+    if (r >= rows) return;
+#pragma GCC unroll 4
+    for (int v = 0; v < kColumns; ++v) {
+      T* out = to[r] + v * kL;
+      V sum = sums[r][v] * splat<V>(factors(r));
+      if (add) sum += load<V>(out);
+      store(out, sum);
+    }
+  }
+}
+
+// to[i][c] = factors(i) * sum_j weights(i, j) * from[j][c] for i < rows, added to what is there
+// where `add`. Weights are read up to the next multiple of 8 rows. Long sums are cut into pieces,
+// since the rounding of a sum grows with its length.
+template <typename W, typename T>
+__attribute__((noinline)) void weighted_sums(W weights, Rows<const T> from, int64_t summands,
+                                             Rows<T> to, int64_t rows, int64_t d,
+                                             Factors<T> factors, bool add) {
+  constexpr int kL = kLanes<T>, kRows = kRegister == 64 ? 8 : 4, kPiece = 64;
+  for (int64_t j = 0; j < summands; j += kPiece, add = true) {
+    const int64_t piece = summands - j < kPiece ? summands - j : kPiece;
+    for (int64_t i = 0; i < rows; i += kRows) {
+      const auto tile = [&]<typename V, int kColumns>(int64_t c) {
+        const Rows<const T> source{from.base + c, from.offset + j};
+        const Rows<T> target{to.base + c, to.offset + i};
+        weighted_tile<V, kRows, kColumns>(weights.from(i, j), source, piece, target, rows - i,
+                                          factors.from(i), add);
+      };
+      int64_t c = 0;
+      for (; c + 2 * kL <= d; c += 2 * kL) tile.template operator()<Vector<T, kL>, 2>(c);
+      for (; c + kL <= d; c += kL) tile.template operator()<Vector<T, kL>, 1>(c);
+      for (; c < d; ++c) tile.template operator()<T, 1>(c);
+    }
+  }
+}
+
+// Rows of bfloat16 as float32, and back. Of two registers of channels the even ones come first,
+// then the odd ones: that needs no shuffle, and no step above minds the order of channels.
+inline void widen(const bfloat16* from, int64_t d, float* to) {
+  constexpr int kL = kLanes<float>;
+  using Bits = Vector<uint32_t, kL>;
+  int64_t c = 0;
+  for (; c + 2 * kL <= d; c += 2 * kL) {
+    const Bits pairs = load_bits<Bits>(from + c);
+    store_bits(to + c, pairs << 16);
+    store_bits(to + c + kL, pairs & 0xFFFF0000);
+  }
+  for (; c < d; ++c) to[c] = widen(from[c]);
+}
+// The bits of x rounded to those that bfloat16 has, which are the upper ones; NaN stays NaN.
+inline Vector<uint32_t, kLanes<float>> rounded(Floats x) {
+  using Bits = Vector<uint32_t, kLanes<float>>;
+  const Bits bits = (Bits)x;
+  return x == x ? bits + 0x7FFF + ((bits >> 16) & 1) : bits | 0x400000;
+}
+inline void narrow(const float* from, int64_t d, bfloat16* to) {
+  constexpr int kL = kLanes<float>;
+  int64_t c = 0;
+  for (; c + 2 * kL <= d; c += 2 * kL) {
+    const auto even = rounded(load<Floats>(from + c)), odd = rounded(load<Floats>(from + c + kL));
+    store_bits(to + c, (even >> 16) | (odd & 0xFFFF0000));
+  }
+  for (; c < d; ++c) to[c] = narrow(from[c]);
+}
+
+}  // namespace
