@@ -45,9 +45,14 @@ def bars(mode: str, dtype: torch.dtype, batch: int, megabytes: float) -> tuple[f
 
 
 class Peers:
-    """Attention in windows as users write it: roll, partition, attend, reverse, roll back."""
+    """Attention in windows as users write it: roll, partition, attend, reverse, roll back.
 
-    def __init__(self, case: str, batch: int):
+    The bias of all pairs is an index into the table, as in Swin, or with `slices` made of slices:
+    torch 2.13's inductor miscompiles the gradient of that index (pytorch#191837).
+    """
+
+    def __init__(self, case: str, batch: int, slices: bool):
+        self.pairs = pairs_by_slices if slices else reference.pairwise_bias
         (rings, sectors, heads), window, self.shift, periodic = ATTENTION[case]
         (mr, ma), (nr, na) = window, (rings // window[0], sectors // window[1])
         self.window, self.rolls = window, any(self.shift)
@@ -71,8 +76,7 @@ class Peers:
     def mask(self, bias: Tensor, dtype: torch.dtype) -> Tensor:
         """The bias of all pairs, hidden ones at minus infinity; 1 and 1 for n_r and n_a if all the
         windows share it."""
-        # Not by an index: torch 2.13's inductor miscompiles the gradient of that (pytorch#191837).
-        pairs = pairs_by_slices(bias, self.window)[:, None, None]
+        pairs = self.pairs(bias, self.window)[:, None, None]
         return (pairs if self.hidden is None else pairs + self.hidden).to(dtype)
 
     def eager(self, qkv: Tensor, bias: Tensor) -> Tensor:
@@ -102,7 +106,8 @@ def attention(
     (rings, sectors, heads), window, shift, periodic = ATTENTION[case]
     qkv = torch.randn(batch, rings, sectors, 3, heads, HEAD_DIM).to(dtype)
     bias = torch.randn(1, heads, 2 * window[0] - 1, 2 * window[1] - 1)
-    peers = Peers(case, batch)
+    peers = Peers(case, batch, slices=False)
+    to_compile = Peers(case, batch, slices=mode != "forward")
 
     def ours(qkv: Tensor, bias: Tensor) -> Tensor:
         return window_attention(qkv, bias, window=window, shift=shift, periodic=periodic)
@@ -110,8 +115,8 @@ def attention(
     torch.set_num_threads(threads)  # inductor writes it into its code
     torch._dynamo.reset()
     runs = {OURS: ours, "eager": peers.eager, "F.sdpa": peers.sdpa}
-    for name in ("eager", "F.sdpa"):
-        runs[COMPILED + name] = torch.compile(runs[name], dynamic=False)
+    for name, run in (("eager", to_compile.eager), ("F.sdpa", to_compile.sdpa)):
+        runs[COMPILED + name] = torch.compile(run, dynamic=False)
     wrap = forward if mode == "forward" else forward_backward
     half = dtype == torch.bfloat16
     results = compare(

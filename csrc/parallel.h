@@ -56,10 +56,10 @@ inline void* scratch(size_t bytes) {
 }
 
 // Memory that is new from the system costs more to be mapped, page by page, than to be written.
-// Large pages cost less; numpy too asks for them from 4 MB on.
+// Large pages cost less. Below 32 MB glibc hands out memory that it has kept, already mapped.
 inline void ask_for_large_pages(const torch::stable::Tensor& tensor) {
 #if defined(__linux__) && defined(MADV_HUGEPAGE)
-  constexpr uintptr_t kPage = 4096, kLeast = uintptr_t{4} << 20;
+  constexpr uintptr_t kPage = 4096, kLeast = uintptr_t{32} << 20;
   const auto begin = reinterpret_cast<uintptr_t>(tensor.mutable_data_ptr());
   const uintptr_t end = begin + tensor.numel() * tensor.element_size();
   const uintptr_t first = (begin + kPage - 1) / kPage * kPage;
