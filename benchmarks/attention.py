@@ -179,7 +179,7 @@ def main() -> None:
         for mode, dtype in kinds:
             for threads in THREADS:
                 results += attention(case, batch, threads, mode, dtype, seconds)
-    finish(results, "attention", avx2_share=0.65, keep=not (args.quick or args.only))
+    finish(results, "attention", avx2_share=0.65, keep=not args.quick)
     print(rates(results))
 
 

@@ -75,6 +75,8 @@ def sampling(size: int, batch: int, threads: int, seconds: float) -> list[Result
     torch._dynamo.reset()
     compiled = torch.compile(tokens, dynamic=False)
     case, timing = f"{size}×{size}, batch {batch}", dict(threads=threads, min_run_time=seconds)
+    # grid_sample's coordinates are float32: at 1000 px they are off by 1e-4 px.
+    equal = dict(timing, tolerance=1e-4 if small else 1e-3)
     results = compare(
         "polar_sample", case,
         {
@@ -103,7 +105,7 @@ def sampling(size: int, batch: int, threads: int, seconds: float) -> list[Result
             OURS: forward(lambda image: ours(image, layout="image"), [images]),
             "F.grid_sample": forward(planes, [images]),
         },
-        mode="forward, layout image", **timing,
+        mode="forward, layout image", **equal,
     )  # fmt: skip
     results += compare(
         "polar_sample", case,
@@ -130,7 +132,7 @@ def sampling(size: int, batch: int, threads: int, seconds: float) -> list[Result
             "F.grid_sample + permute": forward(
                 lambda image: tokens((image / 255 - 0.5) / 0.25), [raw]),
         },
-        mode="forward, uint8", **timing,
+        mode="forward, uint8", **equal,
     )  # fmt: skip
     results += compare(
         "polar_sample", case,
@@ -140,7 +142,7 @@ def sampling(size: int, batch: int, threads: int, seconds: float) -> list[Result
             "F.grid_sample + permute": forward_backward(tokens, [images]),
             "compiled F.grid_sample + permute": forward_backward(compiled, [images]),
         },
-        mode="forward+backward", view=samples, **timing,
+        mode="forward+backward", view=samples, **equal,
         bars={"F.grid_sample": 4.5, "F.grid_sample + permute": 7.0} if small
         else {"F.grid_sample + permute": 2.5},
     )  # fmt: skip

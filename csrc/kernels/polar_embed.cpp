@@ -71,13 +71,13 @@ void embed(const PolarSampleArgs<T>& a, const PolarEmbedArgs<T>& e, int64_t begi
     for (int64_t t = 0; t < sectors && !in_place; ++t) {
       const int64_t to = first + t * e.features;
       const T* from = s.products + t * s.wide;
-      if (a.narrow) {
-        for (int64_t f = 0; f < e.features; ++f) {
-          convert(static_cast<bfloat16*>(a.out) + to + f, from[f]);
+      if constexpr (kSame<T, float>) {
+        if (a.narrow) {
+          narrow_all(from, e.features, static_cast<bfloat16*>(a.out) + to);
+          continue;
         }
-      } else {
-        copy(from, e.features, static_cast<T*>(a.out) + to);
       }
+      copy(from, e.features, static_cast<T*>(a.out) + to);
     }
   }
 }

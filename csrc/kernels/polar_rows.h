@@ -43,8 +43,11 @@ void write_row(const PolarSampleArgs<T>& a, const Row& row, const T* samples, E*
     for (int64_t sector = 0; sector * a.patch_azimuths < a.num_azimuths; ++sector) {
       E* to = out + sector * row.sector_stride;
       const T* from = samples + sector * piece;
-#pragma omp simd
-      for (int64_t e = 0; e < piece; ++e) convert(to + e, from[e]);
+      if constexpr (kSame<E, bfloat16>) {
+        narrow_all(from, piece, to);
+      } else {
+        copy(from, piece, to);
+      }
     }
     return;
   }

@@ -221,4 +221,18 @@ inline bfloat16 narrow(float x) {
   return {static_cast<uint16_t>(x != x ? (bits >> 16) | 0x40 : rounded)};
 }
 
+// The same for a run of them.
+inline void narrow_all(const float* from, int64_t count, bfloat16* to) {
+  constexpr int lanes = kLanes<float>;
+  using Bits = Vector<uint32_t, lanes>;
+  int64_t e = 0;
+  for (; e + lanes <= count; e += lanes) {
+    const auto x = load<Vector<float, lanes>>(from + e);
+    const Bits bits = (Bits)x;
+    const Bits rounded = x == x ? bits + 0x7FFF + ((bits >> 16) & 1) : bits | 0x400000;
+    store_bits(to + e, __builtin_convertvector(rounded >> 16, Vector<uint16_t, lanes>));
+  }
+  for (; e < count; ++e) to[e] = narrow(from[e]);
+}
+
 }  // namespace
