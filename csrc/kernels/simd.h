@@ -221,16 +221,18 @@ inline bfloat16 narrow(float x) {
   return {static_cast<uint16_t>(x != x ? (bits >> 16) | 0x40 : rounded)};
 }
 
-// The same for a run of them.
+// The bits of x rounded to those that bfloat16 has, which are the upper ones; NaN stays NaN.
+inline Vector<uint32_t, kLanes<float>> rounded(Vector<float, kLanes<float>> x) {
+  using Bits = Vector<uint32_t, kLanes<float>>;
+  const Bits bits = (Bits)x;
+  return x == x ? bits + 0x7FFF + ((bits >> 16) & 1) : bits | 0x400000;
+}
 inline void narrow_all(const float* from, int64_t count, bfloat16* to) {
   constexpr int lanes = kLanes<float>;
-  using Bits = Vector<uint32_t, lanes>;
   int64_t e = 0;
   for (; e + lanes <= count; e += lanes) {
-    const auto x = load<Vector<float, lanes>>(from + e);
-    const Bits bits = (Bits)x;
-    const Bits rounded = x == x ? bits + 0x7FFF + ((bits >> 16) & 1) : bits | 0x400000;
-    store_bits(to + e, __builtin_convertvector(rounded >> 16, Vector<uint16_t, lanes>));
+    const auto bits = rounded(load<Vector<float, lanes>>(from + e)) >> 16;
+    store_bits(to + e, __builtin_convertvector(bits, Vector<uint16_t, lanes>));
   }
   for (; e < count; ++e) to[e] = narrow(from[e]);
 }

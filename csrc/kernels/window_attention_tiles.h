@@ -231,12 +231,6 @@ inline void widen(const bfloat16* from, int64_t d, float* to) {
   }
   for (; c < d; ++c) to[c] = widen(from[c]);
 }
-// The bits of x rounded to those that bfloat16 has, which are the upper ones; NaN stays NaN.
-inline Vector<uint32_t, kLanes<float>> rounded(Floats x) {
-  using Bits = Vector<uint32_t, kLanes<float>>;
-  const Bits bits = (Bits)x;
-  return x == x ? bits + 0x7FFF + ((bits >> 16) & 1) : bits | 0x400000;
-}
 inline void narrow(const float* from, int64_t d, bfloat16* to) {
   constexpr int kL = kLanes<float>;
   int64_t c = 0;

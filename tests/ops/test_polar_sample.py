@@ -571,7 +571,10 @@ def test_uint8_frames(layout, rows):
 def test_uint8_frames_have_lens_gradients():
     _, radii, center, azimuths = make_inputs()
     frames = torch.randint(256, (2, 3, 17, 23), dtype=torch.uint8)
-    run = lambda radii, center: polar_sample(frames, radii, azimuths, center, patch=(3, 4))  # noqa: E731
+
+    def run(radii, center):
+        return polar_sample(frames, radii, azimuths, center, patch=(3, 4))
+
     expected = with_gradients(
         lambda r, c: sampler(azimuths, (3, 4))(frames / 255, r, c), (radii, center)
     )
