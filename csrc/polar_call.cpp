@@ -99,6 +99,11 @@ template <typename T>
 Tensor new_image_gradient(PolarCall<T>& call) {
   PolarSampleArgs<T>& args = call.args;
   STD_TORCH_CHECK(args.pixel != Pixel::u8, "polar_sample: uint8 pixels have no gradient");
+  // Sums of bfloat16 pixels are kept packed whatever the size, and found by 32-bit places.
+  const double packed = static_cast<double>(args.height + 3) * static_cast<double>(args.width + 3) *
+                        static_cast<double>((args.channels + 3) / 4 * 4);
+  STD_TORCH_CHECK(args.pixel != Pixel::bf16 || packed < 2147483648.0,
+                  "polar_sample_backward: too large an image for a bfloat16 gradient");
   // Where there are points the kernels write every pixel.
   const Tensor grad = call.channels_and_points()
                           ? torch::stable::new_empty(call.image, call.image.sizes())
