@@ -79,13 +79,10 @@ PolarCall<T>::PolarCall(const Tensor& image_, const Tensor& radii_, const Tensor
   args.cosines = cosines;
   args.sines = cosines + padded;
 
-  // In double, since a product of sizes may not fit 64 bits.
   const double pixels = static_cast<double>(args.height) * static_cast<double>(args.width);
-  const double borders = static_cast<double>(args.height + 3) * static_cast<double>(args.width + 3);
   const double points =
       static_cast<double>(args.num_radii) * static_cast<double>(args.num_azimuths);
-  args.packed = borders * static_cast<double>((args.channels + 3) / 4 * 4 * sizeof(T)) <=
-                    static_cast<double>(kPackedBytes) &&
+  args.packed = packed_values() * sizeof(T) <= static_cast<double>(kPackedBytes) &&
                 pixels <= kPackedPixelsPerPoint * points;
 }
 
@@ -100,9 +97,7 @@ Tensor new_image_gradient(PolarCall<T>& call) {
   PolarSampleArgs<T>& args = call.args;
   STD_TORCH_CHECK(args.pixel != Pixel::u8, "polar_sample: uint8 pixels have no gradient");
   // Sums of bfloat16 pixels are kept packed whatever the size, and found by 32-bit places.
-  const double packed = static_cast<double>(args.height + 3) * static_cast<double>(args.width + 3) *
-                        static_cast<double>((args.channels + 3) / 4 * 4);
-  STD_TORCH_CHECK(args.pixel != Pixel::bf16 || packed < 2147483648.0,
+  STD_TORCH_CHECK(args.pixel != Pixel::bf16 || call.packed_values() < 2147483648.0,
                   "polar_sample_backward: too large an image for a bfloat16 gradient");
   // Where there are points the kernels write every pixel.
   const Tensor grad = call.channels_and_points()

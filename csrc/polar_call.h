@@ -54,6 +54,14 @@ struct PolarCall {
   int64_t rings() const { return args.num_radii / args.patch_radii; }
   int64_t sectors() const { return args.num_azimuths / args.patch_azimuths; }
   int64_t samples() const { return args.patch_radii * args.patch_azimuths * args.channels; }
+  torch::headeronly::ScalarType output_type() const {
+    return args.narrow ? torch::headeronly::ScalarType::BFloat16 : radii.scalar_type();
+  }
+  // Values of the packed image of the kernels; in double, since it may not fit 64 bits.
+  double packed_values() const {
+    return static_cast<double>(args.height + 3) * static_cast<double>(args.width + 3) *
+           static_cast<double>((args.channels + 3) / 4 * 4);
+  }
   bool channels_and_points() const {
     return args.channels > 0 && args.num_radii > 0 && args.num_azimuths > 0;
   }

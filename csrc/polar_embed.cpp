@@ -11,7 +11,6 @@
 namespace darswin {
 namespace {
 
-using torch::headeronly::ScalarType;
 using torch::stable::Tensor;
 
 int64_t padded(int64_t n) { return (n + kRowUnit - 1) / kRowUnit * kRowUnit; }
@@ -35,11 +34,6 @@ Sizes output_sizes(const PolarCall<T>& call, int64_t features) {
 }
 
 template <typename T>
-ScalarType output_type(const PolarCall<T>& call) {
-  return call.args.narrow ? ScalarType::BFloat16 : call.radii.scalar_type();
-}
-
-template <typename T>
 Tensor forward(PolarCall<T>&& call, const Tensor& weight_, const std::optional<Tensor>& bias_) {
   check_weight(call, weight_);
   const Tensor weight = parameter(call, weight_);
@@ -55,7 +49,7 @@ Tensor forward(PolarCall<T>&& call, const Tensor& weight_, const std::optional<T
     embed.bias = bias.template const_data_ptr<T>();
   }
   const Tensor out =
-      torch::stable::new_empty(call.radii, output_sizes(call, embed.features), output_type(call));
+      torch::stable::new_empty(call.radii, output_sizes(call, embed.features), call.output_type());
   if (out.numel() == 0) return out;
   args.out = out.mutable_data_ptr();
   const int64_t wide = padded(embed.features);
@@ -159,7 +153,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> backward(PolarCall<T>&& call,
   PolarEmbedArgs<T> embed{};
   embed.features = weight.size(0);
   STD_TORCH_CHECK(grad_out.sizes().vec() == output_sizes(call, embed.features) &&
-                      grad_out.scalar_type() == output_type(call),
+                      grad_out.scalar_type() == call.output_type(),
                   "polar_embed_backward: grad_out must look like the output");
   args.grad_out = grad_out.const_data_ptr();
   const Sizes none = {0};

@@ -11,7 +11,6 @@
 namespace darswin {
 namespace {
 
-using torch::headeronly::ScalarType;
 using torch::stable::Tensor;
 
 template <typename T>
@@ -25,9 +24,7 @@ template <typename T>
 Tensor forward(PolarCall<T>&& call, bool tokens) {
   PolarSampleArgs<T>& args = call.args;
   args.tokens = tokens;
-  const Tensor out =
-      torch::stable::new_empty(call.radii, output_sizes(call),
-                               args.narrow ? ScalarType::BFloat16 : call.radii.scalar_type());
+  const Tensor out = torch::stable::new_empty(call.radii, output_sizes(call), call.output_type());
   if (out.numel() == 0) return out;
   ask_for_large_pages(out);
   args.out = out.mutable_data_ptr();
@@ -47,8 +44,7 @@ std::tuple<Tensor, Tensor, Tensor> backward(PolarCall<T>&& call, const Tensor& g
   // Gradients arrive expanded or strided: `.sum().backward()` gives stride 0.
   const Tensor grad_out = torch::stable::contiguous(grad_out_);
   STD_TORCH_CHECK(
-      grad_out.sizes().vec() == output_sizes(call) &&
-          grad_out.scalar_type() == (args.narrow ? ScalarType::BFloat16 : call.radii.scalar_type()),
+      grad_out.sizes().vec() == output_sizes(call) && grad_out.scalar_type() == call.output_type(),
       "polar_sample_backward: grad_out must look like the output");
   args.grad_out = grad_out.const_data_ptr();
   return polar_backward(call, image_grad, lens_grad);

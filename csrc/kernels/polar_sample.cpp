@@ -20,13 +20,6 @@ int64_t sampler_bytes(const PolarSampleArgs<T>& a) {
 }
 
 template <typename T>
-int64_t scratch_bytes(const PolarSampleArgs<T>& a) {
-  const int64_t forward = sampler_bytes(a) + a.patch_radii * row_bytes(a);
-  const int64_t backward = Scatter<T>::bytes(a);
-  return forward > backward ? forward : backward;
-}
-
-template <typename T>
 void sample(const PolarSampleArgs<T>& a, int64_t begin, int64_t end, void* scratch) {
   T* samples = reinterpret_cast<T*>(static_cast<char*>(scratch) + sampler_bytes(a));
   const int64_t rings = a.num_radii / a.patch_radii, piece = a.patch_azimuths * a.channels;
@@ -90,7 +83,7 @@ void backward_lens(const PolarSampleArgs<T>& a, int64_t begin, int64_t end, void
     double* sums = a.grad_lens + item * kLensSums;
     read_row(a, a.grad_out, output_row(a, b, i), grads);
     for (int64_t j = 0; j < a.num_azimuths; j += kBlock) {
-      const int64_t count = a.num_azimuths - j < kBlock ? a.num_azimuths - j : kBlock;
+      const int64_t count = smaller(kBlock, a.num_azimuths - j);
       locate(a, b, i, j, count, points.random, [&](int64_t k, const Points& p) {
         place(a, a.image_stride + 2, p, k, places);
         // A radius that was clamped at 0 does not move.
@@ -115,15 +108,15 @@ void backward_lens(const PolarSampleArgs<T>& a, int64_t begin, int64_t end, void
   }
 }
 
+// Enough for each of the three.
 template <typename T>
-int64_t lens_scratch_bytes(const PolarSampleArgs<T>& a) {
-  return round_up(sizeof(LensScratch), 64) + round_up(sizeof(FarPlaces<T>), 64) + row_bytes(a);
-}
-
-template <typename T>
-int64_t all_scratch_bytes(const PolarSampleArgs<T>& a) {
-  const int64_t most = scratch_bytes(a), lens = lens_scratch_bytes(a);
-  return most > lens ? most : lens;
+int64_t scratch_bytes(const PolarSampleArgs<T>& a) {
+  const int64_t forward = sampler_bytes(a) + a.patch_radii * row_bytes(a);
+  const int64_t image = Scatter<T>::bytes(a);
+  const int64_t lens =
+      round_up(sizeof(LensScratch), 64) + round_up(sizeof(FarPlaces<T>), 64) + row_bytes(a);
+  const int64_t both = forward > image ? forward : image;
+  return both > lens ? both : lens;
 }
 
 }  // namespace
@@ -137,18 +130,18 @@ void directions(const double* angles, int64_t n, double* cosines, double* sines)
   }
 }
 
-#define INSTANTIATE(T)                                                                       \
-  int64_t polar_sample_scratch(const PolarSampleArgs<T>& a) { return all_scratch_bytes(a); } \
-  void polar_sample(const PolarSampleArgs<T>& a, int64_t begin, int64_t end, void* s) {      \
-    sample(a, begin, end, s);                                                                \
-  }                                                                                          \
-  void polar_sample_backward_image(const PolarSampleArgs<T>& a, int64_t begin, int64_t end,  \
-                                   void* s) {                                                \
-    backward_image(a, begin, end, s);                                                        \
-  }                                                                                          \
-  void polar_sample_backward_lens(const PolarSampleArgs<T>& a, int64_t begin, int64_t end,   \
-                                  void* s) {                                                 \
-    backward_lens(a, begin, end, s);                                                         \
+#define INSTANTIATE(T)                                                                      \
+  int64_t polar_sample_scratch(const PolarSampleArgs<T>& a) { return scratch_bytes(a); }    \
+  void polar_sample(const PolarSampleArgs<T>& a, int64_t begin, int64_t end, void* s) {     \
+    sample(a, begin, end, s);                                                               \
+  }                                                                                         \
+  void polar_sample_backward_image(const PolarSampleArgs<T>& a, int64_t begin, int64_t end, \
+                                   void* s) {                                               \
+    backward_image(a, begin, end, s);                                                       \
+  }                                                                                         \
+  void polar_sample_backward_lens(const PolarSampleArgs<T>& a, int64_t begin, int64_t end,  \
+                                  void* s) {                                                \
+    backward_lens(a, begin, end, s);                                                        \
   }
 INSTANTIATE(float)
 INSTANTIATE(double)

@@ -95,8 +95,6 @@ class Sampler {
     uint16_t order[kBlock + kAhead];  // in which they are visited, if the image is far
   };
 
-  static int64_t smaller(int64_t x, int64_t y) { return x < y ? x : y; }
-
   // A block is a few whole tokens: their pixels and their output stay in the nearest cache. Blocks
   // are of equal size if that does not make them small. A token of more points than a block holds
   // is cut.

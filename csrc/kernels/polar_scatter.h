@@ -269,8 +269,6 @@ class Scatter {
     }
   }
 
-  static int64_t smaller(int64_t x, int64_t y) { return x < y ? x : y; }
-
   // Whether points of radius i may touch the band.
   bool touches(int64_t i) const {
     if (a.bands == 1) return true;
