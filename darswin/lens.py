@@ -7,10 +7,10 @@ differentiable in them. Angles are radians, lengths pixels.
 
 import copy
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import reduce
 from numbers import Integral
-from typing import ClassVar, Self
+from typing import Any, ClassVar, Self
 
 import torch
 from torch import Tensor
@@ -35,6 +35,7 @@ class Lens:
     """
 
     parameters: ClassVar[tuple[str, ...]]
+    lengths: ClassVar[tuple[str, ...]]  # those of the parameters that are in pixels
     theta_limit: ClassVar[float] = math.pi
     theta_max: Tensor
     center: Tensor | None
@@ -170,6 +171,13 @@ class Lens:
         """The same lens with some of its tensors replaced, unchecked."""
         return self._from_tensors({name: getattr(self, name) for name in self._names()} | tensors)
 
+    def resized(self, scale: float) -> Self:
+        """The same lens in an image `scale` times as large, as `cv2.resize` makes it."""
+        lengths = {name: getattr(self, name) * scale for name in self.lengths}
+        if self.center is not None:
+            lengths["center"] = (self.center + 0.5) * scale - 0.5
+        return self.replace(**lengths)
+
     def expand(self, count: int) -> Self:
         """A single lens as a batch of `count` equal ones."""
         if len(self) not in (1, count):
@@ -241,6 +249,7 @@ class Perspective(Lens):
     """
 
     parameters = ("focal",)
+    lengths = ("focal",)
     focal: Tensor
 
     def __init__(self, focal: Number, theta_max: Number, center: Number | None = None):
@@ -278,6 +287,7 @@ class Spherical(Lens):
     """
 
     parameters = ("xi", "focal")
+    lengths = ("focal",)
     xi: Tensor
     focal: Tensor
 
@@ -323,6 +333,7 @@ class Polynomial(Lens):
     """
 
     parameters = ("coefficients",)
+    lengths = ("coefficients",)
     coefficients: Tensor
 
     def __init__(self, coefficients: Number, theta_max: Number, center: Number | None = None):
@@ -358,3 +369,30 @@ class Polynomial(Lens):
         slack = 4 * torch.finfo(radius.dtype).eps
         lands = (radius >= 0) & (radius <= r_max * (1 + slack))
         return torch.where(lands, inverse(self.project, self._slope, radius, end), torch.nan)
+
+
+def from_dict(description: Mapping[str, Any], image_size: tuple[int, int]) -> Lens:
+    """The lens that a JSON object describes: its model's name and the arguments of its constructor.
+
+    Args:
+        description: {"model": "Spherical", "xi": 0.5, "focal": 300, "theta_max": 1.5}, angles in
+            rad and lengths in px; "center": [x, y] is optional. Instead of "theta_max" and the
+            focal length, "fov" may stand: the full field of view, that fills the circle inside the
+            image.
+        image_size: (H, W) px of the lens's images.
+
+    Raises:
+        ValueError: an unknown model, or arguments that are not its own, by name.
+    """
+    arguments = dict(description)
+    models = {model.__name__: model for model in (Perspective, Spherical, Polynomial)}
+    name = arguments.pop("model", None)
+    if name not in models:
+        raise ValueError(f'a lens\'s "model" must be one of {list(models)}, got {name!r}')
+    model = models[name]
+    try:
+        if "fov" in arguments and hasattr(model, "from_fov"):
+            return model.from_fov(**arguments, radius=min(image_size) / 2)
+        return model(**arguments)
+    except TypeError as error:
+        raise ValueError(f"a {name} lens cannot be made of {arguments}: {error}") from error

@@ -40,10 +40,11 @@ def draw_accuracy(
     axes: Axes,
     xi: Sequence[float],
     accuracy: Mapping[str, Sequence[float]],
-    trained: tuple[float, float],
+    trained: tuple[float, float] | None,
 ) -> None:
-    """Draws accuracy (%) against ξ, a line a model, with the range of training shaded."""
-    axes.axvspan(*trained, color="tab:pink", alpha=0.3, lw=0, label="seen in training")
+    """Draws accuracy (%) against ξ, a line a model, with the range of training, if any, shaded."""
+    if trained is not None:
+        axes.axvspan(*trained, color="tab:pink", alpha=0.3, lw=0, label="seen in training")
     for name, values in accuracy.items():
         axes.plot(xi, values, "o-", ms=4, label=name)
     axes.set_xlabel("distortion ξ")

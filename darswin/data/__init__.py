@@ -1,5 +1,17 @@
 """Data: images seen through lenses."""
 
-from darswin.data.warp import LEVELS, warp, warp_map
+from darswin.data.lenses import LEVELS, PolynomialLenses, SphericalLenses, parse_lenses
+from darswin.data.sources import open_source
+from darswin.data.warp import warp, warp_map
+from darswin.data.wide_angle import WideAngle
 
-__all__ = ["LEVELS", "warp", "warp_map"]
+__all__ = [
+    "LEVELS",
+    "PolynomialLenses",
+    "SphericalLenses",
+    "WideAngle",
+    "open_source",
+    "parse_lenses",
+    "warp",
+    "warp_map",
+]

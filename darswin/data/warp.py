@@ -7,14 +7,6 @@ import torch
 from darswin.lens import Lens
 from darswin.reprojection import reprojection
 
-# The paper's four levels of distortion, as ranges of ξ of the Spherical lens (sec. 5.1).
-LEVELS = {
-    "very low": (0.0, 0.05),
-    "low": (0.2, 0.35),
-    "medium": (0.5, 0.7),
-    "high": (0.85, 1.0),
-}
-
 
 def warp_map(
     source: Lens, source_size: tuple[int, int], target: Lens, size: tuple[int, int]

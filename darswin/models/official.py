@@ -31,6 +31,7 @@ class OfficialPolynomial(Lens):
     """
 
     parameters = ("coefficients", "radius")
+    lengths = ("radius",)
     theta_limit = math.inf
     coefficients: Tensor
     radius: Tensor

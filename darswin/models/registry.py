@@ -30,7 +30,12 @@ def create_model(name: str, **options) -> nn.Module:
     Raises:
         ValueError: an unknown name, or options that do not fit together.
     """
-    if name not in _MODELS:
-        raise ValueError(f"unknown model {name!r}; there are {', '.join(list_models())}")
+    check_model(name)
     model, defaults = _MODELS[name]
     return model(**(defaults | options))
+
+
+def check_model(name: str) -> None:
+    """ValueError unless `create_model` knows the name."""
+    if name not in _MODELS:
+        raise ValueError(f"unknown model {name!r}; there are {', '.join(list_models())}")

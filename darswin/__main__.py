@@ -1,0 +1,54 @@
+"""The command line: `darswin COMMAND`, or `python -m darswin COMMAND`."""
+
+import importlib.util
+import sys
+
+COMMANDS = {
+    "fit": "trains a model",
+    "validate": "measures a trained model on the validation set",
+    "test": "measures a trained model through lenses, for one after the other",
+    "predict": "names what is in pictures taken through a known lens",
+    "models": "lists the models",
+}
+
+
+def main(argv: list[str] | None = None) -> None:
+    """Runs a command; what a user can mend is said in one line, without a traceback."""
+    argv = sys.argv[1:] if argv is None else argv
+    command = argv[0] if argv else "--help"
+    if command in ("-h", "--help"):
+        print("usage: darswin COMMAND [OPTIONS]\n")
+        print("\n".join(f"  {name:<10}{text}" for name, text in COMMANDS.items()))
+        print("\n`darswin COMMAND --help` lists its options.")
+        return
+    if command not in COMMANDS:
+        raise SystemExit(f"darswin: no command {command!r}; there are {', '.join(COMMANDS)}")
+    if importlib.util.find_spec("lightning") is None:
+        raise SystemExit("darswin: this needs more packages: pip install 'darswin[train]'")
+    try:
+        _run(command, argv)
+    except (OSError, ValueError, FloatingPointError) as error:
+        raise SystemExit(f"darswin: {error}") from error
+
+
+def _run(command: str, argv: list[str]) -> None:
+    # Imported here, because they take seconds.
+    if command in ("fit", "validate", "test"):
+        from darswin.train.cli import run_command
+
+        run_command(argv)
+        return
+    from jsonargparse import auto_cli
+
+    if command == "predict":
+        from darswin.predict import predict
+
+        auto_cli(predict, args=argv[1:], prog="darswin predict", as_positional=True)
+    else:
+        from darswin.models import list_models
+
+        print("\n".join(list_models()))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,115 @@
+"""Distributions of lenses, to warp images with.
+
+Each draws a lens whose field of view fills a circle of a given radius, so that lenses differ in how
+they distribute the angles, not in what they see.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+import torch
+
+from darswin.lens import Lens, Polynomial, Spherical
+
+# The paper's four levels of distortion, as ranges of ξ of the Spherical lens (sec. 5.1).
+LEVELS = {
+    "very low": (0.0, 0.05),
+    "low": (0.2, 0.35),
+    "medium": (0.5, 0.7),
+    "high": (0.85, 1.0),
+}
+
+
+class Lenses(Protocol):
+    """A distribution of lenses."""
+
+    def draw(self, rng: np.random.Generator, fov: float, radius: float) -> Lens:
+        """A lens whose full field of view `fov` (rad) fills a circle of `radius` px."""
+
+
+@dataclass(frozen=True)
+class SphericalLenses:
+    """ξ uniform in [low, high]."""
+
+    low: float
+    high: float
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.low <= self.high < math.inf:
+            raise ValueError(f"ξ must be 0 ≤ low ≤ high, got {self.low} to {self.high}")
+
+    def draw(self, rng: np.random.Generator, fov: float, radius: float) -> Lens:
+        return Spherical.from_fov(rng.uniform(self.low, self.high), fov, radius)
+
+
+@dataclass(frozen=True)
+class PolynomialLenses:
+    """r ∝ k₁ θ + … + k₄ θ⁴, (k₁, …, k₄) a random direction in which every component is positive.
+
+    Source: the test set of DarSwin, ICCV 2023, table 5, whose coefficients are positive and of
+    random direction; their magnitude says nothing once the field of view fills the circle.
+    """
+
+    def draw(self, rng: np.random.Generator, fov: float, radius: float) -> Lens:
+        direction = np.abs(rng.standard_normal(4))
+        theta_max = fov / 2
+        scale = radius / sum(k * theta_max**power for power, k in enumerate(direction, start=1))
+        return Polynomial(torch.tensor(direction * scale, dtype=torch.float32), theta_max)
+
+
+def parse_lenses(text: str | float) -> Lenses:
+    """A distribution by its name, as configurations give it.
+
+    Args:
+        text: a level of the paper ("very low", "low", "medium", "high"), a number (one ξ), a range
+            of ξ as "0.2..0.35", or "polynomial".
+
+    Raises:
+        ValueError: none of these.
+    """
+    text = str(text).strip()
+    if text in LEVELS:
+        return SphericalLenses(*LEVELS[text])
+    if text == "polynomial":
+        return PolynomialLenses()
+    try:
+        ends = [float(end) for end in text.split("..")]
+        if len(ends) <= 2:
+            return SphericalLenses(ends[0], ends[-1])
+    except ValueError as error:
+        if "ξ must" in str(error):
+            raise
+    raise ValueError(
+        f"lenses must be one of {list(LEVELS)}, 'polynomial', a number ξ, or a range 'low..high'; "
+        f"got {text!r}"
+    )
+
+
+def parse_sweep(text: str | float | list) -> list[str]:
+    """Several distributions: a list of them, or "start:stop:step" for equally spaced ξ, stop
+    included.
+
+    Returns:
+        What `parse_lenses` takes, one each: ["0", "0.1", …].
+
+    Raises:
+        ValueError: what is no sweep.
+    """
+    if isinstance(text, list):
+        return [name for part in text for name in parse_sweep(part)]
+    parts = str(text).split(":")
+    if len(parts) == 1:
+        names = [part.strip() for part in parts[0].split(",")]
+    elif len(parts) == 3:
+        start, stop, step = (float(part) for part in parts)
+        if step <= 0 or stop < start:
+            raise ValueError(f"a sweep start:stop:step must rise, got {text!r}")
+        count = math.floor((stop - start) / step + 1e-6) + 1
+        names = [f"{start + k * step:.6g}" for k in range(count)]
+    else:
+        raise ValueError(f"a sweep must be start:stop:step, got {text!r}")
+    for name in names:
+        parse_lenses(name)
+    return names

@@ -1,0 +1,95 @@
+"""Which images come when: the order of training, for any number of processes, and resumable."""
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from torch.utils.data import DataLoader, Dataset, Sampler
+
+from darswin.data.wide_angle import Draw
+
+
+class TrainingOrder(Sampler[Draw]):
+    """A new shuffle each epoch, dealt out to the processes.
+
+    The epoch's shuffle is cut into global batches of `batch × world`, what is left over is dropped.
+    In each, image i and image -1-i are partners for mixing. A process gets whole pairs, the first
+    of each in the first half of its batch and the second in the mirrored place, so that its batch,
+    too, mixes with its own reverse; and any number of processes trains on the same mixtures.
+
+    Args:
+        count: of images. batch: of one process; even unless world is 1. rank, world: of processes.
+        pairs: partners share their lens, so that a mixture is an image through one lens.
+        seed: of the shuffle.
+    """
+
+    def __init__(
+        self, count: int, batch: int, *, rank: int, world: int, pairs: bool = True, seed: int = 0
+    ):
+        if world > 1 and batch % 2:
+            raise ValueError(f"with several processes the batch of each must be even, got {batch}")
+        if count < batch * world:
+            raise ValueError(
+                f"a batch of {batch} on each of {world} processes needs more images than {count}"
+            )
+        self.count, self.batch, self.rank, self.world = count, batch, rank, world
+        self.pairs, self.seed = pairs, seed
+        self.epoch, self.first_batch = 0, 0
+
+    def set_epoch(self, epoch: int) -> None:
+        """Called by Lightning before each epoch."""
+        self.epoch = epoch
+
+    def batches(self) -> int:
+        """Of an epoch."""
+        return self.count // (self.batch * self.world)
+
+    def __len__(self) -> int:
+        return self.batches() * self.batch
+
+    def __iter__(self) -> Iterator[Draw]:
+        order = np.random.default_rng((self.seed, self.epoch)).permutation(self.count)
+        size = self.batch * self.world
+        half = self.batch // 2
+        front = np.arange(self.rank * half, self.rank * half + half)
+        middle = np.arange(half, self.batch - half)  # of an odd batch
+        place = np.concatenate((front, middle, size - 1 - front[::-1]))
+        first, self.first_batch = self.first_batch, 0
+        for batch in order[: self.batches() * size].reshape(-1, size)[first:]:
+            for k in place:
+                partner = min(k, size - 1 - k)
+                yield Draw(self.epoch, int(batch[k]), int(batch[partner if self.pairs else k]))
+
+
+class EveryNth(Sampler[int]):
+    """Indices rank, rank + world, …: a process's part of a test set."""
+
+    def __init__(self, count: int, rank: int, world: int):
+        self.indices = range(rank, count, world)
+
+    def __len__(self) -> int:
+        return len(self.indices)
+
+    def __iter__(self) -> Iterator[int]:
+        return iter(self.indices)
+
+
+class ResumableLoader(DataLoader):
+    """A DataLoader over `TrainingOrder` that a checkpoint in the middle of an epoch brings back."""
+
+    def __init__(self, dataset: Dataset, order: TrainingOrder, **options: Any):
+        super().__init__(dataset, order.batch, sampler=order, drop_last=True, **options)
+        self._done = 0
+
+    def __iter__(self) -> Iterator:
+        self._done = self.sampler.first_batch
+        for batch in super().__iter__():
+            self._done += 1
+            yield batch
+
+    def state_dict(self) -> dict[str, int]:
+        """How many batches of the epoch have been handed out."""
+        return {"batches": self._done}
+
+    def load_state_dict(self, state: dict[str, int]) -> None:
+        self.sampler.first_batch = state["batches"] % self.sampler.batches()

@@ -1,0 +1,70 @@
+"""Models as files: safetensors, with what is needed to build the model in their metadata."""
+
+import json
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields
+from pathlib import Path
+from typing import Any
+
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor, nn
+
+from darswin.files import replacing
+from darswin.models.registry import create_model
+
+_ENTRY = "darswin"  # of the metadata
+
+
+@dataclass(frozen=True)
+class ModelCard:
+    """What a model file says besides its weights.
+
+    Args:
+        model: a name of `create_model`. options: its options.
+        classes: names of the logits.
+        size: px, of the images it was trained on. fov: rad, the field of view of their lenses.
+    """
+
+    model: str
+    options: Mapping[str, Any] = field(default_factory=dict)
+    classes: Sequence[str] = ()
+    size: int = 64
+    fov: float = 0.0
+
+    def create(self) -> nn.Module:
+        """The model, with new weights."""
+        return create_model(self.model, **self.options)
+
+
+def save_model(path: str | os.PathLike, weights: Mapping[str, Tensor], card: ModelCard) -> None:
+    """Writes a model's state dict and its card, replacing what stood there in one go."""
+    path = Path(path)
+    contiguous = {name: tensor.detach().cpu().contiguous() for name, tensor in weights.items()}
+    with replacing(path) as temporary:
+        save_file(contiguous, temporary, metadata={_ENTRY: json.dumps(asdict(card))})
+
+
+def load_model(path: str | os.PathLike) -> tuple[nn.Module, ModelCard]:
+    """The model of a file, in eval mode, and its card.
+
+    Raises:
+        ValueError: no model file of darswin, or weights that are not those of its model.
+    """
+    try:
+        with safe_open(path, "pt") as file:
+            entry = (file.metadata() or {}).get(_ENTRY)
+            weights = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    except SafetensorError as error:
+        raise ValueError(f"{path} is no safetensors file: {error}") from error
+    if entry is None:
+        raise ValueError(f"{path} holds weights, but not the name of their model")
+    try:
+        values = json.loads(entry)
+        card = ModelCard(**{f.name: values[f.name] for f in fields(ModelCard)})
+        model = card.create()
+        model.load_state_dict(weights)
+    except (ValueError, KeyError, TypeError, RuntimeError) as error:
+        raise ValueError(f"{path} is no model that this darswin can build: {error}") from error
+    return model.eval(), card

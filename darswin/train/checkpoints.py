@@ -1,0 +1,42 @@
+"""Checkpoints that no kill and no full disk spoils, their weights as safetensors beside them."""
+
+from pathlib import Path
+from typing import Any
+
+import torch
+from lightning.pytorch.plugins.io import TorchCheckpointIO
+
+from darswin.files import replacing
+from darswin.models.files import ModelCard, save_model
+
+
+class SafeCheckpointIO(TorchCheckpointIO):
+    """Writes a checkpoint in the place of the old one in one go; reads no pickled code."""
+
+    def save_checkpoint(
+        self, checkpoint: dict[str, Any], path: str, storage_options: Any = None
+    ) -> None:
+        with replacing(path) as temporary:
+            torch.save(checkpoint, temporary)
+        if "darswin" in checkpoint:
+            weights = {
+                name.removeprefix("net."): tensor
+                for name, tensor in checkpoint["state_dict"].items()
+                if name.startswith("net.")
+            }
+            save_model(_weights(path), weights, ModelCard(**checkpoint["darswin"]))
+
+    def remove_checkpoint(self, path: str) -> None:
+        super().remove_checkpoint(path)
+        _weights(path).unlink(missing_ok=True)
+
+    def load_checkpoint(
+        self, path: str, map_location: Any = "cpu", weights_only: bool | None = None
+    ) -> dict[str, Any]:
+        if not Path(path).is_file():
+            raise FileNotFoundError(f"no checkpoint {path}")
+        return torch.load(path, map_location=map_location, weights_only=True)
+
+
+def _weights(path: str) -> Path:
+    return Path(path).with_suffix(".safetensors")

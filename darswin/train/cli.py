@@ -1,0 +1,154 @@
+"""`darswin fit`, `validate` and `test`: Lightning's command line, with a folder for each run.
+
+A run's folder holds everything of it: `config.yaml`, `checkpoints/{last,best}.{ckpt,safetensors}`,
+the logs `csv/` and `tensorboard/`, and `test.{csv,json,png}`.
+"""
+
+import argparse
+import os
+from pathlib import Path
+
+from lightning.pytorch import Trainer
+from lightning.pytorch.callbacks import LearningRateMonitor, ModelCheckpoint
+from lightning.pytorch.cli import LightningArgumentParser, LightningCLI, SaveConfigCallback
+from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
+
+from darswin.data.lenses import parse_sweep
+from darswin.files import replacing
+from darswin.train.checkpoints import SafeCheckpointIO
+from darswin.train.data import WideAngleData
+from darswin.train.results import WriteResults
+from darswin.train.task import Classification
+
+PRESETS = Path(__file__).parent / "presets"
+
+
+def run_command(argv: list[str]) -> None:
+    """Runs `fit`, `validate` or `test`, the first of `argv`, with the others as its options."""
+    RunCLI(
+        Classification,
+        WideAngleData,
+        args=with_configs(argv),
+        seed_everything_default=0,
+        auto_configure_optimizers=False,
+        save_config_callback=SaveRunConfig,
+        trainer_defaults=dict(
+            accelerator="auto", use_distributed_sampler=False, num_sanity_val_steps=0
+        ),
+        parser_kwargs=dict(
+            prog="darswin", description="Trains and tests models on wide-angle images."
+        ),
+    )
+
+
+def with_configs(argv: list[str]) -> list[str]:
+    """The arguments with presets' names as their files, and a run's own configuration first.
+
+    `test`, `validate` and `fit --resume` start from `RUN/config.yaml`, so that they need no other
+    option.
+    """
+    scan = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    scan.add_argument("-c", "--config", action="append", default=[])
+    scan.add_argument("--run")
+    scan.add_argument("--resume", action="store_true")
+    known, others = scan.parse_known_args(argv[1:])
+    configs = []
+    if known.run:
+        others += ["--run", known.run]
+        own = Path(known.run) / "config.yaml"
+        if (known.resume or argv[0] != "fit") and own.exists():
+            configs.append(str(own))
+    if known.resume:
+        others.append("--resume=true")
+    for name in known.config:
+        preset = PRESETS / f"{name}.yaml"
+        configs.append(str(preset) if preset.exists() and not Path(name).exists() else name)
+    return [argv[0], *(f"--config={config}" for config in configs), *others]
+
+
+class RunCLI(LightningCLI):
+    """Lightning's command line with `--run`, `--resume` and `--xi`."""
+
+    @staticmethod
+    def subcommands() -> dict[str, set[str]]:
+        commands = LightningCLI.subcommands()
+        return {name: commands[name] for name in ("fit", "validate", "test")}
+
+    def add_arguments_to_parser(self, parser: LightningArgumentParser) -> None:
+        parser.add_argument("--run", type=str, required=True, help="the folder of the run")
+        parser.add_argument(
+            "--resume", type=bool, default=False, help="fit: goes on from the run's last checkpoint"
+        )
+        parser.add_argument(
+            "--checkpoint_steps", type=int, default=200, help="fit: steps between checkpoints"
+        )
+        parser.add_argument(
+            "--xi", type=str, help="test: the same as --data.test_lenses, e.g. 0:1:0.1 for every ξ"
+        )
+        parser.add_argument("--devices", type=int, help="the same as --trainer.devices")
+        parser.link_arguments("seed_everything", "data.seed", compute_fn=int)
+        parser.link_arguments("seed_everything", "model.seed", compute_fn=int)
+
+    def before_instantiate_classes(self) -> None:
+        config = self.config[self.subcommand]
+        self.folder = Path(config.run)
+        config.trainer.default_root_dir = str(self.folder)
+        if config.devices is not None:
+            config.trainer.devices = config.devices
+        if config.xi is not None:
+            config.data.test_lenses = parse_sweep(config.xi)
+        last = self.folder / "checkpoints" / "last.ckpt"
+        best = self.folder / "checkpoints" / "best.ckpt"
+        if self.subcommand != "fit":
+            config.ckpt_path = config.ckpt_path or str(best if best.exists() else last)
+        elif config.resume:
+            if last.exists():
+                config.ckpt_path = str(last)
+            else:
+                print(f"{last} is not there yet: starting from the beginning")
+        elif last.exists() and "LOCAL_RANK" not in os.environ:
+            raise FileExistsError(
+                f"{self.folder} holds a run already: go on with --resume, or choose another folder"
+            )
+
+    def instantiate_trainer(self, **kwargs) -> Trainer:
+        config = self.config_init[self.subcommand]
+        given = config.trainer
+        kwargs["plugins"] = [SafeCheckpointIO(), *(given.plugins or [])]
+        if given.logger is None:
+            kwargs["logger"] = self._loggers() if self.subcommand == "fit" else False
+        kwargs["callbacks"] = [*(given.callbacks or []), *self._callbacks(config.checkpoint_steps)]
+        return super().instantiate_trainer(**kwargs)
+
+    def _loggers(self) -> list:
+        return [
+            CSVLogger(self.folder, name="csv"),  # a new version each time: nothing is overwritten
+            TensorBoardLogger(self.folder, name="", version="tensorboard"),
+        ]
+
+    def _callbacks(self, steps: int) -> list:
+        if self.subcommand != "fit":
+            return [WriteResults(self.folder)] if self.subcommand == "test" else []
+        kept = dict(dirpath=self.folder / "checkpoints", enable_version_counter=False)
+        return [
+            LearningRateMonitor("step"),
+            ModelCheckpoint(filename="best", monitor="val/top1", mode="max", **kept),
+            ModelCheckpoint(filename="last", every_n_train_steps=steps, **kept),
+            ModelCheckpoint(filename="last", save_on_train_epoch_end=True, **kept),
+        ]
+
+
+class SaveRunConfig(SaveConfigCallback):
+    """Writes the configuration of a `fit` to its run's folder."""
+
+    def __init__(self, parser: LightningArgumentParser, config, **kwargs):
+        super().__init__(parser, config, save_to_log_dir=False)
+
+    def save_config(self, trainer: Trainer, pl_module: Classification, stage: str) -> None:
+        if stage != "fit":
+            return
+        config = self.config.clone()
+        for name in ("config", "run", "resume", "xi", "devices", "ckpt_path"):
+            config.pop(name, None)
+        with replacing(Path(trainer.default_root_dir) / "config.yaml") as file:
+            file.write_text(self.parser.dump(config, skip_none=False, skip_check=True))

@@ -1,0 +1,70 @@
+"""What a test over lenses found, as a table, CSV, JSON and a picture."""
+
+import csv
+import json
+from pathlib import Path
+
+from lightning.pytorch import Callback, LightningModule, Trainer
+from lightning.pytorch.utilities import rank_zero_only
+
+from darswin.data.lenses import SphericalLenses, parse_lenses
+from darswin.files import replacing
+
+
+class WriteResults(Callback):
+    """After a test: prints the accuracy for each distribution of lenses, and writes it to a folder.
+
+    Files: `test.csv` and `test.json` with lenses, top1, top5 and loss, and `test.png`.
+    """
+
+    def __init__(self, folder: Path):
+        self.folder = Path(folder)
+
+    @rank_zero_only
+    def on_test_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        rows = pl_module.results
+        print(f"\n{'lenses':<16}{'top-1 (%)':>10}{'top-5 (%)':>10}{'loss':>10}")
+        for row in rows:
+            print(
+                f"{row['lenses']:<16}{100 * row['top1']:>10.2f}{100 * row['top5']:>10.2f}"
+                f"{row['loss']:>10.4f}"
+            )
+        write_results(self.folder, rows, pl_module.card.model, trainer.datamodule.train_lenses)
+        print(f"\n{self.folder}/test.csv, test.json and test.png")
+        if broken := trainer.datamodule.broken():
+            print(f"{broken} pictures could not be read and were left out")
+
+
+def write_results(folder: Path, rows: list[dict], name: str, trained_on) -> None:
+    """The rows of a test as files; `trained_on` is the distribution that the picture shades."""
+    report = dict(model=name, results=rows)
+    with replacing(folder / "test.json") as file:
+        file.write_text(json.dumps(report, indent=1))
+    with replacing(folder / "test.csv") as file, file.open("w", newline="") as stream:
+        writer = csv.DictWriter(stream, rows[0].keys())
+        writer.writeheader()
+        writer.writerows(rows)
+    figure = draw_results(rows, name, trained_on)
+    with replacing(folder / "test.png") as file:
+        figure.savefig(file, format="png", dpi=130)
+
+
+def draw_results(rows: list[dict], name: str, trained_on):
+    """A figure: accuracy against ξ where every distribution is one ξ, else bars."""
+    from matplotlib.figure import Figure
+
+    from darswin.plot import draw_accuracy
+
+    figure = Figure(figsize=(7, 4.2), layout="constrained")
+    axes = figure.subplots()
+    accuracy = [100 * row["top1"] for row in rows]
+    lenses = [parse_lenses(row["lenses"]) for row in rows]
+    if all(isinstance(lens, SphericalLenses) and lens.low == lens.high for lens in lenses):
+        shaded = trained_on if isinstance(trained_on, SphericalLenses) else None
+        band = None if shaded is None else (shaded.low, shaded.high)
+        draw_accuracy(axes, [lens.low for lens in lenses], {name: accuracy}, band)
+    else:
+        axes.bar([row["lenses"] for row in rows], accuracy, label=name)
+        axes.set(ylabel="accuracy (%)", ylim=(0, 100))
+        axes.legend()
+    return figure

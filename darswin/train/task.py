@@ -1,0 +1,208 @@
+"""Image classification: what is trained and what is measured."""
+
+import math
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from lightning.pytorch import LightningModule
+from torch import Tensor, nn
+from torchmetrics import MeanMetric, Metric
+from torchmetrics.classification import MulticlassAccuracy
+
+from darswin.data.mixing import Mixing
+from darswin.lens import Lens
+from darswin.models.files import ModelCard
+from darswin.models.registry import check_model
+from darswin.train.recipe import learning_rate, parameter_groups
+
+Batch = tuple[Tensor, Lens, Tensor]
+
+
+class Classification(LightningModule):
+    """A classifier of wide-angle images, its loss, its optimiser and its accuracy.
+
+    Learning rates are those of `reference_batch` images a step and grow in proportion to the batch.
+
+    Args:
+        model: a name that `darswin.list_models()` gives. options: options of the model, e.g.
+            `{spacing: tan, jitter: 0}`.
+        learning_rate, warmup_rate, final_rate: its peak, start and end.
+        warmup_epochs: of linear warm-up; may be a fraction.
+        weight_decay: AdamW's. decay_position_bias: decays position biases too, as the authors' code
+            does.
+        label_smoothing: in [0, 1).
+        mixup, cutmix: α of Beta(α, α), 0 is off. mix_p: the share of batches that are mixed.
+        reference_batch: images that the rates are meant for.
+        seed: of jitter, drop path and mixing.
+
+    Source: the recipe of DarSwin, ICCV 2023, sec. 5.2, and of its released code.
+    """
+
+    def __init__(
+        self,
+        model: str = "darswin_a_micro",
+        options: dict[str, Any] | None = None,
+        *,
+        learning_rate: float = 5e-4,
+        warmup_rate: float = 5e-7,
+        final_rate: float = 5e-6,
+        warmup_epochs: float = 20,
+        weight_decay: float = 0.05,
+        decay_position_bias: bool = False,
+        label_smoothing: float = 0.1,
+        mixup: float = 0.8,
+        cutmix: float = 1.0,
+        mix_p: float = 1.0,
+        reference_batch: int = 512,
+        seed: int = 0,
+    ):
+        super().__init__()
+        check_model(model)
+        if not 0 <= label_smoothing < 1:
+            raise ValueError(f"label_smoothing must be in [0, 1), got {label_smoothing}")
+        self.model, self.options = model, options or {}
+        self.rates = dict(peak=learning_rate, warmup=warmup_rate, final=final_rate)
+        self.warmup_epochs, self.reference_batch = warmup_epochs, reference_batch
+        self.weight_decay, self.decay_position_bias = weight_decay, decay_position_bias
+        self.label_smoothing, self.seed = label_smoothing, seed
+        self.mixing = Mixing(mixup, cutmix, mix_p)
+        self.net: nn.Module | None = None
+        self.card: ModelCard | None = None
+
+    # -- building -----------------------------------------------------------------------------
+
+    def configure_model(self) -> None:
+        """Builds the network for the classes and channels of the data."""
+        if self.net is not None:
+            return
+        data = self.trainer.datamodule
+        options = dict(num_classes=len(data.classes), in_chans=data.channels)
+        options |= dict(mean=data.mean, std=data.std) | self.options
+        self.card = ModelCard(self.model, options, data.classes, data.size, data.fov)
+        torch.manual_seed(self.seed)
+        self.net = self.card.create()
+        count = len(data.classes)
+        self.val_metrics = metrics(count)
+        self.test_metrics = nn.ModuleList(metrics(count) for _ in data.test_names)
+
+    def configure_optimizers(self) -> dict:
+        trainer = self.trainer
+        batch = trainer.datamodule.batch_size * trainer.world_size * trainer.accumulate_grad_batches
+        scale = batch / self.reference_batch
+        steps = trainer.estimated_stepping_batches
+        if not math.isfinite(steps):
+            raise ValueError("the cosine needs an end: set --trainer.max_epochs or max_steps")
+        rates = {name: rate * scale for name, rate in self.rates.items()}
+        epoch = math.ceil(trainer.num_training_batches / trainer.accumulate_grad_batches)
+        warmup_steps = self.warmup_epochs * epoch
+        undecayed = () if self.decay_position_bias else self.net.no_weight_decay()
+        optimizer = torch.optim.AdamW(
+            parameter_groups(self.net, self.weight_decay, undecayed), lr=rates["peak"]
+        )
+        schedule = torch.optim.lr_scheduler.LambdaLR(
+            optimizer,
+            lambda step: (
+                learning_rate(step, warmup_steps=warmup_steps, steps=steps, **rates) / rates["peak"]
+            ),
+        )
+        return {
+            "optimizer": optimizer,
+            "lr_scheduler": {"scheduler": schedule, "interval": "step"},
+        }
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        checkpoint["darswin"] = asdict(self.card)
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """ValueError where the checkpoint is not one of this model."""
+        if "darswin" not in checkpoint:
+            raise ValueError("this is no checkpoint of `darswin fit`: it has no model's name in it")
+        theirs, ours = (
+            {**card, **card.pop("options")}
+            for card in (checkpoint["darswin"].copy(), asdict(self.card))
+        )
+        other = [
+            f"{key} {theirs.get(key)!r} there, {ours.get(key)!r} here"
+            for key in sorted(theirs.keys() | ours.keys())
+            if theirs.get(key) != ours.get(key)
+        ]
+        if other:
+            raise ValueError(f"the checkpoint is one of another model: {'; '.join(other)}")
+
+    # -- training -----------------------------------------------------------------------------
+
+    def forward(self, images: Tensor, lens: Lens) -> Tensor:
+        """Images (B, C, H, W) and their lenses → logits (B, K)."""
+        return self.net(images, lens)
+
+    def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
+        images, lens, labels = batch
+        # A step's random numbers depend on its place alone, so that a resumed run repeats them.
+        step = (self.seed, self.current_epoch, batch_idx)
+        rng = np.random.default_rng(step)  # the same in all processes
+        torch.manual_seed(int(np.random.default_rng((*step, self.global_rank)).integers(2**63)))
+        targets = self._targets(labels, len(self.card.classes))
+        images, targets = self.mixing(images, targets, rng)
+        loss = soft_cross_entropy(self.net(images, lens), targets)
+        if not torch.isfinite(loss):
+            raise FloatingPointError(
+                f"the loss is {loss.item()} in epoch {self.current_epoch}, step {batch_idx}: try a "
+                "smaller learning rate; the last checkpoint is from before"
+            )
+        self.log("train/loss", loss, prog_bar=True, batch_size=len(images), sync_dist=True)
+        return loss
+
+    def _targets(self, labels: Tensor, classes: int) -> Tensor:
+        """Labels (B,) → probabilities (B, K); all 0 for label -1, which then weighs nothing."""
+        names = torch.arange(classes, device=labels.device)
+        hot = (labels[:, None] == names).float()
+        smooth = hot * (1 - self.label_smoothing) + self.label_smoothing / classes
+        return smooth * (labels >= 0)[:, None]
+
+    # -- evaluation ---------------------------------------------------------------------------
+
+    def _measure(self, batch: Batch, measured: nn.ModuleDict) -> None:
+        images, lens, labels = batch
+        known = labels >= 0
+        logits = self.net(images, lens).float()[known]
+        for name, metric in measured.items():
+            if not known.any():
+                continue
+            if name == "loss":
+                metric.update(F.cross_entropy(logits, labels[known]), weight=known.sum())
+            else:
+                metric.update(logits, labels[known])
+
+    def validation_step(self, batch: Batch, batch_idx: int) -> None:
+        self._measure(batch, self.val_metrics)
+        for name, metric in self.val_metrics.items():
+            self.log(f"val/{name}", metric, prog_bar=name != "top5", on_step=False, on_epoch=True)
+
+    def test_step(self, batch: Batch, batch_idx: int, dataloader_idx: int = 0) -> None:
+        self._measure(batch, self.test_metrics[dataloader_idx])
+
+    def on_test_epoch_end(self) -> None:
+        """Collects `results`: a row for each distribution of lenses."""
+        names = self.trainer.datamodule.test_names
+        self.results = [
+            {"lenses": name} | {key: metric.compute().item() for key, metric in measured.items()}
+            for name, measured in zip(names, self.test_metrics, strict=True)
+        ]
+
+
+def metrics(classes: int) -> nn.ModuleDict:
+    """What an evaluation measures: mean loss, and the shares that top-1 and top-5 get right."""
+
+    def accuracy(k: int) -> Metric:
+        top_k = min(k, classes)
+        return MulticlassAccuracy(classes, average="micro", top_k=top_k)
+
+    return nn.ModuleDict(dict(top1=accuracy(1), top5=accuracy(5), loss=MeanMetric()))
+
+
+def soft_cross_entropy(logits: Tensor, targets: Tensor) -> Tensor:
+    """Mean over the batch of -Σ target · log softmax(logits), in float32."""
+    return -(targets * F.log_softmax(logits.float(), -1)).sum(-1).mean()
