@@ -2,35 +2,35 @@
 
 import os
 import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 
-@contextmanager
-def replacing(path: str | os.PathLike) -> Iterator[Path]:
-    """A new file's name, to be written; it takes the place of `path` if all went well.
+def replace_file(path: str | os.PathLike, content: bytes | str) -> None:
+    """Writes a file whole, beside the old one and then in its place; makes its folder.
 
     Raises:
-        OSError: no room, or no right to write, naming `path`, which is as it was.
+        OSError: no room, or no right to write; it names `path`, which is as it was.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
-    os.close(handle)
-    temporary = Path(name)
+    data = content.encode() if isinstance(content, str) else content
+    temporary = None
     try:
-        yield temporary
-        with temporary.open("rb") as file:
+        with tempfile.NamedTemporaryFile(
+            prefix=f".{path.name}.", dir=path.parent, delete=False
+        ) as file:
+            temporary = Path(file.name)
+            file.write(data)
+            file.flush()
             os.fsync(file.fileno())
         temporary.chmod(0o666 & ~_umask())
         temporary.replace(path)
     except OSError as error:
+        if temporary is not None:
+            temporary.unlink(missing_ok=True)
         raise OSError(
-            error.errno, f"cannot write it, and left it as it was: {error.strerror}", str(path)
+            error.errno, f"cannot write it, it is as it was: {error.strerror}", str(path)
         ) from error
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def _umask() -> int:

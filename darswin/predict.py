@@ -11,9 +11,9 @@ import torch
 from torch import Tensor, nn
 
 from darswin.data.sources import read_image
-from darswin.files import replacing
+from darswin.files import replace_file
 from darswin.lens import Lens, from_dict
-from darswin.models.files import ModelCard, load_model
+from darswin.models.saving import ModelCard, load_model
 
 
 def predict(
@@ -58,8 +58,7 @@ def predict(
     if out is None:
         print(text)
     else:
-        with replacing(out) as temporary:
-            temporary.write_text(text)
+        replace_file(out, text)
     return found
 
 

@@ -27,7 +27,7 @@ OPERATIONS: dict[str, Callable[[Image.Image, float, np.random.Generator], Image.
     "equalize": lambda image, magnitude, rng: ImageOps.equalize(image),
     "invert": lambda image, magnitude, rng: ImageOps.invert(image),
     "posterize": lambda image, magnitude, rng: ImageOps.posterize(
-        image, 4 - int(4 * magnitude / LARGEST)
+        image, max(1, 4 - int(4 * magnitude / LARGEST))
     ),
     "solarize": lambda image, magnitude, rng: ImageOps.solarize(
         image, 256 - int(256 * magnitude / LARGEST)

@@ -34,11 +34,20 @@ class TrainingOrder(Sampler[Draw]):
             )
         self.count, self.batch, self.rank, self.world = count, batch, rank, world
         self.pairs, self.seed = pairs, seed
-        self.epoch, self.first_batch = 0, 0
+        self.epoch = 0
+        self._resume = (-1, 0)  # an epoch, and how many of its batches are done
 
     def set_epoch(self, epoch: int) -> None:
         """Called by Lightning before each epoch."""
         self.epoch = epoch
+
+    def resume(self, epoch: int, done: int) -> None:
+        """Leaves out the first `done` batches of an epoch."""
+        self._resume = (epoch, done)
+
+    def done(self) -> int:
+        """Batches that the next iteration leaves out."""
+        return self._resume[1] if self._resume[0] == self.epoch else 0
 
     def batches(self) -> int:
         """Of an epoch."""
@@ -54,8 +63,7 @@ class TrainingOrder(Sampler[Draw]):
         front = np.arange(self.rank * half, self.rank * half + half)
         middle = np.arange(half, self.batch - half)  # of an odd batch
         place = np.concatenate((front, middle, size - 1 - front[::-1]))
-        first, self.first_batch = self.first_batch, 0
-        for batch in order[: self.batches() * size].reshape(-1, size)[first:]:
+        for batch in order[: self.batches() * size].reshape(-1, size)[self.done() :]:
             for k in place:
                 partner = min(k, size - 1 - k)
                 yield Draw(self.epoch, int(batch[k]), int(batch[partner if self.pairs else k]))
@@ -82,14 +90,14 @@ class ResumableLoader(DataLoader):
         self._done = 0
 
     def __iter__(self) -> Iterator:
-        self._done = self.sampler.first_batch
+        self._done = self.sampler.done()
         for batch in super().__iter__():
             self._done += 1
             yield batch
 
     def state_dict(self) -> dict[str, int]:
-        """How many batches of the epoch have been handed out."""
-        return {"batches": self._done}
+        """Which epoch it is, and how many of its batches have been handed out."""
+        return {"epoch": self.sampler.epoch, "done": self._done}
 
     def load_state_dict(self, state: dict[str, int]) -> None:
-        self.sampler.first_batch = state["batches"] % self.sampler.batches()
+        self.sampler.resume(**state)

@@ -259,7 +259,7 @@ def _held_out(labels: np.ndarray, split: Split, share: float) -> np.ndarray:
             test=members[:count], val=members[count : 2 * count], train=members[2 * count :]
         )
         chosen.append(parts[split])
-    return np.sort(np.concatenate(chosen))
+    return np.sort(np.concatenate(chosen)) if chosen else np.empty(0, np.int64)
 
 
 # -- IDX files and digits ---------------------------------------------------------------------

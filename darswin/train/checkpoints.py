@@ -1,13 +1,14 @@
 """Checkpoints that no kill and no full disk spoils, their weights as safetensors beside them."""
 
+import io
 from pathlib import Path
 from typing import Any
 
 import torch
 from lightning.pytorch.plugins.io import TorchCheckpointIO
 
-from darswin.files import replacing
-from darswin.models.files import ModelCard, save_model
+from darswin.files import replace_file
+from darswin.models.saving import ModelCard, save_model
 
 
 class SafeCheckpointIO(TorchCheckpointIO):
@@ -16,8 +17,9 @@ class SafeCheckpointIO(TorchCheckpointIO):
     def save_checkpoint(
         self, checkpoint: dict[str, Any], path: str, storage_options: Any = None
     ) -> None:
-        with replacing(path) as temporary:
-            torch.save(checkpoint, temporary)
+        content = io.BytesIO()
+        torch.save(checkpoint, content)
+        replace_file(path, content.getvalue())
         if "darswin" in checkpoint:
             weights = {
                 name.removeprefix("net."): tensor

@@ -14,7 +14,7 @@ from lightning.pytorch.cli import LightningArgumentParser, LightningCLI, SaveCon
 from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
 
 from darswin.data.lenses import parse_sweep
-from darswin.files import replacing
+from darswin.files import replace_file
 from darswin.train.checkpoints import SafeCheckpointIO
 from darswin.train.data import WideAngleData
 from darswin.train.results import WriteResults
@@ -122,7 +122,8 @@ class RunCLI(LightningCLI):
 
     def _loggers(self) -> list:
         return [
-            CSVLogger(self.folder, name="csv"),  # a new version each time: nothing is overwritten
+            # A new version each time: nothing is overwritten.
+            CSVLogger(self.folder, name="csv", flush_logs_every_n_steps=1),
             TensorBoardLogger(self.folder, name="", version="tensorboard"),
         ]
 
@@ -150,5 +151,5 @@ class SaveRunConfig(SaveConfigCallback):
         config = self.config.clone()
         for name in ("config", "run", "resume", "xi", "devices", "ckpt_path"):
             config.pop(name, None)
-        with replacing(Path(trainer.default_root_dir) / "config.yaml") as file:
-            file.write_text(self.parser.dump(config, skip_none=False, skip_check=True))
+        text = self.parser.dump(config, skip_none=False, skip_check=True)
+        replace_file(Path(trainer.default_root_dir) / "config.yaml", text)

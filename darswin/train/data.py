@@ -91,6 +91,8 @@ class WideAngleData(LightningDataModule):
         self.pair_lenses, self.seed = pair_lenses, seed
         self._sources: dict[str, Source] = {}
         self.datasets: list[WideAngle] = []
+        self._loader: ResumableLoader | None = None
+        self._progress: dict[str, int] = {}
 
     def source(self, split: Split) -> Source:
         """The pictures of a split."""
@@ -140,7 +142,20 @@ class WideAngleData(LightningDataModule):
         order = TrainingOrder(
             len(dataset), self.batch_size, pairs=self.pair_lenses, seed=self.seed, **self._place
         )
-        return ResumableLoader(dataset, order, persistent_workers=self.workers > 0, **self._options)
+        self._loader = ResumableLoader(
+            dataset, order, persistent_workers=self.workers > 0, **self._options
+        )
+        if self._progress:
+            self._loader.load_state_dict(self._progress)
+        return self._loader
+
+    # Lightning restores a loader's own state only if it was made after the optimiser, and the
+    # optimiser's schedule needs its length.
+    def state_dict(self) -> dict[str, int]:
+        return self._loader.state_dict() if self._loader else {}
+
+    def load_state_dict(self, state_dict: dict[str, int]) -> None:
+        self._progress = state_dict
 
     def _evaluation(self, split: Split, lenses: str | None = None) -> DataLoader:
         dataset = self.dataset(split, lenses)

@@ -1,6 +1,7 @@
 """What a test over lenses found, as a table, CSV, JSON and a picture."""
 
 import csv
+import io
 import json
 from pathlib import Path
 
@@ -8,7 +9,7 @@ from lightning.pytorch import Callback, LightningModule, Trainer
 from lightning.pytorch.utilities import rank_zero_only
 
 from darswin.data.lenses import SphericalLenses, parse_lenses
-from darswin.files import replacing
+from darswin.files import replace_file
 
 
 class WriteResults(Callback):
@@ -38,15 +39,15 @@ class WriteResults(Callback):
 def write_results(folder: Path, rows: list[dict], name: str, trained_on) -> None:
     """The rows of a test as files; `trained_on` is the distribution that the picture shades."""
     report = dict(model=name, results=rows)
-    with replacing(folder / "test.json") as file:
-        file.write_text(json.dumps(report, indent=1))
-    with replacing(folder / "test.csv") as file, file.open("w", newline="") as stream:
-        writer = csv.DictWriter(stream, rows[0].keys())
-        writer.writeheader()
-        writer.writerows(rows)
-    figure = draw_results(rows, name, trained_on)
-    with replacing(folder / "test.png") as file:
-        figure.savefig(file, format="png", dpi=130)
+    replace_file(folder / "test.json", json.dumps(report, indent=1))
+    table = io.StringIO(newline="")
+    writer = csv.DictWriter(table, rows[0].keys())
+    writer.writeheader()
+    writer.writerows(rows)
+    replace_file(folder / "test.csv", table.getvalue())
+    picture = io.BytesIO()
+    draw_results(rows, name, trained_on).savefig(picture, format="png", dpi=130)
+    replace_file(folder / "test.png", picture.getvalue())
 
 
 def draw_results(rows: list[dict], name: str, trained_on):

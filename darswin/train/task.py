@@ -14,8 +14,8 @@ from torchmetrics.classification import MulticlassAccuracy
 
 from darswin.data.mixing import Mixing
 from darswin.lens import Lens
-from darswin.models.files import ModelCard
 from darswin.models.registry import check_model
+from darswin.models.saving import ModelCard
 from darswin.train.recipe import learning_rate, parameter_groups
 
 Batch = tuple[Tensor, Lens, Tensor]

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from darswin.data import LEVELS, warp, warp_map
+from darswin.data import warp, warp_map
 from darswin.lens import Perspective, Polynomial, Spherical
 
 
@@ -66,7 +66,3 @@ def test_one_lens_at_a_time():
     two = Perspective([10.0, 20.0], 1.0)
     with pytest.raises(ValueError, match="one lens each, got 2 and 1"):
         warp(np.zeros((4, 4), np.float32), two, two[0], (4, 4))
-
-
-def test_levels_of_the_paper():
-    assert LEVELS["low"] == (0.2, 0.35) and list(LEVELS) == ["very low", "low", "medium", "high"]

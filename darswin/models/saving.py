@@ -4,14 +4,13 @@ import json
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
-from pathlib import Path
 from typing import Any
 
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
+from safetensors.torch import save
 from torch import Tensor, nn
 
-from darswin.files import replacing
+from darswin.files import replace_file
 from darswin.models.registry import create_model
 
 _ENTRY = "darswin"  # of the metadata
@@ -40,10 +39,8 @@ class ModelCard:
 
 def save_model(path: str | os.PathLike, weights: Mapping[str, Tensor], card: ModelCard) -> None:
     """Writes a model's state dict and its card, replacing what stood there in one go."""
-    path = Path(path)
     contiguous = {name: tensor.detach().cpu().contiguous() for name, tensor in weights.items()}
-    with replacing(path) as temporary:
-        save_file(contiguous, temporary, metadata={_ENTRY: json.dumps(asdict(card))})
+    replace_file(path, save(contiguous, metadata={_ENTRY: json.dumps(asdict(card))}))
 
 
 def load_model(path: str | os.PathLike) -> tuple[nn.Module, ModelCard]:

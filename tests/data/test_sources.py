@@ -1,0 +1,152 @@
+import gzip
+import json
+
+import cv2
+import numpy as np
+import pytest
+
+from darswin.data.sources import BrokenImageError, Part, open_source, read_idx, read_image
+
+
+def write_pictures(root, classes=("cat", "dog"), count=10, size=(6, 8)):
+    """Pictures whose grey level is their number."""
+    for name in classes:
+        (root / name).mkdir(parents=True)
+        for k in range(count):
+            assert cv2.imwrite(str(root / name / f"{k:02}.png"), np.full((*size, 3), k, np.uint8))
+
+
+def levels(source):
+    return [int(source[k][0].max()) for k in range(len(source))]
+
+
+def test_a_plain_folder_is_split_the_same_way_every_time(tmp_path):
+    write_pictures(tmp_path)
+    parts = {s: open_source(tmp_path, s, holdout=0.2) for s in ("train", "val", "test")}
+    assert [len(p) for p in parts.values()] == [12, 4, 4]
+    seen = [
+        (label, level)
+        for p in parts.values()
+        for (_, label), level in zip(p, levels(p), strict=True)
+    ]
+    assert sorted(seen) == [(label, level) for label in (0, 1) for level in range(10)]
+    assert parts["val"].classes == ["cat", "dog"]
+    assert levels(open_source(tmp_path, "val", holdout=0.2)) == levels(parts["val"])
+    image, label = parts["train"][0]
+    assert image.shape == (6, 8, 3) and image.dtype == np.uint8 and label == 0
+
+
+def test_a_folder_of_splits(tmp_path):
+    write_pictures(tmp_path / "train", count=3)
+    write_pictures(tmp_path / "val", count=2)
+    assert [len(open_source(tmp_path, s)) for s in ("train", "val", "test")] == [6, 4, 4]
+    write_pictures(tmp_path / "test", count=1)
+    assert len(open_source(tmp_path, "test")) == 2
+
+
+def test_class_lists_choose_and_order(tmp_path):
+    write_pictures(tmp_path, ("a", "b", "c"))
+    (tmp_path / "classes.txt").write_text("c\na\n")
+    (tmp_path / "classes.json").write_text('["c", "a"]')
+    for name in ("classes.txt", "classes.json"):
+        source = open_source(tmp_path, "train", classes=tmp_path / name)
+        assert source.classes == ["c", "a"] and len(source) == 16
+        assert source.paths[0].startswith(b"c/") and source[0][1] == 0
+    (tmp_path / "classes.txt").write_text("c\nz\n")
+    with pytest.raises(FileNotFoundError, match=r"classes \['z'\]"):
+        open_source(tmp_path, "train", classes=tmp_path / "classes.txt")
+
+
+def test_lists_of_splits(tmp_path):
+    write_pictures(tmp_path / "pictures")
+    lists = {"train": ["dog/01.png", "cat/02.png"], "val": ["cat/03.png"], "test": []}
+    (tmp_path / "splits.json").write_text(json.dumps(lists))
+    (tmp_path / "lists").mkdir()
+    for name, paths in lists.items():
+        (tmp_path / "lists" / f"{name}.txt").write_text("\n".join(paths))
+    for splits in (tmp_path / "splits.json", tmp_path / "lists"):
+        train = open_source(tmp_path / "pictures", "train", splits=splits)
+        assert [train[k][1] for k in range(2)] == [1, 0] and levels(train) == [1, 2]
+        assert levels(open_source(tmp_path / "pictures", "val", splits=splits)) == [3]
+        with pytest.raises(FileNotFoundError, match="no images for the 'test' split"):
+            open_source(tmp_path / "pictures", "test", splits=splits)
+
+
+def write_idx(path, array):
+    head = b"\0\0\x08" + bytes([array.ndim]) + np.array(array.shape, ">u4").tobytes()
+    data = head + array.tobytes()
+    path.write_bytes(gzip.compress(data) if path.suffix == ".gz" else data)
+
+
+@pytest.mark.parametrize("suffix", ["", ".gz"])
+def test_idx_files(tmp_path, suffix):
+    rng = np.random.default_rng(0)
+    arrays = {}
+    for part, count in (("train", 20), ("t10k", 5)):
+        arrays[part] = rng.integers(256, size=(count, 28, 28), dtype=np.uint8)
+        write_idx(tmp_path / f"{part}-images-idx3-ubyte{suffix}", arrays[part])
+        labels = (np.arange(count) % 10).astype(np.uint8)
+        write_idx(tmp_path / f"{part}-labels-idx1-ubyte{suffix}", labels)
+    train, val, test = (open_source(tmp_path, s, channels=1) for s in ("train", "val", "test"))
+    assert (len(train), len(val), len(test)) == (18, 2, 5) and len(train.classes) == 10
+    image, label = val[1]
+    assert np.array_equal(image[..., 0], arrays["train"][19]) and label == 9
+    assert np.array_equal(test[4][0][..., 0], arrays["t10k"][4])
+    assert open_source(tmp_path, "test")[0][0].shape == (28, 28, 3)
+
+
+def test_a_cut_idx_file_is_named(tmp_path):
+    write_idx(tmp_path / "a", np.zeros((4, 3, 3), np.uint8))
+    whole = (tmp_path / "a").read_bytes()
+    (tmp_path / "a").write_bytes(whole[:-1])
+    with pytest.raises(ValueError, match=r"a says it holds \[4, 3, 3\] bytes, but holds 35"):
+        read_idx(tmp_path / "a")
+    (tmp_path / "a").write_bytes(b"GIF89a")
+    with pytest.raises(ValueError, match="a is no IDX file"):
+        read_idx(tmp_path / "a")
+
+
+def test_digits():
+    parts = [open_source("digits", s, channels=1) for s in ("train", "val", "test")]
+    assert sum(len(p) for p in parts) == 1797 and all(len(p) > 180 for p in parts)
+    assert parts[0][0][0].shape == (8, 8, 1) and max(levels(parts[0])) == 255
+
+
+def test_a_part_is_a_sample_of_the_whole():
+    whole = open_source("digits", "train", channels=1)
+    part = Part(whole, 50)
+    assert len(part) == 50 and len({part[k][1] for k in range(50)}) == 10
+
+
+@pytest.mark.parametrize("content", [b"", b"no picture", None])
+def test_a_broken_picture_is_named(tmp_path, content):
+    if content is not None:
+        (tmp_path / "x.jpg").write_bytes(content)
+    with pytest.raises(BrokenImageError, match=r"cannot read .*x\.jpg"):
+        read_image(tmp_path / "x.jpg")
+
+
+def test_grey_and_colour_files(tmp_path):
+    colour = np.zeros((4, 5, 3), np.uint8)
+    colour[..., 2] = 200  # OpenCV's order: red
+    cv2.imwrite(str(tmp_path / "c.png"), colour)
+    assert read_image(tmp_path / "c.png")[0, 0].tolist() == [200, 0, 0]
+    assert read_image(tmp_path / "c.png", 1).shape == (4, 5, 1)
+    cv2.imwrite(str(tmp_path / "g.png"), colour[..., 2])
+    assert read_image(tmp_path / "g.png")[0, 0].tolist() == [200, 200, 200]
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [(dict(split="fit"), "split must be"), (dict(split="val", holdout=0.5), "holdout must be")],
+)
+def test_wrong_options(options, message):
+    with pytest.raises(ValueError, match=message):
+        open_source("digits", **options)
+
+
+def test_no_folder(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"no folder .*nowhere"):
+        open_source(tmp_path / "nowhere", "train")
+    with pytest.raises(FileNotFoundError, match="no images for the 'train' split"):
+        open_source(tmp_path, "train")

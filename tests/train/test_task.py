@@ -1,0 +1,42 @@
+import pytest
+import torch
+import torch.nn.functional as F
+
+from darswin.train.task import Classification, metrics, soft_cross_entropy
+
+
+def test_the_loss_is_torch_s_where_torch_has_it():
+    logits, labels = torch.randn(6, 4), torch.tensor([0, 1, 2, 3, 1, 1])
+    targets = Classification("darswin_a_nano", label_smoothing=0.1)._targets(labels, 4)
+    expected = F.cross_entropy(logits, labels, label_smoothing=0.1)
+    torch.testing.assert_close(soft_cross_entropy(logits, targets), expected)
+
+
+def test_a_broken_picture_weighs_nothing():
+    task = Classification("darswin_a_nano", label_smoothing=0.1)
+    logits = torch.randn(2, 4, requires_grad=True)
+    soft_cross_entropy(logits, task._targets(torch.tensor([2, -1]), 4)).backward()
+    assert (logits.grad[1] == 0).all() and (logits.grad[0] != 0).all()
+
+
+def test_metrics_count_images():
+    measured = metrics(10)
+    logits = torch.zeros(4, 10)
+    logits[torch.arange(4), torch.tensor([1, 2, 3, 4])] = 1
+    logits[2, 3] = -1  # last of all
+    measured["top1"].update(logits, torch.tensor([1, 2, 3, 5]))
+    assert measured["top1"].compute() == 0.5
+    assert metrics(3)["top5"].top_k == 3
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (dict(model="resnet"), "unknown model 'resnet'"),
+        (dict(label_smoothing=1.0), "label_smoothing"),
+        (dict(mixup=-1.0), "mixing needs"),
+    ],
+)
+def test_wrong_options(options, message):
+    with pytest.raises(ValueError, match=message):
+        Classification(**options)
