@@ -38,12 +38,15 @@ def _run(command: str, argv: list[str]) -> None:
 
         run_command(argv)
         return
-    from jsonargparse import auto_cli
-
     if command == "predict":
+        from jsonargparse import ArgumentParser
+
         from darswin.predict import predict
 
-        auto_cli(predict, args=argv[1:], prog="darswin predict", as_positional=True)
+        parser = ArgumentParser(prog="darswin predict", description=predict.__doc__.split("\n")[0])
+        parser.add_argument("pictures", nargs="+", type=str, help="image files")
+        parser.add_function_arguments(predict, skip={"pictures"})
+        predict(**parser.parse_args(argv[1:]).as_dict())
     else:
         from darswin.models import list_models
 

@@ -24,13 +24,14 @@ def predict(
 
     Args:
         pictures: image files.
-        lens: the camera's lens, in pixels of the pictures, as JSON or the name of a JSON file: e.g.
-            '{"model": "Spherical", "xi": 0.5, "focal": 300, "theta_max": 1.5}', or with "fov" (rad)
-                in place of
-            "focal" and "theta_max" where the field of view fills the circle inside the picture.
+        lens: the camera's lens, in pixels of the pictures, as JSON or the name of a JSON file:
+            {"model": "Spherical", "xi": 0.5, "focal": 300, "theta_max": 1.5}, or with "fov" (rad)
+                in
+            place of the last two where the field of view fills the circle inside the picture.
         run: the folder of a run, whose best model is taken.
         model: a model's safetensors file, instead.
-        top: how many classes. out: a JSON file; None prints them.
+        top: how many classes.
+        out: a JSON file to write; without it, the classes are printed.
     """
     if (run is None) == (model is None):
         raise ValueError(

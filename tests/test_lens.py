@@ -236,3 +236,14 @@ def test_pickle_copy_and_pytree(name):
     leaves, spec = pytree.tree_flatten(lens)
     assert torch.equal(pytree.tree_unflatten(leaves, spec).r_max, lens.r_max)
     assert type(lens).__name__ in repr(lens)
+
+
+@pytest.mark.parametrize("center", [None, [20.0, 11.0]])
+def test_a_resized_lens_projects_to_the_resized_image(center):
+    lens = Spherical(0.4, 30.0, 1.3, center=center)
+    half = lens.resized(0.5)
+    assert half.project(1.0).item() == pytest.approx(lens.project(1.0).item() / 2)
+    # Pixel centres are integers: the corner at -1/2 stays where it is.
+    middle, before = half.center_in((15, 20))[0], lens.center_in((30, 40))[0]
+    assert torch.allclose(middle + 0.5, (before + 0.5) / 2)
+    assert Polynomial([5.0, 1.0], 1.0).resized(2).coefficients.tolist() == [[10.0, 2.0]]

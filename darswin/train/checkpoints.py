@@ -1,6 +1,7 @@
 """Checkpoints that no kill and no full disk spoils, their weights as safetensors beside them."""
 
 import io
+import pickle
 from pathlib import Path
 from typing import Any
 
@@ -20,13 +21,12 @@ class SafeCheckpointIO(TorchCheckpointIO):
         content = io.BytesIO()
         torch.save(checkpoint, content)
         replace_file(path, content.getvalue())
-        if "darswin" in checkpoint:
-            weights = {
-                name.removeprefix("net."): tensor
-                for name, tensor in checkpoint["state_dict"].items()
-                if name.startswith("net.")
-            }
-            save_model(_weights(path), weights, ModelCard(**checkpoint["darswin"]))
+        weights = {
+            name.removeprefix("net."): tensor
+            for name, tensor in checkpoint["state_dict"].items()
+            if name.startswith("net.")
+        }
+        save_model(_weights(path), weights, ModelCard(**checkpoint["darswin"]))
 
     def remove_checkpoint(self, path: str) -> None:
         super().remove_checkpoint(path)
@@ -37,7 +37,13 @@ class SafeCheckpointIO(TorchCheckpointIO):
     ) -> dict[str, Any]:
         if not Path(path).is_file():
             raise FileNotFoundError(f"no checkpoint {path}")
-        return torch.load(path, map_location=map_location, weights_only=True)
+        try:
+            checkpoint = torch.load(path, map_location=map_location, weights_only=True)
+        except (pickle.UnpicklingError, RuntimeError, EOFError) as error:
+            raise ValueError(f"{path} is no checkpoint that can be read safely: {error}") from error
+        if "darswin" not in checkpoint:
+            raise ValueError(f"{path} is no checkpoint of `darswin fit`: it names no model")
+        return checkpoint
 
 
 def _weights(path: str) -> Path:

@@ -6,10 +6,11 @@ the logs `csv/` and `tensorboard/`, and `test.{csv,json,png}`.
 
 import argparse
 import os
+import warnings
 from pathlib import Path
 
 from lightning.pytorch import Trainer
-from lightning.pytorch.callbacks import LearningRateMonitor, ModelCheckpoint
+from lightning.pytorch.callbacks import ModelCheckpoint
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI, SaveConfigCallback
 from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
 
@@ -25,6 +26,8 @@ PRESETS = Path(__file__).parent / "presets"
 
 def run_command(argv: list[str]) -> None:
     """Runs `fit`, `validate` or `test`, the first of `argv`, with the others as its options."""
+    # The arguments are the command line's own, with the run's configuration added.
+    warnings.filterwarnings("ignore", "LightningCLI's args parameter")
     RunCLI(
         Classification,
         WideAngleData,
@@ -89,6 +92,9 @@ class RunCLI(LightningCLI):
         parser.link_arguments("seed_everything", "data.seed", compute_fn=int)
         parser.link_arguments("seed_everything", "model.seed", compute_fn=int)
 
+    def _parse_ckpt_path(self) -> None:
+        """Lightning looks for options in checkpoints here; a run has them in its folder."""
+
     def before_instantiate_classes(self) -> None:
         config = self.config[self.subcommand]
         self.folder = Path(config.run)
@@ -132,8 +138,13 @@ class RunCLI(LightningCLI):
             return [WriteResults(self.folder)] if self.subcommand == "test" else []
         kept = dict(dirpath=self.folder / "checkpoints", enable_version_counter=False)
         return [
-            LearningRateMonitor("step"),
-            ModelCheckpoint(filename="best", monitor="val/top1", mode="max", **kept),
+            ModelCheckpoint(
+                filename="best",
+                monitor="val/top1",
+                mode="max",
+                save_on_train_epoch_end=False,
+                **kept,
+            ),
             ModelCheckpoint(filename="last", every_n_train_steps=steps, **kept),
             ModelCheckpoint(filename="last", save_on_train_epoch_end=True, **kept),
         ]
@@ -149,7 +160,7 @@ class SaveRunConfig(SaveConfigCallback):
         if stage != "fit":
             return
         config = self.config.clone()
-        for name in ("config", "run", "resume", "xi", "devices", "ckpt_path"):
+        for name in ("config", "resume", "xi", "devices", "ckpt_path"):
             config.pop(name, None)
-        text = self.parser.dump(config, skip_none=False, skip_check=True)
+        text = self.parser.dump(config, skip_none=False)
         replace_file(Path(trainer.default_root_dir) / "config.yaml", text)

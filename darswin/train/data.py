@@ -20,28 +20,30 @@ class WideAngleData(LightningDataModule):
     Args:
         path: a folder of images, a folder of IDX files, or "digits": see
             `darswin.data.open_source`.
-        train_lenses: what training sees: a level of the paper ("very low", "low", "medium",
-            "high"), one ξ ("0.4"), a range ("0.2..0.35"), or "polynomial". Validation has the same
-            distribution.
+        train_lenses: what training and validation go through: a level of the paper ("very low",
+            "low", "medium", "high"), one ξ ("0.4"), a range ("0.2..0.35"), or "polynomial".
         test_lenses: what testing goes through, one after the other: such names, or a sweep
             "0:1:0.1".
-        size: px, H = W of the images. render: px, what they are reduced from.
+        size: px, H = W of the images.
+        render: px, what they are reduced from.
         fov_deg: degrees, the field of view that a picture's width spans, and that of every lens.
-        fit: how a picture becomes a square, "crop" or "stretch".
+        fit: how a picture becomes a square, cut or squashed.
         picture_size: px, the width that larger pictures are first reduced to.
-        channels: 3 or 1.
-        mean, std: of the pixels in [0, 1], per channel; None means ImageNet's.
-        classes: a file with the names of the classes. splits: a file or folder that says which
-            picture is in which split. holdout: the share for validation, and for testing, where
-            nothing says so.
+        channels: of the images, grey or colour.
+        mean: of the pixels in [0, 1], per channel; null means ImageNet's.
+        std: of the pixels, likewise.
+        classes: a file with the names of the classes.
+        splits: a file or folder that says which picture is in which split.
+        holdout: the share for validation, and for testing, where nothing says so.
         limit: at most so many pictures of each split.
         batch_size: of one process.
         workers: processes that read and warp; 0 does it in the training process.
-        randaugment: changes colours in training. erasing: how often a box is erased in training.
+        randaugment: changes colours in training.
+        erasing: how often a box of an image is erased in training.
         pair_lenses: gives both images of a mixture the same lens, so that the mixture is an image
-            through one lens. False is the authors' code: the mixed-in image is taken for one
+            through one lens. False is the authors' code, which takes the mixed-in image for one
             through the other's lens.
-        seed: of the shuffles, lenses and augmentation. Test sets depend on it, too.
+        seed: of the shuffles, lenses and augmentation, those of the test sets among them.
         skip_broken: counts files that are no images, instead of stopping at the first.
     """
 

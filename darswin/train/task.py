@@ -27,23 +27,27 @@ class Classification(LightningModule):
     Learning rates are those of `reference_batch` images a step and grow in proportion to the batch.
 
     Args:
-        model: a name that `darswin.list_models()` gives. options: options of the model, e.g.
-            `{spacing: tan, jitter: 0}`.
-        learning_rate, warmup_rate, final_rate: its peak, start and end.
+        name: of a model, one that `darswin models` lists.
+        options: of the model, e.g. {spacing: tan, jitter: 0}.
+        learning_rate: its peak.
+        warmup_rate: what it starts from.
+        final_rate: what it ends at.
         warmup_epochs: of linear warm-up; may be a fraction.
-        weight_decay: AdamW's. decay_position_bias: decays position biases too, as the authors' code
-            does.
+        weight_decay: AdamW's.
+        decay_position_bias: decays position biases too, as the authors' code does.
         label_smoothing: in [0, 1).
-        mixup, cutmix: α of Beta(α, α), 0 is off. mix_p: the share of batches that are mixed.
+        mixup: α of Beta(α, α) that the shares of two images are drawn from; 0 is off.
+        cutmix: α of the share that a box of another image leaves; 0 is off.
+        mix_p: the share of batches that are mixed.
         reference_batch: images that the rates are meant for.
-        seed: of jitter, drop path and mixing.
+        seed: of the weights, jitter, drop path and mixing.
 
     Source: the recipe of DarSwin, ICCV 2023, sec. 5.2, and of its released code.
     """
 
     def __init__(
         self,
-        model: str = "darswin_a_micro",
+        name: str = "darswin_a_micro",
         options: dict[str, Any] | None = None,
         *,
         learning_rate: float = 5e-4,
@@ -60,10 +64,10 @@ class Classification(LightningModule):
         seed: int = 0,
     ):
         super().__init__()
-        check_model(model)
+        check_model(name)
         if not 0 <= label_smoothing < 1:
             raise ValueError(f"label_smoothing must be in [0, 1), got {label_smoothing}")
-        self.model, self.options = model, options or {}
+        self.name, self.options = name, options or {}
         self.rates = dict(peak=learning_rate, warmup=warmup_rate, final=final_rate)
         self.warmup_epochs, self.reference_batch = warmup_epochs, reference_batch
         self.weight_decay, self.decay_position_bias = weight_decay, decay_position_bias
@@ -81,7 +85,7 @@ class Classification(LightningModule):
         data = self.trainer.datamodule
         options = dict(num_classes=len(data.classes), in_chans=data.channels)
         options |= dict(mean=data.mean, std=data.std) | self.options
-        self.card = ModelCard(self.model, options, data.classes, data.size, data.fov)
+        self.card = ModelCard(self.name, options, data.classes, data.size, data.fov)
         torch.manual_seed(self.seed)
         self.net = self.card.create()
         count = len(data.classes)
@@ -118,8 +122,6 @@ class Classification(LightningModule):
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """ValueError where the checkpoint is not one of this model."""
-        if "darswin" not in checkpoint:
-            raise ValueError("this is no checkpoint of `darswin fit`: it has no model's name in it")
         theirs, ours = (
             {**card, **card.pop("options")}
             for card in (checkpoint["darswin"].copy(), asdict(self.card))
@@ -153,6 +155,7 @@ class Classification(LightningModule):
                 "smaller learning rate; the last checkpoint is from before"
             )
         self.log("train/loss", loss, prog_bar=True, batch_size=len(images), sync_dist=True)
+        self.log("train/rate", self.lr_schedulers().get_last_lr()[0])
         return loss
 
     def _targets(self, labels: Tensor, classes: int) -> Tensor:

@@ -32,7 +32,7 @@ def test_metrics_count_images():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (dict(model="resnet"), "unknown model 'resnet'"),
+        (dict(name="resnet"), "unknown model 'resnet'"),
         (dict(label_smoothing=1.0), "label_smoothing"),
         (dict(mixup=-1.0), "mixing needs"),
     ],

@@ -1,0 +1,85 @@
+"""What goes wrong is said in one line, before any work."""
+
+import re
+
+import pytest
+import torch
+import yaml
+
+from darswin.__main__ import COMMANDS, main
+from darswin.train.cli import PRESETS, with_configs
+
+DIGITS = ["--config", "minutes", "--data.path", "digits", "--trainer.logger", "false"]
+
+
+def error(capsys, *argv) -> str:
+    with pytest.raises(SystemExit) as caught:
+        main([str(arg) for arg in argv])
+    assert caught.value.code != 0
+    return f"{caught.value.code}{capsys.readouterr().err}"
+
+
+def test_help_names_every_command(capsys):
+    main(["--help"])
+    shown = capsys.readouterr().out
+    assert all(re.search(rf"^  {name} ", shown, re.M) for name in COMMANDS)
+    main(["models"])
+    assert "darswin_a_small" in capsys.readouterr().out.split()
+
+
+def test_unknown_things(capsys, tmp_path):
+    assert "no command 'train'" in error(capsys, "train")
+    run = ["fit", "--run", tmp_path / "r"]
+    assert "model.speed" in error(capsys, *run, *DIGITS, "--model.speed", "9")
+    assert "unknown model 'resnet'" in error(capsys, *run, *DIGITS, "--model.name", "resnet")
+    assert "lenses must be one of" in error(capsys, *run, *DIGITS, "--data.train_lenses", "odd")
+    assert "no folder" in error(capsys, *run, *DIGITS, "--data.path", tmp_path / "nothing")
+    assert "run" in error(capsys, "fit", *DIGITS)
+
+
+def test_a_run_is_not_overwritten(capsys, tmp_path):
+    (tmp_path / "checkpoints").mkdir()
+    (tmp_path / "checkpoints" / "last.ckpt").write_bytes(b"")
+    assert "holds a run already" in error(capsys, "fit", "--run", tmp_path, *DIGITS)
+
+
+def test_a_checkpoint_of_another_model(capsys, tmp_path):
+    fit = ["fit", "--run", tmp_path, *DIGITS, "--trainer.max_steps", "1"]
+    fit += ["--data.limit", "48", "--trainer.enable_progress_bar", "false", "--data.workers", "0"]
+    main([str(a) for a in fit])
+    before = (tmp_path / "checkpoints" / "last.ckpt").read_bytes()
+    options = ["--resume", "--model.options", "{embed_dim: 12}"]
+    message = error(capsys, *fit, *options)
+    assert "another model" in message and "embed_dim None there, 12 here" in message
+    assert (tmp_path / "checkpoints" / "last.ckpt").read_bytes() == before
+    torch.save({"state_dict": {}}, tmp_path / "other.ckpt")
+    message = error(capsys, "test", "--run", tmp_path, "--ckpt_path", tmp_path / "other.ckpt")
+    assert "no checkpoint of `darswin fit`" in message
+    (tmp_path / "other.ckpt").write_bytes(b"\x80\x02cos\nsystem\n(S'touch owned'\ntR.")
+    error(capsys, "test", "--run", tmp_path, "--ckpt_path", tmp_path / "other.ckpt")
+    assert "no checkpoint" in error(capsys, "test", "--run", tmp_path, "--ckpt_path", "none.ckpt")
+
+
+def test_presets_and_a_run_s_own_configuration(tmp_path):
+    preset = str(PRESETS / "iccv2023.yaml")
+    assert with_configs(["fit", "--config", "iccv2023", "--run", "r", "--x", "1"]) == [
+        "fit", f"--config={preset}", "--x", "1", "--run", "r",
+    ]  # fmt: skip
+    own = tmp_path / "config.yaml"
+    own.write_text("")
+    run = ["--run", str(tmp_path)]
+    assert with_configs(["test", *run]) == ["test", f"--config={own}", *run]
+    assert with_configs(["fit", *run]) == ["fit", *run]
+    assert with_configs(["fit", *run, "--resume"]) == [
+        "fit", f"--config={own}", *run, "--resume=true",
+    ]  # fmt: skip
+
+
+def test_the_paper_s_preset_holds_the_recipe():
+    preset = yaml.safe_load((PRESETS / "iccv2023.yaml").read_text())
+    model, data = preset["model"], preset["data"]
+    assert preset["trainer"] == {"max_epochs": 600, "gradient_clip_val": 5.0}
+    assert (model["learning_rate"], model["warmup_rate"], model["final_rate"]) == (5e-4, 5e-7, 5e-6)
+    assert (model["warmup_epochs"], model["weight_decay"]) == (20, 0.05)
+    assert (model["mixup"], model["cutmix"], model["label_smoothing"]) == (0.8, 1.0, 0.1)
+    assert (data["batch_size"], data["erasing"], data["size"]) == (128, 0.25, 64)
