@@ -5,7 +5,7 @@ import torch
 
 from darswin import DarSwin, PolarSample, create_model, list_models
 from darswin.lens import Perspective, Polynomial, Spherical
-from darswin.models.darswin import plan_stages
+from darswin.models.stages import plan_stages
 from darswin.ops import use_reference
 
 LENS = Spherical.from_fov([0.2, 0.9], 2.6, 16.0)
