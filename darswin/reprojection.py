@@ -46,18 +46,21 @@ def reproject(images: Tensor, source: Lens, target: Lens, size: tuple[int, int])
     Runs on the images' device. Gradients go to the images and both lenses.
 
     Args:
-        images: (B, C, H, W), taken with `source`. source, target: B lenses each, or one.
+        images: (B, C, H, W), floating point, taken with `source`.
+        source, target: B lenses each, or one.
         size: (H', W') of the view.
 
     Returns:
         (B, C, H', W').
     """
     height, width = images.shape[2:]
-    there = reprojection(source, (height, width), target, size).to(images.device, images.dtype)
+    exact = torch.promote_types(images.dtype, torch.float32)  # half a pixel is lost in bfloat16
+    there = reprojection(source, (height, width), target, size).to(images.device, exact)
     # -1 and 1 are the image's edges, half a pixel beyond the centres of its outermost pixels.
     places = (2 * there + 1) / there.new_tensor((width, height)) - 1
     places = places.expand(images.shape[0], -1, -1, -1)
-    return F.grid_sample(images, places, padding_mode="zeros", align_corners=False)
+    view = F.grid_sample(images.to(exact), places, padding_mode="zeros", align_corners=False)
+    return view.to(images.dtype)
 
 
 def perspective_view(lens: Lens, size: tuple[int, int], max_fov: float) -> Perspective:

@@ -50,6 +50,9 @@ def test_reproject_of_many():
     for k in range(2):
         alone = reproject(images[k : k + 1], source[k], target, (16, 18))
         torch.testing.assert_close(together[k : k + 1], alone)
+    half = reproject(images.bfloat16(), source, target, (16, 18))
+    assert half.dtype == torch.bfloat16
+    torch.testing.assert_close(half.float(), together, rtol=0, atol=0.01)
     assert reproject(images[:0], source[:0], target, (16, 18)).shape == (0, 3, 16, 18)
     corner = math.hypot(7.5, 8.5)
     assert corner > 8.0 and not together[..., 0, 0].any()  # beyond θ_max

@@ -83,6 +83,13 @@ def test_the_lens_is_ignored():
     assert torch.equal(model(x, LENS), model(x, None)) and torch.equal(model(x, LENS), model(x))
 
 
+@pytest.mark.parametrize("name", ["dat_micro"])
+def test_the_micro_models_run(name):
+    model = create_model(name, num_classes=7).eval()
+    with torch.no_grad():
+        assert model(images(1, 64, 64), Spherical.from_fov(0.5, 2.0, 32.0)).shape == (1, 7)
+
+
 def test_features_intermediates_and_head():
     model = nano().eval()
     x = images()

@@ -51,6 +51,12 @@ def test_stages_of_the_small_model():
     ]
 
 
+def test_stochastic_depth_rises_from_block_to_block():
+    model = nano(drop_path_rate=0.3)
+    rates = [block.drop_path.p for stage in model.stages for block in stage.blocks]
+    assert rates == pytest.approx([0.0, 0.1, 0.2, 0.3])
+
+
 @pytest.mark.parametrize("size", ["tiny", "micro", "nano"])
 def test_as_many_tokens_as_darswin(size):
     with torch.device("meta"):
@@ -93,6 +99,13 @@ def test_no_axis_wraps():
     (grad,) = torch.autograd.grad(shifted(x)[0, 0, 0].sum(), x)
     seen = grad[0].ne(0).any(-1)
     assert seen[:2, :2].all() and seen.sum() == 4
+
+
+@pytest.mark.parametrize("name", ["swin_micro", "swin_undis_micro"])
+def test_the_micro_models_run(name):
+    model = create_model(name, num_classes=7).eval()
+    with torch.no_grad():
+        assert model(images(1, 64, 64), Spherical.from_fov(0.5, 2.0, 32.0)).shape == (1, 7)
 
 
 def test_features_intermediates_and_head():
