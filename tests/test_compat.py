@@ -408,8 +408,12 @@ def test_files_that_are_no_checkpoints(content, tmp_path):
     (tmp_path / "checkpoint.pth").write_bytes(content)
     with pytest.raises(ValueError, match=r"checkpoint\.pth cannot be read as a checkpoint"):
         read_state(tmp_path / "checkpoint.pth")
-    with pytest.raises(FileNotFoundError):
-        read_state(tmp_path / "another.pth")
+    (tmp_path / "model.safetensors").write_bytes(content)
+    with pytest.raises(ValueError, match=r"model\.safetensors cannot be read as safetensors"):
+        read_state(tmp_path / "model.safetensors")
+    for name in ("another.pth", "another.safetensors"):
+        with pytest.raises(FileNotFoundError):
+            read_state(tmp_path / name)
 
 
 def test_a_failed_conversion_leaves_the_target_as_it_was(tmp_path, monkeypatch):

@@ -10,6 +10,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import torch
+from safetensors import SafetensorError
 from safetensors.torch import load_file, save
 from torch import Tensor
 
@@ -36,7 +37,10 @@ def read_state(source: Source) -> dict[str, Tensor]:
         return _model(source)
     path = Path(source)
     if path.suffix == ".safetensors":
-        return load_file(path)
+        try:
+            return load_file(path)
+        except SafetensorError as error:
+            raise ValueError(f"{path} cannot be read as safetensors: {error}") from error
     return _model(_unpickled(path), path)
 
 
@@ -55,7 +59,10 @@ def convert_checkpoint(source: str | os.PathLike, target: str | os.PathLike) -> 
     source, target = Path(source), Path(target)
     checkpoint = _unpickled(source)
     # Copies: safetensors takes no tensors that share memory.
-    state = {name: value.clone().contiguous() for name, value in _model(checkpoint, source).items()}
+    state = {
+        name: value.clone(memory_format=torch.contiguous_format)
+        for name, value in _model(checkpoint, source).items()
+    }
     metadata = {"format": "pt"}
     with contextlib.suppress(TypeError, ValueError, KeyError):
         metadata["config"] = json.dumps(checkpoint["config"])
@@ -76,11 +83,12 @@ def _unpickled(path: Path) -> object:
     except Exception as error:  # a file that is no checkpoint may fail in any way
         found = re.search(r"GLOBAL (\S+)", str(error))
         if not isinstance(error, pickle.UnpicklingError) or not found:
-            raise ValueError(f"{path} cannot be read as a checkpoint: {error}") from error
+            raise ValueError(f"{path} cannot be read as a checkpoint") from error
+        # Without torch's own message, which advises to load the file all the same.
         raise ValueError(
             f"{path} is refused, and nothing in it was executed: it asks for {found[1]}, which no "
             "state dict needs"
-        ) from error
+        ) from None
 
 
 def _model(checkpoint: object, path: Path | None = None) -> dict[str, Tensor]:

@@ -6,15 +6,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from darswin.layers import (
-    PatchProjection,
-    Pixels,
-    RelativeTable,
-    WindowAttention,
-    check_heads,
-)
-from darswin.models.encoder import ImageEncoder, map_size
-from darswin.models.stages import Pair, StagePlan, check_depths, make_stages, plan_stages
+from darswin.layers import PatchProjection, RelativeTable, WindowAttention, check_heads
+from darswin.models.encoder import ImageEncoder
+from darswin.models.stages import Pair, StagePlan
 
 
 class DeformableAttention(nn.Module):
@@ -145,8 +139,6 @@ class DAT(ImageEncoder):
         mean: float | Sequence[float] = 0.0,
         std: float | Sequence[float] = 1.0,
     ):
-        super().__init__()
-        check_depths(depths, num_heads)
         if not len(blocks) == len(groups) == len(depths):
             raise ValueError(
                 f"blocks and groups must have one entry a stage, {len(depths)}, "
@@ -154,10 +146,6 @@ class DAT(ImageEncoder):
             )
         if not all(blocks) or not set("".join(blocks)) <= set("LSD"):
             raise ValueError(f"blocks must be of the kinds 'L', 'S' and 'D', got {blocks}")
-        size, tokens = map_size(image_size, patch_size)
-        self.num_features = embed_dim * 2 ** (len(depths) - 1)
-        self.pixels = Pixels(size, in_chans, mean, std)
-        self.patch_embed = PatchProjection(in_chans, embed_dim, patch_size)
 
         def attention(dim: int, heads: int, plan: StagePlan, block: int) -> nn.Module:
             kinds = blocks[plan.index]
@@ -176,14 +164,19 @@ class DAT(ImageEncoder):
                 dim, heads, map_size=plan.map_size, window=plan.window, shift=shift
             )
 
-        self.stages = make_stages(
-            plan_stages(*tokens, len(depths), "RA", window),
+        super().__init__(
+            num_classes,
+            in_chans,
             embed_dim,
             depths,
             num_heads,
-            attention=attention,
-            downsample=lambda dim, _plan: PatchProjection(dim, 2 * dim, 2, bias=False),
+            image_size=image_size,
+            patch_size=patch_size,
+            window=window,
             mlp_ratio=mlp_ratio,
             drop_path_rate=drop_path_rate,
+            mean=mean,
+            std=std,
+            attention=attention,
+            downsample=lambda dim, _plan: PatchProjection(dim, 2 * dim, 2, bias=False),
         )
-        self._finish(num_classes)

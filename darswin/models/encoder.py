@@ -4,8 +4,9 @@ from collections.abc import Sequence
 
 from torch import Tensor, nn
 
-from darswin.layers import Pixels
+from darswin.layers import PatchProjection, Pixels
 from darswin.lens import Lens
+from darswin.models.stages import Pair, check_depths, make_stages, plan_stages
 
 
 class Encoder(nn.Module):
@@ -82,14 +83,40 @@ class Encoder(nn.Module):
 class ImageEncoder(Encoder):
     """Base of the models that see images of one size as they are, and need no lens.
 
-    A model makes `patch_embed` too: (B, H, W, C) → the first stage's map.
+    Args:
+        attention, downsample: as `make_stages`. Others: as `Swin`.
     """
 
-    pixels: Pixels
-    patch_embed: nn.Module
+    def __init__(
+        self,
+        num_classes: int,
+        in_chans: int,
+        embed_dim: int,
+        depths: Sequence[int],
+        num_heads: Sequence[int],
+        *,
+        image_size: int | Pair,
+        patch_size: int,
+        window: Pair,
+        mean: float | Sequence[float],
+        std: float | Sequence[float],
+        **stages,
+    ):
+        super().__init__()
+        check_depths(depths, num_heads)
+        size = (image_size, image_size) if isinstance(image_size, int) else tuple(image_size)
+        if any(side < 1 or side % patch_size for side in size):
+            raise ValueError(f"patch_size must divide image_size = {size}, got {patch_size}")
+        plans = plan_stages(*(side // patch_size for side in size), len(depths), "RA", window)
+        self.num_features = embed_dim * 2 ** (len(depths) - 1)
+        self.in_chans = in_chans
+        self.pixels = Pixels(size, in_chans, mean, std)
+        self.patch_embed = PatchProjection(in_chans, embed_dim, patch_size)
+        self.stages = make_stages(plans, embed_dim, depths, num_heads, **stages)
+        self._finish(num_classes)
 
     @property
-    def image_size(self) -> tuple[int, int]:
+    def image_size(self) -> Pair:
         """(H, W) that images must have."""
         return self.pixels.image_size
 
@@ -105,14 +132,6 @@ class ImageEncoder(Encoder):
             x = stage(x)
             maps.append(x)
         return maps
-
-
-def map_size(image_size: int | tuple[int, int], patch_size: int) -> tuple[tuple[int, int], ...]:
-    """The image's (H, W) and its map's; ValueError where patches do not divide the image."""
-    size = (image_size, image_size) if isinstance(image_size, int) else tuple(image_size)
-    if any(side < 1 or side % patch_size for side in size):
-        raise ValueError(f"patch_size must divide image_size = {size}, got {patch_size}")
-    return size, (size[0] // patch_size, size[1] // patch_size)
 
 
 def _init_weights(module: nn.Module) -> None:

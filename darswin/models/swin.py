@@ -5,10 +5,10 @@ from collections.abc import Sequence
 
 from torch import Tensor
 
-from darswin.layers import PatchProjection, Pixels, WindowAttention, check_lens
+from darswin.layers import WindowAttention, check_lens
 from darswin.lens import Lens
-from darswin.models.encoder import ImageEncoder, map_size
-from darswin.models.stages import Pair, check_depths, make_stages, plan_stages
+from darswin.models.encoder import ImageEncoder
+from darswin.models.stages import Pair
 from darswin.reprojection import perspective_view, reproject
 
 
@@ -46,24 +46,23 @@ class Swin(ImageEncoder):
         mean: float | Sequence[float] = 0.0,
         std: float | Sequence[float] = 1.0,
     ):
-        super().__init__()
-        check_depths(depths, num_heads)
-        size, tokens = map_size(image_size, patch_size)
-        self.num_features = embed_dim * 2 ** (len(depths) - 1)
-        self.pixels = Pixels(size, in_chans, mean, std)
-        self.patch_embed = PatchProjection(in_chans, embed_dim, patch_size)
-        self.stages = make_stages(
-            plan_stages(*tokens, len(depths), "RA", window),
+        super().__init__(
+            num_classes,
+            in_chans,
             embed_dim,
             depths,
             num_heads,
+            image_size=image_size,
+            patch_size=patch_size,
+            window=window,
+            mlp_ratio=mlp_ratio,
+            drop_path_rate=drop_path_rate,
+            mean=mean,
+            std=std,
             attention=lambda dim, heads, plan, block: WindowAttention(
                 dim, heads, **plan.windows(block)
             ),
-            mlp_ratio=mlp_ratio,
-            drop_path_rate=drop_path_rate,
         )
-        self._finish(num_classes)
 
 
 class SwinUndis(Swin):
