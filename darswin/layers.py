@@ -1,7 +1,9 @@
-"""The layers of DarSwin. A polar map is (B, R, A, D) from the embedding to the head."""
+"""The layers of the models. A polar map is (B, R, A, D) from the embedding to the head; the maps of
+Swin and DAT are (B, H, W, D), rows and columns."""
 
 import math
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Literal
 
 import torch
@@ -11,7 +13,8 @@ from torch import Tensor, nn
 from darswin.grid import Placement, PolarGrid, Spacing, check_grid, polar_grid
 from darswin.lens import Lens
 from darswin.ops import polar_embed, polar_sample, window_attention
-from darswin.ops.checks import channels_first, check_jitter, check_layout
+from darswin.ops.checks import channels_first, check_jitter, check_layout, per_channel
+from darswin.ops.reference import normalized
 
 PositionBias = Literal["angular_relative", "angular", "polar"]
 GridFunction = Callable[..., PolarGrid]
@@ -87,7 +90,8 @@ class PolarSample(nn.Module):
 
     def forward(self, images: Tensor, lens: Lens) -> Tensor:
         """Images (B, C, H, W) and their lenses (B or 1) → the samples, in `layout`."""
-        images = check_images(images, lens)
+        images = check_images(images)
+        check_lens(lens, images)
         grid = self.grid(lens, images.shape[2:])
         return polar_sample(**self.arguments(images, grid), layout=self.layout)
 
@@ -99,22 +103,85 @@ class PolarSample(nn.Module):
         )
 
 
-def check_images(images: Tensor, lens: Lens) -> Tensor:
-    """The images as (B, C, H, W); TypeError or ValueError unless there is a lens for each, or one.
-
-    uint8 images may be (B, H, W, 3).
-    """
+def check_images(images: Tensor) -> Tensor:
+    """The images as (B, C, H, W), else TypeError or ValueError. uint8 ones may be (B, H, W, 3)."""
     if not isinstance(images, Tensor):
         raise TypeError(f"images must be a tensor, got {type(images).__name__}")
     if images.dim() != 4:
         raise ValueError(f"images must have shape (B, C, H, W), got {tuple(images.shape)}")
+    return channels_first(images)
+
+
+def check_lens(lens: Lens, images: Tensor) -> None:
+    """TypeError or ValueError unless there is a lens for each image, or one."""
     if not isinstance(lens, Lens):
         raise TypeError(f"lens must be a darswin.lens.Lens, got {type(lens).__name__}")
     if len(lens) not in (1, images.shape[0]):
         raise ValueError(
             f"there must be one lens or one an image, {images.shape[0]}, got {len(lens)}"
         )
-    return channels_first(images)
+
+
+class Pixels(nn.Module):
+    """The images of a model of fixed size, as (B, C, H, W) in floating point.
+
+    Args:
+        image_size: (H, W). in_chans: C.
+        mean, std: of uint8 images, which count as `(pixel/255 - mean) / std`; others ignore them.
+
+    Raises:
+        TypeError, ValueError: images of another kind, shape, size or number of channels.
+    """
+
+    def __init__(
+        self,
+        image_size: tuple[int, int],
+        in_chans: int = 3,
+        mean: float | Sequence[float] = 0.0,
+        std: float | Sequence[float] = 1.0,
+    ):
+        super().__init__()
+        self.image_size, self.in_chans = tuple(image_size), in_chans
+        self.mean, self.std = per_channel("mean", mean, in_chans), per_channel("std", std, in_chans)
+
+    def forward(self, images: Tensor) -> Tensor:
+        """(B, C, H, W), or uint8 (B, H, W, 3) → (B, C, H, W)."""
+        images = check_images(images)
+        check_channels(images, self.in_chans)
+        if images.shape[2:] != self.image_size:
+            raise ValueError(
+                f"images must have the model's image_size, (H, W) = {self.image_size}, "
+                f"got {tuple(images.shape[2:])}"
+            )
+        return normalized(images, self.mean, self.std) if images.dtype == torch.uint8 else images
+
+    def extra_repr(self) -> str:
+        return f"image_size={self.image_size}, mean={self.mean}, std={self.std}"
+
+
+def check_channels(images: Tensor, in_chans: int) -> None:
+    """ValueError unless the images (B, C, H, W) have `in_chans` channels."""
+    if images.shape[1] != in_chans:
+        raise ValueError(f"images must have {in_chans} channels, got {images.shape[1]}")
+
+
+class PatchProjection(nn.Module):
+    """Joins p × p neighbours of a map into one: a convolution as wide as its step, a LayerNorm.
+
+    Args:
+        dim: D of the map, out_dim: D'. patch: p, which divides the map. bias: of the convolution.
+
+    Source: Swin Transformer, ICCV 2021, sec. 3.1; DAT, CVPR 2022, sec. 3.3.
+    """
+
+    def __init__(self, dim: int, out_dim: int, patch: int, *, bias: bool = True):
+        super().__init__()
+        self.proj = nn.Conv2d(dim, out_dim, patch, patch, bias=bias)
+        self.norm = nn.LayerNorm(out_dim)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(B, H, W, D) → (B, H/p, W/p, D')."""
+        return self.norm(self.proj(x.permute(0, 3, 1, 2)).permute(0, 2, 3, 1))
 
 
 class PolarPatchEmbed(nn.Module):
@@ -144,8 +211,7 @@ class PolarPatchEmbed(nn.Module):
 
     def forward(self, images: Tensor, grid: PolarGrid) -> Tensor:
         """(B, C, H, W) → (B, R, A, D)."""
-        if images.shape[1] != self.in_chans:
-            raise ValueError(f"images must have {self.in_chans} channels, got {images.shape[1]}")
+        check_channels(images, self.in_chans)
         tokens = polar_embed(
             **self.sample.arguments(images, grid), weight=self.proj.weight, bias=self.proj.bias
         )
@@ -238,12 +304,95 @@ class FourierBias(RelativeBias):
         return b[0] + (torch.sin(waves) @ a + torch.cos(waves) @ b[1:]) / harmonics
 
 
-class PolarWindowAttention(nn.Module):
+class RelativeTable(nn.Module):
+    """A learned bias for each offset between two tokens, which knows no angle.
+
+    Args:
+        window: (M_r, M_φ), or of a plain map rows and columns. heads: attention heads.
+
+    Source: Swin Transformer, ICCV 2021, eq. 4.
+    """
+
+    def __init__(self, window: tuple[int, int], heads: int):
+        super().__init__()
+        table = torch.empty(heads, 2 * window[0] - 1, 2 * window[1] - 1)
+        self.table = nn.Parameter(nn.init.trunc_normal_(table, std=0.02))
+
+    def forward(self) -> Tensor:
+        """(1, heads, 2·M_r-1, 2·M_φ-1), the `bias` of `window_attention`."""
+        return self.table[None]
+
+
+class WindowAttention(nn.Module):
+    """Multi-head attention in the windows of a map, as in Swin.
+
+    Args:
+        dim: D. num_heads: divides D. map_size: (R, A), or of a plain map (H, W).
+        window: (M_r, M_φ), which divides the map. shift: (s_r, s_φ).
+        periodic: whether the map wraps around along each axis.
+        position_bias: makes the bias from the window and the heads.
+
+    Raises:
+        ValueError: sizes that do not divide.
+
+    Source: Swin Transformer, ICCV 2021, sec. 3.2.
+    """
+
+    def __init__(
+        self,
+        dim: int,
+        num_heads: int,
+        *,
+        map_size: tuple[int, int],
+        window: tuple[int, int],
+        shift: tuple[int, int] = (0, 0),
+        periodic: tuple[bool, bool] = (False, False),
+        position_bias: Callable[[tuple[int, int], int], nn.Module] = RelativeTable,
+        qkv_bias: bool = True,
+    ):
+        super().__init__()
+        check_heads(dim, num_heads)
+        if map_size[0] % window[0] or map_size[1] % window[1]:
+            raise ValueError(f"window must divide the map (R, A) = {map_size}, got {window}")
+        self.num_heads, self.window, self.shift = num_heads, tuple(window), tuple(shift)
+        self.map_size, self.periodic = tuple(map_size), tuple(periodic)
+        self.qkv = nn.Linear(dim, 3 * dim, bias=qkv_bias)
+        self.proj = nn.Linear(dim, dim)
+        self.position_bias = position_bias(self.window, num_heads)
+
+    def forward(self, x: Tensor, *positions: Tensor) -> Tensor:
+        """(B, R, A, D) → the same shape. `positions` are what the bias is made from."""
+        batch, rings, sectors, dim = x.shape
+        if (rings, sectors) != self.map_size:
+            raise ValueError(f"the map must be (R, A) = {self.map_size}, got {(rings, sectors)}")
+        qkv = self.qkv(x).reshape(batch, rings, sectors, 3, self.num_heads, dim // self.num_heads)
+        out = window_attention(
+            qkv,
+            self.position_bias(*positions),
+            window=self.window,
+            shift=self.shift,
+            periodic=self.periodic,
+        )
+        return self.proj(out)
+
+    def extra_repr(self) -> str:
+        return (
+            f"map_size={self.map_size}, window={self.window}, shift={self.shift}, "
+            f"periodic={self.periodic}"
+        )
+
+
+def check_heads(dim: int, num_heads: int) -> None:
+    """ValueError unless the heads divide the width."""
+    if dim % num_heads:
+        raise ValueError(f"num_heads must divide dim = {dim}, got {num_heads}")
+
+
+class PolarWindowAttention(WindowAttention):
     """Multi-head attention in the windows of a polar map, with a bias that knows the angles.
 
     Args:
-        dim: D. num_heads: divides D. map_size: (R, A). window: (M_r, M_φ), which divides (R, A).
-        shift: (s_r, s_φ). periodic: whether the map wraps around along (radius, azimuth).
+        dim, num_heads, map_size, window, shift, periodic: as `WindowAttention`.
         position_bias: "angular_relative", "angular" or "polar".
         harmonics: of the last two. periodic_bias: see `AngularRelativeBias`; it acts where the
             window spans the ring.
@@ -268,43 +417,31 @@ class PolarWindowAttention(nn.Module):
         periodic_bias: bool = False,
         qkv_bias: bool = True,
     ):
-        super().__init__()
-        if dim % num_heads:
-            raise ValueError(f"num_heads must divide dim = {dim}, got {num_heads}")
-        if map_size[0] % window[0] or map_size[1] % window[1]:
-            raise ValueError(f"window must divide the map (R, A) = {map_size}, got {window}")
-        self.num_heads, self.window, self.shift = num_heads, tuple(window), tuple(shift)
-        self.map_size, self.periodic = tuple(map_size), tuple(periodic)
-        self.qkv = nn.Linear(dim, 3 * dim, bias=qkv_bias)
-        self.proj = nn.Linear(dim, dim)
+        sectors = map_size[1]
         if position_bias == "angular_relative":
-            whole = periodic_bias and window[1] == map_size[1]
-            self.position_bias = AngularRelativeBias(self.window, num_heads, map_size[1], whole)
+            whole = periodic_bias and window[1] == sectors
+            bias = partial(AngularRelativeBias, sectors=sectors, periodic=whole)
         elif position_bias in ("angular", "polar"):
-            self.position_bias = FourierBias(self.window, num_heads, map_size[1], harmonics)
+            bias = partial(FourierBias, sectors=sectors, harmonics=harmonics)
         else:
             raise ValueError(
                 "position_bias must be 'angular_relative', 'angular' or 'polar', "
                 f"got {position_bias!r}"
             )
+        super().__init__(
+            dim,
+            num_heads,
+            map_size=map_size,
+            window=window,
+            shift=shift,
+            periodic=periodic,
+            position_bias=bias,
+            qkv_bias=qkv_bias,
+        )
 
     def forward(self, x: Tensor, radial: Tensor) -> Tensor:
         """(B, R, A, D) → the same shape. `radial` (B or 1, R+1): see `radial_positions`."""
-        batch, rings, sectors, dim = x.shape
-        if (rings, sectors) != self.map_size:
-            raise ValueError(f"the map must be (R, A) = {self.map_size}, got {(rings, sectors)}")
-        qkv = self.qkv(x).reshape(batch, rings, sectors, 3, self.num_heads, dim // self.num_heads)
-        bias = self.position_bias(radial.to(x.device, self.proj.weight.dtype))
-        out = window_attention(
-            qkv, bias, window=self.window, shift=self.shift, periodic=self.periodic
-        )
-        return self.proj(out)
-
-    def extra_repr(self) -> str:
-        return (
-            f"map_size={self.map_size}, window={self.window}, shift={self.shift}, "
-            f"periodic={self.periodic}"
-        )
+        return super().forward(x, radial.to(x.device, self.proj.weight.dtype))
 
 
 def radial_positions(lens: Lens, grid: PolarGrid, rings: int, kind: PositionBias) -> Tensor:
@@ -353,21 +490,26 @@ class Mlp(nn.Module):
 
 
 class Block(nn.Module):
-    """Pre-norm transformer block: windowed attention, then an MLP, each behind a residual."""
+    """Pre-norm transformer block: attention, then an MLP, each behind a residual.
+
+    Args:
+        dim: D. attn: maps (B, R, A, D), and positions, to the same shape.
+        mlp_ratio: hidden width of the MLP over D. drop_path: probability.
+    """
 
     def __init__(
-        self, dim: int, num_heads: int, *, mlp_ratio: float = 4.0, drop_path: float = 0.0, **attn
+        self, dim: int, attn: nn.Module, *, mlp_ratio: float = 4.0, drop_path: float = 0.0
     ):
         super().__init__()
         self.norm1 = nn.LayerNorm(dim)
-        self.attn = PolarWindowAttention(dim, num_heads, **attn)
+        self.attn = attn
         self.norm2 = nn.LayerNorm(dim)
         self.mlp = Mlp(dim, int(dim * mlp_ratio))
         self.drop_path = DropPath(drop_path)
 
-    def forward(self, x: Tensor, radial: Tensor) -> Tensor:
-        """(B, R, A, D) → the same shape."""
-        x = x + self.drop_path(self.attn(self.norm1(x), radial))
+    def forward(self, x: Tensor, *positions: Tensor) -> Tensor:
+        """(B, R, A, D) → the same shape. `positions` are the attention's."""
+        x = x + self.drop_path(self.attn(self.norm1(x), *positions))
         return x + self.drop_path(self.mlp(self.norm2(x)))
 
 

@@ -1,9 +1,10 @@
-"""Where what one lens shows at a pixel stands in another lens's image."""
+"""What one lens shows, in another lens's image: where it stands, and how it looks."""
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
-from darswin.lens import Lens
+from darswin.lens import Lens, Perspective
 
 
 def reprojection(
@@ -37,3 +38,37 @@ def reprojection(
     ratio = source.project(torch.where(seen, theta, limit)) / radius  # keeps the azimuth
     there = source.center_in(source_size)[:, None, None] + offset * ratio[..., None]
     return torch.where(seen[..., None], there, -10)
+
+
+def reproject(images: Tensor, source: Lens, target: Lens, size: tuple[int, int]) -> Tensor:
+    """The view of `target` on what `source` saw, bilinear; 0 beyond either θ_max.
+
+    Runs on the images' device. Gradients go to the images and both lenses.
+
+    Args:
+        images: (B, C, H, W), floating point, taken with `source`.
+        source, target: B lenses each, or one.
+        size: (H', W') of the view.
+
+    Returns:
+        (B, C, H', W').
+    """
+    height, width = images.shape[2:]
+    exact = torch.promote_types(images.dtype, torch.float32)  # half a pixel is lost in bfloat16
+    there = reprojection(source, (height, width), target, size).to(images.device, exact)
+    # -1 and 1 are the image's edges, half a pixel beyond the centres of its outermost pixels.
+    places = (2 * there + 1) / there.new_tensor((width, height)) - 1
+    places = places.expand(images.shape[0], -1, -1, -1)
+    view = F.grid_sample(images.to(exact), places, padding_mode="zeros", align_corners=False)
+    return view.to(images.dtype)
+
+
+def perspective_view(lens: Lens, size: tuple[int, int], max_fov: float) -> Perspective:
+    """The perspective lens that shows a lens's field of view, up to `max_fov`, in (H, W).
+
+    θ_max lands at half the shorter side. `max_fov` (rad, below π) bounds what a perspective lens
+    cannot show: of a wider lens it shows the middle.
+    """
+    theta_max = lens.theta_max.clamp(max=max_fov / 2)
+    focal = min(size) / 2 / torch.tan(theta_max)
+    return Perspective._from_tensors(dict(focal=focal, theta_max=theta_max, center=None))

@@ -1,24 +1,38 @@
-"""The released code's outputs, from fixtures computed with it.
+"""Other implementations' outputs, from fixtures computed with them, and their files.
 
-The fixtures were made on a CPU on which MKL takes its compatible path. Near 90° the float32
-tangents of the released sampling differ between MKL's paths enough to move the embedding by 3e-4,
-for the released code as for ours. So the comparison runs in a process with that path chosen.
+The fixtures of the released DarSwin were made on a CPU on which MKL takes its compatible path. Near
+90° the float32 tangents of the released sampling differ between MKL's paths enough to move the
+embedding by 3e-4, for the released code as for ours. So the comparison runs in a process with that
+path chosen.
 """
 
 import json
 import os
+import pickle
+import shutil
 import subprocess
 import sys
+import types
 import warnings
 from pathlib import Path
 
 import pytest
 import torch
+from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
 from darswin import DarSwin
-from darswin.compat import OfficialPolynomial, load_official
+from darswin.compat import (
+    OfficialPolynomial,
+    convert_checkpoint,
+    load_dat,
+    load_official,
+    load_timm_swin,
+    read_state,
+)
+from darswin.layers import WindowAttention
 from darswin.lens import Spherical
+from darswin.models.dat import DeformableAttention
 
 FIXTURES = Path(__file__).parent / "fixtures"
 NAMES = ("angular", "polar", "poly")
@@ -173,3 +187,257 @@ def test_no_warning_for_models_that_run():
         warnings.simplefilter("error")
         for name in NAMES:
             load_official(fixture(name)[1])
+
+
+# -- Swin and DAT ---------------------------------------------------------------------------------
+
+BASELINES = {"timm_swin": load_timm_swin, "dat_v1": load_dat}
+
+
+def baseline(name):
+    tensors = load_file(FIXTURES / f"{name}.safetensors")
+    state = {k.removeprefix("state."): v for k, v in tensors.items() if k.startswith("state.")}
+    return tensors, state, BASELINES[name]
+
+
+@pytest.mark.parametrize("name", BASELINES)
+def test_baselines_equal_their_originals(name):
+    tensors, state, load = baseline(name)
+    model = load(state)
+    assert not model.training
+    with torch.no_grad():
+        logits = model(tensors["images"], None)
+        assert (logits - tensors["logits"]).abs().max() <= 1e-5
+        if "out.features" in tensors:
+            features = model.forward_features(tensors["images"], None)
+            assert (features - tensors["out.features"]).abs().max() <= 1e-5
+
+
+def without_shifts(model):
+    for module in model.modules():
+        if isinstance(module, WindowAttention):
+            module.shift = (0, 0)
+
+
+def with_tables_turned(model):
+    for name, parameter in model.named_parameters():
+        if name.endswith("position_bias.table"):
+            parameter.data = parameter.data.transpose(1, 2)
+
+
+def with_still_keys(model):
+    for module in model.modules():
+        if isinstance(module, DeformableAttention):
+            module.offset_range = 0.0
+
+
+@pytest.mark.parametrize(
+    ("name", "change"),
+    [
+        ("timm_swin", without_shifts),
+        ("timm_swin", with_tables_turned),
+        ("dat_v1", without_shifts),
+        ("dat_v1", with_tables_turned),
+        ("dat_v1", with_still_keys),
+    ],
+)
+def test_the_baselines_fixtures_can_tell(name, change):
+    tensors, state, load = baseline(name)
+    model = load(state)
+    change(model)
+    with torch.no_grad():
+        assert (model(tensors["images"]) - tensors["logits"]).abs().max() > 1e-4
+
+
+@pytest.mark.parametrize("name", BASELINES)
+def test_baselines_from_files_and_without_a_head(name, tmp_path):
+    tensors, state, load = baseline(name)
+    expected = load(state).state_dict()
+    save_file(state, tmp_path / "model.safetensors")
+    torch.save({"model": state}, tmp_path / "model.pth")
+    for file in ("model.safetensors", "model.pth"):
+        loaded = load(tmp_path / file).state_dict()
+        assert loaded.keys() == expected.keys()
+        assert all(torch.equal(loaded[key], expected[key]) for key in expected)
+    headless = load({k: v for k, v in state.items() if "head" not in k})
+    assert headless(tensors["images"]).shape == (2, headless.num_features)
+
+
+@pytest.mark.parametrize("name", BASELINES)
+def test_other_state_dicts_are_no_baselines(name):
+    _, state, load = baseline(name)
+    other = next(n for n in BASELINES if n != name)
+    for wrong in ({}, baseline(other)[1], {k: v for k, v in state.items() if "norm1" not in k
+                                           and "layer_norms.0" not in k}):  # fmt: skip
+        with pytest.raises(ValueError, match="not a state dict of"):
+            load(wrong)
+
+
+def test_the_image_size_of_swin_is_an_option():
+    tensors, state, load = baseline("timm_swin")
+    wide = load(state, image_size=(64, 128))
+    assert wide(torch.cat([tensors["images"]] * 2, 3)).shape == (2, 10)
+
+
+# -- pickled checkpoints --------------------------------------------------------------------------
+
+
+class CfgNode(dict):
+    """As yacs has it, as far as a pickle goes."""
+
+    def __init__(self, *given):
+        super().__init__(*given)
+        self.__dict__["__immutable__"] = True
+
+
+@pytest.fixture(params=["zip", "legacy"])
+def checkpoint(request, tmp_path, monkeypatch):
+    """What the authors' code saves. yacs is not needed to read it, so a module of that name is
+    there only to write it."""
+    weight = torch.nn.Parameter(torch.zeros(3))
+    optimizer = torch.optim.AdamW([weight])
+    weight.sum().backward()
+    optimizer.step()
+    model = CfgNode(dict(DROP_PATH_RATE=0.2, NAME="darswin"))
+    content = dict(
+        model=fixture("angular")[1],
+        optimizer=optimizer.state_dict(),
+        lr_scheduler={"base_values": [1.25e-4]},
+        max_accuracy=92.8,
+        scaler={"scale": 65536.0},
+        epoch=325,
+        config=CfgNode(dict(MODEL=model, BASE=[""], AUG=(1, None))),
+    )
+    target = tmp_path / "authors" / "checkpoint.pth"
+    target.parent.mkdir()
+    with monkeypatch.context() as patch:
+        module = types.ModuleType("yacs.config")
+        module.CfgNode = CfgNode
+        patch.setattr(CfgNode, "__module__", "yacs.config")
+        patch.setitem(sys.modules, "yacs", types.ModuleType("yacs"))
+        patch.setitem(sys.modules, "yacs.config", module)
+        torch.save(content, target, _use_new_zipfile_serialization=request.param == "zip")
+    return target
+
+
+def test_converts_the_authors_checkpoints(checkpoint, tmp_path):
+    assert "yacs" not in sys.modules
+    with pytest.raises(pickle.UnpicklingError, match=r"yacs\.config\.CfgNode"):
+        torch.load(checkpoint, weights_only=True)  # torch alone does not
+    target = tmp_path / "converted" / "model.safetensors"
+    target.parent.mkdir()
+    convert_checkpoint(checkpoint, target)
+    tensors, state, lens = fixture("angular")
+    written = load_file(target)
+    assert written.keys() == state.keys()
+    assert all(torch.equal(written[key], state[key]) for key in state)
+    with safe_open(target, "pt") as file:
+        config = json.loads(file.metadata()["config"])
+    assert config == {
+        "MODEL": {"DROP_PATH_RATE": 0.2, "NAME": "darswin"}, "BASE": [""], "AUG": [1, None],
+    }  # fmt: skip
+    assert list(target.parent.iterdir()) == [target]
+    assert target.stat().st_mode & 0o777 == 0o666 & ~_umask()
+    for file in (target, checkpoint):  # loaders read the checkpoint as well
+        with torch.no_grad():
+            logits = load_official(file)(tensors["images"], lens)
+        assert (logits - tensors["logits"]).abs().max() <= 1e-5
+    assert "yacs" not in sys.modules
+    assert "yacs" not in str(torch.serialization.get_safe_globals())
+
+
+def _umask():
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask
+
+
+class Hostile:
+    def __init__(self, function, *arguments):
+        self.call = function, arguments
+
+    def __reduce__(self):
+        return self.call
+
+
+@pytest.mark.parametrize("zipped", [True, False])
+@pytest.mark.parametrize(
+    ("function", "name"),
+    [
+        (os.system, "posix.system"),
+        (shutil.copyfile, "shutil.copyfile"),
+        (eval, "eval"),
+    ],
+)
+@pytest.mark.parametrize("entry", ["config", "model", "optimizer"])
+def test_a_hostile_checkpoint_is_refused(function, name, entry, zipped, tmp_path):
+    executed = tmp_path / "executed"
+    arguments = {
+        os.system: [f"touch {executed}"],
+        shutil.copyfile: [__file__, str(executed)],
+        eval: [f"open({str(executed)!r}, 'w')"],
+    }[function]
+    checkpoint = {"model": {"norm.weight": torch.zeros(3)}, entry: Hostile(function, *arguments)}
+    source, target = tmp_path / "hostile.pth", tmp_path / "model.safetensors"
+    torch.save(checkpoint, source, _use_new_zipfile_serialization=zipped)
+    for read in (read_state, load_official, lambda path: convert_checkpoint(path, target)):
+        with pytest.raises(ValueError, match=f"is refused, .* it asks for {name}, which"):
+            read(source)
+    assert list(tmp_path.iterdir()) == [source]
+    torch.load(source, weights_only=False)  # it would have been
+    assert executed.exists()
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ({"epoch": 3}, "holds no state dict"),
+        ([torch.zeros(2)], "holds no state dict"),
+        ({"model": [torch.zeros(2)]}, "holds no state dict"),
+    ],
+)
+def test_checkpoints_without_weights(content, message, tmp_path):
+    torch.save(content, tmp_path / "checkpoint.pth")
+    with pytest.raises(ValueError, match=message):
+        convert_checkpoint(tmp_path / "checkpoint.pth", tmp_path / "model.safetensors")
+    assert len(list(tmp_path.iterdir())) == 1
+
+
+@pytest.mark.parametrize("content", [b"", b"no checkpoint", b"PK\3\4" + bytes(100), b"\x80\2R."])
+def test_files_that_are_no_checkpoints(content, tmp_path):
+    (tmp_path / "checkpoint.pth").write_bytes(content)
+    with pytest.raises(ValueError, match=r"checkpoint\.pth cannot be read as a checkpoint"):
+        read_state(tmp_path / "checkpoint.pth")
+    (tmp_path / "model.safetensors").write_bytes(content)
+    with pytest.raises(ValueError, match=r"model\.safetensors cannot be read as safetensors"):
+        read_state(tmp_path / "model.safetensors")
+    for name in ("another.pth", "another.safetensors"):
+        with pytest.raises(FileNotFoundError):
+            read_state(tmp_path / name)
+
+
+def test_a_failed_conversion_leaves_the_target_as_it_was(tmp_path, monkeypatch):
+    source, target = tmp_path / "checkpoint.pth", tmp_path / "model.safetensors"
+    torch.save({"model": {"a": torch.ones(2)}}, source)
+    target.write_bytes(b"before")
+
+    def fail(path, content, write=Path.write_bytes):
+        write(path, content[: len(content) // 2])
+        raise OSError("no space left")
+
+    monkeypatch.setattr(Path, "write_bytes", fail)
+    with pytest.raises(OSError, match="no space left"):
+        convert_checkpoint(source, target)
+    assert target.read_bytes() == b"before" and len(list(tmp_path.iterdir())) == 2
+
+
+def test_weights_that_share_memory_or_stride_and_odd_configurations(tmp_path):
+    weight = torch.arange(6.0).reshape(2, 3)
+    source, target = tmp_path / "checkpoint.pth", tmp_path / "model.safetensors"
+    model = {"a": weight, "b": weight, "c": weight.T, "d": torch.ones(2, dtype=torch.bfloat16)}
+    torch.save({"model": model, "config": {"a set": {1, 2}}}, source)
+    convert_checkpoint(source, target)
+    written = load_file(target)
+    assert all(torch.equal(written[key], value) for key, value in model.items())
+    with safe_open(target, "pt") as file:
+        assert "config" not in file.metadata()

@@ -1,9 +1,10 @@
 import math
 
+import pytest
 import torch
 
-from darswin.lens import Perspective, Spherical
-from darswin.reprojection import reprojection
+from darswin.lens import Perspective, Polynomial, Spherical
+from darswin.reprojection import perspective_view, reproject, reprojection
 
 
 def test_a_ray_keeps_its_angles():
@@ -28,3 +29,44 @@ def test_gradients_reach_both_lenses_also_at_the_centre():
         return reprojection(Perspective(focal, 1.2), (40, 40), Spherical(xi, focal, 1.2), (9, 9))
 
     assert torch.autograd.gradcheck(places, (focal, xi))
+
+
+def test_reproject_is_bilinear_between_pixel_centres():
+    image = torch.arange(12.0).reshape(1, 1, 3, 4)
+    lens = Perspective(10.0, 1.2)
+    torch.testing.assert_close(reproject(image, lens, lens, (3, 4)), image, rtol=0, atol=1e-5)
+    moved = Perspective(10.0, 1.2, center=[1.0, 0.75])  # half a pixel and a quarter
+    got = reproject(image, lens, moved, (3, 4))
+    torch.testing.assert_close(got[..., :2, :3], image[..., :2, :3] + 0.5 + 0.25 * 4)
+    torch.testing.assert_close(got[0, 0, 0, 3], torch.tensor((3 + 0.25 * 4) / 2))  # half is outside
+
+
+def test_reproject_of_many():
+    images = torch.rand(2, 3, 20, 24)
+    source = Spherical.from_fov([0.2, 0.9], 2.0, 10.0)
+    target = Perspective.from_fov(1.8, 8.0)
+    together = reproject(images, source, target, (16, 18))
+    assert together.shape == (2, 3, 16, 18)
+    for k in range(2):
+        alone = reproject(images[k : k + 1], source[k], target, (16, 18))
+        torch.testing.assert_close(together[k : k + 1], alone)
+    half = reproject(images.bfloat16(), source, target, (16, 18))
+    assert half.dtype == torch.bfloat16
+    torch.testing.assert_close(half.float(), together, rtol=0, atol=0.01)
+    assert reproject(images[:0], source[:0], target, (16, 18)).shape == (0, 3, 16, 18)
+    corner = math.hypot(7.5, 8.5)
+    assert corner > 8.0 and not together[..., 0, 0].any()  # beyond θ_max
+
+
+@pytest.mark.parametrize("size", [(64, 64), (40, 64), (64, 40)])
+def test_perspective_view(size):
+    papers = 2 * math.atan(64 / 3)  # 174.6°, of the paper's images
+    wide = Polynomial([20.0], math.radians(100))
+    for lens, theta_max in (
+        (Spherical.from_fov(0.5, papers, 32.0), papers / 2),
+        (wide, math.radians(87.5)),
+    ):
+        view = perspective_view(lens, size, math.radians(175))
+        torch.testing.assert_close(view.theta_max, torch.tensor([theta_max]))
+        torch.testing.assert_close(view.r_max, torch.tensor([min(size) / 2]), rtol=1e-4, atol=0)
+        assert view.center is None

@@ -16,7 +16,7 @@ from darswin.grid import PolarGrid, check_tan
 from darswin.lens import Lens, Number, Spherical
 
 if TYPE_CHECKING:
-    from darswin.models.darswin import StagePlan
+    from darswin.models.stages import StagePlan
 
 
 class OfficialPolynomial(Lens):

@@ -63,6 +63,16 @@ def channels_first(image: Tensor) -> Tensor:
     return image.permute(0, 3, 1, 2) if frames else image
 
 
+def per_channel(name: str, value: float | Sequence[float], channels: int) -> tuple[float, ...]:
+    """`mean` or `std` as one number a channel; ValueError where they are not."""
+    values = (value,) * channels if isinstance(value, (int, float)) else tuple(value)
+    if len(values) != channels:
+        raise ValueError(f"{name} must be one number or one a channel, {channels}, got {value!r}")
+    if name == "std" and not all(v > 0 for v in values):
+        raise ValueError(f"std must be positive, got {value!r}")
+    return tuple(float(v) for v in values)
+
+
 def check_layout(layout: str) -> None:
     """ValueError unless the layout is one that there is."""
     if layout not in LAYOUTS:

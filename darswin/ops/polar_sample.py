@@ -15,6 +15,7 @@ from darswin.ops.checks import (
     check_pair,
     check_shape,
     check_tensor,
+    per_channel,
 )
 
 
@@ -107,22 +108,13 @@ def sampling_arguments(image, radii, azimuths, center, patch, jitter, seed, mean
     check_jitter(jitter)
     key = _seed_tensor(seed) if jitter > 0 else None
     if image.dtype == torch.uint8:
-        mean = _per_channel("mean", 0.0 if mean is None else mean, channels)
-        std = _per_channel("std", 1.0 if std is None else std, channels)
+        mean = per_channel("mean", 0.0 if mean is None else mean, channels)
+        std = per_channel("std", 1.0 if std is None else std, channels)
     elif mean is None and std is None:
         mean = std = ()
     else:
         raise ValueError(f"mean and std go with uint8 images, got an image of {image.dtype}")
     return image, radii, azimuths, center, patch, float(jitter), key, mean, std
-
-
-def _per_channel(name: str, value: float | Sequence[float], channels: int) -> tuple[float, ...]:
-    values = (value,) * channels if isinstance(value, (int, float)) else tuple(value)
-    if len(values) != channels:
-        raise ValueError(f"{name} must be one number or one a channel, {channels}, got {value!r}")
-    if name == "std" and not all(v > 0 for v in values):
-        raise ValueError(f"std must be positive, got {value!r}")
-    return tuple(float(v) for v in values)
 
 
 def _seed_tensor(seed: int | Tensor) -> Tensor:

@@ -57,6 +57,12 @@ def _jittered(
     return moved.clamp(min=0), azimuths + v * (2 * math.pi / columns)
 
 
+def normalized(image: Tensor, mean: Sequence[float], std: Sequence[float]) -> Tensor:
+    """`(pixel/255 - mean) / std` of a uint8 image (B, C, H, W), in float32; a value a channel."""
+    m, s = (torch.tensor(v, device=image.device).reshape(-1, 1, 1) for v in (mean, std))
+    return (image / 255 - m) / s
+
+
 def polar_sample(
     image: Tensor,
     radii: Tensor,
@@ -72,8 +78,7 @@ def polar_sample(
 ) -> Tensor:
     """See `darswin.ops.polar_sample`."""
     if image.dtype == torch.uint8:
-        m, s = (torch.tensor(v, device=image.device).reshape(-1, 1, 1) for v in (mean, std))
-        image = (image / 255 - m) / s
+        image = normalized(image, mean, std)
     image = image.to(radii.dtype)  # bfloat16 is computed in float32
     batch, channels, height, width = image.shape
     rows, columns = radii.shape[1], azimuths.shape[0]

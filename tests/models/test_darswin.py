@@ -5,7 +5,7 @@ import torch
 
 from darswin import DarSwin, PolarSample, create_model, list_models
 from darswin.lens import Perspective, Polynomial, Spherical
-from darswin.models.darswin import plan_stages
+from darswin.models.stages import plan_stages
 from darswin.ops import use_reference
 
 LENS = Spherical.from_fov([0.2, 0.9], 2.6, 16.0)
@@ -50,9 +50,9 @@ def test_stage_plan_of_other_sizes():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ((16, 60, 4, "A", (1, 16)), r"stage 1: window \(1, 16\) must divide .* = \(16, 60\)"),
-        ((16, 6, 2, "A", (1, 6)), r"stage 2: a map of \(R, A\) = \(16, 6\) cannot be merged"),
-        ((6, 64, 4, "A", (1, 16)), r"stage 3: window \(4, 4\) must divide .* = \(6, 4\)"),
+        ((16, 60, 4, "A", (1, 16)), r"stage 1: window \(1, 16\) must divide the map, \(16, 60\)"),
+        ((16, 6, 2, "A", (1, 6)), r"stage 2: a map of \(16, 6\) cannot be merged"),
+        ((6, 64, 4, "A", (1, 16)), r"stage 3: window \(4, 4\) must divide the map, \(6, 4\)"),
         ((15, 64, 2, "RA", (5, 4)), r"stage 2: a map .* cannot be merged by \(2, 2\)"),
     ],
 )
@@ -71,7 +71,10 @@ def test_parameter_counts(name, classes, parameters):
     assert sum(p.numel() for p in model.parameters()) == parameters
 
 
-@pytest.mark.parametrize("name", list_models())
+DARSWINS = [name for name in list_models() if name.startswith("darswin")]
+
+
+@pytest.mark.parametrize("name", DARSWINS)
 def test_every_named_model_trains_a_step(name):
     torch.manual_seed(0)
     depths = dict(depths=(1, 1, 2, 1)) if "nano" not in name else {}

@@ -1,18 +1,13 @@
-"""Weights of other implementations: reads their state dicts into our models."""
+"""The authors' released DarSwin."""
 
 import os
 import warnings
 from collections.abc import Mapping
-from pathlib import Path
 
-import torch
-from safetensors.torch import load_file
 from torch import Tensor
 
+from darswin.compat.checkpoint import count_blocks, read_state, refused
 from darswin.models.darswin import DarSwin
-from darswin.models.official import OfficialPolynomial
-
-__all__ = ["OfficialPolynomial", "load_official"]
 
 
 def load_official(source: str | os.PathLike | Mapping[str, Tensor], **options) -> DarSwin:
@@ -26,19 +21,16 @@ def load_official(source: str | os.PathLike | Mapping[str, Tensor], **options) -
     pixels of its input, or with `OfficialPolynomial(coefficients, radius)`.
 
     Args:
-        source: a state dict, or a file of one: safetensors, or what `torch.load` reads with
-            `weights_only=True`. A checkpoint's "model" entry is found.
+        source: a state dict or a file of one, as `darswin.compat.read_state`.
         options: constructor arguments that no shape tells: `rings`, `sectors`, `samples` and
             `in_chans` where they are not 16, 64, (10, 10) and 3.
 
     Raises:
         ValueError: keys or shapes that are not those of a released model.
     """
-    state = _read(source)
-    try:
+    state = read_state(source)
+    with refused("a released DarSwin"):
         settings = _settings(state)
-    except (KeyError, IndexError) as error:
-        raise ValueError(f"not a state dict of a released DarSwin: no key {error}") from error
     model = DarSwin(**(settings | options))
     sample = model.patch_embed.sample
     converted = {}
@@ -50,35 +42,15 @@ def load_official(source: str | os.PathLike | Mapping[str, Tensor], **options) -
             value = value.unflatten(1, (model.in_chans, *sample.samples))
             value = value.permute(0, 2, 3, 1).flatten(1)
         converted[_renamed(key)] = value
-    try:
+    with refused("a released DarSwin"):
         model.load_state_dict(converted)
-    except RuntimeError as error:
-        raise ValueError(f"not a state dict of a released DarSwin: {error}") from error
     return model.eval()
-
-
-def _read(source: str | os.PathLike | Mapping[str, Tensor]) -> dict[str, Tensor]:
-    if not isinstance(source, Mapping):
-        path = Path(source)
-        if path.suffix == ".safetensors":
-            source = load_file(path)
-        else:
-            source = torch.load(path, map_location="cpu", weights_only=True)
-    return dict(source.get("model", source))
 
 
 def _settings(state: Mapping[str, Tensor]) -> dict:
     """Constructor arguments, from keys and shapes."""
-    depths, heads = [], []
-    while f"layers.{len(depths)}.blocks.0.norm1.weight" in state:
-        layer = f"layers.{len(depths)}.blocks"
-        depth = 1
-        while f"{layer}.{depth}.norm1.weight" in state:
-            depth += 1
-        depths.append(depth)
-        heads.append(state[f"{layer}.0.attn.a_p"].shape[1])
-    if not depths:
-        raise KeyError("'layers.0.blocks.0.norm1.weight'")
+    depths = count_blocks(state, "layers.{}.blocks.{}.norm1.weight")
+    heads = [state[f"layers.{stage}.blocks.0.attn.a_p"].shape[1] for stage in range(len(depths))]
     settings = dict(
         num_classes=state["head.weight"].shape[0],
         embed_dim=state["patch_embed.norm.weight"].shape[0],

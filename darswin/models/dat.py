@@ -1,0 +1,182 @@
+"""DAT, the Deformable Attention Transformer, in its CVPR 2022 form: a baseline of the paper."""
+
+from collections.abc import Sequence
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from darswin.layers import PatchProjection, RelativeTable, WindowAttention, check_heads
+from darswin.models.encoder import ImageEncoder
+from darswin.models.stages import Pair, StagePlan
+
+
+class DeformableAttention(nn.Module):
+    """Multi-head attention whose keys are sampled where the queries of each group say.
+
+    Keys stand at the map's pixels, moved by an offset that a small network reads from the queries
+    around. The bias of a query and a key is a table, between whose entries it is bilinear.
+
+    Args:
+        dim: D. num_heads: divides D. map_size: (H, W).
+        groups: of heads that share their keys; divides num_heads.
+        kernel: of the offset network, odd.
+        offset_range: how far a key may move, in half pixels of the map.
+
+    Raises:
+        ValueError: sizes that do not divide.
+
+    Source: DAT, CVPR 2022, sec. 3.2.
+    """
+
+    def __init__(
+        self,
+        dim: int,
+        num_heads: int,
+        *,
+        map_size: Pair,
+        groups: int,
+        kernel: int,
+        offset_range: float = 2.0,
+    ):
+        super().__init__()
+        check_heads(dim, num_heads)
+        if num_heads % groups:
+            raise ValueError(f"groups must divide num_heads = {num_heads}, got {groups}")
+        self.num_heads, self.groups, self.offset_range = num_heads, groups, offset_range
+        channels = dim // groups
+        self.q = nn.Linear(dim, dim)
+        self.kv = nn.Linear(dim, 2 * dim)
+        self.proj = nn.Linear(dim, dim)
+        self.around = nn.Conv2d(channels, channels, kernel, padding=kernel // 2, groups=channels)
+        self.norm = nn.LayerNorm(channels)
+        self.offset = nn.Linear(channels, 2, bias=False)
+        self.position_bias = RelativeTable(map_size, num_heads)
+
+    def _grouped(self, x: Tensor) -> Tensor:
+        """(B, H, W, D) → (B·G, D/G, H, W)."""
+        return x.unflatten(3, (self.groups, -1)).permute(0, 3, 4, 1, 2).flatten(0, 1)
+
+    def _heads(self, x: Tensor) -> Tensor:
+        """(B, N, D) → (B, heads, N, d)."""
+        return x.unflatten(2, (self.num_heads, -1)).transpose(1, 2)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(B, H, W, D) → the same shape."""
+        batch, height, width, dim = x.shape
+        tokens = height * width
+        q = self.q(x)
+        around = self.around(self._grouped(q)).permute(0, 2, 3, 1)
+        offset = torch.tanh(self.offset(F.gelu(self.norm(around))))  # (B·G, H, W, 2): y, x
+        # Places in the map as parts of its half sides, -1 … 1 from edge to edge.
+        pixels = _pixel_centers(height, width, offset)
+        places = pixels + offset * (self.offset_range / offset.new_tensor((height, width)))
+        # The released code samples as if the outermost pixels' centres were at the edges.
+        sampled = F.grid_sample(self._grouped(x), places.flip(-1), align_corners=True)
+        sampled = sampled.reshape(batch, dim, tokens).transpose(1, 2)
+        k, v = self.kv(sampled).chunk(2, 2)
+
+        reach = (pixels.flatten(0, 1)[:, None] - places.flatten(1, 2)[:, None]) / 2
+        table = self.position_bias().unflatten(1, (self.groups, -1))
+        table = table.expand(batch, -1, -1, -1, -1).flatten(0, 1)
+        bias = F.grid_sample(table, reach.flip(-1), align_corners=True)  # (B·G, heads/G, N, N)
+        bias = bias.reshape(batch, self.num_heads, tokens, tokens)
+        out = F.scaled_dot_product_attention(
+            self._heads(q.flatten(1, 2)), self._heads(k), self._heads(v), attn_mask=bias
+        )
+        return self.proj(out.transpose(1, 2).reshape(x.shape))
+
+    def extra_repr(self) -> str:
+        return f"groups={self.groups}, offset_range={self.offset_range}"
+
+
+def _pixel_centers(height: int, width: int, like: Tensor) -> Tensor:
+    """(H, W, 2): y and x of each pixel's centre, where -1 and 1 are the map's edges."""
+    y, x = (
+        (2 * torch.arange(side, dtype=like.dtype, device=like.device) + 1) / side - 1
+        for side in (height, width)
+    )
+    return torch.stack(torch.meshgrid(y, x, indexing="ij"), -1)
+
+
+class DAT(ImageEncoder):
+    """The Deformable Attention Transformer. It is called as DarSwin is, and ignores the lens.
+
+    Args:
+        num_classes: 0 leaves out the head. in_chans: C of the images.
+        embed_dim, depths, num_heads: of the stages; width doubles at each.
+        image_size: (H, W), or the side of a square. patch_size: its side, in pixels.
+        window: (rows, columns) where the map is large enough.
+        blocks: of each stage the kinds of its blocks, repeated: "L" attends in windows, "S" in
+            shifted ones, "D" is deformable.
+        groups: of the heads of each stage's deformable blocks; others ignore it.
+        offset_range: as `DeformableAttention`.
+        mlp_ratio: hidden width of the MLPs over D. drop_path_rate: of the last block; linear.
+        mean, std: of uint8 images, which count as `(pixel/255 - mean) / std`; others ignore them.
+
+    Raises:
+        ValueError: sizes that do not divide; in forward, images of another size.
+
+    Source: DAT, CVPR 2022, which the paper compares with; not the later DAT++.
+    """
+
+    def __init__(
+        self,
+        num_classes: int = 1000,
+        in_chans: int = 3,
+        embed_dim: int = 96,
+        depths: Sequence[int] = (2, 2, 18, 2),
+        num_heads: Sequence[int] = (3, 6, 12, 24),
+        *,
+        image_size: int | Pair = 64,
+        patch_size: int = 2,
+        window: Pair = (4, 4),
+        blocks: Sequence[str] = ("LS", "LS", "LD", "LD"),
+        groups: Sequence[int] = (1, 1, 3, 6),
+        offset_range: float = 2.0,
+        mlp_ratio: float = 4.0,
+        drop_path_rate: float = 0.2,
+        mean: float | Sequence[float] = 0.0,
+        std: float | Sequence[float] = 1.0,
+    ):
+        if not len(blocks) == len(groups) == len(depths):
+            raise ValueError(
+                f"blocks and groups must have one entry a stage, {len(depths)}, "
+                f"got {blocks} and {groups}"
+            )
+        if not all(blocks) or not set("".join(blocks)) <= set("LSD"):
+            raise ValueError(f"blocks must be of the kinds 'L', 'S' and 'D', got {blocks}")
+
+        def attention(dim: int, heads: int, plan: StagePlan, block: int) -> nn.Module:
+            kinds = blocks[plan.index]
+            kind = kinds[block % len(kinds)]
+            if kind == "D":
+                return DeformableAttention(
+                    dim,
+                    heads,
+                    map_size=plan.map_size,
+                    groups=groups[plan.index],
+                    kernel=2 * (len(depths) - plan.index) + 1,  # 9, 7, 5, 3: smaller, as the maps
+                    offset_range=offset_range,
+                )
+            shift = tuple(-(-side // 2) for side in plan.window) if kind == "S" else (0, 0)
+            return WindowAttention(
+                dim, heads, map_size=plan.map_size, window=plan.window, shift=shift
+            )
+
+        super().__init__(
+            num_classes,
+            in_chans,
+            embed_dim,
+            depths,
+            num_heads,
+            image_size=image_size,
+            patch_size=patch_size,
+            window=window,
+            mlp_ratio=mlp_ratio,
+            drop_path_rate=drop_path_rate,
+            mean=mean,
+            std=std,
+            attention=attention,
+            downsample=lambda dim, _plan: PatchProjection(dim, 2 * dim, 2, bias=False),
+        )
