@@ -8,6 +8,7 @@ COMMANDS = {
     "validate": "measures a trained model on the validation set",
     "test": "measures a trained model through lenses, for one after the other",
     "predict": "names what is in pictures taken through a known lens",
+    "convert": "makes a safetensors file of a pickled checkpoint, without executing it",
     "models": "lists the models",
 }
 
@@ -47,6 +48,12 @@ def _run(command: str, argv: list[str]) -> None:
         parser.add_argument("pictures", nargs="+", type=str, help="image files")
         parser.add_function_arguments(predict, skip={"pictures"})
         predict(**parser.parse_args(argv[1:]).as_dict())
+    elif command == "convert":
+        from jsonargparse import auto_cli
+
+        from darswin.compat import convert_checkpoint
+
+        auto_cli(convert_checkpoint, args=argv[1:], prog="darswin convert")
     else:
         from darswin.models import list_models
 

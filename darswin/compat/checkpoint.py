@@ -8,11 +8,14 @@ import re
 from collections import OrderedDict
 from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 import torch
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save
 from torch import Tensor
+
+from darswin.files import replace_file
 
 Source = str | os.PathLike | Mapping[str, Tensor]
 
@@ -41,7 +44,7 @@ def read_state(source: Source) -> dict[str, Tensor]:
             return load_file(path)
         except SafetensorError as error:
             raise ValueError(f"{path} cannot be read as safetensors: {error}") from error
-    return _model(_unpickled(path), path)
+    return _model(read_pickle(path), path)
 
 
 def convert_checkpoint(source: str | os.PathLike, target: str | os.PathLike) -> None:
@@ -56,8 +59,8 @@ def convert_checkpoint(source: str | os.PathLike, target: str | os.PathLike) -> 
     Raises:
         ValueError: as `read_state`.
     """
-    source, target = Path(source), Path(target)
-    checkpoint = _unpickled(source)
+    source = Path(source)
+    checkpoint = read_pickle(source)
     # Copies: safetensors takes no tensors that share memory.
     state = {
         name: value.clone(memory_format=torch.contiguous_format)
@@ -66,18 +69,14 @@ def convert_checkpoint(source: str | os.PathLike, target: str | os.PathLike) -> 
     metadata = {"format": "pt"}
     with contextlib.suppress(TypeError, ValueError, KeyError):
         metadata["config"] = json.dumps(checkpoint["config"])
-    partial = target.with_name(f".{target.name}.{os.getpid()}.partial")
-    try:
-        partial.write_bytes(save(state, metadata))  # save_file would make it private
-        os.replace(partial, target)
-    finally:
-        partial.unlink(missing_ok=True)
+    replace_file(target, save(state, metadata))
 
 
-def _unpickled(path: Path) -> object:
+def read_pickle(path: str | os.PathLike, map_location: Any = "cpu") -> object:
+    """What `torch.save` wrote; ValueError where that is more than tensors and plain values."""
     try:
         with torch.serialization.safe_globals(_STAND_INS):
-            return torch.load(path, map_location="cpu", weights_only=True)
+            return torch.load(path, map_location=map_location, weights_only=True)
     except OSError:
         raise
     except Exception as error:  # a file that is no checkpoint may fail in any way

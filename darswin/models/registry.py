@@ -46,12 +46,11 @@ def create_model(name: str, **options) -> nn.Module:
     Raises:
         ValueError: an unknown name, or options that do not fit together.
     """
-    check_model(name)
-    model, defaults = _MODELS[name]
-    return model(**(defaults | options))
+    return model_class(name)(**(_MODELS[name][1] | options))
 
 
-def check_model(name: str) -> None:
-    """ValueError unless `create_model` knows the name."""
+def model_class(name: str) -> type[nn.Module]:
+    """The class of the models of that name; ValueError for a name that there is not."""
     if name not in _MODELS:
         raise ValueError(f"unknown model {name!r}; there are {', '.join(list_models())}")
+    return _MODELS[name][0]

@@ -1,13 +1,13 @@
 """Checkpoints that no kill and no full disk spoils, their weights as safetensors beside them."""
 
 import io
-import pickle
 from pathlib import Path
 from typing import Any
 
 import torch
 from lightning.pytorch.plugins.io import TorchCheckpointIO
 
+from darswin.compat.checkpoint import read_pickle
 from darswin.files import replace_file
 from darswin.models.saving import ModelCard, save_model
 
@@ -37,11 +37,8 @@ class SafeCheckpointIO(TorchCheckpointIO):
     ) -> dict[str, Any]:
         if not Path(path).is_file():
             raise FileNotFoundError(f"no checkpoint {path}")
-        try:
-            checkpoint = torch.load(path, map_location=map_location, weights_only=True)
-        except (pickle.UnpicklingError, RuntimeError, EOFError) as error:
-            raise ValueError(f"{path} is no checkpoint that can be read safely: {error}") from error
-        if "darswin" not in checkpoint:
+        checkpoint = read_pickle(path, map_location)
+        if not isinstance(checkpoint, dict) or "darswin" not in checkpoint:
             raise ValueError(f"{path} is no checkpoint of `darswin fit`: it names no model")
         return checkpoint
 

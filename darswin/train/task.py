@@ -14,7 +14,8 @@ from torchmetrics.classification import MulticlassAccuracy
 
 from darswin.data.mixing import Mixing
 from darswin.lens import Lens
-from darswin.models.registry import check_model
+from darswin.models.encoder import ImageEncoder
+from darswin.models.registry import model_class
 from darswin.models.saving import ModelCard
 from darswin.train.recipe import learning_rate, parameter_groups
 
@@ -64,7 +65,7 @@ class Classification(LightningModule):
         seed: int = 0,
     ):
         super().__init__()
-        check_model(name)
+        model_class(name)
         if not 0 <= label_smoothing < 1:
             raise ValueError(f"label_smoothing must be in [0, 1), got {label_smoothing}")
         self.name, self.options = name, options or {}
@@ -84,7 +85,10 @@ class Classification(LightningModule):
             return
         data = self.trainer.datamodule
         options = dict(num_classes=len(data.classes), in_chans=data.channels)
-        options |= dict(mean=data.mean, std=data.std) | self.options
+        options |= dict(mean=data.mean, std=data.std)
+        if issubclass(model_class(self.name), ImageEncoder):
+            options["image_size"] = data.size
+        options |= self.options
         self.card = ModelCard(self.name, options, data.classes, data.size, data.fov)
         torch.manual_seed(self.seed)
         self.net = self.card.create()

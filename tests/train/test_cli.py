@@ -1,10 +1,12 @@
 """What goes wrong is said in one line, before any work."""
 
+import json
 import re
 
 import pytest
 import torch
 import yaml
+from safetensors.torch import load_file
 
 from darswin.__main__ import COMMANDS, main
 from darswin.train.cli import PRESETS, with_configs
@@ -83,3 +85,27 @@ def test_the_paper_s_preset_holds_the_recipe():
     assert (model["warmup_epochs"], model["weight_decay"]) == (20, 0.05)
     assert (model["mixup"], model["cutmix"], model["label_smoothing"]) == (0.8, 1.0, 0.1)
     assert (data["batch_size"], data["erasing"], data["size"]) == (128, 0.25, 64)
+
+
+FIVE = ["darswin_a_nano", "darswin_ra_nano", "swin_nano", "swin_undis_nano", "dat_nano"]
+
+
+@pytest.mark.parametrize("name", FIVE)
+def test_each_of_the_five_models_trains_and_tests(name, tmp_path, capsys):
+    run = ["--run", tmp_path]
+    fit = [*DIGITS, "--model.name", name, "--trainer.max_steps", "3", "--data.limit", "96"]
+    quiet = ["--data.workers", "0", "--trainer.enable_progress_bar", "false"]
+    main([str(a) for a in ("fit", *run, *fit, *quiet, "--model.mixup", "0.8")])
+    main([str(a) for a in ("test", *run, *quiet, "--xi", "0.1,polynomial")])
+    rows = json.loads((tmp_path / "test.json").read_text())
+    assert rows["model"] == name and [r["lenses"] for r in rows["results"]] == ["0.1", "polynomial"]
+    assert (tmp_path / "test.png").exists()
+
+
+def test_convert(tmp_path, capsys):
+    torch.save({"model": {"a": torch.ones(2)}, "epoch": 3}, tmp_path / "a.pth")
+    main(["convert", str(tmp_path / "a.pth"), str(tmp_path / "a.safetensors")])
+    assert load_file(tmp_path / "a.safetensors")["a"].tolist() == [1, 1]
+    torch.save([1, 2], tmp_path / "b.pth")
+    assert "no state dict" in error(capsys, "convert", tmp_path / "b.pth", tmp_path / "b")
+    assert not (tmp_path / "b").exists()
