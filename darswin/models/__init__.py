@@ -1,8 +1,19 @@
-"""The models, by name."""
+"""The models, by name, and their files."""
 
 from darswin.models.darswin import DarSwin
 from darswin.models.dat import DAT
 from darswin.models.registry import create_model, list_models
+from darswin.models.saving import ModelCard, load_model, save_model
 from darswin.models.swin import Swin, SwinUndis
 
-__all__ = ["DAT", "DarSwin", "Swin", "SwinUndis", "create_model", "list_models"]
+__all__ = [
+    "DAT",
+    "DarSwin",
+    "ModelCard",
+    "Swin",
+    "SwinUndis",
+    "create_model",
+    "list_models",
+    "load_model",
+    "save_model",
+]

@@ -1,0 +1,170 @@
+"""How many images a second training and testing handle, and what they spend outside the model.
+
+Runs `Classification` and `WideAngleData` as `darswin fit` does, on a folder of JPEG files, for each
+of the five models: with our operators and with their PyTorch reference. Then the loader alone.
+"""
+
+import argparse
+import json
+import tempfile
+import time
+import warnings
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from common import RESULTS, machine
+from lightning.pytorch import Callback, Trainer
+from torch.utils.data import DataLoader
+from tqdm import tqdm
+
+from darswin.data.augment import RandAugment, RandomErasing
+from darswin.ops import use_reference
+from darswin.train.data import WideAngleData
+from darswin.train.task import Classification
+
+FAMILIES = ("darswin_a", "darswin_ra", "swin", "swin_undis", "dat")
+WARM_UP = 3  # steps that are not counted
+
+
+def write_pictures(root: Path, count: int) -> None:
+    """Two classes of JPEG files of 500×375 pixels, with detail at every scale."""
+    rng = np.random.default_rng(0)
+    for k in range(count):
+        picture = np.zeros((375, 500, 3), np.float32)
+        for scale in (4, 16, 64):
+            noise = rng.random((scale, scale, 3), dtype=np.float32)
+            picture += cv2.resize(noise, (500, 375), interpolation=cv2.INTER_CUBIC) / 3
+        folder = root / f"class{k % 2}"
+        folder.mkdir(parents=True, exist_ok=True)
+        cv2.imwrite(str(folder / f"{k:04}.jpg"), np.clip(255 * picture, 0, 255).astype(np.uint8))
+
+
+class Stopwatch(Callback):
+    """The time of the steps, and of all there is between them, after a warm-up."""
+
+    def __init__(self):
+        self.inside, self.start, self.end, self.steps = 0.0, 0.0, 0.0, 0
+
+    def _begin(self, batch_idx: int) -> None:
+        self.began = time.perf_counter()
+        if batch_idx == WARM_UP:
+            self.start = self.end
+
+    def _finish(self, batch_idx: int) -> None:
+        self.end = time.perf_counter()
+        if batch_idx >= WARM_UP:
+            self.inside += self.end - self.began
+            self.steps += 1
+
+    def on_train_batch_start(self, trainer, pl_module, batch, batch_idx):
+        self._begin(batch_idx)
+
+    def on_train_batch_end(self, trainer, pl_module, outputs, batch, batch_idx):
+        self._finish(batch_idx)
+
+    def on_test_batch_start(self, trainer, pl_module, batch, batch_idx, dataloader_idx=0):
+        self._begin(batch_idx)
+
+    def on_test_batch_end(self, trainer, pl_module, outputs, batch, batch_idx, dataloader_idx=0):
+        self._finish(batch_idx)
+
+    def result(self, batch: int) -> dict[str, float]:
+        """Images a second, and the share of the time that was not spent in steps."""
+        wall = self.end - self.start
+        return dict(images_per_second=self.steps * batch / wall, outside=1 - self.inside / wall)
+
+
+def run(mode: str, name: str, data: dict, steps: int, reference: bool) -> dict[str, float]:
+    """One model, trained or tested for some steps."""
+    watch = Stopwatch()
+    trainer = Trainer(
+        accelerator="cpu", max_epochs=1, limit_train_batches=steps, limit_test_batches=steps,
+        limit_val_batches=0, callbacks=[watch], logger=False, enable_checkpointing=False,
+        enable_progress_bar=False, enable_model_summary=False, use_distributed_sampler=False,
+    )  # fmt: skip
+    module = WideAngleData(**data, test_lenses="low")
+    with use_reference(reference):
+        (trainer.fit if mode == "train" else trainer.test)(Classification(name), datamodule=module)
+    return watch.result(data["batch_size"])
+
+
+def loader_rates(data: dict) -> dict[str, float]:
+    """Images a second that one core makes, all told and of each part of the work alone."""
+    module = WideAngleData(**data)
+    dataset = module.dataset("train", augment=RandAugment(), erase=RandomErasing())
+    rng = np.random.default_rng(0)
+    picture, _ = dataset.source[0]
+    _, lens, _ = dataset[0]
+    image = dataset.through(lens, picture)
+    parts = {
+        "read and decode": lambda k: dataset.source[k],
+        "warp and reduce": lambda k: dataset.through(lens, picture),
+        "RandAugment": lambda k: RandAugment()(image, rng),
+        "all": lambda k: dataset[k],
+    }
+    threads, cv_threads = torch.get_num_threads(), cv2.getNumThreads()
+    torch.set_num_threads(1)
+    cv2.setNumThreads(1)
+    rates = {}
+    for part, work in parts.items():
+        start, count = time.perf_counter(), len(dataset)
+        for k in range(count):
+            work(k)
+        rates[part] = count / (time.perf_counter() - start)
+    torch.set_num_threads(threads)
+    cv2.setNumThreads(cv_threads)
+    for workers in (1, 2):
+        batches = DataLoader(dataset, 16, num_workers=workers, prefetch_factor=4)
+        iterator = iter(batches)
+        next(iterator)
+        start, count = time.perf_counter(), sum(len(b[0]) for b in iterator)
+        rates[f"{workers} worker processes"] = count / (time.perf_counter() - start)
+    return rates
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--size", default="micro", help="of the models")
+    parser.add_argument("--batch", type=int, default=32)
+    parser.add_argument("--steps", type=int, default=12, help="timed, of each run")
+    parser.add_argument("--quick", action="store_true", help="one model, few steps, nothing kept")
+    args = parser.parse_args()
+    warnings.filterwarnings("ignore")
+    print(" ".join(f"{k}={v}" for k, v in machine().items()))
+    families = FAMILIES[:1] if args.quick else FAMILIES
+    steps = WARM_UP + (2 if args.quick else args.steps)
+    report: dict = dict(machine=machine(), size=args.size, batch=args.batch, models={})
+    with tempfile.TemporaryDirectory() as folder:
+        write_pictures(Path(folder), steps * args.batch * 5 // 4 + 16)
+        data = dict(path=folder, batch_size=args.batch, holdout=0.1)
+        report["loader"] = loader_rates(data)
+        for part, rate in report["loader"].items():
+            print(f"loader, {part}: {rate:.0f} images/s")
+        cases = [(f, mode, ref) for f in families for mode in ("train", "test") for ref in (0, 1)]
+        for family, mode, reference in tqdm(cases, unit="run"):
+            name = f"{family}_{args.size}"
+            if mode == "test":  # the whole folder, as its test set
+                data = dict(data, holdout=0.49)
+            found = run(mode, name, data, steps, bool(reference))
+            entry = report["models"].setdefault(name, {}).setdefault(mode, {})
+            entry["reference" if reference else "darswin"] = found
+    print(
+        f"\n{'images a second':<22}{'':>6}{'darswin':>9}{'reference':>11}{'ratio':>7}{'outside':>9}"
+    )
+    for name, modes in report["models"].items():
+        for mode, both in modes.items():
+            ours, theirs = (both[k]["images_per_second"] for k in ("darswin", "reference"))
+            print(
+                f"{name:<22}{mode:>6}{ours:>9.1f}{theirs:>11.1f}{ours / theirs:>6.2f}×"
+                f"{both['darswin']['outside']:>8.1%}"
+            )
+    if not args.quick:
+        path = RESULTS / f"training--{args.size}.json"
+        path.write_text(json.dumps(report, indent=1))
+        print(path)
+
+
+if __name__ == "__main__":
+    main()
