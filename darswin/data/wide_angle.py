@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Sequence
+from functools import lru_cache
 from typing import Literal, NamedTuple
 
 import cv2
@@ -13,12 +14,26 @@ from torch.utils.data import Dataset
 from darswin.data.lenses import Lenses
 from darswin.data.sources import BrokenImageError, Source
 from darswin.lens import Lens, Perspective
-from darswin.reprojection import reprojection
 
 # Per-channel statistics of ImageNet, in [0, 1].
 IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 # The paper's pictures, 384 px wide, have a focal length of 9 px.
 PAPER_FOV = 2 * math.atan(192 / 9)
+
+
+@lru_cache(maxsize=256)
+def _camera(fov: float, side: int) -> Perspective:
+    """What a square picture was taken with."""
+    return Perspective.from_fov(fov, side / 2)
+
+
+@lru_cache(maxsize=4)
+def _rays(side: int) -> tuple[Tensor, np.ndarray, np.ndarray]:
+    """The different radii (1, K) of a square's pixels, which one each pixel has, and its offset."""
+    y, x = np.mgrid[:side, :side] - (side - 1) / 2
+    square, place = np.unique(x * x + y * y, return_inverse=True)
+    radii = torch.from_numpy(np.sqrt(square)).to(torch.float32).clamp(min=1e-6)
+    return radii[None], place.reshape(side, side), np.stack((x, y), -1).astype(np.float32)
 
 
 class Draw(NamedTuple):
@@ -130,15 +145,25 @@ class WideAngle(Dataset):
     def through(self, lens: Lens, picture: np.ndarray) -> np.ndarray:
         """The picture (H, W, C) uint8 through a lens of this data set → (size, size, C) uint8."""
         picture = self._square(picture)
-        side = picture.shape[0]
-        camera = Perspective.from_fov(self.fov, side / 2)
-        larger = lens.resized(self.render / self.size)
-        there = reprojection(camera, (side, side), larger, (self.render, self.render))[0].numpy()
+        there = self._pixels(lens, picture.shape[0])
         # With both coordinates in one array OpenCV need not join them.
         image = cv2.remap(picture, there, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
         if self.render != self.size:
             image = cv2.resize(image, (self.size, self.size), interpolation=cv2.INTER_AREA)
         return image.reshape(self.size, self.size, -1)
+
+    def _pixels(self, lens: Lens, side: int) -> np.ndarray:
+        """`darswin.reprojection` of a centred lens: (render, render, 2), x and y in the picture.
+
+        An image has an eighth as many radii as pixels, and only radii need the lens's curve.
+        """
+        camera = _camera(self.fov, side)
+        radii, place, offset = _rays(self.render)
+        theta = lens.resized(self.render / self.size).unproject(radii)[0]
+        seen = theta <= lens.theta_max * (1 + 1e-6)  # False for NaN
+        ratio = camera.project(torch.where(seen, theta, 0.0)[None])[0] / radii[0]
+        ratio = torch.where(seen, ratio, 1e4).numpy()  # far outside
+        return offset * ratio[place][..., None] + np.float32((side - 1) / 2)
 
     def _square(self, picture: np.ndarray) -> np.ndarray:
         height, width = picture.shape[:2]

@@ -6,10 +6,11 @@ import pytest
 import torch
 from torch.utils.data import DataLoader
 
-from darswin.data import SphericalLenses, WideAngle, warp
+from darswin.data import PolynomialLenses, SphericalLenses, WideAngle, warp
 from darswin.data.sources import Arrays, BrokenImageError, ImageFiles
 from darswin.data.wide_angle import IMAGENET_MEAN, IMAGENET_STD, PAPER_FOV, Draw
 from darswin.lens import Perspective, Spherical
+from darswin.reprojection import reprojection
 
 
 def smooth(size=384):
@@ -44,6 +45,23 @@ def test_an_image_is_the_warp_of_the_picture_reduced():
     inside = np.hypot(x, y) < 28
     assert np.abs(got - expected)[inside].mean() < 1.5
     assert np.abs(got)[np.hypot(x, y) > 33].max() < 1e-3  # black
+
+
+@pytest.mark.parametrize(("size", "render"), [(64, 224), (15, 31)])
+@pytest.mark.parametrize("distribution", [SphericalLenses(0, 1), PolynomialLenses()])
+def test_the_map_of_a_lens_is_the_reprojection(size, render, distribution):
+    dataset = WideAngle(pictures(), distribution, size=size, render=render)
+    lens = dataset[0][1]
+    larger = lens.resized(render / size)
+    camera = Perspective.from_fov(PAPER_FOV, 20)
+    expected = reprojection(camera, (40, 40), larger, (render, render))[0].numpy()
+    got = dataset._pixels(lens, 40)
+    inside = (expected > -1).all(-1)
+    y, x = np.mgrid[:render, :render] - (render - 1) / 2
+    rim = np.abs(np.hypot(x, y) - render / 2) < 0.01  # seen or not, by rounding
+    np.testing.assert_allclose(got[inside & ~rim], expected[inside & ~rim], atol=2e-3)
+    outside = ~inside & ~rim & (np.hypot(x, y) > 0)
+    assert (np.abs(got[outside]).max(-1) > 60).all() and outside.any()
 
 
 def test_a_sample_depends_on_its_draw_alone():
