@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/installed
 
-.PHONY: help build demo test test-isa lint format bench dist clean
+.PHONY: help build demo test test-isa lint format bench study dist clean
 
 help:  ## this list
 	@grep -E '^[a-z-]+:.*##' Makefile | sed -E 's/:.*## /\t/' | expand -t 12
@@ -43,9 +43,14 @@ format: $(STAMP)  ## ruff and clang-format, in place
 	$(BIN)/ruff format .
 	$(BIN)/clang-format -i csrc/*.cpp csrc/*.h csrc/kernels/*
 
-bench: build  ## time both operators against their peers; nothing else should be running
+bench: build  ## time the operators against their peers, and training; nothing else should be running
 	$(BIN)/python benchmarks/sampling.py
 	$(BIN)/python benchmarks/attention.py
+	$(BIN)/python benchmarks/training.py
+
+study: build  ## the paper's experiments, small: an hour; goes on where it was stopped
+	$(BIN)/python studies/study.py
+	$(BIN)/python studies/tables.py
 
 dist: $(STAMP)  ## sdist and wheel in dist/
 	PATH=$(CURDIR)/$(BIN):$$PATH $(BIN)/python -m build --no-isolation --outdir dist

@@ -1,0 +1,66 @@
+"""The cells of the study: which model is trained on which lenses."""
+
+from dataclasses import dataclass, field
+
+LEVELS = ("very low", "low", "medium", "high")
+SWEEP = [f"{k / 20:g}" for k in range(21)]  # ξ = 0, 0.05, …, 1
+POLYNOMIAL = "polynomial"
+
+# The released code spaces rings and samples by tan θ, and so the paper's numbers must; see README.
+DARSWIN = dict(spacing="tan", samples=[10, 10])
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A model, its options, and the lenses and the seed it is trained with."""
+
+    label: str
+    family: str
+    options: dict = field(default_factory=dict)
+    level: str = "low"
+    seed: int = 0
+
+    @property
+    def key(self) -> str:
+        """The name of its folder."""
+        words = f"{self.label} {self.level} {self.seed}".lower()
+        return "".join(c if c.isalnum() else "-" for c in words)
+
+
+MODELS = {
+    "DarSwin-A": ("darswin_a", DARSWIN),
+    "DAT": ("dat", {}),
+    "Swin (undis)": ("swin_undis", {}),
+    "Swin": ("swin", {}),
+}
+
+# Table 3 of the paper, and the spacings, in which it and its released code differ.
+ABLATIONS = {
+    "polar position bias": ("darswin_a", dict(position_bias="polar")),
+    "angular position bias": ("darswin_a", dict(position_bias="angular")),
+    "S_r = 5": ("darswin_a", dict(samples=[5, 10])),
+    "S_r = 2": ("darswin_a", dict(samples=[2, 10])),
+    "DarSwin-RA": ("darswin_ra", {}),
+    "no jitter": ("darswin_a", dict(jitter=0.0)),
+    "uniform sampling": ("darswin_a", dict(sample_spacing="radius")),
+    "no distortion-aware partition": ("darswin_a", dict(spacing="radius")),
+    "spacing θ": ("darswin_a", dict(spacing="theta")),
+    "spacing g": ("darswin_a", dict(spacing="g")),
+}
+
+
+def headline(seeds: int) -> list[Cell]:
+    """Each model on each level, seed by seed, so that the first seed is complete first."""
+    return [
+        Cell(label, family, options, level, seed)
+        for seed in range(seeds)
+        for level in LEVELS
+        for label, (family, options) in MODELS.items()
+    ]
+
+
+def ablations() -> list[Cell]:
+    """DarSwin-A trained on "low", with one thing changed."""
+    return [
+        Cell(label, family, DARSWIN | changes) for label, (family, changes) in ABLATIONS.items()
+    ]

@@ -1,0 +1,161 @@
+"""The tables and the picture of the study, from what its cells found; writes them into the README.
+
+`python studies/tables.py` makes them again from `results/`.
+"""
+
+import argparse
+import io
+import json
+import platform
+import statistics
+from collections import defaultdict
+from pathlib import Path
+
+import torch
+from cells import ABLATIONS, LEVELS, MODELS, POLYNOMIAL, SWEEP
+from matplotlib.figure import Figure
+
+from darswin.data.lenses import LEVELS as RANGES
+from darswin.files import replace_file
+
+HERE = Path(__file__).parent
+README = HERE.parent / "README.md"
+
+# The paper's tables (DarSwin, ICCV 2023), by the training level.
+PAPER_04 = {
+    "DarSwin-A": (80.33, 92.61, 92.35, 91.39),
+    "DAT": (57.5, 90.4, 88.5, 75.7),
+    "Swin (undis)": (47.48, 91.52, 91.07, 87.34),
+    "Swin": (33.94, 87.90, 78.7, 40.1),
+}
+PAPER_POLYNOMIAL = {
+    "DarSwin-A": (82.7, 84.8, 78.4, 65.5),
+    "DAT": (65.4, 85.9, 78.9, 63.8),
+    "Swin (undis)": (85.9, 87.1, 71.3, 60.3),
+    "Swin": (33.5, 70.2, 42.3, 25.6),
+}
+# The paper's ablations, by the test level.
+PAPER_ABLATIONS = {
+    "DarSwin-A": (83.43, 92.8, 91.5, 88.27),
+    "polar position bias": (79.6, 92.0, 90.1, 85.4),
+    "angular position bias": (81.47, 92.617, 91.11, 87.4),
+    "S_r = 5": (81.81, 91.94, 90.0, 85.19),
+    "S_r = 2": (78.9, 90.4, 87.9, 82.4),
+    "DarSwin-RA": (79.7, 92.7, 90.3, 84.7),
+    "no jitter": (81.5, 92.6, 91.16, 87.4),
+    "uniform sampling": (82.4, 92.5, 91.2, 86.2),
+    "no distortion-aware partition": (52.2, 91.3, 86.2, 75.5),
+}
+
+
+def collect(cells: list[dict], folder: Path, size: str) -> None:
+    """Writes the results of a study, with the machine and versions, and draws its picture."""
+    machine = dict(
+        python=platform.python_version(), torch=torch.__version__, machine=platform.machine()
+    )
+    cells = sorted(cells, key=lambda c: (c["label"], c["level"], c["seed"]))
+    text = json.dumps(dict(machine=machine, size=size, cells=cells), indent=1)
+    replace_file(folder / f"study--{size}.json", text)
+    draw(cells, folder / f"study--{size}.png")
+
+
+def by_model(cells: list[dict]) -> dict[tuple[str, str], list[dict]]:
+    """The accuracies of every seed, by label and training level."""
+    found = defaultdict(list)
+    for cell in cells:
+        found[cell["label"], cell["level"]].append(cell["accuracy"])
+    return found
+
+
+def draw(cells: list[dict], path: Path) -> None:
+    """Accuracy against ξ: a panel for each training level, its range shaded; lines are means of the
+    seeds, bands their span."""
+    found, xi = by_model(cells), [float(name) for name in SWEEP]
+    figure = Figure(figsize=(12, 8), layout="constrained")
+    for axes, level in zip(figure.subplots(2, 2, sharey=True).flat, LEVELS, strict=True):
+        axes.axvspan(*RANGES[level], color="tab:pink", alpha=0.3, lw=0, label="seen in training")
+        for label in MODELS:
+            runs = found.get((label, level))
+            if runs:
+                values = [[run[name] for run in runs] for name in SWEEP]
+                (line,) = axes.plot(xi, list(map(statistics.mean, values)), label=label)
+                low, high = list(map(min, values)), list(map(max, values))
+                axes.fill_between(xi, low, high, color=line.get_color(), alpha=0.2, lw=0)
+        axes.set(title=f'trained on "{level}"', xlabel="distortion ξ", xlim=(0, 1))
+        axes.set_ylabel("accuracy (%)")
+        axes.grid(alpha=0.3)
+    axes.legend(loc="lower left")
+    picture = io.BytesIO()
+    figure.savefig(picture, format="png", dpi=110)
+    replace_file(path, picture.getvalue())
+
+
+def row(label: str, values: list[str]) -> str:
+    return f"| {label} | {' | '.join(values)} |"
+
+
+def spread(values: list[float]) -> str:
+    """Mean and, of several seeds, half the span."""
+    mean = f"{statistics.mean(values):.1f}"
+    return mean if len(values) < 2 else f"{mean} ± {(max(values) - min(values)) / 2:.1f}"
+
+
+def level_table(cells: list[dict], lenses: str, paper: dict) -> str:
+    """A row a model, a column a training level: ours, and the paper's in brackets."""
+    found = by_model(cells)
+    lines = [row("trained on", [f'"{level}"' for level in LEVELS]), "|---" * 5 + "|"]
+    for label in MODELS:
+        values = []
+        for level, published in zip(LEVELS, paper[label], strict=True):
+            runs = found.get((label, level))
+            ours = spread([run[lenses] for run in runs]) if runs else "not run"
+            values.append(f"{ours} ({published:.1f})")
+        lines.append(row(label, values))
+    return "\n".join(lines)
+
+
+def ablation_table(cells: list[dict]) -> str:
+    """A row a variant trained on "low" with the first seed, a column a test level."""
+    first = {c["label"]: c["accuracy"] for c in cells if c["level"] == "low" and c["seed"] == 0}
+    lines = [row("tested on", [f'"{level}"' for level in LEVELS]), "|---" * 5 + "|"]
+    for label in ("DarSwin-A", *ABLATIONS):
+        published = PAPER_ABLATIONS.get(label)
+        values = []
+        for k, level in enumerate(LEVELS):
+            ours = f"{first[label][level]:.1f}" if label in first else "not run"
+            values.append(ours + (f" ({published[k]:.1f})" if published else ""))
+        lines.append(row(label, values))
+    return "\n".join(lines)
+
+
+def tables(cells: list[dict]) -> dict[str, str]:
+    """The README's tables, by the name of their place in it."""
+    return {
+        "xi-0.4": level_table(cells, "0.4", PAPER_04),
+        "polynomial": level_table(cells, POLYNOMIAL, PAPER_POLYNOMIAL),
+        "ablations": ablation_table(cells),
+    }
+
+
+def place(text: str, name: str, table: str) -> str:
+    """The text with a table between the marks of its name."""
+    begin, end = f"<!-- study: {name} -->", f"<!-- end: {name} -->"
+    before, rest = text.split(begin)
+    return f"{before}{begin}\n{table}\n{end}{rest.split(end)[1]}"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--size", default="nano")
+    args = parser.parse_args()
+    file = HERE / "results" / f"study--{args.size}.json"
+    cells = json.loads(file.read_text())["cells"]
+    draw(cells, file.with_suffix(".png"))
+    text = README.read_text()
+    for name, table in tables(cells).items():
+        text = place(text, name, table)
+    replace_file(README, text)
+
+
+if __name__ == "__main__":
+    main()
