@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/installed
 
-.PHONY: help build demo test test-isa lint format bench study dist clean
+.PHONY: help build demo test test-isa lint format bench study readme dist clean
 
 help:  ## this list
 	@grep -E '^[a-z-]+:.*##' Makefile | sed -E 's/:.*## /\t/' | expand -t 12
@@ -50,7 +50,9 @@ bench: build  ## time the operators against their peers, and training; nothing e
 
 study: build  ## the paper's experiments, small: an hour; goes on where it was stopped
 	$(BIN)/python studies/study.py
-	$(BIN)/python studies/tables.py
+
+readme: $(STAMP)  ## fill the README's tables from the results of bench and study
+	$(BIN)/python docs/readme.py
 
 dist: $(STAMP)  ## sdist and wheel in dist/
 	PATH=$(CURDIR)/$(BIN):$$PATH $(BIN)/python -m build --no-isolation --outdir dist

@@ -1,9 +1,5 @@
-"""The tables and the picture of the study, from what its cells found; writes them into the README.
+"""The tables and the picture of the study, from what its cells found."""
 
-`python studies/tables.py` makes them again from `results/`.
-"""
-
-import argparse
 import io
 import json
 import platform
@@ -17,9 +13,6 @@ from matplotlib.figure import Figure
 
 from darswin.data.lenses import LEVELS as RANGES
 from darswin.files import replace_file
-
-HERE = Path(__file__).parent
-README = HERE.parent / "README.md"
 
 # The paper's tables (DarSwin, ICCV 2023), by the training level.
 PAPER_04 = {
@@ -135,27 +128,3 @@ def tables(cells: list[dict]) -> dict[str, str]:
         "polynomial": level_table(cells, POLYNOMIAL, PAPER_POLYNOMIAL),
         "ablations": ablation_table(cells),
     }
-
-
-def place(text: str, name: str, table: str) -> str:
-    """The text with a table between the marks of its name."""
-    begin, end = f"<!-- study: {name} -->", f"<!-- end: {name} -->"
-    before, rest = text.split(begin)
-    return f"{before}{begin}\n{table}\n{end}{rest.split(end)[1]}"
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--size", default="nano")
-    args = parser.parse_args()
-    file = HERE / "results" / f"study--{args.size}.json"
-    cells = json.loads(file.read_text())["cells"]
-    draw(cells, file.with_suffix(".png"))
-    text = README.read_text()
-    for name, table in tables(cells).items():
-        text = place(text, name, table)
-    replace_file(README, text)
-
-
-if __name__ == "__main__":
-    main()

@@ -1,11 +1,13 @@
 """The README's code runs as it stands there."""
 
 import re
+import sys
 from pathlib import Path
 
 import torch
 
-README = (Path(__file__).parent.parent / "README.md").read_text()
+ROOT = Path(__file__).parent.parent
+README = (ROOT / "README.md").read_text()
 
 
 def test_python_blocks():
@@ -23,4 +25,13 @@ def test_python_blocks():
 def test_pictures_and_links_exist():
     for target in re.findall(r"\]\(([^)#]+)\)", README):
         if not target.startswith("http"):
-            assert (Path(__file__).parent.parent / target).is_file(), target
+            assert (ROOT / target).is_file(), target
+
+
+def test_tables_are_those_of_the_results():
+    sys.path.append(str(ROOT / "docs"))
+    import readme
+
+    for name, table in readme.tables().items():
+        assert readme.placed(name, table) in README, name
+        assert "not run" not in table

@@ -60,14 +60,3 @@ def test_tables_and_picture(quick):
     made = tables.tables(cells)
     assert "| Swin |" in made["xi-0.4"] and "(33.9)" in made["xi-0.4"]
     assert "not run" not in made["ablations"]
-    text = tables.place("a\n<!-- study: x -->\nold\n<!-- end: x -->\nb", "x", "new")
-    assert text == "a\n<!-- study: x -->\nnew\n<!-- end: x -->\nb"
-
-
-def test_the_readme_has_the_tables_of_the_results():
-    results = ROOT / "studies" / "results" / "study--nano.json"
-    cells = json.loads(results.read_text())["cells"]
-    readme = (ROOT / "README.md").read_text()
-    for name, table in tables.tables(cells).items():
-        assert f"<!-- study: {name} -->\n{table}\n<!-- end: {name} -->" in readme
-        assert "not run" not in table

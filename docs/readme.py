@@ -1,0 +1,132 @@
+"""Puts the tables of `results/` into the README: compact ones, at one and at two threads ("a / b").
+
+A ratio is the time of what one would write without the operator, over ours. Run it after `make
+bench`.
+"""
+
+import json
+from pathlib import Path
+
+ROOT = Path(__file__).parent.parent
+README = ROOT / "README.md"
+RESULTS = Path(__file__).parent / "results"
+
+SAMPLING_PEERS = ("F.grid_sample", "F.grid_sample + permute", "cv2.remap")
+EMBED_PEERS = ("F.grid_sample + permute + F.linear", "F.linear alone")
+
+
+def load(name: str) -> list[dict]:
+    return json.loads((RESULTS / name).read_text())["results"]
+
+
+def both(rows: list[dict], value) -> str:
+    """The value of each number of threads, "a / b"; empty where there is none."""
+    found = [value(row) for row in sorted(rows, key=lambda row: row["threads"])]
+    return " / ".join(found)
+
+
+def ratio(row: dict) -> str:
+    return f"{row['ratio']:.1f}×"
+
+
+def milliseconds(row: dict) -> str:
+    return f"{1e3 * row['median']:.2f}"
+
+
+def peers_table(results: list[dict], operator: str, peers: tuple[str, ...]) -> str:
+    """A row a case and mode, a column a peer."""
+    rows = [r for r in results if r["operator"] == operator]
+    lines = [f"| `{operator}` | ours (ms) | {' | '.join(peers)} |", "|---" * (len(peers) + 2) + "|"]
+    for case, mode in dict.fromkeys((r["case"], r["mode"]) for r in rows):
+        found = {}
+        for row in rows:
+            if (row["case"], row["mode"]) == (case, mode):
+                found.setdefault(row["name"], []).append(row)
+        if not any(peer in found for peer in peers):
+            continue
+        cells = [both(found.get(peer, []), ratio) for peer in peers]
+        ours = both(found["darswin"], milliseconds)
+        lines.append(f"| {case}, {mode} | {ours} | {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def attention_table(results: list[dict]) -> str:
+    """A row a case; for each mode the best of all peers, and eager."""
+    modes = {
+        "forward": ("window_attention", "forward"),
+        "forward+backward": ("window_attention", "forward+backward"),
+        "forward+backward, bfloat16": ("window_attention, bfloat16", "forward+backward"),
+    }
+    head = " | ".join(f"{mode}: best peer | eager" for mode in modes)
+    lines = [f"| `window_attention` | ours, forward (ms) | {head} |", "|---" * 8 + "|"]
+    for case in dict.fromkeys(r["case"] for r in results):
+        cells, times = [], ""
+        for operator, mode in modes.values():
+            rows = [
+                r
+                for r in results
+                if (r["operator"], r["case"], r["mode"]) == (operator, case, mode)
+            ]
+            threads = sorted({r["threads"] for r in rows})
+            peers = [
+                [r for r in rows if r["threads"] == t and "darswin" not in r["name"]]
+                for t in threads
+            ]
+            best = [min(group, key=lambda r: r["ratio"]) for group in peers]
+            eager = [r for r in rows if r["name"] == "eager"]
+            cells += [both(list(best.values()), ratio), both(eager, ratio)]
+            times = times or both([r for r in rows if r["name"] == "darswin"], milliseconds)
+        lines.append(f"| {case} | {times} | {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def training_table(report: dict) -> str:
+    """A row a model: images a second in training and testing, and over the reference operators."""
+    lines = [
+        "| model | training (images/s) | over the reference | outside the model "
+        "| testing (images/s) | over the reference |",
+        "|---" * 6 + "|",
+    ]
+    for name, modes in report["models"].items():
+        cells = []
+        for mode in ("train", "test"):
+            ours, theirs = (modes[mode][k] for k in ("darswin", "reference"))
+            cells += [
+                f"{ours['images_per_second']:.0f}",
+                f"{ours['images_per_second'] / theirs['images_per_second']:.2f}×",
+            ]
+            if mode == "train":
+                cells.append(f"{ours['outside']:.1%}")
+        lines.append(f"| `{name}` | {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def tables() -> dict[str, str]:
+    """All tables, by the name of their place in the README."""
+    sampling, attention = load("sampling--avx512.json"), load("attention--avx512.json")
+    training = json.loads((RESULTS / "training--micro.json").read_text())
+    cells = json.loads((ROOT / "studies" / "results" / "study--nano.json").read_text())["cells"]
+    return {
+        "sampling": peers_table(sampling, "polar_sample", SAMPLING_PEERS),
+        "embedding": peers_table(sampling, "polar_embed", EMBED_PEERS),
+        "attention": attention_table(attention),
+        "training": training_table(training),
+        **study.tables(cells),
+    }
+
+
+def placed(name: str, table: str) -> str:
+    """A table between the marks of its place."""
+    return f"<!-- table: {name} -->\n{table}\n<!-- end: {name} -->"
+
+
+def main() -> None:
+    text = README.read_text()
+    for name, table in tables().items():
+        before, rest = text.split(f"<!-- table: {name} -->")
+        text = before + placed(name, table) + rest.split(f"<!-- end: {name} -->")[1]
+    README.write_text(text)
+
+
+if __name__ == "__main__":
+    main()
