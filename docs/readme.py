@@ -5,9 +5,12 @@ bench`.
 """
 
 import json
+import sys
 from pathlib import Path
 
 ROOT = Path(__file__).parent.parent
+sys.path.append(str(ROOT / "studies"))
+
 README = ROOT / "README.md"
 RESULTS = Path(__file__).parent / "results"
 
@@ -103,6 +106,8 @@ def training_table(report: dict) -> str:
 
 def tables() -> dict[str, str]:
     """All tables, by the name of their place in the README."""
+    import tables as study
+
     sampling, attention = load("sampling--avx512.json"), load("attention--avx512.json")
     training = json.loads((RESULTS / "training--micro.json").read_text())
     cells = json.loads((ROOT / "studies" / "results" / "study--nano.json").read_text())["cells"]
