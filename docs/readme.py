@@ -1,7 +1,7 @@
-"""Puts the tables of `results/` into the README: compact ones, at one and at two threads ("a / b").
+"""Fills the README's tables from the results of the benchmarks and of the study: `make readme`.
 
-A ratio is the time of what one would write without the operator, over ours. Run it after `make
-bench`.
+In a benchmark's table "a / b" is at one and at two threads, and a ratio is the time of what one
+would write without the operator, over ours.
 """
 
 import json
@@ -12,7 +12,7 @@ ROOT = Path(__file__).parent.parent
 sys.path.append(str(ROOT / "studies"))
 
 README = ROOT / "README.md"
-RESULTS = Path(__file__).parent / "results"
+RESULTS = ROOT / "benchmarks" / "results"
 
 SAMPLING_PEERS = ("F.grid_sample", "F.grid_sample + permute", "cv2.remap")
 EMBED_PEERS = ("F.grid_sample + permute + F.linear", "F.linear alone")
