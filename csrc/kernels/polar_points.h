@@ -69,7 +69,7 @@ double reach(const PolarSampleArgs<T>& a, int64_t b, int64_t i) {
 // The part of locate() that jitter needs. With `tiny` turns their sines are short sums.
 template <bool tiny, typename T, typename Visit>
 void locate_moved(const PolarSampleArgs<T>& a, int64_t b, int64_t i, int64_t j, int64_t count,
-                  const RandomWords& random, Visit visit) {
+                  const RandomWords& random, const Visit& visit) {
   using Ints = Vector<int32_t, kDoubles>;
   const T* radii = a.radii + b * a.radii_stride;
   const T* center = a.center + b * a.center_stride;
@@ -113,7 +113,7 @@ void locate_moved(const PolarSampleArgs<T>& a, int64_t b, int64_t i, int64_t j, 
 // last register may reach beyond count.
 template <typename T, typename Visit>
 void locate(const PolarSampleArgs<T>& a, int64_t b, int64_t i, int64_t j, int64_t count,
-            RandomWords& random, Visit visit) {
+            RandomWords& random, const Visit& visit) {
   if (a.jitter > 0) {
     random.draw(a.seed, static_cast<uint64_t>(b), static_cast<uint64_t>(i * a.num_azimuths + j),
                 count);
