@@ -28,8 +28,8 @@ struct RandomWords {
   void draw(uint64_t seed, uint64_t image, uint64_t point, int64_t count) {
     constexpr int lanes = kLanes<uint64_t>;
     first = static_cast<int64_t>(point % 4);
-    Words counter;
-    for (int lane = 0; lane < lanes; ++lane) counter[lane] = point / 4 + lane;
+    constexpr uint64_t steps[] = {0, 1, 2, 3, 4, 5, 6, 7};
+    Words counter = load<Words>(steps) + point / 4;
     for (int64_t k = 0; k < first + count; k += 4 * lanes) {
       Words w[4];
       philox(seed, counter, image, w);
