@@ -27,7 +27,8 @@ inline Vector<double, 4> interpolate(const double* pixel, const double* below, d
 
 #if defined(__AVX512F__)
 // Four points in a register: two pairs of pixels and two of those below, then four pixels and their
-// right neighbours.
+// right neighbours. Loads and stores are what limits a point alone: here the weights of four are
+// two loads, and the four go out as one store where they lie one behind the other.
 inline Vector<float, 16> interpolate_four(const float* pixels, const float* below,
                                           const int32_t* offset, const float* right,
                                           const float* lower) {
