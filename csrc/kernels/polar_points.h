@@ -28,8 +28,8 @@ struct RandomWords {
   void draw(uint64_t seed, uint64_t image, uint64_t point, int64_t count) {
     constexpr int lanes = kLanes<uint64_t>;
     first = static_cast<int64_t>(point % 4);
-    Words counter;
-    for (int lane = 0; lane < lanes; ++lane) counter[lane] = point / 4 + lane;
+    constexpr uint64_t steps[] = {0, 1, 2, 3, 4, 5, 6, 7};
+    Words counter = load<Words>(steps) + point / 4;
     for (int64_t k = 0; k < first + count; k += 4 * lanes) {
       Words w[4];
       philox(seed, counter, image, w);
@@ -69,7 +69,7 @@ double reach(const PolarSampleArgs<T>& a, int64_t b, int64_t i) {
 // The part of locate() that jitter needs. With `tiny` turns their sines are short sums.
 template <bool tiny, typename T, typename Visit>
 void locate_moved(const PolarSampleArgs<T>& a, int64_t b, int64_t i, int64_t j, int64_t count,
-                  const RandomWords& random, Visit visit) {
+                  const RandomWords& random, const Visit& visit) {
   using Ints = Vector<int32_t, kDoubles>;
   const T* radii = a.radii + b * a.radii_stride;
   const T* center = a.center + b * a.center_stride;
@@ -113,7 +113,7 @@ void locate_moved(const PolarSampleArgs<T>& a, int64_t b, int64_t i, int64_t j, 
 // last register may reach beyond count.
 template <typename T, typename Visit>
 void locate(const PolarSampleArgs<T>& a, int64_t b, int64_t i, int64_t j, int64_t count,
-            RandomWords& random, Visit visit) {
+            RandomWords& random, const Visit& visit) {
   if (a.jitter > 0) {
     random.draw(a.seed, static_cast<uint64_t>(b), static_cast<uint64_t>(i * a.num_azimuths + j),
                 count);

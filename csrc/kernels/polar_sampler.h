@@ -25,15 +25,60 @@ inline Vector<double, 4> interpolate(const double* pixel, const double* below, d
   return l + right * (r - l);
 }
 
-// Samples points of a packed image, point k to to[target[k]]. A function of its own, so that all it
-// needs stays in registers.
+#if defined(__AVX512F__)
+// Four points in a register: two pairs of pixels and two of those below, then four pixels and their
+// right neighbours. Loads and stores are what limits a point alone: here the weights of four are
+// two loads, and the four go out as one store where they lie one behind the other.
+inline Vector<float, 16> interpolate_four(const float* pixels, const float* below,
+                                          const int32_t* offset, const float* right,
+                                          const float* lower) {
+  using V = Vector<float, 16>;
+  using Index = Vector<int32_t, 16>;
+  constexpr Index first_two = {0, 0, 0, 0, 0, 0, 0, 0, 1, 1, 1, 1, 1, 1, 1, 1};
+  constexpr Index all = {0, 0, 0, 0, 1, 1, 1, 1, 2, 2, 2, 2, 3, 3, 3, 3};
+  const auto down = load<Vector<float, 4>>(lower), along = load<Vector<float, 4>>(right);
+  const V top = two_eights(pixels + offset[0], pixels + offset[1]);
+  const V bottom = two_eights(below + offset[0], below + offset[1]);
+  const V top2 = two_eights(pixels + offset[2], pixels + offset[3]);
+  const V bottom2 = two_eights(below + offset[2], below + offset[3]);
+  const V pairs = top + pick(down, first_two) * (bottom - top);
+  const V pairs2 = top2 + pick(down, first_two + 2) * (bottom2 - top2);
+  const V l = __builtin_shufflevector(pairs, pairs2, 0, 1, 2, 3, 8, 9, 10, 11, 16, 17, 18, 19, 24,
+                                      25, 26, 27);
+  const V r = __builtin_shufflevector(pairs, pairs2, 4, 5, 6, 7, 12, 13, 14, 15, 20, 21, 22, 23, 28,
+                                      29, 30, 31);
+  return l + pick(along, all) * (r - l);
+}
+#endif
+
+// Samples points of a packed image, point k to to[target[k]]; joined[k] says whether the next three
+// follow it there. A function of its own, so that all it needs stays in registers.
 template <typename T>
-[[gnu::noinline]] void sample_line(const T* pixels, int64_t row, const int32_t* offset,
-                                   const T* right, const T* lower, int64_t begin, int64_t end,
-                                   const int32_t* target, T* to) {
+[[gnu::noinline]] void sample_line(const T* pixels, int64_t row, const PackedPlaces<T>& places,
+                                   int64_t begin, int64_t end, const int32_t* target,
+                                   [[maybe_unused]] const bool* joined,
+                                   [[maybe_unused]] int64_t channels, T* to) {
   const T* below = pixels + row;
+  const int32_t* offset = places.offset;
+  const T *right = places.right, *lower = places.lower;
+  int64_t k = begin;
+#if defined(__AVX512F__)
+  if constexpr (kSame<T, float>) {
+    for (; k + 4 <= end; k += 4) {
+      const auto v = interpolate_four(pixels, below, offset + k, right + k, lower + k);
+      if (joined[k]) {
+        store_front(to + target[k], front_of_quarters(v, channels), 4 * channels);
+      } else {
+        store(to + target[k], quarter<0>(v));
+        store(to + target[k + 1], quarter<1>(v));
+        store(to + target[k + 2], quarter<2>(v));
+        store(to + target[k + 3], quarter<3>(v));
+      }
+    }
+  }
+#endif
 #pragma GCC unroll 4
-  for (int64_t k = begin; k < end; ++k) {
+  for (; k < end; ++k) {
     store(to + target[k], interpolate(pixels + offset[k], below + offset[k], right[k], lower[k]));
   }
 }
@@ -59,12 +104,15 @@ class Sampler {
         state(*static_cast<State*>(scratch)),
         points(state.points),
         image(reinterpret_cast<T*>(static_cast<char*>(scratch) + round_up(sizeof(State), 64))) {
-    const int64_t columns = block_columns();
-    for (int64_t k = 0; k < kBlock; ++k) {
-      const int64_t column = k % columns;
-      state.to[k] = static_cast<int32_t>(k / columns * row_stride +
-                                         column / a.patch_azimuths * sector_stride +
-                                         column % a.patch_azimuths * a.channels);
+    int64_t k = 0;
+    for (int64_t row = 0, columns = block_columns(); k + columns <= kBlock; ++row) {
+      for (int64_t sector = 0; sector * a.patch_azimuths < columns; ++sector) {
+        for (int64_t s = 0; s < smaller(columns, a.patch_azimuths); ++s, ++k) {
+          state.to[k] =
+              static_cast<int32_t>(row * row_stride + sector * sector_stride + s * a.channels);
+          state.joined[k] = s + 4 <= a.patch_azimuths;
+        }
+      }
     }
   }
 
@@ -92,6 +140,7 @@ class Sampler {
   struct State {
     PlacedPoints<T> points;
     int32_t to[kBlock];               // where the points of a block go
+    bool joined[kBlock];              // whether the next three follow there
     uint16_t order[kBlock + kAhead];  // in which they are visited, if the image is far
   };
 
@@ -147,26 +196,28 @@ class Sampler {
   // which is there already, so it is kept; behind the last token is what others may write to.
   void lines(int64_t rows, int64_t count, T* to, bool last_row, bool last_token) {
     const int64_t channels = a.channels, all = rows * count, tokens = count / a.patch_azimuths;
-    const int32_t* target = state.to;
     const auto& near = points.near;
+    const auto sample = [&](int64_t begin, int64_t end) {
+      sample_line(image, packed.row, near, begin, end, state.to, state.joined, channels, to);
+    };
     if (!last_row) {
-      sample_line(image, packed.row, near.offset, near.right, near.lower, 0, all, target, to);
+      sample(0, all);
       return;
     }
     const int64_t before = all - count;
-    sample_line(image, packed.row, near.offset, near.right, near.lower, 0, before, target, to);
+    sample(0, before);
     T* first = to + (rows - a.patch_radii) * row_stride;  // row 0 of the first token
     T kept[kBlock / 4 + 1][4];
     for (int64_t t = 1; t < tokens; ++t) {
       store(kept[t], load<Vector<T, 4>>(first + t * sector_stride));
     }
     const int64_t whole = last_token && before < all - 4 ? all - 4 : last_token ? before : all;
-    sample_line(image, packed.row, near.offset, near.right, near.lower, before, whole, target, to);
+    sample(before, whole);
     for (int64_t k = whole; k < all; ++k) {
       const Vector<T, 4> v =
           interpolate(image + near.offset[k], image + packed.row + near.offset[k], near.right[k],
                       near.lower[k]);
-      for (int64_t c = 0; c < channels; ++c) to[target[k] + c] = v[c];
+      for (int64_t c = 0; c < channels; ++c) to[state.to[k] + c] = v[c];
     }
     for (int64_t t = 1; t < tokens; ++t) {
       store(first + t * sector_stride, load<Vector<T, 4>>(kept[t]));

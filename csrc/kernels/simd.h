@@ -155,6 +155,33 @@ inline Vector<float, 4> two_pairs(const float* here, const float* there) {
   return (Vector<float, 4>)Pairs{first, second};
 }
 
+#if defined(__AVX512F__)
+// Eight floats from here and eight from there: a masked load, which needs no shuffle.
+inline Vector<float, 16> two_eights(const float* here, const float* there) {
+  const __m512 first = _mm512_castps256_ps512(_mm256_loadu_ps(here));
+  return (Vector<float, 16>)_mm512_mask_broadcast_f32x8(first, 0xFF00, _mm256_loadu_ps(there));
+}
+
+// The lanes of v that `index` names.
+inline Vector<float, 16> pick(Vector<float, 4> v, Vector<int32_t, 16> index) {
+  return (Vector<float, 16>)_mm512_maskz_permutexvar_ps(0xFFFF, (__m512i)index,
+                                                        _mm512_castps128_ps512((__m128)v));
+}
+
+// A quarter of a register, a few lanes of each behind one another, and the first lanes written.
+template <int index>
+inline Vector<float, 4> quarter(Vector<float, 16> v) {
+  return (Vector<float, 4>)_mm512_maskz_extractf32x4_ps(0xF, (__m512)v, index);
+}
+inline Vector<float, 16> front_of_quarters(Vector<float, 16> v, int64_t lanes) {
+  const auto mask = static_cast<__mmask16>(0x1111 * ((1 << lanes) - 1));
+  return (Vector<float, 16>)_mm512_maskz_compress_ps(mask, (__m512)v);
+}
+inline void store_front(float* to, Vector<float, 16> v, int64_t lanes) {
+  _mm512_mask_storeu_ps(to, static_cast<__mmask16>((1 << lanes) - 1), (__m512)v);
+}
+#endif
+
 template <typename A, typename B>
 constexpr bool kSame = false;
 template <typename A>
