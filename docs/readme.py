@@ -70,12 +70,10 @@ def attention_table(results: list[dict]) -> str:
                 for r in results
                 if (r["operator"], r["case"], r["mode"]) == (operator, case, mode)
             ]
-            threads = sorted({r["threads"] for r in rows})
-            peers = [
-                [r for r in rows if r["threads"] == t and "darswin" not in r["name"]]
-                for t in threads
-            ]
-            best = [min(group, key=lambda r: r["ratio"]) for group in peers]
+            best = {}  # the fastest peer, by threads
+            for row in sorted(rows, key=lambda r: -r["ratio"]):
+                if "darswin" not in row["name"]:
+                    best[row["threads"]] = row
             eager = [r for r in rows if r["name"] == "eager"]
             cells += [both(list(best.values()), ratio), both(eager, ratio)]
             times = times or both([r for r in rows if r["name"] == "darswin"], milliseconds)

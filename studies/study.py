@@ -79,6 +79,7 @@ def main(arguments: list[str] | None = None) -> None:
     cells = [] if args.only == "ablations" else headline(args.seeds)
     cells += [] if args.only == "headline" else ablations()
     cells = [cell for cell in cells if (args.cell or "") in cell.key]
+    cells.sort(key=lambda cell: cell.seed)  # a study that is stopped has whole tables first
     start, results = time.perf_counter(), []
     os.environ["OMP_NUM_THREADS"] = "1"
     context = multiprocessing.get_context("spawn")
