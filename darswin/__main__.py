@@ -29,7 +29,11 @@ def main(argv: list[str] | None = None) -> None:
     try:
         _run(command, argv)
     except (OSError, ValueError, FloatingPointError) as error:
-        raise SystemExit(f"darswin: {error}") from error
+        # A worker process puts its whole traceback into the message; the last line is the error's.
+        message = str(error).strip().splitlines()[-1] if "Traceback" in str(error) else str(error)
+        if "BrokenImageError" in f"{type(error).__name__}{message}" and command != "predict":
+            message += " (--data.skip_broken true leaves such files out)"
+        raise SystemExit(f"darswin: {message}") from error
 
 
 def _run(command: str, argv: list[str]) -> None:

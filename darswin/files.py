@@ -4,8 +4,10 @@ import os
 import tempfile
 from pathlib import Path
 
+_PARTIAL = ".partial"
 
-def replace_file(path: str | os.PathLike, content: bytes | str) -> None:
+
+def replace_file(path: str | os.PathLike, content: bytes | memoryview | str) -> None:
     """Writes a file whole, beside the old one and then in its place; makes its folder.
 
     Raises:
@@ -17,7 +19,7 @@ def replace_file(path: str | os.PathLike, content: bytes | str) -> None:
     temporary = None
     try:
         with tempfile.NamedTemporaryFile(
-            prefix=f".{path.name}.", dir=path.parent, delete=False
+            prefix=f".{path.name}.", suffix=_PARTIAL, dir=path.parent, delete=False
         ) as file:
             temporary = Path(file.name)
             file.write(data)
@@ -31,6 +33,12 @@ def replace_file(path: str | os.PathLike, content: bytes | str) -> None:
         raise OSError(
             error.errno, f"cannot write it, it is as it was: {error.strerror}", str(path)
         ) from error
+
+
+def remove_partial_files(folder: str | os.PathLike) -> None:
+    """Removes what kills in the middle of `replace_file` left below a folder."""
+    for path in Path(folder).rglob(f".*{_PARTIAL}"):
+        path.unlink(missing_ok=True)
 
 
 def _umask() -> int:

@@ -384,6 +384,8 @@ def from_dict(description: Mapping[str, Any], image_size: tuple[int, int]) -> Le
     Raises:
         ValueError: an unknown model, or arguments that are not its own, by name.
     """
+    if not isinstance(description, Mapping):
+        raise ValueError(f"a lens must be a JSON object, got {description!r}")
     arguments = dict(description)
     models = {model.__name__: model for model in (Perspective, Spherical, Polynomial)}
     name = arguments.pop("model", None)

@@ -46,7 +46,7 @@ def draw_accuracy(
     if trained is not None:
         axes.axvspan(*trained, color="tab:pink", alpha=0.3, lw=0, label="seen in training")
     for name, values in accuracy.items():
-        axes.plot(xi, values, "o-", ms=4, label=name)
+        axes.plot(xi, values, "o-", ms=4, label=name, clip_on=False)
     axes.set_xlabel("distortion ξ")
     axes.set_ylabel("accuracy (%)")
     axes.set_xlim(min(xi), max(xi))

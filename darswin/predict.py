@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from darswin.data.sources import read_image
 from darswin.files import replace_file
 from darswin.lens import Lens, from_dict
-from darswin.models.saving import ModelCard, load_model
+from darswin.models.saving import ModelCard, load_model, model_of_run
 
 
 def predict(
@@ -37,9 +37,8 @@ def predict(
         raise ValueError(
             "predict needs either --run, a run's folder, or --model, a safetensors file"
         )
-    file = model or Path(run) / "checkpoints" / "best.safetensors"
-    net, card = load_model(file)
-    description = json.loads(Path(lens).read_text() if Path(lens).is_file() else lens)
+    net, card = load_model(model or model_of_run(run))
+    description = read_description(lens)
     found = []
     for name in pictures:
         image, taken_with = resized(net, card, read_image(name, net.in_chans), description)
@@ -55,12 +54,21 @@ def predict(
                 ],
             }
         )
-    text = json.dumps(found, indent=1)
+    text = json.dumps(found, indent=1, ensure_ascii=False)
     if out is None:
         print(text)
     else:
         replace_file(out, text)
     return found
+
+
+def read_description(lens: str) -> dict[str, Any]:
+    """A lens as JSON, or in a file of that name."""
+    text = lens if lens.lstrip().startswith("{") else Path(lens).read_text()
+    try:
+        return json.loads(text)
+    except json.JSONDecodeError as error:
+        raise ValueError(f"the lens is no JSON: {error}: {text!r}") from error
 
 
 def resized(

@@ -24,10 +24,14 @@ CONFIG = HERE / "fashion_mnist.yaml"
 
 def run_cell(cell: Cell, out: Path, size: str, test_images: int, options: list[str]) -> dict:
     """Trains and tests one cell, or reads what an earlier run found."""
-    folder = out / cell.key
+    folder = out / size / cell.key
     found = folder / "cell.json"
+    given = dict(options=cell.options, test_images=test_images, arguments=options)
     if found.exists():
-        return json.loads(found.read_text())
+        result = json.loads(found.read_text())
+        if result["given"] != given:
+            raise ValueError(f"{found} was made with {result['given']}, not {given}: remove it")
+        return result
     from darswin.__main__ import main  # here, so that a new process sets its threads first
     from darswin.files import replace_file
 
@@ -50,7 +54,7 @@ def run_cell(cell: Cell, out: Path, size: str, test_images: int, options: list[s
     result = dict(
         label=cell.label,
         model=name,
-        options=cell.options,
+        given=given,
         level=cell.level,
         seed=cell.seed,
         accuracy={row["lenses"]: round(100 * row["top1"], 4) for row in rows},

@@ -36,14 +36,14 @@ def quick(tmp_path_factory) -> Path:
 
 
 def test_cells_are_trained_and_tested_once(quick, capsys):
-    cells = {p.parent.name: json.loads(p.read_text()) for p in quick.glob("out/*/cell.json")}
+    cells = {p.parent.name: json.loads(p.read_text()) for p in quick.glob("out/nano/*/cell.json")}
     assert {"darswin-a-low-0", "swin-very-low-0", "dat-low-0", "spacing-g-low-0"} <= cells.keys()
     for cell in cells.values():
         assert cell["accuracy"].keys() == {*SWEEP, POLYNOMIAL, *LEVELS}
         assert all(0 <= value <= 100 for value in cell["accuracy"].values())
     # A study that was stopped reads what it has; a cell that is run again finds the same.
-    (quick / "out" / "swin-low-0" / "cell.json").unlink()
-    for file in (quick / "out" / "swin-low-0").rglob("*"):
+    (quick / "out" / "nano" / "swin-low-0" / "cell.json").unlink()
+    for file in (quick / "out" / "nano" / "swin-low-0").rglob("*"):
         if file.is_file():
             file.unlink()
     capsys.readouterr()
@@ -54,7 +54,7 @@ def test_cells_are_trained_and_tested_once(quick, capsys):
 
 
 def test_tables_and_picture(quick):
-    cells = [json.loads(p.read_text()) for p in quick.glob("out/*/cell.json")]
+    cells = [json.loads(p.read_text()) for p in quick.glob("out/nano/*/cell.json")]
     tables.collect(cells, quick, "nano")
     assert (quick / "study--nano.png").read_bytes().startswith(b"\x89PNG")
     made = tables.tables(cells)

@@ -41,9 +41,23 @@ class TrainingOrder(Sampler[Draw]):
         """Called by Lightning before each epoch."""
         self.epoch = epoch
 
-    def resume(self, epoch: int, done: int) -> None:
-        """Leaves out the first `done` batches of an epoch."""
+    def resume(self, epoch: int, done: int, shuffle: list[int]) -> None:
+        """Leaves out the first `done` batches of an epoch.
+
+        Raises:
+            ValueError: batches of another shuffle, unless the epoch was whole.
+        """
+        count, size, _ = shuffle
+        if shuffle != self.shuffle() and done < count // size:
+            raise ValueError(
+                "in the middle of an epoch a run goes on with what it began with, "
+                f"(pictures, global batch, seed) = {tuple(shuffle)}; got {tuple(self.shuffle())}"
+            )
         self._resume = (epoch, done)
+
+    def shuffle(self) -> list[int]:
+        """What the order depends on: the pictures, the global batch and the seed."""
+        return [self.count, self.batch * self.world, self.seed]
 
     def done(self) -> int:
         """Batches that the next iteration leaves out."""
@@ -95,9 +109,10 @@ class ResumableLoader(DataLoader):
             self._done += 1
             yield batch
 
-    def state_dict(self) -> dict[str, int]:
-        """Which epoch it is, and how many of its batches have been handed out."""
-        return {"epoch": self.sampler.epoch, "done": self._done}
+    def state_dict(self) -> dict[str, Any]:
+        """Which epoch it is, how many of its batches have been handed out, and of what."""
+        order = self.sampler
+        return {"epoch": order.epoch, "done": self._done, "shuffle": order.shuffle()}
 
-    def load_state_dict(self, state: dict[str, int]) -> None:
+    def load_state_dict(self, state: dict[str, Any]) -> None:
         self.sampler.resume(**state)

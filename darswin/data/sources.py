@@ -6,12 +6,13 @@ means.
 """
 
 import gzip
+import hashlib
 import json
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Literal, Protocol
+from typing import Any, Literal, Protocol
 
 import cv2
 import numpy as np
@@ -143,7 +144,7 @@ def open_source(
       (without `test/`, "val" serves as the test set).
 
     Where a set has no split of its own, "val" and "test" are `holdout` of each class each, chosen
-    by a fixed shuffle.
+    by a hash of their names.
 
     Args:
         channels: 3 or 1, of the images that come out.
@@ -197,16 +198,19 @@ def _folder(
     if splits is not None:
         lists = {name: _listed(Path(splits), name) for name in SPLITS}
         paths = lists[split]
-        names = names or sorted({Path(p).parts[0] for part in lists.values() for p in part})
+        names = names or _classes(path for part in lists.values() for path in part)
     elif (root / "train").is_dir() and (root / "val").is_dir():
-        names = names or _folders(root / "train")
-        root /= "val" if split == "test" and not (root / "test").is_dir() else split
-        paths = _images_under(root, names)
+        part = "val" if split == "test" and not (root / "test").is_dir() else split
+        training = _images_under(root / "train", names)
+        names = names or _classes(training)
+        root /= part
+        present = [name for name in names if (root / name).is_dir()]
+        paths = training if part == "train" else _images_under(root, present)
     else:
-        names = names or _folders(root)
         everything = _images_under(root, names)
-        labels = np.array([Path(p).parts[0] for p in everything])
-        paths = [everything[i] for i in _held_out(labels, split, holdout)]
+        names = names or _classes(everything)
+        labels = [Path(path).parts[0] for path in everything]
+        paths = [everything[k] for k in _held_out(labels, everything, split, holdout)]
     if not paths:
         raise FileNotFoundError(
             f"no images for the {split!r} split in {root}: darswin looks for ROOT/CLASS/*.jpg "
@@ -219,12 +223,15 @@ def _folder(
     return ImageFiles(root, [(p, index[Path(p).parts[0]]) for p in paths], names, channels)
 
 
-def _folders(root: Path) -> list[str]:
-    return sorted(entry.name for entry in root.iterdir() if entry.is_dir())
+def _classes(paths: Iterable[str]) -> list[str]:
+    """The first folders of paths."""
+    return sorted({Path(path).parts[0] for path in paths})
 
 
-def _images_under(root: Path, names: list[str]) -> list[str]:
-    """Paths "class/….jpg" below the root, sorted."""
+def _images_under(root: Path, names: list[str] | None) -> list[str]:
+    """Paths "class/….jpg" below the root, sorted, of these classes or of all; no hidden ones."""
+    if names is None:
+        names = sorted(p.name for p in root.iterdir() if p.is_dir() and not _hidden(p.name))
     missing = [name for name in names if not (root / name).is_dir()]
     if missing:
         raise FileNotFoundError(f"no folder for the classes {missing[:5]} in {root}")
@@ -232,8 +239,12 @@ def _images_under(root: Path, names: list[str]) -> list[str]:
         str(path.relative_to(root))
         for name in names
         for path in sorted((root / name).rglob("*"))
-        if path.suffix.lower() in SUFFIXES
+        if path.suffix.lower() in SUFFIXES and not _hidden(path.name) and path.is_file()
     ]
+
+
+def _hidden(name: str) -> bool:
+    return name.startswith(".")
 
 
 def _listed(splits: Path, split: Split) -> list[str]:
@@ -248,18 +259,22 @@ def _listed(splits: Path, split: Split) -> list[str]:
     return lists.get(split, [])
 
 
-def _held_out(labels: np.ndarray, split: Split, share: float) -> np.ndarray:
-    """Indices of a split where "val" and "test" take a share of each class, by a fixed shuffle."""
+def _held_out(labels: Sequence, keys: Sequence[str], split: Split, share: float) -> list[int]:
+    """Indices of a split where "val" and "test" take a share of each class.
+
+    Each class is shuffled by hashes of its keys, so that a picture more or less moves hardly any.
+    """
+    classes: dict[Any, list[int]] = {}
+    for index in sorted(
+        range(len(keys)), key=lambda k: hashlib.sha1(os.fsencode(keys[k])).digest()
+    ):
+        classes.setdefault(labels[index], []).append(index)
     chosen = []
-    for name in np.unique(labels):
-        members = np.flatnonzero(labels == name)
-        members = np.random.default_rng(0).permutation(members)
+    for members in classes.values():
         count = math.ceil(share * len(members))
-        parts = dict(
-            test=members[:count], val=members[count : 2 * count], train=members[2 * count :]
-        )
-        chosen.append(parts[split])
-    return np.sort(np.concatenate(chosen)) if chosen else np.empty(0, np.int64)
+        ends = dict(test=(0, count), val=(count, 2 * count), train=(2 * count, None))
+        chosen += members[slice(*ends[split])]
+    return sorted(chosen)
 
 
 # -- IDX files and digits ---------------------------------------------------------------------
@@ -305,6 +320,7 @@ def _digits(split: Split, channels: int, names: list[str] | None, holdout: float
     from sklearn.datasets import load_digits
 
     digits = load_digits()
-    part = _held_out(digits.target, split, holdout)
+    labels = digits.target.tolist()
+    part = _held_out(labels, [str(k) for k in range(len(labels))], split, holdout)
     images = np.round(digits.images[part] * (255 / 16)).astype(np.uint8)
     return Arrays(images, digits.target[part], names or [str(k) for k in range(10)], channels)

@@ -129,7 +129,8 @@ class WideAngle(Dataset):
             if not self.skip_broken:
                 raise
             self._broken[draw.index] = True
-            return torch.zeros(len(self.mean), self.size, self.size), lens, -1
+            black = torch.from_numpy(-self.mean / self.std)
+            return black.expand(-1, self.size, self.size).clone(), lens, -1
         rng = self._random(draw.epoch, draw.index, 0)
         image = self.through(lens, picture)
         if self.augment:

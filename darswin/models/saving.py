@@ -4,6 +4,7 @@ import json
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
+from pathlib import Path
 from typing import Any
 
 from safetensors import SafetensorError, safe_open
@@ -41,6 +42,19 @@ def save_model(path: str | os.PathLike, weights: Mapping[str, Tensor], card: Mod
     """Writes a model's state dict and its card, replacing what stood there in one go."""
     contiguous = {name: tensor.detach().cpu().contiguous() for name, tensor in weights.items()}
     replace_file(path, save(contiguous, metadata={_ENTRY: json.dumps(asdict(card))}))
+
+
+def model_of_run(run: str | os.PathLike, suffix: str = ".safetensors") -> Path:
+    """The best model of a run of `darswin fit`, or, before there is one, the last.
+
+    Raises:
+        FileNotFoundError: neither.
+    """
+    folder = Path(run) / "checkpoints"
+    for name in ("best", "last"):
+        if (path := folder / f"{name}{suffix}").exists():
+            return path
+    raise FileNotFoundError(f"there is no model in {run} yet")
 
 
 def load_model(path: str | os.PathLike) -> tuple[nn.Module, ModelCard]:

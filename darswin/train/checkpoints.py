@@ -5,11 +5,35 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from lightning.pytorch import Trainer
+from lightning.pytorch.callbacks import ModelCheckpoint
 from lightning.pytorch.plugins.io import TorchCheckpointIO
 
 from darswin.compat.checkpoint import read_pickle
 from darswin.files import replace_file
 from darswin.models.saving import ModelCard, save_model
+
+
+class RunCheckpoint(ModelCheckpoint):
+    """A checkpoint in a run's folder, wherever that folder has been moved.
+
+    One that is due at an epoch's last step is left to the callback behind the epoch's validation:
+    a run that resumed from before it would take the epoch for finished, and not validate it.
+    """
+
+    def on_train_batch_end(self, trainer: Trainer, *arguments: Any) -> None:
+        if not trainer.is_last_batch:
+            super().on_train_batch_end(trainer, *arguments)
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        def here(path: str) -> str:
+            return str(Path(self.dirpath) / Path(path).name) if path else path
+
+        state = dict(state_dict, dirpath=self.dirpath)
+        for key in ("best_model_path", "kth_best_model_path", "last_model_path"):
+            state[key] = here(state[key])
+        state["best_k_models"] = {here(path): k for path, k in state["best_k_models"].items()}
+        super().load_state_dict(state)
 
 
 class SafeCheckpointIO(TorchCheckpointIO):
@@ -20,7 +44,7 @@ class SafeCheckpointIO(TorchCheckpointIO):
     ) -> None:
         content = io.BytesIO()
         torch.save(checkpoint, content)
-        replace_file(path, content.getvalue())
+        replace_file(path, content.getbuffer())
         weights = {
             name.removeprefix("net."): tensor
             for name, tensor in checkpoint["state_dict"].items()

@@ -5,18 +5,19 @@ the logs `csv/` and `tensorboard/`, and `test.{csv,json,png}`.
 """
 
 import argparse
-import os
+import signal
 import warnings
 from pathlib import Path
 
 from lightning.pytorch import Trainer
-from lightning.pytorch.callbacks import ModelCheckpoint
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI, SaveConfigCallback
 from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
+from lightning.pytorch.utilities.exceptions import MisconfigurationException, SIGTERMException
 
 from darswin.data.lenses import parse_sweep
-from darswin.files import replace_file
-from darswin.train.checkpoints import SafeCheckpointIO
+from darswin.files import remove_partial_files, replace_file
+from darswin.models.saving import model_of_run
+from darswin.train.checkpoints import RunCheckpoint, SafeCheckpointIO
 from darswin.train.data import WideAngleData
 from darswin.train.results import WriteResults
 from darswin.train.task import Classification
@@ -28,6 +29,17 @@ def run_command(argv: list[str]) -> None:
     """Runs `fit`, `validate` or `test`, the first of `argv`, with the others as its options."""
     # The arguments are the command line's own, with the run's configuration added.
     warnings.filterwarnings("ignore", "LightningCLI's args parameter")
+    warnings.filterwarnings("ignore", r".*isinstance\(treespec, LeafSpec\)")  # Lightning's own
+    warnings.filterwarnings("ignore", "Checkpoint directory .* exists and is not empty")
+    try:
+        _run(argv)
+    except MisconfigurationException as error:
+        raise ValueError(str(error)) from error
+    except SIGTERMException:
+        raise SystemExit(128 + signal.SIGTERM) from None
+
+
+def _run(argv: list[str]) -> None:
     RunCLI(
         Classification,
         WideAngleData,
@@ -49,24 +61,41 @@ def with_configs(argv: list[str]) -> list[str]:
 
     `test`, `validate` and `fit --resume` start from `RUN/config.yaml`, so that they need no other
     option.
+
+    Raises:
+        ValueError: an unknown preset. FileExistsError, FileNotFoundError: a run, or none, in RUN.
     """
     scan = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     scan.add_argument("-c", "--config", action="append", default=[])
     scan.add_argument("--run")
     scan.add_argument("--resume", action="store_true")
     known, others = scan.parse_known_args(argv[1:])
-    configs = []
+    configs = [_config_file(name) for name in known.config]
     if known.run:
         others += ["--run", known.run]
         own = Path(known.run) / "config.yaml"
-        if (known.resume or argv[0] != "fit") and own.exists():
-            configs.append(str(own))
+        if argv[0] == "fit" and not known.resume:
+            if (Path(known.run) / "checkpoints" / "last.ckpt").exists():
+                raise FileExistsError(
+                    f"{known.run} holds a run already: go on with --resume, or choose another one"
+                )
+        elif own.exists():
+            configs.insert(0, str(own))
+        elif argv[0] != "fit" and not configs:
+            raise FileNotFoundError(f"there is no run in {known.run}: it has no config.yaml")
     if known.resume:
         others.append("--resume=true")
-    for name in known.config:
-        preset = PRESETS / f"{name}.yaml"
-        configs.append(str(preset) if preset.exists() and not Path(name).exists() else name)
     return [argv[0], *(f"--config={config}" for config in configs), *others]
+
+
+def _config_file(name: str) -> str:
+    preset = PRESETS / f"{name}.yaml"
+    if Path(name).exists():
+        return name
+    if not preset.exists():
+        presets = ", ".join(sorted(path.stem for path in PRESETS.glob("*.yaml")))
+        raise ValueError(f"there is no file {name} and no such preset; the presets are {presets}")
+    return str(preset)
 
 
 class RunCLI(LightningCLI):
@@ -99,23 +128,20 @@ class RunCLI(LightningCLI):
         config = self.config[self.subcommand]
         self.folder = Path(config.run)
         config.trainer.default_root_dir = str(self.folder)
-        if config.devices is not None:
-            config.trainer.devices = config.devices
+        for name in ("path", "classes", "splits"):  # so that the run works from anywhere
+            if config.data[name] and Path(config.data[name]).exists():
+                config.data[name] = str(Path(config.data[name]).resolve())
         if config.xi is not None:
             config.data.test_lenses = parse_sweep(config.xi)
-        last = self.folder / "checkpoints" / "last.ckpt"
-        best = self.folder / "checkpoints" / "best.ckpt"
         if self.subcommand != "fit":
-            config.ckpt_path = config.ckpt_path or str(best if best.exists() else last)
+            config.ckpt_path = config.ckpt_path or str(model_of_run(self.folder, ".ckpt"))
+            return
+        remove_partial_files(self.folder)
+        last = self.folder / "checkpoints" / "last.ckpt"
+        if config.resume and last.exists():
+            config.ckpt_path = str(last)
         elif config.resume:
-            if last.exists():
-                config.ckpt_path = str(last)
-            else:
-                print(f"{last} is not there yet: starting from the beginning")
-        elif last.exists() and "LOCAL_RANK" not in os.environ:
-            raise FileExistsError(
-                f"{self.folder} holds a run already: go on with --resume, or choose another folder"
-            )
+            print(f"{last} is not there yet: starting from the beginning")
 
     def instantiate_trainer(self, **kwargs) -> Trainer:
         config = self.config_init[self.subcommand]
@@ -123,8 +149,15 @@ class RunCLI(LightningCLI):
         kwargs["plugins"] = [SafeCheckpointIO(), *(given.plugins or [])]
         if given.logger is None:
             kwargs["logger"] = self._loggers() if self.subcommand == "fit" else False
+        if config.devices is not None:
+            kwargs["devices"] = config.devices
         kwargs["callbacks"] = [*(given.callbacks or []), *self._callbacks(config.checkpoint_steps)]
         return super().instantiate_trainer(**kwargs)
+
+    def _run_subcommand(self, subcommand: str) -> None:
+        super()._run_subcommand(subcommand)
+        if broken := self.datamodule.broken():
+            print(f"{broken} pictures could not be read and were left out")
 
     def _loggers(self) -> list:
         return [
@@ -138,15 +171,15 @@ class RunCLI(LightningCLI):
             return [WriteResults(self.folder)] if self.subcommand == "test" else []
         kept = dict(dirpath=self.folder / "checkpoints", enable_version_counter=False)
         return [
-            ModelCheckpoint(
+            RunCheckpoint(
                 filename="best",
                 monitor="val/top1",
                 mode="max",
                 save_on_train_epoch_end=False,
                 **kept,
             ),
-            ModelCheckpoint(filename="last", every_n_train_steps=steps, **kept),
-            ModelCheckpoint(filename="last", save_on_train_epoch_end=True, **kept),
+            RunCheckpoint(filename="last", every_n_train_steps=steps, **kept),
+            RunCheckpoint(filename="last", save_on_train_epoch_end=True, **kept),
         ]
 
 
@@ -160,7 +193,7 @@ class SaveRunConfig(SaveConfigCallback):
         if stage != "fit":
             return
         config = self.config.clone()
-        for name in ("config", "resume", "xi", "devices", "ckpt_path"):
+        for name in ("config", "resume", "xi", "devices", "ckpt_path"):  # of this call alone
             config.pop(name, None)
         text = self.parser.dump(config, skip_none=False)
         replace_file(Path(trainer.default_root_dir) / "config.yaml", text)

@@ -1,7 +1,7 @@
 """The data of a run."""
 
 import math
-from typing import Literal
+from typing import Any, Literal
 
 import cv2
 from lightning.pytorch import LightningDataModule
@@ -41,8 +41,8 @@ class WideAngleData(LightningDataModule):
         randaugment: changes colours in training.
         erasing: how often a box of an image is erased in training.
         pair_lenses: gives both images of a mixture the same lens, so that the mixture is an image
-            through one lens. False is the authors' code, which takes the mixed-in image for one
-            through the other's lens.
+            through one lens. Without it, the mixed-in image is taken for one through the other's
+            lens, as in the authors' code; or, without mixing, every image has a lens of its own.
         seed: of the shuffles, lenses and augmentation, those of the test sets among them.
         skip_broken: counts files that are no images, instead of stopping at the first.
     """
@@ -94,7 +94,7 @@ class WideAngleData(LightningDataModule):
         self._sources: dict[str, Source] = {}
         self.datasets: list[WideAngle] = []
         self._loader: ResumableLoader | None = None
-        self._progress: dict[str, int] = {}
+        self._progress: dict[str, Any] = {}
 
     def source(self, split: Split) -> Source:
         """The pictures of a split."""
@@ -153,15 +153,19 @@ class WideAngleData(LightningDataModule):
 
     # Lightning restores a loader's own state only if it was made after the optimiser, and the
     # optimiser's schedule needs its length.
-    def state_dict(self) -> dict[str, int]:
+    def state_dict(self) -> dict[str, Any]:
         return self._loader.state_dict() if self._loader else {}
 
-    def load_state_dict(self, state_dict: dict[str, int]) -> None:
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         self._progress = state_dict
 
     def _evaluation(self, split: Split, lenses: str | None = None) -> DataLoader:
         dataset = self.dataset(split, lenses)
         part = EveryNth(len(dataset), **self._place)
+        if not part.indices:
+            raise ValueError(
+                f"the {split!r} split has too few pictures for as many processes: {len(dataset)}"
+            )
         return DataLoader(dataset, self.batch_size, sampler=part, **self._options)
 
     def val_dataloader(self) -> DataLoader:

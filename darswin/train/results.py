@@ -32,14 +32,12 @@ class WriteResults(Callback):
             )
         write_results(self.folder, rows, pl_module.card.model, trainer.datamodule.train_lenses)
         print(f"\n{self.folder}/test.csv, test.json and test.png")
-        if broken := trainer.datamodule.broken():
-            print(f"{broken} pictures could not be read and were left out")
 
 
 def write_results(folder: Path, rows: list[dict], name: str, trained_on) -> None:
     """The rows of a test as files; `trained_on` is the distribution that the picture shades."""
     report = dict(model=name, results=rows)
-    replace_file(folder / "test.json", json.dumps(report, indent=1))
+    replace_file(folder / "test.json", json.dumps(report, indent=1, ensure_ascii=False))
     table = io.StringIO(newline="")
     writer = csv.DictWriter(table, rows[0].keys())
     writer.writeheader()
@@ -64,6 +62,7 @@ def draw_results(rows: list[dict], name: str, trained_on):
         shaded = trained_on if isinstance(trained_on, SphericalLenses) else None
         band = None if shaded is None else (shaded.low, shaded.high)
         draw_accuracy(axes, [lens.low for lens in lenses], {name: accuracy}, band)
+        axes.set_ylim(0, 100)
     else:
         axes.bar([row["lenses"] for row in rows], accuracy, label=name)
         axes.set(ylabel="accuracy (%)", ylim=(0, 100))

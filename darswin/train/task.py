@@ -84,6 +84,8 @@ class Classification(LightningModule):
         if self.net is not None:
             return
         data = self.trainer.datamodule
+        if len(data.classes) < 2:
+            raise ValueError(f"a classifier needs two classes, the data has only {data.classes}")
         options = dict(num_classes=len(data.classes), in_chans=data.channels)
         options |= dict(mean=data.mean, std=data.std)
         if issubclass(model_class(self.name), ImageEncoder):

@@ -61,7 +61,9 @@ def test_a_loader_goes_on_where_it_was():
     first = loader()
     first.sampler.set_epoch(3)
     every = list(first)
-    assert len(every) == len(first) == 10 and first.state_dict() == {"epoch": 3, "done": 10}
+    assert len(every) == len(first) == 10 and first.state_dict() == dict(
+        epoch=3, done=10, shuffle=[40, 4, 0]
+    )
     taken = iter(first)
     for _ in range(4):
         next(taken)
@@ -70,9 +72,18 @@ def test_a_loader_goes_on_where_it_was():
     second.sampler.set_epoch(3)
     rest = list(second)
     assert [b.tolist() for b in rest] == [b.tolist() for b in every[4:]]
-    assert second.state_dict() == {"epoch": 3, "done": 10}
+    assert second.state_dict() == first.state_dict() | {"done": 10}
     second.sampler.set_epoch(4)
     assert len(list(second)) == 10  # the next epoch is whole
+
+
+def test_another_shuffle_only_between_epochs():
+    order = TrainingOrder(40, 8, rank=0, world=1)
+    with pytest.raises(ValueError, match=r"\(40, 4, 0\); got \(40, 8, 0\)"):
+        order.resume(0, 9, [40, 4, 0])
+    order.resume(0, 10, [40, 4, 0])
+    assert len(list(TrainingOrder(40, 4, rank=1, world=2))) == 20
+    TrainingOrder(40, 4, rank=1, world=2).resume(0, 3, [40, 8, 0])  # the same global batch
 
 
 def test_parts_of_a_test_set():
