@@ -6,7 +6,7 @@ import textwrap
 
 import pytest
 
-from darswin.files import replace_file
+from darswin.files import remove_partial_files, replace_file
 
 
 def test_the_new_file_takes_the_place_of_the_old(tmp_path):
@@ -24,6 +24,21 @@ def test_what_cannot_be_written_is_named(tmp_path):
     with pytest.raises(OSError, match=r"cannot write it.*folder"):
         replace_file(tmp_path / "folder", b"x")
     assert os.listdir(tmp_path) == ["folder"]
+
+
+def test_what_a_kill_left_is_removed(tmp_path):
+    code = f"""
+        import os
+        from darswin.files import replace_file
+        os.fsync = lambda file: os._exit(9)
+        replace_file({str(tmp_path / "a.ckpt")!r}, b"half")
+    """
+    done = subprocess.run([sys.executable, "-c", textwrap.dedent(code)], check=False)
+    (left,) = tmp_path.iterdir()
+    assert done.returncode == 9 and left.name.startswith(".a.ckpt.")
+    (tmp_path / ".hidden").write_text("")
+    remove_partial_files(tmp_path)
+    assert os.listdir(tmp_path) == [".hidden"]
 
 
 def test_a_full_disk_is_said_and_leaves_the_old_file_alone(tmp_path):

@@ -71,6 +71,8 @@ class WideAngle(Dataset):
         skip_broken: makes a picture that cannot be read a black image with label -1, and counts it
             in `broken`, instead of raising.
 
+    Making one sets OpenCV to one thread, in all of the process.
+
     Raises:
         ValueError: sizes or angles out of range.
         BrokenImageError: from `dataset[i]`, naming a file that cannot be read.
@@ -108,6 +110,9 @@ class WideAngle(Dataset):
         self.std = np.asarray(std, np.float32)[:, None, None]
         self.augment, self.erase, self.seed = augment, erase, seed
         self.skip_broken = skip_broken
+        # A DataLoader's workers are forks, and OpenCV's threads do not survive a fork: a worker
+        # that waits for them hangs. Images this small gain nothing from them.
+        cv2.setNumThreads(1)
         # Shared, so that what worker processes find is seen here.
         self._broken = torch.zeros(len(source), dtype=torch.bool).share_memory_()
 

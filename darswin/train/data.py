@@ -3,7 +3,6 @@
 import math
 from typing import Any, Literal
 
-import cv2
 from lightning.pytorch import LightningDataModule
 from torch.utils.data import DataLoader
 
@@ -131,7 +130,6 @@ class WideAngleData(LightningDataModule):
     def _options(self) -> dict:
         return dict(
             num_workers=self.workers,
-            worker_init_fn=_one_thread,
             prefetch_factor=4 if self.workers else None,
         )
 
@@ -173,7 +171,3 @@ class WideAngleData(LightningDataModule):
 
     def test_dataloader(self) -> list[DataLoader]:
         return [self._evaluation("test", name) for name in self.test_names]
-
-
-def _one_thread(worker: int) -> None:
-    cv2.setNumThreads(1)

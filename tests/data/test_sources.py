@@ -44,6 +44,24 @@ def test_a_folder_of_splits(tmp_path):
     assert len(open_source(tmp_path, "test")) == 2
 
 
+def test_hidden_and_empty_things_are_no_pictures(tmp_path):
+    write_pictures(tmp_path, ("a", "b"), count=4)
+    write_pictures(tmp_path, (".checkpoints",), count=4)
+    (tmp_path / "a" / "._00.png").write_bytes(b"a file of another system")
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "b" / "folder.png").mkdir()
+    source = open_source(tmp_path, "train", holdout=0)
+    assert source.classes == ["a", "b"] and len(source) == 8
+
+
+def test_one_picture_more_moves_hardly_any(tmp_path):
+    write_pictures(tmp_path, ("a",), count=60)
+    before = {s: set(open_source(tmp_path, s).paths) for s in ("train", "val", "test")}
+    cv2.imwrite(str(tmp_path / "a" / "new.png"), np.zeros((4, 4, 3), np.uint8))
+    after = {s: set(open_source(tmp_path, s).paths) for s in before}
+    assert sum(len(after[s] - before[s]) for s in before) <= 5
+
+
 def test_class_lists_choose_and_order(tmp_path):
     write_pictures(tmp_path, ("a", "b", "c"))
     (tmp_path / "classes.txt").write_text("c\na\n")

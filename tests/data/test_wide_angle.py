@@ -80,6 +80,14 @@ def test_a_sample_depends_on_its_draw_alone():
     assert torch.equal(dataset[Draw(0, 1, 2)][1].xi, dataset[Draw(0, 0, 2)][1].xi)
 
 
+def test_workers_do_not_hang_after_opencv_ran_on_several_threads():
+    cv2.setNumThreads(4)
+    cv2.GaussianBlur(np.zeros((2000, 2000, 3), np.uint8), (31, 31), 5)  # starts its threads
+    dataset = WideAngle(pictures(), SphericalLenses(0, 1), size=64, render=224)
+    batches = DataLoader(dataset, 5, num_workers=1, timeout=30)
+    assert len(next(iter(batches))[0]) == 5 and cv2.getNumThreads() == 1
+
+
 def test_augmentation_differs_from_image_to_image_and_epoch_to_epoch():
     def noise(image, rng):
         return (image * 0 + rng.integers(256)).astype(np.uint8)

@@ -3,6 +3,8 @@
 import json
 import re
 
+import cv2
+import numpy as np
 import pytest
 import torch
 import yaml
@@ -60,6 +62,60 @@ def test_a_checkpoint_of_another_model(capsys, tmp_path):
     (tmp_path / "other.ckpt").write_bytes(b"\x80\x02cos\nsystem\n(S'touch owned'\ntR.")
     error(capsys, "test", "--run", tmp_path, "--ckpt_path", tmp_path / "other.ckpt")
     assert "no checkpoint" in error(capsys, "test", "--run", tmp_path, "--ckpt_path", "none.ckpt")
+
+
+def test_a_run_is_not_overwritten_by_a_launcher(capsys, tmp_path, monkeypatch):
+    (tmp_path / "checkpoints").mkdir()
+    (tmp_path / "checkpoints" / "last.ckpt").write_bytes(b"")
+    monkeypatch.setenv("LOCAL_RANK", "0")
+    assert "holds a run already" in error(capsys, "fit", "--run", tmp_path)
+
+
+def test_what_is_missing_is_named(capsys, tmp_path):
+    nowhere = tmp_path / "nowhere"
+    assert f"no run in {nowhere}" in error(capsys, "test", "--run", nowhere)
+    assert "the presets are iccv2023, minutes, two_cores" in error(
+        capsys, "fit", "--run", nowhere, "--config", "minute"
+    )
+    (tmp_path / "config.yaml").write_text("data: {path: digits}\n")
+    assert f"no model in {tmp_path} yet" in error(capsys, "test", "--run", tmp_path)
+
+
+@pytest.mark.parametrize("workers", ["0", "1"])
+def test_a_broken_picture_is_named_in_one_line(capsys, tmp_path, workers):
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+        for k in range(6):
+            (tmp_path / name / f"{k}.jpg").write_bytes(b"no picture")
+    options = ["--data.batch_size", "4", "--data.workers", workers]
+    message = error(
+        capsys, "fit", "--run", tmp_path / "r", *DIGITS, "--data.path", tmp_path, *options
+    ).splitlines()[0]
+    assert re.search(r"cannot read .*\.jpg: no image .*--data\.skip_broken true", message)
+
+
+def test_one_class_is_not_enough(capsys, tmp_path):
+    write_pictures(tmp_path / "only", 12)
+    message = error(capsys, "fit", "--run", tmp_path / "r", *DIGITS, "--data.path", tmp_path)
+    assert "needs two classes" in message
+
+
+def write_pictures(folder, count):
+    folder.mkdir(parents=True)
+    for k in range(count):
+        cv2.imwrite(str(folder / f"{k}.png"), np.full((8, 8), 20 * k, np.uint8))
+
+
+def test_skipped_pictures_are_counted(capsys, tmp_path):
+    write_pictures(tmp_path / "p" / "a", 12)
+    write_pictures(tmp_path / "p" / "b", 12)
+    (tmp_path / "p" / "a" / "0.png").write_bytes(b"broken")
+    (tmp_path / "p" / "b" / "1.png").write_bytes(b"broken")
+    fit = ["fit", "--run", tmp_path / "r", *DIGITS, "--data.path", tmp_path / "p"]
+    fit += ["--data.skip_broken", "true", "--data.holdout", "0", "--data.batch_size", "8"]
+    fit += ["--trainer.max_epochs", "1", "--trainer.limit_val_batches", "0"]
+    main([str(a) for a in fit])
+    assert "2 pictures could not be read" in capsys.readouterr().out
 
 
 def test_presets_and_a_run_s_own_configuration(tmp_path):

@@ -87,8 +87,21 @@ def test_a_killed_run_goes_on_bit_for_bit(whole, tmp_path):
     for key in ("exp_avg", "exp_avg_sq"):
         a, b = (c["optimizer_states"][0]["state"] for c in (ours, theirs))
         assert all(torch.equal(a[k][key], b[k][key]) for k in b) and a.keys() == b.keys()
+    best, other = (load_model(r / "checkpoints" / "best.safetensors")[0] for r in (run, whole))
+    assert all(
+        torch.equal(a, b) for a, b in zip(best.parameters(), other.parameters(), strict=True)
+    )
     again, expected = losses(run), losses(whole)
     assert all(again[step] == expected[step] for step in again) and len(again) >= 15
+
+
+def test_a_run_told_to_stop_says_so(tmp_path):
+    run = tmp_path / "stopped"
+    process = start("fit", run, *SMALL, "--trainer.max_epochs", "1000")
+    while not (run / "checkpoints" / "last.ckpt").exists() and process.poll() is None:
+        time.sleep(0.005)
+    process.terminate()
+    assert process.wait(timeout=60) == 128 + signal.SIGTERM
 
 
 def test_two_processes_train_as_one(tmp_path):
