@@ -77,7 +77,7 @@ def draw(cells: list[dict], path: Path) -> None:
         axes.set(title=f'trained on "{level}"', xlabel="distortion ξ", xlim=(0, 1))
         axes.set_ylabel("accuracy (%)")
         axes.grid(alpha=0.3)
-    axes.legend(loc="lower left")
+    figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=5)
     picture = io.BytesIO()
     figure.savefig(picture, format="png", dpi=110)
     replace_file(path, picture.getvalue())
