@@ -151,3 +151,5 @@ def test_the_sdist_builds_a_wheel_that_runs_from_another_folder(tmp_path):
     )
     out = python("-c", code, cwd=tmp_path, env=environment | {"PYTHONPATH": str(elsewhere)})
     assert out.count(str(elsewhere)) == 2 and "torch.Size([1, 3])" in out
+    assert (elsewhere / "darswin" / "train" / "presets" / "iccv2023.yaml").is_file()
+    assert (elsewhere / "bin" / "darswin").is_file()
