@@ -11,6 +11,7 @@ import yaml
 from safetensors.torch import load_file
 
 from darswin.__main__ import COMMANDS, main
+from darswin.models import load_model
 from darswin.train.cli import PRESETS, with_configs
 
 DIGITS = ["--config", "minutes", "--data.path", "digits", "--trainer.logger", "false"]
@@ -165,3 +166,14 @@ def test_convert(tmp_path, capsys):
     torch.save([1, 2], tmp_path / "b.pth")
     assert "no state dict" in error(capsys, "convert", tmp_path / "b.pth", tmp_path / "b")
     assert not (tmp_path / "b").exists()
+
+
+@pytest.mark.parametrize("preset", sorted(path.stem for path in PRESETS.glob("*.yaml")))
+def test_every_preset_trains(preset, tmp_path):
+    small = ["--model.name", "darswin_a_nano", "--data.limit", "8", "--data.batch_size", "4"]
+    steps = ["--trainer.max_steps", "2", "--data.workers", "0", "--trainer.logger", "false"]
+    main(
+        ["fit", "--run", str(tmp_path), "--config", preset, "--data.path", "digits", *small, *steps]
+    )
+    model, card = load_model(tmp_path / "checkpoints" / "last.safetensors")
+    assert card.model == "darswin_a_nano" and model.num_classes == 10
