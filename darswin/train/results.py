@@ -66,5 +66,6 @@ def draw_results(rows: list[dict], name: str, trained_on):
     else:
         axes.bar([row["lenses"] for row in rows], accuracy, label=name)
         axes.set(ylabel="accuracy (%)", ylim=(0, 100))
+        axes.tick_params(axis="x", rotation=90)
         axes.legend()
     return figure
