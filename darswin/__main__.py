@@ -24,7 +24,7 @@ def main(argv: list[str] | None = None) -> None:
         return
     if command not in COMMANDS:
         raise SystemExit(f"darswin: no command {command!r}; there are {', '.join(COMMANDS)}")
-    if importlib.util.find_spec("lightning") is None:
+    if command != "models" and importlib.util.find_spec("lightning") is None:
         raise SystemExit("darswin: this needs more packages: pip install 'darswin[train]'")
     try:
         _run(command, argv)

@@ -1,12 +1,23 @@
 """Pictures with matplotlib: what a lens does to the partition, and accuracy over distortion."""
 
+import io
 import math
+import os
 from collections.abc import Mapping, Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
+from darswin.files import replace_file
 from darswin.grid import PolarGrid
+
+
+def save_figure(figure: Figure, path: str | os.PathLike) -> None:
+    """Writes a figure as a PNG file, whole or not at all."""
+    picture = io.BytesIO()
+    figure.savefig(picture, format="png", dpi=120)
+    replace_file(path, picture.getvalue())
 
 
 def draw_grid(

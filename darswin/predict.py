@@ -26,8 +26,7 @@ def predict(
         pictures: image files.
         lens: the camera's lens, in pixels of the pictures, as JSON or the name of a JSON file:
             {"model": "Spherical", "xi": 0.5, "focal": 300, "theta_max": 1.5}, or with "fov" (rad)
-                in
-            place of the last two where the field of view fills the circle inside the picture.
+            in place of the last two where the field of view fills the circle inside the picture.
         run: the folder of a run, whose best model is taken.
         model: a model's safetensors file, instead.
         top: how many classes.

@@ -1,6 +1,5 @@
 """The tables and the picture of the study, from what its cells found."""
 
-import io
 import json
 import platform
 import statistics
@@ -13,6 +12,7 @@ from matplotlib.figure import Figure
 
 from darswin.data.lenses import LEVELS as RANGES
 from darswin.files import replace_file
+from darswin.plot import save_figure
 
 # The paper's tables (DarSwin, ICCV 2023), by the training level.
 PAPER_04 = {
@@ -78,9 +78,7 @@ def draw(cells: list[dict], path: Path) -> None:
         axes.set_ylabel("accuracy (%)")
         axes.grid(alpha=0.3)
     figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=5)
-    picture = io.BytesIO()
-    figure.savefig(picture, format="png", dpi=110)
-    replace_file(path, picture.getvalue())
+    save_figure(figure, path)
 
 
 def row(label: str, values: list[str]) -> str:

@@ -7,9 +7,11 @@ from pathlib import Path
 
 from lightning.pytorch import Callback, LightningModule, Trainer
 from lightning.pytorch.utilities import rank_zero_only
+from matplotlib.figure import Figure
 
 from darswin.data.lenses import SphericalLenses, parse_lenses
 from darswin.files import replace_file
+from darswin.plot import draw_accuracy, save_figure
 
 
 class WriteResults(Callback):
@@ -43,17 +45,11 @@ def write_results(folder: Path, rows: list[dict], name: str, trained_on) -> None
     writer.writeheader()
     writer.writerows(rows)
     replace_file(folder / "test.csv", table.getvalue())
-    picture = io.BytesIO()
-    draw_results(rows, name, trained_on).savefig(picture, format="png", dpi=130)
-    replace_file(folder / "test.png", picture.getvalue())
+    save_figure(draw_results(rows, name, trained_on), folder / "test.png")
 
 
 def draw_results(rows: list[dict], name: str, trained_on):
     """A figure: accuracy against ξ where every distribution is one ξ, else bars."""
-    from matplotlib.figure import Figure
-
-    from darswin.plot import draw_accuracy
-
     figure = Figure(figsize=(7, 4.2), layout="constrained")
     axes = figure.subplots()
     accuracy = [100 * row["top1"] for row in rows]
