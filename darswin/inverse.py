@@ -1,4 +1,4 @@
-"""Inverts rising functions that have no closed inverse."""
+"""Rising functions that have no closed inverse: how far they rise, and their inverse."""
 
 from collections.abc import Callable
 
@@ -27,3 +27,22 @@ def inverse(function: Function, slope: Function, value: Tensor, end: Tensor) -> 
             step = x - error / slope(x)
             x = torch.where((step >= low) & (step <= high), step, (low + high) / 2)
     return x - (function(x) - value) / slope(x).detach()
+
+
+@torch.no_grad()
+def rising_limit(slope: Function, end: Tensor) -> Tensor:
+    """How far functions rise from 0: the first x at which a slope is not positive, or `end`.
+
+    Args:
+        slope: of x (N, K), a row a function. end: (N,), how far to look, in 1024 steps.
+    """
+    steps = torch.linspace(0, 1, 1025, dtype=end.dtype, device=end.device)
+    x = end[:, None] * steps
+    falls = ~(slope(x) > 0)
+    first = falls.int().argmax(1, keepdim=True)
+    low, high = x.gather(1, (first - 1).clamp(min=0)), x.gather(1, first)
+    for _ in range(50):
+        middle = (low + high) / 2
+        rises = slope(middle) > 0
+        low, high = torch.where(rises, middle, low), torch.where(rises, high, middle)
+    return torch.where(falls.any(1), low[:, 0], end)

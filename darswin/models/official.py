@@ -32,19 +32,21 @@ class OfficialPolynomial(Lens):
 
     parameters = ("coefficients", "radius")
     lengths = ("radius",)
-    theta_limit = math.inf
     coefficients: Tensor
     radius: Tensor
 
     def __init__(self, coefficients: Number, radius: Number, center: Number | None = None):
-        theta_max = torch.as_tensor(coefficients).sum(-1)
-        super().__init__(theta_max, center, coefficients=coefficients, radius=radius)
+        super().__init__(None, center, coefficients=coefficients, radius=radius)
 
     def _validate(self) -> None:
         self._require("radius", self.radius > 0, "greater than 0")
         self._require(
             "coefficients", (self._table()[1].diff(dim=1) > 0).all(1), "such that θ rises"
         )
+
+    @property
+    def theta_limit(self) -> Tensor:
+        return self.coefficients.detach().sum(1)
 
     def _angle(self, x: Tensor) -> Tensor:
         columns = self.coefficients.reshape(*self.coefficients.shape, *(1,) * (x.dim() - 1))

@@ -93,8 +93,8 @@ def test_radii_where_nothing_lands_are_nan():
 @pytest.mark.parametrize("name", LENSES)
 def test_gradients_of_both_directions(name):
     lens = LENSES[name]
-    tensors = [getattr(lens, n).clone().requires_grad_() for n in lens._names() if n != "center"]
-    names = [n for n in lens._names() if n != "center"]
+    names = [n for n in lens._names() if getattr(lens, n) is not None]
+    tensors = [getattr(lens, n).clone().requires_grad_() for n in names]
     part = torch.linspace(0.1, 0.9, 4, dtype=f64)
 
     def run(x, *values, direction="project"):
@@ -126,23 +126,32 @@ def test_a_parameter_can_be_learned():
         (lambda: Perspective(0.0, 1.0), "focal must be"),
         (lambda: Perspective(-3.0, 1.0), r"focal must be .* got -3.0"),
         (lambda: Perspective(math.inf, 1.0), "focal must be"),
-        (lambda: Perspective(1.0, math.pi / 2 + 1e-3), "theta_max must be below π/2"),
+        (
+            lambda: Perspective(1.0, math.pi / 2 + 1e-3),
+            r"theta_max must be at most 1.570795 rad \(90.00°\).* got 1.57179",
+        ),
         (lambda: Perspective(1.0, 0.0), "theta_max must be greater than 0"),
         (lambda: Perspective(1.0, math.nan), "theta_max must be"),
         (lambda: Spherical(-0.1, 1.0, 1.0), r"xi must be .* got -0.1"),
         (lambda: Spherical(math.nan, 1.0, 1.0), "xi must be"),
         (lambda: Spherical(0.5, 0.0, 1.0), "focal must be"),
-        (lambda: Spherical(0.0, 1.0, 1.6), "theta_max must be where r still rises"),
-        (lambda: Spherical(0.5, 1.0, 2.2), "theta_max must be where r still rises"),
-        (lambda: Spherical(2.0, 1.0, 2.2), "theta_max must be where r still rises"),
+        (
+            lambda: Spherical(0.0, 1.0, 1.6),
+            r"theta_max must be at most 1.57.*Spherical lens's r rises",
+        ),
+        (lambda: Spherical(0.5, 1.0, 2.2), r"theta_max must be at most 2.09"),
+        (lambda: Spherical(2.0, 1.0, 2.2), r"theta_max must be at most 2.09"),
         (lambda: Spherical([0.1, 0.2], [1.0, 2.0, 3.0], 1.0), "agree in the number of lenses"),
         (lambda: Spherical([0.1, -0.2], 1.0, 1.0), r"xi must be .* got -0.2"),
         (lambda: Spherical([[0.1]], 1.0, 1.0), r"xi must be a number or \(N,\)"),
-        (lambda: Polynomial([1.0, -5.0], 1.0), "coefficients must be such that r rises"),
+        (
+            lambda: Polynomial([1.0, -5.0], 1.0),
+            r"theta_max must be at most 0.09999.*as far as .* r rises",
+        ),
         (lambda: Polynomial([0.0, 1.0], 1.0), "coefficients must be such that r rises"),
         (lambda: Polynomial([1.0, math.nan], 1.0), "coefficients must be finite"),
         (lambda: Polynomial(1.0, 1.0), r"coefficients must be \(K,\) or \(N, K\)"),
-        (lambda: Polynomial([1.0], 3.2), "theta_max must be below π"),
+        (lambda: Polynomial([1.0], 3.2), "theta_max must be at most 3.14159"),
         (lambda: Perspective(1.0, 1.0, center=[1.0, 2.0, 3.0]), "center must be"),
         (lambda: Perspective(1.0, 1.0, center=3.0), r"center must be \(K,\) or \(N, K\)"),
         (lambda: Perspective.from_fov(3.2, 10.0), "focal must be"),  # tan(θ_max) < 0
@@ -199,12 +208,8 @@ def test_indexing_and_stacking():
         lens.expand(4)
     with pytest.raises(ValueError, match="at least one"):
         stack([])
-    with pytest.raises(TypeError, match=r"one model, got \['Perspective', 'Spherical'\]"):
-        stack([lens[0], Perspective(1.0, 1.0)])
     with pytest.raises(ValueError, match="center for all"):
         stack([lens[0], Spherical(0.1, 1.0, 1.0)])
-    with pytest.raises(ValueError, match="degree"):
-        stack([Polynomial([1.0], 1.0), Polynomial([1.0, 0.1], 1.0)])
 
 
 def test_principal_point():

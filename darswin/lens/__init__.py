@@ -1,0 +1,26 @@
+"""Lenses: where a ray at incident angle θ and azimuth φ lands in the image, and back.
+
+Every lens is a batch, differentiable in its parameters, and works beyond 90° where its model does.
+"""
+
+from darswin.lens.base import Lens, Number
+from darswin.lens.curves import Tabulated, as_curves, stack
+from darswin.lens.description import MODELS, from_dict, to_dict
+from darswin.lens.distorted import BrownConrady, Fisheye624, KannalaBrandt, Mei
+from darswin.lens.ideal import (
+    Equidistant,
+    Equisolid,
+    FieldOfView,
+    Orthographic,
+    Perspective,
+    Stereographic,
+)
+from darswin.lens.polynomial import OCam, OCamInverse, Polynomial
+from darswin.lens.sphere import DoubleSphere, EnhancedUnified, Spherical
+
+__all__ = [
+    "MODELS", "BrownConrady", "DoubleSphere", "EnhancedUnified", "Equidistant", "Equisolid",
+    "FieldOfView", "Fisheye624", "KannalaBrandt", "Lens", "Mei", "Number", "OCam", "OCamInverse",
+    "Orthographic", "Perspective", "Polynomial", "Spherical", "Stereographic", "Tabulated",
+    "as_curves", "from_dict", "stack", "to_dict",
+]  # fmt: skip

@@ -1,0 +1,162 @@
+"""Lenses of one focal length: the projections that a lens designer aims at."""
+
+import math
+from typing import Self
+
+import torch
+from torch import Tensor
+
+from darswin.lens.base import MARGIN, Lens, Number, _as_tensors
+
+
+class IdealLens(Lens):
+    """Base of the lenses r = f u(θ).
+
+    Args:
+        focal: f > 0, px. Others: as `Lens`.
+    """
+
+    parameters = ("focal",)
+    lengths = ("focal",)
+    focal: Tensor
+
+    def __init__(
+        self,
+        focal: Number,
+        theta_max: Number | None = None,
+        center: Number | None = None,
+        **frame: Number | None,
+    ):
+        super().__init__(theta_max, center, focal=focal, **frame)
+
+    @classmethod
+    def from_fov(
+        cls, fov: Number, radius: Number, center: Number | None = None, **frame: Number | None
+    ) -> Self:
+        """The lens whose full field of view `fov` (rad) fills a circle of `radius` px."""
+        t = _as_tensors({"fov": fov, "radius": radius})
+        theta_max = t["fov"] / 2
+        return cls(t["radius"] / cls._rise(theta_max), theta_max, center, **frame)
+
+    def _validate(self) -> None:
+        self._require("focal", (self.focal > 0) & self.focal.isfinite(), "finite and above 0")
+
+    @staticmethod
+    def _rise(theta: Tensor) -> Tensor:
+        """u(θ)."""
+        raise NotImplementedError
+
+    @staticmethod
+    def _angle(rise: Tensor) -> Tensor:
+        """θ at which u takes a value."""
+        raise NotImplementedError
+
+    def project(self, theta: Number) -> Tensor:
+        theta, focal = self._aligned(theta, "focal")
+        return focal * self._rise(theta)
+
+    def unproject(self, radius: Number) -> Tensor:
+        radius, focal = self._aligned(radius, "focal")
+        return self._angle(radius / focal)
+
+    _end = math.pi  # where u stops rising, or to be finite
+
+    @property
+    def theta_limit(self) -> Tensor:
+        return torch.full_like(self.focal, self._end - MARGIN)
+
+
+class Perspective(IdealLens):
+    """r = f tan θ, θ < 90°: the pinhole camera. Arguments: `focal`, and those of `Lens`."""
+
+    _end = math.pi / 2
+    _rise = staticmethod(torch.tan)
+    _angle = staticmethod(torch.atan)
+
+
+class Equidistant(IdealLens):
+    """r = f θ: equal angles are equal steps. Arguments: `focal`, and those of `Lens`."""
+
+    @staticmethod
+    def _rise(theta: Tensor) -> Tensor:
+        return theta
+
+    @staticmethod
+    def _angle(rise: Tensor) -> Tensor:
+        return rise
+
+
+class Equisolid(IdealLens):
+    """r = 2 f sin(θ/2): equal solid angles are equal areas. Arguments: `focal`, those of `Lens`."""
+
+    @staticmethod
+    def _rise(theta: Tensor) -> Tensor:
+        return 2 * torch.sin(theta / 2)
+
+    @staticmethod
+    def _angle(rise: Tensor) -> Tensor:
+        return 2 * torch.asin(rise / 2)  # NaN beyond 2
+
+
+class Stereographic(IdealLens):
+    """r = 2 f tan(θ/2): keeps angles between lines. Arguments: `focal`, and those of `Lens`."""
+
+    @staticmethod
+    def _rise(theta: Tensor) -> Tensor:
+        return 2 * torch.tan(theta / 2)
+
+    @staticmethod
+    def _angle(rise: Tensor) -> Tensor:
+        return 2 * torch.atan(rise / 2)
+
+
+class Orthographic(IdealLens):
+    """r = f sin θ, θ < 90°. Arguments: `focal`, and those of `Lens`."""
+
+    _end = math.pi / 2
+    _rise = staticmethod(torch.sin)
+    _angle = staticmethod(torch.asin)  # NaN beyond 1
+
+
+class FieldOfView(Lens):
+    """r = f atan(2 tan(ω/2) tan θ) / ω: the FOV model, here also beyond 90°.
+
+    Args:
+        omega: ω in (0, π), rad. focal: f > 0, px. Others: as `Lens`.
+
+    Source: Devernay and Faugeras, MVA 2001, sec. 3.1.
+    """
+
+    parameters = ("omega", "focal")
+    lengths = ("focal",)
+    omega: Tensor
+    focal: Tensor
+
+    def __init__(
+        self,
+        omega: Number,
+        focal: Number,
+        theta_max: Number | None = None,
+        center: Number | None = None,
+        **frame: Number | None,
+    ):
+        super().__init__(theta_max, center, omega=omega, focal=focal, **frame)
+
+    def _validate(self) -> None:
+        self._require("omega", (self.omega > 0) & (self.omega < math.pi), "in (0, π)")
+        self._require("focal", (self.focal > 0) & self.focal.isfinite(), "finite and above 0")
+
+    def project(self, theta: Number) -> Tensor:
+        theta, omega, focal = self._aligned(theta, "omega", "focal")
+        tangent = 2 * torch.tan(omega / 2)
+        return focal / omega * torch.atan2(tangent * torch.sin(theta), torch.cos(theta))
+
+    def unproject(self, radius: Number) -> Tensor:
+        radius, omega, focal = self._aligned(radius, "omega", "focal")
+        angle, tangent = radius * omega / focal, 2 * torch.tan(omega / 2)
+        theta = torch.atan2(torch.sin(angle), tangent * torch.cos(angle))
+        return torch.where(angle.abs() <= math.pi, theta, torch.nan)
+
+    @property
+    def theta_limit(self) -> Tensor:
+        return torch.full_like(self.focal, math.pi - MARGIN)

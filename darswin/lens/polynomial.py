@@ -1,0 +1,163 @@
+"""Lenses whose curve is a polynomial, of the angle or of the radius."""
+
+import math
+
+import torch
+from torch import Tensor
+
+from darswin.inverse import inverse, rising_limit
+from darswin.lens.base import MARGIN, Lens, Number
+
+
+def horner(x: Tensor, coefficients: Tensor) -> Tensor:
+    """c₀ + c₁ x + c₂ x² + …, for coefficients (N, n) and x (N or 1, ...)."""
+    value = torch.zeros_like(x)
+    for column in reversed(coefficients.unbind(1)):
+        value = value * x + Lens._row(column, x.dim())
+    return value
+
+
+def slopes(coefficients: Tensor, first: int, step: int = 1) -> Tensor:
+    """(N, n): the factors of the powers first, first + step, … after deriving."""
+    powers = first + step * torch.arange(coefficients.shape[1], device=coefficients.device)
+    return coefficients * powers
+
+
+class Polynomial(Lens):
+    """r = k₁ θ + k₂ θ² + … + k_n θⁿ, of any degree; WoodScape's `radial_poly` has four.
+
+    OpenCV's fisheye coefficients are not these: they belong to a `KannalaBrandt`.
+
+    Args:
+        coefficients: (n,) or (N, n): k₁ … k_n, in px. Others: as `Lens`.
+
+    Source: DarSwin, ICCV 2023, eq. 4.
+    """
+
+    parameters = ("coefficients",)
+    lengths = ("coefficients",)
+    coefficients: Tensor
+
+    def __init__(
+        self,
+        coefficients: Number,
+        theta_max: Number | None = None,
+        center: Number | None = None,
+        **frame: Number | None,
+    ):
+        super().__init__(theta_max, center, coefficients=coefficients, **frame)
+
+    def _validate(self) -> None:
+        self._require("coefficients", self.coefficients.isfinite().all(1), "finite")
+
+    @property
+    def theta_limit(self) -> Tensor:
+        end = torch.full_like(self.coefficients[:, 0].detach(), math.pi)
+        return rising_limit(self._slope, end) - MARGIN
+
+    def _slope(self, theta: Tensor) -> Tensor:
+        return horner(theta, slopes(self.coefficients, 1))
+
+    def project(self, theta: Number) -> Tensor:
+        (theta,) = self._aligned(theta)
+        return theta * horner(theta, self.coefficients)
+
+
+class OCam(Lens):
+    """tan θ = -r / (a₀ + a₁ r + a₂ r² + …): Scaramuzza's model, whose inverse is the closed one.
+
+    Args:
+        coefficients: (n,) or (N, n): a₀ < 0, a₁, … in px, 1, px⁻¹, … Others: as `Lens`.
+
+    Source: Scaramuzza, Martinelli and Siegwart, ICVS 2006; the OCamCalib toolbox.
+    """
+
+    parameters = ("coefficients",)
+    lengths = ("coefficients",)
+    coefficients: Tensor
+
+    def __init__(
+        self,
+        coefficients: Number,
+        theta_max: Number | None = None,
+        center: Number | None = None,
+        **frame: Number | None,
+    ):
+        super().__init__(theta_max, center, coefficients=coefficients, **frame)
+
+    def _validate(self) -> None:
+        a = self.coefficients
+        self._require("coefficients", a.isfinite().all(1) & (a[:, 0] < 0), "finite, a₀ below 0")
+
+    def _angle(self, radius: Tensor) -> Tensor:
+        return torch.atan2(radius, -horner(radius, self.coefficients))
+
+    def _angle_slope(self, radius: Tensor) -> Tensor:
+        depth = horner(radius, self.coefficients)
+        deepens = horner(radius, slopes(self.coefficients, 0)[:, 1:])
+        return (radius * deepens - depth) / (radius * radius + depth * depth)
+
+    @property
+    def _last_radius(self) -> Tensor:
+        """(N,) px: up to where θ rises, of 20 |a₀| at most."""
+        return rising_limit(self._angle_slope, -20 * self.coefficients[:, 0].detach())
+
+    @property
+    def theta_limit(self) -> Tensor:
+        return self._angle(self._last_radius[:, None])[:, 0].detach() - MARGIN
+
+    def project(self, theta: Number) -> Tensor:
+        (theta,) = self._aligned(theta)
+        end = self._row(self._last_radius, theta.dim())
+        return inverse(self._angle, self._angle_slope, theta, end)
+
+    def unproject(self, radius: Number) -> Tensor:
+        (radius,) = self._aligned(radius)
+        last = self._row(self._last_radius, radius.dim())
+        lands = (radius >= 0) & (radius <= last)
+        return torch.where(lands, self._angle(radius), torch.nan)
+
+    def _scaled(self, scale: float | Tensor) -> "OCam":
+        power = 1 - torch.arange(self.coefficients.shape[1], device=self.coefficients.device)
+        factor = torch.as_tensor(scale).to(self.coefficients).reshape(-1, 1) ** power
+        return self.replace(coefficients=self.coefficients * factor)
+
+
+class OCamInverse(Lens):
+    """r = b₀ + b₁ (θ - π/2) + b₂ (θ - π/2)² + …: the polynomial that OCamCalib projects with.
+
+    The toolbox fits it to the inverse of an `OCam`, to some hundredths of a pixel.
+
+    Args:
+        coefficients: (n,) or (N, n): b₀, b₁, … in px. Others: as `Lens`.
+
+    Source: the OCamCalib toolbox, world2cam.
+    """
+
+    parameters = ("coefficients",)
+    lengths = ("coefficients",)
+    coefficients: Tensor
+
+    def __init__(
+        self,
+        coefficients: Number,
+        theta_max: Number | None = None,
+        center: Number | None = None,
+        **frame: Number | None,
+    ):
+        super().__init__(theta_max, center, coefficients=coefficients, **frame)
+
+    def _validate(self) -> None:
+        self._require("coefficients", self.coefficients.isfinite().all(1), "finite")
+
+    @property
+    def theta_limit(self) -> Tensor:
+        end = torch.full_like(self.coefficients[:, 0].detach(), math.pi)
+        return rising_limit(self._slope, end) - MARGIN
+
+    def _slope(self, theta: Tensor) -> Tensor:
+        return horner(theta - math.pi / 2, slopes(self.coefficients, 0)[:, 1:])
+
+    def project(self, theta: Number) -> Tensor:
+        (theta,) = self._aligned(theta)
+        return horner(theta - math.pi / 2, self.coefficients)

@@ -1,0 +1,195 @@
+"""Lenses that project by way of a sphere or an ellipsoid, with a closed inverse."""
+
+from typing import Self
+
+import torch
+from torch import Tensor
+
+from darswin.lens.base import MARGIN, Lens, Number, _as_tensors
+
+
+class Spherical(Lens):
+    """r = f sin θ / (ξ + cos θ): the unified model, perspective at ξ = 0, stereographic at ξ = 1.
+
+    Args:
+        xi: ξ ≥ 0. focal: f > 0, px. Others: as `Lens`; r rises while cos θ > -min(ξ, 1/ξ).
+
+    Source: DarSwin, ICCV 2023, eq. 5; Barreto, CVIU 2006.
+    """
+
+    parameters = ("xi", "focal")
+    lengths = ("focal",)
+    xi: Tensor
+    focal: Tensor
+
+    def __init__(
+        self,
+        xi: Number,
+        focal: Number,
+        theta_max: Number | None = None,
+        center: Number | None = None,
+        **frame: Number | None,
+    ):
+        super().__init__(theta_max, center, xi=xi, focal=focal, **frame)
+
+    @classmethod
+    def from_fov(
+        cls,
+        xi: Number,
+        fov: Number,
+        radius: Number,
+        center: Number | None = None,
+        **frame: Number | None,
+    ) -> Self:
+        """The lens of ξ whose full field of view `fov` (rad) fills a circle of `radius` px."""
+        t = _as_tensors({"xi": xi, "fov": fov, "radius": radius})
+        theta_max = t["fov"] / 2
+        focal = t["radius"] * (t["xi"] + torch.cos(theta_max)) / torch.sin(theta_max)
+        return cls(t["xi"], focal, theta_max, center, **frame)
+
+    def _validate(self) -> None:
+        self._require("xi", (self.xi >= 0) & self.xi.isfinite(), "finite and at least 0")
+        self._require("focal", (self.focal > 0) & self.focal.isfinite(), "finite and above 0")
+
+    @property
+    def theta_limit(self) -> Tensor:
+        return sphere_limit(self.xi)
+
+    def project(self, theta: Number) -> Tensor:
+        theta, xi, focal = self._aligned(theta, "xi", "focal")
+        return focal * torch.sin(theta) / (xi + torch.cos(theta))
+
+    def unproject(self, radius: Number) -> Tensor:
+        # tan ψ = r/f, θ = ψ + asin(ξ sin ψ); as atan2, exact also where the sine nears 1.
+        radius, xi, focal = self._aligned(radius, "xi", "focal")
+        rho = radius / focal
+        return torch.atan(rho) + torch.atan2(xi * rho, root(1 + (1 - xi * xi) * rho * rho))
+
+
+class EnhancedUnified(Lens):
+    """r = f sin θ / (α √(β sin² θ + cos² θ) + (1 - α) cos θ): EUCM, at β = 1 the unified model.
+
+    Args:
+        alpha: α in [0, 1]. beta: β > 0. focal: f > 0, px. Others: as `Lens`.
+
+    Source: Khomutenko, Garcia and Martinet, RA-L 2016.
+    """
+
+    parameters = ("alpha", "beta", "focal")
+    lengths = ("focal",)
+    alpha: Tensor
+    beta: Tensor
+    focal: Tensor
+
+    def __init__(
+        self,
+        alpha: Number,
+        beta: Number,
+        focal: Number,
+        theta_max: Number | None = None,
+        center: Number | None = None,
+        **frame: Number | None,
+    ):
+        super().__init__(theta_max, center, alpha=alpha, beta=beta, focal=focal, **frame)
+
+    def _validate(self) -> None:
+        self._require("alpha", (self.alpha >= 0) & (self.alpha <= 1), "in [0, 1]")
+        self._require("beta", (self.beta > 0) & self.beta.isfinite(), "finite and above 0")
+        self._require("focal", (self.focal > 0) & self.focal.isfinite(), "finite and above 0")
+
+    @property
+    def theta_limit(self) -> Tensor:
+        # Where cos θ = -w √(β sin² θ + cos² θ).
+        w = _cone(self.alpha.detach())
+        last = torch.atan2(root(1 - w * w), -w * self.beta.detach().sqrt())
+        return last - MARGIN
+
+    def project(self, theta: Number) -> Tensor:
+        theta, alpha, beta, focal = self._aligned(theta, "alpha", "beta", "focal")
+        sin, cos = torch.sin(theta), torch.cos(theta)
+        length = torch.sqrt(beta * sin * sin + cos * cos)
+        return focal * sin / (alpha * length + (1 - alpha) * cos)
+
+    def unproject(self, radius: Number) -> Tensor:
+        radius, alpha, beta, focal = self._aligned(radius, "alpha", "beta", "focal")
+        rho = radius / focal
+        square = beta * rho * rho
+        z = (1 - alpha * alpha * square) / (
+            alpha * root(1 - (2 * alpha - 1) * square) + (1 - alpha)
+        )
+        return torch.atan2(rho, z)
+
+
+class DoubleSphere(Lens):
+    """r = f sin θ / (α √(sin² θ + (ξ + cos θ)²) + (1 - α) (ξ + cos θ)).
+
+    Args:
+        xi: ξ > -1. alpha: α in [0, 1]. focal: f > 0, px. Others: as `Lens`.
+
+    Source: Usenko, Demmel and Cremers, 3DV 2018.
+    """
+
+    parameters = ("xi", "alpha", "focal")
+    lengths = ("focal",)
+    xi: Tensor
+    alpha: Tensor
+    focal: Tensor
+
+    def __init__(
+        self,
+        xi: Number,
+        alpha: Number,
+        focal: Number,
+        theta_max: Number | None = None,
+        center: Number | None = None,
+        **frame: Number | None,
+    ):
+        super().__init__(theta_max, center, xi=xi, alpha=alpha, focal=focal, **frame)
+
+    def _validate(self) -> None:
+        self._require("xi", (self.xi > -1) & self.xi.isfinite(), "finite and above -1")
+        self._require("alpha", (self.alpha >= 0) & (self.alpha <= 1), "in [0, 1]")
+        self._require("focal", (self.focal > 0) & self.focal.isfinite(), "finite and above 0")
+
+    @property
+    def theta_limit(self) -> Tensor:
+        # The angle ψ from the second sphere's center, tan ψ = sin θ / (ξ + cos θ), ends where
+        # cos ψ = -w; and, beyond ξ = 1, it stops to rise where cos θ = -1/ξ.
+        w, xi = _cone(self.alpha.detach()), self.xi.detach()
+        psi = torch.atan2(root(1 - w * w), -w)
+        # θ from ψ, as in a triangle of sides 1 and ξ.
+        theta = psi + torch.asin((xi * torch.sin(psi)).clamp(-1, 1))
+        return torch.minimum(theta - MARGIN, sphere_limit(xi.clamp(min=1)))
+
+    def project(self, theta: Number) -> Tensor:
+        theta, xi, alpha, focal = self._aligned(theta, "xi", "alpha", "focal")
+        sin, cos = torch.sin(theta), xi + torch.cos(theta)
+        return focal * sin / (alpha * torch.sqrt(sin * sin + cos * cos) + (1 - alpha) * cos)
+
+    def unproject(self, radius: Number) -> Tensor:
+        radius, xi, alpha, focal = self._aligned(radius, "xi", "alpha", "focal")
+        rho = radius / focal
+        square = rho * rho
+        z = (1 - alpha * alpha * square) / (
+            alpha * root(1 - (2 * alpha - 1) * square) + (1 - alpha)
+        )
+        scale = (z * xi + root(z * z + (1 - xi * xi) * square)) / (z * z + square)
+        return torch.atan2(scale * rho, scale * z - xi)
+
+
+def sphere_limit(xi: Tensor) -> Tensor:
+    """Up to where sin θ / (ξ + cos θ) rises."""
+    with torch.no_grad():
+        return torch.acos(-torch.where(xi <= 1, xi, 1 / xi.clamp(min=1))) - MARGIN
+
+
+def _cone(alpha: Tensor) -> Tensor:
+    """The last angle of the unified model of α has the cosine -w."""
+    return torch.where(alpha <= 0.5, alpha / (1 - alpha), (1 - alpha) / alpha.clamp(min=0.5))
+
+
+def root(square: Tensor) -> Tensor:
+    """√, 0 where rounding took a 0 below it, NaN where it is truly negative."""
+    eps = torch.finfo(square.dtype).eps
+    positive = square.clamp(min=eps * eps)
+    return torch.where(square < -64 * eps, torch.nan, torch.sqrt(positive))
