@@ -54,7 +54,8 @@ class OfficialPolynomial(Lens):
 
     def _table(self) -> tuple[Tensor, Tensor]:
         """x (50,) and its θ (N, 50)."""
-        x = torch.linspace(0, 1, 50, dtype=self.theta_max.dtype, device=self.theta_max.device)
+        like = self.coefficients
+        x = torch.linspace(0, 1, 50, dtype=like.dtype, device=like.device)
         return x, self._angle(x[None])
 
     def project(self, theta: Number) -> Tensor:

@@ -157,7 +157,7 @@ def test_a_parameter_can_be_learned():
         (lambda: Perspective.from_fov(3.2, 10.0), "focal must be"),  # tan(θ_max) < 0
         (lambda: Spherical.from_fov(0.5, 2.0, -1.0), "focal must be"),
     ],
-)
+)  # fmt: skip
 def test_a_parameter_out_of_range_is_named(make, message):
     with pytest.raises(ValueError, match=message):
         make()
