@@ -113,13 +113,24 @@ def check_images(images: Tensor) -> Tensor:
 
 
 def check_lens(lens: Lens, images: Tensor) -> None:
-    """TypeError or ValueError unless there is a lens for each image, or one."""
+    """TypeError or ValueError unless there is a lens for each image, or one, and of its size.
+
+    Compiled graphs cannot look at a value, so they do not check sizes."""
     if not isinstance(lens, Lens):
         raise TypeError(f"lens must be a darswin.lens.Lens, got {type(lens).__name__}")
     if len(lens) not in (1, images.shape[0]):
         raise ValueError(
             f"there must be one lens or one an image, {images.shape[0]}, got {len(lens)}"
         )
+    if lens.image_size is None or torch.compiler.is_compiling():
+        return
+    size = tuple(images.shape[2:])
+    for other in lens.image_size.unique(dim=0).tolist():
+        if tuple(other) != size:
+            raise ValueError(
+                f"the lens belongs to images of (H, W) = {tuple(round(s) for s in other)}, got "
+                f"images of {size}; lens.resized({size}) is the lens of a resized image"
+            )
 
 
 class Pixels(nn.Module):

@@ -262,11 +262,12 @@ class Lens:
             return self._flat(length, point / length[..., None])
 
         def step(point: Tensor) -> Tensor:
-            with torch.no_grad():
-                axes = torch.eye(2, dtype=point.dtype, device=point.device)
-                columns = [torch.func.jvp(land, (point,), (a.expand_as(point),))[1] for a in axes]
-                inverse = torch.linalg.inv_ex(torch.stack(columns, -1)).inverse
-            return torch.einsum("...ij,...j->...i", inverse, land(point) - flat)
+            with torch.enable_grad():
+                at = point.detach().requires_grad_()
+                x, y = land(at).unbind(-1)
+                rows = [torch.autograd.grad(v.sum(), at, retain_graph=True)[0] for v in (x, y)]
+            inverse = torch.linalg.inv_ex(torch.stack(rows, -2)).inverse
+            return (inverse @ (land(point) - flat)[..., None])[..., 0]
 
         end = self._row(self.theta_max.detach(), theta.dim())
         with torch.no_grad():
