@@ -202,7 +202,7 @@ def _least_squares(
     if not math.isfinite(cost):
         return start, math.inf
     axes = torch.eye(len(vector), dtype=vector.dtype)
-    for _ in range(60):
+    for _ in range(200):
         columns = [torch.func.jvp(miss, (vector,), (axis,)) for axis in axes]
         error, slopes = columns[0][0], torch.stack([column[1] for column in columns], 1)
         scale = slopes.norm(dim=0).clamp(min=1e-30)
@@ -217,6 +217,6 @@ def _least_squares(
                 vector, cost, damping = trial, trial_cost, max(damping / 10, 1e-15)
                 break
             damping *= 10
-        if cost > 0.999 * before or cost < 1e-26:
+        if cost > 0.9999 * before or cost < 1e-26:
             break
     return parameters(vector), cost

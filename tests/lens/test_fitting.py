@@ -41,7 +41,7 @@ def test_every_model_finds_itself():
 # The largest error in px that each model leaves of WoodScape's front camera (1280×966), to 95°.
 @pytest.mark.parametrize(
     ("model", "most"),
-    [("KannalaBrandt", 0.45), ("Mei", 0.45), ("Spherical", 1.2), ("EnhancedUnified", 1.1),
+    [("KannalaBrandt", 0.45), ("Mei", 1.0), ("Spherical", 1.2), ("EnhancedUnified", 1.1),
      ("DoubleSphere", 1.1), ("OCam", 0.45), ("OCamInverse", 1e-6), ("Polynomial", 1e-6),
      ("FieldOfView", 7.5), ("Equidistant", 43.0), ("Tabulated", 1e-5)],
 )  # fmt: skip
