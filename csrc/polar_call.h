@@ -41,6 +41,7 @@ inline Pixel pixel_type(const torch::stable::Tensor& image) {
 template <typename T>
 struct PolarCall {
   torch::stable::Tensor image, radii, center;
+  std::optional<torch::stable::Tensor> affine, offsets;
   std::vector<double> directions;
   std::vector<T> scale, offset;
   PolarSampleArgs<T> args{};
@@ -48,8 +49,10 @@ struct PolarCall {
 
   PolarCall(const torch::stable::Tensor& image, const torch::stable::Tensor& radii,
             const torch::stable::Tensor& azimuths, const torch::stable::Tensor& center,
-            const Sizes& patch, double jitter, const std::optional<torch::stable::Tensor>& seed,
-            const std::vector<double>& mean, const std::vector<double>& std, bool bfloat16);
+            const std::optional<torch::stable::Tensor>& affine,
+            const std::optional<torch::stable::Tensor>& offsets, const Sizes& patch, double jitter,
+            const std::optional<torch::stable::Tensor>& seed, const std::vector<double>& mean,
+            const std::vector<double>& std, bool bfloat16);
 
   int64_t rings() const { return args.num_radii / args.patch_radii; }
   int64_t sectors() const { return args.num_azimuths / args.patch_azimuths; }
@@ -75,25 +78,39 @@ int64_t count_bands(int64_t batch, int64_t height);
 template <typename T>
 torch::stable::Tensor new_image_gradient(PolarCall<T>& call);
 
-// Gradients of image, radii and center from args.grad_out; what is not wanted comes back empty.
+// Which gradients backward is asked for. Those of radii, center and affine come together.
+struct PolarWanted {
+  bool image, lens, offsets;
+};
+
+// Gradients of image, radii, center, affine and offsets.
+using PolarGradients =
+    std::tuple<torch::stable::Tensor, torch::stable::Tensor, torch::stable::Tensor,
+               torch::stable::Tensor, torch::stable::Tensor>;
+
+// What stands for gradients that are not wanted, or of what is not there: empty tensors.
 template <typename T>
-std::tuple<torch::stable::Tensor, torch::stable::Tensor, torch::stable::Tensor> polar_backward(
-    PolarCall<T>& call, bool image_grad, bool lens_grad);
+PolarGradients no_gradients(const PolarCall<T>& call);
+
+// The gradients that are wanted, from args.grad_out.
+template <typename T>
+PolarGradients polar_backward(PolarCall<T>& call, const PolarWanted& wanted);
 
 // Calls run(call) with a call of the image's type.
 template <typename Run>
 auto with_polar_call(const torch::stable::Tensor& image, const torch::stable::Tensor& radii,
                      const torch::stable::Tensor& azimuths, const torch::stable::Tensor& center,
-                     const Sizes& patch, double jitter,
-                     const std::optional<torch::stable::Tensor>& seed,
+                     const std::optional<torch::stable::Tensor>& affine,
+                     const std::optional<torch::stable::Tensor>& offsets, const Sizes& patch,
+                     double jitter, const std::optional<torch::stable::Tensor>& seed,
                      const std::vector<double>& mean, const std::vector<double>& std, bool bfloat16,
                      Run run) {
   if (pixel_type(image) == Pixel::f64) {
-    return run(PolarCall<double>(image, radii, azimuths, center, patch, jitter, seed, mean, std,
-                                 bfloat16));
+    return run(PolarCall<double>(image, radii, azimuths, center, affine, offsets, patch, jitter,
+                                 seed, mean, std, bfloat16));
   }
-  return run(
-      PolarCall<float>(image, radii, azimuths, center, patch, jitter, seed, mean, std, bfloat16));
+  return run(PolarCall<float>(image, radii, azimuths, center, affine, offsets, patch, jitter, seed,
+                              mean, std, bfloat16));
 }
 
 extern template struct PolarCall<float>;
