@@ -161,21 +161,12 @@ void fold_lens(const PolarCall<T>& call, const std::vector<double>& sums, PolarG
       for (int e = 0; e < 4 && call.affine.has_value(); ++e) matrix[e] += sum[kAffine + e];
     }
   }
-  std::get<1>(grads) = rounded_like<T>(call.radii, radii);
-  std::get<2>(grads) = rounded_like<T>(call.center, center);
-  if (call.affine.has_value()) std::get<3>(grads) = rounded_like<T>(*call.affine, affine);
+  grads.radii = rounded_like<T>(call.radii, radii);
+  grads.center = rounded_like<T>(call.center, center);
+  if (call.affine.has_value()) grads.affine = rounded_like<T>(*call.affine, affine);
 }
 
 }  // namespace
-
-template <typename T>
-PolarGradients no_gradients(const PolarCall<T>& call) {
-  const auto none = [](const Tensor& like) { return torch::stable::new_empty(like, Sizes{0}); };
-  return {none(call.image), none(call.radii), none(call.center), none(call.radii),
-          none(call.radii)};
-}
-template PolarGradients no_gradients(const PolarCall<float>&);
-template PolarGradients no_gradients(const PolarCall<double>&);
 
 template <typename T>
 PolarGradients polar_backward(PolarCall<T>& call, const PolarWanted& wanted) {
@@ -183,9 +174,9 @@ PolarGradients polar_backward(PolarCall<T>& call, const PolarWanted& wanted) {
   const bool points = call.channels_and_points();
   const auto& kernel = kernels().table<T>();
 
-  PolarGradients grads = no_gradients(call);
+  PolarGradients grads(call);
   if (wanted.image) {
-    std::get<0>(grads) = new_image_gradient(call);
+    grads.image = new_image_gradient(call);
     args.bands = count_bands(call.batch, args.height);
     const int64_t bytes = kernel.polar_sample_scratch(args);
     parallel_ranges(points ? call.batch * args.bands : 0, [&](int64_t begin, int64_t end, int64_t) {
@@ -195,9 +186,8 @@ PolarGradients polar_backward(PolarCall<T>& call, const PolarWanted& wanted) {
   if (!wanted.lens && !wanted.offsets) return grads;
   const bool offsets = wanted.offsets && call.offsets.has_value();
   if (offsets) {
-    const Tensor grad = torch::stable::new_zeros(*call.offsets, call.offsets->sizes());
-    args.grad_offsets = grad.template mutable_data_ptr<T>();
-    std::get<4>(grads) = grad;
+    grads.offsets = torch::stable::new_zeros(*call.offsets, call.offsets->sizes());
+    args.grad_offsets = grads.offsets.template mutable_data_ptr<T>();
   }
   // Images that share their offsets add to one gradient: for a ring of it one thread takes them in
   // turn.

@@ -83,14 +83,20 @@ struct PolarWanted {
   bool image, lens, offsets;
 };
 
-// Gradients of image, radii, center, affine and offsets.
-using PolarGradients =
-    std::tuple<torch::stable::Tensor, torch::stable::Tensor, torch::stable::Tensor,
-               torch::stable::Tensor, torch::stable::Tensor>;
+// Gradients of the sampling: empty tensors until they are made.
+struct PolarGradients {
+  torch::stable::Tensor image, radii, center, affine, offsets;
 
-// What stands for gradients that are not wanted, or of what is not there: empty tensors.
-template <typename T>
-PolarGradients no_gradients(const PolarCall<T>& call);
+  template <typename T>
+  explicit PolarGradients(const PolarCall<T>& call)
+      : image(torch::stable::new_empty(call.image, Sizes{0})),
+        radii(torch::stable::new_empty(call.radii, Sizes{0})),
+        center(torch::stable::new_empty(call.radii, Sizes{0})),
+        affine(torch::stable::new_empty(call.radii, Sizes{0})),
+        offsets(torch::stable::new_empty(call.radii, Sizes{0})) {}
+
+  auto tuple() const { return std::tuple(image, radii, center, affine, offsets); }
+};
 
 // The gradients that are wanted, from args.grad_out.
 template <typename T>

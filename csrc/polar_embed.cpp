@@ -13,9 +13,6 @@ namespace {
 
 using torch::stable::Tensor;
 
-// Those of the sampling, of weight and of bias.
-using EmbedGradients = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;
-
 int64_t padded(int64_t n) { return (n + kRowUnit - 1) / kRowUnit * kRowUnit; }
 
 // A weight (D, S_r * S_phi * C) or a bias (D,), contiguous and in the type that is computed in.
@@ -119,8 +116,8 @@ PolarGradients sampling_gradients(PolarCall<T>& call, PolarEmbedArgs<T>& embed,
   const int64_t bytes = kernel.polar_embed_scratch(call.args, embed);
   const bool image_alone = !wanted.lens && !wanted.offsets;
   if (image_alone && count_bands(call.batch, call.args.height) == 1) {
-    PolarGradients grads = no_gradients(call);
-    std::get<0>(grads) = new_image_gradient(call);
+    PolarGradients grads(call);
+    grads.image = new_image_gradient(call);
     call.args.bands = 1;
     parallel_ranges(
         call.channels_and_points() ? call.batch : 0, [&](int64_t begin, int64_t end, int64_t) {
@@ -141,8 +138,8 @@ PolarGradients sampling_gradients(PolarCall<T>& call, PolarEmbedArgs<T>& embed,
 }
 
 template <typename T>
-EmbedGradients backward(PolarCall<T>&& call, const Tensor& grad_out_, const Tensor& weight_,
-                        const PolarWanted& wanted, bool weight_grad) {
+auto backward(PolarCall<T>&& call, const Tensor& grad_out_, const Tensor& weight_,
+              const PolarWanted& wanted, bool weight_grad) {
   check_weight(call, weight_);
   const Tensor grad_out = torch::stable::contiguous(grad_out_);
   const Tensor weight = parameter(call, weight_);
@@ -161,9 +158,9 @@ EmbedGradients backward(PolarCall<T>&& call, const Tensor& grad_out_, const Tens
     std::tie(grad_weight, grad_bias) = weight_gradients(call, embed);
   }
   const bool sampling = wanted.image || wanted.lens || wanted.offsets;
-  return std::tuple_cat(
-      sampling ? sampling_gradients(call, embed, weight, wanted) : no_gradients(call),
-      std::tuple(grad_weight, grad_bias));
+  const PolarGradients grads =
+      sampling ? sampling_gradients(call, embed, weight, wanted) : PolarGradients(call);
+  return std::tuple_cat(grads.tuple(), std::tuple(grad_weight, grad_bias));
 }
 
 Tensor polar_embed(const Tensor& image, const Tensor& radii, const Tensor& azimuths,
@@ -176,14 +173,13 @@ Tensor polar_embed(const Tensor& image, const Tensor& radii, const Tensor& azimu
                          [&](auto&& call) { return forward(std::move(call), weight, bias); });
 }
 
-EmbedGradients polar_embed_backward(const Tensor& grad_out, const Tensor& image,
-                                    const Tensor& radii, const Tensor& azimuths,
-                                    const Tensor& center, std::optional<Tensor> affine,
-                                    std::optional<Tensor> offsets, const Tensor& weight,
-                                    Sizes patch, double jitter, std::optional<Tensor> seed,
-                                    std::vector<double> mean, std::vector<double> std,
-                                    bool bfloat16, bool image_grad, bool lens_grad,
-                                    bool offsets_grad, bool weight_grad) {
+auto polar_embed_backward(const Tensor& grad_out, const Tensor& image, const Tensor& radii,
+                          const Tensor& azimuths, const Tensor& center,
+                          std::optional<Tensor> affine, std::optional<Tensor> offsets,
+                          const Tensor& weight, Sizes patch, double jitter,
+                          std::optional<Tensor> seed, std::vector<double> mean,
+                          std::vector<double> std, bool bfloat16, bool image_grad, bool lens_grad,
+                          bool offsets_grad, bool weight_grad) {
   return with_polar_call(image, radii, azimuths, center, affine, offsets, patch, jitter, seed, mean,
                          std, bfloat16, [&](auto&& call) {
                            return backward(std::move(call), grad_out, weight,

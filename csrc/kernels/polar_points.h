@@ -8,7 +8,7 @@
 //
 // Most lenses are round: a point stands at its radius and azimuth. Others are bent: a matrix
 // stretches their circles to ellipses, and offsets move each point on its own. What tells the two
-// apart is one struct each, which the loops over points are compiled with; round ones pay nothing.
+// apart is a struct each, which the loops over points are compiled for, so round ones pay nothing.
 #pragma once
 
 #include "math.h"
@@ -83,8 +83,9 @@ struct Bent {
 
   Bent(const PolarSampleArgs<T>& a, int64_t b, int64_t i, int64_t j)
       : center(a, b), end(a.offsets_end) {
-    for (int e = 0; a.affine != nullptr && e < 4; ++e)
-      matrix[e] = a.affine[b * a.affine_stride + e];
+    if (a.affine != nullptr) {
+      for (int e = 0; e < 4; ++e) matrix[e] = a.affine[b * a.affine_stride + e];
+    }
     if (a.offsets == nullptr) return;
     x_offsets = a.offsets + b * a.offsets_stride + i * a.num_azimuths + j;
     y_offsets = x_offsets + a.num_radii * a.num_azimuths;
@@ -192,7 +193,7 @@ void locate_moved(const PolarSampleArgs<T>& a, const Lens& lens, int64_t b, int6
   }
 }
 
-// locate() for points that `lens` puts where they belong.
+// locate() for a lens, Round or Bent.
 template <typename T, typename Lens, typename Visit>
 void locate_through(const PolarSampleArgs<T>& a, const Lens& lens, int64_t b, int64_t i, int64_t j,
                     int64_t count, RandomWords& random, const Visit& visit) {

@@ -17,7 +17,7 @@ BENDS = {"affine": (True, False), "offsets": (False, True), "both": (True, True)
 def make_inputs(
     batch=2, channels=3, height=17, width=23, rows=6, columns=8, shared=False, far=1.0, dtype=f64
 ):
-    """Image, radii, center, affine and offsets, and azimuths; points inside, at the border, outside.
+    """Image, radii, center, affine and offsets, and azimuths; points inside and outside.
 
     The matrix more than doubles some lengths; offsets are of `far` px, now and then of the image's
     size.
