@@ -29,13 +29,16 @@ G_M, G_N, G_B, G_C = 2.288135593220339, 5, 8.31578947368421, 1 / 3
 class PolarGrid(NamedTuple):
     """What `polar_sample` needs of a lens, and the borders of its rings.
 
-    Shapes: radii (N, R·S_r) px, azimuths (A·S_φ,) rad, center (N or 1, 2) px, borders (N, R+1) px.
+    Shapes: radii (N, R·S_r) px, azimuths (A·S_φ,) rad, center (N or 1, 2) px, borders (N, R+1) px;
+    for lenses that are not round affine (N or 1, 2, 2), offsets (N or 1, 2, R·S_r, A·S_φ) px.
     """
 
     radii: Tensor
     azimuths: Tensor
     center: Tensor
     borders: Tensor
+    affine: Tensor | None = None
+    offsets: Tensor | None = None
 
 
 def polar_grid(

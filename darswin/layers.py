@@ -78,14 +78,16 @@ class PolarSample(nn.Module):
     def arguments(self, images: Tensor, grid: PolarGrid) -> dict:
         """What the operators sample images with, on a grid that `grid` gave."""
         dtype = torch.float64 if images.dtype == torch.float64 else torch.float32
-        radii, azimuths, center, _ = (t.to(images.device, dtype) for t in grid)
+        radii, azimuths, center, _, affine, offsets = (
+            None if t is None else t.to(images.device, dtype) for t in grid
+        )
         jitter = self.jitter if self.training else 0.0
         # 62 bits, so that the seed is a tensor that compiled training does not specialise on.
         seed = torch.randint(2**62, ()) if jitter else 0
         statistics = dict(mean=self.mean, std=self.std) if images.dtype == torch.uint8 else {}
         return dict(
-            image=images, radii=radii, azimuths=azimuths, center=center, patch=self.samples,
-            jitter=jitter, seed=seed, **statistics,
+            image=images, radii=radii, azimuths=azimuths, center=center, affine=affine,
+            offsets=offsets, patch=self.samples, jitter=jitter, seed=seed, **statistics,
         )  # fmt: skip
 
     def forward(self, images: Tensor, lens: Lens) -> Tensor:
