@@ -93,7 +93,19 @@ def polar_grid(
         azimuths,
         lens.center_in(image_size),
         border_radii,
+        lens.affine,
+        None if lens.is_radial else _offsets(lens, points, sample_spacing, azimuths),
     )
+
+
+def _offsets(lens: Lens, points: Tensor, spacing: Spacing, azimuths: Tensor) -> Tensor:
+    """(N, 2, N_r, N_a) px: how far from the radial curve the lens lets each point land."""
+    theta = _to_theta(lens, points, spacing)[:, :, None].expand(-1, -1, len(azimuths))
+    direction = torch.stack((torch.cos(azimuths), torch.sin(azimuths)), -1)
+    offsets = lens.offset(theta, direction.expand(*theta.shape, 2))
+    if lens.affine is not None:
+        offsets = (lens.affine[:, None, None] @ offsets[..., None])[..., 0]
+    return offsets.permute(0, 3, 1, 2)
 
 
 def check_grid(
