@@ -348,3 +348,11 @@ def test_a_table_of_two_is_straight():
 def test_a_parameter_out_of_range_is_named(make, message):
     with pytest.raises(ValueError, match=message):
         make()
+
+
+def test_rays_are_found_in_inference_mode():
+    for lens in ASIDE.values():
+        expected = lens.unproject_pixels(lens.project_rays(0.5, 0.3))
+        with torch.inference_mode():
+            found = lens.to(f64).unproject_pixels(lens.project_rays(0.5, 0.3))
+        torch.testing.assert_close(found, expected)
