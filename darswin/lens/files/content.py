@@ -15,6 +15,7 @@ from darswin.lens.files.fields import is_number
 Content = Mapping | list[list[str]]
 
 MAX_BYTES = 32 << 20
+MAX_TABLE = 4 << 20
 MAX_MARKUP = 256 << 10  # YAML is parsed at some 100 KB a second
 MAX_DEPTH = 16
 
@@ -52,11 +53,9 @@ def parse(text: str) -> Content:
             return _parse_json(text)
         if start[0] == "<":
             return _parse_xml(start)
-        rows = [line.split() for line in text.splitlines() if not line.lstrip().startswith("#")]
-        rows = [row for row in rows if row]
-        if rows and is_number(rows[0][0]):
-            return rows
-        return _parse_yaml(text)
+        lines = (line.lstrip() for line in text.splitlines())
+        first = next((line for line in lines if line and line[0] != "#"), "-")
+        return _parse_table(text) if is_number(first.split()[0]) else _parse_yaml(text)
     except RecursionError as error:
         raise ValueError("it must not be nested so deeply") from error
 
@@ -68,9 +67,15 @@ def _parse_json(text: str) -> Mapping:
         raise ValueError(f"it is no JSON: {error}") from error
 
 
+def _parse_table(text: str) -> list[list[str]]:
+    _check_size("a table", text, MAX_TABLE)
+    rows = [line.split() for line in text.splitlines() if not line.lstrip().startswith("#")]
+    return [row for row in rows if row]
+
+
 def _parse_yaml(text: str) -> Mapping:
     """YAML whose scalars stay text and whose tags, !!opencv-matrix or worse, mean nothing."""
-    _check_markup("YAML", text)
+    _check_size("YAML", text, MAX_MARKUP)
     # OpenCV begins its files with %YAML:1.0, which is no YAML.
     text = re.sub(r"\A%YAML[^\n]*\n", "", text)
     try:
@@ -85,7 +90,7 @@ def _parse_yaml(text: str) -> Mapping:
 
 
 def _parse_xml(text: str) -> Mapping:
-    _check_markup("XML", text)
+    _check_size("XML", text, MAX_MARKUP)
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
         raise ValueError("an XML file must not have a DOCTYPE or an ENTITY")
     try:
@@ -110,6 +115,6 @@ def _element(element: ElementTree.Element, depth: int) -> Mapping | list | str:
     return dict(children)
 
 
-def _check_markup(notation: str, text: str) -> None:
-    if len(text) > MAX_MARKUP:
-        raise ValueError(f"{notation} must be at most {MAX_MARKUP >> 10} KiB large")
+def _check_size(notation: str, text: str, most: int) -> None:
+    if len(text) > most:
+        raise ValueError(f"{notation} must be at most {most >> 10} KiB large")

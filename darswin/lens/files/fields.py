@@ -11,7 +11,7 @@ _MAX_WORD = 64
 MAX_SIDE = 1_000_000
 
 _short = reprlib.Repr()
-_short.maxstring = _short.maxother = 60
+_short.maxlevel, _short.maxstring, _short.maxother = 2, 60, 60
 
 
 def short(value: Any) -> str:

@@ -20,17 +20,21 @@ COEFFICIENTS = {"radtan": 4, "equidistant": 4, "fov": 1, "none": 0}
 
 
 def _is_camera(entry: object) -> bool:
-    return isinstance(entry, Mapping) and ("camera_model" in entry or "intrinsics" in entry)
+    return isinstance(entry, Mapping) and "camera_model" in entry
+
+
+def _is_alone(content: Mapping) -> bool:
+    return _is_camera(content) and "intrinsics" in content
 
 
 def fits(content: Content) -> bool:
     return isinstance(content, Mapping) and (
-        _is_camera(content) or any(_is_camera(entry) for entry in content.values())
+        _is_alone(content) or any(_is_camera(entry) for entry in content.values())
     )
 
 
 def cameras(file: Fields) -> dict[str, Description]:
-    if _is_camera(file.entries):
+    if _is_alone(file.entries):
         return {"camera": _camera(file)}
     names = [name for name, entry in file.entries.items() if _is_camera(entry)]
     return {name: _camera(file.section(name)) for name in names}

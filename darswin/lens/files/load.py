@@ -3,7 +3,7 @@
 import json
 import math
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 
@@ -11,7 +11,7 @@ import torch
 
 from darswin.files import replace_file
 from darswin.lens.base import Lens
-from darswin.lens.description import from_dict, to_dict
+from darswin.lens.description import MODELS, from_dict, to_dict
 from darswin.lens.files import (
     basalt,
     camodocal,
@@ -48,6 +48,7 @@ class Format:
 
 # The first that fits is taken.
 FORMATS = (
+    Format("darswin", own.fits, own.cameras, 0.0),
     Format("WoodScape", woodscape.fits, woodscape.cameras, 0.5),
     Format("basalt", basalt.fits, basalt.cameras, 0.0),
     Format("nerfstudio", nerfstudio.fits, nerfstudio.cameras, 0.5),
@@ -57,7 +58,6 @@ FORMATS = (
     Format("OpenCV", opencv.fits, opencv.cameras, 0.0, takes_model=True),
     Format("OCamCalib", ocamcalib.fits, ocamcalib.cameras, 0.0),
     Format("COLMAP", colmap.fits, colmap.cameras, 0.5),
-    Format("darswin", own.fits, own.cameras, 0.0),
 )
 
 
@@ -158,10 +158,11 @@ def _cameras(text: str, what: str, model: str | None) -> tuple[dict[str, Descrip
         content = parse(text)
         file_format = next((f for f in FORMATS if f.fits(content)), None)
         if file_format is None:
-            names = ", ".join(f.name for f in FORMATS[:-1])
+            known = ", ".join(f.name for f in FORMATS)
+            said = content.get("model") if isinstance(content, Mapping) else None
             raise ValueError(
-                f"it is none of the formats that are known ({names}); and of our own JSON the "
-                '"model" must be one of the models of darswin.lens.MODELS'
+                f'it must be of one of the formats {known}; darswin\'s own "model" must be one of '
+                f"{', '.join(MODELS)}, got {short(said)}"
             )
     what = f"{file_format.name} {what}"
     with _about(what):
@@ -211,28 +212,28 @@ def _lens(description: Description, theta_max, image_size, dtype) -> Lens:
         if name != "theta_max"
     }
     lens = from_dict(values, description.get("image_size"))
-    limit = lens.theta_max.item()
+    limit = lens.theta_max
     if theta_max is not None:
-        rounded = limit < theta_max <= limit + ROUNDING
-        lens = lens.with_theta_max(limit if rounded else theta_max)
+        wanted = torch.tensor([theta_max], dtype=dtype)
+        rounded = (limit < wanted) & (wanted <= limit + ROUNDING)
+        lens = lens.with_theta_max(torch.where(rounded, limit, wanted))
     elif "image_size" in description and "fov" not in description:
-        lens = lens.with_theta_max(lens.side_angles().amax().clamp(max=limit))
-    _check(lens)
+        lens = lens.with_theta_max(torch.minimum(lens.side_angles().amax(1), limit))
+    _check(lens, math.inf if theta_max is not None else MAX_RADIUS)
     return lens
 
 
-def _check(lens: Lens) -> None:
-    """That rays land at finite places, not too far out."""
+def _check(lens: Lens, most: float) -> None:
+    """That rays land at finite places, and within `most` px of the center."""
     theta = lens.theta_max[0] * torch.linspace(0, 1, 33, dtype=lens.theta_max.dtype)
     azimuth = torch.linspace(0, 2 * math.pi, 5, dtype=theta.dtype)[:4]
     pixels = lens.project_rays(theta[:, None].expand(33, 4), azimuth.expand(33, 4), (1, 1))
     reach = pixels.abs().amax().item()
-    if not reach <= MAX_RADIUS:
-        theta_max = lens.theta_max.item()
+    if not (reach <= most and math.isfinite(reach)):
         raise ValueError(
-            f"up to theta_max = {theta_max:.4f} rad rays must land within {MAX_RADIUS:g} px of the "
-            f"center, got {reach:.3g} px: give a smaller theta_max, or the image_size if the file "
-            "has none"
+            f"up to theta_max = {lens.theta_max.item():.4f} rad rays must land at most "
+            f"{MAX_RADIUS:g} px away, got {reach:.3g} px: give a smaller theta_max, or the "
+            "image_size if the file has none"
         )
 
 

@@ -13,13 +13,12 @@ MAX_NUMBERS = 65536  # of a table
 
 
 def fits(content: Content) -> bool:
-    return isinstance(content, Mapping) and "model" in content
+    model = content.get("model") if isinstance(content, Mapping) else None
+    return isinstance(model, str) and model in MODELS
 
 
 def cameras(file: Fields) -> dict[str, Description]:
-    name = file.get("model", f"one of {', '.join(MODELS)}")
-    if not isinstance(name, str) or name not in MODELS:
-        raise ValueError(f'its "model" must be one of {", ".join(MODELS)}, got {short(name)}')
+    name = file.text("model")
     model = MODELS[name]
     required, optional = list(model.parameters), [*model.optional, "theta_max", *FRAME]
     if "fov" in file and hasattr(model, "from_fov"):
