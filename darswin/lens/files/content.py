@@ -14,7 +14,7 @@ from darswin.lens.files.fields import is_number
 # A mapping from YAML, JSON or XML; or rows of words, from a plain table.
 Content = Mapping | list[list[str]]
 
-MAX_BYTES = 32 << 20
+MAX_BYTES = 16 << 20
 MAX_TABLE = 4 << 20
 MAX_MARKUP = 256 << 10  # YAML is parsed at some 100 KB a second
 MAX_DEPTH = 16

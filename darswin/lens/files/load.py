@@ -91,10 +91,10 @@ def load(
             chosen, a theta_max beyond the lens's limit; it names the file. OSError: the file cannot
             be read.
     """
-    options = (camera, theta_max, image_size, model, dtype)
-    with _about(f"calibration {os.fspath(path)}"):
-        text = read_text(path)
-    return _load(text, f"calibration {os.fspath(path)}", *options)
+    return loads(
+        _read(path), camera=camera, theta_max=theta_max, image_size=image_size, model=model,
+        dtype=dtype, name=os.fspath(path),
+    )  # fmt: skip
 
 
 def loads(
@@ -105,9 +105,14 @@ def loads(
     image_size: tuple[int, int] | None = None,
     model: str | None = None,
     dtype: torch.dtype | None = None,
+    name: str = "in a string",
 ) -> Lens:
-    """`load` for a file's text."""
-    return _load(text, "calibration", camera, theta_max, image_size, model, dtype)
+    """`load` for a file's text; `name` is what errors call it."""
+    cameras, what = _cameras(text, name, model)
+    with _about(what):
+        chosen = _choose(cameras, camera)
+    with _about(what, chosen if len(cameras) > 1 else None):
+        return _lens(cameras[chosen], theta_max, image_size, dtype)
 
 
 def load_all(
@@ -119,20 +124,13 @@ def load_all(
     dtype: torch.dtype | None = None,
 ) -> dict[str, Lens]:
     """All cameras of a calibration file by their names. Arguments and errors: as `load`."""
-    with _about(f"calibration {os.fspath(path)}"):
-        text = read_text(path)
-    cameras, what = _cameras(text, f"calibration {os.fspath(path)}", model)
-    made: list[tuple[Description, Lens]] = []
-    lenses = {}
+    cameras, what = _cameras(_read(path), os.fspath(path), model)
+    lenses: dict[str, Lens] = {}  # by description: frames often repeat one camera
     for name, description in cameras.items():
-        # Frames often repeat one camera.
-        lens = made[-1][1] if made and made[-1][0] == description else None
-        if lens is None:
+        if (key := repr(description)) not in lenses:
             with _about(what, name if len(cameras) > 1 else None):
-                lens = _lens(description, theta_max, image_size, dtype)
-            made.append((description, lens))
-        lenses[name] = lens
-    return lenses
+                lenses[key] = _lens(description, theta_max, image_size, dtype)
+    return {name: lenses[repr(description)] for name, description in cameras.items()}
 
 
 def save(lens: Lens, path: str | os.PathLike) -> None:
@@ -144,17 +142,14 @@ def save(lens: Lens, path: str | os.PathLike) -> None:
     replace_file(path, json.dumps(to_dict(lens), indent=2) + "\n")
 
 
-def _load(text, what, camera, theta_max, image_size, model, dtype) -> Lens:
-    cameras, what = _cameras(text, what, model)
-    with _about(what):
-        name = _choose(cameras, camera)
-    with _about(what, name if len(cameras) > 1 else None):
-        return _lens(cameras[name], theta_max, image_size, dtype)
+def _read(path: str | os.PathLike) -> str:
+    with _about(f"calibration {os.fspath(path)}"):
+        return read_text(path)
 
 
-def _cameras(text: str, what: str, model: str | None) -> tuple[dict[str, Description], str]:
+def _cameras(text: str, name: str, model: str | None) -> tuple[dict[str, Description], str]:
     """The descriptions in a file, in our pixel origin; and how errors name the file."""
-    with _about(what):
+    with _about(f"calibration {name}"):
         content = parse(text)
         file_format = next((f for f in FORMATS if f.fits(content)), None)
         if file_format is None:
@@ -164,7 +159,7 @@ def _cameras(text: str, what: str, model: str | None) -> tuple[dict[str, Descrip
                 f'it must be of one of the formats {known}; darswin\'s own "model" must be one of '
                 f"{', '.join(MODELS)}, got {short(said)}"
             )
-    what = f"{file_format.name} {what}"
+    what = f"{file_format.name} calibration {name}"
     with _about(what):
         fields = content if isinstance(content, list) else Fields(content)
         if model is None:
@@ -198,7 +193,12 @@ def _choose(cameras: dict[str, Description], camera: str | int | None) -> str:
     return camera
 
 
-def _lens(description: Description, theta_max, image_size, dtype) -> Lens:
+def _lens(
+    description: Description,
+    theta_max: float | None,
+    image_size: tuple[int, int] | None,
+    dtype: torch.dtype | None,
+) -> Lens:
     """The lens of a description, used as far as `load` says."""
     dtype = dtype or torch.get_default_dtype()
     description = dict(description)
