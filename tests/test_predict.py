@@ -8,7 +8,7 @@ import torch
 from darswin.__main__ import main
 from darswin.lens import Spherical, from_dict
 from darswin.models.saving import ModelCard, save_model
-from darswin.predict import predict
+from darswin.predict import lens_of, predict
 
 LENS = {"model": "Spherical", "xi": 0.5, "fov": 2.8}
 
@@ -59,6 +59,39 @@ def test_what_is_missing_is_said(run):
         main(["predict", "none.png", "--lens", json.dumps(LENS)])
     with pytest.raises(SystemExit, match='"model" must be one of'):
         main(["predict", str(run / "p.png"), "--run", str(run), "--lens", "{}"])
+
+
+def test_calibration_files(run):
+    """Of another tool, whose pictures are larger; of several cameras; of another shape."""
+    calibration = {"value0": {"intrinsics": [
+        {"camera_type": "ucm", "intrinsics": dict(fx=fx, fy=fx, cx=95.5, cy=63.5, alpha=0.5)}
+        for fx in (80.0, 120.0)
+    ], "resolution": [[192, 128]] * 2}}  # fmt: skip
+    path = run / "calibration.json"
+    path.write_text(json.dumps(calibration))
+    argv = ["predict", str(run / "p.png"), "--run", str(run), "--out", str(run / "o.json")]
+    with pytest.raises(SystemExit, match="choose one as camera=: 'cam0', 'cam1'"):
+        main([*argv, "--lens", str(path)])
+    main([*argv, "--lens", str(path), "--camera", "cam1"])
+    found = json.loads((run / "o.json").read_text())
+    # The same lens in pixels of the picture, half as large: its center stays between two pixels.
+    lens = lens_of(str(path), (64, 96), "cam1")
+    assert lens.focal.item() == pytest.approx(60) and lens.center.tolist() == [[47.5, 31.5]]
+    assert lens.image_size.tolist() == [[64, 96]]
+    same = dict(
+        model="EnhancedUnified", alpha=0.5, beta=1, focal=60, theta_max=lens.theta_max.item()
+    )
+    main([*argv, "--lens", json.dumps(same)])
+    for a, b in zip(
+        found[0]["top"], json.loads((run / "o.json").read_text())[0]["top"], strict=True
+    ):
+        assert a["probability"] == pytest.approx(b["probability"], abs=1e-5)
+    calibration["value0"]["resolution"] = [[192, 192]] * 2
+    path.write_text(json.dumps(calibration))
+    with pytest.raises(SystemExit, match="pictures of 192×192 px, and 64×96 is not of that shape"):
+        main([*argv, "--lens", str(path), "--camera", "cam1"])
+    with pytest.raises(SystemExit, match="focal is missing"):
+        main([*argv, "--lens", '{"model": "Spherical", "xi": 0.5}'])
 
 
 def test_lenses_from_json():

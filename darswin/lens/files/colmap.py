@@ -1,0 +1,81 @@
+"""COLMAP's cameras.txt: a line a camera, of any model but the spherical ones."""
+
+from darswin.lens.base import Lens
+from darswin.lens.distorted import BrownConrady, Fisheye624, KannalaBrandt
+from darswin.lens.files.cameras import Description, describe
+from darswin.lens.files.content import Content
+from darswin.lens.files.fields import Fields, is_number, short
+from darswin.lens.ideal import FieldOfView, Perspective
+from darswin.lens.sphere import EnhancedUnified
+
+# The class of each model and the order of its parameters. COLMAP, src/colmap/sensor/models/.
+MODELS: dict[str, tuple[type[Lens], str]] = {
+    "SIMPLE_PINHOLE": (BrownConrady, "f cx cy"),
+    "PINHOLE": (BrownConrady, "fx fy cx cy"),
+    "SIMPLE_RADIAL": (BrownConrady, "f cx cy k1"),
+    "RADIAL": (BrownConrady, "f cx cy k1 k2"),
+    "OPENCV": (BrownConrady, "fx fy cx cy k1 k2 p1 p2"),
+    "FULL_OPENCV": (BrownConrady, "fx fy cx cy k1 k2 p1 p2 k3 d1 d2 d3"),
+    "SIMPLE_FISHEYE": (KannalaBrandt, "f cx cy"),
+    "FISHEYE": (KannalaBrandt, "fx fy cx cy"),
+    "SIMPLE_RADIAL_FISHEYE": (KannalaBrandt, "f cx cy k1"),
+    "RADIAL_FISHEYE": (KannalaBrandt, "f cx cy k1 k2"),
+    "OPENCV_FISHEYE": (KannalaBrandt, "fx fy cx cy k1 k2 k3 k4"),
+    "THIN_PRISM_FISHEYE": (KannalaBrandt, "fx fy cx cy k1 k2 p1 p2 k3 k4 s1 s3"),
+    "RAD_TAN_THIN_PRISM_FISHEYE": (
+        Fisheye624, "fx fy cx cy k1 k2 k3 k4 k5 k6 p2 p1 s1 s2 s3 s4"),
+    "FOV": (FieldOfView, "fx fy cx cy omega"),
+    "EUCM": (EnhancedUnified, "fx fy cx cy alpha beta"),
+    "SIMPLE_DIVISION": (EnhancedUnified, "f cx cy division"),
+    "DIVISION": (EnhancedUnified, "fx fy cx cy division"),
+}  # fmt: skip
+
+
+def fits(content: Content) -> bool:
+    return isinstance(content, list) and len(content[0]) > 1 and not is_number(content[0][1])
+
+
+def cameras(rows: list[list[str]]) -> dict[str, Description]:
+    return {row[0]: _camera(row) for row in rows}
+
+
+def _camera(row: list[str]) -> Description:
+    where = f"camera {short(row[0])}, "
+    if len(row) < 4:
+        raise ValueError(f"{where}must be an id, a model, a width, a height and parameters")
+    name = row[1]
+    if name not in MODELS:
+        raise ValueError(f"{where}model must be one of {', '.join(MODELS)}, got {short(name)}")
+    model, order = MODELS[name]
+    names = order.split()
+    if len(row) != 4 + len(names):
+        raise ValueError(f"{where}{name} must have {len(names)} parameters, got {len(row) - 4}")
+    values = Fields(dict(zip(["width", "height", *names], row[2:], strict=True)), where)
+    focal = tuple(values.positive(n) for n in (("f", "f") if "f" in values else ("fx", "fy")))
+    center = (values.number("cx"), values.number("cy"))
+    size = (values.side("height"), values.side("width"))
+    if "division" in values:
+        model, parameters = _division(values)
+    elif model in (FieldOfView, EnhancedUnified):
+        parameters = {n: values.number(n) for n in names[4:]}
+    else:
+        parameters = _terms(values, names)
+    return describe(model, focal, center, size, **parameters)
+
+
+def _terms(values: Fields, names: list[str]) -> dict[str, list[float]]:
+    terms = {"radial": "k1 k2 k3 k4 k5 k6", "denominator": "d1 d2 d3", "tangential": "p1 p2",
+             "prism": "s1 s2 s3 s4"}  # fmt: skip
+    # THIN_PRISM_FISHEYE has s₁ and s₃ only: sx1 and sy1.
+    present = {term: [n for n in order.split() if n in names] for term, order in terms.items()}
+    if present["prism"]:
+        present["prism"] = terms["prism"].split()
+    return {t: [values.number(n, 0.0) for n in order] for t, order in present.items() if order}
+
+
+def _division(values: Fields) -> tuple[type[Lens], dict[str, float]]:
+    """The division model, r / (1 + k r²) = tan θ, is an EUCM of α = 1/2 and β = -4 k."""
+    k = values.number("division")
+    if k > 0:
+        raise ValueError(f"{values.path('k')} must be at most 0, got {k:g}")
+    return (EnhancedUnified, {"alpha": 0.5, "beta": -4 * k}) if k < 0 else (Perspective, {})

@@ -1,0 +1,120 @@
+"""What a text file says, in any notation: nothing in it is ever run, and no size makes it hang."""
+
+import json
+import os
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from xml.etree import ElementTree
+
+import yaml
+
+from darswin.lens.files.fields import is_number
+
+# A mapping from YAML, JSON or XML; or rows of words, from a plain table.
+Content = Mapping | list[list[str]]
+
+MAX_BYTES = 16 << 20
+MAX_TABLE = 4 << 20
+MAX_MARKUP = 256 << 10  # YAML is parsed at some 100 KB a second
+MAX_DEPTH = 16
+
+
+def read_text(path: str | os.PathLike) -> str:
+    """A file as text.
+
+    Raises:
+        ValueError: what is no file, too large, or no UTF-8. OSError: it cannot be read.
+    """
+    path = Path(path)
+    if path.exists() and not path.is_file():
+        raise ValueError("it must be a file")
+    with path.open("rb") as file:
+        data = file.read(MAX_BYTES + 1)
+    if len(data) > MAX_BYTES:
+        raise ValueError(f"it must be at most {MAX_BYTES >> 20} MiB large")
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise ValueError(f"it must be text in UTF-8: {error}") from error
+
+
+def parse(text: str) -> Content:
+    """Tells the notation from the text's beginning.
+
+    Raises:
+        ValueError: text that breaks its notation's rules, or is neither mapping nor table.
+    """
+    start = text.lstrip()
+    if not start:
+        raise ValueError("it must not be empty")
+    try:
+        if start[0] == "{":
+            return _parse_json(text)
+        if start[0] == "<":
+            return _parse_xml(start)
+        lines = (line.lstrip() for line in text.splitlines())
+        first = next((line for line in lines if line and line[0] != "#"), "-")
+        return _parse_table(text) if is_number(first.split()[0]) else _parse_yaml(text)
+    except RecursionError as error:
+        raise ValueError("it must not be nested so deeply") from error
+
+
+def _parse_json(text: str) -> Mapping:
+    try:
+        return json.loads(text)
+    except ValueError as error:
+        raise ValueError(f"it is no JSON: {error}") from error
+
+
+def _parse_table(text: str) -> list[list[str]]:
+    _check_size("a table", text, MAX_TABLE)
+    rows = [line.split() for line in text.splitlines() if not line.lstrip().startswith("#")]
+    return [row for row in rows if row]
+
+
+def _parse_yaml(text: str) -> Mapping:
+    """YAML whose scalars stay text and whose tags, !!opencv-matrix or worse, mean nothing."""
+    _check_size("YAML", text, MAX_MARKUP)
+    # OpenCV begins its files with %YAML:1.0, which is no YAML.
+    text = re.sub(r"\A%YAML[^\n]*\n", "", text)
+    try:
+        content = yaml.load(text, yaml.BaseLoader)
+    except (yaml.YAMLError, ValueError, OverflowError) as error:
+        mark = getattr(error, "problem_mark", None)
+        where = "" if mark is None else f"line {mark.line + 1}: "
+        raise ValueError(f"it is no YAML: {where}{getattr(error, 'problem', error)}") from error
+    if not isinstance(content, Mapping):
+        raise ValueError("it must be a mapping (YAML, JSON or XML) or a table of numbers")
+    return content
+
+
+def _parse_xml(text: str) -> Mapping:
+    _check_size("XML", text, MAX_MARKUP)
+    if "<!DOCTYPE" in text or "<!ENTITY" in text:
+        raise ValueError("an XML file must not have a DOCTYPE or an ENTITY")
+    try:
+        root = ElementTree.fromstring(text)
+    except ElementTree.ParseError as error:
+        raise ValueError(f"it is no XML: {error}") from error
+    content = _element(root, MAX_DEPTH)
+    if not isinstance(content, Mapping):
+        raise ValueError("an XML file must have elements in its root")
+    return content
+
+
+def _element(element: ElementTree.Element, depth: int) -> Mapping | list | str:
+    """As OpenCV writes them: a sequence's elements are named _, all others have names."""
+    if depth == 0:
+        raise ValueError(f"XML must be at most {MAX_DEPTH} elements deep")
+    children = [(child.tag, _element(child, depth - 1)) for child in element]
+    if not children:
+        return (element.text or "").strip().strip('"')
+    if all(tag == "_" for tag, _ in children):
+        return [value for _, value in children]
+    return dict(children)
+
+
+def _check_size(notation: str, text: str, most: int) -> None:
+    if len(text) > most:
+        raise ValueError(f"{notation} must be at most {most >> 10} KiB large")

@@ -1,0 +1,75 @@
+"""Kalibr's camchain YAML: pinhole, omni, ds and eucm with radtan, equidistant, fov or none."""
+
+from collections.abc import Mapping
+
+from darswin.lens.distorted import BrownConrady, KannalaBrandt, Mei
+from darswin.lens.files.cameras import Description, describe
+from darswin.lens.files.content import Content
+from darswin.lens.files.fields import Fields
+from darswin.lens.ideal import FieldOfView
+from darswin.lens.sphere import DoubleSphere, EnhancedUnified
+
+# Each model's intrinsics before fu, fv, pu, pv, and the distortions that Kalibr has for it.
+MODELS = {
+    "pinhole": ((), ("radtan", "equidistant", "fov", "none")),
+    "omni": (("xi",), ("radtan", "none")),
+    "ds": (("xi", "alpha"), ("none",)),
+    "eucm": (("alpha", "beta"), ("none",)),
+}
+COEFFICIENTS = {"radtan": 4, "equidistant": 4, "fov": 1, "none": 0}
+
+
+def _is_camera(entry: object) -> bool:
+    return isinstance(entry, Mapping) and "camera_model" in entry
+
+
+def _is_alone(content: Mapping) -> bool:
+    return _is_camera(content) and "intrinsics" in content
+
+
+def fits(content: Content) -> bool:
+    return isinstance(content, Mapping) and (
+        _is_alone(content) or any(_is_camera(entry) for entry in content.values())
+    )
+
+
+def cameras(file: Fields) -> dict[str, Description]:
+    if _is_alone(file.entries):
+        return {"camera": _camera(file)}
+    names = [name for name, entry in file.entries.items() if _is_camera(entry)]
+    return {name: _camera(file.section(name)) for name in names}
+
+
+def _camera(fields: Fields) -> Description:
+    model = _one_of(fields, "camera_model", tuple(MODELS))
+    names, distortions = MODELS[model]
+    distortion = _one_of(fields, "distortion_model", distortions)
+    *own, fu, fv, pu, pv = fields.numbers("intrinsics", (len(names) + 4,))
+    for index, focal in ((-4, fu), (-3, fv)):
+        if not focal > 0:
+            where = fields.path(f"intrinsics[{len(names) + 4 + index}]")
+            raise ValueError(f"{where} must be a focal length above 0, got {focal:g}")
+    count = COEFFICIENTS[distortion]
+    coefficients = fields.numbers("distortion_coeffs", (count,)) if count else []
+    size = None
+    if "resolution" in fields:
+        width, height = fields.sides("resolution")
+        size = (height, width)
+    parameters = dict(zip(names, own, strict=True))
+    if distortion == "radtan":
+        parameters |= {"radial": coefficients[:2], "tangential": coefficients[2:]}
+    elif distortion == "equidistant":
+        parameters |= {"radial": coefficients}
+    elif distortion == "fov" and coefficients[0] != 0:
+        return describe(FieldOfView, (fu, fv), (pu, pv), size, omega=coefficients[0])
+    pinhole = KannalaBrandt if distortion == "equidistant" else BrownConrady
+    classes = {"pinhole": pinhole, "omni": Mei, "ds": DoubleSphere, "eucm": EnhancedUnified}
+    return describe(classes[model], (fu, fv), (pu, pv), size, **parameters)
+
+
+def _one_of(fields: Fields, name: str, allowed: tuple[str, ...]) -> str:
+    expected = f"one of {', '.join(allowed)}"
+    value = fields.text(name, expected)
+    if value not in allowed:
+        raise ValueError(f"{fields.path(name)} must be {expected}, got {value!r}")
+    return value

@@ -1,0 +1,166 @@
+"""Camera matrices and their coefficients: OpenCV's FileStorage and ROS's camera_info.
+
+YAML, XML and JSON; of one camera, or of several whose keys end with 1 and 2, or left and right.
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+from darswin.lens.distorted import BrownConrady, KannalaBrandt, Mei
+from darswin.lens.files.cameras import Description, describe
+from darswin.lens.files.content import Content
+from darswin.lens.files.fields import Fields, short
+
+# Names as `_plain` leaves them.
+MATRIX = ("k", "cameramatrix", "intrinsicmatrix", "mtx", "m")
+COEFFICIENTS = (
+    "d", "distortioncoefficients", "distcoeffs", "distcoefs", "distortioncoeffs", "dist",
+)  # fmt: skip
+SIZE = ("imagesize", "imgsize", "size", "dim", "resolution")
+WIDTH, HEIGHT = ("imagewidth", "width", "w"), ("imageheight", "height", "h")
+SAYS_FISHEYE = ("fisheyemodel", "fisheye", "isfisheye")
+SAYS_MODEL = ("distortionmodel", "model", "cameramodel", "modeltype", "calibrationmodel")
+SUFFIXES = ("1", "2", "left", "right")
+
+MODELS = ("fisheye", "pinhole", "omnidir")
+WORDS = {
+    "fisheye": ("fisheye", "equidistant", "equi", "kannalabrandt", "kannalabrandt4", "kb", "kb4",
+                "opencvfisheye"),
+    "pinhole": ("pinhole", "plumbbob", "rationalpolynomial", "radtan", "perspective",
+                "brownconrady", "thinprism"),
+    "omnidir": ("omnidir", "omni", "mei", "omnidirectional"),
+}  # fmt: skip
+# How many coefficients there may be.
+COUNTS = {"fisheye": (4,), "pinhole": (4, 5, 8, 12, 14), "omnidir": (4,)}
+
+
+def _plain(name: str) -> str:
+    return name.lower().replace("_", "").replace("-", "").replace(" ", "")
+
+
+def fits(content: Content) -> bool:
+    if not isinstance(content, Mapping):
+        return False
+    names = {_plain(name) for name in content}
+    return any(m + suffix in names for m in MATRIX for suffix in ("", *SUFFIXES))
+
+
+def fits_ros(content: Content) -> bool:
+    return fits(content) and "distortion_model" in content
+
+
+def cameras(file: Fields, hint: str | None = None) -> dict[str, Description]:
+    """Args: hint: one of `MODELS`, which rules where the file does not say it or is wrong."""
+    reader = _Reader(file, hint)
+    if reader.find(MATRIX) is not None:
+        return {"camera": reader.camera("")}
+    suffixes = [suffix for suffix in SUFFIXES if reader.find(MATRIX, suffix) is not None]
+    return {suffix: reader.camera(suffix) for suffix in suffixes}
+
+
+class _Reader:
+    def __init__(self, file: Fields, hint: str | None):
+        self.file, self.hint = file, hint
+        self.names = {_plain(name): name for name in reversed(file.entries)}
+
+    def find(self, names: tuple[str, ...], suffix: str = "") -> str | None:
+        """The file's name of an entry that goes by several."""
+        return next((self.names[n + suffix] for n in names if n + suffix in self.names), None)
+
+    def camera(self, suffix: str) -> Description:
+        matrix = self.find(MATRIX, suffix)
+        fx, skew, cx, zero, fy, cy, *last = self.matrix(matrix, (9,))
+        if not (fx > 0 and fy > 0 and zero == 0 and last == [0, 0, 1]):
+            raise ValueError(
+                f"{matrix} must be [fx, skew, cx, 0, fy, cy, 0, 0, 1] with fx and fy above 0, got "
+                f"{[fx, skew, cx, zero, fy, cy, *last]}"
+            )
+        name = self.find(COEFFICIENTS, suffix)
+        coefficients = [] if name is None else self.matrix(name, (0, 4, 5, 8, 12, 14))
+        xi = self.find(("xi",), suffix)
+        kind = self.kind(name, coefficients, xi)
+        if coefficients and len(coefficients) not in COUNTS[kind]:
+            raise ValueError(
+                f"{name} must have {' or '.join(map(str, COUNTS[kind]))} coefficients for the "
+                f"{kind} model, got {len(coefficients)}"
+            )
+        plane = ((fx, fy), (cx, cy), self.image_size(suffix))
+        if kind == "fisheye":
+            return describe(KannalaBrandt, *plane, skew=skew, radial=coefficients)
+        terms = {"radial": coefficients[:2] + coefficients[4:5], "tangential": coefficients[2:4]}
+        if kind == "omnidir":
+            if xi is None:
+                raise ValueError("xi is missing, it must be a finite number")
+            (value,) = self.matrix(xi, (1,))
+            return describe(Mei, *plane, skew=skew, xi=value, **terms)
+        if any(coefficients[12:]):
+            raise ValueError(
+                f"{name} must end with a tilt of 0, 0: a tilted sensor is not supported, got "
+                f"{coefficients[12:]}"
+            )
+        terms |= {"denominator": coefficients[5:8], "prism": coefficients[8:12]}
+        return describe(BrownConrady, *plane, skew=skew, **terms)
+
+    def kind(self, name: str | None, coefficients: list[float], xi: str | None) -> str:
+        """Which of `MODELS`: the hint, what the file says, or what only one of them has."""
+        if self.hint is not None:
+            return self.hint
+        flag = self.find(SAYS_FISHEYE)
+        if flag is not None:
+            value = self.file.entries[flag]
+            word = _plain(str(value)) if isinstance(value, (str, int)) else ""
+            if word not in ("0", "1", "true", "false"):
+                raise ValueError(f"{flag} must be 0 or 1, got {short(value)}")
+            return "fisheye" if word in ("1", "true") else "pinhole"
+        said = self.find(SAYS_MODEL)
+        if said is not None:
+            word = _plain(self.file.text(said))
+            found = next((kind for kind, words in WORDS.items() if word in words), None)
+            if found is None:
+                known = sorted(word for words in WORDS.values() for word in words)
+                raise ValueError(
+                    f"{said} must be one of {', '.join(known)}, got "
+                    f"{short(self.file.entries[said])}; or give model=, one of {', '.join(MODELS)}"
+                )
+            return found
+        if xi is not None:
+            return "omnidir"
+        if len(coefficients) > 4:
+            return "pinhole"
+        what = f"the 4 coefficients of {name}" if coefficients else "a camera without coefficients"
+        raise ValueError(
+            f"{what} may be cv2.fisheye's (k1 to k4) or a pinhole's (k1, k2, p1, p2), and "
+            'the file does not say which: give model="fisheye" or model="pinhole", or write '
+            "fisheye_model: 1 or 0 into it"
+        )
+
+    def matrix(self, name: str, counts: tuple[int, ...]) -> list[float]:
+        """The numbers of a matrix: a mapping with `data`, a list, a list of rows, or a number."""
+        value, where = self.file.entries[name], name
+        if isinstance(value, Mapping):
+            value, where = self.file.section(name).get("data", "numbers"), f"{name}.data"
+        if isinstance(value, (int, float)):
+            value = [value]
+        if isinstance(value, list) and any(isinstance(row, list) for row in value[:3]):
+            value = _flattened(value)
+        return Fields({where: value}).numbers(where, counts)
+
+    def image_size(self, suffix: str) -> tuple[int, int] | None:
+        for end in (suffix, ""):
+            pair = self.find(SIZE, end)
+            if pair is not None:
+                width, height = self.file.sides(pair)
+                return height, width
+            width, height = self.find(WIDTH, end), self.find(HEIGHT, end)
+            if width is not None or height is not None:
+                return (self.file.side(height or "image_height"),
+                        self.file.side(width or "image_width"))  # fmt: skip
+        return None
+
+
+def _flattened(rows: list[Any]) -> list[Any]:
+    """A short list of short rows as one list."""
+    flat = []
+    for row in rows[:32]:
+        flat += row[:32] if isinstance(row, list) else [row]
+    return flat

@@ -1,0 +1,43 @@
+"""WoodScape's and SynWoodScape's JSON: `intrinsic`, a polynomial of the angle."""
+
+from collections.abc import Mapping
+
+from darswin.lens.files.cameras import Description, in_image
+from darswin.lens.files.content import Content
+from darswin.lens.files.fields import Fields
+from darswin.lens.polynomial import Polynomial
+
+# The least k₁, px per rad, of an image of a few dozen pixels.
+LEAST_K1 = 10.0
+MAX_ORDER = 16
+
+
+def fits(content: Content) -> bool:
+    return isinstance(content, Mapping) and "intrinsic" in content
+
+
+def cameras(file: Fields) -> dict[str, Description]:
+    intrinsic = file.section("intrinsic")
+    model = intrinsic.text("model", '"radial_poly"')
+    if model != "radial_poly":
+        raise ValueError(f'intrinsic.model must be "radial_poly", got {model!r}')
+    order = intrinsic.number("poly_order", 4.0)
+    if order not in range(1, MAX_ORDER + 1):
+        raise ValueError(f"intrinsic.poly_order must be 1 to {MAX_ORDER}, got {order:g}")
+    coefficients = [intrinsic.number(f"k{i}") for i in range(1, int(order) + 1)]
+    if coefficients[0] < LEAST_K1:
+        raise ValueError(
+            f"intrinsic.k1 must be in pixels per radian, at least {LEAST_K1:g}, got "
+            f"{coefficients[0]:g}: if these are Kannala–Brandt coefficients (OpenCV's fisheye), "
+            "they are not radial_poly's; give them with their camera matrix, as an OpenCV file "
+            "or a KannalaBrandt lens"
+        )
+    width, height = intrinsic.side("width"), intrinsic.side("height")
+    center = (
+        width / 2 + intrinsic.number("cx_offset"),
+        height / 2 + intrinsic.number("cy_offset"),
+    )
+    aspect = intrinsic.positive("aspect_ratio") if "aspect_ratio" in intrinsic else 1.0
+    affine = None if aspect == 1 else [[1.0, 0.0], [0.0, aspect]]
+    name = file.text("name") if "name" in file else "camera"
+    return {name: in_image(Polynomial, center, affine, (height, width), coefficients=coefficients)}
