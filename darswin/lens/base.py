@@ -320,7 +320,9 @@ class Lens:
         """The same lens used up to another angle (rad); None means `theta_limit`."""
         lens = self._map(lambda tensor: tensor)
         if theta_max is not None:
-            theta_max = torch.as_tensor(theta_max).to(self.theta_max).expand(len(self))
+            like = self.theta_max
+            theta_max = torch.as_tensor(theta_max, dtype=like.dtype, device=like.device)
+            theta_max = theta_max.expand(len(self))
         lens.theta_max = theta_max
         lens._set_theta_max()
         return lens
