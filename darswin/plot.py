@@ -14,6 +14,7 @@ import torch
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
 from torch import Tensor
 
 from darswin.files import replace_file
@@ -74,13 +75,14 @@ def draw_grid(
 def draw_samples(
     image: np.ndarray, lens: Lens, sampler: PolarSample, *, axes: Axes | None = None
 ) -> Figure:
-    """`draw_grid` enlarged five times, from the principal point to the right and upwards."""
+    """`draw_grid` of a tenth of the image, enlarged: half way out, to the right and upwards."""
     axes = axes or _new_axes()
     draw_grid(image, lens, sampler, axes=axes)
-    axes.lines[-1].set(markersize=1.5, alpha=1)
-    height, width = image.shape[:2]
-    cx, cy = lens.detach().center_in((height, width))[0].tolist()
-    axes.set(xlim=(cx, cx + width / 5), ylim=(cy, cy - height / 5))
+    axes.lines[-1].set(markersize=2, alpha=1)
+    for borders in axes.collections:
+        borders.set_linewidth(1.2)
+    left, top, width, height = _enlarged(image, lens)
+    axes.set(xlim=(left, left + width), ylim=(top + height, top))
     return axes.figure
 
 
@@ -131,15 +133,15 @@ def draw_curve(
     theta = torch.linspace(0, lens.theta_max.item(), 257, dtype=torch.float64)
     degrees, radius = torch.rad2deg(theta), lens.project(theta)
     axes.plot(degrees, radius, "k-", label="r")
-    axes.set(xlabel="incident angle θ (°)", ylabel="r (px)", xlim=(0, degrees[-1]))
+    axes.set(xlabel="incident angle θ (°)", ylabel="r (px)", xlim=(0, degrees[-1].item()))
     density = axes.twinx()
     along, around = pixels_per_degree(lens, theta)
     density.plot(degrees, along, "C0-", label="px/° along r")
     density.plot(degrees, around, "C1-", label="px/° around")
     density.set(ylabel="pixels per degree")
     # Room for the legend above the curves.
-    axes.set_ylim(0, 1.15 * radius.max())
-    density.set_ylim(0, 1.15 * torch.cat((along, around)).max())
+    axes.set_ylim(0, 1.15 * radius.max().item())
+    density.set_ylim(0, 1.15 * torch.cat((along, around)).max().item())
     if image_size is not None:
         ends = torch.rad2deg(lens.side_angles(image_size)[0])
         sides = (("left, right", ends[::2], 0.02), ("top, bottom", ends[1::2], 0.3))
@@ -168,6 +170,9 @@ def draw_lens(
     panels = figure.subplot_mosaic([["partition", "samples", "view"], ["polar", "polar", "curve"]])
     draw_grid(image, lens, sampler, samples=False, axes=panels["partition"])
     draw_samples(image, lens, sampler, axes=panels["samples"])
+    left, top, width, height = _enlarged(image, lens)
+    frame = Rectangle((left, top), width, height, fill=False, color="red")
+    panels["partition"].add_patch(frame)
     draw_view(image, lens, view, axes=panels["view"])
     draw_polar(image, lens, sampler, axes=panels["polar"])
     draw_curve(lens, image.shape[:2], axes=panels["curve"])
@@ -222,3 +227,14 @@ def _one(lens: Lens) -> Lens:
 def _grid(lens: Lens, sampler: PolarSample, image: np.ndarray) -> tuple[Lens, PolarGrid]:
     lens = _one(lens)
     return lens, sampler.grid(lens, image.shape[:2])
+
+
+def _enlarged(image: np.ndarray, lens: Lens) -> tuple[float, float, float, float]:
+    """Left, top, width and height of the part that `draw_samples` shows."""
+    height, width = image.shape[:2]
+    x, y = (
+        _one(lens)
+        .project_rays(lens.theta_max.item() / 2, -math.pi / 4, (height, width))[0]
+        .tolist()
+    )
+    return x - width / 20, y - height / 20, width / 10, height / 10
