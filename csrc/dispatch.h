@@ -12,8 +12,9 @@ struct bfloat16 {
 
 enum class Pixel { f32, f64, bf16, u8 };
 
-// Point (i, j) of image b stands at center[b] + radii[b, i] * (cos, sin)(azimuths[j]). T is the
-// type that is computed in: double for double pixels, else float.
+// Point (i, j) of image b stands at
+// center[b] + affine[b] @ (radii[b, i] * (cos, sin)(azimuths[j])) + offsets[b, :, i, j].
+// T is the type that is computed in: double for double pixels, else float.
 template <typename T>
 struct PolarSampleArgs {
   const void* image;  // (B, C, H, W), any strides
@@ -30,6 +31,11 @@ struct PolarSampleArgs {
   int64_t num_azimuths;
   const T* center;  // (B or 1, 2) px, x then y
   int64_t center_stride;
+  const T* affine;  // (B or 1, 2, 2), or null: the identity
+  int64_t affine_stride;
+  const T* offsets;  // (B or 1, 2, num_radii, num_azimuths) px, x then y, or null: none
+  const T* offsets_end;
+  int64_t offsets_stride;
   int64_t patch_radii, patch_azimuths;  // S_r, S_phi
   bool tokens;                          // layout: (B, R, A, S_r * S_phi * C), else (B, C, N_r, N_a)
   double jitter;
@@ -42,11 +48,13 @@ struct PolarSampleArgs {
   int64_t bands;         // into how many parts the rows of an image are cut
   void* grad_image;      // (B, C, H, W) contiguous, of the pixel's type; all of it is written
   double* grad_lens;     // (B, num_radii, kLensSums)
+  T* grad_offsets;       // like offsets, to be added to; or null
 };
 
 // What polar_sample_backward_lens sums over a row of points: d(loss)/dr, the same times the shift
-// of points that jitter moved inward and outward, and d(loss)/d(x, y).
-enum LensSum { kAlong, kInward, kOutward, kAcross, kDown, kLensSums };
+// of points that jitter moved inward and outward, d(loss)/d(x, y), and, where there is a matrix,
+// d(loss)/d(affine) from kAffine on.
+enum LensSum { kAlong, kInward, kOutward, kAcross, kDown, kAffine, kLensSums = kAffine + 4 };
 
 // The cells beside radius i, which jitter moves into: at both ends of the row the only one there
 // is.

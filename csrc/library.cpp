@@ -10,22 +10,24 @@
 
 STABLE_TORCH_LIBRARY(darswin, m) {
   m.def(
-      "polar_sample(Tensor image, Tensor radii, Tensor azimuths, Tensor center, int[] patch, "
-      "float jitter, Tensor? seed, float[] mean, float[] std, bool tokens, bool bfloat16) -> "
-      "Tensor");
+      "polar_sample(Tensor image, Tensor radii, Tensor azimuths, Tensor center, Tensor? affine, "
+      "Tensor? offsets, int[] patch, float jitter, Tensor? seed, float[] mean, float[] std, "
+      "bool tokens, bool bfloat16) -> Tensor");
   m.def(
       "polar_sample_backward(Tensor grad_out, Tensor image, Tensor radii, Tensor azimuths, "
-      "Tensor center, int[] patch, float jitter, Tensor? seed, float[] mean, float[] std, "
-      "bool tokens, bool bfloat16, bool image_grad, bool lens_grad) -> (Tensor, Tensor, Tensor)");
+      "Tensor center, Tensor? affine, Tensor? offsets, int[] patch, float jitter, Tensor? seed, "
+      "float[] mean, float[] std, bool tokens, bool bfloat16, bool image_grad, bool lens_grad, "
+      "bool offsets_grad) -> (Tensor, Tensor, Tensor, Tensor, Tensor)");
   m.def(
-      "polar_embed(Tensor image, Tensor radii, Tensor azimuths, Tensor center, Tensor weight, "
-      "Tensor? bias, int[] patch, float jitter, Tensor? seed, float[] mean, float[] std, "
-      "bool bfloat16) -> Tensor");
+      "polar_embed(Tensor image, Tensor radii, Tensor azimuths, Tensor center, Tensor? affine, "
+      "Tensor? offsets, Tensor weight, Tensor? bias, int[] patch, float jitter, Tensor? seed, "
+      "float[] mean, float[] std, bool bfloat16) -> Tensor");
   m.def(
       "polar_embed_backward(Tensor grad_out, Tensor image, Tensor radii, Tensor azimuths, "
-      "Tensor center, Tensor weight, int[] patch, float jitter, Tensor? seed, float[] mean, "
-      "float[] std, bool bfloat16, bool image_grad, bool lens_grad, bool weight_grad) -> "
-      "(Tensor, Tensor, Tensor, Tensor, Tensor)");
+      "Tensor center, Tensor? affine, Tensor? offsets, Tensor weight, int[] patch, float jitter, "
+      "Tensor? seed, float[] mean, float[] std, bool bfloat16, bool image_grad, bool lens_grad, "
+      "bool offsets_grad, bool weight_grad) -> "
+      "(Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor)");
   m.def(
       "window_attention(Tensor qkv, Tensor bias, int[] window, int[] shift, bool[] periodic, "
       "float scale) -> Tensor");

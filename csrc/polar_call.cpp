@@ -11,7 +11,8 @@ using torch::stable::Tensor;
 
 template <typename T>
 PolarCall<T>::PolarCall(const Tensor& image_, const Tensor& radii_, const Tensor& azimuths_,
-                        const Tensor& center_, const Sizes& patch, double jitter,
+                        const Tensor& center_, const std::optional<Tensor>& affine_,
+                        const std::optional<Tensor>& offsets_, const Sizes& patch, double jitter,
                         const std::optional<Tensor>& seed, const std::vector<double>& mean,
                         const std::vector<double>& std, bool bfloat16)
     : image(image_),
@@ -34,6 +35,23 @@ PolarCall<T>::PolarCall(const Tensor& image_, const Tensor& radii_, const Tensor
   STD_TORCH_CHECK(patch[0] > 0 && patch[1] > 0 && radii.size(1) % patch[0] == 0 &&
                       azimuths.size(0) % patch[1] == 0,
                   "polar_sample: patch must divide the radii and the azimuths");
+  const auto laid_out = [&](const Tensor& given, Sizes sizes) {
+    sizes[0] = given.dim() > 0 && given.size(0) == 1 ? 1 : batch;
+    STD_TORCH_CHECK(given.scalar_type() == type && given.is_cpu() && given.sizes().vec() == sizes,
+                    "polar_sample: wrong type, device or shape of affine or offsets");
+    return torch::stable::contiguous(given);
+  };
+  if (affine_.has_value()) {
+    affine = laid_out(*affine_, {batch, 2, 2});
+    args.affine = affine->template const_data_ptr<T>();
+    args.affine_stride = affine->size(0) == 1 ? 0 : 4;
+  }
+  if (offsets_.has_value()) {
+    offsets = laid_out(*offsets_, {batch, 2, radii.size(1), azimuths.size(0)});
+    args.offsets = offsets->template const_data_ptr<T>();
+    args.offsets_end = args.offsets + offsets->numel();
+    args.offsets_stride = offsets->size(0) == 1 ? 0 : 2 * radii.size(1) * azimuths.size(0);
+  }
   STD_TORCH_CHECK(jitter == 0 || seed.has_value(), "polar_sample: jitter needs a seed");
 
   args.image = image.const_data_ptr();
@@ -112,15 +130,24 @@ template Tensor new_image_gradient(PolarCall<double>&);
 
 namespace {
 
-// From the sums of each row of points to the gradients of radii and center, in a fixed order.
+// The gradient of `like`, (B or 1, ...), from doubles that were added up in a fixed order.
 template <typename T>
-void fold_lens(const PolarCall<T>& call, const std::vector<double>& sums, Tensor& grad_radii,
-               Tensor& grad_center) {
+Tensor rounded_like(const Tensor& like, const std::vector<double>& sums) {
+  const Tensor grad = torch::stable::new_empty(like, like.sizes());
+  std::copy(sums.begin(), sums.end(), grad.template mutable_data_ptr<T>());
+  return grad;
+}
+
+// From the sums of each row of points to the gradients of radii, center and affine.
+template <typename T>
+void fold_lens(const PolarCall<T>& call, const std::vector<double>& sums, PolarGradients& grads) {
   const int64_t count = call.args.num_radii;
-  std::vector<double> radii(grad_radii.numel(), 0.0), center(grad_center.numel(), 0.0);
+  std::vector<double> radii(call.radii.numel(), 0.0), center(call.center.numel(), 0.0);
+  std::vector<double> affine(call.affine.has_value() ? call.affine->numel() : 0, 0.0);
   for (int64_t b = 0; b < call.batch; ++b) {
-    double* row = radii.data() + (call.args.radii_stride == 0 ? 0 : b * count);
-    double* xy = center.data() + (call.args.center_stride == 0 ? 0 : b * 2);
+    double* row = radii.data() + b * call.args.radii_stride;
+    double* xy = center.data() + b * call.args.center_stride;
+    double* matrix = affine.data() + b * call.args.affine_stride;
     for (int64_t i = 0; i < count; ++i) {
       const double* sum = sums.data() + (b * count + i) * kLensSums;
       const Steps steps(i, count);
@@ -131,49 +158,58 @@ void fold_lens(const PolarCall<T>& call, const std::vector<double>& sums, Tensor
       }
       xy[0] += sum[kAcross];
       xy[1] += sum[kDown];
+      for (int e = 0; e < 4 && call.affine.has_value(); ++e) matrix[e] += sum[kAffine + e];
     }
   }
-  std::copy(radii.begin(), radii.end(), grad_radii.template mutable_data_ptr<T>());
-  std::copy(center.begin(), center.end(), grad_center.template mutable_data_ptr<T>());
+  grads.radii = rounded_like<T>(call.radii, radii);
+  grads.center = rounded_like<T>(call.center, center);
+  if (call.affine.has_value()) grads.affine = rounded_like<T>(*call.affine, affine);
 }
 
 }  // namespace
 
 template <typename T>
-std::tuple<Tensor, Tensor, Tensor> polar_backward(PolarCall<T>& call, bool image_grad,
-                                                  bool lens_grad) {
+PolarGradients polar_backward(PolarCall<T>& call, const PolarWanted& wanted) {
   PolarSampleArgs<T>& args = call.args;
-  const Sizes none = {0};
   const bool points = call.channels_and_points();
   const auto& kernel = kernels().table<T>();
 
-  Tensor grad_image = torch::stable::new_empty(call.image, none);
-  if (image_grad) {
-    grad_image = new_image_gradient(call);
+  PolarGradients grads(call);
+  if (wanted.image) {
+    grads.image = new_image_gradient(call);
     args.bands = count_bands(call.batch, args.height);
     const int64_t bytes = kernel.polar_sample_scratch(args);
     parallel_ranges(points ? call.batch * args.bands : 0, [&](int64_t begin, int64_t end, int64_t) {
       kernel.polar_sample_backward_image(args, begin, end, scratch(bytes));
     });
   }
-  if (!lens_grad) {
-    return {grad_image, torch::stable::new_empty(call.radii, none),
-            torch::stable::new_empty(call.center, none)};
+  if (!wanted.lens && !wanted.offsets) return grads;
+  const bool offsets = wanted.offsets && call.offsets.has_value();
+  if (offsets) {
+    grads.offsets = torch::stable::new_zeros(*call.offsets, call.offsets->sizes());
+    args.grad_offsets = grads.offsets.template mutable_data_ptr<T>();
   }
-  Tensor grad_radii = torch::stable::new_empty(call.radii, call.radii.sizes());
-  Tensor grad_center = torch::stable::new_empty(call.center, call.center.sizes());
+  // Images that share their offsets add to one gradient: for a ring of it one thread takes them in
+  // turn.
+  const int64_t sharing = offsets && args.offsets_stride == 0 ? call.batch : 1;
   std::vector<double> sums(call.batch * args.num_radii * kLensSums, 0.0);
   args.grad_lens = sums.data();
-  const int64_t bytes = kernel.polar_sample_scratch(args);
-  parallel_ranges(points ? call.batch * call.rings() : 0, [&](int64_t begin, int64_t end, int64_t) {
-    kernel.polar_sample_backward_lens(args, begin, end, scratch(bytes));
+  const int64_t bytes = kernel.polar_sample_scratch(args), rings = call.rings();
+  const int64_t items = points && call.batch > 0 ? call.batch * rings / sharing : 0;
+  parallel_ranges(items, [&](int64_t begin, int64_t end, int64_t) {
+    for (int64_t item = begin; item < end; ++item) {
+      for (int64_t b = 0; b < sharing; ++b) {
+        kernel.polar_sample_backward_lens(args, item + b * rings, item + b * rings + 1,
+                                          scratch(bytes));
+      }
+    }
   });
-  fold_lens(call, sums, grad_radii, grad_center);
-  return {grad_image, grad_radii, grad_center};
+  if (wanted.lens) fold_lens(call, sums, grads);
+  return grads;
 }
 
-template std::tuple<Tensor, Tensor, Tensor> polar_backward(PolarCall<float>&, bool, bool);
-template std::tuple<Tensor, Tensor, Tensor> polar_backward(PolarCall<double>&, bool, bool);
+template PolarGradients polar_backward(PolarCall<float>&, const PolarWanted&);
+template PolarGradients polar_backward(PolarCall<double>&, const PolarWanted&);
 template struct PolarCall<float>;
 template struct PolarCall<double>;
 

@@ -41,6 +41,7 @@ inline Pixel pixel_type(const torch::stable::Tensor& image) {
 template <typename T>
 struct PolarCall {
   torch::stable::Tensor image, radii, center;
+  std::optional<torch::stable::Tensor> affine, offsets;
   std::vector<double> directions;
   std::vector<T> scale, offset;
   PolarSampleArgs<T> args{};
@@ -48,8 +49,10 @@ struct PolarCall {
 
   PolarCall(const torch::stable::Tensor& image, const torch::stable::Tensor& radii,
             const torch::stable::Tensor& azimuths, const torch::stable::Tensor& center,
-            const Sizes& patch, double jitter, const std::optional<torch::stable::Tensor>& seed,
-            const std::vector<double>& mean, const std::vector<double>& std, bool bfloat16);
+            const std::optional<torch::stable::Tensor>& affine,
+            const std::optional<torch::stable::Tensor>& offsets, const Sizes& patch, double jitter,
+            const std::optional<torch::stable::Tensor>& seed, const std::vector<double>& mean,
+            const std::vector<double>& std, bool bfloat16);
 
   int64_t rings() const { return args.num_radii / args.patch_radii; }
   int64_t sectors() const { return args.num_azimuths / args.patch_azimuths; }
@@ -75,25 +78,45 @@ int64_t count_bands(int64_t batch, int64_t height);
 template <typename T>
 torch::stable::Tensor new_image_gradient(PolarCall<T>& call);
 
-// Gradients of image, radii and center from args.grad_out; what is not wanted comes back empty.
+// Which gradients backward is asked for. Those of radii, center and affine come together.
+struct PolarWanted {
+  bool image, lens, offsets;
+};
+
+// Gradients of the sampling: empty tensors until they are made.
+struct PolarGradients {
+  torch::stable::Tensor image, radii, center, affine, offsets;
+
+  template <typename T>
+  explicit PolarGradients(const PolarCall<T>& call)
+      : image(torch::stable::new_empty(call.image, Sizes{0})),
+        radii(torch::stable::new_empty(call.radii, Sizes{0})),
+        center(torch::stable::new_empty(call.radii, Sizes{0})),
+        affine(torch::stable::new_empty(call.radii, Sizes{0})),
+        offsets(torch::stable::new_empty(call.radii, Sizes{0})) {}
+
+  auto tuple() const { return std::tuple(image, radii, center, affine, offsets); }
+};
+
+// The gradients that are wanted, from args.grad_out.
 template <typename T>
-std::tuple<torch::stable::Tensor, torch::stable::Tensor, torch::stable::Tensor> polar_backward(
-    PolarCall<T>& call, bool image_grad, bool lens_grad);
+PolarGradients polar_backward(PolarCall<T>& call, const PolarWanted& wanted);
 
 // Calls run(call) with a call of the image's type.
 template <typename Run>
 auto with_polar_call(const torch::stable::Tensor& image, const torch::stable::Tensor& radii,
                      const torch::stable::Tensor& azimuths, const torch::stable::Tensor& center,
-                     const Sizes& patch, double jitter,
-                     const std::optional<torch::stable::Tensor>& seed,
+                     const std::optional<torch::stable::Tensor>& affine,
+                     const std::optional<torch::stable::Tensor>& offsets, const Sizes& patch,
+                     double jitter, const std::optional<torch::stable::Tensor>& seed,
                      const std::vector<double>& mean, const std::vector<double>& std, bool bfloat16,
                      Run run) {
   if (pixel_type(image) == Pixel::f64) {
-    return run(PolarCall<double>(image, radii, azimuths, center, patch, jitter, seed, mean, std,
-                                 bfloat16));
+    return run(PolarCall<double>(image, radii, azimuths, center, affine, offsets, patch, jitter,
+                                 seed, mean, std, bfloat16));
   }
-  return run(
-      PolarCall<float>(image, radii, azimuths, center, patch, jitter, seed, mean, std, bfloat16));
+  return run(PolarCall<float>(image, radii, azimuths, center, affine, offsets, patch, jitter, seed,
+                              mean, std, bfloat16));
 }
 
 extern template struct PolarCall<float>;

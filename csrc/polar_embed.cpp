@@ -103,9 +103,8 @@ std::tuple<Tensor, Tensor> weight_gradients(const PolarCall<T>& call,
 
 // Gradients of image and lens, through those of the samples.
 template <typename T>
-std::tuple<Tensor, Tensor, Tensor> sampling_gradients(PolarCall<T>& call, PolarEmbedArgs<T>& embed,
-                                                      const Tensor& weight, bool image_grad,
-                                                      bool lens_grad) {
+PolarGradients sampling_gradients(PolarCall<T>& call, PolarEmbedArgs<T>& embed,
+                                  const Tensor& weight, const PolarWanted& wanted) {
   const auto& kernel = kernels().table<T>();
   const int64_t depth = call.samples(), row = padded(depth);
   std::vector<T> rows(embed.features * row, T(0));
@@ -115,17 +114,16 @@ std::tuple<Tensor, Tensor, Tensor> sampling_gradients(PolarCall<T>& call, PolarE
   }
   embed.weight = rows.data();
   const int64_t bytes = kernel.polar_embed_scratch(call.args, embed);
-  const bool fused = !lens_grad && count_bands(call.batch, call.args.height) == 1;
-  if (fused) {
-    const Tensor grad_image = new_image_gradient(call);
+  const bool image_alone = !wanted.lens && !wanted.offsets;
+  if (image_alone && count_bands(call.batch, call.args.height) == 1) {
+    PolarGradients grads(call);
+    grads.image = new_image_gradient(call);
     call.args.bands = 1;
     parallel_ranges(
         call.channels_and_points() ? call.batch : 0, [&](int64_t begin, int64_t end, int64_t) {
           kernel.polar_embed_backward_image(call.args, embed, begin, end, scratch(bytes));
         });
-    const Sizes none = {0};
-    return {grad_image, torch::stable::new_empty(call.radii, none),
-            torch::stable::new_empty(call.center, none)};
+    return grads;
   }
   const Tensor grad_samples = torch::stable::new_empty(call.radii, output_sizes(call, depth));
   embed.grad_samples = grad_samples.template mutable_data_ptr<T>();
@@ -136,14 +134,12 @@ std::tuple<Tensor, Tensor, Tensor> sampling_gradients(PolarCall<T>& call, PolarE
                   });
   call.args.grad_out = embed.grad_samples;
   call.args.narrow = false;
-  return polar_backward(call, image_grad, lens_grad);
+  return polar_backward(call, wanted);
 }
 
 template <typename T>
-std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> backward(PolarCall<T>&& call,
-                                                            const Tensor& grad_out_,
-                                                            const Tensor& weight_, bool image_grad,
-                                                            bool lens_grad, bool weight_grad) {
+auto backward(PolarCall<T>&& call, const Tensor& grad_out_, const Tensor& weight_,
+              const PolarWanted& wanted, bool weight_grad) {
   check_weight(call, weight_);
   const Tensor grad_out = torch::stable::contiguous(grad_out_);
   const Tensor weight = parameter(call, weight_);
@@ -161,33 +157,34 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> backward(PolarCall<T>&& call,
   if (weight_grad) {
     std::tie(grad_weight, grad_bias) = weight_gradients(call, embed);
   }
-  Tensor grad_image = torch::stable::new_empty(call.image, none);
-  Tensor grad_radii = torch::stable::new_empty(call.radii, none);
-  Tensor grad_center = torch::stable::new_empty(call.center, none);
-  if (image_grad || lens_grad) {
-    std::tie(grad_image, grad_radii, grad_center) =
-        sampling_gradients(call, embed, weight, image_grad, lens_grad);
-  }
-  return {grad_image, grad_radii, grad_center, grad_weight, grad_bias};
+  const bool sampling = wanted.image || wanted.lens || wanted.offsets;
+  const PolarGradients grads =
+      sampling ? sampling_gradients(call, embed, weight, wanted) : PolarGradients(call);
+  return std::tuple_cat(grads.tuple(), std::tuple(grad_weight, grad_bias));
 }
 
 Tensor polar_embed(const Tensor& image, const Tensor& radii, const Tensor& azimuths,
-                   const Tensor& center, const Tensor& weight, std::optional<Tensor> bias,
+                   const Tensor& center, std::optional<Tensor> affine,
+                   std::optional<Tensor> offsets, const Tensor& weight, std::optional<Tensor> bias,
                    Sizes patch, double jitter, std::optional<Tensor> seed, std::vector<double> mean,
                    std::vector<double> std, bool bfloat16) {
-  return with_polar_call(image, radii, azimuths, center, patch, jitter, seed, mean, std, bfloat16,
+  return with_polar_call(image, radii, azimuths, center, affine, offsets, patch, jitter, seed, mean,
+                         std, bfloat16,
                          [&](auto&& call) { return forward(std::move(call), weight, bias); });
 }
 
-std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> polar_embed_backward(
-    const Tensor& grad_out, const Tensor& image, const Tensor& radii, const Tensor& azimuths,
-    const Tensor& center, const Tensor& weight, Sizes patch, double jitter,
-    std::optional<Tensor> seed, std::vector<double> mean, std::vector<double> std, bool bfloat16,
-    bool image_grad, bool lens_grad, bool weight_grad) {
-  return with_polar_call(
-      image, radii, azimuths, center, patch, jitter, seed, mean, std, bfloat16, [&](auto&& call) {
-        return backward(std::move(call), grad_out, weight, image_grad, lens_grad, weight_grad);
-      });
+auto polar_embed_backward(const Tensor& grad_out, const Tensor& image, const Tensor& radii,
+                          const Tensor& azimuths, const Tensor& center,
+                          std::optional<Tensor> affine, std::optional<Tensor> offsets,
+                          const Tensor& weight, Sizes patch, double jitter,
+                          std::optional<Tensor> seed, std::vector<double> mean,
+                          std::vector<double> std, bool bfloat16, bool image_grad, bool lens_grad,
+                          bool offsets_grad, bool weight_grad) {
+  return with_polar_call(image, radii, azimuths, center, affine, offsets, patch, jitter, seed, mean,
+                         std, bfloat16, [&](auto&& call) {
+                           return backward(std::move(call), grad_out, weight,
+                                           {image_grad, lens_grad, offsets_grad}, weight_grad);
+                         });
 }
 
 }  // namespace

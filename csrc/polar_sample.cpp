@@ -37,8 +37,8 @@ Tensor forward(PolarCall<T>&& call, bool tokens) {
 }
 
 template <typename T>
-std::tuple<Tensor, Tensor, Tensor> backward(PolarCall<T>&& call, const Tensor& grad_out_,
-                                            bool tokens, bool image_grad, bool lens_grad) {
+auto backward(PolarCall<T>&& call, const Tensor& grad_out_, bool tokens,
+              const PolarWanted& wanted) {
   PolarSampleArgs<T>& args = call.args;
   args.tokens = tokens;
   // Gradients arrive expanded or strided: `.sum().backward()` gives stride 0.
@@ -47,25 +47,30 @@ std::tuple<Tensor, Tensor, Tensor> backward(PolarCall<T>&& call, const Tensor& g
       grad_out.sizes().vec() == output_sizes(call) && grad_out.scalar_type() == call.output_type(),
       "polar_sample_backward: grad_out must look like the output");
   args.grad_out = grad_out.const_data_ptr();
-  return polar_backward(call, image_grad, lens_grad);
+  return polar_backward(call, wanted).tuple();
 }
 
 Tensor polar_sample(const Tensor& image, const Tensor& radii, const Tensor& azimuths,
-                    const Tensor& center, Sizes patch, double jitter, std::optional<Tensor> seed,
-                    std::vector<double> mean, std::vector<double> std, bool tokens, bool bfloat16) {
-  return with_polar_call(image, radii, azimuths, center, patch, jitter, seed, mean, std, bfloat16,
+                    const Tensor& center, std::optional<Tensor> affine,
+                    std::optional<Tensor> offsets, Sizes patch, double jitter,
+                    std::optional<Tensor> seed, std::vector<double> mean, std::vector<double> std,
+                    bool tokens, bool bfloat16) {
+  return with_polar_call(image, radii, azimuths, center, affine, offsets, patch, jitter, seed, mean,
+                         std, bfloat16,
                          [&](auto&& call) { return forward(std::move(call), tokens); });
 }
 
-std::tuple<Tensor, Tensor, Tensor> polar_sample_backward(
-    const Tensor& grad_out, const Tensor& image, const Tensor& radii, const Tensor& azimuths,
-    const Tensor& center, Sizes patch, double jitter, std::optional<Tensor> seed,
-    std::vector<double> mean, std::vector<double> std, bool tokens, bool bfloat16, bool image_grad,
-    bool lens_grad) {
-  return with_polar_call(
-      image, radii, azimuths, center, patch, jitter, seed, mean, std, bfloat16, [&](auto&& call) {
-        return backward(std::move(call), grad_out, tokens, image_grad, lens_grad);
-      });
+auto polar_sample_backward(const Tensor& grad_out, const Tensor& image, const Tensor& radii,
+                           const Tensor& azimuths, const Tensor& center,
+                           std::optional<Tensor> affine, std::optional<Tensor> offsets, Sizes patch,
+                           double jitter, std::optional<Tensor> seed, std::vector<double> mean,
+                           std::vector<double> std, bool tokens, bool bfloat16, bool image_grad,
+                           bool lens_grad, bool offsets_grad) {
+  return with_polar_call(image, radii, azimuths, center, affine, offsets, patch, jitter, seed, mean,
+                         std, bfloat16, [&](auto&& call) {
+                           return backward(std::move(call), grad_out, tokens,
+                                           {image_grad, lens_grad, offsets_grad});
+                         });
 }
 
 }  // namespace

@@ -29,13 +29,16 @@ G_M, G_N, G_B, G_C = 2.288135593220339, 5, 8.31578947368421, 1 / 3
 class PolarGrid(NamedTuple):
     """What `polar_sample` needs of a lens, and the borders of its rings.
 
-    Shapes: radii (N, R·S_r) px, azimuths (A·S_φ,) rad, center (N or 1, 2) px, borders (N, R+1) px.
+    Shapes: radii (N, R·S_r) px, azimuths (A·S_φ,) rad, center (N or 1, 2) px, borders (N, R+1) px;
+    for lenses that are not round affine (N or 1, 2, 2), offsets (N or 1, 2, R·S_r, A·S_φ) px.
     """
 
     radii: Tensor
     azimuths: Tensor
     center: Tensor
     borders: Tensor
+    affine: Tensor | None = None
+    offsets: Tensor | None = None
 
 
 def polar_grid(
@@ -90,7 +93,19 @@ def polar_grid(
         azimuths,
         lens.center_in(image_size),
         border_radii,
+        lens.affine,
+        None if lens.is_radial else _offsets(lens, points, sample_spacing, azimuths),
     )
+
+
+def _offsets(lens: Lens, points: Tensor, spacing: Spacing, azimuths: Tensor) -> Tensor:
+    """(N, 2, N_r, N_a) px: how far from the radial curve the lens lets each point land."""
+    theta = _to_theta(lens, points, spacing)[:, :, None].expand(-1, -1, len(azimuths))
+    direction = torch.stack((torch.cos(azimuths), torch.sin(azimuths)), -1)
+    offsets = lens.offset(theta, direction.expand(*theta.shape, 2))
+    if lens.affine is not None:
+        offsets = (lens.affine[:, None, None] @ offsets[..., None])[..., 0]
+    return offsets.permute(0, 3, 1, 2)
 
 
 def check_grid(

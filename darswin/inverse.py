@@ -11,8 +11,9 @@ Function = Callable[[Tensor], Tensor]
 def inverse(function: Function, slope: Function, value: Tensor, end: Tensor) -> Tensor:
     """The x in [0, end] at which a function that rises from 0 takes a value.
 
-    Newton's method, kept inside a bracket by bisection. The last step is the one that carries the
-    gradients of the inverse, to `value` and to whatever `function` depends on.
+    Newton's method inside a bracket, which is halved instead where a step would leave it or is not
+    half as long as the one before. The last step is the one that carries the gradients of the
+    inverse, to `value` and to whatever `function` depends on.
 
     Args:
         function, slope: of x, elementwise. value: any shape. end: broadcasts to that of x.
@@ -21,11 +22,14 @@ def inverse(function: Function, slope: Function, value: Tensor, end: Tensor) -> 
         last = function(end)
         high = end.expand(torch.broadcast_shapes(value.shape, end.shape))
         low, x = torch.zeros_like(high), high * (value / last).clamp(0, 1)
+        moved = high
         for _ in range(40):
             error = function(x) - value
             low, high = torch.where(error < 0, x, low), torch.where(error > 0, x, high)
-            step = x - error / slope(x)
-            x = torch.where((step >= low) & (step <= high), step, (low + high) / 2)
+            newton = x - error / slope(x)
+            fine = (newton >= low) & (newton <= high) & (2 * (newton - x).abs() <= moved)
+            before, x = x, torch.where(fine, newton, (low + high) / 2)
+            moved = (x - before).abs()
     return x - (function(x) - value) / slope(x).detach()
 
 
@@ -39,6 +43,8 @@ def rising_limit(slope: Function, end: Tensor) -> Tensor:
     steps = torch.linspace(0, 1, 1025, dtype=end.dtype, device=end.device)
     x = end[:, None] * steps
     falls = ~(slope(x) > 0)
+    if not torch.compiler.is_compiling() and not falls.any():
+        return end  # as nearly always
     first = falls.int().argmax(1, keepdim=True)
     low, high = x.gather(1, (first - 1).clamp(min=0)), x.gather(1, first)
     for _ in range(50):

@@ -78,14 +78,16 @@ class PolarSample(nn.Module):
     def arguments(self, images: Tensor, grid: PolarGrid) -> dict:
         """What the operators sample images with, on a grid that `grid` gave."""
         dtype = torch.float64 if images.dtype == torch.float64 else torch.float32
-        radii, azimuths, center, _ = (t.to(images.device, dtype) for t in grid)
+        radii, azimuths, center, _, affine, offsets = (
+            None if t is None else t.to(images.device, dtype) for t in grid
+        )
         jitter = self.jitter if self.training else 0.0
         # 62 bits, so that the seed is a tensor that compiled training does not specialise on.
         seed = torch.randint(2**62, ()) if jitter else 0
         statistics = dict(mean=self.mean, std=self.std) if images.dtype == torch.uint8 else {}
         return dict(
-            image=images, radii=radii, azimuths=azimuths, center=center, patch=self.samples,
-            jitter=jitter, seed=seed, **statistics,
+            image=images, radii=radii, azimuths=azimuths, center=center, affine=affine,
+            offsets=offsets, patch=self.samples, jitter=jitter, seed=seed, **statistics,
         )  # fmt: skip
 
     def forward(self, images: Tensor, lens: Lens) -> Tensor:
@@ -113,13 +115,24 @@ def check_images(images: Tensor) -> Tensor:
 
 
 def check_lens(lens: Lens, images: Tensor) -> None:
-    """TypeError or ValueError unless there is a lens for each image, or one."""
+    """TypeError or ValueError unless there is a lens for each image, or one, and of its size.
+
+    Compiled graphs cannot look at a value, so they do not check sizes."""
     if not isinstance(lens, Lens):
         raise TypeError(f"lens must be a darswin.lens.Lens, got {type(lens).__name__}")
     if len(lens) not in (1, images.shape[0]):
         raise ValueError(
             f"there must be one lens or one an image, {images.shape[0]}, got {len(lens)}"
         )
+    if lens.image_size is None or torch.compiler.is_compiling():
+        return
+    size = tuple(images.shape[2:])
+    for other in lens.image_size.unique(dim=0).tolist():
+        if tuple(other) != size:
+            raise ValueError(
+                f"the lens belongs to images of (H, W) = {tuple(round(s) for s in other)}, got "
+                f"images of {size}; lens.resized({size}) is the lens of a resized image"
+            )
 
 
 class Pixels(nn.Module):

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from darswin.grid import PLACEMENTS, SPACINGS, polar_grid
-from darswin.lens import Perspective, Polynomial, Spherical
+from darswin.lens import Mei, Perspective, Polynomial, Spherical
 
 f64 = torch.float64
 SIZES = dict(rings=16, sectors=64, samples=(10, 10))
@@ -152,3 +152,42 @@ def test_gradients_reach_the_lens(spacing, sample_spacing):
 def test_errors(change, message):
     with pytest.raises(ValueError, match=message):
         polar_grid(spherical(), (64, 64), **(SIZES | change))
+
+
+def camera(**aside):
+    """KITTI-360's image_02, to 95°."""
+    return Mei(torch.tensor([2.2134047507854890], dtype=f64), 1336.3220825849971,
+               [0.016798235660113681, 1.6548773243373522], math.radians(95),
+               [716.94323510126321, 705.76498308221585], **aside)  # fmt: skip
+
+
+@pytest.mark.parametrize("spacing", ["theta", "g", "radius"])
+@pytest.mark.parametrize(
+    "aside",
+    [
+        {"affine": [[1.0, 0.01], [0.0, 0.9996]]},
+        {"tangential": [4.2223943394772046e-4, 4.2462134260997584e-3]},
+        {"affine": [[1.0, 0.0], [0.0, 1.2]], "prism": [1e-3, 0.0, -2e-3, 0.0]},
+    ],
+)
+def test_points_are_where_the_lens_projects_their_rays(spacing, aside):
+    lens = camera(**aside)
+    grid = polar_grid(lens, (1400, 1400), **SIZES, spacing=spacing)
+    direction = torch.stack((torch.cos(grid.azimuths), torch.sin(grid.azimuths)), -1)
+    around = grid.radii[0, :, None, None] * direction
+    matrix = torch.eye(2, dtype=f64) if grid.affine is None else grid.affine[0]
+    points = grid.center[0] + around @ matrix.T
+    if grid.offsets is not None:
+        points = points + grid.offsets[0].permute(1, 2, 0)
+    theta = lens.unproject(grid.radii[0])
+    expected = lens.project_rays(theta[:, None], grid.azimuths[None])
+    torch.testing.assert_close(points, expected, rtol=0, atol=1e-8)
+    assert (grid.affine is None) == ("affine" not in aside)
+    assert (grid.offsets is None) == ("affine" in aside and "prism" not in aside)
+    if grid.offsets is not None:
+        assert grid.offsets.shape == (1, 2, 160, 640) and 0.5 < grid.offsets.abs().max() < 10
+
+
+def test_a_grid_of_a_round_lens_has_no_offsets():
+    grid = polar_grid(camera(), (1400, 1400), **SIZES)
+    assert grid.affine is None and grid.offsets is None

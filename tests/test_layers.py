@@ -10,10 +10,11 @@ from darswin.layers import (
     DropPath,
     FourierBias,
     PatchMerging,
+    PolarPatchEmbed,
     radial_positions,
 )
 from darswin.lens import Perspective, Spherical
-from darswin.ops import use_reference, window_attention
+from darswin.ops import polar_embed, polar_sample, use_reference, window_attention
 
 LENS = Spherical.from_fov([0.2, 0.9], 2.6, 16.0)
 
@@ -28,6 +29,27 @@ def test_polar_sample_replaces_grid_sample_on_a_polar_grid():
     expected = F.grid_sample(images, mesh, align_corners=True)
     torch.testing.assert_close(sample(images, LENS), expected, rtol=1e-4, atol=1e-4)
     assert sample.train()(images, LENS).shape == (2, 3, 12, 16)
+
+
+def test_polar_sample_passes_on_what_bends_a_lens():
+    images = torch.randn(2, 3, 32, 33, dtype=torch.float64)
+    affine = torch.eye(2) + 0.3 * torch.randn(2, 2, 2)
+    offsets = torch.randn(1, 2, 12, 16)
+
+    def bent(*arguments, **settings):
+        return polar_grid(*arguments, **settings)._replace(affine=affine, offsets=offsets)
+
+    grid = polar_grid(LENS, (32, 33), rings=4, sectors=8, samples=(3, 2))
+    radii, azimuths, center = (t.double() for t in grid[:3])
+    bends = dict(affine=affine.double(), offsets=offsets.double())
+    expected = polar_sample(images, radii, azimuths, center, **bends, patch=(3, 2), layout="image")
+    assert torch.equal(PolarSample(4, 8, (3, 2), grid=bent)(images, LENS), expected)
+    embed = PolarPatchEmbed(4, 8, (3, 2), grid=bent).double()
+    tokens = polar_embed(
+        images, radii, azimuths, center, embed.proj.weight, embed.proj.bias, **bends, patch=(3, 2)
+    )
+    got = embed(images, embed.sample.grid(LENS, (32, 33)))
+    assert torch.equal(got, embed.norm(tokens))
 
 
 def test_polar_sample_jitters_only_in_training_and_by_torchs_generator():

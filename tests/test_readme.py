@@ -6,20 +6,26 @@ from pathlib import Path
 
 import torch
 
+from darswin import lens
+
 ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text()
 
 
-def test_python_blocks():
+def test_python_blocks(tmp_path, monkeypatch):
     blocks = re.findall(r"```python\n(.*?)```", README, flags=re.S)
-    assert len(blocks) == 3
-    scope = {}
+    monkeypatch.chdir(tmp_path)
+    lens.save(lens.Equidistant(200.0, 1.5, image_size=(640, 640)), "calibration.json")
+    scope, polar = {}, []
     with torch.no_grad():
         for block in blocks:
             exec(block, scope)
+            polar.append(scope.pop("polar", None))
     assert scope["logits"].shape == (2, 200)
     assert scope["features"].shape == (2, 16, 1, 768)
-    assert scope["polar"].shape == (2, 3, 160, 640)
+    polar = [image for image in polar if image is not None]
+    assert len(polar) >= 4 and all(image.shape == (2, 3, 160, 640) for image in polar)
+    torch.testing.assert_close(polar[0], polar[1], rtol=0, atol=1e-4)  # the drop-in and grid_sample
 
 
 def test_pictures_and_links_exist():

@@ -95,11 +95,11 @@ struct PlacedPoints {
   // Finds points j, j + 1, ... of radius i of image b, for places `first` on.
   void find(const PolarSampleArgs<T>& a, const Packed& packed, int64_t b, int64_t i, int64_t j,
             int64_t count, int64_t first) {
-    const double most = reach(a, b, i);
+    const Reach most = reach(a, b, i);
     const T* center = a.center + b * a.center_stride;
     const auto width = static_cast<double>(a.width), height = static_cast<double>(a.height);
-    if (center[0] - most > -1 && center[0] + most < width && center[1] - most > -1 &&
-        center[1] + most < height) {
+    if (a.offsets == nullptr && center[0] - most.x > -1 && center[0] + most.x < width &&
+        center[1] - most.y > -1 && center[1] + most.y < height) {
       locate(a, b, i, j, count, random,
              [&](int64_t k, const Points& p) { place<true>(a, packed, p, first + k, near); });
     } else {

@@ -5,8 +5,13 @@
 // float a coordinate of 100 px is only good to 1e-5 px, the largest error of the whole operation.
 // Jitter moves a point by a fraction of a cell along both vectors. Its numbers come from a
 // counter-based generator, a word a point, so that backward finds the same places again.
+//
+// Most lenses are round: a point stands at its radius and azimuth. Others are bent: a matrix
+// stretches their circles to ellipses, and offsets move each point on its own. What tells the two
+// apart is a struct each, which the loops over points are compiled for, so round ones pay nothing.
 #pragma once
 
+#include "math.h"
 #include "philox.h"
 #include "simd.h"
 #include "trig.h"
@@ -45,35 +50,115 @@ struct RandomWords {
 
 // A register of points.
 struct Points {
-  Doubles x, y;      // px
-  Doubles cos, sin;  // of their azimuths
-  Doubles shift;     // how far jitter moved them along the radius, in cells
-  Masks clamped;     // whether their radius would have been negative
+  Doubles x, y;          // px
+  Doubles cos, sin;      // of their azimuths
+  Doubles radius;        // px
+  Doubles across, down;  // d(x, y) / d(radius)
+  Doubles shift;         // how far jitter moved them along the radius, in cells
+  Masks clamped;         // whether their radius would have been negative
 };
 
-// The largest distance from the center that a point of radius i may have; NaN if the radius is.
+// Puts points at their radius and azimuth around the center of image b.
 template <typename T>
-double reach(const PolarSampleArgs<T>& a, int64_t b, int64_t i) {
+struct Round {
+  double x, y;
+
+  Round(const PolarSampleArgs<T>& a, int64_t b)
+      : x(a.center[b * a.center_stride]), y(a.center[b * a.center_stride + 1]) {}
+
+  void put(Points& p, int64_t) const {
+    p.across = p.cos;
+    p.down = p.sin;
+    p.x = x + p.radius * p.across;
+    p.y = y + p.radius * p.down;
+  }
+};
+
+// The same through the matrix and with the offsets of points j, j + 1, ... of radius i.
+template <typename T>
+struct Bent {
+  const Round<T> center;
+  double matrix[4] = {1, 0, 0, 1};
+  const T *x_offsets = nullptr, *y_offsets = nullptr, *end;
+
+  Bent(const PolarSampleArgs<T>& a, int64_t b, int64_t i, int64_t j)
+      : center(a, b), end(a.offsets_end) {
+    if (a.affine != nullptr) {
+      for (int e = 0; e < 4; ++e) matrix[e] = a.affine[b * a.affine_stride + e];
+    }
+    if (a.offsets == nullptr) return;
+    x_offsets = a.offsets + b * a.offsets_stride + i * a.num_azimuths + j;
+    y_offsets = x_offsets + a.num_radii * a.num_azimuths;
+  }
+
+  void put(Points& p, int64_t k) const {
+    p.across = matrix[0] * p.cos + unfused(matrix[1] * p.sin);
+    p.down = matrix[2] * p.cos + unfused(matrix[3] * p.sin);
+    p.x = center.x + p.radius * p.across;
+    p.y = center.y + p.radius * p.down;
+    if (x_offsets == nullptr) return;
+    p.x += read(x_offsets + k);
+    p.y += read(y_offsets + k);
+  }
+
+  // A register of offsets. The last one of all may not be whole.
+  Doubles read(const T* from) const {
+    using V = Vector<T, kDoubles>;
+    if (end - from >= kDoubles) return __builtin_convertvector(load<V>(from), Doubles);
+    Doubles part = {};
+    for (int lane = 0; lane < end - from; ++lane) part[lane] = from[lane];
+    return part;
+  }
+};
+
+inline double magnitude(double x) { return x < 0 ? -x : x; }
+
+// How far from the center the points of a radius may stand, offsets left out; NaN if the radius or
+// the matrix is.
+struct Reach {
+  double x, y;
+};
+template <typename T>
+Reach reach(const PolarSampleArgs<T>& a, int64_t b, int64_t i) {
   const T* radii = a.radii + b * a.radii_stride;
-  double most = radii[i] < 0 ? -radii[i] : radii[i];
+  double most = magnitude(radii[i]);
   if (a.jitter > 0) {
     const Steps steps(i, a.num_radii);
     for (int side = 0; side < 2; ++side) {
-      const double step = static_cast<double>(radii[steps.above[side]]) - radii[steps.below[side]];
-      most += step < 0 ? -step : step;
+      most += magnitude(static_cast<double>(radii[steps.above[side]]) - radii[steps.below[side]]);
     }
   }
-  return most;
+  if (a.affine == nullptr) return {most, most};
+  const T* matrix = a.affine + b * a.affine_stride;
+  return {most * (magnitude(matrix[0]) + magnitude(matrix[1])),
+          most * (magnitude(matrix[2]) + magnitude(matrix[3]))};
+}
+
+// The largest offset along y of the points of radius i, those at no number left out.
+template <typename T>
+double largest_offset(const PolarSampleArgs<T>& a, int64_t b, int64_t i) {
+  if (a.offsets == nullptr) return 0;
+  using V = Vector<T, kLanes<T>>;
+  const T* row = a.offsets + b * a.offsets_stride + (a.num_radii + i) * a.num_azimuths;
+  V most = {};
+  int64_t j = 0;
+  for (; j + kLanes<T> <= a.num_azimuths; j += kLanes<T>) {
+    const V y = load<V>(row + j);
+    most = larger(y, larger(-y, most));
+  }
+  T largest = 0;
+  for (int lane = 0; lane < kLanes<T>; ++lane) largest = larger(most[lane], largest);
+  for (; j < a.num_azimuths; ++j) largest = larger(row[j], larger(-row[j], largest));
+  return largest;
 }
 
 // The part of locate() that jitter needs. With `tiny` turns their sines are short sums.
-template <bool tiny, typename T, typename Visit>
-void locate_moved(const PolarSampleArgs<T>& a, int64_t b, int64_t i, int64_t j, int64_t count,
-                  const RandomWords& random, const Visit& visit) {
+template <bool tiny, typename T, typename Lens, typename Visit>
+void locate_moved(const PolarSampleArgs<T>& a, const Lens& lens, int64_t b, int64_t i, int64_t j,
+                  int64_t count, const RandomWords& random, const Visit& visit) {
   using Ints = Vector<int32_t, kDoubles>;
   const T* radii = a.radii + b * a.radii_stride;
-  const T* center = a.center + b * a.center_stride;
-  const double cx = center[0], cy = center[1], radius = radii[i];
+  const double radius = radii[i];
   const Steps steps(i, a.num_radii);
   double step[2];
   for (int side = 0; side < 2; ++side) {
@@ -93,7 +178,7 @@ void locate_moved(const PolarSampleArgs<T>& a, int64_t b, int64_t i, int64_t j, 
     const Doubles turn = v * (0x1p-16 * cell) - 0.5 * cell;
     const Doubles moved = radius + p.shift * select(p.shift < 0, inner, outer);
     p.clamped = moved < 0;
-    const Doubles r = select(p.clamped, Doubles{}, moved);
+    p.radius = select(p.clamped, Doubles{}, moved);
     Doubles sin, cos;
     if constexpr (tiny) {
       tiny_sin_cos(turn, &sin, &cos);
@@ -103,8 +188,33 @@ void locate_moved(const PolarSampleArgs<T>& a, int64_t b, int64_t i, int64_t j, 
     const Doubles c = load<Doubles>(cosines + k), s = load<Doubles>(sines + k);
     p.cos = c * cos - s * sin;
     p.sin = s * cos + c * sin;
-    p.x = cx + r * p.cos;
-    p.y = cy + r * p.sin;
+    lens.put(p, k);
+    visit(k, p);
+  }
+}
+
+// locate() for a lens, Round or Bent.
+template <typename T, typename Lens, typename Visit>
+void locate_through(const PolarSampleArgs<T>& a, const Lens& lens, int64_t b, int64_t i, int64_t j,
+                    int64_t count, RandomWords& random, const Visit& visit) {
+  if (a.jitter > 0) {
+    random.draw(a.seed, static_cast<uint64_t>(b), static_cast<uint64_t>(i * a.num_azimuths + j),
+                count);
+    if (sizeof(T) == sizeof(float) && kPi * a.jitter / a.num_azimuths <= kTiny) {
+      return locate_moved<true>(a, lens, b, i, j, count, random, visit);
+    }
+    return locate_moved<false>(a, lens, b, i, j, count, random, visit);
+  }
+  const Doubles radius = splat<Doubles>(double{a.radii[b * a.radii_stride + i]});
+  const double *cosines = a.cosines + j, *sines = a.sines + j;
+  for (int64_t k = 0; k < count; k += kDoubles) {
+    Points p;
+    p.cos = load<Doubles>(cosines + k);
+    p.sin = load<Doubles>(sines + k);
+    p.radius = radius;
+    p.shift = Doubles{};
+    p.clamped = Masks{};
+    lens.put(p, k);
     visit(k, p);
   }
 }
@@ -114,26 +224,10 @@ void locate_moved(const PolarSampleArgs<T>& a, int64_t b, int64_t i, int64_t j, 
 template <typename T, typename Visit>
 void locate(const PolarSampleArgs<T>& a, int64_t b, int64_t i, int64_t j, int64_t count,
             RandomWords& random, const Visit& visit) {
-  if (a.jitter > 0) {
-    random.draw(a.seed, static_cast<uint64_t>(b), static_cast<uint64_t>(i * a.num_azimuths + j),
-                count);
-    if (sizeof(T) == sizeof(float) && kPi * a.jitter / a.num_azimuths <= kTiny) {
-      return locate_moved<true>(a, b, i, j, count, random, visit);
-    }
-    return locate_moved<false>(a, b, i, j, count, random, visit);
-  }
-  const T* center = a.center + b * a.center_stride;
-  const double cx = center[0], cy = center[1], radius = a.radii[b * a.radii_stride + i];
-  const double *cosines = a.cosines + j, *sines = a.sines + j;
-  for (int64_t k = 0; k < count; k += kDoubles) {
-    Points p;
-    p.cos = load<Doubles>(cosines + k);
-    p.sin = load<Doubles>(sines + k);
-    p.x = cx + radius * p.cos;
-    p.y = cy + radius * p.sin;
-    p.shift = Doubles{};
-    p.clamped = Masks{};
-    visit(k, p);
+  if (a.affine == nullptr && a.offsets == nullptr) {
+    locate_through(a, Round<T>(a, b), b, i, j, count, random, visit);
+  } else {
+    locate_through(a, Bent<T>(a, b, i, j), b, i, j, count, random, visit);
   }
 }
 

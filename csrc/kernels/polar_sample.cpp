@@ -4,8 +4,9 @@
 // the image in cache or, if it is large, in place (polar_image.h). Backward has two halves. The
 // image's gradient scatters every point into four pixels that other points share: each thread owns
 // a band of rows of an image and adds to them in the order of the points, so that no sum depends on
-// how many bands there are. The lens's gradient is a sum over each radius. A point outside the
-// image, or at no number at all, samples zeros and has no gradient.
+// how many bands there are. The lens's gradient is a sum over each radius, but for the offsets,
+// which have one gradient a point. A point outside the image, or at no number at all, samples zeros
+// and has no gradient.
 #include "kernels.h"
 #include "polar_rows.h"
 #include "polar_sampler.h"
@@ -68,7 +69,8 @@ void slope(const Corners<T, E>& corners, const T* grad, T right, T lower, T* gx,
 
 struct LensScratch {
   RandomWords random;
-  double cos[kBlock + kDoubles], sin[kBlock + kDoubles], shift[kBlock + kDoubles];
+  double across[kPlaces], down[kPlaces], shift[kPlaces];
+  double x[kPlaces], y[kPlaces];  // of points before the matrix, from the center
 };
 
 template <typename T>
@@ -81,15 +83,21 @@ void backward_lens(const PolarSampleArgs<T>& a, int64_t begin, int64_t end, void
   for (int64_t item = begin * a.patch_radii; item < end * a.patch_radii; ++item) {
     const int64_t b = item / a.num_radii, i = item % a.num_radii;
     double* sums = a.grad_lens + item * kLensSums;
+    T* grad_offsets = a.grad_offsets == nullptr
+                          ? nullptr
+                          : a.grad_offsets + b * a.offsets_stride + i * a.num_azimuths;
     read_row(a, a.grad_out, output_row(a, b, i), grads);
     for (int64_t j = 0; j < a.num_azimuths; j += kBlock) {
       const int64_t count = smaller(kBlock, a.num_azimuths - j);
       locate(a, b, i, j, count, points.random, [&](int64_t k, const Points& p) {
         place(a, a.image_stride + 2, p, k, places);
         // A radius that was clamped at 0 does not move.
-        store(points.cos + k, select(p.clamped, Doubles{}, p.cos));
-        store(points.sin + k, select(p.clamped, Doubles{}, p.sin));
+        store(points.across + k, select(p.clamped, Doubles{}, p.across));
+        store(points.down + k, select(p.clamped, Doubles{}, p.down));
         store(points.shift + k, p.shift);
+        if (a.affine == nullptr) return;
+        store(points.x + k, p.radius * p.cos);
+        store(points.y + k, p.radius * p.sin);
       });
       with_pixel_type<T>(a.pixel, [&]<typename E>() {
         for (int64_t k = 0; k < count; ++k) {
@@ -97,11 +105,21 @@ void backward_lens(const PolarSampleArgs<T>& a, int64_t begin, int64_t end, void
           if (corners.outside()) continue;
           T gx, gy;
           slope(corners, grads + (j + k) * a.channels, places.right[k], places.lower[k], &gx, &gy);
-          const double along = gx * points.cos[k] + gy * points.sin[k], shift = points.shift[k];
+          const double along = gx * points.across[k] + gy * points.down[k], shift = points.shift[k];
           sums[kAcross] += gx;
           sums[kDown] += gy;
           sums[kAlong] += along;
           sums[shift < 0 ? kInward : kOutward] += along * shift;
+          if (a.affine != nullptr) {
+            sums[kAffine] += gx * points.x[k];
+            sums[kAffine + 1] += gx * points.y[k];
+            sums[kAffine + 2] += gy * points.x[k];
+            sums[kAffine + 3] += gy * points.y[k];
+          }
+          if (grad_offsets != nullptr) {
+            grad_offsets[j + k] += gx;
+            grad_offsets[a.num_radii * a.num_azimuths + j + k] += gy;
+          }
         }
       });
     }

@@ -272,7 +272,8 @@ class Scatter {
   // Whether points of radius i may touch the band.
   bool touches(int64_t i) const {
     if (a.bands == 1) return true;
-    const double y = a.center[image * a.center_stride + 1], most = reach(a, image, i) + 2;
+    const double y = a.center[image * a.center_stride + 1];
+    const double most = reach(a, image, i).y + largest_offset(a, image, i) + 2;
     // Written so that NaN touches.
     return !(y + most < first_row || y - most > end_row);
   }

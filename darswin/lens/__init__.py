@@ -7,6 +7,7 @@ from darswin.lens.base import Lens, Number
 from darswin.lens.curves import Tabulated, as_curves, stack
 from darswin.lens.description import MODELS, from_dict, to_dict
 from darswin.lens.distorted import BrownConrady, Fisheye624, KannalaBrandt, Mei
+from darswin.lens.fitting import Fit, fit
 from darswin.lens.ideal import (
     Equidistant,
     Equisolid,
@@ -20,7 +21,7 @@ from darswin.lens.sphere import DoubleSphere, EnhancedUnified, Spherical
 
 __all__ = [
     "MODELS", "BrownConrady", "DoubleSphere", "EnhancedUnified", "Equidistant", "Equisolid",
-    "FieldOfView", "Fisheye624", "KannalaBrandt", "Lens", "Mei", "Number", "OCam", "OCamInverse",
-    "Orthographic", "Perspective", "Polynomial", "Spherical", "Stereographic", "Tabulated",
-    "as_curves", "from_dict", "stack", "to_dict",
+    "FieldOfView", "Fisheye624", "Fit", "KannalaBrandt", "Lens", "Mei", "Number", "OCam",
+    "OCamInverse", "Orthographic", "Perspective", "Polynomial", "Spherical", "Stereographic",
+    "Tabulated", "as_curves", "fit", "from_dict", "stack", "to_dict",
 ]  # fmt: skip

@@ -247,7 +247,7 @@ class Lens:
         flat = self._aligned(pixels)[0] - self._row(self.center_in(image_size), pixels.dim())
         if self.affine is not None:
             flat = _apply(torch.linalg.inv(self.affine), flat)
-        radius = _length(flat)
+        radius = length_of(flat)
         theta, direction = self.unproject(radius), flat / radius[..., None]
         if self.is_radial:
             return theta, direction
@@ -262,38 +262,6 @@ class Lens:
             theta: (N or 1, ...) rad. direction: (N or 1, ..., 2).
         """
         return self.to_pixels(self._flat(theta, direction), image_size)
-
-    def _find_rays(self, flat: Tensor, theta: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
-        """Newton's method in the plane θ (cos φ, sin φ), from the ray that would land there if
-        nothing but the radial curve were."""
-
-        def land(point: Tensor) -> Tensor:
-            length = _length(point)
-            return self._flat(length, point / length[..., None])
-
-        def step(point: Tensor) -> Tensor:
-            with torch.no_grad():
-                axes = torch.eye(2, dtype=point.dtype, device=point.device)
-                columns = [torch.func.jvp(land, (point,), (a.expand_as(point),))[1] for a in axes]
-                inverse = torch.linalg.inv_ex(torch.stack(columns, -1)).inverse
-            return torch.einsum("...ij,...j->...i", inverse, land(point) - flat)
-
-        end = self._row(self.theta_max.detach(), theta.dim())
-        with torch.no_grad():
-            start = torch.where(theta.isnan(), end, theta)
-            point = start[..., None] * direction
-            for _ in range(8):
-                point = point - step(point)
-                length = _length(point)
-                point = point * (end / length).clamp(max=1)[..., None]
-        # The last step carries the gradients.
-        point = point - step(point)
-        length = _length(point)
-        with torch.no_grad():
-            slack = 1e3 * torch.finfo(flat.dtype).eps
-            missed = _length(land(point) - flat) > slack * (1 + _length(flat))
-            missed |= ~(length <= end * (1 + slack))
-        return torch.where(missed, torch.nan, length), point / length[..., None]
 
     def to_pixels(self, flat: Tensor, image_size: tuple[int, int] | None = None) -> Tensor:
         """Points (N, ..., 2) around the principal point, before `affine` → pixels."""
@@ -492,8 +460,8 @@ def _apply(matrix: Tensor, points: Tensor) -> Tensor:
     return (Lens._row(matrix, points.dim() + 1) @ points[..., None])[..., 0]
 
 
-def _length(points: Tensor) -> Tensor:
-    """Of (..., 2), never 0, where a root has no slope."""
+def length_of(points: Tensor) -> Tensor:
+    """The length of (..., 2), never 0, where a root has no slope."""
     return points.square().sum(-1).clamp(min=1e-12 * torch.finfo(points.dtype).eps).sqrt()
 
 

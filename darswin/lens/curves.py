@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from darswin.inverse import inverse
-from darswin.lens.base import Lens, Number
+from darswin.lens.base import FRAME, Lens, Number
 
 
 class Tabulated(Lens):
@@ -62,7 +62,7 @@ class Tabulated(Lens):
 
         def end(h0: Tensor, h1: Tensor, s0: Tensor, s1: Tensor) -> Tensor:
             parabola = ((2 * h0 + h1) * s0 - h0 * s1) / (h0 + h1)
-            return torch.minimum(parabola.clamp(min=0), 3 * s0)
+            return torch.clamp(parabola, s0 / 10, 3 * s0)
 
         first = end(width[:, :1], width[:, 1:2], secant[:, :1], secant[:, 1:2])
         last = end(width[:, -1:], width[:, -2:-1], secant[:, -1:], secant[:, -2:-1])
@@ -127,10 +127,7 @@ def as_curves(lens: Lens, count: int = 512) -> Tabulated:
     Raises:
         ValueError: a lens with tangential or thin-prism terms, which no curve has.
     """
-    if (
-        lens.offset(lens.theta_max, torch.zeros_like(lens.theta_max)[..., None].expand(-1, 2))
-        is not None
-    ):
+    if not lens.is_radial:
         raise ValueError(
             "a lens with tangential or thin-prism terms is no curve; "
             "lens.replace(tangential=None, prism=None) leaves them out"
@@ -139,9 +136,7 @@ def as_curves(lens: Lens, count: int = 512) -> Tabulated:
     angles = lens.theta_max[:, None] * steps
     radii = lens.project(angles)
     radii = torch.cat((torch.zeros_like(radii[:, :1]), radii[:, 1:]), 1)
-    tensors = {
-        name: getattr(lens, name) for name in ("theta_max", "center", "affine", "image_size")
-    }
+    tensors = {name: getattr(lens, name) for name in ("theta_max", *FRAME)}
     return Tabulated._from_tensors(dict(angles=angles, radii=radii) | tensors)
 
 

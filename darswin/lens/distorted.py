@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from darswin.inverse import rising_limit
-from darswin.lens.base import MARGIN, Lens, Number
+from darswin.lens.base import MARGIN, Lens, Number, length_of
 from darswin.lens.polynomial import horner, slopes
 from darswin.lens.sphere import sphere_limit
 
@@ -86,6 +86,9 @@ class DistortedLens(Lens):
         """The radius of the plane that tangential and thin-prism terms are functions of."""
         return self._plane(theta)
 
+    def _offset_plane_slope(self, theta: Tensor) -> Tensor:
+        return self._plane_slope(theta)
+
     @property
     def is_radial(self) -> bool:
         return self.tangential is None and self.prism is None
@@ -94,16 +97,70 @@ class DistortedLens(Lens):
         w = self._offset_plane(theta)
         x, y = (w[..., None] * direction).unbind(-1)
         square = w * w
-        dx, dy = torch.zeros_like(x), torch.zeros_like(y)
-        if self.tangential is not None:
-            p1, p2 = (self._row(p, w.dim()) for p in self.tangential.unbind(1))
-            dx = dx + 2 * p1 * x * y + p2 * (square + 2 * x * x)
-            dy = dy + p1 * (square + 2 * y * y) + 2 * p2 * x * y
-        if self.prism is not None:
-            s1, s2, s3, s4 = (self._row(s, w.dim()) for s in self.prism.unbind(1))
-            dx = dx + square * (s1 + s2 * square)
-            dy = dy + square * (s3 + s4 * square)
+        p1, p2, s1, s2, s3, s4 = self._terms(w.dim())
+        dx = 2 * p1 * x * y + p2 * (square + 2 * x * x) + square * (s1 + s2 * square)
+        dy = p1 * (square + 2 * y * y) + 2 * p2 * x * y + square * (s3 + s4 * square)
         return self._row(self.focal, w.dim() + 1) * torch.stack((dx, dy), -1)
+
+    def _terms(self, dims: int) -> list[Tensor]:
+        """p₁, p₂, s₁ … s₄, to broadcast over `dims` dimensions."""
+        none = torch.zeros_like(self.focal)
+        p = (none, none) if self.tangential is None else self.tangential.unbind(1)
+        s = (none,) * 4 if self.prism is None else self.prism.unbind(1)
+        return [self._row(term, dims) for term in (*p, *s)]
+
+    def _offset_slopes(self, x: Tensor, y: Tensor) -> Tensor:
+        """(..., 2, 2): the derivatives of the offset in its plane, in units of the focal length."""
+        p1, p2, s1, s2, s3, s4 = self._terms(x.dim())
+        square = x * x + y * y
+        across, down = s1 + 2 * s2 * square, s3 + 2 * s4 * square
+        mixed = 2 * (p1 * x + p2 * y)
+        rows = (
+            (2 * p1 * y + 6 * p2 * x + 2 * x * across, mixed + 2 * y * across),
+            (mixed + 2 * x * down, 6 * p1 * y + 2 * p2 * x + 2 * y * down),
+        )
+        return torch.stack([torch.stack(row, -1) for row in rows], -2)
+
+    def _flat_slopes(self, theta: Tensor, direction: Tensor) -> Tensor:
+        """(..., 2, 2): the derivatives of where a ray lands in the plane θ (cos φ, sin φ)."""
+        w, w_slope = self._offset_plane(theta), self._offset_plane_slope(theta)
+        x, y = (w[..., None] * direction).unbind(-1)
+        aside = self._offset_slopes(x, y) @ _radial_slopes(w / theta, w_slope, direction)
+        straight = _radial_slopes(self.project(theta) / theta, self._slope(theta), direction)
+        return straight + self._row(self.focal, w.dim() + 2) * aside
+
+    def _find_rays(self, flat: Tensor, theta: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
+        """Newton's method in the plane θ (cos φ, sin φ), from the ray that would land there if
+        nothing but the radial curve were. The last step carries the gradients."""
+
+        def step(point: Tensor) -> Tensor:
+            theta = length_of(point)
+            direction = point / theta[..., None]
+            slopes = self._flat_slopes(theta, direction).detach()
+            missed = self._flat(theta, direction) - flat
+            return point - (torch.linalg.inv_ex(slopes).inverse @ missed[..., None])[..., 0]
+
+        end = self._row(self.theta_max.detach(), theta.dim())
+        with torch.no_grad():
+            point = torch.where(theta.isnan(), end, theta)[..., None] * direction
+            for _ in range(8):
+                point = step(point)
+                point = point * (end / length_of(point)).clamp(max=1)[..., None]
+        point = step(point)
+        theta = length_of(point)
+        direction = point / theta[..., None]
+        with torch.no_grad():
+            slack = 1e3 * torch.finfo(flat.dtype).eps
+            missed = length_of(self._flat(theta, direction) - flat) > slack * (1 + length_of(flat))
+            missed |= ~(theta <= end * (1 + slack))
+        return torch.where(missed, torch.nan, theta), direction
+
+
+def _radial_slopes(ratio: Tensor, slope: Tensor, direction: Tensor) -> Tensor:
+    """(..., 2, 2): the derivatives of a radial map, `ratio` across and `slope` along a radius."""
+    along = direction[..., :, None] * direction[..., None, :]
+    across = torch.eye(2, dtype=ratio.dtype, device=ratio.device) - along
+    return ratio[..., None, None] * across + slope[..., None, None] * along
 
 
 class KannalaBrandt(DistortedLens):
@@ -149,6 +206,9 @@ class Fisheye624(KannalaBrandt):
 
     def _offset_plane(self, theta: Tensor) -> Tensor:
         return self._stretch(theta)
+
+    def _offset_plane_slope(self, theta: Tensor) -> Tensor:
+        return self._stretch_slope(theta)
 
 
 class Mei(DistortedLens):

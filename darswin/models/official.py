@@ -93,6 +93,8 @@ def grid(
     height, width = image_size
     if height != width:
         raise ValueError(f"compat='official' needs square images, got (H, W) = {image_size}")
+    if lens.affine is not None or not lens.is_radial:
+        raise ValueError("compat='official' needs radial lenses, with no affine, got " + repr(lens))
     like = lens.theta_max
     lens = lens.replace(theta_max=like[:1].expand(len(lens)))
     along_r, along_phi = (_inclusive(count - 1, like) for count in samples)

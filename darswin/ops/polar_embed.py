@@ -7,7 +7,12 @@ from torch import Tensor
 
 from darswin.ops import _library, reference
 from darswin.ops.checks import check_shape, check_tensor
-from darswin.ops.polar_sample import sampling_arguments
+from darswin.ops.polar_sample import (
+    sampling_arguments,
+    sampling_gradients,
+    sampling_wants,
+    wanted_gradients,
+)
 
 
 def polar_embed(
@@ -18,6 +23,8 @@ def polar_embed(
     weight: Tensor,
     bias: Tensor | None = None,
     *,
+    affine: Tensor | None = None,
+    offsets: Tensor | None = None,
     patch: tuple[int, int],
     jitter: float = 0.0,
     seed: int | Tensor = 0,
@@ -29,7 +36,8 @@ def polar_embed(
     The samples are never written to memory; backward makes them again.
 
     Args:
-        image, radii, azimuths, center, patch, jitter, seed, mean, std: as `polar_sample`.
+        image, radii, azimuths, center, affine, offsets, patch, jitter, seed, mean, std: as
+            `polar_sample`.
         weight: (D, S_r·S_φ·C), float64 if the image is, else float32 or bfloat16.
         bias: (D,) or None, as weight.
 
@@ -37,16 +45,18 @@ def polar_embed(
         (B, R, A, D). bfloat16 where the image is, or under bfloat16 autocast; float64 where the
         image is; else float32. bfloat16 is computed in float32 and rounded once.
 
-    Gradients go to weight, bias, image (unless uint8), radii and center; results and gradients do
-    not depend on the number of threads.
+    Gradients go to weight, bias, image (unless uint8), radii, center, affine and offsets; results
+    and gradients do not depend on the number of threads.
 
     Raises:
         TypeError, ValueError: as `polar_sample`, and for a weight or bias that does not fit.
 
     Source: DarSwin, ICCV 2023, sec. 4.3.
     """
-    sampling = sampling_arguments(image, radii, azimuths, center, patch, jitter, seed, mean, std)
-    image, patch = sampling[0], sampling[4]
+    sampling = sampling_arguments(
+        image, radii, azimuths, center, affine, offsets, patch, jitter, seed, mean, std
+    )
+    image, patch = sampling[0], sampling[6]
     double = image.dtype == torch.float64
     dtypes = (torch.float64,) if double else (torch.float32, torch.bfloat16)
     check_tensor("weight", weight, like=image, dtypes=dtypes)
@@ -55,7 +65,7 @@ def polar_embed(
     if bias is not None:
         check_tensor("bias", bias, like=image, dtypes=dtypes)
         check_shape("bias", bias, f"(D,) = ({weight.shape[0]},)", (weight.shape[0],))
-    arguments = (*sampling[:4], weight, bias, *sampling[4:], _library.output_bfloat16(image))
+    arguments = (*sampling[:6], weight, bias, *sampling[6:], _library.output_bfloat16(image))
     if _library.compiled(image):
         return torch.ops.darswin.polar_embed(*arguments)
     with _library.autocast_off(image.device.type):
@@ -63,7 +73,7 @@ def polar_embed(
 
 
 @torch.library.register_fake("darswin::polar_embed")
-def _fake(image, radii, azimuths, center, weight, bias, patch, *settings):
+def _fake(image, radii, azimuths, center, affine, offsets, weight, bias, patch, *settings):
     shape = (
         image.shape[0], radii.shape[1] // patch[0], azimuths.shape[0] // patch[1], weight.shape[0],
     )  # fmt: skip
@@ -72,43 +82,36 @@ def _fake(image, radii, azimuths, center, weight, bias, patch, *settings):
 
 
 @torch.library.register_fake("darswin::polar_embed_backward")
-def _fake_backward(grad_out, image, radii, azimuths, center, weight, *settings):
-    image_grad, lens_grad, weight_grad = settings[-3:]
+def _fake_backward(grad_out, image, radii, azimuths, center, affine, offsets, weight, *settings):
+    *_, image_grad, lens_grad, offsets_grad, weight_grad = settings
+    wants = (image_grad, lens_grad, offsets_grad)
     return (
-        image.new_empty(image.shape if image_grad else (0,)),
-        radii.new_empty(radii.shape if lens_grad else (0,)),
-        center.new_empty(center.shape if lens_grad else (0,)),
+        *sampling_gradients(image, radii, center, affine, offsets, *wants),
         radii.new_empty(weight.shape if weight_grad else (0,)),
         radii.new_empty(weight.shape[:1] if weight_grad else (0,)),
     )
 
 
 def _setup_context(ctx, inputs, output):
-    image, radii, azimuths, center, weight, bias, patch, jitter, seed, *rest = inputs
-    ctx.save_for_backward(image, radii, azimuths, center, weight, seed)
-    ctx.settings = (patch, jitter, rest)
-    ctx.bias_dtype = None if bias is None else bias.dtype
+    *sampling, weight, bias, patch, jitter, seed, mean, std, bfloat16 = inputs
+    ctx.save_for_backward(*sampling, weight, seed)
+    ctx.settings = (patch, jitter), (mean, std, bfloat16)
+    ctx.bias_dtype = weight.dtype if bias is None else bias.dtype
 
 
 def _backward(ctx, grad_out):
-    image, radii, azimuths, center, weight, seed = ctx.saved_tensors
-    patch, jitter, rest = ctx.settings
-    wants_image, wants_radii, _, wants_center, wants_weight, wants_bias = ctx.needs_input_grad[:6]
-    grad_image, grad_radii, grad_center, grad_weight, grad_bias = (
+    *sampling, weight, seed = ctx.saved_tensors
+    settings, rest = ctx.settings
+    wants_weight, wants_bias = ctx.needs_input_grad[6:8]
+    image, radii, center, affine, offsets, grad_weight, grad_bias = (
         torch.ops.darswin.polar_embed_backward(
-            grad_out, image, radii, azimuths, center, weight, patch, jitter, seed, *rest,
-            wants_image, wants_radii or wants_center, wants_weight or wants_bias,
+            grad_out, *sampling, weight, *settings, seed, *rest,
+            *sampling_wants(ctx.needs_input_grad), wants_weight or wants_bias,
         )
     )  # fmt: skip
-    grads = (
-        grad_image if wants_image else None,
-        grad_radii if wants_radii else None,
-        None,
-        grad_center if wants_center else None,
-        grad_weight.to(weight.dtype) if wants_weight else None,
-        grad_bias.to(ctx.bias_dtype) if wants_bias else None,
-    )
-    return (*grads, *(None,) * 6)
+    grads = (image, radii, None, center, affine, offsets)
+    grads += (grad_weight.to(weight.dtype), grad_bias.to(ctx.bias_dtype))
+    return wanted_gradients(ctx, *grads, *(None,) * 6)
 
 
 torch.library.register_autograd("darswin::polar_embed", _backward, setup_context=_setup_context)

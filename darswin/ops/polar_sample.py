@@ -25,6 +25,8 @@ def polar_sample(
     azimuths: Tensor,
     center: Tensor,
     *,
+    affine: Tensor | None = None,
+    offsets: Tensor | None = None,
     patch: tuple[int, int],
     jitter: float = 0.0,
     seed: int | Tensor = 0,
@@ -34,25 +36,31 @@ def polar_sample(
 ) -> Tensor:
     """Samples an image bilinearly on a polar grid, zeros outside.
 
-    Point (i, j) of image b stands at `x = cx + r cos a`, `y = cy + r sin a` with `r = radii[b, i]`
-    and `a = azimuths[j]`.
+    Point (i, j) of image b stands at `(x, y) = center + affine @ (r cos a, r sin a) +
+    offsets[b, :, i, j]` with `r = radii[b, i]` and `a = azimuths[j]`. A lens that is round needs
+    neither affine nor offsets, and pays nothing for them.
 
     Convention:
         Pixel centres are integers, x to the right in [0, W-1] and y down in [0, H-1]; azimuth 0
-        points right, π/2 down. NaN and infinite radii sample nothing.
+        points right, π/2 down. Points at NaN or infinity sample nothing.
 
     Args:
         image: (B, C, H, W), any strides: float32, float64, bfloat16, or uint8 camera frames, which
             may also be (B, H, W, 3).
-        radii: (B or 1, R·S_r) px. Like azimuths and center float64 if the image is, else float32.
+        radii: (B or 1, R·S_r) px. Like azimuths, center, affine and offsets float64 if the image
+            is, else float32.
         azimuths: (A·S_φ,) rad. They get no gradient.
         center: (B or 1, 2) px, x then y.
+        affine: (B or 1, 2, 2), of rows x and y: aspect ratio and skew. None is the identity.
+        offsets: (B or 1, 2, R·S_r, A·S_φ) px, x then y: what is left of a lens that is not round,
+            such as its tangential distortion. None is zero.
         patch: (S_r, S_φ), the samples of a patch along radius and azimuth.
         jitter: in [0, 1]. Moves each point by `u·jitter` cells along its row of radii (linear
             between neighbours, extrapolated at both ends, never below 0) and by
-            `v·jitter·2π/(A·S_φ)` in azimuth. u and v, in [-½, ½), are the upper and the lower half
-            of one 32-bit word of Philox4x32-10: for point p = i·A·S_φ + j of image b word p mod 4
-            of key `seed`, counter (⌊p/4⌋, b).
+            `v·jitter·2π/(A·S_φ)` in azimuth, before the matrix; its offset stays that of the
+            unmoved point. u and v, in [-½, ½), are the upper and the lower half of one 32-bit word
+            of Philox4x32-10: for point p = i·A·S_φ + j of image b word p mod 4 of key `seed`,
+            counter (⌊p/4⌋, b).
         seed: int or 0-dim int64 tensor on the CPU. Without jitter it is not used.
         layout: "tokens" or "image".
         mean, std: of uint8 images only, which count as `(pixel/255 - mean) / std`: one number, or
@@ -64,8 +72,8 @@ def polar_sample(
         bfloat16 where the image is, or under bfloat16 autocast; float64 where the image is; else
         float32. bfloat16 is computed in float32 and rounded once.
 
-    Gradients go to image (unless uint8), radii and center; results and gradients do not depend on
-    the number of threads.
+    Gradients go to image (unless uint8), radii, center, affine and offsets; results and gradients
+    do not depend on the number of threads.
 
     A large fresh output costs its memory's first touch, about as much time as sampling. Where the
     linear layer of a patch embedding comes next, `polar_embed` never writes the samples at all.
@@ -76,7 +84,9 @@ def polar_sample(
 
     Source: DarSwin, ICCV 2023, sec. 4.3.
     """
-    sampling = sampling_arguments(image, radii, azimuths, center, patch, jitter, seed, mean, std)
+    sampling = sampling_arguments(
+        image, radii, azimuths, center, affine, offsets, patch, jitter, seed, mean, std
+    )
     check_layout(layout)
     arguments = (*sampling, layout == "tokens", _library.output_bfloat16(sampling[0]))
     if _library.compiled(image):
@@ -85,7 +95,9 @@ def polar_sample(
         return reference.polar_sample(*arguments)
 
 
-def sampling_arguments(image, radii, azimuths, center, patch, jitter, seed, mean, std) -> tuple:
+def sampling_arguments(
+    image, radii, azimuths, center, affine, offsets, patch, jitter, seed, mean, std
+) -> tuple:
     """What `polar_sample` and `polar_embed` share, checked, as the operators take it."""
     if isinstance(image, Tensor):
         image = _library.without_float16(image)
@@ -93,12 +105,21 @@ def sampling_arguments(image, radii, azimuths, center, patch, jitter, seed, mean
     check_shape("image", image, "(B, C, H, W)", (None,) * 4)
     image = channels_first(image)
     geometry = None if image.dtype in DTYPES else (torch.float32,)
-    for name, value in (("radii", radii), ("azimuths", azimuths), ("center", center)):
-        check_tensor(name, value, like=image, dtypes=geometry)
+    tensors = dict(radii=radii, azimuths=azimuths, center=center, affine=affine, offsets=offsets)
+    for name, value in tensors.items():
+        if value is not None or name not in ("affine", "offsets"):
+            check_tensor(name, value, like=image, dtypes=geometry)
     batch, channels = image.shape[:2]
     check_shape("radii", radii, f"(B or 1, R·S_r) = ({batch} or 1, any)", (batch, None), (1, None))
     check_shape("azimuths", azimuths, "(A·S_φ,)", (None,))
     check_shape("center", center, f"(B or 1, 2) = ({batch} or 1, 2)", (batch, 2), (1, 2))
+    if affine is not None:
+        form = f"(B or 1, 2, 2) = ({batch} or 1, 2, 2)"
+        check_shape("affine", affine, form, (batch, 2, 2), (1, 2, 2))
+    if offsets is not None:
+        points = (2, radii.shape[1], azimuths.shape[0])
+        form = f"(B or 1, 2, R·S_r, A·S_φ) = ({batch} or 1, {', '.join(map(str, points))})"
+        check_shape("offsets", offsets, form, (batch, *points), (1, *points))
     patch = check_pair("patch", patch, lowest=1)
     if radii.shape[1] % patch[0] or azimuths.shape[0] % patch[1]:
         raise ValueError(
@@ -114,7 +135,8 @@ def sampling_arguments(image, radii, azimuths, center, patch, jitter, seed, mean
         mean = std = ()
     else:
         raise ValueError(f"mean and std go with uint8 images, got an image of {image.dtype}")
-    return image, radii, azimuths, center, patch, float(jitter), key, mean, std
+    jitter = float(jitter)
+    return image, radii, azimuths, center, affine, offsets, patch, jitter, key, mean, std
 
 
 def _seed_tensor(seed: int | Tensor) -> Tensor:
@@ -133,7 +155,8 @@ def _seed_tensor(seed: int | Tensor) -> Tensor:
 
 
 @torch.library.register_fake("darswin::polar_sample")
-def _fake(image, radii, azimuths, center, patch, jitter, seed, mean, std, tokens, bfloat16):
+def _fake(image, radii, azimuths, center, affine, offsets, patch, *settings):
+    *_, tokens, bfloat16 = settings
     batch, channels = image.shape[:2]
     rows, columns = radii.shape[1], azimuths.shape[0]
     if tokens:
@@ -144,36 +167,53 @@ def _fake(image, radii, azimuths, center, patch, jitter, seed, mean, std, tokens
 
 
 @torch.library.register_fake("darswin::polar_sample_backward")
-def _fake_backward(grad_out, image, radii, azimuths, center, *settings):
-    image_grad, lens_grad = settings[-2:]
-    return (
-        image.new_empty(image.shape if image_grad else (0,)),
-        radii.new_empty(radii.shape if lens_grad else (0,)),
-        center.new_empty(center.shape if lens_grad else (0,)),
+def _fake_backward(grad_out, image, radii, azimuths, center, affine, offsets, *settings):
+    return sampling_gradients(image, radii, center, affine, offsets, *settings[-3:])
+
+
+def sampling_gradients(
+    image, radii, center, affine, offsets, image_grad, lens_grad, offsets_grad
+) -> tuple[Tensor, ...]:
+    """The gradients of the sampling as the backward operators give them: empty if not wanted."""
+    return tuple(
+        value.new_empty(value.shape) if wanted and value is not None else like.new_empty((0,))
+        for value, like, wanted in (
+            (image, image, image_grad),
+            (radii, radii, lens_grad),
+            (center, radii, lens_grad),
+            (affine, radii, lens_grad),
+            (offsets, radii, offsets_grad),
+        )
     )
+
+
+def sampling_wants(needs_input_grad: Sequence[bool]) -> tuple[bool, bool, bool]:
+    """Whether backward needs the gradients of the image, of the lens and of the offsets."""
+    image, radii, _, center, affine, offsets = needs_input_grad[:6]
+    return image, radii or center or affine, offsets
 
 
 def _setup_context(ctx, inputs, output):
-    image, radii, azimuths, center, patch, jitter, seed, *rest = inputs
-    ctx.save_for_backward(image, radii, azimuths, center, seed)
-    ctx.settings = (patch, jitter, rest)
+    *sampling, patch, jitter, seed, mean, std, tokens, bfloat16 = inputs
+    ctx.save_for_backward(*sampling, seed)
+    ctx.settings = (patch, jitter), (mean, std, tokens, bfloat16)
 
 
 def _backward(ctx, grad_out):
-    image, radii, azimuths, center, seed = ctx.saved_tensors
-    patch, jitter, rest = ctx.settings
-    wants_image, wants_radii, _, wants_center = ctx.needs_input_grad[:4]
-    grad_image, grad_radii, grad_center = torch.ops.darswin.polar_sample_backward(
-        grad_out, image, radii, azimuths, center, patch, jitter, seed, *rest,
-        wants_image, wants_radii or wants_center,
-    )  # fmt: skip
-    grads = (
-        grad_image if wants_image else None,
-        grad_radii if wants_radii else None,
-        None,
-        grad_center if wants_center else None,
+    *sampling, seed = ctx.saved_tensors
+    settings, rest = ctx.settings
+    image, radii, center, affine, offsets = torch.ops.darswin.polar_sample_backward(
+        grad_out, *sampling, *settings, seed, *rest, *sampling_wants(ctx.needs_input_grad)
     )
-    return (*grads, *(None,) * 7)
+    return wanted_gradients(ctx, image, radii, None, center, affine, offsets, *(None,) * 7)
+
+
+def wanted_gradients(ctx, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
+    """The gradients of inputs that need one, None for the others."""
+    return tuple(
+        gradient if wanted else None
+        for gradient, wanted in zip(gradients, ctx.needs_input_grad, strict=True)
+    )
 
 
 torch.library.register_autograd("darswin::polar_sample", _backward, setup_context=_setup_context)

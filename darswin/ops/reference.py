@@ -68,6 +68,8 @@ def polar_sample(
     radii: Tensor,
     azimuths: Tensor,
     center: Tensor,
+    affine: Tensor | None,
+    offsets: Tensor | None,
     patch: tuple[int, int],
     jitter: float,
     seed: Tensor | None,
@@ -85,9 +87,18 @@ def polar_sample(
     r, a = radii[:, :, None], azimuths[None, None, :]
     if jitter > 0 and rows > 0 and columns > 0:
         r, a = _jittered(radii, azimuths, batch, jitter, seed)
-    x = center[:, 0, None, None] + r * torch.cos(a)  # (B or 1, N_r, N_a)
-    y = center[:, 1, None, None] + r * torch.sin(a)
-    touches = (x > -1) & (x < width) & (y > -1) & (y < height)  # NaN touches nothing
+    x, y = r * torch.cos(a), r * torch.sin(a)  # (B or 1, N_r, N_a)
+    known = True
+    if affine is not None:
+        # Gradients must not meet what is no number: it stays one when it is multiplied with 0.
+        known = x.isfinite() & y.isfinite() & affine.isfinite().all(2).all(1)[:, None, None]
+        x, y = torch.where(known, x, 0), torch.where(known, y, 0)
+        (xx, xy), (yx, yy) = affine.nan_to_num(0, 0, 0).permute(1, 2, 0)[..., None, None]
+        x, y = xx * x + xy * y, yx * x + yy * y
+    x, y = center[:, 0, None, None] + x, center[:, 1, None, None] + y
+    if offsets is not None:
+        x, y = x + offsets[:, 0], y + offsets[:, 1]
+    touches = known & (x > -1) & (x < width) & (y > -1) & (y < height)  # NaN touches nothing
     x, y = torch.where(touches, x, -1), torch.where(touches, y, -1)
     left, top = x.detach().floor(), y.detach().floor()
     right, lower = x - left, y - top
@@ -118,6 +129,8 @@ def polar_embed(
     radii: Tensor,
     azimuths: Tensor,
     center: Tensor,
+    affine: Tensor | None,
+    offsets: Tensor | None,
     weight: Tensor,
     bias: Tensor | None,
     patch: tuple[int, int],
@@ -129,7 +142,7 @@ def polar_embed(
 ) -> Tensor:
     """See `darswin.ops.polar_embed`."""
     settings = (patch, jitter, seed, mean, std, True, False)
-    samples = polar_sample(image, radii, azimuths, center, *settings)
+    samples = polar_sample(image, radii, azimuths, center, affine, offsets, *settings)
     weight = weight.to(samples.dtype)
     bias = None if bias is None else bias.to(samples.dtype)
     out = F.linear(samples, weight, bias)

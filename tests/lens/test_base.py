@@ -1,4 +1,5 @@
 import copy
+import json
 import math
 import pickle
 
@@ -8,7 +9,7 @@ import torch
 from torch.utils import _pytree as pytree
 from torch.utils.data import DataLoader, Dataset
 
-from darswin.lens import Perspective, Polynomial, Spherical, stack
+from darswin.lens import Perspective, Polynomial, Spherical, from_dict, stack, to_dict
 
 f64 = torch.float64
 
@@ -47,21 +48,6 @@ def test_project_rises_beyond_90_degrees_where_the_model_does(name):
     assert (lens.project(lens.theta_max[:, None] * steps).diff(dim=1) > 0).all()
     if name != "perspective":
         assert (lens.theta_max > math.pi / 2).any()
-
-
-@pytest.mark.parametrize(
-    ("coefficients", "theta_deg", "radius"),
-    [  # valeoai/WoodScape front.json and SynWoodScape FV
-        ((339.749, -31.988, 48.275, -7.201), (10, 45, 75, 90, 95),
-         (58.573, 267.754, 477.055, 598.013, 641.012)),
-        ((341.725, -26.4448, 32.7864, 0.50499), (10, 45, 75, 90, 95),
-         (59.012, 268.154, 477.025, 601.678, 647.167)),
-    ],
-)  # fmt: skip
-def test_polynomial_gives_woodscape_radii(coefficients, theta_deg, radius):
-    lens = Polynomial(coefficients, math.radians(112))
-    theta = torch.deg2rad(torch.tensor(theta_deg, dtype=torch.float32))
-    torch.testing.assert_close(lens.project(theta), torch.tensor(radius), rtol=0, atol=2e-3)
 
 
 def test_spherical_has_the_papers_focal_lengths():
@@ -252,3 +238,70 @@ def test_a_resized_lens_projects_to_the_resized_image(center):
     middle, before = half.center_in((15, 20))[0], lens.center_in((30, 40))[0]
     assert torch.allclose(middle + 0.5, (before + 0.5) / 2)
     assert Polynomial([5.0, 1.0], 1.0).resized(2).coefficients.tolist() == [[10.0, 2.0]]
+
+
+def test_resizing_to_a_size_keeps_where_rays_land():
+    lens = Polynomial([339.749, -31.988, 48.275, -7.201], 1.6, [643.4, 479.4],
+                      affine=[[1.0, 0.0], [0.0, 1.2]], image_size=(966, 1280))  # fmt: skip
+    theta, azimuth = torch.tensor([0.0, 0.5, 1.5]), torch.tensor([0.3, 2.0, -1.0])
+    before = lens.project_rays(theta, azimuth)
+    half = lens.resized((483, 320))
+    assert half.image_size.tolist() == [[483, 320]]
+    after = (before + 0.5) * torch.tensor([0.25, 0.5]) - 0.5
+    torch.testing.assert_close(half.project_rays(theta, azimuth), after, rtol=1e-5, atol=1e-4)
+    assert lens.resized(0.5).image_size.tolist() == [[483, 640]]
+    assert lens.resized((483, 640)).affine.tolist() == lens.affine.tolist()
+    with pytest.raises(ValueError, match="needs a lens that has an image_size"):
+        Spherical(0.5, 10.0, 1.0).resized((3, 4))
+
+
+def test_cropping_moves_the_principal_point():
+    lens = Spherical(0.5, 100.0, 1.0, image_size=(300, 400))
+    part = lens.cropped(50, 100, 200, 150)
+    assert part.center.tolist() == [[199.5 - 100, 149.5 - 50]]
+    assert part.image_size.tolist() == [[200, 150]]
+    with pytest.raises(ValueError, match="needs the image_size"):
+        Spherical(0.5, 100.0, 1.0).cropped(0, 0, 10, 10)
+
+
+def test_angles_at_the_sides_of_the_image():
+    lens = Polynomial([339.749, -31.988, 48.275, -7.201], None, [639.5, 482.5],
+                      image_size=(966, 1280))  # fmt: skip
+    left, top, right, bottom = torch.rad2deg(lens.side_angles()[0]).tolist()
+    assert left == pytest.approx(94.88, abs=5e-3) and right == pytest.approx(left, abs=1e-4)
+    assert top == pytest.approx(75.77, abs=5e-3) and bottom == pytest.approx(top, abs=1e-4)
+    # An image that ends beyond the circle sees as far as the lens.
+    small = Spherical(2.0, 10.0, image_size=(100, 8))
+    assert small.side_angles()[0].tolist()[1] == small.theta_limit.item()
+
+
+def test_another_theta_max():
+    lens = Spherical([0.5, 2.0], 10.0, 1.0)
+    assert torch.equal(lens.with_theta_max(None).theta_max, lens.theta_limit)
+    assert lens.with_theta_max(1.5).theta_max.tolist() == [1.5, 1.5]
+    assert lens.theta_max.tolist() == [1.0, 1.0]
+    with pytest.raises(ValueError, match=r"theta_max must be at most 2\.09"):
+        lens.with_theta_max(2.5)
+
+
+def test_stacking_needs_the_same_frame():
+    with_size = Spherical(0.5, 10.0, 1.0, image_size=(4, 4))
+    with pytest.raises(ValueError, match="image_size for all"):
+        stack([with_size, Spherical(0.5, 10.0, 1.0)])
+    tilted = Spherical(0.5, 10.0, 1.0, affine=[[1.0, 0.0], [0.0, 2.0]])
+    both = stack([tilted, Spherical(0.5, 10.0, 1.0)])
+    assert isinstance(both, Spherical) and both.affine[1].tolist() == [[1.0, 0.0], [0.0, 1.0]]
+
+
+def test_as_json_and_back():
+    lens = Spherical(torch.tensor(0.1, dtype=f64), 300.0, 1.3, [3.0, 4.0], image_size=(480, 640))
+    described = to_dict(lens)
+    assert described == {
+        "model": "Spherical", "xi": 0.1, "focal": 300.0, "theta_max": 1.3, "center": [3.0, 4.0],
+        "image_size": [480, 640],
+    }  # fmt: skip
+    assert to_dict(from_dict(json.loads(json.dumps(to_dict(lens))))) == to_dict(
+        lens.to(torch.float32)
+    )
+    with pytest.raises(ValueError, match="one lens, got 2"):
+        to_dict(lens.expand(2))

@@ -102,7 +102,8 @@ def test_opcheck(requires_grad, with_bias):
     for tensor in (image, radii, center, weight, bias):
         tensor.requires_grad_(requires_grad)
     settings = ((4, 5), 0.5, torch.tensor(5), (), (), False)
-    arguments = (image, radii, azimuths, center, weight, bias if with_bias else None, *settings)
+    parameters = (weight, bias if with_bias else None)
+    arguments = (image, radii, azimuths, center, None, None, *parameters, *settings)
     torch.library.opcheck(torch.ops.darswin.polar_embed.default, arguments)
 
 
@@ -266,6 +267,6 @@ def test_the_compiled_operator_itself_reads_nothing_outside():
     ):  # fmt: skip
         with pytest.raises(RuntimeError):
             torch.ops.darswin.polar_embed(
-                image, radii, azimuths, center, bad_weight, bad_bias, (4, 5), 0.0, None, (), (),
-                False,
+                image, radii, azimuths, center, None, None, bad_weight, bad_bias, (4, 5), 0.0, None,
+                (), (), False,
             )  # fmt: skip

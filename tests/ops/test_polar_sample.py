@@ -153,15 +153,29 @@ def test_opcheck(requires_grad, jitter):
     for tensor in (image, radii, center):
         tensor.requires_grad_(requires_grad)
     seed = torch.tensor(5) if jitter else None
-    arguments = (image, radii, azimuths, center, (3, 4), jitter, seed, (), (), True, False)
+    arguments = (
+        image,
+        radii,
+        azimuths,
+        center,
+        None,
+        None,
+        (3, 4),
+        jitter,
+        seed,
+        (),
+        (),
+        True,
+        False,
+    )
     torch.library.opcheck(torch.ops.darswin.polar_sample.default, arguments)
 
 
 def test_opcheck_backward():
     image, radii, center, azimuths = make_inputs()
     grad = torch.randn(2, 2, 2, 36)
-    for wanted in ((True, True), (True, False), (False, True)):
-        settings = ((3, 4), 0.0, None, (), (), True, False)
+    for wanted in ((True, True, False), (True, False, False), (False, True, False)):
+        settings = (None, None, (3, 4), 0.0, None, (), (), True, False)
         arguments = (grad, image, radii, azimuths, center, *settings, *wanted)
         torch.library.opcheck(
             torch.ops.darswin.polar_sample_backward.default,
@@ -723,9 +737,9 @@ def test_errors_say_what_was_expected(change, error, message, reference):
 def test_the_compiled_operator_itself_reads_nothing_outside():
     # Without the checks of the public function, wrong sizes must still not crash.
     image, radii, center, azimuths = make_inputs()
-    good = (image, radii, azimuths, center, (3, 4), 0.0, None, (), (), True, False)
+    good = (image, radii, azimuths, center, None, None, (3, 4), 0.0, None, (), (), True, False)
     for index, value in {
-        0: torch.zeros(3), 1: torch.zeros(3, 6), 3: torch.zeros(1, 1), 4: (0, 4), 5: 0.5,
+        0: torch.zeros(3), 1: torch.zeros(3, 6), 3: torch.zeros(1, 1), 6: (0, 4), 7: 0.5,
     }.items():  # fmt: skip
         arguments = [value if k == index else v for k, v in enumerate(good)]
         with pytest.raises(RuntimeError):
