@@ -112,7 +112,8 @@ def _model(lens: Lens, image_size: tuple[int, int]) -> list[tuple[str, str]]:
         a, b, c, d = lens.affine[0].flatten().tolist()
         rows.append(("affine", f"[[{a:.6g}, {b:.6g}], [{c:.6g}, {d:.6g}]]"))
     if not lens.is_radial:
-        rows.append(("tangential", f"moves a ray by {largest_offset(lens):.2f} px at most"))
+        offset = f"{largest_offset(lens):.2f} px at most, by tangential and thin-prism terms"
+        rows.append(("off the curve", offset))
     return rows
 
 
@@ -167,7 +168,7 @@ def _usable(lens: Lens, spacing: str) -> bool:
 
 
 def _numbers(values: Tensor) -> str:
-    return ", ".join(f"{value:.8g}" for value in values.reshape(-1).tolist())
+    return ", ".join(f"{value:.7g}" for value in values.reshape(-1).tolist())
 
 
 def _degrees(angle: float) -> str:
