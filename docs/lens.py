@@ -52,12 +52,15 @@ def room(rays: np.ndarray) -> np.ndarray:
 def photograph(lens: Polynomial) -> np.ndarray:
     """The room through a lens, four rays a pixel: (H, W, 3) uint8."""
     height, width = SIZE
-    y, x = np.mgrid[: 2 * height, : 2 * width] / 2 - 0.25
+    return np.concatenate([row(lens, y, width) for y in range(height)])
+
+
+def row(lens: Polynomial, y: int, width: int) -> np.ndarray:
+    y, x = np.mgrid[2 * y : 2 * y + 2, : 2 * width] / 2 - 0.25
     theta, direction = lens.rays(torch.from_numpy(np.stack((x, y), -1))[None])
     aside = torch.sin(theta)[..., None] * direction
     rays = torch.cat((aside, torch.cos(theta)[..., None]), -1)[0].numpy()
-    colours = room(rays).reshape(height, 2, width, 2, 3)
-    return colours.mean((1, 3)).round().astype(np.uint8)
+    return room(rays).reshape(1, 2, width, 2, 3).mean((1, 3)).round().astype(np.uint8)
 
 
 def main() -> None:
