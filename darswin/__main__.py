@@ -10,7 +10,10 @@ COMMANDS = {
     "predict": "names what is in pictures taken through a known lens",
     "convert": "makes a safetensors file of a pickled checkpoint, without executing it",
     "models": "lists the models",
+    "lens": "draws, describes or converts a calibrated lens",
 }
+# What a command imports beyond torch, if not Lightning, which brings all.
+NEEDS = {"models": (), "lens": ("cv2", "jsonargparse", "matplotlib")}
 
 
 def main(argv: list[str] | None = None) -> None:
@@ -24,14 +27,17 @@ def main(argv: list[str] | None = None) -> None:
         return
     if command not in COMMANDS:
         raise SystemExit(f"darswin: no command {command!r}; there are {', '.join(COMMANDS)}")
-    if command != "models" and importlib.util.find_spec("lightning") is None:
+    if any(importlib.util.find_spec(name) is None for name in NEEDS.get(command, ("lightning",))):
         raise SystemExit("darswin: this needs more packages: pip install 'darswin[train]'")
     try:
         _run(command, argv)
     except (OSError, ValueError, FloatingPointError) as error:
         # A worker process puts its whole traceback into the message; the last line is the error's.
         message = str(error).strip().splitlines()[-1] if "Traceback" in str(error) else str(error)
-        if "BrokenImageError" in f"{type(error).__name__}{message}" and command != "predict":
+        if "BrokenImageError" in f"{type(error).__name__}{message}" and command not in (
+            "predict",
+            "lens",
+        ):
             message += " (--data.skip_broken true leaves such files out)"
         raise SystemExit(f"darswin: {message}") from error
 
@@ -58,6 +64,10 @@ def _run(command: str, argv: list[str]) -> None:
         from darswin.compat import convert_checkpoint
 
         auto_cli(convert_checkpoint, args=argv[1:], prog="darswin convert")
+    elif command == "lens":
+        from darswin.lens.cli import run
+
+        run(argv[1:])
     else:
         from darswin.models import list_models
 

@@ -28,15 +28,10 @@ def reprojection(
         torch.arange(width, dtype=like.dtype, device=like.device),
         indexing="ij",
     )
-    offset = torch.stack((x, y), -1) - target.center_in(size)[:, None, None]
-    # Away from 0, where a root has no slope: r_source / r_target has a limit there all the same.
-    square = offset.square().sum(-1).clamp(min=1e-12)
-    radius = square.sqrt().expand(len(target), -1, -1)
-    theta = target.unproject(radius)
+    theta, direction = target.rays(torch.stack((x, y), -1)[None], size)
     limit = torch.minimum(source.theta_max, target.theta_max)[:, None, None]
     seen = theta <= limit * (1 + 4 * torch.finfo(like.dtype).eps)  # False for NaN
-    ratio = source.project(torch.where(seen, theta, limit)) / radius  # keeps the azimuth
-    there = source.center_in(source_size)[:, None, None] + offset * ratio[..., None]
+    there = source.pixels(torch.where(seen, theta, limit), direction, source_size)
     return torch.where(seen[..., None], there, -10)
 
 

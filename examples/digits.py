@@ -98,8 +98,7 @@ def draw(model: DarSwin, scan: np.ndarray, path: Path) -> None:
         rows[0, column].imshow(images[0, 0], cmap="gray")
         rows[0, column].set_title(f"ξ = {xi:g}")
         rows[0, column].axis("off")
-        grid = sampler.grid(lenses, (SIZE, SIZE))
-        draw_grid(rows[1, column], images[0, 0].numpy(), grid, sampler.sectors)
+        draw_grid(images[0, 0].numpy(), lenses, sampler, axes=rows[1, column])
     figure.suptitle("A digit through four lenses; below, the patches and samples of DarSwin")
     figure.tight_layout()
     figure.savefig(path, dpi=130)
@@ -145,7 +144,7 @@ def main() -> None:
         print(name.ljust(24) + "".join(f"{value:7.1f}" for value in row))
 
     figure, axes = plt.subplots(figsize=(7, 4.2))
-    draw_accuracy(axes, XI, table, LEVELS["low"])
+    draw_accuracy(XI, table, LEVELS["low"], axes=axes)
     axes.set_title("Digits through lenses never seen in training")
     figure.tight_layout()
     figure.savefig(args.out / "accuracy.png", dpi=130)

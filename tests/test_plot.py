@@ -1,31 +1,134 @@
-import matplotlib
+import math
 
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
 import numpy as np
+import pytest
+import torch
+from matplotlib.figure import Figure
 
-from darswin import polar_grid
-from darswin.lens import Spherical
-from darswin.plot import draw_accuracy, draw_grid
+from darswin import PolarSample
+from darswin.lens import KannalaBrandt, Mei, Polynomial, Spherical
+from darswin.plot import (
+    draw_accuracy,
+    draw_curve,
+    draw_grid,
+    draw_lens,
+    draw_polar,
+    draw_samples,
+    draw_view,
+    save_figure,
+)
+from darswin.views import perspective
+
+SAMPLER = PolarSample(rings=4, sectors=8, samples=(3, 2))
+ROUND = Spherical.from_fov(0.4, 2.6, 16.0)
+BENT = Mei(
+    2.0, 40.0, (0.05, 1.5), 1.7, affine=[[1.0, 0.1], [0.0, 0.8]], tangential=(0.02, -0.03)
+)  # fmt: skip
+
+
+def borders(axes):
+    rings, sectors = ([np.array(s) for s in c.get_segments()] for c in axes.collections)
+    return rings, sectors
 
 
 def test_draw_grid_shows_borders_and_samples():
-    grid = polar_grid(Spherical.from_fov(0.4, 2.6, 16.0), (32, 32), rings=4, sectors=8,
-                      samples=(3, 2))  # fmt: skip
-    figure, axes = plt.subplots()
-    draw_grid(axes, np.zeros((32, 32)), grid, sectors=8)
-    rings, sectors, points = axes.lines[:5], axes.lines[5:13], axes.lines[13]
-    assert len(axes.lines) == 14
-    radii = [np.hypot(*(np.array(line.get_data()) - 15.5)).max() for line in rings]
-    np.testing.assert_allclose(radii, grid.borders[0].numpy(), atol=1e-4)
-    assert len(sectors) == 8 and len(points.get_xdata()) == 4 * 3 * 8 * 2
-    plt.close(figure)
+    (axes,) = draw_grid(np.zeros((32, 32)), ROUND, SAMPLER).axes
+    rings, sectors = borders(axes)
+    radii = [np.hypot(*(ring - 15.5).T) for ring in rings]
+    expected = SAMPLER.grid(ROUND, (32, 32)).borders[0].numpy()
+    assert len(rings) == 5
+    for radius, border in zip(radii, expected, strict=True):
+        np.testing.assert_allclose(radius, border, atol=1e-4)
+    azimuths = [math.atan2(*(sector[-1] - 15.5)[::-1]) % (2 * math.pi) for sector in sectors]
+    np.testing.assert_allclose(azimuths, np.arange(8) * math.pi / 4, atol=1e-6)
+    (points,) = axes.lines
+    assert len(points.get_xdata()) == 4 * 3 * 8 * 2
+    assert not draw_grid(np.zeros((32, 32)), ROUND, SAMPLER, samples=False).axes[0].lines
+
+
+def test_borders_and_samples_follow_a_lens_that_is_not_round():
+    size = (60, 80)
+    (axes,) = draw_grid(np.zeros(size), BENT, SAMPLER).axes
+    rings, _ = borders(axes)
+    exact = BENT.to(torch.float64)
+    for k, ring in enumerate(rings):  # equal steps of θ
+        theta, _ = exact.unproject_pixels(torch.from_numpy(ring), size)
+        np.testing.assert_allclose(theta, k / 4 * exact.theta_max.item(), atol=1e-6)
+    spread = np.hypot(*(rings[-1] - (39.5, 29.5)).T)
+    assert spread.max() > 1.2 * spread.min()
+    points = np.stack(axes.lines[0].get_data(), -1)
+    theta, azimuth = exact.unproject_pixels(torch.from_numpy(points), size)
+    expected = (np.arange(12) + 0.5) / 12 * exact.theta_max.item()
+    np.testing.assert_allclose(np.sort(theta), np.repeat(expected, 16), atol=1e-6)
+    turns = azimuth.numpy() % (2 * math.pi) / (2 * math.pi) * 16
+    np.testing.assert_allclose(np.sort(turns), np.repeat(np.arange(16) + 0.5, 12), atol=1e-6)
+
+
+def test_draw_samples_is_a_part_of_the_grid():
+    (axes,) = draw_samples(np.zeros((60, 80)), BENT, SAMPLER).axes
+    assert np.diff(axes.get_xlim()) == pytest.approx(8) and np.diff(axes.get_ylim()) == [-6]
+    x, y = BENT.project_rays(0.85, -math.pi / 4, (60, 80))[0].tolist()
+    assert np.mean(axes.get_xlim()) == pytest.approx(x, abs=1e-3)
+    assert np.mean(axes.get_ylim()) == pytest.approx(y, abs=1e-3)
+
+
+@pytest.mark.parametrize("shape", [(32, 32), (32, 32, 3)])
+def test_draw_polar_is_what_the_layer_samples(shape):
+    image = np.random.default_rng(0).integers(256, size=shape, dtype=np.uint8)
+    for sampler in (SAMPLER, PolarSample(4, 8, (3, 2), jitter=1.0, mean=0.5, layout="tokens")):
+        (axes,) = draw_polar(image, ROUND, sampler).axes
+        channels = torch.from_numpy(np.atleast_3d(image)).permute(2, 0, 1)[None]
+        expected = SAMPLER(channels, ROUND)[0].permute(1, 2, 0).squeeze(2)
+        np.testing.assert_allclose(axes.images[0].get_array(), expected, atol=1e-5)
+        labels = [text.get_text() for text in axes.get_yticklabels()]
+        assert labels == ["0°", "19°", "37°", "56°", "74°"]
+
+
+def test_draw_view_is_the_undistorted_image():
+    image = np.full((32, 32, 3), 200, np.uint8)
+    (axes,) = draw_view(image, ROUND, perspective((6, 8), 1.0)).axes
+    assert (axes.images[0].get_array() == 200).all() and axes.images[0].get_array().size == 144
+
+
+def test_draw_curve_shows_radius_and_density():
+    lens = Polynomial([20.0, 1.0, 0.5], 1.7)
+    left, right = draw_curve(lens, (48, 80)).axes
+    degrees, radius = (np.array(values) for values in left.lines[0].get_data())
+    theta = torch.deg2rad(torch.from_numpy(degrees)).float()
+    np.testing.assert_allclose(radius, lens.project(theta), rtol=1e-5)
+    along = right.lines[0].get_ydata()
+    np.testing.assert_allclose(np.gradient(radius, degrees)[1:-1], along[1:-1], rtol=1e-3)
+    ends = sorted(line.get_xdata()[0] for line in left.lines[1:])
+    seen = lens.side_angles((48, 80))[0].rad2deg()
+    np.testing.assert_allclose(ends, seen[seen < degrees[-1] + 1e-6].sort().values, rtol=1e-6)
+    labels = [text.get_text() for text in left.get_legend().get_texts()]
+    assert labels == ["r", "px/° along r", "px/° around"]
+    assert len(draw_curve(lens).axes[0].lines) == 1
+
+
+def test_draw_lens_has_all_panels(tmp_path):
+    image = np.zeros((48, 64, 3), np.uint8)
+    lens = KannalaBrandt(20.0, [0.01], 1.7)
+    figure = draw_lens(image, lens, SAMPLER, perspective((6, 8), 1.0), "ahead")
+    titles = [axes.get_title() for axes in figure.axes]
+    assert titles[:5] == [
+        "4 rings × 8 sectors, equal steps of θ", "3 × 2 samples in each, enlarged", "ahead",
+        "polar image, 12 × 16 samples", "projection: KannalaBrandt",
+    ]  # fmt: skip
+    save_figure(figure, tmp_path / "lens.png")
+    assert (tmp_path / "lens.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_drawing_on_axes_of_ones_own():
+    axes = Figure().subplots()
+    assert draw_grid(np.zeros((32, 32)), ROUND, SAMPLER, axes=axes) is axes.figure
+    with pytest.raises(ValueError, match="one lens, got 2"):
+        draw_grid(np.zeros((32, 32)), Spherical([0.1, 0.2], 10.0), SAMPLER)
 
 
 def test_draw_accuracy_shows_each_model():
-    figure, axes = plt.subplots()
-    draw_accuracy(axes, [0.0, 0.5, 1.0], {"a": [1, 2, 3], "b": [3, 2, 1]}, (0.2, 0.35))
+    figure = draw_accuracy([0.0, 0.5, 1.0], {"a": [1, 2, 3], "b": [3, 2, 1]}, (0.2, 0.35))
+    (axes,) = figure.axes
     labels = [text.get_text() for text in axes.get_legend().get_texts()]
     assert labels == ["seen in training", "a", "b"]
     assert list(axes.lines[0].get_ydata()) == [1, 2, 3]
-    plt.close(figure)

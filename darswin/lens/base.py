@@ -222,7 +222,7 @@ class Lens:
         """
         theta, azimuth = self._aligned(theta)[0], self._aligned(azimuth)[0]
         direction = torch.stack((torch.cos(azimuth), torch.sin(azimuth)), -1)
-        return self.to_pixels(self._flat(theta, direction), image_size)
+        return self.pixels(theta, direction, image_size)
 
     def unproject_pixels(
         self, pixels: Tensor, image_size: tuple[int, int] | None = None
@@ -252,6 +252,16 @@ class Lens:
         if self.is_radial:
             return theta, direction
         return self._find_rays(flat, theta, direction)
+
+    def pixels(
+        self, theta: Tensor, direction: Tensor, image_size: tuple[int, int] | None = None
+    ) -> Tensor:
+        """`project_rays` with (cos φ, sin φ) in place of φ: the inverse of `rays`.
+
+        Args:
+            theta: (N or 1, ...) rad. direction: (N or 1, ..., 2).
+        """
+        return self.to_pixels(self._flat(theta, direction), image_size)
 
     def to_pixels(self, flat: Tensor, image_size: tuple[int, int] | None = None) -> Tensor:
         """Points (N, ..., 2) around the principal point, before `affine` → pixels."""

@@ -57,7 +57,7 @@ def draw_results(rows: list[dict], name: str, trained_on):
     if all(isinstance(lens, SphericalLenses) and lens.low == lens.high for lens in lenses):
         shaded = trained_on if isinstance(trained_on, SphericalLenses) else None
         band = None if shaded is None else (shaded.low, shaded.high)
-        draw_accuracy(axes, [lens.low for lens in lenses], {name: accuracy}, band)
+        draw_accuracy([lens.low for lens in lenses], {name: accuracy}, band, axes=axes)
         axes.set_ylim(0, 100)
     else:
         axes.bar([row["lenses"] for row in rows], accuracy, label=name)

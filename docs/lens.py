@@ -1,0 +1,79 @@
+"""Draws docs/lens.png: a room that is computed, through the front lens of the WoodScape data set.
+
+Run it with `.venv/bin/python docs/lens.py`. The room is a box with a checkerboard on its walls, so
+that its lines are straight in the perspective view and nowhere else.
+"""
+
+import io
+import math
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image
+
+from darswin import PolarSample
+from darswin.files import replace_file
+from darswin.lens import Polynomial
+from darswin.plot import draw_lens
+from darswin.views import perspective
+
+SIZE = (966, 1280)
+HALF = np.array([2.0, 1.2, 2.5])  # the box around the camera, m
+SQUARE = 0.4  # m
+# Left and right, above and below, behind and before.
+COLOURS = np.array([
+    [(200, 90, 80), (235, 160, 120)], [(225, 225, 230), (150, 120, 90)],
+    [(90, 120, 90), (110, 160, 220)],
+])  # fmt: skip
+
+
+def front_lens() -> Polynomial:
+    """As published, used as far as the image's sides."""
+    lens = Polynomial(
+        [339.749, -31.988, 48.275, -7.201], center=[643.442, 479.407], image_size=SIZE
+    ).to(torch.float64)
+    return lens.with_theta_max(lens.side_angles().amax())
+
+
+def room(rays: np.ndarray) -> np.ndarray:
+    """What the walls look like along rays (..., 3): (..., 3) uint8."""
+    far = HALF / np.abs(rays).clip(1e-9)
+    wall = far.argmin(-1)
+    hit = rays * far.min(-1, keepdims=True) / SQUARE
+    side = np.take_along_axis(rays, wall[..., None], -1)[..., 0] > 0
+    on_wall = np.arange(3) != wall[..., None]  # the two coordinates along it
+    dark = (np.floor(hit).astype(int) * on_wall).sum(-1) % 2
+    line = ((np.abs(hit - np.round(hit)) < 0.04) & on_wall).any(-1)
+    colour = COLOURS[wall, side.astype(int)] * np.where(dark, 0.82, 1.0)[..., None]
+    return np.where(line[..., None], 30, colour).astype(np.uint8)
+
+
+def photograph(lens: Polynomial) -> np.ndarray:
+    """The room through a lens, four rays a pixel: (H, W, 3) uint8."""
+    height, width = SIZE
+    return np.concatenate([row(lens, y, width) for y in range(height)])
+
+
+def row(lens: Polynomial, y: int, width: int) -> np.ndarray:
+    y, x = np.mgrid[2 * y : 2 * y + 2, : 2 * width] / 2 - 0.25
+    theta, direction = lens.rays(torch.from_numpy(np.stack((x, y), -1))[None])
+    aside = torch.sin(theta)[..., None] * direction
+    rays = torch.cat((aside, torch.cos(theta)[..., None]), -1)[0].numpy()
+    return room(rays).reshape(1, 2, width, 2, 3).mean((1, 3)).round().astype(np.uint8)
+
+
+def main() -> None:
+    lens = front_lens().with_theta_max(None)
+    image = photograph(lens)
+    view = perspective((604, 800), math.radians(110))
+    sampler = PolarSample(rings=16, sectors=64, samples=(10, 10))
+    figure = draw_lens(image, front_lens(), sampler, view, "perspective view, 110° across")
+    drawn, small = io.BytesIO(), io.BytesIO()
+    figure.savefig(drawn, format="png", dpi=80)
+    Image.open(drawn).convert("RGB").quantize(256).save(small, format="png", optimize=True)
+    replace_file(Path(__file__).parent / "lens.png", small.getvalue())
+
+
+if __name__ == "__main__":
+    main()
