@@ -57,9 +57,13 @@ class IdealLens(Lens):
 
     def unproject(self, radius: Number) -> Tensor:
         radius, focal = self._aligned(radius, "focal")
-        return self._angle(radius / focal)
+        rise = radius / focal
+        lands = rise <= self._top
+        # 0 in place of what has no angle: NaN would reach the gradients.
+        return torch.where(lands, self._angle(torch.where(lands, rise, 0.0)), torch.nan)
 
     _end = math.pi  # where u stops rising, or to be finite
+    _top = math.inf  # u there
 
     @property
     def theta_limit(self) -> Tensor:
@@ -89,13 +93,15 @@ class Equidistant(IdealLens):
 class Equisolid(IdealLens):
     """r = 2 f sin(θ/2): equal solid angles are equal areas. Arguments: `focal`, those of `Lens`."""
 
+    _top = 2.0
+
     @staticmethod
     def _rise(theta: Tensor) -> Tensor:
         return 2 * torch.sin(theta / 2)
 
     @staticmethod
     def _angle(rise: Tensor) -> Tensor:
-        return 2 * torch.asin(rise / 2)  # NaN beyond 2
+        return 2 * torch.asin(rise / 2)
 
 
 class Stereographic(IdealLens):
@@ -114,8 +120,9 @@ class Orthographic(IdealLens):
     """r = f sin θ, θ < 90°. Arguments: `focal`, and those of `Lens`."""
 
     _end = math.pi / 2
+    _top = 1.0
     _rise = staticmethod(torch.sin)
-    _angle = staticmethod(torch.asin)  # NaN beyond 1
+    _angle = staticmethod(torch.asin)
 
 
 class FieldOfView(Lens):

@@ -63,7 +63,8 @@ class Spherical(Lens):
         # tan ψ = r/f, θ = ψ + asin(ξ sin ψ); as atan2, exact also where the sine nears 1.
         radius, xi, focal = self._aligned(radius, "xi", "focal")
         rho = radius / focal
-        return torch.atan(rho) + torch.atan2(xi * rho, root(1 + (1 - xi * xi) * rho * rho))
+        square = 1 + (1 - xi * xi) * rho * rho
+        return where_real(square, torch.atan(rho) + torch.atan2(xi * rho, root(square)))
 
 
 class EnhancedUnified(Lens):
@@ -114,10 +115,9 @@ class EnhancedUnified(Lens):
         radius, alpha, beta, focal = self._aligned(radius, "alpha", "beta", "focal")
         rho = radius / focal
         square = beta * rho * rho
-        z = (1 - alpha * alpha * square) / (
-            alpha * root(1 - (2 * alpha - 1) * square) + (1 - alpha)
-        )
-        return torch.atan2(rho, z)
+        rest = 1 - (2 * alpha - 1) * square
+        z = (1 - alpha * alpha * square) / (alpha * root(rest) + (1 - alpha))
+        return where_real(rest, torch.atan2(rho, z))
 
 
 class DoubleSphere(Lens):
@@ -170,11 +170,12 @@ class DoubleSphere(Lens):
         radius, xi, alpha, focal = self._aligned(radius, "xi", "alpha", "focal")
         rho = radius / focal
         square = rho * rho
-        z = (1 - alpha * alpha * square) / (
-            alpha * root(1 - (2 * alpha - 1) * square) + (1 - alpha)
-        )
-        scale = (z * xi + root(z * z + (1 - xi * xi) * square)) / (z * z + square)
-        return torch.atan2(scale * rho, scale * z - xi)
+        rest = 1 - (2 * alpha - 1) * square
+        z = (1 - alpha * alpha * square) / (alpha * root(rest) + (1 - alpha))
+        second = z * z + (1 - xi * xi) * square
+        scale = (z * xi + root(second)) / (z * z + square)
+        theta = torch.atan2(scale * rho, scale * z - xi)
+        return where_real(rest, where_real(second, theta))
 
 
 def sphere_limit(xi: Tensor) -> Tensor:
@@ -189,7 +190,11 @@ def _cone(alpha: Tensor) -> Tensor:
 
 
 def root(square: Tensor) -> Tensor:
-    """√, 0 where rounding took a 0 below it, NaN where it is truly negative."""
+    """√, and nearly 0 where the square is negative; `where_real` tells."""
     eps = torch.finfo(square.dtype).eps
-    positive = square.clamp(min=eps * eps)
-    return torch.where(square < -64 * eps, torch.nan, torch.sqrt(positive))
+    return square.clamp(min=eps * eps).sqrt()
+
+
+def where_real(square: Tensor, value: Tensor) -> Tensor:
+    """The value where a square is not negative but for rounding, else NaN, with no gradient."""
+    return torch.where(square >= -64 * torch.finfo(square.dtype).eps, value, torch.nan)

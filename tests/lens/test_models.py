@@ -356,3 +356,16 @@ def test_rays_are_found_in_inference_mode():
         with torch.inference_mode():
             found = lens.to(f64).unproject_pixels(lens.project_rays(0.5, 0.3))
         torch.testing.assert_close(found, expected)
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_where_nothing_lands_there_is_no_gradient_either(name):
+    lens = random_lens(name, torch.Generator().manual_seed(9), (0.8, 3))
+    lens = lens.with_theta_max(0.9 * lens.theta_limit)
+    names = [n for n in (*lens.parameters, *lens.optional) if getattr(lens, n) is not None]
+    values = [getattr(lens, n).clone().requires_grad_() for n in names]
+    made = lens.replace(**dict(zip(names, values, strict=True)))
+    radius = torch.cat((lens.r_max[:, None] * double(0.3, 0.8), double(1e9).expand(4, 1)), 1)
+    theta = made.unproject(radius)
+    torch.where(theta <= lens.theta_max[:, None], theta, 0.0).sum().backward()
+    assert all(value.grad.isfinite().all() and value.grad.any() for value in values)
