@@ -52,16 +52,17 @@ PROBLEMS = {"xi": ("xi",), "place": ("radius", "x", "y"), "all": ("xi", "radius"
 LOSSES = ("labels", "entropy", "information", "statistics")
 KNOWN = dict(xi=0.5, radius=SIZE / 2, x=(SIZE - 1) / 2, y=(SIZE - 1) / 2)
 # Truths and starts are uniform in these; descent may go as far as the bounds.
-RANGES = dict(xi=(0.0, 1.0), radius=(12.0, 20.0), x=(11.5, 19.5), y=(11.5, 19.5))
-BOUNDS = dict(xi=(0.0, 1.5), radius=(8.0, 24.0), x=(7.5, 23.5), y=(7.5, 23.5))
+RANGES = dict(xi=(0.0, 1.0), radius=(11.0, 16.0), x=(13.0, 18.0), y=(13.0, 18.0))
+BOUNDS = dict(xi=(0.0, 1.5), radius=(8.0, 20.0), x=(10.0, 21.0), y=(10.0, 21.0))
 
 IMAGES = dict(xi=(16, 64, 256), place=(256,), all=(256,))  # how many of a camera are used
 BATCH = 32  # images a step
-STEPS = dict(xi=50, place=80, all=80)
+STEPS = dict(xi=40, place=80, all=80)
 RATE = 0.06  # Adam's, in parts of a range; falls to 0 as a cosine
 STARTS = 2  # for each camera
 TESTED = 200  # other images of each camera, for the accuracy
 SEARCHED = 128  # images that a search evaluates the losses on
+USUAL = 1000  # training pictures that the usual statistics are taken on
 GRID = [k / 40 for k in range(41)]  # of ξ
 
 
@@ -117,7 +118,7 @@ Usual = tuple[Tensor, Tensor]
 def usual_map(model: DarSwin, data: str) -> Usual:
     """Mean and variance (R, A, D) of the first stage's map on training pictures."""
     rng, maps = np.random.default_rng(0), []
-    for picture in pictures(data, "train", 1000)[0]:
+    for picture in pictures(data, "train", USUAL)[0]:
         lens = lens_of(KNOWN | draw(rng, "xi"))
         image = photograph(picture[None], lens)
         maps += model.forward_intermediates(image, lens, indices=[0], intermediates_only=True)
@@ -239,7 +240,7 @@ def run_camera(problem: str, camera: int, out: Path, data: str) -> dict:
         search[loss] = dict(least=min(curve), **judge(guesses[int(np.argmin(curve))]))
         if problem == "xi":
             search[loss]["curve"] = curve
-    trials = []
+    begun, trials = [judge(start) for start in starts], []
     for count in IMAGES[problem]:
         for loss in LOSSES:
             for index, start in enumerate(starts):
@@ -248,9 +249,10 @@ def run_camera(problem: str, camera: int, out: Path, data: str) -> dict:
                 path = descend(
                     model, *seen, usual, loss, true, start, STEPS[problem], camera * STARTS + index
                 )
+                seconds = time.process_time() - began
                 trial = dict(
-                    images=count, loss=loss, start=judge(start), found=judge(path[-1]),
-                    least=evaluate(path[-1])[loss], seconds=time.process_time() - began,
+                    images=count, loss=loss, start=begun[index], found=judge(path[-1]),
+                    least=evaluate(path[-1])[loss], seconds=round(seconds, 2),
                 )  # fmt: skip
                 if problem == "xi":
                     trial["path"] = [round(values["xi"], 3) for values in path]

@@ -1,4 +1,4 @@
-"""A lens inside a model: the loss's gradient at its parameters, through the samples and the bias."""
+"""A lens inside a model: the gradient at its parameters, through the samples and the bias."""
 
 from collections.abc import Callable
 
