@@ -137,7 +137,8 @@ def losses(
     - "statistics": whether the first stage's map has, at each place, the mean and variance that it
       had in training.
 
-    Source: information, Liang, Hu and Feng, ICML 2020; statistics, after Mirza et al., CVPR 2023.
+    Source: entropy, Wang et al., ICLR 2021; information, Liang, Hu and Feng, ICML 2020;
+    statistics, after Mirza et al., CVPR 2023.
     """
     features, (first,) = model.forward_intermediates(images, lens, indices=[0])
     log = F.log_softmax(model.forward_head(features), -1)
