@@ -75,7 +75,7 @@ def recovery_table(cameras: list[dict]) -> str:
     near it, how often no higher than it, and the accuracy."""
     lines = [
         f"| unknown | loss | start (px) | found (px): median, 90 % | below {CLOSE} px "
-        f"| lower of {STARTS} starts below {CLOSE} px | as low as the true lens "
+        f"| lower of {STARTS} starts below {CLOSE} px | loss ≤ the true lens's "
         "| best guess (px) | accuracy (%): start → found (true lens) |",
         "|---" * 9 + "|",
     ]
@@ -137,7 +137,7 @@ def tables(cameras: list[dict]) -> dict[str, str]:
 
 def draw(cameras: list[dict], path: Path) -> None:
     """Landscapes of the losses over ξ, descents on them, and how far from the truth all end."""
-    figure = Figure(figsize=(15, 11), layout="constrained")
+    figure = Figure(figsize=(13, 9.5), layout="constrained")
     axes = figure.subplots(3, 4)
     known = [camera for camera in cameras if camera["problem"] == "xi"]
     for above, below, loss in zip(axes[0], axes[1], LOSSES, strict=True):
