@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/installed
 
-.PHONY: help build demo test test-isa lint format bench study readme dist clean
+.PHONY: help build demo test test-isa lint format bench study learned-lens readme dist clean
 
 help:  ## this list
 	@grep -E '^[a-z-]+:.*##' Makefile | sed -E 's/:.*## /\t/' | expand -t 12
@@ -50,6 +50,9 @@ bench: build  ## time the operators against their peers, and training; nothing e
 
 study: build  ## the paper's experiments, small: an hour; goes on where it was stopped
 	$(BIN)/python studies/study.py
+
+learned-lens: build  ## find unknown lenses by gradient descent: ten minutes; goes on where it was stopped
+	$(BIN)/python studies/learned_lens.py
 
 readme: $(STAMP)  ## fill the README's tables from the results of bench and study
 	$(BIN)/python docs/readme.py

@@ -1,0 +1,203 @@
+"""The tables and the picture of the learned lenses, from what `learned_lens.py` found."""
+
+import json
+import platform
+from pathlib import Path
+
+import numpy as np
+import torch
+from learned_lens import GRID, IMAGES, LOSSES, PROBLEMS, STARTS
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from darswin.files import replace_file
+from darswin.plot import save_figure
+
+CLOSE = 0.5  # px, a lens that is found
+CLOSE_XI = 0.05
+UNKNOWN = {
+    "xi": "ξ",
+    "place": "focal length, principal point",
+    "all": "ξ, focal length, principal point",
+}
+
+
+def collect(cameras: list[dict], folder: Path) -> None:
+    """Writes the results, with the machine and versions, and draws their picture."""
+    machine = dict(
+        python=platform.python_version(), torch=torch.__version__, machine=platform.machine()
+    )
+    cameras = sorted(cameras, key=lambda c: (list(PROBLEMS).index(c["problem"]), c["camera"]))
+    lines = ",\n".join(json.dumps(camera) for camera in cameras)
+    text = f'{{"machine": {json.dumps(machine)},\n"cameras": [\n{lines}\n]}}\n'
+    replace_file(folder / "learned_lens.json", text)
+    draw(cameras, folder / "learned_lens.png")
+
+
+def trials_of(cameras: list[dict], problem: str, loss: str, images: int) -> list[dict]:
+    """All descents of a kind, each with its camera's `true` lens and `search`."""
+    return [
+        trial
+        | dict(
+            camera=camera["camera"],
+            true=camera["true"],
+            true_loss=camera["losses"][loss],
+            search=camera["search"][loss],
+        )
+        for camera in cameras
+        for trial in camera["trials"]
+        if (camera["problem"], trial["loss"], trial["images"]) == (problem, loss, images)
+    ]
+
+
+def distances(trials: list[dict], of: str = "found") -> np.ndarray:
+    return np.array([trial[of]["distance"] for trial in trials])
+
+
+def xi_errors(trials: list[dict], of: str = "found") -> np.ndarray:
+    return np.array([abs(t[of]["values"]["xi"] - t["true"]["values"]["xi"]) for t in trials])
+
+
+def better_starts(trials: list[dict]) -> list[dict]:
+    """Of each camera's descents the one that ended lowest."""
+    best = {}
+    for trial in sorted(trials, key=lambda trial: -trial["least"]):
+        best[trial["camera"]] = trial
+    return list(best.values())
+
+
+def share(close: np.ndarray) -> str:
+    return f"{close.sum()} of {len(close)}"
+
+
+def recovery_table(cameras: list[dict]) -> str:
+    """A row a problem and loss, on all images: how far descents end from the true lens, how often
+    near it, how often no higher than it, and the accuracy."""
+    lines = [
+        f"| unknown | loss | start (px) | found (px): median, 90 % | below {CLOSE} px "
+        f"| lower of {STARTS} starts below {CLOSE} px | loss ≤ the true lens's "
+        "| best guess (px) | accuracy (%): start → found (true lens) |",
+        "|---" * 9 + "|",
+    ]
+    for problem in PROBLEMS:
+        for loss in LOSSES:
+            trials = trials_of(cameras, problem, loss, max(IMAGES[problem]))
+            if not trials:
+                continue
+            found = distances(trials)
+            start, found_accuracy, true = (
+                np.mean([trial[of]["accuracy"] for trial in trials])
+                for of in ("start", "found", "true")
+            )
+            cells = [
+                UNKNOWN[problem],
+                loss,
+                f"{np.median(distances(trials, 'start')):.2f}",
+                f"{np.median(found):.2f}, {np.quantile(found, 0.9):.2f}",
+                share(found < CLOSE),
+                share(distances(better_starts(trials)) < CLOSE),
+                share(np.array([trial["least"] <= trial["true_loss"] for trial in trials])),
+                f"{np.median(distances(trials, 'search')):.2f}",
+                f"{start:.0f} → {found_accuracy:.0f} ({true:.0f})",
+            ]
+            lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def images_table(cameras: list[dict]) -> str:
+    """A row a loss, a column a number of images: how well ξ alone is found; last, by the grid."""
+    head = [f"{count} images" for count in IMAGES["xi"]]
+    lines = [f"| loss | {' | '.join(head)} | the loss's lowest on a grid |", "|---" * 5 + "|"]
+    for loss in LOSSES:
+        cells = []
+        for count in IMAGES["xi"]:
+            trials = trials_of(cameras, "xi", loss, count)
+            errors = xi_errors(trials)
+            cells.append(f"{np.median(errors):.3f}, {share(errors < CLOSE_XI)}")
+        grid = xi_errors(
+            [
+                dict(true=camera["true"], search=camera["search"][loss])
+                for camera in cameras
+                if camera["problem"] == "xi"
+            ],
+            "search",
+        )
+        cells.append(f"{np.median(grid):.3f}, {share(grid < CLOSE_XI)}")
+        lines.append(f"| {loss} | {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def tables(cameras: list[dict]) -> dict[str, str]:
+    """The README's tables, by the name of their place in it."""
+    return {"learned-lens": recovery_table(cameras), "learned-xi": images_table(cameras)}
+
+
+# -- the picture ------------------------------------------------------------------------------
+
+
+def draw(cameras: list[dict], path: Path) -> None:
+    """Landscapes of the losses over ξ, descents on them, and how far from the truth all end."""
+    figure = Figure(figsize=(13, 9.5), layout="constrained")
+    axes = figure.subplots(3, 4)
+    known = [camera for camera in cameras if camera["problem"] == "xi"]
+    for above, below, loss in zip(axes[0], axes[1], LOSSES, strict=True):
+        draw_landscapes(above, known, loss)
+        draw_paths(below, known, loss)
+        above.sharex(below)
+    for panel, problem in zip(axes[2], PROBLEMS, strict=False):
+        draw_distances(panel, cameras, problem)
+    draw_images(axes[2, 3], known)
+    save_figure(figure, path)
+
+
+def draw_landscapes(axes: Axes, cameras: list[dict], loss: str) -> None:
+    """A curve a camera, from its lowest to its highest value; a dot where ξ is the true one."""
+    for k, camera in enumerate(cameras):
+        curve = np.array(camera["search"][loss]["curve"])
+        low, high = curve.min(), curve.max()
+        axes.plot(GRID, (curve - low) / (high - low), color=f"C{k}", lw=1)
+        true = camera["true"]["values"]["xi"]
+        height = (camera["losses"][loss] - low) / (high - low)
+        axes.plot(true, height, "o", color=f"C{k}", ms=5, mec="k", mew=0.6)
+    axes.set(title=f'"{loss}"', ylabel="loss, from lowest to highest")
+    axes.grid(alpha=0.3)
+
+
+def draw_paths(axes: Axes, cameras: list[dict], loss: str) -> None:
+    """ξ, step by step downwards, in the camera's colour; dashed the true one."""
+    for k, camera in enumerate(cameras):
+        axes.axvline(camera["true"]["values"]["xi"], color=f"C{k}", ls="--", lw=0.8)
+        for trial in trials_of([camera], "xi", loss, max(IMAGES["xi"])):
+            axes.plot(trial["path"], range(len(trial["path"])), color=f"C{k}", lw=1.2)
+    axes.set(xlabel="ξ", ylabel="step of descent", xlim=(0, 1.2))
+    axes.invert_yaxis()
+    axes.grid(alpha=0.3)
+
+
+def draw_distances(axes: Axes, cameras: list[dict], problem: str) -> None:
+    """The share of descents that end within a distance of the true lens."""
+    for loss in LOSSES:
+        trials = trials_of(cameras, problem, loss, max(IMAGES[problem]))
+        axes.ecdf(distances(trials), label=loss)
+    axes.ecdf(distances(trials, "start"), color="grey", ls=":", label="start")
+    axes.axvline(CLOSE, color="k", lw=0.6)
+    axes.set_title(f"unknown: {UNKNOWN[problem]}", fontsize="medium")
+    axes.set(xlabel="distance to the true lens (px)", ylabel="share of descents", xscale="log")
+    axes.grid(alpha=0.3)
+    if problem == "xi":
+        axes.legend(fontsize="small")
+
+
+def draw_images(axes: Axes, cameras: list[dict]) -> None:
+    """The median error of ξ by the number of images."""
+    counts = IMAGES["xi"]
+    for loss in LOSSES:
+        errors = [np.median(xi_errors(trials_of(cameras, "xi", loss, count))) for count in counts]
+        axes.plot(counts, errors, "o-", label=loss)
+    axes.axhline(CLOSE_XI, color="k", lw=0.6)
+    axes.set_title("unknown: ξ", fontsize="medium")
+    axes.set(xlabel="images", ylabel="median error of ξ", xscale="log")
+    axes.set_xticks(counts, [str(count) for count in counts])
+    axes.minorticks_off()
+    axes.set_ylim(bottom=0)
+    axes.grid(alpha=0.3)
