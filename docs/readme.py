@@ -104,17 +104,21 @@ def training_table(report: dict) -> str:
 
 def tables() -> dict[str, str]:
     """All tables, by the name of their place in the README."""
+    import learned_tables
     import tables as study
 
+    studies = ROOT / "studies" / "results"
     sampling, attention = load("sampling--avx512.json"), load("attention--avx512.json")
     training = json.loads((RESULTS / "training--micro.json").read_text())
-    cells = json.loads((ROOT / "studies" / "results" / "study--nano.json").read_text())["cells"]
+    cells = json.loads((studies / "study--nano.json").read_text())["cells"]
+    cameras = json.loads((studies / "learned_lens.json").read_text())["cameras"]
     return {
         "sampling": peers_table(sampling, "polar_sample", SAMPLING_PEERS),
         "embedding": peers_table(sampling, "polar_embed", EMBED_PEERS),
         "attention": attention_table(attention),
         "training": training_table(training),
         **study.tables(cells),
+        **learned_tables.tables(cameras),
     }
 
 
