@@ -74,15 +74,16 @@ struct Round {
   }
 };
 
-// The same through the matrix and with the offsets of points j, j + 1, ... of radius i.
+// The same through the matrix and with the offsets of points j to j + count of radius i.
 template <typename T>
 struct Bent {
   const Round<T> center;
   double matrix[4] = {1, 0, 0, 1};
   const T *x_offsets = nullptr, *y_offsets = nullptr, *end;
+  const int64_t count;
 
-  Bent(const PolarSampleArgs<T>& a, int64_t b, int64_t i, int64_t j)
-      : center(a, b), end(a.offsets_end) {
+  Bent(const PolarSampleArgs<T>& a, int64_t b, int64_t i, int64_t j, int64_t count)
+      : center(a, b), end(a.offsets_end), count(count) {
     if (a.affine != nullptr) {
       for (int e = 0; e < 4; ++e) matrix[e] = a.affine[b * a.affine_stride + e];
     }
@@ -101,9 +102,11 @@ struct Bent {
     p.y += read(y_offsets + k);
   }
 
-  // A register of offsets. The last one of all may not be whole.
+  // A register of offsets; the last one of all may not be whole. The points that will be asked for
+  // next stand behind these, out of the sight of the hardware's own prefetching.
   Doubles read(const T* from) const {
     using V = Vector<T, kDoubles>;
+    __builtin_prefetch(from + count);
     if (end - from >= kDoubles) return __builtin_convertvector(load<V>(from), Doubles);
     Doubles part = {};
     for (int lane = 0; lane < end - from; ++lane) part[lane] = from[lane];
@@ -227,7 +230,7 @@ void locate(const PolarSampleArgs<T>& a, int64_t b, int64_t i, int64_t j, int64_
   if (a.affine == nullptr && a.offsets == nullptr) {
     locate_through(a, Round<T>(a, b), b, i, j, count, random, visit);
   } else {
-    locate_through(a, Bent<T>(a, b, i, j), b, i, j, count, random, visit);
+    locate_through(a, Bent<T>(a, b, i, j, count), b, i, j, count, random, visit);
   }
 }
 

@@ -245,6 +245,7 @@ def test_accuracy_rule(shape, layout):
         sampler(azimuths, patch, layout=layout),
         lambda: make_inputs(**sizes, dtype=torch.float32)[:-1],
         mask,
+        draws=10,  # of six radii three draws are too few to measure rounding with
     )
 
 
