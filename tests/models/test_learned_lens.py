@@ -94,7 +94,9 @@ def without_sampling(model, monkeypatch) -> None:
     sampler = model.patch_embed.sample
     grid = sampler.grid
     monkeypatch.setattr(
-        sampler, "grid", lambda *args: PolarGrid(*(t.detach() for t in grid(*args)))
+        sampler,
+        "grid",
+        lambda *args: PolarGrid(*(None if t is None else t.detach() for t in grid(*args))),
     )
 
 
