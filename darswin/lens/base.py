@@ -93,6 +93,10 @@ class Lens:
     ):
         given = {**parameters, "theta_max": theta_max, "center": center, "affine": affine,
                  "image_size": image_size}  # fmt: skip
+        if unknown := sorted(given.keys() - set(self._names())):
+            raise TypeError(
+                f"{type(self).__name__} takes {', '.join(self._names())}, got {', '.join(unknown)}"
+            )
         tensors = _as_tensors({name: value for name, value in given.items() if value is not None})
         for name, tensor in tensors.items():
             row_dims = ROW_DIMS.get(name, 0)

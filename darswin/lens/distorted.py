@@ -38,6 +38,16 @@ class DistortedLens(Lens):
     tangential: Tensor | None
     prism: Tensor | None
 
+    def __init__(
+        self,
+        focal: Number,
+        radial: Number | None = None,
+        theta_max: Number | None = None,
+        center: Number | None = None,
+        **others: Number | None,
+    ):
+        super().__init__(theta_max, center, focal=focal, radial=radial, **others)
+
     def _validate(self) -> None:
         self._require("focal", (self.focal > 0) & self.focal.isfinite(), "finite and above 0")
         for name in self.optional:
@@ -171,22 +181,6 @@ class KannalaBrandt(DistortedLens):
     Source: Kannala and Brandt, PAMI 2006; OpenCV, cv::fisheye.
     """
 
-    def __init__(
-        self,
-        focal: Number,
-        radial: Number | None = None,
-        theta_max: Number | None = None,
-        center: Number | None = None,
-        *,
-        tangential: Number | None = None,
-        prism: Number | None = None,
-        **frame: Number | None,
-    ):
-        super().__init__(
-            theta_max, center, focal=focal, radial=radial, tangential=tangential, prism=prism,
-            **frame,
-        )  # fmt: skip
-
     def _plane(self, theta: Tensor) -> Tensor:
         return theta
 
@@ -231,15 +225,9 @@ class Mei(DistortedLens):
         radial: Number | None = None,
         theta_max: Number | None = None,
         center: Number | None = None,
-        *,
-        tangential: Number | None = None,
-        prism: Number | None = None,
-        **frame: Number | None,
+        **others: Number | None,
     ):
-        super().__init__(
-            theta_max, center, xi=xi, focal=focal, radial=radial, tangential=tangential,
-            prism=prism, **frame,
-        )  # fmt: skip
+        super().__init__(focal, radial, theta_max, center, xi=xi, **others)
 
     def _validate(self) -> None:
         self._require("xi", (self.xi >= 0) & self.xi.isfinite(), "finite and at least 0")
@@ -268,23 +256,6 @@ class BrownConrady(DistortedLens):
 
     optional = ("radial", "denominator", "tangential", "prism")
     denominator: Tensor | None
-
-    def __init__(
-        self,
-        focal: Number,
-        radial: Number | None = None,
-        theta_max: Number | None = None,
-        center: Number | None = None,
-        *,
-        denominator: Number | None = None,
-        tangential: Number | None = None,
-        prism: Number | None = None,
-        **frame: Number | None,
-    ):
-        super().__init__(
-            theta_max, center, focal=focal, radial=radial, denominator=denominator,
-            tangential=tangential, prism=prism, **frame,
-        )  # fmt: skip
 
     def _plane(self, theta: Tensor) -> Tensor:
         return torch.tan(theta)

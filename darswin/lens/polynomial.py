@@ -23,15 +23,11 @@ def slopes(coefficients: Tensor, first: int, step: int = 1) -> Tensor:
     return coefficients * powers
 
 
-class Polynomial(Lens):
-    """r = k₁ θ + k₂ θ² + … + k_n θⁿ, of any degree; WoodScape's `radial_poly` has four.
-
-    OpenCV's fisheye coefficients are not these: they belong to a `KannalaBrandt`.
+class PolynomialLens(Lens):
+    """Base of the lenses that are all coefficients, lowest power first.
 
     Args:
-        coefficients: (n,) or (N, n): k₁ … k_n, in px. Others: as `Lens`.
-
-    Source: DarSwin, ICCV 2023, eq. 4.
+        coefficients: (n,) or (N, n). Others: as `Lens`.
     """
 
     parameters = ("coefficients",)
@@ -50,6 +46,18 @@ class Polynomial(Lens):
     def _validate(self) -> None:
         self._require("coefficients", self.coefficients.isfinite().all(1), "finite")
 
+
+class Polynomial(PolynomialLens):
+    """r = k₁ θ + k₂ θ² + … + k_n θⁿ, of any degree; WoodScape's `radial_poly` has four.
+
+    OpenCV's fisheye coefficients are not these: they belong to a `KannalaBrandt`.
+
+    Args:
+        coefficients: (n,) or (N, n): k₁ … k_n, in px. Others: as `Lens`.
+
+    Source: DarSwin, ICCV 2023, eq. 4.
+    """
+
     @property
     def theta_limit(self) -> Tensor:
         end = torch.full_like(self.coefficients[:, 0].detach(), math.pi)
@@ -63,7 +71,7 @@ class Polynomial(Lens):
         return theta * horner(theta, self.coefficients)
 
 
-class OCam(Lens):
+class OCam(PolynomialLens):
     """tan θ = -r / (a₀ + a₁ r + a₂ r² + …): Scaramuzza's model, whose inverse is the closed one.
 
     Args:
@@ -72,22 +80,9 @@ class OCam(Lens):
     Source: Scaramuzza, Martinelli and Siegwart, ICVS 2006; the OCamCalib toolbox.
     """
 
-    parameters = ("coefficients",)
-    lengths = ("coefficients",)
-    coefficients: Tensor
-
-    def __init__(
-        self,
-        coefficients: Number,
-        theta_max: Number | None = None,
-        center: Number | None = None,
-        **frame: Number | None,
-    ):
-        super().__init__(theta_max, center, coefficients=coefficients, **frame)
-
     def _validate(self) -> None:
-        a = self.coefficients
-        self._require("coefficients", a.isfinite().all(1) & (a[:, 0] < 0), "finite, a₀ below 0")
+        super()._validate()
+        self._require("coefficients", self.coefficients[:, 0] < 0, "such that a₀ is below 0")
 
     def _angle(self, radius: Tensor) -> Tensor:
         return torch.atan2(radius, -horner(radius, self.coefficients))
@@ -123,7 +118,7 @@ class OCam(Lens):
         return self.replace(coefficients=self.coefficients * factor)
 
 
-class OCamInverse(Lens):
+class OCamInverse(PolynomialLens):
     """r = b₀ + b₁ (θ - π/2) + b₂ (θ - π/2)² + …: the polynomial that OCamCalib projects with.
 
     The toolbox fits it to the inverse of an `OCam`, to some hundredths of a pixel.
@@ -133,22 +128,6 @@ class OCamInverse(Lens):
 
     Source: the OCamCalib toolbox, world2cam.
     """
-
-    parameters = ("coefficients",)
-    lengths = ("coefficients",)
-    coefficients: Tensor
-
-    def __init__(
-        self,
-        coefficients: Number,
-        theta_max: Number | None = None,
-        center: Number | None = None,
-        **frame: Number | None,
-    ):
-        super().__init__(theta_max, center, coefficients=coefficients, **frame)
-
-    def _validate(self) -> None:
-        self._require("coefficients", self.coefficients.isfinite().all(1), "finite")
 
     @property
     def theta_limit(self) -> Tensor:

@@ -332,7 +332,7 @@ def test_a_table_of_two_is_straight():
         (lambda: EnhancedUnified(0.5, 0.0, 1.0), "beta must be finite and above 0"),
         (lambda: DoubleSphere(-1.0, 0.5, 1.0), "xi must be finite and above -1"),
         (lambda: FieldOfView(3.2, 1.0), r"omega must be in \(0, π\)"),
-        (lambda: OCam([100.0, 0.0]), "coefficients must be finite, a₀ below 0"),
+        (lambda: OCam([100.0, 0.0]), "coefficients must be such that a₀ is below 0"),
         (lambda: Polynomial([-1.0, 2.0]), "coefficients must be such that r rises"),
         (lambda: KannalaBrandt(1.0, [math.nan]), "radial must be finite"),
         (lambda: KannalaBrandt(1.0, [0.1], tangential=[0.1, 0.1, 0.1]), "tangential must be 2 num"),
