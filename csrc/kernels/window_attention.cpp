@@ -17,14 +17,14 @@ namespace darswin::TIER {
 namespace {
 
 // One thread's work on a call.
-template <typename S>
+template <typename S, int64_t kTokens, int64_t kDim>
 struct Attention {
   using T = Arithmetic<S>;
   using V = Vector<T, kLanes<T>>;
   static constexpr int kVectors = kGroup / kLanes<T>;
 
   const WindowAttentionArgs<S>& a;
-  Shape<S> shape;
+  Shape<kTokens, kDim> shape;
   Arena arena;
   Scratch<S> s;
   int64_t part;            // from a token's queries to its keys, and on to its values
@@ -61,7 +61,9 @@ struct Attention {
   __attribute__((always_inline)) void fetch(const S* map, const int64_t* offset,
                                             int64_t group) const {
     if (!shape.far) return;
+    // One by one: a burst of unrolled prefetches stalls, and is slower than none.
     const int64_t end = group + group_size(group), row = shape.d * static_cast<int64_t>(sizeof(S));
+#pragma GCC unroll 1
     for (int64_t t = group; t < end; ++t) {
       const char* lines = reinterpret_cast<const char*>(map + offset[t]);
       for (int64_t c = 0; c < row; c += 128) {
@@ -258,7 +260,9 @@ struct Attention {
     const T unit = 1;
     const Factors<T> scale{&a.scale, 0}, one{&unit, 0};
     for (int64_t group = 0; group < shape.n; group += kGroup) {
-      const int64_t n = shape.n, d = shape.d, queries = group_size(group);
+      const auto n = shape.n;
+      const auto d = shape.d;
+      const int64_t queries = group_size(group);
       const Weights<kGroup, 1, T> p{s.p}, ds{s.dp};
       const Weights<1, kGroup, T> ds_of_query{s.dp};
       const bool add = group > 0;
@@ -320,10 +324,33 @@ struct Attention {
   }
 };
 
+// run(attention) for a call. Nearly every one has windows of 16 tokens and heads of 32 channels;
+// with loops of known lengths that takes 5 to 20 % less time. Rows that are used where they lie,
+// beyond the caches, were up to 20 % slower to come with them.
+template <typename S, typename Run>
+void with_attention(const WindowAttentionArgs<S>& args, void* scratch, Run run) {
+  const bool usual = args.window_r * args.window_a == 16 && args.head_dim == 32;
+  const bool copied = sizeof(S) < sizeof(float);
+  if (usual && (copied || !Shape<0, 0>(args).far)) {
+    run(Attention<S, 16, 32>(args, scratch));
+  } else {
+    run(Attention<S, 0, 0>(args, scratch));
+  }
+}
+
+template <typename S>
+void forward(const WindowAttentionArgs<S>& args, int64_t begin, int64_t end, void* scratch) {
+  with_attention(args, scratch, [&](auto attention) { attention.forward_range(begin, end); });
+}
+template <typename S>
+void backward(const WindowAttentionArgs<S>& args, int64_t begin, int64_t end, void* scratch) {
+  with_attention(args, scratch, [&](auto attention) { attention.backward_range(begin, end); });
+}
+
 template <typename S>
 int64_t scratch_bytes(const WindowAttentionArgs<S>& args) {
   Arena arena{nullptr};
-  Scratch<S>(arena, Shape<S>(args));
+  Scratch<S>(arena, Shape<0, 0>(args));
   return arena.used;
 }
 
@@ -340,27 +367,27 @@ int64_t window_attention_scratch(const WindowAttentionArgs<bfloat16>& args) {
 }
 void window_attention(const WindowAttentionArgs<float>& args, int64_t begin, int64_t end,
                       void* scratch) {
-  Attention<float>(args, scratch).forward_range(begin, end);
+  forward(args, begin, end, scratch);
 }
 void window_attention(const WindowAttentionArgs<double>& args, int64_t begin, int64_t end,
                       void* scratch) {
-  Attention<double>(args, scratch).forward_range(begin, end);
+  forward(args, begin, end, scratch);
 }
 void window_attention(const WindowAttentionArgs<bfloat16>& args, int64_t begin, int64_t end,
                       void* scratch) {
-  Attention<bfloat16>(args, scratch).forward_range(begin, end);
+  forward(args, begin, end, scratch);
 }
 void window_attention_backward(const WindowAttentionArgs<float>& args, int64_t begin, int64_t end,
                                void* scratch) {
-  Attention<float>(args, scratch).backward_range(begin, end);
+  backward(args, begin, end, scratch);
 }
 void window_attention_backward(const WindowAttentionArgs<double>& args, int64_t begin, int64_t end,
                                void* scratch) {
-  Attention<double>(args, scratch).backward_range(begin, end);
+  backward(args, begin, end, scratch);
 }
 void window_attention_backward(const WindowAttentionArgs<bfloat16>& args, int64_t begin,
                                int64_t end, void* scratch) {
-  Attention<bfloat16>(args, scratch).backward_range(begin, end);
+  backward(args, begin, end, scratch);
 }
 
 }  // namespace darswin::TIER

@@ -11,23 +11,37 @@ namespace {
 constexpr int64_t kPairTokens = 64;
 // Bytes of qkv from which on it pays to ask for rows before they are needed.
 constexpr int64_t kCache = int64_t{4} << 20;
-// The sizes of one call. A window of one sector counts as one of one ring: the same tokens in the
-// same order, but in one long run.
-template <typename S>
+
+// A size that the compiler knows, or 0 where only the call does.
+template <int64_t kKnown>
+struct Size {
+  int64_t size;
+  operator int64_t() const { return kKnown > 0 ? kKnown : size; }
+};
+
+constexpr int64_t round_up(int64_t count, int64_t step) { return (count + step - 1) / step * step; }
+
+// The sizes of one call; kTokens and kDim are what the compiler knows of n and d. A window of one
+// sector counts as one of one ring: the same tokens in the same order, but in one long run.
+template <int64_t kTokens, int64_t kDim>
 struct Shape {
-  int64_t n, padded, eights;  // tokens of a window; rounded up to whole groups, and to eights
-  int64_t d, heads;
+  Size<kTokens> n;                         // tokens of a window
+  Size<round_up(kTokens, kGroup)> padded;  // rounded up to whole groups
+  Size<round_up(kTokens, 8)> eights;       // and to eights
+  Size<kDim> d;
+  int64_t heads;
   int64_t windows_r, windows_a, map_windows;  // windows along the axes, and of one image
   int64_t runs, run;       // a window is `runs` times `run` tokens that follow each other
   int64_t table_a, table;  // width and size of one head's bias table
   bool pairs;              // whether there are tables of all pairs
   bool far;                // whether the map is too large for the caches
 
+  template <typename S>
   explicit Shape(const WindowAttentionArgs<S>& a)
-      : n(a.window_r * a.window_a),
-        padded((n + kGroup - 1) / kGroup * kGroup),
-        eights((n + 7) / 8 * 8),
-        d(a.head_dim),
+      : n{a.window_r * a.window_a},
+        padded{round_up(n, kGroup)},
+        eights{round_up(n, 8)},
+        d{a.head_dim},
         heads(a.heads),
         windows_r(a.rings / a.window_r),
         windows_a(a.sectors / a.window_a),
@@ -87,8 +101,8 @@ struct Tokens {
 
   // Finds the rows of a window's tokens, and their sides of the borders: 1 beyond that of the
   // radius and 2 beyond that of the azimuth where these do not wrap. Token 0 pads the last group.
-  template <typename S>
-  void find(const WindowAttentionArgs<S>& a, const Shape<S>& shape, int64_t window) {
+  template <typename S, typename Sizes>
+  void find(const WindowAttentionArgs<S>& a, const Sizes& shape, int64_t window) {
     if (window == index) return;
     index = window;
     const int64_t wa = window % shape.windows_a, wr = window / shape.windows_a % shape.windows_r;
@@ -133,7 +147,8 @@ struct Scratch {
   T *q_copy, *k_copy, *v_copy, *g_copy;  // (padded, d): rows of a head, widened; g: the gradient
   T *dq_copy, *dk_copy, *dv_copy;        // the same of results, yet to be rounded
 
-  Scratch(Arena& arena, const Shape<S>& shape) {
+  template <typename Sizes>
+  Scratch(Arena& arena, const Sizes& shape) {
     const int64_t n = shape.n, padded = shape.padded;
     const int64_t pairs = shape.pairs ? shape.heads * n * padded : 0;
     const int64_t rows = sizeof(S) == sizeof(T) ? 0 : padded * shape.d;

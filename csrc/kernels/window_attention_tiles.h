@@ -91,12 +91,12 @@ inline void transpose_square(Floats* rows) {
 }
 
 // columns[c * kGroup + i] = rows[i][c] for the rows of a group.
-template <typename T>
-__attribute__((noinline)) void transpose(Rows<const T> rows, int64_t d, T* columns) {
-  int64_t begin = 0;
+template <typename T, typename Dim>
+__attribute__((noinline)) void transpose(Rows<const T> rows, Dim d, T* columns) {
+  constexpr int kL = kLanes<float>;
+  const int64_t squares = sizeof(T) == sizeof(float) ? d / kL * kL : 0;
   if constexpr (sizeof(T) == sizeof(float)) {
-    constexpr int kL = kLanes<float>;
-    for (; begin + kL <= d; begin += kL) {
+    for (int64_t begin = 0; begin < squares; begin += kL) {
       for (int row = 0; row < kGroup; row += kL) {
         Floats square[kL];
 #pragma GCC unroll 16
@@ -108,15 +108,15 @@ __attribute__((noinline)) void transpose(Rows<const T> rows, int64_t d, T* colum
     }
   }
   for (int i = 0; i < kGroup; ++i) {
-    for (int64_t c = begin; c < d; ++c) columns[c * kGroup + i] = rows[i][c];
+    for (int64_t c = squares; c < d; ++c) columns[c * kGroup + i] = rows[i][c];
   }
 }
 
 // use(k, v, sum) for each key k < n, n a multiple of 8, and each register v of the group: the sums
 // over c of columns[c * kGroup + i] * rows[k][c]. There are as many sums under way as the latency
 // of the multiply-add asks for.
-template <typename T, typename Use>
-inline void products(const T* columns, Rows<const T> rows, int64_t n, int64_t d, Use use) {
+template <typename T, typename Count, typename Dim, typename Use>
+inline void products(const T* columns, Rows<const T> rows, Count n, Dim d, Use use) {
   using V = Vector<T, kLanes<T>>;
   constexpr int kVectors = kGroup / kLanes<T>;
   constexpr int kRows = kVectors < 8 ? 8 / kVectors : 1;
@@ -196,10 +196,10 @@ inline void weighted_tile(W weights, Rows<const T> from, int64_t summands, Rows<
 // to[i][c] = factors(i) * sum_j weights(i, j) * from[j][c] for i < rows, added to what is there
 // where `add`. Weights are read up to the next multiple of 8 rows. Long sums are cut into pieces,
 // since the rounding of a sum grows with its length.
-template <typename W, typename T>
-__attribute__((noinline)) void weighted_sums(W weights, Rows<const T> from, int64_t summands,
-                                             Rows<T> to, int64_t rows, int64_t d,
-                                             Factors<T> factors, bool add) {
+template <typename W, typename T, typename Summands, typename Count, typename Dim>
+__attribute__((noinline)) void weighted_sums(W weights, Rows<const T> from, Summands summands,
+                                             Rows<T> to, Count rows, Dim d, Factors<T> factors,
+                                             bool add) {
   constexpr int kL = kLanes<T>, kRows = kRegister == 64 ? 8 : 4, kPiece = 64;
   for (int64_t j = 0; j < summands; j += kPiece, add = true) {
     const int64_t piece = summands - j < kPiece ? summands - j : kPiece;

@@ -37,6 +37,8 @@ def check_tensor(
 def check_shape(name: str, value: Tensor, form: str, *allowed: Sequence[int | None]) -> None:
     """ValueError unless the shape is one of `allowed` (None: any size); `form` says it in words."""
     shape = tuple(value.shape)
+    if shape in allowed:
+        return
     for sizes in allowed:
         if len(shape) == len(sizes) and all(
             s is None or s == size for s, size in zip(sizes, shape, strict=True)

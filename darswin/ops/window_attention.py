@@ -91,8 +91,10 @@ def _arithmetic_types(qkv: Tensor, bias: Tensor) -> tuple[Tensor, Tensor]:
     """What autocast may have made of the arguments, as the operator takes it: qkv in bfloat16
     stays, since the operator widens it as it reads; a bias that goes with it is float32."""
     qkv, bias = _library.without_float16(qkv), _library.without_float16(bias)
+    if bias.dtype != torch.bfloat16:
+        return qkv, bias
     mixed = qkv.dtype == torch.bfloat16 or _library.autocast_dtype(qkv) is not None
-    return qkv, bias.float() if mixed and bias.dtype == torch.bfloat16 else bias
+    return qkv, bias.float() if mixed else bias
 
 
 @torch.library.register_fake("darswin::window_attention")
