@@ -61,7 +61,7 @@ struct Attention {
   __attribute__((always_inline)) void fetch(const S* map, const int64_t* offset,
                                             int64_t group) const {
     if (!shape.far) return;
-    // One by one: a burst of unrolled prefetches stalls, and is slower than none.
+    // One by one: thirty-two unrolled in a row were measured to take much longer than none at all.
     const int64_t end = group + group_size(group), row = shape.d * static_cast<int64_t>(sizeof(S));
 #pragma GCC unroll 1
     for (int64_t t = group; t < end; ++t) {
