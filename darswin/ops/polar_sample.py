@@ -96,9 +96,9 @@ def sampling_arguments(image, radii, azimuths, center, patch, jitter, seed, mean
     for name, value in (("radii", radii), ("azimuths", azimuths), ("center", center)):
         check_tensor(name, value, like=image, dtypes=geometry)
     batch, channels = image.shape[:2]
-    check_shape("radii", radii, f"(B or 1, R·S_r) = ({batch} or 1, any)", (batch, None), (1, None))
+    check_shape("radii", radii, "(B or 1, R·S_r) = ({} or 1, any)", (batch, None), (1, None))
     check_shape("azimuths", azimuths, "(A·S_φ,)", (None,))
-    check_shape("center", center, f"(B or 1, 2) = ({batch} or 1, 2)", (batch, 2), (1, 2))
+    check_shape("center", center, "(B or 1, 2) = ({} or 1, 2)", (batch, 2), (1, 2))
     patch = check_pair("patch", patch, lowest=1)
     if radii.shape[1] % patch[0] or azimuths.shape[0] % patch[1]:
         raise ValueError(
