@@ -1,11 +1,11 @@
-"""Models as graphs of tensors, lens included: for AOTInductor, ONNX and processes without Python's
-`darswin`."""
+"""Models as graphs of tensors, lens included: for AOTInductor, ONNX, and processes without us."""
 
 import os
 
 import torch
 from torch import Tensor, nn
 from torch.export import ExportedProgram
+from torch.nn.attention import SDPBackend, sdpa_kernel
 from torch.utils import _pytree as pytree
 
 from darswin.lens import Lens
@@ -69,7 +69,8 @@ def export_onnx(
     Args:
         path: of the file; it holds the weights too. Others, and errors: as `export_program`.
     """
-    with use_reference():
+    # MATH, as other attention kernels of torch lay out their result unlike their decomposition.
+    with use_reference(), sdpa_kernel(SDPBackend.MATH):
         program = export_program(model, images, lens, fixed_lens=fixed_lens)
         torch.onnx.export(
             program, f=path, output_names=["logits"], external_data=False, verbose=False
