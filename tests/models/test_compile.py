@@ -25,16 +25,25 @@ def test_one_graph_for_training_at_any_batch_size(family):
     assert counter.frame_count == 1
 
 
-@pytest.mark.parametrize(  # DarSwin's: test_darswin.py
-    ("family", "options"), [("swin_undis", {}), ("dat", dict(blocks=("D",), groups=(1,)))]
-)
-def test_a_compiled_training_step(family, options):
-    # One block, so that inductor's C++ takes seconds.
-    model = create_model(f"{family}_nano", num_classes=5, depths=(1,), num_heads=(1,), **options)
-    images, lens = inputs(2)
+def one_block(family, **options):
+    """A model of which inductor's C++ is built in seconds."""
+    return create_model(f"{family}_nano", num_classes=5, depths=(1,), num_heads=(1,), **options)
+
+
+def test_a_compiled_training_step():  # DarSwin's: test_darswin.py
+    model, (images, lens) = one_block("swin_undis"), inputs(2)
     model(images, lens).square().sum().backward()
     expected = {name: p.grad.clone() for name, p in model.named_parameters()}
     model.zero_grad()
     torch.compile(model, fullgraph=True)(images, lens).square().sum().backward()
     for name, parameter in model.named_parameters():
         torch.testing.assert_close(parameter.grad, expected[name], rtol=1e-3, atol=1e-4, msg=name)
+
+
+def test_compiled_inference():  # DarSwin's: the package in test_export.py
+    model = one_block("dat", blocks=("D",), groups=(1,)).eval()
+    images, lens = inputs(2)
+    with torch.no_grad():
+        expected = model(images, lens)
+        got = torch.compile(model, fullgraph=True)(images, lens)
+    torch.testing.assert_close(got, expected, rtol=1e-4, atol=1e-5)
