@@ -35,7 +35,12 @@ def check_tensor(
 
 
 def check_shape(name: str, value: Tensor, form: str, *allowed: Sequence[int | None]) -> None:
-    """ValueError unless the shape is one of `allowed` (None: any size); `form` says it in words."""
+    """ValueError unless the shape is one of `allowed` (None: any size).
+
+    `form` says it in words; its fields, {}, are the sizes that the first of `allowed` knows. They
+    are filled in where the error is raised: as an f-string they would tie a graph that is being
+    compiled to these sizes.
+    """
     shape = tuple(value.shape)
     if shape in allowed:
         return
@@ -44,7 +49,8 @@ def check_shape(name: str, value: Tensor, form: str, *allowed: Sequence[int | No
             s is None or s == size for s, size in zip(sizes, shape, strict=True)
         ):
             return
-    raise ValueError(f"{name} must have shape {form}, got {shape}")
+    expected = form.format(*(s for s in allowed[0] if s is not None))
+    raise ValueError(f"{name} must have shape {expected}, got {shape}")
 
 
 def check_pair(name: str, value: Sequence[int], lowest: int) -> tuple[int, int]:

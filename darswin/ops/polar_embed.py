@@ -61,10 +61,10 @@ def polar_embed(
     dtypes = (torch.float64,) if double else (torch.float32, torch.bfloat16)
     check_tensor("weight", weight, like=image, dtypes=dtypes)
     samples = patch[0] * patch[1] * image.shape[1]
-    check_shape("weight", weight, f"(D, S_r·S_φ·C) = (any, {samples})", (None, samples))
+    check_shape("weight", weight, "(D, S_r·S_φ·C) = (any, {})", (None, samples))
     if bias is not None:
         check_tensor("bias", bias, like=image, dtypes=dtypes)
-        check_shape("bias", bias, f"(D,) = ({weight.shape[0]},)", (weight.shape[0],))
+        check_shape("bias", bias, "(D,) = ({},)", (weight.shape[0],))
     arguments = (*sampling[:6], weight, bias, *sampling[6:], _library.output_bfloat16(image))
     if _library.compiled(image):
         return torch.ops.darswin.polar_embed(*arguments)

@@ -110,15 +110,15 @@ def sampling_arguments(
         if value is not None or name not in ("affine", "offsets"):
             check_tensor(name, value, like=image, dtypes=geometry)
     batch, channels = image.shape[:2]
-    check_shape("radii", radii, f"(B or 1, R·S_r) = ({batch} or 1, any)", (batch, None), (1, None))
+    check_shape("radii", radii, "(B or 1, R·S_r) = ({} or 1, any)", (batch, None), (1, None))
     check_shape("azimuths", azimuths, "(A·S_φ,)", (None,))
-    check_shape("center", center, f"(B or 1, 2) = ({batch} or 1, 2)", (batch, 2), (1, 2))
+    check_shape("center", center, "(B or 1, 2) = ({} or 1, 2)", (batch, 2), (1, 2))
     if affine is not None:
-        form = f"(B or 1, 2, 2) = ({batch} or 1, 2, 2)"
+        form = "(B or 1, 2, 2) = ({} or 1, 2, 2)"
         check_shape("affine", affine, form, (batch, 2, 2), (1, 2, 2))
     if offsets is not None:
         points = (2, radii.shape[1], azimuths.shape[0])
-        form = f"(B or 1, 2, R·S_r, A·S_φ) = ({batch} or 1, {', '.join(map(str, points))})"
+        form = "(B or 1, 2, R·S_r, A·S_φ) = ({} or 1, {}, {}, {})"
         check_shape("offsets", offsets, form, (batch, *points), (1, *points))
     patch = check_pair("patch", patch, lowest=1)
     if radii.shape[1] % patch[0] or azimuths.shape[0] % patch[1]:

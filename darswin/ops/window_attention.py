@@ -68,13 +68,8 @@ def window_attention(
     if not isinstance(periodic, (tuple, list)) or len(periodic) != 2:
         raise TypeError(f"periodic must be a pair of bools, got {periodic!r}")
     table = (2 * window[0] - 1, 2 * window[1] - 1)
-    check_shape(
-        "bias",
-        bias,
-        f"(B or 1, heads, 2·M_r-1, 2·M_φ-1) = ({batch} or 1, {heads}, {table[0]}, {table[1]})",
-        (batch, heads, *table),
-        (1, heads, *table),
-    )
+    form = "(B or 1, heads, 2·M_r-1, 2·M_φ-1) = ({} or 1, {}, {}, {})"
+    check_shape("bias", bias, form, (batch, heads, *table), (1, heads, *table))
     if dropout != 0:
         raise NotImplementedError(
             f"window_attention has no dropout: DarSwin's recipe uses 0, got {dropout!r}"

@@ -1,0 +1,117 @@
+"""Exported models compute what the model does, at other batch sizes, and without `darswin`."""
+
+import subprocess
+import sys
+
+import pytest
+import torch
+
+from darswin import _C, create_model
+from darswin.export import export_onnx, export_program
+from darswin.lens import Polynomial, Spherical
+
+SPHERICAL = Spherical.from_fov([0.2, 0.9], 2.6, 16.0)
+# θ_max = 115°.
+POLYNOMIAL = Polynomial([[7.0, 0.4, -0.1, 0.05], [7.5, 0.3, -0.1, 0.05]], 2.0, [15.0, 17.0])
+
+ONE_BLOCK = dict(depths=(1,), num_heads=(1,))  # tracing takes as long as there are nodes
+
+
+def short(name, **options):
+    options = dict(num_classes=5, depths=(1, 1), num_heads=(1, 2)) | options
+    return create_model(name, **options).eval()
+
+
+def batch_of(lens, count):
+    """Images and lenses, and the lenses' tensors by name."""
+    lens = lens[[k % len(lens) for k in range(count)]]
+    names = (*lens.parameters, "theta_max", "center")
+    tensors = {name: getattr(lens, name) for name in names if getattr(lens, name) is not None}
+    return torch.randn(count, 3, 32, 32), lens, tensors
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "lens"),
+    [
+        # A radius that only Newton's method takes back to an angle.
+        ("darswin_ra_nano", dict(spacing="radius", sample_spacing="theta"), POLYNOMIAL),
+        ("darswin_a_nano", dict(compat="official", rings=16, sectors=64), SPHERICAL),
+        ("swin_nano", {}, SPHERICAL),
+    ],
+)
+def test_program(name, options, lens):
+    model = short(name, **options)
+    program = export_program(model, *batch_of(lens, 1)[:2]).module()
+    for count in (1, 2, 5):
+        images, lenses, tensors = batch_of(lens, count)
+        torch.testing.assert_close(program(images, **tensors), model(images, lenses))
+
+
+def test_program_of_camera_frames_through_one_lens():
+    model = short("darswin_a_nano", mean=0.5, std=0.2)
+    frames = torch.randint(256, (3, 20, 30, 3), dtype=torch.uint8)
+    program = export_program(model, frames[:1], SPHERICAL[1], fixed_lens=True)
+    torch.testing.assert_close(program.module()(frames), model(frames, SPHERICAL[1]))
+
+
+ELSEWHERE = """
+import sys, torch
+torch.ops.load_library(sys.argv[1])
+model = torch._inductor.aoti_load_package("model.pt2")
+for count in (1, 5):
+    images, tensors, logits = torch.load(f"{count}.pt")
+    tensors = dict(reversed(tensors.items()))  # by name, in any order
+    torch.testing.assert_close(model(images, **tensors), logits, rtol=1e-4, atol=1e-6)
+assert "darswin" not in sys.modules
+"""
+
+
+def test_package_in_a_process_without_the_package(tmp_path):
+    model = short("darswin_a_nano")
+    program = export_program(model, *batch_of(SPHERICAL, 1)[:2])
+    torch._inductor.aoti_compile_and_package(program, package_path=str(tmp_path / "model.pt2"))
+    for count in (1, 5):
+        images, lens, tensors = batch_of(SPHERICAL, count)
+        with torch.no_grad():
+            logits = model(images, lens)
+        torch.save((images, tensors, logits), tmp_path / f"{count}.pt")
+    command = [sys.executable, "-c", ELSEWHERE, _C.__file__]
+    run = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+    assert run.returncode == 0, run.stderr
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "lens"),
+    [
+        ("darswin_a_nano", {}, POLYNOMIAL),
+        ("darswin_ra_nano", ONE_BLOCK, POLYNOMIAL[0]),
+        ("swin_undis_nano", ONE_BLOCK, SPHERICAL),
+        ("dat_nano", dict(ONE_BLOCK, blocks=("D",), groups=(1,)), SPHERICAL),
+    ],
+)
+def test_onnx(name, options, lens, tmp_path):
+    onnxruntime = pytest.importorskip("onnxruntime")
+    model, fixed = short(name, **options), len(lens) == 1
+    path = tmp_path / "model.onnx"
+    export_onnx(model, path, *batch_of(lens, 1)[:2], fixed_lens=fixed)
+    assert [file.name for file in tmp_path.iterdir()] == ["model.onnx"]
+    session = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
+    for count in (1, 5):
+        images, lenses, tensors = batch_of(lens, count)
+        inputs = dict(images=images) | ({} if fixed else tensors)
+        assert [i.name for i in session.get_inputs()] == list(inputs)
+        (logits,) = session.run(["logits"], {name: t.numpy() for name, t in inputs.items()})
+        with torch.no_grad():
+            expected = model(images, lenses)
+        error = (torch.from_numpy(logits) - expected).abs().max()
+        assert error <= 1e-4 * expected.abs().max()
+
+
+def test_errors():
+    model, (images, lens, _) = short("darswin_a_nano"), batch_of(SPHERICAL, 2)
+    with pytest.raises(ValueError, match="fixed_lens needs a single lens, got Spherical"):
+        export_program(model, images, lens, fixed_lens=True)
+    with pytest.raises(ValueError, match="fixed_lens needs a single lens, got None"):
+        export_program(model, images, fixed_lens=True)
+    with pytest.raises(ValueError, match="model must be in eval mode"):
+        export_program(model.train(), images, lens)
