@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 from darswin.grid import Placement, PolarGrid, Spacing, check_grid, polar_grid
 from darswin.lens import Lens
+from darswin.linear import Linear
 from darswin.ops import polar_embed, polar_sample, window_attention
 from darswin.ops.checks import channels_first, check_jitter, check_layout, per_channel
 from darswin.ops.reference import normalized
@@ -206,7 +207,7 @@ class PolarPatchEmbed(nn.Module):
         super().__init__()
         self.in_chans = in_chans
         self.sample = PolarSample(rings, sectors, samples, layout="tokens", **grid_options)
-        self.proj = nn.Linear(samples[0] * samples[1] * in_chans, embed_dim)
+        self.proj = Linear(samples[0] * samples[1] * in_chans, embed_dim)
         self.norm = nn.LayerNorm(embed_dim)
 
     def forward(self, images: Tensor, grid: PolarGrid) -> Tensor:
@@ -356,8 +357,8 @@ class WindowAttention(nn.Module):
             raise ValueError(f"window must divide the map (R, A) = {map_size}, got {window}")
         self.num_heads, self.window, self.shift = num_heads, tuple(window), tuple(shift)
         self.map_size, self.periodic = tuple(map_size), tuple(periodic)
-        self.qkv = nn.Linear(dim, 3 * dim, bias=qkv_bias)
-        self.proj = nn.Linear(dim, dim)
+        self.qkv = Linear(dim, 3 * dim, bias=qkv_bias)
+        self.proj = Linear(dim, dim)
         self.position_bias = position_bias(self.window, num_heads)
 
     def forward(self, x: Tensor, *positions: Tensor) -> Tensor:
@@ -482,8 +483,8 @@ class Mlp(nn.Module):
 
     def __init__(self, dim: int, hidden: int):
         super().__init__()
-        self.fc1 = nn.Linear(dim, hidden)
-        self.fc2 = nn.Linear(hidden, dim)
+        self.fc1 = Linear(dim, hidden)
+        self.fc2 = Linear(hidden, dim)
 
     def forward(self, x: Tensor) -> Tensor:
         return self.fc2(F.gelu(self.fc1(x)))
@@ -527,7 +528,7 @@ class PatchMerging(nn.Module):
         self.merge = tuple(merge)
         joined = dim * merge[0] * merge[1]
         self.norm = nn.LayerNorm(joined)
-        self.reduction = nn.Linear(joined, 2 * dim, bias=False)
+        self.reduction = Linear(joined, 2 * dim, bias=False)
 
     def forward(self, x: Tensor) -> Tensor:
         """(B, R, A, D) → (B, R/m_r, A/m_φ, 2·D)."""
