@@ -10,6 +10,7 @@ COMMANDS = {
     "predict": "names what is in pictures taken through a known lens",
     "convert": "makes a safetensors file of a pickled checkpoint, without executing it",
     "models": "lists the models",
+    "bench": "measures how fast a model is on this machine, ten minutes",
 }
 
 
@@ -24,7 +25,7 @@ def main(argv: list[str] | None = None) -> None:
         return
     if command not in COMMANDS:
         raise SystemExit(f"darswin: no command {command!r}; there are {', '.join(COMMANDS)}")
-    if command != "models" and importlib.util.find_spec("lightning") is None:
+    if command not in ("models", "bench") and importlib.util.find_spec("lightning") is None:
         raise SystemExit("darswin: this needs more packages: pip install 'darswin[train]'")
     try:
         _run(command, argv)
@@ -58,6 +59,10 @@ def _run(command: str, argv: list[str]) -> None:
         from darswin.compat import convert_checkpoint
 
         auto_cli(convert_checkpoint, args=argv[1:], prog="darswin convert")
+    elif command == "bench":
+        from darswin.bench.command import main as bench
+
+        bench(argv[1:])
     else:
         from darswin.models import list_models
 

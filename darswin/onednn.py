@@ -39,6 +39,7 @@ class PackedLinear(nn.Module):
 
     def __init__(self, linear: nn.Linear, dtype: torch.dtype):
         super().__init__()
+        self.in_features, self.out_features = linear.in_features, linear.out_features
         self.packed = missing(dtype) is None
         # Tensors that are no parameters: in this layout they can be neither moved nor saved.
         weight, self.bias = (
@@ -67,3 +68,6 @@ class PackedLinear(nn.Module):
         if self.packed:
             return self._binary(x, residual, self.weight, self.bias, "add")
         return residual + F.linear(x, self.weight, self.bias)
+
+    def extra_repr(self) -> str:
+        return f"in_features={self.in_features}, out_features={self.out_features}"
