@@ -16,6 +16,7 @@ from darswin.linear import Linear
 from darswin.ops import polar_embed, polar_sample, window_attention
 from darswin.ops.checks import channels_first, check_jitter, check_layout, per_channel
 from darswin.ops.reference import normalized
+from darswin.recompute import made_again
 
 PositionBias = Literal["angular_relative", "angular", "polar"]
 GridFunction = Callable[..., PolarGrid]
@@ -339,6 +340,8 @@ class WindowAttention(nn.Module):
     Source: Swin Transformer, ICCV 2021, sec. 3.2.
     """
 
+    recompute = False  # see `Encoder.set_recompute`
+
     def __init__(
         self,
         dim: int,
@@ -367,14 +370,13 @@ class WindowAttention(nn.Module):
         if (rings, sectors) != self.map_size:
             raise ValueError(f"the map must be (R, A) = {self.map_size}, got {(rings, sectors)}")
         qkv = self.qkv(x).reshape(batch, rings, sectors, 3, self.num_heads, dim // self.num_heads)
-        out = window_attention(
-            qkv,
-            self.position_bias(*positions),
-            window=self.window,
-            shift=self.shift,
-            periodic=self.periodic,
+        attend = partial(
+            window_attention, window=self.window, shift=self.shift, periodic=self.periodic
         )
-        return self.proj(out)
+        bias = self.position_bias(*positions)
+        out = attend(qkv, bias)
+        with made_again(out, attend, qkv, bias, when=self.recompute):
+            return self.proj(out)
 
     def extra_repr(self) -> str:
         return (
@@ -481,13 +483,18 @@ class DropPath(nn.Module):
 class Mlp(nn.Module):
     """Linear, GELU, Linear."""
 
+    recompute = False  # see `Encoder.set_recompute`
+
     def __init__(self, dim: int, hidden: int):
         super().__init__()
         self.fc1 = Linear(dim, hidden)
         self.fc2 = Linear(hidden, dim)
 
     def forward(self, x: Tensor) -> Tensor:
-        return self.fc2(F.gelu(self.fc1(x)))
+        hidden = self.fc1(x)
+        x = F.gelu(hidden)
+        with made_again(x, F.gelu, hidden, when=self.recompute):
+            return self.fc2(x)
 
 
 class Block(nn.Module):
@@ -497,6 +504,8 @@ class Block(nn.Module):
         dim: D. attn: maps (B, R, A, D), and positions, to the same shape.
         mlp_ratio: hidden width of the MLP over D. drop_path: probability.
     """
+
+    recompute = False  # see `Encoder.set_recompute`
 
     def __init__(
         self, dim: int, attn: nn.Module, *, mlp_ratio: float = 4.0, drop_path: float = 0.0
@@ -510,8 +519,14 @@ class Block(nn.Module):
 
     def forward(self, x: Tensor, *positions: Tensor) -> Tensor:
         """(B, R, A, D) → the same shape. `positions` are the attention's."""
-        x = x + self.drop_path(self.attn(self.norm1(x), *positions))
-        return x + self.drop_path(self.mlp(self.norm2(x)))
+        y = self.norm1(x)
+        with made_again(y, self.norm1, x, when=self.recompute):
+            y = self.attn(y, *positions)
+        x = x + self.drop_path(y)
+        y = self.norm2(x)
+        with made_again(y, self.norm2, x, when=self.recompute):
+            y = self.mlp(y)
+        return x + self.drop_path(y)
 
 
 class PatchMerging(nn.Module):

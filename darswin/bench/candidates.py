@@ -123,16 +123,17 @@ def training_step(name: str, size: int, dtype: torch.dtype, batch: int, *, refer
     model, lens = network(name, size).train(), lens_of(size)
     if not reference:
         model.set_products("fastest")
+        model.set_recompute(True)
     optimizer = torch.optim.AdamW(model.parameters(), lr=1e-4)
     images, labels = torch.randn(batch, 3, size, size), torch.randint(CLASSES, (batch,))
 
     def step() -> Tensor:
+        optimizer.zero_grad()
         with (
             use_reference(reference),
             torch.autocast("cpu", torch.bfloat16, enabled=dtype == torch.bfloat16),
         ):
             loss = F.cross_entropy(model(images, lens).float(), labels)
-        optimizer.zero_grad()
         loss.backward()
         optimizer.step()
         return loss.detach()

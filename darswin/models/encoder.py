@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 from torch import Tensor, nn
 
-from darswin.layers import PatchProjection, Pixels
+from darswin.layers import Block, Mlp, PatchProjection, Pixels, WindowAttention
 from darswin.lens import Lens
 from darswin.linear import PRODUCTS, Linear, Products
 from darswin.models.stages import Pair, check_depths, make_stages, plan_stages
@@ -47,6 +47,14 @@ class Encoder(nn.Module):
         for module in self.modules():
             if isinstance(module, Linear):
                 module.products = products
+
+    def set_recompute(self, recompute: bool) -> None:
+        """Says whether training saves memory: norms, GELUs and attention in windows, a few percent
+        of the work, are then computed again in backward. The gradients are the same, bit for bit.
+        """
+        for module in self.modules():
+            if isinstance(module, (Block, Mlp, WindowAttention)):
+                module.recompute = recompute
 
     def _stage_maps(self, images: Tensor, lens: Lens | None) -> list[Tensor]:
         """The map that each stage ends with."""

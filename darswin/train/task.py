@@ -44,6 +44,7 @@ class Classification(LightningModule):
         reference_batch: images that the rates are meant for.
         products: who multiplies in float32: torch, onednn, or the fastest, measured as it runs. On
             AMD's CPUs onednn is twice as fast; which one it is decides how results are rounded.
+        recompute: saves a third of the activations' memory for a few percent of the time.
         seed: of the weights, jitter, drop path and mixing.
 
     Source: the recipe of DarSwin, ICCV 2023, sec. 5.2, and of its released code.
@@ -66,6 +67,7 @@ class Classification(LightningModule):
         mix_p: float = 1.0,
         reference_batch: int = 512,
         products: Products = "torch",
+        recompute: bool = False,
         seed: int = 0,
     ):
         super().__init__()
@@ -76,7 +78,8 @@ class Classification(LightningModule):
         self.rates = dict(peak=learning_rate, warmup=warmup_rate, final=final_rate)
         self.warmup_epochs, self.reference_batch = warmup_epochs, reference_batch
         self.weight_decay, self.decay_position_bias = weight_decay, decay_position_bias
-        self.label_smoothing, self.products, self.seed = label_smoothing, products, seed
+        self.label_smoothing, self.seed = label_smoothing, seed
+        self.products, self.recompute = products, recompute
         self.mixing = Mixing(mixup, cutmix, mix_p)
         self.net: nn.Module | None = None
         self.card: ModelCard | None = None
@@ -99,6 +102,7 @@ class Classification(LightningModule):
         torch.manual_seed(self.seed)
         self.net = self.card.create()
         self.net.set_products(self.products)
+        self.net.set_recompute(self.recompute)
         count = len(data.classes)
         self.val_metrics = metrics(count)
         self.test_metrics = nn.ModuleList(metrics(count) for _ in data.test_names)
