@@ -128,7 +128,6 @@ def training_step(name: str, size: int, dtype: torch.dtype, batch: int, *, refer
     images, labels = torch.randn(batch, 3, size, size), torch.randint(CLASSES, (batch,))
 
     def step() -> Tensor:
-        optimizer.zero_grad()
         with (
             use_reference(reference),
             torch.autocast("cpu", torch.bfloat16, enabled=dtype == torch.bfloat16),
@@ -136,6 +135,7 @@ def training_step(name: str, size: int, dtype: torch.dtype, batch: int, *, refer
             loss = F.cross_entropy(model(images, lens).float(), labels)
         loss.backward()
         optimizer.step()
+        optimizer.zero_grad()
         return loss.detach()
 
     return step

@@ -135,8 +135,11 @@ def bar_lines(record: Record) -> list[str]:
             what = f"{mode}, {dtype}, batch {batch}, over {peer}"
             lines.append(_against(what, ratio, bar, ratio >= bar))
     for ours, theirs in _memory_pairs(record):
-        if ours.mode == "training":
-            ratio, what = ours.whole / theirs.whole, f"peak memory of a training step, {ours.dtype}"
+        if ours.mode != "training":
+            continue
+        for name, kind in (("in all", "whole"), ("of the step itself", "own")):
+            ratio = getattr(ours, kind) / getattr(theirs, kind)
+            what = f"peak memory of a training step, {ours.dtype}, {name}"
             lines.append(_against(what, ratio, MEMORY_BAR, ratio <= MEMORY_BAR))
     return lines
 

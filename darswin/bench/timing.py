@@ -65,7 +65,6 @@ def _time(run: Callable[[], object]) -> float:
 def summary(case: tuple[str, str, int, int], name: str, seconds: list[float]) -> Timing:
     """The timing of a candidate from its calls."""
     values = torch.tensor(seconds, dtype=torch.float64)
-    low, median, high, p99 = (
-        values.quantile(q, interpolation="nearest").item() for q in (0.25, 0.5, 0.75, 0.99)
-    )
+    low, median, high = values.quantile(values.new_tensor((0.25, 0.5, 0.75))).tolist()
+    p99 = values.quantile(0.99, interpolation="higher").item()
     return Timing(*case, name, len(seconds), median, high - low, p99)
