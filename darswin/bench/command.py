@@ -63,8 +63,9 @@ def bench(
     )
     path = out / f"model--{record.machine['tier']}.json"
     record.save(path)
-    print(report.table(record), report.memory_table(record), report.roof(record), sep="\n\n")
-    print("", *report.bar_lines(record), "", path, sep="\n")
+    for part in (report.products, report.table, report.memory_table, report.roof):
+        print(part(record), "", sep="\n")
+    print(*report.bar_lines(record), path, sep="\n")
     try:
         report.plot(record, path.with_suffix(".png"))
         print(path.with_suffix(".png"))

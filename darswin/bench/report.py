@@ -123,6 +123,19 @@ def roof(record: Record) -> str:
     return "\n".join(lines)
 
 
+def products(record: Record) -> str:
+    """Which way of each product was the fastest in training, and by how much."""
+    lines = []
+    for row in record.products:
+        best, *others = row["seconds"].items()
+        over = ", ".join(f"{name} {seconds / best[1]:.2f}×" for name, seconds in others)
+        lines.append(
+            f"{row['product']}, {row['rows']} rows, {row['in_features']} → {row['out_features']}, "
+            f"{row['threads']} threads: {best[0]} {1e3 * best[1]:.2f} ms; {over}"
+        )
+    return "\n".join(lines)
+
+
 def bar_lines(record: Record) -> list[str]:
     """Each ratio that has a bar, against it; the bars are for one model."""
     if (record.model, record.size) != ("darswin_a_small", 64):

@@ -60,6 +60,14 @@ def test_tables(record):
     )
 
 
+def test_products(record):
+    row = dict(product="forward", rows=512, in_features=384, out_features=96, threads=2)
+    record.products = [row | dict(seconds=dict(onednn=0.002, torch=0.005))]
+    assert report.products(record) == (
+        "forward, 512 rows, 384 → 96, 2 threads: onednn 2.00 ms; torch 2.50×"
+    )
+
+
 def test_files(record, tmp_path):
     path = tmp_path / "new" / "model.json"
     record.save(path)
