@@ -17,19 +17,22 @@ from darswin import onednn
 Products = Literal["torch", "onednn", "fastest"]
 PRODUCTS = get_args(Products)
 
-# Of rows x (M, D), a weight w (D', D) and the gradient g (M, D') of the result: the ways to each
-# product, torch's first. oneDNN copies the left of its factors where that is transposed.
+
+def _weight_gradient(g: Tensor, x: Tensor) -> Tensor:
+    """gᵀ x by oneDNN, which copies the left factor where that is transposed: the smaller copies."""
+    if g.numel() <= x.numel() + g.shape[1] * x.shape[1]:
+        return onednn.product(g.t(), x.t())
+    return onednn.product(x.t(), g.t()).t().contiguous()
+
+
+# Of rows x (M, D), a weight w (D', D) and the gradient g (M, D') of the result.
 _WAYS: dict[str, dict[str, Callable[..., Tensor]]] = {
     "forward": {"torch": F.linear, "onednn": onednn.product},
     "input gradient": {
         "torch": lambda g, w: g @ w,
         "onednn": lambda g, w: onednn.product(g, w.t()),
     },
-    "weight gradient": {
-        "torch": lambda g, x: g.t() @ x,
-        "onednn": lambda g, x: onednn.product(g.t(), x.t()),
-        "onednn, transposed": lambda g, x: onednn.product(x.t(), g.t()).t().contiguous(),
-    },
+    "weight gradient": {"torch": lambda g, x: g.t() @ x, "onednn": _weight_gradient},
 }
 
 
