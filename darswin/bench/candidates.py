@@ -1,11 +1,12 @@
 """What is compared: our model, the same on the operators' PyTorch reference, and that compiled."""
 
+import copy
 import math
 from collections.abc import Callable
 
 import torch
 import torch.nn.functional as F
-from torch import Tensor
+from torch import Tensor, nn
 
 from darswin.bench.timing import COMPILED, ONE_LENS, OURS, PRODUCTS, REFERENCE
 from darswin.lens import Lens, Spherical
@@ -40,39 +41,33 @@ def inference(
     The products alone are those of the linear layers, one after the other with nothing between, by
     oneDNN and with weights packed for it: the roof of what a model can reach that way.
     """
-    lens, images = lens_of(size), torch.randn(batch, 3, size, size)
-    ours_of_lens = optimize(network(name, size), dtype, lens=lens)
-    products = products_of(name, size, dtype, batch)
+    model, lens = network(name, size).eval(), lens_of(size)
+    images = torch.randn(batch, 3, size, size)
+    ours_of_lens = optimize(model, dtype, lens=lens)
+    products = products_of(model, images, lens, dtype)
+    peer = copy.deepcopy(model) if dtype == torch.bfloat16 else model
     runs: dict[str, Run] = {
-        OURS: inference_run(name, size, dtype, images, reference=False),
+        OURS: inference_run(model, lens, dtype, images, reference=False),
         ONE_LENS: lambda: ours_of_lens(images),
         PRODUCTS: lambda: [layer(x) for layer, x in products][-1],
-        REFERENCE: inference_run(name, size, dtype, images, reference=True),
+        REFERENCE: inference_run(peer, lens, dtype, images, reference=True),
     }
     if compiled:
         torch._dynamo.reset()
-        runs[COMPILED] = inference_run(name, size, dtype, images, reference=True, compiled=True)
+        graph = torch.compile(peer, options={"freezing": True}, dynamic=False)
+        runs[COMPILED] = inference_run(graph, lens, dtype, images, reference=True)
     return {name: torch.no_grad()(run) for name, run in runs.items()}
 
 
 def inference_run(
-    name: str,
-    size: int,
-    dtype: torch.dtype,
-    images: Tensor,
-    *,
-    reference: bool,
-    compiled: bool = False,
+    model: nn.Module, lens: Lens, dtype: torch.dtype, images: Tensor, *, reference: bool
 ) -> Run:
-    """Inference by one of the candidates."""
-    model, lens = network(name, size).eval(), lens_of(size)
+    """Inference by one of the candidates; the reference's model becomes one of `dtype`, which in
+    bfloat16 is faster than autocast."""
     if not reference:
         optimized = optimize(model, dtype)
         return lambda: optimized(images, lens)
-    # A model whose weights are bfloat16 is faster than autocast.
     model, pixels = model.to(dtype), images.to(dtype)
-    if compiled:
-        model = torch.compile(model, options={"freezing": True}, dynamic=False)
 
     def run() -> Tensor:
         with use_reference():
@@ -82,10 +77,9 @@ def inference_run(
 
 
 def products_of(
-    name: str, size: int, dtype: torch.dtype, batch: int
+    model: Encoder, images: Tensor, lens: Lens, dtype: torch.dtype
 ) -> list[tuple[PackedLinear, Tensor]]:
     """The linear layers that a model runs, packed, and an input of each."""
-    model = network(name, size).eval()
     found: list[tuple[PackedLinear, Tensor]] = []
 
     def add(layer: Linear, rows: int) -> None:
@@ -94,19 +88,22 @@ def products_of(
     def hook(layer: Linear, _inputs: tuple[Tensor], output: Tensor) -> None:
         add(layer, output.numel() // layer.out_features)
 
-    for layer in model.modules():
-        if isinstance(layer, Linear):
-            layer.register_forward_hook(hook)
     if isinstance(model, DarSwin):  # its first one is inside of `polar_embed`
         sample = model.patch_embed.sample
-        add(model.patch_embed.proj, batch * sample.rings * sample.sectors)
+        add(model.patch_embed.proj, len(images) * sample.rings * sample.sectors)
+    layers = [layer for layer in model.modules() if isinstance(layer, Linear)]
+    handles = [layer.register_forward_hook(hook) for layer in layers]
     with torch.no_grad():
-        model(torch.randn(batch, 3, size, size), lens_of(size))
+        model(images, lens)
+    for handle in handles:
+        handle.remove()
     return found
 
 
-def operations(products: list[tuple[PackedLinear, Tensor]]) -> int:
-    """Floating-point operations of products."""
+def operations_of(name: str, size: int) -> int:
+    """Floating-point operations of the products that a model runs for one image."""
+    image, lens = torch.randn(1, 3, size, size), lens_of(size)
+    products = products_of(network(name, size).eval(), image, lens, torch.float32)
     return sum(2 * x.numel() * layer.out_features for layer, x in products)
 
 
@@ -124,7 +121,7 @@ def training_step(name: str, size: int, dtype: torch.dtype, batch: int, *, refer
     if not reference:
         model.set_products("fastest")
         model.set_recompute(True)
-    optimizer = torch.optim.AdamW(model.parameters(), lr=1e-4)
+    optimizer = torch.optim.AdamW(model.parameters(), lr=1e-4, fused=True)
     images, labels = torch.randn(batch, 3, size, size), torch.randint(CLASSES, (batch,))
 
     def step() -> Tensor:

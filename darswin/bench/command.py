@@ -54,7 +54,7 @@ def bench(
         machine=machine(),
         model=model,
         size=size,
-        operations=candidates.operations(candidates.products_of(model, size, torch.float32, 1)),
+        operations=candidates.operations_of(model, size),
         timings=timings,
         memory=_memory(model, size, 8) if memory.available() else [],
         products=[
@@ -85,7 +85,7 @@ def _measure(
     else:
         runs = candidates.training(*kind)
     _check(runs, TOLERANCES[dtype])
-    least = LATENCY_RUNS if mode == "inference" and batch == 1 else 2
+    least = LATENCY_RUNS if mode == "inference" and batch == 1 else 3
     found = [summary(case, name, times) for name, times in in_turns(runs, seconds, least).items()]
     times = ", ".join(f"{t.name} {1e3 * t.median:.1f} ms" for t in found)
     print(f"{mode}, {dtype}, batch {batch}, {threads} threads: {times}", flush=True)

@@ -72,12 +72,15 @@ def _measure_here(
 ) -> Memory:
     torch.set_num_threads(int(threads))
     before = _resident("VmRSS")
-    kind, reference = (model, int(size), getattr(torch, dtype)), name == REFERENCE
+    pixels, kind, reference = int(size), getattr(torch, dtype), name == REFERENCE
     if mode == "training":
-        run = candidates.training_step(*kind, int(batch), reference=reference)
+        run = candidates.training_step(model, pixels, kind, int(batch), reference=reference)
     else:
-        images = torch.randn(int(batch), 3, int(size), int(size))
-        run = torch.no_grad()(candidates.inference_run(*kind, images, reference=reference))
+        net, lens = candidates.network(model, pixels).eval(), candidates.lens_of(pixels)
+        images = torch.randn(int(batch), 3, pixels, pixels)
+        run = candidates.inference_run(net, lens, kind, images, reference=reference)
+        run = torch.no_grad()(run)
+        del net  # ours needs it no more
     for _ in range(2):
         run()
     _give_back()

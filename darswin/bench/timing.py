@@ -33,19 +33,18 @@ class Timing:
 def in_turns(
     candidates: dict[str, Callable[[], object]], seconds: float, least: int
 ) -> dict[str, list[float]]:
-    """Calls each candidate for about `seconds` in all, and at least `least` times.
+    """Calls each candidate, which has run before, for about `seconds`, at least `least` times.
 
     Returns:
         the seconds of each call of each candidate.
     """
-    found: dict[str, list[float]] = {}
-    calls, turns = {}, {}
+    found, calls, turns = {}, {}, {}
     for name, run in candidates.items():
-        run()
-        once = _time(run)
+        found[name] = [once := _time(run)]
         calls[name] = max(1, round(0.2 / once))  # a turn: long enough for caches to be its own
-        turns[name] = max(math.ceil(least / calls[name]), round(seconds / (calls[name] * once)), 1)
-        found[name] = []
+        turns[name] = max(
+            math.ceil((least - 1) / calls[name]), round(seconds / (calls[name] * once)), 1
+        )
     for turn in range(max(turns.values())):
         for name, run in candidates.items():
             if turn >= turns[name]:

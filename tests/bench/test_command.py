@@ -51,8 +51,8 @@ def test_it_measures_and_writes(tmp_path, capsys, monkeypatch):
 
 @pytest.mark.parametrize("name", ["darswin_a_nano", "dat_nano"])
 def test_the_products_are_all_of_the_model(name):
-    products = candidates.products_of(name, 32, torch.float32, 2)
-    model = candidates.network(name, 32)
+    model, lens = candidates.network(name, 32).eval(), candidates.lens_of(32)
+    products = candidates.products_of(model, torch.randn(2, 3, 32, 32), lens, torch.float32)
     layers = [m for m in model.modules() if isinstance(m, torch.nn.Linear)]
     sizes = sorted((m.in_features, m.out_features) for m in layers)
     assert sorted((p.in_features, p.out_features) for p, _ in products) == sizes
@@ -62,7 +62,7 @@ def test_the_products_are_all_of_the_model(name):
         expected = 256 * 4 * 4 * 3 * 24 + 96 * 200
         expected += sum(12 * t * w * w * d for t, w, d in zip(tokens, widths, depths, strict=True))
         expected += sum(t * 4 * w * 2 * w for t, w in ((64, 24), (16, 48)))
-        assert candidates.operations(products) == 2 * 2 * expected
+        assert candidates.operations_of(name, 32) == 2 * expected
 
 
 def test_candidates_that_disagree_are_not_timed():
@@ -72,7 +72,14 @@ def test_candidates_that_disagree_are_not_timed():
         command._check(runs, 1e-4)
 
 
-def test_the_compiled_reference_agrees():
+def test_the_reference_is_compiled_with_freezing(monkeypatch):
+    asked = []
+
+    def compiled(model, **options):
+        asked.append(options)
+        return model
+
+    monkeypatch.setattr(torch, "compile", compiled)
     runs = candidates.inference("darswin_a_nano", 32, torch.float32, 2, compiled=True)
-    assert COMPILED in runs
+    assert COMPILED in runs and asked == [dict(options={"freezing": True}, dynamic=False)]
     command._check(runs, 1e-4)
