@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from darswin import create_model, onednn, optimize
+from darswin import optimized as module
 from darswin.layers import RelativeBias
 from darswin.lens import Spherical
 from darswin.ops import use_reference
@@ -67,6 +68,27 @@ def test_bfloat16_is_as_close_as_autocast(name):
     got = optimize(model, torch.bfloat16)(images, LENSES)
     assert got.dtype == torch.bfloat16
     assert error(got, want) < 2 * autocast < 0.1
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("name", ["darswin_a_nano", "dat_nano"])
+@pytest.mark.parametrize("lenses", [slice(0, 1), slice(0, 5)])
+def test_large_batches_go_in_parts(monkeypatch, name, lenses):
+    model = network(name)
+    images = torch.randn(5, 3, 32, 32)
+    lens = Spherical.from_fov([0.0, 0.2, 0.5, 0.7, 0.9], math.radians(160), 16.0)[lenses]
+    want = model(images, lens)
+    image = 256 * 4 * 24 * 4  # bytes of a hidden map of the first stage
+    sizes = []
+    call = module._Block.__call__
+    monkeypatch.setattr(
+        module._Block, "__call__", lambda block, x, t: sizes.append(len(x)) or call(block, x, t)
+    )
+    for most, parts in ((1, [1] * 5), (2 * image, [2, 2, 1]), (5 * image, [5])):
+        monkeypatch.setattr(module, "CACHED_BYTES", most)
+        sizes.clear()
+        assert error(optimize(model)(images, lens), want) < 1e-5
+        assert sizes[: len(parts)] == parts
 
 
 @torch.no_grad()

@@ -37,7 +37,8 @@ def bench(
         seconds: of each timing, about.
         out: the folder of the record, `model--<tier>.json`, and its plot.
     """
-    print(" ".join(f"{k}={v}" for k, v in machine().items()), flush=True)
+    head = machine()
+    print(" ".join(f"{k}={v}" for k, v in head.items()), flush=True)
     threads_before = torch.get_num_threads()
     timings: list[Timing] = []
     try:
@@ -51,7 +52,7 @@ def bench(
     finally:
         torch.set_num_threads(threads_before)
     record = report.Record(
-        machine=machine(),
+        machine=head,
         model=model,
         size=size,
         operations=candidates.operations_of(model, size),
@@ -61,7 +62,7 @@ def bench(
             dict(shape._asdict(), seconds=seconds) for shape, seconds in linear.choices().items()
         ],
     )
-    path = out / f"model--{record.machine['tier']}.json"
+    path = out / f"model--{head['tier']}.json"
     record.save(path)
     for part in (report.products, report.table, report.memory_table, report.roof):
         print(part(record), "", sep="\n")
