@@ -49,7 +49,7 @@ def inference(
     runs: dict[str, Run] = {
         OURS: inference_run(model, lens, dtype, images, reference=False),
         ONE_LENS: lambda: ours_of_lens(images),
-        PRODUCTS: lambda: [layer(x) for layer, x in products][-1],
+        PRODUCTS: lambda: _all(products),
         REFERENCE: inference_run(peer, lens, dtype, images, reference=True),
     }
     if compiled:
@@ -57,6 +57,13 @@ def inference(
         graph = torch.compile(peer, options={"freezing": True}, dynamic=False)
         runs[COMPILED] = inference_run(graph, lens, dtype, images, reference=True)
     return {name: torch.no_grad()(run) for name, run in runs.items()}
+
+
+def _all(products: list[tuple[PackedLinear, Tensor]]) -> Tensor:
+    """The last of the products. The others' memory is free again at once, as a model's is."""
+    for layer, x in products:
+        result = layer(x)
+    return result
 
 
 def inference_run(
