@@ -47,6 +47,7 @@ bench: build  ## time the operators against their peers, and training; nothing e
 	$(BIN)/python benchmarks/sampling.py
 	$(BIN)/python benchmarks/attention.py
 	$(BIN)/python benchmarks/training.py
+	$(BIN)/python -m darswin bench --out benchmarks/results
 
 study: build  ## the paper's experiments, small: an hour; goes on where it was stopped
 	$(BIN)/python studies/study.py

@@ -11,10 +11,11 @@ import math
 import peaks
 import torch
 import torch.nn.functional as F
-from common import OURS, THREADS, Result, compare, finish, forward, forward_backward, machine
+from common import OURS, Result, compare, finish, forward, forward_backward
 from torch import Tensor
 from tqdm import tqdm
 
+from darswin.bench.machine import THREADS, machine
 from darswin.ops import reference, window_attention
 
 HEAD_DIM = 32

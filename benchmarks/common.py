@@ -7,8 +7,6 @@ losses too. A peer may carry a bar: how many times as long as ours it must at le
 
 import json
 import math
-import platform
-import subprocess
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -20,10 +18,9 @@ import matplotlib.pyplot as plt
 import torch
 from torch.utils.benchmark import Timer
 
-import darswin
 from darswin import _C
+from darswin.bench.machine import machine
 
-THREADS = sorted({1, torch.get_num_threads()})
 RESULTS = Path(__file__).parent / "results"
 OURS = "darswin"
 
@@ -88,27 +85,6 @@ def on_tier(tier: str, run: Callable[[], list[torch.Tensor]]):
             _C.set_tier(best)
 
     return step
-
-
-def machine() -> dict:
-    """CPU, tier, versions and commit, for the head of a result file."""
-    cpu = next(
-        (line.split(":")[1].strip() for line in Path("/proc/cpuinfo").read_text().splitlines()
-         if line.startswith("model name")), platform.processor(),
-    )  # fmt: skip
-    commit = subprocess.run(
-        ["git", "describe", "--always", "--dirty"], capture_output=True, text=True
-    ).stdout.strip()
-    return dict(
-        cpu=cpu,
-        cores=torch.get_num_threads(),
-        tier=_C.tier(),
-        compiler=_C.build_info()["compiler"],
-        python=platform.python_version(),
-        torch=torch.__version__,
-        darswin=darswin.__version__,
-        commit=commit,
-    )
 
 
 def compare(

@@ -11,11 +11,12 @@ import cv2
 import numpy as np
 import torch
 import torch.nn.functional as F
-from common import OURS, THREADS, Result, compare, finish, forward, forward_backward, machine
+from common import OURS, Result, compare, finish, forward, forward_backward
 from torch import Tensor
 from tqdm import tqdm
 
 from darswin import polar_grid
+from darswin.bench.machine import THREADS, machine
 from darswin.lens import Spherical
 from darswin.ops import polar_embed, polar_sample
 

@@ -14,11 +14,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 import torch
-from common import RESULTS, machine
+from common import RESULTS
 from lightning.pytorch import Callback, Trainer
 from torch.utils.data import DataLoader
 from tqdm import tqdm
 
+from darswin.bench.machine import machine
 from darswin.data.augment import RandAugment, RandomErasing
 from darswin.ops import use_reference
 from darswin.train.data import WideAngleData

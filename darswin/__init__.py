@@ -6,6 +6,7 @@ from darswin import compat, lens, models, ops
 from darswin.grid import PolarGrid, polar_grid
 from darswin.layers import PolarSample, PolarWindowAttention
 from darswin.models import DarSwin, create_model, list_models
+from darswin.optimized import optimize
 
 __version__ = version("darswin")
 
@@ -20,5 +21,6 @@ __all__ = [
     "list_models",
     "models",
     "ops",
+    "optimize",
     "polar_grid",
 ]

@@ -12,9 +12,11 @@ from torch import Tensor, nn
 
 from darswin.grid import Placement, PolarGrid, Spacing, check_grid, polar_grid
 from darswin.lens import Lens
+from darswin.linear import Linear
 from darswin.ops import polar_embed, polar_sample, window_attention
 from darswin.ops.checks import channels_first, check_jitter, check_layout, per_channel
 from darswin.ops.reference import normalized
+from darswin.recompute import made_again
 
 PositionBias = Literal["angular_relative", "angular", "polar"]
 GridFunction = Callable[..., PolarGrid]
@@ -219,7 +221,7 @@ class PolarPatchEmbed(nn.Module):
         super().__init__()
         self.in_chans = in_chans
         self.sample = PolarSample(rings, sectors, samples, layout="tokens", **grid_options)
-        self.proj = nn.Linear(samples[0] * samples[1] * in_chans, embed_dim)
+        self.proj = Linear(samples[0] * samples[1] * in_chans, embed_dim)
         self.norm = nn.LayerNorm(embed_dim)
 
     def forward(self, images: Tensor, grid: PolarGrid) -> Tensor:
@@ -351,6 +353,8 @@ class WindowAttention(nn.Module):
     Source: Swin Transformer, ICCV 2021, sec. 3.2.
     """
 
+    recompute = False  # see `Encoder.set_recompute`
+
     def __init__(
         self,
         dim: int,
@@ -369,8 +373,8 @@ class WindowAttention(nn.Module):
             raise ValueError(f"window must divide the map (R, A) = {map_size}, got {window}")
         self.num_heads, self.window, self.shift = num_heads, tuple(window), tuple(shift)
         self.map_size, self.periodic = tuple(map_size), tuple(periodic)
-        self.qkv = nn.Linear(dim, 3 * dim, bias=qkv_bias)
-        self.proj = nn.Linear(dim, dim)
+        self.qkv = Linear(dim, 3 * dim, bias=qkv_bias)
+        self.proj = Linear(dim, dim)
         self.position_bias = position_bias(self.window, num_heads)
 
     def forward(self, x: Tensor, *positions: Tensor) -> Tensor:
@@ -379,14 +383,13 @@ class WindowAttention(nn.Module):
         if (rings, sectors) != self.map_size:
             raise ValueError(f"the map must be (R, A) = {self.map_size}, got {(rings, sectors)}")
         qkv = self.qkv(x).reshape(batch, rings, sectors, 3, self.num_heads, dim // self.num_heads)
-        out = window_attention(
-            qkv,
-            self.position_bias(*positions),
-            window=self.window,
-            shift=self.shift,
-            periodic=self.periodic,
+        attend = partial(
+            window_attention, window=self.window, shift=self.shift, periodic=self.periodic
         )
-        return self.proj(out)
+        bias = self.position_bias(*positions)
+        out = attend(qkv, bias)
+        with made_again(out, attend, qkv, bias, when=self.recompute):
+            return self.proj(out)
 
     def extra_repr(self) -> str:
         return (
@@ -493,13 +496,18 @@ class DropPath(nn.Module):
 class Mlp(nn.Module):
     """Linear, GELU, Linear."""
 
+    recompute = False  # see `Encoder.set_recompute`
+
     def __init__(self, dim: int, hidden: int):
         super().__init__()
-        self.fc1 = nn.Linear(dim, hidden)
-        self.fc2 = nn.Linear(hidden, dim)
+        self.fc1 = Linear(dim, hidden)
+        self.fc2 = Linear(hidden, dim)
 
     def forward(self, x: Tensor) -> Tensor:
-        return self.fc2(F.gelu(self.fc1(x)))
+        hidden = self.fc1(x)
+        x = F.gelu(hidden)
+        with made_again(x, F.gelu, hidden, when=self.recompute):
+            return self.fc2(x)
 
 
 class Block(nn.Module):
@@ -509,6 +517,8 @@ class Block(nn.Module):
         dim: D. attn: maps (B, R, A, D), and positions, to the same shape.
         mlp_ratio: hidden width of the MLP over D. drop_path: probability.
     """
+
+    recompute = False  # see `Encoder.set_recompute`
 
     def __init__(
         self, dim: int, attn: nn.Module, *, mlp_ratio: float = 4.0, drop_path: float = 0.0
@@ -522,8 +532,14 @@ class Block(nn.Module):
 
     def forward(self, x: Tensor, *positions: Tensor) -> Tensor:
         """(B, R, A, D) → the same shape. `positions` are the attention's."""
-        x = x + self.drop_path(self.attn(self.norm1(x), *positions))
-        return x + self.drop_path(self.mlp(self.norm2(x)))
+        y = self.norm1(x)
+        with made_again(y, self.norm1, x, when=self.recompute):
+            y = self.attn(y, *positions)
+        x = x + self.drop_path(y)
+        y = self.norm2(x)
+        with made_again(y, self.norm2, x, when=self.recompute):
+            y = self.mlp(y)
+        return x + self.drop_path(y)
 
 
 class PatchMerging(nn.Module):
@@ -540,7 +556,7 @@ class PatchMerging(nn.Module):
         self.merge = tuple(merge)
         joined = dim * merge[0] * merge[1]
         self.norm = nn.LayerNorm(joined)
-        self.reduction = nn.Linear(joined, 2 * dim, bias=False)
+        self.reduction = Linear(joined, 2 * dim, bias=False)
 
     def forward(self, x: Tensor) -> Tensor:
         """(B, R, A, D) → (B, R/m_r, A/m_φ, 2·D)."""

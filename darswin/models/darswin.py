@@ -130,20 +130,28 @@ class DarSwin(Encoder):
         self._rings = [plan.map_size[0] for plan in plans]
         self._finish(num_classes)
 
-    def _radial(self, lens: Lens, grid: PolarGrid, rings: int) -> Tensor:
+    def geometry(self, lens: Lens, image_size: Pair) -> tuple[PolarGrid, list[Tensor]]:
+        """All that the model makes of the lenses of images (H, W): the grid of their samples, and
+        for each stage what its position bias is made from, `radial_positions`."""
+        grid = self.patch_embed.sample.grid(lens, image_size)
         if self.compat:
-            return official.radial_positions(lens, rings)
-        return radial_positions(lens, grid, rings, self.position_bias)
+            return grid, [official.radial_positions(lens, rings) for rings in self._rings]
+        kind = self.position_bias
+        return grid, [radial_positions(lens, grid, rings, kind) for rings in self._rings]
+
+    def embed(self, images: Tensor, grid: PolarGrid) -> Tensor:
+        """Images (B, C, H, W) on a grid of `geometry` → the first map, (B, R, A, D)."""
+        if self.compat:
+            images = images.transpose(2, 3)  # its x runs down and its y to the right
+        return self.patch_embed(images, grid)
 
     def _stage_maps(self, images: Tensor, lens: Lens) -> list[Tensor]:
         images = check_images(images)
         check_lens(lens, images)
-        grid = self.patch_embed.sample.grid(lens, images.shape[2:])
-        if self.compat:
-            images = images.transpose(2, 3)  # its x runs down and its y to the right
-        x = self.patch_embed(images, grid)
+        grid, radials = self.geometry(lens, images.shape[2:])
+        x = self.embed(images, grid)
         maps = []
-        for stage, rings in zip(self.stages, self._rings, strict=True):
-            x = stage(x, self._radial(lens, grid, rings))
+        for stage, radial in zip(self.stages, radials, strict=True):
+            x = stage(x, radial)
             maps.append(x)
         return maps

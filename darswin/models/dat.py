@@ -7,6 +7,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from darswin.layers import PatchProjection, RelativeTable, WindowAttention, check_heads
+from darswin.linear import Linear
 from darswin.models.encoder import ImageEncoder
 from darswin.models.stages import Pair, StagePlan
 
@@ -45,12 +46,12 @@ class DeformableAttention(nn.Module):
             raise ValueError(f"groups must divide num_heads = {num_heads}, got {groups}")
         self.num_heads, self.groups, self.offset_range = num_heads, groups, offset_range
         channels = dim // groups
-        self.q = nn.Linear(dim, dim)
-        self.kv = nn.Linear(dim, 2 * dim)
-        self.proj = nn.Linear(dim, dim)
+        self.q = Linear(dim, dim)
+        self.kv = Linear(dim, 2 * dim)
+        self.proj = Linear(dim, dim)
         self.around = nn.Conv2d(channels, channels, kernel, padding=kernel // 2, groups=channels)
         self.norm = nn.LayerNorm(channels)
-        self.offset = nn.Linear(channels, 2, bias=False)
+        self.offset = Linear(channels, 2, bias=False)
         self.position_bias = RelativeTable(map_size, num_heads)
 
     def _grouped(self, x: Tensor) -> Tensor:

@@ -4,8 +4,9 @@ from collections.abc import Sequence
 
 from torch import Tensor, nn
 
-from darswin.layers import PatchProjection, Pixels
+from darswin.layers import Block, Mlp, PatchProjection, Pixels, WindowAttention
 from darswin.lens import Lens
+from darswin.linear import PRODUCTS, Linear, Products
 from darswin.models.stages import Pair, check_depths, make_stages, plan_stages
 
 
@@ -28,12 +29,32 @@ class Encoder(nn.Module):
     def reset_classifier(self, num_classes: int) -> None:
         """A new head for `num_classes` classes; 0 leaves it out."""
         self.num_classes = num_classes
-        self.head = nn.Linear(self.num_features, num_classes) if num_classes else nn.Identity()
+        self.head = Linear(self.num_features, num_classes) if num_classes else nn.Identity()
         _init_weights(self.head)
 
     def no_weight_decay(self) -> set[str]:
         """Names of the parameters, besides biases and norms, that a recipe should not decay."""
         return {name for name, _ in self.named_parameters() if ".position_bias." in name}
+
+    def set_products(self, products: Products) -> None:
+        """Says who multiplies in the linear layers: "torch", "onednn" or "fastest", see `Linear`.
+
+        Raises:
+            ValueError: an unknown choice.
+        """
+        if products not in PRODUCTS:
+            raise ValueError(f"products must be one of {PRODUCTS}, got {products!r}")
+        for module in self.modules():
+            if isinstance(module, Linear):
+                module.products = products
+
+    def set_recompute(self, recompute: bool) -> None:
+        """Says whether training saves memory: norms, GELUs and attention in windows, a few percent
+        of the work, are then computed again in backward. The gradients are the same, bit for bit.
+        """
+        for module in self.modules():
+            if isinstance(module, (Block, Mlp, WindowAttention)):
+                module.recompute = recompute
 
     def _stage_maps(self, images: Tensor, lens: Lens | None) -> list[Tensor]:
         """The map that each stage ends with."""

@@ -14,6 +14,7 @@ from torchmetrics.classification import MulticlassAccuracy
 
 from darswin.data.mixing import Mixing
 from darswin.lens import Lens
+from darswin.linear import Products
 from darswin.models.encoder import ImageEncoder
 from darswin.models.registry import model_class
 from darswin.models.saving import ModelCard
@@ -41,6 +42,9 @@ class Classification(LightningModule):
         cutmix: α of the share that a box of another image leaves; 0 is off.
         mix_p: the share of batches that are mixed.
         reference_batch: images that the rates are meant for.
+        products: who multiplies in float32: torch, onednn, or the fastest, measured as it runs. On
+            AMD's CPUs onednn is twice as fast; which one it is decides how results are rounded.
+        recompute: saves a third of the activations' memory for a few percent of the time.
         seed: of the weights, jitter, drop path and mixing.
 
     Source: the recipe of DarSwin, ICCV 2023, sec. 5.2, and of its released code.
@@ -62,6 +66,8 @@ class Classification(LightningModule):
         cutmix: float = 1.0,
         mix_p: float = 1.0,
         reference_batch: int = 512,
+        products: Products = "torch",
+        recompute: bool = False,
         seed: int = 0,
     ):
         super().__init__()
@@ -73,6 +79,7 @@ class Classification(LightningModule):
         self.warmup_epochs, self.reference_batch = warmup_epochs, reference_batch
         self.weight_decay, self.decay_position_bias = weight_decay, decay_position_bias
         self.label_smoothing, self.seed = label_smoothing, seed
+        self.products, self.recompute = products, recompute
         self.mixing = Mixing(mixup, cutmix, mix_p)
         self.net: nn.Module | None = None
         self.card: ModelCard | None = None
@@ -94,6 +101,8 @@ class Classification(LightningModule):
         self.card = ModelCard(self.name, options, data.classes, data.size, data.fov)
         torch.manual_seed(self.seed)
         self.net = self.card.create()
+        self.net.set_products(self.products)
+        self.net.set_recompute(self.recompute)
         count = len(data.classes)
         self.val_metrics = metrics(count)
         self.test_metrics = nn.ModuleList(metrics(count) for _ in data.test_names)

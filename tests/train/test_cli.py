@@ -10,6 +10,7 @@ import torch
 import yaml
 from safetensors.torch import load_file
 
+from darswin import linear
 from darswin.__main__ import COMMANDS, main
 from darswin.models import load_model
 from darswin.train.cli import PRESETS, with_configs
@@ -37,6 +38,7 @@ def test_unknown_things(capsys, tmp_path):
     run = ["fit", "--run", tmp_path / "r"]
     assert "model.speed" in error(capsys, *run, *DIGITS, "--model.speed", "9")
     assert "unknown model 'resnet'" in error(capsys, *run, *DIGITS, "--model.name", "resnet")
+    assert "model.products" in error(capsys, *run, *DIGITS, "--model.products", "mkl")
     assert "lenses must be one of" in error(capsys, *run, *DIGITS, "--data.train_lenses", "odd")
     assert "no folder" in error(capsys, *run, *DIGITS, "--data.path", tmp_path / "nothing")
     assert "run" in error(capsys, "fit", *DIGITS)
@@ -46,6 +48,16 @@ def test_a_run_is_not_overwritten(capsys, tmp_path):
     (tmp_path / "checkpoints").mkdir()
     (tmp_path / "checkpoints" / "last.ckpt").write_bytes(b"")
     assert "holds a run already" in error(capsys, "fit", "--run", tmp_path, *DIGITS)
+
+
+def test_who_multiplies_and_what_is_computed_again_are_options(tmp_path):
+    linear._choices.clear()
+    fit = ["fit", "--run", tmp_path, *DIGITS, "--trainer.max_steps", "1", "--data.limit", "48"]
+    fit += ["--trainer.enable_progress_bar", "false", "--data.workers", "0"]
+    main([str(a) for a in (*fit, "--model.products", "fastest", "--model.recompute", "true")])
+    assert {shape.product for shape in linear.choices()} == set(linear._WAYS)
+    saved = yaml.safe_load((tmp_path / "config.yaml").read_text())["model"]
+    assert saved["products"] == "fastest" and saved["recompute"] is True
 
 
 def test_a_checkpoint_of_another_model(capsys, tmp_path):

@@ -1,0 +1,94 @@
+"""The peak memory of a batch, measured in a process of its own, which runs this file."""
+
+import contextlib
+import ctypes
+import json
+import subprocess
+import sys
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import torch
+
+from darswin.bench import candidates
+from darswin.bench.timing import REFERENCE
+
+_STATUS, _RESET = Path("/proc/self/status"), Path("/proc/self/clear_refs")
+
+
+@dataclass
+class Memory:
+    """Resident memory of a process that does one thing, in bytes."""
+
+    mode: str
+    dtype: str
+    batch: int
+    name: str
+    before: int  # of Python, torch and darswin, without a model
+    between: int  # between two batches
+    peak: int  # while one is computed
+
+    @property
+    def whole(self) -> int:
+        """Of the model, its optimizer and a batch."""
+        return self.peak - self.before
+
+    @property
+    def own(self) -> int:
+        """Of a batch, over what is there between two."""
+        return self.peak - self.between
+
+
+def available() -> bool:
+    """Whether this system tells a process its peak, and lets it start anew."""
+    return _STATUS.exists() and _RESET.exists()
+
+
+def measure(
+    mode: str, model: str, size: int, dtype: str, batch: int, name: str, threads: int
+) -> Memory:
+    """Measures `OURS` or `REFERENCE` in a new process."""
+    arguments = [mode, model, size, dtype, batch, name, threads]
+    command = [sys.executable, "-m", "darswin.bench.memory", *map(str, arguments)]
+    done = subprocess.run(command, capture_output=True, text=True)
+    if done.returncode:
+        raise RuntimeError(f"the peak memory of {name} cannot be measured: {done.stderr.strip()}")
+    return Memory(**json.loads(done.stdout.splitlines()[-1]))
+
+
+def _give_back() -> None:
+    """Makes glibc give back what is free, where it is glibc."""
+    with contextlib.suppress(OSError, AttributeError):
+        ctypes.CDLL(None).malloc_trim(0)
+
+
+def _resident(kind: str) -> int:
+    lines = _STATUS.read_text().splitlines()
+    return next(1024 * int(line.split()[1]) for line in lines if line.startswith(f"{kind}:"))
+
+
+def _measure_here(
+    mode: str, model: str, size: str, dtype: str, batch: str, name: str, threads: str
+) -> Memory:
+    torch.set_num_threads(int(threads))
+    before = _resident("VmRSS")
+    pixels, kind, reference = int(size), getattr(torch, dtype), name == REFERENCE
+    if mode == "training":
+        run = candidates.training_step(model, pixels, kind, int(batch), reference=reference)
+    else:
+        net, lens = candidates.network(model, pixels).eval(), candidates.lens_of(pixels)
+        images = torch.randn(int(batch), 3, pixels, pixels)
+        run = candidates.inference_run(net, lens, kind, images, reference=reference)
+        run = torch.no_grad()(run)
+        del net  # ours needs it no more
+    for _ in range(2):
+        run()
+    _give_back()
+    between = _resident("VmRSS")
+    _RESET.write_text("5")  # the peak starts from here
+    run()
+    return Memory(mode, dtype, int(batch), name, before, between, _resident("VmHWM"))
+
+
+if __name__ == "__main__":
+    print(json.dumps(asdict(_measure_here(*sys.argv[1:]))))

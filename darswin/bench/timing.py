@@ -1,0 +1,69 @@
+"""Timing of what is to be compared: in turns, so that a clock that wanders wanders for all."""
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+
+OURS, ONE_LENS, REFERENCE = "darswin", "darswin, one lens", "reference"
+COMPILED, PRODUCTS = "compiled reference", "products alone"
+
+
+@dataclass
+class Timing:
+    """Of one candidate in one case. Times are seconds a batch."""
+
+    mode: str  # "inference" or "training"
+    dtype: str
+    batch: int
+    threads: int
+    name: str
+    runs: int
+    median: float
+    iqr: float
+    p99: float  # the largest, below a hundred runs
+
+    @property
+    def case(self) -> tuple[str, str, int, int]:
+        return (self.mode, self.dtype, self.batch, self.threads)
+
+
+def in_turns(
+    candidates: dict[str, Callable[[], object]], seconds: float, least: int
+) -> dict[str, list[float]]:
+    """Calls each candidate, which has run before, for about `seconds`, at least `least` times.
+
+    Returns:
+        the seconds of each call of each candidate.
+    """
+    found, calls, turns = {}, {}, {}
+    for name, run in candidates.items():
+        found[name] = [once := _time(run)]
+        calls[name] = max(1, round(0.2 / once))  # a turn: long enough for caches to be its own
+        turns[name] = max(
+            math.ceil((least - 1) / calls[name]), round(seconds / (calls[name] * once)), 1
+        )
+    for turn in range(max(turns.values())):
+        for name, run in candidates.items():
+            if turn >= turns[name]:
+                continue
+            if calls[name] > 1:
+                run()
+            found[name] += [_time(run) for _ in range(calls[name])]
+    return found
+
+
+def _time(run: Callable[[], object]) -> float:
+    start = time.perf_counter()
+    run()
+    return time.perf_counter() - start
+
+
+def summary(case: tuple[str, str, int, int], name: str, seconds: list[float]) -> Timing:
+    """The timing of a candidate from its calls."""
+    values = torch.tensor(seconds, dtype=torch.float64)
+    low, median, high = values.quantile(values.new_tensor((0.25, 0.5, 0.75))).tolist()
+    p99 = values.quantile(0.99, interpolation="higher").item()
+    return Timing(*case, name, len(seconds), median, high - low, p99)

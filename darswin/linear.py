@@ -1,0 +1,148 @@
+"""A linear layer whose three products, the gradients' included, may be oneDNN's or torch's BLAS.
+
+In float32 torch asks its BLAS, which is MKL in the wheels for x86-64 and slow on AMD's CPUs.
+"""
+
+import time
+from collections.abc import Callable
+from typing import Literal, NamedTuple, get_args
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
+
+from darswin import onednn
+
+Products = Literal["torch", "onednn", "fastest"]
+PRODUCTS = get_args(Products)
+
+
+def _weight_gradient(g: Tensor, x: Tensor) -> Tensor:
+    """gᵀ x by oneDNN, which copies the left factor where that is transposed: the smaller copies."""
+    if g.numel() <= x.numel() + g.shape[1] * x.shape[1]:
+        return onednn.product(g.t(), x.t())
+    return onednn.product(x.t(), g.t()).t().contiguous()
+
+
+# Of rows x (M, D), a weight w (D', D) and the gradient g (M, D') of the result.
+_WAYS: dict[str, dict[str, Callable[..., Tensor]]] = {
+    "forward": {"torch": F.linear, "onednn": onednn.product},
+    "input gradient": {
+        "torch": lambda g, w: g @ w,
+        "onednn": lambda g, w: onednn.product(g, w.t()),
+    },
+    "weight gradient": {"torch": lambda g, x: g.t() @ x, "onednn": _weight_gradient},
+}
+
+
+class Shape(NamedTuple):
+    """What a choice is made for."""
+
+    product: str  # "forward", "input gradient" or "weight gradient"
+    rows: int  # of the input, rounded up to a power of two
+    in_features: int
+    out_features: int
+    threads: int
+
+
+_choices: dict[Shape, dict[str, float]] = {}
+
+
+def choices() -> dict[Shape, dict[str, float]]:
+    """What was measured so far: for each shape the seconds of each way, the one taken first."""
+    return {
+        shape: dict(sorted(seconds.items(), key=lambda item: item[1]))
+        for shape, seconds in _choices.items()
+    }
+
+
+class Linear(nn.Linear):
+    """`nn.Linear` with a choice of who multiplies.
+
+    `products` says who: "torch" as `nn.Linear`; "onednn"; or "fastest", which measures both at the
+    first call with a shape, takes the faster from then on, and shows what it found in `choices`.
+    Both compute in float32; they round differently, so runs that must repeat bit for bit should not
+    leave the choice to a clock. Second derivatives need "torch".
+
+    It concerns float32 on the CPU in eager mode. Elsewhere torch multiplies: compiled, under
+    autocast and in bfloat16, where it asks oneDNN by itself, and where there is no oneDNN.
+    """
+
+    products: Products = "torch"
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(..., D) → (..., D')."""
+        if self.products == "torch" or not _concerned(x, self.weight):
+            return super().forward(x)
+        return _Product.apply(x, self.weight, self.bias, self.products)
+
+    def extra_repr(self) -> str:
+        return f"{super().extra_repr()}, products={self.products!r}"
+
+
+def _concerned(x: Tensor, weight: Tensor) -> bool:
+    return (
+        not torch.compiler.is_compiling()
+        and x.dtype == weight.dtype == torch.float32
+        and x.device.type == weight.device.type == "cpu"
+        and x.numel() > 0
+        and not torch.is_autocast_enabled("cpu")
+        and onednn.missing(torch.float32) is None
+    )
+
+
+class _Product(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, x, weight, bias, products):
+        ctx.save_for_backward(x, weight)
+        ctx.products = products
+        rows = x.reshape(-1, x.shape[-1])
+        out = _multiply("forward", products, rows, weight, bias)
+        return out.view(*x.shape[:-1], weight.shape[0])
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, grad):
+        x, weight = ctx.saved_tensors
+        rows, grad_rows = x.reshape(-1, x.shape[-1]), grad.reshape(-1, grad.shape[-1])
+        wants_x, wants_weight, wants_bias, _ = ctx.needs_input_grad
+        grad_x = grad_weight = grad_bias = None
+        if wants_x:
+            grad_x = _multiply("input gradient", ctx.products, grad_rows, weight).view(x.shape)
+        if wants_weight:
+            grad_weight = _multiply("weight gradient", ctx.products, grad_rows, rows)
+        if wants_bias:
+            grad_bias = grad_rows.sum(0)
+        return grad_x, grad_weight, grad_bias, None
+
+
+def _multiply(
+    product: str, products: Products, rows: Tensor, other: Tensor, bias: Tensor | None = None
+) -> Tensor:
+    """The product of (M, ...) rows and a weight, or rows again, in the way that is to be taken."""
+    arguments = (rows, other, bias) if product == "forward" else (rows, other)
+    ways = _WAYS[product]
+    if products == "onednn":
+        return ways["onednn"](*arguments)
+    out_features, in_features = other.shape
+    if product == "weight gradient":
+        out_features, in_features = rows.shape[1], other.shape[1]
+    height = 1 << (rows.shape[0] - 1).bit_length()
+    shape = Shape(product, height, in_features, out_features, torch.get_num_threads())
+    if shape not in _choices:
+        _choices[shape] = _measure(ways, arguments)
+    seconds = _choices[shape]
+    return ways[min(seconds, key=seconds.get)](*arguments)
+
+
+def _measure(ways: dict[str, Callable[..., Tensor]], arguments: tuple) -> dict[str, float]:
+    """Seconds of each way: the best of a few, taken in turns."""
+    seconds = dict.fromkeys(ways, float("inf"))
+    for turn in range(5):
+        for name, way in ways.items():
+            start = time.perf_counter()
+            way(*arguments)
+            if turn:  # the first one makes what oneDNN keeps for the shape
+                seconds[name] = min(seconds[name], time.perf_counter() - start)
+    return seconds
