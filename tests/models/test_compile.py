@@ -10,6 +10,14 @@ from darswin.lens import Spherical
 FAMILIES = ("darswin_a", "darswin_ra", "swin", "swin_undis", "dat")
 
 
+@pytest.fixture(autouse=True)
+def no_graphs_before_or_after():
+    """All models share a forward, of which torch.compile keeps eight graphs at most."""
+    torch._dynamo.reset()
+    yield
+    torch._dynamo.reset()
+
+
 def inputs(batch):
     xi = torch.linspace(0.2, 0.9, batch)
     return torch.randn(batch, 3, 32, 32), Spherical.from_fov(xi, 2.6, 16.0)
