@@ -12,7 +12,7 @@ README = (ROOT / "README.md").read_text()
 
 def test_python_blocks():
     blocks = re.findall(r"```python\n(.*?)```", README, flags=re.S)
-    assert len(blocks) == 3
+    assert len(blocks) == 4
     scope = {}
     with torch.no_grad():
         for block in blocks:
