@@ -9,7 +9,9 @@ import sys
 from pathlib import Path
 
 ROOT = Path(__file__).parent.parent
-sys.path.append(str(ROOT / "studies"))
+sys.path[:0] = [str(ROOT), str(ROOT / "studies")]
+
+from darswin.bench import report  # noqa: E402
 
 README = ROOT / "README.md"
 RESULTS = ROOT / "benchmarks" / "results"
@@ -112,7 +114,10 @@ def tables() -> dict[str, str]:
     training = json.loads((RESULTS / "training--micro.json").read_text())
     cells = json.loads((studies / "study--nano.json").read_text())["cells"]
     cameras = json.loads((studies / "learned_lens.json").read_text())["cameras"]
+    model = report.Record.load(RESULTS / "model--avx512.json")
     return {
+        "model": report.table(model),
+        "model memory": report.memory_table(model),
         "sampling": peers_table(sampling, "polar_sample", SAMPLING_PEERS),
         "embedding": peers_table(sampling, "polar_embed", EMBED_PEERS),
         "attention": attention_table(attention),
