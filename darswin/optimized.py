@@ -14,6 +14,7 @@ from darswin.layers import (
     RelativeBias,
     WindowAttention,
     check_images,
+    check_lens,
 )
 from darswin.lens import Lens
 from darswin.models.darswin import DarSwin
@@ -91,6 +92,7 @@ class OneLens(Encoder):
         images = check_images(images)
         size = images.shape[2:]
         if size not in self._known:
+            check_lens(self.lens, images)
             grid, radials = self.model.geometry(self.lens, size)
             tables = [s.tables(r) for s, r in zip(self.stages, radials, strict=True)]
             self._known[size] = grid, tables

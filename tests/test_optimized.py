@@ -6,7 +6,7 @@ import torch
 from darswin import create_model, onednn, optimize
 from darswin import optimized as module
 from darswin.layers import RelativeBias
-from darswin.lens import Spherical
+from darswin.lens import KannalaBrandt, Spherical
 from darswin.ops import use_reference
 
 LENSES = Spherical.from_fov([0.2, 0.9], math.radians(160), 16.0)
@@ -169,3 +169,23 @@ def test_missing_says_why(monkeypatch):
         assert "enabled is False" in onednn.missing(torch.float32)
     monkeypatch.setattr(torch.ops.mkldnn, "_is_mkldnn_bf16_supported", lambda: False)
     assert "this CPU" in onednn.missing(torch.bfloat16)
+
+
+def test_one_lens_refuses_images_of_another_size_than_its_own():
+    camera = LENSES[:1].replace(image_size=torch.tensor([[32.0, 32.0]]))
+    fast = optimize(network(), lens=camera)
+    assert fast(torch.rand(1, 3, 32, 32)).shape == (1, 10)
+    with pytest.raises(ValueError, match=r"belongs to images of \(H, W\) = \(32, 32\)"):
+        fast(torch.rand(1, 3, 40, 32))
+
+
+@torch.no_grad()
+def test_a_bent_lens_is_optimized_too():
+    bent = KannalaBrandt(
+        10.0, [0.01], 1.5, affine=[[1.0, 0.1], [0.0, 1.1]], tangential=[0.02, 0.01]
+    )
+    model, images = network(), torch.rand(2, 3, 32, 32)
+    want = model(images, bent)
+    assert error(want, model(images, bent.replace(tangential=None))) > 1e-3
+    assert error(optimize(model)(images, bent), want) < 1e-5
+    assert error(optimize(model, lens=bent)(images), want) < 1e-5
