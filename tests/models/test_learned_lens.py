@@ -102,8 +102,13 @@ def without_sampling(model, monkeypatch) -> None:
 
 def without_bias(model, monkeypatch) -> None:
     """The lens's parameters reach the model through the samples alone."""
-    radial = model._radial
-    monkeypatch.setattr(model, "_radial", lambda *args: radial(*args).detach())
+    geometry = model.geometry
+
+    def detached(*args):
+        grid, radials = geometry(*args)
+        return grid, [radial.detach() for radial in radials]
+
+    monkeypatch.setattr(model, "geometry", detached)
 
 
 @pytest.mark.parametrize("make", LENSES)
