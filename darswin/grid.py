@@ -103,9 +103,7 @@ def _offsets(lens: Lens, points: Tensor, spacing: Spacing, azimuths: Tensor) -> 
     theta = _to_theta(lens, points, spacing)[:, :, None].expand(-1, -1, len(azimuths))
     direction = torch.stack((torch.cos(azimuths), torch.sin(azimuths)), -1)
     offsets = lens.offset(theta, direction.expand(*theta.shape, 2))
-    if lens.affine is not None:
-        offsets = (lens.affine[:, None, None] @ offsets[..., None])[..., 0]
-    return offsets.permute(0, 3, 1, 2)
+    return lens.through_affine(offsets).permute(0, 3, 1, 2)
 
 
 def check_grid(

@@ -269,9 +269,11 @@ class Lens:
 
     def to_pixels(self, flat: Tensor, image_size: tuple[int, int] | None = None) -> Tensor:
         """Points (N, ..., 2) around the principal point, before `affine` → pixels."""
-        if self.affine is not None:
-            flat = _apply(self.affine, flat)
-        return flat + self._row(self.center_in(image_size), flat.dim())
+        return self.through_affine(flat) + self._row(self.center_in(image_size), flat.dim())
+
+    def through_affine(self, flat: Tensor) -> Tensor:
+        """`affine` @ points or offsets (N or 1, ..., 2)."""
+        return flat if self.affine is None else _apply(self.affine, flat)
 
     def _flat(self, theta: Tensor, direction: Tensor) -> Tensor:
         flat = self.project(theta)[..., None] * direction

@@ -73,9 +73,7 @@ def largest_distance(lens: Lens, other: Lens) -> Tensor:
     theta = other.theta_max[:, None, None] * _fractions(other, 1024)[:, None]
     direction = _directions(other, 72)
     apart = lens._flat(theta, direction) - other._flat(theta, direction)
-    if other.affine is not None:
-        apart = (other.affine[:, None, None] @ apart[..., None])[..., 0]
-    return apart.norm(dim=-1).flatten(1).amax(1)
+    return other.through_affine(apart).norm(dim=-1).flatten(1).amax(1)
 
 
 def _model(model: str | type[Lens]) -> type[Lens]:

@@ -46,6 +46,11 @@ class PolynomialLens(Lens):
     def _validate(self) -> None:
         self._require("coefficients", self.coefficients.isfinite().all(1), "finite")
 
+    @property
+    def theta_limit(self) -> Tensor:
+        end = torch.full_like(self.coefficients[:, 0].detach(), math.pi)
+        return rising_limit(self._slope, end) - MARGIN
+
 
 class Polynomial(PolynomialLens):
     """r = k₁ θ + k₂ θ² + … + k_n θⁿ, of any degree; WoodScape's `radial_poly` has four.
@@ -57,11 +62,6 @@ class Polynomial(PolynomialLens):
 
     Source: DarSwin, ICCV 2023, eq. 4.
     """
-
-    @property
-    def theta_limit(self) -> Tensor:
-        end = torch.full_like(self.coefficients[:, 0].detach(), math.pi)
-        return rising_limit(self._slope, end) - MARGIN
 
     def _slope(self, theta: Tensor) -> Tensor:
         return horner(theta, slopes(self.coefficients, 1))
@@ -128,11 +128,6 @@ class OCamInverse(PolynomialLens):
 
     Source: the OCamCalib toolbox, world2cam.
     """
-
-    @property
-    def theta_limit(self) -> Tensor:
-        end = torch.full_like(self.coefficients[:, 0].detach(), math.pi)
-        return rising_limit(self._slope, end) - MARGIN
 
     def _slope(self, theta: Tensor) -> Tensor:
         return horner(theta - math.pi / 2, slopes(self.coefficients, 0)[:, 1:])

@@ -36,9 +36,7 @@ def largest_offset(lens: Lens) -> float:
     theta = lens.theta_max * torch.linspace(0, 1, 129).to(lens.theta_max)[:, None]
     azimuth = torch.linspace(0, 2 * math.pi, 181).to(theta)
     direction = torch.stack((torch.cos(azimuth), torch.sin(azimuth)), -1)
-    origin = torch.zeros(1, 2).to(theta)
-    moved = lens.to_pixels(lens.offset(theta, direction), (1, 1)) - lens.to_pixels(origin, (1, 1))
-    return moved.norm(dim=-1).max().item()
+    return lens.through_affine(lens.offset(theta, direction)).norm(dim=-1).max().item()
 
 
 class Patches(NamedTuple):
