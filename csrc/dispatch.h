@@ -117,6 +117,15 @@ struct WindowAttentionArgs {
   int64_t chunk;      // windows that share one row of bias gradients
 };
 
+// x += y, then y = x normalized over its last axis * weight + bias.
+template <typename S>
+struct AddNormArgs {
+  S *x, *y;                    // (rows, width)
+  const float *weight, *bias;  // (width,)
+  float eps;
+  int64_t width;
+};
+
 // Kernels are serial over [begin, end) of their work items; the drivers own the threads.
 template <typename T>
 struct KernelTable {
@@ -161,6 +170,10 @@ struct WindowAttentionTable {
   void (*backward)(const WindowAttentionArgs<T>&, int64_t begin, int64_t end, void* scratch);
 };
 
+// item: row
+template <typename S>
+using AddNorm = void (*)(const AddNormArgs<S>&, int64_t begin, int64_t end);
+
 struct Kernels {
   const char* tier;
   KernelTable<float> f32;
@@ -168,6 +181,8 @@ struct Kernels {
   WindowAttentionTable<float> attention_f32;
   WindowAttentionTable<double> attention_f64;
   WindowAttentionTable<bfloat16> attention_bf16;
+  AddNorm<float> add_norm_f32;
+  AddNorm<bfloat16> add_norm_bf16;
 
   template <typename T>
   const KernelTable<T>& table() const {
@@ -186,6 +201,15 @@ struct Kernels {
       return attention_f64;
     } else {
       return attention_bf16;
+    }
+  }
+
+  template <typename S>
+  AddNorm<S> add_norm() const {
+    if constexpr (sizeof(S) == sizeof(float)) {
+      return add_norm_f32;
+    } else {
+      return add_norm_bf16;
     }
   }
 };

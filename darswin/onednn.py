@@ -48,26 +48,19 @@ class PackedLinear(nn.Module):
         )
         self.weight = torch.ops.mkldnn._reorder_linear_weight(weight) if self.packed else weight
         if self.packed:
-            self._unary = torch.ops.mkldnn._linear_pointwise.default
-            self._binary = torch.ops.mkldnn._linear_pointwise.binary
+            self._product = torch.ops.mkldnn._linear_pointwise.default
 
     def forward(self, x: Tensor) -> Tensor:
         """(..., D) → (..., D')."""
         if self.packed:
-            return self._unary(x, self.weight, self.bias, "none", [], "")
+            return self._product(x, self.weight, self.bias, "none", [], "")
         return F.linear(x, self.weight, self.bias)
 
     def gelu(self, x: Tensor) -> Tensor:
         """(..., D) → the GELU of the result."""
         if self.packed:
-            return self._unary(x, self.weight, self.bias, "gelu", [], "none")
+            return self._product(x, self.weight, self.bias, "gelu", [], "none")
         return F.gelu(F.linear(x, self.weight, self.bias))
-
-    def add(self, x: Tensor, residual: Tensor) -> Tensor:
-        """(..., D) → the result and `residual` (..., D'), added."""
-        if self.packed:
-            return self._binary(x, residual, self.weight, self.bias, "add")
-        return residual + F.linear(x, self.weight, self.bias)
 
     def extra_repr(self) -> str:
         return f"in_features={self.in_features}, out_features={self.out_features}"

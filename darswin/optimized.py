@@ -1,4 +1,5 @@
-"""Models for inference: weights packed for oneDNN, GELU and residuals inside the products."""
+"""Models for inference: weights packed for oneDNN, GELU inside of the products, each residual and
+the norm behind it in one."""
 
 import copy
 import warnings
@@ -21,6 +22,7 @@ from darswin.models.darswin import DarSwin
 from darswin.models.encoder import Encoder
 from darswin.models.stages import Stage
 from darswin.onednn import PackedLinear
+from darswin.ops.add_norm import add_norm_
 
 DTYPES = (torch.float32, torch.bfloat16)
 # A stage runs on so many images at once that what lies between two products stays below this: it
@@ -33,9 +35,10 @@ def optimize(
 ) -> Encoder:
     """A copy of a model that computes the same, faster: on CPU, in inference only.
 
-    Its products are oneDNN's, with weights laid out for them, and take bias, GELU and residual
-    along. It is called as the model is and has its methods, but it is neither trained, saved nor
-    compiled: the model, which stays as it is, is there for that.
+    Its products are oneDNN's, with weights laid out for them, and take bias and GELU along; a
+    residual and the norm behind it are one operator. It is called as the model is and has its
+    methods, but it is neither trained, saved nor compiled: the model, which stays as it is, is
+    there for that.
 
     Args:
         model: one of `create_model`, on the CPU.
@@ -152,24 +155,31 @@ class _Stage(nn.Module):
         return [table.contiguous() for table in joined.split(self.heads, 1)]
 
     def run(self, x: Tensor, tables: list[Tensor | None]) -> Tensor:
-        """What `Stage` does, with what `tables` gave."""
-        x = self.downsample(x)
+        """What `Stage` does, with what `tables` gave. Where nothing merges, x itself changes."""
+        x = self.downsample(x).contiguous()
         widest = x[:1].numel() * self.mlp_ratio * x.element_size()
         parts = -(-len(x) * widest // CACHED_BYTES)
         if parts <= 1:
-            return self._blocks(x, tables)
-        results, start = [], 0
+            self._blocks(x, tables)
+            return x
+        start = 0
         for part in x.tensor_split(min(parts, len(x))):
             end = start + len(part)
-            own = [t if t is None or len(t) == 1 else t[start:end] for t in tables]
-            results.append(self._blocks(part, own))
+            self._blocks(part, [t if t is None or len(t) == 1 else t[start:end] for t in tables])
             start = end
-        return torch.cat(results)
-
-    def _blocks(self, x: Tensor, tables: list[Tensor | None]) -> Tensor:
-        for block, table in zip(self.blocks, tables, strict=True):
-            x = block(x, table)
         return x
+
+    def _blocks(self, x: Tensor, tables: list[Tensor | None]) -> None:
+        """All blocks on x, in place: it is what their residuals add up to."""
+        y = self.blocks[0].norm1(x)
+        followers = [*self.blocks[1:], None]
+        for block, follower, table in zip(self.blocks, followers, tables, strict=True):
+            y = block.norm2.after(x, block.attention(y, table))
+            y = block.fc2(block.fc1.gelu(y))
+            if follower is None:
+                x += y
+            else:
+                y = follower.norm1.after(x, y)
 
     def forward(self, x: Tensor, *positions: Tensor) -> Tensor:
         """As `Stage`."""
@@ -186,21 +196,32 @@ def _joined(biases: list[RelativeBias]) -> RelativeBias:
 
 
 class _Block:
-    """A block with everything at hand that its operators take."""
+    """A block's parts, with everything at hand that their operators take."""
 
     def __init__(self, block: Block, dtype: torch.dtype):
         in_windows = isinstance(block.attn, WindowAttention)
         self.attention = (_Windows if in_windows else _Deformable)(block.attn, dtype)
-        self.norm1, self.norm2 = (_norm(norm, dtype) for norm in (block.norm1, block.norm2))
+        self.norm1, self.norm2 = _Norm(block.norm1), _Norm(block.norm2)
         self.fc1, self.fc2 = (PackedLinear(fc, dtype) for fc in (block.mlp.fc1, block.mlp.fc2))
 
-    def __call__(self, x: Tensor, table: Tensor | None) -> Tensor:
-        x = self.attention(torch.layer_norm(x, *self.norm1), x, table)
-        return self.fc2.add(self.fc1.gelu(torch.layer_norm(x, *self.norm2)), x)
+
+class _Norm:
+    """A layer norm; its parameters stay float32."""
+
+    def __init__(self, norm: nn.LayerNorm):
+        self.shape, self.eps = norm.normalized_shape, norm.eps
+        self.weight, self.bias = norm.weight.float(), norm.bias.float()
+
+    def __call__(self, x: Tensor) -> Tensor:
+        return torch.layer_norm(x, self.shape, self.weight, self.bias, self.eps)
+
+    def after(self, x: Tensor, y: Tensor) -> Tensor:
+        """Adds y to the residual x, in place, and normalizes the sum, in place of y."""
+        return add_norm_(x, y, self.weight, self.bias, self.eps)
 
 
 class _Windows:
-    """Attention in windows and its residual."""
+    """Attention in windows."""
 
     def __init__(self, attn: WindowAttention, dtype: torch.dtype):
         self.qkv, self.proj = PackedLinear(attn.qkv, dtype), PackedLinear(attn.proj, dtype)
@@ -208,23 +229,18 @@ class _Windows:
         self.shape = (*attn.map_size, 3, attn.num_heads, dim)
         self.settings = (attn.window, attn.shift, attn.periodic, dim**-0.5)
 
-    def __call__(self, x: Tensor, residual: Tensor, table: Tensor) -> Tensor:
+    def __call__(self, x: Tensor, table: Tensor) -> Tensor:
         qkv = self.qkv(x).view(x.shape[0], *self.shape)
         # Not by way of darswin.ops: all that it would check is known to fit.
         out = torch.ops.darswin.window_attention.default(qkv, table, *self.settings)
-        return self.proj.add(out, residual)
+        return self.proj(out)
 
 
 class _Deformable:
-    """Any other attention, as it is, and its residual."""
+    """Any other attention, as it is."""
 
     def __init__(self, attn: nn.Module, dtype: torch.dtype):
         self.attn = _InDtype(attn, dtype)
 
-    def __call__(self, x: Tensor, residual: Tensor, table: None) -> Tensor:
-        return residual + self.attn(x)
-
-
-def _norm(norm: nn.LayerNorm, dtype: torch.dtype) -> tuple:
-    """What `torch.layer_norm` takes after the input."""
-    return (norm.normalized_shape, norm.weight.to(dtype), norm.bias.to(dtype), norm.eps)
+    def __call__(self, x: Tensor, table: None) -> Tensor:
+        return self.attn(x).contiguous()

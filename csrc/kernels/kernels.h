@@ -52,4 +52,7 @@ void window_attention(const WindowAttentionArgs<bfloat16>&, int64_t begin, int64
 void window_attention_backward(const WindowAttentionArgs<bfloat16>&, int64_t begin, int64_t end,
                                void* scratch);
 
+void add_norm(const AddNormArgs<float>&, int64_t begin, int64_t end);
+void add_norm(const AddNormArgs<bfloat16>&, int64_t begin, int64_t end);
+
 }  // namespace darswin::TIER

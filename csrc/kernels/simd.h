@@ -248,6 +248,19 @@ inline bfloat16 narrow(float x) {
   return {static_cast<uint16_t>(x != x ? (bits >> 16) | 0x40 : rounded)};
 }
 
+// A register of floats from as many bfloat16; the compiler's own conversion goes by halves of it.
+inline Vector<float, kLanes<float>> widen_lanes(const bfloat16* from) {
+  using Bits = Vector<uint32_t, kLanes<float>>;
+#if defined(__AVX512F__)
+  const Bits bits = (Bits)_mm512_maskz_cvtepu16_epi32(0xFFFF, load_bits<__m256i>(from));
+#elif defined(__AVX2__)
+  const Bits bits = (Bits)_mm256_cvtepu16_epi32(load_bits<__m128i>(from));
+#else
+  const auto bits = __builtin_convertvector(load_bits<Vector<uint16_t, kLanes<float>>>(from), Bits);
+#endif
+  return (Vector<float, kLanes<float>>)(bits << 16);
+}
+
 // The bits of x rounded to those that bfloat16 has, which are the upper ones; NaN stays NaN.
 inline Vector<uint32_t, kLanes<float>> rounded(Vector<float, kLanes<float>> x) {
   using Bits = Vector<uint32_t, kLanes<float>>;

@@ -17,7 +17,7 @@ constexpr Kernels kernels = {
          polar_embed_backward_weight, polar_embed_backward_samples, polar_embed_backward_image},
         {window_attention_scratch, window_attention, window_attention_backward},
         {window_attention_scratch, window_attention, window_attention_backward},
-        {window_attention_scratch, window_attention, window_attention_backward},
+        {window_attention_scratch, window_attention, window_attention_backward}, add_norm, add_norm,
 };
 
 }  // namespace darswin::TIER
