@@ -45,6 +45,10 @@ def main(argv: list[str] | None = None) -> None:
 
 def _run(command: str, argv: list[str]) -> None:
     # Imported here, because they take seconds.
+    if command in ("fit", "bench"):
+        from darswin.malloc import keep_freed_memory
+
+        keep_freed_memory()
     if command in ("fit", "validate", "test"):
         from darswin.train.cli import run_command
 

@@ -18,21 +18,21 @@ Products = Literal["torch", "onednn", "fastest"]
 PRODUCTS = get_args(Products)
 
 
-def _weight_gradient(g: Tensor, x: Tensor) -> Tensor:
-    """gᵀ x by oneDNN, which copies the left factor where that is transposed: the smaller copies."""
-    if g.numel() <= x.numel() + g.shape[1] * x.shape[1]:
-        return onednn.product(g.t(), x.t())
-    return onednn.product(x.t(), g.t()).t().contiguous()
+def _parameter_gradients(
+    g: Tensor, x: Tensor, weight: Tensor, with_bias: bool
+) -> tuple[Tensor, Tensor | None]:
+    return g.t() @ x, g.sum(0) if with_bias else None
 
 
 # Of rows x (M, D), a weight w (D', D) and the gradient g (M, D') of the result.
-_WAYS: dict[str, dict[str, Callable[..., Tensor]]] = {
+_WAYS: dict[str, dict[str, Callable]] = {
     "forward": {"torch": F.linear, "onednn": onednn.product},
     "input gradient": {
         "torch": lambda g, w: g @ w,
         "onednn": lambda g, w: onednn.product(g, w.t()),
     },
-    "weight gradient": {"torch": lambda g, x: g.t() @ x, "onednn": _weight_gradient},
+    # and that of the bias
+    "weight gradient": {"torch": _parameter_gradients, "onednn": onednn.parameter_gradients},
 }
 
 
@@ -98,7 +98,7 @@ class _Product(torch.autograd.Function):
         ctx.save_for_backward(x, weight)
         ctx.products = products
         rows = x.reshape(-1, x.shape[-1])
-        out = _multiply("forward", products, rows, weight, bias)
+        out = _multiply("forward", products, weight, rows, weight, bias)
         return out.view(*x.shape[:-1], weight.shape[0])
 
     @staticmethod
@@ -109,34 +109,31 @@ class _Product(torch.autograd.Function):
         wants_x, wants_weight, wants_bias, _ = ctx.needs_input_grad
         grad_x = grad_weight = grad_bias = None
         if wants_x:
-            grad_x = _multiply("input gradient", ctx.products, grad_rows, weight).view(x.shape)
+            grad_x = _multiply("input gradient", ctx.products, weight, grad_rows, weight)
+            grad_x = grad_x.view(x.shape)
         if wants_weight:
-            grad_weight = _multiply("weight gradient", ctx.products, grad_rows, rows)
-        if wants_bias:
+            arguments = (grad_rows, rows, weight, wants_bias)
+            grad_weight, grad_bias = _multiply("weight gradient", ctx.products, weight, *arguments)
+        elif wants_bias:
             grad_bias = grad_rows.sum(0)
         return grad_x, grad_weight, grad_bias, None
 
 
-def _multiply(
-    product: str, products: Products, rows: Tensor, other: Tensor, bias: Tensor | None = None
-) -> Tensor:
-    """The product of (M, ...) rows and a weight, or rows again, in the way that is to be taken."""
-    arguments = (rows, other, bias) if product == "forward" else (rows, other)
+def _multiply(product: str, products: Products, weight: Tensor, rows: Tensor, *others):
+    """The product of a layer with `weight`, of (M, ...) rows and others, in the way to take."""
     ways = _WAYS[product]
     if products == "onednn":
-        return ways["onednn"](*arguments)
-    out_features, in_features = other.shape
-    if product == "weight gradient":
-        out_features, in_features = rows.shape[1], other.shape[1]
+        return ways["onednn"](rows, *others)
     height = 1 << (rows.shape[0] - 1).bit_length()
+    out_features, in_features = weight.shape
     shape = Shape(product, height, in_features, out_features, torch.get_num_threads())
     if shape not in _choices:
-        _choices[shape] = _measure(ways, arguments)
+        _choices[shape] = _measure(ways, (rows, *others))
     seconds = _choices[shape]
-    return ways[min(seconds, key=seconds.get)](*arguments)
+    return ways[min(seconds, key=seconds.get)](rows, *others)
 
 
-def _measure(ways: dict[str, Callable[..., Tensor]], arguments: tuple) -> dict[str, float]:
+def _measure(ways: dict[str, Callable], arguments: tuple) -> dict[str, float]:
     """Seconds of each way: the best of a few, taken in turns."""
     seconds = dict.fromkeys(ways, float("inf"))
     for turn in range(5):

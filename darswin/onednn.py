@@ -28,6 +28,15 @@ def product(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
     return torch.ops.mkldnn._linear_pointwise.default(x, weight, bias, "none", [], "")
 
 
+def parameter_gradients(
+    g: Tensor, x: Tensor, weight: Tensor, with_bias: bool
+) -> tuple[Tensor, Tensor | None]:
+    """Of `F.linear(x, weight, bias)` in float32, x (M, D), whose result has the gradient g."""
+    gradients = torch.ops.aten.mkldnn_linear_backward_weights.default
+    grad_weight, grad_bias = gradients(g.to_mkldnn(), x.to_mkldnn(), weight, with_bias)
+    return grad_weight, grad_bias if with_bias else None
+
+
 class PackedLinear(nn.Module):
     """A linear layer for inference, its weight laid out as the product reads it.
 

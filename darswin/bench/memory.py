@@ -1,7 +1,5 @@
 """The peak memory of a batch, measured in a process of its own, which runs this file."""
 
-import contextlib
-import ctypes
 import json
 import subprocess
 import sys
@@ -12,6 +10,7 @@ import torch
 
 from darswin.bench import candidates
 from darswin.bench.timing import REFERENCE
+from darswin.malloc import give_back_memory
 
 _STATUS, _RESET = Path("/proc/self/status"), Path("/proc/self/clear_refs")
 
@@ -56,12 +55,6 @@ def measure(
     return Memory(**json.loads(done.stdout.splitlines()[-1]))
 
 
-def _give_back() -> None:
-    """Makes glibc give back what is free, where it is glibc."""
-    with contextlib.suppress(OSError, AttributeError):
-        ctypes.CDLL(None).malloc_trim(0)
-
-
 def _resident(kind: str) -> int:
     lines = _STATUS.read_text().splitlines()
     return next(1024 * int(line.split()[1]) for line in lines if line.startswith(f"{kind}:"))
@@ -83,7 +76,7 @@ def _measure_here(
         del net  # ours needs it no more
     for _ in range(2):
         run()
-    _give_back()
+    give_back_memory()
     between = _resident("VmRSS")
     _RESET.write_text("5")  # the peak starts from here
     run()
