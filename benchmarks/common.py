@@ -1,8 +1,8 @@
 """What every benchmark shares: timing, checking against peers, and a record of the machine.
 
 The contract: `torch.utils.benchmark`, median and interquartile range; ours and every peer in the
-same process and run; outputs checked equal before anything is timed; every result is published,
-losses too. A peer may carry a bar: how many times as long as ours it must at least take.
+same process and run, in turns; outputs checked equal before anything is timed; every result is
+published, losses too. A peer may carry a bar: how many times as long as ours it must at least take.
 """
 
 import json
@@ -16,13 +16,14 @@ import matplotlib
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import torch
-from torch.utils.benchmark import Timer
+from torch.utils.benchmark import Measurement, Timer
 
 from darswin import _C
 from darswin.bench.machine import machine
 
 RESULTS = Path(__file__).parent / "results"
 OURS = "darswin"
+ROUNDS = 5  # candidates take turns, so that a clock that wanders wanders for all
 
 
 @dataclass
@@ -119,10 +120,15 @@ def compare(
                 got, want, rtol=tolerance, atol=tolerance * want.abs().max().item(),
                 msg=lambda text, name=name: f"{case}: {name} disagrees with ours: {text}",
             )  # fmt: skip
-    times = {}
-    for name, run in candidates.items():
-        timer = Timer("run()", globals={"run": run}, num_threads=threads)
-        times[name] = timer.blocked_autorange(min_run_time=min_run_time)
+    timers = {
+        name: Timer("run()", globals={"run": run}, num_threads=threads)
+        for name, run in candidates.items()
+    }
+    parts: dict[str, list[Measurement]] = {name: [] for name in timers}
+    for _ in range(ROUNDS):
+        for name, timer in timers.items():
+            parts[name].append(timer.blocked_autorange(min_run_time=min_run_time / ROUNDS))
+    times = {name: Measurement.merge(measured)[0] for name, measured in parts.items()}
     return [
         Result(
             operator, case, mode, threads, name, t.median, t.iqr,
