@@ -7,6 +7,7 @@ published, losses too. A peer may carry a bar: how many times as long as ours it
 
 import json
 import math
+import statistics
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -23,7 +24,7 @@ from darswin.bench.machine import machine
 
 RESULTS = Path(__file__).parent / "results"
 OURS = "darswin"
-ROUNDS = 5  # candidates take turns, so that a clock that wanders wanders for all
+ROUNDS = 7  # candidates take turns, so that a clock that wanders wanders for all
 
 
 @dataclass
@@ -37,7 +38,7 @@ class Result:
     name: str
     median: float
     iqr: float
-    ratio: float  # the candidate's time over ours
+    ratio: float  # the candidate's time over ours, as the median of the rounds has it
     bar: float | None = None  # the least that the ratio should be
 
 
@@ -124,18 +125,21 @@ def compare(
         name: Timer("run()", globals={"run": run}, num_threads=threads)
         for name, run in candidates.items()
     }
-    parts: dict[str, list[Measurement]] = {name: [] for name in timers}
-    for _ in range(ROUNDS):
-        for name, timer in timers.items():
-            parts[name].append(timer.blocked_autorange(min_run_time=min_run_time / ROUNDS))
-    times = {name: Measurement.merge(measured)[0] for name, measured in parts.items()}
-    return [
-        Result(
-            operator, case, mode, threads, name, t.median, t.iqr,
-            t.median / times[OURS].median, bars.get(name),
+    part = min_run_time / ROUNDS
+    rounds = [
+        {name: timer.blocked_autorange(min_run_time=part) for name, timer in timers.items()}
+        for _ in range(ROUNDS)
+    ]
+    results = []
+    for name in candidates:
+        whole = Measurement.merge([times[name] for times in rounds])[0]
+        ratio = statistics.median(times[name].median / times[OURS].median for times in rounds)
+        results.append(
+            Result(
+                operator, case, mode, threads, name, whole.median, whole.iqr, ratio, bars.get(name)
+            )
         )
-        for name, t in times.items()
-    ]  # fmt: skip
+    return results
 
 
 def table(results: list[Result]) -> str:

@@ -1,0 +1,40 @@
+import platform
+import subprocess
+import sys
+
+import pytest
+
+from darswin import malloc
+
+# Page faults of making 64 MB, and 300 tensors of 1 MB, again.
+SCRIPT = """
+import resource, torch
+from darswin import malloc
+{call}
+def make():
+    large = torch.ones(16, 2**20)
+    small = [torch.ones(2**18) for _ in range(300)]
+make()
+make()
+before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+make()
+print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
+"""
+
+
+def faults(call: str) -> int:
+    # A process of its own: what is told to malloc stays.
+    command = [sys.executable, "-c", SCRIPT.format(call=call)]
+    return int(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="glibc's malloc is what is told")
+def test_kept_memory_needs_no_new_pages():
+    assert faults("assert malloc.keep_freed_memory()") < 100
+    assert faults("") > 10_000
+
+
+def test_other_c_libraries_are_left_alone(monkeypatch):
+    monkeypatch.setattr(malloc.ctypes, "CDLL", lambda name: object())
+    assert not malloc.keep_freed_memory()
+    malloc.give_back_memory()
