@@ -72,16 +72,7 @@ def lens_of(lens: str, image_size: tuple[int, int], camera: str | None = None) -
         ValueError: as `darswin.lens.load`; a picture of another shape than the calibration's.
     """
     read = loads if lens.lstrip().startswith("{") else load
-    found = read(lens, camera=camera, image_size=image_size)
-    height, width = (round(side) for side in found.image_size[0].tolist())
-    scale = image_size[0] / height
-    if abs(scale * width - image_size[1]) > 1:
-        raise ValueError(
-            f"the lens is of pictures of {height}×{width} px, and {image_size[0]}×{image_size[1]} "
-            "is not of that shape"
-        )
-    if (height, width) != image_size:
-        found = found.resized(image_size)
+    found = read(lens, camera=camera, image_size=image_size).in_picture(image_size)
     return found.replace(center=found.center_in())
 
 

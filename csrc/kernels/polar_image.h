@@ -13,7 +13,6 @@ namespace {
 
 using darswin::Pixel;
 
-inline int64_t round_up(int64_t n, int64_t unit) { return (n + unit - 1) / unit * unit; }
 inline int64_t smaller(int64_t x, int64_t y) { return x < y ? x : y; }
 
 // An image with borders. Pixel (x, y) of the image is pixel (x + 1, y + 1) of this.

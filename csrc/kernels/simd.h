@@ -40,6 +40,9 @@ using Doubles = Vector<double, kLanes<double>>;
 using Words = Vector<uint64_t, kLanes<uint64_t>>;
 constexpr int kDoubles = kLanes<double>;
 
+// n, or the next multiple of `unit`.
+constexpr int64_t round_up(int64_t n, int64_t unit) { return (n + unit - 1) / unit * unit; }
+
 // Unaligned load and store of lanes, or of one value, that have the type of what is pointed to, so
 // that the compiler may assume that nothing else is touched.
 template <typename V>

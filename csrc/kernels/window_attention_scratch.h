@@ -19,8 +19,6 @@ struct Size {
   operator int64_t() const { return kKnown > 0 ? kKnown : size; }
 };
 
-constexpr int64_t round_up(int64_t count, int64_t step) { return (count + step - 1) / step * step; }
-
 // The sizes of one call; kTokens and kDim are what the compiler knows of n and d. A window of one
 // sector counts as one of one ring: the same tokens in the same order, but in one long run.
 template <int64_t kTokens, int64_t kDim>

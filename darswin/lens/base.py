@@ -374,6 +374,25 @@ class Lens:
             )
         return lens
 
+    def in_picture(self, size: tuple[int, int]) -> Self:
+        """The lens in a picture of (H, W) that shows all that the lens was calibrated with.
+
+        A lens without an `image_size` stays as it is.
+
+        Raises:
+            ValueError: a picture of another shape, by more than the rounding of its sides.
+        """
+        if self.image_size is None:
+            return self
+        height, width = (round(side) for side in self.image_size[0].tolist())
+        off = abs(size[0] * width - size[1] * height)  # px times the other side
+        if off > width and off > height:
+            raise ValueError(
+                f"the lens is of pictures of {height}×{width} px, and {size[0]}×{size[1]} is not "
+                "of that shape"
+            )
+        return self if tuple(size) == (height, width) else self.resized(tuple(size))
+
     def _scaled(self, scale: float | Tensor) -> Self:
         """The same lens with all its lengths `scale` times as long."""
         lengths = {}

@@ -54,7 +54,7 @@ def show(
     """
     picture = read_image(image)
     size = picture.shape[:2]
-    lens = _in_picture(_load(calib, camera, theta_max_deg, size, coefficients), size)
+    lens = _load(calib, camera, theta_max_deg, size, coefficients).in_picture(size)
     sampler = PolarSample(rings, sectors, samples, spacing=spacing)
     across, down = _fields_of_view(lens, size)
     if fov_deg is None:
@@ -133,20 +133,6 @@ def _load(
         model=coefficients,
         dtype=torch.float64,
     )
-
-
-def _in_picture(lens: Lens, size: tuple[int, int]) -> Lens:
-    """The lens in a picture of (H, W), which may be smaller or larger than those it was calibrated
-    with; ValueError where it is another part of them."""
-    if lens.image_size is None:
-        return lens
-    height, width = (round(side) for side in lens.image_size[0].tolist())
-    if abs(size[0] * width / (size[1] * height) - 1) > 0.01:
-        raise ValueError(
-            f"the picture must show what was calibrated, {width} × {height} px or as many times "
-            f"larger or smaller, got {size[1]} × {size[0]} (width × height)"
-        )
-    return lens if size == (height, width) else lens.resized(size)
 
 
 def _fields_of_view(lens: Lens, size: tuple[int, int]) -> tuple[float, float]:

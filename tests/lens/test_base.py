@@ -9,7 +9,7 @@ import torch
 from torch.utils import _pytree as pytree
 from torch.utils.data import DataLoader, Dataset
 
-from darswin.lens import Perspective, Polynomial, Spherical, from_dict, stack, to_dict
+from darswin.lens import Equidistant, Perspective, Polynomial, Spherical, from_dict, stack, to_dict
 
 f64 = torch.float64
 
@@ -240,6 +240,24 @@ def test_a_resized_lens_projects_to_the_resized_image(center):
     middle, before = half.center_in((15, 20))[0], lens.center_in((30, 40))[0]
     assert torch.allclose(middle + 0.5, (before + 0.5) / 2)
     assert Polynomial([5.0, 1.0], 1.0).resized(2).coefficients.tolist() == [[10.0, 2.0]]
+
+
+@pytest.mark.parametrize("size", [(966, 1280), (483, 640), (75, 100), (1, 1), (1932, 2561)])
+def test_in_a_picture_of_the_same_view(size):
+    lens = Equidistant(300.0, 1.5, image_size=(966, 1280))
+    found = lens.in_picture(size)
+    assert found.image_size.tolist() == [list(size)]
+    assert found.focal.item() == pytest.approx(300 * size[1] / 1280)
+    assert (found is lens) == (size == (966, 1280))
+
+
+def test_in_a_picture_of_another_view():
+    lens = Equidistant(300.0, 1.5, image_size=(966, 1280))
+    for size in [(966, 1278), (480, 643), (1280, 966)]:
+        with pytest.raises(ValueError, match="pictures of 966×1280 px, and"):
+            lens.in_picture(size)
+    unknown = Equidistant(300.0, 1.5)
+    assert unknown.in_picture((4, 9)) is unknown
 
 
 def test_resizing_to_a_size_keeps_where_rays_land():
