@@ -1,4 +1,4 @@
-"""The two operators: compiled on CPU, plain PyTorch elsewhere and under `use_reference`."""
+"""The operators: compiled on CPU, plain PyTorch elsewhere and under `use_reference`."""
 
 from darswin.ops._library import reference_in_use, use_reference
 from darswin.ops.polar_embed import polar_embed
