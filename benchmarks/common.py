@@ -201,7 +201,7 @@ def plot(results: list[Result], path: Path) -> None:
     rows = [r for r in results if r.threads == 1 and not r.name.startswith(OURS)]
     names = list(dict.fromkeys(r.name for r in rows))
     keys = list(dict.fromkeys((r.operator, r.case, r.mode) for r in rows))
-    figure, axes = plt.subplots(figsize=(9, 1.5 + 0.3 * len(keys)))
+    figure, axes = plt.subplots(figsize=(9, 1.5 + 0.3 * len(keys)), layout="constrained")
     for index, name in enumerate(names):
         points = {(r.operator, r.case, r.mode): r.ratio for r in rows if r.name == name}
         places = [k for k, key in enumerate(keys) if key in points]
@@ -211,9 +211,9 @@ def plot(results: list[Result], path: Path) -> None:
     axes.set_yticks([k + 0.4 for k in range(len(keys))], [", ".join(key) for key in keys])
     axes.tick_params(axis="y", labelsize=7)
     axes.invert_yaxis()
+    axes.margins(y=0.005)
     axes.set_xlabel("time of the peer / time of darswin, 1 thread")
     axes.legend(fontsize=8)
-    figure.tight_layout()
     figure.savefig(path, dpi=120)
     plt.close(figure)
 
