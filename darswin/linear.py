@@ -31,7 +31,7 @@ _WAYS: dict[str, dict[str, Callable]] = {
         "torch": lambda g, w: g @ w,
         "onednn": lambda g, w: onednn.product(g, w.t()),
     },
-    # and that of the bias
+    # The bias's gradient comes along.
     "weight gradient": {"torch": _parameter_gradients, "onednn": onednn.parameter_gradients},
 }
 

@@ -62,3 +62,14 @@ def with_gradients(operator: Callable[..., Tensor], inputs: Sequence[Tensor]) ->
     generator = torch.Generator().manual_seed(7)
     grad = torch.randn(out.shape, generator=generator).to(out.dtype)
     return [out.detach(), *torch.autograd.grad(out, leaves, grad)]
+
+
+def assert_equals_reference(
+    operator: Callable[..., Tensor], inputs: Sequence[Tensor], *, rtol: float, atol: float
+) -> None:
+    """The output and the gradients of `with_gradients` are the reference's."""
+    ours = with_gradients(operator, inputs)
+    with use_reference():
+        expected = with_gradients(operator, inputs)
+    for got, want in zip(ours, expected, strict=True):
+        torch.testing.assert_close(got, want, rtol=rtol, atol=atol)

@@ -11,7 +11,6 @@ namespace darswin::TIER {
 namespace {
 
 constexpr int64_t kL = kLanes<float>;
-using Floats = Vector<float, kL>;
 
 // Lanes of V, which is Floats or float, as they are stored.
 template <typename V>
@@ -35,7 +34,7 @@ inline void write(bfloat16* to, V v) {
   if constexpr (kSame<V, float>) {
     *to = narrow(v);
   } else {
-    store_bits(to, __builtin_convertvector(rounded(v) >> 16, Vector<uint16_t, kL>));
+    narrow_lanes(to, v);
   }
 }
 

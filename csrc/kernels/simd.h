@@ -36,6 +36,7 @@ constexpr int kRegister = 16;
 template <typename T>
 constexpr int kLanes = kRegister / static_cast<int>(sizeof(T));
 
+using Floats = Vector<float, kLanes<float>>;
 using Doubles = Vector<double, kLanes<double>>;
 using Words = Vector<uint64_t, kLanes<uint64_t>>;
 constexpr int kDoubles = kLanes<double>;
@@ -252,7 +253,7 @@ inline bfloat16 narrow(float x) {
 }
 
 // A register of floats from as many bfloat16; the compiler's own conversion goes by halves of it.
-inline Vector<float, kLanes<float>> widen_lanes(const bfloat16* from) {
+inline Floats widen_lanes(const bfloat16* from) {
   using Bits = Vector<uint32_t, kLanes<float>>;
 #if defined(__AVX512F__)
   const Bits bits = (Bits)_mm512_maskz_cvtepu16_epi32(0xFFFF, load_bits<__m256i>(from));
@@ -261,22 +262,22 @@ inline Vector<float, kLanes<float>> widen_lanes(const bfloat16* from) {
 #else
   const auto bits = __builtin_convertvector(load_bits<Vector<uint16_t, kLanes<float>>>(from), Bits);
 #endif
-  return (Vector<float, kLanes<float>>)(bits << 16);
+  return (Floats)(bits << 16);
 }
 
 // The bits of x rounded to those that bfloat16 has, which are the upper ones; NaN stays NaN.
-inline Vector<uint32_t, kLanes<float>> rounded(Vector<float, kLanes<float>> x) {
+inline Vector<uint32_t, kLanes<float>> rounded(Floats x) {
   using Bits = Vector<uint32_t, kLanes<float>>;
   const Bits bits = (Bits)x;
   return x == x ? bits + 0x7FFF + ((bits >> 16) & 1) : bits | 0x400000;
 }
+inline void narrow_lanes(bfloat16* to, Floats x) {
+  store_bits(to, __builtin_convertvector(rounded(x) >> 16, Vector<uint16_t, kLanes<float>>));
+}
 inline void narrow_all(const float* from, int64_t count, bfloat16* to) {
   constexpr int lanes = kLanes<float>;
   int64_t e = 0;
-  for (; e + lanes <= count; e += lanes) {
-    const auto bits = rounded(load<Vector<float, lanes>>(from + e)) >> 16;
-    store_bits(to + e, __builtin_convertvector(bits, Vector<uint16_t, lanes>));
-  }
+  for (; e + lanes <= count; e += lanes) narrow_lanes(to + e, load<Floats>(from + e));
   for (; e < count; ++e) to[e] = narrow(from[e]);
 }
 

@@ -25,7 +25,6 @@ struct Rows {
 
 // a0 a2 .. b0 b2 .. within each 128 bits, and a1 a3 .. b1 b3 ..; the same of whole 128 bits.
 #if defined(__AVX512F__)
-using Floats = Vector<float, 16>;
 inline Floats even_lanes(Floats a, Floats b) {
   return __builtin_shufflevector(a, b, 0, 2, 16, 18, 4, 6, 20, 22, 8, 10, 24, 26, 12, 14, 28, 30);
 }
@@ -39,7 +38,6 @@ inline Floats odd_quads(Floats a, Floats b) {
   return __builtin_shufflevector(a, b, 4, 5, 6, 7, 12, 13, 14, 15, 20, 21, 22, 23, 28, 29, 30, 31);
 }
 #elif defined(__AVX2__)
-using Floats = Vector<float, 8>;
 inline Floats even_lanes(Floats a, Floats b) {
   return __builtin_shufflevector(a, b, 0, 2, 8, 10, 4, 6, 12, 14);
 }
@@ -53,7 +51,6 @@ inline Floats odd_quads(Floats a, Floats b) {
   return __builtin_shufflevector(a, b, 4, 5, 6, 7, 12, 13, 14, 15);
 }
 #else
-using Floats = Vector<float, 4>;
 inline Floats even_lanes(Floats a, Floats b) { return __builtin_shufflevector(a, b, 0, 2, 4, 6); }
 inline Floats odd_lanes(Floats a, Floats b) { return __builtin_shufflevector(a, b, 1, 3, 5, 7); }
 #endif

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 import torch.nn.functional as F
-from helpers import assert_accurate, with_gradients
+from helpers import assert_accurate, assert_equals_reference, with_gradients
 
 from darswin.ops import polar_embed, polar_sample, use_reference
 
@@ -206,11 +206,7 @@ def test_equals_reference_in_float64(shape, jitter, bends, layout):
     *inputs, azimuths = make_inputs(**sizes)
     inputs = bent(inputs, bends)
     run = sampler(azimuths, patch, bends, jitter=jitter, seed=3, layout=layout)
-    ours = with_gradients(run, inputs)
-    with use_reference():
-        expected = with_gradients(run, inputs)
-    for got, want in zip(ours, expected, strict=True):
-        torch.testing.assert_close(got, want, rtol=1e-9, atol=1e-9)
+    assert_equals_reference(run, inputs, rtol=1e-9, atol=1e-9)
 
 
 @jitters
@@ -220,11 +216,7 @@ def test_embedding_equals_reference_in_float64(shape, jitter):
     *inputs, azimuths = make_inputs(**sizes)
     inputs += linear(patch[0] * patch[1] * inputs[0].shape[1])
     run = embedder(azimuths, patch, jitter=jitter, seed=3)
-    ours = with_gradients(run, inputs)
-    with use_reference():
-        expected = with_gradients(run, inputs)
-    for got, want in zip(ours, expected, strict=True):
-        torch.testing.assert_close(got, want, rtol=1e-9, atol=1e-9)
+    assert_equals_reference(run, inputs, rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)

@@ -3,7 +3,7 @@ import math
 import pytest
 import torch
 import torch.nn.functional as F
-from helpers import assert_accurate, with_gradients
+from helpers import assert_accurate, assert_equals_reference, with_gradients
 
 from darswin import _C
 from darswin.ops import polar_sample, reference_in_use, use_reference
@@ -68,11 +68,7 @@ def test_equals_reference_in_float64(shape, jitter, layout):
     sizes, patch = SHAPES[shape]
     *inputs, azimuths = make_inputs(**sizes, dtype=torch.float64)
     run = sampler(azimuths, patch, jitter=jitter, seed=3, layout=layout)
-    ours = with_gradients(run, inputs)
-    with use_reference():
-        expected = with_gradients(run, inputs)
-    for got, want in zip(ours, expected, strict=True):
-        torch.testing.assert_close(got, want, rtol=1e-11, atol=1e-11)
+    assert_equals_reference(run, inputs, rtol=1e-11, atol=1e-11)
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)

@@ -3,7 +3,7 @@ import math
 import pytest
 import torch
 import torch.nn.functional as F
-from helpers import assert_accurate, with_gradients
+from helpers import assert_accurate, assert_equals_reference, with_gradients
 
 from darswin.ops import use_reference, window_attention
 
@@ -90,11 +90,7 @@ CASES = {
 def test_equals_reference_in_float64(case):
     sizes, options = CASES[case]
     inputs = make_inputs(**sizes, dtype=torch.float64)
-    ours = with_gradients(attention(**options), inputs)
-    with use_reference():
-        expected = with_gradients(attention(**options), inputs)
-    for got, want in zip(ours, expected, strict=True):
-        torch.testing.assert_close(got, want, rtol=1e-11, atol=1e-12)
+    assert_equals_reference(attention(**options), inputs, rtol=1e-11, atol=1e-12)
 
 
 @pytest.mark.parametrize("case", CASES)
