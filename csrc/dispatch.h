@@ -126,6 +126,15 @@ struct AddNormArgs {
   int64_t width;
 };
 
+// to = the transpose of `from`. The rows are taken in groups; each has its own sums of columns.
+constexpr int64_t kTransposedRows = 64;
+struct TransposeSumArgs {
+  const float* from;  // (rows, columns)
+  float* to;          // (columns, rows)
+  float* sums;        // (groups, columns)
+  int64_t rows, columns;
+};
+
 // Kernels are serial over [begin, end) of their work items; the drivers own the threads.
 template <typename T>
 struct KernelTable {
@@ -183,6 +192,8 @@ struct Kernels {
   WindowAttentionTable<bfloat16> attention_bf16;
   AddNorm<float> add_norm_f32;
   AddNorm<bfloat16> add_norm_bf16;
+  // item: group of rows
+  void (*transpose_sum)(const TransposeSumArgs&, int64_t begin, int64_t end);
 
   template <typename T>
   const KernelTable<T>& table() const {

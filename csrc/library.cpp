@@ -35,6 +35,7 @@ STABLE_TORCH_LIBRARY(darswin, m) {
       "window_attention_backward(Tensor grad_out, Tensor qkv, Tensor bias, int[] window, "
       "int[] shift, bool[] periodic, float scale) -> (Tensor, Tensor)");
   m.def("add_norm_(Tensor(a!) x, Tensor(b!) y, Tensor weight, Tensor bias, float eps) -> ()");
+  m.def("transpose_sum(Tensor x) -> (Tensor, Tensor)");
 }
 
 PYBIND11_MODULE(_C, m) {

@@ -18,9 +18,7 @@ Products = Literal["torch", "onednn", "fastest"]
 PRODUCTS = get_args(Products)
 
 
-def _parameter_gradients(
-    g: Tensor, x: Tensor, weight: Tensor, with_bias: bool
-) -> tuple[Tensor, Tensor | None]:
+def _parameter_gradients(g: Tensor, x: Tensor, with_bias: bool) -> tuple[Tensor, Tensor | None]:
     return g.t() @ x, g.sum(0) if with_bias else None
 
 
@@ -112,7 +110,7 @@ class _Product(torch.autograd.Function):
             grad_x = _multiply("input gradient", ctx.products, weight, grad_rows, weight)
             grad_x = grad_x.view(x.shape)
         if wants_weight:
-            arguments = (grad_rows, rows, weight, wants_bias)
+            arguments = (grad_rows, rows, wants_bias)
             grad_weight, grad_bias = _multiply("weight gradient", ctx.products, weight, *arguments)
         elif wants_bias:
             grad_bias = grad_rows.sum(0)

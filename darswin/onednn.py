@@ -7,6 +7,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from darswin.ops.transpose_sum import transpose_sum
+
 
 def missing(dtype: torch.dtype) -> str | None:
     """Why this torch on this machine has no such products in `dtype`; None where it has them."""
@@ -28,13 +30,11 @@ def product(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
     return torch.ops.mkldnn._linear_pointwise.default(x, weight, bias, "none", [], "")
 
 
-def parameter_gradients(
-    g: Tensor, x: Tensor, weight: Tensor, with_bias: bool
-) -> tuple[Tensor, Tensor | None]:
+def parameter_gradients(g: Tensor, x: Tensor, with_bias: bool) -> tuple[Tensor, Tensor | None]:
     """Of `F.linear(x, weight, bias)` in float32, x (M, D), whose result has the gradient g."""
-    gradients = torch.ops.aten.mkldnn_linear_backward_weights.default
-    grad_weight, grad_bias = gradients(g.to_mkldnn(), x.to_mkldnn(), weight, with_bias)
-    return grad_weight, grad_bias if with_bias else None
+    # oneDNN's product wants one of the two transposed in memory; torch's own copy is a slow one.
+    transposed, grad_bias = transpose_sum(g.contiguous())
+    return product(transposed, x.t()), grad_bias if with_bias else None
 
 
 class PackedLinear(nn.Module):

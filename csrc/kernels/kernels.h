@@ -55,4 +55,6 @@ void window_attention_backward(const WindowAttentionArgs<bfloat16>&, int64_t beg
 void add_norm(const AddNormArgs<float>&, int64_t begin, int64_t end);
 void add_norm(const AddNormArgs<bfloat16>&, int64_t begin, int64_t end);
 
+void transpose_sum(const TransposeSumArgs&, int64_t begin, int64_t end);
+
 }  // namespace darswin::TIER

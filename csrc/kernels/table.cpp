@@ -18,6 +18,7 @@ constexpr Kernels kernels = {
         {window_attention_scratch, window_attention, window_attention_backward},
         {window_attention_scratch, window_attention, window_attention_backward},
         {window_attention_scratch, window_attention, window_attention_backward}, add_norm, add_norm,
+        transpose_sum,
 };
 
 }  // namespace darswin::TIER

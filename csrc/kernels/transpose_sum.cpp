@@ -1,0 +1,58 @@
+// The transpose of a matrix and the sums of its columns, in one pass over memory.
+//
+// It is what the gradient of a linear layer's weight wants of the gradient of its output: a product
+// whose rows are the output's features, and, for the bias, their sums. Rows are read in groups, so
+// that what is written of a column is whole cache lines.
+#include "kernels.h"
+#include "transpose.h"
+
+namespace darswin::TIER {
+namespace {
+
+constexpr int64_t kL = kLanes<float>;
+
+// to[c * to_stride + r] = from[r * columns + c] for r < kL, c < kL; -> the sums over r.
+inline Floats square(const float* from, int64_t columns, float* to, int64_t to_stride) {
+  Floats rows[kL];
+  Floats sums[4] = {};
+#pragma GCC unroll 16
+  for (int i = 0; i < kL; ++i) {
+    rows[i] = load<Floats>(from + i * columns);
+    sums[i % 4] += rows[i];
+  }
+  transpose_square(rows);
+#pragma GCC unroll 16
+  for (int i = 0; i < kL; ++i) store(to + i * to_stride, rows[i]);
+  return (sums[0] + sums[1]) + (sums[2] + sums[3]);
+}
+
+}  // namespace
+
+void transpose_sum(const TransposeSumArgs& a, int64_t begin, int64_t end) {
+  for (int64_t group = begin; group < end; ++group) {
+    const int64_t first = group * kTransposedRows;
+    const int64_t rows = a.rows - first < kTransposedRows ? a.rows - first : kTransposedRows;
+    const float* from = a.from + first * a.columns;
+    float *to = a.to + first, *sums = a.sums + group * a.columns;
+    const int64_t whole_rows = rows / kL * kL, whole_columns = a.columns / kL * kL;
+    for (int64_t c = 0; c < whole_columns; c += kL) {
+      Floats sum{};
+      for (int64_t r = 0; r < whole_rows; r += kL) {
+        sum += square(from + r * a.columns + c, a.columns, to + c * a.rows + r, a.rows);
+      }
+      store(sums + c, sum);
+    }
+    for (int64_t c = 0; c < a.columns; ++c) {
+      const bool whole = c < whole_columns;
+      float sum = whole ? sums[c] : 0;
+      for (int64_t r = whole ? whole_rows : 0; r < rows; ++r) {
+        const float value = from[r * a.columns + c];
+        to[c * a.rows + r] = value;
+        sum += value;
+      }
+      sums[c] = sum;
+    }
+  }
+}
+
+}  // namespace darswin::TIER

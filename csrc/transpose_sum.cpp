@@ -1,0 +1,49 @@
+// transpose_sum on CPU: check, allocate, thread, call the kernel.
+#include <torch/csrc/stable/library.h>
+#include <torch/csrc/stable/ops.h>
+#include <torch/csrc/stable/tensor.h>
+#include <torch/headeronly/util/Exception.h>
+
+#include <algorithm>
+#include <tuple>
+#include <vector>
+
+#include "dispatch.h"
+#include "parallel.h"
+
+namespace darswin {
+namespace {
+
+using torch::stable::Tensor;
+
+std::tuple<Tensor, Tensor> transpose_sum(const Tensor& x) {
+  STD_TORCH_CHECK(x.is_cpu() && x.scalar_type() == torch::headeronly::ScalarType::Float &&
+                      x.dim() == 2 && x.is_contiguous(),
+                  "transpose_sum: x must be a contiguous float32 matrix");
+  const int64_t rows = x.size(0), columns = x.size(1);
+  const int64_t groups = (rows + kTransposedRows - 1) / kTransposedRows;
+  const Tensor transposed = torch::stable::new_empty(x, std::vector<int64_t>{columns, rows});
+  const Tensor sum = torch::stable::new_empty(x, std::vector<int64_t>{columns});
+  std::vector<float> sums(groups * columns);
+  const TransposeSumArgs args{static_cast<const float*>(x.const_data_ptr()),
+                              static_cast<float*>(transposed.mutable_data_ptr()), sums.data(), rows,
+                              columns};
+  parallel_ranges(groups, [&](int64_t begin, int64_t end, int64_t) {
+    kernels().transpose_sum(args, begin, end);
+  });
+  // Group after group, whoever made it.
+  auto* to = static_cast<float*>(sum.mutable_data_ptr());
+  std::fill_n(to, columns, 0.0f);
+  for (int64_t group = 0; group < groups; ++group) {
+    const float* part = sums.data() + group * columns;
+    for (int64_t c = 0; c < columns; ++c) to[c] += part[c];
+  }
+  return {transposed, sum};
+}
+
+}  // namespace
+}  // namespace darswin
+
+STABLE_TORCH_LIBRARY_IMPL(darswin, CPU, m) {
+  m.impl("transpose_sum", TORCH_BOX(&darswin::transpose_sum));
+}

@@ -1,0 +1,27 @@
+"""transpose_sum: a matrix's transpose and the sums of its columns. Public function and fake."""
+
+import torch
+from torch import Tensor
+
+
+def transpose_sum(x: Tensor) -> tuple[Tensor, Tensor]:
+    """The transpose of a matrix, contiguous, and the sums of its columns: one pass over memory.
+
+    For the gradients of a linear layer's weight and bias; there is none of it, nothing may require
+    one. Results do not depend on the number of threads.
+
+    Args:
+        x: (M, N), contiguous, float32.
+
+    Returns:
+        (N, M) and (N,).
+
+    Raises:
+        RuntimeError: another kind of tensor.
+    """
+    return torch.ops.darswin.transpose_sum.default(x)
+
+
+@torch.library.register_fake("darswin::transpose_sum")
+def _fake(x):
+    return x.new_empty(x.shape[::-1]), x.new_empty(x.shape[1:])
