@@ -15,6 +15,7 @@ from darswin.bench.timing import OURS, PRODUCTS, REFERENCE, Timing, in_turns, su
 from darswin.models import list_models
 
 DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16}
+RUNS = 7  # at least: steps of training are too long to be many, and some are disturbed
 LATENCY_RUNS = 100  # at batch 1: what a 99th percentile takes
 # How far the results of two candidates may be apart, of their norm.
 TOLERANCES = {"float32": 1e-4, "bfloat16": 5e-2}
@@ -86,8 +87,9 @@ def _measure(
     else:
         runs = candidates.training(*kind)
     _check(runs, TOLERANCES[dtype])
-    least = LATENCY_RUNS if mode == "inference" and batch == 1 else 3
-    found = [summary(case, name, times) for name, times in in_turns(runs, seconds, least).items()]
+    least = LATENCY_RUNS if mode == "inference" and batch == 1 else RUNS
+    turns = in_turns(runs, seconds, least)
+    found = [summary(case, name, of_it, turns[OURS]) for name, of_it in turns.items()]
     times = ", ".join(f"{t.name} {1e3 * t.median:.1f} ms" for t in found)
     print(f"{mode}, {dtype}, batch {batch}, {threads} threads: {times}", flush=True)
     return found

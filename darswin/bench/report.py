@@ -59,8 +59,8 @@ class Record:
 
     def ratio(self, case: tuple, peer: str) -> float | None:
         """The peer's time over ours."""
-        ours, theirs = self.find(case, OURS), self.find(case, peer)
-        return theirs.median / ours.median if ours and theirs else None
+        found = self.find(case, peer)
+        return found.ratio if found else None
 
 
 def table(record: Record) -> str:
@@ -118,7 +118,7 @@ def roof(record: Record) -> str:
         )
         lines.append(
             f"{mode}, {dtype}, batch {batch}, {threads} threads: products alone {alone:.0f} "
-            f"GFLOP/s, the model {ours:.0f} ({ours / alone:.0%})"
+            f"GFLOP/s, the model {ours:.0f} ({record.ratio(case, PRODUCTS):.0%})"
         )
     return "\n".join(lines)
 
