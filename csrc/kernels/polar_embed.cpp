@@ -9,6 +9,7 @@
 #include "polar_rows.h"
 #include "polar_sampler.h"
 #include "polar_scatter.h"
+#include "transpose.h"
 
 namespace darswin::TIER {
 namespace {

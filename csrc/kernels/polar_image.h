@@ -8,6 +8,7 @@
 #pragma once
 
 #include "polar_points.h"
+#include "transpose.h"
 
 namespace {
 

@@ -224,19 +224,6 @@ inline V interleave_upper(V a, V b) {
 #endif
 }
 
-// Writes the transpose of four rows of four, its rows `stride` apart.
-template <typename V, typename T>
-inline void transpose4(V a, V b, V c, V d, T* to, int64_t stride) {
-  const V ab = __builtin_shufflevector(a, b, 0, 4, 1, 5);
-  const V cd = __builtin_shufflevector(c, d, 0, 4, 1, 5);
-  const V ab2 = __builtin_shufflevector(a, b, 2, 6, 3, 7);
-  const V cd2 = __builtin_shufflevector(c, d, 2, 6, 3, 7);
-  store(to, __builtin_shufflevector(ab, cd, 0, 1, 4, 5));
-  store(to + stride, __builtin_shufflevector(ab, cd, 2, 3, 6, 7));
-  store(to + 2 * stride, __builtin_shufflevector(ab2, cd2, 0, 1, 4, 5));
-  store(to + 3 * stride, __builtin_shufflevector(ab2, cd2, 2, 3, 6, 7));
-}
-
 // bfloat16 is the upper half of a float32. Narrowing rounds to nearest, ties to even.
 inline float widen(bfloat16 x) {
   const uint32_t bits = static_cast<uint32_t>(x.bits) << 16;

@@ -1,9 +1,22 @@
-// The transpose of a square of floats in registers: log2(N) steps of shuffles, none through memory.
+// Transposes of small squares in registers: log2(N) steps of shuffles, none through memory.
 #pragma once
 
 #include "simd.h"
 
 namespace {
+
+// Writes the transpose of four rows of four, its rows `stride` apart.
+template <typename V, typename T>
+inline void transpose4(V a, V b, V c, V d, T* to, int64_t stride) {
+  const V ab = __builtin_shufflevector(a, b, 0, 4, 1, 5);
+  const V cd = __builtin_shufflevector(c, d, 0, 4, 1, 5);
+  const V ab2 = __builtin_shufflevector(a, b, 2, 6, 3, 7);
+  const V cd2 = __builtin_shufflevector(c, d, 2, 6, 3, 7);
+  store(to, __builtin_shufflevector(ab, cd, 0, 1, 4, 5));
+  store(to + stride, __builtin_shufflevector(ab, cd, 2, 3, 6, 7));
+  store(to + 2 * stride, __builtin_shufflevector(ab2, cd2, 0, 1, 4, 5));
+  store(to + 3 * stride, __builtin_shufflevector(ab2, cd2, 2, 3, 6, 7));
+}
 
 // a0 a2 .. b0 b2 .. within each 128 bits, and a1 a3 .. b1 b3 ..; the same of whole 128 bits.
 #if defined(__AVX512F__)
