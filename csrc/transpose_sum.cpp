@@ -24,9 +24,9 @@ std::tuple<Tensor, Tensor> transpose_sum(const Tensor& x) {
   const int64_t groups = (rows + kTransposedRows - 1) / kTransposedRows;
   const Tensor transposed = torch::stable::new_empty(x, std::vector<int64_t>{columns, rows});
   const Tensor sum = torch::stable::new_empty(x, std::vector<int64_t>{columns});
-  std::vector<float> sums(groups * columns);
+  auto* sums = static_cast<float*>(scratch(groups * columns * sizeof(float)));
   const TransposeSumArgs args{static_cast<const float*>(x.const_data_ptr()),
-                              static_cast<float*>(transposed.mutable_data_ptr()), sums.data(), rows,
+                              static_cast<float*>(transposed.mutable_data_ptr()), sums, rows,
                               columns};
   parallel_ranges(groups, [&](int64_t begin, int64_t end, int64_t) {
     kernels().transpose_sum(args, begin, end);
@@ -35,8 +35,7 @@ std::tuple<Tensor, Tensor> transpose_sum(const Tensor& x) {
   auto* to = static_cast<float*>(sum.mutable_data_ptr());
   std::fill_n(to, columns, 0.0f);
   for (int64_t group = 0; group < groups; ++group) {
-    const float* part = sums.data() + group * columns;
-    for (int64_t c = 0; c < columns; ++c) to[c] += part[c];
+    for (int64_t c = 0; c < columns; ++c) to[c] += sums[group * columns + c];
   }
   return {transposed, sum};
 }

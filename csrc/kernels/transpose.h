@@ -64,9 +64,9 @@ inline void split_pairs(Floats* rows, int stride, Even even, Odd odd) {
   for (int i = 0; i < N; ++i) rows[i * stride] = next[i];
 }
 
-// The transpose of a square of kLanes x kLanes floats: of each 4 x 4 inside its 128 bits, then of
-// the 128 bits among themselves.
-inline void transpose_square(Floats* rows) {
+// Writes the transpose of a square of kLanes x kLanes, its rows `stride` apart: of each 4 x 4
+// inside its 128 bits, then of the 128 bits among themselves.
+inline void transpose_square(Floats* rows, float* to, int64_t stride) {
   constexpr int kQuads = kLanes<float> / 4;
 #pragma GCC unroll 4
   for (int quad = 0; quad < kQuads; ++quad) {
@@ -80,6 +80,8 @@ inline void transpose_square(Floats* rows) {
     if constexpr (kQuads == 4) split_pairs<kQuads>(rows + lane, 4, even_quads, odd_quads);
   }
 #endif
+#pragma GCC unroll 16
+  for (int i = 0; i < kLanes<float>; ++i) store(to + i * stride, rows[i]);
 }
 
 }  // namespace

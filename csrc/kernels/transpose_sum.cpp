@@ -20,9 +20,7 @@ inline Floats square(const float* from, int64_t columns, float* to, int64_t to_s
     rows[i] = load<Floats>(from + i * columns);
     sums[i % 4] += rows[i];
   }
-  transpose_square(rows);
-#pragma GCC unroll 16
-  for (int i = 0; i < kL; ++i) store(to + i * to_stride, rows[i]);
+  transpose_square(rows, to, to_stride);
   return (sums[0] + sums[1]) + (sums[2] + sums[3]);
 }
 
@@ -42,7 +40,8 @@ void transpose_sum(const TransposeSumArgs& a, int64_t begin, int64_t end) {
       }
       store(sums + c, sum);
     }
-    for (int64_t c = 0; c < a.columns; ++c) {
+    // What is left: the last rows of all columns, if any, and all rows of the last columns.
+    for (int64_t c = whole_rows < rows ? 0 : whole_columns; c < a.columns; ++c) {
       const bool whole = c < whole_columns;
       float sum = whole ? sums[c] : 0;
       for (int64_t r = whole ? whole_rows : 0; r < rows; ++r) {

@@ -34,9 +34,7 @@ __attribute__((noinline)) void transpose(Rows<const T> rows, Dim d, T* columns) 
         Floats square[kL];
 #pragma GCC unroll 16
         for (int i = 0; i < kL; ++i) square[i] = load<Floats>(rows[row + i] + begin);
-        transpose_square(square);
-#pragma GCC unroll 16
-        for (int i = 0; i < kL; ++i) store(columns + (begin + i) * kGroup + row, square[i]);
+        transpose_square(square, columns + begin * kGroup + row, kGroup);
       }
     }
   }
