@@ -29,7 +29,7 @@ void run(const Tensor& x, const Tensor& y, const Tensor& weight, const Tensor& b
   };
   if (x.numel() == 0) return;
   const int64_t rows = x.numel() / args.width, each = std::max<int64_t>(kGrain / args.width, 1);
-  parallel_ranges((rows + each - 1) / each, [&](int64_t begin, int64_t end, int64_t) {
+  parallel_ranges((rows + each - 1) / each, 0, [&](int64_t begin, int64_t end, void*) {
     kernels().add_norm<S>()(args, begin * each, std::min(end * each, rows));
   });
 }

@@ -28,6 +28,7 @@ struct PolarSampleArgs {
   int64_t radii_stride, num_radii;
   const double* cosines;  // (num_azimuths,), readable for a register more
   const double* sines;    // the same
+  bool directions_known;  // whether all of these are numbers
   int64_t num_azimuths;
   const T* center;  // (B or 1, 2) px, x then y
   int64_t center_stride;
@@ -55,6 +56,10 @@ struct PolarSampleArgs {
 // of points that jitter moved inward and outward, d(loss)/d(x, y), and, where there is a matrix,
 // d(loss)/d(affine) from kAffine on.
 enum LensSum { kAlong, kInward, kOutward, kAcross, kDown, kAffine, kLensSums = kAffine + 4 };
+
+// What a kernel does with the samples: makes them (polar_embed's gradient of the weight does too),
+// or brings their gradients to the image, to the lens or, of polar_embed, to memory.
+enum class PolarPass { forward, backward_image, backward_lens, backward_samples };
 
 // The cells beside radius i, which jitter moves into: at both ends of the row the only one there
 // is.
@@ -140,8 +145,8 @@ template <typename T>
 struct KernelTable {
   // (n,) angles -> their cosines and sines, n a multiple of the lanes
   void (*directions)(const double* angles, int64_t n, double* cosines, double* sines);
-  // bytes of scratch that each thread needs in the functions of polar_sample below
-  int64_t (*polar_sample_scratch)(const PolarSampleArgs<T>&);
+  // bytes of scratch that each thread needs in one of the functions of polar_sample below
+  int64_t (*polar_sample_scratch)(const PolarSampleArgs<T>&, PolarPass);
   // item: (image, ring)
   void (*polar_sample)(const PolarSampleArgs<T>&, int64_t begin, int64_t end, void* scratch);
   // item: (image, band)
@@ -152,14 +157,14 @@ struct KernelTable {
                                      void* scratch);
   // (rows, columns) -> (columns, to_stride)
   void (*transpose)(const T* from, int64_t rows, int64_t columns, T* to, int64_t to_stride);
-  // bytes of scratch that each thread needs in the functions of polar_embed below
-  int64_t (*polar_embed_scratch)(const PolarSampleArgs<T>&, const PolarEmbedArgs<T>&);
+  // bytes of scratch that each thread needs in one of the functions of polar_embed below
+  int64_t (*polar_embed_scratch)(const PolarSampleArgs<T>&, const PolarEmbedArgs<T>&, PolarPass);
   // item: (image, ring)
   void (*polar_embed)(const PolarSampleArgs<T>&, const PolarEmbedArgs<T>&, int64_t begin,
                       int64_t end, void* scratch);
   // item: (image, ring); adds to weight (D, padded S_r * S_phi * C) and bias (D,)
   void (*polar_embed_backward_weight)(const PolarSampleArgs<T>&, const PolarEmbedArgs<T>&,
-                                      int64_t begin, int64_t end, T* weight, T* bias,
+                                      int64_t begin, int64_t end, T* weight, double* bias,
                                       void* scratch);
   // item: (image, ring); writes grad_samples
   void (*polar_embed_backward_samples)(const PolarSampleArgs<T>&, const PolarEmbedArgs<T>&,

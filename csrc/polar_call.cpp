@@ -1,5 +1,6 @@
 #include "polar_call.h"
 
+#include <algorithm>
 #include <numeric>
 
 #include "parallel.h"
@@ -8,6 +9,18 @@ namespace darswin {
 
 using torch::headeronly::ScalarType;
 using torch::stable::Tensor;
+
+int64_t product(std::initializer_list<int64_t> sizes) {
+  int64_t result = 64;
+  bool zero = false;
+  for (const int64_t size : sizes) {
+    // Zeros last: what is multiplied with them must fit as well.
+    zero |= size == 0;
+    STD_TORCH_CHECK(size == 0 || !__builtin_mul_overflow(result, size, &result),
+                    "polar_sample: the sizes are too large");
+  }
+  return zero ? 0 : result / 64;
+}
 
 template <typename T>
 PolarCall<T>::PolarCall(const Tensor& image_, const Tensor& radii_, const Tensor& azimuths_,
@@ -18,11 +31,12 @@ PolarCall<T>::PolarCall(const Tensor& image_, const Tensor& radii_, const Tensor
     : image(image_),
       radii(torch::stable::contiguous(radii_)),
       center(torch::stable::contiguous(center_)),
-      batch(image_.size(0)) {
+      batch(image_.dim() == 4 ? image_.size(0) : 0) {
   const Tensor azimuths = torch::stable::contiguous(azimuths_);
   STD_TORCH_CHECK(image.dim() == 4 && radii.dim() == 2 && azimuths.dim() == 1 &&
                       center.dim() == 2 && center.size(1) == 2 && patch.size() == 2,
                   "polar_sample: wrong number of dimensions");
+  STD_TORCH_CHECK(image.is_cpu(), "polar_sample: the image must be on the CPU");
   STD_TORCH_CHECK((radii.size(0) == 1 || radii.size(0) == batch) &&
                       (center.size(0) == 1 || center.size(0) == batch),
                   "polar_sample: radii and center must have a row an image, or one");
@@ -52,14 +66,20 @@ PolarCall<T>::PolarCall(const Tensor& image_, const Tensor& radii_, const Tensor
     args.offsets_end = args.offsets + offsets->numel();
     args.offsets_stride = offsets->size(0) == 1 ? 0 : 2 * radii.size(1) * azimuths.size(0);
   }
+  STD_TORCH_CHECK(jitter >= 0 && jitter <= 1, "polar_sample: jitter must be in [0, 1]");
   STD_TORCH_CHECK(jitter == 0 || seed.has_value(), "polar_sample: jitter needs a seed");
+  STD_TORCH_CHECK(type == ScalarType::Float || !bfloat16,
+                  "polar_sample: samples of a float64 image are not rounded to bfloat16");
 
   args.image = image.const_data_ptr();
   args.pixel = pixel_type(image);
   args.channels = image.size(1);
   args.height = image.size(2);
   args.width = image.size(3);
-  for (int axis = 0; axis < 4; ++axis) args.image_stride[axis] = image.stride(axis);
+  // The stride of a single row or column may be any number, and is never used.
+  for (int axis = 0; axis < 4; ++axis) {
+    args.image_stride[axis] = image.size(axis) > 1 ? image.stride(axis) : 0;
+  }
   args.radii = radii.template const_data_ptr<T>();
   args.num_radii = radii.size(1);
   args.radii_stride = radii.size(0) == 1 ? 0 : args.num_radii;
@@ -70,9 +90,12 @@ PolarCall<T>::PolarCall(const Tensor& image_, const Tensor& radii_, const Tensor
   args.patch_azimuths = patch[1];
   args.jitter = jitter;
   args.narrow = bfloat16;
+  // What is counted below: points, values of samples, sums of a lens.
+  product({batch, args.num_radii, args.num_azimuths, args.channels});
+  samples();
   if (seed.has_value()) {
-    STD_TORCH_CHECK(seed->numel() == 1 && seed->scalar_type() == ScalarType::Long,
-                    "polar_sample: seed must be one int64");
+    STD_TORCH_CHECK(seed->is_cpu() && seed->numel() == 1 && seed->scalar_type() == ScalarType::Long,
+                    "polar_sample: seed must be one int64 on the CPU");
     args.seed = static_cast<uint64_t>(*seed->const_data_ptr<int64_t>());
   }
   if (args.pixel == Pixel::u8) {
@@ -96,6 +119,8 @@ PolarCall<T>::PolarCall(const Tensor& image_, const Tensor& radii_, const Tensor
   kernels().table<T>().directions(directions.data(), padded, cosines, cosines + padded);
   args.cosines = cosines;
   args.sines = cosines + padded;
+  args.directions_known =
+      std::all_of(cosines, cosines + args.num_azimuths, [](double x) { return x == x; });
 
   const double pixels = static_cast<double>(args.height) * static_cast<double>(args.width);
   const double points =
@@ -118,9 +143,8 @@ Tensor new_image_gradient(PolarCall<T>& call) {
   STD_TORCH_CHECK(args.pixel != Pixel::bf16 || call.packed_values() < 2147483648.0,
                   "polar_sample_backward: too large an image for a bfloat16 gradient");
   // Where there are points the kernels write every pixel.
-  const Tensor grad = call.channels_and_points()
-                          ? torch::stable::new_empty(call.image, call.image.sizes())
-                          : torch::stable::new_zeros(call.image, call.image.sizes());
+  const Tensor grad = call.points() ? torch::stable::new_empty(call.image, call.image.sizes())
+                                    : torch::stable::new_zeros(call.image, call.image.sizes());
   ask_for_large_pages(grad);
   args.grad_image = grad.mutable_data_ptr();
   return grad;
@@ -171,17 +195,20 @@ void fold_lens(const PolarCall<T>& call, const std::vector<double>& sums, PolarG
 template <typename T>
 PolarGradients polar_backward(PolarCall<T>& call, const PolarWanted& wanted) {
   PolarSampleArgs<T>& args = call.args;
-  const bool points = call.channels_and_points();
+  const int64_t images = call.points() && args.channels > 0 ? call.batch : 0;  // that are sampled
   const auto& kernel = kernels().table<T>();
 
   PolarGradients grads(call);
   if (wanted.image) {
     grads.image = new_image_gradient(call);
     args.bands = count_bands(call.batch, args.height);
-    const int64_t bytes = kernel.polar_sample_scratch(args);
-    parallel_ranges(points ? call.batch * args.bands : 0, [&](int64_t begin, int64_t end, int64_t) {
-      kernel.polar_sample_backward_image(args, begin, end, scratch(bytes));
-    });
+    if (images > 0) {
+      parallel_ranges(images * args.bands,
+                      kernel.polar_sample_scratch(args, PolarPass::backward_image),
+                      [&](int64_t begin, int64_t end, void* scratch) {
+                        kernel.polar_sample_backward_image(args, begin, end, scratch);
+                      });
+    }
   }
   if (!wanted.lens && !wanted.offsets) return grads;
   const bool offsets = wanted.offsets && call.offsets.has_value();
@@ -194,16 +221,19 @@ PolarGradients polar_backward(PolarCall<T>& call, const PolarWanted& wanted) {
   const int64_t sharing = offsets && args.offsets_stride == 0 ? call.batch : 1;
   std::vector<double> sums(call.batch * args.num_radii * kLensSums, 0.0);
   args.grad_lens = sums.data();
-  const int64_t bytes = kernel.polar_sample_scratch(args), rings = call.rings();
-  const int64_t items = points && call.batch > 0 ? call.batch * rings / sharing : 0;
-  parallel_ranges(items, [&](int64_t begin, int64_t end, int64_t) {
-    for (int64_t item = begin; item < end; ++item) {
-      for (int64_t b = 0; b < sharing; ++b) {
-        kernel.polar_sample_backward_lens(args, item + b * rings, item + b * rings + 1,
-                                          scratch(bytes));
-      }
-    }
-  });
+  if (images > 0) {
+    const int64_t rings = call.rings();
+    parallel_ranges(images * rings / sharing,
+                    kernel.polar_sample_scratch(args, PolarPass::backward_lens),
+                    [&](int64_t begin, int64_t end, void* scratch) {
+                      for (int64_t item = begin; item < end; ++item) {
+                        for (int64_t b = 0; b < sharing; ++b) {
+                          kernel.polar_sample_backward_lens(args, item + b * rings,
+                                                            item + b * rings + 1, scratch);
+                        }
+                      }
+                    });
+  }
   if (wanted.lens) fold_lens(call, sums, grads);
   return grads;
 }

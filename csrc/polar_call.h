@@ -6,6 +6,7 @@
 #include <torch/csrc/stable/tensor.h>
 #include <torch/headeronly/util/Exception.h>
 
+#include <initializer_list>
 #include <optional>
 #include <tuple>
 #include <vector>
@@ -37,6 +38,9 @@ inline Pixel pixel_type(const torch::stable::Tensor& image) {
   }
 }
 
+// The product of sizes, none negative; RuntimeError unless it, and 64 times it, fits 64 bits.
+int64_t product(std::initializer_list<int64_t> sizes);
+
 // The tensors of one call. Owns what `args` points into.
 template <typename T>
 struct PolarCall {
@@ -56,7 +60,9 @@ struct PolarCall {
 
   int64_t rings() const { return args.num_radii / args.patch_radii; }
   int64_t sectors() const { return args.num_azimuths / args.patch_azimuths; }
-  int64_t samples() const { return args.patch_radii * args.patch_azimuths * args.channels; }
+  int64_t samples() const {
+    return product({args.patch_radii, args.patch_azimuths, args.channels});
+  }
   torch::headeronly::ScalarType output_type() const {
     return args.narrow ? torch::headeronly::ScalarType::BFloat16 : radii.scalar_type();
   }
@@ -65,9 +71,7 @@ struct PolarCall {
     return static_cast<double>(args.height + 3) * static_cast<double>(args.width + 3) *
            static_cast<double>((args.channels + 3) / 4 * 4);
   }
-  bool channels_and_points() const {
-    return args.channels > 0 && args.num_radii > 0 && args.num_azimuths > 0;
-  }
+  bool points() const { return batch > 0 && args.num_radii > 0 && args.num_azimuths > 0; }
 };
 
 // Into how many bands of rows backward cuts an image, so that a small batch of large images uses

@@ -1,6 +1,7 @@
 // polar_embed and its backward on CPU: allocate, thread, call the kernel.
 #include <torch/csrc/stable/library.h>
 
+#include <algorithm>
 #include <optional>
 #include <tuple>
 #include <vector>
@@ -57,11 +58,36 @@ Tensor forward(PolarCall<T>&& call, const Tensor& weight_, const std::optional<T
   kernel.transpose(weight.template const_data_ptr<T>(), embed.features, call.samples(),
                    transposed.data(), wide);
   embed.transposed = transposed.data();
-  const int64_t bytes = kernel.polar_embed_scratch(args, embed);
-  parallel_ranges(call.batch * call.rings(), [&](int64_t begin, int64_t end, int64_t) {
-    kernel.polar_embed(args, embed, begin, end, scratch(bytes));
-  });
+  parallel_ranges(call.batch * call.rings(),
+                  kernel.polar_embed_scratch(args, embed, PolarPass::forward),
+                  [&](int64_t begin, int64_t end, void* scratch) {
+                    kernel.polar_embed(args, embed, begin, end, scratch);
+                  });
   return out;
+}
+
+// Tokens whose products are added up one by one. Longer sums are made of these, since the rounding
+// of a sum grows with its length.
+constexpr int64_t kRunTokens = 1024;
+
+// Adds the weight's gradient from items [begin, end) to `weight`, (D, padded samples), and the
+// bias's to `bias`, (D,).
+template <typename T>
+void add_weight_gradient(const PolarCall<T>& call, const PolarEmbedArgs<T>& embed, int64_t begin,
+                         int64_t end, T* weight, double* bias, void* scratch) {
+  const auto& kernel = kernels().table<T>();
+  const int64_t run = std::max<int64_t>(1, kRunTokens / call.sectors());
+  if (end - begin <= run) {
+    kernel.polar_embed_backward_weight(call.args, embed, begin, end, weight, bias, scratch);
+    return;
+  }
+  std::vector<T> part(embed.features * padded(call.samples()));
+  for (int64_t first = begin; first < end; first += run) {
+    std::fill(part.begin(), part.end(), T(0));
+    const int64_t last = std::min(first + run, end);
+    kernel.polar_embed_backward_weight(call.args, embed, first, last, part.data(), bias, scratch);
+    for (size_t k = 0; k < part.size(); ++k) weight[k] += part[k];
+  }
 }
 
 // Gradients of weight and bias: sums of chunks, as many as there are whatever the threads, added up
@@ -69,33 +95,36 @@ Tensor forward(PolarCall<T>&& call, const Tensor& weight_, const std::optional<T
 template <typename T>
 std::tuple<Tensor, Tensor> weight_gradients(const PolarCall<T>& call,
                                             const PolarEmbedArgs<T>& embed) {
-  const auto& kernel = kernels().table<T>();
-  const int64_t depth = call.samples(), row = padded(depth), items = call.batch * call.rings();
-  const int64_t size = embed.features * (row + 1);  // of a chunk: weight, then bias
+  const int64_t depth = call.samples(), row = padded(depth), features = embed.features;
+  const int64_t items = call.points() ? call.batch * call.rings() : 0;
   const int64_t chunks = std::min<int64_t>(items, 16);
-  std::vector<T> sums(chunks * size, T(0));
-  const int64_t bytes = kernel.polar_embed_scratch(call.args, embed);
-  parallel_ranges(chunks, [&](int64_t begin, int64_t end, int64_t) {
-    for (int64_t chunk = begin; chunk < end; ++chunk) {
-      T* sum = sums.data() + chunk * size;
-      kernel.polar_embed_backward_weight(call.args, embed, items * chunk / chunks,
-                                         items * (chunk + 1) / chunks, sum,
-                                         sum + embed.features * row, scratch(bytes));
-    }
-  });
-  const Tensor weight = torch::stable::new_empty(call.radii, Sizes{embed.features, depth});
-  const Tensor bias = torch::stable::new_empty(call.radii, Sizes{embed.features});
+  std::vector<T> weights(chunks * features * row, T(0));
+  std::vector<double> biases(chunks * features, 0.0);
+  if (chunks > 0) {
+    parallel_ranges(
+        chunks, kernels().table<T>().polar_embed_scratch(call.args, embed, PolarPass::forward),
+        [&](int64_t begin, int64_t end, void* scratch) {
+          for (int64_t chunk = begin; chunk < end; ++chunk) {
+            add_weight_gradient(call, embed, items * chunk / chunks, items * (chunk + 1) / chunks,
+                                weights.data() + chunk * features * row,
+                                biases.data() + chunk * features, scratch);
+          }
+        });
+  }
+  const Tensor weight = torch::stable::new_empty(call.radii, Sizes{features, depth});
+  const Tensor bias = torch::stable::new_empty(call.radii, Sizes{features});
   T *to_weight = weight.template mutable_data_ptr<T>(),
     *to_bias = bias.template mutable_data_ptr<T>();
-  parallel_ranges(embed.features, [&](int64_t begin, int64_t end, int64_t) {
+  parallel_ranges(features, 0, [&](int64_t begin, int64_t end, void*) {
     for (int64_t f = begin; f < end; ++f) {
+      double sum = 0;
       for (int64_t k = 0; k < depth; ++k) to_weight[f * depth + k] = 0;
-      to_bias[f] = 0;
       for (int64_t chunk = 0; chunk < chunks; ++chunk) {
-        const T* sum = sums.data() + chunk * size;
-        for (int64_t k = 0; k < depth; ++k) to_weight[f * depth + k] += sum[f * row + k];
-        to_bias[f] += sum[embed.features * row + f];
+        const T* from = weights.data() + (chunk * features + f) * row;
+        for (int64_t k = 0; k < depth; ++k) to_weight[f * depth + k] += from[k];
+        sum += biases[chunk * features + f];
       }
+      to_bias[f] = static_cast<T>(sum);
     }
   });
   return {weight, bias};
@@ -113,25 +142,30 @@ PolarGradients sampling_gradients(PolarCall<T>& call, PolarEmbedArgs<T>& embed,
     std::copy(from + f * depth, from + (f + 1) * depth, rows.begin() + f * row);
   }
   embed.weight = rows.data();
-  const int64_t bytes = kernel.polar_embed_scratch(call.args, embed);
+  const int64_t images = call.points() && call.args.channels > 0 ? call.batch : 0;
   const bool image_alone = !wanted.lens && !wanted.offsets;
   if (image_alone && count_bands(call.batch, call.args.height) == 1) {
     PolarGradients grads(call);
     grads.image = new_image_gradient(call);
     call.args.bands = 1;
-    parallel_ranges(
-        call.channels_and_points() ? call.batch : 0, [&](int64_t begin, int64_t end, int64_t) {
-          kernel.polar_embed_backward_image(call.args, embed, begin, end, scratch(bytes));
-        });
+    if (images > 0) {
+      parallel_ranges(images,
+                      kernel.polar_embed_scratch(call.args, embed, PolarPass::backward_image),
+                      [&](int64_t begin, int64_t end, void* scratch) {
+                        kernel.polar_embed_backward_image(call.args, embed, begin, end, scratch);
+                      });
+    }
     return grads;
   }
   const Tensor grad_samples = torch::stable::new_empty(call.radii, output_sizes(call, depth));
   embed.grad_samples = grad_samples.template mutable_data_ptr<T>();
-  parallel_ranges(call.channels_and_points() ? call.batch * call.rings() : 0,
-                  [&](int64_t begin, int64_t end, int64_t) {
-                    kernel.polar_embed_backward_samples(call.args, embed, begin, end,
-                                                        scratch(bytes));
-                  });
+  if (images > 0) {
+    parallel_ranges(images * call.rings(),
+                    kernel.polar_embed_scratch(call.args, embed, PolarPass::backward_samples),
+                    [&](int64_t begin, int64_t end, void* scratch) {
+                      kernel.polar_embed_backward_samples(call.args, embed, begin, end, scratch);
+                    });
+  }
   call.args.grad_out = embed.grad_samples;
   call.args.narrow = false;
   return polar_backward(call, wanted);

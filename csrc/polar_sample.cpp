@@ -29,10 +29,10 @@ Tensor forward(PolarCall<T>&& call, bool tokens) {
   ask_for_large_pages(out);
   args.out = out.mutable_data_ptr();
   const auto& kernel = kernels().table<T>();
-  const int64_t bytes = kernel.polar_sample_scratch(args);
-  parallel_ranges(call.batch * call.rings(), [&](int64_t begin, int64_t end, int64_t) {
-    kernel.polar_sample(args, begin, end, scratch(bytes));
-  });
+  parallel_ranges(call.batch * call.rings(), kernel.polar_sample_scratch(args, PolarPass::forward),
+                  [&](int64_t begin, int64_t end, void* scratch) {
+                    kernel.polar_sample(args, begin, end, scratch);
+                  });
   return out;
 }
 

@@ -24,19 +24,20 @@ std::tuple<Tensor, Tensor> transpose_sum(const Tensor& x) {
   const int64_t groups = (rows + kTransposedRows - 1) / kTransposedRows;
   const Tensor transposed = torch::stable::new_empty(x, std::vector<int64_t>{columns, rows});
   const Tensor sum = torch::stable::new_empty(x, std::vector<int64_t>{columns});
-  auto* sums = static_cast<float*>(scratch(groups * columns * sizeof(float)));
+  const Scratch memory(groups * columns * sizeof(float));
+  auto* sums = static_cast<float*>(memory.get());
   const TransposeSumArgs args{static_cast<const float*>(x.const_data_ptr()),
                               static_cast<float*>(transposed.mutable_data_ptr()), sums, rows,
                               columns};
-  parallel_ranges(groups, [&](int64_t begin, int64_t end, int64_t) {
+  parallel_ranges(groups, 0, [&](int64_t begin, int64_t end, void*) {
     kernels().transpose_sum(args, begin, end);
   });
-  // Group after group, whoever made it.
-  auto* to = static_cast<float*>(sum.mutable_data_ptr());
-  std::fill_n(to, columns, 0.0f);
+  // Group after group, whichever thread made it; in double, since there may be many thousands.
+  std::vector<double> totals(columns, 0.0);
   for (int64_t group = 0; group < groups; ++group) {
-    for (int64_t c = 0; c < columns; ++c) to[c] += sums[group * columns + c];
+    for (int64_t c = 0; c < columns; ++c) totals[c] += sums[group * columns + c];
   }
+  std::copy(totals.begin(), totals.end(), static_cast<float*>(sum.mutable_data_ptr()));
   return {transposed, sum};
 }
 

@@ -72,10 +72,9 @@ struct Call {
   // Runs `kernel` over `items` work items, each thread with its own scratch.
   template <typename Kernel>
   void run(int64_t items, Kernel kernel) {
-    const int64_t bytes = kernels().attention<T>().scratch(args);
-    parallel_ranges(items, [&](int64_t begin, int64_t end, int64_t) {
-      kernel(args, begin, end, scratch(bytes));
-    });
+    parallel_ranges(
+        items, kernels().attention<T>().scratch(args),
+        [&](int64_t begin, int64_t end, void* scratch) { kernel(args, begin, end, scratch); });
   }
 };
 
@@ -84,6 +83,7 @@ Tensor forward(Call<T>&& call) {
   auto& args = call.args;
   const Tensor out = torch::stable::new_empty(
       call.qkv, Sizes{call.qkv.size(0), args.rings, args.sectors, args.heads * args.head_dim});
+  if (out.numel() == 0) return out;
   ask_for_large_pages(out);
   args.out = static_cast<T*>(out.mutable_data_ptr());
   call.run(args.windows * args.heads, kernels().attention<T>().forward);

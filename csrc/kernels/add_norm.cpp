@@ -1,9 +1,10 @@
 // Residual and layer norm in one pass over memory, in place.
 //
 // A row holds a token's features. It is small enough for the first cache, so memory sees it once,
-// while three loops go over it: the sum with its mean, the squares of what is left, and the
-// normalized row. Taking the mean off before squaring keeps the digits that a large mean would
-// cost. Where rows are bfloat16, it is the rounded sum that is normalized.
+// while three loops go over it: the sum with its mean, what is left of it and the squares of that,
+// and the normalized row. Taking the mean off before squaring keeps the digits that a large mean
+// would cost. What is left has a small mean of its own, the rounding of the first one, and that is
+// taken off as well. Where rows are bfloat16, it is the rounded sum that is normalized.
 #include "kernels.h"
 #include "simd.h"
 
@@ -25,25 +26,35 @@ inline V read(const bfloat16* from) {
     return widen_lanes(from);
   }
 }
+// Stores v, and returns what is stored: v, or its bfloat16.
 template <typename V>
-inline void write(float* to, V v) {
+inline V write(float* to, V v) {
   store_bits(to, v);
+  return v;
 }
 template <typename V>
-inline void write(bfloat16* to, V v) {
+inline V write(bfloat16* to, V v) {
   if constexpr (kSame<V, float>) {
     *to = narrow(v);
+    return widen(*to);
   } else {
-    narrow_lanes(to, v);
+    const auto upper = rounded(v) >> 16;
+    store_bits(to, __builtin_convertvector(upper, Vector<uint16_t, kL>));
+    return (V)(upper << 16);
   }
 }
 
-// body<V>(column) on whole registers of a row, and on the columns that are left.
+// body<V>(column, turn) on whole registers of a row, and on the columns that are left. Turns go 0,
+// 1, 0, 1: a sum for each, and neither waits for the addition before.
 template <typename Body>
 inline void along(int64_t width, Body body) {
   int64_t c = 0;
-  for (; c + kL <= width; c += kL) body.template operator()<Floats>(c);
-  for (; c < width; ++c) body.template operator()<float>(c);
+  for (; c + 2 * kL <= width; c += 2 * kL) {
+    body.template operator()<Floats>(c, 0);
+    body.template operator()<Floats>(c + kL, 1);
+  }
+  for (; c + kL <= width; c += kL) body.template operator()<Floats>(c, 0);
+  for (; c < width; ++c) body.template operator()<float>(c, 0);
 }
 
 // The lanes' sum, by halves.
@@ -60,33 +71,35 @@ inline float total(Vector<float, kCount> v) {
   }
 }
 
-// A sum along a row: of the lanes, and of what is left.
+// A sum along a row: of the lanes of each turn, and of what is left.
 struct Sum {
-  Floats lanes{};
+  Floats lanes[2]{};
   float rest = 0;
-  void add(Floats v) { lanes += v; }
-  void add(float v) { rest += v; }
-  float all() const { return total<kL>(lanes) + rest; }
+  void add(Floats v, int turn) { lanes[turn] += v; }
+  void add(float v, int) { rest += v; }
+  float all() const { return total<kL>(lanes[0] + lanes[1]) + rest; }
 };
 
 template <typename S>
 void add_norm_rows(const AddNormArgs<S>& a, int64_t begin, int64_t end) {
-  const float width = static_cast<float>(a.width);
+  const float part = 1 / static_cast<float>(a.width);
   for (int64_t row = begin; row < end; ++row) {
     S *x = a.x + row * a.width, *y = a.y + row * a.width;
-    Sum values, squares;
-    along(a.width, [&]<typename V>(int64_t c) {
-      write(x + c, read<V>(x + c) + read<V>(y + c));
-      values.add(read<V>(x + c));
+    Sum values, rest, squares;
+    along(a.width, [&]<typename V>(int64_t c, int turn) {
+      values.add(write(x + c, read<V>(x + c) + read<V>(y + c)), turn);
     });
-    const float mean = values.all() / width;
-    along(a.width, [&]<typename V>(int64_t c) {
+    const float mean = values.all() * part;
+    along(a.width, [&]<typename V>(int64_t c, int turn) {
       const V left = read<V>(x + c) - mean;
-      squares.add(left * left);
+      rest.add(left, turn);
+      squares.add(left * left, turn);
     });
-    const float scale = 1 / __builtin_sqrtf(squares.all() / width + a.eps);
-    along(a.width, [&]<typename V>(int64_t c) {
-      const V unit = (read<V>(x + c) - mean) * scale;
+    const float more = rest.all() * part, variance = squares.all() * part - more * more;
+    const float scale = 1 / __builtin_sqrtf((variance < 0 ? 0 : variance) + a.eps);
+    const float shift = more * scale;
+    along(a.width, [&]<typename V>(int64_t c, int) {
+      const V unit = (read<V>(x + c) - mean) * scale - shift;
       write(y + c, unit * read<V>(a.weight + c) + read<V>(a.bias + c));
     });
   }

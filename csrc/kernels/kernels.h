@@ -7,8 +7,8 @@
 namespace darswin::TIER {
 
 void directions(const double* angles, int64_t n, double* cosines, double* sines);
-int64_t polar_sample_scratch(const PolarSampleArgs<float>&);
-int64_t polar_sample_scratch(const PolarSampleArgs<double>&);
+int64_t polar_sample_scratch(const PolarSampleArgs<float>&, PolarPass);
+int64_t polar_sample_scratch(const PolarSampleArgs<double>&, PolarPass);
 void polar_sample(const PolarSampleArgs<float>&, int64_t, int64_t, void* scratch);
 void polar_sample(const PolarSampleArgs<double>&, int64_t, int64_t, void* scratch);
 void polar_sample_backward_image(const PolarSampleArgs<float>&, int64_t, int64_t, void* scratch);
@@ -17,17 +17,18 @@ void polar_sample_backward_lens(const PolarSampleArgs<float>&, int64_t, int64_t,
 void polar_sample_backward_lens(const PolarSampleArgs<double>&, int64_t, int64_t, void* scratch);
 
 void transpose(const float*, int64_t rows, int64_t columns, float* to, int64_t to_stride);
-int64_t polar_embed_scratch(const PolarSampleArgs<float>&, const PolarEmbedArgs<float>&);
+int64_t polar_embed_scratch(const PolarSampleArgs<float>&, const PolarEmbedArgs<float>&, PolarPass);
 void polar_embed(const PolarSampleArgs<float>&, const PolarEmbedArgs<float>&, int64_t, int64_t,
                  void* scratch);
 void polar_embed_backward_weight(const PolarSampleArgs<float>&, const PolarEmbedArgs<float>&,
-                                 int64_t, int64_t, float* weight, float* bias, void* scratch);
+                                 int64_t, int64_t, float* weight, double* bias, void* scratch);
 void polar_embed_backward_samples(const PolarSampleArgs<float>&, const PolarEmbedArgs<float>&,
                                   int64_t, int64_t, void* scratch);
 void polar_embed_backward_image(const PolarSampleArgs<float>&, const PolarEmbedArgs<float>&,
                                 int64_t, int64_t, void* scratch);
 void transpose(const double*, int64_t rows, int64_t columns, double* to, int64_t to_stride);
-int64_t polar_embed_scratch(const PolarSampleArgs<double>&, const PolarEmbedArgs<double>&);
+int64_t polar_embed_scratch(const PolarSampleArgs<double>&, const PolarEmbedArgs<double>&,
+                            PolarPass);
 void polar_embed(const PolarSampleArgs<double>&, const PolarEmbedArgs<double>&, int64_t, int64_t,
                  void* scratch);
 void polar_embed_backward_weight(const PolarSampleArgs<double>&, const PolarEmbedArgs<double>&,

@@ -24,7 +24,7 @@ struct Scratch {
   T* grads;     // (A, D)
   int64_t bytes;
 
-  Scratch(const PolarSampleArgs<T>& a, const PolarEmbedArgs<T>& e, void* memory)
+  Scratch(const PolarSampleArgs<T>& a, const PolarEmbedArgs<T>& e, PolarPass pass, void* memory)
       : depth(a.patch_radii * a.patch_azimuths * a.channels),
         row(round_up(depth, kRowUnit)),
         wide(round_up(e.features, kRowUnit)) {
@@ -36,8 +36,8 @@ struct Scratch {
     };
     const int64_t sectors = a.num_azimuths / a.patch_azimuths;
     const int64_t value = static_cast<int64_t>(sizeof(T));
-    sampler = scatter = take(Sampler<T>::bytes(a) > Scatter<T>::bytes(a) ? Sampler<T>::bytes(a)
-                                                                         : Scatter<T>::bytes(a));
+    sampler = take(pass == PolarPass::forward ? Sampler<T>::bytes(a) : 0);
+    scatter = take(pass == PolarPass::backward_image ? Scatter<T>::bytes(a) : 0);
     samples = reinterpret_cast<T*>(take((sectors * row + kRowUnit) * value));
     products = reinterpret_cast<T*>(take(sectors * wide * value));
     grads = reinterpret_cast<T*>(take(sectors * e.features * value));
@@ -53,7 +53,7 @@ int64_t sectors_of(const PolarSampleArgs<T>& a) {
 template <typename T>
 void embed(const PolarSampleArgs<T>& a, const PolarEmbedArgs<T>& e, int64_t begin, int64_t end,
            void* scratch) {
-  const Scratch<T> s(a, e, scratch);
+  const Scratch<T> s(a, e, PolarPass::forward, scratch);
   const int64_t rings = a.num_radii / a.patch_radii, sectors = sectors_of(a);
   Sampler<T> sampler(a, s.row, a.patch_azimuths * a.channels, s.sampler);
   // Products go where they belong if rows there are whole registers of the type computed in.
@@ -98,8 +98,8 @@ const T* ring_grads(const PolarSampleArgs<T>& a, const PolarEmbedArgs<T>& e, int
 
 template <typename T>
 void backward_weight(const PolarSampleArgs<T>& a, const PolarEmbedArgs<T>& e, int64_t begin,
-                     int64_t end, T* weight, T* bias, void* scratch) {
-  const Scratch<T> s(a, e, scratch);
+                     int64_t end, T* weight, double* bias, void* scratch) {
+  const Scratch<T> s(a, e, PolarPass::forward, scratch);
   const int64_t rings = a.num_radii / a.patch_radii, sectors = sectors_of(a);
   Sampler<T> sampler(a, s.row, a.patch_azimuths * a.channels, s.sampler);
   for (int64_t item = begin; item < end; ++item) {
@@ -126,7 +126,7 @@ void sample_grads(const PolarSampleArgs<T>& a, const PolarEmbedArgs<T>& e, int64
 template <typename T>
 void backward_samples(const PolarSampleArgs<T>& a, const PolarEmbedArgs<T>& e, int64_t begin,
                       int64_t end, void* scratch) {
-  const Scratch<T> s(a, e, scratch);
+  const Scratch<T> s(a, e, PolarPass::backward_samples, scratch);
   const int64_t sectors = sectors_of(a);
   for (int64_t item = begin; item < end; ++item) {
     sample_grads(a, e, item, s);
@@ -139,7 +139,7 @@ void backward_samples(const PolarSampleArgs<T>& a, const PolarEmbedArgs<T>& e, i
 template <typename T>
 void backward_image(const PolarSampleArgs<T>& args, const PolarEmbedArgs<T>& e, int64_t begin,
                     int64_t end, void* scratch) {
-  const Scratch<T> s(args, e, scratch);
+  const Scratch<T> s(args, e, PolarPass::backward_image, scratch);
   PolarSampleArgs<T> a = args;
   a.narrow = false;  // the gradients of the samples are not
   const int64_t rings = a.num_radii / a.patch_radii, piece = a.patch_azimuths * a.channels;
@@ -179,28 +179,29 @@ void transposed(const T* from, int64_t rows, int64_t columns, T* to, int64_t to_
 
 }  // namespace
 
-#define INSTANTIATE(T)                                                                        \
-  void transpose(const T* from, int64_t rows, int64_t columns, T* to, int64_t to_stride) {    \
-    transposed(from, rows, columns, to, to_stride);                                           \
-  }                                                                                           \
-  int64_t polar_embed_scratch(const PolarSampleArgs<T>& a, const PolarEmbedArgs<T>& e) {      \
-    return Scratch<T>(a, e, nullptr).bytes;                                                   \
-  }                                                                                           \
-  void polar_embed(const PolarSampleArgs<T>& a, const PolarEmbedArgs<T>& e, int64_t begin,    \
-                   int64_t end, void* s) {                                                    \
-    embed(a, e, begin, end, s);                                                               \
-  }                                                                                           \
-  void polar_embed_backward_weight(const PolarSampleArgs<T>& a, const PolarEmbedArgs<T>& e,   \
-                                   int64_t begin, int64_t end, T* weight, T* bias, void* s) { \
-    backward_weight(a, e, begin, end, weight, bias, s);                                       \
-  }                                                                                           \
-  void polar_embed_backward_samples(const PolarSampleArgs<T>& a, const PolarEmbedArgs<T>& e,  \
-                                    int64_t begin, int64_t end, void* s) {                    \
-    backward_samples(a, e, begin, end, s);                                                    \
-  }                                                                                           \
-  void polar_embed_backward_image(const PolarSampleArgs<T>& a, const PolarEmbedArgs<T>& e,    \
-                                  int64_t begin, int64_t end, void* s) {                      \
-    backward_image(a, e, begin, end, s);                                                      \
+#define INSTANTIATE(T)                                                                             \
+  void transpose(const T* from, int64_t rows, int64_t columns, T* to, int64_t to_stride) {         \
+    transposed(from, rows, columns, to, to_stride);                                                \
+  }                                                                                                \
+  int64_t polar_embed_scratch(const PolarSampleArgs<T>& a, const PolarEmbedArgs<T>& e,             \
+                              PolarPass pass) {                                                    \
+    return Scratch<T>(a, e, pass, nullptr).bytes;                                                  \
+  }                                                                                                \
+  void polar_embed(const PolarSampleArgs<T>& a, const PolarEmbedArgs<T>& e, int64_t begin,         \
+                   int64_t end, void* s) {                                                         \
+    embed(a, e, begin, end, s);                                                                    \
+  }                                                                                                \
+  void polar_embed_backward_weight(const PolarSampleArgs<T>& a, const PolarEmbedArgs<T>& e,        \
+                                   int64_t begin, int64_t end, T* weight, double* bias, void* s) { \
+    backward_weight(a, e, begin, end, weight, bias, s);                                            \
+  }                                                                                                \
+  void polar_embed_backward_samples(const PolarSampleArgs<T>& a, const PolarEmbedArgs<T>& e,       \
+                                    int64_t begin, int64_t end, void* s) {                         \
+    backward_samples(a, e, begin, end, s);                                                         \
+  }                                                                                                \
+  void polar_embed_backward_image(const PolarSampleArgs<T>& a, const PolarEmbedArgs<T>& e,         \
+                                  int64_t begin, int64_t end, void* s) {                           \
+    backward_image(a, e, begin, end, s);                                                           \
   }
 INSTANTIATE(float)
 INSTANTIATE(double)

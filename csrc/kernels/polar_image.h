@@ -16,10 +16,12 @@ using darswin::Pixel;
 
 inline int64_t smaller(int64_t x, int64_t y) { return x < y ? x : y; }
 
-// An image with borders. Pixel (x, y) of the image is pixel (x + 1, y + 1) of this.
+// An image with borders. Pixel (x, y) of the image is pixel (x + 1, y + 1) of this. Only for images
+// that are packed, or whose gradient is: the sizes of others may not fit 64 bits.
 struct Packed {
-  int64_t pixel, row, size;  // values of a pixel, of a row, of the image
+  int64_t pixel = 0, row = 0, size = 0;  // values of a pixel, of a row, of the image
 
+  Packed() = default;
   template <typename T>
   explicit Packed(const PolarSampleArgs<T>& a)
       : pixel(round_up(a.channels, 4)), row((a.width + 3) * pixel), size((a.height + 3) * row) {}
@@ -98,8 +100,8 @@ struct PlacedPoints {
     const Reach most = reach(a, b, i);
     const T* center = a.center + b * a.center_stride;
     const auto width = static_cast<double>(a.width), height = static_cast<double>(a.height);
-    if (a.offsets == nullptr && center[0] - most.x > -1 && center[0] + most.x < width &&
-        center[1] - most.y > -1 && center[1] + most.y < height) {
+    if (a.offsets == nullptr && a.directions_known && center[0] - most.x > -1 &&
+        center[0] + most.x < width && center[1] - most.y > -1 && center[1] + most.y < height) {
       locate(a, b, i, j, count, random,
              [&](int64_t k, const Points& p) { place<true>(a, packed, p, first + k, near); });
     } else {
@@ -156,14 +158,24 @@ void with_pixel_type(Pixel pixel, Visit visit) {
   }
 }
 
-// The value of a pixel, in the type that is computed in.
-template <typename T>
-inline T value(const PolarSampleArgs<T>&, T pixel, int64_t) {
-  return pixel;
+// A pixel in the type that is computed in.
+template <typename T, typename E>
+inline T number(E pixel) {
+  if constexpr (kSame<E, bfloat16>) {
+    return widen(pixel);
+  } else {
+    return pixel;
+  }
 }
-inline float value(const PolarSampleArgs<float>&, bfloat16 pixel, int64_t) { return widen(pixel); }
-inline float value(const PolarSampleArgs<float>& a, uint8_t pixel, int64_t channel) {
-  return pixel * a.pixel_scale[channel] + a.pixel_offset[channel];
+// What it stands for: as it is, or of type uint8 by its channel's scale and offset. Between pixels
+// it is the same before and after interpolation.
+template <typename E, typename T>
+inline T normalized(const PolarSampleArgs<T>& a, T pixel, int64_t channel) {
+  return kSame<E, uint8_t> ? pixel * a.pixel_scale[channel] + a.pixel_offset[channel] : pixel;
+}
+template <typename T, typename E>
+inline T value(const PolarSampleArgs<T>& a, E pixel, int64_t channel) {
+  return normalized<E>(a, number<T>(pixel), channel);
 }
 
 // Interleaves planes of four channels: (4, width) -> (width, 4).
@@ -247,13 +259,14 @@ struct Corners {
   bool outside() const { return !(left || right) || !(upper || lower); }
 
   // Upper left, upper right, lower left, lower right. Those outside count as 0.
-  void read(int64_t channel, T corner[4]) const {
+  Vector<T, 4> read(int64_t channel) const {
     const E* p = image + first + channel * args.image_stride[1];
     const int64_t row = args.image_stride[2], column = args.image_stride[3];
-    corner[0] = upper && left ? value(args, p[0], channel) : T(0);
-    corner[1] = upper && right ? value(args, p[column], channel) : T(0);
-    corner[2] = lower && left ? value(args, p[row], channel) : T(0);
-    corner[3] = lower && right ? value(args, p[row + column], channel) : T(0);
+    const T top_left = upper && left ? value(args, p[0], channel) : T(0);
+    const T top_right = upper && right ? value(args, p[column], channel) : T(0);
+    const T bottom_left = lower && left ? value(args, p[row], channel) : T(0);
+    const T bottom_right = lower && right ? value(args, p[row + column], channel) : T(0);
+    return Vector<T, 4>{top_left, top_right, bottom_left, bottom_right};
   }
 };
 

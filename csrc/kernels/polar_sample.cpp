@@ -58,13 +58,10 @@ void backward_image(const PolarSampleArgs<T>& a, int64_t begin, int64_t end, voi
 // d(loss)/d(x, y) of a point, over its channels.
 template <typename T, typename E>
 void slope(const Corners<T, E>& corners, const T* grad, T right, T lower, T* gx, T* gy) {
-  *gx = *gy = 0;
-  for (int64_t c = 0; c < corners.args.channels; ++c) {
-    T p[4];
-    corners.read(c, p);
-    *gx += grad[c] * ((p[1] - p[0]) * (1 - lower) + (p[3] - p[2]) * lower);
-    *gy += grad[c] * ((p[2] - p[0]) * (1 - right) + (p[3] - p[1]) * right);
-  }
+  Vector<T, 4> sums{};  // of the corners, over the channels
+  for (int64_t c = 0; c < corners.args.channels; ++c) sums += grad[c] * corners.read(c);
+  *gx = (sums[1] - sums[0]) * (1 - lower) + (sums[3] - sums[2]) * lower;
+  *gy = (sums[2] - sums[0]) * (1 - right) + (sums[3] - sums[1]) * right;
 }
 
 struct LensScratch {
@@ -126,15 +123,11 @@ void backward_lens(const PolarSampleArgs<T>& a, int64_t begin, int64_t end, void
   }
 }
 
-// Enough for each of the three.
 template <typename T>
-int64_t scratch_bytes(const PolarSampleArgs<T>& a) {
-  const int64_t forward = sampler_bytes(a) + a.patch_radii * row_bytes(a);
-  const int64_t image = Scatter<T>::bytes(a);
-  const int64_t lens =
-      round_up(sizeof(LensScratch), 64) + round_up(sizeof(FarPlaces<T>), 64) + row_bytes(a);
-  const int64_t both = forward > image ? forward : image;
-  return both > lens ? both : lens;
+int64_t scratch_bytes(const PolarSampleArgs<T>& a, PolarPass pass) {
+  if (pass == PolarPass::forward) return sampler_bytes(a) + a.patch_radii * row_bytes(a);
+  if (pass == PolarPass::backward_image) return Scatter<T>::bytes(a);
+  return round_up(sizeof(LensScratch), 64) + round_up(sizeof(FarPlaces<T>), 64) + row_bytes(a);
 }
 
 }  // namespace
@@ -149,7 +142,9 @@ void directions(const double* angles, int64_t n, double* cosines, double* sines)
 }
 
 #define INSTANTIATE(T)                                                                      \
-  int64_t polar_sample_scratch(const PolarSampleArgs<T>& a) { return scratch_bytes(a); }    \
+  int64_t polar_sample_scratch(const PolarSampleArgs<T>& a, PolarPass pass) {               \
+    return scratch_bytes(a, pass);                                                          \
+  }                                                                                         \
   void polar_sample(const PolarSampleArgs<T>& a, int64_t begin, int64_t end, void* s) {     \
     sample(a, begin, end, s);                                                               \
   }                                                                                         \

@@ -1,28 +1,51 @@
 // Samples of one token after another, forward. Interpolation is linear first downwards, then to the
-// right: two fused multiply-adds on pixels that hold all their channels.
+// right, on pixels that hold all their channels.
 #pragma once
 
 #include "polar_image.h"
 
 namespace {
 
-// A pixel of four values between its neighbours, given it and the one below.
-inline Vector<float, 4> interpolate(const float* pixel, const float* below, float right,
-                                    float lower) {
-  // It and its right neighbour are one load.
-  using Pair = Vector<float, 8>;
-  const Pair top = load<Pair>(pixel), bottom = load<Pair>(below);
-  const Pair pair = top + lower * (bottom - top);
-  const Vector<float, 4> l = lower_half(pair), r = upper_half(pair);
-  return l + right * (r - l);
+// Interpolation is by weights, or by differences, a + t * (b - a): those of huge values overflow,
+// and those of infinite ones come to NaN. Where a vector of four is not a whole register, weights
+// cost more: differences come first there, and weights only if a result is not finite.
+template <typename T>
+constexpr bool kTryDifferences = kSame<T, float> && kRegister < 64;
+
+template <bool kWeights, typename V>
+inline V between(V a, V b, V t) {
+  if constexpr (kWeights) {
+    return between(a, b, 1 - t, t);
+  } else {
+    return a + t * (b - a);
+  }
 }
-inline Vector<double, 4> interpolate(const double* pixel, const double* below, double right,
-                                     double lower) {
-  using V = Vector<double, 4>;
-  const V tl = load<V>(pixel), tr = load<V>(pixel + 4);
-  const V bl = load<V>(below), br = load<V>(below + 4);
-  const V l = tl + lower * (bl - tl), r = tr + lower * (br - tr);
-  return l + right * (r - l);
+
+// Writes a pixel of four values between its neighbours, given it and the one below.
+template <typename T>
+using Piece = Vector<T, (kLanes<T> < 4 ? kLanes<T> : 4)>;
+template <bool kWeights, typename T>
+inline void interpolate(const T* pixel, const T* below, T right, T lower, T* to, Piece<T>* sum) {
+  using V = Piece<T>;
+  const V along = splat<V>(right);
+  const auto write = [&](int e, V v) {
+    store(to + e, v);
+    if constexpr (!kWeights) *sum += v;
+  };
+  if constexpr (kSame<T, float> && kRegister > 16) {
+    // It and its right neighbour are one load.
+    using Pair = Vector<T, 8>;
+    const Pair pair = between<kWeights>(load<Pair>(pixel), load<Pair>(below), splat<Pair>(lower));
+    write(0, between<kWeights>(lower_half(pair), upper_half(pair), along));
+  } else {
+    const V down = splat<V>(lower);
+#pragma GCC unroll 2
+    for (int e = 0; e < 4; e += kLanes<T>) {
+      const V l = between<kWeights>(load<V>(pixel + e), load<V>(below + e), down);
+      const V r = between<kWeights>(load<V>(pixel + 4 + e), load<V>(below + 4 + e), down);
+      write(e, between<kWeights>(l, r, along));
+    }
+  }
 }
 
 #if defined(__AVX512F__)
@@ -41,20 +64,29 @@ inline Vector<float, 16> interpolate_four(const float* pixels, const float* belo
   const V bottom = two_eights(below + offset[0], below + offset[1]);
   const V top2 = two_eights(pixels + offset[2], pixels + offset[3]);
   const V bottom2 = two_eights(below + offset[2], below + offset[3]);
-  const V pairs = top + pick(down, first_two) * (bottom - top);
-  const V pairs2 = top2 + pick(down, first_two + 2) * (bottom2 - top2);
+  const V pairs = between<true>(top, bottom, pick(down, first_two));
+  const V pairs2 = between<true>(top2, bottom2, pick(down, first_two + 2));
   const V l = __builtin_shufflevector(pairs, pairs2, 0, 1, 2, 3, 8, 9, 10, 11, 16, 17, 18, 19, 24,
                                       25, 26, 27);
   const V r = __builtin_shufflevector(pairs, pairs2, 4, 5, 6, 7, 12, 13, 14, 15, 20, 21, 22, 23, 28,
                                       29, 30, 31);
-  return l + pick(along, all) * (r - l);
+  return between<true>(l, r, pick(along, all));
 }
 #endif
 
+// Whether all lanes are finite.
+template <typename V>
+inline bool all_finite(const V& v) {
+  bool finite = true;
+  for (size_t lane = 0; lane < sizeof(V) / sizeof(v[0]); ++lane) finite &= v[lane] - v[lane] == 0;
+  return finite;
+}
+
 // Samples points of a packed image, point k to to[target[k]]; joined[k] says whether the next three
-// follow it there. A function of its own, so that all it needs stays in registers.
-template <typename T>
-[[gnu::noinline]] void sample_line(const T* pixels, int64_t row, const PackedPlaces<T>& places,
+// follow it there. A function of its own, so that all it needs stays in registers. Returns false if
+// it sampled by differences and a sample is not finite, which their sum tells.
+template <bool kWeights, typename T>
+[[gnu::noinline]] bool sample_line(const T* pixels, int64_t row, const PackedPlaces<T>& places,
                                    int64_t begin, int64_t end, const int32_t* target,
                                    [[maybe_unused]] const bool* joined,
                                    [[maybe_unused]] int64_t channels, T* to) {
@@ -77,10 +109,17 @@ template <typename T>
     }
   }
 #endif
+  Piece<T> sums[4]{};  // in turn, so that none waits for the addition before
+  const auto sample = [&](int64_t k, Piece<T>* sum) {
+    interpolate<kWeights>(pixels + offset[k], below + offset[k], right[k], lower[k], to + target[k],
+                          sum);
+  };
+  for (; k + 4 <= end; k += 4) {
 #pragma GCC unroll 4
-  for (; k < end; ++k) {
-    store(to + target[k], interpolate(pixels + offset[k], below + offset[k], right[k], lower[k]));
+    for (int turn = 0; turn < 4; ++turn) sample(k + turn, sums + turn);
   }
+  for (; k < end; ++k) sample(k, sums);
+  return kWeights || all_finite((sums[0] + sums[1]) + (sums[2] + sums[3]));
 }
 
 template <typename T>
@@ -96,21 +135,26 @@ class Sampler {
   // row of all tokens is and has room for three values more.
   Sampler(const PolarSampleArgs<T>& args, int64_t sector_stride, int64_t row_stride, void* scratch)
       : a(args),
-        packed(args),
+        packed(args.packed ? Packed(args) : Packed()),
         sector_stride(sector_stride),
         row_stride(row_stride),
         in_line(args.packed && args.channels <= 4 && args.patch_azimuths <= kBlock &&
-                args.patch_azimuths * args.channels >= 4),
+                args.patch_azimuths * args.channels >= 4 && reach_of_block() < INT32_MAX),
         state(*static_cast<State*>(scratch)),
         points(state.points),
         image(reinterpret_cast<T*>(static_cast<char*>(scratch) + round_up(sizeof(State), 64))) {
+    if (a.packed && !in_line) return;
     int64_t k = 0;
     for (int64_t row = 0, columns = block_columns(); k + columns <= kBlock; ++row) {
       for (int64_t sector = 0; sector * a.patch_azimuths < columns; ++sector) {
         for (int64_t s = 0; s < smaller(columns, a.patch_azimuths); ++s, ++k) {
-          state.to[k] =
-              static_cast<int32_t>(row * row_stride + sector * sector_stride + s * a.channels);
-          state.joined[k] = s + 4 <= a.patch_azimuths;
+          const int64_t to = row * row_stride + sector * sector_stride + s * a.channels;
+          if (a.packed) {
+            state.near_to[k] = static_cast<int32_t>(to);
+            state.joined[k] = s + 4 <= a.patch_azimuths;
+          } else {
+            state.far_to[k] = to;
+          }
         }
       }
     }
@@ -139,10 +183,19 @@ class Sampler {
  private:
   struct State {
     PlacedPoints<T> points;
-    int32_t to[kBlock];               // where the points of a block go
+    union {  // where the points of a block go
+      int32_t near_to[kBlock];
+      int64_t far_to[kBlock];
+    };
     bool joined[kBlock];              // whether the next three follow there
     uint16_t order[kBlock + kAhead];  // in which they are visited, if the image is far
   };
+
+  // No point of a block goes further than this.
+  int64_t reach_of_block() const {
+    return smaller(kBlock, a.patch_radii) * row_stride +
+           block_columns() / a.patch_azimuths * sector_stride;
+  }
 
   // A block is a few whole tokens: their pixels and their output stay in the nearest cache. Blocks
   // are of equal size if that does not make them small. A token of more points than a block holds
@@ -191,37 +244,54 @@ class Sampler {
     }
   }
 
-  // Rows of a block, of up to four channels. Four values are stored where the point has fewer: the
-  // next point or row puts that right. Behind the last row of a token is the first of the next one,
-  // which is there already, so it is kept; behind the last token is what others may write to.
+  // Rows of a block, of up to four channels.
   void lines(int64_t rows, int64_t count, T* to, bool last_row, bool last_token) {
+    if constexpr (kTryDifferences<T>) {
+      if (lines<false>(rows, count, to, last_row, last_token)) return;
+    }
+    lines<true>(rows, count, to, last_row, last_token);
+  }
+
+  // Four values are stored where the point has fewer: the points of that place are sampled later,
+  // with one exception. Behind the last row of a token is the first row of the next one, which is
+  // there already if a token has more than one row: it is kept and put back. Behind the last token
+  // is what others may write to: its last points are exact.
+  template <bool kWeights>
+  bool lines(int64_t rows, int64_t count, T* to, bool last_row, bool last_token) {
     const int64_t channels = a.channels, all = rows * count, tokens = count / a.patch_azimuths;
     const auto& near = points.near;
+    bool finite = true;
     const auto sample = [&](int64_t begin, int64_t end) {
-      sample_line(image, packed.row, near, begin, end, state.to, state.joined, channels, to);
+      finite &= sample_line<kWeights>(image, packed.row, near, begin, end, state.near_to,
+                                      state.joined, channels, to);
     };
     if (!last_row) {
       sample(0, all);
-      return;
+      return finite;
     }
     const int64_t before = all - count;
     sample(0, before);
+    // Then, with four values or more in a row, it has at least four points.
     T* first = to + (rows - a.patch_radii) * row_stride;  // row 0 of the first token
-    T kept[kBlock / 4 + 1][4];
-    for (int64_t t = 1; t < tokens; ++t) {
+    T kept[kBlock / 4][4];
+    const int64_t overrun = channels < 4 && a.patch_radii > 1 ? tokens : 0;
+    for (int64_t t = 1; t < overrun; ++t) {
       store(kept[t], load<Vector<T, 4>>(first + t * sector_stride));
     }
     const int64_t whole = last_token && before < all - 4 ? all - 4 : last_token ? before : all;
     sample(before, whole);
     for (int64_t k = whole; k < all; ++k) {
-      const Vector<T, 4> v =
-          interpolate(image + near.offset[k], image + packed.row + near.offset[k], near.right[k],
-                      near.lower[k]);
-      for (int64_t c = 0; c < channels; ++c) to[state.to[k] + c] = v[c];
+      const T* pixel = image + near.offset[k];
+      T v[4];
+      Piece<T> sum{};
+      interpolate<kWeights>(pixel, pixel + packed.row, near.right[k], near.lower[k], v, &sum);
+      finite &= all_finite(sum);
+      for (int64_t c = 0; c < channels; ++c) to[state.near_to[k] + c] = v[c];
     }
-    for (int64_t t = 1; t < tokens; ++t) {
+    for (int64_t t = 1; t < overrun; ++t) {
       store(first + t * sector_stride, load<Vector<T, 4>>(kept[t]));
     }
+    return finite;
   }
 
   // Points j to j + count of one radius, whose places are `place` on, of any number of channels.
@@ -235,9 +305,9 @@ class Sampler {
               *opposite = below + packed.pixel;
 #pragma omp simd
       for (int64_t c = 0; c < a.channels; ++c) {
-        const T l = pixel[c] + lower * (below[c] - pixel[c]);
-        const T r = next[c] + lower * (opposite[c] - next[c]);
-        to[c] = l + right * (r - l);
+        const T l = between(pixel[c], below[c], 1 - lower, lower);
+        const T r = between(next[c], opposite[c], 1 - lower, lower);
+        to[c] = between(l, r, 1 - right, right);
       }
     }
   }
@@ -259,7 +329,7 @@ class Sampler {
         __builtin_prefetch(pixel + below, 0, 2);
       }
       const int64_t place = state.order[v];
-      T* out = to + state.to[place];
+      T* out = to + state.far_to[place];
       if (offset[place] < 0) {
         border_point<E>(b, place, out);
         continue;
@@ -283,10 +353,11 @@ class Sampler {
     const V top = two_pairs(pixel, pixel + plane);
     const V bottom = two_pairs(pixel + below, pixel + plane + below);
     const V top3 = two_pairs(third, third), bottom3 = two_pairs(third + below, third + below);
-    const V ab = top + lower * (bottom - top), c = top3 + lower * (bottom3 - top3);
+    const V ab = between(top, bottom, 1 - lower, lower);
+    const V c = between(top3, bottom3, 1 - lower, lower);
     const V l = __builtin_shufflevector(ab, c, 0, 2, 4, 6);
     const V r = __builtin_shufflevector(ab, c, 1, 3, 5, 7);
-    const V v = l + right * (r - l);
+    const V v = between(l, r, 1 - right, right);
     to[0] = v[0];
     to[1] = v[1];
     to[2] = v[2];
@@ -297,10 +368,9 @@ class Sampler {
     const int64_t below = a.image_stride[2], next = a.image_stride[3];
     const T right = points.far.right[place], lower = points.far.lower[place];
     for (int64_t c = 0; c < a.channels; ++c, pixel += a.image_stride[1]) {
-      const T top = value(a, pixel[0], c), top_next = value(a, pixel[next], c);
-      const T l = top + lower * (value(a, pixel[below], c) - top);
-      const T r = top_next + lower * (value(a, pixel[below + next], c) - top_next);
-      to[c] = l + right * (r - l);
+      const T l = between(number<T>(pixel[0]), number<T>(pixel[below]), 1 - lower, lower);
+      const T r = between(number<T>(pixel[next]), number<T>(pixel[below + next]), 1 - lower, lower);
+      to[c] = normalized<E>(a, between(l, r, 1 - right, right), c);
     }
   }
 
@@ -309,10 +379,9 @@ class Sampler {
     const Corners<T, E> corners(a, b, points.far.column[place], points.far.row[place]);
     const T right = points.far.right[place], lower = points.far.lower[place];
     for (int64_t c = 0; c < a.channels; ++c) {
-      T p[4];
-      corners.read(c, p);
-      const T l = p[0] + lower * (p[2] - p[0]), r = p[1] + lower * (p[3] - p[1]);
-      to[c] = l + right * (r - l);
+      const Vector<T, 4> p = corners.read(c);
+      const T l = between(p[0], p[2], 1 - lower, lower), r = between(p[1], p[3], 1 - lower, lower);
+      to[c] = between(l, r, 1 - right, right);
     }
   }
 

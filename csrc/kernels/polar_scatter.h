@@ -17,9 +17,8 @@ template <typename T>
 class Scatter {
  public:
   static int64_t bytes(const PolarSampleArgs<T>& a) {
-    const int64_t sums = keeping(a) == kInPlace ? 0 : sums_layout(a).size;
     return round_up(sizeof(PlacedPoints<T>), 64) + a.patch_radii * row_bytes(a) +
-           sums * static_cast<int64_t>(sizeof(T));
+           sums_layout(a).size * static_cast<int64_t>(sizeof(T));
   }
 
   // Band `band` of image b.
@@ -104,6 +103,7 @@ class Scatter {
   }
 
   static Packed sums_layout(const PolarSampleArgs<T>& a) {
+    if (keeping(a) == kInPlace) return Packed();
     Packed layout(a);
     if (keeping(a) == kCells) {
       layout.pixel *= 4;
@@ -187,6 +187,9 @@ class Scatter {
   void add_pixels(int64_t k, const T* block) const {
     using V = Vector<T, 4>;
     const T down = points.near.lower[k], right = points.near.right[k];
+    const T up = 1 - down, left = 1 - right;
+    const T up_left = up * left, up_right = up * right, down_left = down * left;
+    const T down_right = down * right;
     const int64_t offset = points.near.offset[k], pixel = layout.pixel;
     const bool upper = !kBanded || in_band(offset);
     const bool lower = !kBanded || in_band(offset + layout.row);
@@ -194,15 +197,14 @@ class Scatter {
     T* bottom = top + layout.row;
     const T* grad = block + k * a.channels;
     for (int64_t c = 0; c < pixel; c += 4) {
-      const V g = load<V>(grad + c), below = unfused(g * down), above = g - below;
-      const V above_right = unfused(above * right), below_right = unfused(below * right);
+      const V g = load<V>(grad + c);
       if (upper) {
-        store(top + c, load<V>(top + c) + (above - above_right));
-        store(top + pixel + c, load<V>(top + pixel + c) + above_right);
+        store(top + c, load<V>(top + c) + unfused(g * up_left));
+        store(top + pixel + c, load<V>(top + pixel + c) + unfused(g * up_right));
       }
       if (lower) {
-        store(bottom + c, load<V>(bottom + c) + (below - below_right));
-        store(bottom + pixel + c, load<V>(bottom + pixel + c) + below_right);
+        store(bottom + c, load<V>(bottom + c) + unfused(g * down_left));
+        store(bottom + pixel + c, load<V>(bottom + pixel + c) + unfused(g * down_right));
       }
     }
   }
@@ -256,16 +258,17 @@ class Scatter {
     if (!upper && !lower) return;
     const bool left = column >= 0 && column < a.width;
     const bool next = column >= -1 && column + 1 < a.width;
-    const T down = points.far.lower[place], right = points.far.right[place];
+    const T by_down = points.far.lower[place], by_right = points.far.right[place];
+    const T by_up = 1 - by_down, by_left = 1 - by_right;
+    const T up_left = by_up * by_left, up_right = by_up * by_right;
+    const T down_left = by_down * by_left, down_right = by_down * by_right;
     const int64_t plane = a.height * a.width;
     T* pixel = static_cast<T*>(a.grad_image) + image * a.channels * plane + row * a.width + column;
     for (int64_t c = 0; c < a.channels; ++c, pixel += plane) {
-      const T below = unfused(grad[c] * down), above = grad[c] - below;
-      const T above_right = unfused(above * right), below_right = unfused(below * right);
-      if (upper && left) pixel[0] += above - above_right;
-      if (upper && next) pixel[1] += above_right;
-      if (lower && left) pixel[a.width] += below - below_right;
-      if (lower && next) pixel[a.width + 1] += below_right;
+      if (upper && left) pixel[0] += unfused(grad[c] * up_left);
+      if (upper && next) pixel[1] += unfused(grad[c] * up_right);
+      if (lower && left) pixel[a.width] += unfused(grad[c] * down_left);
+      if (lower && next) pixel[a.width + 1] += unfused(grad[c] * down_right);
     }
   }
 

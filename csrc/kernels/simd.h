@@ -111,6 +111,30 @@ inline V unfused(V value) {
   return value;
 }
 
+// (1 - t) * a + t * b, given both weights. Weights rather than a + t * (b - a), since the
+// difference of huge values overflows, and infinity less anything but itself would become NaN later
+// on. Which of the two products is fused into the sum is fixed, so that every copy of the code
+// gives the same.
+template <typename V, typename Weight>
+inline V between(V a, V b, Weight one_less_t, Weight t) {
+  return unfused(one_less_t * a) + t * b;
+}
+// Of single values, in a form that loops over them can be made vectors of.
+inline float between(float a, float b, float one_less_t, float t) {
+#if defined(__FMA__)
+  return __builtin_fmaf(t, b, one_less_t * a);
+#else
+  return one_less_t * a + t * b;
+#endif
+}
+inline double between(double a, double b, double one_less_t, double t) {
+#if defined(__FMA__)
+  return __builtin_fma(t, b, one_less_t * a);
+#else
+  return one_less_t * a + t * b;
+#endif
+}
+
 // a where the mask's lane is all ones, else b.
 template <typename M, typename V>
 inline V select(M mask, V a, V b) {

@@ -141,7 +141,7 @@ struct Scratch {
   T *p, *dp;                 // (padded, group): logits, then probabilities, and their gradients
   T *pair_bias, *pair_grad;  // (heads, n, padded): biases of all pairs, and gradients of a chunk
   int64_t* bias_row;         // (heads,): the row of the bias that pair_bias holds
-  T* group_bias;             // (n, group): biases of a group, where there are no tables of pairs
+  T* group_bias;  // (eights, group): biases of a group, where there are no tables of pairs
   T *q_copy, *k_copy, *v_copy, *g_copy;  // (padded, d): rows of a head, widened; g: the gradient
   T *dq_copy, *dk_copy, *dv_copy;        // the same of results, yet to be rounded
 
@@ -149,6 +149,8 @@ struct Scratch {
   Scratch(Arena& arena, const Sizes& shape) {
     const int64_t n = shape.n, padded = shape.padded;
     const int64_t pairs = shape.pairs ? shape.heads * n * padded : 0;
+    const int64_t past =
+        (shape.eights - n) * padded;  // keys are read in eights, here past the last
     const int64_t rows = sizeof(S) == sizeof(T) ? 0 : padded * shape.d;
     window.take(arena, padded);
     next.take(arena, padded);
@@ -158,10 +160,10 @@ struct Scratch {
     inverse = arena.take<T>(kGroup);
     p = arena.take<T>(padded * kGroup);
     dp = arena.take<T>(padded * kGroup);
-    pair_bias = arena.take<T>(pairs);
+    pair_bias = arena.take<T>(shape.pairs ? pairs + past : 0);
     pair_grad = arena.take<T>(pairs);
     bias_row = arena.take<int64_t>(shape.heads);
-    group_bias = arena.take<T>(shape.pairs ? 0 : n * kGroup);
+    group_bias = arena.take<T>(shape.pairs ? 0 : shape.eights * kGroup);
     q_copy = arena.take<T>(rows);
     k_copy = arena.take<T>(rows);
     v_copy = arena.take<T>(rows);
