@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/installed
 
-.PHONY: help build demo test test-isa lint format bench study learned-lens readme dist clean
+.PHONY: help build demo test test-isa test-asan fuzz lint format bench study learned-lens readme dist clean
 
 help:  ## this list
 	@grep -E '^[a-z-]+:.*##' Makefile | sed -E 's/:.*## /\t/' | expand -t 12
@@ -32,6 +32,28 @@ test-isa: build  ## the operators' tests on every instruction-set tier of this m
 	    $(BIN)/python -m pytest -q tests/ops \
 	      tests/test_build.py::test_the_tier_in_use_is_the_one_asked_for; \
 	done
+
+# The sanitized module stands with a copy of the sources in a folder of its own, and the tests run
+# from there. Python itself is not sanitized, so the sanitizers' libraries come first.
+SANITIZED := build/sanitized
+PRELOAD = $(shell g++ -print-file-name=libasan.so):$(shell g++ -print-file-name=libstdc++.so)
+
+test-asan: build  ## the operators' tests on every tier under AddressSanitizer and UBSan
+	@rm -rf $(SANITIZED)/darswin
+	@PATH=$(CURDIR)/$(BIN):$$PATH DARSWIN_SANITIZE=address,undefined \
+	  $(BIN)/python setup.py -q build --build-lib $(SANITIZED)
+	@set -e; tiers=$$($(BIN)/python -c 'from darswin import _C; print(*_C.tiers())'); \
+	cd $(SANITIZED); for tier in $$tiers; do \
+	  echo "== $$tier, sanitized"; \
+	  LD_PRELOAD="$(PRELOAD)" ASAN_OPTIONS=detect_leaks=0:allocator_may_return_null=1 \
+	  UBSAN_OPTIONS=print_stacktrace=1 ATEN_CPU_CAPABILITY=$$(echo $$tier | sed s/generic/default/) \
+	    $(CURDIR)/$(BIN)/python -m pytest -q -c $(CURDIR)/pyproject.toml --rootdir $(CURDIR) \
+	      -m "not unsanitized" $(CURDIR)/tests/ops; \
+	done
+
+fuzz: build  ## 20,000 random calls of the operators against the reference, 48,000 hostile ones
+	$(BIN)/python -X faulthandler -m pytest -q --hypothesis-profile=fuzz \
+	  tests/ops/test_properties.py tests/ops/test_hostile.py
 
 lint: $(STAMP)  ## ruff and clang-format, without changing anything
 	$(BIN)/ruff check .

@@ -1,6 +1,7 @@
 """Builds darswin._C by calling CMake, which alone knows the sources and the flags."""
 
 import importlib.util
+import os
 import subprocess
 import sys
 import sysconfig
@@ -22,11 +23,14 @@ class CMakeBuild(build_ext):
                 "then run pip with --no-build-isolation"
             )
         output = Path(self.get_ext_fullpath(ext.name)).resolve().parent
-        build = ROOT / "build" / f"cmake-{sysconfig.get_config_var('SOABI')}"
+        sanitize = os.environ.get("DARSWIN_SANITIZE", "")
+        kind = "sanitized" if sanitize else "cmake"
+        build = ROOT / "build" / f"{kind}-{sysconfig.get_config_var('SOABI')}"
         subprocess.check_call(
             ["cmake", "--log-level=NOTICE", "-S", ROOT, "-B", build, "-G", "Ninja",
              f"-DTORCH_DIR={Path(torch.origin).parent}",
              f"-DDARSWIN_OUTPUT_DIR={output}",
+             f"-DDARSWIN_SANITIZE={sanitize}",
              f"-DPython_EXECUTABLE={sys.executable}",
              f"-Dpybind11_DIR={pybind11.get_cmake_dir()}"]
         )  # fmt: skip

@@ -47,6 +47,16 @@ void add_norm_(Tensor x, Tensor y, const Tensor& weight, const Tensor& bias, dou
                         t->size(0) == x.size(x.dim() - 1) && t->is_contiguous(),
                     "add_norm_: weight and bias must be float32 (D,), D the last size of x");
   }
+  const auto shared = [](const Tensor& a, const Tensor& b) {
+    const auto* first = static_cast<const char*>(a.const_data_ptr());
+    const auto* second = static_cast<const char*>(b.const_data_ptr());
+    return first < second + b.numel() * b.element_size() &&
+           second < first + a.numel() * a.element_size();
+  };
+  STD_TORCH_CHECK(!shared(x, y) && !shared(x, weight) && !shared(x, bias) && !shared(y, weight) &&
+                      !shared(y, bias),
+                  "add_norm_: x and y change, so they must share no memory with each other nor "
+                  "with weight or bias");
   half ? run<bfloat16>(x, y, weight, bias, eps) : run<float>(x, y, weight, bias, eps);
 }
 

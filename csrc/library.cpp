@@ -11,29 +11,29 @@
 STABLE_TORCH_LIBRARY(darswin, m) {
   m.def(
       "polar_sample(Tensor image, Tensor radii, Tensor azimuths, Tensor center, Tensor? affine, "
-      "Tensor? offsets, int[] patch, float jitter, Tensor? seed, float[] mean, float[] std, "
+      "Tensor? offsets, int[] patch, Tensor? jitter, Tensor? seed, float[] mean, float[] std, "
       "bool tokens, bool bfloat16) -> Tensor");
   m.def(
       "polar_sample_backward(Tensor grad_out, Tensor image, Tensor radii, Tensor azimuths, "
-      "Tensor center, Tensor? affine, Tensor? offsets, int[] patch, float jitter, Tensor? seed, "
+      "Tensor center, Tensor? affine, Tensor? offsets, int[] patch, Tensor? jitter, Tensor? seed, "
       "float[] mean, float[] std, bool tokens, bool bfloat16, bool image_grad, bool lens_grad, "
       "bool offsets_grad) -> (Tensor, Tensor, Tensor, Tensor, Tensor)");
   m.def(
       "polar_embed(Tensor image, Tensor radii, Tensor azimuths, Tensor center, Tensor? affine, "
-      "Tensor? offsets, Tensor weight, Tensor? bias, int[] patch, float jitter, Tensor? seed, "
+      "Tensor? offsets, Tensor weight, Tensor? bias, int[] patch, Tensor? jitter, Tensor? seed, "
       "float[] mean, float[] std, bool bfloat16) -> Tensor");
   m.def(
       "polar_embed_backward(Tensor grad_out, Tensor image, Tensor radii, Tensor azimuths, "
-      "Tensor center, Tensor? affine, Tensor? offsets, Tensor weight, int[] patch, float jitter, "
+      "Tensor center, Tensor? affine, Tensor? offsets, Tensor weight, int[] patch, Tensor? jitter, "
       "Tensor? seed, float[] mean, float[] std, bool bfloat16, bool image_grad, bool lens_grad, "
       "bool offsets_grad, bool weight_grad) -> "
       "(Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor)");
   m.def(
-      "window_attention(Tensor qkv, Tensor bias, int[] window, int[] shift, bool[] periodic, "
+      "window_attention(Tensor qkv, Tensor bias, int[] window, int[] shift, int[] periodic, "
       "float scale) -> Tensor");
   m.def(
       "window_attention_backward(Tensor grad_out, Tensor qkv, Tensor bias, int[] window, "
-      "int[] shift, bool[] periodic, float scale) -> (Tensor, Tensor)");
+      "int[] shift, int[] periodic, float scale) -> (Tensor, Tensor)");
   m.def("add_norm_(Tensor(a!) x, Tensor(b!) y, Tensor weight, Tensor bias, float eps) -> ()");
   m.def("transpose_sum(Tensor x) -> (Tensor, Tensor)");
 }

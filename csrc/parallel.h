@@ -66,7 +66,11 @@ class Scratch {
   void* get() const { return memory_; }
 
  private:
-  static constexpr size_t kKept = size_t{8} << 20;
+#if defined(__SANITIZE_ADDRESS__)  // which then sees every step beyond the end
+  static constexpr size_t kKept = 0, kUnit = 64;
+#else
+  static constexpr size_t kKept = size_t{8} << 20, kUnit = 4096;
+#endif
 
   struct Free {
     void operator()(void* memory) const { std::free(memory); }
@@ -74,7 +78,7 @@ class Scratch {
   using Memory = std::unique_ptr<void, Free>;
 
   static Memory allocate(size_t bytes) {
-    Memory memory(std::aligned_alloc(64, (bytes + 4095) / 4096 * 4096));
+    Memory memory(std::aligned_alloc(64, (bytes + kUnit - 1) / kUnit * kUnit));
     if (memory == nullptr) throw std::bad_alloc();
     return memory;
   }

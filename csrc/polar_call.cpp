@@ -25,9 +25,10 @@ int64_t product(std::initializer_list<int64_t> sizes) {
 template <typename T>
 PolarCall<T>::PolarCall(const Tensor& image_, const Tensor& radii_, const Tensor& azimuths_,
                         const Tensor& center_, const std::optional<Tensor>& affine_,
-                        const std::optional<Tensor>& offsets_, const Sizes& patch, double jitter,
-                        const std::optional<Tensor>& seed, const std::vector<double>& mean,
-                        const std::vector<double>& std, bool bfloat16)
+                        const std::optional<Tensor>& offsets_, const Sizes& patch,
+                        const std::optional<Tensor>& jitter, const std::optional<Tensor>& seed,
+                        const std::vector<double>& mean, const std::vector<double>& std,
+                        bool bfloat16)
     : image(image_),
       radii(torch::stable::contiguous(radii_)),
       center(torch::stable::contiguous(center_)),
@@ -66,8 +67,7 @@ PolarCall<T>::PolarCall(const Tensor& image_, const Tensor& radii_, const Tensor
     args.offsets_end = args.offsets + offsets->numel();
     args.offsets_stride = offsets->size(0) == 1 ? 0 : 2 * radii.size(1) * azimuths.size(0);
   }
-  STD_TORCH_CHECK(jitter >= 0 && jitter <= 1, "polar_sample: jitter must be in [0, 1]");
-  STD_TORCH_CHECK(jitter == 0 || seed.has_value(), "polar_sample: jitter needs a seed");
+  STD_TORCH_CHECK(!jitter.has_value() || seed.has_value(), "polar_sample: jitter needs a seed");
   STD_TORCH_CHECK(type == ScalarType::Float || !bfloat16,
                   "polar_sample: samples of a float64 image are not rounded to bfloat16");
 
@@ -88,11 +88,17 @@ PolarCall<T>::PolarCall(const Tensor& image_, const Tensor& radii_, const Tensor
   args.num_azimuths = azimuths.size(0);
   args.patch_radii = patch[0];
   args.patch_azimuths = patch[1];
-  args.jitter = jitter;
   args.narrow = bfloat16;
   // What is counted below: points, values of samples, sums of a lens.
   product({batch, args.num_radii, args.num_azimuths, args.channels});
   samples();
+  if (jitter.has_value()) {
+    STD_TORCH_CHECK(
+        jitter->is_cpu() && jitter->numel() == 1 && jitter->scalar_type() == ScalarType::Double,
+        "polar_sample: jitter must be one float64 on the CPU");
+    args.jitter = *jitter->const_data_ptr<double>();
+    STD_TORCH_CHECK(args.jitter >= 0 && args.jitter <= 1, "polar_sample: jitter must be in [0, 1]");
+  }
   if (seed.has_value()) {
     STD_TORCH_CHECK(seed->is_cpu() && seed->numel() == 1 && seed->scalar_type() == ScalarType::Long,
                     "polar_sample: seed must be one int64 on the CPU");

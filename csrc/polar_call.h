@@ -54,7 +54,8 @@ struct PolarCall {
   PolarCall(const torch::stable::Tensor& image, const torch::stable::Tensor& radii,
             const torch::stable::Tensor& azimuths, const torch::stable::Tensor& center,
             const std::optional<torch::stable::Tensor>& affine,
-            const std::optional<torch::stable::Tensor>& offsets, const Sizes& patch, double jitter,
+            const std::optional<torch::stable::Tensor>& offsets, const Sizes& patch,
+            const std::optional<torch::stable::Tensor>& jitter,
             const std::optional<torch::stable::Tensor>& seed, const std::vector<double>& mean,
             const std::vector<double>& std, bool bfloat16);
 
@@ -112,7 +113,8 @@ auto with_polar_call(const torch::stable::Tensor& image, const torch::stable::Te
                      const torch::stable::Tensor& azimuths, const torch::stable::Tensor& center,
                      const std::optional<torch::stable::Tensor>& affine,
                      const std::optional<torch::stable::Tensor>& offsets, const Sizes& patch,
-                     double jitter, const std::optional<torch::stable::Tensor>& seed,
+                     const std::optional<torch::stable::Tensor>& jitter,
+                     const std::optional<torch::stable::Tensor>& seed,
                      const std::vector<double>& mean, const std::vector<double>& std, bool bfloat16,
                      Run run) {
   if (pixel_type(image) == Pixel::f64) {

@@ -200,8 +200,8 @@ auto backward(PolarCall<T>&& call, const Tensor& grad_out_, const Tensor& weight
 Tensor polar_embed(const Tensor& image, const Tensor& radii, const Tensor& azimuths,
                    const Tensor& center, std::optional<Tensor> affine,
                    std::optional<Tensor> offsets, const Tensor& weight, std::optional<Tensor> bias,
-                   Sizes patch, double jitter, std::optional<Tensor> seed, std::vector<double> mean,
-                   std::vector<double> std, bool bfloat16) {
+                   Sizes patch, std::optional<Tensor> jitter, std::optional<Tensor> seed,
+                   std::vector<double> mean, std::vector<double> std, bool bfloat16) {
   return with_polar_call(image, radii, azimuths, center, affine, offsets, patch, jitter, seed, mean,
                          std, bfloat16,
                          [&](auto&& call) { return forward(std::move(call), weight, bias); });
@@ -210,7 +210,7 @@ Tensor polar_embed(const Tensor& image, const Tensor& radii, const Tensor& azimu
 auto polar_embed_backward(const Tensor& grad_out, const Tensor& image, const Tensor& radii,
                           const Tensor& azimuths, const Tensor& center,
                           std::optional<Tensor> affine, std::optional<Tensor> offsets,
-                          const Tensor& weight, Sizes patch, double jitter,
+                          const Tensor& weight, Sizes patch, std::optional<Tensor> jitter,
                           std::optional<Tensor> seed, std::vector<double> mean,
                           std::vector<double> std, bool bfloat16, bool image_grad, bool lens_grad,
                           bool offsets_grad, bool weight_grad) {

@@ -52,7 +52,7 @@ auto backward(PolarCall<T>&& call, const Tensor& grad_out_, bool tokens,
 
 Tensor polar_sample(const Tensor& image, const Tensor& radii, const Tensor& azimuths,
                     const Tensor& center, std::optional<Tensor> affine,
-                    std::optional<Tensor> offsets, Sizes patch, double jitter,
+                    std::optional<Tensor> offsets, Sizes patch, std::optional<Tensor> jitter,
                     std::optional<Tensor> seed, std::vector<double> mean, std::vector<double> std,
                     bool tokens, bool bfloat16) {
   return with_polar_call(image, radii, azimuths, center, affine, offsets, patch, jitter, seed, mean,
@@ -63,9 +63,9 @@ Tensor polar_sample(const Tensor& image, const Tensor& radii, const Tensor& azim
 auto polar_sample_backward(const Tensor& grad_out, const Tensor& image, const Tensor& radii,
                            const Tensor& azimuths, const Tensor& center,
                            std::optional<Tensor> affine, std::optional<Tensor> offsets, Sizes patch,
-                           double jitter, std::optional<Tensor> seed, std::vector<double> mean,
-                           std::vector<double> std, bool tokens, bool bfloat16, bool image_grad,
-                           bool lens_grad, bool offsets_grad) {
+                           std::optional<Tensor> jitter, std::optional<Tensor> seed,
+                           std::vector<double> mean, std::vector<double> std, bool tokens,
+                           bool bfloat16, bool image_grad, bool lens_grad, bool offsets_grad) {
   return with_polar_call(image, radii, azimuths, center, affine, offsets, patch, jitter, seed, mean,
                          std, bfloat16, [&](auto&& call) {
                            return backward(std::move(call), grad_out, tokens,

@@ -21,6 +21,10 @@ std::tuple<Tensor, Tensor> transpose_sum(const Tensor& x) {
                       x.dim() == 2 && x.is_contiguous(),
                   "transpose_sum: x must be a contiguous float32 matrix");
   const int64_t rows = x.size(0), columns = x.size(1);
+  if (x.numel() == 0) {
+    return {torch::stable::new_empty(x, std::vector<int64_t>{columns, rows}),
+            torch::stable::new_zeros(x, std::vector<int64_t>{columns})};
+  }
   const int64_t groups = (rows + kTransposedRows - 1) / kTransposedRows;
   const Tensor transposed = torch::stable::new_empty(x, std::vector<int64_t>{columns, rows});
   const Tensor sum = torch::stable::new_empty(x, std::vector<int64_t>{columns});

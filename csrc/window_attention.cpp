@@ -32,7 +32,7 @@ struct Call {
   WindowAttentionArgs<T> args{};
 
   Call(const Tensor& qkv_, const Tensor& bias_, const Sizes& window, const Sizes& shift,
-       const std::vector<bool>& periodic, double scale)
+       const Sizes& periodic, double scale)
       : qkv(torch::stable::contiguous(qkv_)), bias(torch::stable::contiguous(bias_)) {
     STD_TORCH_CHECK(qkv.dim() == 6 && qkv.size(3) == 3 && bias.dim() == 4 && window.size() == 2 &&
                         shift.size() == 2 && periodic.size() == 2,
@@ -64,8 +64,8 @@ struct Call {
     args.windows = batch * (args.rings / args.window_r) * (args.sectors / args.window_a);
     args.shift_r = shift[0];
     args.shift_a = shift[1];
-    args.periodic_r = periodic[0];
-    args.periodic_a = periodic[1];
+    args.periodic_r = periodic[0] != 0;
+    args.periodic_a = periodic[1] != 0;
     args.scale = static_cast<Arithmetic<T>>(scale);
   }
 
@@ -131,7 +131,7 @@ std::tuple<Tensor, Tensor> backward(Call<T>&& call, const Tensor& grad_out_) {
 // use(Call<T>) for the T of qkv.
 template <typename Use>
 auto with_call(Use use, const Tensor& qkv, const Tensor& bias, const Sizes& window,
-               const Sizes& shift, const std::vector<bool>& periodic, double scale) {
+               const Sizes& shift, const Sizes& periodic, double scale) {
   switch (qkv.scalar_type()) {
     case ScalarType::Float:
       return use(Call<float>(qkv, bias, window, shift, periodic, scale));
@@ -145,14 +145,14 @@ auto with_call(Use use, const Tensor& qkv, const Tensor& bias, const Sizes& wind
 }
 
 Tensor window_attention(const Tensor& qkv, const Tensor& bias, Sizes window, Sizes shift,
-                        std::vector<bool> periodic, double scale) {
+                        Sizes periodic, double scale) {
   return with_call([](auto&& call) { return forward(std::move(call)); }, qkv, bias, window, shift,
                    periodic, scale);
 }
 
 std::tuple<Tensor, Tensor> window_attention_backward(const Tensor& grad_out, const Tensor& qkv,
                                                      const Tensor& bias, Sizes window, Sizes shift,
-                                                     std::vector<bool> periodic, double scale) {
+                                                     Sizes periodic, double scale) {
   return with_call([&](auto&& call) { return backward(std::move(call), grad_out); }, qkv, bias,
                    window, shift, periodic, scale);
 }

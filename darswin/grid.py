@@ -16,6 +16,7 @@ from torch import Tensor
 
 from darswin.inverse import inverse
 from darswin.lens import Lens
+from darswin.ops.checks import as_int
 
 Spacing = Literal["theta", "tan", "g", "radius"]
 Placement = Literal["centers", "edges"]
@@ -116,9 +117,9 @@ def check_grid(
 ) -> None:
     """ValueError where the settings of a grid make none."""
     for name, value in (("rings", rings), ("sectors", sectors)):
-        if not isinstance(value, int) or value < 1:
+        if (as_int(value) or 0) < 1:
             raise ValueError(f"{name} must be an int of at least 1, got {value!r}")
-    if len(samples) != 2 or any(not isinstance(s, int) or s < 1 for s in samples):
+    if len(samples) != 2 or any((as_int(s) or 0) < 1 for s in samples):
         raise ValueError(f"samples must be (S_r, S_φ), ints of at least 1, got {samples!r}")
     for name, value in (("spacing", spacing), ("sample_spacing", sample_spacing)):
         if value not in SPACINGS:

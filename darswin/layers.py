@@ -56,11 +56,10 @@ class PolarSample(nn.Module):
     ):
         super().__init__()
         check_grid(rings, sectors, samples, spacing, sample_spacing or spacing, placement)
-        check_jitter(jitter)
         check_layout(layout)
-        self.rings, self.sectors, self.samples = rings, sectors, tuple(samples)
+        self.rings, self.sectors, self.samples = int(rings), int(sectors), (*map(int, samples),)
         self.spacing, self.sample_spacing = spacing, sample_spacing or spacing
-        self.placement, self.jitter, self.layout = placement, float(jitter), layout
+        self.placement, self.jitter, self.layout = placement, check_jitter(jitter), layout
         self.mean, self.std = mean, std
         self._grid = grid
 

@@ -156,6 +156,11 @@ class _Stage(nn.Module):
 
     def run(self, x: Tensor, tables: list[Tensor | None]) -> Tensor:
         """What `Stage` does, with what `tables` gave. Where nothing merges, x itself changes."""
+        if torch.is_grad_enabled() and x.requires_grad:
+            raise RuntimeError(
+                "an optimized model has no gradients, but its images or its lens require one: call "
+                "it under torch.no_grad(), or use the model it was made of"
+            )
         x = self.downsample(x).contiguous()
         widest = x[:1].numel() * self.mlp_ratio * x.element_size()
         parts = -(-len(x) * widest // CACHED_BYTES)
@@ -184,6 +189,20 @@ class _Stage(nn.Module):
     def forward(self, x: Tensor, *positions: Tensor) -> Tensor:
         """As `Stage`."""
         return self.run(x, self.tables(*positions))
+
+    def train(self, mode: bool = True) -> "_Stage":
+        if mode:
+            raise TypeError("an optimized model is not trained: train the model it was made of")
+        return super().train(mode)
+
+    def state_dict(self, *args, **kwargs):
+        raise TypeError("an optimized model is not saved: save the model it was made of")
+
+    def __reduce_ex__(self, protocol):
+        raise TypeError(
+            "an optimized model is neither copied nor pickled, since oneDNN's weights cannot be: "
+            "copy the model it was made of, and optimize that"
+        )
 
 
 def _joined(biases: list[RelativeBias]) -> RelativeBias:

@@ -1,9 +1,16 @@
 import os
 
+import hypothesis
 import pytest
 import torch
 
 from darswin import _C
+
+# Properties: the same few cases in each `make test`; `make fuzz` draws new ones.
+_common = dict(deadline=None, database=None, suppress_health_check=list(hypothesis.HealthCheck))
+hypothesis.settings.register_profile("test", max_examples=30, derandomize=True, **_common)
+hypothesis.settings.register_profile("fuzz", max_examples=2000, print_blob=True, **_common)
+hypothesis.settings.load_profile("test")
 
 
 def pytest_report_header(config):

@@ -4,6 +4,7 @@
 // cache. It is made, multiplied with the weight and forgotten, so samples are never written to
 // memory; backward makes it again. The gradient of the samples goes the same way, from the product
 // straight to the pixels.
+#include "arena.h"
 #include "kernels.h"
 #include "matmul.h"
 #include "polar_rows.h"
@@ -28,20 +29,14 @@ struct Scratch {
       : depth(a.patch_radii * a.patch_azimuths * a.channels),
         row(round_up(depth, kRowUnit)),
         wide(round_up(e.features, kRowUnit)) {
-    char* next = static_cast<char*>(memory);
-    const auto take = [&next](int64_t size) {
-      char* part = next;
-      next += round_up(size, 64);
-      return part;
-    };
+    Arena arena{static_cast<char*>(memory)};
     const int64_t sectors = a.num_azimuths / a.patch_azimuths;
-    const int64_t value = static_cast<int64_t>(sizeof(T));
-    sampler = take(pass == PolarPass::forward ? Sampler<T>::bytes(a) : 0);
-    scatter = take(pass == PolarPass::backward_image ? Scatter<T>::bytes(a) : 0);
-    samples = reinterpret_cast<T*>(take((sectors * row + kRowUnit) * value));
-    products = reinterpret_cast<T*>(take(sectors * wide * value));
-    grads = reinterpret_cast<T*>(take(sectors * e.features * value));
-    bytes = next - static_cast<char*>(memory);
+    sampler = arena.take<char>(pass == PolarPass::forward ? Sampler<T>::bytes(a) : 0);
+    scatter = arena.take<char>(pass == PolarPass::backward_image ? Scatter<T>::bytes(a) : 0);
+    samples = arena.take<T>(sectors * row + kRowUnit);
+    products = arena.take<T>(sectors * wide);
+    grads = arena.take<T>(sectors * e.features);
+    bytes = arena.used;
   }
 };
 

@@ -2,6 +2,7 @@
 #pragma once
 
 #include "../dispatch.h"
+#include "arena.h"
 #include "window_attention_tiles.h"
 
 namespace darswin::TIER {
@@ -67,19 +68,6 @@ struct Shape {
         }
       }
     }
-  }
-};
-
-// Hands out pieces of a block of memory, and counts them.
-struct Arena {
-  char* memory;
-  int64_t used = 0;
-
-  template <typename T>
-  T* take(int64_t count) {
-    T* piece = reinterpret_cast<T*>(memory + used);
-    used += (count * static_cast<int64_t>(sizeof(T)) + 63) / 64 * 64;
-    return piece;
   }
 };
 

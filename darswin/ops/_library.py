@@ -2,9 +2,11 @@
 
 import contextlib
 import importlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import torch  # before the module: both must share the libgomp that torch loads
+from torch import Tensor
+from torch.autograd import forward_ad
 
 _reference = False
 
@@ -42,26 +44,31 @@ def reference_in_use() -> bool:
     return _reference
 
 
-def compiled(tensor: torch.Tensor) -> bool:
+def compiled(tensor: Tensor) -> bool:
     """Whether an operator on `tensor` runs compiled code rather than the reference."""
     return tensor.device.type == "cpu" and not _reference
 
 
-def autocast_dtype(tensor: torch.Tensor) -> torch.dtype | None:
+@torch.compiler.assume_constant_result  # before torch 2.12 Dynamo cannot trace what it calls
+def _has_autocast(device: str) -> bool:
+    return torch.amp.is_autocast_available(device)
+
+
+def autocast_dtype(tensor: Tensor) -> torch.dtype | None:
     """What autocast, where it is on for the tensor's device, computes in."""
     device = tensor.device.type
-    if not torch.amp.is_autocast_available(device) or not torch.is_autocast_enabled(device):
+    if not _has_autocast(device) or not torch.is_autocast_enabled(device):
         return None
     return torch.get_autocast_dtype(device)
 
 
-def without_float16(tensor: torch.Tensor) -> torch.Tensor:
+def without_float16(tensor: Tensor) -> Tensor:
     """Under autocast, a float16 tensor as float32: the operators have no float16."""
     half = tensor.dtype == torch.float16 and autocast_dtype(tensor) is not None
     return tensor.float() if half else tensor
 
 
-def output_bfloat16(image: torch.Tensor) -> bool:
+def output_bfloat16(image: Tensor) -> bool:
     """Whether an operator on `image` gives bfloat16: as the image is, or as autocast says."""
     if image.dtype == torch.float64:
         return False
@@ -70,9 +77,54 @@ def output_bfloat16(image: torch.Tensor) -> bool:
 
 def autocast_off(device: str) -> contextlib.AbstractContextManager:
     """A context in which autocast does not touch the arithmetic of a reference."""
-    if not torch.amp.is_autocast_available(device):
+    if not _has_autocast(device):
         return contextlib.nullcontext()
     return torch.autocast(device, enabled=False)
+
+
+def run(operator: torch._ops.OpOverloadPacket, reference: Callable, arguments: tuple) -> Tensor:
+    """The operator on checked arguments, compiled or, as the first of them says, its reference."""
+    if compiled(arguments[0]):
+        refuse_other_derivatives(operator, arguments)
+        return operator(*arguments)
+    with autocast_off(arguments[0].device.type):
+        return reference(*arguments)
+
+
+def refuse_other_derivatives(operator: torch._ops.OpOverloadPacket, arguments: tuple) -> None:
+    """NotImplementedError where forward-mode AD or torch.func differentiates an argument.
+
+    The first would come to zeros without a word, the second to an error about autograd's insides.
+    """
+    if torch.compiler.is_compiling():
+        return
+    forward = forward_ad._current_level >= 0
+    functional = torch._C._functorch.peek_interpreter_stack() is not None
+    if not forward and not functional:
+        return
+    for value in arguments:
+        if not isinstance(value, Tensor):
+            continue
+        if functional and _tracked(value):
+            mode = "torch.func's derivatives"
+        elif forward and forward_ad.unpack_dual(value).tangent is not None:
+            mode = "forward-mode derivatives"
+        else:
+            continue
+        raise NotImplementedError(
+            f"{operator} has no {mode}, only backward(); run it within "
+            "darswin.ops.use_reference() for them"
+        )
+
+
+def _tracked(tensor: Tensor) -> bool:
+    """Whether a transform of torch.func differentiates with respect to the tensor."""
+    functorch = torch._C._functorch
+    while functorch.is_functorch_wrapped_tensor(tensor):
+        if functorch.is_gradtrackingtensor(tensor):
+            return True
+        tensor = functorch.get_unwrapped(tensor)
+    return False
 
 
 def no_second_derivative(name: str) -> None:

@@ -1,7 +1,8 @@
-"""add_norm_: a residual and the layer norm behind it, in place. Public function and fake."""
+"""add_norm_: a residual and the layer norm behind it, in place. Public function, fake, autograd."""
 
 import torch
 from torch import Tensor
+from torch.autograd.graph import increment_version
 
 
 def add_norm_(x: Tensor, y: Tensor, weight: Tensor, bias: Tensor, eps: float) -> Tensor:
@@ -12,11 +13,12 @@ def add_norm_(x: Tensor, y: Tensor, weight: Tensor, bias: Tensor, eps: float) ->
         y: of the same type and size, contiguous; it becomes the norm, and is returned.
         weight, bias: (D,), float32. eps: added to the variance.
 
-    With bfloat16 the arithmetic is float32, and the sum is rounded before it is normalized. There
-    is no gradient: nothing may require one. Results do not depend on the number of threads.
+    With bfloat16 the arithmetic is float32, and the sum is rounded before it is normalized.
+    Results do not depend on the number of threads.
 
     Raises:
-        RuntimeError: tensors that do not fit.
+        RuntimeError: tensors that do not fit, that share memory, or that require a gradient where
+            one would be recorded: there is none.
     """
     torch.ops.darswin.add_norm_.default(x, y, weight, bias, eps)
     return y
@@ -25,3 +27,31 @@ def add_norm_(x: Tensor, y: Tensor, weight: Tensor, bias: Tensor, eps: float) ->
 @torch.library.register_fake("darswin::add_norm_")
 def _fake(x, y, weight, bias, eps):
     return None
+
+
+_library = torch.library.Library("darswin", "IMPL")
+
+
+def _no_gradient(keyset, *arguments):
+    wants = [isinstance(t, Tensor) and t.requires_grad for t in arguments[:4]]
+    if torch.is_grad_enabled() and any(wants):
+        raise RuntimeError(
+            "add_norm_ has no gradient, but one of its tensors requires one: call it under "
+            "torch.no_grad(), or use torch.layer_norm(x + y, ...)"
+        )
+    with torch._C._AutoDispatchBelowAutograd():
+        return torch.ops.darswin.add_norm_.default.redispatch(
+            keyset & torch._C._after_autograd_keyset, *arguments
+        )
+
+
+def _changed(keyset, x, y, *others):
+    # Autograd then notices where a value that it has saved was changed.
+    increment_version((x, y))
+    return torch.ops.darswin.add_norm_.default.redispatch(
+        keyset & torch._C._after_ADInplaceOrView_keyset, x, y, *others
+    )
+
+
+_library.impl("add_norm_", _no_gradient, "Autograd", with_keyset=True)
+_library.impl("add_norm_", _changed, "ADInplaceOrView", with_keyset=True)

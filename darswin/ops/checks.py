@@ -3,6 +3,8 @@
 A message says what was expected and what came.
 """
 
+import numbers
+import operator
 from collections.abc import Sequence
 
 import torch
@@ -53,16 +55,29 @@ def check_shape(name: str, value: Tensor, form: str, *allowed: Sequence[int | No
     raise ValueError(f"{name} must have shape {expected}, got {shape}")
 
 
+def as_int(value: object) -> int | None:
+    """An int, also of NumPy, as Python's; None where it is not one. bool and floats are not."""
+    if isinstance(value, (bool, Tensor)):
+        return None
+    if isinstance(value, (int, torch.SymInt)):
+        return value
+    try:
+        return operator.index(value)
+    except TypeError:
+        return None
+
+
 def check_pair(name: str, value: Sequence[int], lowest: int) -> tuple[int, int]:
     """Two ints of at least `lowest`, else TypeError or ValueError."""
     if not isinstance(value, (tuple, list, torch.Size)) or len(value) != 2:
         raise TypeError(f"{name} must be a pair of ints, got {value!r}")
-    for item in value:
-        if isinstance(item, bool) or not isinstance(item, (int, torch.SymInt)):
+    pair = tuple(as_int(item) for item in value)
+    for item in pair:
+        if item is None:
             raise TypeError(f"{name} must be a pair of ints, got {value!r}")
         if item < lowest:
             raise ValueError(f"{name} must be at least {lowest} along both axes, got {value!r}")
-    return tuple(value)
+    return pair
 
 
 def channels_first(image: Tensor) -> Tensor:
@@ -73,7 +88,7 @@ def channels_first(image: Tensor) -> Tensor:
 
 def per_channel(name: str, value: float | Sequence[float], channels: int) -> tuple[float, ...]:
     """`mean` or `std` as one number a channel; ValueError where they are not."""
-    values = (value,) * channels if isinstance(value, (int, float)) else tuple(value)
+    values = (value,) * channels if isinstance(value, numbers.Real) else tuple(value)
     if len(values) != channels:
         raise ValueError(f"{name} must be one number or one a channel, {channels}, got {value!r}")
     if name == "std" and not all(v > 0 for v in values):
@@ -87,9 +102,12 @@ def check_layout(layout: str) -> None:
         raise ValueError(f"layout must be one of {LAYOUTS}, got {layout!r}")
 
 
-def check_jitter(jitter: float) -> None:
-    """TypeError or ValueError unless jitter is in [0, 1]."""
-    if not isinstance(jitter, (int, float)):
-        raise TypeError(f"jitter must be a float, got {type(jitter).__name__}")
+def check_jitter(jitter: float) -> float:
+    """Jitter as a Python float, also of NumPy's; TypeError or ValueError unless it is in [0, 1]."""
+    if not isinstance(jitter, (float, torch.SymFloat)):
+        if isinstance(jitter, Tensor) or not isinstance(jitter, numbers.Real):
+            raise TypeError(f"jitter must be a float, got {type(jitter).__name__}")
+        jitter = float(jitter)
     if not 0 <= jitter <= 1:
         raise ValueError(f"jitter must be in [0, 1], got {jitter}")
+    return jitter

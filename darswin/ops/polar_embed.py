@@ -66,10 +66,7 @@ def polar_embed(
         check_tensor("bias", bias, like=image, dtypes=dtypes)
         check_shape("bias", bias, "(D,) = ({},)", (weight.shape[0],))
     arguments = (*sampling[:6], weight, bias, *sampling[6:], _library.output_bfloat16(image))
-    if _library.compiled(image):
-        return torch.ops.darswin.polar_embed(*arguments)
-    with _library.autocast_off(image.device.type):
-        return reference.polar_embed(*arguments)
+    return _library.run(torch.ops.darswin.polar_embed, reference.polar_embed, arguments)
 
 
 @torch.library.register_fake("darswin::polar_embed")
@@ -94,18 +91,18 @@ def _fake_backward(grad_out, image, radii, azimuths, center, affine, offsets, we
 
 def _setup_context(ctx, inputs, output):
     *sampling, weight, bias, patch, jitter, seed, mean, std, bfloat16 = inputs
-    ctx.save_for_backward(*sampling, weight, seed)
-    ctx.settings = (patch, jitter), (mean, std, bfloat16)
+    ctx.save_for_backward(*sampling, weight, jitter, seed)
+    ctx.settings = patch, (mean, std, bfloat16)
     ctx.bias_dtype = weight.dtype if bias is None else bias.dtype
 
 
 def _backward(ctx, grad_out):
-    *sampling, weight, seed = ctx.saved_tensors
-    settings, rest = ctx.settings
+    *sampling, weight, jitter, seed = ctx.saved_tensors
+    patch, rest = ctx.settings
     wants_weight, wants_bias = ctx.needs_input_grad[6:8]
     image, radii, center, affine, offsets, grad_weight, grad_bias = (
         torch.ops.darswin.polar_embed_backward(
-            grad_out, *sampling, weight, *settings, seed, *rest,
+            grad_out, *sampling, weight, patch, jitter, seed, *rest,
             *sampling_wants(ctx.needs_input_grad), wants_weight or wants_bias,
         )
     )  # fmt: skip

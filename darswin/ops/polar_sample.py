@@ -9,6 +9,7 @@ from torch import Tensor
 from darswin.ops import _library, reference
 from darswin.ops.checks import (
     DTYPES,
+    as_int,
     channels_first,
     check_jitter,
     check_layout,
@@ -89,10 +90,7 @@ def polar_sample(
     )
     check_layout(layout)
     arguments = (*sampling, layout == "tokens", _library.output_bfloat16(sampling[0]))
-    if _library.compiled(image):
-        return torch.ops.darswin.polar_sample(*arguments)
-    with _library.autocast_off(image.device.type):
-        return reference.polar_sample(*arguments)
+    return _library.run(torch.ops.darswin.polar_sample, reference.polar_sample, arguments)
 
 
 def sampling_arguments(
@@ -126,8 +124,7 @@ def sampling_arguments(
             f"patch = (S_r, S_φ) must divide (R·S_r, A·S_φ) = "
             f"({radii.shape[1]}, {azimuths.shape[0]}), got {patch}"
         )
-    check_jitter(jitter)
-    key = _seed_tensor(seed) if jitter > 0 else None
+    jitter, key = _jitter_tensors(jitter, seed)
     if image.dtype == torch.uint8:
         mean = per_channel("mean", 0.0 if mean is None else mean, channels)
         std = per_channel("std", 1.0 if std is None else std, channels)
@@ -135,8 +132,16 @@ def sampling_arguments(
         mean = std = ()
     else:
         raise ValueError(f"mean and std go with uint8 images, got an image of {image.dtype}")
-    jitter = float(jitter)
     return image, radii, azimuths, center, affine, offsets, patch, jitter, key, mean, std
+
+
+def _jitter_tensors(jitter: float, seed: int | Tensor) -> tuple[Tensor | None, Tensor | None]:
+    """Jitter and seed as the operators take them: tensors, so that a graph which is compiled does
+    not keep their values. None and None without jitter."""
+    jitter = check_jitter(jitter)
+    if jitter == 0:
+        return None, None
+    return torch.tensor(jitter, dtype=torch.float64), _seed_tensor(seed)
 
 
 def _seed_tensor(seed: int | Tensor) -> Tensor:
@@ -147,11 +152,12 @@ def _seed_tensor(seed: int | Tensor) -> Tensor:
                 f"{tuple(seed.shape)}"
             )
         return seed
-    if isinstance(seed, bool) or not isinstance(seed, (int, torch.SymInt)):
+    key = as_int(seed)
+    if key is None:
         raise TypeError(f"seed must be an int or a 0-dim int64 tensor, got {type(seed).__name__}")
-    if not -(2**63) <= seed < 2**63:
+    if not -(2**63) <= key < 2**63:
         raise ValueError(f"seed must fit 64 bits, got {seed}")
-    return torch.tensor(seed, dtype=torch.int64)
+    return torch.tensor(key, dtype=torch.int64)
 
 
 @torch.library.register_fake("darswin::polar_sample")
@@ -195,15 +201,15 @@ def sampling_wants(needs_input_grad: Sequence[bool]) -> tuple[bool, bool, bool]:
 
 def _setup_context(ctx, inputs, output):
     *sampling, patch, jitter, seed, mean, std, tokens, bfloat16 = inputs
-    ctx.save_for_backward(*sampling, seed)
-    ctx.settings = (patch, jitter), (mean, std, tokens, bfloat16)
+    ctx.save_for_backward(*sampling, jitter, seed)
+    ctx.settings = patch, (mean, std, tokens, bfloat16)
 
 
 def _backward(ctx, grad_out):
-    *sampling, seed = ctx.saved_tensors
-    settings, rest = ctx.settings
+    *sampling, jitter, seed = ctx.saved_tensors
+    patch, rest = ctx.settings
     image, radii, center, affine, offsets = torch.ops.darswin.polar_sample_backward(
-        grad_out, *sampling, *settings, seed, *rest, *sampling_wants(ctx.needs_input_grad)
+        grad_out, *sampling, patch, jitter, seed, *rest, *sampling_wants(ctx.needs_input_grad)
     )
     return wanted_gradients(ctx, image, radii, None, center, affine, offsets, *(None,) * 7)
 

@@ -37,7 +37,7 @@ def _multiply(a: int, b: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _jittered(
-    radii: Tensor, azimuths: Tensor, batch: int, jitter: float, seed: Tensor
+    radii: Tensor, azimuths: Tensor, batch: int, jitter: Tensor, seed: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Radius and azimuth of each point, (B, N_r, N_a)."""
     rows, columns, device = radii.shape[1], azimuths.shape[0], radii.device
@@ -71,7 +71,7 @@ def polar_sample(
     affine: Tensor | None,
     offsets: Tensor | None,
     patch: tuple[int, int],
-    jitter: float,
+    jitter: Tensor | None,
     seed: Tensor | None,
     mean: Sequence[float],
     std: Sequence[float],
@@ -85,14 +85,14 @@ def polar_sample(
     batch, channels, height, width = image.shape
     rows, columns = radii.shape[1], azimuths.shape[0]
     r, a = radii[:, :, None], azimuths[None, None, :]
-    if jitter > 0 and rows > 0 and columns > 0:
+    if jitter is not None and rows > 0 and columns > 0:
         r, a = _jittered(radii, azimuths, batch, jitter, seed)
+    # Gradients must not meet what is not a number: it stays one when it is multiplied with 0.
+    known = r.isfinite() & a.isfinite()
+    r, a = torch.where(r.isfinite(), r, 0), torch.where(a.isfinite(), a, 0)
     x, y = r * torch.cos(a), r * torch.sin(a)  # (B or 1, N_r, N_a)
-    known = True
     if affine is not None:
-        # Gradients must not meet what is no number: it stays one when it is multiplied with 0.
-        known = x.isfinite() & y.isfinite() & affine.isfinite().all(2).all(1)[:, None, None]
-        x, y = torch.where(known, x, 0), torch.where(known, y, 0)
+        known = known & affine.isfinite().all(2).all(1)[:, None, None]
         (xx, xy), (yx, yy) = affine.nan_to_num(0, 0, 0).permute(1, 2, 0)[..., None, None]
         x, y = xx * x + xy * y, yx * x + yy * y
     x, y = center[:, 0, None, None] + x, center[:, 1, None, None] + y
@@ -134,7 +134,7 @@ def polar_embed(
     weight: Tensor,
     bias: Tensor | None,
     patch: tuple[int, int],
-    jitter: float,
+    jitter: Tensor | None,
     seed: Tensor | None,
     mean: Sequence[float],
     std: Sequence[float],

@@ -1,4 +1,4 @@
-"""transpose_sum: a matrix's transpose and the sums of its columns. Public function and fake."""
+"""transpose_sum: a matrix's transpose and sums of columns. Public function, fake, autograd."""
 
 import torch
 from torch import Tensor
@@ -7,8 +7,8 @@ from torch import Tensor
 def transpose_sum(x: Tensor) -> tuple[Tensor, Tensor]:
     """The transpose of a matrix, contiguous, and the sums of its columns: one pass over memory.
 
-    For the gradients of a linear layer's weight and bias; there is none of it, nothing may require
-    one. Results do not depend on the number of threads.
+    For the gradients of a linear layer's weight and bias. Its own gradient is torch's transpose and
+    sum. Results do not depend on the number of threads.
 
     Args:
         x: (M, N), contiguous, float32.
@@ -25,3 +25,10 @@ def transpose_sum(x: Tensor) -> tuple[Tensor, Tensor]:
 @torch.library.register_fake("darswin::transpose_sum")
 def _fake(x):
     return x.new_empty(x.shape[::-1]), x.new_empty(x.shape[1:])
+
+
+def _backward(ctx, grad_transposed, grad_sums):
+    return grad_transposed.t() + grad_sums
+
+
+torch.library.register_autograd("darswin::transpose_sum", _backward)

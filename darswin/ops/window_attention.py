@@ -75,11 +75,9 @@ def window_attention(
             f"window_attention has no dropout: DarSwin's recipe uses 0, got {dropout!r}"
         )
     scale = head_dim**-0.5 if scale is None else float(scale)
-    arguments = (qkv, bias, window, shift, tuple(bool(p) for p in periodic), scale)
-    if _library.compiled(qkv):
-        return torch.ops.darswin.window_attention(*arguments)
-    with _library.autocast_off(qkv.device.type):
-        return reference.window_attention(*arguments)
+    # As ints: torch.jit.trace takes no list of bools.
+    arguments = (qkv, bias, window, shift, tuple(int(bool(p)) for p in periodic), scale)
+    return _library.run(torch.ops.darswin.window_attention, reference.window_attention, arguments)
 
 
 def _arithmetic_types(qkv: Tensor, bias: Tensor) -> tuple[Tensor, Tensor]:

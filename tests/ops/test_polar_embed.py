@@ -101,7 +101,7 @@ def test_opcheck(requires_grad, with_bias):
     image, radii, center, weight, bias, azimuths = make_inputs()
     for tensor in (image, radii, center, weight, bias):
         tensor.requires_grad_(requires_grad)
-    settings = ((4, 5), 0.5, torch.tensor(5), (), (), False)
+    settings = ((4, 5), torch.tensor(0.5).double(), torch.tensor(5), (), (), False)
     parameters = (weight, bias if with_bias else None)
     arguments = (image, radii, azimuths, center, None, None, *parameters, *settings)
     torch.library.opcheck(torch.ops.darswin.polar_embed.default, arguments)
@@ -204,6 +204,7 @@ def test_uint8_frames():
         torch.testing.assert_close(got, want, rtol=1e-4, atol=1e-3)
 
 
+@pytest.mark.unsanitized
 def test_compile_fullgraph():
     *inputs, azimuths = make_inputs()
 
@@ -267,6 +268,6 @@ def test_the_compiled_operator_itself_reads_nothing_outside():
     ):  # fmt: skip
         with pytest.raises(RuntimeError):
             torch.ops.darswin.polar_embed(
-                image, radii, azimuths, center, None, None, bad_weight, bad_bias, (4, 5), 0.0, None,
-                (), (), False,
+                image, radii, azimuths, center, None, None, bad_weight, bad_bias, (4, 5), None,
+                None, (), (), False,
             )  # fmt: skip

@@ -215,6 +215,7 @@ def test_no_second_derivative():
         grad.sum().backward()
 
 
+@pytest.mark.unsanitized
 @pytest.mark.parametrize("backend", ["aot_eager", "inductor"])
 def test_compile_fullgraph(backend):
     inputs = make_inputs()
@@ -229,6 +230,7 @@ def test_compile_fullgraph(backend):
         torch.testing.assert_close(got, want, rtol=1e-6, atol=1e-6)
 
 
+@pytest.mark.unsanitized
 def test_export():
     class Module(torch.nn.Module):
         def forward(self, qkv, bias):

@@ -1,0 +1,248 @@
+"""Random arguments of every operator, for hypothesis: sizes 0 and 1 in every place, every layout,
+dtype, stride and storage offset, and sizes around what the kernels' blocks and registers hold."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import torch
+import torch.nn.functional as F
+from hypothesis import strategies as st
+from torch import Tensor
+
+from darswin.ops import polar_embed, polar_sample, reference, window_attention
+
+f32, f64 = torch.float32, torch.float64
+
+
+@dataclass
+class Case:
+    """One call: `run(**inputs)` is differentiable in every input."""
+
+    run: Callable[..., Tensor]
+    inputs: dict[str, Tensor]
+    # float64 inputs -> what the gradient of the output is multiplied with: 0 where it has a jump.
+    mask: Callable[..., Tensor] | None = None
+    settings: dict = field(default_factory=dict)
+
+    def __repr__(self):
+        shapes = {name: (tuple(t.shape), t.stride()) for name, t in self.inputs.items()}
+        dtype = next(iter(self.inputs.values())).dtype
+        return f"{dtype} {shapes} {self.settings}"
+
+    def to(self, dtype: torch.dtype) -> "Case":
+        inputs = {name: t.to(dtype) for name, t in self.inputs.items()}
+        return Case(self.run, inputs, self.mask, self.settings)
+
+
+def sizes(*values: int):
+    return st.sampled_from(values)
+
+
+@st.composite
+def generators(draw) -> torch.Generator:
+    """A generator of tensors; hypothesis draws its seed, and shapes, but not every number."""
+    return torch.Generator().manual_seed(draw(st.integers(0, 2**31)))
+
+
+def normal(generator: torch.Generator, *shape: int, dtype: torch.dtype = f64) -> Tensor:
+    return torch.randn(shape, generator=generator, dtype=f64).to(dtype)
+
+
+@st.composite
+def strided(draw, tensor: Tensor) -> Tensor:
+    """The same values elsewhere in memory: behind others, with gaps, or in other orders."""
+    kind = draw(st.sampled_from(["plain", "plain", "offset", "gaps", "turned", "expanded"]))
+    if kind == "offset":
+        room = tensor.new_empty(tensor.numel() + 3)
+        return room[3:].view(tensor.shape).copy_(tensor)
+    if kind == "gaps" and tensor.dim():
+        room = tensor.new_full((*tensor.shape, 2), math.nan)
+        room[..., 1] = tensor
+        return room[..., 1]
+    if kind == "turned":
+        order = draw(st.permutations(range(tensor.dim())))
+        back = [order.index(axis) for axis in range(tensor.dim())]
+        return tensor.permute(order).contiguous().permute(back)
+    if kind == "expanded" and tensor.dim() and tensor.shape[0] > 1:
+        return tensor[:1].expand_as(tensor)  # other values, but of stride 0
+    return tensor
+
+
+@st.composite
+def grids(draw, generator: torch.Generator, largest: int = 4000):
+    """Rings, sectors and samples of a patch, no more than `largest` points in all."""
+    rings, sectors = draw(sizes(0, 1, 2, 3, 5)), draw(sizes(0, 1, 2, 3, 8, 17, 64, 257, 300))
+    patch = draw(sizes(1, 2, 3, 4, 7, 10)), draw(sizes(1, 2, 3, 4, 5, 10, 33, 1030))
+    while rings * patch[0] * sectors * patch[1] > largest:
+        if sectors > 2:
+            sectors = (sectors + 1) // 2
+        elif rings > 1:
+            rings -= 1
+        else:
+            patch = (max(patch[0] // 2, 1), max(patch[1] // 2, 1))
+    return rings, sectors, patch
+
+
+@st.composite
+def lenses(draw, generator, batch, size, rows, columns, dtype):
+    """radii, azimuths, center, and affine and offsets or None, for images of `size` = (H, W)."""
+    reach = max(*size, 2)
+    count = draw(st.sampled_from([1, batch]))
+    spread = draw(st.sampled_from([0.4, 0.7, 1.5, 0.0]))
+    radii = torch.rand(count, rows, generator=generator, dtype=f64) * spread * reach
+    if draw(st.booleans()):
+        radii = radii.sort(1).values
+    if draw(st.integers(0, 7)) == 0:
+        radii = -radii
+    azimuths = (torch.arange(columns, dtype=f64) + 0.37) * (2 * math.pi / max(columns, 1))
+    if draw(st.integers(0, 3)) == 0:
+        azimuths = 1e6 * normal(generator, columns)
+    center = torch.tensor([(size[1] - 1) / 2, (size[0] - 1) / 2], dtype=f64)
+    count = draw(st.sampled_from([1, batch]))
+    center = center + draw(st.sampled_from([0.3, 3.0])) * normal(generator, count, 2)
+    affine = offsets = None
+    if draw(st.integers(0, 2)) == 0:
+        count = draw(st.sampled_from([1, batch]))
+        affine = torch.eye(2, dtype=f64) + 0.4 * normal(generator, count, 2, 2)
+        affine = affine.to(dtype)
+    if draw(st.integers(0, 2)) == 0:
+        count = draw(st.sampled_from([1, batch]))
+        far = draw(st.sampled_from([0.5, 30.0]))
+        offsets = (far * normal(generator, count, 2, rows, columns)).to(dtype)
+    return radii.to(dtype), azimuths.to(dtype), center.to(dtype), affine, offsets
+
+
+def places(radii, azimuths, center, affine, offsets, batch, jitter, seed) -> tuple[Tensor, ...]:
+    """x, y and radius of the points, (B, N_r, N_a) each, in float64."""
+    radii, azimuths, center = radii.double(), azimuths.double(), center.double()
+    r, a = radii[:, :, None], azimuths[None, None]
+    if jitter > 0 and radii.shape[1] and len(azimuths):
+        amount = torch.tensor(jitter, dtype=f64)
+        r, a = reference._jittered(radii, azimuths, batch, amount, torch.tensor(seed))
+    x, y = r * torch.cos(a), r * torch.sin(a)
+    if affine is not None:
+        (xx, xy), (yx, yy) = affine.double().permute(1, 2, 0)[..., None, None]
+        x, y = xx * x + xy * y, yx * x + yy * y
+    x, y = center[:, 0, None, None] + x, center[:, 1, None, None] + y
+    if offsets is not None:
+        x, y = x + offsets[:, 0].double(), y + offsets[:, 1].double()
+    shape = (batch, radii.shape[1], len(azimuths))
+    return x.expand(shape), y.expand(shape), r.expand(shape)
+
+
+def to_tokens(planes: Tensor, patch: tuple[int, int]) -> Tensor:
+    """(B, C, R·S_r, A·S_φ) → (B, R, A, S_r·S_φ·C), by torch alone."""
+    batch, channels, rows, columns = planes.shape
+    rings, sectors = rows // patch[0], columns // patch[1]
+    parts = planes.reshape(batch, channels, rings, patch[0], sectors, patch[1])
+    return parts.permute(0, 2, 4, 3, 5, 1).reshape(
+        batch, rings, sectors, patch[0] * patch[1] * channels
+    )
+
+
+@st.composite
+def sampling(draw, dtypes=(f32, f64), embed: bool = False) -> Case:
+    """A call of polar_sample, or of polar_embed."""
+    generator, dtype = draw(generators()), draw(st.sampled_from(dtypes))
+    batch, channels = draw(sizes(0, 1, 2, 3, 5)), draw(sizes(0, 1, 2, 3, 3, 4, 5, 8, 17))
+    size = draw(sizes(0, 1, 2, 7, 16, 33, 90)), draw(sizes(0, 1, 2, 7, 16, 33, 90))
+    rings, sectors, patch = draw(grids(generator))
+    rows, columns = rings * patch[0], sectors * patch[1]
+    image = draw(strided(normal(generator, batch, channels, *size, dtype=dtype)))
+    lens = draw(lenses(generator, batch, size, rows, columns, dtype))
+    radii, azimuths, center, affine, offsets = (
+        None if t is None else draw(strided(t)) for t in lens
+    )
+    jitter = draw(st.sampled_from([0.0, 0.0, 1.0, 0.3]))
+    seed = draw(st.integers(-(2**63), 2**63 - 1))
+    options = dict(patch=patch, jitter=jitter, seed=seed)
+    inputs = dict(image=image, radii=radii, center=center)
+    if affine is not None:
+        inputs["affine"] = affine
+    if offsets is not None:
+        inputs["offsets"] = offsets
+    if embed:
+        features = draw(sizes(0, 1, 2, 15, 16, 17, 48))
+        samples = patch[0] * patch[1] * channels
+        inputs["weight"] = draw(strided(normal(generator, features, samples, dtype=dtype)))
+        if draw(st.booleans()):
+            inputs["bias"] = draw(strided(normal(generator, features, dtype=dtype)))
+    else:
+        options["layout"] = draw(st.sampled_from(["tokens", "image"]))
+
+    def run(image, radii, center, weight=None, bias=None, **bends):
+        grid = (image, radii, azimuths.to(radii.dtype), center)
+        if embed:
+            return polar_embed(*grid, weight, bias, **bends, **options)
+        return polar_sample(*grid, **bends, **options)
+
+    def mask(image, radii, center, weight=None, bias=None, affine=None, offsets=None):
+        """Bilinear gradients jump at borders of pixels, and where jitter meets the radius 0."""
+        x, y, r = places(radii, azimuths, center, affine, offsets, len(image), jitter, seed)
+        smooth = ((x - x.round()).abs() > 1e-3) & ((y - y.round()).abs() > 1e-3)
+        if jitter > 0:
+            smooth &= r > 1e-3
+        planes = smooth[:, None].expand(-1, channels, -1, -1).to(f64)
+        if embed:  # a token has a gradient if all of its samples may have one
+            tokens = to_tokens(smooth[:, None].to(f64), patch)
+            return tokens.amin(-1, keepdim=True)
+        return planes if options["layout"] == "image" else to_tokens(planes, patch)
+
+    return Case(run, inputs, mask, options | dict(azimuths=azimuths))
+
+
+@st.composite
+def attention(draw, dtypes=(f32, f64)) -> Case:
+    """A call of window_attention."""
+    generator, dtype = draw(generators()), draw(st.sampled_from(dtypes))
+    batch, heads = draw(sizes(0, 1, 2, 3)), draw(sizes(0, 1, 2, 3))
+    head_dim = draw(sizes(1, 2, 5, 8, 16, 17, 32, 33))
+    window = draw(sizes(1, 2, 3, 4, 8)), draw(sizes(1, 2, 3, 4, 5, 16, 65))
+    rings, sectors = window[0] * draw(sizes(1, 2, 3)), window[1] * draw(sizes(1, 2, 3))
+    if rings * sectors > 600:
+        rings, sectors = window
+    rows = draw(st.sampled_from([1, batch]))
+    table = (rows, heads, 2 * window[0] - 1, 2 * window[1] - 1)
+    options = dict(
+        window=window,
+        shift=(draw(st.integers(0, rings - 1)), draw(st.integers(0, sectors - 1))),
+        periodic=(draw(st.booleans()), draw(st.booleans())),
+        scale=draw(st.sampled_from([None, 0.7, 0.0])),
+    )
+    qkv = normal(generator, batch, rings, sectors, 3, heads, head_dim, dtype=dtype)
+    bias = normal(generator, *table, dtype=f32 if dtype == torch.bfloat16 else dtype)
+    inputs = dict(qkv=draw(strided(qkv)), bias=draw(strided(bias)))
+    return Case(lambda qkv, bias: window_attention(qkv, bias, **options), inputs, None, options)
+
+
+WIDTHS = (1, 2, 3, 7, 15, 16, 17, 31, 33, 64, 96, 200, 384, 1500)
+
+
+@st.composite
+def norms(draw, dtypes=(f32,)) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """x, y, weight and bias of add_norm_."""
+    generator, dtype = draw(generators()), draw(st.sampled_from(dtypes))
+    shape = (*draw(st.lists(sizes(0, 1, 2, 3, 9), max_size=3)), draw(sizes(*WIDTHS)))
+    mean = draw(st.sampled_from([0.0, 300.0, -1e4]))
+    room = draw(sizes(0, 1, 5))  # an odd storage offset
+    x, y = (
+        (normal(generator, math.prod(shape) + room) + m).to(dtype)[room:].view(shape)
+        for m in (mean, 0.0)
+    )
+    return x, y, normal(generator, shape[-1], dtype=f32), normal(generator, shape[-1], dtype=f32)
+
+
+@st.composite
+def matrices(draw) -> Tensor:
+    """x of transpose_sum."""
+    generator = draw(generators())
+    counts = sizes(0, 1, 2, 3, 15, 16, 17, 33, 63, 64, 65, 130, 700)
+    room, mean = draw(sizes(0, 1, 5)), draw(st.sampled_from([0.0, 1.0, 1e4]))
+    rows, columns = draw(counts), draw(counts)
+    values = normal(generator, rows * columns + room) + mean
+    return values.to(f32)[room:].view(rows, columns)
+
+
+def layer_norm(x: Tensor, y: Tensor, weight: Tensor, bias: Tensor, eps: float) -> Tensor:
+    return F.layer_norm(x + y, weight.shape, weight, bias, eps)

@@ -1,0 +1,154 @@
+"""Operators called past the public functions, with arguments that nobody checked: each call returns
+or raises. It never reads or writes where it should not; `make test-asan` and `make fuzz` look."""
+
+import math
+import tempfile
+from pathlib import Path
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+
+ops = torch.ops.darswin
+# A crash leaves nothing but this: the call that is under way.
+LAST_CALL = Path(tempfile.gettempdir()) / "darswin_last_hostile_call.txt"
+ALLOWED = (RuntimeError, TypeError, ValueError, IndexError, MemoryError, NotImplementedError)
+
+HUGE = (2**31, 2**53, 2**62, 2**63 - 1)
+INTS = st.sampled_from([-(2**63), -(2**31), -1, 0, 1, 2, 3, 5, 64, *HUGE])
+FLOATS = st.sampled_from([0.0, -0.0, 0.5, -1.0, 2.0, 1e308, 1e-320, math.nan, math.inf, -math.inf])
+DTYPES = (
+    torch.float32, torch.float64, torch.bfloat16, torch.float16, torch.uint8, torch.int64,
+    torch.bool, torch.complex64,
+)  # fmt: skip
+
+
+def sampling(dtype=torch.float32, batch=2):
+    """image, radii, azimuths, center, affine, offsets."""
+    radii, azimuths = torch.rand(batch, 4, dtype=dtype) * 5, torch.linspace(0, 6, 6, dtype=dtype)
+    affine = torch.eye(2, dtype=dtype)[None]
+    offsets = torch.rand(1, 2, 4, 6, dtype=dtype)
+    image = torch.rand(batch, 3, 5, 7, dtype=dtype)
+    return [image, radii, azimuths, torch.full((1, 2), 3.0, dtype=dtype), affine, offsets]
+
+
+def jitter(seed=3):
+    return [[2, 3], torch.tensor(0.5, dtype=torch.float64), torch.tensor(seed), [], []]
+
+
+# A valid call of each operator.
+CALLS = {
+    "polar_sample": lambda: [*sampling(), *jitter(), True, False],
+    "polar_sample_backward": lambda: [
+        torch.rand(2, 2, 2, 18), *sampling(), *jitter(), True, False, True, True, True,
+    ],
+    "polar_embed": lambda: [*sampling(), torch.rand(5, 18), torch.rand(5), *jitter(), False],
+    "polar_embed_backward": lambda: [
+        torch.rand(2, 2, 2, 5), *sampling(), torch.rand(5, 18), *jitter(), False,
+        True, True, True, True,
+    ],
+    "window_attention": lambda: [
+        torch.rand(2, 4, 6, 3, 2, 5), torch.rand(1, 2, 3, 5), [2, 3], [1, 2], [0, 1], 0.5,
+    ],
+    "window_attention_backward": lambda: [
+        torch.rand(2, 4, 6, 10), torch.rand(2, 4, 6, 3, 2, 5), torch.rand(2, 2, 3, 5), [2, 3],
+        [1, 2], [0, 1], 0.5,
+    ],
+    "add_norm_": lambda: [
+        torch.rand(3, 4), torch.rand(3, 4), torch.rand(4), torch.rand(4), 1e-5,
+    ],
+    "transpose_sum": lambda: [torch.rand(5, 7)],
+}  # fmt: skip
+
+
+@st.composite
+def tensors(draw, like: Tensor) -> Tensor | None:
+    """What may come in place of a tensor."""
+    kind = draw(st.sampled_from(
+        ["dtype", "shape", "cut", "huge", "strides", "meta", "values", "grad", "none", "turned"]
+    ))  # fmt: skip
+    if kind == "dtype":
+        return like.to(draw(st.sampled_from(DTYPES)))
+    if kind == "shape":
+        shape = draw(st.lists(st.sampled_from([0, 1, 2, 3, 4, 6]), max_size=6))
+        return torch.rand(shape).to(like.dtype)
+    if kind == "cut" and like.dim():
+        axis = draw(st.integers(0, like.dim() - 1))
+        return like.narrow(axis, 0, draw(st.integers(0, like.shape[axis])))
+    if kind == "huge" and like.dim():
+        # One number that counts as very many.
+        axis, size = draw(st.integers(0, like.dim() - 1)), draw(st.sampled_from([2**53, 2**62]))
+        shape = [size if a == axis else min(n, 3) for a, n in enumerate(like.shape)]
+        if draw(st.booleans()):
+            shape[(axis + 1) % like.dim()] = 0
+        try:
+            return like.new_ones([1] * like.dim()).expand(shape)
+        except RuntimeError:  # more than torch can count
+            return like
+    if kind == "strides" and like.dim():
+        first = like.narrow(0, 0, min(like.shape[0], 1))
+        strides = [draw(st.sampled_from([0, 1, 2**40, 2**62])) if n == 1 else s
+                   for n, s in zip(first.shape, first.stride(), strict=True)]  # fmt: skip
+        return first.as_strided(first.shape, strides)
+    if kind == "meta":
+        return like.to("meta")
+    if kind == "values" and like.is_floating_point():
+        return like * draw(FLOATS)
+    if kind == "grad" and like.is_floating_point():
+        return like.clone().requires_grad_()
+    if kind == "none":
+        return None
+    return like.mT if like.dim() > 1 else like
+
+
+@st.composite
+def hostile(draw, name: str) -> list:
+    """A call with one to three of its arguments replaced."""
+    arguments = CALLS[name]()
+    if draw(st.integers(0, 3)) == 0 and name.startswith("polar"):
+        arguments = [a.double() if isinstance(a, Tensor) and a.dtype == torch.float32 else a
+                     for a in arguments]  # fmt: skip
+    for _ in range(draw(st.integers(1, 3))):
+        index = draw(st.integers(0, len(arguments) - 1))
+        value = arguments[index]
+        if isinstance(value, Tensor) and value.numel() < 10**6:
+            arguments[index] = draw(tensors(value))
+        elif isinstance(value, bool):
+            arguments[index] = not value
+        elif isinstance(value, list):
+            of = FLOATS if not value else INTS
+            size = 3 if draw(st.booleans()) else len(value)
+            mixed = st.sampled_from(value) | of if value else of
+            arguments[index] = draw(st.lists(mixed, min_size=min(size, 2), max_size=size))
+        elif isinstance(value, float):
+            arguments[index] = draw(FLOATS)
+    return arguments
+
+
+def describe(value) -> str:
+    if isinstance(value, Tensor):
+        return f"{value.dtype}{tuple(value.shape)}/{value.stride()} on {value.device}"
+    return repr(value)
+
+
+@pytest.mark.parametrize("name", CALLS)
+def test_valid_calls_are_valid(name):
+    with torch.no_grad():
+        getattr(ops, name)(*CALLS[name]())
+
+
+@pytest.mark.parametrize("name", CALLS)
+@settings(max_examples=3 * settings().max_examples)
+@given(data=st.data())
+def test_a_hostile_call_returns_or_raises(name, data):
+    arguments = data.draw(hostile(name))
+    LAST_CALL.write_text(f"{name}({', '.join(map(describe, arguments))})\n")
+    try:
+        result = getattr(ops, name)(*arguments)
+    except ALLOWED:
+        return
+    for tensor in result if isinstance(result, (tuple, list)) else [result]:
+        if tensor is not None and tensor.device.type == "cpu":
+            tensor.double().sum().item()  # all of it is there
