@@ -37,8 +37,8 @@ def optimize(
 
     Its products are oneDNN's, with weights laid out for them, and take bias and GELU along; a
     residual and the norm behind it are one operator. It is called as the model is and has its
-    methods, but it is neither trained, saved nor compiled: the model, which stays as it is, is
-    there for that.
+    methods, but it is neither trained, saved, copied nor compiled, and has no gradients: the model,
+    which stays as it is, is there for that.
 
     Args:
         model: one of `create_model`, on the CPU.
@@ -64,6 +64,7 @@ def optimize(
     if (lack := onednn.missing(dtype)) is not None:
         warnings.warn(f"optimize goes on with torch's own products: {lack}", stacklevel=2)
     optimized = copy.deepcopy(model).eval().requires_grad_(False)
+    optimized.__class__ = type(f"Optimized{type(model).__name__}", (_Optimized, type(model)), {})
     optimized.patch_embed = _InDtype(optimized.patch_embed, dtype)
     optimized.stages = nn.ModuleList(_Stage(stage, dtype) for stage in optimized.stages)
     optimized.norm.to(dtype)
@@ -71,7 +72,25 @@ def optimize(
     return optimized if lens is None else OneLens(optimized, lens)
 
 
-class OneLens(Encoder):
+class _Optimized:
+    """What an optimized model refuses, before anything of it has changed."""
+
+    def train(self, mode: bool = True):
+        if mode:
+            raise TypeError("an optimized model is not trained: train the model it was made of")
+        return super().train(mode)
+
+    def state_dict(self, *args, **kwargs):
+        raise TypeError("an optimized model is not saved: save the model it was made of")
+
+    def __reduce_ex__(self, protocol):
+        raise TypeError(
+            "an optimized model is neither copied nor pickled, since oneDNN's weights cannot be: "
+            "copy the model it was made of, and optimize that"
+        )
+
+
+class OneLens(_Optimized, Encoder):
     """An optimized model and the one lens of all its images, which it is called without.
 
     Args:
@@ -189,20 +208,6 @@ class _Stage(nn.Module):
     def forward(self, x: Tensor, *positions: Tensor) -> Tensor:
         """As `Stage`."""
         return self.run(x, self.tables(*positions))
-
-    def train(self, mode: bool = True) -> "_Stage":
-        if mode:
-            raise TypeError("an optimized model is not trained: train the model it was made of")
-        return super().train(mode)
-
-    def state_dict(self, *args, **kwargs):
-        raise TypeError("an optimized model is not saved: save the model it was made of")
-
-    def __reduce_ex__(self, protocol):
-        raise TypeError(
-            "an optimized model is neither copied nor pickled, since oneDNN's weights cannot be: "
-            "copy the model it was made of, and optimize that"
-        )
 
 
 def _joined(biases: list[RelativeBias]) -> RelativeBias:

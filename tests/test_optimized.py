@@ -1,4 +1,6 @@
+import copy
 import math
+import pickle
 
 import pytest
 import torch
@@ -189,3 +191,22 @@ def test_a_bent_lens_is_optimized_too():
     assert error(want, model(images, bent.replace(tangential=None))) > 1e-3
     assert error(optimize(model)(images, bent), want) < 1e-5
     assert error(optimize(model, lens=bent)(images), want) < 1e-5
+
+
+def test_what_an_optimized_model_does_not_do():
+    model = create_model("darswin_a_nano", num_classes=3, jitter=1.0).eval()
+    images, lens = torch.randn(1, 3, 32, 32), Spherical.from_fov(0.4, 2.6, 16.0)
+    for fast, arguments in ((optimize(model), (lens,)), (optimize(model, lens=lens), ())):
+        expected = fast(images, *arguments)
+        for action in (copy.copy, copy.deepcopy, pickle.dumps):
+            with pytest.raises(TypeError, match=r"neither copied nor pickled.*it was made of"):
+                action(fast)
+        with pytest.raises(TypeError, match="not saved: save the model it was made of"):
+            fast.state_dict()
+        with pytest.raises(TypeError, match="not trained: train the model it was made of"):
+            fast.train()
+        leaf = images.clone().requires_grad_()
+        with pytest.raises(RuntimeError, match="has no gradients, but its images or its lens"):
+            fast(leaf, *arguments)
+        with torch.no_grad():
+            assert torch.equal(fast.eval()(leaf, *arguments), expected)

@@ -1,4 +1,8 @@
-"""The operators: compiled on CPU, plain PyTorch elsewhere and under `use_reference`."""
+"""The operators: compiled on CPU, plain PyTorch elsewhere and under `use_reference`.
+
+They run on torch's number of threads. A process that is forked after such a call must not make
+another one on several: use `spawn`, or `torch.set_num_threads(1)` in the child.
+"""
 
 from darswin.ops._library import reference_in_use, use_reference
 from darswin.ops.polar_embed import polar_embed

@@ -50,6 +50,7 @@ def polar_embed(
 
     Raises:
         TypeError, ValueError: as `polar_sample`, and for a weight or bias that does not fit.
+        NotImplementedError: as `polar_sample`.
 
     Source: DarSwin, ICCV 2023, sec. 4.3.
     """

@@ -43,7 +43,8 @@ def polar_sample(
 
     Convention:
         Pixel centres are integers, x to the right in [0, W-1] and y down in [0, H-1]; azimuth 0
-        points right, π/2 down. Points at NaN or infinity sample nothing.
+        points right, π/2 down. Points at NaN or infinity sample nothing; pixels that are NaN or
+        infinite count with their weights, as in `F.grid_sample`.
 
     Args:
         image: (B, C, H, W), any strides: float32, float64, bfloat16, or uint8 camera frames, which
@@ -74,7 +75,7 @@ def polar_sample(
         float32. bfloat16 is computed in float32 and rounded once.
 
     Gradients go to image (unless uint8), radii, center, affine and offsets; results and gradients
-    do not depend on the number of threads.
+    do not depend on the number of threads. There are no others than those of backward().
 
     A large fresh output costs its memory's first touch, about as much time as sampling. Where the
     linear layer of a patch embedding comes next, `polar_embed` never writes the samples at all.
@@ -82,6 +83,7 @@ def polar_sample(
     Raises:
         TypeError: a tensor of another dtype, or an argument of another type.
         ValueError: a shape, device or range that does not fit.
+        NotImplementedError: forward-mode derivatives, those of torch.func, and second ones.
 
     Source: DarSwin, ICCV 2023, sec. 4.3.
     """

@@ -46,7 +46,8 @@ def window_attention(
     Raises:
         TypeError: a tensor of another dtype, or an argument of another type.
         ValueError: a shape, device or range that does not fit.
-        NotImplementedError: a dropout other than 0.
+        NotImplementedError: a dropout other than 0; forward-mode derivatives, those of torch.func,
+            and second ones.
 
     Source: DarSwin, ICCV 2023, sec. 4.4; Swin Transformer, ICCV 2021, sec. 3.2.
     """

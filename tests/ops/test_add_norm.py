@@ -4,6 +4,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 
+from darswin import _C
 from darswin.ops.add_norm import add_norm_
 
 EPS = 1e-5
@@ -92,3 +93,62 @@ def test_wrong_arguments(change):
     given = dict(zip(("x", "y", "weight", "bias"), make_inputs((6, 4)), strict=True)) | change
     with pytest.raises(RuntimeError, match="add_norm_"):
         add_norm_(**given, eps=EPS)
+
+
+@pytest.mark.parametrize("width", [384, 768, 1500])
+def test_a_large_mean_costs_no_digits_on_any_tier(width):
+    x, y, weight, bias = make_inputs((64, width), mean=300.0)
+    total = (x + y).double()
+    want = F.layer_norm(total, (width,), weight.double(), bias.double(), EPS)
+    own = F.layer_norm(x + y, (width,), weight, bias, EPS)
+    before = _C.tier()
+    try:
+        for tier in _C.tiers():
+            _C.set_tier(tier)
+            got = add_norm_(x.clone(), y.clone(), weight, bias, EPS)
+            assert (got - want).abs().max() <= (own - want).abs().max()
+    finally:
+        _C.set_tier(before)
+
+
+@pytest.mark.parametrize("index", range(4), ids=["x", "y", "weight", "bias"])
+@pytest.mark.parametrize("raw", [False, True])
+def test_what_requires_a_gradient_is_refused(index, raw):
+    run = torch.ops.darswin.add_norm_ if raw else add_norm_
+    inputs = list(make_inputs((4, 8)))
+    inputs[index].requires_grad_()
+    leaf = inputs[index]
+    inputs[index] = leaf * 1  # not a leaf, so that torch itself would let it change
+    kept = [t.detach().clone() for t in inputs]
+    with pytest.raises(RuntimeError, match="add_norm_ has no gradient"):
+        run(*inputs, EPS)
+    assert all(torch.equal(a, b) for a, b in zip(inputs, kept, strict=True))
+    with torch.no_grad():
+        run(*inputs, EPS)
+
+
+def test_autograd_notices_the_change():
+    x, y, weight, bias = make_inputs((4, 8))
+    other = torch.randn(4, 8, requires_grad=True)
+    product = other * x  # keeps x for its gradient
+    versions = x._version, y._version
+    add_norm_(x, y, weight, bias, EPS)
+    assert (x._version, y._version) == (versions[0] + 1, versions[1] + 1)
+    with pytest.raises(RuntimeError, match="modified by an inplace operation"):
+        product.sum().backward()
+    with torch.inference_mode():
+        add_norm_(*make_inputs((4, 8)), EPS)  # tensors without a version
+
+
+def test_memory_is_not_shared():
+    x, y, weight, bias = make_inputs((4, 8))
+    whole = torch.randn(7, 8)
+    for arguments in (
+        (x, x, weight, bias),
+        (whole[:4], whole[3:], weight, bias),
+        (x, y, x[0], bias),
+        (x, y, weight, y[3]),
+    ):
+        with pytest.raises(RuntimeError, match="share no memory"):
+            add_norm_(*arguments, EPS)
+    add_norm_(whole[:3], whole[3:6], whole[6], bias, EPS)  # neighbours

@@ -271,3 +271,24 @@ def test_the_compiled_operator_itself_reads_nothing_outside():
                 image, radii, azimuths, center, None, None, bad_weight, bad_bias, (4, 5), None,
                 None, (), (), False,
             )  # fmt: skip
+
+
+def test_gradients_of_very_many_tokens_are_as_accurate_as_torch():
+    # 131,072 tokens: sums of float32 one by one had 12 times torch's error.
+    radii, azimuths = torch.linspace(1, 6, 64)[None], torch.linspace(0, 6.2, 512)
+    image, center = torch.randn(4, 1, 12, 12), torch.full((1, 2), 5.5)
+    grad = torch.randn(4, 64, 512, 3) + 0.5
+
+    def gradients(dtype):
+        weight = torch.ones(3, 1, dtype=dtype, requires_grad=True)
+        bias = torch.zeros(3, dtype=dtype, requires_grad=True)
+        grid = (t.to(dtype) for t in (image, radii, azimuths, center))
+        out = polar_embed(*grid, weight, bias, patch=(1, 1))
+        return torch.autograd.grad(out, (weight, bias), grad.to(dtype))
+
+    ours = gradients(torch.float32)
+    with use_reference():
+        own, exact = gradients(torch.float32), gradients(torch.float64)
+    for got, base, want in zip(ours, own, exact, strict=True):
+        rounding = torch.finfo(torch.float32).eps * want.abs().max()
+        assert (got - want).abs().max() <= max(2 * (base - want).abs().max(), rounding)

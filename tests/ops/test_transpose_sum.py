@@ -55,3 +55,22 @@ def test_opcheck():
 def test_wrong_arguments(x):
     with pytest.raises(RuntimeError, match="transpose_sum"):
         transpose_sum(x)
+
+
+@pytest.mark.parametrize("rows", [131_072, 1_000_000])
+def test_sums_of_very_many_rows_are_as_accurate_as_torch(rows):
+    x = torch.randn(rows, 5) + 1
+    exact = x.double().sum(0)
+    rounding = torch.finfo(torch.float32).eps * exact.abs().max()
+    own = (x.sum(0) - exact).abs().max()
+    assert (transpose_sum(x)[1] - exact).abs().max() <= max(2 * own, rounding)
+
+
+def test_its_gradient_is_that_of_torch():
+    x = torch.randn(20, 7)
+    grads = torch.randn(7, 20), torch.randn(7)
+    results = []
+    for run in (transpose_sum, lambda x: (x.t(), x.sum(0))):
+        leaf = x.clone().requires_grad_()
+        results.append(torch.autograd.grad(run(leaf), leaf, grads)[0])
+    torch.testing.assert_close(*results)

@@ -1,0 +1,137 @@
+"""What the operators share: which of two runs, autocast, and the derivatives that there are not."""
+
+import numpy as np
+import pytest
+import torch
+from torch.autograd import forward_ad
+from torch.func import vmap
+
+from darswin.layers import PolarSample
+from darswin.ops import polar_embed, polar_sample, use_reference, window_attention
+
+image, radii = torch.randn(1, 3, 8, 8), torch.linspace(0.5, 3, 4)[None]
+azimuths, center = torch.linspace(0, 6, 8), torch.tensor([[3.5, 3.5]])
+qkv, bias = torch.randn(1, 2, 4, 3, 1, 4), torch.randn(1, 1, 1, 7)
+weight = torch.randn(5, 12)
+
+# A function of one tensor for each operator, and the tensor.
+CALLS = {
+    "polar_sample": (lambda x: polar_sample(x, radii, azimuths, center, patch=(2, 2)), image),
+    "polar_embed": (
+        lambda x: polar_embed(image, radii, azimuths, center, x, patch=(2, 2)), weight,
+    ),
+    "window_attention": (lambda x: window_attention(x, bias, window=(1, 4)), qkv),
+}  # fmt: skip
+operators = pytest.mark.parametrize("name", CALLS)
+
+
+def dual(run, x):
+    with forward_ad.dual_level():
+        return forward_ad.unpack_dual(run(forward_ad.make_dual(x, torch.ones_like(x)))).tangent
+
+
+DERIVATIVES = {
+    "forward mode": dual,
+    "jvp": lambda run, x: torch.func.jvp(run, (x,), (torch.ones_like(x),))[1],
+    "grad": lambda run, x: torch.func.grad(lambda x: run(x).sum())(x),
+    "vjp": lambda run, x: torch.func.vjp(run, x)[1](torch.ones_like(run(x)))[0],
+    "grad of vmap": lambda run, x: torch.func.grad(lambda x: vmap(run)(x).sum())(x[None]),
+}
+
+
+@operators
+@pytest.mark.parametrize("kind", DERIVATIVES)
+def test_derivatives_that_there_are_not_are_refused(name, kind):
+    run, x = CALLS[name]
+    with pytest.raises(NotImplementedError, match=rf"{name} has no .*use_reference"):
+        DERIVATIVES[kind](run, x)
+
+
+@pytest.mark.parametrize("kind", ["forward mode", "jvp", "grad", "vjp"])
+@operators
+def test_the_reference_has_them(name, kind):
+    run, x = CALLS[name]
+    with use_reference():
+        derivative = DERIVATIVES[kind](run, x)
+    assert derivative.isfinite().all() and derivative.count_nonzero() > 0
+
+
+@operators
+def test_transforms_of_other_tensors_are_none_of_their_business(name):
+    run, x = CALLS[name]
+    scale = torch.ones(())
+    grad = torch.func.grad(lambda scale: (scale * run(x)).sum())(scale)
+    torch.testing.assert_close(grad, run(x).sum())
+    assert vmap(run)(x[None]).shape == run(x)[None].shape
+    with forward_ad.dual_level():
+        assert torch.equal(run(x), run(x.clone()))
+
+
+@pytest.mark.unsanitized
+@pytest.mark.filterwarnings("ignore")  # torch.jit is deprecated, and warns of every shape
+@operators
+def test_jit_trace(name):
+    run, x = CALLS[name]
+    traced = torch.jit.trace(run, x)
+    other = torch.randn_like(x)
+    assert torch.equal(traced(other), run(other))
+
+
+@pytest.mark.unsanitized
+@operators
+def test_a_graph_asks_nothing_that_dynamo_of_torch_2_10_cannot_trace(name, monkeypatch):
+    monkeypatch.setattr(
+        torch.amp, "is_autocast_available", torch.compiler.disable(torch.amp.is_autocast_available)
+    )
+    torch._dynamo.reset()
+    run, x = CALLS[name]
+    compiled = torch.compile(run, fullgraph=True, backend="eager")
+    assert torch.equal(compiled(x), run(x))
+
+
+@pytest.mark.unsanitized
+def test_one_graph_for_any_jitter():
+    from torch._dynamo.testing import CompileCounter
+
+    torch._dynamo.reset()
+    counter = CompileCounter()
+
+    @torch.compile(fullgraph=True, backend=counter)
+    def run(jitter):
+        seed = torch.tensor(1)
+        return polar_sample(image, radii, azimuths, center, patch=(2, 2), jitter=jitter, seed=seed)
+
+    for jitter in (0.1, 0.2, 0.3, 0.4, 0.5):
+        expected = polar_sample(image, radii, azimuths, center, patch=(2, 2), jitter=jitter, seed=1)
+        assert torch.equal(run(jitter), expected)
+    assert counter.frame_count == 2  # the first one keeps its value, as Dynamo does with any float
+
+
+def test_numpy_numbers_are_taken():
+    one, two, four = np.int64(1), np.int32(2), np.uint8(4)
+    expected = polar_sample(image, radii, azimuths, center, patch=(2, 2), jitter=0.5, seed=4)
+    got = polar_sample(image, radii, azimuths, center, patch=(two, two), jitter=np.float32(0.5),
+                       seed=four)  # fmt: skip
+    assert torch.equal(got, expected)
+    expected = window_attention(qkv, bias, window=(1, 4), shift=(1, 2))
+    assert torch.equal(window_attention(qkv, bias, window=(one, four), shift=(one, two)), expected)
+    layer = PolarSample(four, np.int64(8), samples=(two, one), jitter=np.float64(0.5))
+    assert (layer.rings, layer.sectors, layer.samples) == (4, 8, (2, 1))
+    frames = torch.randint(256, (1, 8, 8, 3), dtype=torch.uint8)
+    means = [np.float32(0.5), 0.5]
+    first, second = (
+        polar_sample(frames, radii, azimuths, center, patch=(2, 2), mean=mean) for mean in means
+    )
+    assert torch.equal(first, second)
+
+
+@pytest.mark.parametrize("bad", [2.0, np.float64(2), True, torch.tensor(2), "2", None])
+def test_what_is_no_int_is_no_size(bad):
+    with pytest.raises(TypeError, match="patch must be a pair of ints"):
+        polar_sample(image, radii, azimuths, center, patch=(bad, 2))
+
+
+@pytest.mark.parametrize("bad", [2.0, np.float64(2), True, "2", None])
+def test_what_is_no_int_is_no_seed(bad):
+    with pytest.raises(TypeError, match="seed must be an int"):
+        polar_sample(image, radii, azimuths, center, patch=(2, 2), jitter=0.5, seed=bad)
