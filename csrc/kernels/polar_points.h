@@ -116,6 +116,9 @@ struct Bent {
 
 inline double magnitude(double x) { return x < 0 ? -x : x; }
 
+// x, or NaN where it is infinite: else a radius of minus infinity, moved and clamped, would be 0.
+inline double finite(double x) { return x - x == 0 ? x : __builtin_nan(""); }
+
 // How far from the center the points of a radius may stand, offsets left out; NaN if the radius or
 // the matrix is.
 struct Reach {
@@ -161,11 +164,11 @@ void locate_moved(const PolarSampleArgs<T>& a, const Lens& lens, int64_t b, int6
                   int64_t count, const RandomWords& random, const Visit& visit) {
   using Ints = Vector<int32_t, kDoubles>;
   const T* radii = a.radii + b * a.radii_stride;
-  const double radius = radii[i];
+  const double radius = finite(radii[i]);
   const Steps steps(i, a.num_radii);
   double step[2];
   for (int side = 0; side < 2; ++side) {
-    step[side] = static_cast<double>(radii[steps.above[side]]) - radii[steps.below[side]];
+    step[side] = finite(static_cast<double>(radii[steps.above[side]]) - radii[steps.below[side]]);
   }
   const Doubles inner = splat<Doubles>(step[0]), outer = splat<Doubles>(step[1]);
   const double jitter = a.jitter, cell = 2 * kPi * a.jitter / a.num_azimuths;

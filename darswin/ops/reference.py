@@ -49,6 +49,8 @@ def _jittered(
     u, v = (
         (half.to(radii.dtype) * 2.0**-16 - 0.5) * jitter for half in (word >> 16, word & 0xFFFF)
     )
+    # Infinite radii are as good as NaN: clamped, minus infinity would become 0.
+    radii = torch.where(radii.isfinite(), radii, math.nan)
     # The step to the outer neighbour and from the inner one; at both ends the only one there is.
     steps = radii.diff(dim=1) if rows > 1 else torch.zeros_like(radii)
     outer = torch.cat((steps, steps[:, -1:]), 1)[:, :rows, None]

@@ -339,6 +339,17 @@ def test_jitter_keeps_bad_radii_to_themselves(jitter):
 
 
 @pytest.mark.parametrize("reference", [False, True])
+@pytest.mark.parametrize("rows", [1, 3])
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
+def test_jitter_moves_no_radius_from_infinity_to_the_center(bad, rows, reference):
+    image, radii, center, azimuths = make_inputs(rows=rows, columns=40)
+    radii[:, 0] = bad
+    with use_reference(reference):
+        out = polar_sample(image, radii, azimuths, center, patch=(1, 1), jitter=1.0, layout="image")
+    assert (out[:, :, 0] == 0).all()
+
+
+@pytest.mark.parametrize("reference", [False, True])
 @pytest.mark.parametrize("bad", [math.nan, math.inf])
 def test_a_bad_pixel_spoils_only_the_points_that_touch_it(bad, reference):
     image = torch.ones(1, 1, 9, 9)
