@@ -48,6 +48,7 @@ class Scratch {
   explicit Scratch(size_t bytes) {
     static thread_local Memory kept;
     static thread_local size_t kept_bytes = 0;
+    if (bytes == 0) return;
     if (bytes > kKept) {
       own_ = allocate(bytes);
       ask_for_large_pages(own_.get(), bytes);
@@ -78,13 +79,14 @@ class Scratch {
   using Memory = std::unique_ptr<void, Free>;
 
   static Memory allocate(size_t bytes) {
+    if (bytes > PTRDIFF_MAX) throw std::bad_alloc();
     Memory memory(std::aligned_alloc(64, (bytes + kUnit - 1) / kUnit * kUnit));
     if (memory == nullptr) throw std::bad_alloc();
     return memory;
   }
 
   Memory own_;
-  void* memory_;
+  void* memory_ = nullptr;
 };
 
 // body(begin, end, scratch) on contiguous ranges that cover [0, count), each in a thread of its own

@@ -50,6 +50,9 @@ PolarCall<T>::PolarCall(const Tensor& image_, const Tensor& radii_, const Tensor
   STD_TORCH_CHECK(patch[0] > 0 && patch[1] > 0 && radii.size(1) % patch[0] == 0 &&
                       azimuths.size(0) % patch[1] == 0,
                   "polar_sample: patch must divide the radii and the azimuths");
+  // What is counted below: points, values of samples, sums of a lens.
+  product({batch, radii.size(1), azimuths.size(0), image.size(1)});
+  product({patch[0], patch[1], image.size(1)});
   const auto laid_out = [&](const Tensor& given, Sizes sizes) {
     sizes[0] = given.dim() > 0 && given.size(0) == 1 ? 1 : batch;
     STD_TORCH_CHECK(given.scalar_type() == type && given.is_cpu() && given.sizes().vec() == sizes,
@@ -89,9 +92,6 @@ PolarCall<T>::PolarCall(const Tensor& image_, const Tensor& radii_, const Tensor
   args.patch_radii = patch[0];
   args.patch_azimuths = patch[1];
   args.narrow = bfloat16;
-  // What is counted below: points, values of samples, sums of a lens.
-  product({batch, args.num_radii, args.num_azimuths, args.channels});
-  samples();
   if (jitter.has_value()) {
     STD_TORCH_CHECK(
         jitter->is_cpu() && jitter->numel() == 1 && jitter->scalar_type() == ScalarType::Double,
@@ -208,7 +208,7 @@ PolarGradients polar_backward(PolarCall<T>& call, const PolarWanted& wanted) {
   if (wanted.image) {
     grads.image = new_image_gradient(call);
     args.bands = count_bands(call.batch, args.height);
-    if (images > 0) {
+    if (images > 0 && grads.image.numel() > 0) {
       parallel_ranges(images * args.bands,
                       kernel.polar_sample_scratch(args, PolarPass::backward_image),
                       [&](int64_t begin, int64_t end, void* scratch) {
@@ -222,24 +222,32 @@ PolarGradients polar_backward(PolarCall<T>& call, const PolarWanted& wanted) {
     grads.offsets = torch::stable::new_zeros(*call.offsets, call.offsets->sizes());
     args.grad_offsets = grads.offsets.template mutable_data_ptr<T>();
   }
+  if (images == 0) {
+    if (wanted.lens) {
+      grads.radii = torch::stable::new_zeros(call.radii, call.radii.sizes());
+      grads.center = torch::stable::new_zeros(call.center, call.center.sizes());
+      if (call.affine.has_value()) {
+        grads.affine = torch::stable::new_zeros(*call.affine, call.affine->sizes());
+      }
+    }
+    return grads;
+  }
   // Images that share their offsets add to one gradient: for a ring of it one thread takes them in
   // turn.
   const int64_t sharing = offsets && args.offsets_stride == 0 ? call.batch : 1;
   std::vector<double> sums(call.batch * args.num_radii * kLensSums, 0.0);
   args.grad_lens = sums.data();
-  if (images > 0) {
-    const int64_t rings = call.rings();
-    parallel_ranges(images * rings / sharing,
-                    kernel.polar_sample_scratch(args, PolarPass::backward_lens),
-                    [&](int64_t begin, int64_t end, void* scratch) {
-                      for (int64_t item = begin; item < end; ++item) {
-                        for (int64_t b = 0; b < sharing; ++b) {
-                          kernel.polar_sample_backward_lens(args, item + b * rings,
-                                                            item + b * rings + 1, scratch);
-                        }
+  const int64_t rings = call.rings();
+  parallel_ranges(images * rings / sharing,
+                  kernel.polar_sample_scratch(args, PolarPass::backward_lens),
+                  [&](int64_t begin, int64_t end, void* scratch) {
+                    for (int64_t item = begin; item < end; ++item) {
+                      for (int64_t b = 0; b < sharing; ++b) {
+                        kernel.polar_sample_backward_lens(args, item + b * rings,
+                                                          item + b * rings + 1, scratch);
                       }
-                    });
-  }
+                    }
+                  });
   if (wanted.lens) fold_lens(call, sums, grads);
   return grads;
 }

@@ -136,19 +136,19 @@ PolarGradients sampling_gradients(PolarCall<T>& call, PolarEmbedArgs<T>& embed,
                                   const Tensor& weight, const PolarWanted& wanted) {
   const auto& kernel = kernels().table<T>();
   const int64_t depth = call.samples(), row = padded(depth);
-  std::vector<T> rows(embed.features * row, T(0));
+  const int64_t images = call.points() && call.args.channels > 0 ? call.batch : 0;
+  std::vector<T> rows(images > 0 ? embed.features * row : 0, T(0));
   const T* from = weight.template const_data_ptr<T>();
-  for (int64_t f = 0; f < embed.features; ++f) {
+  for (int64_t f = 0; images > 0 && f < embed.features; ++f) {
     std::copy(from + f * depth, from + (f + 1) * depth, rows.begin() + f * row);
   }
   embed.weight = rows.data();
-  const int64_t images = call.points() && call.args.channels > 0 ? call.batch : 0;
   const bool image_alone = !wanted.lens && !wanted.offsets;
   if (image_alone && count_bands(call.batch, call.args.height) == 1) {
     PolarGradients grads(call);
     grads.image = new_image_gradient(call);
     call.args.bands = 1;
-    if (images > 0) {
+    if (images > 0 && grads.image.numel() > 0) {
       parallel_ranges(images,
                       kernel.polar_embed_scratch(call.args, embed, PolarPass::backward_image),
                       [&](int64_t begin, int64_t end, void* scratch) {

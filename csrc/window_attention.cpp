@@ -45,7 +45,8 @@ struct Call {
       STD_TORCH_CHECK(window[axis] > 0 && size > 0 && size % window[axis] == 0 &&
                           shift[axis] >= 0 && shift[axis] < size,
                       "window_attention: window must divide the map, shift must lie inside it");
-      STD_TORCH_CHECK(bias.size(2 + axis) == 2 * window[axis] - 1,
+      const int64_t entries = bias.size(2 + axis);  // twice the window, less one
+      STD_TORCH_CHECK(entries % 2 == 1 && entries / 2 + 1 == window[axis],
                       "window_attention: bias does not fit the window");
     }
     const int64_t batch = qkv.size(0);

@@ -16,12 +16,12 @@ struct Arena {
 
   template <typename T>
   T* take(int64_t count) {
-    char* piece = memory + used;
+    char* piece = memory == nullptr ? nullptr : memory + used;
     const int64_t bytes = count * static_cast<int64_t>(sizeof(T));
     used += (bytes + 63) / 64 * 64;
 #if defined(__SANITIZE_ADDRESS__)
     used += 64;
-    if (memory != nullptr) ASAN_POISON_MEMORY_REGION(piece + bytes, memory + used - piece - bytes);
+    if (piece != nullptr) ASAN_POISON_MEMORY_REGION(piece + bytes, memory + used - piece - bytes);
 #endif
     return reinterpret_cast<T*>(piece);
   }

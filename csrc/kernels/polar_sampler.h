@@ -8,7 +8,8 @@ namespace {
 
 // Interpolation is by weights, or by differences, a + t * (b - a): those of huge values overflow,
 // and those of infinite ones come to NaN. Where a vector of four is not a whole register, weights
-// cost more: differences come first there, and weights only if a result is not finite.
+// cost more: differences come first there, and weights only if a result is not finite, for the
+// whole block of points, whose other samples may then differ in their last bit.
 template <typename T>
 constexpr bool kTryDifferences = kSame<T, float> && kRegister < 64;
 
@@ -271,7 +272,8 @@ class Sampler {
     }
     const int64_t before = all - count;
     sample(0, before);
-    // Then, with four values or more in a row, it has at least four points.
+    // These are enough: such a token has at least two rows and, of fewer than four channels but
+    // four values a row, two points in each.
     T* first = to + (rows - a.patch_radii) * row_stride;  // row 0 of the first token
     T kept[kBlock / 4][4];
     const int64_t overrun = channels < 4 && a.patch_radii > 1 ? tokens : 0;

@@ -2,7 +2,7 @@
 
 import contextlib
 import importlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 
 import torch  # before the module: both must share the libgomp that torch loads
 from torch import Tensor
@@ -91,10 +91,11 @@ def run(operator: torch._ops.OpOverloadPacket, reference: Callable, arguments: t
         return reference(*arguments)
 
 
-def refuse_other_derivatives(operator: torch._ops.OpOverloadPacket, arguments: tuple) -> None:
-    """NotImplementedError where forward-mode AD or torch.func differentiates an argument.
+def refuse_other_derivatives(operator: object, tensors: Iterable[object]) -> None:
+    """NotImplementedError where forward-mode AD or torch.func differentiates one of the tensors.
 
     The first would come to zeros without a word, the second to an error about autograd's insides.
+    A graph that is being compiled does not look.
     """
     if torch.compiler.is_compiling():
         return
@@ -102,12 +103,13 @@ def refuse_other_derivatives(operator: torch._ops.OpOverloadPacket, arguments: t
     functional = torch._C._functorch.peek_interpreter_stack() is not None
     if not forward and not functional:
         return
-    for value in arguments:
-        if not isinstance(value, Tensor):
+    for tensor in tensors:
+        if not isinstance(tensor, Tensor):
             continue
-        if functional and _tracked(value):
+        tracked, tensor = _unwrapped(tensor)
+        if tracked:
             mode = "torch.func's derivatives"
-        elif forward and forward_ad.unpack_dual(value).tangent is not None:
+        elif forward and forward_ad.unpack_dual(tensor).tangent is not None:
             mode = "forward-mode derivatives"
         else:
             continue
@@ -117,14 +119,14 @@ def refuse_other_derivatives(operator: torch._ops.OpOverloadPacket, arguments: t
         )
 
 
-def _tracked(tensor: Tensor) -> bool:
-    """Whether a transform of torch.func differentiates with respect to the tensor."""
-    functorch = torch._C._functorch
+def _unwrapped(tensor: Tensor) -> tuple[bool, Tensor]:
+    """Whether a transform of torch.func differentiates with respect to the tensor, and what it
+    wraps."""
+    functorch, tracked = torch._C._functorch, False
     while functorch.is_functorch_wrapped_tensor(tensor):
-        if functorch.is_gradtrackingtensor(tensor):
-            return True
+        tracked |= functorch.is_gradtrackingtensor(tensor)
         tensor = functorch.get_unwrapped(tensor)
-    return False
+    return tracked, tensor
 
 
 def no_second_derivative(name: str) -> None:

@@ -4,6 +4,8 @@ import torch
 from torch import Tensor
 from torch.autograd.graph import increment_version
 
+from darswin.ops import _library
+
 
 def add_norm_(x: Tensor, y: Tensor, weight: Tensor, bias: Tensor, eps: float) -> Tensor:
     """Adds y to x, then makes y the layer norm of the sum: one pass over memory, for inference.
@@ -29,10 +31,11 @@ def _fake(x, y, weight, bias, eps):
     return None
 
 
-_library = torch.library.Library("darswin", "IMPL")
+_implementations = torch.library.Library("darswin", "IMPL")
 
 
 def _no_gradient(keyset, *arguments):
+    _library.refuse_other_derivatives("add_norm_", arguments)
     wants = [isinstance(t, Tensor) and t.requires_grad for t in arguments[:4]]
     if torch.is_grad_enabled() and any(wants):
         raise RuntimeError(
@@ -53,5 +56,5 @@ def _changed(keyset, x, y, *others):
     )
 
 
-_library.impl("add_norm_", _no_gradient, "Autograd", with_keyset=True)
-_library.impl("add_norm_", _changed, "ADInplaceOrView", with_keyset=True)
+_implementations.impl("add_norm_", _no_gradient, "Autograd", with_keyset=True)
+_implementations.impl("add_norm_", _changed, "ADInplaceOrView", with_keyset=True)

@@ -98,6 +98,7 @@ def _setup_context(ctx, inputs, output):
 
 
 def _backward(ctx, grad_out):
+    _library.refuse_other_derivatives("polar_embed's backward", (grad_out,))
     *sampling, weight, jitter, seed = ctx.saved_tensors
     patch, rest = ctx.settings
     wants_weight, wants_bias = ctx.needs_input_grad[6:8]

@@ -75,7 +75,8 @@ def polar_sample(
         float32. bfloat16 is computed in float32 and rounded once.
 
     Gradients go to image (unless uint8), radii, center, affine and offsets; results and gradients
-    do not depend on the number of threads. There are no others than those of backward().
+    do not depend on the number of threads. There are no others than those of backward(); in eager
+    mode, asking for others is an error.
 
     A large fresh output costs its memory's first touch, about as much time as sampling. Where the
     linear layer of a patch embedding comes next, `polar_embed` never writes the samples at all.
@@ -143,7 +144,7 @@ def _jitter_tensors(jitter: float, seed: int | Tensor) -> tuple[Tensor | None, T
     jitter = check_jitter(jitter)
     if jitter == 0:
         return None, None
-    return torch.tensor(jitter, dtype=torch.float64), _seed_tensor(seed)
+    return torch.tensor(jitter, dtype=torch.float64, device="cpu"), _seed_tensor(seed)
 
 
 def _seed_tensor(seed: int | Tensor) -> Tensor:
@@ -159,7 +160,7 @@ def _seed_tensor(seed: int | Tensor) -> Tensor:
         raise TypeError(f"seed must be an int or a 0-dim int64 tensor, got {type(seed).__name__}")
     if not -(2**63) <= key < 2**63:
         raise ValueError(f"seed must fit 64 bits, got {seed}")
-    return torch.tensor(key, dtype=torch.int64)
+    return torch.tensor(key, dtype=torch.int64, device="cpu")
 
 
 @torch.library.register_fake("darswin::polar_sample")
@@ -208,6 +209,7 @@ def _setup_context(ctx, inputs, output):
 
 
 def _backward(ctx, grad_out):
+    _library.refuse_other_derivatives("polar_sample's backward", (grad_out,))
     *sampling, jitter, seed = ctx.saved_tensors
     patch, rest = ctx.settings
     image, radii, center, affine, offsets = torch.ops.darswin.polar_sample_backward(

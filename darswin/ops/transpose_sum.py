@@ -3,6 +3,8 @@
 import torch
 from torch import Tensor
 
+from darswin.ops import _library
+
 
 def transpose_sum(x: Tensor) -> tuple[Tensor, Tensor]:
     """The transpose of a matrix, contiguous, and the sums of its columns: one pass over memory.
@@ -18,7 +20,9 @@ def transpose_sum(x: Tensor) -> tuple[Tensor, Tensor]:
 
     Raises:
         RuntimeError: another kind of tensor.
+        NotImplementedError: forward-mode derivatives and those of torch.func.
     """
+    _library.refuse_other_derivatives("transpose_sum", (x,))
     return torch.ops.darswin.transpose_sum.default(x)
 
 

@@ -109,6 +109,7 @@ def _setup_context(ctx, inputs, output):
 
 
 def _backward(ctx, grad_out):
+    _library.refuse_other_derivatives("window_attention's backward", (grad_out,))
     grad_qkv, grad_bias = torch.ops.darswin.window_attention_backward(
         grad_out, *ctx.saved_tensors, *ctx.settings
     )

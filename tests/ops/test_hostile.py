@@ -1,6 +1,7 @@
 """Operators called past the public functions, with arguments that nobody checked: each call returns
 or raises. It never reads or writes where it should not; `make test-asan` and `make fuzz` look."""
 
+import contextlib
 import math
 import tempfile
 from pathlib import Path
@@ -65,6 +66,8 @@ CALLS = {
 @st.composite
 def tensors(draw, like: Tensor) -> Tensor | None:
     """What may come in place of a tensor."""
+    if like.numel() > 10**6:
+        return like
     kind = draw(st.sampled_from(
         ["dtype", "shape", "cut", "huge", "strides", "meta", "values", "grad", "none", "turned"]
     ))  # fmt: skip
@@ -82,10 +85,7 @@ def tensors(draw, like: Tensor) -> Tensor | None:
         shape = [size if a == axis else min(n, 3) for a, n in enumerate(like.shape)]
         if draw(st.booleans()):
             shape[(axis + 1) % like.dim()] = 0
-        try:
-            return like.new_ones([1] * like.dim()).expand(shape)
-        except RuntimeError:  # more than torch can count
-            return like
+        return like.new_ones([1] * like.dim()).expand(shape)
     if kind == "strides" and like.dim():
         first = like.narrow(0, 0, min(like.shape[0], 1))
         strides = [draw(st.sampled_from([0, 1, 2**40, 2**62])) if n == 1 else s
@@ -112,8 +112,9 @@ def hostile(draw, name: str) -> list:
     for _ in range(draw(st.integers(1, 3))):
         index = draw(st.integers(0, len(arguments) - 1))
         value = arguments[index]
-        if isinstance(value, Tensor) and value.numel() < 10**6:
-            arguments[index] = draw(tensors(value))
+        if isinstance(value, Tensor):
+            with contextlib.suppress(RuntimeError):  # a tensor that torch itself does not make
+                arguments[index] = draw(tensors(value))
         elif isinstance(value, bool):
             arguments[index] = not value
         elif isinstance(value, list):

@@ -8,6 +8,8 @@ from torch.func import vmap
 
 from darswin.layers import PolarSample
 from darswin.ops import polar_embed, polar_sample, use_reference, window_attention
+from darswin.ops.add_norm import add_norm_
+from darswin.ops.transpose_sum import transpose_sum
 
 image, radii = torch.randn(1, 3, 8, 8), torch.linspace(0.5, 3, 4)[None]
 azimuths, center = torch.linspace(0, 6, 8), torch.tensor([[3.5, 3.5]])
@@ -45,6 +47,23 @@ def test_derivatives_that_there_are_not_are_refused(name, kind):
     run, x = CALLS[name]
     with pytest.raises(NotImplementedError, match=rf"{name} has no .*use_reference"):
         DERIVATIVES[kind](run, x)
+
+
+@operators
+def test_backward_has_none_of_them_either(name):
+    run, x = CALLS[name]
+    out = run(x.clone().requires_grad_())
+    with forward_ad.dual_level(), pytest.raises(NotImplementedError, match=f"{name}'s backward"):
+        out.backward(forward_ad.make_dual(torch.ones_like(out), torch.ones_like(out)))
+
+
+@pytest.mark.parametrize("kind", ["forward mode", "jvp", "grad"])
+def test_operators_without_a_reference_refuse_them_too(kind):
+    ones, zeros = torch.ones(4), torch.zeros(4)
+    with pytest.raises(NotImplementedError, match="transpose_sum has no"):
+        DERIVATIVES[kind](lambda x: transpose_sum(x)[1], torch.rand(3, 4))
+    with pytest.raises(NotImplementedError, match="add_norm_ has no"):
+        DERIVATIVES[kind](lambda x: add_norm_(x * 1, x * 2, ones, zeros, 1e-5), torch.rand(3, 4))
 
 
 @pytest.mark.parametrize("kind", ["forward mode", "jvp", "grad", "vjp"])

@@ -220,6 +220,26 @@ def test_sizes_that_no_number_holds_are_refused(shape, patch):
         SAMPLE(image, *lens, patch, *settings)
 
 
+def test_gradients_of_nothing_take_no_time_and_no_memory():
+    # Sizes that count for nothing, since there is no point: a lens of many images, a weight of
+    # many features.
+    many = torch.ones(1, 1, 1, 1).expand(2**40, 1, 4, 4)
+    grads = torch.ops.darswin.polar_sample_backward(
+        torch.zeros(1, 2, 0, 2).expand(2**40, 2, 0, 2), many,
+        torch.ones(1, 4), torch.zeros(0), torch.ones(1, 2), None, None, (2, 1), *settings,
+        False, True, False,
+    )  # fmt: skip
+    assert torch.equal(grads[1], torch.zeros(1, 4))
+    assert torch.equal(grads[2], torch.zeros(1, 2))
+    features = 2**40
+    grads = torch.ops.darswin.polar_embed_backward(
+        torch.empty(1, 1, 0, 1).expand(1, 1, 0, features), torch.ones(1, 0, 4, 4),
+        torch.ones(1, 2), torch.zeros(0), torch.ones(1, 2), None, None,
+        torch.empty(features, 0), (2, 3), None, None, [], [], False, True, False, False, False,
+    )  # fmt: skip
+    assert grads[0].shape == (1, 0, 4, 4)
+
+
 def test_any_stride_of_a_single_row_is_as_good():
     image = torch.rand(1, 1, 1, 9)
     odd = image.as_strided(image.shape, (2**62, 2**62, 2**62, 1))
