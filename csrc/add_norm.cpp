@@ -47,14 +47,16 @@ void add_norm_(Tensor x, Tensor y, const Tensor& weight, const Tensor& bias, dou
                         t->size(0) == x.size(x.dim() - 1) && t->is_contiguous(),
                     "add_norm_: weight and bias must be float32 (D,), D the last size of x");
   }
-  const auto shared = [](const Tensor& a, const Tensor& b) {
-    const auto* first = static_cast<const char*>(a.const_data_ptr());
-    const auto* second = static_cast<const char*>(b.const_data_ptr());
-    return first < second + b.numel() * b.element_size() &&
-           second < first + a.numel() * a.element_size();
+  struct Bytes {
+    const char *begin, *end;
+    Bytes(const Tensor& t, int64_t count)
+        : begin(static_cast<const char*>(t.const_data_ptr())), end(begin + count) {}
+    bool apart(const Bytes& other) const { return end <= other.begin || other.end <= begin; }
   };
-  STD_TORCH_CHECK(!shared(x, y) && !shared(x, weight) && !shared(x, bias) && !shared(y, weight) &&
-                      !shared(y, bias),
+  const int64_t rows = x.numel() * (half ? 2 : 4), row = x.size(x.dim() - 1) * 4;
+  const Bytes in_x(x, rows), in_y(y, rows), in_weight(weight, row), in_bias(bias, row);
+  STD_TORCH_CHECK(in_x.apart(in_y) && in_x.apart(in_weight) && in_x.apart(in_bias) &&
+                      in_y.apart(in_weight) && in_y.apart(in_bias),
                   "add_norm_: x and y change, so they must share no memory with each other nor "
                   "with weight or bias");
   half ? run<bfloat16>(x, y, weight, bias, eps) : run<float>(x, y, weight, bias, eps);

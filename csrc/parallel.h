@@ -46,9 +46,9 @@ inline void ask_for_large_pages(const torch::stable::Tensor& tensor) {
 class Scratch {
  public:
   explicit Scratch(size_t bytes) {
+    if (bytes == 0) return;
     static thread_local Memory kept;
     static thread_local size_t kept_bytes = 0;
-    if (bytes == 0) return;
     if (bytes > kKept) {
       own_ = allocate(bytes);
       ask_for_large_pages(own_.get(), bytes);
@@ -70,7 +70,7 @@ class Scratch {
 #if defined(__SANITIZE_ADDRESS__)  // which then sees every step beyond the end
   static constexpr size_t kKept = 0, kUnit = 64;
 #else
-  static constexpr size_t kKept = size_t{8} << 20, kUnit = 4096;
+  static constexpr size_t kKept = size_t{32} << 20, kUnit = 4096;
 #endif
 
   struct Free {

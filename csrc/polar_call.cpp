@@ -135,11 +135,19 @@ PolarCall<T>::PolarCall(const Tensor& image_, const Tensor& radii_, const Tensor
                 pixels <= kPackedPixelsPerPoint * points;
 }
 
-int64_t count_bands(int64_t batch, int64_t height) {
-  const int64_t threads = torch::stable::get_num_threads();
-  if (batch == 0 || batch >= 4 * threads) return 1;
-  return std::clamp<int64_t>(threads / std::gcd(batch, threads), 1, std::max<int64_t>(height, 1));
+template <typename T>
+int64_t count_bands(const PolarCall<T>& call) {
+  const int64_t threads = torch::stable::get_num_threads(), height = call.args.height;
+  int64_t bands = 1;
+  if (call.batch > 0 && call.batch < 4 * threads) bands = threads / std::gcd(call.batch, threads);
+  if (call.args.pixel == Pixel::bf16) {
+    const double bytes = call.packed_values() * sizeof(T);
+    bands = std::max<int64_t>(bands, static_cast<int64_t>(bytes / kSumsBytes) + 1);
+  }
+  return std::clamp<int64_t>(bands, 1, std::max<int64_t>(height, 1));
 }
+template int64_t count_bands(const PolarCall<float>&);
+template int64_t count_bands(const PolarCall<double>&);
 
 template <typename T>
 Tensor new_image_gradient(PolarCall<T>& call) {
@@ -207,7 +215,7 @@ PolarGradients polar_backward(PolarCall<T>& call, const PolarWanted& wanted) {
   PolarGradients grads(call);
   if (wanted.image) {
     grads.image = new_image_gradient(call);
-    args.bands = count_bands(call.batch, args.height);
+    args.bands = count_bands(call);
     if (images > 0 && grads.image.numel() > 0) {
       parallel_ranges(images * args.bands,
                       kernel.polar_sample_scratch(args, PolarPass::backward_image),

@@ -21,6 +21,8 @@ using Sizes = std::vector<int64_t>;
 // circle; it pays where a pixel is looked at often enough.
 constexpr int64_t kPackedBytes = 3 << 19;
 constexpr int64_t kPackedPixelsPerPoint = 4;
+// Sums of bfloat16 pixels are float32, of four channels: no thread keeps more of them than this.
+constexpr int64_t kSumsBytes = 24 << 20;
 
 inline Pixel pixel_type(const torch::stable::Tensor& image) {
   using torch::headeronly::ScalarType;
@@ -76,8 +78,9 @@ struct PolarCall {
 };
 
 // Into how many bands of rows backward cuts an image, so that a small batch of large images uses
-// all threads.
-int64_t count_bands(int64_t batch, int64_t height);
+// all threads, and a thread never needs much memory for the sums of bfloat16 pixels.
+template <typename T>
+int64_t count_bands(const PolarCall<T>& call);
 
 // The image's gradient, for backward kernels to fill.
 template <typename T>

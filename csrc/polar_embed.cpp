@@ -144,7 +144,7 @@ PolarGradients sampling_gradients(PolarCall<T>& call, PolarEmbedArgs<T>& embed,
   }
   embed.weight = rows.data();
   const bool image_alone = !wanted.lens && !wanted.offsets;
-  if (image_alone && count_bands(call.batch, call.args.height) == 1) {
+  if (image_alone && count_bands(call) == 1) {
     PolarGradients grads(call);
     grads.image = new_image_gradient(call);
     call.args.bands = 1;

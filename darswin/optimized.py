@@ -22,9 +22,10 @@ from darswin.models.darswin import DarSwin
 from darswin.models.encoder import Encoder
 from darswin.models.stages import Stage
 from darswin.onednn import PackedLinear
-from darswin.ops.add_norm import add_norm_
 
 DTYPES = (torch.float32, torch.bfloat16)
+_ADD_NORM = torch.ops.darswin.add_norm_.default
+_CPU = torch._C.DispatchKeySet(torch._C.DispatchKey.CPU)
 # A stage runs on so many images at once that what lies between two products stays below this: it
 # is then in the caches, and in memory that the allocator has kept rather than in fresh pages.
 CACHED_BYTES = 16 * 2**20
@@ -241,7 +242,9 @@ class _Norm:
 
     def after(self, x: Tensor, y: Tensor) -> Tensor:
         """Adds y to the residual x, in place, and normalizes the sum, in place of y."""
-        return add_norm_(x, y, self.weight, self.bias, self.eps)
+        # Not by way of autograd, which would look for gradients and count versions: there are none.
+        _ADD_NORM.redispatch(_CPU, x, y, self.weight, self.bias, self.eps)
+        return y
 
 
 class _Windows:

@@ -17,8 +17,9 @@ template <typename T>
 class Scatter {
  public:
   static int64_t bytes(const PolarSampleArgs<T>& a) {
+    const int64_t kept_rows = (a.height + a.bands - 1) / a.bands + 3;  // at most
     return round_up(sizeof(PlacedPoints<T>), 64) + a.patch_radii * row_bytes(a) +
-           sums_layout(a).size * static_cast<int64_t>(sizeof(T));
+           kept_rows * sums_layout(a).row * static_cast<int64_t>(sizeof(T));
   }
 
   // Band `band` of image b.
@@ -32,7 +33,7 @@ class Scatter {
         points(*static_cast<PlacedPoints<T>*>(scratch)),
         grads(reinterpret_cast<T*>(static_cast<char*>(scratch) +
                                    round_up(sizeof(PlacedPoints<T>), 64))),
-        sums(grads + args.patch_radii * row_bytes(args) / sizeof(T)) {
+        sums(grads + args.patch_radii * row_bytes(args) / sizeof(T) - first_kept() * layout.row) {
     if (keep == kInPlace) {
       T* rows =
           static_cast<T*>(a.grad_image) + (image * a.channels * a.height + first_row) * a.width;
@@ -287,7 +288,7 @@ class Scatter {
   const int64_t image, first_row, end_row;
   PlacedPoints<T>& points;
   T* grads;  // one row of gradients
-  T* sums;   // cells or packed image
+  T* sums;   // cells or packed image, of which the band's rows are there
 };
 
 }  // namespace
