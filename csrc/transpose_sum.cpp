@@ -36,12 +36,19 @@ std::tuple<Tensor, Tensor> transpose_sum(const Tensor& x) {
   parallel_ranges(groups, 0, [&](int64_t begin, int64_t end, void*) {
     kernels().transpose_sum(args, begin, end);
   });
-  // Group after group, whichever thread made it; in double, since there may be many thousands.
-  std::vector<double> totals(columns, 0.0);
-  for (int64_t group = 0; group < groups; ++group) {
-    for (int64_t c = 0; c < columns; ++c) totals[c] += sums[group * columns + c];
+  // Group after group, whichever thread made it; in double, since there may be many thousands. Some
+  // columns at a time, whose totals stay in the nearest cache.
+  constexpr int64_t kColumns = 128;
+  auto* to = static_cast<float*>(sum.mutable_data_ptr());
+  for (int64_t first = 0; first < columns; first += kColumns) {
+    const int64_t count = std::min(kColumns, columns - first);
+    double totals[kColumns] = {};
+    for (int64_t group = 0; group < groups; ++group) {
+      const float* from = sums + group * columns + first;
+      for (int64_t c = 0; c < count; ++c) totals[c] += from[c];
+    }
+    std::copy_n(totals, count, to + first);
   }
-  std::copy(totals.begin(), totals.end(), static_cast<float*>(sum.mutable_data_ptr()));
   return {transposed, sum};
 }
 

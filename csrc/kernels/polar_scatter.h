@@ -187,10 +187,8 @@ class Scatter {
   template <bool kBanded>
   void add_pixels(int64_t k, const T* block) const {
     using V = Vector<T, 4>;
-    const T down = points.near.lower[k], right = points.near.right[k];
-    const T up = 1 - down, left = 1 - right;
-    const T up_left = up * left, up_right = up * right, down_left = down * left;
-    const T down_right = down * right;
+    const V down = splat<V>(points.near.lower[k]), right = splat<V>(points.near.right[k]);
+    const V up = 1 - down, left = 1 - right;
     const int64_t offset = points.near.offset[k], pixel = layout.pixel;
     const bool upper = !kBanded || in_band(offset);
     const bool lower = !kBanded || in_band(offset + layout.row);
@@ -198,14 +196,14 @@ class Scatter {
     T* bottom = top + layout.row;
     const T* grad = block + k * a.channels;
     for (int64_t c = 0; c < pixel; c += 4) {
-      const V g = load<V>(grad + c);
+      const V g = load<V>(grad + c), above = unfused(g * up), below = unfused(g * down);
       if (upper) {
-        store(top + c, load<V>(top + c) + unfused(g * up_left));
-        store(top + pixel + c, load<V>(top + pixel + c) + unfused(g * up_right));
+        store(top + c, load<V>(top + c) + unfused(above * left));
+        store(top + pixel + c, load<V>(top + pixel + c) + unfused(above * right));
       }
       if (lower) {
-        store(bottom + c, load<V>(bottom + c) + unfused(g * down_left));
-        store(bottom + pixel + c, load<V>(bottom + pixel + c) + unfused(g * down_right));
+        store(bottom + c, load<V>(bottom + c) + unfused(below * left));
+        store(bottom + pixel + c, load<V>(bottom + pixel + c) + unfused(below * right));
       }
     }
   }

@@ -111,28 +111,22 @@ inline V unfused(V value) {
   return value;
 }
 
+template <typename A, typename B>
+constexpr bool kSame = false;
+template <typename A>
+constexpr bool kSame<A, A> = true;
+
 // (1 - t) * a + t * b, given both weights. Weights rather than a + t * (b - a), since the
 // difference of huge values overflows, and infinity less anything but itself would become NaN later
 // on. Which of the two products is fused into the sum is fixed, so that every copy of the code
-// gives the same.
+// gives the same; for single values in a form that loops over them can be made vectors of.
 template <typename V, typename Weight>
 inline V between(V a, V b, Weight one_less_t, Weight t) {
+#if defined(__FMA__)
+  if constexpr (kSame<V, float>) return __builtin_fmaf(t, b, one_less_t * a);
+  if constexpr (kSame<V, double>) return __builtin_fma(t, b, one_less_t * a);
+#endif
   return unfused(one_less_t * a) + t * b;
-}
-// Of single values, in a form that loops over them can be made vectors of.
-inline float between(float a, float b, float one_less_t, float t) {
-#if defined(__FMA__)
-  return __builtin_fmaf(t, b, one_less_t * a);
-#else
-  return one_less_t * a + t * b;
-#endif
-}
-inline double between(double a, double b, double one_less_t, double t) {
-#if defined(__FMA__)
-  return __builtin_fma(t, b, one_less_t * a);
-#else
-  return one_less_t * a + t * b;
-#endif
 }
 
 // a where the mask's lane is all ones, else b.
@@ -209,11 +203,6 @@ inline void store_front(float* to, Vector<float, 16> v, int64_t lanes) {
   _mm512_mask_storeu_ps(to, static_cast<__mmask16>((1 << lanes) - 1), (__m512)v);
 }
 #endif
-
-template <typename A, typename B>
-constexpr bool kSame = false;
-template <typename A>
-constexpr bool kSame<A, A> = true;
 
 // The whole part of numbers below 2^63.
 inline Doubles whole_part(Doubles x) {
