@@ -41,8 +41,8 @@ inline void ask_for_large_pages(const torch::stable::Tensor& tensor) {
 
 // Working memory of the calling thread for as long as this lives: at least `bytes`, aligned to
 // cache lines, contents undefined. Up to kKept bytes stay with the thread from use to use, since
-// fresh pages cost more than what the kernels do with them; so a thread has one Scratch at a time.
-// Throws std::bad_alloc.
+// fresh pages cost more than what the kernels do with them; so a thread has one Scratch at a time,
+// but for those of 0 bytes, which have no memory. Throws std::bad_alloc.
 class Scratch {
  public:
   explicit Scratch(size_t bytes) {

@@ -6,7 +6,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import torch
-import torch.nn.functional as F
 from hypothesis import strategies as st
 from torch import Tensor
 
@@ -245,7 +244,3 @@ def matrices(draw) -> Tensor:
     rows, columns = draw(counts), draw(counts)
     values = normal(generator, rows * columns + room) + mean
     return values.to(f32)[room:].view(rows, columns)
-
-
-def layer_norm(x: Tensor, y: Tensor, weight: Tensor, bias: Tensor, eps: float) -> Tensor:
-    return F.layer_norm(x + y, weight.shape, weight, bias, eps)

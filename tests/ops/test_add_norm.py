@@ -1,4 +1,6 @@
 import math
+import subprocess
+import sys
 
 import pytest
 import torch
@@ -152,3 +154,12 @@ def test_memory_is_not_shared():
         with pytest.raises(RuntimeError, match="share no memory"):
             add_norm_(*arguments, EPS)
     add_norm_(whole[:3], whole[3:6], whole[6], bias, EPS)  # neighbours
+
+
+def test_the_raw_operator_is_guarded_as_soon_as_the_package_is_imported():
+    code = (
+        "import torch, darswin; x = torch.ones(2, 3, requires_grad=True) * 1; y = torch.ones(2, 3);"
+        "torch.ops.darswin.add_norm_(x, y, torch.ones(3), torch.ones(3), 1e-5)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode != 0 and "add_norm_ has no gradient" in done.stderr
