@@ -10,16 +10,12 @@ namespace darswin {
 using torch::headeronly::ScalarType;
 using torch::stable::Tensor;
 
-int64_t product(std::initializer_list<int64_t> sizes) {
+void check_product(std::initializer_list<int64_t> sizes) {
   int64_t result = 64;
-  bool zero = false;
   for (const int64_t size : sizes) {
-    // Zeros last: what is multiplied with them must fit as well.
-    zero |= size == 0;
     STD_TORCH_CHECK(size == 0 || !__builtin_mul_overflow(result, size, &result),
                     "polar_sample: the sizes are too large");
   }
-  return zero ? 0 : result / 64;
 }
 
 template <typename T>
@@ -51,8 +47,8 @@ PolarCall<T>::PolarCall(const Tensor& image_, const Tensor& radii_, const Tensor
                       azimuths.size(0) % patch[1] == 0,
                   "polar_sample: patch must divide the radii and the azimuths");
   // What is counted below: points, values of samples, sums of a lens.
-  product({batch, radii.size(1), azimuths.size(0), image.size(1)});
-  product({patch[0], patch[1], image.size(1)});
+  check_product({batch, radii.size(1), azimuths.size(0), image.size(1)});
+  check_product({patch[0], patch[1], image.size(1)});
   const auto laid_out = [&](const Tensor& given, Sizes sizes) {
     sizes[0] = given.dim() > 0 && given.size(0) == 1 ? 1 : batch;
     STD_TORCH_CHECK(given.scalar_type() == type && given.is_cpu() && given.sizes().vec() == sizes,
@@ -209,7 +205,7 @@ void fold_lens(const PolarCall<T>& call, const std::vector<double>& sums, PolarG
 template <typename T>
 PolarGradients polar_backward(PolarCall<T>& call, const PolarWanted& wanted) {
   PolarSampleArgs<T>& args = call.args;
-  const int64_t images = call.points() && args.channels > 0 ? call.batch : 0;  // that are sampled
+  const int64_t images = call.sampled_images();
   const auto& kernel = kernels().table<T>();
 
   PolarGradients grads(call);

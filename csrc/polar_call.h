@@ -40,8 +40,9 @@ inline Pixel pixel_type(const torch::stable::Tensor& image) {
   }
 }
 
-// The product of sizes, none negative; RuntimeError unless it, and 64 times it, fits 64 bits.
-int64_t product(std::initializer_list<int64_t> sizes);
+// RuntimeError unless the product of sizes, none negative and zeros left out, fits 64 bits, and 64
+// times it as well.
+void check_product(std::initializer_list<int64_t> sizes);
 
 // The tensors of one call. Owns what `args` points into.
 template <typename T>
@@ -63,9 +64,7 @@ struct PolarCall {
 
   int64_t rings() const { return args.num_radii / args.patch_radii; }
   int64_t sectors() const { return args.num_azimuths / args.patch_azimuths; }
-  int64_t samples() const {
-    return product({args.patch_radii, args.patch_azimuths, args.channels});
-  }
+  int64_t samples() const { return args.patch_radii * args.patch_azimuths * args.channels; }
   torch::headeronly::ScalarType output_type() const {
     return args.narrow ? torch::headeronly::ScalarType::BFloat16 : radii.scalar_type();
   }
@@ -75,6 +74,8 @@ struct PolarCall {
            static_cast<double>((args.channels + 3) / 4 * 4);
   }
   bool points() const { return batch > 0 && args.num_radii > 0 && args.num_azimuths > 0; }
+  // Images that samples are taken of: none if there is no point or no channel.
+  int64_t sampled_images() const { return points() && args.channels > 0 ? batch : 0; }
 };
 
 // Into how many bands of rows backward cuts an image, so that a small batch of large images uses

@@ -136,7 +136,7 @@ PolarGradients sampling_gradients(PolarCall<T>& call, PolarEmbedArgs<T>& embed,
                                   const Tensor& weight, const PolarWanted& wanted) {
   const auto& kernel = kernels().table<T>();
   const int64_t depth = call.samples(), row = padded(depth);
-  const int64_t images = call.points() && call.args.channels > 0 ? call.batch : 0;
+  const int64_t images = call.sampled_images();
   std::vector<T> rows(images > 0 ? embed.features * row : 0, T(0));
   const T* from = weight.template const_data_ptr<T>();
   for (int64_t f = 0; images > 0 && f < embed.features; ++f) {

@@ -38,9 +38,8 @@ inline V write(bfloat16* to, V v) {
     *to = narrow(v);
     return widen(*to);
   } else {
-    const auto upper = rounded(v) >> 16;
-    store_bits(to, __builtin_convertvector(upper, Vector<uint16_t, kL>));
-    return (V)(upper << 16);
+    narrow_lanes(to, v);
+    return (V)(rounded(v) & 0xFFFF0000);
   }
 }
 

@@ -69,7 +69,7 @@ def strided(draw, tensor: Tensor) -> Tensor:
 
 
 @st.composite
-def grids(draw, generator: torch.Generator, largest: int = 4000):
+def grids(draw, largest: int = 4000):
     """Rings, sectors and samples of a patch, no more than `largest` points in all."""
     rings, sectors = draw(sizes(0, 1, 2, 3, 5)), draw(sizes(0, 1, 2, 3, 8, 17, 64, 257, 300))
     patch = draw(sizes(1, 2, 3, 4, 7, 10)), draw(sizes(1, 2, 3, 4, 5, 10, 33, 1030))
@@ -146,7 +146,7 @@ def sampling(draw, dtypes=(f32, f64), embed: bool = False) -> Case:
     generator, dtype = draw(generators()), draw(st.sampled_from(dtypes))
     batch, channels = draw(sizes(0, 1, 2, 3, 5)), draw(sizes(0, 1, 2, 3, 3, 4, 5, 8, 17))
     size = draw(sizes(0, 1, 2, 7, 16, 33, 90)), draw(sizes(0, 1, 2, 7, 16, 33, 90))
-    rings, sectors, patch = draw(grids(generator))
+    rings, sectors, patch = draw(grids())
     rows, columns = rings * patch[0], sectors * patch[1]
     image = draw(strided(normal(generator, batch, channels, *size, dtype=dtype)))
     lens = draw(lenses(generator, batch, size, rows, columns, dtype))
