@@ -174,22 +174,29 @@ class Lens:
     def unproject(self, radius: Number) -> Tensor:
         """r (px) → θ (rad), the inverse of `project` on [0, θ_max]. Shapes as there.
 
-        NaN where no ray of the lens lands at that radius. Lenses with a closed inverse override
-        this; it is found with their `_slope`, to the last digits.
+        NaN where no ray of [0, θ_max] lands: below 0 and, but for rounding, beyond `r_max`.
         """
         (radius,) = self._aligned(radius)
-        end, r_max = (self._row(t.detach(), radius.dim()) for t in (self.theta_max, self.r_max))
-        slack = 4 * torch.finfo(radius.dtype).eps
-        lands = (radius >= 0) & (radius <= r_max * (1 + slack))
-        return torch.where(lands, inverse(self.project, self._slope, radius, end), torch.nan)
+        slack = 1 + 16 * torch.finfo(radius.dtype).eps
+        with torch.no_grad():
+            last = self.r_max.maximum(self.project(self.theta_max * slack)) * slack
+            lands = (radius >= 0) & (radius <= self._row(last, radius.dim()))
+        # 0 in place of what has no angle: NaN would reach the gradients.
+        return torch.where(lands, self._angle_at(torch.where(lands, radius, 0.0)), torch.nan)
+
+    def _angle_at(self, radius: Tensor) -> Tensor:
+        """θ at radii where rays land. Lenses with a closed inverse override this."""
+        end = self._row(self.theta_max.detach(), radius.dim())
+        return inverse(self.project, self._slope, radius, end)
 
     def _slope(self, theta: Tensor) -> Tensor:
-        """dr/dθ."""
-        raise NotImplementedError
+        """dr/dθ, of θ (N or 1, ...)."""
+        return torch.func.jvp(self.project, (theta,), (torch.ones_like(theta),))[1]
 
     @property
     def theta_limit(self) -> Tensor:
-        """(N,) rad: the largest angle that the model is valid for, up to which r rises."""
+        """(N,) rad: the largest angle that the model is valid for, up to which r rises and no two
+        rays land on one pixel."""
         raise NotImplementedError
 
     @property

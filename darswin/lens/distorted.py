@@ -10,10 +10,10 @@ import math
 import torch
 from torch import Tensor
 
-from darswin.inverse import rising_limit
+from darswin.inverse import Function, rising_limit
 from darswin.lens.base import MARGIN, Lens, Number, length_of
 from darswin.lens.polynomial import horner, slopes
-from darswin.lens.sphere import sphere_limit
+from darswin.lens.sphere import sphere_angle, sphere_limit
 
 
 class DistortedLens(Lens):
@@ -65,6 +65,10 @@ class DistortedLens(Lens):
     def _plane_slope(self, theta: Tensor) -> Tensor:
         raise NotImplementedError
 
+    def _plane_angle(self, w: Tensor) -> Tensor:
+        """θ at which w takes a value."""
+        raise NotImplementedError
+
     def _plane_limit(self) -> Tensor:
         """(N,) rad: up to where w rises."""
         raise NotImplementedError
@@ -85,32 +89,39 @@ class DistortedLens(Lens):
     @property
     def theta_limit(self) -> Tensor:
         end = self._plane_limit()
-        limit = rising_limit(self._slope, end)
+        limits = [rising_limit(self._slope, end)]
+        if not self.is_radial:
+            limits.append(rising_limit(self._least_area, limits[0]))
+        limit = limits[-1]
         return torch.where(limit < end, limit - MARGIN, end)
 
     def project(self, theta: Number) -> Tensor:
         theta, focal = self._aligned(theta, "focal")
         return focal * self._stretch(self._plane(theta))
 
-    def _offset_plane(self, theta: Tensor) -> Tensor:
+    def _offset_plane(self, w: Tensor) -> Tensor:
         """The radius of the plane that tangential and thin-prism terms are functions of."""
-        return self._plane(theta)
+        return w
 
-    def _offset_plane_slope(self, theta: Tensor) -> Tensor:
-        return self._plane_slope(theta)
+    def _offset_plane_slope(self, w: Tensor) -> Tensor:
+        return torch.ones_like(w)
 
     @property
     def is_radial(self) -> bool:
         return self.tangential is None and self.prism is None
 
     def offset(self, theta: Tensor, direction: Tensor) -> Tensor:
-        w = self._offset_plane(theta)
-        x, y = (w[..., None] * direction).unbind(-1)
-        square = w * w
-        p1, p2, s1, s2, s3, s4 = self._terms(w.dim())
+        w = self._offset_plane(self._plane(theta))
+        return self._row(self.focal, w.dim() + 1) * self._aside(w[..., None] * direction)
+
+    def _aside(self, point: Tensor) -> Tensor:
+        """(..., 2): the offset at a point of its plane, in units of the focal length."""
+        x, y = point.unbind(-1)
+        square = x * x + y * y
+        p1, p2, s1, s2, s3, s4 = self._terms(x.dim())
         dx = 2 * p1 * x * y + p2 * (square + 2 * x * x) + square * (s1 + s2 * square)
         dy = p1 * (square + 2 * y * y) + 2 * p2 * x * y + square * (s3 + s4 * square)
-        return self._row(self.focal, w.dim() + 1) * torch.stack((dx, dy), -1)
+        return torch.stack((dx, dy), -1)
 
     def _terms(self, dims: int) -> list[Tensor]:
         """p₁, p₂, s₁ … s₄, to broadcast over `dims` dimensions."""
@@ -119,8 +130,9 @@ class DistortedLens(Lens):
         s = (none,) * 4 if self.prism is None else self.prism.unbind(1)
         return [self._row(term, dims) for term in (*p, *s)]
 
-    def _offset_slopes(self, x: Tensor, y: Tensor) -> Tensor:
-        """(..., 2, 2): the derivatives of the offset in its plane, in units of the focal length."""
+    def _aside_slopes(self, point: Tensor) -> Tensor:
+        """(..., 2, 2): the derivatives of `_aside`."""
+        x, y = point.unbind(-1)
         p1, p2, s1, s2, s3, s4 = self._terms(x.dim())
         square = x * x + y * y
         across, down = s1 + 2 * s2 * square, s3 + 2 * s4 * square
@@ -131,39 +143,102 @@ class DistortedLens(Lens):
         )
         return torch.stack([torch.stack(row, -1) for row in rows], -2)
 
-    def _flat_slopes(self, theta: Tensor, direction: Tensor) -> Tensor:
-        """(..., 2, 2): the derivatives of where a ray lands in the plane θ (cos φ, sin φ)."""
-        w, w_slope = self._offset_plane(theta), self._offset_plane_slope(theta)
-        x, y = (w[..., None] * direction).unbind(-1)
-        aside = self._offset_slopes(x, y) @ _radial_slopes(w / theta, w_slope, direction)
-        straight = _radial_slopes(self.project(theta) / theta, self._slope(theta), direction)
-        return straight + self._row(self.focal, w.dim() + 2) * aside
+    def _bent(self, point: Tensor) -> Tensor:
+        """(..., 2): where a point w (cos φ, sin φ) of the ideal plane lands, in focal lengths."""
+        w = length_of(point)
+        direction = point / w[..., None]
+        aside = self._aside(self._offset_plane(w)[..., None] * direction)
+        return self._stretch(w)[..., None] * direction + aside
+
+    def _bent_slopes(self, point: Tensor) -> Tensor:
+        """(..., 2, 2): the derivatives of `_bent`."""
+        w = length_of(point)
+        direction = point / w[..., None]
+        u, slope = self._offset_plane(w), self._offset_plane_slope(w)
+        aside = self._aside_slopes(u[..., None] * direction)
+        straight = _radial_slopes(self._stretch(w) / w, self._stretch_slope(w), direction)
+        return straight + aside @ _radial_slopes(u / w, slope, direction)
+
+    def _least_area(self, theta: Tensor) -> Tensor:
+        """(N, K): by how much the bent plane makes an area larger at θ, least of all azimuths.
+
+        It is a trigonometric polynomial of degree 3 in φ, so that 8 azimuths tell all others.
+        """
+        azimuth = torch.arange(8, dtype=theta.dtype, device=theta.device) * (math.pi / 4)
+        direction = torch.stack((torch.cos(azimuth), torch.sin(azimuth)), -1)
+        area = _determinant(self._bent_slopes(self._plane(theta)[..., None, None] * direction))
+        terms = torch.fft.rfft(area, norm="forward")[..., :4]
+        area = torch.fft.irfft(terms, 256, norm="forward")
+        # The least between the samples: that of the parabola through the three around the least.
+        place = area.argmin(-1, keepdim=True)
+        before, least, after = (area.gather(-1, (place + k) % 256) for k in (-1, 0, 1))
+        bend = (before - 2 * least + after).clamp(min=torch.finfo(theta.dtype).tiny)
+        return (least - (after - before) ** 2 / (8 * bend))[..., 0]
 
     def _find_rays(self, flat: Tensor, theta: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
-        """Newton's method in the plane θ (cos φ, sin φ), from the ray that would land there if
-        nothing but the radial curve were. The last step carries the gradients."""
-
-        def step(point: Tensor) -> Tensor:
-            theta = length_of(point)
-            direction = point / theta[..., None]
-            slopes = self._flat_slopes(theta, direction).detach()
-            missed = self._flat(theta, direction) - flat
-            return point - (torch.linalg.inv_ex(slopes).inverse @ missed[..., None])[..., 0]
-
+        """The rays that land at points before `affine`, by Newton's method in the ideal plane, from
+        where they would be if nothing but the radial curve were. The last steps carry the
+        gradients, as in `inverse`."""
         end = self._row(self.theta_max.detach(), theta.dim())
+        goal = flat / self._row(self.focal, flat.dim())
         with torch.no_grad():
-            point = torch.where(theta.isnan(), end, theta)[..., None] * direction
-            for _ in range(8):
-                point = step(point)
-                point = point * (end / length_of(point)).clamp(max=1)[..., None]
-        point = step(point)
-        theta = length_of(point)
-        direction = point / theta[..., None]
-        with torch.no_grad():
-            slack = 1e3 * torch.finfo(flat.dtype).eps
-            missed = length_of(self._flat(theta, direction) - flat) > slack * (1 + length_of(flat))
-            missed |= ~(theta <= end * (1 + slack))
-        return torch.where(missed, torch.nan, theta), direction
+            last = self._plane(end)
+            start = self._plane(torch.where(theta.isnan(), end, theta))[..., None] * direction
+            # From half as far out, where nothing is about to fold.
+            point = _newton(self._bent, self._bent_slopes, goal, start / 2, 1.1 * last)
+            eps = torch.finfo(flat.dtype).eps
+            lands = length_of(self._bent(point) - goal) <= 1e3 * eps * (1 + length_of(goal))
+            # Where the map is about to fold, rounding moves a ray by the root of what a pixel moves.
+            lands &= length_of(point) <= last * (1 + math.sqrt(eps))
+        # The principal point in place of what has no ray: NaN would reach the gradients.
+        goal, point = (torch.where(lands[..., None], x, 0.0) for x in (goal, point))
+        for _ in range(2):
+            point = point - _solve(self._bent_slopes(point), self._bent(point) - goal)
+        w = length_of(point)
+        theta = torch.where(lands, self._plane_angle(w), torch.nan)
+        return theta, torch.where(lands[..., None], point / w[..., None], direction)
+
+
+def _newton(
+    function: Function, slopes: Function, goal: Tensor, point: Tensor, end: Tensor
+) -> Tensor:
+    """Where a map of the plane takes the value `goal`.
+
+    Newton's steps, shortened until they come nearer and stay where the map does not turn over: from
+    a point where it does not, that ends at the goal, or where the map is about to fold.
+
+    Args:
+        function: (..., 2) → (..., 2). slopes: (..., 2) → (..., 2, 2), its derivatives.
+        goal, point: (..., 2). end: how far from the origin to look, broadcasts to (...).
+    """
+    error = function(point) - goal
+    step = _solve(slopes(point), error)
+    missed, part = length_of(error), torch.ones_like(error[..., 0])
+    for _ in range(60):
+        trial = point - part[..., None] * step
+        error, slope = function(trial) - goal, slopes(trial)
+        better = (length_of(error) < missed) & (_determinant(slope) > 0)
+        better &= length_of(trial) <= end
+        point = torch.where(better[..., None], trial, point)
+        step = torch.where(better[..., None], _solve(slope, error), step)
+        missed = torch.where(better, length_of(error), missed)
+        part = torch.where(better, (2 * part).clamp(max=1), part / 4)
+        if not torch.compiler.is_compiling() and not (part > 1e-6).any():
+            break
+    return point
+
+
+def _determinant(matrix: Tensor) -> Tensor:
+    (a, b), (c, d) = (row.unbind(-1) for row in matrix.unbind(-2))
+    return a * d - b * c
+
+
+def _solve(matrix: Tensor, vector: Tensor) -> Tensor:
+    """(..., 2, 2)⁻¹ @ (..., 2)."""
+    (a, b), (c, d) = (row.unbind(-1) for row in matrix.unbind(-2))
+    x, y = vector.unbind(-1)
+    solved = torch.stack((d * x - b * y, a * y - c * x), -1)
+    return solved / _determinant(matrix)[..., None]
 
 
 def _radial_slopes(ratio: Tensor, slope: Tensor, direction: Tensor) -> Tensor:
@@ -187,6 +262,9 @@ class KannalaBrandt(DistortedLens):
     def _plane_slope(self, theta: Tensor) -> Tensor:
         return torch.ones_like(theta)
 
+    def _plane_angle(self, w: Tensor) -> Tensor:
+        return w
+
     def _plane_limit(self) -> Tensor:
         return torch.full_like(self.focal.detach(), math.pi - MARGIN)
 
@@ -198,11 +276,11 @@ class Fisheye624(KannalaBrandt):
     RAD_TAN_THIN_PRISM_FISHEYE. Arguments: as `KannalaBrandt`; their p₀ and p₁ are our p₂ and p₁.
     """
 
-    def _offset_plane(self, theta: Tensor) -> Tensor:
-        return self._stretch(theta)
+    def _offset_plane(self, w: Tensor) -> Tensor:
+        return self._stretch(w)
 
-    def _offset_plane_slope(self, theta: Tensor) -> Tensor:
-        return self._stretch_slope(theta)
+    def _offset_plane_slope(self, w: Tensor) -> Tensor:
+        return self._stretch_slope(w)
 
 
 class Mei(DistortedLens):
@@ -240,6 +318,9 @@ class Mei(DistortedLens):
         xi, cos = self._row(self.xi, theta.dim()), torch.cos(theta)
         return (1 + xi * cos) / (xi + cos) ** 2
 
+    def _plane_angle(self, w: Tensor) -> Tensor:
+        return sphere_angle(w, self._row(self.xi, w.dim()))
+
     def _plane_limit(self) -> Tensor:
         return sphere_limit(self.xi)
 
@@ -262,6 +343,9 @@ class BrownConrady(DistortedLens):
 
     def _plane_slope(self, theta: Tensor) -> Tensor:
         return torch.cos(theta) ** -2
+
+    def _plane_angle(self, w: Tensor) -> Tensor:
+        return torch.atan(w)
 
     def _plane_limit(self) -> Tensor:
         return torch.full_like(self.focal.detach(), math.pi / 2 - MARGIN)

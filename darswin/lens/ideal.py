@@ -47,7 +47,7 @@ class IdealLens(Lens):
         raise NotImplementedError
 
     @staticmethod
-    def _angle(rise: Tensor) -> Tensor:
+    def _fall(rise: Tensor) -> Tensor:
         """θ at which u takes a value."""
         raise NotImplementedError
 
@@ -55,15 +55,13 @@ class IdealLens(Lens):
         theta, focal = self._aligned(theta, "focal")
         return focal * self._rise(theta)
 
-    def unproject(self, radius: Number) -> Tensor:
-        radius, focal = self._aligned(radius, "focal")
-        rise = radius / focal
-        lands = rise <= self._top
-        # 0 in place of what has no angle: NaN would reach the gradients.
-        return torch.where(lands, self._angle(torch.where(lands, rise, 0.0)), torch.nan)
+    def _angle_at(self, radius: Tensor) -> Tensor:
+        rise = radius / self._row(self.focal, radius.dim())
+        # Rounding can take u above its top, where there is no angle.
+        return self._fall(rise if self._top is None else rise.clamp(max=self._top))
 
     _end = math.pi  # where u stops rising, or to be finite
-    _top = math.inf  # u there
+    _top: float | None = None  # u there, where it is finite
 
     @property
     def theta_limit(self) -> Tensor:
@@ -75,7 +73,7 @@ class Perspective(IdealLens):
 
     _end = math.pi / 2
     _rise = staticmethod(torch.tan)
-    _angle = staticmethod(torch.atan)
+    _fall = staticmethod(torch.atan)
 
 
 class Equidistant(IdealLens):
@@ -86,7 +84,7 @@ class Equidistant(IdealLens):
         return theta
 
     @staticmethod
-    def _angle(rise: Tensor) -> Tensor:
+    def _fall(rise: Tensor) -> Tensor:
         return rise
 
 
@@ -100,7 +98,7 @@ class Equisolid(IdealLens):
         return 2 * torch.sin(theta / 2)
 
     @staticmethod
-    def _angle(rise: Tensor) -> Tensor:
+    def _fall(rise: Tensor) -> Tensor:
         return 2 * torch.asin(rise / 2)
 
 
@@ -112,7 +110,7 @@ class Stereographic(IdealLens):
         return 2 * torch.tan(theta / 2)
 
     @staticmethod
-    def _angle(rise: Tensor) -> Tensor:
+    def _fall(rise: Tensor) -> Tensor:
         return 2 * torch.atan(rise / 2)
 
 
@@ -122,7 +120,7 @@ class Orthographic(IdealLens):
     _end = math.pi / 2
     _top = 1.0
     _rise = staticmethod(torch.sin)
-    _angle = staticmethod(torch.asin)
+    _fall = staticmethod(torch.asin)
 
 
 class FieldOfView(Lens):
@@ -158,11 +156,10 @@ class FieldOfView(Lens):
         tangent = 2 * torch.tan(omega / 2)
         return focal / omega * torch.atan2(tangent * torch.sin(theta), torch.cos(theta))
 
-    def unproject(self, radius: Number) -> Tensor:
+    def _angle_at(self, radius: Tensor) -> Tensor:
         radius, omega, focal = self._aligned(radius, "omega", "focal")
         angle, tangent = radius * omega / focal, 2 * torch.tan(omega / 2)
-        theta = torch.atan2(torch.sin(angle), tangent * torch.cos(angle))
-        return torch.where(angle.abs() <= math.pi, theta, torch.nan)
+        return torch.atan2(torch.sin(angle), tangent * torch.cos(angle))
 
     @property
     def theta_limit(self) -> Tensor:

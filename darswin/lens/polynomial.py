@@ -84,7 +84,7 @@ class OCam(PolynomialLens):
         super()._validate()
         self._require("coefficients", self.coefficients[:, 0] < 0, "such that a₀ is below 0")
 
-    def _angle(self, radius: Tensor) -> Tensor:
+    def _angle_at(self, radius: Tensor) -> Tensor:
         return torch.atan2(radius, -horner(radius, self.coefficients))
 
     def _angle_slope(self, radius: Tensor) -> Tensor:
@@ -99,18 +99,12 @@ class OCam(PolynomialLens):
 
     @property
     def theta_limit(self) -> Tensor:
-        return self._angle(self._last_radius[:, None])[:, 0].detach() - MARGIN
+        return self._angle_at(self._last_radius[:, None])[:, 0].detach() - MARGIN
 
     def project(self, theta: Number) -> Tensor:
         (theta,) = self._aligned(theta)
         end = self._row(self._last_radius, theta.dim())
-        return inverse(self._angle, self._angle_slope, theta, end)
-
-    def unproject(self, radius: Number) -> Tensor:
-        (radius,) = self._aligned(radius)
-        last = self._row(self._last_radius, radius.dim())
-        lands = (radius >= 0) & (radius <= last)
-        return torch.where(lands, self._angle(radius), torch.nan)
+        return inverse(self._angle_at, self._angle_slope, theta, end)
 
     def _scaled(self, scale: float | Tensor) -> "OCam":
         power = 1 - torch.arange(self.coefficients.shape[1], device=self.coefficients.device)

@@ -59,12 +59,9 @@ class Spherical(Lens):
         theta, xi, focal = self._aligned(theta, "xi", "focal")
         return focal * torch.sin(theta) / (xi + torch.cos(theta))
 
-    def unproject(self, radius: Number) -> Tensor:
-        # tan ψ = r/f, θ = ψ + asin(ξ sin ψ); as atan2, exact also where the sine nears 1.
+    def _angle_at(self, radius: Tensor) -> Tensor:
         radius, xi, focal = self._aligned(radius, "xi", "focal")
-        rho = radius / focal
-        square = 1 + (1 - xi * xi) * rho * rho
-        return where_real(square, torch.atan(rho) + torch.atan2(xi * rho, root(square)))
+        return sphere_angle(radius / focal, xi)
 
 
 class EnhancedUnified(Lens):
@@ -111,13 +108,13 @@ class EnhancedUnified(Lens):
         length = torch.sqrt(beta * sin * sin + cos * cos)
         return focal * sin / (alpha * length + (1 - alpha) * cos)
 
-    def unproject(self, radius: Number) -> Tensor:
+    def _angle_at(self, radius: Tensor) -> Tensor:
         radius, alpha, beta, focal = self._aligned(radius, "alpha", "beta", "focal")
         rho = radius / focal
         square = beta * rho * rho
         rest = 1 - (2 * alpha - 1) * square
         z = (1 - alpha * alpha * square) / (alpha * root(rest) + (1 - alpha))
-        return where_real(rest, torch.atan2(rho, z))
+        return torch.atan2(rho, z)
 
 
 class DoubleSphere(Lens):
@@ -166,7 +163,7 @@ class DoubleSphere(Lens):
         sin, cos = torch.sin(theta), xi + torch.cos(theta)
         return focal * sin / (alpha * torch.sqrt(sin * sin + cos * cos) + (1 - alpha) * cos)
 
-    def unproject(self, radius: Number) -> Tensor:
+    def _angle_at(self, radius: Tensor) -> Tensor:
         radius, xi, alpha, focal = self._aligned(radius, "xi", "alpha", "focal")
         rho = radius / focal
         square = rho * rho
@@ -174,8 +171,14 @@ class DoubleSphere(Lens):
         z = (1 - alpha * alpha * square) / (alpha * root(rest) + (1 - alpha))
         second = z * z + (1 - xi * xi) * square
         scale = (z * xi + root(second)) / (z * z + square)
-        theta = torch.atan2(scale * rho, scale * z - xi)
-        return where_real(rest, where_real(second, theta))
+        return torch.atan2(scale * rho, scale * z - xi)
+
+
+def sphere_angle(rho: Tensor, xi: Tensor) -> Tensor:
+    """θ at which sin θ / (ξ + cos θ) is ρ."""
+    # tan ψ = ρ, θ = ψ + asin(ξ sin ψ); as atan2, exact also where the sine nears 1.
+    square = 1 + (1 - xi * xi) * rho * rho
+    return torch.atan(rho) + torch.atan2(xi * rho, root(square))
 
 
 def sphere_limit(xi: Tensor) -> Tensor:
@@ -190,11 +193,6 @@ def _cone(alpha: Tensor) -> Tensor:
 
 
 def root(square: Tensor) -> Tensor:
-    """√, and nearly 0 where the square is negative; `where_real` tells."""
+    """√, and nearly 0 where rounding made the square of a last ray negative."""
     eps = torch.finfo(square.dtype).eps
     return square.clamp(min=eps * eps).sqrt()
-
-
-def where_real(square: Tensor, value: Tensor) -> Tensor:
-    """The value where a square is not negative but for rounding, else NaN, with no gradient."""
-    return torch.where(square >= -64 * torch.finfo(square.dtype).eps, value, torch.nan)

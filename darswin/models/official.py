@@ -70,7 +70,7 @@ class OfficialPolynomial(Lens):
         rho = x[above - 1] + fraction * (x[above] - x[above - 1])
         return rho.reshape(shape) * radius
 
-    def unproject(self, radius: Number) -> Tensor:
+    def _angle_at(self, radius: Tensor) -> Tensor:
         radius, full = self._aligned(radius, "radius")
         return self._angle(radius / full)
 
