@@ -103,10 +103,13 @@ def sampling(size: int, batch: int, threads: int, seconds: float) -> list[Result
     results += compare(
         "polar_sample", case,
         {
-            OURS: forward(lambda image: ours(image, layout="image"), [images]),
+            # The README's drop-in call.
+            OURS: forward(
+                lambda image: polar_sample(image, *arguments, patch=(1, 1), layout="image"), [images]
+            ),
             "F.grid_sample": forward(planes, [images]),
         },
-        mode="forward, layout image", **equal,
+        mode="forward, layout image", bars={"F.grid_sample": 1.0}, **equal,
     )  # fmt: skip
     results += compare(
         "polar_sample", case,

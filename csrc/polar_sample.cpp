@@ -1,6 +1,7 @@
 // polar_sample and its backward on CPU: allocate, thread, call the kernel.
 #include <torch/csrc/stable/library.h>
 
+#include <algorithm>
 #include <optional>
 #include <tuple>
 #include <vector>
@@ -20,10 +21,29 @@ Sizes output_sizes(const PolarCall<T>& call) {
   return {call.batch, call.rings(), call.sectors(), call.samples()};
 }
 
+int64_t largest_divisor(int64_t number, int64_t most) {
+  int64_t divisor = std::clamp<int64_t>(number, 1, most);
+  while (number % divisor != 0) --divisor;
+  return divisor;
+}
+
+// An image has no tokens, so what the kernels have in hand at a time is free: near, one radius,
+// whose samples stay in the nearest cache; far, tokens that are about square, whose points share
+// pixels.
+template <typename T>
+void choose_patch(PolarSampleArgs<T>& args) {
+  constexpr int64_t kSide = 16;
+  const bool near = args.packed;
+  args.patch_radii = near ? 1 : largest_divisor(args.num_radii, kSide);
+  args.patch_azimuths =
+      near ? std::max<int64_t>(args.num_azimuths, 1) : largest_divisor(args.num_azimuths, kSide);
+}
+
 template <typename T>
 Tensor forward(PolarCall<T>&& call, bool tokens) {
   PolarSampleArgs<T>& args = call.args;
   args.tokens = tokens;
+  if (!tokens) choose_patch(args);
   const Tensor out = torch::stable::new_empty(call.radii, output_sizes(call), call.output_type());
   if (out.numel() == 0) return out;
   ask_for_large_pages(out);
@@ -41,6 +61,7 @@ auto backward(PolarCall<T>&& call, const Tensor& grad_out_, bool tokens,
               const PolarWanted& wanted) {
   PolarSampleArgs<T>& args = call.args;
   args.tokens = tokens;
+  if (!tokens) choose_patch(args);
   // Gradients arrive expanded or strided: `.sum().backward()` gives stride 0.
   const Tensor grad_out = torch::stable::contiguous(grad_out_);
   STD_TORCH_CHECK(

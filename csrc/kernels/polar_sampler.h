@@ -139,8 +139,9 @@ class Sampler {
         packed(args.packed ? Packed(args) : Packed()),
         sector_stride(sector_stride),
         row_stride(row_stride),
-        in_line(args.packed && args.channels <= 4 && args.patch_azimuths <= kBlock &&
-                args.patch_azimuths * args.channels >= 4 && reach_of_block() < INT32_MAX),
+        in_line(args.packed && args.channels <= 4 && args.patch_azimuths * args.channels >= 4 &&
+                (args.patch_azimuths <= kBlock || args.patch_radii == 1) &&
+                reach_of_block() < INT32_MAX),
         state(*static_cast<State*>(scratch)),
         points(state.points),
         image(reinterpret_cast<T*>(static_cast<char*>(scratch) + round_up(sizeof(State), 64))) {
@@ -235,9 +236,11 @@ class Sampler {
         for (int64_t e = n * bytes; e < (n + 1) * bytes; e += 64) __builtin_prefetch(next + e, 1);
       }
     }
-    if (in_line && count == smaller(block_columns(), a.num_azimuths)) {
-      lines(rows, count, to + j / a.patch_azimuths * sector_stride + row * row_stride,
-            row + rows == a.patch_radii, j + count == a.num_azimuths);
+    // Where the points of a smaller block go is known only if they are of one radius.
+    if (in_line && (rows == 1 || count == smaller(block_columns(), a.num_azimuths))) {
+      T* out = to + j / a.patch_azimuths * sector_stride + j % a.patch_azimuths * a.channels +
+               row * row_stride;
+      lines(rows, count, out, row + rows == a.patch_radii, j + count == a.num_azimuths);
       return;
     }
     for (int64_t n = 0; n < rows; ++n) {

@@ -2,9 +2,10 @@
 
 import copy
 import math
+import operator
 from collections.abc import Sequence
 from functools import reduce
-from numbers import Integral
+from numbers import Integral, Real
 from typing import ClassVar, Self
 
 import torch
@@ -24,7 +25,7 @@ FRAME = ("center", "affine", "image_size")
 # Dimensions of one lens's part of a tensor, where it is not a number.
 ROW_DIMS = {
     "coefficients": 1, "radial": 1, "denominator": 1, "tangential": 1, "prism": 1, "angles": 1,
-    "radii": 1, "center": 1, "affine": 2, "image_size": 1,
+    "radii": 1, "slopes": 1, "center": 1, "affine": 2, "image_size": 1,
 }  # fmt: skip
 FORMS = ("a number or (N,)", "(K,) or (N, K)", "(K, L) or (N, K, L)")
 
@@ -108,6 +109,12 @@ class Lens:
         count = next((size for size in sizes.values() if size != 1), 1)
         if any(size not in (1, count) for size in sizes.values()):
             raise ValueError(f"parameters must agree in the number of lenses, got {sizes}")
+        varied = [name for name, size in sizes.items() if size == count]
+        if count > 1 and varied == ["radial"] and tensors["radial"].shape[1] == 1:  # OpenCV's form
+            raise ValueError(
+                f"radial of shape ({count}, 1) is {count} lenses of one coefficient each: give "
+                f"({count},) for one lens, or another parameter with {count} numbers"
+            )
         for name in self._names():
             tensor = tensors.get(name)
             setattr(self, name, None if tensor is None else tensor.expand(count, *tensor.shape[1:]))
@@ -354,19 +361,25 @@ class Lens:
         """The same lens in a resized image, as `cv2.resize` makes it.
 
         Args:
-            scale: how many times as large the image is; or its new (H, W), for a lens with an
-                `image_size`.
+            scale: how many times as large the image is, above 0; or its new (H, W), in whole
+                pixels, for a lens with an `image_size`. Images have whole pixels, so that (H, W)
+                is exact where a number is not.
 
         Raises:
-            ValueError: an (H, W) for a lens that does not know its image_size.
+            ValueError: a scale or a size that is no image's, or an (H, W) for a lens that does not
+                know its image_size. TypeError: neither a number nor two.
         """
-        if isinstance(scale, (int, float)):
-            down = across = scale
-            size = None if self.image_size is None else (self.image_size * scale).round()
+        if isinstance(scale, Real) or getattr(scale, "ndim", None) == 0:
+            across = down = float(scale)
+            if not 0 < across < math.inf:
+                raise ValueError(f"resized must be given a finite scale above 0, got {across}")
+            size = None
+            if self.image_size is not None:
+                size = (self.image_size * across).round().clamp(min=1)
         elif self.image_size is None:
             raise ValueError(f"resized to (H, W) = {scale} needs a lens that has an image_size")
         else:
-            size = self.theta_max.new_tensor([scale]).expand(len(self), 2)
+            size = self.theta_max.new_tensor([_size(scale)]).expand(len(self), 2)
             down, across = (size / self.image_size).unbind(1)
         lens = self._scaled(across)
         lens.image_size = size
@@ -374,7 +387,7 @@ class Lens:
             factor = torch.stack(torch.broadcast_tensors(
                 *(torch.as_tensor(f).to(self.center) for f in (across, down))), -1)  # fmt: skip
             lens.center = (self.center + 0.5) * factor - 0.5
-        if not isinstance(scale, (int, float)) and bool((down != across).any()):
+        if isinstance(across, Tensor) and bool((down != across).any()):
             rows = torch.stack((torch.ones_like(down), down / across), -1)
             lens.affine = rows[..., None] * (
                 _identity(self) if self.affine is None else self.affine
@@ -405,16 +418,22 @@ class Lens:
         lengths = {}
         for name in self.lengths:
             value = getattr(self, name)
-            factor = self._row(scale, value.dim()) if isinstance(scale, Tensor) else scale
-            lengths[name] = value * factor
+            if value is not None:
+                factor = self._row(scale, value.dim()) if isinstance(scale, Tensor) else scale
+                lengths[name] = value * factor
         return self.replace(**lengths)
 
     def cropped(self, top: int, left: int, height: int, width: int) -> Self:
         """The same lens in a part of the image: `image[..., top:top + height, left:left + width]`.
 
+        The part may reach beyond the image, as padding does: `cropped(-8, -8, H + 16, W + 16)`.
+
         Raises:
-            ValueError: a lens with neither a center nor an image_size.
+            ValueError: a part of no pixels, or a lens with neither a center nor an image_size.
+            TypeError: what is not in whole pixels.
         """
+        top, left = (_whole(side) for side in (top, left))
+        height, width = _size((height, width))
         center = self.center_in() - self.theta_max.new_tensor([left, top])
         size = self.theta_max.new_tensor([[height, width]]).expand(len(self), 2)
         return self.replace(center=center.expand(len(self), 2), image_size=size)
@@ -477,6 +496,27 @@ class Lens:
         values = {name: getattr(self, name) for name in self._names()}
         shown = (f"{name}={value.tolist()}" for name, value in values.items() if value is not None)
         return f"{type(self).__name__}({', '.join(shown)})"
+
+
+def _whole(value: Number) -> int:
+    try:
+        return operator.index(value)
+    except TypeError:
+        if isinstance(value, Real) and float(value).is_integer():
+            return int(value)
+        raise TypeError(f"an image has whole pixels, got {value!r}") from None
+
+
+def _size(size: tuple[int, int]) -> tuple[int, int]:
+    """(H, W) of an image, or ValueError."""
+    try:
+        height, width = size
+    except (TypeError, ValueError):
+        raise TypeError(f"an image's size must be (H, W), got {size!r}") from None
+    height, width = _whole(height), _whole(width)
+    if height < 1 or width < 1:
+        raise ValueError(f"an image's (H, W) must be at least (1, 1), got {(height, width)}")
+    return height, width
 
 
 def _collate(batch, *, collate_fn_map=None) -> Lens:

@@ -187,8 +187,8 @@ class DistortedLens(Lens):
             # From half as far out, where nothing is about to fold.
             point = _newton(self._bent, self._bent_slopes, goal, start / 2, 1.1 * last)
             eps = torch.finfo(flat.dtype).eps
-            lands = length_of(self._bent(point) - goal) <= 1e3 * eps * (1 + length_of(goal))
-            # Where the map is about to fold, rounding moves a ray by the root of what a pixel moves.
+            lands = length_of(self._bent(point) - goal) < 1e3 * eps * (1 + length_of(goal))
+            # About to fold, it moves a ray by the root of what a pixel is off.
             lands &= length_of(point) <= last * (1 + math.sqrt(eps))
         # The principal point in place of what has no ray: NaN would reach the gradients.
         goal, point = (torch.where(lands[..., None], x, 0.0) for x in (goal, point))

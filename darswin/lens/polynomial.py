@@ -92,6 +92,9 @@ class OCam(PolynomialLens):
         deepens = horner(radius, slopes(self.coefficients, 0)[:, 1:])
         return (radius * deepens - depth) / (radius * radius + depth * depth)
 
+    def _slope(self, theta: Tensor) -> Tensor:
+        return 1 / self._angle_slope(self.project(theta))
+
     @property
     def _last_radius(self) -> Tensor:
         """(N,) px: up to where θ rises, of 20 |a₀| at most."""

@@ -325,3 +325,37 @@ def test_as_json_and_back():
     )
     with pytest.raises(ValueError, match="one lens, got 2"):
         to_dict(lens.expand(2))
+
+
+def test_resized_takes_any_number_and_nothing_that_is_no_image():
+    lens = Perspective(100.0, 1.0, (319.5, 241.5), image_size=(483, 640))
+    whole = lens.resized(0.5)
+    for half in (np.float32(0.5), np.float64(0.5), torch.tensor(0.5), np.array(0.5)):
+        resized = lens.resized(half)
+        assert resized.focal.item() == 50 and resized.affine is None
+        assert resized.image_size.tolist() == whole.image_size.tolist() == [[242, 320]]
+    assert lens.resized(torch.tensor([240, 320])).image_size.tolist() == [[240, 320]]
+    assert lens.resized((240.0, np.int64(320))).image_size.tolist() == [[240, 320]]
+    assert lens.resized(1e-6).image_size.tolist() == [[1, 1]]
+    for scale in (0, -1, math.nan, math.inf, np.float32(-2), torch.tensor(0.0)):
+        with pytest.raises(ValueError, match="resized must be given a finite scale above 0, got"):
+            lens.resized(scale)
+    for size in ((0, 5), (-5, 5), torch.tensor([3, 0])):
+        with pytest.raises(ValueError, match=r"image's \(H, W\) must be at least \(1, 1\), got"):
+            lens.resized(size)
+    for size in ((483,), (1, 2, 3), "12", None, (2.5, 3), (math.nan, 3), (None, 3)):
+        with pytest.raises(TypeError, match=r"size must be \(H, W\)|whole pixels"):
+            lens.resized(size)
+
+
+def test_cropped_takes_only_parts_with_pixels():
+    lens = Perspective(100.0, 1.0, (319.5, 241.5), image_size=(483, 640))
+    padded = lens.cropped(-8, -4, 499, 648)
+    assert padded.center.tolist() == [[323.5, 249.5]]
+    assert padded.image_size.tolist() == [[499, 648]]
+    for part in ((0, 0, -5, 10), (0, 0, 5, 0)):
+        with pytest.raises(ValueError, match=r"must be at least \(1, 1\)"):
+            lens.cropped(*part)
+    for part in ((0.5, 0, 5, 10), (0, 0, math.nan, 10), (None, 0, 5, 5)):
+        with pytest.raises(TypeError, match="an image has whole pixels, got"):
+            lens.cropped(*part)

@@ -477,7 +477,8 @@ def lens_of(name, dtype):
     """A lens of each model, with a frame."""
     parameters = dict(
         focal=300.0, omega=0.9, xi=0.8, alpha=0.6, beta=1.1, angles=[0.0, 0.5, 1.2],
-        radii=[0.0, 140.0, 400.0], coefficients=[340.0, -32.0, 48.0, -7.2], radial=[0.01, -0.002],
+        radii=[0.0, 140.0, 400.0], slopes=[275.0, 330.0, 380.0],
+        coefficients=[340.0, -32.0, 48.0, -7.2], radial=[0.01, -0.002],
         denominator=[0.02], tangential=[0.001, -0.002], prism=[0.0005, 0.0, 0.0002, 0.0],
     )  # fmt: skip
     if name == "OCam":

@@ -182,6 +182,61 @@ def test_gradients_of_both_directions(name):
 
 
 @pytest.mark.parametrize("name", MODELS)
+def test_radii_that_no_ray_up_to_theta_max_reaches_have_no_angle(name):
+    lens = random_lens(name, torch.Generator().manual_seed(10))
+    for end in (1.0, 0.5):
+        used = lens.with_theta_max(end * lens.theta_limit)
+        beyond = double(-1e-3, -1, -1e9, math.inf, -math.inf, math.nan).expand(4, -1)
+        # At the limit r may rise so steeply that it is known to 1e-9 only.
+        more = double(1.5, 1e6) if end == 1 else double(1 + 1e-9, 1.5, 1e6)
+        beyond = torch.cat((beyond, used.r_max[:, None] * more), 1)
+        assert used.unproject(beyond).isnan().all()
+        assert used.unproject(used.r_max[:, None]).isfinite().all()
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_float32_finds_angles_that_land_where_they_were_asked_for(name):
+    """Near the limit, where r hardly rises, an angle is known no better; its radius is."""
+    exact = random_lens(name, torch.Generator().manual_seed(8))
+    lens = exact.with_theta_max(0.999 * exact.theta_limit).to(torch.float32)
+    radius = lens.project(lens.theta_max[:, None] * torch.linspace(0.01, 1, 200))
+    error = (lens.project(lens.unproject(radius)) - radius).abs()
+    # Rounding of θ, where r is steep, and of r.
+    allowed = torch.finfo(torch.float32).eps * (8 * radius + 4 * 3.2 * lens._slope(
+        lens.theta_max[:, None] * torch.linspace(0.01, 1, 200)))  # fmt: skip
+    assert (error <= allowed).all()
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_second_and_third_derivatives(name):
+    lens = random_lens(name, torch.Generator().manual_seed(7), (0.8, 3))[0]
+    lens = lens.with_theta_max(0.7 * lens.theta_limit)
+    names = [n for n in (*lens.parameters, *lens.optional) if getattr(lens, n) is not None]
+
+    def run(x, *values, direction):
+        return getattr(lens.replace(**dict(zip(names, values, strict=True))), direction)(x)
+
+    theta = (lens.theta_max * double(0.52, 0.83)).requires_grad_()
+    radius = lens.project(theta).detach().requires_grad_()
+    for x, direction in ((theta, "project"), (radius, "unproject")):
+        values = [getattr(lens, n).clone().requires_grad_() for n in names]
+        assert torch.autograd.gradgradcheck(
+            lambda *a, direction=direction: run(*a, direction=direction), (x, *values), atol=1e-6
+        )
+
+        def second(value, x=x, rest=values[1:], direction=direction):
+            slope = run(x, value, *rest, direction=direction)
+            for _ in range(2):
+                (slope,) = torch.autograd.grad(
+                    slope.sum(), x, create_graph=True, materialize_grads=True
+                )
+            return slope
+
+        if second(values[0]).requires_grad:
+            assert torch.autograd.gradcheck(second, (values[0],), atol=1e-5)
+
+
+@pytest.mark.parametrize("name", MODELS)
 def test_float32(name):
     exact = random_lens(name, torch.Generator().manual_seed(8))
     exact = exact.with_theta_max(0.9 * exact.theta_limit)
@@ -317,6 +372,70 @@ def test_lenses_of_several_models_are_one_batch_of_curves():
         xi.grad, -10 * torch.sin(double(0.7)) / (0.5 + torch.cos(double(0.7))) ** 2,
         rtol=1e-5, atol=0,
     )  # fmt: skip
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_a_curve_is_its_lens_to_1e_7_of_the_largest_radius(name):
+    lens = random_lens(name, torch.Generator().manual_seed(3), (100, 1000))
+    steps = torch.linspace(0, 1, 20001, dtype=f64)
+    for part in (0.5, 0.99):
+        used = lens.with_theta_max(part * lens.theta_limit)
+        theta = used.theta_max[:, None] * steps
+        error = (as_curves(used).project(theta) - used.project(theta)).abs() / used.r_max[:, None]
+        if name == "OCamInverse":
+            error = error[:, 100:]  # r(0) is not 0 there
+        assert error.max() < (1e-3 if name == "Tabulated" else 1e-7)
+        curve, exact = as_curves(used.to(torch.float32)), used.project(theta)
+        error = (curve.project(theta.float()) - exact).abs() / used.r_max[:, None]
+        assert error.max() < (1e-3 if name == "Tabulated" else 1e-5)
+
+
+def test_mixed_ideal_lenses_in_one_batch_are_exact_to_1e_5_px():
+    ends = {
+        Perspective: 89.0,
+        Equidistant: 110,
+        Equisolid: 110,
+        Stereographic: 110,
+        Orthographic: 85,
+    }
+    lenses = [model(double(300.0), math.radians(end)) for model, end in ends.items()]
+    batch = stack(lenses)
+    theta = batch.theta_max[:, None] * torch.linspace(0, 1, 30001, dtype=f64)
+    exact = torch.cat([lens.project(t[None]) for lens, t in zip(lenses, theta, strict=True)])
+    error = (batch.project(theta) - exact).abs().amax(1)
+    assert error[1:].max() < 1e-6 and error[0] < 1e-4  # r_max is 17,187 px there
+    radius = exact[:, ::7]
+    torch.testing.assert_close(batch.unproject(radius), theta[:, ::7], rtol=0, atol=1e-8)
+
+
+def test_slopes_of_a_table_are_used_and_checked():
+    angles = torch.linspace(0, 1.5, 40, dtype=f64)
+    exact = Stereographic(double(200.0))
+    slopes = 200 / torch.cos(angles / 2) ** 2
+    lens = Tabulated(angles, exact.project(angles), slopes=slopes)
+    plain = Tabulated(angles, exact.project(angles))
+    theta = torch.linspace(0, 1.5, 1001, dtype=f64)
+    error, usual = (
+        (made.project(theta) - exact.project(theta)).abs().max() for made in (lens, plain)
+    )
+    assert error < 1e-5 < 1e-3 < usual
+    double_size = lens.resized(2).project(theta)
+    torch.testing.assert_close(double_size, 2 * lens.project(theta))
+    with pytest.raises(ValueError, match="slopes must be from 0 to 3 times the table's"):
+        Tabulated(angles, exact.project(angles), slopes=4 * slopes)
+    with pytest.raises(
+        ValueError, match=r"slopes must have the shape of angles and radii, \(1, 40"
+    ):
+        Tabulated(angles, exact.project(angles), slopes=slopes[:-1])
+
+
+def test_a_column_of_coefficients_is_not_many_lenses():
+    column = [[0.01], [0.002], [-0.001], [0.0003]]  # as OpenCV has its D
+    for make in (lambda: KannalaBrandt(300.0, column), lambda: KannalaBrandt([300.0], column)):
+        with pytest.raises(ValueError, match=r"radial of shape \(4, 1\) is 4 lenses of one coef"):
+            make()
+    assert len(KannalaBrandt([300.0] * 4, column)) == 4
+    assert len(KannalaBrandt(300.0, [[0.01]])) == 1
 
 
 def test_a_table_of_two_is_straight():
