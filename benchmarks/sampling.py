@@ -105,7 +105,8 @@ def sampling(size: int, batch: int, threads: int, seconds: float) -> list[Result
         {
             # The README's drop-in call.
             OURS: forward(
-                lambda image: polar_sample(image, *arguments, patch=(1, 1), layout="image"), [images]
+                lambda image: polar_sample(image, *arguments, patch=(1, 1), layout="image"),
+                [images],
             ),
             "F.grid_sample": forward(planes, [images]),
         },

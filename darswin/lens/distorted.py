@@ -175,6 +175,33 @@ class DistortedLens(Lens):
         bend = (before - 2 * least + after).clamp(min=torch.finfo(theta.dtype).tiny)
         return (least - (after - before) ** 2 / (8 * bend))[..., 0]
 
+    @staticmethod
+    def _slack(goal: Tensor) -> Tensor:
+        """(...): by how much rounding may let a ray miss points of the bent plane."""
+        return 1e3 * torch.finfo(goal.dtype).eps * (1 + length_of(goal))
+
+    def _find_points(self, goal: Tensor, start: Tensor, last: Tensor) -> Tensor:
+        """(N, ..., 2): points of the ideal plane whose place in the bent one is `goal`, if there is
+        one within `last`; from half as far out as `start`, where nothing is about to fold."""
+        last = last.flatten().expand(len(goal))
+        if torch.compiler.is_compiling():
+            end = self._row(1.1 * last, goal.dim() - 1)
+            return _newton(self._bent, self._bent_slopes, goal, start / 2, end, rounds=30)
+        azimuth = torch.arange(256, dtype=goal.dtype, device=goal.device) * (math.pi / 128)
+        circle = torch.stack((torch.cos(azimuth), torch.sin(azimuth)), -1)
+        start = start.expand_as(goal)
+        points = start.clone()
+        for k, end in enumerate(last):
+            lens = self[k % len(self)]
+            # Most pixels that no ray reaches lie beyond the rim: they are not looked for.
+            near = length_of(goal[k]) < 1.01 * length_of(lens._bent(end * circle)).max()
+            for share in (0.5, 0.0):  # where one way is blocked, another is not
+                points[k][near] = _newton(
+                    lens._bent, lens._bent_slopes, goal[k][near], share * start[k][near], 1.1 * end
+                )
+                near &= length_of(lens._bent(points[k]) - goal[k]) > self._slack(goal[k])
+        return points
+
     def _find_rays(self, flat: Tensor, theta: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
         """The rays that land at points before `affine`, by Newton's method in the ideal plane, from
         where they would be if nothing but the radial curve were. The last steps carry the
@@ -184,12 +211,10 @@ class DistortedLens(Lens):
         with torch.no_grad():
             last = self._plane(end)
             start = self._plane(torch.where(theta.isnan(), end, theta))[..., None] * direction
-            # From half as far out, where nothing is about to fold.
-            point = _newton(self._bent, self._bent_slopes, goal, start / 2, 1.1 * last)
-            eps = torch.finfo(flat.dtype).eps
-            lands = length_of(self._bent(point) - goal) < 1e3 * eps * (1 + length_of(goal))
-            # About to fold, it moves a ray by the root of what a pixel is off.
-            lands &= length_of(point) <= last * (1 + math.sqrt(eps))
+            point = self._find_points(goal, start, last)
+            lands = length_of(self._bent(point) - goal) < self._slack(goal)
+            # Where the map is about to fold, rounding moves a ray by the root of what it is.
+            lands &= length_of(point) <= last * (1 + math.sqrt(torch.finfo(flat.dtype).eps))
         # The principal point in place of what has no ray: NaN would reach the gradients.
         goal, point = (torch.where(lands[..., None], x, 0.0) for x in (goal, point))
         for _ in range(2):
@@ -200,7 +225,12 @@ class DistortedLens(Lens):
 
 
 def _newton(
-    function: Function, slopes: Function, goal: Tensor, point: Tensor, end: Tensor
+    function: Function,
+    slopes: Function,
+    goal: Tensor,
+    point: Tensor,
+    end: Tensor,
+    rounds: int = 60,
 ) -> Tensor:
     """Where a map of the plane takes the value `goal`.
 
@@ -209,23 +239,35 @@ def _newton(
 
     Args:
         function: (..., 2) → (..., 2). slopes: (..., 2) → (..., 2, 2), its derivatives.
-        goal, point: (..., 2). end: how far from the origin to look, broadcasts to (...).
+        goal, point: (n, 2), or any shape while compiling. end: how far from the origin to look.
     """
+    found, places = point.clone(), torch.arange(len(point), device=point.device)
     error = function(point) - goal
-    step = _solve(slopes(point), error)
-    missed, part = length_of(error), torch.ones_like(error[..., 0])
-    for _ in range(60):
+    step, missed, part = (
+        _solve(slopes(point), error),
+        length_of(error),
+        torch.ones_like(error[..., 0]),
+    )
+    for _ in range(rounds):
         trial = point - part[..., None] * step
         error, slope = function(trial) - goal, slopes(trial)
-        better = (length_of(error) < missed) & (_determinant(slope) > 0)
-        better &= length_of(trial) <= end
+        better = (length_of(error) < missed) & (_determinant(slope) > 0) & (length_of(trial) <= end)
         point = torch.where(better[..., None], trial, point)
         step = torch.where(better[..., None], _solve(slope, error), step)
         missed = torch.where(better, length_of(error), missed)
         part = torch.where(better, (2 * part).clamp(max=1), part / 4)
-        if not torch.compiler.is_compiling() and not (part > 1e-6).any():
-            break
-    return point
+        if torch.compiler.is_compiling():
+            continue  # no shape in a graph depends on values
+        found[places] = point
+        going = missed > 16 * torch.finfo(goal.dtype).eps * (1 + length_of(goal))
+        going &= part > 1e-6
+        if not going.any():
+            return found
+        places, goal, point, step, missed, part = (
+            x[going] for x in (places, goal, point, step, missed, part)
+        )
+    found[places] = point
+    return found
 
 
 def _determinant(matrix: Tensor) -> Tensor:
