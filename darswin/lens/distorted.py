@@ -189,8 +189,9 @@ class DistortedLens(Lens):
             return _newton(self._bent, self._bent_slopes, goal, start / 2, end, rounds=30)
         azimuth = torch.arange(256, dtype=goal.dtype, device=goal.device) * (math.pi / 128)
         circle = torch.stack((torch.cos(azimuth), torch.sin(azimuth)), -1)
-        start = start.expand_as(goal)
-        points = start.clone()
+        count, shape = len(goal), goal.shape
+        start = start.expand(shape).reshape(count, -1, 2)
+        goal, points = goal.reshape(count, -1, 2), start.clone()
         for k, end in enumerate(last):
             lens = self[k % len(self)]
             # Most pixels that no ray reaches lie beyond the rim: they are not looked for.
@@ -200,7 +201,7 @@ class DistortedLens(Lens):
                     lens._bent, lens._bent_slopes, goal[k][near], share * start[k][near], 1.1 * end
                 )
                 near &= length_of(lens._bent(points[k]) - goal[k]) > self._slack(goal[k])
-        return points
+        return points.reshape(shape)
 
     def _find_rays(self, flat: Tensor, theta: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
         """The rays that land at points before `affine`, by Newton's method in the ideal plane, from
