@@ -13,14 +13,31 @@ from darswin.ops import use_reference
 
 
 class _OfTensors(nn.Module):
-    """A model that takes its lens as tensors, by name; what is not given is the lens's own."""
+    """A model that takes its lens as tensors, by name; what is not given is the lens's own.
 
-    def __init__(self, model: nn.Module, lens: Lens | None):
+    Args:
+        any_strides: reads its inputs by the strides they come with, whatever the example's were.
+    """
+
+    def __init__(self, model: nn.Module, lens: Lens | None, any_strides: bool):
         super().__init__()
-        self.model, self.lens = model, lens
+        self.model, self.lens, self.any_strides = model, lens, any_strides
 
     def forward(self, images: Tensor, **tensors: Tensor) -> Tensor:
+        if self.any_strides:
+            images = _in_order(images)
+            tensors = {name: _in_order(tensor) for name, tensor in tensors.items()}
         return self.model(images, None if self.lens is None else self.lens.replace(**tensors))
+
+
+def _in_order(tensor: Tensor) -> Tensor:
+    """A contiguous copy, made by an operator that AOTInductor calls with the tensor itself.
+
+    Kernels that it writes take the example's strides for granted, and it drops a `clone` of what is
+    contiguous in the example. `masked_scatter` it leaves to torch, on the CPU.
+    """
+    copy = torch.empty_like(tensor, memory_format=torch.contiguous_format)
+    return copy.masked_scatter(torch.ones((), dtype=torch.bool, device=tensor.device), tensor)
 
 
 def export_program(
@@ -28,6 +45,7 @@ def export_program(
 ) -> ExportedProgram:
     """The graph of `model(images, lens)` for any batch size, with plain tensors as its inputs.
 
+    A package that AOTInductor makes of it for CPUs takes them expanded, cropped or transposed too.
     They are `images` and, by name, the tensors of the lens, one row an image: of a `Spherical` lens
     `program.module()(images, xi=xi, focal=focal, theta_max=theta_max)`, and `center` if it has one.
 
@@ -39,6 +57,12 @@ def export_program(
     Raises:
         ValueError: a model in training mode, or not one lens where it is to be fixed.
     """
+    return _program(model, images, lens, fixed_lens, any_strides=True)
+
+
+def _program(
+    model: nn.Module, images: Tensor, lens: Lens | None, fixed_lens: bool, any_strides: bool
+) -> ExportedProgram:
     if model.training:
         raise ValueError("model must be in eval mode, got one in training mode: call model.eval()")
     if fixed_lens and (lens is None or len(lens) != 1):
@@ -49,9 +73,10 @@ def export_program(
         tensors = {path[0].name: leaf for path, leaf in leaves if leaf is not None}
     for tensor in (images, *tensors.values()):
         torch._dynamo.mark_dynamic(tensor, 0)  # `dynamic_shapes` cannot name keyword arguments
+    module = _OfTensors(model, lens, any_strides)
     with torch.no_grad():
         # strict, as Python's own `len(lens)` would make the batch size a constant.
-        return torch.export.export(_OfTensors(model, lens), (images,), tensors, strict=True)
+        return torch.export.export(module, (images,), tensors, strict=True)
 
 
 def export_onnx(
@@ -71,7 +96,7 @@ def export_onnx(
     """
     # MATH, as other attention kernels of torch lay out their result unlike their decomposition.
     with use_reference(), sdpa_kernel(SDPBackend.MATH):
-        program = export_program(model, images, lens, fixed_lens=fixed_lens)
+        program = _program(model, images, lens, fixed_lens, any_strides=False)
         torch.onnx.export(
             program, f=path, output_names=["logits"], external_data=False, verbose=False
         )

@@ -25,9 +25,12 @@ def short(name, **options):
 def batch_of(lens, count):
     """Images and lenses, and the lenses' tensors by name."""
     lens = lens[[k % len(lens) for k in range(count)]]
+    return torch.randn(count, 3, 32, 32), lens, tensors_of(lens)
+
+
+def tensors_of(lens):
     names = (*lens.parameters, "theta_max", "center")
-    tensors = {name: getattr(lens, name) for name in names if getattr(lens, name) is not None}
-    return torch.randn(count, 3, 32, 32), lens, tensors
+    return {name: getattr(lens, name) for name in names if getattr(lens, name) is not None}
 
 
 @pytest.mark.parametrize(
@@ -58,23 +61,39 @@ ELSEWHERE = """
 import sys, torch
 torch.ops.load_library(sys.argv[1])
 model = torch._inductor.aoti_load_package("model.pt2")
-for count in (1, 5):
-    images, tensors, logits = torch.load(f"{count}.pt")
+for name, (images, tensors, logits) in torch.load("calls.pt").items():
     tensors = dict(reversed(tensors.items()))  # by name, in any order
-    torch.testing.assert_close(model(images, **tensors), logits, rtol=1e-4, atol=1e-6)
+    torch.testing.assert_close(
+        model(images, **tensors), logits, rtol=1e-4, atol=1e-5, msg=lambda m: name + m
+    )
 assert "darswin" not in sys.modules
 """
 
 
 def test_package_in_a_process_without_the_package(tmp_path):
-    model = short("darswin_a_nano")
-    program = export_program(model, *batch_of(SPHERICAL, 1)[:2])
+    model = short("darswin_a_nano", mean=0.5, std=0.2)
+    lens = Spherical.from_fov([0.3, 0.6, 0.9], 2.6, 16.0)
+    frames = torch.randint(256, (3, 32, 40, 3), dtype=torch.uint8)
+    program = export_program(model, frames, lens)
     torch._inductor.aoti_compile_and_package(program, package_path=str(tmp_path / "model.pt2"))
-    for count in (1, 5):
-        images, lens, tensors = batch_of(SPHERICAL, count)
+    shared = {name: t[:1].expand(3) for name, t in tensors_of(lens).items()}
+    columns = dict(
+        zip(tensors_of(lens), torch.stack((*tensors_of(lens).values(),), 1).unbind(1), strict=True)
+    )
+    large = torch.randint(256, (4, 3, 70, 52), dtype=torch.uint8)
+    crop = large.permute(0, 2, 3, 1)[1:, 3:67:2, 5:45]
+    assert not crop.is_contiguous() and not columns["xi"].is_contiguous()
+    calls = {
+        "as it was made": (frames, tensors_of(lens)),
+        "one image": (frames[1:2], tensors_of(lens[1])),
+        "one lens, expanded": (frames, shared),
+        "one image, expanded": (frames[:1].expand(3, -1, -1, -1), tensors_of(lens)),
+        "columns of a table, crops of a picture": (crop, columns),
+    }
+    for name, (images, tensors) in calls.items():
         with torch.no_grad():
-            logits = model(images, lens)
-        torch.save((images, tensors, logits), tmp_path / f"{count}.pt")
+            calls[name] = (images, tensors, model(images, Spherical(**tensors)))
+    torch.save(calls, tmp_path / "calls.pt")
     command = [sys.executable, "-c", ELSEWHERE, _C.__file__]
     run = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
     assert run.returncode == 0, run.stderr

@@ -122,6 +122,10 @@ class Lens:
         self._validate()
         self._set_theta_max()
 
+    def __setattr__(self, name: str, value: object) -> None:
+        # What is compiled ahead of time may take memory in order, whatever the strides.
+        super().__setattr__(name, value.contiguous() if isinstance(value, Tensor) else value)
+
     def _check_frame(self) -> None:
         for name, shape in (("center", (2,)), ("affine", (2, 2)), ("image_size", (2,))):
             tensor = getattr(self, name)

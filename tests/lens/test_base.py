@@ -200,6 +200,35 @@ def test_indexing_and_stacking():
         stack([lens[0], Spherical(0.1, 1.0, 1.0)])
 
 
+@pytest.mark.parametrize("name", LENSES)
+def test_tensors_are_contiguous_however_a_lens_was_made(name):
+    lens = LENSES[name].replace(image_size=torch.full((1, 2), 64.0, dtype=f64).expand(4, 2))
+    made = {
+        "built": lens,
+        "reversed": lens[torch.arange(3, -1, -1)],
+        "every second": lens[::2],
+        "expanded": lens[0].expand(3),
+        "narrowed": lens.with_theta_max(0.2),
+        "resized": lens.resized((48, 64)),
+        "halved": lens.resized(0.5),
+        "cropped": lens.cropped(3, 5, 20, 40),
+        "replaced": lens[:2].replace(theta_max=lens.theta_max[:1].expand(2)),
+        "stacked": stack([lens, lens]),
+        "float32": lens.to(torch.float32),
+    }
+    for how, other in made.items():
+        for tensor in pytree.tree_leaves(other):
+            assert tensor is None or tensor.is_contiguous(), how
+
+
+def test_strided_parameters_make_contiguous_lenses():
+    table = torch.tensor([[0.3, 300.0, 1.4], [0.9, 320.0, 1.5]], requires_grad=True)
+    lens = Spherical(*table.unbind(1), center=table[:, :2].detach().t().flip(0).t())
+    assert all(t is None or t.is_contiguous() for t in pytree.tree_leaves(lens))
+    lens.r_max.sum().backward()
+    assert (table.grad[:, 1] != 0).all()  # still the parameters that were given
+
+
 def test_principal_point():
     lens = Spherical(0.1, 10.0, 1.0)
     assert lens.center_in((5, 8)).tolist() == [[3.5, 2.0]]  # (H, W) in, (x, y) out
