@@ -136,6 +136,17 @@ def check_lens(lens: Lens, images: Tensor) -> None:
             )
 
 
+def check_dtype(images: Tensor, dtype: torch.dtype) -> None:
+    """TypeError unless the images are uint8 or of a model's dtype, or autocast makes them so."""
+    if images.dtype in (torch.uint8, dtype):
+        return
+    autocast = torch.is_autocast_enabled(images.device.type)
+    if not autocast or torch.float64 in (images.dtype, dtype):
+        raise TypeError(
+            f"images must be uint8, or {dtype} as the model's weights are, got {images.dtype}"
+        )
+
+
 class Pixels(nn.Module):
     """The images of a model of fixed size, as (B, C, H, W) in floating point.
 
@@ -158,8 +169,8 @@ class Pixels(nn.Module):
         self.image_size, self.in_chans = tuple(image_size), in_chans
         self.mean, self.std = per_channel("mean", mean, in_chans), per_channel("std", std, in_chans)
 
-    def forward(self, images: Tensor) -> Tensor:
-        """(B, C, H, W), or uint8 (B, H, W, 3) → (B, C, H, W)."""
+    def forward(self, images: Tensor, dtype: torch.dtype = torch.float32) -> Tensor:
+        """(B, C, H, W), or uint8 (B, H, W, 3) → (B, C, H, W), of uint8 in `dtype`."""
         images = check_images(images)
         check_channels(images, self.in_chans)
         if images.shape[2:] != self.image_size:
@@ -167,7 +178,10 @@ class Pixels(nn.Module):
                 f"images must have the model's image_size, (H, W) = {self.image_size}, "
                 f"got {tuple(images.shape[2:])}"
             )
-        return normalized(images, self.mean, self.std) if images.dtype == torch.uint8 else images
+        if images.dtype != torch.uint8:
+            return images
+        exact = torch.promote_types(dtype, torch.float32)
+        return normalized(images, self.mean, self.std, exact).to(dtype)
 
     def extra_repr(self) -> str:
         return f"image_size={self.image_size}, mean={self.mean}, std={self.std}"
@@ -195,6 +209,7 @@ class PatchProjection(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """(B, H, W, D) → (B, H/p, W/p, D')."""
+        check_dtype(x, self.proj.weight.dtype)
         return self.norm(self.proj(x.permute(0, 3, 1, 2)).permute(0, 2, 3, 1))
 
 
@@ -224,11 +239,19 @@ class PolarPatchEmbed(nn.Module):
         self.norm = nn.LayerNorm(embed_dim)
 
     def forward(self, images: Tensor, grid: PolarGrid) -> Tensor:
-        """(B, C, H, W) → (B, R, A, D)."""
+        """(B, C, H, W), uint8 or of the weights' dtype → (B, R, A, D)."""
         check_channels(images, self.in_chans)
-        tokens = polar_embed(
-            **self.sample.arguments(images, grid), weight=self.proj.weight, bias=self.proj.bias
-        )
+        weight, bias = self.proj.weight, self.proj.bias
+        check_dtype(images, weight.dtype)
+        if images.dtype == torch.uint8 and weight.dtype == torch.float64:
+            mean, std = (
+                per_channel(name, getattr(self.sample, name), self.in_chans)
+                for name in ("mean", "std")
+            )
+            images = normalized(images, mean, std, weight.dtype)  # the operator would use float32
+        tokens = polar_embed(**self.sample.arguments(images, grid), weight=weight, bias=bias)
+        if weight.dtype == torch.bfloat16:
+            tokens = tokens.bfloat16()  # of uint8 images they are float32
         return self.norm(tokens)
 
 

@@ -19,6 +19,7 @@ class Encoder(nn.Module):
 
     num_features: int
     stages: nn.ModuleList
+    products: Products = "torch"  # see `set_products`
 
     def _finish(self, num_classes: int) -> None:
         """Makes what ends a model, and initialises it."""
@@ -27,9 +28,16 @@ class Encoder(nn.Module):
         self.apply(_init_weights)
 
     def reset_classifier(self, num_classes: int) -> None:
-        """A new head for `num_classes` classes; 0 leaves it out."""
+        """A new head for `num_classes` classes; 0 leaves it out.
+
+        It has the dtype, the device and the products (see `set_products`) of the model.
+        """
         self.num_classes = num_classes
-        self.head = Linear(self.num_features, num_classes) if num_classes else nn.Identity()
+        self.head = nn.Identity()
+        if num_classes:
+            like = dict(device=self.norm.weight.device, dtype=self.norm.weight.dtype)
+            self.head = Linear(self.num_features, num_classes, **like).train(self.training)
+            self.head.products = self.products
         _init_weights(self.head)
 
     def no_weight_decay(self) -> set[str]:
@@ -44,6 +52,7 @@ class Encoder(nn.Module):
         """
         if products not in PRODUCTS:
             raise ValueError(f"products must be one of {PRODUCTS}, got {products!r}")
+        self.products = products
         for module in self.modules():
             if isinstance(module, Linear):
                 module.products = products
@@ -146,7 +155,8 @@ class ImageEncoder(Encoder):
         return images
 
     def _stage_maps(self, images: Tensor, lens: Lens | None) -> list[Tensor]:
-        x = self._view(self.pixels(images), lens)
+        dtype = next(self.patch_embed.parameters()).dtype
+        x = self._view(self.pixels(images, dtype), lens)
         x = self.patch_embed(x.permute(0, 2, 3, 1))
         maps = []
         for stage in self.stages:

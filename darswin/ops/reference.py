@@ -59,10 +59,16 @@ def _jittered(
     return moved.clamp(min=0), azimuths + v * (2 * math.pi / columns)
 
 
-def normalized(image: Tensor, mean: Sequence[float], std: Sequence[float]) -> Tensor:
-    """`(pixel/255 - mean) / std` of a uint8 image (B, C, H, W), in float32; a value a channel."""
-    m, s = (torch.tensor(v, device=image.device).reshape(-1, 1, 1) for v in (mean, std))
-    return (image / 255 - m) / s
+def normalized(
+    image: Tensor,
+    mean: Sequence[float],
+    std: Sequence[float],
+    dtype: torch.dtype = torch.float32,
+) -> Tensor:
+    """`(pixel/255 - mean) / std` of a uint8 image (B, C, H, W), in `dtype`; a value a channel."""
+    values = torch.tensor([mean, std], device=image.device, dtype=dtype)
+    m, s = values[..., None, None]
+    return (image.to(dtype) / 255 - m) / s
 
 
 def polar_sample(

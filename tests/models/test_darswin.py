@@ -317,3 +317,61 @@ def test_bfloat16_model():
     with torch.autocast("cpu", dtype=torch.bfloat16):
         half = model(images, lens)
     torch.testing.assert_close(half.float(), expected, rtol=0.1, atol=0.05)
+
+
+FAMILIES = ["darswin_a", "darswin_ra", "swin", "swin_undis", "dat"]
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-6), (torch.bfloat16, 0.03)])
+def test_camera_frames_in_models_of_any_dtype(family, dtype, tolerance):
+    options = dict(num_classes=5, mean=(0.485, 0.456, 0.406), std=0.25)
+    model = create_model(f"{family}_nano", **options).eval()
+    frames = torch.randint(256, (2, 32, 32, 3), dtype=torch.uint8)
+    with torch.no_grad():
+        expected = model(frames, LENS)
+        got = model.to(dtype)(frames, LENS)
+    assert got.dtype == dtype
+    assert (got.float() - expected).norm() <= tolerance * expected.norm()
+
+
+def test_camera_frames_are_as_exact_as_a_float64_model():
+    mean, std = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
+    frames = torch.randint(256, (2, 3, 32, 32), dtype=torch.uint8)
+    m, s = torch.tensor([mean, std], dtype=torch.float64)[..., None, None]
+    for family in FAMILIES:
+        model = create_model(f"{family}_nano", num_classes=5, mean=mean, std=std).double().eval()
+        with torch.no_grad():
+            got, expected = model(frames, LENS), model((frames.double() / 255 - m) / s, LENS)
+        torch.testing.assert_close(got, expected, rtol=1e-12, atol=1e-14, msg=family)
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_images_of_another_dtype_than_the_models(family):
+    model = create_model(f"{family}_nano", num_classes=5).eval()
+    pairs = [
+        (torch.bfloat16, torch.float32),
+        (torch.float64, torch.float32),
+        (torch.float32, torch.bfloat16),
+        (torch.float32, torch.float64),
+    ]
+    for ours, theirs in pairs:
+        message = f"images must be uint8, or {ours} as the model's weights are, got {theirs}"
+        with pytest.raises(TypeError, match=message):
+            model.to(ours)(images().to(theirs), LENS)
+    with torch.no_grad(), torch.autocast("cpu", dtype=torch.bfloat16):
+        for dtype in (torch.float32, torch.bfloat16):  # autocast makes them equal
+            assert model.float()(images().to(dtype), LENS).dtype == torch.bfloat16
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_a_new_classifier_is_of_the_models_kind(family):
+    model = create_model(f"{family}_nano", num_classes=5).bfloat16().eval()
+    model.set_products("onednn")
+    for classes in (7, 0, 3):
+        model.reset_classifier(classes)
+    assert model.head.products == "onednn" and not model.head.training
+    frames = torch.randint(256, (2, 32, 32, 3), dtype=torch.uint8)
+    assert model(frames, LENS).dtype == torch.bfloat16 and model(frames, LENS).shape == (2, 3)
+    model.to("meta").reset_classifier(4)
+    assert model.head.weight.device.type == "meta"
