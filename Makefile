@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/installed
 
-.PHONY: help build demo test test-isa test-asan fuzz lint format bench study learned-lens readme dist clean
+.PHONY: help build demo test test-lowest test-isa test-asan fuzz lint format bench study learned-lens readme dist clean
 
 help:  ## this list
 	@grep -E '^[a-z-]+:.*##' Makefile | sed -E 's/:.*## /\t/' | expand -t 12
@@ -24,6 +24,20 @@ demo: build  ## train on digits through mild lenses, test on all, draw pictures 
 
 test: build  ## all tests
 	$(BIN)/python -m pytest
+
+# Everything that pyproject.toml declares, at its lowest version, but for torch.
+LOWEST := .venv-lowest
+
+$(LOWEST)/installed: pyproject.toml requirements.txt tests/lowest.py
+	$(PYTHON) -m venv --clear $(LOWEST)
+	$(LOWEST)/bin/python tests/lowest.py > $(LOWEST)/requirements.txt
+	$(LOWEST)/bin/pip install -q --only-binary :all: -r $(LOWEST)/requirements.txt
+	@touch $@
+
+test-lowest: build $(LOWEST)/installed  ## the commands, files, pictures and ONNX with the oldest libraries allowed
+	PYTHONPATH=$(CURDIR) $(LOWEST)/bin/python -m pytest -q tests/data tests/models/test_saving.py \
+	  tests/test_predict.py tests/test_plot.py tests/test_views.py tests/lens/test_cli.py \
+	  tests/train/test_cli.py tests/test_export.py -k "not program and not package"
 
 test-isa: build  ## the operators' tests on every instruction-set tier of this machine
 	@set -e; for tier in $$($(BIN)/python -c 'from darswin import _C; print(*_C.tiers())'); do \

@@ -1,7 +1,8 @@
 """The command line: `darswin COMMAND`, or `python -m darswin COMMAND`."""
 
-import importlib.util
 import sys
+
+from darswin.extras import lack
 
 COMMANDS = {
     "fit": "trains a model",
@@ -13,8 +14,17 @@ COMMANDS = {
     "lens": "draws, describes or converts a calibrated lens",
     "bench": "measures how fast a model is on this machine, ten minutes",
 }
-# What a command imports beyond torch, if not Lightning, which brings all.
-NEEDS = {"models": (), "bench": (), "lens": ("cv2", "jsonargparse", "matplotlib")}
+# The modules of the extra `train` that a command imports, if not all of them.
+TRAIN = (
+    "PIL", "cv2", "jsonargparse", "lightning", "matplotlib", "sklearn", "tensorboard",
+    "torchmetrics",
+)  # fmt: skip
+NEEDS = {
+    "models": (),
+    "bench": (),
+    "convert": ("jsonargparse",),
+    "lens": ("cv2", "jsonargparse", "matplotlib"),
+}
 
 
 def main(argv: list[str] | None = None) -> None:
@@ -28,8 +38,8 @@ def main(argv: list[str] | None = None) -> None:
         return
     if command not in COMMANDS:
         raise SystemExit(f"darswin: no command {command!r}; there are {', '.join(COMMANDS)}")
-    if any(importlib.util.find_spec(name) is None for name in NEEDS.get(command, ("lightning",))):
-        raise SystemExit("darswin: this needs more packages: pip install 'darswin[train]'")
+    if (without := lack("train", NEEDS.get(command, TRAIN))) is not None:
+        raise SystemExit(f"darswin {command}: {without}")
     try:
         _run(command, argv)
     except (OSError, ValueError, FloatingPointError) as error:

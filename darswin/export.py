@@ -8,6 +8,7 @@ from torch.export import ExportedProgram
 from torch.nn.attention import SDPBackend, sdpa_kernel
 from torch.utils import _pytree as pytree
 
+from darswin.extras import lack
 from darswin.lens import Lens
 from darswin.ops import use_reference
 
@@ -89,11 +90,16 @@ def export_onnx(
 ) -> None:
     """Writes the graph of `export_program` as one ONNX file, by the operators' reference.
 
-    Inputs are named as there, the output is `logits`. Needs `pip install 'darswin[onnx]'`.
+    Inputs are named as there, the output is `logits`.
 
     Args:
         path: of the file; it holds the weights too. Others, and errors: as `export_program`.
+
+    Raises:
+        ModuleNotFoundError: onnx or onnxscript is not installed.
     """
+    if (without := lack("onnx", ("onnx", "onnxscript"))) is not None:
+        raise ModuleNotFoundError(without)
     # MATH, as other attention kernels of torch lay out their result unlike their decomposition.
     with use_reference(), sdpa_kernel(SDPBackend.MATH):
         program = _program(model, images, lens, fixed_lens, any_strides=False)

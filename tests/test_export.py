@@ -1,5 +1,6 @@
 """Exported models compute what the model does, at other batch sizes, and without `darswin`."""
 
+import importlib.util
 import subprocess
 import sys
 
@@ -124,6 +125,16 @@ def test_onnx(name, options, lens, tmp_path):
             expected = model(images, lenses)
         error = (torch.from_numpy(logits) - expected).abs().max()
         assert error <= 1e-4 * expected.abs().max()
+
+
+def test_what_is_missing_is_named_with_packages_that_exist(monkeypatch):
+    found = importlib.util.find_spec
+    monkeypatch.setattr(
+        importlib.util, "find_spec", lambda name: None if name == "onnxscript" else found(name)
+    )
+    expected = "^onnxscript missing; .*: pip install 'onnx>=1.18' 'onnxscript>=0.5.4'$"
+    with pytest.raises(ModuleNotFoundError, match=expected):
+        export_onnx(short("swin_nano"), "model.onnx", torch.zeros(1, 3, 32, 32))
 
 
 def test_errors():
