@@ -33,6 +33,7 @@ class DarSwin(Encoder):
         rings, sectors: R and A. samples: (S_r, S_φ).
         variant: "A" has windows and merging along azimuth, "RA" along radius and azimuth.
         window: (M_r, M_φ) where the map is large enough; None means (1, 16) for A, (4, 4) for RA.
+        merges: (m_r, m_φ) before each stage but the first; None means (1, 4) for A, (2, 2) for RA.
         mlp_ratio: hidden width of the MLPs over D. drop_path_rate: of the last block; linear.
         spacing, sample_spacing, placement: as `darswin.grid.polar_grid`. "radius" for both is a
             model without lens knowledge, "radius" for the samples alone samples uniformly.
@@ -42,6 +43,16 @@ class DarSwin(Encoder):
         mean, std: of uint8 images, which count as `(pixel/255 - mean) / std`; others ignore them.
         compat: "official" reproduces the authors' released DarSwin-A: its sampling grid, masks,
             shifts and bias angles. Overrides spacing, sample_spacing, placement and jitter.
+
+    Rotation:
+        In eval mode a turn of a square image about the principal point by 90° turns the maps by a
+        quarter of their sectors, exactly up to rounding, and leaves the logits as they are, where
+        in each stage that quarter is a whole number of windows; of tokens, if the window spans the
+        ring and its bias is periodic, as `periodic_bias` makes it (those of "angular" and "polar"
+        are). So it is for RA of every size; with half turns for "darswin_a_nano"; but not for the A
+        of four stages, whose last one has a single token in a ring. It is for
+        `merges=((1, 4), (1, 4), (4, 1))`, whose last map is 4×4, and for "darswin_a_nano" with
+        `merges=((1, 4), (4, 1)), window=(1, 8)`.
 
     Raises:
         ValueError: sizes that windows or merging do not divide, or an unknown option.
@@ -62,6 +73,7 @@ class DarSwin(Encoder):
         samples: Pair = (10, 10),
         variant: Literal["A", "RA"] = "A",
         window: Pair | None = None,
+        merges: Sequence[Pair] | None = None,
         mlp_ratio: float = 4.0,
         drop_path_rate: float = 0.2,
         spacing: Spacing = "theta",
@@ -82,9 +94,11 @@ class DarSwin(Encoder):
             raise ValueError(
                 f"compat must be None, or 'official' with variant 'A'; got {compat!r}, {variant!r}"
             )
+        if compat and merges is not None:
+            raise ValueError("compat='official' has merges of its own: leave them out")
         check_depths(depths, num_heads)
         window = window or ((1, 16) if variant == "A" else (4, 4))
-        plans = plan_stages(rings, sectors, len(depths), variant, window)
+        plans = plan_stages(rings, sectors, len(depths), variant, window, merges)
         if compat:
             plans = [official.plan(plan, window) for plan in plans]
         self.in_chans = in_chans

@@ -7,6 +7,7 @@ from typing import Literal
 from torch import Tensor, nn
 
 from darswin.layers import Block, PatchMerging
+from darswin.ops.checks import check_pair
 
 Pair = tuple[int, int]
 
@@ -29,9 +30,16 @@ class StagePlan:
 
 
 def plan_stages(
-    rings: int, sectors: int, count: int, variant: Literal["A", "RA"], window: Pair
+    rings: int,
+    sectors: int,
+    count: int,
+    variant: Literal["A", "RA"],
+    window: Pair,
+    merges: Sequence[Pair] | None = None,
 ) -> list[StagePlan]:
     """The stages' sizes; ValueError where a window or a merging does not divide its map.
+
+    `merges` are those before each stage but the first; None means those of the variant.
 
     A window keeps its number of tokens when an axis runs out. DarSwin-A merges 4 along azimuth,
     once the ring is used up along the radius; it shifts by a quarter window along azimuth, or,
@@ -39,11 +47,16 @@ def plan_stages(
     half the window along both axes. There is no shift along an axis that one window spans. Swin's
     sizes, with rows and columns for rings and sectors, are those of DarSwin-RA.
     """
+    if merges is not None and len(merges) != count - 1:
+        raise ValueError(
+            f"merges must have one entry for each stage but the first, {count - 1}, got {merges}"
+        )
     plans: list[StagePlan] = []
     size, merge = (rings, sectors), None
     for stage in range(count):
         if stage > 0:
-            merge = _merging(size, variant, stage)
+            choices = merges[stage - 1 : stage] if merges else _merges_of(variant, size)
+            merge = _merging(size, choices, stage)
             size = (size[0] // merge[0], size[1] // merge[1])
         fitted = _fit_window(window, size)
         if size[0] % fitted[0] or size[1] % fitted[1]:
@@ -55,9 +68,13 @@ def plan_stages(
     return plans
 
 
-def _merging(size: Pair, variant: str, stage: int) -> Pair:
-    choices = [(2, 2)] if variant == "RA" else [(1, 4), (4, 1)] if size[1] < 4 else [(1, 4)]
+def _merges_of(variant: str, size: Pair) -> Sequence[Pair]:
+    return [(2, 2)] if variant == "RA" else [(1, 4), (4, 1)] if size[1] < 4 else [(1, 4)]
+
+
+def _merging(size: Pair, choices: Sequence[Pair], stage: int) -> Pair:
     for merge in choices:
+        merge = check_pair("merges", merge, lowest=1)
         if size[0] % merge[0] == 0 and size[1] % merge[1] == 0:
             return merge
     raise ValueError(

@@ -3,7 +3,7 @@ import math
 import pytest
 import torch
 
-from darswin import DarSwin, PolarSample, create_model, list_models
+from darswin import PolarSample, create_model, list_models
 from darswin.lens import Perspective, Polynomial, Spherical
 from darswin.models.stages import plan_stages
 from darswin.ops import use_reference
@@ -29,6 +29,18 @@ def test_stage_plan_of_darswin_a():
         ((16, 16), (1, 16), (0, 0)),
         ((16, 4), (4, 4), (2, 0)),
         ((16, 1), (16, 1), (0, 0)),
+    ]
+
+
+def test_stage_plan_of_given_merges():
+    assert plans(16, 64, 4, "A", (1, 16), ((1, 4), (1, 4), (4, 1)))[2:] == [
+        ((16, 4), (4, 4), (2, 0)),
+        ((4, 4), (4, 4), (0, 0)),
+    ]
+    assert plans(8, 32, 3, "A", (1, 8), [[1, 4], [4, 1]]) == [
+        ((8, 32), (1, 8), (0, 2)),
+        ((8, 8), (1, 8), (0, 0)),
+        ((2, 8), (1, 8), (0, 0)),
     ]
 
 
@@ -166,18 +178,51 @@ def test_empty_batch():
     out.sum().backward()
 
 
-def test_turning_the_image_turns_the_maps():
-    # A quarter turn is 16 sectors of 64: a window of stage 1, 4 tokens of stage 2, one of stage 3.
-    model = DarSwin(10, 3, 16, (2, 2, 2), (1, 2, 4), periodic_bias=True, drop_path_rate=0.0).eval()
-    x = images(1, 48, 48)
-    lens = Spherical.from_fov(0.4, 2.6, 24.0)
-    # Azimuth runs from right to down, clockwise on the screen.
-    turned = x.rot90(-1, (2, 3))
+EVEN = dict(periodic_bias=True)
+LAST_ALONG_RADIUS = EVEN | dict(merges=((1, 4), (1, 4), (4, 1)))
+NANO_EVEN = EVEN | dict(merges=((1, 4), (4, 1)), window=(1, 8))
+SHORT = dict(embed_dim=16, depths=(2, 2, 2, 2), num_heads=(1, 2, 4, 8))
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "exact"),
+    [  # the turns, in quarters, that the features follow exactly
+        ("darswin_ra_nano", EVEN, {1, 2, 3}),
+        ("darswin_ra_micro", EVEN, {1, 2, 3}),
+        ("darswin_ra_tiny", EVEN | SHORT, {1, 2, 3}),
+        ("darswin_ra_small", EVEN | SHORT, {1, 2, 3}),
+        ("darswin_ra_micro", {}, set()),
+        ("darswin_ra_micro", dict(position_bias="angular"), {1, 2, 3}),
+        ("darswin_a_nano", EVEN, {2}),
+        ("darswin_a_nano", NANO_EVEN, {1, 2, 3}),
+        ("darswin_a_micro", EVEN, set()),
+        ("darswin_a_tiny", EVEN | SHORT, set()),
+        ("darswin_a_small", EVEN | SHORT, set()),
+        ("darswin_a_micro", LAST_ALONG_RADIUS, {1, 2, 3}),
+        ("darswin_a_tiny", LAST_ALONG_RADIUS | SHORT, {1, 2, 3}),
+        ("darswin_a_small", LAST_ALONG_RADIUS | SHORT, {1, 2, 3}),
+        ("darswin_a_micro", dict(merges=LAST_ALONG_RADIUS["merges"]), set()),
+    ],
+)
+def test_turning_the_image_turns_the_features(name, options, exact):
+    model = create_model(name, num_classes=10, **options).eval()
     with torch.no_grad():
+        for parameter_name, parameter in model.named_parameters():
+            if "position_bias" in parameter_name:
+                parameter.normal_()  # as small as they begin they hide what they break
+        x, lens = images(1, 48, 48), Spherical.from_fov(0.4, 2.6, 24.0)
         maps = model.forward_intermediates(x, lens, intermediates_only=True)
-        after = model.forward_intermediates(turned, lens, intermediates_only=True)
-    for before, later, tokens in zip(maps, after, (16, 4, 1), strict=True):
-        torch.testing.assert_close(later, before.roll(tokens, 2), rtol=1e-3, atol=1e-4)
+        logits = model(x, lens)
+        for turns in (1, 2, 3):
+            # Azimuth runs from right to down, clockwise on the screen.
+            turned = x.rot90(-turns, (2, 3))
+            others = model.forward_intermediates(turned, lens, intermediates_only=True)
+            change = (model(turned, lens) - logits).norm() / logits.norm()
+            assert change <= 1e-5 if turns in exact else change >= 1e-2, (turns, change)
+            if turns in exact:
+                for before, later in zip(maps, others, strict=True):
+                    tokens = before.shape[2] * turns // 4
+                    torch.testing.assert_close(later, before.roll(tokens, 2), rtol=1e-3, atol=1e-4)
 
 
 def test_another_lens_shows_the_same_tokens():
@@ -274,6 +319,10 @@ def test_autocast():
         (dict(num_heads=(5, 5, 5)), "num_heads must divide"),
         (dict(drop_path_rate=1.0), "drop path must be"),
         (dict(sectors=30), "window"),
+        (dict(merges=((1, 4),)), "merges must have one entry for each stage but the first, 2, got"),
+        (dict(merges=((1, 4), (3, 1))), r"a map of \(8, 8\) cannot be merged by \(3, 1\)"),
+        (dict(merges=((1, 4), (0, 1))), "merges must be at least 1"),
+        (dict(compat="official", merges=((1, 4), (4, 1))), "has merges of its own"),
     ],
 )
 def test_constructor_errors(options, message):
