@@ -6,7 +6,7 @@ from pathlib import Path
 
 import torch
 
-from darswin import lens
+from darswin import create_model, lens, list_models
 
 ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text()
@@ -40,3 +40,27 @@ def test_tables_are_those_of_the_results():
     for name, table in readme.tables().items():
         assert readme.placed(name, table) in README, name
         assert "not run" not in table
+
+
+def parameters(name: str, **options) -> int:
+    with torch.device("meta"):
+        return sum(p.numel() for p in create_model(name, **options).parameters())
+
+
+def test_parameter_counts_are_those_of_the_models():
+    counted = re.search(r"with (\d+) classes:\n\n\| \| (.*) \|\n.*\n((?:\| `.*\n)+)", README)
+    classes, sizes, rows = int(counted[1]), counted[2].split(" | "), counted[3].splitlines()
+    told = set()
+    for row in rows:
+        names, *counts = row.strip("| ").split(" | ")
+        for family in re.findall(r"`(\w+)_\*`", names):
+            for size, count in zip(sizes, counts, strict=True):
+                told.add(name := f"{family}_{size}")
+                assert parameters(name, num_classes=classes) == int(count.replace(",", "")), name
+    assert told == set(list_models())
+
+
+def test_the_demos_model_is_as_large_as_it_says():
+    (millions,) = re.findall(r"`darswin_a_nano` \(([\d.]+) M parameters", README)
+    count = parameters("darswin_a_nano", num_classes=10, in_chans=1)
+    assert round(count / 1e6, len(millions.partition(".")[2])) == float(millions)
