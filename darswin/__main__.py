@@ -2,6 +2,8 @@
 
 import importlib.util
 import sys
+import warnings
+from collections.abc import Callable
 
 COMMANDS = {
     "fit": "trains a model",
@@ -31,7 +33,9 @@ def main(argv: list[str] | None = None) -> None:
     if any(importlib.util.find_spec(name) is None for name in NEEDS.get(command, ("lightning",))):
         raise SystemExit("darswin: this needs more packages: pip install 'darswin[train]'")
     try:
-        _run(command, argv)
+        with warnings.catch_warnings():
+            warnings.showwarning = _one_line(warnings.showwarning)
+            _run(command, argv)
     except (OSError, ValueError, FloatingPointError) as error:
         # A worker process puts its whole traceback into the message; the last line is the error's.
         message = str(error).strip().splitlines()[-1] if "Traceback" in str(error) else str(error)
@@ -41,6 +45,20 @@ def main(argv: list[str] | None = None) -> None:
         ):
             message += " (--data.skip_broken true leaves such files out)"
         raise SystemExit(f"darswin: {message}") from error
+
+
+def _one_line(show: Callable[..., None]) -> Callable[..., None]:
+    """Shows our own warnings in one line, each once, as errors are; others as `show` does."""
+    said = set()
+
+    def shown(message: Warning, category: type[Warning], *where, **options) -> None:
+        if not category.__module__.startswith("darswin."):
+            show(message, category, *where, **options)
+        elif str(message) not in said:
+            said.add(str(message))
+            print(f"darswin: {message}", file=sys.stderr)
+
+    return shown
 
 
 def _run(command: str, argv: list[str]) -> None:
