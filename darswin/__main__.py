@@ -32,10 +32,9 @@ def main(argv: list[str] | None = None) -> None:
         raise SystemExit(f"darswin: no command {command!r}; there are {', '.join(COMMANDS)}")
     if any(importlib.util.find_spec(name) is None for name in NEEDS.get(command, ("lightning",))):
         raise SystemExit("darswin: this needs more packages: pip install 'darswin[train]'")
+    warnings.showwarning = _one_line(warnings.showwarning)
     try:
-        with warnings.catch_warnings():
-            warnings.showwarning = _one_line(warnings.showwarning)
-            _run(command, argv)
+        _run(command, argv)
     except (OSError, ValueError, FloatingPointError) as error:
         # A worker process puts its whole traceback into the message; the last line is the error's.
         message = str(error).strip().splitlines()[-1] if "Traceback" in str(error) else str(error)

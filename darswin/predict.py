@@ -16,7 +16,7 @@ from darswin.data.wide_angle import IMAGENET_MEAN, IMAGENET_STD
 from darswin.files import replace_file
 from darswin.lens import Lens, load
 from darswin.lens.files import loads
-from darswin.lens.orientation import TURNS, turned
+from darswin.lens.orientation import in_upright_picture, stored_size
 from darswin.models.saving import ModelCard, NoCardError, load_model, model_of_run
 
 
@@ -59,11 +59,15 @@ def predict(
         for name in pictures:
             try:
                 image, orientation = read_oriented(name, net.in_chans)
-                size = image.shape[:2]
-                taken_with = calibration(stored_size(size, orientation))
-                taken_with = lens_of_picture(name, taken_with, size, orientation)
             except BrokenImageError as error:
                 bad.append(str(error))
+                continue
+            size = image.shape[:2]
+            calibrated = calibration(stored_size(size, orientation))
+            try:
+                taken_with = in_upright_picture(calibrated, size, orientation)
+            except ValueError as error:
+                bad.append(f"{name}: {error}")
                 continue
             image, taken_with = resized(net, card, image, taken_with)
             with torch.inference_mode():
@@ -128,37 +132,6 @@ def read_lens(lens: str, image_size: tuple[int, int], camera: str | None = None)
     """
     read = loads if lens.lstrip().startswith("{") else load
     return read(lens, camera=camera, image_size=image_size)
-
-
-def stored_size(size: tuple[int, int], orientation: int) -> tuple[int, int]:
-    """(H, W) of a picture as stored, from that of the upright one."""
-    return size[::-1] if TURNS[orientation][0] else size
-
-
-def lens_of_picture(
-    name: str, calibrated: Lens, size: tuple[int, int], orientation: int = 1
-) -> Lens:
-    """The lens of a picture that may be resized from the calibration's, and was turned upright.
-
-    A calibration is of pixels as cameras store them, unless only the upright picture is of its
-    shape: then it is of upright pictures.
-
-    Args:
-        name: of the picture. size: (H, W), upright. orientation: EXIF's, what it was turned from.
-
-    Raises:
-        BrokenImageError: a picture of another shape than the calibration's.
-    """
-    stored = stored_size(size, orientation)
-    try:
-        found = turned(calibrated.in_picture(stored), orientation)
-    except ValueError as error:
-        said = "" if orientation == 1 else f" (it has the EXIF orientation {orientation})"
-        try:
-            found = calibrated.in_picture(size)
-        except ValueError:
-            raise BrokenImageError(f"{name}: {error}{said}") from error
-    return found.replace(center=found.center_in())
 
 
 def resized(net: nn.Module, card: ModelCard, image: np.ndarray, lens: Lens) -> tuple[Tensor, Lens]:

@@ -139,7 +139,7 @@ def hold_out(
 
 def class_of(path: str) -> str:
     """The first folder of a path."""
-    return Path(path).parts[0]
+    return path.split(os.sep, 1)[0]
 
 
 def _classes(paths: Iterable[str]) -> list[str]:
@@ -226,7 +226,8 @@ def _pictures(folder: Path, names: list[str] | None, seen: dict[str, str], whole
             )
         if files and not read:
             _say(f"{by_name[name]} holds files, but no pictures: it is no class")
-        paths += sorted((os.path.relpath(file, folder) for file in read), key=_parts)
+        start = len(str(by_name[name])) - len(name)
+        paths += sorted((file[start:] for file in read), key=_parts)
         others += unread
     if others:
         _say(
@@ -354,7 +355,7 @@ def _listed(root: Path, lists: Path) -> dict[Split, Pictures]:
                 raise ValueError(
                     f"{lists}: {name!r} must hold paths CLASS/… below {root}, got {path!r}"
                 )
-        given[split] = Pictures(root, paths)
+        given[split] = Pictures(root, [os.path.normpath(path) for path in paths])
     return given
 
 

@@ -1,4 +1,7 @@
-"""The lens of a picture that was turned upright, as its EXIF orientation says."""
+"""The lens of a picture that was turned upright, as its EXIF orientation says.
+
+A calibration is of pixels as the camera stores them; pictures are read upright.
+"""
 
 from darswin.lens.base import Lens
 
@@ -14,6 +17,34 @@ TURNS = {
     7: (True, True, True),
     8: (True, False, True),
 }
+
+
+def stored_size(size: tuple[int, int], orientation: int) -> tuple[int, int]:
+    """(H, W) of a picture as stored, from that of the upright one."""
+    return size[::-1] if TURNS[orientation][0] else size
+
+
+def in_upright_picture(lens: Lens, size: tuple[int, int], orientation: int) -> Lens:
+    """The lens in a picture that shows all that it was calibrated with, and was turned upright.
+
+    Where only the upright picture has the calibration's shape, the calibration is of such pictures.
+
+    Args:
+        lens: one that has an image_size. size: (H, W), upright. orientation: EXIF's, 1 to 8.
+
+    Raises:
+        ValueError: a picture of another shape than the calibration's.
+    """
+    try:
+        return turned(lens.in_picture(stored_size(size, orientation)), orientation)
+    except ValueError as error:
+        try:
+            return lens.in_picture(size)
+        except ValueError:
+            turn = (
+                "" if orientation == 1 else f" (as stored; its EXIF orientation is {orientation})"
+            )
+            raise ValueError(f"{error}{turn}") from error
 
 
 def turned(lens: Lens, orientation: int) -> Lens:

@@ -145,6 +145,15 @@ def test_a_test_set_that_is_a_link_to_validation(tmp_path):
     assert [len(part) for part in opened(tmp_path).values()] == [20, 4, 4]
 
 
+def test_the_folder_one_is_in(tmp_path, monkeypatch):
+    pictures(tmp_path / "train", "a", "b/c")
+    pictures(tmp_path / "val", "a", "b", count=1)
+    for folder, path in ((tmp_path, "."), (tmp_path / "train", "../train"), (tmp_path, "train")):
+        monkeypatch.chdir(folder)
+        source = open_source(path, "train")
+        assert source.classes == ["a", "b"] and all(map(os.path.exists, files(source)))
+
+
 def test_every_class_of_a_list_has_pictures(tmp_path):
     pictures(tmp_path, "a", "b")
     (tmp_path / "c").mkdir()
