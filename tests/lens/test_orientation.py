@@ -7,7 +7,16 @@ import torch
 from hypothesis import given
 from PIL import ExifTags, Image, ImageOps
 
-from darswin.lens import MODELS, BrownConrady, Equidistant, Fisheye624, KannalaBrandt, Mei
+from darswin.lens import (
+    MODELS,
+    BrownConrady,
+    Equidistant,
+    Fisheye624,
+    KannalaBrandt,
+    Mei,
+    cli,
+    save,
+)
 from darswin.lens.base import Lens
 from darswin.lens.distorted import DistortedLens
 from darswin.lens.orientation import in_upright_picture, stored_size, turned
@@ -66,6 +75,26 @@ def test_every_model_that_moves_rays_aside_is_among_them():
     aside = {model for model in MODELS.values() if model.is_radial is not Lens.is_radial}
     assert aside == {KannalaBrandt, Fisheye624, Mei, BrownConrady}
     assert DistortedLens.optional == ("radial", "tangential", "prism")
+
+
+@pytest.mark.parametrize("orientation", [1, 3, 6])
+def test_a_lens_is_shown_in_the_picture_that_exif_turns(tmp_path, monkeypatch, orientation):
+    """The upright picture is drawn, with the lens turned as it was."""
+    lens = Equidistant(20.0, theta_max=1.3, center=(40.0, 20.0), image_size=(48, 64))
+    save(lens, tmp_path / "lens.json")
+    image = Image.new("RGB", (64, 48))
+    exif = Image.Exif()
+    exif[ExifTags.Base.Orientation] = orientation
+    image.save(tmp_path / "p.jpg", exif=exif)
+    drawn = []
+    monkeypatch.setattr(cli, "draw_lens", lambda picture, lens, *_: drawn.append((picture, lens)))
+    monkeypatch.setattr(cli, "save_figure", lambda *_: None)
+    cli.show(str(tmp_path / "lens.json"), str(tmp_path / "p.jpg"))
+    ((picture, seen),) = drawn
+    assert picture.shape[:2] == ((64, 48) if orientation == 6 else (48, 64))
+    expected = turned(lens, orientation)
+    torch.testing.assert_close(seen.center.float(), expected.center)
+    assert torch.equal(seen.image_size.float(), expected.image_size)
 
 
 def test_a_calibration_fits_the_stored_picture_or_else_the_upright_one():
