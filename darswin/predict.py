@@ -87,7 +87,7 @@ def predict(
             text = json.dumps(found, indent=1, ensure_ascii=False)
             print(text) if out is None else replace_file(out, text)
     if bad:
-        count = f"{len(bad)} of {len(pictures)} pictures have no answer:\n" if found else ""
+        count = f"no answer for {len(bad)} of {len(pictures)} pictures:\n" if found else ""
         raise BrokenImageError(count + "\n".join(bad))
     return found
 

@@ -23,13 +23,17 @@ LENS = {"model": "Spherical", "xi": 0.5, "fov": 2.8}
 
 @pytest.fixture
 def run(tmp_path):
+    return write_run(tmp_path)
+
+
+def write_run(folder):
     """A run's folder with an untrained model in it, and a picture."""
     options = dict(num_classes=6, in_chans=3, mean=[0.5] * 3, std=[0.25] * 3)
     card = ModelCard("darswin_a_nano", options, list("abcdef"), 32, 2.8)
-    save_model(tmp_path / "checkpoints" / "best.safetensors", card.create().state_dict(), card)
+    save_model(folder / "checkpoints" / "best.safetensors", card.create().state_dict(), card)
     picture = np.random.default_rng(0).integers(256, size=(64, 96, 3), dtype=np.uint8)
-    cv2.imwrite(str(tmp_path / "p.png"), picture)
-    return tmp_path
+    cv2.imwrite(str(folder / "p.png"), picture)
+    return folder
 
 
 def test_the_most_probable_classes(run, capsys):
@@ -124,7 +128,7 @@ def test_one_bad_picture_of_many(run, capsys):
     found = json.loads(capsys.readouterr().out)
     assert [answer["image"] for answer in found] == [good, good]
     first, *lines = str(caught.value).splitlines()
-    assert first == "darswin: 3 of 5 pictures have no answer:"
+    assert first == "darswin: no answer for 3 of 5 pictures:"
     for line, name in zip(lines, ("bad.jpg", "none.png", "small.png"), strict=True):
         assert name in line
     with pytest.raises(SystemExit):
@@ -132,6 +136,40 @@ def test_one_bad_picture_of_many(run, capsys):
     assert len(json.loads((run / "o.json").read_text())) == 1
     with pytest.raises(SystemExit, match=r"none\.json"):  # a lens that is wrong ends it at once
         main(["predict", good, bad, "--run", str(run), "--lens", "none.json"])
+
+
+@pytest.fixture(scope="module")
+def mixed(tmp_path_factory):
+    """A run, pictures that its lens fits, and others that have no answer."""
+    folder = tmp_path_factory.mktemp("mixed")
+    write_run(folder)
+    (folder / "broken.png").write_bytes(b"\x89PNG\r\n\x1a\n")
+    (folder / "folder.png").mkdir()
+    cv2.imwrite(str(folder / "q.png"), np.zeros((32, 48), np.uint8))
+    cv2.imwrite(str(folder / "square.png"), np.zeros((40, 40, 3), np.uint8))
+    return folder
+
+
+GOOD, BAD = ("p.png", "q.png"), ("broken.png", "folder.png", "square.png", "none.png")
+
+
+@given(st.lists(st.sampled_from(GOOD + BAD), min_size=1, max_size=6), st.integers(-3, 9))
+def test_every_picture_is_answered_or_named(mixed, pictures, top):
+    argv = [str(mixed / name) for name in pictures]
+    argv += ["--run", str(mixed), "--top", str(top), "--out", str(mixed / "out.json")]
+    argv += ["--lens", json.dumps(LENS | {"image_size": [64, 96]})]
+    good = [str(mixed / name) for name in pictures if name in GOOD and top > 0]
+    (mixed / "out.json").unlink(missing_ok=True)
+    if len(good) == len(pictures):
+        main(["predict", *argv])
+    else:
+        with pytest.raises(SystemExit) as caught:
+            main(["predict", *argv])
+        named = all(name in str(caught.value) for name in pictures if name in BAD)
+        assert named if top > 0 else "--top must be at least 1" in str(caught.value)
+    found = json.loads((mixed / "out.json").read_text()) if good else []
+    assert [answer["image"] for answer in found] == good
+    assert all(len(answer["top"]) == min(top, 6) for answer in found)
 
 
 @pytest.mark.parametrize("top", [0, -1])
@@ -147,10 +185,16 @@ COLMAP = """1 OPENCV_FISHEYE 96 64 40 40 48 32 0 0 0 0
 """
 
 
-def test_a_camera_that_is_called_by_a_number(run):
+def test_a_camera_that_is_called_by_a_number(run, capsys):
     (run / "cameras.txt").write_text(COLMAP)
+    picture, calibration = str(run / "p.png"), str(run / "cameras.txt")
     for name, focal in (("1", 40), ("2", 30), ("5", 20)):
-        assert read_lens(str(run / "cameras.txt"), (64, 96), name).focal.item() == focal
+        lens = read_lens(calibration, (64, 96), name)
+        assert lens.focal.item() == focal
+        save(lens, run / "lens.json")
+        (same,) = answers([picture, "--lens", str(run / "lens.json")], run, capsys)
+        argv = [picture, "--lens", calibration, "--camera", name]
+        assert close(answers(argv, run, capsys)[0], same)
 
 
 def exif_picture(path, orientation, stored):

@@ -234,14 +234,16 @@ def _pictures(folder: Path, names: list[str] | None, seen: dict[str, str], whole
             f"{folder} holds pictures that darswin does not read, {_kinds(others)}, e.g. "
             f"{others[0]}: left out"
         )
-    if whole and names and (missing := [n for n in names if n not in set(_classes(paths))]):
+    found = set(_classes(paths))
+    if whole and names and (missing := [name for name in names if name not in found]):
         raise FileNotFoundError(f"no pictures of the classes {_some(missing)} in {folder}")
     return Pictures(folder, paths)
 
 
 def _say_loose(folder: Path, files: list[Path]) -> None:
     if loose := [file for file in files if _is_picture(file)]:
-        _say(f"{folder} holds {len(loose)} pictures in no class's folder, {loose[0]}: left out")
+        count = f"{len(loose)}, e.g. {loose[0]}"
+        _say(f"{folder} holds pictures in no class's folder ({count}): left out")
 
 
 def _entries(folder: Path) -> tuple[list[Path], list[Path]]:

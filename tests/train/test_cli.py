@@ -116,7 +116,8 @@ def test_what_folders_leave_out_is_said_once_in_one_line(capsys, tmp_path):
     main([str(a) for a in (*fit, "--trainer.enable_progress_bar", "false")])
     said = [line for line in capsys.readouterr().err.splitlines() if "left out" in line]
     assert said == [
-        f"darswin: {tmp_path} holds 1 pictures in no class's folder, {tmp_path}/0.png: left out"
+        f"darswin: {tmp_path} holds pictures in no class's folder (1, e.g. {tmp_path}/0.png): "
+        "left out"
     ]
     again = [*fit, "--run", tmp_path / "again", "--data.limit", "-1"]
     assert "--data.limit must be at least 1, got -1" in error(capsys, *again)
