@@ -1,6 +1,8 @@
 """The command line: `darswin COMMAND`, or `python -m darswin COMMAND`."""
 
 import sys
+import warnings
+from collections.abc import Callable
 
 from darswin.extras import lack
 
@@ -40,6 +42,7 @@ def main(argv: list[str] | None = None) -> None:
         raise SystemExit(f"darswin: no command {command!r}; there are {', '.join(COMMANDS)}")
     if (without := lack("train", NEEDS.get(command, TRAIN))) is not None:
         raise SystemExit(f"darswin {command}: {without}")
+    warnings.showwarning = _one_line(warnings.showwarning)
     try:
         _run(command, argv)
     except (OSError, ValueError, FloatingPointError) as error:
@@ -51,6 +54,20 @@ def main(argv: list[str] | None = None) -> None:
         ):
             message += " (--data.skip_broken true leaves such files out)"
         raise SystemExit(f"darswin: {message}") from error
+
+
+def _one_line(show: Callable[..., None]) -> Callable[..., None]:
+    """Shows our own warnings in one line, each once, as errors are; others as `show` does."""
+    said = set()
+
+    def shown(message: Warning, category: type[Warning], *where, **options) -> None:
+        if not category.__module__.startswith("darswin."):
+            show(message, category, *where, **options)
+        elif str(message) not in said:
+            said.add(str(message))
+            print(f"darswin: {message}", file=sys.stderr)
+
+    return shown
 
 
 def _run(command: str, argv: list[str]) -> None:

@@ -6,20 +6,28 @@ means.
 """
 
 import gzip
-import hashlib
-import json
+import io
 import math
 import os
-from collections.abc import Iterable, Sequence
+import warnings
+import zlib
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Protocol
 
 import cv2
 import numpy as np
+from PIL import ExifTags, Image, UnidentifiedImageError
 
-Split = Literal["train", "val", "test"]
-SPLITS = ("train", "val", "test")
-SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff", ".ppm", ".pgm")
+from darswin.data.folders import (
+    SPLITS,
+    Split,
+    class_of,
+    hold_out,
+    pictures_of,
+    read_classes,
+)
+from darswin.lens.orientation import TURNS
 
 
 class BrokenImageError(OSError):
@@ -43,16 +51,64 @@ def read_image(path: str | Path, channels: int = 3) -> np.ndarray:
     Raises:
         BrokenImageError: a file that is missing, unreadable or no image; it names the file.
     """
+    return _decoded(_content(path), path, channels)
+
+
+def read_oriented(path: str | Path, channels: int = 3) -> tuple[np.ndarray, int]:
+    """`read_image`, and the EXIF orientation that it was turned from, which its lens needs.
+
+    Returns:
+        The upright picture, and 1 to 8; see `darswin.lens.orientation.turned`.
+
+    Raises:
+        BrokenImageError: as `read_image`; an orientation that cannot be read.
+    """
+    data = _content(path)
+    upright = _decoded(data, path, channels)
+    orientation, kind = _exif(data, path)
+    if orientation == 1 or kind == "TIFF":  # which OpenCV turns upright in any case
+        return upright, orientation
+    # Turned by our own hands: some versions of OpenCV do not turn every kind of file.
+    image = _decoded(data, path, channels, cv2.IMREAD_IGNORE_ORIENTATION)
+    swapped, *reversed_ = TURNS[orientation]
+    image = image.swapaxes(0, 1) if swapped else image
+    across, down = (slice(None, None, -1 if r else 1) for r in reversed_)
+    return np.ascontiguousarray(image[down, across]), orientation
+
+
+def _content(path: str | Path) -> np.ndarray:
     try:
-        data = np.fromfile(path, np.uint8)
+        return np.fromfile(path, np.uint8)
     except OSError as error:
         raise BrokenImageError(f"cannot read {path}: {error.strerror}") from error
-    image = None
-    if data.size:
-        image = cv2.imdecode(data, cv2.IMREAD_COLOR_RGB if channels == 3 else cv2.IMREAD_GRAYSCALE)
+
+
+def _decoded(data: np.ndarray, path: str | Path, channels: int, flags: int = 0) -> np.ndarray:
+    flags |= cv2.IMREAD_COLOR_RGB if channels == 3 else cv2.IMREAD_GRAYSCALE
+    try:
+        image = cv2.imdecode(data, flags) if data.size else None
+    except (cv2.error, MemoryError) as error:  # too many pixels for OpenCV, or for the memory
+        reason = getattr(error, "err", None) or "not enough memory"
+        raise BrokenImageError(
+            f"cannot read {path}: too many pixels for OpenCV, or damaged ({reason})"
+        ) from error
     if image is None:
         raise BrokenImageError(f"cannot read {path}: no image that OpenCV can decode")
     return image.reshape(*image.shape[:2], channels)
+
+
+def _exif(data: np.ndarray, path: str | Path) -> tuple[int, str | None]:
+    """The EXIF orientation, 1 where there is none, and Pillow's name of the file's format."""
+    try:
+        with warnings.catch_warnings(action="ignore"), Image.open(io.BytesIO(data)) as file:
+            orientation = file.getexif().get(ExifTags.Base.Orientation, 1)
+            return orientation if orientation in TURNS else 1, file.format
+    except UnidentifiedImageError:  # none of the formats that have EXIF
+        return 1, None
+    except Exception as error:  # EXIF that is no EXIF fails in many ways
+        raise BrokenImageError(
+            f"cannot read {path}: its EXIF orientation cannot be told, {error}"
+        ) from error
 
 
 def with_channels(image: np.ndarray, channels: int) -> np.ndarray:
@@ -114,6 +170,8 @@ class Part:
     """At most `count` of a source's pictures, chosen by a fixed shuffle."""
 
     def __init__(self, source: Source, count: int):
+        if count < 1:
+            raise ValueError(f"--data.limit must be at least 1, got {count}")
         self.source, self.classes = source, source.classes
         self.chosen = np.sort(np.random.default_rng(0).permutation(len(source))[:count])
 
@@ -140,11 +198,12 @@ def open_source(
     - "digits": scikit-learn's 1797 scanned digits of 8×8 pixels;
     - a folder of IDX files, the MNIST family: `train-images-idx3-ubyte[.gz]` and its three
       companions. "test" is its test set, "val" the last `holdout` of its training set;
-    - a folder of images, one folder a class; or `train/`, `val/` and `test/` folders of that kind
-      (without `test/`, "val" serves as the test set).
+    - a folder of images, one folder a class; or `train/`, `val/` (also `valid/`, `validation/`)
+      and `test/` folders of that kind. Links to folders are followed, hidden ones left out.
 
-    Where a set has no split of its own, "val" and "test" are `holdout` of each class each, chosen
-    by a hash of their names.
+    Without a test set, "val" serves as one. What has neither, or no "val", gets `holdout` of each
+    class of "train" for each, chosen by a hash of their names; at least one is left to train on.
+    Pictures that are in no split are said as `darswin.data.folders.LeftOut` warnings.
 
     Args:
         channels: 3 or 1, of the images that come out.
@@ -152,129 +211,39 @@ def open_source(
             folders to take and in which order. For IDX files and digits, the labels' names.
         splits: a JSON file `{"train": ["class/a.jpg", …], "val": …, "test": …}` with paths relative
             to `path`, or a folder of `train.txt`, `val.txt`, `test.txt` with one path a line. The
-            first folder of a path is its class.
+            first folder of a path is its class. A split without a list is held out.
         holdout: a share, in [0, 0.5).
 
     Raises:
-        FileNotFoundError: no such folder, or nothing in it. ValueError: lists that do not fit it.
+        FileNotFoundError: no such folder, or nothing in it. ValueError: folders whose meaning is
+            not clear, and lists that do not fit them; it names them.
     """
     if split not in SPLITS:
         raise ValueError(f"split must be one of {SPLITS}, got {split!r}")
     if not 0 <= holdout < 0.5:
         raise ValueError(f"holdout must be in [0, 0.5), got {holdout}")
-    names = None if classes is None else read_list(classes)
-    if str(path) == "digits":
-        return _digits(split, channels, names, holdout)
+    names = None if classes is None else read_classes(classes)
     root = Path(path)
-    if not root.is_dir():
+    digits = str(path) == "digits"
+    idx = not digits and _idx_file(root, "train-images-idx3-ubyte") is not None
+    if splits is not None and (digits or idx):
+        raise ValueError(f"--data.splits is for folders of images, and {path} is none")
+    if digits:
+        source = _digits(split, channels, names, holdout)
+    elif not root.is_dir():
         raise FileNotFoundError(f"no folder {root}")
-    if _idx_file(root, "train-images-idx3-ubyte"):
-        return _idx(root, split, channels, names, holdout)
-    return _folder(root, split, channels, names, splits, holdout)
-
-
-def read_list(path: str | Path) -> list[str]:
-    """Names from a text file, one a line, or from a JSON list."""
-    text = Path(path).read_text()
-    if Path(path).suffix != ".json":
-        return [line.strip() for line in text.splitlines() if line.strip()]
-    names = json.loads(text)
-    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
-        raise ValueError(f"{path} must hold a JSON list of names")
-    return names
-
-
-# -- folders ----------------------------------------------------------------------------------
-
-
-def _folder(
-    root: Path,
-    split: Split,
-    channels: int,
-    names: list[str] | None,
-    splits: str | Path | None,
-    holdout: float,
-) -> Source:
-    if splits is not None:
-        lists = {name: _listed(Path(splits), name) for name in SPLITS}
-        paths = lists[split]
-        names = names or _classes(path for part in lists.values() for path in part)
-    elif (root / "train").is_dir() and (root / "val").is_dir():
-        part = "val" if split == "test" and not (root / "test").is_dir() else split
-        training = _images_under(root / "train", names)
-        names = names or _classes(training)
-        root /= part
-        present = [name for name in names if (root / name).is_dir()]
-        paths = training if part == "train" else _images_under(root, present)
+    elif idx:
+        source = _idx(root, split, channels, names, holdout)
     else:
-        everything = _images_under(root, names)
-        names = names or _classes(everything)
-        labels = [Path(path).parts[0] for path in everything]
-        paths = [everything[k] for k in _held_out(labels, everything, split, holdout)]
-    if not paths:
+        pictures, names = pictures_of(split, root, names=names, lists=splits, holdout=holdout)
+        label = {name: k for k, name in enumerate(names)}
+        files = [(path, label[class_of(path)]) for path in pictures.paths]
+        return ImageFiles(pictures.folder, files, names, channels)
+    if not len(source):
         raise FileNotFoundError(
-            f"no images for the {split!r} split in {root}: darswin looks for ROOT/CLASS/*.jpg "
-            "(and png, bmp, webp, tif, ppm), or ROOT/train, ROOT/val and ROOT/test of that kind"
+            f"no images for the {split!r} split of {path}: --data.holdout {holdout:g} leaves none"
         )
-    index = {name: label for label, name in enumerate(names)}
-    unknown = sorted({Path(p).parts[0] for p in paths} - index.keys())
-    if unknown:
-        raise ValueError(f"images of {unknown[:5]}, which the list of classes does not name")
-    return ImageFiles(root, [(p, index[Path(p).parts[0]]) for p in paths], names, channels)
-
-
-def _classes(paths: Iterable[str]) -> list[str]:
-    """The first folders of paths."""
-    return sorted({Path(path).parts[0] for path in paths})
-
-
-def _images_under(root: Path, names: list[str] | None) -> list[str]:
-    """Paths "class/….jpg" below the root, sorted, of these classes or of all; no hidden ones."""
-    if names is None:
-        names = sorted(p.name for p in root.iterdir() if p.is_dir() and not _hidden(p.name))
-    missing = [name for name in names if not (root / name).is_dir()]
-    if missing:
-        raise FileNotFoundError(f"no folder for the classes {missing[:5]} in {root}")
-    return [
-        str(path.relative_to(root))
-        for name in names
-        for path in sorted((root / name).rglob("*"))
-        if path.suffix.lower() in SUFFIXES and not _hidden(path.name) and path.is_file()
-    ]
-
-
-def _hidden(name: str) -> bool:
-    return name.startswith(".")
-
-
-def _listed(splits: Path, split: Split) -> list[str]:
-    if splits.is_dir():
-        file = splits / f"{split}.txt"
-        return read_list(file) if file.exists() else []
-    lists = json.loads(splits.read_text())
-    if not isinstance(lists, dict) or not all(isinstance(v, list) for v in lists.values()):
-        raise ValueError(
-            f'{splits} must hold {{"train": [paths], "val": [paths], "test": [paths]}}'
-        )
-    return lists.get(split, [])
-
-
-def _held_out(labels: Sequence, keys: Sequence[str], split: Split, share: float) -> list[int]:
-    """Indices of a split where "val" and "test" take a share of each class.
-
-    Each class is shuffled by hashes of its keys, so that a picture more or less moves hardly any.
-    """
-    classes: dict[Any, list[int]] = {}
-    for index in sorted(
-        range(len(keys)), key=lambda k: hashlib.sha1(os.fsencode(keys[k])).digest()
-    ):
-        classes.setdefault(labels[index], []).append(index)
-    chosen = []
-    for members in classes.values():
-        count = math.ceil(share * len(members))
-        ends = dict(test=(0, count), val=(count, 2 * count), train=(2 * count, None))
-        chosen += members[slice(*ends[split])]
-    return sorted(chosen)
+    return source
 
 
 # -- IDX files and digits ---------------------------------------------------------------------
@@ -286,12 +255,15 @@ def _idx_file(root: Path, name: str) -> Path | None:
 
 def read_idx(path: Path) -> np.ndarray:
     """A file of unsigned bytes in the IDX format, gzipped or not; ValueError where it is none."""
-    with gzip.open(path) if path.suffix == ".gz" else path.open("rb") as file:
-        head = file.read(4)
-        if len(head) != 4 or head[:3] != b"\0\0\x08" or not 1 <= head[3] <= 4:
-            raise ValueError(f"{path} is no IDX file of unsigned bytes")
-        sizes = np.frombuffer(file.read(4 * head[3]), ">u4")
-        data = np.frombuffer(file.read(), np.uint8)
+    try:
+        with gzip.open(path) if path.suffix == ".gz" else path.open("rb") as file:
+            head = file.read(4)
+            if len(head) != 4 or head[:3] != b"\0\0\x08" or not 1 <= head[3] <= 4:
+                raise ValueError(f"{path} is no IDX file of unsigned bytes")
+            sizes = np.frombuffer(file.read(4 * head[3]), ">u4")
+            data = np.frombuffer(file.read(), np.uint8)
+    except (EOFError, gzip.BadGzipFile, zlib.error) as error:
+        raise ValueError(f"{path} is no whole gzip file: {error}") from error
     if len(sizes) != head[3] or data.size != math.prod(sizes.tolist()):
         raise ValueError(f"{path} says it holds {sizes.tolist()} bytes, but holds {data.size}")
     return data.reshape(sizes)
@@ -300,20 +272,28 @@ def read_idx(path: Path) -> np.ndarray:
 def _idx(
     root: Path, split: Split, channels: int, names: list[str] | None, holdout: float
 ) -> Source:
-    part = "t10k" if split == "test" else "train"
-    arrays = []
-    for kind in ("images-idx3", "labels-idx1"):
-        file = _idx_file(root, f"{part}-{kind}-ubyte")
-        if file is None:
-            raise FileNotFoundError(f"no {part}-{kind}-ubyte or .gz in {root}")
-        arrays.append(read_idx(file))
-    images, labels = arrays
+    labels = _idx_array(root, "train-labels-idx1-ubyte")
     names = names or [str(k) for k in range(int(labels.max(initial=0)) + 1)]
-    if split != "test":
+    if split == "test":
+        images = _idx_array(root, "t10k-images-idx3-ubyte")
+        labels = _idx_array(root, "t10k-labels-idx1-ubyte")
+    else:
+        images = _idx_array(root, "train-images-idx3-ubyte")
         kept = len(images) - math.ceil(holdout * len(images))
         part = slice(kept) if split == "train" else slice(kept, None)
         images, labels = images[part], labels[part]
+    if (last := int(labels.max(initial=0))) >= len(names):
+        raise ValueError(
+            f"{root} has labels up to {last} for the {split!r} split, but its classes are {names}"
+        )
     return Arrays(images, labels, names, channels)
+
+
+def _idx_array(root: Path, name: str) -> np.ndarray:
+    file = _idx_file(root, name)
+    if file is None:
+        raise FileNotFoundError(f"no {name} or .gz in {root}")
+    return read_idx(file)
 
 
 def _digits(split: Split, channels: int, names: list[str] | None, holdout: float) -> Source:
@@ -321,6 +301,7 @@ def _digits(split: Split, channels: int, names: list[str] | None, holdout: float
 
     digits = load_digits()
     labels = digits.target.tolist()
-    part = _held_out(labels, [str(k) for k in range(len(labels))], split, holdout)
+    parts = hold_out(labels, [str(k) for k in range(len(labels))], holdout, ("test", "val"))
+    part = parts[split]
     images = np.round(digits.images[part] * (255 / 16)).astype(np.uint8)
     return Arrays(images, digits.target[part], names or [str(k) for k in range(10)], channels)

@@ -8,10 +8,11 @@ from jsonargparse import auto_cli
 
 import darswin.lens
 from darswin import views
-from darswin.data.sources import read_image
+from darswin.data.sources import read_oriented
 from darswin.grid import Spacing
 from darswin.layers import PolarSample
 from darswin.lens.base import Lens
+from darswin.lens.orientation import in_upright_picture, stored_size
 from darswin.lens.report import describe
 from darswin.plot import draw_lens, save_figure
 
@@ -52,9 +53,10 @@ def show(
         camera: which one, in a file of several.
         coefficients: what they are, in an OpenCV or ROS file that does not say it.
     """
-    picture = read_image(image)
+    picture, orientation = read_oriented(image)
     size = picture.shape[:2]
-    lens = _load(calib, camera, theta_max_deg, size, coefficients).in_picture(size)
+    lens = _load(calib, camera, theta_max_deg, stored_size(size, orientation), coefficients)
+    lens = in_upright_picture(lens, size, orientation)
     sampler = PolarSample(rings, sectors, samples, spacing=spacing)
     across, down = _fields_of_view(lens, size)
     if fov_deg is None:

@@ -17,6 +17,10 @@ from darswin.models.registry import create_model
 _ENTRY = "darswin"  # of the metadata
 
 
+class NoCardError(ValueError):
+    """A safetensors file that does not say what model its weights are of."""
+
+
 @dataclass(frozen=True)
 class ModelCard:
     """What a model file says besides its weights.
@@ -61,7 +65,8 @@ def load_model(path: str | os.PathLike) -> tuple[nn.Module, ModelCard]:
     """The model of a file, in eval mode, and its card.
 
     Raises:
-        ValueError: no model file of darswin, or weights that are not those of its model.
+        NoCardError: other weights. ValueError: no model file of darswin, or weights that are not
+            those of its model.
     """
     try:
         with safe_open(path, "pt") as file:
@@ -70,7 +75,7 @@ def load_model(path: str | os.PathLike) -> tuple[nn.Module, ModelCard]:
     except SafetensorError as error:
         raise ValueError(f"{path} is no safetensors file: {error}") from error
     if entry is None:
-        raise ValueError(f"{path} holds weights, but not the name of their model")
+        raise NoCardError(f"{path} holds weights, but not the name of their model")
     try:
         values = json.loads(entry)
         card = ModelCard(**{f.name: values[f.name] for f in fields(ModelCard)})

@@ -1,11 +1,22 @@
 import gzip
 import json
+import struct
+import zlib
 
 import cv2
 import numpy as np
 import pytest
+from PIL import ExifTags, Image, ImageOps
 
-from darswin.data.sources import BrokenImageError, Part, open_source, read_idx, read_image
+from darswin.data import SphericalLenses, WideAngle
+from darswin.data.sources import (
+    BrokenImageError,
+    Part,
+    open_source,
+    read_idx,
+    read_image,
+    read_oriented,
+)
 
 
 def write_pictures(root, classes=("cat", "dog"), count=10, size=(6, 8)):
@@ -113,12 +124,31 @@ def test_idx_files(tmp_path, suffix):
     assert open_source(tmp_path, "test")[0][0].shape == (28, 28, 3)
 
 
+def test_the_classes_of_idx_files_are_those_of_training(tmp_path):
+    for part, labels in (("train", [0, 1, 2, 0]), ("t10k", [1, 0])):
+        write_idx(tmp_path / f"{part}-images-idx3-ubyte", np.zeros((len(labels), 2, 2), np.uint8))
+        write_idx(tmp_path / f"{part}-labels-idx1-ubyte", np.array(labels, np.uint8))
+    parts = [open_source(tmp_path, split) for split in ("train", "val", "test")]
+    assert [part.classes for part in parts] == [["0", "1", "2"]] * 3
+    (tmp_path / "names.txt").write_text("zero\none\n")
+    with pytest.raises(
+        ValueError, match=r"labels up to 2 for the 'train' split.*\['zero', 'one'\]"
+    ):
+        open_source(tmp_path, "train", classes=tmp_path / "names.txt")
+    write_idx(tmp_path / "t10k-labels-idx1-ubyte", np.array([7, 0], np.uint8))
+    with pytest.raises(ValueError, match="labels up to 7 for the 'test' split"):
+        open_source(tmp_path, "test")
+
+
 def test_a_cut_idx_file_is_named(tmp_path):
     write_idx(tmp_path / "a", np.zeros((4, 3, 3), np.uint8))
     whole = (tmp_path / "a").read_bytes()
     (tmp_path / "a").write_bytes(whole[:-1])
     with pytest.raises(ValueError, match=r"a says it holds \[4, 3, 3\] bytes, but holds 35"):
         read_idx(tmp_path / "a")
+    (tmp_path / "a.gz").write_bytes(gzip.compress(whole)[:-12])
+    with pytest.raises(ValueError, match=r"a\.gz is no whole gzip file"):
+        read_idx(tmp_path / "a.gz")
     (tmp_path / "a").write_bytes(b"GIF89a")
     with pytest.raises(ValueError, match="a is no IDX file"):
         read_idx(tmp_path / "a")
@@ -134,6 +164,10 @@ def test_a_part_is_a_sample_of_the_whole():
     whole = open_source("digits", "train", channels=1)
     part = Part(whole, 50)
     assert len(part) == 50 and len({part[k][1] for k in range(50)}) == 10
+    assert len(Part(whole, 10_000)) == len(whole)
+    for count in (0, -1):
+        with pytest.raises(ValueError, match=rf"--data\.limit must be at least 1, got {count}"):
+            Part(whole, count)
 
 
 @pytest.mark.parametrize("content", [b"", b"no picture", None])
@@ -142,6 +176,60 @@ def test_a_broken_picture_is_named(tmp_path, content):
         (tmp_path / "x.jpg").write_bytes(content)
     with pytest.raises(BrokenImageError, match=r"cannot read .*x\.jpg"):
         read_image(tmp_path / "x.jpg")
+
+
+def huge_png(path):
+    """60,000 × 60,000 pixels, says its header: more than OpenCV reads."""
+
+    def chunk(kind, data):
+        return (
+            struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+        )
+
+    header = struct.pack(">IIBBBBB", 60_000, 60_000, 8, 0, 0, 0, 0)
+    parts = chunk(b"IHDR", header), chunk(b"IDAT", zlib.compress(b"\0" * 1000)), chunk(b"IEND", b"")
+    path.write_bytes(b"\x89PNG\r\n\x1a\n" + b"".join(parts))
+
+
+def test_a_picture_that_is_too_large_is_named_and_can_be_skipped(tmp_path):
+    write_pictures(tmp_path, ("a", "b"), count=3)
+    huge_png(tmp_path / "a" / "00.png")
+    for read in (read_image, read_oriented):
+        with pytest.raises(BrokenImageError, match=r"cannot read .*00\.png: too many pixels"):
+            read(tmp_path / "a" / "00.png")
+    source = open_source(tmp_path, "train", holdout=0)
+    data = WideAngle(source, SphericalLenses(0, 1), size=8, render=8, skip_broken=True)
+    assert [data[k][2] for k in range(6)] == [-1, 0, 0, 1, 1, 1] and data.broken == [0]
+
+
+@pytest.mark.parametrize("channels", [1, 3])
+@pytest.mark.parametrize("suffix", ["jpg", "png", "webp", "tif"])
+def test_pictures_are_upright_whoever_reads_them(tmp_path, suffix, channels):
+    """Training and predicting read the same pixels, which Pillow turns the same way."""
+    pixels = np.kron(np.arange(6, dtype=np.uint8).reshape(2, 3) * 40, np.ones((16, 16), np.uint8))
+    for orientation in range(1, 9):
+        exif = Image.Exif()
+        exif[ExifTags.Base.Orientation] = orientation
+        path = tmp_path / f"{orientation}.{suffix}"
+        Image.fromarray(pixels).convert("RGB").save(path, exif=exif, quality=100)
+        with Image.open(path) as file:
+            upright = np.asarray(ImageOps.exif_transpose(file).convert("L"))
+        image, found = read_oriented(path, channels)
+        assert found == orientation and image.flags.c_contiguous
+        assert np.array_equal(image, read_image(path, channels))
+        assert np.abs(image.astype(int) - upright[..., None]).max() < 6
+
+
+@pytest.mark.parametrize(
+    "exif", [b"Exif\0\0nothing", b"Exif\0\0II*\0\xff\xff\xff\xff", b"Exif\0\0"]
+)
+def test_exif_that_is_none(tmp_path, exif):
+    Image.new("RGB", (8, 6)).save(tmp_path / "x.jpg", exif=exif)
+    try:
+        image, orientation = read_oriented(tmp_path / "x.jpg")
+        assert image.shape == (6, 8, 3) and orientation == 1
+    except BrokenImageError as error:
+        assert "x.jpg: its EXIF orientation cannot be told" in str(error)
 
 
 def test_grey_and_colour_files(tmp_path):

@@ -107,6 +107,22 @@ def test_a_broken_picture_is_named_in_one_line(capsys, tmp_path, workers):
     assert re.search(r"cannot read .*\.jpg: no image .*--data\.skip_broken true", message)
 
 
+def test_what_folders_leave_out_is_said_once_in_one_line(capsys, tmp_path):
+    for name in ("a", "b"):
+        write_pictures(tmp_path / name, 12)
+    write_pictures(tmp_path, 1)
+    fit = ["fit", "--run", tmp_path / "r", *DIGITS, "--data.path", tmp_path]
+    fit += ["--trainer.max_steps", "1", "--data.batch_size", "4", "--data.workers", "0"]
+    main([str(a) for a in (*fit, "--trainer.enable_progress_bar", "false")])
+    said = [line for line in capsys.readouterr().err.splitlines() if "left out" in line]
+    assert said == [
+        f"darswin: {tmp_path} holds pictures in no class's folder (1, e.g. {tmp_path}/0.png): "
+        "left out"
+    ]
+    again = [*fit, "--run", tmp_path / "again", "--data.limit", "-1"]
+    assert "--data.limit must be at least 1, got -1" in error(capsys, *again)
+
+
 def test_one_class_is_not_enough(capsys, tmp_path):
     write_pictures(tmp_path / "only", 12)
     message = error(capsys, "fit", "--run", tmp_path / "r", *DIGITS, "--data.path", tmp_path)
@@ -114,7 +130,7 @@ def test_one_class_is_not_enough(capsys, tmp_path):
 
 
 def write_pictures(folder, count):
-    folder.mkdir(parents=True)
+    folder.mkdir(parents=True, exist_ok=True)
     for k in range(count):
         cv2.imwrite(str(folder / f"{k}.png"), np.full((8, 8), 20 * k, np.uint8))
 

@@ -1,0 +1,79 @@
+"""The lens of a picture that was turned upright, as its EXIF orientation says.
+
+A calibration is of pixels as the camera stores them; pictures are read upright.
+"""
+
+from darswin.lens.base import Lens
+
+# EXIF's orientations: how a picture as stored becomes upright. x and y are swapped, then x runs the
+# other way, then y.
+TURNS = {
+    1: (False, False, False),
+    2: (False, True, False),
+    3: (False, True, True),
+    4: (False, False, True),
+    5: (True, False, False),
+    6: (True, True, False),
+    7: (True, True, True),
+    8: (True, False, True),
+}
+
+
+def stored_size(size: tuple[int, int], orientation: int) -> tuple[int, int]:
+    """(H, W) of a picture as stored, from that of the upright one."""
+    return size[::-1] if TURNS[orientation][0] else size
+
+
+def in_upright_picture(lens: Lens, size: tuple[int, int], orientation: int) -> Lens:
+    """The lens in a picture that shows all that it was calibrated with, and was turned upright.
+
+    Where only the upright picture has the calibration's shape, the calibration is of such pictures.
+
+    Args:
+        lens: one that has an image_size. size: (H, W), upright. orientation: EXIF's, 1 to 8.
+
+    Raises:
+        ValueError: a picture of another shape than the calibration's.
+    """
+    try:
+        return turned(lens.in_picture(stored_size(size, orientation)), orientation)
+    except ValueError as error:
+        try:
+            return lens.in_picture(size)
+        except ValueError:
+            turn = (
+                "" if orientation == 1 else f" (as stored; its EXIF orientation is {orientation})"
+            )
+            raise ValueError(f"{error}{turn}") from error
+
+
+def turned(lens: Lens, orientation: int) -> Lens:
+    """The lens of the upright picture, from that of the picture as it is stored; exact.
+
+    Args:
+        lens: one that has an image_size. orientation: EXIF's, 1 to 8.
+
+    Raises:
+        ValueError: another orientation, or a lens without an image_size.
+
+    Source: EXIF 2.3, tag 0x0112.
+    """
+    if orientation not in TURNS:
+        raise ValueError(f"an EXIF orientation must be 1 to 8, got {orientation}")
+    if lens.image_size is None:
+        raise ValueError("a lens that is turned with its picture needs an image_size")
+    swapped, *reversed_ = TURNS[orientation]
+    turn = lens.theta_max.new_tensor([[1, 0], [0, 1]])
+    turn = turn.flip(0) if swapped else turn
+    turn = turn * turn.new_tensor([[-1.0 if r else 1.0] for r in reversed_])
+    size = lens.image_size.flip(1) if swapped else lens.image_size
+    off_middle = lens.center_in() - (lens.image_size.flip(1) - 1) / 2
+    changed = {"image_size": size, "center": off_middle @ turn.T + (size.flip(1) - 1) / 2}
+    if lens.affine is not None:
+        changed["affine"] = turn @ lens.affine @ turn.T
+    # What moves rays aside are vectors: (p₂, p₁), (s₁, s₃) and (s₂, s₄).
+    if getattr(lens, "tangential", None) is not None:
+        changed["tangential"] = (lens.tangential.flip(1) @ turn.T).flip(1)
+    if getattr(lens, "prism", None) is not None:
+        changed["prism"] = (turn @ lens.prism.unflatten(1, (2, 2))).flatten(1)
+    return lens.replace(**changed)

@@ -1,0 +1,113 @@
+"""Lenses that turn with their picture."""
+
+import hypothesis.strategies as st
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from PIL import ExifTags, Image, ImageOps
+
+from darswin.lens import (
+    MODELS,
+    BrownConrady,
+    Equidistant,
+    Fisheye624,
+    KannalaBrandt,
+    Mei,
+    cli,
+    save,
+)
+from darswin.lens.base import Lens
+from darswin.lens.distorted import DistortedLens
+from darswin.lens.orientation import in_upright_picture, stored_size, turned
+
+f64 = torch.float64
+SIZE = (5, 7)
+
+
+def where_pixels_went(orientation: int) -> torch.Tensor:
+    """(H, W, 2): x and y, as stored, of the pixels of the picture that Pillow turns upright."""
+    y, x = np.mgrid[: SIZE[0], : SIZE[1]].astype(np.uint8)
+    image = Image.fromarray(np.stack((x, y, y), -1))
+    image.getexif()[ExifTags.Base.Orientation] = orientation
+    return torch.from_numpy(np.asarray(ImageOps.exif_transpose(image))[..., :2].astype(np.float64))
+
+
+def from_stored(points: torch.Tensor, orientation: int) -> torch.Tensor:
+    """Upright places (..., 2) of places as stored: the affine map through Pillow's pixels."""
+    went = where_pixels_went(orientation)
+    height, width = went.shape[:2]
+    corner, right, down = went[0, 0], went[0, 1] - went[0, 0], went[1, 0] - went[0, 0]
+    assert torch.equal(
+        went[height - 1, width - 1], corner + (width - 1) * right + (height - 1) * down
+    )
+    return (points - corner) @ torch.linalg.inv(torch.stack((right, down)))
+
+
+terms = st.floats(-0.02, 0.02)
+lenses = st.builds(
+    lambda model, center, affine, p, s: model(
+        **({"xi": torch.tensor(0.8, dtype=f64)} if model is Mei else {}),
+        focal=torch.tensor(2.0, dtype=f64), radial=[0.01, -0.002], theta_max=1.1, center=center,
+        affine=affine, tangential=p, prism=s, image_size=SIZE,
+    ),
+    st.sampled_from([KannalaBrandt, Fisheye624, Mei, BrownConrady]),
+    st.none() | st.tuples(st.floats(0, 6), st.floats(0, 4)),
+    st.sampled_from([None, [[1.0, 0.1], [-0.05, 0.9]]]),
+    st.none() | st.tuples(terms, terms),
+    st.none() | st.tuples(terms, terms, terms, terms),
+)  # fmt: skip
+
+
+@given(lenses, st.integers(1, 8), st.floats(0.01, 1.1), st.floats(-3.1, 3.1))
+def test_a_ray_lands_where_its_pixel_went(lens, orientation, theta, azimuth):
+    upright = turned(lens, orientation)
+    assert stored_size(tuple(upright.image_size[0].int().tolist()), orientation) == SIZE
+    direction = torch.tensor([[np.cos(azimuth), np.sin(azimuth)]], dtype=f64)
+    origin = torch.zeros(2, dtype=f64)
+    turn = from_stored(direction, orientation) - from_stored(origin, orientation)
+    theta = torch.tensor([theta], dtype=f64)
+    expected = from_stored(lens.pixels(theta, direction), orientation)
+    torch.testing.assert_close(upright.pixels(theta, turn), expected, atol=1e-9, rtol=0)
+
+
+def test_every_model_that_moves_rays_aside_is_among_them():
+    aside = {model for model in MODELS.values() if model.is_radial is not Lens.is_radial}
+    assert aside == {KannalaBrandt, Fisheye624, Mei, BrownConrady}
+    assert DistortedLens.optional == ("radial", "tangential", "prism")
+
+
+@pytest.mark.parametrize("orientation", [1, 3, 6])
+def test_a_lens_is_shown_in_the_picture_that_exif_turns(tmp_path, monkeypatch, orientation):
+    """The upright picture is drawn, with the lens turned as it was."""
+    lens = Equidistant(20.0, theta_max=1.3, center=(40.0, 20.0), image_size=(48, 64))
+    save(lens, tmp_path / "lens.json")
+    image = Image.new("RGB", (64, 48))
+    exif = Image.Exif()
+    exif[ExifTags.Base.Orientation] = orientation
+    image.save(tmp_path / "p.jpg", exif=exif)
+    drawn = []
+    monkeypatch.setattr(cli, "draw_lens", lambda picture, lens, *_: drawn.append((picture, lens)))
+    monkeypatch.setattr(cli, "save_figure", lambda *_: None)
+    cli.show(str(tmp_path / "lens.json"), str(tmp_path / "p.jpg"))
+    ((picture, seen),) = drawn
+    assert picture.shape[:2] == ((64, 48) if orientation == 6 else (48, 64))
+    expected = turned(lens, orientation)
+    torch.testing.assert_close(seen.center.float(), expected.center)
+    assert torch.equal(seen.image_size.float(), expected.image_size)
+
+
+def test_a_calibration_fits_the_stored_picture_or_else_the_upright_one():
+    lens = Equidistant(20.0, theta_max=1.3, center=(40.0, 20.0), image_size=(48, 64))
+    assert in_upright_picture(lens, (64, 48), 6).center.tolist() == [[27.0, 40.0]]
+    assert in_upright_picture(lens, (48, 64), 3).center.tolist() == [[23.0, 27.0]]
+    assert in_upright_picture(lens, (24, 32), 3).center.tolist() == [[11.25, 13.25]]
+    assert torch.equal(in_upright_picture(lens, (48, 64), 6).center, lens.center)
+    with pytest.raises(
+        ValueError, match=r"not of that shape \(as stored; its EXIF orientation is 8"
+    ):
+        in_upright_picture(lens, (50, 50), 8)
+    with pytest.raises(ValueError, match="orientation must be 1 to 8, got 9"):
+        turned(lens, 9)
+    with pytest.raises(ValueError, match="needs an image_size"):
+        turned(Equidistant(20.0), 6)
