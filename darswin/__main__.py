@@ -1,8 +1,12 @@
 """The command line: `darswin COMMAND`, or `python -m darswin COMMAND`."""
 
+import argparse
+import codecs
+import json
+import os
 import sys
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 from darswin.extras import lack
 
@@ -27,24 +31,31 @@ NEEDS = {
     "convert": ("jsonargparse",),
     "lens": ("cv2", "jsonargparse", "matplotlib"),
 }
+# For terminals that know no more than ASCII.
+PLAIN = {"°": "deg", "×": "x", "±": "+/-", "–": "-", "…": "...", "²": "^2", "θ": "theta",
+         "φ": "phi", "ξ": "xi", "π": "pi", "α": "alpha"}  # fmt: skip
 
 
 def main(argv: list[str] | None = None) -> None:
     """Runs a command; what a user can mend is said in one line, without a traceback."""
     argv = sys.argv[1:] if argv is None else argv
     command = argv[0] if argv else "--help"
+    print_anywhere({} if command == "predict" else PLAIN)  # which prints JSON, to be read again
     if command in ("-h", "--help"):
         print("usage: darswin COMMAND [OPTIONS]\n")
         print("\n".join(f"  {name:<10}{text}" for name, text in COMMANDS.items()))
         print("\n`darswin COMMAND --help` lists its options.")
         return
     if command not in COMMANDS:
-        raise SystemExit(f"darswin: no command {command!r}; there are {', '.join(COMMANDS)}")
+        raise misuse(f"no command {command!r}; there are {', '.join(COMMANDS)}")
     if (without := lack("train", NEEDS.get(command, TRAIN))) is not None:
         raise SystemExit(f"darswin {command}: {without}")
     warnings.showwarning = _one_line(warnings.showwarning)
     try:
         _run(command, argv)
+        sys.stdout.flush()
+    except BrokenPipeError:  # `darswin lens info … | head`: who reads has enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except (OSError, ValueError, FloatingPointError) as error:
         # A worker process puts its whole traceback into the message; the last line is the error's.
         message = str(error).strip().splitlines()[-1] if "Traceback" in str(error) else str(error)
@@ -53,7 +64,33 @@ def main(argv: list[str] | None = None) -> None:
             "lens",
         ):
             message += " (--data.skip_broken true leaves such files out)"
-        raise SystemExit(f"darswin: {message}") from error
+        if isinstance(error, FloatingPointError):
+            raise SystemExit(f"darswin: {message}") from error
+        raise misuse(message) from error
+
+
+def misuse(message: str) -> SystemExit:
+    """Says what is wrong with a command, and gives what ends the program with exit code 2."""
+    end = SystemExit(f"darswin: {message}")
+    print(end, file=sys.stderr)
+    end.code = 2
+    return end
+
+
+def print_anywhere(words: Mapping[str, str]) -> None:
+    """Lets stdout and stderr replace characters that the terminal has no code for: by `words`,
+    others as JSON escapes them."""
+
+    def plain(error: UnicodeError) -> tuple[str, int]:
+        if not isinstance(error, UnicodeEncodeError):
+            raise error
+        text = error.object[error.start : error.end]
+        return "".join(words.get(c, json.dumps(c)[1:-1]) for c in text), error.end
+
+    codecs.register_error("darswin.plain", plain)
+    for stream in (sys.stdout, sys.stderr):
+        if hasattr(stream, "reconfigure"):
+            stream.reconfigure(errors="darswin.plain")
 
 
 def _one_line(show: Callable[..., None]) -> Callable[..., None]:
@@ -77,9 +114,10 @@ def _run(command: str, argv: list[str]) -> None:
 
         keep_freed_memory()
     if command in ("fit", "validate", "test"):
+        from darswin.arguments import with_lists
         from darswin.train.cli import run_command
 
-        run_command(argv)
+        run_command(with_lists(argv, ("data.mean", "data.std")))
         return
     if command == "predict":
         from jsonargparse import ArgumentParser
@@ -91,11 +129,10 @@ def _run(command: str, argv: list[str]) -> None:
         parser.add_function_arguments(predict, skip={"pictures"})
         predict(**parser.parse_args(argv[1:]).as_dict())
     elif command == "convert":
-        from jsonargparse import auto_cli
-
+        from darswin.arguments import run_command
         from darswin.compat import convert_checkpoint
 
-        auto_cli(convert_checkpoint, args=argv[1:], prog="darswin convert")
+        run_command(convert_checkpoint, argv[1:], "darswin convert")
     elif command == "lens":
         from darswin.lens.cli import run
 
@@ -107,6 +144,9 @@ def _run(command: str, argv: list[str]) -> None:
     else:
         from darswin.models import list_models
 
+        argparse.ArgumentParser(prog="darswin models", description=COMMANDS[command]).parse_args(
+            argv[1:]
+        )
         print("\n".join(list_models()))
 
 

@@ -23,6 +23,8 @@ from torch import Tensor
 
 from darswin.lens import Lens
 
+BEYOND = -10.0  # px: where `view_map` puts rays beyond θ_max, outside any image
+
 
 def perspective(
     size: tuple[int, int], fov: float, *, yaw: float = 0.0, pitch: float = 0.0
@@ -96,7 +98,7 @@ def view_map(lens: Lens, rays: Tensor, image_size: tuple[int, int] | None = None
             point of a lens that has none.
 
     Returns:
-        (H, W, 2) float32, x and y; (-10, -10), outside the image, beyond θ_max.
+        (H, W, 2) float32, x and y; (`BEYOND`, `BEYOND`), outside the image, beyond θ_max.
 
     Raises:
         ValueError: more than one lens, or rays of another shape.
@@ -111,7 +113,7 @@ def view_map(lens: Lens, rays: Tensor, image_size: tuple[int, int] | None = None
     seen = (theta <= lens.theta_max + 1e-9) & rays.any(-1)
     direction = rays[..., :2] / aside.clamp(min=1e-300)[..., None]
     pixels = lens.pixels(torch.where(seen, theta, 0.0)[None], direction[None], image_size)[0]
-    return torch.where(seen[..., None], pixels, -10).to(torch.float32).numpy()
+    return torch.where(seen[..., None], pixels, BEYOND).to(torch.float32).numpy()
 
 
 def undistort(

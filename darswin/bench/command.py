@@ -1,6 +1,7 @@
 """The command `darswin bench`."""
 
 import argparse
+import math
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -9,6 +10,7 @@ import torch
 from torch import Tensor
 
 from darswin import linear
+from darswin.arguments import with_lists
 from darswin.bench import candidates, memory, report
 from darswin.bench.machine import THREADS, machine
 from darswin.bench.timing import OURS, PRODUCTS, REFERENCE, Timing, in_turns, summary
@@ -16,6 +18,7 @@ from darswin.models import list_models
 
 DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16}
 RUNS = 7  # at least: steps of training are too long to be many, and some are disturbed
+MOST = 65536  # px, and images at once
 LATENCY_RUNS = 100  # at batch 1: what a 99th percentile takes
 # How far the results of two candidates may be apart, of their norm.
 TOLERANCES = {"float32": 1e-4, "bfloat16": 5e-2}
@@ -38,6 +41,7 @@ def bench(
         seconds: of each timing, about.
         out: the folder of the record, `model--<tier>.json`, and its plot.
     """
+    out.mkdir(parents=True, exist_ok=True)  # before ten minutes' work
     head = machine()
     print(" ".join(f"{k}={v}" for k, v in head.items()), flush=True)
     threads_before = torch.get_num_threads()
@@ -127,13 +131,33 @@ def main(argv: list[str]) -> None:
     )  # fmt: skip
     default = bench.__kwdefaults__
     parser.add_argument("--model", choices=list_models(), metavar="NAME", help="a model's name")
-    parser.add_argument("--size", type=int, help="px, of the square images")
-    parser.add_argument("--batches", type=int, nargs="+", metavar="B", help="images at once")
+    parser.add_argument("--size", type=_count, help="px, of the square images")
+    parser.add_argument("--batches", type=_counts, metavar="B,B", help="images at once")
     parser.add_argument(
-        "--compiled", type=int, nargs="*", metavar="B",
+        "--compiled", type=_counts, nargs="?", const=(), metavar="B,B",
         help="batches at which torch.compile is measured too, about a minute each; none: no value",
     )  # fmt: skip
-    parser.add_argument("--seconds", type=float, help="of each timing, about")
+    parser.add_argument("--seconds", type=_seconds, help="of each timing, about")
     parser.add_argument("--out", type=Path, help="folder of the record and the plot")
     parser.set_defaults(**default)
-    bench(**vars(parser.parse_args(argv)))
+    bench(**vars(parser.parse_args(with_lists(argv, ("batches", "compiled")))))
+
+
+def _count(text: str) -> int:
+    if not text.isdecimal() or not 1 <= int(text) <= MOST:
+        raise argparse.ArgumentTypeError(f"must be a whole number from 1 to {MOST}, got {text}")
+    return int(text)
+
+
+def _counts(text: str) -> list[int]:
+    return [_count(part) for part in text.strip("[]").split(",")]
+
+
+def _seconds(text: str) -> float:
+    try:
+        seconds = float(text)
+    except ValueError:
+        seconds = math.nan
+    if not 0 < seconds < math.inf:
+        raise argparse.ArgumentTypeError(f"must be a number above 0, got {text}")
+    return seconds

@@ -4,27 +4,30 @@ import math
 from typing import Literal
 
 import torch
-from jsonargparse import auto_cli
 
 import darswin.lens
 from darswin import views
+from darswin.arguments import run_command
 from darswin.data.sources import read_oriented
 from darswin.grid import Spacing
 from darswin.layers import PolarSample
 from darswin.lens.base import Lens
 from darswin.lens.orientation import in_upright_picture, stored_size
-from darswin.lens.report import describe
-from darswin.plot import draw_lens, save_figure
+from darswin.lens.report import describe, sides
+from darswin.plot import draw_lens, figure_format, save_figure
 
 Coefficients = Literal["fisheye", "pinhole", "omnidir"]
 View = Literal["perspective", "cylindrical", "equirectangular"]
-VIEW_WIDTH = 800  # px
+VIEW_SIDE = 800  # px, the longer one
+# More than a picture can show: rings, sectors, samples along each side of a patch, and in all.
+MOST = {"rings": 1024, "sectors": 4096, "samples": 256}
+MOST_SAMPLES = 2**22
 
 
 def run(argv: list[str]) -> None:
     """Runs `darswin lens` with the arguments that follow it."""
     commands = {"show": show, "info": info, "convert": convert}
-    auto_cli(commands, args=argv, prog="darswin lens", fail_untyped=False)
+    run_command(commands, argv, "darswin lens")
 
 
 def show(
@@ -39,10 +42,10 @@ def show(
     Args:
         calib: a calibration file, of any format that darswin.lens.load reads.
         image: a picture that the camera took.
-        out: the PNG file to write.
+        out: the file to write: png, jpg, webp, tif, pdf or svg, as its name ends.
         rings: of the partition.
         sectors: of the partition.
-        samples: along radius and azimuth, in each patch.
+        samples: along radius and azimuth, in each patch, e.g. 10,10.
         spacing: what the rings split equally.
         view: the kind of the undistorted view.
         fov_deg: its horizontal field of view; without it what the picture shows, in a perspective
@@ -53,6 +56,11 @@ def show(
         camera: which one, in a file of several.
         coefficients: what they are, in an OpenCV or ROS file that does not say it.
     """
+    figure_format(out)
+    _check_partition(rings, sectors, samples)
+    for name, angle in (("yaw_deg", yaw_deg), ("pitch_deg", pitch_deg)):
+        _check(name, angle, math.isfinite(angle), "a finite number of degrees")
+    _check_fov(view, fov_deg)
     picture, orientation = read_oriented(image)
     size = picture.shape[:2]
     lens = _load(calib, camera, theta_max_deg, stored_size(size, orientation), coefficients)
@@ -61,14 +69,20 @@ def show(
     across, down = _fields_of_view(lens, size)
     if fov_deg is None:
         fov_deg = min(across, 110) if view == "perspective" else across
-    height = {
-        "perspective": VIEW_WIDTH * size[0] / size[1],
-        "cylindrical": VIEW_WIDTH / 2,
-        "equirectangular": VIEW_WIDTH * down / fov_deg,
+        if not fov_deg > 0:
+            raise ValueError(
+                "the picture shows nothing on the row of the lens's principal point: choose the "
+                "view with --fov_deg and --yaw_deg"
+            )
+    aspect = {
+        "perspective": size[0] / size[1],
+        "cylindrical": 1 / 2,
+        # As high as what the lens shows in the picture; a narrower view has the same shape.
+        "equirectangular": down / max(fov_deg, across),
     }[view]
     fov, yaw, pitch = (math.radians(angle) for angle in (fov_deg, yaw_deg, pitch_deg))
-    rays = getattr(views, view)((round(height), VIEW_WIDTH), fov, yaw=yaw, pitch=pitch)
-    title = f"{view} view, {fov_deg:.0f}° across"
+    rays = getattr(views, view)(_view_size(aspect), fov, yaw=yaw, pitch=pitch)
+    title = f"{view} view, {fov_deg:.4g}° across\nyaw {yaw_deg:.4g}°, pitch {pitch_deg:.4g}°"
     save_figure(draw_lens(picture, lens, sampler, rays, title), out)
     print(out)
 
@@ -82,14 +96,20 @@ def info(
 
     Args:
         calib: a calibration file, of any format that darswin.lens.load reads.
-        image_size: height and width, px, where the file does not say it.
+        image_size: height and width, px, e.g. 960,1280, where the file does not say it.
         rings: of the partition.
         sectors: of the partition.
         theta_max_deg: where the last ring ends; without it as far as image and lens reach.
         camera: which one, in a file of several.
         coefficients: what they are, in an OpenCV or ROS file that does not say it.
     """
+    _check_partition(rings, sectors)
     lens = _load(calib, camera, theta_max_deg, image_size, coefficients)
+    if lens.image_size is None:
+        raise ValueError(
+            f"{calib} does not say how large its images are: give --image_size, their height and "
+            "width, e.g. 960,1280"
+        )
     print(describe(lens, rings=rings, sectors=sectors))
 
 
@@ -125,6 +145,11 @@ def _load(
     image_size: tuple[int, int] | None,
     coefficients: str | None,
 ) -> Lens:
+    for side in image_size or ():
+        _check("image_size", side, 1 <= side <= 10**6, "from 1 to 1000000 px")
+    if theta_max_deg is not None:
+        in_range = 0 < theta_max_deg <= 180
+        _check("theta_max_deg", theta_max_deg, in_range, "above 0° and at most 180°")
     if camera is not None and camera.isdecimal():
         camera = int(camera)
     return darswin.lens.load(
@@ -137,7 +162,40 @@ def _load(
     )
 
 
+def _check(name: str, value: float, ok: bool, range_: str) -> None:
+    if not ok:
+        raise ValueError(f"--{name} must be {range_}, got {str(value)[:40]}")
+
+
+def _check_partition(rings: int, sectors: int, samples: tuple[int, int] = (1, 1)) -> None:
+    """ValueError for more than a picture can show, before memory is asked for it."""
+    given = (("rings", rings), ("sectors", sectors), *(("samples", count) for count in samples))
+    for name, value in given:
+        _check(name, value, 1 <= value <= MOST[name], f"from 1 to {MOST[name]}")
+    if (total := rings * sectors * math.prod(samples)) > MOST_SAMPLES:
+        raise ValueError(
+            f"--rings × --sectors × --samples must be at most {MOST_SAMPLES} samples, got {total}"
+        )
+
+
+def _check_fov(view: View, fov_deg: float | None) -> None:
+    if fov_deg is None:
+        return
+    if view == "perspective":
+        in_range, range_ = 0 < fov_deg < 180, "below 180°"
+    else:
+        in_range, range_ = 0 < fov_deg <= 360, "at most 360°"
+    _check("fov_deg", fov_deg, in_range, f"above 0° and {range_} in a view that is {view}")
+
+
+def _view_size(aspect: float) -> tuple[int, int]:
+    """(H, W) of a view whose height is `aspect` times its width."""
+    longer = max(aspect, 1.0)
+    return max(1, round(VIEW_SIDE * aspect / longer)), max(1, round(VIEW_SIDE / longer))
+
+
 def _fields_of_view(lens: Lens, size: tuple[int, int]) -> tuple[float, float]:
     """Of the lens up to θ_max in a picture of (H, W): across and down, degrees."""
-    angles = torch.rad2deg(lens.side_angles(size).minimum(lens.theta_max[:, None]))[0]
-    return angles[::2].sum().item(), angles[1::2].sum().clamp(max=180).item()
+    end = lens.theta_max.item()
+    angles = torch.rad2deg(sides(lens, size).clamp(-end, end))
+    return min(angles[::2].sum().item(), 360.0), angles[1::2].sum().clamp(max=180).item()

@@ -39,16 +39,34 @@ def largest_offset(lens: Lens) -> float:
     return lens.through_affine(lens.offset(theta, direction)).norm(dim=-1).max().item()
 
 
+def beyond_lens(lens: Lens, image_size: tuple[int, int]) -> Tensor:
+    """(4,), in the order of SIDES: whether the image reaches further than the one lens."""
+    return lens.side_angles(image_size)[0] >= lens.with_theta_max(None).theta_max
+
+
+def sides(lens: Lens, image_size: tuple[int, int]) -> Tensor:
+    """(4,) rad: `side_angles` of one lens, below 0 where the principal point is past that side."""
+    cx, cy = lens.center_in(image_size)[0].tolist()
+    height, width = image_size
+    past = (cx < -0.5, cy < -0.5, cx > width - 0.5, cy > height - 0.5)
+    angles = lens.side_angles(image_size)[0]
+    return torch.where(torch.tensor(past), -angles, angles)
+
+
+def outside_share(lens: Lens, image_size: tuple[int, int]) -> float:
+    """The share of rays up to θ_max, in equal steps of θ and φ, that land outside the image."""
+    steps = (torch.arange(128, dtype=torch.float64) + 0.5) / 128
+    pixels = lens.project_rays(lens.theta_max * steps[:, None], 2 * math.pi * steps, image_size)
+    last = pixels.new_tensor(image_size).flip(0) - 0.5
+    return 1 - ((pixels >= -0.5) & (pixels <= last)).all(-1).double().mean().item()
+
+
 class Patches(NamedTuple):
     """Ring widths (px) and areas of a ring's patches (px), the smallest and the largest."""
 
     width: tuple[float, float]
     area: tuple[float, float]
-
-    @property
-    def ratio(self) -> float:
-        """Of the largest patch to the smallest."""
-        return self.area[1] / self.area[0]
+    ratio: float  # of the largest patch to the smallest
 
 
 def patches(lens: Lens, spacing: str, rings: int, sectors: int) -> Patches:
@@ -56,8 +74,11 @@ def patches(lens: Lens, spacing: str, rings: int, sectors: int) -> Patches:
     grid = polar_grid(lens, (1, 1), rings=rings, sectors=sectors, samples=(1, 1), spacing=spacing)
     borders = grid.borders[0]
     stretch = 1.0 if lens.affine is None else lens.affine[0].det().abs().item()
-    area = (borders**2).diff() * (math.pi / sectors * stretch)
-    return Patches(*((v.min().item(), v.max().item()) for v in (borders.diff(), area)))
+    # Of a circle of radius 1: the square of a length in pixels may be beyond what a float holds.
+    shares = ((borders / borders[-1]) ** 2).diff() * (math.pi / sectors * stretch)
+    areas = shares * borders[-1] ** 2
+    width, area, share = ((v.min().item(), v.max().item()) for v in (borders.diff(), areas, shares))
+    return Patches(width, area, share[1] / share[0])
 
 
 def best_spacing(lens: Lens, rings: int, sectors: int) -> str:
@@ -104,7 +125,11 @@ def _model(lens: Lens, image_size: tuple[int, int]) -> list[tuple[str, str]]:
     rows += [(f"  {name}", _numbers(value[0])) for name, value in values.items()]
     rows += [
         ("image", f"{image_size[1]} × {image_size[0]} px (width × height)"),
-        ("principal point", f"x {cx:.2f}, y {cy:.2f} px (pixel centres are integers)"),
+        (
+            "principal point",
+            f"x {cx:.2f}, y {cy:.2f} px (pixel centres are integers)"
+            f"{', outside the sensor' if _is_outside(lens, image_size) else ''}",
+        ),
     ]
     if lens.affine is not None:
         a, b, c, d = lens.affine[0].flatten().tolist()
@@ -115,21 +140,38 @@ def _model(lens: Lens, image_size: tuple[int, int]) -> list[tuple[str, str]]:
     return rows
 
 
+def _is_outside(lens: Lens, image_size: tuple[int, int]) -> bool:
+    """Whether the principal point is not in the image."""
+    return bool((sides(lens, image_size) < 0).any())
+
+
 def _view(lens: Lens, image_size: tuple[int, int]) -> list[tuple[str, str]]:
-    left, top, right, bottom = lens.side_angles(image_size)[0].tolist()
+    angles = sides(lens, image_size).tolist()
+    left, top, right, bottom = angles
+    ends = zip(SIDES, angles, beyond_lens(lens, image_size).tolist(), strict=True)
+    corners = _corners(lens, image_size)
+    if _is_outside(lens, image_size):
+        corners = "on the row and the column of the principal point"
+    share = outside_share(lens, image_size)
+    return [
+        ("field of view", f"{_degrees(left + right)} across, {_degrees(top + bottom)} down, "
+                          f"{corners}"),
+        ("θ at the sides", ", ".join(
+            f"{side}: the lens ends before" if beyond else f"{side} {_degrees(angle)}"
+            for side, angle, beyond in ends)),
+        ("θ limit", f"{_both(lens.theta_limit)}: up to where r rises"),
+        ("θ_max", f"{_both(lens.theta_max)}: as far as it is used, r = {lens.r_max.item():.1f} px"),
+        ("outside sensor", f"{share:.1%} of the samples up to θ_max, in equal steps of θ"),
+    ]  # fmt: skip
+
+
+def _corners(lens: Lens, image_size: tuple[int, int]) -> str:
     height, width = image_size
     pixels = torch.tensor([[x, y] for y in (-0.5, height - 0.5) for x in (-0.5, width - 0.5)])
     widest = lens.with_theta_max(None).rays(pixels, image_size)[0].tolist()
-    diagonal = max(widest[0] + widest[3], widest[1] + widest[2])
-    corners = "the lens ends before" if math.isnan(sum(widest)) else f"{_degrees(diagonal)} between"
-    ends = zip(SIDES, (left, top, right, bottom), strict=True)
-    return [
-        ("field of view", f"{_degrees(left + right)} across, {_degrees(top + bottom)} down, "
-                          f"{corners} the corners"),
-        ("θ at the sides", ", ".join(f"{side} {_degrees(angle)}" for side, angle in ends)),
-        ("θ limit", f"{_both(lens.theta_limit)}: up to where r rises"),
-        ("θ_max", f"{_both(lens.theta_max)}: as far as it is used, r = {lens.r_max.item():.1f} px"),
-    ]  # fmt: skip
+    if math.isnan(sum(widest)):
+        return "the lens ends before the corners"
+    return f"{_degrees(max(widest[0] + widest[3], widest[1] + widest[2]))} between the corners"
 
 
 def _density(lens: Lens) -> list[tuple[str, str]]:
@@ -154,7 +196,7 @@ def _spacings(lens: Lens, rings: int, sectors: int) -> list[tuple[str, str]]:
             rows.append((f"  {spacing}", "not for this θ_max: tan θ ends at 90°"))
             continue
         found = patches(lens, spacing, rings, sectors)
-        width, area = (f"{low:.1f} to {high:.1f}" for low, high in found)
+        width, area = (f"{low:.1f} to {high:.1f}" for low, high in found[:2])
         note = "  knows nothing of the lens" if spacing == "radius" else ""
         note += "  <- the most even that knows it" if spacing == best else ""
         rows.append((f"  {spacing}", f"{width:<18}{area:<18}1 : {found.ratio:.0f}{note}"))
