@@ -123,8 +123,6 @@ def _load(
     image_size: tuple[int, int] | None,
     coefficients: str | None,
 ) -> Lens:
-    if camera is not None and camera.isdecimal():
-        camera = int(camera)
     return darswin.lens.load(
         calib,
         camera=camera,

@@ -71,7 +71,7 @@ class EnhancedUnified(Lens):
     """r = f sin θ / (α √(β sin² θ + cos² θ) + (1 - α) cos θ): EUCM, at β = 1 the unified model.
 
     Args:
-        alpha: α in [0, 1]. beta: β > 0. focal: f > 0, px. Others: as `Lens`.
+        alpha: α in [0, 1]. beta: β > 0, or β < 0 with tan θ < 1 / √-β. focal: f > 0, px. Others: as `Lens`.
 
     Source: Khomutenko, Garcia and Martinet, RA-L 2016.
     """
@@ -95,21 +95,22 @@ class EnhancedUnified(Lens):
 
     def _validate(self) -> None:
         self._require("alpha", (self.alpha >= 0) & (self.alpha <= 1), "in [0, 1]")
-        self._require("beta", (self.beta > 0) & self.beta.isfinite(), "finite and above 0")
+        self._require("beta", (self.beta != 0) & self.beta.isfinite(), "finite and above 0, or below")
         self._require("focal", (self.focal > 0) & self.focal.isfinite(), "finite and above 0")
 
     @property
     def theta_limit(self) -> Tensor:
         # Where cos θ = -w √(β sin² θ + cos² θ).
-        w = _cone(self.alpha.detach())
-        last = torch.atan2(root(1 - w * w), -w * self.beta.detach().sqrt())
-        return last - MARGIN
+        w, beta = _cone(self.alpha.detach()), self.beta.detach()
+        last = torch.atan2(root(1 - w * w), -w * root(beta))
+        # β below 0: where the square root has none.
+        return torch.where(beta > 0, last, torch.atan(root(-beta).reciprocal())) - MARGIN
 
     def project(self, theta: Number) -> Tensor:
         theta, alpha, beta, focal = self._aligned(theta, "alpha", "beta", "focal")
         sin, cos = torch.sin(theta), torch.cos(theta)
-        length = torch.sqrt(beta * sin * sin + cos * cos)
-        return focal * sin / (alpha * length + (1 - alpha) * cos)
+        square = beta * sin * sin + cos * cos
+        return where_real(square, focal * sin / (alpha * root(square) + (1 - alpha) * cos))
 
     def unproject(self, radius: Number) -> Tensor:
         radius, alpha, beta, focal = self._aligned(radius, "alpha", "beta", "focal")
@@ -117,7 +118,9 @@ class EnhancedUnified(Lens):
         square = beta * rho * rho
         rest = 1 - (2 * alpha - 1) * square
         z = (1 - alpha * alpha * square) / (alpha * root(rest) + (1 - alpha))
-        return where_real(rest, torch.atan2(rho, z))
+        # β below 0: z ends where √(β sin² θ + cos² θ) does.
+        lands = where_real(1 - (1 - alpha) * z, torch.atan2(rho, z))
+        return where_real(rest, torch.where(beta > 0, torch.atan2(rho, z), lands))
 
 
 class DoubleSphere(Lens):

@@ -3,7 +3,7 @@
 A reader leaves the principal point as its file has it; `load` moves it to our pixel origin.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from darswin.lens.base import Lens
@@ -12,6 +12,8 @@ from darswin.lens.ideal import Equidistant, Perspective
 from darswin.lens.sphere import Spherical
 
 Description = dict[str, Any]
+# What describes each camera of a file, by its name: nothing is read before it is asked for.
+Cameras = dict[str, Callable[[], Description]]
 
 TERMS = ("radial", "denominator", "tangential", "prism")
 # What is left of a model when all its terms are zero, with a closed inverse.

@@ -1,8 +1,10 @@
 """COLMAP's cameras.txt: a line a camera, of any model but the spherical ones."""
 
+from functools import partial
+
 from darswin.lens.base import Lens
 from darswin.lens.distorted import BrownConrady, Fisheye624, KannalaBrandt
-from darswin.lens.files.cameras import Description, describe
+from darswin.lens.files.cameras import Cameras, Description, describe
 from darswin.lens.files.content import Content
 from darswin.lens.files.fields import Fields, is_number, short
 from darswin.lens.ideal import FieldOfView, Perspective
@@ -14,6 +16,7 @@ MODELS: dict[str, tuple[type[Lens], str]] = {
     "PINHOLE": (BrownConrady, "fx fy cx cy"),
     "SIMPLE_RADIAL": (BrownConrady, "f cx cy k1"),
     "RADIAL": (BrownConrady, "f cx cy k1 k2"),
+    "BROWN_CONRADY": (BrownConrady, "f cx cy k1 k2 k3 p1 p2"),
     "OPENCV": (BrownConrady, "fx fy cx cy k1 k2 p1 p2"),
     "FULL_OPENCV": (BrownConrady, "fx fy cx cy k1 k2 p1 p2 k3 d1 d2 d3"),
     "SIMPLE_FISHEYE": (KannalaBrandt, "f cx cy"),
@@ -35,8 +38,13 @@ def fits(content: Content) -> bool:
     return isinstance(content, list) and len(content[0]) > 1 and not is_number(content[0][1])
 
 
-def cameras(rows: list[list[str]]) -> dict[str, Description]:
-    return {row[0]: _camera(row) for row in rows}
+def cameras(rows: list[list[str]]) -> Cameras:
+    found: Cameras = {}
+    for row in rows:
+        if row[0] in found:
+            raise ValueError(f"there must be one camera {short(row[0])}, got two")
+        found[row[0]] = partial(_camera, row)
+    return found
 
 
 def _camera(row: list[str]) -> Description:
@@ -76,6 +84,4 @@ def _terms(values: Fields, names: list[str]) -> dict[str, list[float]]:
 def _division(values: Fields) -> tuple[type[Lens], dict[str, float]]:
     """The division model, r / (1 + k r²) = tan θ, is an EUCM of α = 1/2 and β = -4 k."""
     k = values.number("division")
-    if k > 0:
-        raise ValueError(f"{values.path('k')} must be at most 0, got {k:g}")
-    return (EnhancedUnified, {"alpha": 0.5, "beta": -4 * k}) if k < 0 else (Perspective, {})
+    return (EnhancedUnified, {"alpha": 0.5, "beta": -4 * k}) if k else (Perspective, {})

@@ -6,7 +6,7 @@ import reprlib
 from collections.abc import Mapping
 from typing import Any
 
-_NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?")
+_NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", re.ASCII)
 _MAX_WORD = 64
 MAX_SIDE = 1_000_000
 
@@ -56,8 +56,19 @@ def to_side(value: Any, name: str) -> int:
     return int(number)
 
 
+def holds_numbers(value: Any) -> bool:
+    """Whether a value is a number other than 0, or may hold some."""
+    if isinstance(value, str):
+        words = value[:1000].replace(",", " ").split()
+        return all(map(is_number, words)) and any(float(word) for word in words)
+    if isinstance(value, (list, Mapping)):
+        entries = value.values() if isinstance(value, Mapping) else value
+        return any(isinstance(v, (list, Mapping)) or holds_numbers(v) for v in entries)
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and value != 0
+
+
 class Fields:
-    """A mapping of a file. Its methods read an entry by name.
+    """A mapping of a file. Its methods read an entry by name, and it knows which ones were read.
 
     Raises:
         ValueError: an entry that is missing or of the wrong kind.
@@ -65,6 +76,7 @@ class Fields:
 
     def __init__(self, entries: Mapping[str, Any], where: str = ""):
         self.entries, self._where = entries, where
+        self._read: set[str] = set()
 
     def __contains__(self, name: str) -> bool:
         return name in self.entries
@@ -76,7 +88,26 @@ class Fields:
     def get(self, name: str, expected: str) -> Any:
         if name not in self.entries:
             raise ValueError(f"{self.path(name)} is missing, it must be {expected}")
+        self._read.add(name)
         return self.entries[name]
+
+    def check_all_read(
+        self, camera: str, *, known: tuple[str, ...] = (), like: re.Pattern | None = None
+    ) -> None:
+        """That no number was left out, which might be a coefficient under another name.
+
+        Args:
+            camera: what the numbers are of. known: names of what may be left out. like: what the
+                names of coefficients contain; None takes all entries for some.
+        """
+        left = [
+            name for name, value in self.entries.items()
+            if name not in self._read and name not in known and holds_numbers(value)
+            and (like is None or like.search(str(name)))
+        ]  # fmt: skip
+        if left:
+            shown = ", ".join(self.path(name) for name in left[:20]) + ", …" * (len(left) > 20)
+            raise ValueError(f"{camera} has no place for the numbers of {shown}")
 
     def section(self, name: str) -> "Fields":
         value = self.get(name, "a mapping")

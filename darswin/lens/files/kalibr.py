@@ -1,9 +1,11 @@
 """Kalibr's camchain YAML: pinhole, omni, ds and eucm with radtan, equidistant, fov or none."""
 
+import re
 from collections.abc import Mapping
+from functools import partial
 
 from darswin.lens.distorted import BrownConrady, KannalaBrandt, Mei
-from darswin.lens.files.cameras import Description, describe
+from darswin.lens.files.cameras import Cameras, Description, describe
 from darswin.lens.files.content import Content
 from darswin.lens.files.fields import Fields
 from darswin.lens.ideal import FieldOfView
@@ -17,27 +19,30 @@ MODELS = {
     "eucm": (("alpha", "beta"), ("none",)),
 }
 COEFFICIENTS = {"radtan": 4, "equidistant": 4, "fov": 1, "none": 0}
+COEFFICIENTS_LIKE = re.compile("coef|dist(?!ance)")
 
 
 def _is_camera(entry: object) -> bool:
-    return isinstance(entry, Mapping) and "camera_model" in entry
+    """Also one that lacks something, so that it is missed, and no other camera taken for it."""
+    return isinstance(entry, Mapping) and ("camera_model" in entry or "intrinsics" in entry)
 
 
 def _is_alone(content: Mapping) -> bool:
-    return _is_camera(content) and "intrinsics" in content
+    return "camera_model" in content and "intrinsics" in content
 
 
 def fits(content: Content) -> bool:
     return isinstance(content, Mapping) and (
-        _is_alone(content) or any(_is_camera(entry) for entry in content.values())
+        _is_alone(content)
+        or any(isinstance(e, Mapping) and "camera_model" in e for e in content.values())
     )
 
 
-def cameras(file: Fields) -> dict[str, Description]:
+def cameras(file: Fields) -> Cameras:
     if _is_alone(file.entries):
-        return {"camera": _camera(file)}
+        return {"camera": partial(_camera, file)}
     names = [name for name, entry in file.entries.items() if _is_camera(entry)]
-    return {name: _camera(file.section(name)) for name in names}
+    return {name: partial(_camera, file.section(name)) for name in names}
 
 
 def _camera(fields: Fields) -> Description:
@@ -51,6 +56,7 @@ def _camera(fields: Fields) -> Description:
             raise ValueError(f"{where} must be a focal length above 0, got {focal:g}")
     count = COEFFICIENTS[distortion]
     coefficients = fields.numbers("distortion_coeffs", (count,)) if count else []
+    fields.check_all_read(f"a {distortion} camera", like=COEFFICIENTS_LIKE)
     size = None
     if "resolution" in fields:
         width, height = fields.sides("resolution")
