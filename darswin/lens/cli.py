@@ -12,10 +12,12 @@ from darswin.data.sources import read_image
 from darswin.grid import Spacing
 from darswin.layers import PolarSample
 from darswin.lens.base import Lens
+from darswin.lens.files.load import Calibration, reach
 from darswin.lens.report import describe
 from darswin.plot import draw_lens, save_figure
 
 Coefficients = Literal["fisheye", "pinhole", "omnidir"]
+Format = Literal["darswin", "opencv", "colmap", "kalibr"]
 View = Literal["perspective", "cylindrical", "equirectangular"]
 VIEW_WIDTH = 800  # px
 
@@ -87,33 +89,46 @@ def info(
         camera: which one, in a file of several.
         coefficients: what they are, in an OpenCV or ROS file that does not say it.
     """
+    file = Calibration.read(calib, coefficients)
     lens = _load(calib, camera, theta_max_deg, image_size, coefficients)
+    origin = f"({file.format.origin:g}, {file.format.origin:g})"
+    print(f"{'format':<16}{file.format.name}, with the centre of the upper left pixel at {origin}")
+    if len(file.names) > 1:
+        names = ", ".join(file.names[:20]) + ", …" * (len(file.names) > 20)
+        print(f"{'camera':<16}{file.choose(camera)}, of {len(file.names)}: {names}")
     print(describe(lens, rings=rings, sectors=sectors))
 
 
 def convert(
     calib: str, out: str, model: str | None = None, theta_max_deg: float | None = None,
     image_size: tuple[int, int] | None = None, camera: str | None = None,
-    coefficients: Coefficients | None = None,
+    coefficients: Coefficients | None = None, format: Format | None = None,
 ) -> None:  # fmt: skip
-    """Writes a calibration as darswin's JSON, and fits another model to it.
+    """Writes a calibration as a file of darswin, OpenCV, COLMAP or Kalibr, or another model's.
 
     Args:
         calib: a calibration file, of any format that darswin.lens.load reads.
-        out: the JSON file to write.
+        out: the file to write.
         model: a name of darswin.lens.MODELS; without it the model stays.
         theta_max_deg: how far the lens is used; without it as far as image and lens reach.
         image_size: height and width, px, where the file does not say it.
         camera: which one, in a file of several.
         coefficients: what they are, in an OpenCV or ROS file that does not say it.
+        format: of the file; without it OpenCV for .xml, .yaml and .yml, but Kalibr where the name
+            has "camchain" or "kalibr"; COLMAP for .txt; else darswin, whose JSON holds any lens.
     """
     lens = _load(calib, camera, theta_max_deg, image_size, coefficients)
     note = ""
     if model is not None:
         lens, error = darswin.lens.fit(model, lens)
         note = f", at most {error.item():.2g} px from {calib}"
-    darswin.lens.save(lens, out)
-    print(f"{out}: {type(lens).__name__} up to {math.degrees(lens.theta_max.item()):.2f}°{note}")
+    written = darswin.lens.save(lens, out, format)
+    degrees = math.degrees(lens.theta_max.item())
+    if written != "darswin" and bool(
+        (lens.theta_max - reach(lens.with_theta_max(None))).abs() > 1e-6
+    ):
+        note += f"; {written} files do not say how far: read it with --theta_max_deg {degrees:.2f}"
+    print(f"{out}: {written}, {type(lens).__name__} up to {degrees:.2f}°{note}")
 
 
 def _load(

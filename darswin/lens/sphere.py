@@ -71,7 +71,8 @@ class EnhancedUnified(Lens):
     """r = f sin θ / (α √(β sin² θ + cos² θ) + (1 - α) cos θ): EUCM, at β = 1 the unified model.
 
     Args:
-        alpha: α in [0, 1]. beta: β > 0, or β < 0 with tan θ < 1 / √-β. focal: f > 0, px. Others: as `Lens`.
+        alpha: α in [0, 1]. beta: β > 0; or β < 0, for θ up to atan(1 / √-β). focal: f > 0, px.
+        Others: as `Lens`.
 
     Source: Khomutenko, Garcia and Martinet, RA-L 2016.
     """
@@ -95,7 +96,9 @@ class EnhancedUnified(Lens):
 
     def _validate(self) -> None:
         self._require("alpha", (self.alpha >= 0) & (self.alpha <= 1), "in [0, 1]")
-        self._require("beta", (self.beta != 0) & self.beta.isfinite(), "finite and above 0, or below")
+        self._require(
+            "beta", (self.beta != 0) & self.beta.isfinite(), "finite and above 0, or below"
+        )
         self._require("focal", (self.focal > 0) & self.focal.isfinite(), "finite and above 0")
 
     @property

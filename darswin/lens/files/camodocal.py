@@ -1,6 +1,5 @@
 """CamOdoCal's YAML, which KITTI-360 and VINS use: MEI, KANNALA_BRANDT, PINHOLE and SCARAMUZZA."""
 
-import re
 from collections.abc import Mapping
 from functools import partial
 
@@ -12,7 +11,6 @@ from darswin.lens.files.ocamcalib import check_inverse
 from darswin.lens.polynomial import OCam, OCamInverse
 
 MODELS = ("MEI", "KANNALA_BRANDT", "PINHOLE", "SCARAMUZZA")
-PARAMETERS = re.compile("parameters|dist(?!ance)")
 
 
 def fits(content: Content) -> bool:
@@ -46,7 +44,10 @@ def _camera(file: Fields) -> Description:
         description = describe(Mei, *plane, size, xi=xi, **_distortion(file))
     else:
         raise ValueError(f"model_type must be one of {', '.join(MODELS)}, got {said!r}")
-    file.check_all_read(model, like=PARAMETERS)
+    # Other mappings are matrices: where the camera stands.
+    file.check_all_read(
+        model, like=lambda _, value: isinstance(value, Mapping) and "data" not in value
+    )
     return description
 
 

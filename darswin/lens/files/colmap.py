@@ -4,7 +4,7 @@ from functools import partial
 
 from darswin.lens.base import Lens
 from darswin.lens.distorted import BrownConrady, Fisheye624, KannalaBrandt
-from darswin.lens.files.cameras import Cameras, Description, describe
+from darswin.lens.files.cameras import Camera, Cameras, Description, describe
 from darswin.lens.files.content import Content
 from darswin.lens.files.fields import Fields, is_number, short
 from darswin.lens.ideal import FieldOfView, Perspective
@@ -45,6 +45,32 @@ def cameras(rows: list[list[str]]) -> Cameras:
             raise ValueError(f"there must be one camera {short(row[0])}, got two")
         found[row[0]] = partial(_camera, row)
     return found
+
+
+# What `write` makes of a camera: the first of its class that has a place for all its terms.
+WRITTEN = ("PINHOLE", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE", "THIN_PRISM_FISHEYE",
+           "RAD_TAN_THIN_PRISM_FISHEYE", "FOV", "EUCM", "DIVISION")  # fmt: skip
+
+
+def write(camera: Camera) -> str | None:
+    """A cameras.txt of camera 1; None if COLMAP has no such camera."""
+    if camera.size is None:
+        raise ValueError("COLMAP's cameras have an image_size, (H, W), and this lens has none")
+    values = camera.plane | camera.terms
+    if values.get("beta", 1) < 0 and values["alpha"] == 0.5:
+        values["division"] = values.pop("beta") / -4
+        del values["alpha"]
+    for name in WRITTEN:
+        model, names = MODELS[name]
+        if model is camera.model and camera.skew == 0 and values.keys() <= {*names.split()}:
+            numbers = (values.get(n, 0.0) for n in names.split())
+            height, width = camera.size
+            return (
+                "# Camera list with one line of data per camera:\n"
+                "#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n# Number of cameras: 1\n"
+                f"1 {name} {width} {height} {' '.join(map(repr, numbers))}\n"
+            )
+    return None
 
 
 def _camera(row: list[str]) -> Description:

@@ -3,7 +3,7 @@
 import math
 import re
 import reprlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 _NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", re.ASCII)
@@ -92,18 +92,22 @@ class Fields:
         return self.entries[name]
 
     def check_all_read(
-        self, camera: str, *, known: tuple[str, ...] = (), like: re.Pattern | None = None
+        self,
+        camera: str,
+        *,
+        known: tuple[str, ...] = (),
+        like: Callable[[str, Any], Any] = lambda name, value: True,
     ) -> None:
         """That no number was left out, which might be a coefficient under another name.
 
         Args:
-            camera: what the numbers are of. known: names of what may be left out. like: what the
-                names of coefficients contain; None takes all entries for some.
+            camera: what the numbers are of. known: names of what may be left out. like: whether
+                an entry, a name and a value, looks like coefficients.
         """
         left = [
             name for name, value in self.entries.items()
             if name not in self._read and name not in known and holds_numbers(value)
-            and (like is None or like.search(str(name)))
+            and like(str(name), value)
         ]  # fmt: skip
         if left:
             shown = ", ".join(self.path(name) for name in left[:20]) + ", …" * (len(left) > 20)

@@ -4,8 +4,10 @@ import re
 from collections.abc import Mapping
 from functools import partial
 
+import yaml
+
 from darswin.lens.distorted import BrownConrady, KannalaBrandt, Mei
-from darswin.lens.files.cameras import Cameras, Description, describe
+from darswin.lens.files.cameras import Camera, Cameras, Description, describe
 from darswin.lens.files.content import Content
 from darswin.lens.files.fields import Fields
 from darswin.lens.ideal import FieldOfView
@@ -19,7 +21,7 @@ MODELS = {
     "eucm": (("alpha", "beta"), ("none",)),
 }
 COEFFICIENTS = {"radtan": 4, "equidistant": 4, "fov": 1, "none": 0}
-COEFFICIENTS_LIKE = re.compile("coef|dist(?!ance)")
+LIKE = re.compile("coef|dist(?!ance)")
 
 
 def _is_camera(entry: object) -> bool:
@@ -56,7 +58,7 @@ def _camera(fields: Fields) -> Description:
             raise ValueError(f"{where} must be a focal length above 0, got {focal:g}")
     count = COEFFICIENTS[distortion]
     coefficients = fields.numbers("distortion_coeffs", (count,)) if count else []
-    fields.check_all_read(f"a {distortion} camera", like=COEFFICIENTS_LIKE)
+    fields.check_all_read(f"a {distortion} camera", like=lambda name, _: LIKE.search(name))
     size = None
     if "resolution" in fields:
         width, height = fields.sides("resolution")
@@ -71,6 +73,39 @@ def _camera(fields: Fields) -> Description:
     pinhole = KannalaBrandt if distortion == "equidistant" else BrownConrady
     classes = {"pinhole": pinhole, "omni": Mei, "ds": DoubleSphere, "eucm": EnhancedUnified}
     return describe(classes[model], (fu, fv), (pu, pv), size, **parameters)
+
+
+def write(camera: Camera) -> str | None:
+    """A camchain.yaml of cam0; None if Kalibr has no such camera."""
+    if camera.size is None:
+        raise ValueError("Kalibr's cameras have an image_size, (H, W), and this lens has none")
+    kinds = {
+        BrownConrady: ("pinhole", "radtan", "k1 k2 p1 p2"),
+        KannalaBrandt: ("pinhole", "equidistant", "k1 k2 k3 k4"),
+        FieldOfView: ("pinhole", "fov", "omega"),
+        Mei: ("omni", "radtan", "k1 k2 p1 p2"),
+        DoubleSphere: ("ds", "none", ""),
+        EnhancedUnified: ("eucm", "none", ""),
+    }
+    model, distortion, names = kinds.get(camera.model, ("", "", ""))
+    known = model and camera.terms.keys() <= {*names.split()}
+    if not known or camera.skew != 0 or camera.plane.get("beta", 1) < 0:
+        return None
+    own = [camera.plane[name] for name in MODELS[model][0]]
+    coefficients = camera.listed(names)
+    if distortion == "fov":
+        coefficients = [camera.plane["omega"]]
+    height, width = camera.size
+    written = {
+        "cam_overlaps": [],
+        "camera_model": model,
+        "distortion_coeffs": coefficients,
+        "distortion_model": distortion,
+        "intrinsics": own + [camera.plane[name] for name in ("fx", "fy", "cx", "cy")],
+        "resolution": [width, height],
+        "rostopic": "/cam0/image_raw",
+    }
+    return yaml.safe_dump({"cam0": written}, default_flow_style=None, width=1000)
 
 
 def _one_of(fields: Fields, name: str, allowed: tuple[str, ...]) -> str:

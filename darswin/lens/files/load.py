@@ -3,12 +3,15 @@
 import json
 import math
 import os
+import re
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any, Self
+from pathlib import Path
+from typing import Any, NamedTuple, Self
 
 import torch
+from torch import Tensor
 
 from darswin.files import replace_file
 from darswin.lens.base import Lens
@@ -24,7 +27,7 @@ from darswin.lens.files import (
     own,
     woodscape,
 )
-from darswin.lens.files.cameras import Cameras, Description
+from darswin.lens.files.cameras import Camera, Cameras, Description, camera_of
 from darswin.lens.files.content import Content, parse, read_text
 from darswin.lens.files.fields import Fields, short
 
@@ -38,7 +41,8 @@ MAX_CAMERAS = 10_000
 @dataclass(frozen=True)
 class Format:
     """Attributes: name; fits: whether content is of this format; cameras: its descriptions;
-    origin: where the format has the center of the upper left pixel, along both axes. Ours is 0."""
+    origin: where the format has the center of the upper left pixel, along both axes: ours is 0;
+    takes_model: whether `load`'s model may say what its coefficients are."""
 
     name: str
     fits: Callable[[Content], bool]
@@ -60,6 +64,43 @@ FORMATS = (
     Format("OCamCalib", ocamcalib.fits, ocamcalib.cameras, 0.0),
     Format("COLMAP", colmap.fits, colmap.cameras, 0.5),
 )
+
+
+class Writer(NamedTuple):
+    """Attributes: name, and what it holds, in errors; origin: as `Format`; write: makes the text of
+    a camera and the file's suffix, or None if the format has no such camera."""
+
+    name: str
+    holds: str
+    origin: float
+    write: Callable[[Camera, str], str | None]
+
+
+# Beside our own, for `save`.
+WRITERS = {
+    "opencv": Writer(
+        "OpenCV",
+        "Perspective and BrownConrady (3 radial, no skew), Equidistant and KannalaBrandt (4 radial "
+        "only), Spherical and Mei (2 radial, tangential)",
+        0.0,
+        opencv.write,
+    ),
+    "colmap": Writer(
+        "COLMAP",
+        "without skew, Perspective and BrownConrady (3 radial, no prism), Equidistant and "
+        "KannalaBrandt (4 radial), Fisheye624 (6 radial), FieldOfView and EnhancedUnified",
+        0.5,
+        lambda camera, suffix: colmap.write(camera),
+    ),
+    "kalibr": Writer(
+        "Kalibr",
+        "without skew, Perspective and BrownConrady (2 radial, tangential), Equidistant and "
+        "KannalaBrandt (4 radial only), FieldOfView, Spherical and Mei (2 radial, tangential), "
+        "DoubleSphere and EnhancedUnified",
+        0.0,
+        lambda camera, suffix: kalibr.write(camera),
+    ),
+}
 
 
 def load(
@@ -122,13 +163,53 @@ def load_all(
     return Calibration.read(path, model).lenses(theta_max, image_size, dtype)
 
 
-def save(lens: Lens, path: str | os.PathLike) -> None:
-    """Writes one lens as our own JSON, which `load` and `darswin predict --lens` read.
+def save(lens: Lens, path: str | os.PathLike, format: str | None = None) -> str:
+    """Writes one lens as a file that `load` reads, and `darswin predict --lens`.
+
+    Our own JSON holds any lens. The other formats hold those of their own models, all but θ_max:
+    `load` finds it from the image's sides.
+
+    Args:
+        format: "darswin", "opencv", "colmap" or "kalibr". None tells it from the path: OpenCV's for
+            .xml, .yaml and .yml, but Kalibr's where the name has "camchain" or "kalibr"; COLMAP's
+            for .txt; else ours.
+
+    Returns:
+        The format.
 
     Raises:
-        ValueError: several lenses, or a lens of a model that is not in `MODELS`.
+        ValueError: several lenses, a lens of a model that is not in `MODELS`, or one that the
+            format cannot hold exactly.
     """
-    replace_file(path, json.dumps(to_dict(lens), indent=2) + "\n")
+    path = Path(path)
+    format = format_of(path) if format is None else format
+    if format == "darswin":
+        text = json.dumps(to_dict(lens), indent=2) + "\n"
+    elif format in WRITERS:
+        text = _written(lens, WRITERS[format], path.suffix.lower())
+    else:
+        raise ValueError(f"format must be darswin, {', '.join(WRITERS)} or None, got {format!r}")
+    replace_file(path, text)
+    return format
+
+
+def format_of(path: Path) -> str:
+    """The format that a file's name asks for."""
+    if path.suffix.lower() in (".yaml", ".yml") and re.search("camchain|kalibr", path.stem.lower()):
+        return "kalibr"
+    by_suffix = {".xml": "opencv", ".yaml": "opencv", ".yml": "opencv", ".txt": "colmap"}
+    return by_suffix.get(path.suffix.lower(), "darswin")
+
+
+def _written(lens: Lens, writer: Writer, suffix: str) -> str:
+    camera = camera_of(lens, writer.origin)
+    text = None if camera is None else writer.write(camera, suffix)
+    if text is None:
+        raise ValueError(
+            f"{writer.name} has no exact place for this {type(lens).__name__} lens; it holds "
+            f"{writer.holds}. darswin.lens.fit, or --model, finds the closest lens of another model"
+        )
+    return text
 
 
 class Calibration:
@@ -146,7 +227,7 @@ class Calibration:
                 known = ", ".join(f.name for f in FORMATS)
                 said = content.get("model") if isinstance(content, Mapping) else None
                 raise ValueError(
-                    f"it must be of one of the formats {known}; darswin's own \"model\" must be "
+                    f'it must be of one of the formats {known}; darswin\'s own "model" must be '
                     f"one of {', '.join(MODELS)}, got {short(said)}"
                 )
         self.format, self.what = found, f"{found.name} {self.what}"
@@ -162,9 +243,7 @@ class Calibration:
                 self._cameras = found.cameras(fields, model)
             self.names = list(self._cameras)
             if not 1 <= len(self.names) <= MAX_CAMERAS:
-                raise ValueError(
-                    f"it must have 1 to {MAX_CAMERAS} cameras, got {len(self.names)}"
-                )
+                raise ValueError(f"it must have 1 to {MAX_CAMERAS} cameras, got {len(self.names)}")
 
     @classmethod
     def read(cls, path: str | os.PathLike, model: str | None = None) -> Self:
@@ -289,17 +368,23 @@ def _batch(
     wanted = values.pop("theta_max", None)
     if theta_max is not None:
         wanted = torch.tensor([theta_max], dtype=dtype)
-    lens = from_dict(
-        {"model": first["model"], **values}, first.get("image_size", image_size)
-    )
+    lens = from_dict({"model": first["model"], **values}, first.get("image_size", image_size))
     limit = lens.theta_max
     if wanted is not None:
         rounded = (limit < wanted) & (wanted <= limit + ROUNDING)
         lens = lens.with_theta_max(torch.where(rounded, limit, wanted))
     elif "image_size" in values and "fov" not in values:
-        lens = lens.with_theta_max(torch.minimum(lens.side_angles().amax(1), limit))
+        lens = lens.with_theta_max(reach(lens))
     _check(lens, math.inf if wanted is not None else MAX_RADIUS)
     return lens
+
+
+def reach(lens: Lens) -> Tensor:
+    """(N,) rad: how far a lens that is used up to its limit is, where no θ_max is given: to the
+    widest of the image's sides, if it has a size."""
+    if lens.image_size is None:
+        return lens.theta_max
+    return torch.minimum(lens.side_angles().amax(1), lens.theta_max)
 
 
 def _check(lens: Lens, most: float) -> None:

@@ -16,7 +16,8 @@ MODELS = {
 }  # fmt: skip
 TERMS = ("k1", "k2", "k3", "k4", "p1", "p2")
 KEYS = ("camera_model", "is_fisheye", "fl_x", "fl_y", "cx", "cy", "w", "h", *TERMS)
-LIKE = re.compile(r"^[kps]_?\d|coef|dist(?!ance)")
+PAIRS = (("k1", "k2"), ("k3", "k4"), ("p1", "p2"))  # as its tools write them
+LIKE = re.compile(r"(?i)^[a-z]{0,2}_?\d|coef|dist(?!ance)")
 
 
 def fits(content: Content) -> bool:
@@ -61,9 +62,14 @@ def _camera(fields: Fields) -> Description:
         size = (fields.side("h"), fields.side("w"))
     if fields.entries.get("is_fisheye") in (True, "true") and model != "OPENCV_FISHEYE":
         raise ValueError(f"is_fisheye is true, and camera_model must not be {model} then")
+    for pair in PAIRS:
+        if (pair[0] in fields) != (pair[1] in fields):
+            one, other = pair if pair[0] in fields else pair[::-1]
+            there, lacks = fields.path(one), fields.path(other)
+            raise ValueError(f"{lacks} is missing beside {there}; write 0 if there is none")
     terms = {key: fields.number(key, 0.0) for key in TERMS}
     focal = (fields.positive("fl_x"), fields.positive("fl_y"))
     center = (fields.number("cx"), fields.number("cy"))
-    fields.check_all_read(f"nerfstudio's {model}", like=LIKE)
+    fields.check_all_read(f"nerfstudio's {model}", like=lambda name, _: LIKE.search(name))
     radial, tangential = [terms[key] for key in TERMS[:4]], [terms[key] for key in TERMS[4:]]
     return describe(MODELS[model], focal, center, size, radial=radial, tangential=tangential)

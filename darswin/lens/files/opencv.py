@@ -9,7 +9,7 @@ from functools import partial
 from typing import Any
 
 from darswin.lens.distorted import BrownConrady, KannalaBrandt, Mei
-from darswin.lens.files.cameras import Cameras, Description, describe
+from darswin.lens.files.cameras import Camera, Cameras, Description, describe
 from darswin.lens.files.content import Content
 from darswin.lens.files.fields import Fields, holds_numbers, short
 
@@ -63,6 +63,39 @@ def cameras(file: Fields, hint: str | None = None) -> Cameras:
         suffixes = [""]
     reader.check_coefficients(suffixes)
     return {suffix or "camera": partial(reader.camera, suffix) for suffix in suffixes}
+
+
+def write(camera: Camera, suffix: str) -> str | None:
+    """A file of OpenCV's FileStorage: XML, JSON or YAML; None if OpenCV has no such camera."""
+    import cv2  # only here: reading does without
+    import numpy as np
+
+    order = "k1 k2 p1 p2 k3 d1 d2 d3 s1 s2 s3 s4"
+    orders = {KannalaBrandt: "k1 k2 k3 k4", Mei: "k1 k2 p1 p2", BrownConrady: order}
+    order = orders.get(camera.model, "")
+    if not camera.terms.keys() <= {*order.split()} or camera.model not in orders:
+        return None
+    if camera.model is BrownConrady:
+        if camera.skew != 0:  # which cv2.projectPoints leaves out
+            return None
+        if not camera.terms.keys() & {"d1", "d2", "d3", "s1", "s2", "s3", "s4"}:
+            order = "k1 k2 p1 p2 k3"
+    plane = camera.plane
+    matrix = [[plane["fx"], camera.skew, plane["cx"]], [0, plane["fy"], plane["cy"]], [0, 0, 1]]
+    storage = cv2.FileStorage(
+        suffix if suffix in (".xml", ".json") else ".yaml",
+        cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY,
+    )
+    if camera.size is not None:
+        storage.write("image_width", camera.size[1])
+        storage.write("image_height", camera.size[0])
+    if camera.model is Mei:
+        storage.write("xi", plane["xi"])
+    else:
+        storage.write("fisheye_model", int(camera.model is KannalaBrandt))
+    storage.write("camera_matrix", np.array(matrix, float))
+    storage.write("distortion_coefficients", np.array([camera.listed(order)]).T)
+    return storage.releaseAndGetString()
 
 
 class _Reader:
@@ -198,9 +231,7 @@ class _Reader:
         if isinstance(section.entries, Mapping) and "rows" in section and "cols" in section:
             rows, columns = section.number("rows"), section.number("cols")
             if rows * columns != count:
-                raise ValueError(
-                    f"{name}.data must be {rows:g} × {columns:g} numbers, got {count}"
-                )
+                raise ValueError(f"{name}.data must be {rows:g} × {columns:g} numbers, got {count}")
 
     def image_size(self, suffix: str) -> tuple[int, int] | None:
         for end in (suffix, ""):
