@@ -104,7 +104,7 @@ def camera_of(lens: Lens, origin: float) -> Camera | None:
         if value != 0
     }
     plane = {
-        "fx": focal * affine[0][0], "fy": focal * affine[1][1], "cx": center[0] + origin,
+        "fx": _times(affine[0][0], focal), "fy": _times(affine[1][1], focal), "cx": center[0] + origin,
         "cy": center[1] + origin, **values,
     }  # fmt: skip
     size = None
@@ -112,3 +112,10 @@ def camera_of(lens: Lens, origin: float) -> Camera | None:
         size = tuple(round(side) for side in lens.image_size[0].tolist())
     whole = {plain: model for model, plain in reversed(PLAIN.items())}
     return Camera(whole.get(type(lens), type(lens)), plane, terms, focal * affine[0][1], size)
+
+
+def _times(ratio: float, focal: float) -> float:
+    """A focal length that `describe` divides to the same ratio: of these, a short one."""
+    product = ratio * focal
+    short = float(f"{product:.15g}")
+    return short if short / focal == ratio else product

@@ -120,8 +120,8 @@ def load(
 
     Args:
         path: the file.
-        camera: of a file with several different cameras: a name, as COLMAP's "5"; or, if none is
-            called so, a number from 0.
+        camera: of a file with several different cameras: a name, or a number from 0. Where names
+            are numbers, as COLMAP's are, a number is a name.
         theta_max: rad. None means the file's, or the widest of the lens's `side_angles`: the
             corners of the image may see more; or `theta_limit`, where no image size is known.
         image_size: (H, W) px, for a file that does not say it.
@@ -256,8 +256,8 @@ class Calibration:
         return cls(text, name, model)
 
     def choose(self, camera: str | int | None) -> str:
-        """The name of a camera: by its name; by its number from 0, if none is called so; or by
-        None, if all are the same.
+        """The name of a camera: by its name; by its number from 0, in a file that does not call
+        its cameras by numbers; or by None, if all are the same.
 
         Raises:
             ValueError: there is no such camera, or there are several.
@@ -272,6 +272,8 @@ class Calibration:
                 return names[0]
             if str(camera) in self._cameras:
                 return str(camera)
+            if any(name.isdecimal() for name in names):  # a number is a name, or a mistake
+                raise ValueError(f"camera must be one of {shown}, got {camera!r}")
             number = str(camera) if type(camera) in (str, int) else ""
             if number.isdecimal() and len(number) <= 9 and int(number) < len(names):
                 return names[int(number)]
