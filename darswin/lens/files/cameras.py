@@ -104,9 +104,12 @@ def camera_of(lens: Lens, origin: float) -> Camera | None:
         if value != 0
     }
     plane = {
-        "fx": _times(affine[0][0], focal), "fy": _times(affine[1][1], focal), "cx": center[0] + origin,
-        "cy": center[1] + origin, **values,
-    }  # fmt: skip
+        "fx": _times(affine[0][0], focal),
+        "fy": _times(affine[1][1], focal),
+        "cx": center[0] + origin,
+        "cy": center[1] + origin,
+        **values,
+    }
     size = None
     if lens.image_size is not None:
         size = tuple(round(side) for side in lens.image_size[0].tolist())
