@@ -108,15 +108,16 @@ def test_coefficients_of_any_layout(layout, suffix, tmp_path):
         (dict(D=D, my_distortion_x=[0.1]), "must stand in one entry, .*got my_distortion_x"),
         (dict(D=D, rational_coefs={"data": "0.1 0.2"}), "one entry, .*got rational_coefs"),
         (dict(D=D, dist_coeffs=D), "coefficients must stand in one entry, got D, dist_coeffs"),
-        (dict(distortion={"k1": 0.1, "k2": 0.2}, fisheye=1), "distortion.data is missing"),
+        (dict(distortion={"k1": 0.1, "k2": 0.2}, fisheye=0), "distortion.data is missing"),
         # Matrices that do not agree with themselves or each other.
-        (dict(D={"rows": 1, "cols": 5, "data": D[:4]}, fisheye=1), "must be 1 × 5 numbers, got 4"),
+        (dict(D={"rows": 1, "cols": 5, "data": D[:4]}, fisheye=0), "must be 1 × 5 numbers, got 4"),
         (dict(D=D, camera_matrix=[501.0, *BASE["K"][1:]]), "K and camera_matrix must be the same"),
     ],
 )
 def test_coefficients_are_never_left_out(entries, message):
-    with pytest.raises(ValueError, match=message):
-        loads(json.dumps(BASE | entries))
+    for model in (None, "pinhole"):
+        with pytest.raises(ValueError, match=message):
+            loads(json.dumps(BASE | entries), model=model)
 
 
 def test_what_is_no_coefficient_may_stand_beside_them():

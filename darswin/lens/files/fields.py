@@ -3,7 +3,7 @@
 import math
 import re
 import reprlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 _NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", re.ASCII)
@@ -17,6 +17,12 @@ _short.maxlevel, _short.maxstring, _short.maxother = 2, 60, 60
 def short(value: Any) -> str:
     """A value for a message, cut where it is long or deep."""
     return _short.repr(value)
+
+
+def listed(names: Iterable[str]) -> str:
+    """Names for a message, cut where there are many or where one is long."""
+    names = [name if len(name) <= _MAX_WORD else short(name) for name in map(str, names)]
+    return ", ".join(names[:20]) + (", …" if len(names) > 20 else "")
 
 
 def is_number(word: str) -> bool:
@@ -110,8 +116,8 @@ class Fields:
             and like(str(name), value)
         ]  # fmt: skip
         if left:
-            shown = ", ".join(self.path(name) for name in left[:20]) + ", …" * (len(left) > 20)
-            raise ValueError(f"{camera} has no place for the numbers of {shown}")
+            where = listed(self.path(name) for name in left)
+            raise ValueError(f"{camera} has no place for the numbers of {where}")
 
     def section(self, name: str) -> "Fields":
         value = self.get(name, "a mapping")

@@ -11,7 +11,7 @@ from typing import Any
 from darswin.lens.distorted import BrownConrady, KannalaBrandt, Mei
 from darswin.lens.files.cameras import Camera, Cameras, Description, describe
 from darswin.lens.files.content import Content
-from darswin.lens.files.fields import Fields, holds_numbers, short
+from darswin.lens.files.fields import Fields, holds_numbers, listed, short
 
 # Names as `_plain` leaves them.
 MATRIX = ("k", "cameramatrix", "intrinsicmatrix", "mtx", "m")
@@ -114,7 +114,7 @@ class _Reader:
             and COEFFICIENTS.fullmatch(plain.removesuffix(suffix))
         ]  # fmt: skip
         if len(found) > 1:
-            raise ValueError(f"coefficients must stand in one entry, got {', '.join(found)}")
+            raise ValueError(f"coefficients must stand in one entry, got {listed(found)}")
         return found[0] if found else None
 
     def check_coefficients(self, suffixes: list[str]) -> None:
@@ -129,10 +129,9 @@ class _Reader:
             )
         ]  # fmt: skip
         if left or (None in read and any(read)):
-            keys = ", ".join(left) if left else ", ".join(name for name in read if name)
             raise ValueError(
                 "each camera's coefficients must stand in one entry, such as "
-                f"distortion_coefficients or D, got {keys}"
+                f"distortion_coefficients or D, got {listed(left or filter(None, read))}"
             )
 
     def camera(self, suffix: str) -> Description:
@@ -151,11 +150,11 @@ class _Reader:
         coefficients = [] if name is None else self.matrix(name, (0, 4, 5, 8, 12, 14))
         xi = self.find(("xi",), suffix)
         kind = self.kind(name, coefficients, xi)
-        if name is None and self.hint is None:
-            keys = ", ".join(list(map(str, self.file.entries))[:20])
+        says = xi is not None or self.find(SAYS_FISHEYE + SAYS_MODEL) is not None
+        if name is None and (says or self.hint is None):
             raise ValueError(
                 "distortion_coefficients or D is missing; write D: [] if the camera has none. The "
-                f"file has {keys}"
+                f"file has {listed(self.file.entries)}"
             )
         if coefficients and len(coefficients) not in COUNTS[kind]:
             raise ValueError(
