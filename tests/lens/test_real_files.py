@@ -109,6 +109,8 @@ def test_coefficients_of_any_layout(layout, suffix, tmp_path):
         (dict(D=D, rational_coefs={"data": "0.1 0.2"}), "one entry, .*got rational_coefs"),
         (dict(D=D, dist_coeffs=D), "coefficients must stand in one entry, got D, dist_coeffs"),
         (dict(distortion={"k1": 0.1, "k2": 0.2}, fisheye=0), "distortion.data is missing"),
+        (dict(fisheye=0, D="", ts=D), "D must be 0 or 4 or 5 or 8 or 12 or 14 finite numbers, got"),
+        (dict(fisheye=0, D={"data": ""}, ts=D), "D.data must be 0 or 4 or 5 or .*, got None"),
         # Matrices that do not agree with themselves or each other.
         (dict(D={"rows": 1, "cols": 5, "data": D[:4]}, fisheye=0), "must be 1 × 5 numbers, got 4"),
         (dict(D=D, camera_matrix=[501.0, *BASE["K"][1:]]), "K and camera_matrix must be the same"),

@@ -217,7 +217,12 @@ class _Reader:
         """The numbers of a matrix: a mapping with `data`, a list, a list of rows, or a number."""
         value, where = self.file.entries[name], name
         if isinstance(value, Mapping):
-            value, where = self.file.section(name).get("data", "numbers"), f"{name}.data"
+            section, where = self.file.section(name), f"{name}.data"
+            value = section.get("data", "numbers")
+            if value == "" and not ("rows" in section and "cols" in section):
+                value = None  # as below
+        elif value == "":
+            value = None  # nothing is not a list of nothing
         if isinstance(value, (int, float)):
             value = [value]
         if isinstance(value, list) and any(isinstance(row, list) for row in value[:3]):
