@@ -65,9 +65,9 @@ test-asan: build  ## the operators' tests on every tier under AddressSanitizer a
 	      -m "not unsanitized" $(CURDIR)/tests/ops; \
 	done
 
-fuzz: build  ## 20,000 random calls of the operators, and more, and 48,000 hostile ones (10 minutes)
+fuzz: build  ## random and hostile calls of the operators, 100,000 wrong calibrations (40 minutes)
 	$(BIN)/python -X faulthandler -m pytest -q --hypothesis-profile=fuzz \
-	  tests/ops/test_properties.py tests/ops/test_hostile.py
+	  tests/ops/test_properties.py tests/ops/test_hostile.py tests/lens/test_mutations.py
 
 lint: $(STAMP)  ## ruff and clang-format, without changing anything
 	$(BIN)/ruff check .

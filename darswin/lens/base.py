@@ -190,7 +190,7 @@ class Lens:
         (radius,) = self._aligned(radius)
         slack = 1 + 16 * torch.finfo(radius.dtype).eps
         with torch.no_grad():
-            last = self.r_max.maximum(self.project(self.theta_max * slack)) * slack
+            last = torch.fmax(self.r_max, self.project(self.theta_max * slack)) * slack
             lands = (radius >= 0) & (radius <= self._row(last, radius.dim()))
         # 0 in place of what has no angle: NaN would reach the gradients.
         return torch.where(lands, self._angle_at(torch.where(lands, radius, 0.0)), torch.nan)

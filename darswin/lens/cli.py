@@ -12,11 +12,13 @@ from darswin.data.sources import read_oriented
 from darswin.grid import Spacing
 from darswin.layers import PolarSample
 from darswin.lens.base import Lens
+from darswin.lens.files.load import Calibration, reach
 from darswin.lens.orientation import in_upright_picture, stored_size
 from darswin.lens.report import describe, sides
 from darswin.plot import draw_lens, figure_format, save_figure
 
 Coefficients = Literal["fisheye", "pinhole", "omnidir"]
+Format = Literal["darswin", "opencv", "colmap", "kalibr"]
 View = Literal["perspective", "cylindrical", "equirectangular"]
 VIEW_SIDE = 800  # px, the longer one
 # More than a picture can show: rings, sectors, samples along each side of a patch, and in all.
@@ -104,38 +106,51 @@ def info(
         coefficients: what they are, in an OpenCV or ROS file that does not say it.
     """
     _check_partition(rings, sectors)
+    file = Calibration.read(calib, coefficients)
     lens = _load(calib, camera, theta_max_deg, image_size, coefficients)
     if lens.image_size is None:
         raise ValueError(
             f"{calib} does not say how large its images are: give --image_size, their height and "
             "width, e.g. 960,1280"
         )
+    origin = f"({file.format.origin:g}, {file.format.origin:g})"
+    print(f"{'format':<16}{file.format.name}, with the centre of the upper left pixel at {origin}")
+    if len(file.names) > 1:
+        names = ", ".join(file.names[:20]) + ", …" * (len(file.names) > 20)
+        print(f"{'camera':<16}{file.choose(camera)}, of {len(file.names)}: {names}")
     print(describe(lens, rings=rings, sectors=sectors))
 
 
 def convert(
     calib: str, out: str, model: str | None = None, theta_max_deg: float | None = None,
     image_size: tuple[int, int] | None = None, camera: str | None = None,
-    coefficients: Coefficients | None = None,
+    coefficients: Coefficients | None = None, format: Format | None = None,
 ) -> None:  # fmt: skip
-    """Writes a calibration as darswin's JSON, and fits another model to it.
+    """Writes a calibration as a file of darswin, OpenCV, COLMAP or Kalibr, or another model's.
 
     Args:
         calib: a calibration file, of any format that darswin.lens.load reads.
-        out: the JSON file to write.
+        out: the file to write.
         model: a name of darswin.lens.MODELS; without it the model stays.
         theta_max_deg: how far the lens is used; without it as far as image and lens reach.
         image_size: height and width, px, where the file does not say it.
         camera: which one, in a file of several.
         coefficients: what they are, in an OpenCV or ROS file that does not say it.
+        format: of the file; without it OpenCV for .xml, .yaml and .yml, but Kalibr where the name
+            has "camchain" or "kalibr"; COLMAP for .txt; else darswin, whose JSON holds any lens.
     """
     lens = _load(calib, camera, theta_max_deg, image_size, coefficients)
     note = ""
     if model is not None:
         lens, error = darswin.lens.fit(model, lens)
         note = f", at most {error.item():.2g} px from {calib}"
-    darswin.lens.save(lens, out)
-    print(f"{out}: {type(lens).__name__} up to {math.degrees(lens.theta_max.item()):.2f}°{note}")
+    written = darswin.lens.save(lens, out, format)
+    degrees = math.degrees(lens.theta_max.item())
+    if written != "darswin" and bool(
+        (lens.theta_max - reach(lens.with_theta_max(None))).abs() > 1e-6
+    ):
+        note += f"; {written} files do not say how far: read it with --theta_max_deg {degrees:.2f}"
+    print(f"{out}: {written}, {type(lens).__name__} up to {degrees:.2f}°{note}")
 
 
 def _load(
@@ -150,8 +165,6 @@ def _load(
     if theta_max_deg is not None:
         in_range = 0 < theta_max_deg <= 180
         _check("theta_max_deg", theta_max_deg, in_range, "above 0° and at most 180°")
-    if camera is not None and camera.isdecimal():
-        camera = int(camera)
     return darswin.lens.load(
         calib,
         camera=camera,

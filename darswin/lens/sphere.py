@@ -68,7 +68,8 @@ class EnhancedUnified(Lens):
     """r = f sin θ / (α √(β sin² θ + cos² θ) + (1 - α) cos θ): EUCM, at β = 1 the unified model.
 
     Args:
-        alpha: α in [0, 1]. beta: β > 0. focal: f > 0, px. Others: as `Lens`.
+        alpha: α in [0, 1]. beta: β > 0; or β < 0, for θ up to atan(1 / √-β). focal: f > 0, px.
+        Others: as `Lens`.
 
     Source: Khomutenko, Garcia and Martinet, RA-L 2016.
     """
@@ -92,21 +93,25 @@ class EnhancedUnified(Lens):
 
     def _validate(self) -> None:
         self._require("alpha", (self.alpha >= 0) & (self.alpha <= 1), "in [0, 1]")
-        self._require("beta", (self.beta > 0) & self.beta.isfinite(), "finite and above 0")
+        self._require(
+            "beta", (self.beta != 0) & self.beta.isfinite(), "finite and above 0, or below"
+        )
         self._require("focal", (self.focal > 0) & self.focal.isfinite(), "finite and above 0")
 
     @property
     def theta_limit(self) -> Tensor:
         # Where cos θ = -w √(β sin² θ + cos² θ).
-        w = _cone(self.alpha.detach())
-        last = torch.atan2(root(1 - w * w), -w * self.beta.detach().sqrt())
-        return last - MARGIN
+        w, beta = _cone(self.alpha.detach()), self.beta.detach()
+        last = torch.atan2(root(1 - w * w), -w * root(beta))
+        # β below 0: where the square root has none.
+        return torch.where(beta > 0, last, torch.atan(root(-beta).reciprocal())) - MARGIN
 
     def project(self, theta: Number) -> Tensor:
         theta, alpha, beta, focal = self._aligned(theta, "alpha", "beta", "focal")
         sin, cos = torch.sin(theta), torch.cos(theta)
-        length = torch.sqrt(beta * sin * sin + cos * cos)
-        return focal * sin / (alpha * length + (1 - alpha) * cos)
+        square = beta * sin * sin + cos * cos
+        radius = focal * sin / (alpha * root(square) + (1 - alpha) * cos)
+        return torch.where(square >= 0, radius, torch.nan)
 
     def _angle_at(self, radius: Tensor) -> Tensor:
         radius, alpha, beta, focal = self._aligned(radius, "alpha", "beta", "focal")

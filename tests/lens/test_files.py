@@ -1,6 +1,5 @@
 import json
 import math
-import random
 import re
 from itertools import pairwise
 from pathlib import Path
@@ -578,7 +577,6 @@ def changed(name, old, new):
         (changed("colmap.txt", " 3008", ""), "COLMAP .*: camera '1', OPENCV_FISHEYE must have 8"),
         (changed("colmap.txt", "OPENCV_FISHEYE", "EQUIRECTANGULAR"), "model must be one of SIMP"),
         (changed("colmap.txt", "1504", "NaN"), "camera '1', cx must be a finite number, got 'NaN'"),
-        ("1 SIMPLE_DIVISION 640 480 300 320 240 0.2", "k must be at most 0, got 0.2"),
         (changed("nerfstudio.json", "OPENCV_FISHEYE", "EQUIRECTANGULAR"),
          "nerfstudio .*: camera_model must be one of SIMPLE_PINHOLE, .*, got 'EQUIRECTANGULAR'"),
         (changed("nerfstudio.json", '"fl_y": 852.9,', ""), "fl_y is missing"),
@@ -610,7 +608,7 @@ def test_errors_say_what_is_wrong(text, message, tmp_path):
     path = tmp_path / "f"
     path.write_text(text)
     with pytest.raises(ValueError, match=message) as error:
-        load(path, camera=None if "basalt" not in message else 0)
+        load(path, camera=3 if "k3" in message else 0 if "basalt" in message else None)
     assert str(path) in str(error.value) and len(str(error.value)) < 1000
 
 
@@ -646,7 +644,7 @@ BOMB = "a: &a [x, x, x, x, x, x, x, x, x]\n" + "".join(
         ("a: " + "{b: " * 20_000, "nested"),
         ("<a>" * 50_000 + "</a>" * 50_000, "XML must be at most"),
         ("<a>" * 30_000 + "</a>" * 30_000, "XML must be at most 16 elements deep"),
-        ("a: " + "1" * 300_000, "YAML must be at most 256 KiB"),
+        ("a: " + "1" * 300_000, "YAML must be at most 128 KiB"),
         (BOMB, "must be of one of the formats"),
         (BOMB + "model_type: MEI\nimage_height: *j\n", "image_height must be a whole number"),
         (BOMB + "K: *j\n", "K must be 9 finite numbers"),
@@ -661,7 +659,8 @@ BOMB = "a: &a [x, x, x, x, x, x, x, x, x]\n" + "".join(
         ("!!python/object/apply:os.system ['touch pwned']\n", "must be a mapping"),
         ("1 " * 1_000_000, "it must have 5 lines"),
         ("1 A\n" * 2_000_000, "a table must be at most 4096 KiB"),
-        ("1 A\n" * 100_000, "camera '1', must be an id"),
+        ("".join(f"{i} A\n" for i in range(9_000)), "camera '0', must be an id"),
+        ("1 A\n" * 100_000, "there must be one camera '1', got two"),
         ("".join(f"{i} SIMPLE_PINHOLE 9 9 9 4 4\n" for i in range(20_000)), "to 10000 cameras"),
     ],
 )  # fmt: skip
@@ -670,67 +669,3 @@ def test_hostile_files_end_soon_and_run_nothing(text, message, tmp_path, monkeyp
     with pytest.raises(ValueError, match=message) as error:
         loads(text)
     assert len(str(error.value)) < 1000 and not list(tmp_path.iterdir())
-
-
-REPLACEMENTS = (
-    "abc", "NaN", ".nan", "Infinity", "-.inf", "-1", "0", "1e308", "-1e308", "1e-308", "1e30",
-    "1e6", "9" * 400, "-" + "9" * 5000, "[]", "{}", "[[1]]", '{"a": 1}', "null", "~", "true",
-    '""', "''", "!!python/object/apply:os.system [ls]", "&a", "*a", "\x00", "é", "1 2", "1,2",
-    "0x10", "1_000",
-)  # fmt: skip
-
-
-def mutated(data: bytes, rng: random.Random) -> bytes:
-    """A file with one thing wrong, seldom several."""
-    for _ in range(rng.choice((1, 1, 1, 2, 4))):
-        kind = rng.randrange(7)
-        start = rng.randrange(len(data) + 1)
-        end = min(len(data), start + rng.choice((1, 1, 3, 20, 200)))
-        lines = data.split(b"\n")
-        line = rng.randrange(len(lines))
-        numbers = list(re.finditer(rb"-?\d[\d.eE+-]*", data))
-        if kind == 0 and start < len(data):
-            flipped = bytes([data[start] ^ (1 << rng.randrange(8))])
-            data = data[:start] + flipped + data[start + 1 :]
-        elif kind == 1:
-            data = data[:start] + data[end:]
-        elif kind == 2:
-            data = data[:end] + data[start:end] + data[end:]
-        elif kind == 3:
-            del lines[line]
-            data = b"\n".join(lines)
-        elif kind == 4:
-            lines.insert(rng.randrange(len(lines)), lines[line])
-            data = b"\n".join(lines)
-        elif numbers:
-            match = rng.choice(numbers)
-            new = rng.choice(REPLACEMENTS).encode()
-            data = data[: match.start()] + new + data[match.end() :]
-    return data
-
-
-@pytest.mark.parametrize(
-    "name",
-    ["woodscape.json", "kitti360_02.yaml", "camodocal_scaramuzza.yaml", "kalibr_tumvi.yaml",
-     "opencv_fisheye.yaml", "opencv_omnidir.xml", "ros_fisheye.yaml", "ocamcalib.txt",
-     "colmap_all.txt", "nerfstudio.json", "basalt.json", "ours.json"],
-)  # fmt: skip
-def test_a_mutated_file_gives_a_lens_or_a_clear_error(name, tmp_path):
-    original, path = FILES.joinpath(name).read_bytes(), tmp_path / "file"
-    rng = random.Random(name)
-    lenses_found = errors = 0
-    for _ in range(200):
-        path.write_bytes(mutated(original, rng))
-        try:
-            lens = load(path, camera=0)
-        except ValueError as error:
-            message = str(error)
-            assert "calibration " + str(path) in message and len(message) < 1200
-            errors += 1
-            continue
-        lenses_found += 1
-        theta = lens.theta_max * torch.linspace(0, 1, 50)
-        assert 0 < lens.theta_max.item() <= math.pi
-        pixels = lens.project_rays(theta, torch.linspace(-3, 3, 50), (9, 9))
-        assert pixels.isfinite().all()
-    assert lenses_found > 10 and errors > 10

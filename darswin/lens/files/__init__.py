@@ -1,5 +1,6 @@
-"""Calibration files: those of other tools are read, our own JSON is read and written."""
+"""Calibration files: those of ten formats are read, those of four written."""
 
-from darswin.lens.files.load import load, load_all, loads, save
+from darswin.lens.files.load import load, load_all, loads
+from darswin.lens.files.save import save
 
 __all__ = ["load", "load_all", "loads", "save"]

@@ -1,9 +1,10 @@
 """basalt's JSON: `value0` with one entry of `intrinsics` and of `resolution` a camera."""
 
 from collections.abc import Mapping
+from functools import partial
 
 from darswin.lens.distorted import BrownConrady, KannalaBrandt
-from darswin.lens.files.cameras import Description, describe
+from darswin.lens.files.cameras import Cameras, Description, describe
 from darswin.lens.files.content import Content
 from darswin.lens.files.fields import Fields
 from darswin.lens.ideal import FieldOfView
@@ -16,14 +17,14 @@ def fits(content: Content) -> bool:
     return isinstance(content, Mapping) and "value0" in content
 
 
-def cameras(file: Fields) -> dict[str, Description]:
+def cameras(file: Fields) -> Cameras:
     calibration = file.section("value0")
     entries = calibration.sections("intrinsics")
     sizes: list[tuple[int, int] | None] = [None] * len(entries)
     if calibration.entries.get("resolution"):
         sizes = calibration.sizes("resolution", len(entries))
     pairs = zip(entries, sizes, strict=True)
-    return {f"cam{i}": _camera(entry, size) for i, (entry, size) in enumerate(pairs)}
+    return {f"cam{i}": partial(_camera, entry, size) for i, (entry, size) in enumerate(pairs)}
 
 
 def _camera(entry: Fields, size: tuple[int, int] | None) -> Description:
@@ -59,4 +60,5 @@ def _camera(entry: Fields, size: tuple[int, int] | None) -> Description:
     else:
         where, expected = entry.path("camera_type"), ", ".join(MODELS)
         raise ValueError(f"{where} must be one of {expected}, got {kind!r}")
+    values.check_all_read(f"basalt's {kind}", known=("rpmax",))
     return describe(model, focal, center, size, **parameters)

@@ -1,10 +1,11 @@
-"""What every format's reader makes of a camera: a description, as `darswin.lens.from_dict` takes.
+"""What readers make of a camera, a description as `darswin.lens.from_dict` takes, and writers get.
 
-A reader leaves the principal point as its file has it; `load` moves it to our pixel origin.
+Both have the principal point as their files have it; `load` and `save` move it from and to our
+pixel origin.
 """
 
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 from darswin.lens.base import Lens
 from darswin.lens.distorted import BrownConrady, Fisheye624, KannalaBrandt, Mei
@@ -12,8 +13,12 @@ from darswin.lens.ideal import Equidistant, Perspective
 from darswin.lens.sphere import Spherical
 
 Description = dict[str, Any]
+# What describes each camera of a file, by its name: nothing is read before it is asked for.
+Cameras = dict[str, Callable[[], Description]]
 
-TERMS = ("radial", "denominator", "tangential", "prism")
+# What the terms are called in files, with a number from 1.
+LETTERS = {"radial": "k", "denominator": "d", "tangential": "p", "prism": "s"}
+TERMS = tuple(LETTERS)
 # What is left of a model when all its terms are zero, with a closed inverse.
 PLAIN: dict[type[Lens], type[Lens]] = {
     KannalaBrandt: Equidistant, Fisheye624: Equidistant, BrownConrady: Perspective, Mei: Spherical
@@ -55,3 +60,65 @@ def in_image(
     frame = {"center": center, "affine": affine, "image_size": image_size}
     frame = {name: list(value) for name, value in frame.items() if value is not None}
     return {"model": model.__name__, **parameters, **frame}
+
+
+class Camera(NamedTuple):
+    """A lens for a writer, the inverse of `describe`.
+
+    Attributes: model: its class, with terms: a Perspective lens is a BrownConrady without any.
+    plane: fx, fy, cx, cy (px) and those parameters that are numbers. terms: those that are not 0,
+    as k1, k2, p1, …; d1 is the first of the denominator. skew: px. size: (H, W) or None.
+    """
+
+    model: type[Lens]
+    plane: dict[str, float]
+    terms: dict[str, float]
+    skew: float
+    size: tuple[int, int] | None
+
+    def listed(self, names: str) -> list[float]:
+        """Terms in an order, 0 where there are none."""
+        return [self.terms.get(name, 0.0) for name in names.split()]
+
+
+def camera_of(lens: Lens, origin: float) -> Camera | None:
+    """A lens with the center of the upper left pixel at (origin, origin), or None: it has no focal
+    length, or columns that slant.
+
+    Raises:
+        ValueError: several lenses, or one with neither a center nor an image_size.
+    """
+    if len(lens) != 1:
+        raise ValueError(f"save takes one lens, got {len(lens)}")
+    center = lens.center_in()[0].tolist()
+    values = {name: getattr(lens, name) for name in (*lens.parameters, *lens.optional)}
+    values = {name: v.detach()[0].tolist() for name, v in values.items() if v is not None}
+    affine = [[1.0, 0.0], [0.0, 1.0]] if lens.affine is None else lens.affine.detach()[0].tolist()
+    if "focal" not in values or affine[1][0] != 0 or affine[0][0] <= 0 or affine[1][1] <= 0:
+        return None
+    focal = values.pop("focal")
+    terms = {
+        f"{letter}{i}": value
+        for name, letter in LETTERS.items()
+        for i, value in enumerate(values.pop(name, []), 1)
+        if value != 0
+    }
+    plane = {
+        "fx": _times(affine[0][0], focal),
+        "fy": _times(affine[1][1], focal),
+        "cx": center[0] + origin,
+        "cy": center[1] + origin,
+        **values,
+    }
+    size = None
+    if lens.image_size is not None:
+        size = tuple(round(side) for side in lens.image_size[0].tolist())
+    whole = {plain: model for model, plain in reversed(PLAIN.items())}
+    return Camera(whole.get(type(lens), type(lens)), plane, terms, focal * affine[0][1], size)
+
+
+def _times(ratio: float, focal: float) -> float:
+    """A focal length that `describe` divides to the same ratio: of these, a short one."""
+    product = ratio * focal
+    short = float(f"{product:.15g}")
+    return short if short / focal == ratio else product

@@ -1,8 +1,10 @@
 """COLMAP's cameras.txt: a line a camera, of any model but the spherical ones."""
 
+from functools import partial
+
 from darswin.lens.base import Lens
 from darswin.lens.distorted import BrownConrady, Fisheye624, KannalaBrandt
-from darswin.lens.files.cameras import Description, describe
+from darswin.lens.files.cameras import Camera, Cameras, Description, describe
 from darswin.lens.files.content import Content
 from darswin.lens.files.fields import Fields, is_number, short
 from darswin.lens.ideal import FieldOfView, Perspective
@@ -14,6 +16,7 @@ MODELS: dict[str, tuple[type[Lens], str]] = {
     "PINHOLE": (BrownConrady, "fx fy cx cy"),
     "SIMPLE_RADIAL": (BrownConrady, "f cx cy k1"),
     "RADIAL": (BrownConrady, "f cx cy k1 k2"),
+    "BROWN_CONRADY": (BrownConrady, "f cx cy k1 k2 k3 p1 p2"),
     "OPENCV": (BrownConrady, "fx fy cx cy k1 k2 p1 p2"),
     "FULL_OPENCV": (BrownConrady, "fx fy cx cy k1 k2 p1 p2 k3 d1 d2 d3"),
     "SIMPLE_FISHEYE": (KannalaBrandt, "f cx cy"),
@@ -35,8 +38,39 @@ def fits(content: Content) -> bool:
     return isinstance(content, list) and len(content[0]) > 1 and not is_number(content[0][1])
 
 
-def cameras(rows: list[list[str]]) -> dict[str, Description]:
-    return {row[0]: _camera(row) for row in rows}
+def cameras(rows: list[list[str]]) -> Cameras:
+    found: Cameras = {}
+    for row in rows:
+        if row[0] in found:
+            raise ValueError(f"there must be one camera {short(row[0])}, got two")
+        found[row[0]] = partial(_camera, row)
+    return found
+
+
+# What `write` makes of a camera: the first of its class that has a place for all its terms.
+WRITTEN = ("PINHOLE", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE", "THIN_PRISM_FISHEYE",
+           "RAD_TAN_THIN_PRISM_FISHEYE", "FOV", "EUCM", "DIVISION")  # fmt: skip
+
+
+def write(camera: Camera) -> str | None:
+    """A cameras.txt of camera 1; None if COLMAP has no such camera."""
+    if camera.size is None:
+        raise ValueError("COLMAP's cameras have an image_size, (H, W), and this lens has none")
+    values = camera.plane | camera.terms
+    if values.get("beta", 1) < 0 and values["alpha"] == 0.5:
+        values["division"] = values.pop("beta") / -4
+        del values["alpha"]
+    for name in WRITTEN:
+        model, names = MODELS[name]
+        if model is camera.model and camera.skew == 0 and values.keys() <= {*names.split()}:
+            numbers = (values.get(n, 0.0) for n in names.split())
+            height, width = camera.size
+            return (
+                "# Camera list with one line of data per camera:\n"
+                "#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n# Number of cameras: 1\n"
+                f"1 {name} {width} {height} {' '.join(map(repr, numbers))}\n"
+            )
+    return None
 
 
 def _camera(row: list[str]) -> Description:
@@ -76,6 +110,4 @@ def _terms(values: Fields, names: list[str]) -> dict[str, list[float]]:
 def _division(values: Fields) -> tuple[type[Lens], dict[str, float]]:
     """The division model, r / (1 + k r²) = tan θ, is an EUCM of α = 1/2 and β = -4 k."""
     k = values.number("division")
-    if k > 0:
-        raise ValueError(f"{values.path('k')} must be at most 0, got {k:g}")
-    return (EnhancedUnified, {"alpha": 0.5, "beta": -4 * k}) if k < 0 else (Perspective, {})
+    return (EnhancedUnified, {"alpha": 0.5, "beta": -4 * k}) if k else (Perspective, {})

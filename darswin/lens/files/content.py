@@ -3,21 +3,26 @@
 import json
 import os
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree
 
 import yaml
 
-from darswin.lens.files.fields import is_number
+from darswin.lens.files.fields import is_number, short
 
 # A mapping from YAML, JSON or XML; or rows of words, from a plain table.
 Content = Mapping | list[list[str]]
 
 MAX_BYTES = 16 << 20
 MAX_TABLE = 4 << 20
-MAX_MARKUP = 256 << 10  # YAML is parsed at some 100 KB a second
+MAX_YAML = 128 << 10  # it is parsed at some 100 KB a second
+MAX_XML = 256 << 10
 MAX_DEPTH = 16
+
+# The corner points of a calibration, in YAML and in XML: megabytes of numbers, and no lens's.
+_POINTS = re.compile(r"\[[\s\d.,eE+-]{2048,}\]|(?<=>)[\s\d.eE+-]{2048,}(?=<)")
 
 
 def read_text(path: str | os.PathLike) -> str:
@@ -62,9 +67,20 @@ def parse(text: str) -> Content:
 
 def _parse_json(text: str) -> Mapping:
     try:
-        return json.loads(text)
+        return json.loads(text, object_pairs_hook=_mapping)
     except ValueError as error:
         raise ValueError(f"it is no JSON: {error}") from error
+
+
+def _mapping(pairs: Iterable[tuple[str, Any]]) -> dict[str, Any]:
+    """A mapping; two entries of one name, of which a parser keeps the last, are an error."""
+    pairs = list(pairs)
+    mapping = dict(pairs)
+    if len(mapping) < len(pairs):
+        names = [name for name, _ in pairs]
+        twice = next(name for name in names if names.count(name) > 1)
+        raise ValueError(f"{short(twice)} stands there twice")
+    return mapping
 
 
 def _parse_table(text: str) -> list[list[str]]:
@@ -75,22 +91,35 @@ def _parse_table(text: str) -> list[list[str]]:
 
 def _parse_yaml(text: str) -> Mapping:
     """YAML whose scalars stay text and whose tags, !!opencv-matrix or worse, mean nothing."""
-    _check_size("YAML", text, MAX_MARKUP)
     # OpenCV begins its files with %YAML:1.0, which is no YAML.
-    text = re.sub(r"\A%YAML[^\n]*\n", "", text)
+    text = re.sub(r"\A%YAML[^\n]*\n", "", _without_points("YAML", text, MAX_YAML))
+    lines = text.split("\n")
+    while lines and lines[-1].strip() in ("", "---", "..."):  # as `ros2 topic echo` ends
+        lines.pop()
+    text = "\n".join(lines)
     try:
-        content = yaml.load(text, yaml.BaseLoader)
+        content = yaml.load(text, _Loader)
     except (yaml.YAMLError, ValueError, OverflowError) as error:
         mark = getattr(error, "problem_mark", None)
         where = "" if mark is None else f"line {mark.line + 1}: "
-        raise ValueError(f"it is no YAML: {where}{getattr(error, 'problem', error)}") from error
+        problem = str(getattr(error, "problem", error)).splitlines()[0]
+        raise ValueError(f"it is no YAML: {where}{problem}") from error
     if not isinstance(content, Mapping):
         raise ValueError("it must be a mapping (YAML, JSON or XML) or a table of numbers")
     return content
 
 
+class _Loader(yaml.BaseLoader):
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[str, Any]:
+        super().construct_mapping(node, deep)  # which says what cannot be a name
+        return _mapping(
+            (self.construct_object(name), self.construct_object(value))
+            for name, value in node.value
+        )
+
+
 def _parse_xml(text: str) -> Mapping:
-    _check_size("XML", text, MAX_MARKUP)
+    text = _without_points("XML", text, MAX_XML)
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
         raise ValueError("an XML file must not have a DOCTYPE or an ENTITY")
     try:
@@ -112,7 +141,15 @@ def _element(element: ElementTree.Element, depth: int) -> Mapping | list | str:
         return (element.text or "").strip().strip('"')
     if all(tag == "_" for tag, _ in children):
         return [value for _, value in children]
-    return dict(children)
+    return _mapping(children)
+
+
+def _without_points(notation: str, text: str, most: int) -> str:
+    """Text that is parsed soon: where it is large, long lists of numbers become words."""
+    if len(text) > most:
+        text = _POINTS.sub("many numbers", text)
+    _check_size(notation, text, most)
+    return text
 
 
 def _check_size(notation: str, text: str, most: int) -> None:

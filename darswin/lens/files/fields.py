@@ -3,10 +3,10 @@
 import math
 import re
 import reprlib
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
-_NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?")
+_NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", re.ASCII)
 _MAX_WORD = 64
 MAX_SIDE = 1_000_000
 
@@ -17,6 +17,12 @@ _short.maxlevel, _short.maxstring, _short.maxother = 2, 60, 60
 def short(value: Any) -> str:
     """A value for a message, cut where it is long or deep."""
     return _short.repr(value)
+
+
+def listed(names: Iterable[str]) -> str:
+    """Names for a message, cut where there are many or where one is long."""
+    names = [name if len(name) <= _MAX_WORD else short(name) for name in map(str, names)]
+    return ", ".join(names[:20]) + (", …" if len(names) > 20 else "")
 
 
 def is_number(word: str) -> bool:
@@ -56,8 +62,19 @@ def to_side(value: Any, name: str) -> int:
     return int(number)
 
 
+def holds_numbers(value: Any) -> bool:
+    """Whether a value is a number other than 0, or may hold some."""
+    if isinstance(value, str):
+        words = value[:1000].replace(",", " ").split()
+        return all(map(is_number, words)) and any(float(word) for word in words)
+    if isinstance(value, (list, Mapping)):
+        entries = value.values() if isinstance(value, Mapping) else value
+        return any(isinstance(v, (list, Mapping)) or holds_numbers(v) for v in entries)
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and value != 0
+
+
 class Fields:
-    """A mapping of a file. Its methods read an entry by name.
+    """A mapping of a file. Its methods read an entry by name, and it knows which ones were read.
 
     Raises:
         ValueError: an entry that is missing or of the wrong kind.
@@ -65,6 +82,7 @@ class Fields:
 
     def __init__(self, entries: Mapping[str, Any], where: str = ""):
         self.entries, self._where = entries, where
+        self._read: set[str] = set()
 
     def __contains__(self, name: str) -> bool:
         return name in self.entries
@@ -76,7 +94,30 @@ class Fields:
     def get(self, name: str, expected: str) -> Any:
         if name not in self.entries:
             raise ValueError(f"{self.path(name)} is missing, it must be {expected}")
+        self._read.add(name)
         return self.entries[name]
+
+    def check_all_read(
+        self,
+        camera: str,
+        *,
+        known: tuple[str, ...] = (),
+        like: Callable[[str, Any], Any] = lambda name, value: True,
+    ) -> None:
+        """That no number was left out, which might be a coefficient under another name.
+
+        Args:
+            camera: what the numbers are of. known: names of what may be left out. like: whether
+                an entry, a name and a value, looks like coefficients.
+        """
+        left = [
+            name for name, value in self.entries.items()
+            if name not in self._read and name not in known and holds_numbers(value)
+            and like(str(name), value)
+        ]  # fmt: skip
+        if left:
+            where = listed(self.path(name) for name in left)
+            raise ValueError(f"{camera} has no place for the numbers of {where}")
 
     def section(self, name: str) -> "Fields":
         value = self.get(name, "a mapping")

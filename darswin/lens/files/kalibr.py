@@ -1,9 +1,13 @@
 """Kalibr's camchain YAML: pinhole, omni, ds and eucm with radtan, equidistant, fov or none."""
 
+import re
 from collections.abc import Mapping
+from functools import partial
+
+import yaml
 
 from darswin.lens.distorted import BrownConrady, KannalaBrandt, Mei
-from darswin.lens.files.cameras import Description, describe
+from darswin.lens.files.cameras import Camera, Cameras, Description, describe
 from darswin.lens.files.content import Content
 from darswin.lens.files.fields import Fields
 from darswin.lens.ideal import FieldOfView
@@ -17,27 +21,30 @@ MODELS = {
     "eucm": (("alpha", "beta"), ("none",)),
 }
 COEFFICIENTS = {"radtan": 4, "equidistant": 4, "fov": 1, "none": 0}
+LIKE = re.compile("coef|dist(?!ance)")
 
 
 def _is_camera(entry: object) -> bool:
-    return isinstance(entry, Mapping) and "camera_model" in entry
+    """Also one that lacks something, so that it is missed, and no other camera taken for it."""
+    return isinstance(entry, Mapping) and ("camera_model" in entry or "intrinsics" in entry)
 
 
 def _is_alone(content: Mapping) -> bool:
-    return _is_camera(content) and "intrinsics" in content
+    return "camera_model" in content and "intrinsics" in content
 
 
 def fits(content: Content) -> bool:
     return isinstance(content, Mapping) and (
-        _is_alone(content) or any(_is_camera(entry) for entry in content.values())
+        _is_alone(content)
+        or any(isinstance(e, Mapping) and "camera_model" in e for e in content.values())
     )
 
 
-def cameras(file: Fields) -> dict[str, Description]:
+def cameras(file: Fields) -> Cameras:
     if _is_alone(file.entries):
-        return {"camera": _camera(file)}
+        return {"camera": partial(_camera, file)}
     names = [name for name, entry in file.entries.items() if _is_camera(entry)]
-    return {name: _camera(file.section(name)) for name in names}
+    return {name: partial(_camera, file.section(name)) for name in names}
 
 
 def _camera(fields: Fields) -> Description:
@@ -51,6 +58,7 @@ def _camera(fields: Fields) -> Description:
             raise ValueError(f"{where} must be a focal length above 0, got {focal:g}")
     count = COEFFICIENTS[distortion]
     coefficients = fields.numbers("distortion_coeffs", (count,)) if count else []
+    fields.check_all_read(f"a {distortion} camera", like=lambda name, _: LIKE.search(name))
     size = None
     if "resolution" in fields:
         width, height = fields.sides("resolution")
@@ -65,6 +73,39 @@ def _camera(fields: Fields) -> Description:
     pinhole = KannalaBrandt if distortion == "equidistant" else BrownConrady
     classes = {"pinhole": pinhole, "omni": Mei, "ds": DoubleSphere, "eucm": EnhancedUnified}
     return describe(classes[model], (fu, fv), (pu, pv), size, **parameters)
+
+
+def write(camera: Camera) -> str | None:
+    """A camchain.yaml of cam0; None if Kalibr has no such camera."""
+    if camera.size is None:
+        raise ValueError("Kalibr's cameras have an image_size, (H, W), and this lens has none")
+    kinds = {
+        BrownConrady: ("pinhole", "radtan", "k1 k2 p1 p2"),
+        KannalaBrandt: ("pinhole", "equidistant", "k1 k2 k3 k4"),
+        FieldOfView: ("pinhole", "fov", "omega"),
+        Mei: ("omni", "radtan", "k1 k2 p1 p2"),
+        DoubleSphere: ("ds", "none", ""),
+        EnhancedUnified: ("eucm", "none", ""),
+    }
+    model, distortion, names = kinds.get(camera.model, ("", "", ""))
+    known = model and camera.terms.keys() <= {*names.split()}
+    if not known or camera.skew != 0 or camera.plane.get("beta", 1) < 0:
+        return None
+    own = [camera.plane[name] for name in MODELS[model][0]]
+    coefficients = camera.listed(names)
+    if distortion == "fov":
+        coefficients = [camera.plane["omega"]]
+    height, width = camera.size
+    written = {
+        "cam_overlaps": [],
+        "camera_model": model,
+        "distortion_coeffs": coefficients,
+        "distortion_model": distortion,
+        "intrinsics": own + [camera.plane[name] for name in ("fx", "fy", "cx", "cy")],
+        "resolution": [width, height],
+        "rostopic": "/cam0/image_raw",
+    }
+    return yaml.safe_dump({"cam0": written}, default_flow_style=None, width=1000)
 
 
 def _one_of(fields: Fields, name: str, allowed: tuple[str, ...]) -> str:

@@ -1,17 +1,17 @@
-"""Reading a calibration file of any format, and writing our own."""
+"""Reading a calibration file of any format."""
 
-import json
 import math
 import os
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import Any, Self
 
 import torch
+from torch import Tensor
 
-from darswin.files import replace_file
 from darswin.lens.base import Lens
-from darswin.lens.description import MODELS, from_dict, to_dict
+from darswin.lens.description import MODELS, from_dict
 from darswin.lens.files import (
     basalt,
     camodocal,
@@ -23,7 +23,7 @@ from darswin.lens.files import (
     own,
     woodscape,
 )
-from darswin.lens.files.cameras import Description
+from darswin.lens.files.cameras import Cameras, Description
 from darswin.lens.files.content import Content, parse, read_text
 from darswin.lens.files.fields import Fields, short
 
@@ -37,11 +37,12 @@ MAX_CAMERAS = 10_000
 @dataclass(frozen=True)
 class Format:
     """Attributes: name; fits: whether content is of this format; cameras: its descriptions;
-    origin: where the format has the center of the upper left pixel, along both axes. Ours is 0."""
+    origin: where the format has the center of the upper left pixel, along both axes: ours is 0;
+    takes_model: whether `load`'s model may say what its coefficients are."""
 
     name: str
     fits: Callable[[Content], bool]
-    cameras: Callable[..., dict[str, Description]]
+    cameras: Callable[..., Cameras]
     origin: float
     takes_model: bool = False
 
@@ -78,7 +79,8 @@ def load(
 
     Args:
         path: the file.
-        camera: a name, or a number from 0, of a file with several different cameras.
+        camera: of a file with several different cameras: a name, or a number from 0. Where names
+            are numbers, as COLMAP's are, a number is a name.
         theta_max: rad. None means the file's, or the widest of the lens's `side_angles`: the
             corners of the image may see more; or `theta_limit`, where no image size is known.
         image_size: (H, W) px, for a file that does not say it.
@@ -91,10 +93,7 @@ def load(
             chosen, a theta_max beyond the lens's limit; it names the file. OSError: the file cannot
             be read.
     """
-    return loads(
-        _read(path), camera=camera, theta_max=theta_max, image_size=image_size, model=model,
-        dtype=dtype, name=os.fspath(path),
-    )  # fmt: skip
+    return Calibration.read(path, model).lens(camera, theta_max, image_size, dtype)
 
 
 def loads(
@@ -108,11 +107,7 @@ def loads(
     name: str = "in a string",
 ) -> Lens:
     """`load` for a file's text; `name` is what errors call it."""
-    cameras, what = _cameras(text, name, model)
-    with _about(what):
-        chosen = _choose(cameras, camera)
-    with _about(what, chosen if len(cameras) > 1 else None):
-        return _lens(cameras[chosen], theta_max, image_size, dtype)
+    return Calibration(text, name, model).lens(camera, theta_max, image_size, dtype)
 
 
 def load_all(
@@ -124,124 +119,197 @@ def load_all(
     dtype: torch.dtype | None = None,
 ) -> dict[str, Lens]:
     """All cameras of a calibration file by their names. Arguments and errors: as `load`."""
-    cameras, what = _cameras(_read(path), os.fspath(path), model)
-    lenses: dict[str, Lens] = {}  # by description: frames often repeat one camera
-    for name, description in cameras.items():
-        if (key := repr(description)) not in lenses:
-            with _about(what, name if len(cameras) > 1 else None):
-                lenses[key] = _lens(description, theta_max, image_size, dtype)
-    return {name: lenses[repr(description)] for name, description in cameras.items()}
+    return Calibration.read(path, model).lenses(theta_max, image_size, dtype)
 
 
-def save(lens: Lens, path: str | os.PathLike) -> None:
-    """Writes one lens as our own JSON, which `load` and `darswin predict --lens` read.
+class Calibration:
+    """A calibration file: its format, and its cameras, which are described when asked for.
 
-    Raises:
-        ValueError: several lenses, or a lens of a model that is not in `MODELS`.
+    Attributes: format; names: of the cameras.
     """
-    replace_file(path, json.dumps(to_dict(lens), indent=2) + "\n")
 
+    def __init__(self, text: str, name: str, model: str | None = None):
+        self.what = f"calibration {name}"  # in errors
+        with self._about():
+            content = parse(text)
+            found = next((f for f in FORMATS if f.fits(content)), None)
+            if found is None:
+                known = ", ".join(f.name for f in FORMATS)
+                said = content.get("model") if isinstance(content, Mapping) else None
+                raise ValueError(
+                    f'it must be of one of the formats {known}; darswin\'s own "model" must be '
+                    f"one of {', '.join(MODELS)}, got {short(said)}"
+                )
+        self.format, self.what = found, f"{found.name} {self.what}"
+        with self._about():
+            fields = content if isinstance(content, list) else Fields(content)
+            if model is None:
+                self._cameras = found.cameras(fields)
+            elif not found.takes_model:
+                raise ValueError(f"its cameras say their model, but model={model!r} was given")
+            elif model not in opencv.MODELS:
+                raise ValueError(f"model must be one of {', '.join(opencv.MODELS)}, got {model!r}")
+            else:
+                self._cameras = found.cameras(fields, model)
+            self.names = list(self._cameras)
+            if not 1 <= len(self.names) <= MAX_CAMERAS:
+                raise ValueError(f"it must have 1 to {MAX_CAMERAS} cameras, got {len(self.names)}")
 
-def _read(path: str | os.PathLike) -> str:
-    with _about(f"calibration {os.fspath(path)}"):
-        return read_text(path)
+    @classmethod
+    def read(cls, path: str | os.PathLike, model: str | None = None) -> Self:
+        """`model`, and errors: as `load`."""
+        name = os.fspath(path)
+        try:
+            text = read_text(path)
+        except ValueError as error:
+            raise ValueError(f"calibration {name}: {error}") from error
+        return cls(text, name, model)
 
+    def choose(self, camera: str | int | None) -> str:
+        """The name of a camera: by its name; by its number from 0, in a file that does not call
+        its cameras by numbers; or by None, if all are the same.
 
-def _cameras(text: str, name: str, model: str | None) -> tuple[dict[str, Description], str]:
-    """The descriptions in a file, in our pixel origin; and how errors name the file."""
-    with _about(f"calibration {name}"):
-        content = parse(text)
-        file_format = next((f for f in FORMATS if f.fits(content)), None)
-        if file_format is None:
-            known = ", ".join(f.name for f in FORMATS)
-            said = content.get("model") if isinstance(content, Mapping) else None
-            raise ValueError(
-                f'it must be of one of the formats {known}; darswin\'s own "model" must be one of '
-                f"{', '.join(MODELS)}, got {short(said)}"
+        Raises:
+            ValueError: there is no such camera, or there are several.
+        """
+        names = self.names
+        shown = ", ".join(short(name) for name in names[:20]) + (", …" if len(names) > 20 else "")
+        with self._about():
+            if camera is None:
+                first = self._describe(names[0]) if len(names) > 1 else None
+                if any(self._describe(name) != first for name in names[1:]):
+                    raise ValueError(f"it has several cameras, choose one as camera=: {shown}")
+                return names[0]
+            if str(camera) in self._cameras:
+                return str(camera)
+            if any(name.isdecimal() for name in names):  # a number is a name, or a mistake
+                raise ValueError(f"camera must be one of {shown}, got {camera!r}")
+            number = str(camera) if type(camera) in (str, int) else ""
+            if number.isdecimal() and len(number) <= 9 and int(number) < len(names):
+                return names[int(number)]
+            raise ValueError(f"camera must be one of {shown}, or its number, got {camera!r}")
+
+    def lens(
+        self,
+        camera: str | int | None = None,
+        theta_max: float | None = None,
+        image_size: tuple[int, int] | None = None,
+        dtype: torch.dtype | None = None,
+    ) -> Lens:
+        """As `load`."""
+        name = self.choose(camera)
+        description = self._describe(name)
+        with self._about(name):
+            return _batch([description], theta_max, image_size, dtype)
+
+    def lenses(
+        self,
+        theta_max: float | None = None,
+        image_size: tuple[int, int] | None = None,
+        dtype: torch.dtype | None = None,
+    ) -> dict[str, Lens]:
+        """As `load_all`."""
+        # By description, for frames often repeat one camera; those alike are computed together.
+        keys = {name: repr(self._describe(name)) for name in self.names}
+        firsts = {key: name for name, key in reversed(keys.items())}
+        alike: dict[str, list[str]] = {}
+        for name in sorted(firsts.values(), key=self.names.index):
+            alike.setdefault(_shape(self._describe(name)), []).append(name)
+        found = {}
+        for names in alike.values():
+            found |= self._together(names, theta_max, image_size, dtype)
+        return {name: found[firsts[key]] for name, key in keys.items()}
+
+    def _together(self, names: list[str], *arguments) -> dict[str, Lens]:
+        """The lenses of cameras that are alike; of the first bad one, its error."""
+        try:
+            with self._about(names[0]):
+                lenses = _batch([self._describe(name) for name in names], *arguments)
+        except ValueError:
+            if len(names) == 1:
+                raise
+            half = len(names) // 2
+            return self._together(names[:half], *arguments) | self._together(
+                names[half:], *arguments
             )
-    what = f"{file_format.name} calibration {name}"
-    with _about(what):
-        fields = content if isinstance(content, list) else Fields(content)
-        if model is None:
-            cameras = file_format.cameras(fields)
-        elif not file_format.takes_model:
-            raise ValueError(f"its cameras say their model, but model={model!r} was given")
-        elif model not in opencv.MODELS:
-            raise ValueError(f"model must be one of {', '.join(opencv.MODELS)}, got {model!r}")
-        else:
-            cameras = file_format.cameras(fields, model)
-        if not 1 <= len(cameras) <= MAX_CAMERAS:
-            raise ValueError(f"it must have 1 to {MAX_CAMERAS} cameras, got {len(cameras)}")
-        for description in cameras.values():
-            if "center" in description:
-                description["center"] = [c - file_format.origin for c in description["center"]]
-    return cameras, what
+        return {name: lenses[i] for i, name in enumerate(names)}
+
+    def _describe(self, name: str) -> Description:
+        """In our pixel origin."""
+        with self._about(name):
+            description = self._cameras[name]()
+        if "center" in description:
+            description["center"] = [c - self.format.origin for c in description["center"]]
+        return description
+
+    @contextmanager
+    def _about(self, camera: str | None = None) -> Iterator[None]:
+        """Errors within name the file, and the camera if there are several."""
+        try:
+            yield
+        except ValueError as error:
+            if str(error).startswith(self.what):
+                raise
+            which = f"camera {short(camera)}: " if camera and len(self.names) > 1 else ""
+            raise ValueError(f"{self.what}: {which}{error}") from error
 
 
-def _choose(cameras: dict[str, Description], camera: str | int | None) -> str:
-    names = list(cameras)
-    shown = ", ".join(short(name) for name in names[:20]) + (", …" if len(names) > 20 else "")
-    if camera is None:
-        first = cameras[names[0]]
-        if any(description != first for description in cameras.values()):
-            raise ValueError(f"it has several cameras, choose one as camera=: {shown}")
-        return names[0]
-    if isinstance(camera, int) and 0 <= camera < len(names):
-        return names[camera]
-    if camera not in cameras:
-        raise ValueError(f"camera must be one of {shown}, or its number, got {camera!r}")
-    return camera
+def _shape(value: object) -> str:
+    """The same for descriptions that differ in numbers only."""
+    if isinstance(value, dict):
+        return f"{value['model']} " + " ".join(f"{k}{_shape(v)}" for k, v in value.items())
+    return f"[{','.join(map(_shape, value))}]" if isinstance(value, list) else ""
 
 
-def _lens(
-    description: Description,
+def _batch(
+    descriptions: list[Description],
     theta_max: float | None,
     image_size: tuple[int, int] | None,
     dtype: torch.dtype | None,
 ) -> Lens:
-    """The lens of a description, used as far as `load` says."""
+    """The lenses of descriptions of one `_shape`, used as far as `load` says."""
     dtype = dtype or torch.get_default_dtype()
-    description = dict(description)
-    if image_size is not None:
-        description.setdefault("image_size", list(image_size))
-    if theta_max is None:
-        theta_max = description.pop("theta_max", None)
-    values = {
-        name: torch.tensor(value, dtype=dtype) if isinstance(value, (int, float, list)) else value
-        for name, value in description.items()
-        if name != "theta_max"
+    first = descriptions[0]
+    values: dict[str, Any] = {
+        name: torch.tensor([description[name] for description in descriptions], dtype=dtype)
+        for name in first
+        if name != "model"
     }
-    lens = from_dict(values, description.get("image_size"))
-    limit = lens.theta_max
+    if image_size is not None:
+        values.setdefault("image_size", torch.tensor([image_size], dtype=dtype))
+    wanted = values.pop("theta_max", None)
     if theta_max is not None:
         wanted = torch.tensor([theta_max], dtype=dtype)
+    lens = from_dict({"model": first["model"], **values}, first.get("image_size", image_size))
+    limit = lens.theta_max
+    if wanted is not None:
         rounded = (limit < wanted) & (wanted <= limit + ROUNDING)
         lens = lens.with_theta_max(torch.where(rounded, limit, wanted))
-    elif "image_size" in description and "fov" not in description:
-        lens = lens.with_theta_max(torch.minimum(lens.side_angles().amax(1), limit))
-    _check(lens, math.inf if theta_max is not None else MAX_RADIUS)
+    elif "image_size" in values and "fov" not in values:
+        lens = lens.with_theta_max(reach(lens))
+    _check(lens, math.inf if wanted is not None else MAX_RADIUS)
     return lens
+
+
+def reach(lens: Lens) -> Tensor:
+    """(N,) rad: how far a lens that is used up to its limit is, where no θ_max is given: to the
+    widest of the image's sides, if it has a size."""
+    if lens.image_size is None:
+        return lens.theta_max
+    return torch.minimum(lens.side_angles().amax(1), lens.theta_max)
 
 
 def _check(lens: Lens, most: float) -> None:
     """That rays land at finite places, and within `most` px of the center."""
-    theta = lens.theta_max[0] * torch.linspace(0, 1, 33, dtype=lens.theta_max.dtype)
+    theta = lens.theta_max[:, None] * torch.linspace(0, 1, 33, dtype=lens.theta_max.dtype)
     azimuth = torch.linspace(0, 2 * math.pi, 5, dtype=theta.dtype)[:4]
-    pixels = lens.project_rays(theta[:, None].expand(33, 4), azimuth.expand(33, 4), (1, 1))
-    reach = pixels.abs().amax().item()
-    if not (reach <= most and math.isfinite(reach)):
+    shape = (len(lens), 33, 4)
+    pixels = lens.project_rays(theta[..., None].expand(shape), azimuth.expand(shape), (1, 1))
+    reach = pixels.abs().amax((1, 2, 3))
+    wrong = ~((reach <= most) & reach.isfinite())
+    if bool(wrong.any()):
         raise ValueError(
-            f"up to theta_max = {lens.theta_max.item():.4f} rad rays must land at most "
-            f"{MAX_RADIUS:g} px away, got {reach:.3g} px: give a smaller theta_max, or the "
-            "image_size if the file has none"
+            f"up to theta_max = {lens.theta_max[wrong][0].item():.4f} rad rays must land at most "
+            f"{MAX_RADIUS:g} px away, got {reach[wrong][0].item():.3g} px: give a smaller "
+            "theta_max, or the image_size if the file has none"
         )
-
-
-@contextmanager
-def _about(what: str, camera: str | None = None) -> Iterator[None]:
-    """Errors within name the file, and the camera."""
-    try:
-        yield
-    except ValueError as error:
-        which = "" if camera is None else f"camera {short(camera)}: "
-        raise ValueError(f"{what}: {which}{error}") from error

@@ -3,24 +3,30 @@
 YAML, XML and JSON; of one camera, or of several whose keys end with 1 and 2, or left and right.
 """
 
+import re
 from collections.abc import Mapping
+from functools import partial
 from typing import Any
 
 from darswin.lens.distorted import BrownConrady, KannalaBrandt, Mei
-from darswin.lens.files.cameras import Description, describe
+from darswin.lens.files.cameras import Camera, Cameras, Description, describe
 from darswin.lens.files.content import Content
-from darswin.lens.files.fields import Fields, short
+from darswin.lens.files.fields import Fields, holds_numbers, listed, short
 
 # Names as `_plain` leaves them.
 MATRIX = ("k", "cameramatrix", "intrinsicmatrix", "mtx", "m")
-COEFFICIENTS = (
-    "d", "distortioncoefficients", "distcoeffs", "distcoefs", "distortioncoeffs", "dist",
-)  # fmt: skip
+COEFFICIENTS = re.compile(
+    r"d|coef{1,2}s?|coefficients|(camera|lens)?(dist|distort|distortions?|distorsion)"
+    r"(coe?f{1,2}(s|icients?|icents?|ecients?|iecients?)?|params?|parameters?|vec|vector)?"
+)
+# What else may be some: d0, a name with a word like the above, or a number by the name of k1.
+LIKE_COEFFICIENTS = re.compile(r"^d(\d*|left|right)$|coef|(?<!un)dist(?!an[ct])")
+LIKE_A_COEFFICIENT = re.compile(r"[kps]\d+")
 SIZE = ("imagesize", "imgsize", "size", "dim", "resolution")
 WIDTH, HEIGHT = ("imagewidth", "width", "w"), ("imageheight", "height", "h")
 SAYS_FISHEYE = ("fisheyemodel", "fisheye", "isfisheye")
 SAYS_MODEL = ("distortionmodel", "model", "cameramodel", "modeltype", "calibrationmodel")
-SUFFIXES = ("1", "2", "left", "right")
+SUFFIXES = ("0", "1", "2", "3", "left", "right")
 
 MODELS = ("fisheye", "pinhole", "omnidir")
 WORDS = {
@@ -49,13 +55,47 @@ def fits_ros(content: Content) -> bool:
     return fits(content) and "distortion_model" in content
 
 
-def cameras(file: Fields, hint: str | None = None) -> dict[str, Description]:
+def cameras(file: Fields, hint: str | None = None) -> Cameras:
     """Args: hint: one of `MODELS`, which rules where the file does not say it or is wrong."""
     reader = _Reader(file, hint)
-    if reader.find(MATRIX) is not None:
-        return {"camera": reader.camera("")}
     suffixes = [suffix for suffix in SUFFIXES if reader.find(MATRIX, suffix) is not None]
-    return {suffix: reader.camera(suffix) for suffix in suffixes}
+    if reader.find(MATRIX) is not None:
+        suffixes = [""]
+    reader.check_coefficients(suffixes)
+    return {suffix or "camera": partial(reader.camera, suffix) for suffix in suffixes}
+
+
+def write(camera: Camera, suffix: str) -> str | None:
+    """A file of OpenCV's FileStorage: XML, JSON or YAML; None if OpenCV has no such camera."""
+    import cv2  # only here: reading does without
+    import numpy as np
+
+    order = "k1 k2 p1 p2 k3 d1 d2 d3 s1 s2 s3 s4"
+    orders = {KannalaBrandt: "k1 k2 k3 k4", Mei: "k1 k2 p1 p2", BrownConrady: order}
+    order = orders.get(camera.model, "")
+    if not camera.terms.keys() <= {*order.split()} or camera.model not in orders:
+        return None
+    if camera.model is BrownConrady:
+        if camera.skew != 0:  # which cv2.projectPoints leaves out
+            return None
+        if not camera.terms.keys() & {"d1", "d2", "d3", "s1", "s2", "s3", "s4"}:
+            order = "k1 k2 p1 p2 k3"
+    plane = camera.plane
+    matrix = [[plane["fx"], camera.skew, plane["cx"]], [0, plane["fy"], plane["cy"]], [0, 0, 1]]
+    storage = cv2.FileStorage(
+        suffix if suffix in (".xml", ".json") else ".yaml",
+        cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY,
+    )
+    if camera.size is not None:
+        storage.write("image_width", camera.size[1])
+        storage.write("image_height", camera.size[0])
+    if camera.model is Mei:
+        storage.write("xi", plane["xi"])
+    else:
+        storage.write("fisheye_model", int(camera.model is KannalaBrandt))
+    storage.write("camera_matrix", np.array(matrix, float))
+    storage.write("distortion_coefficients", np.array([camera.listed(order)]).T)
+    return storage.releaseAndGetString()
 
 
 class _Reader:
@@ -67,23 +107,62 @@ class _Reader:
         """The file's name of an entry that goes by several."""
         return next((self.names[n + suffix] for n in names if n + suffix in self.names), None)
 
+    def find_coefficients(self, suffix: str) -> str | None:
+        found = [
+            name for name in self.file.entries
+            if (plain := _plain(name)).endswith(suffix)
+            and COEFFICIENTS.fullmatch(plain.removesuffix(suffix))
+        ]  # fmt: skip
+        if len(found) > 1:
+            raise ValueError(f"coefficients must stand in one entry, got {listed(found)}")
+        return found[0] if found else None
+
+    def check_coefficients(self, suffixes: list[str]) -> None:
+        """That no coefficients are left out because of their names."""
+        read = [self.find_coefficients(suffix) for suffix in suffixes]
+        left = [
+            name for name, value in self.file.entries.items()
+            if name not in read and holds_numbers(value) and (
+                LIKE_COEFFICIENTS.search(plain := _plain(name)) or (
+                    LIKE_A_COEFFICIENT.fullmatch(plain) and not isinstance(value, (list, Mapping))
+                )
+            )
+        ]  # fmt: skip
+        if left or (None in read and any(read)):
+            raise ValueError(
+                "each camera's coefficients must stand in one entry, such as "
+                f"distortion_coefficients or D, got {listed(left or filter(None, read))}"
+            )
+
     def camera(self, suffix: str) -> Description:
-        matrix = self.find(MATRIX, suffix)
+        matrices = [self.names[n + suffix] for n in MATRIX if n + suffix in self.names]
+        matrix = matrices[0]
+        if any(self.matrix(other, (9,)) != self.matrix(matrix, (9,)) for other in matrices[1:]):
+            raise ValueError(f"{' and '.join(matrices)} must be the same, a camera's matrix")
         fx, skew, cx, zero, fy, cy, *last = self.matrix(matrix, (9,))
         if not (fx > 0 and fy > 0 and zero == 0 and last == [0, 0, 1]):
             raise ValueError(
                 f"{matrix} must be [fx, skew, cx, 0, fy, cy, 0, 0, 1] with fx and fy above 0, got "
                 f"{[fx, skew, cx, zero, fy, cy, *last]}"
             )
-        name = self.find(COEFFICIENTS, suffix)
+        self.check_shape(matrix, 9)
+        name = self.find_coefficients(suffix)
         coefficients = [] if name is None else self.matrix(name, (0, 4, 5, 8, 12, 14))
         xi = self.find(("xi",), suffix)
         kind = self.kind(name, coefficients, xi)
+        says = xi is not None or self.find(SAYS_FISHEYE + SAYS_MODEL) is not None
+        if name is None and (says or self.hint is None):
+            raise ValueError(
+                "distortion_coefficients or D is missing; write D: [] if the camera has none. The "
+                f"file has {listed(self.file.entries)}"
+            )
         if coefficients and len(coefficients) not in COUNTS[kind]:
             raise ValueError(
                 f"{name} must have {' or '.join(map(str, COUNTS[kind]))} coefficients for the "
                 f"{kind} model, got {len(coefficients)}"
             )
+        if name is not None:
+            self.check_shape(name, len(coefficients))
         plane = ((fx, fy), (cx, cy), self.image_size(suffix))
         if kind == "fisheye":
             return describe(KannalaBrandt, *plane, skew=skew, radial=coefficients)
@@ -138,12 +217,25 @@ class _Reader:
         """The numbers of a matrix: a mapping with `data`, a list, a list of rows, or a number."""
         value, where = self.file.entries[name], name
         if isinstance(value, Mapping):
-            value, where = self.file.section(name).get("data", "numbers"), f"{name}.data"
+            section, where = self.file.section(name), f"{name}.data"
+            value = section.get("data", "numbers")
+            if value == "" and not ("rows" in section and "cols" in section):
+                value = None  # as below
+        elif value == "":
+            value = None  # nothing is not a list of nothing
         if isinstance(value, (int, float)):
             value = [value]
         if isinstance(value, list) and any(isinstance(row, list) for row in value[:3]):
             value = _flattened(value)
         return Fields({where: value}).numbers(where, counts)
+
+    def check_shape(self, name: str, count: int) -> None:
+        """That a matrix is of as many numbers as its rows and columns say."""
+        section = Fields(self.file.entries[name], f"{name}.")
+        if isinstance(section.entries, Mapping) and "rows" in section and "cols" in section:
+            rows, columns = section.number("rows"), section.number("cols")
+            if rows * columns != count:
+                raise ValueError(f"{name}.data must be {rows:g} × {columns:g} numbers, got {count}")
 
     def image_size(self, suffix: str) -> tuple[int, int] | None:
         for end in (suffix, ""):

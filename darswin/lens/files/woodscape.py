@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 
-from darswin.lens.files.cameras import Description, in_image
+from darswin.lens.files.cameras import Cameras, Description, in_image
 from darswin.lens.files.content import Content
 from darswin.lens.files.fields import Fields
 from darswin.lens.polynomial import Polynomial
@@ -16,7 +16,11 @@ def fits(content: Content) -> bool:
     return isinstance(content, Mapping) and "intrinsic" in content
 
 
-def cameras(file: Fields) -> dict[str, Description]:
+def cameras(file: Fields) -> Cameras:
+    return {file.text("name") if "name" in file else "camera": lambda: _camera(file)}
+
+
+def _camera(file: Fields) -> Description:
     intrinsic = file.section("intrinsic")
     model = intrinsic.text("model", '"radial_poly"')
     if model != "radial_poly":
@@ -39,5 +43,5 @@ def cameras(file: Fields) -> dict[str, Description]:
     )
     aspect = intrinsic.positive("aspect_ratio") if "aspect_ratio" in intrinsic else 1.0
     affine = None if aspect == 1 else [[1.0, 0.0], [0.0, aspect]]
-    name = file.text("name") if "name" in file else "camera"
-    return {name: in_image(Polynomial, center, affine, (height, width), coefficients=coefficients)}
+    intrinsic.check_all_read(f"a radial_poly of order {order:g}")
+    return in_image(Polynomial, center, affine, (height, width), coefficients=coefficients)

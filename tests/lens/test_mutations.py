@@ -1,0 +1,265 @@
+"""Files that are wrong in one thing or several: each gives the lens that it says, or an error."""
+
+import math
+import random
+import re
+import time
+from pathlib import Path
+
+import hypothesis
+import pytest
+import torch
+from hypothesis import strategies as st
+
+from darswin.lens import load
+
+FILES = Path(__file__).parent / "files"
+
+# A camera of each file, and where in the file its numbers stand.
+CAMERAS = [
+    ("woodscape.json", None, r'"intrinsic": .*?}'),
+    ("synwoodscape.json", None, r'"intrinsic": .*?}'),
+    ("kitti360_02.yaml", None, r"mirror_parameters.*"),
+    ("kitti360_03.yaml", None, r"mirror_parameters.*"),
+    ("camodocal_kb.yaml", None, r"projection_parameters.*"),
+    ("camodocal_pinhole.yaml", None, r"distortion_parameters.*"),
+    ("camodocal_scaramuzza.yaml", None, r"inv_poly_parameters.*"),
+    ("kalibr_tumvi.yaml", "cam1", r"cam1:.*?(?=resolution)"),
+    ("kalibr_fov.yaml", "cam0", r"cam0:.*?(?=resolution)"),
+    ("kalibr_fov.yaml", "cam2", r"cam2:.*?(?=resolution)"),
+    ("kalibr_omni.yaml", None, r"cam0:.*?(?=resolution)"),
+    ("kalibr_ds.yaml", None, r"cam0:.*?(?=resolution)"),
+    ("ros_fisheye.yaml", None, r"camera_matrix.*?(?=rectification)"),
+    ("ros_plumb_bob.yaml", None, r"camera_matrix.*"),
+    ("ros2_echo.yaml", None, r"\nd:.*?(?=\nr:)"),
+    ("opencv_fisheye.yaml", None, r"camera_matrix.*?(?=avg)"),
+    ("opencv_omnidir.xml", None, r"<camera_matrix.*"),
+    ("opencv_stereo.json", "2", r'"M2".*(?="R")'),
+    ("ocamcalib.txt", None, r"(?<=13 )583.*?(?=#image size)"),
+    ("colmap.txt", None, r"OPENCV_FISHEYE.*"),
+    ("colmap_all.txt", "12", r"(?<=12 RAD_TAN_THIN_PRISM_FISHEYE 640 480 ).*?\n"),
+    ("colmap_all.txt", "17", r"(?<=17 DIVISION 640 480 ).*?\n"),
+    ("nerfstudio.json", None, r'"fl_x".*?(?="camera_model")'),
+    ("nerfstudio_frames.json", "images/3.png", r'"k1".*?(?="frames")|(?<=3.png", ).*?(?="w")'),
+    ("basalt.json", "cam3", r'"kb4".*?}'),
+    ("basalt.json", "cam4", r'"pinhole-radtan8".*?(?="rpmax")'),
+    ("ours.json", None, r'"radial".*?(?="image_size")'),
+]  # fmt: skip
+# 30 in `make test`; 4,000 in `make fuzz`, 108,000 in all.
+FILES_A_CAMERA = n if (n := hypothesis.settings().max_examples) <= 30 else 2 * n
+IDS = [f"{name}-{camera}" for name, camera, _ in CAMERAS]
+NUMBER = re.compile(rb"(?<![\w.])[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?(?![\w.])")
+
+
+def tokens(data: bytes) -> list[re.Match]:
+    """The numbers of a text, but for its comments."""
+    blank = re.sub(rb"(?m)(^|\s)#.*$|(?s:<!--.*?-->)", lambda m: b" " * len(m[0]), data)
+    return list(NUMBER.finditer(blank))
+
+
+def of_camera(name: str, place: str) -> tuple[bytes, list[re.Match]]:
+    """A file, and the numbers of its camera that tell: no 0, and none of a digit or two."""
+    data = FILES.joinpath(name).read_bytes()
+    found = []
+    for block in re.finditer(place.encode(), data, re.DOTALL):
+        found += NUMBER.finditer(data, *block.span())
+    told = [m for m in found if float(m[0]) and len(re.sub(rb"e.*|\D", b"", m[0]).strip(b"0")) > 1]
+    return data, told
+
+
+def numbers_of(lens) -> torch.Tensor:
+    """All that a file may say of a lens, in its own terms and in the file's."""
+    values = {name: getattr(lens, name) for name in lens._names()}
+    found = [value[0] for value in values.values() if value is not None]
+    center = lens.center_in((1, 1))[0]
+    found += [center + 0.5]
+    if lens.image_size is not None:
+        found += [center + 0.5 - lens.image_size[0].flip(0) / 2]
+    if lens.affine is not None and "focal" in values:
+        found += [lens.focal[0] * lens.affine[0]]
+    if "beta" in values:
+        found += [lens.beta[0] / -4]  # COLMAP's division model
+    return torch.cat([value.reshape(-1) for value in found])
+
+
+def missing(lens, expected: list[float]) -> list[float]:
+    found = numbers_of(lens)
+    return [x for x in expected if not ((found - x).abs() <= 1e-9 * abs(x) + 1e-13).any()]
+
+
+def read(path: Path, camera: str | None):
+    """The lens or None: then it said, in a line, why not. Never more than two seconds."""
+    start = time.process_time()
+    try:
+        lens = load(path, camera=camera, dtype=torch.float64)
+    except ValueError as error:
+        message = str(error)
+        assert f"calibration {path}: " in message and len(message) < 1200 and "\n" not in message
+        lens = None
+    assert time.process_time() - start < 2
+    return lens
+
+
+@pytest.mark.parametrize(("name", "camera", "place"), CAMERAS, ids=IDS)
+def test_every_number_of_a_camera_counts(name, camera, place, tmp_path):
+    data, told = of_camera(name, place)
+    path = tmp_path / "file"
+    path.write_bytes(data)
+    lens = read(path, camera)
+    assert len(told) > 2 and not missing(lens, [float(m[0]) for m in told])
+    for match in told:
+        other = f"{float(match[0]) * 1.0137:.9g}".encode()
+        path.write_bytes(data[: match.start()] + other + data[match.end() :])
+        changed = read(path, camera)
+        assert changed is None or not missing(changed, [float(other)]), (match[0], other)
+
+
+VALUES = (
+    "abc", "NaN", ".nan", "Infinity", "-.inf", "-1", "0", "1e308", "-1e308", "1e-308", "1e30",
+    "1e6", "9" * 400, "-" + "9" * 5000, "[]", "{}", "[[1]]", "[" * 50, '{"a": 1}', "null", "~",
+    "true", '""', "''", "!!python/object/apply:os.system [ls]", "&a", "*a", "\x00", "é", "1 2",
+    "1,2", "0x10", "1_000", "٣.٥",
+)  # fmt: skip
+NAMES = ("x", "k", "K", "D", "k1", "k7", "p1", "coeffs", "D0", "dist", "camera_model", "model",
+         "intrinsics", "xi", "abcdef", "image_size", "data", "rows")  # fmt: skip
+
+
+def mutated(data: bytes, rng: random.Random) -> bytes:
+    """A file with one thing wrong, seldom several."""
+    for _ in range(rng.choice((1, 1, 1, 2, 4))):
+        data = rng.choice(MUTATIONS)(data, rng)
+    return data
+
+
+def _number(data: bytes, rng: random.Random, new) -> bytes:
+    matches = list(NUMBER.finditer(data))
+    if not matches:
+        return data
+    match = rng.choice(matches)
+    return data[: match.start()] + new(match[0]) + data[match.end() :]
+
+
+def _value(data, rng):
+    return _number(data, rng, lambda old: rng.choice(VALUES).encode())
+
+
+def _scaled(data, rng):
+    factor = rng.choice((-1, 0.1, 10, 1e3, 1e-3, 1e9)) * rng.uniform(0.9, 1.1)
+    return _number(data, rng, lambda old: f"{float(old) * factor:.9g}".encode())
+
+
+def _digit(data, rng):
+    digit = str(rng.randrange(10)).encode()
+
+    def new(old):
+        place = rng.randrange(len(old))
+        return old[:place] + digit + old[place + 1 :]
+
+    return _number(data, rng, new)
+
+
+def _nested(data, rng):
+    left, right = rng.choice(((b"[", b"]"), (b'"', b'"'), (b"[[", b"]]"), (b'{"a": ', b"}")))
+    return _number(data, rng, lambda old: left + old + right)
+
+
+def _key(data, rng):
+    """Renamed, or written otherwise."""
+    matches = list(re.finditer(rb"[A-Za-z_]\w*(?=\"?\s*[:>])", data))
+    if not matches:
+        return data
+    match = rng.choice(matches)
+    old = match[0]
+    place = rng.randrange(len(old))
+    new = rng.choice((
+        rng.choice(NAMES).encode(), old + b"x", old[:place] + old[place + 1 :], old.upper(),
+        b"_" + old, old[:place] + old[place:][::-1], old + b"2",
+    ))  # fmt: skip
+    return data[: match.start()] + new + data[match.end() :]
+
+
+def _lines(data, rng):
+    """One dropped, or twice there, perhaps with another number."""
+    lines = data.split(b"\n")
+    line = rng.randrange(len(lines))
+    if rng.random() < 0.5:
+        del lines[line]
+    else:
+        other = lines[line] if rng.random() < 0.5 else _scaled(lines[line], rng)
+        lines.insert(rng.choice((line, line + 1, rng.randrange(len(lines)))), other)
+    return b"\n".join(lines)
+
+
+def _entry(data, rng):
+    """`"key": number,` dropped, or twice there with another number."""
+    entry = rb"[\"\w]+\s*:\s*" + NUMBER.pattern + rb",?"
+    matches = list(re.finditer(entry, data))
+    if not matches:
+        return data
+    match = rng.choice(matches)
+    new = b"" if rng.random() < 0.5 else match[0] + b" " + _scaled(match[0], rng)
+    return data[: match.start()] + new + data[match.end() :]
+
+
+def _byte(data, rng):
+    if not data:
+        return data
+    start = rng.randrange(len(data))
+    return data[:start] + bytes([data[start] ^ (1 << rng.randrange(8))]) + data[start + 1 :]
+
+
+def _piece(data, rng):
+    """Cut out, or twice there."""
+    start = rng.randrange(len(data) + 1)
+    end = min(len(data), start + rng.choice((1, 1, 3, 20, 200)))
+    return data[:start] + data[end:] if rng.random() < 0.5 else data[:end] + data[start:]
+
+
+def _truncated(data, rng):
+    return data[: rng.randrange(len(data) + 1)]
+
+
+def _encoded(data, rng):
+    text = data.decode(errors="replace")
+    return rng.choice((
+        text.encode("utf-16"), text.encode("utf-8-sig"), text.replace("\n", "\r\n").encode(),
+        text.replace(" ", "\t").encode(), ("é" + text).encode("latin-1", "replace"),
+        text.replace("-", "−").encode(), (text + text).encode(), (text + "\n---\n").encode(),
+        text.replace(".", ",").encode(),
+    ))  # fmt: skip
+
+
+MUTATIONS = (
+    _value, _scaled, _scaled, _digit, _digit, _nested, _key, _key, _lines, _entry, _byte, _byte,
+    _piece, _truncated, _encoded,
+)  # fmt: skip
+
+
+@pytest.mark.parametrize(("name", "camera", "place"), CAMERAS, ids=IDS)
+@hypothesis.given(seed=st.integers(0, 2**32 - 1))
+@hypothesis.settings(max_examples=FILES_A_CAMERA)
+def test_a_mutated_file_gives_the_lens_that_it_says_or_a_clear_error(
+    name, camera, place, tmp_path_factory, seed
+):
+    data, told = of_camera(name, place)
+    wrong = mutated(data, random.Random(seed))
+    path = tmp_path_factory.getbasetemp() / "mutated"
+    path.write_bytes(wrong)
+    lens = read(path, camera)
+    if lens is None:
+        return
+    assert 0 < lens.theta_max.item() <= math.pi
+    theta = lens.theta_max * torch.linspace(0, 1, 9, dtype=torch.float64)
+    assert lens.project_rays(theta, torch.linspace(-3, 3, 9), (9, 9)).isfinite().all()
+    # The camera's numbers that the file still has, and one that it has in place of another.
+    before, after = ([match[0] for match in tokens(text)] for text in (data, wrong))
+    if len(after) > len(before):  # one that is twice there may stand by a name that means nothing
+        return
+    expected = [m[0] for m in told if after.count(m[0]) >= before.count(m[0])]
+    if len(before) == len(after):
+        changed = [i for i, pair in enumerate(zip(before, after, strict=True)) if len({*pair}) > 1]
+        starts = {match.start() for match in told}
+        if len(changed) == 1 and tokens(data)[changed[0]].start() in starts:
+            expected.append(after[changed[0]])
+    numbers = [float(number) for number in expected]
+    assert not missing(lens, [x for x in numbers if x and math.isfinite(x)]), wrong.decode()
