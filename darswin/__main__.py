@@ -32,7 +32,7 @@ def main(argv: list[str] | None = None) -> None:
         raise SystemExit("darswin: this needs more packages: pip install 'darswin[train]'")
     try:
         _run(command, argv)
-    except (OSError, ValueError, FloatingPointError) as error:
+    except (OSError, ValueError, FloatingPointError, MemoryError) as error:
         # A worker process puts its whole traceback into the message; the last line is the error's.
         message = str(error).strip().splitlines()[-1] if "Traceback" in str(error) else str(error)
         if "BrokenImageError" in f"{type(error).__name__}{message}" and command not in (

@@ -252,7 +252,10 @@ def _listed(splits: Path, split: Split) -> list[str]:
         file = splits / f"{split}.txt"
         return read_list(file) if file.exists() else []
     lists = json.loads(splits.read_text())
-    if not isinstance(lists, dict) or not all(isinstance(v, list) for v in lists.values()):
+    if not isinstance(lists, dict) or not all(
+        isinstance(paths, list) and all(isinstance(path, str) for path in paths)
+        for paths in lists.values()
+    ):
         raise ValueError(
             f'{splits} must hold {{"train": [paths], "val": [paths], "test": [paths]}}'
         )

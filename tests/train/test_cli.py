@@ -65,8 +65,7 @@ def test_a_checkpoint_of_another_model(capsys, tmp_path):
     fit += ["--data.limit", "48", "--trainer.enable_progress_bar", "false", "--data.workers", "0"]
     main([str(a) for a in fit])
     before = (tmp_path / "checkpoints" / "last.ckpt").read_bytes()
-    options = ["--resume", "--model.options", "{embed_dim: 12}"]
-    message = error(capsys, *fit, *options)
+    message = error(capsys, "test", "--run", tmp_path, "--model.options", "{embed_dim: 12}")
     assert "another model" in message and "embed_dim None there, 12 here" in message
     assert (tmp_path / "checkpoints" / "last.ckpt").read_bytes() == before
     torch.save({"state_dict": {}}, tmp_path / "other.ckpt")
