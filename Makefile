@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/installed
 
-.PHONY: help build demo test test-isa test-asan fuzz lint format bench study learned-lens readme dist clean
+.PHONY: help build demo test test-isa test-asan fuzz kills lint format bench study learned-lens readme dist clean
 
 help:  ## this list
 	@grep -E '^[a-z-]+:.*##' Makefile | sed -E 's/:.*## /\t/' | expand -t 12
@@ -54,6 +54,9 @@ test-asan: build  ## the operators' tests on every tier under AddressSanitizer a
 fuzz: build  ## 20,000 random calls of the operators, and more, and 48,000 hostile ones (10 minutes)
 	$(BIN)/python -X faulthandler -m pytest -q --hypothesis-profile=fuzz \
 	  tests/ops/test_properties.py tests/ops/test_hostile.py
+
+kills: build  ## kill runs at random, and see that they end as if nothing had been (10 minutes)
+	$(BIN)/python tests/train/kills.py
 
 lint: $(STAMP)  ## ruff and clang-format, without changing anything
 	$(BIN)/ruff check .

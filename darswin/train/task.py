@@ -139,7 +139,7 @@ class Classification(LightningModule):
             raise ValueError(
                 f"an epoch of this run has {self._steps_there} steps, and would now have "
                 f"{self.steps_per_epoch}, which its schedule cannot follow; the number of "
-                "pictures, --data.batch_size, --devices and --trainer.limit_train_batches decide on it"
+                "pictures, --data.batch_size, --devices and --trainer.limit_train_batches decide it"
             )
         rates = {name: rate * scale for name, rate in self.rates.items()}
         warmup_steps = self.warmup_epochs * self.steps_per_epoch

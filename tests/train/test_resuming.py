@@ -8,6 +8,8 @@ import itertools
 import os
 import shutil
 import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -261,16 +263,16 @@ def test_a_loss_that_is_not_finite_tells_what_helps(begun, capsys):
 
 def test_one_fit_at_a_time(begun, capsys):
     before = files(begun)
-    if pid := os.fork():
-        os.waitpid(pid, os.WUNTRACED)  # it has the lock and stopped
+    hold = "import fcntl, sys; f = open(sys.argv[1], 'a'); fcntl.lockf(f, 2); print(); input()"
+    with subprocess.Popen(
+        [sys.executable, "-c", hold, begun / ".lock"], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    ) as other:
+        other.stdout.readline()
         assert f"another `darswin fit` is at work in {begun}" in error(capsys, begun, "--resume")
         assert files(begun) == before
-        os.kill(pid, signal.SIGKILL)
-        os.waitpid(pid, 0)
-    else:
-        with locked(begun / ".lock"):
-            os.kill(os.getpid(), signal.SIGSTOP)
-    fit(begun, "--resume")
+        other.kill()
+    with locked(begun / ".lock"):
+        pass
 
 
 def test_a_cut_off_checkpoint_is_named_with_the_other_one(whole, begun, capsys):
