@@ -5,6 +5,7 @@ the logs `csv/` and `tensorboard/`, and `test.{csv,json,png}`.
 """
 
 import argparse
+import contextlib
 import re
 import shlex
 import sys
@@ -51,17 +52,18 @@ def run_command(argv: list[str]) -> None:
             # Another process of the run must not end with an error: Lightning kills the first then.
             raise SystemExit(0 if rank_zero_only.rank else 128 + signals.number) from None
         except (MemoryError, RuntimeError) as error:
-            if isinstance(error, MemoryError | torch.OutOfMemoryError) or _NO_MEMORY.search(
-                str(error)
-            ):
-                raise MemoryError(
-                    "not enough memory: a smaller --data.batch_size or --model.name, or "
-                    f"--model.recompute true, needs less ({str(error).strip().splitlines()[-1]})"
-                ) from error
-            raise
+            if not _lacks_memory(error):
+                raise
+            raise MemoryError(
+                "not enough memory: a smaller --data.batch_size or --model.name, or "
+                f"--model.recompute true, needs less ({str(error).strip().splitlines()[-1]})"
+            ) from error
 
 
-_NO_MEMORY = re.compile("can't allocate memory|not enough memory|DataLoader worker .*: Killed")
+def _lacks_memory(error: Exception) -> bool:
+    # Torch has a class for it on GPUs alone; a killed worker process is the system's own remedy.
+    said = re.search("can't allocate memory|DataLoader worker .*: Killed", str(error))
+    return isinstance(error, MemoryError | torch.OutOfMemoryError) or said is not None
 
 
 def _run(argv: list[str], signals: StopSignals) -> None:
@@ -107,7 +109,7 @@ def with_configs(argv: list[str]) -> list[str]:
             _check_free(Path(known.run))
         elif own.exists():
             configs.insert(0, str(own))
-        elif _last(Path(known.run)).exists() or (argv[0] != "fit" and not configs):
+        elif _last(Path(known.run)).exists() if argv[0] == "fit" else not configs:
             raise FileNotFoundError(f"there is no run in {known.run}: it has no config.yaml")
     if known.resume:
         others.append("--resume=true")
@@ -236,20 +238,17 @@ class RunCLI(LightningCLI):
 
     def fit(self, **options) -> None:
         """Trains, alone in the run's folder; called by Lightning."""
-        if not self.trainer.is_global_zero:
-            return self.trainer.fit(**options | {"ckpt_path": self._start()})
+        lock = self.folder / ".lock"
         try:
-            with locked(self.folder / ".lock"):
+            with locked(lock) if self.trainer.is_global_zero else contextlib.nullcontext():
                 self.trainer.fit(**options | {"ckpt_path": self._start()})
         except BlockingIOError:
             raise FileExistsError(f"another `darswin fit` is at work in {self.folder}") from None
         except (KeyboardInterrupt, SystemExit):
             if (self.folder / "config.yaml").exists():
-                command = f"darswin fit --run {shlex.quote(str(self.folder))} --resume"
-                print(
-                    f"stopped at step {self.trainer.global_step}: `{command}` goes on",
-                    file=sys.stderr,
-                )
+                again = f"darswin fit --run {shlex.quote(str(self.folder))} --resume"
+                step = self.trainer.global_step
+                _say(f"stopped at step {step}: `{again}` goes on from the last checkpoint")
             raise
 
     def _start(self) -> str | None:
@@ -300,7 +299,9 @@ class BeginRun(Callback):
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         # A short epoch has its line in the logs, too.
         trainer.log_every_n_steps = min(trainer.log_every_n_steps, pl_module.steps_per_epoch)
-        if trainer.is_global_zero and not trainer.fast_dev_run:
+        if trainer.fast_dev_run:
+            return
+        if trainer.is_global_zero:
             remove_partial_files(self.folder)
             replace_file(self.folder / "config.yaml", self.config)
         trainer.loggers = trainer.loggers or self.loggers
@@ -317,4 +318,4 @@ class RunProgressBar(TQDMProgressBar):
 
 @rank_zero_only
 def _say(text: str) -> None:
-    print(text)
+    print(text, file=sys.stderr)

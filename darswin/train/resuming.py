@@ -5,8 +5,7 @@ from typing import Any
 
 # Those that take effect from there on; of the trainer's, all do but for the size of a step.
 CHANGEABLE = {
-    "checkpoint_steps",
-    *("weights_only", "run"),
+    *("checkpoint_steps", "weights_only"),
     *(f"model.{rate}_rate" for rate in ("learning", "warmup", "final")),
     *("model.warmup_epochs", "model.reference_batch", "model.weight_decay"),
     *("model.label_smoothing", "model.mixup", "model.cutmix", "model.mix_p"),
@@ -47,6 +46,6 @@ def _options(config: Mapping[str, Any]) -> dict[str, Any]:
     for group, value in config.items():
         if group in ("model", "data", "trainer"):
             found |= {f"{group}.{name}": own for name, own in value.items()}
-        else:
+        elif group != "run":  # it may have moved
             found[group] = value
     return found

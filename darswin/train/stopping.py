@@ -82,6 +82,14 @@ class StopWhenTold(Callback):
         if trainer.global_step > 0 and self._told(trainer):
             raise SystemExit
 
+    def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        self.signals.patient = False
+
+    def on_exception(
+        self, trainer: Trainer, pl_module: LightningModule, exception: BaseException
+    ) -> None:
+        self.signals.patient = False
+
     def _told(self, trainer: Trainer) -> bool:
         told = self.signals.number is not None
         if not trainer.strategy.reduce_boolean_decision(told, all=False):

@@ -161,9 +161,8 @@ class Classification(LightningModule):
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """FloatingPointError where the weights, or their moments, are no longer finite."""
-        moments = (
-            state for one in checkpoint["optimizer_states"] for state in one["state"].values()
-        )
+        optimizers = checkpoint.get("optimizer_states", ())
+        moments = (state for one in optimizers for state in one["state"].values())
         for tensors in (checkpoint["state_dict"], *moments):
             if not all(tensor.isfinite().all() for tensor in tensors.values()):
                 step = self.trainer.global_step

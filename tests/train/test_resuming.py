@@ -195,7 +195,7 @@ def test_rates_and_decay_change_on_resume(begun, capsys):
         "0",
     ]
     fit(begun, "--resume", *new, "--trainer.max_epochs", "3")
-    assert "--model.weight_decay 0.2 in place of 0.05" in capsys.readouterr().out
+    assert "--model.weight_decay 0.2 in place of 0.05" in capsys.readouterr().err
     recorded = yaml.safe_load((begun / "config.yaml").read_text())
     assert recorded["model"]["learning_rate"] == 1e-3 and recorded["trainer"]["max_epochs"] == 3
     groups = checkpoint(begun)["optimizer_states"][0]["param_groups"]
