@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/installed
 
-.PHONY: help build demo test test-lowest test-isa test-asan fuzz lint format bench study learned-lens readme dist clean
+.PHONY: help build demo test test-lowest test-isa test-asan fuzz kills lint format bench study learned-lens readme dist clean
 
 help:  ## this list
 	@grep -E '^[a-z-]+:.*##' Makefile | sed -E 's/:.*## /\t/' | expand -t 12
@@ -68,6 +68,9 @@ test-asan: build  ## the operators' tests on every tier under AddressSanitizer a
 fuzz: build  ## random and hostile calls of the operators, 100,000 wrong calibrations (40 minutes)
 	$(BIN)/python -X faulthandler -m pytest -q --hypothesis-profile=fuzz \
 	  tests/ops/test_properties.py tests/ops/test_hostile.py tests/lens/test_mutations.py
+
+kills: build  ## kill runs at random, and see that they end as if nothing had been (10 minutes)
+	$(BIN)/python tests/train/kills.py
 
 lint: $(STAMP)  ## ruff and clang-format, without changing anything
 	$(BIN)/ruff check .

@@ -56,7 +56,7 @@ def main(argv: list[str] | None = None) -> None:
         sys.stdout.flush()
     except BrokenPipeError:  # `darswin lens info … | head`: who reads has enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    except (OSError, ValueError, FloatingPointError) as error:
+    except (OSError, ValueError, FloatingPointError, MemoryError) as error:
         # A worker process puts its whole traceback into the message; the last line is the error's.
         message = str(error).strip().splitlines()[-1] if "Traceback" in str(error) else str(error)
         if "BrokenImageError" in f"{type(error).__name__}{message}" and command not in (

@@ -1,7 +1,11 @@
 """Writing files so that a crash, a kill or a full disk leaves the old one or the new one."""
 
+import contextlib
+import errno
+import fcntl
 import os
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 
 _PARTIAL = ".partial"
@@ -39,6 +43,27 @@ def remove_partial_files(folder: str | os.PathLike) -> None:
     """Removes what kills in the middle of `replace_file` left below a folder."""
     for path in Path(folder).rglob(f".*{_PARTIAL}"):
         path.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def locked(path: str | os.PathLike) -> Iterator[None]:
+    """Within it, no other process can lock the same file, which is made if need be, and stays.
+
+    The lock is the process's own: its forks do not hold it, and its end, even by a kill, frees it.
+
+    Raises:
+        BlockingIOError: another process has locked it.
+    """
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("a") as file:
+        try:
+            fcntl.lockf(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            if error.errno in (errno.EACCES, errno.EAGAIN):
+                raise BlockingIOError(errno.EAGAIN, "another process holds it", str(path)) from None
+            # Some network file systems have no locks; work on them must be possible all the same.
+        yield
 
 
 def _umask() -> int:

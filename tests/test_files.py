@@ -1,12 +1,14 @@
 import os
 import resource
+import signal
 import subprocess
 import sys
 import textwrap
 
 import pytest
 
-from darswin.files import remove_partial_files, replace_file
+from darswin import files
+from darswin.files import locked, remove_partial_files, replace_file
 
 
 def test_the_new_file_takes_the_place_of_the_old(tmp_path):
@@ -58,3 +60,32 @@ def test_a_full_disk_is_said_and_leaves_the_old_file_alone(tmp_path):
     assert done.returncode == 1
     assert "last.ckpt" in done.stderr.splitlines()[-1] and "OSError" in done.stderr
     assert path.read_text() == "old" and os.listdir(tmp_path) == ["last.ckpt"]
+
+
+HOLD = """
+import os, runpy, sys, time
+with runpy.run_path(sys.argv[1])["locked"](sys.argv[2]):
+    if os.fork():
+        print(flush=True)
+    time.sleep(60)
+"""
+
+
+def test_a_kill_frees_a_lock_while_forks_live_on(tmp_path):
+    path = tmp_path / "new" / "lock"
+    holder = subprocess.Popen(
+        [sys.executable, "-c", HOLD, files.__file__, path],
+        stdout=subprocess.PIPE,
+        start_new_session=True,
+    )
+    try:
+        holder.stdout.readline()
+        with pytest.raises(BlockingIOError, match="another process"), locked(path):
+            pass
+        holder.kill()
+        holder.wait()
+        with locked(path):
+            pass
+    finally:
+        os.killpg(holder.pid, signal.SIGKILL)
+        holder.stdout.close()

@@ -77,9 +77,11 @@ def read_pickle(path: str | os.PathLike, map_location: Any = "cpu") -> object:
     try:
         with torch.serialization.safe_globals(_STAND_INS):
             return torch.load(path, map_location=map_location, weights_only=True)
-    except OSError:
-        raise
     except Exception as error:  # a file that is no checkpoint may fail in any way
+        if (
+            isinstance(error, OSError) and error.filename
+        ):  # a cut-off archive has an OSError of its own
+            raise
         found = re.search(r"GLOBAL (\S+)", str(error))
         if not isinstance(error, pickle.UnpicklingError) or not found:
             raise ValueError(f"{path} cannot be read as a checkpoint") from error

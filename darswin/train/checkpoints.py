@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from lightning.pytorch import Trainer
+from lightning.pytorch import LightningModule, Trainer
 from lightning.pytorch.callbacks import ModelCheckpoint
 from lightning.pytorch.plugins.io import TorchCheckpointIO
 
@@ -18,12 +18,15 @@ class RunCheckpoint(ModelCheckpoint):
     """A checkpoint in a run's folder, wherever that folder has been moved.
 
     One that is due at an epoch's last step is left to the callback behind the epoch's validation:
-    a run that resumed from before it would take the epoch for finished, and not validate it.
+    a run that resumed from before it would take the epoch for finished, and not validate it. And
+    none is written amid the batches of a step, whose gradients it would not hold.
     """
 
-    def on_train_batch_end(self, trainer: Trainer, *arguments: Any) -> None:
-        if not trainer.is_last_batch:
-            super().on_train_batch_end(trainer, *arguments)
+    def on_train_batch_end(
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
+        if ends_step(trainer, batch_idx) and not trainer.is_last_batch:
+            super().on_train_batch_end(trainer, pl_module, outputs, batch, batch_idx)
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         def here(path: str) -> str:
@@ -34,6 +37,11 @@ class RunCheckpoint(ModelCheckpoint):
             state[key] = here(state[key])
         state["best_k_models"] = {here(path): k for path, k in state["best_k_models"].items()}
         super().load_state_dict(state)
+
+
+def ends_step(trainer: Trainer, batch_idx: int) -> bool:
+    """Whether the optimizer has stepped on this batch of an epoch."""
+    return (batch_idx + 1) % trainer.accumulate_grad_batches == 0 or trainer.is_last_batch
 
 
 class SafeCheckpointIO(TorchCheckpointIO):
@@ -61,7 +69,12 @@ class SafeCheckpointIO(TorchCheckpointIO):
     ) -> dict[str, Any]:
         if not Path(path).is_file():
             raise FileNotFoundError(f"no checkpoint {path}")
-        checkpoint = read_pickle(path, map_location)
+        try:
+            checkpoint = read_pickle(path, map_location)
+        except ValueError as error:
+            others = sorted(set(Path(path).parent.glob("*.ckpt")) - {Path(path)})
+            hint = f"; --ckpt_path {others[0]} goes on from that one" if others else ""
+            raise ValueError(f"{error}{hint}") from error
         if not isinstance(checkpoint, dict) or "darswin" not in checkpoint:
             raise ValueError(f"{path} is no checkpoint of `darswin fit`: it names no model")
         return checkpoint

@@ -5,21 +5,30 @@ the logs `csv/` and `tensorboard/`, and `test.{csv,json,png}`.
 """
 
 import argparse
-import signal
+import contextlib
+import re
+import shlex
+import sys
 import warnings
 from pathlib import Path
 
-from lightning.pytorch import Trainer
-from lightning.pytorch.cli import LightningArgumentParser, LightningCLI, SaveConfigCallback
+import torch
+import yaml
+from lightning.pytorch import Callback, LightningModule, Trainer
+from lightning.pytorch.callbacks import ProgressBar, TQDMProgressBar
+from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
 from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
-from lightning.pytorch.utilities.exceptions import MisconfigurationException, SIGTERMException
+from lightning.pytorch.utilities import rank_zero_only
+from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
 from darswin.data.lenses import parse_sweep
-from darswin.files import remove_partial_files, replace_file
+from darswin.files import locked, remove_partial_files, replace_file
 from darswin.models.saving import model_of_run
 from darswin.train.checkpoints import RunCheckpoint, SafeCheckpointIO
 from darswin.train.data import WideAngleData
 from darswin.train.results import WriteResults
+from darswin.train.resuming import check_changes
+from darswin.train.stopping import StopSignals, StopWhenTold
 from darswin.train.task import Classification
 
 PRESETS = Path(__file__).parent / "presets"
@@ -31,25 +40,47 @@ def run_command(argv: list[str]) -> None:
     warnings.filterwarnings("ignore", "LightningCLI's args parameter")
     warnings.filterwarnings("ignore", r".*isinstance\(treespec, LeafSpec\)")  # Lightning's own
     warnings.filterwarnings("ignore", "Checkpoint directory .* exists and is not empty")
-    try:
-        _run(argv)
-    except MisconfigurationException as error:
-        raise ValueError(str(error)) from error
-    except SIGTERMException:
-        raise SystemExit(128 + signal.SIGTERM) from None
+    warnings.filterwarnings("ignore", "The number of training batches .* is smaller than the log")
+    with StopSignals() as signals:
+        try:
+            _run(argv, signals)
+        except MisconfigurationException as error:
+            raise ValueError(str(error)) from error
+        except (KeyboardInterrupt, SystemExit):
+            if signals.number is None:
+                raise
+            # Another process of the run must not end with an error: Lightning kills the first then.
+            raise SystemExit(0 if rank_zero_only.rank else 128 + signals.number) from None
+        except (MemoryError, RuntimeError) as error:
+            if not _lacks_memory(error):
+                raise
+            raise MemoryError(
+                "not enough memory: a smaller --data.batch_size or --model.name, or "
+                f"--model.recompute true, needs less ({str(error).strip().splitlines()[-1]})"
+            ) from error
 
 
-def _run(argv: list[str]) -> None:
+def _lacks_memory(error: Exception) -> bool:
+    # Torch has a class for it on GPUs alone; a killed worker process is the system's own remedy.
+    said = re.search("can't allocate memory|DataLoader worker .*: Killed", str(error))
+    return isinstance(error, MemoryError | torch.OutOfMemoryError) or said is not None
+
+
+def _run(argv: list[str], signals: StopSignals) -> None:
     RunCLI(
-        Classification,
-        WideAngleData,
+        signals,
+        model_class=Classification,
+        datamodule_class=WideAngleData,
         args=with_configs(argv),
         seed_everything_default=0,
         auto_configure_optimizers=False,
-        save_config_callback=SaveRunConfig,
+        save_config_callback=None,
         trainer_defaults=dict(
-            accelerator="auto", use_distributed_sampler=False, num_sanity_val_steps=0
+            accelerator="auto",
+            use_distributed_sampler=False,
+            num_sanity_val_steps=0,
         ),
+        parser_class=RunParser,
         parser_kwargs=dict(
             prog="darswin", description="Trains and tests models on wide-angle images."
         ),
@@ -75,17 +106,25 @@ def with_configs(argv: list[str]) -> list[str]:
         others += ["--run", known.run]
         own = Path(known.run) / "config.yaml"
         if argv[0] == "fit" and not known.resume:
-            if (Path(known.run) / "checkpoints" / "last.ckpt").exists():
-                raise FileExistsError(
-                    f"{known.run} holds a run already: go on with --resume, or choose another one"
-                )
+            _check_free(Path(known.run))
         elif own.exists():
             configs.insert(0, str(own))
-        elif argv[0] != "fit" and not configs:
+        elif _last(Path(known.run)).exists() if argv[0] == "fit" else not configs:
             raise FileNotFoundError(f"there is no run in {known.run}: it has no config.yaml")
     if known.resume:
         others.append("--resume=true")
     return [argv[0], *(f"--config={config}" for config in configs), *others]
+
+
+def _last(folder: Path) -> Path:
+    return folder / "checkpoints" / "last.ckpt"
+
+
+def _check_free(folder: Path) -> None:
+    if _last(folder).exists():
+        raise FileExistsError(
+            f"{folder} holds a run already: go on with --resume, or choose another one"
+        )
 
 
 def _config_file(name: str) -> str:
@@ -98,8 +137,28 @@ def _config_file(name: str) -> str:
     return str(preset)
 
 
+class RunParser(LightningArgumentParser):
+    """Names options in its errors as people type them."""
+
+    def error(self, message: str, *rest) -> None:
+        message = re.sub(r'Parser key "([\w.]+)":', r"--\1:", message)
+        message = re.sub(
+            r"Subcommand '\w+' does not accept option '", "there is no option '--", message
+        )
+        if "arguments are required" in message:
+            message = re.sub(r"\b(fit|validate|test)\.", "--", message)
+        super().error(" ".join(message.split()), *rest)
+
+    def print_usage(self, *arguments) -> None:
+        """Nothing before an error: there are 150 options, and `--help` lists them."""
+
+
 class RunCLI(LightningCLI):
     """Lightning's command line with `--run`, `--resume` and `--xi`."""
+
+    def __init__(self, signals: StopSignals, **options):
+        self.signals = signals
+        super().__init__(**options)
 
     @staticmethod
     def subcommands() -> dict[str, set[str]]:
@@ -133,31 +192,75 @@ class RunCLI(LightningCLI):
                 config.data[name] = str(Path(config.data[name]).resolve())
         if config.xi is not None:
             config.data.test_lenses = parse_sweep(config.xi)
+        if config.devices is not None:
+            config.trainer.devices = config.devices
+        if config.trainer.overfit_batches:
+            raise ValueError("--trainer.overfit_batches shuffles otherwise: take --data.limit")
+        if config.checkpoint_steps < 1:
+            raise ValueError(
+                f"--checkpoint_steps must be at least 1, got {config.checkpoint_steps}"
+            )
         if self.subcommand != "fit":
             config.ckpt_path = config.ckpt_path or str(model_of_run(self.folder, ".ckpt"))
             return
-        remove_partial_files(self.folder)
-        last = self.folder / "checkpoints" / "last.ckpt"
-        if config.resume and last.exists():
-            config.ckpt_path = str(last)
-        elif config.resume:
-            print(f"{last} is not there yet: starting from the beginning")
+        self.record = self._recorded(config)
+        if config.resume and _last(self.folder).exists():
+            before = yaml.safe_load((self.folder / "config.yaml").read_text())
+            for change in check_changes(before, yaml.safe_load(self.record)):
+                _say(change)
+
+    def _recorded(self, config) -> str:
+        """What config.yaml says: all but the options of this call alone."""
+        config = config.clone()
+        for name in ("config", "resume", "xi", "devices", "ckpt_path", "trainer.default_root_dir"):
+            config.pop(name, None)
+        return self._parser("fit").dump(config, skip_none=False)
 
     def instantiate_trainer(self, **kwargs) -> Trainer:
         config = self.config_init[self.subcommand]
         given = config.trainer
         kwargs["plugins"] = [SafeCheckpointIO(), *(given.plugins or [])]
         if given.logger is None:
-            kwargs["logger"] = self._loggers() if self.subcommand == "fit" else False
-        if config.devices is not None:
-            kwargs["devices"] = config.devices
-        kwargs["callbacks"] = [*(given.callbacks or []), *self._callbacks(config.checkpoint_steps)]
+            kwargs["logger"] = False  # a run's own begin with it
+        callbacks = list(given.callbacks or [])
+        if given.enable_progress_bar and not any(isinstance(c, ProgressBar) for c in callbacks):
+            callbacks.append(RunProgressBar())
+        if self.subcommand == "fit":
+            loggers = self._loggers() if given.logger is None else []
+            callbacks.insert(0, BeginRun(self.folder, self.record, loggers))
+        kwargs["callbacks"] = [*callbacks, *self._callbacks(config.checkpoint_steps)]
         return super().instantiate_trainer(**kwargs)
 
     def _run_subcommand(self, subcommand: str) -> None:
         super()._run_subcommand(subcommand)
         if broken := self.datamodule.broken():
             print(f"{broken} pictures could not be read and were left out")
+
+    def fit(self, **options) -> None:
+        """Trains, alone in the run's folder; called by Lightning."""
+        lock = self.folder / ".lock"
+        try:
+            with locked(lock) if self.trainer.is_global_zero else contextlib.nullcontext():
+                self.trainer.fit(**options | {"ckpt_path": self._start()})
+        except BlockingIOError:
+            raise FileExistsError(f"another `darswin fit` is at work in {self.folder}") from None
+        except (KeyboardInterrupt, SystemExit):
+            if (self.folder / "config.yaml").exists():
+                again = f"darswin fit --run {shlex.quote(str(self.folder))} --resume"
+                step = self.trainer.global_step
+                _say(f"stopped at step {step}: `{again}` goes on from the last checkpoint")
+            raise
+
+    def _start(self) -> str | None:
+        """The checkpoint to start from."""
+        config, last = self.config_init["fit"], _last(self.folder)
+        if not config.resume:
+            _check_free(self.folder)
+        elif last.exists():
+            return config.ckpt_path or str(last)
+        else:
+            _say(f"{last} is not there yet: starting from the beginning")
+        return config.ckpt_path
 
     def _loggers(self) -> list:
         return [
@@ -171,6 +274,7 @@ class RunCLI(LightningCLI):
             return [WriteResults(self.folder)] if self.subcommand == "test" else []
         kept = dict(dirpath=self.folder / "checkpoints", enable_version_counter=False)
         return [
+            StopWhenTold(self.signals, _last(self.folder)),
             RunCheckpoint(
                 filename="best",
                 monitor="val/top1",
@@ -183,17 +287,35 @@ class RunCLI(LightningCLI):
         ]
 
 
-class SaveRunConfig(SaveConfigCallback):
-    """Writes the configuration of a `fit` to its run's folder."""
+class BeginRun(Callback):
+    """Writes into a run's folder what it is, once nothing can refuse it any more.
 
-    def __init__(self, parser: LightningArgumentParser, config, **kwargs):
-        super().__init__(parser, config, save_to_log_dir=False)
+    Lightning would have its loggers write before the checkpoint is checked.
+    """
 
-    def save_config(self, trainer: Trainer, pl_module: Classification, stage: str) -> None:
-        if stage != "fit":
+    def __init__(self, folder: Path, config: str, loggers: list):
+        self.folder, self.config, self.loggers = folder, config, loggers
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        # A short epoch has its line in the logs, too.
+        trainer.log_every_n_steps = min(trainer.log_every_n_steps, pl_module.steps_per_epoch)
+        if trainer.fast_dev_run:
             return
-        config = self.config.clone()
-        for name in ("config", "resume", "xi", "devices", "ckpt_path"):  # of this call alone
-            config.pop(name, None)
-        text = self.parser.dump(config, skip_none=False)
-        replace_file(Path(trainer.default_root_dir) / "config.yaml", text)
+        if trainer.is_global_zero:
+            remove_partial_files(self.folder)
+            replace_file(self.folder / "config.yaml", self.config)
+        trainer.loggers = trainer.loggers or self.loggers
+
+
+class RunProgressBar(TQDMProgressBar):
+    """Lightning's, without the last letters of the logs' folder."""
+
+    def get_metrics(self, trainer: Trainer, pl_module: LightningModule) -> dict:
+        shown = super().get_metrics(trainer, pl_module)
+        shown.pop("v_num", None)
+        return shown
+
+
+@rank_zero_only
+def _say(text: str) -> None:
+    print(text, file=sys.stderr)

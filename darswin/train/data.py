@@ -11,6 +11,7 @@ from darswin.data.lenses import parse_lenses, parse_sweep
 from darswin.data.sampling import EveryNth, ResumableLoader, TrainingOrder
 from darswin.data.sources import Part, Source, Split, open_source
 from darswin.data.wide_angle import IMAGENET_MEAN, IMAGENET_STD, PAPER_FOV, WideAngle
+from darswin.train.stopping import ignore_signals
 
 
 class WideAngleData(LightningDataModule):
@@ -73,6 +74,13 @@ class WideAngleData(LightningDataModule):
         skip_broken: bool = False,
     ):
         super().__init__()
+        if limit is not None and limit < 1:
+            raise ValueError(f"--data.limit must be at least 1, got {limit}")
+        if batch_size < 1 or workers < 0:
+            raise ValueError(
+                "--data.batch_size must be at least 1 and --data.workers at least 0, "
+                f"got {batch_size} and {workers}"
+            )
         self.train_lenses = parse_lenses(train_lenses)
         self.test_names = parse_sweep(test_lenses)
         self._where = dict(
@@ -131,6 +139,7 @@ class WideAngleData(LightningDataModule):
         return dict(
             num_workers=self.workers,
             prefetch_factor=4 if self.workers else None,
+            worker_init_fn=ignore_signals,
         )
 
     def train_dataloader(self) -> ResumableLoader:
@@ -158,7 +167,17 @@ class WideAngleData(LightningDataModule):
         self._progress = state_dict
 
     def _evaluation(self, split: Split, lenses: str | None = None) -> DataLoader:
-        dataset = self.dataset(split, lenses)
+        try:
+            dataset = self.dataset(split, lenses)
+        except FileNotFoundError:
+            if self._where["holdout"]:
+                raise
+            dataset = ()
+        if not dataset and not self._where["holdout"]:
+            raise ValueError(
+                f"--data.holdout 0 leaves no pictures for {split!r}, and {self._where['path']} has "
+                "none of its own; --trainer.limit_val_batches 0 trains without validation"
+            )
         part = EveryNth(len(dataset), **self._place)
         if not part.indices:
             raise ValueError(

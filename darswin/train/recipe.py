@@ -2,8 +2,11 @@
 
 import math
 from collections.abc import Iterable
+from typing import Any
 
 from torch import nn
+from torch.optim import AdamW
+from torch.optim.lr_scheduler import LambdaLR
 
 
 def parameter_groups(model: nn.Module, weight_decay: float, undecayed: Iterable[str]) -> list[dict]:
@@ -36,3 +39,32 @@ def learning_rate(
     if step < warmup_steps:
         return warmup + (peak - warmup) * step / warmup_steps
     return final + (peak - final) * (1 + math.cos(math.pi * min(step / max(steps, 1), 1))) / 2
+
+
+class Schedule(LambdaLR):
+    """AdamW's learning rate, each step. What a checkpoint brings back is the step alone.
+
+    Rates and weight decay stay those that the optimizer and the schedule were made with, so that a
+    run goes on with those of its options. The schedule is to be restored after the optimizer.
+
+    Args:
+        rates: of `learning_rate`, with its steps.
+    """
+
+    def __init__(self, optimizer: AdamW, **rates: float):
+        super().__init__(optimizer, lambda step: learning_rate(step, **rates) / rates["peak"])
+        optimizer.register_load_state_dict_pre_hook(_with_own_options)
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"last_epoch": self.last_epoch}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        self.last_epoch = state_dict["last_epoch"] - 1
+        self._step_count = 0  # else torch takes this for a step before the optimizer's first
+        self.step()
+
+
+def _with_own_options(optimizer: AdamW, state: dict[str, Any]) -> dict[str, Any]:
+    theirs, own = state["param_groups"], optimizer.param_groups
+    groups = [mine | {"params": group["params"]} for group, mine in zip(theirs, own, strict=True)]
+    return state | {"param_groups": groups}

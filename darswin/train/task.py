@@ -18,7 +18,7 @@ from darswin.linear import Products
 from darswin.models.encoder import ImageEncoder
 from darswin.models.registry import model_class
 from darswin.models.saving import ModelCard
-from darswin.train.recipe import learning_rate, parameter_groups
+from darswin.train.recipe import Schedule, parameter_groups
 
 Batch = tuple[Tensor, Lens, Tensor]
 
@@ -72,9 +72,18 @@ class Classification(LightningModule):
     ):
         super().__init__()
         model_class(name)
-        if not 0 <= label_smoothing < 1:
-            raise ValueError(f"label_smoothing must be in [0, 1), got {label_smoothing}")
         self.name, self.options = name, options or {}
+        if not 0 <= label_smoothing < 1:
+            raise ValueError(f"--model.label_smoothing must be in [0, 1), got {label_smoothing}")
+        for option, value in dict(
+            learning_rate=learning_rate, reference_batch=reference_batch
+        ).items():
+            if not 0 < value < math.inf:
+                raise ValueError(f"--model.{option} must be above 0, got {value}")
+        rates = dict(warmup_rate=warmup_rate, final_rate=final_rate, weight_decay=weight_decay)
+        for option, value in (rates | dict(warmup_epochs=warmup_epochs)).items():
+            if not 0 <= value < math.inf:
+                raise ValueError(f"--model.{option} must be at least 0, got {value}")
         self.rates = dict(peak=learning_rate, warmup=warmup_rate, final=final_rate)
         self.warmup_epochs, self.reference_batch = warmup_epochs, reference_batch
         self.weight_decay, self.decay_position_bias = weight_decay, decay_position_bias
@@ -82,6 +91,7 @@ class Classification(LightningModule):
         self.products, self.recompute = products, recompute
         self.mixing = Mixing(mixup, cutmix, mix_p)
         self.net: nn.Module | None = None
+        self._steps_there: int | None = None  # in an epoch of the run that a checkpoint is of
         self.card: ModelCard | None = None
 
     # -- building -----------------------------------------------------------------------------
@@ -97,10 +107,21 @@ class Classification(LightningModule):
         options |= dict(mean=data.mean, std=data.std)
         if issubclass(model_class(self.name), ImageEncoder):
             options["image_size"] = data.size
+        if taken := sorted(options.keys() & self.options.keys()):
+            raise ValueError(
+                f"--model.options cannot set {', '.join(taken)}: the data decides on it"
+            )
         options |= self.options
         self.card = ModelCard(self.name, options, data.classes, data.size, data.fov)
         torch.manual_seed(self.seed)
-        self.net = self.card.create()
+        try:
+            self.net = self.card.create()
+        except (TypeError, ValueError) as error:
+            if not self.options:
+                raise
+            raise ValueError(
+                f"no {self.name} with --model.options {self.options}: {error}"
+            ) from error
         self.net.set_products(self.products)
         self.net.set_recompute(self.recompute)
         count = len(data.classes)
@@ -114,29 +135,46 @@ class Classification(LightningModule):
         steps = trainer.estimated_stepping_batches
         if not math.isfinite(steps):
             raise ValueError("the cosine needs an end: set --trainer.max_epochs or max_steps")
+        if self._steps_there not in (None, self.steps_per_epoch):
+            raise ValueError(
+                f"an epoch of this run has {self._steps_there} steps, and would now have "
+                f"{self.steps_per_epoch}, which its schedule cannot follow; the number of "
+                "pictures, --data.batch_size, --devices and --trainer.limit_train_batches decide it"
+            )
         rates = {name: rate * scale for name, rate in self.rates.items()}
-        epoch = math.ceil(trainer.num_training_batches / trainer.accumulate_grad_batches)
-        warmup_steps = self.warmup_epochs * epoch
+        warmup_steps = self.warmup_epochs * self.steps_per_epoch
         undecayed = () if self.decay_position_bias else self.net.no_weight_decay()
         optimizer = torch.optim.AdamW(
             parameter_groups(self.net, self.weight_decay, undecayed), lr=rates["peak"]
         )
-        schedule = torch.optim.lr_scheduler.LambdaLR(
-            optimizer,
-            lambda step: (
-                learning_rate(step, warmup_steps=warmup_steps, steps=steps, **rates) / rates["peak"]
-            ),
-        )
+        schedule = Schedule(optimizer, warmup_steps=warmup_steps, steps=steps, **rates)
         return {
             "optimizer": optimizer,
             "lr_scheduler": {"scheduler": schedule, "interval": "step"},
         }
 
+    @property
+    def steps_per_epoch(self) -> int:
+        """Steps of the optimizer, the last of which may be on fewer batches than the others."""
+        trainer = self.trainer
+        return math.ceil(trainer.num_training_batches / trainer.accumulate_grad_batches)
+
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """FloatingPointError where the weights, or their moments, are no longer finite."""
+        optimizers = checkpoint.get("optimizer_states", ())
+        moments = (state for one in optimizers for state in one["state"].values())
+        for tensors in (checkpoint["state_dict"], *moments):
+            if not all(tensor.isfinite().all() for tensor in tensors.values()):
+                step = self.trainer.global_step
+                raise FloatingPointError(
+                    f"the weights are not finite after step {step}: {self._advice()}"
+                )
         checkpoint["darswin"] = asdict(self.card)
+        checkpoint["steps_per_epoch"] = self.steps_per_epoch
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """ValueError where the checkpoint is not one of this model."""
+        self._steps_there = checkpoint.get("steps_per_epoch")
         theirs, ours = (
             {**card, **card.pop("options")}
             for card in (checkpoint["darswin"].copy(), asdict(self.card))
@@ -166,12 +204,18 @@ class Classification(LightningModule):
         loss = soft_cross_entropy(self.net(images, lens), targets)
         if not torch.isfinite(loss):
             raise FloatingPointError(
-                f"the loss is {loss.item()} in epoch {self.current_epoch}, step {batch_idx}: try a "
-                "smaller learning rate; the last checkpoint is from before"
+                f"the loss is {loss.item()} in epoch {self.current_epoch}, batch {batch_idx}: "
+                f"{self._advice()}"
             )
         self.log("train/loss", loss, prog_bar=True, batch_size=len(images), sync_dist=True)
         self.log("train/rate", self.lr_schedulers().get_last_lr()[0])
         return loss
+
+    def _advice(self) -> str:
+        return (
+            f"go on with --resume and a --model.learning_rate below {self.rates['peak']:g}; if the "
+            "last checkpoint has diverged too, add --ckpt_path for best.ckpt, or begin anew"
+        )
 
     def _targets(self, labels: Tensor, classes: int) -> Tensor:
         """Labels (B,) → probabilities (B, K); all 0 for label -1, which then weighs nothing."""

@@ -31,5 +31,6 @@ def test_an_epoch_s_last_step_waits_for_its_validation(tmp_path, monkeypatch):
     )
     checkpoint = RunCheckpoint(tmp_path, every_n_train_steps=1)
     for last in (False, True, False):
-        checkpoint.on_train_batch_end(SimpleNamespace(is_last_batch=last), None, None, None, 0)
+        trainer = SimpleNamespace(is_last_batch=last, accumulate_grad_batches=1)
+        checkpoint.on_train_batch_end(trainer, None, None, None, 0)
     assert saved == [False, False]

@@ -2,6 +2,7 @@
 
 import json
 import re
+import resource
 
 import cv2
 import numpy as np
@@ -44,6 +45,64 @@ def test_unknown_things(capsys, tmp_path):
     assert "run" in error(capsys, "fit", *DIGITS)
 
 
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ("--data.limit -1", "--data.limit must be at least 1, got -1"),
+        ("--data.batch_size 0", "--data.batch_size must be at least 1"),
+        ("--data.workers -1", "--data.workers at least 0"),
+        ("--data.holdout 0", "--data.holdout 0 leaves no pictures for 'val'"),
+        ("--model.learning_rate 0", "--model.learning_rate must be above 0, got 0"),
+        ("--model.learning_rate .nan", "--model.learning_rate must be above 0, got nan"),
+        ("--model.reference_batch 0", "--model.reference_batch must be above 0"),
+        ("--model.weight_decay -1", "--model.weight_decay must be at least 0"),
+        ("--model.warmup_epochs .inf", "--model.warmup_epochs must be at least 0"),
+        ("--model.options {foo: 1}", "--model.options {'foo': 1}: "),
+        ("--model.options {embed_dim: a}", "--model.options {'embed_dim': 'a'}: "),
+        ("--model.options {num_classes: 3}", "--model.options cannot set num_classes"),
+        ("--model.options {embed_dim: 1099511627776}", "not enough memory: a smaller --data."),
+        ("--trainer.overfit_batches 2", "--trainer.overfit_batches"),
+        ("--checkpoint_steps 0", "--checkpoint_steps must be at least 1"),
+        ("--trainer.max_epochs many", "error: --trainer.max_epochs: "),
+        ("--devices many", "error: --devices: "),
+    ],
+)
+def test_wrong_options_are_named_in_one_line(capsys, tmp_path, options, message):
+    run = ["--run", tmp_path / "r", *DIGITS, "--data.limit", "96", "--data.workers", "0"]
+    said = error(capsys, "fit", *run, *options.split(" ", 1))
+    assert message in said and re.match("darswin: |error: ", said.splitlines()[-1])
+    assert {p.name for p in (tmp_path / "r").glob("*")} <= {".lock"}
+
+
+def test_what_is_missing_is_named_as_people_type_it(capsys, tmp_path):
+    assert "required: --data.path, --run" in error(capsys, "fit", "--config", "minutes")
+    (tmp_path / "c.yaml").write_text("model: {speed: 3}")
+    message = error(capsys, "fit", "--run", tmp_path, *DIGITS, "--config", tmp_path / "c.yaml")
+    assert "no option '--model.speed'" in message
+
+
+def test_a_list_of_splits_holds_paths(capsys, tmp_path):
+    write_pictures(tmp_path / "p" / "a", 12)
+    splits = tmp_path / "splits.json"
+    for text in ('{"train": [1, 2]}', '{"train": 3}', "[]"):
+        splits.write_text(text)
+        options = ["--data.path", tmp_path / "p", "--data.splits", splits]
+        assert "must hold" in error(capsys, "fit", "--run", tmp_path / "r", *DIGITS, *options)
+
+
+def test_a_disk_that_is_full_from_the_start(capsys, tmp_path):
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    fit = ["fit", "--run", tmp_path, "--config", "minutes", "--data.path", "digits"]
+    fit += ["--data.limit", "96"]
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, before[1]))  # the configuration needs more
+    try:
+        message = error(capsys, *fit, "--data.workers", "0")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert re.search(r"^darswin: .*cannot write it.*config\.yaml'$", message, re.M)
+    assert [p.name for p in tmp_path.rglob("*")] == [".lock"]
+
+
 def test_a_run_is_not_overwritten(capsys, tmp_path):
     (tmp_path / "checkpoints").mkdir()
     (tmp_path / "checkpoints" / "last.ckpt").write_bytes(b"")
@@ -65,8 +124,7 @@ def test_a_checkpoint_of_another_model(capsys, tmp_path):
     fit += ["--data.limit", "48", "--trainer.enable_progress_bar", "false", "--data.workers", "0"]
     main([str(a) for a in fit])
     before = (tmp_path / "checkpoints" / "last.ckpt").read_bytes()
-    options = ["--resume", "--model.options", "{embed_dim: 12}"]
-    message = error(capsys, *fit, *options)
+    message = error(capsys, "test", "--run", tmp_path, "--model.options", "{embed_dim: 12}")
     assert "another model" in message and "embed_dim None there, 12 here" in message
     assert (tmp_path / "checkpoints" / "last.ckpt").read_bytes() == before
     torch.save({"state_dict": {}}, tmp_path / "other.ckpt")

@@ -102,6 +102,7 @@ def test_a_run_told_to_stop_says_so(tmp_path):
         time.sleep(0.005)
     process.terminate()
     assert process.wait(timeout=60) == 128 + signal.SIGTERM
+    assert f"`darswin fit --run {run} --resume` goes on" in Path(f"{run}.log").read_text()
 
 
 def test_two_processes_train_as_one(tmp_path):

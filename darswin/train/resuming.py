@@ -1,0 +1,51 @@
+"""Which options of a run may change when it goes on."""
+
+from collections.abc import Mapping
+from typing import Any
+
+# Those that take effect from there on; of the trainer's, all do but for the size of a step.
+CHANGEABLE = {
+    *("checkpoint_steps", "weights_only"),
+    *(f"model.{rate}_rate" for rate in ("learning", "warmup", "final")),
+    *("model.warmup_epochs", "model.reference_batch", "model.weight_decay"),
+    *("model.label_smoothing", "model.mixup", "model.cutmix", "model.mix_p"),
+    *("model.products", "model.recompute"),
+    *("data.path", "data.classes", "data.splits", "data.skip_broken"),
+    *("data.batch_size", "data.workers"),
+    *("data.train_lenses", "data.test_lenses", "data.pair_lenses"),
+    *("data.render", "data.fit", "data.picture_size", "data.randaugment", "data.erasing"),
+}
+
+
+def check_changes(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
+    """What differs between a run's configuration and that to go on with, a line for each option.
+
+    Raises:
+        ValueError: an option that cannot change, named as people type it.
+    """
+    before, now = _options(before), _options(now)
+    changes = {
+        name: f"--{name} {now[name]!r} in place of {before.get(name)!r}"
+        for name in now
+        if now[name] != before.get(name)
+    }
+    refused = [
+        text
+        for name, text in changes.items()
+        if name not in CHANGEABLE
+        and (not name.startswith("trainer.") or name == "trainer.accumulate_grad_batches")
+    ]
+    if refused:
+        raise ValueError(f"a run goes on with what it began with, not with {'; '.join(refused)}")
+    return list(changes.values())
+
+
+def _options(config: Mapping[str, Any]) -> dict[str, Any]:
+    """The options by their names on the command line."""
+    found = {}
+    for group, value in config.items():
+        if group in ("model", "data", "trainer"):
+            found |= {f"{group}.{name}": own for name, own in value.items()}
+        elif group != "run":  # it may have moved
+            found[group] = value
+    return found

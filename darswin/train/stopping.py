@@ -1,0 +1,98 @@
+"""Ctrl-C and SIGTERM: training stops behind a whole step, with a checkpoint to go on from."""
+
+import os
+import signal
+import threading
+from pathlib import Path
+from typing import Any
+
+from lightning.pytorch import Callback, LightningModule, Trainer
+
+from darswin.train.checkpoints import ends_step
+
+_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+
+class StopSignals:
+    """Within it, Ctrl-C and SIGTERM raise KeyboardInterrupt; while `patient`, only the second does.
+
+    Attributes:
+        number: of the last signal, None before the first.
+        patient: whether the program itself looks at `number`, and stops when it can.
+    """
+
+    def __init__(self) -> None:
+        self.number: int | None = None
+        self.patient = False
+
+    def __enter__(self) -> "StopSignals":
+        self._before = {number: signal.getsignal(number) for number in _SIGNALS}
+        self.listen()
+        return self
+
+    def __exit__(self, *error: Any) -> None:
+        for number, handler in self._before.items():
+            _handle(number, handler)
+
+    def listen(self) -> None:
+        """Takes the signals, also from one who took them since."""
+        for number in _SIGNALS:
+            _handle(number, self._received)
+
+    def _received(self, number: int, frame: Any) -> None:
+        first, self.number = self.number is None, number
+        if not (first and self.patient):
+            raise KeyboardInterrupt
+        # print() fails in a handler that interrupts a print().
+        os.write(2, b"\nstopping at the end of this step; a second signal stops at once\n")
+
+
+def _handle(number: int, handler: Any) -> None:
+    if threading.current_thread() is threading.main_thread():  # others may not
+        signal.signal(number, handler)
+
+
+def ignore_signals(worker: int) -> None:
+    """For a process that reads data: the training process stops it, when it needs no more."""
+    for number in _SIGNALS:
+        signal.signal(number, signal.SIG_IGN)
+
+
+class StopWhenTold(Callback):
+    """Once any process of a run was told to stop, all save a checkpoint behind the same step.
+
+    Behind an epoch's last step they validate first, and the epoch's own checkpoint is the one.
+    """
+
+    def __init__(self, signals: StopSignals, checkpoint: Path):
+        self.signals, self.checkpoint = signals, checkpoint
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        self.signals.listen()  # Lightning took SIGTERM a moment ago
+        self.signals.patient = True
+
+    def on_train_batch_end(
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
+        if ends_step(trainer, batch_idx) and not trainer.is_last_batch and self._told(trainer):
+            trainer.save_checkpoint(self.checkpoint)
+            raise SystemExit
+
+    def on_train_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        if trainer.global_step > 0 and self._told(trainer):
+            raise SystemExit
+
+    def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        self.signals.patient = False
+
+    def on_exception(
+        self, trainer: Trainer, pl_module: LightningModule, exception: BaseException
+    ) -> None:
+        self.signals.patient = False
+
+    def _told(self, trainer: Trainer) -> bool:
+        told = self.signals.number is not None
+        if not trainer.strategy.reduce_boolean_decision(told, all=False):
+            return False
+        self.signals.number = self.signals.number or signal.SIGTERM  # another process got it
+        return True
