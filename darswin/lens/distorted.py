@@ -183,17 +183,15 @@ class DistortedLens(Lens):
     def _find_points(self, goal: Tensor, start: Tensor, last: Tensor) -> Tensor:
         """(N, ..., 2): points of the ideal plane whose place in the bent one is `goal`, if there is
         one within `last`; from half as far out as `start`, where nothing is about to fold."""
-        last = last.flatten().expand(len(goal))
         if torch.compiler.is_compiling():
-            end = self._row(1.1 * last, goal.dim() - 1)
-            return _newton(self._bent, self._bent_slopes, goal, start / 2, end, rounds=30)
+            return _newton(self._bent, self._bent_slopes, goal, start / 2, 1.1 * last, rounds=30)
         azimuth = torch.arange(256, dtype=goal.dtype, device=goal.device) * (math.pi / 128)
         circle = torch.stack((torch.cos(azimuth), torch.sin(azimuth)), -1)
-        count, shape = len(goal), goal.shape
-        start = start.expand(shape).reshape(count, -1, 2)
-        goal, points = goal.reshape(count, -1, 2), start.clone()
-        for k, end in enumerate(last):
-            lens = self[k % len(self)]
+        # A lens at a time, whatever the shape of its pixels.
+        shape, start = goal.shape, start.expand_as(goal).reshape(len(self), -1, 2)
+        goal, points = goal.reshape(len(self), -1, 2), start.clone()
+        for k, end in enumerate(last.flatten()):
+            lens = self[k]
             # Most pixels that no ray reaches lie beyond the rim: they are not looked for.
             near = length_of(goal[k]) < 1.01 * length_of(lens._bent(end * circle)).max()
             for share in (0.5, 0.0):  # where one way is blocked, another is not
