@@ -18,7 +18,7 @@ COMMANDS = {
     "convert": "makes a safetensors file of a pickled checkpoint, without executing it",
     "models": "lists the models",
     "lens": "draws, describes or converts a calibrated lens",
-    "bench": "measures how fast a model is on this machine, ten minutes",
+    "bench": "measures how fast a model is on this machine, in some minutes",
 }
 # The modules of the extra `train` that a command imports, if not all of them.
 TRAIN = (

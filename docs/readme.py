@@ -55,6 +55,41 @@ def peers_table(results: list[dict], operator: str, peers: tuple[str, ...]) -> s
     return "\n".join(lines)
 
 
+def drop_in_line(results: list[dict]) -> str:
+    """How much faster the README's own call is than what it replaces."""
+    found = [
+        row
+        for row in results
+        if (row["operator"], row["mode"]) == ("polar_sample", "forward, layout image")
+        and row["name"] == "F.grid_sample"
+    ]
+    cases = ", ".join(dict.fromkeys(row["case"] for row in found))
+    low, high = (end(row["ratio"] for row in found) for end in (min, max))
+    return f"{low:.1f} to {high:.1f} times as fast as `F.grid_sample`, this very call ({cases})."
+
+
+def missed_table(*records: list[dict]) -> str:
+    """Ratios that are below the bar that was set for them."""
+    lines = ["| | ratio | bar |", "|---|---|---|"]
+    for row in (row for results in records for row in results):
+        if row["bar"] is not None and row["ratio"] < row["bar"]:
+            threads = "1 thread" if row["threads"] == 1 else f"{row['threads']} threads"
+            what = f"{row['operator']}, {row['case']}, {row['mode']}, {threads}: {row['name']}"
+            lines.append(f"| {what} | {row['ratio']:.2f} | {row['bar']:.2f} |")
+    return "\n".join(lines)
+
+
+def demo_table(record: dict) -> str:
+    """A row a model, a column a lens."""
+    lines = [
+        f"| ξ | {' | '.join(f'{xi:.1f}' for xi in record['xi'])} |",
+        "|---" * (len(record["xi"]) + 1) + "|",
+    ]
+    for name, accuracy in record["accuracy"].items():
+        lines.append(f"| {name} | {' | '.join(f'{value:.1f}' for value in accuracy)} |")
+    return "\n".join(lines)
+
+
 def attention_table(results: list[dict]) -> str:
     """A row a case; for each mode the best of all peers, and eager."""
     modes = {
@@ -116,6 +151,9 @@ def tables() -> dict[str, str]:
     cameras = json.loads((studies / "learned_lens.json").read_text())["cameras"]
     model = report.Record.load(RESULTS / "model--avx512.json")
     return {
+        "demo": demo_table(json.loads((ROOT / "docs" / "accuracy.json").read_text())),
+        "drop-in": drop_in_line(sampling),
+        "missed": missed_table(sampling, attention),
         "model": report.table(model),
         "model memory": report.memory_table(model),
         "sampling": peers_table(sampling, "polar_sample", SAMPLING_PEERS),

@@ -1,6 +1,8 @@
 """The README's code runs as it stands there."""
 
+import json
 import re
+import statistics
 import sys
 from pathlib import Path
 
@@ -9,6 +11,8 @@ import torch
 from darswin import create_model, lens, list_models
 
 ROOT = Path(__file__).parent.parent
+LEVELS = ("very low", "low", "medium", "high")
+SWEEP = tuple(f"{k / 20:g}" for k in range(21))
 README = (ROOT / "README.md").read_text()
 
 
@@ -40,6 +44,70 @@ def test_tables_are_those_of_the_results():
     for name, table in readme.tables().items():
         assert readme.placed(name, table) in README, name
         assert "not run" not in table
+
+
+def test_the_drop_in_call_is_faster_than_what_it_replaces():
+    record = json.loads((ROOT / "benchmarks/results/sampling--avx512.json").read_text())
+    calls = [
+        row
+        for row in record["results"]
+        if row["mode"] == "forward, layout image" and row["name"] == "F.grid_sample"
+    ]
+    assert len(calls) == 6 and min(row["ratio"] for row in calls) > 1
+
+
+def test_what_is_said_of_the_study_is_in_its_record():
+    cells = json.loads((ROOT / "studies/results/study--nano.json").read_text())["cells"]
+    runs = {}
+    for cell in cells:
+        runs.setdefault((cell["label"], cell["level"]), []).append(cell["accuracy"])
+
+    def mean(label: str, level: str, lenses: str) -> float:
+        return statistics.mean(run[lenses] for run in runs[label, level])
+
+    def span(values) -> str:
+        low, high = (round(end(values)) for end in (min, max))
+        return f"{low} to {high}"
+
+    others = ("Swin", "DAT")
+    kept = [round(mean("DarSwin-A", level, "0.4")) for level in ("very low", "high")]
+    fell = [span([mean(o, level, "0.4") for o in others]) for level in ("very low", "high")]
+    ends = [round(mean("DarSwin-A", "very low", xi)) for xi in ("0", "1")]
+    undistorted = round(mean("Swin (undis)", "very low", "1"))
+    first = {c["label"]: c["accuracy"] for c in cells if c["level"] == "low" and c["seed"] == 0}
+
+    def cost(label: str) -> list[float]:
+        return [first["DarSwin-A"][level] - first[label][level] for level in LEVELS]
+
+    lost = [round(cost("no distortion-aware partition")[k]) for k in (0, -1)]
+    samples = span(cost("S_r = 5") + cost("S_r = 2"))
+    biases = span(cost("polar position bias") + cost("angular position bias"))
+    for said in (
+        f"DarSwin keeps {kept[0]} and {kept[1]} % while Swin and DAT fall to {fell[0]} "
+        f"and {fell[1]} %",
+        f"from {ends[0]} % at ξ = 0 to {ends[1]} % at ξ = 1, Swin and DAT to "
+        + " or ".join(sorted({f"{mean(o, 'very low', '1'):.0f}" for o in others})),
+        f"({undistorted} against {ends[1]} % at ξ = 1)",
+        f"accuracy falls by {lost[0]} and {lost[1]} points at the ends",
+        f"Fewer samples cost {samples} points, the other position biases {biases},",
+    ):
+        assert said in " ".join(README.split()), said
+    ahead = [
+        mean(label, level, xi) - mean("DarSwin-A", level, xi)
+        for label, level in runs
+        if label in (*others, "Swin (undis)")
+        for xi in SWEEP
+    ]
+    assert max(ahead) <= 2
+
+
+def test_what_is_said_of_loading_is_in_its_record():
+    loader = json.loads((ROOT / "benchmarks/results/training--micro.json").read_text())["loader"]
+    one, beside, two = (
+        round(loader[key]) for key in ("all", "1 worker processes", "2 worker processes")
+    )
+    said = f"One core makes {one} such images a second, one worker process beside the training "
+    assert f"{said}{beside}, two {two}:" in " ".join(README.split())
 
 
 def parameters(name: str, **options) -> int:

@@ -41,7 +41,7 @@ def bench(
         seconds: of each timing, about.
         out: the folder of the record, `model--<tier>.json`, and its plot.
     """
-    out.mkdir(parents=True, exist_ok=True)  # before ten minutes' work
+    out.mkdir(parents=True, exist_ok=True)  # before the work
     head = machine()
     print(" ".join(f"{k}={v}" for k, v in head.items()), flush=True)
     threads_before = torch.get_num_threads()

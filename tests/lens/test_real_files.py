@@ -13,7 +13,7 @@ import torch
 from darswin.__main__ import main
 from darswin.lens import EnhancedUnified, load, load_all
 from darswin.lens.files import loads
-from darswin.predict import lens_of
+from darswin.predict import read_lens
 
 FILES = Path(__file__).parent / "files"
 f64 = torch.float64
@@ -30,7 +30,7 @@ def test_a_camera_that_is_called_by_a_number_is_that_one(camera, tmp_path, capsy
     path.write_text(COLMAP)
     assert load(path, camera=str(camera)).focal.item() == 100 * camera
     assert load(path, camera=camera).focal.item() == 100 * camera
-    assert lens_of(str(path), (480, 640), str(camera)).focal.item() == 100 * camera
+    assert read_lens(str(path), (480, 640), str(camera)).focal.item() == 100 * camera
     main(["lens", "info", str(path), "--camera", str(camera)])
     printed = capsys.readouterr().out
     assert f"focal         {100 * camera}\n" in printed
@@ -48,7 +48,7 @@ def test_a_number_chooses_among_cameras_of_other_names(capsys):
     path = FILES / "kalibr_tumvi.yaml"
     focal = load(path, camera="cam1").focal.item()
     assert load(path, camera="1").focal.item() == load(path, camera=1).focal.item() == focal
-    assert lens_of(str(path), (512, 512), "1").focal.item() == focal
+    assert read_lens(str(path), (512, 512), "1").focal.item() == focal
     main(["lens", "info", str(path), "--camera=1"])
     assert "camera          cam1, of 2: cam0, cam1\n" in capsys.readouterr().out
     with pytest.raises(ValueError, match="one of 'cam0', 'cam1', or its number, got '2'"):
