@@ -190,7 +190,8 @@ class Lens:
         (radius,) = self._aligned(radius)
         slack = 1 + 16 * torch.finfo(radius.dtype).eps
         with torch.no_grad():
-            last = torch.fmax(self.r_max, self.project(self.theta_max * slack)) * slack
+            last, beyond = self.r_max, self.project(self.theta_max * slack)
+            last = torch.where(beyond > last, beyond, last) * slack  # which may be none
             lands = (radius >= 0) & (radius <= self._row(last, radius.dim()))
         # 0 in place of what has no angle: NaN would reach the gradients.
         return torch.where(lands, self._angle_at(torch.where(lands, radius, 0.0)), torch.nan)

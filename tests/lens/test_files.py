@@ -191,7 +191,8 @@ def colmap_pixels(model, params, points):
     """As COLMAP's ImgFromCam, without its 0.5."""
     x, y, z = points.T
     single = model in ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEYE",
-                       "RADIAL_FISHEYE", "SIMPLE_DIVISION")  # fmt: skip
+                       "RADIAL_FISHEYE", "SIMPLE_DIVISION", "BROWN_CONRADY",
+                       "SIMPLE_FISHEYE")  # fmt: skip
     fx, fy, cx, cy, *extra = params[:1] * 2 + params[1:] if single else params
     if "FISHEYE" in model:
         theta = np.arctan2(np.hypot(x, y), z)
@@ -204,6 +205,8 @@ def colmap_pixels(model, params, points):
         k, p, d = [*extra[:2], extra[4]], extra[2:4], extra[5:]
     elif model == "OPENCV":
         k, p = extra[:2], extra[2:]
+    elif model == "BROWN_CONRADY":
+        k, p = extra[:3], extra[3:]
     elif model == "THIN_PRISM_FISHEYE":
         k, p, s = [*extra[:2], *extra[4:6]], extra[2:4], [extra[6], 0, extra[7], 0]
     elif model == "RAD_TAN_THIN_PRISM_FISHEYE":
@@ -217,7 +220,7 @@ def colmap_pixels(model, params, points):
         alpha, beta = extra
         den = alpha * np.sqrt(beta * (x * x + y * y) + z * z) + (1 - alpha) * z
         u, v = x / den, y / den
-    elif model == "SIMPLE_DIVISION":
+    elif model in ("SIMPLE_DIVISION", "DIVISION"):
         den = (z + np.sqrt(z * z - 4 * (x * x + y * y) * extra[0])) / 2
         u, v = x / den, y / den
     else:
@@ -233,7 +236,7 @@ def test_every_model_of_colmap():
     path = FILES / "colmap_all.txt"
     found = load_all(path, dtype=f64)
     rows = [line.split() for line in path.read_text().splitlines() if line[0] != "#"]
-    assert list(found) == [row[0] for row in rows] and len(rows) == 15
+    assert list(found) == [row[0] for row in rows] and len(rows) == 18
     points, theta, phi = rays(0.8)
     for (name, lens), row in zip(found.items(), rows, strict=True):
         expected = colmap_pixels(row[1], [float(p) for p in row[4:]], points) - 0.5

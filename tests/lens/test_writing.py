@@ -32,10 +32,10 @@ def lens_of(draw, name):
         beta=draw(st.floats(0.5, 2)), radial=draw(st.integers(1, 6).flatmap(small)),
         denominator=draw(st.integers(1, 3).flatmap(small)), tangential=draw(small(2)),
         prism=draw(small(4)), coefficients=[300.0, *draw(small(2))], angles=[0.0, 0.5, 1.2],
-        radii=[0.0, 140.0, 400.0],
+        radii=[0.0, 140.0, 400.0], slopes=[270.0, 330.0, 380.0],
     )  # fmt: skip
     if name == "OCam":
-        values["coefficients"][0] = -300.0
+        values["coefficients"] = [-300.0, *(value / 10 for value in values["coefficients"][1:])]
     elif name == "OCamInverse":
         values["coefficients"] = [500.0, 320.0, 1.0]
     wanted = [*model.parameters, *(key for key in model.optional if draw(st.booleans()))]
