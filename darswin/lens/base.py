@@ -158,13 +158,15 @@ class Lens:
             self.theta_max = limit
             return
         self._require("theta_max", self.theta_max > 0, "greater than 0")
-        beyond = ~(self.theta_max <= limit)
+        # A limit found in another dtype differs by a rounding, which MARGIN leaves room for.
+        beyond = ~(self.theta_max <= limit * (1 + 2 * torch.finfo(limit.dtype).eps))
         if bool(beyond.any()):
             last, got = (t.detach()[beyond][0].item() for t in (limit, self.theta_max))
             raise ValueError(
                 f"theta_max must be at most {last:.6f} rad ({math.degrees(last):.2f}°), as far as "
                 f"this {type(self).__name__} lens's r rises, got {got:.6f}"
             )
+        self.theta_max = torch.where(self.theta_max > limit, limit, self.theta_max)
 
     @property
     def _curve(self) -> str:
@@ -389,8 +391,9 @@ class Lens:
         lens = self._scaled(across)
         lens.image_size = size
         if self.center is not None:
-            factor = torch.stack(torch.broadcast_tensors(
-                *(torch.as_tensor(f).to(self.center) for f in (across, down))), -1)  # fmt: skip
+            like = dict(dtype=self.center.dtype, device=self.center.device)
+            factors = (torch.as_tensor(factor, **like) for factor in (across, down))
+            factor = torch.stack(torch.broadcast_tensors(*factors), -1)
             lens.center = (self.center + 0.5) * factor - 0.5
         if isinstance(across, Tensor) and bool((down != across).any()):
             rows = torch.stack((torch.ones_like(down), down / across), -1)

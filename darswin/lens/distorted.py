@@ -88,12 +88,13 @@ class DistortedLens(Lens):
 
     @property
     def theta_limit(self) -> Tensor:
-        end = self._plane_limit()
-        limits = [rising_limit(self._slope, end)]
+        lens = self.detach().to(torch.float64)  # near 90° tan θ has high powers that float32 lacks
+        end = lens._plane_limit()
+        limits = [rising_limit(lens._slope, end)]
         if not self.is_radial:
-            limits.append(rising_limit(self._least_area, limits[0]))
+            limits.append(rising_limit(lens._least_area, limits[0]))
         limit = limits[-1]
-        return torch.where(limit < end, limit - MARGIN, end)
+        return torch.where(limit < end, limit - MARGIN, end).to(self.focal.dtype)
 
     def project(self, theta: Number) -> Tensor:
         theta, focal = self._aligned(theta, "focal")

@@ -44,6 +44,8 @@ class PolynomialLens(Lens):
         super().__init__(theta_max, center, coefficients=coefficients, **frame)
 
     def _validate(self) -> None:
+        if self.coefficients.shape[1] < 1:
+            raise ValueError("coefficients must be at least one a lens, got none")
         self._require("coefficients", self.coefficients.isfinite().all(1), "finite")
 
     @property
@@ -111,7 +113,10 @@ class OCam(PolynomialLens):
 
     def _scaled(self, scale: float | Tensor) -> "OCam":
         power = 1 - torch.arange(self.coefficients.shape[1], device=self.coefficients.device)
-        factor = torch.as_tensor(scale).to(self.coefficients).reshape(-1, 1) ** power
+        like = self.coefficients
+        factor = (
+            torch.as_tensor(scale, dtype=like.dtype, device=like.device).reshape(-1, 1) ** power
+        )
         return self.replace(coefficients=self.coefficients * factor)
 
 
@@ -125,6 +130,10 @@ class OCamInverse(PolynomialLens):
 
     Source: the OCamCalib toolbox, world2cam.
     """
+
+    def _set_theta_max(self) -> None:
+        super()._set_theta_max()
+        self._require("coefficients", self.r_max > 0, "such that r at theta_max is above 0")
 
     def _slope(self, theta: Tensor) -> Tensor:
         return horner(theta - math.pi / 2, slopes(self.coefficients, 0)[:, 1:])

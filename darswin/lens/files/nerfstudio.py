@@ -39,7 +39,9 @@ def cameras(file: Fields) -> Cameras:
     found: Cameras = {}
     for index, frame in enumerate(frames):
         name = frame.get("file_path")
-        name = name if isinstance(name, str) and name not in found else f"frame {index}"
+        name = name if isinstance(name, str) else f"frame {index}"
+        if name in found:
+            raise ValueError(f"frames[{index}].file_path is that of another frame: {short(name)}")
         found[name] = partial(_frame, shared, own, frame, f"frames[{index}].")
     return found
 
