@@ -1,4 +1,5 @@
 import math
+import time
 
 import pytest
 import torch
@@ -754,3 +755,38 @@ def test_the_compiled_operator_itself_reads_nothing_outside():
         arguments = [value if k == index else v for k, v in enumerate(good)]
         with pytest.raises(RuntimeError):
             torch.ops.darswin.polar_sample(*arguments)
+
+
+@pytest.mark.parametrize(
+    ("size", "rows", "columns"),
+    [(9, 6, 12), (40, 8, 1031), (40, 1, 2500), (700, 12, 90), (9, 7, 1)],
+)
+def test_the_patch_does_not_matter_to_an_image(size, rows, columns):
+    """Near and far images, rows longer than a block, and rows of no other divisor than 1."""
+    image = torch.randn(2, 3, size, size)
+    radii, azimuths = torch.linspace(0, size / 2, rows)[None], torch.linspace(0, 6.28, columns)
+    center = torch.full((1, 2), (size - 1) / 2)
+    arguments = (image, radii, azimuths, center)
+    sampled = [
+        polar_sample(*arguments, patch=patch, layout="image", jitter=1.0, seed=3)
+        for patch in ((1, 1), (1, columns), (rows, 1), (rows, columns))
+    ]
+    assert all(torch.equal(sampled[0], other) for other in sampled[1:])
+    with use_reference():
+        expected = polar_sample(*arguments, patch=(1, 1), layout="image", jitter=1.0, seed=3)
+    # The reference computes places in float32.
+    torch.testing.assert_close(sampled[0], expected, rtol=0, atol=2e-6 * (10 + size))
+
+
+@pytest.mark.unsanitized
+def test_an_image_of_patches_of_one_point_is_as_fast_as_one_of_whole_rows(threads):
+    threads(1)
+    image, center = torch.rand(2, 3, 64, 64), torch.full((1, 2), 31.5)
+    radii, azimuths = torch.linspace(0, 32, 160)[None], torch.linspace(0, 6.28, 640)
+    best = {(1, 1): math.inf, (1, 640): math.inf}
+    for _ in range(40):  # in turns; the fastest of each is the least disturbed
+        for patch in best:
+            start = time.perf_counter()
+            polar_sample(image, radii, azimuths, center, patch=patch, layout="image")
+            best[patch] = min(best[patch], time.perf_counter() - start)
+    assert best[1, 1] < 1.5 * best[1, 640]
