@@ -130,6 +130,17 @@ def test_the_sides_of_an_image_are_found_near_the_limit():
     )
 
 
+@pytest.mark.parametrize("theta", [1.955, 2.0])
+def test_a_side_whose_ray_is_hard_to_find_is_not_beyond_the_lens(theta):
+    turn, terms = 26 * math.pi / 24, CALIBRATIONS["omnidir"].tangential[0]
+    turned = terms * math.cos(turn) + terms.flip(0) * double(1, -1) * math.sin(turn)
+    lens = CALIBRATIONS["omnidir"].replace(tangential=turned[None], center=double(700, 700)[None])
+    lens = lens.with_theta_max(None)
+    right = lens.project_rays(theta, 0.0)[0, 0].item()  # where the image ends
+    found = lens.side_angles((1400, right + 0.5))[0, 2].item()
+    assert found == pytest.approx(theta, abs=2e-3)  # the ray lands a little below the row
+
+
 def test_a_pixel_outside_the_circle_has_no_ray_and_no_gradient():
     lens = CALIBRATIONS["omnidir"]
     values = [lens.xi.clone().requires_grad_(), lens.tangential.clone().requires_grad_()]
