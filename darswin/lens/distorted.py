@@ -88,13 +88,13 @@ class DistortedLens(Lens):
 
     @property
     def theta_limit(self) -> Tensor:
-        lens = self.detach().to(torch.float64)  # near 90° tan θ has high powers that float32 lacks
-        end = lens._plane_limit()
-        limits = [rising_limit(lens._slope, end)]
+        # In the lens's own dtype: where the high powers of w overflow, it ends too.
+        end = self._plane_limit()
+        limits = [rising_limit(self._slope, end)]
         if not self.is_radial:
-            limits.append(rising_limit(lens._least_area, limits[0]))
+            limits.append(rising_limit(self._least_area, limits[0]))
         limit = limits[-1]
-        return torch.where(limit < end, limit - MARGIN, end).to(self.focal.dtype)
+        return torch.where(limit < end, limit - MARGIN, end)
 
     def project(self, theta: Number) -> Tensor:
         theta, focal = self._aligned(theta, "focal")

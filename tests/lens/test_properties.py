@@ -123,8 +123,12 @@ def test_a_batch_is_its_lenses_and_json_is_the_lens(lens):
         value, other = getattr(lens, name), getattr(joined, name)
         assert (value is None) == (other is None) and (value is None or torch.equal(value, other))
     for k in range(len(lens)):
-        read = from_dict(json.loads(json.dumps(to_dict(lens[k]))))
-        read = read.to(f64)  # JSON has no dtype: numbers are torch's default
+        described = json.loads(json.dumps(to_dict(lens[k])))
+        torch.set_default_dtype(f64)  # JSON has none
+        try:
+            read = from_dict(described)
+        finally:
+            torch.set_default_dtype(torch.float32)
         assert read._names() == lens._names()
         alone = lens[k].project_rays(theta[k : k + 1], 0.7, (480, 640))
         torch.testing.assert_close(alone, together[k : k + 1])
