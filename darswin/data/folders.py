@@ -32,6 +32,7 @@ OTHER_SUFFIXES = frozenset((
     ".gif", ".heic", ".heif", ".avif", ".jp2", ".j2k", ".jxl", ".psd", ".svg", ".tga", ".exr",
     ".hdr", ".dng", ".cr2", ".nef", ".arw",
 ))  # fmt: skip
+PICTURES = SUFFIXES | OTHER_SUFFIXES
 LOOKED_FOR = (
     "darswin looks for ROOT/CLASS/*.jpg (and png, bmp, webp, tif, ppm), or for folders of that "
     "kind in ROOT/train, ROOT/val and ROOT/test"
@@ -287,7 +288,7 @@ def _has_pictures(folder: Path) -> bool:
 
 
 def _is_picture(path: str | Path) -> bool:
-    return _suffix(path) in SUFFIXES | OTHER_SUFFIXES
+    return _suffix(path) in PICTURES
 
 
 def _suffix(path: str | Path) -> str:

@@ -65,7 +65,8 @@ def show(
     _check_fov(view, fov_deg)
     picture, orientation = read_oriented(image)
     size = picture.shape[:2]
-    lens = _load(calib, camera, theta_max_deg, stored_size(size, orientation), coefficients)
+    stored = stored_size(size, orientation)
+    _, lens = _read(calib, camera, theta_max_deg, stored, coefficients)
     lens = in_upright_picture(lens, size, orientation)
     sampler = PolarSample(rings, sectors, samples, spacing=spacing)
     across, down = _fields_of_view(lens, size)
@@ -106,8 +107,7 @@ def info(
         coefficients: what they are, in an OpenCV or ROS file that does not say it.
     """
     _check_partition(rings, sectors)
-    file = Calibration.read(calib, coefficients)
-    lens = _load(calib, camera, theta_max_deg, image_size, coefficients)
+    file, lens = _read(calib, camera, theta_max_deg, image_size, coefficients)
     if lens.image_size is None:
         raise ValueError(
             f"{calib} does not say how large its images are: give --image_size, their height and "
@@ -139,7 +139,7 @@ def convert(
         format: of the file; without it OpenCV for .xml, .yaml and .yml, but Kalibr where the name
             has "camchain" or "kalibr"; COLMAP for .txt; else darswin, whose JSON holds any lens.
     """
-    lens = _load(calib, camera, theta_max_deg, image_size, coefficients)
+    _, lens = _read(calib, camera, theta_max_deg, image_size, coefficients)
     note = ""
     if model is not None:
         lens, error = darswin.lens.fit(model, lens)
@@ -153,26 +153,21 @@ def convert(
     print(f"{out}: {written}, {type(lens).__name__} up to {degrees:.2f}°{note}")
 
 
-def _load(
+def _read(
     calib: str,
     camera: str | None,
     theta_max_deg: float | None,
     image_size: tuple[int, int] | None,
     coefficients: str | None,
-) -> Lens:
+) -> tuple[Calibration, Lens]:
     for side in image_size or ():
         _check("image_size", side, 1 <= side <= 10**6, "from 1 to 1000000 px")
     if theta_max_deg is not None:
         in_range = 0 < theta_max_deg <= 180
         _check("theta_max_deg", theta_max_deg, in_range, "above 0° and at most 180°")
-    return darswin.lens.load(
-        calib,
-        camera=camera,
-        theta_max=None if theta_max_deg is None else math.radians(theta_max_deg),
-        image_size=image_size,
-        model=coefficients,
-        dtype=torch.float64,
-    )
+    file = Calibration.read(calib, coefficients)
+    theta_max = None if theta_max_deg is None else math.radians(theta_max_deg)
+    return file, file.lens(camera, theta_max, image_size, torch.float64)
 
 
 def _check(name: str, value: float, ok: bool, range_: str) -> None:
