@@ -1,6 +1,7 @@
 """What several test files share."""
 
 from collections.abc import Callable, Sequence
+from pathlib import Path
 
 import torch
 from torch import Tensor
@@ -73,3 +74,13 @@ def assert_equals_reference(
         expected = with_gradients(operator, inputs)
     for got, want in zip(ours, expected, strict=True):
         torch.testing.assert_close(got, want, rtol=rtol, atol=atol)
+
+
+CALIBRATIONS = Path(__file__).parent / "lens" / "files"
+
+
+def changed(name: str, old: str, new: str) -> str:
+    """The text of an example calibration with something replaced, which must be there."""
+    text = CALIBRATIONS.joinpath(name).read_text()
+    assert old in text
+    return text.replace(old, new)

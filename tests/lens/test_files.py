@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from helpers import changed
 
 from darswin import lens as lenses
 from darswin.lens import MODELS, load, load_all, save
@@ -524,12 +525,6 @@ def test_our_own_json_may_say_a_field_of_view():
 
 
 # -- files that are wrong -----------------------------------------------------------------------
-
-
-def changed(name, old, new):
-    text = FILES.joinpath(name).read_text()
-    assert old in text
-    return text.replace(old, new)
 
 
 @pytest.mark.parametrize(
