@@ -36,8 +36,8 @@ $(LOWEST)/installed: pyproject.toml requirements.txt tests/lowest.py
 
 test-lowest: build $(LOWEST)/installed  ## the commands, files, pictures and ONNX with the oldest libraries allowed
 	PYTHONPATH=$(CURDIR) $(LOWEST)/bin/python -m pytest -q tests/data tests/models/test_saving.py \
-	  tests/test_predict.py tests/test_plot.py tests/test_views.py tests/lens/test_cli.py \
-	  tests/train/test_cli.py tests/test_export.py -k "not program and not package"
+	  tests/cli tests/viz \
+	  tests/deploy/test_export.py -k "not program and not package"
 
 test-isa: build  ## the operators' tests on every instruction-set tier of this machine
 	@set -e; for tier in $$($(BIN)/python -c 'from darswin import _C; print(*_C.tiers())'); do \

@@ -3,10 +3,11 @@
 from importlib.metadata import version
 
 from darswin import compat, lens, models, ops
-from darswin.grid import PolarGrid, polar_grid
-from darswin.layers import PolarSample, PolarWindowAttention
+from darswin.deploy.optimize import optimize
+from darswin.layers.attention import PolarWindowAttention
+from darswin.layers.grid import PolarGrid, polar_grid
+from darswin.layers.sampling import PolarSample
 from darswin.models import DarSwin, create_model, list_models
-from darswin.optimized import optimize
 
 __version__ = version("darswin")
 

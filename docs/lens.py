@@ -13,10 +13,10 @@ import torch
 from PIL import Image
 
 from darswin import PolarSample
-from darswin.files import replace_file
 from darswin.lens import Polynomial
-from darswin.plot import draw_lens
-from darswin.views import perspective
+from darswin.utils.files import replace_file
+from darswin.viz.plot import draw_lens
+from darswin.viz.views import perspective
 
 SIZE = (966, 1280)
 HALF = np.array([2.0, 1.2, 2.5])  # the box around the camera, m

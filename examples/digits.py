@@ -28,7 +28,7 @@ from tqdm import tqdm
 from darswin import create_model, lens
 from darswin.data import LEVELS, warp_map
 from darswin.models import DarSwin
-from darswin.plot import draw_accuracy, draw_grid
+from darswin.viz.plot import draw_accuracy, draw_grid
 
 FOV = math.radians(165)
 SIZE = 32  # px, of the wide-angle images

@@ -34,10 +34,10 @@ from torch import Tensor
 from tqdm import tqdm
 
 from darswin.data import open_source, warp_map
-from darswin.files import replace_file
 from darswin.lens import Lens, Perspective, Spherical
 from darswin.models import DarSwin
 from darswin.models.saving import load_model, model_of_run
+from darswin.utils.files import replace_file
 
 HERE = Path(__file__).parent
 FOV, SIZE, RENDER = math.radians(165), 32, 96  # rad; px, of the images and what they come from
@@ -271,7 +271,7 @@ def run_camera(problem: str, camera: int, out: Path, data: str) -> dict:
 
 def pretrain(out: Path, options: list[str]) -> None:
     """The classifier of all lenses, and what its first map usually is."""
-    from darswin.__main__ import main as darswin
+    from darswin.cli.main import main as darswin
 
     with (
         (out / "log.txt").open("a") as log,

@@ -10,8 +10,8 @@ from learned_lens import GRID, IMAGES, LOSSES, PROBLEMS, STARTS
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from darswin.files import replace_file
-from darswin.plot import save_figure
+from darswin.utils.files import replace_file
+from darswin.viz.plot import save_figure
 
 CLOSE = 0.5  # px, a lens that is found
 CLOSE_XI = 0.05

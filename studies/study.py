@@ -32,8 +32,8 @@ def run_cell(cell: Cell, out: Path, size: str, test_images: int, options: list[s
         if result["given"] != given:
             raise ValueError(f"{found} was made with {result['given']}, not {given}: remove it")
         return result
-    from darswin.__main__ import main  # here, so that a new process sets its threads first
-    from darswin.files import replace_file
+    from darswin.cli.main import main
+    from darswin.utils.files import replace_file
 
     run = ["--run", str(folder)]
     name = f"{cell.family}_{size}"

@@ -11,8 +11,8 @@ from cells import ABLATIONS, LEVELS, MODELS, POLYNOMIAL, SWEEP
 from matplotlib.figure import Figure
 
 from darswin.data.lenses import LEVELS as RANGES
-from darswin.files import replace_file
-from darswin.plot import save_figure
+from darswin.utils.files import replace_file
+from darswin.viz.plot import save_figure
 
 # The paper's tables (DarSwin, ICCV 2023), by the training level.
 PAPER_04 = {

@@ -9,13 +9,13 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from darswin.bench.timing import COMPILED, ONE_LENS, OURS, PRODUCTS, REFERENCE
+from darswin.deploy.optimize import optimize
+from darswin.layers.linear import Linear
+from darswin.layers.onednn import PackedLinear
 from darswin.lens import Lens, Spherical
-from darswin.linear import Linear
 from darswin.models import DarSwin, create_model
 from darswin.models.encoder import Encoder
-from darswin.onednn import PackedLinear
 from darswin.ops import use_reference
-from darswin.optimized import optimize
 
 Run = Callable[[], Tensor]
 CLASSES = 200

@@ -2,11 +2,11 @@
 
 import platform
 import subprocess
+from importlib.metadata import version
 from pathlib import Path
 
 import torch
 
-import darswin
 from darswin import _C
 
 THREADS = sorted({1, torch.get_num_threads()})
@@ -21,7 +21,7 @@ def machine() -> dict[str, str | int]:
         compiler=_C.build_info()["compiler"],
         python=platform.python_version(),
         torch=torch.__version__,
-        darswin=darswin.__version__,
+        darswin=version("darswin"),
         commit=_commit(),
     )
 
@@ -36,7 +36,7 @@ def _cpu() -> str:
 
 
 def _commit() -> str:
-    root = Path(darswin.__file__).parent.parent
+    root = Path(__file__).parent.parent.parent
     if not (root / ".git").exists():
         return ""
     return subprocess.run(

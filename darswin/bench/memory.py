@@ -10,7 +10,7 @@ import torch
 
 from darswin.bench import candidates
 from darswin.bench.timing import REFERENCE
-from darswin.malloc import give_back_memory
+from darswin.utils.malloc import give_back_memory
 
 _STATUS, _RESET = Path("/proc/self/status"), Path("/proc/self/clear_refs")
 

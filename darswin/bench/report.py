@@ -7,7 +7,7 @@ from pathlib import Path
 
 from darswin.bench.memory import Memory
 from darswin.bench.timing import COMPILED, ONE_LENS, OURS, PRODUCTS, REFERENCE, Timing
-from darswin.files import replace_file
+from darswin.utils.files import replace_file
 
 # Of darswin_a_small on 64×64: the least that a peer's time over ours should be, at all threads.
 BARS = {
@@ -30,7 +30,7 @@ class Record:
     Args:
         machine: see `machine`. model, size: of the network and of its images, px.
         operations: of the products of one image, by name of the dtype.
-        products: of `darswin.linear.choices`, as rows.
+        products: of `darswin.layers.linear.choices`, as rows.
     """
 
     machine: dict
@@ -165,7 +165,7 @@ def plot(record: Record, path: Path) -> None:
     """Draws images a second of all candidates at all threads, a group of bars a case."""
     from matplotlib.figure import Figure  # which not everybody has
 
-    from darswin.plot import save_figure
+    from darswin.viz.plot import save_figure
 
     threads = max(t.threads for t in record.timings)
     rows = [t for t in record.timings if t.threads == threads]

@@ -5,13 +5,13 @@ import numpy as np
 import torch
 
 from darswin.lens import Lens
-from darswin.reprojection import reprojection
+from darswin.lens.reprojection import reprojection
 
 
 def warp_map(
     source: Lens, source_size: tuple[int, int], target: Lens, size: tuple[int, int]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """`darswin.reprojection` in double precision, as the maps of `cv2.remap`.
+    """`darswin.lens.reprojection` in double precision, as the maps of `cv2.remap`.
 
     Returns:
         x and y, (N, H, W) float32 each; outside the image where a ray is beyond either θ_max.

@@ -12,8 +12,9 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 from darswin.data.lenses import Lenses
-from darswin.data.sources import BrokenImageError, Source
+from darswin.data.sources import Source
 from darswin.lens import Lens, Perspective
+from darswin.utils.image import BrokenImageError
 
 # Per-channel statistics of ImageNet, in [0, 1].
 IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
@@ -159,7 +160,7 @@ class WideAngle(Dataset):
         return image.reshape(self.size, self.size, -1)
 
     def _pixels(self, lens: Lens, side: int) -> np.ndarray:
-        """`darswin.reprojection` of a centred lens: (render, render, 2), x and y in the picture.
+        """`darswin.lens.reprojection` of a centred lens: (render, render, 2), x and y, px.
 
         An image has an eighth as many radii as pixels, and only radii need the lens's curve.
         """

@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.utils import _pytree as pytree
 from torch.utils.data._utils.collate import default_collate_fn_map
 
-from darswin.inverse import inverse
+from darswin.lens.inverse import inverse
 
 Number = float | Sequence[float] | Tensor
 
@@ -528,7 +528,7 @@ def _size(size: tuple[int, int]) -> tuple[int, int]:
 
 
 def _collate(batch, *, collate_fn_map=None) -> Lens:
-    from darswin.lens.curves import stack  # curves are lenses
+    from darswin.lens.curves import stack
 
     return stack(batch)
 

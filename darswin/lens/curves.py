@@ -5,8 +5,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from darswin.inverse import inverse
 from darswin.lens.base import FRAME, Lens, Number
+from darswin.lens.inverse import inverse
 
 
 class Tabulated(Lens):

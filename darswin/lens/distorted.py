@@ -10,8 +10,8 @@ import math
 import torch
 from torch import Tensor
 
-from darswin.inverse import Function, rising_limit
 from darswin.lens.base import MARGIN, Lens, Number, length_of
+from darswin.lens.inverse import Function, rising_limit
 from darswin.lens.polynomial import horner, slopes
 from darswin.lens.sphere import sphere_angle, sphere_limit
 

@@ -4,19 +4,7 @@ A calibration is of pixels as the camera stores them; pictures are read upright.
 """
 
 from darswin.lens.base import Lens
-
-# EXIF's orientations: how a picture as stored becomes upright. x and y are swapped, then x runs the
-# other way, then y.
-TURNS = {
-    1: (False, False, False),
-    2: (False, True, False),
-    3: (False, True, True),
-    4: (False, False, True),
-    5: (True, False, False),
-    6: (True, True, False),
-    7: (True, True, True),
-    8: (True, False, True),
-}
+from darswin.utils.exif import TURNS
 
 
 def stored_size(size: tuple[int, int], orientation: int) -> tuple[int, int]:

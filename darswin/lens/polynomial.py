@@ -5,8 +5,8 @@ import math
 import torch
 from torch import Tensor
 
-from darswin.inverse import inverse, rising_limit
 from darswin.lens.base import MARGIN, Lens, Number
+from darswin.lens.inverse import inverse, rising_limit
 
 
 def horner(x: Tensor, coefficients: Tensor) -> Tensor:

@@ -5,15 +5,11 @@ from typing import Literal
 
 from torch import Tensor
 
-from darswin.grid import Placement, PolarGrid, Spacing, polar_grid
-from darswin.layers import (
-    PolarPatchEmbed,
-    PolarWindowAttention,
-    PositionBias,
-    check_images,
-    check_lens,
-    radial_positions,
-)
+from darswin.layers.attention import PolarWindowAttention
+from darswin.layers.embed import PolarPatchEmbed
+from darswin.layers.grid import Placement, PolarGrid, Spacing, polar_grid
+from darswin.layers.position_bias import PositionBias, radial_positions
+from darswin.layers.sampling import check_images, check_lens
 from darswin.lens import Lens
 from darswin.models import official
 from darswin.models.encoder import Encoder
@@ -35,7 +31,7 @@ class DarSwin(Encoder):
         window: (M_r, M_φ) where the map is large enough; None means (1, 16) for A, (4, 4) for RA.
         merges: (m_r, m_φ) before each stage but the first; None means (1, 4) for A, (2, 2) for RA.
         mlp_ratio: hidden width of the MLPs over D. drop_path_rate: of the last block; linear.
-        spacing, sample_spacing, placement: as `darswin.grid.polar_grid`. "radius" for both is a
+        spacing, sample_spacing, placement: as `darswin.polar_grid`. "radius" for both is a
             model without lens knowledge, "radius" for the samples alone samples uniformly.
         jitter: in [0, 1], of the sample points in training; 0 is off.
         position_bias: "angular_relative", or the ablations "angular" and "polar" with `harmonics`.

@@ -6,8 +6,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from darswin.layers import PatchProjection, RelativeTable, WindowAttention, check_heads
-from darswin.linear import Linear
+from darswin.layers.attention import WindowAttention, check_heads
+from darswin.layers.embed import PatchProjection
+from darswin.layers.linear import Linear
+from darswin.layers.position_bias import RelativeTable
 from darswin.models.encoder import ImageEncoder
 from darswin.models.stages import Pair, StagePlan
 

@@ -4,9 +4,11 @@ from collections.abc import Sequence
 
 from torch import Tensor, nn
 
-from darswin.layers import Block, Mlp, PatchProjection, Pixels, WindowAttention
+from darswin.layers.attention import WindowAttention
+from darswin.layers.block import Block, Mlp
+from darswin.layers.embed import PatchProjection, Pixels
+from darswin.layers.linear import PRODUCTS, Linear, Products
 from darswin.lens import Lens
-from darswin.linear import PRODUCTS, Linear, Products
 from darswin.models.stages import Pair, check_depths, make_stages, plan_stages
 
 

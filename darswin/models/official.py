@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from darswin.grid import PolarGrid, check_tan
+from darswin.layers.grid import PolarGrid, check_tan
 from darswin.lens import Lens, Number, Spherical
 
 if TYPE_CHECKING:

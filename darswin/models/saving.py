@@ -11,8 +11,8 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor, nn
 
-from darswin.files import replace_file
 from darswin.models.registry import create_model
+from darswin.utils.files import replace_file
 
 _ENTRY = "darswin"  # of the metadata
 

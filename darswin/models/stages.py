@@ -6,7 +6,7 @@ from typing import Literal
 
 from torch import Tensor, nn
 
-from darswin.layers import Block, PatchMerging
+from darswin.layers.block import Block, PatchMerging
 from darswin.ops.checks import check_pair
 
 Pair = tuple[int, int]

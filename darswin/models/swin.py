@@ -5,11 +5,12 @@ from collections.abc import Sequence
 
 from torch import Tensor
 
-from darswin.layers import WindowAttention, check_lens
+from darswin.layers.attention import WindowAttention
+from darswin.layers.sampling import check_lens
 from darswin.lens import Lens
+from darswin.lens.reprojection import perspective_view, reproject
 from darswin.models.encoder import ImageEncoder
 from darswin.models.stages import Pair
-from darswin.reprojection import perspective_view, reproject
 
 
 class Swin(ImageEncoder):

@@ -9,9 +9,9 @@ from lightning.pytorch import LightningModule, Trainer
 from lightning.pytorch.callbacks import ModelCheckpoint
 from lightning.pytorch.plugins.io import TorchCheckpointIO
 
-from darswin.compat.checkpoint import read_pickle
-from darswin.files import replace_file
 from darswin.models.saving import ModelCard, save_model
+from darswin.utils.files import replace_file
+from darswin.utils.unpickle import read_pickle
 
 
 class RunCheckpoint(ModelCheckpoint):

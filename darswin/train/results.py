@@ -10,8 +10,8 @@ from lightning.pytorch.utilities import rank_zero_only
 from matplotlib.figure import Figure
 
 from darswin.data.lenses import SphericalLenses, parse_lenses
-from darswin.files import replace_file
-from darswin.plot import draw_accuracy, save_figure
+from darswin.utils.files import replace_file
+from darswin.viz.plot import draw_accuracy, save_figure
 
 
 class WriteResults(Callback):

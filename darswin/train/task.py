@@ -13,8 +13,8 @@ from torchmetrics import MeanMetric, Metric
 from torchmetrics.classification import MulticlassAccuracy
 
 from darswin.data.mixing import Mixing
+from darswin.layers.linear import Products
 from darswin.lens import Lens
-from darswin.linear import Products
 from darswin.models.encoder import ImageEncoder
 from darswin.models.registry import model_class
 from darswin.models.saving import ModelCard

@@ -9,14 +9,8 @@ import pytest
 from PIL import ExifTags, Image, ImageOps
 
 from darswin.data import SphericalLenses, WideAngle
-from darswin.data.sources import (
-    BrokenImageError,
-    Part,
-    open_source,
-    read_idx,
-    read_image,
-    read_oriented,
-)
+from darswin.data.sources import Part, open_source, read_idx
+from darswin.utils.image import BrokenImageError, read_image, read_oriented
 
 
 def write_pictures(root, classes=("cat", "dog"), count=10, size=(6, 8)):

@@ -7,10 +7,11 @@ import torch
 from torch.utils.data import DataLoader
 
 from darswin.data import PolynomialLenses, SphericalLenses, WideAngle, warp
-from darswin.data.sources import Arrays, BrokenImageError, ImageFiles
+from darswin.data.sources import Arrays, ImageFiles
 from darswin.data.wide_angle import IMAGENET_MEAN, IMAGENET_STD, PAPER_FOV, Draw
 from darswin.lens import Perspective, Spherical
-from darswin.reprojection import reprojection
+from darswin.lens.reprojection import reprojection
+from darswin.utils.image import BrokenImageError
 
 
 def smooth(size=384):

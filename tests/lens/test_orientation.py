@@ -7,16 +7,8 @@ import torch
 from hypothesis import given
 from PIL import ExifTags, Image, ImageOps
 
-from darswin.lens import (
-    MODELS,
-    BrownConrady,
-    Equidistant,
-    Fisheye624,
-    KannalaBrandt,
-    Mei,
-    cli,
-    save,
-)
+from darswin.cli import lens as cli
+from darswin.lens import MODELS, BrownConrady, Equidistant, Fisheye624, KannalaBrandt, Mei, save
 from darswin.lens.base import Lens
 from darswin.lens.distorted import DistortedLens
 from darswin.lens.orientation import in_upright_picture, stored_size, turned

@@ -7,7 +7,7 @@ import hypothesis
 import hypothesis.strategies as st
 import torch
 
-from darswin.grid import PLACEMENTS, SPACINGS, polar_grid
+from darswin.layers.grid import PLACEMENTS, SPACINGS, polar_grid
 from darswin.lens import MODELS, from_dict, stack, to_dict
 from darswin.lens.base import ROW_DIMS
 

@@ -11,10 +11,10 @@ import pytest
 import torch
 from helpers import changed
 
-from darswin.__main__ import main
+from darswin.cli.main import main
+from darswin.cli.predict import read_lens
 from darswin.lens import EnhancedUnified, load, load_all
 from darswin.lens.files import loads
-from darswin.predict import read_lens
 
 FILES = Path(__file__).parent / "files"
 f64 = torch.float64

@@ -11,7 +11,7 @@ import torch
 import yaml
 from hypothesis import strategies as st
 
-from darswin.__main__ import main
+from darswin.cli.main import main
 from darswin.lens import MODELS, Spherical, load, load_all, save
 
 FILES = Path(__file__).parent / "files"

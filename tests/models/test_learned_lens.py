@@ -8,7 +8,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from darswin import create_model
-from darswin.grid import PolarGrid
+from darswin.layers.grid import PolarGrid
 from darswin.lens import KannalaBrandt, Lens, Mei, Spherical
 
 f64 = torch.float64

@@ -5,8 +5,8 @@ import torch
 
 from darswin import create_model
 from darswin.lens import Perspective, Polynomial, Spherical
+from darswin.lens.reprojection import reproject
 from darswin.ops import use_reference
-from darswin.reprojection import reproject
 
 LENS = Spherical.from_fov([0.2, 0.9], 2.0, 16.0)
 

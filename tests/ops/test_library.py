@@ -6,7 +6,7 @@ import torch
 from torch.autograd import forward_ad
 from torch.func import vmap
 
-from darswin.layers import PolarSample
+from darswin.layers.sampling import PolarSample
 from darswin.ops import polar_embed, polar_sample, use_reference, window_attention
 from darswin.ops.add_norm import add_norm_
 from darswin.ops.transpose_sum import transpose_sum

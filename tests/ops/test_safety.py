@@ -11,7 +11,7 @@ import torch
 from helpers import with_gradients
 
 from darswin import create_model
-from darswin.layers import PolarSample
+from darswin.layers.sampling import PolarSample
 from darswin.lens import Spherical
 from darswin.ops import polar_embed, polar_sample, use_reference, window_attention
 
@@ -133,7 +133,7 @@ def test_windows_without_tables_read_nothing_past_their_biases():
 
 LACKING_MEMORY = """
     import resource, torch
-    from darswin.malloc import give_back_memory
+    from darswin.utils.malloc import give_back_memory
     from darswin.ops import polar_sample
     torch.set_num_threads(2)
     image = torch.rand(2, 1, 9, 9)

@@ -16,11 +16,11 @@ import pytest
 import torch
 import yaml
 
-from darswin.__main__ import main
-from darswin.files import locked
+from darswin.cli.main import main
 from darswin.train.recipe import learning_rate
 from darswin.train.resuming import CHANGEABLE, check_changes
 from darswin.train.task import Classification
+from darswin.utils.files import locked
 
 # 12 batches an epoch, in steps of 5, 5 and 2.
 TINY = """

@@ -1,0 +1,321 @@
+"""`darswin fit`, `validate` and `test`: Lightning's command line, with a folder for each run.
+
+A run's folder holds everything of it: `config.yaml`, `checkpoints/{last,best}.{ckpt,safetensors}`,
+the logs `csv/` and `tensorboard/`, and `test.{csv,json,png}`.
+"""
+
+import argparse
+import contextlib
+import re
+import shlex
+import sys
+import warnings
+from pathlib import Path
+
+import torch
+import yaml
+from lightning.pytorch import Callback, LightningModule, Trainer
+from lightning.pytorch.callbacks import ProgressBar, TQDMProgressBar
+from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
+from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
+from lightning.pytorch.utilities import rank_zero_only
+from lightning.pytorch.utilities.exceptions import MisconfigurationException
+
+from darswin.data.lenses import parse_sweep
+from darswin.models.saving import model_of_run
+from darswin.train.checkpoints import RunCheckpoint, SafeCheckpointIO
+from darswin.train.data import WideAngleData
+from darswin.train.results import WriteResults
+from darswin.train.resuming import check_changes
+from darswin.train.stopping import StopSignals, StopWhenTold
+from darswin.train.task import Classification
+from darswin.utils.files import locked, remove_partial_files, replace_file
+
+PRESETS = Path(__file__).parent.parent / "train" / "presets"
+
+
+def run_command(argv: list[str]) -> None:
+    """Runs `fit`, `validate` or `test`, the first of `argv`, with the others as its options."""
+    # The arguments are the command line's own, with the run's configuration added.
+    warnings.filterwarnings("ignore", "LightningCLI's args parameter")
+    warnings.filterwarnings("ignore", r".*isinstance\(treespec, LeafSpec\)")  # Lightning's own
+    warnings.filterwarnings("ignore", "Checkpoint directory .* exists and is not empty")
+    warnings.filterwarnings("ignore", "The number of training batches .* is smaller than the log")
+    with StopSignals() as signals:
+        try:
+            _run(argv, signals)
+        except MisconfigurationException as error:
+            raise ValueError(str(error)) from error
+        except (KeyboardInterrupt, SystemExit):
+            if signals.number is None:
+                raise
+            # Another process of the run must not end with an error: Lightning kills the first then.
+            raise SystemExit(0 if rank_zero_only.rank else 128 + signals.number) from None
+        except (MemoryError, RuntimeError) as error:
+            if not _lacks_memory(error):
+                raise
+            raise MemoryError(
+                "not enough memory: a smaller --data.batch_size or --model.name, or "
+                f"--model.recompute true, needs less ({str(error).strip().splitlines()[-1]})"
+            ) from error
+
+
+def _lacks_memory(error: Exception) -> bool:
+    # Torch has a class for it on GPUs alone; a killed worker process is the system's own remedy.
+    said = re.search("can't allocate memory|DataLoader worker .*: Killed", str(error))
+    return isinstance(error, MemoryError | torch.OutOfMemoryError) or said is not None
+
+
+def _run(argv: list[str], signals: StopSignals) -> None:
+    RunCLI(
+        signals,
+        model_class=Classification,
+        datamodule_class=WideAngleData,
+        args=with_configs(argv),
+        seed_everything_default=0,
+        auto_configure_optimizers=False,
+        save_config_callback=None,
+        trainer_defaults=dict(
+            accelerator="auto",
+            use_distributed_sampler=False,
+            num_sanity_val_steps=0,
+        ),
+        parser_class=RunParser,
+        parser_kwargs=dict(
+            prog="darswin", description="Trains and tests models on wide-angle images."
+        ),
+    )
+
+
+def with_configs(argv: list[str]) -> list[str]:
+    """The arguments with presets' names as their files, and a run's own configuration first.
+
+    `test`, `validate` and `fit --resume` start from `RUN/config.yaml`, so that they need no other
+    option.
+
+    Raises:
+        ValueError: an unknown preset. FileExistsError, FileNotFoundError: a run, or none, in RUN.
+    """
+    scan = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    scan.add_argument("-c", "--config", action="append", default=[])
+    scan.add_argument("--run")
+    scan.add_argument("--resume", action="store_true")
+    known, others = scan.parse_known_args(argv[1:])
+    configs = [_config_file(name) for name in known.config]
+    if known.run:
+        others += ["--run", known.run]
+        own = Path(known.run) / "config.yaml"
+        if argv[0] == "fit" and not known.resume:
+            _check_free(Path(known.run))
+        elif own.exists():
+            configs.insert(0, str(own))
+        elif _last(Path(known.run)).exists() if argv[0] == "fit" else not configs:
+            raise FileNotFoundError(f"there is no run in {known.run}: it has no config.yaml")
+    if known.resume:
+        others.append("--resume=true")
+    return [argv[0], *(f"--config={config}" for config in configs), *others]
+
+
+def _last(folder: Path) -> Path:
+    return folder / "checkpoints" / "last.ckpt"
+
+
+def _check_free(folder: Path) -> None:
+    if _last(folder).exists():
+        raise FileExistsError(
+            f"{folder} holds a run already: go on with --resume, or choose another one"
+        )
+
+
+def _config_file(name: str) -> str:
+    preset = PRESETS / f"{name}.yaml"
+    if Path(name).exists():
+        return name
+    if not preset.exists():
+        presets = ", ".join(sorted(path.stem for path in PRESETS.glob("*.yaml")))
+        raise ValueError(f"there is no file {name} and no such preset; the presets are {presets}")
+    return str(preset)
+
+
+class RunParser(LightningArgumentParser):
+    """Names options in its errors as people type them."""
+
+    def error(self, message: str, *rest) -> None:
+        message = re.sub(r'Parser key "([\w.]+)":', r"--\1:", message)
+        message = re.sub(
+            r"Subcommand '\w+' does not accept option '", "there is no option '--", message
+        )
+        if "arguments are required" in message:
+            message = re.sub(r"\b(fit|validate|test)\.", "--", message)
+        super().error(" ".join(message.split()), *rest)
+
+    def print_usage(self, *arguments) -> None:
+        """Nothing before an error: there are 150 options, and `--help` lists them."""
+
+
+class RunCLI(LightningCLI):
+    """Lightning's command line with `--run`, `--resume` and `--xi`."""
+
+    def __init__(self, signals: StopSignals, **options):
+        self.signals = signals
+        super().__init__(**options)
+
+    @staticmethod
+    def subcommands() -> dict[str, set[str]]:
+        commands = LightningCLI.subcommands()
+        return {name: commands[name] for name in ("fit", "validate", "test")}
+
+    def add_arguments_to_parser(self, parser: LightningArgumentParser) -> None:
+        parser.add_argument("--run", type=str, required=True, help="the folder of the run")
+        parser.add_argument(
+            "--resume", type=bool, default=False, help="fit: goes on from the run's last checkpoint"
+        )
+        parser.add_argument(
+            "--checkpoint_steps", type=int, default=200, help="fit: steps between checkpoints"
+        )
+        parser.add_argument(
+            "--xi", type=str, help="test: the same as --data.test_lenses, e.g. 0:1:0.1 for every ξ"
+        )
+        parser.add_argument("--devices", type=int, help="the same as --trainer.devices")
+        parser.link_arguments("seed_everything", "data.seed", compute_fn=int)
+        parser.link_arguments("seed_everything", "model.seed", compute_fn=int)
+
+    def _parse_ckpt_path(self) -> None:
+        """Lightning looks for options in checkpoints here; a run has them in its folder."""
+
+    def before_instantiate_classes(self) -> None:
+        config = self.config[self.subcommand]
+        self.folder = Path(config.run)
+        config.trainer.default_root_dir = str(self.folder)
+        for name in ("path", "classes", "splits"):  # so that the run works from anywhere
+            if config.data[name] and Path(config.data[name]).exists():
+                config.data[name] = str(Path(config.data[name]).resolve())
+        if config.xi is not None:
+            config.data.test_lenses = parse_sweep(config.xi)
+        if config.devices is not None:
+            config.trainer.devices = config.devices
+        if config.trainer.overfit_batches:
+            raise ValueError("--trainer.overfit_batches shuffles otherwise: take --data.limit")
+        if config.checkpoint_steps < 1:
+            raise ValueError(
+                f"--checkpoint_steps must be at least 1, got {config.checkpoint_steps}"
+            )
+        if self.subcommand != "fit":
+            config.ckpt_path = config.ckpt_path or str(model_of_run(self.folder, ".ckpt"))
+            return
+        self.record = self._recorded(config)
+        if config.resume and _last(self.folder).exists():
+            before = yaml.safe_load((self.folder / "config.yaml").read_text())
+            for change in check_changes(before, yaml.safe_load(self.record)):
+                _say(change)
+
+    def _recorded(self, config) -> str:
+        """What config.yaml says: all but the options of this call alone."""
+        config = config.clone()
+        for name in ("config", "resume", "xi", "devices", "ckpt_path", "trainer.default_root_dir"):
+            config.pop(name, None)
+        return self._parser("fit").dump(config, skip_none=False)
+
+    def instantiate_trainer(self, **kwargs) -> Trainer:
+        config = self.config_init[self.subcommand]
+        given = config.trainer
+        kwargs["plugins"] = [SafeCheckpointIO(), *(given.plugins or [])]
+        if given.logger is None:
+            kwargs["logger"] = False  # a run's own begin with it
+        callbacks = list(given.callbacks or [])
+        if given.enable_progress_bar and not any(isinstance(c, ProgressBar) for c in callbacks):
+            callbacks.append(RunProgressBar())
+        if self.subcommand == "fit":
+            loggers = self._loggers() if given.logger is None else []
+            callbacks.insert(0, BeginRun(self.folder, self.record, loggers))
+        kwargs["callbacks"] = [*callbacks, *self._callbacks(config.checkpoint_steps)]
+        return super().instantiate_trainer(**kwargs)
+
+    def _run_subcommand(self, subcommand: str) -> None:
+        super()._run_subcommand(subcommand)
+        if broken := self.datamodule.broken():
+            print(f"{broken} pictures could not be read and were left out")
+
+    def fit(self, **options) -> None:
+        """Trains, alone in the run's folder; called by Lightning."""
+        lock = self.folder / ".lock"
+        try:
+            with locked(lock) if self.trainer.is_global_zero else contextlib.nullcontext():
+                self.trainer.fit(**options | {"ckpt_path": self._start()})
+        except BlockingIOError:
+            raise FileExistsError(f"another `darswin fit` is at work in {self.folder}") from None
+        except (KeyboardInterrupt, SystemExit):
+            if (self.folder / "config.yaml").exists():
+                again = f"darswin fit --run {shlex.quote(str(self.folder))} --resume"
+                step = self.trainer.global_step
+                _say(f"stopped at step {step}: `{again}` goes on from the last checkpoint")
+            raise
+
+    def _start(self) -> str | None:
+        """The checkpoint to start from."""
+        config, last = self.config_init["fit"], _last(self.folder)
+        if not config.resume:
+            _check_free(self.folder)
+        elif last.exists():
+            return config.ckpt_path or str(last)
+        else:
+            _say(f"{last} is not there yet: starting from the beginning")
+        return config.ckpt_path
+
+    def _loggers(self) -> list:
+        return [
+            # A new version each time: nothing is overwritten.
+            CSVLogger(self.folder, name="csv", flush_logs_every_n_steps=1),
+            TensorBoardLogger(self.folder, name="", version="tensorboard"),
+        ]
+
+    def _callbacks(self, steps: int) -> list:
+        if self.subcommand != "fit":
+            return [WriteResults(self.folder)] if self.subcommand == "test" else []
+        kept = dict(dirpath=self.folder / "checkpoints", enable_version_counter=False)
+        return [
+            StopWhenTold(self.signals, _last(self.folder)),
+            RunCheckpoint(
+                filename="best",
+                monitor="val/top1",
+                mode="max",
+                save_on_train_epoch_end=False,
+                **kept,
+            ),
+            RunCheckpoint(filename="last", every_n_train_steps=steps, **kept),
+            RunCheckpoint(filename="last", save_on_train_epoch_end=True, **kept),
+        ]
+
+
+class BeginRun(Callback):
+    """Writes into a run's folder what it is, once nothing can refuse it any more.
+
+    Lightning would have its loggers write before the checkpoint is checked.
+    """
+
+    def __init__(self, folder: Path, config: str, loggers: list):
+        self.folder, self.config, self.loggers = folder, config, loggers
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        # A short epoch has its line in the logs, too.
+        trainer.log_every_n_steps = min(trainer.log_every_n_steps, pl_module.steps_per_epoch)
+        if trainer.fast_dev_run:
+            return
+        if trainer.is_global_zero:
+            remove_partial_files(self.folder)
+            replace_file(self.folder / "config.yaml", self.config)
+        trainer.loggers = trainer.loggers or self.loggers
+
+
+class RunProgressBar(TQDMProgressBar):
+    """Lightning's, without the last letters of the logs' folder."""
+
+    def get_metrics(self, trainer: Trainer, pl_module: LightningModule) -> dict:
+        shown = super().get_metrics(trainer, pl_module)
+        shown.pop("v_num", None)
+        return shown
+
+
+@rank_zero_only
+def _say(text: str) -> None:
+    print(text, file=sys.stderr)

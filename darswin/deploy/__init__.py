@@ -1,0 +1,1 @@
+"""Models for inference: made faster, and exported as graphs."""

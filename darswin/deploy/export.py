@@ -1,0 +1,108 @@
+"""Models as graphs of tensors, lens included: for AOTInductor, ONNX, and processes without us."""
+
+import os
+
+import torch
+from torch import Tensor, nn
+from torch.export import ExportedProgram
+from torch.nn.attention import SDPBackend, sdpa_kernel
+from torch.utils import _pytree as pytree
+
+from darswin.lens import Lens
+from darswin.ops import use_reference
+from darswin.utils.extras import lack
+
+
+class _OfTensors(nn.Module):
+    """A model that takes its lens as tensors, by name; what is not given is the lens's own.
+
+    Args:
+        any_strides: reads its inputs by the strides they come with, whatever the example's were.
+    """
+
+    def __init__(self, model: nn.Module, lens: Lens | None, any_strides: bool):
+        super().__init__()
+        self.model, self.lens, self.any_strides = model, lens, any_strides
+
+    def forward(self, images: Tensor, **tensors: Tensor) -> Tensor:
+        if self.any_strides:
+            images = _in_order(images)
+            tensors = {name: _in_order(tensor) for name, tensor in tensors.items()}
+        return self.model(images, None if self.lens is None else self.lens.replace(**tensors))
+
+
+def _in_order(tensor: Tensor) -> Tensor:
+    """A contiguous copy, made by an operator that AOTInductor calls with the tensor itself.
+
+    Kernels that it writes take the example's strides for granted, and it drops a `clone` of what is
+    contiguous in the example. `masked_scatter` it leaves to torch, on the CPU.
+    """
+    copy = torch.empty_like(tensor, memory_format=torch.contiguous_format)
+    return copy.masked_scatter(torch.ones((), dtype=torch.bool, device=tensor.device), tensor)
+
+
+def export_program(
+    model: nn.Module, images: Tensor, lens: Lens | None = None, *, fixed_lens: bool = False
+) -> ExportedProgram:
+    """The graph of `model(images, lens)` for any batch size, with plain tensors as its inputs.
+
+    A package that AOTInductor makes of it for CPUs takes them expanded, cropped or transposed too.
+    They are `images` and, by name, the tensors of the lens, one row an image: of a `Spherical` lens
+    `program.module()(images, xi=xi, focal=focal, theta_max=theta_max)`, and `center` if it has one.
+
+    Args:
+        model: in eval mode.
+        images, lens: an example. The graph keeps its types and sizes, all but the batch size.
+        fixed_lens: the graph keeps the lens too, which must be a single one; `images` is its input.
+
+    Raises:
+        ValueError: a model in training mode, or not one lens where it is to be fixed.
+    """
+    return _program(model, images, lens, fixed_lens, any_strides=True)
+
+
+def _program(
+    model: nn.Module, images: Tensor, lens: Lens | None, fixed_lens: bool, any_strides: bool
+) -> ExportedProgram:
+    if model.training:
+        raise ValueError("model must be in eval mode, got one in training mode: call model.eval()")
+    if fixed_lens and (lens is None or len(lens) != 1):
+        raise ValueError(f"fixed_lens needs a single lens, got {lens}")
+    images, tensors = images[[0, 0]], {}  # two: torch.export takes a size of 1 for a constant
+    if lens is not None and not fixed_lens:
+        leaves, _ = pytree.tree_flatten_with_path(lens[[0, 0]])
+        tensors = {path[0].name: leaf for path, leaf in leaves if leaf is not None}
+    for tensor in (images, *tensors.values()):
+        torch._dynamo.mark_dynamic(tensor, 0)  # `dynamic_shapes` cannot name keyword arguments
+    module = _OfTensors(model, lens, any_strides)
+    with torch.no_grad():
+        # strict, as Python's own `len(lens)` would make the batch size a constant.
+        return torch.export.export(module, (images,), tensors, strict=True)
+
+
+def export_onnx(
+    model: nn.Module,
+    path: str | os.PathLike,
+    images: Tensor,
+    lens: Lens | None = None,
+    *,
+    fixed_lens: bool = False,
+) -> None:
+    """Writes the graph of `export_program` as one ONNX file, by the operators' reference.
+
+    Inputs are named as there, the output is `logits`.
+
+    Args:
+        path: of the file; it holds the weights too. Others, and errors: as `export_program`.
+
+    Raises:
+        ModuleNotFoundError: onnx or onnxscript is not installed.
+    """
+    if (without := lack("onnx", ("onnx", "onnxscript"))) is not None:
+        raise ModuleNotFoundError(without)
+    # MATH, as other attention kernels of torch lay out their result unlike their decomposition.
+    with use_reference(), sdpa_kernel(SDPBackend.MATH):
+        program = _program(model, images, lens, fixed_lens, any_strides=False)
+        torch.onnx.export(
+            program, f=path, output_names=["logits"], external_data=False, verbose=False
+        )

@@ -1,0 +1,268 @@
+"""Models for inference: weights packed for oneDNN, GELU inside of the products, each residual and
+the norm behind it in one."""
+
+import copy
+import warnings
+
+import torch
+from torch import Tensor, nn
+
+from darswin.layers import onednn
+from darswin.layers.attention import PolarWindowAttention, WindowAttention
+from darswin.layers.block import Block, PatchMerging
+from darswin.layers.onednn import PackedLinear
+from darswin.layers.position_bias import RelativeBias
+from darswin.layers.sampling import check_images, check_lens
+from darswin.lens import Lens
+from darswin.models.darswin import DarSwin
+from darswin.models.encoder import Encoder
+from darswin.models.stages import Stage
+
+DTYPES = (torch.float32, torch.bfloat16)
+_ADD_NORM = torch.ops.darswin.add_norm_.default
+_CPU = torch._C.DispatchKeySet(torch._C.DispatchKey.CPU)
+# A stage runs on so many images at once that what lies between two products stays below this: it
+# is then in the caches, and in memory that the allocator has kept rather than in fresh pages.
+CACHED_BYTES = 16 * 2**20
+
+
+def optimize(
+    model: Encoder, dtype: torch.dtype = torch.float32, *, lens: Lens | None = None
+) -> Encoder:
+    """A copy of a model that computes the same, faster: on CPU, in inference only.
+
+    Its products are oneDNN's, with weights laid out for them, and take bias and GELU along; a
+    residual and the norm behind it are one operator. It is called as the model is and has its
+    methods, but it is neither trained, saved, copied nor compiled, and has no gradients: the model,
+    which stays as it is, is there for that.
+
+    Args:
+        model: one of `create_model`, on the CPU.
+        dtype: float32 or bfloat16, of what flows between the layers and of the result.
+        lens: one camera's, whose grid and position biases are then computed once; the result is
+            called `optimized(images)`.
+
+    Where torch lacks oneDNN's products it warns, and uses its own.
+
+    Raises:
+        TypeError: another kind of model.
+        ValueError: another dtype or device, or not one lens.
+    """
+    if not isinstance(model, Encoder):
+        raise TypeError(f"model must be one of create_model, got {type(model).__name__}")
+    if any(isinstance(stage, _Stage) for stage in model.stages):
+        raise TypeError("model must be one of create_model, got one that is optimized already")
+    if dtype not in DTYPES:
+        raise ValueError(f"dtype must be torch.float32 or torch.bfloat16, got {dtype}")
+    devices = sorted({parameter.device.type for parameter in model.parameters()})
+    if devices != ["cpu"]:
+        raise ValueError(f"model must be on the CPU, got one on {' and '.join(devices)}")
+    if (lack := onednn.missing(dtype)) is not None:
+        warnings.warn(f"optimize goes on with torch's own products: {lack}", stacklevel=2)
+    optimized = copy.deepcopy(model).eval().requires_grad_(False)
+    optimized.__class__ = type(f"Optimized{type(model).__name__}", (_Optimized, type(model)), {})
+    optimized.patch_embed = _InDtype(optimized.patch_embed, dtype)
+    optimized.stages = nn.ModuleList(_Stage(stage, dtype) for stage in optimized.stages)
+    optimized.norm.to(dtype)
+    optimized.head.to(dtype)
+    return optimized if lens is None else OneLens(optimized, lens)
+
+
+class _Optimized:
+    """What an optimized model refuses, before anything of it has changed."""
+
+    def train(self, mode: bool = True):
+        if mode:
+            raise TypeError("an optimized model is not trained: train the model it was made of")
+        return super().train(mode)
+
+    def state_dict(self, *args, **kwargs):
+        raise TypeError("an optimized model is not saved: save the model it was made of")
+
+    def __reduce_ex__(self, protocol):
+        raise TypeError(
+            "an optimized model is neither copied nor pickled, since oneDNN's weights cannot be: "
+            "copy the model it was made of, and optimize that"
+        )
+
+
+class OneLens(_Optimized, Encoder):
+    """An optimized model and the one lens of all its images, which it is called without.
+
+    Args:
+        model: of `optimize`. lens: one.
+    """
+
+    def __init__(self, model: Encoder, lens: Lens):
+        super().__init__()
+        if not isinstance(lens, Lens) or len(lens) != 1:
+            raise ValueError(f"lens must be one lens, got {lens!r}")
+        self.model, self.lens = model, lens
+        self.stages, self.norm, self.head = model.stages, model.norm, model.head
+        self.num_features, self.num_classes = model.num_features, model.num_classes
+        self._known: dict[torch.Size, tuple] = {}  # what the lens gives, by image size
+
+    def _stage_maps(self, images: Tensor, lens: Lens | None = None) -> list[Tensor]:
+        if lens is not None:
+            raise ValueError("this model is optimized for one lens: call it without one")
+        if not isinstance(self.model, DarSwin):
+            return self.model._stage_maps(images, self.lens)
+        images = check_images(images)
+        size = images.shape[2:]
+        if size not in self._known:
+            check_lens(self.lens, images)
+            grid, radials = self.model.geometry(self.lens, size)
+            tables = [s.tables(r) for s, r in zip(self.stages, radials, strict=True)]
+            self._known[size] = grid, tables
+        grid, tables = self._known[size]
+        x, maps = self.model.embed(images, grid), []
+        for stage, known in zip(self.stages, tables, strict=True):
+            x = stage.run(x, known)
+            maps.append(x)
+        return maps
+
+
+class _InDtype(nn.Module):
+    """A module as it is, in bfloat16 under autocast, and its result in `dtype`."""
+
+    def __init__(self, module: nn.Module, dtype: torch.dtype):
+        super().__init__()
+        self.module, self.dtype = module, dtype
+        self.sample = getattr(module, "sample", None)
+
+    def forward(self, *arguments) -> Tensor:
+        with torch.autocast("cpu", torch.bfloat16, enabled=self.dtype == torch.bfloat16):
+            return self.module(*arguments).to(self.dtype)
+
+
+class _Stage(nn.Module):
+    """A stage as calls of operators."""
+
+    def __init__(self, stage: Stage, dtype: torch.dtype):
+        super().__init__()
+        self.downsample = stage.downsample
+        if isinstance(stage.downsample, PatchMerging):
+            self.downsample.norm.to(dtype)
+            self.downsample.reduction = PackedLinear(stage.downsample.reduction, dtype)
+        elif not isinstance(stage.downsample, nn.Identity):
+            self.downsample = _InDtype(stage.downsample, dtype)
+        self.blocks = [_Block(block, dtype) for block in stage.blocks]
+        mlp = stage.blocks[0].mlp
+        self.mlp_ratio = mlp.fc1.out_features // mlp.fc1.in_features
+        attentions = [block.attn for block in stage.blocks]
+        self.fixed: list[Tensor | None] = []  # tables that need no position
+        if isinstance(attentions[0], PolarWindowAttention):
+            self.heads = attentions[0].num_heads
+            self.bias = _joined([attn.position_bias for attn in attentions])
+        else:
+            windowed = [isinstance(attn, WindowAttention) for attn in attentions]
+            self.fixed = [
+                attn.position_bias().contiguous() if in_windows else None
+                for attn, in_windows in zip(attentions, windowed, strict=True)
+            ]
+
+    def tables(self, *positions: Tensor) -> list[Tensor | None]:
+        """The position bias of each block, where its attention has one that is known before."""
+        if self.fixed:
+            return self.fixed
+        (radial,) = positions
+        joined = self.bias(radial.to(torch.float32))
+        return [table.contiguous() for table in joined.split(self.heads, 1)]
+
+    def run(self, x: Tensor, tables: list[Tensor | None]) -> Tensor:
+        """What `Stage` does, with what `tables` gave. Where nothing merges, x itself changes."""
+        if torch.is_grad_enabled() and x.requires_grad:
+            raise RuntimeError(
+                "an optimized model has no gradients, but its images or its lens require one: call "
+                "it under torch.no_grad(), or use the model it was made of"
+            )
+        x = self.downsample(x).contiguous()
+        widest = x[:1].numel() * self.mlp_ratio * x.element_size()
+        parts = -(-len(x) * widest // CACHED_BYTES)
+        if parts <= 1:
+            self._blocks(x, tables)
+            return x
+        start = 0
+        for part in x.tensor_split(min(parts, len(x))):
+            end = start + len(part)
+            self._blocks(part, [t if t is None or len(t) == 1 else t[start:end] for t in tables])
+            start = end
+        return x
+
+    def _blocks(self, x: Tensor, tables: list[Tensor | None]) -> None:
+        """All blocks on x, in place: it is what their residuals add up to."""
+        y = self.blocks[0].norm1(x)
+        followers = [*self.blocks[1:], None]
+        for block, follower, table in zip(self.blocks, followers, tables, strict=True):
+            y = block.norm2.after(x, block.attention(y, table))
+            y = block.fc2(block.fc1.gelu(y))
+            if follower is None:
+                x += y
+            else:
+                y = follower.norm1.after(x, y)
+
+    def forward(self, x: Tensor, *positions: Tensor) -> Tensor:
+        """As `Stage`."""
+        return self.run(x, self.tables(*positions))
+
+
+def _joined(biases: list[RelativeBias]) -> RelativeBias:
+    """The biases of several blocks as one with the heads of all, computed in as few calls."""
+    joined = copy.deepcopy(biases[0])
+    for name, _ in list(joined.named_parameters()):
+        heads = torch.cat([getattr(bias, name).float() for bias in biases], 1)
+        setattr(joined, name, nn.Parameter(heads, requires_grad=False))
+    return joined
+
+
+class _Block:
+    """A block's parts, with everything at hand that their operators take."""
+
+    def __init__(self, block: Block, dtype: torch.dtype):
+        in_windows = isinstance(block.attn, WindowAttention)
+        self.attention = (_Windows if in_windows else _Deformable)(block.attn, dtype)
+        self.norm1, self.norm2 = _Norm(block.norm1), _Norm(block.norm2)
+        self.fc1, self.fc2 = (PackedLinear(fc, dtype) for fc in (block.mlp.fc1, block.mlp.fc2))
+
+
+class _Norm:
+    """A layer norm; its parameters stay float32."""
+
+    def __init__(self, norm: nn.LayerNorm):
+        self.shape, self.eps = norm.normalized_shape, norm.eps
+        self.weight, self.bias = norm.weight.float(), norm.bias.float()
+
+    def __call__(self, x: Tensor) -> Tensor:
+        return torch.layer_norm(x, self.shape, self.weight, self.bias, self.eps)
+
+    def after(self, x: Tensor, y: Tensor) -> Tensor:
+        """Adds y to the residual x, in place, and normalizes the sum, in place of y."""
+        # Not by way of autograd, which would look for gradients and count versions: there are none.
+        _ADD_NORM.redispatch(_CPU, x, y, self.weight, self.bias, self.eps)
+        return y
+
+
+class _Windows:
+    """Attention in windows."""
+
+    def __init__(self, attn: WindowAttention, dtype: torch.dtype):
+        self.qkv, self.proj = PackedLinear(attn.qkv, dtype), PackedLinear(attn.proj, dtype)
+        dim = attn.proj.in_features // attn.num_heads
+        self.shape = (*attn.map_size, 3, attn.num_heads, dim)
+        self.settings = (attn.window, attn.shift, attn.periodic, dim**-0.5)
+
+    def __call__(self, x: Tensor, table: Tensor) -> Tensor:
+        qkv = self.qkv(x).view(x.shape[0], *self.shape)
+        # Not by way of darswin.ops: all that it would check is known to fit.
+        out = torch.ops.darswin.window_attention.default(qkv, table, *self.settings)
+        return self.proj(out)
+
+
+class _Deformable:
+    """Any other attention, as it is."""
+
+    def __init__(self, attn: nn.Module, dtype: torch.dtype):
+        self.attn = _InDtype(attn, dtype)
+
+    def __call__(self, x: Tensor, table: None) -> Tensor:
+        return self.attn(x).contiguous()

@@ -1,0 +1,130 @@
+"""The position biases of window attention: of angles, Fourier series or a table."""
+
+import math
+from typing import Literal
+
+import torch
+from torch import Tensor, nn
+
+from darswin.layers.grid import PolarGrid
+from darswin.lens import Lens
+
+PositionBias = Literal["angular_relative", "angular", "polar"]
+
+
+class RelativeBias(nn.Module):
+    """B_θ + B_φ: a bias table from the angles between tokens. Subclasses say what one axis gives.
+
+    Args:
+        window: (M_r, M_φ). sectors: A of the map.
+    """
+
+    def __init__(self, window: tuple[int, int], sectors: int):
+        super().__init__()
+        self.window, self.turn = window, 2 * math.pi / sectors
+
+    def _coefficients(self, rows: int, heads: int) -> nn.Parameter:
+        return nn.Parameter(nn.init.trunc_normal_(torch.empty(rows, heads), std=0.02))
+
+    def _axis(self, angle: Tensor, a: Tensor, b: Tensor) -> Tensor:
+        """Angles (N, K) of Δ = -(K-1)/2 … (K-1)/2 → (N, K, heads)."""
+        raise NotImplementedError
+
+    def forward(self, radial: Tensor) -> Tensor:
+        """`radial` (N, at least M_r) rad: how far 0, 1, … rings reach.
+
+        Returns:
+            (N, heads, 2·M_r-1, 2·M_φ-1), the `bias` of `window_attention`.
+        """
+        outward = radial[:, : self.window[0]]
+        theta = torch.cat((-outward[:, 1:].flip(1), outward), 1)
+        reach = self.window[1]
+        phi = torch.arange(1 - reach, reach, device=radial.device, dtype=radial.dtype) * self.turn
+        along_r = self._axis(theta, self.a_theta, self.b_theta).transpose(1, 2)
+        along_phi = self._axis(phi[None], self.a_phi, self.b_phi).transpose(1, 2)
+        return along_r[..., None] + along_phi[..., None, :]
+
+
+class AngularRelativeBias(RelativeBias):
+    """B = a_Δ sin α + b_Δ cos α, α the angle between two tokens Δ apart.
+
+    Coefficients are stored by Δ modulo their number: Δ = 0, 1, …, -2, -1.
+
+    Args:
+        window, sectors: as `RelativeBias`. heads: attention heads.
+        periodic: φ coefficients by Δφ modulo M_φ rather than modulo 2·M_φ-1, which makes them, and
+            so the bias, periodic; for a window that spans the ring.
+
+    Source: DarSwin, ICCV 2023, eq. 9 to 11.
+    """
+
+    def __init__(self, window: tuple[int, int], heads: int, sectors: int, periodic: bool = False):
+        super().__init__(window, sectors)
+        rows_theta, rows_phi = 2 * window[0] - 1, window[1] if periodic else 2 * window[1] - 1
+        self.a_theta = self._coefficients(rows_theta, heads)
+        self.b_theta = self._coefficients(rows_theta, heads)
+        self.a_phi = self._coefficients(rows_phi, heads)
+        self.b_phi = self._coefficients(rows_phi, heads)
+
+    def _axis(self, angle: Tensor, a: Tensor, b: Tensor) -> Tensor:
+        reach, angle = angle.shape[1] // 2, angle[..., None]
+        # Rows Δ = -reach … reach. Slices: the gradient of an index would be a slow scatter.
+        a, b = (torch.cat((rows[len(rows) - reach :], rows[: reach + 1])) for rows in (a, b))
+        return a * torch.sin(angle) + b * torch.cos(angle)
+
+
+class FourierBias(RelativeBias):
+    """B = b_0 + (1/P) Σ_{p=1..P} (a_p sin pα + b_p cos pα), P harmonics.
+
+    α is the angle between two tokens ("angular"), or along the radius their distance in the image,
+    the circle's radius being π ("polar"): what `radial` holds decides.
+
+    Args:
+        window, sectors: as `RelativeBias`. heads: attention heads. harmonics: P.
+
+    Source: DarSwin, ICCV 2023, table 3, after Ning et al., IJCAI 2020.
+    """
+
+    def __init__(self, window: tuple[int, int], heads: int, sectors: int, harmonics: int = 16):
+        super().__init__(window, sectors)
+        self.a_theta = self._coefficients(harmonics, heads)
+        self.b_theta = self._coefficients(harmonics + 1, heads)
+        self.a_phi = self._coefficients(harmonics, heads)
+        self.b_phi = self._coefficients(harmonics + 1, heads)
+
+    def _axis(self, angle: Tensor, a: Tensor, b: Tensor) -> Tensor:
+        harmonics = a.shape[0]
+        waves = angle[..., None] * torch.arange(1, harmonics + 1, device=angle.device)
+        return b[0] + (torch.sin(waves) @ a + torch.cos(waves) @ b[1:]) / harmonics
+
+
+class RelativeTable(nn.Module):
+    """A learned bias for each offset between two tokens, which knows no angle.
+
+    Args:
+        window: (M_r, M_φ), or of a plain map rows and columns. heads: attention heads.
+
+    Source: Swin Transformer, ICCV 2021, eq. 4.
+    """
+
+    def __init__(self, window: tuple[int, int], heads: int):
+        super().__init__()
+        table = torch.empty(heads, 2 * window[0] - 1, 2 * window[1] - 1)
+        self.table = nn.Parameter(nn.init.trunc_normal_(table, std=0.02))
+
+    def forward(self) -> Tensor:
+        """(1, heads, 2·M_r-1, 2·M_φ-1), the `bias` of `window_attention`."""
+        return self.table[None]
+
+
+def radial_positions(lens: Lens, grid: PolarGrid, rings: int, kind: PositionBias) -> Tensor:
+    """(N, rings+1): how far from the centre the borders of a map of `rings` rings are, in rad.
+
+    The angle θ, equally split; for "polar" the radius in the image, the circle's radius being π.
+    """
+    if kind == "polar":
+        step = (grid.borders.shape[1] - 1) // rings
+        borders = grid.borders[:, ::step]
+        return borders * (math.pi / borders[:, -1:])
+    fractions = torch.linspace(0, 1, rings + 1, device=lens.theta_max.device)
+    return lens.theta_max[:, None] * fractions

@@ -1,0 +1,128 @@
+"""Samples of images on the polar grid of their lenses."""
+
+from collections.abc import Callable, Sequence
+from typing import Literal
+
+import torch
+from torch import Tensor, nn
+
+from darswin.layers.grid import Placement, PolarGrid, Spacing, check_grid, polar_grid
+from darswin.lens import Lens
+from darswin.ops import polar_sample
+from darswin.ops.checks import channels_first, check_jitter, check_layout
+
+GridFunction = Callable[..., PolarGrid]
+
+
+class PolarSample(nn.Module):
+    """Samples images on the polar grid of their lenses: what `F.grid_sample` does, with the grid.
+
+    Args:
+        rings, sectors, samples, spacing, sample_spacing, placement: as `darswin.polar_grid`.
+        jitter: in [0, 1], how far a sample may move, in cells; only in training. The seed of each
+            call comes from torch's generator.
+        layout: "image" gives (B, C, R·S_r, A·S_φ), "tokens" (B, R, A, S_r·S_φ·C).
+        mean, std: of uint8 images, which count as `(pixel/255 - mean) / std`; others ignore them.
+        grid: the function that makes the grid.
+
+    Raises:
+        ValueError: settings that make no grid, here; images and lenses that do not fit, in forward.
+
+    Source: DarSwin, ICCV 2023, sec. 4.2 and 4.3.
+    """
+
+    def __init__(
+        self,
+        rings: int,
+        sectors: int,
+        samples: tuple[int, int],
+        *,
+        spacing: Spacing = "theta",
+        sample_spacing: Spacing | None = None,
+        placement: Placement = "centers",
+        jitter: float = 0.0,
+        layout: Literal["tokens", "image"] = "image",
+        mean: float | Sequence[float] = 0.0,
+        std: float | Sequence[float] = 1.0,
+        grid: GridFunction = polar_grid,
+    ):
+        super().__init__()
+        check_grid(rings, sectors, samples, spacing, sample_spacing or spacing, placement)
+        check_layout(layout)
+        self.rings, self.sectors, self.samples = int(rings), int(sectors), (*map(int, samples),)
+        self.spacing, self.sample_spacing = spacing, sample_spacing or spacing
+        self.placement, self.jitter, self.layout = placement, check_jitter(jitter), layout
+        self.mean, self.std = mean, std
+        self._grid = grid
+
+    def grid(self, lens: Lens, image_size: tuple[int, int]) -> PolarGrid:
+        """The grid of a lens in images of (H, W)."""
+        return self._grid(
+            lens,
+            image_size,
+            rings=self.rings,
+            sectors=self.sectors,
+            samples=self.samples,
+            spacing=self.spacing,
+            sample_spacing=self.sample_spacing,
+            placement=self.placement,
+        )
+
+    def arguments(self, images: Tensor, grid: PolarGrid) -> dict:
+        """What the operators sample images with, on a grid that `grid` gave."""
+        dtype = torch.float64 if images.dtype == torch.float64 else torch.float32
+        radii, azimuths, center, _, affine, offsets = (
+            None if t is None else t.to(images.device, dtype) for t in grid
+        )
+        jitter = self.jitter if self.training else 0.0
+        # 62 bits, so that the seed is a tensor that compiled training does not specialise on.
+        seed = torch.randint(2**62, ()) if jitter else 0
+        statistics = dict(mean=self.mean, std=self.std) if images.dtype == torch.uint8 else {}
+        return dict(
+            image=images, radii=radii, azimuths=azimuths, center=center, affine=affine,
+            offsets=offsets, patch=self.samples, jitter=jitter, seed=seed, **statistics,
+        )  # fmt: skip
+
+    def forward(self, images: Tensor, lens: Lens) -> Tensor:
+        """Images (B, C, H, W) and their lenses (B or 1) → the samples, in `layout`."""
+        images = check_images(images)
+        check_lens(lens, images)
+        grid = self.grid(lens, images.shape[2:])
+        return polar_sample(**self.arguments(images, grid), layout=self.layout)
+
+    def extra_repr(self) -> str:
+        return (
+            f"rings={self.rings}, sectors={self.sectors}, samples={self.samples}, "
+            f"spacing={self.spacing!r}, sample_spacing={self.sample_spacing!r}, "
+            f"placement={self.placement!r}, jitter={self.jitter}, layout={self.layout!r}"
+        )
+
+
+def check_images(images: Tensor) -> Tensor:
+    """The images as (B, C, H, W), else TypeError or ValueError. uint8 ones may be (B, H, W, 3)."""
+    if not isinstance(images, Tensor):
+        raise TypeError(f"images must be a tensor, got {type(images).__name__}")
+    if images.dim() != 4:
+        raise ValueError(f"images must have shape (B, C, H, W), got {tuple(images.shape)}")
+    return channels_first(images)
+
+
+def check_lens(lens: Lens, images: Tensor) -> None:
+    """TypeError or ValueError unless there is a lens for each image, or one, and of its size.
+
+    Compiled graphs cannot look at a value, so they do not check sizes."""
+    if not isinstance(lens, Lens):
+        raise TypeError(f"lens must be a darswin.lens.Lens, got {type(lens).__name__}")
+    if len(lens) not in (1, images.shape[0]):
+        raise ValueError(
+            f"there must be one lens or one an image, {images.shape[0]}, got {len(lens)}"
+        )
+    if lens.image_size is None or torch.compiler.is_compiling():
+        return
+    size = tuple(images.shape[2:])
+    for other in lens.image_size.unique(dim=0).tolist():
+        if tuple(other) != size:
+            raise ValueError(
+                f"the lens belongs to images of (H, W) = {tuple(round(s) for s in other)}, got "
+                f"images of {size}; lens.resized({size}) is the lens of a resized image"
+            )

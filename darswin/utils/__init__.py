@@ -1,0 +1,1 @@
+"""What has nothing to do with lenses: files, memory, reading an image."""

@@ -1,0 +1,90 @@
+"""Reading picture files, upright as their EXIF orientation says."""
+
+import io
+import warnings
+from pathlib import Path
+
+import cv2
+import numpy as np
+from PIL import ExifTags, Image, UnidentifiedImageError
+
+from darswin.utils.exif import TURNS
+
+
+class BrokenImageError(OSError):
+    """A file that is no readable image."""
+
+
+def read_image(path: str | Path, channels: int = 3) -> np.ndarray:
+    """A picture file as (H, W, C) uint8, C = 3 (RGB) or 1 (grey), turned upright as its EXIF says.
+
+    Raises:
+        BrokenImageError: a file that is missing, unreadable or no image; it names the file.
+    """
+    return _decoded(_content(path), path, channels)
+
+
+def read_oriented(path: str | Path, channels: int = 3) -> tuple[np.ndarray, int]:
+    """`read_image`, and the EXIF orientation that it was turned from, which its lens needs.
+
+    Returns:
+        The upright picture, and 1 to 8; see `darswin.lens.orientation.turned`.
+
+    Raises:
+        BrokenImageError: as `read_image`; an orientation that cannot be read.
+    """
+    data = _content(path)
+    upright = _decoded(data, path, channels)
+    orientation, kind = _exif(data, path)
+    if orientation == 1 or kind == "TIFF":  # which OpenCV turns upright in any case
+        return upright, orientation
+    # Turned by our own hands: some versions of OpenCV do not turn every kind of file.
+    image = _decoded(data, path, channels, cv2.IMREAD_IGNORE_ORIENTATION)
+    swapped, *reversed_ = TURNS[orientation]
+    image = image.swapaxes(0, 1) if swapped else image
+    across, down = (slice(None, None, -1 if r else 1) for r in reversed_)
+    return np.ascontiguousarray(image[down, across]), orientation
+
+
+def _content(path: str | Path) -> np.ndarray:
+    try:
+        return np.fromfile(path, np.uint8)
+    except OSError as error:
+        raise BrokenImageError(f"cannot read {path}: {error.strerror}") from error
+
+
+def _decoded(data: np.ndarray, path: str | Path, channels: int, flags: int = 0) -> np.ndarray:
+    flags |= cv2.IMREAD_COLOR_RGB if channels == 3 else cv2.IMREAD_GRAYSCALE
+    try:
+        image = cv2.imdecode(data, flags) if data.size else None
+    except (cv2.error, MemoryError) as error:  # too many pixels for OpenCV, or for the memory
+        reason = getattr(error, "err", None) or "not enough memory"
+        raise BrokenImageError(
+            f"cannot read {path}: too many pixels for OpenCV, or damaged ({reason})"
+        ) from error
+    if image is None:
+        raise BrokenImageError(f"cannot read {path}: no image that OpenCV can decode")
+    return image.reshape(*image.shape[:2], channels)
+
+
+def _exif(data: np.ndarray, path: str | Path) -> tuple[int, str | None]:
+    """The EXIF orientation, 1 where there is none, and Pillow's name of the file's format."""
+    try:
+        with warnings.catch_warnings(action="ignore"), Image.open(io.BytesIO(data)) as file:
+            orientation = file.getexif().get(ExifTags.Base.Orientation, 1)
+            return orientation if orientation in TURNS else 1, file.format
+    except UnidentifiedImageError:  # none of the formats that have EXIF
+        return 1, None
+    except Exception as error:  # EXIF that is no EXIF fails in many ways
+        raise BrokenImageError(
+            f"cannot read {path}: its EXIF orientation cannot be told, {error}"
+        ) from error
+
+
+def with_channels(image: np.ndarray, channels: int) -> np.ndarray:
+    """The image (H, W, C) with 1 or 3 channels: grey is repeated, RGB becomes its luminance."""
+    if image.shape[2] == channels:
+        return image
+    if channels == 3:
+        return np.repeat(image, 3, 2)
+    return cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)[..., None]

@@ -1,0 +1,1 @@
+"""Pictures of lenses, grids and results."""

@@ -1,0 +1,353 @@
+"""Pictures with matplotlib: what a lens does to an image, and accuracy over distortion.
+
+Each function draws on `axes`, or on a new figure that pyplot knows nothing of, and returns the
+figure; `save_figure` writes it. Images are (H, W) or (H, W, 3), uint8 or floats in [0, 1].
+"""
+
+import io
+import math
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+from matplotlib.patheffects import AbstractPathEffect, Normal, Stroke
+from matplotlib.ticker import MaxNLocator
+from torch import Tensor
+
+from darswin.layers.grid import PolarGrid
+from darswin.layers.sampling import PolarSample
+from darswin.lens import Lens
+from darswin.ops import polar_sample
+from darswin.utils.files import replace_file
+from darswin.viz.report import SIDES, beyond_lens, pixels_per_degree
+from darswin.viz.views import BEYOND, undistort, view_map
+
+SPACING_SYMBOLS = {"theta": "θ", "tan": "tan θ", "g": "g(θ)", "radius": "r"}
+
+
+# What matplotlib writes without another program, and the format it is.
+FORMATS = {".png": "png", ".jpg": "jpeg", ".jpeg": "jpeg", ".webp": "webp", ".tif": "tiff",
+           ".tiff": "tiff", ".pdf": "pdf", ".svg": "svg"}  # fmt: skip
+# Where an image has nothing to show.
+HATCH = dict(facecolor="0.9", hatch="///", edgecolor="0.6", linewidth=0)
+
+
+def figure_format(path: str | os.PathLike) -> str:
+    """The format that a file's ending names; ValueError where it is none of `FORMATS`."""
+    ending = Path(path).suffix.lower()
+    if ending not in FORMATS:
+        raise ValueError(
+            f"a picture's name must end in one of {', '.join(FORMATS)}, got {os.fspath(path)!r}"
+        )
+    return FORMATS[ending]
+
+
+def save_figure(figure: Figure, path: str | os.PathLike) -> None:
+    """Writes a figure as the file that its ending names, whole or not at all.
+
+    Raises:
+        ValueError: as `figure_format`. OSError: as `darswin.utils.files.replace_file`.
+    """
+    picture = io.BytesIO()
+    figure.savefig(picture, format=figure_format(path), dpi=120)
+    replace_file(path, picture.getvalue())
+
+
+def draw_grid(
+    image: np.ndarray,
+    lens: Lens,
+    sampler: PolarSample,
+    *,
+    samples: bool = True,
+    axes: Axes | None = None,
+) -> Figure:
+    """An image with the borders of its polar patches and, over them, the sample points.
+
+    All follow the lens: with affine, tangential or thin-prism terms they are on no circles.
+
+    Args:
+        lens: of the image. sampler: how it is cut and sampled, as `model.patch_embed.sample`.
+
+    Raises:
+        ValueError: more than one lens.
+    """
+    axes = axes or _new_axes()
+    lens, grid = _grid(lens, sampler, image)
+    _show(axes, image)
+    _draw_borders(axes, lens, grid, sampler, image.shape[:2], (0.6, 0.3))
+    if samples:
+        axes.plot(*_sample_places(lens, grid, image.shape[:2]), "r.", ms=0.6, alpha=0.5)
+    axes.set(xlim=(-0.5, image.shape[1] - 0.5), ylim=(image.shape[0] - 0.5, -0.5))
+    return axes.figure
+
+
+def draw_samples(
+    image: np.ndarray, lens: Lens, sampler: PolarSample, *, axes: Axes | None = None
+) -> Figure:
+    """`draw_grid` of a tenth of the image, enlarged: half way out, to the right and upwards, or as
+    near to it as the image reaches."""
+    axes = axes or _new_axes()
+    lens, grid = _grid(lens, sampler, image)
+    left, top, width, height = _enlarged(image, lens)
+    _show(axes, image)
+    _draw_borders(axes, lens, grid, sampler, image.shape[:2], (1.2, 1.2))
+    x, y = _sample_places(lens, grid, image.shape[:2])
+    inside = (x > left) & (x < left + width) & (y > top) & (y < top + height)
+    axes.plot(x[inside], y[inside], "r.", ms=2.5, path_effects=_outline(0.5, "white"))
+    axes.set(xlim=(left, left + width), ylim=(top + height, top))
+    return axes.figure
+
+
+def _draw_borders(
+    axes: Axes,
+    lens: Lens,
+    grid: PolarGrid,
+    sampler: PolarSample,
+    size: tuple[int, int],
+    widths: tuple[float, float],
+) -> None:
+    """Rings and sectors, of these line widths; outlined, so that they show on bright walls."""
+    rings = lens.unproject(grid.borders[0])[:, None]
+    around = torch.linspace(0, 2 * math.pi, 361)
+    outwards = torch.linspace(rings.min(), rings.max(), 65)
+    sectors = torch.arange(sampler.sectors)[:, None] * (2 * math.pi / sampler.sectors)
+    for theta, azimuth, width in zip((rings, outwards), (around, sectors), widths, strict=True):
+        lines = lens.project_rays(theta, azimuth, size).numpy()
+        effects = _outline(width, "black")
+        collection = LineCollection(lines, colors="cyan", lw=width, path_effects=effects)
+        axes.add_collection(collection, autolim=False)
+
+
+def _sample_places(lens: Lens, grid: PolarGrid, size: tuple[int, int]) -> Tensor:
+    """x and y of the sample points, (2, n) px."""
+    theta = lens.unproject(grid.radii[0])[:, None]
+    return lens.project_rays(theta, grid.azimuths, size).flatten(0, 1).T
+
+
+def _outline(width: float, colour: str) -> list[AbstractPathEffect]:
+    """A line of this width with a thin outline."""
+    return [Stroke(linewidth=width + 0.8, foreground=colour, alpha=0.6), Normal()]
+
+
+def draw_polar(
+    image: np.ndarray, lens: Lens, sampler: PolarSample, *, axes: Axes | None = None
+) -> Figure:
+    """The polar image that a network gets: a row a radius, a column an azimuth, without jitter.
+
+    Arguments: as `draw_grid`.
+    """
+    axes = axes or _new_axes(9, 3)
+    lens, grid = _grid(lens, sampler, image)
+    pixels = torch.from_numpy(np.atleast_3d(image)).permute(2, 0, 1)[None].float()
+    # With a channel that says how much of a sample is of the image.
+    pixels = torch.cat((pixels, torch.ones_like(pixels[:, :1])), 1)
+    arguments = sampler.arguments(pixels, grid) | dict(jitter=0.0)
+    *colours, share = polar_sample(**arguments, layout="image")[0].numpy()
+    rows, scale = len(share), 255 if image.dtype == np.uint8 else 1
+    outside = share < 0.5
+    _show(axes, np.stack(colours, -1) / scale, outside, extent=(0, 360, rows, 0), aspect="auto")
+    sides = ("right", "below", "left", "above", "right")
+    axes.set_xticks(range(0, 361, 90), [f"{90 * k}°\n{side}" for k, side in enumerate(sides)])
+    step = -(-sampler.rings // 8)  # at most nine labels
+    angles = torch.rad2deg(lens.unproject(grid.borders[0]))[::step].tolist()
+    axes.set_yticks([k * step * sampler.samples[0] for k in range(len(angles))],
+                    [f"{angle:.0f}°" for angle in angles])  # fmt: skip
+    axes.set(xlabel=_label("azimuth φ", outside), ylabel="incident angle θ")
+    return axes.figure
+
+
+def draw_view(image: np.ndarray, lens: Lens, rays: Tensor, *, axes: Axes | None = None) -> Figure:
+    """What the image shows along rays (H, W, 3), which `darswin.viz.views` makes.
+
+    Ticks are angles from the ray in the middle, along the view's middle row and column, to the
+    right and upwards.
+    """
+    axes = axes or _new_axes()
+    x, y = np.moveaxis(view_map(lens, rays, image.shape[:2]), -1, 0)
+    height, width = image.shape[:2]
+    beyond = (x == BEYOND) & (y == BEYOND)
+    outside = ~beyond & ((x < -0.5) | (x > width - 0.5) | (y < -0.5) | (y > height - 0.5))
+    _show(axes, undistort(image, lens, rays), beyond | outside)
+    lines = ((axes.xaxis, _middle(rays), 1), (axes.yaxis, _middle(rays.transpose(0, 1)), -1))
+    for axis, line, sign in lines:
+        places, degrees = _angle_ticks(line, max(2, 7 * len(line) // max(rays.shape[:2])))
+        axis.set_ticks(places, [f"{sign * angle + 0:g}°" for angle in degrees])
+    axes.set(xlabel=_label("degrees from the view's middle", outside, beyond))
+    return axes.figure
+
+
+def _middle(rays: Tensor) -> Tensor:
+    """The middle row of rays (H, W, 3), of unit length: (W, 3), float64."""
+    rays = torch.nn.functional.normalize(rays.detach().to("cpu", torch.float64), dim=-1)
+    rows = rays[(len(rays) - 1) // 2], rays[len(rays) // 2]
+    return torch.nn.functional.normalize(sum(rows), dim=-1)
+
+
+def _angle_ticks(line: Tensor, most: int) -> tuple[np.ndarray, np.ndarray]:
+    """Places on a line of rays (n, 3) and what they are, round degrees from its middle: at most
+    `most` steps."""
+    seen = line.any(-1).numpy()
+    half = (len(line) - 1) / 2
+    middle = torch.nn.functional.normalize(line[math.floor(half)] + line[math.ceil(half)], dim=0)
+    apart = torch.linalg.cross(line, middle.expand_as(line)).norm(dim=-1)
+    places = np.arange(len(line))
+    degrees = torch.rad2deg(torch.atan2(apart, line @ middle)).numpy() * np.sign(places - half)
+    places, degrees = places[seen], degrees[seen]
+    if len(degrees) < 2 or not (np.diff(degrees) > 0).all():
+        return places[:0], degrees[:0]  # of rays that are no picture of directions in a row
+    ticks = MaxNLocator(most, steps=[1, 1.5, 2, 3, 5, 6, 10]).tick_values(*degrees[[0, -1]])
+    ticks = ticks[(ticks >= degrees[0]) & (ticks <= degrees[-1])]
+    return np.interp(ticks, degrees, places), ticks
+
+
+def _label(text: str, outside: np.ndarray, beyond: np.ndarray | None = None) -> str:
+    """An axis's label and, where anything is hatched, what that means."""
+    reasons = ["outside the sensor"] if outside.any() else []
+    reasons += ["beyond θ_max"] if beyond is not None and beyond.any() else []
+    return f"{text}\nhatched: {' or '.join(reasons)}" if reasons else text
+
+
+def draw_curve(
+    lens: Lens, image_size: tuple[int, int] | None = None, *, axes: Axes | None = None
+) -> Figure:
+    """The projection curve r(θ) up to θ_max, and how many pixels a degree has along the radius and
+    around the axis; where the image (H, W) ends, if it is given, dashed to the left and right and
+    dotted above and below.
+
+    Raises:
+        ValueError: more than one lens.
+    """
+    axes = axes or _new_axes()
+    lens = _one(lens)
+    theta = torch.linspace(0, lens.theta_max.item(), 257, dtype=torch.float64)
+    degrees, radius = torch.rad2deg(theta), lens.project(theta)
+    axes.plot(degrees, radius, "k-", label="r")
+    axes.set(xlabel="incident angle θ (°)", ylabel="r (px)", xlim=(0, degrees[-1].item()))
+    density = axes.twinx()
+    along, around = pixels_per_degree(lens, theta)
+    density.plot(degrees, along, "C0-", label="px/° along r")
+    density.plot(degrees, around, "C1-", label="px/° around")
+    density.set(ylabel="pixels per degree")
+    # Room for the legend above the curves.
+    axes.set_ylim(0, 1.15 * radius.max().item())
+    density.set_ylim(0, 1.15 * torch.cat((along, around)).max().item())
+    if image_size is not None:
+        _draw_sides(axes, lens, image_size)
+    axes.legend(handles=[*axes.lines[:1], *density.lines], loc="upper center", ncols=3)
+    return axes.figure
+
+
+def _draw_sides(axes: Axes, lens: Lens, image_size: tuple[int, int]) -> None:
+    """A line where the image ends to each side, but for sides that are beyond θ_max."""
+    angles = torch.rad2deg(lens.side_angles(image_size)[0]).tolist()
+    ends = beyond_lens(lens, image_size).tolist()
+    # Each name at a height of its own: opposite sides are often at nearly the same angle.
+    looks = zip(SIDES, ("--", ":", "--", ":"), (0.02, 0.21, 0.4, 0.6), strict=True)
+    for (side, style, height), angle, beyond in zip(looks, angles, ends, strict=True):
+        if beyond or angle > axes.get_xlim()[1] + 1e-6:
+            continue
+        axes.axvline(angle, color="0.4", ls=style, lw=1)
+        axes.text(
+            angle, height, f"{side} {angle:.1f}°", transform=axes.get_xaxis_transform(),
+            rotation=90, ha="right", va="bottom", color="0.3", fontsize="small",
+            path_effects=_outline(1.2, "white"),
+        )  # fmt: skip
+
+
+def draw_lens(
+    image: np.ndarray, lens: Lens, sampler: PolarSample, view: Tensor, title: str = "undistorted"
+) -> Figure:
+    """All of it in one figure: partition, sample points, a view, polar image, projection curve.
+
+    Args:
+        lens, sampler: as `draw_grid`. view: (H, W, 3), its rays. title: of the view.
+    """
+    figure = Figure(figsize=(15, 9), layout="constrained")
+    panels = figure.subplot_mosaic([["partition", "samples", "view"], ["polar", "polar", "curve"]])
+    draw_grid(image, lens, sampler, samples=False, axes=panels["partition"])
+    draw_samples(image, lens, sampler, axes=panels["samples"])
+    left, top, width, height = _enlarged(image, lens)
+    frame = Rectangle(
+        (left, top), width, height, fill=False, color="red", path_effects=_outline(1.5, "white")
+    )
+    panels["partition"].add_patch(frame)
+    draw_view(image, lens, view, axes=panels["view"])
+    draw_polar(image, lens, sampler, axes=panels["polar"])
+    draw_curve(lens, image.shape[:2], axes=panels["curve"])
+    (rows, columns), rings, sectors = sampler.samples, sampler.rings, sampler.sectors
+    equal = SPACING_SYMBOLS[sampler.spacing]
+    panels["partition"].set_title(f"{rings} rings × {sectors} sectors, equal steps of {equal}")
+    panels["samples"].set_title(f"{rows} × {columns} samples in each, enlarged")
+    panels["view"].set_title(title)
+    panels["polar"].set_title(f"polar image, {rows * rings} × {columns * sectors} samples")
+    panels["curve"].set_title(f"projection: {type(lens).__name__}")
+    return figure
+
+
+def draw_accuracy(
+    xi: Sequence[float],
+    accuracy: Mapping[str, Sequence[float]],
+    trained: tuple[float, float] | None,
+    *,
+    axes: Axes | None = None,
+) -> Figure:
+    """Accuracy (%) against ξ, a line a model, with the range of training, if any, shaded."""
+    axes = axes or _new_axes(7, 4.2)
+    if trained is not None:
+        axes.axvspan(*trained, color="tab:pink", alpha=0.3, lw=0, label="seen in training")
+    for name, values in accuracy.items():
+        axes.plot(xi, values, "o-", ms=4, label=name, clip_on=False)
+    axes.set_xlabel("distortion ξ")
+    axes.set_ylabel("accuracy (%)")
+    axes.set_xlim(min(xi), max(xi))
+    axes.grid(alpha=0.3)
+    axes.legend()
+    return axes.figure
+
+
+def _new_axes(width: float = 6, height: float = 6) -> Axes:
+    return Figure(figsize=(width, height), layout="constrained").subplots()
+
+
+def _show(axes: Axes, image: np.ndarray, outside: np.ndarray | None = None, **options) -> None:
+    """Draws an image (H, W[, 1 or 3]), hatched where `outside` (H, W) is true."""
+    image = np.atleast_3d(image)
+    opaque, colours = (255 if image.dtype == np.uint8 else 1), image.shape[2]
+    image = np.repeat(image, 3, 2) if colours == 1 else image
+    image = image.clip(0, opaque)
+    if outside is not None:
+        alpha = np.where(outside, 0, opaque).astype(image.dtype)
+        image = np.concatenate((image, alpha[..., None]), 2)
+        axes.patch.set(**HATCH)
+    axes.imshow(image, **options)
+    axes.set_xticks([])
+    axes.set_yticks([])
+
+
+def _one(lens: Lens) -> Lens:
+    """The lens in double precision, without gradients; ValueError unless it is one."""
+    if len(lens) != 1:
+        raise ValueError(f"a picture is of one lens, got {len(lens)}")
+    return lens.detach().to("cpu", torch.float64)
+
+
+def _grid(lens: Lens, sampler: PolarSample, image: np.ndarray) -> tuple[Lens, PolarGrid]:
+    lens = _one(lens)
+    return lens, sampler.grid(lens, image.shape[:2])
+
+
+def _enlarged(image: np.ndarray, lens: Lens) -> tuple[float, float, float, float]:
+    """Left, top, width and height of the part that `draw_samples` shows, inside the image."""
+    height, width = image.shape[:2]
+    place = _one(lens).project_rays(lens.theta_max.item() / 2, -math.pi / 4, (height, width))[0]
+    x, y = (
+        min(max(at, 0.05 * side - 0.5), 0.95 * side - 0.5) if math.isfinite(at) else side / 2
+        for at, side in zip(place.tolist(), (width, height), strict=True)
+    )
+    return x - width / 20, y - height / 20, width / 10, height / 10

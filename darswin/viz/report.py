@@ -1,0 +1,219 @@
+"""What a lens shows, in words: field of view, pixels per degree, and which spacing fits."""
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from darswin.layers.grid import SPACINGS, polar_grid
+from darswin.lens.base import Lens
+
+SIDES = ("left", "top", "right", "bottom")
+
+
+def pixels_per_degree(lens: Lens, theta: Tensor) -> tuple[Tensor, Tensor]:
+    """How many pixels a degree has at θ, along the radius and around the axis, before `affine`.
+
+    Args:
+        lens: one lens. theta: any shape, rad.
+
+    Returns:
+        dr/dθ and r / sin θ, px/°, of the shape of θ.
+    """
+    theta = theta.detach().clone().requires_grad_()
+    lens = lens.detach()
+    with torch.enable_grad():
+        radius = lens.project(theta)
+        (along,) = torch.autograd.grad(radius.sum(), theta)
+    theta, radius = theta.detach(), radius.detach()
+    around = torch.where(theta == 0, along, radius / torch.sin(theta))
+    return along * math.pi / 180, around * math.pi / 180
+
+
+def largest_offset(lens: Lens) -> float:
+    """px: how far tangential and thin-prism terms move a ray at most, up to θ_max, of one lens."""
+    theta = lens.theta_max * torch.linspace(0, 1, 129).to(lens.theta_max)[:, None]
+    azimuth = torch.linspace(0, 2 * math.pi, 181).to(theta)
+    direction = torch.stack((torch.cos(azimuth), torch.sin(azimuth)), -1)
+    return lens.through_affine(lens.offset(theta, direction)).norm(dim=-1).max().item()
+
+
+def beyond_lens(lens: Lens, image_size: tuple[int, int]) -> Tensor:
+    """(4,), in the order of SIDES: whether the image reaches further than the one lens."""
+    return lens.side_angles(image_size)[0] >= lens.with_theta_max(None).theta_max
+
+
+def sides(lens: Lens, image_size: tuple[int, int]) -> Tensor:
+    """(4,) rad: `side_angles` of one lens, below 0 where the principal point is past that side."""
+    cx, cy = lens.center_in(image_size)[0].tolist()
+    height, width = image_size
+    past = (cx < -0.5, cy < -0.5, cx > width - 0.5, cy > height - 0.5)
+    angles = lens.side_angles(image_size)[0]
+    return torch.where(torch.tensor(past), -angles, angles)
+
+
+def outside_share(lens: Lens, image_size: tuple[int, int]) -> float:
+    """The share of rays up to θ_max, in equal steps of θ and φ, that land outside the image."""
+    steps = (torch.arange(128, dtype=torch.float64) + 0.5) / 128
+    pixels = lens.project_rays(lens.theta_max * steps[:, None], 2 * math.pi * steps, image_size)
+    last = pixels.new_tensor(image_size).flip(0) - 0.5
+    return 1 - ((pixels >= -0.5) & (pixels <= last)).all(-1).double().mean().item()
+
+
+class Patches(NamedTuple):
+    """Ring widths (px) and areas of a ring's patches (px), the smallest and the largest."""
+
+    width: tuple[float, float]
+    area: tuple[float, float]
+    ratio: float  # of the largest patch to the smallest
+
+
+def patches(lens: Lens, spacing: str, rings: int, sectors: int) -> Patches:
+    """How large the patches of one lens's partition are."""
+    grid = polar_grid(lens, (1, 1), rings=rings, sectors=sectors, samples=(1, 1), spacing=spacing)
+    borders = grid.borders[0]
+    stretch = 1.0 if lens.affine is None else lens.affine[0].det().abs().item()
+    # Of a circle of radius 1: the square of a length in pixels may be beyond what a float holds.
+    shares = ((borders / borders[-1]) ** 2).diff() * (math.pi / sectors * stretch)
+    areas = shares * borders[-1] ** 2
+    width, area, share = ((v.min().item(), v.max().item()) for v in (borders.diff(), areas, shares))
+    return Patches(width, area, share[1] / share[0])
+
+
+def best_spacing(lens: Lens, rings: int, sectors: int) -> str:
+    """The spacing that knows the lens and has the most even patches, in pixels, of one lens."""
+    usable = [s for s in SPACINGS if s != "radius" and _usable(lens, s)]
+    return min(usable, key=lambda spacing: patches(lens, spacing, rings, sectors).ratio)
+
+
+def describe(
+    lens: Lens, image_size: tuple[int, int] | None = None, *, rings: int = 16, sectors: int = 64
+) -> str:
+    """What a user wants to know of a lens: some twenty lines of text.
+
+    Args:
+        lens: one lens. image_size: (H, W); None means the lens's own.
+        rings, sectors: of the partition, for the sizes of its patches.
+
+    Raises:
+        ValueError: more than one lens, or no image_size.
+    """
+    if len(lens) != 1:
+        raise ValueError(f"describe takes one lens, got {len(lens)}")
+    lens = lens.detach().to("cpu", torch.float64)
+    if image_size is None:
+        if lens.image_size is None:
+            raise ValueError("this lens needs the image_size, (H, W)")
+        image_size = tuple(round(side) for side in lens.image_size[0].tolist())
+    return "\n".join(
+        f"{name:<16}{text}".rstrip()
+        for name, text in (
+            *_model(lens, image_size),
+            *_view(lens, image_size),
+            *_density(lens),
+            *_spacings(lens, rings, sectors),
+        )
+    )
+
+
+def _model(lens: Lens, image_size: tuple[int, int]) -> list[tuple[str, str]]:
+    names = lens.parameters + lens.optional
+    values = {name: getattr(lens, name) for name in names if getattr(lens, name) is not None}
+    cx, cy = lens.center_in(image_size)[0].tolist()
+    rows = [("model", type(lens).__name__)]
+    rows += [(f"  {name}", _numbers(value[0])) for name, value in values.items()]
+    rows += [
+        ("image", f"{image_size[1]} × {image_size[0]} px (width × height)"),
+        (
+            "principal point",
+            f"x {cx:.2f}, y {cy:.2f} px (pixel centres are integers)"
+            f"{', outside the sensor' if _is_outside(lens, image_size) else ''}",
+        ),
+    ]
+    if lens.affine is not None:
+        a, b, c, d = lens.affine[0].flatten().tolist()
+        rows.append(("affine", f"[[{a:.6g}, {b:.6g}], [{c:.6g}, {d:.6g}]]"))
+    if not lens.is_radial:
+        offset = f"{largest_offset(lens):.2f} px at most, by tangential and thin-prism terms"
+        rows.append(("off the curve", offset))
+    return rows
+
+
+def _is_outside(lens: Lens, image_size: tuple[int, int]) -> bool:
+    """Whether the principal point is not in the image."""
+    return bool((sides(lens, image_size) < 0).any())
+
+
+def _view(lens: Lens, image_size: tuple[int, int]) -> list[tuple[str, str]]:
+    angles = sides(lens, image_size).tolist()
+    left, top, right, bottom = angles
+    ends = zip(SIDES, angles, beyond_lens(lens, image_size).tolist(), strict=True)
+    corners = _corners(lens, image_size)
+    if _is_outside(lens, image_size):
+        corners = "on the row and the column of the principal point"
+    share = outside_share(lens, image_size)
+    return [
+        ("field of view", f"{_degrees(left + right)} across, {_degrees(top + bottom)} down, "
+                          f"{corners}"),
+        ("θ at the sides", ", ".join(
+            f"{side}: the lens ends before" if beyond else f"{side} {_degrees(angle)}"
+            for side, angle, beyond in ends)),
+        ("θ limit", f"{_both(lens.theta_limit)}: up to where r rises"),
+        ("θ_max", f"{_both(lens.theta_max)}: as far as it is used, r = {lens.r_max.item():.1f} px"),
+        ("outside sensor", f"{share:.1%} of the samples up to θ_max, in equal steps of θ"),
+    ]  # fmt: skip
+
+
+def _corners(lens: Lens, image_size: tuple[int, int]) -> str:
+    height, width = image_size
+    pixels = torch.tensor([[x, y] for y in (-0.5, height - 0.5) for x in (-0.5, width - 0.5)])
+    widest = lens.with_theta_max(None).rays(pixels, image_size)[0].tolist()
+    if math.isnan(sum(widest)):
+        return "the lens ends before the corners"
+    return f"{_degrees(max(widest[0] + widest[3], widest[1] + widest[2]))} between the corners"
+
+
+def _density(lens: Lens) -> list[tuple[str, str]]:
+    end = math.degrees(lens.theta_max.item())
+    degrees = torch.arange(0, end, 15, dtype=torch.float64)
+    degrees = torch.cat((degrees[end - degrees > 5], degrees.new_tensor([end])))
+    theta = torch.deg2rad(degrees).clamp(max=lens.theta_max.item())
+    rows = [("θ (°)", degrees, 1), ("r (px)", lens.project(theta), 1)]
+    density = pixels_per_degree(lens, theta)
+    rows += list(zip(("px/° along r", "px/° around"), density, (2, 2), strict=True))
+    return [("", "")] + [
+        (name, "".join(f"{value:>8.{digits}f}" for value in values.tolist()))
+        for name, values, digits in rows
+    ]
+
+
+def _spacings(lens: Lens, rings: int, sectors: int) -> list[tuple[str, str]]:
+    rows = [("", ""), ("spacing", f"ring width (px)   px a token   of {rings} × {sectors} tokens")]
+    best = best_spacing(lens, rings, sectors)
+    for spacing in SPACINGS:
+        if not _usable(lens, spacing):
+            rows.append((f"  {spacing}", "not for this θ_max: tan θ ends at 90°"))
+            continue
+        found = patches(lens, spacing, rings, sectors)
+        width, area = (f"{low:.1f} to {high:.1f}" for low, high in found[:2])
+        note = "  knows nothing of the lens" if spacing == "radius" else ""
+        note += "  <- the most even that knows it" if spacing == best else ""
+        rows.append((f"  {spacing}", f"{width:<18}{area:<18}1 : {found.ratio:.0f}{note}"))
+    return rows
+
+
+def _usable(lens: Lens, spacing: str) -> bool:
+    return spacing != "tan" or lens.theta_max.item() < math.pi / 2
+
+
+def _numbers(values: Tensor) -> str:
+    return ", ".join(f"{value:.7g}" for value in values.reshape(-1).tolist())
+
+
+def _degrees(angle: float) -> str:
+    return f"{math.degrees(angle):.2f}°"
+
+
+def _both(angle: Tensor) -> str:
+    return f"{_degrees(angle.item())} ({angle.item():.5f} rad)"

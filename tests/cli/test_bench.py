@@ -1,0 +1,86 @@
+import pytest
+import torch
+
+from darswin.bench import candidates, report
+from darswin.bench.memory import Memory
+from darswin.bench.timing import COMPILED, ONE_LENS, OURS, PRODUCTS, REFERENCE
+from darswin.cli import bench as command
+from darswin.cli.main import main
+from darswin.models import DarSwin
+
+
+def test_it_measures_and_writes(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(command, "THREADS", [1])
+    measured = []
+
+    def measure(mode, model, size, dtype, batch, name, threads):
+        measured.append((mode, dtype, name))
+        return Memory(mode, dtype, batch, name, 1, 2, 3)
+
+    monkeypatch.setattr(command.memory, "measure", measure)
+    options = ["--model", "darswin_a_nano", "--size", "32", "--batches", "1", "2"]
+    main(["bench", *options, "--seconds", "0.01", "--compiled", "--out", str(tmp_path)])
+    (path,) = tmp_path.glob("model--*.json")
+    assert path.with_suffix(".png").exists()
+    record = report.Record.load(path)
+    assert {t.case for t in record.timings} == {
+        (mode, dtype, batch, 1)
+        for mode in ("inference", "training")
+        for dtype in ("float32", "bfloat16")
+        for batch in (1, 2)
+    }
+    names = {
+        mode: {t.name for t in record.timings if t.mode == mode}
+        for mode in ("inference", "training")
+    }
+    assert names["inference"] == {OURS, ONE_LENS, REFERENCE, PRODUCTS}
+    assert names["training"] == {OURS, REFERENCE}
+    assert all(t.runs >= 100 for t in record.timings if t.mode == "inference" and t.batch == 1)
+    assert measured == [(m.mode, m.dtype, m.name) for m in record.memory]
+    assert set(measured) == {
+        (mode, dtype, name)
+        for mode in ("inference", "training")
+        for dtype in ("float32", "bfloat16")
+        for name in (OURS, REFERENCE)
+    }
+    assert {row["product"] for row in record.products} == {
+        "forward", "input gradient", "weight gradient",
+    }  # fmt: skip
+    printed = capsys.readouterr().out
+    assert report.table(record) in printed and str(path) in printed
+
+
+@pytest.mark.parametrize("name", ["darswin_a_nano", "dat_nano"])
+def test_the_products_are_all_of_the_model(name):
+    model, lens = candidates.network(name, 32).eval(), candidates.lens_of(32)
+    products = candidates.products_of(model, torch.randn(2, 3, 32, 32), lens, torch.float32)
+    layers = [m for m in model.modules() if isinstance(m, torch.nn.Linear)]
+    sizes = sorted((m.in_features, m.out_features) for m in layers)
+    assert sorted((p.in_features, p.out_features) for p, _ in products) == sizes
+    if isinstance(model, DarSwin):
+        # Tokens of the embedding, of three stages' blocks with twelve squares of their width each.
+        tokens, widths, depths = (256, 64, 16), (24, 48, 96), (1, 2, 1)
+        expected = 256 * 4 * 4 * 3 * 24 + 96 * 200
+        expected += sum(12 * t * w * w * d for t, w, d in zip(tokens, widths, depths, strict=True))
+        expected += sum(t * 4 * w * 2 * w for t, w in ((64, 24), (16, 48)))
+        assert candidates.operations_of(name, 32) == 2 * expected
+
+
+def test_candidates_that_disagree_are_not_timed():
+    runs = {OURS: lambda: torch.ones(3), REFERENCE: lambda: torch.ones(3) + 1e-3}
+    command._check(runs | {PRODUCTS: lambda: torch.zeros(1)}, 1e-2)
+    with pytest.raises(RuntimeError, match="darswin is off the reference's result"):
+        command._check(runs, 1e-4)
+
+
+def test_the_reference_is_compiled_with_freezing(monkeypatch):
+    asked = []
+
+    def compiled(model, **options):
+        asked.append(options)
+        return model
+
+    monkeypatch.setattr(torch, "compile", compiled)
+    runs = candidates.inference("darswin_a_nano", 32, torch.float32, 2, compiled=True)
+    assert COMPILED in runs and asked == [dict(options={"freezing": True}, dynamic=False)]
+    command._check(runs, 1e-4)

@@ -1,0 +1,335 @@
+import json
+
+import cv2
+import hypothesis.strategies as st
+import numpy as np
+import pytest
+import torch
+from helpers import fixture
+from hypothesis import given
+from PIL import ExifTags, Image, ImageOps
+
+from darswin.cli.main import main
+from darswin.cli.predict import predict, read_lens, resized
+from darswin.compat import load_official
+from darswin.data.wide_angle import IMAGENET_MEAN, IMAGENET_STD
+from darswin.lens import Equidistant, Spherical, from_dict, save
+from darswin.lens.orientation import in_upright_picture
+from darswin.models.saving import ModelCard, save_model
+from darswin.utils.exif import TURNS
+from darswin.utils.image import read_oriented
+
+LENS = {"model": "Spherical", "xi": 0.5, "fov": 2.8}
+
+
+@pytest.fixture
+def run(tmp_path):
+    return write_run(tmp_path)
+
+
+def write_run(folder):
+    """A run's folder with an untrained model in it, and a picture."""
+    options = dict(num_classes=6, in_chans=3, mean=[0.5] * 3, std=[0.25] * 3)
+    card = ModelCard("darswin_a_nano", options, list("abcdef"), 32, 2.8)
+    save_model(folder / "checkpoints" / "best.safetensors", card.create().state_dict(), card)
+    picture = np.random.default_rng(0).integers(256, size=(64, 96, 3), dtype=np.uint8)
+    cv2.imwrite(str(folder / "p.png"), picture)
+    return folder
+
+
+def test_the_most_probable_classes(run, capsys):
+    argv = ["predict", str(run / "p.png"), str(run / "p.png"), "--run", str(run), "--top", "3"]
+    main([*argv, "--lens", json.dumps(LENS)])
+    printed = json.loads(capsys.readouterr().out)
+    assert [p["image"] for p in printed] == [str(run / "p.png")] * 2
+    top = printed[0]["top"]
+    assert len({t["class"] for t in top}) == 3 and all(t["class"] in "abcdef" for t in top)
+    probabilities = [t["probability"] for t in top]
+    assert probabilities == sorted(probabilities, reverse=True) and sum(probabilities) <= 1.0001
+    (run / "lens.json").write_text(json.dumps(LENS))
+    main([*argv, "--lens", str(run / "lens.json"), "--out", str(run / "out.json")])
+    assert json.loads((run / "out.json").read_text()) == printed
+
+
+def test_it_is_what_the_model_says_of_the_normalised_picture(run):
+    from darswin.models.saving import load_model
+
+    (found,) = predict([str(run / "p.png")], lens=json.dumps(LENS), run=str(run), top=6)
+    net, _ = load_model(run / "checkpoints" / "best.safetensors")
+    image = cv2.imread(str(run / "p.png"))[..., ::-1]
+    image = cv2.resize(np.ascontiguousarray(image), (48, 32), interpolation=cv2.INTER_AREA)
+    image = (torch.from_numpy(image).permute(2, 0, 1)[None] / 255 - 0.5) / 0.25
+    expected = net(image, Spherical.from_fov(0.5, 2.8, 16)).softmax(-1)[0]
+    for entry in found["top"]:
+        k = "abcdef".index(entry["class"])
+        assert entry["probability"] == pytest.approx(expected[k].item(), abs=1e-5)
+
+
+def test_what_is_missing_is_said(run):
+    with pytest.raises(SystemExit, match=r"cannot read .*none\.png"):
+        main(["predict", "none.png", "--run", str(run), "--lens", json.dumps(LENS)])
+    with pytest.raises(SystemExit, match="--run, a run's folder, or --model"):
+        main(["predict", "none.png", "--lens", json.dumps(LENS)])
+    with pytest.raises(SystemExit, match='"model" must be one of'):
+        main(["predict", str(run / "p.png"), "--run", str(run), "--lens", "{}"])
+
+
+def test_calibration_files(run):
+    """Of another tool, whose pictures are larger; of several cameras; of another shape."""
+    calibration = {"value0": {"intrinsics": [
+        {"camera_type": "ucm", "intrinsics": dict(fx=fx, fy=fx, cx=95.5, cy=63.5, alpha=0.5)}
+        for fx in (80.0, 120.0)
+    ], "resolution": [[192, 128]] * 2}}  # fmt: skip
+    path = run / "calibration.json"
+    path.write_text(json.dumps(calibration))
+    argv = ["predict", str(run / "p.png"), "--run", str(run), "--out", str(run / "o.json")]
+    with pytest.raises(SystemExit, match="choose one as camera=: 'cam0', 'cam1'"):
+        main([*argv, "--lens", str(path)])
+    main([*argv, "--lens", str(path), "--camera", "cam1"])
+    found = json.loads((run / "o.json").read_text())
+    # The same lens in pixels of the picture, half as large: its center stays between two pixels.
+    lens = in_upright_picture(read_lens(str(path), (64, 96), "cam1"), (64, 96), 1)
+    assert lens.focal.item() == pytest.approx(60) and lens.center.tolist() == [[47.5, 31.5]]
+    assert lens.image_size.tolist() == [[64, 96]]
+    same = dict(
+        model="EnhancedUnified", alpha=0.5, beta=1, focal=60, theta_max=lens.theta_max.item()
+    )
+    main([*argv, "--lens", json.dumps(same)])
+    for a, b in zip(
+        found[0]["top"], json.loads((run / "o.json").read_text())[0]["top"], strict=True
+    ):
+        assert a["probability"] == pytest.approx(b["probability"], abs=1e-5)
+    calibration["value0"]["resolution"] = [[192, 192]] * 2
+    path.write_text(json.dumps(calibration))
+    with pytest.raises(SystemExit, match="pictures of 192×192 px, and 64×96 is not of that shape"):
+        main([*argv, "--lens", str(path), "--camera", "cam1"])
+    with pytest.raises(SystemExit, match="focal is missing"):
+        main([*argv, "--lens", '{"model": "Spherical", "xi": 0.5}'])
+
+
+def answers(argv, run, capsys) -> list[dict]:
+    main(["predict", *argv, "--run", str(run), "--top", "6"])
+    return json.loads(capsys.readouterr().out)
+
+
+def close(one: dict, other: dict) -> bool:
+    a, b = ({t["class"]: t["probability"] for t in answer["top"]} for answer in (one, other))
+    return all(a[name] == pytest.approx(b[name], abs=1e-4) for name in a)
+
+
+def test_one_bad_picture_of_many(run, capsys):
+    """The others' answers are printed, the bad ones named, and the command fails."""
+    good, bad = str(run / "p.png"), str(run / "bad.jpg")
+    (run / "bad.jpg").write_bytes(b"no picture")
+    cv2.imwrite(str(run / "small.png"), np.zeros((40, 40, 3), np.uint8))
+    lens = json.dumps(LENS | {"image_size": [64, 96]})
+    pictures = [bad, good, str(run / "none.png"), str(run / "small.png"), good]
+    with pytest.raises(SystemExit) as caught:
+        main(["predict", *pictures, "--run", str(run), "--lens", lens])
+    found = json.loads(capsys.readouterr().out)
+    assert [answer["image"] for answer in found] == [good, good]
+    first, *lines = str(caught.value).splitlines()
+    assert first == "darswin: no answer for 3 of 5 pictures:"
+    for line, name in zip(lines, ("bad.jpg", "none.png", "small.png"), strict=True):
+        assert name in line
+    with pytest.raises(SystemExit):
+        main(["predict", bad, good, "--run", str(run), "--lens", lens, "--out", f"{run}/o.json"])
+    assert len(json.loads((run / "o.json").read_text())) == 1
+    with pytest.raises(SystemExit, match=r"none\.json"):  # a lens that is wrong ends it at once
+        main(["predict", good, bad, "--run", str(run), "--lens", "none.json"])
+
+
+@pytest.fixture(scope="module")
+def mixed(tmp_path_factory):
+    """A run, pictures that its lens fits, and others that have no answer."""
+    folder = tmp_path_factory.mktemp("mixed")
+    write_run(folder)
+    (folder / "broken.png").write_bytes(b"\x89PNG\r\n\x1a\n")
+    (folder / "folder.png").mkdir()
+    cv2.imwrite(str(folder / "q.png"), np.zeros((32, 48), np.uint8))
+    cv2.imwrite(str(folder / "square.png"), np.zeros((40, 40, 3), np.uint8))
+    return folder
+
+
+GOOD, BAD = ("p.png", "q.png"), ("broken.png", "folder.png", "square.png", "none.png")
+
+
+@given(st.lists(st.sampled_from(GOOD + BAD), min_size=1, max_size=6), st.integers(-3, 9))
+def test_every_picture_is_answered_or_named(mixed, pictures, top):
+    argv = [str(mixed / name) for name in pictures]
+    argv += ["--run", str(mixed), "--top", str(top), "--out", str(mixed / "out.json")]
+    argv += ["--lens", json.dumps(LENS | {"image_size": [64, 96]})]
+    good = [str(mixed / name) for name in pictures if name in GOOD and top > 0]
+    (mixed / "out.json").unlink(missing_ok=True)
+    if len(good) == len(pictures):
+        main(["predict", *argv])
+    else:
+        with pytest.raises(SystemExit) as caught:
+            main(["predict", *argv])
+        named = all(name in str(caught.value) for name in pictures if name in BAD)
+        assert named if top > 0 else "--top must be at least 1" in str(caught.value)
+    found = json.loads((mixed / "out.json").read_text()) if good else []
+    assert [answer["image"] for answer in found] == good
+    assert all(len(answer["top"]) == min(top, 6) for answer in found)
+
+
+@pytest.mark.parametrize("top", [0, -1])
+def test_how_many_classes(run, top):
+    argv = ["predict", str(run / "p.png"), "--run", str(run), "--lens", json.dumps(LENS)]
+    with pytest.raises(SystemExit, match=f"--top must be at least 1, got {top}"):
+        main([*argv, "--top", str(top)])
+
+
+COLMAP = """1 OPENCV_FISHEYE 96 64 40 40 48 32 0 0 0 0
+2 OPENCV_FISHEYE 96 64 30 30 48 32 0 0 0 0
+5 OPENCV_FISHEYE 96 64 20 20 48 32 0 0 0 0
+"""
+
+
+def test_a_camera_that_is_called_by_a_number(run, capsys):
+    (run / "cameras.txt").write_text(COLMAP)
+    picture, calibration = str(run / "p.png"), str(run / "cameras.txt")
+    for name, focal in (("1", 40), ("2", 30), ("5", 20)):
+        lens = read_lens(calibration, (64, 96), name)
+        assert lens.focal.item() == focal
+        save(lens, run / "lens.json")
+        (same,) = answers([picture, "--lens", str(run / "lens.json")], run, capsys)
+        argv = [picture, "--lens", calibration, "--camera", name]
+        assert close(answers(argv, run, capsys)[0], same)
+
+
+def exif_picture(path, orientation, stored):
+    """A picture file of these pixels (RGB) with an EXIF orientation."""
+    exif = Image.Exif()
+    exif[ExifTags.Base.Orientation] = orientation
+    Image.fromarray(stored).save(path, exif=exif)
+
+
+# With each thing that a turn changes: a center, oblong pixels, tangential terms.
+SENSOR_LENS = {
+    "model": "KannalaBrandt", "focal": 30, "radial": [0.02, -0.01], "tangential": [0.01, -0.02],
+    "theta_max": 1.3, "center": [52.0, 29.0], "affine": [[1.0, 0.02], [0.0, 0.95]],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("size", [[64, 96], None])
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_a_picture_that_exif_turns_is_answered_as_the_upright_one(run, capsys, orientation, size):
+    """The same rays in the same pixels: the upright file with its lens found by another way."""
+    lens = from_dict(SENSOR_LENS | {"image_size": [64, 96]})
+    stored = cv2.imread(str(run / "p.png"))[..., ::-1]
+    exif_picture(run / "exif.png", orientation, np.ascontiguousarray(stored))
+    upright = np.asarray(ImageOps.exif_transpose(Image.open(run / "exif.png")).convert("RGB"))
+    exif_picture(run / "upright.png", 1, upright)
+
+    # Pillow turns pictures of the pixels' places, which tell where a pixel went.
+    y, x = np.mgrid[:64, :96].astype(np.uint8)
+    exif_picture(run / "places.png", orientation, np.stack((x, y, y), -1))
+    places = np.asarray(ImageOps.exif_transpose(Image.open(run / "places.png")))[..., :2]
+    seen = read_oriented(run / "exif.png")
+    assert np.array_equal(seen[0], upright) and seen[1] == orientation
+    turn = in_upright_picture(lens, upright.shape[:2], orientation)
+    pixels = torch.from_numpy(places.astype(np.float32)).reshape(-1, 2)
+    theta, azimuth = lens.unproject_pixels(pixels)
+    v, u = np.mgrid[: upright.shape[0], : upright.shape[1]].astype(np.float32)
+    theirs = turn.unproject_pixels(torch.from_numpy(np.stack((u, v), -1)).reshape(-1, 2))
+    torch.testing.assert_close(theirs[0], theta, atol=1e-4, rtol=0, equal_nan=True)
+    # The camera's own axes turn with the picture: a ray to the right of the upright picture.
+    inside = ~theta[0].isnan()
+    ours, there = ((a.cos()[0, inside], a.sin()[0, inside]) for a in (theirs[1], azimuth))
+    swapped, across, down = TURNS[orientation]
+    there = there[::-1] if swapped else there
+    for got, want, sign in zip(ours, there, (across, down), strict=True):
+        torch.testing.assert_close(got, -want if sign else want, atol=2e-3, rtol=0)
+
+    described = SENSOR_LENS | ({"image_size": size} if size else {})
+    (answer,) = answers([str(run / "exif.png"), "--lens", json.dumps(described)], run, capsys)
+    save(turn, run / "turned.json")
+    argv = [str(run / "upright.png"), "--lens", str(run / "turned.json")]
+    assert close(answer, answers(argv, run, capsys)[0])
+
+
+def test_a_calibration_of_upright_pictures(run, capsys):
+    """One of OpenCV, which turned them upright as it read them: known by its shape."""
+    stored = cv2.imread(str(run / "p.png"))[..., ::-1]
+    exif_picture(run / "exif.jpg", 6, np.ascontiguousarray(stored))
+    image, orientation = read_oriented(run / "exif.jpg")
+    assert image.shape == (96, 64, 3) and orientation == 6
+    lens = from_dict(dict(SENSOR_LENS, image_size=[96, 64]))
+    assert torch.equal(in_upright_picture(lens, (96, 64), 6).center, lens.center)
+    described = json.dumps(dict(SENSOR_LENS, image_size=[90, 90]))
+    with pytest.raises(
+        SystemExit, match=r"exif\.jpg: .* not of that shape .*EXIF orientation is 6"
+    ):
+        main(["predict", str(run / "exif.jpg"), "--run", str(run), "--lens", described])
+
+
+class Square(torch.nn.Module):
+    image_size = (64, 64)
+
+
+@given(
+    st.integers(8, 200), st.integers(8, 200), st.integers(8, 64), st.booleans(), st.floats(0, 1.2)
+)
+def test_the_lens_of_a_resized_picture_is_exact(height, width, side, square, theta):
+    """Where a ray lands in the resized picture is where its pixel went, in the place `cv2.resize`
+    gives it."""
+    lens = Equidistant(
+        50.0, theta_max=1.3, center=(width / 3, height / 2), image_size=(height, width)
+    )
+    net = Square() if square else torch.nn.Identity()
+    image = np.zeros((height, width, 3), np.uint8)
+    small, taken_with = resized(net, ModelCard("", size=side), image, lens)
+    azimuth = torch.linspace(0, 6, 7)
+    before = lens.project_rays(theta, azimuth[None])[0]
+    top = left = 0
+    if square:
+        cut = min(height, width)
+        top, left = (height - cut) // 2, (width - cut) // 2
+        height = width = cut
+    scale = torch.tensor([small.shape[3] / width, small.shape[2] / height])
+    expected = (before - torch.tensor([left, top]) + 0.5) * scale - 0.5
+    after = taken_with.project_rays(theta, azimuth[None])[0]
+    torch.testing.assert_close(after, expected, atol=1e-3, rtol=0)
+    assert taken_with.image_size.tolist() == [list(small.shape[2:])]
+
+
+def test_weights_of_the_released_model(tmp_path, capsys):
+    """As `darswin convert` writes them: what the released code computes of ImageNet's pixels."""
+    _, state, _ = fixture("angular")
+    pixels = np.random.default_rng(1).integers(256, size=(64, 64, 3), dtype=np.uint8)
+    cv2.imwrite(str(tmp_path / "p.png"), pixels[..., ::-1])
+    config = {"DATA": {"IMG_SIZE": 64}}
+    torch.save({"model": state, "config": config, "epoch": 325}, tmp_path / "released.pth")
+    main(["convert", str(tmp_path / "released.pth"), str(tmp_path / "m.safetensors")])
+    argv = ["predict", str(tmp_path / "p.png"), "--lens", json.dumps(LENS), "--top", "10"]
+    main([*argv, "--model", str(tmp_path / "m.safetensors")])
+    (found,) = json.loads(capsys.readouterr().out)
+    mean, std = (torch.tensor(t)[:, None, None] for t in (IMAGENET_MEAN, IMAGENET_STD))
+    image = (torch.from_numpy(pixels).permute(2, 0, 1) / 255 - mean) / std
+    with torch.no_grad():
+        logits = load_official(state)(image[None], Spherical.from_fov(0.5, 2.8, 32.0))
+    expected = logits.softmax(-1)[0]
+    for entry in found["top"]:
+        assert entry["probability"] == pytest.approx(expected[entry["class"]].item(), abs=1e-5)
+    # Its pictures are square: of another the middle is taken.
+    cv2.imwrite(str(tmp_path / "p.png"), np.pad(pixels, ((0, 0), (8, 8), (0, 0)))[..., ::-1])
+    main([*argv, "--model", str(tmp_path / "m.safetensors")])
+    assert close(found, json.loads(capsys.readouterr().out)[0])
+    torch.save({"model": {"a": torch.ones(2)}}, tmp_path / "other.pth")
+    main(["convert", str(tmp_path / "other.pth"), str(tmp_path / "other.safetensors")])
+    with pytest.raises(
+        SystemExit, match="not the name of their model, and are not a state dict of"
+    ):
+        main([*argv, "--model", str(tmp_path / "other.safetensors")])
+
+
+def test_lenses_from_json():
+    lens = from_dict({"model": "Spherical", "xi": 0.5, "focal": 20, "theta_max": 1.2}, (9, 9))
+    assert lens.focal.item() == 20
+    lens = from_dict({"model": "Perspective", "fov": 2.0}, (40, 60))
+    assert lens.r_max.item() == pytest.approx(20)
+    lens = from_dict({"model": "Polynomial", "coefficients": [9, 1], "theta_max": 1}, (9, 9))
+    assert lens.r_max.item() == pytest.approx(10)
+    with pytest.raises(ValueError, match="Spherical lens cannot be made of"):
+        from_dict({"model": "Spherical", "x": 0.5}, (9, 9))

@@ -1,0 +1,147 @@
+"""Exported models compute what the model does, at other batch sizes, and without `darswin`."""
+
+import importlib.util
+import subprocess
+import sys
+
+import pytest
+import torch
+
+from darswin import _C, create_model
+from darswin.deploy.export import export_onnx, export_program
+from darswin.lens import Polynomial, Spherical
+
+SPHERICAL = Spherical.from_fov([0.2, 0.9], 2.6, 16.0)
+# θ_max = 115°.
+POLYNOMIAL = Polynomial([[7.0, 0.4, -0.1, 0.05], [7.5, 0.3, -0.1, 0.05]], 2.0, [15.0, 17.0])
+
+ONE_BLOCK = dict(depths=(1,), num_heads=(1,))  # tracing takes as long as there are nodes
+
+
+def short(name, **options):
+    options = dict(num_classes=5, depths=(1, 1), num_heads=(1, 2)) | options
+    return create_model(name, **options).eval()
+
+
+def batch_of(lens, count):
+    """Images and lenses, and the lenses' tensors by name."""
+    lens = lens[[k % len(lens) for k in range(count)]]
+    return torch.randn(count, 3, 32, 32), lens, tensors_of(lens)
+
+
+def tensors_of(lens):
+    names = (*lens.parameters, "theta_max", "center")
+    return {name: getattr(lens, name) for name in names if getattr(lens, name) is not None}
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "lens"),
+    [
+        # A radius that only Newton's method takes back to an angle.
+        ("darswin_ra_nano", dict(spacing="radius", sample_spacing="theta"), POLYNOMIAL),
+        ("darswin_a_nano", dict(compat="official", rings=16, sectors=64), SPHERICAL),
+        ("swin_nano", {}, SPHERICAL),
+    ],
+)
+def test_program(name, options, lens):
+    model = short(name, **options)
+    program = export_program(model, *batch_of(lens, 1)[:2]).module()
+    for count in (1, 2, 5):
+        images, lenses, tensors = batch_of(lens, count)
+        torch.testing.assert_close(program(images, **tensors), model(images, lenses))
+
+
+def test_program_of_camera_frames_through_one_lens():
+    model = short("darswin_a_nano", mean=0.5, std=0.2)
+    frames = torch.randint(256, (3, 20, 30, 3), dtype=torch.uint8)
+    program = export_program(model, frames[:1], SPHERICAL[1], fixed_lens=True)
+    torch.testing.assert_close(program.module()(frames), model(frames, SPHERICAL[1]))
+
+
+ELSEWHERE = """
+import sys, torch
+torch.ops.load_library(sys.argv[1])
+model = torch._inductor.aoti_load_package("model.pt2")
+for name, (images, tensors, logits) in torch.load("calls.pt").items():
+    tensors = dict(reversed(tensors.items()))  # by name, in any order
+    torch.testing.assert_close(
+        model(images, **tensors), logits, rtol=1e-4, atol=1e-5, msg=lambda m: name + m
+    )
+assert "darswin" not in sys.modules
+"""
+
+
+def test_package_in_a_process_without_the_package(tmp_path):
+    model = short("darswin_a_nano", mean=0.5, std=0.2)
+    lens = Spherical.from_fov([0.3, 0.6, 0.9], 2.6, 16.0)
+    frames = torch.randint(256, (3, 32, 40, 3), dtype=torch.uint8)
+    program = export_program(model, frames, lens)
+    torch._inductor.aoti_compile_and_package(program, package_path=str(tmp_path / "model.pt2"))
+    shared = {name: t[:1].expand(3) for name, t in tensors_of(lens).items()}
+    columns = dict(
+        zip(tensors_of(lens), torch.stack((*tensors_of(lens).values(),), 1).unbind(1), strict=True)
+    )
+    large = torch.randint(256, (4, 3, 70, 52), dtype=torch.uint8)
+    crop = large.permute(0, 2, 3, 1)[1:, 3:67:2, 5:45]
+    assert not crop.is_contiguous() and not columns["xi"].is_contiguous()
+    calls = {
+        "as it was made": (frames, tensors_of(lens)),
+        "one image": (frames[1:2], tensors_of(lens[1])),
+        "one lens, expanded": (frames, shared),
+        "one image, expanded": (frames[:1].expand(3, -1, -1, -1), tensors_of(lens)),
+        "columns of a table, crops of a picture": (crop, columns),
+    }
+    for name, (images, tensors) in calls.items():
+        with torch.no_grad():
+            calls[name] = (images, tensors, model(images, Spherical(**tensors)))
+    torch.save(calls, tmp_path / "calls.pt")
+    command = [sys.executable, "-c", ELSEWHERE, _C.__file__]
+    run = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+    assert run.returncode == 0, run.stderr
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "lens"),
+    [
+        ("darswin_a_nano", {}, POLYNOMIAL),
+        ("darswin_ra_nano", ONE_BLOCK, POLYNOMIAL[0]),
+        ("swin_undis_nano", ONE_BLOCK, SPHERICAL),
+        ("dat_nano", dict(ONE_BLOCK, blocks=("D",), groups=(1,)), SPHERICAL),
+    ],
+)
+def test_onnx(name, options, lens, tmp_path):
+    onnxruntime = pytest.importorskip("onnxruntime")
+    model, fixed = short(name, **options), len(lens) == 1
+    path = tmp_path / "model.onnx"
+    export_onnx(model, path, *batch_of(lens, 1)[:2], fixed_lens=fixed)
+    assert [file.name for file in tmp_path.iterdir()] == ["model.onnx"]
+    session = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
+    for count in (1, 5):
+        images, lenses, tensors = batch_of(lens, count)
+        inputs = dict(images=images) | ({} if fixed else tensors)
+        assert [i.name for i in session.get_inputs()] == list(inputs)
+        (logits,) = session.run(["logits"], {name: t.numpy() for name, t in inputs.items()})
+        with torch.no_grad():
+            expected = model(images, lenses)
+        error = (torch.from_numpy(logits) - expected).abs().max()
+        assert error <= 1e-4 * expected.abs().max()
+
+
+def test_what_is_missing_is_named_with_packages_that_exist(monkeypatch):
+    found = importlib.util.find_spec
+    monkeypatch.setattr(
+        importlib.util, "find_spec", lambda name: None if name == "onnxscript" else found(name)
+    )
+    expected = "^onnxscript missing; .*: pip install 'onnx>=1.18' 'onnxscript>=0.6'$"
+    with pytest.raises(ModuleNotFoundError, match=expected):
+        export_onnx(short("swin_nano"), "model.onnx", torch.zeros(1, 3, 32, 32))
+
+
+def test_errors():
+    model, (images, lens, _) = short("darswin_a_nano"), batch_of(SPHERICAL, 2)
+    with pytest.raises(ValueError, match="fixed_lens needs a single lens, got Spherical"):
+        export_program(model, images, lens, fixed_lens=True)
+    with pytest.raises(ValueError, match="fixed_lens needs a single lens, got None"):
+        export_program(model, images, fixed_lens=True)
+    with pytest.raises(ValueError, match="model must be in eval mode"):
+        export_program(model.train(), images, lens)

@@ -1,0 +1,213 @@
+import copy
+import math
+import pickle
+
+import pytest
+import torch
+
+from darswin import create_model, optimize
+from darswin.deploy import optimize as module
+from darswin.layers import onednn
+from darswin.layers.position_bias import RelativeBias
+from darswin.lens import KannalaBrandt, Spherical
+from darswin.ops import use_reference
+
+LENSES = Spherical.from_fov([0.2, 0.9], math.radians(160), 16.0)
+MODELS = ["darswin_a_nano", "darswin_ra_nano", "swin_nano", "swin_undis_nano", "dat_nano"]
+
+
+def network(name="darswin_a_nano", **options):
+    """A model whose every parameter counts: as initialised, biases and offsets are close to 0."""
+    model = create_model(name, **(dict(num_classes=10) | options)).eval()
+    for parameter in model.parameters():
+        torch.nn.init.normal_(parameter, mean=1.0 if parameter.dim() == 1 else 0.0, std=0.2)
+    return model
+
+
+def error(got, want):
+    return ((got.float() - want).norm() / want.norm()).item()
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("name", MODELS)
+@pytest.mark.parametrize("layout", ["tokens of every image", "one image"])
+def test_float32_is_the_same(name, layout):
+    model = network(name)
+    images = torch.randn(2 if layout == "tokens of every image" else 1, 3, 32, 32)
+    lenses = LENSES[: len(images)]
+    with use_reference():
+        want = model(images, lenses)
+    assert error(optimize(model)(images, lenses), want) < 1e-5
+
+
+@torch.no_grad()
+@pytest.mark.parametrize(
+    "options",
+    [
+        dict(position_bias="angular"),
+        dict(position_bias="polar"),
+        dict(periodic_bias=True),
+        dict(compat="official"),
+        dict(num_classes=0),
+    ],
+    ids=str,
+)
+def test_options(options):
+    model = network(**options)
+    images = torch.randn(2, 3, 32, 32)
+    want = model(images, LENSES[:1])
+    assert error(optimize(model)(images, LENSES[:1]), want) < 1e-5
+    assert error(optimize(model, lens=LENSES[:1])(images), want) < 1e-5
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("name", MODELS)
+def test_bfloat16_is_as_close_as_autocast(name):
+    model = network(name)
+    images = torch.randn(2, 3, 32, 32)
+    want = model(images, LENSES)
+    with torch.autocast("cpu", torch.bfloat16):
+        autocast = error(model(images, LENSES), want)
+    got = optimize(model, torch.bfloat16)(images, LENSES)
+    assert got.dtype == torch.bfloat16
+    assert error(got, want) < 2 * autocast < 0.1
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("name", ["darswin_a_nano", "dat_nano"])
+@pytest.mark.parametrize("lenses", [slice(0, 1), slice(0, 5)])
+def test_large_batches_go_in_parts(monkeypatch, name, lenses):
+    model = network(name)
+    images = torch.randn(5, 3, 32, 32)
+    lens = Spherical.from_fov([0.0, 0.2, 0.5, 0.7, 0.9], math.radians(160), 16.0)[lenses]
+    want = model(images, lens)
+    image = 256 * 4 * 24 * 4  # bytes of a hidden map of the first stage
+    sizes = []
+    blocks = module._Stage._blocks
+    monkeypatch.setattr(
+        module._Stage, "_blocks", lambda stage, x, t: sizes.append(len(x)) or blocks(stage, x, t)
+    )
+    for most, parts in ((1, [1] * 5), (2 * image, [2, 2, 1]), (5 * image, [5])):
+        monkeypatch.setattr(module, "CACHED_BYTES", most)
+        sizes.clear()
+        assert error(optimize(model)(images, lens), want) < 1e-5
+        assert sizes[: len(parts)] == parts
+
+
+@torch.no_grad()
+def test_methods_and_camera_frames():
+    model = network(mean=0.5, std=0.25)
+    frames = torch.randint(256, (2, 40, 32, 3), dtype=torch.uint8)
+    lens = LENSES[0:1]
+    for optimized, given in ((optimize(model), [lens]), (optimize(model, lens=lens), [])):
+        features, maps = model.forward_intermediates(frames, lens)
+        got, got_maps = optimized.forward_intermediates(frames, *given)
+        assert error(got, features) < 1e-5
+        assert [m.shape for m in got_maps] == [m.shape for m in maps]
+        assert all(error(a, b) < 1e-5 for a, b in zip(got_maps, maps, strict=True))
+        assert error(optimized.forward_head(features), model.forward_head(features)) < 1e-5
+
+
+@torch.no_grad()
+def test_one_lens_is_folded_once(monkeypatch):
+    model = network()
+    optimized = optimize(model, lens=LENSES[:1])
+    sizes = [(32, 32), (40, 36)]
+    images = {size: torch.randn(1, 3, *size) for size in sizes}
+    want = {size: model(images[size], LENSES[:1]) for size in sizes}
+    for size in sizes:
+        assert error(optimized(images[size]), want[size]) < 1e-5
+    monkeypatch.setattr(RelativeBias, "forward", None)
+    monkeypatch.setattr(type(LENSES), "project", None)
+    for size in sizes:
+        assert error(optimized(images[size]), want[size]) < 1e-5
+    with pytest.raises(ValueError, match="call it without one"):
+        optimized(images[sizes[0]], LENSES[:1])
+
+
+def test_the_model_stays_as_it_is():
+    model = network().train()
+    images = torch.randn(2, 3, 32, 32)
+    optimized = optimize(model)
+    want = optimized(images, LENSES)
+    assert not want.requires_grad
+    assert model.training and all(p.requires_grad for p in model.parameters())
+    model(images, LENSES).sum().backward()
+    with torch.no_grad():
+        for parameter in model.parameters():
+            assert parameter.grad is not None
+            parameter.add_(1.0)
+    torch.testing.assert_close(optimized(images, LENSES), want)  # a copy, not a view
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+def test_without_onednn_it_warns_and_goes_on(monkeypatch, dtype):
+    model = network()
+    images = torch.randn(2, 3, 32, 32)
+    usual = optimize(model, dtype)(images, LENSES)
+    monkeypatch.setattr(torch.backends.mkldnn, "is_available", lambda: False)
+    with pytest.warns(UserWarning, match="built without oneDNN"):
+        plain = optimize(model, dtype)
+    monkeypatch.delattr(torch.ops.mkldnn, "_linear_pointwise")
+    assert error(plain(images, LENSES), usual.float()) < (1e-5 if dtype == torch.float32 else 2e-2)
+
+
+def test_what_cannot_be_optimized():
+    with pytest.raises(TypeError, match="model must be one of create_model, got Linear"):
+        optimize(torch.nn.Linear(2, 2))
+    with pytest.raises(ValueError, match=r"dtype must be .* got torch.float16"):
+        optimize(network(), torch.float16)
+    with pytest.raises(ValueError, match="on the CPU"):
+        optimize(network().to("meta"))
+    with pytest.raises(TypeError, match="optimized already"):
+        optimize(optimize(network()))
+    with pytest.raises(ValueError, match="lens must be one lens"):
+        optimize(network(), lens=LENSES)
+
+
+def test_missing_says_why(monkeypatch):
+    assert "float64" in onednn.missing(torch.float64)
+    with torch.backends.mkldnn.flags(enabled=False):
+        assert "enabled is False" in onednn.missing(torch.float32)
+    monkeypatch.setattr(torch.ops.mkldnn, "_is_mkldnn_bf16_supported", lambda: False)
+    assert "this CPU" in onednn.missing(torch.bfloat16)
+
+
+def test_one_lens_refuses_images_of_another_size_than_its_own():
+    camera = LENSES[:1].replace(image_size=torch.tensor([[32.0, 32.0]]))
+    fast = optimize(network(), lens=camera)
+    assert fast(torch.rand(1, 3, 32, 32)).shape == (1, 10)
+    with pytest.raises(ValueError, match=r"belongs to images of \(H, W\) = \(32, 32\)"):
+        fast(torch.rand(1, 3, 40, 32))
+
+
+@torch.no_grad()
+def test_a_bent_lens_is_optimized_too():
+    bent = KannalaBrandt(
+        10.0, [0.01], 1.5, affine=[[1.0, 0.1], [0.0, 1.1]], tangential=[0.02, 0.01]
+    )
+    model, images = network(), torch.rand(2, 3, 32, 32)
+    want = model(images, bent)
+    assert error(want, model(images, bent.replace(tangential=None))) > 1e-3
+    assert error(optimize(model)(images, bent), want) < 1e-5
+    assert error(optimize(model, lens=bent)(images), want) < 1e-5
+
+
+def test_what_an_optimized_model_does_not_do():
+    model = create_model("darswin_a_nano", num_classes=3, jitter=1.0).eval()
+    images, lens = torch.randn(1, 3, 32, 32), Spherical.from_fov(0.4, 2.6, 16.0)
+    for fast, arguments in ((optimize(model), (lens,)), (optimize(model, lens=lens), ())):
+        expected = fast(images, *arguments)
+        for action in (copy.copy, copy.deepcopy, pickle.dumps):
+            with pytest.raises(TypeError, match=r"neither copied nor pickled.*it was made of"):
+                action(fast)
+        with pytest.raises(TypeError, match="not saved: save the model it was made of"):
+            fast.state_dict()
+        with pytest.raises(TypeError, match="not trained: train the model it was made of"):
+            fast.train()
+        leaf = images.clone().requires_grad_()
+        with pytest.raises(RuntimeError, match="has no gradients, but its images or its lens"):
+            fast(leaf, *arguments)
+        with torch.no_grad():
+            assert torch.equal(fast.eval()(leaf, *arguments), expected)

@@ -1,0 +1,193 @@
+import math
+
+import pytest
+import torch
+
+from darswin.layers.grid import PLACEMENTS, SPACINGS, polar_grid
+from darswin.lens import Mei, Perspective, Polynomial, Spherical
+
+f64 = torch.float64
+SIZES = dict(rings=16, sectors=64, samples=(10, 10))
+
+
+def spherical(xi=0.0, fov=3.0479112779, radius=32.0):
+    return Spherical.from_fov(torch.tensor(xi, dtype=f64), fov, radius)
+
+
+@pytest.mark.parametrize(
+    ("xi", "spacing", "radii"),
+    [  # of rings 1, 2, 4, 8, 12, 15 at 64 px
+        (0.0, "tan", (2, 4, 8, 16, 24, 30)),
+        (0.0, "theta", (0.14, 0.29, 0.60, 1.43, 3.29, 10.49)),
+        (0.2, "tan", (7.9, 13.4, 20.2, 26.8, 30.1, 31.6)),
+        (0.2, "theta", (0.63, 1.27, 2.61, 5.91, 11.7, 22.9)),
+        (0.5, "tan", (12.7, 19.3, 25.2, 29.4, 31.1, 31.8)),
+        (0.5, "theta", (1.11, 2.24, 4.56, 9.88, 17.4, 27.0)),
+        (1.0, "tan", (16.8, 23.2, 27.8, 30.5, 31.5, 31.9)),
+        (1.0, "theta", (1.60, 3.20, 6.47, 13.4, 21.6, 29.1)),
+        (0.7, "radius", (2, 4, 8, 16, 24, 30)),
+    ],
+)
+def test_ring_borders_in_pixels(xi, spacing, radii):
+    borders = polar_grid(spherical(xi), (64, 64), **SIZES, spacing=spacing).borders
+    got = borders[0, [1, 2, 4, 8, 12, 15]]
+    torch.testing.assert_close(got, torch.tensor(radii, dtype=f64), rtol=0, atol=0.06)
+    assert borders[0, 0] == 0
+    torch.testing.assert_close(borders[0, -1], torch.tensor(32.0, dtype=f64))
+
+
+@pytest.mark.parametrize(
+    ("spacing", "degrees"),
+    [  # DarSwin-Unet at a field of view of 175°
+        ("g", (0, 13.7, 30.4, 45.3, 54.7, 60.9, 65.5, 69.2, 72.3, 74.9, 77.3, 79.4, 81.3, 83.0,
+               84.6, 86.1, 87.5)),
+        ("tan", (0, 55.1, 70.8, 76.9, 80.1, 82.1, 83.4, 84.3)),
+        ("theta", [87.5 * k / 16 for k in range(17)]),
+    ],
+)  # fmt: skip
+def test_ring_borders_in_degrees(spacing, degrees):
+    lens = spherical(0.3, math.radians(175))
+    borders = polar_grid(lens, (64, 64), **SIZES, spacing=spacing).borders
+    got = torch.rad2deg(lens.unproject(borders))[0, : len(degrees)]
+    torch.testing.assert_close(got, torch.tensor(degrees, dtype=f64), rtol=0, atol=0.06)
+
+
+@pytest.mark.parametrize("placement", PLACEMENTS)
+@pytest.mark.parametrize("sample_spacing", [None, *SPACINGS])
+@pytest.mark.parametrize("spacing", SPACINGS)
+def test_samples_lie_in_their_patches(spacing, sample_spacing, placement):
+    lens = Spherical.from_fov(torch.tensor([0.0, 0.4, 1.0], dtype=f64), 2.8, 30.0)
+    grid = polar_grid(
+        lens, (64, 64), rings=5, sectors=7, samples=(4, 3), spacing=spacing,
+        sample_spacing=sample_spacing, placement=placement,
+    )  # fmt: skip
+    radii = grid.radii.unflatten(1, (5, 4))
+    inner, outer = grid.borders[:, :-1, None], grid.borders[:, 1:, None]
+    assert grid.radii.shape == (3, 20) and grid.borders.shape == (3, 6)
+    assert (radii >= inner - 1e-9).all() and (radii <= outer + 1e-9).all()
+    assert (grid.borders.diff(dim=1) > 0).all() and (radii.diff(dim=2) > 0).all()
+    turns = (grid.azimuths * 7 / (2 * math.pi)).unflatten(0, (7, 3))
+    if placement == "edges":
+        torch.testing.assert_close(radii[:, :, ::3], torch.cat((inner, outer), 2))
+        torch.testing.assert_close(turns[2], torch.tensor([2.0, 2.5, 3.0], dtype=f64))
+    else:
+        torch.testing.assert_close(turns[2], 2 + torch.tensor([1, 3, 5], dtype=f64) / 6)
+
+
+@pytest.mark.parametrize("sample_spacing", SPACINGS)
+def test_sample_spacing_splits_each_ring_equally(sample_spacing):
+    lens = spherical(0.4, 2.8)
+    grid = polar_grid(
+        lens, (64, 64), rings=4, sectors=4, samples=(6, 2), spacing="theta",
+        sample_spacing=sample_spacing, placement="edges",
+    )  # fmt: skip
+    theta = lens.unproject(grid.radii)
+    measure = {
+        "theta": lambda t: t,
+        "tan": torch.tan,
+        "radius": lens.project,
+        "g": lambda t: (
+            8.31578947368421 / 3 * (t / 1.4) ** 5
+            + 2 / 3 * (1 - (1 - (t / 1.4).clamp(max=1)) ** 2.288135593220339)
+        ),
+    }[sample_spacing]
+    steps = measure(theta).unflatten(1, (4, 6)).diff(dim=2)
+    torch.testing.assert_close(steps, steps[..., :1].expand_as(steps), rtol=1e-6, atol=1e-9)
+    torch.testing.assert_close(
+        lens.unproject(grid.borders)[0], 1.4 * torch.arange(5, dtype=f64) / 4
+    )
+
+
+def test_works_beyond_90_degrees_except_for_tan():
+    lens = Polynomial([339.749, -31.988, 48.275, -7.201], math.radians(112))
+    for spacing in ("theta", "radius", "g"):
+        grid = polar_grid(lens, (966, 1280), **SIZES, spacing=spacing)
+        assert grid.radii.isfinite().all() and (grid.borders.diff(dim=1) > 0).all()
+    wide = Spherical(0.9, 30.0, math.pi / 2)
+    for options in (dict(spacing="tan"), dict(spacing="theta", sample_spacing="tan")):
+        for one in (lens, wide):
+            with pytest.raises(ValueError, match=r"spacing='tan' needs .* below 90°.*got \d+\.\d°"):
+                polar_grid(one, (966, 1280), **SIZES, **options)
+
+
+def test_center_and_batch():
+    lens = Perspective([10.0, 20.0], 1.0, center=[[3.0, 4.0], [5.0, 6.0]])
+    grid = polar_grid(lens, (48, 64), **SIZES)
+    assert grid.center.tolist() == [[3.0, 4.0], [5.0, 6.0]]
+    torch.testing.assert_close(grid.radii[1], 2 * grid.radii[0])
+    assert polar_grid(Perspective(10.0, 1.0), (48, 64), **SIZES).center.tolist() == [[31.5, 23.5]]
+    empty = polar_grid(lens[:0], (48, 64), **SIZES, spacing="tan")
+    assert empty.radii.shape == (0, 160)
+
+
+@pytest.mark.parametrize("spacing", SPACINGS)
+@pytest.mark.parametrize("sample_spacing", SPACINGS)
+def test_gradients_reach_the_lens(spacing, sample_spacing):
+    xi = torch.tensor([0.3, 0.6], dtype=f64, requires_grad=True)
+    focal = torch.tensor([20.0, 25.0], dtype=f64, requires_grad=True)
+    theta_max = torch.tensor([1.2, 1.3], dtype=f64, requires_grad=True)
+
+    def radii(xi, focal, theta_max):
+        return polar_grid(
+            Spherical(xi, focal, theta_max), (64, 64), rings=3, sectors=4, samples=(3, 2),
+            spacing=spacing, sample_spacing=sample_spacing,
+        ).radii  # fmt: skip
+
+    assert torch.autograd.gradcheck(radii, (xi, focal, theta_max))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (dict(rings=0), "rings must be an int of at least 1, got 0"),
+        (dict(sectors=2.0), "sectors must be an int"),
+        (dict(samples=(0, 3)), r"samples must be \(S_r, S_φ\)"),
+        (dict(samples=(3,)), r"samples must be \(S_r, S_φ\)"),
+        (dict(spacing="log"), "spacing must be one of"),
+        (dict(sample_spacing="log"), "sample_spacing must be one of"),
+        (dict(placement="middle"), "placement must be one of"),
+        (dict(placement="edges", samples=(1, 4)), "at least 2 samples"),
+    ],
+)
+def test_errors(change, message):
+    with pytest.raises(ValueError, match=message):
+        polar_grid(spherical(), (64, 64), **(SIZES | change))
+
+
+def camera(**aside):
+    """KITTI-360's image_02, to 95°."""
+    return Mei(torch.tensor([2.2134047507854890], dtype=f64), 1336.3220825849971,
+               [0.016798235660113681, 1.6548773243373522], math.radians(95),
+               [716.94323510126321, 705.76498308221585], **aside)  # fmt: skip
+
+
+@pytest.mark.parametrize("spacing", ["theta", "g", "radius"])
+@pytest.mark.parametrize(
+    "aside",
+    [
+        {"affine": [[1.0, 0.01], [0.0, 0.9996]]},
+        {"tangential": [4.2223943394772046e-4, 4.2462134260997584e-3]},
+        {"affine": [[1.0, 0.0], [0.0, 1.2]], "prism": [1e-3, 0.0, -2e-3, 0.0]},
+    ],
+)
+def test_points_are_where_the_lens_projects_their_rays(spacing, aside):
+    lens = camera(**aside)
+    grid = polar_grid(lens, (1400, 1400), **SIZES, spacing=spacing)
+    direction = torch.stack((torch.cos(grid.azimuths), torch.sin(grid.azimuths)), -1)
+    around = grid.radii[0, :, None, None] * direction
+    matrix = torch.eye(2, dtype=f64) if grid.affine is None else grid.affine[0]
+    points = grid.center[0] + around @ matrix.T
+    if grid.offsets is not None:
+        points = points + grid.offsets[0].permute(1, 2, 0)
+    theta = lens.unproject(grid.radii[0])
+    expected = lens.project_rays(theta[:, None], grid.azimuths[None])
+    torch.testing.assert_close(points, expected, rtol=0, atol=1e-8)
+    assert (grid.affine is None) == ("affine" not in aside)
+    assert (grid.offsets is None) == ("affine" in aside and "prism" not in aside)
+    if grid.offsets is not None:
+        assert grid.offsets.shape == (1, 2, 160, 640) and 0.5 < grid.offsets.abs().max() < 10
+
+
+def test_a_grid_of_a_round_lens_has_no_offsets():
+    grid = polar_grid(camera(), (1400, 1400), **SIZES)
+    assert grid.affine is None and grid.offsets is None

@@ -1,0 +1,143 @@
+import copy
+
+import pytest
+import torch
+import torch.nn.functional as F
+
+from darswin import create_model
+from darswin.layers import linear
+from darswin.layers.linear import Linear, choices
+from darswin.lens import Spherical
+
+LENSES = Spherical.from_fov([0.2, 0.9], 2.6, 16.0)
+
+
+@pytest.fixture(autouse=True)
+def forget():
+    """Every test measures for itself."""
+    linear._choices.clear()
+
+
+def results(layer, x):
+    """The output and all gradients of a random projection."""
+    x = x.detach().requires_grad_()
+    layer.zero_grad()
+    out = layer(x)
+    grad = torch.randn(out.shape, generator=torch.Generator().manual_seed(1)).to(out.dtype)
+    out.backward(grad)
+    return [out.detach(), x.grad, *(p.grad.clone() for p in layer.parameters())]
+
+
+def pick(monkeypatch, way):
+    """Makes the measuring find this way the fastest."""
+    monkeypatch.setattr(
+        linear, "_measure", lambda ways, _: {name: float(name != way) for name in ways}
+    )
+
+
+@pytest.mark.parametrize("bias", [True, False])
+@pytest.mark.parametrize("shape", [(12,), (1, 12), (2, 3, 5, 12), (300, 12)])
+@pytest.mark.parametrize("way", ["torch", "onednn"])
+def test_every_way_is_the_same(monkeypatch, way, shape, bias):
+    layer = Linear(12, 20, bias=bias)
+    x = torch.randn(shape)
+    exact = results(copy.deepcopy(layer).double(), x.double())
+    usual = results(layer, x)
+    pick(monkeypatch, way)
+    layer.products = "fastest"
+    for got, base, want in zip(results(layer, x), usual, exact, strict=True):
+        assert got.is_contiguous()
+        rounding = 4 * torch.finfo(torch.float32).eps * want.abs().max()
+        assert (got - want).abs().max() <= max(2 * (base - want).abs().max(), rounding)
+
+
+def test_onednn_asks_onednn_alone(monkeypatch):
+    monkeypatch.setattr(linear, "_measure", None)
+    calls = []
+    for product, ways in linear._WAYS.items():
+        way = ways["onednn"]
+        monkeypatch.setitem(
+            ways, "onednn", lambda *a, way=way, name=product: calls.append(name) or way(*a)
+        )
+    layer = Linear(12, 20)
+    layer.products = "onednn"
+    results(layer, torch.randn(4, 12))
+    assert calls == ["forward", "input gradient", "weight gradient"] and not choices()
+
+
+def test_fastest_measures_each_shape_once(monkeypatch):
+    measured = []
+
+    def measure(ways, arguments):
+        measured.append(arguments[0].shape)
+        return dict(zip(ways, (0.2, 0.1), strict=True))
+
+    monkeypatch.setattr(linear, "_measure", measure)
+    layer = Linear(12, 20)
+    layer.products = "fastest"
+    for rows in (5, 8, 8, 2):  # 5 to 8 rows are one shape
+        results(layer, torch.randn(rows, 12))
+    assert measured == [(5, 12), (5, 20), (5, 20), (2, 12), (2, 20), (2, 20)]
+    threads = torch.get_num_threads()
+    assert choices() == {
+        (product, rows, 12, 20, threads): {"onednn": 0.1, "torch": 0.2}
+        for rows in (8, 2)
+        for product in ("forward", "input gradient", "weight gradient")
+    }
+    assert all(next(iter(seconds)) == "onednn" for seconds in choices().values())
+
+
+def test_only_wanted_gradients():
+    layer = Linear(12, 20)
+    layer.products = "fastest"
+    x = torch.randn(4, 12, requires_grad=True)
+    layer.requires_grad_(False)
+    layer(x).sum().backward()
+    assert {shape.product for shape in choices()} == {"forward", "input gradient"}
+    torch.testing.assert_close(x.grad, layer.weight.sum(0).expand(4, 12))
+
+
+@pytest.mark.parametrize("products", ["onednn", "fastest"])
+def test_where_torch_multiplies_anyway(monkeypatch, products):
+    monkeypatch.setattr(linear, "_multiply", None)
+    layer = Linear(12, 20)
+    layer.products = products
+    x = torch.randn(4, 12)
+    with torch.autocast("cpu", torch.bfloat16):
+        assert layer(x).dtype == torch.bfloat16
+    half, double = copy.deepcopy(layer).bfloat16(), copy.deepcopy(layer).double()
+    assert torch.equal(half(x.bfloat16()), F.linear(x.bfloat16(), half.weight, half.bias))
+    assert double(x.double()).dtype == torch.float64
+    assert layer(x[:0]).shape == (0, 20)
+    compiled = torch.compile(layer, fullgraph=True, backend="aot_eager")
+    torch.testing.assert_close(compiled(x), F.linear(x, layer.weight, layer.bias))
+    with torch.backends.mkldnn.flags(enabled=False):
+        assert layer(x).shape == (4, 20)
+
+
+def test_no_second_derivative():
+    layer = Linear(12, 20)
+    layer.products = "onednn"
+    x = torch.randn(4, 12, requires_grad=True)
+    (grad,) = torch.autograd.grad(layer(x).square().sum(), x, create_graph=True)
+    with pytest.raises(RuntimeError, match="once_differentiable"):
+        grad.sum().backward()
+
+
+@pytest.mark.parametrize("name", ["darswin_a_nano", "swin_nano", "dat_nano"])
+def test_models_train_with_each_choice(name):
+    model = create_model(name, num_classes=10, drop_path_rate=0.0)
+    images = torch.randn(2, 3, 32, 32)
+    gradients = {}
+    for products in linear.PRODUCTS:
+        model.set_products(products)
+        model.zero_grad()
+        torch.manual_seed(0)  # of the jitter
+        model(images, LENSES).square().sum().backward()
+        gradients[products] = [p.grad.clone() for p in model.parameters()]
+    assert choices()
+    for products in ("onednn", "fastest"):
+        for got, want in zip(gradients[products], gradients["torch"], strict=True):
+            assert (got - want).norm() <= 1e-4 * want.norm() + 1e-6
+    with pytest.raises(ValueError, match=r"products must be one of .* got 'mkl'"):
+        model.set_products("mkl")

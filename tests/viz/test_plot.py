@@ -1,0 +1,245 @@
+import math
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from matplotlib.figure import Figure
+
+from darswin import PolarSample
+from darswin.lens import KannalaBrandt, Mei, Polynomial, Spherical
+from darswin.viz.plot import (
+    FORMATS,
+    draw_accuracy,
+    draw_curve,
+    draw_grid,
+    draw_lens,
+    draw_polar,
+    draw_samples,
+    draw_view,
+    figure_format,
+    save_figure,
+)
+from darswin.viz.views import cylindrical, equirectangular, perspective
+
+SAMPLER = PolarSample(rings=4, sectors=8, samples=(3, 2))
+ROUND = Spherical.from_fov(0.4, 2.6, 16.0)
+BENT = Mei(
+    2.0, 40.0, (0.05, 1.5), 1.7, affine=[[1.0, 0.1], [0.0, 0.8]], tangential=(0.02, -0.03)
+)  # fmt: skip
+
+
+def borders(axes):
+    rings, sectors = ([np.array(s) for s in c.get_segments()] for c in axes.collections)
+    return rings, sectors
+
+
+def test_draw_grid_shows_borders_and_samples():
+    (axes,) = draw_grid(np.zeros((32, 32)), ROUND, SAMPLER).axes
+    rings, sectors = borders(axes)
+    radii = [np.hypot(*(ring - 15.5).T) for ring in rings]
+    expected = SAMPLER.grid(ROUND, (32, 32)).borders[0].numpy()
+    assert len(rings) == 5
+    for radius, border in zip(radii, expected, strict=True):
+        np.testing.assert_allclose(radius, border, atol=1e-4)
+    azimuths = [math.atan2(*(sector[-1] - 15.5)[::-1]) % (2 * math.pi) for sector in sectors]
+    np.testing.assert_allclose(azimuths, np.arange(8) * math.pi / 4, atol=1e-6)
+    (points,) = axes.lines
+    assert len(points.get_xdata()) == 4 * 3 * 8 * 2
+    assert not draw_grid(np.zeros((32, 32)), ROUND, SAMPLER, samples=False).axes[0].lines
+
+
+def test_borders_and_samples_follow_a_lens_that_is_not_round():
+    size = (60, 80)
+    (axes,) = draw_grid(np.zeros(size), BENT, SAMPLER).axes
+    rings, _ = borders(axes)
+    exact = BENT.to(torch.float64)
+    for k, ring in enumerate(rings):  # equal steps of θ
+        theta, _ = exact.unproject_pixels(torch.from_numpy(ring), size)
+        np.testing.assert_allclose(theta, k / 4 * exact.theta_max.item(), atol=1e-6)
+    spread = np.hypot(*(rings[-1] - (39.5, 29.5)).T)
+    assert spread.max() > 1.2 * spread.min()
+    points = np.stack(axes.lines[0].get_data(), -1)
+    theta, azimuth = exact.unproject_pixels(torch.from_numpy(points), size)
+    expected = (np.arange(12) + 0.5) / 12 * exact.theta_max.item()
+    np.testing.assert_allclose(np.sort(theta), np.repeat(expected, 16), atol=1e-6)
+    turns = azimuth.numpy() % (2 * math.pi) / (2 * math.pi) * 16
+    np.testing.assert_allclose(np.sort(turns), np.repeat(np.arange(16) + 0.5, 12), atol=1e-6)
+
+
+def test_draw_samples_is_a_part_of_the_grid():
+    (axes,) = draw_samples(np.zeros((60, 80)), BENT, SAMPLER).axes
+    assert np.diff(axes.get_xlim()) == pytest.approx(8) and np.diff(axes.get_ylim()) == [-6]
+    x, y = BENT.project_rays(0.85, -math.pi / 4, (60, 80))[0].tolist()
+    assert np.mean(axes.get_xlim()) == pytest.approx(x, abs=1e-3)
+    assert np.mean(axes.get_ylim()) == pytest.approx(y, abs=1e-3)
+
+
+@pytest.mark.parametrize("shape", [(32, 32), (32, 32, 3)])
+def test_draw_polar_is_what_the_layer_samples(shape):
+    image = np.random.default_rng(0).integers(256, size=shape, dtype=np.uint8)
+    for sampler in (SAMPLER, PolarSample(4, 8, (3, 2), jitter=1.0, mean=0.5, layout="tokens")):
+        (axes,) = draw_polar(image, ROUND, sampler).axes
+        channels = torch.from_numpy(np.atleast_3d(image)).permute(2, 0, 1)[None]
+        expected = SAMPLER(channels, ROUND)[0].permute(1, 2, 0).expand(-1, -1, 3)
+        np.testing.assert_allclose(axes.images[0].get_array()[..., :3], expected, atol=1e-5)
+        labels = [text.get_text() for text in axes.get_yticklabels()]
+        assert labels == ["0°", "19°", "37°", "56°", "74°"]
+
+
+def test_draw_view_is_the_undistorted_image():
+    image = np.full((32, 32, 3), 200, np.uint8)
+    (axes,) = draw_view(image, ROUND, perspective((6, 8), 1.0)).axes
+    drawn = axes.images[0].get_array()
+    assert drawn.shape == (6, 8, 4) and (drawn[..., :3] == 200).all()
+
+
+def ticks(axis):
+    """Places and labels, the labels as degrees."""
+    labels = [text.get_text() for text in axis.get_ticklabels()]
+    return np.array(axis.get_ticklocs()), np.array([float(text.rstrip("°")) for text in labels])
+
+
+@pytest.mark.parametrize("turn", [dict(), dict(yaw=0.7, pitch=-0.4)])
+def test_ticks_of_a_view_are_degrees_from_its_middle(turn):
+    image = np.zeros((32, 32, 3), np.uint8)
+    for make, fov in ((perspective, 110), (cylindrical, 200), (equirectangular, 360)):
+        (axes,) = draw_view(image, ROUND, make((61, 121), math.radians(fov), **turn)).axes
+        across, degrees = ticks(axes.xaxis)
+        step = 2 * math.tan(math.radians(fov) / 2) if make is perspective else math.radians(fov)
+        angle = np.radians(degrees)
+        right = np.tan(angle) if make is perspective else angle
+        np.testing.assert_allclose(across, 60 + right / (step / 121), atol=0.02)
+        down, degrees = ticks(axes.yaxis)
+        angle = np.radians(degrees)
+        up = angle if make is equirectangular else np.tan(angle)
+        np.testing.assert_allclose(down, 30 - up / (step / 121), atol=0.02)
+        assert len(across) >= 3 and len(down) >= 3
+
+
+def test_rays_in_no_order_have_no_ticks():
+    rays = torch.randn(9, 9, 3, generator=torch.Generator().manual_seed(0))
+    (axes,) = draw_view(np.zeros((32, 32, 3), np.uint8), ROUND, rays).axes
+    assert not len(axes.get_xticks()) and not len(axes.get_yticks())
+
+
+def test_it_is_said_where_there_is_no_picture():
+    image = np.full((20, 60, 3), 200, np.uint8)
+    lens = ROUND  # its circle is 32 px wide
+    (axes,) = draw_polar(image, lens, SAMPLER).axes
+    alpha = axes.images[0].get_array()[..., 3]
+    grid = SAMPLER.grid(lens.to(torch.float64), (20, 60))
+    down = np.abs(grid.radii[0].numpy()[:, None] * np.sin(grid.azimuths.numpy()))
+    np.testing.assert_array_equal(alpha == 0, down > 10)  # the sensor ends 10 px from the middle
+    assert "hatched: outside the sensor" in axes.get_xlabel() and axes.patch.get_hatch()
+    (axes,) = draw_polar(np.zeros((40, 40)), lens, SAMPLER).axes
+    assert (axes.images[0].get_array()[..., 3] == 1).all() and "hatched" not in axes.get_xlabel()
+
+    rays = equirectangular((45, 90))
+    (axes,) = draw_view(image, lens, rays).axes
+    theta = torch.atan2(rays[..., :2].norm(dim=-1), rays[..., 2])
+    place = lens.to(torch.float64).project_rays(theta, torch.atan2(rays[..., 1], rays[..., 0]),
+                                                (20, 60))  # fmt: skip
+    seen = (theta <= lens.theta_max) & ((place[..., 1] - 9.5).abs() <= 10)
+    np.testing.assert_array_equal(axes.images[0].get_array()[..., 3] == 255, seen)
+    assert "hatched: outside the sensor or beyond θ_max" in axes.get_xlabel()
+    (axes,) = draw_view(np.zeros((40, 40)), lens, rays).axes
+    assert "hatched: beyond θ_max" in axes.get_xlabel()
+    (axes,) = draw_view(image, lens, perspective((6, 8), 0.1)).axes
+    assert "hatched" not in axes.get_xlabel()
+
+
+def test_what_is_enlarged_is_in_the_image():
+    lens = ROUND.replace(center=torch.tensor([[-40.0, 300.0]]))
+    (axes,) = draw_samples(np.zeros((60, 80)), lens, SAMPLER).axes
+    assert axes.get_xlim() == (-0.5, 7.5) and axes.get_ylim() == (59.5, 53.5)
+
+
+@pytest.mark.parametrize("tone", [0, 60, 200, 240, 255])
+@pytest.mark.parametrize("panel", [draw_grid, draw_samples])
+def test_borders_show_on_dark_and_on_pale_walls(panel, tone, tmp_path):
+    image = np.full((64, 64, 3), tone, np.uint8)
+    lens = Spherical.from_fov(0.4, 2.6, 32.0)
+    figure = panel(image, lens, SAMPLER)
+    for line in figure.axes[0].lines:  # the sample points
+        line.remove()
+    save_figure(figure, tmp_path / "walls.png")
+    grey = cv2.imread(str(tmp_path / "walls.png"), cv2.IMREAD_GRAYSCALE)[100:-100, 100:-100]
+    assert (np.abs(grey.astype(int) - tone) > 80).mean() > 0.002
+
+
+def test_draw_curve_shows_radius_and_density():
+    lens = Polynomial([20.0, 1.0, 0.5], 1.7)
+    left, right = draw_curve(lens, (48, 80)).axes
+    degrees, radius = (np.array(values) for values in left.lines[0].get_data())
+    theta = torch.deg2rad(torch.from_numpy(degrees)).float()
+    np.testing.assert_allclose(radius, lens.project(theta), rtol=1e-5)
+    along = right.lines[0].get_ydata()
+    np.testing.assert_allclose(np.gradient(radius, degrees)[1:-1], along[1:-1], rtol=1e-3)
+    ends = sorted(line.get_xdata()[0] for line in left.lines[1:])
+    seen = lens.side_angles((48, 80))[0].rad2deg()
+    np.testing.assert_allclose(ends, seen[seen < degrees[-1] - 1e-6].sort().values, rtol=1e-6)
+    labels = [text.get_text() for text in left.get_legend().get_texts()]
+    assert labels == ["r", "px/° along r", "px/° around"]
+    assert len(draw_curve(lens).axes[0].lines) == 1
+
+
+def test_sides_of_the_image_are_told_apart():
+    lens = Polynomial([20.0, 1.0, 0.5], 1.7, [45.0, 22.0])
+    axes = draw_curve(lens, (48, 80)).axes[0]
+    angles = lens.side_angles((48, 80))[0].rad2deg().tolist()
+    names = [
+        f"{s} {a:.1f}°" for s, a in zip(("left", "top", "right", "bottom"), angles, strict=True)
+    ]
+    shown = [a <= math.degrees(1.7) for a in angles]
+    assert shown == [False, True, True, True]
+    assert [text.get_text() for text in axes.texts] == names[1:]
+    styles = [line.get_linestyle() for line in axes.lines[1:]]
+    assert styles == [":", "--", ":"]
+    heights = [text.get_position()[1] for text in axes.texts]
+    assert min(np.diff(sorted(heights))) > 0.15  # no name over another one
+
+
+def test_sides_that_the_lens_does_not_reach_are_not_drawn():
+    lens = Polynomial([30.0, 0.0, -3.0])  # r rises up to 105°, 36 px
+    assert not draw_curve(lens, (400, 400)).axes[0].texts
+    assert len(draw_curve(lens, (40, 40)).axes[0].texts) == 4
+
+
+def test_draw_lens_has_all_panels(tmp_path):
+    image = np.zeros((48, 64, 3), np.uint8)
+    lens = KannalaBrandt(20.0, [0.01], 1.7)
+    figure = draw_lens(image, lens, SAMPLER, perspective((6, 8), 1.0), "ahead")
+    titles = [axes.get_title() for axes in figure.axes]
+    assert titles[:5] == [
+        "4 rings × 8 sectors, equal steps of θ", "3 × 2 samples in each, enlarged", "ahead",
+        "polar image, 12 × 16 samples", "projection: KannalaBrandt",
+    ]  # fmt: skip
+    heads = {"png": b"\x89PNG", "jpeg": b"\xff\xd8\xff", "webp": b"RIFF", "tiff": b"II*\0",
+             "pdf": b"%PDF", "svg": b"<?xml"}  # fmt: skip
+    small = draw_curve(lens)
+    for ending, format_ in FORMATS.items():
+        path = tmp_path / f"lens{ending.upper()}"
+        save_figure(figure if ending == ".png" else small, path)
+        assert path.read_bytes().startswith(heads[format_])
+
+
+@pytest.mark.parametrize("name", ["lens.gif", "lens", "lens.", "png", "a.png/b"])
+def test_other_endings_are_refused(name):
+    with pytest.raises(ValueError, match=rf"must end in one of \.png, .*, got '{name}'"):
+        figure_format(name)
+
+
+def test_drawing_on_axes_of_ones_own():
+    axes = Figure().subplots()
+    assert draw_grid(np.zeros((32, 32)), ROUND, SAMPLER, axes=axes) is axes.figure
+    with pytest.raises(ValueError, match="one lens, got 2"):
+        draw_grid(np.zeros((32, 32)), Spherical([0.1, 0.2], 10.0), SAMPLER)
+
+
+def test_draw_accuracy_shows_each_model():
+    figure = draw_accuracy([0.0, 0.5, 1.0], {"a": [1, 2, 3], "b": [3, 2, 1]}, (0.2, 0.35))
+    (axes,) = figure.axes
+    labels = [text.get_text() for text in axes.get_legend().get_texts()]
+    assert labels == ["seen in training", "a", "b"]
+    assert list(axes.lines[0].get_ydata()) == [1, 2, 3]
