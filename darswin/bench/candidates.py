@@ -126,8 +126,8 @@ def training_step(name: str, size: int, dtype: torch.dtype, batch: int, *, refer
     """A step of one of the candidates; bfloat16 is autocast."""
     model, lens = network(name, size).train(), lens_of(size)
     if not reference:
-        model.set_products("fastest")
-        model.set_recompute(True)
+        model.set_matmul_backend("autotune")
+        model.set_grad_checkpointing(True)
     optimizer = torch.optim.AdamW(model.parameters(), lr=1e-4, fused=True)
     images, labels = torch.randn(batch, 3, size, size), torch.randint(CLASSES, (batch,))
 

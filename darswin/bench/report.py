@@ -30,7 +30,7 @@ class Record:
     Args:
         machine: see `machine`. model, size: of the network and of its images, px.
         operations: of the products of one image, by name of the dtype.
-        products: of `darswin.layers.linear.choices`, as rows.
+        products: of `darswin.layers.linear.autotune_results`, as rows.
     """
 
     machine: dict

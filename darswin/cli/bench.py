@@ -64,7 +64,8 @@ def bench(
         timings=timings,
         memory=_memory(model, size, 8) if memory.available() else [],
         products=[
-            dict(shape._asdict(), seconds=seconds) for shape, seconds in linear.choices().items()
+            dict(shape._asdict(), seconds=seconds)
+            for shape, seconds in linear.autotune_results().items()
         ],
     )
     path = out / f"model--{head['tier']}.json"

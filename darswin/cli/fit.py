@@ -56,7 +56,8 @@ def run_command(argv: list[str]) -> None:
                 raise
             raise MemoryError(
                 "not enough memory: a smaller --data.batch_size or --model.name, or "
-                f"--model.recompute true, needs less ({str(error).strip().splitlines()[-1]})"
+                "--model.grad_checkpointing true, needs less "
+                f"({str(error).strip().splitlines()[-1]})"
             ) from error
 
 

@@ -22,7 +22,7 @@ LEVELS = {
 }
 
 
-class Lenses(Protocol):
+class LensDistribution(Protocol):
     """A distribution of lenses."""
 
     def draw(self, rng: np.random.Generator, fov: float, radius: float) -> Lens:
@@ -59,7 +59,7 @@ class PolynomialLenses:
         return Polynomial(torch.tensor(direction * scale, dtype=torch.float32), theta_max)
 
 
-def parse_lenses(text: str | float) -> Lenses:
+def parse_lenses(text: str | float) -> LensDistribution:
     """A distribution by its name, as configurations give it.
 
     Args:

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from darswin.data.lenses import Lenses
+from darswin.data.lenses import LensDistribution
 from darswin.data.sources import Source
 from darswin.lens import Lens, Perspective
 from darswin.utils.image import BrokenImageError
@@ -84,7 +84,7 @@ class WideAngle(Dataset):
     def __init__(
         self,
         source: Source,
-        lenses: Lenses,
+        lenses: LensDistribution,
         *,
         size: int = 64,
         render: int = 224,

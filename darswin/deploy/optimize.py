@@ -65,7 +65,7 @@ def optimize(
     optimized.stages = nn.ModuleList(_Stage(stage, dtype) for stage in optimized.stages)
     optimized.norm.to(dtype)
     optimized.head.to(dtype)
-    return optimized if lens is None else OneLens(optimized, lens)
+    return optimized if lens is None else FixedLens(optimized, lens)
 
 
 class _Optimized:
@@ -86,7 +86,7 @@ class _Optimized:
         )
 
 
-class OneLens(_Optimized, Encoder):
+class FixedLens(_Optimized, Encoder):
     """An optimized model and the one lens of all its images, which it is called without.
 
     Args:
@@ -111,8 +111,8 @@ class OneLens(_Optimized, Encoder):
         size = images.shape[2:]
         if size not in self._known:
             check_lens(self.lens, images)
-            grid, radials = self.model.geometry(self.lens, size)
-            tables = [s.tables(r) for s, r in zip(self.stages, radials, strict=True)]
+            grid, angles = self.model.geometry(self.lens, size)
+            tables = [s.tables(r) for s, r in zip(self.stages, angles, strict=True)]
             self._known[size] = grid, tables
         grid, tables = self._known[size]
         x, maps = self.model.embed(images, grid), []
@@ -165,8 +165,8 @@ class _Stage(nn.Module):
         """The position bias of each block, where its attention has one that is known before."""
         if self.fixed:
             return self.fixed
-        (radial,) = positions
-        joined = self.bias(radial.to(torch.float32))
+        (angles,) = positions
+        joined = self.bias(angles.to(torch.float32))
         return [table.contiguous() for table in joined.split(self.heads, 1)]
 
     def run(self, x: Tensor, tables: list[Tensor | None]) -> Tensor:

@@ -12,7 +12,7 @@ from darswin.layers.position_bias import (
     PositionBias,
     RelativeTable,
 )
-from darswin.layers.recompute import made_again
+from darswin.layers.recompute import recomputed
 from darswin.ops import window_attention
 
 
@@ -31,7 +31,7 @@ class WindowAttention(nn.Module):
     Source: Swin Transformer, ICCV 2021, sec. 3.2.
     """
 
-    recompute = False  # see `Encoder.set_recompute`
+    grad_checkpointing = False  # see `Encoder.set_grad_checkpointing`
 
     def __init__(
         self,
@@ -66,7 +66,7 @@ class WindowAttention(nn.Module):
         )
         bias = self.position_bias(*positions)
         out = attend(qkv, bias)
-        with made_again(out, attend, qkv, bias, when=self.recompute):
+        with recomputed(out, attend, qkv, bias, when=self.grad_checkpointing):
             return self.proj(out)
 
     def extra_repr(self) -> str:
@@ -133,6 +133,7 @@ class PolarWindowAttention(WindowAttention):
             qkv_bias=qkv_bias,
         )
 
-    def forward(self, x: Tensor, radial: Tensor) -> Tensor:
-        """(B, R, A, D) → the same shape. `radial` (B or 1, R+1): see `radial_positions`."""
-        return super().forward(x, radial.to(x.device, self.proj.weight.dtype))
+    def forward(self, x: Tensor, ring_angles: Tensor) -> Tensor:
+        """(B, R, A, D) → the same shape. `ring_angles` (B or 1, R+1): of
+        `darswin.layers.position_bias.ring_angles`."""
+        return super().forward(x, ring_angles.to(x.device, self.proj.weight.dtype))

@@ -9,7 +9,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from darswin.layers.linear import Linear
-from darswin.layers.recompute import made_again
+from darswin.layers.recompute import recomputed
 
 
 class DropPath(nn.Module):
@@ -35,7 +35,7 @@ class DropPath(nn.Module):
 class Mlp(nn.Module):
     """Linear, GELU, Linear."""
 
-    recompute = False  # see `Encoder.set_recompute`
+    grad_checkpointing = False  # see `Encoder.set_grad_checkpointing`
 
     def __init__(self, dim: int, hidden: int):
         super().__init__()
@@ -45,7 +45,7 @@ class Mlp(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         hidden = self.fc1(x)
         x = F.gelu(hidden)
-        with made_again(x, F.gelu, hidden, when=self.recompute):
+        with recomputed(x, F.gelu, hidden, when=self.grad_checkpointing):
             return self.fc2(x)
 
 
@@ -57,7 +57,7 @@ class Block(nn.Module):
         mlp_ratio: hidden width of the MLP over D. drop_path: probability.
     """
 
-    recompute = False  # see `Encoder.set_recompute`
+    grad_checkpointing = False  # see `Encoder.set_grad_checkpointing`
 
     def __init__(
         self, dim: int, attn: nn.Module, *, mlp_ratio: float = 4.0, drop_path: float = 0.0
@@ -72,11 +72,11 @@ class Block(nn.Module):
     def forward(self, x: Tensor, *positions: Tensor) -> Tensor:
         """(B, R, A, D) → the same shape. `positions` are the attention's."""
         y = self.norm1(x)
-        with made_again(y, self.norm1, x, when=self.recompute):
+        with recomputed(y, self.norm1, x, when=self.grad_checkpointing):
             y = self.attn(y, *positions)
         x = x + self.drop_path(y)
         y = self.norm2(x)
-        with made_again(y, self.norm2, x, when=self.recompute):
+        with recomputed(y, self.norm2, x, when=self.grad_checkpointing):
             y = self.mlp(y)
         return x + self.drop_path(y)
 

@@ -24,7 +24,7 @@ def check_dtype(images: Tensor, dtype: torch.dtype) -> None:
         )
 
 
-class Pixels(nn.Module):
+class ImageInput(nn.Module):
     """The images of a model of fixed size, as (B, C, H, W) in floating point.
 
     Args:

@@ -14,8 +14,8 @@ from torch.autograd.function import once_differentiable
 
 from darswin.layers import onednn
 
-Products = Literal["torch", "onednn", "fastest"]
-PRODUCTS = get_args(Products)
+MatmulBackend = Literal["torch", "onednn", "autotune"]
+MATMUL_BACKENDS = get_args(MatmulBackend)
 
 
 def _parameter_gradients(g: Tensor, x: Tensor, with_bias: bool) -> tuple[Tensor, Tensor | None]:
@@ -44,39 +44,40 @@ class Shape(NamedTuple):
     threads: int
 
 
-_choices: dict[Shape, dict[str, float]] = {}
+_measured: dict[Shape, dict[str, float]] = {}
 
 
-def choices() -> dict[Shape, dict[str, float]]:
+def autotune_results() -> dict[Shape, dict[str, float]]:
     """What was measured so far: for each shape the seconds of each way, the one taken first."""
     return {
         shape: dict(sorted(seconds.items(), key=lambda item: item[1]))
-        for shape, seconds in _choices.items()
+        for shape, seconds in _measured.items()
     }
 
 
 class Linear(nn.Linear):
-    """`nn.Linear` with a choice of who multiplies.
+    """`nn.Linear` with a choice of the library that computes its products.
 
-    `products` says who: "torch" as `nn.Linear`; "onednn"; or "fastest", which measures both at the
-    first call with a shape, takes the faster from then on, and shows what it found in `choices`.
-    Both compute in float32; they round differently, so runs that must repeat bit for bit should not
-    leave the choice to a clock. Second derivatives need "torch".
+    `matmul_backend` is "torch", as `nn.Linear`; "onednn"; or "autotune", which measures both at the
+    first call with a shape, takes the faster from then on, and shows what it found in
+    `autotune_results`. Both compute in float32. They round differently, so a run that must repeat
+    bit for bit names one of the two. Second derivatives need "torch".
 
-    It concerns float32 on the CPU in eager mode. Elsewhere torch multiplies: compiled, under
-    autocast and in bfloat16, where it asks oneDNN by itself, and where there is no oneDNN.
+    It concerns float32 on the CPU in eager mode. Elsewhere torch computes the product as ever: in
+    compiled graphs; under autocast and in bfloat16, where it asks oneDNN by itself; and where there
+    is no oneDNN.
     """
 
-    products: Products = "torch"
+    matmul_backend: MatmulBackend = "torch"
 
     def forward(self, x: Tensor) -> Tensor:
         """(..., D) → (..., D')."""
-        if self.products == "torch" or not _concerned(x, self.weight):
+        if self.matmul_backend == "torch" or not _concerned(x, self.weight):
             return super().forward(x)
-        return _Product.apply(x, self.weight, self.bias, self.products)
+        return _Product.apply(x, self.weight, self.bias, self.matmul_backend)
 
     def extra_repr(self) -> str:
-        return f"{super().extra_repr()}, products={self.products!r}"
+        return f"{super().extra_repr()}, matmul_backend={self.matmul_backend!r}"
 
 
 def _concerned(x: Tensor, weight: Tensor) -> bool:
@@ -92,11 +93,11 @@ def _concerned(x: Tensor, weight: Tensor) -> bool:
 
 class _Product(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, x, weight, bias, products):
+    def forward(ctx, x, weight, bias, matmul_backend):
         ctx.save_for_backward(x, weight)
-        ctx.products = products
+        ctx.matmul_backend = matmul_backend
         rows = x.reshape(-1, x.shape[-1])
-        out = _multiply("forward", products, weight, rows, weight, bias)
+        out = _multiply("forward", matmul_backend, weight, rows, weight, bias)
         return out.view(*x.shape[:-1], weight.shape[0])
 
     @staticmethod
@@ -107,27 +108,29 @@ class _Product(torch.autograd.Function):
         wants_x, wants_weight, wants_bias, _ = ctx.needs_input_grad
         grad_x = grad_weight = grad_bias = None
         if wants_x:
-            grad_x = _multiply("input gradient", ctx.products, weight, grad_rows, weight)
+            grad_x = _multiply("input gradient", ctx.matmul_backend, weight, grad_rows, weight)
             grad_x = grad_x.view(x.shape)
         if wants_weight:
             arguments = (grad_rows, rows, wants_bias)
-            grad_weight, grad_bias = _multiply("weight gradient", ctx.products, weight, *arguments)
+            grad_weight, grad_bias = _multiply(
+                "weight gradient", ctx.matmul_backend, weight, *arguments
+            )
         elif wants_bias:
             grad_bias = grad_rows.sum(0)
         return grad_x, grad_weight, grad_bias, None
 
 
-def _multiply(product: str, products: Products, weight: Tensor, rows: Tensor, *others):
+def _multiply(product: str, matmul_backend: MatmulBackend, weight: Tensor, rows: Tensor, *others):
     """The product of a layer with `weight`, of (M, ...) rows and others, in the way to take."""
     ways = _WAYS[product]
-    if products == "onednn":
+    if matmul_backend == "onednn":
         return ways["onednn"](rows, *others)
     height = 1 << (rows.shape[0] - 1).bit_length()
     out_features, in_features = weight.shape
     shape = Shape(product, height, in_features, out_features, torch.get_num_threads())
-    if shape not in _choices:
-        _choices[shape] = _measure(ways, (rows, *others))
-    seconds = _choices[shape]
+    if shape not in _measured:
+        _measured[shape] = _measure(ways, (rows, *others))
+    seconds = _measured[shape]
     return ways[min(seconds, key=seconds.get)](rows, *others)
 
 

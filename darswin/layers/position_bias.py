@@ -30,16 +30,16 @@ class RelativeBias(nn.Module):
         """Angles (N, K) of Δ = -(K-1)/2 … (K-1)/2 → (N, K, heads)."""
         raise NotImplementedError
 
-    def forward(self, radial: Tensor) -> Tensor:
-        """`radial` (N, at least M_r) rad: how far 0, 1, … rings reach.
+    def forward(self, ring_angles: Tensor) -> Tensor:
+        """`ring_angles` (N, at least M_r) rad: how far 0, 1, … rings reach.
 
         Returns:
             (N, heads, 2·M_r-1, 2·M_φ-1), the `bias` of `window_attention`.
         """
-        outward = radial[:, : self.window[0]]
+        outward = ring_angles[:, : self.window[0]]
         theta = torch.cat((-outward[:, 1:].flip(1), outward), 1)
         reach = self.window[1]
-        phi = torch.arange(1 - reach, reach, device=radial.device, dtype=radial.dtype) * self.turn
+        phi = self.turn * torch.arange(1 - reach, reach).to(ring_angles)
         along_r = self._axis(theta, self.a_theta, self.b_theta).transpose(1, 2)
         along_phi = self._axis(phi[None], self.a_phi, self.b_phi).transpose(1, 2)
         return along_r[..., None] + along_phi[..., None, :]
@@ -77,7 +77,7 @@ class FourierBias(RelativeBias):
     """B = b_0 + (1/P) Σ_{p=1..P} (a_p sin pα + b_p cos pα), P harmonics.
 
     α is the angle between two tokens ("angular"), or along the radius their distance in the image,
-    the circle's radius being π ("polar"): what `radial` holds decides.
+    the circle's radius being π ("polar"): what `ring_angles` holds decides.
 
     Args:
         window, sectors: as `RelativeBias`. heads: attention heads. harmonics: P.
@@ -117,7 +117,7 @@ class RelativeTable(nn.Module):
         return self.table[None]
 
 
-def radial_positions(lens: Lens, grid: PolarGrid, rings: int, kind: PositionBias) -> Tensor:
+def ring_angles(lens: Lens, grid: PolarGrid, rings: int, kind: PositionBias) -> Tensor:
     """(N, rings+1): how far from the centre the borders of a map of `rings` rings are, in rad.
 
     The angle θ, equally split; for "polar" the radius in the image, the circle's radius being π.

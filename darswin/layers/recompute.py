@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 
-def made_again(
+def recomputed(
     value: Tensor, make: Callable[..., Tensor], *inputs: Tensor, when: bool
 ) -> contextlib.AbstractContextManager:
     """A context in which autograd, where it would save `value`, saves `inputs` to make it from.

@@ -4,7 +4,7 @@ Every lens is a batch, differentiable in its parameters, and works beyond 90° w
 """
 
 from darswin.lens.base import Lens, Number
-from darswin.lens.curves import Tabulated, as_curves, stack
+from darswin.lens.curves import Tabulated, as_curves, cat
 from darswin.lens.description import MODELS, from_dict, to_dict
 from darswin.lens.distorted import BrownConrady, Fisheye624, KannalaBrandt, Mei
 from darswin.lens.files import load, load_all, save
@@ -24,5 +24,5 @@ __all__ = [
     "MODELS", "BrownConrady", "DoubleSphere", "EnhancedUnified", "Equidistant", "Equisolid",
     "FieldOfView", "Fisheye624", "Fit", "KannalaBrandt", "Lens", "Mei", "Number", "OCam",
     "OCamInverse", "Orthographic", "Perspective", "Polynomial", "Spherical", "Stereographic",
-    "Tabulated", "as_curves", "fit", "from_dict", "load", "load_all", "save", "stack", "to_dict",
+    "Tabulated", "as_curves", "cat", "fit", "from_dict", "load", "load_all", "save", "to_dict",
 ]  # fmt: skip

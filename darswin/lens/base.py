@@ -56,7 +56,7 @@ class Lens:
     Raises:
         ValueError: a parameter out of its range, by name. TypeError: one that is no number.
 
-    Indexing gives lenses (`lens[3]` is a batch of one), `len` counts them, `stack` joins them, and
+    Indexing gives lenses (`lens[3]` is a batch of one), `len` counts them, `cat` joins them, and
     a DataLoader batches a dataset's lenses like its tensors.
     """
 
@@ -528,9 +528,9 @@ def _size(size: tuple[int, int]) -> tuple[int, int]:
 
 
 def _collate(batch, *, collate_fn_map=None) -> Lens:
-    from darswin.lens.curves import stack
+    from darswin.lens.curves import cat  # curves are lenses
 
-    return stack(batch)
+    return cat(batch)
 
 
 def _identity(lens: Lens) -> Tensor:

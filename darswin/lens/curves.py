@@ -185,7 +185,7 @@ def _fractions(lens: Lens, count: int) -> Tensor:
     return fractions
 
 
-def stack(lenses: Sequence[Lens]) -> Lens:
+def cat(lenses: Sequence[Lens]) -> Lens:
     """One batch of all the lenses of a sequence; of several models as curves (`as_curves`).
 
     Raises:
@@ -194,10 +194,10 @@ def stack(lenses: Sequence[Lens]) -> Lens:
     """
     lenses = list(lenses)
     if not lenses:
-        raise ValueError("stack needs at least one lens")
+        raise ValueError("cat needs at least one lens")
     for name in ("center", "image_size"):
         if len({getattr(lens, name) is None for lens in lenses}) > 1:
-            raise ValueError(f"stack needs a {name} for all lenses or for none")
+            raise ValueError(f"cat needs a {name} for all lenses or for none")
     if len({_form(lens) for lens in lenses}) > 1:
         lenses = [as_curves(lens) for lens in lenses]
     if len({lens.affine is None for lens in lenses}) > 1:

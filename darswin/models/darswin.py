@@ -8,7 +8,7 @@ from torch import Tensor
 from darswin.layers.attention import PolarWindowAttention
 from darswin.layers.embed import PolarPatchEmbed
 from darswin.layers.grid import Placement, PolarGrid, Spacing, polar_grid
-from darswin.layers.position_bias import PositionBias, radial_positions
+from darswin.layers.position_bias import PositionBias, ring_angles
 from darswin.layers.sampling import check_images, check_lens
 from darswin.lens import Lens
 from darswin.models import official
@@ -142,12 +142,12 @@ class DarSwin(Encoder):
 
     def geometry(self, lens: Lens, image_size: Pair) -> tuple[PolarGrid, list[Tensor]]:
         """All that the model makes of the lenses of images (H, W): the grid of their samples, and
-        for each stage what its position bias is made from, `radial_positions`."""
+        for each stage what its position bias is made from, `ring_angles`."""
         grid = self.patch_embed.sample.grid(lens, image_size)
         if self.compat:
-            return grid, [official.radial_positions(lens, rings) for rings in self._rings]
+            return grid, [official.ring_angles(lens, rings) for rings in self._rings]
         kind = self.position_bias
-        return grid, [radial_positions(lens, grid, rings, kind) for rings in self._rings]
+        return grid, [ring_angles(lens, grid, rings, kind) for rings in self._rings]
 
     def embed(self, images: Tensor, grid: PolarGrid) -> Tensor:
         """Images (B, C, H, W) on a grid of `geometry` → the first map, (B, R, A, D)."""
@@ -158,10 +158,10 @@ class DarSwin(Encoder):
     def _stage_maps(self, images: Tensor, lens: Lens) -> list[Tensor]:
         images = check_images(images)
         check_lens(lens, images)
-        grid, radials = self.geometry(lens, images.shape[2:])
+        grid, angles = self.geometry(lens, images.shape[2:])
         x = self.embed(images, grid)
         maps = []
-        for stage, radial in zip(self.stages, radials, strict=True):
-            x = stage(x, radial)
+        for stage, of_rings in zip(self.stages, angles, strict=True):
+            x = stage(x, of_rings)
             maps.append(x)
         return maps

@@ -6,8 +6,8 @@ from torch import Tensor, nn
 
 from darswin.layers.attention import WindowAttention
 from darswin.layers.block import Block, Mlp
-from darswin.layers.embed import PatchProjection, Pixels
-from darswin.layers.linear import PRODUCTS, Linear, Products
+from darswin.layers.embed import ImageInput, PatchProjection
+from darswin.layers.linear import MATMUL_BACKENDS, Linear, MatmulBackend
 from darswin.lens import Lens
 from darswin.models.stages import Pair, check_depths, make_stages, plan_stages
 
@@ -21,7 +21,7 @@ class Encoder(nn.Module):
 
     num_features: int
     stages: nn.ModuleList
-    products: Products = "torch"  # see `set_products`
+    matmul_backend: MatmulBackend = "torch"  # see `set_matmul_backend`
 
     def _finish(self, num_classes: int) -> None:
         """Makes what ends a model, and initialises it."""
@@ -32,40 +32,43 @@ class Encoder(nn.Module):
     def reset_classifier(self, num_classes: int) -> None:
         """A new head for `num_classes` classes; 0 leaves it out.
 
-        It has the dtype, the device and the products (see `set_products`) of the model.
+        It has the dtype, the device and the backend (see `set_matmul_backend`) of the model.
         """
         self.num_classes = num_classes
         self.head = nn.Identity()
         if num_classes:
             like = dict(device=self.norm.weight.device, dtype=self.norm.weight.dtype)
             self.head = Linear(self.num_features, num_classes, **like).train(self.training)
-            self.head.products = self.products
+            self.head.matmul_backend = self.matmul_backend
         _init_weights(self.head)
 
     def no_weight_decay(self) -> set[str]:
         """Names of the parameters, besides biases and norms, that a recipe should not decay."""
         return {name for name, _ in self.named_parameters() if ".position_bias." in name}
 
-    def set_products(self, products: Products) -> None:
-        """Says who multiplies in the linear layers: "torch", "onednn" or "fastest", see `Linear`.
+    def set_matmul_backend(self, matmul_backend: MatmulBackend) -> None:
+        """Chooses what computes the linear layers' products: "torch", "onednn" or "autotune"; see
+        `Linear`.
 
         Raises:
             ValueError: an unknown choice.
         """
-        if products not in PRODUCTS:
-            raise ValueError(f"products must be one of {PRODUCTS}, got {products!r}")
-        self.products = products
+        if matmul_backend not in MATMUL_BACKENDS:
+            raise ValueError(
+                f"matmul_backend must be one of {MATMUL_BACKENDS}, got {matmul_backend!r}"
+            )
+        self.matmul_backend = matmul_backend
         for module in self.modules():
             if isinstance(module, Linear):
-                module.products = products
+                module.matmul_backend = matmul_backend
 
-    def set_recompute(self, recompute: bool) -> None:
+    def set_grad_checkpointing(self, enable: bool = True) -> None:
         """Says whether training saves memory: norms, GELUs and attention in windows, a few percent
         of the work, are then computed again in backward. The gradients are the same, bit for bit.
         """
         for module in self.modules():
             if isinstance(module, (Block, Mlp, WindowAttention)):
-                module.recompute = recompute
+                module.grad_checkpointing = enable
 
     def _stage_maps(self, images: Tensor, lens: Lens | None) -> list[Tensor]:
         """The map that each stage ends with."""
@@ -142,7 +145,7 @@ class ImageEncoder(Encoder):
         plans = plan_stages(*(side // patch_size for side in size), len(depths), "RA", window)
         self.num_features = embed_dim * 2 ** (len(depths) - 1)
         self.in_chans = in_chans
-        self.pixels = Pixels(size, in_chans, mean, std)
+        self.image_input = ImageInput(size, in_chans, mean, std)
         self.patch_embed = PatchProjection(in_chans, embed_dim, patch_size)
         self.stages = make_stages(plans, embed_dim, depths, num_heads, **stages)
         self._finish(num_classes)
@@ -150,7 +153,7 @@ class ImageEncoder(Encoder):
     @property
     def image_size(self) -> Pair:
         """(H, W) that images must have."""
-        return self.pixels.image_size
+        return self.image_input.image_size
 
     def _view(self, images: Tensor, lens: Lens | None) -> Tensor:
         """What the network sees of the images."""
@@ -158,7 +161,7 @@ class ImageEncoder(Encoder):
 
     def _stage_maps(self, images: Tensor, lens: Lens | None) -> list[Tensor]:
         dtype = next(self.patch_embed.parameters()).dtype
-        x = self._view(self.pixels(images, dtype), lens)
+        x = self._view(self.image_input(images, dtype), lens)
         x = self.patch_embed(x.permute(0, 2, 3, 1))
         maps = []
         for stage in self.stages:

@@ -148,7 +148,7 @@ def _last_angle(lens: Lens) -> Tensor:
     return torch.tan(lens.theta_max)
 
 
-def radial_positions(lens: Lens, rings: int) -> Tensor:
+def ring_angles(lens: Lens, rings: int) -> Tensor:
     """(1, rings+1): equal steps up to tan θ_max of image 0, taken for an angle."""
     return _last_angle(lens[:1])[:, None] * _inclusive(rings, lens.theta_max)
 

@@ -9,7 +9,7 @@ CHANGEABLE = {
     *(f"model.{rate}_rate" for rate in ("learning", "warmup", "final")),
     *("model.warmup_epochs", "model.reference_batch", "model.weight_decay"),
     *("model.label_smoothing", "model.mixup", "model.cutmix", "model.mix_p"),
-    *("model.products", "model.recompute"),
+    *("model.matmul_backend", "model.grad_checkpointing"),
     *("data.path", "data.classes", "data.splits", "data.skip_broken"),
     *("data.batch_size", "data.workers"),
     *("data.train_lenses", "data.test_lenses", "data.pair_lenses"),

@@ -13,7 +13,7 @@ from torchmetrics import MeanMetric, Metric
 from torchmetrics.classification import MulticlassAccuracy
 
 from darswin.data.mixing import Mixing
-from darswin.layers.linear import Products
+from darswin.layers.linear import MatmulBackend
 from darswin.lens import Lens
 from darswin.models.encoder import ImageEncoder
 from darswin.models.registry import model_class
@@ -42,9 +42,9 @@ class Classification(LightningModule):
         cutmix: α of the share that a box of another image leaves; 0 is off.
         mix_p: the share of batches that are mixed.
         reference_batch: images that the rates are meant for.
-        products: who multiplies in float32: torch, onednn, or the fastest, measured as it runs. On
-            AMD's CPUs onednn is twice as fast; which one it is decides how results are rounded.
-        recompute: saves a third of the activations' memory for a few percent of the time.
+        matmul_backend: of float32 products: torch, onednn, or autotune, which measures as it runs.
+            On AMD's CPUs onednn is twice as fast; which one it is decides how results are rounded.
+        grad_checkpointing: saves a third of the activations' memory for a few percent of the time.
         seed: of the weights, jitter, drop path and mixing.
 
     Source: the recipe of DarSwin, ICCV 2023, sec. 5.2, and of its released code.
@@ -66,8 +66,8 @@ class Classification(LightningModule):
         cutmix: float = 1.0,
         mix_p: float = 1.0,
         reference_batch: int = 512,
-        products: Products = "torch",
-        recompute: bool = False,
+        matmul_backend: MatmulBackend = "torch",
+        grad_checkpointing: bool = False,
         seed: int = 0,
     ):
         super().__init__()
@@ -88,7 +88,7 @@ class Classification(LightningModule):
         self.warmup_epochs, self.reference_batch = warmup_epochs, reference_batch
         self.weight_decay, self.decay_position_bias = weight_decay, decay_position_bias
         self.label_smoothing, self.seed = label_smoothing, seed
-        self.products, self.recompute = products, recompute
+        self.matmul_backend, self.grad_checkpointing = matmul_backend, grad_checkpointing
         self.mixing = Mixing(mixup, cutmix, mix_p)
         self.net: nn.Module | None = None
         self._steps_there: int | None = None  # in an epoch of the run that a checkpoint is of
@@ -122,8 +122,8 @@ class Classification(LightningModule):
             raise ValueError(
                 f"no {self.name} with --model.options {self.options}: {error}"
             ) from error
-        self.net.set_products(self.products)
-        self.net.set_recompute(self.recompute)
+        self.net.set_matmul_backend(self.matmul_backend)
+        self.net.set_grad_checkpointing(self.grad_checkpointing)
         count = len(data.classes)
         self.val_metrics = metrics(count)
         self.test_metrics = nn.ModuleList(metrics(count) for _ in data.test_names)

@@ -44,7 +44,7 @@ def test_unknown_things(capsys, tmp_path):
     run = ["fit", "--run", tmp_path / "r"]
     assert "model.speed" in error(capsys, *run, *DIGITS, "--model.speed", "9")
     assert "unknown model 'resnet'" in error(capsys, *run, *DIGITS, "--model.name", "resnet")
-    assert "model.products" in error(capsys, *run, *DIGITS, "--model.products", "mkl")
+    assert "model.matmul_backend" in error(capsys, *run, *DIGITS, "--model.matmul_backend", "mkl")
     assert "lenses must be one of" in error(capsys, *run, *DIGITS, "--data.train_lenses", "odd")
     assert "no folder" in error(capsys, *run, *DIGITS, "--data.path", tmp_path / "nothing")
     assert "run" in error(capsys, "fit", *DIGITS)
@@ -114,14 +114,15 @@ def test_a_run_is_not_overwritten(capsys, tmp_path):
     assert "holds a run already" in error(capsys, "fit", "--run", tmp_path, *DIGITS)
 
 
-def test_who_multiplies_and_what_is_computed_again_are_options(tmp_path):
-    linear._choices.clear()
+def test_the_matmul_backend_and_checkpointing_are_options(tmp_path):
+    linear._measured.clear()
     fit = ["fit", "--run", tmp_path, *DIGITS, "--trainer.max_steps", "1", "--data.limit", "48"]
     fit += ["--trainer.enable_progress_bar", "false", "--data.workers", "0"]
-    main([str(a) for a in (*fit, "--model.products", "fastest", "--model.recompute", "true")])
-    assert {shape.product for shape in linear.choices()} == set(linear._WAYS)
+    fit += ["--model.matmul_backend", "autotune", "--model.grad_checkpointing", "true"]
+    main([str(a) for a in fit])
+    assert {shape.product for shape in linear.autotune_results()} == set(linear._WAYS)
     saved = yaml.safe_load((tmp_path / "config.yaml").read_text())["model"]
-    assert saved["products"] == "fastest" and saved["recompute"] is True
+    assert saved["matmul_backend"] == "autotune" and saved["grad_checkpointing"] is True
 
 
 def test_a_checkpoint_of_another_model(capsys, tmp_path):

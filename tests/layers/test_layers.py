@@ -7,7 +7,7 @@ import torch.nn.functional as F
 from darswin import PolarSample, PolarWindowAttention, polar_grid
 from darswin.layers.block import DropPath, PatchMerging
 from darswin.layers.embed import PolarPatchEmbed
-from darswin.layers.position_bias import AngularRelativeBias, FourierBias, radial_positions
+from darswin.layers.position_bias import AngularRelativeBias, FourierBias, ring_angles
 from darswin.lens import Perspective, Spherical
 from darswin.ops import polar_embed, polar_sample, use_reference, window_attention
 
@@ -85,14 +85,14 @@ def test_polar_sample_errors(call, error, message):
 
 def test_angular_relative_bias_is_the_papers_formula():
     bias = AngularRelativeBias((3, 4), heads=2, sectors=8)
-    radial = torch.tensor([[0.0, 0.1, 0.2, 0.3], [0.0, 0.3, 0.6, 0.9]])
-    table = bias(radial)
+    ring_angles = torch.tensor([[0.0, 0.1, 0.2, 0.3], [0.0, 0.3, 0.6, 0.9]])
+    table = bias(ring_angles)
     assert table.shape == (2, 2, 5, 7)
     for image in range(2):
         for head in range(2):
             for delta_r in range(-2, 3):
                 for delta_a in range(-3, 4):
-                    theta = math.copysign(radial[image, abs(delta_r)].item(), delta_r)
+                    theta = math.copysign(ring_angles[image, abs(delta_r)].item(), delta_r)
                     phi = 2 * math.pi * delta_a / 8
                     expected = (
                         bias.a_theta[delta_r % 5, head] * math.sin(theta)
@@ -123,9 +123,9 @@ def test_periodic_bias_joins_at_the_seam():
 
 def test_radial_positions():
     grid = polar_grid(LENS, (32, 32), rings=8, sectors=4, samples=(2, 2))
-    angles = radial_positions(LENS, grid, 4, "angular_relative")
+    angles = ring_angles(LENS, grid, 4, "angular_relative")
     torch.testing.assert_close(angles[0], torch.linspace(0, 1.3, 5))
-    radii = radial_positions(LENS, grid, 4, "polar")
+    radii = ring_angles(LENS, grid, 4, "polar")
     torch.testing.assert_close(radii, grid.borders[:, ::2] * math.pi / 16)
 
 
@@ -135,13 +135,13 @@ def test_window_attention_layer(position_bias):
         12, 3, map_size=(4, 8), window=(2, 8), position_bias=position_bias, periodic_bias=True
     )
     x = torch.randn(2, 4, 8, 12)
-    radial = torch.linspace(0, 1, 5)[None]
-    out = layer(x, radial)
+    ring_angles = torch.linspace(0, 1, 5)[None]
+    out = layer(x, ring_angles)
     out.sum().backward()
     assert out.shape == x.shape
     assert all(p.grad is not None and p.grad.isfinite().all() for p in layer.parameters())
     with pytest.raises(ValueError, match=r"the map must be \(R, A\) = \(4, 8\), got \(8, 4\)"):
-        layer(x.transpose(1, 2), radial)
+        layer(x.transpose(1, 2), ring_angles)
 
 
 @pytest.mark.parametrize("periodic_bias", [False, True])
@@ -153,11 +153,11 @@ def test_compiled_gradients_of_the_bias(position_bias, periodic_bias):
         16, 8, map_size=(2, 8), window=(1, 8), position_bias=position_bias,
         periodic_bias=periodic_bias,
     )  # fmt: skip
-    x, radial = torch.randn(2, 2, 8, 16), torch.rand(2, 3).cumsum(1)
-    layer(x, radial).square().sum().backward()
+    x, ring_angles = torch.randn(2, 2, 8, 16), torch.rand(2, 3).cumsum(1)
+    layer(x, ring_angles).square().sum().backward()
     expected = {name: p.grad.clone() for name, p in layer.named_parameters()}
     layer.zero_grad()
-    torch.compile(layer, fullgraph=True)(x, radial).square().sum().backward()
+    torch.compile(layer, fullgraph=True)(x, ring_angles).square().sum().backward()
     for name, parameter in layer.named_parameters():
         torch.testing.assert_close(parameter.grad, expected[name], rtol=1e-3, atol=1e-4)
 
@@ -191,10 +191,10 @@ def test_a_plain_swin_block_runs_on_the_layer():
     layer = PolarWindowAttention(
         8, 2, map_size=(8, 8), window=(4, 4), shift=(2, 2), periodic=(False, False)
     )
-    x, radial = torch.randn(2, 8, 8, 8, requires_grad=True), torch.linspace(0, 1, 9)[None]
-    out = layer(x, radial)
+    x, ring_angles = torch.randn(2, 8, 8, 8, requires_grad=True), torch.linspace(0, 1, 9)[None]
+    out = layer(x, ring_angles)
     with use_reference():
-        expected = layer(x, radial)
+        expected = layer(x, ring_angles)
     torch.testing.assert_close(out, expected)
     (grad,) = torch.autograd.grad(out[0, 0, 0].sum(), x)
     # The corner's window holds the four corners of the map; it sees only its own.

@@ -6,7 +6,7 @@ import torch.nn.functional as F
 
 from darswin import create_model
 from darswin.layers import linear
-from darswin.layers.linear import Linear, choices
+from darswin.layers.linear import Linear, autotune_results
 from darswin.lens import Spherical
 
 LENSES = Spherical.from_fov([0.2, 0.9], 2.6, 16.0)
@@ -15,7 +15,7 @@ LENSES = Spherical.from_fov([0.2, 0.9], 2.6, 16.0)
 @pytest.fixture(autouse=True)
 def forget():
     """Every test measures for itself."""
-    linear._choices.clear()
+    linear._measured.clear()
 
 
 def results(layer, x):
@@ -44,7 +44,7 @@ def test_every_way_is_the_same(monkeypatch, way, shape, bias):
     exact = results(copy.deepcopy(layer).double(), x.double())
     usual = results(layer, x)
     pick(monkeypatch, way)
-    layer.products = "fastest"
+    layer.matmul_backend = "autotune"
     for got, base, want in zip(results(layer, x), usual, exact, strict=True):
         assert got.is_contiguous()
         rounding = 4 * torch.finfo(torch.float32).eps * want.abs().max()
@@ -60,9 +60,9 @@ def test_onednn_asks_onednn_alone(monkeypatch):
             ways, "onednn", lambda *a, way=way, name=product: calls.append(name) or way(*a)
         )
     layer = Linear(12, 20)
-    layer.products = "onednn"
+    layer.matmul_backend = "onednn"
     results(layer, torch.randn(4, 12))
-    assert calls == ["forward", "input gradient", "weight gradient"] and not choices()
+    assert calls == ["forward", "input gradient", "weight gradient"] and not autotune_results()
 
 
 def test_fastest_measures_each_shape_once(monkeypatch):
@@ -74,34 +74,34 @@ def test_fastest_measures_each_shape_once(monkeypatch):
 
     monkeypatch.setattr(linear, "_measure", measure)
     layer = Linear(12, 20)
-    layer.products = "fastest"
+    layer.matmul_backend = "autotune"
     for rows in (5, 8, 8, 2):  # 5 to 8 rows are one shape
         results(layer, torch.randn(rows, 12))
     assert measured == [(5, 12), (5, 20), (5, 20), (2, 12), (2, 20), (2, 20)]
     threads = torch.get_num_threads()
-    assert choices() == {
+    assert autotune_results() == {
         (product, rows, 12, 20, threads): {"onednn": 0.1, "torch": 0.2}
         for rows in (8, 2)
         for product in ("forward", "input gradient", "weight gradient")
     }
-    assert all(next(iter(seconds)) == "onednn" for seconds in choices().values())
+    assert all(next(iter(seconds)) == "onednn" for seconds in autotune_results().values())
 
 
 def test_only_wanted_gradients():
     layer = Linear(12, 20)
-    layer.products = "fastest"
+    layer.matmul_backend = "autotune"
     x = torch.randn(4, 12, requires_grad=True)
     layer.requires_grad_(False)
     layer(x).sum().backward()
-    assert {shape.product for shape in choices()} == {"forward", "input gradient"}
+    assert {shape.product for shape in autotune_results()} == {"forward", "input gradient"}
     torch.testing.assert_close(x.grad, layer.weight.sum(0).expand(4, 12))
 
 
-@pytest.mark.parametrize("products", ["onednn", "fastest"])
-def test_where_torch_multiplies_anyway(monkeypatch, products):
+@pytest.mark.parametrize("backend", ["onednn", "autotune"])
+def test_where_torch_multiplies_anyway(monkeypatch, backend):
     monkeypatch.setattr(linear, "_multiply", None)
     layer = Linear(12, 20)
-    layer.products = products
+    layer.matmul_backend = backend
     x = torch.randn(4, 12)
     with torch.autocast("cpu", torch.bfloat16):
         assert layer(x).dtype == torch.bfloat16
@@ -117,7 +117,7 @@ def test_where_torch_multiplies_anyway(monkeypatch, products):
 
 def test_no_second_derivative():
     layer = Linear(12, 20)
-    layer.products = "onednn"
+    layer.matmul_backend = "onednn"
     x = torch.randn(4, 12, requires_grad=True)
     (grad,) = torch.autograd.grad(layer(x).square().sum(), x, create_graph=True)
     with pytest.raises(RuntimeError, match="once_differentiable"):
@@ -129,15 +129,15 @@ def test_models_train_with_each_choice(name):
     model = create_model(name, num_classes=10, drop_path_rate=0.0)
     images = torch.randn(2, 3, 32, 32)
     gradients = {}
-    for products in linear.PRODUCTS:
-        model.set_products(products)
+    for backend in linear.MATMUL_BACKENDS:
+        model.set_matmul_backend(backend)
         model.zero_grad()
         torch.manual_seed(0)  # of the jitter
         model(images, LENSES).square().sum().backward()
-        gradients[products] = [p.grad.clone() for p in model.parameters()]
-    assert choices()
-    for products in ("onednn", "fastest"):
-        for got, want in zip(gradients[products], gradients["torch"], strict=True):
+        gradients[backend] = [p.grad.clone() for p in model.parameters()]
+    assert autotune_results()
+    for backend in ("onednn", "autotune"):
+        for got, want in zip(gradients[backend], gradients["torch"], strict=True):
             assert (got - want).norm() <= 1e-4 * want.norm() + 1e-6
-    with pytest.raises(ValueError, match=r"products must be one of .* got 'mkl'"):
-        model.set_products("mkl")
+    with pytest.raises(ValueError, match=r"matmul_backend must be one of .* got 'mkl'"):
+        model.set_matmul_backend("mkl")

@@ -5,7 +5,7 @@ from torch import nn
 from torch.multiprocessing.reductions import StorageWeakRef
 
 from darswin import create_model
-from darswin.layers.recompute import made_again
+from darswin.layers.recompute import recomputed
 from darswin.lens import Spherical
 
 LENSES = Spherical.from_fov([0.2, 0.9], 2.6, 16.0)
@@ -26,7 +26,7 @@ def test_gradients_are_the_same_bit_for_bit(name, half):
     model = create_model(name, num_classes=10, drop_path_rate=0.2).train()
     images = torch.randn(2, 3, 32, 32)
     want = gradients(model, images, half)
-    model.set_recompute(True)
+    model.set_grad_checkpointing(True)
     for got, expected in zip(gradients(model, images, half), want, strict=True):
         assert torch.equal(got, expected)
 
@@ -42,7 +42,7 @@ def test_the_value_is_not_kept_but_made_again(when):
 
     value = gelu(hidden)
     memory = StorageWeakRef(value.untyped_storage())
-    with made_again(value, gelu, hidden, when=when):
+    with recomputed(value, gelu, hidden, when=when):
         out = linear(value)
     del value
     # Freed, but for what the GELU's own node needs, which is `hidden`.
@@ -55,7 +55,7 @@ def test_the_value_is_not_kept_but_made_again(when):
 def test_other_tensors_are_kept():
     hidden, other = torch.randn(2, 6, requires_grad=True), torch.randn(2, 6, requires_grad=True)
     value = F.gelu(hidden)
-    with made_again(value, F.gelu, hidden, when=True):
+    with recomputed(value, F.gelu, hidden, when=True):
         (value * other * value[:, :6]).sum().backward()
     exact = F.gelu(hidden.detach())
     torch.testing.assert_close(other.grad, exact.square())
@@ -66,7 +66,7 @@ def test_compiled_and_without_gradients_it_does_nothing():
     images = torch.randn(2, 3, 32, 32)
     with torch.no_grad():
         want = model(images, LENSES)
-        model.set_recompute(True)
+        model.set_grad_checkpointing(True)
         assert torch.equal(model(images, LENSES), want)
     compiled = torch.compile(model, fullgraph=True, backend="aot_eager")
     torch.testing.assert_close(compiled(images, LENSES), want)

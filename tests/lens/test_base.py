@@ -9,7 +9,7 @@ import torch
 from torch.utils import _pytree as pytree
 from torch.utils.data import DataLoader, Dataset
 
-from darswin.lens import Equidistant, Perspective, Polynomial, Spherical, from_dict, stack, to_dict
+from darswin.lens import Equidistant, Perspective, Polynomial, Spherical, cat, from_dict, to_dict
 
 f64 = torch.float64
 
@@ -188,16 +188,16 @@ def test_indexing_and_stacking():
     assert lens[torch.tensor([True, False, True])].focal.tolist() == [1.0, 3.0]
     with pytest.raises(IndexError):
         lens[3]
-    again = stack([lens[k] for k in range(3)])
+    again = cat([lens[k] for k in range(3)])
     assert torch.equal(again.xi, lens.xi) and torch.equal(again.center, lens.center)
     assert [x.focal.item() for x in lens] == [1.0, 2.0, 3.0]
     assert len(lens[0].expand(5)) == 5
     with pytest.raises(ValueError, match="cannot expand"):
         lens.expand(4)
     with pytest.raises(ValueError, match="at least one"):
-        stack([])
+        cat([])
     with pytest.raises(ValueError, match="center for all"):
-        stack([lens[0], Spherical(0.1, 1.0, 1.0)])
+        cat([lens[0], Spherical(0.1, 1.0, 1.0)])
 
 
 @pytest.mark.parametrize("name", LENSES)
@@ -213,7 +213,7 @@ def test_tensors_are_contiguous_however_a_lens_was_made(name):
         "halved": lens.resized(0.5),
         "cropped": lens.cropped(3, 5, 20, 40),
         "replaced": lens[:2].replace(theta_max=lens.theta_max[:1].expand(2)),
-        "stacked": stack([lens, lens]),
+        "stacked": cat([lens, lens]),
         "float32": lens.to(torch.float32),
     }
     for how, other in made.items():
@@ -336,9 +336,9 @@ def test_another_theta_max():
 def test_stacking_needs_the_same_frame():
     with_size = Spherical(0.5, 10.0, 1.0, image_size=(4, 4))
     with pytest.raises(ValueError, match="image_size for all"):
-        stack([with_size, Spherical(0.5, 10.0, 1.0)])
+        cat([with_size, Spherical(0.5, 10.0, 1.0)])
     tilted = Spherical(0.5, 10.0, 1.0, affine=[[1.0, 0.0], [0.0, 2.0]])
-    both = stack([tilted, Spherical(0.5, 10.0, 1.0)])
+    both = cat([tilted, Spherical(0.5, 10.0, 1.0)])
     assert isinstance(both, Spherical) and both.affine[1].tolist() == [[1.0, 0.0], [0.0, 1.0]]
 
 

@@ -11,8 +11,8 @@ from darswin.lens import (
     Mei,
     Polynomial,
     Spherical,
+    cat,
     fit,
-    stack,
 )
 
 f64 = torch.float64
@@ -66,7 +66,7 @@ def test_tangential_terms_are_fitted_where_the_model_has_them():
 
 
 def test_a_batch_in_its_own_precision():
-    lens = stack([Spherical(0.3, 100.0, 1.2), Spherical(0.9, 50.0, 1.2)])
+    lens = cat([Spherical(0.3, 100.0, 1.2), Spherical(0.9, 50.0, 1.2)])
     found, error = fit(KannalaBrandt, lens)
     assert len(found) == 2 and error.shape == (2,) and found.focal.dtype == torch.float32
     alone = fit(KannalaBrandt, lens[1])

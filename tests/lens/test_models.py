@@ -25,7 +25,7 @@ from darswin.lens import (
     Stereographic,
     Tabulated,
     as_curves,
-    stack,
+    cat,
 )
 
 f64 = torch.float64
@@ -352,19 +352,19 @@ def test_lenses_of_several_models_are_one_batch_of_curves():
     lenses = [CALIBRATIONS[name][0] for name in ("WoodScape front", "Kalibr ds", "COLMAP")]
     lenses = [lens.with_theta_max(1.6).replace(center=double(1, 2)[None]) for lens in lenses]
     lenses[1] = lenses[1].replace(affine=2 * torch.eye(2, dtype=f64)[None])
-    batch = stack(lenses)
+    batch = cat(lenses)
     assert isinstance(batch, Tabulated) and len(batch) == 3
     theta = torch.linspace(0, 1.6, 777, dtype=f64)[None]
     exact = torch.cat([lens.project(theta) for lens in lenses])
     torch.testing.assert_close(batch.project(theta), exact, rtol=0, atol=2e-5)
     torch.testing.assert_close(batch.unproject(exact), theta.expand(3, -1), rtol=0, atol=1e-7)
     assert batch.affine[0].tolist() == [[1, 0], [0, 1]] and batch.affine[1, 0, 0] == 2
-    degrees = stack([Polynomial(double(10.0), 1.0), Polynomial(double(10.0, 1.0), 1.0)])
+    degrees = cat([Polynomial(double(10.0), 1.0), Polynomial(double(10.0, 1.0), 1.0)])
     assert isinstance(degrees, Tabulated)
-    same = stack([lenses[1], lenses[1]])
+    same = cat([lenses[1], lenses[1]])
     assert isinstance(same, DoubleSphere) and len(same) == 2
     with pytest.raises(ValueError, match="tangential or thin-prism terms is no curve"):
-        stack([ASIDE["Mei"], ASIDE["affine alone"]])
+        cat([ASIDE["Mei"], ASIDE["affine alone"]])
     xi = torch.tensor([0.5], dtype=f64, requires_grad=True)
     curve = as_curves(Spherical(xi, 10.0, 1.0))
     curve.project(double(0.7)).backward()
@@ -399,7 +399,7 @@ def test_mixed_ideal_lenses_in_one_batch_are_exact_to_1e_5_px():
         Orthographic: 85,
     }
     lenses = [model(double(300.0), math.radians(end)) for model, end in ends.items()]
-    batch = stack(lenses)
+    batch = cat(lenses)
     theta = batch.theta_max[:, None] * torch.linspace(0, 1, 30001, dtype=f64)
     exact = torch.cat([lens.project(t[None]) for lens, t in zip(lenses, theta, strict=True)])
     error = (batch.project(theta) - exact).abs().amax(1)

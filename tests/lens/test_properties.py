@@ -8,7 +8,7 @@ import hypothesis.strategies as st
 import torch
 
 from darswin.layers.grid import PLACEMENTS, SPACINGS, polar_grid
-from darswin.lens import MODELS, from_dict, stack, to_dict
+from darswin.lens import MODELS, cat, from_dict, to_dict
 from darswin.lens.base import ROW_DIMS
 
 f64 = torch.float64
@@ -118,7 +118,7 @@ def test_a_resized_or_cropped_lens_sees_the_same(lens, scale, data):
 def test_a_batch_is_its_lenses_and_json_is_the_lens(lens):
     theta = 0.9 * lens.theta_max[:, None]
     together = lens.project_rays(theta, torch.full_like(theta, 0.7), (480, 640))
-    joined = stack([lens[k] for k in range(len(lens))])
+    joined = cat([lens[k] for k in range(len(lens))])
     for name in lens._names():
         value, other = getattr(lens, name), getattr(joined, name)
         assert (value is None) == (other is None) and (value is None or torch.equal(value, other))

@@ -416,10 +416,10 @@ def test_images_of_another_dtype_than_the_models(family):
 @pytest.mark.parametrize("family", FAMILIES)
 def test_a_new_classifier_is_of_the_models_kind(family):
     model = create_model(f"{family}_nano", num_classes=5).bfloat16().eval()
-    model.set_products("onednn")
+    model.set_matmul_backend("onednn")
     for classes in (7, 0, 3):
         model.reset_classifier(classes)
-    assert model.head.products == "onednn" and not model.head.training
+    assert model.head.matmul_backend == "onednn" and not model.head.training
     frames = torch.randint(256, (2, 32, 32, 3), dtype=torch.uint8)
     assert model(frames, LENS).dtype == torch.bfloat16 and model(frames, LENS).shape == (2, 3)
     model.to("meta").reset_classifier(4)

@@ -105,8 +105,8 @@ def without_bias(model, monkeypatch) -> None:
     geometry = model.geometry
 
     def detached(*args):
-        grid, radials = geometry(*args)
-        return grid, [radial.detach() for radial in radials]
+        grid, angles = geometry(*args)
+        return grid, [of_rings.detach() for of_rings in angles]
 
     monkeypatch.setattr(model, "geometry", detached)
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from darswin import PolarSample, create_model, polar_grid
-from darswin.lens import Mei, Polynomial, Spherical, Tabulated, stack
+from darswin.lens import Mei, Polynomial, Spherical, Tabulated, cat
 from darswin.ops import use_reference
 
 WOODSCAPE = Polynomial(
@@ -61,7 +61,7 @@ def test_a_batch_of_several_models_is_each_of_them():
         Spherical.from_fov(0.7, 3.0, 48.0, center=[63.5, 47.5], image_size=(96, 128)),
         KITTI.replace(tangential=None).resized((96, 128)),
     ]
-    batch = stack(lenses)
+    batch = cat(lenses)
     assert isinstance(batch, Tabulated)
     model = create_model("darswin_a_nano", num_classes=5).eval()
     images = torch.rand(3, 3, 96, 128)
@@ -82,7 +82,7 @@ def test_images_of_another_size_than_the_lens_are_refused():
 
 
 @pytest.mark.parametrize(
-    "lens", [WOODSCAPE, KITTI, stack([KITTI.replace(tangential=None), WOODSCAPE])[:1]]
+    "lens", [WOODSCAPE, KITTI, cat([KITTI.replace(tangential=None), WOODSCAPE])[:1]]
 )
 def test_a_calibrated_camera_compiles(lens):
     sample = PolarSample(8, 32, (2, 2))
