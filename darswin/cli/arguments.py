@@ -68,7 +68,7 @@ def with_lists(argv: Sequence[str], names: Collection[str]) -> list[str]:
 def _sentence(message: str, kinds: Mapping[str, Any]) -> str:
     """What jsonargparse says of an argument, in one line and with options as people type them."""
     key = re.search(r'[Kk]ey "([^"]+)"', message)
-    name = key[1].rpartition(".")[2] if key else None
+    name = key[1].rpartition(".")[2] if key else ""
     got = re.search(r"(?:Got|Given) value: (.*)", message)
     if name in kinds and got:
         return f"--{name} must be {_kind(kinds[name])}, got {got[1] or 'nothing'}"

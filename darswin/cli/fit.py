@@ -10,7 +10,9 @@ import re
 import shlex
 import sys
 import warnings
+from functools import partial
 from pathlib import Path
+from typing import Any, NoReturn
 
 import torch
 import yaml
@@ -21,6 +23,7 @@ from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
 from lightning.pytorch.utilities import rank_zero_only
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
+from darswin.cli.arguments import with_lists
 from darswin.data.lenses import parse_sweep
 from darswin.models.saving import model_of_run
 from darswin.train.checkpoints import RunCheckpoint, SafeCheckpointIO
@@ -30,12 +33,16 @@ from darswin.train.resuming import check_changes
 from darswin.train.stopping import StopSignals, StopWhenTold
 from darswin.train.task import Classification
 from darswin.utils.files import locked, remove_partial_files, replace_file
+from darswin.utils.malloc import keep_freed_memory
 
 PRESETS = Path(__file__).parent.parent / "train" / "presets"
 
 
-def run_command(argv: list[str]) -> None:
+def run(argv: list[str]) -> None:
     """Runs `fit`, `validate` or `test`, the first of `argv`, with the others as its options."""
+    if argv[0] == "fit":
+        keep_freed_memory()
+    argv = with_lists(argv, ("data.mean", "data.std"))
     # The arguments are the command line's own, with the run's configuration added.
     warnings.filterwarnings("ignore", "LightningCLI's args parameter")
     warnings.filterwarnings("ignore", r".*isinstance\(treespec, LeafSpec\)")  # Lightning's own
@@ -141,7 +148,7 @@ def _config_file(name: str) -> str:
 class RunParser(LightningArgumentParser):
     """Names options in its errors as people type them."""
 
-    def error(self, message: str, *rest) -> None:
+    def error(self, message: str, *rest: Any) -> NoReturn:
         message = re.sub(r'Parser key "([\w.]+)":', r"--\1:", message)
         message = re.sub(
             r"Subcommand '\w+' does not accept option '", "there is no option '--", message
@@ -270,21 +277,17 @@ class RunCLI(LightningCLI):
             TensorBoardLogger(self.folder, name="", version="tensorboard"),
         ]
 
-    def _callbacks(self, steps: int) -> list:
+    def _callbacks(self, steps: int) -> list[Callback]:
         if self.subcommand != "fit":
             return [WriteResults(self.folder)] if self.subcommand == "test" else []
-        kept = dict(dirpath=self.folder / "checkpoints", enable_version_counter=False)
+        checkpoint = partial(
+            RunCheckpoint, self.folder / "checkpoints", enable_version_counter=False
+        )
         return [
             StopWhenTold(self.signals, _last(self.folder)),
-            RunCheckpoint(
-                filename="best",
-                monitor="val/top1",
-                mode="max",
-                save_on_train_epoch_end=False,
-                **kept,
-            ),
-            RunCheckpoint(filename="last", every_n_train_steps=steps, **kept),
-            RunCheckpoint(filename="last", save_on_train_epoch_end=True, **kept),
+            checkpoint("best", monitor="val/top1", mode="max", save_on_train_epoch_end=False),
+            checkpoint("last", every_n_train_steps=steps),
+            checkpoint("last", save_on_train_epoch_end=True),
         ]
 
 

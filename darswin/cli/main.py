@@ -7,29 +7,83 @@ import os
 import sys
 import warnings
 from collections.abc import Callable, Mapping
+from typing import NamedTuple
 
 from darswin.utils.extras import lack
 
-COMMANDS = {
-    "fit": "trains a model",
-    "validate": "measures a trained model on the validation set",
-    "test": "measures a trained model through lenses, for one after the other",
-    "predict": "names what is in pictures taken through a known lens",
-    "convert": "makes a safetensors file of a pickled checkpoint, without executing it",
-    "models": "lists the models",
-    "lens": "draws, describes or converts a calibrated lens",
-    "bench": "measures how fast a model is on this machine, in some minutes",
-}
-# The modules of the extra `train` that a command imports, if not all of them.
+
+class Command(NamedTuple):
+    """A command: its help, the modules of the extra `train` that it imports, and what runs it."""
+
+    text: str
+    needs: tuple[str, ...]
+    run: Callable[[list[str]], None]
+
+
+# Each imports what it runs when it is called: that takes seconds.
+def _fit(argv: list[str]) -> None:
+    from darswin.cli.fit import run
+
+    run(argv)
+
+
+def _predict(argv: list[str]) -> None:
+    from darswin.cli.predict import run
+
+    run(argv[1:])
+
+
+def _convert(argv: list[str]) -> None:
+    from darswin.cli.arguments import run_command
+    from darswin.compat import convert_checkpoint
+
+    run_command(convert_checkpoint, argv[1:], "darswin convert")
+
+
+def _models(argv: list[str]) -> None:
+    from darswin.models import list_models
+
+    parser = argparse.ArgumentParser(prog="darswin models", description=COMMANDS["models"].text)
+    parser.parse_args(argv[1:])
+    print("\n".join(list_models()))
+
+
+def _lens(argv: list[str]) -> None:
+    from darswin.cli.lens import run
+
+    run(argv[1:])
+
+
+def _bench(argv: list[str]) -> None:
+    from darswin.cli.bench import main as run
+    from darswin.utils.malloc import keep_freed_memory
+
+    keep_freed_memory()
+    run(argv[1:])
+
+
 TRAIN = (
     "PIL", "cv2", "jsonargparse", "lightning", "matplotlib", "sklearn", "tensorboard",
     "torchmetrics",
 )  # fmt: skip
-NEEDS = {
-    "models": (),
-    "bench": (),
-    "convert": ("jsonargparse",),
-    "lens": ("cv2", "jsonargparse", "matplotlib"),
+PICTURES = ("PIL", "cv2", "jsonargparse")
+COMMANDS = {
+    "fit": Command("trains a model", TRAIN, _fit),
+    "validate": Command("measures a trained model on the validation set", TRAIN, _fit),
+    "test": Command(
+        "measures a trained model through lenses, for one after the other", TRAIN, _fit
+    ),
+    "predict": Command("names what is in pictures taken through a known lens", PICTURES, _predict),
+    "convert": Command(
+        "makes a safetensors file of a pickled checkpoint, without executing it",
+        ("jsonargparse",),
+        _convert,
+    ),
+    "models": Command("lists the models", (), _models),
+    "lens": Command(
+        "draws, describes or converts a calibrated lens", (*PICTURES, "matplotlib"), _lens
+    ),
+    "bench": Command("measures how fast a model is on this machine, in some minutes", (), _bench),
 }
 # For terminals that know no more than ASCII.
 PLAIN = {"°": "deg", "×": "x", "±": "+/-", "–": "-", "…": "...", "²": "^2", "θ": "theta",
@@ -39,30 +93,29 @@ PLAIN = {"°": "deg", "×": "x", "±": "+/-", "–": "-", "…": "...", "²": "^
 def main(argv: list[str] | None = None) -> None:
     """Runs a command; what a user can mend is said in one line, without a traceback."""
     argv = sys.argv[1:] if argv is None else argv
-    command = argv[0] if argv else "--help"
-    print_anywhere({} if command == "predict" else PLAIN)  # which prints JSON, to be read again
-    if command in ("-h", "--help"):
+    name = argv[0] if argv else "--help"
+    print_anywhere({} if name == "predict" else PLAIN)  # which prints JSON, to be read again
+    if name in ("-h", "--help"):
         print("usage: darswin COMMAND [OPTIONS]\n")
-        print("\n".join(f"  {name:<10}{text}" for name, text in COMMANDS.items()))
+        print("\n".join(f"  {name:<10}{command.text}" for name, command in COMMANDS.items()))
         print("\n`darswin COMMAND --help` lists its options.")
         return
-    if command not in COMMANDS:
-        raise misuse(f"no command {command!r}; there are {', '.join(COMMANDS)}")
-    if (without := lack("train", NEEDS.get(command, TRAIN))) is not None:
-        raise SystemExit(f"darswin {command}: {without}")
+    if name not in COMMANDS:
+        raise misuse(f"no command {name!r}; there are {', '.join(COMMANDS)}")
+    command = COMMANDS[name]
+    if (without := lack("train", command.needs)) is not None:
+        raise SystemExit(f"darswin {name}: {without}")
     warnings.showwarning = _one_line(warnings.showwarning)
     try:
-        _run(command, argv)
+        command.run(argv)
         sys.stdout.flush()
     except BrokenPipeError:  # `darswin lens info … | head`: who reads has enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except (OSError, ValueError, FloatingPointError, MemoryError) as error:
         # A worker process puts its whole traceback into the message; the last line is the error's.
         message = str(error).strip().splitlines()[-1] if "Traceback" in str(error) else str(error)
-        if "BrokenImageError" in f"{type(error).__name__}{message}" and command not in (
-            "predict",
-            "lens",
-        ):
+        broken = "BrokenImageError" in f"{type(error).__name__}{message}"
+        if broken and command.run is _fit:
             message += " (--data.skip_broken true leaves such files out)"
         if isinstance(error, FloatingPointError):
             raise SystemExit(f"darswin: {message}") from error
@@ -105,46 +158,3 @@ def _one_line(show: Callable[..., None]) -> Callable[..., None]:
             print(f"darswin: {message}", file=sys.stderr)
 
     return shown
-
-
-def _run(command: str, argv: list[str]) -> None:
-    # Imported here, because they take seconds.
-    if command in ("fit", "bench"):
-        from darswin.utils.malloc import keep_freed_memory
-
-        keep_freed_memory()
-    if command in ("fit", "validate", "test"):
-        from darswin.cli.arguments import with_lists
-        from darswin.cli.fit import run_command
-
-        run_command(with_lists(argv, ("data.mean", "data.std")))
-        return
-    if command == "predict":
-        from jsonargparse import ArgumentParser
-
-        from darswin.cli.predict import predict
-
-        parser = ArgumentParser(prog="darswin predict", description=predict.__doc__.split("\n")[0])
-        parser.add_argument("pictures", nargs="+", type=str, help="image files")
-        parser.add_function_arguments(predict, skip={"pictures"})
-        predict(**parser.parse_args(argv[1:]).as_dict())
-    elif command == "convert":
-        from darswin.cli.arguments import run_command
-        from darswin.compat import convert_checkpoint
-
-        run_command(convert_checkpoint, argv[1:], "darswin convert")
-    elif command == "lens":
-        from darswin.cli.lens import run
-
-        run(argv[1:])
-    elif command == "bench":
-        from darswin.cli.bench import main as bench
-
-        bench(argv[1:])
-    else:
-        from darswin.models import list_models
-
-        argparse.ArgumentParser(prog="darswin models", description=COMMANDS[command]).parse_args(
-            argv[1:]
-        )
-        print("\n".join(list_models()))

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 import torch
+from jsonargparse import ArgumentParser
 from safetensors import safe_open
 from torch import Tensor, nn
 
@@ -18,6 +19,15 @@ from darswin.lens.orientation import in_upright_picture, stored_size
 from darswin.models.saving import ModelCard, NoCardError, load_model, model_of_run
 from darswin.utils.files import replace_file
 from darswin.utils.image import BrokenImageError, read_oriented
+
+
+def run(argv: list[str]) -> None:
+    """Runs `darswin predict` with the arguments that follow it."""
+    described = (predict.__doc__ or "").splitlines()[0]
+    parser = ArgumentParser(prog="darswin predict", description=described)
+    parser.add_argument("pictures", nargs="+", type=str, help="image files")
+    parser.add_function_arguments(predict, skip={"pictures"})
+    predict(**parser.parse_args(argv).as_dict())
 
 
 def predict(

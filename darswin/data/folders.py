@@ -78,7 +78,7 @@ def pictures_of(
                 "--data.classes"
             )
     # Without a test set of its own, "val" serves as one.
-    held_out = [part for part in ("test", "val") if part not in given]
+    held_out: list[Split] = [part for part in ("test", "val") if part not in given]
     if held_out == ["test"]:
         held_out, given["test"] = [], given["val"]
     if held_out and split in ("train", *held_out):
@@ -249,7 +249,8 @@ def _say_loose(folder: Path, files: list[Path]) -> None:
 
 def _entries(folder: Path) -> tuple[list[Path], list[Path]]:
     """The folders and the files in a folder, sorted, links to them too, no hidden ones."""
-    folders, files = [], []
+    folders: list[Path] = []
+    files: list[Path] = []
     with os.scandir(folder) as entries:
         for entry in sorted(entries, key=lambda entry: entry.name):
             if not _hidden(entry.name):

@@ -29,8 +29,10 @@ class RunCheckpoint(ModelCheckpoint):
             super().on_train_batch_end(trainer, pl_module, outputs, batch, batch_idx)
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        folder = Path(self.dirpath or "")
+
         def here(path: str) -> str:
-            return str(Path(self.dirpath) / Path(path).name) if path else path
+            return str(folder / Path(path).name) if path else path
 
         state = dict(state_dict, dirpath=self.dirpath)
         for key in ("best_model_path", "kth_best_model_path", "last_model_path"):
@@ -48,7 +50,7 @@ class SafeCheckpointIO(TorchCheckpointIO):
     """Writes a checkpoint in the place of the old one in one go; reads no pickled code."""
 
     def save_checkpoint(
-        self, checkpoint: dict[str, Any], path: str, storage_options: Any = None
+        self, checkpoint: dict[str, Any], path: str | Path, storage_options: Any = None
     ) -> None:
         content = io.BytesIO()
         torch.save(checkpoint, content)
@@ -60,12 +62,12 @@ class SafeCheckpointIO(TorchCheckpointIO):
         }
         save_model(_weights(path), weights, ModelCard(**checkpoint["darswin"]))
 
-    def remove_checkpoint(self, path: str) -> None:
+    def remove_checkpoint(self, path: str | Path) -> None:
         super().remove_checkpoint(path)
         _weights(path).unlink(missing_ok=True)
 
     def load_checkpoint(
-        self, path: str, map_location: Any = "cpu", weights_only: bool | None = None
+        self, path: str | Path, map_location: Any = "cpu", weights_only: bool | None = None
     ) -> dict[str, Any]:
         if not Path(path).is_file():
             raise FileNotFoundError(f"no checkpoint {path}")
@@ -80,5 +82,5 @@ class SafeCheckpointIO(TorchCheckpointIO):
         return checkpoint
 
 
-def _weights(path: str) -> Path:
+def _weights(path: str | Path) -> Path:
     return Path(path).with_suffix(".safetensors")

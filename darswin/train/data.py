@@ -1,6 +1,7 @@
 """The data of a run."""
 
 import math
+from functools import partial
 from typing import Any, Literal
 
 from lightning.pytorch import LightningDataModule
@@ -83,16 +84,17 @@ class WideAngleData(LightningDataModule):
             )
         self.train_lenses = parse_lenses(train_lenses)
         self.test_names = parse_sweep(test_lenses)
-        self._where = dict(
-            path=path, channels=channels, classes=classes, splits=splits, holdout=holdout
+        self._path, self._holdout = path, holdout
+        self._open = partial(
+            open_source, path, channels=channels, classes=classes, splits=splits, holdout=holdout
         )
         self.size, self.fov, self.channels = size, math.radians(fov_deg), channels
         self.mean = list(mean or (IMAGENET_MEAN if channels == 3 else [0.449]))
         self.std = list(std or (IMAGENET_STD if channels == 3 else [0.226]))
         if not len(self.mean) == len(self.std) == channels:
             raise ValueError(f"mean and std must have {channels} values, got {mean} and {std}")
-        self._views = dict(
-            size=size, render=render, fov=self.fov, fit=fit, picture_size=picture_size,
+        self._view = partial(
+            WideAngle, size=size, render=render, fov=self.fov, fit=fit, picture_size=picture_size,
             mean=self.mean, std=self.std, seed=seed, skip_broken=skip_broken,
         )  # fmt: skip
         self.limit, self.batch_size, self.workers = limit, batch_size, workers
@@ -106,7 +108,7 @@ class WideAngleData(LightningDataModule):
     def source(self, split: Split) -> Source:
         """The pictures of a split."""
         if split not in self._sources:
-            self._sources[split] = open_source(split=split, **self._where)
+            self._sources[split] = self._open(split)
         return self._sources[split]
 
     @property
@@ -120,7 +122,7 @@ class WideAngleData(LightningDataModule):
         if self.limit is not None and self.limit < len(source):
             source = Part(source, self.limit)
         distribution = self.train_lenses if lenses is None else parse_lenses(lenses)
-        dataset = WideAngle(source, distribution, **self._views, **options)
+        dataset = self._view(source, distribution, **options)
         self.datasets.append(dataset)
         return dataset
 
@@ -135,7 +137,7 @@ class WideAngleData(LightningDataModule):
         return dict(rank=self.trainer.global_rank, world=self.trainer.world_size)
 
     @property
-    def _options(self) -> dict:
+    def _options(self) -> dict[str, Any]:
         return dict(
             num_workers=self.workers,
             prefetch_factor=4 if self.workers else None,
@@ -169,15 +171,13 @@ class WideAngleData(LightningDataModule):
     def _evaluation(self, split: Split, lenses: str | None = None) -> DataLoader:
         try:
             dataset = self.dataset(split, lenses)
-        except FileNotFoundError:
-            if self._where["holdout"]:
+        except FileNotFoundError as error:
+            if self._holdout:
                 raise
-            dataset = ()
-        if not dataset and not self._where["holdout"]:
             raise ValueError(
-                f"--data.holdout 0 leaves no pictures for {split!r}, and {self._where['path']} has "
-                "none of its own; --trainer.limit_val_batches 0 trains without validation"
-            )
+                f"--data.holdout 0 leaves no pictures for {split!r}, and {self._path} has none of "
+                "its own; --trainer.limit_val_batches 0 trains without validation"
+            ) from error
         part = EveryNth(len(dataset), **self._place)
         if not part.indices:
             raise ValueError(

@@ -5,7 +5,7 @@ from collections.abc import Iterable
 from typing import Any
 
 from torch import nn
-from torch.optim import AdamW
+from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LambdaLR
 
 
@@ -17,7 +17,7 @@ def parameter_groups(model: nn.Module, weight_decay: float, undecayed: Iterable[
         undecayed: names of further parameters without decay.
     """
     undecayed = set(undecayed)
-    groups = {True: [], False: []}
+    groups: dict[bool, list[nn.Parameter]] = {True: [], False: []}
     for name, parameter in model.named_parameters():
         if parameter.requires_grad:
             decays = parameter.dim() > 1 and not name.endswith(".bias") and name not in undecayed
@@ -51,7 +51,7 @@ class Schedule(LambdaLR):
         rates: of `learning_rate`, with its steps.
     """
 
-    def __init__(self, optimizer: AdamW, **rates: float):
+    def __init__(self, optimizer: Optimizer, **rates: Any):
         super().__init__(optimizer, lambda step: learning_rate(step, **rates) / rates["peak"])
         optimizer.register_load_state_dict_pre_hook(_with_own_options)
 
@@ -64,7 +64,7 @@ class Schedule(LambdaLR):
         self.step()
 
 
-def _with_own_options(optimizer: AdamW, state: dict[str, Any]) -> dict[str, Any]:
+def _with_own_options(optimizer: Optimizer, state: dict[str, Any]) -> dict[str, Any]:
     theirs, own = state["param_groups"], optimizer.param_groups
     groups = [mine | {"params": group["params"]} for group, mine in zip(theirs, own, strict=True)]
     return state | {"param_groups": groups}

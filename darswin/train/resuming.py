@@ -42,7 +42,7 @@ def check_changes(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str
 
 def _options(config: Mapping[str, Any]) -> dict[str, Any]:
     """The options by their names on the command line."""
-    found = {}
+    found: dict[str, Any] = {}
     for group, value in config.items():
         if group in ("model", "data", "trainer"):
             found |= {f"{group}.{name}": own for name, own in value.items()}

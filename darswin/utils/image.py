@@ -70,7 +70,7 @@ def _decoded(data: np.ndarray, path: str | Path, channels: int, flags: int = 0) 
 def _exif(data: np.ndarray, path: str | Path) -> tuple[int, str | None]:
     """The EXIF orientation, 1 where there is none, and Pillow's name of the file's format."""
     try:
-        with warnings.catch_warnings(action="ignore"), Image.open(io.BytesIO(data)) as file:
+        with warnings.catch_warnings(action="ignore"), Image.open(io.BytesIO(data.data)) as file:
             orientation = file.getexif().get(ExifTags.Base.Orientation, 1)
             return orientation if orientation in TURNS else 1, file.format
     except UnidentifiedImageError:  # none of the formats that have EXIF

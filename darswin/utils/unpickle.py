@@ -11,7 +11,7 @@ import torch
 # The authors' training code pickles its configuration, a dict subclass of yacs, into the file. A
 # dict's pickle builds just as well another dict, and torch's restricted unpickler fills only those
 # of Python.
-_STAND_INS = [(OrderedDict, "yacs.config.CfgNode")]
+_STAND_INS: list[Any] = [(OrderedDict, "yacs.config.CfgNode")]
 
 
 def read_pickle(path: str | os.PathLike, map_location: Any = "cpu") -> object:

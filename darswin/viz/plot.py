@@ -84,7 +84,7 @@ def draw_grid(
     if samples:
         axes.plot(*_sample_places(lens, grid, image.shape[:2]), "r.", ms=0.6, alpha=0.5)
     axes.set(xlim=(-0.5, image.shape[1] - 0.5), ylim=(image.shape[0] - 0.5, -0.5))
-    return axes.figure
+    return _figure_of(axes)
 
 
 def draw_samples(
@@ -101,7 +101,7 @@ def draw_samples(
     inside = (x > left) & (x < left + width) & (y > top) & (y < top + height)
     axes.plot(x[inside], y[inside], "r.", ms=2.5, path_effects=_outline(0.5, "white"))
     axes.set(xlim=(left, left + width), ylim=(top + height, top))
-    return axes.figure
+    return _figure_of(axes)
 
 
 def _draw_borders(
@@ -120,7 +120,7 @@ def _draw_borders(
     for theta, azimuth, width in zip((rings, outwards), (around, sectors), widths, strict=True):
         lines = lens.project_rays(theta, azimuth, size).numpy()
         effects = _outline(width, "black")
-        collection = LineCollection(lines, colors="cyan", lw=width, path_effects=effects)
+        collection = LineCollection(list(lines), colors="cyan", lw=width, path_effects=effects)
         axes.add_collection(collection, autolim=False)
 
 
@@ -159,7 +159,7 @@ def draw_polar(
     axes.set_yticks([k * step * sampler.samples[0] for k in range(len(angles))],
                     [f"{angle:.0f}°" for angle in angles])  # fmt: skip
     axes.set(xlabel=_label("azimuth φ", outside), ylabel="incident angle θ")
-    return axes.figure
+    return _figure_of(axes)
 
 
 def draw_view(image: np.ndarray, lens: Lens, rays: Tensor, *, axes: Axes | None = None) -> Figure:
@@ -179,14 +179,14 @@ def draw_view(image: np.ndarray, lens: Lens, rays: Tensor, *, axes: Axes | None 
         places, degrees = _angle_ticks(line, max(2, 7 * len(line) // max(rays.shape[:2])))
         axis.set_ticks(places, [f"{sign * angle + 0:g}°" for angle in degrees])
     axes.set(xlabel=_label("degrees from the view's middle", outside, beyond))
-    return axes.figure
+    return _figure_of(axes)
 
 
 def _middle(rays: Tensor) -> Tensor:
     """The middle row of rays (H, W, 3), of unit length: (W, 3), float64."""
     rays = torch.nn.functional.normalize(rays.detach().to("cpu", torch.float64), dim=-1)
     rows = rays[(len(rays) - 1) // 2], rays[len(rays) // 2]
-    return torch.nn.functional.normalize(sum(rows), dim=-1)
+    return torch.nn.functional.normalize(rows[0] + rows[1], dim=-1)
 
 
 def _angle_ticks(line: Tensor, most: int) -> tuple[np.ndarray, np.ndarray]:
@@ -240,7 +240,7 @@ def draw_curve(
     if image_size is not None:
         _draw_sides(axes, lens, image_size)
     axes.legend(handles=[*axes.lines[:1], *density.lines], loc="upper center", ncols=3)
-    return axes.figure
+    return _figure_of(axes)
 
 
 def _draw_sides(axes: Axes, lens: Lens, image_size: tuple[int, int]) -> None:
@@ -308,7 +308,13 @@ def draw_accuracy(
     axes.set_xlim(min(xi), max(xi))
     axes.grid(alpha=0.3)
     axes.legend()
-    return axes.figure
+    return _figure_of(axes)
+
+
+def _figure_of(axes: Axes) -> Figure:
+    """The whole figure, that of axes in a subfigure too."""
+    figure = axes.figure
+    return figure if isinstance(figure, Figure) else figure.figure
 
 
 def _new_axes(width: float = 6, height: float = 6) -> Axes:

@@ -31,7 +31,7 @@ def test_what_cannot_be_written_is_named(tmp_path):
 def test_what_a_kill_left_is_removed(tmp_path):
     code = f"""
         import os
-        from darswin.files import replace_file
+        from darswin.utils.files import replace_file
         os.fsync = lambda file: os._exit(9)
         replace_file({str(tmp_path / "a.ckpt")!r}, b"half")
     """

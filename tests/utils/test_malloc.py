@@ -14,7 +14,7 @@ SMALL = "[torch.ones(2**18) for _ in range(300)]"
 # them may need pages that were never touched.
 SCRIPT = """
 import resource, torch
-from darswin import malloc
+from darswin.utils import malloc
 {call}
 def make():
     made = {what}
