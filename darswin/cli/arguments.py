@@ -11,9 +11,7 @@ _NUMBERS = re.compile(r"[\s\[\](),.+\-eE\d]*\d[\s\[\](),.+\-eE\d]*")
 _WORDS = {int: "a whole number", float: "a number", bool: "true or false"}
 
 
-def run_command(
-    commands: Callable[..., Any] | Mapping[str, Callable[..., Any]], argv: list[str], prog: str
-) -> None:
+def run_command(commands: Callable[..., Any] | dict[str, Any], argv: list[str], prog: str) -> None:
     """Calls the function, or the one of several that `argv` names, with the arguments in `argv`.
 
     Raises:
@@ -21,7 +19,7 @@ def run_command(
     """
     from jsonargparse import ArgumentParser, auto_cli
 
-    functions = commands.values() if isinstance(commands, Mapping) else [commands]
+    functions = commands.values() if isinstance(commands, dict) else [commands]
     kinds = {
         name: parameter.annotation
         for function in functions

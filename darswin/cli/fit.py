@@ -57,7 +57,8 @@ def run(argv: list[str]) -> None:
             if signals.number is None:
                 raise
             # Another process of the run must not end with an error: Lightning kills the first then.
-            raise SystemExit(0 if rank_zero_only.rank else 128 + signals.number) from None
+            other = rank_zero_only.rank  # type: ignore[attr-defined]  # Lightning adds it as it runs
+            raise SystemExit(0 if other else 128 + signals.number) from None
         except (MemoryError, RuntimeError) as error:
             if not _lacks_memory(error):
                 raise
@@ -192,7 +193,7 @@ class RunCLI(LightningCLI):
         """Lightning looks for options in checkpoints here; a run has them in its folder."""
 
     def before_instantiate_classes(self) -> None:
-        config = self.config[self.subcommand]
+        config = self.config[str(self.subcommand)]
         self.folder = Path(config.run)
         config.trainer.default_root_dir = str(self.folder)
         for name in ("path", "classes", "splits"):  # so that the run works from anywhere
@@ -225,7 +226,7 @@ class RunCLI(LightningCLI):
         return self._parser("fit").dump(config, skip_none=False)
 
     def instantiate_trainer(self, **kwargs) -> Trainer:
-        config = self.config_init[self.subcommand]
+        config = self.config_init[str(self.subcommand)]
         given = config.trainer
         kwargs["plugins"] = [SafeCheckpointIO(), *(given.plugins or [])]
         if given.logger is None:
@@ -301,9 +302,10 @@ class BeginRun(Callback):
         self.folder, self.config, self.loggers = folder, config, loggers
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        # A short epoch has its line in the logs, too.
-        trainer.log_every_n_steps = min(trainer.log_every_n_steps, pl_module.steps_per_epoch)
-        if trainer.fast_dev_run:
+        # A short epoch has its line in the logs, too. Lightning adds these two as it runs.
+        most = trainer.log_every_n_steps  # type: ignore[attr-defined]
+        trainer.log_every_n_steps = min(most, pl_module.steps_per_epoch)  # type: ignore[attr-defined]
+        if trainer.fast_dev_run:  # type: ignore[attr-defined]
             return
         if trainer.is_global_zero:
             remove_partial_files(self.folder)

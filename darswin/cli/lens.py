@@ -28,8 +28,7 @@ MOST_SAMPLES = 2**22
 
 def run(argv: list[str]) -> None:
     """Runs `darswin lens` with the arguments that follow it."""
-    commands = {"show": show, "info": info, "convert": convert}
-    run_command(commands, argv, "darswin lens")
+    run_command({"show": show, "info": info, "convert": convert}, argv, "darswin lens")
 
 
 def show(

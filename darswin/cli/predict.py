@@ -3,6 +3,7 @@
 import functools
 import json
 from collections.abc import Sequence
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -56,13 +57,17 @@ def predict(
         BrokenImageError: a picture that cannot be read, or that the lens does not fit.
         ValueError: arguments that are wrong, a lens that `darswin.lens.load` or the model refuses.
     """
-    if (run is None) == (model is None):
+    if run is not None and model is None:
+        weights = model_of_run(run)
+    elif model is not None and run is None:
+        weights = Path(model)
+    else:
         raise ValueError(
             "predict needs either --run, a run's folder, or --model, a safetensors file"
         )
     if top < 1:
         raise ValueError(f"--top must be at least 1, got {top}")
-    net, card = trained_model(model or model_of_run(run))
+    net, card = trained_model(weights)
     calibration = functools.cache(lambda size: read_lens(lens, size, camera))
     found, bad = [], []
     try:
@@ -79,9 +84,9 @@ def predict(
             except ValueError as error:
                 bad.append(f"{name}: {error}")
                 continue
-            image, taken_with = resized(net, card, image, taken_with)
+            batch, taken_with = resized(net, card, image, taken_with)
             with torch.inference_mode():
-                probabilities = net(image, taken_with).softmax(-1)[0]
+                probabilities = net(batch, taken_with).softmax(-1)[0]
             best = probabilities.topk(min(top, len(probabilities)))
             found.append(
                 {
@@ -102,7 +107,7 @@ def predict(
     return found
 
 
-def trained_model(path: str) -> tuple[nn.Module, ModelCard]:
+def trained_model(path: str | Path) -> tuple[nn.Module, ModelCard]:
     """The model of a file of ours, or of the released DarSwin's weights, and its card.
 
     The released code normalises pixels as ImageNet's; a model's classes have numbers there.
@@ -120,7 +125,7 @@ def trained_model(path: str) -> tuple[nn.Module, ModelCard]:
         return net, ModelCard("", size=_released_size(path))
 
 
-def _released_size(path: str) -> int:
+def _released_size(path: str | Path) -> int:
     """px of the images that released weights were trained on, 64 unless their configuration says
     another size."""
     with safe_open(path, "pt") as file:
@@ -159,6 +164,6 @@ def resized(net: nn.Module, card: ModelCard, image: np.ndarray, lens: Lens) -> t
     height, width = (round(length * scale) for length in image.shape[:2])
     channels = image.shape[2]
     image = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
-    image = torch.from_numpy(image.reshape(1, height, width, channels)).permute(0, 3, 1, 2)
+    pixels = torch.from_numpy(image.reshape(1, height, width, channels)).permute(0, 3, 1, 2)
     # The pixels are whole, so the scale differs a little between height and width.
-    return image.contiguous(), lens.resized((height, width))
+    return pixels.contiguous(), lens.resized((height, width))

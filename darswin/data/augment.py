@@ -98,7 +98,7 @@ class RandomErasing:
         channels, height, width = image.shape
         for _ in range(10):
             area = rng.uniform(*self.area) * height * width
-            aspect = math.exp(rng.uniform(*map(math.log, self.aspect)))
+            aspect = math.exp(rng.uniform(math.log(self.aspect[0]), math.log(self.aspect[1])))
             h, w = round(math.sqrt(area * aspect)), round(math.sqrt(area / aspect))
             if h < height and w < width:
                 top, left = rng.integers(height - h + 1), rng.integers(width - w + 1)

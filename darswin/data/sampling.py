@@ -101,18 +101,19 @@ class ResumableLoader(DataLoader):
 
     def __init__(self, dataset: Dataset, order: TrainingOrder, **options: Any):
         super().__init__(dataset, order.batch, sampler=order, drop_last=True, **options)
-        self._done = 0
+        self._order, self._done = order, 0
 
-    def __iter__(self) -> Iterator:
-        self._done = self.sampler.done()
+    # torch's own type is that of its private iterators.
+    def __iter__(self) -> Iterator:  # type: ignore[override]
+        self._done = self._order.done()
         for batch in super().__iter__():
             self._done += 1
             yield batch
 
     def state_dict(self) -> dict[str, Any]:
         """Which epoch it is, how many of its batches have been handed out, and of what."""
-        order = self.sampler
+        order = self._order
         return {"epoch": order.epoch, "done": self._done, "shuffle": order.shuffle()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        self.sampler.resume(**state)
+        self._order.resume(**state)

@@ -1,1 +1,1 @@
-"""Training and evaluation on Lightning: `darswin fit`, `validate`, `test` and `predict`."""
+"""Training and evaluation on Lightning: `darswin fit`, `validate` and `test`."""

@@ -9,7 +9,7 @@ from lightning.pytorch import Callback, LightningModule, Trainer
 from lightning.pytorch.utilities import rank_zero_only
 from matplotlib.figure import Figure
 
-from darswin.data.lenses import SphericalLenses, parse_lenses
+from darswin.data.lenses import LensDistribution, SphericalLenses, parse_lenses
 from darswin.utils.files import replace_file
 from darswin.viz.plot import draw_accuracy, save_figure
 
@@ -36,7 +36,7 @@ class WriteResults(Callback):
         print(f"\n{self.folder}/test.csv, test.json and test.png")
 
 
-def write_results(folder: Path, rows: list[dict], name: str, trained_on) -> None:
+def write_results(folder: Path, rows: list[dict], name: str, trained_on: LensDistribution) -> None:
     """The rows of a test as files; `trained_on` is the distribution that the picture shades."""
     report = dict(model=name, results=rows)
     replace_file(folder / "test.json", json.dumps(report, indent=1, ensure_ascii=False))
@@ -48,16 +48,19 @@ def write_results(folder: Path, rows: list[dict], name: str, trained_on) -> None
     save_figure(draw_results(rows, name, trained_on), folder / "test.png")
 
 
-def draw_results(rows: list[dict], name: str, trained_on):
+def draw_results(rows: list[dict], name: str, trained_on: LensDistribution) -> Figure:
     """A figure: accuracy against ξ where every distribution is one ξ, else bars."""
     figure = Figure(figsize=(7, 4.2), layout="constrained")
     axes = figure.subplots()
     accuracy = [100 * row["top1"] for row in rows]
     lenses = [parse_lenses(row["lenses"]) for row in rows]
-    if all(isinstance(lens, SphericalLenses) and lens.low == lens.high for lens in lenses):
+    of_one_xi = [
+        lens for lens in lenses if isinstance(lens, SphericalLenses) and lens.low == lens.high
+    ]
+    if len(of_one_xi) == len(rows):
         shaded = trained_on if isinstance(trained_on, SphericalLenses) else None
         band = None if shaded is None else (shaded.low, shaded.high)
-        draw_accuracy([lens.low for lens in lenses], {name: accuracy}, band, axes=axes)
+        draw_accuracy([lens.low for lens in of_one_xi], {name: accuracy}, band, axes=axes)
         axes.set_ylim(0, 100)
     else:
         axes.bar([row["lenses"] for row in rows], accuracy, label=name)
