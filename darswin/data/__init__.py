@@ -1,7 +1,7 @@
 """Data: images seen through lenses."""
 
+from darswin.data.datasets import open_source
 from darswin.data.lenses import LEVELS, PolynomialLenses, SphericalLenses, parse_lenses
-from darswin.data.sources import open_source
 from darswin.data.warp import warp, warp_map
 from darswin.data.wide_angle import WideAngle
 

@@ -4,19 +4,16 @@ Nothing is left out silently: what can be read in two ways is refused with a sen
 folder, and what no split takes is said as a `LeftOut` warning.
 """
 
-import hashlib
-import json
-import math
 import os
 import warnings
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
 
-Split = Literal["train", "val", "test"]
-SPLITS = ("train", "val", "test")
+from darswin.data.sources import ImageFiles
+from darswin.data.splits import Split, hold_out, read_json, read_list, some
+
 # What folders and lists of a split are called, in any case.
 SPLIT_NAMES: dict[str, Split] = {
     "train": "train", "training": "train",
@@ -74,7 +71,7 @@ def pictures_of(
             reason = "the list of classes does not name" if names else "training has no pictures of"
             raise ValueError(
                 f"{pictures.folder} holds pictures for the {part!r} split of the classes "
-                f"{_some(unknown)}, which {reason}: move them away, or list the classes to take in "
+                f"{some(unknown)}, which {reason}: move them away, or list the classes to take in "
                 "--data.classes"
             )
     # Without a test set of its own, "val" serves as one.
@@ -93,49 +90,30 @@ def pictures_of(
     return pictures, classes
 
 
+def open_folder(
+    root: Path, split: Split, channels: int, names: list[str] | None,
+    lists: str | Path | None, holdout: float,
+) -> ImageFiles:  # fmt: skip
+    """The pictures of a split as a source; arguments and errors as `darswin.data.open_source`."""
+    pictures, names = pictures_of(split, root, names=names, lists=lists, holdout=holdout)
+    label = {name: k for k, name in enumerate(names)}
+    files = [(path, label[class_of(path)]) for path in pictures.paths]
+    return ImageFiles(pictures.folder, files, names, channels)
+
+
 def _held_out(training: Pictures, parts: Sequence[Split], holdout: float) -> dict[Split, Pictures]:
     """A share of the training pictures for each of `parts`, and for "train" what is left."""
     labels = [class_of(path) for path in training.paths]
     small = sorted(name for name, count in Counter(labels).items() if count <= len(parts))
     if small and holdout > 0:
         _say(
-            f"{training.folder}: too few pictures to hold any out of the classes {_some(small)}: "
+            f"{training.folder}: too few pictures to hold any out of the classes {some(small)}: "
             f"all of them are trained on, none is for {' or '.join(parts)}"
         )
     return {
         part: Pictures(training.folder, [training.paths[k] for k in chosen])
         for part, chosen in hold_out(labels, training.paths, holdout, parts).items()
     }
-
-
-def _some(names: list[str]) -> str:
-    """The first few of them, and how many more."""
-    more = f" and {len(names) - 5} more" if len(names) > 5 else ""
-    return f"{names[:5]}{more}"
-
-
-def hold_out(
-    labels: Sequence, keys: Sequence[str], share: float, parts: Sequence[Split]
-) -> dict[Split, list[int]]:
-    """Indices of each split, where `parts` take a share of each class and "train" the rest.
-
-    Each class is shuffled by hashes of its keys, so that a picture more or less moves hardly any.
-    At least one of each class is left to train on.
-    """
-    classes: dict[Any, list[int]] = {}
-    for index in sorted(
-        range(len(keys)), key=lambda k: hashlib.sha1(os.fsencode(keys[k])).digest()
-    ):
-        classes.setdefault(labels[index], []).append(index)
-    chosen: dict[Split, list[int]] = {part: [] for part in (*parts, "train")}
-    for members in classes.values():
-        count = math.ceil(share * len(members))
-        if parts:
-            count = min(count, (len(members) - 1) // len(parts))
-        for place, part in enumerate(parts):
-            chosen[part] += members[place * count : (place + 1) * count]
-        chosen["train"] += members[len(parts) * count :]
-    return {part: sorted(indices) for part, indices in chosen.items()}
 
 
 def class_of(path: str) -> str:
@@ -237,7 +215,7 @@ def _pictures(folder: Path, names: list[str] | None, seen: dict[str, str], whole
         )
     found = set(_classes(paths))
     if whole and names and (missing := [name for name in names if name not in found]):
-        raise FileNotFoundError(f"no pictures of the classes {_some(missing)} in {folder}")
+        raise FileNotFoundError(f"no pictures of the classes {some(missing)} in {folder}")
     return Pictures(folder, paths)
 
 
@@ -313,26 +291,6 @@ def _hidden(name: str) -> bool:
 # -- lists ------------------------------------------------------------------------------------
 
 
-def read_list(path: str | Path) -> list[str]:
-    """Names from a text file, one a line, or from a JSON list."""
-    if Path(path).suffix != ".json":
-        return [line.strip() for line in Path(path).read_text().splitlines() if line.strip()]
-    names = _json(path)
-    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
-        raise ValueError(f"{path} must hold a JSON list of names")
-    return names
-
-
-def read_classes(path: str | Path) -> list[str]:
-    """Names of classes as `read_list`; ValueError where there are none, or one is there twice."""
-    names = read_list(path)
-    if not names:
-        raise ValueError(f"{path} must name the classes, but is empty")
-    if twice := [name for name, count in Counter(names).items() if count > 1]:
-        raise ValueError(f"{path} must name each class once, but repeats {_some(twice)}")
-    return names
-
-
 def _listed(root: Path, lists: Path) -> dict[Split, Pictures]:
     """The pictures of each split that the lists have."""
     if lists.is_dir():
@@ -342,7 +300,7 @@ def _listed(root: Path, lists: Path) -> dict[Split, Pictures]:
             if file.stem.lower() in SPLIT_NAMES
         }
     else:
-        content = _json(lists)
+        content = read_json(lists)
     form = f'{lists} must hold {{"train": [paths], "val": [paths], "test": [paths]}}'
     if not isinstance(content, dict):
         raise ValueError(form)
@@ -361,10 +319,3 @@ def _listed(root: Path, lists: Path) -> dict[Split, Pictures]:
                 )
         given[split] = Pictures(root, [os.path.normpath(path) for path in paths])
     return given
-
-
-def _json(path: str | Path) -> Any:
-    try:
-        return json.loads(Path(path).read_text())
-    except ValueError as error:
-        raise ValueError(f"{path} must be JSON: {error}") from error

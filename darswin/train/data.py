@@ -8,9 +8,11 @@ from lightning.pytorch import LightningDataModule
 from torch.utils.data import DataLoader
 
 from darswin.data.augment import RandAugment, RandomErasing
+from darswin.data.datasets import open_source
 from darswin.data.lenses import parse_lenses, parse_sweep
 from darswin.data.sampling import EveryNth, ResumableLoader, TrainingOrder
-from darswin.data.sources import Part, Source, Split, open_source
+from darswin.data.sources import Part, Source
+from darswin.data.splits import Split
 from darswin.data.wide_angle import IMAGENET_MEAN, IMAGENET_STD, PAPER_FOV, WideAngle
 from darswin.train.stopping import ignore_signals
 

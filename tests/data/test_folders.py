@@ -11,8 +11,9 @@ import hypothesis.strategies as st
 import pytest
 from hypothesis import given
 
-from darswin.data.folders import SPLITS, LeftOut
-from darswin.data.sources import open_source
+from darswin.data.datasets import open_source
+from darswin.data.folders import LeftOut
+from darswin.data.splits import SPLITS
 
 
 def touch(root: Path, *names: str) -> None:

@@ -1,4 +1,3 @@
-import gzip
 import json
 import struct
 import zlib
@@ -6,10 +5,10 @@ import zlib
 import cv2
 import numpy as np
 import pytest
-from PIL import ExifTags, Image, ImageOps
 
 from darswin.data import SphericalLenses, WideAngle
-from darswin.data.sources import Part, open_source, read_idx
+from darswin.data.datasets import open_source
+from darswin.data.sources import Part
 from darswin.utils.image import BrokenImageError, read_image, read_oriented
 
 
@@ -95,59 +94,6 @@ def test_lists_of_splits(tmp_path):
             open_source(tmp_path / "pictures", "test", splits=splits)
 
 
-def write_idx(path, array):
-    head = b"\0\0\x08" + bytes([array.ndim]) + np.array(array.shape, ">u4").tobytes()
-    data = head + array.tobytes()
-    path.write_bytes(gzip.compress(data) if path.suffix == ".gz" else data)
-
-
-@pytest.mark.parametrize("suffix", ["", ".gz"])
-def test_idx_files(tmp_path, suffix):
-    rng = np.random.default_rng(0)
-    arrays = {}
-    for part, count in (("train", 20), ("t10k", 5)):
-        arrays[part] = rng.integers(256, size=(count, 28, 28), dtype=np.uint8)
-        write_idx(tmp_path / f"{part}-images-idx3-ubyte{suffix}", arrays[part])
-        labels = (np.arange(count) % 10).astype(np.uint8)
-        write_idx(tmp_path / f"{part}-labels-idx1-ubyte{suffix}", labels)
-    train, val, test = (open_source(tmp_path, s, channels=1) for s in ("train", "val", "test"))
-    assert (len(train), len(val), len(test)) == (18, 2, 5) and len(train.classes) == 10
-    image, label = val[1]
-    assert np.array_equal(image[..., 0], arrays["train"][19]) and label == 9
-    assert np.array_equal(test[4][0][..., 0], arrays["t10k"][4])
-    assert open_source(tmp_path, "test")[0][0].shape == (28, 28, 3)
-
-
-def test_the_classes_of_idx_files_are_those_of_training(tmp_path):
-    for part, labels in (("train", [0, 1, 2, 0]), ("t10k", [1, 0])):
-        write_idx(tmp_path / f"{part}-images-idx3-ubyte", np.zeros((len(labels), 2, 2), np.uint8))
-        write_idx(tmp_path / f"{part}-labels-idx1-ubyte", np.array(labels, np.uint8))
-    parts = [open_source(tmp_path, split) for split in ("train", "val", "test")]
-    assert [part.classes for part in parts] == [["0", "1", "2"]] * 3
-    (tmp_path / "names.txt").write_text("zero\none\n")
-    with pytest.raises(
-        ValueError, match=r"labels up to 2 for the 'train' split.*\['zero', 'one'\]"
-    ):
-        open_source(tmp_path, "train", classes=tmp_path / "names.txt")
-    write_idx(tmp_path / "t10k-labels-idx1-ubyte", np.array([7, 0], np.uint8))
-    with pytest.raises(ValueError, match="labels up to 7 for the 'test' split"):
-        open_source(tmp_path, "test")
-
-
-def test_a_cut_idx_file_is_named(tmp_path):
-    write_idx(tmp_path / "a", np.zeros((4, 3, 3), np.uint8))
-    whole = (tmp_path / "a").read_bytes()
-    (tmp_path / "a").write_bytes(whole[:-1])
-    with pytest.raises(ValueError, match=r"a says it holds \[4, 3, 3\] bytes, but holds 35"):
-        read_idx(tmp_path / "a")
-    (tmp_path / "a.gz").write_bytes(gzip.compress(whole)[:-12])
-    with pytest.raises(ValueError, match=r"a\.gz is no whole gzip file"):
-        read_idx(tmp_path / "a.gz")
-    (tmp_path / "a").write_bytes(b"GIF89a")
-    with pytest.raises(ValueError, match="a is no IDX file"):
-        read_idx(tmp_path / "a")
-
-
 def test_digits():
     parts = [open_source("digits", s, channels=1) for s in ("train", "val", "test")]
     assert sum(len(p) for p in parts) == 1797 and all(len(p) > 180 for p in parts)
@@ -162,14 +108,6 @@ def test_a_part_is_a_sample_of_the_whole():
     for count in (0, -1):
         with pytest.raises(ValueError, match=rf"--data\.limit must be at least 1, got {count}"):
             Part(whole, count)
-
-
-@pytest.mark.parametrize("content", [b"", b"no picture", None])
-def test_a_broken_picture_is_named(tmp_path, content):
-    if content is not None:
-        (tmp_path / "x.jpg").write_bytes(content)
-    with pytest.raises(BrokenImageError, match=r"cannot read .*x\.jpg"):
-        read_image(tmp_path / "x.jpg")
 
 
 def huge_png(path):
@@ -194,46 +132,6 @@ def test_a_picture_that_is_too_large_is_named_and_can_be_skipped(tmp_path):
     source = open_source(tmp_path, "train", holdout=0)
     data = WideAngle(source, SphericalLenses(0, 1), size=8, render=8, skip_broken=True)
     assert [data[k][2] for k in range(6)] == [-1, 0, 0, 1, 1, 1] and data.broken == [0]
-
-
-@pytest.mark.parametrize("channels", [1, 3])
-@pytest.mark.parametrize("suffix", ["jpg", "png", "webp", "tif"])
-def test_pictures_are_upright_whoever_reads_them(tmp_path, suffix, channels):
-    """Training and predicting read the same pixels, which Pillow turns the same way."""
-    pixels = np.kron(np.arange(6, dtype=np.uint8).reshape(2, 3) * 40, np.ones((16, 16), np.uint8))
-    for orientation in range(1, 9):
-        exif = Image.Exif()
-        exif[ExifTags.Base.Orientation] = orientation
-        path = tmp_path / f"{orientation}.{suffix}"
-        Image.fromarray(pixels).convert("RGB").save(path, exif=exif, quality=100)
-        with Image.open(path) as file:
-            upright = np.asarray(ImageOps.exif_transpose(file).convert("L"))
-        image, found = read_oriented(path, channels)
-        assert found == orientation and image.flags.c_contiguous
-        assert np.array_equal(image, read_image(path, channels))
-        assert np.abs(image.astype(int) - upright[..., None]).max() < 6
-
-
-@pytest.mark.parametrize(
-    "exif", [b"Exif\0\0nothing", b"Exif\0\0II*\0\xff\xff\xff\xff", b"Exif\0\0"]
-)
-def test_exif_that_is_none(tmp_path, exif):
-    Image.new("RGB", (8, 6)).save(tmp_path / "x.jpg", exif=exif)
-    try:
-        image, orientation = read_oriented(tmp_path / "x.jpg")
-        assert image.shape == (6, 8, 3) and orientation == 1
-    except BrokenImageError as error:
-        assert "x.jpg: its EXIF orientation cannot be told" in str(error)
-
-
-def test_grey_and_colour_files(tmp_path):
-    colour = np.zeros((4, 5, 3), np.uint8)
-    colour[..., 2] = 200  # OpenCV's order: red
-    cv2.imwrite(str(tmp_path / "c.png"), colour)
-    assert read_image(tmp_path / "c.png")[0, 0].tolist() == [200, 0, 0]
-    assert read_image(tmp_path / "c.png", 1).shape == (4, 5, 1)
-    cv2.imwrite(str(tmp_path / "g.png"), colour[..., 2])
-    assert read_image(tmp_path / "g.png")[0, 0].tolist() == [200, 200, 200]
 
 
 @pytest.mark.parametrize(

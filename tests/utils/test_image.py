@@ -1,0 +1,54 @@
+import cv2
+import numpy as np
+import pytest
+from PIL import ExifTags, Image, ImageOps
+
+from darswin.utils.image import BrokenImageError, read_image, read_oriented
+
+
+@pytest.mark.parametrize("content", [b"", b"no picture", None])
+def test_a_broken_picture_is_named(tmp_path, content):
+    if content is not None:
+        (tmp_path / "x.jpg").write_bytes(content)
+    with pytest.raises(BrokenImageError, match=r"cannot read .*x\.jpg"):
+        read_image(tmp_path / "x.jpg")
+
+
+@pytest.mark.parametrize("channels", [1, 3])
+@pytest.mark.parametrize("suffix", ["jpg", "png", "webp", "tif"])
+def test_pictures_are_upright_whoever_reads_them(tmp_path, suffix, channels):
+    """Training and predicting read the same pixels, which Pillow turns the same way."""
+    pixels = np.kron(np.arange(6, dtype=np.uint8).reshape(2, 3) * 40, np.ones((16, 16), np.uint8))
+    for orientation in range(1, 9):
+        exif = Image.Exif()
+        exif[ExifTags.Base.Orientation] = orientation
+        path = tmp_path / f"{orientation}.{suffix}"
+        Image.fromarray(pixels).convert("RGB").save(path, exif=exif, quality=100)
+        with Image.open(path) as file:
+            upright = np.asarray(ImageOps.exif_transpose(file).convert("L"))
+        image, found = read_oriented(path, channels)
+        assert found == orientation and image.flags.c_contiguous
+        assert np.array_equal(image, read_image(path, channels))
+        assert np.abs(image.astype(int) - upright[..., None]).max() < 6
+
+
+@pytest.mark.parametrize(
+    "exif", [b"Exif\0\0nothing", b"Exif\0\0II*\0\xff\xff\xff\xff", b"Exif\0\0"]
+)
+def test_exif_that_is_none(tmp_path, exif):
+    Image.new("RGB", (8, 6)).save(tmp_path / "x.jpg", exif=exif)
+    try:
+        image, orientation = read_oriented(tmp_path / "x.jpg")
+        assert image.shape == (6, 8, 3) and orientation == 1
+    except BrokenImageError as error:
+        assert "x.jpg: its EXIF orientation cannot be told" in str(error)
+
+
+def test_grey_and_colour_files(tmp_path):
+    colour = np.zeros((4, 5, 3), np.uint8)
+    colour[..., 2] = 200  # OpenCV's order: red
+    cv2.imwrite(str(tmp_path / "c.png"), colour)
+    assert read_image(tmp_path / "c.png")[0, 0].tolist() == [200, 0, 0]
+    assert read_image(tmp_path / "c.png", 1).shape == (4, 5, 1)
+    cv2.imwrite(str(tmp_path / "g.png"), colour[..., 2])
+    assert read_image(tmp_path / "g.png")[0, 0].tolist() == [200, 200, 200]
