@@ -77,8 +77,6 @@ class WideAngleData(LightningDataModule):
         skip_broken: bool = False,
     ):
         super().__init__()
-        if limit is not None and limit < 1:
-            raise ValueError(f"--data.limit must be at least 1, got {limit}")
         if batch_size < 1 or workers < 0:
             raise ValueError(
                 "--data.batch_size must be at least 1 and --data.workers at least 0, "
