@@ -49,7 +49,7 @@ def with_lists(argv: Sequence[str], names: Collection[str]) -> list[str]:
     while left:
         argument = left.pop(0)
         option, equals, value = argument.partition("=")
-        # argparse takes the beginning of an option's name too, where it is no other one's.
+        # argparse also takes an unambiguous beginning of an option's name.
         if option[:2] != "--" or not any(name.startswith(option[2:] or "-") for name in names):
             found.append(argument)
             continue
@@ -87,7 +87,7 @@ def _kind(annotation: Any) -> str:
 
 
 def _length(annotation: Any) -> int:
-    """How many numbers an option takes that takes a tuple of them; 0 where it takes none."""
+    """How many numbers an option of a tuple type takes; 0 for other types."""
     if typing.get_origin(annotation) is tuple:
         return len(typing.get_args(annotation))
     return max((_length(option) for option in typing.get_args(annotation)), default=0)

@@ -43,7 +43,7 @@ def run(argv: list[str]) -> None:
     if argv[0] == "fit":
         keep_freed_memory()
     argv = with_lists(argv, ("data.mean", "data.std"))
-    # The arguments are the command line's own, with the run's configuration added.
+    # Lightning warns of arguments that are not sys.argv: ours add the run's configuration.
     warnings.filterwarnings("ignore", "LightningCLI's args parameter")
     warnings.filterwarnings("ignore", r".*isinstance\(treespec, LeafSpec\)")  # Lightning's own
     warnings.filterwarnings("ignore", "Checkpoint directory .* exists and is not empty")
@@ -70,7 +70,7 @@ def run(argv: list[str]) -> None:
 
 
 def _lacks_memory(error: Exception) -> bool:
-    # Torch has a class for it on GPUs alone; a killed worker process is the system's own remedy.
+    # Torch has an exception class for GPUs only. On Linux, the system kills a worker instead.
     said = re.search("can't allocate memory|DataLoader worker .*: Killed", str(error))
     return isinstance(error, MemoryError | torch.OutOfMemoryError) or said is not None
 
@@ -159,7 +159,7 @@ class RunParser(LightningArgumentParser):
         super().error(" ".join(message.split()), *rest)
 
     def print_usage(self, *arguments) -> None:
-        """Nothing before an error: there are 150 options, and `--help` lists them."""
+        """Prints nothing before an error: the usage would have 150 options, see `--help`."""
 
 
 class RunCLI(LightningCLI):
@@ -190,7 +190,7 @@ class RunCLI(LightningCLI):
         parser.link_arguments("seed_everything", "model.seed", compute_fn=int)
 
     def _parse_ckpt_path(self) -> None:
-        """Lightning looks for options in checkpoints here; a run has them in its folder."""
+        """Lightning would look for options in the checkpoint; a run keeps them in config.yaml."""
 
     def before_instantiate_classes(self) -> None:
         config = self.config[str(self.subcommand)]
@@ -230,7 +230,7 @@ class RunCLI(LightningCLI):
         given = config.trainer
         kwargs["plugins"] = [SafeCheckpointIO(), *(given.plugins or [])]
         if given.logger is None:
-            kwargs["logger"] = False  # a run's own begin with it
+            kwargs["logger"] = False  # BeginRun adds the run's own loggers
         callbacks = list(given.callbacks or [])
         if given.enable_progress_bar and not any(isinstance(c, ProgressBar) for c in callbacks):
             callbacks.append(RunProgressBar())
@@ -246,7 +246,7 @@ class RunCLI(LightningCLI):
             print(f"{broken} pictures could not be read and were left out")
 
     def fit(self, **options) -> None:
-        """Trains, alone in the run's folder; called by Lightning."""
+        """Trains, holding the lock of the run's folder; Lightning calls it."""
         lock = self.folder / ".lock"
         try:
             with locked(lock) if self.trainer.is_global_zero else contextlib.nullcontext():
@@ -293,9 +293,9 @@ class RunCLI(LightningCLI):
 
 
 class BeginRun(Callback):
-    """Writes into a run's folder what it is, once nothing can refuse it any more.
+    """Writes config.yaml and starts the loggers once training begins.
 
-    Lightning would have its loggers write before the checkpoint is checked.
+    Before that the checkpoint may still be refused, and the folder stays as it is.
     """
 
     def __init__(self, folder: Path, config: str, loggers: list):
@@ -314,7 +314,7 @@ class BeginRun(Callback):
 
 
 class RunProgressBar(TQDMProgressBar):
-    """Lightning's, without the last letters of the logs' folder."""
+    """Lightning's progress bar without the version number of the logs."""
 
     def get_metrics(self, trainer: Trainer, pl_module: LightningModule) -> dict:
         shown = super().get_metrics(trainer, pl_module)

@@ -79,7 +79,7 @@ def show(
     aspect = {
         "perspective": size[0] / size[1],
         "cylindrical": 1 / 2,
-        # As high as what the lens shows in the picture; a narrower view has the same shape.
+        # As high as what the lens shows in the picture; a narrower view keeps that shape.
         "equirectangular": down / max(fov_deg, across),
     }[view]
     fov, yaw, pitch = (math.radians(angle) for angle in (fov_deg, yaw_deg, pitch_deg))

@@ -24,7 +24,7 @@ SUFFIXES = frozenset((
     ".jpg", ".jpeg", ".jpe", ".jfif", ".png", ".bmp", ".dib", ".webp", ".tif", ".tiff", ".ppm",
     ".pgm", ".pbm", ".pnm",
 ))  # fmt: skip
-# Pictures too, which OpenCV reads in some builds or in none.
+# Pictures that OpenCV reads only in some builds, or not at all.
 OTHER_SUFFIXES = frozenset((
     ".gif", ".heic", ".heif", ".avif", ".jp2", ".j2k", ".jxl", ".psd", ".svg", ".tga", ".exr",
     ".hdr", ".dng", ".cr2", ".nef", ".arw",

@@ -103,7 +103,7 @@ class ResumableLoader(DataLoader):
         super().__init__(dataset, order.batch, sampler=order, drop_last=True, **options)
         self._order, self._done = order, 0
 
-    # torch's own type is that of its private iterators.
+    # torch declares the type of its private iterators.
     def __iter__(self) -> Iterator:  # type: ignore[override]
         self._done = self._order.done()
         for batch in super().__iter__():

@@ -1,4 +1,4 @@
-"""Checkpoints that no kill and no full disk spoils, their weights as safetensors beside them."""
+"""Checkpoints that survive kills and full disks, with their weights as safetensors beside them."""
 
 import io
 from pathlib import Path
@@ -17,9 +17,9 @@ from darswin.utils.unpickle import read_pickle
 class RunCheckpoint(ModelCheckpoint):
     """A checkpoint in a run's folder, wherever that folder has been moved.
 
-    One that is due at an epoch's last step is left to the callback behind the epoch's validation:
-    a run that resumed from before it would take the epoch for finished, and not validate it. And
-    none is written amid the batches of a step, whose gradients it would not hold.
+    At an epoch's last step nothing is written before the validation: a run that resumed from there
+    would take the epoch for finished and skip its validation. Between the batches of an accumulated
+    step nothing is written either, because a checkpoint does not hold gradients.
     """
 
     def on_train_batch_end(
@@ -47,7 +47,7 @@ def ends_step(trainer: Trainer, batch_idx: int) -> bool:
 
 
 class SafeCheckpointIO(TorchCheckpointIO):
-    """Writes a checkpoint in the place of the old one in one go; reads no pickled code."""
+    """Replaces a checkpoint in one go, and reads checkpoints without executing what they hold."""
 
     def save_checkpoint(
         self, checkpoint: dict[str, Any], path: str | Path, storage_options: Any = None

@@ -1,9 +1,10 @@
-"""Which options of a run may change when it goes on."""
+"""Which options of a run may change when it is resumed."""
 
 from collections.abc import Mapping
 from typing import Any
 
-# Those that take effect from there on; of the trainer's, all do but for the size of a step.
+# A change takes effect from the checkpoint on. Options of the trainer may change as well, except
+# for accumulate_grad_batches, which is part of a step's size.
 CHANGEABLE = {
     *("checkpoint_steps", "weights_only"),
     *(f"model.{rate}_rate" for rate in ("learning", "warmup", "final")),
@@ -18,7 +19,7 @@ CHANGEABLE = {
 
 
 def check_changes(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
-    """What differs between a run's configuration and that to go on with, a line for each option.
+    """What differs between a run's configuration and the one to resume with, a line an option.
 
     Raises:
         ValueError: an option that cannot change, named as people type it.

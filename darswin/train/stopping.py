@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM: training stops behind a whole step, with a checkpoint to go on from."""
+"""Ctrl-C and SIGTERM: training stops after a whole step, with a checkpoint to resume from."""
 
 import os
 import signal
@@ -35,7 +35,7 @@ class StopSignals:
             _handle(number, handler)
 
     def listen(self) -> None:
-        """Takes the signals, also from one who took them since."""
+        """Installs the handlers, in place of any that were installed since."""
         for number in _SIGNALS:
             _handle(number, self._received)
 
@@ -48,27 +48,27 @@ class StopSignals:
 
 
 def _handle(number: int, handler: Any) -> None:
-    if threading.current_thread() is threading.main_thread():  # others may not
+    if threading.current_thread() is threading.main_thread():  # Python allows it in no other thread
         signal.signal(number, handler)
 
 
 def ignore_signals(worker: int) -> None:
-    """For a process that reads data: the training process stops it, when it needs no more."""
+    """Called in the worker processes of a DataLoader: the training process ends them itself."""
     for number in _SIGNALS:
         signal.signal(number, signal.SIG_IGN)
 
 
 class StopWhenTold(Callback):
-    """Once any process of a run was told to stop, all save a checkpoint behind the same step.
+    """Once any process of a run is told to stop, all stop after the same step, with a checkpoint.
 
-    Behind an epoch's last step they validate first, and the epoch's own checkpoint is the one.
+    After an epoch's last step they validate first; the checkpoint is then the epoch's own.
     """
 
     def __init__(self, signals: StopSignals, checkpoint: Path):
         self.signals, self.checkpoint = signals, checkpoint
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        self.signals.listen()  # Lightning took SIGTERM a moment ago
+        self.signals.listen()  # Lightning has just installed its own for SIGTERM
         self.signals.patient = True
 
     def on_train_batch_end(

@@ -1,7 +1,6 @@
 """The orientations that EXIF gives pictures (EXIF 2.3, tag 0x0112)."""
 
-# How a picture as stored becomes upright. x and y are swapped, then x runs the
-# other way, then y.
+# How a stored picture becomes upright: (swap x and y, then mirror x, then mirror y).
 TURNS = {
     1: (False, False, False),
     2: (False, True, False),

@@ -40,14 +40,14 @@ def replace_file(path: str | os.PathLike, content: bytes | memoryview | str) -> 
 
 
 def remove_partial_files(folder: str | os.PathLike) -> None:
-    """Removes what kills in the middle of `replace_file` left below a folder."""
+    """Removes the temporary files below a folder that killed calls of `replace_file` left there."""
     for path in Path(folder).rglob(f".*{_PARTIAL}"):
         path.unlink(missing_ok=True)
 
 
 @contextlib.contextmanager
 def locked(path: str | os.PathLike) -> Iterator[None]:
-    """Within it, no other process can lock the same file, which is made if need be, and stays.
+    """A context in which no other process can lock the same file. The file is created, and stays.
 
     The lock is the process's own: its forks do not hold it, and its end, even by a kill, frees it.
 
@@ -62,7 +62,7 @@ def locked(path: str | os.PathLike) -> Iterator[None]:
         except OSError as error:
             if error.errno in (errno.EACCES, errno.EAGAIN):
                 raise BlockingIOError(errno.EAGAIN, "another process holds it", str(path)) from None
-            # Some network file systems have no locks; work on them must be possible all the same.
+            # Some network file systems have no locks: go on without one there.
         yield
 
 

@@ -36,9 +36,9 @@ def read_oriented(path: str | Path, channels: int = 3) -> tuple[np.ndarray, int]
     data = _content(path)
     upright = _decoded(data, path, channels)
     orientation, kind = _exif(data, path)
-    if orientation == 1 or kind == "TIFF":  # which OpenCV turns upright in any case
+    if orientation == 1 or kind == "TIFF":  # OpenCV turns TIFFs upright in any case
         return upright, orientation
-    # Turned by our own hands: some versions of OpenCV do not turn every kind of file.
+    # Turned here, because some versions of OpenCV do not turn every kind of file.
     image = _decoded(data, path, channels, cv2.IMREAD_IGNORE_ORIENTATION)
     swapped, *reversed_ = TURNS[orientation]
     image = image.swapaxes(0, 1) if swapped else image

@@ -1,4 +1,4 @@
-"""What becomes of memory that is freed, where glibc decides it."""
+"""What glibc does with freed memory: keep it for the process, or give it back to the system."""
 
 import ctypes
 from collections.abc import Callable

@@ -8,9 +8,8 @@ from typing import Any
 
 import torch
 
-# The authors' training code pickles its configuration, a dict subclass of yacs, into the file. A
-# dict's pickle builds just as well another dict, and torch's restricted unpickler fills only those
-# of Python.
+# The authors' checkpoints hold their configuration, pickled as a dict subclass of the package yacs.
+# An OrderedDict takes its place: torch's restricted unpickler can fill that one.
 _STAND_INS: list[Any] = [(OrderedDict, "yacs.config.CfgNode")]
 
 
@@ -22,12 +21,12 @@ def read_pickle(path: str | os.PathLike, map_location: Any = "cpu") -> object:
     except Exception as error:  # a file that is no checkpoint may fail in any way
         if (
             isinstance(error, OSError) and error.filename
-        ):  # a cut-off archive has an OSError of its own
+        ):  # a file that cannot be read; cut-off archives name none
             raise
         found = re.search(r"GLOBAL (\S+)", str(error))
         if not isinstance(error, pickle.UnpicklingError) or not found:
             raise ValueError(f"{path} cannot be read as a checkpoint") from error
-        # Without torch's own message, which advises to load the file all the same.
+        # Torch's own message would advise to load the file with weights_only=False.
         raise ValueError(
             f"{path} is refused, and nothing in it was executed: it asks for {found[1]}, which no "
             "state dict needs"
