@@ -72,9 +72,10 @@ fuzz: build  ## random and hostile calls of the operators, 100,000 wrong calibra
 kills: build  ## kill runs at random, and see that they end as if nothing had been (10 minutes)
 	$(BIN)/python tests/train/kills.py
 
-lint: $(STAMP)  ## ruff and clang-format, without changing anything
+lint: $(STAMP)  ## ruff, mypy and clang-format, without changing anything
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	$(BIN)/mypy
 	$(BIN)/clang-format --dry-run --Werror csrc/*.cpp csrc/*.h csrc/kernels/*
 
 format: $(STAMP)  ## ruff and clang-format, in place

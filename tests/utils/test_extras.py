@@ -34,7 +34,7 @@ def test_nothing_is_missing_here():
     assert lack("train", TRAIN) is None
 
 
-@pytest.mark.parametrize("command", sorted(COMMANDS))
+@pytest.mark.parametrize("command", [c for c in COMMANDS if COMMANDS[c].needs != TRAIN])
 def test_a_command_imports_no_more_than_it_says(command):
     script = (
         "import sys\n"
