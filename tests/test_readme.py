@@ -37,6 +37,16 @@ def test_pictures_and_links_exist():
             assert (ROOT / target).is_file(), target
 
 
+def test_what_contributors_are_sent_to_exists():
+    text = (ROOT / "docs/contributing.md").read_text()
+    places = set(re.findall(r"`((?:benchmarks|csrc|darswin|docs|studies|tests)/[^` ]*)`", text))
+    assert len(places) > 30
+    for place in places:
+        assert "NAME" in place or (ROOT / place).exists(), place
+    targets = {word for words in re.findall(r"`make ([^`]*)`", text) for word in words.split()}
+    assert targets <= set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.M))
+
+
 def test_tables_are_those_of_the_results():
     sys.path.append(str(ROOT / "docs"))
     import readme
