@@ -7,6 +7,7 @@
 #  include <sanitizer/asan_interface.h>
 #endif
 
+namespace darswin {
 namespace {
 
 // Hands out pieces of a block of memory, and counts their bytes; of no block it only counts.
@@ -28,3 +29,4 @@ struct Arena {
 };
 
 }  // namespace
+}  // namespace darswin

@@ -4,6 +4,7 @@
 
 #include "simd.h"
 
+namespace darswin {
 namespace {
 
 // The larger one in each lane; NaN where b is NaN.
@@ -37,3 +38,4 @@ inline Vector<double, kLanes<double>> exponential_of_negative(Vector<double, kLa
 }
 
 }  // namespace
+}  // namespace darswin

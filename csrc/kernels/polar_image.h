@@ -10,9 +10,8 @@
 #include "polar_points.h"
 #include "transpose.h"
 
+namespace darswin {
 namespace {
-
-using darswin::Pixel;
 
 inline int64_t smaller(int64_t x, int64_t y) { return x < y ? x : y; }
 
@@ -100,7 +99,7 @@ struct PlacedPoints {
     const Reach most = reach(a, b, i);
     const T* center = a.center + b * a.center_stride;
     const auto width = static_cast<double>(a.width), height = static_cast<double>(a.height);
-    if (a.offsets == nullptr && a.directions_known && center[0] - most.x > -1 &&
+    if (a.offsets == nullptr && a.directions_finite && center[0] - most.x > -1 &&
         center[0] + most.x < width && center[1] - most.y > -1 && center[1] + most.y < height) {
       locate(a, b, i, j, count, random,
              [&](int64_t k, const Points& p) { place<true>(a, packed, p, first + k, near); });
@@ -127,8 +126,8 @@ template <typename T>
 int64_t far_order(const PolarSampleArgs<T>& a, int64_t j, int64_t count, int64_t rows,
                   int64_t columns, uint16_t* order) {
   int64_t visited = 0;
-  for (int64_t k = 0; k < count; k += a.patch_azimuths) {
-    const int64_t end = k + a.patch_azimuths < count ? k + a.patch_azimuths : count;
+  for (int64_t k = 0; k < count; k += a.samples_a) {
+    const int64_t end = k + a.samples_a < count ? k + a.samples_a : count;
     const double sin = a.sines[j + k], cos = a.cosines[j + k];
     if (sin * sin > cos * cos) {
       for (int64_t n = 0; n < rows; ++n) {
@@ -271,3 +270,4 @@ struct Corners {
 };
 
 }  // namespace
+}  // namespace darswin

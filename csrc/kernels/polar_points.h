@@ -11,15 +11,14 @@
 // apart is a struct each, which the loops over points are compiled for, so round ones pay nothing.
 #pragma once
 
+#include "../polar.h"
 #include "math.h"
 #include "philox.h"
 #include "simd.h"
 #include "trig.h"
 
+namespace darswin {
 namespace {
-
-using darswin::PolarSampleArgs;
-using darswin::Steps;
 
 constexpr int kBlock = 1024;  // points in hand at a time
 
@@ -60,10 +59,10 @@ struct Points {
 
 // Puts points at their radius and azimuth around the center of image b.
 template <typename T>
-struct Round {
+struct Circular {
   double x, y;
 
-  Round(const PolarSampleArgs<T>& a, int64_t b)
+  Circular(const PolarSampleArgs<T>& a, int64_t b)
       : x(a.center[b * a.center_stride]), y(a.center[b * a.center_stride + 1]) {}
 
   void put(Points& p, int64_t) const {
@@ -76,13 +75,13 @@ struct Round {
 
 // The same through the matrix and with the offsets of points j to j + count of radius i.
 template <typename T>
-struct Bent {
-  const Round<T> center;
+struct General {
+  const Circular<T> center;
   double matrix[4] = {1, 0, 0, 1};
   const T *x_offsets = nullptr, *y_offsets = nullptr, *end;
   const int64_t count;
 
-  Bent(const PolarSampleArgs<T>& a, int64_t b, int64_t i, int64_t j, int64_t count)
+  General(const PolarSampleArgs<T>& a, int64_t b, int64_t i, int64_t j, int64_t count)
       : center(a, b), end(a.offsets_end), count(count) {
     if (a.affine != nullptr) {
       for (int e = 0; e < 4; ++e) matrix[e] = a.affine[b * a.affine_stride + e];
@@ -199,7 +198,7 @@ void locate_moved(const PolarSampleArgs<T>& a, const Lens& lens, int64_t b, int6
   }
 }
 
-// locate() for a lens, Round or Bent.
+// locate() for a lens, Circular or General.
 template <typename T, typename Lens, typename Visit>
 void locate_through(const PolarSampleArgs<T>& a, const Lens& lens, int64_t b, int64_t i, int64_t j,
                     int64_t count, RandomWords& random, const Visit& visit) {
@@ -231,10 +230,11 @@ template <typename T, typename Visit>
 void locate(const PolarSampleArgs<T>& a, int64_t b, int64_t i, int64_t j, int64_t count,
             RandomWords& random, const Visit& visit) {
   if (a.affine == nullptr && a.offsets == nullptr) {
-    locate_through(a, Round<T>(a, b), b, i, j, count, random, visit);
+    locate_through(a, Circular<T>(a, b), b, i, j, count, random, visit);
   } else {
-    locate_through(a, Bent<T>(a, b, i, j, count), b, i, j, count, random, visit);
+    locate_through(a, General<T>(a, b, i, j, count), b, i, j, count, random, visit);
   }
 }
 
 }  // namespace
+}  // namespace darswin

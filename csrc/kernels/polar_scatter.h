@@ -9,6 +9,7 @@
 
 #include "polar_rows.h"
 
+namespace darswin {
 namespace {
 
 constexpr int64_t kCellBytes = 1 << 20;
@@ -18,7 +19,7 @@ class Scatter {
  public:
   static int64_t bytes(const PolarSampleArgs<T>& a) {
     const int64_t kept_rows = (a.height + a.bands - 1) / a.bands + 3;  // at most
-    return round_up(sizeof(PlacedPoints<T>), 64) + a.patch_radii * row_bytes(a) +
+    return round_up(sizeof(PlacedPoints<T>), 64) + a.samples_r * row_bytes(a) +
            kept_rows * sums_layout(a).row * static_cast<int64_t>(sizeof(T));
   }
 
@@ -33,7 +34,7 @@ class Scatter {
         points(*static_cast<PlacedPoints<T>*>(scratch)),
         grads(reinterpret_cast<T*>(static_cast<char*>(scratch) +
                                    round_up(sizeof(PlacedPoints<T>), 64))),
-        sums(grads + args.patch_radii * row_bytes(args) / sizeof(T) - first_kept() * layout.row) {
+        sums(grads + args.samples_r * row_bytes(args) / sizeof(T) - first_kept() * layout.row) {
     if (keep == kInPlace) {
       T* rows =
           static_cast<T*>(a.grad_image) + (image * a.channels * a.height + first_row) * a.width;
@@ -48,17 +49,17 @@ class Scatter {
   // Adds the gradients of a ring, whose radius n read(n, to) writes as (num_azimuths, C).
   template <typename Read>
   void ring(int64_t ring, Read read) {
-    const int64_t first = ring * a.patch_radii;
+    const int64_t first = ring * a.samples_r;
     if (keep == kInPlace) {
       bool any = false;
-      for (int64_t n = 0; n < a.patch_radii; ++n) any |= touches(first + n);
+      for (int64_t n = 0; n < a.samples_r; ++n) any |= touches(first + n);
       if (!any) return;
       const int64_t line = row_bytes(a) / sizeof(T);
-      for (int64_t n = 0; n < a.patch_radii; ++n) read(n, grads + n * line);
+      for (int64_t n = 0; n < a.samples_r; ++n) read(n, grads + n * line);
       add_in_place(first, line);
       return;
     }
-    for (int64_t n = 0; n < a.patch_radii; ++n) {
+    for (int64_t n = 0; n < a.samples_r; ++n) {
       if (!touches(first + n)) continue;
       read(n, grads);
       for (int64_t j = 0; j < a.num_azimuths; j += kBlock) {
@@ -154,7 +155,7 @@ class Scatter {
     constexpr float sign_x[] = {-1, -1, -1, -1, 1, 1, 1, 1, -1, -1, -1, -1, 1, 1, 1, 1};
     constexpr float one_y[] = {1, 1, 1, 1, 1, 1, 1, 1, 0, 0, 0, 0, 0, 0, 0, 0};
     constexpr float sign_y[] = {-1, -1, -1, -1, -1, -1, -1, -1, 1, 1, 1, 1, 1, 1, 1, 1};
-    const V g = repeat<V>(load<Vector<float, 4>>(grad));
+    const V g = repeat(load<Vector<float, 4>>(grad));
     for (int e = 0; e < 16; e += lanes) {
       const V x = load<V>(one_x + e) + right * load<V>(sign_x + e);
       const V y = load<V>(one_y + e) + lower * load<V>(sign_y + e);
@@ -216,14 +217,14 @@ class Scatter {
   // Blocks of points as in Sampler::far_block.
   void add_in_place(int64_t first, int64_t line) {
     const int64_t strides[2] = {a.width, 1};
-    const int64_t token = a.patch_radii * a.patch_azimuths;
+    const int64_t token = a.samples_r * a.samples_a;
     const int64_t columns =
-        smaller(token < kBlock ? kBlock / token * a.patch_azimuths : a.patch_azimuths, kBlock);
-    const int64_t rows = smaller(a.patch_radii, kBlock / columns);
+        smaller(token < kBlock ? kBlock / token * a.samples_a : a.samples_a, kBlock);
+    const int64_t rows = smaller(a.samples_r, kBlock / columns);
     for (int64_t j = 0; j < a.num_azimuths; j += columns) {
       const int64_t count = smaller(columns, a.num_azimuths - j);
-      for (int64_t row = 0; row < a.patch_radii; row += rows) {
-        const int64_t end = smaller(row + rows, a.patch_radii);
+      for (int64_t row = 0; row < a.samples_r; row += rows) {
+        const int64_t end = smaller(row + rows, a.samples_r);
         for (int64_t n = row; n < end; ++n) {
           points.find_far(a, strides, image, first + n, j, count, (n - row) * columns);
         }
@@ -290,3 +291,4 @@ class Scatter {
 };
 
 }  // namespace
+}  // namespace darswin

@@ -8,12 +8,13 @@
 // border carry different `side` marks and do not see each other. Backward finds the probabilities
 // again, just as forward did, so forward saves nothing. Every token lies in one window, so qkv
 // gradients have one writer; bias gradients are summed over a chunk of windows, in order.
-#include "kernels.h"
+#include "../window_attention.h"
+
 #include "math.h"
 #include "window_attention_scratch.h"
 #include "window_attention_tiles.h"
 
-namespace darswin::TIER {
+namespace darswin {
 namespace {
 
 // One thread's work on a call.
@@ -354,40 +355,20 @@ int64_t scratch_bytes(const WindowAttentionArgs<S>& args) {
   return arena.used;
 }
 
+template <typename S>
+constexpr WindowAttentionKernels<S> kTable = {
+    .scratch = scratch_bytes<S>, .forward = forward<S>, .backward = backward<S>};
+
 }  // namespace
 
-int64_t window_attention_scratch(const WindowAttentionArgs<float>& args) {
-  return scratch_bytes(args);
-}
-int64_t window_attention_scratch(const WindowAttentionArgs<double>& args) {
-  return scratch_bytes(args);
-}
-int64_t window_attention_scratch(const WindowAttentionArgs<bfloat16>& args) {
-  return scratch_bytes(args);
-}
-void window_attention(const WindowAttentionArgs<float>& args, int64_t begin, int64_t end,
-                      void* scratch) {
-  forward(args, begin, end, scratch);
-}
-void window_attention(const WindowAttentionArgs<double>& args, int64_t begin, int64_t end,
-                      void* scratch) {
-  forward(args, begin, end, scratch);
-}
-void window_attention(const WindowAttentionArgs<bfloat16>& args, int64_t begin, int64_t end,
-                      void* scratch) {
-  forward(args, begin, end, scratch);
-}
-void window_attention_backward(const WindowAttentionArgs<float>& args, int64_t begin, int64_t end,
-                               void* scratch) {
-  backward(args, begin, end, scratch);
-}
-void window_attention_backward(const WindowAttentionArgs<double>& args, int64_t begin, int64_t end,
-                               void* scratch) {
-  backward(args, begin, end, scratch);
-}
-void window_attention_backward(const WindowAttentionArgs<bfloat16>& args, int64_t begin,
-                               int64_t end, void* scratch) {
-  backward(args, begin, end, scratch);
-}
+template <>
+constinit const WindowAttentionKernels<float>
+    Kernels<WindowAttentionKernels<float>, Tier::TIER>::table = kTable<float>;
+template <>
+constinit const WindowAttentionKernels<double>
+    Kernels<WindowAttentionKernels<double>, Tier::TIER>::table = kTable<double>;
+template <>
+constinit const WindowAttentionKernels<bfloat16>
+    Kernels<WindowAttentionKernels<bfloat16>, Tier::TIER>::table = kTable<bfloat16>;
 
-}  // namespace darswin::TIER
+}  // namespace darswin

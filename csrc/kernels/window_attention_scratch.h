@@ -1,11 +1,11 @@
 // Sizes, places and working memory of window attention: everything but the arithmetic.
 #pragma once
 
-#include "../dispatch.h"
+#include "../window_attention.h"
 #include "arena.h"
 #include "window_attention_tiles.h"
 
-namespace darswin::TIER {
+namespace darswin {
 namespace {
 
 // Up to this many tokens a window, tables of all pairs of tokens are kept for each head.
@@ -163,4 +163,4 @@ struct Scratch {
 };
 
 }  // namespace
-}  // namespace darswin::TIER
+}  // namespace darswin

@@ -9,6 +9,7 @@
 
 #include "transpose.h"
 
+namespace darswin {
 namespace {
 
 constexpr int kGroup = 16;
@@ -131,7 +132,7 @@ template <typename W, typename T, typename Summands, typename Count, typename Di
 __attribute__((noinline)) void weighted_sums(W weights, Rows<const T> from, Summands summands,
                                              Rows<T> to, Count rows, Dim d, Factors<T> factors,
                                              bool add) {
-  constexpr int kL = kLanes<T>, kRows = kRegister == 64 ? 8 : 4, kPiece = 64;
+  constexpr int kL = kLanes<T>, kRows = kTileRows, kPiece = 64;
   for (int64_t j = 0; j < summands; j += kPiece, add = true) {
     const int64_t piece = summands - j < kPiece ? summands - j : kPiece;
     for (int64_t i = 0; i < rows; i += kRows) {
@@ -173,3 +174,4 @@ inline void narrow(const float* from, int64_t d, bfloat16* to) {
 }
 
 }  // namespace
+}  // namespace darswin
