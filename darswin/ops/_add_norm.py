@@ -1,4 +1,4 @@
-"""add_norm_: a residual and the layer norm behind it, in place. Private: it has no reference twin."""
+"""add_norm_: a residual and the layer norm behind it, in place. Private: it has no reference."""
 
 import torch
 from torch import Tensor

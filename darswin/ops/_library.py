@@ -29,8 +29,8 @@ def load_extension():
 def cpu_capability() -> str:
     """The instruction-set tier that the operators run on: "generic", "avx2" or "avx512".
 
-    It is the best one of this CPU. ATEN_CPU_CAPABILITY (default, avx2, avx512) lowers it, as it does
-    in torch.
+    It is the best one of this CPU; ATEN_CPU_CAPABILITY (default, avx2, avx512) lowers it, as it
+    does in torch.
     """
     return load_extension().tier()
 

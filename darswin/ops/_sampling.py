@@ -1,4 +1,4 @@
-"""What polar_sample and polar_embed share: the arguments of the sampling, their checks, gradients."""
+"""What polar_sample and polar_embed share: the arguments of a sampling, checked, and gradients."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -83,7 +83,7 @@ def checked_sampling(
     mean: float | Sequence[float],
     std: float | Sequence[float],
 ) -> Sampling:
-    """The arguments of the public functions, checked; TypeError or ValueError where they are wrong."""
+    """The arguments of the public functions, else TypeError or ValueError."""
     if isinstance(image, Tensor):
         image = _library.without_float16(image)
     check_tensor("image", image, dtypes=(*DTYPES, torch.bfloat16, torch.uint8))

@@ -1,4 +1,4 @@
-"""transpose_sum: a matrix's transpose and sums of columns. Private: it has no reference twin."""
+"""transpose_sum: a transpose and sums of columns in one. Private: it has no reference."""
 
 import torch
 from torch import Tensor
