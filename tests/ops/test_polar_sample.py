@@ -7,7 +7,7 @@ import torch.nn.functional as F
 from helpers import assert_accurate, assert_equals_reference, with_gradients
 
 from darswin import _C
-from darswin.ops import polar_sample, reference_in_use, use_reference
+from darswin.ops import cpu_capability, polar_sample, reference_in_use, use_reference
 from darswin.ops.reference import philox
 
 LAYOUTS = ("tokens", "image")
