@@ -9,8 +9,8 @@
 
 #include "dispatch.h"
 
-// What polar_sample and polar_embed share: struct Sampling in C++ and in Python, fields in this
-// order.
+// The arguments that polar_sample and polar_embed share, in the order of the fields of struct
+// Sampling (polar_call.h) and of darswin.ops._sampling.Sampling.
 #define SAMPLING                                                                                  \
   "Tensor image, Tensor radii, Tensor azimuths, Tensor center, Tensor? affine, Tensor? offsets, " \
   "Tensor? jitter, Tensor? seed, int[] samples, float[] mean, float[] std, bool bfloat16"

@@ -22,8 +22,8 @@ inline int64_t num_threads(int64_t count) {
   return std::clamp<int64_t>(count, 1, torch::stable::get_num_threads());
 }
 
-// Memory that is new from the system costs more to be mapped, page by page, than to be written.
-// Large pages cost less. Below 32 MB glibc hands out memory that it has kept, already mapped.
+// It takes longer to map memory that is new from the system, page by page, than to write it. Large
+// pages make it faster. Below 32 MB glibc hands out memory that it has kept, already mapped.
 inline void ask_for_large_pages(void* memory, size_t bytes) {
 #if defined(__linux__) && defined(MADV_HUGEPAGE)
   constexpr uintptr_t kPage = 4096, kLeast = uintptr_t{32} << 20;
@@ -66,7 +66,7 @@ class Scratch {
   void* get() const { return memory_; }
 
  private:
-#if defined(__SANITIZE_ADDRESS__)  // which then sees every step beyond the end
+#if defined(__SANITIZE_ADDRESS__)  // so that it sees every step beyond the end
   static constexpr size_t kKept = 0, kUnit = 64;
 #else
   static constexpr size_t kKept = size_t{32} << 20, kUnit = 4096;

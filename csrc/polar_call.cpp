@@ -148,7 +148,7 @@ template <typename T>
 Tensor new_image_gradient(PolarCall<T>& call) {
   PolarSampleArgs<T>& args = call.args;
   STD_TORCH_CHECK(args.pixel != Pixel::u8, "polar_sample: uint8 pixels have no gradient");
-  // Sums of bfloat16 pixels are kept packed whatever the size, and found by 32-bit places.
+  // Sums of bfloat16 pixels are kept packed whatever the size, and indexed with 32 bits.
   STD_TORCH_CHECK(args.pixel != Pixel::bf16 || call.packed_values() < 2147483648.0,
                   "polar_sample_backward: too large an image for a bfloat16 gradient");
   // Where there are points the kernels write every pixel.
@@ -234,8 +234,8 @@ PolarGradients polar_backward(PolarCall<T>& call, const PolarWanted& wanted) {
     }
     return grads;
   }
-  // Images that share their offsets add to one gradient: for a ring of it one thread takes them in
-  // turn.
+  // Images that share their offsets add to one gradient, so one thread takes a ring of all images,
+  // one after another.
   const int64_t sharing = offsets && args.offsets_stride == 0 ? call.batch : 1;
   std::vector<double> sums(call.batch * args.num_radii * kLensSums, 0.0);
   args.grad_lens = sums.data();

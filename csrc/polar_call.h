@@ -1,5 +1,5 @@
-// What a call of polar_sample or polar_embed brings, checked and laid out as the kernels want it.
-// The checks only keep memory safe; darswin/ops explains wrong arguments.
+// A call of polar_sample or polar_embed, checked and laid out as the kernels take it. The checks
+// only keep memory safe; darswin/ops explains wrong arguments.
 #pragma once
 
 #include <torch/csrc/stable/ops.h>
@@ -17,8 +17,8 @@ namespace darswin {
 
 using Sizes = std::vector<int64_t>;
 
-// A packed copy of this many bytes stays in the second-level cache, as its points walk around the
-// circle; it pays where a pixel is looked at often enough.
+// An image is packed if its copy takes at most this many bytes, which stay in the second-level
+// cache, and if it has at most this many pixels a point.
 constexpr int64_t kPackedBytes = 3 << 19;
 constexpr int64_t kPackedPixelsPerPoint = 4;
 // Sums of bfloat16 pixels are float32, of four channels: no thread keeps more of them than this.
@@ -40,8 +40,8 @@ inline Pixel pixel_type(const torch::stable::Tensor& image) {
   }
 }
 
-// RuntimeError unless the product of sizes, none negative and zeros left out, fits 64 bits, and 64
-// times it as well.
+// RuntimeError unless 64 times the product of the sizes that are not 0 fits 64 bits. No size is
+// negative.
 void check_product(std::initializer_list<int64_t> sizes);
 
 // The arguments that polar_sample and polar_embed share, in the order of their schemas.

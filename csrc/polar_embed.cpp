@@ -66,7 +66,7 @@ Tensor forward(PolarCall<T>&& call, const Tensor& weight_, const std::optional<T
   return out;
 }
 
-// Tokens whose products are added up one by one. Longer sums are made of these, since the rounding
+// How many tokens are summed one by one. Longer sums add up such partial sums, since the rounding
 // of a sum grows with its length.
 constexpr int64_t kRunTokens = 1024;
 
@@ -90,8 +90,9 @@ void add_weight_gradient(const PolarCall<T>& call, const PolarEmbedArgs<T>& embe
   }
 }
 
-// Gradients of weight and bias: sums of chunks, as many as there are whatever the threads, added up
-// in their order.
+// Gradients of weight and bias. Each chunk of items has sums of its own, which are then added up in
+// order. The number of chunks does not depend on that of the threads, so the result does not
+// either.
 template <typename T>
 std::tuple<Tensor, Tensor> weight_gradients(const PolarCall<T>& call,
                                             const PolarEmbedArgs<T>& embed) {

@@ -28,8 +28,8 @@ int64_t largest_divisor(int64_t number, int64_t most) {
   return divisor;
 }
 
-// An image has no tokens, so what the kernels have in hand at a time is free: near, one radius,
-// whose samples stay in the nearest cache; far, tokens that are about square, whose points share
+// An image has no tokens, so the driver chooses what the kernels take for one: near, one radius,
+// whose samples stay in the nearest cache; far, pieces that are about square, whose points share
 // pixels.
 template <typename T>
 void choose_samples(PolarSampleArgs<T>& args) {

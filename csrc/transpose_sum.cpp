@@ -40,8 +40,8 @@ std::tuple<Tensor, Tensor> transpose_sum(const Tensor& x) {
   parallel_ranges(groups, [&](int64_t begin, int64_t end) {
     kernels<TransposeSumKernels>().groups(args, begin, end);
   });
-  // Group after group, whichever thread made it; in double, since there may be many thousands. Some
-  // columns at a time, whose totals stay in the nearest cache.
+  // Adds up the groups in order, whichever thread made them; in double, since there may be many
+  // thousands. Some columns at a time, whose totals stay in the nearest cache.
   constexpr int64_t kColumns = 128;
   auto* to = static_cast<float*>(sum.mutable_data_ptr());
   for (int64_t first = 0; first < columns; first += kColumns) {

@@ -93,8 +93,9 @@ Tensor forward(Call<T>&& call) {
   return out;
 }
 
-// Windows that share one row of bias gradients: few rows to fold, yet equal work for many threads.
-// Their number must not depend on that of the threads, or the sums would.
+// How many windows share one row of bias gradients: many, so that few rows are left to add up, but
+// not so many that threads get unequal work. It must not depend on the number of threads, or the
+// sums would.
 template <typename T>
 int64_t chunk_size(const WindowAttentionArgs<T>& args) {
   const int64_t most = std::clamp<int64_t>(args.windows * args.heads / 32, 1, 16);

@@ -1,10 +1,11 @@
 // Residual and layer norm in one pass over memory, in place.
 //
 // A row holds a token's features. It is small enough for the first cache, so memory sees it once,
-// while three loops go over it: the sum with its mean, what is left of it and the squares of that,
-// and the normalized row. Taking the mean off before squaring keeps the digits that a large mean
-// would cost. What is left has a small mean of its own, the rounding of the first one, and that is
-// taken off as well. Where rows are bfloat16, it is the rounded sum that is normalized.
+// while three loops go over it: they make the sum and its mean; the differences from the mean and
+// their squares; the normalized row. Taking the mean off before squaring keeps the digits that a
+// large mean would cost. The differences have a small mean of their own, the rounding of the first
+// one, and that is taken off as well. Where rows are bfloat16, it is the rounded sum that is
+// normalized.
 #include "../add_norm.h"
 
 #include "simd.h"

@@ -1,5 +1,5 @@
-// Scalar maths for both types. Built-ins rather than <cmath>: an inline function of the standard
-// library, emitted here with AVX, could be the copy that the linker keeps for the whole program.
+// Maths for both types. Built-ins rather than <cmath>: an inline function of the standard library
+// would come out of every tier (see tier.h).
 #pragma once
 
 #include "simd.h"

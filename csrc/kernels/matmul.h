@@ -1,8 +1,8 @@
 // Products of matrices that are in cache, for linear layers that are fused with what feeds them.
 //
-// A tile of the result stays in registers while the depth runs by: each step multiplies a few whole
-// registers of b with a few single values of a. The tile is as large as the registers allow, since
-// every value that is loaded is then used often.
+// A tile of the result stays in registers while a loop runs over the depth: each step multiplies a
+// few whole registers of b with a few single values of a. The tile is as large as the registers
+// allow, so that every value is used often once it is loaded.
 #pragma once
 
 #include "simd.h"

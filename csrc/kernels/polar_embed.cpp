@@ -1,8 +1,8 @@
 // The patch embedding: polar sampling and the linear layer behind it, a ring of tokens at a time.
 //
-// The samples of a ring are a matrix (A, S_r * S_phi * C) of a size that fits the second-level
-// cache. It is made, multiplied with the weight and forgotten, so samples are never written to
-// memory; backward makes it again. The gradient of the samples goes the same way, from the product
+// The samples of a ring are a matrix (A, S_r * S_phi * C) that fits the second-level cache. They
+// are made, multiplied with the weight and dropped, so that they are never written to memory;
+// backward recomputes them. The gradient of the samples goes the same way, from the product
 // straight to the pixels.
 #include "arena.h"
 #include "matmul.h"
@@ -50,7 +50,8 @@ void embed(const PolarSampleArgs<T>& a, const PolarEmbedArgs<T>& e, int64_t begi
   const Scratch<T> s(a, e, PolarPass::forward, scratch);
   const int64_t rings = a.num_radii / a.samples_r, sectors = sectors_of(a);
   Sampler<T> sampler(a, s.row, a.samples_a * a.channels, s.sampler);
-  // Products go where they belong if rows there are whole registers of the type computed in.
+  // The product is written straight into the output if rows there are whole registers of the type
+  // that is computed in.
   const bool in_place = !a.narrow && e.features == s.wide;
   for (int64_t item = begin; item < end; ++item) {
     const int64_t first = item * sectors * e.features;

@@ -1,5 +1,5 @@
-// Bilinear interpolation in a packed image (polar_image.h), first downwards, then to the right, on
-// pixels that hold all their channels.
+// Bilinear interpolation in a packed image (polar_image.h): first downwards, then to the right,
+// four channels at a time.
 #pragma once
 
 #include "polar_image.h"
@@ -7,10 +7,11 @@
 namespace darswin {
 namespace {
 
-// Interpolation is by weights, or by differences, a + t * (b - a): those of huge values overflow,
-// and those of infinite ones come to NaN. Where a vector of four is not a whole register, weights
-// cost more: differences come first there, and weights only if a result is not finite, for the
-// whole block of points, whose other samples may then differ in their last bit.
+// Interpolation uses weights, (1 - t) * a + t * b, or differences, a + t * (b - a). Differences
+// overflow between huge values and give NaN between infinite ones. Weights cost more, but not for
+// registers of 512 bits, which hold four points. The other tiers try differences first and, where a
+// sample is not finite, take the whole block of points again with weights; its other samples may
+// then differ in their last bit.
 template <typename T>
 constexpr bool kTryDifferences = kSame<T, float> && kRegister < 64;
 
@@ -23,7 +24,8 @@ inline V between(V a, V b, V t) {
   }
 }
 
-// Writes a pixel of four values between its neighbours, given it and the one below.
+// Writes four channels of a sample, given the upper left and the lower left pixel; their right
+// neighbours follow them in memory. With differences, also adds what it writes to *sum.
 template <typename T>
 using Piece = Vector<T, (kLanes<T> < 4 ? kLanes<T> : 4)>;
 template <bool kWeights, typename T>
@@ -35,7 +37,7 @@ inline void interpolate(const T* pixel, const T* below, T right, T lower, T* to,
     if constexpr (!kWeights) *sum += v;
   };
   if constexpr (kSame<T, float> && kRegister > 16) {
-    // It and its right neighbour are one load.
+    // One load takes a pixel and its right neighbour.
     using Pair = Vector<T, 8>;
     const Pair pair = between<kWeights>(load<Pair>(pixel), load<Pair>(below), splat<Pair>(lower));
     write(0, between<kWeights>(lower_half(pair), upper_half(pair), along));
@@ -50,10 +52,10 @@ inline void interpolate(const T* pixel, const T* below, T right, T lower, T* to,
   }
 }
 
-// Four points in a register of 512 bits: two pairs of pixels and two of those below, then four
-// pixels and their right neighbours. A point alone is limited by its loads and stores: here the
-// weights of four are two loads, and the four go out as one store where they lie one behind the
-// other. A template, since only tiers with such registers have two_eights and pick.
+// Four points in a register of 512 bits: two pairs of pixels and the two pairs below, then four
+// pixels and their right neighbours. Loads and stores are what limits a single point; here one load
+// each brings the weights of four, and points that follow each other are written by one store. A
+// template, since only tiers with such registers have two_eights and pick.
 template <typename T>
 inline Vector<T, 16> interpolate_four(const T* pixels, const T* below, const int32_t* offset,
                                       const T* right, const T* lower) {
@@ -84,8 +86,8 @@ inline bool all_finite(const V& v) {
 }
 
 // Samples points of a packed image, point k to to[target[k]]; joined[k] says whether the next three
-// follow it there. A function of its own, so that all it needs stays in registers. Returns false if
-// it sampled by differences and a sample is not finite, which their sum tells.
+// points follow it there. Returns false if it used differences and a sample is not finite, which
+// the sum of all samples shows. A function of its own, so that all it needs stays in registers.
 template <bool kWeights, typename T>
 [[gnu::noinline]] bool sample_line(const T* pixels, int64_t row, const PackedPlaces<T>& places,
                                    int64_t begin, int64_t end, const int32_t* target,
@@ -105,7 +107,7 @@ template <bool kWeights, typename T>
       }
     }
   }
-  Piece<T> sums[4]{};  // in turn, so that none waits for the addition before
+  Piece<T> sums[4]{};  // used in turn, so that no addition waits for the one before
   const auto sample = [&](int64_t k, Piece<T>* sum) {
     interpolate<kWeights>(pixels + offset[k], below + offset[k], right[k], lower[k], to + target[k],
                           sum);

@@ -1,4 +1,5 @@
-// A row of samples, all points of one radius, where the operator's output or its gradient keeps it.
+// A row of samples is all points of one radius: where the operator's output, or its gradient, holds
+// them.
 #pragma once
 
 #include "polar_image.h"

@@ -4,9 +4,9 @@
 // the image in cache or, if it is large, in place (polar_image.h). Backward has two halves. The
 // image's gradient scatters every point into four pixels that other points share: each thread owns
 // a band of rows of an image and adds to them in the order of the points, so that no sum depends on
-// how many bands there are. The lens's gradient is a sum over each radius, but for the offsets,
-// which have one gradient a point. A point outside the image, or at no number at all, samples zeros
-// and has no gradient.
+// how many bands there are. The lens's gradient is a sum over each radius; only the offsets have a
+// gradient for each point. A point outside the image, or whose place is NaN or infinite, samples
+// zeros and has no gradient.
 #include "polar_rows.h"
 #include "polar_sampler.h"
 #include "polar_scatter.h"

@@ -1,4 +1,4 @@
-// Forward: samples of one token after another, from the packed image or, if it is far, in place.
+// Forward: samples one token after another, from the packed image or, if it is far, where it lies.
 #pragma once
 
 #include "polar_interpolate.h"
@@ -14,9 +14,9 @@ class Sampler {
     return round_up(sizeof(State), 64) + values * static_cast<int64_t>(sizeof(T));
   }
 
-  // Sample (row, s) of the token of a sector, channel c, will go to
-  // to[sector * sector_stride + row * row_stride + s * C + c]. Either a token is contiguous, or a
-  // row of all tokens is and has room for three values more.
+  // Channel c of sample (row, s) of a sector's token goes to to[sector * sector_stride + row *
+  // row_stride + s * C + c]. Either each token is contiguous, or each row, one radius of all
+  // tokens, is and has room for three values behind it.
   Sampler(const PolarSampleArgs<T>& args, int64_t sector_stride, int64_t row_stride, void* scratch)
       : a(args),
         packed(args.packed ? Packed(args) : Packed()),
@@ -54,7 +54,7 @@ class Sampler {
     }
     const int64_t columns = block_columns(), rows = smaller(kBlock / columns, a.samples_r);
     for (int64_t j = 0, count; j < a.num_azimuths; j += count) {
-      // A block ends where a token that is cut does.
+      // Where a token has more points than a block, no block reaches beyond its token.
       const int64_t left =
           columns < a.samples_a ? a.samples_a - j % a.samples_a : a.num_azimuths - j;
       count = smaller(columns, left);
@@ -71,19 +71,19 @@ class Sampler {
       int32_t near_to[kBlock];
       int64_t far_to[kBlock];
     };
-    bool joined[kBlock];              // whether the next three follow there
-    uint16_t order[kBlock + kAhead];  // in which they are visited, if the image is far
+    bool joined[kBlock];              // whether the next three points follow there
+    uint16_t order[kBlock + kAhead];  // in which points of a far image are visited
   };
 
-  // No point of a block goes further than this.
+  // No point of a block is stored further than this from the block's first.
   int64_t reach_of_block() const {
     return smaller(kBlock, a.samples_r) * row_stride +
            block_columns() / a.samples_a * sector_stride;
   }
 
-  // A block is a few whole tokens: their pixels and their output stay in the nearest cache. Blocks
-  // are of equal size if that does not make them small. A token of more points than a block holds
-  // is cut.
+  // A block is a few whole tokens, so that their pixels and their output stay in the nearest cache.
+  // Blocks are of equal size if that does not make them small. A token of more points than a block
+  // holds is cut into several blocks.
   int64_t block_columns() const {
     const int64_t sectors = a.num_azimuths / a.samples_a;
     const int64_t most = kBlock / (a.samples_r * a.samples_a);
@@ -111,14 +111,15 @@ class Sampler {
     for (int64_t n = 0; n < rows; ++n) {
       points.find(a, packed, b, first + n, j, count, n * count);
       if (row_stride == a.samples_a * a.channels && rows == a.samples_r) {
-        // The tokens of the next block come behind these: their lines are asked for meanwhile.
+        // The tokens of the next block come behind these: prefetches where they will be written.
         const char* next =
             reinterpret_cast<const char*>(to + (j + count) / a.samples_a * sector_stride);
         const int64_t bytes = count * row_stride / a.samples_a * sizeof(T);
         for (int64_t e = n * bytes; e < (n + 1) * bytes; e += 64) __builtin_prefetch(next + e, 1);
       }
     }
-    // Where the points of a smaller block go is known only if they are of one radius.
+    // near_to holds the places of a whole block. They hold for a smaller block only if its points
+    // are of one radius.
     if (in_line && (rows == 1 || count == smaller(block_columns(), a.num_azimuths))) {
       T* out =
           to + j / a.samples_a * sector_stride + j % a.samples_a * a.channels + row * row_stride;
@@ -130,7 +131,7 @@ class Sampler {
     }
   }
 
-  // Rows of a block, of up to four channels.
+  // Samples rows of a block whose pixels have up to four channels.
   void lines(int64_t rows, int64_t count, T* to, bool last_row, bool last_token) {
     if constexpr (kTryDifferences<T>) {
       if (lines<false>(rows, count, to, last_row, last_token)) return;
@@ -138,10 +139,11 @@ class Sampler {
     lines<true>(rows, count, to, last_row, last_token);
   }
 
-  // Four values are stored where the point has fewer: the points of that place are sampled later,
-  // with one exception. Behind the last row of a token is the first row of the next one, which is
-  // there already if a token has more than one row: it is kept and put back. Behind the last token
-  // is what others may write to: its last points are exact.
+  // A point stores four values even if it has fewer channels: the point that belongs behind it
+  // comes later and overwrites the rest. There are two exceptions. Behind the last row of a token
+  // is the first row of the next token, which is written already if tokens have several rows: its
+  // values are kept and put back. Behind the last token may be what another thread writes: its last
+  // points store only their own values.
   template <bool kWeights>
   bool lines(int64_t rows, int64_t count, T* to, bool last_row, bool last_token) {
     const int64_t channels = a.channels, all = rows * count, tokens = count / a.samples_a;
@@ -157,8 +159,8 @@ class Sampler {
     }
     const int64_t before = all - count;
     sample(0, before);
-    // These are enough: such a token has at least two rows and, of fewer than four channels but
-    // four values a row, two points in each.
+    // kBlock / 4 tokens are enough: one that overruns has two rows at least, and two points in
+    // each, since a row has at least four values and a point fewer.
     T* first = to + (rows - a.samples_r) * row_stride;  // row 0 of the first token
     T kept[kBlock / 4][4];
     const int64_t overrun = channels < 4 && a.samples_r > 1 ? tokens : 0;
@@ -181,7 +183,8 @@ class Sampler {
     return finite;
   }
 
-  // Points j to j + count of one radius, whose places are `place` on, of any number of channels.
+  // Samples points j to j + count of one radius, whose places are `place` on, of any number of
+  // channels.
   void near_row(int64_t j, int64_t count, int64_t place, T* row) const {
     for (int64_t k = 0; k < count; ++k) {
       T* to = row + (j + k) / a.samples_a * sector_stride + (j + k) % a.samples_a * a.channels;
@@ -198,9 +201,9 @@ class Sampler {
     }
   }
 
-  // The points of a block in the far image. The pixels of points to come are asked for, into the
-  // second-level cache: rows of an image share few sets of the first if its width is a power of
-  // two.
+  // Samples the points of a block in the far image. Pixels of later points are prefetched into the
+  // second-level cache: in the first, rows of an image whose width is a power of two share few
+  // sets.
   template <typename E>
   [[gnu::noinline]] void far_block(int64_t b, int64_t visits, T* to) const {
     const E* pixels = static_cast<const E*>(a.image) + b * a.image_stride[0];
@@ -231,7 +234,7 @@ class Sampler {
     }
   }
 
-  // Three planes of float: a pixel and its right neighbour are one load.
+  // Three planes of float: one load takes a pixel and its right neighbour.
   static void planes_point(const float* pixel, int64_t plane, int64_t below, float right,
                            float lower, float* to) {
     using V = Vector<float, 4>;

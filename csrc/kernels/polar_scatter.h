@@ -1,10 +1,11 @@
-// The image's gradient: every point adds its gradient, weighted, to four pixels.
+// The image's gradient: each point adds its gradient, weighted, to the four pixels around it.
 //
-// The sums of a small image are kept in cells: what goes to the four pixels around a point, four
-// channels each, is one cache line that is added to as a whole; at the end each pixel collects its
-// share of four cells. A larger image is kept packed (polar_image.h), a pixel a register; a still
-// larger one is added to in place. Neighbouring points often meet in one pixel, and an addition
-// must wait for the one before; so points are taken from several places of the circle in turn.
+// For a small image the sums are kept in cells. A cell holds what points at one place add to the
+// four pixels around them, four channels each: one cache line, added to as a whole. At the end each
+// pixel collects its share of four cells. For a larger image the sums are kept packed
+// (polar_image.h), a pixel a register; for a still larger one they are added up in place.
+// Neighbouring points often meet in one pixel, and an addition must wait for the one before; so
+// points are taken from several places of the circle in turn.
 #pragma once
 
 #include "polar_rows.h"
@@ -95,8 +96,7 @@ class Scatter {
  private:
   enum Keeping { kCells, kPacked, kInPlace };
 
-  // Bands are rows of packed images. Gradients narrower than what is added up cannot be added to in
-  // place.
+  // bfloat16 gradients are never added up in place, since their sums are float32.
   static Keeping keeping(const PolarSampleArgs<T>& a) {
     if (!a.packed && a.pixel != Pixel::bf16) return kInPlace;
     const bool cells =
@@ -115,8 +115,8 @@ class Scatter {
     return layout;
   }
 
-  // The rows that the band keeps sums in: those of its pixels, the outermost bands the borders too;
-  // in cells also the row above, which two bands then keep.
+  // The rows of sums that the band keeps: those of its pixels and, in the outermost bands, of the
+  // border. Cells need the row above as well, so two neighbouring bands each keep one of their own.
   int64_t band_row(int64_t band) const { return a.height * band / a.bands; }
   int64_t first_kept() const { return first_row == 0 ? 0 : first_row + (keep == kCells ? 0 : 1); }
   int64_t end_kept() const { return end_row == a.height ? a.height + 3 : end_row + 1; }
@@ -164,13 +164,15 @@ class Scatter {
   }
   static void add_cell(double*, const double*, double, double) {}  // doubles are never in cells
 
-  // The pixels of a row, from the cells around each, into the front of their own cells.
+  // Adds up the pixels of a row from the cells around each; a pixel's sum replaces the front of its
+  // own cell.
   void collect(const T* row) const {
     using V = Vector<T, 4>;
     T* cell = const_cast<T*>(row);
     for (int64_t x = 0; x < a.width; ++x, cell += layout.pixel) {
       const T *left = cell - layout.pixel, *above = cell - layout.row;
-      // The cell to the left has given its own part away, but not that for this pixel.
+      // The front of the cell to the left is that pixel's sum by now; the part for this pixel is
+      // still there.
       store(cell, load<V>(cell) + load<V>(left + 4) +
                       (load<V>(above + 8) + load<V>(above - layout.pixel + 12)));
     }
@@ -239,7 +241,7 @@ class Scatter {
     }
   }
 
-  // Asks for the pixels of a point to come.
+  // Prefetches the pixels of a point to come.
   void fetch(int64_t place) const {
     if (points.far.offset[place] < 0) return;
     const int64_t plane = a.height * a.width;
@@ -277,7 +279,7 @@ class Scatter {
     if (a.bands == 1) return true;
     const double y = a.center[image * a.center_stride + 1];
     const double most = reach(a, image, i).y + largest_offset(a, image, i) + 2;
-    // Written so that NaN touches.
+    // NaN compares false, so that it counts as touching.
     return !(y + most < first_row || y - most > end_row);
   }
 

@@ -1,8 +1,8 @@
 // The transpose of a matrix and the sums of its columns, in one pass over memory.
 //
-// It is what the gradient of a linear layer's weight wants of the gradient of its output: a product
-// whose rows are the output's features, and, for the bias, their sums. Rows are read in groups, so
-// that what is written of a column is whole cache lines.
+// Backward of a linear layer needs both of the output's gradient: its transpose times the input is
+// the weight's gradient, the sums of its columns are the bias's. Rows are read in groups, so that
+// what is written of a column is whole cache lines.
 #include "../transpose_sum.h"
 
 #include "transpose.h"
@@ -39,7 +39,7 @@ void transpose_groups(const TransposeSumArgs& a, int64_t begin, int64_t end) {
       }
       store(sums + c, sum);
     }
-    // What is left: the last rows of all columns, if any, and all rows of the last columns.
+    // The rest: the last rows of all columns, if any, and all rows of the last columns.
     for (int64_t c = whole_rows < rows ? 0 : whole_columns; c < a.columns; ++c) {
       const bool whole = c < whole_columns;
       float sum = whole ? sums[c] : 0;

@@ -45,8 +45,8 @@ __attribute__((noinline)) void transpose(Rows<const T> rows, Dim d, T* columns) 
 }
 
 // use(k, v, sum) for each key k < n, n a multiple of 8, and each register v of the group: the sums
-// over c of columns[c * kGroup + i] * rows[k][c]. There are as many sums under way as the latency
-// of the multiply-add asks for.
+// over c of columns[c * kGroup + i] * rows[k][c]. Enough sums are under way to hide the latency of
+// the multiply-add.
 template <typename T, typename Count, typename Dim, typename Use>
 inline void products(const T* columns, Rows<const T> rows, Count n, Dim d, Use use) {
   using V = Vector<T, kLanes<T>>;
@@ -151,7 +151,7 @@ __attribute__((noinline)) void weighted_sums(W weights, Rows<const T> from, Summ
 }
 
 // Rows of bfloat16 as float32, and back. Of two registers of channels the even ones come first,
-// then the odd ones: that needs no shuffle, and no step above minds the order of channels.
+// then the odd ones: that needs no shuffle, and the order of channels matters to no step above.
 inline void widen(const bfloat16* from, int64_t d, float* to) {
   constexpr int kL = kLanes<float>;
   using Bits = Vector<uint32_t, kL>;

@@ -92,7 +92,7 @@ def autocast_off(device: str) -> contextlib.AbstractContextManager:
     return torch.autocast(device, enabled=False)
 
 
-def run(reference: Callable[..., Tensor], *arguments: object) -> Tensor:
+def run(reference: Callable[..., Tensor], *arguments: Any) -> Tensor:
     """An operator on checked arguments: compiled, or its twin of the same name in reference.py.
 
     The compiled one takes the fields of a NamedTuple one by one.

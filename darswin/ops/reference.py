@@ -83,8 +83,9 @@ def polar_sample(sampling: Sampling, tokens: bool) -> Tensor:
     batch, channels, height, width = image.shape
     rows, columns = radii.shape[1], azimuths.shape[0]
     r, a = radii[:, :, None], azimuths[None, None, :]
-    if sampling.jitter is not None and rows > 0 and columns > 0:
-        r, a = _jittered(radii, azimuths, batch, sampling.jitter, sampling.seed)
+    jitter, seed = sampling.jitter, sampling.seed
+    if jitter is not None and seed is not None and rows > 0 and columns > 0:
+        r, a = _jittered(radii, azimuths, batch, jitter, seed)
     # Gradients must not meet what is not a number: it stays one when it is multiplied with 0.
     known = r.isfinite() & a.isfinite()
     r, a = torch.where(r.isfinite(), r, 0), torch.where(a.isfinite(), a, 0)
@@ -101,7 +102,7 @@ def polar_sample(sampling: Sampling, tokens: bool) -> Tensor:
     left, top = x.detach().floor(), y.detach().floor()
     right, lower = x - left, y - top
     pixels = image.flatten(2)
-    out = 0
+    out = image.new_zeros(())
     for down, wy in ((0, 1 - lower), (1, lower)):
         for across, wx in ((0, 1 - right), (1, right)):
             column, row = left.long() + across, top.long() + down
