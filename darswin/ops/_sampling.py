@@ -111,8 +111,9 @@ def checked_sampling(
             f"samples = (S_r, S_φ) must divide (R·S_r, A·S_φ) = "
             f"({radii.shape[1]}, {azimuths.shape[0]}), got {samples}"
         )
-    mean, std = per_channel("mean", mean, channels), per_channel("std", std, channels)
-    if image.dtype != torch.uint8:
+    if image.dtype == torch.uint8:
+        mean, std = per_channel("mean", mean, channels), per_channel("std", std, channels)
+    else:
         mean = std = ()
     return Sampling(
         image, radii, azimuths, center, affine, offsets, *_jitter_tensors(jitter, seed),

@@ -348,14 +348,14 @@ def test_strided_lenses():
         torch.testing.assert_close(a, b, rtol=0, atol=0)
 
 
-# -- what is no number -----------------------------------------------------------------------------
+# -- NaN and infinity ------------------------------------------------------------------------------
 
 
 @references
 @jitters
 @pytest.mark.parametrize("rows", [6, 60])  # far and near
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
-def test_points_at_no_number_sample_nothing(bad, rows, jitter, reference):
+def test_points_at_nan_or_infinity_sample_nothing(bad, rows, jitter, reference):
     image, radii, center, affine, offsets, azimuths = make_inputs(
         rows=rows, columns=40, dtype=torch.float32
     )

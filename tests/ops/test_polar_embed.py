@@ -244,8 +244,6 @@ def test_compile_fullgraph():
         (dict(bias="no"), TypeError, "bias must be a tensor, got str"),
         (dict(samples=(5, 5)), ValueError, "must divide"),
         (dict(jitter=2.0), ValueError, r"jitter must be in \[0, 1\]"),
-        (dict(mean=(0.1, 0.2)), ValueError, "mean must be one number or one a channel, 3, got"),
-        (dict(std=0.0), ValueError, "std must be positive, got 0.0"),
     ],
 )
 def test_errors_say_what_was_expected(change, error, message, reference):

@@ -291,7 +291,7 @@ def test_expanded_image_and_gradient():
 
 @pytest.mark.parametrize("reference", [False, True])
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf, 1e30, -1e30])
-def test_points_at_no_number_sample_nothing(bad, reference):
+def test_points_at_nan_or_infinity_sample_nothing(bad, reference):
     image, radii, center, azimuths = make_inputs(rows=4, columns=6)
     good = polar_sample(image, radii, azimuths, center, samples=(1, 1), layout="image")
     broken = radii.clone()

@@ -63,12 +63,12 @@ def test_the_layer_and_the_model_take_patches_of_one_radius():
         torch.testing.assert_close(ours, expected, rtol=1e-4, atol=1e-4)
 
 
-# -- azimuths at no number, and none at all --------------------------------------------------------
+# -- azimuths that are NaN or infinite, and none at all -------------------------------------------
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, f64])
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
-def test_azimuths_at_no_number_sample_nothing_of_a_packed_image(bad, dtype):
+def test_azimuths_at_nan_or_infinity_sample_nothing_of_a_packed_image(bad, dtype):
     # A small image and many points: the image is packed, and no point but these leaves it.
     image = torch.randn(2, 3, 20, 20, dtype=dtype)
     radii, azimuths, center = grid(16, 40, 20, dtype)
