@@ -1,10 +1,13 @@
-// add_norm_ on CPU: check, thread, call the kernel.
+// _add_norm_ on CPU: check, thread, call the kernel.
+#include "add_norm.h"
+
 #include <torch/csrc/stable/library.h>
 #include <torch/csrc/stable/tensor.h>
 #include <torch/headeronly/util/Exception.h>
 
 #include <algorithm>
 
+#include "bfloat16.h"
 #include "dispatch.h"
 #include "parallel.h"
 
@@ -19,18 +22,16 @@ constexpr int64_t kGrain = 8192;
 
 template <typename S>
 void run(const Tensor& x, const Tensor& y, const Tensor& weight, const Tensor& bias, double eps) {
-  const AddNormArgs<S> args{
-      static_cast<S*>(x.mutable_data_ptr()),
-      static_cast<S*>(y.mutable_data_ptr()),
-      static_cast<const float*>(weight.const_data_ptr()),
-      static_cast<const float*>(bias.const_data_ptr()),
-      static_cast<float>(eps),
-      weight.numel(),
-  };
+  const AddNormArgs<S> args{.x = static_cast<S*>(x.mutable_data_ptr()),
+                            .y = static_cast<S*>(y.mutable_data_ptr()),
+                            .weight = static_cast<const float*>(weight.const_data_ptr()),
+                            .bias = static_cast<const float*>(bias.const_data_ptr()),
+                            .eps = static_cast<float>(eps),
+                            .width = weight.numel()};
   if (x.numel() == 0) return;
   const int64_t rows = x.numel() / args.width, each = std::max<int64_t>(kGrain / args.width, 1);
-  parallel_ranges((rows + each - 1) / each, 0, [&](int64_t begin, int64_t end, void*) {
-    kernels().add_norm<S>()(args, begin * each, std::min(end * each, rows));
+  parallel_ranges((rows + each - 1) / each, [&](int64_t begin, int64_t end) {
+    kernels<AddNormKernels<S>>().rows(args, begin * each, std::min(end * each, rows));
   });
 }
 
@@ -65,4 +66,4 @@ void add_norm_(Tensor x, Tensor y, const Tensor& weight, const Tensor& bias, dou
 }  // namespace
 }  // namespace darswin
 
-STABLE_TORCH_LIBRARY_IMPL(darswin, CPU, m) { m.impl("add_norm_", TORCH_BOX(&darswin::add_norm_)); }
+STABLE_TORCH_LIBRARY_IMPL(darswin, CPU, m) { m.impl("_add_norm_", TORCH_BOX(&darswin::add_norm_)); }

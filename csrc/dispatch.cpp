@@ -5,82 +5,75 @@
 #include <atomic>
 #include <cstdlib>
 #include <cstring>
+#include <optional>
 
 namespace darswin {
-
-namespace generic {
-extern const Kernels kernels;
-}
-#ifdef DARSWIN_X86_TIERS
-namespace avx2 {
-extern const Kernels kernels;
-}
-namespace avx512 {
-extern const Kernels kernels;
-}
-#endif
-
 namespace {
 
-// Tiers from low to high; supported() counts how many of them this CPU runs.
-const Kernels* const tiers[] = {
-    &generic::kernels,
-#ifdef DARSWIN_X86_TIERS
-    &avx2::kernels,
-    &avx512::kernels,
-#endif
+struct TierFacts {
+  const char* name;
+  bool supported;  // by this CPU
 };
 
-int supported() {
-  int count = 1;
-#ifdef DARSWIN_X86_TIERS
-  __builtin_cpu_init();
-  if (__builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma")) {
-    count = 2;
-    if (__builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512bw") &&
-        __builtin_cpu_supports("avx512vl") && __builtin_cpu_supports("avx512dq")) {
-      count = 3;
-    }
-  }
+TierFacts facts(Tier tier) {
+  switch (tier) {
+#if defined(__x86_64__)
+    case Tier::avx2:
+      return {"avx2", __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma")};
+    case Tier::avx512:
+      return {"avx512",
+              __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma") &&
+                  __builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512bw") &&
+                  __builtin_cpu_supports("avx512vl") && __builtin_cpu_supports("avx512dq")};
 #endif
-  return count;
-}
-
-const Kernels* find(const char* tier) {
-  for (int i = 0; i < supported(); ++i) {
-    if (std::strcmp(tiers[i]->tier, tier) == 0) return tiers[i];
+    default:
+      return {"generic", true};
   }
-  return nullptr;
 }
 
-const Kernels* initial() {
-  const Kernels* best = tiers[supported() - 1];
+std::optional<Tier> find(const char* name) {
+  for (const Tier tier : available_tiers()) {
+    if (std::strcmp(tier_name(tier), name) == 0) return tier;
+  }
+  return std::nullopt;
+}
+
+Tier initial() {
+  const Tier best = available_tiers().back();
   const char* wanted = std::getenv("ATEN_CPU_CAPABILITY");
   if (wanted == nullptr) return best;
-  if (std::strcmp(wanted, "default") == 0) return &generic::kernels;
-  // A tier above the CPU's, or a name torch itself warns about, leaves the best one.
-  const Kernels* found = find(wanted);
-  return found != nullptr ? found : best;
+  if (std::strcmp(wanted, "default") == 0) return Tier::generic;
+  // A tier above the CPU's, or a name that torch itself warns about, leaves the best one.
+  return find(wanted).value_or(best);
 }
 
-std::atomic<const Kernels*>& current() {
-  static std::atomic<const Kernels*> chosen{initial()};
+std::atomic<Tier>& current() {
+  static std::atomic<Tier> chosen{initial()};
   return chosen;
 }
 
 }  // namespace
 
-const Kernels& kernels() { return *current().load(std::memory_order_relaxed); }
+Tier current_tier() { return current().load(std::memory_order_relaxed); }
 
-const char* best_tier() { return tiers[supported() - 1]->tier; }
+const char* tier_name(Tier tier) { return facts(tier).name; }
 
-bool tier_available(const char* tier) { return find(tier) != nullptr; }
+std::vector<Tier> available_tiers() {
+  using enum Tier;
+#if defined(__x86_64__)
+  __builtin_cpu_init();
+#endif
+  std::vector<Tier> tiers;
+  for (const Tier tier : {DARSWIN_TIERS}) {
+    if (facts(tier).supported) tiers.push_back(tier);
+  }
+  return tiers;
+}
 
-bool set_tier(const char* tier) {
-  const Kernels* found = find(tier);
-  if (found == nullptr) return false;
-  current().store(found, std::memory_order_relaxed);
-  return true;
+bool set_tier(const char* name) {
+  const std::optional<Tier> found = find(name);
+  if (found.has_value()) current().store(*found, std::memory_order_relaxed);
+  return found.has_value();
 }
 
 }  // namespace darswin

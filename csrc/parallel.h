@@ -22,8 +22,8 @@ inline int64_t num_threads(int64_t count) {
   return std::clamp<int64_t>(count, 1, torch::stable::get_num_threads());
 }
 
-// Memory that is new from the system costs more to be mapped, page by page, than to be written.
-// Large pages cost less. Below 32 MB glibc hands out memory that it has kept, already mapped.
+// It takes longer to map memory that is new from the system, page by page, than to write it. Large
+// pages make it faster. Below 32 MB glibc hands out memory that it has kept, already mapped.
 inline void ask_for_large_pages(void* memory, size_t bytes) {
 #if defined(__linux__) && defined(MADV_HUGEPAGE)
   constexpr uintptr_t kPage = 4096, kLeast = uintptr_t{32} << 20;
@@ -41,12 +41,11 @@ inline void ask_for_large_pages(const torch::stable::Tensor& tensor) {
 
 // Working memory of the calling thread for as long as this lives: at least `bytes`, aligned to
 // cache lines, contents undefined. Up to kKept bytes stay with the thread from use to use, since
-// fresh pages cost more than what the kernels do with them; so a thread has one Scratch at a time,
-// but for those of 0 bytes, which have no memory. Throws std::bad_alloc.
+// fresh pages cost more than what the kernels do with them; so a thread has one Scratch at a time.
+// Throws std::bad_alloc.
 class Scratch {
  public:
   explicit Scratch(size_t bytes) {
-    if (bytes == 0) return;
     static thread_local Memory kept;
     static thread_local size_t kept_bytes = 0;
     if (bytes > kKept) {
@@ -67,7 +66,7 @@ class Scratch {
   void* get() const { return memory_; }
 
  private:
-#if defined(__SANITIZE_ADDRESS__)  // which then sees every step beyond the end
+#if defined(__SANITIZE_ADDRESS__)  // so that it sees every step beyond the end
   static constexpr size_t kKept = 0, kUnit = 64;
 #else
   static constexpr size_t kKept = size_t{32} << 20, kUnit = 4096;
@@ -89,11 +88,11 @@ class Scratch {
   void* memory_ = nullptr;
 };
 
-// body(begin, end, scratch) on contiguous ranges that cover [0, count), each in a thread of its own
-// with `bytes` of working memory. An exception must not leave an OpenMP region, or the process
-// ends: it is kept, and thrown again when all threads are done.
+// body(begin, end) on contiguous ranges that cover [0, count), each in a thread of its own. An
+// exception must not leave an OpenMP region, or the process ends: it is kept, and thrown again when
+// all threads are done.
 template <typename Body>
-void parallel_ranges(int64_t count, size_t bytes, Body&& body) {
+void parallel_ranges(int64_t count, Body&& body) {
   if (count <= 0) return;
   const int64_t threads = num_threads(count);
   std::exception_ptr failure;
@@ -104,7 +103,7 @@ void parallel_ranges(int64_t count, size_t bytes, Body&& body) {
     const int64_t begin = thread * each + std::min(thread, extra);
     const int64_t end = begin + each + (thread < extra ? 1 : 0);
     try {
-      if (begin < end) body(begin, end, Scratch(bytes).get());
+      if (begin < end) body(begin, end);
     } catch (...) {
 #pragma omp critical(darswin_failure)
       failure = std::current_exception();

@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <numeric>
 
+#include "dispatch.h"
 #include "parallel.h"
 
 namespace darswin {
@@ -19,55 +20,52 @@ void check_product(std::initializer_list<int64_t> sizes) {
 }
 
 template <typename T>
-PolarCall<T>::PolarCall(const Tensor& image_, const Tensor& radii_, const Tensor& azimuths_,
-                        const Tensor& center_, const std::optional<Tensor>& affine_,
-                        const std::optional<Tensor>& offsets_, const Sizes& patch,
-                        const std::optional<Tensor>& jitter, const std::optional<Tensor>& seed,
-                        const std::vector<double>& mean, const std::vector<double>& std,
-                        bool bfloat16)
-    : image(image_),
-      radii(torch::stable::contiguous(radii_)),
-      center(torch::stable::contiguous(center_)),
-      batch(image_.dim() == 4 ? image_.size(0) : 0) {
-  const Tensor azimuths = torch::stable::contiguous(azimuths_);
+PolarCall<T>::PolarCall(const Sampling& given)
+    : image(given.image),
+      radii(torch::stable::contiguous(given.radii)),
+      center(torch::stable::contiguous(given.center)),
+      batch(image.dim() == 4 ? image.size(0) : 0) {
+  const Tensor azimuths = torch::stable::contiguous(given.azimuths);
+  const Sizes& samples = given.samples;
   STD_TORCH_CHECK(image.dim() == 4 && radii.dim() == 2 && azimuths.dim() == 1 &&
-                      center.dim() == 2 && center.size(1) == 2 && patch.size() == 2,
+                      center.dim() == 2 && center.size(1) == 2 && samples.size() == 2,
                   "polar_sample: wrong number of dimensions");
   STD_TORCH_CHECK(image.is_cpu(), "polar_sample: the image must be on the CPU");
   STD_TORCH_CHECK((radii.size(0) == 1 || radii.size(0) == batch) &&
                       (center.size(0) == 1 || center.size(0) == batch),
                   "polar_sample: radii and center must have a row an image, or one");
   constexpr ScalarType type = sizeof(T) == sizeof(float) ? ScalarType::Float : ScalarType::Double;
-  for (const Tensor* tensor :
-       std::initializer_list<const Tensor*>{&this->radii, &azimuths, &this->center}) {
+  for (const Tensor* tensor : std::initializer_list<const Tensor*>{&radii, &azimuths, &center}) {
     STD_TORCH_CHECK(tensor->scalar_type() == type && tensor->is_cpu(),
                     "polar_sample: wrong type or device of radii, azimuths or center");
   }
-  STD_TORCH_CHECK(patch[0] > 0 && patch[1] > 0 && radii.size(1) % patch[0] == 0 &&
-                      azimuths.size(0) % patch[1] == 0,
-                  "polar_sample: patch must divide the radii and the azimuths");
+  STD_TORCH_CHECK(samples[0] > 0 && samples[1] > 0 && radii.size(1) % samples[0] == 0 &&
+                      azimuths.size(0) % samples[1] == 0,
+                  "polar_sample: samples must divide the radii and the azimuths");
   // What is counted below: points, values of samples, sums of a lens.
   check_product({batch, radii.size(1), azimuths.size(0), image.size(1)});
-  check_product({patch[0], patch[1], image.size(1)});
-  const auto laid_out = [&](const Tensor& given, Sizes sizes) {
-    sizes[0] = given.dim() > 0 && given.size(0) == 1 ? 1 : batch;
-    STD_TORCH_CHECK(given.scalar_type() == type && given.is_cpu() && given.sizes().vec() == sizes,
-                    "polar_sample: wrong type, device or shape of affine or offsets");
-    return torch::stable::contiguous(given);
+  check_product({samples[0], samples[1], image.size(1)});
+  const auto laid_out = [&](const Tensor& tensor, Sizes sizes) {
+    sizes[0] = tensor.dim() > 0 && tensor.size(0) == 1 ? 1 : batch;
+    STD_TORCH_CHECK(
+        tensor.scalar_type() == type && tensor.is_cpu() && tensor.sizes().vec() == sizes,
+        "polar_sample: wrong type, device or shape of affine or offsets");
+    return torch::stable::contiguous(tensor);
   };
-  if (affine_.has_value()) {
-    affine = laid_out(*affine_, {batch, 2, 2});
+  if (given.affine.has_value()) {
+    affine = laid_out(*given.affine, {batch, 2, 2});
     args.affine = affine->template const_data_ptr<T>();
     args.affine_stride = affine->size(0) == 1 ? 0 : 4;
   }
-  if (offsets_.has_value()) {
-    offsets = laid_out(*offsets_, {batch, 2, radii.size(1), azimuths.size(0)});
+  if (given.offsets.has_value()) {
+    offsets = laid_out(*given.offsets, {batch, 2, radii.size(1), azimuths.size(0)});
     args.offsets = offsets->template const_data_ptr<T>();
     args.offsets_end = args.offsets + offsets->numel();
     args.offsets_stride = offsets->size(0) == 1 ? 0 : 2 * radii.size(1) * azimuths.size(0);
   }
-  STD_TORCH_CHECK(!jitter.has_value() || seed.has_value(), "polar_sample: jitter needs a seed");
-  STD_TORCH_CHECK(type == ScalarType::Float || !bfloat16,
+  STD_TORCH_CHECK(!given.jitter.has_value() || given.seed.has_value(),
+                  "polar_sample: jitter needs a seed");
+  STD_TORCH_CHECK(type == ScalarType::Float || !given.bfloat16,
                   "polar_sample: samples of a float64 image are not rounded to bfloat16");
 
   args.image = image.const_data_ptr();
@@ -85,28 +83,29 @@ PolarCall<T>::PolarCall(const Tensor& image_, const Tensor& radii_, const Tensor
   args.center = center.template const_data_ptr<T>();
   args.center_stride = center.size(0) == 1 ? 0 : 2;
   args.num_azimuths = azimuths.size(0);
-  args.patch_radii = patch[0];
-  args.patch_azimuths = patch[1];
-  args.narrow = bfloat16;
-  if (jitter.has_value()) {
-    STD_TORCH_CHECK(
-        jitter->is_cpu() && jitter->numel() == 1 && jitter->scalar_type() == ScalarType::Double,
-        "polar_sample: jitter must be one float64 on the CPU");
-    args.jitter = *jitter->const_data_ptr<double>();
+  args.samples_r = samples[0];
+  args.samples_a = samples[1];
+  args.narrow = given.bfloat16;
+  if (given.jitter.has_value()) {
+    STD_TORCH_CHECK(given.jitter->is_cpu() && given.jitter->numel() == 1 &&
+                        given.jitter->scalar_type() == ScalarType::Double,
+                    "polar_sample: jitter must be one float64 on the CPU");
+    args.jitter = *given.jitter->const_data_ptr<double>();
     STD_TORCH_CHECK(args.jitter >= 0 && args.jitter <= 1, "polar_sample: jitter must be in [0, 1]");
   }
-  if (seed.has_value()) {
-    STD_TORCH_CHECK(seed->is_cpu() && seed->numel() == 1 && seed->scalar_type() == ScalarType::Long,
+  if (given.seed.has_value()) {
+    STD_TORCH_CHECK(given.seed->is_cpu() && given.seed->numel() == 1 &&
+                        given.seed->scalar_type() == ScalarType::Long,
                     "polar_sample: seed must be one int64 on the CPU");
-    args.seed = static_cast<uint64_t>(*seed->const_data_ptr<int64_t>());
+    args.seed = static_cast<uint64_t>(*given.seed->const_data_ptr<int64_t>());
   }
   if (args.pixel == Pixel::u8) {
     const size_t channels = static_cast<size_t>(args.channels);
-    STD_TORCH_CHECK(mean.size() == channels && std.size() == channels,
+    STD_TORCH_CHECK(given.mean.size() == channels && given.std.size() == channels,
                     "polar_sample: uint8 pixels need a mean and a std for each channel");
     for (size_t c = 0; c < channels; ++c) {
-      scale.push_back(static_cast<T>(1 / (255 * std[c])));
-      offset.push_back(static_cast<T>(-mean[c] / std[c]));
+      scale.push_back(static_cast<T>(1 / (255 * given.std[c])));
+      offset.push_back(static_cast<T>(-given.mean[c] / given.std[c]));
     }
     args.pixel_scale = scale.data();
     args.pixel_offset = offset.data();
@@ -118,10 +117,10 @@ PolarCall<T>::PolarCall(const Tensor& image_, const Tensor& radii_, const Tensor
   const T* angles = azimuths.template const_data_ptr<T>();
   for (int64_t j = 0; j < args.num_azimuths; ++j) directions[j] = angles[j];
   double* cosines = directions.data() + padded;
-  kernels().table<T>().directions(directions.data(), padded, cosines, cosines + padded);
+  kernels<PolarSampleKernels<T>>().directions(directions.data(), padded, cosines, cosines + padded);
   args.cosines = cosines;
   args.sines = cosines + padded;
-  args.directions_known =
+  args.directions_finite =
       std::all_of(cosines, cosines + args.num_azimuths, [](double x) { return x == x; });
 
   const double pixels = static_cast<double>(args.height) * static_cast<double>(args.width);
@@ -149,7 +148,7 @@ template <typename T>
 Tensor new_image_gradient(PolarCall<T>& call) {
   PolarSampleArgs<T>& args = call.args;
   STD_TORCH_CHECK(args.pixel != Pixel::u8, "polar_sample: uint8 pixels have no gradient");
-  // Sums of bfloat16 pixels are kept packed whatever the size, and found by 32-bit places.
+  // Sums of bfloat16 pixels are kept packed whatever the size, and indexed with 32 bits.
   STD_TORCH_CHECK(args.pixel != Pixel::bf16 || call.packed_values() < 2147483648.0,
                   "polar_sample_backward: too large an image for a bfloat16 gradient");
   // Where there are points the kernels write every pixel.
@@ -206,18 +205,17 @@ template <typename T>
 PolarGradients polar_backward(PolarCall<T>& call, const PolarWanted& wanted) {
   PolarSampleArgs<T>& args = call.args;
   const int64_t images = call.sampled_images();
-  const auto& kernel = kernels().table<T>();
+  const auto& kernel = kernels<PolarSampleKernels<T>>();
 
   PolarGradients grads(call);
   if (wanted.image) {
     grads.image = new_image_gradient(call);
     args.bands = count_bands(call);
     if (images > 0 && grads.image.numel() > 0) {
-      parallel_ranges(images * args.bands,
-                      kernel.polar_sample_scratch(args, PolarPass::backward_image),
-                      [&](int64_t begin, int64_t end, void* scratch) {
-                        kernel.polar_sample_backward_image(args, begin, end, scratch);
-                      });
+      const int64_t bytes = kernel.scratch(args, PolarPass::backward_image);
+      parallel_ranges(images * args.bands, [&](int64_t begin, int64_t end) {
+        kernel.backward_image(args, begin, end, Scratch(bytes).get());
+      });
     }
   }
   if (!wanted.lens && !wanted.offsets) return grads;
@@ -236,22 +234,22 @@ PolarGradients polar_backward(PolarCall<T>& call, const PolarWanted& wanted) {
     }
     return grads;
   }
-  // Images that share their offsets add to one gradient: for a ring of it one thread takes them in
-  // turn.
+  // Images that share their offsets add to one gradient, so one thread takes a ring of all images,
+  // one after another.
   const int64_t sharing = offsets && args.offsets_stride == 0 ? call.batch : 1;
   std::vector<double> sums(call.batch * args.num_radii * kLensSums, 0.0);
   args.grad_lens = sums.data();
   const int64_t rings = call.rings();
-  parallel_ranges(images * rings / sharing,
-                  kernel.polar_sample_scratch(args, PolarPass::backward_lens),
-                  [&](int64_t begin, int64_t end, void* scratch) {
-                    for (int64_t item = begin; item < end; ++item) {
-                      for (int64_t b = 0; b < sharing; ++b) {
-                        kernel.polar_sample_backward_lens(args, item + b * rings,
-                                                          item + b * rings + 1, scratch);
-                      }
-                    }
-                  });
+  const int64_t bytes = kernel.scratch(args, PolarPass::backward_lens);
+  parallel_ranges(images * rings / sharing, [&](int64_t begin, int64_t end) {
+    const Scratch scratch(bytes);
+    for (int64_t item = begin; item < end; ++item) {
+      for (int64_t b = 0; b < sharing; ++b) {
+        const int64_t of_image = item + b * rings;
+        kernel.backward_lens(args, of_image, of_image + 1, scratch.get());
+      }
+    }
+  });
   if (wanted.lens) fold_lens(call, sums, grads);
   return grads;
 }

@@ -1,5 +1,5 @@
-// What a call of polar_sample or polar_embed brings, checked and laid out as the kernels want it.
-// The checks only keep memory safe; darswin/ops explains wrong arguments.
+// A call of polar_sample or polar_embed, checked and laid out as the kernels take it. The checks
+// only keep memory safe; darswin/ops explains wrong arguments.
 #pragma once
 
 #include <torch/csrc/stable/ops.h>
@@ -11,14 +11,14 @@
 #include <tuple>
 #include <vector>
 
-#include "dispatch.h"
+#include "polar.h"
 
 namespace darswin {
 
 using Sizes = std::vector<int64_t>;
 
-// A packed copy of this many bytes stays in the second-level cache, as its points walk around the
-// circle; it pays where a pixel is looked at often enough.
+// An image is packed if its copy takes at most this many bytes, which stay in the second-level
+// cache, and if it has at most this many pixels a point.
 constexpr int64_t kPackedBytes = 3 << 19;
 constexpr int64_t kPackedPixelsPerPoint = 4;
 // Sums of bfloat16 pixels are float32, of four channels: no thread keeps more of them than this.
@@ -40,11 +40,38 @@ inline Pixel pixel_type(const torch::stable::Tensor& image) {
   }
 }
 
-// RuntimeError unless the product of sizes, none negative and zeros left out, fits 64 bits, and 64
-// times it as well.
+// RuntimeError unless 64 times the product of the sizes that are not 0 fits 64 bits. No size is
+// negative.
 void check_product(std::initializer_list<int64_t> sizes);
 
-// The tensors of one call. Owns what `args` points into.
+// The arguments that polar_sample and polar_embed share, in the order of their schemas.
+struct Sampling {
+  torch::stable::Tensor image, radii, azimuths, center;
+  std::optional<torch::stable::Tensor> affine, offsets, jitter, seed;
+  Sizes samples;  // (S_r, S_phi)
+  std::vector<double> mean, std;
+  bool bfloat16;  // the type of the output
+};
+
+// Listed<run>::call is run(Sampling, others...) as the dispatcher calls it, argument by argument.
+template <auto run>
+struct Listed;
+template <typename Result, typename... Others, Result (*run)(const Sampling&, Others...)>
+struct Listed<run> {
+  using Tensor = torch::stable::Tensor;
+
+  static Result call(Tensor image, Tensor radii, Tensor azimuths, Tensor center,
+                     std::optional<Tensor> affine, std::optional<Tensor> offsets,
+                     std::optional<Tensor> jitter, std::optional<Tensor> seed, Sizes samples,
+                     std::vector<double> mean, std::vector<double> std, bool bfloat16,
+                     Others... others) {
+    return run({image, radii, azimuths, center, affine, offsets, jitter, seed, samples, mean, std,
+                bfloat16},
+               others...);
+  }
+};
+
+// One call's arguments as the kernels take them. Owns what `args` points into.
 template <typename T>
 struct PolarCall {
   torch::stable::Tensor image, radii, center;
@@ -54,17 +81,11 @@ struct PolarCall {
   PolarSampleArgs<T> args{};
   int64_t batch;
 
-  PolarCall(const torch::stable::Tensor& image, const torch::stable::Tensor& radii,
-            const torch::stable::Tensor& azimuths, const torch::stable::Tensor& center,
-            const std::optional<torch::stable::Tensor>& affine,
-            const std::optional<torch::stable::Tensor>& offsets, const Sizes& patch,
-            const std::optional<torch::stable::Tensor>& jitter,
-            const std::optional<torch::stable::Tensor>& seed, const std::vector<double>& mean,
-            const std::vector<double>& std, bool bfloat16);
+  explicit PolarCall(const Sampling& given);
 
-  int64_t rings() const { return args.num_radii / args.patch_radii; }
-  int64_t sectors() const { return args.num_azimuths / args.patch_azimuths; }
-  int64_t samples() const { return args.patch_radii * args.patch_azimuths * args.channels; }
+  int64_t rings() const { return args.num_radii / args.samples_r; }
+  int64_t sectors() const { return args.num_azimuths / args.samples_a; }
+  int64_t token_size() const { return args.samples_r * args.samples_a * args.channels; }
   torch::headeronly::ScalarType output_type() const {
     return args.narrow ? torch::headeronly::ScalarType::BFloat16 : radii.scalar_type();
   }
@@ -113,20 +134,9 @@ PolarGradients polar_backward(PolarCall<T>& call, const PolarWanted& wanted);
 
 // Calls run(call) with a call of the image's type.
 template <typename Run>
-auto with_polar_call(const torch::stable::Tensor& image, const torch::stable::Tensor& radii,
-                     const torch::stable::Tensor& azimuths, const torch::stable::Tensor& center,
-                     const std::optional<torch::stable::Tensor>& affine,
-                     const std::optional<torch::stable::Tensor>& offsets, const Sizes& patch,
-                     const std::optional<torch::stable::Tensor>& jitter,
-                     const std::optional<torch::stable::Tensor>& seed,
-                     const std::vector<double>& mean, const std::vector<double>& std, bool bfloat16,
-                     Run run) {
-  if (pixel_type(image) == Pixel::f64) {
-    return run(PolarCall<double>(image, radii, azimuths, center, affine, offsets, patch, jitter,
-                                 seed, mean, std, bfloat16));
-  }
-  return run(PolarCall<float>(image, radii, azimuths, center, affine, offsets, patch, jitter, seed,
-                              mean, std, bfloat16));
+auto with_polar_call(const Sampling& given, Run run) {
+  if (pixel_type(given.image) == Pixel::f64) return run(PolarCall<double>(given));
+  return run(PolarCall<float>(given));
 }
 
 extern template struct PolarCall<float>;

@@ -6,6 +6,7 @@
 #include <tuple>
 #include <vector>
 
+#include "dispatch.h"
 #include "parallel.h"
 #include "polar_call.h"
 
@@ -25,7 +26,7 @@ Tensor parameter(const PolarCall<T>& call, const Tensor& value) {
 
 template <typename T>
 void check_weight(const PolarCall<T>& call, const Tensor& weight) {
-  STD_TORCH_CHECK(weight.dim() == 2 && weight.size(1) == call.samples(),
+  STD_TORCH_CHECK(weight.dim() == 2 && weight.size(1) == call.token_size(),
                   "polar_embed: weight does not fit the samples of a token");
 }
 
@@ -38,7 +39,7 @@ template <typename T>
 Tensor forward(PolarCall<T>&& call, const Tensor& weight_, const std::optional<Tensor>& bias_) {
   check_weight(call, weight_);
   const Tensor weight = parameter(call, weight_);
-  const auto& kernel = kernels().table<T>();
+  const auto& kernel = kernels<PolarEmbedKernels<T>>();
   PolarSampleArgs<T>& args = call.args;
   args.tokens = true;
   PolarEmbedArgs<T> embed{};
@@ -54,19 +55,18 @@ Tensor forward(PolarCall<T>&& call, const Tensor& weight_, const std::optional<T
   if (out.numel() == 0) return out;
   args.out = out.mutable_data_ptr();
   const int64_t wide = padded(embed.features);
-  std::vector<T> transposed(call.samples() * wide);
-  kernel.transpose(weight.template const_data_ptr<T>(), embed.features, call.samples(),
+  std::vector<T> transposed(call.token_size() * wide);
+  kernel.transpose(weight.template const_data_ptr<T>(), embed.features, call.token_size(),
                    transposed.data(), wide);
   embed.transposed = transposed.data();
-  parallel_ranges(call.batch * call.rings(),
-                  kernel.polar_embed_scratch(args, embed, PolarPass::forward),
-                  [&](int64_t begin, int64_t end, void* scratch) {
-                    kernel.polar_embed(args, embed, begin, end, scratch);
-                  });
+  const int64_t bytes = kernel.scratch(args, embed, PolarPass::forward);
+  parallel_ranges(call.batch * call.rings(), [&](int64_t begin, int64_t end) {
+    kernel.forward(args, embed, begin, end, Scratch(bytes).get());
+  });
   return out;
 }
 
-// Tokens whose products are added up one by one. Longer sums are made of these, since the rounding
+// How many tokens are summed one by one. Longer sums add up such partial sums, since the rounding
 // of a sum grows with its length.
 constexpr int64_t kRunTokens = 1024;
 
@@ -75,47 +75,48 @@ constexpr int64_t kRunTokens = 1024;
 template <typename T>
 void add_weight_gradient(const PolarCall<T>& call, const PolarEmbedArgs<T>& embed, int64_t begin,
                          int64_t end, T* weight, double* bias, void* scratch) {
-  const auto& kernel = kernels().table<T>();
+  const auto& kernel = kernels<PolarEmbedKernels<T>>();
   const int64_t run = std::max<int64_t>(1, kRunTokens / call.sectors());
   if (end - begin <= run) {
-    kernel.polar_embed_backward_weight(call.args, embed, begin, end, weight, bias, scratch);
+    kernel.backward_weight(call.args, embed, begin, end, weight, bias, scratch);
     return;
   }
-  std::vector<T> part(embed.features * padded(call.samples()));
+  std::vector<T> part(embed.features * padded(call.token_size()));
   for (int64_t first = begin; first < end; first += run) {
     std::fill(part.begin(), part.end(), T(0));
     const int64_t last = std::min(first + run, end);
-    kernel.polar_embed_backward_weight(call.args, embed, first, last, part.data(), bias, scratch);
+    kernel.backward_weight(call.args, embed, first, last, part.data(), bias, scratch);
     for (size_t k = 0; k < part.size(); ++k) weight[k] += part[k];
   }
 }
 
-// Gradients of weight and bias: sums of chunks, as many as there are whatever the threads, added up
-// in their order.
+// Gradients of weight and bias. Each chunk of items has sums of its own, which are then added up in
+// order. The number of chunks does not depend on that of the threads, so the result does not
+// either.
 template <typename T>
 std::tuple<Tensor, Tensor> weight_gradients(const PolarCall<T>& call,
                                             const PolarEmbedArgs<T>& embed) {
-  const int64_t depth = call.samples(), row = padded(depth), features = embed.features;
+  const int64_t depth = call.token_size(), row = padded(depth), features = embed.features;
   const int64_t items = call.points() ? call.batch * call.rings() : 0;
   const int64_t chunks = std::min<int64_t>(items, 16);
   std::vector<T> weights(chunks * features * row, T(0));
   std::vector<double> biases(chunks * features, 0.0);
-  if (chunks > 0) {
-    parallel_ranges(
-        chunks, kernels().table<T>().polar_embed_scratch(call.args, embed, PolarPass::forward),
-        [&](int64_t begin, int64_t end, void* scratch) {
-          for (int64_t chunk = begin; chunk < end; ++chunk) {
-            add_weight_gradient(call, embed, items * chunk / chunks, items * (chunk + 1) / chunks,
-                                weights.data() + chunk * features * row,
-                                biases.data() + chunk * features, scratch);
-          }
-        });
-  }
+  const int64_t bytes =
+      chunks > 0 ? kernels<PolarEmbedKernels<T>>().scratch(call.args, embed, PolarPass::forward)
+                 : 0;
+  parallel_ranges(chunks, [&](int64_t begin, int64_t end) {
+    const Scratch scratch(bytes);
+    for (int64_t chunk = begin; chunk < end; ++chunk) {
+      add_weight_gradient(call, embed, items * chunk / chunks, items * (chunk + 1) / chunks,
+                          weights.data() + chunk * features * row, biases.data() + chunk * features,
+                          scratch.get());
+    }
+  });
   const Tensor weight = torch::stable::new_empty(call.radii, Sizes{features, depth});
   const Tensor bias = torch::stable::new_empty(call.radii, Sizes{features});
   T *to_weight = weight.template mutable_data_ptr<T>(),
     *to_bias = bias.template mutable_data_ptr<T>();
-  parallel_ranges(features, 0, [&](int64_t begin, int64_t end, void*) {
+  parallel_ranges(features, [&](int64_t begin, int64_t end) {
     for (int64_t f = begin; f < end; ++f) {
       double sum = 0;
       for (int64_t k = 0; k < depth; ++k) to_weight[f * depth + k] = 0;
@@ -134,8 +135,8 @@ std::tuple<Tensor, Tensor> weight_gradients(const PolarCall<T>& call,
 template <typename T>
 PolarGradients sampling_gradients(PolarCall<T>& call, PolarEmbedArgs<T>& embed,
                                   const Tensor& weight, const PolarWanted& wanted) {
-  const auto& kernel = kernels().table<T>();
-  const int64_t depth = call.samples(), row = padded(depth);
+  const auto& kernel = kernels<PolarEmbedKernels<T>>();
+  const int64_t depth = call.token_size(), row = padded(depth);
   const int64_t images = call.sampled_images();
   std::vector<T> rows(images > 0 ? embed.features * row : 0, T(0));
   const T* from = weight.template const_data_ptr<T>();
@@ -149,22 +150,20 @@ PolarGradients sampling_gradients(PolarCall<T>& call, PolarEmbedArgs<T>& embed,
     grads.image = new_image_gradient(call);
     call.args.bands = 1;
     if (images > 0 && grads.image.numel() > 0) {
-      parallel_ranges(images,
-                      kernel.polar_embed_scratch(call.args, embed, PolarPass::backward_image),
-                      [&](int64_t begin, int64_t end, void* scratch) {
-                        kernel.polar_embed_backward_image(call.args, embed, begin, end, scratch);
-                      });
+      const int64_t bytes = kernel.scratch(call.args, embed, PolarPass::backward_image);
+      parallel_ranges(images, [&](int64_t begin, int64_t end) {
+        kernel.backward_image(call.args, embed, begin, end, Scratch(bytes).get());
+      });
     }
     return grads;
   }
   const Tensor grad_samples = torch::stable::new_empty(call.radii, output_sizes(call, depth));
   embed.grad_samples = grad_samples.template mutable_data_ptr<T>();
   if (images > 0) {
-    parallel_ranges(images * call.rings(),
-                    kernel.polar_embed_scratch(call.args, embed, PolarPass::backward_samples),
-                    [&](int64_t begin, int64_t end, void* scratch) {
-                      kernel.polar_embed_backward_samples(call.args, embed, begin, end, scratch);
-                    });
+    const int64_t bytes = kernel.scratch(call.args, embed, PolarPass::backward_samples);
+    parallel_ranges(images * call.rings(), [&](int64_t begin, int64_t end) {
+      kernel.backward_samples(call.args, embed, begin, end, Scratch(bytes).get());
+    });
   }
   call.args.grad_out = embed.grad_samples;
   call.args.narrow = false;
@@ -197,34 +196,24 @@ auto backward(PolarCall<T>&& call, const Tensor& grad_out_, const Tensor& weight
   return std::tuple_cat(grads.tuple(), std::tuple(grad_weight, grad_bias));
 }
 
-Tensor polar_embed(const Tensor& image, const Tensor& radii, const Tensor& azimuths,
-                   const Tensor& center, std::optional<Tensor> affine,
-                   std::optional<Tensor> offsets, const Tensor& weight, std::optional<Tensor> bias,
-                   Sizes patch, std::optional<Tensor> jitter, std::optional<Tensor> seed,
-                   std::vector<double> mean, std::vector<double> std, bool bfloat16) {
-  return with_polar_call(image, radii, azimuths, center, affine, offsets, patch, jitter, seed, mean,
-                         std, bfloat16,
+Tensor polar_embed(const Sampling& sampling, const Tensor& weight, std::optional<Tensor> bias) {
+  return with_polar_call(sampling,
                          [&](auto&& call) { return forward(std::move(call), weight, bias); });
 }
 
-auto polar_embed_backward(const Tensor& grad_out, const Tensor& image, const Tensor& radii,
-                          const Tensor& azimuths, const Tensor& center,
-                          std::optional<Tensor> affine, std::optional<Tensor> offsets,
-                          const Tensor& weight, Sizes patch, std::optional<Tensor> jitter,
-                          std::optional<Tensor> seed, std::vector<double> mean,
-                          std::vector<double> std, bool bfloat16, bool image_grad, bool lens_grad,
-                          bool offsets_grad, bool weight_grad) {
-  return with_polar_call(image, radii, azimuths, center, affine, offsets, patch, jitter, seed, mean,
-                         std, bfloat16, [&](auto&& call) {
-                           return backward(std::move(call), grad_out, weight,
-                                           {image_grad, lens_grad, offsets_grad}, weight_grad);
-                         });
+auto polar_embed_backward(const Sampling& sampling, const Tensor& weight, const Tensor& grad_out,
+                          bool image_grad, bool lens_grad, bool offsets_grad, bool weight_grad) {
+  return with_polar_call(sampling, [&](auto&& call) {
+    return backward(std::move(call), grad_out, weight, {image_grad, lens_grad, offsets_grad},
+                    weight_grad);
+  });
 }
 
 }  // namespace
 }  // namespace darswin
 
 STABLE_TORCH_LIBRARY_IMPL(darswin, CPU, m) {
-  m.impl("polar_embed", TORCH_BOX(&darswin::polar_embed));
-  m.impl("polar_embed_backward", TORCH_BOX(&darswin::polar_embed_backward));
+  using namespace darswin;
+  m.impl("polar_embed", TORCH_BOX(&Listed<polar_embed>::call));
+  m.impl("polar_embed_backward", TORCH_BOX(&Listed<polar_embed_backward>::call));
 }

@@ -6,6 +6,7 @@
 #include <tuple>
 #include <vector>
 
+#include "dispatch.h"
 #include "parallel.h"
 #include "polar_call.h"
 
@@ -18,7 +19,7 @@ template <typename T>
 Sizes output_sizes(const PolarCall<T>& call) {
   const PolarSampleArgs<T>& args = call.args;
   if (!args.tokens) return {call.batch, args.channels, args.num_radii, args.num_azimuths};
-  return {call.batch, call.rings(), call.sectors(), call.samples()};
+  return {call.batch, call.rings(), call.sectors(), call.token_size()};
 }
 
 int64_t largest_divisor(int64_t number, int64_t most) {
@@ -27,15 +28,15 @@ int64_t largest_divisor(int64_t number, int64_t most) {
   return divisor;
 }
 
-// An image has no tokens, so what the kernels have in hand at a time is free: near, one radius,
-// whose samples stay in the nearest cache; far, tokens that are about square, whose points share
+// An image has no tokens, so the driver chooses what the kernels take for one: near, one radius,
+// whose samples stay in the nearest cache; far, pieces that are about square, whose points share
 // pixels.
 template <typename T>
-void choose_patch(PolarSampleArgs<T>& args) {
+void choose_samples(PolarSampleArgs<T>& args) {
   constexpr int64_t kSide = 16;
   const bool near = args.packed;
-  args.patch_radii = near ? 1 : largest_divisor(args.num_radii, kSide);
-  args.patch_azimuths =
+  args.samples_r = near ? 1 : largest_divisor(args.num_radii, kSide);
+  args.samples_a =
       near ? std::max<int64_t>(args.num_azimuths, 1) : largest_divisor(args.num_azimuths, kSide);
 }
 
@@ -43,16 +44,16 @@ template <typename T>
 Tensor forward(PolarCall<T>&& call, bool tokens) {
   PolarSampleArgs<T>& args = call.args;
   args.tokens = tokens;
-  if (!tokens) choose_patch(args);
+  if (!tokens) choose_samples(args);
   const Tensor out = torch::stable::new_empty(call.radii, output_sizes(call), call.output_type());
   if (out.numel() == 0) return out;
   ask_for_large_pages(out);
   args.out = out.mutable_data_ptr();
-  const auto& kernel = kernels().table<T>();
-  parallel_ranges(call.batch * call.rings(), kernel.polar_sample_scratch(args, PolarPass::forward),
-                  [&](int64_t begin, int64_t end, void* scratch) {
-                    kernel.polar_sample(args, begin, end, scratch);
-                  });
+  const auto& kernel = kernels<PolarSampleKernels<T>>();
+  const int64_t bytes = kernel.scratch(args, PolarPass::forward);
+  parallel_ranges(call.batch * call.rings(), [&](int64_t begin, int64_t end) {
+    kernel.forward(args, begin, end, Scratch(bytes).get());
+  });
   return out;
 }
 
@@ -61,7 +62,7 @@ auto backward(PolarCall<T>&& call, const Tensor& grad_out_, bool tokens,
               const PolarWanted& wanted) {
   PolarSampleArgs<T>& args = call.args;
   args.tokens = tokens;
-  if (!tokens) choose_patch(args);
+  if (!tokens) choose_samples(args);
   // Gradients arrive expanded or strided: `.sum().backward()` gives stride 0.
   const Tensor grad_out = torch::stable::contiguous(grad_out_);
   STD_TORCH_CHECK(
@@ -71,33 +72,22 @@ auto backward(PolarCall<T>&& call, const Tensor& grad_out_, bool tokens,
   return polar_backward(call, wanted).tuple();
 }
 
-Tensor polar_sample(const Tensor& image, const Tensor& radii, const Tensor& azimuths,
-                    const Tensor& center, std::optional<Tensor> affine,
-                    std::optional<Tensor> offsets, Sizes patch, std::optional<Tensor> jitter,
-                    std::optional<Tensor> seed, std::vector<double> mean, std::vector<double> std,
-                    bool tokens, bool bfloat16) {
-  return with_polar_call(image, radii, azimuths, center, affine, offsets, patch, jitter, seed, mean,
-                         std, bfloat16,
-                         [&](auto&& call) { return forward(std::move(call), tokens); });
+Tensor polar_sample(const Sampling& sampling, bool tokens) {
+  return with_polar_call(sampling, [&](auto&& call) { return forward(std::move(call), tokens); });
 }
 
-auto polar_sample_backward(const Tensor& grad_out, const Tensor& image, const Tensor& radii,
-                           const Tensor& azimuths, const Tensor& center,
-                           std::optional<Tensor> affine, std::optional<Tensor> offsets, Sizes patch,
-                           std::optional<Tensor> jitter, std::optional<Tensor> seed,
-                           std::vector<double> mean, std::vector<double> std, bool tokens,
-                           bool bfloat16, bool image_grad, bool lens_grad, bool offsets_grad) {
-  return with_polar_call(image, radii, azimuths, center, affine, offsets, patch, jitter, seed, mean,
-                         std, bfloat16, [&](auto&& call) {
-                           return backward(std::move(call), grad_out, tokens,
-                                           {image_grad, lens_grad, offsets_grad});
-                         });
+auto polar_sample_backward(const Sampling& sampling, bool tokens, const Tensor& grad_out,
+                           bool image_grad, bool lens_grad, bool offsets_grad) {
+  return with_polar_call(sampling, [&](auto&& call) {
+    return backward(std::move(call), grad_out, tokens, {image_grad, lens_grad, offsets_grad});
+  });
 }
 
 }  // namespace
 }  // namespace darswin
 
 STABLE_TORCH_LIBRARY_IMPL(darswin, CPU, m) {
-  m.impl("polar_sample", TORCH_BOX(&darswin::polar_sample));
-  m.impl("polar_sample_backward", TORCH_BOX(&darswin::polar_sample_backward));
+  using namespace darswin;
+  m.impl("polar_sample", TORCH_BOX(&Listed<polar_sample>::call));
+  m.impl("polar_sample_backward", TORCH_BOX(&Listed<polar_sample_backward>::call));
 }

@@ -1,4 +1,6 @@
-// transpose_sum on CPU: check, allocate, thread, call the kernel.
+// _transpose_sum on CPU: check, allocate, thread, call the kernel.
+#include "transpose_sum.h"
+
 #include <torch/csrc/stable/library.h>
 #include <torch/csrc/stable/ops.h>
 #include <torch/csrc/stable/tensor.h>
@@ -25,19 +27,21 @@ std::tuple<Tensor, Tensor> transpose_sum(const Tensor& x) {
     return {torch::stable::new_empty(x, std::vector<int64_t>{columns, rows}),
             torch::stable::new_zeros(x, std::vector<int64_t>{columns})};
   }
-  const int64_t groups = (rows + kTransposedRows - 1) / kTransposedRows;
+  const int64_t groups = (rows + kGroupRows - 1) / kGroupRows;
   const Tensor transposed = torch::stable::new_empty(x, std::vector<int64_t>{columns, rows});
   const Tensor sum = torch::stable::new_empty(x, std::vector<int64_t>{columns});
   const Scratch memory(groups * columns * sizeof(float));
   auto* sums = static_cast<float*>(memory.get());
-  const TransposeSumArgs args{static_cast<const float*>(x.const_data_ptr()),
-                              static_cast<float*>(transposed.mutable_data_ptr()), sums, rows,
-                              columns};
-  parallel_ranges(groups, 0, [&](int64_t begin, int64_t end, void*) {
-    kernels().transpose_sum(args, begin, end);
+  const TransposeSumArgs args{.from = static_cast<const float*>(x.const_data_ptr()),
+                              .to = static_cast<float*>(transposed.mutable_data_ptr()),
+                              .sums = sums,
+                              .rows = rows,
+                              .columns = columns};
+  parallel_ranges(groups, [&](int64_t begin, int64_t end) {
+    kernels<TransposeSumKernels>().groups(args, begin, end);
   });
-  // Group after group, whichever thread made it; in double, since there may be many thousands. Some
-  // columns at a time, whose totals stay in the nearest cache.
+  // Adds up the groups in order, whichever thread made them; in double, since there may be many
+  // thousands. Some columns at a time, whose totals stay in the nearest cache.
   constexpr int64_t kColumns = 128;
   auto* to = static_cast<float*>(sum.mutable_data_ptr());
   for (int64_t first = 0; first < columns; first += kColumns) {
@@ -56,5 +60,5 @@ std::tuple<Tensor, Tensor> transpose_sum(const Tensor& x) {
 }  // namespace darswin
 
 STABLE_TORCH_LIBRARY_IMPL(darswin, CPU, m) {
-  m.impl("transpose_sum", TORCH_BOX(&darswin::transpose_sum));
+  m.impl("_transpose_sum", TORCH_BOX(&darswin::transpose_sum));
 }

@@ -1,5 +1,7 @@
 // window_attention and its backward on CPU: check, allocate, thread, call the kernel.
 // The checks here only keep memory safe; darswin/ops/window_attention.py explains wrong arguments.
+#include "window_attention.h"
+
 #include <torch/csrc/stable/library.h>
 #include <torch/csrc/stable/ops.h>
 #include <torch/csrc/stable/tensor.h>
@@ -73,9 +75,9 @@ struct Call {
   // Runs `kernel` over `items` work items, each thread with its own scratch.
   template <typename Kernel>
   void run(int64_t items, Kernel kernel) {
+    const int64_t bytes = kernels<WindowAttentionKernels<T>>().scratch(args);
     parallel_ranges(
-        items, kernels().attention<T>().scratch(args),
-        [&](int64_t begin, int64_t end, void* scratch) { kernel(args, begin, end, scratch); });
+        items, [&](int64_t begin, int64_t end) { kernel(args, begin, end, Scratch(bytes).get()); });
   }
 };
 
@@ -87,12 +89,13 @@ Tensor forward(Call<T>&& call) {
   if (out.numel() == 0) return out;
   ask_for_large_pages(out);
   args.out = static_cast<T*>(out.mutable_data_ptr());
-  call.run(args.windows * args.heads, kernels().attention<T>().forward);
+  call.run(args.windows * args.heads, kernels<WindowAttentionKernels<T>>().forward);
   return out;
 }
 
-// Windows that share one row of bias gradients: few rows to fold, yet equal work for many threads.
-// Their number must not depend on that of the threads, or the sums would.
+// How many windows share one row of bias gradients: many, so that few rows are left to add up, but
+// not so many that threads get unequal work. It must not depend on the number of threads, or the
+// sums would.
 template <typename T>
 int64_t chunk_size(const WindowAttentionArgs<T>& args) {
   const int64_t most = std::clamp<int64_t>(args.windows * args.heads / 32, 1, 16);
@@ -119,7 +122,7 @@ std::tuple<Tensor, Tensor> backward(Call<T>&& call, const Tensor& grad_out_) {
   args.grad_out = static_cast<const T*>(grad_out.const_data_ptr());
   args.grad_qkv = static_cast<T*>(grad_qkv.mutable_data_ptr());
   args.grad_bias = rows.data();
-  call.run(chunks * args.bias_rows * args.heads, kernels().attention<T>().backward);
+  call.run(chunks * args.bias_rows * args.heads, kernels<WindowAttentionKernels<T>>().backward);
 
   auto* sums = static_cast<Arithmetic<T>*>(grad_bias.mutable_data_ptr());
   for (int64_t chunk = 1; chunk < chunks; ++chunk) {
@@ -151,9 +154,9 @@ Tensor window_attention(const Tensor& qkv, const Tensor& bias, Sizes window, Siz
                    periodic, scale);
 }
 
-std::tuple<Tensor, Tensor> window_attention_backward(const Tensor& grad_out, const Tensor& qkv,
-                                                     const Tensor& bias, Sizes window, Sizes shift,
-                                                     Sizes periodic, double scale) {
+std::tuple<Tensor, Tensor> window_attention_backward(const Tensor& qkv, const Tensor& bias,
+                                                     Sizes window, Sizes shift, Sizes periodic,
+                                                     double scale, const Tensor& grad_out) {
   return with_call([&](auto&& call) { return backward(std::move(call), grad_out); }, qkv, bias,
                    window, shift, periodic, scale);
 }

@@ -1,14 +1,16 @@
 // Residual and layer norm in one pass over memory, in place.
 //
 // A row holds a token's features. It is small enough for the first cache, so memory sees it once,
-// while three loops go over it: the sum with its mean, what is left of it and the squares of that,
-// and the normalized row. Taking the mean off before squaring keeps the digits that a large mean
-// would cost. What is left has a small mean of its own, the rounding of the first one, and that is
-// taken off as well. Where rows are bfloat16, it is the rounded sum that is normalized.
-#include "kernels.h"
+// while three loops go over it: they make the sum and its mean; the differences from the mean and
+// their squares; the normalized row. Taking the mean off before squaring keeps the digits that a
+// large mean would cost. The differences have a small mean of their own, the rounding of the first
+// one, and that is taken off as well. Where rows are bfloat16, it is the rounded sum that is
+// normalized.
+#include "../add_norm.h"
+
 #include "simd.h"
 
-namespace darswin::TIER {
+namespace darswin {
 namespace {
 
 constexpr int64_t kL = kLanes<float>;
@@ -106,11 +108,11 @@ void add_norm_rows(const AddNormArgs<S>& a, int64_t begin, int64_t end) {
 
 }  // namespace
 
-void add_norm(const AddNormArgs<float>& a, int64_t begin, int64_t end) {
-  add_norm_rows(a, begin, end);
-}
-void add_norm(const AddNormArgs<bfloat16>& a, int64_t begin, int64_t end) {
-  add_norm_rows(a, begin, end);
-}
+template <>
+constinit const AddNormKernels<float> Kernels<AddNormKernels<float>, Tier::TIER>::table = {
+    .rows = add_norm_rows<float>};
+template <>
+constinit const AddNormKernels<bfloat16> Kernels<AddNormKernels<bfloat16>, Tier::TIER>::table = {
+    .rows = add_norm_rows<bfloat16>};
 
-}  // namespace darswin::TIER
+}  // namespace darswin

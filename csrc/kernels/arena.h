@@ -7,9 +7,10 @@
 #  include <sanitizer/asan_interface.h>
 #endif
 
+namespace darswin {
 namespace {
 
-// Hands out pieces of a block of memory, and counts their bytes; of no block it only counts.
+// Hands out pieces of a block of memory and counts their bytes; without a block it only counts.
 struct Arena {
   char* memory;
   int64_t used = 0;
@@ -28,3 +29,4 @@ struct Arena {
 };
 
 }  // namespace
+}  // namespace darswin

@@ -1,9 +1,10 @@
-// Scalar maths for both types. Built-ins rather than <cmath>: an inline function of the standard
-// library, emitted here with AVX, could be the copy that the linker keeps for the whole program.
+// Maths for both types. Built-ins rather than <cmath>: an inline function of the standard library
+// would come out of every tier (see tier.h).
 #pragma once
 
 #include "simd.h"
 
+namespace darswin {
 namespace {
 
 // The larger one in each lane; NaN where b is NaN.
@@ -37,3 +38,4 @@ inline Vector<double, kLanes<double>> exponential_of_negative(Vector<double, kLa
 }
 
 }  // namespace
+}  // namespace darswin

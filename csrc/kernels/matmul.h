@@ -1,12 +1,13 @@
 // Products of matrices that are in cache, for linear layers that are fused with what feeds them.
 //
-// A tile of the result stays in registers while the depth runs by: each step multiplies a few whole
-// registers of b with a few single values of a. The tile is as large as the registers allow, since
-// every value that is loaded is then used often.
+// A tile of the result stays in registers while a loop runs over the depth: each step multiplies a
+// few whole registers of b with a few single values of a. The tile is as large as the registers
+// allow, so that every value is used often once it is loaded.
 #pragma once
 
 #include "simd.h"
 
+namespace darswin {
 namespace {
 
 // c[i * c_row + n] += sum over k < depth of a[i * a_row + k * a_column] * b[k * b_row + n] for rows
@@ -35,10 +36,10 @@ template <int kRows, int kWide, typename T>
 template <int kWide, typename T>
 void add_columns(int64_t rows, int64_t depth, const T* a, int64_t a_row, int64_t a_column,
                  const T* b, int64_t b_row, T* c, int64_t c_row) {
-  constexpr int kRows = kRegister == 64 ? 8 : 4;  // 24 of 32 registers, or 12 of 16
   int64_t i = 0;
-  for (; i + kRows <= rows; i += kRows) {
-    add_tile<kRows, kWide>(depth, a + i * a_row, a_row, a_column, b, b_row, c + i * c_row, c_row);
+  for (; i + kTileRows <= rows; i += kTileRows) {
+    add_tile<kTileRows, kWide>(depth, a + i * a_row, a_row, a_column, b, b_row, c + i * c_row,
+                               c_row);
   }
   for (; i < rows; ++i) {
     add_tile<1, kWide>(depth, a + i * a_row, a_row, a_column, b, b_row, c + i * c_row, c_row);
@@ -66,3 +67,4 @@ void add_product(int64_t rows, int64_t columns, int64_t depth, const T* a, int64
 }
 
 }  // namespace
+}  // namespace darswin

@@ -8,21 +8,8 @@
 
 #include "simd.h"
 
+namespace darswin {
 namespace {
-
-// Products of the lower halves of the lanes.
-inline Words lower_product(Words a, uint32_t b) {
-  const Words factor = splat<Words>(static_cast<uint64_t>(b));
-#if defined(__AVX512F__)
-  return (Words)_mm512_maskz_mul_epu32(0xFF, (__m512i)a, (__m512i)factor);
-#elif defined(__AVX2__)
-  return (Words)_mm256_mul_epu32((__m256i)a, (__m256i)factor);
-#elif defined(__SSE2__)
-  return (Words)_mm_mul_epu32((__m128i)a, (__m128i)factor);
-#else
-  return (a & 0xFFFFFFFF) * factor;
-#endif
-}
 
 // The four words for each counter, 128 bits in two parts, in the lower halves of word[0..3].
 inline void philox(uint64_t key, Words counter, uint64_t counter_upper, Words word[4]) {
@@ -46,3 +33,4 @@ inline void philox(uint64_t key, Words counter, uint64_t counter_upper, Words wo
 }
 
 }  // namespace
+}  // namespace darswin

@@ -1,18 +1,17 @@
 // The patch embedding: polar sampling and the linear layer behind it, a ring of tokens at a time.
 //
-// The samples of a ring are a matrix (A, S_r * S_phi * C) of a size that fits the second-level
-// cache. It is made, multiplied with the weight and forgotten, so samples are never written to
-// memory; backward makes it again. The gradient of the samples goes the same way, from the product
+// The samples of a ring are a matrix (A, S_r * S_phi * C) that fits the second-level cache. They
+// are made, multiplied with the weight and dropped, so that they are never written to memory;
+// backward recomputes them. The gradient of the samples goes the same way, from the product
 // straight to the pixels.
 #include "arena.h"
-#include "kernels.h"
 #include "matmul.h"
 #include "polar_rows.h"
 #include "polar_sampler.h"
 #include "polar_scatter.h"
 #include "transpose.h"
 
-namespace darswin::TIER {
+namespace darswin {
 namespace {
 
 // Scratch of one thread, part after part.
@@ -26,11 +25,11 @@ struct Scratch {
   int64_t bytes;
 
   Scratch(const PolarSampleArgs<T>& a, const PolarEmbedArgs<T>& e, PolarPass pass, void* memory)
-      : depth(a.patch_radii * a.patch_azimuths * a.channels),
+      : depth(a.samples_r * a.samples_a * a.channels),
         row(round_up(depth, kRowUnit)),
         wide(round_up(e.features, kRowUnit)) {
     Arena arena{static_cast<char*>(memory)};
-    const int64_t sectors = a.num_azimuths / a.patch_azimuths;
+    const int64_t sectors = a.num_azimuths / a.samples_a;
     sampler = arena.take<char>(pass == PolarPass::forward ? Sampler<T>::bytes(a) : 0);
     scatter = arena.take<char>(pass == PolarPass::backward_image ? Scatter<T>::bytes(a) : 0);
     samples = arena.take<T>(sectors * row + kRowUnit);
@@ -42,16 +41,17 @@ struct Scratch {
 
 template <typename T>
 int64_t sectors_of(const PolarSampleArgs<T>& a) {
-  return a.num_azimuths / a.patch_azimuths;
+  return a.num_azimuths / a.samples_a;
 }
 
 template <typename T>
 void embed(const PolarSampleArgs<T>& a, const PolarEmbedArgs<T>& e, int64_t begin, int64_t end,
            void* scratch) {
   const Scratch<T> s(a, e, PolarPass::forward, scratch);
-  const int64_t rings = a.num_radii / a.patch_radii, sectors = sectors_of(a);
-  Sampler<T> sampler(a, s.row, a.patch_azimuths * a.channels, s.sampler);
-  // Products go where they belong if rows there are whole registers of the type computed in.
+  const int64_t rings = a.num_radii / a.samples_r, sectors = sectors_of(a);
+  Sampler<T> sampler(a, s.row, a.samples_a * a.channels, s.sampler);
+  // The product is written straight into the output if rows there are whole registers of the type
+  // that is computed in.
   const bool in_place = !a.narrow && e.features == s.wide;
   for (int64_t item = begin; item < end; ++item) {
     const int64_t first = item * sectors * e.features;
@@ -95,8 +95,8 @@ template <typename T>
 void backward_weight(const PolarSampleArgs<T>& a, const PolarEmbedArgs<T>& e, int64_t begin,
                      int64_t end, T* weight, double* bias, void* scratch) {
   const Scratch<T> s(a, e, PolarPass::forward, scratch);
-  const int64_t rings = a.num_radii / a.patch_radii, sectors = sectors_of(a);
-  Sampler<T> sampler(a, s.row, a.patch_azimuths * a.channels, s.sampler);
+  const int64_t rings = a.num_radii / a.samples_r, sectors = sectors_of(a);
+  Sampler<T> sampler(a, s.row, a.samples_a * a.channels, s.sampler);
   for (int64_t item = begin; item < end; ++item) {
     const T* grads = ring_grads(a, e, item, s);
     sampler.ring(item / rings, item % rings, s.samples);
@@ -137,7 +137,7 @@ void backward_image(const PolarSampleArgs<T>& args, const PolarEmbedArgs<T>& e, 
   const Scratch<T> s(args, e, PolarPass::backward_image, scratch);
   PolarSampleArgs<T> a = args;
   a.narrow = false;  // the gradients of the samples are not
-  const int64_t rings = a.num_radii / a.patch_radii, piece = a.patch_azimuths * a.channels;
+  const int64_t rings = a.num_radii / a.samples_r, piece = a.samples_a * a.channels;
   for (int64_t b = begin; b < end; ++b) {
     Scatter<T> scatter(a, b, 0, s.scatter);
     for (int64_t ring = 0; ring < rings; ++ring) {
@@ -172,34 +172,26 @@ void transposed(const T* from, int64_t rows, int64_t columns, T* to, int64_t to_
   }
 }
 
+template <typename T>
+int64_t scratch_bytes(const PolarSampleArgs<T>& a, const PolarEmbedArgs<T>& e, PolarPass pass) {
+  return Scratch<T>(a, e, pass, nullptr).bytes;
+}
+
+template <typename T>
+constexpr PolarEmbedKernels<T> kTable = {.transpose = transposed<T>,
+                                         .scratch = scratch_bytes<T>,
+                                         .forward = embed<T>,
+                                         .backward_weight = backward_weight<T>,
+                                         .backward_samples = backward_samples<T>,
+                                         .backward_image = backward_image<T>};
+
 }  // namespace
 
-#define INSTANTIATE(T)                                                                             \
-  void transpose(const T* from, int64_t rows, int64_t columns, T* to, int64_t to_stride) {         \
-    transposed(from, rows, columns, to, to_stride);                                                \
-  }                                                                                                \
-  int64_t polar_embed_scratch(const PolarSampleArgs<T>& a, const PolarEmbedArgs<T>& e,             \
-                              PolarPass pass) {                                                    \
-    return Scratch<T>(a, e, pass, nullptr).bytes;                                                  \
-  }                                                                                                \
-  void polar_embed(const PolarSampleArgs<T>& a, const PolarEmbedArgs<T>& e, int64_t begin,         \
-                   int64_t end, void* s) {                                                         \
-    embed(a, e, begin, end, s);                                                                    \
-  }                                                                                                \
-  void polar_embed_backward_weight(const PolarSampleArgs<T>& a, const PolarEmbedArgs<T>& e,        \
-                                   int64_t begin, int64_t end, T* weight, double* bias, void* s) { \
-    backward_weight(a, e, begin, end, weight, bias, s);                                            \
-  }                                                                                                \
-  void polar_embed_backward_samples(const PolarSampleArgs<T>& a, const PolarEmbedArgs<T>& e,       \
-                                    int64_t begin, int64_t end, void* s) {                         \
-    backward_samples(a, e, begin, end, s);                                                         \
-  }                                                                                                \
-  void polar_embed_backward_image(const PolarSampleArgs<T>& a, const PolarEmbedArgs<T>& e,         \
-                                  int64_t begin, int64_t end, void* s) {                           \
-    backward_image(a, e, begin, end, s);                                                           \
-  }
-INSTANTIATE(float)
-INSTANTIATE(double)
-#undef INSTANTIATE
+template <>
+constinit const PolarEmbedKernels<float> Kernels<PolarEmbedKernels<float>, Tier::TIER>::table =
+    kTable<float>;
+template <>
+constinit const PolarEmbedKernels<double> Kernels<PolarEmbedKernels<double>, Tier::TIER>::table =
+    kTable<double>;
 
-}  // namespace darswin::TIER
+}  // namespace darswin

@@ -1,23 +1,22 @@
-// Pixels of an image, near and far.
+// Reading pixels, of near and of far images.
 //
-// Near: an image that fits the second-level cache is first copied into a packed one: channels last,
-// padded to four, so that a pixel and its right neighbour are one load; with zeros around it, so
-// that no bounds test stands in the inner loop. A point outside the image finds zeros at the lower
-// right, where the border is two pixels wide. Far: a larger image, or one that few points look at,
-// is read where it lies, with whatever strides and type it has.
+// A near image fits the second-level cache. It is first copied into a packed image: channels last
+// and padded to four, so that one load takes a pixel and its right neighbour, and with a border of
+// zeros, so that the inner loop needs no bounds test. A point outside the image reads the zeros at
+// the lower right, where the border is two pixels wide. A far image is larger, or few points look
+// at it: it is read where it lies, with whatever strides and type it has.
 #pragma once
 
 #include "polar_points.h"
 #include "transpose.h"
 
+namespace darswin {
 namespace {
-
-using darswin::Pixel;
 
 inline int64_t smaller(int64_t x, int64_t y) { return x < y ? x : y; }
 
-// An image with borders. Pixel (x, y) of the image is pixel (x + 1, y + 1) of this. Only for images
-// that are packed, or whose gradient is: the sizes of others may not fit 64 bits.
+// The layout of a packed image. Pixel (x, y) of the image is its pixel (x + 1, y + 1). Only for
+// images that are packed, or whose gradient is: the sizes of others may not fit 64 bits.
 struct Packed {
   int64_t pixel = 0, row = 0, size = 0;  // values of a pixel, of a row, of the image
 
@@ -27,8 +26,9 @@ struct Packed {
       : pixel(round_up(a.channels, 4)), row((a.width + 3) * pixel), size((a.height + 3) * row) {}
 };
 
-// Places of a block of points. `lower` and `right` say how far on the way to the lower and to the
-// right neighbour a point is. The last register of a row may reach beyond the row.
+// Where a block of points lies among the pixels. `right` and `lower` say how far a point is on the
+// way to the right and to the lower neighbour, from 0 to 1. The last register of a row may reach
+// beyond the row.
 constexpr int kPlaces = kBlock + kDoubles;
 template <typename T>
 struct Places {
@@ -44,7 +44,7 @@ struct FarPlaces : Places<T> {
   int64_t offset[kPlaces];                // its offset, or -1 where not all four are inside
 };
 
-// Whole and fractional parts of coordinates, one pixel further as in a packed image. Coordinates
+// Whole and fractional parts of coordinates, moved by one pixel as in a packed image. Coordinates
 // that touch no pixel, and NaN, become `outside`, unless all are known to be `inside`.
 template <bool inside, typename T>
 inline Doubles split(Doubles x, double size, double outside, T* fraction) {
@@ -94,13 +94,13 @@ struct PlacedPoints {
   };
   RandomWords random;
 
-  // Finds points j, j + 1, ... of radius i of image b, for places `first` on.
+  // Finds points j to j + count of radius i of image b, and stores them from place `first` on.
   void find(const PolarSampleArgs<T>& a, const Packed& packed, int64_t b, int64_t i, int64_t j,
             int64_t count, int64_t first) {
     const Reach most = reach(a, b, i);
     const T* center = a.center + b * a.center_stride;
     const auto width = static_cast<double>(a.width), height = static_cast<double>(a.height);
-    if (a.offsets == nullptr && a.directions_known && center[0] - most.x > -1 &&
+    if (a.offsets == nullptr && a.directions_finite && center[0] - most.x > -1 &&
         center[0] + most.x < width && center[1] - most.y > -1 && center[1] + most.y < height) {
       locate(a, b, i, j, count, random,
              [&](int64_t k, const Points& p) { place<true>(a, packed, p, first + k, near); });
@@ -118,17 +118,18 @@ struct PlacedPoints {
   }
 };
 
-constexpr int64_t kAhead = 40;  // how many points ahead the pixels of a far image are asked for
+constexpr int64_t kAhead = 40;  // how many points ahead a far image's pixels are prefetched
 
-// The order to visit a block of a far image in, points j to j + count of `rows` radii, whose places
-// are `columns` apart; returns their number. Token after token, and in each along the rows of the
-// image: above and below the center these follow the azimuth, on both sides of it the radius.
+// Writes the order in which to visit a block of a far image: points j to j + count of `rows` radii,
+// whose places are `columns` apart. Returns their number. The order goes token by token and, inside
+// a token, along the rows of the image: above and below the center that is along the azimuth, to
+// the left and right of it along the radius.
 template <typename T>
 int64_t far_order(const PolarSampleArgs<T>& a, int64_t j, int64_t count, int64_t rows,
                   int64_t columns, uint16_t* order) {
   int64_t visited = 0;
-  for (int64_t k = 0; k < count; k += a.patch_azimuths) {
-    const int64_t end = k + a.patch_azimuths < count ? k + a.patch_azimuths : count;
+  for (int64_t k = 0; k < count; k += a.samples_a) {
+    const int64_t end = k + a.samples_a < count ? k + a.samples_a : count;
     const double sin = a.sines[j + k], cos = a.cosines[j + k];
     if (sin * sin > cos * cos) {
       for (int64_t n = 0; n < rows; ++n) {
@@ -167,8 +168,8 @@ inline T number(E pixel) {
     return pixel;
   }
 }
-// What it stands for: as it is, or of type uint8 by its channel's scale and offset. Between pixels
-// it is the same before and after interpolation.
+// The value of a pixel: one of type uint8 has a scale and an offset for each channel, others count
+// as they are. Interpolation between pixels may come before or after this.
 template <typename E, typename T>
 inline T normalized(const PolarSampleArgs<T>& a, T pixel, int64_t channel) {
   return kSame<E, uint8_t> ? pixel * a.pixel_scale[channel] + a.pixel_offset[channel] : pixel;
@@ -203,7 +204,8 @@ void pack(const PolarSampleArgs<T>& a, const Packed& packed, int64_t b, T* plane
     for (int64_t e = 0; e < packed.pixel; ++e) row[e] = 0;
     row += packed.pixel;
     for (int64_t first = 0; first < a.channels; first += 4) {
-      // Four channels as planes: where they lie, if they do, else a converted copy.
+      // Four channels as planes: the image's own where they can be read as they are, else a
+      // converted copy.
       const T* plane[4];
       for (int64_t c = 0; c < 4; ++c) {
         T* copy = planes + c * a.width;
@@ -238,8 +240,8 @@ void pack(const PolarSampleArgs<T>& a, const Packed& packed, int64_t b, T* plane
   for (int64_t e = (a.height + 1) * packed.row; e < packed.size; ++e) to[e] = 0;
 }
 
-// The four pixels around a point of a far image, where they may lie outside it, one channel after
-// another.
+// The four pixels around a point of a far image, any of which may lie outside, one channel at a
+// time.
 template <typename T, typename E>
 struct Corners {
   const PolarSampleArgs<T>& args;
@@ -271,3 +273,4 @@ struct Corners {
 };
 
 }  // namespace
+}  // namespace darswin

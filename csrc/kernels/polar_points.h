@@ -1,27 +1,27 @@
-// Where the samples of a polar grid stand, a register of points at a time.
+// Where the points of a polar grid stand, a register of points at a time.
 //
 // A polar grid is separable: point (i, j) needs radius i and azimuth j, so two short vectors stand
 // for the whole (N_r, N_a, 2) mesh that grid_sample would read. Places are computed in double: in
 // float a coordinate of 100 px is only good to 1e-5 px, the largest error of the whole operation.
 // Jitter moves a point by a fraction of a cell along both vectors. Its numbers come from a
-// counter-based generator, a word a point, so that backward finds the same places again.
+// counter-based generator, one word a point, so that backward finds the same places again.
 //
-// Most lenses are round: a point stands at its radius and azimuth. Others are bent: a matrix
-// stretches their circles to ellipses, and offsets move each point on its own. What tells the two
-// apart is a struct each, which the loops over points are compiled for, so round ones pay nothing.
+// In a circular lens a point stands at its radius and azimuth. A general lens has a matrix, which
+// stretches circles to ellipses, or offsets, which move each point on its own. The loops over
+// points are compiled for both (structs Circular and General), so circular lenses pay nothing for
+// general ones.
 #pragma once
 
+#include "../polar.h"
 #include "math.h"
 #include "philox.h"
 #include "simd.h"
 #include "trig.h"
 
+namespace darswin {
 namespace {
 
-using darswin::PolarSampleArgs;
-using darswin::Steps;
-
-constexpr int kBlock = 1024;  // points in hand at a time
+constexpr int kBlock = 1024;  // points that are worked on at a time
 
 using Masks = Vector<int64_t, kDoubles>;
 
@@ -58,12 +58,12 @@ struct Points {
   Masks clamped;         // whether their radius would have been negative
 };
 
-// Puts points at their radius and azimuth around the center of image b.
+// A circular lens: puts points at their radius and azimuth around the center of image b.
 template <typename T>
-struct Round {
+struct Circular {
   double x, y;
 
-  Round(const PolarSampleArgs<T>& a, int64_t b)
+  Circular(const PolarSampleArgs<T>& a, int64_t b)
       : x(a.center[b * a.center_stride]), y(a.center[b * a.center_stride + 1]) {}
 
   void put(Points& p, int64_t) const {
@@ -74,15 +74,16 @@ struct Round {
   }
 };
 
-// The same through the matrix and with the offsets of points j to j + count of radius i.
+// A general lens: the same through the matrix and with the offsets of points j to j + count of
+// radius i.
 template <typename T>
-struct Bent {
-  const Round<T> center;
+struct General {
+  const Circular<T> center;
   double matrix[4] = {1, 0, 0, 1};
   const T *x_offsets = nullptr, *y_offsets = nullptr, *end;
   const int64_t count;
 
-  Bent(const PolarSampleArgs<T>& a, int64_t b, int64_t i, int64_t j, int64_t count)
+  General(const PolarSampleArgs<T>& a, int64_t b, int64_t i, int64_t j, int64_t count)
       : center(a, b), end(a.offsets_end), count(count) {
     if (a.affine != nullptr) {
       for (int e = 0; e < 4; ++e) matrix[e] = a.affine[b * a.affine_stride + e];
@@ -102,8 +103,8 @@ struct Bent {
     p.y += read(y_offsets + k);
   }
 
-  // A register of offsets; the last one of all may not be whole. The points that will be asked for
-  // next stand behind these, out of the sight of the hardware's own prefetching.
+  // A register of offsets; the last one of all may not be whole. Those of the next block are
+  // `count` further on, where the hardware's own prefetching does not look.
   Doubles read(const T* from) const {
     using V = Vector<T, kDoubles>;
     __builtin_prefetch(from + count);
@@ -116,11 +117,11 @@ struct Bent {
 
 inline double magnitude(double x) { return x < 0 ? -x : x; }
 
-// x, or NaN where it is infinite: else a radius of minus infinity, moved and clamped, would be 0.
+// x, or NaN where it is infinite: a radius of minus infinity, moved and clamped, would become 0.
 inline double finite(double x) { return x - x == 0 ? x : __builtin_nan(""); }
 
-// How far from the center the points of a radius may stand, offsets left out; NaN if the radius or
-// the matrix is.
+// How far from the center the points of a radius may stand without their offsets; NaN if the radius
+// or the matrix is.
 struct Reach {
   double x, y;
 };
@@ -140,7 +141,7 @@ Reach reach(const PolarSampleArgs<T>& a, int64_t b, int64_t i) {
           most * (magnitude(matrix[2]) + magnitude(matrix[3]))};
 }
 
-// The largest offset along y of the points of radius i, those at no number left out.
+// The largest offset along y of the points of radius i. NaN does not count.
 template <typename T>
 double largest_offset(const PolarSampleArgs<T>& a, int64_t b, int64_t i) {
   if (a.offsets == nullptr) return 0;
@@ -158,7 +159,7 @@ double largest_offset(const PolarSampleArgs<T>& a, int64_t b, int64_t i) {
   return largest;
 }
 
-// The part of locate() that jitter needs. With `tiny` turns their sines are short sums.
+// locate_through() with jitter. `tiny` turns are small enough for short sums to give their sines.
 template <bool tiny, typename T, typename Lens, typename Visit>
 void locate_moved(const PolarSampleArgs<T>& a, const Lens& lens, int64_t b, int64_t i, int64_t j,
                   int64_t count, const RandomWords& random, const Visit& visit) {
@@ -199,7 +200,7 @@ void locate_moved(const PolarSampleArgs<T>& a, const Lens& lens, int64_t b, int6
   }
 }
 
-// locate() for a lens, Round or Bent.
+// locate() for one kind of lens, Circular or General.
 template <typename T, typename Lens, typename Visit>
 void locate_through(const PolarSampleArgs<T>& a, const Lens& lens, int64_t b, int64_t i, int64_t j,
                     int64_t count, RandomWords& random, const Visit& visit) {
@@ -231,10 +232,11 @@ template <typename T, typename Visit>
 void locate(const PolarSampleArgs<T>& a, int64_t b, int64_t i, int64_t j, int64_t count,
             RandomWords& random, const Visit& visit) {
   if (a.affine == nullptr && a.offsets == nullptr) {
-    locate_through(a, Round<T>(a, b), b, i, j, count, random, visit);
+    locate_through(a, Circular<T>(a, b), b, i, j, count, random, visit);
   } else {
-    locate_through(a, Bent<T>(a, b, i, j, count), b, i, j, count, random, visit);
+    locate_through(a, General<T>(a, b, i, j, count), b, i, j, count, random, visit);
   }
 }
 
 }  // namespace
+}  // namespace darswin

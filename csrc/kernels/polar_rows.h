@@ -1,8 +1,10 @@
-// A row of samples, all points of one radius, where the operator's output or its gradient keeps it.
+// A row of samples is all points of one radius: where the operator's output, or its gradient, holds
+// them.
 #pragma once
 
 #include "polar_image.h"
 
+namespace darswin {
 namespace {
 
 // Point (sector, s), channel c, of a row lies at
@@ -15,12 +17,12 @@ template <typename T>
 Row output_row(const PolarSampleArgs<T>& a, int64_t b, int64_t i) {
   if (!a.tokens) {
     const int64_t plane = a.num_radii * a.num_azimuths;
-    return {b * a.channels * plane + i * a.num_azimuths, a.patch_azimuths, 1, plane};
+    return {b * a.channels * plane + i * a.num_azimuths, a.samples_a, 1, plane};
   }
-  const int64_t rings = a.num_radii / a.patch_radii, sectors = a.num_azimuths / a.patch_azimuths;
-  const int64_t piece = a.patch_azimuths * a.channels, token = a.patch_radii * piece;
-  const int64_t ring = b * rings + i / a.patch_radii;
-  return {ring * sectors * token + i % a.patch_radii * piece, token, a.channels, 1};
+  const int64_t rings = a.num_radii / a.samples_r, sectors = a.num_azimuths / a.samples_a;
+  const int64_t piece = a.samples_a * a.channels, token = a.samples_r * piece;
+  const int64_t ring = b * rings + i / a.samples_r;
+  return {ring * sectors * token + i % a.samples_r * piece, token, a.channels, 1};
 }
 
 // Room for one row, of pixels padded to four channels.
@@ -38,9 +40,9 @@ inline void convert(float* to, bfloat16 from) { *to = widen(from); }
 template <typename T, typename E>
 void write_row(const PolarSampleArgs<T>& a, const Row& row, const T* samples, E* out) {
   out += row.first;
-  const int64_t piece = a.patch_azimuths * a.channels;
+  const int64_t piece = a.samples_a * a.channels;
   if (a.tokens) {
-    for (int64_t sector = 0; sector * a.patch_azimuths < a.num_azimuths; ++sector) {
+    for (int64_t sector = 0; sector * a.samples_a < a.num_azimuths; ++sector) {
       E* to = out + sector * row.sector_stride;
       const T* from = samples + sector * piece;
       if constexpr (kSame<E, bfloat16>) {
@@ -75,11 +77,11 @@ void write_row(const PolarSampleArgs<T>& a, const Row& row, const T* samples) {
 template <typename T, typename E>
 void read_row(const PolarSampleArgs<T>& a, const E* grad, const Row& row, T* to) {
   grad += row.first;
-  const int64_t piece = a.patch_azimuths * a.channels;
-  for (int64_t sector = 0; sector * a.patch_azimuths < a.num_azimuths; ++sector, to += piece) {
+  const int64_t piece = a.samples_a * a.channels;
+  for (int64_t sector = 0; sector * a.samples_a < a.num_azimuths; ++sector, to += piece) {
     const E* from = grad + sector * row.sector_stride;
     if (row.channel_stride != 1) {
-      for (int64_t s = 0; s < a.patch_azimuths; ++s) {
+      for (int64_t s = 0; s < a.samples_a; ++s) {
         for (int64_t c = 0; c < a.channels; ++c) {
           convert(to + s * a.channels + c, from[s * row.sample_stride + c * row.channel_stride]);
         }
@@ -102,3 +104,4 @@ void read_row(const PolarSampleArgs<T>& a, const void* grad, const Row& row, T* 
 }
 
 }  // namespace
+}  // namespace darswin

@@ -4,15 +4,14 @@
 // the image in cache or, if it is large, in place (polar_image.h). Backward has two halves. The
 // image's gradient scatters every point into four pixels that other points share: each thread owns
 // a band of rows of an image and adds to them in the order of the points, so that no sum depends on
-// how many bands there are. The lens's gradient is a sum over each radius, but for the offsets,
-// which have one gradient a point. A point outside the image, or at no number at all, samples zeros
-// and has no gradient.
-#include "kernels.h"
+// how many bands there are. The lens's gradient is a sum over each radius; only the offsets have a
+// gradient for each point. A point outside the image, or whose place is NaN or infinite, samples
+// zeros and has no gradient.
 #include "polar_rows.h"
 #include "polar_sampler.h"
 #include "polar_scatter.h"
 
-namespace darswin::TIER {
+namespace darswin {
 namespace {
 
 template <typename T>
@@ -23,20 +22,19 @@ int64_t sampler_bytes(const PolarSampleArgs<T>& a) {
 template <typename T>
 void sample(const PolarSampleArgs<T>& a, int64_t begin, int64_t end, void* scratch) {
   T* samples = reinterpret_cast<T*>(static_cast<char*>(scratch) + sampler_bytes(a));
-  const int64_t rings = a.num_radii / a.patch_radii, piece = a.patch_azimuths * a.channels;
+  const int64_t rings = a.num_radii / a.samples_r, piece = a.samples_a * a.channels;
   const int64_t values = a.num_azimuths * a.channels + 3;  // of a radius, as Sampler wants it
   const bool in_place = a.tokens && !a.narrow;
-  Sampler<T> sampler(a, in_place ? a.patch_radii * piece : piece, in_place ? piece : values,
-                     scratch);
+  Sampler<T> sampler(a, in_place ? a.samples_r * piece : piece, in_place ? piece : values, scratch);
   for (int64_t item = begin; item < end; ++item) {
     const int64_t b = item / rings, ring = item % rings;
     if (in_place) {
-      sampler.ring(b, ring, static_cast<T*>(a.out) + output_row(a, b, ring * a.patch_radii).first);
+      sampler.ring(b, ring, static_cast<T*>(a.out) + output_row(a, b, ring * a.samples_r).first);
       continue;
     }
     sampler.ring(b, ring, samples);
-    for (int64_t n = 0; n < a.patch_radii; ++n) {
-      write_row(a, output_row(a, b, ring * a.patch_radii + n), samples + n * values);
+    for (int64_t n = 0; n < a.samples_r; ++n) {
+      write_row(a, output_row(a, b, ring * a.samples_r + n), samples + n * values);
     }
   }
 }
@@ -46,9 +44,9 @@ void backward_image(const PolarSampleArgs<T>& a, int64_t begin, int64_t end, voi
   for (int64_t item = begin; item < end; ++item) {
     const int64_t b = item / a.bands;
     Scatter<T> scatter(a, b, item % a.bands, scratch);
-    for (int64_t ring = 0; ring < a.num_radii / a.patch_radii; ++ring) {
+    for (int64_t ring = 0; ring < a.num_radii / a.samples_r; ++ring) {
       scatter.ring(ring, [&](int64_t n, T* to) {
-        read_row(a, a.grad_out, output_row(a, b, ring * a.patch_radii + n), to);
+        read_row(a, a.grad_out, output_row(a, b, ring * a.samples_r + n), to);
       });
     }
     scatter.finish();
@@ -77,7 +75,7 @@ void backward_lens(const PolarSampleArgs<T>& a, int64_t begin, int64_t end, void
   memory += round_up(sizeof(LensScratch), 64);
   auto& places = *reinterpret_cast<FarPlaces<T>*>(memory);
   T* grads = reinterpret_cast<T*>(memory + round_up(sizeof(FarPlaces<T>), 64));
-  for (int64_t item = begin * a.patch_radii; item < end * a.patch_radii; ++item) {
+  for (int64_t item = begin * a.samples_r; item < end * a.samples_r; ++item) {
     const int64_t b = item / a.num_radii, i = item % a.num_radii;
     double* sums = a.grad_lens + item * kLensSums;
     T* grad_offsets = a.grad_offsets == nullptr
@@ -125,12 +123,10 @@ void backward_lens(const PolarSampleArgs<T>& a, int64_t begin, int64_t end, void
 
 template <typename T>
 int64_t scratch_bytes(const PolarSampleArgs<T>& a, PolarPass pass) {
-  if (pass == PolarPass::forward) return sampler_bytes(a) + a.patch_radii * row_bytes(a);
+  if (pass == PolarPass::forward) return sampler_bytes(a) + a.samples_r * row_bytes(a);
   if (pass == PolarPass::backward_image) return Scatter<T>::bytes(a);
   return round_up(sizeof(LensScratch), 64) + round_up(sizeof(FarPlaces<T>), 64) + row_bytes(a);
 }
-
-}  // namespace
 
 void directions(const double* angles, int64_t n, double* cosines, double* sines) {
   for (int64_t j = 0; j < n; j += kDoubles) {
@@ -141,23 +137,20 @@ void directions(const double* angles, int64_t n, double* cosines, double* sines)
   }
 }
 
-#define INSTANTIATE(T)                                                                      \
-  int64_t polar_sample_scratch(const PolarSampleArgs<T>& a, PolarPass pass) {               \
-    return scratch_bytes(a, pass);                                                          \
-  }                                                                                         \
-  void polar_sample(const PolarSampleArgs<T>& a, int64_t begin, int64_t end, void* s) {     \
-    sample(a, begin, end, s);                                                               \
-  }                                                                                         \
-  void polar_sample_backward_image(const PolarSampleArgs<T>& a, int64_t begin, int64_t end, \
-                                   void* s) {                                               \
-    backward_image(a, begin, end, s);                                                       \
-  }                                                                                         \
-  void polar_sample_backward_lens(const PolarSampleArgs<T>& a, int64_t begin, int64_t end,  \
-                                  void* s) {                                                \
-    backward_lens(a, begin, end, s);                                                        \
-  }
-INSTANTIATE(float)
-INSTANTIATE(double)
-#undef INSTANTIATE
+template <typename T>
+constexpr PolarSampleKernels<T> kTable = {.directions = directions,
+                                          .scratch = scratch_bytes<T>,
+                                          .forward = sample<T>,
+                                          .backward_image = backward_image<T>,
+                                          .backward_lens = backward_lens<T>};
 
-}  // namespace darswin::TIER
+}  // namespace
+
+template <>
+constinit const PolarSampleKernels<float> Kernels<PolarSampleKernels<float>, Tier::TIER>::table =
+    kTable<float>;
+template <>
+constinit const PolarSampleKernels<double> Kernels<PolarSampleKernels<double>, Tier::TIER>::table =
+    kTable<double>;
+
+}  // namespace darswin

@@ -1,127 +1,10 @@
-// Samples of one token after another, forward. Interpolation is linear first downwards, then to the
-// right, on pixels that hold all their channels.
+// Forward: samples one token after another, from the packed image or, if it is far, where it lies.
 #pragma once
 
-#include "polar_image.h"
+#include "polar_interpolate.h"
 
+namespace darswin {
 namespace {
-
-// Interpolation is by weights, or by differences, a + t * (b - a): those of huge values overflow,
-// and those of infinite ones come to NaN. Where a vector of four is not a whole register, weights
-// cost more: differences come first there, and weights only if a result is not finite, for the
-// whole block of points, whose other samples may then differ in their last bit.
-template <typename T>
-constexpr bool kTryDifferences = kSame<T, float> && kRegister < 64;
-
-template <bool kWeights, typename V>
-inline V between(V a, V b, V t) {
-  if constexpr (kWeights) {
-    return between(a, b, 1 - t, t);
-  } else {
-    return a + t * (b - a);
-  }
-}
-
-// Writes a pixel of four values between its neighbours, given it and the one below.
-template <typename T>
-using Piece = Vector<T, (kLanes<T> < 4 ? kLanes<T> : 4)>;
-template <bool kWeights, typename T>
-inline void interpolate(const T* pixel, const T* below, T right, T lower, T* to, Piece<T>* sum) {
-  using V = Piece<T>;
-  const V along = splat<V>(right);
-  const auto write = [&](int e, V v) {
-    store(to + e, v);
-    if constexpr (!kWeights) *sum += v;
-  };
-  if constexpr (kSame<T, float> && kRegister > 16) {
-    // It and its right neighbour are one load.
-    using Pair = Vector<T, 8>;
-    const Pair pair = between<kWeights>(load<Pair>(pixel), load<Pair>(below), splat<Pair>(lower));
-    write(0, between<kWeights>(lower_half(pair), upper_half(pair), along));
-  } else {
-    const V down = splat<V>(lower);
-#pragma GCC unroll 2
-    for (int e = 0; e < 4; e += kLanes<T>) {
-      const V l = between<kWeights>(load<V>(pixel + e), load<V>(below + e), down);
-      const V r = between<kWeights>(load<V>(pixel + 4 + e), load<V>(below + 4 + e), down);
-      write(e, between<kWeights>(l, r, along));
-    }
-  }
-}
-
-#if defined(__AVX512F__)
-// Four points in a register: two pairs of pixels and two of those below, then four pixels and their
-// right neighbours. Loads and stores are what limits a point alone: here the weights of four are
-// two loads, and the four go out as one store where they lie one behind the other.
-inline Vector<float, 16> interpolate_four(const float* pixels, const float* below,
-                                          const int32_t* offset, const float* right,
-                                          const float* lower) {
-  using V = Vector<float, 16>;
-  using Index = Vector<int32_t, 16>;
-  constexpr Index first_two = {0, 0, 0, 0, 0, 0, 0, 0, 1, 1, 1, 1, 1, 1, 1, 1};
-  constexpr Index all = {0, 0, 0, 0, 1, 1, 1, 1, 2, 2, 2, 2, 3, 3, 3, 3};
-  const auto down = load<Vector<float, 4>>(lower), along = load<Vector<float, 4>>(right);
-  const V top = two_eights(pixels + offset[0], pixels + offset[1]);
-  const V bottom = two_eights(below + offset[0], below + offset[1]);
-  const V top2 = two_eights(pixels + offset[2], pixels + offset[3]);
-  const V bottom2 = two_eights(below + offset[2], below + offset[3]);
-  const V pairs = between<true>(top, bottom, pick(down, first_two));
-  const V pairs2 = between<true>(top2, bottom2, pick(down, first_two + 2));
-  const V l = __builtin_shufflevector(pairs, pairs2, 0, 1, 2, 3, 8, 9, 10, 11, 16, 17, 18, 19, 24,
-                                      25, 26, 27);
-  const V r = __builtin_shufflevector(pairs, pairs2, 4, 5, 6, 7, 12, 13, 14, 15, 20, 21, 22, 23, 28,
-                                      29, 30, 31);
-  return between<true>(l, r, pick(along, all));
-}
-#endif
-
-// Whether all lanes are finite.
-template <typename V>
-inline bool all_finite(const V& v) {
-  bool finite = true;
-  for (size_t lane = 0; lane < sizeof(V) / sizeof(v[0]); ++lane) finite &= v[lane] - v[lane] == 0;
-  return finite;
-}
-
-// Samples points of a packed image, point k to to[target[k]]; joined[k] says whether the next three
-// follow it there. A function of its own, so that all it needs stays in registers. Returns false if
-// it sampled by differences and a sample is not finite, which their sum tells.
-template <bool kWeights, typename T>
-[[gnu::noinline]] bool sample_line(const T* pixels, int64_t row, const PackedPlaces<T>& places,
-                                   int64_t begin, int64_t end, const int32_t* target,
-                                   [[maybe_unused]] const bool* joined,
-                                   [[maybe_unused]] int64_t channels, T* to) {
-  const T* below = pixels + row;
-  const int32_t* offset = places.offset;
-  const T *right = places.right, *lower = places.lower;
-  int64_t k = begin;
-#if defined(__AVX512F__)
-  if constexpr (kSame<T, float>) {
-    for (; k + 4 <= end; k += 4) {
-      const auto v = interpolate_four(pixels, below, offset + k, right + k, lower + k);
-      if (joined[k]) {
-        store_front(to + target[k], front_of_quarters(v, channels), 4 * channels);
-      } else {
-        store(to + target[k], quarter<0>(v));
-        store(to + target[k + 1], quarter<1>(v));
-        store(to + target[k + 2], quarter<2>(v));
-        store(to + target[k + 3], quarter<3>(v));
-      }
-    }
-  }
-#endif
-  Piece<T> sums[4]{};  // in turn, so that none waits for the addition before
-  const auto sample = [&](int64_t k, Piece<T>* sum) {
-    interpolate<kWeights>(pixels + offset[k], below + offset[k], right[k], lower[k], to + target[k],
-                          sum);
-  };
-  for (; k + 4 <= end; k += 4) {
-#pragma GCC unroll 4
-    for (int turn = 0; turn < 4; ++turn) sample(k + turn, sums + turn);
-  }
-  for (; k < end; ++k) sample(k, sums);
-  return kWeights || all_finite((sums[0] + sums[1]) + (sums[2] + sums[3]));
-}
 
 template <typename T>
 class Sampler {
@@ -131,29 +14,28 @@ class Sampler {
     return round_up(sizeof(State), 64) + values * static_cast<int64_t>(sizeof(T));
   }
 
-  // Sample (row, s) of the token of a sector, channel c, will go to
-  // to[sector * sector_stride + row * row_stride + s * C + c]. Either a token is contiguous, or a
-  // row of all tokens is and has room for three values more.
+  // Channel c of sample (row, s) of a sector's token goes to to[sector * sector_stride + row *
+  // row_stride + s * C + c]. Either each token is contiguous, or each row, one radius of all
+  // tokens, is and has room for three values behind it.
   Sampler(const PolarSampleArgs<T>& args, int64_t sector_stride, int64_t row_stride, void* scratch)
       : a(args),
         packed(args.packed ? Packed(args) : Packed()),
         sector_stride(sector_stride),
         row_stride(row_stride),
-        in_line(args.packed && args.channels <= 4 && args.patch_azimuths * args.channels >= 4 &&
-                (args.patch_azimuths <= kBlock || args.patch_radii == 1) &&
-                reach_of_block() < INT32_MAX),
+        in_line(args.packed && args.channels <= 4 && args.samples_a * args.channels >= 4 &&
+                (args.samples_a <= kBlock || args.samples_r == 1) && reach_of_block() < INT32_MAX),
         state(*static_cast<State*>(scratch)),
         points(state.points),
         image(reinterpret_cast<T*>(static_cast<char*>(scratch) + round_up(sizeof(State), 64))) {
     if (a.packed && !in_line) return;
     int64_t k = 0;
     for (int64_t row = 0, columns = block_columns(); k + columns <= kBlock; ++row) {
-      for (int64_t sector = 0; sector * a.patch_azimuths < columns; ++sector) {
-        for (int64_t s = 0; s < smaller(columns, a.patch_azimuths); ++s, ++k) {
+      for (int64_t sector = 0; sector * a.samples_a < columns; ++sector) {
+        for (int64_t s = 0; s < smaller(columns, a.samples_a); ++s, ++k) {
           const int64_t to = row * row_stride + sector * sector_stride + s * a.channels;
           if (a.packed) {
             state.near_to[k] = static_cast<int32_t>(to);
-            state.joined[k] = s + 4 <= a.patch_azimuths;
+            state.joined[k] = s + 4 <= a.samples_a;
           } else {
             state.far_to[k] = to;
           }
@@ -170,14 +52,14 @@ class Sampler {
       });
       image_in_hand = b;
     }
-    const int64_t columns = block_columns(), rows = smaller(kBlock / columns, a.patch_radii);
+    const int64_t columns = block_columns(), rows = smaller(kBlock / columns, a.samples_r);
     for (int64_t j = 0, count; j < a.num_azimuths; j += count) {
-      // A block ends where a token that is cut does.
+      // Where a token has more points than a block, no block reaches beyond its token.
       const int64_t left =
-          columns < a.patch_azimuths ? a.patch_azimuths - j % a.patch_azimuths : a.num_azimuths - j;
+          columns < a.samples_a ? a.samples_a - j % a.samples_a : a.num_azimuths - j;
       count = smaller(columns, left);
-      for (int64_t row = 0; row < a.patch_radii; row += rows) {
-        block(b, ring, j, count, row, smaller(rows, a.patch_radii - row), to);
+      for (int64_t row = 0; row < a.samples_r; row += rows) {
+        block(b, ring, j, count, row, smaller(rows, a.samples_r - row), to);
       }
     }
   }
@@ -189,31 +71,31 @@ class Sampler {
       int32_t near_to[kBlock];
       int64_t far_to[kBlock];
     };
-    bool joined[kBlock];              // whether the next three follow there
-    uint16_t order[kBlock + kAhead];  // in which they are visited, if the image is far
+    bool joined[kBlock];              // whether the next three points follow there
+    uint16_t order[kBlock + kAhead];  // in which points of a far image are visited
   };
 
-  // No point of a block goes further than this.
+  // No point of a block is stored further than this from the block's first.
   int64_t reach_of_block() const {
-    return smaller(kBlock, a.patch_radii) * row_stride +
-           block_columns() / a.patch_azimuths * sector_stride;
+    return smaller(kBlock, a.samples_r) * row_stride +
+           block_columns() / a.samples_a * sector_stride;
   }
 
-  // A block is a few whole tokens: their pixels and their output stay in the nearest cache. Blocks
-  // are of equal size if that does not make them small. A token of more points than a block holds
-  // is cut.
+  // A block is a few whole tokens, so that their pixels and their output stay in the nearest cache.
+  // Blocks are of equal size if that does not make them small. A token of more points than a block
+  // holds is cut into several blocks.
   int64_t block_columns() const {
-    const int64_t sectors = a.num_azimuths / a.patch_azimuths;
-    const int64_t most = kBlock / (a.patch_radii * a.patch_azimuths);
-    if (most < 1) return smaller(a.patch_azimuths, kBlock);
+    const int64_t sectors = a.num_azimuths / a.samples_a;
+    const int64_t most = kBlock / (a.samples_r * a.samples_a);
+    if (most < 1) return smaller(a.samples_a, kBlock);
     int64_t tokens = smaller(most, sectors);
     while (sectors % tokens != 0 && 2 * tokens > most) --tokens;
-    return tokens * a.patch_azimuths;
+    return tokens * a.samples_a;
   }
 
   // Points j to j + count of `rows` radii of a ring, from its radius `row` on.
   void block(int64_t b, int64_t ring, int64_t j, int64_t count, int64_t row, int64_t rows, T* to) {
-    const int64_t first = ring * a.patch_radii + row;
+    const int64_t first = ring * a.samples_r + row;
     if (!a.packed) {
       const int64_t columns = block_columns();
       for (int64_t n = 0; n < rows; ++n) {
@@ -221,26 +103,27 @@ class Sampler {
       }
       const int64_t visits = far_order(a, j, count, rows, columns, state.order);
       for (int64_t v = visits; v < visits + kAhead; ++v) state.order[v] = state.order[visits - 1];
-      T* out = to + j / a.patch_azimuths * sector_stride + j % a.patch_azimuths * a.channels +
-               row * row_stride;
+      T* out =
+          to + j / a.samples_a * sector_stride + j % a.samples_a * a.channels + row * row_stride;
       with_pixel_type<T>(a.pixel, [&]<typename E>() { far_block<E>(b, visits, out); });
       return;
     }
     for (int64_t n = 0; n < rows; ++n) {
       points.find(a, packed, b, first + n, j, count, n * count);
-      if (row_stride == a.patch_azimuths * a.channels && rows == a.patch_radii) {
-        // The tokens of the next block come behind these: their lines are asked for meanwhile.
+      if (row_stride == a.samples_a * a.channels && rows == a.samples_r) {
+        // The tokens of the next block come behind these: prefetches where they will be written.
         const char* next =
-            reinterpret_cast<const char*>(to + (j + count) / a.patch_azimuths * sector_stride);
-        const int64_t bytes = count * row_stride / a.patch_azimuths * sizeof(T);
+            reinterpret_cast<const char*>(to + (j + count) / a.samples_a * sector_stride);
+        const int64_t bytes = count * row_stride / a.samples_a * sizeof(T);
         for (int64_t e = n * bytes; e < (n + 1) * bytes; e += 64) __builtin_prefetch(next + e, 1);
       }
     }
-    // Where the points of a smaller block go is known only if they are of one radius.
+    // near_to holds the places of a whole block. They hold for a smaller block only if its points
+    // are of one radius.
     if (in_line && (rows == 1 || count == smaller(block_columns(), a.num_azimuths))) {
-      T* out = to + j / a.patch_azimuths * sector_stride + j % a.patch_azimuths * a.channels +
-               row * row_stride;
-      lines(rows, count, out, row + rows == a.patch_radii, j + count == a.num_azimuths);
+      T* out =
+          to + j / a.samples_a * sector_stride + j % a.samples_a * a.channels + row * row_stride;
+      lines(rows, count, out, row + rows == a.samples_r, j + count == a.num_azimuths);
       return;
     }
     for (int64_t n = 0; n < rows; ++n) {
@@ -248,7 +131,7 @@ class Sampler {
     }
   }
 
-  // Rows of a block, of up to four channels.
+  // Samples rows of a block whose pixels have up to four channels.
   void lines(int64_t rows, int64_t count, T* to, bool last_row, bool last_token) {
     if constexpr (kTryDifferences<T>) {
       if (lines<false>(rows, count, to, last_row, last_token)) return;
@@ -256,13 +139,14 @@ class Sampler {
     lines<true>(rows, count, to, last_row, last_token);
   }
 
-  // Four values are stored where the point has fewer: the points of that place are sampled later,
-  // with one exception. Behind the last row of a token is the first row of the next one, which is
-  // there already if a token has more than one row: it is kept and put back. Behind the last token
-  // is what others may write to: its last points are exact.
+  // A point stores four values even if it has fewer channels: the point that belongs behind it
+  // comes later and overwrites the rest. There are two exceptions. Behind the last row of a token
+  // is the first row of the next token, which is written already if tokens have several rows: its
+  // values are kept and put back. Behind the last token may be what another thread writes: its last
+  // points store only their own values.
   template <bool kWeights>
   bool lines(int64_t rows, int64_t count, T* to, bool last_row, bool last_token) {
-    const int64_t channels = a.channels, all = rows * count, tokens = count / a.patch_azimuths;
+    const int64_t channels = a.channels, all = rows * count, tokens = count / a.samples_a;
     const auto& near = points.near;
     bool finite = true;
     const auto sample = [&](int64_t begin, int64_t end) {
@@ -275,11 +159,11 @@ class Sampler {
     }
     const int64_t before = all - count;
     sample(0, before);
-    // These are enough: such a token has at least two rows and, of fewer than four channels but
-    // four values a row, two points in each.
-    T* first = to + (rows - a.patch_radii) * row_stride;  // row 0 of the first token
+    // kBlock / 4 tokens are enough: one that overruns has two rows at least, and two points in
+    // each, since a row has at least four values and a point fewer.
+    T* first = to + (rows - a.samples_r) * row_stride;  // row 0 of the first token
     T kept[kBlock / 4][4];
-    const int64_t overrun = channels < 4 && a.patch_radii > 1 ? tokens : 0;
+    const int64_t overrun = channels < 4 && a.samples_r > 1 ? tokens : 0;
     for (int64_t t = 1; t < overrun; ++t) {
       store(kept[t], load<Vector<T, 4>>(first + t * sector_stride));
     }
@@ -299,11 +183,11 @@ class Sampler {
     return finite;
   }
 
-  // Points j to j + count of one radius, whose places are `place` on, of any number of channels.
+  // Samples points j to j + count of one radius, whose places are `place` on, of any number of
+  // channels.
   void near_row(int64_t j, int64_t count, int64_t place, T* row) const {
     for (int64_t k = 0; k < count; ++k) {
-      T* to = row + (j + k) / a.patch_azimuths * sector_stride +
-              (j + k) % a.patch_azimuths * a.channels;
+      T* to = row + (j + k) / a.samples_a * sector_stride + (j + k) % a.samples_a * a.channels;
       const T* pixel = image + points.near.offset[place + k];
       const T right = points.near.right[place + k], lower = points.near.lower[place + k];
       const T *below = pixel + packed.row, *next = pixel + packed.pixel,
@@ -317,9 +201,9 @@ class Sampler {
     }
   }
 
-  // The points of a block in the far image. The pixels of points to come are asked for, into the
-  // second-level cache: rows of an image share few sets of the first if its width is a power of
-  // two.
+  // Samples the points of a block in the far image. Pixels of later points are prefetched into the
+  // second-level cache: in the first, rows of an image whose width is a power of two share few
+  // sets.
   template <typename E>
   [[gnu::noinline]] void far_block(int64_t b, int64_t visits, T* to) const {
     const E* pixels = static_cast<const E*>(a.image) + b * a.image_stride[0];
@@ -350,7 +234,7 @@ class Sampler {
     }
   }
 
-  // Three planes of float: a pixel and its right neighbour are one load.
+  // Three planes of float: one load takes a pixel and its right neighbour.
   static void planes_point(const float* pixel, int64_t plane, int64_t below, float right,
                            float lower, float* to) {
     using V = Vector<float, 4>;
@@ -401,3 +285,4 @@ class Sampler {
 };
 
 }  // namespace
+}  // namespace darswin

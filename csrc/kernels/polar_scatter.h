@@ -1,14 +1,16 @@
-// The image's gradient: every point adds its gradient, weighted, to four pixels.
+// The image's gradient: each point adds its gradient, weighted, to the four pixels around it.
 //
-// The sums of a small image are kept in cells: what goes to the four pixels around a point, four
-// channels each, is one cache line that is added to as a whole; at the end each pixel collects its
-// share of four cells. A larger image is kept packed (polar_image.h), a pixel a register; a still
-// larger one is added to in place. Neighbouring points often meet in one pixel, and an addition
-// must wait for the one before; so points are taken from several places of the circle in turn.
+// For a small image the sums are kept in cells. A cell holds what points at one place add to the
+// four pixels around them, four channels each: one cache line, added to as a whole. At the end each
+// pixel collects its share of four cells. For a larger image the sums are kept packed
+// (polar_image.h), a pixel a register; for a still larger one they are added up in place.
+// Neighbouring points often meet in one pixel, and an addition must wait for the one before; so
+// points are taken from several places of the circle in turn.
 #pragma once
 
 #include "polar_rows.h"
 
+namespace darswin {
 namespace {
 
 constexpr int64_t kCellBytes = 1 << 20;
@@ -18,7 +20,7 @@ class Scatter {
  public:
   static int64_t bytes(const PolarSampleArgs<T>& a) {
     const int64_t kept_rows = (a.height + a.bands - 1) / a.bands + 3;  // at most
-    return round_up(sizeof(PlacedPoints<T>), 64) + a.patch_radii * row_bytes(a) +
+    return round_up(sizeof(PlacedPoints<T>), 64) + a.samples_r * row_bytes(a) +
            kept_rows * sums_layout(a).row * static_cast<int64_t>(sizeof(T));
   }
 
@@ -33,7 +35,7 @@ class Scatter {
         points(*static_cast<PlacedPoints<T>*>(scratch)),
         grads(reinterpret_cast<T*>(static_cast<char*>(scratch) +
                                    round_up(sizeof(PlacedPoints<T>), 64))),
-        sums(grads + args.patch_radii * row_bytes(args) / sizeof(T) - first_kept() * layout.row) {
+        sums(grads + args.samples_r * row_bytes(args) / sizeof(T) - first_kept() * layout.row) {
     if (keep == kInPlace) {
       T* rows =
           static_cast<T*>(a.grad_image) + (image * a.channels * a.height + first_row) * a.width;
@@ -48,17 +50,17 @@ class Scatter {
   // Adds the gradients of a ring, whose radius n read(n, to) writes as (num_azimuths, C).
   template <typename Read>
   void ring(int64_t ring, Read read) {
-    const int64_t first = ring * a.patch_radii;
+    const int64_t first = ring * a.samples_r;
     if (keep == kInPlace) {
       bool any = false;
-      for (int64_t n = 0; n < a.patch_radii; ++n) any |= touches(first + n);
+      for (int64_t n = 0; n < a.samples_r; ++n) any |= touches(first + n);
       if (!any) return;
       const int64_t line = row_bytes(a) / sizeof(T);
-      for (int64_t n = 0; n < a.patch_radii; ++n) read(n, grads + n * line);
+      for (int64_t n = 0; n < a.samples_r; ++n) read(n, grads + n * line);
       add_in_place(first, line);
       return;
     }
-    for (int64_t n = 0; n < a.patch_radii; ++n) {
+    for (int64_t n = 0; n < a.samples_r; ++n) {
       if (!touches(first + n)) continue;
       read(n, grads);
       for (int64_t j = 0; j < a.num_azimuths; j += kBlock) {
@@ -94,8 +96,7 @@ class Scatter {
  private:
   enum Keeping { kCells, kPacked, kInPlace };
 
-  // Bands are rows of packed images. Gradients narrower than what is added up cannot be added to in
-  // place.
+  // bfloat16 gradients are never added up in place, since their sums are float32.
   static Keeping keeping(const PolarSampleArgs<T>& a) {
     if (!a.packed && a.pixel != Pixel::bf16) return kInPlace;
     const bool cells =
@@ -114,8 +115,8 @@ class Scatter {
     return layout;
   }
 
-  // The rows that the band keeps sums in: those of its pixels, the outermost bands the borders too;
-  // in cells also the row above, which two bands then keep.
+  // The rows of sums that the band keeps: those of its pixels and, in the outermost bands, of the
+  // border. Cells need the row above as well, so two neighbouring bands each keep one of their own.
   int64_t band_row(int64_t band) const { return a.height * band / a.bands; }
   int64_t first_kept() const { return first_row == 0 ? 0 : first_row + (keep == kCells ? 0 : 1); }
   int64_t end_kept() const { return end_row == a.height ? a.height + 3 : end_row + 1; }
@@ -154,7 +155,7 @@ class Scatter {
     constexpr float sign_x[] = {-1, -1, -1, -1, 1, 1, 1, 1, -1, -1, -1, -1, 1, 1, 1, 1};
     constexpr float one_y[] = {1, 1, 1, 1, 1, 1, 1, 1, 0, 0, 0, 0, 0, 0, 0, 0};
     constexpr float sign_y[] = {-1, -1, -1, -1, -1, -1, -1, -1, 1, 1, 1, 1, 1, 1, 1, 1};
-    const V g = repeat<V>(load<Vector<float, 4>>(grad));
+    const V g = repeat(load<Vector<float, 4>>(grad));
     for (int e = 0; e < 16; e += lanes) {
       const V x = load<V>(one_x + e) + right * load<V>(sign_x + e);
       const V y = load<V>(one_y + e) + lower * load<V>(sign_y + e);
@@ -163,13 +164,15 @@ class Scatter {
   }
   static void add_cell(double*, const double*, double, double) {}  // doubles are never in cells
 
-  // The pixels of a row, from the cells around each, into the front of their own cells.
+  // Adds up the pixels of a row from the cells around each; a pixel's sum replaces the front of its
+  // own cell.
   void collect(const T* row) const {
     using V = Vector<T, 4>;
     T* cell = const_cast<T*>(row);
     for (int64_t x = 0; x < a.width; ++x, cell += layout.pixel) {
       const T *left = cell - layout.pixel, *above = cell - layout.row;
-      // The cell to the left has given its own part away, but not that for this pixel.
+      // The front of the cell to the left is that pixel's sum by now; the part for this pixel is
+      // still there.
       store(cell, load<V>(cell) + load<V>(left + 4) +
                       (load<V>(above + 8) + load<V>(above - layout.pixel + 12)));
     }
@@ -216,14 +219,14 @@ class Scatter {
   // Blocks of points as in Sampler::far_block.
   void add_in_place(int64_t first, int64_t line) {
     const int64_t strides[2] = {a.width, 1};
-    const int64_t token = a.patch_radii * a.patch_azimuths;
+    const int64_t token = a.samples_r * a.samples_a;
     const int64_t columns =
-        smaller(token < kBlock ? kBlock / token * a.patch_azimuths : a.patch_azimuths, kBlock);
-    const int64_t rows = smaller(a.patch_radii, kBlock / columns);
+        smaller(token < kBlock ? kBlock / token * a.samples_a : a.samples_a, kBlock);
+    const int64_t rows = smaller(a.samples_r, kBlock / columns);
     for (int64_t j = 0; j < a.num_azimuths; j += columns) {
       const int64_t count = smaller(columns, a.num_azimuths - j);
-      for (int64_t row = 0; row < a.patch_radii; row += rows) {
-        const int64_t end = smaller(row + rows, a.patch_radii);
+      for (int64_t row = 0; row < a.samples_r; row += rows) {
+        const int64_t end = smaller(row + rows, a.samples_r);
         for (int64_t n = row; n < end; ++n) {
           points.find_far(a, strides, image, first + n, j, count, (n - row) * columns);
         }
@@ -238,7 +241,7 @@ class Scatter {
     }
   }
 
-  // Asks for the pixels of a point to come.
+  // Prefetches the pixels of a point to come.
   void fetch(int64_t place) const {
     if (points.far.offset[place] < 0) return;
     const int64_t plane = a.height * a.width;
@@ -276,7 +279,7 @@ class Scatter {
     if (a.bands == 1) return true;
     const double y = a.center[image * a.center_stride + 1];
     const double most = reach(a, image, i).y + largest_offset(a, image, i) + 2;
-    // Written so that NaN touches.
+    // NaN compares false, so that it counts as touching.
     return !(y + most < first_row || y - most > end_row);
   }
 
@@ -290,3 +293,4 @@ class Scatter {
 };
 
 }  // namespace
+}  // namespace darswin

@@ -1,12 +1,13 @@
 // The transpose of a matrix and the sums of its columns, in one pass over memory.
 //
-// It is what the gradient of a linear layer's weight wants of the gradient of its output: a product
-// whose rows are the output's features, and, for the bias, their sums. Rows are read in groups, so
-// that what is written of a column is whole cache lines.
-#include "kernels.h"
+// Backward of a linear layer needs both of the output's gradient: its transpose times the input is
+// the weight's gradient, the sums of its columns are the bias's. Rows are read in groups, so that
+// what is written of a column is whole cache lines.
+#include "../transpose_sum.h"
+
 #include "transpose.h"
 
-namespace darswin::TIER {
+namespace darswin {
 namespace {
 
 constexpr int64_t kL = kLanes<float>;
@@ -24,12 +25,10 @@ inline Floats square(const float* from, int64_t columns, float* to, int64_t to_s
   return (sums[0] + sums[1]) + (sums[2] + sums[3]);
 }
 
-}  // namespace
-
-void transpose_sum(const TransposeSumArgs& a, int64_t begin, int64_t end) {
+void transpose_groups(const TransposeSumArgs& a, int64_t begin, int64_t end) {
   for (int64_t group = begin; group < end; ++group) {
-    const int64_t first = group * kTransposedRows;
-    const int64_t rows = a.rows - first < kTransposedRows ? a.rows - first : kTransposedRows;
+    const int64_t first = group * kGroupRows;
+    const int64_t rows = a.rows - first < kGroupRows ? a.rows - first : kGroupRows;
     const float* from = a.from + first * a.columns;
     float *to = a.to + first, *sums = a.sums + group * a.columns;
     const int64_t whole_rows = rows / kL * kL, whole_columns = a.columns / kL * kL;
@@ -40,7 +39,7 @@ void transpose_sum(const TransposeSumArgs& a, int64_t begin, int64_t end) {
       }
       store(sums + c, sum);
     }
-    // What is left: the last rows of all columns, if any, and all rows of the last columns.
+    // The rest: the last rows of all columns, if any, and all rows of the last columns.
     for (int64_t c = whole_rows < rows ? 0 : whole_columns; c < a.columns; ++c) {
       const bool whole = c < whole_columns;
       float sum = whole ? sums[c] : 0;
@@ -54,4 +53,10 @@ void transpose_sum(const TransposeSumArgs& a, int64_t begin, int64_t end) {
   }
 }
 
-}  // namespace darswin::TIER
+}  // namespace
+
+template <>
+constinit const TransposeSumKernels Kernels<TransposeSumKernels, Tier::TIER>::table = {
+    .groups = transpose_groups};
+
+}  // namespace darswin

@@ -3,6 +3,7 @@
 
 #include "simd.h"
 
+namespace darswin {
 namespace {
 
 constexpr double kPi = 3.14159265358979323846;
@@ -58,3 +59,4 @@ inline void tiny_sin_cos(Doubles t, Doubles* sin, Doubles* cos) {
 }
 
 }  // namespace
+}  // namespace darswin

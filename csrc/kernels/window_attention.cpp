@@ -1,19 +1,20 @@
 // Windowed attention on a polar map.
 //
-// A window is never cut out of the map: token t of a window is found by index arithmetic that
-// includes the shift and the wrap around the border, and the tiles of window_attention_tiles.h read
-// its rows where they are. One window is attended to by one head at a time; with 16 tokens all that
-// this needs stays in registers and the first cache. Logits stand as (key, query), queries in the
-// SIMD lanes. Along an axis that is not periodic, tokens that the shift brought together across the
-// border carry different `side` marks and do not see each other. Backward finds the probabilities
-// again, just as forward did, so forward saves nothing. Every token lies in one window, so qkv
-// gradients have one writer; bias gradients are summed over a chunk of windows, in order.
-#include "kernels.h"
+// A window is never cut out of the map: index arithmetic that includes the shift and the wrap
+// around the border finds the rows of its tokens, and the tiles of window_attention_tiles.h read
+// them where they are. One head attends to one window at a time; with 16 tokens all that this needs
+// stays in registers and the first cache. Logits stand as (key, query), queries in the SIMD lanes.
+// Along an axis that is not periodic, tokens that the shift brought together across the border
+// carry different `side` marks and do not see each other. Backward recomputes the probabilities
+// just as forward computed them, so forward saves nothing. Every token lies in one window, so each
+// qkv gradient has one writer; bias gradients are summed over a chunk of windows, in order.
+#include "../window_attention.h"
+
 #include "math.h"
 #include "window_attention_scratch.h"
 #include "window_attention_tiles.h"
 
-namespace darswin::TIER {
+namespace darswin {
 namespace {
 
 // One thread's work on a call.
@@ -28,7 +29,7 @@ struct Attention {
   Arena arena;
   Scratch<S> s;
   int64_t part;            // from a token's queries to its keys, and on to its values
-  int64_t bias_row, head;  // at work
+  int64_t bias_row, head;  // the current ones
   Rows<const T> q, k, v;   // of the head
 
   Attention(const WindowAttentionArgs<S>& args, void* memory)
@@ -46,7 +47,8 @@ struct Attention {
     return shape.n - group < kGroup ? shape.n - group : kGroup;
   }
 
-  // Makes `window` the one at work. The one after it is found as well, to be fetched meanwhile.
+  // Makes `window` the current one. Finds the one after it as well, whose rows are prefetched
+  // meanwhile.
   void enter(int64_t window) {
     s.next.find(a, shape, window);
     const Tokens<T> last = s.window;
@@ -56,12 +58,13 @@ struct Attention {
     bias_row = a.bias_rows == 1 ? 0 : window / shape.map_windows;
   }
 
-  // Asks for the same rows of the next window, a group at a time, two cache lines a step. Inlined,
-  // since the compiler takes a function that only prefetches for one without effect.
+  // Prefetches the same rows of the next window, a group at a time, two cache lines a step.
+  // Inlined, since the compiler takes a function that only prefetches for one without effect.
   __attribute__((always_inline)) void fetch(const S* map, const int64_t* offset,
                                             int64_t group) const {
     if (!shape.far) return;
-    // One by one: thirty-two unrolled in a row were measured to take much longer than none at all.
+    // Not unrolled: thirty-two prefetches in a row were measured to take much longer than none at
+    // all.
     const int64_t end = group + group_size(group), row = shape.d * static_cast<int64_t>(sizeof(S));
 #pragma GCC unroll 1
     for (int64_t t = group; t < end; ++t) {
@@ -224,7 +227,7 @@ struct Attention {
   }
 
   // The steps from queries and keys to the exponentials, for the queries of one group. In between,
-  // every few steps' worth of time, rows of the next window are asked for.
+  // a few at a time, rows of the next window are prefetched.
   void weights(int64_t group) const {
     fetch(queries(), s.next.in, group);
     transpose(q.from(group), shape.d, s.columns);
@@ -234,7 +237,7 @@ struct Attention {
     exponentials();
   }
 
-  // One head of the window at work.
+  // One head of the current window.
   void forward(int64_t index) {
     begin(index);
     S* to = a.out + head * shape.d;
@@ -324,9 +327,9 @@ struct Attention {
   }
 };
 
-// run(attention) for a call. Nearly every one has windows of 16 tokens and heads of 32 channels;
-// with loops of known lengths that takes 5 to 20 % less time. Rows that are used where they lie,
-// beyond the caches, were up to 20 % slower to come with them.
+// run(attention) for a call. Nearly every call has windows of 16 tokens and heads of 32 channels:
+// loops of known lengths make it 5 to 20 % faster. Not so where rows are read in place from a map
+// larger than the caches: those were up to 20 % slower with them.
 template <typename S, typename Run>
 void with_attention(const WindowAttentionArgs<S>& args, void* scratch, Run run) {
   const bool usual = args.window_r * args.window_a == 16 && args.head_dim == 32;
@@ -354,40 +357,20 @@ int64_t scratch_bytes(const WindowAttentionArgs<S>& args) {
   return arena.used;
 }
 
+template <typename S>
+constexpr WindowAttentionKernels<S> kTable = {
+    .scratch = scratch_bytes<S>, .forward = forward<S>, .backward = backward<S>};
+
 }  // namespace
 
-int64_t window_attention_scratch(const WindowAttentionArgs<float>& args) {
-  return scratch_bytes(args);
-}
-int64_t window_attention_scratch(const WindowAttentionArgs<double>& args) {
-  return scratch_bytes(args);
-}
-int64_t window_attention_scratch(const WindowAttentionArgs<bfloat16>& args) {
-  return scratch_bytes(args);
-}
-void window_attention(const WindowAttentionArgs<float>& args, int64_t begin, int64_t end,
-                      void* scratch) {
-  forward(args, begin, end, scratch);
-}
-void window_attention(const WindowAttentionArgs<double>& args, int64_t begin, int64_t end,
-                      void* scratch) {
-  forward(args, begin, end, scratch);
-}
-void window_attention(const WindowAttentionArgs<bfloat16>& args, int64_t begin, int64_t end,
-                      void* scratch) {
-  forward(args, begin, end, scratch);
-}
-void window_attention_backward(const WindowAttentionArgs<float>& args, int64_t begin, int64_t end,
-                               void* scratch) {
-  backward(args, begin, end, scratch);
-}
-void window_attention_backward(const WindowAttentionArgs<double>& args, int64_t begin, int64_t end,
-                               void* scratch) {
-  backward(args, begin, end, scratch);
-}
-void window_attention_backward(const WindowAttentionArgs<bfloat16>& args, int64_t begin,
-                               int64_t end, void* scratch) {
-  backward(args, begin, end, scratch);
-}
+template <>
+constinit const WindowAttentionKernels<float>
+    Kernels<WindowAttentionKernels<float>, Tier::TIER>::table = kTable<float>;
+template <>
+constinit const WindowAttentionKernels<double>
+    Kernels<WindowAttentionKernels<double>, Tier::TIER>::table = kTable<double>;
+template <>
+constinit const WindowAttentionKernels<bfloat16>
+    Kernels<WindowAttentionKernels<bfloat16>, Tier::TIER>::table = kTable<bfloat16>;
 
-}  // namespace darswin::TIER
+}  // namespace darswin

@@ -1,16 +1,16 @@
 // Sizes, places and working memory of window attention: everything but the arithmetic.
 #pragma once
 
-#include "../dispatch.h"
+#include "../window_attention.h"
 #include "arena.h"
 #include "window_attention_tiles.h"
 
-namespace darswin::TIER {
+namespace darswin {
 namespace {
 
 // Up to this many tokens a window, tables of all pairs of tokens are kept for each head.
 constexpr int64_t kPairTokens = 64;
-// Bytes of qkv from which on it pays to ask for rows before they are needed.
+// From this many bytes of qkv on, prefetching pays.
 constexpr int64_t kCache = int64_t{4} << 20;
 
 // A size that the compiler knows, or 0 where only the call does.
@@ -122,7 +122,7 @@ template <typename S>
 struct Scratch {
   using T = Arithmetic<S>;
 
-  Tokens<T> window, next;    // the window at work, and the one after it
+  Tokens<T> window, next;    // the current window, and the one after it
   int64_t* copy;             // (padded,): offsets of a token's row in a copy
   T* columns;                // (d, group): queries or gradients of a group, transposed
   T *largest, *inverse;      // (group,): of each query, the largest logit; 1 / sum of exponentials
@@ -163,4 +163,4 @@ struct Scratch {
 };
 
 }  // namespace
-}  // namespace darswin::TIER
+}  // namespace darswin

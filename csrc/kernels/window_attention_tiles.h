@@ -9,6 +9,7 @@
 
 #include "transpose.h"
 
+namespace darswin {
 namespace {
 
 constexpr int kGroup = 16;
@@ -44,8 +45,8 @@ __attribute__((noinline)) void transpose(Rows<const T> rows, Dim d, T* columns) 
 }
 
 // use(k, v, sum) for each key k < n, n a multiple of 8, and each register v of the group: the sums
-// over c of columns[c * kGroup + i] * rows[k][c]. There are as many sums under way as the latency
-// of the multiply-add asks for.
+// over c of columns[c * kGroup + i] * rows[k][c]. Enough sums are under way to hide the latency of
+// the multiply-add.
 template <typename T, typename Count, typename Dim, typename Use>
 inline void products(const T* columns, Rows<const T> rows, Count n, Dim d, Use use) {
   using V = Vector<T, kLanes<T>>;
@@ -131,7 +132,7 @@ template <typename W, typename T, typename Summands, typename Count, typename Di
 __attribute__((noinline)) void weighted_sums(W weights, Rows<const T> from, Summands summands,
                                              Rows<T> to, Count rows, Dim d, Factors<T> factors,
                                              bool add) {
-  constexpr int kL = kLanes<T>, kRows = kRegister == 64 ? 8 : 4, kPiece = 64;
+  constexpr int kL = kLanes<T>, kRows = kTileRows, kPiece = 64;
   for (int64_t j = 0; j < summands; j += kPiece, add = true) {
     const int64_t piece = summands - j < kPiece ? summands - j : kPiece;
     for (int64_t i = 0; i < rows; i += kRows) {
@@ -150,7 +151,7 @@ __attribute__((noinline)) void weighted_sums(W weights, Rows<const T> from, Summ
 }
 
 // Rows of bfloat16 as float32, and back. Of two registers of channels the even ones come first,
-// then the odd ones: that needs no shuffle, and no step above minds the order of channels.
+// then the odd ones: that needs no shuffle, and the order of channels matters to no step above.
 inline void widen(const bfloat16* from, int64_t d, float* to) {
   constexpr int kL = kLanes<float>;
   using Bits = Vector<uint32_t, kL>;
@@ -173,3 +174,4 @@ inline void narrow(const float* from, int64_t d, bfloat16* to) {
 }
 
 }  // namespace
+}  // namespace darswin

@@ -19,7 +19,7 @@ from darswin.models.encoder import Encoder
 from darswin.models.stages import Stage
 
 DTYPES = (torch.float32, torch.bfloat16)
-_ADD_NORM = torch.ops.darswin.add_norm_.default
+_ADD_NORM = torch.ops.darswin._add_norm_.default
 _CPU = torch._C.DispatchKeySet(torch._C.DispatchKey.CPU)
 # A stage runs on so many images at once that what lies between two products stays below this: it
 # is then in the caches, and in memory that the allocator has kept rather than in fresh pages.

@@ -7,7 +7,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from darswin.ops.transpose_sum import transpose_sum
+from darswin.ops._transpose_sum import transpose_sum
 
 
 def missing(dtype: torch.dtype) -> str | None:

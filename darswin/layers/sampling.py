@@ -77,10 +77,10 @@ class PolarSample(nn.Module):
         jitter = self.jitter if self.training else 0.0
         # 62 bits, so that the seed is a tensor that compiled training does not specialise on.
         seed = torch.randint(2**62, ()) if jitter else 0
-        statistics = dict(mean=self.mean, std=self.std) if images.dtype == torch.uint8 else {}
         return dict(
             image=images, radii=radii, azimuths=azimuths, center=center, affine=affine,
-            offsets=offsets, patch=self.samples, jitter=jitter, seed=seed, **statistics,
+            offsets=offsets, samples=self.samples, jitter=jitter, seed=seed, mean=self.mean,
+            std=self.std,
         )  # fmt: skip
 
     def forward(self, images: Tensor, lens: Lens) -> Tensor:

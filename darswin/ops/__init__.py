@@ -4,11 +4,18 @@ They run on torch's number of threads. A process that is forked after such a cal
 another one on several: use `spawn`, or `torch.set_num_threads(1)` in the child.
 """
 
-# The last two are not public; they are imported so that their fakes and autograd are registered.
-from darswin.ops import add_norm, transpose_sum  # noqa: F401
-from darswin.ops._library import reference_in_use, use_reference
+# The first two are not public; they are imported so that their fakes and autograd are registered.
+from darswin.ops import _add_norm, _transpose_sum  # noqa: F401
+from darswin.ops._library import cpu_capability, reference_in_use, use_reference
 from darswin.ops.polar_embed import polar_embed
 from darswin.ops.polar_sample import polar_sample
 from darswin.ops.window_attention import window_attention
 
-__all__ = ["polar_embed", "polar_sample", "reference_in_use", "use_reference", "window_attention"]
+__all__ = [
+    "cpu_capability",
+    "polar_embed",
+    "polar_sample",
+    "reference_in_use",
+    "use_reference",
+    "window_attention",
+]

@@ -3,6 +3,7 @@
 import contextlib
 import importlib
 from collections.abc import Callable, Iterable, Iterator
+from typing import Any
 
 import torch  # before the module: both must share the libgomp that torch loads
 from torch import Tensor
@@ -23,6 +24,15 @@ def load_extension():
             "Rebuild it with `pip install --no-build-isolation --force-reinstall --no-deps darswin`"
             ", or in a checkout with `make build`."
         ) from error
+
+
+def cpu_capability() -> str:
+    """The instruction-set tier that the operators run on: "generic", "avx2" or "avx512".
+
+    It is the best one of this CPU; ATEN_CPU_CAPABILITY (default, avx2, avx512) lowers it, as it
+    does in torch.
+    """
+    return load_extension().tier()
 
 
 @contextlib.contextmanager
@@ -82,12 +92,19 @@ def autocast_off(device: str) -> contextlib.AbstractContextManager:
     return torch.autocast(device, enabled=False)
 
 
-def run(operator: torch._ops.OpOverloadPacket, reference: Callable, arguments: tuple) -> Tensor:
-    """The operator on checked arguments, compiled or, as the first of them says, its reference."""
-    if compiled(arguments[0]):
-        refuse_other_derivatives(operator, arguments)
-        return operator(*arguments)
-    with autocast_off(arguments[0].device.type):
+def run(reference: Callable[..., Tensor], *arguments: Any) -> Tensor:
+    """An operator on checked arguments: compiled, or its twin of the same name in reference.py.
+
+    The compiled one takes the fields of a NamedTuple one by one.
+    """
+    flat: list[Any] = []
+    for argument in arguments:
+        flat.extend(argument if hasattr(argument, "_fields") else (argument,))
+    if compiled(flat[0]):
+        operator = getattr(torch.ops.darswin, reference.__name__)
+        refuse_other_derivatives(operator, flat)
+        return operator(*flat)
+    with autocast_off(flat[0].device.type):
         return reference(*arguments)
 
 

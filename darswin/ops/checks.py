@@ -5,7 +5,8 @@ A message says what was expected and what came.
 
 import numbers
 import operator
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -55,14 +56,13 @@ def check_shape(name: str, value: Tensor, form: str, *allowed: Sequence[int | No
     raise ValueError(f"{name} must have shape {expected}, got {shape}")
 
 
-def as_int(value: object) -> int | None:
+def as_int(value: Any) -> int | None:
     """An int, also of NumPy, as Python's; None where it is not one. bool and floats are not."""
     if isinstance(value, (bool, Tensor)):
         return None
-    if isinstance(value, (int, torch.SymInt)):
-        return value
+    known = isinstance(value, (int, torch.SymInt))
     try:
-        return operator.index(value)
+        return value if known else operator.index(value)
     except TypeError:
         return None
 
@@ -71,13 +71,12 @@ def check_pair(name: str, value: Sequence[int], lowest: int) -> tuple[int, int]:
     """Two ints of at least `lowest`, else TypeError or ValueError."""
     if not isinstance(value, (tuple, list, torch.Size)) or len(value) != 2:
         raise TypeError(f"{name} must be a pair of ints, got {value!r}")
-    pair = tuple(as_int(item) for item in value)
-    for item in pair:
-        if item is None:
-            raise TypeError(f"{name} must be a pair of ints, got {value!r}")
-        if item < lowest:
-            raise ValueError(f"{name} must be at least {lowest} along both axes, got {value!r}")
-    return pair
+    first, second = as_int(value[0]), as_int(value[1])
+    if first is None or second is None:
+        raise TypeError(f"{name} must be a pair of ints, got {value!r}")
+    if first < lowest or second < lowest:
+        raise ValueError(f"{name} must be at least {lowest} along both axes, got {value!r}")
+    return first, second
 
 
 def channels_first(image: Tensor) -> Tensor:
@@ -88,7 +87,7 @@ def channels_first(image: Tensor) -> Tensor:
 
 def per_channel(name: str, value: float | Sequence[float], channels: int) -> tuple[float, ...]:
     """`mean` or `std` as one number a channel; ValueError where they are not."""
-    values = (value,) * channels if isinstance(value, numbers.Real) else tuple(value)
+    values = tuple(value) if isinstance(value, Iterable) else (value,) * channels
     if len(values) != channels:
         raise ValueError(f"{name} must be one number or one a channel, {channels}, got {value!r}")
     if name == "std" and not all(v > 0 for v in values):

@@ -6,13 +6,14 @@ import torch
 from torch import Tensor
 
 from darswin.ops import _library, reference
-from darswin.ops.checks import check_shape, check_tensor
-from darswin.ops.polar_sample import (
-    sampling_arguments,
-    sampling_gradients,
-    sampling_wants,
-    wanted_gradients,
+from darswin.ops._sampling import (
+    TENSORS,
+    Sampling,
+    checked_sampling,
+    input_gradients,
+    wanted_groups,
 )
+from darswin.ops.checks import check_shape, check_tensor
 
 
 def polar_embed(
@@ -25,18 +26,18 @@ def polar_embed(
     *,
     affine: Tensor | None = None,
     offsets: Tensor | None = None,
-    patch: tuple[int, int],
+    samples: tuple[int, int],
     jitter: float = 0.0,
     seed: int | Tensor = 0,
-    mean: float | Sequence[float] | None = None,
-    std: float | Sequence[float] | None = None,
+    mean: float | Sequence[float] = 0.0,
+    std: float | Sequence[float] = 1.0,
 ) -> Tensor:
     """Samples the patches of a polar grid and maps each to a token: `F.linear(polar_sample(...))`.
 
-    The samples are never written to memory; backward makes them again.
+    The samples are never written to memory; backward recomputes them.
 
     Args:
-        image, radii, azimuths, center, affine, offsets, patch, jitter, seed, mean, std: as
+        image, radii, azimuths, center, affine, offsets, samples, jitter, seed, mean, std: as
             `polar_sample`.
         weight: (D, S_r·S_φ·C), float64 if the image is, else float32 or bfloat16.
         bias: (D,) or None, as weight.
@@ -54,63 +55,55 @@ def polar_embed(
 
     Source: DarSwin, ICCV 2023, sec. 4.3.
     """
-    sampling = sampling_arguments(
-        image, radii, azimuths, center, affine, offsets, patch, jitter, seed, mean, std
+    sampling = checked_sampling(
+        image, radii, azimuths, center, affine, offsets, jitter, seed, samples, mean, std
     )
-    image, patch = sampling[0], sampling[6]
+    image = sampling.image
     double = image.dtype == torch.float64
     dtypes = (torch.float64,) if double else (torch.float32, torch.bfloat16)
     check_tensor("weight", weight, like=image, dtypes=dtypes)
-    samples = patch[0] * patch[1] * image.shape[1]
-    check_shape("weight", weight, "(D, S_r·S_φ·C) = (any, {})", (None, samples))
+    form = "(D, S_r·S_φ·C) = (any, {})"
+    check_shape("weight", weight, form, (None, sampling.token_size))
     if bias is not None:
         check_tensor("bias", bias, like=image, dtypes=dtypes)
         check_shape("bias", bias, "(D,) = ({},)", (weight.shape[0],))
-    arguments = (*sampling[:6], weight, bias, *sampling[6:], _library.output_bfloat16(image))
-    return _library.run(torch.ops.darswin.polar_embed, reference.polar_embed, arguments)
+    return _library.run(reference.polar_embed, sampling, weight, bias)
 
 
 @torch.library.register_fake("darswin::polar_embed")
-def _fake(image, radii, azimuths, center, affine, offsets, weight, bias, patch, *settings):
-    shape = (
-        image.shape[0], radii.shape[1] // patch[0], azimuths.shape[0] // patch[1], weight.shape[0],
-    )  # fmt: skip
-    bfloat16 = settings[-1]
-    return radii.new_empty(shape, dtype=torch.bfloat16 if bfloat16 else None)
+def _fake(*arguments):
+    *fields, weight, _bias = arguments
+    sampling = Sampling(*fields)
+    return sampling.new_output((*sampling.map_size, weight.shape[0]))
 
 
 @torch.library.register_fake("darswin::polar_embed_backward")
-def _fake_backward(grad_out, image, radii, azimuths, center, affine, offsets, weight, *settings):
-    *_, image_grad, lens_grad, offsets_grad, weight_grad = settings
-    wants = (image_grad, lens_grad, offsets_grad)
+def _fake_backward(*arguments):
+    *fields, weight, _grad_out, image_grad, lens_grad, offsets_grad, weight_grad = arguments
+    sampling = Sampling(*fields)
     return (
-        *sampling_gradients(image, radii, center, affine, offsets, *wants),
-        radii.new_empty(weight.shape if weight_grad else (0,)),
-        radii.new_empty(weight.shape[:1] if weight_grad else (0,)),
+        *sampling.new_gradients(image_grad, lens_grad, offsets_grad),
+        sampling.radii.new_empty(weight.shape if weight_grad else (0,)),
+        sampling.radii.new_empty(weight.shape[:1] if weight_grad else (0,)),
     )
 
 
 def _setup_context(ctx, inputs, output):
-    *sampling, weight, bias, patch, jitter, seed, mean, std, bfloat16 = inputs
-    ctx.save_for_backward(*sampling, weight, jitter, seed)
-    ctx.settings = patch, (mean, std, bfloat16)
+    *settings, weight, bias = inputs[TENSORS:]
+    ctx.save_for_backward(*inputs[:TENSORS], weight)
+    ctx.settings = settings
     ctx.bias_dtype = weight.dtype if bias is None else bias.dtype
 
 
 def _backward(ctx, grad_out):
     _library.refuse_other_derivatives("polar_embed's backward", (grad_out,))
-    *sampling, weight, jitter, seed = ctx.saved_tensors
-    patch, rest = ctx.settings
-    wants_weight, wants_bias = ctx.needs_input_grad[6:8]
-    image, radii, center, affine, offsets, grad_weight, grad_bias = (
-        torch.ops.darswin.polar_embed_backward(
-            grad_out, *sampling, weight, patch, jitter, seed, *rest,
-            *sampling_wants(ctx.needs_input_grad), wants_weight or wants_bias,
-        )
-    )  # fmt: skip
-    grads = (image, radii, None, center, affine, offsets)
-    grads += (grad_weight.to(weight.dtype), grad_bias.to(ctx.bias_dtype))
-    return wanted_gradients(ctx, *grads, *(None,) * 6)
+    *tensors, weight = ctx.saved_tensors
+    needs = ctx.needs_input_grad
+    *gradients, grad_weight, grad_bias = torch.ops.darswin.polar_embed_backward(
+        *tensors, *ctx.settings, weight, grad_out, *wanted_groups(needs), needs[-2] or needs[-1]
+    )
+    layer = grad_weight.to(weight.dtype), grad_bias.to(ctx.bias_dtype)
+    return input_gradients(needs, *gradients, *layer)
 
 
 torch.library.register_autograd("darswin::polar_embed", _backward, setup_context=_setup_context)

@@ -7,17 +7,14 @@ import torch
 from torch import Tensor
 
 from darswin.ops import _library, reference
-from darswin.ops.checks import (
-    DTYPES,
-    as_int,
-    channels_first,
-    check_jitter,
-    check_layout,
-    check_pair,
-    check_shape,
-    check_tensor,
-    per_channel,
+from darswin.ops._sampling import (
+    TENSORS,
+    Sampling,
+    checked_sampling,
+    input_gradients,
+    wanted_groups,
 )
+from darswin.ops.checks import check_layout
 
 
 def polar_sample(
@@ -28,18 +25,18 @@ def polar_sample(
     *,
     affine: Tensor | None = None,
     offsets: Tensor | None = None,
-    patch: tuple[int, int],
+    samples: tuple[int, int],
     jitter: float = 0.0,
     seed: int | Tensor = 0,
     layout: Literal["tokens", "image"] = "tokens",
-    mean: float | Sequence[float] | None = None,
-    std: float | Sequence[float] | None = None,
+    mean: float | Sequence[float] = 0.0,
+    std: float | Sequence[float] = 1.0,
 ) -> Tensor:
     """Samples an image bilinearly on a polar grid, zeros outside.
 
     Point (i, j) of image b stands at `(x, y) = center + affine @ (r cos a, r sin a) +
-    offsets[b, :, i, j]` with `r = radii[b, i]` and `a = azimuths[j]`. A lens that is round needs
-    neither affine nor offsets, and pays nothing for them.
+    offsets[b, :, i, j]` with `r = radii[b, i]` and `a = azimuths[j]`. A lens that is circular
+    needs neither affine nor offsets, and pays nothing for them.
 
     Convention:
         Pixel centres are integers, x to the right in [0, W-1] and y down in [0, H-1]; azimuth 0
@@ -54,9 +51,9 @@ def polar_sample(
         azimuths: (A·S_φ,) rad. They get no gradient.
         center: (B or 1, 2) px, x then y.
         affine: (B or 1, 2, 2), of rows x and y: aspect ratio and skew. None is the identity.
-        offsets: (B or 1, 2, R·S_r, A·S_φ) px, x then y: what is left of a lens that is not round,
-            such as its tangential distortion. None is zero.
-        patch: (S_r, S_φ), the samples of a patch along radius and azimuth.
+        offsets: (B or 1, 2, R·S_r, A·S_φ) px, x then y: what else moves the points of a
+            general lens, such as its tangential distortion. None is zero.
+        samples: (S_r, S_φ), the samples of a patch along radius and azimuth.
         jitter: in [0, 1]. Moves each point by `u·jitter` cells along its row of radii (linear
             between neighbours, extrapolated at both ends, never below 0) and by
             `v·jitter·2π/(A·S_φ)` in azimuth, before the matrix; its offset stays that of the
@@ -65,8 +62,9 @@ def polar_sample(
             counter (⌊p/4⌋, b).
         seed: int or 0-dim int64 tensor on the CPU. Without jitter it is not used.
         layout: "tokens" or "image".
-        mean, std: of uint8 images only, which count as `(pixel/255 - mean) / std`: one number, or
-            one a channel. None means 0 and 1. Outside the image is zero after this.
+        mean, std: one number, or one a channel. Pixels of type uint8 count as
+            `(pixel/255 - mean) / std`, zero outside the image; those of other types count as they
+            are, whatever mean and std say.
 
     Returns:
         "tokens": (B, R, A, S_r·S_φ·C), inner order (S_r, S_φ, C).
@@ -88,142 +86,40 @@ def polar_sample(
 
     Source: DarSwin, ICCV 2023, sec. 4.3.
     """
-    sampling = sampling_arguments(
-        image, radii, azimuths, center, affine, offsets, patch, jitter, seed, mean, std
+    sampling = checked_sampling(
+        image, radii, azimuths, center, affine, offsets, jitter, seed, samples, mean, std
     )
     check_layout(layout)
-    arguments = (*sampling, layout == "tokens", _library.output_bfloat16(sampling[0]))
-    return _library.run(torch.ops.darswin.polar_sample, reference.polar_sample, arguments)
-
-
-def sampling_arguments(
-    image, radii, azimuths, center, affine, offsets, patch, jitter, seed, mean, std
-) -> tuple:
-    """What `polar_sample` and `polar_embed` share, checked, as the operators take it."""
-    if isinstance(image, Tensor):
-        image = _library.without_float16(image)
-    check_tensor("image", image, dtypes=(*DTYPES, torch.bfloat16, torch.uint8))
-    check_shape("image", image, "(B, C, H, W)", (None,) * 4)
-    image = channels_first(image)
-    geometry = None if image.dtype in DTYPES else (torch.float32,)
-    tensors = dict(radii=radii, azimuths=azimuths, center=center, affine=affine, offsets=offsets)
-    for name, value in tensors.items():
-        if value is not None or name not in ("affine", "offsets"):
-            check_tensor(name, value, like=image, dtypes=geometry)
-    batch, channels = image.shape[:2]
-    check_shape("radii", radii, "(B or 1, R·S_r) = ({} or 1, any)", (batch, None), (1, None))
-    check_shape("azimuths", azimuths, "(A·S_φ,)", (None,))
-    check_shape("center", center, "(B or 1, 2) = ({} or 1, 2)", (batch, 2), (1, 2))
-    if affine is not None:
-        form = "(B or 1, 2, 2) = ({} or 1, 2, 2)"
-        check_shape("affine", affine, form, (batch, 2, 2), (1, 2, 2))
-    if offsets is not None:
-        points = (2, radii.shape[1], azimuths.shape[0])
-        form = "(B or 1, 2, R·S_r, A·S_φ) = ({} or 1, {}, {}, {})"
-        check_shape("offsets", offsets, form, (batch, *points), (1, *points))
-    patch = check_pair("patch", patch, lowest=1)
-    if radii.shape[1] % patch[0] or azimuths.shape[0] % patch[1]:
-        raise ValueError(
-            f"patch = (S_r, S_φ) must divide (R·S_r, A·S_φ) = "
-            f"({radii.shape[1]}, {azimuths.shape[0]}), got {patch}"
-        )
-    jitter, key = _jitter_tensors(jitter, seed)
-    if image.dtype == torch.uint8:
-        mean = per_channel("mean", 0.0 if mean is None else mean, channels)
-        std = per_channel("std", 1.0 if std is None else std, channels)
-    elif mean is None and std is None:
-        mean = std = ()
-    else:
-        raise ValueError(f"mean and std go with uint8 images, got an image of {image.dtype}")
-    return image, radii, azimuths, center, affine, offsets, patch, jitter, key, mean, std
-
-
-def _jitter_tensors(jitter: float, seed: int | Tensor) -> tuple[Tensor | None, Tensor | None]:
-    """Jitter and seed as the operators take them: tensors, so that a graph which is compiled does
-    not keep their values. None and None without jitter."""
-    jitter = check_jitter(jitter)
-    if jitter == 0:
-        return None, None
-    return torch.tensor(jitter, dtype=torch.float64, device="cpu"), _seed_tensor(seed)
-
-
-def _seed_tensor(seed: int | Tensor) -> Tensor:
-    if isinstance(seed, Tensor):
-        if seed.dtype != torch.int64 or seed.dim() != 0:
-            raise ValueError(
-                f"seed must be an int or a 0-dim int64 tensor, got {seed.dtype} of shape "
-                f"{tuple(seed.shape)}"
-            )
-        return seed
-    key = as_int(seed)
-    if key is None:
-        raise TypeError(f"seed must be an int or a 0-dim int64 tensor, got {type(seed).__name__}")
-    if not -(2**63) <= key < 2**63:
-        raise ValueError(f"seed must fit 64 bits, got {seed}")
-    return torch.tensor(key, dtype=torch.int64, device="cpu")
+    return _library.run(reference.polar_sample, sampling, layout == "tokens")
 
 
 @torch.library.register_fake("darswin::polar_sample")
-def _fake(image, radii, azimuths, center, affine, offsets, patch, *settings):
-    *_, tokens, bfloat16 = settings
-    batch, channels = image.shape[:2]
-    rows, columns = radii.shape[1], azimuths.shape[0]
+def _fake(*arguments):
+    *fields, tokens = arguments
+    sampling = Sampling(*fields)
     if tokens:
-        shape = (batch, rows // patch[0], columns // patch[1], patch[0] * patch[1] * channels)
-    else:
-        shape = (batch, channels, rows, columns)
-    return radii.new_empty(shape, dtype=torch.bfloat16 if bfloat16 else None)
+        return sampling.new_output((*sampling.map_size, sampling.token_size))
+    rows, columns = sampling.radii.shape[1], sampling.azimuths.shape[0]
+    return sampling.new_output((*sampling.image.shape[:2], rows, columns))
 
 
 @torch.library.register_fake("darswin::polar_sample_backward")
-def _fake_backward(grad_out, image, radii, azimuths, center, affine, offsets, *settings):
-    return sampling_gradients(image, radii, center, affine, offsets, *settings[-3:])
-
-
-def sampling_gradients(
-    image, radii, center, affine, offsets, image_grad, lens_grad, offsets_grad
-) -> tuple[Tensor, ...]:
-    """The gradients of the sampling as the backward operators give them: empty if not wanted."""
-    return tuple(
-        value.new_empty(value.shape) if wanted and value is not None else like.new_empty((0,))
-        for value, like, wanted in (
-            (image, image, image_grad),
-            (radii, radii, lens_grad),
-            (center, radii, lens_grad),
-            (affine, radii, lens_grad),
-            (offsets, radii, offsets_grad),
-        )
-    )
-
-
-def sampling_wants(needs_input_grad: Sequence[bool]) -> tuple[bool, bool, bool]:
-    """Whether backward needs the gradients of the image, of the lens and of the offsets."""
-    image, radii, _, center, affine, offsets = needs_input_grad[:6]
-    return image, radii or center or affine, offsets
+def _fake_backward(*arguments):
+    *fields, _tokens, _grad_out, image_grad, lens_grad, offsets_grad = arguments
+    return Sampling(*fields).new_gradients(image_grad, lens_grad, offsets_grad)
 
 
 def _setup_context(ctx, inputs, output):
-    *sampling, patch, jitter, seed, mean, std, tokens, bfloat16 = inputs
-    ctx.save_for_backward(*sampling, jitter, seed)
-    ctx.settings = patch, (mean, std, tokens, bfloat16)
+    ctx.save_for_backward(*inputs[:TENSORS])
+    ctx.settings = inputs[TENSORS:]
 
 
 def _backward(ctx, grad_out):
     _library.refuse_other_derivatives("polar_sample's backward", (grad_out,))
-    *sampling, jitter, seed = ctx.saved_tensors
-    patch, rest = ctx.settings
-    image, radii, center, affine, offsets = torch.ops.darswin.polar_sample_backward(
-        grad_out, *sampling, patch, jitter, seed, *rest, *sampling_wants(ctx.needs_input_grad)
+    gradients = torch.ops.darswin.polar_sample_backward(
+        *ctx.saved_tensors, *ctx.settings, grad_out, *wanted_groups(ctx.needs_input_grad)
     )
-    return wanted_gradients(ctx, image, radii, None, center, affine, offsets, *(None,) * 7)
-
-
-def wanted_gradients(ctx, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
-    """The gradients of inputs that need one, None for the others."""
-    return tuple(
-        gradient if wanted else None
-        for gradient, wanted in zip(gradients, ctx.needs_input_grad, strict=True)
-    )
+    return input_gradients(ctx.needs_input_grad, *gradients, None)
 
 
 torch.library.register_autograd("darswin::polar_sample", _backward, setup_context=_setup_context)

@@ -1,6 +1,7 @@
 """The operators in plain PyTorch: oracle of the tests, and what runs on other devices.
 
-Arguments come checked, as the compiled operators get them.
+An operator and its twin have the same name and the same parameters, which come checked; those of a
+sampling come as one.
 """
 
 import math
@@ -9,6 +10,8 @@ from collections.abc import Sequence
 import torch
 import torch.nn.functional as F
 from torch import Tensor
+
+from darswin.ops._sampling import Sampling
 
 _WORD = 0xFFFFFFFF
 
@@ -71,29 +74,17 @@ def normalized(
     return (image.to(dtype) / 255 - m) / s
 
 
-def polar_sample(
-    image: Tensor,
-    radii: Tensor,
-    azimuths: Tensor,
-    center: Tensor,
-    affine: Tensor | None,
-    offsets: Tensor | None,
-    patch: tuple[int, int],
-    jitter: Tensor | None,
-    seed: Tensor | None,
-    mean: Sequence[float],
-    std: Sequence[float],
-    tokens: bool,
-    bfloat16: bool,
-) -> Tensor:
+def polar_sample(sampling: Sampling, tokens: bool) -> Tensor:
     """See `darswin.ops.polar_sample`."""
+    image, radii, azimuths, center, affine, offsets = sampling[:6]
     if image.dtype == torch.uint8:
-        image = normalized(image, mean, std)
+        image = normalized(image, sampling.mean, sampling.std)
     image = image.to(radii.dtype)  # bfloat16 is computed in float32
     batch, channels, height, width = image.shape
     rows, columns = radii.shape[1], azimuths.shape[0]
     r, a = radii[:, :, None], azimuths[None, None, :]
-    if jitter is not None and rows > 0 and columns > 0:
+    jitter, seed = sampling.jitter, sampling.seed
+    if jitter is not None and seed is not None and rows > 0 and columns > 0:
         r, a = _jittered(radii, azimuths, batch, jitter, seed)
     # Gradients must not meet what is not a number: it stays one when it is multiplied with 0.
     known = r.isfinite() & a.isfinite()
@@ -111,7 +102,7 @@ def polar_sample(
     left, top = x.detach().floor(), y.detach().floor()
     right, lower = x - left, y - top
     pixels = image.flatten(2)
-    out = 0
+    out = image.new_zeros(())
     for down, wy in ((0, 1 - lower), (1, lower)):
         for across, wx in ((0, 1 - right), (1, right)):
             column, row = left.long() + across, top.long() + down
@@ -123,38 +114,21 @@ def polar_sample(
             # A pixel that is not there must not count, were it NaN.
             corner = torch.where(inside[:, None], corner, 0)
             out = out + (wx * wy)[:, None] * corner
-    out = out.bfloat16() if bfloat16 else out
+    out = out.bfloat16() if sampling.bfloat16 else out
     if not tokens:
         return out
-    rings, sectors = rows // patch[0], columns // patch[1]
-    out = out.reshape(batch, channels, rings, patch[0], sectors, patch[1])
-    samples = patch[0] * patch[1] * channels
-    return out.permute(0, 2, 4, 3, 5, 1).reshape(batch, rings, sectors, samples)
+    size, (along, around) = sampling.map_size, sampling.samples
+    out = out.reshape(batch, channels, size[1], along, size[2], around)
+    return out.permute(0, 2, 4, 3, 5, 1).reshape(*size, sampling.token_size)
 
 
-def polar_embed(
-    image: Tensor,
-    radii: Tensor,
-    azimuths: Tensor,
-    center: Tensor,
-    affine: Tensor | None,
-    offsets: Tensor | None,
-    weight: Tensor,
-    bias: Tensor | None,
-    patch: tuple[int, int],
-    jitter: Tensor | None,
-    seed: Tensor | None,
-    mean: Sequence[float],
-    std: Sequence[float],
-    bfloat16: bool,
-) -> Tensor:
+def polar_embed(sampling: Sampling, weight: Tensor, bias: Tensor | None) -> Tensor:
     """See `darswin.ops.polar_embed`."""
-    settings = (patch, jitter, seed, mean, std, True, False)
-    samples = polar_sample(image, radii, azimuths, center, affine, offsets, *settings)
+    samples = polar_sample(sampling._replace(bfloat16=False), tokens=True)
     weight = weight.to(samples.dtype)
     bias = None if bias is None else bias.to(samples.dtype)
     out = F.linear(samples, weight, bias)
-    return out.bfloat16() if bfloat16 else out
+    return out.bfloat16() if sampling.bfloat16 else out
 
 
 def window_attention(

@@ -15,7 +15,6 @@ def window_attention(
     shift: tuple[int, int] = (0, 0),
     periodic: tuple[bool, bool] = (False, True),
     scale: float | None = None,
-    dropout: float = 0.0,
 ) -> Tensor:
     """Attends inside each window of a polar map: `softmax(q·k·scale + bias)·v`.
 
@@ -34,8 +33,6 @@ def window_attention(
         periodic: whether the map wraps around along (radius, azimuth). A plain Swin map is
             (False, False).
         scale: of the logits; None means d^-½.
-        dropout: of the probabilities. Only 0 is there: it is what DarSwin was trained with, and
-            what Swin's recipes use.
 
     Returns:
         (B, R, A, heads·d).
@@ -46,8 +43,7 @@ def window_attention(
     Raises:
         TypeError: a tensor of another dtype, or an argument of another type.
         ValueError: a shape, device or range that does not fit.
-        NotImplementedError: a dropout other than 0; forward-mode derivatives, those of torch.func,
-            and second ones.
+        NotImplementedError: forward-mode derivatives, those of torch.func, and second ones.
 
     Source: DarSwin, ICCV 2023, sec. 4.4; Swin Transformer, ICCV 2021, sec. 3.2.
     """
@@ -71,14 +67,10 @@ def window_attention(
     table = (2 * window[0] - 1, 2 * window[1] - 1)
     form = "(B or 1, heads, 2·M_r-1, 2·M_φ-1) = ({} or 1, {}, {}, {})"
     check_shape("bias", bias, form, (batch, heads, *table), (1, heads, *table))
-    if dropout != 0:
-        raise NotImplementedError(
-            f"window_attention has no dropout: DarSwin's recipe uses 0, got {dropout!r}"
-        )
     scale = head_dim**-0.5 if scale is None else float(scale)
     # As ints: torch.jit.trace takes no list of bools.
-    arguments = (qkv, bias, window, shift, tuple(int(bool(p)) for p in periodic), scale)
-    return _library.run(torch.ops.darswin.window_attention, reference.window_attention, arguments)
+    wrap = tuple(int(bool(p)) for p in periodic)
+    return _library.run(reference.window_attention, qkv, bias, window, shift, wrap, scale)
 
 
 def _arithmetic_types(qkv: Tensor, bias: Tensor) -> tuple[Tensor, Tensor]:
@@ -98,7 +90,7 @@ def _fake(qkv, bias, window, shift, periodic, scale):
 
 
 @torch.library.register_fake("darswin::window_attention_backward")
-def _fake_backward(grad_out, qkv, bias, window, shift, periodic, scale):
+def _fake_backward(qkv, bias, window, shift, periodic, scale, grad_out):
     return qkv.new_empty(qkv.shape), bias.new_empty(bias.shape)
 
 
@@ -111,7 +103,7 @@ def _setup_context(ctx, inputs, output):
 def _backward(ctx, grad_out):
     _library.refuse_other_derivatives("window_attention's backward", (grad_out,))
     grad_qkv, grad_bias = torch.ops.darswin.window_attention_backward(
-        grad_out, *ctx.saved_tensors, *ctx.settings
+        *ctx.saved_tensors, *ctx.settings, grad_out
     )
     return grad_qkv, grad_bias, None, None, None, None
 

@@ -72,15 +72,15 @@ def strided(draw, tensor: Tensor) -> Tensor:
 def grids(draw, largest: int = 4000):
     """Rings, sectors and samples of a patch, no more than `largest` points in all."""
     rings, sectors = draw(sizes(0, 1, 2, 3, 5)), draw(sizes(0, 1, 2, 3, 8, 17, 64, 257, 300))
-    patch = draw(sizes(1, 2, 3, 4, 7, 10)), draw(sizes(1, 2, 3, 4, 5, 10, 33, 1030))
-    while rings * patch[0] * sectors * patch[1] > largest:
+    samples = draw(sizes(1, 2, 3, 4, 7, 10)), draw(sizes(1, 2, 3, 4, 5, 10, 33, 1030))
+    while rings * samples[0] * sectors * samples[1] > largest:
         if sectors > 2:
             sectors = (sectors + 1) // 2
         elif rings > 1:
             rings -= 1
         else:
-            patch = (max(patch[0] // 2, 1), max(patch[1] // 2, 1))
-    return rings, sectors, patch
+            samples = (max(samples[0] // 2, 1), max(samples[1] // 2, 1))
+    return rings, sectors, samples
 
 
 @st.composite
@@ -130,13 +130,13 @@ def places(radii, azimuths, center, affine, offsets, batch, jitter, seed) -> tup
     return x.expand(shape), y.expand(shape), r.expand(shape)
 
 
-def to_tokens(planes: Tensor, patch: tuple[int, int]) -> Tensor:
+def to_tokens(planes: Tensor, samples: tuple[int, int]) -> Tensor:
     """(B, C, R·S_r, A·S_φ) → (B, R, A, S_r·S_φ·C), by torch alone."""
     batch, channels, rows, columns = planes.shape
-    rings, sectors = rows // patch[0], columns // patch[1]
-    parts = planes.reshape(batch, channels, rings, patch[0], sectors, patch[1])
+    rings, sectors = rows // samples[0], columns // samples[1]
+    parts = planes.reshape(batch, channels, rings, samples[0], sectors, samples[1])
     return parts.permute(0, 2, 4, 3, 5, 1).reshape(
-        batch, rings, sectors, patch[0] * patch[1] * channels
+        batch, rings, sectors, samples[0] * samples[1] * channels
     )
 
 
@@ -146,8 +146,8 @@ def sampling(draw, dtypes=(f32, f64), embed: bool = False) -> Case:
     generator, dtype = draw(generators()), draw(st.sampled_from(dtypes))
     batch, channels = draw(sizes(0, 1, 2, 3, 5)), draw(sizes(0, 1, 2, 3, 3, 4, 5, 8, 17))
     size = draw(sizes(0, 1, 2, 7, 16, 33, 90)), draw(sizes(0, 1, 2, 7, 16, 33, 90))
-    rings, sectors, patch = draw(grids())
-    rows, columns = rings * patch[0], sectors * patch[1]
+    rings, sectors, samples = draw(grids())
+    rows, columns = rings * samples[0], sectors * samples[1]
     image = draw(strided(normal(generator, batch, channels, *size, dtype=dtype)))
     lens = draw(lenses(generator, batch, size, rows, columns, dtype))
     radii, azimuths, center, affine, offsets = (
@@ -155,7 +155,7 @@ def sampling(draw, dtypes=(f32, f64), embed: bool = False) -> Case:
     )
     jitter = draw(st.sampled_from([0.0, 0.0, 1.0, 0.3]))
     seed = draw(st.integers(-(2**63), 2**63 - 1))
-    options = dict(patch=patch, jitter=jitter, seed=seed)
+    options = dict(samples=samples, jitter=jitter, seed=seed)
     inputs = dict(image=image, radii=radii, center=center)
     if affine is not None:
         inputs["affine"] = affine
@@ -163,8 +163,8 @@ def sampling(draw, dtypes=(f32, f64), embed: bool = False) -> Case:
         inputs["offsets"] = offsets
     if embed:
         features = draw(sizes(0, 1, 2, 15, 16, 17, 48))
-        samples = patch[0] * patch[1] * channels
-        inputs["weight"] = draw(strided(normal(generator, features, samples, dtype=dtype)))
+        depth = samples[0] * samples[1] * channels
+        inputs["weight"] = draw(strided(normal(generator, features, depth, dtype=dtype)))
         if draw(st.booleans()):
             inputs["bias"] = draw(strided(normal(generator, features, dtype=dtype)))
     else:
@@ -172,11 +172,11 @@ def sampling(draw, dtypes=(f32, f64), embed: bool = False) -> Case:
 
     settings = options | dict(azimuths=azimuths)
 
-    def run(image, radii, center, weight=None, bias=None, **bends):
+    def run(image, radii, center, weight=None, bias=None, **general):
         grid = (image, radii, settings["azimuths"].to(radii.dtype), center)
         if embed:
-            return polar_embed(*grid, weight, bias, **bends, **options)
-        return polar_sample(*grid, **bends, **options)
+            return polar_embed(*grid, weight, bias, **general, **options)
+        return polar_sample(*grid, **general, **options)
 
     def mask(image, radii, center, weight=None, bias=None, affine=None, offsets=None):
         """Bilinear gradients jump at borders of pixels, and where jitter meets the radius 0."""
@@ -187,9 +187,9 @@ def sampling(draw, dtypes=(f32, f64), embed: bool = False) -> Case:
             smooth &= r > 1e-3
         planes = smooth[:, None].expand(-1, channels, -1, -1).to(f64)
         if embed:  # a token has a gradient if all of its samples may have one
-            tokens = to_tokens(smooth[:, None].to(f64), patch)
+            tokens = to_tokens(smooth[:, None].to(f64), samples)
             return tokens.amin(-1, keepdim=True)
-        return planes if options["layout"] == "image" else to_tokens(planes, patch)
+        return planes if options["layout"] == "image" else to_tokens(planes, samples)
 
     return Case(run, inputs, mask, settings)
 

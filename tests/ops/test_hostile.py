@@ -25,41 +25,39 @@ DTYPES = (
 )  # fmt: skip
 
 
-def sampling(dtype=torch.float32, batch=2):
-    """image, radii, azimuths, center, affine, offsets."""
+def sampling(dtype=torch.float32, batch=2, seed=3):
+    """The arguments that polar_sample and polar_embed share."""
     radii, azimuths = torch.rand(batch, 4, dtype=dtype) * 5, torch.linspace(0, 6, 6, dtype=dtype)
     affine = torch.eye(2, dtype=dtype)[None]
     offsets = torch.rand(1, 2, 4, 6, dtype=dtype)
     image = torch.rand(batch, 3, 5, 7, dtype=dtype)
-    return [image, radii, azimuths, torch.full((1, 2), 3.0, dtype=dtype), affine, offsets]
-
-
-def jitter(seed=3):
-    return [[2, 3], torch.tensor(0.5, dtype=torch.float64), torch.tensor(seed), [], []]
+    jitter = torch.tensor(0.5, dtype=torch.float64)
+    center = torch.full((1, 2), 3.0, dtype=dtype)
+    return [image, radii, azimuths, center, affine, offsets, jitter, torch.tensor(seed), [2, 3],
+            [], [], False]  # fmt: skip
 
 
 # A valid call of each operator.
 CALLS = {
-    "polar_sample": lambda: [*sampling(), *jitter(), True, False],
+    "polar_sample": lambda: [*sampling(), True],
     "polar_sample_backward": lambda: [
-        torch.rand(2, 2, 2, 18), *sampling(), *jitter(), True, False, True, True, True,
+        *sampling(), True, torch.rand(2, 2, 2, 18), True, True, True,
     ],
-    "polar_embed": lambda: [*sampling(), torch.rand(5, 18), torch.rand(5), *jitter(), False],
+    "polar_embed": lambda: [*sampling(), torch.rand(5, 18), torch.rand(5)],
     "polar_embed_backward": lambda: [
-        torch.rand(2, 2, 2, 5), *sampling(), torch.rand(5, 18), *jitter(), False,
-        True, True, True, True,
+        *sampling(), torch.rand(5, 18), torch.rand(2, 2, 2, 5), True, True, True, True,
     ],
     "window_attention": lambda: [
         torch.rand(2, 4, 6, 3, 2, 5), torch.rand(1, 2, 3, 5), [2, 3], [1, 2], [0, 1], 0.5,
     ],
     "window_attention_backward": lambda: [
-        torch.rand(2, 4, 6, 10), torch.rand(2, 4, 6, 3, 2, 5), torch.rand(2, 2, 3, 5), [2, 3],
-        [1, 2], [0, 1], 0.5,
+        torch.rand(2, 4, 6, 3, 2, 5), torch.rand(2, 2, 3, 5), [2, 3], [1, 2], [0, 1], 0.5,
+        torch.rand(2, 4, 6, 10),
     ],
-    "add_norm_": lambda: [
+    "_add_norm_": lambda: [
         torch.rand(3, 4), torch.rand(3, 4), torch.rand(4), torch.rand(4), 1e-5,
     ],
-    "transpose_sum": lambda: [torch.rand(5, 7)],
+    "_transpose_sum": lambda: [torch.rand(5, 7)],
 }  # fmt: skip
 
 

@@ -1,15 +1,20 @@
 """What the operators share: which of two runs, autocast, and the derivatives that there are not."""
 
+import functools
+import inspect
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
 from torch.autograd import forward_ad
 from torch.func import vmap
 
+from darswin import ops
 from darswin.layers.sampling import PolarSample
-from darswin.ops import polar_embed, polar_sample, use_reference, window_attention
-from darswin.ops.add_norm import add_norm_
-from darswin.ops.transpose_sum import transpose_sum
+from darswin.ops import polar_embed, polar_sample, reference, use_reference, window_attention
+from darswin.ops._add_norm import add_norm_
+from darswin.ops._transpose_sum import transpose_sum
 
 image, radii = torch.randn(1, 3, 8, 8), torch.linspace(0.5, 3, 4)[None]
 azimuths, center = torch.linspace(0, 6, 8), torch.tensor([[3.5, 3.5]])
@@ -18,9 +23,9 @@ weight = torch.randn(5, 12)
 
 # A function of one tensor for each operator, and the tensor.
 CALLS = {
-    "polar_sample": (lambda x: polar_sample(x, radii, azimuths, center, patch=(2, 2)), image),
+    "polar_sample": (lambda x: polar_sample(x, radii, azimuths, center, samples=(2, 2)), image),
     "polar_embed": (
-        lambda x: polar_embed(image, radii, azimuths, center, x, patch=(2, 2)), weight,
+        lambda x: polar_embed(image, radii, azimuths, center, x, samples=(2, 2)), weight,
     ),
     "window_attention": (lambda x: window_attention(x, bias, window=(1, 4)), qkv),
 }  # fmt: skip
@@ -30,6 +35,50 @@ operators = pytest.mark.parametrize("name", CALLS)
 def dual(run, x):
     with forward_ad.dual_level():
         return forward_ad.unpack_dual(run(forward_ad.make_dual(x, torch.ones_like(x)))).tangent
+
+
+def schemas():
+    """Name → schema of every compiled operator."""
+    names = {s.name for s in torch._C._jit_get_all_schemas() if s.name.startswith("darswin::")}
+    operators = {name.removeprefix("darswin::") for name in names}
+    return {name: getattr(torch.ops.darswin, name).default._schema for name in sorted(operators)}
+
+
+def test_every_compiled_operator_is_public_a_backward_or_private():
+    public = {name for name in schemas() if not name.startswith("_") and "_backward" not in name}
+    switches = {"cpu_capability", "reference_in_use", "use_reference"}
+    assert public == set(ops.__all__) - switches == set(CALLS)
+    backward = {name for name in schemas() if name.endswith("_backward")}
+    assert backward == {f"{name}_backward" for name in public}
+
+
+@operators
+def test_a_public_operator_has_a_twin_with_its_parameters_and_a_test_against_it(name):
+    names = []
+    for parameter in inspect.signature(getattr(reference, name)).parameters.values():
+        fields = getattr(parameter.annotation, "_fields", (parameter.name,))
+        names.extend(fields)
+    assert names == [argument.name for argument in schemas()[name].arguments]
+    tests = Path(__file__).with_name(f"test_{name}.py").read_text()
+    assert "assert_accurate(" in tests and "opcheck(" in tests
+
+
+@operators
+def test_use_reference_reaches_every_public_operator(name, monkeypatch):
+    run, x = CALLS[name]
+    calls, twin = [], getattr(reference, name)
+
+    @functools.wraps(twin)
+    def spy(*arguments):
+        calls.append(arguments)
+        return twin(*arguments)
+
+    monkeypatch.setattr(reference, name, spy)
+    run(x)
+    assert not calls
+    with use_reference():
+        run(x)
+    assert len(calls) == 1
 
 
 DERIVATIVES = {
@@ -118,18 +167,22 @@ def test_one_graph_for_any_jitter():
     @torch.compile(fullgraph=True, backend=counter)
     def run(jitter):
         seed = torch.tensor(1)
-        return polar_sample(image, radii, azimuths, center, patch=(2, 2), jitter=jitter, seed=seed)
+        return polar_sample(
+            image, radii, azimuths, center, samples=(2, 2), jitter=jitter, seed=seed
+        )
 
     for jitter in (0.1, 0.2, 0.3, 0.4, 0.5):
-        expected = polar_sample(image, radii, azimuths, center, patch=(2, 2), jitter=jitter, seed=1)
+        expected = polar_sample(
+            image, radii, azimuths, center, samples=(2, 2), jitter=jitter, seed=1
+        )
         assert torch.equal(run(jitter), expected)
     assert counter.frame_count == 2  # the first one keeps its value, as Dynamo does with any float
 
 
 def test_numpy_numbers_are_taken():
     one, two, four = np.int64(1), np.int32(2), np.uint8(4)
-    expected = polar_sample(image, radii, azimuths, center, patch=(2, 2), jitter=0.5, seed=4)
-    got = polar_sample(image, radii, azimuths, center, patch=(two, two), jitter=np.float32(0.5),
+    expected = polar_sample(image, radii, azimuths, center, samples=(2, 2), jitter=0.5, seed=4)
+    got = polar_sample(image, radii, azimuths, center, samples=(two, two), jitter=np.float32(0.5),
                        seed=four)  # fmt: skip
     assert torch.equal(got, expected)
     expected = window_attention(qkv, bias, window=(1, 4), shift=(1, 2))
@@ -139,18 +192,18 @@ def test_numpy_numbers_are_taken():
     frames = torch.randint(256, (1, 8, 8, 3), dtype=torch.uint8)
     means = [np.float32(0.5), 0.5]
     first, second = (
-        polar_sample(frames, radii, azimuths, center, patch=(2, 2), mean=mean) for mean in means
+        polar_sample(frames, radii, azimuths, center, samples=(2, 2), mean=mean) for mean in means
     )
     assert torch.equal(first, second)
 
 
 @pytest.mark.parametrize("bad", [2.0, np.float64(2), True, torch.tensor(2), "2", None])
 def test_what_is_no_int_is_no_size(bad):
-    with pytest.raises(TypeError, match="patch must be a pair of ints"):
-        polar_sample(image, radii, azimuths, center, patch=(bad, 2))
+    with pytest.raises(TypeError, match="samples must be a pair of ints"):
+        polar_sample(image, radii, azimuths, center, samples=(bad, 2))
 
 
 @pytest.mark.parametrize("bad", [2.0, np.float64(2), True, "2", None])
 def test_what_is_no_int_is_no_seed(bad):
     with pytest.raises(TypeError, match="seed must be an int"):
-        polar_sample(image, radii, azimuths, center, patch=(2, 2), jitter=0.5, seed=bad)
+        polar_sample(image, radii, azimuths, center, samples=(2, 2), jitter=0.5, seed=bad)

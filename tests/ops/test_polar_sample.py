@@ -7,7 +7,7 @@ import torch.nn.functional as F
 from helpers import assert_accurate, assert_equals_reference, with_gradients
 
 from darswin import _C
-from darswin.ops import polar_sample, reference_in_use, use_reference
+from darswin.ops import cpu_capability, polar_sample, reference_in_use, use_reference
 from darswin.ops.reference import philox
 
 LAYOUTS = ("tokens", "image")
@@ -26,14 +26,14 @@ def make_inputs(
     return image, radii, center, azimuths
 
 
-def sampler(azimuths, patch, **options):
+def sampler(azimuths, samples, **options):
     """polar_sample as a function of its differentiable inputs."""
     return lambda image, radii, center: polar_sample(
-        image, radii, azimuths.to(radii.dtype), center, patch=patch, **options
+        image, radii, azimuths.to(radii.dtype), center, samples=samples, **options
     )
 
 
-def away_from_borders(image, radii, center, azimuths, patch, layout):
+def away_from_borders(image, radii, center, azimuths, samples, layout):
     """1 at points that are not within 1e-3 px of where a bilinear gradient jumps, else 0."""
     r, a = radii.double()[:, :, None], azimuths.double()
     xy = (center.double()[:, 0, None, None] + r * torch.cos(a),
@@ -42,8 +42,8 @@ def away_from_borders(image, radii, center, azimuths, patch, layout):
     points = smooth[:, None].expand(len(image), image.shape[1], -1, -1)
     if layout == "image":
         return points
-    rings, sectors = radii.shape[1] // patch[0], len(azimuths) // patch[1]
-    points = points.unflatten(3, (sectors, patch[1])).unflatten(2, (rings, patch[0]))
+    rings, sectors = radii.shape[1] // samples[0], len(azimuths) // samples[1]
+    points = points.unflatten(3, (sectors, samples[1])).unflatten(2, (rings, samples[0]))
     return points.permute(0, 2, 4, 3, 5, 1).flatten(3)
 
 
@@ -66,21 +66,21 @@ SHAPES = {
 @pytest.mark.parametrize("jitter", [0.0, 0.8])
 @pytest.mark.parametrize("shape", SHAPES)
 def test_equals_reference_in_float64(shape, jitter, layout):
-    sizes, patch = SHAPES[shape]
+    sizes, samples = SHAPES[shape]
     *inputs, azimuths = make_inputs(**sizes, dtype=torch.float64)
-    run = sampler(azimuths, patch, jitter=jitter, seed=3, layout=layout)
+    run = sampler(azimuths, samples, jitter=jitter, seed=3, layout=layout)
     assert_equals_reference(run, inputs, rtol=1e-11, atol=1e-11)
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
 @pytest.mark.parametrize("shape", SHAPES)
 def test_accuracy_rule(shape, layout):
-    sizes, patch = SHAPES[shape]
+    sizes, samples = SHAPES[shape]
     azimuths = make_inputs(**sizes)[-1]
     assert_accurate(
-        sampler(azimuths, patch, layout=layout),
+        sampler(azimuths, samples, layout=layout),
         lambda: make_inputs(**sizes)[:-1],
-        lambda *inputs: away_from_borders(*inputs, azimuths, patch, layout),
+        lambda *inputs: away_from_borders(*inputs, azimuths, samples, layout),
     )
 
 
@@ -121,14 +121,14 @@ def test_equals_grid_sample():
     y = center[:, 1, None, None] + radii[:, :, None] * torch.sin(azimuths)
     mesh = torch.stack((2 * x / (width - 1) - 1, 2 * y / (height - 1) - 1), -1)
     expected = F.grid_sample(image, mesh, align_corners=True)
-    got = polar_sample(image, radii, azimuths, center, patch=(1, 1), layout="image")
+    got = polar_sample(image, radii, azimuths, center, samples=(1, 1), layout="image")
     torch.testing.assert_close(got, expected, rtol=1e-10, atol=1e-10)
 
 
 def test_layouts_hold_the_same_samples():
     image, radii, center, azimuths = make_inputs(rows=6, columns=8)
-    planes = polar_sample(image, radii, azimuths, center, patch=(3, 4), layout="image")
-    tokens = polar_sample(image, radii, azimuths, center, patch=(3, 4), layout="tokens")
+    planes = polar_sample(image, radii, azimuths, center, samples=(3, 4), layout="image")
+    tokens = polar_sample(image, radii, azimuths, center, samples=(3, 4), layout="tokens")
     assert tokens.shape == (2, 2, 2, 36) and planes.shape == (2, 3, 6, 8)
     # Token (ring 1, sector 0), inner order (S_r, S_φ, C).
     torch.testing.assert_close(
@@ -150,20 +150,8 @@ def test_opcheck(requires_grad, jitter):
     for tensor in (image, radii, center):
         tensor.requires_grad_(requires_grad)
     moved = (torch.tensor(jitter, dtype=torch.float64), torch.tensor(5)) if jitter else (None, None)
-    arguments = (
-        image,
-        radii,
-        azimuths,
-        center,
-        None,
-        None,
-        (3, 4),
-        *moved,
-        (),
-        (),
-        True,
-        False,
-    )
+    settings = (None, None, *moved, (3, 4), (), (), False)
+    arguments = (image, radii, azimuths, center, *settings, True)
     torch.library.opcheck(torch.ops.darswin.polar_sample.default, arguments)
 
 
@@ -171,8 +159,8 @@ def test_opcheck_backward():
     image, radii, center, azimuths = make_inputs()
     grad = torch.randn(2, 2, 2, 36)
     for wanted in ((True, True, False), (True, False, False), (False, True, False)):
-        settings = (None, None, (3, 4), None, None, (), (), True, False)
-        arguments = (grad, image, radii, azimuths, center, *settings, *wanted)
+        settings = (None, None, None, None, (3, 4), (), (), False)
+        arguments = (image, radii, azimuths, center, *settings, True, grad, *wanted)
         torch.library.opcheck(
             torch.ops.darswin.polar_sample_backward.default,
             arguments,
@@ -184,7 +172,7 @@ def test_no_second_derivative():
     image, radii, center, azimuths = make_inputs()
     for reference in (True, False):
         with use_reference(reference):
-            out = polar_sample(image.requires_grad_(), radii, azimuths, center, patch=(3, 4))
+            out = polar_sample(image.requires_grad_(), radii, azimuths, center, samples=(3, 4))
         (grad,) = torch.autograd.grad(out.square().sum(), image, create_graph=True)
         if reference:
             grad.sum().backward()
@@ -201,7 +189,7 @@ def test_only_the_gradients_asked_for():
         inputs = dict(zip(names, (image, radii, center), strict=True))
         leaf = inputs[name] = inputs[name].detach().requires_grad_()
         out = polar_sample(
-            inputs["image"], inputs["radii"], azimuths, inputs["center"], patch=(3, 4)
+            inputs["image"], inputs["radii"], azimuths, inputs["center"], samples=(3, 4)
         )
         grad = torch.randn(out.shape, generator=torch.Generator().manual_seed(7))
         (got,) = torch.autograd.grad(out, leaf, grad)
@@ -215,7 +203,7 @@ def test_compile_fullgraph(backend):
     seed = torch.tensor(4)
 
     def run(image, radii, center):
-        out = polar_sample(image, radii, azimuths, center, patch=(3, 4), jitter=0.5, seed=seed)
+        out = polar_sample(image, radii, azimuths, center, samples=(3, 4), jitter=0.5, seed=seed)
         return out * 2
 
     compiled = torch.compile(run, fullgraph=True, backend=backend)
@@ -232,7 +220,7 @@ def test_compiled_training_does_not_respecialise_on_the_seed():
 
     @torch.compile(fullgraph=True, backend=counter)
     def run(seed):
-        return polar_sample(image, radii, azimuths, center, patch=(3, 4), jitter=0.5, seed=seed)
+        return polar_sample(image, radii, azimuths, center, samples=(3, 4), jitter=0.5, seed=seed)
 
     outputs = [run(torch.tensor(seed)) for seed in range(3)]
     assert counter.frame_count == 1
@@ -243,7 +231,7 @@ def test_compiled_training_does_not_respecialise_on_the_seed():
 def test_export():
     class Module(torch.nn.Module):
         def forward(self, image, radii, azimuths, center):
-            return polar_sample(image, radii, azimuths, center, patch=(3, 4))
+            return polar_sample(image, radii, azimuths, center, samples=(3, 4))
 
     image, radii, center, azimuths = make_inputs()
     arguments = (image, radii, azimuths, center)
@@ -280,7 +268,7 @@ def test_strided_inputs():
         assert any(not t.is_contiguous() for t in inputs)
         # As leaves they would be copied; a view of a leaf keeps its strides.
         got = polar_sample(
-            inputs[0], inputs[1], azimuths.repeat_interleave(2)[::2], inputs[2], patch=(3, 4)
+            inputs[0], inputs[1], azimuths.repeat_interleave(2)[::2], inputs[2], samples=(3, 4)
         )
         assert torch.equal(got, plain[0])
         leaves = [t.requires_grad_() if t.is_leaf else t for t in inputs]
@@ -293,8 +281,8 @@ def test_strided_inputs():
 def test_expanded_image_and_gradient():
     image, radii, center, azimuths = make_inputs(batch=1)
     image.requires_grad_()
-    many = polar_sample(image.expand(4, -1, -1, -1), radii, azimuths, center, patch=(3, 4))
-    one = polar_sample(image, radii, azimuths, center, patch=(3, 4))
+    many = polar_sample(image.expand(4, -1, -1, -1), radii, azimuths, center, samples=(3, 4))
+    one = polar_sample(image, radii, azimuths, center, samples=(3, 4))
     assert torch.equal(many[3], one[0])
     (grad,) = torch.autograd.grad(many.sum(), image)  # stride 0 comes back
     (expected,) = torch.autograd.grad(one.sum(), image)
@@ -303,9 +291,9 @@ def test_expanded_image_and_gradient():
 
 @pytest.mark.parametrize("reference", [False, True])
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf, 1e30, -1e30])
-def test_points_at_no_number_sample_nothing(bad, reference):
+def test_points_at_nan_or_infinity_sample_nothing(bad, reference):
     image, radii, center, azimuths = make_inputs(rows=4, columns=6)
-    good = polar_sample(image, radii, azimuths, center, patch=(1, 1), layout="image")
+    good = polar_sample(image, radii, azimuths, center, samples=(1, 1), layout="image")
     broken = radii.clone()
     broken[0, 2] = bad
     with use_reference(reference):
@@ -319,11 +307,11 @@ def test_points_at_no_number_sample_nothing(bad, reference):
             assert grad.isfinite().all()
         lost = center.clone()
         lost[1, 0] = bad
-        assert (polar_sample(image, radii, azimuths, lost, patch=(1, 1))[1] == 0).all()
+        assert (polar_sample(image, radii, azimuths, lost, samples=(1, 1))[1] == 0).all()
         for jitter in (0.0, 1.0):
             turned = azimuths.clone()
             turned[3] = bad
-            out = polar_sample(image, radii, turned, center, patch=(1, 1), jitter=jitter,
+            out = polar_sample(image, radii, turned, center, samples=(1, 1), jitter=jitter,
                                layout="image")  # fmt: skip
             assert (out[..., 3] == 0).all() or abs(bad) == 1e30
             assert out.isfinite().all()
@@ -333,7 +321,9 @@ def test_points_at_no_number_sample_nothing(bad, reference):
 def test_jitter_keeps_bad_radii_to_themselves(jitter):
     image, radii, center, azimuths = make_inputs(rows=6, columns=6)
     radii[0, 2] = math.nan
-    out = polar_sample(image, radii, azimuths, center, patch=(1, 1), jitter=jitter, layout="image")
+    out = polar_sample(
+        image, radii, azimuths, center, samples=(1, 1), jitter=jitter, layout="image"
+    )
     assert out.isfinite().all()
     assert (out[0, :, 2] == 0).all()
     assert (out[0, :, 0] != 0).any()
@@ -346,7 +336,9 @@ def test_jitter_moves_no_radius_from_infinity_to_the_center(bad, rows, reference
     image, radii, center, azimuths = make_inputs(rows=rows, columns=40)
     radii[:, 0] = bad
     with use_reference(reference):
-        out = polar_sample(image, radii, azimuths, center, patch=(1, 1), jitter=1.0, layout="image")
+        out = polar_sample(
+            image, radii, azimuths, center, samples=(1, 1), jitter=1.0, layout="image"
+        )
     assert (out[:, :, 0] == 0).all()
 
 
@@ -358,7 +350,7 @@ def test_a_bad_pixel_spoils_only_the_points_that_touch_it(bad, reference):
     radii, center = torch.tensor([[0.5, 2.5, 4.5]]), torch.tensor([[4.0, 4.0]])
     with use_reference(reference):
         out = polar_sample(
-            image, radii, torch.tensor([0.1, 1.7]), center, patch=(1, 1), layout="image"
+            image, radii, torch.tensor([0.1, 1.7]), center, samples=(1, 1), layout="image"
         )
     assert not out[0, 0, 0].isfinite().any()
     assert out[0, 0, 1:].isfinite().all()
@@ -368,7 +360,7 @@ def test_outside_is_zero():
     image = torch.ones(1, 1, 5, 5)
     radii = torch.tensor([[1.5, 2.25, 2.999, 3.0, 50.0]])
     out = polar_sample(
-        image, radii, torch.zeros(1), torch.tensor([[2.0, 2.0]]), patch=(1, 1), layout="image"
+        image, radii, torch.zeros(1), torch.tensor([[2.0, 2.0]]), samples=(1, 1), layout="image"
     )
     torch.testing.assert_close(out.flatten(), torch.tensor([1.0, 0.75, 0.001, 0.0, 0.0]))
 
@@ -382,7 +374,7 @@ def test_indices_beyond_two_to_the_31():
     image[0, 0, side - 4 :, side - 4 :] = torch.arange(16.0).reshape(4, 4)
     center = torch.tensor([[side - 3.0, side - 3.0]])
     out = polar_sample(
-        image, torch.tensor([[0.0, 1.0]]), torch.zeros(1), center, patch=(1, 1), layout="image"
+        image, torch.tensor([[0.0, 1.0]]), torch.zeros(1), center, samples=(1, 1), layout="image"
     )
     assert out.flatten().tolist() == [5.0, 6.0]
 
@@ -393,7 +385,7 @@ def test_sizes_beyond_two_to_the_31():
     center = torch.tensor([[2.0**31, 2.0**31]], dtype=torch.float64)
     radii = torch.tensor([[0.0, 3.5, 100.0]], dtype=torch.float64)
     azimuths = torch.zeros(1, dtype=torch.float64)
-    out = polar_sample(image, radii, azimuths, center, patch=(1, 1), layout="image")
+    out = polar_sample(image, radii, azimuths, center, samples=(1, 1), layout="image")
     assert out.flatten().tolist() == [1.0, 1.0, 0.0]
 
 
@@ -413,7 +405,7 @@ def coordinates_image(size=64):
 def places(radii, azimuths, jitter, seed, size=64):
     """Radius and azimuth at which the points of one image really stand, (N_r, N_a) each."""
     middle = torch.full((1, 2), (size - 1) / 2, dtype=torch.float64)
-    out = polar_sample(coordinates_image(size), radii, azimuths, middle, patch=(1, 1),
+    out = polar_sample(coordinates_image(size), radii, azimuths, middle, samples=(1, 1),
                        jitter=jitter, seed=seed, layout="image")  # fmt: skip
     x, y = out[0] - (size - 1) / 2
     return torch.hypot(x, y), torch.atan2(y, x)
@@ -460,7 +452,7 @@ def test_seed_as_int_and_as_tensor_and_per_image():
     image = image[:1].expand(2, -1, -1, -1)
 
     def run(seed, images=image):
-        return polar_sample(images, radii, azimuths, center, patch=(3, 4), jitter=1.0, seed=seed)
+        return polar_sample(images, radii, azimuths, center, samples=(3, 4), jitter=1.0, seed=seed)
 
     for seed in (0, 7, 2**62, -(2**63), 2**63 - 1):
         assert torch.equal(run(seed), run(torch.tensor(seed)))
@@ -472,7 +464,7 @@ def test_seed_as_int_and_as_tensor_and_per_image():
 
 def test_without_jitter_the_seed_does_nothing():
     image, radii, center, azimuths = make_inputs()
-    a, b = (polar_sample(image, radii, azimuths, center, patch=(3, 4), seed=s) for s in (0, 1))
+    a, b = (polar_sample(image, radii, azimuths, center, samples=(3, 4), seed=s) for s in (0, 1))
     assert torch.equal(a, b)
 
 
@@ -486,7 +478,7 @@ def test_reference_switch(monkeypatch):
         assert reference_in_use()
         with use_reference(False):
             assert not reference_in_use()
-        out = polar_sample(image.requires_grad_(), radii, azimuths, center, patch=(3, 4))
+        out = polar_sample(image.requires_grad_(), radii, azimuths, center, samples=(3, 4))
         names, nodes = set(), [out.grad_fn]
         while nodes:
             node = nodes.pop()
@@ -498,7 +490,7 @@ def test_reference_switch(monkeypatch):
 
 def test_other_devices_run_the_reference():
     image, radii, center, azimuths = (t.to("meta") for t in make_inputs())
-    out = polar_sample(image, radii, azimuths, center, patch=(3, 4))
+    out = polar_sample(image, radii, azimuths, center, samples=(3, 4))
     assert out.shape == (2, 2, 2, 36) and out.device.type == "meta"
 
 
@@ -537,35 +529,35 @@ def test_bfloat16_rounds_to_nearest_even_and_keeps_nan():
         center = torch.tensor([[0.0, 0.0]])
         radii = torch.arange(float(columns))[None]
         with torch.autocast("cpu", dtype=torch.bfloat16):
-            out = polar_sample(image, radii, torch.zeros(1), center, patch=(1, 1))
-        expected = polar_sample(image, radii, torch.zeros(1), center, patch=(1, 1)).bfloat16()
+            out = polar_sample(image, radii, torch.zeros(1), center, samples=(1, 1))
+        expected = polar_sample(image, radii, torch.zeros(1), center, samples=(1, 1)).bfloat16()
         torch.testing.assert_close(out, expected, rtol=0, atol=0, equal_nan=True)
 
 
 def test_autocast_gives_bfloat16():
     image, radii, center, azimuths = make_inputs()
-    expected = polar_sample(image, radii, azimuths, center, patch=(3, 4))
+    expected = polar_sample(image, radii, azimuths, center, samples=(3, 4))
     for reference in (False, True):
         with use_reference(reference), torch.autocast("cpu", dtype=torch.bfloat16):
-            out = polar_sample(image.requires_grad_(), radii, azimuths, center, patch=(3, 4))
+            out = polar_sample(image.requires_grad_(), radii, azimuths, center, samples=(3, 4))
         assert out.dtype == torch.bfloat16
         torch.testing.assert_close(out.float(), expected, rtol=2**-7, atol=1e-3)
         (grad,) = torch.autograd.grad(out.float().sum(), image)
         assert grad.dtype == torch.float32
     double = [t.double() for t in (image, radii, azimuths, center)]
     with torch.autocast("cpu", dtype=torch.bfloat16):
-        assert polar_sample(*double, patch=(3, 4)).dtype == torch.float64
+        assert polar_sample(*double, samples=(3, 4)).dtype == torch.float64
 
 
 def test_autocast_takes_float16_as_float32():
     image, radii, center, azimuths = make_inputs()
     half = image.half()
     with torch.autocast("cpu", dtype=torch.float16):
-        out = polar_sample(half, radii, azimuths, center, patch=(3, 4))
-    expected = polar_sample(half.float(), radii, azimuths, center, patch=(3, 4))
+        out = polar_sample(half, radii, azimuths, center, samples=(3, 4))
+    expected = polar_sample(half.float(), radii, azimuths, center, samples=(3, 4))
     assert torch.equal(out, expected)
     with pytest.raises(TypeError, match=r"image must be .* or uint8, got torch.float16"):
-        polar_sample(half, radii, azimuths, center, patch=(3, 4))
+        polar_sample(half, radii, azimuths, center, samples=(3, 4))
 
 
 @pytest.mark.parametrize("rows", [6, 60])  # far and near, see csrc/kernels/polar_image.h
@@ -582,14 +574,27 @@ def test_uint8_frames(layout, rows):
     for image in (frames, planes, planes.contiguous()):
         for reference in (False, True):
             with use_reference(reference):
-                out = polar_sample(image, radii, azimuths, center, patch=(3, 4), layout=layout,
+                out = polar_sample(image, radii, azimuths, center, samples=(3, 4), layout=layout,
                                    mean=mean, std=std)  # fmt: skip
             torch.testing.assert_close(out, run(normalised, radii, center), rtol=1e-5, atol=1e-5)
-    plain = polar_sample(frames, radii, azimuths, center, patch=(3, 4), layout=layout)
+    plain = polar_sample(frames, radii, azimuths, center, samples=(3, 4), layout=layout)
     torch.testing.assert_close(plain, run(planes / 255, radii, center), rtol=1e-5, atol=1e-6)
     with torch.autocast("cpu", dtype=torch.bfloat16):
-        half = polar_sample(frames, radii, azimuths, center, patch=(3, 4), layout=layout)
+        half = polar_sample(frames, radii, azimuths, center, samples=(3, 4), layout=layout)
     assert torch.equal(half, plain.bfloat16())
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.bfloat16])
+def test_images_that_are_not_uint8_count_as_they_are(dtype):
+    image, radii, center, azimuths = make_inputs(
+        dtype=torch.float64 if dtype == torch.float64 else torch.float32
+    )
+    run = sampler(azimuths, (3, 4), mean=0.5, std=(0.2, 0.3, 0.25))
+    plain = sampler(azimuths, (3, 4))(image.to(dtype), radii, center)
+    for reference in (False, True):
+        with use_reference(reference):
+            out = run(image.to(dtype), radii, center)
+        torch.testing.assert_close(out, plain)
 
 
 def test_uint8_frames_have_lens_gradients():
@@ -597,7 +602,7 @@ def test_uint8_frames_have_lens_gradients():
     frames = torch.randint(256, (2, 3, 17, 23), dtype=torch.uint8)
 
     def run(radii, center):
-        return polar_sample(frames, radii, azimuths, center, patch=(3, 4))
+        return polar_sample(frames, radii, azimuths, center, samples=(3, 4))
 
     expected = with_gradients(
         lambda r, c: sampler(azimuths, (3, 4))(frames / 255, r, c), (radii, center)
@@ -648,11 +653,11 @@ def test_every_path_equals_the_reference_in_float64(path, jitter):
 @pytest.mark.parametrize("layout", LAYOUTS)
 @pytest.mark.parametrize("path", PATHS)
 def test_accuracy_rule_on_every_path(path, layout):
-    azimuths, patch = make_inputs(**PATHS[path])[-1], PATCHES.get(path, (4, 4))
+    azimuths, samples = make_inputs(**PATHS[path])[-1], PATCHES.get(path, (4, 4))
     assert_accurate(
-        sampler(azimuths, patch, layout=layout),
+        sampler(azimuths, samples, layout=layout),
         lambda: make_inputs(**PATHS[path])[:-1],
-        lambda *inputs: away_from_borders(*inputs, azimuths, patch, layout),
+        lambda *inputs: away_from_borders(*inputs, azimuths, samples, layout),
     )
 
 
@@ -675,16 +680,16 @@ def test_jitter_is_the_same_on_every_path_and_tier(columns):
     # Odd counts of points, so that rows begin in the middle of a group of four random words.
     image, radii, center, azimuths = make_inputs(rows=9, columns=columns - 1)
     results = []
-    best = _C.tier()
+    best = cpu_capability()
     for tier in _C.tiers():
         _C.set_tier(tier)
         results.append(
-            polar_sample(image, radii, azimuths, center, patch=(3, 1), jitter=1.0, seed=5)
+            polar_sample(image, radii, azimuths, center, samples=(3, 1), jitter=1.0, seed=5)
         )
     _C.set_tier(best)
     with use_reference():
         results.append(
-            polar_sample(image, radii, azimuths, center, patch=(3, 1), jitter=1.0, seed=5)
+            polar_sample(image, radii, azimuths, center, samples=(3, 1), jitter=1.0, seed=5)
         )
     for other in results[1:]:
         torch.testing.assert_close(other, results[0], rtol=1e-4, atol=1e-4)
@@ -695,9 +700,9 @@ def test_nothing_is_written_beyond_the_last_token():
     image, radii, center, azimuths = make_inputs(batch=1, rows=40, columns=64, height=31, width=33)
     for channels in (1, 2, 3):
         for count in (1, 2, 3):  # rings that different threads may write
-            whole = polar_sample(image[:, :channels], radii, azimuths, center, patch=(4, 4))
+            whole = polar_sample(image[:, :channels], radii, azimuths, center, samples=(4, 4))
             part = polar_sample(
-                image[:, :channels], radii[:, : 4 * count], azimuths, center, patch=(4, 4)
+                image[:, :channels], radii[:, : 4 * count], azimuths, center, samples=(4, 4)
             )
             assert torch.equal(part, whole[:, :count])
 
@@ -723,9 +728,9 @@ f32 = torch.float32
         (dict(center=torch.zeros(2)), ValueError, r"center must have shape .*, got \(2,\)"),
         (dict(center=torch.zeros(2, 3)), ValueError, "center must have shape"),
         (dict(center=torch.zeros(3, 2)), ValueError, "center must have shape"),
-        (dict(patch=(0, 4)), ValueError, "patch must be at least 1"),
-        (dict(patch=3), TypeError, "patch must be a pair of ints, got 3"),
-        (dict(patch=(3.0, 4)), TypeError, "patch must be a pair of ints"),
+        (dict(samples=(0, 4)), ValueError, "samples must be at least 1"),
+        (dict(samples=3), TypeError, "samples must be a pair of ints, got 3"),
+        (dict(samples=(3.0, 4)), TypeError, "samples must be a pair of ints"),
         (dict(jitter=1.5), ValueError, r"jitter must be in \[0, 1\], got 1.5"),
         (dict(jitter=-0.1), ValueError, r"jitter must be in \[0, 1\]"),
         (dict(jitter=math.nan), ValueError, r"jitter must be in \[0, 1\]"),
@@ -739,7 +744,7 @@ f32 = torch.float32
 )
 def test_errors_say_what_was_expected(change, error, message, reference):
     image, radii, center, azimuths = make_inputs()
-    arguments = dict(image=image, radii=radii, azimuths=azimuths, center=center, patch=(3, 4))
+    arguments = dict(image=image, radii=radii, azimuths=azimuths, center=center, samples=(3, 4))
     with use_reference(reference), pytest.raises(error, match=message):
         polar_sample(**(arguments | change))
 
@@ -747,10 +752,10 @@ def test_errors_say_what_was_expected(change, error, message, reference):
 def test_the_compiled_operator_itself_reads_nothing_outside():
     # Without the checks of the public function, wrong sizes must still not crash.
     image, radii, center, azimuths = make_inputs()
-    good = (image, radii, azimuths, center, None, None, (3, 4), None, None, (), (), True, False)
+    good = (image, radii, azimuths, center, None, None, None, None, (3, 4), (), (), False, True)
     for index, value in {
-        0: torch.zeros(3), 1: torch.zeros(3, 6), 3: torch.zeros(1, 1), 6: (0, 4),
-        7: torch.tensor(0.5),
+        0: torch.zeros(3), 1: torch.zeros(3, 6), 3: torch.zeros(1, 1), 6: torch.tensor(0.5),
+        8: (0, 4),
     }.items():  # fmt: skip
         arguments = [value if k == index else v for k, v in enumerate(good)]
         with pytest.raises(RuntimeError):
@@ -768,12 +773,12 @@ def test_the_patch_does_not_matter_to_an_image(size, rows, columns):
     center = torch.full((1, 2), (size - 1) / 2)
     arguments = (image, radii, azimuths, center)
     sampled = [
-        polar_sample(*arguments, patch=patch, layout="image", jitter=1.0, seed=3)
-        for patch in ((1, 1), (1, columns), (rows, 1), (rows, columns))
+        polar_sample(*arguments, samples=samples, layout="image", jitter=1.0, seed=3)
+        for samples in ((1, 1), (1, columns), (rows, 1), (rows, columns))
     ]
     assert all(torch.equal(sampled[0], other) for other in sampled[1:])
     with use_reference():
-        expected = polar_sample(*arguments, patch=(1, 1), layout="image", jitter=1.0, seed=3)
+        expected = polar_sample(*arguments, samples=(1, 1), layout="image", jitter=1.0, seed=3)
     # The reference computes places in float32.
     torch.testing.assert_close(sampled[0], expected, rtol=0, atol=2e-6 * (10 + size))
 
@@ -785,8 +790,8 @@ def test_an_image_of_patches_of_one_point_is_as_fast_as_one_of_whole_rows(thread
     radii, azimuths = torch.linspace(0, 32, 160)[None], torch.linspace(0, 6.28, 640)
     best = {(1, 1): math.inf, (1, 640): math.inf}
     for _ in range(40):  # in turns; the fastest of each is the least disturbed
-        for patch in best:
+        for samples in best:
             start = time.perf_counter()
-            polar_sample(image, radii, azimuths, center, patch=patch, layout="image")
-            best[patch] = min(best[patch], time.perf_counter() - start)
+            polar_sample(image, radii, azimuths, center, samples=samples, layout="image")
+            best[samples] = min(best[samples], time.perf_counter() - start)
     assert best[1, 1] < 1.5 * best[1, 640]

@@ -15,8 +15,8 @@ from strategies import Case, f32, f64
 from torch import Tensor
 
 from darswin.ops import polar_sample, reference, use_reference
-from darswin.ops.add_norm import add_norm_
-from darswin.ops.transpose_sum import transpose_sum
+from darswin.ops._add_norm import add_norm_
+from darswin.ops._transpose_sum import transpose_sum
 
 bf16 = torch.bfloat16
 THREADS = (1, 2, 3)
@@ -97,9 +97,9 @@ def check_sampling(case: Case) -> None:
     # they may be away from 0; the reference itself has no more digits.
     places = 1.0
     if case.inputs["image"].dtype == f64:
-        bends = largest(exact.inputs["affine"]) if "affine" in exact.inputs else 1.0
+        stretch = largest(exact.inputs["affine"]) if "affine" in exact.inputs else 1.0
         turns = 1 + largest(case.settings["azimuths"])
-        places += 4 * largest(exact.inputs["radii"]) * max(bends, 1.0) * turns + 100
+        places += 4 * largest(exact.inputs["radii"]) * max(stretch, 1.0) * turns + 100
     assert_equals_reference(
         case,
         lambda name: places * (largest(sizes[name]) if name in ("out", "grad", *linear) else lens),
@@ -196,13 +196,13 @@ def test_uint8_pixels_are_sampled_as_what_they_stand_for(case, frames):
         return  # these are taken for (B, H, W, 3), or may be
     mean, std = 0.4, 0.25
     grid = (inputs["radii"], settings.pop("azimuths"), inputs["center"])
-    bends = {name: inputs[name] for name in ("affine", "offsets") if name in inputs}
+    general = {name: inputs[name] for name in ("affine", "offsets") if name in inputs}
     given = image.permute(0, 2, 3, 1) if frames and image.shape[1] == 3 != image.shape[3] else image
-    ours = polar_sample(given, *grid, **bends, **settings, mean=mean, std=std)
+    ours = polar_sample(given, *grid, **general, **settings, mean=mean, std=std)
     with use_reference():
         exact = polar_sample(
             (image.double() / 255 - mean) / std, *(t.double() for t in grid),
-            **{name: t.double() for name, t in bends.items()}, **settings,
+            **{name: t.double() for name, t in general.items()}, **settings,
         )  # fmt: skip
     torch.testing.assert_close(ours.double(), exact, rtol=1e-5, atol=1e-5)
 
@@ -342,7 +342,7 @@ def test_the_reference_is_what_the_operators_are_compared_with():
         image = torch.ones(1, 1, 4, 4, requires_grad=True)
         case = Case(
             lambda image: strategies.polar_sample(
-                image, torch.ones(1, 2), torch.zeros(2), torch.ones(1, 2), patch=(1, 1)
+                image, torch.ones(1, 2), torch.zeros(2), torch.ones(1, 2), samples=(1, 1)
             ),
             dict(),
         )

@@ -37,15 +37,17 @@ def run(code: str, **environment: str) -> subprocess.CompletedProcess:
 
 
 @pytest.mark.parametrize("channels", [1, 2, 3, 4])
-@pytest.mark.parametrize("patch", [(1, 2), (1, 4), (1, 5), (2, 2), (1, 1), (2, 1), (3, 1)], ids=str)
+@pytest.mark.parametrize(
+    "samples", [(1, 2), (1, 4), (1, 5), (2, 2), (1, 1), (2, 1), (3, 1)], ids=str
+)
 @pytest.mark.parametrize("sectors", [16, 300, 1024])
-def test_patches_of_few_points(patch, channels, sectors):
+def test_patches_of_few_points(samples, channels, sectors):
     # More tokens a block than their first rows had room for, and tokens of a single row.
     image = torch.randn(1, channels, 12, 12)
-    arguments = grid(2 * patch[0], sectors * patch[1], 12)
-    ours = polar_sample(image, *arguments, patch=patch)
+    arguments = grid(2 * samples[0], sectors * samples[1], 12)
+    ours = polar_sample(image, *arguments, samples=samples)
     with use_reference():
-        expected = polar_sample(image, *arguments, patch=patch)
+        expected = polar_sample(image, *arguments, samples=samples)
     torch.testing.assert_close(ours, expected, rtol=1e-4, atol=1e-4)
 
 
@@ -61,12 +63,12 @@ def test_the_layer_and_the_model_take_patches_of_one_radius():
         torch.testing.assert_close(ours, expected, rtol=1e-4, atol=1e-4)
 
 
-# -- azimuths at no number, and none at all --------------------------------------------------------
+# -- azimuths that are NaN or infinite, and none at all -------------------------------------------
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, f64])
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
-def test_azimuths_at_no_number_sample_nothing_of_a_packed_image(bad, dtype):
+def test_azimuths_at_nan_or_infinity_sample_nothing_of_a_packed_image(bad, dtype):
     # A small image and many points: the image is packed, and no point but these leaves it.
     image = torch.randn(2, 3, 20, 20, dtype=dtype)
     radii, azimuths, center = grid(16, 40, 20, dtype)
@@ -74,7 +76,7 @@ def test_azimuths_at_no_number_sample_nothing_of_a_packed_image(bad, dtype):
     for jitter in (0.0, 1.0):
         out, *grads = with_gradients(
             lambda i, r, c, j=jitter: polar_sample(
-                i, r, azimuths, c, patch=(4, 4), jitter=j, layout="image"
+                i, r, azimuths, c, samples=(4, 4), jitter=j, layout="image"
             ),
             (image, radii, center),
         )
@@ -82,7 +84,7 @@ def test_azimuths_at_no_number_sample_nothing_of_a_packed_image(bad, dtype):
         with use_reference():
             expected = with_gradients(
                 lambda i, r, c, j=jitter: polar_sample(
-                    i, r, azimuths, c, patch=(4, 4), jitter=j, layout="image"
+                    i, r, azimuths, c, samples=(4, 4), jitter=j, layout="image"
                 ),
                 (image, radii, center),
             )
@@ -98,7 +100,7 @@ def test_polar_embed_of_no_azimuths_has_a_backward(channels):
 
     def embed(image, radii, center, weight, bias):
         none = torch.zeros(0)
-        return polar_embed(image, radii, none, center, weight, bias, patch=(2, 3))
+        return polar_embed(image, radii, none, center, weight, bias, samples=(2, 3))
 
     out, *grads = with_gradients(embed, inputs)
     assert out.shape == (2, 3, 0, 5)
@@ -111,7 +113,7 @@ def test_the_bias_of_polar_embed_has_a_gradient_without_channels():
 
     def embed(bias):
         image, weight = torch.zeros(2, 0, 8, 8), torch.zeros(5, 0)
-        return polar_embed(image, radii, azimuths, center, weight, bias, patch=(2, 3))
+        return polar_embed(image, radii, azimuths, center, weight, bias, samples=(2, 3))
 
     (grad,) = with_gradients(embed, (torch.randn(5),))[1:]
     with use_reference():
@@ -141,10 +143,10 @@ LACKING_MEMORY = """
     center = torch.full((1, 2), 4.0)
 
     def large():  # 16 MB, and 64 MB of working memory for each thread
-        return polar_sample(image.bfloat16(), radii, azimuths, center, patch=(1000, 1))
+        return polar_sample(image.bfloat16(), radii, azimuths, center, samples=(1000, 1))
 
     def small():
-        return polar_sample(image, radii[:, ::100], azimuths[:40], center, patch=(2, 2))
+        return polar_sample(image, radii[:, ::100], azimuths[:40], center, samples=(2, 2))
 
     def size(name):
         give_back_memory()  # what glibc keeps of freed memory
@@ -163,7 +165,7 @@ LACKING_MEMORY = """
     before = size("VmRSS")
     assert large().isfinite().all()
     frames = torch.ones(2, 1, 4000, 4000, dtype=torch.bfloat16, requires_grad=True)
-    out = polar_sample(frames, radii, azimuths[:40], center, patch=(1, 1))
+    out = polar_sample(frames, radii, azimuths[:40], center, samples=(1, 1))
     (grad,) = torch.autograd.grad(out.float().sum(), frames)  # whose sums take 256 MB
     assert grad.count_nonzero() > 0
     del out, grad, frames
@@ -191,9 +193,9 @@ def test_sampling_bfloat16_needs_no_memory_of_its_gradient():
         def size():
             (line,) = [l for l in open("/proc/self/status") if l.startswith("VmSize")]
             return int(line.split()[1]) // 1024
-        polar_sample(image[:, :, :9, :9], *arguments, patch=(2, 2))
+        polar_sample(image[:, :, :9, :9], *arguments, samples=(2, 2))
         before = size()
-        polar_sample(image, *arguments, patch=(2, 2))
+        polar_sample(image, *arguments, samples=(2, 2))
         print(size() - before)
     """)
     assert done.returncode == 0, done.stderr
@@ -203,21 +205,25 @@ def test_sampling_bfloat16_needs_no_memory_of_its_gradient():
 # -- sizes that are too large ----------------------------------------------------------------------
 
 SAMPLE = torch.ops.darswin.polar_sample
-settings = (None, None, [], [], True, False)
+
+
+def plain(samples):
+    """The rest of a raw call of polar_sample, without jitter."""
+    return (None, None, samples, [], [], False, True)
 
 
 @pytest.mark.parametrize(
-    ("shape", "patch"),
+    ("shape", "samples"),
     [((2, 3, 5, 7), (2**62, 2**62)), ((2**53, 0, 5, 7), (1, 1)), ((2, 2**53, 5, 0), (1, 1))],
     ids=str,
 )
-def test_sizes_that_no_number_holds_are_refused(shape, patch):
+def test_sizes_that_no_number_holds_are_refused(shape, samples):
     image = torch.ones(1, 1, 1, 1).expand(shape)
     lens = (torch.rand(1, 1024), torch.rand(1024), torch.rand(1, 2), None, None)
-    if patch[0] > 1:
+    if samples[0] > 1:
         lens = (torch.rand(1, 0), torch.rand(0), torch.rand(1, 2), None, None)
     with pytest.raises(RuntimeError, match="too large"):
-        SAMPLE(image, *lens, patch, *settings)
+        SAMPLE(image, *lens, *plain(samples))
 
 
 def test_gradients_of_nothing_take_no_time_and_no_memory():
@@ -225,17 +231,16 @@ def test_gradients_of_nothing_take_no_time_and_no_memory():
     # many features.
     many = torch.ones(1, 1, 1, 1).expand(2**40, 1, 4, 4)
     grads = torch.ops.darswin.polar_sample_backward(
-        torch.zeros(1, 2, 0, 2).expand(2**40, 2, 0, 2), many,
-        torch.ones(1, 4), torch.zeros(0), torch.ones(1, 2), None, None, (2, 1), *settings,
-        False, True, False,
+        many, torch.ones(1, 4), torch.zeros(0), torch.ones(1, 2), None, None, *plain((2, 1)),
+        torch.zeros(1, 2, 0, 2).expand(2**40, 2, 0, 2), False, True, False,
     )  # fmt: skip
     assert torch.equal(grads[1], torch.zeros(1, 4))
     assert torch.equal(grads[2], torch.zeros(1, 2))
     features = 2**40
     grads = torch.ops.darswin.polar_embed_backward(
-        torch.empty(1, 1, 0, 1).expand(1, 1, 0, features), torch.ones(1, 0, 4, 4),
-        torch.ones(1, 2), torch.zeros(0), torch.ones(1, 2), None, None,
-        torch.empty(features, 0), (2, 3), None, None, [], [], False, True, False, False, False,
+        torch.ones(1, 0, 4, 4), torch.ones(1, 2), torch.zeros(0), torch.ones(1, 2), None, None,
+        None, None, (2, 3), [], [], False, torch.empty(features, 0),
+        torch.empty(1, 1, 0, 1).expand(1, 1, 0, features), True, False, False, False,
     )  # fmt: skip
     assert grads[0].shape == (1, 0, 4, 4)
 
@@ -244,8 +249,7 @@ def test_any_stride_of_a_single_row_is_as_good():
     image = torch.rand(1, 1, 1, 9)
     odd = image.as_strided(image.shape, (2**62, 2**62, 2**62, 1))
     lens = (torch.rand(1, 4) * 4, torch.rand(8), torch.tensor([[4.0, 0.0]]), None, None)
-    assert torch.equal(SAMPLE(odd, *lens, (1, 1), *settings),
-                       SAMPLE(image, *lens, (1, 1), *settings))  # fmt: skip
+    assert torch.equal(SAMPLE(odd, *lens, *plain((1, 1))), SAMPLE(image, *lens, *plain((1, 1))))
 
 
 # -- raw calls -------------------------------------------------------------------------------------
@@ -256,15 +260,15 @@ def test_jitter_outside_its_range_is_refused_by_the_operator_itself(jitter):
     radii, azimuths, center = grid(4, 6, 8)
     moved = (torch.tensor(jitter, dtype=f64), torch.tensor(1))
     with pytest.raises(RuntimeError, match=r"jitter must be in \[0, 1\]"):
-        SAMPLE(torch.rand(1, 3, 8, 8), radii, azimuths, center, None, None, (2, 3), *moved,
-               [], [], True, False)  # fmt: skip
+        SAMPLE(torch.rand(1, 3, 8, 8), radii, azimuths, center, None, None, *moved,
+               (2, 3), [], [], False, True)  # fmt: skip
 
 
 def test_float64_samples_are_not_rounded_by_the_operator_itself():
     radii, azimuths, center = grid(4, 6, 8, f64)
     with pytest.raises(RuntimeError, match="float64 image are not rounded"):
-        SAMPLE(torch.rand(1, 3, 8, 8, dtype=f64), radii, azimuths, center, None, None, (2, 3),
-               None, None, [], [], True, True)  # fmt: skip
+        SAMPLE(torch.rand(1, 3, 8, 8, dtype=f64), radii, azimuths, center, None, None,
+               None, None, (2, 3), [], [], True, True)  # fmt: skip
 
 
 # -- pixels beyond half of what a float holds ------------------------------------------------------
@@ -276,13 +280,13 @@ def test_huge_and_infinite_pixels(size, channels):
     radii, azimuths, center = grid(8, 16, size)
     image = torch.full((1, channels, size, size), 3e38)
     image[..., ::2] = -3e38
-    out = polar_sample(image, radii, azimuths, center, patch=(4, 4))
+    out = polar_sample(image, radii, azimuths, center, samples=(4, 4))
     with use_reference():
-        expected = polar_sample(image, radii, azimuths, center, patch=(4, 4))
+        expected = polar_sample(image, radii, azimuths, center, samples=(4, 4))
     assert out.isfinite().all()
     torch.testing.assert_close(out, expected, rtol=1e-3, atol=1e34)
     image.fill_(1.0)[..., size // 2 :] = math.inf
-    out = polar_sample(image, radii, azimuths, center, patch=(4, 4), layout="image")
+    out = polar_sample(image, radii, azimuths, center, samples=(4, 4), layout="image")
     right = torch.cos(azimuths) > 0.1
     assert (out[..., 1:, right] == math.inf).all() and not out.isnan().any()
 
@@ -295,12 +299,12 @@ FORKED = """
     torch.set_num_threads(2)
     image, radii = torch.rand(4, 3, 32, 32), torch.linspace(0, 15, 16)[None]
     arguments = (image, radii, torch.linspace(0, 6, 32), torch.full((1, 2), 15.5))
-    expected = polar_sample(*arguments, patch=(4, 4))
+    expected = polar_sample(*arguments, samples=(4, 4))
     child = os.fork()
     if child == 0:
         signal.alarm(20)
         torch.set_num_threads(1)
-        os._exit(0 if torch.equal(polar_sample(*arguments, patch=(4, 4)), expected) else 1)
+        os._exit(0 if torch.equal(polar_sample(*arguments, samples=(4, 4)), expected) else 1)
     sys.exit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
 """
 

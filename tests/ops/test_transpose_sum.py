@@ -3,7 +3,7 @@ import math
 import pytest
 import torch
 
-from darswin.ops.transpose_sum import transpose_sum
+from darswin.ops._transpose_sum import transpose_sum
 
 # Less than a register, registers and rests of both sides, groups of rows and a rest, and what the
 # models have.
@@ -46,7 +46,7 @@ def test_nothing(shape):
 
 
 def test_opcheck():
-    torch.library.opcheck(torch.ops.darswin.transpose_sum.default, (torch.randn(20, 24),))
+    torch.library.opcheck(torch.ops.darswin._transpose_sum.default, (torch.randn(20, 24),))
 
 
 @pytest.mark.parametrize(

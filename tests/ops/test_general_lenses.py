@@ -1,4 +1,4 @@
-"""Both operators with lenses that are not round: `affine` and `offsets`."""
+"""Both operators with general lenses: `affine` and `offsets`."""
 
 import math
 
@@ -11,7 +11,7 @@ from darswin.ops import polar_embed, polar_sample, use_reference
 
 f64 = torch.float64
 LAYOUTS = ("tokens", "image")
-BENDS = {"affine": (True, False), "offsets": (False, True), "both": (True, True)}
+PARTS = {"affine": (True, False), "offsets": (False, True), "both": (True, True)}
 
 
 def make_inputs(
@@ -35,36 +35,36 @@ def make_inputs(
     return image, radii, center, affine, offsets, azimuths
 
 
-def sampler(azimuths, patch, bends="both", **options):
-    """polar_sample as a function of its differentiable inputs; without those that do not bend."""
+def sampler(azimuths, samples, parts="both", **options):
+    """polar_sample of its differentiable inputs, of affine and offsets only `parts`."""
 
-    def run(image, radii, center, *bent):
-        names = [n for n, given in zip(("affine", "offsets"), BENDS[bends], strict=True) if given]
+    def run(image, radii, center, *tensors):
+        names = [n for n, given in zip(("affine", "offsets"), PARTS[parts], strict=True) if given]
         return polar_sample(
-            image, radii, azimuths.to(radii.dtype), center, patch=patch,
-            **dict(zip(names, bent, strict=True)), **options,
+            image, radii, azimuths.to(radii.dtype), center, samples=samples,
+            **dict(zip(names, tensors, strict=True)), **options,
         )  # fmt: skip
 
     return run
 
 
-def embedder(azimuths, patch, **options):
+def embedder(azimuths, samples, **options):
     """polar_embed likewise, of weight and bias too."""
     return lambda image, radii, center, affine, offsets, weight, bias: polar_embed(
         image, radii, azimuths.to(radii.dtype), center, weight, bias,
-        affine=affine, offsets=offsets, patch=patch, **options,
+        affine=affine, offsets=offsets, samples=samples, **options,
     )  # fmt: skip
 
 
-def bent(inputs, bends):
-    """The differentiable inputs without the bends that are not there."""
+def without_others(inputs, parts):
+    """The differentiable inputs, of affine and offsets only `parts`."""
     image, radii, center, *rest = inputs
-    given = [t for t, with_it in zip(rest, BENDS[bends], strict=True) if with_it]
+    given = [t for t, with_it in zip(rest, PARTS[parts], strict=True) if with_it]
     return image, radii, center, *given
 
 
-def linear(samples, features=20, dtype=f64):
-    weight = torch.randn(features, samples, dtype=dtype) / math.sqrt(samples or 1)
+def linear(depth, features=20, dtype=f64):
+    weight = torch.randn(features, depth, dtype=dtype) / math.sqrt(depth or 1)
     return weight, torch.randn(features, dtype=dtype)
 
 
@@ -129,7 +129,7 @@ def test_a_rotation_turns_the_azimuths(jitter):
     image, radii, center, *_, azimuths = make_inputs()
     c, s = math.cos(0.4), math.sin(0.4)
     turn = torch.tensor([[[c, -s], [s, c]]], dtype=f64)
-    options = dict(patch=(3, 4), jitter=jitter, seed=2)
+    options = dict(samples=(3, 4), jitter=jitter, seed=2)
     torch.testing.assert_close(
         polar_sample(image, radii, azimuths, center, affine=turn, **options),
         polar_sample(image, radii, azimuths + 0.4, center, **options),
@@ -140,7 +140,7 @@ def test_a_rotation_turns_the_azimuths(jitter):
 def test_equal_offsets_move_the_center(jitter):
     image, radii, center, _, offsets, azimuths = make_inputs()
     shift = torch.tensor([1.5, -2.25], dtype=f64)
-    options = dict(patch=(3, 4), jitter=jitter, seed=2)
+    options = dict(samples=(3, 4), jitter=jitter, seed=2)
     offsets = shift[None, :, None, None].expand_as(offsets)
     torch.testing.assert_close(
         polar_sample(image, radii, azimuths, center, offsets=offsets, **options),
@@ -153,9 +153,9 @@ def test_jitter_moves_points_before_the_matrix_and_leaves_their_offsets():
     # An image whose channels are x and y: sampling it gives each point's place.
     x = torch.arange(256.0, dtype=f64).expand(256, 256)
     image, center = torch.stack((x, x.T))[None], torch.full((1, 2), 127.5, dtype=f64)
-    options = dict(patch=(1, 1), jitter=0.9, seed=7, layout="image")
+    options = dict(samples=(1, 1), jitter=0.9, seed=7, layout="image")
     moved = polar_sample(image, radii, azimuths, center, **options)[0] - 127.5
-    still = polar_sample(image, radii, azimuths, center, patch=(1, 1), layout="image")[0] - 127.5
+    still = polar_sample(image, radii, azimuths, center, samples=(1, 1), layout="image")[0] - 127.5
     assert (moved - still).abs().max() > 0.5
     got = polar_sample(
         image, radii, azimuths, center, affine=affine, offsets=offsets, **options
@@ -168,10 +168,10 @@ def test_jitter_moves_points_before_the_matrix_and_leaves_their_offsets():
 @pytest.mark.parametrize("shape", ["plain", "cells", "packed, large", "in place", "one pixel"])
 @jitters
 def test_an_identity_changes_no_bit(shape, jitter, dtype):
-    sizes, patch = SHAPES[shape]
+    sizes, samples = SHAPES[shape]
     image, radii, center, _, offsets, azimuths = make_inputs(**sizes, dtype=dtype)
-    options = dict(patch=patch, jitter=jitter, seed=3)
-    for bend in (dict(affine=torch.eye(2, dtype=dtype)[None]), dict(offsets=0 * offsets)):
+    options = dict(samples=samples, jitter=jitter, seed=3)
+    for part in (dict(affine=torch.eye(2, dtype=dtype)[None]), dict(offsets=0 * offsets)):
         results = [
             with_gradients(
                 lambda i, r, c, given=given: polar_sample(
@@ -179,7 +179,7 @@ def test_an_identity_changes_no_bit(shape, jitter, dtype):
                 ),
                 (image, radii, center),
             )
-            for given in ({}, bend)
+            for given in ({}, part)
         ]
         assert all(torch.equal(a, b) for a, b in zip(*results, strict=True))
 
@@ -198,64 +198,64 @@ def test_points_thrown_far_outside_are_zero():
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
-@pytest.mark.parametrize("bends", BENDS)
+@pytest.mark.parametrize("parts", PARTS)
 @jitters
 @shapes
-def test_equals_reference_in_float64(shape, jitter, bends, layout):
-    sizes, patch = SHAPES[shape]
+def test_equals_reference_in_float64(shape, jitter, parts, layout):
+    sizes, samples = SHAPES[shape]
     *inputs, azimuths = make_inputs(**sizes)
-    inputs = bent(inputs, bends)
-    run = sampler(azimuths, patch, bends, jitter=jitter, seed=3, layout=layout)
+    inputs = without_others(inputs, parts)
+    run = sampler(azimuths, samples, parts, jitter=jitter, seed=3, layout=layout)
     assert_equals_reference(run, inputs, rtol=1e-9, atol=1e-9)
 
 
 @jitters
 @shapes
 def test_embedding_equals_reference_in_float64(shape, jitter):
-    sizes, patch = SHAPES[shape]
+    sizes, samples = SHAPES[shape]
     *inputs, azimuths = make_inputs(**sizes)
-    inputs += linear(patch[0] * patch[1] * inputs[0].shape[1])
-    run = embedder(azimuths, patch, jitter=jitter, seed=3)
+    inputs += linear(samples[0] * samples[1] * inputs[0].shape[1])
+    run = embedder(azimuths, samples, jitter=jitter, seed=3)
     assert_equals_reference(run, inputs, rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
 @shapes
 def test_accuracy_rule(shape, layout):
-    sizes, patch = SHAPES[shape]
+    sizes, samples = SHAPES[shape]
     azimuths = make_inputs(**sizes)[-1]
 
     def mask(*inputs):
         points = away_from_borders(inputs, azimuths).expand(-1, inputs[0].shape[1], -1, -1)
         if layout == "image":
             return points
-        rings, sectors = points.shape[2] // patch[0], points.shape[3] // patch[1]
-        points = points.unflatten(3, (sectors, patch[1])).unflatten(2, (rings, patch[0]))
+        rings, sectors = points.shape[2] // samples[0], points.shape[3] // samples[1]
+        points = points.unflatten(3, (sectors, samples[1])).unflatten(2, (rings, samples[0]))
         return points.permute(0, 2, 4, 3, 5, 1).flatten(3)
 
     assert_accurate(
-        sampler(azimuths, patch, layout=layout),
+        sampler(azimuths, samples, layout=layout),
         lambda: make_inputs(**sizes, dtype=torch.float32)[:-1],
         mask,
         draws=10,  # of six radii three draws are too few to measure rounding with
     )
 
 
-@pytest.mark.parametrize("bends", BENDS)
-def test_accuracy_rule_where_many_images_share_a_lens(bends):
+@pytest.mark.parametrize("parts", PARTS)
+def test_accuracy_rule_where_many_images_share_a_lens(parts):
     sizes = dict(batch=64, rows=8, columns=16, shared=True)
     azimuths = make_inputs(**sizes)[-1]
     smooth = {}
 
     def make():
         inputs = make_inputs(**sizes, dtype=torch.float32)[:-1]
-        inputs[4].mul_(BENDS[bends][1])
-        if not BENDS[bends][0]:
+        inputs[4].mul_(PARTS[parts][1])
+        if not PARTS[parts][0]:
             inputs[3].copy_(torch.eye(2))
         smooth["mask"] = away_from_borders(inputs, azimuths)
-        return bent(inputs, bends)
+        return without_others(inputs, parts)
 
-    assert_accurate(sampler(azimuths, (1, 1), bends, layout="image"), make,
+    assert_accurate(sampler(azimuths, (1, 1), parts, layout="image"), make,
                     lambda *_: smooth["mask"])  # fmt: skip
 
 
@@ -348,14 +348,14 @@ def test_strided_lenses():
         torch.testing.assert_close(a, b, rtol=0, atol=0)
 
 
-# -- what is no number -----------------------------------------------------------------------------
+# -- NaN and infinity ------------------------------------------------------------------------------
 
 
 @references
 @jitters
 @pytest.mark.parametrize("rows", [6, 60])  # far and near
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
-def test_points_at_no_number_sample_nothing(bad, rows, jitter, reference):
+def test_points_at_nan_or_infinity_sample_nothing(bad, rows, jitter, reference):
     image, radii, center, affine, offsets, azimuths = make_inputs(
         rows=rows, columns=40, dtype=torch.float32
     )
@@ -403,11 +403,11 @@ def test_bad_radii_keep_to_themselves(bad, reference):
 @jitters
 @shapes
 def test_same_bits_for_any_number_of_threads(threads, shape, jitter, batch, shared):
-    sizes, patch = SHAPES[shape]
+    sizes, samples = SHAPES[shape]
     sizes = sizes | dict(batch=batch, shared=shared, dtype=torch.float32)
     *inputs, azimuths = make_inputs(**sizes)
-    weights = linear(patch[0] * patch[1] * inputs[0].shape[1], dtype=torch.float32)
-    run, embed = (make(azimuths, patch, jitter=jitter, seed=1) for make in (sampler, embedder))
+    weights = linear(samples[0] * samples[1] * inputs[0].shape[1], dtype=torch.float32)
+    run, embed = (make(azimuths, samples, jitter=jitter, seed=1) for make in (sampler, embedder))
     results = []
     for count in (1, 2, 7):
         threads(count)
@@ -437,22 +437,18 @@ def test_bands_get_what_offsets_bring_them(threads, far):
 
 
 @pytest.mark.parametrize("requires_grad", [False, True])
-@pytest.mark.parametrize("bends", BENDS)
-def test_opcheck(requires_grad, bends):
+@pytest.mark.parametrize("parts", PARTS)
+def test_opcheck(requires_grad, parts):
     image, radii, center, affine, offsets, azimuths = make_inputs(dtype=torch.float32)
     weight, bias = linear(36, dtype=torch.float32)
     for tensor in (image, radii, center, affine, offsets, weight, bias):
         tensor.requires_grad_(requires_grad)
-    with_affine, with_offsets = BENDS[bends]
+    with_affine, with_offsets = PARTS[parts]
     lens = (radii, azimuths, center, affine if with_affine else None,
             offsets if with_offsets else None)  # fmt: skip
-    settings = ((3, 4), torch.tensor(0.5).double(), torch.tensor(5), (), ())
-    torch.library.opcheck(
-        torch.ops.darswin.polar_sample.default, (image, *lens, *settings, True, False)
-    )
-    torch.library.opcheck(
-        torch.ops.darswin.polar_embed.default, (image, *lens, weight, bias, *settings, False)
-    )
+    sampling = (image, *lens, torch.tensor(0.5).double(), torch.tensor(5), (3, 4), (), (), False)
+    torch.library.opcheck(torch.ops.darswin.polar_sample.default, (*sampling, True))
+    torch.library.opcheck(torch.ops.darswin.polar_embed.default, (*sampling, weight, bias))
 
 
 @pytest.mark.parametrize("lens_grad", [False, True])
@@ -460,21 +456,12 @@ def test_opcheck(requires_grad, bends):
 def test_opcheck_backward(lens_grad, offsets_grad):
     image, radii, center, affine, offsets, azimuths = make_inputs(dtype=torch.float32)
     weight, _ = linear(36, dtype=torch.float32)
-    settings = ((3, 4), None, None, (), ())
     wanted = (False, lens_grad, offsets_grad)
     lens = (radii, azimuths, center, affine, offsets)
+    sampling = (image, *lens, None, None, (3, 4), (), (), False)
     sample, embed = torch.ops.darswin.polar_sample_backward, torch.ops.darswin.polar_embed_backward
-    sample_arguments = (torch.randn(2, 2, 2, 36), image, *lens, *settings, True, False, *wanted)
-    embed_arguments = (
-        torch.randn(2, 2, 2, 20),
-        image,
-        *lens,
-        weight,
-        *settings,
-        False,
-        *wanted,
-        True,
-    )
+    sample_arguments = (*sampling, True, torch.randn(2, 2, 2, 36), *wanted)
+    embed_arguments = (*sampling, weight, torch.randn(2, 2, 2, 20), *wanted, True)
     for operator, arguments in ((sample, sample_arguments), (embed, embed_arguments)):
         torch.library.opcheck(
             operator.default, arguments, test_utils=("test_schema", "test_faketensor")
@@ -506,7 +493,7 @@ def test_export():
     class Module(torch.nn.Module):
         def forward(self, image, radii, center, affine, offsets, azimuths):
             return polar_sample(
-                image, radii, azimuths, center, affine=affine, offsets=offsets, patch=(3, 4)
+                image, radii, azimuths, center, affine=affine, offsets=offsets, samples=(3, 4)
             )
 
     arguments = make_inputs(dtype=torch.float32)
@@ -542,7 +529,7 @@ def test_errors_say_what_was_expected(change, error, message, reference):
     weight, _ = linear(36, dtype=torch.float32)
     arguments = dict(
         image=image, radii=radii, azimuths=azimuths, center=center, affine=affine, offsets=offsets,
-        patch=(3, 4),
+        samples=(3, 4),
     )  # fmt: skip
     with use_reference(reference):
         with pytest.raises(error, match=message):
@@ -564,6 +551,6 @@ def test_the_compiled_operator_itself_reads_nothing_outside():
         lens = dict(affine=affine, offsets=offsets) | bad
         with pytest.raises(RuntimeError, match="affine or offsets"):
             torch.ops.darswin.polar_sample(
-                image, radii, azimuths, center, lens["affine"], lens["offsets"], (3, 4), None, None,
-                (), (), True, False,
+                image, radii, azimuths, center, lens["affine"], lens["offsets"], None, None, (3, 4),
+                (), (), False, True,
             )  # fmt: skip

@@ -1,4 +1,4 @@
-"""add_norm_: a residual and the layer norm behind it, in place. Public function, fake, autograd."""
+"""add_norm_: a residual and the layer norm behind it, in place. Private: it has no reference."""
 
 import torch
 from torch import Tensor
@@ -22,11 +22,11 @@ def add_norm_(x: Tensor, y: Tensor, weight: Tensor, bias: Tensor, eps: float) ->
         RuntimeError: tensors that do not fit, that share memory, or that require a gradient where
             one would be recorded: there is none.
     """
-    torch.ops.darswin.add_norm_.default(x, y, weight, bias, eps)
+    torch.ops.darswin._add_norm_.default(x, y, weight, bias, eps)
     return y
 
 
-@torch.library.register_fake("darswin::add_norm_")
+@torch.library.register_fake("darswin::_add_norm_")
 def _fake(x, y, weight, bias, eps):
     return None
 
@@ -43,7 +43,7 @@ def _no_gradient(keyset, *arguments):
             "torch.no_grad(), or use torch.layer_norm(x + y, ...)"
         )
     with torch._C._AutoDispatchBelowAutograd():
-        return torch.ops.darswin.add_norm_.default.redispatch(
+        return torch.ops.darswin._add_norm_.default.redispatch(
             keyset & torch._C._after_autograd_keyset, *arguments
         )
 
@@ -51,10 +51,10 @@ def _no_gradient(keyset, *arguments):
 def _changed(keyset, x, y, *others):
     # Autograd then notices where a value that it has saved was changed.
     increment_version((x, y))
-    return torch.ops.darswin.add_norm_.default.redispatch(
+    return torch.ops.darswin._add_norm_.default.redispatch(
         keyset & torch._C._after_ADInplaceOrView_keyset, x, y, *others
     )
 
 
-_implementations.impl("add_norm_", _no_gradient, "Autograd", with_keyset=True)
-_implementations.impl("add_norm_", _changed, "ADInplaceOrView", with_keyset=True)
+_implementations.impl("_add_norm_", _no_gradient, "Autograd", with_keyset=True)
+_implementations.impl("_add_norm_", _changed, "ADInplaceOrView", with_keyset=True)

@@ -1,4 +1,4 @@
-"""transpose_sum: a matrix's transpose and sums of columns. Public function, fake, autograd."""
+"""transpose_sum: a transpose and sums of columns in one. Private: it has no reference."""
 
 import torch
 from torch import Tensor
@@ -23,10 +23,10 @@ def transpose_sum(x: Tensor) -> tuple[Tensor, Tensor]:
         NotImplementedError: forward-mode derivatives and those of torch.func.
     """
     _library.refuse_other_derivatives("transpose_sum", (x,))
-    return torch.ops.darswin.transpose_sum.default(x)
+    return torch.ops.darswin._transpose_sum.default(x)
 
 
-@torch.library.register_fake("darswin::transpose_sum")
+@torch.library.register_fake("darswin::_transpose_sum")
 def _fake(x):
     return x.new_empty(x.shape[::-1]), x.new_empty(x.shape[1:])
 
@@ -35,4 +35,4 @@ def _backward(ctx, grad_transposed, grad_sums):
     return grad_transposed.t() + grad_sums
 
 
-torch.library.register_autograd("darswin::transpose_sum", _backward)
+torch.library.register_autograd("darswin::_transpose_sum", _backward)

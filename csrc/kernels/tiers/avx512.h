@@ -1,0 +1,113 @@
+// AVX-512 (F, BW, VL, DQ): registers of 512 bits, and fused multiply-add. generic.h says what each
+// of these does.
+#pragma once
+
+#include <immintrin.h>
+
+#include "../../bfloat16.h"
+#include "../vector.h"
+
+namespace darswin {
+namespace {
+
+constexpr int kRegister = 64;  // bytes
+constexpr int kTileRows = 8;   // rows of a tile of sums: 8 x 3 of 32 registers
+constexpr bool kFused = true;
+
+using Floats = Vector<float, 16>;
+using Doubles = Vector<double, 8>;
+using Words = Vector<uint64_t, 8>;
+
+template <typename V>
+inline V unfused(V value) {
+  asm("" : "+x"(value));
+  return value;
+}
+
+// The compiler's own shuffle is a slow one.
+inline Vector<float, 4> upper_half(Vector<float, 8> v) {
+  return (Vector<float, 4>)_mm256_extractf128_ps((__m256)v, 1);
+}
+
+inline Floats repeat(Vector<float, 4> v) {
+  return (Floats)_mm512_maskz_broadcast_f32x4(0xFFFF, (__m128)v);
+}
+
+// The compiler's own conversions go by halves of a register.
+inline Doubles to_doubles(Vector<int32_t, 8> x) {
+  return (Doubles)_mm512_maskz_cvtepi32_pd(0xFF, (__m256i)x);
+}
+
+inline Doubles whole_part(Doubles x) {
+  return (Doubles)_mm512_maskz_roundscale_pd(0xFF, (__m512d)x, _MM_FROUND_TO_ZERO);
+}
+
+inline Floats widen_lanes(const bfloat16* from) {
+  const __m256i halves = load_bits<__m256i>(from);
+  return (Floats)((Vector<uint32_t, 16>)_mm512_maskz_cvtepu16_epi32(0xFFFF, halves) << 16);
+}
+
+inline Words lower_product(Words a, uint32_t b) {
+  const Words factor = splat<Words>(static_cast<uint64_t>(b));
+  return (Words)_mm512_maskz_mul_epu32(0xFF, (__m512i)a, (__m512i)factor);
+}
+
+inline Words interleave_lower(Words a, Words b) {
+  return __builtin_shufflevector(a, b, 0, 8, 1, 9, 2, 10, 3, 11);
+}
+inline Words interleave_upper(Words a, Words b) {
+  return __builtin_shufflevector(a, b, 4, 12, 5, 13, 6, 14, 7, 15);
+}
+
+inline Floats even_lanes(Floats a, Floats b) {
+  return __builtin_shufflevector(a, b, 0, 2, 16, 18, 4, 6, 20, 22, 8, 10, 24, 26, 12, 14, 28, 30);
+}
+inline Floats odd_lanes(Floats a, Floats b) {
+  return __builtin_shufflevector(a, b, 1, 3, 17, 19, 5, 7, 21, 23, 9, 11, 25, 27, 13, 15, 29, 31);
+}
+
+inline Floats even_quads(Floats a, Floats b) {
+  return __builtin_shufflevector(a, b, 0, 1, 2, 3, 8, 9, 10, 11, 16, 17, 18, 19, 24, 25, 26, 27);
+}
+inline Floats odd_quads(Floats a, Floats b) {
+  return __builtin_shufflevector(a, b, 4, 5, 6, 7, 12, 13, 14, 15, 20, 21, 22, 23, 28, 29, 30, 31);
+}
+inline void transpose_quads(Floats* rows) {
+#pragma GCC unroll 4
+  for (int lane = 0; lane < 4; ++lane) {
+    split_pairs<4>(rows + lane, 4, even_quads, odd_quads);
+    split_pairs<4>(rows + lane, 4, even_quads, odd_quads);
+  }
+}
+
+// What follows is for registers of 512 bits alone, which hold four pixels of four channels.
+
+// Eight floats from here and eight from there: a masked load, which needs no shuffle.
+inline Floats two_eights(const float* here, const float* there) {
+  const __m512 first = _mm512_castps256_ps512(_mm256_loadu_ps(here));
+  return (Floats)_mm512_mask_broadcast_f32x8(first, 0xFF00, _mm256_loadu_ps(there));
+}
+
+// The lanes of v that `index` names.
+inline Floats pick(Vector<float, 4> v, Vector<int32_t, 16> index) {
+  const __m512 wide = _mm512_castps128_ps512((__m128)v);
+  return (Floats)_mm512_maskz_permutexvar_ps(0xFFFF, (__m512i)index, wide);
+}
+
+// The first `lanes` of each quarter of v, one quarter behind the other.
+inline void store_quarters(float* to, Floats v, int64_t lanes) {
+  const auto fronts = static_cast<__mmask16>(0x1111 * ((1 << lanes) - 1));
+  const auto joined = static_cast<__mmask16>((1 << 4 * lanes) - 1);
+  _mm512_mask_storeu_ps(to, joined, _mm512_maskz_compress_ps(fronts, (__m512)v));
+}
+
+// Each quarter of v to to[place[0]], to[place[1]], ...
+inline void scatter_quarters(float* to, Floats v, const int32_t* place) {
+  store(to + place[0], (Vector<float, 4>)_mm512_maskz_extractf32x4_ps(0xF, (__m512)v, 0));
+  store(to + place[1], (Vector<float, 4>)_mm512_maskz_extractf32x4_ps(0xF, (__m512)v, 1));
+  store(to + place[2], (Vector<float, 4>)_mm512_maskz_extractf32x4_ps(0xF, (__m512)v, 2));
+  store(to + place[3], (Vector<float, 4>)_mm512_maskz_extractf32x4_ps(0xF, (__m512)v, 3));
+}
+
+}  // namespace
+}  // namespace darswin

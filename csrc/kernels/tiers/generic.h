@@ -1,0 +1,75 @@
+// The generic tier: registers of 128 bits and no fused multiply-add. On x86 that is SSE2, which
+// every such CPU has; elsewhere the compiler's own choice.
+//
+// A tier's header holds all that differs between tiers: the registers, and a few functions that the
+// compiler does not make well out of plain vector code.
+#pragma once
+
+#if defined(__SSE2__)
+#  include <emmintrin.h>
+#endif
+
+#include "../../bfloat16.h"
+#include "../vector.h"
+
+namespace darswin {
+namespace {
+
+constexpr int kRegister = 16;  // bytes
+constexpr int kTileRows = 4;   // rows of a tile of sums: 4 x 3 of 16 registers
+constexpr bool kFused = false;
+
+using Floats = Vector<float, 4>;
+using Doubles = Vector<double, 2>;
+using Words = Vector<uint64_t, 2>;
+
+// A value that is rounded as it stands. The compiler may else fuse the product in it into a sum in
+// one copy of the code and not in another, and results would depend on which copy runs.
+template <typename V>
+inline V unfused(V value) {
+#if !defined(__SSE2__)
+  asm("" : "+m"(value));
+#endif
+  return value;
+}
+
+// Four lanes, in every 128 bits of a register.
+inline Floats repeat(Vector<float, 4> v) { return v; }
+
+inline Doubles to_doubles(Vector<int32_t, 2> x) { return __builtin_convertvector(x, Doubles); }
+
+// The whole part of numbers below 2^63.
+inline Doubles whole_part(Doubles x) {
+  return __builtin_convertvector(__builtin_convertvector(x, Vector<int64_t, 2>), Doubles);
+}
+
+// bfloat16 as the floats that have these upper halves.
+inline Floats widen_lanes(const bfloat16* from) {
+  using Bits = Vector<uint32_t, 4>;
+  const auto bits = __builtin_convertvector(load_bits<Vector<uint16_t, 4>>(from), Bits);
+  return (Floats)(bits << 16);
+}
+
+// Products of the lower halves of the lanes.
+inline Words lower_product(Words a, uint32_t b) {
+  const Words factor = splat<Words>(static_cast<uint64_t>(b));
+#if defined(__SSE2__)
+  return (Words)_mm_mul_epu32((__m128i)a, (__m128i)factor);
+#else
+  return (a & 0xFFFFFFFF) * factor;
+#endif
+}
+
+// a0 b0 a1 b1 ... of the lower and of the upper halves of two registers.
+inline Words interleave_lower(Words a, Words b) { return __builtin_shufflevector(a, b, 0, 2); }
+inline Words interleave_upper(Words a, Words b) { return __builtin_shufflevector(a, b, 1, 3); }
+
+// a0 a2 .. b0 b2 .. within each 128 bits, and a1 a3 .. b1 b3 ..
+inline Floats even_lanes(Floats a, Floats b) { return __builtin_shufflevector(a, b, 0, 2, 4, 6); }
+inline Floats odd_lanes(Floats a, Floats b) { return __builtin_shufflevector(a, b, 1, 3, 5, 7); }
+
+// Of a square of registers, transposes the 128-bit parts among themselves: here there is one.
+inline void transpose_quads(Floats*) {}
+
+}  // namespace
+}  // namespace darswin

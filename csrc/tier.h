@@ -1,0 +1,22 @@
+// The instruction-set tiers, and where the kernels of each are found.
+//
+// csrc/kernels is compiled once per tier, with that tier's instructions. An inline function with
+// external linkage would come out of every tier's objects, and the linker would keep any one copy:
+// perhaps AVX-512 code that all CPUs then run. So whatever kernels/ compiles, this header and those
+// of the operators included, stands in an unnamed namespace; only the tables of kernels have
+// external linkage, and their names contain the tier.
+#pragma once
+
+namespace darswin {
+
+// From low to high. CMakeLists.txt lists them: generic and, on x86, avx2 and avx512.
+enum class Tier { DARSWIN_TIERS };
+
+// The kernels of one operator on one tier. `Table` is a struct of function pointers, which the
+// operator's header declares; kernels/OPERATOR.cpp defines `table`.
+template <typename Table, Tier tier>
+struct Kernels {
+  static const Table table;
+};
+
+}  // namespace darswin

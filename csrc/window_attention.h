@@ -1,0 +1,57 @@
+// What the driver of window_attention and its kernels agree on.
+#pragma once
+
+#include <cstdint>
+
+#include "bfloat16.h"
+#include "tier.h"
+
+namespace darswin {
+
+// The type in which a storage type is computed.
+template <typename T>
+struct ArithmeticOf {
+  using type = T;
+};
+template <>
+struct ArithmeticOf<bfloat16> {
+  using type = float;
+};
+template <typename T>
+using Arithmetic = typename ArithmeticOf<T>::type;
+
+// Windows of a polar map; token (r, a) of the rolled map is token (r + shift_r, a + shift_a) of it.
+// Windows are counted over all images: window w lies in image w / (windows of an image).
+template <typename T>
+struct WindowAttentionArgs {
+  using Real = Arithmetic<T>;
+
+  const T* qkv;      // (B, R, A, 3, heads, d)
+  const Real* bias;  // (B or 1, heads, 2 M_r - 1, 2 M_a - 1)
+  int64_t bias_rows, windows;
+  int64_t rings, sectors, heads, head_dim;
+  int64_t window_r, window_a, shift_r, shift_a;
+  bool periodic_r, periodic_a;
+  Real scale;
+
+  T* out;  // forward: (B, R, A, heads, d)
+
+  const T* grad_out;  // backward
+  T* grad_qkv;        // like qkv
+  double* grad_bias;  // (chunks of a bias row, B or 1, heads, 2 M_r - 1, 2 M_a - 1), to be summed
+                      // over the chunks; zero on entry
+  int64_t chunk;      // windows that share one row of bias gradients
+};
+
+// A kernel works serially through the items [begin, end); the driver owns the threads.
+template <typename T>
+struct WindowAttentionKernels {
+  // bytes of scratch that each thread needs in the two functions below
+  int64_t (*scratch)(const WindowAttentionArgs<T>&);
+  // item: (window, head)
+  void (*forward)(const WindowAttentionArgs<T>&, int64_t begin, int64_t end, void* scratch);
+  // item: (chunk of windows, head)
+  void (*backward)(const WindowAttentionArgs<T>&, int64_t begin, int64_t end, void* scratch);
+};
+
+}  // namespace darswin

@@ -1,0 +1,170 @@
+"""What polar_sample and polar_embed share: the arguments of a sampling, checked, and gradients."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from darswin.ops import _library
+from darswin.ops.checks import (
+    DTYPES,
+    as_int,
+    channels_first,
+    check_jitter,
+    check_pair,
+    check_shape,
+    check_tensor,
+    per_channel,
+)
+
+TENSORS = 8  # how many fields of `Sampling` are tensors; they come first
+
+
+class Sampling(NamedTuple):
+    """The arguments of a sampling as the operators take them, in the order of their schemas."""
+
+    image: Tensor
+    radii: Tensor
+    azimuths: Tensor
+    center: Tensor
+    affine: Tensor | None
+    offsets: Tensor | None
+    # Tensors, so that a graph which is compiled does not keep their values. None without jitter.
+    jitter: Tensor | None
+    seed: Tensor | None
+    samples: tuple[int, int]
+    # Of uint8 images, one number a channel; of others empty.
+    mean: Sequence[float]
+    std: Sequence[float]
+    bfloat16: bool  # whether the output is
+
+    @property
+    def token_size(self) -> int:
+        """Values of a token: S_r·S_φ·C."""
+        return self.samples[0] * self.samples[1] * self.image.shape[1]
+
+    @property
+    def map_size(self) -> tuple[int, int, int]:
+        """(B, R, A) of the tokens."""
+        rings = self.radii.shape[1] // self.samples[0]
+        return self.image.shape[0], rings, self.azimuths.shape[0] // self.samples[1]
+
+    def new_output(self, shape: tuple[int, ...]) -> Tensor:
+        """An empty tensor of the output's type."""
+        return self.radii.new_empty(shape, dtype=torch.bfloat16 if self.bfloat16 else None)
+
+    def new_gradients(
+        self, image_grad: bool, lens_grad: bool, offsets_grad: bool
+    ) -> tuple[Tensor, ...]:
+        """Empty gradients, as the backward operators give them: of size (0,) if not wanted."""
+        return tuple(
+            value.new_empty(value.shape) if wanted and value is not None else like.new_empty((0,))
+            for value, like, wanted in (
+                (self.image, self.image, image_grad),
+                (self.radii, self.radii, lens_grad),
+                (self.center, self.radii, lens_grad),
+                (self.affine, self.radii, lens_grad),
+                (self.offsets, self.radii, offsets_grad),
+            )
+        )
+
+
+def checked_sampling(
+    image: Tensor,
+    radii: Tensor,
+    azimuths: Tensor,
+    center: Tensor,
+    affine: Tensor | None,
+    offsets: Tensor | None,
+    jitter: float,
+    seed: int | Tensor,
+    samples: tuple[int, int],
+    mean: float | Sequence[float],
+    std: float | Sequence[float],
+) -> Sampling:
+    """The arguments of the public functions, else TypeError or ValueError."""
+    if isinstance(image, Tensor):
+        image = _library.without_float16(image)
+    check_tensor("image", image, dtypes=(*DTYPES, torch.bfloat16, torch.uint8))
+    check_shape("image", image, "(B, C, H, W)", (None,) * 4)
+    image = channels_first(image)
+    geometry = None if image.dtype in DTYPES else (torch.float32,)
+    tensors = dict(radii=radii, azimuths=azimuths, center=center, affine=affine, offsets=offsets)
+    for name, value in tensors.items():
+        if value is not None or name not in ("affine", "offsets"):
+            check_tensor(name, value, like=image, dtypes=geometry)
+    batch, channels = image.shape[:2]
+    check_shape("radii", radii, "(B or 1, R·S_r) = ({} or 1, any)", (batch, None), (1, None))
+    check_shape("azimuths", azimuths, "(A·S_φ,)", (None,))
+    check_shape("center", center, "(B or 1, 2) = ({} or 1, 2)", (batch, 2), (1, 2))
+    if affine is not None:
+        form = "(B or 1, 2, 2) = ({} or 1, 2, 2)"
+        check_shape("affine", affine, form, (batch, 2, 2), (1, 2, 2))
+    if offsets is not None:
+        points = (2, radii.shape[1], azimuths.shape[0])
+        form = "(B or 1, 2, R·S_r, A·S_φ) = ({} or 1, {}, {}, {})"
+        check_shape("offsets", offsets, form, (batch, *points), (1, *points))
+    samples = check_pair("samples", samples, lowest=1)
+    if radii.shape[1] % samples[0] or azimuths.shape[0] % samples[1]:
+        raise ValueError(
+            f"samples = (S_r, S_φ) must divide (R·S_r, A·S_φ) = "
+            f"({radii.shape[1]}, {azimuths.shape[0]}), got {samples}"
+        )
+    if image.dtype == torch.uint8:
+        mean, std = per_channel("mean", mean, channels), per_channel("std", std, channels)
+    else:
+        mean = std = ()
+    return Sampling(
+        image, radii, azimuths, center, affine, offsets, *_jitter_tensors(jitter, seed),
+        samples, mean, std, _library.output_bfloat16(image),
+    )  # fmt: skip
+
+
+def _jitter_tensors(jitter: float, seed: int | Tensor) -> tuple[Tensor | None, Tensor | None]:
+    """Jitter and seed as the operators take them; None and None without jitter."""
+    jitter = check_jitter(jitter)
+    if jitter == 0:
+        return None, None
+    return torch.tensor(jitter, dtype=torch.float64, device="cpu"), _seed_tensor(seed)
+
+
+def _seed_tensor(seed: int | Tensor) -> Tensor:
+    if isinstance(seed, Tensor):
+        if seed.dtype != torch.int64 or seed.dim() != 0:
+            raise ValueError(
+                f"seed must be an int or a 0-dim int64 tensor, got {seed.dtype} of shape "
+                f"{tuple(seed.shape)}"
+            )
+        return seed
+    key = as_int(seed)
+    if key is None:
+        raise TypeError(f"seed must be an int or a 0-dim int64 tensor, got {type(seed).__name__}")
+    if not -(2**63) <= key < 2**63:
+        raise ValueError(f"seed must fit 64 bits, got {seed}")
+    return torch.tensor(key, dtype=torch.int64, device="cpu")
+
+
+def wanted_groups(needs_input_grad: Sequence[bool]) -> tuple[bool, bool, bool]:
+    """Whether backward needs the gradients of the image, of the lens and of the offsets."""
+    image, radii, _, center, affine, offsets = needs_input_grad[:6]
+    return image, radii or center or affine, offsets
+
+
+def input_gradients(
+    needs_input_grad: Sequence[bool],
+    image: Tensor,
+    radii: Tensor,
+    center: Tensor,
+    affine: Tensor,
+    offsets: Tensor,
+    *others: Tensor | None,
+) -> tuple[Tensor | None, ...]:
+    """A gradient for each input that needs one, None for the rest: the fields of a `Sampling`, then
+    the operator's other arguments."""
+    settings = (None,) * (len(Sampling._fields) - 6)
+    gradients = (image, radii, None, center, affine, offsets, *settings, *others)
+    return tuple(
+        gradient if wanted else None
+        for gradient, wanted in zip(gradients, needs_input_grad, strict=True)
+    )
