@@ -15,13 +15,13 @@ GridFunction = Callable[..., PolarGrid]
 
 
 class PolarSample(nn.Module):
-    """Samples images on the polar grid of their lenses, which it makes; see `polar_sample`.
+    """Samples images on the polar grid of their lenses: `polar_sample` and the grid it needs.
 
     Args:
         rings, sectors, samples, spacing, sample_spacing, placement: as `darswin.polar_grid`.
         jitter: in [0, 1], how far a sample may move, in cells; only in training. The seed of each
             call comes from torch's generator.
-        layout: "tokens" gives (B, R, A, S_r·S_φ·C); "image" (B, C, R·S_r, A·S_φ), as `F.grid_sample`.
+        layout: "tokens" gives (B, R, A, S_r·S_φ·C), "image" (B, C, R·S_r, A·S_φ).
         mean, std: of uint8 images, which count as `(pixel/255 - mean) / std`; others ignore them.
         grid: the function that makes the grid.
 
@@ -129,6 +129,4 @@ def check_lens(lens: Lens | None, size: tuple[int, int]) -> Lens:
 def check_count(lenses: int, images: Tensor) -> None:
     """ValueError unless there is a lens for each image, or one for all."""
     if lenses not in (1, images.shape[0]):
-        raise ValueError(
-            f"there must be one lens or one an image, {images.shape[0]}, got {lenses}"
-        )
+        raise ValueError(f"there must be one lens or one an image, {images.shape[0]}, got {lenses}")

@@ -19,9 +19,7 @@ Presets = Mapping[str, Mapping[str, Any]]
 Model = TypeVar("Model", bound=type[Encoder])
 
 
-def register_model(
-    family: str, *, presets: Presets, **options: Any
-) -> Callable[[Model], Model]:
+def register_model(family: str, *, presets: Presets, **options: Any) -> Callable[[Model], Model]:
     """Decorates a model's class: `create_model` knows it as `family`_small, _tiny, _micro, _nano.
 
     Args:

@@ -130,7 +130,7 @@ def make_stages(
 
     Args:
         attention: the width, heads, plan and number of a block → its attention.
-        downsample: the width before and the merging (m_r, m_φ) → what begins every stage but the first.
+        downsample: the width before and (m_r, m_φ) → what begins every stage but the first.
         drop_path_rate: of the last block; it rises linearly from 0.
     """
     stages = nn.ModuleList()
