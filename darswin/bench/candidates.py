@@ -10,11 +10,13 @@ from torch import Tensor, nn
 
 from darswin.bench.timing import COMPILED, ONE_LENS, OURS, PRODUCTS, REFERENCE
 from darswin.deploy.optimize import optimize
+from darswin.layers.embed import PolarPatchEmbed
 from darswin.layers.linear import Linear
 from darswin.layers.onednn import PackedLinear
 from darswin.lens import Lens, Spherical
-from darswin.models import DarSwin, create_model
+from darswin.models import create_model
 from darswin.models.encoder import Encoder
+from darswin.models.registry import model_class
 from darswin.ops import use_reference
 
 Run = Callable[[], Tensor]
@@ -29,7 +31,7 @@ def lens_of(size: int) -> Lens:
 def network(name: str, size: int) -> Encoder:
     """A model of random weights, the same at every call."""
     torch.manual_seed(0)
-    options = {} if name.startswith("darswin") else dict(image_size=size)
+    options = {} if model_class(name).image_size is None else dict(image_size=size)
     return create_model(name, num_classes=CLASSES, **options)
 
 
@@ -92,13 +94,12 @@ def products_of(
     def add(layer: Linear, rows: int) -> None:
         found.append((PackedLinear(layer, dtype), torch.randn(rows, layer.in_features).to(dtype)))
 
-    def hook(layer: Linear, _inputs: tuple[Tensor], output: Tensor) -> None:
-        add(layer, output.numel() // layer.out_features)
+    def hook(layer: Linear | PolarPatchEmbed, _inputs: tuple[Tensor], output: Tensor) -> None:
+        # A polar embedding's linear layer is not called: `polar_embed` takes its weight.
+        linear = layer.proj if isinstance(layer, PolarPatchEmbed) else layer
+        add(linear, output.numel() // linear.out_features)
 
-    if isinstance(model, DarSwin):  # its first one is inside of `polar_embed`
-        sample = model.patch_embed.sample
-        add(model.patch_embed.proj, len(images) * sample.rings * sample.sectors)
-    layers = [layer for layer in model.modules() if isinstance(layer, Linear)]
+    layers = [layer for layer in model.modules() if isinstance(layer, (Linear, PolarPatchEmbed))]
     handles = [layer.register_forward_hook(hook) for layer in layers]
     with torch.no_grad():
         model(images, lens)

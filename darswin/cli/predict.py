@@ -10,13 +10,14 @@ import numpy as np
 import torch
 from jsonargparse import ArgumentParser
 from safetensors import safe_open
-from torch import Tensor, nn
+from torch import Tensor
 
 from darswin.compat import load_official
 from darswin.data.wide_angle import IMAGENET_MEAN, IMAGENET_STD
 from darswin.lens import Lens, load
 from darswin.lens.files import loads
 from darswin.lens.orientation import in_upright_picture, stored_size
+from darswin.models.encoder import Encoder
 from darswin.models.saving import ModelCard, NoCardError, load_model, model_of_run
 from darswin.utils.files import replace_file
 from darswin.utils.image import BrokenImageError, read_oriented
@@ -107,7 +108,7 @@ def predict(
     return found
 
 
-def trained_model(path: str | Path) -> tuple[nn.Module, ModelCard]:
+def trained_model(path: str | Path) -> tuple[Encoder, ModelCard]:
     """The model of a file of ours, or of the released DarSwin's weights, and its card.
 
     The released code normalises pixels as ImageNet's; a model's classes have numbers there.
@@ -149,14 +150,14 @@ def read_lens(lens: str, image_size: tuple[int, int], camera: str | None = None)
     return read(lens, camera=camera, image_size=image_size)
 
 
-def resized(net: nn.Module, card: ModelCard, image: np.ndarray, lens: Lens) -> tuple[Tensor, Lens]:
+def resized(net: Encoder, card: ModelCard, image: np.ndarray, lens: Lens) -> tuple[Tensor, Lens]:
     """A picture as the model saw them in training: (1, C, H, W) uint8 with its lens, in its pixels.
 
     The shorter side becomes the model's size. A model that takes only squares gets the middle one.
     """
     height, width = image.shape[:2]
     side = min(height, width)
-    if hasattr(net, "image_size") or getattr(net, "compat", None) == "official":
+    if net.square_images:
         top, left = (height - side) // 2, (width - side) // 2
         image = image[top : top + side, left : left + side]
         lens = lens.cropped(top, left, side, side)

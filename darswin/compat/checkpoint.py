@@ -59,8 +59,9 @@ def convert_checkpoint(source: str | os.PathLike, target: str | os.PathLike) -> 
         for name, value in _model(checkpoint, source).items()
     }
     metadata = {"format": "pt"}
-    with contextlib.suppress(TypeError, ValueError, KeyError):
-        metadata["config"] = json.dumps(checkpoint["config"])
+    if isinstance(checkpoint, Mapping):
+        with contextlib.suppress(TypeError, ValueError, KeyError):
+            metadata["config"] = json.dumps(checkpoint["config"])
     replace_file(target, save(state, metadata))
 
 
@@ -88,7 +89,7 @@ def count_blocks(state: Mapping[str, Tensor], form: str) -> list[int]:
     Args:
         form: the key, with {} for the stage and {} for the block.
     """
-    depths = []
+    depths: list[int] = []
     while form.format(len(depths), 0) in state:
         depth = 1
         while form.format(len(depths), depth) in state:

@@ -88,8 +88,8 @@ def _renamed(key: str) -> str:
         return f"stages.{int(parts[1]) + 1}.downsample.{layer}.{parts[-1]}"
     if parts[0] != "stages" or len(parts) < 5:
         return key
-    _, stage, part, index, *rest = parts
-    rest = ".".join(rest)
+    _, stage, part, index = parts[:4]
+    rest = ".".join(parts[4:])
     if part == "layer_norms":
         block, second = divmod(int(index), 2)
         return f"stages.{stage}.blocks.{block}.norm{second + 1}.{rest.removeprefix('norm.')}"

@@ -71,7 +71,11 @@ def _program(
     images, tensors = images[[0, 0]], {}  # two: torch.export takes a size of 1 for a constant
     if lens is not None and not fixed_lens:
         leaves, _ = pytree.tree_flatten_with_path(lens[[0, 0]])
-        tensors = {path[0].name: leaf for path, leaf in leaves if leaf is not None}
+        tensors = {
+            key.name: leaf
+            for (key,), leaf in leaves
+            if isinstance(key, pytree.GetAttrKey) and leaf is not None
+        }
     for tensor in (images, *tensors.values()):
         torch._dynamo.mark_dynamic(tensor, 0)  # `dynamic_shapes` cannot name keyword arguments
     module = _OfTensors(model, lens, any_strides)

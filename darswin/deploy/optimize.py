@@ -3,20 +3,20 @@ the norm behind it in one."""
 
 import copy
 import warnings
+from collections.abc import Sequence
+from typing import Self
 
 import torch
 from torch import Tensor, nn
 
 from darswin.layers import onednn
-from darswin.layers.attention import PolarWindowAttention, WindowAttention
+from darswin.layers.attention import WindowAttention
 from darswin.layers.block import Block, PatchMerging
 from darswin.layers.onednn import PackedLinear
-from darswin.layers.position_bias import RelativeBias
-from darswin.layers.sampling import check_images, check_lens
+from darswin.layers.position_bias import RelativeBias, RelativeTable
 from darswin.lens import Lens
-from darswin.models.darswin import DarSwin
-from darswin.models.encoder import Encoder
-from darswin.models.stages import Stage
+from darswin.models.encoder import Encoder, Prepared
+from darswin.models.stages import Pair, Stage
 
 DTYPES = (torch.float32, torch.bfloat16)
 _ADD_NORM = torch.ops.darswin._add_norm_.default
@@ -39,8 +39,8 @@ def optimize(
     Args:
         model: one of `create_model`, on the CPU.
         dtype: float32 or bfloat16, of what flows between the layers and of the result.
-        lens: one camera's, whose grid and position biases are then computed once; the result is
-            called `optimized(images)`.
+        lens: one camera's, for all images; the result is then called `optimized(images)`, and
+            computes the grid and the position biases once for each image size.
 
     Where torch lacks oneDNN's products it warns, and uses its own.
 
@@ -50,8 +50,10 @@ def optimize(
     """
     if not isinstance(model, Encoder):
         raise TypeError(f"model must be one of create_model, got {type(model).__name__}")
-    if any(isinstance(stage, _Stage) for stage in model.stages):
+    if isinstance(model, _Optimized):
         raise TypeError("model must be one of create_model, got one that is optimized already")
+    if lens is not None and (not isinstance(lens, Lens) or len(lens) != 1):
+        raise ValueError(f"lens must be one lens, got {lens!r}")
     if dtype not in DTYPES:
         raise ValueError(f"dtype must be torch.float32 or torch.bfloat16, got {dtype}")
     devices = sorted({parameter.device.type for parameter in model.parameters()})
@@ -60,18 +62,29 @@ def optimize(
     if (lack := onednn.missing(dtype)) is not None:
         warnings.warn(f"optimize goes on with torch's own products: {lack}", stacklevel=2)
     optimized = copy.deepcopy(model).eval().requires_grad_(False)
-    optimized.__class__ = type(f"Optimized{type(model).__name__}", (_Optimized, type(model)), {})
+    base, attributes = _Optimized, {}
+    if lens is not None:
+        base, attributes = FixedLens, dict(fixed_lens=lens, _prepared={})
+    name = f"Optimized{type(model).__name__}"
+    optimized.__class__ = type(name, (base, type(model)), attributes)
     optimized.patch_embed = _InDtype(optimized.patch_embed, dtype)
-    optimized.stages = nn.ModuleList(_Stage(stage, dtype) for stage in optimized.stages)
+    stages = [stage for stage in optimized.stages if isinstance(stage, Stage)]
+    optimized.stages = nn.ModuleList(_Stage(stage, dtype) for stage in stages)
     optimized.norm.to(dtype)
     optimized.head.to(dtype)
-    return optimized if lens is None else FixedLens(optimized, lens)
+    return optimized
 
 
-class _Optimized:
-    """What an optimized model refuses, before anything of it has changed."""
+class _Optimized(Encoder):
+    """What an optimized model does otherwise; what it refuses, it refuses before it changes."""
 
-    def train(self, mode: bool = True):
+    def prepare(self, lens: Lens | None, size: Pair) -> Prepared:
+        """As the model it was made of, with the position bias of each block in full."""
+        points, positions = super().prepare(lens, size)
+        stages = (stage for stage in self.stages if isinstance(stage, _Stage))
+        return Prepared(points, [s.tables(*p) for s, p in zip(stages, positions, strict=True)])
+
+    def train(self, mode: bool = True) -> Self:
         if mode:
             raise TypeError("an optimized model is not trained: train the model it was made of")
         return super().train(mode)
@@ -86,40 +99,23 @@ class _Optimized:
         )
 
 
-class FixedLens(_Optimized, Encoder):
-    """An optimized model and the one lens of all its images, which it is called without.
+class FixedLens(_Optimized):
+    """An optimized model and the single lens of all its images, which it is called without."""
 
-    Args:
-        model: of `optimize`. lens: one.
-    """
+    fixed_lens: Lens
+    _prepared: dict[Pair, Prepared]  # by image size
 
-    def __init__(self, model: Encoder, lens: Lens):
-        super().__init__()
-        if not isinstance(lens, Lens) or len(lens) != 1:
-            raise ValueError(f"lens must be one lens, got {lens!r}")
-        self.model, self.lens = model, lens
-        self.stages, self.norm, self.head = model.stages, model.norm, model.head
-        self.num_features, self.num_classes = model.num_features, model.num_classes
-        self._known: dict[torch.Size, tuple] = {}  # what the lens gives, by image size
+    def prepare(self, lens: Lens | None, size: Pair) -> Prepared:
+        """What the fixed lens decides about images of (H, W), computed once for each size.
 
-    def _stage_maps(self, images: Tensor, lens: Lens | None = None) -> list[Tensor]:
+        Raises:
+            ValueError: a lens, or images of another size than the fixed lens's.
+        """
         if lens is not None:
-            raise ValueError("this model is optimized for one lens: call it without one")
-        if not isinstance(self.model, DarSwin):
-            return self.model._stage_maps(images, self.lens)
-        images = check_images(images)
-        size = images.shape[2:]
-        if size not in self._known:
-            check_lens(self.lens, images)
-            grid, angles = self.model.geometry(self.lens, size)
-            tables = [s.tables(r) for s, r in zip(self.stages, angles, strict=True)]
-            self._known[size] = grid, tables
-        grid, tables = self._known[size]
-        x, maps = self.model.embed(images, grid), []
-        for stage, known in zip(self.stages, tables, strict=True):
-            x = stage.run(x, known)
-            maps.append(x)
-        return maps
+            raise ValueError("this model is optimized for a fixed lens: call it without one")
+        if size not in self._prepared:
+            self._prepared[size] = super().prepare(self.fixed_lens, size)
+        return self._prepared[size]
 
 
 class _InDtype(nn.Module):
@@ -142,35 +138,31 @@ class _Stage(nn.Module):
         super().__init__()
         self.downsample = stage.downsample
         if isinstance(stage.downsample, PatchMerging):
-            self.downsample.norm.to(dtype)
-            self.downsample.reduction = PackedLinear(stage.downsample.reduction, dtype)
+            stage.downsample.norm.to(dtype)
+            packed = PackedLinear(stage.downsample.reduction, dtype)
+            stage.downsample.set_submodule("reduction", packed)
         elif not isinstance(stage.downsample, nn.Identity):
             self.downsample = _InDtype(stage.downsample, dtype)
-        self.blocks = [_Block(block, dtype) for block in stage.blocks]
-        mlp = stage.blocks[0].mlp
-        self.mlp_ratio = mlp.fc1.out_features // mlp.fc1.in_features
-        attentions = [block.attn for block in stage.blocks]
-        self.fixed: list[Tensor | None] = []  # tables that need no position
-        if isinstance(attentions[0], PolarWindowAttention):
-            self.heads = attentions[0].num_heads
-            self.bias = _joined([attn.position_bias for attn in attentions])
-        else:
-            windowed = [isinstance(attn, WindowAttention) for attn in attentions]
-            self.fixed = [
-                attn.position_bias().contiguous() if in_windows else None
-                for attn, in_windows in zip(attentions, windowed, strict=True)
-            ]
+        blocks = [block for block in stage.blocks if isinstance(block, Block)]
+        self.blocks = [_Block(block, dtype) for block in blocks]
+        self.mlp_ratio = blocks[0].mlp.fc1.out_features // blocks[0].mlp.fc1.in_features
+        attentions = [block.attn for block in blocks]
+        biases = [a.position_bias if isinstance(a, WindowAttention) else None for a in attentions]
+        self.bias = _joined([bias for bias in biases if isinstance(bias, RelativeBias)])
+        # Tables that depend on no position, and None for an attention that is not in windows.
+        self.fixed = [
+            bias().contiguous() if isinstance(bias, RelativeTable) else None for bias in biases
+        ]
 
-    def tables(self, *positions: Tensor) -> list[Tensor | None]:
-        """The position bias of each block, where its attention has one that is known before."""
-        if self.fixed:
+    def tables(self, *positions: Tensor | None) -> Sequence[Tensor | None]:
+        """The position bias of each block, for `forward`: (B or 1, heads, ...), contiguous."""
+        if self.bias is None:
             return self.fixed
-        (angles,) = positions
-        joined = self.bias(angles.to(torch.float32))
-        return [table.contiguous() for table in joined.split(self.heads, 1)]
+        joined = self.bias(*positions)
+        return [table.contiguous() for table in joined.chunk(len(self.blocks), 1)]
 
-    def run(self, x: Tensor, tables: list[Tensor | None]) -> Tensor:
-        """What `Stage` does, with what `tables` gave. Where nothing merges, x itself changes."""
+    def forward(self, x: Tensor, *tables: Tensor | None) -> Tensor:
+        """The map of the stage before → this stage's. Where nothing merges, x itself changes."""
         if torch.is_grad_enabled() and x.requires_grad:
             raise RuntimeError(
                 "an optimized model has no gradients, but its images or its lens require one: call "
@@ -189,8 +181,8 @@ class _Stage(nn.Module):
             start = end
         return x
 
-    def _blocks(self, x: Tensor, tables: list[Tensor | None]) -> None:
-        """All blocks on x, in place: it is what their residuals add up to."""
+    def _blocks(self, x: Tensor, tables: Sequence[Tensor | None]) -> None:
+        """All blocks on x, in place: their residuals are added to it."""
         y = self.blocks[0].norm1(x)
         followers = [*self.blocks[1:], None]
         for block, follower, table in zip(self.blocks, followers, tables, strict=True):
@@ -201,13 +193,11 @@ class _Stage(nn.Module):
             else:
                 y = follower.norm1.after(x, y)
 
-    def forward(self, x: Tensor, *positions: Tensor) -> Tensor:
-        """As `Stage`."""
-        return self.run(x, self.tables(*positions))
 
-
-def _joined(biases: list[RelativeBias]) -> RelativeBias:
+def _joined(biases: Sequence[RelativeBias]) -> RelativeBias | None:
     """The biases of several blocks as one with the heads of all, computed in as few calls."""
+    if not biases:
+        return None
     joined = copy.deepcopy(biases[0])
     for name, _ in list(joined.named_parameters()):
         heads = torch.cat([getattr(bias, name).float() for bias in biases], 1)
@@ -219,8 +209,11 @@ class _Block:
     """A block's parts, with everything at hand that their operators take."""
 
     def __init__(self, block: Block, dtype: torch.dtype):
-        in_windows = isinstance(block.attn, WindowAttention)
-        self.attention = (_Windows if in_windows else _Deformable)(block.attn, dtype)
+        self.attention: _Windows | _Deformable
+        if isinstance(block.attn, WindowAttention):
+            self.attention = _Windows(block.attn, dtype)
+        else:
+            self.attention = _Deformable(block.attn, dtype)
         self.norm1, self.norm2 = _Norm(block.norm1), _Norm(block.norm2)
         self.fc1, self.fc2 = (PackedLinear(fc, dtype) for fc in (block.mlp.fc1, block.mlp.fc2))
 
@@ -251,7 +244,7 @@ class _Windows:
         self.shape = (*attn.map_size, 3, attn.num_heads, dim)
         self.settings = (attn.window, attn.shift, attn.periodic, dim**-0.5)
 
-    def __call__(self, x: Tensor, table: Tensor) -> Tensor:
+    def __call__(self, x: Tensor, table: Tensor | None) -> Tensor:
         qkv = self.qkv(x).view(x.shape[0], *self.shape)
         # Not by way of darswin.ops: all that it would check is known to fit.
         out = torch.ops.darswin.window_attention.default(qkv, table, *self.settings)
@@ -264,5 +257,5 @@ class _Deformable:
     def __init__(self, attn: nn.Module, dtype: torch.dtype):
         self.attn = _InDtype(attn, dtype)
 
-    def __call__(self, x: Tensor, table: None) -> Tensor:
+    def __call__(self, x: Tensor, table: Tensor | None) -> Tensor:
         return self.attn(x).contiguous()

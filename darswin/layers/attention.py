@@ -14,6 +14,7 @@ from darswin.layers.position_bias import (
 )
 from darswin.layers.recompute import recomputed
 from darswin.ops import window_attention
+from darswin.ops.checks import check_pair
 
 
 class WindowAttention(nn.Module):
@@ -43,15 +44,16 @@ class WindowAttention(nn.Module):
         shift: tuple[int, int] = (0, 0),
         periodic: tuple[bool, bool] = (False, False),
         position_bias: Callable[[tuple[int, int], int], nn.Module] = RelativeTable,
-        qkv_bias: bool = True,
     ):
         super().__init__()
         check_heads(dim, num_heads)
+        self.num_heads, self.periodic = num_heads, periodic
+        self.map_size = check_pair("map_size", map_size, lowest=1)
+        self.window = check_pair("window", window, lowest=1)
+        self.shift = check_pair("shift", shift, lowest=0)
         if map_size[0] % window[0] or map_size[1] % window[1]:
             raise ValueError(f"window must divide the map (R, A) = {map_size}, got {window}")
-        self.num_heads, self.window, self.shift = num_heads, tuple(window), tuple(shift)
-        self.map_size, self.periodic = tuple(map_size), tuple(periodic)
-        self.qkv = Linear(dim, 3 * dim, bias=qkv_bias)
+        self.qkv = Linear(dim, 3 * dim)
         self.proj = Linear(dim, dim)
         self.position_bias = position_bias(self.window, num_heads)
 
@@ -85,6 +87,9 @@ def check_heads(dim: int, num_heads: int) -> None:
 class PolarWindowAttention(WindowAttention):
     """Multi-head attention in the windows of a polar map, with a bias that knows the angles.
 
+    It is called `layer(x, ring_angles)`: x (B, R, A, D), and (B or 1, R+1) of
+    `darswin.layers.position_bias.ring_angles`.
+
     Args:
         dim, num_heads, map_size, window, shift, periodic: as `WindowAttention`.
         position_bias: "angular_relative", "angular" or "polar".
@@ -109,9 +114,9 @@ class PolarWindowAttention(WindowAttention):
         position_bias: PositionBias = "angular_relative",
         harmonics: int = 16,
         periodic_bias: bool = False,
-        qkv_bias: bool = True,
     ):
         sectors = map_size[1]
+        bias: Callable[[tuple[int, int], int], nn.Module]
         if position_bias == "angular_relative":
             whole = periodic_bias and window[1] == sectors
             bias = partial(AngularRelativeBias, sectors=sectors, periodic=whole)
@@ -130,10 +135,4 @@ class PolarWindowAttention(WindowAttention):
             shift=shift,
             periodic=periodic,
             position_bias=bias,
-            qkv_bias=qkv_bias,
         )
-
-    def forward(self, x: Tensor, ring_angles: Tensor) -> Tensor:
-        """(B, R, A, D) → the same shape. `ring_angles` (B or 1, R+1): of
-        `darswin.layers.position_bias.ring_angles`."""
-        return super().forward(x, ring_angles.to(x.device, self.proj.weight.dtype))

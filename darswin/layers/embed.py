@@ -7,7 +7,7 @@ from torch import Tensor, nn
 
 from darswin.layers.grid import PolarGrid
 from darswin.layers.linear import Linear
-from darswin.layers.sampling import PolarSample, check_images
+from darswin.layers.sampling import PolarSample
 from darswin.ops import polar_embed
 from darswin.ops.checks import per_channel
 from darswin.ops.reference import normalized
@@ -32,7 +32,7 @@ class ImageInput(nn.Module):
         mean, std: of uint8 images, which count as `(pixel/255 - mean) / std`; others ignore them.
 
     Raises:
-        TypeError, ValueError: images of another kind, shape, size or number of channels.
+        ValueError: images of another size or number of channels.
     """
 
     def __init__(
@@ -43,12 +43,11 @@ class ImageInput(nn.Module):
         std: float | Sequence[float] = 1.0,
     ):
         super().__init__()
-        self.image_size, self.in_chans = tuple(image_size), in_chans
+        self.image_size, self.in_chans = image_size, in_chans
         self.mean, self.std = per_channel("mean", mean, in_chans), per_channel("std", std, in_chans)
 
     def forward(self, images: Tensor, dtype: torch.dtype = torch.float32) -> Tensor:
-        """(B, C, H, W), or uint8 (B, H, W, 3) → (B, C, H, W), of uint8 in `dtype`."""
-        images = check_images(images)
+        """(B, C, H, W) → the same, in `dtype` where they are uint8."""
         check_channels(images, self.in_chans)
         if images.shape[2:] != self.image_size:
             raise ValueError(
@@ -111,7 +110,7 @@ class PolarPatchEmbed(nn.Module):
     ):
         super().__init__()
         self.in_chans = in_chans
-        self.sample = PolarSample(rings, sectors, samples, layout="tokens", **grid_options)
+        self.sample = PolarSample(rings, sectors, samples, **grid_options)
         self.proj = Linear(samples[0] * samples[1] * in_chans, embed_dim)
         self.norm = nn.LayerNorm(embed_dim)
 

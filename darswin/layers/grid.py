@@ -31,7 +31,7 @@ class PolarGrid(NamedTuple):
     """What `polar_sample` needs of a lens, and the borders of its rings.
 
     Shapes: radii (N, R·S_r) px, azimuths (A·S_φ,) rad, center (N or 1, 2) px, borders (N, R+1) px;
-    for lenses that are not round affine (N or 1, 2, 2), offsets (N or 1, 2, R·S_r, A·S_φ) px.
+    for general lenses also affine (N or 1, 2, 2) and offsets (N or 1, 2, R·S_r, A·S_φ) px.
     """
 
     radii: Tensor
@@ -121,9 +121,9 @@ def check_grid(
             raise ValueError(f"{name} must be an int of at least 1, got {value!r}")
     if len(samples) != 2 or any((as_int(s) or 0) < 1 for s in samples):
         raise ValueError(f"samples must be (S_r, S_φ), ints of at least 1, got {samples!r}")
-    for name, value in (("spacing", spacing), ("sample_spacing", sample_spacing)):
-        if value not in SPACINGS:
-            raise ValueError(f"{name} must be one of {SPACINGS}, got {value!r}")
+    for name, choice in (("spacing", spacing), ("sample_spacing", sample_spacing)):
+        if choice not in SPACINGS:
+            raise ValueError(f"{name} must be one of {SPACINGS}, got {choice!r}")
     if placement not in PLACEMENTS:
         raise ValueError(f"placement must be one of {PLACEMENTS}, got {placement!r}")
     if placement == "edges" and min(samples) < 2:

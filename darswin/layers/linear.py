@@ -35,7 +35,7 @@ _WAYS: dict[str, dict[str, Callable]] = {
 
 
 class Shape(NamedTuple):
-    """What a choice is made for."""
+    """What a measurement is of."""
 
     product: str  # "forward", "input gradient" or "weight gradient"
     rows: int  # of the input, rounded up to a power of two
@@ -131,7 +131,7 @@ def _multiply(product: str, matmul_backend: MatmulBackend, weight: Tensor, rows:
     if shape not in _measured:
         _measured[shape] = _measure(ways, (rows, *others))
     seconds = _measured[shape]
-    return ways[min(seconds, key=seconds.get)](rows, *others)
+    return ways[min(seconds, key=seconds.__getitem__)](rows, *others)
 
 
 def _measure(ways: dict[str, Callable], arguments: tuple) -> dict[str, float]:

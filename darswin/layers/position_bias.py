@@ -16,15 +16,19 @@ class RelativeBias(nn.Module):
     """B_θ + B_φ: a bias table from the angles between tokens. Subclasses say what one axis gives.
 
     Args:
-        window: (M_r, M_φ). sectors: A of the map.
+        window: (M_r, M_φ). sectors: A of the map. heads: attention heads.
+        rows: of coefficients for each head: a_θ, b_θ, a_φ and b_φ.
     """
 
-    def __init__(self, window: tuple[int, int], sectors: int):
+    def __init__(
+        self, window: tuple[int, int], sectors: int, heads: int, rows: tuple[int, int, int, int]
+    ):
         super().__init__()
         self.window, self.turn = window, 2 * math.pi / sectors
-
-    def _coefficients(self, rows: int, heads: int) -> nn.Parameter:
-        return nn.Parameter(nn.init.trunc_normal_(torch.empty(rows, heads), std=0.02))
+        self.a_theta, self.b_theta, self.a_phi, self.b_phi = (
+            nn.Parameter(nn.init.trunc_normal_(torch.empty(count, heads), std=0.02))
+            for count in rows
+        )
 
     def _axis(self, angle: Tensor, a: Tensor, b: Tensor) -> Tensor:
         """Angles (N, K) of Δ = -(K-1)/2 … (K-1)/2 → (N, K, heads)."""
@@ -36,10 +40,10 @@ class RelativeBias(nn.Module):
         Returns:
             (N, heads, 2·M_r-1, 2·M_φ-1), the `bias` of `window_attention`.
         """
-        outward = ring_angles[:, : self.window[0]]
+        outward = ring_angles[:, : self.window[0]].to(self.a_theta)
         theta = torch.cat((-outward[:, 1:].flip(1), outward), 1)
         reach = self.window[1]
-        phi = self.turn * torch.arange(1 - reach, reach).to(ring_angles)
+        phi = self.turn * torch.arange(1 - reach, reach).to(outward)
         along_r = self._axis(theta, self.a_theta, self.b_theta).transpose(1, 2)
         along_phi = self._axis(phi[None], self.a_phi, self.b_phi).transpose(1, 2)
         return along_r[..., None] + along_phi[..., None, :]
@@ -59,12 +63,8 @@ class AngularRelativeBias(RelativeBias):
     """
 
     def __init__(self, window: tuple[int, int], heads: int, sectors: int, periodic: bool = False):
-        super().__init__(window, sectors)
-        rows_theta, rows_phi = 2 * window[0] - 1, window[1] if periodic else 2 * window[1] - 1
-        self.a_theta = self._coefficients(rows_theta, heads)
-        self.b_theta = self._coefficients(rows_theta, heads)
-        self.a_phi = self._coefficients(rows_phi, heads)
-        self.b_phi = self._coefficients(rows_phi, heads)
+        theta, phi = 2 * window[0] - 1, window[1] if periodic else 2 * window[1] - 1
+        super().__init__(window, sectors, heads, (theta, theta, phi, phi))
 
     def _axis(self, angle: Tensor, a: Tensor, b: Tensor) -> Tensor:
         reach, angle = angle.shape[1] // 2, angle[..., None]
@@ -86,11 +86,7 @@ class FourierBias(RelativeBias):
     """
 
     def __init__(self, window: tuple[int, int], heads: int, sectors: int, harmonics: int = 16):
-        super().__init__(window, sectors)
-        self.a_theta = self._coefficients(harmonics, heads)
-        self.b_theta = self._coefficients(harmonics + 1, heads)
-        self.a_phi = self._coefficients(harmonics, heads)
-        self.b_phi = self._coefficients(harmonics + 1, heads)
+        super().__init__(window, sectors, heads, (harmonics, harmonics + 1) * 2)
 
     def _axis(self, angle: Tensor, a: Tensor, b: Tensor) -> Tensor:
         harmonics = a.shape[0]

@@ -1,4 +1,4 @@
-"""Backward makes what is cheap to make again, instead of keeping it."""
+"""Backward recomputes what is cheap to compute, so that memory need not keep it."""
 
 import contextlib
 from collections.abc import Callable
@@ -8,15 +8,16 @@ from torch import Tensor
 
 
 def recomputed(
-    value: Tensor, make: Callable[..., Tensor], *inputs: Tensor, when: bool
+    value: Tensor, function: Callable[..., Tensor], *inputs: Tensor, when: bool
 ) -> contextlib.AbstractContextManager:
-    """A context in which autograd, where it would save `value`, saves `inputs` to make it from.
+    """A context in which autograd does not keep `value`, but recomputes it from `inputs`.
 
-    Worth it where `make` costs little and autograd keeps `inputs` anyway. What is made again is the
-    same, bit for bit, and so are the gradients. Contexts do not nest: the inner one acts.
+    It saves memory where autograd keeps `inputs` anyway, at the cost of `function`. The recomputed
+    value, and so the gradients, are the same, bit for bit. Of nested contexts the inner one acts.
 
     Args:
-        value: what `make(*inputs)` gave, which is not random. when: else nothing is changed.
+        value: the result of `function(*inputs)`, which must not be random.
+        when: False makes it a context that does nothing.
     """
     if not when or torch.compiler.is_compiling() or not torch.is_grad_enabled():
         return contextlib.nullcontext()  # a compiler decides for itself
@@ -31,6 +32,6 @@ def recomputed(
         if isinstance(kept, Tensor):
             return kept
         with torch.no_grad():
-            return make(*inputs).view(kept)
+            return function(*inputs).view(kept)
 
     return torch.autograd.graph.saved_tensors_hooks(pack, unpack)

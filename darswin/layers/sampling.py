@@ -15,13 +15,13 @@ GridFunction = Callable[..., PolarGrid]
 
 
 class PolarSample(nn.Module):
-    """Samples images on the polar grid of their lenses: what `F.grid_sample` does, with the grid.
+    """Samples images on the polar grid of their lenses: `polar_sample` and the grid it needs.
 
     Args:
         rings, sectors, samples, spacing, sample_spacing, placement: as `darswin.polar_grid`.
         jitter: in [0, 1], how far a sample may move, in cells; only in training. The seed of each
             call comes from torch's generator.
-        layout: "image" gives (B, C, R·S_r, A·S_φ), "tokens" (B, R, A, S_r·S_φ·C).
+        layout: "tokens" gives (B, R, A, S_r·S_φ·C), "image" (B, C, R·S_r, A·S_φ).
         mean, std: of uint8 images, which count as `(pixel/255 - mean) / std`; others ignore them.
         grid: the function that makes the grid.
 
@@ -41,7 +41,7 @@ class PolarSample(nn.Module):
         sample_spacing: Spacing | None = None,
         placement: Placement = "centers",
         jitter: float = 0.0,
-        layout: Literal["tokens", "image"] = "image",
+        layout: Literal["tokens", "image"] = "tokens",
         mean: float | Sequence[float] = 0.0,
         std: float | Sequence[float] = 1.0,
         grid: GridFunction = polar_grid,
@@ -86,8 +86,10 @@ class PolarSample(nn.Module):
     def forward(self, images: Tensor, lens: Lens) -> Tensor:
         """Images (B, C, H, W) and their lenses (B or 1) → the samples, in `layout`."""
         images = check_images(images)
-        check_lens(lens, images)
-        grid = self.grid(lens, images.shape[2:])
+        height, width = images.shape[2:]
+        check_lens(lens, (height, width))
+        check_count(len(lens), images)
+        grid = self.grid(lens, (height, width))
         return polar_sample(**self.arguments(images, grid), layout=self.layout)
 
     def extra_repr(self) -> str:
@@ -107,22 +109,24 @@ def check_images(images: Tensor) -> Tensor:
     return channels_first(images)
 
 
-def check_lens(lens: Lens, images: Tensor) -> None:
-    """TypeError or ValueError unless there is a lens for each image, or one, and of its size.
+def check_lens(lens: Lens | None, size: tuple[int, int]) -> Lens:
+    """The lens, which must be one, for images of (H, W); else TypeError or ValueError.
 
     Compiled graphs cannot look at a value, so they do not check sizes."""
     if not isinstance(lens, Lens):
         raise TypeError(f"lens must be a darswin.lens.Lens, got {type(lens).__name__}")
-    if len(lens) not in (1, images.shape[0]):
-        raise ValueError(
-            f"there must be one lens or one an image, {images.shape[0]}, got {len(lens)}"
-        )
     if lens.image_size is None or torch.compiler.is_compiling():
-        return
-    size = tuple(images.shape[2:])
+        return lens
     for other in lens.image_size.unique(dim=0).tolist():
         if tuple(other) != size:
             raise ValueError(
                 f"the lens belongs to images of (H, W) = {tuple(round(s) for s in other)}, got "
                 f"images of {size}; lens.resized({size}) is the lens of a resized image"
             )
+    return lens
+
+
+def check_count(lenses: int, images: Tensor) -> None:
+    """ValueError unless there is a lens for each image, or one for all."""
+    if lenses not in (1, images.shape[0]):
+        raise ValueError(f"there must be one lens or one an image, {images.shape[0]}, got {lenses}")

@@ -38,7 +38,7 @@ def reprojection(
 def reproject(images: Tensor, source: Lens, target: Lens, size: tuple[int, int]) -> Tensor:
     """The view of `target` on what `source` saw, bilinear; 0 beyond either θ_max.
 
-    Runs on the images' device. Gradients go to the images and both lenses.
+    Gradients go to the images and both lenses.
 
     Args:
         images: (B, C, H, W), floating point, taken with `source`.
@@ -49,8 +49,17 @@ def reproject(images: Tensor, source: Lens, target: Lens, size: tuple[int, int])
         (B, C, H', W').
     """
     height, width = images.shape[2:]
+    return sample_at(images, reprojection(source, (height, width), target, size))
+
+
+def sample_at(images: Tensor, pixels: Tensor) -> Tensor:
+    """Images (B, C, H, W) read at pixels (B or 1, H', W', 2), x and y → (B, C, H', W').
+
+    Bilinear, 0 outside, on the images' device and in their dtype.
+    """
+    height, width = images.shape[2:]
     exact = torch.promote_types(images.dtype, torch.float32)  # half a pixel is lost in bfloat16
-    there = reprojection(source, (height, width), target, size).to(images.device, exact)
+    there = pixels.to(images.device, exact)
     # -1 and 1 are the image's edges, half a pixel beyond the centres of its outermost pixels.
     places = (2 * there + 1) / there.new_tensor((width, height)) - 1
     places = places.expand(images.shape[0], -1, -1, -1)

@@ -9,13 +9,19 @@ from darswin.layers.attention import PolarWindowAttention
 from darswin.layers.embed import PolarPatchEmbed
 from darswin.layers.grid import Placement, PolarGrid, Spacing, polar_grid
 from darswin.layers.position_bias import PositionBias, ring_angles
-from darswin.layers.sampling import check_images, check_lens
+from darswin.layers.sampling import check_count, check_lens
 from darswin.lens import Lens
 from darswin.models import official
-from darswin.models.encoder import Encoder
+from darswin.models.encoder import Encoder, Prepared
+from darswin.models.registry import Presets, register_model
 from darswin.models.stages import Pair, StagePlan, check_depths, make_stages, plan_stages
 
+# All models of a size have as many tokens.
+_PRESETS: Presets = dict(micro=dict(samples=(6, 6)), nano=dict(rings=8, sectors=32, samples=(4, 4)))
 
+
+@register_model("darswin_a", variant="A", presets=_PRESETS)
+@register_model("darswin_ra", variant="RA", presets=_PRESETS)
 class DarSwin(Encoder):
     """The Distortion Aware Radial Swin Transformer.
 
@@ -55,6 +61,8 @@ class DarSwin(Encoder):
 
     Source: DarSwin, ICCV 2023.
     """
+
+    patch_embed: PolarPatchEmbed
 
     def __init__(
         self,
@@ -99,6 +107,7 @@ class DarSwin(Encoder):
             plans = [official.plan(plan, window) for plan in plans]
         self.in_chans = in_chans
         self.num_features = embed_dim * 2 ** (len(depths) - 1)
+        self.square_images = compat == "official"
         self.compat, self.position_bias = compat, position_bias
 
         self.patch_embed = PolarPatchEmbed(
@@ -120,7 +129,9 @@ class DarSwin(Encoder):
             return PolarWindowAttention(
                 dim,
                 heads,
-                **plan.windows(block),
+                map_size=plan.map_size,
+                window=plan.window,
+                shift=plan.shift_of(block),
                 periodic=(False, not compat),
                 position_bias=position_bias,
                 harmonics=harmonics,
@@ -140,28 +151,19 @@ class DarSwin(Encoder):
         self._rings = [plan.map_size[0] for plan in plans]
         self._finish(num_classes)
 
-    def geometry(self, lens: Lens, image_size: Pair) -> tuple[PolarGrid, list[Tensor]]:
-        """All that the model makes of the lenses of images (H, W): the grid of their samples, and
-        for each stage what its position bias is made from, `ring_angles`."""
-        grid = self.patch_embed.sample.grid(lens, image_size)
+    def prepare(self, lens: Lens | None, size: Pair) -> Prepared:
+        """The grid of the samples, and for each stage its `ring_angles`; else as `Encoder`."""
+        lens = check_lens(lens, size)
+        grid = self.patch_embed.sample.grid(lens, size)
         if self.compat:
-            return grid, [official.ring_angles(lens, rings) for rings in self._rings]
-        kind = self.position_bias
-        return grid, [ring_angles(lens, grid, rings, kind) for rings in self._rings]
+            angles = [official.ring_angles(lens, rings) for rings in self._rings]
+        else:
+            angles = [ring_angles(lens, grid, rings, self.position_bias) for rings in self._rings]
+        return Prepared(grid, [(of_stage,) for of_stage in angles])
 
-    def embed(self, images: Tensor, grid: PolarGrid) -> Tensor:
-        """Images (B, C, H, W) on a grid of `geometry` → the first map, (B, R, A, D)."""
+    def embed(self, images: Tensor, points: PolarGrid) -> Tensor:
+        """Images (B, C, H, W) on a grid of `prepare` → the first map, (B, R, A, D)."""
+        check_count(len(points.radii), images)
         if self.compat:
             images = images.transpose(2, 3)  # its x runs down and its y to the right
-        return self.patch_embed(images, grid)
-
-    def _stage_maps(self, images: Tensor, lens: Lens) -> list[Tensor]:
-        images = check_images(images)
-        check_lens(lens, images)
-        grid, angles = self.geometry(lens, images.shape[2:])
-        x = self.embed(images, grid)
-        maps = []
-        for stage, of_rings in zip(self.stages, angles, strict=True):
-            x = stage(x, of_rings)
-            maps.append(x)
-        return maps
+        return self.patch_embed(images, points)

@@ -11,6 +11,7 @@ from darswin.layers.embed import PatchProjection
 from darswin.layers.linear import Linear
 from darswin.layers.position_bias import RelativeTable
 from darswin.models.encoder import ImageEncoder
+from darswin.models.registry import register_model
 from darswin.models.stages import Pair, StagePlan
 
 
@@ -102,6 +103,13 @@ def _pixel_centers(height: int, width: int, like: Tensor) -> Tensor:
     return torch.stack(torch.meshgrid(y, x, indexing="ij"), -1)
 
 
+@register_model(
+    "dat",
+    presets=dict(
+        micro=dict(groups=(1, 1, 1, 2)),
+        nano=dict(image_size=32, blocks=("L", "LD", "D"), groups=(1, 1, 2)),
+    ),
+)
 class DAT(ImageEncoder):
     """The Deformable Attention Transformer. It is called as DarSwin is, and ignores the lens.
 
@@ -162,7 +170,8 @@ class DAT(ImageEncoder):
                     kernel=2 * (len(depths) - plan.index) + 1,  # 9, 7, 5, 3: smaller, as the maps
                     offset_range=offset_range,
                 )
-            shift = tuple(-(-side // 2) for side in plan.window) if kind == "S" else (0, 0)
+            rows, columns = plan.window
+            shift = ((rows + 1) // 2, (columns + 1) // 2) if kind == "S" else (0, 0)
             return WindowAttention(
                 dim, heads, map_size=plan.map_size, window=plan.window, shift=shift
             )
@@ -181,5 +190,5 @@ class DAT(ImageEncoder):
             mean=mean,
             std=std,
             attention=attention,
-            downsample=lambda dim, _plan: PatchProjection(dim, 2 * dim, 2, bias=False),
+            downsample=lambda dim, _merge: PatchProjection(dim, 2 * dim, 2, bias=False),
         )

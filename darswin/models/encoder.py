@@ -1,26 +1,47 @@
-"""What the models share: maps of stages → features, intermediate maps and logits."""
+"""What the models share: lens and images → maps of stages, features and logits."""
 
 from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 from torch import Tensor, nn
 
 from darswin.layers.attention import WindowAttention
 from darswin.layers.block import Block, Mlp
 from darswin.layers.embed import ImageInput, PatchProjection
+from darswin.layers.grid import PolarGrid
 from darswin.layers.linear import MATMUL_BACKENDS, Linear, MatmulBackend
+from darswin.layers.sampling import check_count, check_images
 from darswin.lens import Lens
+from darswin.lens.reprojection import sample_at
 from darswin.models.stages import Pair, check_depths, make_stages, plan_stages
+
+
+class Prepared(NamedTuple):
+    """What lenses alone decide about images of one size: of `Encoder.prepare`, for `Encoder.run`.
+
+    points: where the images are read: on a polar grid, at pixels (N, H, W, 2), or as they are.
+    positions: for each stage, the tensors that its position biases are made from.
+    """
+
+    points: PolarGrid | Tensor | None
+    positions: Sequence[Sequence[Tensor | None]]
 
 
 class Encoder(nn.Module):
     """Base of all models, called `model(images, lens)`; the methods are those of timm's models.
 
-    A model sets `num_features` and makes `stages`, then calls `_finish`; it defines `_stage_maps`.
-    Maps are channels last: (B, R, A, D) where they are polar, else (B, H, W, D).
+    A model sets `num_features`, makes `patch_embed` and `stages`, then calls `_finish`; it defines
+    `embed` and, if its lens matters, `prepare`. Maps are channels last: (B, R, A, D) where they are
+    polar, else (B, H, W, D).
     """
 
+    image_size: Pair | None = None  # (H, W) that all images must have; None: any size
+    square_images = False  # whether images must be square
+    in_chans: int
     num_features: int
+    patch_embed: nn.Module
     stages: nn.ModuleList
+    head: nn.Module
     matmul_backend: MatmulBackend = "torch"  # see `set_matmul_backend`
 
     def _finish(self, num_classes: int) -> None:
@@ -35,12 +56,14 @@ class Encoder(nn.Module):
         It has the dtype, the device and the backend (see `set_matmul_backend`) of the model.
         """
         self.num_classes = num_classes
-        self.head = nn.Identity()
         if num_classes:
-            like = dict(device=self.norm.weight.device, dtype=self.norm.weight.dtype)
-            self.head = Linear(self.num_features, num_classes, **like).train(self.training)
-            self.head.matmul_backend = self.matmul_backend
-        _init_weights(self.head)
+            like = self.norm.weight
+            head = Linear(self.num_features, num_classes, device=like.device, dtype=like.dtype)
+            head.matmul_backend = self.matmul_backend
+            _init_weights(head)
+            self.head = head.train(self.training)
+        else:
+            self.head = nn.Identity()
 
     def no_weight_decay(self) -> set[str]:
         """Names of the parameters, besides biases and norms, that a recipe should not decay."""
@@ -64,19 +87,40 @@ class Encoder(nn.Module):
 
     def set_grad_checkpointing(self, enable: bool = True) -> None:
         """Says whether training saves memory: norms, GELUs and attention in windows, a few percent
-        of the work, are then computed again in backward. The gradients are the same, bit for bit.
+        of the work, are recomputed in backward. The gradients are the same, bit for bit.
         """
         for module in self.modules():
             if isinstance(module, (Block, Mlp, WindowAttention)):
                 module.grad_checkpointing = enable
 
-    def _stage_maps(self, images: Tensor, lens: Lens | None) -> list[Tensor]:
-        """The map that each stage ends with."""
+    def prepare(self, lens: Lens | None, size: Pair) -> Prepared:
+        """What the lenses alone decide about images of (H, W): computed once, it serves many `run`.
+
+        Raises:
+            TypeError, ValueError: a model that needs a lens gets none, or one of another size.
+        """
+        return Prepared(None, [()] * len(self.stages))
+
+    def embed(self, images: Tensor, points: Any) -> Tensor:
+        """Images (B, C, H, W) and the `points` of `prepare` → the first map."""
         raise NotImplementedError
+
+    def run(self, images: Tensor, prepared: Prepared) -> list[Tensor]:
+        """Images (B, C, H, W), of the size and lenses that gave `prepared` → each stage's map."""
+        x = self.embed(check_images(images), prepared.points)
+        maps = []
+        for stage, positions in zip(self.stages, prepared.positions, strict=True):
+            x = stage(x, *positions)
+            maps.append(x)
+        return maps
+
+    def _maps(self, images: Tensor, lens: Lens | None) -> list[Tensor]:
+        height, width = check_images(images).shape[2:]
+        return self.run(images, self.prepare(lens, (height, width)))
 
     def forward_features(self, images: Tensor, lens: Lens | None = None) -> Tensor:
         """Images (B, C, H, W) and their lenses (B or 1) → the last map, (B, R', A', D'), normed."""
-        return self.norm(self._stage_maps(images, lens)[-1])
+        return self.norm(self._maps(images, lens)[-1])
 
     def forward_intermediates(
         self,
@@ -101,7 +145,7 @@ class Encoder(nn.Module):
             not -count <= i < count for i in chosen
         ):
             raise ValueError(f"indices must name some of {count} stages, got {indices}")
-        maps = self._stage_maps(images, lens)
+        maps = self._maps(images, lens)
         intermediates = [maps[i] for i in chosen]
         return intermediates if intermediates_only else (self.norm(maps[-1]), intermediates)
 
@@ -116,11 +160,13 @@ class Encoder(nn.Module):
 
 
 class ImageEncoder(Encoder):
-    """Base of the models that see images of one size as they are, and need no lens.
+    """Base of the models that cut images of one size into square patches.
 
     Args:
         attention, downsample: as `make_stages`. Others: as `Swin`.
     """
+
+    image_size: Pair = (64, 64)
 
     def __init__(
         self,
@@ -139,35 +185,27 @@ class ImageEncoder(Encoder):
     ):
         super().__init__()
         check_depths(depths, num_heads)
-        size = (image_size, image_size) if isinstance(image_size, int) else tuple(image_size)
-        if any(side < 1 or side % patch_size for side in size):
-            raise ValueError(f"patch_size must divide image_size = {size}, got {patch_size}")
-        plans = plan_stages(*(side // patch_size for side in size), len(depths), "RA", window)
+        height, width = (image_size,) * 2 if isinstance(image_size, int) else image_size
+        self.image_size, self.square_images = (height, width), height == width
+        if any(side < 1 or side % patch_size for side in (height, width)):
+            raise ValueError(
+                f"patch_size must divide image_size = {self.image_size}, got {patch_size}"
+            )
+        plans = plan_stages(height // patch_size, width // patch_size, len(depths), "RA", window)
         self.num_features = embed_dim * 2 ** (len(depths) - 1)
         self.in_chans = in_chans
-        self.image_input = ImageInput(size, in_chans, mean, std)
+        self.image_input = ImageInput(self.image_size, in_chans, mean, std)
         self.patch_embed = PatchProjection(in_chans, embed_dim, patch_size)
         self.stages = make_stages(plans, embed_dim, depths, num_heads, **stages)
         self._finish(num_classes)
 
-    @property
-    def image_size(self) -> Pair:
-        """(H, W) that images must have."""
-        return self.image_input.image_size
-
-    def _view(self, images: Tensor, lens: Lens | None) -> Tensor:
-        """What the network sees of the images."""
-        return images
-
-    def _stage_maps(self, images: Tensor, lens: Lens | None) -> list[Tensor]:
-        dtype = next(self.patch_embed.parameters()).dtype
-        x = self._view(self.image_input(images, dtype), lens)
-        x = self.patch_embed(x.permute(0, 2, 3, 1))
-        maps = []
-        for stage in self.stages:
-            x = stage(x)
-            maps.append(x)
-        return maps
+    def embed(self, images: Tensor, points: Tensor | None) -> Tensor:
+        """Images (B, C, H, W), read at the pixels `points` (N, H, W, 2) if any → the first map."""
+        images = self.image_input(images, next(self.patch_embed.parameters()).dtype)
+        if points is not None:
+            check_count(len(points), images)
+            images = sample_at(images, points)
+        return self.patch_embed(images.permute(0, 2, 3, 1))
 
 
 def _init_weights(module: nn.Module) -> None:

@@ -7,16 +7,13 @@ whole batch, tan θ_max as the angle of the bias, a seam in the azimuth, and oth
 
 import dataclasses
 import math
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
 from darswin.layers.grid import PolarGrid, check_tan
 from darswin.lens import Lens, Number, Spherical
-
-if TYPE_CHECKING:
-    from darswin.models.stages import StagePlan
+from darswin.models.stages import Pair, StagePlan
 
 
 class OfficialPolynomial(Lens):
@@ -50,7 +47,8 @@ class OfficialPolynomial(Lens):
 
     def _angle(self, x: Tensor) -> Tensor:
         columns = self.coefficients.reshape(*self.coefficients.shape, *(1,) * (x.dim() - 1))
-        return sum(column * x**power for power, column in enumerate(columns.unbind(1), start=1))
+        terms = (column * x**power for power, column in enumerate(columns.unbind(1), start=1))
+        return sum(terms, torch.zeros_like(x))
 
     def _table(self) -> tuple[Tensor, Tensor]:
         """x (50,) and its θ (N, 50)."""
@@ -153,14 +151,14 @@ def ring_angles(lens: Lens, rings: int) -> Tensor:
     return _last_angle(lens[:1])[:, None] * _inclusive(rings, lens.theta_max)
 
 
-def plan(stage: "StagePlan", window: tuple[int, int]) -> "StagePlan":
+def plan(stage: StagePlan, window: Pair) -> StagePlan:
     """The stage with the released code's shift of its odd blocks."""
     shift = (window[0], window[1] // 4)
     if stage.map_size[1] < 4:
         shift = shift[::-1]
     # Rolling by whole windows of one token, or once around, moves nothing.
-    effective = tuple(
+    along_r, along_phi = (
         s % size if w > 1 else 0
         for s, size, w in zip(shift, stage.map_size, stage.window, strict=True)
     )
-    return dataclasses.replace(stage, shift=effective)
+    return dataclasses.replace(stage, shift=(along_r, along_phi))

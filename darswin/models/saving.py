@@ -9,8 +9,9 @@ from typing import Any
 
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
-from torch import Tensor, nn
+from torch import Tensor
 
+from darswin.models.encoder import Encoder
 from darswin.models.registry import create_model
 from darswin.utils.files import replace_file
 
@@ -37,7 +38,7 @@ class ModelCard:
     size: int = 64
     fov: float = 0.0
 
-    def create(self) -> nn.Module:
+    def create(self) -> Encoder:
         """The model, with new weights."""
         return create_model(self.model, **self.options)
 
@@ -61,7 +62,7 @@ def model_of_run(run: str | os.PathLike, suffix: str = ".safetensors") -> Path:
     raise FileNotFoundError(f"there is no model in {run} yet")
 
 
-def load_model(path: str | os.PathLike) -> tuple[nn.Module, ModelCard]:
+def load_model(path: str | os.PathLike) -> tuple[Encoder, ModelCard]:
     """The model of a file, in eval mode, and its card.
 
     Raises:

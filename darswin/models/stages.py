@@ -23,10 +23,9 @@ class StagePlan:
     shift: Pair
     merge: Pair | None
 
-    def windows(self, block: int) -> dict[str, Pair]:
-        """The sizes that the windowed attention of a block takes."""
-        shift = self.shift if block % 2 else (0, 0)
-        return dict(map_size=self.map_size, window=self.window, shift=shift)
+    def shift_of(self, block: int) -> Pair:
+        """The shift of the windows of a block: every second block has one."""
+        return self.shift if block % 2 else (0, 0)
 
 
 def plan_stages(
@@ -93,10 +92,11 @@ def _fit_window(window: Pair, size: Pair) -> Pair:
 
 
 def _shift(size: Pair, window: Pair, variant: str) -> Pair:
-    half = tuple(w // 2 if s > w else 0 for s, w in zip(size, window, strict=True))
+    along_r = window[0] // 2 if size[0] > window[0] else 0
+    along_phi = window[1] // 2 if size[1] > window[1] else 0
     if variant == "RA":
-        return half
-    return (0, window[1] // 4) if size[1] > window[1] else (half[0], 0)
+        return along_r, along_phi
+    return (0, window[1] // 4) if size[1] > window[1] else (along_r, 0)
 
 
 class Stage(nn.Module):
@@ -122,9 +122,7 @@ def make_stages(
     num_heads: Sequence[int],
     *,
     attention: Callable[[int, int, StagePlan, int], nn.Module],
-    downsample: Callable[[int, StagePlan], nn.Module] = lambda dim, plan: PatchMerging(
-        dim, plan.merge
-    ),
+    downsample: Callable[[int, Pair], nn.Module] = PatchMerging,
     mlp_ratio: float,
     drop_path_rate: float,
 ) -> nn.ModuleList:
@@ -132,14 +130,14 @@ def make_stages(
 
     Args:
         attention: the width, heads, plan and number of a block → its attention.
-        downsample: the width before and the plan → what begins every stage but the first.
+        downsample: the width before and (m_r, m_φ) → what begins every stage but the first.
         drop_path_rate: of the last block; it rises linearly from 0.
     """
     stages = nn.ModuleList()
     before, last = 0, max(sum(depths) - 1, 1)
     for plan, depth, heads in zip(plans, depths, num_heads, strict=True):
         dim = embed_dim * 2**plan.index
-        merging = downsample(dim // 2, plan) if plan.merge else nn.Identity()
+        merging = downsample(dim // 2, plan.merge) if plan.merge else nn.Identity()
         blocks = [
             Block(
                 dim,

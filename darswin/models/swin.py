@@ -3,16 +3,18 @@
 import math
 from collections.abc import Sequence
 
-from torch import Tensor
-
 from darswin.layers.attention import WindowAttention
 from darswin.layers.sampling import check_lens
 from darswin.lens import Lens
-from darswin.lens.reprojection import perspective_view, reproject
-from darswin.models.encoder import ImageEncoder
+from darswin.lens.reprojection import perspective_view, reprojection
+from darswin.models.encoder import ImageEncoder, Prepared
+from darswin.models.registry import Presets, register_model
 from darswin.models.stages import Pair
 
+_PRESETS: Presets = dict(nano=dict(image_size=32))
 
+
+@register_model("swin", presets=_PRESETS)
 class Swin(ImageEncoder):
     """The Swin Transformer. It is called as DarSwin is, and ignores the lens.
 
@@ -61,11 +63,16 @@ class Swin(ImageEncoder):
             mean=mean,
             std=std,
             attention=lambda dim, heads, plan, block: WindowAttention(
-                dim, heads, **plan.windows(block)
+                dim,
+                heads,
+                map_size=plan.map_size,
+                window=plan.window,
+                shift=plan.shift_of(block),
             ),
         )
 
 
+@register_model("swin_undis", presets=_PRESETS)
 class SwinUndis(Swin):
     """Swin on the perspective view of each image, which its lens gives: "Swin (undis)".
 
@@ -90,7 +97,9 @@ class SwinUndis(Swin):
             raise ValueError(f"max_fov must be in (0, π), got {max_fov}")
         self.max_fov = float(max_fov)
 
-    def _view(self, images: Tensor, lens: Lens | None) -> Tensor:
-        check_lens(lens, images)
+    def prepare(self, lens: Lens | None, size: Pair) -> Prepared:
+        """The pixels where the lenses show each pixel of their views; else as `Encoder`."""
+        lens = check_lens(lens, size)
         view = perspective_view(lens, self.image_size, self.max_fov)
-        return reproject(images, lens, view, self.image_size)
+        points = reprojection(lens, size, view, self.image_size)
+        return super().prepare(lens, size)._replace(points=points)

@@ -1,6 +1,7 @@
 """Image classification: what is trained and what is measured."""
 
 import math
+from collections.abc import Iterator
 from dataclasses import asdict
 from typing import Any
 
@@ -8,6 +9,7 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 from lightning.pytorch import LightningModule
+from lightning.pytorch.utilities.types import OptimizerLRSchedulerConfig
 from torch import Tensor, nn
 from torchmetrics import MeanMetric, Metric
 from torchmetrics.classification import MulticlassAccuracy
@@ -15,9 +17,10 @@ from torchmetrics.classification import MulticlassAccuracy
 from darswin.data.mixing import Mixing
 from darswin.layers.linear import MatmulBackend
 from darswin.lens import Lens
-from darswin.models.encoder import ImageEncoder
+from darswin.models.encoder import Encoder
 from darswin.models.registry import model_class
 from darswin.models.saving import ModelCard
+from darswin.train.data import WideAngleData
 from darswin.train.recipe import Schedule, parameter_groups
 
 Batch = tuple[Tensor, Lens, Tensor]
@@ -49,6 +52,9 @@ class Classification(LightningModule):
 
     Source: the recipe of DarSwin, ICCV 2023, sec. 5.2, and of its released code.
     """
+
+    net: Encoder  # of `configure_model`, as is what describes it
+    card: ModelCard
 
     def __init__(
         self,
@@ -90,22 +96,20 @@ class Classification(LightningModule):
         self.label_smoothing, self.seed = label_smoothing, seed
         self.matmul_backend, self.grad_checkpointing = matmul_backend, grad_checkpointing
         self.mixing = Mixing(mixup, cutmix, mix_p)
-        self.net: nn.Module | None = None
         self._steps_there: int | None = None  # in an epoch of the run that a checkpoint is of
-        self.card: ModelCard | None = None
 
     # -- building -----------------------------------------------------------------------------
 
     def configure_model(self) -> None:
         """Builds the network for the classes and channels of the data."""
-        if self.net is not None:
+        if hasattr(self, "net"):
             return
-        data = self.trainer.datamodule
+        data = self._data
         if len(data.classes) < 2:
             raise ValueError(f"a classifier needs two classes, the data has only {data.classes}")
-        options = dict(num_classes=len(data.classes), in_chans=data.channels)
+        options: dict[str, Any] = dict(num_classes=len(data.classes), in_chans=data.channels)
         options |= dict(mean=data.mean, std=data.std)
-        if issubclass(model_class(self.name), ImageEncoder):
+        if model_class(self.name).image_size is not None:
             options["image_size"] = data.size
         if taken := sorted(options.keys() & self.options.keys()):
             raise ValueError(
@@ -128,9 +132,13 @@ class Classification(LightningModule):
         self.val_metrics = metrics(count)
         self.test_metrics = nn.ModuleList(metrics(count) for _ in data.test_names)
 
-    def configure_optimizers(self) -> dict:
+    @property
+    def _data(self) -> WideAngleData:
+        return self.trainer.datamodule  # type: ignore[attr-defined]  # Lightning attaches it
+
+    def configure_optimizers(self) -> OptimizerLRSchedulerConfig:
         trainer = self.trainer
-        batch = trainer.datamodule.batch_size * trainer.world_size * trainer.accumulate_grad_batches
+        batch = self._data.batch_size * trainer.world_size * trainer.accumulate_grad_batches
         scale = batch / self.reference_batch
         steps = trainer.estimated_stepping_batches
         if not math.isfinite(steps):
@@ -201,14 +209,14 @@ class Classification(LightningModule):
         torch.manual_seed(int(np.random.default_rng((*step, self.global_rank)).integers(2**63)))
         targets = self._targets(labels, len(self.card.classes))
         images, targets = self.mixing(images, targets, rng)
-        loss = soft_cross_entropy(self.net(images, lens), targets)
+        loss = F.cross_entropy(self.net(images, lens).float(), targets)
         if not torch.isfinite(loss):
             raise FloatingPointError(
                 f"the loss is {loss.item()} in epoch {self.current_epoch}, batch {batch_idx}: "
                 f"{self._advice()}"
             )
         self.log("train/loss", loss, prog_bar=True, batch_size=len(images), sync_dist=True)
-        self.log("train/rate", self.lr_schedulers().get_last_lr()[0])
+        self.log("train/rate", self.trainer.optimizers[0].param_groups[0]["lr"])
         return loss
 
     def _advice(self) -> str:
@@ -226,11 +234,11 @@ class Classification(LightningModule):
 
     # -- evaluation ---------------------------------------------------------------------------
 
-    def _measure(self, batch: Batch, measured: nn.ModuleDict) -> None:
+    def _measure(self, batch: Batch, measured: nn.Module) -> None:
         images, lens, labels = batch
         known = labels >= 0
         logits = self.net(images, lens).float()[known]
-        for name, metric in measured.items():
+        for name, metric in _named(measured):
             if not known.any():
                 continue
             if name == "loss":
@@ -240,7 +248,7 @@ class Classification(LightningModule):
 
     def validation_step(self, batch: Batch, batch_idx: int) -> None:
         self._measure(batch, self.val_metrics)
-        for name, metric in self.val_metrics.items():
+        for name, metric in _named(self.val_metrics):
             self.log(f"val/{name}", metric, prog_bar=name != "top5", on_step=False, on_epoch=True)
 
     def test_step(self, batch: Batch, batch_idx: int, dataloader_idx: int = 0) -> None:
@@ -248,9 +256,9 @@ class Classification(LightningModule):
 
     def on_test_epoch_end(self) -> None:
         """Collects `results`: a row for each distribution of lenses."""
-        names = self.trainer.datamodule.test_names
+        names = self._data.test_names
         self.results = [
-            {"lenses": name} | {key: metric.compute().item() for key, metric in measured.items()}
+            {"lenses": name} | {key: metric.compute().item() for key, metric in _named(measured)}
             for name, measured in zip(names, self.test_metrics, strict=True)
         ]
 
@@ -265,6 +273,8 @@ def metrics(classes: int) -> nn.ModuleDict:
     return nn.ModuleDict(dict(top1=accuracy(1), top5=accuracy(5), loss=MeanMetric()))
 
 
-def soft_cross_entropy(logits: Tensor, targets: Tensor) -> Tensor:
-    """Mean over the batch of -Σ target · log softmax(logits), in float32."""
-    return -(targets * F.log_softmax(logits.float(), -1)).sum(-1).mean()
+def _named(measured: nn.Module) -> Iterator[tuple[str, Metric]]:
+    """The metrics of `metrics`, and their names."""
+    for name, metric in measured.named_children():
+        assert isinstance(metric, Metric)
+        yield name, metric

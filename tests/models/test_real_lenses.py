@@ -40,7 +40,7 @@ def test_a_calibrated_camera_runs(name, lens, size):
 
 def test_rays_keep_their_place_in_the_polar_image():
     """Two cameras that see the same scene give the same polar image, but for interpolation."""
-    sample = PolarSample(8, 32, (4, 4))
+    sample = PolarSample(8, 32, (4, 4), layout="image")
     views = []
     for lens in (WOODSCAPE, KITTI):
         size = tuple(int(s) // 2 for s in lens.image_size[0].tolist())
