@@ -20,7 +20,7 @@ def test_general_lenses():
     embed = PolarPatchEmbed(4, 8, (3, 2), grid=general).double()
     tokens = polar_embed(
         images, radii, azimuths, center, embed.proj.weight, embed.proj.bias,
-        affine=affine.double(), offsets=offsets.double(), patch=(3, 2),
+        affine=affine.double(), offsets=offsets.double(), samples=(3, 2),
     )  # fmt: skip
     got = embed(images, embed.sample.grid(LENS, (32, 33)))
     assert torch.equal(got, embed.norm(tokens))

@@ -41,7 +41,7 @@ def test_general_lenses():
     radii, azimuths, center = (t.double() for t in grid[:3])
     expected = polar_sample(
         images, radii, azimuths, center, affine=affine.double(), offsets=offsets.double(),
-        patch=(3, 2), layout="image",
+        samples=(3, 2), layout="image",
     )  # fmt: skip
     sample = PolarSample(4, 8, (3, 2), layout="image", grid=general)
     assert torch.equal(sample(images, LENS), expected)
