@@ -1,14 +1,18 @@
-"""What a measurement ran on."""
+"""What a measurement runs on: the machine, its instruction-set tiers, the number of threads."""
 
+import contextlib
 import platform
 import subprocess
+from collections.abc import Callable, Iterator
 from importlib.metadata import version
 from pathlib import Path
+from typing import TypeVar
 
 import torch
 
-from darswin import _C
+import darswin._C as _C
 
+T = TypeVar("T")
 THREADS = sorted({1, torch.get_num_threads()})
 
 
@@ -24,6 +28,34 @@ def machine() -> dict[str, str | int]:
         darswin=version("darswin"),
         commit=_commit(),
     )
+
+
+def on_other_tiers(run: Callable[[], T]) -> dict[str, Callable[[], T]]:
+    """`run` with our operators on each other instruction-set tier of this machine, by its name."""
+    best = _C.tier()
+
+    def on(tier: str) -> Callable[[], T]:
+        def step() -> T:
+            _C.set_tier(tier)
+            try:
+                return run()
+            finally:
+                _C.set_tier(best)
+
+        return step
+
+    return {tier: on(tier) for tier in _C.tiers() if tier != best}
+
+
+@contextlib.contextmanager
+def num_threads(count: int) -> Iterator[None]:
+    """Within it torch and our operators use so many threads, and inductor compiles for them."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 def _cpu() -> str:
