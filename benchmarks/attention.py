@@ -121,7 +121,7 @@ def attention(name: str, batch: int, mode: str, dtype: torch.dtype, seconds: flo
     half = dtype == torch.bfloat16
     subject = "window_attention, bfloat16" if half else "window_attention"
     timings = compare(
-        Case(subject, name, batch, mode, torch.get_num_threads()),
+        Case(subject, name, batch, torch.get_num_threads(), mode),
         runs,
         [qkv, bias],
         seconds,

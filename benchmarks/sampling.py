@@ -6,7 +6,7 @@ ratio against its target; with a folder, writes a record and a plot there.
 
 import argparse
 import math
-from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -47,13 +47,8 @@ def as_tokens(result: Tensor) -> Tensor:
     return to_tokens(result) if result.shape[-2:] == (160, 640) else result
 
 
-def cases(subject: str, size: int, batch: int) -> Callable[[str], Case]:
-    """The cases of an operator, by mode, at the number of threads in use."""
-    return lambda mode: Case(subject, f"{size}×{size}", batch, mode, torch.get_num_threads())
-
-
 def sampling(size: int, batch: int, seconds: float) -> list[Timing]:
-    case = cases("polar_sample", size, batch)
+    case = partial(Case, "polar_sample", f"{size}×{size}", batch, torch.get_num_threads())
     images, grid, mesh, (x, y) = sampling_case(size, batch)
     arguments = (grid.radii, grid.azimuths, grid.center)
     small = size <= 256
@@ -122,7 +117,7 @@ def sampling(size: int, batch: int, seconds: float) -> list[Timing]:
 
 
 def embedding(size: int, batch: int, seconds: float) -> list[Timing]:
-    case = cases("polar_embed", size, batch)
+    case = partial(Case, "polar_embed", f"{size}×{size}", batch, torch.get_num_threads())
     images, grid, mesh, _ = sampling_case(size, batch)
     arguments = (grid.radii, grid.azimuths, grid.center)
     weight, bias = torch.randn(96, 300) / 300**0.5, torch.randn(96)

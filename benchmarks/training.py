@@ -12,7 +12,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import torch
 from lightning.pytorch import Callback, Trainer
 from torch.utils.data import DataLoader
 from tqdm import tqdm

@@ -4,6 +4,7 @@ import contextlib
 import platform
 import subprocess
 from collections.abc import Callable, Iterator
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import TypeVar
@@ -32,19 +33,16 @@ def machine() -> dict[str, str | int]:
 
 def on_other_tiers(run: Callable[[], T]) -> dict[str, Callable[[], T]]:
     """`run` with our operators on each other instruction-set tier of this machine, by its name."""
+    return {tier: partial(_on_tier, tier, run) for tier in _C.tiers() if tier != _C.tier()}
+
+
+def _on_tier(tier: str, run: Callable[[], T]) -> T:
     best = _C.tier()
-
-    def on(tier: str) -> Callable[[], T]:
-        def step() -> T:
-            _C.set_tier(tier)
-            try:
-                return run()
-            finally:
-                _C.set_tier(best)
-
-        return step
-
-    return {tier: on(tier) for tier in _C.tiers() if tier != best}
+    _C.set_tier(tier)
+    try:
+        return run()
+    finally:
+        _C.set_tier(best)
 
 
 @contextlib.contextmanager

@@ -20,11 +20,6 @@ Step = Callable[[], list[Tensor]]
 View = Callable[[Tensor], Tensor]
 
 
-def as_it_is(result: Tensor) -> Tensor:
-    """The view that compares all of a result."""
-    return result
-
-
 def forward(run: Callable[..., Tensor], inputs: Sequence[Tensor]) -> Step:
     """A function that runs without recording gradients; returns the output."""
 
@@ -55,7 +50,10 @@ def forward_backward(run: Callable[..., Tensor], inputs: Sequence[Tensor], view:
 
 
 def check(
-    case: Case, steps: Mapping[str, Step], tolerance: float | None, view: View = as_it_is
+    case: Case,
+    steps: Mapping[str, Step],
+    tolerance: float | None,
+    view: View = lambda result: result,
 ) -> None:
     """Calls all candidates; AssertionError unless they agree with `OURS` in `view`.
 
@@ -68,10 +66,11 @@ def check(
         if tolerance is None:
             continue
         for got, want in zip(map(view, results), expected, strict=True):
-            torch.testing.assert_close(
-                got, want, rtol=tolerance, atol=tolerance * want.abs().max().item(),
-                msg=lambda text, name=name: f"{case}: {name} disagrees with ours: {text}",
-            )  # fmt: skip
+            largest = want.abs().max().item()
+            try:
+                torch.testing.assert_close(got, want, rtol=tolerance, atol=tolerance * largest)
+            except AssertionError as error:
+                raise AssertionError(f"{name} disagrees with ours in {case}: {error}") from None
 
 
 def compare(
@@ -82,7 +81,7 @@ def compare(
     *,
     targets: Mapping[str, float] | None = None,
     tolerance: float | None = 1e-4,
-    view: View = as_it_is,
+    view: View = lambda result: result,
 ) -> list[Timing]:
     """Checks that all candidates agree, then times them, as `case.mode` says with their gradients.
 

@@ -22,8 +22,8 @@ class Case(NamedTuple):
     subject: str  # an operator or a model
     setting: str  # its sizes
     batch: int
-    mode: str  # such as "forward" or "training, float32"
     threads: int
+    mode: str  # such as "forward" or "training, float32"
 
 
 @dataclass
@@ -33,8 +33,8 @@ class Timing:
     subject: str
     setting: str
     batch: int
-    mode: str
     threads: int
+    mode: str
     name: str
     median: float
     iqr: float
@@ -45,7 +45,7 @@ class Timing:
 
     @property
     def case(self) -> Case:
-        return Case(self.subject, self.setting, self.batch, self.mode, self.threads)
+        return Case(self.subject, self.setting, self.batch, self.threads, self.mode)
 
     @property
     def missed(self) -> bool:

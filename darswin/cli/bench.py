@@ -74,7 +74,7 @@ def _measure(
     mode: str, dtype: str, model: str, size: int, batch: int, seconds: float, compiled: bool
 ) -> list[Timing]:
     threads = torch.get_num_threads()
-    case = Case(model, f"{size}×{size}", batch, f"{mode}, {dtype}", threads)
+    case = Case(model, f"{size}×{size}", batch, threads, f"{mode}, {dtype}")
     if mode == "inference":
         runs = candidates.inference(model, size, DTYPES[dtype], batch, compiled=compiled)
     else:
