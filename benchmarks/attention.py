@@ -7,16 +7,15 @@ folder, writes a record and a plot there.
 
 import argparse
 import math
+from functools import partial
 from pathlib import Path
 
 import peaks
 import torch
 import torch.nn.functional as F
 from torch import Tensor
-from tqdm import tqdm
 
-from darswin.bench.machine import THREADS, machine, num_threads
-from darswin.bench.operators import compare, publish
+from darswin.bench.operators import compare, run_suite
 from darswin.bench.timing import OURS, Case, Timing
 from darswin.ops import reference, window_attention
 
@@ -150,7 +149,7 @@ def rates(timings: list[Timing]) -> str:
         gbytes = 1e-9 * maps * numbers * (2 if "bfloat16" in t.subject else 4) / t.median
         limit = limits[t.threads]
         lines.append(
-            f"{t} {gflops:.0f} GFLOP/s ({gflops / limit.gflops:.0%} of the peak), "
+            f"{t.label}: {gflops:.0f} GFLOP/s ({gflops / limit.gflops:.0%} of the peak), "
             f"{gbytes:.1f} GB/s ({gbytes / limit.memory_gbytes:.0%} of a copy in memory)"
         )
     return "\n".join(lines)
@@ -172,14 +171,11 @@ def main() -> None:
         ("forward+backward", torch.float32),
         ("forward+backward", torch.bfloat16),
     ]
-    print(" ".join(f"{k}={v}" for k, v in machine().items()))
-    timings: list[Timing] = []
-    for name, batch in tqdm([(n, b) for n in names for b in batches], unit="case"):
-        for mode, dtype in kinds:
-            for threads in THREADS:
-                with num_threads(threads):
-                    timings += attention(name, batch, mode, dtype, seconds)
-    publish(timings, "attention", avx2_share=0.65, out=args.out)
+    jobs = [
+        partial(attention, name, batch, *kind, seconds)
+        for name in names for batch in batches for kind in kinds
+    ]  # fmt: skip
+    timings = run_suite("attention", jobs, avx2_share=0.65, out=args.out)
     print(rates(timings))
 
 

@@ -14,11 +14,9 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
-from tqdm import tqdm
 
 from darswin import polar_grid
-from darswin.bench.machine import THREADS, machine, num_threads
-from darswin.bench.operators import check, compare, forward, publish
+from darswin.bench.operators import check, compare, forward, run_suite
 from darswin.bench.timing import OURS, Case, Timing, measure
 from darswin.lens import Spherical
 from darswin.ops import polar_embed, polar_sample
@@ -155,15 +153,12 @@ def main() -> None:
     torch.manual_seed(0)
     sizes = [(64, 8)] if args.quick else [(64, 8), (256, 8), (1024, 4)]
     seconds = 0.05 if args.quick else 0.3
-    print(" ".join(f"{k}={v}" for k, v in machine().items()))
-    timings: list[Timing] = []
-    for size, batch in tqdm(sizes, unit="case"):
-        for threads in THREADS:
-            with num_threads(threads):
-                timings += sampling(size, batch, seconds)
-                if size <= 256:
-                    timings += embedding(size, batch, seconds)
-    publish(timings, "sampling", avx2_share=0.6, out=args.out)
+    jobs = []
+    for size, batch in sizes:
+        jobs.append(partial(sampling, size, batch, seconds))
+        if size <= 256:
+            jobs.append(partial(embedding, size, batch, seconds))
+    run_suite("sampling", jobs, avx2_share=0.6, out=args.out)
 
 
 if __name__ == "__main__":

@@ -3,7 +3,7 @@
 import json
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -38,10 +38,15 @@ class Memory:
         return self.peak - self.between
 
 
-def pairs(memory: Sequence[Memory]) -> list[tuple[Memory, Memory]]:
-    """Ours and the reference's, case by case."""
+def compared(memory: Sequence[Memory]) -> Iterator[tuple[str, int, int]]:
+    """What was measured, in words, and our bytes and the reference's."""
     found = {(m.mode, m.batch, m.name): m for m in memory}
-    return [(m, found[m.mode, m.batch, REFERENCE]) for m in memory if m.name == OURS]
+    for ours in memory:
+        if ours.name == OURS:
+            theirs = found[ours.mode, ours.batch, REFERENCE]
+            what = f"{ours.mode}, batch {ours.batch}"
+            yield f"{what}, in all", ours.whole, theirs.whole
+            yield f"{what}, of the batch itself", ours.own, theirs.own
 
 
 def available() -> bool:
@@ -77,8 +82,11 @@ def _measure_here(
     else:
         net, lens = candidates.network(model, pixels).eval(), candidates.lens_of(pixels)
         images = torch.randn(int(batch), 3, pixels, pixels)
-        inference_run = candidates.reference_run if reference else candidates.optimized_run
-        run = torch.no_grad()(inference_run(net, lens, kind, images))
+        if reference:
+            run = candidates.reference_run(net.to(kind), lens, images.to(kind))
+        else:
+            run = candidates.optimized_run(net, lens, kind, images)
+        run = torch.no_grad()(run)
         del net  # the optimized model is a copy
     for _ in range(2):
         run()

@@ -10,9 +10,10 @@ from pathlib import Path
 
 import torch
 from torch import Tensor
+from tqdm import tqdm
 
 from darswin.bench import plot, tables, targets
-from darswin.bench.machine import machine, on_other_tiers
+from darswin.bench.machine import THREADS, machine, num_threads, on_other_tiers
 from darswin.bench.record import Record
 from darswin.bench.timing import OURS, Case, Timing, measure
 
@@ -70,7 +71,9 @@ def check(
             try:
                 torch.testing.assert_close(got, want, rtol=tolerance, atol=tolerance * largest)
             except AssertionError as error:
-                raise AssertionError(f"{name} disagrees with ours in {case}: {error}") from None
+                raise AssertionError(
+                    f"{name} disagrees with ours in {case.label}: {error}"
+                ) from None
 
 
 def compare(
@@ -100,10 +103,24 @@ def compare(
     return measure(case, steps, seconds, targets=targets)
 
 
-def publish(timings: list[Timing], suite: str, avx2_share: float, out: Path | None) -> None:
-    """Prints tables and targets; writes the record and its plot if there is a folder for them."""
+def run_suite(
+    suite: str, jobs: Sequence[Callable[[], list[Timing]]], avx2_share: float, out: Path | None
+) -> list[Timing]:
+    """Runs jobs at one and at all threads, and prints tables and targets.
+
+    Args:
+        avx2_share: of each target, on the AVX2 tier. out: a folder for the record and its plot.
+    """
+    head = machine()
+    print(" ".join(f"{k}={v}" for k, v in head.items()))
+    timings: list[Timing] = []
+    for job in tqdm(jobs, unit="case"):
+        for threads in THREADS:
+            with num_threads(threads):
+                timings += job()
     for subject in dict.fromkeys(t.subject for t in timings):
         print(tables.peers_table(timings, subject), end="\n\n")
     print(*targets.lines(timings, avx2_share), sep="\n")
     if out:
-        Record(machine(), timings).publish(out, suite, plot.draw_peers)
+        Record(head, timings).publish(out, suite, plot.draw_peers)
+    return timings

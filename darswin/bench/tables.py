@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 
-from darswin.bench.memory import Memory, pairs
+from darswin.bench.memory import Memory, compared
 from darswin.bench.record import Record
 from darswin.bench.timing import COMPILED, FIXED_LENS, MATMULS, OURS, REFERENCE, Timing
 
@@ -69,10 +69,9 @@ def attention_table(timings: Sequence[Timing]) -> str:
 
 def missed_table(timings: Iterable[Timing]) -> str:
     """The ratios that are below their target."""
-    return markdown(
-        ["", "ratio", "target"],
-        [[str(t), f"{t.ratio:.2f}", f"{t.target:.2f}"] for t in timings if t.missed],
-    )
+    missed = [t for t in timings if t.missed]
+    rows = [[f"{t.label}: {t.name}", f"{t.ratio:.2f}", f"{t.target:.2f}"] for t in missed]
+    return markdown(["", "ratio", "target"], rows)
 
 
 def models_table(timings: Sequence[Timing]) -> str:
@@ -101,14 +100,10 @@ def models_table(timings: Sequence[Timing]) -> str:
 
 def memory_table(memory: Sequence[Memory]) -> str:
     """Peaks of resident memory, ours and the reference's."""
-    rows = []
-    for ours, theirs in pairs(memory):
-        for name, a, b in (
-            ("in all", ours.whole, theirs.whole),
-            ("of the batch itself", ours.own, theirs.own),
-        ):
-            what = f"{ours.mode}, batch {ours.batch}, {name}"
-            rows.append([what, f"{a / 2**20:.0f}", f"{b / 2**20:.0f}", f"{a / b:.2f}"])
+    rows = [
+        [what, f"{a / 2**20:.0f}", f"{b / 2**20:.0f}", f"{a / b:.2f}"]
+        for what, a, b in compared(memory)
+    ]
     return markdown(["peak memory (MB)", OURS, REFERENCE, "ratio"], rows)
 
 
@@ -133,15 +128,13 @@ def training_table(models: Mapping[str, Mapping]) -> str:
 
 def roofline_lines(record: Record) -> list[str]:
     """What the matrix products alone reach a second, and with the model around them."""
-    ours = {t.case: t for t in record.timings if t.name == OURS}
+    ours = {t.label: t.median for t in record.timings if t.name == OURS}
     lines = []
     for t in record.timings:
         if t.name == MATMULS:
             work = 1e-9 * record.operations * t.batch
-            lines.append(
-                f"{t} {work / t.median:.0f} GFLOP/s, the model {work / ours[t.case].median:.0f} "
-                f"({t.ratio:.0%})"
-            )
+            rates = f"{work / t.median:.0f} GFLOP/s, the model {work / ours[t.label]:.0f}"
+            lines.append(f"{t.label}: {t.name} {rates} ({t.ratio:.0%})")
     return lines
 
 

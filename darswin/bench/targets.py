@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from darswin.bench.memory import Memory, pairs
+from darswin.bench.memory import Memory, compared
 from darswin.bench.timing import COMPILED, MATMULS, OURS, REFERENCE, Case, Timing
 
 MODEL, SETTING = "darswin_a_small", "64×64"
@@ -26,32 +26,26 @@ def of_model(case: Case) -> dict[str, float]:
 
 def lines(timings: Sequence[Timing], avx2_share: float = 1.0) -> list[str]:
     """Each ratio that has a target, against it; on the AVX2 tier the target is a share of it."""
-    avx2 = {t.case: t for t in timings if t.name == f"{OURS} (avx2)"}
+    avx2 = {t.label: t for t in timings if t.name == f"{OURS} (avx2)"}
     found = []
     for t in timings:
         if t.target is None:
             continue
         line = _against(t.ratio, t.target, t.missed)
-        if t.case in avx2:
-            ratio, target = t.median / avx2[t.case].median, t.target * avx2_share
+        if t.label in avx2:
+            ratio, target = t.median / avx2[t.label].median, t.target * avx2_share
             line += f"; avx2 {_against(ratio, target, ratio < target)}"
-        found.append(f"{t} {line}")
+        found.append(f"{t.label}: {t.name} {line}")
     return found
 
 
 def memory_lines(memory: Sequence[Memory]) -> list[str]:
     """The peaks of training steps of `MODEL`, against their target."""
-    found = []
-    for ours, theirs in pairs(memory):
-        if not ours.mode.startswith("training"):
-            continue
-        for name, ratio in (
-            ("in all", ours.whole / theirs.whole),
-            ("of the step itself", ours.own / theirs.own),
-        ):
-            line = _against(ratio, MEMORY_TARGET, ratio > MEMORY_TARGET)
-            found.append(f"peak memory, {ours.mode}, batch {ours.batch}, {name}: {line}")
-    return found
+    return [
+        f"peak memory, {what}: {_against(a / b, MEMORY_TARGET, a / b > MEMORY_TARGET)}"
+        for what, a, b in compared(memory)
+        if what.startswith("training")
+    ]
 
 
 def _against(ratio: float, target: float, missed: bool) -> str:
