@@ -50,7 +50,7 @@ def test_the_drop_in_call_is_faster_than_what_it_replaces():
     record = json.loads((ROOT / "benchmarks/results/sampling--avx512.json").read_text())
     calls = [
         row
-        for row in record["results"]
+        for row in record["timings"]
         if row["mode"] == "forward, layout image" and row["name"] == "F.grid_sample"
     ]
     assert len(calls) == 6 and min(row["ratio"] for row in calls) > 1
