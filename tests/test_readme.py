@@ -11,8 +11,11 @@ import torch
 from darswin import create_model, lens, list_models
 
 ROOT = Path(__file__).parent.parent
-LEVELS = ("very low", "low", "medium", "high")
-SWEEP = tuple(f"{k / 20:g}" for k in range(21))
+sys.path[:0] = [str(ROOT / "docs"), str(ROOT / "studies")]
+
+import readme  # noqa: E402
+from cells import LEVELS, SWEEP  # noqa: E402
+
 README = (ROOT / "README.md").read_text()
 
 
@@ -38,9 +41,6 @@ def test_pictures_and_links_exist():
 
 
 def test_tables_are_those_of_the_results():
-    sys.path.append(str(ROOT / "docs"))
-    import readme
-
     for name, table in readme.tables().items():
         assert readme.placed(name, table) in README, name
         assert "not run" not in table
