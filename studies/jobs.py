@@ -16,7 +16,7 @@ def run_all(
     work: Callable[..., dict], jobs: Sequence[tuple], processes: int, unit: str
 ) -> list[dict]:
     """What `work` returns for the arguments of each job, in the order in which they end."""
-    use_one_core()
+    os.environ["OMP_NUM_THREADS"] = "1"  # of the new processes, from their start
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(processes, context, use_one_core) as pool:
         started = [pool.submit(work, *job) for job in jobs]
@@ -25,8 +25,7 @@ def run_all(
 
 
 def use_one_core() -> None:
-    """Two jobs side by side are faster than one on two cores. Processes started later do so too."""
-    os.environ["OMP_NUM_THREADS"] = "1"
+    """Two jobs side by side are faster than one on two cores."""
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
 
@@ -34,9 +33,5 @@ def use_one_core() -> None:
 @contextlib.contextmanager
 def printing_to(path: Path) -> Iterator[None]:
     """Appends what is printed within it to a file."""
-    with (
-        path.open("a") as log,
-        contextlib.redirect_stdout(log),
-        contextlib.redirect_stderr(log),
-    ):
+    with path.open("a") as log, contextlib.redirect_stdout(log), contextlib.redirect_stderr(log):
         yield

@@ -1,4 +1,4 @@
-"""What is compared: our model, the same on the operators' PyTorch reference, and that compiled."""
+"""The candidates: our model, and the same on the operators' reference, as it is and compiled."""
 
 import copy
 import math

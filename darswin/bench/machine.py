@@ -14,14 +14,14 @@ import torch
 import darswin._C as _C
 
 T = TypeVar("T")
-THREADS = sorted({1, torch.get_num_threads()})
+THREADS = sorted({1, torch.get_num_threads()})  # to measure at: one and all
 
 
 def machine() -> dict[str, str | int]:
     """CPU, tier and versions, and in a checkout the commit: the head of a record."""
     return dict(
         cpu=_cpu(),
-        cores=torch.get_num_threads(),
+        cores=max(THREADS),
         tier=_C.tier(),
         compiler=_C.build_info()["compiler"],
         python=platform.python_version(),

@@ -34,6 +34,8 @@ def bench(
 ) -> Record:
     """Measures inference and training of a model on this machine, and prints what it found.
 
+    With the default options it takes a quarter of an hour.
+
     Args:
         model: its name. size: px, of square images. batches: B.
         compiled: the batches at which the compiled reference is measured too, at all threads.
