@@ -84,9 +84,9 @@ format: $(STAMP)  ## ruff and clang-format, in place
 	$(BIN)/clang-format -i $$(find csrc -name '*.h' -o -name '*.cpp')
 
 bench: build  ## time the operators against their peers, and training; nothing else should be running
-	$(BIN)/python benchmarks/sampling.py
-	$(BIN)/python benchmarks/attention.py
-	$(BIN)/python benchmarks/training.py
+	$(BIN)/python benchmarks/sampling.py --out benchmarks/results
+	$(BIN)/python benchmarks/attention.py --out benchmarks/results
+	$(BIN)/python benchmarks/training.py --out benchmarks/results
 	$(BIN)/python -m darswin bench --out benchmarks/results
 
 study: build  ## the paper's experiments, small: an hour; goes on where it was stopped

@@ -1,21 +1,22 @@
 """window_attention, forward and forward+backward, against what a user would write without it.
 
-`make bench`, or `python benchmarks/attention.py [--quick] [--only "A stage 1"]`. Writes
-benchmarks/results/*.json and a plot beside it, and prints the tables of the README, each ratio
-against its bar, and our rates against the machine's peaks.
+`make bench`, or `python benchmarks/attention.py [--quick] [--only "A stage 1"] [--out FOLDER]`.
+Prints tables, each ratio against its target, and our rates against the machine's peaks; with a
+folder, writes a record and a plot there.
 """
 
 import argparse
 import math
+from functools import partial
+from pathlib import Path
 
 import peaks
 import torch
 import torch.nn.functional as F
-from common import OURS, Result, compare, finish, forward, forward_backward
 from torch import Tensor
-from tqdm import tqdm
 
-from darswin.bench.machine import THREADS, machine
+from darswin.bench.operators import compare, run_suite
+from darswin.bench.timing import OURS, Case, Timing
 from darswin.ops import reference, window_attention
 
 HEAD_DIM = 32
@@ -33,10 +34,11 @@ ATTENTION = {
     "Swin 4x4": ((32, 32, 3), (4, 4), (2, 2), (False, False)),
     "Swin 8x8": ((32, 32, 3), (8, 8), (4, 4), (False, False)),
 }
-COMPILED = "compiled "
 
 
-def bars(mode: str, dtype: torch.dtype, batch: int, megabytes: float) -> tuple[float, float | None]:
+def targets(
+    mode: str, dtype: torch.dtype, batch: int, megabytes: float
+) -> tuple[float, float | None]:
     """How much longer the best of the peers must at least take, and eager attention."""
     if dtype == torch.bfloat16:
         return 3.0, None
@@ -101,59 +103,53 @@ def pairs_by_slices(bias: Tensor, window: tuple[int, int]) -> Tensor:
     return table.transpose(3, 4).reshape(*bias.shape[:2], mr * ma, mr * ma)
 
 
-def attention(
-    case: str, batch: int, threads: int, mode: str, dtype: torch.dtype, seconds: float
-) -> list[Result]:
-    (rings, sectors, heads), window, shift, periodic = ATTENTION[case]
+def attention(name: str, batch: int, mode: str, dtype: torch.dtype, seconds: float) -> list[Timing]:
+    (rings, sectors, heads), window, shift, periodic = ATTENTION[name]
     qkv = torch.randn(batch, rings, sectors, 3, heads, HEAD_DIM).to(dtype)
     bias = torch.randn(1, heads, 2 * window[0] - 1, 2 * window[1] - 1)
-    peers = Peers(case, batch, slices=False)
-    to_compile = Peers(case, batch, slices=mode != "forward")
+    peers = Peers(name, batch, slices=False)
+    to_compile = Peers(name, batch, slices=mode != "forward")
 
     def ours(qkv: Tensor, bias: Tensor) -> Tensor:
         return window_attention(qkv, bias, window=window, shift=shift, periodic=periodic)
 
-    torch.set_num_threads(threads)  # inductor writes it into its code
     torch._dynamo.reset()
     runs = {OURS: ours, "eager": peers.eager, "F.sdpa": peers.sdpa}
-    for name, run in (("eager", to_compile.eager), ("F.sdpa", to_compile.sdpa)):
-        runs[COMPILED + name] = torch.compile(run, dynamic=False)
-    wrap = forward if mode == "forward" else forward_backward
+    for peer, run in (("eager", to_compile.eager), ("F.sdpa", to_compile.sdpa)):
+        runs[f"compiled {peer}"] = torch.compile(run, dynamic=False)
     half = dtype == torch.bfloat16
-    results = compare(
-        "window_attention, bfloat16" if half else "window_attention",
-        f"{case}, batch {batch}",
-        {name: wrap(run, [qkv, bias]) for name, run in runs.items()},
-        mode=mode, threads=threads, min_run_time=seconds,
+    subject = "window_attention, bfloat16" if half else "window_attention"
+    timings = compare(
+        Case(subject, name, batch, torch.get_num_threads(), mode),
+        runs,
+        [qkv, bias],
+        seconds,
         tolerance=5e-2 if half else 1e-4,  # the peers round to bfloat16 at each step
-    )  # fmt: skip
-    best_bar, eager_bar = bars(mode, dtype, batch, 4 * qkv.numel() / 3 / 2**20)
-    by_name = {r.name: r for r in results}
-    by_name["eager"].bar = eager_bar
-    best = min((r for r in results if not r.name.startswith(OURS)), key=lambda r: r.median)
-    best.bar = max(best_bar, best.bar or 0)
-    return results
+    )
+    best_target, eager_target = targets(mode, dtype, batch, 4 * qkv.numel() / 3 / 2**20)
+    next(t for t in timings if t.name == "eager").target = eager_target
+    best = min((t for t in timings if not t.name.startswith(OURS)), key=lambda t: t.median)
+    best.target = max(best_target, best.target or 0)
+    return timings
 
 
-def rates(results: list[Result]) -> str:
+def rates(timings: list[Timing]) -> str:
     """Our arithmetic and our traffic a second, against the machine's peaks."""
-    limits = {threads: peaks.measure(threads) for threads in sorted({r.threads for r in results})}
+    limits = {threads: peaks.measure(threads) for threads in sorted({t.threads for t in timings})}
     lines = [str(limit) for limit in limits.values()]
-    for r in results:
-        if r.name != OURS:
+    for t in timings:
+        if t.name != OURS:
             continue
-        case, batch = r.case.rsplit(", batch ", 1)
-        (rings, sectors, heads), window, *_ = ATTENTION[case]
-        numbers = int(batch) * rings * sectors * heads * HEAD_DIM
+        (rings, sectors, heads), window, *_ = ATTENTION[t.setting]
+        numbers = t.batch * rings * sectors * heads * HEAD_DIM
         # Two products forward, five backward; a map of qkv read and one written, then two and a
         # gradient read and the gradient of qkv written.
-        products, maps = (2, 4) if r.mode == "forward" else (7, 11)
-        gflops = 2e-9 * products * numbers * window[0] * window[1] / r.median
-        gbytes = 1e-9 * maps * numbers * (2 if "bfloat16" in r.operator else 4) / r.median
-        limit = limits[r.threads]
+        products, maps = (2, 4) if t.mode == "forward" else (7, 11)
+        gflops = 2e-9 * products * numbers * window[0] * window[1] / t.median
+        gbytes = 1e-9 * maps * numbers * (2 if "bfloat16" in t.subject else 4) / t.median
+        limit = limits[t.threads]
         lines.append(
-            f"{r.operator}, {r.case}, {r.mode}, {r.threads} threads: "
-            f"{gflops:.0f} GFLOP/s ({gflops / limit.gflops:.0%} of the peak), "
+            f"{t.label}: {gflops:.0f} GFLOP/s ({gflops / limit.gflops:.0%} of the peak), "
             f"{gbytes:.1f} GB/s ({gbytes / limit.memory_gbytes:.0%} of a copy in memory)"
         )
     return "\n".join(lines)
@@ -164,9 +160,10 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="one small case, short runs")
     parser.add_argument("--only", action="append", choices=ATTENTION, help="this case; repeatable")
     parser.add_argument("--seconds", type=float, help="of each timing")
+    parser.add_argument("--out", type=Path, help="folder of the record and the plot")
     args = parser.parse_args()
     torch.manual_seed(0)
-    cases = args.only or (["A stage 3"] if args.quick else list(ATTENTION))
+    names = args.only or (["A stage 3"] if args.quick else list(ATTENTION))
     batches = [8] if args.quick else [8, 32]
     seconds = args.seconds or (0.05 if args.quick else 0.5)
     kinds = [
@@ -174,14 +171,12 @@ def main() -> None:
         ("forward+backward", torch.float32),
         ("forward+backward", torch.bfloat16),
     ]
-    print(" ".join(f"{k}={v}" for k, v in machine().items()))
-    results: list[Result] = []
-    for case, batch in tqdm([(c, b) for c in cases for b in batches], unit="case"):
-        for mode, dtype in kinds:
-            for threads in THREADS:
-                results += attention(case, batch, threads, mode, dtype, seconds)
-    finish(results, "attention", avx2_share=0.65, keep=not args.quick)
-    print(rates(results))
+    jobs = [
+        partial(attention, name, batch, *kind, seconds)
+        for name in names for batch in batches for kind in kinds
+    ]  # fmt: skip
+    timings = run_suite("attention", jobs, avx2_share=0.65, out=args.out)
+    print(rates(timings))
 
 
 if __name__ == "__main__":

@@ -3,10 +3,15 @@
 The operators' GFLOP/s and GB/s are read against these.
 """
 
+import itertools
+import statistics
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
-from torch.utils.benchmark import Timer
+
+from darswin.bench.machine import THREADS, num_threads
+from darswin.bench.timing import in_turns
 
 
 @dataclass
@@ -30,27 +35,25 @@ def measure(threads: int) -> Peaks:
     """Measures them. The product is oneDNN's where torch has it, else that of torch's BLAS."""
     size = 384  # 0.6 MB a matrix
     a, b = torch.randn(size * threads, size), torch.randn(size, size)
-    rate = 0.0
-    products = [lambda: torch.mm(a, b)]
+    products: list[Callable[[], object]] = [lambda: torch.mm(a, b)]
     if torch.backends.mkldnn.is_available():
         products.append(lambda: torch.ops.mkldnn._linear_pointwise(a, b, None, "none", [], ""))
-    for product in products:
-        rate = max(rate, 2e-9 * a.shape[0] * size**2 / _seconds(product, threads))
-    return Peaks(threads, rate, _copied(2**20, threads), _copied(2**28, threads))
+    with num_threads(threads):
+        rate = max(2e-9 * a.shape[0] * size**2 / _seconds(product) for product in products)
+        return Peaks(threads, rate, _copied(2**20), _copied(2**28))
 
 
-def _copied(size: int, threads: int) -> float:
+def _copied(size: int) -> float:
     """GB/s of copying `size` bytes, read and written."""
-    source = torch.ones(size // 4)
-    target = torch.ones(size // 4)
-    return 2e-9 * size / _seconds(lambda: target.copy_(source), threads)
+    source, copy = torch.ones(size // 4), torch.ones(size // 4)
+    return 2e-9 * size / _seconds(lambda: copy.copy_(source))
 
 
-def _seconds(run, threads: int) -> float:
-    timer = Timer("run()", globals={"run": run}, num_threads=threads)
-    return timer.blocked_autorange(min_run_time=0.3).median
+def _seconds(run: Callable[[], object]) -> float:
+    run()
+    return statistics.median(itertools.chain(*in_turns({"": run}, 0.3)[""]))
 
 
 if __name__ == "__main__":
-    for count in sorted({1, torch.get_num_threads()}):
+    for count in THREADS:
         print(measure(count))

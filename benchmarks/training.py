@@ -5,7 +5,6 @@ of the five models: with our operators and with their PyTorch reference. Then th
 """
 
 import argparse
-import json
 import tempfile
 import time
 import warnings
@@ -13,13 +12,13 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import torch
-from common import RESULTS
 from lightning.pytorch import Callback, Trainer
 from torch.utils.data import DataLoader
 from tqdm import tqdm
 
-from darswin.bench.machine import machine
+from darswin.bench.machine import machine, num_threads
+from darswin.bench.record import write
+from darswin.bench.tables import training_table
 from darswin.data.augment import RandAugment, RandomErasing
 from darswin.ops import use_reference
 from darswin.train.data import WideAngleData
@@ -48,28 +47,18 @@ class Stopwatch(Callback):
     def __init__(self):
         self.inside, self.start, self.end, self.steps = 0.0, 0.0, 0.0, 0
 
-    def _begin(self, batch_idx: int) -> None:
+    def on_train_batch_start(self, trainer, pl_module, batch, batch_idx, dataloader_idx=0):
         self.began = time.perf_counter()
         if batch_idx == WARM_UP:
             self.start = self.end
 
-    def _finish(self, batch_idx: int) -> None:
+    def on_train_batch_end(self, trainer, pl_module, outputs, batch, batch_idx, dataloader_idx=0):
         self.end = time.perf_counter()
         if batch_idx >= WARM_UP:
             self.inside += self.end - self.began
             self.steps += 1
 
-    def on_train_batch_start(self, trainer, pl_module, batch, batch_idx):
-        self._begin(batch_idx)
-
-    def on_train_batch_end(self, trainer, pl_module, outputs, batch, batch_idx):
-        self._finish(batch_idx)
-
-    def on_test_batch_start(self, trainer, pl_module, batch, batch_idx, dataloader_idx=0):
-        self._begin(batch_idx)
-
-    def on_test_batch_end(self, trainer, pl_module, outputs, batch, batch_idx, dataloader_idx=0):
-        self._finish(batch_idx)
+    on_test_batch_start, on_test_batch_end = on_train_batch_start, on_train_batch_end
 
     def result(self, batch: int) -> dict[str, float]:
         """Images a second, and the share of the time that was not spent in steps."""
@@ -105,16 +94,14 @@ def loader_rates(data: dict) -> dict[str, float]:
         "RandAugment": lambda k: RandAugment()(image, rng),
         "all": lambda k: dataset[k],
     }
-    threads, cv_threads = torch.get_num_threads(), cv2.getNumThreads()
-    torch.set_num_threads(1)
+    rates, cv_threads = {}, cv2.getNumThreads()
     cv2.setNumThreads(1)
-    rates = {}
-    for part, work in parts.items():
-        start, count = time.perf_counter(), len(dataset)
-        for k in range(count):
-            work(k)
-        rates[part] = count / (time.perf_counter() - start)
-    torch.set_num_threads(threads)
+    with num_threads(1):
+        for part, work in parts.items():
+            start, count = time.perf_counter(), len(dataset)
+            for k in range(count):
+                work(k)
+            rates[part] = count / (time.perf_counter() - start)
     cv2.setNumThreads(cv_threads)
     for workers in (1, 2):
         batches = DataLoader(dataset, 16, num_workers=workers, prefetch_factor=4)
@@ -130,18 +117,20 @@ def main() -> None:
     parser.add_argument("--size", default="micro", help="of the models")
     parser.add_argument("--batch", type=int, default=32)
     parser.add_argument("--steps", type=int, default=12, help="timed, of each run")
-    parser.add_argument("--quick", action="store_true", help="one model, few steps, nothing kept")
+    parser.add_argument("--quick", action="store_true", help="one model, few steps")
+    parser.add_argument("--out", type=Path, help="folder of the record")
     args = parser.parse_args()
     warnings.filterwarnings("ignore")
-    print(" ".join(f"{k}={v}" for k, v in machine().items()))
+    head = machine()
+    print(" ".join(f"{k}={v}" for k, v in head.items()))
     families = FAMILIES[:1] if args.quick else FAMILIES
     steps = WARM_UP + (2 if args.quick else args.steps)
-    report: dict = dict(machine=machine(), size=args.size, batch=args.batch, models={})
+    models: dict[str, dict] = {}
     with tempfile.TemporaryDirectory() as folder:
         write_pictures(Path(folder), steps * args.batch * 9 // 4)
         data = dict(path=folder, batch_size=args.batch, holdout=0.1)
-        report["loader"] = loader_rates(data)
-        for part, rate in report["loader"].items():
+        loader = loader_rates(data)
+        for part, rate in loader.items():
             print(f"loader, {part}: {rate:.0f} images/s")
         cases = [(f, mode, ref) for f in families for mode in ("train", "test") for ref in (0, 1)]
         for family, mode, reference in tqdm(cases, unit="run"):
@@ -149,21 +138,12 @@ def main() -> None:
             # Half of the folder is enough to test on.
             given = dict(data, holdout=0.49 if mode == "test" else 0.1)
             found = run(mode, name, given, steps, bool(reference))
-            entry = report["models"].setdefault(name, {}).setdefault(mode, {})
+            entry = models.setdefault(name, {}).setdefault(mode, {})
             entry["reference" if reference else "darswin"] = found
-    print(
-        f"\n{'images a second':<22}{'':>6}{'darswin':>9}{'reference':>11}{'ratio':>7}{'outside':>9}"
-    )
-    for name, modes in report["models"].items():
-        for mode, both in modes.items():
-            ours, theirs = (both[k]["images_per_second"] for k in ("darswin", "reference"))
-            print(
-                f"{name:<22}{mode:>6}{ours:>9.1f}{theirs:>11.1f}{ours / theirs:>6.2f}×"
-                f"{both['darswin']['outside']:>8.1%}"
-            )
-    if not args.quick:
-        path = RESULTS / f"training--{args.size}.json"
-        path.write_text(json.dumps(report, indent=1))
+    print(training_table(models))
+    if args.out:
+        path = args.out / f"training--{args.size}.json"
+        write(path, machine=head, size=args.size, batch=args.batch, models=models, loader=loader)
         print(path)
 
 

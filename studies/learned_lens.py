@@ -16,13 +16,10 @@ Every camera's results are kept under `--out`, so that a study that was stopped 
 """
 
 import argparse
-import contextlib
 import json
 import math
-import multiprocessing
 import os
 import time
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from functools import cache
 from pathlib import Path
 
@@ -30,9 +27,12 @@ import cv2
 import numpy as np
 import torch
 import torch.nn.functional as F
+from jobs import printing_to, run_all, use_one_core
+from learned_problems import GRID, IMAGES, LOSSES, PROBLEMS, STARTS
+from learned_tables import collect
 from torch import Tensor
-from tqdm import tqdm
 
+from darswin.cli.main import main as darswin
 from darswin.data import open_source, warp_map
 from darswin.lens import Lens, Perspective, Spherical
 from darswin.models import DarSwin
@@ -48,22 +48,17 @@ CONFIG = [
     "--data.std", f"[{STD}]", "--trainer.max_epochs", "5", "--seed_everything", "0",
 ]  # fmt: skip
 
-PROBLEMS = {"xi": ("xi",), "place": ("radius", "x", "y"), "all": ("xi", "radius", "x", "y")}
-LOSSES = ("labels", "entropy", "information", "statistics")
 KNOWN = dict(xi=0.5, radius=SIZE / 2, x=(SIZE - 1) / 2, y=(SIZE - 1) / 2)
 # Truths and starts are uniform in these; descent may go as far as the bounds.
 RANGES = dict(xi=(0.0, 1.0), radius=(11.0, 16.0), x=(13.0, 18.0), y=(13.0, 18.0))
 BOUNDS = dict(xi=(0.0, 1.5), radius=(8.0, 20.0), x=(10.0, 21.0), y=(10.0, 21.0))
 
-IMAGES = dict(xi=(16, 64, 256), place=(256,), all=(256,))  # how many of a camera are used
 BATCH = 32  # images a step
 STEPS = dict(xi=40, place=80, all=80)
 RATE = 0.06  # Adam's, in parts of a range; falls to 0 as a cosine
-STARTS = 2  # for each camera
 TESTED = 200  # other images of each camera, for the accuracy
 SEARCHED = 128  # images that a search evaluates the losses on
 USUAL = 1000  # training pictures that the usual statistics are taken on
-GRID = [k / 40 for k in range(41)]  # of ξ
 
 
 # -- cameras and their images -----------------------------------------------------------------
@@ -271,20 +266,8 @@ def run_camera(problem: str, camera: int, out: Path, data: str) -> dict:
 
 def pretrain(out: Path, options: list[str]) -> None:
     """The classifier of all lenses, and what its first map usually is."""
-    from darswin.cli.main import main as darswin
-
-    with (
-        (out / "log.txt").open("a") as log,
-        contextlib.redirect_stdout(log),
-        contextlib.redirect_stderr(log),
-    ):
+    with printing_to(out / "log.txt"):
         darswin(["fit", "--run", str(out / "model"), *CONFIG, *options, "--resume"])
-
-
-def use_one_core() -> None:
-    """Two cameras side by side are faster than one on two cores."""
-    torch.set_num_threads(1)
-    cv2.setNumThreads(1)
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -296,22 +279,14 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--results", type=Path, default=HERE / "results")
     args, options = parser.parse_known_args(arguments)  # the others are options of `darswin fit`
     args.out.mkdir(parents=True, exist_ok=True)
-    os.environ["OMP_NUM_THREADS"] = "1"
     use_one_core()
     if not (args.out / "usual.pt").exists():
         pretrain(args.out, ["--data.path", args.data, *options])
         model, _ = load_model(model_of_run(args.out / "model"))
         torch.save(list(usual_map(model, args.data)), args.out / "usual.pt")
-    jobs = [(problem, camera) for camera in range(args.cameras) for problem in PROBLEMS]
-    results = []
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(args.processes, context, use_one_core) as pool:
-        started = [pool.submit(run_camera, *job, args.out, args.data) for job in jobs]
-        for job in tqdm(as_completed(started), total=len(jobs), unit="camera"):
-            results.append(job.result())
-    from learned_tables import collect
-
-    collect(results, args.results)
+    cameras = [(problem, camera) for camera in range(args.cameras) for problem in PROBLEMS]
+    jobs = [(problem, camera, args.out, args.data) for problem, camera in cameras]
+    collect(run_all(run_camera, jobs, args.processes, "camera"), args.results)
 
 
 if __name__ == "__main__":

@@ -1,16 +1,15 @@
 """The tables and the picture of the learned lenses, from what `learned_lens.py` found."""
 
-import json
-import platform
 from pathlib import Path
 
 import numpy as np
-import torch
-from learned_lens import GRID, IMAGES, LOSSES, PROBLEMS, STARTS
+from learned_problems import GRID, IMAGES, LOSSES, PROBLEMS, STARTS
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from darswin.utils.files import replace_file
+from darswin.bench.machine import machine
+from darswin.bench.record import write
+from darswin.bench.tables import markdown
 from darswin.viz.plot import save_figure
 
 CLOSE = 0.5  # px, a lens that is found
@@ -24,13 +23,8 @@ UNKNOWN = {
 
 def collect(cameras: list[dict], folder: Path) -> None:
     """Writes the results, with the machine and versions, and draws their picture."""
-    machine = dict(
-        python=platform.python_version(), torch=torch.__version__, machine=platform.machine()
-    )
     cameras = sorted(cameras, key=lambda c: (list(PROBLEMS).index(c["problem"]), c["camera"]))
-    lines = ",\n".join(json.dumps(camera) for camera in cameras)
-    text = f'{{"machine": {json.dumps(machine)},\n"cameras": [\n{lines}\n]}}\n'
-    replace_file(folder / "learned_lens.json", text)
+    write(folder / "learned_lens.json", machine=machine(), cameras=cameras)
     draw(cameras, folder / "learned_lens.png")
 
 
@@ -73,12 +67,12 @@ def share(close: np.ndarray) -> str:
 def recovery_table(cameras: list[dict]) -> str:
     """A row a problem and loss, on all images: how far descents end from the true lens, how often
     near it, how often no higher than it, and the accuracy."""
-    lines = [
-        f"| unknown | loss | start (px) | found (px): median, 90 % | below {CLOSE} px "
-        f"| lower of {STARTS} starts below {CLOSE} px | loss ≤ the true lens's "
-        "| best guess (px) | accuracy (%): start → found (true lens) |",
-        "|---" * 9 + "|",
-    ]
+    heads = [
+        "unknown", "loss", "start (px)", "found (px): median, 90 %", f"below {CLOSE} px",
+        f"lower of {STARTS} starts below {CLOSE} px", "loss ≤ the true lens's",
+        "best guess (px)", "accuracy (%): start → found (true lens)",
+    ]  # fmt: skip
+    rows = []
     for problem in PROBLEMS:
         for loss in LOSSES:
             trials = trials_of(cameras, problem, loss, max(IMAGES[problem]))
@@ -89,7 +83,7 @@ def recovery_table(cameras: list[dict]) -> str:
                 np.mean([trial[of]["accuracy"] for trial in trials])
                 for of in ("start", "found", "true")
             )
-            cells = [
+            row = [
                 UNKNOWN[problem],
                 loss,
                 f"{np.median(distances(trials, 'start')):.2f}",
@@ -100,16 +94,15 @@ def recovery_table(cameras: list[dict]) -> str:
                 f"{np.median(distances(trials, 'search')):.2f}",
                 f"{start:.0f} → {found_accuracy:.0f} ({true:.0f})",
             ]
-            lines.append(f"| {' | '.join(cells)} |")
-    return "\n".join(lines)
+            rows.append(row)
+    return markdown(heads, rows)
 
 
 def images_table(cameras: list[dict]) -> str:
     """A row a loss, a column a number of images: how well ξ alone is found; last, by the grid."""
-    head = [f"{count} images" for count in IMAGES["xi"]]
-    lines = [f"| loss | {' | '.join(head)} | the loss's lowest on a grid |", "|---" * 5 + "|"]
+    rows = []
     for loss in LOSSES:
-        cells = []
+        cells = [loss]
         for count in IMAGES["xi"]:
             trials = trials_of(cameras, "xi", loss, count)
             errors = xi_errors(trials)
@@ -123,8 +116,9 @@ def images_table(cameras: list[dict]) -> str:
             "search",
         )
         cells.append(f"{np.median(grid):.3f}, {share(grid < CLOSE_XI)}")
-        lines.append(f"| {loss} | {' | '.join(cells)} |")
-    return "\n".join(lines)
+        rows.append(cells)
+    heads = [f"{count} images" for count in IMAGES["xi"]]
+    return markdown(["loss", *heads, "the loss's lowest on a grid"], rows)
 
 
 def tables(cameras: list[dict]) -> dict[str, str]:

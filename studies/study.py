@@ -6,17 +6,17 @@ with `make study`.
 """
 
 import argparse
-import contextlib
 import json
-import multiprocessing
 import os
 import time
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
 
-import torch
 from cells import LEVELS, POLYNOMIAL, SWEEP, Cell, ablations, headline
-from tqdm import tqdm
+from jobs import printing_to, run_all
+from tables import collect
+
+from darswin.cli.main import main as darswin
+from darswin.utils.files import replace_file
 
 HERE = Path(__file__).parent
 CONFIG = HERE / "fashion_mnist.yaml"
@@ -32,9 +32,6 @@ def run_cell(cell: Cell, out: Path, size: str, test_images: int, options: list[s
         if result["given"] != given:
             raise ValueError(f"{found} was made with {result['given']}, not {given}: remove it")
         return result
-    from darswin.cli.main import main
-    from darswin.utils.files import replace_file
-
     run = ["--run", str(folder)]
     name = f"{cell.family}_{size}"
     model = ["--model.name", name, "--model.options", json.dumps(cell.options)]
@@ -42,14 +39,10 @@ def run_cell(cell: Cell, out: Path, size: str, test_images: int, options: list[s
     tests = ["--xi", ",".join([*SWEEP, POLYNOMIAL, *LEVELS])]
     folder.mkdir(parents=True, exist_ok=True)
     start = time.perf_counter()
-    with (
-        (folder / "log.txt").open("a") as log,
-        contextlib.redirect_stdout(log),
-        contextlib.redirect_stderr(log),
-    ):
-        main(["fit", *run, "--config", str(CONFIG), *model, *lenses, *options, "--resume"])
+    with printing_to(folder / "log.txt"):
+        darswin(["fit", *run, "--config", str(CONFIG), *model, *lenses, *options, "--resume"])
         trained = time.perf_counter()
-        main(["test", *run, *tests, "--data.limit", str(test_images)])
+        darswin(["test", *run, *tests, "--data.limit", str(test_images)])
     rows = json.loads((folder / "test.json").read_text())["results"]
     result = dict(
         label=cell.label,
@@ -62,11 +55,6 @@ def run_cell(cell: Cell, out: Path, size: str, test_images: int, options: list[s
     )
     replace_file(found, json.dumps(result, indent=1))
     return result
-
-
-def use_one_core() -> None:
-    """Two cells side by side are faster than one on two cores."""
-    torch.set_num_threads(1)
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -84,23 +72,14 @@ def main(arguments: list[str] | None = None) -> None:
     cells += [] if args.only == "headline" else ablations()
     cells = [cell for cell in cells if (args.cell or "") in cell.key]
     cells.sort(key=lambda cell: cell.seed)  # a study that is stopped has whole tables first
-    start, results = time.perf_counter(), []
-    os.environ["OMP_NUM_THREADS"] = "1"
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(args.processes, context, use_one_core) as pool:
-        jobs = [
-            pool.submit(run_cell, cell, args.out, args.size, args.test_images, options)
-            for cell in cells
-        ]
-        for job in tqdm(as_completed(jobs), total=len(jobs), unit="cell"):
-            results.append(job.result())
+    jobs = [(cell, args.out, args.size, args.test_images, options) for cell in cells]
+    start = time.perf_counter()
+    results = run_all(run_cell, jobs, args.processes, "cell")
     print(f"{len(results)} cells after {time.perf_counter() - start:.0f} s")
     if args.cell:
         print(json.dumps(results, indent=1))
-        return
-    from tables import collect
-
-    collect(results, args.results, args.size)
+    else:
+        collect(results, args.results, args.size)
 
 
 if __name__ == "__main__":

@@ -1,17 +1,16 @@
 """The tables and the picture of the study, from what its cells found."""
 
-import json
-import platform
 import statistics
 from collections import defaultdict
 from pathlib import Path
 
-import torch
 from cells import ABLATIONS, LEVELS, MODELS, POLYNOMIAL, SWEEP
 from matplotlib.figure import Figure
 
+from darswin.bench.machine import machine
+from darswin.bench.record import write
+from darswin.bench.tables import markdown
 from darswin.data.lenses import LEVELS as RANGES
-from darswin.utils.files import replace_file
 from darswin.viz.plot import save_figure
 
 # The paper's tables (DarSwin, ICCV 2023), by the training level.
@@ -43,12 +42,8 @@ PAPER_ABLATIONS = {
 
 def collect(cells: list[dict], folder: Path, size: str) -> None:
     """Writes the results of a study, with the machine and versions, and draws its picture."""
-    machine = dict(
-        python=platform.python_version(), torch=torch.__version__, machine=platform.machine()
-    )
     cells = sorted(cells, key=lambda c: (c["label"], c["level"], c["seed"]))
-    text = json.dumps(dict(machine=machine, size=size, cells=cells), indent=1)
-    replace_file(folder / f"study--{size}.json", text)
+    write(folder / f"study--{size}.json", machine=machine(), size=size, cells=cells)
     draw(cells, folder / f"study--{size}.png")
 
 
@@ -81,10 +76,6 @@ def draw(cells: list[dict], path: Path) -> None:
     save_figure(figure, path)
 
 
-def row(label: str, values: list[str]) -> str:
-    return f"| {label} | {' | '.join(values)} |"
-
-
 def spread(values: list[float]) -> str:
     """Mean and, of several seeds, half the span."""
     mean = f"{statistics.mean(values):.1f}"
@@ -94,29 +85,29 @@ def spread(values: list[float]) -> str:
 def level_table(cells: list[dict], lenses: str, paper: dict) -> str:
     """A row a model, a column a training level: ours, and the paper's in brackets."""
     found = by_model(cells)
-    lines = [row("trained on", [f'"{level}"' for level in LEVELS]), "|---" * 5 + "|"]
+    rows = []
     for label in MODELS:
-        values = []
+        row = [label]
         for level, published in zip(LEVELS, paper[label], strict=True):
             runs = found.get((label, level))
             ours = spread([run[lenses] for run in runs]) if runs else "not run"
-            values.append(f"{ours} ({published:.1f})")
-        lines.append(row(label, values))
-    return "\n".join(lines)
+            row.append(f"{ours} ({published:.1f})")
+        rows.append(row)
+    return markdown(["trained on", *(f'"{level}"' for level in LEVELS)], rows)
 
 
 def ablation_table(cells: list[dict]) -> str:
     """A row a variant trained on "low" with the first seed, a column a test level."""
     first = {c["label"]: c["accuracy"] for c in cells if c["level"] == "low" and c["seed"] == 0}
-    lines = [row("tested on", [f'"{level}"' for level in LEVELS]), "|---" * 5 + "|"]
+    rows = []
     for label in ("DarSwin-A", *ABLATIONS):
         published = PAPER_ABLATIONS.get(label)
-        values = []
+        row = [label]
         for k, level in enumerate(LEVELS):
             ours = f"{first[label][level]:.1f}" if label in first else "not run"
-            values.append(ours + (f" ({published[k]:.1f})" if published else ""))
-        lines.append(row(label, values))
-    return "\n".join(lines)
+            row.append(ours + (f" ({published[k]:.1f})" if published else ""))
+        rows.append(row)
+    return markdown(["tested on", *(f'"{level}"' for level in LEVELS)], rows)
 
 
 def tables(cells: list[dict]) -> dict[str, str]:

@@ -11,8 +11,11 @@ import torch
 from darswin import create_model, lens, list_models
 
 ROOT = Path(__file__).parent.parent
-LEVELS = ("very low", "low", "medium", "high")
-SWEEP = tuple(f"{k / 20:g}" for k in range(21))
+sys.path[:0] = [str(ROOT / "docs"), str(ROOT / "studies")]
+
+import readme  # noqa: E402
+from cells import LEVELS, SWEEP  # noqa: E402
+
 README = (ROOT / "README.md").read_text()
 
 
@@ -48,9 +51,6 @@ def test_what_contributors_are_sent_to_exists():
 
 
 def test_tables_are_those_of_the_results():
-    sys.path.append(str(ROOT / "docs"))
-    import readme
-
     for name, table in readme.tables().items():
         assert readme.placed(name, table) in README, name
         assert "not run" not in table
@@ -60,7 +60,7 @@ def test_the_drop_in_call_is_faster_than_what_it_replaces():
     record = json.loads((ROOT / "benchmarks/results/sampling--avx512.json").read_text())
     calls = [
         row
-        for row in record["results"]
+        for row in record["timings"]
         if row["mode"] == "forward, layout image" and row["name"] == "F.grid_sample"
     ]
     assert len(calls) == 6 and min(row["ratio"] for row in calls) > 1

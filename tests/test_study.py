@@ -11,7 +11,7 @@ sys.path.insert(0, str(ROOT / "studies"))
 
 import study  # noqa: E402
 import tables  # noqa: E402
-from cells import ABLATIONS, LEVELS, MODELS, POLYNOMIAL, SWEEP, ablations, headline  # noqa: E402
+from cells import LEVELS, POLYNOMIAL, SWEEP, ablations, headline  # noqa: E402
 
 QUICK = """
     --data.path digits --data.limit 96 --data.batch_size 16 --trainer.max_epochs 1 --data.render 32
@@ -19,11 +19,10 @@ QUICK = """
 """.split()  # noqa: SIM905
 
 
-def test_every_cell_of_the_paper_is_there():
-    assert headline(3)[0].key == "darswin-a-very-low-0"
-    assert len({c.key for c in headline(3)}) == len(MODELS) * len(LEVELS) * 3
-    assert len(ablations()) == len(ABLATIONS) == 10
-    assert SWEEP[0] == "0" and SWEEP[1] == "0.05" and SWEEP[-1] == "1" and len(SWEEP) == 21
+def test_cells_have_folders_of_their_own():
+    cells = headline(3) + ablations()
+    assert cells[0].key == "darswin-a-very-low-0"
+    assert len({cell.key for cell in cells}) == len(cells)
 
 
 @pytest.fixture(scope="module")

@@ -1,1 +1,1 @@
-"""`darswin bench`: how fast a whole model is on this machine, beside what else one could run."""
+"""The benchmark kit: turns, targets, tables, plots and records of operators and whole models."""

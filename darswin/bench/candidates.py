@@ -1,4 +1,4 @@
-"""What is compared: our model, the same on the operators' PyTorch reference, and that compiled."""
+"""The candidates: our model, and the same on the operators' reference, as it is and compiled."""
 
 import copy
 import math
@@ -6,9 +6,9 @@ from collections.abc import Callable
 
 import torch
 import torch.nn.functional as F
-from torch import Tensor, nn
+from torch import Tensor
 
-from darswin.bench.timing import COMPILED, ONE_LENS, OURS, PRODUCTS, REFERENCE
+from darswin.bench.timing import COMPILED, FIXED_LENS, MATMULS, OURS, REFERENCE
 from darswin.deploy.optimize import optimize
 from darswin.layers.embed import PolarPatchEmbed
 from darswin.layers.linear import Linear
@@ -40,52 +40,53 @@ def inference(
 ) -> dict[str, Run]:
     """The candidates for inference, by name: images (B, 3, size, size) → logits.
 
-    The products alone are those of the linear layers, one after the other with nothing between, by
-    oneDNN and with weights packed for it: the roof of what a model can reach that way.
+    The matrix products alone are those of the linear layers, one after the other with nothing
+    between, by oneDNN and with weights packed for it: the roofline of a model on this machine.
     """
     model, lens = network(name, size).eval(), lens_of(size)
     images = torch.randn(batch, 3, size, size)
     ours_of_lens = optimize(model, dtype, lens=lens)
-    products = products_of(model, images, lens, dtype)
-    peer = copy.deepcopy(model) if dtype == torch.bfloat16 else model
+    products = matmuls_of(model, images, lens, dtype)
+    peer = copy.deepcopy(model).to(dtype) if dtype == torch.bfloat16 else model
+    pixels = images.to(dtype)
     runs: dict[str, Run] = {
-        OURS: inference_run(model, lens, dtype, images, reference=False),
-        ONE_LENS: lambda: ours_of_lens(images),
-        PRODUCTS: lambda: _all(products),
-        REFERENCE: inference_run(peer, lens, dtype, images, reference=True),
+        OURS: optimized_run(model, lens, dtype, images),
+        FIXED_LENS: lambda: ours_of_lens(images),
+        MATMULS: lambda: _all(products),
+        REFERENCE: reference_run(peer, lens, pixels),
     }
     if compiled:
         torch._dynamo.reset()
         graph = torch.compile(peer, options={"freezing": True}, dynamic=False)
-        runs[COMPILED] = inference_run(graph, lens, dtype, images, reference=True)
+        runs[COMPILED] = reference_run(graph, lens, pixels)
     return {name: torch.no_grad()(run) for name, run in runs.items()}
 
 
 def _all(products: list[tuple[PackedLinear, Tensor]]) -> Tensor:
-    """The last of the products. The others' memory is free again at once, as a model's is."""
+    """The last of the products. The others' memory is freed at once, as it is within a model."""
     for layer, x in products:
         result = layer(x)
     return result
 
 
-def inference_run(
-    model: nn.Module, lens: Lens, dtype: torch.dtype, images: Tensor, *, reference: bool
-) -> Run:
-    """Inference by one of the candidates; the reference's model becomes one of `dtype`, which in
-    bfloat16 is faster than autocast."""
-    if not reference:
-        optimized = optimize(model, dtype)
-        return lambda: optimized(images, lens)
-    model, pixels = model.to(dtype), images.to(dtype)
+def optimized_run(model: Encoder, lens: Lens, dtype: torch.dtype, images: Tensor) -> Run:
+    """Inference by our operators."""
+    optimized = optimize(model, dtype)
+    return lambda: optimized(images, lens)
+
+
+def reference_run(model: Callable[..., Tensor], lens: Lens, images: Tensor) -> Run:
+    """Inference by the PyTorch reference. In bfloat16 it is fastest with the model's weights and
+    the images in bfloat16, not under autocast."""
 
     def run() -> Tensor:
         with use_reference():
-            return model(pixels, lens)
+            return model(images, lens)
 
     return run
 
 
-def products_of(
+def matmuls_of(
     model: Encoder, images: Tensor, lens: Lens, dtype: torch.dtype
 ) -> list[tuple[PackedLinear, Tensor]]:
     """The linear layers that a model runs, packed, and an input of each."""
@@ -109,9 +110,9 @@ def products_of(
 
 
 def operations_of(name: str, size: int) -> int:
-    """Floating-point operations of the products that a model runs for one image."""
+    """Floating-point operations of a model's matrix products for one image."""
     image, lens = torch.randn(1, 3, size, size), lens_of(size)
-    products = products_of(network(name, size).eval(), image, lens, torch.float32)
+    products = matmuls_of(network(name, size).eval(), image, lens, torch.float32)
     return sum(2 * x.numel() * layer.out_features for layer, x in products)
 
 

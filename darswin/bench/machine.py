@@ -1,29 +1,60 @@
-"""What a measurement ran on."""
+"""What a measurement runs on: the machine, its instruction-set tiers, the number of threads."""
 
+import contextlib
 import platform
 import subprocess
+from collections.abc import Callable, Iterator
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
+from typing import TypeVar
 
 import torch
 
-from darswin import _C
+import darswin._C as _C
+from darswin.ops import cpu_capability
 
-THREADS = sorted({1, torch.get_num_threads()})
+T = TypeVar("T")
+THREADS = sorted({1, torch.get_num_threads()})  # to measure at: one and all
 
 
 def machine() -> dict[str, str | int]:
     """CPU, tier and versions, and in a checkout the commit: the head of a record."""
     return dict(
         cpu=_cpu(),
-        cores=torch.get_num_threads(),
-        tier=_C.tier(),
+        cores=max(THREADS),
+        tier=cpu_capability(),
         compiler=_C.build_info()["compiler"],
         python=platform.python_version(),
         torch=torch.__version__,
         darswin=version("darswin"),
         commit=_commit(),
     )
+
+
+def on_other_tiers(run: Callable[[], T]) -> dict[str, Callable[[], T]]:
+    """`run` with our operators on each other instruction-set tier of this machine, by its name."""
+    return {tier: partial(_on_tier, tier, run) for tier in _C.tiers() if tier != cpu_capability()}
+
+
+def _on_tier(tier: str, run: Callable[[], T]) -> T:
+    best = cpu_capability()
+    _C.set_tier(tier)
+    try:
+        return run()
+    finally:
+        _C.set_tier(best)
+
+
+@contextlib.contextmanager
+def num_threads(count: int) -> Iterator[None]:
+    """Within it torch and our operators use so many threads, and inductor compiles for them."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 def _cpu() -> str:

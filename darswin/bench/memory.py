@@ -3,13 +3,14 @@
 import json
 import subprocess
 import sys
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import torch
 
 from darswin.bench import candidates
-from darswin.bench.timing import REFERENCE
+from darswin.bench.timing import OURS, REFERENCE
 from darswin.utils.malloc import give_back_memory
 
 _STATUS, _RESET = Path("/proc/self/status"), Path("/proc/self/clear_refs")
@@ -19,8 +20,7 @@ _STATUS, _RESET = Path("/proc/self/status"), Path("/proc/self/clear_refs")
 class Memory:
     """Resident memory of a process that does one thing, in bytes."""
 
-    mode: str
-    dtype: str
+    mode: str  # such as "training, float32"
     batch: int
     name: str
     before: int  # of Python, torch and darswin, without a model
@@ -38,8 +38,19 @@ class Memory:
         return self.peak - self.between
 
 
+def compared(memory: Sequence[Memory]) -> Iterator[tuple[str, int, int]]:
+    """What was measured, in words, and our bytes and the reference's."""
+    found = {(m.mode, m.batch, m.name): m for m in memory}
+    for ours in memory:
+        if ours.name == OURS:
+            theirs = found[ours.mode, ours.batch, REFERENCE]
+            what = f"{ours.mode}, batch {ours.batch}"
+            yield f"{what}, in all", ours.whole, theirs.whole
+            yield f"{what}, of the batch itself", ours.own, theirs.own
+
+
 def available() -> bool:
-    """Whether this system tells a process its peak, and lets it start anew."""
+    """Whether this system tells a process the peak of its memory, and lets it reset that."""
     return _STATUS.exists() and _RESET.exists()
 
 
@@ -71,16 +82,19 @@ def _measure_here(
     else:
         net, lens = candidates.network(model, pixels).eval(), candidates.lens_of(pixels)
         images = torch.randn(int(batch), 3, pixels, pixels)
-        run = candidates.inference_run(net, lens, kind, images, reference=reference)
+        if reference:
+            run = candidates.reference_run(net.to(kind), lens, images.to(kind))
+        else:
+            run = candidates.optimized_run(net, lens, kind, images)
         run = torch.no_grad()(run)
-        del net  # ours needs it no more
+        del net  # the optimized model is a copy
     for _ in range(2):
         run()
     give_back_memory()
     between = _resident("VmRSS")
     _RESET.write_text("5")  # the peak starts from here
     run()
-    return Memory(mode, dtype, int(batch), name, before, between, _resident("VmHWM"))
+    return Memory(f"{mode}, {dtype}", int(batch), name, before, between, _resident("VmHWM"))
 
 
 if __name__ == "__main__":

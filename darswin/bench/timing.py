@@ -1,52 +1,86 @@
-"""Timing of what is to be compared: in turns, so that a clock that wanders wanders for all."""
+"""Timing candidates in turns, so that a change of the clock rate meets all of them alike."""
 
 import itertools
 import math
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import torch
 
-OURS, ONE_LENS, REFERENCE = "darswin", "darswin, one lens", "reference"
-COMPILED, PRODUCTS = "compiled reference", "products alone"
+OURS, FIXED_LENS, REFERENCE = "darswin", "darswin, fixed lens", "reference"
+COMPILED, MATMULS = "compiled reference", "matrix products alone"
+TURNS = 7  # or more, for as long as a candidate's calls are short
+LONGEST_TURN = 0.2  # seconds: long enough for the caches to hold what the candidate uses
+
+Turns = dict[str, list[list[float]]]  # by candidate and turn, the seconds of each call
 
 
 @dataclass
-class Timing:
-    """Of one candidate in one case. Times are seconds a batch."""
+class Case:
+    """What is timed, and how."""
 
-    mode: str  # "inference" or "training"
-    dtype: str
+    subject: str  # an operator or a model
+    setting: str  # its sizes
     batch: int
     threads: int
-    name: str
-    runs: int
-    median: float
-    iqr: float
-    p99: float  # the largest, below a hundred runs
-    ratio: float  # over our time in the same turn, the median of all turns
+    mode: str  # such as "forward" or "training, float32"
 
     @property
-    def case(self) -> tuple[str, str, int, int]:
-        return (self.mode, self.dtype, self.batch, self.threads)
+    def label(self) -> str:
+        """All of it, in words."""
+        threads = "1 thread" if self.threads == 1 else f"{self.threads} threads"
+        return f"{self.subject}, {self.setting}, batch {self.batch}, {self.mode}, {threads}"
+
+
+@dataclass
+class Timing(Case):
+    """One candidate in one case. Times are seconds a call."""
+
+    name: str
+    median: float
+    iqr: float
+    ratio: float  # over our time in the same turn, the median of all turns
+    target: float | None = None  # the least that the ratio should be
+    runs: int | None = None  # None, as `p99`, where calls were not timed one by one
+    p99: float | None = None  # below a hundred runs the longest
+
+    @property
+    def missed(self) -> bool:
+        """Whether there is a target that the ratio does not reach."""
+        return self.target is not None and self.ratio < self.target
+
+
+def measure(
+    case: Case,
+    candidates: Mapping[str, Callable[[], object]],
+    seconds: float,
+    *,
+    least: int = TURNS,
+    targets: Mapping[str, float] | None = None,
+) -> list[Timing]:
+    """Times candidates, `OURS` among them, as `in_turns` does.
+
+    Args:
+        targets: by candidate, how many times as long as ours it should at least take.
+    """
+    turns = in_turns(candidates, seconds, least)
+    targets = targets or {}
+    return [summary(case, name, turns, targets.get(name)) for name in candidates]
 
 
 def in_turns(
-    candidates: dict[str, Callable[[], object]], seconds: float, least: int
-) -> dict[str, list[list[float]]]:
-    """Calls each candidate, which has run before, for about `seconds`, at least `least` times.
-
-    Returns:
-        the seconds of each call of each candidate, turn by turn; all have as many turns.
-    """
+    candidates: Mapping[str, Callable[[], object]], seconds: float, least: int = TURNS
+) -> Turns:
+    """Calls each candidate, which has run before, for about `seconds`, at least `least` times; all
+    have as many turns."""
     calls, turns = {}, 1
     for name, run in candidates.items():
         once = _time(run)
-        calls[name] = max(1, round(0.2 / once))  # a turn: long enough for caches to be its own
+        calls[name] = max(1, round(min(LONGEST_TURN, seconds / TURNS) / once))
         turns = max(turns, round(seconds / (calls[name] * once)), math.ceil(least / calls[name]))
-    found: dict[str, list[list[float]]] = {name: [] for name in candidates}
+    found: Turns = {name: [] for name in candidates}
     for _ in range(turns):
         for name, run in candidates.items():
             if calls[name] > 1:
@@ -61,13 +95,14 @@ def _time(run: Callable[[], object]) -> float:
     return time.perf_counter() - start
 
 
-def summary(
-    case: tuple[str, str, int, int], name: str, turns: list[list[float]], ours: list[list[float]]
-) -> Timing:
+def summary(case: Case, name: str, turns: Turns, target: float | None = None) -> Timing:
     """The timing of a candidate from what `in_turns` found of it and of `OURS`."""
-    values = torch.tensor(list(itertools.chain(*turns)), dtype=torch.float64)
+    values = torch.tensor(list(itertools.chain(*turns[name])), dtype=torch.float64)
     low, median, high = values.quantile(values.new_tensor((0.25, 0.5, 0.75))).tolist()
     p99 = values.quantile(0.99, interpolation="higher").item()
-    pairs = zip(turns, ours, strict=True)
+    pairs = zip(turns[name], turns[OURS], strict=True)
     ratio = statistics.median(statistics.median(a) / statistics.median(b) for a, b in pairs)
-    return Timing(*case, name, len(values), median, high - low, p99, ratio)
+    return Timing(
+        **vars(case), name=name, median=median, iqr=high - low, ratio=ratio, target=target,
+        runs=len(values), p99=p99,
+    )  # fmt: skip

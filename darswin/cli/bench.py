@@ -2,22 +2,21 @@
 
 import argparse
 import math
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
-from darswin.bench import candidates, memory, report
-from darswin.bench.machine import THREADS, machine
-from darswin.bench.timing import OURS, PRODUCTS, REFERENCE, Timing, in_turns, summary
+from darswin.bench import candidates, memory, plot, tables, targets
+from darswin.bench.machine import THREADS, machine, num_threads
+from darswin.bench.record import Record
+from darswin.bench.timing import MATMULS, OURS, REFERENCE, TURNS, Case, Timing, measure
 from darswin.cli.arguments import with_lists
 from darswin.layers import linear
 from darswin.models import list_models
 
 DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16}
-RUNS = 7  # at least: steps of training are too long to be many, and some are disturbed
 MOST = 65536  # px, and images at once
 LATENCY_RUNS = 100  # at batch 1: what a 99th percentile takes
 # How far the results of two candidates may be apart, of their norm.
@@ -32,8 +31,10 @@ def bench(
     compiled: Sequence[int] = (8,),
     seconds: float = 2.0,
     out: Path = Path(),
-) -> report.Record:
+) -> Record:
     """Measures inference and training of a model on this machine, and prints what it found.
+
+    With the default options it takes a quarter of an hour.
 
     Args:
         model: its name. size: px, of square images. batches: B.
@@ -44,57 +45,46 @@ def bench(
     out.mkdir(parents=True, exist_ok=True)  # before the work
     head = machine()
     print(" ".join(f"{k}={v}" for k, v in head.items()), flush=True)
-    threads_before = torch.get_num_threads()
     timings: list[Timing] = []
-    try:
-        for mode in ("inference", "training"):
-            for dtype in DTYPES:
-                for batch in batches:
-                    for threads in THREADS:
-                        case = (mode, dtype, batch, threads)
-                        with_compiled = batch in compiled and threads == max(THREADS)
-                        timings += _measure(case, model, size, seconds, with_compiled)
-    finally:
-        torch.set_num_threads(threads_before)
-    record = report.Record(
+    for mode in ("inference", "training"):
+        for dtype in DTYPES:
+            for batch in batches:
+                for threads in THREADS:
+                    with_compiled = batch in compiled and threads == max(THREADS)
+                    with num_threads(threads):
+                        timings += _measure(mode, dtype, model, size, batch, seconds, with_compiled)
+    record = Record(
         machine=head,
-        model=model,
-        size=size,
-        operations=candidates.operations_of(model, size),
         timings=timings,
         memory=_memory(model, size, 8) if memory.available() else [],
-        products=[
+        operations=candidates.operations_of(model, size),
+        autotune=[
             dict(shape._asdict(), seconds=seconds)
             for shape, seconds in linear.autotune_results().items()
         ],
     )
-    path = out / f"model--{head['tier']}.json"
-    record.save(path)
-    for part in (report.products, report.table, report.memory_table, report.roof):
-        print(part(record), "", sep="\n")
-    print(*report.bar_lines(record), path, sep="\n")
-    try:
-        report.plot(record, path.with_suffix(".png"))
-        print(path.with_suffix(".png"))
-    except ImportError as error:
-        print(f"no plot: {error}", file=sys.stderr)
+    print(*tables.autotune_lines(record.autotune), "", sep="\n")
+    print(tables.models_table(timings), "", tables.memory_table(record.memory), "", sep="\n")
+    print(*tables.roofline_lines(record), "", *targets.lines(timings), sep="\n")
+    if (model, f"{size}×{size}") == (targets.MODEL, targets.SETTING):
+        print(*targets.memory_lines(record.memory), sep="\n")
+    record.publish(out, "model", plot.draw_models)
     return record
 
 
 def _measure(
-    case: tuple[str, str, int, int], model: str, size: int, seconds: float, compiled: bool
+    mode: str, dtype: str, model: str, size: int, batch: int, seconds: float, compiled: bool
 ) -> list[Timing]:
-    mode, dtype, batch, threads = case
-    torch.set_num_threads(threads)  # which inductor writes into its code
-    kind = (model, size, DTYPES[dtype], batch)
+    threads = torch.get_num_threads()
+    case = Case(model, f"{size}×{size}", batch, threads, f"{mode}, {dtype}")
     if mode == "inference":
-        runs = candidates.inference(*kind, compiled=compiled)
+        runs = candidates.inference(model, size, DTYPES[dtype], batch, compiled=compiled)
     else:
-        runs = candidates.training(*kind)
+        runs = candidates.training(model, size, DTYPES[dtype], batch)
     _check(runs, TOLERANCES[dtype])
-    least = LATENCY_RUNS if mode == "inference" and batch == 1 else RUNS
-    turns = in_turns(runs, seconds, least)
-    found = [summary(case, name, of_it, turns[OURS]) for name, of_it in turns.items()]
+    least = LATENCY_RUNS if mode == "inference" and batch == 1 else TURNS
+    wanted = targets.of_model(case) if threads == max(THREADS) else None
+    found = measure(case, runs, seconds, least=least, targets=wanted)
     times = ", ".join(f"{t.name} {1e3 * t.median:.1f} ms" for t in found)
     print(f"{mode}, {dtype}, batch {batch}, {threads} threads: {times}", flush=True)
     return found
@@ -104,7 +94,7 @@ def _check(runs: dict[str, candidates.Run], tolerance: float) -> None:
     """RuntimeError unless all candidates, in training at their first step, find the same."""
     results: dict[str, Tensor] = {}
     for name, run in runs.items():
-        if name == PRODUCTS:
+        if name == MATMULS:
             continue
         torch.manual_seed(0)  # of jitter and drop path
         results[name] = run().float()
@@ -124,13 +114,12 @@ def _memory(model: str, size: int, batch: int) -> list[memory.Memory]:
     ]
 
 
-def main(argv: list[str]) -> None:
-    """`darswin bench`, with its options."""
+def run(argv: list[str]) -> None:
+    """Runs `darswin bench` with the arguments that follow it."""
     parser = argparse.ArgumentParser(
-        prog="darswin bench", description=bench.__doc__.split("\n")[0],
+        prog="darswin bench", description=(bench.__doc__ or "").split("\n")[0],
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
     )  # fmt: skip
-    default = bench.__kwdefaults__
     parser.add_argument("--model", choices=list_models(), metavar="NAME", help="a model's name")
     parser.add_argument("--size", type=_count, help="px, of the square images")
     parser.add_argument("--batches", type=_counts, metavar="B,B", help="images at once")
@@ -140,7 +129,7 @@ def main(argv: list[str]) -> None:
     )  # fmt: skip
     parser.add_argument("--seconds", type=_seconds, help="of each timing, about")
     parser.add_argument("--out", type=Path, help="folder of the record and the plot")
-    parser.set_defaults(**default)
+    parser.set_defaults(**(bench.__kwdefaults__ or {}))
     bench(**vars(parser.parse_args(with_lists(argv, ("batches", "compiled")))))
 
 

@@ -55,7 +55,7 @@ def _lens(argv: list[str]) -> None:
 
 
 def _bench(argv: list[str]) -> None:
-    from darswin.cli.bench import main as run
+    from darswin.cli.bench import run
     from darswin.utils.malloc import keep_freed_memory
 
     keep_freed_memory()
@@ -83,7 +83,9 @@ COMMANDS = {
     "lens": Command(
         "draws, describes or converts a calibrated lens", (*PICTURES, "matplotlib"), _lens
     ),
-    "bench": Command("measures how fast a model is on this machine, in some minutes", (), _bench),
+    "bench": Command(
+        "measures how fast a model is on this machine, in a quarter of an hour", (), _bench
+    ),
 }
 # For terminals that know no more than ASCII.
 PLAIN = {"°": "deg", "×": "x", "±": "+/-", "–": "-", "…": "...", "²": "^2", "θ": "theta",

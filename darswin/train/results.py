@@ -10,6 +10,7 @@ from lightning.pytorch.utilities import rank_zero_only
 from matplotlib.figure import Figure
 
 from darswin.data.lenses import LensDistribution, SphericalLenses, parse_lenses
+from darswin.train.task import Classification
 from darswin.utils.files import replace_file
 from darswin.viz.plot import draw_accuracy, save_figure
 
@@ -25,6 +26,8 @@ class WriteResults(Callback):
 
     @rank_zero_only
     def on_test_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        if not isinstance(pl_module, Classification):
+            raise TypeError(f"results are of Classification, got {type(pl_module).__name__}")
         rows = pl_module.results
         print(f"\n{'lenses':<16}{'top-1 (%)':>10}{'top-5 (%)':>10}{'loss':>10}")
         for row in rows:
@@ -32,7 +35,7 @@ class WriteResults(Callback):
                 f"{row['lenses']:<16}{100 * row['top1']:>10.2f}{100 * row['top5']:>10.2f}"
                 f"{row['loss']:>10.4f}"
             )
-        write_results(self.folder, rows, pl_module.card.model, trainer.datamodule.train_lenses)
+        write_results(self.folder, rows, pl_module.card.model, pl_module.data.train_lenses)
         print(f"\n{self.folder}/test.csv, test.json and test.png")
 
 

@@ -104,7 +104,7 @@ class Classification(LightningModule):
         """Builds the network for the classes and channels of the data."""
         if hasattr(self, "net"):
             return
-        data = self._data
+        data = self.data
         if len(data.classes) < 2:
             raise ValueError(f"a classifier needs two classes, the data has only {data.classes}")
         options: dict[str, Any] = dict(num_classes=len(data.classes), in_chans=data.channels)
@@ -133,12 +133,13 @@ class Classification(LightningModule):
         self.test_metrics = nn.ModuleList(metrics(count) for _ in data.test_names)
 
     @property
-    def _data(self) -> WideAngleData:
+    def data(self) -> WideAngleData:
+        """The data of the run."""
         return self.trainer.datamodule  # type: ignore[attr-defined]  # Lightning attaches it
 
     def configure_optimizers(self) -> OptimizerLRSchedulerConfig:
         trainer = self.trainer
-        batch = self._data.batch_size * trainer.world_size * trainer.accumulate_grad_batches
+        batch = self.data.batch_size * trainer.world_size * trainer.accumulate_grad_batches
         scale = batch / self.reference_batch
         steps = trainer.estimated_stepping_batches
         if not math.isfinite(steps):
@@ -256,7 +257,7 @@ class Classification(LightningModule):
 
     def on_test_epoch_end(self) -> None:
         """Collects `results`: a row for each distribution of lenses."""
-        names = self._data.test_names
+        names = self.data.test_names
         self.results = [
             {"lenses": name} | {key: metric.compute().item() for key, metric in _named(measured)}
             for name, measured in zip(names, self.test_metrics, strict=True)

@@ -1,7 +1,7 @@
 import pytest
 
 from darswin.bench import timing
-from darswin.bench.timing import in_turns, summary
+from darswin.bench.timing import OURS, Case, in_turns, measure, summary
 
 
 @pytest.fixture
@@ -21,11 +21,17 @@ def taking(monkeypatch):
 
 
 def test_each_candidate_runs_long_enough(taking):
-    turns = in_turns({"slow": taking(0.03), "fast": taking(0.001)}, 0.5, least=5)
-    assert [len(turn) for turn in turns["slow"]] == [7] * 2
-    assert [len(turn) for turn in turns["fast"]] == [200] * 2
+    turns = in_turns({"slow": taking(0.03), "fast": taking(0.001)}, 2.0, least=5)
+    assert [len(turn) for turn in turns["slow"]] == [7] * 10
+    assert [len(turn) for turn in turns["fast"]] == [200] * 10
     assert turns["slow"][1] == pytest.approx([0.03] * 7)
-    assert len(in_turns({"slow": taking(0.03)}, 0.0, least=9)["slow"]) == 2
+    assert len(in_turns({"slow": taking(0.03)}, 0.01, least=9)["slow"]) == 9
+
+
+def test_short_timings_have_seven_turns_too(taking):
+    turns = in_turns({"slow": taking(0.1), "fast": taking(0.001)}, 0.07)
+    assert [len(turn) for turn in turns["slow"]] == [1] * 7
+    assert [len(turn) for turn in turns["fast"]] == [10] * 7
 
 
 def test_candidates_take_turns(taking):
@@ -35,12 +41,20 @@ def test_candidates_take_turns(taking):
     assert order == ["a", "b"] * 4  # the first time for their lengths
 
 
+def test_measurement(taking):
+    case = Case("model", "64×64", 1, 2, "inference, float32")
+    runs = {OURS: taking(0.02), "reference": taking(0.05)}
+    ours, reference = measure(case, runs, 0.1, targets=dict(reference=3.0))
+    assert (ours.name, ours.ratio, ours.target, ours.missed) == (OURS, 1, None, False)
+    assert reference.ratio == pytest.approx(2.5) and reference.missed
+
+
 def test_summary():
-    case = ("inference", "float32", 1, 2)
+    case = Case("model", "64×64", 1, 2, "inference, float32")
     ours = [[1.0] * 100, [2.0] * 100, [4.0]]
     turns = [[float(n) for n in range(200, 100, -1)], [float(n) for n in range(100, 0, -1)], [88.0]]
-    found = summary(case, "reference", turns, ours)
-    assert found.case == case and found.runs == 201
+    found = summary(case, "reference", {OURS: ours, "reference": turns})
+    assert found.label == case.label and found.runs == 201
     assert (found.median, found.p99) == (100.0, 198.0)
     assert found.iqr == 99.0
     assert found.ratio == 25.25  # of 150.5, 25.25 and 22

@@ -1,9 +1,10 @@
 import pytest
 import torch
 
-from darswin.bench import candidates, report
+from darswin.bench import candidates, tables, targets
 from darswin.bench.memory import Memory
-from darswin.bench.timing import COMPILED, ONE_LENS, OURS, PRODUCTS, REFERENCE
+from darswin.bench.record import Record
+from darswin.bench.timing import COMPILED, FIXED_LENS, MATMULS, OURS, REFERENCE
 from darswin.cli import bench as command
 from darswin.cli.main import main
 from darswin.models import DarSwin
@@ -14,46 +15,59 @@ def test_it_measures_and_writes(tmp_path, capsys, monkeypatch):
     measured = []
 
     def measure(mode, model, size, dtype, batch, name, threads):
-        measured.append((mode, dtype, name))
-        return Memory(mode, dtype, batch, name, 1, 2, 3)
+        measured.append((f"{mode}, {dtype}", name))
+        return Memory(f"{mode}, {dtype}", batch, name, 1, 2, 3)
 
     monkeypatch.setattr(command.memory, "measure", measure)
     options = ["--model", "darswin_a_nano", "--size", "32", "--batches", "1", "2"]
     main(["bench", *options, "--seconds", "0.01", "--compiled", "--out", str(tmp_path)])
     (path,) = tmp_path.glob("model--*.json")
     assert path.with_suffix(".png").exists()
-    record = report.Record.load(path)
-    assert {t.case for t in record.timings} == {
-        (mode, dtype, batch, 1)
+    record = Record.load(path)
+    assert {(t.subject, t.setting, t.batch, t.threads, t.mode) for t in record.timings} == {
+        ("darswin_a_nano", "32×32", batch, 1, f"{mode}, {dtype}")
         for mode in ("inference", "training")
         for dtype in ("float32", "bfloat16")
         for batch in (1, 2)
     }
     names = {
-        mode: {t.name for t in record.timings if t.mode == mode}
+        mode: {t.name for t in record.timings if t.mode.startswith(mode)}
         for mode in ("inference", "training")
     }
-    assert names["inference"] == {OURS, ONE_LENS, REFERENCE, PRODUCTS}
+    assert names["inference"] == {OURS, FIXED_LENS, REFERENCE, MATMULS}
     assert names["training"] == {OURS, REFERENCE}
-    assert all(t.runs >= 100 for t in record.timings if t.mode == "inference" and t.batch == 1)
-    assert measured == [(m.mode, m.dtype, m.name) for m in record.memory]
+    assert all(t.runs >= 100 for t in record.timings if t.mode[:9] == "inference" and t.batch == 1)
+    assert all(t.target is None for t in record.timings)  # targets are for one model and size
+    assert measured == [(m.mode, m.name) for m in record.memory]
     assert set(measured) == {
-        (mode, dtype, name)
+        (f"{mode}, {dtype}", name)
         for mode in ("inference", "training")
         for dtype in ("float32", "bfloat16")
         for name in (OURS, REFERENCE)
     }
-    assert {row["product"] for row in record.products} == {
+    assert {row["product"] for row in record.autotune} == {
         "forward", "input gradient", "weight gradient",
     }  # fmt: skip
     printed = capsys.readouterr().out
-    assert report.table(record) in printed and str(path) in printed
+    assert tables.models_table(record.timings) in printed and str(path) in printed
+
+
+def test_targets_are_for_all_threads(monkeypatch):
+    monkeypatch.setattr(targets, "MODEL", "darswin_a_nano")
+    monkeypatch.setattr(command, "THREADS", [1, 2])
+    arguments = ("darswin_a_nano", 64, 8, 1e-3, False)
+    with command.num_threads(2):
+        found = command._measure("inference", "float32", *arguments)
+    wanted = {t.name: t.target for t in found}
+    assert wanted == {OURS: None, FIXED_LENS: None, MATMULS: 0.8, REFERENCE: 2.6}
+    with command.num_threads(1):
+        assert not any(t.target for t in command._measure("inference", "float32", *arguments))
 
 
 @pytest.mark.parametrize("name", ["darswin_a_nano", "dat_nano"])
-def test_the_products_are_all_of_the_model(name):
+def test_the_matrix_products_are_all_of_the_model(name):
     model, lens = candidates.network(name, 32).eval(), candidates.lens_of(32)
-    products = candidates.products_of(model, torch.randn(2, 3, 32, 32), lens, torch.float32)
+    products = candidates.matmuls_of(model, torch.randn(2, 3, 32, 32), lens, torch.float32)
     layers = [m for m in model.modules() if isinstance(m, torch.nn.Linear)]
     sizes = sorted((m.in_features, m.out_features) for m in layers)
     assert sorted((p.in_features, p.out_features) for p, _ in products) == sizes
@@ -68,7 +82,7 @@ def test_the_products_are_all_of_the_model(name):
 
 def test_candidates_that_disagree_are_not_timed():
     runs = {OURS: lambda: torch.ones(3), REFERENCE: lambda: torch.ones(3) + 1e-3}
-    command._check(runs | {PRODUCTS: lambda: torch.zeros(1)}, 1e-2)
+    command._check(runs | {MATMULS: lambda: torch.zeros(1)}, 1e-2)
     with pytest.raises(RuntimeError, match="darswin is off the reference's result"):
         command._check(runs, 1e-4)
 

@@ -1,0 +1,52 @@
+"""The ratios that we want to reach, and whether we do."""
+
+from collections.abc import Sequence
+
+from darswin.bench.memory import Memory, compared
+from darswin.bench.timing import COMPILED, MATMULS, OURS, REFERENCE, Case, Timing
+
+MODEL, SETTING = "darswin_a_small", "64×64"
+# By mode and batch: the least that a peer's time over ours should be, at all threads.
+MODEL_TARGETS = {
+    ("inference, float32", 8): {REFERENCE: 2.6, COMPILED: 2.2, MATMULS: 0.8},
+    ("inference, float32", 1): {REFERENCE: 2.2},
+    ("inference, bfloat16", 8): {REFERENCE: 1.35, COMPILED: 1.1},
+    ("training, float32", 8): {REFERENCE: 2.0},
+    ("training, bfloat16", 8): {REFERENCE: 1.15},
+}
+MEMORY_TARGET = 0.8  # the most that the peak of a training step should be of the reference's
+
+
+def of_model(case: Case) -> dict[str, float]:
+    """The targets of a model's case at all threads."""
+    if (case.subject, case.setting) != (MODEL, SETTING):
+        return {}
+    return MODEL_TARGETS.get((case.mode, case.batch), {})
+
+
+def lines(timings: Sequence[Timing], avx2_share: float = 1.0) -> list[str]:
+    """Each ratio that has a target, against it; on the AVX2 tier the target is a share of it."""
+    avx2 = {t.label: t for t in timings if t.name == f"{OURS} (avx2)"}
+    found = []
+    for t in timings:
+        if t.target is None:
+            continue
+        line = _against(t.ratio, t.target, t.missed)
+        if t.label in avx2:
+            ratio, target = t.median / avx2[t.label].median, t.target * avx2_share
+            line += f"; avx2 {_against(ratio, target, ratio < target)}"
+        found.append(f"{t.label}: {t.name} {line}")
+    return found
+
+
+def memory_lines(memory: Sequence[Memory]) -> list[str]:
+    """The peaks of training steps of `MODEL`, against their target."""
+    return [
+        f"peak memory, {what}: {_against(a / b, MEMORY_TARGET, a / b > MEMORY_TARGET)}"
+        for what, a, b in compared(memory)
+        if what.startswith("training")
+    ]
+
+
+def _against(ratio: float, target: float, missed: bool) -> str:
+    return f"{ratio:.2f} (target {target:.2f}){' MISSED' if missed else ''}"

@@ -1,0 +1,51 @@
+"""Records that the tests of the kit share."""
+
+import pytest
+
+from darswin.bench.memory import Memory
+from darswin.bench.record import Record
+from darswin.bench.timing import COMPILED, MATMULS, OURS, REFERENCE, Timing
+
+
+def timing(name, milliseconds, ratio=1.0, target=None, *, mode="inference", batch=8, threads=2):
+    seconds = 1e-3 * milliseconds
+    case = ("darswin_a_small", "64×64", batch, threads, f"{mode}, float32")
+    return Timing(*case, name, seconds, 1e-3, ratio, target, 10, 2 * seconds)
+
+
+@pytest.fixture
+def record() -> Record:
+    """Of a model."""
+    timings = [
+        *(timing(OURS, t, threads=n) for n, t in ((1, 200.0), (2, 100.0))),
+        *(timing(REFERENCE, t, r, threads=n) for n, t, r in ((1, 480.0, 2.5), (2, 310.0, 3.0))),
+        timing(COMPILED, 200.0, 2.1, 2.2),
+        timing(MATMULS, 90.0, 0.9, 0.8),
+        timing(OURS, 20.0, batch=1),
+        timing(OURS, 300.0, mode="training"),
+    ]
+    memory = [
+        Memory("training, float32", 8, OURS, 100 * 2**20, 300 * 2**20, 500 * 2**20),
+        Memory("training, float32", 8, REFERENCE, 100 * 2**20, 300 * 2**20, 600 * 2**20),
+    ]
+    return Record(dict(tier="avx512"), timings, memory, operations=4_500_000_000)
+
+
+def operator(name, threads, milliseconds, ratio=1.0, target=None, subject="polar_sample"):
+    case = (subject, "64×64", 8, threads, "forward")
+    return Timing(*case, name, 1e-3 * milliseconds, 0.0, ratio, target)
+
+
+@pytest.fixture
+def operators() -> list[Timing]:
+    """Two operators and their peers."""
+    return [
+        operator(OURS, 1, 2.0),
+        operator("slow", 1, 10.0, 5.0, 4.0),
+        operator("fast", 1, 3.0, 1.5, 2.0),
+        operator(f"{OURS} (avx2)", 1, 5.0, 2.5),
+        operator(OURS, 2, 1.0),
+        operator("slow", 2, 6.0, 6.0),
+        operator(OURS, 1, 1.0, subject="another"),
+        operator("peer", 1, 1.0, subject="another"),
+    ]

@@ -1,0 +1,76 @@
+import pytest
+import torch
+
+from darswin import _C
+from darswin.bench import operators
+from darswin.bench.record import Record
+from darswin.bench.timing import OURS, Case
+from darswin.ops import cpu_capability
+
+
+def case(mode="forward"):
+    return Case("double", "of four", 4, torch.get_num_threads(), mode)
+
+
+def double(x, y):
+    return 2 * x + y
+
+
+INPUTS = [torch.randn(4), torch.randn(4)]
+
+
+@pytest.mark.parametrize("mode", ["forward", "forward+backward, all"])
+def test_ours_is_timed_on_every_tier(mode):
+    seen, best = set(), cpu_capability()
+
+    def ours(x, y):
+        seen.add(cpu_capability())
+        return double(x, y)
+
+    found = operators.compare(
+        case(mode), {OURS: ours, "peer": double}, INPUTS, 1e-4, targets=dict(peer=3.0)
+    )
+    others = [f"{OURS} ({tier})" for tier in _C.tiers() if tier != best]
+    assert [t.name for t in found] == [OURS, "peer", *others]
+    assert [t.target for t in found[:2]] == [None, 3.0]
+    assert seen == set(_C.tiers()) and cpu_capability() == best
+
+
+@pytest.mark.parametrize("mode", ["forward", "forward+backward"])
+def test_candidates_that_disagree_are_not_timed(mode):
+    def compare(peer, **options):
+        return operators.compare(case(mode), {OURS: double, "peer": peer}, INPUTS, 1e-4, **options)
+
+    def wrong(x, y):
+        return 2.01 * x + y
+
+    with pytest.raises(AssertionError, match="peer disagrees with ours in double, of four"):
+        compare(wrong)
+    compare(wrong, tolerance=0.1)
+    compare(wrong, tolerance=None)
+    compare(lambda x, y: double(x, y)[None], view=lambda result: result.reshape(4))
+
+
+def test_a_wrong_gradient_is_a_disagreement():
+    runs = {OURS: double, "peer": lambda x, y: double(x, y.detach()) + 0 * y}
+    operators.compare(case(), runs, INPUTS, 1e-4)
+    with pytest.raises(AssertionError, match="disagrees"):
+        operators.compare(case("forward+backward"), runs, INPUTS, 1e-4)
+
+
+def test_a_suite_prints_and_writes_what_it_found(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(operators, "THREADS", [1, 2])
+    before = torch.get_num_threads()
+    runs = {OURS: double, "peer": double}
+    targets = dict(peer=1e6)
+
+    def job():
+        return operators.compare(case(), runs, INPUTS, 1e-4, targets=targets)
+
+    found = operators.run_suite("suite", [job, job], 1.0, tmp_path)
+    assert [t.threads for t in found if t.name == "peer"] == [1, 2] * 2
+    assert torch.get_num_threads() == before
+    (path,) = tmp_path.glob("suite--*.json")
+    assert Record.load(path).timings == found
+    printed = capsys.readouterr().out
+    assert "| `double` | ours (ms) | peer |" in printed and printed.count("MISSED") >= 4

@@ -1,0 +1,30 @@
+from darswin.bench.record import Record, write
+
+
+def test_a_record_and_its_plot(record, tmp_path, capsys):
+    def draw(found, path):
+        assert found is record
+        path.write_text("a picture")
+
+    record.publish(tmp_path / "new", "model", draw)
+    path = tmp_path / "new" / "model--avx512.json"
+    assert Record.load(path) == record
+    assert capsys.readouterr().out.split() == [str(path), str(path.with_suffix(".png"))]
+
+
+def test_a_plot_needs_matplotlib(record, tmp_path, capsys):
+    def draw(record, path):
+        raise ImportError("No module named 'matplotlib'")
+
+    record.publish(tmp_path, "model", draw)
+    assert (tmp_path / "model--avx512.json").exists()
+    assert "no plot: No module named 'matplotlib'" in capsys.readouterr().err
+
+
+def test_a_record_has_a_line_for_each_row(tmp_path):
+    path = tmp_path / "record.json"
+    write(path, size=3, parts=dict(a=[1, 2], b=None), cells=[dict(x=0.1), dict(x=1e-9)])
+    assert path.read_text().splitlines() == [
+        "{", ' "size": 3,', ' "parts": {', '  "a": [1, 2],', '  "b": null', " },", ' "cells": [',
+        '  {"x": 0.1},', '  {"x": 1e-09}', " ]", "}",
+    ]  # fmt: skip

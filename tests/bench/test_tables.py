@@ -1,0 +1,39 @@
+from darswin.bench import tables
+
+
+def test_models(record):
+    lines = tables.models_table(record.timings).splitlines()
+    assert len(lines) == 2 + 3
+    assert (
+        "| inference, float32, batch 8 | 40 / 80 |  | 2.50× / 3.00× | 2.10× | 90% |  |  |"
+    ) in lines
+    (latency,) = (line for line in lines if "batch 1 " in line)
+    assert latency.endswith("| 20.0 | 40.0 |")
+    assert tables.memory_table(record.memory).splitlines()[2:] == [
+        "| training, float32, batch 8, in all | 400 | 500 | 0.80 |",
+        "| training, float32, batch 8, of the batch itself | 200 | 300 | 0.67 |",
+    ]
+    assert tables.roofline_lines(record) == [
+        "darswin_a_small, 64×64, batch 8, inference, float32, 2 threads: matrix products alone "
+        "400 GFLOP/s, the model 360 (90%)"
+    ]
+
+
+def test_autotune():
+    row = dict(product="forward", rows=512, in_features=384, out_features=96, threads=2)
+    assert tables.autotune_lines([row | dict(seconds=dict(onednn=0.002, torch=0.005))]) == [
+        "forward, 512 rows, 384 → 96, 2 threads: onednn 2.00 ms; torch 2.50×"
+    ]
+
+
+def test_peers(operators):
+    assert tables.peers_table(operators, "polar_sample").splitlines() == [
+        "| `polar_sample` | ours (ms) | slow | fast | darswin (avx2) |",
+        "|---|---|---|---|---|",
+        "| 64×64, batch 8, forward | 2.00 / 1.00 | 5.0× / 6.0× | 1.5× | 2.5× |",
+    ]
+    assert tables.peers_table(operators, "polar_sample", ["fast"]).count("\n") == 2
+    assert tables.peers_table(operators, "polar_sample", ["peer"]).count("\n") == 1
+    assert tables.missed_table(operators).splitlines()[2:] == [
+        "| polar_sample, 64×64, batch 8, forward, 1 thread: fast | 1.50 | 2.00 |"
+    ]
