@@ -11,9 +11,10 @@ from typing import TypeVar
 
 import torch
 
-import darswin._C as _C
 from darswin.ops import cpu_capability
+from darswin.ops._library import load_extension
 
+_C = load_extension()
 T = TypeVar("T")
 THREADS = sorted({1, torch.get_num_threads()})  # to measure at: one and all
 
