@@ -17,6 +17,8 @@ struct TierFacts {
 
 TierFacts facts(Tier tier) {
   switch (tier) {
+    case Tier::generic:
+      return {"generic", true};
 #if defined(__x86_64__)
     case Tier::avx2:
       return {"avx2", __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma")};
@@ -26,9 +28,8 @@ TierFacts facts(Tier tier) {
                   __builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512bw") &&
                   __builtin_cpu_supports("avx512vl") && __builtin_cpu_supports("avx512dq")};
 #endif
-    default:
-      return {"generic", true};
   }
+  __builtin_unreachable();
 }
 
 std::optional<Tier> find(const char* name) {

@@ -2,6 +2,8 @@
 // four channels at a time.
 #pragma once
 
+#include <cstddef>
+
 #include "polar_image.h"
 
 namespace darswin {
@@ -24,10 +26,12 @@ inline V between(V a, V b, V t) {
   }
 }
 
-// Writes four channels of a sample, given the upper left and the lower left pixel; their right
-// neighbours follow them in memory. With differences, also adds what it writes to *sum.
+// Four channels, or as many as a register holds.
 template <typename T>
 using Piece = Vector<T, (kLanes<T> < 4 ? kLanes<T> : 4)>;
+
+// Writes four channels of a sample, given the upper left and the lower left pixel; their right
+// neighbours follow them in memory. With differences, also adds what it writes to *sum.
 template <bool kWeights, typename T>
 inline void interpolate(const T* pixel, const T* below, T right, T lower, T* to, Piece<T>* sum) {
   using V = Piece<T>;
@@ -81,7 +85,8 @@ inline Vector<T, 16> interpolate_four(const T* pixels, const T* below, const int
 template <typename V>
 inline bool all_finite(const V& v) {
   bool finite = true;
-  for (size_t lane = 0; lane < sizeof(V) / sizeof(v[0]); ++lane) finite &= v[lane] - v[lane] == 0;
+  for (std::size_t lane = 0; lane < sizeof(V) / sizeof(v[0]); ++lane)
+    finite &= v[lane] - v[lane] == 0;
   return finite;
 }
 
