@@ -113,9 +113,10 @@ class FixedLens(_Optimized):
         """
         if lens is not None:
             raise ValueError("this model is optimized for a fixed lens: call it without one")
-        if size not in self._prepared:
-            self._prepared[size] = super().prepare(self.fixed_lens, size)
-        return self._prepared[size]
+        prepared = self._prepared.get(size)
+        if prepared is None:
+            prepared = self._prepared[size] = super().prepare(self.fixed_lens, size)
+        return prepared
 
 
 class _InDtype(nn.Module):
@@ -145,6 +146,7 @@ class _Stage(nn.Module):
             self.downsample = _InDtype(stage.downsample, dtype)
         blocks = [block for block in stage.blocks if isinstance(block, Block)]
         self.blocks = [_Block(block, dtype) for block in blocks]
+        self.followers = [*self.blocks[1:], None]
         self.mlp_ratio = blocks[0].mlp.fc1.out_features // blocks[0].mlp.fc1.in_features
         attentions = [block.attn for block in blocks]
         biases = [a.position_bias if isinstance(a, WindowAttention) else None for a in attentions]
@@ -184,8 +186,7 @@ class _Stage(nn.Module):
     def _blocks(self, x: Tensor, tables: Sequence[Tensor | None]) -> None:
         """All blocks on x, in place: their residuals are added to it."""
         y = self.blocks[0].norm1(x)
-        followers = [*self.blocks[1:], None]
-        for block, follower, table in zip(self.blocks, followers, tables, strict=True):
+        for block, follower, table in zip(self.blocks, self.followers, tables, strict=True):
             y = block.norm2.after(x, block.attention(y, table))
             y = block.fc2(block.fc1.gelu(y))
             if follower is None:
