@@ -46,7 +46,7 @@ def optimize(
 
     Raises:
         TypeError: another kind of model.
-        ValueError: another dtype or device, or not one lens.
+        ValueError: another dtype or device, or `lens` is not a single lens.
     """
     if not isinstance(model, Encoder):
         raise TypeError(f"model must be one of create_model, got {type(model).__name__}")
@@ -76,10 +76,10 @@ def optimize(
 
 
 class _Optimized(Encoder):
-    """What an optimized model does otherwise; what it refuses, it refuses before it changes."""
+    """How an optimized model differs from the model it was made of, and what it refuses."""
 
     def prepare(self, lens: Lens | None, size: Pair) -> Prepared:
-        """As the model it was made of, with the position bias of each block in full."""
+        """As the model it was made of, but `positions` are the tables of each stage's blocks."""
         points, positions = super().prepare(lens, size)
         stages = (stage for stage in self.stages if isinstance(stage, _Stage))
         return Prepared(points, [s.tables(*p) for s, p in zip(stages, positions, strict=True)])
@@ -196,7 +196,7 @@ class _Stage(nn.Module):
 
 
 def _joined(biases: Sequence[RelativeBias]) -> RelativeBias | None:
-    """The biases of several blocks as one with the heads of all, computed in as few calls."""
+    """The biases of several blocks as one with the heads of all: one computation for the stage."""
     if not biases:
         return None
     joined = copy.deepcopy(biases[0])
