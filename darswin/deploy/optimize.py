@@ -46,7 +46,7 @@ def optimize(
 
     Raises:
         TypeError: another kind of model.
-        ValueError: another dtype or device, or not one lens.
+        ValueError: another dtype or device, or `lens` is not a single lens.
     """
     if not isinstance(model, Encoder):
         raise TypeError(f"model must be one of create_model, got {type(model).__name__}")
@@ -76,10 +76,10 @@ def optimize(
 
 
 class _Optimized(Encoder):
-    """What an optimized model does otherwise; what it refuses, it refuses before it changes."""
+    """How an optimized model differs from the model it was made of, and what it refuses."""
 
     def prepare(self, lens: Lens | None, size: Pair) -> Prepared:
-        """As the model it was made of, with the position bias of each block in full."""
+        """As the model it was made of, but `positions` are the tables of each stage's blocks."""
         points, positions = super().prepare(lens, size)
         stages = (stage for stage in self.stages if isinstance(stage, _Stage))
         return Prepared(points, [s.tables(*p) for s, p in zip(stages, positions, strict=True)])
@@ -113,9 +113,10 @@ class FixedLens(_Optimized):
         """
         if lens is not None:
             raise ValueError("this model is optimized for a fixed lens: call it without one")
-        if size not in self._prepared:
-            self._prepared[size] = super().prepare(self.fixed_lens, size)
-        return self._prepared[size]
+        prepared = self._prepared.get(size)
+        if prepared is None:
+            prepared = self._prepared[size] = super().prepare(self.fixed_lens, size)
+        return prepared
 
 
 class _InDtype(nn.Module):
@@ -145,6 +146,7 @@ class _Stage(nn.Module):
             self.downsample = _InDtype(stage.downsample, dtype)
         blocks = [block for block in stage.blocks if isinstance(block, Block)]
         self.blocks = [_Block(block, dtype) for block in blocks]
+        self.followers = [*self.blocks[1:], None]
         self.mlp_ratio = blocks[0].mlp.fc1.out_features // blocks[0].mlp.fc1.in_features
         attentions = [block.attn for block in blocks]
         biases = [a.position_bias if isinstance(a, WindowAttention) else None for a in attentions]
@@ -184,8 +186,7 @@ class _Stage(nn.Module):
     def _blocks(self, x: Tensor, tables: Sequence[Tensor | None]) -> None:
         """All blocks on x, in place: their residuals are added to it."""
         y = self.blocks[0].norm1(x)
-        followers = [*self.blocks[1:], None]
-        for block, follower, table in zip(self.blocks, followers, tables, strict=True):
+        for block, follower, table in zip(self.blocks, self.followers, tables, strict=True):
             y = block.norm2.after(x, block.attention(y, table))
             y = block.fc2(block.fc1.gelu(y))
             if follower is None:
@@ -195,7 +196,7 @@ class _Stage(nn.Module):
 
 
 def _joined(biases: Sequence[RelativeBias]) -> RelativeBias | None:
-    """The biases of several blocks as one with the heads of all, computed in as few calls."""
+    """The biases of several blocks as one with the heads of all: one computation for the stage."""
     if not biases:
         return None
     joined = copy.deepcopy(biases[0])

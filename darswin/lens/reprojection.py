@@ -38,7 +38,7 @@ def reprojection(
 def reproject(images: Tensor, source: Lens, target: Lens, size: tuple[int, int]) -> Tensor:
     """The view of `target` on what `source` saw, bilinear; 0 beyond either θ_max.
 
-    Gradients go to the images and both lenses.
+    Runs on the images' device. Gradients go to the images and both lenses.
 
     Args:
         images: (B, C, H, W), floating point, taken with `source`.
@@ -58,7 +58,7 @@ def sample_at(images: Tensor, pixels: Tensor) -> Tensor:
     Bilinear, 0 outside, on the images' device and in their dtype.
     """
     height, width = images.shape[2:]
-    exact = torch.promote_types(images.dtype, torch.float32)  # half a pixel is lost in bfloat16
+    exact = torch.promote_types(images.dtype, torch.float32)  # bfloat16 has no half pixels
     there = pixels.to(images.device, exact)
     # -1 and 1 are the image's edges, half a pixel beyond the centres of its outermost pixels.
     places = (2 * there + 1) / there.new_tensor((width, height)) - 1

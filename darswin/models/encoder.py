@@ -17,10 +17,11 @@ from darswin.models.stages import Pair, check_depths, make_stages, plan_stages
 
 
 class Prepared(NamedTuple):
-    """What lenses alone decide about images of one size: of `Encoder.prepare`, for `Encoder.run`.
+    """What the lenses alone decide about images of one size: `Encoder.prepare` computes it.
 
-    points: where the images are read: on a polar grid, at pixels (N, H, W, 2), or as they are.
-    positions: for each stage, the tensors that its position biases are made from.
+    points: where the images are read: on a polar grid, or at pixels (N, H, W, 2); None means as
+        they are.
+    positions: for each stage, the tensors that its position biases are computed from.
     """
 
     points: PolarGrid | Tensor | None
@@ -94,10 +95,14 @@ class Encoder(nn.Module):
                 module.grad_checkpointing = enable
 
     def prepare(self, lens: Lens | None, size: Pair) -> Prepared:
-        """What the lenses alone decide about images of (H, W): computed once, it serves many `run`.
+        """What the lenses alone decide about images of (H, W), for any number of calls of `run`.
+
+        Args:
+            lens: N lenses, or None for a model that ignores them. size: (H, W) of the images.
 
         Raises:
-            TypeError, ValueError: a model that needs a lens gets none, or one of another size.
+            TypeError: no lens, for a model that needs one.
+            ValueError: a lens of images of another size.
         """
         return Prepared(None, [()] * len(self.stages))
 
@@ -106,7 +111,15 @@ class Encoder(nn.Module):
         raise NotImplementedError
 
     def run(self, images: Tensor, prepared: Prepared) -> list[Tensor]:
-        """Images (B, C, H, W), of the size and lenses that gave `prepared` → each stage's map."""
+        """The map that each stage ends with: `prepare` and `run` are a model without its head.
+
+        Args:
+            images: (B, C, H, W), or uint8 (B, H, W, 3).
+            prepared: of `prepare`, for the size of these images and B lenses or one.
+
+        Raises:
+            TypeError, ValueError: images of another kind, or as many lenses as do not fit them.
+        """
         x = self.embed(check_images(images), prepared.points)
         maps = []
         for stage, positions in zip(self.stages, prepared.positions, strict=True):

@@ -1,7 +1,7 @@
 """What the authors' released DarSwin-A does otherwise than the paper: `DarSwin(compat="official")`.
 
 Rings and samples equal in tan θ with both borders sampled, azimuth 0 pointing down and running
-against the clock, radii scaled as align_corners=True does, the field of view of image 0 for the
+counterclockwise, radii scaled as align_corners=True does, the field of view of image 0 for the
 whole batch, tan θ_max as the angle of the bias, a seam in the azimuth, and other shifts.
 """
 

@@ -109,7 +109,7 @@ def test_methods_and_camera_frames():
 
 
 @torch.no_grad()
-def test_one_lens_is_folded_once(monkeypatch):
+def test_a_fixed_lens_is_prepared_once_for_each_size(monkeypatch):
     model = network()
     optimized = optimize(model, lens=LENSES[:1])
     sizes = [(32, 32), (40, 36)]
@@ -123,6 +123,16 @@ def test_one_lens_is_folded_once(monkeypatch):
         assert error(optimized(images[size]), want[size]) < 1e-5
     with pytest.raises(ValueError, match="call it without one"):
         optimized(images[sizes[0]], LENSES[:1])
+
+
+@torch.no_grad()
+def test_a_fixed_lens_undistorts_by_one_map(monkeypatch):
+    model, images = network("swin_undis_nano"), torch.randn(2, 3, 32, 32)
+    optimized = optimize(model, lens=LENSES[:1])
+    want = model(images, LENSES[:1])
+    assert error(optimized(images), want) < 1e-5
+    monkeypatch.setattr(type(LENSES), "project", None)
+    assert error(optimized(images), want) < 1e-5
 
 
 def test_the_model_stays_as_it_is():
@@ -174,7 +184,7 @@ def test_missing_says_why(monkeypatch):
     assert "this CPU" in onednn.missing(torch.bfloat16)
 
 
-def test_one_lens_refuses_images_of_another_size_than_its_own():
+def test_a_fixed_lens_refuses_images_of_another_size_than_its_own():
     camera = LENSES[:1].replace(image_size=torch.tensor([[32.0, 32.0]]))
     fast = optimize(network(), lens=camera)
     assert fast(torch.rand(1, 3, 32, 32)).shape == (1, 10)
@@ -183,15 +193,15 @@ def test_one_lens_refuses_images_of_another_size_than_its_own():
 
 
 @torch.no_grad()
-def test_a_bent_lens_is_optimized_too():
-    bent = KannalaBrandt(
+def test_general_lenses():
+    general = KannalaBrandt(
         10.0, [0.01], 1.5, affine=[[1.0, 0.1], [0.0, 1.1]], tangential=[0.02, 0.01]
     )
     model, images = network(), torch.rand(2, 3, 32, 32)
-    want = model(images, bent)
-    assert error(want, model(images, bent.replace(tangential=None))) > 1e-3
-    assert error(optimize(model)(images, bent), want) < 1e-5
-    assert error(optimize(model, lens=bent)(images), want) < 1e-5
+    want = model(images, general)
+    assert error(want, model(images, general.replace(tangential=None))) > 1e-3
+    assert error(optimize(model)(images, general), want) < 1e-5
+    assert error(optimize(model, lens=general)(images), want) < 1e-5
 
 
 def test_what_an_optimized_model_does_not_do():

@@ -1,0 +1,188 @@
+"""Files of weights: what is read from them, and what is refused."""
+
+import errno
+import json
+import os
+import pickle
+import shutil
+import sys
+import types
+
+import pytest
+import torch
+from helpers import fixture
+from safetensors import safe_open
+from safetensors.torch import load_file, save_file
+
+from darswin.compat import convert_checkpoint, load_official, read_state
+
+
+class CfgNode(dict):
+    """As yacs has it, as far as a pickle goes."""
+
+    def __init__(self, *given):
+        super().__init__(*given)
+        self.__dict__["__immutable__"] = True
+
+
+@pytest.fixture(params=["zip", "legacy"])
+def checkpoint(request, tmp_path, monkeypatch):
+    """What the authors' code saves. yacs is not needed to read it, so a module of that name is
+    there only to write it."""
+    weight = torch.nn.Parameter(torch.zeros(3))
+    optimizer = torch.optim.AdamW([weight])
+    weight.sum().backward()
+    optimizer.step()
+    model = CfgNode(dict(DROP_PATH_RATE=0.2, NAME="darswin"))
+    content = dict(
+        model=fixture("angular")[1],
+        optimizer=optimizer.state_dict(),
+        lr_scheduler={"base_values": [1.25e-4]},
+        max_accuracy=92.8,
+        scaler={"scale": 65536.0},
+        epoch=325,
+        config=CfgNode(dict(MODEL=model, BASE=[""], AUG=(1, None))),
+    )
+    target = tmp_path / "authors" / "checkpoint.pth"
+    target.parent.mkdir()
+    with monkeypatch.context() as patch:
+        module = types.ModuleType("yacs.config")
+        module.CfgNode = CfgNode
+        patch.setattr(CfgNode, "__module__", "yacs.config")
+        patch.setitem(sys.modules, "yacs", types.ModuleType("yacs"))
+        patch.setitem(sys.modules, "yacs.config", module)
+        torch.save(content, target, _use_new_zipfile_serialization=request.param == "zip")
+    return target
+
+
+def test_converts_the_authors_checkpoints(checkpoint, tmp_path):
+    assert "yacs" not in sys.modules
+    with pytest.raises(pickle.UnpicklingError, match=r"yacs\.config\.CfgNode"):
+        torch.load(checkpoint, weights_only=True)  # torch alone does not
+    target = tmp_path / "converted" / "model.safetensors"
+    target.parent.mkdir()
+    convert_checkpoint(checkpoint, target)
+    tensors, state, lens = fixture("angular")
+    written = load_file(target)
+    assert written.keys() == state.keys()
+    assert all(torch.equal(written[key], state[key]) for key in state)
+    with safe_open(target, "pt") as file:
+        config = json.loads(file.metadata()["config"])
+    assert config == {
+        "MODEL": {"DROP_PATH_RATE": 0.2, "NAME": "darswin"}, "BASE": [""], "AUG": [1, None],
+    }  # fmt: skip
+    assert list(target.parent.iterdir()) == [target]
+    assert target.stat().st_mode & 0o777 == 0o666 & ~_umask()
+    for file in (target, checkpoint):  # loaders read the checkpoint as well
+        with torch.no_grad():
+            logits = load_official(file)(tensors["images"], lens)
+        assert (logits - tensors["logits"]).abs().max() <= 1e-5
+    assert "yacs" not in sys.modules
+    assert "yacs" not in str(torch.serialization.get_safe_globals())
+
+
+def _umask():
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask
+
+
+class Hostile:
+    def __init__(self, function, *arguments):
+        self.call = function, arguments
+
+    def __reduce__(self):
+        return self.call
+
+
+@pytest.mark.parametrize("zipped", [True, False])
+@pytest.mark.parametrize(
+    ("function", "name"),
+    [
+        (os.system, "posix.system"),
+        (shutil.copyfile, "shutil.copyfile"),
+        (eval, "eval"),
+    ],
+)
+@pytest.mark.parametrize("entry", ["config", "model", "optimizer"])
+def test_a_hostile_checkpoint_is_refused(function, name, entry, zipped, tmp_path):
+    executed = tmp_path / "executed"
+    arguments = {
+        os.system: [f"touch {executed}"],
+        shutil.copyfile: [__file__, str(executed)],
+        eval: [f"open({str(executed)!r}, 'w')"],
+    }[function]
+    checkpoint = {"model": {"norm.weight": torch.zeros(3)}, entry: Hostile(function, *arguments)}
+    source, target = tmp_path / "hostile.pth", tmp_path / "model.safetensors"
+    torch.save(checkpoint, source, _use_new_zipfile_serialization=zipped)
+    for read in (read_state, load_official, lambda path: convert_checkpoint(path, target)):
+        with pytest.raises(ValueError, match=f"is refused, .* it asks for {name}, which"):
+            read(source)
+    assert list(tmp_path.iterdir()) == [source]
+    torch.load(source, weights_only=False)  # it would have been
+    assert executed.exists()
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ({"epoch": 3}, "holds no state dict"),
+        ([torch.zeros(2)], "holds no state dict"),
+        ({"model": [torch.zeros(2)]}, "holds no state dict"),
+    ],
+)
+def test_checkpoints_without_weights(content, message, tmp_path):
+    torch.save(content, tmp_path / "checkpoint.pth")
+    with pytest.raises(ValueError, match=message):
+        convert_checkpoint(tmp_path / "checkpoint.pth", tmp_path / "model.safetensors")
+    assert len(list(tmp_path.iterdir())) == 1
+
+
+@pytest.mark.parametrize("content", [b"", b"no checkpoint", b"PK\3\4" + bytes(100), b"\x80\2R."])
+def test_files_that_are_no_checkpoints(content, tmp_path):
+    (tmp_path / "checkpoint.pth").write_bytes(content)
+    with pytest.raises(ValueError, match=r"checkpoint\.pth cannot be read as a checkpoint"):
+        read_state(tmp_path / "checkpoint.pth")
+    (tmp_path / "model.safetensors").write_bytes(content)
+    with pytest.raises(ValueError, match=r"model\.safetensors cannot be read as safetensors"):
+        read_state(tmp_path / "model.safetensors")
+    for name in ("another.pth", "another.safetensors"):
+        with pytest.raises(FileNotFoundError):
+            read_state(tmp_path / name)
+
+
+def test_a_failed_conversion_leaves_the_target_as_it_was(tmp_path, monkeypatch):
+    source, target = tmp_path / "checkpoint.pth", tmp_path / "model.safetensors"
+    torch.save({"model": {"a": torch.ones(2)}}, source)
+    target.write_bytes(b"before")
+
+    def full(file):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(OSError, match=r"cannot write it.*No space left.*model\.safetensors"):
+        convert_checkpoint(source, target)
+    assert target.read_bytes() == b"before" and len(list(tmp_path.iterdir())) == 2
+
+
+def test_weights_that_share_memory_or_stride_and_odd_configurations(tmp_path):
+    weight = torch.arange(6.0).reshape(2, 3)
+    source, target = tmp_path / "checkpoint.pth", tmp_path / "model.safetensors"
+    model = {"a": weight, "b": weight, "c": weight.T, "d": torch.ones(2, dtype=torch.bfloat16)}
+    torch.save({"model": model, "config": {"a set": {1, 2}}}, source)
+    convert_checkpoint(source, target)
+    written = load_file(target)
+    assert all(torch.equal(written[key], value) for key, value in model.items())
+    with safe_open(target, "pt") as file:
+        assert "config" not in file.metadata()
+
+
+def test_reads_files(tmp_path):
+    _, state, _ = fixture("angular")
+    expected = load_official(state).state_dict()
+    save_file(state, tmp_path / "model.safetensors")
+    torch.save(state, tmp_path / "model.pt")
+    torch.save({"model": state, "epoch": 325, "max_accuracy": 92.8}, tmp_path / "checkpoint.pth")
+    for name in ("model.safetensors", "model.pt", "checkpoint.pth"):
+        for key, value in load_official(tmp_path / name).state_dict().items():
+            assert torch.equal(value, expected[key]), key

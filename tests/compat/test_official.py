@@ -1,0 +1,153 @@
+"""The released DarSwin's outputs, from fixtures computed with it.
+
+The fixtures were made on a CPU on which MKL takes its compatible path. Near 90° the float32
+tangents of the released sampling differ between MKL's paths enough to move the embedding by 3e-4,
+for the released code as for ours. So the comparison runs in a process with that path chosen.
+"""
+
+import json
+import os
+import subprocess
+import sys
+import warnings
+from pathlib import Path
+
+import pytest
+import torch
+from helpers import fixture
+
+from darswin import DarSwin
+from darswin.compat import OfficialPolynomial, load_official
+
+NAMES = ("angular", "polar", "poly")
+
+
+def differences(name) -> dict[str, float]:
+    """Largest absolute difference from the released code, for each thing that a fixture holds."""
+    tensors, state, lens = fixture(name)
+    model = load_official(state)
+    found = {}
+    model.patch_embed.register_forward_hook(lambda _m, _i, out: found.update(embed=out))
+    for stage in (1, 2, 3):
+        model.stages[stage].downsample.register_forward_hook(
+            lambda _m, _i, out, key=f"stage{stage - 1}": found.update({key: out})
+        )
+    with torch.no_grad():
+        found["logits"] = model(tensors["images"], lens)
+        found["stage3"] = model.forward_intermediates(tensors["images"], lens)[1][-1]
+    results = {}
+    for key, value in found.items():
+        expected = tensors[key if key == "logits" else f"out.{key}"]
+        results[key] = (value.reshape(expected.shape) - expected).abs().max().item()
+    # Patches in the released order: (azimuth, ring), and of them every 37th; the grid is that of
+    # the transposed image.
+    grid = model.patch_embed.sample.grid(lens, (64, 64))
+    r, a = grid.radii[:, :, None], grid.azimuths
+    xy = torch.stack((r * torch.sin(a), r * torch.cos(a)), -1) / 31.5
+    patches = xy.reshape(-1, 16, 10, 64, 10, 2).permute(0, 3, 1, 2, 4, 5).reshape(-1, 1024, 100, 2)
+    results["grid"] = (patches[:, ::37] - tensors["out.grid"]).abs().max().item()
+    return results
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_equals_the_released_code_to_1e_4(name):
+    code = f"import test_official, json; print(json.dumps(test_official.differences({name!r})))"
+    path = [str(Path(__file__).parent), *sys.path]
+    environment = dict(os.environ, MKL_CBWR="COMPATIBLE", PYTHONPATH=os.pathsep.join(path))
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    results = json.loads(done.stdout)
+    assert results.keys() == {
+        "grid", "embed", "stage0", "stage1", "stage2", "stage3", "logits"
+    }  # fmt: skip
+    assert max(results.values()) <= 1e-4, results
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_logits_equal_with_any_maths_library(name):
+    results = differences(name)
+    assert results["logits"] <= 1e-5 and results["grid"] <= 5e-6, results
+
+
+def test_every_part_of_the_compatibility_matters():
+    # The same weights in the paper's model give other logits: the fixture can tell.
+    tensors, state, lens = fixture("angular")
+    official = load_official(state)
+    paper = DarSwin(10, 3, 8, (2, 2, 2, 2), (1, 2, 4, 8), spacing="tan", placement="edges")
+    values = official.state_dict()
+    for key in ("stages.3.blocks.0", "stages.3.blocks.1"):
+        for coefficient in ("a_phi", "b_phi"):
+            name = f"{key}.attn.position_bias.{coefficient}"
+            assert values[name].shape == (1, 8)  # one row where a window is the whole map
+    paper.load_state_dict(values)
+    with torch.no_grad():
+        other = paper.eval()(tensors["images"], lens)
+    assert (other - tensors["logits"]).abs().max() > 1e-2
+
+
+def test_full_size_parameter_count():
+    with torch.device("meta"):
+        model = DarSwin(200, compat="official")
+    assert sum(p.numel() for p in model.parameters()) == 48_977_864
+
+
+def test_the_polar_model_is_the_papers_angular_encoding():
+    _, state, _ = fixture("polar")
+    model = load_official(state)
+    assert model.position_bias == "angular" and model.compat == "official"
+    assert model.stages[0].blocks[0].attn.position_bias.a_phi.shape == (16, 1)
+    assert not model.training
+
+
+def test_the_radial_models_weights_load_with_a_warning():
+    donor = DarSwin(
+        10, 3, 8, (2, 2, 2, 2), (1, 2, 4, 8), variant="RA", position_bias="polar", harmonics=4
+    )
+    names = {"b_theta": "a_r", "a_theta": "b_r", "b_phi": "a_p", "a_phi": "b_p"}
+    state = {}
+    for key, value in donor.state_dict().items():
+        for ours, theirs in names.items():
+            key = key.replace(f"position_bias.{ours}", theirs)
+        key = key.replace("patch_embed.proj", "patch_embed.mlp")
+        if key.startswith("stages."):
+            _, stage, rest = key.split(".", 2)
+            key = f"layers.{int(stage) - rest.startswith('downsample')}.{rest}"
+        state[key] = value
+    with pytest.warns(UserWarning, match="released radial model does not run"):
+        model = load_official(state)
+    loaded, expected = model.state_dict(), donor.state_dict()
+    assert loaded.keys() == expected.keys()
+    weight = "stages.1.blocks.0.attn.position_bias.b_phi"
+    assert torch.equal(loaded[weight], expected[weight])
+
+
+def test_other_state_dicts_are_refused():
+    with pytest.raises(ValueError, match="not a state dict of a released DarSwin"):
+        load_official({})
+    with pytest.raises(ValueError, match="not a state dict of a released DarSwin"):
+        load_official({"layers.0.blocks.0.norm1.weight": torch.zeros(8)})
+    _, state, _ = fixture("angular")
+    del state["norm.weight"]
+    with pytest.raises(ValueError, match=r"norm\.weight"):
+        load_official(state)
+
+
+def test_official_polynomial():
+    lens = OfficialPolynomial(torch.tensor([[0.5, 0.5, 0.5, 0.5], [1.0, 0.2, 0.0, 0.1]]), 32.0)
+    theta = lens.theta_max[:, None] * torch.linspace(0, 1, 40)
+    torch.testing.assert_close(lens.unproject(lens.project(theta)), theta, rtol=0, atol=3e-3)
+    torch.testing.assert_close(lens.r_max, torch.full((2,), 32.0))
+    assert OfficialPolynomial([7.7, 7.7, 7.7, 7.7], 32.0).theta_max > 30  # as in the released data
+    with pytest.raises(ValueError, match="coefficients must be such that θ rises"):
+        OfficialPolynomial([1.0, -3.0, 0.5, 3.0], 32.0)
+    with pytest.raises(ValueError, match="radius must be greater than 0"):
+        OfficialPolynomial([1.0, 0.0, 0.0, 0.0], 0.0)
+
+
+def test_no_warning_for_models_that_run():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for name in NAMES:
+            load_official(fixture(name)[1])
