@@ -4,8 +4,10 @@ from collections.abc import Sequence
 
 import torch
 from torch import Tensor
+from torch.utils.data._utils.collate import default_collate_fn_map
 
-from darswin.lens.base import FRAME, Lens, Number
+from darswin.lens.base import Lens
+from darswin.lens.batch import Number
 from darswin.lens.inverse import inverse
 
 
@@ -23,7 +25,9 @@ class Tabulated(Lens):
 
     parameters = ("angles", "radii")
     optional = ("slopes",)
+    lists = ("angles", "radii", "slopes")
     lengths = ("radii", "slopes")
+    max_numbers = 65536
     angles: Tensor
     radii: Tensor
     slopes: Tensor | None
@@ -90,11 +94,10 @@ class Tabulated(Lens):
         rows = max(len(self), x.shape[0])
         flat = x.detach().expand(rows, *x.shape[1:]).reshape(rows, -1)
         table = table.detach().expand(rows, -1).contiguous()
+        shape = (rows, *x.shape[1:])
         if len(self) == 1:
-            flat, shape = flat.reshape(1, -1), x.shape
+            flat = flat.reshape(1, -1)
             table = table[:1].contiguous()
-        else:
-            shape = (rows, *x.shape[1:])
         index = torch.searchsorted(table, flat.contiguous(), right=True) - 1
         index = index.clamp(0, self.angles.shape[1] - 2)
 
@@ -160,7 +163,7 @@ def as_curves(lens: Lens, count: int = 512) -> Tabulated:
     radii, slopes = lens.project(angles), lens._slope(angles)
     radii = torch.cat((torch.zeros_like(radii[:, :1]), radii[:, 1:]), 1)
     slopes = torch.minimum(slopes.clamp(min=0), _steepest(angles, radii))
-    tensors = {name: getattr(lens, name) for name in ("theta_max", *FRAME)}
+    tensors = {name: getattr(lens, name) for name in lens.common}
     return Tabulated._from_tensors(dict(angles=angles, radii=radii, slopes=slopes) | tensors)
 
 
@@ -217,3 +220,11 @@ def _form(lens: Lens) -> tuple:
     """Lenses that agree in this are one batch as they are."""
     parameters = [getattr(lens, name) for name in (*lens.parameters, *lens.optional)]
     return type(lens), tuple(None if p is None else p.shape[1:] for p in parameters)
+
+
+def _collate(batch: Sequence[Lens], *, collate_fn_map: object = None) -> Lens:
+    return cat(batch)
+
+
+# A DataLoader batches lenses of any class.
+default_collate_fn_map[Lens] = _collate

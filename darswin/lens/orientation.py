@@ -59,9 +59,4 @@ def turned(lens: Lens, orientation: int) -> Lens:
     changed = {"image_size": size, "center": off_middle @ turn.T + (size.flip(1) - 1) / 2}
     if lens.affine is not None:
         changed["affine"] = turn @ lens.affine @ turn.T
-    # What moves rays aside are vectors: (p₂, p₁), (s₁, s₃) and (s₂, s₄).
-    if getattr(lens, "tangential", None) is not None:
-        changed["tangential"] = (lens.tangential.flip(1) @ turn.T).flip(1)
-    if getattr(lens, "prism", None) is not None:
-        changed["prism"] = (turn @ lens.prism.unflatten(1, (2, 2))).flatten(1)
-    return lens.replace(**changed)
+    return lens.replace(**changed, **lens._turned(turn))

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from darswin.models.stages import StagePlan
 
 
-class OfficialPolynomial(Lens):
+class OfficialPolynomial(Lens, register=False):
     """The released code's polynomial lens, an angle as a function of the radius.
 
     θ(x) = x (d₁ + d₂ x + d₃ x² + d₄ x³) with x = r / radius in [0, 1], inverted on a table of 50
@@ -31,6 +31,7 @@ class OfficialPolynomial(Lens):
     """
 
     parameters = ("coefficients", "radius")
+    lists = ("coefficients",)
     lengths = ("radius",)
     coefficients: Tensor
     radius: Tensor
@@ -50,7 +51,10 @@ class OfficialPolynomial(Lens):
 
     def _angle(self, x: Tensor) -> Tensor:
         columns = self.coefficients.reshape(*self.coefficients.shape, *(1,) * (x.dim() - 1))
-        return sum(column * x**power for power, column in enumerate(columns.unbind(1), start=1))
+        angle = torch.zeros_like(x)
+        for power, column in enumerate(columns.unbind(1), start=1):
+            angle = angle + column * x**power
+        return angle
 
     def _table(self) -> tuple[Tensor, Tensor]:
         """x (50,) and its θ (N, 50)."""

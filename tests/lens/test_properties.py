@@ -9,7 +9,6 @@ import torch
 
 from darswin.layers.grid import PLACEMENTS, SPACINGS, polar_grid
 from darswin.lens import MODELS, cat, from_dict, to_dict
-from darswin.lens.base import ROW_DIMS
 
 f64 = torch.float64
 
@@ -50,7 +49,7 @@ def lenses(draw, radial=False):
             steps = rows(draw, 0.01, 0.4, count, 6)
             most = 1 if key == "angles" else draw(st.floats(1, 2000))
             values[key] = [[0.0] + [most * sum(row[: k + 1]) for k in range(6)] for row in steps]
-        elif key in ROW_DIMS:
+        elif model._dims(key):
             width = COUNTS.get(key) or draw(st.integers(1, 4))
             values[key] = rows(draw, *RANGES[key], count, width)
         else:
@@ -179,7 +178,7 @@ def test_any_numbers_make_a_lens_that_rises_or_an_error_in_a_sentence(name, data
         width = data.draw(st.integers(0, 5))
         values[key] = (
             data.draw(st.lists(numbers, min_size=width, max_size=width))
-            if key in ROW_DIMS
+            if model._dims(key)
             else data.draw(numbers)
         )
     if data.draw(st.booleans()):
