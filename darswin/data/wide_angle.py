@@ -168,8 +168,7 @@ class WideAngle(Dataset):
         large = lens.resized(self.render / self.size)
         ratio = radial_reprojection(_camera(self.fov, side), large, radii)[0].numpy()[place]
         places = offset * ratio[..., None] + np.float32((side - 1) / 2)
-        places[np.isnan(ratio)] = OUTSIDE
-        return places
+        return np.fmax(places, np.float32(OUTSIDE), out=places)  # NaN becomes OUTSIDE
 
     def _square(self, picture: np.ndarray) -> np.ndarray:
         height, width = picture.shape[:2]

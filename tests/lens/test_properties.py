@@ -6,19 +6,10 @@ import math
 import hypothesis
 import hypothesis.strategies as st
 import torch
+from lens_examples import COUNTS, RANGES, f64, first_coefficients
 
 from darswin.layers.grid import PLACEMENTS, SPACINGS, polar_grid
 from darswin.lens import MODELS, cat, from_dict, to_dict
-
-f64 = torch.float64
-
-# Parameters as calibrations have them, and further out.
-RANGES = {
-    "focal": (0.5, 5000), "xi": (0, 4), "alpha": (0, 1), "beta": (0.05, 5), "omega": (0.02, 3.1),
-    "radial": (-0.3, 0.3), "denominator": (-0.2, 0.2), "tangential": (-0.02, 0.02),
-    "prism": (-0.02, 0.02),
-}  # fmt: skip
-COUNTS = {"tangential": 2, "prism": 4}
 
 
 def rows(draw, low, high, count, width):
@@ -36,13 +27,7 @@ def lenses(draw, radial=False):
         if key in model.optional and (key == "slopes" or (aside and radial) or draw(st.booleans())):
             continue
         if key == "coefficients":
-            size = draw(st.floats(10, 2000))
-            first = {
-                "OCam": [-size, 0.0],
-                "OCamInverse": [size, size / math.pi * 2],
-                "Polynomial": [size],
-            }[name]
-            scale = size / (size**2 if name == "OCam" else 1)
+            first, scale = first_coefficients(name, draw(st.floats(10, 2000)))
             more = rows(draw, -0.1 * scale, 0.1 * scale, count, draw(st.integers(1, 3)))
             values[key] = [first + row for row in more]
         elif key in ("angles", "radii"):
