@@ -11,8 +11,8 @@ from darswin.lens.batch import Number
 from darswin.lens.frame import ImageFrame
 from darswin.lens.inverse import inverse
 
-# Where r stops rising, or grows beyond all bounds, θ cannot be told from r; a lens is used up to
-# this far (rad) from there.
+# A lens ends this far (rad) before the angle where r stops rising or becomes infinite: there θ
+# cannot be told from r.
 MARGIN = 1e-6
 
 # All lens models by their names. A class enters it by being defined.
@@ -49,14 +49,14 @@ class Lens(ImageFrame):
     a DataLoader batches a dataset's lenses like its tensors.
 
     A class is a model of `MODELS`, by its name, unless it is defined with `register=False`, as
-    bases of several models are. It tells `fit` where to start, within which bounds to search, and
-    how many terms of a polynomial are usual.
+    bases of several models are.
     """
 
-    starts: ClassVar[Mapping[str, tuple[float, ...]]] = {}  # values to try, all with all others
+    # Of `fit`: values to start from, in all combinations; bounds; the usual number of terms.
+    starts: ClassVar[Mapping[str, tuple[float, ...]]] = {}
     bounds: ClassVar[Mapping[str, tuple[float, float]]] = {}
     terms: ClassVar[int] = 4
-    # As many numbers as one list of a calibration file may have.
+    # The longest list of numbers that a calibration file may give for a parameter.
     max_numbers: ClassVar[int] = 64
 
     def __init_subclass__(cls, register: bool = True) -> None:
@@ -140,7 +140,7 @@ class Lens(ImageFrame):
             # A little beyond θ_max a model may have no radius, or a smaller one.
             last = torch.where(beyond > last, beyond, last) * slack
             lands = (radius >= 0) & (radius <= self._row(last, radius.dim()))
-        # 0 in place of what has no angle: NaN would reach the gradients.
+        # Radii without an angle become 0, as NaN would reach the gradients.
         return torch.where(lands, self._angle_at(torch.where(lands, radius, 0.0)), torch.nan)
 
     def _angle_at(self, radius: Tensor) -> Tensor:

@@ -106,7 +106,7 @@ class DistortedLens(FocalLens, register=False):
 
     @property
     def theta_limit(self) -> Tensor:
-        # In the lens's own dtype: where the high powers of w overflow, it ends too.
+        # The lens also ends where the high powers of w overflow in its dtype.
         end = self._plane_limit()
         limits = [rising_limit(self._slope, end)]
         if not self.is_radial:
@@ -188,7 +188,7 @@ class DistortedLens(FocalLens, register=False):
         area = determinant(self._distort_slopes(self._plane(theta)[..., None, None] * direction))
         terms = torch.fft.rfft(area, norm="forward")[..., :4]
         area = torch.fft.irfft(terms, 256, norm="forward")
-        # The least between the samples: that of the parabola through the three around the least.
+        # The minimum between the samples, of the parabola through the smallest and its neighbours.
         place = area.argmin(-1, keepdim=True)
         before, least, after = (area.gather(-1, (place + k) % 256) for k in (-1, 0, 1))
         bend = (before - 2 * least + after).clamp(min=torch.finfo(theta.dtype).tiny)
@@ -196,7 +196,7 @@ class DistortedLens(FocalLens, register=False):
 
     @staticmethod
     def _slack(goal: Tensor) -> Tensor:
-        """(...): by how much rounding may let a ray miss points of the distorted plane."""
+        """(...): how far from a point of the distorted plane rounding lets its ray land."""
         return 1e3 * torch.finfo(goal.dtype).eps * (1 + length_of(goal))
 
     def _find_points(self, goal: Tensor, start: Tensor, last: Tensor) -> Tensor:
@@ -227,7 +227,7 @@ class DistortedLens(FocalLens, register=False):
         return points.reshape(shape)
 
     def _turned(self, turn: Tensor) -> dict[str, Tensor]:
-        # What moves rays aside are vectors: (p₂, p₁), (s₁, s₃) and (s₂, s₄).
+        # The terms are vectors of the image plane: (p₂, p₁), (s₁, s₃) and (s₂, s₄).
         changed = {}
         if self.tangential is not None:
             changed["tangential"] = (self.tangential.flip(1) @ turn.T).flip(1)
@@ -245,9 +245,9 @@ class DistortedLens(FocalLens, register=False):
             start = self._plane(torch.where(theta.isnan(), end, theta))[..., None] * direction
             point = self._find_points(goal, start, last)
             lands = length_of(self._distort(point) - goal) < self._slack(goal)
-            # Where the map is about to fold, rounding moves a ray by the root of what it is.
+            # Near a fold of the map, a rounding ε of a pixel moves its ray by √ε.
             lands &= length_of(point) <= last * (1 + math.sqrt(torch.finfo(flat.dtype).eps))
-        # The principal point in place of what has no ray: NaN would reach the gradients.
+        # Pixels without a ray become the principal point, as NaN would reach the gradients.
         goal, point = (torch.where(lands[..., None], x, 0.0) for x in (goal, point))
         for _ in range(2):
             point = point - solve(self._distort_slopes(point), self._distort(point) - goal)

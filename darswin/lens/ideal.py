@@ -43,11 +43,11 @@ class IdealLens(FocalLens, register=False):
 
     def _angle_at(self, radius: Tensor) -> Tensor:
         rise = radius / self._row(self.focal, radius.dim())
-        # Rounding can take u above its top, where there is no angle.
+        # Rounding can take u above its largest value, which no angle has.
         return self._fall(rise if self._top is None else rise.clamp(max=self._top))
 
-    _end = math.pi  # where u stops rising, or to be finite
-    _top: float | None = None  # u there, where it is finite
+    _end = math.pi  # θ where u stops rising, or becomes infinite
+    _top: float | None = None  # u there, if it is finite
 
     @property
     def theta_limit(self) -> Tensor:

@@ -15,7 +15,7 @@ def stored_size(size: tuple[int, int], orientation: int) -> tuple[int, int]:
 def in_upright_picture(lens: Lens, size: tuple[int, int], orientation: int) -> Lens:
     """The lens in a picture that shows all that it was calibrated with, and was turned upright.
 
-    Where only the upright picture has the calibration's shape, the calibration is of such pictures.
+    If only the upright picture has the calibration's shape, the calibration was made upright.
 
     Args:
         lens: one that has an image_size. size: (H, W), upright. orientation: EXIF's, 1 to 8.

@@ -101,7 +101,7 @@ class EnhancedUnified(FocalLens):
         # Where cos θ = -w √(β sin² θ + cos² θ).
         w, beta = _cone(self.alpha.detach()), self.beta.detach()
         last = torch.atan2(root(1 - w * w), -w * root(beta))
-        # β below 0: where the square root has none.
+        # Where β is below 0, the lens ends where the square root does.
         return torch.where(beta > 0, last, torch.atan(root(-beta).reciprocal())) - MARGIN
 
     def project(self, theta: Number) -> Tensor:
@@ -192,11 +192,11 @@ def sphere_limit(xi: Tensor) -> Tensor:
 
 
 def _cone(alpha: Tensor) -> Tensor:
-    """The last angle of the unified model of α has the cosine -w."""
+    """w: the cosine of the last angle of the unified model of α is -w."""
     return torch.where(alpha <= 0.5, alpha / (1 - alpha), (1 - alpha) / alpha.clamp(min=0.5))
 
 
 def root(square: Tensor) -> Tensor:
-    """√, and nearly 0 where rounding made the square of a last ray negative."""
+    """√, and nearly 0 where rounding made a square negative, as at the last ray of a lens."""
     eps = torch.finfo(square.dtype).eps
     return square.clamp(min=eps * eps).sqrt()

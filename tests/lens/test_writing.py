@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from lens_examples import assert_projects, points_around
 
 from darswin.cli.main import main
-from darswin.lens import MODELS, Spherical, load, load_all, save
+from darswin.lens import MODELS, Spherical, as_curves, load, load_all, save
 
 FILES = Path(__file__).parent / "files"
 f64 = torch.float64
@@ -109,6 +109,13 @@ def test_which_formats_hold_which_cameras(tmp_path):
             seen += 1
             assert held == HELD[name].split(), name
     assert seen == len(HELD)
+
+
+def test_a_table_of_many_slopes(tmp_path):
+    lens = as_curves(load(FILES / "kalibr_tumvi.yaml", camera="cam0", dtype=f64))
+    save(lens, tmp_path / "lens.json")
+    found = load(tmp_path / "lens.json", dtype=f64)
+    assert torch.equal(found.slopes, lens.slopes) and lens.slopes.shape == (1, 512)
 
 
 # -- for the libraries themselves ---------------------------------------------------------------

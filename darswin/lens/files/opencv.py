@@ -8,6 +8,8 @@ from collections.abc import Mapping
 from functools import partial
 from typing import Any
 
+import numpy as np
+
 from darswin.lens.distorted import BrownConrady, KannalaBrandt, Mei
 from darswin.lens.files.cameras import Camera, Cameras, Description, describe
 from darswin.lens.files.content import Content
@@ -68,7 +70,6 @@ def cameras(file: Fields, hint: str | None = None) -> Cameras:
 def write(camera: Camera, suffix: str) -> str | None:
     """A file of OpenCV's FileStorage: XML, JSON or YAML; None if OpenCV has no such camera."""
     import cv2  # only here: reading does without
-    import numpy as np
 
     order = "k1 k2 p1 p2 k3 d1 d2 d3 s1 s2 s3 s4"
     orders = {KannalaBrandt: "k1 k2 k3 k4", Mei: "k1 k2 p1 p2", BrownConrady: order}
