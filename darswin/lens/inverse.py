@@ -12,9 +12,9 @@ def inverse(function: Function, slope: Function, value: Tensor, end: Tensor) -> 
     """The x in [0, end] at which a function that rises from 0 takes a value.
 
     Newton's method inside a bracket; a step that would leave it, or is more than half as long as
-    the one before, is replaced by the bracket's middle. Two more steps carry the gradients of the inverse, to `value`
-    and to whatever `function` and `slope` depend on: Newton's method doubles the order to which a
-    step is right, so derivatives up to the third are exact.
+    the one before, is replaced by the bracket's middle. Two more steps carry the gradients of the
+    inverse, to `value` and to whatever `function` and `slope` depend on: each step doubles the
+    order of the error, so that derivatives up to the third are exact.
 
     Args:
         function, slope: of x, elementwise. value: any shape. end: broadcasts to that of x.
