@@ -57,9 +57,7 @@ def photograph(lens: Polynomial) -> np.ndarray:
 
 def row(lens: Polynomial, y: int, width: int) -> np.ndarray:
     y, x = np.mgrid[2 * y : 2 * y + 2, : 2 * width] / 2 - 0.25
-    theta, direction = lens.rays(torch.from_numpy(np.stack((x, y), -1))[None])
-    aside = torch.sin(theta)[..., None] * direction
-    rays = torch.cat((aside, torch.cos(theta)[..., None]), -1)[0].numpy()
+    rays = lens.unproject_points(torch.from_numpy(np.stack((x, y), -1))[None])[0].numpy()
     return room(rays).reshape(1, 2, width, 2, 3).mean((1, 3)).round().astype(np.uint8)
 
 

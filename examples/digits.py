@@ -46,7 +46,8 @@ def through_lenses(scans: np.ndarray, xi: np.ndarray) -> tuple[Tensor, lens.Lens
     lenses = lens.Spherical.from_fov(torch.from_numpy(xi).float(), FOV, SIZE / 2)
     maps = warp_map(camera, scans.shape[1:], lenses, (SIZE, SIZE))
     images = [
-        cv2.remap(scan, x, y, cv2.INTER_CUBIC) for scan, x, y in zip(scans, *maps, strict=True)
+        cv2.remap(scan, places, None, cv2.INTER_CUBIC)
+        for scan, places in zip(scans, maps, strict=True)
     ]
     return torch.from_numpy(np.stack(images))[:, None], lenses
 

@@ -34,6 +34,7 @@ from torch import Tensor
 
 from darswin.cli.main import main as darswin
 from darswin.data import open_source, warp_map
+from darswin.data.warp import remap
 from darswin.lens import Lens, Perspective, Spherical
 from darswin.models import DarSwin
 from darswin.models.saving import load_model, model_of_run
@@ -79,10 +80,9 @@ def photograph(pictures: np.ndarray, lens: Lens) -> Tensor:
     """Pictures (N, H, W) uint8 through a lens, as `WideAngle` does → images (N, 1, SIZE, SIZE)."""
     camera = Perspective.from_fov(FOV, pictures.shape[1] / 2)
     large = lens.resized(RENDER / SIZE)
-    (x,), (y,) = warp_map(camera, pictures.shape[1:], large, (RENDER, RENDER))
+    (places,) = warp_map(camera, pictures.shape[1:], large, (RENDER, RENDER))
     images = [
-        cv2.resize(cv2.remap(p, x, y, cv2.INTER_LINEAR), (SIZE, SIZE), interpolation=cv2.INTER_AREA)
-        for p in pictures
+        cv2.resize(remap(p, places), (SIZE, SIZE), interpolation=cv2.INTER_AREA) for p in pictures
     ]
     return torch.from_numpy(np.stack(images))[:, None].float() / (255 * STD)
 

@@ -1,4 +1,4 @@
-"""Shows an image taken with one lens as another lens would have taken it."""
+"""Shows an image taken with one lens as another lens would have taken it, through OpenCV."""
 
 import cv2
 import numpy as np
@@ -10,15 +10,22 @@ from darswin.lens.reprojection import reprojection
 
 def warp_map(
     source: Lens, source_size: tuple[int, int], target: Lens, size: tuple[int, int]
-) -> tuple[np.ndarray, np.ndarray]:
-    """`darswin.lens.reprojection` in double precision, as the maps of `cv2.remap`.
+) -> np.ndarray:
+    """`darswin.lens.reprojection.reprojection` in double precision, as maps of `cv2.remap`.
 
     Returns:
-        x and y, (N, H, W) float32 each; outside the image where a ray is beyond either θ_max.
+        (N, H, W, 2) float32, x and y; outside the image where a ray is beyond either θ_max.
     """
     source, target = source.detach().to(torch.float64), target.detach().to(torch.float64)
-    there = reprojection(source, source_size, target, size).to(torch.float32).numpy()
-    return np.ascontiguousarray(there[..., 0]), np.ascontiguousarray(there[..., 1])
+    return reprojection(source, source_size, target, size).to(torch.float32).numpy()
+
+
+def remap(
+    image: np.ndarray, places: np.ndarray, interpolation: int = cv2.INTER_LINEAR
+) -> np.ndarray:
+    """An image (H, W) or (H, W, C) at the places (H', W', 2) of a map; black outside the image."""
+    # None: x and y are in one array, which OpenCV's types do not know.
+    return cv2.remap(image, places, None, interpolation)  # type: ignore[call-overload]
 
 
 def warp(
@@ -41,7 +48,5 @@ def warp(
     """
     if len(source) != 1 or len(target) != 1:
         raise ValueError(f"warp takes one lens each, got {len(source)} and {len(target)}")
-    map_x, map_y = warp_map(source, image.shape[:2], target, size)
-    return cv2.remap(
-        image, map_x[0], map_y[0], interpolation, borderMode=cv2.BORDER_CONSTANT, borderValue=0
-    )
+    height, width = image.shape[:2]
+    return remap(image, warp_map(source, (height, width), target, size)[0], interpolation)

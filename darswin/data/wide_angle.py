@@ -13,7 +13,9 @@ from torch.utils.data import Dataset
 
 from darswin.data.lenses import LensDistribution
 from darswin.data.sources import Source
+from darswin.data.warp import remap
 from darswin.lens import Lens, Perspective
+from darswin.lens.reprojection import OUTSIDE, radial_reprojection
 from darswin.utils.image import BrokenImageError
 
 # Per-channel statistics of ImageNet, in [0, 1].
@@ -40,11 +42,11 @@ def _rays(side: int) -> tuple[Tensor, np.ndarray, np.ndarray]:
 class Draw(NamedTuple):
     """Which image, and which random numbers: all that a sample depends on.
 
-    `epoch` and `index` key its augmentation, `epoch` and `lens` its lens.
+    `epoch` and `picture` key its augmentation, `epoch` and `lens` its lens.
     """
 
     epoch: int
-    index: int
+    picture: int
     lens: int
 
 
@@ -130,14 +132,14 @@ class WideAngle(Dataset):
             draw = Draw(0, int(draw), int(draw))
         lens = self.lenses.draw(self._random(draw.epoch, draw.lens, 1), self.fov, self.size / 2)
         try:
-            picture, label = self.source[draw.index]
+            picture, label = self.source[draw.picture]
         except BrokenImageError:
             if not self.skip_broken:
                 raise
-            self._broken[draw.index] = True
+            self._broken[draw.picture] = True
             black = torch.from_numpy(-self.mean / self.std)
             return black.expand(-1, self.size, self.size).clone(), lens, -1
-        rng = self._random(draw.epoch, draw.index, 0)
+        rng = self._random(draw.epoch, draw.picture, 0)
         image = self.through(lens, picture)
         if self.augment:
             image = self.augment(image, rng)
@@ -152,25 +154,21 @@ class WideAngle(Dataset):
     def through(self, lens: Lens, picture: np.ndarray) -> np.ndarray:
         """The picture (H, W, C) uint8 through a lens of this data set → (size, size, C) uint8."""
         picture = self._square(picture)
-        there = self._pixels(lens, picture.shape[0])
-        # With both coordinates in one array OpenCV need not join them.
-        image = cv2.remap(picture, there, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
+        image = remap(picture, self._map(lens, picture.shape[0]))
         if self.render != self.size:
             image = cv2.resize(image, (self.size, self.size), interpolation=cv2.INTER_AREA)
         return image.reshape(self.size, self.size, -1)
 
-    def _pixels(self, lens: Lens, side: int) -> np.ndarray:
-        """`darswin.lens.reprojection` of a centred lens: (render, render, 2), x and y, px.
+    def _map(self, lens: Lens, side: int) -> np.ndarray:
+        """(render, render, 2): where in a picture of `side` px each pixel of the lens's image lies.
 
         An image has an eighth as many radii as pixels, and only radii need the lens's curve.
         """
-        camera = _camera(self.fov, side)
         radii, place, offset = _rays(self.render)
-        theta = lens.resized(self.render / self.size).unproject(radii)[0]
-        seen = theta <= lens.theta_max * (1 + 1e-6)  # False for NaN
-        ratio = camera.project(torch.where(seen, theta, 0.0)[None])[0] / radii[0]
-        ratio = torch.where(seen, ratio, 1e4).numpy()  # far outside
-        return offset * ratio[place][..., None] + np.float32((side - 1) / 2)
+        large = lens.resized(self.render / self.size)
+        ratio = radial_reprojection(_camera(self.fov, side), large, radii)[0].numpy()[place]
+        places = offset * ratio[..., None] + np.float32((side - 1) / 2)
+        return np.fmax(places, np.float32(OUTSIDE), out=places)  # NaN becomes OUTSIDE
 
     def _square(self, picture: np.ndarray) -> np.ndarray:
         height, width = picture.shape[:2]

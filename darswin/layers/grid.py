@@ -20,7 +20,7 @@ from darswin.ops.checks import as_int
 
 Spacing = Literal["theta", "tan", "g", "radius"]
 Placement = Literal["centers", "edges"]
-SPACINGS = ("theta", "tan", "g", "radius")
+SPACINGS: tuple[Spacing, ...] = ("theta", "tan", "g", "radius")
 PLACEMENTS = ("centers", "edges")
 
 # g(t) = c b t^n + (1 - c) (1 - (1 - t)^m), t = θ/θ_max: constants of the released DarSwin-Unet.

@@ -3,9 +3,10 @@
 Every lens is a batch, differentiable in its parameters, and works beyond 90° where its model does.
 """
 
-from darswin.lens.base import Lens, Number
+from darswin.lens.base import MODELS, Lens
+from darswin.lens.batch import Number
 from darswin.lens.curves import Tabulated, as_curves, cat
-from darswin.lens.description import MODELS, from_dict, to_dict
+from darswin.lens.description import from_dict, to_dict
 from darswin.lens.distorted import BrownConrady, Fisheye624, KannalaBrandt, Mei
 from darswin.lens.files import load, load_all, save
 from darswin.lens.fitting import Fit, fit

@@ -4,8 +4,10 @@ from collections.abc import Sequence
 
 import torch
 from torch import Tensor
+from torch.utils.data._utils.collate import default_collate_fn_map
 
-from darswin.lens.base import FRAME, Lens, Number
+from darswin.lens.base import Lens
+from darswin.lens.batch import Number
 from darswin.lens.inverse import inverse
 
 
@@ -23,7 +25,9 @@ class Tabulated(Lens):
 
     parameters = ("angles", "radii")
     optional = ("slopes",)
+    lists = ("angles", "radii", "slopes")
     lengths = ("radii", "slopes")
+    max_numbers = 65536
     angles: Tensor
     radii: Tensor
     slopes: Tensor | None
@@ -71,7 +75,7 @@ class Tabulated(Lens):
         secant = rise / width
         if secant.shape[1] == 1:
             return secant.expand(-1, 2)
-        # Inside a weighted harmonic mean; at both ends the parabola through three points.
+        # Inside, a weighted harmonic mean of two secants; at an end, a parabola through 3 points.
         before, after = width[:, :-1], width[:, 1:]
         w1, w2 = 2 * after + before, after + 2 * before
         inside = (w1 + w2) / (w1 / secant[:, :-1] + w2 / secant[:, 1:])
@@ -85,16 +89,15 @@ class Tabulated(Lens):
         return torch.cat((first, inside, last), 1)
 
     def _pieces(self, x: Tensor, table: Tensor) -> tuple[Tensor, ...]:
-        """Of the piece of the table that each x is in: θ where it starts, its width; r where it
-        starts, its rise, and its slopes at both ends, in units of the width."""
+        """Of the piece of the table that each x is in: its first θ and its width; its first r, its
+        rise, and its slopes at both ends, in units of the width."""
         rows = max(len(self), x.shape[0])
         flat = x.detach().expand(rows, *x.shape[1:]).reshape(rows, -1)
         table = table.detach().expand(rows, -1).contiguous()
+        shape = (rows, *x.shape[1:])
         if len(self) == 1:
-            flat, shape = flat.reshape(1, -1), x.shape
+            flat = flat.reshape(1, -1)
             table = table[:1].contiguous()
-        else:
-            shape = (rows, *x.shape[1:])
         index = torch.searchsorted(table, flat.contiguous(), right=True) - 1
         index = index.clamp(0, self.angles.shape[1] - 2)
 
@@ -144,9 +147,9 @@ def as_curves(lens: Lens, count: int = 512) -> Tabulated:
     """The lenses as tables of `count` angles with their slopes; differentiable in their parameters.
 
     In float64, 512 angles are within 1e-7 of `r_max` of any formula here up to 0.99 of its
-    `theta_limit`; in float32, within rounding. Two things no such table has: the kinks of a
-    `Tabulated` lens without slopes (they are met to some 1e-4 of `r_max`), and an r(0) that is not
-    0, of `OCamInverse`.
+    `theta_limit`; in float32, within rounding. Two things are lost: the kinks of a
+    `Tabulated` lens without slopes (to some 1e-4 of `r_max`), and an r(0) of `OCamInverse` that is
+    not 0.
 
     Raises:
         ValueError: a lens with tangential or thin-prism terms, which no curve has.
@@ -160,17 +163,17 @@ def as_curves(lens: Lens, count: int = 512) -> Tabulated:
     radii, slopes = lens.project(angles), lens._slope(angles)
     radii = torch.cat((torch.zeros_like(radii[:, :1]), radii[:, 1:]), 1)
     slopes = torch.minimum(slopes.clamp(min=0), _steepest(angles, radii))
-    tensors = {name: getattr(lens, name) for name in ("theta_max", *FRAME)}
+    tensors = {name: getattr(lens, name) for name in lens.common}
     return Tabulated._from_tensors(dict(angles=angles, radii=radii, slopes=slopes) | tensors)
 
 
 @torch.no_grad()
 def _fractions(lens: Lens, count: int) -> Tensor:
-    """(N, count) of θ_max, from 0 to 1: close together where r bends, half of them at most."""
+    """(N, count), from 0 to 1: parts of θ_max, closer together where the slope of r changes."""
     like = lens.theta_max
     fractions = torch.linspace(0, 1, 2 * count, dtype=like.dtype, device=like.device)[None]
     fractions = fractions.expand(len(lens), -1)
-    # The first points miss how steep a curve is beside a pole, and those of the second round less.
+    # Each round places its points by the slopes at the last one's, which resolve a pole better.
     for points in (2 * count, 2 * count, count):
         slope = lens._slope(like[:, None] * fractions)
         bends = slope.clamp(min=torch.finfo(like.dtype).tiny).log().diff(dim=1).abs()
@@ -214,6 +217,14 @@ def cat(lenses: Sequence[Lens]) -> Lens:
 
 
 def _form(lens: Lens) -> tuple:
-    """Lenses that agree in this are one batch as they are."""
+    """Lenses of the same form are joined as they are."""
     parameters = [getattr(lens, name) for name in (*lens.parameters, *lens.optional)]
     return type(lens), tuple(None if p is None else p.shape[1:] for p in parameters)
+
+
+def _collate(batch: Sequence[Lens], *, collate_fn_map: object = None) -> Lens:
+    return cat(batch)
+
+
+# A DataLoader batches lenses of any class.
+default_collate_fn_map[Lens] = _collate

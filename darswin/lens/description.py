@@ -3,28 +3,8 @@
 from collections.abc import Mapping
 from typing import Any
 
-from darswin.lens.base import Lens
-from darswin.lens.curves import Tabulated
-from darswin.lens.distorted import BrownConrady, Fisheye624, KannalaBrandt, Mei
-from darswin.lens.ideal import (
-    Equidistant,
-    Equisolid,
-    FieldOfView,
-    Orthographic,
-    Perspective,
-    Stereographic,
-)
-from darswin.lens.polynomial import OCam, OCamInverse, Polynomial
-from darswin.lens.sphere import DoubleSphere, EnhancedUnified, Spherical
-
-MODELS: dict[str, type[Lens]] = {
-    model.__name__: model
-    for model in (
-        Perspective, Equidistant, Equisolid, Stereographic, Orthographic, FieldOfView, Spherical,
-        EnhancedUnified, DoubleSphere, Polynomial, OCam, OCamInverse, KannalaBrandt, Fisheye624,
-        Mei, BrownConrady, Tabulated,
-    )
-}  # fmt: skip
+from darswin.lens.base import MODELS, Lens
+from darswin.lens.focal import FocalLens
 
 
 def from_dict(description: Mapping[str, Any], image_size: tuple[int, int] | None = None) -> Lens:
@@ -33,8 +13,8 @@ def from_dict(description: Mapping[str, Any], image_size: tuple[int, int] | None
     Args:
         description: {"model": "Spherical", "xi": 0.5, "focal": 300, "theta_max": 1.5}: a name of
             `MODELS` and the arguments of its constructor, angles in rad and lengths in px. For
-            models with a `from_fov`, "fov" may stand instead of "theta_max" and the focal length:
-            the full field of view, that fills the circle inside the image.
+            models with a focal length, "fov" may stand in place of it and of "theta_max": the
+            full field of view, which fills the circle inside the image.
         image_size: (H, W) px of the lens's images, which "fov" needs.
 
     Raises:
@@ -45,10 +25,10 @@ def from_dict(description: Mapping[str, Any], image_size: tuple[int, int] | None
     arguments = dict(description)
     name = arguments.pop("model", None)
     if not isinstance(name, str) or name not in MODELS:
-        raise ValueError(f'a lens\'s "model" must be one of {list(MODELS)}, got {name!r}')
+        raise ValueError(f'a lens\'s "model" must be one of {sorted(MODELS)}, got {name!r}')
     model = MODELS[name]
     try:
-        if "fov" in arguments and hasattr(model, "from_fov"):
+        if "fov" in arguments and issubclass(model, FocalLens):
             size = image_size or arguments.get("image_size")
             if size is None:
                 raise ValueError('a lens of a "fov" needs the image_size, (H, W)')
@@ -68,7 +48,7 @@ def to_dict(lens: Lens) -> dict[str, Any]:
         raise ValueError(f"to_dict takes one lens, got {len(lens)}")
     name = type(lens).__name__
     if MODELS.get(name) is not type(lens):
-        raise ValueError(f"to_dict takes a lens of {list(MODELS)}, got {name}")
+        raise ValueError(f"to_dict takes a lens of {sorted(MODELS)}, got {name}")
     values = {key: getattr(lens, key) for key in lens._names()}
     described = {k: v.detach()[0].tolist() for k, v in values.items() if v is not None}
     if "image_size" in described:

@@ -1,22 +1,28 @@
-"""Lenses that bend an ideal plane: radial, tangential and thin-prism terms.
+"""Lenses with distortion: radial, tangential and thin-prism terms.
 
 A ray has a place in an ideal plane, w(θ) (cos φ, sin φ). Radial terms stretch it; tangential terms
-(elements of the lens that are off centre) and thin-prism terms (tilted ones) move it aside; the
-focal length makes pixels of it.
+(elements of the lens that are off centre) and thin-prism terms (tilted ones) move it aside. The
+focal length turns the distorted plane into pixels.
 """
 
 import math
+from collections.abc import Mapping
+from typing import ClassVar
 
 import torch
 from torch import Tensor
 
-from darswin.lens.base import MARGIN, Lens, Number, length_of
-from darswin.lens.inverse import Function, rising_limit
+from darswin.lens.base import MARGIN, Lens, length_of
+from darswin.lens.batch import Number
+from darswin.lens.focal import FocalLens
+from darswin.lens.ideal import Equidistant, Perspective
+from darswin.lens.inverse import rising_limit
+from darswin.lens.plane import determinant, newton, radial_slopes, solve
 from darswin.lens.polynomial import horner, slopes
-from darswin.lens.sphere import sphere_angle, sphere_limit
+from darswin.lens.sphere import XI_STARTS, Spherical, sphere_angle, sphere_limit
 
 
-class DistortedLens(Lens):
+class DistortedLens(FocalLens, register=False):
     """Base of the lenses with radial, tangential and thin-prism terms in a plane of radius w(θ).
 
     r = f w (1 + k₁ w² + k₂ w⁴ + …), and with (x, y) = w (cos φ, sin φ) the offset is
@@ -30,10 +36,10 @@ class DistortedLens(Lens):
         Others: as `Lens`.
     """
 
-    parameters = ("focal",)
-    optional = ("radial", "tangential", "prism")
-    lengths = ("focal",)
-    focal: Tensor
+    optional: ClassVar[tuple[str, ...]] = ("radial", "tangential", "prism")
+    lists: ClassVar[tuple[str, ...]] = optional
+    # What is left of the model when all its terms are zero, with a closed inverse.
+    plain: ClassVar[type[Lens]]
     radial: Tensor | None
     tangential: Tensor | None
     prism: Tensor | None
@@ -48,8 +54,20 @@ class DistortedLens(Lens):
     ):
         super().__init__(theta_max, center, focal=focal, radial=radial, **others)
 
+    @classmethod
+    def _rows(cls, given: Mapping[str, Number]) -> dict[str, Tensor]:
+        rows = super()._rows(given)
+        varied = [name for name, tensor in rows.items() if len(tensor) > 1]
+        if varied == ["radial"] and rows["radial"].shape[1] == 1:  # a column, as OpenCV has it
+            count = len(rows["radial"])
+            raise ValueError(
+                f"radial of shape ({count}, 1) is {count} lenses of one coefficient each: give "
+                f"({count},) for one lens, or another parameter with {count} numbers"
+            )
+        return rows
+
     def _validate(self) -> None:
-        self._require("focal", (self.focal > 0) & self.focal.isfinite(), "finite and above 0")
+        super()._validate()
         for name in self.optional:
             if getattr(self, name) is not None:
                 self._require(name, getattr(self, name).isfinite().all(1), "finite")
@@ -88,7 +106,7 @@ class DistortedLens(Lens):
 
     @property
     def theta_limit(self) -> Tensor:
-        # In the lens's own dtype: where the high powers of w overflow, it ends too.
+        # The lens also ends where the high powers of w overflow in its dtype.
         end = self._plane_limit()
         limits = [rising_limit(self._slope, end)]
         if not self.is_radial:
@@ -144,33 +162,33 @@ class DistortedLens(Lens):
         )
         return torch.stack([torch.stack(row, -1) for row in rows], -2)
 
-    def _bent(self, point: Tensor) -> Tensor:
+    def _distort(self, point: Tensor) -> Tensor:
         """(..., 2): where a point w (cos φ, sin φ) of the ideal plane lands, in focal lengths."""
         w = length_of(point)
         direction = point / w[..., None]
         aside = self._aside(self._offset_plane(w)[..., None] * direction)
         return self._stretch(w)[..., None] * direction + aside
 
-    def _bent_slopes(self, point: Tensor) -> Tensor:
-        """(..., 2, 2): the derivatives of `_bent`."""
+    def _distort_slopes(self, point: Tensor) -> Tensor:
+        """(..., 2, 2): the derivatives of `_distort`."""
         w = length_of(point)
         direction = point / w[..., None]
         u, slope = self._offset_plane(w), self._offset_plane_slope(w)
         aside = self._aside_slopes(u[..., None] * direction)
-        straight = _radial_slopes(self._stretch(w) / w, self._stretch_slope(w), direction)
-        return straight + aside @ _radial_slopes(u / w, slope, direction)
+        straight = radial_slopes(self._stretch(w) / w, self._stretch_slope(w), direction)
+        return straight + aside @ radial_slopes(u / w, slope, direction)
 
     def _least_area(self, theta: Tensor) -> Tensor:
-        """(N, K): by how much the bent plane makes an area larger at θ, least of all azimuths.
+        """(N, K): by how much the distortion enlarges an area at θ, at the azimuth of the least.
 
-        It is a trigonometric polynomial of degree 3 in φ, so that 8 azimuths tell all others.
+        It is a trigonometric polynomial of degree 3 in φ: 8 azimuths determine all others.
         """
         azimuth = torch.arange(8, dtype=theta.dtype, device=theta.device) * (math.pi / 4)
         direction = torch.stack((torch.cos(azimuth), torch.sin(azimuth)), -1)
-        area = _determinant(self._bent_slopes(self._plane(theta)[..., None, None] * direction))
+        area = determinant(self._distort_slopes(self._plane(theta)[..., None, None] * direction))
         terms = torch.fft.rfft(area, norm="forward")[..., :4]
         area = torch.fft.irfft(terms, 256, norm="forward")
-        # The least between the samples: that of the parabola through the three around the least.
+        # The minimum between the samples, of the parabola through the smallest and its neighbours.
         place = area.argmin(-1, keepdim=True)
         before, least, after = (area.gather(-1, (place + k) % 256) for k in (-1, 0, 1))
         bend = (before - 2 * least + after).clamp(min=torch.finfo(theta.dtype).tiny)
@@ -178,116 +196,64 @@ class DistortedLens(Lens):
 
     @staticmethod
     def _slack(goal: Tensor) -> Tensor:
-        """(...): by how much rounding may let a ray miss points of the bent plane."""
+        """(...): how far from a point of the distorted plane rounding lets its ray land."""
         return 1e3 * torch.finfo(goal.dtype).eps * (1 + length_of(goal))
 
     def _find_points(self, goal: Tensor, start: Tensor, last: Tensor) -> Tensor:
-        """(N, ..., 2): points of the ideal plane whose place in the bent one is `goal`, if there is
-        one within `last`; from half as far out as `start`, where nothing is about to fold."""
+        """(N, ..., 2): points of the ideal plane that `_distort` takes to `goal`, if there are any
+        within `last`. The search begins half as far out as `start`, far from any fold."""
         if torch.compiler.is_compiling():
-            return _newton(self._bent, self._bent_slopes, goal, start / 2, 1.1 * last, rounds=30)
+            return newton(
+                self._distort, self._distort_slopes, goal, start / 2, 1.1 * last, rounds=30
+            )
         azimuth = torch.arange(256, dtype=goal.dtype, device=goal.device) * (math.pi / 128)
         circle = torch.stack((torch.cos(azimuth), torch.sin(azimuth)), -1)
-        # A lens at a time, whatever the shape of its pixels.
+        # One lens at a time: each has its own shape of selected pixels.
         shape, start = goal.shape, start.expand_as(goal).reshape(len(self), -1, 2)
         goal, points = goal.reshape(len(self), -1, 2), start.clone()
         for k, end in enumerate(last.flatten()):
             lens = self[k]
-            # Most pixels that no ray reaches lie beyond the rim: they are not looked for.
-            near = length_of(goal[k]) < 1.01 * length_of(lens._bent(end * circle)).max()
-            for share in (0.5, 0.0):  # where one way is blocked, another is not
-                points[k][near] = _newton(
-                    lens._bent, lens._bent_slopes, goal[k][near], share * start[k][near], 1.1 * end
+            # Most pixels that no ray reaches lie beyond the rim; they are skipped.
+            near = length_of(goal[k]) < 1.01 * length_of(lens._distort(end * circle)).max()
+            for share in (0.5, 0.0):  # from the axis, where a fold blocked the first way
+                points[k][near] = newton(
+                    lens._distort,
+                    lens._distort_slopes,
+                    goal[k][near],
+                    share * start[k][near],
+                    1.1 * end,
                 )
-                near &= length_of(lens._bent(points[k]) - goal[k]) > self._slack(goal[k])
+                near &= length_of(lens._distort(points[k]) - goal[k]) > self._slack(goal[k])
         return points.reshape(shape)
 
+    def _turned(self, turn: Tensor) -> dict[str, Tensor]:
+        # The terms are vectors of the image plane: (p₂, p₁), (s₁, s₃) and (s₂, s₄).
+        changed = {}
+        if self.tangential is not None:
+            changed["tangential"] = (self.tangential.flip(1) @ turn.T).flip(1)
+        if self.prism is not None:
+            changed["prism"] = (turn @ self.prism.unflatten(1, (2, 2))).flatten(1)
+        return changed
+
     def _find_rays(self, flat: Tensor, theta: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
-        """The rays that land at points before `affine`, by Newton's method in the ideal plane, from
-        where they would be if nothing but the radial curve were. The last steps carry the
-        gradients, as in `inverse`."""
+        """Newton's method in the ideal plane, from the place that a ray has on the radial curve
+        alone. The last steps carry the gradients, as in `inverse`."""
         end = self._row(self.theta_max.detach(), theta.dim())
         goal = flat / self._row(self.focal, flat.dim())
         with torch.no_grad():
             last = self._plane(end)
             start = self._plane(torch.where(theta.isnan(), end, theta))[..., None] * direction
             point = self._find_points(goal, start, last)
-            lands = length_of(self._bent(point) - goal) < self._slack(goal)
-            # Where the map is about to fold, rounding moves a ray by the root of what it is.
+            lands = length_of(self._distort(point) - goal) < self._slack(goal)
+            # Near a fold of the map, a rounding ε of a pixel moves its ray by √ε.
             lands &= length_of(point) <= last * (1 + math.sqrt(torch.finfo(flat.dtype).eps))
-        # The principal point in place of what has no ray: NaN would reach the gradients.
+        # Pixels without a ray become the principal point, as NaN would reach the gradients.
         goal, point = (torch.where(lands[..., None], x, 0.0) for x in (goal, point))
         for _ in range(2):
-            point = point - _solve(self._bent_slopes(point), self._bent(point) - goal)
+            point = point - solve(self._distort_slopes(point), self._distort(point) - goal)
         w = length_of(point)
         theta = torch.where(lands, self._plane_angle(w), torch.nan)
         return theta, torch.where(lands[..., None], point / w[..., None], direction)
-
-
-def _newton(
-    function: Function,
-    slopes: Function,
-    goal: Tensor,
-    point: Tensor,
-    end: Tensor,
-    rounds: int = 60,
-) -> Tensor:
-    """Where a map of the plane takes the value `goal`.
-
-    Newton's steps, shortened until they come nearer and stay where the map does not turn over: from
-    a point where it does not, that ends at the goal, or where the map is about to fold.
-
-    Args:
-        function: (..., 2) → (..., 2). slopes: (..., 2) → (..., 2, 2), its derivatives.
-        goal, point: (n, 2), or any shape while compiling. end: how far from the origin to look.
-    """
-    found, places = point.clone(), torch.arange(len(point), device=point.device)
-    error = function(point) - goal
-    step, missed, part = (
-        _solve(slopes(point), error),
-        length_of(error),
-        torch.ones_like(error[..., 0]),
-    )
-    for _ in range(rounds):
-        trial = point - part[..., None] * step
-        error, slope = function(trial) - goal, slopes(trial)
-        better = (length_of(error) < missed) & (_determinant(slope) > 0) & (length_of(trial) <= end)
-        point = torch.where(better[..., None], trial, point)
-        step = torch.where(better[..., None], _solve(slope, error), step)
-        missed = torch.where(better, length_of(error), missed)
-        part = torch.where(better, (2 * part).clamp(max=1), part / 4)
-        if torch.compiler.is_compiling():
-            continue  # no shape in a graph depends on values
-        found[places] = point
-        going = missed > 16 * torch.finfo(goal.dtype).eps * (1 + length_of(goal))
-        going &= part > 1e-6
-        if not going.any():
-            return found
-        places, goal, point, step, missed, part = (
-            x[going] for x in (places, goal, point, step, missed, part)
-        )
-    found[places] = point
-    return found
-
-
-def _determinant(matrix: Tensor) -> Tensor:
-    (a, b), (c, d) = (row.unbind(-1) for row in matrix.unbind(-2))
-    return a * d - b * c
-
-
-def _solve(matrix: Tensor, vector: Tensor) -> Tensor:
-    """(..., 2, 2)⁻¹ @ (..., 2)."""
-    (a, b), (c, d) = (row.unbind(-1) for row in matrix.unbind(-2))
-    x, y = vector.unbind(-1)
-    solved = torch.stack((d * x - b * y, a * y - c * x), -1)
-    return solved / _determinant(matrix)[..., None]
-
-
-def _radial_slopes(ratio: Tensor, slope: Tensor, direction: Tensor) -> Tensor:
-    """(..., 2, 2): the derivatives of a radial map, `ratio` across and `slope` along a radius."""
-    along = direction[..., :, None] * direction[..., None, :]
-    across = torch.eye(2, dtype=ratio.dtype, device=ratio.device) - along
-    return ratio[..., None, None] * across + slope[..., None, None] * along
 
 
 class KannalaBrandt(DistortedLens):
@@ -297,6 +263,8 @@ class KannalaBrandt(DistortedLens):
 
     Source: Kannala and Brandt, PAMI 2006; OpenCV, cv::fisheye.
     """
+
+    plain = Equidistant
 
     def _plane(self, theta: Tensor) -> Tensor:
         return theta
@@ -336,6 +304,10 @@ class Mei(DistortedLens):
     """
 
     parameters = ("xi", "focal")
+    starts: ClassVar = {"xi": XI_STARTS}
+    bounds: ClassVar = {**FocalLens.bounds, "xi": (0.0, math.inf)}
+    terms = 2
+    plain = Spherical
     xi: Tensor
 
     def __init__(
@@ -378,6 +350,9 @@ class BrownConrady(DistortedLens):
     """
 
     optional = ("radial", "denominator", "tangential", "prism")
+    lists = optional
+    terms = 3
+    plain = Perspective
     denominator: Tensor | None
 
     def _plane(self, theta: Tensor) -> Tensor:
@@ -392,17 +367,17 @@ class BrownConrady(DistortedLens):
     def _plane_limit(self) -> Tensor:
         return torch.full_like(self.focal.detach(), math.pi / 2 - MARGIN)
 
-    def _divisor(self, w: Tensor) -> Tensor:
-        return 1 + w * w * horner(w * w, self.denominator)
-
     def _stretch(self, w: Tensor) -> Tensor:
         stretched = super()._stretch(w)
-        return stretched if self.denominator is None else stretched / self._divisor(w)
+        if self.denominator is None:
+            return stretched
+        return stretched / (1 + w * w * horner(w * w, self.denominator))
 
     def _stretch_slope(self, w: Tensor) -> Tensor:
         slope = super()._stretch_slope(w)
         if self.denominator is None:
             return slope
-        divisor, grows = self._divisor(w), w * horner(w * w, slopes(self.denominator, 2, 2))
+        divisor = 1 + w * w * horner(w * w, self.denominator)
+        grows = w * horner(w * w, slopes(self.denominator, 2, 2))
         slope = (slope * divisor - super()._stretch(w) * grows) / divisor**2
         return torch.where(divisor > 0, slope, -1)  # beyond a pole nothing lands

@@ -2,25 +2,17 @@
 
 import itertools
 import math
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from darswin.lens.base import FRAME, Lens
+from darswin.lens.base import MODELS, Lens
 from darswin.lens.curves import Tabulated, as_curves
-from darswin.lens.description import MODELS
-from darswin.lens.distorted import BrownConrady, DistortedLens, Mei
-from darswin.lens.polynomial import OCamInverse, Polynomial
-from darswin.lens.sphere import DoubleSphere
+from darswin.lens.polynomial import PolynomialLens
 
-# Where to start from, several values of each; lengths are found from the curve's slope at 0.
-STARTS = {"xi": (1.0, -0.2, 0.5, 2.0), "alpha": (0.5, 0.7), "beta": (1.0,), "omega": (1.0,)}
-BOUNDS = {
-    "xi": (0.0, math.inf), "alpha": (0.0, 1.0), "beta": (1e-6, math.inf), "omega": (1e-3, 3.14),
-    "focal": (1e-9, math.inf),
-}  # fmt: skip
-TERMS = {Mei: 2, BrownConrady: 3}
+# How finely rays are compared.
 RINGS, SPOKES = 200, 16
 
 
@@ -41,7 +33,7 @@ def fit(model: str | type[Lens], lens: Lens, *, terms: int | None = None) -> Fit
         model: a lens class, or its name in `darswin.lens.MODELS`.
         lens: N lenses.
         terms: of the model's polynomial. None means the usual number: 2 of `Mei`, 3 of
-            `BrownConrady`, 4 of the others.
+            `BrownConrady`, 4 of the others (their `terms`).
 
     Returns:
         (lens, error): N lenses in the dtype of `lens`, and for each the largest distance in px, on
@@ -51,10 +43,10 @@ def fit(model: str | type[Lens], lens: Lens, *, terms: int | None = None) -> Fit
         ValueError: an unknown model, or one that cannot reach θ_max.
     """
     model = _model(model)
-    if model is Tabulated:
-        fitted = as_curves(lens if lens.is_radial else lens.replace(tangential=None, prism=None))
-        return Fit(fitted, largest_distance(fitted, lens))
-    terms = TERMS.get(model, 4) if terms is None else terms
+    if issubclass(model, Tabulated):
+        curves = as_curves(lens if lens.is_radial else lens.replace(tangential=None, prism=None))
+        return Fit(curves, largest_distance(curves, lens))
+    terms = model.terms if terms is None else terms
     exact = lens.detach().to(torch.float64)
     parts = [_fit_one(model, exact[k], terms) for k in range(len(lens))]
     names = parts[0].parameters + parts[0].optional
@@ -63,8 +55,7 @@ def fit(model: str | type[Lens], lens: Lens, *, terms: int | None = None) -> Fit
         for name in names
         if getattr(parts[0], name) is not None
     }
-    frame = {name: getattr(exact, name) for name in FRAME}
-    fitted = model(**tensors, theta_max=exact.theta_max, **frame)
+    fitted = model(**tensors, **{name: getattr(exact, name) for name in exact.common})
     return Fit(fitted.to(lens.theta_max.dtype), largest_distance(fitted, exact).to(lens.theta_max))
 
 
@@ -79,7 +70,7 @@ def largest_distance(lens: Lens, other: Lens) -> Tensor:
 def _model(model: str | type[Lens]) -> type[Lens]:
     if isinstance(model, str):
         if model not in MODELS:
-            raise ValueError(f"model must be one of {list(MODELS)}, got {model!r}")
+            raise ValueError(f"model must be one of {sorted(MODELS)}, got {model!r}")
         return MODELS[model]
     if not isinstance(model, type) or not issubclass(model, Lens):
         raise TypeError(f"model must be a lens class or its name, got {model!r}")
@@ -98,14 +89,14 @@ def _directions(like: Lens, count: int) -> Tensor:
 
 def _fit_one(model: type[Lens], lens: Lens, terms: int) -> Lens:
     theta = lens.theta_max[:, None, None] * _fractions(lens, RINGS)[:, None]
-    # Along one azimuth all is said about a radial lens.
-    aside = not lens.is_radial and issubclass(model, DistortedLens)
+    # A radial lens is the same along all azimuths.
+    aside = not lens.is_radial and "tangential" in model.optional
     direction = _directions(lens, SPOKES if aside else 1)
     goal = lens._flat(theta, direction) if aside else lens.project(theta)[..., None] * direction
+    if issubclass(model, PolynomialLens):
+        coefficients = _coefficients(model, lens, terms)
+        return model._from_tensors({"coefficients": coefficients, "theta_max": lens.theta_max})
     best = None
-    if "coefficients" in model.parameters:
-        tensors = {"coefficients": _coefficients(model, lens, terms)}
-        return model._from_tensors(tensors | {"theta_max": lens.theta_max})
     for start in _starts(model, lens, terms, aside):
         found, cost = _least_squares(model, start, lens.theta_max, theta, direction, goal)
         if best is None or cost < best[1]:
@@ -116,51 +107,27 @@ def _fit_one(model: type[Lens], lens: Lens, terms: int) -> Lens:
     return model._from_tensors(best[0] | {"theta_max": lens.theta_max})
 
 
-def _starts(model: type[Lens], lens: Lens, terms: int, aside: bool) -> list[dict[str, Tensor]]:
-    """Parameters to start from; the free ones' shapes are theirs."""
+def _starts(model: type[Lens], lens: Lens, terms: int, aside: bool) -> Iterator[dict[str, Tensor]]:
+    """Parameters to start from, with the shapes that all shall have."""
     slope = lens.project(1e-4 * lens.theta_max) / (1e-4 * lens.theta_max)
-    free = [name for name in model.parameters if name in STARTS]
-    starts = []
-    for values in itertools.product(*(STARTS[name] for name in free)):
+    free = [name for name in model.parameters if name in model.starts]
+    for values in itertools.product(*(model.starts[name] for name in free)):
         start = {n: slope.new_tensor([v]) for n, v in zip(free, values, strict=True)}
         if "radial" in model.optional:
             start["radial"] = slope.new_zeros(1, terms)
         if aside:
             start |= {"tangential": slope.new_zeros(1, 2), "prism": slope.new_zeros(1, 4)}
+        # The focal length with which the curve has the right slope at 0.
         unit = start | {"focal": slope.new_ones(1), "theta_max": lens.theta_max}
         start["focal"] = slope * 1e-4 / model._from_tensors(unit).project(1e-4)
-        starts.append(start)
-    return starts
+        yield start
 
 
-def _coefficients(model: type[Lens], lens: Lens, terms: int) -> Tensor:
-    """Of the polynomials, a linear problem."""
+def _coefficients(model: type[PolynomialLens], lens: Lens, terms: int) -> Tensor:
     theta = lens.theta_max[0] * _fractions(lens, RINGS)
-    r = lens.project(theta[None])[0]
-    powers = torch.arange(terms + 1, dtype=r.dtype)
-    if model is Polynomial:
-        return _solve(theta[:, None] ** powers[1:], r)
-    if model is OCamInverse:
-        return _solve((theta - math.pi / 2)[:, None] ** powers, r)
-    # a₀ + a₂ r² + … = -r / tan θ; the toolbox has no a₁, which is a kink at the centre. Each row
-    # is weighted so that what it misses is, to first order, pixels.
+    radius = lens.project(theta[None])[0]
     slope = torch.func.jvp(lens.project, (theta[None],), (torch.ones_like(theta)[None],))[1][0]
-    scale, weight = r.max(), slope * torch.sin(theta) / r
-    matrix = torch.sin(theta)[:, None] * (r / scale)[:, None] ** powers
-    solved = _solve(weight[:, None] * matrix[:, powers != 1], -weight * r * torch.cos(theta))
-    coefficients = r.new_zeros(1, terms + 1)
-    coefficients[:, powers != 1] = solved / scale ** powers[powers != 1]
-    return coefficients
-
-
-def _solve(matrix: Tensor, value: Tensor) -> Tensor:
-    return torch.linalg.lstsq(matrix, value[:, None]).solution.T
-
-
-def _bounds(model: type[Lens], name: str) -> tuple[float, float]:
-    if model is DoubleSphere and name == "xi":
-        return (-0.999, math.inf)
-    return BOUNDS.get(name, (-math.inf, math.inf))
+    return model.closest(theta, radius, slope, terms)
 
 
 def _least_squares(
@@ -175,7 +142,7 @@ def _least_squares(
     names = list(start)
     shapes = [start[name].shape for name in names]
     sizes = [shape.numel() for shape in shapes]
-    bounds = [_bounds(model, name) for name in names]
+    bounds = [model.bounds.get(name, (-math.inf, math.inf)) for name in names]
     low, high = (
         torch.cat([theta.new_full((s,), b[end]) for b, s in zip(bounds, sizes, strict=True)])
         for end in (0, 1)

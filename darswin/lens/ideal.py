@@ -1,24 +1,22 @@
 """Lenses of one focal length: the projections that a lens designer aims at."""
 
 import math
-from typing import Self
+from typing import ClassVar
 
 import torch
 from torch import Tensor
 
-from darswin.lens.base import MARGIN, Lens, Number, _as_tensors
+from darswin.lens.base import MARGIN
+from darswin.lens.batch import Number
+from darswin.lens.focal import FocalLens
 
 
-class IdealLens(Lens):
-    """Base of the lenses r = f u(θ).
+class IdealLens(FocalLens, register=False):
+    """Base of the lenses r = f u(θ) that have no other parameter.
 
     Args:
         focal: f > 0, px. Others: as `Lens`.
     """
-
-    parameters = ("focal",)
-    lengths = ("focal",)
-    focal: Tensor
 
     def __init__(
         self,
@@ -28,18 +26,6 @@ class IdealLens(Lens):
         **frame: Number | None,
     ):
         super().__init__(theta_max, center, focal=focal, **frame)
-
-    @classmethod
-    def from_fov(
-        cls, fov: Number, radius: Number, center: Number | None = None, **frame: Number | None
-    ) -> Self:
-        """The lens whose full field of view `fov` (rad) fills a circle of `radius` px."""
-        t = _as_tensors({"fov": fov, "radius": radius})
-        theta_max = t["fov"] / 2
-        return cls(t["radius"] / cls._rise(theta_max), theta_max, center, **frame)
-
-    def _validate(self) -> None:
-        self._require("focal", (self.focal > 0) & self.focal.isfinite(), "finite and above 0")
 
     @staticmethod
     def _rise(theta: Tensor) -> Tensor:
@@ -57,11 +43,11 @@ class IdealLens(Lens):
 
     def _angle_at(self, radius: Tensor) -> Tensor:
         rise = radius / self._row(self.focal, radius.dim())
-        # Rounding can take u above its top, where there is no angle.
+        # Rounding can take u above its largest value, which no angle has.
         return self._fall(rise if self._top is None else rise.clamp(max=self._top))
 
-    _end = math.pi  # where u stops rising, or to be finite
-    _top: float | None = None  # u there, where it is finite
+    _end = math.pi  # θ where u stops rising, or becomes infinite
+    _top: float | None = None  # u there, if it is finite
 
     @property
     def theta_limit(self) -> Tensor:
@@ -72,8 +58,14 @@ class Perspective(IdealLens):
     """r = f tan θ, θ < 90°: the pinhole camera. Arguments: `focal`, and those of `Lens`."""
 
     _end = math.pi / 2
-    _rise = staticmethod(torch.tan)
-    _fall = staticmethod(torch.atan)
+
+    @staticmethod
+    def _rise(theta: Tensor) -> Tensor:
+        return torch.tan(theta)
+
+    @staticmethod
+    def _fall(rise: Tensor) -> Tensor:
+        return torch.atan(rise)
 
 
 class Equidistant(IdealLens):
@@ -119,11 +111,17 @@ class Orthographic(IdealLens):
 
     _end = math.pi / 2
     _top = 1.0
-    _rise = staticmethod(torch.sin)
-    _fall = staticmethod(torch.asin)
+
+    @staticmethod
+    def _rise(theta: Tensor) -> Tensor:
+        return torch.sin(theta)
+
+    @staticmethod
+    def _fall(rise: Tensor) -> Tensor:
+        return torch.asin(rise)
 
 
-class FieldOfView(Lens):
+class FieldOfView(FocalLens):
     """r = f atan(2 tan(ω/2) tan θ) / ω: the FOV model, here also beyond 90°.
 
     Args:
@@ -133,9 +131,9 @@ class FieldOfView(Lens):
     """
 
     parameters = ("omega", "focal")
-    lengths = ("focal",)
+    starts: ClassVar = {"omega": (1.0,)}
+    bounds: ClassVar = {**FocalLens.bounds, "omega": (1e-3, 3.14)}
     omega: Tensor
-    focal: Tensor
 
     def __init__(
         self,
@@ -149,7 +147,7 @@ class FieldOfView(Lens):
 
     def _validate(self) -> None:
         self._require("omega", (self.omega > 0) & (self.omega < math.pi), "in (0, π)")
-        self._require("focal", (self.focal > 0) & self.focal.isfinite(), "finite and above 0")
+        super()._validate()
 
     def project(self, theta: Number) -> Tensor:
         theta, omega, focal = self._aligned(theta, "omega", "focal")

@@ -11,10 +11,10 @@ Function = Callable[[Tensor], Tensor]
 def inverse(function: Function, slope: Function, value: Tensor, end: Tensor) -> Tensor:
     """The x in [0, end] at which a function that rises from 0 takes a value.
 
-    Newton's method inside a bracket, which is halved instead where a step would leave it or is not
-    half as long as the one before. Two more steps carry the gradients of the inverse, to `value`
-    and to whatever `function` and `slope` depend on: Newton's method doubles the order to which a
-    step is right, so derivatives up to the third are exact.
+    Newton's method inside a bracket; a step that would leave it, or is more than half as long as
+    the one before, is replaced by the bracket's middle. Two more steps carry the gradients of the
+    inverse, to `value` and to whatever `function` and `slope` depend on: each step doubles the
+    order of the error, so that derivatives up to the third are exact.
 
     Args:
         function, slope: of x, elementwise. value: any shape. end: broadcasts to that of x.
@@ -47,7 +47,7 @@ def rising_limit(slope: Function, end: Tensor) -> Tensor:
     x = end[:, None] * steps
     falls = ~(slope(x) > 0)
     if not torch.compiler.is_compiling() and not falls.any():
-        return end  # as nearly always
+        return end  # the usual case
     first = falls.int().argmax(1, keepdim=True)
     low, high = x.gather(1, (first - 1).clamp(min=0)), x.gather(1, first)
     for _ in range(50):

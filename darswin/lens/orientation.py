@@ -15,7 +15,7 @@ def stored_size(size: tuple[int, int], orientation: int) -> tuple[int, int]:
 def in_upright_picture(lens: Lens, size: tuple[int, int], orientation: int) -> Lens:
     """The lens in a picture that shows all that it was calibrated with, and was turned upright.
 
-    Where only the upright picture has the calibration's shape, the calibration is of such pictures.
+    If only the upright picture has the calibration's shape, the calibration was made upright.
 
     Args:
         lens: one that has an image_size. size: (H, W), upright. orientation: EXIF's, 1 to 8.
@@ -59,9 +59,4 @@ def turned(lens: Lens, orientation: int) -> Lens:
     changed = {"image_size": size, "center": off_middle @ turn.T + (size.flip(1) - 1) / 2}
     if lens.affine is not None:
         changed["affine"] = turn @ lens.affine @ turn.T
-    # What moves rays aside are vectors: (p₂, p₁), (s₁, s₃) and (s₂, s₄).
-    if getattr(lens, "tangential", None) is not None:
-        changed["tangential"] = (lens.tangential.flip(1) @ turn.T).flip(1)
-    if getattr(lens, "prism", None) is not None:
-        changed["prism"] = (turn @ lens.prism.unflatten(1, (2, 2))).flatten(1)
-    return lens.replace(**changed)
+    return lens.replace(**changed, **lens._turned(turn))

@@ -5,7 +5,8 @@ import math
 import torch
 from torch import Tensor
 
-from darswin.lens.base import MARGIN, Lens, Number
+from darswin.lens.base import MARGIN, Lens
+from darswin.lens.batch import Number
 from darswin.lens.inverse import inverse, rising_limit
 
 
@@ -23,7 +24,7 @@ def slopes(coefficients: Tensor, first: int, step: int = 1) -> Tensor:
     return coefficients * powers
 
 
-class PolynomialLens(Lens):
+class PolynomialLens(Lens, register=False):
     """Base of the lenses that are all coefficients, lowest power first.
 
     Args:
@@ -31,6 +32,7 @@ class PolynomialLens(Lens):
     """
 
     parameters = ("coefficients",)
+    lists = ("coefficients",)
     lengths = ("coefficients",)
     coefficients: Tensor
 
@@ -53,6 +55,15 @@ class PolynomialLens(Lens):
         end = torch.full_like(self.coefficients[:, 0].detach(), math.pi)
         return rising_limit(self._slope, end) - MARGIN
 
+    @classmethod
+    def closest(cls, theta: Tensor, radius: Tensor, slope: Tensor, terms: int) -> Tensor:
+        """(1, n): the coefficients of the closest polynomial of as many terms, for `fit`.
+
+        Args:
+            theta: (K,) rad. radius, slope: (K,), r there in px and dr/dθ.
+        """
+        raise NotImplementedError
+
 
 class Polynomial(PolynomialLens):
     """r = k₁ θ + k₂ θ² + … + k_n θⁿ, of any degree; WoodScape's `radial_poly` has four.
@@ -71,6 +82,11 @@ class Polynomial(PolynomialLens):
     def project(self, theta: Number) -> Tensor:
         (theta,) = self._aligned(theta)
         return theta * horner(theta, self.coefficients)
+
+    @classmethod
+    def closest(cls, theta: Tensor, radius: Tensor, slope: Tensor, terms: int) -> Tensor:
+        powers = torch.arange(1, terms + 1, dtype=theta.dtype)
+        return _least_squares(theta[:, None] ** powers, radius)
 
 
 class OCam(PolynomialLens):
@@ -111,13 +127,23 @@ class OCam(PolynomialLens):
         end = self._row(self._last_radius, theta.dim())
         return inverse(self._angle_at, self._angle_slope, theta, end)
 
-    def _scaled(self, scale: float | Tensor) -> "OCam":
-        power = 1 - torch.arange(self.coefficients.shape[1], device=self.coefficients.device)
-        like = self.coefficients
-        factor = (
-            torch.as_tensor(scale, dtype=like.dtype, device=like.device).reshape(-1, 1) ** power
-        )
-        return self.replace(coefficients=self.coefficients * factor)
+    def _scaled(self, scale: Tensor) -> "OCam":
+        power = 1 - torch.arange(self.coefficients.shape[1], device=scale.device)
+        return self.replace(coefficients=self.coefficients * scale[:, None] ** power)
+
+    @classmethod
+    def closest(cls, theta: Tensor, radius: Tensor, slope: Tensor, terms: int) -> Tensor:
+        # a₀ + a₂ r² + … = -r / tan θ; the toolbox has no a₁, which is a kink at the centre. Each
+        # row is weighted so that its error is, to first order, in pixels.
+        powers = torch.arange(terms + 1, dtype=theta.dtype)
+        used = powers != 1
+        scale, weight = radius.max(), slope * torch.sin(theta) / radius
+        matrix = torch.sin(theta)[:, None] * (radius / scale)[:, None] ** powers
+        depth = -weight * radius * torch.cos(theta)
+        coefficients = radius.new_zeros(1, terms + 1)
+        solved = _least_squares(weight[:, None] * matrix[:, used], depth)
+        coefficients[:, used] = solved / scale ** powers[used]
+        return coefficients
 
 
 class OCamInverse(PolynomialLens):
@@ -131,8 +157,8 @@ class OCamInverse(PolynomialLens):
     Source: the OCamCalib toolbox, world2cam.
     """
 
-    def _set_theta_max(self) -> None:
-        super()._set_theta_max()
+    def _set_theta_max(self, wanted: Tensor | None) -> None:
+        super()._set_theta_max(wanted)
         self._require("coefficients", self.r_max > 0, "such that r at theta_max is above 0")
 
     def _slope(self, theta: Tensor) -> Tensor:
@@ -141,3 +167,13 @@ class OCamInverse(PolynomialLens):
     def project(self, theta: Number) -> Tensor:
         (theta,) = self._aligned(theta)
         return horner(theta - math.pi / 2, self.coefficients)
+
+    @classmethod
+    def closest(cls, theta: Tensor, radius: Tensor, slope: Tensor, terms: int) -> Tensor:
+        powers = torch.arange(terms + 1, dtype=theta.dtype)
+        return _least_squares((theta - math.pi / 2)[:, None] ** powers, radius)
+
+
+def _least_squares(matrix: Tensor, value: Tensor) -> Tensor:
+    """(1, n): x of the least |matrix @ x - value|."""
+    return torch.linalg.lstsq(matrix, value[:, None]).solution.T

@@ -1,10 +1,17 @@
-"""What one lens shows, in another lens's image: where it stands, and how it looks."""
+"""What one lens shows, in another lens's image: where it stands, and how it looks.
+
+A map says for each pixel of a target where in the source's image its ray lands: (..., 2), x and y,
+and (`OUTSIDE`, `OUTSIDE`) where no ray does.
+"""
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from darswin.lens import Lens, Perspective
+from darswin.lens.base import Lens
+from darswin.lens.ideal import Perspective
+
+OUTSIDE = -10.0  # px: beyond any image, also for an interpolation of several pixels
 
 
 def reprojection(
@@ -19,7 +26,7 @@ def reprojection(
         source, target: N lenses each, or one. source_size, size: (H, W) of their images.
 
     Returns:
-        (N, H, W, 2): x and y; (-10, -10), outside the image, where a ray is beyond either θ_max.
+        (N, H, W, 2): x and y; `OUTSIDE` where a ray is beyond either θ_max.
     """
     like = target.theta_max
     height, width = size
@@ -29,10 +36,28 @@ def reprojection(
         indexing="ij",
     )
     theta, direction = target.rays(torch.stack((x, y), -1)[None], size)
-    limit = torch.minimum(source.theta_max, target.theta_max)[:, None, None]
-    seen = theta <= limit * (1 + 4 * torch.finfo(like.dtype).eps)  # False for NaN
-    there = source.pixels(torch.where(seen, theta, limit), direction, source_size)
-    return torch.where(seen[..., None], there, -10)
+    theta = torch.where(target.sees(theta), theta, torch.nan)
+    return as_map(source.seen_pixels(theta, direction, source_size))
+
+
+def radial_reprojection(source: Lens, target: Lens, radii: Tensor) -> Tensor:
+    """`reprojection` of two radial lenses without `affine`, along one azimuth.
+
+    Args:
+        radii: (1, K) px, above 0, from the principal point of `target`, one lens.
+
+    Returns:
+        (1, K): how many times as far from its own principal point `source` has the same ray; NaN
+        where a ray is beyond either θ_max.
+    """
+    theta = target.unproject(radii)
+    seen = target.sees(theta) & source.sees(theta)
+    return torch.where(seen, source.project(torch.where(seen, theta, 0.0)) / radii, torch.nan)
+
+
+def as_map(pixels: Tensor) -> Tensor:
+    """Pixels (..., 2) with `OUTSIDE` in place of NaN."""
+    return torch.where(pixels.isnan(), OUTSIDE, pixels)
 
 
 def reproject(images: Tensor, source: Lens, target: Lens, size: tuple[int, int]) -> Tensor:

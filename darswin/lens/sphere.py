@@ -1,14 +1,21 @@
 """Lenses that project by way of a sphere or an ellipsoid, with a closed inverse."""
 
-from typing import Self
+import math
+from typing import ClassVar
 
 import torch
 from torch import Tensor
 
-from darswin.lens.base import MARGIN, Lens, Number, _as_tensors
+from darswin.lens.base import MARGIN
+from darswin.lens.batch import Number
+from darswin.lens.focal import FocalLens
+
+# Where `fit` starts from.
+XI_STARTS = (1.0, -0.2, 0.5, 2.0)
+ALPHA_STARTS = (0.5, 0.7)
 
 
-class Spherical(Lens):
+class Spherical(FocalLens):
     """r = f sin θ / (ξ + cos θ): the unified model, perspective at ξ = 0, stereographic at ξ = 1.
 
     Args:
@@ -18,7 +25,8 @@ class Spherical(Lens):
     """
 
     parameters = ("xi", "focal")
-    lengths = ("focal",)
+    starts: ClassVar = {"xi": XI_STARTS}
+    bounds: ClassVar = {**FocalLens.bounds, "xi": (0.0, math.inf)}
     xi: Tensor
     focal: Tensor
 
@@ -32,24 +40,9 @@ class Spherical(Lens):
     ):
         super().__init__(theta_max, center, xi=xi, focal=focal, **frame)
 
-    @classmethod
-    def from_fov(
-        cls,
-        xi: Number,
-        fov: Number,
-        radius: Number,
-        center: Number | None = None,
-        **frame: Number | None,
-    ) -> Self:
-        """The lens of ξ whose full field of view `fov` (rad) fills a circle of `radius` px."""
-        t = _as_tensors({"xi": xi, "fov": fov, "radius": radius})
-        theta_max = t["fov"] / 2
-        focal = t["radius"] * (t["xi"] + torch.cos(theta_max)) / torch.sin(theta_max)
-        return cls(t["xi"], focal, theta_max, center, **frame)
-
     def _validate(self) -> None:
         self._require("xi", (self.xi >= 0) & self.xi.isfinite(), "finite and at least 0")
-        self._require("focal", (self.focal > 0) & self.focal.isfinite(), "finite and above 0")
+        super()._validate()
 
     @property
     def theta_limit(self) -> Tensor:
@@ -59,12 +52,16 @@ class Spherical(Lens):
         theta, xi, focal = self._aligned(theta, "xi", "focal")
         return focal * torch.sin(theta) / (xi + torch.cos(theta))
 
+    def _scale_to(self, radius: Tensor) -> Tensor:
+        # Not radius / r_max, which rounds otherwise: data sets are the same to the bit.
+        return radius * (self.xi + torch.cos(self.theta_max)) / torch.sin(self.theta_max)
+
     def _angle_at(self, radius: Tensor) -> Tensor:
         radius, xi, focal = self._aligned(radius, "xi", "focal")
         return sphere_angle(radius / focal, xi)
 
 
-class EnhancedUnified(Lens):
+class EnhancedUnified(FocalLens):
     """r = f sin θ / (α √(β sin² θ + cos² θ) + (1 - α) cos θ): EUCM, at β = 1 the unified model.
 
     Args:
@@ -75,7 +72,8 @@ class EnhancedUnified(Lens):
     """
 
     parameters = ("alpha", "beta", "focal")
-    lengths = ("focal",)
+    starts: ClassVar = {"alpha": ALPHA_STARTS, "beta": (1.0,)}
+    bounds: ClassVar = {**FocalLens.bounds, "alpha": (0.0, 1.0), "beta": (1e-6, math.inf)}
     alpha: Tensor
     beta: Tensor
     focal: Tensor
@@ -96,14 +94,14 @@ class EnhancedUnified(Lens):
         self._require(
             "beta", (self.beta != 0) & self.beta.isfinite(), "finite and above 0, or below"
         )
-        self._require("focal", (self.focal > 0) & self.focal.isfinite(), "finite and above 0")
+        super()._validate()
 
     @property
     def theta_limit(self) -> Tensor:
         # Where cos θ = -w √(β sin² θ + cos² θ).
         w, beta = _cone(self.alpha.detach()), self.beta.detach()
         last = torch.atan2(root(1 - w * w), -w * root(beta))
-        # β below 0: where the square root has none.
+        # Where β is below 0, the lens ends where the square root does.
         return torch.where(beta > 0, last, torch.atan(root(-beta).reciprocal())) - MARGIN
 
     def project(self, theta: Number) -> Tensor:
@@ -122,7 +120,7 @@ class EnhancedUnified(Lens):
         return torch.atan2(rho, z)
 
 
-class DoubleSphere(Lens):
+class DoubleSphere(FocalLens):
     """r = f sin θ / (α √(sin² θ + (ξ + cos θ)²) + (1 - α) (ξ + cos θ)).
 
     Args:
@@ -132,7 +130,8 @@ class DoubleSphere(Lens):
     """
 
     parameters = ("xi", "alpha", "focal")
-    lengths = ("focal",)
+    starts: ClassVar = {"xi": XI_STARTS, "alpha": ALPHA_STARTS}
+    bounds: ClassVar = {**FocalLens.bounds, "xi": (-0.999, math.inf), "alpha": (0.0, 1.0)}
     xi: Tensor
     alpha: Tensor
     focal: Tensor
@@ -151,7 +150,7 @@ class DoubleSphere(Lens):
     def _validate(self) -> None:
         self._require("xi", (self.xi > -1) & self.xi.isfinite(), "finite and above -1")
         self._require("alpha", (self.alpha >= 0) & (self.alpha <= 1), "in [0, 1]")
-        self._require("focal", (self.focal > 0) & self.focal.isfinite(), "finite and above 0")
+        super()._validate()
 
     @property
     def theta_limit(self) -> Tensor:
@@ -193,11 +192,11 @@ def sphere_limit(xi: Tensor) -> Tensor:
 
 
 def _cone(alpha: Tensor) -> Tensor:
-    """The last angle of the unified model of α has the cosine -w."""
+    """w: the cosine of the last angle of the unified model of α is -w."""
     return torch.where(alpha <= 0.5, alpha / (1 - alpha), (1 - alpha) / alpha.clamp(min=0.5))
 
 
 def root(square: Tensor) -> Tensor:
-    """√, and nearly 0 where rounding made the square of a last ray negative."""
+    """√, and nearly 0 where rounding made a square negative, as at the last ray of a lens."""
     eps = torch.finfo(square.dtype).eps
     return square.clamp(min=eps * eps).sqrt()

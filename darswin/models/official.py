@@ -16,7 +16,7 @@ from darswin.lens import Lens, Number, Spherical
 from darswin.models.stages import Pair, StagePlan
 
 
-class OfficialPolynomial(Lens):
+class OfficialPolynomial(Lens, register=False):
     """The released code's polynomial lens, an angle as a function of the radius.
 
     θ(x) = x (d₁ + d₂ x + d₃ x² + d₄ x³) with x = r / radius in [0, 1], inverted on a table of 50
@@ -28,6 +28,7 @@ class OfficialPolynomial(Lens):
     """
 
     parameters = ("coefficients", "radius")
+    lists = ("coefficients",)
     lengths = ("radius",)
     coefficients: Tensor
     radius: Tensor

@@ -23,10 +23,11 @@ from torch import Tensor
 from darswin.layers.grid import PolarGrid
 from darswin.layers.sampling import PolarSample
 from darswin.lens import Lens
+from darswin.lens.reprojection import OUTSIDE
 from darswin.ops import polar_sample
 from darswin.utils.files import replace_file
 from darswin.viz.report import SIDES, beyond_lens, pixels_per_degree
-from darswin.viz.views import BEYOND, undistort, view_map
+from darswin.viz.views import undistort, view_map
 
 SPACING_SYMBOLS = {"theta": "θ", "tan": "tan θ", "g": "g(θ)", "radius": "r"}
 
@@ -171,7 +172,7 @@ def draw_view(image: np.ndarray, lens: Lens, rays: Tensor, *, axes: Axes | None 
     axes = axes or _new_axes()
     x, y = np.moveaxis(view_map(lens, rays, image.shape[:2]), -1, 0)
     height, width = image.shape[:2]
-    beyond = (x == BEYOND) & (y == BEYOND)
+    beyond = (x == OUTSIDE) & (y == OUTSIDE)
     outside = ~beyond & ((x < -0.5) | (x > width - 0.5) | (y < -0.5) | (y > height - 0.5))
     _show(axes, undistort(image, lens, rays), beyond | outside)
     lines = ((axes.xaxis, _middle(rays), 1), (axes.yaxis, _middle(rays.transpose(0, 1)), -1))

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from darswin.layers.grid import SPACINGS, polar_grid
+from darswin.layers.grid import SPACINGS, Spacing, polar_grid
 from darswin.lens.base import Lens
 
 SIDES = ("left", "top", "right", "bottom")
@@ -69,7 +69,7 @@ class Patches(NamedTuple):
     ratio: float  # of the largest patch to the smallest
 
 
-def patches(lens: Lens, spacing: str, rings: int, sectors: int) -> Patches:
+def patches(lens: Lens, spacing: Spacing, rings: int, sectors: int) -> Patches:
     """How large the patches of one lens's partition are."""
     grid = polar_grid(lens, (1, 1), rings=rings, sectors=sectors, samples=(1, 1), spacing=spacing)
     borders = grid.borders[0]
@@ -81,7 +81,7 @@ def patches(lens: Lens, spacing: str, rings: int, sectors: int) -> Patches:
     return Patches(width, area, share[1] / share[0])
 
 
-def best_spacing(lens: Lens, rings: int, sectors: int) -> str:
+def best_spacing(lens: Lens, rings: int, sectors: int) -> Spacing:
     """The spacing that knows the lens and has the most even patches, in pixels, of one lens."""
     usable = [s for s in SPACINGS if s != "radius" and _usable(lens, s)]
     return min(usable, key=lambda spacing: patches(lens, spacing, rings, sectors).ratio)
@@ -105,7 +105,8 @@ def describe(
     if image_size is None:
         if lens.image_size is None:
             raise ValueError("this lens needs the image_size, (H, W)")
-        image_size = tuple(round(side) for side in lens.image_size[0].tolist())
+        height, width = (round(side) for side in lens.image_size[0].tolist())
+        image_size = height, width
     return "\n".join(
         f"{name:<16}{text}".rstrip()
         for name, text in (
@@ -203,7 +204,7 @@ def _spacings(lens: Lens, rings: int, sectors: int) -> list[tuple[str, str]]:
     return rows
 
 
-def _usable(lens: Lens, spacing: str) -> bool:
+def _usable(lens: Lens, spacing: Spacing) -> bool:
     return spacing != "tan" or lens.theta_max.item() < math.pi / 2
 
 

@@ -21,9 +21,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from darswin.data.warp import remap
 from darswin.lens import Lens
-
-BEYOND = -10.0  # px: where `view_map` puts rays beyond θ_max, outside any image
+from darswin.lens.reprojection import as_map
 
 
 def perspective(
@@ -98,7 +98,7 @@ def view_map(lens: Lens, rays: Tensor, image_size: tuple[int, int] | None = None
             point of a lens that has none.
 
     Returns:
-        (H, W, 2) float32, x and y; (`BEYOND`, `BEYOND`), outside the image, beyond θ_max.
+        (H, W, 2) float32, x and y; `darswin.lens.reprojection.OUTSIDE` beyond θ_max.
 
     Raises:
         ValueError: more than one lens, or rays of another shape.
@@ -108,12 +108,7 @@ def view_map(lens: Lens, rays: Tensor, image_size: tuple[int, int] | None = None
     if rays.dim() != 3 or rays.shape[2] != 3:
         raise ValueError(f"rays must have shape (H, W, 3), got {tuple(rays.shape)}")
     lens, rays = lens.detach().to("cpu", torch.float64), rays.detach().to("cpu", torch.float64)
-    aside = rays[..., :2].norm(dim=-1)
-    theta = torch.atan2(aside, rays[..., 2])
-    seen = (theta <= lens.theta_max + 1e-9) & rays.any(-1)
-    direction = rays[..., :2] / aside.clamp(min=1e-300)[..., None]
-    pixels = lens.pixels(torch.where(seen, theta, 0.0)[None], direction[None], image_size)[0]
-    return torch.where(seen[..., None], pixels, BEYOND).to(torch.float32).numpy()
+    return as_map(lens.project_points(rays[None], image_size))[0].to(torch.float32).numpy()
 
 
 def undistort(
@@ -132,10 +127,8 @@ def undistort(
     Raises:
         ValueError: as `view_map`.
     """
-    there = view_map(lens, rays, image.shape[:2])
-    return cv2.remap(
-        image, there, None, interpolation, borderMode=cv2.BORDER_CONSTANT, borderValue=0
-    )
+    height, width = image.shape[:2]
+    return remap(image, view_map(lens, rays, (height, width)), interpolation)
 
 
 def _plane(size: tuple[int, int], width: float) -> tuple[Tensor, Tensor]:

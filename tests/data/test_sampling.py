@@ -13,11 +13,11 @@ def batches(order):
 
 def test_an_epoch_has_each_image_once_and_the_next_is_another_shuffle():
     order = TrainingOrder(25, 6, rank=0, world=1)
-    first = [d.index for d in order]
+    first = [d.picture for d in order]
     assert len(first) == len(order) == 24 and len(set(first)) == 24
-    assert first == [d.index for d in order]
+    assert first == [d.picture for d in order]
     order.set_epoch(1)
-    assert first != [d.index for d in order] and {d.epoch for d in order} == {1}
+    assert first != [d.picture for d in order] and {d.epoch for d in order} == {1}
 
 
 @pytest.mark.parametrize("batch", [6, 5])
@@ -26,7 +26,7 @@ def test_partners_share_a_lens(batch):
         assert [d.lens for d in one] == [d.lens for d in one[::-1]]
         assert len({d.lens for d in one}) == (batch + 1) // 2
     apart = TrainingOrder(30, batch, rank=0, world=1, pairs=False)
-    assert all(d.lens == d.index for d in apart)
+    assert all(d.lens == d.picture for d in apart)
 
 
 @pytest.mark.parametrize("world", [2, 3])
@@ -36,10 +36,10 @@ def test_processes_together_see_the_batches_of_one(world):
     for k, one in enumerate(whole):
         together = [d for part in parts for d in part[k]]
         assert sorted(together) == sorted(one)
-        partner = {d.index: p.index for d, p in zip(one, one[::-1], strict=True)}
+        partner = {d.picture: p.picture for d, p in zip(one, one[::-1], strict=True)}
         for part in parts:
             for d, p in zip(part[k], part[k][::-1], strict=True):
-                assert partner[d.index] == p.index  # each mixes with what it would mix with alone
+                assert partner[d.picture] == p.picture  # as it would mix alone
 
 
 def test_what_does_not_fit():

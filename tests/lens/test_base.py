@@ -1,72 +1,13 @@
-import copy
-import json
+"""Rays to pixels and back."""
+
 import math
-import pickle
 
 import numpy as np
 import pytest
 import torch
-from torch.utils import _pytree as pytree
-from torch.utils.data import DataLoader, Dataset
+from lens_examples import ASIDE, CALIBRATIONS, assert_projects, double, f64, points_around
 
-from darswin.lens import Equidistant, Perspective, Polynomial, Spherical, cat, from_dict, to_dict
-
-f64 = torch.float64
-
-# Four lenses of each model, in float64; the last ones reach far.
-LENSES = {
-    "perspective": Perspective(torch.tensor([1.5, 20.0, 300.0, 40.0], dtype=f64),
-                               torch.tensor([1.52, 1.0, 0.3, 1.57], dtype=f64)),
-    "spherical": Spherical(torch.tensor([0.0, 0.35, 1.0, 2.2134], dtype=f64), 30.0,
-                           torch.tensor([1.55, 1.9, 3.1, 2.0], dtype=f64)),
-    "polynomial": Polynomial(
-        torch.tensor([[339.749, -31.988, 48.275, -7.201], [342.457, -22.4772, 28.5462, 1.78203],
-                      [1.0, 0.0, 0.0, 0.0], [0.01, 0.0, 5.0, 0.0]], dtype=f64),
-        torch.tensor([1.96, 1.9, 3.1, 1.2], dtype=f64)),
-    "polynomial of degree 1": Polynomial(torch.tensor([[20.0]] * 4, dtype=f64), 2.0),
-    "polynomial of degree 9": Polynomial(
-        torch.tensor([[30.0, 0, -1.1, 0, 0.4, 0, -0.05, 0, 0.003]] * 4, dtype=f64), 2.5),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("name", LENSES)
-def test_unproject_is_the_inverse_to_1e_9(name):
-    lens = LENSES[name]
-    fractions = torch.cat((torch.tensor([1e-12, 1e-6, 1e-3], dtype=f64),
-                           torch.linspace(0.01, 1, 500, dtype=f64)))  # fmt: skip
-    theta = lens.theta_max[:, None] * fractions
-    torch.testing.assert_close(lens.unproject(lens.project(theta)), theta, rtol=1e-9, atol=0)
-    radius = lens.r_max[:, None] * fractions
-    torch.testing.assert_close(lens.project(lens.unproject(radius)), radius, rtol=1e-9, atol=0)
-    assert (lens.unproject(0.0) == 0).all() and (lens.project(0.0) == 0).all()
-
-
-@pytest.mark.parametrize("name", LENSES)
-def test_project_rises_beyond_90_degrees_where_the_model_does(name):
-    lens = LENSES[name]
-    steps = torch.linspace(0, 1, 2001, dtype=f64)
-    assert (lens.project(lens.theta_max[:, None] * steps).diff(dim=1) > 0).all()
-    if name != "perspective":
-        assert (lens.theta_max > math.pi / 2).any()
-
-
-def test_spherical_has_the_papers_focal_lengths():
-    # The circle fills a 64 px image at a field of view of 174.63° (released data).
-    xi = torch.tensor([0.0, 0.05, 0.2, 0.35, 0.5, 0.7, 0.93, 1.0], dtype=f64)
-    lens = Spherical.from_fov(xi, 3.0479112779, 32.0)
-    expected = [1.5, 3.102, 7.907, 12.712, 17.518, 23.925, 31.293, 33.535]
-    torch.testing.assert_close(lens.focal, torch.tensor(expected, dtype=f64), rtol=0, atol=1e-3)
-    torch.testing.assert_close(lens.r_max, torch.full((8,), 32.0, dtype=f64))
-
-
-def test_spherical_is_perspective_at_0_and_stereographic_at_1():
-    theta = torch.linspace(0, 1.4, 50, dtype=f64)
-    flat, round_ = (Spherical(torch.tensor(x, dtype=f64), 10.0, 1.5) for x in (0.0, 1.0))
-    torch.testing.assert_close(flat.project(theta), 10 * torch.tan(theta))
-    torch.testing.assert_close(round_.project(theta), 10 * torch.tan(theta / 2))
-    torch.testing.assert_close(
-        Perspective.from_fov(2.8, 7.0).r_max, torch.tensor([7.0]), rtol=1e-5, atol=0
-    )
+from darswin.lens import MODELS, KannalaBrandt, Lens, Perspective, Polynomial, Spherical
 
 
 def test_radii_where_nothing_lands_are_nan():
@@ -74,26 +15,6 @@ def test_radii_where_nothing_lands_are_nan():
     polynomial = Polynomial([20.0, 1.0], 1.5)
     outside = polynomial.unproject(torch.tensor([-1.0, 1e3, math.nan, math.inf]))
     assert outside.isnan().all()
-
-
-@pytest.mark.parametrize("name", LENSES)
-def test_gradients_of_both_directions(name):
-    lens = LENSES[name]
-    names = [n for n in lens._names() if getattr(lens, n) is not None]
-    tensors = [getattr(lens, n).clone().requires_grad_() for n in names]
-    part = torch.linspace(0.1, 0.9, 4, dtype=f64)
-
-    def run(x, *values, direction="project"):
-        made = lens.replace(**dict(zip(names, values, strict=True)))
-        return getattr(made, direction)(x)
-
-    theta = (lens.theta_max[:, None] * part).requires_grad_()
-    assert torch.autograd.gradcheck(run, (theta, *tensors))
-    radius = lens.project(theta).detach().requires_grad_()
-    # gradcheck moves θ_max too, which no inverse depends on.
-    assert torch.autograd.gradcheck(
-        lambda x, *values: run(x, *values, direction="unproject"), (radius, *tensors)
-    )
 
 
 def test_a_parameter_can_be_learned():
@@ -149,170 +70,6 @@ def test_a_parameter_out_of_range_is_named(make, message):
         make()
 
 
-def test_wrong_types():
-    with pytest.raises(TypeError, match="focal must be a number or a tensor, got 'wide'"):
-        Perspective("wide", 1.0)
-    with pytest.raises(TypeError, match="xi must be a number"):
-        Spherical(object(), 1.0, 1.0)
-    with pytest.raises(TypeError, match=r"Spherical takes xi, focal, theta_max, .* got thetamax"):
-        Spherical(0.5, 1.0, thetamax=1.0)
-
-
-def test_dtype_and_precision():
-    assert Spherical(0.3, 1.3, 1.0).focal.dtype == torch.float32
-    lens = Spherical(torch.tensor(0.3, dtype=f64), 1.3, 1.0)
-    assert lens.focal.dtype == f64 and lens.focal.item() == 1.3  # not rounded to float32 first
-    assert lens.to(torch.float32).xi.dtype == torch.float32
-    assert lens.to("meta").focal.device.type == "meta"
-
-
-def test_shapes_of_project():
-    one, many = Spherical(0.3, 10.0, 1.0), Spherical([0.3, 0.4, 0.5], 10.0, 1.0)
-    assert one.project(0.5).shape == (1,) and many.project(0.5).shape == (3,)
-    assert one.project(torch.zeros(7)).shape == (7,)
-    assert one.project(torch.zeros(7, 2)).shape == (7, 2)
-    assert many.project(torch.zeros(1, 5)).shape == (3, 5)
-    assert many.unproject(torch.zeros(3, 5, 2)).shape == (3, 5, 2)
-    for direction in (many.project, many.unproject):
-        with pytest.raises(ValueError, match=r"number of lenses, 3 or 1, got shape \(5,\)"):
-            direction(torch.zeros(5))
-
-
-def test_indexing_and_stacking():
-    lens = Spherical([0.0, 0.2, 0.4], [1.0, 2.0, 3.0], 1.2, center=[[1.0, 2.0]] * 3)
-    assert len(lens) == 3 and len(lens[1]) == 1 and lens[1].focal.item() == 2.0
-    assert lens[-1].xi.item() == pytest.approx(0.4)
-    assert len(lens[np.int64(1)]) == 1
-    assert lens[:2].xi.tolist() == pytest.approx([0.0, 0.2])
-    assert lens[torch.tensor([2, 0])].focal.tolist() == [3.0, 1.0]
-    assert lens[torch.tensor([True, False, True])].focal.tolist() == [1.0, 3.0]
-    with pytest.raises(IndexError):
-        lens[3]
-    again = cat([lens[k] for k in range(3)])
-    assert torch.equal(again.xi, lens.xi) and torch.equal(again.center, lens.center)
-    assert [x.focal.item() for x in lens] == [1.0, 2.0, 3.0]
-    assert len(lens[0].expand(5)) == 5
-    with pytest.raises(ValueError, match="cannot expand"):
-        lens.expand(4)
-    with pytest.raises(ValueError, match="at least one"):
-        cat([])
-    with pytest.raises(ValueError, match="center for all"):
-        cat([lens[0], Spherical(0.1, 1.0, 1.0)])
-
-
-@pytest.mark.parametrize("name", LENSES)
-def test_tensors_are_contiguous_however_a_lens_was_made(name):
-    lens = LENSES[name].replace(image_size=torch.full((1, 2), 64.0, dtype=f64).expand(4, 2))
-    made = {
-        "built": lens,
-        "reversed": lens[torch.arange(3, -1, -1)],
-        "every second": lens[::2],
-        "expanded": lens[0].expand(3),
-        "narrowed": lens.with_theta_max(0.2),
-        "resized": lens.resized((48, 64)),
-        "halved": lens.resized(0.5),
-        "cropped": lens.cropped(3, 5, 20, 40),
-        "replaced": lens[:2].replace(theta_max=lens.theta_max[:1].expand(2)),
-        "stacked": cat([lens, lens]),
-        "float32": lens.to(torch.float32),
-    }
-    for how, other in made.items():
-        for tensor in pytree.tree_leaves(other):
-            assert tensor is None or tensor.is_contiguous(), how
-
-
-def test_strided_parameters_make_contiguous_lenses():
-    table = torch.tensor([[0.3, 300.0, 1.4], [0.9, 320.0, 1.5]], requires_grad=True)
-    lens = Spherical(*table.unbind(1), center=table[:, :2].detach().t().flip(0).t())
-    assert all(t is None or t.is_contiguous() for t in pytree.tree_leaves(lens))
-    lens.r_max.sum().backward()
-    assert (table.grad[:, 1] != 0).all()  # still the parameters that were given
-
-
-def test_principal_point():
-    lens = Spherical(0.1, 10.0, 1.0)
-    assert lens.center_in((5, 8)).tolist() == [[3.5, 2.0]]  # (H, W) in, (x, y) out
-    assert Spherical(0.1, 10.0, 1.0, center=[3.0, 4.0]).center_in((5, 8)).tolist() == [[3.0, 4.0]]
-
-
-class Lenses(Dataset):
-    def __len__(self):
-        return 5
-
-    def __getitem__(self, index):
-        return {"image": torch.zeros(1), "lens": Spherical.from_fov(index / 5, 2.6, 16.0)}
-
-
-@pytest.mark.parametrize("workers", [0, 2])
-def test_a_dataloader_batches_lenses(workers):
-    batches = list(DataLoader(Lenses(), batch_size=3, num_workers=workers))
-    assert [len(b["lens"]) for b in batches] == [3, 2]
-    assert batches[1]["lens"].xi.tolist() == pytest.approx([0.6, 0.8])
-
-
-@pytest.mark.parametrize("name", LENSES)
-def test_pickle_copy_and_pytree(name):
-    lens = LENSES[name]
-    for other in (pickle.loads(pickle.dumps(lens)), copy.deepcopy(lens)):
-        assert torch.equal(other.r_max, lens.r_max)
-    leaves, spec = pytree.tree_flatten(lens)
-    assert torch.equal(pytree.tree_unflatten(leaves, spec).r_max, lens.r_max)
-    assert type(lens).__name__ in repr(lens)
-
-
-@pytest.mark.parametrize("center", [None, [20.0, 11.0]])
-def test_a_resized_lens_projects_to_the_resized_image(center):
-    lens = Spherical(0.4, 30.0, 1.3, center=center)
-    half = lens.resized(0.5)
-    assert half.project(1.0).item() == pytest.approx(lens.project(1.0).item() / 2)
-    # Pixel centres are integers: the corner at -1/2 stays where it is.
-    middle, before = half.center_in((15, 20))[0], lens.center_in((30, 40))[0]
-    assert torch.allclose(middle + 0.5, (before + 0.5) / 2)
-    assert Polynomial([5.0, 1.0], 1.0).resized(2).coefficients.tolist() == [[10.0, 2.0]]
-
-
-@pytest.mark.parametrize("size", [(966, 1280), (483, 640), (75, 100), (1, 1), (1932, 2561)])
-def test_in_a_picture_of_the_same_view(size):
-    lens = Equidistant(300.0, 1.5, image_size=(966, 1280))
-    found = lens.in_picture(size)
-    assert found.image_size.tolist() == [list(size)]
-    assert found.focal.item() == pytest.approx(300 * size[1] / 1280)
-    assert (found is lens) == (size == (966, 1280))
-
-
-def test_in_a_picture_of_another_view():
-    lens = Equidistant(300.0, 1.5, image_size=(966, 1280))
-    for size in [(966, 1278), (480, 643), (1280, 966)]:
-        with pytest.raises(ValueError, match="pictures of 966×1280 px, and"):
-            lens.in_picture(size)
-    unknown = Equidistant(300.0, 1.5)
-    assert unknown.in_picture((4, 9)) is unknown
-
-
-def test_resizing_to_a_size_keeps_where_rays_land():
-    lens = Polynomial([339.749, -31.988, 48.275, -7.201], 1.6, [643.4, 479.4],
-                      affine=[[1.0, 0.0], [0.0, 1.2]], image_size=(966, 1280))  # fmt: skip
-    theta, azimuth = torch.tensor([0.0, 0.5, 1.5]), torch.tensor([0.3, 2.0, -1.0])
-    before = lens.project_rays(theta, azimuth)
-    half = lens.resized((483, 320))
-    assert half.image_size.tolist() == [[483, 320]]
-    after = (before + 0.5) * torch.tensor([0.25, 0.5]) - 0.5
-    torch.testing.assert_close(half.project_rays(theta, azimuth), after, rtol=1e-5, atol=1e-4)
-    assert lens.resized(0.5).image_size.tolist() == [[483, 640]]
-    assert lens.resized((483, 640)).affine.tolist() == lens.affine.tolist()
-    with pytest.raises(ValueError, match="needs a lens that has an image_size"):
-        Spherical(0.5, 10.0, 1.0).resized((3, 4))
-
-
-def test_cropping_moves_the_principal_point():
-    lens = Spherical(0.5, 100.0, 1.0, image_size=(300, 400))
-    part = lens.cropped(50, 100, 200, 150)
-    assert part.center.tolist() == [[199.5 - 100, 149.5 - 50]]
-    assert part.image_size.tolist() == [[200, 150]]
-    with pytest.raises(ValueError, match="needs the image_size"):
-        Spherical(0.5, 100.0, 1.0).cropped(0, 0, 10, 10)
-
-
 def test_angles_at_the_sides_of_the_image():
     lens = Polynomial([339.749, -31.988, 48.275, -7.201], None, [639.5, 482.5],
                       image_size=(966, 1280))  # fmt: skip
@@ -333,58 +90,131 @@ def test_another_theta_max():
         lens.with_theta_max(2.5)
 
 
-def test_stacking_needs_the_same_frame():
-    with_size = Spherical(0.5, 10.0, 1.0, image_size=(4, 4))
-    with pytest.raises(ValueError, match="image_size for all"):
-        cat([with_size, Spherical(0.5, 10.0, 1.0)])
-    tilted = Spherical(0.5, 10.0, 1.0, affine=[[1.0, 0.0], [0.0, 2.0]])
-    both = cat([tilted, Spherical(0.5, 10.0, 1.0)])
-    assert isinstance(both, Spherical) and both.affine[1].tolist() == [[1.0, 0.0], [0.0, 1.0]]
+@pytest.mark.parametrize("name", ASIDE)
+def test_pixels_and_rays_undo_each_other(name):
+    lens = ASIDE[name]
+    theta = torch.linspace(0, 1, 40, dtype=f64)[:, None] * lens.theta_max
+    azimuth = torch.linspace(-3.1, 3.1, 33, dtype=f64)[None]
+    pixels = lens.project_rays(theta, azimuth)
+    assert pixels.shape == (40, 33, 2)
+    # The last ring may land where only rays beyond θ_max do.
+    found, direction = lens.with_theta_max(None).unproject_pixels(pixels)
+    assert (found - theta).abs().max() < 1e-9
+    assert (direction - azimuth)[1:].abs().max() < 1e-9
 
 
-def test_as_json_and_back():
-    lens = Spherical(torch.tensor(0.1, dtype=f64), 300.0, 1.3, [3.0, 4.0], image_size=(480, 640))
-    described = to_dict(lens)
-    assert described == {
-        "model": "Spherical", "xi": 0.1, "focal": 300.0, "theta_max": 1.3, "center": [3.0, 4.0],
-        "image_size": [480, 640],
-    }  # fmt: skip
-    assert to_dict(from_dict(json.loads(json.dumps(to_dict(lens))))) == to_dict(
-        lens.to(torch.float32)
+@pytest.mark.parametrize("name", ASIDE)
+def test_gradients_of_rays_and_pixels(name):
+    lens = ASIDE[name]
+    names = [n for n in lens._names() if n != "theta_max" and getattr(lens, n) is not None]
+    values = [getattr(lens, n).clone().requires_grad_() for n in names]
+    theta = (lens.theta_max * double(0.1, 0.5, 0.9)).requires_grad_()
+    azimuth = double(0.3, 2.5, -1.2).requires_grad_()
+
+    def project(theta, azimuth, *values):
+        return lens.replace(**dict(zip(names, values, strict=True))).project_rays(theta, azimuth)
+
+    def unproject(pixels, *values):
+        return lens.replace(**dict(zip(names, values, strict=True))).unproject_pixels(pixels)
+
+    assert torch.autograd.gradcheck(project, (theta, azimuth, *values))
+    pixels = project(theta, azimuth, *values).detach().requires_grad_()
+    assert torch.autograd.gradcheck(unproject, (pixels, *values))
+
+
+def test_pixels_that_no_ray_reaches_are_nan():
+    lens = ASIDE["Mei"]
+    theta, _ = lens.unproject_pixels(
+        double(716.9 + 900, 705.8, 5000, 5000, 716.9, 705.8).view(3, 2)
     )
-    with pytest.raises(ValueError, match="one lens, got 2"):
-        to_dict(lens.expand(2))
+    assert theta.isnan().tolist() == [True, True, False] and theta[2].abs() < 1e-9
 
 
-def test_resized_takes_any_number_and_nothing_that_is_no_image():
-    lens = Perspective(100.0, 1.0, (319.5, 241.5), image_size=(483, 640))
-    whole = lens.resized(0.5)
-    for half in (np.float32(0.5), np.float64(0.5), torch.tensor(0.5), np.array(0.5)):
-        resized = lens.resized(half)
-        assert resized.focal.item() == 50 and resized.affine is None
-        assert resized.image_size.tolist() == whole.image_size.tolist() == [[242, 320]]
-    assert lens.resized(torch.tensor([240, 320])).image_size.tolist() == [[240, 320]]
-    assert lens.resized((240.0, np.int64(320))).image_size.tolist() == [[240, 320]]
-    assert lens.resized(1e-6).image_size.tolist() == [[1, 1]]
-    for scale in (0, -1, math.nan, math.inf, np.float32(-2), torch.tensor(0.0)):
-        with pytest.raises(ValueError, match="resized must be given a finite scale above 0, got"):
-            lens.resized(scale)
-    for size in ((0, 5), (-5, 5), torch.tensor([3, 0])):
-        with pytest.raises(ValueError, match=r"image's \(H, W\) must be at least \(1, 1\), got"):
-            lens.resized(size)
-    for size in ((483,), (1, 2, 3), "12", None, (2.5, 3), (math.nan, 3), (None, 3)):
-        with pytest.raises(TypeError, match=r"size must be \(H, W\)|whole pixels"):
-            lens.resized(size)
+def test_rays_are_found_in_inference_mode():
+    for lens in ASIDE.values():
+        expected = lens.unproject_pixels(lens.project_rays(0.5, 0.3))
+        with torch.inference_mode():
+            found = lens.to(f64).unproject_pixels(lens.project_rays(0.5, 0.3))
+        torch.testing.assert_close(found, expected)
 
 
-def test_cropped_takes_only_parts_with_pixels():
-    lens = Perspective(100.0, 1.0, (319.5, 241.5), image_size=(483, 640))
-    padded = lens.cropped(-8, -4, 499, 648)
-    assert padded.center.tolist() == [[323.5, 249.5]]
-    assert padded.image_size.tolist() == [[499, 648]]
-    for part in ((0, 0, -5, 10), (0, 0, 5, 0)):
-        with pytest.raises(ValueError, match=r"must be at least \(1, 1\)"):
-            lens.cropped(*part)
-    for part in ((0.5, 0, 5, 10), (0, 0, math.nan, 10), (None, 0, 5, 5)):
-        with pytest.raises(TypeError, match="an image has whole pixels, got"):
-            lens.cropped(*part)
+def test_points_are_projected_as_opencvs_fisheye_projects_them():
+    cv2 = pytest.importorskip("cv2")
+    d, points = (0.01, -0.002, 0.0005, -0.0001), points_around(1.5)
+    lens = KannalaBrandt(double(300.0), double(*d), center=double(400, 310))
+    lens = lens.replace(affine=double(1, 0, 0, 1.1).view(1, 2, 2))
+    camera = np.array([[300.0, 0, 400], [0, 330, 310], [0, 0, 1]])
+    pixels, _ = cv2.fisheye.projectPoints(
+        points[None], np.zeros(3), np.zeros(3), camera, np.array(d)
+    )
+    assert_projects(lens, points, pixels[0])
+
+
+def test_points_are_projected_as_opencvs_pinhole_projects_them():
+    cv2 = pytest.importorskip("cv2")
+    affine = double(1, 0, 0, 1.2).view(1, 2, 2)
+    lens, points = ASIDE["BrownConrady"].replace(prism=None, affine=affine), points_around(0.9)
+    camera = np.array([[500.0, 0, 320], [0, 600, 240], [0, 0, 1]])
+    d = np.array([*lens.radial[0], *lens.tangential[0]])
+    pixels, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), camera, d)
+    assert_projects(lens, points, pixels[:, 0])
+
+
+@pytest.mark.parametrize("name", ASIDE)
+def test_points_and_pixels_undo_each_other(name):
+    lens = ASIDE[name]
+    points = torch.from_numpy(points_around(lens.theta_max.item() - 1e-6)).unflatten(0, (40, 5))
+    pixels = lens.project_points(points)
+    assert pixels.shape == (40, 5, 2)
+    torch.testing.assert_close(lens.unproject_points(pixels), points, rtol=0, atol=1e-8)
+    for scale in (1e-30, 1e30):  # how far away changes nothing
+        torch.testing.assert_close(lens.project_points(scale * points), pixels)
+
+
+def test_points_that_are_not_seen_are_nan():
+    lens = Spherical(0.5, 10.0, [1.0, 1.5], center=[3.0, 4.0])
+    points = torch.tensor([[0.0, 0, 2], [0, 0, -2], [0, 0, 0], [1, 0, 0.4], [math.nan, 0, 1]])
+    pixels = lens.project_points(points[None])
+    assert pixels.shape == (2, 5, 2) and pixels[:, 0].tolist() == [[3, 4]] * 2
+    nan = pixels.isnan()
+    assert torch.equal(nan[..., 0], nan[..., 1])
+    assert nan[0, :, 0].tolist() == [False, True, True, True, True]
+    assert nan[1, :, 0].tolist() == [False, True, True, False, True]
+    # Beyond 90°, what is behind the plane of the camera may be seen.
+    wide = CALIBRATIONS["TUM-VI Kalibr"][0]
+    behind = wide.project_points(double(1, 0, -0.2), (1, 1))
+    expected = wide.project_rays(math.pi / 2 + math.atan(0.2), 0.0, (1, 1))
+    torch.testing.assert_close(behind, expected)
+    found = lens.unproject_points(torch.tensor([[[1e4, 4.0], [3.0, 4.0]]]))
+    assert found[:, 0].isnan().all() and found[:, 1].tolist() == [[0, 0, 1]] * 2
+
+
+def test_gradients_of_points():
+    lens = ASIDE["Mei"]
+    points = double(0.3, -0.2, 0.5, 0, 0, 2, 0.9, 0.1, 0.1, 1, 1, -9).view(4, 3)
+    seen = torch.tensor([0, 1, 2])
+
+    def project(points, focal):
+        return lens.replace(focal=focal).project_points(points)[seen]
+
+    leaves = points.requires_grad_(), lens.focal.clone().requires_grad_()
+    assert torch.autograd.gradcheck(project, leaves)
+    pixels = project(*leaves).detach().requires_grad_()
+    assert torch.autograd.gradcheck(lens.unproject_points, (pixels,))
+    lens.replace(focal=leaves[1]).project_points(points).nan_to_num().sum().backward()
+    assert points.grad.isfinite().all() and leaves[1].grad.isfinite().all()
+    assert points.grad.any(1).tolist() == [True, True, True, False]
+
+
+def test_a_class_is_a_model_unless_it_says_otherwise():
+    assert MODELS["Spherical"] is Spherical
+    assert all(model.__name__ == name for name, model in MODELS.items())
+    bases = {base for model in MODELS.values() for base in model.__mro__} - {*MODELS.values()}
+    assert not {base.__name__ for base in bases} & {*MODELS}
+    with pytest.raises(ValueError, match="there is a lens model Spherical already"):
+        type("Spherical", (Lens,), {})
+
+    class OfNoName(Spherical, register=False):
+        pass
+
+    assert "OfNoName" not in MODELS and len(OfNoName(0.5, 10.0)) == 1

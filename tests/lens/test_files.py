@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from helpers import changed
+from lens_examples import assert_projects, points_around
 
 from darswin import lens as lenses
 from darswin.lens import MODELS, load, load_all, save
@@ -89,14 +90,6 @@ def test_each_format_keeps_its_pixel_origin(name, model, center, size):
 # -- against other implementations -------------------------------------------------------------
 
 
-def rays(theta_max, count=200):
-    """Unit vectors around the axis, and their θ and φ."""
-    rng = np.random.default_rng(0)
-    theta, phi = rng.uniform(0, theta_max, count), rng.uniform(-math.pi, math.pi, count)
-    points = [np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)]
-    return np.stack(points, -1), torch.from_numpy(theta), torch.from_numpy(phi)
-
-
 def write(path, **entries):
     """A file of OpenCV's own FileStorage; the notation is that of the suffix."""
     storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
@@ -118,13 +111,11 @@ def test_opencv_fisheye(tmp_path, suffix, alpha):
     path = write(tmp_path / f"c.{suffix}", K=k.tolist(), D=d, image_width=1280, image_height=960,
                  fisheye_model=1)  # fmt: skip
     lens = load(path, dtype=f64)
-    points, theta, phi = rays(1.5)
+    points = points_around(1.5)
     expected, _ = cv2.fisheye.projectPoints(
         points[None], np.zeros(3), np.zeros(3), np.array(K), np.array(d), alpha=alpha
     )
-    torch.testing.assert_close(
-        lens.project_rays(theta, phi), torch.from_numpy(expected[0]), rtol=0, atol=1e-9
-    )
+    assert_projects(lens, points, expected[0])
 
 
 @pytest.mark.parametrize("suffix", ["yaml", "xml", "json"])
@@ -144,11 +135,9 @@ def test_opencv_pinhole(tmp_path, suffix, d):
     path = write(tmp_path / f"c.{suffix}", camera_matrix=K, distortion_coefficients=d,
                  image_width=1280, image_height=960)  # fmt: skip
     lens = load(path, model="pinhole", dtype=f64)
-    points, theta, phi = rays(0.8)
+    points = points_around(0.8)
     expected, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), np.array(K), np.array(d))
-    torch.testing.assert_close(
-        lens.project_rays(theta, phi), torch.from_numpy(expected[:, 0]), rtol=0, atol=1e-9
-    )
+    assert_projects(lens, points, expected[:, 0])
     assert lens.is_radial == (not any(d[2:4]) and not any(d[8:]))
     if not any(d):
         assert type(lens).__name__ == "Perspective"
@@ -181,10 +170,8 @@ def mei(points, xi, k1, k2, p1, p2, fx, fy, s, cx, cy):
 )  # fmt: skip
 def test_mei(name, theta_max, parameters):
     lens = load(FILES / name, dtype=f64)
-    points, theta, phi = rays(theta_max)
-    torch.testing.assert_close(
-        lens.project_rays(theta, phi), mei(points, *parameters), rtol=0, atol=1e-9
-    )
+    points = points_around(theta_max)
+    assert_projects(lens, points, mei(points, *parameters))
     assert not lens.is_radial
 
 
@@ -238,50 +225,43 @@ def test_every_model_of_colmap():
     found = load_all(path, dtype=f64)
     rows = [line.split() for line in path.read_text().splitlines() if line[0] != "#"]
     assert list(found) == [row[0] for row in rows] and len(rows) == 18
-    points, theta, phi = rays(0.8)
-    for (name, lens), row in zip(found.items(), rows, strict=True):
-        expected = colmap_pixels(row[1], [float(p) for p in row[4:]], points) - 0.5
-        got = lens.project_rays(theta, phi)
-        torch.testing.assert_close(got, expected, rtol=0, atol=1e-9, msg=f"{name} {row[1]}")
+    points = points_around(0.8)
+    for lens, row in zip(found.values(), rows, strict=True):
+        pixels = colmap_pixels(row[1], [float(p) for p in row[4:]], points) - 0.5
+        assert_projects(lens, points, pixels)
 
 
 def test_colmaps_rational_model_is_opencvs():
     lens = load(FILES / "colmap_all.txt", camera="7", dtype=f64)
-    points, theta, phi = rays(0.8)
+    points = points_around(0.8)
     d = np.array([0.2, 0.05, 0.001, -0.002, 0.003, 0.25, 0.04, 0.002])
     k = np.array([[500.0, 0, 319.5], [0, 510, 239.5], [0, 0, 1]])
     expected, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), k, d)
-    torch.testing.assert_close(
-        lens.project_rays(theta, phi), torch.from_numpy(expected[:, 0]), rtol=0, atol=1e-9
-    )
+    assert_projects(lens, points, expected[:, 0])
 
 
 def test_basalts_radtan8_is_opencvs_rational_model():
     lens = load(FILES / "basalt.json", camera="cam4", dtype=f64)
-    points, theta, phi = rays(0.8)
+    points = points_around(0.8)
     d = np.array([0.302, -0.021, -0.00025, 6.1e-05, 0.0158, 0.575, -0.063, 0.034])
     k = np.array([[269.7, 0, 322.6], [0, 269.8, 228.9], [0, 0, 1]])
     expected, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), k, d)
-    torch.testing.assert_close(
-        lens.project_rays(theta, phi), torch.from_numpy(expected[:, 0]), rtol=0, atol=1e-9
-    )
+    assert_projects(lens, points, expected[:, 0])
 
 
 def test_basalts_unified_model():
     lens = load(FILES / "basalt.json", camera=2, dtype=f64)
-    points, theta, phi = rays(1.3)
+    points = points_around(1.3)
     x, y, z = points.T
     den = 0.6469 + (1 - 0.6469) * z
     expected = np.stack((191.1 * x / den + 254.9, 191.2 * y / den + 256.8), -1)
-    torch.testing.assert_close(
-        lens.project_rays(theta, phi), torch.from_numpy(expected), rtol=0, atol=1e-9
-    )
+    assert_projects(lens, points, expected)
 
 
 def test_ocamcalib_is_world2cam():
     """Its x is down (row) and its y to the right, its optical axis is -z."""
     lens = load(FILES / "ocamcalib.txt", dtype=f64)
-    points, theta, phi = rays(1.8)
+    points = points_around(1.8)
     right, down, forward = points.T
     x, y, z = down, right, -forward
     norm = np.hypot(x, y)
@@ -290,10 +270,7 @@ def test_ocamcalib_is_world2cam():
     c, d, e, xc, yc = 1.001407, -0.000818, 0.000221, 728.648728, 729.090632
     x, y = x / norm * rho, y / norm * rho
     row, column = x * c + y * d + xc, x * e + y + yc
-    torch.testing.assert_close(
-        lens.project_rays(theta, phi),
-        torch.from_numpy(np.stack((column, row), -1)), rtol=0, atol=1e-9,
-    )  # fmt: skip
+    assert_projects(lens, points, np.stack((column, row), -1))
 
 
 def test_ocamcalib_without_an_inverse_polynomial():
@@ -308,7 +285,7 @@ def test_ocamcalib_without_an_inverse_polynomial():
 def test_scaramuzzas_axis_may_point_either_way():
     text = FILES.joinpath("camodocal_scaramuzza.yaml").read_text()
     lens = loads(text, dtype=f64)
-    _, theta, phi = rays(1.8)
+    theta, phi = torch.linspace(0, 1.8, 200, dtype=f64), torch.linspace(-31, 31, 200, dtype=f64)
     direct, inverse = (
         re.findall(r" p\d+: (\S+)", part) for part in text.split("inv_poly_parameters")
     )
@@ -342,16 +319,14 @@ def test_nerfstudios_opencv_has_four_k():
                        "w": 640, "h": 480, "k1": 0.1, "k2": -0.05, "k3": 0.02, "k4": -0.003,
                        "p1": 0.001, "p2": -0.002})  # fmt: skip
     lens = loads(text, dtype=f64)
-    points, theta, phi = rays(0.6)
+    points = points_around(0.6)
     x, y = points[:, 0] / points[:, 2], points[:, 1] / points[:, 2]
     r = x * x + y * y
     d = 1 + r * (0.1 + r * (-0.05 + r * (0.02 + r * -0.003)))
     u = x * d + 2 * 0.001 * x * y - 0.002 * (r + 2 * x * x)
     v = y * d - 2 * 0.002 * x * y + 0.001 * (r + 2 * y * y)
     expected = np.stack((500 * u + 319.5, 510 * v + 239.5), -1)
-    torch.testing.assert_close(
-        lens.project_rays(theta, phi), torch.from_numpy(expected), rtol=0, atol=1e-9
-    )
+    assert_projects(lens, points, expected)
 
 
 # -- what a file may leave open -----------------------------------------------------------------

@@ -6,20 +6,10 @@ import math
 import hypothesis
 import hypothesis.strategies as st
 import torch
+from lens_examples import COUNTS, RANGES, f64, first_coefficients
 
 from darswin.layers.grid import PLACEMENTS, SPACINGS, polar_grid
 from darswin.lens import MODELS, cat, from_dict, to_dict
-from darswin.lens.base import ROW_DIMS
-
-f64 = torch.float64
-
-# Parameters as calibrations have them, and further out.
-RANGES = {
-    "focal": (0.5, 5000), "xi": (0, 4), "alpha": (0, 1), "beta": (0.05, 5), "omega": (0.02, 3.1),
-    "radial": (-0.3, 0.3), "denominator": (-0.2, 0.2), "tangential": (-0.02, 0.02),
-    "prism": (-0.02, 0.02),
-}  # fmt: skip
-COUNTS = {"tangential": 2, "prism": 4}
 
 
 def rows(draw, low, high, count, width):
@@ -37,20 +27,14 @@ def lenses(draw, radial=False):
         if key in model.optional and (key == "slopes" or (aside and radial) or draw(st.booleans())):
             continue
         if key == "coefficients":
-            size = draw(st.floats(10, 2000))
-            first = {
-                "OCam": [-size, 0.0],
-                "OCamInverse": [size, size / math.pi * 2],
-                "Polynomial": [size],
-            }[name]
-            scale = size / (size**2 if name == "OCam" else 1)
+            first, scale = first_coefficients(name, draw(st.floats(10, 2000)))
             more = rows(draw, -0.1 * scale, 0.1 * scale, count, draw(st.integers(1, 3)))
             values[key] = [first + row for row in more]
         elif key in ("angles", "radii"):
             steps = rows(draw, 0.01, 0.4, count, 6)
             most = 1 if key == "angles" else draw(st.floats(1, 2000))
             values[key] = [[0.0] + [most * sum(row[: k + 1]) for k in range(6)] for row in steps]
-        elif key in ROW_DIMS:
+        elif model._dims(key):
             width = COUNTS.get(key) or draw(st.integers(1, 4))
             values[key] = rows(draw, *RANGES[key], count, width)
         else:
@@ -179,7 +163,7 @@ def test_any_numbers_make_a_lens_that_rises_or_an_error_in_a_sentence(name, data
         width = data.draw(st.integers(0, 5))
         values[key] = (
             data.draw(st.lists(numbers, min_size=width, max_size=width))
-            if key in ROW_DIMS
+            if model._dims(key)
             else data.draw(numbers)
         )
     if data.draw(st.booleans()):

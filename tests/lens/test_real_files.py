@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from helpers import changed
+from lens_examples import assert_projects
 
 from darswin.cli.main import main
 from darswin.cli.predict import read_lens
@@ -238,9 +239,7 @@ def test_colmaps_brown_conrady_is_opencvs_model():
     matrix = np.array([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]])
     d = np.array([-0.05, 0.01, 0.001, -0.002, -0.003])
     expected, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), matrix, d)
-    x, y = torch.from_numpy(points[:, :2]).T
-    pixels = lens.project_rays(torch.atan(torch.hypot(x, y)), torch.atan2(y, x))
-    torch.testing.assert_close(pixels, torch.from_numpy(expected[:, 0]), rtol=0, atol=1e-9)
+    assert_projects(lens, points, expected[:, 0])
 
 
 # -- OCamCalib's two polynomials ----------------------------------------------------------------

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from darswin.lens import KannalaBrandt, Mei, Perspective, Polynomial, Spherical
-from darswin.lens.reprojection import perspective_view, reproject, reprojection
+from darswin.lens.reprojection import OUTSIDE, perspective_view, reproject, reprojection
 
 
 def test_a_ray_keeps_its_angles():
@@ -72,7 +72,7 @@ def test_perspective_view(size):
         assert view.center is None
 
 
-def test_lenses_that_are_not_round():
+def test_general_lenses():
     source = Mei(
         1.5, 40.0, (0.05, 0.2), 1.2, (30.0, 22.5), affine=[[1.0, 0.05], [0.0, 0.8]],
         tangential=(0.02, -0.03),
@@ -80,7 +80,7 @@ def test_lenses_that_are_not_round():
     target = KannalaBrandt(20.0, [0.02], 1.7, affine=[[1.0, 0.0], [0.1, 1.1]]).to(torch.float64)
     for a, b in ((source, target), (target, source)):
         there = reprojection(a, (46, 64), b, (40, 50))[0]
-        seen = there[..., 0] != -10
+        seen = there[..., 0] != OUTSIDE
         assert 0.3 < seen.double().mean() < 1
         y, x = seen.nonzero().unbind(1)
         theta, azimuth = b.unproject_pixels(torch.stack((x, y), -1).double(), (40, 50))
@@ -88,7 +88,7 @@ def test_lenses_that_are_not_round():
         torch.testing.assert_close(there[seen], expected)
     # There and back again.
     there = reprojection(source, (46, 64), target, (40, 50))
-    seen = there[..., 0] != -10
+    seen = there[..., 0] != OUTSIDE
     theta, direction = source.rays(there[seen], (46, 64))
     y, x = seen[0].nonzero().unbind(1)
     torch.testing.assert_close(
@@ -97,7 +97,7 @@ def test_lenses_that_are_not_round():
     )  # fmt: skip
 
 
-def test_gradients_of_lenses_that_are_not_round_also_where_nothing_is_seen():
+def test_gradients_of_general_lenses_also_where_nothing_is_seen():
     def places(focal, tangential, affine, center):
         source = Mei(1.5, focal, (0.05, 0.2), 1.2, center, affine=affine, tangential=tangential)
         target = Mei(1.0, focal, None, 1.3, affine=affine, tangential=tangential)
@@ -106,5 +106,5 @@ def test_gradients_of_lenses_that_are_not_round_also_where_nothing_is_seen():
     parameters = [[2.9], [0.01, -0.02], [[1.0, 0.1], [0.0, 0.9]], [19.0, 20.5]]
     tensors = [torch.tensor(p, dtype=torch.float64, requires_grad=True) for p in parameters]
     there = places(*tensors)
-    assert (there == -10).any() and (there[0, 4, 4] != -10).all()
+    assert (there == OUTSIDE).any() and (there[0, 4, 4] != OUTSIDE).all()
     assert torch.autograd.gradcheck(places, tensors)

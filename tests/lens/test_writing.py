@@ -1,6 +1,5 @@
 """Files of OpenCV, COLMAP and Kalibr that are written here: the same lens, for them and for us."""
 
-import math
 from pathlib import Path
 
 import cv2
@@ -10,9 +9,10 @@ import pytest
 import torch
 import yaml
 from hypothesis import strategies as st
+from lens_examples import assert_projects, points_around
 
 from darswin.cli.main import main
-from darswin.lens import MODELS, Spherical, load, load_all, save
+from darswin.lens import MODELS, Spherical, as_curves, load, load_all, save
 
 FILES = Path(__file__).parent / "files"
 f64 = torch.float64
@@ -111,14 +111,14 @@ def test_which_formats_hold_which_cameras(tmp_path):
     assert seen == len(HELD)
 
 
+def test_a_table_of_many_slopes(tmp_path):
+    lens = as_curves(load(FILES / "kalibr_tumvi.yaml", camera="cam0", dtype=f64))
+    save(lens, tmp_path / "lens.json")
+    found = load(tmp_path / "lens.json", dtype=f64)
+    assert torch.equal(found.slopes, lens.slopes) and lens.slopes.shape == (1, 512)
+
+
 # -- for the libraries themselves ---------------------------------------------------------------
-
-
-def rays(theta_max, count=100):
-    rng = np.random.default_rng(0)
-    theta, phi = rng.uniform(0, theta_max, count), rng.uniform(-math.pi, math.pi, count)
-    points = [np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)]
-    return np.stack(points, -1), torch.from_numpy(theta), torch.from_numpy(phi)
 
 
 @pytest.mark.parametrize("suffix", FORMATS["opencv"])
@@ -135,7 +135,7 @@ def test_opencv_reads_what_is_written_for_it(name, camera, suffix, tmp_path):
     fisheye = storage.getNode("fisheye_model").real()
     size = [storage.getNode(f"image_{side}").real() for side in ("height", "width")]
     assert size == lens.image_size[0].tolist()
-    points, theta, phi = rays(0.6)
+    points = points_around(0.6)
     if fisheye:
         found, _ = cv2.fisheye.projectPoints(
             points[None], np.zeros(3), np.zeros(3), matrix, d.mat()
@@ -143,9 +143,7 @@ def test_opencv_reads_what_is_written_for_it(name, camera, suffix, tmp_path):
         found = found[0]
     else:
         found = cv2.projectPoints(points, np.zeros(3), np.zeros(3), matrix, d.mat())[0][:, 0]
-    torch.testing.assert_close(
-        lens.project_rays(theta, phi), torch.from_numpy(found), rtol=0, atol=1e-9
-    )
+    assert_projects(lens, points, found)
 
 
 def test_colmap_reads_what_is_written_for_it(tmp_path):
@@ -158,8 +156,8 @@ def test_colmap_reads_what_is_written_for_it(tmp_path):
         "2e-05 1e-05 0.001 -0.002 0.0005 -0.0004 0.0003 -0.0002"
     )
     pycolmap = pytest.importorskip("pycolmap")
-    points, theta, phi = rays(0.6)
-    for name, lens in cameras():
+    points = points_around(0.6)
+    for _, lens in cameras():
         try:
             save(lens, tmp_path / "cameras.txt")
         except ValueError:
@@ -168,10 +166,8 @@ def test_colmap_reads_what_is_written_for_it(tmp_path):
         camera = pycolmap.Camera(
             model=row[1], width=int(row[2]), height=int(row[3]), params=list(map(float, row[4:]))
         )
-        found = torch.from_numpy(np.array([camera.img_from_cam(point) for point in points])) - 0.5
-        torch.testing.assert_close(
-            lens.project_rays(theta, phi), found, rtol=0, atol=1e-8, msg=f"{name} {row[1]}"
-        )
+        pixels = np.array([camera.img_from_cam(point) for point in points]) - 0.5
+        assert_projects(lens, points, pixels, atol=1e-8)
 
 
 def test_kalibr_reads_what_is_written_for_it(tmp_path):

@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from darswin.lens import KannalaBrandt, Mei, Perspective, Polynomial
+from darswin.lens.reprojection import OUTSIDE
 from darswin.viz.views import cylindrical, equirectangular, perspective, turned, undistort, view_map
 
 VIEWS = {
@@ -58,9 +59,7 @@ def photograph(lens) -> np.ndarray:
         torch.arange(height, dtype=torch.float64), torch.arange(width, dtype=torch.float64),
         indexing="ij",
     )  # fmt: skip
-    theta, direction = lens.rays(torch.stack((x, y), -1))
-    rays = torch.cat((torch.sin(theta)[..., None] * direction, torch.cos(theta)[..., None]), -1)
-    return scene(rays).astype(np.float32)
+    return scene(lens.unproject_points(torch.stack((x, y), -1))).astype(np.float32)
 
 
 @pytest.mark.parametrize("make", [woodscape, kitti_360, skewed])
@@ -86,7 +85,7 @@ def test_rays_land_where_the_lens_projects_them(make):
     expected = lens.project_rays(theta, azimuth).numpy()
     there = view_map(lens, rays)
     beyond = (theta > lens.theta_max).numpy()
-    assert 0 < beyond.mean() < 1 and (there[beyond] == -10).all()
+    assert 0 < beyond.mean() < 1 and (there[beyond] == OUTSIDE).all()
     np.testing.assert_allclose(there[~beyond], expected[~beyond], atol=1e-3)
 
 
@@ -96,7 +95,7 @@ def test_straight_lines_stay_straight():
     points = torch.stack(
         (torch.linspace(-1, 1, 9), torch.full((9,), -1.2), torch.linspace(1.2, 1.8, 9)), -1
     ).double()
-    pixels = lens.project_rays(*angles(points)).numpy()
+    pixels = lens.project_points(points).numpy()
     image = np.zeros((1400, 1400), np.float32)
     rows, columns = np.mgrid[:1400, :1400]
     for x, y in pixels:

@@ -1,10 +1,11 @@
 """basalt's JSON: `value0` with one entry of `intrinsics` and of `resolution` a camera."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import partial
 
+from darswin.lens.base import Lens
 from darswin.lens.distorted import BrownConrady, KannalaBrandt
-from darswin.lens.files.cameras import Cameras, Description, describe
+from darswin.lens.files.cameras import Cameras, Description, Parameters, describe
 from darswin.lens.files.content import Content
 from darswin.lens.files.fields import Fields
 from darswin.lens.ideal import FieldOfView
@@ -20,7 +21,7 @@ def fits(content: Content) -> bool:
 def cameras(file: Fields) -> Cameras:
     calibration = file.section("value0")
     entries = calibration.sections("intrinsics")
-    sizes: list[tuple[int, int] | None] = [None] * len(entries)
+    sizes: Sequence[tuple[int, int] | None] = [None] * len(entries)
     if calibration.entries.get("resolution"):
         sizes = calibration.sizes("resolution", len(entries))
     pairs = zip(entries, sizes, strict=True)
@@ -36,6 +37,8 @@ def _camera(entry: Fields, size: tuple[int, int] | None) -> Description:
     def listed(*names: str) -> list[float]:
         return [values.number(name) for name in names]
 
+    model: type[Lens]
+    parameters: Parameters
     if kind == "ds":
         model, parameters = DoubleSphere, {n: values.number(n) for n in ("xi", "alpha")}
     elif kind == "eucm":
@@ -49,16 +52,14 @@ def _camera(entry: Fields, size: tuple[int, int] | None) -> Description:
     elif kind == "pinhole":
         model, parameters = BrownConrady, {}
     elif kind == "pinhole-radtan8":
-        model, parameters = (
-            BrownConrady,
-            {
-                "radial": listed("k1", "k2", "k3"),
-                "denominator": listed("k4", "k5", "k6"),
-                "tangential": listed("p1", "p2"),
-            },
-        )
+        model = BrownConrady
+        parameters = {
+            "radial": listed("k1", "k2", "k3"),
+            "denominator": listed("k4", "k5", "k6"),
+            "tangential": listed("p1", "p2"),
+        }
     else:
         where, expected = entry.path("camera_type"), ", ".join(MODELS)
         raise ValueError(f"{where} must be one of {expected}, got {kind!r}")
     values.check_all_read(f"basalt's {kind}", known=("rpmax",))
-    return describe(model, focal, center, size, **parameters)
+    return describe(model, focal, center, size, parameters)

@@ -4,25 +4,19 @@ Both have the principal point as their files have it; `load` and `save` move it 
 pixel origin.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
-from darswin.lens.base import Lens
-from darswin.lens.distorted import BrownConrady, Fisheye624, KannalaBrandt, Mei
-from darswin.lens.ideal import Equidistant, Perspective
-from darswin.lens.sphere import Spherical
+from darswin.lens.base import MODELS, Lens
+from darswin.lens.distorted import DistortedLens
 
+Parameters = Mapping[str, float | Sequence[float]]
 Description = dict[str, Any]
 # What describes each camera of a file, by its name: nothing is read before it is asked for.
 Cameras = dict[str, Callable[[], Description]]
 
 # What the terms are called in files, with a number from 1.
 LETTERS = {"radial": "k", "denominator": "d", "tangential": "p", "prism": "s"}
-TERMS = tuple(LETTERS)
-# What is left of a model when all its terms are zero, with a closed inverse.
-PLAIN: dict[type[Lens], type[Lens]] = {
-    KannalaBrandt: Equidistant, Fisheye624: Equidistant, BrownConrady: Perspective, Mei: Spherical
-}  # fmt: skip
 
 
 def describe(
@@ -30,23 +24,26 @@ def describe(
     focal: tuple[float, float],
     center: tuple[float, float],
     image_size: tuple[int, int] | None,
-    *,
+    parameters: Parameters,
     skew: float = 0.0,
-    **parameters: float | Sequence[float],
 ) -> Description:
     """A camera of two focal lengths.
 
     Args:
         model: its class. focal: fx and fy > 0, px. center: (cx, cy) px. image_size: (H, W) or None.
-        skew: px, by which a pixel's x grows with y: x = fx x' + skew y' + cx.
         parameters: the model's others. Terms that are all zero are left out.
+        skew: px, by which a pixel's x grows with y: x = fx x' + skew y' + cx.
     """
     fx, fy = focal
-    parameters = {k: v for k, v in parameters.items() if k not in TERMS or any(v)}
-    if not any(term in parameters for term in TERMS):
-        model = PLAIN.get(model, model)
+    parameters = {
+        name: value
+        for name, value in parameters.items()
+        if not isinstance(value, Sequence) or any(value)
+    }
+    if issubclass(model, DistortedLens) and not parameters.keys() & LETTERS.keys():
+        model = model.plain
     affine = None if fx == fy and skew == 0 else [[1.0, skew / fx], [0.0, fy / fx]]
-    return in_image(model, center, affine, image_size, focal=fx, **parameters)
+    return in_image(model, center, affine, image_size, {"focal": fx, **parameters})
 
 
 def in_image(
@@ -54,11 +51,14 @@ def in_image(
     center: tuple[float, float],
     affine: list[list[float]] | None,
     image_size: tuple[int, int] | None,
-    **parameters: float | Sequence[float],
+    parameters: Parameters,
 ) -> Description:
     """A camera of any model: its class, where it stands in the image, and its parameters."""
-    frame = {"center": center, "affine": affine, "image_size": image_size}
-    frame = {name: list(value) for name, value in frame.items() if value is not None}
+    frame: dict[str, Any] = {"center": list(center)}
+    if affine is not None:
+        frame["affine"] = affine
+    if image_size is not None:
+        frame["image_size"] = list(image_size)
     return {"model": model.__name__, **parameters, **frame}
 
 
@@ -112,9 +112,11 @@ def camera_of(lens: Lens, origin: float) -> Camera | None:
     }
     size = None
     if lens.image_size is not None:
-        size = tuple(round(side) for side in lens.image_size[0].tolist())
-    whole = {plain: model for model, plain in reversed(PLAIN.items())}
-    return Camera(whole.get(type(lens), type(lens)), plane, terms, focal * affine[0][1], size)
+        height, width = (round(side) for side in lens.image_size[0].tolist())
+        size = height, width
+    with_terms = {m.__dict__["plain"]: m for m in MODELS.values() if "plain" in m.__dict__}
+    model = with_terms.get(type(lens), type(lens))
+    return Camera(model, plane, terms, focal * affine[0][1], size)
 
 
 def _times(ratio: float, focal: float) -> float:

@@ -10,6 +10,7 @@ from darswin.lens.files.fields import Fields
 from darswin.lens.files.ocamcalib import check_inverse
 from darswin.lens.polynomial import OCam, OCamInverse
 
+Plane = tuple[tuple[float, float], tuple[float, float]]  # focal lengths, principal point
 MODELS = ("MEI", "KANNALA_BRANDT", "PINHOLE", "SCARAMUZZA")
 
 
@@ -32,16 +33,16 @@ def _camera(file: Fields) -> Description:
         projection = file.section("projection_parameters")
         radial = [projection.number(f"k{i}") for i in (2, 3, 4, 5)]
         plane = _plane(projection, "mu", "mv", "u0", "v0")
-        description = describe(KannalaBrandt, *plane, size, radial=radial)
+        description = describe(KannalaBrandt, *plane, size, {"radial": radial})
     elif model == "PINHOLE":
         plane = _plane(file.section("projection_parameters"), "fx", "fy", "cx", "cy")
-        description = describe(BrownConrady, *plane, size, **_distortion(file))
+        description = describe(BrownConrady, *plane, size, _distortion(file))
     elif model == "MEI":
         plane = _plane(file.section("projection_parameters"), "gamma1", "gamma2", "u0", "v0")
         mirror = file.section("mirror_parameters")
         xi = mirror.number("xi")
         mirror.check_all_read(model)
-        description = describe(Mei, *plane, size, xi=xi, **_distortion(file))
+        description = describe(Mei, *plane, size, {"xi": xi, **_distortion(file)})
     else:
         raise ValueError(f"model_type must be one of {', '.join(MODELS)}, got {said!r}")
     # Other mappings are matrices: where the camera stands.
@@ -51,7 +52,7 @@ def _camera(file: Fields) -> Description:
     return description
 
 
-def _plane(fields: Fields, fx: str, fy: str, cx: str, cy: str) -> tuple:
+def _plane(fields: Fields, fx: str, fy: str, cx: str, cy: str) -> Plane:
     plane = (fields.positive(fx), fields.positive(fy)), (fields.number(cx), fields.number(cy))
     fields.check_all_read("this camera")
     return plane
@@ -79,8 +80,8 @@ def _scaramuzza(file: Fields, size: tuple[int, int]) -> Description:
         if backwards:
             coefficients = [c * (-1) ** i for i, c in enumerate(coefficients)]
         check_inverse(direct, coefficients, size)
-        return in_image(OCamInverse, center, matrix, size, coefficients=coefficients)
-    return in_image(OCam, center, matrix, size, coefficients=direct)
+        return in_image(OCamInverse, center, matrix, size, {"coefficients": coefficients})
+    return in_image(OCam, center, matrix, size, {"coefficients": direct})
 
 
 def _polynomial(fields: Fields) -> list[float]:

@@ -4,7 +4,7 @@ from functools import partial
 
 from darswin.lens.base import Lens
 from darswin.lens.distorted import BrownConrady, Fisheye624, KannalaBrandt
-from darswin.lens.files.cameras import Camera, Cameras, Description, describe
+from darswin.lens.files.cameras import Camera, Cameras, Description, Parameters, describe
 from darswin.lens.files.content import Content
 from darswin.lens.files.fields import Fields, is_number, short
 from darswin.lens.ideal import FieldOfView, Perspective
@@ -85,16 +85,18 @@ def _camera(row: list[str]) -> Description:
     if len(row) != 4 + len(names):
         raise ValueError(f"{where}{name} must have {len(names)} parameters, got {len(row) - 4}")
     values = Fields(dict(zip(["width", "height", *names], row[2:], strict=True)), where)
-    focal = tuple(values.positive(n) for n in (("f", "f") if "f" in values else ("fx", "fy")))
+    fx, fy = ("f", "f") if "f" in values else ("fx", "fy")
+    focal = (values.positive(fx), values.positive(fy))
     center = (values.number("cx"), values.number("cy"))
     size = (values.side("height"), values.side("width"))
+    parameters: Parameters
     if "division" in values:
         model, parameters = _division(values)
     elif model in (FieldOfView, EnhancedUnified):
         parameters = {n: values.number(n) for n in names[4:]}
     else:
         parameters = _terms(values, names)
-    return describe(model, focal, center, size, **parameters)
+    return describe(model, focal, center, size, parameters)
 
 
 def _terms(values: Fields, names: list[str]) -> dict[str, list[float]]:

@@ -72,7 +72,7 @@ def _parse_json(text: str) -> Mapping:
         raise ValueError(f"it is no JSON: {error}") from error
 
 
-def _mapping(pairs: Iterable[tuple[str, Any]]) -> dict[str, Any]:
+def _mapping(pairs: Iterable[tuple[Any, Any]]) -> dict[Any, Any]:
     """A mapping; two entries of one name, of which a parser keeps the last, are an error."""
     pairs = list(pairs)
     mapping = dict(pairs)
@@ -110,7 +110,7 @@ def _parse_yaml(text: str) -> Mapping:
 
 
 class _Loader(yaml.BaseLoader):
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[str, Any]:
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         super().construct_mapping(node, deep)  # which says what cannot be a name
         return _mapping(
             (self.construct_object(name), self.construct_object(value))

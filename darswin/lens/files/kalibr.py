@@ -3,6 +3,7 @@
 import re
 from collections.abc import Mapping
 from functools import partial
+from typing import Any
 
 import yaml
 
@@ -63,16 +64,16 @@ def _camera(fields: Fields) -> Description:
     if "resolution" in fields:
         width, height = fields.sides("resolution")
         size = (height, width)
-    parameters = dict(zip(names, own, strict=True))
+    parameters: dict[str, Any] = dict(zip(names, own, strict=True))
     if distortion == "radtan":
         parameters |= {"radial": coefficients[:2], "tangential": coefficients[2:]}
     elif distortion == "equidistant":
         parameters |= {"radial": coefficients}
     elif distortion == "fov" and coefficients[0] != 0:
-        return describe(FieldOfView, (fu, fv), (pu, pv), size, omega=coefficients[0])
+        return describe(FieldOfView, (fu, fv), (pu, pv), size, {"omega": coefficients[0]})
     pinhole = KannalaBrandt if distortion == "equidistant" else BrownConrady
     classes = {"pinhole": pinhole, "omni": Mei, "ds": DoubleSphere, "eucm": EnhancedUnified}
-    return describe(classes[model], (fu, fv), (pu, pv), size, **parameters)
+    return describe(classes[model], (fu, fv), (pu, pv), size, parameters)
 
 
 def write(camera: Camera) -> str | None:

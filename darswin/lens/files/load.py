@@ -10,8 +10,8 @@ from typing import Any, Self
 import torch
 from torch import Tensor
 
-from darswin.lens.base import Lens
-from darswin.lens.description import MODELS, from_dict
+from darswin.lens.base import MODELS, Lens
+from darswin.lens.description import from_dict
 from darswin.lens.files import (
     basalt,
     camodocal,
@@ -138,7 +138,7 @@ class Calibration:
                 said = content.get("model") if isinstance(content, Mapping) else None
                 raise ValueError(
                     f'it must be of one of the formats {known}; darswin\'s own "model" must be '
-                    f"one of {', '.join(MODELS)}, got {short(said)}"
+                    f"one of {', '.join(sorted(MODELS))}, got {short(said)}"
                 )
         self.format, self.what = found, f"{found.name} {self.what}"
         with self._about():
@@ -215,7 +215,7 @@ class Calibration:
         alike: dict[str, list[str]] = {}
         for name in sorted(firsts.values(), key=self.names.index):
             alike.setdefault(_shape(self._describe(name)), []).append(name)
-        found = {}
+        found: dict[str, Lens] = {}
         for names in alike.values():
             found |= self._together(names, theta_max, image_size, dtype)
         return {name: found[firsts[key]] for name, key in keys.items()}

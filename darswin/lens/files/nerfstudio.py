@@ -74,4 +74,5 @@ def _camera(fields: Fields) -> Description:
     center = (fields.number("cx"), fields.number("cy"))
     fields.check_all_read(f"nerfstudio's {model}", like=lambda name, _: LIKE.search(name))
     radial, tangential = [terms[key] for key in TERMS[:4]], [terms[key] for key in TERMS[4:]]
-    return describe(MODELS[model], focal, center, size, radial=radial, tangential=tangential)
+    parameters = {"radial": radial, "tangential": tangential}
+    return describe(MODELS[model], focal, center, size, parameters)

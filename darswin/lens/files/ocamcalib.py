@@ -38,9 +38,9 @@ def _camera(rows: list[list[str]]) -> Description:
     # Its x' is down and its y' to the right: row = c x' + d y' + …, column = e x' + y' + ….
     affine, size = [[1.0, e], [d, c]], (height, width)
     if not inverse:
-        return in_image(OCam, (column, row), affine, size, coefficients=direct)
+        return in_image(OCam, (column, row), affine, size, {"coefficients": direct})
     check_inverse(direct, inverse, size)
-    return in_image(OCamInverse, (column, row), affine, size, coefficients=inverse)
+    return in_image(OCamInverse, (column, row), affine, size, {"coefficients": inverse})
 
 
 def check_inverse(direct: list[float], inverse: list[float], size: tuple[int, int]) -> None:

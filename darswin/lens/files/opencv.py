@@ -8,6 +8,8 @@ from collections.abc import Mapping
 from functools import partial
 from typing import Any
 
+import numpy as np
+
 from darswin.lens.distorted import BrownConrady, KannalaBrandt, Mei
 from darswin.lens.files.cameras import Camera, Cameras, Description, describe
 from darswin.lens.files.content import Content
@@ -68,7 +70,6 @@ def cameras(file: Fields, hint: str | None = None) -> Cameras:
 def write(camera: Camera, suffix: str) -> str | None:
     """A file of OpenCV's FileStorage: XML, JSON or YAML; None if OpenCV has no such camera."""
     import cv2  # only here: reading does without
-    import numpy as np
 
     order = "k1 k2 p1 p2 k3 d1 d2 d3 s1 s2 s3 s4"
     orders = {KannalaBrandt: "k1 k2 k3 k4", Mei: "k1 k2 p1 p2", BrownConrady: order}
@@ -101,7 +102,8 @@ def write(camera: Camera, suffix: str) -> str | None:
 class _Reader:
     def __init__(self, file: Fields, hint: str | None):
         self.file, self.hint = file, hint
-        self.names = {_plain(name): name for name in reversed(file.entries)}
+        # Of two names that are one here, the first counts.
+        self.names = {_plain(name): name for name in reversed(list(file.entries))}
 
     def find(self, names: tuple[str, ...], suffix: str = "") -> str | None:
         """The file's name of an entry that goes by several."""
@@ -165,20 +167,20 @@ class _Reader:
             self.check_shape(name, len(coefficients))
         plane = ((fx, fy), (cx, cy), self.image_size(suffix))
         if kind == "fisheye":
-            return describe(KannalaBrandt, *plane, skew=skew, radial=coefficients)
+            return describe(KannalaBrandt, *plane, {"radial": coefficients}, skew)
         terms = {"radial": coefficients[:2] + coefficients[4:5], "tangential": coefficients[2:4]}
         if kind == "omnidir":
             if xi is None:
                 raise ValueError("xi is missing, it must be a finite number")
             (value,) = self.matrix(xi, (1,))
-            return describe(Mei, *plane, skew=skew, xi=value, **terms)
+            return describe(Mei, *plane, {"xi": value, **terms}, skew)
         if any(coefficients[12:]):
             raise ValueError(
                 f"{name} must end with a tilt of 0, 0: a tilted sensor is not supported, got "
                 f"{coefficients[12:]}"
             )
         terms |= {"denominator": coefficients[5:8], "prism": coefficients[8:12]}
-        return describe(BrownConrady, *plane, skew=skew, **terms)
+        return describe(BrownConrady, *plane, terms, skew)
 
     def kind(self, name: str | None, coefficients: list[float], xi: str | None) -> str:
         """Which of `MODELS`: the hint, what the file says, or what only one of them has."""
@@ -220,9 +222,9 @@ class _Reader:
             section, where = self.file.section(name), f"{name}.data"
             value = section.get("data", "numbers")
             if value == "" and not ("rows" in section and "cols" in section):
-                value = None  # as below
+                value = None
         elif value == "":
-            value = None  # nothing is not a list of nothing
+            value = None  # an empty entry is an error, not a list of no numbers
         if isinstance(value, (int, float)):
             value = [value]
         if isinstance(value, list) and any(isinstance(row, list) for row in value[:3]):
@@ -243,10 +245,10 @@ class _Reader:
             if pair is not None:
                 width, height = self.file.sides(pair)
                 return height, width
-            width, height = self.find(WIDTH, end), self.find(HEIGHT, end)
-            if width is not None or height is not None:
-                return (self.file.side(height or "image_height"),
-                        self.file.side(width or "image_width"))  # fmt: skip
+            across, down = self.find(WIDTH, end), self.find(HEIGHT, end)
+            if across is not None or down is not None:
+                return (self.file.side(down or "image_height"),
+                        self.file.side(across or "image_width"))  # fmt: skip
         return None
 
 

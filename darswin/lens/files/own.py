@@ -3,14 +3,11 @@
 from collections.abc import Mapping
 from typing import Any
 
-from darswin.lens.base import FRAME, ROW_DIMS
-from darswin.lens.description import MODELS
+from darswin.lens.base import MODELS
 from darswin.lens.files.cameras import Cameras, Description
 from darswin.lens.files.content import Content
 from darswin.lens.files.fields import Fields, short, to_number, to_positive
-
-MAX_NUMBERS = {"angles": 65536, "radii": 65536}  # of a table's columns
-MAX_COEFFICIENTS = 64  # of all else
+from darswin.lens.focal import FocalLens
 
 
 def fits(content: Content) -> bool:
@@ -25,8 +22,8 @@ def cameras(file: Fields) -> Cameras:
 def _lens(file: Fields) -> Description:
     name = file.text("model")
     model = MODELS[name]
-    required, optional = list(model.parameters), [*model.optional, "theta_max", *FRAME]
-    if "fov" in file and hasattr(model, "from_fov"):
+    required, optional = list(model.parameters), [*model.optional, *model.common]
+    if "fov" in file and issubclass(model, FocalLens):
         required.remove("focal")
         required.append("fov")
         optional.remove("theta_max")
@@ -36,9 +33,9 @@ def _lens(file: Fields) -> Description:
             raise ValueError(f"{file.path(key)} is not of a {name} lens, which has {known}")
     description: Description = {"model": name}
     for key in (*required, *(key for key in optional if key in file)):
-        value = file.get(key, "a finite number" if key not in ROW_DIMS else "a list of numbers")
-        most = MAX_NUMBERS.get(key, MAX_COEFFICIENTS)
-        description[key] = _value(value, file.path(key), ROW_DIMS.get(key, 0), most)
+        dims = model._dims(key)
+        value = file.get(key, "a list of numbers" if dims else "a finite number")
+        description[key] = _value(value, file.path(key), dims, model.max_numbers)
     if "image_size" in file:
         description["image_size"] = list(file.sides("image_size"))
     return description

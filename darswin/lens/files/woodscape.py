@@ -44,4 +44,4 @@ def _camera(file: Fields) -> Description:
     aspect = intrinsic.positive("aspect_ratio") if "aspect_ratio" in intrinsic else 1.0
     affine = None if aspect == 1 else [[1.0, 0.0], [0.0, aspect]]
     intrinsic.check_all_read(f"a radial_poly of order {order:g}")
-    return in_image(Polynomial, center, affine, (height, width), coefficients=coefficients)
+    return in_image(Polynomial, center, affine, (height, width), {"coefficients": coefficients})

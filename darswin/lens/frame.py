@@ -1,0 +1,197 @@
+"""The image that lenses belong to: principal point, shape of the pixels, size; resized or cut."""
+
+import math
+import operator
+from collections.abc import Sequence
+from numbers import Real
+from typing import Any, ClassVar, Self
+
+import torch
+from torch import Tensor
+
+from darswin.lens.batch import LensBatch
+
+FRAME = ("center", "affine", "image_size")
+# Beside theta_max, and how each is written.
+_SHAPES = {"center": (2,), "affine": (2, 2), "image_size": (2,)}
+_FORMS = {"center": "(x, y)", "affine": "(2, 2)", "image_size": "(H, W)"}
+
+
+class ImageFrame(LensBatch):
+    """Lenses and where their images have them: from points around the principal point to pixels."""
+
+    common = ("theta_max", *FRAME)
+    lengths: ClassVar[tuple[str, ...]]  # those of the parameters that are in pixels
+    center: Tensor | None
+    affine: Tensor | None
+    image_size: Tensor | None
+
+    @classmethod
+    def _dims(cls, name: str) -> int:
+        return len(_SHAPES[name]) if name in _SHAPES else super()._dims(name)
+
+    def _check_frame(self) -> None:
+        for name, shape in _SHAPES.items():
+            tensor = getattr(self, name)
+            if tensor is None:
+                continue
+            if tensor.shape[1:] != shape:
+                raise ValueError(
+                    f"{name} must be {_FORMS[name]} or {('N', *shape)}, got {tuple(tensor.shape)}"
+                )
+            self._require(name, tensor.isfinite().flatten(1).all(1), "finite")
+        if self.affine is not None:
+            self._require("affine", self.affine.detach().det() != 0, "invertible")
+        if self.image_size is not None:
+            self._require("image_size", (self.image_size >= 1).all(1), "at least (1, 1)")
+
+    def center_in(self, image_size: tuple[int, int] | None = None) -> Tensor:
+        """(N or 1, 2) px: the principal point (x, y) in an image of (H, W)."""
+        if self.center is not None:
+            return self.center
+        if image_size is not None:
+            size = self.theta_max.new_tensor([image_size])
+        elif self.image_size is not None:
+            size = self.image_size
+        else:
+            raise ValueError("a lens with no center needs the image_size, (H, W)")
+        return (size.flip(1) - 1) / 2
+
+    def to_pixels(self, flat: Tensor, image_size: tuple[int, int] | None = None) -> Tensor:
+        """Points (N, ..., 2) around the principal point, before `affine` → pixels."""
+        return self.through_affine(flat) + self._row(self.center_in(image_size), flat.dim())
+
+    def from_pixels(self, pixels: Tensor, image_size: tuple[int, int] | None = None) -> Tensor:
+        """The inverse of `to_pixels`."""
+        flat = self._aligned(pixels)[0] - self._row(self.center_in(image_size), pixels.dim())
+        return flat if self.affine is None else _apply(torch.linalg.inv(self.affine), flat)
+
+    def through_affine(self, flat: Tensor) -> Tensor:
+        """`affine` @ points or offsets (N or 1, ..., 2)."""
+        return flat if self.affine is None else _apply(self.affine, flat)
+
+    def _side_pixels(self, image_size: tuple[int, int] | None) -> Tensor:
+        """(N, 4, 2) px: where the image ends to the left, above, to the right and below, on the row
+        and the column of the principal point."""
+        cx, cy = self.center_in(image_size).expand(len(self), 2).unbind(1)
+        if image_size is not None:
+            height, width = self.theta_max.new_tensor(image_size)
+        elif self.image_size is not None:
+            height, width = self.image_size.unbind(1)
+        else:
+            raise ValueError("side_angles needs the image_size, (H, W)")
+        low = torch.full_like(cx, -0.5)
+        sides = ((low, cy), (cx, low), ((width - 0.5).expand_as(cx), cy),
+                 (cx, (height - 0.5).expand_as(cy)))  # fmt: skip
+        return torch.stack([torch.stack(side, -1) for side in sides], 1)
+
+    def resized(self, scale: float | Tensor | Sequence[int]) -> Self:
+        """The same lens in a resized image, as `cv2.resize` makes it.
+
+        Args:
+            scale: how many times as large the image is, above 0; or its new (H, W), in whole
+                pixels, for a lens with an `image_size`. Images have whole pixels, so that (H, W)
+                is exact where a number is not.
+
+        Raises:
+            ValueError: a scale or a size that is no image's, or an (H, W) for a lens that does not
+                know its image_size. TypeError: neither a number nor two.
+        """
+        number = _number(scale)
+        if number is not None:
+            if not 0 < number < math.inf:
+                raise ValueError(f"resized must be given a finite scale above 0, got {number}")
+            size = self.image_size
+            size = None if size is None else (size * number).round().clamp(min=1)
+            across = down = self.theta_max.new_tensor([number])
+        elif self.image_size is None:
+            raise ValueError(f"resized to (H, W) = {scale} needs a lens that has an image_size")
+        else:
+            size = self.theta_max.new_tensor([_size(scale)]).expand(len(self), 2)
+            down, across = (size / self.image_size).unbind(1)
+        lens = self._scaled(across)
+        lens.image_size = size
+        if self.center is not None:
+            lens.center = (self.center + 0.5) * torch.stack((across, down), -1) - 0.5
+        if down is not across and bool((down != across).any()):
+            affine = self.affine
+            if affine is None:
+                affine = torch.eye(2, dtype=down.dtype, device=down.device)
+            rows = torch.stack((torch.ones_like(down), down / across), -1)
+            lens.affine = rows[..., None] * affine
+        return lens
+
+    def in_picture(self, size: tuple[int, int]) -> Self:
+        """The lens in a picture of (H, W) that shows all that the lens was calibrated with.
+
+        A lens without an `image_size` stays as it is.
+
+        Raises:
+            ValueError: a picture of another shape, by more than the rounding of its sides.
+        """
+        if self.image_size is None:
+            return self
+        height, width = (round(side) for side in self.image_size[0].tolist())
+        off = abs(size[0] * width - size[1] * height)  # px times the other side
+        if off > width and off > height:
+            raise ValueError(
+                f"the lens is of pictures of {height}×{width} px, and {size[0]}×{size[1]} is not "
+                "of that shape"
+            )
+        return self if tuple(size) == (height, width) else self.resized(size)
+
+    def _scaled(self, scale: Tensor) -> Self:
+        """The same lens with all its lengths `scale`, (N or 1,), times as long."""
+        lengths = {}
+        for name in self.lengths:
+            value = getattr(self, name)
+            if value is not None:
+                lengths[name] = value * self._row(scale, value.dim())
+        return self.replace(**lengths)
+
+    def cropped(self, top: int, left: int, height: int, width: int) -> Self:
+        """The same lens in a part of the image: `image[..., top:top + height, left:left + width]`.
+
+        The part may reach beyond the image, as padding does: `cropped(-8, -8, H + 16, W + 16)`.
+
+        Raises:
+            ValueError: a part of no pixels, or a lens with neither a center nor an image_size.
+            TypeError: what is not in whole pixels.
+        """
+        top, left = (_whole(side) for side in (top, left))
+        height, width = _size((height, width))
+        center = self.center_in() - self.theta_max.new_tensor([left, top])
+        size = self.theta_max.new_tensor([[height, width]]).expand(len(self), 2)
+        return self.replace(center=center.expand(len(self), 2), image_size=size)
+
+
+def _number(value: Any) -> float | None:
+    """A number, also one of NumPy or torch; None for anything else."""
+    is_number = isinstance(value, Real) or getattr(value, "ndim", None) == 0
+    return float(value) if is_number else None
+
+
+def _whole(value: Any) -> int:
+    try:
+        return operator.index(value)
+    except TypeError:
+        if isinstance(value, Real) and float(value).is_integer():
+            return int(float(value))
+        raise TypeError(f"an image has whole pixels, got {value!r}") from None
+
+
+def _size(size: Any) -> tuple[int, int]:
+    """(H, W) of an image, or ValueError."""
+    try:
+        height, width = size
+    except (TypeError, ValueError):
+        raise TypeError(f"an image's size must be (H, W), got {size!r}") from None
+    height, width = _whole(height), _whole(width)
+    if height < 1 or width < 1:
+        raise ValueError(f"an image's (H, W) must be at least (1, 1), got {(height, width)}")
+    return height, width
+
+
+def _apply(matrix: Tensor, points: Tensor) -> Tensor:
+    """(N, 2, 2) @ (N or 1, ..., 2)."""
+    return (LensBatch._row(matrix, points.dim() + 1) @ points[..., None])[..., 0]

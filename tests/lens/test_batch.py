@@ -1,0 +1,112 @@
+"""A batch of lenses as tensors."""
+
+import copy
+import pickle
+
+import numpy as np
+import pytest
+import torch
+from lens_examples import example, f64
+from torch.utils import _pytree as pytree
+
+from darswin.lens import MODELS, KannalaBrandt, Perspective, Spherical, cat
+
+
+def test_wrong_types():
+    with pytest.raises(TypeError, match="focal must be a number or a tensor, got 'wide'"):
+        Perspective("wide", 1.0)
+    with pytest.raises(TypeError, match="xi must be a number"):
+        Spherical(object(), 1.0, 1.0)
+    with pytest.raises(TypeError, match=r"Spherical takes xi, focal, theta_max, .* got thetamax"):
+        Spherical(0.5, 1.0, thetamax=1.0)
+
+
+def test_dtype_and_precision():
+    assert Spherical(0.3, 1.3, 1.0).focal.dtype == torch.float32
+    lens = Spherical(torch.tensor(0.3, dtype=f64), 1.3, 1.0)
+    assert lens.focal.dtype == f64 and lens.focal.item() == 1.3  # not rounded to float32 first
+    assert lens.to(torch.float32).xi.dtype == torch.float32
+    assert lens.to("meta").focal.device.type == "meta"
+
+
+def test_shapes_of_project():
+    one, many = Spherical(0.3, 10.0, 1.0), Spherical([0.3, 0.4, 0.5], 10.0, 1.0)
+    assert one.project(0.5).shape == (1,) and many.project(0.5).shape == (3,)
+    assert one.project(torch.zeros(7)).shape == (7,)
+    assert one.project(torch.zeros(7, 2)).shape == (7, 2)
+    assert many.project(torch.zeros(1, 5)).shape == (3, 5)
+    assert many.unproject(torch.zeros(3, 5, 2)).shape == (3, 5, 2)
+    for direction in (many.project, many.unproject):
+        with pytest.raises(ValueError, match=r"number of lenses, 3 or 1, got shape \(5,\)"):
+            direction(torch.zeros(5))
+
+
+def test_indexing_and_joining():
+    lens = Spherical([0.0, 0.2, 0.4], [1.0, 2.0, 3.0], 1.2, center=[[1.0, 2.0]] * 3)
+    assert len(lens) == 3 and len(lens[1]) == 1 and lens[1].focal.item() == 2.0
+    assert lens[-1].xi.item() == pytest.approx(0.4)
+    assert len(lens[np.int64(1)]) == 1
+    assert lens[:2].xi.tolist() == pytest.approx([0.0, 0.2])
+    assert lens[torch.tensor([2, 0])].focal.tolist() == [3.0, 1.0]
+    assert lens[torch.tensor([True, False, True])].focal.tolist() == [1.0, 3.0]
+    with pytest.raises(IndexError):
+        lens[3]
+    again = cat([lens[k] for k in range(3)])
+    assert torch.equal(again.xi, lens.xi) and torch.equal(again.center, lens.center)
+    assert [x.focal.item() for x in lens] == [1.0, 2.0, 3.0]
+    assert len(lens[0].expand(5)) == 5
+    with pytest.raises(ValueError, match="cannot expand"):
+        lens.expand(4)
+    with pytest.raises(ValueError, match="at least one"):
+        cat([])
+    with pytest.raises(ValueError, match="center for all"):
+        cat([lens[0], Spherical(0.1, 1.0, 1.0)])
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_tensors_are_contiguous_however_a_lens_was_made(name):
+    lens = example(name, torch.Generator().manual_seed(1))
+    lens = lens.replace(image_size=torch.full((1, 2), 64.0, dtype=f64).expand(4, 2))
+    made = {
+        "built": lens,
+        "reversed": lens[torch.arange(3, -1, -1)],
+        "every second": lens[::2],
+        "expanded": lens[0].expand(3),
+        "narrowed": lens.with_theta_max(0.9 * lens.theta_limit),
+        "resized": lens.resized((48, 64)),
+        "halved": lens.resized(0.5),
+        "cropped": lens.cropped(3, 5, 20, 40),
+        "replaced": lens[:2].replace(theta_max=lens.theta_max[:1].expand(2)),
+        "joined": cat([lens, lens]),
+        "float32": lens.to(torch.float32),
+    }
+    for how, other in made.items():
+        for tensor in pytree.tree_leaves(other):
+            assert tensor is None or tensor.is_contiguous(), how
+
+
+def test_strided_parameters_make_contiguous_lenses():
+    table = torch.tensor([[0.3, 300.0, 1.4], [0.9, 320.0, 1.5]], requires_grad=True)
+    lens = Spherical(*table.unbind(1), center=table[:, :2].detach().t().flip(0).t())
+    assert all(t is None or t.is_contiguous() for t in pytree.tree_leaves(lens))
+    lens.r_max.sum().backward()
+    assert (table.grad[:, 1] != 0).all()  # still the parameters that were given
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_pickle_copy_and_pytree(name):
+    lens = example(name, torch.Generator().manual_seed(1))
+    for other in (pickle.loads(pickle.dumps(lens)), copy.deepcopy(lens)):
+        assert torch.equal(other.r_max, lens.r_max)
+    leaves, spec = pytree.tree_flatten(lens)
+    assert torch.equal(pytree.tree_unflatten(leaves, spec).r_max, lens.r_max)
+    assert type(lens).__name__ in repr(lens)
+
+
+def test_a_column_of_coefficients_is_not_many_lenses():
+    column = [[0.01], [0.002], [-0.001], [0.0003]]  # as OpenCV has its D
+    for make in (lambda: KannalaBrandt(300.0, column), lambda: KannalaBrandt([300.0], column)):
+        with pytest.raises(ValueError, match=r"radial of shape \(4, 1\) is 4 lenses of one coef"):
+            make()
+    assert len(KannalaBrandt([300.0] * 4, column)) == 4
+    assert len(KannalaBrandt(300.0, [[0.01]])) == 1

@@ -1,0 +1,134 @@
+"""Lenses as curves, and several models in one batch."""
+
+import math
+
+import pytest
+import torch
+from lens_examples import ASIDE, CALIBRATIONS, double, example, f64
+from torch.utils.data import DataLoader, Dataset
+
+from darswin.lens import (
+    MODELS,
+    DoubleSphere,
+    Equidistant,
+    Equisolid,
+    Orthographic,
+    Perspective,
+    Polynomial,
+    Spherical,
+    Stereographic,
+    Tabulated,
+    as_curves,
+    cat,
+)
+
+
+class Lenses(Dataset):
+    def __len__(self):
+        return 5
+
+    def __getitem__(self, index):
+        return {"image": torch.zeros(1), "lens": Spherical.from_fov(index / 5, 2.6, 16.0)}
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_a_dataloader_batches_lenses(workers):
+    batches = list(DataLoader(Lenses(), batch_size=3, num_workers=workers))
+    assert [len(b["lens"]) for b in batches] == [3, 2]
+    assert batches[1]["lens"].xi.tolist() == pytest.approx([0.6, 0.8])
+
+
+def test_stacking_needs_the_same_frame():
+    with_size = Spherical(0.5, 10.0, 1.0, image_size=(4, 4))
+    with pytest.raises(ValueError, match="image_size for all"):
+        cat([with_size, Spherical(0.5, 10.0, 1.0)])
+    tilted = Spherical(0.5, 10.0, 1.0, affine=[[1.0, 0.0], [0.0, 2.0]])
+    both = cat([tilted, Spherical(0.5, 10.0, 1.0)])
+    assert isinstance(both, Spherical) and both.affine[1].tolist() == [[1.0, 0.0], [0.0, 1.0]]
+
+
+def test_lenses_of_several_models_are_one_batch_of_curves():
+    lenses = [CALIBRATIONS[name][0] for name in ("WoodScape front", "Kalibr ds", "COLMAP")]
+    lenses = [lens.with_theta_max(1.6).replace(center=double(1, 2)[None]) for lens in lenses]
+    lenses[1] = lenses[1].replace(affine=2 * torch.eye(2, dtype=f64)[None])
+    batch = cat(lenses)
+    assert isinstance(batch, Tabulated) and len(batch) == 3
+    theta = torch.linspace(0, 1.6, 777, dtype=f64)[None]
+    exact = torch.cat([lens.project(theta) for lens in lenses])
+    torch.testing.assert_close(batch.project(theta), exact, rtol=0, atol=2e-5)
+    torch.testing.assert_close(batch.unproject(exact), theta.expand(3, -1), rtol=0, atol=1e-7)
+    assert batch.affine[0].tolist() == [[1, 0], [0, 1]] and batch.affine[1, 0, 0] == 2
+    degrees = cat([Polynomial(double(10.0), 1.0), Polynomial(double(10.0, 1.0), 1.0)])
+    assert isinstance(degrees, Tabulated)
+    same = cat([lenses[1], lenses[1]])
+    assert isinstance(same, DoubleSphere) and len(same) == 2
+    with pytest.raises(ValueError, match="tangential or thin-prism terms is no curve"):
+        cat([ASIDE["Mei"], ASIDE["affine alone"]])
+    xi = torch.tensor([0.5], dtype=f64, requires_grad=True)
+    curve = as_curves(Spherical(xi, 10.0, 1.0))
+    curve.project(double(0.7)).backward()
+    torch.testing.assert_close(
+        xi.grad, -10 * torch.sin(double(0.7)) / (0.5 + torch.cos(double(0.7))) ** 2,
+        rtol=1e-5, atol=0,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_a_curve_is_its_lens_to_1e_7_of_the_largest_radius(name):
+    lens = example(name, torch.Generator().manual_seed(3), (100, 1000))
+    steps = torch.linspace(0, 1, 20001, dtype=f64)
+    for part in (0.5, 0.99):
+        used = lens.with_theta_max(part * lens.theta_limit)
+        theta = used.theta_max[:, None] * steps
+        error = (as_curves(used).project(theta) - used.project(theta)).abs() / used.r_max[:, None]
+        if name == "OCamInverse":
+            error = error[:, 100:]  # r(0) is not 0 there
+        assert error.max() < (1e-3 if name == "Tabulated" else 1e-7)
+        curve, exact = as_curves(used.to(torch.float32)), used.project(theta)
+        error = (curve.project(theta.float()) - exact).abs() / used.r_max[:, None]
+        assert error.max() < (1e-3 if name == "Tabulated" else 1e-5)
+
+
+def test_mixed_ideal_lenses_in_one_batch_are_exact_to_1e_5_px():
+    ends = {
+        Perspective: 89.0,
+        Equidistant: 110,
+        Equisolid: 110,
+        Stereographic: 110,
+        Orthographic: 85,
+    }
+    lenses = [model(double(300.0), math.radians(end)) for model, end in ends.items()]
+    batch = cat(lenses)
+    theta = batch.theta_max[:, None] * torch.linspace(0, 1, 30001, dtype=f64)
+    exact = torch.cat([lens.project(t[None]) for lens, t in zip(lenses, theta, strict=True)])
+    error = (batch.project(theta) - exact).abs().amax(1)
+    assert error[1:].max() < 1e-6 and error[0] < 1e-4  # r_max is 17,187 px there
+    radius = exact[:, ::7]
+    torch.testing.assert_close(batch.unproject(radius), theta[:, ::7], rtol=0, atol=1e-8)
+
+
+def test_slopes_of_a_table_are_used_and_checked():
+    angles = torch.linspace(0, 1.5, 40, dtype=f64)
+    exact = Stereographic(double(200.0))
+    slopes = 200 / torch.cos(angles / 2) ** 2
+    lens = Tabulated(angles, exact.project(angles), slopes=slopes)
+    plain = Tabulated(angles, exact.project(angles))
+    theta = torch.linspace(0, 1.5, 1001, dtype=f64)
+    error, usual = (
+        (made.project(theta) - exact.project(theta)).abs().max() for made in (lens, plain)
+    )
+    assert error < 1e-5 < 1e-3 < usual
+    double_size = lens.resized(2).project(theta)
+    torch.testing.assert_close(double_size, 2 * lens.project(theta))
+    with pytest.raises(ValueError, match="slopes must be from 0 to 3 times the table's"):
+        Tabulated(angles, exact.project(angles), slopes=4 * slopes)
+    with pytest.raises(
+        ValueError, match=r"slopes must have the shape of angles and radii, \(1, 40"
+    ):
+        Tabulated(angles, exact.project(angles), slopes=slopes[:-1])
+
+
+def test_a_table_of_two_is_straight():
+    lens = Tabulated([0.0, 1.0], [0.0, 50.0])
+    torch.testing.assert_close(lens.project(torch.tensor([0.25, 1.0])), torch.tensor([12.5, 50.0]))
+    assert lens.theta_limit.item() == 1.0

@@ -1,0 +1,102 @@
+"""The image that lenses belong to."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from darswin.lens import Equidistant, Perspective, Polynomial, Spherical
+
+
+def test_principal_point():
+    lens = Spherical(0.1, 10.0, 1.0)
+    assert lens.center_in((5, 8)).tolist() == [[3.5, 2.0]]  # (H, W) in, (x, y) out
+    assert Spherical(0.1, 10.0, 1.0, center=[3.0, 4.0]).center_in((5, 8)).tolist() == [[3.0, 4.0]]
+
+
+@pytest.mark.parametrize("center", [None, [20.0, 11.0]])
+def test_a_resized_lens_projects_to_the_resized_image(center):
+    lens = Spherical(0.4, 30.0, 1.3, center=center)
+    half = lens.resized(0.5)
+    assert half.project(1.0).item() == pytest.approx(lens.project(1.0).item() / 2)
+    # Pixel centres are integers: the corner at -1/2 stays where it is.
+    middle, before = half.center_in((15, 20))[0], lens.center_in((30, 40))[0]
+    assert torch.allclose(middle + 0.5, (before + 0.5) / 2)
+    assert Polynomial([5.0, 1.0], 1.0).resized(2).coefficients.tolist() == [[10.0, 2.0]]
+
+
+def test_resizing_to_a_size_keeps_where_rays_land():
+    lens = Polynomial([339.749, -31.988, 48.275, -7.201], 1.6, [643.4, 479.4],
+                      affine=[[1.0, 0.0], [0.0, 1.2]], image_size=(966, 1280))  # fmt: skip
+    theta, azimuth = torch.tensor([0.0, 0.5, 1.5]), torch.tensor([0.3, 2.0, -1.0])
+    before = lens.project_rays(theta, azimuth)
+    half = lens.resized((483, 320))
+    assert half.image_size.tolist() == [[483, 320]]
+    after = (before + 0.5) * torch.tensor([0.25, 0.5]) - 0.5
+    torch.testing.assert_close(half.project_rays(theta, azimuth), after, rtol=1e-5, atol=1e-4)
+    assert lens.resized(0.5).image_size.tolist() == [[483, 640]]
+    assert lens.resized((483, 640)).affine.tolist() == lens.affine.tolist()
+    with pytest.raises(ValueError, match="needs a lens that has an image_size"):
+        Spherical(0.5, 10.0, 1.0).resized((3, 4))
+
+
+def test_resized_takes_any_number_and_nothing_that_is_no_image():
+    lens = Perspective(100.0, 1.0, (319.5, 241.5), image_size=(483, 640))
+    whole = lens.resized(0.5)
+    for half in (np.float32(0.5), np.float64(0.5), torch.tensor(0.5), np.array(0.5)):
+        resized = lens.resized(half)
+        assert resized.focal.item() == 50 and resized.affine is None
+        assert resized.image_size.tolist() == whole.image_size.tolist() == [[242, 320]]
+    assert lens.resized(torch.tensor([240, 320])).image_size.tolist() == [[240, 320]]
+    assert lens.resized((240.0, np.int64(320))).image_size.tolist() == [[240, 320]]
+    assert lens.resized(1e-6).image_size.tolist() == [[1, 1]]
+    for scale in (0, -1, math.nan, math.inf, np.float32(-2), torch.tensor(0.0)):
+        with pytest.raises(ValueError, match="resized must be given a finite scale above 0, got"):
+            lens.resized(scale)
+    for size in ((0, 5), (-5, 5), torch.tensor([3, 0])):
+        with pytest.raises(ValueError, match=r"image's \(H, W\) must be at least \(1, 1\), got"):
+            lens.resized(size)
+    for size in ((483,), (1, 2, 3), "12", None, (2.5, 3), (math.nan, 3), (None, 3)):
+        with pytest.raises(TypeError, match=r"size must be \(H, W\)|whole pixels"):
+            lens.resized(size)
+
+
+@pytest.mark.parametrize("size", [(966, 1280), (483, 640), (75, 100), (1, 1), (1932, 2561)])
+def test_in_a_picture_of_the_same_view(size):
+    lens = Equidistant(300.0, 1.5, image_size=(966, 1280))
+    found = lens.in_picture(size)
+    assert found.image_size.tolist() == [list(size)]
+    assert found.focal.item() == pytest.approx(300 * size[1] / 1280)
+    assert (found is lens) == (size == (966, 1280))
+
+
+def test_in_a_picture_of_another_view():
+    lens = Equidistant(300.0, 1.5, image_size=(966, 1280))
+    for size in [(966, 1278), (480, 643), (1280, 966)]:
+        with pytest.raises(ValueError, match="pictures of 966×1280 px, and"):
+            lens.in_picture(size)
+    unknown = Equidistant(300.0, 1.5)
+    assert unknown.in_picture((4, 9)) is unknown
+
+
+def test_cropping_moves_the_principal_point():
+    lens = Spherical(0.5, 100.0, 1.0, image_size=(300, 400))
+    part = lens.cropped(50, 100, 200, 150)
+    assert part.center.tolist() == [[199.5 - 100, 149.5 - 50]]
+    assert part.image_size.tolist() == [[200, 150]]
+    with pytest.raises(ValueError, match="needs the image_size"):
+        Spherical(0.5, 100.0, 1.0).cropped(0, 0, 10, 10)
+
+
+def test_cropped_takes_only_parts_with_pixels():
+    lens = Perspective(100.0, 1.0, (319.5, 241.5), image_size=(483, 640))
+    padded = lens.cropped(-8, -4, 499, 648)
+    assert padded.center.tolist() == [[323.5, 249.5]]
+    assert padded.image_size.tolist() == [[499, 648]]
+    for part in ((0, 0, -5, 10), (0, 0, 5, 0)):
+        with pytest.raises(ValueError, match=r"must be at least \(1, 1\)"):
+            lens.cropped(*part)
+    for part in ((0.5, 0, 5, 10), (0, 0, math.nan, 10), (None, 0, 5, 5)):
+        with pytest.raises(TypeError, match="an image has whole pixels, got"):
+            lens.cropped(*part)
