@@ -10,6 +10,7 @@ from torch import Tensor
 from darswin import create_model
 from darswin.layers.grid import PolarGrid
 from darswin.lens import KannalaBrandt, Lens, Mei, Spherical
+from darswin.models.encoder import Prepared
 
 f64 = torch.float64
 CIRCLE = 14.7  # px, the radius that the images are used up to
@@ -102,13 +103,13 @@ def without_sampling(model, monkeypatch) -> None:
 
 def without_bias(model, monkeypatch) -> None:
     """The lens's parameters reach the model through the samples alone."""
-    geometry = model.geometry
+    prepare = model.prepare
 
     def detached(*args):
-        grid, angles = geometry(*args)
-        return grid, [of_rings.detach() for of_rings in angles]
+        points, positions = prepare(*args)
+        return Prepared(points, [[t.detach() for t in of_stage] for of_stage in positions])
 
-    monkeypatch.setattr(model, "geometry", detached)
+    monkeypatch.setattr(model, "prepare", detached)
 
 
 @pytest.mark.parametrize("make", LENSES)
