@@ -19,7 +19,7 @@ $(STAMP): requirements.txt pyproject.toml setup.py
 build: $(STAMP)  ## (re)build darswin._C in place
 	@PATH=$(CURDIR)/$(BIN):$$PATH $(BIN)/python setup.py -q build_ext --inplace
 
-demo: build  ## train on digits through mild lenses, test on all, draw pictures (1 minute)
+demo: build  ## train on nearly undistorted digits, test through any fisheye, draw it (2 minutes)
 	$(BIN)/python examples/digits.py
 
 test: build  ## all tests

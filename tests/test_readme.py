@@ -138,6 +138,19 @@ def test_parameter_counts_are_those_of_the_models():
     assert told == set(list_models())
 
 
+def test_the_demo_shows_its_point():
+    seeds = json.loads((ROOT / "docs/accuracy.json").read_text())["accuracy"]
+    assert all(len(runs) == 2 for runs in seeds.values())
+    assert min(min(run) for run in seeds["DarSwin-A"]) >= 92
+    fell = {}
+    for name in ("without lens knowledge", "Swin"):
+        for ours, theirs in zip(seeds["DarSwin-A"], seeds[name], strict=True):
+            assert ours[-1] - theirs[-1] >= 15
+        fell[name] = statistics.mean(run[0] - run[-1] for run in seeds[name])
+    words = f"falls by {fell['without lens knowledge']:.0f} points, and Swin by {fell['Swin']:.0f}"
+    assert words in " ".join(README.split())
+
+
 def test_the_demos_model_is_as_large_as_it_says():
     (millions,) = re.findall(r"`darswin_a_nano` \(([\d.]+) M parameters", README)
     count = parameters("darswin_a_nano", num_classes=10, in_chans=1)

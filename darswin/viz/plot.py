@@ -293,17 +293,26 @@ def draw_lens(
 
 def draw_accuracy(
     xi: Sequence[float],
-    accuracy: Mapping[str, Sequence[float]],
+    accuracy: Mapping[str, Sequence[float] | Sequence[Sequence[float]]],
     trained: tuple[float, float] | None,
     *,
     axes: Axes | None = None,
 ) -> Figure:
-    """Accuracy (%) against ξ, a line a model, with the range of training, if any, shaded."""
+    """Accuracy (%) against ξ, a line a model, with the range of training, if any, shaded.
+
+    Args:
+        accuracy: at each ξ; or a list of that for each seed, whose mean is the line and whose span
+            is a band.
+    """
     axes = axes or _new_axes(7, 4.2)
     if trained is not None:
         axes.axvspan(*trained, color="tab:pink", alpha=0.3, lw=0, label="seen in training")
     for name, values in accuracy.items():
-        axes.plot(xi, values, "o-", ms=4, label=name, clip_on=False)
+        seeds = np.atleast_2d(np.asarray(values))
+        (line,) = axes.plot(xi, seeds.mean(0), "o-", ms=4, label=name, clip_on=False)
+        if len(seeds) > 1:
+            span = seeds.min(0), seeds.max(0)
+            axes.fill_between(xi, *span, color=line.get_color(), alpha=0.2, lw=0)
     axes.set_xlabel("distortion ξ")
     axes.set_ylabel("accuracy (%)")
     axes.set_xlim(min(xi), max(xi))

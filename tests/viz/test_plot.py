@@ -243,3 +243,10 @@ def test_draw_accuracy_shows_each_model():
     labels = [text.get_text() for text in axes.get_legend().get_texts()]
     assert labels == ["seen in training", "a", "b"]
     assert list(axes.lines[0].get_ydata()) == [1, 2, 3]
+
+
+def test_draw_accuracy_shows_the_mean_and_the_span_of_seeds():
+    (axes,) = draw_accuracy([0.0, 1.0], {"a": [[1, 2], [3, 8]]}, None).axes
+    assert list(axes.lines[0].get_ydata()) == [2, 5]
+    (band,) = axes.collections
+    assert band.get_datalim(axes.transData).get_points().tolist() == [[0, 1], [1, 8]]
