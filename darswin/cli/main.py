@@ -62,6 +62,12 @@ def _bench(argv: list[str]) -> None:
     run(argv[1:])
 
 
+def _info(argv: list[str]) -> None:
+    from darswin.cli.info import run
+
+    run(argv[1:])
+
+
 TRAIN = (
     "PIL", "cv2", "jsonargparse", "lightning", "matplotlib", "sklearn", "tensorboard",
     "torchmetrics",
@@ -86,6 +92,7 @@ COMMANDS = {
     "bench": Command(
         "measures how fast a model is on this machine, in a quarter of an hour", (), _bench
     ),
+    "info": Command("says what an issue's report needs: versions, CPU, extras", (), _info),
 }
 # For terminals that know no more than ASCII.
 PLAIN = {"°": "deg", "×": "x", "±": "+/-", "–": "-", "…": "...", "²": "^2", "θ": "theta",

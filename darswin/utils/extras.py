@@ -8,23 +8,26 @@ from collections.abc import Sequence
 from importlib.metadata import requires
 
 # Packages whose modules have other names.
-_PACKAGES = {"PIL": "pillow", "cv2": "opencv-python-headless", "sklearn": "scikit-learn"}
+_MODULES = {"pillow": "PIL", "opencv-python-headless": "cv2", "scikit-learn": "sklearn"}
 
 
-def lack(extra: str, modules: Sequence[str]) -> str | None:
+def lack(extra: str, modules: Sequence[str] | None = None) -> str | None:
     """None if all modules are installed, else a sentence on which are not and what installs them.
 
     Args:
         extra: of darswin, which declares the modules' packages and their versions.
+        modules: some of that extra's; None means all.
     """
-    missing = [module for module in modules if importlib.util.find_spec(module) is None]
-    if not missing:
-        return None
     of_extra = re.compile(rf"extra == ['\"]{extra}['\"]")
     declared = {}
     for requirement in requires("darswin") or ():
-        name, _, when = requirement.partition(";")
+        named, _, when = requirement.partition(";")
         if of_extra.search(when):
-            declared[re.split(r"[^\w.-]", name, maxsplit=1)[0]] = name.strip()
-    packages = shlex.join(declared[_PACKAGES.get(module, module)] for module in missing)
+            package = re.split(r"[^\w.-]", named, maxsplit=1)[0]
+            declared[_MODULES.get(package, package)] = named.strip()
+    wanted = declared if modules is None else modules
+    missing = [module for module in wanted if importlib.util.find_spec(module) is None]
+    if not missing:
+        return None
+    packages = shlex.join(declared[module] for module in missing)
     return f"{', '.join(missing)} missing; to install what is needed: pip install {packages}"

@@ -1,5 +1,7 @@
+import contextlib
 import json
 import math
+import random
 import re
 from itertools import pairwise
 from pathlib import Path
@@ -12,7 +14,7 @@ from helpers import changed
 from lens_examples import assert_projects, points_around
 
 from darswin import lens as lenses
-from darswin.lens import MODELS, load, load_all, save
+from darswin.lens import MODELS, load, load_all, save, to_dict
 from darswin.lens.files import loads
 
 FILES = Path(__file__).parent / "files"
@@ -642,3 +644,34 @@ def test_hostile_files_end_soon_and_run_nothing(text, message, tmp_path, monkeyp
     with pytest.raises(ValueError, match=message) as error:
         loads(text)
     assert len(str(error.value)) < 1000 and not list(tmp_path.iterdir())
+
+
+# colmap_all.bin was written by pycolmap 4.2.1 from colmap_all.txt, but for BROWN_CONRADY, which it
+# does not know.
+def test_colmap_s_binary_file_has_the_cameras_of_its_text_file():
+    binary, text = (load_all(FILES / f"colmap_all.{end}", dtype=f64) for end in ("bin", "txt"))
+    assert text.keys() - binary.keys() == {"16"} and len(binary) == 17
+    assert all(to_dict(binary[name]) == to_dict(text[name]) for name in binary)
+
+
+def test_binary_files_that_are_wrong(tmp_path):
+    whole, path = (FILES / "colmap_all.bin").read_bytes(), tmp_path / "cameras.bin"
+
+    def said(data):
+        path.write_bytes(data)
+        with pytest.raises(ValueError, match=r"calibration .*cameras\.bin") as error:
+            load_all(path)
+        return str(error.value)
+
+    for length in range(8, len(whole)):
+        assert "it must hold 17 cameras, but ends in number" in said(whole[:length])
+    assert "it holds 3 bytes after its 17 cameras" in said(whole + b"abc")
+    assert "cameras, got 4294967295" in said(b"\xff" * 4 + whole[4:])
+    assert "to 16 (EUCM), got 17" in said(whole[:12] + bytes([17]) + whole[13:])
+    random.seed(0)
+    for _ in range(300):  # any bytes give lenses or a sentence
+        data = bytearray(whole)
+        data[random.randrange(len(data))] = random.randrange(256)
+        path.write_bytes(data)
+        with contextlib.suppress(ValueError):
+            load_all(path)

@@ -1,5 +1,6 @@
-"""COLMAP's cameras.txt: a line a camera, of any model but the spherical ones."""
+"""COLMAP's cameras.txt and cameras.bin: cameras of any model but the spherical ones."""
 
+import struct
 from functools import partial
 
 from darswin.lens.base import Lens
@@ -33,6 +34,15 @@ MODELS: dict[str, tuple[type[Lens], str]] = {
     "DIVISION": (EnhancedUnified, "fx fy cx cy division"),
 }  # fmt: skip
 
+# The models by their numbers in cameras.bin; BROWN_CONRADY has none yet. COLMAP 4.2, CameraModelId.
+NUMBERED = (
+    "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE",
+    "FULL_OPENCV", "FOV", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "THIN_PRISM_FISHEYE",
+    "RAD_TAN_THIN_PRISM_FISHEYE", "SIMPLE_DIVISION", "DIVISION", "SIMPLE_FISHEYE", "FISHEYE",
+    "EUCM",
+)  # fmt: skip
+_COUNT, _HEAD = struct.Struct("<Q"), struct.Struct("<IiQQ")  # id, model, width, height
+
 
 def fits(content: Content) -> bool:
     return isinstance(content, list) and len(content[0]) > 1 and not is_number(content[0][1])
@@ -45,6 +55,46 @@ def cameras(rows: list[list[str]]) -> Cameras:
             raise ValueError(f"there must be one camera {short(row[0])}, got two")
         found[row[0]] = partial(_camera, row)
     return found
+
+
+def is_binary(data: bytes) -> bool:
+    """Whether a file is a cameras.bin: it begins with a number of cameras, of eight bytes."""
+    return len(data) >= _COUNT.size and data[4:8] == bytes(4)
+
+
+def from_binary(data: bytes, most: int) -> str:
+    """A cameras.bin as the cameras.txt of the same cameras.
+
+    Args:
+        most: cameras that it may have.
+
+    Raises:
+        ValueError: more cameras, an unknown model, or another length than its cameras have.
+    """
+    (count,), place = _COUNT.unpack_from(data), _COUNT.size
+    if count > most:
+        raise ValueError(f"it must have 1 to {most} cameras, got {count}")
+    lines = []
+    try:
+        for _ in range(count):
+            camera, model, width, height = _HEAD.unpack_from(data, place)
+            if not 0 <= model < len(NUMBERED):
+                raise ValueError(
+                    f"camera {camera}, model must be a number from 0 ({NUMBERED[0]}) to "
+                    f"{len(NUMBERED) - 1} ({NUMBERED[-1]}), got {model}"
+                )
+            name = NUMBERED[model]
+            values = struct.Struct(f"<{len(MODELS[name][1].split())}d")
+            numbers = values.unpack_from(data, place + _HEAD.size)
+            lines.append(f"{camera} {name} {width} {height} {' '.join(map(repr, numbers))}")
+            place += _HEAD.size + values.size
+    except struct.error as error:
+        raise ValueError(
+            f"it must hold {count} cameras, but ends in number {len(lines)}"
+        ) from error
+    if place != len(data):
+        raise ValueError(f"it holds {len(data) - place} bytes after its {count} cameras")
+    return "\n".join(lines)
 
 
 # What `write` makes of a camera: the first of its class that has a place for all its terms.

@@ -25,11 +25,11 @@ MAX_DEPTH = 16
 _POINTS = re.compile(r"\[[\s\d.,eE+-]{2048,}\]|(?<=>)[\s\d.eE+-]{2048,}(?=<)")
 
 
-def read_text(path: str | os.PathLike) -> str:
-    """A file as text.
+def read_bytes(path: str | os.PathLike) -> bytes:
+    """A file whole.
 
     Raises:
-        ValueError: what is no file, too large, or no UTF-8. OSError: it cannot be read.
+        ValueError: what is no file, or too large. OSError: it cannot be read.
     """
     path = Path(path)
     if path.exists() and not path.is_file():
@@ -38,6 +38,11 @@ def read_text(path: str | os.PathLike) -> str:
         data = file.read(MAX_BYTES + 1)
     if len(data) > MAX_BYTES:
         raise ValueError(f"it must be at most {MAX_BYTES >> 20} MiB large")
+    return data
+
+
+def to_text(data: bytes) -> str:
+    """A text file's content; ValueError where it is no UTF-8."""
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:

@@ -24,7 +24,7 @@ from darswin.lens.files import (
     woodscape,
 )
 from darswin.lens.files.cameras import Cameras, Description
-from darswin.lens.files.content import Content, parse, read_text
+from darswin.lens.files.content import Content, parse, read_bytes, to_text
 from darswin.lens.files.fields import Fields, short
 
 # A curve that lands further out than this, px, is of no use: a pinhole's near 90°.
@@ -74,8 +74,8 @@ def load(
     """The lens of a calibration file.
 
     Reads WoodScape, KITTI-360 and CamOdoCal, Kalibr, OpenCV (fisheye, omnidir and pinhole), ROS
-    camera_info, OCamCalib, COLMAP, nerfstudio, basalt, and what `save` writes; the format is told
-    from the content. The lens has our pixel origin, whatever the file's.
+    camera_info, OCamCalib, COLMAP (cameras.txt, cameras.bin), nerfstudio, basalt, and what `save`
+    writes; the format is told from the content. The lens has our pixel origin, whatever the file's.
 
     Args:
         path: the file.
@@ -160,7 +160,9 @@ class Calibration:
         """`model`, and errors: as `load`."""
         name = os.fspath(path)
         try:
-            text = read_text(path)
+            data = read_bytes(path)
+            binary = colmap.is_binary(data)
+            text = colmap.from_binary(data, MAX_CAMERAS) if binary else to_text(data)
         except ValueError as error:
             raise ValueError(f"calibration {name}: {error}") from error
         return cls(text, name, model)
