@@ -25,6 +25,7 @@ from tqdm import tqdm
 
 from darswin import create_model, lens
 from darswin.data import LEVELS, warp_map
+from darswin.data.warp import remap
 from darswin.layers.sampling import PolarSample
 from darswin.models.encoder import Encoder
 from darswin.utils.files import replace_file
@@ -49,8 +50,7 @@ def through_lenses(scans: np.ndarray, xi: np.ndarray, size: int = SIZE) -> tuple
     lenses = lens.Spherical.from_fov(torch.from_numpy(xi).float(), FOV, size / 2)
     maps = warp_map(camera, scans.shape[1:], lenses, (size, size))
     images = [
-        cv2.remap(scan, places, None, cv2.INTER_CUBIC)
-        for scan, places in zip(scans, maps, strict=True)
+        remap(scan, places, cv2.INTER_CUBIC) for scan, places in zip(scans, maps, strict=True)
     ]
     return torch.from_numpy(np.stack(images))[:, None], lenses
 
