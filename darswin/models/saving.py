@@ -12,6 +12,7 @@ from safetensors.torch import save
 from torch import Tensor
 
 from darswin.models.encoder import Encoder
+from darswin.models.pretrained import list_pretrained, pretrained_file
 from darswin.models.registry import create_model
 from darswin.utils.files import replace_file
 
@@ -63,12 +64,14 @@ def model_of_run(run: str | os.PathLike, suffix: str = ".safetensors") -> Path:
 
 
 def load_model(path: str | os.PathLike) -> tuple[Encoder, ModelCard]:
-    """The model of a file, in eval mode, and its card.
+    """The model of a file, or of a name in `list_pretrained()`, in eval mode, and its card.
 
     Raises:
         NoCardError: other weights. ValueError: no model file of darswin, or weights that are not
             those of its model.
     """
+    if path in list_pretrained():
+        path = pretrained_file(str(path))
     try:
         with safe_open(path, "pt") as file:
             entry = (file.metadata() or {}).get(_ENTRY)
@@ -84,4 +87,7 @@ def load_model(path: str | os.PathLike) -> tuple[Encoder, ModelCard]:
         model.load_state_dict(weights)
     except (ValueError, KeyError, TypeError, RuntimeError) as error:
         raise ValueError(f"{path} is no model that this darswin can build: {error}") from error
+    model.pretrained_cfg |= dict(label_names=tuple(card.classes), file=str(path))
+    if model.image_size is None:
+        model.pretrained_cfg["input_size"] = (model.in_chans, card.size, card.size)
     return model.eval(), card
