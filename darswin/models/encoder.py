@@ -55,6 +55,7 @@ class Encoder(nn.Module):
     num_classes: int
     patch_embed: nn.Module
     stages: nn.ModuleList
+    norm: nn.Module
     head: nn.Module
     matmul_backend: MatmulBackend = "torch"  # see `set_matmul_backend`
 

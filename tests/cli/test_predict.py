@@ -9,8 +9,9 @@ from helpers import fixture
 from hypothesis import given
 from PIL import ExifTags, Image, ImageOps
 
+from darswin.cli.answers import resized
 from darswin.cli.main import main
-from darswin.cli.predict import predict, read_lens, resized
+from darswin.cli.predict import predict, read_lens
 from darswin.compat import load_official
 from darswin.data.wide_angle import IMAGENET_MEAN, IMAGENET_STD
 from darswin.lens import Equidistant, Spherical, from_dict, save
