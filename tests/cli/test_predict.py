@@ -12,7 +12,7 @@ from PIL import ExifTags, Image, ImageOps
 from darswin.cli.main import main
 from darswin.cli.predict import predict, read_lens, resized
 from darswin.compat import load_official
-from darswin.data.wide_angle import IMAGENET_MEAN, IMAGENET_STD
+from darswin.data.samples import IMAGENET_MEAN, IMAGENET_STD
 from darswin.lens import Equidistant, Spherical, from_dict, save
 from darswin.lens.orientation import in_upright_picture
 from darswin.models.encoder import Encoder
