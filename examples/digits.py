@@ -103,7 +103,7 @@ def save(path: Path, model: Encoder, scan: np.ndarray) -> None:
     )
     save_model(path, model.state_dict(), card)
     size = 256
-    image, taken_with = through_lenses(scan[None], np.array([0.3]), size)
+    image, taken_with = through_lenses(scan[None], np.array([0.5]), size)
     pixels = (image[0, 0].clamp(0, 1) * 255).round().to(torch.uint8).numpy()
     cv2.imwrite(str(path.with_suffix(".png")), pixels)
     sized = taken_with.replace(image_size=torch.tensor([[size, size]]))
@@ -142,7 +142,6 @@ def main() -> None:
     seen, unseen = train_test_split(
         np.arange(len(scans)), test_size=500, random_state=0, stratify=digits.target
     )
-    three = unseen[digits.target[unseen] == 3][0]
     tests = {
         xi: through_lenses(scans[unseen], np.full(len(unseen), xi))
         for xi in tqdm(XI, desc="warp test images", unit="lens")
@@ -155,7 +154,7 @@ def main() -> None:
             train(model, scans[seen], labels[seen], args.epochs, args.batch, seed, name)
             table[name].append([accuracy(model, *tests[xi], labels[unseen]) for xi in XI])
             if args.save and name == "DarSwin-A" and seed == 0:
-                save(args.save, model, scans[three])
+                save(args.save, model, scans[unseen[0]])
 
     print(
         f"\nAccuracy (%), mean of {args.seeds} seeds, trained on ξ in {list(LEVELS[LEVEL])}, "
@@ -166,6 +165,7 @@ def main() -> None:
         print(name.ljust(24) + "".join(f"{value:7.1f}" for value in np.mean(rows, 0)))
     model_name, options = MODELS["DarSwin-A"]
     sampler = create_model(model_name, **options).patch_embed.sample
+    three = unseen[digits.target[unseen] == 3][0]
     save_figure(draw(table, scans[three], sampler), args.out / "accuracy.png")
     record = json.dumps(dict(xi=XI, accuracy=table), indent=1)
     replace_file(args.out / "accuracy.json", record)

@@ -3,11 +3,11 @@
 import time
 from typing import Any
 
-import cv2
 import numpy as np
 import torch
 from torch import Tensor
 
+from darswin.data.frames import at_size
 from darswin.deploy.optimize import optimize
 from darswin.lens import Lens
 from darswin.models.encoder import Encoder, Prepared
@@ -77,18 +77,9 @@ class Answers:
 def resized(net: Encoder, card: ModelCard, image: np.ndarray, lens: Lens) -> tuple[Tensor, Lens]:
     """A picture as the model saw them in training: (1, C, H, W) uint8 with its lens, in its pixels.
 
-    The shorter side becomes the model's size. A model that takes only squares gets the middle one.
+    `darswin.data.frames.at_size` as the model's card says. A model that takes only squares gets one
+    in any case.
     """
-    height, width = image.shape[:2]
-    side = min(height, width)
-    if net.square_images:
-        top, left = (height - side) // 2, (width - side) // 2
-        image = image[top : top + side, left : left + side]
-        lens = lens.cropped(top, left, side, side)
-    scale = card.size / side
-    height, width = (round(length * scale) for length in image.shape[:2])
-    channels = image.shape[2]
-    image = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
-    pixels = torch.from_numpy(image.reshape(1, height, width, channels)).permute(0, 3, 1, 2)
-    # The pixels are whole, so the scale differs a little between height and width.
-    return pixels.contiguous(), lens.resized((height, width))
+    fit = "crop" if net.square_images and card.fit == "whole" else card.fit
+    image, lens = at_size(image, lens, card.size, fit)
+    return torch.from_numpy(image[None]).permute(0, 3, 1, 2).contiguous(), lens

@@ -1,6 +1,5 @@
 """`darswin predict`: what a trained model sees in pictures and videos, taken with known lenses."""
 
-import functools
 import json
 import os
 import sys
@@ -9,16 +8,16 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
 from jsonargparse import ArgumentParser
 from safetensors import safe_open
 
 from darswin.cli.answers import Answers
 from darswin.compat import load_official
+from darswin.data.calibrations import Calibrations, is_json
 from darswin.data.folders import PICTURES, pictures_below
-from darswin.data.wide_angle import IMAGENET_MEAN, IMAGENET_STD
-from darswin.lens import Lens, load
-from darswin.lens.files import loads
-from darswin.lens.orientation import in_upright_picture, stored_size
+from darswin.data.samples import IMAGENET_MEAN, IMAGENET_STD
+from darswin.lens import Lens
 from darswin.models.encoder import Encoder
 from darswin.models.pretrained import list_pretrained, pretrained_file
 from darswin.models.saving import ModelCard, NoCardError, load_model, model_of_run
@@ -62,7 +61,8 @@ def predict(
         lens: the camera's calibration file, of any format that `darswin.lens.load` reads; or its
             lens as JSON, in pixels of the pictures: {"model": "Spherical", "xi": 0.5, "focal": 300,
             "theta_max": 1.5}, or with "fov" (rad) in place of the last two where the field of view
-            fills the circle inside the picture.
+            fills the circle inside the picture; or, for several cameras, a lenses.json, whose
+            folders and files are relative to its own folder: see `darswin.data.Calibrations`.
         run: the folder of a run, whose best model is taken.
         model: a model's safetensors file, instead; "digits", which comes with darswin; or what
             `darswin convert` makes of the authors' released weights, whose classes have numbers.
@@ -92,7 +92,7 @@ def predict(
     if not paths or lens is None:
         raise ValueError("predict needs pictures or videos, and --lens, what they were taken with")
     net, card = trained_model(weights)
-    lenses = Lenses(lens, camera)
+    calibrations = Calibrations(lens, "." if is_json(lens) else Path(lens).parent, camera)
     answers = Answers(net, card, top)
     files = pictures_and_videos(paths)
     bad: list[str] = []
@@ -100,10 +100,10 @@ def predict(
         for file in files:
             try:
                 if file.is_video:
-                    answer_video(file.name, every, lenses, answers)
+                    answer_video(file.name, every, calibrations, answers)
                 else:
                     image, orientation = read_oriented(file.name, net.in_chans)
-                    taken_with = lenses.of(file.name, image.shape[:2], orientation)
+                    taken_with = _lens(calibrations, file.name, image, orientation)
                     answers.add({"image": file.name}, image, taken_with)
             except BrokenImageError as error:
                 bad.append(str(error))
@@ -136,7 +136,7 @@ def pictures_and_videos(paths: Sequence[str]) -> list[File]:
     return files
 
 
-def answer_video(name: str, every: int, lenses: "Lenses", answers: Answers) -> None:
+def answer_video(name: str, every: int, calibrations: Calibrations, answers: Answers) -> None:
     """Answers the frames of a video, and says how fast that went.
 
     Raises:
@@ -146,7 +146,7 @@ def answer_video(name: str, every: int, lenses: "Lenses", answers: Answers) -> N
     done, before, start = len(answers.found), answers.seconds, time.perf_counter()
     try:
         for frame in read_frames(name, answers.model.in_chans, every):
-            taken_with = lenses.of(name, frame.image.shape[:2], frame.orientation)
+            taken_with = _lens(calibrations, name, frame.image, frame.orientation)
             entry = {"video": name, "frame": frame.number, "time": round(frame.time, 6)}
             answers.add(entry, frame.image, taken_with)
     finally:
@@ -166,32 +166,12 @@ def answer_video(name: str, every: int, lenses: "Lenses", answers: Answers) -> N
             )
 
 
-class Lenses:
-    """The lenses of upright pictures that one camera took; the same object for the same lens.
-
-    Args:
-        lens, camera: as `read_lens`.
-    """
-
-    def __init__(self, lens: str, camera: str | None):
-        self._read = functools.cache(lambda size: read_lens(lens, size, camera))
-        self._upright = functools.cache(
-            lambda size, orientation: in_upright_picture(
-                self._read(stored_size(size, orientation)), size, orientation
-            )
-        )
-
-    def of(self, name: str, size: tuple[int, int], orientation: int) -> Lens:
-        """The lens in a picture of (H, W) that was turned upright from that orientation.
-
-        Raises:
-            ValueError: as `read_lens`. BrokenImageError: a picture that the lens does not fit.
-        """
-        self._read(stored_size(size, orientation))
-        try:
-            return self._upright(size, orientation)
-        except ValueError as error:
-            raise BrokenImageError(f"{name}: {error}") from error
+def _lens(calibrations: Calibrations, name: str, image: np.ndarray, orientation: int) -> Lens:
+    """The lens in an upright picture or frame; BrokenImageError where there is none that fits."""
+    try:
+        return calibrations.lens_of(name, (image.shape[0], image.shape[1]), orientation)
+    except ValueError as error:
+        raise BrokenImageError(str(error)) from error
 
 
 def trained_model(path: str | Path) -> tuple[Encoder, ModelCard]:
@@ -221,16 +201,3 @@ def _released_size(path: str | Path) -> int:
         return int(json.loads(config)["DATA"]["IMG_SIZE"])
     except (KeyError, TypeError, ValueError):
         return 64
-
-
-def read_lens(lens: str, image_size: tuple[int, int], camera: str | None = None) -> Lens:
-    """A lens from JSON or the name of a calibration file.
-
-    Args:
-        image_size: (H, W) of pictures as stored, for a lens that does not say it.
-
-    Raises:
-        ValueError, OSError: as `darswin.lens.load`.
-    """
-    read = loads if lens.lstrip().startswith("{") else load
-    return read(lens, camera=camera, image_size=image_size)

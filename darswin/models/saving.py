@@ -5,7 +5,7 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
@@ -30,7 +30,10 @@ class ModelCard:
     Args:
         model: a name of `create_model`. options: its options.
         classes: names of the logits.
-        size: px, of the images it was trained on. fov: rad, the field of view of their lenses.
+        size: px, of the images it was trained on. fov: rad, the field of view of their lenses, 0
+            where calibrations say it.
+        fit: how a camera's pictures get that size, as `darswin.data.frames.at_size` takes it:
+            "whole" where it was trained through the lenses of `darswin.data.WideAngle`.
     """
 
     model: str
@@ -38,6 +41,7 @@ class ModelCard:
     classes: Sequence[str] = ()
     size: int = 64
     fov: float = 0.0
+    fit: Literal["crop", "stretch", "whole"] = "whole"
 
     def create(self) -> Encoder:
         """The model, with new weights."""
@@ -82,7 +86,9 @@ def load_model(path: str | os.PathLike) -> tuple[Encoder, ModelCard]:
         raise NoCardError(f"{path} holds weights, but not the name of their model")
     try:
         values = json.loads(entry)
-        card = ModelCard(**{f.name: values[f.name] for f in fields(ModelCard)})
+        # Older files do not say all of it.
+        known = {field.name for field in fields(ModelCard)}
+        card = ModelCard(**{name: values[name] for name in known if name in values})
         model = card.create()
         model.load_state_dict(weights)
     except (ValueError, KeyError, TypeError, RuntimeError) as error:

@@ -17,8 +17,10 @@ SUFFIXES = frozenset((
 # The EXIF orientations of pictures that are turned upright as a video's metadata says, in degrees
 # clockwise.
 _ORIENTATIONS = {0: 1, 90: 6, 180: 3, 270: 8}
-# s: a video's header may be wrong by so much, as where the sound is longer than the frames.
+# A video may end so much before the end that its header names, as where its sound is longer: s, but
+# no larger a part of the video.
 _TOLERANCE = 0.5
+_PART = 0.05
 
 
 class Frame(NamedTuple):
@@ -43,7 +45,7 @@ def read_frames(path: str | Path, channels: int = 3, every: int = 1) -> Iterator
 
     Raises:
         BrokenImageError: a file that is missing or no video; after its last frame, a video that
-            ends more than half a second before the end that its header names.
+            ends before the end that its header names, by half a second or a twentieth.
     """
     capture = _opened(path)
     if capture is None:
@@ -84,7 +86,7 @@ def _check_end(path: str | Path, capture: cv2.VideoCapture, count: int, time: fl
         return
     # Times rather than counts: for some files OpenCV makes the count from the length.
     length, end = named / rate, time + 1 / rate
-    if length - end > _TOLERANCE:
+    if length - end > min(_TOLERANCE, _PART * length):
         raise BrokenImageError(
             f"{path} is damaged or cut off: it ends after {count} frames, at {end:.1f} s of the "
             f"{length:.1f} s that its header names"

@@ -11,10 +11,10 @@ from PIL import ExifTags, Image, ImageOps
 
 from darswin.cli.answers import resized
 from darswin.cli.main import main
-from darswin.cli.predict import predict, read_lens
+from darswin.cli.predict import predict
 from darswin.compat import load_official
-from darswin.data.wide_angle import IMAGENET_MEAN, IMAGENET_STD
-from darswin.lens import Equidistant, Spherical, from_dict, save
+from darswin.data.samples import IMAGENET_MEAN, IMAGENET_STD
+from darswin.lens import Equidistant, Spherical, from_dict, load, save
 from darswin.lens.orientation import in_upright_picture
 from darswin.models.encoder import Encoder
 from darswin.models.saving import ModelCard, save_model
@@ -90,7 +90,7 @@ def test_calibration_files(run):
     main([*argv, "--lens", str(path), "--camera", "cam1"])
     found = json.loads((run / "o.json").read_text())
     # The same lens in pixels of the picture, half as large: its center stays between two pixels.
-    lens = in_upright_picture(read_lens(str(path), (64, 96), "cam1"), (64, 96), 1)
+    lens = in_upright_picture(load(path, camera="cam1", image_size=(64, 96)), (64, 96), 1)
     assert lens.focal.item() == pytest.approx(60) and lens.center.tolist() == [[47.5, 31.5]]
     assert lens.image_size.tolist() == [[64, 96]]
     same = dict(
@@ -192,7 +192,7 @@ def test_a_camera_that_is_called_by_a_number(run, capsys):
     (run / "cameras.txt").write_text(COLMAP)
     picture, calibration = str(run / "p.png"), str(run / "cameras.txt")
     for name, focal in (("1", 40), ("2", 30), ("5", 20)):
-        lens = read_lens(calibration, (64, 96), name)
+        lens = load(calibration, camera=name, image_size=(64, 96))
         assert lens.focal.item() == focal
         save(lens, run / "lens.json")
         (same,) = answers([picture, "--lens", str(run / "lens.json")], run, capsys)
