@@ -12,7 +12,9 @@ import torch
 from sklearn.datasets import load_digits
 from sklearn.model_selection import train_test_split
 
-from darswin.lens import load
+from darswin.data.frames import at_size
+from darswin.data.warp import remap, warp_map
+from darswin.lens import Perspective, Spherical, load
 from darswin.models import ModelCard, list_pretrained, load_model, pretrained_file
 
 ROOT = Path(__file__).parents[2]
@@ -47,6 +49,26 @@ def test_digits_reads_through_any_fisheye_as_its_card_says(demo, unseen):
         assert found >= 92
         # Another machine rounds otherwise: that may turn one close decision or two.
         assert found == pytest.approx(float(percent), abs=0.41)
+
+
+def test_digits_in_picture_files(demo, unseen):
+    """What `darswin predict` makes of 8-bit pictures, at the accuracies that the card says."""
+    model, card = load_model("digits")
+    said = re.findall(r"([\d.]+) at (?:ξ = )?([\d.]+)", pretrained_file("digits", "md").read_text())
+    assert [float(xi) for _, xi in said] == [0, 0.5, 1]
+    for percent, xi in said:
+        taken_with = Spherical.from_fov(float(xi), demo.FOV, 128)
+        (places,) = warp_map(Perspective.from_fov(demo.FOV, 4), (8, 8), taken_with, (256, 256))
+        taken_with = taken_with.replace(image_size=torch.tensor([[256, 256]]))
+        small = []
+        for scan in unseen[0]:
+            picture = remap(scan, places, cv2.INTER_CUBIC).clip(0, 1)
+            pixels = np.round(picture * 255).astype(np.uint8)[..., None]
+            image, lens = at_size(pixels, taken_with, card.size, card.fit)
+            small.append(image)
+        images = torch.from_numpy(np.stack(small)).permute(0, 3, 1, 2)
+        found = demo.accuracy(model, images, lens[[0] * len(small)], unseen[1])
+        assert found >= 92 and found == pytest.approx(float(percent), abs=0.41)
 
 
 def test_what_comes_with_a_model():
