@@ -1,5 +1,6 @@
 """Small videos for tests."""
 
+import struct
 from pathlib import Path
 
 import cv2
@@ -26,3 +27,14 @@ def write_video(
         writer.write(np.ascontiguousarray(frame[..., ::-1]))
     writer.release()
     return frames
+
+
+def turn_video(path: Path, degrees: int) -> None:
+    """Makes the track header of an MP4 say that its frames are to be turned, clockwise."""
+    content = bytearray(path.read_bytes())
+    sine, cosine = {0: (0, 1), 90: (1, 0), 180: (0, -1), 270: (-1, 0)}[degrees]
+    matrix = content.index(b"tkhd") + 4 + 40  # ISO/IEC 14496-12, 8.3.2: version 0
+    assert struct.unpack_from(">9i", content, matrix)[0] == 1 << 16
+    rows = [cosine << 16, sine << 16, 0, -sine << 16, cosine << 16, 0, 0, 0, 1 << 30]
+    struct.pack_into(">9i", content, matrix, *rows)
+    path.write_bytes(content)

@@ -114,8 +114,9 @@ def predict(
             text = json.dumps(found, indent=1, ensure_ascii=False)
             print(text) if out is None else replace_file(out, text)
     if bad:
-        kind = "files" if any(file.is_video for file in files) else "pictures"
-        count = f"no answer for {len(bad)} of {len(files)} {kind}:\n" if found else ""
+        videos = any(file.is_video for file in files)
+        what, kind = (", or not for all frames,", "files") if videos else ("", "pictures")
+        count = f"no answer{what} for {len(bad)} of {len(files)} {kind}:\n" if found else ""
         raise BrokenImageError(count + "\n".join(bad))
     return found
 

@@ -1,11 +1,9 @@
 """Frames of video files, against what was written into them and what OpenCV itself reads."""
 
-import struct
-
 import cv2
 import numpy as np
 import pytest
-from videos import write_video
+from videos import turn_video, write_video
 
 from darswin.utils.image import BrokenImageError
 from darswin.utils.video import is_video, read_frames
@@ -37,22 +35,11 @@ def test_every_so_many_frames(tmp_path):
         assert np.array_equal(frame.image, every[frame.number].image)
 
 
-def turned_video(path, degrees):
-    """A video whose track header says that its frames are to be turned."""
-    write_video(path, 5)
-    content = bytearray(path.read_bytes())
-    sine, cosine = {0: (0, 1), 90: (1, 0), 180: (0, -1), 270: (-1, 0)}[degrees]
-    matrix = content.index(b"tkhd") + 4 + 40  # ISO/IEC 14496-12, 8.3.2: version 0
-    assert struct.unpack_from(">9i", content, matrix)[0] == 1 << 16
-    rows = [cosine << 16, sine << 16, 0, -sine << 16, cosine << 16, 0, 0, 0, 1 << 30]
-    struct.pack_into(">9i", content, matrix, *rows)
-    path.write_bytes(content)
-
-
 @pytest.mark.parametrize(("degrees", "turns"), [(0, 0), (90, -1), (180, 2), (270, 1)])
 def test_frames_come_upright(tmp_path, degrees, turns):
     write_video(tmp_path / "stored.mp4", 5)
-    turned_video(tmp_path / "turned.mp4", degrees)
+    write_video(tmp_path / "turned.mp4", 5)
+    turn_video(tmp_path / "turned.mp4", degrees)
     for stored, frame in zip(
         read_frames(tmp_path / "stored.mp4"), read_frames(tmp_path / "turned.mp4"), strict=True
     ):
