@@ -28,6 +28,7 @@ from darswin.data.lenses import parse_sweep
 from darswin.models.saving import model_of_run
 from darswin.train.checkpoints import RunCheckpoint, SafeCheckpointIO
 from darswin.train.data import WideAngleData
+from darswin.train.finetuning import read_card, settle
 from darswin.train.results import WriteResults
 from darswin.train.resuming import check_changes
 from darswin.train.stopping import StopSignals, StopWhenTold
@@ -213,6 +214,14 @@ class RunCLI(LightningCLI):
         if self.subcommand != "fit":
             config.ckpt_path = config.ckpt_path or str(model_of_run(self.folder, ".ckpt"))
             return
+        weights = config.model.weights
+        if weights is not None and Path(weights).exists():
+            weights = config.model.weights = str(Path(weights).resolve())
+        if weights is not None and not (config.resume and _last(self.folder).exists()):
+            model, data = settle(read_card(weights), weights, config.model, config.data)
+            for group, settled in ((config.model, model), (config.data, data)):
+                for name, value in settled.items():
+                    group[name] = value
         self.record = self._recorded(config)
         if config.resume and _last(self.folder).exists():
             before = yaml.safe_load((self.folder / "config.yaml").read_text())
@@ -262,7 +271,10 @@ class RunCLI(LightningCLI):
         lock = self.folder / ".lock"
         try:
             with locked(lock) if self.trainer.is_global_zero else contextlib.nullcontext():
-                self.trainer.fit(**options | {"ckpt_path": self._start()})
+                start = self._start()
+                if start is not None:
+                    self.model.weights = None  # the checkpoint has its own
+                self.trainer.fit(**options | {"ckpt_path": start})
         except BlockingIOError:
             raise FileExistsError(f"another `darswin fit` is at work in {self.folder}") from None
         except (KeyboardInterrupt, SystemExit):
