@@ -41,7 +41,8 @@ class WideAngleData(LightningDataModule):
         size: px, H = W of the images; null is that of model.weights, or 64.
         render: px, what they are reduced from.
         fov_deg: degrees, the field of view that a picture's width spans, and that of every lens.
-        fit: how a picture becomes a square, cut or squashed; its lens, if it has one, follows.
+        fit: how a picture becomes a square: crop cuts it, stretch squashes it; its lens, if it has
+            one, follows.
         picture_size: px, the width that larger pictures are first reduced to.
         channels: of the images, grey or colour; null is that of model.weights, or 3.
         mean: of the pixels in [0, 1], per channel; null is that of model.weights, or

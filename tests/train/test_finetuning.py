@@ -67,10 +67,10 @@ def weights_of(run, name="last"):
 
 def test_fine_tuning_beats_a_fresh_start_and_leaves_frozen_stages_alone(base, others, tmp_path):
     tuned, fresh = tmp_path / "tuned", tmp_path / "fresh"
-    fit(tuned, *others, "--model.weights", str(base), "--model.freeze_stages", "2")
+    fit(tuned, *others, "--model.weights", str(base), "--model.freeze_stages", "1")
     fit(fresh, *others, "--config", "minutes")
     before, after = weights_of(base, "best"), weights_of(tuned)
-    frozen = [n for n in before if n.startswith(("patch_embed.", "stages.0.", "stages.1."))]
+    frozen = [n for n in before if n.startswith(("patch_embed.", "stages.0."))]
     assert len(frozen) > 10 and all(torch.equal(before[n], after[n]) for n in frozen)
     trained = [n for n in before if n not in frozen and not n.startswith("head.")]
     assert all(not torch.equal(before[n], after[n]) for n in trained if "weight" in n)
@@ -81,7 +81,7 @@ def test_fine_tuning_beats_a_fresh_start_and_leaves_frozen_stages_alone(base, ot
     count = sum(len(group["params"]) for group in checkpoint(tuned)["optimizer_states"][0][
         "param_groups"])  # fmt: skip
     assert len(state) == count == sum(n not in frozen for n in after)
-    assert accuracy(tuned) > accuracy(fresh) + 0.1
+    assert accuracy(tuned) > accuracy(fresh) + 0.03
 
 
 def test_the_head_stays_with_its_classes(base, tmp_path):
