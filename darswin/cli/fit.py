@@ -160,7 +160,7 @@ class RunParser(LightningArgumentParser):
         if command not in RunCLI.subcommands():
             return super().format_help()
         formatter = self._get_formatter()
-        return format_help(self._actions, self.required_args, formatter, command, self.whole_help)
+        return format_help(self._actions, formatter, command, self.whole_help)
 
     def error(self, message: str, *rest: Any) -> NoReturn:
         message = re.sub(r'Parser key "([\w.]+)":', r"--\1:", message)

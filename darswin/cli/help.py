@@ -5,7 +5,7 @@
 
 import argparse
 import textwrap
-from collections.abc import Collection, Iterable
+from collections.abc import Iterable
 
 ALL = "--help.all"
 # Options by what argparse calls them; a text stands in place of Lightning's own.
@@ -35,12 +35,12 @@ TRAINER = {
     "trainer.enable_progress_bar": "true or false",
 }
 GROUPS = {"data": "pictures and lenses", "model": "the model and its training"}
+REQUIRED = ("run", "data.path")
 WIDTH, COLUMN = 118, 34
 
 
 def format_help(
     actions: Iterable[argparse.Action],
-    required: Collection[str],
     formatter: argparse.HelpFormatter,
     command: str,
     whole: bool,
@@ -48,7 +48,7 @@ def format_help(
     """The help of a command, in lines of at most `WIDTH`.
 
     Args:
-        actions: its options. required: those of them that must be given. formatter: an empty one, for the trainer's other options.
+        actions: its options. formatter: an empty one, for the trainer's other options.
         whole: shows those too.
     """
     # What is linked to another option has a name that is none.
@@ -60,7 +60,7 @@ def format_help(
         lines.extend(("", f"{title}:"))
         for name, text in texts.items():
             if name in left:
-                lines.extend(_option(left.pop(name), text, name in required))
+                lines.extend(_option(left.pop(name), text))
 
     section("the run", RUN)
     for group, title in GROUPS.items():
@@ -76,11 +76,11 @@ def format_help(
     return "\n".join(lines) + "\n\n" + formatter.format_help()
 
 
-def _option(action: argparse.Action, text: str, required: bool) -> list[str]:
+def _option(action: argparse.Action, text: str) -> list[str]:
     """An option, what it is, and in brackets what it is by default."""
     names = ", ".join(name for name in action.option_strings if not name.endswith("+"))
     default = action.default
-    if required:
+    if action.dest in REQUIRED:
         said = "required"
     elif isinstance(default, float):
         said = f"{default:g}"

@@ -38,13 +38,13 @@ def base(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def others(tmp_path_factory):
-    """Frames of the digits 6 to 9, of another camera."""
+    """Frames of the digits 1 to 7, of another camera."""
     folder = tmp_path_factory.mktemp("others")
     lens = folder / "lens.json"
     lens.write_text(
         '{"model": "Equidistant", "focal": 38.0, "theta_max": 1.5, "image_size": [121, 160]}'
     )
-    data = write_frames(folder / "frames", lens, 700, classes="6789")
+    data = write_frames(folder / "frames", lens, 600, classes="1234567")
     rates = ["--model.learning_rate", "3e-3", "--model.reference_batch", "48"]
     return [
         *("--data.path", str(data), "--data.lens", str(lens), "--data.batch_size", "16"),
@@ -74,14 +74,14 @@ def test_fine_tuning_beats_a_fresh_start_and_leaves_frozen_stages_alone(base, ot
     assert len(frozen) > 10 and all(torch.equal(before[n], after[n]) for n in frozen)
     trained = [n for n in before if n not in frozen and not n.startswith("head.")]
     assert all(not torch.equal(before[n], after[n]) for n in trained if "weight" in n)
-    assert after["head.weight"].shape[0] == 4
+    assert after["head.weight"].shape[0] == 7
     card = load_model(tuned / "checkpoints" / "last.safetensors")[1]
     assert (card.model, card.size, card.options["in_chans"]) == ("darswin_a_nano", 32, 1)
     state = checkpoint(tuned)["optimizer_states"][0]["state"]
     count = sum(len(group["params"]) for group in checkpoint(tuned)["optimizer_states"][0][
         "param_groups"])  # fmt: skip
     assert len(state) == count == sum(n not in frozen for n in after)
-    assert accuracy(tuned) > accuracy(fresh) + 0.03
+    assert accuracy(tuned) > accuracy(fresh) + 0.1
 
 
 def test_the_head_stays_with_its_classes(base, tmp_path):
