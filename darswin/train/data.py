@@ -18,6 +18,7 @@ from darswin.data.samples import IMAGENET_MEAN, IMAGENET_STD, Samples
 from darswin.data.sampling import EveryNth, ResumableLoader, TrainingOrder
 from darswin.data.sources import Part, Source
 from darswin.data.splits import Split
+from darswin.data.turning import RandomTurns
 from darswin.data.wide_angle import PAPER_FOV, WideAngle
 from darswin.train.stopping import ignore_signals
 
@@ -37,13 +38,15 @@ class WideAngleData(LightningDataModule):
             "low", "medium", "high"), one ξ ("0.4"), a range ("0.2..0.35"), or "polynomial".
         test_lenses: what testing goes through, one after the other: such names, or a sweep
             "0:1:0.1".
-        size: px, H = W of the images.
+        size: px, H = W of the images; null is that of model.weights, or 64.
         render: px, what they are reduced from.
         fov_deg: degrees, the field of view that a picture's width spans, and that of every lens.
-        fit: how a picture becomes a square, cut or squashed; its lens, if it has one, follows.
+        fit: how a picture becomes a square: crop cuts it, stretch squashes it; its lens, if it has
+            one, follows.
         picture_size: px, the width that larger pictures are first reduced to.
-        channels: of the images, grey or colour.
-        mean: of the pixels in [0, 1], per channel; null means ImageNet's.
+        channels: of the images, grey or colour; null is that of model.weights, or 3.
+        mean: of the pixels in [0, 1], per channel; null is that of model.weights, or
+            ImageNet's.
         std: of the pixels, likewise.
         classes: a file with the names of the classes.
         splits: a file or folder that says which picture is in which split.
@@ -51,6 +54,10 @@ class WideAngleData(LightningDataModule):
         limit: at most so many pictures of each split.
         batch_size: of one process.
         workers: processes that read and warp; 0 does it in the training process.
+        flip: mirrors half of the images in training, and their lenses with them.
+        rotate_deg: turns images about the optical axis in training, and their lenses with them, by
+            an angle uniform in ± so many degrees; 180 is any. What turns in from beyond a picture
+            is black.
         randaugment: changes colours in training.
         erasing: how often a box of an image is erased in training.
         pair_lenses: gives both images of a mixture the same lens, so that the mixture is an image
@@ -69,12 +76,12 @@ class WideAngleData(LightningDataModule):
         camera: str | None = None,
         train_lenses: str = "low",
         test_lenses: str | list[str] = "0:1:0.1",
-        size: int = 64,
+        size: int | None = None,
         render: int = 224,
         fov_deg: float = math.degrees(PAPER_FOV),
         fit: Literal["crop", "stretch"] = "crop",
         picture_size: int = 384,
-        channels: Literal[1, 3] = 3,
+        channels: Literal[1, 3] | None = None,
         mean: list[float] | None = None,
         std: list[float] | None = None,
         classes: str | None = None,
@@ -83,6 +90,8 @@ class WideAngleData(LightningDataModule):
         limit: int | None = None,
         batch_size: int = 128,
         workers: int = 1,
+        flip: bool = False,
+        rotate_deg: float = 0.0,
         randaugment: bool = True,
         erasing: float = 0.25,
         pair_lenses: bool = True,
@@ -90,6 +99,7 @@ class WideAngleData(LightningDataModule):
         skip_broken: bool = False,
     ):
         super().__init__()
+        size, channels = 64 if size is None else size, channels or 3
         if batch_size < 1 or workers < 0:
             raise ValueError(
                 "--data.batch_size must be at least 1 and --data.workers at least 0, "
@@ -121,6 +131,7 @@ class WideAngleData(LightningDataModule):
             WideAngle, render=render, fov=math.radians(fov_deg), picture_size=picture_size
         )
         self.limit, self.batch_size, self.workers = limit, batch_size, workers
+        self.turns = RandomTurns(flip, rotate_deg) if flip or rotate_deg else None
         self.randaugment, self.erasing = randaugment, erasing
         self.pair_lenses, self.seed = pair_lenses, seed
         self._sources: dict[str, Source] = {}
@@ -180,6 +191,7 @@ class WideAngleData(LightningDataModule):
     def train_dataloader(self) -> ResumableLoader:
         dataset = self.dataset(
             "train",
+            turns=self.turns,
             augment=RandAugment() if self.randaugment else None,
             erase=RandomErasing(self.erasing) if self.erasing else None,
         )
