@@ -156,6 +156,7 @@ class RunParser(LightningArgumentParser):
     whole_help = False
 
     def format_help(self) -> str:
+        """The help of `darswin.cli.help`: ours first."""
         command = self.prog.split()[-1]
         if command not in RunCLI.subcommands():
             return super().format_help()
@@ -163,6 +164,7 @@ class RunParser(LightningArgumentParser):
         return format_help(self._actions, formatter, command, self.whole_help)
 
     def error(self, message: str, *rest: Any) -> NoReturn:
+        """Ends the command with one sentence, in the words that people type."""
         message = re.sub(r'Parser key "([\w.]+)":', r"--\1:", message)
         message = re.sub(
             r"Subcommand '\w+' does not accept option '", "there is no option '--", message
@@ -190,10 +192,12 @@ class RunCLI(LightningCLI):
 
     @staticmethod
     def subcommands() -> dict[str, set[str]]:
+        """The three of Lightning's that a run has, and what each of them fills in itself."""
         commands = LightningCLI.subcommands()
         return {name: commands[name] for name in ("fit", "validate", "test")}
 
     def add_arguments_to_parser(self, parser: LightningArgumentParser) -> None:
+        """Adds the options that are the run's, and neither the model's nor the data's."""
         (config,) = (action for action in parser._actions if action.dest == "config")
         presets = ", ".join(sorted(path.stem for path in PRESETS.glob("*.yaml")))
         config.help = f"a preset ({presets}) or a YAML file of options; later ones win"
@@ -215,6 +219,7 @@ class RunCLI(LightningCLI):
         """Lightning would look for options in the checkpoint; a run keeps them in config.yaml."""
 
     def before_instantiate_classes(self) -> None:
+        """Completes the configuration, and checks it before anything is built."""
         config = self.config[str(self.subcommand)]
         self.folder = Path(config.run)
         config.trainer.default_root_dir = str(self.folder)
@@ -268,6 +273,7 @@ class RunCLI(LightningCLI):
         return self._parser("fit").dump(config, skip_none=False)
 
     def instantiate_trainer(self, **kwargs) -> Trainer:
+        """The trainer, with the run's callbacks, loggers and safe checkpoints."""
         config = self.config_init[str(self.subcommand)]
         given = config.trainer
         kwargs["plugins"] = [SafeCheckpointIO(), *(given.plugins or [])]
@@ -347,6 +353,7 @@ class BeginRun(Callback):
         self.folder, self.config, self.loggers = folder, config, loggers
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Writes the configuration and hands the trainer the loggers."""
         # A short epoch has its line in the logs, too. Lightning adds these two as it runs.
         most = trainer.log_every_n_steps  # type: ignore[attr-defined]
         trainer.log_every_n_steps = min(most, pl_module.steps_per_epoch)  # type: ignore[attr-defined]
@@ -362,6 +369,7 @@ class RunProgressBar(TQDMProgressBar):
     """Lightning's progress bar without the version number of the logs."""
 
     def get_metrics(self, trainer: Trainer, pl_module: LightningModule) -> dict:
+        """What the bar shows."""
         shown = super().get_metrics(trainer, pl_module)
         shown.pop("v_num", None)
         return shown

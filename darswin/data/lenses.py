@@ -41,6 +41,7 @@ class SphericalLenses:
             raise ValueError(f"ξ must be 0 ≤ low ≤ high, got {self.low} to {self.high}")
 
     def draw(self, rng: np.random.Generator, fov: float, radius: float) -> Lens:
+        """A Spherical lens whose full field of view `fov` (rad) fills a circle of `radius` px."""
         return Spherical.from_fov(rng.uniform(self.low, self.high), fov, radius)
 
 
@@ -53,6 +54,7 @@ class PolynomialLenses:
     """
 
     def draw(self, rng: np.random.Generator, fov: float, radius: float) -> Lens:
+        """A Polynomial lens whose full field of view `fov` (rad) fills a circle of `radius` px."""
         direction = np.abs(rng.standard_normal(4))
         theta_max = fov / 2
         scale = radius / sum(k * theta_max**power for power, k in enumerate(direction, start=1))

@@ -143,4 +143,5 @@ class ResumableLoader(DataLoader):
         return {"epoch": order.epoch, "done": self._done, "shuffle": order.shuffle()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Goes on where the loader stood that gave this state."""
         self._order.resume(**state)

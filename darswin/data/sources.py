@@ -61,10 +61,12 @@ class ImageFiles:
         return read_image(self.file(index), self.channels), int(self.labels[index])
 
     def oriented(self, index: int) -> tuple[np.ndarray, int, int]:
+        """The image, turned upright, its label, and the EXIF orientation it had."""
         image, orientation = read_oriented(self.file(index), self.channels)
         return image, int(self.labels[index]), orientation
 
     def file(self, index: int) -> Path:
+        """The picture's path, relative to `root`."""
         return self.root / os.fsdecode(self.paths[index])
 
 
@@ -86,9 +88,11 @@ class Arrays:
         return with_channels(self.images[index], self.channels), int(self.labels[index])
 
     def oriented(self, index: int) -> tuple[np.ndarray, int, int]:
+        """The image, its label, and 1: it is upright."""
         return *self[index], 1
 
     def file(self, index: int) -> None:
+        """None: the images have no files of their own."""
         return None
 
 
@@ -108,7 +112,9 @@ class Part:
         return self.source[self.chosen[index]]
 
     def oriented(self, index: int) -> tuple[np.ndarray, int, int]:
+        """As the source's."""
         return self.source.oriented(self.chosen[index])
 
     def file(self, index: int) -> Path | None:
+        """As the source's."""
         return self.source.file(self.chosen[index])

@@ -64,6 +64,7 @@ def some(names: list[str]) -> str:
 
 
 def read_json(path: str | Path) -> Any:
+    """What a JSON file holds; ValueError names a file that is none."""
     try:
         return json.loads(Path(path).read_text())
     except ValueError as error:

@@ -48,6 +48,7 @@ class RandomTurns:
             raise ValueError(f"rotate_deg must be in [0, 180], got {self.rotate_deg}")
 
     def draw(self, rng: np.random.Generator) -> Turn:
+        """A turn, drawn from `rng`."""
         angle = rng.uniform(-1, 1) * math.radians(self.rotate_deg)
         return Turn(angle, bool(rng.random() < 0.5) and self.flip)
 

@@ -25,10 +25,12 @@ class RunCheckpoint(ModelCheckpoint):
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
+        """Saves every so many steps."""
         if ends_step(trainer, batch_idx) and not trainer.is_last_batch:
             super().on_train_batch_end(trainer, pl_module, outputs, batch, batch_idx)
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Takes over the best score, with the files where the folder is now."""
         folder = Path(self.dirpath or "")
 
         def here(path: str) -> str:
@@ -52,6 +54,7 @@ class SafeCheckpointIO(TorchCheckpointIO):
     def save_checkpoint(
         self, checkpoint: dict[str, Any], path: str | Path, storage_options: Any = None
     ) -> None:
+        """Writes a checkpoint beside the old one, then in its place."""
         content = io.BytesIO()
         torch.save(checkpoint, content)
         replace_file(path, content.getbuffer())
@@ -63,12 +66,14 @@ class SafeCheckpointIO(TorchCheckpointIO):
         save_model(_weights(path), weights, ModelCard(**checkpoint["darswin"]))
 
     def remove_checkpoint(self, path: str | Path) -> None:
+        """Removes a checkpoint and the weights beside it."""
         super().remove_checkpoint(path)
         _weights(path).unlink(missing_ok=True)
 
     def load_checkpoint(
         self, path: str | Path, map_location: Any = "cpu", weights_only: bool | None = None
     ) -> dict[str, Any]:
+        """Reads a checkpoint without executing anything in it."""
         if not Path(path).is_file():
             raise FileNotFoundError(f"no checkpoint {path}")
         try:

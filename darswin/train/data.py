@@ -189,6 +189,7 @@ class WideAngleData(LightningDataModule):
         )
 
     def train_dataloader(self) -> ResumableLoader:
+        """Batches of the training split, in an order that can be resumed."""
         dataset = self.dataset(
             "train",
             turns=self.turns,
@@ -209,9 +210,11 @@ class WideAngleData(LightningDataModule):
     # Lightning restores a loader's own state only if it was made after the optimiser, and the
     # optimiser's schedule needs its length.
     def state_dict(self) -> dict[str, Any]:
+        """How far the training's order has come."""
         return self._loader.state_dict() if self._loader else {}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Goes on from there: the next training loader starts at that place."""
         self._progress = state_dict
 
     def _evaluation(self, split: Split, lenses: str | None = None) -> DataLoader:
@@ -232,7 +235,9 @@ class WideAngleData(LightningDataModule):
         return DataLoader(dataset, self.batch_size, sampler=part, **self._options)
 
     def val_dataloader(self) -> DataLoader:
+        """Batches of the validation split, through the training's lenses."""
         return self._evaluation("val")
 
     def test_dataloader(self) -> list[DataLoader]:
+        """Batches of the test split, one loader for each distribution of lenses."""
         return [self._evaluation("test", name) for name in self.test_names]

@@ -56,9 +56,11 @@ class Schedule(LambdaLR):
         optimizer.register_load_state_dict_pre_hook(_with_own_options)
 
     def state_dict(self) -> dict[str, Any]:
+        """The step, and nothing else."""
         return {"last_epoch": self.last_epoch}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Goes on at the step, with this schedule's own rates."""
         self.last_epoch = state_dict["last_epoch"] - 1
         self._step_count = 0  # else torch takes this for a step before the optimizer's first
         self.step()

@@ -26,6 +26,7 @@ class WriteResults(Callback):
 
     @rank_zero_only
     def on_test_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Prints the table and writes the files."""
         if not isinstance(pl_module, Classification):
             raise TypeError(f"results are of Classification, got {type(pl_module).__name__}")
         rows = pl_module.results

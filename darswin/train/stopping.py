@@ -68,26 +68,31 @@ class StopWhenTold(Callback):
         self.signals, self.checkpoint = signals, checkpoint
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """From here on the run stops by itself: the first signal only tells it to."""
         self.signals.listen()  # Lightning has just installed its own for SIGTERM
         self.signals.patient = True
 
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
+        """Saves a checkpoint and ends the process after a step in which it was told to stop."""
         if ends_step(trainer, batch_idx) and not trainer.is_last_batch and self._told(trainer):
             trainer.save_checkpoint(self.checkpoint)
             raise SystemExit
 
     def on_train_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Ends the process where an epoch's last step was the one; its checkpoint is there."""
         if trainer.global_step > 0 and self._told(trainer):
             raise SystemExit
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """A signal stops at once again."""
         self.signals.patient = False
 
     def on_exception(
         self, trainer: Trainer, pl_module: LightningModule, exception: BaseException
     ) -> None:
+        """A signal stops at once again."""
         self.signals.patient = False
 
     def _told(self, trainer: Trainer) -> bool:

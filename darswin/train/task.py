@@ -177,6 +177,7 @@ class Classification(LightningModule):
         return self.trainer.datamodule  # type: ignore[attr-defined]  # Lightning attaches it
 
     def configure_optimizers(self) -> OptimizerLRSchedulerConfig:
+        """AdamW, and its learning rate over the run's steps."""
         trainer = self.trainer
         batch = self.data.batch_size * trainer.world_size * trainer.accumulate_grad_batches
         scale = batch / self.reference_batch
@@ -245,6 +246,7 @@ class Classification(LightningModule):
         return self.net(images, lens)
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
+        """The loss of a batch, mixed if mixing is on."""
         images, lens, labels = batch
         # A step's random numbers depend on its place alone, so that a resumed run repeats them.
         step = (self.seed, self.current_epoch, batch_idx)
@@ -291,11 +293,13 @@ class Classification(LightningModule):
                 metric.update(logits, labels[known])
 
     def validation_step(self, batch: Batch, batch_idx: int) -> None:
+        """Counts a batch into the validation's loss and accuracy."""
         self._measure(batch, self.val_metrics)
         for name, metric in _named(self.val_metrics):
             self.log(f"val/{name}", metric, prog_bar=name != "top5", on_step=False, on_epoch=True)
 
     def test_step(self, batch: Batch, batch_idx: int, dataloader_idx: int = 0) -> None:
+        """Counts a batch into the loss and accuracy of its lenses."""
         self._measure(batch, self.test_metrics[dataloader_idx])
 
     def on_test_epoch_end(self) -> None:
