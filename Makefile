@@ -16,7 +16,7 @@ $(STAMP): requirements.txt pyproject.toml setup.py
 	PATH=$(CURDIR)/$(BIN):$$PATH $(BIN)/pip install -q --no-build-isolation --no-deps -e .
 	@touch $@
 
-build: $(STAMP)  ## (re)build darswin._C in place
+build: $(STAMP)  ## (re)build darswin/libdarswin.so in place
 	@PATH=$(CURDIR)/$(BIN):$$PATH $(BIN)/python setup.py -q build_ext --inplace
 
 demo: build  ## train on nearly undistorted digits, test through any fisheye, draw it (2 minutes)
@@ -40,7 +40,7 @@ test-lowest: build $(LOWEST)/installed  ## the commands, files, pictures and ONN
 	  tests/deploy/test_export.py -k "not program and not package"
 
 test-isa: build  ## the operators' tests on every instruction-set tier of this machine
-	@set -e; for tier in $$($(BIN)/python -c 'from darswin import _C; print(*_C.tiers())'); do \
+	@set -e; for tier in $$($(BIN)/python -c 'from darswin.ops import _module; print(*_module.tiers())'); do \
 	  echo "== $$tier"; \
 	  ATEN_CPU_CAPABILITY=$$(echo $$tier | sed s/generic/default/) \
 	    $(BIN)/python -m pytest -q tests/ops \
@@ -56,7 +56,7 @@ test-asan: build  ## the operators' tests on every tier under AddressSanitizer a
 	@rm -rf $(SANITIZED)/darswin
 	@PATH=$(CURDIR)/$(BIN):$$PATH DARSWIN_SANITIZE=address,undefined \
 	  $(BIN)/python setup.py -q build --build-lib $(SANITIZED)
-	@set -e; tiers=$$($(BIN)/python -c 'from darswin import _C; print(*_C.tiers())'); \
+	@set -e; tiers=$$($(BIN)/python -c 'from darswin.ops import _module; print(*_module.tiers())'); \
 	cd $(SANITIZED); for tier in $$tiers; do \
 	  echo "== $$tier, sanitized"; \
 	  LD_PRELOAD="$(PRELOAD)" ASAN_OPTIONS=detect_leaks=0:allocator_may_return_null=1 \
@@ -102,4 +102,4 @@ dist: $(STAMP)  ## sdist and wheel in dist/
 	PATH=$(CURDIR)/$(BIN):$$PATH $(BIN)/python -m build --no-isolation --outdir dist
 
 clean:  ## remove what was built
-	rm -rf build dist darswin.egg-info darswin/_C*.so
+	rm -rf build dist darswin.egg-info darswin/libdarswin.so
