@@ -5,10 +5,10 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/installed
 
-.PHONY: help build demo test test-lowest test-isa test-asan fuzz kills lint format bench study learned-lens readme dist clean
+.PHONY: help build demo test test-lowest test-isa test-asan fuzz kills lint format bench study learned-lens readme dist wheels repair published-wheels test-torch clean
 
 help:  ## this list
-	@grep -E '^[a-z-]+:.*##' Makefile | sed -E 's/:.*## /\t/' | expand -t 12
+	@grep -E '^[a-z-]+:.*##' Makefile | sed -E 's/:.*## /\t/' | expand -t 18
 
 $(STAMP): requirements.txt pyproject.toml setup.py
 	$(PYTHON) -m venv $(VENV)
@@ -100,6 +100,35 @@ readme: $(STAMP)  ## fill the README's tables from the results of bench and stud
 
 dist: $(STAMP)  ## sdist and wheel in dist/
 	PATH=$(CURDIR)/$(BIN):$$PATH $(BIN)/python -m build --no-isolation --outdir dist
+
+# One wheel of a platform serves every Python. It shares its libraries with torch, which is imported
+# first. What is published is made by cibuildwheel, which runs `repair` and tests/installed.py too.
+wheels: $(STAMP)  ## the manylinux_2_28 wheel in dist/, tested in a fresh environment
+	rm -rf build/wheel
+	PATH=$(CURDIR)/$(BIN):$$PATH $(BIN)/python -m build --no-isolation --wheel --outdir build/wheel
+	PATH=$(CURDIR)/$(BIN):$$PATH $(MAKE) repair WHEEL="$$(echo build/wheel/*.whl)"
+	$(MAKE) test-torch
+
+DEST := dist
+repair:
+	auditwheel repair --plat manylinux_2_28_$$(uname -m) --only-plat --wheel-dir "$(DEST)" \
+	  --exclude 'libtorch*' --exclude 'libc10*' --exclude 'libgomp*' "$(WHEEL)"
+
+published-wheels: $(STAMP)  ## the same in the manylinux_2_28 container, by cibuildwheel: needs Docker
+	$(BIN)/cibuildwheel --output-dir dist
+
+# The versions of torch that the wheel of `make wheels` is tested under, a fresh environment each.
+TORCH := $(shell sed -n 's/^torch==//p' requirements.txt)
+SCRATCH := build/scratch
+
+test-torch:  ## the wheel under TORCH="2.10.0 2.11.0 …", on PYTHON; gigabytes of downloads each
+	@set -e; for version in $(TORCH); do \
+	  echo "== torch $$version on $(PYTHON)"; \
+	  $(PYTHON) -m venv --clear $(SCRATCH); \
+	  $(SCRATCH)/bin/pip install -q torch==$$version dist/darswin-*-manylinux_2_28_$$(uname -m).whl \
+	    $$(grep -E '^(hypothesis|pytest)==' requirements.txt); \
+	  $(SCRATCH)/bin/python tests/installed.py; \
+	done
 
 clean:  ## remove what was built
 	rm -rf build dist darswin.egg-info darswin/libdarswin.so

@@ -6,6 +6,7 @@ import re
 import shlex
 import subprocess
 import sys
+import zipfile
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -129,6 +130,29 @@ def test_the_module_holds_no_path_of_the_build_machine():
     assert not any("/" in line.split("[")[1] for line in needed)
 
 
+def test_the_module_exports_its_facts_only():
+    shown = subprocess.run(
+        ["nm", "-D", "--defined-only", _module.FILE], capture_output=True, text=True, check=True
+    )
+    exported = {line.split()[-1] for line in shown.stdout.splitlines()}
+    facts = {"darswin_tier", "darswin_tiers", "darswin_set_tier", "darswin_build_info"}
+    assert exported == facts
+
+
+def test_the_module_asks_for_nothing_newer_than_manylinux_2_28():
+    major = int(re.search(r"g\+\+ (\d+)", _module.build_info()["compiler"])[1])
+    if major > 12:
+        pytest.skip("headers of a newer compiler may ask for more: use the container")
+    newest = {"GLIBC": (2, 28), "GLIBCXX": (3, 4, 24), "CXXABI": (1, 3, 11)}
+    shown = subprocess.run(
+        ["readelf", "-V", _module.FILE], capture_output=True, text=True, check=True
+    )
+    found = re.findall(r"Name: (GLIBC|GLIBCXX|CXXABI)_([\d.]+)", shown.stdout)
+    assert {library for library, _ in found} == set(newest)
+    for library, version in found:
+        assert tuple(map(int, version.split("."))) <= newest[library], f"{library}_{version}"
+
+
 def test_a_missing_module_is_explained(monkeypatch, tmp_path):
     monkeypatch.setattr(_module, "FILE", tmp_path / "libdarswin.so")
     with pytest.raises(ImportError) as caught:
@@ -168,7 +192,10 @@ def test_the_sdist_builds_a_wheel_that_runs_from_another_folder(tmp_path):
 
     # `build` makes the wheel from the unpacked sdist, not from the checkout.
     python("-m", "build", "--no-isolation", "--outdir", tmp_path, ROOT, env=environment)
-    (wheel,) = tmp_path.glob("*.whl")
+    (wheel,) = tmp_path.glob("darswin-*-py3-none-linux_*.whl")
+    names = zipfile.ZipFile(wheel).namelist()
+    assert [name for name in names if name.endswith(".so")] == ["darswin/libdarswin.so"]
+    assert all(name.startswith(("darswin/", "darswin-")) for name in names)
     elsewhere = tmp_path / "site"
     python("-m", "pip", "install", "-q", "--no-deps", "--target", elsewhere, wheel)
     code = (
