@@ -48,9 +48,10 @@ def check_shape(name: str, value: Tensor, form: str, *allowed: Sequence[int | No
     if shape in allowed:
         return
     for sizes in allowed:
-        if len(shape) == len(sizes) and all(
-            s is None or s == size for s, size in zip(sizes, shape, strict=True)
-        ):
+        if len(shape) != len(sizes):
+            continue
+        # Not with all(): Dynamo of torch 2.10 cannot trace it.
+        if shape == tuple(n if s is None else s for s, n in zip(sizes, shape, strict=True)):
             return
     expected = form.format(*(s for s in allowed[0] if s is not None))
     raise ValueError(f"{name} must have shape {expected}, got {shape}")
