@@ -53,6 +53,7 @@ struct Call {
     args.channels = x.size(3), args.height = size[0], args.width = size[1], args.tokens = tokens;
     check_product({args.batch, args.height, args.width, args.channels});
     check_product({args.batch, args.height, args.rings + kSums});
+    STD_TORCH_CHECK(args.rings <= INT32_MAX / args.sectors, "polar_to_image: too many tokens");
     check_product({args.rings, args.sectors, std::max(args.channels, kChannelBlock)});
     STD_TORCH_CHECK(center.has_value() != points.has_value() && !(points && affine),
                     "polar_to_image: takes center, and affine if need be, or else points");

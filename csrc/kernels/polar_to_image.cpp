@@ -13,130 +13,11 @@
 #include "../polar_to_image.h"
 
 #include "arena.h"
-#include "math.h"
+#include "polar_plan.h"
 #include "transpose.h"
-#include "trig.h"
 
 namespace darswin {
 namespace {
-
-constexpr int64_t kTile = 64;  // pixels that are planned together; a multiple of every register
-
-template <typename T>
-inline T smaller(T a, T b) {
-  return b < a ? b : a;
-}
-
-// Where the pixels of a tile lie in the map.
-template <typename Real>
-struct Plan {
-  int64_t token[4][kTile];  // inner ring left, right; outer ring left, right
-  Real weight[4][kTile];
-  bool known[kTile];  // else the pixel is zero
-
-  // For the gradients of the lens alone.
-  int64_t inner[kTile], outer[kTile];
-  bool pole[kTile];
-  Real t[kTile], left[kTile], right[kTile];  // shares of the outer ring, and of the right sectors
-  Real across[kTile], down[kTile], radius[kTile];
-};
-
-template <typename T, typename Real>
-class Planner {
- public:
-  using Args = PolarToImageArgs<T, Real>;
-  using V = Vector<Real, kLanes<Real>>;
-
-  explicit Planner(const Args& args) : a(args) {}
-
-  // Plans `count` pixels of a row of image b, from pixel `first` on.
-  void plan(int64_t b, int64_t row, int64_t first, int64_t count, Plan<Real>& plan) {
-    const Real* radii = a.radii + (a.radii_rows == 1 ? 0 : b) * a.rings;
-    const Real limit = a.r_max == nullptr ? static_cast<Real>(__builtin_inf())
-                                          : a.r_max[a.r_max_rows == 1 ? 0 : b];
-    if (first == 0) above = 0;  // what a pixel gets does not depend on who computes it
-    place(a.place_rows == 1 ? 0 : b, row, first, count, plan);
-    const Real per_turn = static_cast<Real>(a.sectors / (2 * kPi));
-    const Real half = static_cast<Real>(0.5) * static_cast<Real>(a.sectors);
-    for (int64_t k = 0; k < count; k += kLanes<Real>) {
-      const V x = load<V>(plan.across + k), y = load<V>(plan.down + k);
-      store(plan.radius + k, x * x + y * y);
-      store(plan.right + k, arc_tangent(y, x) * per_turn - static_cast<Real>(0.5));
-    }
-    for (int64_t k = 0; k < count; ++k) plan.radius[k] = root(plan.radius[k]);
-    for (int64_t k = 0; k < count; ++k) {
-      const Real r = plan.radius[k], column = plan.right[k];
-      // Infinity less itself is NaN, which is not below the limit either.
-      plan.known[k] = plan.across[k] - plan.across[k] == 0 && plan.down[k] - plan.down[k] == 0 &&
-                      r <= limit && r < static_cast<Real>(__builtin_inf());
-      if (!plan.known[k]) {
-        for (int corner = 0; corner < 4; ++corner) {
-          plan.token[corner][k] = 0;
-          plan.weight[corner][k] = 0;
-        }
-        continue;
-      }
-      while (above < a.rings && radii[above] <= r) ++above;
-      while (above > 0 && radii[above - 1] > r) --above;
-      const bool pole = above == 0, beyond = above == a.rings;
-      const int64_t inner = pole ? 0 : above - 1, outer = beyond ? inner : above;
-      const Real from = pole ? -radii[0] : radii[inner];
-      const Real t = beyond ? 0 : (r - from) / (radii[outer] - from);
-      const auto [l0, r0, share0] = neighbours(pole ? column + half : column);
-      const auto [l1, r1, share1] = neighbours(column);
-      plan.token[0][k] = (inner * a.sectors + l0) * a.channels;
-      plan.token[1][k] = (inner * a.sectors + r0) * a.channels;
-      plan.token[2][k] = (outer * a.sectors + l1) * a.channels;
-      plan.token[3][k] = (outer * a.sectors + r1) * a.channels;
-      plan.weight[0][k] = (1 - t) * (1 - share0);
-      plan.weight[1][k] = (1 - t) * share0;
-      plan.weight[2][k] = t * (1 - share1);
-      plan.weight[3][k] = t * share1;
-      plan.inner[k] = inner, plan.outer[k] = outer, plan.pole[k] = pole;
-      plan.t[k] = t, plan.left[k] = share0, plan.right[k] = share1;
-    }
-  }
-
- private:
-  struct Neighbours {
-    int64_t left, right;
-    Real share;  // of the right one
-  };
-
-  // Of a column in [-A, 2 A), around the ring.
-  Neighbours neighbours(Real column) const {
-    int64_t left = static_cast<int64_t>(column);
-    left -= static_cast<Real>(left) > column;  // towards minus infinity
-    const Real share = column - static_cast<Real>(left);
-    while (left < 0) left += a.sectors;
-    while (left >= a.sectors) left -= a.sectors;
-    const int64_t right = left + 1 == a.sectors ? 0 : left + 1;
-    return {left, right, share};
-  }
-
-  // The pixels on the polar plane. Behind the last one up to the end of its register stand zeros.
-  void place(int64_t n, int64_t row, int64_t first, int64_t count, Plan<Real>& plan) const {
-    const int64_t whole = smaller(round_up(count, kLanes<Real>), kTile);
-    for (int64_t k = count; k < whole; ++k) plan.across[k] = plan.down[k] = 0;
-    if (a.points != nullptr) {
-      const Real* from = a.points + ((n * a.height + row) * a.width + first) * 2;
-      for (int64_t k = 0; k < count; ++k) {
-        plan.across[k] = from[2 * k], plan.down[k] = from[2 * k + 1];
-      }
-      return;
-    }
-    const double* m = a.plane + n * kPlane;
-    const double y = static_cast<double>(row) - m[1];
-    for (int64_t k = 0; k < count; ++k) {
-      const double x = static_cast<double>(first + k) - m[0];
-      plan.across[k] = static_cast<Real>(m[2] * x + m[3] * y);
-      plan.down[k] = static_cast<Real>(m[4] * x + m[5] * y);
-    }
-  }
-
-  const Args& a;
-  int64_t above = 0;  // ring centres that the last pixel was not inside of
-};
 
 // Values of a token, widened, and back.
 inline Floats values(const float* from) { return load<Floats>(from); }
@@ -178,57 +59,76 @@ class Forward {
  private:
   V mix(const T* map, int64_t k, int64_t c) const {
     if (!plan.known[k]) return V{};
-    const V inner = plan.weight[0][k] * values(map + plan.token[0][k] + c) +
-                    plan.weight[1][k] * values(map + plan.token[1][k] + c);
-    const V outer = plan.weight[2][k] * values(map + plan.token[2][k] + c) +
-                    plan.weight[3][k] * values(map + plan.token[3][k] + c);
+    const V inner = plan.weight[0][k] * values(map + a.channels * plan.token[0][k] + c) +
+                    plan.weight[1][k] * values(map + a.channels * plan.token[1][k] + c);
+    const V outer = plan.weight[2][k] * values(map + a.channels * plan.token[2][k] + c) +
+                    plan.weight[3][k] * values(map + a.channels * plan.token[3][k] + c);
     return inner + outer;
   }
   Real mix_one(const T* map, int64_t k, int64_t c) const {
     if (!plan.known[k]) return 0;
-    const Real inner = plan.weight[0][k] * value(map[plan.token[0][k] + c]) +
-                       plan.weight[1][k] * value(map[plan.token[1][k] + c]);
-    const Real outer = plan.weight[2][k] * value(map[plan.token[2][k] + c]) +
-                       plan.weight[3][k] * value(map[plan.token[3][k] + c]);
+    const Real inner = plan.weight[0][k] * value(map[a.channels * plan.token[0][k] + c]) +
+                       plan.weight[1][k] * value(map[a.channels * plan.token[1][k] + c]);
+    const Real outer = plan.weight[2][k] * value(map[a.channels * plan.token[2][k] + c]) +
+                       plan.weight[3][k] * value(map[a.channels * plan.token[3][k] + c]);
     return inner + outer;
   }
 
+  // The channels from c on, fewer than a register: whole registers where they lie in the map.
+  V mix_last(const T* map, int64_t k, int64_t c) const {
+    const int64_t end = a.rings * a.sectors * a.channels - c - kL;
+    bool inside = true;
+    for (int corner = 0; corner < 4; ++corner) {
+      inside &= a.channels * plan.token[corner][k] <= end;
+    }
+    if (inside) return mix(map, k, c);
+    V v{};
+    for (int64_t e = c; e < a.channels; ++e) v[e - c] = mix_one(map, k, e);
+    return v;
+  }
+
   void tokens(const T* map, int64_t count, T* to) const {
+    const T* end = to + count * a.channels;
     for (int64_t k = 0; k < count; ++k, to += a.channels) {
       int64_t c = 0;
       for (; c + kL <= a.channels; c += kL) put(to + c, mix(map, k, c));
-      for (; c < a.channels; ++c) put_one(to + c, mix_one(map, k, c));
+      if (c == a.channels) continue;
+      const V last = mix_last(map, k, c);
+      if (end - (to + c) >= kL) {
+        put(to + c, last);  // the next pixel overwrites what is too much
+      } else {
+        for (; c < a.channels; ++c) put_one(to + c, last[c % kL]);
+      }
     }
   }
 
   void planes(const T* map, int64_t count, T* to, int64_t stride) const {
-    int64_t c = 0;
-    if constexpr (kSame<Real, float>) {
-      for (; c + kL <= a.channels; c += kL) {
-        int64_t k = 0;
-        for (; k + kL <= count; k += kL) square(map, k, c, to + c * stride + k, stride);
-        for (; k < count; ++k) {
-          for (int64_t e = c; e < c + kL; ++e) put_one(to + e * stride + k, mix_one(map, k, e));
-        }
+    for (int64_t c = 0; c < a.channels; c += kL) {
+      const int64_t channels = smaller(kL, a.channels - c);
+      int64_t k = 0;
+      if constexpr (kSame<Real, float>) {
+        for (; k + kL <= count; k += kL) square(map, k, c, channels, to + c * stride + k, stride);
       }
-    }
-    for (; c < a.channels; ++c) {
-      for (int64_t k = 0; k < count; ++k) put_one(to + c * stride + k, mix_one(map, k, c));
+      for (; k < count; ++k) {
+        const V v = channels == kL ? mix(map, k, c) : mix_last(map, k, c);
+        for (int64_t e = 0; e < channels; ++e) put_one(to + (c + e) * stride + k, v[e]);
+      }
     }
   }
 
-  // kL channels of kL pixels, from pixel k and channel c on.
-  void square(const T* map, int64_t k, int64_t c, T* to, int64_t stride) const {
+  // Up to kL channels of kL pixels, from pixel k and channel c on.
+  void square(const T* map, int64_t k, int64_t c, int64_t channels, T* to, int64_t stride) const {
     Floats rows[kL];
+    if (channels == kL) {
 #pragma GCC unroll 16
-    for (int i = 0; i < kL; ++i) rows[i] = mix(map, k + i, c);
-    if constexpr (kSame<T, float>) {
-      transpose_square(rows, to, stride);
+      for (int i = 0; i < kL; ++i) rows[i] = mix(map, k + i, c);
+      if constexpr (kSame<T, float>) return transpose_square(rows, to, stride);
     } else {
-      float turned[kL * kL];
-      transpose_square(rows, turned, kL);
-      for (int64_t i = 0; i < kL; ++i) narrow_lanes(to + i * stride, load<Floats>(turned + i * kL));
+      for (int i = 0; i < kL; ++i) rows[i] = mix_last(map, k + i, c);
     }
+    float turned[kL * kL];
+    transpose_square(rows, turned, kL);
+    for (int64_t i = 0; i < channels; ++i) put(to + i * stride, load<Floats>(turned + i * kL));
   }
 
   const Args& a;
@@ -240,12 +140,18 @@ class Forward {
 template <typename T, typename Real>
 void gather(const PolarToImageArgs<T, Real>& a, int64_t b, int64_t place, int64_t count, int64_t c,
             int64_t width, int64_t row, Real* to) {
+  constexpr int64_t kAhead = 16, kBytes = sizeof(T);
   const int64_t pixels = a.height * a.width;
   if (a.tokens) {
     const T* from = a.grad_out + (b * pixels + place) * a.channels + c;
-    for (int64_t k = 0; k < count; ++k) {
-      for (int64_t e = 0; e < width; ++e) to[k * row + e] = value(from[k * a.channels + e]);
-      for (int64_t e = width; e < row; ++e) to[k * row + e] = 0;
+    for (int64_t k = 0; k < count; ++k, from += a.channels, to += row) {
+      // The pieces lie apart, which the hardware does not foresee.
+      const char* ahead = reinterpret_cast<const char*>(from + kAhead * a.channels);
+      for (int64_t byte = 0; byte < width * kBytes; byte += 64) __builtin_prefetch(ahead + byte);
+      int64_t e = 0;
+      for (; e + kLanes<Real> <= width; e += kLanes<Real>) store(to + e, values(from + e));
+      for (; e < width; ++e) to[e] = value(from[e]);
+      for (; e < row; ++e) to[e] = 0;
     }
     return;
   }
@@ -305,9 +211,29 @@ void forward(const PolarToImageArgs<T, Real>& a, int64_t begin, int64_t end, voi
   for (int64_t item = begin; item < end; ++item) forward.row(item / a.height, item % a.height);
 }
 
+// Adds the gradients of a tile's pixels, rows of `row_` values, to those of their tokens. `fixed`
+// is the length of a row, or 0 where it is known only now.
+template <typename Real, int64_t fixed>
+void add(const Plan<Real>& plan, int64_t count, int64_t row_, const Real* gradients, Real* sums) {
+  using V = Vector<Real, kLanes<Real>>;
+  constexpr int64_t kL = kLanes<Real>;
+  const int64_t row = fixed > 0 ? fixed : row_;
+  for (int64_t k = 0; k < count; ++k, gradients += row) {
+    if (!plan.known[k]) continue;
+#pragma GCC unroll 4
+    for (int corner = 0; corner < 4; ++corner) {
+      Real* to = sums + plan.token[corner][k] * row;
+      const Real weight = plan.weight[corner][k];
+#pragma GCC unroll 8
+      for (int64_t e = 0; e < row; e += kL) {
+        store(to + e, load<V>(to + e) + weight * load<V>(gradients + e));
+      }
+    }
+  }
+}
+
 template <typename T, typename Real>
 void backward_map(const PolarToImageArgs<T, Real>& a, int64_t begin, int64_t end, void* memory) {
-  using V = Vector<Real, kLanes<Real>>;
   constexpr int64_t kL = kLanes<Real>;
   const Workspace<T, Real> work(a, memory);
   Plan<Real>& plan = *work.plan;
@@ -325,17 +251,10 @@ void backward_map(const PolarToImageArgs<T, Real>& a, int64_t begin, int64_t end
         const int64_t count = smaller(kTile, a.width - first);
         planner.plan(b, y, first, count, plan);
         gather(a, b, y * a.width + first, count, c, width, row, work.gradients);
-        for (int64_t k = 0; k < count; ++k) {
-          if (!plan.known[k]) continue;
-          const Real* g = work.gradients + k * row;
-#pragma GCC unroll 4
-          for (int corner = 0; corner < 4; ++corner) {
-            Real* to = work.sums + plan.token[corner][k] / a.channels * row;
-            const Real weight = plan.weight[corner][k];
-            for (int64_t e = 0; e < row; e += kL) {
-              store(to + e, load<V>(to + e) + weight * load<V>(g + e));
-            }
-          }
+        if (row == kChannelBlock) {
+          add<Real, kChannelBlock>(plan, count, row, work.gradients, work.sums);
+        } else {
+          add<Real, 0>(plan, count, row, work.gradients, work.sums);
         }
       }
     }
@@ -398,8 +317,8 @@ void backward_lens(const PolarToImageArgs<T, Real>& a, int64_t begin, int64_t en
           if (!plan.known[k]) continue;
           double s[4];  // how the loss changes with each corner's weight
           for (int corner = 0; corner < 4; ++corner) {
-            s[corner] = product(work.gradients + k * row, a.x + b * map + plan.token[corner][k],
-                                a.channels);
+            s[corner] = product(work.gradients + k * row,
+                                a.x + b * map + a.channels * plan.token[corner][k], a.channels);
           }
           const double t = plan.t[k], left = plan.left[k], right = plan.right[k];
           const double by_t = (1 - right) * s[2] + right * s[3] - (1 - left) * s[0] - left * s[1];
@@ -408,7 +327,7 @@ void backward_lens(const PolarToImageArgs<T, Real>& a, int64_t begin, int64_t en
           const Real* radii = a.radii + (a.radii_rows == 1 ? 0 : b) * a.rings;
           const int64_t inner = plan.inner[k], outer = plan.outer[k];
           double by_r = 0;
-          if (plan.pole[k]) {  // t = (r + r_0) / (2 r_0)
+          if (plan.turn[k] != 0) {  // t = (r + r_0) / (2 r_0)
             const double first_radius = radii[0];
             by_r = by_t / (2 * first_radius);
             grad_radii[0] -= by_t * r / (2 * first_radius * first_radius);
