@@ -90,8 +90,7 @@ struct Call {
   void find_plane() {
     const int64_t matrices = affine ? checked(*affine, {2, 2}) : 1;
     const Real *c = pointer(*center), *m = affine ? pointer(*affine) : nullptr;
-    args.place_rows = std::max(args.place_rows, matrices);
-    if (args.batch == 0) args.place_rows = std::min(args.place_rows, matrices);
+    if (args.place_rows == 1) args.place_rows = matrices;
     for (int64_t n = 0; n < args.place_rows; ++n) {
       const Real* at = c + (center->size(0) == 1 ? 0 : 2 * n);
       double xx = 1, xy = 0, yx = 0, yy = 1;

@@ -62,9 +62,10 @@ def check_rising(name: str, value: Tensor) -> None:
 
     Only values that can be read without waiting for a device, and outside of graphs and transforms.
     """
-    wrapped = torch._C._functorch.is_functorch_wrapped_tensor(value)
-    plain = type(value) in (Tensor, torch.nn.Parameter) and value.device.type == "cpu"
-    if torch.compiler.is_compiling() or wrapped or not plain:
+    if torch.compiler.is_compiling() or value.device.type != "cpu":
+        return
+    transformed = torch._C._functorch.peek_interpreter_stack() is not None
+    if transformed or type(value) not in (Tensor, torch.nn.Parameter):
         return
     rows = value.detach().numpy()
     if not ((rows[:, 1:] > rows[:, :-1]).all() and (rows >= 0).all() and (rows < math.inf).all()):

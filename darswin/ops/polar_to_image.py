@@ -110,9 +110,7 @@ def _fake_backward(
     x, radii, center, affine, points, r_max, size, tokens, grad_out, x_grad, lens_grad
 ):
     lens = (radii, center, affine, points)
-    gradients = [
-        radii.new_empty(t.shape if lens_grad and t is not None else (0,)) for t in lens
-    ]
+    gradients = [radii.new_empty(t.shape if lens_grad and t is not None else (0,)) for t in lens]
     return x.new_empty(x.shape if x_grad else (0,)), *gradients
 
 

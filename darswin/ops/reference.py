@@ -158,7 +158,7 @@ def polar_to_image(
     if r_max is not None:
         known = known & (r <= r_max[:, None, None])
 
-    rows = max(len(r), len(radii))
+    rows = 1 if len(r) == len(radii) == 1 else batch
     r, azimuth = (t.expand(rows, *t.shape[1:]) for t in (r, azimuth))
     known, radii = known.expand(rows, *known.shape[1:]), radii.expand(rows, rings)
     # The ring centres on both sides. Inside the first one the inner side lies across the pole, at
