@@ -78,23 +78,29 @@ def polar_to_image(
         raise ValueError("polar_to_image takes center, and affine if need be, or else points")
     if isinstance(r_max, (int, float)):
         r_max = radii.new_full((1,), float(r_max)) if isinstance(radii, Tensor) else None
-    for name, tensor, form, shape in (
-        ("radii", radii, "(B or 1, R) = ({} or 1, {})", (rings,)),
-        ("center", center, "(B or 1, 2) = ({} or 1, {})", (2,)),
-        ("affine", affine, "(B or 1, 2, 2) = ({} or 1, {}, {})", (2, 2)),
-        ("points", points, "(B or 1, H, W, 2) = ({} or 1, {}, {}, {})", (height, width, 2)),
-        ("r_max", r_max, "(B or 1,) = ({} or 1,)", ()),
+    _check_lens("radii", radii, x, real, "(B or 1, R) = ({} or 1, {})", rings)
+    for name, tensor, form, *shape in (
+        ("center", center, "(B or 1, 2) = ({} or 1, {})", 2),
+        ("affine", affine, "(B or 1, 2, 2) = ({} or 1, {}, {})", 2, 2),
+        ("points", points, "(B or 1, H, W, 2) = ({} or 1, {}, {}, {})", height, width, 2),
+        ("r_max", r_max, "(B or 1,) = ({} or 1,)"),
     ):
-        if tensor is not None or name == "radii":
-            check_tensor(name, tensor, dtypes=(real,))
-            check_tensor(name, tensor, like=x, dtypes=(real,))
-            check_shape(name, tensor, form, (batch, *shape), (1, *shape))
+        if tensor is not None:
+            _check_lens(name, tensor, x, real, form, *shape)
     check_rising("radii", radii)
     check_layout(layout)
     return _library.run(
         reference.polar_to_image,
         x, radii, center, affine, points, r_max, (height, width), layout == "tokens",
     )  # fmt: skip
+
+
+def _check_lens(
+    name: str, tensor: Tensor, x: Tensor, dtype: torch.dtype, form: str, *shape: int
+) -> None:
+    """TypeError or ValueError unless a tensor of the lens is (B or 1, *shape), beside x."""
+    check_tensor(name, tensor, like=x, dtypes=(dtype,))
+    check_shape(name, tensor, form, (len(x), *shape), (1, *shape))
 
 
 @torch.library.register_fake("darswin::polar_to_image")
