@@ -69,7 +69,7 @@ def polar_to_image(
         x = _library.without_float16(x)
     check_tensor("x", x, dtypes=(*DTYPES, torch.bfloat16))
     check_shape("x", x, "(B, R, A, D)", (None,) * 4)
-    batch, rings, sectors, _ = x.shape
+    rings, sectors = x.shape[1:3]
     if rings == 0 or sectors == 0:
         raise ValueError(f"x must have rings and sectors, got {tuple(x.shape)}")
     real = torch.float64 if x.dtype == torch.float64 else torch.float32
