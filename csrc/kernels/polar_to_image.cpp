@@ -164,7 +164,11 @@ void gather(const PolarToImageArgs<T, Real>& a, int64_t b, int64_t place, int64_
       for (; k + kL <= count; k += kL) {
         Floats rows[kL];
 #pragma GCC unroll 16
-        for (int i = 0; i < kL; ++i) rows[i] = values(from + (e + i) * pixels + k);
+        for (int i = 0; i < kL; ++i) {
+          const T* plane = from + (e + i) * pixels + k;
+          __builtin_prefetch(plane + kTile);
+          rows[i] = values(plane);
+        }
         transpose_square(rows, to + k * row + e, row);
       }
       for (; k < count; ++k) {
