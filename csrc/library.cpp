@@ -13,6 +13,10 @@
   "Tensor image, Tensor radii, Tensor azimuths, Tensor center, Tensor? affine, Tensor? offsets, " \
   "Tensor? jitter, Tensor? seed, int[] samples, float[] mean, float[] std, bool bfloat16"
 
+#define POLAR_TO_IMAGE                                                                      \
+  "Tensor x, Tensor radii, Tensor? center, Tensor? affine, Tensor? points, Tensor? r_max, " \
+  "int[] size, bool tokens"
+
 // A backward takes what its operator takes, then the gradient of the output.
 STABLE_TORCH_LIBRARY(darswin, m) {
   m.def("polar_sample(" SAMPLING ", bool tokens) -> Tensor");
@@ -29,6 +33,10 @@ STABLE_TORCH_LIBRARY(darswin, m) {
   m.def(
       "window_attention_backward(Tensor qkv, Tensor bias, int[] window, int[] shift, "
       "int[] periodic, float scale, Tensor grad_out) -> (Tensor, Tensor)");
+  m.def("polar_to_image(" POLAR_TO_IMAGE ") -> Tensor");
+  m.def("polar_to_image_backward(" POLAR_TO_IMAGE
+        ", Tensor grad_out, bool x_grad, bool lens_grad) -> "
+        "(Tensor, Tensor, Tensor, Tensor, Tensor)");
   m.def("_add_norm_(Tensor(a!) x, Tensor(b!) y, Tensor weight, Tensor bias, float eps) -> ()");
   m.def("_transpose_sum(Tensor x) -> (Tensor, Tensor)");
 }

@@ -15,7 +15,7 @@ void check_product(std::initializer_list<int64_t> sizes) {
   int64_t result = 64;
   for (const int64_t size : sizes) {
     STD_TORCH_CHECK(size == 0 || !__builtin_mul_overflow(result, size, &result),
-                    "polar_sample: the sizes are too large");
+                    "the sizes are too large");
   }
 }
 

@@ -21,6 +21,9 @@ inline V larger(V a, V b) {
   return a > b ? a : b;
 }
 
+inline float root(float x) { return __builtin_sqrtf(x); }
+inline double root(double x) { return __builtin_sqrt(x); }
+
 // e^x for x <= 0, within 1 unit in the last place; below 2^-126 it becomes 0. NaN stays NaN.
 inline Vector<float, kLanes<float>> exponential_of_negative(Vector<float, kLanes<float>> x) {
   using V = Vector<float, kLanes<float>>;

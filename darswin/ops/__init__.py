@@ -9,12 +9,14 @@ from darswin.ops import _add_norm, _transpose_sum  # noqa: F401
 from darswin.ops._library import cpu_capability, reference_in_use, use_reference
 from darswin.ops.polar_embed import polar_embed
 from darswin.ops.polar_sample import polar_sample
+from darswin.ops.polar_to_image import polar_to_image
 from darswin.ops.window_attention import window_attention
 
 __all__ = [
     "cpu_capability",
     "polar_embed",
     "polar_sample",
+    "polar_to_image",
     "reference_in_use",
     "use_reference",
     "window_attention",

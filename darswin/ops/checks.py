@@ -3,6 +3,7 @@
 A message says what was expected and what came.
 """
 
+import math
 import numbers
 import operator
 from collections.abc import Iterable, Sequence
@@ -55,6 +56,21 @@ def check_shape(name: str, value: Tensor, form: str, *allowed: Sequence[int | No
             return
     expected = form.format(*(s for s in allowed[0] if s is not None))
     raise ValueError(f"{name} must have shape {expected}, got {shape}")
+
+
+def check_rising(name: str, value: Tensor) -> None:
+    """ValueError unless each row of (N, R) is finite, at least 0, and rises.
+
+    Only values that can be read without waiting for a device, and outside of graphs and transforms.
+    """
+    if torch.compiler.is_compiling() or value.device.type != "cpu":
+        return
+    transformed = torch._C._functorch.peek_interpreter_stack() is not None
+    if transformed or type(value) not in (Tensor, torch.nn.Parameter):
+        return
+    rows = value.detach().numpy()
+    if not ((rows[:, 1:] > rows[:, :-1]).all() and (rows >= 0).all() and (rows < math.inf).all()):
+        raise ValueError(f"{name} must be finite, at least 0, and rise from ring to ring")
 
 
 def as_int(value: Any) -> int | None:

@@ -131,6 +131,78 @@ def polar_embed(sampling: Sampling, weight: Tensor, bias: Tensor | None) -> Tens
     return out.bfloat16() if sampling.bfloat16 else out
 
 
+def polar_to_image(
+    x: Tensor,
+    radii: Tensor,
+    center: Tensor | None,
+    affine: Tensor | None,
+    points: Tensor | None,
+    r_max: Tensor | None,
+    size: Sequence[int],
+    tokens: bool,
+) -> Tensor:
+    """See `darswin.ops.polar_to_image`."""
+    batch, rings, sectors, channels = x.shape
+    if points is None and center is not None:
+        points = _on_polar_plane(size, center, affine)
+    assert points is not None
+    across, down = points.unbind(-1)  # (N, H, W)
+    known = across.isfinite() & down.isfinite()
+    across, down = torch.where(known, across, 1), torch.where(known, down, 0)
+    # At the centre itself neither the radius nor the azimuth has a derivative.
+    middle = (across == 0) & (down == 0)
+    across = torch.where(middle, 1, across)
+    r = torch.where(middle, 0, (across.square() + down.square()).sqrt())
+    azimuth = torch.atan2(down, across)
+    known = known & r.isfinite()
+    if r_max is not None:
+        known = known & (r <= r_max[:, None, None])
+
+    rows = 1 if len(r) == len(radii) == 1 else batch
+    r, azimuth = (t.expand(rows, *t.shape[1:]) for t in (r, azimuth))
+    known, radii = known.expand(rows, *known.shape[1:]), radii.expand(rows, rings)
+    # The ring centres on both sides. Inside the first one the inner side lies across the pole, at
+    # a negative radius; beyond the last one both sides are the last ring.
+    above = torch.searchsorted(radii.contiguous(), r.detach().flatten(1).contiguous(), right=True)
+    above = above.reshape(r.shape)
+    pole, beyond = above == 0, above == rings
+    inner, outer = (above - 1).clamp(min=0), above.clamp(max=rings - 1)
+    first, second = (radii.gather(1, k.flatten(1)).reshape(r.shape) for k in (inner, outer))
+    first = torch.where(pole, -first, first)
+    span = torch.where(beyond, 1, second - first)
+    t = torch.where(beyond, 0, (r - first) / span)
+
+    column = azimuth * (sectors / (2 * math.pi)) - 0.5
+    maps = x.to(radii.dtype).flatten(1, 2)  # bfloat16 is computed in float32
+    out = maps.new_zeros(())
+    for ring, weight, place in (
+        (inner, 1 - t, torch.where(pole, column + sectors / 2, column)),
+        (outer, t, column),
+    ):
+        left = place.detach().floor()
+        for sector, share in ((left, 1 - (place - left)), (left + 1, place - left)):
+            index = (ring * sectors + sector.long() % sectors).flatten(1)
+            index = index[:, :, None].expand(batch, -1, channels)
+            corner = maps.gather(1, index).unflatten(1, tuple(size))
+            out = out + (weight * share)[..., None] * corner
+    out = torch.where(known[..., None], out, 0).to(x.dtype)
+    return out if tokens else out.permute(0, 3, 1, 2).contiguous()
+
+
+def _on_polar_plane(size: Sequence[int], center: Tensor, affine: Tensor | None) -> Tensor:
+    """(N, H, W, 2): each pixel's place from the centre, with the matrix undone."""
+    height, width = size
+    y, x = (torch.arange(n, dtype=center.dtype, device=center.device) for n in (height, width))
+    pixels = torch.stack(torch.meshgrid(x, y, indexing="xy"), -1)
+    points = pixels - center[:, None, None]
+    if affine is None:
+        return points
+    (a, b), (c, d) = affine.permute(1, 2, 0)
+    inverse = torch.stack((torch.stack((d, -b), -1), torch.stack((-c, a), -1)), -2)
+    inverse = inverse / (a * d - b * c)[:, None, None]
+    return torch.einsum("nij,nhwj->nhwi", inverse, points)
+
+
 def window_attention(
     qkv: Tensor,
     bias: Tensor,

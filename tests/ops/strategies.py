@@ -9,7 +9,7 @@ import torch
 from hypothesis import strategies as st
 from torch import Tensor
 
-from darswin.ops import polar_embed, polar_sample, reference, window_attention
+from darswin.ops import polar_embed, polar_sample, polar_to_image, reference, window_attention
 
 f32, f64 = torch.float32, torch.float64
 
@@ -216,6 +216,70 @@ def attention(draw, dtypes=(f32, f64)) -> Case:
     bias = normal(generator, *table, dtype=f32 if dtype == torch.bfloat16 else dtype)
     inputs = dict(qkv=draw(strided(qkv)), bias=draw(strided(bias)))
     return Case(lambda qkv, bias: window_attention(qkv, bias, **options), inputs, None, options)
+
+
+@st.composite
+def polar_maps(draw, dtypes=(f32, f64)) -> Case:
+    """A call of polar_to_image."""
+    generator, dtype = draw(generators()), draw(st.sampled_from(dtypes))
+    real = f32 if dtype == torch.bfloat16 else dtype
+    batch, channels = draw(sizes(0, 1, 2, 3)), draw(sizes(0, 1, 2, 3, 8, 10, 16, 17, 31, 33, 65))
+    rings, sectors = draw(sizes(1, 2, 3, 5, 16)), draw(sizes(1, 2, 3, 8, 17, 64))
+    size = height, width = draw(sizes(0, 1, 2, 7, 16, 33)), draw(sizes(0, 1, 2, 7, 16, 33, 90))
+    rows = st.sampled_from([1, batch])
+    spread = draw(st.sampled_from([0.2, 0.5, 1.5])) * max(*size, 2)
+    radii = (torch.rand(draw(rows), rings, generator=generator, dtype=f64) + 0.3).cumsum(1)
+    radii = radii / rings * spread
+    if draw(st.integers(0, 4)) == 0:
+        radii = radii - radii[:, :1]  # a ring at the pole itself
+    options = dict(size=size, layout=draw(st.sampled_from(["tokens", "image"])))
+    inputs = dict(x=normal(generator, batch, rings, sectors, channels, dtype=dtype))
+    inputs["radii"] = radii.to(real)
+    general = draw(st.sampled_from(["circular", "affine", "points"]))
+    if general == "points":
+        points = 0.4 * max(*size, 2) * normal(generator, draw(rows), *size, 2)
+        inputs["points"] = points.to(real)
+    else:
+        center = torch.tensor([(width - 1) / 2, (height - 1) / 2], dtype=f64)
+        spread = draw(st.sampled_from([0.3, 3.0]))
+        inputs["center"] = (center + spread * normal(generator, draw(rows), 2)).to(real)
+    if general == "affine":
+        skew = normal(generator, draw(rows), 2, 2).clamp(-2, 2)
+        inputs["affine"] = (torch.eye(2, dtype=f64) + 0.15 * skew).to(real)
+    r, _ = on_polar_plane(size, **{name: t.double() for name, t in inputs.items() if name != "x"})
+    if draw(st.booleans()) and r.numel() > 1:
+        # Between two pixels, since what lies on the border may count as inside or outside.
+        radius = r.flatten().sort().values
+        gap = radius.diff().argmax()
+        options["r_max"] = (radius[gap] + radius[gap + 1]).item() / 2
+    inputs = {name: draw(strided(t)) if name != "radii" else t for name, t in inputs.items()}
+
+    def run(x, radii, center=None, **lens):
+        return polar_to_image(x, radii, center, **lens, **options)
+
+    def mask(x, radii, **lens):
+        """Gradients of the lens jump at ring centres, at the middles of sectors and at the pole."""
+        r, azimuth = on_polar_plane(size, **lens)
+        column = azimuth * (sectors / (2 * math.pi)) - 0.5
+        columns = torch.stack((column, column + sectors / 2))
+        smooth = ((columns - columns.round()).abs() > 1e-3).all(0) & (r > 0.5)
+        smooth = smooth & ((r[..., None] - radii[:, None, None]).abs() > 1e-3).all(-1)
+        smooth = smooth.expand(batch, *smooth.shape[1:]).to(f64)
+        return smooth[..., None] if options["layout"] == "tokens" else smooth[:, None]
+
+    return Case(run, inputs, mask, options)
+
+
+def on_polar_plane(size, radii=None, center=None, affine=None, points=None):
+    """Radius and azimuth of the pixels, (N, H, W) each, in float64."""
+    if points is None:
+        y, x = (torch.arange(n, dtype=f64) for n in size)
+        pixels = torch.stack(torch.meshgrid(x, y, indexing="xy"), -1)
+        points = pixels - center[:, None, None]
+        if affine is not None:
+            points = torch.linalg.solve(affine[:, None, None], points[..., None])[..., 0]
+    x, y = points.unbind(-1)
+    return torch.hypot(x, y), torch.atan2(y, x)
 
 
 WIDTHS = (1, 2, 3, 7, 15, 16, 17, 31, 33, 64, 96, 200, 384, 1500)

@@ -37,6 +37,15 @@ def sampling(dtype=torch.float32, batch=2, seed=3):
             [], [], False]  # fmt: skip
 
 
+def polar_map(general):
+    """The arguments that polar_to_image and its backward share."""
+    plane = [torch.full((1, 2), 3.0), torch.eye(2)[None], None]
+    if general:
+        plane = [None, None, torch.rand(2, 5, 7, 2) * 6 - 3]
+    radii = torch.tensor([[0.5, 1.5, 2.5]])
+    return [torch.rand(2, 3, 4, 5), radii, *plane, torch.tensor([3.0]), [5, 7], True]
+
+
 # A valid call of each operator.
 CALLS = {
     "polar_sample": lambda: [*sampling(), True],
@@ -53,6 +62,10 @@ CALLS = {
     "window_attention_backward": lambda: [
         torch.rand(2, 4, 6, 3, 2, 5), torch.rand(2, 2, 3, 5), [2, 3], [1, 2], [0, 1], 0.5,
         torch.rand(2, 4, 6, 10),
+    ],
+    "polar_to_image": lambda: polar_map(False),
+    "polar_to_image_backward": lambda: [
+        *polar_map(True), torch.rand(2, 5, 7, 5), True, True,
     ],
     "_add_norm_": lambda: [
         torch.rand(3, 4), torch.rand(3, 4), torch.rand(4), torch.rand(4), 1e-5,

@@ -12,7 +12,14 @@ from torch.func import vmap
 
 from darswin import ops
 from darswin.layers.sampling import PolarSample
-from darswin.ops import polar_embed, polar_sample, reference, use_reference, window_attention
+from darswin.ops import (
+    polar_embed,
+    polar_sample,
+    polar_to_image,
+    reference,
+    use_reference,
+    window_attention,
+)
 from darswin.ops._add_norm import add_norm_
 from darswin.ops._transpose_sum import transpose_sum
 
@@ -26,6 +33,9 @@ CALLS = {
     "polar_sample": (lambda x: polar_sample(x, radii, azimuths, center, samples=(2, 2)), image),
     "polar_embed": (
         lambda x: polar_embed(image, radii, azimuths, center, x, samples=(2, 2)), weight,
+    ),
+    "polar_to_image": (
+        lambda x: polar_to_image(x, radii, center, (8, 8)), torch.randn(1, 4, 8, 3),
     ),
     "window_attention": (lambda x: window_attention(x, bias, window=(1, 4)), qkv),
 }  # fmt: skip

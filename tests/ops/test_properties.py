@@ -132,6 +132,31 @@ def test_window_attention_equals_the_reference(case):
     assert_equals_reference(case, size_of)
 
 
+def check_polar_map(case: Case) -> None:
+    exact = case.to(f64)
+    sizes = results(exact, is_reference=True, absolute=["x"])
+    x, radii = exact.inputs["x"], exact.inputs["radii"]
+    # Of the lens: all pixels, each by the difference of two tokens, at the narrowest ring or, half
+    # a pixel from the pole, by the azimuth; a matrix has as long a lever as the image is wide.
+    steps = torch.cat((2 * radii[:, :1], radii.diff(dim=1)), 1)
+    narrow = steps[steps > 0].min().item() if (steps > 0).any() else 1.0
+    lens = sizes["grad"].sum().item() * 2 * largest(x) * (1 / narrow + x.shape[2])
+    lens *= 1 + max(case.settings["size"])
+    # A weight is right to the rounding of a place, in units of a ring or of a sector.
+    weights = (1 + max(case.settings["size"])) * (1 / narrow + x.shape[2])
+    assert_equals_reference(
+        case,
+        lambda name: (
+            weights * largest(sizes[name]) if name in ("out", "grad", "x") else weights * lens
+        ),
+    )
+
+
+@given(strategies.polar_maps())
+def test_polar_to_image_equals_the_reference(case):
+    check_polar_map(case)
+
+
 @given(strategies.norms())
 def test_add_norm_is_as_accurate_as_torch(arguments):
     x, y, weight, bias = arguments
@@ -214,6 +239,18 @@ def test_bfloat16_attention_is_float32_rounded_once(case):
     ours, exact = (results(c, is_reference=False) for c in (case, wide))
     assert ours["out"].dtype == ours["qkv"].dtype == bf16
     torch.testing.assert_close(ours["out"].float(), exact["out"], rtol=2**-7, atol=1e-5)
+    assert_same_bits_on_any_number_of_threads(
+        lambda: list(results(case, is_reference=False).values())
+    )
+
+
+@given(strategies.polar_maps(dtypes=(bf16,)))
+def test_bfloat16_maps_are_brought_back_in_float32_and_rounded_once(case):
+    note(repr(case))
+    wide = Case(case.run, {name: t.float() for name, t in case.inputs.items()}, case.mask)
+    ours, exact = (results(c, is_reference=False) for c in (case, wide))
+    assert ours["out"].dtype == ours["x"].dtype == bf16
+    assert torch.equal(ours["out"], exact["out"].bfloat16())
     assert_same_bits_on_any_number_of_threads(
         lambda: list(results(case, is_reference=False).values())
     )
@@ -314,6 +351,32 @@ def test_huge_pixels_do_not_overflow(case, huge):
             exact = case.run(**{name: t.double() for name, t in inputs.items()})
     assert ours.isfinite().all()
     torch.testing.assert_close(ours.double(), exact, rtol=1e-4, atol=1e-5 * 3e38)
+
+
+@given(strategies.polar_maps(), strategies.generators(), bad_values, st.data())
+def test_pixels_that_lie_nowhere_on_the_map_are_zero(case, generator, bad, data):
+    names = [name for name in ("center", "affine", "points") if name in case.inputs]
+    name = data.draw(st.sampled_from(names))
+    case.inputs[name] = spoiled(generator, case.inputs[name], bad, 0.2)
+    note(repr(case))
+    exact = results(Case(case.run, case.to(f64).inputs), is_reference=True)
+    ours = results(Case(case.run, case.inputs), is_reference=False)
+    for key in ("out", "x"):
+        assert ours[key].isfinite().all()
+        assert_same_kinds(ours[key], exact[key], atol=1e-2 * (1 + largest(exact[key])))
+
+
+@given(strategies.polar_maps(), strategies.generators(), bad_values)
+def test_tokens_that_are_not_finite_spoil_the_pixels_around_them(case, generator, bad):
+    note(repr(case))
+    smooth = case.mask(**{name: t.double() for name, t in case.inputs.items()}) > 0
+    case.inputs["x"] = spoiled(generator, case.inputs["x"], bad, 0.02)
+    with torch.no_grad():
+        ours = case.run(**case.inputs)
+        with use_reference():
+            exact = case.to(f64).run(**case.to(f64).inputs)
+    # Right on the middle of a token the others' weights are 0 or a rounding.
+    assert_same_kinds(torch.where(smooth, ours, 0), torch.where(smooth, exact, 0), atol=1e-2)
 
 
 @given(strategies.attention(), strategies.generators(), bad_values)

@@ -1,0 +1,84 @@
+"""polar_to_image, forward and backward, against a padded F.grid_sample.
+
+`make bench`, or `python benchmarks/to_image.py [--quick] [--out FOLDER]`. Prints tables and each
+ratio against its target; with a folder, writes a record and a plot there.
+"""
+
+import argparse
+import math
+from functools import partial
+from pathlib import Path
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from darswin.bench.operators import compare, run_suite
+from darswin.bench.timing import OURS, Case, Timing
+from darswin.ops import polar_to_image
+
+PEER = "F.pad + F.grid_sample"
+# Batch, rings, sectors, channels and side of the image: the least that forward must be ahead, in
+# tokens and as an image.
+CASES = {(4, 16, 64, 96, 128): (4.0, 2.5), (2, 64, 256, 96, 256): (5.0, 3.0)}
+
+
+def mesh(rings: int, sectors: int, size: int) -> Tensor:
+    """(size, size, 2): where grid_sample reads a map that is padded: by a sector on both sides, and
+    by the ring across the pole."""
+    offset = torch.arange(size) - (size - 1) / 2
+    y, x = torch.meshgrid(offset, offset, indexing="ij")
+    ring = (torch.hypot(x, y) * (2 * rings / size) - 0.5).clamp(max=rings - 1) + 1
+    column = (torch.atan2(y, x) * (sectors / (2 * math.pi)) - 0.5) % sectors + 1
+    return torch.stack(((2 * column + 1) / (sectors + 2) - 1, (2 * ring + 1) / (rings + 1) - 1), -1)
+
+
+def to_image(
+    sizes: tuple[int, int, int, int, int], mode: str, layout: str, seconds: float
+) -> list[Timing]:
+    """Times one case; `layout` is that of the operator, and the peer permutes for "tokens"."""
+    batch, rings, sectors, channels, size = sizes
+    maps = torch.randn(batch, rings, sectors, channels)
+    radii = ((torch.arange(rings) + 0.5) * (size / 2 / rings))[None]
+    center = torch.full((1, 2), (size - 1) / 2)
+    places = mesh(rings, sectors, size).expand(batch, -1, -1, -1)
+
+    def ours(maps: Tensor) -> Tensor:
+        return polar_to_image(maps, radii, center, (size, size), layout=layout)
+
+    def padded(maps: Tensor) -> Tensor:
+        planes = maps.permute(0, 3, 1, 2)
+        across = planes[:, :, :1].roll(sectors // 2, 3)
+        planes = F.pad(torch.cat((across, planes), 2), (1, 1, 0, 0), mode="circular")
+        image = F.grid_sample(planes, places, align_corners=False, padding_mode="border")
+        return image.permute(0, 2, 3, 1).contiguous() if layout == "tokens" else image
+
+    case = Case(
+        "polar_to_image", f"{rings}×{sectors}×{channels} → {size}×{size}", batch,
+        torch.get_num_threads(), f"{mode}, layout {layout}",
+    )  # fmt: skip
+    target = CASES[sizes][layout == "image"] if mode == "forward" else 8.0
+    # grid_sample's coordinates are float32, in units of the whole map.
+    return compare(
+        case, {OURS: ours, PEER: padded}, [maps], seconds, targets={PEER: target}, tolerance=1e-4
+    )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--quick", action="store_true", help="one small case, short runs")
+    parser.add_argument("--out", type=Path, help="folder of the record and the plot")
+    args = parser.parse_args()
+    torch.manual_seed(0)
+    seconds = 0.05 if args.quick else 0.5
+    jobs = [
+        partial(to_image, sizes, mode, layout, seconds)
+        for sizes in list(CASES)[: 1 if args.quick else None]
+        for mode in ("forward", "forward+backward")
+        for layout in ("tokens", "image")
+    ]
+    run_suite("to_image", jobs, avx2_share=0.6, out=args.out)
+
+
+if __name__ == "__main__":
+    main()

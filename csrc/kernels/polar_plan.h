@@ -1,0 +1,141 @@
+// Where the pixels of an image lie in a polar map: four tokens each, and their weights.
+#pragma once
+
+#include "../polar_to_image.h"
+#include "math.h"
+#include "trig.h"
+
+namespace darswin {
+namespace {
+
+constexpr int64_t kTile = 64;  // pixels that are planned together; a multiple of every register
+
+inline int64_t smaller(int64_t x, int64_t y) { return x < y ? x : y; }
+
+// An integer as wide as a real number.
+template <typename Real>
+struct IndexOf {
+  using type = int32_t;
+};
+template <>
+struct IndexOf<double> {
+  using type = int64_t;
+};
+
+template <typename Real>
+struct Plan {
+  using Index = typename IndexOf<Real>::type;
+
+  Index token[4][kTile];  // of the inner ring left, right; of the outer ring left, right
+  Real weight[4][kTile];
+  Index known[kTile];  // all ones, or 0 where the pixel is zero
+
+  // How they came about.
+  Real across[kTile], down[kTile], radius[kTile];  // the place on the polar plane
+  Index inner[kTile], outer[kTile];                // the rings on both sides
+  Real from[kTile], span[kTile];                   // the inner ring's radius, and how far the outer
+  Real turn[kTile];                                // sectors to the other side of the pole, or 0
+  Real t[kTile], left[kTile], right[kTile];        // shares: of the outer ring, of the right sector
+                                                   // in the inner ring and in the outer one
+};
+
+template <typename T, typename Real>
+class Planner {
+ public:
+  using Args = PolarToImageArgs<T, Real>;
+  using V = Vector<Real, kLanes<Real>>;
+  using Index = typename Plan<Real>::Index;
+  using I = Vector<Index, kLanes<Real>>;
+
+  explicit Planner(const Args& args) : a(args) {}
+
+  // Plans `count` pixels of a row of image b, from pixel `first` on.
+  void plan(int64_t b, int64_t row, int64_t first, int64_t count, Plan<Real>& plan) {
+    const int64_t whole = round_up(count, kLanes<Real>);
+    place(a.place_rows == 1 ? 0 : b, row, first, count, plan);
+    for (int64_t k = count; k < whole; ++k) plan.across[k] = plan.down[k] = 0;
+    for (int64_t k = 0; k < whole; ++k) {
+      plan.radius[k] = root(plan.across[k] * plan.across[k] + plan.down[k] * plan.down[k]);
+    }
+    if (first == 0) above = 0;  // what a pixel gets does not depend on who computes it
+    find_rings(a.radii + (a.radii_rows == 1 ? 0 : b) * a.rings, whole, plan);
+    const Real infinity = static_cast<Real>(__builtin_inf());
+    const Real limit = a.r_max == nullptr ? infinity : a.r_max[a.r_max_rows == 1 ? 0 : b];
+    for (int64_t k = 0; k < whole; k += kLanes<Real>) mix(k, limit, infinity, plan);
+  }
+
+ private:
+  // The pixels on the polar plane.
+  void place(int64_t n, int64_t row, int64_t first, int64_t count, Plan<Real>& plan) const {
+    if (a.points != nullptr) {
+      const Real* from = a.points + ((n * a.height + row) * a.width + first) * 2;
+      for (int64_t k = 0; k < count; ++k) {
+        plan.across[k] = from[2 * k], plan.down[k] = from[2 * k + 1];
+      }
+      return;
+    }
+    const double* m = a.plane + n * kPlane;
+    const double y = static_cast<double>(row) - m[1];
+    for (int64_t k = 0; k < count; ++k) {
+      const double x = static_cast<double>(first + k) - m[0];
+      plan.across[k] = static_cast<Real>(m[2] * x + m[3] * y);
+      plan.down[k] = static_cast<Real>(m[4] * x + m[5] * y);
+    }
+  }
+
+  // The rings on both sides of each pixel. Radii change little from pixel to pixel, so the search
+  // begins where it ended. NaN stays where it is.
+  void find_rings(const Real* radii, int64_t count, Plan<Real>& plan) {
+    const auto last = static_cast<Index>(a.rings - 1);
+    const Real half = static_cast<Real>(0.5) * static_cast<Real>(a.sectors);
+    for (int64_t k = 0; k < count; ++k) {
+      const Real r = plan.radius[k];
+      while (above <= last && radii[above] <= r) ++above;
+      while (above > 0 && radii[above - 1] > r) --above;
+      const bool pole = above == 0, beyond = above > last;
+      const Index inner = pole ? 0 : above - 1, outer = beyond ? last : above;
+      const Real from = pole ? -radii[0] : radii[inner];
+      plan.inner[k] = inner, plan.outer[k] = outer;
+      plan.from[k] = from;
+      plan.span[k] = beyond ? static_cast<Real>(__builtin_inf()) : radii[outer] - from;
+      plan.turn[k] = pole ? half : 0;
+    }
+  }
+
+  // Tokens and weights of a register of pixels.
+  void mix(int64_t k, Real limit, Real infinity, Plan<Real>& plan) const {
+    const V x = load<V>(plan.across + k), y = load<V>(plan.down + k), r = load<V>(plan.radius + k);
+    // Infinity less itself is NaN, which nothing equals.
+    const I known = (x - x == 0) & (y - y == 0) & (r <= limit) & (r < infinity);
+    const V t = (r - load<V>(plan.from + k)) / load<V>(plan.span + k);
+    const V column = arc_tangent(y, x) * static_cast<Real>(a.sectors / (2 * kPi)) - Real{0.5};
+    const auto sectors = static_cast<Index>(a.sectors);
+    const I none{};
+    const auto side = [&](int ring, const Index* of, V at, V weight, Real* share_to) {
+      I left = __builtin_convertvector(at, I);
+      left += __builtin_convertvector(left, V) > at;  // towards minus infinity: true is -1
+      const V share = at - __builtin_convertvector(left, V);
+      left += (left < 0) & sectors;
+      left += (left < 0) & sectors;  // a ring of one sector, rounded beyond its end
+      left -= (left >= sectors) & sectors;
+      I right = left + 1;
+      right -= (right >= sectors) & sectors;
+      const I base = load<I>(of + k) * sectors;
+      store(plan.token[2 * ring] + k, select(known, base + left, none));
+      store(plan.token[2 * ring + 1] + k, select(known, base + right, none));
+      store(plan.weight[2 * ring] + k, weight * (1 - share));
+      store(plan.weight[2 * ring + 1] + k, weight * share);
+      store(share_to + k, share);
+    };
+    side(0, plan.inner, column + load<V>(plan.turn + k), 1 - t, plan.left);
+    side(1, plan.outer, column, t, plan.right);
+    store(plan.known + k, known);
+    store(plan.t + k, t);
+  }
+
+  const Args& a;
+  Index above = 0;  // how many ring centres the last pixel was not inside of
+};
+
+}  // namespace
+}  // namespace darswin

@@ -1,0 +1,380 @@
+// A polar map as an image.
+//
+// polar_sample knows where its points lie in the image; here each pixel asks where it lies in the
+// map. Its radius and azimuth follow from its place, for a register of pixels at once, and the ring
+// below it from its neighbour's, since radii change little from pixel to pixel. What is left of a
+// pixel is four tokens and their weights; its channels are then four products a register.
+//
+// Inside the centre of the first ring the inner neighbour lies across the pole, half a turn away:
+// the map goes on there at negative radii.
+//
+// Backward adds each pixel's gradient to its four tokens. An item is all pixels of some rows, and a
+// few channels, whose sums stay in the cache: no two items write the same place.
+#include "../polar_to_image.h"
+
+#include "arena.h"
+#include "polar_plan.h"
+#include "transpose.h"
+
+namespace darswin {
+namespace {
+
+// Values of a token, widened, and back.
+inline Floats values(const float* from) { return load<Floats>(from); }
+inline Doubles values(const double* from) { return load<Doubles>(from); }
+inline Floats values(const bfloat16* from) { return widen_lanes(from); }
+inline void put(float* to, const Floats& v) { store(to, v); }
+inline void put(double* to, const Doubles& v) { store(to, v); }
+inline void put(bfloat16* to, const Floats& v) { narrow_lanes(to, v); }
+inline float value(float x) { return x; }
+inline double value(double x) { return x; }
+inline float value(bfloat16 x) { return widen(x); }
+inline void put_one(float* to, float x) { *to = x; }
+inline void put_one(double* to, double x) { *to = x; }
+inline void put_one(bfloat16* to, float x) { *to = narrow(x); }
+
+template <typename T, typename Real>
+class Forward {
+ public:
+  using Args = PolarToImageArgs<T, Real>;
+  using V = Vector<Real, kLanes<Real>>;
+  static constexpr int64_t kL = kLanes<Real>;
+
+  Forward(const Args& args, Plan<Real>& plan) : a(args), plan(plan), planner(args) {}
+
+  void row(int64_t b, int64_t y) {
+    const int64_t pixels = a.height * a.width;
+    for (int64_t first = 0; first < a.width; first += kTile) {
+      const int64_t count = smaller(kTile, a.width - first), place = y * a.width + first;
+      planner.plan(b, y, first, count, plan);
+      const T* map = a.x + b * a.rings * a.sectors * a.channels;
+      if (a.tokens) {
+        tokens(map, count, a.out + (b * pixels + place) * a.channels);
+      } else {
+        planes(map, count, a.out + b * a.channels * pixels + place, pixels);
+      }
+    }
+  }
+
+ private:
+  V mix(const T* map, int64_t k, int64_t c) const {
+    if (!plan.known[k]) return V{};
+    const V inner = plan.weight[0][k] * values(map + a.channels * plan.token[0][k] + c) +
+                    plan.weight[1][k] * values(map + a.channels * plan.token[1][k] + c);
+    const V outer = plan.weight[2][k] * values(map + a.channels * plan.token[2][k] + c) +
+                    plan.weight[3][k] * values(map + a.channels * plan.token[3][k] + c);
+    return inner + outer;
+  }
+  Real mix_one(const T* map, int64_t k, int64_t c) const {
+    if (!plan.known[k]) return 0;
+    const Real inner = plan.weight[0][k] * value(map[a.channels * plan.token[0][k] + c]) +
+                       plan.weight[1][k] * value(map[a.channels * plan.token[1][k] + c]);
+    const Real outer = plan.weight[2][k] * value(map[a.channels * plan.token[2][k] + c]) +
+                       plan.weight[3][k] * value(map[a.channels * plan.token[3][k] + c]);
+    return inner + outer;
+  }
+
+  // The channels from c on, fewer than a register: whole registers where they lie in the map.
+  V mix_last(const T* map, int64_t k, int64_t c) const {
+    const int64_t end = a.rings * a.sectors * a.channels - c - kL;
+    bool inside = true;
+    for (int corner = 0; corner < 4; ++corner) {
+      inside &= a.channels * plan.token[corner][k] <= end;
+    }
+    if (inside) return mix(map, k, c);
+    V v{};
+    for (int64_t e = c; e < a.channels; ++e) v[e - c] = mix_one(map, k, e);
+    return v;
+  }
+
+  void tokens(const T* map, int64_t count, T* to) const {
+    const T* end = to + count * a.channels;
+    for (int64_t k = 0; k < count; ++k, to += a.channels) {
+      int64_t c = 0;
+      for (; c + kL <= a.channels; c += kL) put(to + c, mix(map, k, c));
+      if (c == a.channels) continue;
+      const V last = mix_last(map, k, c);
+      if (end - (to + c) >= kL) {
+        put(to + c, last);  // the next pixel overwrites what is too much
+      } else {
+        for (; c < a.channels; ++c) put_one(to + c, last[c % kL]);
+      }
+    }
+  }
+
+  void planes(const T* map, int64_t count, T* to, int64_t stride) const {
+    for (int64_t c = 0; c < a.channels; c += kL) {
+      const int64_t channels = smaller(kL, a.channels - c);
+      int64_t k = 0;
+      if constexpr (kSame<Real, float>) {
+        for (; k + kL <= count; k += kL) square(map, k, c, channels, to + c * stride + k, stride);
+      }
+      for (; k < count; ++k) {
+        const V v = channels == kL ? mix(map, k, c) : mix_last(map, k, c);
+        for (int64_t e = 0; e < channels; ++e) put_one(to + (c + e) * stride + k, v[e]);
+      }
+    }
+  }
+
+  // Up to kL channels of kL pixels, from pixel k and channel c on.
+  void square(const T* map, int64_t k, int64_t c, int64_t channels, T* to, int64_t stride) const {
+    Floats rows[kL];
+    if (channels == kL) {
+#pragma GCC unroll 16
+      for (int i = 0; i < kL; ++i) rows[i] = mix(map, k + i, c);
+      if constexpr (kSame<T, float>) return transpose_square(rows, to, stride);
+    } else {
+      for (int i = 0; i < kL; ++i) rows[i] = mix_last(map, k + i, c);
+    }
+    float turned[kL * kL];
+    transpose_square(rows, turned, kL);
+    for (int64_t i = 0; i < channels; ++i) put(to + i * stride, load<Floats>(turned + i * kL));
+  }
+
+  const Args& a;
+  Plan<Real>& plan;
+  Planner<T, Real> planner;
+};
+
+// Gradients of a tile's pixels, of channels [c, c + width), as rows of `row` values, zeros behind.
+template <typename T, typename Real>
+void gather(const PolarToImageArgs<T, Real>& a, int64_t b, int64_t place, int64_t count, int64_t c,
+            int64_t width, int64_t row, Real* to) {
+  constexpr int64_t kAhead = 16, kBytes = sizeof(T);
+  const int64_t pixels = a.height * a.width;
+  if (a.tokens) {
+    const T* from = a.grad_out + (b * pixels + place) * a.channels + c;
+    for (int64_t k = 0; k < count; ++k, from += a.channels, to += row) {
+      // The pieces lie apart, which the hardware does not foresee.
+      const char* ahead = reinterpret_cast<const char*>(from + kAhead * a.channels);
+      for (int64_t byte = 0; byte < width * kBytes; byte += 64) __builtin_prefetch(ahead + byte);
+      int64_t e = 0;
+      for (; e + kLanes<Real> <= width; e += kLanes<Real>) store(to + e, values(from + e));
+      for (; e < width; ++e) to[e] = value(from[e]);
+      for (; e < row; ++e) to[e] = 0;
+    }
+    return;
+  }
+  const T* from = a.grad_out + (b * a.channels + c) * pixels + place;
+  int64_t e = 0;
+  if constexpr (kSame<Real, float>) {
+    constexpr int64_t kL = kLanes<float>;
+    for (; e + kL <= width; e += kL) {
+      int64_t k = 0;
+      for (; k + kL <= count; k += kL) {
+        Floats rows[kL];
+#pragma GCC unroll 16
+        for (int i = 0; i < kL; ++i) {
+          const T* plane = from + (e + i) * pixels + k;
+          __builtin_prefetch(plane + kTile);
+          rows[i] = values(plane);
+        }
+        transpose_square(rows, to + k * row + e, row);
+      }
+      for (; k < count; ++k) {
+        for (int64_t i = e; i < e + kL; ++i) to[k * row + i] = value(from[i * pixels + k]);
+      }
+    }
+  }
+  for (; e < width; ++e) {
+    for (int64_t k = 0; k < count; ++k) to[k * row + e] = value(from[e * pixels + k]);
+  }
+  for (; e < row; ++e) {
+    for (int64_t k = 0; k < count; ++k) to[k * row + e] = 0;
+  }
+}
+
+// The working memory of a thread.
+template <typename T, typename Real>
+struct Workspace {
+  Plan<Real>* plan;
+  Real *gradients, *sums;
+  int64_t used;
+
+  Workspace(const PolarToImageArgs<T, Real>& a, void* memory) {
+    Arena arena{static_cast<char*>(memory)};
+    const bool backward = a.grad_out != nullptr;
+    const int64_t row = round_up(a.channels, kLanes<Real>);
+    plan = arena.take<Plan<Real>>(1);
+    gradients =
+        arena.take<Real>(backward ? kTile * (row > kChannelBlock ? row : kChannelBlock) : 0);
+    sums = arena.take<Real>(backward ? a.rings * a.sectors * kChannelBlock : 0);
+    used = arena.used;
+  }
+};
+
+template <typename T, typename Real>
+int64_t scratch(const PolarToImageArgs<T, Real>& a) {
+  return Workspace<T, Real>(a, nullptr).used;
+}
+
+template <typename T, typename Real>
+void forward(const PolarToImageArgs<T, Real>& a, int64_t begin, int64_t end, void* memory) {
+  const Workspace<T, Real> work(a, memory);
+  Forward<T, Real> forward(a, *work.plan);
+  for (int64_t item = begin; item < end; ++item) forward.row(item / a.height, item % a.height);
+}
+
+// Adds the gradients of a tile's pixels, rows of `row_` values, to those of their tokens. `fixed`
+// is the length of a row, or 0 where it is known only now.
+template <typename Real, int64_t fixed>
+void add(const Plan<Real>& plan, int64_t count, int64_t row_, const Real* gradients, Real* sums) {
+  using V = Vector<Real, kLanes<Real>>;
+  constexpr int64_t kL = kLanes<Real>;
+  const int64_t row = fixed > 0 ? fixed : row_;
+  for (int64_t k = 0; k < count; ++k, gradients += row) {
+    if (!plan.known[k]) continue;
+#pragma GCC unroll 4
+    for (int corner = 0; corner < 4; ++corner) {
+      Real* to = sums + plan.token[corner][k] * row;
+      const Real weight = plan.weight[corner][k];
+#pragma GCC unroll 8
+      for (int64_t e = 0; e < row; e += kL) {
+        store(to + e, load<V>(to + e) + weight * load<V>(gradients + e));
+      }
+    }
+  }
+}
+
+template <typename T, typename Real>
+void backward_map(const PolarToImageArgs<T, Real>& a, int64_t begin, int64_t end, void* memory) {
+  constexpr int64_t kL = kLanes<Real>;
+  const Workspace<T, Real> work(a, memory);
+  Plan<Real>& plan = *work.plan;
+  Planner<T, Real> planner(a);
+  const int64_t blocks = (a.channels + kChannelBlock - 1) / kChannelBlock;
+  const int64_t map = a.rings * a.sectors;
+  for (int64_t item = begin; item < end; ++item) {
+    const int64_t c = item % blocks * kChannelBlock, band = item / blocks % a.bands;
+    const int64_t b = item / blocks / a.bands;
+    const int64_t width = smaller(kChannelBlock, a.channels - c), row = round_up(width, kL);
+    for (int64_t e = 0; e < map * row; ++e) work.sums[e] = 0;
+    const int64_t rows = (a.height + a.bands - 1) / a.bands;
+    for (int64_t y = band * rows; y < smaller((band + 1) * rows, a.height); ++y) {
+      for (int64_t first = 0; first < a.width; first += kTile) {
+        const int64_t count = smaller(kTile, a.width - first);
+        planner.plan(b, y, first, count, plan);
+        gather(a, b, y * a.width + first, count, c, width, row, work.gradients);
+        if (row == kChannelBlock) {
+          add<Real, kChannelBlock>(plan, count, row, work.gradients, work.sums);
+        } else {
+          add<Real, 0>(plan, count, row, work.gradients, work.sums);
+        }
+      }
+    }
+    for (int64_t token = 0; token < map; ++token) {
+      const int64_t to = (b * map + token) * a.channels + c;
+      const Real* from = work.sums + token * row;
+      if (a.bands > 1) {
+        copy(from, width, a.partial + band * a.batch * map * a.channels + to);
+      } else if constexpr (kSame<T, Real>) {
+        copy(from, width, a.grad_x + to);
+      } else {
+        narrow_all(from, width, a.grad_x + to);
+      }
+    }
+  }
+}
+
+template <typename T, typename Real>
+void sum_bands(const PolarToImageArgs<T, Real>& a, int64_t begin, int64_t end) {
+  const int64_t values = a.batch * a.rings * a.sectors * a.channels;
+  for (int64_t k = begin; k < end; ++k) {
+    Real sum = a.partial[k];
+    for (int64_t band = 1; band < a.bands; ++band) sum += a.partial[band * values + k];
+    put_one(a.grad_x + k, sum);
+  }
+}
+
+// sum over channels of g times a token's values
+template <typename T, typename Real>
+double product(const Real* g, const T* token, int64_t channels) {
+  using V = Vector<Real, kLanes<Real>>;
+  constexpr int64_t kL = kLanes<Real>;
+  V sums{};
+  int64_t c = 0;
+  for (; c + kL <= channels; c += kL) sums += load<V>(g + c) * values(token + c);
+  double sum = 0;
+  for (int64_t e = 0; e < kL; ++e) sum += sums[e];
+  for (; c < channels; ++c) sum += static_cast<double>(g[c]) * value(token[c]);
+  return sum;
+}
+
+template <typename T, typename Real>
+void backward_lens(const PolarToImageArgs<T, Real>& a, int64_t begin, int64_t end, void* memory) {
+  const Workspace<T, Real> work(a, memory);
+  Plan<Real>& plan = *work.plan;
+  Planner<T, Real> planner(a);
+  const int64_t map = a.rings * a.sectors * a.channels, row = round_up(a.channels, kLanes<Real>);
+  const double per_turn = a.sectors / (2 * kPi);
+  for (int64_t item = begin; item < end; ++item) {
+    const int64_t lens = item / a.height, y = item % a.height;
+    const int64_t last = a.lenses == 1 ? a.batch : lens + 1;
+    double *grad_radii = a.grad_rows + item * (a.rings + kSums), *sums = grad_radii + a.rings;
+    for (int64_t b = lens; b < last; ++b) {
+      const double* m = a.plane == nullptr ? nullptr : a.plane + (a.place_rows == 1 ? 0 : b) * 6;
+      for (int64_t first = 0; first < a.width; first += kTile) {
+        const int64_t count = smaller(kTile, a.width - first);
+        planner.plan(b, y, first, count, plan);
+        gather(a, b, y * a.width + first, count, int64_t{0}, a.channels, row, work.gradients);
+        for (int64_t k = 0; k < count; ++k) {
+          if (!plan.known[k]) continue;
+          double s[4];  // how the loss changes with each corner's weight
+          for (int corner = 0; corner < 4; ++corner) {
+            s[corner] = product(work.gradients + k * row,
+                                a.x + b * map + a.channels * plan.token[corner][k], a.channels);
+          }
+          const double t = plan.t[k], left = plan.left[k], right = plan.right[k];
+          const double by_t = (1 - right) * s[2] + right * s[3] - (1 - left) * s[0] - left * s[1];
+          const double by_column = (1 - t) * (s[1] - s[0]) + t * (s[3] - s[2]);
+          const double r = plan.radius[k], dx = plan.across[k], dy = plan.down[k];
+          const Real* radii = a.radii + (a.radii_rows == 1 ? 0 : b) * a.rings;
+          const int64_t inner = plan.inner[k], outer = plan.outer[k];
+          double by_r = 0;
+          if (plan.turn[k] != 0) {  // t = (r + r_0) / (2 r_0)
+            const double first_radius = radii[0];
+            by_r = by_t / (2 * first_radius);
+            grad_radii[0] -= by_t * r / (2 * first_radius * first_radius);
+          } else if (outer != inner) {  // t = (r - r_inner) / (r_outer - r_inner)
+            by_r = by_t / (static_cast<double>(radii[outer]) - radii[inner]);
+            grad_radii[inner] -= by_r * (1 - t);
+            grad_radii[outer] -= by_r * t;
+          }
+          if (r == 0) continue;
+          const double turn = by_column * per_turn / (r * r);
+          const double gx = by_r * dx / r - turn * dy, gy = by_r * dy / r + turn * dx;
+          if (a.grad_points != nullptr) {
+            Real* to = a.grad_points + ((lens * a.height + y) * a.width + first + k) * 2;
+            to[0] += static_cast<Real>(gx), to[1] += static_cast<Real>(gy);
+          } else {
+            const double px = static_cast<double>(first + k) - m[0];
+            const double py = static_cast<double>(y) - m[1];
+            sums[0] += gx, sums[1] += gy;
+            sums[2] += gx * px, sums[3] += gx * py, sums[4] += gy * px, sums[5] += gy * py;
+          }
+        }
+      }
+    }
+  }
+}
+
+template <typename T, typename Real>
+constexpr PolarToImageKernels<T, Real> kKernels = {.scratch = scratch<T, Real>,
+                                                   .forward = forward<T, Real>,
+                                                   .backward_map = backward_map<T, Real>,
+                                                   .sum_bands = sum_bands<T, Real>,
+                                                   .backward_lens = backward_lens<T, Real>};
+
+}  // namespace
+
+template <>
+constinit const PolarToImageKernels<float, float>
+    Kernels<PolarToImageKernels<float, float>, Tier::TIER>::table = kKernels<float, float>;
+template <>
+constinit const PolarToImageKernels<double, double>
+    Kernels<PolarToImageKernels<double, double>, Tier::TIER>::table = kKernels<double, double>;
+template <>
+constinit const PolarToImageKernels<bfloat16, float>
+    Kernels<PolarToImageKernels<bfloat16, float>, Tier::TIER>::table = kKernels<bfloat16, float>;
+
+}  // namespace darswin

@@ -1,0 +1,57 @@
+// What the driver of polar_to_image and its kernels agree on.
+#pragma once
+
+#include <cstdint>
+
+#include "bfloat16.h"
+#include "tier.h"
+
+namespace darswin {
+
+// The six numbers that take a pixel to the polar plane: d = inverse (p - center).
+constexpr int64_t kPlane = 6;  // center x, y; inverse xx, xy, yx, yy
+// What backward sums over pixels besides the radii's gradients: of d, and of d times p - center.
+constexpr int64_t kSums = 6;
+
+template <typename T, typename Real>
+struct PolarToImageArgs {
+  const T* x;           // (B, R, A, D)
+  const Real* radii;    // (B or 1, R), rising
+  const double* plane;  // (B or 1, kPlane), or null where there are points
+  const Real* points;   // (B or 1, H, W, 2), or null
+  const Real* r_max;    // (B or 1), or null
+  int64_t radii_rows, place_rows, r_max_rows;
+  int64_t batch, rings, sectors, channels, height, width;
+  bool tokens;  // (B, H, W, D), else (B, D, H, W)
+
+  T* out;  // forward
+
+  const T* grad_out;  // backward
+  T* grad_x;          // like x
+  int64_t bands;      // into how many bands of rows an image is cut
+  Real* partial;      // with several bands: (bands, B, R, A, D), to be summed over the bands
+  int64_t lenses;     // 1 if all images share one lens, else B
+  double* grad_rows;  // (lenses, H, R + kSums), to be summed over the rows; zero on entry
+  Real* grad_points;  // (lenses, H, W, 2), or null
+};
+
+// Channels that one item of backward takes.
+constexpr int64_t kChannelBlock = 32;
+
+// A kernel works serially through the items [begin, end); the driver owns the threads.
+template <typename T, typename Real>
+struct PolarToImageKernels {
+  using Args = PolarToImageArgs<T, Real>;
+  // bytes of scratch that each thread needs in the functions below
+  int64_t (*scratch)(const Args&);
+  // item: (image, row of pixels)
+  void (*forward)(const Args&, int64_t begin, int64_t end, void* scratch);
+  // item: (image, band of rows, block of channels) -> grad_x or partial
+  void (*backward_map)(const Args&, int64_t begin, int64_t end, void* scratch);
+  // item: value of grad_x, as the sum over the bands of partial
+  void (*sum_bands)(const Args&, int64_t begin, int64_t end);
+  // item: (lens, row of pixels) -> grad_rows and grad_points
+  void (*backward_lens)(const Args&, int64_t begin, int64_t end, void* scratch);
+};
+
+}  // namespace darswin
