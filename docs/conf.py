@@ -1,0 +1,54 @@
+"""The site of these pages: `make docs`."""
+
+import re
+from importlib.metadata import version as installed
+
+project, author, release = "darswin", "the darswin authors", installed("darswin")
+copyright = author
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
+exclude_patterns = ["_build"]
+
+html_theme, html_title = "furo", "darswin"
+
+myst_enable_extensions = ["colon_fence", "dollarmath"]
+myst_heading_anchors = 3
+
+# Docstrings name things between single backticks.
+default_role = "literal"
+autodoc_default_options = {"members": True, "undoc-members": True, "show-inheritance": True}
+autodoc_member_order = "bysource"
+autodoc_typehints_format = "short"
+autodoc_preserve_defaults = True
+autodoc_inherit_docstrings = False  # Lightning's and torch's are in another markup
+napoleon_numpy_docstring = False
+napoleon_custom_sections = ["Convention"]
+napoleon_use_rtype = False  # "(N,) rad" is a shape and a unit
+
+# Names of other projects, since the site is built without a network; and bases that are not public.
+OTHERS = "torch|numpy|np|matplotlib|lightning|collections|os|pathlib|datetime|contextlib"
+UNITS = "[A-Z]|rad|px"  # of properties, whose docstrings begin with shape and unit
+PRIVATE = "LensBatch|LensDistribution|_Optimized|Sampling|Draw|Model|T"
+nitpick_ignore_regex = [
+    ("py:.*", rf"({OTHERS})\..*"),
+    ("py:.*", rf"darswin\..*\.({PRIVATE})"),
+    ("py:class", UNITS),
+]
+
+
+def one_a_line(app, what, name, obj, options, lines):
+    """Gives each argument and each error a line of its own, as napoleon wants them."""
+    found, indent = [], None
+    for line in lines:
+        start = len(line) - len(line.lstrip())
+        if line.strip() in ("Args:", "Raises:"):
+            indent = start + 4
+        elif line.strip() and indent is not None and start < indent:
+            indent = None
+        if indent is not None:
+            line = re.sub(r"(?<=[.;]) (?=[a-zA-Z_]\w*(, \w+)*: )", "\n" + " " * indent, line)
+        found += line.split("\n")
+    lines[:] = found
+
+
+def setup(app):
+    app.connect("autodoc-process-docstring", one_a_line, priority=1)  # before napoleon's
