@@ -3,6 +3,10 @@
 import re
 from importlib.metadata import version as installed
 
+from sphinx.util.typing import stringify_annotation
+
+from darswin.lens import Number
+
 project, author, release = "darswin", "the darswin authors", installed("darswin")
 copyright = author
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
@@ -15,7 +19,7 @@ myst_heading_anchors = 3
 
 # Docstrings name things between single backticks.
 default_role = "literal"
-autodoc_default_options = {"members": True, "undoc-members": True, "show-inheritance": True}
+autodoc_default_options = {"members": True, "show-inheritance": True}
 autodoc_member_order = "bysource"
 autodoc_typehints_format = "short"
 autodoc_preserve_defaults = True
@@ -50,5 +54,12 @@ def one_a_line(app, what, name, obj, options, lines):
     lines[:] = found
 
 
+def short(app, what, name, obj, options, signature, returns):
+    """Names the type of a lens's parameters, which is as long as a line."""
+    number = stringify_annotation(Number, "smart")
+    return signature and signature.replace(number, "~darswin.lens.Number"), returns
+
+
 def setup(app):
     app.connect("autodoc-process-docstring", one_a_line, priority=1)  # before napoleon's
+    app.connect("autodoc-process-signature", short)
