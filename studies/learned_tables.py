@@ -122,7 +122,7 @@ def images_table(cameras: list[dict]) -> str:
 
 
 def tables(cameras: list[dict]) -> dict[str, str]:
-    """The README's tables, by the name of their place in it."""
+    """The tables, by the name of their place in a page."""
     return {"learned-lens": recovery_table(cameras), "learned-xi": images_table(cameras)}
 
 

@@ -113,7 +113,7 @@ def ablation_table(cells: list[dict]) -> str:
 
 
 def tables(cells: list[dict]) -> dict[str, str]:
-    """The README's tables, by the name of their place in it."""
+    """The tables, by the name of their place in a page."""
     return {
         "xi-0.4": level_table(cells, "0.4", PAPER_04),
         "polynomial": level_table(cells, POLYNOMIAL, PAPER_POLYNOMIAL),
