@@ -5,6 +5,8 @@ view of 165° and warped through a Spherical lens. All networks are trained on �
 paper's "very low" distortion, with which pictures look as ordinary ones do: DarSwin-A, the same
 network without lens knowledge, whose rings are equal in pixels, and Swin. All are then tested on
 ξ = 0, 0.1, …, 1. Run it with `make demo`.
+
+`--save darswin/models/weights/digits.safetensors` made the model "digits" that comes with darswin.
 """
 
 import argparse
@@ -27,6 +29,7 @@ from darswin import create_model, lens
 from darswin.data import LEVELS, warp_map
 from darswin.data.warp import remap
 from darswin.layers.sampling import PolarSample
+from darswin.models import ModelCard, save_model
 from darswin.models.encoder import Encoder
 from darswin.utils.files import replace_file
 from darswin.viz.plot import draw_accuracy, draw_grid, save_figure
@@ -92,6 +95,21 @@ def accuracy(model: Encoder, images: Tensor, lenses: lens.Lens, labels: Tensor) 
     return 100 * right / len(images)
 
 
+def save(path: Path, model: Encoder, scan: np.ndarray) -> None:
+    """Writes a DarSwin-A with its card and, beside it, a sample picture and its lens."""
+    model_name, options = MODELS["DarSwin-A"]
+    card = ModelCard(
+        model_name, dict(num_classes=10, in_chans=1, **options), [*"0123456789"], SIZE, FOV
+    )
+    save_model(path, model.state_dict(), card)
+    size = 256
+    image, taken_with = through_lenses(scan[None], np.array([0.5]), size)
+    pixels = (image[0, 0].clamp(0, 1) * 255).round().to(torch.uint8).numpy()
+    cv2.imwrite(str(path.with_suffix(".png")), pixels)
+    sized = taken_with.replace(image_size=torch.tensor([[size, size]]))
+    lens.save(sized, path.with_suffix(".json"))
+
+
 def draw(table: dict[str, list[list[float]]], scan: np.ndarray, sampler: PolarSample) -> Figure:
     """Accuracy against ξ; beside it a digit through two lenses, with the patches of both."""
     figure = Figure(figsize=(12, 6), layout="constrained")
@@ -112,6 +130,9 @@ def main() -> None:
     parser.add_argument("--batch", type=int, default=48)
     parser.add_argument("--seeds", type=int, default=2)
     parser.add_argument("--out", type=Path, default=Path("out/demo"))
+    parser.add_argument(
+        "--save", type=Path, metavar="FILE", help="keep the first DarSwin-A, with a sample picture"
+    )
     args = parser.parse_args()
     start = time.perf_counter()
 
@@ -132,6 +153,8 @@ def main() -> None:
             model = create_model(model_name, num_classes=10, in_chans=1, **options)
             train(model, scans[seen], labels[seen], args.epochs, args.batch, seed, name)
             table[name].append([accuracy(model, *tests[xi], labels[unseen]) for xi in XI])
+            if args.save and name == "DarSwin-A" and seed == 0:
+                save(args.save, model, scans[unseen[0]])
 
     print(
         f"\nAccuracy (%), mean of {args.seeds} seeds, trained on ξ in {list(LEVELS[LEVEL])}, "

@@ -166,7 +166,7 @@ class RunCLI(LightningCLI):
     """Lightning's command line with `--run`, `--resume` and `--xi`."""
 
     def __init__(self, signals: StopSignals, **options):
-        self.signals = signals
+        self.signals, self.typed = signals, options["args"]
         super().__init__(**options)
 
     @staticmethod
@@ -196,9 +196,10 @@ class RunCLI(LightningCLI):
         config = self.config[str(self.subcommand)]
         self.folder = Path(config.run)
         config.trainer.default_root_dir = str(self.folder)
-        for name in ("path", "classes", "splits"):  # so that the run works from anywhere
+        for name in ("path", "classes", "splits", "lens"):  # so that the run works from anywhere
             if config.data[name] and Path(config.data[name]).exists():
                 config.data[name] = str(Path(config.data[name]).resolve())
+        self._check_lenses(config)
         if config.xi is not None:
             config.data.test_lenses = parse_sweep(config.xi)
         if config.devices is not None:
@@ -217,6 +218,17 @@ class RunCLI(LightningCLI):
             before = yaml.safe_load((self.folder / "config.yaml").read_text())
             for change in check_changes(before, yaml.safe_load(self.record)):
                 _say(change)
+
+    def _check_lenses(self, config) -> None:
+        """ValueError for lenses to warp to, typed beside those that took the pictures."""
+        warping = ("--xi", "--data.test_lenses", "--data.train_lenses")
+        typed = [word.partition("=")[0] for word in self.typed]
+        both = [name for name in warping if name in typed]
+        if both and config.data.lens is not None:
+            raise ValueError(
+                f"{both[0]} warps pictures through lenses, and --data.lens says which lens took "
+                "them: give one, or --data.lens null"
+            )
 
     def _recorded(self, config) -> str:
         """What config.yaml says: all but the options of this call alone."""

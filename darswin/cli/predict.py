@@ -1,111 +1,178 @@
-"""`darswin predict`: what a trained model sees in pictures taken through a known lens."""
+"""`darswin predict`: what a trained model sees in pictures and videos, taken with known lenses."""
 
-import functools
 import json
+import os
+import sys
+import time
 from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
-import cv2
 import numpy as np
-import torch
 from jsonargparse import ArgumentParser
 from safetensors import safe_open
-from torch import Tensor
 
+from darswin.cli.answers import Answers
 from darswin.compat import load_official
-from darswin.data.wide_angle import IMAGENET_MEAN, IMAGENET_STD
-from darswin.lens import Lens, load
-from darswin.lens.files import loads
-from darswin.lens.orientation import in_upright_picture, stored_size
+from darswin.data.calibrations import Calibrations, is_json
+from darswin.data.folders import PICTURES, pictures_below
+from darswin.data.samples import IMAGENET_MEAN, IMAGENET_STD
+from darswin.lens import Lens
 from darswin.models.encoder import Encoder
+from darswin.models.pretrained import list_pretrained, pretrained_file
 from darswin.models.saving import ModelCard, NoCardError, load_model, model_of_run
 from darswin.utils.files import replace_file
 from darswin.utils.image import BrokenImageError, read_oriented
+from darswin.utils.video import is_video, read_frames
+
+
+class File(NamedTuple):
+    """A picture or a video that has an answer coming."""
+
+    name: str
+    is_video: bool
 
 
 def run(argv: list[str]) -> None:
     """Runs `darswin predict` with the arguments that follow it."""
     described = (predict.__doc__ or "").splitlines()[0]
     parser = ArgumentParser(prog="darswin predict", description=described)
-    parser.add_argument("pictures", nargs="+", type=str, help="image files")
-    parser.add_function_arguments(predict, skip={"pictures"})
+    parser.add_argument(
+        "paths", nargs="*", type=str, help="pictures, videos, and folders of pictures"
+    )
+    parser.add_function_arguments(predict, skip={"paths"})
     predict(**parser.parse_args(argv).as_dict())
 
 
 def predict(
-    pictures: Sequence[str], *, lens: str, run: str | None = None, model: str | None = None,
-    camera: str | None = None, top: int = 5, out: str | None = None,
+    paths: Sequence[str] = (), *, lens: str | None = None, run: str | None = None,
+    model: str | None = None, camera: str | None = None, top: int = 5, every: int = 1,
+    out: str | None = None,
 ) -> list[dict]:  # fmt: skip
-    """The most probable classes of pictures that one camera took, as JSON.
+    """The most probable classes of pictures and of the frames of videos, as JSON.
 
-    A picture that its EXIF turns upright is turned, as in training, and its lens with it. Pictures
-    that have no answer are named once the others' answers are written.
+    A picture or video that its metadata turns upright is turned, as in training, and its lens with
+    it. What has no answer is named once the others' answers are written. After the frames of a
+    video stands how fast they were answered, on stderr too.
 
     Args:
-        pictures: image files.
+        paths: image files, videos, and folders, of which all pictures are taken; a model that comes
+            with darswin brings a picture and its lens, for want of others.
         lens: the camera's calibration file, of any format that `darswin.lens.load` reads; or its
             lens as JSON, in pixels of the pictures: {"model": "Spherical", "xi": 0.5, "focal": 300,
             "theta_max": 1.5}, or with "fov" (rad) in place of the last two where the field of view
-            fills the circle inside the picture.
+            fills the circle inside the picture; or, for several cameras, a lenses.json, whose
+            folders and files are relative to its own folder: see `darswin.data.Calibrations`.
         run: the folder of a run, whose best model is taken.
-        model: a model's safetensors file, instead; also what `darswin convert` makes of the
-            authors' released weights, whose classes have numbers.
+        model: a model's safetensors file, instead; "digits", which comes with darswin; or what
+            `darswin convert` makes of the authors' released weights, whose classes have numbers.
         camera: which, of a calibration of several.
         top: how many classes.
+        every: of a video the first frame, and each so many frames after it.
         out: a JSON file to write; without it, the classes are printed.
 
     Raises:
-        BrokenImageError: a picture that cannot be read, or that the lens does not fit.
+        BrokenImageError: a picture or video that cannot be read, or that the lens does not fit.
         ValueError: arguments that are wrong, a lens that `darswin.lens.load` or the model refuses.
     """
     if run is not None and model is None:
-        weights = model_of_run(run)
+        weights: str | Path = model_of_run(run)
     elif model is not None and run is None:
-        weights = Path(model)
+        weights = model
     else:
         raise ValueError(
-            "predict needs either --run, a run's folder, or --model, a safetensors file"
+            "predict needs either --run, a run's folder, or --model, a safetensors file or one of "
+            + ", ".join(list_pretrained())
         )
-    if top < 1:
-        raise ValueError(f"--top must be at least 1, got {top}")
+    for name, value in (("top", top), ("every", every)):
+        if value < 1:
+            raise ValueError(f"--{name} must be at least 1, got {value}")
+    if not paths and lens is None and model in list_pretrained():
+        paths, lens = [str(pretrained_file(model, "png"))], str(pretrained_file(model, "json"))
+    if not paths or lens is None:
+        raise ValueError("predict needs pictures or videos, and --lens, what they were taken with")
     net, card = trained_model(weights)
-    calibration = functools.cache(lambda size: read_lens(lens, size, camera))
-    found, bad = [], []
+    calibrations = Calibrations(lens, "." if is_json(lens) else Path(lens).parent, camera)
+    answers = Answers(net, card, top)
+    files = pictures_and_videos(paths)
+    bad: list[str] = []
     try:
-        for name in pictures:
+        for file in files:
             try:
-                image, orientation = read_oriented(name, net.in_chans)
+                if file.is_video:
+                    answer_video(file.name, every, calibrations, answers)
+                else:
+                    image, orientation = read_oriented(file.name, net.in_chans)
+                    taken_with = _lens(calibrations, file.name, image, orientation)
+                    answers.add({"image": file.name}, image, taken_with)
             except BrokenImageError as error:
                 bad.append(str(error))
-                continue
-            size = image.shape[:2]
-            calibrated = calibration(stored_size(size, orientation))
-            try:
-                taken_with = in_upright_picture(calibrated, size, orientation)
-            except ValueError as error:
-                bad.append(f"{name}: {error}")
-                continue
-            batch, taken_with = resized(net, card, image, taken_with)
-            with torch.inference_mode():
-                probabilities = net(batch, taken_with).softmax(-1)[0]
-            best = probabilities.topk(min(top, len(probabilities)))
-            found.append(
-                {
-                    "image": str(name),
-                    "top": [
-                        {"class": card.classes[k] if card.classes else k, "probability": p}
-                        for p, k in zip(best.values.tolist(), best.indices.tolist(), strict=True)
-                    ],
-                }
-            )
     finally:  # what was found is not lost
+        answers.flush()
+        found = answers.found
         if found:
             text = json.dumps(found, indent=1, ensure_ascii=False)
             print(text) if out is None else replace_file(out, text)
     if bad:
-        count = f"no answer for {len(bad)} of {len(pictures)} pictures:\n" if found else ""
+        videos = any(file.is_video for file in files)
+        what, kind = (", or not for all frames,", "files") if videos else ("", "pictures")
+        count = f"no answer{what} for {len(bad)} of {len(files)} {kind}:\n" if found else ""
         raise BrokenImageError(count + "\n".join(bad))
     return found
+
+
+def pictures_and_videos(paths: Sequence[str]) -> list[File]:
+    """The files that are meant by paths, of which folders mean all pictures in them.
+
+    Raises:
+        FileNotFoundError: a folder without pictures.
+    """
+    files = []
+    for path in paths:
+        if os.path.isdir(path) and os.path.splitext(path)[1].lower() not in PICTURES:
+            files += [File(name, False) for name in pictures_below(Path(path))]
+        else:
+            picture = os.path.splitext(path)[1].lower() in PICTURES
+            files.append(File(str(path), not picture and is_video(path)))
+    return files
+
+
+def answer_video(name: str, every: int, calibrations: Calibrations, answers: Answers) -> None:
+    """Answers the frames of a video, and says how fast that went.
+
+    Raises:
+        BrokenImageError: as `read_frames`, and a lens that does not fit, after what was answered.
+    """
+    answers.flush()
+    done, before, start = len(answers.found), answers.seconds, time.perf_counter()
+    try:
+        for frame in read_frames(name, answers.model.in_chans, every):
+            taken_with = _lens(calibrations, name, frame.image, frame.orientation)
+            entry = {"video": name, "frame": frame.number, "time": round(frame.time, 6)}
+            answers.add(entry, frame.image, taken_with)
+    finally:
+        answers.flush()
+        seconds, network = time.perf_counter() - start, answers.seconds - before
+        if frames := len(answers.found) - done:
+            speed = {
+                "frames": frames,
+                "frames_per_second": round(frames / seconds, 1),
+                "network_frames_per_second": round(frames / network, 1),
+            }
+            answers.found.append({"video": name, **speed})
+            print(
+                f"darswin: {name}: {frames} frames at {frames / seconds:.1f} a second, by the "
+                f"network alone {frames / network:.1f}",
+                file=sys.stderr,
+            )
+
+
+def _lens(calibrations: Calibrations, name: str, image: np.ndarray, orientation: int) -> Lens:
+    """The lens in an upright picture or frame; BrokenImageError where there is none that fits."""
+    try:
+        return calibrations.lens_of(name, (image.shape[0], image.shape[1]), orientation)
+    except ValueError as error:
+        raise BrokenImageError(str(error)) from error
 
 
 def trained_model(path: str | Path) -> tuple[Encoder, ModelCard]:
@@ -135,36 +202,3 @@ def _released_size(path: str | Path) -> int:
         return int(json.loads(config)["DATA"]["IMG_SIZE"])
     except (KeyError, TypeError, ValueError):
         return 64
-
-
-def read_lens(lens: str, image_size: tuple[int, int], camera: str | None = None) -> Lens:
-    """A lens from JSON or the name of a calibration file.
-
-    Args:
-        image_size: (H, W) of pictures as stored, for a lens that does not say it.
-
-    Raises:
-        ValueError, OSError: as `darswin.lens.load`.
-    """
-    read = loads if lens.lstrip().startswith("{") else load
-    return read(lens, camera=camera, image_size=image_size)
-
-
-def resized(net: Encoder, card: ModelCard, image: np.ndarray, lens: Lens) -> tuple[Tensor, Lens]:
-    """A picture as the model saw them in training: (1, C, H, W) uint8 with its lens, in its pixels.
-
-    The shorter side becomes the model's size. A model that takes only squares gets the middle one.
-    """
-    height, width = image.shape[:2]
-    side = min(height, width)
-    if net.square_images:
-        top, left = (height - side) // 2, (width - side) // 2
-        image = image[top : top + side, left : left + side]
-        lens = lens.cropped(top, left, side, side)
-    scale = card.size / side
-    height, width = (round(length * scale) for length in image.shape[:2])
-    channels = image.shape[2]
-    image = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
-    pixels = torch.from_numpy(image.reshape(1, height, width, channels)).permute(0, 3, 1, 2)
-    # The pixels are whole, so the scale differs a little between height and width.
-    return pixels.contiguous(), lens.resized((height, width))

@@ -1,5 +1,7 @@
 """Data: images seen through lenses."""
 
+from darswin.data.calibrated import Calibrated
+from darswin.data.calibrations import Calibrations
 from darswin.data.datasets import open_source
 from darswin.data.lenses import LEVELS, PolynomialLenses, SphericalLenses, parse_lenses
 from darswin.data.warp import warp, warp_map
@@ -7,6 +9,8 @@ from darswin.data.wide_angle import WideAngle
 
 __all__ = [
     "LEVELS",
+    "Calibrated",
+    "Calibrations",
     "PolynomialLenses",
     "SphericalLenses",
     "WideAngle",

@@ -90,6 +90,22 @@ def pictures_of(
     return pictures, classes
 
 
+def pictures_below(folder: Path) -> list[str]:
+    """The pictures in a folder and in those below it, sorted; links are followed, hidden ones not.
+
+    Raises:
+        FileNotFoundError: none that darswin reads.
+    """
+    files = sorted(_below(folder, {}, strict=False), key=_parts)
+    read = [file for file in files if _suffix(file) in SUFFIXES]
+    others = [file for file in files if _suffix(file) in OTHER_SUFFIXES]
+    if not read:
+        found = f", but {_kinds(others)}, which darswin does not read" if others else ""
+        raise FileNotFoundError(f"no pictures in {folder}{found}")
+    _say_unread(folder, others)
+    return read
+
+
 def open_folder(
     root: Path, split: Split, channels: int, names: list[str] | None,
     lists: str | Path | None, holdout: float,
@@ -208,15 +224,19 @@ def _pictures(folder: Path, names: list[str] | None, seen: dict[str, str], whole
         start = len(str(by_name[name])) - len(name)
         paths += sorted((file[start:] for file in read), key=_parts)
         others += unread
-    if others:
-        _say(
-            f"{folder} holds pictures that darswin does not read, {_kinds(others)}, e.g. "
-            f"{others[0]}: left out"
-        )
+    _say_unread(folder, others)
     found = set(_classes(paths))
     if whole and names and (missing := [name for name in names if name not in found]):
         raise FileNotFoundError(f"no pictures of the classes {some(missing)} in {folder}")
     return Pictures(folder, paths)
+
+
+def _say_unread(folder: Path, files: list[str]) -> None:
+    if files:
+        _say(
+            f"{folder} holds pictures that darswin does not read, {_kinds(files)}, e.g. "
+            f"{files[0]}: left out"
+        )
 
 
 def _say_loose(folder: Path, files: list[Path]) -> None:

@@ -7,6 +7,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from darswin.lens import Lens
+
 
 @dataclass(frozen=True)
 class Mixing:
@@ -32,9 +34,16 @@ class Mixing:
             raise ValueError(f"mixing needs mixup, cutmix ≥ 0 and p in [0, 1], got {self}")
 
     def __call__(
-        self, images: Tensor, targets: Tensor, rng: np.random.Generator
+        self,
+        images: Tensor,
+        targets: Tensor,
+        rng: np.random.Generator,
+        may_mix: Tensor | None = None,
     ) -> tuple[Tensor, Tensor]:
-        """Images (B, C, H, W) and class probabilities (B, K) → mixed, of the same shapes."""
+        """Images (B, C, H, W) and class probabilities (B, K) → mixed, of the same shapes.
+
+        Where `may_mix`, (B,) bool, is False, an image stays as it is; None is True for all.
+        """
         if not (self.mixup or self.cutmix) or rng.random() >= self.p:
             return images, targets
         partners = images.flip(0)
@@ -49,7 +58,20 @@ class Mixing:
         else:
             share = rng.beta(self.mixup, self.mixup)
             mixed = torch.lerp(partners, images, share)
-        return mixed, torch.lerp(targets.flip(0), targets, share)
+        mixed_targets = torch.lerp(targets.flip(0), targets, share)
+        if may_mix is None or bool(may_mix.all()):
+            return mixed, mixed_targets
+        return (
+            torch.where(may_mix[:, None, None, None], mixed, images),
+            torch.where(may_mix[:, None], mixed_targets, targets),
+        )
+
+
+def partners_share(lens: Lens) -> Tensor:
+    """(B,) bool: whether an image of a batch and its partner have the same lens."""
+    tensors = (getattr(lens, name) for name in lens._names())
+    same = [(t == t.flip(0)).reshape(len(t), -1).all(1) for t in tensors if t is not None]
+    return torch.stack(same).all(0)
 
 
 def _box(

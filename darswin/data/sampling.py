@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from torch.utils.data import DataLoader, Dataset, Sampler
 
-from darswin.data.wide_angle import Draw
+from darswin.data.samples import Draw
 
 
 class TrainingOrder(Sampler[Draw]):
@@ -21,11 +21,14 @@ class TrainingOrder(Sampler[Draw]):
         count: of images. batch: of one process; even unless world is 1. rank, world: of processes.
         pairs: partners share their lens, so that a mixture is an image through one lens.
         seed: of the shuffle.
+        cameras: (count,), what took each image, if cameras did: with `pairs`, partners are of one
+            camera, but for those that are left over.
     """
 
     def __init__(
-        self, count: int, batch: int, *, rank: int, world: int, pairs: bool = True, seed: int = 0
-    ):
+        self, count: int, batch: int, *, rank: int, world: int, pairs: bool = True, seed: int = 0,
+        cameras: np.ndarray | None = None,
+    ):  # fmt: skip
         if world > 1 and batch % 2:
             raise ValueError(f"with several processes the batch of each must be even, got {batch}")
         if count < batch * world:
@@ -34,6 +37,8 @@ class TrainingOrder(Sampler[Draw]):
             )
         self.count, self.batch, self.rank, self.world = count, batch, rank, world
         self.pairs, self.seed = pairs, seed
+        several = cameras is not None and len(np.unique(cameras)) > 1
+        self.cameras = cameras if pairs and several else None
         self.epoch = 0
         self._resume = (-1, 0)  # an epoch, and how many of its batches are done
 
@@ -71,16 +76,38 @@ class TrainingOrder(Sampler[Draw]):
         return self.batches() * self.batch
 
     def __iter__(self) -> Iterator[Draw]:
-        order = np.random.default_rng((self.seed, self.epoch)).permutation(self.count)
+        rng = np.random.default_rng((self.seed, self.epoch))
+        order = rng.permutation(self.count)
         size = self.batch * self.world
         half = self.batch // 2
         front = np.arange(self.rank * half, self.rank * half + half)
         middle = np.arange(half, self.batch - half)  # of an odd batch
         place = np.concatenate((front, middle, size - 1 - front[::-1]))
-        for batch in order[: self.batches() * size].reshape(-1, size)[self.done() :]:
+        batches = order[: self.batches() * size].reshape(-1, size)
+        if self.cameras is not None:
+            batches = _paired(order, self.cameras, self.batches(), size, rng)
+        for batch in batches[self.done() :]:
             for k in place:
                 partner = min(k, size - 1 - k)
                 yield Draw(self.epoch, int(batch[k]), int(batch[partner if self.pairs else k]))
+
+
+def _paired(
+    order: np.ndarray, cameras: np.ndarray, batches: int, size: int, rng: np.random.Generator
+) -> np.ndarray:
+    """(batches, size): a shuffle whose images i and -1-i of a batch are of one camera.
+
+    The last image of a camera that took an odd number has a partner of another one.
+    """
+    alone = order[: batches * (size % 2)].reshape(batches, -1)  # amid a batch of odd size
+    order = order[alone.size :]
+    order = order[np.argsort(cameras[order], kind="stable")]
+    _, first, count = np.unique(cameras[order], return_index=True, return_counts=True)
+    left_over = (first + count - 1)[count % 2 == 1]
+    order = np.concatenate((np.delete(order, left_over), order[left_over]))
+    pairs = order[: len(order) // 2 * 2].reshape(-1, 2)
+    chosen = rng.permutation(pairs)[: batches * (size // 2)].reshape(batches, -1, 2)
+    return np.concatenate((chosen[..., 0], alone, chosen[:, ::-1, 1]), 1)
 
 
 class EveryNth(Sampler[int]):

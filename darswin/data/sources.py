@@ -11,7 +11,7 @@ from typing import Protocol
 
 import numpy as np
 
-from darswin.utils.image import read_image, with_channels
+from darswin.utils.image import read_image, read_oriented, with_channels
 
 
 class Source(Protocol):
@@ -23,6 +23,15 @@ class Source(Protocol):
 
     def __getitem__(self, index: int) -> tuple[np.ndarray, int]:
         """The image (H, W, C) uint8 and its label; BrokenImageError names a file that is none."""
+        ...
+
+    def oriented(self, index: int) -> tuple[np.ndarray, int, int]:
+        """The image, its label, and the EXIF orientation that it was turned upright from."""
+        ...
+
+    def file(self, index: int) -> Path | None:
+        """The image's own file, if it has one."""
+        ...
 
 
 class ImageFiles:
@@ -49,8 +58,14 @@ class ImageFiles:
         return len(self.labels)
 
     def __getitem__(self, index: int) -> tuple[np.ndarray, int]:
-        path = self.root / os.fsdecode(self.paths[index])
-        return read_image(path, self.channels), int(self.labels[index])
+        return read_image(self.file(index), self.channels), int(self.labels[index])
+
+    def oriented(self, index: int) -> tuple[np.ndarray, int, int]:
+        image, orientation = read_oriented(self.file(index), self.channels)
+        return image, int(self.labels[index]), orientation
+
+    def file(self, index: int) -> Path:
+        return self.root / os.fsdecode(self.paths[index])
 
 
 class Arrays:
@@ -70,6 +85,12 @@ class Arrays:
     def __getitem__(self, index: int) -> tuple[np.ndarray, int]:
         return with_channels(self.images[index], self.channels), int(self.labels[index])
 
+    def oriented(self, index: int) -> tuple[np.ndarray, int, int]:
+        return *self[index], 1
+
+    def file(self, index: int) -> None:
+        return None
+
 
 class Part:
     """At most `count` of a source's pictures, chosen by a fixed shuffle."""
@@ -85,3 +106,9 @@ class Part:
 
     def __getitem__(self, index: int) -> tuple[np.ndarray, int]:
         return self.source[self.chosen[index]]
+
+    def oriented(self, index: int) -> tuple[np.ndarray, int, int]:
+        return self.source.oriented(self.chosen[index])
+
+    def file(self, index: int) -> Path | None:
+        return self.source.file(self.chosen[index])

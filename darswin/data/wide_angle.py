@@ -1,25 +1,21 @@
 """A data set of wide-angle images, made from ordinary pictures as it is read."""
 
 import math
-from collections.abc import Callable, Sequence
 from functools import lru_cache
-from typing import Literal, NamedTuple
+from typing import Any, Literal
 
 import cv2
 import numpy as np
 import torch
 from torch import Tensor
-from torch.utils.data import Dataset
 
 from darswin.data.lenses import LensDistribution
+from darswin.data.samples import Draw, Samples
 from darswin.data.sources import Source
 from darswin.data.warp import remap
 from darswin.lens import Lens, Perspective
 from darswin.lens.reprojection import OUTSIDE, radial_reprojection
-from darswin.utils.image import BrokenImageError
 
-# Per-channel statistics of ImageNet, in [0, 1].
-IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 # The paper's pictures, 384 px wide, have a focal length of 9 px.
 PAPER_FOV = 2 * math.atan(192 / 9)
 
@@ -39,18 +35,7 @@ def _rays(side: int) -> tuple[Tensor, np.ndarray, np.ndarray]:
     return radii[None], place.reshape(side, side), np.stack((x, y), -1).astype(np.float32)
 
 
-class Draw(NamedTuple):
-    """Which image, and which random numbers: all that a sample depends on.
-
-    `epoch` and `picture` key its augmentation, `epoch` and `lens` its lens.
-    """
-
-    epoch: int
-    picture: int
-    lens: int
-
-
-class WideAngle(Dataset):
+class WideAngle(Samples):
     """Pictures seen through random lenses: `dataset[i]` is (image, lens, label).
 
     Each picture is taken for a perspective view whose width spans `fov`. It is warped through a
@@ -67,14 +52,7 @@ class WideAngle(Dataset):
         fit: how a picture becomes a square: "crop" cuts its longer side, "stretch" squashes it, as
             the authors' code does.
         picture_size: px, the width that larger pictures are reduced to before they are warped.
-        mean, std: per channel, in [0, 1]; the image comes out as (pixel/255 - mean) / std.
-        augment: changes the warped (H, W, C) uint8 image, given it and a random generator.
-        erase: changes the normalised (C, H, W) float32 image, likewise.
-        seed: of everything random.
-        skip_broken: makes a picture that cannot be read a black image with label -1, and counts it
-            in `broken`, instead of raising.
-
-    Making one sets OpenCV to one thread, in all of the process.
+        options: mean, std, augment, erase, seed and skip_broken, as `Samples`.
 
     Raises:
         ValueError: sizes or angles out of range.
@@ -93,12 +71,7 @@ class WideAngle(Dataset):
         fov: float = PAPER_FOV,
         fit: Literal["crop", "stretch"] = "crop",
         picture_size: int = 384,
-        mean: Sequence[float] = IMAGENET_MEAN,
-        std: Sequence[float] = IMAGENET_STD,
-        augment: Callable[[np.ndarray, np.random.Generator], np.ndarray] | None = None,
-        erase: Callable[[np.ndarray, np.random.Generator], np.ndarray] | None = None,
-        seed: int = 0,
-        skip_broken: bool = False,
+        **options: Any,
     ):
         if not 0 < size <= render:
             raise ValueError(f"sizes must be 0 < size ≤ render, got {size} and {render}")
@@ -106,50 +79,17 @@ class WideAngle(Dataset):
             raise ValueError(f"fov must be in (0, π), got {fov}")
         if fit not in ("crop", "stretch"):
             raise ValueError(f"fit must be 'crop' or 'stretch', got {fit!r}")
-        self.source, self.lenses = source, lenses
-        self.size, self.render, self.picture_size = size, render, picture_size
-        self.fov, self.fit = fov, fit
-        self.mean = np.asarray(mean, np.float32)[:, None, None]
-        self.std = np.asarray(std, np.float32)[:, None, None]
-        self.augment, self.erase, self.seed = augment, erase, seed
-        self.skip_broken = skip_broken
-        # A DataLoader's workers are forks, and OpenCV's threads do not survive a fork: a worker
-        # that waits for them hangs. Images this small gain nothing from them.
-        cv2.setNumThreads(1)
-        # Shared, so that what worker processes find is seen here.
-        self._broken = torch.zeros(len(source), dtype=torch.bool).share_memory_()
+        super().__init__(source, size=size, **options)
+        self.lenses, self.fov, self.fit = lenses, fov, fit
+        self.render, self.picture_size = render, picture_size
 
-    def __len__(self) -> int:
-        return len(self.source)
+    def _seen(self, draw: Draw) -> tuple[np.ndarray, Lens, int]:
+        picture, label = self.source[draw.picture]
+        lens = self._lens_alone(draw)
+        return self.through(lens, picture), lens, label
 
-    @property
-    def broken(self) -> list[int]:
-        """Indices of the pictures that could not be read so far."""
-        return self._broken.nonzero().flatten().tolist()
-
-    def __getitem__(self, draw: Draw | int) -> tuple[Tensor, Lens, int]:
-        if not isinstance(draw, Draw):
-            draw = Draw(0, int(draw), int(draw))
-        lens = self.lenses.draw(self._random(draw.epoch, draw.lens, 1), self.fov, self.size / 2)
-        try:
-            picture, label = self.source[draw.picture]
-        except BrokenImageError:
-            if not self.skip_broken:
-                raise
-            self._broken[draw.picture] = True
-            black = torch.from_numpy(-self.mean / self.std)
-            return black.expand(-1, self.size, self.size).clone(), lens, -1
-        rng = self._random(draw.epoch, draw.picture, 0)
-        image = self.through(lens, picture)
-        if self.augment:
-            image = self.augment(image, rng)
-        image = (image.transpose(2, 0, 1) * np.float32(1 / 255) - self.mean) / self.std
-        if self.erase:
-            image = self.erase(image, rng)
-        return torch.from_numpy(np.ascontiguousarray(image)), lens, label
-
-    def _random(self, epoch: int, key: int, purpose: int) -> np.random.Generator:
-        return np.random.default_rng((self.seed, epoch, key, purpose))
+    def _lens_alone(self, draw: Draw) -> Lens:
+        return self.lenses.draw(self._random(draw.epoch, draw.lens, 1), self.fov, self.size / 2)
 
     def through(self, lens: Lens, picture: np.ndarray) -> np.ndarray:
         """The picture (H, W, C) uint8 through a lens of this data set → (size, size, C) uint8."""

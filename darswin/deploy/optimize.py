@@ -89,6 +89,11 @@ class _Optimized(Encoder):
             raise TypeError("an optimized model is not trained: train the model it was made of")
         return super().train(mode)
 
+    def prune_intermediate_layers(self, *args, **kwargs):
+        raise TypeError(
+            "an optimized model is not pruned: prune it first, and optimize what is left"
+        )
+
     def state_dict(self, *args, **kwargs):
         raise TypeError("an optimized model is not saved: save the model it was made of")
 

@@ -201,7 +201,7 @@ def cat(lenses: Sequence[Lens]) -> Lens:
     for name in ("center", "image_size"):
         if len({getattr(lens, name) is None for lens in lenses}) > 1:
             raise ValueError(f"cat needs a {name} for all lenses or for none")
-    if len({_form(lens) for lens in lenses}) > 1:
+    if len({form_of(lens) for lens in lenses}) > 1:
         lenses = [as_curves(lens) for lens in lenses]
     if len({lens.affine is None for lens in lenses}) > 1:
         eye = torch.eye(2, dtype=lenses[0].theta_max.dtype, device=lenses[0].theta_max.device)
@@ -216,7 +216,7 @@ def cat(lenses: Sequence[Lens]) -> Lens:
     return lenses[0]._from_tensors(tensors)
 
 
-def _form(lens: Lens) -> tuple:
+def form_of(lens: Lens) -> tuple:
     """Lenses of the same form are joined as they are."""
     parameters = [getattr(lens, name) for name in (*lens.parameters, *lens.optional)]
     return type(lens), tuple(None if p is None else p.shape[1:] for p in parameters)

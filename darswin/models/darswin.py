@@ -106,7 +106,6 @@ class DarSwin(Encoder):
         if compat:
             plans = [official.plan(plan, window) for plan in plans]
         self.in_chans = in_chans
-        self.num_features = embed_dim * 2 ** (len(depths) - 1)
         self.square_images = compat == "official"
         self.compat, self.position_bias = compat, position_bias
 
@@ -149,16 +148,17 @@ class DarSwin(Encoder):
             drop_path_rate=drop_path_rate,
         )
         self._rings = [plan.map_size[0] for plan in plans]
-        self._finish(num_classes)
+        self._finish(num_classes, plans, embed_dim, patch=samples, mean=mean, std=std)
 
     def prepare(self, lens: Lens | None, size: Pair) -> Prepared:
         """The grid of the samples, and for each stage its `ring_angles`; else as `Encoder`."""
         lens = check_lens(lens, size)
         grid = self.patch_embed.sample.grid(lens, size)
+        counts = self._rings[: len(self.stages)]
         if self.compat:
-            angles = [official.ring_angles(lens, rings) for rings in self._rings]
+            angles = [official.ring_angles(lens, rings) for rings in counts]
         else:
-            angles = [ring_angles(lens, grid, rings, self.position_bias) for rings in self._rings]
+            angles = [ring_angles(lens, grid, rings, self.position_bias) for rings in counts]
         return Prepared(grid, [(of_stage,) for of_stage in angles])
 
     def embed(self, images: Tensor, points: PolarGrid) -> Tensor:

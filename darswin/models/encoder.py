@@ -1,7 +1,8 @@
 """What the models share: lens and images → maps of stages, features and logits."""
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from itertools import chain
+from typing import Any, Literal, NamedTuple
 
 from torch import Tensor, nn
 
@@ -13,7 +14,9 @@ from darswin.layers.linear import MATMUL_BACKENDS, Linear, MatmulBackend
 from darswin.layers.sampling import check_count, check_images
 from darswin.lens import Lens
 from darswin.lens.reprojection import sample_at
-from darswin.models.stages import Pair, check_depths, make_stages, plan_stages
+from darswin.models.features import FeatureInfo, feature_info, take_indices
+from darswin.models.stages import Pair, StagePlan, check_depths, make_stages, plan_stages
+from darswin.ops.checks import per_channel
 
 
 class Prepared(NamedTuple):
@@ -32,25 +35,72 @@ class Prepared(NamedTuple):
 class Encoder(nn.Module):
     """Base of all models, called `model(images, lens)`; the methods are those of timm's models.
 
-    A model sets `num_features`, makes `patch_embed` and `stages`, then calls `_finish`; it defines
+    A model sets `in_chans`, makes `patch_embed` and `stages`, then calls `_finish`; it defines
     `embed` and, if its lens matters, `prepare`. Maps are channels last: (B, R, A, D) where they are
     polar, else (B, H, W, D).
+
+    Attributes:
+        num_features, head_hidden_size: D of the last map, and of what the head takes.
+        feature_info: what the stages are.
+        pretrained_cfg: timm's description of a model: "architecture" (of `create_model`),
+            "num_classes", "input_size" (C, H, W), "fixed_input_size", "mean" and "std" (of pixels
+            in [0, 1]), "interpolation", "crop_pct", "first_conv" (the layer that takes the pixels),
+            "classifier". A loaded model's says what its card does, and has "label_names" and
+            "file".
     """
 
     image_size: Pair | None = None  # (H, W) that all images must have; None: any size
     square_images = False  # whether images must be square
     in_chans: int
     num_features: int
+    num_classes: int
     patch_embed: nn.Module
     stages: nn.ModuleList
+    norm: nn.Module
     head: nn.Module
     matmul_backend: MatmulBackend = "torch"  # see `set_matmul_backend`
 
-    def _finish(self, num_classes: int) -> None:
-        """Makes what ends a model, and initialises it."""
+    def __init__(self) -> None:
+        super().__init__()
+        self.feature_info = FeatureInfo()
+        self.pretrained_cfg: dict[str, Any] = {}
+
+    def _finish(
+        self,
+        num_classes: int,
+        plans: Sequence[StagePlan],
+        embed_dim: int,
+        *,
+        patch: Pair,
+        mean: float | Sequence[float],
+        std: float | Sequence[float],
+    ) -> None:
+        """Makes what ends a model, initialises it, and says what it is."""
+        self.feature_info = feature_info(plans, embed_dim, patch)
+        self.num_features = self.feature_info.channels(-1)
         self.norm = nn.LayerNorm(self.num_features)
         self.reset_classifier(num_classes)
         self.apply(_init_weights)
+        self.pretrained_cfg = dict(
+            num_classes=num_classes,
+            input_size=(self.in_chans, *(self.image_size or (64, 64))),  # else the paper's
+            fixed_input_size=self.image_size is not None,
+            interpolation="box",  # as `darswin predict`
+            crop_pct=1.0,
+            mean=tuple(per_channel("mean", mean, self.in_chans)),
+            std=tuple(per_channel("std", std, self.in_chans)),
+            first_conv="patch_embed.proj",
+            classifier="head",
+        )
+
+    @property
+    def head_hidden_size(self) -> int:
+        """D of what the head takes."""
+        return self.num_features
+
+    def get_classifier(self) -> nn.Module:
+        """The head; an identity where there is none."""
+        return self.head
 
     def reset_classifier(self, num_classes: int) -> None:
         """A new head for `num_classes` classes; 0 leaves it out.
@@ -59,7 +109,7 @@ class Encoder(nn.Module):
         """
         self.num_classes = num_classes
         if num_classes:
-            like = self.norm.weight
+            like = next(chain(self.norm.parameters(), self.parameters()))
             head = Linear(self.num_features, num_classes, device=like.device, dtype=like.dtype)
             head.matmul_backend = self.matmul_backend
             _init_weights(head)
@@ -111,12 +161,15 @@ class Encoder(nn.Module):
         """Images (B, C, H, W) and the `points` of `prepare` → the first map."""
         raise NotImplementedError
 
-    def run(self, images: Tensor, prepared: Prepared) -> list[Tensor]:
+    def run(
+        self, images: Tensor, prepared: Prepared, *, stop_after: int | None = None
+    ) -> list[Tensor]:
         """The map that each stage ends with: `prepare` and `run` are a model without its head.
 
         Args:
             images: (B, C, H, W), or uint8 (B, H, W, 3).
             prepared: of `prepare`, for the size of these images and B lenses or one.
+            stop_after: the last stage that runs; None means all do.
 
         Raises:
             TypeError, ValueError: images of another kind, or as many lenses as do not fit them.
@@ -126,11 +179,15 @@ class Encoder(nn.Module):
         for stage, positions in zip(self.stages, prepared.positions, strict=True):
             x = stage(x, *positions)
             maps.append(x)
+            if len(maps) - 1 == stop_after:
+                break
         return maps
 
-    def _maps(self, images: Tensor, lens: Lens | None) -> list[Tensor]:
+    def _maps(
+        self, images: Tensor, lens: Lens | None, stop_after: int | None = None
+    ) -> list[Tensor]:
         height, width = check_images(images).shape[2:]
-        return self.run(images, self.prepare(lens, (height, width)))
+        return self.run(images, self.prepare(lens, (height, width)), stop_after=stop_after)
 
     def forward_features(self, images: Tensor, lens: Lens | None = None) -> Tensor:
         """Images (B, C, H, W) and their lenses (B or 1) → the last map, (B, R', A', D'), normed."""
@@ -142,26 +199,70 @@ class Encoder(nn.Module):
         lens: Lens | None = None,
         *,
         indices: int | Sequence[int] | None = None,
+        norm: bool = False,
+        stop_early: bool = False,
+        output_fmt: Literal["NHWC", "NCHW"] = "NHWC",
         intermediates_only: bool = False,
     ) -> list[Tensor] | tuple[Tensor, list[Tensor]]:
-        """The maps of the stages, before the norm, and `forward_features`.
+        """The maps of some stages, in their order, and the last map.
 
         Args:
             indices: which stages; an int means the last so many, None all.
+            norm: the last stage's map is normed; the norm fits no other.
+            stop_early: no stage runs after the last of `indices`.
+            output_fmt: of the maps: "NHWC" as (B, R, A, D), "NCHW" as (B, D, R, A).
             intermediates_only: leaves out the first result.
 
         Returns:
-            (features, maps), each map (B, R, A, D) of its stage.
+            (features, maps); the features are `forward_features`, or, where stages were left out,
+            the last map that was made.
+
+        Raises:
+            ValueError: stages that there are not, another format.
         """
-        count = len(self.stages)
-        chosen = range(count)[-indices:] if isinstance(indices, int) else indices or range(count)
-        if (isinstance(indices, int) and not 0 < indices <= count) or any(
-            not -count <= i < count for i in chosen
-        ):
-            raise ValueError(f"indices must name some of {count} stages, got {indices}")
-        maps = self._maps(images, lens)
-        intermediates = [maps[i] for i in chosen]
-        return intermediates if intermediates_only else (self.norm(maps[-1]), intermediates)
+        last = len(self.stages) - 1
+        taken = take_indices(len(self.stages), indices)
+        if output_fmt not in ("NHWC", "NCHW"):
+            raise ValueError(f"output_fmt must be 'NHWC' or 'NCHW', got {output_fmt!r}")
+        maps = self._maps(images, lens, max(taken) if stop_early else last)
+        final = maps[-1]
+        if len(maps) - 1 == last and (norm or not intermediates_only):
+            final = self.norm(final)
+            if norm:
+                maps[-1] = final
+        intermediates = [maps[i] for i in sorted(set(taken))]
+        if output_fmt == "NCHW":
+            intermediates = [x.permute(0, 3, 1, 2).contiguous() for x in intermediates]
+        return intermediates if intermediates_only else (final, intermediates)
+
+    def prune_intermediate_layers(
+        self,
+        indices: int | Sequence[int] = 1,
+        *,
+        prune_norm: bool = False,
+        prune_head: bool = True,
+    ) -> list[int]:
+        """Removes, in place, what comes after the last of some stages.
+
+        Args:
+            indices: as `forward_intermediates`.
+            prune_norm: removes the norm too; prune_head: and the head. Both go in any case where a
+                stage does, since they do not fit what is left.
+
+        Returns:
+            The numbers of those stages.
+        """
+        taken = take_indices(len(self.stages), indices)
+        end = max(taken) + 1
+        shorter = end < len(self.stages)
+        self.stages = self.stages[:end]
+        self.feature_info = FeatureInfo(self.feature_info[:end])
+        self.num_features = self.feature_info.channels(-1)
+        if prune_norm or shorter:
+            self.norm = nn.Identity()
+        if prune_head or shorter:
+            self.reset_classifier(0)
+        return taken
 
     def forward_head(self, features: Tensor, pre_logits: bool = False) -> Tensor:
         """Features (B, R', A', D') → logits (B, num_classes), or their mean (B, D')."""
@@ -206,12 +307,12 @@ class ImageEncoder(Encoder):
                 f"patch_size must divide image_size = {self.image_size}, got {patch_size}"
             )
         plans = plan_stages(height // patch_size, width // patch_size, len(depths), "RA", window)
-        self.num_features = embed_dim * 2 ** (len(depths) - 1)
         self.in_chans = in_chans
         self.image_input = ImageInput(self.image_size, in_chans, mean, std)
         self.patch_embed = PatchProjection(in_chans, embed_dim, patch_size)
         self.stages = make_stages(plans, embed_dim, depths, num_heads, **stages)
-        self._finish(num_classes)
+        patch = (patch_size, patch_size)
+        self._finish(num_classes, plans, embed_dim, patch=patch, mean=mean, std=std)
 
     def embed(self, images: Tensor, points: Tensor | None) -> Tensor:
         """Images (B, C, H, W), read at the pixels `points` (N, H, W, 2) if any → the first map."""

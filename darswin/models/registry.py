@@ -46,7 +46,9 @@ def create_model(name: str, **options: Any) -> Encoder:
     Raises:
         ValueError: an unknown name, or options that do not fit together.
     """
-    return model_class(name)(**(_MODELS[name][1] | options))
+    model = model_class(name)(**(_MODELS[name][1] | options))
+    model.pretrained_cfg["architecture"] = name
+    return model
 
 
 def model_class(name: str) -> type[Encoder]:

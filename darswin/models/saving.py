@@ -5,13 +5,14 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
 
 from darswin.models.encoder import Encoder
+from darswin.models.pretrained import list_pretrained, pretrained_file
 from darswin.models.registry import create_model
 from darswin.utils.files import replace_file
 
@@ -29,7 +30,10 @@ class ModelCard:
     Args:
         model: a name of `create_model`. options: its options.
         classes: names of the logits.
-        size: px, of the images it was trained on. fov: rad, the field of view of their lenses.
+        size: px, of the images it was trained on. fov: rad, the field of view of their lenses, 0
+            where calibrations say it.
+        fit: how a camera's pictures get that size, as `darswin.data.frames.at_size` takes it:
+            "whole" where it was trained through the lenses of `darswin.data.WideAngle`.
     """
 
     model: str
@@ -37,6 +41,7 @@ class ModelCard:
     classes: Sequence[str] = ()
     size: int = 64
     fov: float = 0.0
+    fit: Literal["crop", "stretch", "whole"] = "whole"
 
     def create(self) -> Encoder:
         """The model, with new weights."""
@@ -63,12 +68,14 @@ def model_of_run(run: str | os.PathLike, suffix: str = ".safetensors") -> Path:
 
 
 def load_model(path: str | os.PathLike) -> tuple[Encoder, ModelCard]:
-    """The model of a file, in eval mode, and its card.
+    """The model of a file, or of a name in `list_pretrained()`, in eval mode, and its card.
 
     Raises:
         NoCardError: other weights. ValueError: no model file of darswin, or weights that are not
             those of its model.
     """
+    if path in list_pretrained():
+        path = pretrained_file(str(path))
     try:
         with safe_open(path, "pt") as file:
             entry = (file.metadata() or {}).get(_ENTRY)
@@ -79,9 +86,14 @@ def load_model(path: str | os.PathLike) -> tuple[Encoder, ModelCard]:
         raise NoCardError(f"{path} holds weights, but not the name of their model")
     try:
         values = json.loads(entry)
-        card = ModelCard(**{f.name: values[f.name] for f in fields(ModelCard)})
+        # Older files do not say all of it.
+        known = {field.name for field in fields(ModelCard)}
+        card = ModelCard(**{name: values[name] for name in known if name in values})
         model = card.create()
         model.load_state_dict(weights)
     except (ValueError, KeyError, TypeError, RuntimeError) as error:
         raise ValueError(f"{path} is no model that this darswin can build: {error}") from error
+    model.pretrained_cfg |= dict(label_names=tuple(card.classes), file=str(path))
+    if model.image_size is None:
+        model.pretrained_cfg["input_size"] = (model.in_chans, card.size, card.size)
     return model.eval(), card

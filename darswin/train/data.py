@@ -1,28 +1,38 @@
 """The data of a run."""
 
 import math
-from functools import partial
+from functools import cached_property, partial
+from pathlib import Path
 from typing import Any, Literal
 
 from lightning.pytorch import LightningDataModule
 from torch.utils.data import DataLoader
 
 from darswin.data.augment import RandAugment, RandomErasing
+from darswin.data.calibrated import Calibrated
+from darswin.data.calibrations import Calibrations, is_json
 from darswin.data.datasets import open_source
+from darswin.data.frames import Fit
 from darswin.data.lenses import parse_lenses, parse_sweep
+from darswin.data.samples import IMAGENET_MEAN, IMAGENET_STD, Samples
 from darswin.data.sampling import EveryNth, ResumableLoader, TrainingOrder
 from darswin.data.sources import Part, Source
 from darswin.data.splits import Split
-from darswin.data.wide_angle import IMAGENET_MEAN, IMAGENET_STD, PAPER_FOV, WideAngle
+from darswin.data.wide_angle import PAPER_FOV, WideAngle
 from darswin.train.stopping import ignore_signals
 
 
 class WideAngleData(LightningDataModule):
-    """Pictures as wide-angle images.
+    """Pictures as wide-angle images, or wide-angle pictures with the lenses that took them.
 
     Args:
         path: a folder of images, a folder of IDX files, or "digits": see
             `darswin.data.open_source`.
+        lens: the lens of a camera that took the pictures: a calibration file of any format that
+            `darswin.lens.load` reads, a lens as JSON, or a lenses.json that says which camera took
+            which folder or picture (see `darswin.data.Calibrations`). The pictures are then not
+            warped, and what is said of lenses, fov_deg, render and picture_size has no effect.
+        camera: which, of a calibration of several cameras.
         train_lenses: what training and validation go through: a level of the paper ("very low",
             "low", "medium", "high"), one ξ ("0.4"), a range ("0.2..0.35"), or "polynomial".
         test_lenses: what testing goes through, one after the other: such names, or a sweep
@@ -30,7 +40,7 @@ class WideAngleData(LightningDataModule):
         size: px, H = W of the images.
         render: px, what they are reduced from.
         fov_deg: degrees, the field of view that a picture's width spans, and that of every lens.
-        fit: how a picture becomes a square, cut or squashed.
+        fit: how a picture becomes a square, cut or squashed; its lens, if it has one, follows.
         picture_size: px, the width that larger pictures are first reduced to.
         channels: of the images, grey or colour.
         mean: of the pixels in [0, 1], per channel; null means ImageNet's.
@@ -46,6 +56,7 @@ class WideAngleData(LightningDataModule):
         pair_lenses: gives both images of a mixture the same lens, so that the mixture is an image
             through one lens. Without it, the mixed-in image is taken for one through the other's
             lens, as in the authors' code; or, without mixing, every image has a lens of its own.
+            Calibrated pictures are paired by their cameras, and those left over stay unmixed.
         seed: of the shuffles, lenses and augmentation, those of the test sets among them.
         skip_broken: counts files that are no images, instead of stopping at the first.
     """
@@ -54,6 +65,8 @@ class WideAngleData(LightningDataModule):
         self,
         path: str,
         *,
+        lens: str | None = None,
+        camera: str | None = None,
         train_lenses: str = "low",
         test_lenses: str | list[str] = "0:1:0.1",
         size: int = 64,
@@ -82,26 +95,36 @@ class WideAngleData(LightningDataModule):
                 "--data.batch_size must be at least 1 and --data.workers at least 0, "
                 f"got {batch_size} and {workers}"
             )
+        if camera is not None and lens is None:
+            raise ValueError(f"--data.camera {camera} is one of a calibration: give --data.lens")
+        self._lens, self._camera = lens, camera
         self.train_lenses = parse_lenses(train_lenses)
         self.test_names = parse_sweep(test_lenses)
+        if lens is not None:
+            self.test_names = ["lens" if is_json(lens) else Path(lens).name]
         self._path, self._holdout = path, holdout
         self._open = partial(
             open_source, path, channels=channels, classes=classes, splits=splits, holdout=holdout
         )
-        self.size, self.fov, self.channels = size, math.radians(fov_deg), channels
+        self.size, self.channels = size, channels
+        # What a model's card says of its pictures.
+        self.fov = 0.0 if lens else math.radians(fov_deg)
+        self.frame_fit: Fit = fit if lens else "whole"
         self.mean = list(mean or (IMAGENET_MEAN if channels == 3 else [0.449]))
         self.std = list(std or (IMAGENET_STD if channels == 3 else [0.226]))
         if not len(self.mean) == len(self.std) == channels:
             raise ValueError(f"mean and std must have {channels} values, got {mean} and {std}")
-        self._view = partial(
-            WideAngle, size=size, render=render, fov=self.fov, fit=fit, picture_size=picture_size,
-            mean=self.mean, std=self.std, seed=seed, skip_broken=skip_broken,
-        )  # fmt: skip
+        self._form: dict[str, Any] = dict(
+            size=size, fit=fit, mean=self.mean, std=self.std, seed=seed, skip_broken=skip_broken
+        )
+        self._warped = partial(
+            WideAngle, render=render, fov=math.radians(fov_deg), picture_size=picture_size
+        )
         self.limit, self.batch_size, self.workers = limit, batch_size, workers
         self.randaugment, self.erasing = randaugment, erasing
         self.pair_lenses, self.seed = pair_lenses, seed
         self._sources: dict[str, Source] = {}
-        self.datasets: list[WideAngle] = []
+        self.datasets: list[Samples] = []
         self._loader: ResumableLoader | None = None
         self._progress: dict[str, Any] = {}
 
@@ -116,13 +139,23 @@ class WideAngleData(LightningDataModule):
         """The names behind the labels."""
         return self.source("train").classes
 
-    def dataset(self, split: Split, lenses: str | None = None, **options) -> WideAngle:
-        """A split through a distribution of lenses; None means that of training."""
+    @cached_property
+    def calibrations(self) -> Calibrations | None:
+        """The lenses that the pictures were taken with, if `lens` says them."""
+        return Calibrations(self._lens, self._path, self._camera) if self._lens else None
+
+    def dataset(self, split: Split, lenses: str | None = None, **options) -> Samples:
+        """A split as it is, with its cameras' lenses; or through a distribution of lenses, where
+        None means that of training."""
         source = self.source(split)
         if self.limit is not None and self.limit < len(source):
             source = Part(source, self.limit)
-        distribution = self.train_lenses if lenses is None else parse_lenses(lenses)
-        dataset = self._view(source, distribution, **options)
+        dataset: Samples
+        if self.calibrations is not None:
+            dataset = Calibrated(source, self.calibrations, **self._form, **options)
+        else:
+            distribution = self.train_lenses if lenses is None else parse_lenses(lenses)
+            dataset = self._warped(source, distribution, **self._form, **options)
         self.datasets.append(dataset)
         return dataset
 
@@ -151,8 +184,9 @@ class WideAngleData(LightningDataModule):
             erase=RandomErasing(self.erasing) if self.erasing else None,
         )
         order = TrainingOrder(
-            len(dataset), self.batch_size, pairs=self.pair_lenses, seed=self.seed, **self._place
-        )
+            len(dataset), self.batch_size, pairs=self.pair_lenses, seed=self.seed,
+            cameras=dataset.cameras if isinstance(dataset, Calibrated) else None, **self._place,
+        )  # fmt: skip
         self._loader = ResumableLoader(
             dataset, order, persistent_workers=self.workers > 0, **self._options
         )

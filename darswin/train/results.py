@@ -29,18 +29,24 @@ class WriteResults(Callback):
         if not isinstance(pl_module, Classification):
             raise TypeError(f"results are of Classification, got {type(pl_module).__name__}")
         rows = pl_module.results
-        print(f"\n{'lenses':<16}{'top-1 (%)':>10}{'top-5 (%)':>10}{'loss':>10}")
+        width = max(16, *(len(row["lenses"]) + 2 for row in rows))
+        print(f"\n{'lenses':<{width}}{'top-1 (%)':>10}{'top-5 (%)':>10}{'loss':>10}")
         for row in rows:
             print(
-                f"{row['lenses']:<16}{100 * row['top1']:>10.2f}{100 * row['top5']:>10.2f}"
+                f"{row['lenses']:<{width}}{100 * row['top1']:>10.2f}{100 * row['top5']:>10.2f}"
                 f"{row['loss']:>10.4f}"
             )
-        write_results(self.folder, rows, pl_module.card.model, pl_module.data.train_lenses)
+        warped = pl_module.trained.fit == "whole"
+        trained_on = pl_module.data.train_lenses if warped else None
+        write_results(self.folder, rows, pl_module.card.model, trained_on)
         print(f"\n{self.folder}/test.csv, test.json and test.png")
 
 
-def write_results(folder: Path, rows: list[dict], name: str, trained_on: LensDistribution) -> None:
-    """The rows of a test as files; `trained_on` is the distribution that the picture shades."""
+def write_results(
+    folder: Path, rows: list[dict], name: str, trained_on: LensDistribution | None
+) -> None:
+    """The rows of a test as files; `trained_on` is the distribution that the picture shades, None
+    where the lenses are those of cameras."""
     report = dict(model=name, results=rows)
     replace_file(folder / "test.json", json.dumps(report, indent=1, ensure_ascii=False))
     table = io.StringIO(newline="")
@@ -51,12 +57,12 @@ def write_results(folder: Path, rows: list[dict], name: str, trained_on: LensDis
     save_figure(draw_results(rows, name, trained_on), folder / "test.png")
 
 
-def draw_results(rows: list[dict], name: str, trained_on: LensDistribution) -> Figure:
+def draw_results(rows: list[dict], name: str, trained_on: LensDistribution | None) -> Figure:
     """A figure: accuracy against ξ where every distribution is one ξ, else bars."""
     figure = Figure(figsize=(7, 4.2), layout="constrained")
     axes = figure.subplots()
     accuracy = [100 * row["top1"] for row in rows]
-    lenses = [parse_lenses(row["lenses"]) for row in rows]
+    lenses = [_distribution(row["lenses"]) for row in rows]
     of_one_xi = [
         lens for lens in lenses if isinstance(lens, SphericalLenses) and lens.low == lens.high
     ]
@@ -71,3 +77,11 @@ def draw_results(rows: list[dict], name: str, trained_on: LensDistribution) -> F
         axes.tick_params(axis="x", rotation=90)
         axes.legend()
     return figure
+
+
+def _distribution(name: str) -> LensDistribution | None:
+    """The distribution of a row; None where it is a camera's calibration."""
+    try:
+        return parse_lenses(name)
+    except ValueError:
+        return None

@@ -12,6 +12,7 @@ CHANGEABLE = {
     *("model.label_smoothing", "model.mixup", "model.cutmix", "model.mix_p"),
     *("model.matmul_backend", "model.grad_checkpointing"),
     *("data.path", "data.classes", "data.splits", "data.skip_broken"),
+    *("data.lens", "data.camera"),
     *("data.batch_size", "data.workers"),
     *("data.train_lenses", "data.test_lenses", "data.pair_lenses"),
     *("data.render", "data.fit", "data.picture_size", "data.randaugment", "data.erasing"),
@@ -28,7 +29,8 @@ def check_changes(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str
     changes = {
         name: f"--{name} {now[name]!r} in place of {before.get(name)!r}"
         for name in now
-        if now[name] != before.get(name)
+        # An option that is off is none that an older run lacks.
+        if now[name] != before.get(name) and (name in before or now[name])
     }
     refused = [
         text

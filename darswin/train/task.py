@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from torchmetrics import MeanMetric, Metric
 from torchmetrics.classification import MulticlassAccuracy
 
-from darswin.data.mixing import Mixing
+from darswin.data.mixing import Mixing, partners_share
 from darswin.layers.linear import MatmulBackend
 from darswin.lens import Lens
 from darswin.models.encoder import Encoder
@@ -55,6 +55,7 @@ class Classification(LightningModule):
 
     net: Encoder  # of `configure_model`, as is what describes it
     card: ModelCard
+    trained: ModelCard  # of the checkpoint that was read; else `card`
 
     def __init__(
         self,
@@ -116,7 +117,8 @@ class Classification(LightningModule):
                 f"--model.options cannot set {', '.join(taken)}: the data decides on it"
             )
         options |= self.options
-        self.card = ModelCard(self.name, options, data.classes, data.size, data.fov)
+        self.card = ModelCard(self.name, options, data.classes, data.size, data.fov, data.frame_fit)
+        self.trained = self.card
         torch.manual_seed(self.seed)
         try:
             self.net = self.card.create()
@@ -184,13 +186,15 @@ class Classification(LightningModule):
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """ValueError where the checkpoint is not one of this model."""
         self._steps_there = checkpoint.get("steps_per_epoch")
+        self.trained = ModelCard(**checkpoint["darswin"])
         theirs, ours = (
-            {**card, **card.pop("options")}
-            for card in (checkpoint["darswin"].copy(), asdict(self.card))
+            {**card, **card.pop("options")} for card in (asdict(self.trained), asdict(self.card))
         )
+        # A model may be measured on pictures that come to it in another way.
+        ignored = {"fit"} if theirs["fov"] and ours["fov"] else {"fit", "fov"}
         other = [
             f"{key} {theirs.get(key)!r} there, {ours.get(key)!r} here"
-            for key in sorted(theirs.keys() | ours.keys())
+            for key in sorted((theirs.keys() | ours.keys()) - ignored)
             if theirs.get(key) != ours.get(key)
         ]
         if other:
@@ -209,7 +213,8 @@ class Classification(LightningModule):
         rng = np.random.default_rng(step)  # the same in all processes
         torch.manual_seed(int(np.random.default_rng((*step, self.global_rank)).integers(2**63)))
         targets = self._targets(labels, len(self.card.classes))
-        images, targets = self.mixing(images, targets, rng)
+        shared = partners_share(lens) if self.data.calibrations and self.data.pair_lenses else None
+        images, targets = self.mixing(images, targets, rng, shared)
         loss = F.cross_entropy(self.net(images, lens).float(), targets)
         if not torch.isfinite(loss):
             raise FloatingPointError(

@@ -12,7 +12,7 @@ from darswin.utils.exif import TURNS
 
 
 class BrokenImageError(OSError):
-    """A file that is no readable image."""
+    """A file that is no readable image or video."""
 
 
 def read_image(path: str | Path, channels: int = 3) -> np.ndarray:

@@ -8,17 +8,21 @@ import torch
 from helpers import fixture
 from hypothesis import given
 from PIL import ExifTags, Image, ImageOps
+from videos import turn_video, write_video
 
+from darswin.cli.answers import resized
 from darswin.cli.main import main
-from darswin.cli.predict import predict, read_lens, resized
+from darswin.cli.predict import predict
 from darswin.compat import load_official
-from darswin.data.wide_angle import IMAGENET_MEAN, IMAGENET_STD
-from darswin.lens import Equidistant, Spherical, from_dict, save
+from darswin.data.samples import IMAGENET_MEAN, IMAGENET_STD
+from darswin.lens import Equidistant, Spherical, from_dict, load, save
 from darswin.lens.orientation import in_upright_picture
+from darswin.models import pretrained_file
 from darswin.models.encoder import Encoder
 from darswin.models.saving import ModelCard, save_model
 from darswin.utils.exif import TURNS
 from darswin.utils.image import read_oriented
+from darswin.utils.video import read_frames
 
 LENS = {"model": "Spherical", "xi": 0.5, "fov": 2.8}
 
@@ -89,7 +93,7 @@ def test_calibration_files(run):
     main([*argv, "--lens", str(path), "--camera", "cam1"])
     found = json.loads((run / "o.json").read_text())
     # The same lens in pixels of the picture, half as large: its center stays between two pixels.
-    lens = in_upright_picture(read_lens(str(path), (64, 96), "cam1"), (64, 96), 1)
+    lens = in_upright_picture(load(path, camera="cam1", image_size=(64, 96)), (64, 96), 1)
     assert lens.focal.item() == pytest.approx(60) and lens.center.tolist() == [[47.5, 31.5]]
     assert lens.image_size.tolist() == [[64, 96]]
     same = dict(
@@ -191,7 +195,7 @@ def test_a_camera_that_is_called_by_a_number(run, capsys):
     (run / "cameras.txt").write_text(COLMAP)
     picture, calibration = str(run / "p.png"), str(run / "cameras.txt")
     for name, focal in (("1", 40), ("2", 30), ("5", 20)):
-        lens = read_lens(calibration, (64, 96), name)
+        lens = load(calibration, camera=name, image_size=(64, 96))
         assert lens.focal.item() == focal
         save(lens, run / "lens.json")
         (same,) = answers([picture, "--lens", str(run / "lens.json")], run, capsys)
@@ -331,3 +335,151 @@ def test_lenses_from_json():
     assert lens.r_max.item() == pytest.approx(10)
     with pytest.raises(ValueError, match="Spherical lens cannot be made of"):
         from_dict({"model": "Spherical", "x": 0.5}, (9, 9))
+
+
+# -- a model that comes with darswin, folders, videos ------------------------------------------
+
+
+def test_the_first_prediction(capsys):
+    """Without a run, pictures or a lens of one's own; and the same, spelled out."""
+    main(["predict", "--model", "digits"])
+    (found,) = json.loads(capsys.readouterr().out)
+    sample, lens = (str(pretrained_file("digits", kind)) for kind in ("png", "json"))
+    assert found["image"] == sample and found["top"][0]["class"] == "4"
+    assert found["top"][0]["probability"] > 0.8
+    main(["predict", sample, "--model", "digits", "--lens", lens])
+    assert json.loads(capsys.readouterr().out) == [found]
+
+
+def test_what_is_needed(run, monkeypatch):
+    monkeypatch.chdir(run)
+    for argv in ([], ["p.png"], ["--lens", json.dumps(LENS)]):
+        with pytest.raises(SystemExit, match="needs pictures or videos, and --lens"):
+            main(["predict", *argv, "--run", str(run)])
+    with pytest.raises(SystemExit, match="needs pictures or videos, and --lens"):
+        main(["predict", "p.png", "--model", "digits"])
+    with pytest.raises(SystemExit, match="safetensors file or one of digits"):
+        main(["predict", "p.png", "--model", "digits", "--run", str(run)])
+    with pytest.raises(SystemExit, match="--every must be at least 1, got 0"):
+        main(["predict", "p.png", "--run", str(run), "--lens", json.dumps(LENS), "--every", "0"])
+
+
+@pytest.fixture
+def folder(run):
+    """Pictures of several folders, between files that are none."""
+    pictures = run / "pictures"
+    names = ("b/2.png", "b/10.png", "a/x/1.PNG", "0.png", "a/y.png")
+    for k, name in enumerate(names):
+        (pictures / name).parent.mkdir(parents=True, exist_ok=True)
+        image = np.random.default_rng(k).integers(256, size=(64, 96, 3), dtype=np.uint8)
+        (pictures / name).write_bytes(cv2.imencode(".png", image)[1].tobytes())
+    for name in (".hidden/1.png", ".2.png", "notes.txt", "a/lens.json"):
+        (pictures / name).parent.mkdir(exist_ok=True)
+        (pictures / name).write_text("no picture")
+    return pictures
+
+
+def test_a_folder_means_its_pictures(run, folder, capsys):
+    lens = ["--lens", json.dumps(LENS)]
+    found = answers([str(folder), *lens], run, capsys)
+    names = ["0.png", "a/x/1.PNG", "a/y.png", "b/10.png", "b/2.png"]
+    assert [answer["image"] for answer in found] == [str(folder / name) for name in names]
+    for answer in found:  # as one after the other
+        assert close(answer, *answers([answer["image"], *lens], run, capsys))
+    mixed = answers([str(run / "p.png"), str(folder / "a"), *lens], run, capsys)
+    assert [answer["image"] for answer in mixed][1:] == [str(folder / name) for name in names[1:3]]
+    (folder / "b" / "bad.jpg").write_text("no picture")
+    (folder / "b" / "z.heic").write_text("not read")
+    with pytest.raises(SystemExit, match=r"no answer for 1 of 6 pictures:\n.*bad\.jpg"):
+        answers([str(folder), *lens], run, capsys)
+    said = capsys.readouterr()
+    assert len(json.loads(said.out)) == 5 and "does not read, 1 .heic" in said.err
+    (run / "empty").mkdir()
+    with pytest.raises(SystemExit, match=r"no pictures in .*empty"):
+        answers([str(run / "empty"), *lens], run, capsys)
+
+
+def test_a_lens_for_each_folder(run, folder, capsys):
+    """As a lenses.json says: each picture as with its own lens alone."""
+    lenses = {xi: {"model": "Spherical", "xi": xi, "fov": 2.8} for xi in (0.1, 0.5, 0.9)}
+    (run / "wide.json").write_text(json.dumps(lenses[0.9] | {"image_size": [64, 96]}))
+    said = {"pictures": lenses[0.1], "pictures/a": lenses[0.5], "pictures/b/2.png": "wide.json"}
+    (run / "lenses.json").write_text(json.dumps(said))
+    found = answers([str(folder), "--lens", str(run / "lenses.json")], run, capsys)
+    for answer, xi in zip(found, (0.1, 0.5, 0.5, 0.1, 0.9), strict=True):
+        (alone,) = answers([answer["image"], "--lens", json.dumps(lenses[xi])], run, capsys)
+        assert close(answer, alone)
+    with pytest.raises(SystemExit, match=r"lenses\.json has no lens for .*p\.png"):
+        answers([str(run / "p.png"), "--lens", str(run / "lenses.json")], run, capsys)
+
+
+def as_pictures(video, folder, **options):
+    """The frames of a video as upright pictures."""
+    folder.mkdir()
+    for frame in read_frames(video, **options):
+        cv2.imwrite(str(folder / f"{frame.number:03}.png"), frame.image[..., ::-1])
+    return str(folder)
+
+
+@pytest.mark.parametrize("every", [1, 4])
+def test_each_frame_of_a_video(run, capsys, every):
+    write_video(run / "v.mp4", 19)
+    argv = ["--lens", json.dumps(LENS), "--run", str(run), "--top", "6"]
+    main(["predict", str(run / "p.png"), str(run / "v.mp4"), *argv, "--every", str(every)])
+    said = capsys.readouterr()
+    picture, *found, speed = json.loads(said.out)
+    assert picture["image"] == str(run / "p.png")
+    assert all(answer["video"] == str(run / "v.mp4") for answer in found)
+    assert [answer["frame"] for answer in found] == list(range(0, 19, every))
+    times = [k / 10 for k in range(0, 19, every)]
+    assert [answer["time"] for answer in found] == pytest.approx(times)
+    for answer, same in zip(
+        found,
+        answers([as_pictures(run / "v.mp4", run / "f", every=every), *argv[:2]], run, capsys),
+        strict=True,
+    ):
+        assert close(answer, same)
+    assert speed["video"] == str(run / "v.mp4") and speed["frames"] == len(found)
+    overall, network = speed["frames_per_second"], speed["network_frames_per_second"]
+    assert 0 < overall < network
+    line = f"darswin: {run}/v.mp4: {len(found)} frames at {overall} a second, by the network alone"
+    assert f"{line} {network}" in said.err
+
+
+@pytest.mark.parametrize("degrees", [90, 180, 270])
+def test_a_video_that_its_metadata_turns(run, capsys, degrees):
+    """As its upright frames, with their lens turned another way: by EXIF of a picture."""
+    write_video(run / "v.mp4", 3)
+    turn_video(run / "v.mp4", degrees)
+    lens = from_dict(SENSOR_LENS | {"image_size": [64, 96]})
+    (run / "lens.json").write_text(json.dumps(SENSOR_LENS | {"image_size": [64, 96]}))
+    *found, _ = answers([str(run / "v.mp4"), "--lens", str(run / "lens.json")], run, capsys)
+    upright = as_pictures(run / "v.mp4", run / "f")
+    shape = cv2.imread(f"{upright}/000.png").shape[:2]
+    assert shape == ((64, 96) if degrees == 180 else (96, 64))
+    save(in_upright_picture(lens, shape, {90: 6, 180: 3, 270: 8}[degrees]), run / "turned.json")
+    same = answers([upright, "--lens", str(run / "turned.json")], run, capsys)
+    assert all(close(a, b) for a, b in zip(found, same, strict=True))
+    save(lens.replace(center=None), run / "centered.json")  # and it matters that it is turned
+    other = answers([str(run / "v.mp4"), "--lens", str(run / "centered.json")], run, capsys)
+    assert not close(found[0], other[0])
+
+
+def test_a_video_that_is_damaged(run, capsys):
+    write_video(run / "cut.avi", 40, codec="MJPG")
+    content = (run / "cut.avi").read_bytes()
+    (run / "cut.avi").write_bytes(content[: len(content) // 2])
+    (run / "none.mp4").write_text("no video")
+    paths = [str(run / name) for name in ("cut.avi", "none.mp4", "p.png")]
+    with pytest.raises(SystemExit) as caught:
+        answers([*paths, "--lens", json.dumps(LENS)], run, capsys)
+    *frames, speed, picture = json.loads(capsys.readouterr().out)
+    assert [answer["frame"] for answer in frames] == list(range(speed["frames"]))
+    assert 5 < speed["frames"] < 35 and picture["image"] == str(run / "p.png")
+    first, *lines = str(caught.value).splitlines()
+    assert first == "darswin: no answer, or not for all frames, for 2 of 3 files:"
+    assert "cut.avi is damaged or cut off" in lines[0] and "none.mp4" in lines[1]
+    square = json.dumps(LENS | {"image_size": [64, 64]})
+    write_video(run / "v.mp4", 4)
+    with pytest.raises(SystemExit, match=r"v\.mp4: .*64×96 is not of that shape"):
+        answers([str(run / "v.mp4"), "--lens", square], run, capsys)

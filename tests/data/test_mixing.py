@@ -2,7 +2,8 @@ import numpy as np
 import pytest
 import torch
 
-from darswin.data.mixing import Mixing
+from darswin.data.mixing import Mixing, partners_share
+from darswin.lens import Spherical
 
 
 def batch(count=6):
@@ -59,3 +60,18 @@ def test_off_changes_nothing_and_inputs_stay():
     assert torch.equal(images, before)
     with pytest.raises(ValueError, match="mixing needs"):
         Mixing(p=2)
+
+
+@pytest.mark.parametrize("options", [dict(mixup=1.0, cutmix=0.0), dict(mixup=0.0, cutmix=1.0)])
+def test_images_of_different_lenses_stay_as_they_are(options):
+    images, targets = torch.rand(6, 1, 8, 8), torch.eye(6)
+    lens = Spherical([0.1, 0.2, 0.3, 0.3, 0.2, 0.4], 9.0)
+    may_mix = partners_share(lens)
+    assert may_mix.tolist() == [False, True, True, True, True, False]
+    mixed, mixed_targets = Mixing(**options)(images, targets, np.random.default_rng(0), may_mix)
+    every, every_target = Mixing(**options)(images, targets, np.random.default_rng(0))
+    assert torch.equal(mixed[may_mix], every[may_mix])
+    assert torch.equal(mixed_targets[may_mix], every_target[may_mix])
+    assert torch.equal(mixed[~may_mix], images[~may_mix])
+    assert torch.equal(mixed_targets[~may_mix], targets[~may_mix])
+    assert not torch.equal(every_target[~may_mix], targets[~may_mix])

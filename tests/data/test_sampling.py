@@ -1,9 +1,10 @@
+import numpy as np
 import pytest
 import torch
 from torch.utils.data import Dataset
 
+from darswin.data.samples import Draw
 from darswin.data.sampling import EveryNth, ResumableLoader, TrainingOrder
-from darswin.data.wide_angle import Draw
 
 
 def batches(order):
@@ -91,3 +92,37 @@ def test_parts_of_a_test_set():
     assert sorted(k for part in parts for k in part) == list(range(10)) and [
         len(p) for p in parts
     ] == [4, 3, 3]
+
+
+@pytest.mark.parametrize("batch", [6, 5])
+def test_partners_are_of_one_camera_where_that_can_be(batch):
+    cameras = np.array([0] * 31 + [1] * 17 + [2] * 4 + [3])
+    order = TrainingOrder(53, batch, rank=0, world=1, cameras=cameras)
+    for epoch in range(3):
+        order.set_epoch(epoch)
+        pictures = [d.picture for d in order]
+        assert len(pictures) == len(set(pictures)) == len(order) == 53 // batch * batch
+        pairs = {
+            frozenset((d.picture, p.picture))
+            for one in batches(order)
+            for d, p in zip(one, one[::-1], strict=True)
+        }
+        mixed = [pair for pair in pairs if len({cameras[k] for k in pair}) > 1]
+        assert len(mixed) <= 2  # of four cameras, each has at most one image left over
+        for one in batches(order):
+            assert [d.lens for d in one] == [d.lens for d in one[::-1]]
+    whole = list(TrainingOrder(50, 10, rank=0, world=1, cameras=cameras[:50]))
+    assert whole != list(TrainingOrder(50, 10, rank=0, world=1, seed=1, cameras=cameras[:50]))
+    for plain in (np.zeros(50), None):
+        same = TrainingOrder(50, 10, rank=0, world=1, cameras=plain)
+        assert list(same) == list(TrainingOrder(50, 10, rank=0, world=1))
+    apart = TrainingOrder(50, 10, rank=0, world=1, cameras=cameras[:50], pairs=False)
+    assert list(apart) == list(TrainingOrder(50, 10, rank=0, world=1, pairs=False))
+
+
+def test_cameras_go_on_where_they_were():
+    cameras = np.arange(40) % 3
+    order = TrainingOrder(40, 4, rank=0, world=1, cameras=cameras)
+    whole = list(order)
+    order.resume(0, 6, order.shuffle())
+    assert list(order) == whole[24:]

@@ -7,8 +7,9 @@ import torch
 from torch.utils.data import DataLoader
 
 from darswin.data import PolynomialLenses, SphericalLenses, WideAngle, warp
+from darswin.data.samples import IMAGENET_MEAN, IMAGENET_STD, Draw
 from darswin.data.sources import Arrays, ImageFiles
-from darswin.data.wide_angle import IMAGENET_MEAN, IMAGENET_STD, PAPER_FOV, Draw
+from darswin.data.wide_angle import PAPER_FOV
 from darswin.lens import Perspective, Spherical
 from darswin.lens.reprojection import OUTSIDE, reprojection
 from darswin.utils.image import BrokenImageError

@@ -13,7 +13,6 @@ from helpers import changed
 from lens_examples import assert_projects
 
 from darswin.cli.main import main
-from darswin.cli.predict import read_lens
 from darswin.lens import EnhancedUnified, load, load_all
 from darswin.lens.files import loads
 
@@ -32,7 +31,7 @@ def test_a_camera_that_is_called_by_a_number_is_that_one(camera, tmp_path, capsy
     path.write_text(COLMAP)
     assert load(path, camera=str(camera)).focal.item() == 100 * camera
     assert load(path, camera=camera).focal.item() == 100 * camera
-    assert read_lens(str(path), (480, 640), str(camera)).focal.item() == 100 * camera
+    assert load(path, camera=str(camera), image_size=(480, 640)).focal.item() == 100 * camera
     main(["lens", "info", str(path), "--camera", str(camera)])
     printed = capsys.readouterr().out
     assert f"focal         {100 * camera}\n" in printed
@@ -50,7 +49,7 @@ def test_a_number_chooses_among_cameras_of_other_names(capsys):
     path = FILES / "kalibr_tumvi.yaml"
     focal = load(path, camera="cam1").focal.item()
     assert load(path, camera="1").focal.item() == load(path, camera=1).focal.item() == focal
-    assert read_lens(str(path), (512, 512), "1").focal.item() == focal
+    assert load(path, camera="1", image_size=(512, 512)).focal.item() == focal
     main(["lens", "info", str(path), "--camera=1"])
     assert "camera          cam1, of 2: cam0, cam1\n" in capsys.readouterr().out
     with pytest.raises(ValueError, match="one of 'cam0', 'cam1', or its number, got '2'"):

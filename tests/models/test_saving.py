@@ -39,3 +39,10 @@ def test_what_is_no_model_of_ours(tmp_path):
         load_model(path)
     with pytest.raises(FileNotFoundError):
         load_model(tmp_path / "nothing.safetensors")
+
+
+def test_an_older_file_lacks_what_came_later(tmp_path):
+    path, older = tmp_path / "m.safetensors", dict(vars(CARD))
+    del older["fit"]
+    save_file(CARD.create().state_dict(), path, metadata={"darswin": json.dumps(older)})
+    assert load_model(path)[1] == CARD and CARD.fit == "whole"

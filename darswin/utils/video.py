@@ -1,0 +1,93 @@
+"""Reading the frames of video files, upright as their metadata says."""
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from darswin.utils.image import BrokenImageError
+
+SUFFIXES = frozenset((
+    ".3gp", ".asf", ".avi", ".flv", ".h264", ".h265", ".hevc", ".m2ts", ".m4v", ".mjpeg", ".mjpg",
+    ".mkv", ".mov", ".mp4", ".mpeg", ".mpg", ".mts", ".ogv", ".ts", ".webm", ".wmv", ".y4m",
+))  # fmt: skip
+# The EXIF orientations of pictures that are turned upright as a video's metadata says, in degrees
+# clockwise.
+_ORIENTATIONS = {0: 1, 90: 6, 180: 3, 270: 8}
+# A video may end so much before the end that its header names, as where its sound is longer: s, but
+# no larger a part of the video.
+_TOLERANCE = 0.5
+_PART = 0.05
+
+
+class Frame(NamedTuple):
+    """Attributes: number: from 0; time: s; image: (H, W, C) uint8, upright; orientation: as EXIF's,
+    what it was turned upright from."""
+
+    number: int
+    time: float
+    image: np.ndarray
+    orientation: int
+
+
+def is_video(path: str | Path) -> bool:
+    """Whether a file is a video: by its name, or because OpenCV opens it as one and as no image."""
+    if os.path.splitext(path)[1].lower() in SUFFIXES:
+        return True
+    return os.path.isfile(path) and not cv2.haveImageReader(str(path)) and _opened(path) is not None
+
+
+def read_frames(path: str | Path, channels: int = 3, every: int = 1) -> Iterator[Frame]:
+    """Every so many frames of a video file, from the first on; C = 3 (RGB) or 1 (grey).
+
+    Raises:
+        BrokenImageError: a file that is missing or no video; after its last frame, a video that
+            ends before the end that its header names, by half a second or a twentieth.
+    """
+    capture = _opened(path)
+    if capture is None:
+        reason = "no video that OpenCV can decode" if os.path.isfile(path) else "no such file"
+        raise BrokenImageError(f"cannot read {path}: {reason}")
+    upright = capture.get(cv2.CAP_PROP_ORIENTATION_AUTO) > 0
+    degrees = round(capture.get(cv2.CAP_PROP_ORIENTATION_META)) if upright else 0
+    orientation = _ORIENTATIONS.get(degrees % 360, 1)
+    colors = cv2.COLOR_BGR2RGB if channels == 3 else cv2.COLOR_BGR2GRAY
+    count, time = 0, 0.0
+    try:
+        while capture.grab():
+            time = capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
+            if count % every == 0:
+                _, image = capture.retrieve()
+                image = cv2.cvtColor(image, colors).reshape(*image.shape[:2], channels)
+                yield Frame(count, time, image, orientation)
+            count += 1
+        _check_end(path, capture, count, time)
+    finally:
+        capture.release()
+
+
+def _opened(path: str | Path) -> cv2.VideoCapture | None:
+    """None for what is no video."""
+    # FFmpeg would describe damage on stderr, line after line.
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+    capture = cv2.VideoCapture(str(path)) if os.path.isfile(path) else None
+    return capture if capture is not None and capture.isOpened() else None
+
+
+def _check_end(path: str | Path, capture: cv2.VideoCapture, count: int, time: float) -> None:
+    """BrokenImageError where a video of so many frames, the last at `time`, is not whole."""
+    if count == 0:
+        raise BrokenImageError(f"cannot read {path}: no frame that OpenCV can decode")
+    rate, named = capture.get(cv2.CAP_PROP_FPS), capture.get(cv2.CAP_PROP_FRAME_COUNT)
+    if rate <= 0 or named <= 0:  # a stream without a header
+        return
+    # Times rather than counts: for some files OpenCV makes the count from the length.
+    length, end = named / rate, time + 1 / rate
+    if length - end > min(_TOLERANCE, _PART * length):
+        raise BrokenImageError(
+            f"{path} is damaged or cut off: it ends after {count} frames, at {end:.1f} s of the "
+            f"{length:.1f} s that its header names"
+        )

@@ -1,0 +1,151 @@
+import json
+import shutil
+
+import pytest
+import torch
+from frames import CALIBRATIONS, WOODSCAPE
+
+from darswin.data import Calibrations
+from darswin.lens import Tabulated, from_dict, load, load_all
+from darswin.lens.orientation import turned
+
+SIZE = (121, 160)
+SPHERICAL = {"model": "Spherical", "xi": 0.5, "focal": 60.0, "theta_max": 1.4}
+
+
+@pytest.fixture
+def root(tmp_path):
+    """Three empty pictures in two folders, and calibrations beside them."""
+    for name in ("a/0.png", "a/1.png", "b/c/2.png"):
+        (tmp_path / "p" / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / "p" / name).touch()
+    for name in ("woodscape.json", "opencv_stereo.json", "ocamcalib.txt", "kalibr_ds.yaml"):
+        shutil.copy(CALIBRATIONS / name, tmp_path)
+    return tmp_path / "p"
+
+
+def listed(root, entries):
+    file = root.parent / "lenses.json"
+    file.write_text(entries if isinstance(entries, str) else json.dumps(entries))
+    return file
+
+
+def same(one, other):
+    assert type(one) is type(other)
+    for name in one._names():
+        a, b = getattr(one, name), getattr(other, name)
+        assert (a is None) == (b is None) and (a is None or torch.equal(a, b)), name
+
+
+def test_one_calibration_is_of_all_pictures(root):
+    lenses = Calibrations(WOODSCAPE, root)
+    expected = load(WOODSCAPE).in_picture(SIZE)
+    for picture in (root / "a/0.png", root / "b/c/2.png", None, "elsewhere.png"):
+        same(lenses.lens_of(picture, SIZE), expected)
+    assert lenses.lens_of(None, SIZE) is lenses.lens_of(root / "a/0.png", SIZE)
+    assert lenses.cameras_of([None, root / "a/0.png"]).tolist() == [0, 0]
+
+
+def test_a_camera_of_several(root):
+    file = CALIBRATIONS / "colmap_all.txt"
+    name = next(iter(load_all(file)))
+    size = tuple(int(side) for side in load(file, camera=name).image_size[0])
+    same(Calibrations(file, root, name).lens_of(None, size), load(file, camera=name))
+    with pytest.raises(ValueError, match="several cameras, choose one"):
+        Calibrations(file, root)
+    with pytest.raises(ValueError, match="camera must be one of"):
+        Calibrations(file, root, "none")
+
+
+def test_a_lens_as_json(root):
+    lens = Calibrations(json.dumps(SPHERICAL), root).lens_of(None, SIZE)
+    same(lens, from_dict(dict(SPHERICAL, center=[79.5, 60.0], image_size=SIZE)))
+    wide = Calibrations('{"model": "Equidistant", "fov": 3.0}', root)
+    assert wide.lens_of(None, (40, 60)).r_max.item() == pytest.approx(20)
+    assert wide.lens_of(None, (80, 60)).r_max.item() == pytest.approx(30)
+
+
+def test_the_most_specific_entry_counts(root):
+    file = listed(
+        root,
+        {".": "woodscape.json", "a/": SPHERICAL, "a/1.png": {"file": "woodscape.json"}},
+    )
+    lenses = Calibrations(file, root)
+    assert len(lenses.cameras) == 2
+    pictures = [root / name for name in ("a/0.png", "a/1.png", "b/c/2.png")]
+    assert lenses.cameras_of(pictures).tolist() == [1, 0, 0]
+    assert lenses.cameras_of([None]).tolist() == [0]
+
+
+def test_lenses_of_several_models_are_curves(root):
+    file = listed(root, {"a": "woodscape.json", "b/c": "kalibr_ds.yaml"})
+    camera = load(CALIBRATIONS / "kalibr_ds.yaml", camera="cam0")
+    size = tuple(int(side) for side in camera.image_size[0])
+    file = listed(
+        root, {"a": "woodscape.json", "b/c": {"file": "kalibr_ds.yaml", "camera": "cam0"}}
+    )
+    lens = Calibrations(file, root).lens_of(root / "b/c/2.png", size)
+    assert isinstance(lens, Tabulated)
+    theta = torch.linspace(0, 0.95 * camera.theta_max.item(), 20)
+    torch.testing.assert_close(lens.project(theta), camera.project(theta), rtol=1e-4, atol=1e-3)
+    alone = Calibrations(listed(root, {".": "woodscape.json"}), root)
+    assert not isinstance(alone.lens_of(root / "a/0.png", SIZE), Tabulated)
+
+
+def test_a_turned_picture_has_a_turned_lens(root):
+    lens = Calibrations(WOODSCAPE, root).lens_of(root / "a/0.png", SIZE[::-1], 6)
+    same(lens, turned(load(WOODSCAPE).in_picture(SIZE), 6))
+
+
+@pytest.mark.parametrize(
+    ("entries", "message"),
+    [
+        ({}, "is empty"),
+        ({"a": 3}, r'"a" must be a calibration file.*got 3'),
+        ({"a": ["woodscape.json"]}, r'"a" must be a calibration file'),
+        ({"a": {"fil": "woodscape.json"}}, r'"a" must be a calibration file'),
+        ({"a": {"camera": "1"}}, r'"a" must be a calibration file'),
+        ({"a": {"model": "Fish"}}, r'in .*"a".*must be one of'),
+        ({"a": {"model": "Spherical", "xi": 0.5}}, r'in .*"a".*focal'),
+        ({"nowhere": "woodscape.json"}, r'"nowhere" must name a folder or a picture in .*p'),
+        ({"3": "woodscape.json"}, '"3" must name a folder or a picture'),
+        ({"../p/a": "woodscape.json"}, "must name a folder or a picture"),
+        ({"/": "woodscape.json"}, "must name a folder or a picture"),
+        ({"a": "woodscape.json", "a/": "woodscape.json"}, '"a/" is there twice'),
+        ({"a": "none.json"}, r'"a" .*none\.json, which is no file'),
+        ({"a": "."}, "which is no file"),
+        ({"a": {"file": "opencv_stereo.json", "camera": "x"}}, "camera must be one of"),
+        ("[]", "it must be a mapping"),
+        ("3", "calibration"),
+        ("{", "calibration"),
+    ],
+)
+def test_a_wrong_lenses_json_is_named(root, entries, message):
+    with pytest.raises((ValueError, OSError), match=message):
+        Calibrations(listed(root, entries), root)
+
+
+def test_what_has_no_lens(root):
+    lenses = Calibrations(listed(root, {"a": "woodscape.json"}), root)
+    for picture in (root / "b/c/2.png", root.parent / "x.png"):
+        with pytest.raises(ValueError, match=f"has no lens for {picture}: an entry"):
+            lenses.camera_of(picture)
+    with pytest.raises(ValueError, match="no lens for pictures without a file"):
+        lenses.camera_of(None)
+    with pytest.raises(FileNotFoundError):
+        Calibrations(root / "none.json", root)
+    with pytest.raises(ValueError, match="a camera is chosen of one calibration file"):
+        Calibrations(listed(root, {"a": "woodscape.json"}), root, "0")
+
+
+def test_a_picture_of_another_shape_is_named(root):
+    lenses = Calibrations(WOODSCAPE, root)
+    with pytest.raises(ValueError, match=r"0\.png: the lens is of pictures of 966×1280 px.*woods"):
+        lenses.lens_of(root / "a/0.png", (100, 100))
+
+
+def test_terms_that_no_curve_has_are_named(root):
+    tangential = {"model": "KannalaBrandt", "focal": 60.0, "radial": [0.1], "tangential": [0.1, 0]}
+    file = listed(root, {"a": SPHERICAL, "b": dict(tangential, theta_max=1.0)})
+    with pytest.raises(ValueError, match=r'in .*"b": cameras of several lens models'):
+        Calibrations(file, root)

@@ -1,0 +1,82 @@
+"""Frames of video files, against what was written into them and what OpenCV itself reads."""
+
+import cv2
+import numpy as np
+import pytest
+from videos import turn_video, write_video
+
+from darswin.utils.image import BrokenImageError
+from darswin.utils.video import is_video, read_frames
+
+FORMATS = {"a.mp4": "mp4v", "a.avi": "MJPG", "a.mkv": "mp4v"}
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_frames_are_what_was_written(tmp_path, name):
+    written = write_video(tmp_path / name, 30, codec=FORMATS[name])
+    frames = list(read_frames(tmp_path / name))
+    assert [frame.number for frame in frames] == list(range(30))
+    assert [frame.time for frame in frames] == pytest.approx([k / 10 for k in range(30)], abs=1e-6)
+    for frame, pixels in zip(frames, written, strict=True):
+        assert frame.image.dtype == np.uint8 and frame.orientation == 1
+        assert np.abs(frame.image.astype(int) - pixels).mean() < 4  # compressed, but RGB as written
+    (grey, *_) = read_frames(tmp_path / name, channels=1)
+    expected = cv2.cvtColor(frames[0].image, cv2.COLOR_RGB2GRAY)[..., None]
+    assert np.abs(grey.image.astype(int) - expected).max() <= 1
+
+
+def test_every_so_many_frames(tmp_path):
+    write_video(tmp_path / "a.mp4", 10)
+    every = list(read_frames(tmp_path / "a.mp4"))
+    third = list(read_frames(tmp_path / "a.mp4", every=3))
+    assert [frame.number for frame in third] == [0, 3, 6, 9]
+    for frame in third:
+        assert frame.time == every[frame.number].time
+        assert np.array_equal(frame.image, every[frame.number].image)
+
+
+@pytest.mark.parametrize(("degrees", "turns"), [(0, 0), (90, -1), (180, 2), (270, 1)])
+def test_frames_come_upright(tmp_path, degrees, turns):
+    write_video(tmp_path / "stored.mp4", 5)
+    write_video(tmp_path / "turned.mp4", 5)
+    turn_video(tmp_path / "turned.mp4", degrees)
+    for stored, frame in zip(
+        read_frames(tmp_path / "stored.mp4"), read_frames(tmp_path / "turned.mp4"), strict=True
+    ):
+        assert np.array_equal(frame.image, np.rot90(stored.image, turns))
+        assert frame.orientation == {0: 1, 90: 6, 180: 3, 270: 8}[degrees]
+
+
+@pytest.mark.parametrize("name", ["a.avi", "a.mkv"])
+@pytest.mark.parametrize("part", [0.5, 0.7, 0.85])
+def test_a_video_that_is_cut_off(tmp_path, name, part):
+    path = tmp_path / name
+    write_video(path, 40, codec=FORMATS[name])
+    content = path.read_bytes()
+    path.write_bytes(content[: int(len(content) * part)])
+    numbers = []
+    with pytest.raises(BrokenImageError, match=rf"{name} is damaged or cut off: .* of the 4.0 s"):
+        for frame in read_frames(path):
+            numbers.append(frame.number)
+    assert numbers == list(range(len(numbers))) and 0.4 * part < len(numbers) / 40 < part + 0.1
+
+
+def test_what_is_no_video(tmp_path):
+    write_video(tmp_path / "a.mp4", 40)
+    content = (tmp_path / "a.mp4").read_bytes()
+    (tmp_path / "cut.mp4").write_bytes(content[: len(content) // 2])  # its index is at the end
+    (tmp_path / "text.mp4").write_text("no video")
+    (tmp_path / "folder.mp4").mkdir()
+    for name in ("cut.mp4", "text.mp4"):
+        with pytest.raises(BrokenImageError, match=rf"{name}: no video that OpenCV can decode"):
+            next(read_frames(tmp_path / name))
+    for name in ("none.mp4", "folder.mp4"):
+        with pytest.raises(BrokenImageError, match=rf"cannot read .*{name}: no such file"):
+            next(read_frames(tmp_path / name))
+    (tmp_path / "a.mp4").rename(tmp_path / "recording")
+    cv2.imwrite(str(tmp_path / "picture.png"), np.zeros((8, 8, 3), np.uint8))
+    (tmp_path / "picture.png").rename(tmp_path / "picture")
+    (tmp_path / "text").write_text("no video")
+    found = {name: is_video(tmp_path / name) for name in ("recording", "picture", "text", "none")}
+    assert found == {"recording": True, "picture": False, "text": False, "none": False}
+    assert is_video("none.MP4")
