@@ -6,6 +6,7 @@ from darswin.data.calibrations import Calibrations
 from darswin.data.frames import Fit, at_size, lens_at_size
 from darswin.data.samples import Draw, Samples
 from darswin.data.sources import Source
+from darswin.data.turning import turned_picture
 from darswin.lens import Lens
 
 
@@ -38,6 +39,8 @@ class Calibrated(Samples):
         picture, label, orientation = self.source.oriented(draw.picture)
         file, size = self.source.file(draw.picture), (picture.shape[0], picture.shape[1])
         lens = self.calibrations.lens_of(file, size, orientation)
+        if (turn := self._turn(draw)) is not None:
+            picture, lens = turned_picture(picture, lens, turn)
         image, lens = at_size(picture, lens, self.size, self.fit)
         return image, lens, label
 

@@ -10,6 +10,7 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 from darswin.data.sources import Source
+from darswin.data.turning import RandomTurns, Turn
 from darswin.lens import Lens
 from darswin.utils.image import BrokenImageError
 
@@ -22,7 +23,7 @@ Augmentation = Callable[[np.ndarray, np.random.Generator], np.ndarray]
 class Draw(NamedTuple):
     """Which image, and which random numbers: all that a sample depends on.
 
-    `epoch` and `picture` key its augmentation, `epoch` and `lens` its lens.
+    `epoch` and `picture` key its augmentation, `epoch` and `lens` its lens and its turn.
     """
 
     epoch: int
@@ -40,6 +41,7 @@ class Samples(Dataset):
         source: the pictures.
         size: px, H = W of the images.
         mean, std: per channel, in [0, 1]; the image comes out as (pixel/255 - mean) / std.
+        turns: of the images with their lenses; None is none.
         augment: changes the (H, W, C) uint8 image, given it and a random generator.
         erase: changes the normalised (C, H, W) float32 image, likewise.
         seed: of everything random.
@@ -59,6 +61,7 @@ class Samples(Dataset):
         size: int = 64,
         mean: Sequence[float] = IMAGENET_MEAN,
         std: Sequence[float] = IMAGENET_STD,
+        turns: RandomTurns | None = None,
         augment: Augmentation | None = None,
         erase: Augmentation | None = None,
         seed: int = 0,
@@ -67,7 +70,7 @@ class Samples(Dataset):
         self.source, self.size = source, size
         self.mean = np.asarray(mean, np.float32)[:, None, None]
         self.std = np.asarray(std, np.float32)[:, None, None]
-        self.augment, self.erase, self.seed = augment, erase, seed
+        self.turns, self.augment, self.erase, self.seed = turns, augment, erase, seed
         self.skip_broken = skip_broken
         # A DataLoader's workers are forks, and OpenCV's threads do not survive a fork: a worker
         # that waits for them hangs. Images this small gain nothing from them.
@@ -104,6 +107,9 @@ class Samples(Dataset):
 
     def _random(self, epoch: int, key: int, purpose: int) -> np.random.Generator:
         return np.random.default_rng((self.seed, epoch, key, purpose))
+
+    def _turn(self, draw: Draw) -> Turn | None:
+        return self.turns.draw(self._random(draw.epoch, draw.lens, 2)) if self.turns else None
 
     def _seen(self, draw: Draw) -> tuple[np.ndarray, Lens, int]:
         """The image (size, size, C) uint8 of a draw before augmentation, its lens and its label."""

@@ -12,6 +12,7 @@ from torch import Tensor
 from darswin.data.lenses import LensDistribution
 from darswin.data.samples import Draw, Samples
 from darswin.data.sources import Source
+from darswin.data.turning import Turn
 from darswin.data.warp import remap
 from darswin.lens import Lens, Perspective
 from darswin.lens.reprojection import OUTSIDE, radial_reprojection
@@ -52,7 +53,7 @@ class WideAngle(Samples):
         fit: how a picture becomes a square: "crop" cuts its longer side, "stretch" squashes it, as
             the authors' code does.
         picture_size: px, the width that larger pictures are reduced to before they are warped.
-        options: mean, std, augment, erase, seed and skip_broken, as `Samples`.
+        options: mean, std, turns, augment, erase, seed and skip_broken, as `Samples`.
 
     Raises:
         ValueError: sizes or angles out of range.
@@ -86,20 +87,22 @@ class WideAngle(Samples):
     def _seen(self, draw: Draw) -> tuple[np.ndarray, Lens, int]:
         picture, label = self.source[draw.picture]
         lens = self._lens_alone(draw)
-        return self.through(lens, picture), lens, label
+        # The lens is round and in the middle: a turn leaves it as it is.
+        return self.through(lens, picture, self._turn(draw)), lens, label
 
     def _lens_alone(self, draw: Draw) -> Lens:
         return self.lenses.draw(self._random(draw.epoch, draw.lens, 1), self.fov, self.size / 2)
 
-    def through(self, lens: Lens, picture: np.ndarray) -> np.ndarray:
-        """The picture (H, W, C) uint8 through a lens of this data set → (size, size, C) uint8."""
+    def through(self, lens: Lens, picture: np.ndarray, turn: Turn | None = None) -> np.ndarray:
+        """The picture (H, W, C) uint8 through a lens of this data set, turned if there is a turn
+        → (size, size, C) uint8."""
         picture = self._square(picture)
-        image = remap(picture, self._map(lens, picture.shape[0]))
+        image = remap(picture, self._map(lens, picture.shape[0], turn))
         if self.render != self.size:
             image = cv2.resize(image, (self.size, self.size), interpolation=cv2.INTER_AREA)
         return image.reshape(self.size, self.size, -1)
 
-    def _map(self, lens: Lens, side: int) -> np.ndarray:
+    def _map(self, lens: Lens, side: int, turn: Turn | None = None) -> np.ndarray:
         """(render, render, 2): where in a picture of `side` px each pixel of the lens's image lies.
 
         An image has an eighth as many radii as pixels, and only radii need the lens's curve.
@@ -107,6 +110,8 @@ class WideAngle(Samples):
         radii, place, offset = _rays(self.render)
         large = lens.resized(self.render / self.size)
         ratio = radial_reprojection(_camera(self.fov, side), large, radii)[0].numpy()[place]
+        if turn is not None:
+            offset = offset @ turn.matrix.astype(np.float32)
         places = offset * ratio[..., None] + np.float32((side - 1) / 2)
         return np.fmax(places, np.float32(OUTSIDE), out=places)  # NaN becomes OUTSIDE
 

@@ -1,7 +1,12 @@
-"""The lens of a picture that was turned upright, as its EXIF orientation says.
+"""The lens of a picture that was turned: upright, as its EXIF orientation says, or by any angle.
 
 A calibration is of pixels as the camera stores them; pictures are read upright.
 """
+
+import math
+
+import torch
+from torch import Tensor
 
 from darswin.lens.base import Lens
 from darswin.utils.exif import TURNS
@@ -60,3 +65,31 @@ def turned(lens: Lens, orientation: int) -> Lens:
     if lens.affine is not None:
         changed["affine"] = turn @ lens.affine @ turn.T
     return lens.replace(**changed, **lens._turned(turn))
+
+
+def rotated(lens: Lens, angle: float) -> tuple[Lens, Tensor]:
+    """The lens of a camera that was turned about its optical axis; exact for every model.
+
+    A ray at (θ, φ) is then at (θ, φ + angle), and the picture moves by an affine map around the
+    principal point: a rotation, or where pixels are oblong what looks like one through the lens.
+
+    Args:
+        lens: one lens, with an image_size or a center. angle: rad, from x to y.
+
+    Returns:
+        The lens, which is the same unless it has tangential or thin-prism terms; and (2, 3)
+        float64: what takes a pixel (x, y, 1) to its new place, as of `cv2.warpAffine`.
+
+    Raises:
+        ValueError: several lenses, or one with neither an image_size nor a center.
+    """
+    if len(lens) != 1:
+        raise ValueError(f"rotated takes one lens, got {len(lens)}")
+    cos, sin = math.cos(angle), math.sin(angle)
+    turn = torch.tensor([[cos, -sin], [sin, cos]], dtype=torch.float64)
+    center, moves = lens.center_in()[0].detach().double(), turn
+    if lens.affine is not None:
+        affine = lens.affine[0].detach().double()
+        moves = affine @ turn @ torch.linalg.inv(affine)
+    matrix = torch.cat((moves, (center - moves @ center)[:, None]), 1)
+    return lens.replace(**lens._turned(turn.to(lens.theta_max))), matrix.cpu()

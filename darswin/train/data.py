@@ -18,6 +18,7 @@ from darswin.data.samples import IMAGENET_MEAN, IMAGENET_STD, Samples
 from darswin.data.sampling import EveryNth, ResumableLoader, TrainingOrder
 from darswin.data.sources import Part, Source
 from darswin.data.splits import Split
+from darswin.data.turning import RandomTurns
 from darswin.data.wide_angle import PAPER_FOV, WideAngle
 from darswin.train.stopping import ignore_signals
 
@@ -51,6 +52,10 @@ class WideAngleData(LightningDataModule):
         limit: at most so many pictures of each split.
         batch_size: of one process.
         workers: processes that read and warp; 0 does it in the training process.
+        flip: mirrors half of the images in training, and their lenses with them.
+        rotate_deg: turns images about the optical axis in training, and their lenses with them, by
+            an angle uniform in ± so many degrees; 180 is any. What turns in from beyond a picture
+            is black.
         randaugment: changes colours in training.
         erasing: how often a box of an image is erased in training.
         pair_lenses: gives both images of a mixture the same lens, so that the mixture is an image
@@ -83,6 +88,8 @@ class WideAngleData(LightningDataModule):
         limit: int | None = None,
         batch_size: int = 128,
         workers: int = 1,
+        flip: bool = False,
+        rotate_deg: float = 0.0,
         randaugment: bool = True,
         erasing: float = 0.25,
         pair_lenses: bool = True,
@@ -121,6 +128,7 @@ class WideAngleData(LightningDataModule):
             WideAngle, render=render, fov=math.radians(fov_deg), picture_size=picture_size
         )
         self.limit, self.batch_size, self.workers = limit, batch_size, workers
+        self.turns = RandomTurns(flip, rotate_deg) if flip or rotate_deg else None
         self.randaugment, self.erasing = randaugment, erasing
         self.pair_lenses, self.seed = pair_lenses, seed
         self._sources: dict[str, Source] = {}
@@ -180,6 +188,7 @@ class WideAngleData(LightningDataModule):
     def train_dataloader(self) -> ResumableLoader:
         dataset = self.dataset(
             "train",
+            turns=self.turns,
             augment=RandAugment() if self.randaugment else None,
             erase=RandomErasing(self.erasing) if self.erasing else None,
         )

@@ -16,6 +16,7 @@ CHANGEABLE = {
     *("data.batch_size", "data.workers"),
     *("data.train_lenses", "data.test_lenses", "data.pair_lenses"),
     *("data.render", "data.fit", "data.picture_size", "data.randaugment", "data.erasing"),
+    *("data.flip", "data.rotate_deg"),
 }
 
 

@@ -11,7 +11,7 @@ from darswin.cli import lens as cli
 from darswin.lens import MODELS, BrownConrady, Equidistant, Fisheye624, KannalaBrandt, Mei, save
 from darswin.lens.base import Lens
 from darswin.lens.distorted import DistortedLens
-from darswin.lens.orientation import in_upright_picture, stored_size, turned
+from darswin.lens.orientation import in_upright_picture, rotated, stored_size, turned
 
 f64 = torch.float64
 SIZE = (5, 7)
@@ -103,3 +103,20 @@ def test_a_calibration_fits_the_stored_picture_or_else_the_upright_one():
         turned(lens, 9)
     with pytest.raises(ValueError, match="needs an image_size"):
         turned(Equidistant(20.0), 6)
+
+
+@given(lenses, st.floats(-3.2, 3.2), st.floats(0.01, 1.1), st.floats(-3.1, 3.1))
+def test_a_ray_lands_where_its_pixel_was_turned_to(lens, angle, theta, azimuth):
+    after, matrix = rotated(lens, angle)
+    before = lens.project_rays(theta, azimuth)
+    place = before @ matrix[:, :2].T + matrix[:, 2]
+    torch.testing.assert_close(after.project_rays(theta, azimuth + angle), place)
+    if lens.affine is None:  # lengths are kept
+        torch.testing.assert_close(matrix[:, :2] @ matrix[:, :2].T, torch.eye(2, dtype=f64))
+
+
+def test_rotated_takes_one_lens_that_knows_its_middle():
+    with pytest.raises(ValueError, match="takes one lens, got 2"):
+        rotated(Equidistant([9.0, 8.0], image_size=SIZE), 0.1)
+    with pytest.raises(ValueError, match="image_size"):
+        rotated(Equidistant(9.0), 0.1)

@@ -28,6 +28,7 @@ def tiny(data):
         *("--data.batch_size", "8", "--data.workers", "0", "--checkpoint_steps", "1"),
         *("--trainer.max_epochs", "2", "--trainer.enable_progress_bar", "false"),
         *("--trainer.enable_model_summary", "false", "--data.randaugment", "true"),
+        *("--data.flip", "true", "--data.rotate_deg", "180"),
         *("--model.options", "{embed_dim: 8, depths: [1, 1, 1]}", "--model.mixup", "0.8"),
     ]
 
