@@ -5,10 +5,10 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/installed
 
-.PHONY: help build demo test test-lowest test-isa test-asan fuzz kills lint format bench study learned-lens tables docs dist clean
+.PHONY: help build demo test test-lowest test-isa test-asan fuzz kills lint format bench study learned-lens tables docs dist wheels repair published-wheels test-torch clean
 
 help:  ## this list
-	@grep -E '^[a-z-]+:.*##' Makefile | sed -E 's/:.*## /\t/' | expand -t 12
+	@grep -E '^[a-z-]+:.*##' Makefile | sed -E 's/:.*## /\t/' | expand -t 18
 
 $(STAMP): requirements.txt pyproject.toml setup.py
 	$(PYTHON) -m venv $(VENV)
@@ -16,7 +16,7 @@ $(STAMP): requirements.txt pyproject.toml setup.py
 	PATH=$(CURDIR)/$(BIN):$$PATH $(BIN)/pip install -q --no-build-isolation --no-deps -e .
 	@touch $@
 
-build: $(STAMP)  ## (re)build darswin._C in place
+build: $(STAMP)  ## (re)build darswin/libdarswin.so in place
 	@PATH=$(CURDIR)/$(BIN):$$PATH $(BIN)/python setup.py -q build_ext --inplace
 
 demo: build  ## train on nearly undistorted digits, test through any fisheye, draw it (2 minutes)
@@ -40,7 +40,7 @@ test-lowest: build $(LOWEST)/installed  ## the commands, files, pictures and ONN
 	  tests/deploy/test_export.py -k "not program and not package"
 
 test-isa: build  ## the operators' tests on every instruction-set tier of this machine
-	@set -e; for tier in $$($(BIN)/python -c 'from darswin import _C; print(*_C.tiers())'); do \
+	@set -e; for tier in $$($(BIN)/python -c 'from darswin.ops import _module; print(*_module.tiers())'); do \
 	  echo "== $$tier"; \
 	  ATEN_CPU_CAPABILITY=$$(echo $$tier | sed s/generic/default/) \
 	    $(BIN)/python -m pytest -q tests/ops \
@@ -56,7 +56,7 @@ test-asan: build  ## the operators' tests on every tier under AddressSanitizer a
 	@rm -rf $(SANITIZED)/darswin
 	@PATH=$(CURDIR)/$(BIN):$$PATH DARSWIN_SANITIZE=address,undefined \
 	  $(BIN)/python setup.py -q build --build-lib $(SANITIZED)
-	@set -e; tiers=$$($(BIN)/python -c 'from darswin import _C; print(*_C.tiers())'); \
+	@set -e; tiers=$$($(BIN)/python -c 'from darswin.ops import _module; print(*_module.tiers())'); \
 	cd $(SANITIZED); for tier in $$tiers; do \
 	  echo "== $$tier, sanitized"; \
 	  LD_PRELOAD="$(PRELOAD)" ASAN_OPTIONS=detect_leaks=0:allocator_may_return_null=1 \
@@ -104,5 +104,34 @@ docs: build  ## the site of docs/, in build/docs; warnings are errors
 dist: $(STAMP)  ## sdist and wheel in dist/
 	PATH=$(CURDIR)/$(BIN):$$PATH $(BIN)/python -m build --no-isolation --outdir dist
 
+# One wheel of a platform serves every Python. It shares its libraries with torch, which is imported
+# first. What is published is made by cibuildwheel, which runs `repair` and tests/installed.py too.
+wheels: $(STAMP)  ## the manylinux_2_28 wheel in dist/, tested in a fresh environment
+	rm -rf build/wheel
+	PATH=$(CURDIR)/$(BIN):$$PATH $(BIN)/python -m build --no-isolation --wheel --outdir build/wheel
+	PATH=$(CURDIR)/$(BIN):$$PATH $(MAKE) repair WHEEL="$$(echo build/wheel/*.whl)"
+	$(MAKE) test-torch
+
+DEST := dist
+repair:
+	auditwheel repair --plat manylinux_2_28_$$(uname -m) --only-plat --wheel-dir "$(DEST)" \
+	  --exclude 'libtorch*' --exclude 'libc10*' --exclude 'libgomp*' "$(WHEEL)"
+
+published-wheels: $(STAMP)  ## the same in the manylinux_2_28 container, by cibuildwheel: needs Docker
+	$(BIN)/cibuildwheel --output-dir dist
+
+# The versions of torch that the wheel of `make wheels` is tested under, a fresh environment each.
+TORCH := $(shell sed -n 's/^torch==//p' requirements.txt)
+SCRATCH := build/scratch
+
+test-torch:  ## the wheel under TORCH="2.10.0 2.11.0 …", on PYTHON; gigabytes of downloads each
+	@set -e; for version in $(TORCH); do \
+	  echo "== torch $$version on $(PYTHON)"; \
+	  $(PYTHON) -m venv --clear $(SCRATCH); \
+	  $(SCRATCH)/bin/pip install -q torch==$$version dist/darswin-*-manylinux_2_28_$$(uname -m).whl \
+	    $$(grep -E '^(hypothesis|pytest)==' requirements.txt); \
+	  $(SCRATCH)/bin/python tests/installed.py; \
+	done
+
 clean:  ## remove what was built
-	rm -rf build dist darswin.egg-info darswin/_C*.so
+	rm -rf build dist darswin.egg-info darswin/libdarswin.so

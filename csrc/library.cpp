@@ -1,10 +1,8 @@
-// Table of contents of darswin._C: the operators' schemas, and the module's build facts.
+// Table of contents of libdarswin.so: the operators' schemas, and the module's build facts.
 // The CPU implementations are registered in their drivers; fake kernels and autograd are in
 // darswin/ops.
-#include <pybind11/pybind11.h>
 #include <torch/csrc/stable/library.h>
 
-#include <stdexcept>
 #include <string>
 
 #include "dispatch.h"
@@ -35,42 +33,31 @@ STABLE_TORCH_LIBRARY(darswin, m) {
   m.def("_transpose_sum(Tensor x) -> (Tensor, Tensor)");
 }
 
-PYBIND11_MODULE(_C, m) {
-  m.doc() = "Compiled operators of darswin and the instruction-set tier they run on.";
-  m.def(
-      "tier", [] { return std::string(darswin::tier_name(darswin::current_tier())); },
-      "The instruction-set tier in use: 'generic', 'avx2' or 'avx512'.");
-  m.def(
-      "tiers",
-      [] {
-        pybind11::list available;
-        for (const darswin::Tier tier : darswin::available_tiers()) {
-          available.append(darswin::tier_name(tier));
-        }
-        return available;
-      },
-      "The tiers that this CPU and this build offer, from low to high.");
-  m.def(
-      "set_tier",
-      [](const std::string& tier) {
-        if (!darswin::set_tier(tier.c_str())) {
-          throw pybind11::value_error(
-              "tier must be one that this CPU and build offer (best: '" +
-              std::string(darswin::tier_name(darswin::available_tiers().back())) + "'), got '" +
-              tier + "'");
-        }
-      },
-      pybind11::arg("tier"),
-      "Runs the operators on another tier from now on. Raises ValueError if the CPU lacks it.");
-  m.def(
-      "build_info",
-      [] {
-        pybind11::dict info;
-        info["compiler"] = "g++ " __VERSION__;
-        info["cxx_standard"] = static_cast<int64_t>(__cplusplus);
-        info["openmp"] = _OPENMP;
-        info["torch_abi"] = "stable, torch>=2.10";
-        return info;
-      },
-      "What this module was built with.");
+// The module's facts, which darswin/ops/_module.py reads.
+#define FACT extern "C" __attribute__((visibility("default")))
+
+// The instruction-set tier in use.
+FACT const char* darswin_tier() { return darswin::tier_name(darswin::current_tier()); }
+
+// The tiers that this CPU and this build offer, from low to high, each with a space behind it.
+FACT const char* darswin_tiers() {
+  static const std::string names = [] {
+    std::string joined;
+    for (const darswin::Tier tier : darswin::available_tiers()) {
+      joined.append(darswin::tier_name(tier)).push_back(' ');
+    }
+    return joined;
+  }();
+  return names.c_str();
+}
+
+// Runs the operators on another tier from now on; false where it is not offered.
+FACT bool darswin_set_tier(const char* name) { return darswin::set_tier(name); }
+
+// What this module was built with, as JSON.
+FACT const char* darswin_build_info() {
+  static const std::string info =
+      R"({"compiler": "g++ )" __VERSION__ R"(", "cxx_standard": )" + std::to_string(__cplusplus) +
+      R"(, "openmp": )" + std::to_string(_OPENMP) + R"(, "torch_abi": "stable, torch>=2.10"})";
+  return info.c_str();
 }

@@ -4,8 +4,7 @@ import hypothesis
 import pytest
 import torch
 
-from darswin import _C
-from darswin.ops import cpu_capability
+from darswin.ops import _module, cpu_capability
 
 # Properties: the same few cases in each `make test`; `make fuzz` draws new ones.
 _common = dict(deadline=None, database=None, suppress_health_check=list(hypothesis.HealthCheck))
@@ -16,7 +15,7 @@ hypothesis.settings.load_profile("test")
 
 def pytest_report_header(config):
     return (
-        f"darswin: tier {cpu_capability()} of {_C.tiers()}, ATEN_CPU_CAPABILITY="
+        f"darswin: tier {cpu_capability()} of {_module.tiers()}, ATEN_CPU_CAPABILITY="
         f"{os.environ.get('ATEN_CPU_CAPABILITY', '')!r}, torch {torch.__version__}, "
         f"{torch.get_num_threads()} threads"
     )

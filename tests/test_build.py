@@ -6,7 +6,7 @@ import re
 import shlex
 import subprocess
 import sys
-import sysconfig
+import zipfile
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -14,15 +14,14 @@ import pytest
 import torch
 from torch_abi_audit import inspect_extension
 
-from darswin import _C
-from darswin.ops import _library, cpu_capability, polar_sample
+from darswin.ops import _module, cpu_capability, polar_sample
 
 ROOT = Path(__file__).parent.parent
-BUILD = ROOT / "build" / f"cmake-{sysconfig.get_config_var('SOABI')}"
+BUILD = ROOT / "build" / "cmake"
 
 
 def test_the_tier_in_use_is_the_one_asked_for():
-    asked = os.environ.get("ATEN_CPU_CAPABILITY", _C.tiers()[-1])
+    asked = os.environ.get("ATEN_CPU_CAPABILITY", _module.tiers()[-1])
     assert cpu_capability() == {"default": "generic"}.get(asked, asked)
 
 
@@ -30,9 +29,9 @@ def test_tiers_of_this_machine():
     capability = torch.backends.cpu.get_cpu_capability()
     expected = {"DEFAULT": 1, "AVX2": 2, "AVX512": 3}.get(capability, 1)
     if "ATEN_CPU_CAPABILITY" in os.environ:
-        assert len(_C.tiers()) >= expected
+        assert len(_module.tiers()) >= expected
     else:
-        assert len(_C.tiers()) == expected
+        assert len(_module.tiers()) == expected
 
 
 @pytest.mark.parametrize(
@@ -45,8 +44,8 @@ def test_environment_chooses_the_tier_at_load(asked, expected):
     done = subprocess.run(
         [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True
     )
-    best = _C.tiers()[-1]
-    assert done.stdout.strip() == (expected if expected in _C.tiers() else best)
+    best = _module.tiers()[-1]
+    assert done.stdout.strip() == (expected if expected in _module.tiers() else best)
 
 
 def test_tiers_can_be_forced_and_agree():
@@ -55,20 +54,20 @@ def test_tiers_can_be_forced_and_agree():
     azimuths, center = torch.linspace(0, 6, 48), torch.tensor([[19.5, 19.5]])
     results = []
     try:
-        for tier in _C.tiers():
-            _C.set_tier(tier)
+        for tier in _module.tiers():
+            _module.set_tier(tier)
             assert cpu_capability() == tier
             results.append(polar_sample(image, radii, azimuths, center, samples=(4, 4), jitter=0.5))
     finally:
-        _C.set_tier(before)
+        _module.set_tier(before)
     for other in results[1:]:
         torch.testing.assert_close(other, results[0], rtol=1e-5, atol=1e-5)
     with pytest.raises(ValueError, match=r"tier must be one that .* got 'sse9'"):
-        _C.set_tier("sse9")
+        _module.set_tier("sse9")
 
 
 def test_build_info():
-    info = _C.build_info()
+    info = _module.build_info()
     assert info["cxx_standard"] >= 202002 and info["openmp"] >= 201511
     assert "stable" in info["torch_abi"]
 
@@ -84,7 +83,7 @@ def test_no_inline_function_leaks_from_a_tier(debug, tmp_path):
     sources = {command["file"] for command in kernels}
     assert sources == set(map(str, (ROOT / "csrc" / "kernels").glob("*.cpp")))
     tiers = set(re.findall(r"/kernels_(\w+)\.dir/", " ".join(c["output"] for c in kernels)))
-    assert tiers >= set(_C.tiers()) and len(kernels) == len(tiers) * len(sources)
+    assert tiers >= set(_module.tiers()) and len(kernels) == len(tiers) * len(sources)
 
     def compiled(command: dict) -> Path:
         if not debug:
@@ -111,19 +110,19 @@ def test_no_inline_function_leaks_from_a_tier(debug, tmp_path):
 
 
 def test_the_module_keeps_to_the_stable_abi_of_torch_2_10():
-    torch_abi = inspect_extension(Path(_C.__file__)).torch
+    torch_abi = inspect_extension(_module.FILE).torch
     assert torch_abi.uses_torch and torch_abi.stable, torch_abi.unstable_symbols
     assert torch_abi.min_torch_version == "2.10.0" and not torch_abi.unknown_shim_symbols
 
 
 def test_the_module_holds_no_path_of_the_build_machine():
-    module = Path(_C.__file__).read_bytes()
+    module = _module.FILE.read_bytes()
     sources = re.findall(rb"[\w./+-]+\.(?:h|hpp|cpp)\b", module)
     assert sources and not [name for name in sources if name.startswith(b"/")]
     for folder in (ROOT, Path(torch.__file__).parent, sys.prefix, sys.base_prefix):
         assert str(folder).encode() not in module
     dynamic = subprocess.run(
-        ["readelf", "-d", _C.__file__], capture_output=True, text=True, check=True
+        ["readelf", "-d", _module.FILE], capture_output=True, text=True, check=True
     ).stdout
     assert "RPATH" not in dynamic and "RUNPATH" not in dynamic
     needed = [line for line in dynamic.splitlines() if "NEEDED" in line]
@@ -131,14 +130,38 @@ def test_the_module_holds_no_path_of_the_build_machine():
     assert not any("/" in line.split("[")[1] for line in needed)
 
 
-def test_a_missing_module_is_explained(monkeypatch):
-    monkeypatch.setitem(sys.modules, "darswin._C", None)
+def test_the_module_exports_its_facts_only():
+    shown = subprocess.run(
+        ["nm", "-D", "--defined-only", _module.FILE], capture_output=True, text=True, check=True
+    )
+    exported = {line.split()[-1] for line in shown.stdout.splitlines()}
+    facts = {"darswin_tier", "darswin_tiers", "darswin_set_tier", "darswin_build_info"}
+    assert exported == facts
+
+
+def test_the_module_asks_for_nothing_newer_than_manylinux_2_28():
+    major = int(re.search(r"g\+\+ (\d+)", _module.build_info()["compiler"])[1])
+    if major > 12:
+        pytest.skip("headers of a newer compiler may ask for more: use the container")
+    newest = {"GLIBC": (2, 28), "GLIBCXX": (3, 4, 24), "CXXABI": (1, 3, 11)}
+    shown = subprocess.run(
+        ["readelf", "-V", _module.FILE], capture_output=True, text=True, check=True
+    )
+    found = re.findall(r"Name: (GLIBC|GLIBCXX|CXXABI)_([\d.]+)", shown.stdout)
+    assert {library for library, _ in found} == set(newest)
+    for library, version in found:
+        assert tuple(map(int, version.split("."))) <= newest[library], f"{library}_{version}"
+
+
+def test_a_missing_module_is_explained(monkeypatch, tmp_path):
+    monkeypatch.setattr(_module, "FILE", tmp_path / "libdarswin.so")
     with pytest.raises(ImportError) as caught:
-        _library.load_extension()
+        _module.load()
     message = str(caught.value)
-    assert "darswin/_C" in message and torch.__version__ in message and "torch>=2.10" in message
+    assert f"{_module.FILE}: cannot open" in message
+    assert torch.__version__ in message and "torch>=2.10" in message
     assert "make build" in message and "pip install" in message
-    assert isinstance(caught.value.__cause__, ImportError)
+    assert isinstance(caught.value.__cause__, OSError)
 
 
 def test_a_broken_module_names_its_file(tmp_path):
@@ -146,8 +169,7 @@ def test_a_broken_module_names_its_file(tmp_path):
     package.mkdir()
     for name in ("__init__.py", "ops"):
         (package / name).symlink_to(ROOT / "darswin" / name)
-    suffix = sysconfig.get_config_var("EXT_SUFFIX")
-    (package / f"_C{suffix}").write_bytes(b"not a library")
+    (package / "libdarswin.so").write_bytes(b"not a library")
     code = "import darswin.ops"
     (package / "__init__.py").unlink()
     (package / "__init__.py").write_text("")
@@ -155,7 +177,7 @@ def test_a_broken_module_names_its_file(tmp_path):
         [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True
     )
     assert done.returncode != 0
-    assert f"_C{suffix}" in done.stderr and "make build" in done.stderr
+    assert "libdarswin.so: file too short" in done.stderr and "make build" in done.stderr
 
 
 def test_the_sdist_builds_a_wheel_that_runs_from_another_folder(tmp_path):
@@ -170,11 +192,14 @@ def test_the_sdist_builds_a_wheel_that_runs_from_another_folder(tmp_path):
 
     # `build` makes the wheel from the unpacked sdist, not from the checkout.
     python("-m", "build", "--no-isolation", "--outdir", tmp_path, ROOT, env=environment)
-    (wheel,) = tmp_path.glob("*.whl")
+    (wheel,) = tmp_path.glob("darswin-*-py3-none-linux_*.whl")
+    names = zipfile.ZipFile(wheel).namelist()
+    assert [name for name in names if name.endswith(".so")] == ["darswin/libdarswin.so"]
+    assert all(name.startswith(("darswin/", "darswin-")) for name in names)
     elsewhere = tmp_path / "site"
     python("-m", "pip", "install", "-q", "--no-deps", "--target", elsewhere, wheel)
     code = (
-        "import torch, darswin; print(darswin.__file__, darswin.ops._library.load_extension());"
+        "import torch, darswin; print(darswin.__file__, darswin.ops._module.FILE);"
         "lens = darswin.lens.Spherical.from_fov(0.4, 2.6, 16.0);"
         "model = darswin.create_model('darswin_a_nano', num_classes=3);"
         "print(model(torch.zeros(1, 3, 32, 32), lens).shape)"

@@ -4,6 +4,14 @@
 
 #include "simd.h"
 
+// The exp that glibc has had from the start: the one of 2.29 computes the same and reports errors
+// in another way, and manylinux_2_28 lacks it (see portable.cpp).
+#if defined(__GLIBC__) && defined(__x86_64__)
+__asm__(".symver exp, exp@GLIBC_2.2.5");
+#elif defined(__GLIBC__) && defined(__aarch64__)
+__asm__(".symver exp, exp@GLIBC_2.17");
+#endif
+
 namespace darswin {
 namespace {
 

@@ -11,10 +11,8 @@ from typing import TypeVar
 
 import torch
 
-from darswin.ops import cpu_capability
-from darswin.ops._library import load_extension
+from darswin.ops import _module, cpu_capability
 
-_C = load_extension()
 T = TypeVar("T")
 THREADS = sorted({1, torch.get_num_threads()})  # to measure at: one and all
 
@@ -25,7 +23,7 @@ def machine() -> dict[str, str | int]:
         cpu=_cpu(),
         cores=max(THREADS),
         tier=cpu_capability(),
-        compiler=_C.build_info()["compiler"],
+        compiler=_module.build_info()["compiler"],
         python=platform.python_version(),
         torch=torch.__version__,
         darswin=version("darswin"),
@@ -35,16 +33,17 @@ def machine() -> dict[str, str | int]:
 
 def on_other_tiers(run: Callable[[], T]) -> dict[str, Callable[[], T]]:
     """`run` with our operators on each other instruction-set tier of this machine, by its name."""
-    return {tier: partial(_on_tier, tier, run) for tier in _C.tiers() if tier != cpu_capability()}
+    others = (tier for tier in _module.tiers() if tier != cpu_capability())
+    return {tier: partial(_on_tier, tier, run) for tier in others}
 
 
 def _on_tier(tier: str, run: Callable[[], T]) -> T:
     best = cpu_capability()
-    _C.set_tier(tier)
+    _module.set_tier(tier)
     try:
         return run()
     finally:
-        _C.set_tier(best)
+        _module.set_tier(best)
 
 
 @contextlib.contextmanager

@@ -7,7 +7,7 @@ import torch
 
 from darswin.bench.machine import machine
 from darswin.layers import onednn
-from darswin.ops._library import load_extension
+from darswin.ops import _module
 from darswin.utils.extras import lack
 
 EXTRAS = ("demo", "onnx", "train")
@@ -29,7 +29,7 @@ def info() -> dict[str, str]:
         "torch": str(here["torch"]),
         "python": f"{here['python']}, {platform.platform()}",
         "CPU": f"{here['cpu']}, {torch.get_num_threads()} threads",
-        "tier": f"{here['tier']}, of {', '.join(load_extension().tiers())}",
+        "tier": f"{here['tier']}, of {', '.join(_module.tiers())}",
     }
     for dtype in (torch.float32, torch.bfloat16):
         reason = onednn.missing(dtype)

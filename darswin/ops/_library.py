@@ -1,29 +1,16 @@
-"""Loads the compiled module, and decides between it and the PyTorch reference."""
+"""Decides between the compiled operators and their PyTorch reference."""
 
 import contextlib
-import importlib
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
-import torch  # before the module: both must share the libgomp that torch loads
+import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 
+from darswin.ops import _module
+
 _reference = False
-
-
-def load_extension():
-    """Imports `darswin._C`; its ImportError says what was tried and how to rebuild."""
-    try:
-        return importlib.import_module("darswin._C")
-    except ImportError as error:
-        file = error.path or "darswin/_C.*.so (not found)"
-        raise ImportError(
-            f"cannot load the compiled module of darswin, {file}: {error}. It is built on "
-            f"libtorch's stable ABI for torch>=2.10; torch {torch.__version__} is running. "
-            "Rebuild it with `pip install --no-build-isolation --force-reinstall --no-deps darswin`"
-            ", or in a checkout with `make build`."
-        ) from error
 
 
 def cpu_capability() -> str:
@@ -32,7 +19,7 @@ def cpu_capability() -> str:
     It is the best one of this CPU; ATEN_CPU_CAPABILITY (default, avx2, avx512) lowers it, as it
     does in torch.
     """
-    return load_extension().tier()
+    return _module.tier()
 
 
 @contextlib.contextmanager
@@ -155,6 +142,3 @@ def no_second_derivative(name: str) -> None:
         )
 
     torch.library.register_autograd(f"{name}_backward", raise_error)
-
-
-load_extension()

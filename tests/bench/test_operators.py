@@ -1,11 +1,10 @@
 import pytest
 import torch
 
-from darswin import _C
 from darswin.bench import operators
 from darswin.bench.record import Record
 from darswin.bench.timing import OURS, Case
-from darswin.ops import cpu_capability
+from darswin.ops import _module, cpu_capability
 
 
 def case(mode="forward"):
@@ -30,10 +29,10 @@ def test_ours_is_timed_on_every_tier(mode):
     found = operators.compare(
         case(mode), {OURS: ours, "peer": double}, INPUTS, 1e-4, targets=dict(peer=3.0)
     )
-    others = [f"{OURS} ({tier})" for tier in _C.tiers() if tier != best]
+    others = [f"{OURS} ({tier})" for tier in _module.tiers() if tier != best]
     assert [t.name for t in found] == [OURS, "peer", *others]
     assert [t.target for t in found[:2]] == [None, 3.0]
-    assert seen == set(_C.tiers()) and cpu_capability() == best
+    assert seen == set(_module.tiers()) and cpu_capability() == best
 
 
 @pytest.mark.parametrize("mode", ["forward", "forward+backward"])

@@ -7,9 +7,10 @@ import sys
 import pytest
 import torch
 
-from darswin import _C, create_model
+from darswin import create_model
 from darswin.deploy.export import export_onnx, export_program
 from darswin.lens import Polynomial, Spherical
+from darswin.ops import _module
 
 SPHERICAL = Spherical.from_fov([0.2, 0.9], 2.6, 16.0)
 # θ_max = 115°.
@@ -95,7 +96,7 @@ def test_package_in_a_process_without_the_package(tmp_path):
         with torch.no_grad():
             calls[name] = (images, tensors, model(images, Spherical(**tensors)))
     torch.save(calls, tmp_path / "calls.pt")
-    command = [sys.executable, "-c", ELSEWHERE, _C.__file__]
+    command = [sys.executable, "-c", ELSEWHERE, _module.FILE]
     run = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
     assert run.returncode == 0, run.stderr
 

@@ -6,8 +6,7 @@ import torch
 import torch.nn.functional as F
 from helpers import assert_accurate, assert_equals_reference, with_gradients
 
-from darswin import _C
-from darswin.ops import cpu_capability, polar_sample, reference_in_use, use_reference
+from darswin.ops import _module, cpu_capability, polar_sample, reference_in_use, use_reference
 from darswin.ops.reference import philox
 
 LAYOUTS = ("tokens", "image")
@@ -681,12 +680,12 @@ def test_jitter_is_the_same_on_every_path_and_tier(columns):
     image, radii, center, azimuths = make_inputs(rows=9, columns=columns - 1)
     results = []
     best = cpu_capability()
-    for tier in _C.tiers():
-        _C.set_tier(tier)
+    for tier in _module.tiers():
+        _module.set_tier(tier)
         results.append(
             polar_sample(image, radii, azimuths, center, samples=(3, 1), jitter=1.0, seed=5)
         )
-    _C.set_tier(best)
+    _module.set_tier(best)
     with use_reference():
         results.append(
             polar_sample(image, radii, azimuths, center, samples=(3, 1), jitter=1.0, seed=5)

@@ -1,0 +1,58 @@
+"""The compiled module, `libdarswin.so`: loads its operators into torch, and asks for its facts.
+
+It holds nothing of Python, so that one file serves every version; its facts are C functions.
+"""
+
+import ctypes
+import json
+from pathlib import Path
+
+import torch  # before the module: both must share the libgomp that torch loads
+
+FILE = Path(__file__).parent.parent / "libdarswin.so"
+
+
+def load() -> ctypes.CDLL:
+    """Loads `FILE`; its ImportError says what was tried and how to rebuild."""
+    try:
+        torch.ops.load_library(FILE)
+    except OSError as error:
+        reason = error.__cause__ or error  # torch's own error only names the file
+        raise ImportError(
+            f"cannot load the compiled module of darswin, {FILE}: {reason}. It is built on "
+            f"libtorch's stable ABI for torch>=2.10; torch {torch.__version__} is running. "
+            "Rebuild it with `pip install --no-build-isolation --force-reinstall --no-deps darswin`"
+            ", or in a checkout with `make build`."
+        ) from error
+    module = ctypes.CDLL(str(FILE))
+    for function in (module.darswin_tier, module.darswin_tiers, module.darswin_build_info):
+        function.restype = ctypes.c_char_p
+    module.darswin_set_tier.argtypes = [ctypes.c_char_p]
+    module.darswin_set_tier.restype = ctypes.c_bool
+    return module
+
+
+def tier() -> str:
+    """The instruction-set tier in use: "generic", "avx2" or "avx512"."""
+    return _loaded.darswin_tier().decode()
+
+
+def tiers() -> list[str]:
+    """The tiers that this CPU and this build offer, from low to high."""
+    return _loaded.darswin_tiers().decode().split()
+
+
+def set_tier(tier: str) -> None:
+    """Runs the operators on another tier from now on. Raises ValueError if the CPU lacks it."""
+    if not _loaded.darswin_set_tier(tier.encode()):
+        raise ValueError(
+            f"tier must be one that this CPU and build offer (best: {tiers()[-1]!r}), got {tier!r}"
+        )
+
+
+def build_info() -> dict[str, str | int]:
+    """What the module was built with: compiler, cxx_standard, openmp, torch_abi."""
+    return json.loads(_loaded.darswin_build_info())
+
+
+_loaded = load()

@@ -1,0 +1,30 @@
+"""Runs the operators' tests on the darswin that this Python has installed, not on the checkout's.
+
+    python tests/installed.py [options of pytest]
+
+Beside darswin it needs pytest and hypothesis.
+"""
+
+import os
+import sys
+import tempfile
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+def main(options: list[str]) -> int:
+    import darswin
+
+    if Path(darswin.__file__).is_relative_to(ROOT / "darswin"):
+        sys.exit(f"darswin must be an installed one, got the checkout's, {darswin.__file__}")
+    settings = ["-c", str(ROOT / "pyproject.toml"), "--rootdir", str(ROOT)]
+    with tempfile.TemporaryDirectory() as elsewhere:
+        os.chdir(elsewhere)
+        return pytest.main(["-q", *settings, *options, str(ROOT / "tests" / "ops")])
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
