@@ -25,13 +25,13 @@ autodoc_typehints_format = "short"
 autodoc_preserve_defaults = True
 autodoc_inherit_docstrings = False  # Lightning's and torch's are in another markup
 napoleon_numpy_docstring = False
-napoleon_custom_sections = ["Convention"]
+napoleon_custom_sections = ["Convention", ("Keys", "params_style")]
 napoleon_use_rtype = False  # "(N,) rad" is a shape and a unit
 
 # Names of other projects, since the site is built without a network; and bases that are not public.
-OTHERS = "torch|numpy|np|matplotlib|lightning|collections|os|pathlib|datetime|contextlib"
-UNITS = "[A-Z]|rad|px"  # of properties, whose docstrings begin with shape and unit
-PRIVATE = "LensBatch|LensDistribution|_Optimized|Sampling|Draw|Model|T"
+OTHERS = "torch|numpy|np|matplotlib|lightning|collections|typing|os|pathlib|datetime|contextlib"
+UNITS = r"[A-Z]|\d|rad|px"  # of properties, whose docstrings begin with shape and unit
+PRIVATE = "LensBatch|LensDistribution|_Optimized|Sampling|Model|T"
 nitpick_ignore_regex = [
     ("py:.*", rf"({OTHERS})\..*"),
     ("py:.*", rf"darswin\..*\.({PRIVATE})"),

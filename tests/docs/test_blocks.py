@@ -70,7 +70,8 @@ def test_every_block_is_of_a_kind_that_is_checked():
 def scratch(tmp_path, monkeypatch):
     """A folder with what pages take for granted: a checkout's examples, photos, a checkpoint."""
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "examples").symlink_to(ROOT / "examples")
+    for folder in ("examples", "darswin"):
+        (tmp_path / folder).symlink_to(ROOT / folder)
     random = np.random.default_rng(0)
     for name in ("cat", "dog"):
         (tmp_path / "photos" / name).mkdir(parents=True)
