@@ -24,10 +24,12 @@ from lightning.pytorch.utilities import rank_zero_only
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
 from darswin.cli.arguments import with_lists
+from darswin.cli.help import ALL, format_help
 from darswin.data.lenses import parse_sweep
 from darswin.models.saving import model_of_run
 from darswin.train.checkpoints import RunCheckpoint, SafeCheckpointIO
 from darswin.train.data import WideAngleData
+from darswin.train.finetuning import read_card, settle
 from darswin.train.results import WriteResults
 from darswin.train.resuming import check_changes
 from darswin.train.stopping import StopSignals, StopWhenTold
@@ -76,6 +78,8 @@ def _lacks_memory(error: Exception) -> bool:
 
 
 def _run(argv: list[str], signals: StopSignals) -> None:
+    whole_help = ALL in argv
+    argv = ["--help" if word == ALL else word for word in argv]
     RunCLI(
         signals,
         model_class=Classification,
@@ -89,7 +93,7 @@ def _run(argv: list[str], signals: StopSignals) -> None:
             use_distributed_sampler=False,
             num_sanity_val_steps=0,
         ),
-        parser_class=RunParser,
+        parser_class=WholeHelpParser if whole_help else RunParser,
         parser_kwargs=dict(
             prog="darswin", description="Trains and tests models on wide-angle images."
         ),
@@ -147,7 +151,16 @@ def _config_file(name: str) -> str:
 
 
 class RunParser(LightningArgumentParser):
-    """Names options in its errors as people type them."""
+    """Names options in its errors as people type them, and shows ours first in its help."""
+
+    whole_help = False
+
+    def format_help(self) -> str:
+        command = self.prog.split()[-1]
+        if command not in RunCLI.subcommands():
+            return super().format_help()
+        formatter = self._get_formatter()
+        return format_help(self._actions, self.required_args, formatter, command, self.whole_help)
 
     def error(self, message: str, *rest: Any) -> NoReturn:
         message = re.sub(r'Parser key "([\w.]+)":', r"--\1:", message)
@@ -160,6 +173,12 @@ class RunParser(LightningArgumentParser):
 
     def print_usage(self, *arguments) -> None:
         """Prints nothing before an error: the usage would have 150 options, see `--help`."""
+
+
+class WholeHelpParser(RunParser):
+    """A parser whose help shows all options."""
+
+    whole_help = True
 
 
 class RunCLI(LightningCLI):
@@ -175,6 +194,9 @@ class RunCLI(LightningCLI):
         return {name: commands[name] for name in ("fit", "validate", "test")}
 
     def add_arguments_to_parser(self, parser: LightningArgumentParser) -> None:
+        (config,) = (action for action in parser._actions if action.dest == "config")
+        presets = ", ".join(sorted(path.stem for path in PRESETS.glob("*.yaml")))
+        config.help = f"a preset ({presets}) or a YAML file of options; later ones win"
         parser.add_argument("--run", type=str, required=True, help="the folder of the run")
         parser.add_argument(
             "--resume", type=bool, default=False, help="fit: goes on from the run's last checkpoint"
@@ -213,6 +235,14 @@ class RunCLI(LightningCLI):
         if self.subcommand != "fit":
             config.ckpt_path = config.ckpt_path or str(model_of_run(self.folder, ".ckpt"))
             return
+        weights = config.model.weights
+        if weights is not None and Path(weights).exists():
+            weights = config.model.weights = str(Path(weights).resolve())
+        if weights is not None and not (config.resume and _last(self.folder).exists()):
+            model, data = settle(read_card(weights), weights, config.model, config.data)
+            for group, settled in ((config.model, model), (config.data, data)):
+                for name, value in settled.items():
+                    group[name] = value
         self.record = self._recorded(config)
         if config.resume and _last(self.folder).exists():
             before = yaml.safe_load((self.folder / "config.yaml").read_text())
@@ -262,7 +292,10 @@ class RunCLI(LightningCLI):
         lock = self.folder / ".lock"
         try:
             with locked(lock) if self.trainer.is_global_zero else contextlib.nullcontext():
-                self.trainer.fit(**options | {"ckpt_path": self._start()})
+                start = self._start()
+                if start is not None:
+                    self.model.weights = None  # the checkpoint has its own
+                self.trainer.fit(**options | {"ckpt_path": start})
         except BlockingIOError:
             raise FileExistsError(f"another `darswin fit` is at work in {self.folder}") from None
         except (KeyboardInterrupt, SystemExit):

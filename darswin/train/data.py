@@ -38,13 +38,15 @@ class WideAngleData(LightningDataModule):
             "low", "medium", "high"), one ξ ("0.4"), a range ("0.2..0.35"), or "polynomial".
         test_lenses: what testing goes through, one after the other: such names, or a sweep
             "0:1:0.1".
-        size: px, H = W of the images.
+        size: px, H = W of the images; null is that of model.weights, or 64.
         render: px, what they are reduced from.
         fov_deg: degrees, the field of view that a picture's width spans, and that of every lens.
-        fit: how a picture becomes a square, cut or squashed; its lens, if it has one, follows.
+        fit: how a picture becomes a square: crop cuts it, stretch squashes it; its lens, if it has
+            one, follows.
         picture_size: px, the width that larger pictures are first reduced to.
-        channels: of the images, grey or colour.
-        mean: of the pixels in [0, 1], per channel; null means ImageNet's.
+        channels: of the images, grey or colour; null is that of model.weights, or 3.
+        mean: of the pixels in [0, 1], per channel; null is that of model.weights, or
+            ImageNet's.
         std: of the pixels, likewise.
         classes: a file with the names of the classes.
         splits: a file or folder that says which picture is in which split.
@@ -74,12 +76,12 @@ class WideAngleData(LightningDataModule):
         camera: str | None = None,
         train_lenses: str = "low",
         test_lenses: str | list[str] = "0:1:0.1",
-        size: int = 64,
+        size: int | None = None,
         render: int = 224,
         fov_deg: float = math.degrees(PAPER_FOV),
         fit: Literal["crop", "stretch"] = "crop",
         picture_size: int = 384,
-        channels: Literal[1, 3] = 3,
+        channels: Literal[1, 3] | None = None,
         mean: list[float] | None = None,
         std: list[float] | None = None,
         classes: str | None = None,
@@ -97,6 +99,7 @@ class WideAngleData(LightningDataModule):
         skip_broken: bool = False,
     ):
         super().__init__()
+        size, channels = 64 if size is None else size, channels or 3
         if batch_size < 1 or workers < 0:
             raise ValueError(
                 "--data.batch_size must be at least 1 and --data.workers at least 0, "

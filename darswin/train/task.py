@@ -3,7 +3,7 @@
 import math
 from collections.abc import Iterator
 from dataclasses import asdict
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -21,8 +21,10 @@ from darswin.models.encoder import Encoder
 from darswin.models.registry import model_class
 from darswin.models.saving import ModelCard
 from darswin.train.data import WideAngleData
+from darswin.train.finetuning import frozen_parts, own_options, read_card, start_from
 from darswin.train.recipe import Schedule, parameter_groups
 
+DEFAULT_MODEL = "darswin_a_micro"
 Batch = tuple[Tensor, Lens, Tensor]
 
 
@@ -32,8 +34,16 @@ class Classification(LightningModule):
     Learning rates are those of `reference_batch` images a step and grow in proportion to the batch.
 
     Args:
-        name: of a model, one that `darswin models` lists.
-        options: of the model, e.g. {spacing: tan, jitter: 0}.
+        name: of a model, one that `darswin models` lists; null is that of `weights`, or
+            darswin_a_micro.
+        options: of the model, e.g. {spacing: tan, jitter: 0}. With `weights` they are its own, and
+            only drop_path_rate and jitter may differ.
+        weights: a trained model to start from: the folder of a run, whose best model is taken, or a
+            safetensors file. Its name, options, channels, mean and std are the run's; so is its
+            size, unless data.size says another and the model takes it. Its head is kept for the
+            same classes in the same order, else a new one is made. A resumed run does not read it.
+        freeze_stages: keeps the patch embedding and so many first stages of `weights` as they are,
+            without drop path and jitter; all stages leave the head alone to be trained.
         learning_rate: its peak.
         warmup_rate: what it starts from.
         final_rate: what it ends at.
@@ -59,9 +69,11 @@ class Classification(LightningModule):
 
     def __init__(
         self,
-        name: str = "darswin_a_micro",
+        name: str | None = None,
         options: dict[str, Any] | None = None,
         *,
+        weights: str | None = None,
+        freeze_stages: int = 0,
         learning_rate: float = 5e-4,
         warmup_rate: float = 5e-7,
         final_rate: float = 5e-6,
@@ -78,8 +90,17 @@ class Classification(LightningModule):
         seed: int = 0,
     ):
         super().__init__()
-        model_class(name)
-        self.name, self.options = name, options or {}
+        if freeze_stages and weights is None:
+            raise ValueError(
+                f"--model.freeze_stages {freeze_stages} keeps trained stages: give --model.weights"
+            )
+        if name is None and weights is not None:
+            card = read_card(weights)
+            name, options = card.model, own_options(card) | (options or {})
+        self.name, self.options = name or DEFAULT_MODEL, options or {}
+        model_class(self.name)
+        self.weights, self.freeze_stages = weights, freeze_stages
+        self._frozen: list[nn.Module] = []
         if not 0 <= label_smoothing < 1:
             raise ValueError(f"--model.label_smoothing must be in [0, 1), got {label_smoothing}")
         for option, value in dict(
@@ -128,11 +149,27 @@ class Classification(LightningModule):
             raise ValueError(
                 f"no {self.name} with --model.options {self.options}: {error}"
             ) from error
+        if self.weights is not None and self.trainer.training:
+            start_from(self.net, data.classes, self.weights)
+        self._freeze()
         self.net.set_matmul_backend(self.matmul_backend)
         self.net.set_grad_checkpointing(self.grad_checkpointing)
         count = len(data.classes)
         self.val_metrics = metrics(count)
         self.test_metrics = nn.ModuleList(metrics(count) for _ in data.test_names)
+
+    def _freeze(self) -> None:
+        self._frozen = frozen_parts(self.net, self.freeze_stages)
+        for module in self._frozen:
+            module.requires_grad_(False)
+        self.train(self.training)
+
+    def train(self, mode: bool = True) -> Self:
+        """As torch's; frozen stages stay as in evaluation, without drop path and jitter."""
+        super().train(mode)
+        for module in self._frozen:
+            module.eval()
+        return self
 
     @property
     def data(self) -> WideAngleData:
@@ -143,6 +180,7 @@ class Classification(LightningModule):
         trainer = self.trainer
         batch = self.data.batch_size * trainer.world_size * trainer.accumulate_grad_batches
         scale = batch / self.reference_batch
+        trainer.fit_loop.setup_data()  # with max_steps alone, Lightning has not yet
         steps = trainer.estimated_stepping_batches
         if not math.isfinite(steps):
             raise ValueError("the cosine needs an end: set --trainer.max_epochs or max_steps")

@@ -166,7 +166,7 @@ def test_what_may_change_is_an_option():
 def _help() -> str:
     text = io.StringIO()
     with contextlib.redirect_stdout(text), contextlib.suppress(SystemExit):
-        main(["fit", "--help"])
+        main(["fit", "--help.all"])
     return text.getvalue()
 
 
