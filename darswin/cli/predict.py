@@ -38,7 +38,7 @@ def run(argv: list[str]) -> None:
     described = (predict.__doc__ or "").splitlines()[0]
     parser = ArgumentParser(prog="darswin predict", description=described)
     parser.add_argument(
-        "paths", nargs="*", type=str, help="pictures, videos, and folders of pictures"
+        "paths", nargs="*", type=str, default=[], help="pictures, videos, folders of pictures"
     )
     parser.add_function_arguments(predict, skip={"paths"})
     predict(**parser.parse_args(argv).as_dict())
