@@ -5,10 +5,10 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/installed
 
-.PHONY: help build demo test test-lowest test-isa test-asan fuzz kills lint format bench study learned-lens tables docs dist wheels repair published-wheels test-torch clean
+.PHONY: help build demo test test-lowest test-isa test-asan fuzz kills lint format bench study learned-lens tables docs dist wheels repair published-wheels test-torch aarch64 clean
 
 help:  ## this list
-	@grep -E '^[a-z-]+:.*##' Makefile | sed -E 's/:.*## /\t/' | expand -t 18
+	@grep -E '^[a-z0-9-]+:.*##' Makefile | sed -E 's/:.*## /\t/' | expand -t 18
 
 $(STAMP): requirements.txt pyproject.toml setup.py
 	$(PYTHON) -m venv $(VENV)
@@ -132,6 +132,13 @@ test-torch:  ## the wheel under TORCH="2.10.0 2.11.0 …", on PYTHON; gigabytes 
 	    $$(grep -E '^(hypothesis|pytest)==' requirements.txt); \
 	  $(SCRATCH)/bin/python tests/installed.py; \
 	done
+
+# It links against the libraries of torch's wheel for aarch64, unpacked.
+aarch64: $(STAMP)  ## cross-compile for aarch64 with g++-aarch64-linux-gnu and TORCH_DIR=…/torch
+	PATH=$(CURDIR)/$(BIN):$$PATH; cmake --log-level=NOTICE -S . -B build/cmake-aarch64 -G Ninja \
+	  -DCMAKE_SYSTEM_NAME=Linux -DCMAKE_SYSTEM_PROCESSOR=aarch64 \
+	  -DCMAKE_CXX_COMPILER=aarch64-linux-gnu-g++ -DTORCH_DIR="$(TORCH_DIR)" \
+	  -DDARSWIN_OUTPUT_DIR=$(CURDIR)/build/aarch64 && cmake --build build/cmake-aarch64
 
 clean:  ## remove what was built
 	rm -rf build dist darswin.egg-info darswin/libdarswin.so

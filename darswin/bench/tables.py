@@ -6,6 +6,8 @@ from darswin.bench.memory import Memory, compared
 from darswin.bench.record import Record
 from darswin.bench.timing import COMPILED, FIXED_LENS, MATMULS, OURS, REFERENCE, Timing
 
+BOTH = "\u00a0/\u00a0"  # at one and at all threads, on one line
+
 
 def markdown(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     """A table of cells."""
@@ -22,11 +24,11 @@ def _by_case(timings: Iterable[Timing]) -> dict[tuple[str, int, str], dict[str, 
 
 
 def _milliseconds(timings: Iterable[Timing], digits: int = 2) -> str:
-    return " / ".join(f"{1e3 * t.median:.{digits}f}" for t in timings)
+    return BOTH.join(f"{1e3 * t.median:.{digits}f}" for t in timings)
 
 
 def _ratios(timings: Iterable[Timing], digits: int = 1) -> str:
-    return " / ".join(f"{t.ratio:.{digits}f}×" for t in timings)
+    return BOTH.join(f"{t.ratio:.{digits}f}×" for t in timings)
 
 
 def peers_table(timings: Sequence[Timing], subject: str, peers: Sequence[str] = ()) -> str:
@@ -116,11 +118,11 @@ def models_table(timings: Sequence[Timing]) -> str:
         rows.append(
             [
                 f"{mode}, batch {batch}",
-                " / ".join(f"{batch / t.median:.0f}" for t in ours),
+                BOTH.join(f"{batch / t.median:.0f}" for t in ours),
                 *(_ratios(found.get(peer, ()), 2) for peer in peers),
-                " / ".join(f"{t.ratio:.0%}" for t in found.get(MATMULS, ())),
+                BOTH.join(f"{t.ratio:.0%}" for t in found.get(MATMULS, ())),
                 _milliseconds(latency, 1),
-                " / ".join(f"{1e3 * t.p99:.1f}" for t in latency if t.p99),
+                BOTH.join(f"{1e3 * t.p99:.1f}" for t in latency if t.p99),
             ]
         )
     heads = [
