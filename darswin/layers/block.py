@@ -22,6 +22,7 @@ class DropPath(nn.Module):
         self.p = p
 
     def forward(self, x: Tensor) -> Tensor:
+        """x, any shape → the same with each image's branch kept, and scaled, or zero."""
         if self.p == 0 or not self.training:
             return x
         keep = 1 - self.p
@@ -43,6 +44,7 @@ class Mlp(nn.Module):
         self.fc2 = Linear(hidden, dim)
 
     def forward(self, x: Tensor) -> Tensor:
+        """(..., D) → (..., D)."""
         hidden = self.fc1(x)
         x = F.gelu(hidden)
         with recomputed(x, F.gelu, hidden, when=self.grad_checkpointing):

@@ -54,6 +54,7 @@ def newton(
 
 
 def determinant(matrix: Tensor) -> Tensor:
+    """The determinants (...) of matrices (..., 2, 2)."""
     (a, b), (c, d) = (row.unbind(-1) for row in matrix.unbind(-2))
     return a * d - b * c
 

@@ -15,10 +15,12 @@ MODELS = ("ds", "eucm", "ucm", "kb4", "fov", "pinhole", "pinhole-radtan8")
 
 
 def fits(content: Content) -> bool:
+    """Whether a file's content is basalt's: it has `value0`."""
     return isinstance(content, Mapping) and "value0" in content
 
 
 def cameras(file: Fields) -> Cameras:
+    """Its cameras, as cam0, cam1, …"""
     calibration = file.section("value0")
     entries = calibration.sections("intrinsics")
     sizes: Sequence[tuple[int, int] | None] = [None] * len(entries)

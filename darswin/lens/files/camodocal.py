@@ -15,11 +15,13 @@ MODELS = ("MEI", "KANNALA_BRANDT", "PINHOLE", "SCARAMUZZA")
 
 
 def fits(content: Content) -> bool:
+    """Whether a file's content is CamOdoCal's: it has a model type, or parameters of one."""
     keys = ("model_type", "mirror_parameters", "projection_parameters")
     return isinstance(content, Mapping) and any(key in content for key in keys)
 
 
 def cameras(file: Fields) -> Cameras:
+    """Its one camera, by its name if it has one."""
     return {file.text("camera_name") if "camera_name" in file else "camera": partial(_camera, file)}
 
 

@@ -45,10 +45,12 @@ _COUNT, _HEAD = struct.Struct("<Q"), struct.Struct("<IiQQ")  # id, model, width,
 
 
 def fits(content: Content) -> bool:
+    """Whether a file's content is COLMAP's: rows whose second word is the name of a model."""
     return isinstance(content, list) and len(content[0]) > 1 and not is_number(content[0][1])
 
 
 def cameras(rows: list[list[str]]) -> Cameras:
+    """Its cameras, by their ids."""
     found: Cameras = {}
     for row in rows:
         if row[0] in found:

@@ -92,6 +92,7 @@ class Fields:
         return f"{self._where}{name if len(str(name)) <= _MAX_WORD else short(name)}"
 
     def get(self, name: str, expected: str) -> Any:
+        """The entry `name`; `expected` says what it must be, for the error."""
         if name not in self.entries:
             raise ValueError(f"{self.path(name)} is missing, it must be {expected}")
         self._read.add(name)
@@ -120,29 +121,35 @@ class Fields:
             raise ValueError(f"{camera} has no place for the numbers of {where}")
 
     def section(self, name: str) -> "Fields":
+        """The entry as a mapping."""
         value = self.get(name, "a mapping")
         if not isinstance(value, Mapping):
             raise ValueError(f"{self.path(name)} must be a mapping, got {short(value)}")
         return Fields(value, f"{self.path(name)}.")
 
     def sections(self, name: str) -> "list[Fields]":
+        """The entry as a list of mappings."""
         value = self.get(name, "a list of mappings")
         if not isinstance(value, list) or not all(isinstance(v, Mapping) for v in value):
             raise ValueError(f"{self.path(name)} must be a list of mappings, got {short(value)}")
         return [Fields(v, f"{self.path(name)}[{i}].") for i, v in enumerate(value)]
 
     def number(self, name: str, default: float | None = None) -> float:
+        """The entry as a finite number; `default`, if there is one, where it is missing."""
         if default is not None and name not in self.entries:
             return default
         return to_number(self.get(name, "a finite number"), self.path(name))
 
     def positive(self, name: str) -> float:
+        """The entry as a finite number above 0."""
         return to_positive(self.get(name, "a finite number above 0"), self.path(name))
 
     def side(self, name: str) -> int:
+        """The entry as a side of an image, in pixels."""
         return to_side(self.get(name, "a whole number of pixels"), self.path(name))
 
     def text(self, name: str, expected: str = "text") -> str:
+        """The entry as text."""
         value = self.get(name, expected)
         if not isinstance(value, str):
             raise ValueError(f"{self.path(name)} must be {expected}, got {short(value)}")

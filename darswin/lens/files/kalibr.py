@@ -35,6 +35,7 @@ def _is_alone(content: Mapping) -> bool:
 
 
 def fits(content: Content) -> bool:
+    """Whether a file's content is Kalibr's: it has a camera, or is one."""
     return isinstance(content, Mapping) and (
         _is_alone(content)
         or any(isinstance(e, Mapping) and "camera_model" in e for e in content.values())
@@ -42,6 +43,7 @@ def fits(content: Content) -> bool:
 
 
 def cameras(file: Fields) -> Cameras:
+    """Its cameras, by their names."""
     if _is_alone(file.entries):
         return {"camera": partial(_camera, file)}
     names = [name for name, entry in file.entries.items() if _is_camera(entry)]

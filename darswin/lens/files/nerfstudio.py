@@ -21,12 +21,14 @@ LIKE = re.compile(r"(?i)^[a-z]{0,2}_?\d|coef|dist(?!ance)")
 
 
 def fits(content: Content) -> bool:
+    """Whether a file's content is nerfstudio's: it has frames, or what stands beside them."""
     return isinstance(content, Mapping) and any(
         key in content for key in ("frames", "fl_x", "fl_y", "transform_matrix")
     )
 
 
 def cameras(file: Fields) -> Cameras:
+    """Its cameras: the one at the top, or each frame's, by the frame's file."""
     frames = file.get("frames", "a list of mappings") if "frames" in file else []
     if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):
         raise ValueError(f"frames must be a list of mappings, got {short(frames)}")

@@ -16,10 +16,12 @@ MOST_APART = 1.0  # px
 
 
 def fits(content: Content) -> bool:
+    """Whether a file's content is OCamCalib's: rows of numbers."""
     return isinstance(content, list) and (len(content[0]) < 2 or is_number(content[0][1]))
 
 
 def cameras(rows: list[list[str]]) -> Cameras:
+    """Its one camera."""
     return {"camera": lambda: _camera(rows)}
 
 

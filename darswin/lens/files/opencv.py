@@ -47,6 +47,7 @@ def _plain(name: str) -> str:
 
 
 def fits(content: Content) -> bool:
+    """Whether a file's content is OpenCV's or ROS's: it has a camera matrix."""
     if not isinstance(content, Mapping):
         return False
     names = {_plain(name) for name in content}
@@ -54,11 +55,16 @@ def fits(content: Content) -> bool:
 
 
 def fits_ros(content: Content) -> bool:
+    """Whether a file's content is ROS's: it names its distortion model, too."""
     return fits(content) and "distortion_model" in content
 
 
 def cameras(file: Fields, hint: str | None = None) -> Cameras:
-    """Args: hint: one of `MODELS`, which rules where the file does not say it or is wrong."""
+    """Its cameras, by what their keys end with.
+
+    Args:
+        hint: one of `MODELS`, which rules where the file does not say it or is wrong.
+    """
     reader = _Reader(file, hint)
     suffixes = [suffix for suffix in SUFFIXES if reader.find(MATRIX, suffix) is not None]
     if reader.find(MATRIX) is not None:

@@ -11,11 +11,13 @@ from darswin.lens.focal import FocalLens
 
 
 def fits(content: Content) -> bool:
+    """Whether a file's content is our own: it names one of `MODELS`."""
     model = content.get("model") if isinstance(content, Mapping) else None
     return isinstance(model, str) and model in MODELS
 
 
 def cameras(file: Fields) -> Cameras:
+    """Its one lens."""
     return {"lens": lambda: _lens(file)}
 
 

@@ -13,10 +13,12 @@ MAX_ORDER = 16
 
 
 def fits(content: Content) -> bool:
+    """Whether a file's content is WoodScape's: it has `intrinsic`."""
     return isinstance(content, Mapping) and "intrinsic" in content
 
 
 def cameras(file: Fields) -> Cameras:
+    """Its one camera, by its name if it has one."""
     return {file.text("name") if "name" in file else "camera": lambda: _camera(file)}
 
 
