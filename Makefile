@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/installed
 
-.PHONY: help build demo test test-lowest test-isa test-asan fuzz kills lint format bench study learned-lens readme dist wheels repair published-wheels test-torch aarch64 clean
+.PHONY: help build demo test test-lowest test-isa test-asan fuzz kills lint format bench study learned-lens tables docs dist wheels repair published-wheels test-torch aarch64 clean
 
 help:  ## this list
 	@grep -E '^[a-z0-9-]+:.*##' Makefile | sed -E 's/:.*## /\t/' | expand -t 18
@@ -95,8 +95,11 @@ study: build  ## the paper's experiments, small: an hour; goes on where it was s
 learned-lens: build  ## find unknown lenses by gradient descent: ten minutes; goes on where it was stopped
 	$(BIN)/python studies/learned_lens.py
 
-readme: $(STAMP)  ## fill the README's tables from the results of bench and study
-	$(BIN)/python docs/readme.py
+tables: $(STAMP)  ## fill the tables of README and docs from the results of bench and study
+	$(BIN)/python docs/fill.py
+
+docs: build  ## the site of docs/, in build/docs; warnings are errors
+	$(BIN)/python -m sphinx -q -n -W --keep-going docs build/docs
 
 dist: $(STAMP)  ## sdist and wheel in dist/
 	PATH=$(CURDIR)/$(BIN):$$PATH $(BIN)/python -m build --no-isolation --outdir dist

@@ -1,10 +1,12 @@
-"""Draws docs/lens.png: a room that is computed, through the front lens of the WoodScape data set.
+"""Draws docs/lens.png, and examples/front.jpg with its calibration examples/front.json: a room that
+is computed, through the front lens of the WoodScape data set.
 
 Run it with `.venv/bin/python docs/lens.py`. The room is a box with a checkerboard on its walls, so
 that its lines are straight in the perspective view and nowhere else.
 """
 
 import io
+import json
 import math
 from pathlib import Path
 
@@ -18,7 +20,14 @@ from darswin.utils.files import replace_file
 from darswin.viz.plot import draw_lens
 from darswin.viz.views import perspective
 
+EXAMPLES = Path(__file__).parents[1] / "examples"
 SIZE = (966, 1280)
+# The front camera's, as the data set's files have them.
+COEFFICIENTS = [339.749, -31.988, 48.275, -7.201]
+OFFSETS = dict(
+    cx_offset=3.942, cy_offset=-3.093, aspect_ratio=1.0, width=1280.0, height=966.0,
+    model="radial_poly", poly_order=4,
+)  # fmt: skip
 HALF = np.array([2.0, 1.2, 2.5])  # the box around the camera, m
 SQUARE = 0.4  # m
 # Left and right, above and below, behind and before.
@@ -30,9 +39,7 @@ COLOURS = np.array([
 
 def front_lens() -> Polynomial:
     """As published, used as far as the image's sides."""
-    lens = Polynomial(
-        [339.749, -31.988, 48.275, -7.201], center=[643.442, 479.407], image_size=SIZE
-    ).to(torch.float64)
+    lens = Polynomial(COEFFICIENTS, center=[643.442, 479.407], image_size=SIZE).to(torch.float64)
     return lens.with_theta_max(lens.side_angles().amax())
 
 
@@ -64,6 +71,11 @@ def row(lens: Polynomial, y: int, width: int) -> np.ndarray:
 def main() -> None:
     lens = front_lens().with_theta_max(None)
     image = photograph(lens)
+    picture = io.BytesIO()
+    Image.fromarray(image).save(picture, format="jpeg", quality=80, optimize=True)
+    replace_file(EXAMPLES / "front.jpg", picture.getvalue())
+    calibration = dict(zip(("k1", "k2", "k3", "k4"), COEFFICIENTS, strict=True)) | OFFSETS
+    replace_file(EXAMPLES / "front.json", json.dumps({"intrinsic": calibration}, indent=2) + "\n")
     view = perspective((604, 800), math.radians(110))
     sampler = PolarSample(rings=16, sectors=64, samples=(10, 10))
     figure = draw_lens(image, front_lens(), sampler, view, "perspective view, 110° across")

@@ -6,7 +6,8 @@ LEVELS = ("very low", "low", "medium", "high")
 SWEEP = [f"{k / 20:g}" for k in range(21)]  # ξ = 0, 0.05, …, 1
 POLYNOMIAL = "polynomial"
 
-# The released code spaces rings and samples by tan θ, and so the paper's numbers must; see README.
+# The released code spaces rings and samples by tan θ, and so the paper's numbers must; see
+# docs/explanation/spacings.md.
 DARSWIN = dict(spacing="tan", samples=[10, 10])
 
 

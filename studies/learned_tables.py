@@ -122,7 +122,7 @@ def images_table(cameras: list[dict]) -> str:
 
 
 def tables(cameras: list[dict]) -> dict[str, str]:
-    """The README's tables, by the name of their place in it."""
+    """The tables, by the name of their place in a page."""
     return {"learned-lens": recovery_table(cameras), "learned-xi": images_table(cameras)}
 
 
@@ -131,16 +131,23 @@ def tables(cameras: list[dict]) -> dict[str, str]:
 
 def draw(cameras: list[dict], path: Path) -> None:
     """Landscapes of the losses over ξ, descents on them, and how far from the truth all end."""
-    figure = Figure(figsize=(13, 9.5), layout="constrained")
+    figure = Figure(figsize=(9, 8.5), layout="constrained")
     axes = figure.subplots(3, 4)
     known = [camera for camera in cameras if camera["problem"] == "xi"]
     for above, below, loss in zip(axes[0], axes[1], LOSSES, strict=True):
         draw_landscapes(above, known, loss)
         draw_paths(below, known, loss)
         above.sharex(below)
+        above.label_outer()
+        if below is not axes[1, 0]:
+            below.set_ylabel("")
+            below.tick_params(labelleft=False)
     for panel, problem in zip(axes[2], PROBLEMS, strict=False):
         draw_distances(panel, cameras, problem)
+        panel.label_outer()
     draw_images(axes[2, 3], known)
+    names = axes[2, 0].get_legend_handles_labels()
+    figure.legend(*names, loc="outside lower center", ncols=len(names[1]))
     save_figure(figure, path)
 
 
@@ -175,11 +182,9 @@ def draw_distances(axes: Axes, cameras: list[dict], problem: str) -> None:
         axes.ecdf(distances(trials), label=loss)
     axes.ecdf(distances(trials, "start"), color="grey", ls=":", label="start")
     axes.axvline(CLOSE, color="k", lw=0.6)
-    axes.set_title(f"unknown: {UNKNOWN[problem]}", fontsize="medium")
-    axes.set(xlabel="distance to the true lens (px)", ylabel="share of descents", xscale="log")
+    axes.set_title("unknown: " + ",\n".join(UNKNOWN[problem].rsplit(", ", 1)), fontsize="medium")
+    axes.set(xlabel="distance (px)", ylabel="share of descents", xscale="log")
     axes.grid(alpha=0.3)
-    if problem == "xi":
-        axes.legend(fontsize="small")
 
 
 def draw_images(axes: Axes, cameras: list[dict]) -> None:

@@ -59,7 +59,7 @@ def draw(cells: list[dict], path: Path) -> None:
     """Accuracy against ξ: a panel for each training level, its range shaded; lines are means of the
     seeds, bands their span."""
     found, xi = by_model(cells), [float(name) for name in SWEEP]
-    figure = Figure(figsize=(12, 8), layout="constrained")
+    figure = Figure(figsize=(9, 7), layout="constrained")
     for axes, level in zip(figure.subplots(2, 2, sharey=True).flat, LEVELS, strict=True):
         axes.axvspan(*RANGES[level], color="tab:pink", alpha=0.3, lw=0, label="seen in training")
         for label in MODELS:
@@ -69,8 +69,10 @@ def draw(cells: list[dict], path: Path) -> None:
                 (line,) = axes.plot(xi, list(map(statistics.mean, values)), label=label)
                 low, high = list(map(min, values)), list(map(max, values))
                 axes.fill_between(xi, low, high, color=line.get_color(), alpha=0.2, lw=0)
-        axes.set(title=f'trained on "{level}"', xlabel="distortion ξ", xlim=(0, 1))
-        axes.set_ylabel("accuracy (%)")
+        axes.set(
+            title=f'trained on "{level}"', xlabel="distortion ξ", ylabel="accuracy (%)", xlim=(0, 1)
+        )
+        axes.label_outer()
         axes.grid(alpha=0.3)
     figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=5)
     save_figure(figure, path)
@@ -111,7 +113,7 @@ def ablation_table(cells: list[dict]) -> str:
 
 
 def tables(cells: list[dict]) -> dict[str, str]:
-    """The README's tables, by the name of their place in it."""
+    """The tables, by the name of their place in a page."""
     return {
         "xi-0.4": level_table(cells, "0.4", PAPER_04),
         "polynomial": level_table(cells, POLYNOMIAL, PAPER_POLYNOMIAL),

@@ -1,61 +1,111 @@
 """Pictures of what was measured. Only drawing needs matplotlib."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
+from textwrap import fill
+from typing import TYPE_CHECKING
 
 from darswin.bench.record import Record
 from darswin.bench.timing import COMPILED, FIXED_LENS, MATMULS, OURS, REFERENCE
 
-Bars = dict[str, dict[str, float]]  # by case, then by name
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.lines import Line2D
+
+WIDTH = 9  # inches: text of 10 pt is still 8 pt in a page 740 px wide
+COLUMNS = 3  # panels beside each other, at most
+
+Rows = dict[str, dict[str, float]]  # by case, then by name
+Panels = list[list[tuple[str, Rows]]]  # line by line, with their titles
 
 
 def draw_peers(record: Record, path: Path) -> None:
-    """Draws the peers' times over ours at one thread."""
-    bars: Bars = {}
+    """Draws the peers' times over ours at one thread: lines of panels for each operator, a panel a
+    mode, in it a row a case."""
+    found: dict[str, dict[str, Rows]] = {}
     for t in record.timings:
         if t.threads == 1 and not t.name.startswith(OURS):
-            case = f"{t.subject}, {t.setting}, batch {t.batch}, {t.mode}"
-            bars.setdefault(case, {})[t.name] = t.ratio
-    names = list(dict.fromkeys(name for group in bars.values() for name in group))
-    _draw_bars(bars, names, "time of the peer / time of darswin, 1 thread", path, mark=1)
+            operator = t.subject.partition(",")[0]
+            rows = found.setdefault(operator, {}).setdefault(f"{t.subject}\n{fill(t.mode, 26)}", {})
+            rows.setdefault(f"{t.setting}, batch {t.batch}", {})[t.name] = t.ratio
+    lines = [line for panels in found.values() for line in _batched(panels.items(), COLUMNS)]
+    names = dict.fromkeys(t.name for t in record.timings if not t.name.startswith(OURS))
+    _draw_panels(lines, list(names), "time of the peer / time of darswin, 1 thread", path, mark=1)
 
 
 def draw_models(record: Record, path: Path) -> None:
-    """Draws the images a second of all candidates at all threads."""
+    """Draws the images a second of all candidates at all threads: a panel a mode, a row a batch."""
     threads = max(t.threads for t in record.timings)
-    bars: Bars = {}
+    panels: dict[str, Rows] = {}
     for t in record.timings:
         if t.threads == threads:
-            bars.setdefault(f"{t.mode}, batch {t.batch}", {})[t.name] = t.batch / t.median
+            rows = panels.setdefault(t.mode, {})
+            rows.setdefault(f"batch {t.batch}", {})[t.name] = t.batch / t.median
     found = {t.name for t in record.timings}
     names = [n for n in (OURS, FIXED_LENS, REFERENCE, COMPILED, MATMULS) if n in found]
-    _draw_bars(
-        bars, names, f"images a second, {record.timings[0].subject}, {threads} threads", path
-    )
+    unit = f"images a second, {record.timings[0].subject}, {threads} threads"
+    _draw_panels(_batched(panels.items(), 2), names, unit, path)
 
 
-def _draw_bars(
-    bars: Bars, names: Sequence[str], xlabel: str, path: Path, mark: float | None = None
+def _batched(items: Iterable[tuple[str, Rows]], count: int) -> Panels:
+    """Lines of so many panels."""
+    panels = list(items)
+    return [panels[k : k + count] for k in range(0, len(panels), count)]
+
+
+def _draw_panels(
+    lines: Panels, names: Sequence[str], unit: str, path: Path, mark: float | None = None
 ) -> None:
-    """A group of bars a case, in it a bar a name, `MATMULS` pale; a line at `mark`."""
+    """Panels on one scale; on a logarithmic one with a line at `mark`, if there is one."""
     from matplotlib.figure import Figure
+    from matplotlib.ticker import LogLocator
 
     from darswin.viz.plot import save_figure
 
-    figure = Figure(figsize=(9, 1.5 + 0.3 * len(bars)), layout="constrained")
-    axes = figure.subplots()
-    width = 0.8 / len(names)
-    for index, name in enumerate(names):
-        lengths = {k: group[name] for k, group in enumerate(bars.values()) if name in group}
-        places = [k + index * width for k in lengths]
-        color = "0.8" if name == MATMULS else None
-        axes.barh(places, list(lengths.values()), width, label=name, color=color)
-    if mark is not None:
-        axes.axvline(mark, color="black", lw=1)
-    axes.set_yticks([k + 0.4 for k in range(len(bars))], list(bars))
-    axes.tick_params(axis="y", labelsize=7)
-    axes.invert_yaxis()
-    axes.margins(y=0.005)
-    axes.set_xlabel(xlabel)
-    axes.legend(fontsize=8)
+    heights = [max(len(rows) for _, rows in line) for line in lines]
+    size = (WIDTH, 1.2 + sum(0.75 + 0.25 * height for height in heights))
+    figure = Figure(figsize=size, layout="constrained")
+    grid = figure.subplots(
+        len(lines), max(map(len, lines)), squeeze=False, sharex=True, height_ratios=heights
+    )
+    legend: dict[str, Line2D] = {}
+    for line, beside in zip(lines, grid, strict=True):
+        for (title, rows), axes in zip(line, beside, strict=False):
+            legend |= _draw_rows(axes, rows, names)
+            axes.set_title(title, fontsize="medium")
+            axes.tick_params(labelbottom=True)
+            if axes is not beside[0] and list(rows) == list(line[0][1]):
+                axes.set_yticklabels([])
+            if mark is not None:
+                axes.axvline(mark, color="black", lw=1)
+        for axes in beside[len(line) :]:
+            axes.set_axis_off()
+    if mark is None:
+        grid[0, 0].set_xlim(left=0)
+    else:
+        grid[0, 0].set_xscale("log", base=2)
+        for axes in grid.flat:
+            axes.xaxis.set_major_locator(LogLocator(2, numticks=8))
+            axes.xaxis.set_major_formatter("{x:g}×")
+    figure.supxlabel(unit, fontsize="medium")
+    shown = [name for name in names if name in legend]
+    columns = len(shown) if len(shown) < 5 else 3
+    handles = [legend[name] for name in shown]
+    figure.legend(handles=handles, loc="outside upper center", ncols=columns)
     save_figure(figure, path)
+
+
+def _draw_rows(axes: "Axes", rows: Rows, names: Sequence[str]) -> "dict[str, Line2D]":
+    """A dot a name in each row, `MATMULS` pale; the dots by name."""
+    drawn = {}
+    for index, name in enumerate(names):
+        places = {k: group[name] for k, group in enumerate(rows.values()) if name in group}
+        if places:
+            color = "0.7" if name == MATMULS else f"C{index}"
+            (drawn[name],) = axes.plot(
+                list(places.values()), list(places), "o", ms=6, color=color, label=name
+            )
+    axes.set_yticks(range(len(rows)), list(rows))
+    axes.set_ylim(len(rows) - 0.4, -0.6)
+    axes.grid(alpha=0.3)
+    return drawn

@@ -6,6 +6,8 @@ from darswin.bench.memory import Memory, compared
 from darswin.bench.record import Record
 from darswin.bench.timing import COMPILED, FIXED_LENS, MATMULS, OURS, REFERENCE, Timing
 
+BOTH = "\u00a0/\u00a0"  # at one and at all threads, on one line
+
 
 def markdown(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     """A table of cells."""
@@ -22,11 +24,11 @@ def _by_case(timings: Iterable[Timing]) -> dict[tuple[str, int, str], dict[str, 
 
 
 def _milliseconds(timings: Iterable[Timing], digits: int = 2) -> str:
-    return " / ".join(f"{1e3 * t.median:.{digits}f}" for t in timings)
+    return BOTH.join(f"{1e3 * t.median:.{digits}f}" for t in timings)
 
 
 def _ratios(timings: Iterable[Timing], digits: int = 1) -> str:
-    return " / ".join(f"{t.ratio:.{digits}f}×" for t in timings)
+    return BOTH.join(f"{t.ratio:.{digits}f}×" for t in timings)
 
 
 def peers_table(timings: Sequence[Timing], subject: str, peers: Sequence[str] = ()) -> str:
@@ -67,6 +69,38 @@ def attention_table(timings: Sequence[Timing]) -> str:
     return markdown(["`window_attention`", "ours, forward (ms)", *heads], rows.values())
 
 
+def best_table(timings: Sequence[Timing], rows: Iterable[tuple[str, str, str, int]]) -> str:
+    """A row for each (subject, mode, setting, batch), at all threads: our time, the fastest peer's,
+    how much longer it takes, and how much longer the fastest takes in all settings and batches."""
+    threads = max(t.threads for t in timings)
+    parts = (MATMULS, "F.linear alone")  # less work than ours: bounds, no peers
+    found: dict[tuple, list[Timing]] = {}
+    for t in timings:
+        if t.threads == threads and t.name not in parts and not t.name.startswith(f"{OURS}"):
+            found.setdefault((t.subject, t.mode, t.setting, t.batch), []).append(t)
+    best = {case: min(peers, key=lambda t: t.ratio) for case, peers in found.items()}
+    lines = []
+    for case in rows:
+        subject, mode, setting, batch = case
+        (ours,) = (
+            t
+            for t in timings
+            if (t.subject, t.mode, t.setting, t.batch) == case
+            and (t.name, t.threads) == (OURS, threads)
+        )
+        ratios = [t.ratio for other, t in best.items() if other[:2] == case[:2]]
+        lines.append(
+            [
+                f"`{subject}`, {mode}, {setting}, batch {batch}",
+                f"{1e3 * ours.median:.2f}" if ours.median < 0.01 else f"{1e3 * ours.median:.0f}",
+                best[case].name,
+                f"{best[case].ratio:.1f}×",
+                f"{min(ratios):.1f}× to {max(ratios):.1f}×",
+            ]
+        )
+    return markdown(["", "ours (ms)", "best peer", "takes", "in all sizes"], lines)
+
+
 def missed_table(timings: Iterable[Timing]) -> str:
     """The ratios that are below their target."""
     missed = [t for t in timings if t.missed]
@@ -84,11 +118,11 @@ def models_table(timings: Sequence[Timing]) -> str:
         rows.append(
             [
                 f"{mode}, batch {batch}",
-                " / ".join(f"{batch / t.median:.0f}" for t in ours),
+                BOTH.join(f"{batch / t.median:.0f}" for t in ours),
                 *(_ratios(found.get(peer, ()), 2) for peer in peers),
-                " / ".join(f"{t.ratio:.0%}" for t in found.get(MATMULS, ())),
+                BOTH.join(f"{t.ratio:.0%}" for t in found.get(MATMULS, ())),
                 _milliseconds(latency, 1),
-                " / ".join(f"{1e3 * t.p99:.1f}" for t in latency if t.p99),
+                BOTH.join(f"{1e3 * t.p99:.1f}" for t in latency if t.p99),
             ]
         )
     heads = [

@@ -34,7 +34,9 @@ class Lens(ImageFrame):
         point before `affine`, px. φ = 0 points right, π/2 down. Pixel centres are integers, x to
         the right and y down. The camera looks along z, with x to the right and y down.
 
-    Args, beside a model's own:
+    Beside a model's own parameters every lens takes these.
+
+    Args:
         theta_max: in (0, theta_limit], the widest angle that the lens is used for: where the last
             ring of a polar grid ends. None means theta_limit.
         center: (x, y) or (N, 2) px, the principal point. None means the middle of whatever image

@@ -30,12 +30,12 @@ class FocalLens(Lens, register=False):
         """The lens whose full field of view fills a circle.
 
         Args:
-            The model's parameters but `focal`, in the order of its constructor, then
-            fov: rad, the full field of view. radius: px, of the circle.
-            center: as `Lens`. By their names also `affine`, `image_size` and what is optional.
+            arguments: the model's parameters but `focal`, in the order of its constructor, then
+                `fov`, rad, the full field of view, `radius`, px, of the circle, and `center`, as
+                `Lens` has it.
+            named: any of them by name, also `affine`, `image_size` and what is optional.
 
-        Raises:
-            As the constructor.
+        Raises what the constructor does.
         """
         own = tuple(name for name in cls.parameters if name != "focal")
         order = (*own, "fov", "radius", "center")

@@ -22,9 +22,10 @@ from darswin.ops.checks import per_channel
 class Prepared(NamedTuple):
     """What the lenses alone decide about images of one size: `Encoder.prepare` computes it.
 
-    points: where the images are read: on a polar grid, or at pixels (N, H, W, 2); None means as
-        they are.
-    positions: for each stage, the tensors that its position biases are computed from.
+    Args:
+        points: where the images are read: on a polar grid, or at pixels (N, H, W, 2); None means
+            as they are.
+        positions: for each stage, the tensors that its position biases are computed from.
     """
 
     points: PolarGrid | Tensor | None

@@ -20,7 +20,7 @@ Model = TypeVar("Model", bound=type[Encoder])
 
 
 def register_model(family: str, *, presets: Presets, **options: Any) -> Callable[[Model], Model]:
-    """Decorates a model's class: `create_model` knows it as `family`_small, _tiny, _micro, _nano.
+    """Decorates a model's class: `create_model` knows it as `FAMILY_small`, `FAMILY_tiny` …
 
     Args:
         presets: for a size, the constructor's arguments beyond those that all models of it have.

@@ -1,40 +1,68 @@
+from pathlib import Path
+
 import pytest
+from matplotlib.text import Text
 
 from darswin.bench import plot
 from darswin.bench.record import Record
 
+RESULTS = Path(__file__).parents[2] / "benchmarks" / "results"
+
 
 @pytest.fixture
 def drawn(monkeypatch):
-    """What is drawn: the labels of the cases, and the lengths of the bars by name."""
+    """What is drawn: by the panels' titles, the rows' labels, and the dots of each row by name."""
     figures = []
     monkeypatch.setattr("darswin.viz.plot.save_figure", lambda figure, path: figures.append(figure))
 
     def read():
-        (axes,) = figures[-1].axes
-        cases = [label.get_text() for label in axes.get_yticklabels()]
-        bars = {b.get_label(): [bar.get_width() for bar in b] for b in axes.containers}
-        return cases, bars
+        panels = {}
+        for axes in figures[-1].axes:
+            rows = [label.get_text() for label in axes.get_yticklabels()]
+            dots = {
+                line.get_label(): dict(zip(line.get_ydata(), line.get_xdata(), strict=True))
+                for line in axes.lines
+                if not line.get_label().startswith("_")
+            }
+            if dots:
+                panels[axes.get_title()] = rows, dots
+        return panels
 
     return read
 
 
 def test_models(record, drawn, tmp_path):
     plot.draw_models(record, tmp_path / "models.png")
-    cases, bars = drawn()
-    assert cases[0] == "inference, float32, batch 8" and len(cases) == 3
-    assert bars["darswin"] == pytest.approx([80, 50, 8 / 0.3])
-    assert bars["matrix products alone"] == pytest.approx([8 / 0.09])
+    panels = drawn()
+    assert list(panels) == ["inference, float32", "training, float32"]
+    rows, dots = panels["inference, float32"]
+    assert rows == ["batch 8", "batch 1"]
+    assert dots["darswin"] == pytest.approx({0: 80, 1: 50})
+    assert dots["matrix products alone"] == pytest.approx({0: 8 / 0.09})
+    rows, dots = panels["training, float32"]
+    assert rows == ["batch 8"] and dots == {"darswin": pytest.approx({0: 8 / 0.3})}
 
 
 def test_peers(operators, drawn, tmp_path):
     plot.draw_peers(Record({}, operators), tmp_path / "peers.png")
-    cases, bars = drawn()
-    assert cases == [
-        "polar_sample, 64×64, batch 8, forward",
-        "another, 64×64, batch 8, forward",
-    ]
-    assert bars == {"slow": [5.0], "fast": [1.5], "peer": [1.0]}
+    assert drawn() == {
+        "polar_sample\nforward": (["64×64, batch 8"], {"slow": {0: 5.0}, "fast": {0: 1.5}}),
+        "another\nforward": (["64×64, batch 8"], {"peer": {0: 1.0}}),
+    }
+
+
+@pytest.mark.parametrize("suite", ["sampling", "attention", "model"])
+def test_the_pictures_of_the_records_can_be_read(suite, tmp_path, monkeypatch):
+    """At the width of a page, 740 px, text is at least 8 pt high, and the page is not endless."""
+    record = Record.load(RESULTS / f"{suite}--avx512.json")
+    figures = []
+    monkeypatch.setattr("darswin.viz.plot.save_figure", lambda figure, path: figures.append(figure))
+    (plot.draw_models if suite == "model" else plot.draw_peers)(record, tmp_path / "a.png")
+    (figure,) = figures
+    width, height = figure.get_size_inches() * 120
+    assert height <= 1200
+    texts = [text for text in figure.findobj(Text) if text.get_text()]
+    assert min(text.get_fontsize() for text in texts) * 120 / 72 * 740 / width * 72 / 96 >= 8
 
 
 def test_a_file(record, tmp_path):

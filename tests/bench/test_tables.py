@@ -1,11 +1,12 @@
 from darswin.bench import tables
+from darswin.bench.tables import BOTH
 
 
 def test_models(record):
     lines = tables.models_table(record.timings).splitlines()
     assert len(lines) == 2 + 3
     assert (
-        "| inference, float32, batch 8 | 40 / 80 |  | 2.50× / 3.00× | 2.10× | 90% |  |  |"
+        f"| inference, float32, batch 8 | 40{BOTH}80 |  | 2.50×{BOTH}3.00× | 2.10× | 90% |  |  |"
     ) in lines
     (latency,) = (line for line in lines if "batch 1 " in line)
     assert latency.endswith("| 20.0 | 40.0 |")
@@ -30,7 +31,7 @@ def test_peers(operators):
     assert tables.peers_table(operators, "polar_sample").splitlines() == [
         "| `polar_sample` | ours (ms) | slow | fast | darswin (avx2) |",
         "|---|---|---|---|---|",
-        "| 64×64, batch 8, forward | 2.00 / 1.00 | 5.0× / 6.0× | 1.5× | 2.5× |",
+        f"| 64×64, batch 8, forward | 2.00{BOTH}1.00 | 5.0×{BOTH}6.0× | 1.5× | 2.5× |",
     ]
     assert tables.peers_table(operators, "polar_sample", ["fast"]).count("\n") == 2
     assert tables.peers_table(operators, "polar_sample", ["peer"]).count("\n") == 1

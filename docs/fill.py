@@ -1,10 +1,11 @@
-"""Fills the README's tables from the results of the benchmarks and of the study: `make readme`.
+"""Fills the tables of README and pages from what benchmarks and studies found: `make tables`.
 
 In a benchmark's table "a / b" is at one and at two threads, and a ratio is the time of what one
 would write without the operator, over ours.
 """
 
 import json
+import re
 import statistics
 import sys
 from collections.abc import Sequence
@@ -17,15 +18,26 @@ from darswin.bench import tables as bench  # noqa: E402
 from darswin.bench.record import Record  # noqa: E402
 from darswin.bench.timing import Timing  # noqa: E402
 
-README = ROOT / "README.md"
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 RESULTS = ROOT / "benchmarks" / "results"
 
 SAMPLING_PEERS = ("F.grid_sample", "F.grid_sample + permute", "cv2.remap")
 EMBED_PEERS = ("F.grid_sample + permute + F.linear", "F.linear alone")
+# The README's rows: subject, mode, setting, batch.
+SPEED = (
+    ("polar_sample", "forward", "256×256", 8),
+    ("polar_sample", "forward+backward", "256×256", 8),
+    ("polar_embed", "forward", "256×256", 8),
+    ("window_attention", "forward", "A stage 1", 32),
+    ("window_attention", "forward+backward", "A stage 1", 32),
+    ("darswin_a_small", "inference, float32", "64×64", 8),
+    ("darswin_a_small", "inference, bfloat16", "64×64", 8),
+    ("darswin_a_small", "training, float32", "64×64", 8),
+)
 
 
 def drop_in_line(timings: Sequence[Timing]) -> str:
-    """How much faster the README's own call is than what it replaces."""
+    """How much faster the call of howto/use.md is than what it replaces."""
     found = [
         t
         for t in timings
@@ -46,7 +58,7 @@ def demo_table(record: dict) -> str:
 
 
 def tables() -> dict[str, str]:
-    """All tables, by the name of their place in the README."""
+    """All tables, by the name of their place in a page."""
     import learned_tables
     import tables as study
 
@@ -60,6 +72,7 @@ def tables() -> dict[str, str]:
     return {
         "demo": demo_table(json.loads((ROOT / "docs" / "accuracy.json").read_text())),
         "drop-in": drop_in_line(sampling),
+        "speed": bench.best_table([*sampling, *attention, *model.timings], SPEED),
         "missed": bench.missed_table([*sampling, *attention]),
         "model": bench.models_table(model.timings),
         "model memory": bench.memory_table(model.memory),
@@ -78,11 +91,13 @@ def placed(name: str, table: str) -> str:
 
 
 def main() -> None:
-    text = README.read_text()
-    for name, table in tables().items():
-        before, rest = text.split(f"<!-- table: {name} -->")
-        text = before + placed(name, table) + rest.split(f"<!-- end: {name} -->")[1]
-    README.write_text(text)
+    found = tables()
+    for page in PAGES:
+        text = page.read_text()
+        for name in re.findall(r"<!-- table: (.*) -->", text):
+            before, rest = text.split(f"<!-- table: {name} -->")
+            text = before + placed(name, found[name]) + rest.split(f"<!-- end: {name} -->")[1]
+        page.write_text(text)
 
 
 if __name__ == "__main__":

@@ -1,43 +1,46 @@
-"""The README's code runs as it stands there."""
+"""What README and the pages say is what the records and the code say."""
 
 import json
 import re
+import shlex
 import statistics
 import sys
 from pathlib import Path
 
 import torch
 
-from darswin import create_model, lens, list_models
+from darswin import create_model, list_models
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 sys.path[:0] = [str(ROOT / "docs"), str(ROOT / "studies")]
 
-import readme  # noqa: E402
+import fill  # noqa: E402
 from cells import LEVELS, SWEEP  # noqa: E402
 
 README = (ROOT / "README.md").read_text()
 
 
-def test_python_blocks(tmp_path, monkeypatch):
-    blocks = re.findall(r"```python\n(.*?)```", README, flags=re.S)
-    monkeypatch.chdir(tmp_path)
-    lens.save(lens.Equidistant(200.0, 1.5, image_size=(640, 640)), "calibration.json")
-    scope, polar = {}, []
-    for block in blocks:
-        exec(block, scope)
-        polar.append(scope.pop("polar", None))
-    assert scope["logits"].shape == (2, 200)
-    assert scope["features"].shape == (2, 16, 1, 768)
-    polar = [image for image in polar if image is not None]
-    assert len(polar) >= 4 and all(image.shape == (2, 3, 160, 640) for image in polar)
-    torch.testing.assert_close(polar[0], polar[1], rtol=0, atol=1e-4)  # the drop-in and grid_sample
+def page(name: str) -> str:
+    return (ROOT / name).read_text()
+
+
+def prose(name: str) -> str:
+    """A page in one line."""
+    return " ".join(page(name).split())
+
+
+def test_the_readme_is_short_and_lines_fit():
+    assert README.count("\n") <= 160 and max(map(len, README.splitlines())) < 120
+    for path in fill.PAGES:
+        for line in path.read_text().splitlines():
+            assert len(line) < 120 or line.startswith("|"), (path, line)
 
 
 def test_pictures_and_links_exist():
-    for target in re.findall(r"\]\(([^)#]+)\)", README):
-        if not target.startswith("http"):
-            assert (ROOT / target).is_file(), target
+    for path in fill.PAGES:
+        for target in re.findall(r"(?:\]\(|\]: |`[^`<]* <)([^)#>\s]+)[)#>]", path.read_text()):
+            if not target.startswith("http"):
+                assert (path.parent / target).is_file(), (path, target)
 
 
 def test_what_contributors_are_sent_to_exists():
@@ -46,13 +49,18 @@ def test_what_contributors_are_sent_to_exists():
     assert len(places) > 30
     for place in places:
         assert "NAME" in place or (ROOT / place).exists(), place
-    targets = {word for words in re.findall(r"`make ([^`]*)`", text) for word in words.split()}
-    assert targets <= set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.M))
+    said = " ".join(re.findall(r"`make ([^`]*)`", text))
+    targets = set(shlex.split(re.sub(r'[A-Z_]+=("[^"]*"|\S+)', "", said)))  # variables aside
+    assert targets <= set(re.findall(r"^([a-z][\w-]*):", (ROOT / "Makefile").read_text(), re.M))
 
 
 def test_tables_are_those_of_the_results():
-    for name, table in readme.tables().items():
-        assert readme.placed(name, table) in README, name
+    tables = fill.tables()
+    pages = {path: path.read_text() for path in fill.PAGES}
+    places = [name for text in pages.values() for name in re.findall("<!-- table: (.*) -->", text)]
+    assert sorted(places) == sorted(tables)  # each in one page
+    for name, table in tables.items():
+        assert any(fill.placed(name, table) in text for text in pages.values()), name
         assert "not run" not in table
 
 
@@ -101,7 +109,7 @@ def test_what_is_said_of_the_study_is_in_its_record():
         f"accuracy falls by {lost[0]} and {lost[1]} points at the ends",
         f"Fewer samples cost {samples} points, the other position biases {biases},",
     ):
-        assert said in " ".join(README.split()), said
+        assert said in prose("docs/study.md"), said
     ahead = [
         mean(label, level, xi) - mean("DarSwin-A", level, xi)
         for label, level in runs
@@ -117,7 +125,7 @@ def test_what_is_said_of_loading_is_in_its_record():
         round(loader[key]) for key in ("all", "1 worker processes", "2 worker processes")
     )
     said = f"One core makes {one} such images a second, one worker process beside the training "
-    assert f"{said}{beside}, two {two}:" in " ".join(README.split())
+    assert f"{said}{beside}, two {two}:" in prose("docs/performance.md")
 
 
 def parameters(name: str, **options) -> int:
@@ -126,7 +134,9 @@ def parameters(name: str, **options) -> int:
 
 
 def test_parameter_counts_are_those_of_the_models():
-    counted = re.search(r"with (\d+) classes:\n\n\| \| (.*) \|\n.*\n((?:\| `.*\n)+)", README)
+    counted = re.search(
+        r"with (\d+) classes:\n\n\| \| (.*) \|\n.*\n((?:\| `.*\n)+)", page("docs/howto/use.md")
+    )
     classes, sizes, rows = int(counted[1]), counted[2].split(" | "), counted[3].splitlines()
     told = set()
     for row in rows:
@@ -148,10 +158,10 @@ def test_the_demo_shows_its_point():
             assert ours[-1] - theirs[-1] >= 15
         fell[name] = statistics.mean(run[0] - run[-1] for run in seeds[name])
     words = f"falls by {fell['without lens knowledge']:.0f} points, and Swin by {fell['Swin']:.0f}"
-    assert words in " ".join(README.split())
+    assert words in prose("README.md") and words in prose("docs/demo.md")
 
 
 def test_the_demos_model_is_as_large_as_it_says():
-    (millions,) = re.findall(r"`darswin_a_nano` \(([\d.]+) M parameters", README)
+    (millions,) = re.findall(r"`darswin_a_nano` \(([\d.]+) M parameters", page("docs/demo.md"))
     count = parameters("darswin_a_nano", num_classes=10, in_chans=1)
     assert round(count / 1e6, len(millions.partition(".")[2])) == float(millions)

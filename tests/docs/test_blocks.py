@@ -1,0 +1,170 @@
+"""Every block of code on README and the pages runs as it stands there.
+
+Python runs, a page's blocks in order and in one namespace, the README's each in its own; so do
+commands of `darswin`, on few pictures for one epoch. What would install something or take hours is
+checked against what declares it: the Makefile, pyproject.toml, the programs' own parsers.
+"""
+
+import ast
+import re
+import shlex
+import sys
+import tomllib
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from helpers import fixture
+
+from darswin.cli.main import main
+
+ROOT = Path(__file__).parents[2]
+sys.path.insert(0, str(ROOT / "studies"))
+
+import study  # noqa: E402
+
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+FENCE = re.compile(r"^(`{3,}|:{3,})(\S*)[^\n]*\n(.*?)^\1$", re.M | re.S)
+DIRECTIVES = {"{toctree}", "{eval-rst}", "{include}", "{warning}"}  # Sphinx builds these
+SHOWN = {"bibtex"}
+QUICK = [
+    *("--data.limit", "40", "--data.batch_size", "8", "--data.workers", "0"),
+    *("--trainer.max_epochs", "1", "--trainer.logger", "false"),
+    *("--trainer.enable_progress_bar", "false"),
+]
+
+
+class Block(NamedTuple):
+    language: str
+    text: str
+
+
+def blocks(page: Path) -> list[Block]:
+    return [Block(match[2], match[3]) for match in FENCE.finditer(page.read_text())]
+
+
+CODE = [page for page in PAGES if {block.language for block in blocks(page)} - DIRECTIVES - SHOWN]
+
+
+def page_name(page: Path) -> str:
+    return str(page.relative_to(ROOT))
+
+
+def test_every_block_is_of_a_kind_that_is_checked():
+    for page in PAGES:
+        text, found = page.read_text(), blocks(page)
+        for block in found:
+            assert block.language in {"python", "sh"} | DIRECTIVES | SHOWN, (page, block)
+        assert len(re.findall(r"^(?:```|:::)", text, re.M)) == 2 * len(found), page
+    assert len(CODE) > 12
+    assert [page_name(p) for p in PAGES if any(b.language in SHOWN for b in blocks(p))] == [
+        "README.md"
+    ]
+
+
+@pytest.fixture
+def scratch(tmp_path, monkeypatch):
+    """A folder with what pages take for granted: a checkout's examples, photos, a checkpoint."""
+    monkeypatch.chdir(tmp_path)
+    for folder in ("examples", "darswin"):
+        (tmp_path / folder).symlink_to(ROOT / folder)
+    random = np.random.default_rng(0)
+    for name in ("cat", "dog"):
+        (tmp_path / "photos" / name).mkdir(parents=True)
+        for k in range(12):
+            picture = random.integers(256, size=(48, 64, 3), dtype=np.uint8)
+            cv2.imwrite(f"photos/{name}/{k}.jpg", picture)
+    for name in ("a.jpg", "b.jpg"):
+        cv2.imwrite(name, picture)
+    torch.save(fixture("polar")[1], "checkpoint.pth")
+    return tmp_path
+
+
+@pytest.mark.unsanitized
+@pytest.mark.parametrize("page", CODE, ids=page_name)
+def test_code_runs_as_it_stands(page, scratch, monkeypatch):
+    scope: dict = {}
+    for block in blocks(page):
+        if block.language == "python":
+            scope = {} if page.name == "README.md" else scope
+            run_python(block.text, scope)
+        elif block.language == "sh":
+            for command in commands(block.text):
+                PROGRAMS[command[0]](command[1:], monkeypatch)
+
+
+def run_python(text: str, scope: dict) -> None:
+    """Runs a block, and holds each `x = …  # (2, 3)` against the shape of x."""
+    exec(compile(text, "<page>", "exec"), scope)
+    lines, shapes = text.splitlines(), {}
+    for node in ast.parse(text).body:
+        if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name):
+            said = re.search(r"# \((\d+(?:, \d+)*)\)", lines[node.end_lineno - 1])
+            shapes[node.targets[0].id] = said and tuple(map(int, said[1].split(", ")))
+    for name, shape in shapes.items():
+        assert shape is None or tuple(scope[name].shape) == shape, name
+
+
+def commands(text: str) -> list[list[str]]:
+    """The words of each line, `\\` at the end of one joining it with the next."""
+    return [shlex.split(line) for line in text.replace("\\\n", " ").splitlines() if line.strip()]
+
+
+def run_darswin(arguments: list[str], monkeypatch) -> None:
+    """Runs a command; `bench` is only parsed."""
+    monkeypatch.setattr("darswin.cli.bench.bench", lambda **options: None)
+    command, *options = arguments
+    main([command, *(QUICK if command == "fit" else ()), *options])
+
+
+def check_make(targets: list[str], monkeypatch) -> None:
+    declared = set(re.findall(r"^([a-z][\w-]*):", (ROOT / "Makefile").read_text(), re.M))
+    assert set(targets) <= declared
+
+
+def check_pip(arguments: list[str], monkeypatch) -> None:
+    """Extras must be declared, and packages be what building or an extra asks for."""
+    content = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    extras = content["project"]["optional-dependencies"]
+    asked = [*content["build-system"]["requires"], *(p for e in extras.values() for p in e)]
+    names = {re.match(r"[\w.-]+", requirement)[0] for requirement in asked}
+    assert arguments[0] == "install"
+    for word in arguments[1:]:
+        if word.startswith("."):
+            assert word == "." or word[2:-1] in extras, word
+        else:
+            assert word == "--no-build-isolation" or word in names, word
+
+
+def check_study(arguments: list[str], monkeypatch) -> None:
+    """Its own options are read as it reads them, the others as `darswin fit` does."""
+    assert arguments[0] == "studies/study.py"
+    asked: list = []
+    monkeypatch.setattr(study, "run_all", lambda _, jobs, *rest: asked.extend(jobs) or [])
+    monkeypatch.setattr(study, "collect", lambda *results: None)
+    study.main(arguments[1:])
+    *_, options = asked[0]
+    with pytest.raises(SystemExit) as end:
+        main(["fit", "--run", "runs/parsed", "--data.path", "digits", *options, "--print_config"])
+    assert end.value.code in (0, None)
+
+
+PROGRAMS: dict[str, Callable] = {
+    "darswin": run_darswin,
+    "make": check_make,
+    "pip": check_pip,
+    "python": check_study,
+}
+
+
+@pytest.mark.unsanitized
+def test_the_drop_in_gives_the_values_of_what_it_replaces(scratch):
+    scope: dict = {}
+    for block in blocks(ROOT / "docs/howto/use.md"):
+        if block.language == "python" and "PolarSample" not in block.text:
+            run_python(block.text, scope)
+    torch.testing.assert_close(scope["polar"], scope["by_mesh"], rtol=0, atol=1e-4)
