@@ -39,12 +39,11 @@ class Sampling(NamedTuple):
     std: Sequence[float]
     bfloat16: bool  # whether the output is
 
-    @property
+    # Methods, not properties: Dynamo of torch 2.10 cannot trace a NamedTuple's properties.
     def token_size(self) -> int:
         """Values of a token: S_r·S_φ·C."""
         return self.samples[0] * self.samples[1] * self.image.shape[1]
 
-    @property
     def map_size(self) -> tuple[int, int, int]:
         """(B, R, A) of the tokens."""
         rings = self.radii.shape[1] // self.samples[0]

@@ -63,7 +63,7 @@ def polar_embed(
     dtypes = (torch.float64,) if double else (torch.float32, torch.bfloat16)
     check_tensor("weight", weight, like=image, dtypes=dtypes)
     form = "(D, S_r·S_φ·C) = (any, {})"
-    check_shape("weight", weight, form, (None, sampling.token_size))
+    check_shape("weight", weight, form, (None, sampling.token_size()))
     if bias is not None:
         check_tensor("bias", bias, like=image, dtypes=dtypes)
         check_shape("bias", bias, "(D,) = ({},)", (weight.shape[0],))
@@ -74,7 +74,7 @@ def polar_embed(
 def _fake(*arguments):
     *fields, weight, _bias = arguments
     sampling = Sampling(*fields)
-    return sampling.new_output((*sampling.map_size, weight.shape[0]))
+    return sampling.new_output((*sampling.map_size(), weight.shape[0]))
 
 
 @torch.library.register_fake("darswin::polar_embed_backward")

@@ -98,7 +98,7 @@ def _fake(*arguments):
     *fields, tokens = arguments
     sampling = Sampling(*fields)
     if tokens:
-        return sampling.new_output((*sampling.map_size, sampling.token_size))
+        return sampling.new_output((*sampling.map_size(), sampling.token_size()))
     rows, columns = sampling.radii.shape[1], sampling.azimuths.shape[0]
     return sampling.new_output((*sampling.image.shape[:2], rows, columns))
 

@@ -117,9 +117,9 @@ def polar_sample(sampling: Sampling, tokens: bool) -> Tensor:
     out = out.bfloat16() if sampling.bfloat16 else out
     if not tokens:
         return out
-    size, (along, around) = sampling.map_size, sampling.samples
+    size, (along, around) = sampling.map_size(), sampling.samples
     out = out.reshape(batch, channels, size[1], along, size[2], around)
-    return out.permute(0, 2, 4, 3, 5, 1).reshape(*size, sampling.token_size)
+    return out.permute(0, 2, 4, 3, 5, 1).reshape(*size, sampling.token_size())
 
 
 def polar_embed(sampling: Sampling, weight: Tensor, bias: Tensor | None) -> Tensor:
