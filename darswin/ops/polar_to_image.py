@@ -63,7 +63,7 @@ def polar_to_image(
     Raises:
         TypeError: a tensor of another dtype, or an argument of another type.
         ValueError: a shape, device or range that does not fit, or radii that do not rise.
-            NotImplementedError: forward-mode derivatives, those of torch.func, and second ones.
+        NotImplementedError: forward-mode derivatives, those of torch.func, and second ones.
     """
     if isinstance(x, Tensor):
         x = _library.without_float16(x)
