@@ -86,6 +86,7 @@ format: $(STAMP)  ## ruff and clang-format, in place
 bench: build  ## time the operators against their peers, and training; nothing else should be running
 	$(BIN)/python benchmarks/sampling.py --out benchmarks/results
 	$(BIN)/python benchmarks/attention.py --out benchmarks/results
+	$(BIN)/python benchmarks/to_image.py --out benchmarks/results
 	$(BIN)/python benchmarks/training.py --out benchmarks/results
 	$(BIN)/python -m darswin bench --out benchmarks/results
 

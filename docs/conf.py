@@ -50,8 +50,10 @@ def one_a_line(app, what, name, obj, options, lines):
             indent = None
         if indent is not None:
             line = re.sub(r"(?<=[.;]) (?=[a-zA-Z_]\w*(, \w+)*: )", "\n" + " " * indent, line)
+            line = re.sub(r"(: [A-Z])\.$", r"\1\\.", line, flags=re.M)  # "A." begins no list
         found += line.split("\n")
-    lines[:] = found
+    # What Python writes for a NamedTuple's fields says nothing.
+    lines[:] = [line for line in found if not line.startswith("Alias for field number")]
 
 
 def short(app, what, name, obj, options, signature, returns):

@@ -66,7 +66,7 @@ def share(close: np.ndarray) -> str:
 
 def recovery_table(cameras: list[dict]) -> str:
     """A row a problem and loss, on all images: how far descents end from the true lens, how often
-    near it, how often no higher than it, and the accuracy."""
+    near it, how often no higher than it, and the accuracy. A problem is named in its first row."""
     heads = [
         "unknown", "loss", "start (px)", "found (px): median, 90 %", f"below {CLOSE} px",
         f"lower of {STARTS} starts below {CLOSE} px", "loss ≤ the true lens's",
@@ -84,7 +84,7 @@ def recovery_table(cameras: list[dict]) -> str:
                 for of in ("start", "found", "true")
             )
             row = [
-                UNKNOWN[problem],
+                UNKNOWN[problem] if loss == LOSSES[0] else "",
                 loss,
                 f"{np.median(distances(trials, 'start')):.2f}",
                 f"{np.median(found):.2f}, {np.quantile(found, 0.9):.2f}",

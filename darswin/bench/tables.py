@@ -65,7 +65,7 @@ def attention_table(timings: Sequence[Timing]) -> str:
                 (setting, batch), [f"{setting}, batch {batch}", _milliseconds(found[OURS])]
             )
             row += [_ratios(best), _ratios(found["eager"])]
-    heads = [head for mode in columns for head in (f"{mode}: best peer", "eager")]
+    heads = [head for mode in columns for head in (f"{mode}: best peer", f"{mode}: eager")]
     return markdown(["`window_attention`", "ours, forward (ms)", *heads], rows.values())
 
 

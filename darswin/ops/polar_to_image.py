@@ -48,7 +48,7 @@ def polar_to_image(
         points: (B or 1, H, W, 2) px, for a lens that is not circular: where each pixel's ray lies
             on the plane of radius and azimuth, as (r cos φ, r sin φ). It takes the place of center
             and affine. Pixels at NaN or infinity are zero.
-        r_max: px, where the image ends: a number, or (B or 1,). None: nowhere.
+        r_max: px, where the image ends: a number, or (B or 1,); None means nowhere.
         layout: "image" or "tokens".
 
     Returns:
@@ -63,7 +63,7 @@ def polar_to_image(
     Raises:
         TypeError: a tensor of another dtype, or an argument of another type.
         ValueError: a shape, device or range that does not fit, or radii that do not rise.
-            NotImplementedError: forward-mode derivatives, those of torch.func, and second ones.
+        NotImplementedError: forward-mode derivatives, those of torch.func, and second ones.
     """
     if isinstance(x, Tensor):
         x = _library.without_float16(x)
