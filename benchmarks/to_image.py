@@ -54,7 +54,7 @@ def to_image(
         return image.permute(0, 2, 3, 1).contiguous() if layout == "tokens" else image
 
     case = Case(
-        "polar_to_image", f"{rings}×{sectors}×{channels} → {size}×{size}", batch,
+        "polar_to_image", f"{rings}×{sectors} → {size}×{size}", batch,
         torch.get_num_threads(), f"{mode}, layout {layout}",
     )  # fmt: skip
     target = CASES[sizes][layout == "image"] if mode == "forward" else 8.0

@@ -28,6 +28,7 @@ SPEED = (
     ("polar_sample", "forward", "256×256", 8),
     ("polar_sample", "forward+backward", "256×256", 8),
     ("polar_embed", "forward", "256×256", 8),
+    ("polar_to_image", "forward, layout tokens", "64×256 → 256×256", 2),
     ("window_attention", "forward", "A stage 1", 32),
     ("window_attention", "forward+backward", "A stage 1", 32),
     ("darswin_a_small", "inference, float32", "64×64", 8),
@@ -43,7 +44,7 @@ def drop_in_line(timings: Sequence[Timing]) -> str:
         for t in timings
         if (t.subject, t.mode, t.name) == ("polar_sample", "forward, layout image", "F.grid_sample")
     ]
-    cases = ", ".join(dict.fromkeys(f"{t.setting}, batch {t.batch}" for t in found))
+    cases = "; ".join(dict.fromkeys(f"{t.setting}, batch {t.batch}" for t in found))
     low, high = (end(t.ratio for t in found) for end in (min, max))
     return f"{low:.1f} to {high:.1f} times as fast as `F.grid_sample`, this very call ({cases})."
 
@@ -64,6 +65,7 @@ def tables() -> dict[str, str]:
 
     studies = ROOT / "studies" / "results"
     sampling = Record.load(RESULTS / "sampling--avx512.json").timings
+    to_image = Record.load(RESULTS / "to_image--avx512.json").timings
     attention = Record.load(RESULTS / "attention--avx512.json").timings
     model = Record.load(RESULTS / "model--avx512.json")
     training = json.loads((RESULTS / "training--micro.json").read_text())
@@ -72,12 +74,13 @@ def tables() -> dict[str, str]:
     return {
         "demo": demo_table(json.loads((ROOT / "docs" / "accuracy.json").read_text())),
         "drop-in": drop_in_line(sampling),
-        "speed": bench.best_table([*sampling, *attention, *model.timings], SPEED),
-        "missed": bench.missed_table([*sampling, *attention]),
+        "speed": bench.best_table([*sampling, *to_image, *attention, *model.timings], SPEED),
+        "missed": bench.missed_table([*sampling, *to_image, *attention]),
         "model": bench.models_table(model.timings),
         "model memory": bench.memory_table(model.memory),
         "sampling": bench.peers_table(sampling, "polar_sample", SAMPLING_PEERS),
         "embedding": bench.peers_table(sampling, "polar_embed", EMBED_PEERS),
+        "to image": bench.peers_table(to_image, "polar_to_image", ("F.pad + F.grid_sample",)),
         "attention": bench.attention_table(attention),
         "training": bench.training_table(training["models"]),
         **study.tables(cells),
