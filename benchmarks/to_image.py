@@ -55,7 +55,7 @@ def to_image(
 
     case = Case(
         "polar_to_image", f"{rings}×{sectors} → {size}×{size}", batch,
-        torch.get_num_threads(), f"{mode}, layout {layout}",
+        torch.get_num_threads(), mode if layout == "image" else f"{mode}, layout {layout}",
     )  # fmt: skip
     target = CASES[sizes][layout == "image"] if mode == "forward" else 8.0
     # grid_sample's coordinates are float32, in units of the whole map.

@@ -28,7 +28,7 @@ SPEED = (
     ("polar_sample", "forward", "256×256", 8),
     ("polar_sample", "forward+backward", "256×256", 8),
     ("polar_embed", "forward", "256×256", 8),
-    ("polar_to_image", "forward, layout tokens", "64×256 → 256×256", 2),
+    ("polar_to_image", "forward", "64×256 → 256×256", 2),
     ("window_attention", "forward", "A stage 1", 32),
     ("window_attention", "forward+backward", "A stage 1", 32),
     ("darswin_a_small", "inference, float32", "64×64", 8),
