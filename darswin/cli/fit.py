@@ -26,10 +26,10 @@ from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from darswin.cli.arguments import with_lists
 from darswin.cli.help import ALL, format_help
 from darswin.data.lenses import parse_sweep
-from darswin.models.saving import model_of_run
+from darswin.models.saving import model_of_run, read_card
 from darswin.train.checkpoints import RunCheckpoint, SafeCheckpointIO
 from darswin.train.data import WideAngleData
-from darswin.train.finetuning import read_card, settle
+from darswin.train.finetuning import settle, weights_file
 from darswin.train.results import WriteResults
 from darswin.train.resuming import check_changes
 from darswin.train.stopping import StopSignals, StopWhenTold
@@ -244,7 +244,8 @@ class RunCLI(LightningCLI):
         if weights is not None and Path(weights).exists():
             weights = config.model.weights = str(Path(weights).resolve())
         if weights is not None and not (config.resume and _last(self.folder).exists()):
-            model, data = settle(read_card(weights), weights, config.model, config.data)
+            card = read_card(weights_file(weights))
+            model, data = settle(card, weights, config.model, config.data)
             for group, settled in ((config.model, model), (config.data, data)):
                 for name, value in settled.items():
                     group[name] = value

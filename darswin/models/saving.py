@@ -2,7 +2,8 @@
 
 import json
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any, Literal
@@ -15,6 +16,8 @@ from darswin.models.encoder import Encoder
 from darswin.models.pretrained import list_pretrained, pretrained_file
 from darswin.models.registry import create_model
 from darswin.utils.files import replace_file
+
+Task = Literal["classification", "segmentation", "distance"]
 
 _ENTRY = "darswin"  # of the metadata
 
@@ -34,6 +37,8 @@ class ModelCard:
             where calibrations say it.
         fit: how a camera's pictures get that size, as `darswin.data.frames.at_size` takes it:
             "whole" where it was trained through the lenses of `darswin.data.WideAngle`.
+        task: what it tells: a class for an image, or a class or a distance for each pixel.
+        colors: (r, g, b) in 0 … 255 of each class, where the data say them.
     """
 
     model: str
@@ -42,6 +47,8 @@ class ModelCard:
     size: int = 64
     fov: float = 0.0
     fit: Literal["crop", "stretch", "whole"] = "whole"
+    task: Task = "classification"
+    colors: Sequence[Sequence[int]] = field(default_factory=list)
 
     def create(self) -> Encoder:
         """The model, with new weights."""
@@ -67,6 +74,17 @@ def model_of_run(run: str | os.PathLike, suffix: str = ".safetensors") -> Path:
     raise FileNotFoundError(f"there is no model in {run} yet")
 
 
+def read_card(path: str | os.PathLike) -> ModelCard:
+    """The card of a model's file, or of a name in `list_pretrained()`, without its weights.
+
+    Raises:
+        NoCardError: other weights. ValueError: no model file of darswin.
+    """
+    path = _model_file(path)
+    with _opened(path) as file:
+        return _card(file, path)
+
+
 def load_model(path: str | os.PathLike) -> tuple[Encoder, ModelCard]:
     """The model of a file, or of a name in `list_pretrained()`, in eval mode, and its card.
 
@@ -74,26 +92,46 @@ def load_model(path: str | os.PathLike) -> tuple[Encoder, ModelCard]:
         NoCardError: other weights. ValueError: no model file of darswin, or weights that are not
             those of its model.
     """
-    if path in list_pretrained():
-        path = pretrained_file(str(path))
+    path = _model_file(path)
+    with _opened(path) as file:
+        card = _card(file, path)
+        weights = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    try:
+        model = card.create()
+        model.load_state_dict(weights)
+    except (ValueError, KeyError, TypeError, RuntimeError) as error:
+        raise _unknown(path, error) from error
+    model.pretrained_cfg |= dict(label_names=tuple(card.classes), file=str(path))
+    if model.image_size is None:
+        model.pretrained_cfg["input_size"] = (model.in_chans, card.size, card.size)
+    return model.eval(), card
+
+
+def _model_file(path: str | os.PathLike) -> str | os.PathLike:
+    return pretrained_file(str(path)) if path in list_pretrained() else path
+
+
+@contextmanager
+def _opened(path: str | os.PathLike) -> Iterator[Any]:
     try:
         with safe_open(path, "pt") as file:
-            entry = (file.metadata() or {}).get(_ENTRY)
-            weights = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+            yield file
     except SafetensorError as error:
         raise ValueError(f"{path} is no safetensors file: {error}") from error
+
+
+def _card(file: Any, path: str | os.PathLike) -> ModelCard:
+    entry = (file.metadata() or {}).get(_ENTRY)
     if entry is None:
         raise NoCardError(f"{path} holds weights, but not the name of their model")
     try:
         values = json.loads(entry)
         # Older files do not say all of it.
         known = {field.name for field in fields(ModelCard)}
-        card = ModelCard(**{name: values[name] for name in known if name in values})
-        model = card.create()
-        model.load_state_dict(weights)
-    except (ValueError, KeyError, TypeError, RuntimeError) as error:
-        raise ValueError(f"{path} is no model that this darswin can build: {error}") from error
-    model.pretrained_cfg |= dict(label_names=tuple(card.classes), file=str(path))
-    if model.image_size is None:
-        model.pretrained_cfg["input_size"] = (model.in_chans, card.size, card.size)
-    return model.eval(), card
+        return ModelCard(**{name: values[name] for name in known if name in values})
+    except (ValueError, TypeError) as error:
+        raise _unknown(path, error) from error
+
+
+def _unknown(path: str | os.PathLike, error: Exception) -> ValueError:
+    return ValueError(f"{path} is no model that this darswin can build: {error}")

@@ -20,15 +20,6 @@ def weights_file(weights: str | Path) -> str | Path:
     return model_of_run(weights) if Path(weights).is_dir() else weights
 
 
-def read_card(weights: str | Path) -> ModelCard:
-    """What a model says of itself.
-
-    Raises:
-        ValueError, OSError: as `darswin.models.load_model`; a run without a model.
-    """
-    return load_model(weights_file(weights))[1]
-
-
 def own_options(card: ModelCard) -> dict[str, Any]:
     """The options of a model but for those that the data decide."""
     return {name: value for name, value in card.options.items() if name not in OF_DATA}

@@ -19,9 +19,9 @@ from darswin.layers.linear import MatmulBackend
 from darswin.lens import Lens
 from darswin.models.encoder import Encoder
 from darswin.models.registry import model_class
-from darswin.models.saving import ModelCard
+from darswin.models.saving import ModelCard, read_card
 from darswin.train.data import WideAngleData
-from darswin.train.finetuning import frozen_parts, own_options, read_card, start_from
+from darswin.train.finetuning import frozen_parts, own_options, start_from, weights_file
 from darswin.train.recipe import Schedule, parameter_groups
 
 DEFAULT_MODEL = "darswin_a_micro"
@@ -95,7 +95,7 @@ class Classification(LightningModule):
                 f"--model.freeze_stages {freeze_stages} keeps trained stages: give --model.weights"
             )
         if name is None and weights is not None:
-            card = read_card(weights)
+            card = read_card(weights_file(weights))
             name, options = card.model, own_options(card) | (options or {})
         self.name, self.options = name or DEFAULT_MODEL, options or {}
         model_class(self.name)
