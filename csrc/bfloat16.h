@@ -9,4 +9,16 @@ struct bfloat16 {
   uint16_t bits;
 };
 
+// The type in which a storage type is computed.
+template <typename T>
+struct ArithmeticOf {
+  using type = T;
+};
+template <>
+struct ArithmeticOf<bfloat16> {
+  using type = float;
+};
+template <typename T>
+using Arithmetic = typename ArithmeticOf<T>::type;
+
 }  // namespace darswin

@@ -30,12 +30,14 @@ MaybeTensor contiguous(const MaybeTensor& tensor) {
 }
 
 // One call's arguments as the kernels take them. Owns what `args` points into.
-template <typename T, typename Real>
+template <typename T>
 struct Call {
+  using Real = Arithmetic<T>;
+
   Tensor x, radii;
   MaybeTensor center, affine, points, r_max;
   std::vector<double> plane;
-  PolarToImageArgs<T, Real> args{};
+  PolarToImageArgs<T> args{};
 
   Call(const Tensor& x_, const Tensor& radii_, const MaybeTensor& center_,
        const MaybeTensor& affine_, const MaybeTensor& points_, const MaybeTensor& r_max_,
@@ -112,44 +114,44 @@ struct Call {
 
   template <typename Kernel>
   void run(int64_t items, Kernel kernel) {
-    const int64_t bytes = kernels<PolarToImageKernels<T, Real>>().scratch(args);
+    const int64_t bytes = kernels<PolarToImageKernels<T>>().scratch(args);
     parallel_ranges(
         items, [&](int64_t begin, int64_t end) { kernel(args, begin, end, Scratch(bytes).get()); });
   }
 };
 
-template <typename T, typename Real>
-Tensor forward(Call<T, Real>&& call) {
+template <typename T>
+Tensor forward(Call<T>&& call) {
   auto& args = call.args;
   const Tensor out = torch::stable::new_empty(call.x, call.output_sizes());
   if (out.numel() == 0) return out;
   ask_for_large_pages(out);
   args.out = static_cast<T*>(out.mutable_data_ptr());
-  call.run(args.batch * args.height, kernels<PolarToImageKernels<T, Real>>().forward);
+  call.run(args.batch * args.height, kernels<PolarToImageKernels<T>>().forward);
   return out;
 }
 
 // Into how many bands an image is cut, so that few channels of few images use all threads, too.
 // It must not depend on the number of threads, or the sums would.
-template <typename T, typename Real>
-int64_t count_bands(const PolarToImageArgs<T, Real>& args) {
+template <typename T>
+int64_t count_bands(const PolarToImageArgs<T>& args) {
   constexpr int64_t kItems = 16;
   const int64_t blocks = (args.channels + kChannelBlock - 1) / kChannelBlock;
   const int64_t most = args.height * args.width / (4 * args.rings * args.sectors);
   return std::clamp<int64_t>(kItems / (args.batch * blocks), 1, std::max<int64_t>(most, 1));
 }
 
-template <typename T, typename Real>
-Tensor map_gradient(Call<T, Real>& call) {
+template <typename T>
+Tensor map_gradient(Call<T>& call) {
   auto& args = call.args;
-  const auto& kernel = kernels<PolarToImageKernels<T, Real>>();
+  const auto& kernel = kernels<PolarToImageKernels<T>>();
   const int64_t pixels = args.height * args.width;
   if (call.x.numel() == 0 || pixels == 0) return torch::stable::new_zeros(call.x, call.x.sizes());
   const Tensor grad = torch::stable::new_empty(call.x, call.x.sizes());
   ask_for_large_pages(grad);
   args.grad_x = static_cast<T*>(grad.mutable_data_ptr());
   args.bands = count_bands(args);
-  std::vector<Real> partial(args.bands > 1 ? args.bands * grad.numel() : 0);
+  std::vector<Arithmetic<T>> partial(args.bands > 1 ? args.bands * grad.numel() : 0);
   args.partial = partial.data();
   const int64_t blocks = (args.channels + kChannelBlock - 1) / kChannelBlock;
   call.run(args.batch * args.bands * blocks, kernel.backward_map);
@@ -161,15 +163,16 @@ Tensor map_gradient(Call<T, Real>& call) {
 }
 
 // The gradients of radii, center, affine and points, in this order.
-template <typename T, typename Real>
-std::vector<Tensor> lens_gradients(Call<T, Real>& call) {
+template <typename T>
+std::vector<Tensor> lens_gradients(Call<T>& call) {
   auto& args = call.args;
   const int64_t row = args.rings + kSums;
   std::vector<double> sums(args.lenses * args.height * row, 0.0);
-  std::vector<Real> points(args.points == nullptr ? 0 : args.lenses * args.height * args.width * 2);
+  std::vector<Arithmetic<T>> points(
+      args.points == nullptr ? 0 : args.lenses * args.height * args.width * 2);
   args.grad_rows = sums.data();
   args.grad_points = args.points == nullptr ? nullptr : points.data();
-  call.run(args.lenses * args.height, kernels<PolarToImageKernels<T, Real>>().backward_lens);
+  call.run(args.lenses * args.height, kernels<PolarToImageKernels<T>>().backward_lens);
 
   std::vector<double> lens(args.lenses * row, 0.0);
   for (int64_t item = 0; item < args.lenses * args.height; ++item) {
@@ -184,7 +187,7 @@ std::vector<Tensor> lens_gradients(Call<T, Real>& call) {
     for (int64_t n = 0; n < args.lenses && of->size(0) > 0; ++n) {
       add(n, total.data() + (of->size(0) == 1 ? 0 : n * values));
     }
-    std::copy(total.begin(), total.end(), static_cast<Real*>(grad.mutable_data_ptr()));
+    std::copy(total.begin(), total.end(), static_cast<Arithmetic<T>*>(grad.mutable_data_ptr()));
     return grad;
   };
   const auto on_plane = [&](int64_t n) {
@@ -217,8 +220,8 @@ std::vector<Tensor> lens_gradients(Call<T, Real>& call) {
           })};
 }
 
-template <typename T, typename Real>
-auto backward(Call<T, Real>&& call, const Tensor& grad_out_, bool x_grad, bool lens_grad) {
+template <typename T>
+auto backward(Call<T>&& call, const Tensor& grad_out_, bool x_grad, bool lens_grad) {
   // Gradients arrive expanded or strided: `.sum().backward()` gives stride 0.
   const Tensor grad_out = torch::stable::contiguous(grad_out_);
   STD_TORCH_CHECK(grad_out.sizes().vec() == call.output_sizes() && grad_out.is_cpu() &&
@@ -240,13 +243,13 @@ auto with_call(Use use, const Tensor& x, const Tensor& radii, const MaybeTensor&
   STD_TORCH_CHECK(x.is_cpu(), "polar_to_image: x must be on the CPU");
   switch (x.scalar_type()) {
     case ScalarType::Float:
-      return use(Call<float, float>(x, radii, center, affine, points, r_max, size, tokens));
+      return use(Call<float>(x, radii, center, affine, points, r_max, size, tokens));
     case ScalarType::Double:
-      return use(Call<double, double>(x, radii, center, affine, points, r_max, size, tokens));
+      return use(Call<double>(x, radii, center, affine, points, r_max, size, tokens));
     default:
       STD_TORCH_CHECK(x.scalar_type() == ScalarType::BFloat16,
                       "polar_to_image: x must be float32, float64 or bfloat16");
-      return use(Call<bfloat16, float>(x, radii, center, affine, points, r_max, size, tokens));
+      return use(Call<bfloat16>(x, radii, center, affine, points, r_max, size, tokens));
   }
 }
 

@@ -13,8 +13,10 @@ constexpr int64_t kPlane = 6;  // center x, y; inverse xx, xy, yx, yy
 // What backward sums over pixels besides the radii's gradients: of d, and of d times p - center.
 constexpr int64_t kSums = 6;
 
-template <typename T, typename Real>
+template <typename T>
 struct PolarToImageArgs {
+  using Real = Arithmetic<T>;
+
   const T* x;           // (B, R, A, D)
   const Real* radii;    // (B or 1, R), rising
   const double* plane;  // (B or 1, kPlane), or null where there are points
@@ -39,14 +41,14 @@ struct PolarToImageArgs {
 constexpr int64_t kChannelBlock = 32;
 
 // A kernel works serially through the items [begin, end); the driver owns the threads.
-template <typename T, typename Real>
+template <typename T>
 struct PolarToImageKernels {
-  using Args = PolarToImageArgs<T, Real>;
+  using Args = PolarToImageArgs<T>;
   // bytes of scratch that each thread needs in the functions below
   int64_t (*scratch)(const Args&);
   // item: (image, row of pixels)
   void (*forward)(const Args&, int64_t begin, int64_t end, void* scratch);
-  // item: (image, band of rows, block of channels) -> grad_x or partial
+  // item: (band of rows, image, block of channels) -> grad_x or partial
   void (*backward_map)(const Args&, int64_t begin, int64_t end, void* scratch);
   // item: value of grad_x, as the sum over the bands of partial
   void (*sum_bands)(const Args&, int64_t begin, int64_t end);

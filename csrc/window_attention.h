@@ -8,18 +8,6 @@
 
 namespace darswin {
 
-// The type in which a storage type is computed.
-template <typename T>
-struct ArithmeticOf {
-  using type = T;
-};
-template <>
-struct ArithmeticOf<bfloat16> {
-  using type = float;
-};
-template <typename T>
-using Arithmetic = typename ArithmeticOf<T>::type;
-
 // Windows of a polar map; token (r, a) of the rolled map is token (r + shift_r, a + shift_a) of it.
 // Windows are counted over all images: window w lies in image w / (windows of an image).
 template <typename T>

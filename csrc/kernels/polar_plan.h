@@ -2,6 +2,7 @@
 #pragma once
 
 #include "../polar_to_image.h"
+#include "arena.h"
 #include "math.h"
 #include "trig.h"
 
@@ -22,15 +23,21 @@ struct IndexOf<double> {
   using type = int64_t;
 };
 
+// What a tile of pixels is mixed from.
 template <typename Real>
-struct Plan {
+struct Mix {
   using Index = typename IndexOf<Real>::type;
 
   Index token[4][kTile];  // of the inner ring left, right; of the outer ring left, right
   Real weight[4][kTile];
   Index known[kTile];  // all ones, or 0 where the pixel is zero
+};
 
-  // How they came about.
+// How that came about.
+template <typename Real>
+struct Origin {
+  using Index = typename IndexOf<Real>::type;
+
   Real across[kTile], down[kTile], radius[kTile];  // the place on the polar plane
   Index inner[kTile], outer[kTile];                // the rings on both sides
   Real from[kTile], span[kTile];                   // the inner ring's radius, and how far the outer
@@ -39,18 +46,20 @@ struct Plan {
                                                    // in the inner ring and in the outer one
 };
 
-template <typename T, typename Real>
+template <typename T>
 class Planner {
  public:
-  using Args = PolarToImageArgs<T, Real>;
+  using Args = PolarToImageArgs<T>;
+  using Real = Arithmetic<T>;
   using V = Vector<Real, kLanes<Real>>;
-  using Index = typename Plan<Real>::Index;
+  using Index = typename Mix<Real>::Index;
   using I = Vector<Index, kLanes<Real>>;
 
   explicit Planner(const Args& args) : a(args) {}
 
   // Plans `count` pixels of a row of image b, from pixel `first` on.
-  void plan(int64_t b, int64_t row, int64_t first, int64_t count, Plan<Real>& plan) {
+  void plan(int64_t b, int64_t row, int64_t first, int64_t count, Mix<Real>& tile,
+            Origin<Real>& plan) {
     const int64_t whole = round_up(count, kLanes<Real>);
     place(a.place_rows == 1 ? 0 : b, row, first, count, plan);
     for (int64_t k = count; k < whole; ++k) plan.across[k] = plan.down[k] = 0;
@@ -61,12 +70,12 @@ class Planner {
     find_rings(a.radii + (a.radii_rows == 1 ? 0 : b) * a.rings, whole, plan);
     const Real infinity = static_cast<Real>(__builtin_inf());
     const Real limit = a.r_max == nullptr ? infinity : a.r_max[a.r_max_rows == 1 ? 0 : b];
-    for (int64_t k = 0; k < whole; k += kLanes<Real>) mix(k, limit, infinity, plan);
+    for (int64_t k = 0; k < whole; k += kLanes<Real>) mix(k, limit, infinity, tile, plan);
   }
 
  private:
   // The pixels on the polar plane.
-  void place(int64_t n, int64_t row, int64_t first, int64_t count, Plan<Real>& plan) const {
+  void place(int64_t n, int64_t row, int64_t first, int64_t count, Origin<Real>& plan) const {
     if (a.points != nullptr) {
       const Real* from = a.points + ((n * a.height + row) * a.width + first) * 2;
       for (int64_t k = 0; k < count; ++k) {
@@ -85,7 +94,7 @@ class Planner {
 
   // The rings on both sides of each pixel. Radii change little from pixel to pixel, so the search
   // begins where it ended. NaN stays where it is.
-  void find_rings(const Real* radii, int64_t count, Plan<Real>& plan) {
+  void find_rings(const Real* radii, int64_t count, Origin<Real>& plan) {
     const auto last = static_cast<Index>(a.rings - 1);
     const Real half = static_cast<Real>(0.5) * static_cast<Real>(a.sectors);
     for (int64_t k = 0; k < count; ++k) {
@@ -103,7 +112,7 @@ class Planner {
   }
 
   // Tokens and weights of a register of pixels.
-  void mix(int64_t k, Real limit, Real infinity, Plan<Real>& plan) const {
+  void mix(int64_t k, Real limit, Real infinity, Mix<Real>& tile, Origin<Real>& plan) const {
     const V x = load<V>(plan.across + k), y = load<V>(plan.down + k), r = load<V>(plan.radius + k);
     // Infinity less itself is NaN, which nothing equals.
     const I known = (x - x == 0) & (y - y == 0) & (r <= limit) & (r < infinity);
@@ -121,20 +130,69 @@ class Planner {
       I right = left + 1;
       right -= (right >= sectors) & sectors;
       const I base = load<I>(of + k) * sectors;
-      store(plan.token[2 * ring] + k, select(known, base + left, none));
-      store(plan.token[2 * ring + 1] + k, select(known, base + right, none));
-      store(plan.weight[2 * ring] + k, weight * (1 - share));
-      store(plan.weight[2 * ring + 1] + k, weight * share);
+      store(tile.token[2 * ring] + k, select(known, base + left, none));
+      store(tile.token[2 * ring + 1] + k, select(known, base + right, none));
+      store(tile.weight[2 * ring] + k, weight * (1 - share));
+      store(tile.weight[2 * ring + 1] + k, weight * share);
       store(share_to + k, share);
     };
     side(0, plan.inner, column + load<V>(plan.turn + k), 1 - t, plan.left);
     side(1, plan.outer, column, t, plan.right);
-    store(plan.known + k, known);
+    store(tile.known + k, known);
     store(plan.t + k, t);
   }
 
   const Args& a;
   Index above = 0;  // how many ring centres the last pixel was not inside of
+};
+
+template <typename T>
+bool shares_lens(const PolarToImageArgs<T>& a) {
+  return a.radii_rows == 1 && a.place_rows == 1 && a.r_max_rows == 1;
+}
+
+// The mixes of whole rows of pixels, kept for the images and channels that come next: images of one
+// lens share them. Row y has its place at y % rows.
+template <typename T>
+class Rows {
+ public:
+  using Args = PolarToImageArgs<T>;
+  using Real = Arithmetic<T>;
+
+  Rows(const Args& args, int64_t rows, Arena& arena)
+      : a(args),
+        planner(args),
+        rows(rows),
+        tiles(round_up(args.width, kTile) / kTile),
+        kept(arena.take<int64_t>(rows)),
+        mixes(arena.take<Mix<Real>>(rows * tiles)),
+        origin(arena.take<Origin<Real>>(1)) {}
+
+  // Before the first row: the memory says nothing yet.
+  void forget() const {
+    for (int64_t k = 0; k < rows; ++k) kept[k] = -1;
+  }
+
+  // The tiles of row y of image b.
+  const Mix<Real>* row(int64_t b, int64_t y) {
+    const int64_t at = y % rows, key = (shares_lens(a) ? 0 : b) * a.height + y;
+    Mix<Real>* to = mixes + at * tiles;
+    if (kept[at] == key) return to;
+    kept[at] = key;
+    for (int64_t tile = 0; tile < tiles; ++tile) {
+      const int64_t first = tile * kTile;
+      planner.plan(b, y, first, smaller(kTile, a.width - first), to[tile], *origin);
+    }
+    return to;
+  }
+
+ private:
+  const Args& a;
+  Planner<T> planner;
+  int64_t rows, tiles;
+  int64_t* kept;
+  Mix<Real>* mixes;
+  Origin<Real>* origin;
 };
 
 }  // namespace

@@ -33,20 +33,21 @@ inline void put_one(float* to, float x) { *to = x; }
 inline void put_one(double* to, double x) { *to = x; }
 inline void put_one(bfloat16* to, float x) { *to = narrow(x); }
 
-template <typename T, typename Real>
+template <typename T>
 class Forward {
  public:
-  using Args = PolarToImageArgs<T, Real>;
+  using Args = PolarToImageArgs<T>;
+  using Real = Arithmetic<T>;
   using V = Vector<Real, kLanes<Real>>;
   static constexpr int64_t kL = kLanes<Real>;
 
-  Forward(const Args& args, Plan<Real>& plan) : a(args), plan(plan), planner(args) {}
+  Forward(const Args& args, Rows<T>& rows) : a(args), rows(rows) {}
 
   void row(int64_t b, int64_t y) {
     const int64_t pixels = a.height * a.width;
-    for (int64_t first = 0; first < a.width; first += kTile) {
+    tile = rows.row(b, y);
+    for (int64_t first = 0; first < a.width; first += kTile, ++tile) {
       const int64_t count = smaller(kTile, a.width - first), place = y * a.width + first;
-      planner.plan(b, y, first, count, plan);
       const T* map = a.x + b * a.rings * a.sectors * a.channels;
       if (a.tokens) {
         tokens(map, count, a.out + (b * pixels + place) * a.channels);
@@ -58,19 +59,19 @@ class Forward {
 
  private:
   V mix(const T* map, int64_t k, int64_t c) const {
-    if (!plan.known[k]) return V{};
-    const V inner = plan.weight[0][k] * values(map + a.channels * plan.token[0][k] + c) +
-                    plan.weight[1][k] * values(map + a.channels * plan.token[1][k] + c);
-    const V outer = plan.weight[2][k] * values(map + a.channels * plan.token[2][k] + c) +
-                    plan.weight[3][k] * values(map + a.channels * plan.token[3][k] + c);
+    if (!tile->known[k]) return V{};
+    const V inner = tile->weight[0][k] * values(map + a.channels * tile->token[0][k] + c) +
+                    tile->weight[1][k] * values(map + a.channels * tile->token[1][k] + c);
+    const V outer = tile->weight[2][k] * values(map + a.channels * tile->token[2][k] + c) +
+                    tile->weight[3][k] * values(map + a.channels * tile->token[3][k] + c);
     return inner + outer;
   }
   Real mix_one(const T* map, int64_t k, int64_t c) const {
-    if (!plan.known[k]) return 0;
-    const Real inner = plan.weight[0][k] * value(map[a.channels * plan.token[0][k] + c]) +
-                       plan.weight[1][k] * value(map[a.channels * plan.token[1][k] + c]);
-    const Real outer = plan.weight[2][k] * value(map[a.channels * plan.token[2][k] + c]) +
-                       plan.weight[3][k] * value(map[a.channels * plan.token[3][k] + c]);
+    if (!tile->known[k]) return 0;
+    const Real inner = tile->weight[0][k] * value(map[a.channels * tile->token[0][k] + c]) +
+                       tile->weight[1][k] * value(map[a.channels * tile->token[1][k] + c]);
+    const Real outer = tile->weight[2][k] * value(map[a.channels * tile->token[2][k] + c]) +
+                       tile->weight[3][k] * value(map[a.channels * tile->token[3][k] + c]);
     return inner + outer;
   }
 
@@ -79,7 +80,7 @@ class Forward {
     const int64_t end = a.rings * a.sectors * a.channels - c - kL;
     bool inside = true;
     for (int corner = 0; corner < 4; ++corner) {
-      inside &= a.channels * plan.token[corner][k] <= end;
+      inside &= a.channels * tile->token[corner][k] <= end;
     }
     if (inside) return mix(map, k, c);
     V v{};
@@ -121,7 +122,11 @@ class Forward {
     Floats rows[kL];
     if (channels == kL) {
 #pragma GCC unroll 16
-      for (int i = 0; i < kL; ++i) rows[i] = mix(map, k + i, c);
+      for (int i = 0; i < kL; ++i) {
+        // The planes lie apart, which the hardware does not foresee.
+        __builtin_prefetch(to + i * stride + kL, 1);
+        rows[i] = mix(map, k + i, c);
+      }
       if constexpr (kSame<T, float>) return transpose_square(rows, to, stride);
     } else {
       for (int i = 0; i < kL; ++i) rows[i] = mix_last(map, k + i, c);
@@ -132,13 +137,13 @@ class Forward {
   }
 
   const Args& a;
-  Plan<Real>& plan;
-  Planner<T, Real> planner;
+  Rows<T>& rows;
+  const Mix<Real>* tile = nullptr;
 };
 
 // Gradients of a tile's pixels, of channels [c, c + width), as rows of `row` values, zeros behind.
-template <typename T, typename Real>
-void gather(const PolarToImageArgs<T, Real>& a, int64_t b, int64_t place, int64_t count, int64_t c,
+template <typename T, typename Real = Arithmetic<T>>
+void gather(const PolarToImageArgs<T>& a, int64_t b, int64_t place, int64_t count, int64_t c,
             int64_t width, int64_t row, Real* to) {
   constexpr int64_t kAhead = 16, kBytes = sizeof(T);
   const int64_t pixels = a.height * a.width;
@@ -184,50 +189,70 @@ void gather(const PolarToImageArgs<T, Real>& a, int64_t b, int64_t place, int64_
   }
 }
 
-// The working memory of a thread.
-template <typename T, typename Real>
-struct Workspace {
-  Plan<Real>* plan;
-  Real *gradients, *sums;
-  int64_t used;
+template <typename T>
+int64_t rows_of_band(const PolarToImageArgs<T>& a) {
+  return (a.height + a.bands - 1) / a.bands;
+}
 
-  Workspace(const PolarToImageArgs<T, Real>& a, void* memory) {
-    Arena arena{static_cast<char*>(memory)};
-    const bool backward = a.grad_out != nullptr;
+// How many rows of mixes are kept: those that come again, of other images or other channels, where
+// they need no more memory than this.
+template <typename T>
+int64_t kept_rows(const PolarToImageArgs<T>& a) {
+  constexpr int64_t kMost = int64_t{16} << 20;
+  const bool again = a.grad_out != nullptr || (a.batch > 1 && shares_lens(a));
+  const int64_t row = round_up(a.width, kTile) / kTile * sizeof(Mix<Arithmetic<T>>);
+  return again && rows_of_band(a) * row <= kMost ? rows_of_band(a) : 1;
+}
+
+// The working memory of a thread.
+template <typename T>
+struct Workspace {
+  using Real = Arithmetic<T>;
+
+  Arena arena;
+  Rows<T> rows;
+  Mix<Real>* tile;  // of backward through the lens
+  Origin<Real>* origin;
+  Real *gradients, *sums;
+
+  Workspace(const PolarToImageArgs<T>& a, void* memory)
+      : arena{static_cast<char*>(memory)}, rows(a, kept_rows(a), arena) {
+    const bool backward = a.grad_out != nullptr;  // or there are no channels
     const int64_t row = round_up(a.channels, kLanes<Real>);
-    plan = arena.take<Plan<Real>>(1);
+    tile = arena.take<Mix<Real>>(1);
+    origin = arena.take<Origin<Real>>(1);
     gradients =
         arena.take<Real>(backward ? kTile * (row > kChannelBlock ? row : kChannelBlock) : 0);
     sums = arena.take<Real>(backward ? a.rings * a.sectors * kChannelBlock : 0);
-    used = arena.used;
+    if (memory != nullptr) rows.forget();
   }
 };
 
-template <typename T, typename Real>
-int64_t scratch(const PolarToImageArgs<T, Real>& a) {
-  return Workspace<T, Real>(a, nullptr).used;
+template <typename T>
+int64_t scratch(const PolarToImageArgs<T>& a) {
+  return Workspace<T>(a, nullptr).arena.used;
 }
 
-template <typename T, typename Real>
-void forward(const PolarToImageArgs<T, Real>& a, int64_t begin, int64_t end, void* memory) {
-  const Workspace<T, Real> work(a, memory);
-  Forward<T, Real> forward(a, *work.plan);
+template <typename T>
+void forward(const PolarToImageArgs<T>& a, int64_t begin, int64_t end, void* memory) {
+  Workspace<T> work(a, memory);
+  Forward<T> forward(a, work.rows);
   for (int64_t item = begin; item < end; ++item) forward.row(item / a.height, item % a.height);
 }
 
 // Adds the gradients of a tile's pixels, rows of `row_` values, to those of their tokens. `fixed`
 // is the length of a row, or 0 where it is known only now.
 template <typename Real, int64_t fixed>
-void add(const Plan<Real>& plan, int64_t count, int64_t row_, const Real* gradients, Real* sums) {
+void add(const Mix<Real>& tile, int64_t count, int64_t row_, const Real* gradients, Real* sums) {
   using V = Vector<Real, kLanes<Real>>;
   constexpr int64_t kL = kLanes<Real>;
   const int64_t row = fixed > 0 ? fixed : row_;
   for (int64_t k = 0; k < count; ++k, gradients += row) {
-    if (!plan.known[k]) continue;
+    if (!tile.known[k]) continue;
 #pragma GCC unroll 4
     for (int corner = 0; corner < 4; ++corner) {
-      Real* to = sums + plan.token[corner][k] * row;
-      const Real weight = plan.weight[corner][k];
+      Real* to = sums + tile.token[corner][k] * row;
+      const Real weight = tile.weight[corner][k];
 #pragma GCC unroll 8
       for (int64_t e = 0; e < row; e += kL) {
         store(to + e, load<V>(to + e) + weight * load<V>(gradients + e));
@@ -236,29 +261,28 @@ void add(const Plan<Real>& plan, int64_t count, int64_t row_, const Real* gradie
   }
 }
 
-template <typename T, typename Real>
-void backward_map(const PolarToImageArgs<T, Real>& a, int64_t begin, int64_t end, void* memory) {
+template <typename T>
+void backward_map(const PolarToImageArgs<T>& a, int64_t begin, int64_t end, void* memory) {
+  using Real = Arithmetic<T>;
   constexpr int64_t kL = kLanes<Real>;
-  const Workspace<T, Real> work(a, memory);
-  Plan<Real>& plan = *work.plan;
-  Planner<T, Real> planner(a);
+  Workspace<T> work(a, memory);
   const int64_t blocks = (a.channels + kChannelBlock - 1) / kChannelBlock;
   const int64_t map = a.rings * a.sectors;
   for (int64_t item = begin; item < end; ++item) {
-    const int64_t c = item % blocks * kChannelBlock, band = item / blocks % a.bands;
-    const int64_t b = item / blocks / a.bands;
+    const int64_t c = item % blocks * kChannelBlock, b = item / blocks % a.batch;
+    const int64_t band = item / blocks / a.batch;
     const int64_t width = smaller(kChannelBlock, a.channels - c), row = round_up(width, kL);
     for (int64_t e = 0; e < map * row; ++e) work.sums[e] = 0;
-    const int64_t rows = (a.height + a.bands - 1) / a.bands;
+    const int64_t rows = rows_of_band(a);
     for (int64_t y = band * rows; y < smaller((band + 1) * rows, a.height); ++y) {
-      for (int64_t first = 0; first < a.width; first += kTile) {
+      const Mix<Real>* tile = work.rows.row(b, y);
+      for (int64_t first = 0; first < a.width; first += kTile, ++tile) {
         const int64_t count = smaller(kTile, a.width - first);
-        planner.plan(b, y, first, count, plan);
         gather(a, b, y * a.width + first, count, c, width, row, work.gradients);
         if (row == kChannelBlock) {
-          add<Real, kChannelBlock>(plan, count, row, work.gradients, work.sums);
+          add<Real, kChannelBlock>(*tile, count, row, work.gradients, work.sums);
         } else {
-          add<Real, 0>(plan, count, row, work.gradients, work.sums);
+          add<Real, 0>(*tile, count, row, work.gradients, work.sums);
         }
       }
     }
@@ -276,18 +300,18 @@ void backward_map(const PolarToImageArgs<T, Real>& a, int64_t begin, int64_t end
   }
 }
 
-template <typename T, typename Real>
-void sum_bands(const PolarToImageArgs<T, Real>& a, int64_t begin, int64_t end) {
+template <typename T>
+void sum_bands(const PolarToImageArgs<T>& a, int64_t begin, int64_t end) {
   const int64_t values = a.batch * a.rings * a.sectors * a.channels;
   for (int64_t k = begin; k < end; ++k) {
-    Real sum = a.partial[k];
+    Arithmetic<T> sum = a.partial[k];
     for (int64_t band = 1; band < a.bands; ++band) sum += a.partial[band * values + k];
     put_one(a.grad_x + k, sum);
   }
 }
 
 // sum over channels of g times a token's values
-template <typename T, typename Real>
+template <typename T, typename Real = Arithmetic<T>>
 double product(const Real* g, const T* token, int64_t channels) {
   using V = Vector<Real, kLanes<Real>>;
   constexpr int64_t kL = kLanes<Real>;
@@ -300,11 +324,13 @@ double product(const Real* g, const T* token, int64_t channels) {
   return sum;
 }
 
-template <typename T, typename Real>
-void backward_lens(const PolarToImageArgs<T, Real>& a, int64_t begin, int64_t end, void* memory) {
-  const Workspace<T, Real> work(a, memory);
-  Plan<Real>& plan = *work.plan;
-  Planner<T, Real> planner(a);
+template <typename T>
+void backward_lens(const PolarToImageArgs<T>& a, int64_t begin, int64_t end, void* memory) {
+  using Real = Arithmetic<T>;
+  const Workspace<T> work(a, memory);
+  Mix<Real>& tile = *work.tile;
+  Origin<Real>& plan = *work.origin;
+  Planner<T> planner(a);
   const int64_t map = a.rings * a.sectors * a.channels, row = round_up(a.channels, kLanes<Real>);
   const double per_turn = a.sectors / (2 * kPi);
   for (int64_t item = begin; item < end; ++item) {
@@ -315,14 +341,14 @@ void backward_lens(const PolarToImageArgs<T, Real>& a, int64_t begin, int64_t en
       const double* m = a.plane == nullptr ? nullptr : a.plane + (a.place_rows == 1 ? 0 : b) * 6;
       for (int64_t first = 0; first < a.width; first += kTile) {
         const int64_t count = smaller(kTile, a.width - first);
-        planner.plan(b, y, first, count, plan);
+        planner.plan(b, y, first, count, tile, plan);
         gather(a, b, y * a.width + first, count, int64_t{0}, a.channels, row, work.gradients);
         for (int64_t k = 0; k < count; ++k) {
-          if (!plan.known[k]) continue;
+          if (!tile.known[k]) continue;
           double s[4];  // how the loss changes with each corner's weight
           for (int corner = 0; corner < 4; ++corner) {
             s[corner] = product(work.gradients + k * row,
-                                a.x + b * map + a.channels * plan.token[corner][k], a.channels);
+                                a.x + b * map + a.channels * tile.token[corner][k], a.channels);
           }
           const double t = plan.t[k], left = plan.left[k], right = plan.right[k];
           const double by_t = (1 - right) * s[2] + right * s[3] - (1 - left) * s[0] - left * s[1];
@@ -358,23 +384,23 @@ void backward_lens(const PolarToImageArgs<T, Real>& a, int64_t begin, int64_t en
   }
 }
 
-template <typename T, typename Real>
-constexpr PolarToImageKernels<T, Real> kKernels = {.scratch = scratch<T, Real>,
-                                                   .forward = forward<T, Real>,
-                                                   .backward_map = backward_map<T, Real>,
-                                                   .sum_bands = sum_bands<T, Real>,
-                                                   .backward_lens = backward_lens<T, Real>};
+template <typename T>
+constexpr PolarToImageKernels<T> kKernels = {.scratch = scratch<T>,
+                                             .forward = forward<T>,
+                                             .backward_map = backward_map<T>,
+                                             .sum_bands = sum_bands<T>,
+                                             .backward_lens = backward_lens<T>};
 
 }  // namespace
 
 template <>
-constinit const PolarToImageKernels<float, float>
-    Kernels<PolarToImageKernels<float, float>, Tier::TIER>::table = kKernels<float, float>;
+constinit const PolarToImageKernels<float> Kernels<PolarToImageKernels<float>, Tier::TIER>::table =
+    kKernels<float>;
 template <>
-constinit const PolarToImageKernels<double, double>
-    Kernels<PolarToImageKernels<double, double>, Tier::TIER>::table = kKernels<double, double>;
+constinit const PolarToImageKernels<double>
+    Kernels<PolarToImageKernels<double>, Tier::TIER>::table = kKernels<double>;
 template <>
-constinit const PolarToImageKernels<bfloat16, float>
-    Kernels<PolarToImageKernels<bfloat16, float>, Tier::TIER>::table = kKernels<bfloat16, float>;
+constinit const PolarToImageKernels<bfloat16>
+    Kernels<PolarToImageKernels<bfloat16>, Tier::TIER>::table = kKernels<bfloat16>;
 
 }  // namespace darswin
