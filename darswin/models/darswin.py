@@ -7,10 +7,11 @@ from torch import Tensor
 
 from darswin.layers.attention import PolarWindowAttention
 from darswin.layers.embed import PolarPatchEmbed
-from darswin.layers.grid import Placement, PolarGrid, Spacing, polar_grid
+from darswin.layers.grid import Placement, PolarGrid, polar_grid
 from darswin.layers.position_bias import PositionBias, ring_angles
 from darswin.layers.sampling import check_count, check_lens
 from darswin.lens import Lens
+from darswin.lens.spacing import Spacing
 from darswin.models import official
 from darswin.models.encoder import Encoder, Prepared
 from darswin.models.registry import Presets, register_model
