@@ -3,6 +3,7 @@
 import copy
 import math
 from collections.abc import Callable
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -33,7 +34,7 @@ def network(name: str, size: int) -> Model:
     """A model of random weights, the same at every call."""
     torch.manual_seed(0)
     kind = model_class(name)
-    options = {} if kind.image_size is None else dict(image_size=size)
+    options: dict[str, Any] = {} if kind.image_size is None else dict(image_size=size)
     classes = PIXEL_CLASSES if issubclass(kind, DenseModel) else CLASSES
     return create_model(name, num_classes=classes, **options)
 

@@ -19,6 +19,7 @@ from darswin.lens import Lens
 from darswin.models.base import Model
 from darswin.models.dense import DenseModel, DensePrepared
 from darswin.models.encoder import Encoder, Prepared
+from darswin.models.feature_maps import FeatureMaps
 from darswin.models.stages import Pair, Stage
 
 Net = TypeVar("Net", bound=Model)
@@ -59,6 +60,10 @@ def optimize(model: Net, dtype: torch.dtype = torch.float32, *, lens: Lens | Non
     if isinstance(optimized, DenseModel):
         _pack_dense(optimized, dtype)
         kind = _OptimizedDense
+    elif isinstance(optimized, FeatureMaps):
+        _pack_encoder(optimized.encoder, dtype)
+        _become(optimized.encoder, _OptimizedEncoder)
+        kind = _Optimized
     elif isinstance(optimized, Encoder):
         _pack_encoder(optimized, dtype)
     if lens is None:
@@ -69,7 +74,7 @@ def optimize(model: Net, dtype: torch.dtype = torch.float32, *, lens: Lens | Non
 
 
 def _check(model: nn.Module, dtype: torch.dtype, lens: Lens | None) -> None:
-    if not isinstance(model, (Encoder, DenseModel)):
+    if not isinstance(model, (Encoder, DenseModel, FeatureMaps)):
         raise TypeError(f"model must be one of create_model, got {type(model).__name__}")
     if isinstance(model, _Optimized):
         raise TypeError("model must be one of create_model, got one that is optimized already")
