@@ -302,4 +302,4 @@ def test_an_optimized_model_prepares_a_fixed_lens_once(monkeypatch):
     with pytest.raises(TypeError, match="not saved"):
         fixed.state_dict()
     with torch.enable_grad(), pytest.raises(RuntimeError, match="has no gradients"):
-        fixed(torch.rand(1, 3, 64, 64, requires_grad=True))
+        fixed(torch.rand(1, 3, 80, 64, requires_grad=True))
