@@ -61,9 +61,9 @@ class DarSwinUnet(DenseModel):
     Rotation:
         In eval mode, without `rays` and without the skip from the image (skip_width=0), whose
         convolutions are not symmetric, a turn of a square image about the principal point by 90°
-        turns the result by 90°, up to rounding, where it turns the maps of `DarSwin`: for "darswin_unet_ra_nano", and
-        with `periodic_bias` for RA of every size and "darswin_unet_a_nano". A pixel at the very
-        middle has no azimuth and is left out.
+        turns the result by 90°, up to rounding, where it turns the maps of `DarSwin`: for
+        "darswin_unet_ra_nano", and with `periodic_bias` for RA of every size and
+        "darswin_unet_a_nano". A pixel at the very middle has no azimuth and is left out.
 
     Raises:
         ValueError: as `DarSwin`, or an option out of its range. TypeError: in forward, no lens.
@@ -149,7 +149,8 @@ class DarSwinUnet(DenseModel):
         if not self.rays:
             return maps
         steps = zip(maps, self.rays, way.rays, strict=True)
-        return [x + layer(rays.to(layer.weight)).to(x.dtype) for x, layer, rays in steps]
+        dtype = next(self.rays.parameters()).dtype
+        return [x + layer(rays.to(x.device, dtype)).to(x.dtype) for x, layer, rays in steps]
 
     def to_pixels(self, x: Tensor, way: PolarWay, size: Pair) -> Tensor:
         """The projected map (B, 4·R, 4·A, K) → (B, K, H, W); 0 beyond θ_max."""
