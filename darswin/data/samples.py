@@ -1,7 +1,7 @@
 """What the data sets of images with lenses share: a sample's random numbers and its form."""
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Generic, NamedTuple, Protocol, TypeVar
 
 import cv2
 import numpy as np
@@ -17,6 +17,7 @@ from darswin.utils.image import BrokenImageError
 # Per-channel statistics of ImageNet, in [0, 1].
 IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 
+Label = TypeVar("Label")
 Augmentation = Callable[[np.ndarray, np.random.Generator], np.ndarray]
 
 
@@ -31,7 +32,7 @@ class Draw(NamedTuple):
     lens: int
 
 
-class Samples(Dataset):
+class Samples(Dataset, Generic[Label]):
     """Base of the data sets: `dataset[i]` is (image, lens, label). A data set defines `_seen`.
 
     A sample depends on the seed and its `Draw` alone, not on what was read before: `dataset[i]`
@@ -86,7 +87,7 @@ class Samples(Dataset):
         """Indices of the pictures that could not be read so far."""
         return self._broken.nonzero().flatten().tolist()
 
-    def __getitem__(self, draw: Draw | int) -> tuple[Tensor, Lens, int]:
+    def __getitem__(self, draw: Draw | int) -> tuple[Tensor, Lens, Label]:
         if not isinstance(draw, Draw):
             draw = Draw(0, int(draw), int(draw))
         try:
@@ -96,7 +97,8 @@ class Samples(Dataset):
                 raise
             self._broken[draw.picture] = True
             black = torch.from_numpy(-self.mean / self.std)
-            return black.expand(-1, self.size, self.size).clone(), self._lens_alone(draw), -1
+            black = black.expand(-1, self.size, self.size).clone()
+            return black, self._lens_alone(draw), self._unknown()
         rng = self._random(draw.epoch, draw.picture, 0)
         if self.augment:
             image = self.augment(image, rng)
