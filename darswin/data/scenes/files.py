@@ -2,7 +2,7 @@
 
 import os
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from darswin.data.folders import OTHER_SUFFIXES, SUFFIXES, LeftOut, files_below
@@ -46,31 +46,39 @@ def pictures_in(folder: Path) -> dict[str, str]:
 
 
 def pair(
-    pictures: dict[str, str], targets: dict[str, str], root: Path, what: str, strict: bool = True
+    pictures: dict[str, str],
+    targets: dict[str, str],
+    choice: Callable[[list[str]], list[str]],
+    *,
+    root: Path,
+    what: str,
+    strict: bool = True,
 ) -> Pairs:
-    """Pictures and the targets of the same stems.
+    """The pictures that `choice` takes, and the targets of the same stems.
 
     Args:
         root: what the paths become relative to. what: the targets, as errors call them.
-        strict: each picture must have one.
+        strict: pictures without a target are an error if they are chosen, else left out.
 
     Raises:
-        FileNotFoundError: a picture without a target, by name; no picture with one.
+        FileNotFoundError: pictures without a target, by name.
     """
-    missing = [stem for stem in pictures if stem not in targets]
-    if len(missing) == len(pictures) or (strict and missing):
-        raise FileNotFoundError(
-            f"no {what} for {len(missing)} of {len(pictures)} pictures, {some(missing)}: add them, "
-            "or move the pictures away"
-        )
-    if missing:
-        _say(f"{len(missing)} pictures have no {what}, {some(missing)}: left out")
+    stems = list(pictures)
+    if not strict:
+        stems = [stem for stem in pictures if stem in targets]
+        if without := len(pictures) - len(stems):
+            _say(f"{without} of {len(pictures)} pictures in {root} have no {what}: left out")
     if alone := [targets[stem] for stem in targets if stem not in pictures]:
-        _say(f"{len(alone)} {what} have no picture, {some(alone)}: left out")
+        _say(f"{len(alone)} files of {what} have no picture, {some(alone)}: left out")
+    chosen = choice(stems)
+    if missing := [pictures[stem] for stem in chosen if stem not in targets]:
+        raise FileNotFoundError(
+            f"no {what} for {len(missing)} of {len(chosen)} pictures, {some(missing)}: add them, "
+            "move the pictures away, or list those to take as splits"
+        )
     return {
         stem: (os.path.relpath(pictures[stem], root), os.path.relpath(targets[stem], root))
-        for stem in pictures
-        if stem in targets
+        for stem in chosen
     }
 
 

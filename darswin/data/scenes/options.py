@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 from darswin.data.scenes.parts import ScenesSplit
 from darswin.data.scenes.scene import Target
@@ -14,7 +13,7 @@ class Options:
 
     split: ScenesSplit
     target: Target
-    channels: Literal[1, 3] = 3
+    channels: int = 3
     lens: str | Path | None = None
     camera: str | None = None
     classes: str | Path | None = None

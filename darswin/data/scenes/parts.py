@@ -22,16 +22,48 @@ def taken_from(split: Split, given: Collection[Split]) -> tuple[Split, list[Spli
     Raises:
         FileNotFoundError: no part to take it from.
     """
+    part: Split = split
     missing: list[Split] = [part for part in ("test", "val") if part not in given]
     if missing == ["test"]:
         part, missing = ("val" if split == "test" else split), []
     elif split in missing:
         part = "train"
-    else:
-        part, missing = split, (missing if split == "train" else [])
+    elif split != "train":
+        missing = []
     if part not in given:
         raise FileNotFoundError(f"there are {sorted(given)} scenes, and none for {split!r}")
     return part, missing
+
+
+def without_others(
+    stems: list[str],
+    split: Split,
+    held_out: Sequence[Split],
+    *,
+    where: Path,
+    holdout: float,
+    group: Callable[[str], str] | None = None,
+) -> list[str]:
+    """A split's of the stems that `held_out` are taken from.
+
+    Args:
+        where: the folder, for errors. group: of a stem: what is held out together.
+
+    Raises:
+        FileNotFoundError: the split has none.
+    """
+    if held_out:
+        groups = {stem: group(stem) if group else stem for stem in stems}
+        names = sorted(set(groups.values()))
+        kept = {names[k] for k in hold_out([0] * len(names), names, holdout, held_out)[split]}
+        stems = [stem for stem in stems if groups[stem] in kept]
+        if not stems:
+            raise FileNotFoundError(
+                f"no scenes for the {split!r} split in {where}: a holdout of {holdout:g} of "
+                f"{len(names)} {'groups' if group else 'pictures'} leaves none for it; list the "
+                "splits, or hold out more"
+            )
+    return stems
 
 
 def choose(
@@ -41,14 +73,14 @@ def choose(
     root: Path,
     splits: str | Path | None = None,
     holdout: float = 0.1,
-    group: Callable[[str], str] = str,
+    group: Callable[[str], str] | None = None,
     named: Named | None = None,
 ) -> list[str]:
     """The stems of a split, of all those found in a folder that says no splits itself.
 
     Args:
         splits: lists of stems as `darswin.data.open_scenes` takes them, or one of `named`.
-        group: of a stem: what is held out together.
+        group: as `without_others`.
 
     Raises:
         ValueError: lists that are wrong, or a stem in two of them. FileNotFoundError: a stem in the
@@ -67,23 +99,9 @@ def choose(
             f"{splits} lists {len(unknown)} pictures for {part!r} that are not in {root}: "
             f"{some(unknown)}"
         )
-    if held_out:
-        groups = sorted({group(stem) for stem in chosen})
-        kept = hold_out([0] * len(groups), groups, holdout, held_out)[split]
-        names = {groups[k] for k in kept}
-        chosen = [stem for stem in chosen if group(stem) in names]
     if not chosen:
-        of = "" if groups_are(group) else f" of {len({group(s) for s in found})} drives"
-        raise FileNotFoundError(
-            f"no scenes for the {split!r} split in {root}: a holdout of {holdout:g}{of} leaves "
-            "none for it; list the splits"
-        )
-    return chosen
-
-
-def groups_are(group: Callable[[str], str]) -> bool:
-    """Whether each stem is a group of its own."""
-    return group is str
+        raise FileNotFoundError(f"{splits} lists no pictures for {part!r}")
+    return without_others(chosen, split, held_out, where=root, holdout=holdout, group=group)
 
 
 def _listed(path: Path, found: Sequence[str], named: Named | None) -> dict[Split, list[str]]:
@@ -94,7 +112,7 @@ def _listed(path: Path, found: Sequence[str], named: Named | None) -> dict[Split
     for split, names in read_split_lists(path).items():
         given[split] = [_stem(name) for name in names]
         for stem in given[split]:
-            if where.setdefault(stem, split) != split:
+            if where.setdefault(stem, split) != split and "train" in (where[stem], split):
                 raise ValueError(f"{path} lists {stem} for {where[stem]!r} and for {split!r}")
         given[split] = list(dict.fromkeys(given[split]))
     if left := [stem for stem in found if stem not in where]:

@@ -1,18 +1,20 @@
 """The plain form: `images/`, `labels/` or `distance/`, and a lens beside them."""
 
 import os
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 from darswin.data.calibrations import Calibrations, PictureLenses
 from darswin.data.folders import SPLIT_NAMES
 from darswin.data.scenes.classes import Classes, read_palette
-from darswin.data.scenes.files import pair, pictures_in, stems
+from darswin.data.scenes.files import Pairs, pair, pictures_in, stems
 from darswin.data.scenes.lenses import OwnLenses
 from darswin.data.scenes.options import Options
-from darswin.data.scenes.parts import choose, taken_from
+from darswin.data.scenes.parts import choose, taken_from, without_others
 from darswin.data.scenes.scene import Scenes
 from darswin.data.scenes.targets import DISTANCE_SUFFIXES, LABEL_SUFFIXES
-from darswin.data.splits import Split, hold_out
+from darswin.data.splits import Split
 
 FORM = (
     "darswin looks for images/STEM.png (or jpg, bmp, webp, tif, ppm) with labels/STEM.png or "
@@ -35,40 +37,39 @@ def open_split(root: Path, options: Options) -> Scenes:
             raise ValueError(
                 f"{root / 'images'} and {next(iter(folders.values()))} may both be meant: {FORM}"
             )
-        return _scenes(root, root, options, None)
+        choice = partial(
+            choose, split=options.split, root=root, splits=options.splits, holdout=options.holdout
+        )
+        return _scenes(root, root, options, choice)
     if options.splits is not None:
         raise ValueError(f"{options.splits} lists splits, and {root} has a folder for each")
     if options.split == "all":
         raise ValueError(f"{root} has a folder for each split: 'all' is of a folder without splits")
     part, held_out = taken_from(options.split, folders)
-    return _scenes(root, folders[part], options, held_out)
+    choice = partial(
+        without_others,
+        split=options.split,
+        held_out=held_out,
+        where=folders[part],
+        holdout=options.holdout,
+    )
+    return _scenes(root, folders[part], options, choice)
 
 
-def _scenes(root: Path, folder: Path, options: Options, held_out: list[Split] | None) -> Scenes:
-    """The scenes of a folder with images.
-
-    Args:
-        held_out: of the folder of a split, what is held out of it; None is a folder of all splits.
-    """
+def _scenes(
+    root: Path, folder: Path, options: Options, choice: Callable[[list[str]], list[str]]
+) -> Scenes:
+    """The scenes of a folder with `images/`, of the stems that `choice` takes."""
     target = options.target
     targets = stems(folder / target, SUFFIXES[target])
-    pairs = pair(pictures_in(folder / "images"), targets, folder, target)
-    if held_out is None:
-        chosen = choose(list(pairs), options.split, root=folder, splits=options.splits,
-                        holdout=options.holdout)  # fmt: skip
-    elif held_out:
-        keys = list(pairs)
-        parts = hold_out([0] * len(keys), keys, options.holdout, held_out)
-        chosen = [keys[k] for k in parts[options.split]]
-    else:
-        chosen = list(pairs)
+    pairs = pair(pictures_in(folder / "images"), targets, choice, root=folder, what=target)
     classes = Classes([], [])
     if target == "labels":
         classes = read_palette(options.classes or _beside("classes.json", folder, root))
     return Scenes(
         folder,
-        [pairs[stem] for stem in chosen],
-        _lenses(root, folder, chosen, pairs, options),
+        list(pairs.values()),
+        _lenses(root, folder, pairs, options),
         target=target,
         channels=options.channels,
         classes=classes.names,
@@ -76,14 +77,14 @@ def _scenes(root: Path, folder: Path, options: Options, held_out: list[Split] | 
     )
 
 
-def _lenses(root: Path, folder: Path, chosen: list[str], pairs: dict, options: Options):
+def _lenses(root: Path, folder: Path, pairs: Pairs, options: Options) -> PictureLenses:
     """The lens that was given; else those of the pictures themselves, else the folder's."""
     if options.lens is not None:
         return Calibrations(options.lens, root, options.camera)
     own: dict[str, str] = {}
     if (folder / "lenses").is_dir():
         own = stems(folder / "lenses", (".json",))
-    missing = [stem for stem in chosen if stem not in own]
+    missing = [stem for stem in pairs if stem not in own]
     shared = None
     if missing:
         try:
@@ -97,7 +98,7 @@ def _lenses(root: Path, folder: Path, chosen: list[str], pairs: dict, options: O
     if not own:
         assert shared is not None  # as all pictures miss one of their own
         return shared
-    files = {folder / pairs[stem][0]: Path(own[stem]) for stem in chosen if stem in own}
+    files = {folder / pairs[stem][0]: Path(own[stem]) for stem in pairs if stem in own}
     return OwnLenses(files, shared)
 
 

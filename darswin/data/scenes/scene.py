@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from darswin.data.calibrations import PictureLenses
-from darswin.data.scenes.targets import IGNORE, read_distance, read_labels
+from darswin.data.scenes.targets import nothing_of, read_distance, read_labels
 from darswin.lens import Lens
 from darswin.utils.image import read_oriented
 
@@ -104,8 +104,9 @@ class Scenes:
         lens = self.lenses.lens_of(self.file(index), size)
         rows = self._rows(size[0])
         kept = slice(rows, size[0] - rows)
-        self.unknown[index] = int(np.count_nonzero(_says_nothing(target[kept])))
-        return Scene(image[kept], target[kept], self._trimmed(lens, rows))
+        image, target = image[kept], target[kept]
+        self.unknown[index] = int(np.count_nonzero(target == nothing_of(target)))
+        return Scene(image, target, self._trimmed(lens, rows))
 
     def file(self, index: int) -> Path:
         """The picture's file."""
@@ -140,7 +141,3 @@ class Scenes:
             return lens
         height, width = (round(side) for side in lens.image_size[0].tolist())
         return lens.cropped(rows, 0, height - 2 * rows, width)
-
-
-def _says_nothing(target: np.ndarray) -> np.ndarray:
-    return target == (IGNORE if target.dtype == np.uint8 else 0)

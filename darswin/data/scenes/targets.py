@@ -16,6 +16,11 @@ LABEL_SUFFIXES = (".png",)
 DISTANCE_SUFFIXES = (".png", ".npy")
 
 
+def nothing_of(target: np.ndarray) -> int:
+    """What a target holds where it says nothing: `IGNORE` of labels (uint8), 0 of distances."""
+    return IGNORE if target.dtype == np.uint8 else 0
+
+
 def read_labels(path: Path, classes: int) -> np.ndarray:
     """A label PNG as (H, W) uint8: ids of so many classes, or `IGNORE`. Of a PNG with a palette
     the ids count, not their colours.
