@@ -20,8 +20,8 @@ class OwnLenses(PictureLenses):
     The files are looked through when this is made, and each is read when its picture is.
 
     Args:
-        files: pictures and their calibrations, in JSON of any format that `darswin.lens.load`
-            reads.
+        files: pictures and their calibrations, of any format that `darswin.lens.load` reads; in
+            JSON where there are many.
 
     Raises:
         ValueError: a file that is no JSON or no lens, or lenses that cannot be joined; it names
@@ -34,7 +34,8 @@ class OwnLenses(PictureLenses):
         # Files that differ in numbers alone have lenses of one form: one of them stands for all.
         alike: dict[Hashable, Camera] = {}
         for file in dict.fromkeys(self._files.values()):
-            alike.setdefault(_form(_content(file)), Camera(file, None, file))
+            form = _form(_content(file)) if file.endswith(".json") else file
+            alike.setdefault(form, Camera(file, None, file))
         examples = [*alike.values(), *(shared.cameras if shared else ())]
         super().__init__(are_curves(examples, [camera.lens(NOMINAL) for camera in examples]))
 
