@@ -11,7 +11,7 @@ from darswin.lens import Lens
 
 # What names a lens model in any format; other words in a file say nothing of its lens's form.
 _SAYS_MODEL = re.compile("model|distortion")
-_KEPT = 1024  # lenses in memory
+_KEPT = 8192  # lenses in memory
 
 
 class OwnLenses(PictureLenses):
