@@ -69,7 +69,7 @@ def test_every_block_is_of_a_kind_that_is_checked():
 
 @pytest.fixture
 def scratch(tmp_path, monkeypatch):
-    """A folder with what pages take for granted: a checkout's examples, photos, scenes, a checkpoint."""
+    """A folder with what pages take for granted: a checkout's examples, photos, scenes, weights."""
     monkeypatch.chdir(tmp_path)
     for folder in ("examples", "darswin"):
         (tmp_path / folder).symlink_to(ROOT / folder)
