@@ -1,0 +1,198 @@
+"""Data sets of scenes on disk, small, in the form of each reader."""
+
+import json
+import shutil
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+
+from darswin.lens import Lens, load, save
+from darswin.lens.pixels import pixel_rays
+
+CALIBRATIONS = Path(__file__).parent / "lens" / "files"
+WOODSCAPE = CALIBRATIONS / "woodscape.json"
+CLASSES = {"names": ["sky", "ground", "wall"], "colors": [[0, 0, 255], [0, 128, 0], [200, 0, 0]]}
+
+
+def labels_of(theta: np.ndarray, azimuth: np.ndarray, classes: int = 3) -> np.ndarray:
+    """Labels as a function of the ray: sectors of azimuth that change with every 0.4 rad of θ."""
+    sector = np.floor(np.nan_to_num(azimuth) / (2 * np.pi) * 6 + 6)
+    return ((sector + np.floor(np.nan_to_num(theta) / 0.4)) % classes).astype(np.uint8)
+
+
+def distance_of(theta: np.ndarray, azimuth: np.ndarray) -> np.ndarray:
+    """Metres as a function of the ray: smooth, from 2 to 10."""
+    theta, azimuth = np.nan_to_num(theta), np.nan_to_num(azimuth)
+    return (6 + 2 * np.cos(3 * theta) + 2 * np.sin(theta) * np.cos(azimuth)).astype(np.float32)
+
+
+def rays_of(lens: Lens, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+    """θ, NaN where nothing is seen, and azimuth of each pixel, (H, W)."""
+    theta, direction = pixel_rays(lens.to(torch.float64), size)
+    azimuth = torch.atan2(direction[..., 1], direction[..., 0])
+    return theta[0].numpy(), azimuth[0].numpy()
+
+
+def picture_of(
+    theta: np.ndarray, azimuth: np.ndarray, colors: Sequence[Sequence[int]], seed: int
+) -> np.ndarray:
+    """(H, W, 3) uint8: the labels' colours, with noise; black where nothing is seen."""
+    noise = np.random.default_rng(seed).integers(0, 40, size=(*theta.shape, 3))
+    image = np.asarray(colors)[labels_of(theta, azimuth, len(colors))] * 0.8 + noise
+    return np.where(np.isnan(theta)[..., None], 0, image).astype(np.uint8)
+
+
+def write_plain(
+    folder: Path,
+    count: int = 4,
+    *,
+    lens: str | Path | Lens = WOODSCAPE,
+    size: tuple[int, int] = (121, 160),
+    targets: Sequence[str] = ("labels", "distance"),
+    split: str | None = None,
+    own_lenses: bool = False,
+    classes: dict | list | None = CLASSES,
+    name: Callable[[int], str] = "{:03d}".format,
+) -> Path:
+    """`count` scenes in the plain form, which a lens sees: labels and distances of the ray.
+
+    Args:
+        split: a folder of a split in `folder`, or None. own_lenses: a file a picture.
+    """
+    place = folder if split is None else folder / split
+    seen = (lens if isinstance(lens, Lens) else load(lens)).in_picture(size)
+    if seen.image_size is None:
+        seen = seen.replace(image_size=torch.tensor([size], dtype=torch.float32))
+    theta, azimuth = rays_of(seen, size)
+    for part in ("images", *targets):
+        (place / part).mkdir(parents=True, exist_ok=True)
+    for k in range(count):
+        turned = azimuth + 0.3 * k
+        colors = CLASSES["colors"]
+        write(place / "images" / f"{name(k)}.png", picture_of(theta, turned, colors, k)[..., ::-1])
+        if "labels" in targets:
+            write(place / "labels" / f"{name(k)}.png", labels_of(theta, turned))
+        if "distance" in targets:
+            metres = np.round(distance_of(theta, turned) * 256).astype(np.uint16)
+            write(place / "distance" / f"{name(k)}.png", metres)
+        if own_lenses:
+            (place / "lenses").mkdir(exist_ok=True)
+            save(seen, place / "lenses" / f"{name(k)}.json")
+    if not own_lenses:
+        save(seen, place / "lens.json")
+    if classes is not None:
+        (folder / "classes.json").write_text(json.dumps(classes))
+    return folder
+
+
+# -- trees of data sets that cannot be downloaded: as their authors describe them ----------------
+
+WOODSCAPE_INFO = {
+    "class_names": ["void", "road", "lanemarks", "curb", "person", "rider", "vehicles", "bicycle",
+                    "motorcycle", "traffic_sign"],
+    "class_colors": [[k, 10 * k, 255 - k] for k in range(10)],
+    "class_indexes": list(range(10)),
+    "color_scheme": "BGR",
+}  # fmt: skip
+VIEWS = ("FV", "RV", "MVL", "MVR")
+
+
+def write_woodscape(
+    folder: Path, count: int = 8, *, size: tuple[int, int] = (121, 160), nested: bool = True,
+    calibration: str = "calibration/calibration",
+) -> Path:  # fmt: skip
+    """WoodScape's tree, `count` frames of its four cameras in turn, with green rows.
+
+    Args:
+        nested: semantic_annotations/semantic_annotations/, as its archives unpack. calibration:
+            where the calibrations are.
+    """
+    annotations = folder / "semantic_annotations" / ("semantic_annotations" if nested else "")
+    for k in range(count):
+        view = VIEWS[k % 4]
+        stem, lens = f"{k:05d}_{view}", _woodscape_lens(folder / calibration, k, view, size)
+        theta, azimuth = rays_of(lens, size)
+        colors = WOODSCAPE_INFO["class_colors"]
+        image = picture_of(theta, azimuth + 0.3 * k, colors, k)
+        green = -(-3 * size[0] // 966)
+        image[:green] = image[-green:] = (0, 255, 0)
+        write(folder / "rgb_images" / f"{stem}.png", image[..., ::-1])
+        labels = labels_of(theta, azimuth + 0.3 * k, 10)
+        write(annotations / "gtLabels" / f"{stem}.png", labels)
+        write(annotations / "rgbLabels" / f"{stem}.png", np.asarray(colors, np.uint8)[labels])
+        boxes = folder / "box_2d_annotations" / "box_2d_annotations" / f"{stem}.txt"
+        boxes.parent.mkdir(parents=True, exist_ok=True)
+        boxes.write_text("vehicles,0,10,10,40,40\n")
+        write(folder / "previous_images" / f"{stem}_prev.png", image[..., ::-1])
+    write(folder / "rgb_images(test_set)" / "08234_FV.png", image[..., ::-1])
+    (folder / "semantic_annotations" / "seg_annotation_info.json").write_text(
+        json.dumps(WOODSCAPE_INFO)
+    )
+    return folder
+
+
+def write_synwoodscape(folder: Path, count: int = 4, *, size: tuple[int, int] = (121, 160)) -> Path:
+    """SynWoodScape's tree: labels of 25 classes, depth maps in metres in which 1000 is the sky."""
+    for k in range(count):
+        view = VIEWS[k % 4]
+        stem = f"{k:05d}_{view}"
+        lens = _woodscape_lens(folder / "calibration" / "calibration", k, view, size)
+        theta, azimuth = rays_of(lens, size)
+        colors = [[10 * k, 0, 255 - 10 * k] for k in range(25)]
+        image = picture_of(theta, azimuth, colors, k)
+        write(folder / "rgb_images" / "rgb_images" / f"{stem}.png", image[..., ::-1])
+        nested = folder / "semantic_annotations" / "semantic_annotations"
+        write(nested / "gtLabels" / f"{stem}.png", labels_of(theta, azimuth, 25))
+        metres = np.where(azimuth < -2, 1000, distance_of(theta, azimuth)).astype(np.float32)
+        raw = folder / "depth_maps" / "raw_data"
+        raw.mkdir(parents=True, exist_ok=True)
+        np.save(raw / f"{stem}.npy", metres)
+    return folder
+
+
+def write_kitti360(
+    folder: Path, drives: int = 3, count: int = 3, *, size: tuple[int, int] = (140, 140)
+) -> Path:
+    """KITTI-360's tree of both fisheye cameras; every frame but the last of a drive has distances,
+    as sparse as those of a LiDAR."""
+    (folder / "calibration").mkdir(parents=True, exist_ok=True)
+    for drive in range(drives):
+        name = f"2013_05_28_drive_{drive:04d}_sync"
+        for camera in ("image_02", "image_03"):
+            source = CALIBRATIONS / f"kitti360_{camera[-2:]}.yaml"
+            shutil.copy(source, folder / "calibration" / f"{camera}.yaml")
+            theta, azimuth = rays_of(load(source).in_picture(size), size)
+            for k in range(count):
+                image = picture_of(theta, azimuth, CLASSES["colors"], k)
+                stem = f"{k:010d}.png"
+                write(folder / "data_2d_raw" / name / camera / "data_rgb" / stem, image[..., ::-1])
+                if k < count - 1:
+                    metres = np.round(distance_of(theta, azimuth) * 256).astype(np.uint16)
+                    metres[::2] = 0
+                    write(folder / "distance" / name / camera / stem, metres)
+        write(folder / "data_2d_raw" / name / "image_00" / "data_rect" / "0000000000.png", image)
+    return folder
+
+
+def _woodscape_lens(folder: Path, number: int, view: str, size: tuple[int, int]) -> Lens:
+    """Writes the calibration of a frame, whose offsets and numbers differ from the others', and
+    gives its lens in a picture of a size."""
+    content = json.loads(WOODSCAPE.read_text())
+    content["name"] = view
+    content["intrinsic"]["cx_offset"] += number
+    content["intrinsic"]["k1"] += number % 4
+    folder.mkdir(parents=True, exist_ok=True)
+    file = folder / f"{number:05d}_{view}.json"
+    file.write_text(json.dumps(content))
+    return load(file).in_picture(size)
+
+
+def write(file: Path, array: np.ndarray) -> Path:
+    """An array as PNG, BGR where it has colours; makes its folder."""
+    file.parent.mkdir(parents=True, exist_ok=True)
+    array = np.ascontiguousarray(array)
+    assert cv2.imwrite(str(file), array)
+    return file
