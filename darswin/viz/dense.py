@@ -180,7 +180,7 @@ def draw_predictions(
     if of_labels and not classes:
         raise ValueError("predictions of labels are drawn with the names of their classes")
     height, width = rows[0][1].shape
-    tall = len(rows) * (2.5 * height / width + 0.25) + (0.8 if of_labels else 1.2)
+    tall = len(rows) * (2.5 * height / width + 0.25) + (0.9 if of_labels else 1.5)
     figure = Figure(figsize=(10.4, tall), layout="constrained")
     panels = figure.subplots(len(rows), 4, squeeze=False)
     for axes, title in zip(panels[0], ("image", "truth", "prediction", "error"), strict=True):
