@@ -111,8 +111,10 @@ def distance_image(distance: np.ndarray, near: float, far: float) -> np.ndarray:
     if not 0 < near < far < np.inf:
         raise ValueError(f"0 < near < far must hold, got {near:g} and {far:g} m")
     known = is_known(distance)
-    colors = _distances()(LogNorm(near, far, clip=True)(np.where(known, distance, far)), bytes=True)
-    return np.where(known[..., None], colors[..., :3], np.array(UNKNOWN, np.uint8))
+    part = np.log(np.where(known, distance, near).clip(near, far) / near) / np.log(far / near)
+    table = _distances()(np.arange(256), bytes=True)[:, :3]
+    colors = table[np.rint(255 * part).astype(np.uint8)]
+    return np.where(known[..., None], colors, np.array(UNKNOWN, np.uint8))
 
 
 def distance_range(distance: np.ndarray) -> tuple[float, float]:
