@@ -13,7 +13,8 @@ from PIL import Image
 from torch import Tensor
 
 from darswin.cli.answers import Answers, Asked, fit_of
-from darswin.data.full_size import IGNORE, FullSize
+from darswin.data.full_size import FullSize
+from darswin.data.scenes.targets import IGNORE, PER_METRE
 from darswin.lens import Lens
 from darswin.models.encoder import Encoder, Prepared
 from darswin.models.saving import ModelCard
@@ -29,8 +30,7 @@ from darswin.viz.dense import (
 )
 
 ANSWERS = "predictions.json"
-STEPS = 256  # of a metre, in 16 bits of a distance's PNG
-FARTHEST = 2**16 - 1
+FARTHEST = 2**16 - 1  # of what 16 bits hold
 
 
 class DenseAnswers(Answers):
@@ -154,7 +154,7 @@ def distance_png(distance: np.ndarray) -> memoryview:
     From 255.996 m on, the end of its range, pixels are 65535; from 0 to 1/256 m they are 1.
     """
     known = is_known(distance)
-    steps = np.rint(np.where(known, distance, 0) * STEPS).clip(known, FARTHEST)
+    steps = np.rint(np.where(known, distance, 0) * PER_METRE).clip(known, FARTHEST)
     _, png = cv2.imencode(".png", steps.astype(np.uint16))
     return png.data
 

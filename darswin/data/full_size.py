@@ -3,11 +3,10 @@
 import cv2
 import numpy as np
 
-from darswin.data.frames import Fit, taken_part
+from darswin.data.frames import Fit, part_of
+from darswin.data.scenes.targets import IGNORE
 from darswin.lens import Lens
 from darswin.lens.pixels import pixel_angles
-
-IGNORE = 255
 
 
 class FullSize:
@@ -30,7 +29,7 @@ class FullSize:
         if lens.image_size is None or len(lens) != 1:
             raise ValueError("pictures through one lens with an image_size are meant")
         height, width = (round(side) for side in lens.image_size[0].tolist())
-        self._part = top, left, rows, columns = taken_part((height, width), fit)
+        self._part = top, left, rows, columns = part_of((height, width), fit)
         inside = ~pixel_angles(lens.detach(), (height, width))[0].isnan().cpu().numpy()
         self.seen = np.zeros_like(inside)
         part = np.s_[top : top + rows, left : left + columns]

@@ -7,7 +7,8 @@ import torch
 from hypothesis import given
 
 from darswin.data.frames import at_size
-from darswin.data.full_size import IGNORE, FullSize
+from darswin.data.full_size import FullSize
+from darswin.data.scenes import IGNORE
 from darswin.lens import Equidistant, KannalaBrandt
 
 FITS = ("crop", "stretch", "whole")
