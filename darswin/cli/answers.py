@@ -10,6 +10,8 @@ from torch import Tensor
 from darswin.data.frames import Fit, at_size
 from darswin.deploy.optimize import optimize
 from darswin.lens import Lens
+from darswin.models.base import Model
+from darswin.models.dense import DenseModel
 from darswin.models.encoder import Encoder, Prepared
 from darswin.models.saving import ModelCard
 
@@ -36,15 +38,15 @@ class Answers:
         found: an entry for each image answered. seconds: what the network took for them.
 
     Args:
-        model, card: as `load_model` gives them.
+        model: of `create_model`, or what `optimize` makes of one. card: as `load_model` gives it.
     """
 
-    def __init__(self, model: Encoder, card: ModelCard):
-        self.model, self.card = optimize(model), card
+    def __init__(self, model: Encoder | DenseModel, card: ModelCard):
+        self.model, self.card = model, card
         self.found: list[dict[str, Any]] = []
         self.seconds = 0.0
         self._lens: Lens | None = None
-        self._prepared = Prepared(None, ())  # for the lens
+        self._prepared: Any = None  # for the lens
         self._waiting: list[Asked] = []
 
     def add(self, entry: dict[str, Any], image: np.ndarray, lens: Lens) -> None:
@@ -81,7 +83,7 @@ class Answers:
     def look_through(self, lens: Lens) -> None:
         """Prepares `answer` for images through another lens."""
 
-    def ask(self, images: Tensor, prepared: Prepared) -> Tensor:
+    def ask(self, images: Tensor, prepared: Any) -> Tensor:
         """What the network says of images (B, C, h, w): (B, …)."""
         raise NotImplementedError
 
@@ -97,8 +99,10 @@ class ClassAnswers(Answers):
         model, card: as `load_model` gives them. top: how many classes of each image.
     """
 
+    model: Encoder
+
     def __init__(self, model: Encoder, card: ModelCard, top: int):
-        super().__init__(model, card)
+        super().__init__(optimize(model), card)
         self.top = top
 
     def ask(self, images: Tensor, prepared: Prepared) -> Tensor:
@@ -116,7 +120,7 @@ class ClassAnswers(Answers):
         return {"class": name, "probability": probability}
 
 
-def resized(net: Encoder, card: ModelCard, image: np.ndarray, lens: Lens) -> tuple[Tensor, Lens]:
+def resized(net: Model, card: ModelCard, image: np.ndarray, lens: Lens) -> tuple[Tensor, Lens]:
     """A picture as the model saw them in training: (1, C, H, W) uint8 with its lens, in its pixels.
 
     `darswin.data.frames.at_size` as the model's card says, and `fit_of`.
@@ -125,6 +129,6 @@ def resized(net: Encoder, card: ModelCard, image: np.ndarray, lens: Lens) -> tup
     return torch.from_numpy(image[None]).permute(0, 3, 1, 2).contiguous(), lens
 
 
-def fit_of(net: Encoder, card: ModelCard) -> Fit:
+def fit_of(net: Model, card: ModelCard) -> Fit:
     """How pictures get the model's size. One that takes only squares gets one in any case."""
     return "crop" if net.square_images and card.fit == "whole" else card.fit

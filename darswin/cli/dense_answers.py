@@ -16,7 +16,7 @@ from darswin.cli.answers import Answers, Asked, fit_of
 from darswin.data.full_size import FullSize
 from darswin.data.scenes.targets import IGNORE, PER_METRE
 from darswin.lens import Lens
-from darswin.models.encoder import Encoder, Prepared
+from darswin.models.dense import DenseModel, DensePrepared
 from darswin.models.saving import ModelCard
 from darswin.utils.files import replace_file
 from darswin.viz.dense import (
@@ -45,17 +45,18 @@ class DenseAnswers(Answers):
     """
 
     kind: str  # of the answers, and the name of their folder
+    model: DenseModel
 
-    def __init__(self, model: Encoder, card: ModelCard, out: Path, names: Mapping[str, str]):
+    def __init__(self, model: DenseModel, card: ModelCard, out: Path, names: Mapping[str, str]):
         super().__init__(model, card)
         self.out, self.names = out, names
         self.full_size: FullSize  # of the lens
 
     def look_through(self, lens: Lens) -> None:
         """Computes which pixels have an answer."""
-        self.full_size = FullSize(lens, fit_of(self.model, self.card))
+        self.full_size = FullSize(lens, self.card.size, fit_of(self.model, self.card))
 
-    def ask(self, images: Tensor, prepared: Prepared) -> Tensor:
+    def ask(self, images: Tensor, prepared: DensePrepared) -> Tensor:
         """What the network says of each pixel, (B, K, h, w)."""
         return self.model.run(images, prepared)
 
@@ -88,7 +89,7 @@ class LabelAnswers(DenseAnswers):
 
     kind = "labels"
 
-    def __init__(self, model: Encoder, card: ModelCard, out: Path, names: Mapping[str, str]):
+    def __init__(self, model: DenseModel, card: ModelCard, out: Path, names: Mapping[str, str]):
         super().__init__(model, card, out, names)
         if model.num_classes > IGNORE:
             raise ValueError(f"labels of 8 bits are for {IGNORE} classes, got {model.num_classes}")
@@ -114,7 +115,7 @@ class DistanceAnswers(DenseAnswers):
 
     kind = "distance"
 
-    def __init__(self, model: Encoder, card: ModelCard, out: Path, names: Mapping[str, str]):
+    def __init__(self, model: DenseModel, card: ModelCard, out: Path, names: Mapping[str, str]):
         super().__init__(model, card, out, names)
         self._range: tuple[Any, tuple[float, float]] = (None, (1.0, 2.0))
 

@@ -6,7 +6,7 @@ import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jsonargparse import ArgumentParser
@@ -19,7 +19,6 @@ from darswin.data.calibrations import Calibrations, is_json
 from darswin.data.folders import PICTURES, pictures_and_videos_below
 from darswin.data.samples import IMAGENET_MEAN, IMAGENET_STD
 from darswin.lens import Lens
-from darswin.models.encoder import Encoder
 from darswin.models.pretrained import list_pretrained, pretrained_file
 from darswin.models.saving import ModelCard, NoCardError, Task, load_model, model_of_run
 from darswin.utils.files import replace_file
@@ -202,7 +201,7 @@ def _lens(calibrations: Calibrations, name: str, image: np.ndarray, orientation:
         raise BrokenImageError(str(error)) from error
 
 
-def trained_model(path: str | Path) -> tuple[Encoder, ModelCard]:
+def trained_model(path: str | Path) -> tuple[Any, ModelCard]:
     """The model of a file of ours, or of the released DarSwin's weights, and its card.
 
     The released code normalises pixels as ImageNet's; a model's classes have numbers there.

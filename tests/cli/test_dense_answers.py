@@ -9,7 +9,6 @@ import pytest
 from PIL import Image
 from videos import write_video
 
-from darswin.cli import answers as answers_module
 from darswin.cli import predict as predict_module
 from darswin.cli.dense_answers import claim_folder, distance_png, file_names, label_png
 from darswin.cli.main import main
@@ -23,7 +22,7 @@ from darswin.viz.dense import UNKNOWN, palette
 LENS = {"model": "Spherical", "xi": 0.5, "fov": 2.8, "image_size": [48, 64]}
 COLORS = [[250, 0, 0], [0, 250, 0], [0, 0, 250]]
 NAMES = ["red", "green", "blue"]
-SEEN = FullSize(from_dict(LENS, (48, 64)), "crop").seen
+SEEN = FullSize(from_dict(LENS, (48, 64)), 48, "crop").seen
 
 
 class Stub(Encoder):
@@ -54,7 +53,6 @@ def stub(monkeypatch):
         known = dict(classes=NAMES, colors=COLORS, size=48, fit="crop", task=task)
         card = ModelCard("stub", **(known | card))
         monkeypatch.setattr(predict_module, "trained_model", lambda path: (net, card))
-        monkeypatch.setattr(answers_module, "optimize", lambda model: model)
         return net
 
     return install
@@ -323,5 +321,5 @@ def test_pictures_of_several_lenses_go_through_their_own(stub, labels, tmp_path)
     out = tmp_path / "out"
     main([*argv, "--lens", str(tmp_path / "lenses.json"), "--out", str(out)])
     for name, described in lenses.items():
-        seen = FullSize(from_dict(described, (48, 64)), "crop").seen
+        seen = FullSize(from_dict(described, (48, 64)), 48, "crop").seen
         assert np.array_equal(ids(out / f"labels/{name}/p.png") != 255, seen)
