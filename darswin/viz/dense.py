@@ -94,7 +94,7 @@ def label_image(labels: np.ndarray, colors: Sequence[Sequence[int]]) -> np.ndarr
     _check_map("labels", labels)
     table = np.array([*colors, UNKNOWN], np.uint8).reshape(-1, 3)
     known = (labels >= 0) & (labels < len(colors))
-    return table[np.where(known, labels, len(colors))]
+    return np.take(table, np.where(known, labels, len(colors)), 0)
 
 
 def distance_image(distance: np.ndarray, near: float, far: float) -> np.ndarray:
@@ -112,9 +112,9 @@ def distance_image(distance: np.ndarray, near: float, far: float) -> np.ndarray:
         raise ValueError(f"0 < near < far must hold, got {near:g} and {far:g} m")
     known = is_known(distance)
     part = np.log(np.where(known, distance, near).clip(near, far) / near) / np.log(far / near)
-    table = _distances()(np.arange(256), bytes=True)[:, :3]
-    colors = table[np.rint(255 * part).astype(np.uint8)]
-    return np.where(known[..., None], colors, np.array(UNKNOWN, np.uint8))
+    table = [*_distances()(np.arange(256), bytes=True)[:, :3], UNKNOWN]
+    steps = np.where(known, np.rint(255 * part), 256).astype(np.int16)
+    return np.take(np.array(table, np.uint8), steps, 0)
 
 
 def distance_range(distance: np.ndarray) -> tuple[float, float]:
@@ -151,10 +151,9 @@ def overlay(
         )
     if not 0 <= alpha <= 1:
         raise ValueError(f"alpha must be in 0 … 1, got {alpha}")
-    mixed = (1 - alpha) * image + alpha * picture.astype(np.float32)
-    laid = np.rint(mixed).astype(np.uint8)
-    below = np.broadcast_to(image, picture.shape)
-    return laid if where is None else np.where(where[..., None], laid, below)
+    below = np.repeat(image, 3, 2) if image.shape[2] == 1 else image
+    laid = cv2.addWeighted(below, 1 - alpha, picture, alpha, 0)
+    return laid if where is None else cv2.copyTo(laid, where.astype(np.uint8), below.copy())
 
 
 def draw_predictions(
