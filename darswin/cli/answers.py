@@ -16,6 +16,7 @@ from darswin.models.encoder import Encoder, Prepared
 from darswin.models.saving import ModelCard
 
 BATCH = 8  # images at once take a half or a third of the time of one after the other
+LENSES = 16  # of which what they decide is kept: as many cameras may take turns in a folder
 
 
 class Asked(NamedTuple):
@@ -30,9 +31,9 @@ class Asked(NamedTuple):
 class Answers:
     """Collects what a model says of images, in their order.
 
-    Images that follow each other and have the same lens go through the model together, and what
-    their lens alone decides is computed once. A subclass says what is asked of the model, in `ask`,
-    and what is made of that, in `answer`.
+    Images that follow each other and have the same lens go through the model together, and what a
+    lens alone decides is computed once. A subclass says what is asked of the model, in `ask`, and
+    what is made of that, in `answer`.
 
     Attributes:
         found: an entry for each image answered. seconds: what the network took for them.
@@ -45,8 +46,8 @@ class Answers:
         self.model, self.card = model, card
         self.found: list[dict[str, Any]] = []
         self.seconds = 0.0
-        self._lens: Lens | None = None
-        self._prepared: Any = None  # for the lens
+        self._lens: Lens | None = None  # of the images that wait
+        self._decided: dict[int, tuple[Lens, Any, Any]] = {}  # by the identity of a lens
         self._waiting: list[Asked] = []
 
     def add(self, entry: dict[str, Any], image: np.ndarray, lens: Lens) -> None:
@@ -58,11 +59,14 @@ class Answers:
         pixels, resized_lens = resized(self.model, self.card, image, lens)
         if lens is not self._lens:
             self.flush()
-            with torch.inference_mode():
-                size = (pixels.shape[2], pixels.shape[3])
-                self._prepared = self.model.prepare(resized_lens, size)
-            self.look_through(lens)
             self._lens = lens
+            if id(lens) not in self._decided:
+                if len(self._decided) == LENSES:
+                    del self._decided[next(iter(self._decided))]
+                with torch.inference_mode():
+                    size = (pixels.shape[2], pixels.shape[3])
+                    prepared = self.model.prepare(resized_lens, size)
+                self._decided[id(lens)] = lens, prepared, self.look_through(lens)
         self._waiting.append(Asked(entry, image, pixels))
         if len(self._waiting) == BATCH:
             self.flush()
@@ -72,23 +76,25 @@ class Answers:
         waiting, self._waiting = self._waiting, []
         if not waiting:
             return
+        _, prepared, look = self._decided[id(self._lens)]
         images = torch.cat([asked.pixels for asked in waiting])
         start = time.perf_counter()
         with torch.inference_mode():
-            output = self.ask(images, self._prepared)
+            output = self.ask(images, prepared)
         self.seconds += time.perf_counter() - start
         for asked, said in zip(waiting, output, strict=True):
-            self.found.append(asked.entry | self.answer(asked, said))
+            self.found.append(asked.entry | self.answer(asked, said, look))
 
-    def look_through(self, lens: Lens) -> None:
-        """Prepares `answer` for images through another lens."""
+    def look_through(self, lens: Lens) -> Any:
+        """What `answer` needs of a lens."""
+        return None
 
     def ask(self, images: Tensor, prepared: Any) -> Tensor:
         """What the network says of images (B, C, h, w): (B, …)."""
         raise NotImplementedError
 
-    def answer(self, asked: Asked, said: Tensor) -> dict[str, Any]:
-        """The answer for an image of which the network says that."""
+    def answer(self, asked: Asked, said: Tensor, look: Any) -> dict[str, Any]:
+        """The answer for an image of which the network says that; `look` is of `look_through`."""
         raise NotImplementedError
 
 
@@ -110,7 +116,7 @@ class ClassAnswers(Answers):
         features = self.model.norm(self.model.run(images, prepared)[-1])
         return self.model.forward_head(features).softmax(-1)
 
-    def answer(self, asked: Asked, said: Tensor) -> dict[str, Any]:
+    def answer(self, asked: Asked, said: Tensor, look: Any) -> dict[str, Any]:
         """The most probable classes."""
         best = said.topk(min(self.top, len(said)))
         return {"top": [*map(self._class, best.indices.tolist(), best.values.tolist())]}

@@ -50,19 +50,18 @@ class DenseAnswers(Answers):
     def __init__(self, model: DenseModel, card: ModelCard, out: Path, names: Mapping[str, str]):
         super().__init__(model, card)
         self.out, self.names = out, names
-        self.full_size: FullSize  # of the lens
 
-    def look_through(self, lens: Lens) -> None:
-        """Computes which pixels have an answer."""
-        self.full_size = FullSize(lens, self.card.size, fit_of(self.model, self.card))
+    def look_through(self, lens: Lens) -> FullSize:
+        """The way back to the pixels of its pictures."""
+        return FullSize(lens, self.card.size, fit_of(self.model, self.card))
 
     def ask(self, images: Tensor, prepared: DensePrepared) -> Tensor:
         """What the network says of each pixel, (B, K, h, w)."""
         return self.model.run(images, prepared)
 
-    def answer(self, asked: Asked, said: Tensor) -> dict[str, Any]:
+    def answer(self, asked: Asked, said: Tensor, look: FullSize) -> dict[str, Any]:
         """Writes the files of an image, and names and summarizes them."""
-        content, picture, where, summary = self.picture(asked, said.float().numpy())
+        content, picture, where, summary = self.picture(asked, said.float().numpy(), look)
         name = self._name(asked.entry)
         files = {self.kind: f"{self.kind}/{name}.png", "overlay": f"overlays/{name}.jpg"}
         replace_file(self.out / files[self.kind], content)
@@ -72,7 +71,7 @@ class DenseAnswers(Answers):
         return files | summary
 
     def picture(
-        self, asked: Asked, said: np.ndarray
+        self, asked: Asked, said: np.ndarray, look: FullSize
     ) -> tuple[bytes | memoryview, np.ndarray, np.ndarray, dict[str, Any]]:
         """What (K, h, w) are in the image: a PNG file's content, a picture for the overlay and
         where it is laid, and a summary."""
@@ -96,9 +95,9 @@ class LabelAnswers(DenseAnswers):
         self.classes = list(card.classes) or [str(k) for k in range(model.num_classes)]
         self.colors = list(card.colors) or palette(len(self.classes))
 
-    def picture(self, asked, said):
+    def picture(self, asked, said, look):
         """Labels, and each class's share of the pixels that have one."""
-        labels = self.full_size.labels(said)
+        labels = look.labels(said)
         counts = np.bincount(labels.ravel(), minlength=IGNORE + 1)
         answered = max(1, labels.size - counts[IGNORE])
         shares = {
@@ -119,9 +118,9 @@ class DistanceAnswers(DenseAnswers):
         super().__init__(model, card, out, names)
         self._range: tuple[Any, tuple[float, float]] = (None, (1.0, 2.0))
 
-    def picture(self, asked, said):
+    def picture(self, asked, said, look):
         """Distances, and the nearest, the median and the farthest of them."""
-        distance = self.full_size.distance(said[0])
+        distance = look.distance(said[0])
         known = is_known(distance)
         values = distance[known] if known.any() else np.zeros(1)
         unanswered = round(float(1 - known.mean()), 6)

@@ -52,3 +52,21 @@ def test_a_lens_is_prepared_once(monkeypatch):
     answers.flush()
     assert len(answers.found) == 2 * module.BATCH + 1
     assert all(len(entry["top"]) == 2 for entry in answers.found)
+
+
+def test_lenses_that_take_turns_are_prepared_once(monkeypatch):
+    answers = ClassAnswers(create_model("darswin_a_nano", num_classes=6), CARD, 1)
+    prepared = []
+    prepare = answers.model.prepare
+    monkeypatch.setattr(answers.model, "prepare", lambda *a: prepared.append(a) or prepare(*a))
+    image = np.zeros((48, 64, 3), np.uint8)
+    lenses = [
+        Spherical.from_fov(xi / 20, 2.6, 24.0).replace(image_size=SIZE) for xi in range(20)
+    ]  # fmt: skip
+    for lens in lenses[:4] * 3:
+        answers.add({}, image, lens)
+    assert len(prepared) == 4
+    for lens in lenses + lenses[-module.LENSES :]:  # no more than so many are kept
+        answers.add({}, image, lens)
+    answers.flush()
+    assert len(prepared) == 20 and len(answers.found) == 12 + 20 + module.LENSES
