@@ -6,16 +6,19 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 from videos import write_video
 
+from darswin.cli import dense_answers
 from darswin.cli import predict as predict_module
 from darswin.cli.dense_answers import claim_folder, distance_png, file_names, label_png
 from darswin.cli.main import main
+from darswin.data.frames import at_size
 from darswin.data.full_size import FullSize
 from darswin.lens import from_dict
 from darswin.models.encoder import Encoder, Prepared
-from darswin.models.saving import ModelCard
+from darswin.models.saving import ModelCard, save_model
 from darswin.viz.dense import UNKNOWN, palette
 
 # A circle inside of pictures of 48×64, of whose middle square it leaves the corners out.
@@ -53,6 +56,7 @@ def stub(monkeypatch):
         known = dict(classes=NAMES, colors=COLORS, size=48, fit="crop", task=task)
         card = ModelCard("stub", **(known | card))
         monkeypatch.setattr(predict_module, "trained_model", lambda path: (net, card))
+        monkeypatch.setattr(dense_answers, "optimize", lambda model: model)
         return net
 
     return install
@@ -323,3 +327,29 @@ def test_pictures_of_several_lenses_go_through_their_own(stub, labels, tmp_path)
     for name, described in lenses.items():
         seen = FullSize(from_dict(described, (48, 64)), 48, "crop").seen
         assert np.array_equal(ids(out / f"labels/{name}/p.png") != 255, seen)
+
+
+@pytest.mark.parametrize("task", ["segmentation", "distance"])
+@pytest.mark.parametrize("name", ["darswin_unet_a_nano", "swin_unet_adapted_nano"])
+def test_a_real_model_says_what_it_says_in_python(name, task, tmp_path):
+    options = dict(task=task, num_classes=3, in_chans=3, mean=[0.5] * 3, std=[0.25] * 3)
+    size = 128
+    card = ModelCard(name, options, NAMES, size, fit="crop", task=task, colors=COLORS)
+    model = card.create().eval()
+    save_model(tmp_path / "m.safetensors", model.state_dict(), card)
+    rng = np.random.default_rng(0)
+    image = cv2.resize(rng.integers(256, size=(9, 12, 3), dtype=np.uint8), (160, 140))
+    picture, out = write(tmp_path / "p.png", image), tmp_path / "out"
+    lens = {"model": "Spherical", "xi": 0.5, "fov": 2.8, "image_size": [140, 160]}
+    argv = ["predict", picture, "--model", str(tmp_path / "m.safetensors"), "--out", str(out)]
+    main([*argv, "--lens", json.dumps(lens)])
+    taken_with = from_dict(lens, (140, 160))
+    small, small_lens = at_size(image, taken_with, size, "crop")
+    with torch.no_grad():
+        said = model(torch.from_numpy(small)[None], small_lens)[0].numpy()
+    full = FullSize(taken_with, size, "crop")
+    if task == "segmentation":
+        assert (ids(out / "labels/p.png") == full.labels(said)).mean() > 0.998
+    else:
+        steps = cv2.imread(str(out / "distance/p.png"), cv2.IMREAD_UNCHANGED)
+        np.testing.assert_allclose(steps / 256, full.distance(said[0]), atol=1 / 256, rtol=1e-3)
