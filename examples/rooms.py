@@ -81,7 +81,10 @@ class Room:
             if max(abs(x), abs(z)) > side + 0.3:  # the camera is in no box
                 corners.append(((x - side, eye - 2 * top, z - side), (x + side, eye, z + side)))
         self.low, self.high = np.array(corners, np.float32).swapaxes(0, 1)
-        self.paint = rng.uniform(40, 230, (len(corners) + 1, 3, 3))
+        # Floors are dark, ceilings bright, boxes of full colours; floors and walls are checkered.
+        self.paint = rng.uniform(60, 200, (len(corners), 3, 3))
+        self.paint[1:] = rng.permuted(np.tile([30, 130, 250], (len(corners) - 1, 3, 1)), axis=-1)
+        self.floor, self.ceiling = rng.uniform(30, 110, 3), rng.uniform(190, 250, 3)
         self.square = rng.uniform(0.3, 0.8)
 
     def trace(self, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -103,10 +106,11 @@ class Room:
     def colors(self, rays: np.ndarray) -> np.ndarray:
         """What the camera sees, (H, W, 3) uint8: checkered sides, darker far away."""
         labels, distance, which, axis = self.trace(rays)
-        paint = self.paint[np.where(labels == CEILING, len(self.low), which), axis]
+        paint = self.paint[which, axis]
+        paint[labels == FLOOR], paint[labels == CEILING] = self.floor, self.ceiling
         places = np.floor(rays @ self.turn.T * distance[..., None] / self.square)
         along = np.arange(3) != axis[..., None]
-        dark = np.nansum(places * along, -1) % 2
+        dark = np.nansum(places * along, -1) % 2 * (labels < CEILING)
         light = (1 - 0.25 * dark) / (1 + 0.08 * distance)
         image = paint * light[..., None] + 4 * self.rng.standard_normal(rays.shape, np.float32)
         return np.where(np.isnan(rays), 0, image.clip(0, 255)).astype(np.uint8)
