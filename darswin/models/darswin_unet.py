@@ -48,8 +48,9 @@ class DarSwinUnet(DenseModel):
     Rotation:
         In eval mode and without the skip from the image (skip_width=0), whose convolutions are not
         symmetric, a turn of a square image about the principal point by 90° turns the result by
-        90°, up to rounding, where it turns the maps of `DarSwin`: for RA of every size, and for A
-        as it says.
+        90°, up to rounding, where it turns the maps of `DarSwin`: for "darswin_unet_ra_nano", and
+        with `periodic_bias` for RA of every size and "darswin_unet_a_nano". A pixel at the very
+        middle has no azimuth and is left out.
 
     Raises:
         ValueError: as `DarSwin`, or an option out of its range. TypeError: in forward, no lens.
