@@ -163,8 +163,7 @@ def polar_to_image(
     known, radii = known.expand(rows, *known.shape[1:]), radii.expand(rows, rings)
     # The ring centres on both sides. Inside the first one the inner side lies across the pole, at
     # a negative radius; beyond the last one both sides are the last ring.
-    above = torch.searchsorted(radii.contiguous(), r.detach().flatten(1).contiguous(), right=True)
-    above = above.reshape(r.shape)
+    above = _rings_within(radii.detach(), r.detach().flatten(1)).reshape(r.shape)
     pole, beyond = above == 0, above == rings
     inner, outer = (above - 1).clamp(min=0), above.clamp(max=rings - 1)
     first, second = (radii.gather(1, k.flatten(1)).reshape(r.shape) for k in (inner, outer))
@@ -187,6 +186,13 @@ def polar_to_image(
             out = out + (weight * share)[..., None] * corner
     out = torch.where(known[..., None], out, 0).to(x.dtype)
     return out if tokens else out.permute(0, 3, 1, 2).contiguous()
+
+
+def _rings_within(radii: Tensor, r: Tensor) -> Tensor:
+    """How many of the rising radii (N, R) are at most r (N, K): (N, K)."""
+    if torch.compiler.is_compiling():  # ONNX has no searchsorted; this takes R times the memory
+        return (radii[:, :, None] <= r[:, None]).sum(1)
+    return torch.searchsorted(radii.contiguous(), r.contiguous(), right=True)
 
 
 def _on_polar_plane(size: Sequence[int], center: Tensor, affine: Tensor | None) -> Tensor:

@@ -42,6 +42,10 @@ def tensors_of(lens):
         ("darswin_ra_nano", dict(spacing="radius", sample_spacing="theta"), POLYNOMIAL),
         ("darswin_a_nano", dict(compat="official", rings=16, sectors=64), SPHERICAL),
         ("swin_nano", {}, SPHERICAL),
+        ("darswin_unet_a_nano", dict(skip_width=4), SPHERICAL),
+        ("darswin_unet_ra_nano", dict(ONE_BLOCK, task="distance"), POLYNOMIAL),
+        ("swin_unet_undis_nano", dict(ONE_BLOCK, image_size=32), SPHERICAL),
+        ("swin_unet_adapted_nano", dict(ONE_BLOCK, image_size=32), SPHERICAL),
     ],
 )
 def test_program(name, options, lens):
@@ -108,6 +112,8 @@ def test_package_in_a_process_without_the_package(tmp_path):
         ("darswin_ra_nano", ONE_BLOCK, POLYNOMIAL[0]),
         ("swin_undis_nano", ONE_BLOCK, SPHERICAL),
         ("dat_nano", dict(ONE_BLOCK, blocks=("D",), groups=(1,)), SPHERICAL),
+        ("darswin_unet_a_nano", ONE_BLOCK, SPHERICAL),
+        ("swin_unet_adapted_nano", dict(ONE_BLOCK, image_size=32, task="distance"), SPHERICAL[0]),
     ],
 )
 def test_onnx(name, options, lens, tmp_path):

@@ -27,7 +27,7 @@ class Network(nn.Module):
 
 def smooth(height, width):
     y, x = torch.meshgrid(torch.arange(float(height)), torch.arange(float(width)), indexing="ij")
-    return torch.stack((torch.sin(x / 9), torch.cos(y / 8), torch.sin((x + y) / 11)))[None]
+    return torch.stack((torch.sin(x / 12), torch.cos(y / 12), torch.sin((x + y) / 16)))[None]
 
 
 @pytest.mark.parametrize(

@@ -33,6 +33,17 @@ def test_one_graph_for_training_at_any_batch_size(family):
     assert counter.frame_count == 1
 
 
+@pytest.mark.parametrize("name", ["darswin_unet_a_nano", "swin_unet_undis_nano"])
+def test_one_graph_of_a_dense_model_at_any_batch_size(name):
+    counter = CompileCounter()
+    options = {} if name.startswith("darswin") else dict(image_size=32)
+    model = create_model(name, num_classes=5, drop_path_rate=0.1, **options)
+    compiled = torch.compile(model, fullgraph=True, dynamic=True, backend=counter)
+    for batch in (2, 3, 5):
+        assert compiled(*inputs(batch)).shape == (batch, 5, 32, 32)
+    assert counter.frame_count == 1
+
+
 def one_block(family, **options):
     """A model of which inductor's C++ is built in seconds."""
     return create_model(f"{family}_nano", num_classes=5, depths=(1,), num_heads=(1,), **options)
