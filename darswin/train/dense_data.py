@@ -80,7 +80,7 @@ class DenseData(RunData):
 
     @property
     def test_names(self) -> list[str]:
-        """The names of the folders that are tested, or, where two have the same one, as much of their
+        """The names of the folders that are tested; where two have the same one, as much of their
         paths as tells all apart."""
         paths = [os.path.abspath(path) for path in self.test_paths or [self.path]]
         names = [os.path.basename(path) for path in paths]
