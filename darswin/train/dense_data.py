@@ -80,8 +80,8 @@ class DenseData(RunData):
 
     @property
     def test_names(self) -> list[str]:
-        """Of the folders that are tested: their own names, or, where two have one, with as much of
-        their paths as tells all apart."""
+        """The names of the folders that are tested; where two have the same one, as much of their
+        paths as tells all apart."""
         paths = [os.path.abspath(path) for path in self.test_paths or [self.path]]
         names = [os.path.basename(path) for path in paths]
         if len(set(names)) == len(names):

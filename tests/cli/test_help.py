@@ -7,8 +7,7 @@ import pytest
 from lightning.pytorch import Trainer
 
 from darswin.cli.main import main
-from darswin.train.classification import Classification
-from darswin.train.wide_angle import WideAngleData
+from darswin.train.tasks import TASKS
 
 
 def shown(capsys, *argv):
@@ -22,9 +21,9 @@ def options(text):
     return re.findall(r"^  (?:-c, |-c CONFIG, )?--([\w.]+)", text, re.M)
 
 
-def own():
+def own(task="classification"):
     """All options of the data and of the model: those of their classes and of the bases."""
-    for group, made in (("data", WideAngleData), ("model", Classification)):
+    for group, made in (("data", TASKS[task].data), ("model", TASKS[task].module)):
         for part in (c for c in made.__mro__ if c.__module__.startswith("darswin.")):
             for name, parameter in inspect.signature(part).parameters.items():
                 if parameter.kind is not parameter.VAR_KEYWORD and name != "seed":
@@ -43,6 +42,18 @@ def test_ours_come_first_and_none_is_missing(capsys, command):
     assert "SUPPRESS" not in text.upper() and f"darswin {command} --help.all" in lines[-1]
 
 
+@pytest.mark.parametrize("task", ["segmentation", "distance"])
+def test_a_task_has_its_own(capsys, task):
+    text = shown(capsys, "fit", "--task", task, "--help")
+    names = options(text)
+    assert len(text.splitlines()) <= 150 and len(set(names)) == len(names)
+    assert set(own(task)) <= set(names) and "task" in names
+    assert not {"xi", "data.test_lenses", "model.mixup"} & set(names)
+    assert ("data.max_distance" in names) == (task == "distance")
+    assert f"lists its options [{task}]" in " ".join(text.split())
+    assert " None [" not in text  # every option says what it is
+
+
 def test_all_has_everything(capsys):
     few, every = (options(shown(capsys, "fit", flag)) for flag in ("--help", "--help.all"))
     assert every[: len(few)] == few
@@ -58,4 +69,4 @@ def test_defaults_are_said(capsys):
     text = " ".join(shown(capsys, "fit", "--help").split())
     assert "the folder of the run [required]" in text
     assert "--data.batch_size of one process [128]" in text
-    assert "a preset (iccv2023, minutes, two_cores)" in text
+    assert "a preset (iccv2023, minutes, scenes_minutes, two_cores)" in text
