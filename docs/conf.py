@@ -29,7 +29,8 @@ napoleon_custom_sections = ["Convention", ("Keys", "params_style")]
 napoleon_use_rtype = False  # "(N,) rad" is a shape and a unit
 
 # Names of other projects, since the site is built without a network; and bases that are not public.
-OTHERS = "torch|numpy|np|matplotlib|lightning|collections|typing|os|pathlib|datetime|contextlib"
+OTHERS = "torch|torchmetrics|numpy|np|matplotlib|lightning|"
+OTHERS += "collections|typing|os|pathlib|datetime|contextlib"
 UNITS = r"[A-Z]|\d|rad|px"  # of properties, whose docstrings begin with shape and unit
 PRIVATE = "LensBatch|LensDistribution|_Optimized|Sampling|Net|_Class|T"
 nitpick_ignore_regex = [

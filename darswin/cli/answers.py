@@ -1,56 +1,73 @@
-"""The most probable classes of a stream of images, several at once."""
+"""What a model says of a stream of images, several at once: their most probable classes."""
 
 import time
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from darswin.data.frames import at_size
+from darswin.data.frames import Fit, at_size
 from darswin.deploy.optimize import optimize
 from darswin.lens import Lens
+from darswin.models.base import Model
+from darswin.models.dense import DenseModel
 from darswin.models.encoder import Encoder, Prepared
 from darswin.models.saving import ModelCard
 
 BATCH = 8  # images at once take a half or a third of the time of one after the other
+LENSES = 16  # of which what they decide is kept: as many cameras may take turns in a folder
+
+
+class Asked(NamedTuple):
+    """Attributes: entry: what is said of an image beside the answer; image: (H, W, C) uint8;
+    pixels: (1, C, h, w), what the model gets of it."""
+
+    entry: dict[str, Any]
+    image: np.ndarray
+    pixels: Tensor
 
 
 class Answers:
     """Collects what a model says of images, in their order.
 
-    Images that follow each other and have the same lens go through the model together, and the grid
-    and position biases of that lens are computed once.
+    Images that follow each other and have the same lens go through the model together, and what a
+    lens alone decides is computed once. A subclass says what is asked of the model, in `ask`, and
+    what is made of that, in `answer`.
 
     Attributes:
         found: an entry for each image answered. seconds: what the network took for them.
 
     Args:
-        model, card: as `load_model` gives them. top: how many classes of each image.
+        model: of `create_model`, or what `optimize` makes of one. card: as `load_model` gives it.
     """
 
-    def __init__(self, model: Encoder, card: ModelCard, top: int):
-        self.model, self.card, self.top = optimize(model), card, top
+    def __init__(self, model: Encoder | DenseModel, card: ModelCard):
+        self.model, self.card = model, card
         self.found: list[dict[str, Any]] = []
         self.seconds = 0.0
-        self._lens: Lens | None = None
-        self._prepared = Prepared(None, ())  # for the lens
-        self._waiting: list[tuple[dict[str, Any], Tensor]] = []
+        self._lens: Lens | None = None  # of the images that wait
+        self._decided: dict[int, tuple[Lens, Any, Any]] = {}  # by the identity of a lens
+        self._waiting: list[Asked] = []
 
     def add(self, entry: dict[str, Any], image: np.ndarray, lens: Lens) -> None:
         """An image (H, W, C) uint8 and its lens; the same object is the same lens.
 
         Args:
-            entry: what is said of the image beside its classes.
+            entry: what is said of the image beside the answer.
         """
         pixels, resized_lens = resized(self.model, self.card, image, lens)
         if lens is not self._lens:
             self.flush()
-            with torch.inference_mode():
-                size = (pixels.shape[2], pixels.shape[3])
-                self._prepared = self.model.prepare(resized_lens, size)
             self._lens = lens
-        self._waiting.append((entry, pixels))
+            if id(lens) not in self._decided:
+                if len(self._decided) == LENSES:
+                    del self._decided[next(iter(self._decided))]
+                with torch.inference_mode():
+                    size = (pixels.shape[2], pixels.shape[3])
+                    prepared = self.model.prepare(resized_lens, size)
+                self._decided[id(lens)] = lens, prepared, self.look_through(lens)
+        self._waiting.append(Asked(entry, image, pixels))
         if len(self._waiting) == BATCH:
             self.flush()
 
@@ -59,27 +76,65 @@ class Answers:
         waiting, self._waiting = self._waiting, []
         if not waiting:
             return
-        images = torch.cat([pixels for _, pixels in waiting])
+        _, prepared, look = self._decided[id(self._lens)]
+        images = torch.cat([asked.pixels for asked in waiting])
         start = time.perf_counter()
         with torch.inference_mode():
-            features = self.model.norm(self.model.run(images, self._prepared)[-1])
-            probabilities = self.model.forward_head(features).softmax(-1)
+            output = self.ask(images, prepared)
         self.seconds += time.perf_counter() - start
-        best = probabilities.topk(min(self.top, probabilities.shape[1]))
-        for (entry, _), values, indices in zip(waiting, *map(Tensor.tolist, best), strict=True):
-            self.found.append(entry | {"top": [*map(self._class, indices, values)]})
+        for asked, said in zip(waiting, output, strict=True):
+            self.found.append(asked.entry | self.answer(asked, said, look))
+
+    def look_through(self, lens: Lens) -> Any:
+        """What `answer` needs of a lens."""
+        return None
+
+    def ask(self, images: Tensor, prepared: Any) -> Tensor:
+        """What the network says of images (B, C, h, w): (B, …)."""
+        raise NotImplementedError
+
+    def answer(self, asked: Asked, said: Tensor, look: Any) -> dict[str, Any]:
+        """The answer for an image of which the network says that; `look` is of `look_through`."""
+        raise NotImplementedError
+
+
+class ClassAnswers(Answers):
+    """The most probable classes of images.
+
+    Args:
+        model, card: as `load_model` gives them. top: how many classes of each image.
+    """
+
+    model: Encoder
+
+    def __init__(self, model: Encoder, card: ModelCard, top: int):
+        super().__init__(optimize(model), card)
+        self.top = top
+
+    def ask(self, images: Tensor, prepared: Prepared) -> Tensor:
+        """The probabilities of all classes, (B, K)."""
+        features = self.model.norm(self.model.run(images, prepared)[-1])
+        return self.model.forward_head(features).softmax(-1)
+
+    def answer(self, asked: Asked, said: Tensor, look: Any) -> dict[str, Any]:
+        """The most probable classes."""
+        best = said.topk(min(self.top, len(said)))
+        return {"top": [*map(self._class, best.indices.tolist(), best.values.tolist())]}
 
     def _class(self, index: int, probability: float) -> dict[str, Any]:
         name = self.card.classes[index] if self.card.classes else index
         return {"class": name, "probability": probability}
 
 
-def resized(net: Encoder, card: ModelCard, image: np.ndarray, lens: Lens) -> tuple[Tensor, Lens]:
+def resized(net: Model, card: ModelCard, image: np.ndarray, lens: Lens) -> tuple[Tensor, Lens]:
     """A picture as the model saw them in training: (1, C, H, W) uint8 with its lens, in its pixels.
 
-    `darswin.data.frames.at_size` as the model's card says. A model that takes only squares gets one
-    in any case.
+    `darswin.data.frames.at_size` as the model's card says, and `fit_of`.
     """
-    fit = "crop" if net.square_images and card.fit == "whole" else card.fit
-    image, lens = at_size(image, lens, card.size, fit)
+    image, lens = at_size(image, lens, card.size, fit_of(net, card))
     return torch.from_numpy(image[None]).permute(0, 3, 1, 2).contiguous(), lens
+
+
+def fit_of(net: Model, card: ModelCard) -> Fit:
+    """How pictures get the model's size. One that takes only squares gets one in any case."""
+    return "crop" if net.square_images and card.fit == "whole" else card.fit

@@ -41,11 +41,13 @@ def _convert(argv: list[str]) -> None:
 
 
 def _models(argv: list[str]) -> None:
-    from darswin.models import list_models
+    from darswin.models import list_models, list_pretrained
 
     parser = argparse.ArgumentParser(prog="darswin models", description=COMMANDS["models"].text)
     parser.parse_args(argv[1:])
     print("\n".join(list_models()))
+    print("\ntrained, for --model of predict:")
+    print("\n".join(list_pretrained()))
 
 
 def _lens(argv: list[str]) -> None:
@@ -79,7 +81,11 @@ COMMANDS = {
     "test": Command(
         "measures a trained model through lenses, for one after the other", TRAIN, _fit
     ),
-    "predict": Command("names what is in pictures taken through a known lens", PICTURES, _predict),
+    "predict": Command(
+        "says what is in pictures taken through a known lens, or in each of their pixels",
+        (*PICTURES, "matplotlib"),
+        _predict,
+    ),
     "convert": Command(
         "makes a safetensors file of a pickled checkpoint, without executing it",
         ("jsonargparse",),

@@ -6,21 +6,21 @@ import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jsonargparse import ArgumentParser
 from safetensors import safe_open
 
-from darswin.cli.answers import Answers
+from darswin.cli.answers import Answers, ClassAnswers
+from darswin.cli.dense_answers import ANSWERS, ANSWERS_OF, claim_folder, file_names
 from darswin.compat import load_official
 from darswin.data.calibrations import Calibrations, is_json
-from darswin.data.folders import PICTURES, pictures_below
+from darswin.data.folders import PICTURES, pictures_and_videos_below
 from darswin.data.samples import IMAGENET_MEAN, IMAGENET_STD
 from darswin.lens import Lens
-from darswin.models.encoder import Encoder
 from darswin.models.pretrained import list_pretrained, pretrained_file
-from darswin.models.saving import ModelCard, NoCardError, load_model, model_of_run
+from darswin.models.saving import ModelCard, NoCardError, Task, load_model, model_of_run
 from darswin.utils.files import replace_file
 from darswin.utils.image import BrokenImageError, read_oriented
 from darswin.utils.video import is_video, read_frames
@@ -38,7 +38,7 @@ def run(argv: list[str]) -> None:
     described = (predict.__doc__ or "").splitlines()[0]
     parser = ArgumentParser(prog="darswin predict", description=described)
     parser.add_argument(
-        "paths", nargs="*", type=str, default=[], help="pictures, videos, folders of pictures"
+        "paths", nargs="*", type=str, default=[], help="pictures, videos, folders of both"
     )
     parser.add_function_arguments(predict, skip={"paths"})
     predict(**parser.parse_args(argv).as_dict())
@@ -46,18 +46,19 @@ def run(argv: list[str]) -> None:
 
 def predict(
     paths: Sequence[str] = (), *, lens: str | None = None, run: str | None = None,
-    model: str | None = None, camera: str | None = None, top: int = 5, every: int = 1,
-    out: str | None = None,
+    model: str | None = None, camera: str | None = None, task: Task | None = None, top: int = 5,
+    every: int = 1, out: str | None = None,
 ) -> list[dict]:  # fmt: skip
-    """The most probable classes of pictures and of the frames of videos, as JSON.
+    """What a model says of pictures and of the frames of videos, as JSON: their most probable
+    classes, or files with a class or a distance for each pixel.
 
     A picture or video that its metadata turns upright is turned, as in training, and its lens with
     it. What has no answer is named once the others' answers are written. After the frames of a
     video stands how fast they were answered, on stderr too.
 
     Args:
-        paths: image files, videos, and folders, of which all pictures are taken; a model that comes
-            with darswin brings a picture and its lens, for want of others.
+        paths: image files, videos, and folders, of which all pictures and videos are taken; a model
+            that comes with darswin brings a picture and its lens, for want of others.
         lens: the camera's calibration file, of any format that `darswin.lens.load` reads; or its
             lens as JSON, in pixels of the pictures: {"model": "Spherical", "xi": 0.5, "focal": 300,
             "theta_max": 1.5}, or with "fov" (rad) in place of the last two where the field of view
@@ -67,13 +68,19 @@ def predict(
         model: a model's safetensors file, instead; "digits", which comes with darswin; or what
             `darswin convert` makes of the authors' released weights, whose classes have numbers.
         camera: which, of a calibration of several.
-        top: how many classes.
+        task: what the model is expected to tell; it says so itself.
+        top: how many classes of an image.
         every: of a video the first frame, and each so many frames after it.
-        out: a JSON file to write; without it, the classes are printed.
+        out: a JSON file to write; without it, the classes are printed. Of a model for segmentation
+            or distance the folder of what it writes: labels/NAME.png, whose pixels are ids of
+            classes, or distance/NAME.png, metres × 256 in 16 bits, up to 255.996 m; where nothing
+            is known, 255 or 0; and overlays/NAME.jpg. Its predictions.json is the answer. It must
+            be new, empty, or of an earlier predict.
 
     Raises:
         BrokenImageError: a picture or video that cannot be read, or that the lens does not fit.
-        ValueError: arguments that are wrong, a lens that `darswin.lens.load` or the model refuses.
+        ValueError: arguments that are wrong, a lens that `darswin.lens.load` or the model refuses;
+            another `task` than the model's.
     """
     if run is not None and model is None:
         weights: str | Path = model_of_run(run)
@@ -92,9 +99,17 @@ def predict(
     if not paths or lens is None:
         raise ValueError("predict needs pictures or videos, and --lens, what they were taken with")
     net, card = trained_model(weights)
+    if task not in (None, card.task):
+        raise ValueError(f"--task {task} was asked of {weights}, a model for {card.task}")
     calibrations = Calibrations(lens, "." if is_json(lens) else Path(lens).parent, camera)
-    answers = Answers(net, card, top)
-    files = pictures_and_videos(paths)
+    if card.task == "classification":
+        files = pictures_and_videos(paths)
+        answers: Answers = ClassAnswers(net, card, top)
+    else:
+        files = pictures_and_videos(paths, leave_out=out)
+        folder = claim_folder(out)
+        out = str(folder / ANSWERS)
+        answers = ANSWERS_OF[card.task](net, card, folder, file_names(paths, files))
     bad: list[str] = []
     try:
         for file in files:
@@ -121,20 +136,31 @@ def predict(
     return found
 
 
-def pictures_and_videos(paths: Sequence[str]) -> list[File]:
-    """The files that are meant by paths, of which folders mean all pictures in them.
+def pictures_and_videos(paths: Sequence[str], leave_out: str | None = None) -> list[File]:
+    """The files that are meant by paths, of which folders mean all pictures and videos in them.
+
+    Args:
+        leave_out: a folder whose files other folders do not mean.
 
     Raises:
-        FileNotFoundError: a folder without pictures.
+        FileNotFoundError: a folder without any.
     """
     files = []
     for path in paths:
-        if os.path.isdir(path) and os.path.splitext(path)[1].lower() not in PICTURES:
-            files += [File(name, False) for name in pictures_below(Path(path))]
-        else:
-            picture = os.path.splitext(path)[1].lower() in PICTURES
-            files.append(File(str(path), not picture and is_video(path)))
+        names = [str(path)]
+        if os.path.isdir(path) and not _is_picture(path):
+            below = pictures_and_videos_below(Path(path))
+            names = [n for n in below if leave_out is None or not _is_below(n, leave_out)]
+        files += [File(name, not _is_picture(name) and is_video(name)) for name in names]
     return files
+
+
+def _is_picture(path: str) -> bool:
+    return os.path.splitext(path)[1].lower() in PICTURES
+
+
+def _is_below(path: str, folder: str) -> bool:
+    return Path(os.path.realpath(path)).is_relative_to(os.path.realpath(folder))
 
 
 def answer_video(name: str, every: int, calibrations: Calibrations, answers: Answers) -> None:
@@ -175,7 +201,7 @@ def _lens(calibrations: Calibrations, name: str, image: np.ndarray, orientation:
         raise BrokenImageError(str(error)) from error
 
 
-def trained_model(path: str | Path) -> tuple[Encoder, ModelCard]:
+def trained_model(path: str | Path) -> tuple[Any, ModelCard]:
     """The model of a file of ours, or of the released DarSwin's weights, and its card.
 
     The released code normalises pixels as ImageNet's; a model's classes have numbers there.

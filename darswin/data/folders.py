@@ -13,6 +13,7 @@ from pathlib import Path
 
 from darswin.data.sources import ImageFiles
 from darswin.data.splits import Split, hold_out, read_json, read_list, some
+from darswin.utils.video import SUFFIXES as VIDEOS
 
 # What folders and lists of a split are called, in any case.
 SPLIT_NAMES: dict[str, Split] = {
@@ -90,18 +91,19 @@ def pictures_of(
     return pictures, classes
 
 
-def pictures_below(folder: Path) -> list[str]:
-    """The pictures in a folder and in those below it, sorted; links are followed, hidden ones not.
+def pictures_and_videos_below(folder: Path) -> list[str]:
+    """The pictures and videos in a folder and in those below it, sorted; links are followed, hidden
+    ones not.
 
     Raises:
         FileNotFoundError: none that darswin reads.
     """
     files = sorted(files_below(folder), key=_parts)
-    read = [file for file in files if _suffix(file) in SUFFIXES]
+    read = [file for file in files if _suffix(file) in SUFFIXES | VIDEOS]
     others = [file for file in files if _suffix(file) in OTHER_SUFFIXES]
     if not read:
         found = f", but {_kinds(others)}, which darswin does not read" if others else ""
-        raise FileNotFoundError(f"no pictures in {folder}{found}")
+        raise FileNotFoundError(f"no pictures or videos in {folder}{found}")
     _say_unread(folder, others)
     return read
 

@@ -4,7 +4,7 @@ import torch
 
 from darswin import create_model
 from darswin.cli import answers as module
-from darswin.cli.answers import Answers
+from darswin.cli.answers import ClassAnswers
 from darswin.layers.position_bias import RelativeBias
 from darswin.lens import Spherical
 from darswin.models.saving import ModelCard
@@ -22,7 +22,7 @@ def test_answers_are_the_models_in_order_whatever_the_lenses(name, monkeypatch):
     order = [0] * 10 + [1, 0, 1, 1] + [0] * 3
     rng = np.random.default_rng(0)
     images = [rng.integers(256, size=(48, 64, 3), dtype=np.uint8) for _ in order]
-    answers = Answers(model, card, 6)
+    answers = ClassAnswers(model, card, 6)
     sizes = []
     run = answers.model.run
     monkeypatch.setattr(answers.model, "run", lambda x, p: sizes.append(len(x)) or run(x, p))
@@ -42,7 +42,7 @@ def test_answers_are_the_models_in_order_whatever_the_lenses(name, monkeypatch):
 
 
 def test_a_lens_is_prepared_once(monkeypatch):
-    answers = Answers(create_model("darswin_a_nano", num_classes=6), CARD, 2)
+    answers = ClassAnswers(create_model("darswin_a_nano", num_classes=6), CARD, 2)
     lens = Spherical.from_fov(0.3, 2.6, 24.0).replace(image_size=SIZE)
     image = np.zeros((48, 64, 3), np.uint8)
     answers.add({}, image, lens)
@@ -52,3 +52,21 @@ def test_a_lens_is_prepared_once(monkeypatch):
     answers.flush()
     assert len(answers.found) == 2 * module.BATCH + 1
     assert all(len(entry["top"]) == 2 for entry in answers.found)
+
+
+def test_lenses_that_take_turns_are_prepared_once(monkeypatch):
+    answers = ClassAnswers(create_model("darswin_a_nano", num_classes=6), CARD, 1)
+    prepared = []
+    prepare = answers.model.prepare
+    monkeypatch.setattr(answers.model, "prepare", lambda *a: prepared.append(a) or prepare(*a))
+    image = np.zeros((48, 64, 3), np.uint8)
+    lenses = [
+        Spherical.from_fov(xi / 20, 2.6, 24.0).replace(image_size=SIZE) for xi in range(20)
+    ]  # fmt: skip
+    for lens in lenses[:4] * 3:
+        answers.add({}, image, lens)
+    assert len(prepared) == 4
+    for lens in lenses + lenses[-module.LENSES :]:  # no more than so many are kept
+        answers.add({}, image, lens)
+    answers.flush()
+    assert len(prepared) == 20 and len(answers.found) == 12 + 20 + module.LENSES

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from darswin.cli import bench as command
-from darswin.cli.arguments import with_lists
+from darswin.cli.arguments import with_lists, with_words
 from darswin.cli.main import main
 
 
@@ -15,6 +15,19 @@ def test_only_numbers_after_the_option_are_its_list():
     argv = ["--mean", ".5", "-1e-3", "a.png", "--std", "x", "--other", "1", "2", "--mean"]
     expected = ["--mean=[.5,-1e-3]", "a.png", "--std", "x", "--other", "1", "2", "--mean"]
     assert with_lists(argv, ("mean", "std")) == expected
+
+
+def test_words_after_the_option_are_its_list():
+    for argv in (["--paths", "a b", "c"], ["--paths=a b", "c"]):
+        assert with_words([*argv, "--x", "1"], "paths") == ['--paths=["a b", "c"]', "--x", "1"]
+    for argv in (
+        ["--paths", "null", "--x"],
+        ["--paths", '["a"]'],
+        ["--paths=null"],
+        ["--pathsx", "a"],
+    ):
+        assert "=".join(with_words(argv, "paths")) == "=".join(argv)
+    assert with_words(["--paths"], "paths") == ["--paths"]
 
 
 def refused(capsys, *argv):

@@ -10,8 +10,9 @@ import pytest
 import torch
 import yaml
 from safetensors.torch import load_file
+from scenes import write_plain
 
-from darswin.cli.fit import PRESETS, with_configs
+from darswin.cli.configs import PRESETS, task_of, with_configs
 from darswin.cli.main import COMMANDS, main
 from darswin.layers import linear
 from darswin.models import load_model
@@ -151,7 +152,7 @@ def test_a_run_is_not_overwritten_by_a_launcher(capsys, tmp_path, monkeypatch):
 def test_what_is_missing_is_named(capsys, tmp_path):
     nowhere = tmp_path / "nowhere"
     assert f"no run in {nowhere}" in error(capsys, "test", "--run", nowhere)
-    assert "the presets are iccv2023, minutes, two_cores" in error(
+    assert "the presets are iccv2023, minutes, scenes_minutes, two_cores" in error(
         capsys, "fit", "--run", nowhere, "--config", "minute"
     )
     (tmp_path / "config.yaml").write_text("data: {path: digits}\n")
@@ -260,7 +261,13 @@ def test_convert(tmp_path, capsys):
     assert not (tmp_path / "b").exists()
 
 
-@pytest.mark.parametrize("preset", sorted(path.stem for path in PRESETS.glob("*.yaml")))
+def presets(task):
+    """Those whose task it is."""
+    said = {path.stem: yaml.safe_load(path.read_text()) for path in PRESETS.glob("*.yaml")}
+    return sorted(name for name, preset in said.items() if preset.get("task") == task)
+
+
+@pytest.mark.parametrize("preset", presets(None))
 def test_every_preset_trains(preset, tmp_path):
     small = ["--model.name", "darswin_a_nano", "--data.limit", "8", "--data.batch_size", "4"]
     steps = ["--trainer.max_steps", "2", "--data.workers", "0", "--trainer.logger", "false"]
@@ -269,3 +276,36 @@ def test_every_preset_trains(preset, tmp_path):
     )
     model, card = load_model(tmp_path / "checkpoints" / "last.safetensors")
     assert card.model == "darswin_a_nano" and model.num_classes == 10
+
+
+@pytest.mark.parametrize("preset", presets("segmentation"))
+@pytest.mark.parametrize("task", [None, "distance"])
+def test_every_preset_of_scenes_trains(preset, task, tmp_path):
+    scenes = write_plain(tmp_path / "scenes", 8, size=(45, 60))
+    few = ["--trainer.max_steps", "1", "--data.batch_size", "4", "--data.workers", "0"]
+    few += ["--trainer.logger", "false", "--data.path", str(scenes)]
+    run = tmp_path / "run"
+    main(["fit", "--run", str(run), "-c", preset, *few, *(["--task", task] if task else [])])
+    model, card = load_model(run / "checkpoints" / "last.safetensors")
+    assert card.model == "darswin_unet_a_nano" and card.size == 128
+    assert model.task == card.task == (task or "segmentation")
+
+
+def test_the_task_is_said_once(tmp_path, capsys):
+    config = tmp_path / "config.yaml"
+    config.write_text("task: distance\n")
+    run = ["--run", str(tmp_path / "run")]
+    assert task_of(with_configs(["fit", *run])) == "classification"
+    assert task_of(with_configs(["fit", "-c", str(config), *run])) == "distance"
+    both = ["fit", "-c", str(config), "--task", "segmentation", *run]
+    assert task_of(with_configs(both)) == "segmentation"
+    own = ["test", "--run", str(tmp_path)]
+    assert task_of(with_configs(own)) == "distance"
+    assert "is a run of --task distance, not of segmentation" in error(
+        capsys, *own, "--task", "segmentation"
+    )
+    config.write_text("data: {path: digits}\n")  # of a run before there were tasks
+    assert task_of(with_configs(own)) == "classification"
+    assert "--task must be one of classification, segmentation, distance, got 'odd'" in error(
+        capsys, "fit", *run, "--task", "odd"
+    )

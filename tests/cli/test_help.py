@@ -7,8 +7,7 @@ import pytest
 from lightning.pytorch import Trainer
 
 from darswin.cli.main import main
-from darswin.train.data import WideAngleData
-from darswin.train.task import Classification
+from darswin.train.tasks import TASKS
 
 
 def shown(capsys, *argv):
@@ -22,10 +21,13 @@ def options(text):
     return re.findall(r"^  (?:-c, |-c CONFIG, )?--([\w.]+)", text, re.M)
 
 
-def own():
-    for group, made in (("data", WideAngleData), ("model", Classification)):
-        names = list(inspect.signature(made).parameters)
-        yield from (f"{group}.{name}" for name in names if name != "seed")
+def own(task="classification"):
+    """All options of the data and of the model: those of their classes and of the bases."""
+    for group, made in (("data", TASKS[task].data), ("model", TASKS[task].module)):
+        for part in (c for c in made.__mro__ if c.__module__.startswith("darswin.")):
+            for name, parameter in inspect.signature(part).parameters.items():
+                if parameter.kind is not parameter.VAR_KEYWORD and name != "seed":
+                    yield f"{group}.{name}"
 
 
 @pytest.mark.parametrize("command", ["fit", "validate", "test"])
@@ -38,6 +40,18 @@ def test_ours_come_first_and_none_is_missing(capsys, command):
     last = max(k for k, name in enumerate(names) if not name.startswith("trainer."))
     assert 5 < len(names) - last - 1 < 20  # then the trainer's, a handful
     assert "SUPPRESS" not in text.upper() and f"darswin {command} --help.all" in lines[-1]
+
+
+@pytest.mark.parametrize("task", ["segmentation", "distance"])
+def test_a_task_has_its_own(capsys, task):
+    text = shown(capsys, "fit", "--task", task, "--help")
+    names = options(text)
+    assert len(text.splitlines()) <= 150 and len(set(names)) == len(names)
+    assert set(own(task)) <= set(names) and "task" in names
+    assert not {"xi", "data.test_lenses", "model.mixup"} & set(names)
+    assert ("data.max_distance" in names) == (task == "distance")
+    assert f"lists its options [{task}]" in " ".join(text.split())
+    assert " None [" not in text  # every option says what it is
 
 
 def test_all_has_everything(capsys):
@@ -55,4 +69,4 @@ def test_defaults_are_said(capsys):
     text = " ".join(shown(capsys, "fit", "--help").split())
     assert "the folder of the run [required]" in text
     assert "--data.batch_size of one process [128]" in text
-    assert "a preset (iccv2023, minutes, two_cores)" in text
+    assert "a preset (iccv2023, minutes, scenes_minutes, two_cores)" in text

@@ -395,8 +395,32 @@ def test_a_folder_means_its_pictures(run, folder, capsys):
     said = capsys.readouterr()
     assert len(json.loads(said.out)) == 5 and "does not read, 1 .heic" in said.err
     (run / "empty").mkdir()
-    with pytest.raises(SystemExit, match=r"no pictures in .*empty"):
+    with pytest.raises(SystemExit, match=r"no pictures or videos in .*empty"):
         answers([str(run / "empty"), *lens], run, capsys)
+
+
+def test_a_folder_means_its_videos_too(run, folder, capsys):
+    lens = ["--lens", json.dumps(LENS)]
+    write_video(folder / "a" / "drive.MP4", 3)
+    found = answers([str(folder), *lens], run, capsys)
+    alone = answers([str(folder / "a" / "drive.MP4"), *lens], run, capsys)
+    named = [
+        (answer.get("image") or answer["video"]).removeprefix(f"{folder}/") for answer in found
+    ]
+    assert named == ["0.png", *["a/drive.MP4"] * 4, "a/x/1.PNG", "a/y.png", "b/10.png", "b/2.png"]
+    assert all(close(a, b) for a, b in zip(found[1:4], alone[:3], strict=True))
+    (run / "videos").mkdir()
+    (folder / "a" / "drive.MP4").rename(run / "videos" / "v.mp4")
+    assert len(answers([str(run / "videos"), *lens], run, capsys)) == 4
+
+
+def test_a_task_that_is_not_the_models(run):
+    argv = ["predict", str(run / "p.png"), "--run", str(run), "--lens", json.dumps(LENS)]
+    main([*argv, "--task", "classification", "--out", str(run / "o.json")])
+    with pytest.raises(
+        SystemExit, match=r"--task distance was asked of .*best\.safetensors, a model"
+    ):
+        main([*argv, "--task", "distance"])
 
 
 def test_a_lens_for_each_folder(run, folder, capsys):

@@ -7,6 +7,7 @@ checked against what declares it: the Makefile, pyproject.toml, the programs' ow
 
 import ast
 import re
+import runpy
 import shlex
 import sys
 import tomllib
@@ -122,7 +123,7 @@ def run_darswin(arguments: list[str], monkeypatch) -> None:
     """Runs a command; `bench` is only parsed."""
     monkeypatch.setattr("darswin.cli.bench.bench", lambda **options: None)
     command, *options = arguments
-    main([command, *(QUICK if command == "fit" else ()), *options])
+    main([command, *options, *(QUICK if command == "fit" else ())])
 
 
 def check_make(targets: list[str], monkeypatch) -> None:
@@ -146,7 +147,6 @@ def check_pip(arguments: list[str], monkeypatch) -> None:
 
 def check_study(arguments: list[str], monkeypatch) -> None:
     """Its own options are read as it reads them, the others as `darswin fit` does."""
-    assert arguments[0] == "studies/study.py"
     asked: list = []
     monkeypatch.setattr(study, "run_all", lambda _, jobs, *rest: asked.extend(jobs) or [])
     monkeypatch.setattr(study, "collect", lambda *results: None)
@@ -157,11 +157,22 @@ def check_study(arguments: list[str], monkeypatch) -> None:
     assert end.value.code in (0, None)
 
 
+def write_rooms(arguments: list[str], monkeypatch) -> None:
+    """Runs the program that the page names, for a few pictures."""
+    monkeypatch.setattr(sys, "argv", [*arguments, "--count", "12"])
+    runpy.run_path(arguments[0], run_name="__main__")
+
+
+def run_program(arguments: list[str], monkeypatch) -> None:
+    known = {"studies/study.py": check_study, "examples/rooms.py": write_rooms}
+    known[arguments[0]](arguments, monkeypatch)
+
+
 PROGRAMS: dict[str, Callable] = {
     "darswin": run_darswin,
     "make": check_make,
     "pip": check_pip,
-    "python": check_study,
+    "python": run_program,
 }
 
 

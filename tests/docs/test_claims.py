@@ -15,6 +15,7 @@ ROOT = Path(__file__).parents[2]
 sys.path[:0] = [str(ROOT / "docs"), str(ROOT / "studies")]
 
 import fill  # noqa: E402
+import resampling  # noqa: E402
 from cells import LEVELS, SWEEP  # noqa: E402
 
 README = (ROOT / "README.md").read_text()
@@ -165,3 +166,22 @@ def test_the_demos_model_is_as_large_as_it_says():
     (millions,) = re.findall(r"`darswin_a_nano` \(([\d.]+) M parameters", page("docs/demo.md"))
     count = parameters("darswin_a_nano", num_classes=10, in_chans=1)
     assert round(count / 1e6, len(millions.partition(".")[2])) == float(millions)
+
+
+def test_what_is_said_of_resampling_is_computed():
+    text = page("docs/explanation/dense.md")
+    rows = re.findall(r"^\| (\d+) × (\d+) \| (.*) \|$", text, re.M)
+    assert len(rows) == 4
+    for rings, sectors, scores in rows:
+        found = [
+            f"{resampling.ceiling(size, int(rings), int(sectors), samples):.2f}"
+            for size in (64, 256)
+            for samples in (1, 4)
+        ]
+        assert scores.split(" | ") == found, (rings, sectors)
+    bilinear, nearest, reached = resampling.four_nearest()
+    said = f"a mean error of {nearest:.4f} by the four nearest and of {bilinear:.4f} bilinear"
+    assert said in prose("docs/explanation/dense.md")
+    assert f"{100 * reached:.0f} % of the samples reach any pixel" in prose(
+        "docs/explanation/dense.md"
+    )

@@ -4,10 +4,10 @@ import math
 
 import pytest
 import torch
+from lens_examples import ASIDE
 
 from darswin.lens import Equidistant, KannalaBrandt, Mei, Perspective, Spherical
 from darswin.lens.pixels import distance_to_z, pixel_angles, solid_angles, z_to_distance
-from tests.lens_examples import ASIDE
 
 f64 = torch.float64
 

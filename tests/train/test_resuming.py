@@ -18,6 +18,7 @@ from runs import KilledError, assert_same, checkpoint, error, files, fit, killed
 from darswin.cli.main import main
 from darswin.train.recipe import learning_rate
 from darswin.train.resuming import CHANGEABLE, check_changes
+from darswin.train.tasks import TASKS
 from darswin.utils.files import locked
 
 # 12 batches an epoch, in steps of 5, 5 and 2.
@@ -165,9 +166,19 @@ def test_what_may_change_is_an_option():
 
 def _help() -> str:
     text = io.StringIO()
-    with contextlib.redirect_stdout(text), contextlib.suppress(SystemExit):
-        main(["fit", "--help.all"])
+    for task in TASKS:
+        with contextlib.redirect_stdout(text), contextlib.suppress(SystemExit):
+            main(["fit", "--task", task, "--help.all"])
     return text.getvalue()
+
+
+def test_a_run_of_before_there_were_tasks_goes_on():
+    assert (
+        check_changes({"data": {"size": 32}}, {"task": "classification", "data": {"size": 32}})
+        == []
+    )
+    with pytest.raises(ValueError, match="--task 'distance' in place of 'classification'"):
+        check_changes({}, {"task": "distance"})
 
 
 def test_changes_are_named():
