@@ -151,6 +151,21 @@ bool shares_lens(const PolarToImageArgs<T>& a) {
   return a.radii_rows == 1 && a.place_rows == 1 && a.r_max_rows == 1;
 }
 
+template <typename T>
+int64_t rows_of_band(const PolarToImageArgs<T>& a) {
+  return (a.height + a.bands - 1) / a.bands;
+}
+
+// How many rows of mixes are kept: those that come again, of other images or other channels, where
+// they need no more memory than this.
+template <typename T>
+int64_t kept_rows(const PolarToImageArgs<T>& a) {
+  constexpr int64_t kMost = int64_t{16} << 20;
+  const bool again = a.grad_out != nullptr || (a.batch > 1 && shares_lens(a));
+  const int64_t row = round_up(a.width, kTile) / kTile * sizeof(Mix<Arithmetic<T>>);
+  return again && rows_of_band(a) * row <= kMost ? rows_of_band(a) : 1;
+}
+
 // The mixes of whole rows of pixels, kept for the images and channels that come next: images of one
 // lens share them. Row y has its place at y % rows.
 template <typename T>
