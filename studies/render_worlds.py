@@ -22,7 +22,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument(
         "--lens",
         default="0..1",
-        help='"wide", a ξ, a range of ξ as "0.2..0.35", "polynomial", or a calibration FILE[:CAMERA]',
+        help='"wide", ξ as "0.4", a range as "0.2..0.35", "polynomial", or a FILE[:CAMERA]',
     )
     parser.add_argument("--fov-deg", type=float, default=165, help="full, of lenses given by ξ")
     parser.add_argument("--size", type=int, default=128, help="of the square pictures, px")

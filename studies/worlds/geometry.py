@@ -3,6 +3,7 @@
 x points east, y north, z up.
 """
 
+import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
@@ -138,7 +139,7 @@ def triangulate(outline: np.ndarray) -> np.ndarray:
     low, high = low[low[:, 1] < high[:, 1]], high[low[:, 1] < high[:, 1]]
     slope = (high[:, 0] - low[:, 0]) / (high[:, 1] - low[:, 1])
     levels, made = np.unique(np.concatenate((low[:, 1], high[:, 1]))), []
-    for bottom, top in zip(levels[:-1], levels[1:], strict=True):
+    for bottom, top in itertools.pairwise(levels):
         across = (low[:, 1] <= bottom) & (high[:, 1] >= top)
         at = (np.array([[bottom], [top]]) - low[across, 1]) * slope[across] + low[across, 0]
         at = at[:, np.argsort(at.sum(0), kind="stable")]

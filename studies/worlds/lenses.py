@@ -32,7 +32,7 @@ def draw_lens(name: str, size: int, fov: float, rng: np.random.Generator) -> Len
         return lens.replace(image_size=lens.theta_max.new_tensor([[size, size]]))
     file, _, camera = name.partition(":")
     if Path(file).is_file():
-        return _squared(load(file, camera or None), size, name)
+        return _squared(load(file, camera=camera or None), size, name)
     lens = parse_lenses(name).draw(rng, fov, size / 2)
     return lens.replace(image_size=lens.theta_max.new_tensor([[size, size]]))
 
