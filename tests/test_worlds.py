@@ -203,7 +203,7 @@ def test_no_ray_leaves_a_world(game):
     rng, sphere = np.random.default_rng(1), poses._sphere(3000)
     lost = []
     for k in rng.choice(len(triangles), 60, p=weight):
-        at = triangles[k].mean(0) + (0, 0, 0.2)
+        at = triangles[k].mean(0) + np.array([0, 0, 0.2])
         hits = built.cast(at, sphere)
         above = built.cast(at, np.array([[0.0, 0.0, 1.0]]))
         if above.normal[0, 2] < 0:  # else that is above a low ceiling
