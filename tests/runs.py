@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from darswin.cli.main import main
-from darswin.train.task import Classification
+from darswin.train.task import Task
 
 
 def fit(run: Path, *options: str) -> None:
@@ -46,7 +46,7 @@ class KilledError(BaseException):
     """Nothing that the program knows, as a kill is."""
 
 
-STEP = Classification.training_step
+STEP = Task.training_step
 
 
 def patch_batch(monkeypatch, number: int, action) -> None:
@@ -57,7 +57,7 @@ def patch_batch(monkeypatch, number: int, action) -> None:
         other = action(self) if next(counts) == number else None
         return STEP(self, batch, batch_idx) if other is None else other
 
-    monkeypatch.setattr(Classification, "training_step", acting)
+    monkeypatch.setattr(Task, "training_step", acting)
 
 
 def killed(self):

@@ -28,12 +28,12 @@ from darswin.cli.help import ALL, format_help
 from darswin.data.lenses import parse_sweep
 from darswin.models.saving import model_of_run, read_card
 from darswin.train.checkpoints import RunCheckpoint, SafeCheckpointIO
-from darswin.train.data import WideAngleData
+from darswin.train.classification import Classification
 from darswin.train.finetuning import settle, weights_file
 from darswin.train.results import WriteResults
 from darswin.train.resuming import check_changes
 from darswin.train.stopping import StopSignals, StopWhenTold
-from darswin.train.task import Classification
+from darswin.train.wide_angle import WideAngleData
 from darswin.utils.files import locked, remove_partial_files, replace_file
 from darswin.utils.malloc import keep_freed_memory
 

@@ -7,11 +7,11 @@ import torch
 
 import darswin.lens
 from darswin.cli.arguments import run_command
-from darswin.layers.grid import Spacing
 from darswin.layers.sampling import PolarSample
 from darswin.lens.base import Lens
 from darswin.lens.files.load import Calibration, reach
 from darswin.lens.orientation import in_upright_picture, stored_size
+from darswin.lens.spacing import Spacing
 from darswin.utils.image import read_oriented
 from darswin.viz import views
 from darswin.viz.plot import draw_lens, figure_format, save_figure

@@ -28,6 +28,8 @@ class Calibrated(Samples):
         ValueError: a picture without a lens, or of another shape than its calibration; named.
     """
 
+    source: Source
+
     def __init__(self, source: Source, calibrations: Calibrations, *, fit: Fit = "crop", **options):
         if fit not in ("crop", "stretch"):
             raise ValueError(f"fit must be 'crop' or 'stretch', got {fit!r}")

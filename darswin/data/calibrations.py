@@ -14,7 +14,7 @@ from darswin.lens.files.load import FORMATS, Calibration
 from darswin.lens.orientation import in_upright_picture, stored_size
 
 _ALL = PurePosixPath(".")
-_NOMINAL = (1024, 1024)  # px, for a calibration without a size where no picture says it
+NOMINAL = (1024, 1024)  # px, for a calibration without a size where no picture says it
 
 
 class Camera(NamedTuple):
@@ -40,66 +40,29 @@ class Camera(NamedTuple):
         return Calibration.read(self.calibration)
 
 
-class Calibrations:
-    """The lenses of pictures, by their files.
+class PictureLenses:
+    """Which lens took which picture. A class says it in `cameras` and `camera_of`.
 
     Args:
-        lens: what took them:
-
-            - a calibration file, of any format that `darswin.lens.load` reads: all pictures;
-            - a lens as JSON, as `darswin.lens.from_dict` takes it: all pictures;
-            - a `lenses.json`: a JSON object from folders and pictures, relative to `root`, to
-              their cameras; "." is all, and the most specific counts. A camera is a calibration
-              file's path, relative to the lenses.json, or {"file": path, "camera": name}, or a
-              lens as above.
-        root: the folder of the pictures.
-        camera: which, of one calibration of several cameras.
-
-    Raises:
-        ValueError: what says no lens, in a sentence that names it. FileNotFoundError: a file that
-            is missing.
+        as_curves: whether the lenses are to be curves, because they cannot be joined otherwise.
     """
 
-    def __init__(self, lens: str | Path, root: str | Path, camera: str | None = None):
-        self._root = os.path.abspath(root)
-        self._lens = lens
-        entries = None if is_json(lens) else _entries(Path(lens))
-        if entries is None:
-            name = "of the lens" if is_json(lens) else str(lens)
-            self._cameras = {_ALL: Camera(str(lens), camera, name)}
-        elif camera is not None:
-            raise ValueError(
-                f"a camera is chosen of one calibration file, and {lens} lists several; say it "
-                f'there as {{"file": …, "camera": {json.dumps(camera)}}}'
-            )
-        else:
-            self._cameras = _listed(Path(lens), entries, Path(root))
-        # Early, so that what is no lens is said before any work.
-        nominal = [camera.lens(_NOMINAL) for camera in self.cameras]
-        self._as_curves = _are_curves(self.cameras, nominal)
+    def __init__(self, as_curves: bool):
+        self._as_curves = as_curves
         self._lenses: dict[tuple, Lens] = {}
 
     @property
     def cameras(self) -> list[Camera]:
         """The different cameras."""
-        return list(dict.fromkeys(self._cameras.values()))
+        raise NotImplementedError
 
     def camera_of(self, picture: str | Path | None) -> Camera:
         """What took a picture; None is one that has no file of its own.
 
         Raises:
-            ValueError: a picture that no entry is of.
+            ValueError: a picture that has no lens.
         """
-        key, file = _ALL, Path(os.path.abspath(picture or self._root))
-        if file.is_relative_to(self._root):
-            key = PurePosixPath(file.relative_to(self._root).as_posix())
-        for place in (key, *key.parents):
-            if place in self._cameras:
-                return self._cameras[place]
-        raise ValueError(
-            f'{self._lens} has no lens for {picture or "pictures without a file"}: an entry "." '
-            "is of all pictures"
-        )
+        raise NotImplementedError
 
     def cameras_of(self, pictures: Sequence[str | Path | None]) -> np.ndarray:
         """(N,): the number of each picture's camera in `cameras`; errors as `camera_of`."""
@@ -135,10 +98,71 @@ class Calibrations:
 
     def lens_alone(self, picture: str | Path | None) -> Lens:
         """The lens of a picture that cannot be read: in one of the size that it was made for."""
-        return self._form(self.camera_of(picture).lens(_NOMINAL))
+        return self._form(self.camera_of(picture).lens(NOMINAL))
 
     def _form(self, lens: Lens) -> Lens:
         return as_curves(lens) if self._as_curves else lens
+
+
+class Calibrations(PictureLenses):
+    """The lenses of pictures, by their files.
+
+    Args:
+        lens: what took them:
+
+            - a calibration file, of any format that `darswin.lens.load` reads: all pictures;
+            - a lens as JSON, as `darswin.lens.from_dict` takes it: all pictures;
+            - a `lenses.json`: a JSON object from folders and pictures, relative to `root`, to
+              their cameras; "." is all, and the most specific counts. A camera is a calibration
+              file's path, relative to the lenses.json, or {"file": path, "camera": name}, or a
+              lens as above.
+        root: the folder of the pictures.
+        camera: which, of one calibration of several cameras.
+
+    Raises:
+        ValueError: what says no lens, in a sentence that names it. FileNotFoundError: a file that
+            is missing.
+    """
+
+    def __init__(self, lens: str | Path, root: str | Path, camera: str | None = None):
+        self._root = os.path.abspath(root)
+        self._lens = lens
+        entries = None if is_json(lens) else _entries(Path(lens))
+        if entries is None:
+            name = "of the lens" if is_json(lens) else str(lens)
+            self._cameras = {_ALL: Camera(str(lens), camera, name)}
+        elif camera is not None:
+            raise ValueError(
+                f"a camera is chosen of one calibration file, and {lens} lists several; say it "
+                f'there as {{"file": …, "camera": {json.dumps(camera)}}}'
+            )
+        else:
+            self._cameras = _listed(Path(lens), entries, Path(root))
+        # Early, so that what is no lens is said before any work.
+        nominal = [camera.lens(NOMINAL) for camera in self.cameras]
+        super().__init__(are_curves(self.cameras, nominal))
+
+    @property
+    def cameras(self) -> list[Camera]:
+        """The different cameras."""
+        return list(dict.fromkeys(self._cameras.values()))
+
+    def camera_of(self, picture: str | Path | None) -> Camera:
+        """What took a picture; None is one that has no file of its own.
+
+        Raises:
+            ValueError: a picture that no entry is of.
+        """
+        key, file = _ALL, Path(os.path.abspath(picture or self._root))
+        if file.is_relative_to(self._root):
+            key = PurePosixPath(file.relative_to(self._root).as_posix())
+        for place in (key, *key.parents):
+            if place in self._cameras:
+                return self._cameras[place]
+        raise ValueError(
+            f'{self._lens} has no lens for {picture or "pictures without a file"}: an entry "." '
+            "is of all pictures"
+        )
 
 
 def is_json(lens: str | Path) -> bool:
@@ -195,7 +219,7 @@ def _camera(file: Path, about: str, value: Any) -> Camera:
     return Camera(str(calibration), None if camera is None else str(camera), name)
 
 
-def _are_curves(cameras: Sequence[Camera], lenses: Sequence[Lens]) -> bool:
+def are_curves(cameras: Sequence[Camera], lenses: Sequence[Lens]) -> bool:
     """Whether the cameras' lenses can be joined only as curves; ValueError if not even so."""
     if len({form_of(lens) for lens in lenses}) == 1:
         return False

@@ -96,7 +96,7 @@ def pictures_below(folder: Path) -> list[str]:
     Raises:
         FileNotFoundError: none that darswin reads.
     """
-    files = sorted(_below(folder, {}, strict=False), key=_parts)
+    files = sorted(files_below(folder), key=_parts)
     read = [file for file in files if _suffix(file) in SUFFIXES]
     others = [file for file in files if _suffix(file) in OTHER_SUFFIXES]
     if not read:
@@ -130,6 +130,11 @@ def _held_out(training: Pictures, parts: Sequence[Split], holdout: float) -> dic
         part: Pictures(training.folder, [training.paths[k] for k in chosen])
         for part, chosen in hold_out(labels, training.paths, holdout, parts).items()
     }
+
+
+def files_below(folder: Path) -> list[str]:
+    """The files in a folder and in those below it; links are followed, hidden ones not."""
+    return list(_below(folder, {}, strict=False))
 
 
 def class_of(path: str) -> str:
@@ -311,8 +316,13 @@ def _hidden(name: str) -> bool:
 # -- lists ------------------------------------------------------------------------------------
 
 
-def _listed(root: Path, lists: Path) -> dict[Split, Pictures]:
-    """The pictures of each split that the lists have."""
+def read_split_lists(lists: Path) -> dict[Split, list[str]]:
+    """What lists say is in each split: a JSON file, or a folder of text files, one a split.
+
+    Raises:
+        ValueError: what is no such list, or two of one split; it names them. OSError: it cannot be
+            read.
+    """
     if lists.is_dir():
         content = {
             file.stem: read_list(file)
@@ -324,18 +334,28 @@ def _listed(root: Path, lists: Path) -> dict[Split, Pictures]:
     form = f'{lists} must hold {{"train": [paths], "val": [paths], "test": [paths]}}'
     if not isinstance(content, dict):
         raise ValueError(form)
-    given: dict[Split, Pictures] = {}
+    given: dict[Split, list[str]] = {}
     for name, paths in content.items():
         split = SPLIT_NAMES.get(name.lower())
         if split is None or split in given:
             raise ValueError(f"{form}, got {list(content)}")
         if not isinstance(paths, list):
             raise ValueError(f"{form}, got {paths!r} for {name!r}")
+        if wrong := [path for path in paths if not isinstance(path, str)]:
+            raise ValueError(f"{form}, got {wrong[0]!r} in {name!r}")
+        given[split] = paths
+    return given
+
+
+def _listed(root: Path, lists: Path) -> dict[Split, Pictures]:
+    """The pictures of each split that the lists have."""
+    given: dict[Split, Pictures] = {}
+    for split, paths in read_split_lists(lists).items():
         for path in paths:
-            parts = Path(path).parts if isinstance(path, str) else ()
+            parts = Path(path).parts
             if len(parts) < 2 or Path(path).is_absolute() or ".." in parts:
                 raise ValueError(
-                    f"{lists}: {name!r} must hold paths CLASS/… below {root}, got {path!r}"
+                    f"{lists}: {split!r} must hold paths CLASS/… below {root}, got {path!r}"
                 )
         given[split] = Pictures(root, [os.path.normpath(path) for path in paths])
     return given

@@ -24,7 +24,7 @@ def at_size(image: np.ndarray, lens: Lens, size: int, fit: Fit) -> tuple[np.ndar
     Raises:
         ValueError: an unknown `fit`.
     """
-    top, left, height, width = _part(image.shape[:2], fit)
+    top, left, height, width = part_of(image.shape[:2], fit)
     new_height, new_width = _new_size(height, width, size, fit)
     part = image[top : top + height, left : left + width]
     resized = cv2.resize(part, (new_width, new_height), interpolation=cv2.INTER_AREA)
@@ -39,13 +39,13 @@ def lens_at_size(lens: Lens, size: int, fit: Fit) -> Lens:
     """
     if lens.image_size is None:
         raise ValueError("a lens that follows its picture needs an image_size")
-    part = _part(tuple(round(side) for side in lens.image_size[0].tolist()), fit)
+    part = part_of(tuple(round(side) for side in lens.image_size[0].tolist()), fit)
     if fit == "crop":
         lens = lens.cropped(*part)
     return lens.resized(_new_size(*part[2:], size, fit))
 
 
-def _part(size: tuple[int, ...], fit: Fit) -> tuple[int, int, int, int]:
+def part_of(size: tuple[int, ...], fit: Fit) -> tuple[int, int, int, int]:
     """What is taken of a picture: top, left, height, width."""
     if fit not in get_args(Fit):
         raise ValueError(f"fit must be one of {', '.join(get_args(Fit))}, got {fit!r}")

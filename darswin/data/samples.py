@@ -1,6 +1,6 @@
 """What the data sets of images with lenses share: a sample's random numbers and its form."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Sequence, Sized
 from typing import NamedTuple
 
 import cv2
@@ -9,7 +9,6 @@ import torch
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from darswin.data.sources import Source
 from darswin.data.turning import RandomTurns, Turn
 from darswin.lens import Lens
 from darswin.utils.image import BrokenImageError
@@ -38,15 +37,16 @@ class Samples(Dataset):
     means `dataset[Draw(0, i, i)]`.
 
     Args:
-        source: the pictures.
+        source: the pictures, which a data set reads.
         size: px, H = W of the images.
         mean, std: per channel, in [0, 1]; the image comes out as (pixel/255 - mean) / std.
         turns: of the images with their lenses; None is none.
         augment: changes the (H, W, C) uint8 image, given it and a random generator.
         erase: changes the normalised (C, H, W) float32 image, likewise.
         seed: of everything random.
-        skip_broken: makes a picture that cannot be read a black image with label -1, and counts it
-            in `broken`, instead of raising.
+        skip_broken: makes a picture that cannot be read a black image with label -1 (or, where a
+            label is one of each pixel, that of none), and counts it in `broken`, instead of
+            raising.
 
     Making one sets OpenCV to one thread, in all of the process.
 
@@ -56,7 +56,7 @@ class Samples(Dataset):
 
     def __init__(
         self,
-        source: Source,
+        source: Sized,
         *,
         size: int = 64,
         mean: Sequence[float] = IMAGENET_MEAN,
@@ -86,7 +86,7 @@ class Samples(Dataset):
         """Indices of the pictures that could not be read so far."""
         return self._broken.nonzero().flatten().tolist()
 
-    def __getitem__(self, draw: Draw | int) -> tuple[Tensor, Lens, int]:
+    def __getitem__(self, draw: Draw | int) -> tuple[Tensor, Lens, int | Tensor]:
         if not isinstance(draw, Draw):
             draw = Draw(0, int(draw), int(draw))
         try:
@@ -96,7 +96,8 @@ class Samples(Dataset):
                 raise
             self._broken[draw.picture] = True
             black = torch.from_numpy(-self.mean / self.std)
-            return black.expand(-1, self.size, self.size).clone(), self._lens_alone(draw), -1
+            black = black.expand(-1, self.size, self.size).clone()
+            return black, self._lens_alone(draw), self._unknown()
         rng = self._random(draw.epoch, draw.picture, 0)
         if self.augment:
             image = self.augment(image, rng)
@@ -111,10 +112,14 @@ class Samples(Dataset):
     def _turn(self, draw: Draw) -> Turn | None:
         return self.turns.draw(self._random(draw.epoch, draw.lens, 2)) if self.turns else None
 
-    def _seen(self, draw: Draw) -> tuple[np.ndarray, Lens, int]:
+    def _seen(self, draw: Draw) -> tuple[np.ndarray, Lens, int | Tensor]:
         """The image (size, size, C) uint8 of a draw before augmentation, its lens and its label."""
         raise NotImplementedError
 
     def _lens_alone(self, draw: Draw) -> Lens:
         """A lens for a picture that cannot be read."""
         raise NotImplementedError
+
+    def _unknown(self) -> int | Tensor:
+        """The label of a picture that cannot be read."""
+        return -1

@@ -57,10 +57,10 @@ def read_classes(path: str | Path) -> list[str]:
     return names
 
 
-def some(names: list[str]) -> str:
+def some(names: Sequence) -> str:
     """The first few of them, and how many more."""
     more = f" and {len(names) - 5} more" if len(names) > 5 else ""
-    return f"{names[:5]}{more}"
+    return f"{list(names[:5])}{more}"
 
 
 def read_json(path: str | Path) -> Any:

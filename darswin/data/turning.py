@@ -53,6 +53,25 @@ class RandomTurns:
         return Turn(angle, bool(rng.random() < 0.5) and self.flip)
 
 
+def turned_lens(lens: Lens, turn: Turn) -> tuple[Lens, np.ndarray]:
+    """The lens of a picture after a turn about the lens's optical axis.
+
+    Args:
+        lens: one that has the picture's image_size.
+
+    Returns:
+        The lens; and (2, 3) float64: what takes a pixel (x, y, 1) to its new place.
+    """
+    lens, matrix = rotated(lens, turn.angle)
+    moves = matrix.numpy()
+    if turn.mirrored:
+        assert lens.image_size is not None
+        moves = moves * [[-1.0], [1.0]]
+        moves[0, 2] += lens.image_size[0, 1].item() - 1
+        lens = turned(lens, _MIRRORED)
+    return lens, moves
+
+
 def turned_picture(image: np.ndarray, lens: Lens, turn: Turn) -> tuple[np.ndarray, Lens]:
     """A picture (H, W, C) uint8 and its lens after a turn about the lens's optical axis.
 

@@ -21,11 +21,15 @@ def warp_map(
 
 
 def remap(
-    image: np.ndarray, places: np.ndarray, interpolation: int = cv2.INTER_LINEAR
+    image: np.ndarray,
+    places: np.ndarray,
+    interpolation: int = cv2.INTER_LINEAR,
+    border: float = 0,
 ) -> np.ndarray:
-    """An image (H, W) or (H, W, C) at the places (H', W', 2) of a map; black outside the image."""
+    """An image (H, W) or (H, W, C) at the places (H', W', 2) of a map; `border` outside the image,
+    0 is black."""
     # None: x and y are in one array, which OpenCV's types do not know.
-    return cv2.remap(image, places, None, interpolation)  # type: ignore[call-overload]
+    return cv2.remap(image, places, None, interpolation, borderValue=border)  # type: ignore[call-overload]
 
 
 def warp(

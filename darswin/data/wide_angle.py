@@ -62,6 +62,8 @@ class WideAngle(Samples):
     Source: DarSwin, ICCV 2023, sec. 5.1.
     """
 
+    source: Source
+
     def __init__(
         self,
         source: Source,

@@ -25,10 +25,10 @@ def check_dtype(images: Tensor, dtype: torch.dtype) -> None:
 
 
 class ImageInput(nn.Module):
-    """The images of a model of fixed size, as (B, C, H, W) in floating point.
+    """The images of a model, as (B, C, H, W) in floating point.
 
     Args:
-        image_size: (H, W). in_chans: C.
+        image_size: (H, W) that they must have; None means any. in_chans: C.
         mean, std: of uint8 images, which count as `(pixel/255 - mean) / std`; others ignore them.
 
     Raises:
@@ -37,7 +37,7 @@ class ImageInput(nn.Module):
 
     def __init__(
         self,
-        image_size: tuple[int, int],
+        image_size: tuple[int, int] | None,
         in_chans: int = 3,
         mean: float | Sequence[float] = 0.0,
         std: float | Sequence[float] = 1.0,
@@ -49,7 +49,7 @@ class ImageInput(nn.Module):
     def forward(self, images: Tensor, dtype: torch.dtype = torch.float32) -> Tensor:
         """(B, C, H, W) → the same, in `dtype` where they are uint8."""
         check_channels(images, self.in_chans)
-        if images.shape[2:] != self.image_size:
+        if self.image_size is not None and images.shape[2:] != self.image_size:
             raise ValueError(
                 f"images must have the model's image_size, (H, W) = {self.image_size}, "
                 f"got {tuple(images.shape[2:])}"

@@ -1,11 +1,7 @@
-"""The polar grid: the rings that a lens's image is cut into, and the samples of each patch.
+"""The polar grid: the rings that a lens's image is cut into, and the samples of each patch; and
+what brings a polar map back to pixels.
 
-Rings and samples are each split into equal steps of some function of θ, the *spacing*:
-
-- "theta": θ itself, the paper's text. Works beyond 90°.
-- "tan": tan θ, the authors' released code. Only for θ_max < 90°.
-- "g": DarSwin-Unet's compromise between the two.
-- "radius": r, equal steps in the image; knows nothing of the lens but its image circle.
+Rings and samples are each split into equal steps of a *spacing*, see `darswin.lens.spacing`.
 """
 
 import math
@@ -15,16 +11,12 @@ import torch
 from torch import Tensor
 
 from darswin.lens import Lens
-from darswin.lens.inverse import inverse
+from darswin.lens.pixels import pixel_rays
+from darswin.lens.spacing import SPACINGS, Spacing, change_spacing, check_tan, span, to_theta
 from darswin.ops.checks import as_int
 
-Spacing = Literal["theta", "tan", "g", "radius"]
 Placement = Literal["centers", "edges"]
-SPACINGS: tuple[Spacing, ...] = ("theta", "tan", "g", "radius")
 PLACEMENTS = ("centers", "edges")
-
-# g(t) = c b t^n + (1 - c) (1 - (1 - t)^m), t = θ/θ_max: constants of the released DarSwin-Unet.
-G_M, G_N, G_B, G_C = 2.288135593220339, 5, 8.31578947368421, 1 / 3
 
 
 class PolarGrid(NamedTuple):
@@ -74,34 +66,91 @@ def polar_grid(
     """
     sample_spacing = spacing if sample_spacing is None else sample_spacing
     check_grid(rings, sectors, samples, spacing, sample_spacing, placement)
-    if "tan" in (spacing, sample_spacing):
-        check_tan(lens)
-    theta_max = lens.theta_max[:, None]  # (N, 1)
-    fractions = torch.linspace(0, 1, rings + 1, dtype=theta_max.dtype, device=theta_max.device)
-    first, last = (_to_spacing(lens, t, spacing) for t in (torch.zeros_like(theta_max), theta_max))
-    borders = first + (last - first) * fractions  # (N, R+1), in units of `spacing`
-    border_radii = _change(lens, borders, spacing, "radius")
-    borders = _change(lens, borders, spacing, sample_spacing)
-    inner, outer = borders[:, :-1, None], borders[:, 1:, None]
-    steps = _steps(samples[0], placement, theta_max)
-    points = (inner + (outer - inner) * steps).flatten(1)  # (N, R·S_r), in units of sample_spacing
+    borders, points = _rings(lens, rings, samples[0], spacing, sample_spacing, placement)
+    theta_max = lens.theta_max
     sector = torch.arange(sectors, dtype=theta_max.dtype, device=theta_max.device)[:, None]
     azimuths = (sector + _steps(samples[1], placement, theta_max)).flatten() * (
         2 * math.pi / sectors
     )
     return PolarGrid(
-        _change(lens, points, sample_spacing, "radius"),
+        change_spacing(lens, points, sample_spacing, "radius"),
         azimuths,
         lens.center_in(image_size),
-        border_radii,
+        change_spacing(lens, borders, spacing, "radius"),
         lens.affine,
         None if lens.is_radial else _offsets(lens, points, sample_spacing, azimuths),
     )
 
 
+class PixelGrid(NamedTuple):
+    """What `polar_to_image` needs of a lens to bring back a polar map, by its names.
+
+    Shapes: radii (N, R) px, of the rings' centres; r_max (N,) px; for radial lenses center
+    (N or 1, 2) px and affine (N, 2, 2), for general ones points (N, H, W, 2) px.
+    """
+
+    radii: Tensor
+    r_max: Tensor
+    center: Tensor | None = None
+    affine: Tensor | None = None
+    points: Tensor | None = None
+
+
+def pixel_grid(
+    lens: Lens,
+    image_size: tuple[int, int],
+    *,
+    rings: int,
+    split: int = 1,
+    spacing: Spacing = "theta",
+    sample_spacing: Spacing | None = None,
+) -> PixelGrid:
+    """The way back from the rings of `polar_grid`, each of them split into several.
+
+    Args:
+        lens: N lenses. image_size: (H, W). rings: as many as `polar_grid` was given.
+        split: how many rings of the map a ring of `polar_grid` became.
+        spacing, sample_spacing: as `polar_grid`; the latter splits a ring.
+
+    Raises:
+        ValueError: an unknown spacing, a size below 1, or "tan" with a lens of θ_max ≥ 90°.
+    """
+    sample_spacing = spacing if sample_spacing is None else sample_spacing
+    check_grid(rings, 1, (split, 1), spacing, sample_spacing, "centers")
+    _, centers = _rings(lens, rings, split, spacing, sample_spacing, "centers")
+    radii = change_spacing(lens, centers, sample_spacing, "radius")
+    if lens.is_radial:
+        return PixelGrid(radii, lens.r_max, lens.center_in(image_size), lens.affine)
+    theta, direction = pixel_rays(lens, image_size)
+    seen = ~theta.isnan()  # NaN must not meet the gradients
+    flat = lens.project(torch.where(seen, theta, 0.0))[..., None] * direction
+    return PixelGrid(radii, lens.r_max, points=torch.where(seen[..., None], flat, torch.nan))
+
+
+def _rings(
+    lens: Lens,
+    rings: int,
+    samples: int,
+    spacing: Spacing,
+    sample_spacing: Spacing,
+    placement: Placement,
+) -> tuple[Tensor, Tensor]:
+    """Ring borders (N, R+1) in units of `spacing`; samples (N, R·S_r) in those of the other."""
+    if "tan" in (spacing, sample_spacing):
+        check_tan(lens)
+    theta_max = lens.theta_max
+    fractions = torch.linspace(0, 1, rings + 1, dtype=theta_max.dtype, device=theta_max.device)
+    first, last = span(lens, spacing)
+    borders = first + (last - first) * fractions
+    edges = change_spacing(lens, borders, spacing, sample_spacing)
+    inner, outer = edges[:, :-1, None], edges[:, 1:, None]
+    steps = _steps(samples, placement, theta_max)
+    return borders, (inner + (outer - inner) * steps).flatten(1)
+
+
 def _offsets(lens: Lens, points: Tensor, spacing: Spacing, azimuths: Tensor) -> Tensor:
     """(N, 2, N_r, N_a) px: how far from the radial curve the lens lets each point land."""
-    theta = _to_theta(lens, points, spacing)[:, :, None].expand(-1, -1, len(azimuths))
+    theta = to_theta(lens, points, spacing)[:, :, None].expand(-1, -1, len(azimuths))
     direction = torch.stack((torch.cos(azimuths), torch.sin(azimuths)), -1)
     offsets = lens.offset(theta, direction.expand(*theta.shape, 2))
     return lens.through_affine(offsets).permute(0, 3, 1, 2)
@@ -130,60 +179,7 @@ def check_grid(
         raise ValueError(f"placement='edges' needs at least 2 samples an axis, got {samples!r}")
 
 
-def check_tan(lens: Lens) -> None:
-    """ValueError where tan θ ends before θ_max does. Compiled graphs cannot look at a value, so
-    they do not check."""
-    if torch.compiler.is_compiling():
-        return
-    largest = lens.theta_max.max().item() if len(lens) else 0.0
-    if largest >= math.pi / 2:
-        raise ValueError(
-            "spacing='tan' needs lenses with θ_max below 90°, since tan θ ends there; got "
-            f"{math.degrees(largest):.1f}°. Use 'theta', 'g' or 'radius'."
-        )
-
-
 def _steps(count: int, placement: Placement, like: Tensor) -> Tensor:
     """Fractions of a cell at which its samples stand."""
     steps = torch.arange(count, dtype=like.dtype, device=like.device)
     return steps / (count - 1) if placement == "edges" else (steps + 0.5) / count
-
-
-def _change(lens: Lens, value: Tensor, source: Spacing, target: Spacing) -> Tensor:
-    """(N, K) from units of one spacing to those of another."""
-    if source == target:
-        return value
-    return _to_spacing(lens, _to_theta(lens, value, source), target)
-
-
-def _to_spacing(lens: Lens, theta: Tensor, spacing: Spacing) -> Tensor:
-    if spacing == "theta":
-        return theta
-    if spacing == "tan":
-        return torch.tan(theta)
-    if spacing == "radius":
-        return lens.project(theta)
-    return _g(theta / lens.theta_max[:, None])
-
-
-def _to_theta(lens: Lens, value: Tensor, spacing: Spacing) -> Tensor:
-    if spacing == "theta":
-        return value
-    if spacing == "tan":
-        return torch.atan(value)
-    if spacing == "radius":
-        return lens.unproject(value)
-    return _inverse_g(value) * lens.theta_max[:, None]
-
-
-def _g(t: Tensor) -> Tensor:
-    """DarSwin-Unet's g of t = θ/θ_max in [0, 1]: rises from 0 to c b + 1 - c."""
-    t = t.clamp(max=1)  # rounding must not take (1 - t) below 0
-    return G_C * G_B * t**G_N + (1 - G_C) * (1 - (1 - t) ** G_M)
-
-
-def _inverse_g(value: Tensor) -> Tensor:
-    def slope(t: Tensor) -> Tensor:
-        return G_C * G_B * G_N * t ** (G_N - 1) + (1 - G_C) * G_M * (1 - t) ** (G_M - 1)
-
-    return inverse(_g, slope, value, value.new_ones(()))

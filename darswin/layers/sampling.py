@@ -6,8 +6,9 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
-from darswin.layers.grid import Placement, PolarGrid, Spacing, check_grid, polar_grid
+from darswin.layers.grid import Placement, PolarGrid, check_grid, polar_grid
 from darswin.lens import Lens
+from darswin.lens.spacing import Spacing
 from darswin.ops import polar_sample
 from darswin.ops.checks import channels_first, check_jitter, check_layout
 

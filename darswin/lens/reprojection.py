@@ -10,6 +10,7 @@ from torch import Tensor
 
 from darswin.lens.base import Lens
 from darswin.lens.ideal import Perspective
+from darswin.lens.pixels import pixel_rays
 
 OUTSIDE = -10.0  # px: beyond any image, also for an interpolation of several pixels
 
@@ -28,15 +29,7 @@ def reprojection(
     Returns:
         (N, H, W, 2): x and y; `OUTSIDE` where a ray is beyond either θ_max.
     """
-    like = target.theta_max
-    height, width = size
-    y, x = torch.meshgrid(
-        torch.arange(height, dtype=like.dtype, device=like.device),
-        torch.arange(width, dtype=like.dtype, device=like.device),
-        indexing="ij",
-    )
-    theta, direction = target.rays(torch.stack((x, y), -1)[None], size)
-    theta = torch.where(target.sees(theta), theta, torch.nan)
+    theta, direction = pixel_rays(target, size)
     return as_map(source.seen_pixels(theta, direction, source_size))
 
 

@@ -7,21 +7,22 @@ from torch import Tensor
 
 from darswin.layers.attention import PolarWindowAttention
 from darswin.layers.embed import PolarPatchEmbed
-from darswin.layers.grid import Placement, PolarGrid, Spacing, polar_grid
+from darswin.layers.grid import Placement, PolarGrid, polar_grid
 from darswin.layers.position_bias import PositionBias, ring_angles
 from darswin.layers.sampling import check_count, check_lens
 from darswin.lens import Lens
+from darswin.lens.spacing import Spacing
 from darswin.models import official
 from darswin.models.encoder import Encoder, Prepared
 from darswin.models.registry import Presets, register_model
 from darswin.models.stages import Pair, StagePlan, check_depths, make_stages, plan_stages
 
 # All models of a size have as many tokens.
-_PRESETS: Presets = dict(micro=dict(samples=(6, 6)), nano=dict(rings=8, sectors=32, samples=(4, 4)))
+PRESETS: Presets = dict(micro=dict(samples=(6, 6)), nano=dict(rings=8, sectors=32, samples=(4, 4)))
 
 
-@register_model("darswin_a", variant="A", presets=_PRESETS)
-@register_model("darswin_ra", variant="RA", presets=_PRESETS)
+@register_model("darswin_a", variant="A", presets=PRESETS)
+@register_model("darswin_ra", variant="RA", presets=PRESETS)
 class DarSwin(Encoder):
     """The Distortion Aware Radial Swin Transformer.
 
@@ -108,6 +109,7 @@ class DarSwin(Encoder):
         self.in_chans = in_chans
         self.square_images = compat == "official"
         self.compat, self.position_bias = compat, position_bias
+        self.harmonics, self.periodic_bias = harmonics, periodic_bias
 
         self.patch_embed = PolarPatchEmbed(
             rings,
@@ -124,31 +126,32 @@ class DarSwin(Encoder):
             grid=official.grid if compat else polar_grid,
         )
 
-        def attention(dim: int, heads: int, plan: StagePlan, block: int) -> PolarWindowAttention:
-            return PolarWindowAttention(
-                dim,
-                heads,
-                map_size=plan.map_size,
-                window=plan.window,
-                shift=plan.shift_of(block),
-                periodic=(False, not compat),
-                position_bias=position_bias,
-                harmonics=harmonics,
-                # The released code has M_φ rows of coefficients where one window is the map.
-                periodic_bias=plan.window == plan.map_size if compat else periodic_bias,
-            )
-
         self.stages = make_stages(
             plans,
             embed_dim,
             depths,
             num_heads,
-            attention=attention,
+            attention=self.attention,
             mlp_ratio=mlp_ratio,
             drop_path_rate=drop_path_rate,
         )
         self._rings = [plan.map_size[0] for plan in plans]
         self._finish(num_classes, plans, embed_dim, patch=samples, mean=mean, std=std)
+
+    def attention(self, dim: int, heads: int, plan: StagePlan, block: int) -> PolarWindowAttention:
+        """The attention of a block of a stage, which a decoder's blocks have too."""
+        return PolarWindowAttention(
+            dim,
+            heads,
+            map_size=plan.map_size,
+            window=plan.window,
+            shift=plan.shift_of(block),
+            periodic=(False, not self.compat),
+            position_bias=self.position_bias,
+            harmonics=self.harmonics,
+            # The released code has M_φ rows of coefficients where one window is the map.
+            periodic_bias=plan.window == plan.map_size if self.compat else self.periodic_bias,
+        )
 
     def prepare(self, lens: Lens | None, size: Pair) -> Prepared:
         """The grid of the samples, and for each stage its `ring_angles`; else as `Encoder`."""

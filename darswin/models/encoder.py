@@ -6,14 +6,13 @@ from typing import Any, Literal, NamedTuple
 
 from torch import Tensor, nn
 
-from darswin.layers.attention import WindowAttention
-from darswin.layers.block import Block, Mlp
 from darswin.layers.embed import ImageInput, PatchProjection
 from darswin.layers.grid import PolarGrid
-from darswin.layers.linear import MATMUL_BACKENDS, Linear, MatmulBackend
+from darswin.layers.linear import Linear
 from darswin.layers.sampling import check_count, check_images
 from darswin.lens import Lens
 from darswin.lens.reprojection import sample_at
+from darswin.models.base import Model, init_weights
 from darswin.models.features import FeatureInfo, feature_info, take_indices
 from darswin.models.stages import Pair, StagePlan, check_depths, make_stages, plan_stages
 from darswin.ops.checks import per_channel
@@ -32,8 +31,8 @@ class Prepared(NamedTuple):
     positions: Sequence[Sequence[Tensor | None]]
 
 
-class Encoder(nn.Module):
-    """Base of all models, called `model(images, lens)`; the methods are those of timm's models.
+class Encoder(Model):
+    """Base of the classifiers.
 
     A model sets `in_chans`, makes `patch_embed` and `stages`, then calls `_finish`; it defines
     `embed` and, if its lens matters, `prepare`. Maps are channels last: (B, R, A, D) where they are
@@ -41,29 +40,16 @@ class Encoder(nn.Module):
 
     Attributes:
         num_features, head_hidden_size: D of the last map, and of what the head takes.
-        feature_info: what the stages are.
-        pretrained_cfg: timm's description of a model: "architecture" (of `create_model`),
-            "num_classes", "input_size" (C, H, W), "fixed_input_size", "mean" and "std" (of pixels
-            in [0, 1]), "interpolation", "crop_pct", "first_conv" (the layer that takes the pixels),
-            "classifier". A loaded model's says what its card does, and has "label_names" and
-            "file".
+        plans: the sizes of the stages.
+        feature_info, pretrained_cfg: as `Model`.
     """
 
-    image_size: Pair | None = None  # (H, W) that all images must have; None: any size
-    square_images = False  # whether images must be square
-    in_chans: int
     num_features: int
-    num_classes: int
     patch_embed: nn.Module
+    plans: Sequence[StagePlan]
     stages: nn.ModuleList
     norm: nn.Module
     head: nn.Module
-    matmul_backend: MatmulBackend = "torch"  # see `set_matmul_backend`
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.feature_info = FeatureInfo()
-        self.pretrained_cfg: dict[str, Any] = {}
 
     def _finish(
         self,
@@ -76,11 +62,12 @@ class Encoder(nn.Module):
         std: float | Sequence[float],
     ) -> None:
         """Makes what ends a model, initialises it, and says what it is."""
+        self.plans = plans
         self.feature_info = feature_info(plans, embed_dim, patch)
         self.num_features = self.feature_info.channels(-1)
         self.norm = nn.LayerNorm(self.num_features)
         self.reset_classifier(num_classes)
-        self.apply(_init_weights)
+        self.apply(init_weights)
         self.pretrained_cfg = dict(
             num_classes=num_classes,
             input_size=(self.in_chans, *(self.image_size or (64, 64))),  # else the paper's
@@ -112,38 +99,10 @@ class Encoder(nn.Module):
             like = next(chain(self.norm.parameters(), self.parameters()))
             head = Linear(self.num_features, num_classes, device=like.device, dtype=like.dtype)
             head.matmul_backend = self.matmul_backend
-            _init_weights(head)
+            init_weights(head)
             self.head = head.train(self.training)
         else:
             self.head = nn.Identity()
-
-    def no_weight_decay(self) -> set[str]:
-        """Names of the parameters, besides biases and norms, that a recipe should not decay."""
-        return {name for name, _ in self.named_parameters() if ".position_bias." in name}
-
-    def set_matmul_backend(self, matmul_backend: MatmulBackend) -> None:
-        """Chooses what computes the linear layers' products: "torch", "onednn" or "autotune"; see
-        `Linear`.
-
-        Raises:
-            ValueError: an unknown choice.
-        """
-        if matmul_backend not in MATMUL_BACKENDS:
-            raise ValueError(
-                f"matmul_backend must be one of {MATMUL_BACKENDS}, got {matmul_backend!r}"
-            )
-        self.matmul_backend = matmul_backend
-        for module in self.modules():
-            if isinstance(module, Linear):
-                module.matmul_backend = matmul_backend
-
-    def set_grad_checkpointing(self, enable: bool = True) -> None:
-        """Says whether training saves memory: norms, GELUs and attention in windows, a few percent
-        of the work, are recomputed in backward. The gradients are the same, bit for bit.
-        """
-        for module in self.modules():
-            if isinstance(module, (Block, Mlp, WindowAttention)):
-                module.grad_checkpointing = enable
 
     def prepare(self, lens: Lens | None, size: Pair) -> Prepared:
         """What the lenses alone decide about images of (H, W), for any number of calls of `run`.
@@ -255,7 +214,7 @@ class Encoder(nn.Module):
         taken = take_indices(len(self.stages), indices)
         end = max(taken) + 1
         shorter = end < len(self.stages)
-        self.stages = self.stages[:end]
+        self.plans, self.stages = self.plans[:end], self.stages[:end]
         self.feature_info = FeatureInfo(self.feature_info[:end])
         self.num_features = self.feature_info.channels(-1)
         if prune_norm or shorter:
@@ -321,10 +280,3 @@ class ImageEncoder(Encoder):
             check_count(len(points), images)
             images = sample_at(images, points)
         return self.patch_embed(images.permute(0, 2, 3, 1))
-
-
-def _init_weights(module: nn.Module) -> None:
-    if isinstance(module, nn.Linear):
-        nn.init.trunc_normal_(module.weight, std=0.02)
-        if module.bias is not None:
-            nn.init.zeros_(module.bias)

@@ -11,8 +11,9 @@ import math
 import torch
 from torch import Tensor
 
-from darswin.layers.grid import PolarGrid, check_tan
+from darswin.layers.grid import PolarGrid
 from darswin.lens import Lens, Number, Spherical
+from darswin.lens.spacing import check_tan
 from darswin.models.stages import Pair, StagePlan
 
 

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping
 from typing import Any, TypeVar
 
-from darswin.models.encoder import Encoder
+from darswin.models.base import Model
 
 _SMALL = dict(embed_dim=96, depths=(2, 2, 18, 2), num_heads=(3, 6, 12, 24), drop_path_rate=0.2)
 _SIZES: dict[str, dict[str, Any]] = dict(
@@ -13,13 +13,13 @@ _SIZES: dict[str, dict[str, Any]] = dict(
     # For tests and demos: 32×32 images, three stages, a minute of training on two cores.
     nano=dict(embed_dim=24, depths=(1, 2, 1), num_heads=(1, 2, 4), drop_path_rate=0.0),
 )
-_MODELS: dict[str, tuple[type[Encoder], dict[str, Any]]] = {}
+_MODELS: dict[str, tuple[type[Model], dict[str, Any]]] = {}
 
 Presets = Mapping[str, Mapping[str, Any]]
-Model = TypeVar("Model", bound=type[Encoder])
+_Class = TypeVar("_Class", bound=type[Model])
 
 
-def register_model(family: str, *, presets: Presets, **options: Any) -> Callable[[Model], Model]:
+def register_model(family: str, *, presets: Presets, **options: Any) -> Callable[[_Class], _Class]:
     """Decorates a model's class: `create_model` knows it as `FAMILY_small`, `FAMILY_tiny` …
 
     Args:
@@ -27,7 +27,7 @@ def register_model(family: str, *, presets: Presets, **options: Any) -> Callable
         options: the arguments of every size.
     """
 
-    def register(model: Model) -> Model:
+    def register(model: _Class) -> _Class:
         for size, common in _SIZES.items():
             _MODELS[f"{family}_{size}"] = model, {**common, **presets.get(size, {}), **options}
         return model
@@ -40,8 +40,9 @@ def list_models() -> list[str]:
     return sorted(_MODELS)
 
 
-def create_model(name: str, **options: Any) -> Encoder:
-    """The model of that name; `options` override its constructor's arguments.
+def create_model(name: str, **options: Any) -> Any:
+    """The model of that name, an `Encoder` or a `DenseModel`; `options` override its constructor's
+    arguments.
 
     Raises:
         ValueError: an unknown name, or options that do not fit together.
@@ -51,7 +52,7 @@ def create_model(name: str, **options: Any) -> Encoder:
     return model
 
 
-def model_class(name: str) -> type[Encoder]:
+def model_class(name: str) -> type[Model]:
     """The class of the models of that name; ValueError for a name that there is not."""
     if name not in _MODELS:
         raise ValueError(f"unknown model {name!r}; there are {', '.join(list_models())}")

@@ -12,7 +12,6 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
 
-from darswin.models.encoder import Encoder
 from darswin.models.pretrained import list_pretrained, pretrained_file
 from darswin.models.registry import create_model
 from darswin.utils.files import replace_file
@@ -50,7 +49,7 @@ class ModelCard:
     task: Task = "classification"
     colors: Sequence[Sequence[int]] = field(default_factory=list)
 
-    def create(self) -> Encoder:
+    def create(self) -> Any:
         """The model, with new weights."""
         return create_model(self.model, **self.options)
 
@@ -85,7 +84,7 @@ def read_card(path: str | os.PathLike) -> ModelCard:
         return _card(file, path)
 
 
-def load_model(path: str | os.PathLike) -> tuple[Encoder, ModelCard]:
+def load_model(path: str | os.PathLike) -> tuple[Any, ModelCard]:
     """The model of a file, or of a name in `list_pretrained()`, in eval mode, and its card.
 
     Raises:

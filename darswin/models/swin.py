@@ -3,13 +3,15 @@
 import math
 from collections.abc import Sequence
 
+from torch import Tensor
+
 from darswin.layers.attention import WindowAttention
 from darswin.layers.sampling import check_lens
 from darswin.lens import Lens
 from darswin.lens.reprojection import perspective_view, reprojection
 from darswin.models.encoder import ImageEncoder, Prepared
 from darswin.models.registry import Presets, register_model
-from darswin.models.stages import Pair
+from darswin.models.stages import Pair, StagePlan
 
 _PRESETS: Presets = dict(nano=dict(image_size=32))
 
@@ -62,13 +64,17 @@ class Swin(ImageEncoder):
             drop_path_rate=drop_path_rate,
             mean=mean,
             std=std,
-            attention=lambda dim, heads, plan, block: WindowAttention(
-                dim,
-                heads,
-                map_size=plan.map_size,
-                window=plan.window,
-                shift=plan.shift_of(block),
-            ),
+            attention=self.attention,
+        )
+
+    def attention(self, dim: int, heads: int, plan: StagePlan, block: int) -> WindowAttention:
+        """The attention of a block of a stage, which a decoder's blocks have too."""
+        return WindowAttention(
+            dim,
+            heads,
+            map_size=plan.map_size,
+            window=plan.window,
+            shift=plan.shift_of(block),
         )
 
 
@@ -93,13 +99,23 @@ class SwinUndis(Swin):
 
     def __init__(self, *arguments, max_fov: float = math.radians(175), **options):
         super().__init__(*arguments, **options)
-        if not 0 < max_fov < math.pi:
-            raise ValueError(f"max_fov must be in (0, π), got {max_fov}")
-        self.max_fov = float(max_fov)
+        self.max_fov = check_max_fov(max_fov)
 
     def prepare(self, lens: Lens | None, size: Pair) -> Prepared:
         """The pixels where the lenses show each pixel of their views; else as `Encoder`."""
-        lens = check_lens(lens, size)
-        view = perspective_view(lens, self.image_size, self.max_fov)
-        points = reprojection(lens, size, view, self.image_size)
+        _, points = undistortion(check_lens(lens, size), size, self.image_size, self.max_fov)
         return super().prepare(lens, size)._replace(points=points)
+
+
+def undistortion(lens: Lens, size: Pair, view_size: Pair, max_fov: float) -> tuple[Lens, Tensor]:
+    """The perspective views of N lenses, see `SwinUndis`, and where in the images of (H, W) each
+    pixel of them lies, (N, H', W', 2)."""
+    view = perspective_view(lens, view_size, max_fov)
+    return view, reprojection(lens, size, view, view_size)
+
+
+def check_max_fov(max_fov: float) -> float:
+    """The widest field of view of a perspective view, rad; ValueError unless it is in (0, π)."""
+    if not 0 < max_fov < math.pi:
+        raise ValueError(f"max_fov must be in (0, π), got {max_fov}")
+    return float(max_fov)

@@ -1,43 +1,41 @@
-"""Image classification: what is trained and what is measured."""
+"""What the tasks share: the model, its optimiser and rates, its weights, its steps."""
 
 import math
 from collections.abc import Iterator
 from dataclasses import asdict
-from typing import Any, Self
+from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
 import torch
-import torch.nn.functional as F
 from lightning.pytorch import LightningModule
 from lightning.pytorch.utilities.types import OptimizerLRSchedulerConfig
 from torch import Tensor, nn
-from torchmetrics import MeanMetric, Metric
-from torchmetrics.classification import MulticlassAccuracy
+from torchmetrics import Metric
 
-from darswin.data.mixing import Mixing, partners_share
 from darswin.layers.linear import MatmulBackend
 from darswin.lens import Lens
 from darswin.models.encoder import Encoder
 from darswin.models.registry import model_class
 from darswin.models.saving import ModelCard, read_card
-from darswin.train.data import WideAngleData
+from darswin.models.saving import Task as TaskName
+from darswin.train.data import RunData
 from darswin.train.finetuning import frozen_parts, own_options, start_from, weights_file
 from darswin.train.recipe import Schedule, parameter_groups
 
-DEFAULT_MODEL = "darswin_a_micro"
 Batch = tuple[Tensor, Lens, Tensor]
 
 
-class Classification(LightningModule):
-    """A classifier of wide-angle images, its loss, its optimiser and its accuracy.
+class Task(LightningModule):
+    """Base of the tasks: a model of wide-angle images, its optimiser and its steps.
+
+    A task says what its models are, defines `_loss`, `_make_metrics` and the steps of validation
+    and test, and leaves in `results`, after a test, a row for each set that it was tested on.
 
     Learning rates are those of `reference_batch` images a step and grow in proportion to the batch.
 
     Args:
-        name: of a model, one that `darswin models` lists; null is that of `weights`, or
-            darswin_a_micro.
-        options: of the model, e.g. {spacing: tan, jitter: 0}. With `weights` they are its own, and
-            only drop_path_rate and jitter may differ.
+        name: of a model; None is that of `weights`, or the task's own default.
+        options: of the model. With `weights` they are its own.
         weights: a trained model to start from: the folder of a run, whose best model is taken, or a
             safetensors file. Its name, options, channels, mean and std are the run's; so is its
             size, unless data.size says another and the model takes it. Its head is kept for the
@@ -50,19 +48,17 @@ class Classification(LightningModule):
         warmup_epochs: of linear warm-up; may be a fraction.
         weight_decay: AdamW's.
         decay_position_bias: decays position biases too, as the authors' code does.
-        label_smoothing: in [0, 1).
-        mixup: α of Beta(α, α) that the shares of two images are drawn from; 0 is off.
-        cutmix: α of the share that a box of another image leaves; 0 is off.
-        mix_p: the share of batches that are mixed.
         reference_batch: images that the rates are meant for.
         matmul_backend: of float32 products: torch, onednn, or autotune, which measures as it runs.
             On AMD's CPUs onednn is twice as fast; which one it is decides how results are rounded.
         grad_checkpointing: saves a third of the activations' memory for a few percent of the time.
         seed: of the weights, jitter, drop path and mixing.
-
-    Source: the recipe of DarSwin, ICCV 2023, sec. 5.2, and of its released code.
     """
 
+    task: ClassVar[TaskName]
+    default_model: ClassVar[str]
+    monitor: ClassVar[tuple[str, Literal["min", "max"]]]  # which decides on the best checkpoint
+    results: list[dict[str, Any]]
     net: Encoder  # of `configure_model`, as is what describes it
     card: ModelCard
     trained: ModelCard  # of the checkpoint that was read; else `card`
@@ -80,10 +76,6 @@ class Classification(LightningModule):
         warmup_epochs: float = 20,
         weight_decay: float = 0.05,
         decay_position_bias: bool = False,
-        label_smoothing: float = 0.1,
-        mixup: float = 0.8,
-        cutmix: float = 1.0,
-        mix_p: float = 1.0,
         reference_batch: int = 512,
         matmul_backend: MatmulBackend = "torch",
         grad_checkpointing: bool = False,
@@ -97,12 +89,10 @@ class Classification(LightningModule):
         if name is None and weights is not None:
             card = read_card(weights_file(weights))
             name, options = card.model, own_options(card) | (options or {})
-        self.name, self.options = name or DEFAULT_MODEL, options or {}
+        self.name, self.options = name or self.default_model, options or {}
         model_class(self.name)
         self.weights, self.freeze_stages = weights, freeze_stages
         self._frozen: list[nn.Module] = []
-        if not 0 <= label_smoothing < 1:
-            raise ValueError(f"--model.label_smoothing must be in [0, 1), got {label_smoothing}")
         for option, value in dict(
             learning_rate=learning_rate, reference_batch=reference_batch
         ).items():
@@ -115,9 +105,8 @@ class Classification(LightningModule):
         self.rates = dict(peak=learning_rate, warmup=warmup_rate, final=final_rate)
         self.warmup_epochs, self.reference_batch = warmup_epochs, reference_batch
         self.weight_decay, self.decay_position_bias = weight_decay, decay_position_bias
-        self.label_smoothing, self.seed = label_smoothing, seed
+        self.seed = seed
         self.matmul_backend, self.grad_checkpointing = matmul_backend, grad_checkpointing
-        self.mixing = Mixing(mixup, cutmix, mix_p)
         self._steps_there: int | None = None  # in an epoch of the run that a checkpoint is of
 
     # -- building -----------------------------------------------------------------------------
@@ -127,9 +116,7 @@ class Classification(LightningModule):
         if hasattr(self, "net"):
             return
         data = self.data
-        if len(data.classes) < 2:
-            raise ValueError(f"a classifier needs two classes, the data has only {data.classes}")
-        options: dict[str, Any] = dict(num_classes=len(data.classes), in_chans=data.channels)
+        options: dict[str, Any] = self._head_options() | dict(in_chans=data.channels)
         options |= dict(mean=data.mean, std=data.std)
         if model_class(self.name).image_size is not None:
             options["image_size"] = data.size
@@ -138,7 +125,10 @@ class Classification(LightningModule):
                 f"--model.options cannot set {', '.join(taken)}: the data decides on it"
             )
         options |= self.options
-        self.card = ModelCard(self.name, options, data.classes, data.size, data.fov, data.frame_fit)
+        self.card = ModelCard(
+            self.name, options, data.classes, data.size, data.fov, data.frame_fit,
+            task=self.task, colors=data.colors,
+        )  # fmt: skip
         self.trained = self.card
         torch.manual_seed(self.seed)
         try:
@@ -154,9 +144,15 @@ class Classification(LightningModule):
         self._freeze()
         self.net.set_matmul_backend(self.matmul_backend)
         self.net.set_grad_checkpointing(self.grad_checkpointing)
-        count = len(data.classes)
-        self.val_metrics = metrics(count)
-        self.test_metrics = nn.ModuleList(metrics(count) for _ in data.test_names)
+        self._make_metrics()
+
+    def _head_options(self) -> dict[str, Any]:
+        """The model's options that the task and the data's classes decide on."""
+        raise NotImplementedError
+
+    def _make_metrics(self) -> None:
+        """Makes what validation and test measure."""
+        raise NotImplementedError
 
     def _freeze(self) -> None:
         self._frozen = frozen_parts(self.net, self.freeze_stages)
@@ -172,7 +168,7 @@ class Classification(LightningModule):
         return self
 
     @property
-    def data(self) -> WideAngleData:
+    def data(self) -> RunData:
         """The data of the run."""
         return self.trainer.datamodule  # type: ignore[attr-defined]  # Lightning attaches it
 
@@ -230,7 +226,7 @@ class Classification(LightningModule):
             {**card, **card.pop("options")} for card in (asdict(self.trained), asdict(self.card))
         )
         # A model may be measured on pictures that come to it in another way.
-        ignored = {"fit"} if theirs["fov"] and ours["fov"] else {"fit", "fov"}
+        ignored = {"fit", "colors"} | (set() if theirs["fov"] and ours["fov"] else {"fov"})
         other = [
             f"{key} {theirs.get(key)!r} there, {ours.get(key)!r} here"
             for key in sorted((theirs.keys() | ours.keys()) - ignored)
@@ -242,28 +238,28 @@ class Classification(LightningModule):
     # -- training -----------------------------------------------------------------------------
 
     def forward(self, images: Tensor, lens: Lens) -> Tensor:
-        """Images (B, C, H, W) and their lenses → logits (B, K)."""
+        """Images (B, C, H, W) and their lenses → what the model says of them."""
         return self.net(images, lens)
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
-        """The loss of a batch, mixed if mixing is on."""
-        images, lens, labels = batch
+        """The loss of a batch, with a step's own random numbers."""
         # A step's random numbers depend on its place alone, so that a resumed run repeats them.
         step = (self.seed, self.current_epoch, batch_idx)
         rng = np.random.default_rng(step)  # the same in all processes
         torch.manual_seed(int(np.random.default_rng((*step, self.global_rank)).integers(2**63)))
-        targets = self._targets(labels, len(self.card.classes))
-        shared = partners_share(lens) if self.data.calibrations and self.data.pair_lenses else None
-        images, targets = self.mixing(images, targets, rng, shared)
-        loss = F.cross_entropy(self.net(images, lens).float(), targets)
+        loss = self._loss(batch, rng)
         if not torch.isfinite(loss):
             raise FloatingPointError(
                 f"the loss is {loss.item()} in epoch {self.current_epoch}, batch {batch_idx}: "
                 f"{self._advice()}"
             )
-        self.log("train/loss", loss, prog_bar=True, batch_size=len(images), sync_dist=True)
+        self.log("train/loss", loss, prog_bar=True, batch_size=len(batch[0]), sync_dist=True)
         self.log("train/rate", self.trainer.optimizers[0].param_groups[0]["lr"])
         return loss
+
+    def _loss(self, batch: Batch, rng: np.random.Generator) -> Tensor:
+        """The loss of a batch; `rng` is the same in all processes."""
+        raise NotImplementedError
 
     def _advice(self) -> str:
         return (
@@ -271,58 +267,9 @@ class Classification(LightningModule):
             "last checkpoint has diverged too, add --ckpt_path for best.ckpt, or begin anew"
         )
 
-    def _targets(self, labels: Tensor, classes: int) -> Tensor:
-        """Labels (B,) → probabilities (B, K); all 0 for label -1, which then weighs nothing."""
-        names = torch.arange(classes, device=labels.device)
-        hot = (labels[:, None] == names).float()
-        smooth = hot * (1 - self.label_smoothing) + self.label_smoothing / classes
-        return smooth * (labels >= 0)[:, None]
 
-    # -- evaluation ---------------------------------------------------------------------------
-
-    def _measure(self, batch: Batch, measured: nn.Module) -> None:
-        images, lens, labels = batch
-        known = labels >= 0
-        logits = self.net(images, lens).float()[known]
-        for name, metric in _named(measured):
-            if not known.any():
-                continue
-            if name == "loss":
-                metric.update(F.cross_entropy(logits, labels[known]), weight=known.sum())
-            else:
-                metric.update(logits, labels[known])
-
-    def validation_step(self, batch: Batch, batch_idx: int) -> None:
-        """Counts a batch into the validation's loss and accuracy."""
-        self._measure(batch, self.val_metrics)
-        for name, metric in _named(self.val_metrics):
-            self.log(f"val/{name}", metric, prog_bar=name != "top5", on_step=False, on_epoch=True)
-
-    def test_step(self, batch: Batch, batch_idx: int, dataloader_idx: int = 0) -> None:
-        """Counts a batch into the loss and accuracy of its lenses."""
-        self._measure(batch, self.test_metrics[dataloader_idx])
-
-    def on_test_epoch_end(self) -> None:
-        """Collects `results`: a row for each distribution of lenses."""
-        names = self.data.test_names
-        self.results = [
-            {"lenses": name} | {key: metric.compute().item() for key, metric in _named(measured)}
-            for name, measured in zip(names, self.test_metrics, strict=True)
-        ]
-
-
-def metrics(classes: int) -> nn.ModuleDict:
-    """What an evaluation measures: mean loss, and the shares that top-1 and top-5 get right."""
-
-    def accuracy(k: int) -> Metric:
-        top_k = min(k, classes)
-        return MulticlassAccuracy(classes, average="micro", top_k=top_k)
-
-    return nn.ModuleDict(dict(top1=accuracy(1), top5=accuracy(5), loss=MeanMetric()))
-
-
-def _named(measured: nn.Module) -> Iterator[tuple[str, Metric]]:
-    """The metrics of `metrics`, and their names."""
+def named_metrics(measured: nn.Module) -> Iterator[tuple[str, Metric]]:
+    """The metrics of a ModuleDict, and their names."""
     for name, metric in measured.named_children():
         assert isinstance(metric, Metric)
         yield name, metric

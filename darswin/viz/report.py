@@ -6,8 +6,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from darswin.layers.grid import SPACINGS, Spacing, polar_grid
+from darswin.layers.grid import polar_grid
 from darswin.lens.base import Lens
+from darswin.lens.spacing import SPACINGS, Spacing
 
 SIDES = ("left", "top", "right", "bottom")
 

@@ -7,8 +7,8 @@ import pytest
 from lightning.pytorch import Trainer
 
 from darswin.cli.main import main
-from darswin.train.data import WideAngleData
-from darswin.train.task import Classification
+from darswin.train.classification import Classification
+from darswin.train.wide_angle import WideAngleData
 
 
 def shown(capsys, *argv):
@@ -23,9 +23,12 @@ def options(text):
 
 
 def own():
+    """All options of the data and of the model: those of their classes and of the bases."""
     for group, made in (("data", WideAngleData), ("model", Classification)):
-        names = list(inspect.signature(made).parameters)
-        yield from (f"{group}.{name}" for name in names if name != "seed")
+        for part in (c for c in made.__mro__ if c.__module__.startswith("darswin.")):
+            for name, parameter in inspect.signature(part).parameters.items():
+                if parameter.kind is not parameter.VAR_KEYWORD and name != "seed":
+                    yield f"{group}.{name}"
 
 
 @pytest.mark.parametrize("command", ["fit", "validate", "test"])

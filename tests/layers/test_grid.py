@@ -3,8 +3,9 @@ import math
 import pytest
 import torch
 
-from darswin.layers.grid import PLACEMENTS, SPACINGS, polar_grid
+from darswin.layers.grid import PLACEMENTS, polar_grid
 from darswin.lens import Mei, Perspective, Polynomial, Spherical
+from darswin.lens.spacing import SPACINGS
 
 f64 = torch.float64
 SIZES = dict(rings=16, sectors=64, samples=(10, 10))

@@ -8,8 +8,9 @@ import hypothesis.strategies as st
 import torch
 from lens_examples import COUNTS, RANGES, f64, first_coefficients
 
-from darswin.layers.grid import PLACEMENTS, SPACINGS, polar_grid
+from darswin.layers.grid import PLACEMENTS, polar_grid
 from darswin.lens import MODELS, cat, from_dict, to_dict
+from darswin.lens.spacing import SPACINGS
 
 
 def rows(draw, low, high, count, width):

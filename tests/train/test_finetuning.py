@@ -12,8 +12,8 @@ from safetensors.torch import load_file, save_file
 
 from darswin.cli.main import main
 from darswin.models.saving import ModelCard, load_model, save_model
+from darswin.train.classification import Classification
 from darswin.train.finetuning import frozen_parts, settle, start_from
-from darswin.train.task import Classification
 
 QUIET = """--data.workers 0 --trainer.enable_progress_bar false
     --trainer.enable_model_summary false""".split()  # noqa: SIM905

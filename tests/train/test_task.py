@@ -2,7 +2,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from darswin.train.task import Classification, metrics
+from darswin.train.classification import Classification, metrics
 
 
 def test_targets_smooth_as_torch_does():

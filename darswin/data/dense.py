@@ -1,0 +1,114 @@
+"""A data set of scenes: images with their lenses, and a label or a distance for each pixel."""
+
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from darswin.data.lenses import LensDistribution
+from darswin.data.reframing import Crop, part, resized, through, turned
+from darswin.data.samples import Draw, Samples
+from darswin.data.scenes.scene import Scene, Scenes
+from darswin.data.scenes.targets import IGNORE
+from darswin.lens import Lens
+
+# Of a drawn lens's own limit, where its curve may have no end: how far it is used.
+_USED = 0.95
+
+
+class DenseSamples(Samples):
+    """Scenes at a size: `dataset[i]` is (image, lens, target), which move together.
+
+    The target is labels, (size, size) int64 with `IGNORE`, or distances along the ray, (size, size)
+    float32 metres with 0 where they are not known. Nothing is known beyond a lens's θ_max, nor of
+    what turns in from beyond the picture.
+
+    Args:
+        scenes: the pictures, their targets and lenses.
+        fit: how a picture becomes a square: "crop" cuts its longer side, "stretch" squashes it;
+            the lens follows exactly.
+        crop: the least share of a picture's side that a random part of it has, in (0, 1]; the lens
+            follows, its principal point moves off the middle. None takes no parts.
+        lenses: a distribution of lenses. Each picture is shown as one drawn from it would have seen
+            it, of the same θ_max where that lens can have it, whose circle touches the image's
+            sides; `fit` then has no effect.
+        options: size, mean, std, turns, augment, erase, seed and skip_broken, as `Samples`.
+
+    Raises:
+        ValueError: a share out of range; from `dataset[i]`, as `Scenes`.
+        BrokenImageError: from `dataset[i]`, naming a file that cannot be read.
+    """
+
+    def __init__(
+        self,
+        scenes: Scenes,
+        *,
+        fit: Literal["crop", "stretch"] = "crop",
+        crop: float | None = None,
+        lenses: LensDistribution | None = None,
+        **options: Any,
+    ):
+        if fit not in ("crop", "stretch"):
+            raise ValueError(f"fit must be 'crop' or 'stretch', got {fit!r}")
+        if crop is not None and not 0 < crop <= 1:
+            raise ValueError(f"crop must be a share in (0, 1], got {crop}")
+        super().__init__(scenes, **options)
+        self.scenes, self.fit, self.crop, self.lenses = scenes, fit, crop, lenses
+
+    @property
+    def cameras(self) -> np.ndarray:
+        """(N,): the number of each picture's camera in `scenes.cameras`."""
+        return np.array([self.scenes.camera_of(k) for k in range(len(self))], np.int64)
+
+    def _seen(self, draw: Draw) -> tuple[np.ndarray, Lens, Tensor]:
+        image, target, lens = self._reframed(self.scenes[draw.picture], draw)
+        kind = torch.int64 if self.scenes.target == "labels" else torch.float32
+        return image, lens, torch.from_numpy(np.ascontiguousarray(target)).to(kind)
+
+    def _reframed(self, scene: Scene, draw: Draw) -> Scene:
+        turn, crop = self._turn(draw), self._crop(draw)
+        if self.lenses is not None:
+            return through(scene, self._drawn(draw, scene.lens, crop), self.size, turn)
+        height, width = scene.target.shape
+        taken = part((height, width), self.fit, crop)
+        if turn is not None and turn.angle:
+            return turned(scene, turn, taken, self.size)
+        return resized(scene, taken, self.size, turn is not None and turn.mirrored)
+
+    def _crop(self, draw: Draw) -> Crop | None:
+        if self.crop is None:
+            return None
+        rng = self._random(draw.epoch, draw.lens, 3)
+        return Crop(rng.uniform(self.crop, 1), rng.random(), rng.random())
+
+    def _drawn(self, draw: Draw, own: Lens, crop: Crop | None) -> Lens:
+        """The lens that a scene is shown through, of which the image shows a part."""
+        lenses = self.lenses
+        assert lenses is not None
+        size, share = self.size, 1.0 if crop is None else crop.share
+        radius, theta_max = size / share / 2, own.theta_max.item()
+
+        def lens(fov: float) -> Lens:
+            return lenses.draw(self._random(draw.epoch, draw.lens, 1), fov, radius)
+
+        limit = _USED * lens(1.0).theta_limit.item()
+        drawn = lens(2 * min(theta_max, limit))
+        middle, left = (size / share - 1) / 2, size / share - size
+        across, down = (0.0, 0.0) if crop is None else (crop.across, crop.down)
+        center = drawn.theta_max.new_tensor([[middle - across * left, middle - down * left]])
+        return drawn.replace(center=center, image_size=center.new_tensor([[size, size]]))
+
+    def _lens_alone(self, draw: Draw) -> Lens:
+        own = self.scenes.lens_alone(draw.picture)
+        if self.lenses is not None:
+            return self._drawn(draw, own, self._crop(draw))
+        assert own.image_size is not None
+        height, width = (round(side) for side in own.image_size[0].tolist())
+        return own.cropped(*part((height, width), self.fit, None)).resized((self.size, self.size))
+
+    def _unknown(self) -> Tensor:
+        shape = self.size, self.size
+        if self.scenes.target == "labels":
+            return torch.full(shape, IGNORE, dtype=torch.int64)
+        return torch.zeros(shape)

@@ -1,0 +1,134 @@
+"""Scenes in another frame: image, target and lens move together.
+
+A scene becomes square, of a size, in one step from its picture: a part of it resized, turned about
+the optical axis, or as another lens would have seen it. The image is averaged over areas; a target
+is never mixed of several pixels, each of its own takes that of the nearest.
+"""
+
+from functools import lru_cache
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+import torch
+
+from darswin.data.frames import Fit, part_of
+from darswin.data.scenes.scene import Scene
+from darswin.data.scenes.targets import nothing_of
+from darswin.data.turning import Turn, turned_lens
+from darswin.data.warp import remap
+from darswin.lens import Lens
+from darswin.lens.pixels import pixel_angles
+from darswin.lens.reprojection import as_map
+
+# An image is read at up to so many points a pixel and axis, an odd number, so that one of them is
+# the pixel's centre, and so close together, in pixels of the picture.
+_MOST_POINTS = 5
+_APART = 1.5
+
+
+class Crop(NamedTuple):
+    """A part of a picture: its side as a share of the whole, and where it is, in [0, 1] of what is
+    left across and down."""
+
+    share: float
+    across: float
+    down: float
+
+
+def part(size: tuple[int, int], fit: Fit, crop: Crop | None) -> tuple[int, int, int, int]:
+    """What is taken of a picture (H, W): top, left, height, width. A crop of "crop" is a square
+    anywhere in the picture."""
+    top, left, height, width = part_of(size, fit)
+    if crop is None:
+        return top, left, height, width
+    height, width = (max(1, round(crop.share * side)) for side in (height, width))
+    top, left = round(crop.down * (size[0] - height)), round(crop.across * (size[1] - width))
+    return top, left, height, width
+
+
+def resized(scene: Scene, taken: tuple[int, int, int, int], size: int, mirrored: bool) -> Scene:
+    """A part of a scene, mirrored first if that is asked for, as (size, size).
+
+    Args:
+        taken: top, left, height, width.
+    """
+    image, target, lens = scene
+    if mirrored:
+        lens = turned_lens(lens, Turn(0.0, True))[0]
+        image, target = image[:, ::-1], target[:, ::-1]
+    top, left, height, width = taken
+    image, target = (a[top : top + height, left : left + width] for a in (image, target))
+    image = cv2.resize(np.ascontiguousarray(image), (size, size), interpolation=cv2.INTER_AREA)
+    down, across = (_nearest(side, size) for side in (height, width))
+    lens = lens.cropped(*taken).resized((size, size))
+    return _only_seen(Scene(image.reshape(size, size, -1), target[down[:, None], across], lens))
+
+
+def turned(scene: Scene, turn: Turn, taken: tuple[int, int, int, int], size: int) -> Scene:
+    """A part of a scene turned about its lens's optical axis, as (size, size); what turns in from
+    beyond the picture is black, and nothing is known of it."""
+    lens, matrix = turned_lens(scene.lens, turn)
+    top, left, height, width = taken
+    scale = np.array([width, height]) / size
+    back = np.linalg.inv(matrix[:, :2])
+    points = _points(max(height, width) / size)
+    places = _grid(size, points) * scale + (scale - 1) / 2 + (left, top)
+    places = (places - matrix[:, 2]) @ back.T
+    lens = lens.cropped(*taken).resized((size, size))
+    return _only_seen(_read(scene, places.astype(np.float32), lens, size, points))
+
+
+def through(scene: Scene, lens: Lens, size: int, turn: Turn | None = None) -> Scene:
+    """A scene as another lens would have seen it, as (size, size).
+
+    A distance along the ray stays what it is. What the picture does not show is black, and nothing
+    is known of it.
+
+    Args:
+        lens: one radial lens without `affine`. turn: of the scene about the optical axis.
+    """
+    exact, source = lens.to(torch.float64), scene.lens.to(torch.float64)
+    points = _points((source.r_max / exact.r_max).item())
+    theta, direction = exact.rays(torch.from_numpy(_grid(size, points))[None], (size, size))
+    if turn is not None:
+        direction = direction @ torch.from_numpy(turn.matrix)
+    theta = torch.where(exact.sees(theta), theta, torch.nan)
+    height, width = scene.target.shape
+    places = as_map(source.seen_pixels(theta, direction, (height, width)))[0]
+    return _read(scene, places.to(torch.float32).numpy(), lens, size, points)
+
+
+def _read(scene: Scene, places: np.ndarray, lens: Lens, size: int, points: int) -> Scene:
+    """A scene read at the places (points · size, points · size, 2) of a picture's pixels."""
+    image = remap(scene.image, places)
+    if points > 1:
+        image = cv2.resize(image, (size, size), interpolation=cv2.INTER_AREA)
+    centres = np.ascontiguousarray(places[points // 2 :: points, points // 2 :: points])
+    target = remap(scene.target, centres, cv2.INTER_NEAREST, nothing_of(scene.target))
+    return Scene(image.reshape(size, size, -1), target, lens)
+
+
+def _only_seen(scene: Scene) -> Scene:
+    """Nothing is known of pixels beyond the lens's θ_max."""
+    height, width = scene.target.shape
+    beyond = pixel_angles(scene.lens, (height, width))[0].isnan().numpy()
+    scene.target[beyond] = nothing_of(scene.target)
+    return scene
+
+
+def _nearest(side: int, size: int) -> np.ndarray:
+    """(size,): of a side of so many pixels, those nearest to the centres of `size` others."""
+    return ((2 * np.arange(size) + 1) * side) // (2 * size)
+
+
+def _points(scale: float) -> int:
+    """At how many points along an axis a pixel is read that is as large as `scale` others."""
+    return min(_MOST_POINTS, 2 * int(np.ceil((scale / _APART - 1) / 2)) + 1) if scale > 1 else 1
+
+
+@lru_cache(maxsize=8)
+def _grid(size: int, points: int) -> np.ndarray:
+    """(points · size, points · size, 2): x and y of so many points in each pixel and axis."""
+    along = (np.arange(points * size) + 0.5) / points - 0.5
+    return np.stack(np.meshgrid(along, along), -1)

@@ -1,0 +1,87 @@
+"""The image disc as a square: the concentric map, which keeps ratios of areas, under any lens.
+
+Places in the square are (a, b) in [-1, 1]², a to the right and b down; its middle is the optical
+axis, its edge θ_max, and nested squares are circles of θ, equally spaced in a `Spacing`.
+
+Source: Shirley and Chiu, "A Low Distortion Map Between Disk and Square", JGT 1997.
+"""
+
+import math
+
+import torch
+from torch import Tensor
+
+from darswin.lens.base import Lens
+from darswin.lens.pixels import pixel_rays
+from darswin.lens.reprojection import OUTSIDE, sample_at
+from darswin.lens.spacing import Spacing, check_tan, span, to_spacing, to_theta
+
+
+def square_to_disc(places: Tensor) -> tuple[Tensor, Tensor]:
+    """Places (..., 2) of the square → the disc's radius (...), in [0, 1], and (cos φ, sin φ).
+
+    The direction of the middle is (1, 0).
+    """
+    a, b = places.unbind(-1)
+    wide = a.abs() >= b.abs()
+    long, short = torch.where(wide, a, b), torch.where(wide, b, a)
+    turn = math.pi / 4 * short / torch.where(long == 0, 1, long)
+    sign = torch.where(long < 0, -1.0, 1.0).to(places.dtype)
+    along, aside = sign * torch.cos(turn), sign * torch.sin(turn)
+    direction = torch.where(wide, along, aside), torch.where(wide, aside, along)
+    return long.abs(), torch.stack(direction, -1)
+
+
+def disc_to_square(radius: Tensor, direction: Tensor) -> Tensor:
+    """The inverse of `square_to_disc`. In the middle the direction may be (0, 0)."""
+    c, s = direction.unbind(-1)
+    wide = c.abs() >= s.abs()
+    long, short = torch.where(wide, c, s), torch.where(wide, s, c)
+    turn = torch.atan(short / torch.where(long == 0, 1, long))
+    edge = torch.where(long < 0, -radius, radius)
+    other = edge * turn * (4 / math.pi)
+    places = torch.where(wide, edge, other), torch.where(wide, other, edge)
+    return torch.stack(places, -1)
+
+
+def square_view(lens: Lens, image_size: tuple[int, int], size: int, spacing: Spacing) -> Tensor:
+    """(N, S, S, 2) px: where in the images of (H, W) each pixel of the square of `size` S lies.
+
+    Raises:
+        ValueError: spacing "tan" with a lens of θ_max ≥ 90°.
+    """
+    if spacing == "tan":
+        check_tan(lens)
+    like = lens.theta_max
+    steps = (2 * torch.arange(size, dtype=like.dtype, device=like.device) + 1) / size - 1
+    places = torch.stack(torch.meshgrid(steps, steps, indexing="xy"), -1)
+    radius, direction = square_to_disc(places)
+    first, last = (end[:, :, None] for end in span(lens, spacing))
+    theta = to_theta(lens, first + (last - first) * radius, spacing)
+    return lens.pixels(theta, direction[None], image_size)
+
+
+def square_places(lens: Lens, image_size: tuple[int, int], spacing: Spacing) -> Tensor:
+    """(N, H, W, 2): where in the square each pixel of the images lies; `OUTSIDE` where no ray of
+    [0, θ_max] lands."""
+    if spacing == "tan":
+        check_tan(lens)
+    theta, direction = pixel_rays(lens, image_size)
+    seen = ~theta.isnan()  # NaN must not meet the gradients
+    first, last = (end[:, :, None] for end in span(lens, spacing))
+    value = to_spacing(lens, torch.where(seen, theta, 0.0), spacing)
+    radius = ((value - first) / (last - first)).clamp(max=1)
+    places = disc_to_square(radius, direction)
+    return torch.where(seen[..., None], places, OUTSIDE)
+
+
+def read_square(square: Tensor, places: Tensor) -> Tensor:
+    """Squares (B, C, S, S) read at places (B or 1, H, W, 2), bilinear → (B, C, H, W).
+
+    The outermost half pixel counts up to the edge; `OUTSIDE` is 0. S may be any.
+    """
+    height, width = square.shape[2:]
+    size = places.new_tensor((width, height))
+    pixels = ((places + 1) * size - 1) / 2
+    inside = torch.minimum(pixels.clamp(min=0), size - 1)
+    return sample_at(square, torch.where(places == OUTSIDE, OUTSIDE, inside))

@@ -1,0 +1,90 @@
+"""Spacings: the functions of θ that rings, samples and the concentric square split equally.
+
+- "theta": θ itself, the paper's text. Works beyond 90°.
+- "tan": tan θ, the authors' released code. Only for θ_max < 90°.
+- "g": DarSwin-Unet's compromise between the two.
+- "radius": r, equal steps in the image; knows nothing of the lens but its image circle.
+"""
+
+import math
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from darswin.lens.base import Lens
+from darswin.lens.inverse import inverse
+
+Spacing = Literal["theta", "tan", "g", "radius"]
+SPACINGS: tuple[Spacing, ...] = ("theta", "tan", "g", "radius")
+
+# g(t) = c b t^n + (1 - c) (1 - (1 - t)^m), t = θ/θ_max: constants of the released DarSwin-Unet.
+G_M, G_N, G_B, G_C = 2.288135593220339, 5, 8.31578947368421, 1 / 3
+
+
+def check_tan(lens: Lens) -> None:
+    """ValueError where tan θ ends before θ_max does. Compiled graphs cannot look at a value, so
+    they do not check."""
+    if torch.compiler.is_compiling():
+        return
+    largest = lens.theta_max.max().item() if len(lens) else 0.0
+    if largest >= math.pi / 2:
+        raise ValueError(
+            "spacing='tan' needs lenses with θ_max below 90°, since tan θ ends there; got "
+            f"{math.degrees(largest):.1f}°. Use 'theta', 'g' or 'radius'."
+        )
+
+
+def span(lens: Lens, spacing: Spacing) -> tuple[Tensor, Tensor]:
+    """(N, 1) each: θ = 0 and θ_max in units of a spacing."""
+    theta_max = lens.theta_max[:, None]
+    return (
+        to_spacing(lens, torch.zeros_like(theta_max), spacing),
+        to_spacing(lens, theta_max, spacing),
+    )
+
+
+def change_spacing(lens: Lens, value: Tensor, source: Spacing, target: Spacing) -> Tensor:
+    """(N, ...) from units of one spacing to those of another."""
+    if source == target:
+        return value
+    return to_spacing(lens, to_theta(lens, value, source), target)
+
+
+def to_spacing(lens: Lens, theta: Tensor, spacing: Spacing) -> Tensor:
+    """θ (N, ...), rad, in [0, θ_max] → units of a spacing."""
+    if spacing == "theta":
+        return theta
+    if spacing == "tan":
+        return torch.tan(theta)
+    if spacing == "radius":
+        return lens.project(theta)
+    return _g(theta / _theta_max(lens, theta))
+
+
+def to_theta(lens: Lens, value: Tensor, spacing: Spacing) -> Tensor:
+    """Units of a spacing (N, ...) → θ, rad: the inverse of `to_spacing`."""
+    if spacing == "theta":
+        return value
+    if spacing == "tan":
+        return torch.atan(value)
+    if spacing == "radius":
+        return lens.unproject(value)
+    return _inverse_g(value) * _theta_max(lens, value)
+
+
+def _theta_max(lens: Lens, like: Tensor) -> Tensor:
+    return lens.theta_max.reshape(-1, *(1,) * (like.dim() - 1))
+
+
+def _g(t: Tensor) -> Tensor:
+    """DarSwin-Unet's g of t = θ/θ_max in [0, 1]: rises from 0 to c b + 1 - c."""
+    t = t.clamp(max=1)  # rounding must not take (1 - t) below 0
+    return G_C * G_B * t**G_N + (1 - G_C) * (1 - (1 - t) ** G_M)
+
+
+def _inverse_g(value: Tensor) -> Tensor:
+    def slope(t: Tensor) -> Tensor:
+        return G_C * G_B * G_N * t ** (G_N - 1) + (1 - G_C) * G_M * (1 - t) ** (G_M - 1)
+
+    return inverse(_g, slope, value, value.new_ones(()))

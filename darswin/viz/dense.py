@@ -1,0 +1,273 @@
+"""Pictures of labels and distances of each pixel: colours, overlays, predictions beside the truth.
+
+Labels are ids (H, W) of integers; an id without a colour, as that of pixels without a label, is
+grey. Distances are (H, W) in metres, and grey where they are 0 or not finite: not known.
+"""
+
+from collections.abc import Sequence
+from functools import cache
+
+import cv2
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Colormap, LogNorm, Normalize
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch
+from matplotlib.ticker import FixedLocator, PercentFormatter, StrMethodFormatter
+
+UNKNOWN = (128, 128, 128)  # the colour of pixels without a label or distance
+MOST_CLASSES = 255  # 8 bits of a label picture, of which 255 means none
+
+# Near is bright. Equal steps look equal, also to those who see few colours.
+_DISTANCES = "viridis_r"
+_ERRORS = "magma"
+_WRONG, _RIGHT = (213, 0, 50), (222, 222, 222)
+# Okabe and Ito's colours without black.
+_FIRST = ((0, 114, 178), (230, 159, 0), (0, 158, 115), (204, 121, 167), (86, 180, 233),
+          (213, 94, 0), (240, 228, 66))  # fmt: skip
+# How those without red or green cones see linear RGB: Machado, Oliveira and Fernandes (2009).
+_SEEN = np.array([
+    [[1, 0, 0], [0, 1, 0], [0, 0, 1]],
+    [[0.152286, 1.052583, -0.204868], [0.114503, 0.786281, 0.099216],
+     [-0.003882, -0.048116, 1.051998]],
+    [[0.367322, 0.860646, -0.227968], [0.280085, 0.672501, 0.047413],
+     [-0.011820, 0.042940, 0.968881]],
+])  # fmt: skip
+
+Row = tuple[np.ndarray, np.ndarray, np.ndarray]  # image, truth, prediction
+
+
+def palette(count: int) -> list[list[int]]:
+    """So many colours (r, g, b) in 0 … 255, unlike each other and the grey of unknown pixels.
+
+    The first seven are Okabe and Ito's; each that follows is the one that is least like those
+    before it, to those who see no red or no green too. More colours begin with the same.
+
+    Raises:
+        ValueError: less than 0 or more than 255.
+    """
+    if not 0 <= count <= MOST_CLASSES:
+        raise ValueError(f"a palette has 0 to {MOST_CLASSES} colours, got {count}")
+    return [list(color) for color in _palette()[:count]]
+
+
+@cache
+def _palette() -> tuple[tuple[int, ...], ...]:
+    levels = np.arange(0, 256, 17)
+    candidates = np.stack(np.meshgrid(levels, levels, levels, indexing="ij"), -1).reshape(-1, 3)
+    seen = _as_seen(candidates)
+    chosen = [tuple(color) for color in _FIRST]
+    # Black is kept for those who draw on the colours.
+    unlike = np.full(len(candidates), np.inf)
+    for color in (UNKNOWN, (0, 0, 0), *chosen):
+        unlike = np.minimum(unlike, _difference(seen, _as_seen(np.array([color]))))
+    while len(chosen) < MOST_CLASSES:
+        best = int(unlike.argmax())
+        chosen.append(tuple(candidates[best].tolist()))
+        unlike = np.minimum(unlike, _difference(seen, seen[:, best : best + 1]))
+    return tuple(chosen)
+
+
+def _as_seen(colors: np.ndarray) -> np.ndarray:
+    """sRGB (N, 3) in CIELAB, to each kind of eye: (3, N, 3)."""
+    part = colors / 255
+    linear = np.where(part <= 0.04045, part / 12.92, ((part + 0.055) / 1.055) ** 2.4)
+    seen = (linear @ _SEEN.transpose(0, 2, 1)).clip(0, 1).astype(np.float32)
+    return cv2.cvtColor(seen, cv2.COLOR_LRGB2Lab)
+
+
+def _difference(colors: np.ndarray, color: np.ndarray) -> np.ndarray:
+    """The least ΔE*76 to any eye, (N,)."""
+    return np.linalg.norm(colors - color, axis=-1).min(0)
+
+
+def label_image(labels: np.ndarray, colors: Sequence[Sequence[int]]) -> np.ndarray:
+    """Labels (H, W) in the colours (r, g, b) of their ids: (H, W, 3) uint8.
+
+    Raises:
+        TypeError: labels that are no integers. ValueError: labels of another shape.
+    """
+    if not np.issubdtype(labels.dtype, np.integer):
+        raise TypeError(f"labels must be integers, got {labels.dtype}")
+    _check_map("labels", labels)
+    table = np.array([*colors, UNKNOWN], np.uint8).reshape(-1, 3)
+    known = (labels >= 0) & (labels < len(colors))
+    return table[np.where(known, labels, len(colors))]
+
+
+def distance_image(distance: np.ndarray, near: float, far: float) -> np.ndarray:
+    """Distances (H, W) in metres as colours of their logarithm: (H, W, 3) uint8.
+
+    Args:
+        near, far: m, of the brightest and of the darkest colour; what is nearer or farther has
+            these colours too. `distance_range` proposes them.
+
+    Raises:
+        ValueError: distances of another shape; `near` that is not above 0, `far` not above it.
+    """
+    _check_map("distance", distance)
+    if not 0 < near < far < np.inf:
+        raise ValueError(f"0 < near < far must hold, got {near:g} and {far:g} m")
+    known = is_known(distance)
+    colors = _distances()(LogNorm(near, far, clip=True)(np.where(known, distance, far)), bytes=True)
+    return np.where(known[..., None], colors[..., :3], np.array(UNKNOWN, np.uint8))
+
+
+def distance_range(distance: np.ndarray) -> tuple[float, float]:
+    """(near, far) in metres for `distance_image`: all but the nearest and farthest fiftieth."""
+    known = distance[is_known(distance)]
+    if not known.size:
+        return 1.0, 10.0
+    near, far = np.percentile(known, (2, 98)).tolist()
+    return near, max(far, 1.1 * near)
+
+
+def is_known(distance: np.ndarray) -> np.ndarray:
+    """Which distances (H, W) are some: finite and above 0."""
+    return np.isfinite(distance) & (distance > 0)
+
+
+def overlay(
+    image: np.ndarray, picture: np.ndarray, alpha: float = 0.5, where: np.ndarray | None = None
+) -> np.ndarray:
+    """A picture (H, W, 3) laid over an image (H, W, 1 or 3), uint8 both: (H, W, 3) uint8.
+
+    Args:
+        alpha: how much of the picture is seen, 0 to 1. where: (H, W), its pixels that are laid over
+            the image; None means all.
+
+    Raises:
+        ValueError: pictures of other shapes, `alpha` out of its range.
+    """
+    image = image[..., None] if image.ndim == 2 else image
+    if picture.shape != (*image.shape[:2], 3) or image.shape[2] not in (1, 3):
+        raise ValueError(
+            "image and picture must be (H, W, 1 or 3) and (H, W, 3) of one size, got "
+            f"{image.shape} and {picture.shape}"
+        )
+    if not 0 <= alpha <= 1:
+        raise ValueError(f"alpha must be in 0 … 1, got {alpha}")
+    mixed = (1 - alpha) * image + alpha * picture.astype(np.float32)
+    laid = np.rint(mixed).astype(np.uint8)
+    below = np.broadcast_to(image, picture.shape)
+    return laid if where is None else np.where(where[..., None], laid, below)
+
+
+def draw_predictions(
+    rows: Sequence[Row],
+    classes: Sequence[str] = (),
+    colors: Sequence[Sequence[int]] = (),
+    *,
+    titles: Sequence[str] = (),
+) -> Figure:
+    """Image, truth, prediction and error, a row a sample.
+
+    Args:
+        rows: of (image (H, W, 1 or 3) uint8, truth (H, W), prediction (H, W)): labels of integers,
+            or distances of floats in metres. The error is shown where the truth is known: wrong
+            pixels red, or the distance's relative error.
+        classes, colors: of labels, by id; without colors those of `palette`.
+        titles: a row each, to its left.
+
+    Raises:
+        ValueError: no rows; labels without classes.
+    """
+    if not rows:
+        raise ValueError("there are no predictions to draw")
+    of_labels = np.issubdtype(rows[0][1].dtype, np.integer)
+    if of_labels and not classes:
+        raise ValueError("predictions of labels are drawn with the names of their classes")
+    height, width = rows[0][1].shape
+    tall = len(rows) * (2.5 * height / width + 0.25) + (0.9 if of_labels else 1.5)
+    figure = Figure(figsize=(10.4, tall), layout="constrained")
+    panels = figure.subplots(len(rows), 4, squeeze=False)
+    for axes, title in zip(panels[0], ("image", "truth", "prediction", "error"), strict=True):
+        axes.set_title(title, fontsize=11)
+    if of_labels:
+        _draw_labels(figure, panels, rows, classes, colors or palette(len(classes)))
+    else:
+        _draw_distances(figure, panels, rows)
+    for axes, title in zip(panels[:, 0], titles, strict=False):
+        axes.set_ylabel(title, fontsize=9)
+    return figure
+
+
+def _draw_labels(
+    figure: Figure,
+    panels: np.ndarray,
+    rows: Sequence[Row],
+    classes: Sequence[str],
+    colors: Sequence[Sequence[int]],
+) -> None:
+    for axes, (image, truth, prediction) in zip(panels, rows, strict=True):
+        known = (truth >= 0) & (truth < len(colors))
+        error = np.where(
+            (truth == prediction)[..., None], np.array(_RIGHT, np.uint8), np.array(_WRONG, np.uint8)
+        )
+        error = np.where(known[..., None], error, np.array(UNKNOWN, np.uint8))
+        pictures = (image, label_image(truth, colors), label_image(prediction, colors), error)
+        for panel, picture in zip(axes, pictures, strict=True):
+            _show(panel, picture)
+        share = (truth == prediction)[known].mean() if known.any() else float("nan")
+        axes[3].set_xlabel(f"{share:.0%} right", fontsize=9)
+    meanings = [*zip(classes, colors, strict=False), ("wrong", _WRONG), ("no label", UNKNOWN)]
+    entries = [
+        Patch(color=(red / 255, green / 255, blue / 255), label=name)
+        for name, (red, green, blue) in meanings
+    ]
+    figure.legend(handles=entries, loc="outside lower center", ncols=8, fontsize=9)
+
+
+def _draw_distances(figure: Figure, panels: np.ndarray, rows: Sequence[Row]) -> None:
+    known = [truth[is_known(truth)] for _, truth, _ in rows]
+    near, far = distance_range(np.concatenate(known))
+    worst = Normalize(0, 0.5, clip=True)
+    for axes, (image, truth, prediction) in zip(panels, rows, strict=True):
+        both = is_known(truth) & is_known(prediction)
+        relative = np.abs(prediction - truth) / np.where(both, truth, 1)
+        error = matplotlib.colormaps[_ERRORS](worst(np.where(both, relative, 0)), bytes=True)
+        error = np.where(both[..., None], error[..., :3], np.array(UNKNOWN, np.uint8))
+        maps = (distance_image(d, near, far) for d in (truth, prediction))
+        for panel, picture in zip(axes, (image, *maps, error), strict=True):
+            _show(panel, picture)
+        mean = relative[both].mean() if both.any() else float("nan")
+        axes[3].set_xlabel(f"mean {mean:.0%}", fontsize=9)
+    distances = ScalarMappable(LogNorm(near, far), _distances())
+    bar = figure.colorbar(
+        distances, ax=panels[-1, :3], location="bottom", shrink=0.5, aspect=40, extend="both"
+    )
+    bar.set_label("distance (m), log scale; grey: not known", fontsize=9)
+    bar.ax.xaxis.set_major_locator(FixedLocator(_round_steps(near, far)))
+    bar.ax.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+    bar.ax.minorticks_off()
+    bar.ax.tick_params(labelsize=9)
+    errors = ScalarMappable(worst, matplotlib.colormaps[_ERRORS])
+    bar = figure.colorbar(errors, ax=panels[-1, 3], location="bottom", aspect=15, extend="max")
+    bar.set_label("error of the true distance", fontsize=9)
+    bar.ax.xaxis.set_major_formatter(PercentFormatter(1, 0))
+    bar.ax.tick_params(labelsize=9)
+
+
+def _round_steps(near: float, far: float) -> list[float]:
+    """1, 2, 5, 10 … between two distances; the two where there are fewer than two of them."""
+    decades = 10.0 ** np.arange(np.floor(np.log10(near)), np.ceil(np.log10(far)) + 1)
+    steps = [float(f"{d * k:.1g}") for d in decades for k in (1, 2, 5) if near <= d * k <= far]
+    return steps if len(steps) > 1 else [float(f"{end:.3g}") for end in (near, far)]
+
+
+def _distances() -> Colormap:
+    return matplotlib.colormaps[_DISTANCES]
+
+
+def _show(axes: Axes, picture: np.ndarray) -> None:
+    picture = np.atleast_3d(picture)
+    picture = np.repeat(picture, 3, 2) if picture.shape[2] == 1 else picture
+    axes.imshow(picture, interpolation="nearest" if max(picture.shape) <= 160 else "antialiased")
+    axes.set(xticks=[], yticks=[])
+
+
+def _check_map(name: str, values: np.ndarray) -> None:
+    if values.ndim != 2:
+        raise ValueError(f"{name} must be (H, W), got {values.shape}")

@@ -1,0 +1,173 @@
+import cv2
+import matplotlib
+import numpy as np
+import pytest
+
+from darswin.viz.dense import (
+    UNKNOWN,
+    distance_image,
+    distance_range,
+    draw_predictions,
+    label_image,
+    overlay,
+    palette,
+)
+from darswin.viz.plot import save_figure
+
+
+def lab(colors, protanopia=None):
+    """CIELAB, as those see it who have no red or no green cones (Viénot, Brettel, Mollon 1999)."""
+    linear = (np.array(colors) / 255) ** 2.2
+    if protanopia is not None:
+        weights = ([0.11238, 0.88762], [0.29275, 0.70725])[not protanopia]
+        yellow = linear[:, :2] @ weights
+        blue = linear[:, 2] + (linear[:, 0] - linear[:, 1]) * (0.00401, -0.02234)[not protanopia]
+        linear = np.stack((yellow, yellow, blue), -1).clip(0, 1)
+    srgb = (linear ** (1 / 2.2)).astype(np.float32)
+    return cv2.cvtColor(srgb[None], cv2.COLOR_RGB2LAB)[0]
+
+
+def least_difference(seen):
+    apart = np.linalg.norm(seen[:, None] - seen, axis=-1)
+    return apart[~np.eye(len(seen), dtype=bool)].min()
+
+
+@pytest.mark.parametrize("count", [0, 1, 10, 25, 255])
+def test_a_palette_has_different_colours_and_longer_ones_begin_alike(count):
+    colors = palette(count)
+    assert len({tuple(color) for color in colors} | {UNKNOWN}) == count + 1
+    assert colors == palette(255)[:count]
+    assert all(0 <= value <= 255 for color in colors for value in color)
+
+
+@pytest.mark.parametrize(("protanopia", "least"), [(None, 20), (True, 9), (False, 9)])
+def test_classes_are_told_apart_by_all_eyes(protanopia, least):
+    """By a model of colour blindness that is not the palette's own."""
+    assert least_difference(lab([*palette(12), UNKNOWN], protanopia)) > least
+
+
+def test_a_palette_of_too_many():
+    for count in (-1, 256):
+        with pytest.raises(ValueError, match=f"0 to 255 colours, got {count}"):
+            palette(count)
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.int64])
+def test_a_label_has_the_colour_of_its_id(dtype):
+    colors = [[1, 2, 3], [250, 0, 7]]
+    labels = np.array([[0, 1, 255], [2, 1, 0]], dtype)
+    picture = label_image(labels, colors)
+    assert picture.dtype == np.uint8
+    expected = [[colors[0], colors[1], UNKNOWN], [UNKNOWN, colors[1], colors[0]]]
+    assert np.array_equal(picture, expected)
+    assert np.array_equal(label_image(np.array([[-1]]), colors), [[UNKNOWN]])
+    assert np.array_equal(label_image(labels, []), np.full((2, 3, 3), 128))
+
+
+def test_what_is_no_label_map():
+    with pytest.raises(TypeError, match="integers, got float32"):
+        label_image(np.zeros((2, 2), np.float32), palette(2))
+    with pytest.raises(ValueError, match=r"\(H, W\), got \(2,\)"):
+        label_image(np.zeros(2, int), palette(2))
+
+
+def test_distances_get_darker_by_their_logarithm():
+    distance = np.geomspace(1, 100, 9)[None]
+    picture = distance_image(distance, 1, 100)
+    bright = cv2.cvtColor(picture, cv2.COLOR_RGB2LAB)[0, :, 0].astype(float)
+    steps = np.diff(bright)
+    assert (steps < 0).all() and steps.std() < 0.15 * -steps.mean()  # equal factors look equal
+    ends = distance_image(np.array([[0.1, 1, 100, 1e6]]), 1, 100)[0]
+    assert np.array_equal(ends[0], ends[1]) and np.array_equal(ends[2], ends[3])
+    assert picture.shape == (1, 9, 3) and picture.dtype == np.uint8
+
+
+def test_unknown_distances_are_grey():
+    nothing = np.array([[0.0, -1, np.nan, np.inf, 5]], np.float32)
+    picture = distance_image(nothing, 1, 10)[0]
+    assert (picture[:4] == UNKNOWN).all() and not (picture[4] == UNKNOWN).all()
+    with pytest.raises(ValueError, match="0 < near < far must hold, got 2 and 1 m"):
+        distance_image(nothing, 2, 1)
+
+
+def test_the_range_of_distances_leaves_out_what_is_rare_and_unknown():
+    distance = np.linspace(10, 20, 1000).reshape(10, 100)
+    distance[0, 0], distance[0, 1], distance[0, 2:9] = 1e-3, 1e9, 0
+    near, far = distance_range(distance)
+    assert 10 < near < 10.5 and 19.5 < far < 20
+    for same in (np.zeros((4, 4)), np.full((4, 4), 3.0)):
+        near, far = distance_range(same)
+        assert 0 < near < far
+        distance_image(same, near, far)
+
+
+def test_an_overlay_is_between_both():
+    image, picture = np.full((2, 3, 3), 100, np.uint8), np.full((2, 3, 3), 200, np.uint8)
+    where = np.array([[True, False, True], [False, False, True]])
+    laid = overlay(image, picture, 0.25, where)
+    assert (laid == np.where(where[..., None], 125, 100)).all() and laid.dtype == np.uint8
+    assert (overlay(image[..., :1], picture) == 150).all()
+    assert (overlay(image[..., 0], picture, 1.0) == 200).all()
+    with pytest.raises(ValueError, match="of one size"):
+        overlay(image, picture[:1])
+    with pytest.raises(ValueError, match="alpha"):
+        overlay(image, picture, 2)
+
+
+def texts(figure):
+    found = figure.findobj(matplotlib.text.Text)
+    return [text for text in found if text.get_visible() and text.get_text()]
+
+
+def test_predictions_of_labels_stand_beside_the_truth(tmp_path):
+    truth = np.array([[0, 1], [1, 255]])
+    prediction = np.array([[0, 1], [0, 1]])
+    image = np.full((2, 2, 1), 7, np.uint8)
+    colors = palette(2)
+    rows = [(image, truth, prediction)] * 2
+    figure = draw_predictions(rows, ["road", "sky"], colors, titles=["front", "rear"])
+    assert len(figure.axes) == 8
+    shown = [axes.images[0].get_array() for axes in figure.axes[:4]]
+    assert np.array_equal(shown[0], np.full((2, 2, 3), 7))
+    assert np.array_equal(shown[1], label_image(truth, colors))
+    assert np.array_equal(shown[2], label_image(prediction, colors))
+    right, wrong, unknown = shown[3][0, 0], shown[3][1, 0], shown[3][1, 1]
+    assert np.array_equal(shown[3][0, 1], right) and tuple(unknown) == UNKNOWN
+    assert wrong[0] > 2 * wrong[1] and right.min() > 200
+    said = [text.get_text() for text in texts(figure)]
+    assert said.count("67% right") == 2
+    for word in ("image", "truth", "prediction", "error", "road", "sky", "no label", "front"):
+        assert word in said
+    assert min(text.get_fontsize() for text in texts(figure)) >= 8
+    save_figure(figure, tmp_path / "labels.png")
+    assert cv2.imread(str(tmp_path / "labels.png")).std() > 20
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_predictions_of_distances_have_their_error(count, tmp_path):
+    truth = np.linspace(1, 50, 600, dtype=np.float32).reshape(20, 30)
+    prediction = truth * 1.25
+    truth[0] = 0
+    image = np.zeros((20, 30, 3), np.uint8)
+    figure = draw_predictions([(image, truth, prediction)] * count)
+    assert (figure.axes[3].images[0].get_array()[0] == UNKNOWN).all()
+    assert (figure.axes[1].images[0].get_array()[0] == UNKNOWN).all()
+    error = figure.axes[3].images[0].get_array()[1:].reshape(-1, 3).astype(int)
+    assert np.ptp(error, 0).max() <= 1  # it is the same everywhere
+    said = [text.get_text() for text in texts(figure)]
+    assert said.count("mean 25%") == count
+    assert min(text.get_fontsize() for text in texts(figure)) >= 8
+    save_figure(figure, tmp_path / "distances.png")
+    # All titles are inside of the picture.
+    for axes in figure.axes[:4]:
+        assert axes.title.get_window_extent().y1 <= figure.bbox.height + 1
+
+
+def test_predictions_that_cannot_be_drawn():
+    with pytest.raises(ValueError, match="no predictions"):
+        draw_predictions([])
+    labels = np.zeros((2, 2), int)
+    with pytest.raises(ValueError, match="names of their classes"):
+        draw_predictions([(np.zeros((2, 2, 3), np.uint8), labels, labels)])
+    nothing = np.zeros((4, 4), np.float32)
+    draw_predictions([(np.zeros((4, 4, 3), np.uint8), nothing, nothing + 1)])
