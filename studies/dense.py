@@ -93,7 +93,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--size", default="nano", help="of the models")
     parser.add_argument("--pixels", type=int, default=dense_data.SIZE, help="of the pictures")
     parser.add_argument(
-        "--pictures", type=int, nargs=3, default=(dense_data.TRAIN, dense_data.VAL, dense_data.TEST),
+        "--pictures", type=int, nargs=3, default=dense_data.PICTURES,
         metavar=("TRAIN", "VAL", "TEST"), help="of each lens",
     )  # fmt: skip
     parser.add_argument("--processes", type=int, default=os.cpu_count())

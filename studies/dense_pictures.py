@@ -2,7 +2,6 @@
 
 from pathlib import Path
 
-import dense_data
 import numpy as np
 import torch
 from matplotlib.figure import Figure

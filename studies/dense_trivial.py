@@ -7,6 +7,7 @@
 Both are found on the training pictures of "low", with the true lens, and tested with it.
 """
 
+import itertools
 import json
 import math
 from collections.abc import Iterator
@@ -27,7 +28,7 @@ NEVER = -1.0  # of a direction that no training picture has
 
 
 def trivial(out: Path) -> dict:
-    """The baselines' scores on every test set, {task: {baseline: {set: scores}}}, kept in a file."""
+    """The baselines' scores on all test sets, {task: {baseline: {set: scores}}}; kept in a file."""
     file = out / "trivial.json"
     if file.exists():
         return json.loads(file.read_text())
@@ -69,7 +70,7 @@ def _table(pictures: list[tuple[np.ndarray, ...]], sectors: int, task: str) -> n
     cell = np.concatenate([_cells(*p[1:], sectors) for p in pictures])
     order = np.argsort(cell, kind="stable")
     ends = np.searchsorted(cell[order], np.arange(RINGS * sectors + 1))
-    parts = [target[order[a:b]] for a, b in zip(ends[:-1], ends[1:], strict=True)]
+    parts = [target[order[a:b]] for a, b in itertools.pairwise(ends)]
     said = np.full(RINGS * sectors, NEVER)
     for k, part in enumerate(parts):
         if len(part):
