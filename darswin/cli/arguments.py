@@ -1,6 +1,7 @@
 """Command lines of functions, by jsonargparse: lists as people type them, errors in a sentence."""
 
 import inspect
+import json
 import re
 import types
 import typing
@@ -59,6 +60,29 @@ def with_lists(argv: Sequence[str], names: Collection[str]) -> list[str]:
         if all(_NUMBERS.fullmatch(part) for part in parts) and parts:
             numbers = re.findall(r"[^\s\[\](),]+", " ".join(parts))
             argument = f"{option}=[{','.join(numbers)}]"
+        found.append(argument)
+    return found
+
+
+def with_words(argv: Sequence[str], name: str) -> list[str]:
+    """The arguments with all words that follow an option in one list: `--paths A B` becomes
+    `--paths=["A", "B"]`; what is a list already stays.
+
+    Args:
+        name: of the option, without dashes.
+    """
+    found, left = [], list(argv)
+    while left:
+        argument = left.pop(0)
+        option, equals, value = argument.partition("=")
+        if option == f"--{name}" and not value.startswith("[") and value != "null":
+            words = [value] if equals else []
+            while left and not left[0].startswith("-"):
+                words.append(left.pop(0))
+            if words not in ([], ["null"]) and not words[0].startswith("["):
+                argument = f"{option}={json.dumps(words)}"
+            else:
+                argument = "=".join((option, *words))
         found.append(argument)
     return found
 

@@ -1,10 +1,10 @@
 """`darswin fit`, `validate` and `test`: Lightning's command line, with a folder for each run.
 
 A run's folder holds everything of it: `config.yaml`, `checkpoints/{last,best}.{ckpt,safetensors}`,
-the logs `csv/` and `tensorboard/`, and `test.{csv,json,png}`.
+the logs `csv/` and `tensorboard/`, and `test.{csv,json,png}`. What is trained and tested, and on
+which data, is the task's: `darswin.train.tasks`.
 """
 
-import argparse
 import contextlib
 import re
 import shlex
@@ -12,7 +12,7 @@ import sys
 import warnings
 from functools import partial
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, NoReturn, get_args
 
 import torch
 import yaml
@@ -23,28 +23,26 @@ from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
 from lightning.pytorch.utilities import rank_zero_only
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
-from darswin.cli.arguments import with_lists
+from darswin.cli.arguments import with_lists, with_words
+from darswin.cli.configs import FIRST_TASK, check_free, last_of, presets, task_of, with_configs
 from darswin.cli.help import ALL, format_help
 from darswin.data.lenses import parse_sweep
-from darswin.models.saving import model_of_run, read_card
+from darswin.models.saving import Task, model_of_run, read_card
 from darswin.train.checkpoints import RunCheckpoint, SafeCheckpointIO
-from darswin.train.classification import Classification
 from darswin.train.finetuning import settle, weights_file
-from darswin.train.results import WriteResults
 from darswin.train.resuming import check_changes
 from darswin.train.stopping import StopSignals, StopWhenTold
-from darswin.train.wide_angle import WideAngleData
+from darswin.train.tasks import TASKS
 from darswin.utils.files import locked, remove_partial_files, replace_file
 from darswin.utils.malloc import keep_freed_memory
-
-PRESETS = Path(__file__).parent.parent / "train" / "presets"
 
 
 def run(argv: list[str]) -> None:
     """Runs `fit`, `validate` or `test`, the first of `argv`, with the others as its options."""
     if argv[0] == "fit":
         keep_freed_memory()
-    argv = with_lists(argv, ("data.mean", "data.std"))
+    argv = with_lists(argv, ("data.mean", "data.std", "model.class_weights", "model.zones"))
+    argv = with_words(argv, "data.test_paths")
     # Lightning warns of arguments that are not sys.argv: ours add the run's configuration.
     warnings.filterwarnings("ignore", "LightningCLI's args parameter")
     warnings.filterwarnings("ignore", r".*isinstance\(treespec, LeafSpec\)")  # Lightning's own
@@ -80,11 +78,14 @@ def _lacks_memory(error: Exception) -> bool:
 def _run(argv: list[str], signals: StopSignals) -> None:
     whole_help = ALL in argv
     argv = ["--help" if word == ALL else word for word in argv]
+    argv = with_configs(argv)
+    task = task_of(argv)
     RunCLI(
         signals,
-        model_class=Classification,
-        datamodule_class=WideAngleData,
-        args=with_configs(argv),
+        task,
+        model_class=TASKS[task].module,
+        datamodule_class=TASKS[task].data,
+        args=argv,
         seed_everything_default=0,
         auto_configure_optimizers=False,
         save_config_callback=None,
@@ -98,56 +99,6 @@ def _run(argv: list[str], signals: StopSignals) -> None:
             prog="darswin", description="Trains and tests models on wide-angle images."
         ),
     )
-
-
-def with_configs(argv: list[str]) -> list[str]:
-    """The arguments with presets' names as their files, and a run's own configuration first.
-
-    `test`, `validate` and `fit --resume` start from `RUN/config.yaml`, so that they need no other
-    option.
-
-    Raises:
-        ValueError: an unknown preset. FileExistsError, FileNotFoundError: a run, or none, in RUN.
-    """
-    scan = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    scan.add_argument("-c", "--config", action="append", default=[])
-    scan.add_argument("--run")
-    scan.add_argument("--resume", action="store_true")
-    known, others = scan.parse_known_args(argv[1:])
-    configs = [_config_file(name) for name in known.config]
-    if known.run:
-        others += ["--run", known.run]
-        own = Path(known.run) / "config.yaml"
-        if argv[0] == "fit" and not known.resume:
-            _check_free(Path(known.run))
-        elif own.exists():
-            configs.insert(0, str(own))
-        elif _last(Path(known.run)).exists() if argv[0] == "fit" else not configs:
-            raise FileNotFoundError(f"there is no run in {known.run}: it has no config.yaml")
-    if known.resume:
-        others.append("--resume=true")
-    return [argv[0], *(f"--config={config}" for config in configs), *others]
-
-
-def _last(folder: Path) -> Path:
-    return folder / "checkpoints" / "last.ckpt"
-
-
-def _check_free(folder: Path) -> None:
-    if _last(folder).exists():
-        raise FileExistsError(
-            f"{folder} holds a run already: go on with --resume, or choose another one"
-        )
-
-
-def _config_file(name: str) -> str:
-    preset = PRESETS / f"{name}.yaml"
-    if Path(name).exists():
-        return name
-    if not preset.exists():
-        presets = ", ".join(sorted(path.stem for path in PRESETS.glob("*.yaml")))
-        raise ValueError(f"there is no file {name} and no such preset; the presets are {presets}")
-    return str(preset)
 
 
 class RunParser(LightningArgumentParser):
@@ -186,8 +137,8 @@ class WholeHelpParser(RunParser):
 class RunCLI(LightningCLI):
     """Lightning's command line with `--run`, `--resume` and `--xi`."""
 
-    def __init__(self, signals: StopSignals, **options):
-        self.signals, self.typed = signals, options["args"]
+    def __init__(self, signals: StopSignals, task: Task, **options):
+        self.signals, self.task, self.typed = signals, task, options["args"]
         super().__init__(**options)
 
     @staticmethod
@@ -199,8 +150,7 @@ class RunCLI(LightningCLI):
     def add_arguments_to_parser(self, parser: LightningArgumentParser) -> None:
         """Adds the options that are the run's, and neither the model's nor the data's."""
         (config,) = (action for action in parser._actions if action.dest == "config")
-        presets = ", ".join(sorted(path.stem for path in PRESETS.glob("*.yaml")))
-        config.help = f"a preset ({presets}) or a YAML file of options; later ones win"
+        config.help = f"a preset ({presets()}) or a YAML file of options; later ones win"
         parser.add_argument("--run", type=str, required=True, help="the folder of the run")
         parser.add_argument(
             "--resume", type=bool, default=False, help="fit: goes on from the run's last checkpoint"
@@ -209,8 +159,15 @@ class RunCLI(LightningCLI):
             "--checkpoint_steps", type=int, default=200, help="fit: steps between checkpoints"
         )
         parser.add_argument(
-            "--xi", type=str, help="test: the same as --data.test_lenses, e.g. 0:1:0.1 for every ξ"
-        )
+            "--task", type=Task, default=self.task,
+            help=f"one of {', '.join(get_args(Task))}; `--task TASK --help` lists its options",
+        )  # fmt: skip
+        if self.task == FIRST_TASK:
+            parser.add_argument(
+                "--xi",
+                type=str,
+                help="test: the same as --data.test_lenses, e.g. 0:1:0.1 for every ξ",
+            )
         parser.add_argument("--devices", type=int, help="the same as --trainer.devices")
         parser.link_arguments("seed_everything", "data.seed", compute_fn=int)
         parser.link_arguments("seed_everything", "model.seed", compute_fn=int)
@@ -226,9 +183,12 @@ class RunCLI(LightningCLI):
         for name in ("path", "classes", "splits", "lens"):  # so that the run works from anywhere
             if config.data[name] and Path(config.data[name]).exists():
                 config.data[name] = str(Path(config.data[name]).resolve())
-        self._check_lenses(config)
-        if config.xi is not None:
-            config.data.test_lenses = parse_sweep(config.xi)
+        if self.task == FIRST_TASK:
+            self._check_lenses(config)
+            if config.xi is not None:
+                config.data.test_lenses = parse_sweep(config.xi)
+        elif config.data.test_paths:
+            config.data.test_paths = [str(Path(path).resolve()) for path in config.data.test_paths]
         if config.devices is not None:
             config.trainer.devices = config.devices
         if config.trainer.overfit_batches:
@@ -243,14 +203,14 @@ class RunCLI(LightningCLI):
         weights = config.model.weights
         if weights is not None and Path(weights).exists():
             weights = config.model.weights = str(Path(weights).resolve())
-        if weights is not None and not (config.resume and _last(self.folder).exists()):
+        if weights is not None and not (config.resume and last_of(self.folder).exists()):
             card = read_card(weights_file(weights))
-            model, data = settle(card, weights, config.model, config.data)
+            model, data = settle(card, weights, self.task, config.model, config.data)
             for group, settled in ((config.model, model), (config.data, data)):
                 for name, value in settled.items():
                     group[name] = value
         self.record = self._recorded(config)
-        if config.resume and _last(self.folder).exists():
+        if config.resume and last_of(self.folder).exists():
             before = yaml.safe_load((self.folder / "config.yaml").read_text())
             for change in check_changes(before, yaml.safe_load(self.record)):
                 _say(change)
@@ -314,9 +274,9 @@ class RunCLI(LightningCLI):
 
     def _start(self) -> str | None:
         """The checkpoint to start from."""
-        config, last = self.config_init["fit"], _last(self.folder)
+        config, last = self.config_init["fit"], last_of(self.folder)
         if not config.resume:
-            _check_free(self.folder)
+            check_free(self.folder)
         elif last.exists():
             return config.ckpt_path or str(last)
         else:
@@ -332,13 +292,15 @@ class RunCLI(LightningCLI):
 
     def _callbacks(self, steps: int) -> list[Callback]:
         if self.subcommand != "fit":
-            return [WriteResults(self.folder)] if self.subcommand == "test" else []
+            writer = TASKS[self.task].write(self.folder)
+            return [writer] if self.subcommand == "test" else []
+        monitor, mode = TASKS[self.task].module.monitor
         checkpoint = partial(
             RunCheckpoint, self.folder / "checkpoints", enable_version_counter=False
         )
         return [
-            StopWhenTold(self.signals, _last(self.folder)),
-            checkpoint("best", monitor="val/top1", mode="max", save_on_train_epoch_end=False),
+            StopWhenTold(self.signals, last_of(self.folder)),
+            checkpoint("best", monitor=monitor, mode=mode, save_on_train_epoch_end=False),
             checkpoint("last", every_n_train_steps=steps),
             checkpoint("last", save_on_train_epoch_end=True),
         ]

@@ -13,6 +13,7 @@ RUN = {
     "config": "",
     "run": "",
     "resume": "",
+    "task": "",
     "checkpoint_steps": "",
     "xi": "",
     "devices": "",

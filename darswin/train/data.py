@@ -59,7 +59,7 @@ class RunData(LightningDataModule):
     # What a model's card says of its pictures.
     fov: float
     frame_fit: Fit
-    colors: Sequence[Sequence[int]] = ()
+    colors: Sequence[Sequence[int]] = []
 
     def __init__(
         self,

@@ -6,11 +6,14 @@ from typing import Any
 
 from torch import nn
 
+from darswin.models.base import Model
+from darswin.models.dense import DenseModel
 from darswin.models.encoder import Encoder
-from darswin.models.saving import ModelCard, load_model, model_of_run
+from darswin.models.registry import list_models, model_class
+from darswin.models.saving import ModelCard, Task, load_model, model_of_run
 
 # What the data decide of a model's options.
-OF_DATA = ("num_classes", "in_chans", "mean", "std", "image_size")
+OF_DATA = ("task", "num_classes", "in_chans", "mean", "std", "image_size")
 # Options that change nothing but how a model trains.
 OF_TRAINING = ("drop_path_rate", "jitter")
 
@@ -25,13 +28,48 @@ def own_options(card: ModelCard) -> dict[str, Any]:
     return {name: value for name, value in card.options.items() if name not in OF_DATA}
 
 
+def models_for(task: Task) -> list[str]:
+    """The names of the models that a task trains."""
+    base = Encoder if task == "classification" else DenseModel
+    return [name for name in list_models() if issubclass(model_class(name), base)]
+
+
+def name_from(card: ModelCard, task: Task) -> str:
+    """The model that starts from a trained one: the same, or a dense one with that encoder.
+
+    Raises:
+        ValueError: the task has no such model.
+    """
+    names = models_for(task)
+    found = [name for name in names if card.model in (name, name.replace("_unet_", "_"))]
+    if not found:
+        raise ValueError(
+            f"no model for {task} starts from a {card.model}, which is one for {card.task}"
+        )
+    return found[0]
+
+
+def check_name(name: str, task: Task) -> None:
+    """ValueError for a model that there is not, or that is none for the task."""
+    model_class(name)
+    if name not in models_for(task):
+        raise ValueError(
+            f"--model.name {name} is no model for --task {task}; there are "
+            f"{', '.join(models_for(task))}"
+        )
+
+
 def settle(
-    card: ModelCard, weights: str, model: Mapping[str, Any], data: Mapping[str, Any]
+    card: ModelCard,
+    weights: str,
+    task: Task,
+    model: Mapping[str, Any],
+    data: Mapping[str, Any],
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """The options of a run that starts from a model: those not given, None, are the model's.
 
     Args:
-        model: `name` and `options`. data: `size`, `channels`, `mean` and `std`.
+        task: of the run. model: `name` and `options`. data: `size`, `channels`, `mean` and `std`.
 
     Returns:
         The same, all of them said.
@@ -46,13 +84,17 @@ def settle(
             f"{theirs}; leave it out"
         )
 
-    if model["name"] not in (None, card.model):
+    name = name_from(card, task)
+    if model["name"] not in (None, name):
         raise refuse("model.name", model["name"], card.model)
     own = own_options(card)
     options = dict(model["options"] or {})
-    for name, value in options.items():
-        if name not in OF_TRAINING and _plain(own.get(name)) != _plain(value):
-            raise refuse("model.options", {name: value}, {name: own.get(name)})
+    for option, value in options.items():
+        # A decoder that the model does not have yet has options of its own.
+        if option not in own and name != card.model:
+            continue
+        if option not in OF_TRAINING and _plain(own.get(option)) != _plain(value):
+            raise refuse("model.options", {option: value}, {option: own.get(option)})
     found = {}
     theirs = {
         "size": card.size,
@@ -60,13 +102,13 @@ def settle(
         "mean": card.options.get("mean"),
         "std": card.options.get("std"),
     }
-    for name, value in theirs.items():
-        found[name] = value if data[name] is None else data[name]
+    for option, value in theirs.items():
+        found[option] = value if data[option] is None else data[option]
         # A model that takes images of any size may go on with another one.
-        free = name == "size" and "image_size" not in card.options
-        if not free and value is not None and _plain(found[name]) != _plain(value):
-            raise refuse(f"data.{name}", found[name], value)
-    return {"name": card.model, "options": own | options}, found
+        free = option == "size" and "image_size" not in card.options
+        if not free and value is not None and _plain(found[option]) != _plain(value):
+            raise refuse(f"data.{option}", found[option], value)
+    return {"name": name, "options": own | options}, found
 
 
 def _plain(value: Any) -> Any:
@@ -74,20 +116,28 @@ def _plain(value: Any) -> Any:
     return [_plain(v) for v in value] if isinstance(value, (list, tuple)) else value
 
 
-def start_from(net: Encoder, classes: list[str], weights: str | Path) -> None:
-    """Copies a model's weights into a network; its head too, if it is of the same classes.
+def start_from(net: Model, classes: list[str], weights: str | Path) -> None:
+    """Copies a model's weights into a network; its head too, if it is of the same classes. Those of
+    a classifier go into a dense model's encoder.
 
     Raises:
         ValueError: the weights of another model.
     """
     trained, card = load_model(weights_file(weights))
     there = trained.state_dict()
-    if list(card.classes) != list(classes):
-        there = {name: t for name, t in there.items() if not name.startswith("head.")}
+    if isinstance(net, DenseModel) and card.task == "classification":
+        there = {f"encoder.{name}": t for name, t in there.items() if not _of_head(name)}
+        rest = {name for name in net.state_dict() if not name.startswith("encoder.")}
+    else:
+        if list(card.classes) != list(classes):
+            there = {name: t for name, t in there.items() if not _of_head(name)}
+        # A model for another task has another head.
+        there = {n: t for n, t in there.items() if not _of_head(n) or n in net.state_dict()}
+        rest = {name for name in net.state_dict() if _of_head(name)}
     own = net.state_dict()
     other = sorted(
         name for name in own.keys() | there.keys()
-        if not (name.startswith("head.") and name not in there)
+        if not (name in rest and name not in there)
         and (name not in own or name not in there or own[name].shape != there[name].shape)
     )  # fmt: skip
     if other:
@@ -95,13 +145,18 @@ def start_from(net: Encoder, classes: list[str], weights: str | Path) -> None:
     net.load_state_dict(there, strict=False)
 
 
-def frozen_parts(net: Encoder, stages: int) -> list[nn.Module]:
+def _of_head(name: str) -> bool:
+    return name.startswith(("head.", "segmentation_head.", "distance_head."))
+
+
+def frozen_parts(net: Encoder | DenseModel, stages: int) -> list[nn.Module]:
     """The modules that are not trained: the embedding and the first stages; all but the head, where
-    these are all stages.
+    these are all stages. Of a dense model they are its encoder's.
 
     Raises:
         ValueError: more stages than there are.
     """
+    net = net.encoder if isinstance(net, DenseModel) else net
     if not 0 <= stages <= len(net.stages):
         raise ValueError(
             f"--model.freeze_stages must be from 0 to the model's {len(net.stages)} stages, got "

@@ -10,13 +10,15 @@ CHANGEABLE = {
     *(f"model.{rate}_rate" for rate in ("learning", "warmup", "final")),
     *("model.warmup_epochs", "model.reference_batch", "model.weight_decay"),
     *("model.label_smoothing", "model.mixup", "model.cutmix", "model.mix_p"),
+    *("model.loss", "model.class_weights", "model.solid_angle_weights", "model.zones"),
     *("model.matmul_backend", "model.grad_checkpointing"),
     *("data.path", "data.classes", "data.splits", "data.skip_broken"),
     *("data.lens", "data.camera"),
     *("data.batch_size", "data.workers"),
     *("data.train_lenses", "data.test_lenses", "data.pair_lenses"),
     *("data.render", "data.fit", "data.picture_size", "data.randaugment", "data.erasing"),
-    *("data.flip", "data.rotate_deg"),
+    *("data.flip", "data.rotate_deg", "data.crop", "data.lens_augmentation"),
+    *("data.test_paths", "data.max_distance"),
 }
 
 
@@ -46,7 +48,7 @@ def check_changes(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str
 
 def _options(config: Mapping[str, Any]) -> dict[str, Any]:
     """The options by their names on the command line."""
-    found: dict[str, Any] = {}
+    found: dict[str, Any] = {"task": "classification"}  # before there were others
     for group, value in config.items():
         if group in ("model", "data", "trainer"):
             found |= {f"{group}.{name}": own for name, own in value.items()}

@@ -14,12 +14,20 @@ from torchmetrics import Metric
 
 from darswin.layers.linear import MatmulBackend
 from darswin.lens import Lens
+from darswin.models.dense import DenseModel
 from darswin.models.encoder import Encoder
 from darswin.models.registry import model_class
 from darswin.models.saving import ModelCard, read_card
 from darswin.models.saving import Task as TaskName
 from darswin.train.data import RunData
-from darswin.train.finetuning import frozen_parts, own_options, start_from, weights_file
+from darswin.train.finetuning import (
+    check_name,
+    frozen_parts,
+    name_from,
+    own_options,
+    start_from,
+    weights_file,
+)
 from darswin.train.recipe import Schedule, parameter_groups
 
 Batch = tuple[Tensor, Lens, Tensor]
@@ -59,7 +67,7 @@ class Task(LightningModule):
     default_model: ClassVar[str]
     monitor: ClassVar[tuple[str, Literal["min", "max"]]]  # which decides on the best checkpoint
     results: list[dict[str, Any]]
-    net: Encoder  # of `configure_model`, as is what describes it
+    net: Encoder | DenseModel  # of `configure_model`, as is what describes it
     card: ModelCard
     trained: ModelCard  # of the checkpoint that was read; else `card`
 
@@ -88,9 +96,10 @@ class Task(LightningModule):
             )
         if name is None and weights is not None:
             card = read_card(weights_file(weights))
-            name, options = card.model, own_options(card) | (options or {})
+            name = name_from(card, self.task)
+            options = own_options(card) | (options or {})
         self.name, self.options = name or self.default_model, options or {}
-        model_class(self.name)
+        check_name(self.name, self.task)
         self.weights, self.freeze_stages = weights, freeze_stages
         self._frozen: list[nn.Module] = []
         for option, value in dict(
@@ -134,11 +143,12 @@ class Task(LightningModule):
         try:
             self.net = self.card.create()
         except (TypeError, ValueError) as error:
-            if not self.options:
+            if isinstance(error, TypeError) and not self.options:
                 raise
-            raise ValueError(
-                f"no {self.name} with --model.options {self.options}: {error}"
-            ) from error
+            given = f"--data.size {data.size}"
+            if self.options:
+                given += f" and --model.options {self.options}"
+            raise ValueError(f"no {self.name} with {given}: {error}") from error
         if self.weights is not None and self.trainer.training:
             start_from(self.net, data.classes, self.weights)
         self._freeze()

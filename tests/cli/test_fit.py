@@ -11,7 +11,7 @@ import torch
 import yaml
 from safetensors.torch import load_file
 
-from darswin.cli.fit import PRESETS, with_configs
+from darswin.cli.configs import PRESETS, with_configs
 from darswin.cli.main import COMMANDS, main
 from darswin.layers import linear
 from darswin.models import load_model

@@ -137,15 +137,15 @@ NONE = dict(size=None, channels=None, mean=None, std=None)
 
 
 def test_options_not_given_are_the_model_s():
-    model, data = settle(CARD, "w", dict(name=None, options={"jitter": 0}), NONE)
+    model, data = settle(CARD, "w", "classification", dict(name=None, options={"jitter": 0}), NONE)
     assert model == {"name": "darswin_a_nano", "options": {"spacing": "tan", "jitter": 0}}
     assert data == {"size": 32, "channels": 1, "mean": [0.4], "std": [0.2]}
-    again = settle(CARD, "w", model, data)
+    again = settle(CARD, "w", "classification", model, data)
     assert again == (model, data)
-    assert settle(CARD, "w", model, NONE | {"size": 64})[1]["size"] == 64
+    assert settle(CARD, "w", "classification", model, NONE | {"size": 64})[1]["size"] == 64
     swin = replace(CARD, options={**CARD.options, "image_size": 32})
     with pytest.raises(ValueError, match=r"--data\.size 64 disagrees with --model.weights w"):
-        settle(swin, "w", model, NONE | {"size": 64})
+        settle(swin, "w", "classification", model, NONE | {"size": 64})
 
 
 @pytest.mark.parametrize(

@@ -1,9 +1,10 @@
 """Scenes: pictures with a label or a distance for each pixel, and the lenses that took them."""
 
+import copy
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, Self
 
 import numpy as np
 import torch
@@ -107,6 +108,17 @@ class Scenes:
         image, target = image[kept], target[kept]
         self.unknown[index] = int(np.count_nonzero(target == nothing_of(target)))
         return Scene(image, target, self._trimmed(lens, rows))
+
+    def limited(self, count: int) -> Self:
+        """At most so many of the scenes, chosen by a fixed shuffle."""
+        if count < 1:
+            raise ValueError(f"--data.limit must be at least 1, got {count}")
+        chosen = np.sort(np.random.default_rng(0).permutation(len(self))[:count])
+        part = copy.copy(self)
+        part._pictures, part._targets = self._pictures[chosen], self._targets[chosen]
+        part._camera = self._camera[chosen]
+        part.unknown = self.unknown[torch.from_numpy(chosen)].share_memory_()
+        return part
 
     def file(self, index: int) -> Path:
         """The picture's file."""

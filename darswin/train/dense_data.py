@@ -1,0 +1,163 @@
+"""Scenes with a label or a distance for each pixel: what the dense tasks train on."""
+
+import math
+from collections import Counter
+from pathlib import Path
+from typing import Any, ClassVar
+
+import torch
+
+from darswin.data.dense import DenseSamples
+from darswin.data.lenses import parse_lenses
+from darswin.data.sampling import TrainingOrder
+from darswin.data.scenes import Scenes, open_scenes
+from darswin.data.scenes.scene import Target
+from darswin.data.splits import Split
+from darswin.train.data import RunData
+from darswin.train.task import Batch
+
+
+class DenseData(RunData):
+    """Scenes of calibrated cameras: images, their lenses, and what is known of each pixel.
+
+    Args:
+        path: a folder of scenes: see `darswin.data.open_scenes`.
+        lens: of the pictures in `path`, in place of the data set's own: a calibration file of any
+            format that `darswin.lens.load` reads, a lens as JSON, or a lenses.json that says which
+            camera took which folder or picture (see `darswin.data.Calibrations`).
+        test_paths: folders of scenes to test on, one after the other, each with its own lenses, in
+            place of the test set of `path`.
+        batch_size: of one process.
+        crop: the least share of a picture's side that a random part of it has in training, in
+            (0, 1]; null takes no parts.
+        lens_augmentation: shows pictures in training as other lenses would have seen them: a level
+            of the paper ("very low", "low", "medium", "high"), one ξ ("0.4"), a range of it
+            ("0.2..0.35"), or "polynomial"; null is none.
+        common: as `RunData`; the default size is 128.
+    """
+
+    target: ClassVar[Target]
+    default_size = 128
+    fov = 0.0
+
+    def __init__(
+        self,
+        path: str,
+        *,
+        lens: str | None = None,
+        test_paths: list[str] | None = None,
+        batch_size: int = 16,
+        crop: float | None = None,
+        lens_augmentation: str | None = None,
+        **common: Any,
+    ):
+        super().__init__(path, lens=lens, batch_size=batch_size, **common)
+        self.frame_fit = self._form["fit"]
+        self.test_paths = test_paths or []
+        if crop is not None and not 0 < crop <= 1:
+            raise ValueError(f"--data.crop must be a share in (0, 1], got {crop}")
+        self.crop = crop
+        self.lenses = None if lens_augmentation is None else parse_lenses(lens_augmentation)
+        self._scenes: dict[str, Scenes] = {}
+
+    def scenes(self, split: Split) -> Scenes:
+        """The scenes of a split."""
+        if split not in self._scenes:
+            self._scenes[split] = open_scenes(
+                self.path, split, self.target, lens=self._lens, camera=self._camera, **self._opening
+            )
+        return self._scenes[split]
+
+    @property
+    def classes(self) -> list[str]:
+        """The names of the labels; none where distances are told."""
+        return self.scenes("train").classes
+
+    @property
+    def colors(self) -> list[list[int]]:  # type: ignore[override]  # as `classes`
+        """(r, g, b) of each class, where the data say them."""
+        return self.scenes("train").colors
+
+    @property
+    def test_names(self) -> list[str]:
+        """Of the folders that are tested: their own names, or, where two have one, their paths."""
+        paths = self.test_paths or [self.path]
+        names = [Path(path).resolve().name for path in paths]
+        several = Counter(names)
+        return [
+            name if several[name] == 1 else str(path)
+            for name, path in zip(names, paths, strict=True)
+        ]
+
+    def _test_scenes(self, path: str) -> Scenes:
+        """The test set of another folder; all that it has, if it has no splits."""
+        opening = self._opening | dict(splits=None)
+        flat = (Path(path) / "images").is_dir()
+        scenes = open_scenes(path, "all" if flat else "test", self.target, **opening)
+        if scenes.classes != self.classes:
+            raise ValueError(
+                f"the classes of {path} are {scenes.classes}, and those of {self.path} "
+                f"{self.classes}: a model is tested on the classes that it was trained on"
+            )
+        return scenes
+
+    def dataset(self, split: Split, name: str | None = None, **options: Any) -> DenseSamples:
+        """A split with its cameras' lenses; `name` is one of `test_names`."""
+        if split == "test" and self.test_paths and name is not None:
+            scenes = self._test_scenes(self.test_paths[self.test_names.index(name)])
+        else:
+            scenes = self.scenes(split)
+        if self.limit is not None:
+            scenes = scenes.limited(self.limit)
+        dataset = DenseSamples(scenes, **self._form, **options)
+        self.datasets.append(dataset)
+        return dataset
+
+    def _training(self) -> tuple[DenseSamples, TrainingOrder]:
+        dataset = self.dataset(
+            "train", turns=self.turns, crop=self.crop, lenses=self.lenses,
+            augment=self._colour_changes,
+        )  # fmt: skip
+        order = TrainingOrder(
+            len(dataset), self.batch_size, pairs=False, seed=self.seed, cameras=None, **self._place
+        )
+        return dataset, order
+
+
+class LabelData(DenseData):
+    """Scenes with a label for each pixel.
+
+    Args:
+        path: a folder of scenes: see `darswin.data.open_scenes`.
+        common: as `DenseData`.
+    """
+
+    target = "labels"
+
+    def __init__(self, path: str, **common: Any):
+        super().__init__(path, **common)
+
+
+class DistanceData(DenseData):
+    """Scenes with a distance for each pixel.
+
+    Args:
+        path: a folder of scenes: see `darswin.data.open_scenes`.
+        max_distance: m, beyond which distances count as not known; null is none.
+        common: as `DenseData`.
+    """
+
+    target = "distance"
+
+    def __init__(self, path: str, *, max_distance: float | None = None, **common: Any):
+        super().__init__(path, **common)
+        if max_distance is not None and not 0 < max_distance < math.inf:
+            raise ValueError(f"--data.max_distance must be above 0, got {max_distance}")
+        self.max_distance = max_distance
+
+    def on_after_batch_transfer(self, batch: Batch, dataloader_idx: int) -> Batch:
+        """The batch, in which what is too far away is not known."""
+        if self.max_distance is None:
+            return batch
+        images, lens, distance = batch
+        return images, lens, torch.where(distance > self.max_distance, 0.0, distance)

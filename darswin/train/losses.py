@@ -1,0 +1,123 @@
+"""Losses of predictions for each pixel, finite for a batch without any known pixel: 0."""
+
+from typing import Literal
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from darswin.data.scenes import IGNORE
+
+LabelLoss = Literal["ce", "dice", "ce+dice"]
+DistanceLoss = Literal["silog", "l1", "log_l1"]
+
+_LAMBDA, _SCALE = 0.85, 10.0  # of SILog
+_LEAST = 1e-6  # below the root, where it has no slope; also of a distance, m
+
+
+def label_loss(
+    logits: Tensor,
+    labels: Tensor,
+    kind: LabelLoss = "ce",
+    *,
+    class_weights: Tensor | None = None,
+    label_smoothing: float = 0.0,
+    weights: Tensor | None = None,
+) -> Tensor:
+    """Cross-entropy, soft Dice, or the sum of both; pixels of label `IGNORE` have no part.
+
+    Args:
+        logits: (B, K, H, W). labels: (B, H, W), ids.
+        class_weights: (K,), how much a class counts; None is 1 of each.
+        label_smoothing: in [0, 1), of the cross-entropy.
+        weights: (B, H, W), how much a pixel counts; None is 1 of each.
+
+    Returns:
+        A scalar.
+    """
+    loss = logits.new_zeros(())
+    if "ce" in kind:
+        loss = loss + cross_entropy(logits, labels, class_weights, label_smoothing, weights)
+    if "dice" in kind:
+        loss = loss + dice(logits, labels, class_weights, weights)
+    return loss
+
+
+def cross_entropy(
+    logits: Tensor,
+    labels: Tensor,
+    class_weights: Tensor | None,
+    label_smoothing: float,
+    weights: Tensor | None,
+) -> Tensor:
+    """The mean over the known pixels, each of the weight of its class, as torch takes it."""
+    each = F.cross_entropy(
+        logits, labels, class_weights, ignore_index=IGNORE, reduction="none",
+        label_smoothing=label_smoothing,
+    )  # fmt: skip
+    known = labels != IGNORE
+    share = known.to(each.dtype)
+    if class_weights is not None:
+        share = share * class_weights[torch.where(known, labels, 0)]
+    if weights is not None:
+        each, share = each * weights, share * weights
+    return each.sum() / share.sum().clamp(min=torch.finfo(each.dtype).tiny)
+
+
+def dice(
+    logits: Tensor, labels: Tensor, class_weights: Tensor | None, weights: Tensor | None
+) -> Tensor:
+    """1 - Dice of the probabilities in all pixels of the batch, a mean over the classes that the
+    labels have.
+
+    Source: V-Net, 3DV 2016, with a sum in place of squares in the denominator.
+    """
+    known = labels != IGNORE
+    share = known.to(logits.dtype) if weights is None else known * weights
+    truth = F.one_hot(torch.where(known, labels, 0), logits.shape[1]).permute(0, 3, 1, 2)
+    truth = truth * share[:, None]
+    predicted = logits.softmax(1) * share[:, None]
+    both, either = (predicted * truth.gt(0)).sum((0, 2, 3)), (predicted + truth).sum((0, 2, 3))
+    there = truth.sum((0, 2, 3)) > 0
+    missed = torch.where(there, 1 - 2 * both / torch.where(there, either, 1.0), 0.0)
+    counts = there.to(logits.dtype) if class_weights is None else there * class_weights
+    return (missed * counts).sum() / counts.sum().clamp(min=torch.finfo(logits.dtype).tiny)
+
+
+def distance_loss(
+    predicted: Tensor,
+    distance: Tensor,
+    kind: DistanceLoss = "silog",
+    *,
+    weights: Tensor | None = None,
+) -> Tensor:
+    """SILog, or the mean of what distances, or their logarithms, differ by.
+
+    SILog is 10 √(mean g² - 0.85 (mean g)²) with g the difference of the logarithms, over all known
+    pixels of the batch.
+
+    Args:
+        predicted: (B, 1, H, W), m. distance: (B, H, W), m, 0 where it is not known.
+        weights: (B, H, W), how much a pixel counts; None is 1 of each.
+
+    Returns:
+        A scalar.
+
+    Source: Eigen et al., NeurIPS 2014, with λ and the scale of BTS (Lee et al., 1907.10326).
+    """
+    predicted = predicted[:, 0]
+    known = distance > 0
+    share = known.to(predicted.dtype) if weights is None else known * weights
+    whole = share.sum().clamp(min=torch.finfo(predicted.dtype).tiny)
+
+    def mean(values: Tensor) -> Tensor:
+        return (values * share).sum() / whole
+
+    truth = torch.where(known, distance, 1.0)
+    if kind == "l1":
+        return mean((predicted - truth).abs())
+    difference = predicted.clamp(min=_LEAST).log() - truth.log()
+    if kind == "log_l1":
+        return mean(difference.abs())
+    spread = mean(difference.square()) - _LAMBDA * mean(difference).square()
+    return _SCALE * ((spread.clamp(min=0) + _LEAST).sqrt() - _LEAST**0.5)
