@@ -14,6 +14,7 @@ from pathlib import Path
 
 from jobs import run_all
 from worlds.dataset import SPLITS, Target, jobs_of, write_map
+from worlds.sheet import draw_sheet
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -31,7 +32,11 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--test", type=int, default=200, help="pictures")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--processes", type=int, default=os.cpu_count())
+    parser.add_argument("--sheet", type=Path, help="only draws a few pictures side by side, here")
     args = parser.parse_args(arguments)
+    if args.sheet:
+        draw_sheet(args.sheet)
+        return
     target = Target(str(args.out), args.lens, math.radians(args.fov_deg))
     start = time.perf_counter()
     jobs = []
