@@ -27,7 +27,6 @@ BASELINES = {"zone": 1, "direction": SECTORS}  # sectors
 TARGETS = {"segmentation": "labels", "distance": "distance"}
 TRAINED_ON = "low"
 LEARNED_FROM = 300  # pictures
-NEVER = -1.0  # of a direction that no training picture has
 
 
 def trivial(out: Path) -> dict:
@@ -83,13 +82,13 @@ def _table(pictures: list[tuple[np.ndarray, ...]], sectors: int, task: str) -> n
     cell = np.concatenate([_cells(*p[1:], sectors) for p in pictures])
     order = np.argsort(cell, kind="stable")
     ends = np.searchsorted(cell[order], np.arange(RINGS * sectors + 1))
-    said = np.full(RINGS * sectors, NEVER)
+    usual = (lambda part: np.bincount(part).argmax()) if task == "segmentation" else np.median
+    said = np.full(RINGS * sectors, float(usual(target)))
     for k, (a, b) in enumerate(itertools.pairwise(ends)):
-        part = target[order[a:b]]
-        if len(part):
-            said[k] = np.bincount(part).argmax() if task == "segmentation" else np.median(part)
-    for k in range(sectors, len(said)):  # further out than training: as the ring before
-        said[k] = said[k - sectors] if said[k] == NEVER else said[k]
+        if b > a:
+            said[k] = usual(target[order[a:b]])
+        elif k >= sectors:  # further out than training: as the ring before
+            said[k] = said[k - sectors]
     return said
 
 
