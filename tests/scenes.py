@@ -1,6 +1,7 @@
 """Data sets of scenes on disk, small, in the form of each reader."""
 
 import json
+import shutil
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -87,8 +88,111 @@ def write_plain(
     return folder
 
 
+# -- trees of data sets that cannot be downloaded: as their authors describe them ----------------
+
+WOODSCAPE_INFO = {
+    "class_names": ["void", "road", "lanemarks", "curb", "person", "rider", "vehicles", "bicycle",
+                    "motorcycle", "traffic_sign"],
+    "class_colors": [[k, 10 * k, 255 - k] for k in range(10)],
+    "class_indexes": list(range(10)),
+    "color_scheme": "BGR",
+}  # fmt: skip
+VIEWS = ("FV", "RV", "MVL", "MVR")
+
+
+def write_woodscape(
+    folder: Path, count: int = 8, *, size: tuple[int, int] = (121, 160), nested: bool = True,
+    calibration: str = "calibration/calibration",
+) -> Path:  # fmt: skip
+    """WoodScape's tree, `count` frames of its four cameras in turn, with green rows.
+
+    Args:
+        nested: semantic_annotations/semantic_annotations/, as its archives unpack. calibration:
+            where the calibrations are.
+    """
+    annotations = folder / "semantic_annotations" / ("semantic_annotations" if nested else "")
+    for k in range(count):
+        view = VIEWS[k % 4]
+        stem, lens = f"{k:05d}_{view}", _woodscape_lens(folder / calibration, k, view, size)
+        theta, azimuth = rays_of(lens, size)
+        colors = WOODSCAPE_INFO["class_colors"]
+        image = picture_of(theta, azimuth + 0.3 * k, colors, k)
+        green = -(-3 * size[0] // 966)
+        image[:green] = image[-green:] = (0, 255, 0)
+        write(folder / "rgb_images" / f"{stem}.png", image[..., ::-1])
+        labels = labels_of(theta, azimuth + 0.3 * k, 10)
+        write(annotations / "gtLabels" / f"{stem}.png", labels)
+        write(annotations / "rgbLabels" / f"{stem}.png", np.asarray(colors, np.uint8)[labels])
+        boxes = folder / "box_2d_annotations" / "box_2d_annotations" / f"{stem}.txt"
+        boxes.parent.mkdir(parents=True, exist_ok=True)
+        boxes.write_text("vehicles,0,10,10,40,40\n")
+        write(folder / "previous_images" / f"{stem}_prev.png", image[..., ::-1])
+    write(folder / "rgb_images(test_set)" / "08234_FV.png", image[..., ::-1])
+    (folder / "semantic_annotations" / "seg_annotation_info.json").write_text(
+        json.dumps(WOODSCAPE_INFO)
+    )
+    return folder
+
+
+def write_synwoodscape(folder: Path, count: int = 4, *, size: tuple[int, int] = (121, 160)) -> Path:
+    """SynWoodScape's tree: labels of 25 classes, depth maps in metres in which 1000 is the sky."""
+    for k in range(count):
+        view = VIEWS[k % 4]
+        stem = f"{k:05d}_{view}"
+        lens = _woodscape_lens(folder / "calibration" / "calibration", k, view, size)
+        theta, azimuth = rays_of(lens, size)
+        colors = [[10 * k, 0, 255 - 10 * k] for k in range(25)]
+        image = picture_of(theta, azimuth, colors, k)
+        write(folder / "rgb_images" / "rgb_images" / f"{stem}.png", image[..., ::-1])
+        nested = folder / "semantic_annotations" / "semantic_annotations"
+        write(nested / "gtLabels" / f"{stem}.png", labels_of(theta, azimuth, 25))
+        metres = np.where(azimuth < -2, 1000, distance_of(theta, azimuth)).astype(np.float32)
+        raw = folder / "depth_maps" / "raw_data"
+        raw.mkdir(parents=True, exist_ok=True)
+        np.save(raw / f"{stem}.npy", metres)
+    return folder
+
+
+def write_kitti360(
+    folder: Path, drives: int = 3, count: int = 3, *, size: tuple[int, int] = (140, 140)
+) -> Path:
+    """KITTI-360's tree of both fisheye cameras; every frame but the last of a drive has distances,
+    as sparse as those of a LiDAR."""
+    (folder / "calibration").mkdir(parents=True, exist_ok=True)
+    for drive in range(drives):
+        name = f"2013_05_28_drive_{drive:04d}_sync"
+        for camera in ("image_02", "image_03"):
+            source = CALIBRATIONS / f"kitti360_{camera[-2:]}.yaml"
+            shutil.copy(source, folder / "calibration" / f"{camera}.yaml")
+            theta, azimuth = rays_of(load(source).in_picture(size), size)
+            for k in range(count):
+                image = picture_of(theta, azimuth, CLASSES["colors"], k)
+                stem = f"{k:010d}.png"
+                write(folder / "data_2d_raw" / name / camera / "data_rgb" / stem, image[..., ::-1])
+                if k < count - 1:
+                    metres = np.round(distance_of(theta, azimuth) * 256).astype(np.uint16)
+                    metres[::2] = 0
+                    write(folder / "distance" / name / camera / stem, metres)
+        write(folder / "data_2d_raw" / name / "image_00" / "data_rect" / "0000000000.png", image)
+    return folder
+
+
+def _woodscape_lens(folder: Path, number: int, view: str, size: tuple[int, int]) -> Lens:
+    """Writes the calibration of a frame, whose offsets and numbers differ from the others', and
+    gives its lens in a picture of a size."""
+    content = json.loads(WOODSCAPE.read_text())
+    content["name"] = view
+    content["intrinsic"]["cx_offset"] += number
+    content["intrinsic"]["k1"] += number % 4
+    folder.mkdir(parents=True, exist_ok=True)
+    file = folder / f"{number:05d}_{view}.json"
+    file.write_text(json.dumps(content))
+    return load(file).in_picture(size)
+
+
 def write(file: Path, array: np.ndarray) -> Path:
     """An array as PNG, BGR where it has colours; makes its folder."""
     file.parent.mkdir(parents=True, exist_ok=True)
+    array = np.ascontiguousarray(array)
     assert cv2.imwrite(str(file), array)
     return file

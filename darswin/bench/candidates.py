@@ -3,6 +3,7 @@
 import copy
 import math
 from collections.abc import Callable
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -15,12 +16,13 @@ from darswin.layers.linear import Linear
 from darswin.layers.onednn import PackedLinear
 from darswin.lens import Lens, Spherical
 from darswin.models import create_model
-from darswin.models.encoder import Encoder
+from darswin.models.base import Model
+from darswin.models.dense import DenseModel
 from darswin.models.registry import model_class
 from darswin.ops import use_reference
 
 Run = Callable[[], Tensor]
-CLASSES = 200
+CLASSES, PIXEL_CLASSES = 200, 10  # of images, and of pixels
 
 
 def lens_of(size: int) -> Lens:
@@ -28,11 +30,13 @@ def lens_of(size: int) -> Lens:
     return Spherical.from_fov(xi=0.5, fov=math.radians(170), radius=size / 2)
 
 
-def network(name: str, size: int) -> Encoder:
+def network(name: str, size: int) -> Model:
     """A model of random weights, the same at every call."""
     torch.manual_seed(0)
-    options = {} if model_class(name).image_size is None else dict(image_size=size)
-    return create_model(name, num_classes=CLASSES, **options)
+    kind = model_class(name)
+    options: dict[str, Any] = {} if kind.image_size is None else dict(image_size=size)
+    classes = PIXEL_CLASSES if issubclass(kind, DenseModel) else CLASSES
+    return create_model(name, num_classes=classes, **options)
 
 
 def inference(
@@ -69,7 +73,7 @@ def _all(products: list[tuple[PackedLinear, Tensor]]) -> Tensor:
     return result
 
 
-def optimized_run(model: Encoder, lens: Lens, dtype: torch.dtype, images: Tensor) -> Run:
+def optimized_run(model: Model, lens: Lens, dtype: torch.dtype, images: Tensor) -> Run:
     """Inference by our operators."""
     optimized = optimize(model, dtype)
     return lambda: optimized(images, lens)
@@ -87,7 +91,7 @@ def reference_run(model: Callable[..., Tensor], lens: Lens, images: Tensor) -> R
 
 
 def matmuls_of(
-    model: Encoder, images: Tensor, lens: Lens, dtype: torch.dtype
+    model: Model, images: Tensor, lens: Lens, dtype: torch.dtype
 ) -> list[tuple[PackedLinear, Tensor]]:
     """The linear layers that a model runs, packed, and an input of each."""
     found: list[tuple[PackedLinear, Tensor]] = []
@@ -131,7 +135,9 @@ def training_step(name: str, size: int, dtype: torch.dtype, batch: int, *, refer
         model.set_matmul_backend("autotune")
         model.set_grad_checkpointing(True)
     optimizer = torch.optim.AdamW(model.parameters(), lr=1e-4, fused=True)
-    images, labels = torch.randn(batch, 3, size, size), torch.randint(CLASSES, (batch,))
+    images = torch.randn(batch, 3, size, size)
+    pixels = (size, size) if isinstance(model, DenseModel) else ()
+    labels = torch.randint(model.num_classes, (batch, *pixels))
 
     def step() -> Tensor:
         with (

@@ -316,8 +316,9 @@ def _hidden(name: str) -> bool:
 # -- lists ------------------------------------------------------------------------------------
 
 
-def read_split_lists(lists: Path) -> dict[Split, list[str]]:
-    """What lists say is in each split: a JSON file, or a folder of text files, one a split.
+def read_split_lists(lists: Path) -> dict[Split, list]:
+    """What lists say is in each split: a JSON file, or a folder of text files, one a split. Whether
+    it is paths is left to the reader.
 
     Raises:
         ValueError: what is no such list, or two of one split; it names them. OSError: it cannot be
@@ -334,15 +335,13 @@ def read_split_lists(lists: Path) -> dict[Split, list[str]]:
     form = f'{lists} must hold {{"train": [paths], "val": [paths], "test": [paths]}}'
     if not isinstance(content, dict):
         raise ValueError(form)
-    given: dict[Split, list[str]] = {}
+    given: dict[Split, list] = {}
     for name, paths in content.items():
         split = SPLIT_NAMES.get(name.lower())
         if split is None or split in given:
             raise ValueError(f"{form}, got {list(content)}")
         if not isinstance(paths, list):
             raise ValueError(f"{form}, got {paths!r} for {name!r}")
-        if wrong := [path for path in paths if not isinstance(path, str)]:
-            raise ValueError(f"{form}, got {wrong[0]!r} in {name!r}")
         given[split] = paths
     return given
 
@@ -352,7 +351,7 @@ def _listed(root: Path, lists: Path) -> dict[Split, Pictures]:
     given: dict[Split, Pictures] = {}
     for split, paths in read_split_lists(lists).items():
         for path in paths:
-            parts = Path(path).parts
+            parts = Path(path).parts if isinstance(path, str) else ()
             if len(parts) < 2 or Path(path).is_absolute() or ".." in parts:
                 raise ValueError(
                     f"{lists}: {split!r} must hold paths CLASS/… below {root}, got {path!r}"

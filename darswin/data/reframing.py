@@ -18,6 +18,7 @@ from darswin.data.scenes.targets import nothing_of
 from darswin.data.turning import Turn, turned_lens
 from darswin.data.warp import remap
 from darswin.lens import Lens
+from darswin.lens.base import length_of
 from darswin.lens.pixels import pixel_angles
 from darswin.lens.reprojection import as_map
 
@@ -25,6 +26,7 @@ from darswin.lens.reprojection import as_map
 # the pixel's centre, and so close together, in pixels of the picture.
 _MOST_POINTS = 5
 _APART = 1.5
+_RADII = 4096  # of a table
 
 
 class Crop(NamedTuple):
@@ -89,13 +91,19 @@ def through(scene: Scene, lens: Lens, size: int, turn: Turn | None = None) -> Sc
         lens: one radial lens without `affine`. turn: of the scene about the optical axis.
     """
     exact, source = lens.to(torch.float64), scene.lens.to(torch.float64)
-    points = _points((source.r_max / exact.r_max).item())
-    theta, direction = exact.rays(torch.from_numpy(_grid(size, points))[None], (size, size))
+    last = exact.r_max.item()
+    points = _points(source.r_max.item() / last)
+    offset = _grid(size, points) - exact.center_in((size, size)).numpy()
+    radius = np.sqrt(np.square(offset).sum(-1))
+    # A table of θ, because few lenses have a closed inverse and an image has many radii.
+    radii = np.linspace(0, last, _RADII)
+    angles = exact.unproject(torch.from_numpy(radii)).numpy()
+    theta = torch.from_numpy(np.interp(radius, radii, angles, right=np.nan))
+    direction = torch.from_numpy(offset / np.maximum(radius, np.finfo(float).tiny)[..., None])
     if turn is not None:
         direction = direction @ torch.from_numpy(turn.matrix)
-    theta = torch.where(exact.sees(theta), theta, torch.nan)
     height, width = scene.target.shape
-    places = as_map(source.seen_pixels(theta, direction, (height, width)))[0]
+    places = as_map(source.seen_pixels(theta[None], direction[None], (height, width)))[0]
     return _read(scene, places.to(torch.float32).numpy(), lens, size, points)
 
 
@@ -112,8 +120,13 @@ def _read(scene: Scene, places: np.ndarray, lens: Lens, size: int, points: int) 
 def _only_seen(scene: Scene) -> Scene:
     """Nothing is known of pixels beyond the lens's θ_max."""
     height, width = scene.target.shape
-    beyond = pixel_angles(scene.lens, (height, width))[0].isnan().numpy()
-    scene.target[beyond] = nothing_of(scene.target)
+    lens = scene.lens
+    if lens.is_radial:  # then radii tell, and no angle has to be found
+        places = torch.from_numpy(_grid(height, 1)).to(lens.theta_max)
+        beyond = (length_of(lens.from_pixels(places[None])) > lens.r_max[:, None, None])[0]
+    else:
+        beyond = pixel_angles(lens, (height, width))[0].isnan()
+    scene.target[beyond.numpy()] = nothing_of(scene.target)
     return scene
 
 

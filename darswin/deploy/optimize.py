@@ -4,7 +4,7 @@ the norm behind it in one."""
 import copy
 import warnings
 from collections.abc import Sequence
-from typing import Self
+from typing import Any, Self, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -12,12 +12,17 @@ from torch import Tensor, nn
 from darswin.layers import onednn
 from darswin.layers.attention import WindowAttention
 from darswin.layers.block import Block, PatchMerging
+from darswin.layers.linear import Linear
 from darswin.layers.onednn import PackedLinear
 from darswin.layers.position_bias import RelativeBias, RelativeTable
 from darswin.lens import Lens
+from darswin.models.base import Model
+from darswin.models.dense import DenseModel, DensePrepared
 from darswin.models.encoder import Encoder, Prepared
+from darswin.models.feature_maps import FeatureMaps
 from darswin.models.stages import Pair, Stage
 
+Net = TypeVar("Net", bound=Model)
 DTYPES = (torch.float32, torch.bfloat16)
 _ADD_NORM = torch.ops.darswin._add_norm_.default
 _CPU = torch._C.DispatchKeySet(torch._C.DispatchKey.CPU)
@@ -26,9 +31,7 @@ _CPU = torch._C.DispatchKeySet(torch._C.DispatchKey.CPU)
 CACHED_BYTES = 16 * 2**20
 
 
-def optimize(
-    model: Encoder, dtype: torch.dtype = torch.float32, *, lens: Lens | None = None
-) -> Encoder:
+def optimize(model: Net, dtype: torch.dtype = torch.float32, *, lens: Lens | None = None) -> Net:
     """A copy of a model that computes the same, faster: on CPU, in inference only.
 
     Its products are oneDNN's, with weights laid out for them, and take bias and GELU along; a
@@ -38,7 +41,8 @@ def optimize(
 
     Args:
         model: one of `create_model`, on the CPU.
-        dtype: float32 or bfloat16, of what flows between the layers and of the result.
+        dtype: float32 or bfloat16, of what flows between the layers and of the result; distances
+            are float32, and so is what refines the pixels of dense models.
         lens: one camera's, for all images; the result is then called `optimized(images)`, and
             computes the grid and the position biases once for each image size.
 
@@ -48,7 +52,29 @@ def optimize(
         TypeError: another kind of model.
         ValueError: another dtype or device, or `lens` is not a single lens.
     """
-    if not isinstance(model, Encoder):
+    _check(model, dtype, lens)
+    if (lack := onednn.missing(dtype)) is not None:
+        warnings.warn(f"optimize goes on with torch's own products: {lack}", stacklevel=2)
+    optimized = copy.deepcopy(model).eval().requires_grad_(False)
+    kind: type[_Optimized] = _OptimizedEncoder
+    if isinstance(optimized, DenseModel):
+        _pack_dense(optimized, dtype)
+        kind = _OptimizedDense
+    elif isinstance(optimized, FeatureMaps):
+        _pack_encoder(optimized.encoder, dtype)
+        _become(optimized.encoder, _OptimizedEncoder)
+        kind = _Optimized
+    elif isinstance(optimized, Encoder):
+        _pack_encoder(optimized, dtype)
+    if lens is None:
+        _become(optimized, kind)
+    else:
+        _become(optimized, FixedLens, kind, fixed_lens=lens, _prepared={})
+    return optimized
+
+
+def _check(model: nn.Module, dtype: torch.dtype, lens: Lens | None) -> None:
+    if not isinstance(model, (Encoder, DenseModel, FeatureMaps)):
         raise TypeError(f"model must be one of create_model, got {type(model).__name__}")
     if isinstance(model, _Optimized):
         raise TypeError("model must be one of create_model, got one that is optimized already")
@@ -59,30 +85,54 @@ def optimize(
     devices = sorted({parameter.device.type for parameter in model.parameters()})
     if devices != ["cpu"]:
         raise ValueError(f"model must be on the CPU, got one on {' and '.join(devices)}")
-    if (lack := onednn.missing(dtype)) is not None:
-        warnings.warn(f"optimize goes on with torch's own products: {lack}", stacklevel=2)
-    optimized = copy.deepcopy(model).eval().requires_grad_(False)
-    base, attributes = _Optimized, {}
-    if lens is not None:
-        base, attributes = FixedLens, dict(fixed_lens=lens, _prepared={})
+
+
+def _become(model: Model, *bases: type, **attributes: Any) -> None:
+    """Gives a model the class that it has, behind `bases`."""
     name = f"Optimized{type(model).__name__}"
-    optimized.__class__ = type(name, (base, type(model)), attributes)
-    optimized.patch_embed = _InDtype(optimized.patch_embed, dtype)
-    stages = [stage for stage in optimized.stages if isinstance(stage, Stage)]
-    optimized.stages = nn.ModuleList(_Stage(stage, dtype) for stage in stages)
-    optimized.norm.to(dtype)
-    optimized.head.to(dtype)
-    return optimized
+    model.__class__ = type(name, (*bases, type(model)), attributes)
 
 
-class _Optimized(Encoder):
-    """How an optimized model differs from the model it was made of, and what it refuses."""
+def _pack_encoder(encoder: Encoder, dtype: torch.dtype) -> None:
+    encoder.patch_embed = _InDtype(encoder.patch_embed, dtype)
+    encoder.stages = _stages(encoder.stages, dtype)
+    encoder.norm.to(dtype)
+    encoder.head.to(dtype)
 
-    def prepare(self, lens: Lens | None, size: Pair) -> Prepared:
-        """As the model it was made of, but `positions` are the tables of each stage's blocks."""
-        points, positions = super().prepare(lens, size)
-        stages = (stage for stage in self.stages if isinstance(stage, _Stage))
-        return Prepared(points, [s.tables(*p) for s, p in zip(stages, positions, strict=True)])
+
+def _pack_dense(model: DenseModel, dtype: torch.dtype) -> None:
+    _pack_encoder(model.encoder, dtype)
+    _become(model.encoder, _OptimizedEncoder)
+    decoder, head = model.decoder, model.head
+    _pack(decoder.joins, dtype)
+    _pack(decoder.expand, dtype)
+    decoder.stages = _stages(decoder.stages, dtype)
+    head.set_submodule("proj", PackedLinear(head.proj, dtype))
+
+
+def _pack(module: nn.Module, dtype: torch.dtype) -> None:
+    """Packs the linear layers of a module for oneDNN; norms get `dtype`."""
+    for name, layer in list(module.named_modules()):
+        if isinstance(layer, Linear):
+            module.set_submodule(name, PackedLinear(layer, dtype))
+        elif isinstance(layer, nn.LayerNorm):
+            layer.to(dtype)
+
+
+def _stages(stages: nn.ModuleList, dtype: torch.dtype) -> nn.ModuleList:
+    return nn.ModuleList(_Stage(stage, dtype) for stage in stages if isinstance(stage, Stage))
+
+
+def _tables(
+    stages: nn.ModuleList, positions: Sequence[Sequence[Tensor | None]]
+) -> list[Sequence[Tensor | None]]:
+    """The position biases of each stage's blocks."""
+    optimized = [stage for stage in stages if isinstance(stage, _Stage)]
+    return [s.tables(*p) for s, p in zip(optimized, positions, strict=True)]
+
+
+class _Optimized(Model):
+    """What an optimized model refuses."""
 
     def train(self, mode: bool = True) -> Self:
         if mode:
@@ -104,13 +154,41 @@ class _Optimized(Encoder):
         )
 
 
+class _OptimizedEncoder(_Optimized, Encoder):
+    """How an optimized encoder differs from the one it was made of."""
+
+    def prepare(self, lens: Lens | None, size: Pair) -> Prepared:
+        """As the model it was made of, but `positions` are the tables of each stage's blocks."""
+        return self.with_tables(self.prepare_angles(lens, size))
+
+    def prepare_angles(self, lens: Lens | None, size: Pair) -> Prepared:
+        """As the model it was made of."""
+        return super().prepare(lens, size)
+
+    def with_tables(self, prepared: Prepared) -> Prepared:
+        """Tables in place of what they are computed from."""
+        return prepared._replace(positions=_tables(self.stages, prepared.positions))
+
+
+class _OptimizedDense(_Optimized, DenseModel):
+    """How an optimized dense model differs from the one it was made of."""
+
+    encoder: _OptimizedEncoder  # type: ignore[assignment]  # of a class that is made of both
+
+    def prepare(self, lens: Lens | None, size: Pair) -> DensePrepared:
+        """As the model it was made of, but `positions` are the tables of each stage's blocks."""
+        angles = self.encoder.prepare_angles(lens, size)
+        tables = _tables(self.decoder.stages, angles.positions[:-1])
+        return DensePrepared(self.encoder.with_tables(angles), tables, self.way(lens, size))
+
+
 class FixedLens(_Optimized):
     """An optimized model and the single lens of all its images, which it is called without."""
 
     fixed_lens: Lens
-    _prepared: dict[Pair, Prepared]  # by image size
+    _prepared: dict[Pair, Any]  # by image size
 
-    def prepare(self, lens: Lens | None, size: Pair) -> Prepared:
+    def prepare(self, lens: Lens | None, size: Pair) -> Any:
         """What the fixed lens decides about images of (H, W), computed once for each size.
 
         Raises:
@@ -144,9 +222,7 @@ class _Stage(nn.Module):
         super().__init__()
         self.downsample = stage.downsample
         if isinstance(stage.downsample, PatchMerging):
-            stage.downsample.norm.to(dtype)
-            packed = PackedLinear(stage.downsample.reduction, dtype)
-            stage.downsample.set_submodule("reduction", packed)
+            _pack(stage.downsample, dtype)
         elif not isinstance(stage.downsample, nn.Identity):
             self.downsample = _InDtype(stage.downsample, dtype)
         blocks = [block for block in stage.blocks if isinstance(block, Block)]

@@ -19,7 +19,7 @@ class PatchExpand(nn.Module):
 
     def __init__(self, dim: int, out_dim: int, split: tuple[int, int]):
         super().__init__()
-        self.split = tuple(split)
+        self.out_dim, self.split = out_dim, tuple(split)
         self.expansion = Linear(dim, out_dim * split[0] * split[1], bias=False)
         self.norm = nn.LayerNorm(out_dim)
 
@@ -28,8 +28,9 @@ class PatchExpand(nn.Module):
         batch, rings, sectors, _ = x.shape
         mr, ma = self.split
         # Inner order (φ, r, D), as `PatchMerging` has it.
-        x = self.norm(self.expansion(x).reshape(batch, rings, sectors, ma, mr, -1))
-        return x.permute(0, 1, 4, 2, 3, 5).reshape(batch, rings * mr, sectors * ma, -1)
+        x = self.norm(self.expansion(x).reshape(batch, rings, sectors, ma, mr, self.out_dim))
+        x = x.permute(0, 1, 4, 2, 3, 5)
+        return x.reshape(batch, rings * mr, sectors * ma, self.out_dim)
 
     def extra_repr(self) -> str:
         return f"split={self.split}"

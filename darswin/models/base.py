@@ -7,6 +7,7 @@ from torch import nn
 from darswin.layers.attention import WindowAttention
 from darswin.layers.block import Block, Mlp
 from darswin.layers.linear import MATMUL_BACKENDS, Linear, MatmulBackend
+from darswin.lens import Lens
 from darswin.models.features import FeatureInfo
 from darswin.models.stages import Pair
 
@@ -34,6 +35,18 @@ class Model(nn.Module):
         super().__init__()
         self.feature_info = FeatureInfo()
         self.pretrained_cfg: dict[str, Any] = {}
+
+    def prepare(self, lens: Lens | None, size: Pair) -> Any:
+        """What the lenses alone decide about images of (H, W), for any number of calls of `run`.
+
+        Args:
+            lens: N lenses, or None for a model that ignores them. size: (H, W) of the images.
+
+        Raises:
+            TypeError: no lens, for a model that needs one.
+            ValueError: a lens of images of another size.
+        """
+        raise NotImplementedError
 
     def no_weight_decay(self) -> set[str]:
         """Names of the parameters, besides biases and norms, that a recipe should not decay."""

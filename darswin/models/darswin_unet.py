@@ -16,7 +16,9 @@ from darswin.models.registry import Presets, register_model
 from darswin.models.stages import Pair
 from darswin.ops import polar_to_image
 
-_PRESETS: Presets = dict(micro=PRESETS["micro"], nano=dict(samples=(4, 4), decoder_depths=1))
+_PRESETS: Presets = dict(
+    micro=PRESETS["micro"], nano=dict(samples=(4, 4), decoder_depths=1, skip_width=8)
+)
 
 
 @register_model("darswin_unet_a", variant="A", presets=_PRESETS)
@@ -46,8 +48,9 @@ class DarSwinUnet(DenseModel):
     Rotation:
         In eval mode and without the skip from the image (skip_width=0), whose convolutions are not
         symmetric, a turn of a square image about the principal point by 90° turns the result by
-        90°, up to rounding, where it turns the maps of `DarSwin`: for RA of every size, and for A
-        as it says.
+        90°, up to rounding, where it turns the maps of `DarSwin`: for "darswin_unet_ra_nano", and
+        with `periodic_bias` for RA of every size and "darswin_unet_a_nano". A pixel at the very
+        middle has no azimuth and is left out.
 
     Raises:
         ValueError: as `DarSwin`, or an option out of its range. TypeError: in forward, no lens.
@@ -120,8 +123,11 @@ class DarSwinUnet(DenseModel):
     def to_pixels(self, x: Tensor, way: PixelGrid, size: Pair) -> Tensor:
         """The projected map (B, 4·R, 4·A, K) → (B, K, H, W); 0 beyond θ_max."""
         dtype = torch.float64 if x.dtype == torch.float64 else torch.float32
-        grid = {
-            name: None if tensor is None else tensor.to(x.device, dtype)
-            for name, tensor in way._asdict().items()
-        }
-        return polar_to_image(x, size=size, **grid)
+        radii, r_max, center, affine, points = (
+            None if tensor is None else tensor.to(x.device, dtype) for tensor in way
+        )
+        assert radii is not None
+        pixels = polar_to_image(
+            x, radii, center, size, affine=affine, points=points, r_max=r_max, layout="tokens"
+        )
+        return pixels.permute(0, 3, 1, 2)

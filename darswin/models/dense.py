@@ -157,15 +157,7 @@ class DenseModel(Model):
     # -- what all do --------------------------------------------------------------------------
 
     def prepare(self, lens: Lens | None, size: Pair) -> DensePrepared:
-        """What the lenses alone decide about images of (H, W), for any number of calls of `run`.
-
-        Args:
-            lens: N lenses, or None for a model that ignores them. size: (H, W) of the images.
-
-        Raises:
-            TypeError: no lens, for a model that needs one.
-            ValueError: a lens of images of another size.
-        """
+        """As `Model`: what the encoder and the decoder take, and the way to the pixels."""
         encoder = self.encoder.prepare(lens, size)
         return DensePrepared(encoder, encoder.positions[:-1], self.way(lens, size))
 
@@ -179,7 +171,7 @@ class DenseModel(Model):
         Raises:
             TypeError, ValueError: images of another kind, or as many lenses as do not fit them.
         """
-        dtype = self.encoder.norm.weight.dtype
+        dtype = next(self.encoder.patch_embed.parameters()).dtype
         seen = self.look(self.image_input(check_images(images), dtype), prepared.way)
         maps = self.encoder.run(seen, prepared.encoder)
         maps[-1] = self.encoder.norm(maps[-1])

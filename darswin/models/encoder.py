@@ -105,15 +105,7 @@ class Encoder(Model):
             self.head = nn.Identity()
 
     def prepare(self, lens: Lens | None, size: Pair) -> Prepared:
-        """What the lenses alone decide about images of (H, W), for any number of calls of `run`.
-
-        Args:
-            lens: N lenses, or None for a model that ignores them. size: (H, W) of the images.
-
-        Raises:
-            TypeError: no lens, for a model that needs one.
-            ValueError: a lens of images of another size.
-        """
+        """As `Model`: where the images are read, and what the position biases need."""
         return Prepared(None, [()] * len(self.stages))
 
     def embed(self, images: Tensor, points: Any) -> Tensor:

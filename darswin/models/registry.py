@@ -1,9 +1,11 @@
 """Named models: each model's file registers its class under a name, in four sizes."""
 
-from collections.abc import Callable, Mapping
-from typing import Any, TypeVar
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Literal, TypeVar
 
 from darswin.models.base import Model
+from darswin.models.encoder import Encoder
+from darswin.models.feature_maps import FeatureMaps
 
 _SMALL = dict(embed_dim=96, depths=(2, 2, 18, 2), num_heads=(3, 6, 12, 24), drop_path_rate=0.2)
 _SIZES: dict[str, dict[str, Any]] = dict(
@@ -40,16 +42,33 @@ def list_models() -> list[str]:
     return sorted(_MODELS)
 
 
-def create_model(name: str, **options: Any) -> Any:
-    """The model of that name, an `Encoder` or a `DenseModel`; `options` override its constructor's
-    arguments.
+def create_model(
+    name: str,
+    *,
+    features_only: bool = False,
+    out_indices: int | Sequence[int] | None = None,
+    output_fmt: Literal["NHWC", "NCHW"] | None = None,
+    **options: Any,
+) -> Any:
+    """The model of that name: an `Encoder`, which classifies, or a `DenseModel`.
+
+    Args:
+        features_only: makes an encoder a `FeatureMaps`, which gives the maps of its stages.
+        out_indices, output_fmt: of `FeatureMaps`.
+        options: override the arguments of the model's constructor.
 
     Raises:
         ValueError: an unknown name, or options that do not fit together.
     """
+    if not features_only and (out_indices is not None or output_fmt is not None):
+        raise ValueError("out_indices and output_fmt need features_only=True")
     model = model_class(name)(**(_MODELS[name][1] | options))
     model.pretrained_cfg["architecture"] = name
-    return model
+    if not features_only:
+        return model
+    if not isinstance(model, Encoder):
+        raise ValueError(f"features_only is for encoders, and {name} is a dense model")
+    return FeatureMaps(model, out_indices, output_fmt or "NHWC")
 
 
 def model_class(name: str) -> type[Model]:

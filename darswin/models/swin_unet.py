@@ -18,7 +18,7 @@ from darswin.models.registry import Presets, register_model
 from darswin.models.stages import Pair
 from darswin.models.swin import Swin, check_max_fov, undistortion
 
-_PRESETS: Presets = dict(nano=dict(decoder_depths=1))
+_PRESETS: Presets = dict(nano=dict(decoder_depths=1, skip_width=8))
 
 
 @register_model("swin_unet", presets=_PRESETS)

@@ -13,7 +13,7 @@ from darswin.train.dense_data import DenseData
 from darswin.train.pixel_metrics import Zones, ZoneSums
 from darswin.train.task import Batch, Task
 
-_SHOWN = 6  # samples of a test's picture
+_SHOWN = 4  # samples of a test's picture
 
 
 class Sample(NamedTuple):
@@ -43,7 +43,8 @@ class DenseTask(Task):
         learning_rate: its peak.
         warmup_epochs: of linear warm-up; may be a fraction.
         reference_batch: images that the rates are meant for.
-        zones: degrees from the axis, between the zones that a test measures one by one.
+        zones: degrees from the axis, between the zones that a test measures one by one; null is
+            30, 60, 90.
         solid_angle_weights: pixels count in the loss as their solid angles do, of which the mean is
             1 in each image.
         common: as `Task`.

@@ -1,7 +1,7 @@
 """Scenes with a label or a distance for each pixel: what the dense tasks train on."""
 
 import math
-from collections import Counter
+import os
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -80,14 +80,14 @@ class DenseData(RunData):
 
     @property
     def test_names(self) -> list[str]:
-        """Of the folders that are tested: their own names, or, where two have one, their paths."""
-        paths = self.test_paths or [self.path]
-        names = [Path(path).resolve().name for path in paths]
-        several = Counter(names)
-        return [
-            name if several[name] == 1 else str(path)
-            for name, path in zip(names, paths, strict=True)
-        ]
+        """Of the folders that are tested: their own names, or, where two have one, with as much of
+        their paths as tells all apart."""
+        paths = [os.path.abspath(path) for path in self.test_paths or [self.path]]
+        names = [os.path.basename(path) for path in paths]
+        if len(set(names)) == len(names):
+            return names
+        shared = os.path.commonpath([os.path.dirname(path) for path in paths])
+        return [os.path.relpath(path, shared) for path in paths]
 
     def _test_scenes(self, path: str) -> Scenes:
         """The test set of another folder; all that it has, if it has no splits."""

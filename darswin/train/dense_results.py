@@ -17,7 +17,9 @@ from darswin.viz.dense import draw_predictions
 from darswin.viz.plot import save_figure
 
 _IN_PERCENT = ("miou", "accuracy", "iou", "recall", "delta1", "delta2", "delta3")
-_NOT_SHOWN = ("pixels", "sq_rel", "rmse_log", "delta2", "delta3")  # they are in the files
+# They are in the files.
+_NOT_SHOWN = ("pixels", "sq_rel", "rmse_log", "delta2", "delta3")
+_NOT_SHOWN_BY_AREA = (*_NOT_SHOWN, "rmse", "silog", "recall")
 
 
 class WriteDenseResults(Callback):
@@ -80,7 +82,8 @@ def _csv(rows: Sequence[dict[str, Any]]) -> str:
 def _text(rows: Sequence[dict[str, Any]]) -> str:
     """Rows as people read them: shares in percent, zones as a range, what is not known as –."""
     zoned = "from_deg" in rows[0]
-    shown = [key for key in rows[0] if key not in (*_NOT_SHOWN, "from_deg", "to_deg")]
+    hidden = {*_NOT_SHOWN, *(f"{key}{BY_AREA}" for key in _NOT_SHOWN_BY_AREA)}
+    shown = [key for key in rows[0] if key not in hidden | {"from_deg", "to_deg"}]
     lines = [[_title(key) for key in shown]] + [
         [_cell(key, row[key]) for key in shown] for row in rows
     ]

@@ -36,9 +36,9 @@ def label_loss(
         A scalar.
     """
     loss = logits.new_zeros(())
-    if "ce" in kind:
+    if kind != "dice":
         loss = loss + cross_entropy(logits, labels, class_weights, label_smoothing, weights)
-    if "dice" in kind:
+    if kind != "ce":
         loss = loss + dice(logits, labels, class_weights, weights)
     return loss
 
@@ -61,7 +61,7 @@ def cross_entropy(
         share = share * class_weights[torch.where(known, labels, 0)]
     if weights is not None:
         each, share = each * weights, share * weights
-    return each.sum() / share.sum().clamp(min=torch.finfo(each.dtype).tiny)
+    return each.sum() / _or_one(share.sum())
 
 
 def dice(
@@ -79,9 +79,9 @@ def dice(
     predicted = logits.softmax(1) * share[:, None]
     both, either = (predicted * truth.gt(0)).sum((0, 2, 3)), (predicted + truth).sum((0, 2, 3))
     there = truth.sum((0, 2, 3)) > 0
-    missed = torch.where(there, 1 - 2 * both / torch.where(there, either, 1.0), 0.0)
+    missed = torch.where(there, 1 - 2 * both / _or_one(either), 0.0)
     counts = there.to(logits.dtype) if class_weights is None else there * class_weights
-    return (missed * counts).sum() / counts.sum().clamp(min=torch.finfo(logits.dtype).tiny)
+    return (missed * counts).sum() / _or_one(counts.sum())
 
 
 def distance_loss(
@@ -108,7 +108,7 @@ def distance_loss(
     predicted = predicted[:, 0]
     known = distance > 0
     share = known.to(predicted.dtype) if weights is None else known * weights
-    whole = share.sum().clamp(min=torch.finfo(predicted.dtype).tiny)
+    whole = _or_one(share.sum())
 
     def mean(values: Tensor) -> Tensor:
         return (values * share).sum() / whole
@@ -121,3 +121,8 @@ def distance_loss(
         return mean(difference.abs())
     spread = mean(difference.square()) - _LAMBDA * mean(difference).square()
     return _SCALE * ((spread.clamp(min=0) + _LEAST).sqrt() - _LEAST**0.5)
+
+
+def _or_one(whole: Tensor) -> Tensor:
+    """What to divide by, where there may be nothing."""
+    return torch.where(whole > 0, whole, 1.0)

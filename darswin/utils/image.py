@@ -2,6 +2,7 @@
 
 import io
 import warnings
+from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
@@ -9,6 +10,9 @@ import numpy as np
 from PIL import ExifTags, Image, UnidentifiedImageError
 
 from darswin.utils.exif import TURNS
+
+_PNG = b"\x89PNG\r\n\x1a\n"
+_SAYS_MORE = frozenset((b"eXIf", b"tEXt", b"zTXt", b"iTXt"))  # chunks that may hold an orientation
 
 
 class BrokenImageError(OSError):
@@ -69,6 +73,8 @@ def _decoded(data: np.ndarray, path: str | Path, channels: int, flags: int = 0) 
 
 def _exif(data: np.ndarray, path: str | Path) -> tuple[int, str | None]:
     """The EXIF orientation, 1 where there is none, and Pillow's name of the file's format."""
+    if data[:8].tobytes() == _PNG and _SAYS_MORE.isdisjoint(_png_chunks(data)):
+        return 1, "PNG"  # Pillow would decode all of it to look for more
     try:
         with warnings.catch_warnings(action="ignore"), Image.open(io.BytesIO(data.data)) as file:
             orientation = file.getexif().get(ExifTags.Base.Orientation, 1)
@@ -79,6 +85,14 @@ def _exif(data: np.ndarray, path: str | Path) -> tuple[int, str | None]:
         raise BrokenImageError(
             f"cannot read {path}: its EXIF orientation cannot be told, {error}"
         ) from error
+
+
+def _png_chunks(data: np.ndarray) -> Iterator[bytes]:
+    """The names of a PNG's chunks."""
+    place = len(_PNG)
+    while place + 8 <= data.size:
+        yield data[place + 4 : place + 8].tobytes()
+        place += 12 + int.from_bytes(data[place : place + 4].tobytes(), "big")
 
 
 def with_channels(image: np.ndarray, channels: int) -> np.ndarray:

@@ -20,6 +20,7 @@ import numpy as np
 import pytest
 import torch
 from helpers import fixture
+from scenes import write_plain, write_woodscape
 
 from darswin.cli.main import main
 
@@ -68,7 +69,7 @@ def test_every_block_is_of_a_kind_that_is_checked():
 
 @pytest.fixture
 def scratch(tmp_path, monkeypatch):
-    """A folder with what pages take for granted: a checkout's examples, photos, a checkpoint."""
+    """A folder with what pages take for granted: a checkout's examples, photos, scenes, weights."""
     monkeypatch.chdir(tmp_path)
     for folder in ("examples", "darswin"):
         (tmp_path / folder).symlink_to(ROOT / folder)
@@ -80,6 +81,9 @@ def scratch(tmp_path, monkeypatch):
             cv2.imwrite(f"photos/{name}/{k}.jpg", picture)
     for name in ("a.jpg", "b.jpg"):
         cv2.imwrite(name, picture)
+    write_plain(tmp_path / "garage", 20, split="train")
+    write_plain(tmp_path / "garage", 4, split="val")
+    write_woodscape(tmp_path / "woodscape", 20)
     torch.save(fixture("polar")[1], "checkpoint.pth")
     return tmp_path
 

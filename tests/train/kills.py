@@ -1,6 +1,7 @@
 """Kills runs at random moments, 20 times each, and compares what they end with, bit for bit.
 
-`make kills` runs it: with accumulated gradients, with worker processes, and with two processes.
+`make kills` runs it: with accumulated gradients, with worker processes, and with two processes; and
+for each of the dense tasks.
 """
 
 import argparse
@@ -15,18 +16,32 @@ from pathlib import Path
 
 import torch
 
-TINY = [
-    *("--config", "minutes", "--data.path", "digits", "--data.limit", "160"),
-    *("--data.batch_size", "16", "--data.workers", "0", "--trainer.max_epochs", "24"),
-    *("--checkpoint_steps", "2", "--trainer.log_every_n_steps", "1"),
+sys.path.insert(0, str(Path(__file__).parents[1]))
+from scenes import write_plain
+
+ALL = [
+    *("--data.workers", "0", "--checkpoint_steps", "2", "--trainer.log_every_n_steps", "1"),
     *("--trainer.enable_progress_bar", "false", "--trainer.accelerator", "cpu"),
-    *("--model.mixup", "0.8", "--model.cutmix", "1.0", "--data.randaugment", "true"),
+    *("--data.randaugment", "true"),
+]
+CLASSES = [
+    *("--config", "minutes", "--data.path", "digits", "--data.limit", "160"),
+    *("--data.batch_size", "16", "--trainer.max_epochs", "24", *ALL),
+    *("--model.mixup", "0.8", "--model.cutmix", "1.0"),
     *("--data.erasing", "0.25", "--model.options", "{embed_dim: 8}"),
 ]
+SCENES = [
+    *("--model.name", "darswin_unet_a_nano", "--data.size", "32", "--data.batch_size", "4"),
+    *("--model.options", "{embed_dim: 8, depths: [1, 1, 1], rings: 8, sectors: 32}"),
+    *("--data.flip", "true", "--data.rotate_deg", "180", "--data.crop", "0.5"),
+    *("--data.lens_augmentation", "0..1", "--trainer.max_epochs", "12", *ALL),
+]
 CASES = {
-    "accumulation": ["--trainer.accumulate_grad_batches", "3"],
-    "workers": ["--data.workers", "2"],
-    "processes": ["--devices", "2", "--data.batch_size", "8"],
+    "accumulation": [*CLASSES, "--trainer.accumulate_grad_batches", "3"],
+    "workers": [*CLASSES, "--data.workers", "2"],
+    "processes": [*CLASSES, "--devices", "2", "--data.batch_size", "8"],
+    "segmentation": ["--task", "segmentation", *SCENES, "--data.workers", "2"],
+    "distance": ["--task", "distance", *SCENES, "--devices", "2", "--data.batch_size", "2"],
 }
 
 
@@ -95,7 +110,9 @@ def main() -> None:
     chance = random.Random(arguments.seed)
     for case in arguments.cases:
         with tempfile.TemporaryDirectory() as folder:
-            whole, options = Path(folder) / "whole", [*TINY, *CASES[case]]
+            whole, options = Path(folder) / "whole", CASES[case]
+            if "--task" in options:
+                options = [*options, "--data.path", str(write_plain(Path(folder) / "scenes", 40))]
             process = start(whole, *options)
             wait_for_steps(whole, process)
             began = time.monotonic()

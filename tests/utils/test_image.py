@@ -52,3 +52,23 @@ def test_grey_and_colour_files(tmp_path):
     assert read_image(tmp_path / "c.png", 1).shape == (4, 5, 1)
     cv2.imwrite(str(tmp_path / "g.png"), colour[..., 2])
     assert read_image(tmp_path / "g.png")[0, 0].tolist() == [200, 200, 200]
+
+
+def test_a_png_that_says_no_orientation_is_decoded_once(tmp_path, monkeypatch):
+    """Pillow decodes a PNG whole to look for EXIF behind its pixels."""
+    Image.new("RGB", (8, 6)).save(tmp_path / "plain.png")
+    exif = Image.Exif()
+    exif[ExifTags.Base.Orientation] = 8
+    Image.new("RGB", (8, 6)).save(tmp_path / "turned.png", exif=exif)
+    # EXIF behind the pixels, where the format allows it too.
+    data = (tmp_path / "turned.png").read_bytes()
+    start = data.index(b"eXIf") - 4
+    end = start + 12 + int.from_bytes(data[start : start + 4], "big")
+    tail = data.index(b"IEND") - 4
+    assert end <= tail
+    behind = data[:start] + data[end:tail] + data[start:end] + data[tail:]
+    (tmp_path / "behind.png").write_bytes(behind)
+    assert read_oriented(tmp_path / "turned.png")[1] == 8
+    assert read_oriented(tmp_path / "behind.png")[1] == 8
+    monkeypatch.setattr(Image, "open", lambda *_: pytest.fail("Pillow was asked"))
+    assert read_oriented(tmp_path / "plain.png")[1] == 1

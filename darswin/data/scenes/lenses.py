@@ -11,7 +11,7 @@ from darswin.lens import Lens
 
 # What names a lens model in any format; other words in a file say nothing of its lens's form.
 _SAYS_MODEL = re.compile("model|distortion")
-_KEPT = 1024  # lenses in memory
+_KEPT = 8192  # lenses in memory
 
 
 class OwnLenses(PictureLenses):
@@ -20,8 +20,8 @@ class OwnLenses(PictureLenses):
     The files are looked through when this is made, and each is read when its picture is.
 
     Args:
-        files: pictures and their calibrations, in JSON of any format that `darswin.lens.load`
-            reads.
+        files: pictures and their calibrations, of any format that `darswin.lens.load` reads; in
+            JSON where there are many.
 
     Raises:
         ValueError: a file that is no JSON or no lens, or lenses that cannot be joined; it names
@@ -34,7 +34,8 @@ class OwnLenses(PictureLenses):
         # Files that differ in numbers alone have lenses of one form: one of them stands for all.
         alike: dict[Hashable, Camera] = {}
         for file in dict.fromkeys(self._files.values()):
-            alike.setdefault(_form(_content(file)), Camera(file, None, file))
+            form = _form(_content(file)) if file.endswith(".json") else file
+            alike.setdefault(form, Camera(file, None, file))
         examples = [*alike.values(), *(shared.cameras if shared else ())]
         super().__init__(are_curves(examples, [camera.lens(NOMINAL) for camera in examples]))
 

@@ -3,13 +3,13 @@
 from pathlib import Path
 from typing import get_args
 
-from darswin.data.scenes import plain
+from darswin.data.scenes import kitti360, plain, synwoodscape, woodscape
 from darswin.data.scenes.options import Options
 from darswin.data.scenes.parts import ScenesSplit
 from darswin.data.scenes.scene import Scenes, Target
 
 # The first that fits a path is taken.
-KINDS = (plain,)
+KINDS = (plain, kitti360, synwoodscape, woodscape)
 
 
 def open_scenes(
@@ -34,7 +34,9 @@ def open_scenes(
       ROOT, or in `ROOT/train`, `ROOT/val` and `ROOT/test`. The lens is in `lenses/STEM.json`, one
       for a picture, or in `lens.json` beside `images/` or in ROOT: a calibration, or what
       `darswin.data.Calibrations` takes as a lenses.json, with paths relative to its folder.
-      `classes.json` beside `images/` or in ROOT names the classes.
+      `classes.json` beside `images/` or in ROOT names the classes;
+    - WoodScape, SynWoodScape or KITTI-360, as `darswin.data.scenes.woodscape`, `synwoodscape` and
+      `kitti360` say.
 
     Without a test set, "val" serves as one. What has neither, or no "val", gets `holdout` of
     "train" for each, chosen by a hash of their names; at least one is left to train on. Pictures
@@ -49,7 +51,7 @@ def open_scenes(
             line, a JSON list, or {"names": [...], "colors": [[r, g, b], ...]}.
         splits: a JSON file `{"train": [stems], "val": …, "test": …}`, or a folder of `train.txt`,
             `val.txt`, `test.txt` with one stem a line; with or without the pictures' suffix. A
-            split without a list is held out.
+            split without a list is held out. For WoodScape and SynWoodScape also "heal-swin".
         holdout: a share, in [0, 0.5).
 
     Raises:

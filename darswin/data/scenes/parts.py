@@ -110,6 +110,8 @@ def _listed(path: Path, found: Sequence[str], named: Named | None) -> dict[Split
     given: dict[Split, list[str]] = {}
     where: dict[str, Split] = {}
     for split, names in read_split_lists(path).items():
+        if wrong := [name for name in names if not isinstance(name, str)]:
+            raise ValueError(f"{path} must list names for {split!r}, got {wrong[0]!r}")
         given[split] = [_stem(name) for name in names]
         for stem in given[split]:
             if where.setdefault(stem, split) != split and "train" in (where[stem], split):

@@ -1,0 +1,253 @@
+"""Scenes in which a label and a distance are functions of the ray keep them in every frame."""
+
+import math
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from scenes import CALIBRATIONS, distance_of, labels_of, rays_of
+from scipy import ndimage
+
+from darswin.data import IGNORE
+from darswin.data.reframing import Crop, part, resized, through, turned
+from darswin.data.scenes import Scene
+from darswin.data.turning import Turn, turned_picture
+from darswin.lens import BrownConrady, Equidistant, Mei, OCam, Polynomial, Spherical, load
+from darswin.lens.pixels import pixel_angles
+from darswin.lens.reprojection import reprojection
+
+SIZE = (300, 400)
+LENSES = {
+    "woodscape": load(CALIBRATIONS / "woodscape.json").in_picture((302, 400)).cropped(1, 0, *SIZE),
+    "kitti360": load(CALIBRATIONS / "kitti360_02.yaml").in_picture((400, 400)),  # tangential terms
+    "circle": Equidistant.from_fov(3.0, 150.0, center=[190.0, 155.0], image_size=SIZE),
+    "oblong": Spherical(
+        0.8, 150.0, 1.5, [205.0, 140.0], affine=[[1.0, 0.03], [0.0, 0.9]], image_size=SIZE
+    ),
+    "pinhole": BrownConrady(170.0, [0.02], 0.9, [200.0, 150.0], tangential=[0.01, -0.02],
+                            image_size=SIZE),
+}  # fmt: skip
+TURNS = [Turn(0.0, False), Turn(0.0, True), Turn(0.7, False), Turn(-2.5, True)]
+TARGETS = [
+    Spherical.from_fov(0.3, 2.6, 60.0, center=[63.5, 63.5], image_size=(128, 128)),
+    Spherical.from_fov(1.0, 3.2, 90.0, center=[40.0, 80.0], image_size=(128, 128)),
+    Polynomial([30.0, 5.0, 3.0], 1.4, [63.5, 63.5], image_size=(128, 128)),
+]
+
+
+def size_of(lens):
+    return tuple(round(side) for side in lens.image_size[0].tolist())
+
+
+def scene_of(lens, target="labels"):
+    """Labels or distances of the ray, and an image in which a label is a grey."""
+    theta, azimuth = rays_of(lens, size_of(lens))
+    known = ~np.isnan(theta)
+    labels = labels_of(theta, azimuth)
+    image = np.where(known, 60 + 80 * labels, 0).astype(np.uint8)[..., None]
+    if target == "labels":
+        return Scene(image, np.where(known, labels, IGNORE).astype(np.uint8), lens)
+    return Scene(image, np.where(known, distance_of(theta, azimuth), 0).astype(np.float32), lens)
+
+
+def before(lens, turn=None):
+    """The rays of an image's pixels, as they were before a turn; θ is NaN where none is seen."""
+    theta, azimuth = rays_of(lens, size_of(lens))
+    if turn is not None:
+        x, y = np.linalg.inv(turn.matrix) @ [np.cos(azimuth).ravel(), np.sin(azimuth).ravel()]
+        azimuth = np.arctan2(y, x).reshape(azimuth.shape)
+    return theta, azimuth
+
+
+def shown(source, theta, azimuth, margin):
+    """Whether rays are in a source's image and θ_max by a margin, px, which may be below 0."""
+    known = ~np.isnan(theta)
+    theta = torch.from_numpy(np.where(known, theta, 0.0)).flatten()
+    lens = source.to(torch.float64).with_theta_max(None)
+    far = theta <= source.theta_max.item() - margin / 40
+    theta = theta.clamp(max=lens.theta_max.item())
+    pixels = lens.project_rays(theta[None], torch.from_numpy(azimuth).flatten()[None])[0]
+    height, width = size_of(source)
+    inside = (pixels >= margin - 0.5).all(-1)
+    inside &= (pixels <= torch.tensor([width, height]) - 0.5 - margin).all(-1)
+    return known & (inside & far).numpy().reshape(known.shape)
+
+
+def even(labels):
+    """Where labels are the same in a neighbourhood, which is in the image."""
+    same = ndimage.maximum_filter(labels, 5) == ndimage.minimum_filter(labels, 5)
+    return same & np.pad(np.ones(np.subtract(labels.shape, 4), bool), 2)
+
+
+def check(scene, source, turn=None):
+    """Image, labels or distances and lens say the same of every ray that the source showed."""
+    theta, azimuth = before(scene.lens, turn)
+    certain = shown(source.lens, theta, azimuth, 2.0)
+    assert certain.sum() > 1000
+    nothing = IGNORE if scene.target.dtype == np.uint8 else 0
+    possible = shown(source.lens, theta, azimuth, -2.0)
+    assert (scene.target[~possible] == nothing).all()
+    assert (scene.target[certain] != nothing).all()
+    assert np.isin(scene.target[scene.target != nothing], source.target).all()  # none is made up
+    labels = labels_of(theta, azimuth)
+    inner = certain & even(np.where(certain, labels, IGNORE))
+    assert inner.sum() > 500
+    np.testing.assert_allclose(scene.image[inner, 0], 60.0 + 80 * labels[inner], atol=1)
+    if nothing == IGNORE:
+        assert (scene.target[inner] == labels[inner]).all()
+    else:
+        # The nearest pixel of the source is up to 0.71 px away, and 8 m/rad the steepest slope.
+        per_pixel = 1 / source.lens._slope(torch.linspace(0, 0.85, 9)[None]).min().item()
+        error = np.abs(scene.target - distance_of(theta, azimuth))[certain]
+        assert error.max() < 8 * per_pixel
+
+
+@pytest.mark.parametrize("target", ["labels", "distance"])
+@pytest.mark.parametrize("fit", ["crop", "stretch"])
+@pytest.mark.parametrize("name", LENSES)
+def test_a_part_resized(name, fit, target):
+    source = scene_of(LENSES[name], target)
+    for crop, mirrored in ((None, False), (Crop(0.6, 0.2, 0.9), True), (Crop(0.8, 1, 0), False)):
+        taken = part(source.target.shape, fit, crop)
+        scene = resized(source, taken, 128, mirrored)
+        assert scene.image.shape == (128, 128, 1) and size_of(scene.lens) == (128, 128)
+        check(scene, source, Turn(0.0, True) if mirrored else None)
+
+
+@pytest.mark.parametrize("target", ["labels", "distance"])
+@pytest.mark.parametrize("turn", TURNS)
+@pytest.mark.parametrize("name", LENSES)
+def test_a_part_turned(name, turn, target):
+    source = scene_of(LENSES[name], target)
+    for fit, crop in (("crop", None), ("stretch", Crop(0.7, 0.4, 0.1))):
+        scene = turned(source, turn, part(source.target.shape, fit, crop), 128)
+        check(scene, source, turn)
+
+
+@pytest.mark.parametrize("target", ["labels", "distance"])
+@pytest.mark.parametrize("turn", [None, *TURNS[1:]])
+@pytest.mark.parametrize("name", LENSES)
+def test_another_lens(name, turn, target):
+    source = scene_of(LENSES[name], target)
+    for lens in TARGETS:
+        scene = through(source, lens, 128, turn)
+        assert scene.lens is lens
+        check(scene, source, turn)
+
+
+def test_a_turn_without_an_angle_is_a_mirror():
+    source = scene_of(LENSES["oblong"])
+    taken = part(source.target.shape, "crop", None)
+    for mirrored in (False, True):
+        one, other = (
+            resized(source, taken, 100, mirrored),
+            turned(source, Turn(0, mirrored), taken, 100),
+        )
+        assert str(one.lens) == str(other.lens)
+        assert (one.target != other.target).mean() < 0.005  # but for halves of a pixel
+
+
+def test_turned_labels_are_those_of_scipy():
+    source = scene_of(LENSES["circle"])
+    height, width = SIZE
+    taken = 0, 0, height, width
+    turn = Turn(0.6, False)
+    scene = turned(source, turn, taken, 200)
+    cos, sin = math.cos(0.6), math.sin(0.6)
+    down, across = height / 200, width / 200
+    x, y = 190.0, 155.0
+    # A pixel (row, column) of the result → of the picture: its place there, turned back.
+    turn_back = np.array([[cos, -sin], [sin, cos]])
+    middle = np.array([y, x])
+    offset = turn_back @ (np.array([(down - 1) / 2, (across - 1) / 2]) - middle) + middle
+    expected = ndimage.affine_transform(
+        source.target, turn_back @ np.diag([down, across]), offset, (200, 200), order=0, cval=IGNORE
+    )
+    beyond = pixel_angles(scene.lens, (200, 200))[0].isnan().numpy()
+    expected[beyond] = IGNORE
+    assert (scene.target == expected).mean() > 0.999
+
+
+def test_the_places_are_those_of_the_exact_reprojection():
+    height, width = SIZE
+    y, x = np.mgrid[:height, :width].astype(np.float32)
+    for name in ("woodscape", "oblong", "pinhole"):
+        for lens in TARGETS:
+            source = Scene(np.stack((x, y), -1), np.zeros(SIZE, np.float32), LENSES[name])
+            pair = (source.lens.to(torch.float64), SIZE, lens.to(torch.float64), (128, 128))
+            exact = reprojection(*pair)[0]
+            got = torch.from_numpy(through(source, lens, 128).image)
+            inside = (exact[..., 0] > 2) & (exact[..., 0] < width - 3)
+            inside &= (exact[..., 1] > 2) & (exact[..., 1] < height - 3)
+            inside = torch.from_numpy(ndimage.binary_erosion(inside.numpy(), iterations=2))
+            # A mean over the pixel, and OpenCV's 1/32 px.
+            error = (got - exact)[inside].abs()
+            assert error.mean() < 0.03 and error.quantile(0.99) < 0.3
+
+
+def test_what_is_much_larger_is_averaged():
+    lens = Equidistant.from_fov(3.0, 400.0, image_size=(800, 800), center=[399.5, 399.5])
+    noise = np.random.default_rng(0).integers(256, size=(800, 800, 1), dtype=np.uint8)
+    source = Scene(noise, np.zeros((800, 800), np.uint8), lens)
+    small = Equidistant.from_fov(3.0, 40.0, image_size=(80, 80), center=[39.5, 39.5])
+    middle = (slice(20, 60), slice(20, 60))
+    taken = (0, 0, 800, 800)
+    for scene in (through(source, small, 80), turned(source, Turn(0.5, False), taken, 80)):
+        # Of 10 × 10 pixels that are read at 5 × 5 points: a sixth of the noise at most.
+        assert scene.image[middle].std() < noise.std() / 6
+    assert resized(source, taken, 80, False).image[middle].std() < noise.std() / 9
+
+
+@given(
+    angle=st.floats(-math.pi, math.pi),
+    mirrored=st.booleans(),
+    share=st.floats(0.3, 1),
+    across=st.floats(0, 1),
+    down=st.floats(0, 1),
+    size=st.integers(16, 90),
+    name=st.sampled_from(sorted(LENSES)),
+)
+def test_image_and_labels_move_together(angle, mirrored, share, across, down, size, name):
+    source = SCENES[name]
+    crop, turn = Crop(share, across, down), Turn(angle, mirrored)
+    taken = part(source.target.shape, "crop", crop)
+    top, left, height, width = taken
+    assert top >= 0 and left >= 0 and height == width
+    assert top + height <= source.target.shape[0] and left + width <= source.target.shape[1]
+    drawn = Spherical.from_fov(share, 2.4, size * share, center=[size * across, size * down])
+    drawn = drawn.replace(image_size=torch.tensor([[float(size)] * 2]))
+    for scene in (
+        turned(source, turn, taken, size),
+        resized(source, taken, size, mirrored),
+        through(source, drawn, size, turn),
+    ):
+        assert scene.target.shape == (size, size) and size_of(scene.lens) == (size, size)
+        inner = even(scene.target) & (scene.target != IGNORE)
+        np.testing.assert_allclose(scene.image[inner, 0], 60.0 + 80 * scene.target[inner], atol=1)
+        theta = pixel_angles(scene.lens, (size, size))[0].numpy()
+        beyond = np.isnan(theta)
+        assert (scene.target[beyond] != IGNORE).sum() <= 0.02 * beyond.size
+
+
+SCENES = {name: scene_of(lens) for name, lens in LENSES.items()}
+
+
+def test_a_picture_turns_as_it_does_for_classification():
+    source = scene_of(LENSES["oblong"])
+    turn = TURNS[3]
+    image, lens = turned_picture(source.image, source.lens, turn)
+    height, width = SIZE
+    expected = cv2.resize(image, (width, width), interpolation=cv2.INTER_AREA)
+    scene = turned(source, turn, (0, 0, height, width), width)
+    assert str(scene.lens) == str(lens.resized((width, width)))
+    flat = even(expected) & (expected > 0)
+    assert np.abs(scene.image[..., 0].astype(int) - expected)[flat].max() <= 1
+
+
+def test_other_models_of_lenses():
+    lens = OCam([-120.0, 0.0, 0.002], 1.4, [199.5, 149.5], image_size=SIZE)
+    check(through(scene_of(lens), TARGETS[0], 128), scene_of(lens))
+    assert isinstance(LENSES["kitti360"], Mei)

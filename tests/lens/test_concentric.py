@@ -1,0 +1,176 @@
+import math
+
+import numpy as np
+import pytest
+import torch
+from lens_examples import ASIDE
+
+from darswin.lens import Equidistant, Perspective, Polynomial, Spherical
+from darswin.lens.concentric import (
+    disc_to_square,
+    read_square,
+    square_places,
+    square_to_disc,
+    square_view,
+)
+from darswin.lens.reprojection import OUTSIDE
+from darswin.lens.spacing import SPACINGS
+
+f64 = torch.float64
+
+
+def published(a, b):
+    """Shirley and Chiu's map of one place, by its four regions, as they print it."""
+    if a > -b:
+        if a > b:
+            r, phi = a, math.pi / 4 * (b / a)
+        else:
+            r, phi = b, math.pi / 4 * (2 - a / b)
+    elif a < b:
+        r, phi = -a, math.pi / 4 * (4 + b / a)
+    else:
+        r, phi = -b, math.pi / 4 * (6 - a / b) if b else 0.0
+    return r, phi
+
+
+def grid(count):
+    steps = torch.linspace(-1, 1, count, dtype=f64)
+    return torch.stack(torch.meshgrid(steps, steps, indexing="xy"), -1)
+
+
+@pytest.mark.parametrize("count", [40, 41])  # without and with the middle and the axes
+def test_it_is_the_published_map(count):
+    places = grid(count)
+    radius, direction = square_to_disc(places)
+    for place, r, (c, s) in zip(
+        places.reshape(-1, 2).tolist(),
+        radius.flatten().tolist(),
+        direction.reshape(-1, 2).tolist(),
+        strict=True,
+    ):
+        expected, phi = published(*place)
+        got = r * c, r * s
+        assert np.allclose(got, (expected * math.cos(phi), expected * math.sin(phi)), atol=1e-14)
+    assert torch.allclose(direction.norm(dim=-1), torch.ones((), dtype=f64))
+
+
+@pytest.mark.parametrize("count", [40, 41])
+def test_round_trip(count):
+    places = grid(count)
+    torch.testing.assert_close(disc_to_square(*square_to_disc(places)), places)
+    azimuth = torch.linspace(-math.pi, math.pi, 97, dtype=f64)
+    direction = torch.stack((azimuth.cos(), azimuth.sin()), -1)
+    for r in (0.0, 1e-9, 0.3, 1.0):
+        radius = torch.full_like(azimuth, r)
+        back, aside = square_to_disc(disc_to_square(radius, direction))
+        torch.testing.assert_close(back, radius)
+        torch.testing.assert_close(back[:, None] * aside, radius[:, None] * direction)
+    middle = disc_to_square(torch.zeros(1), torch.zeros(1, 2))  # as `rays` gives it
+    assert torch.equal(middle, torch.zeros(1, 2))
+
+
+def disc(places):
+    radius, direction = square_to_disc(places)
+    return radius[..., None] * direction
+
+
+def test_areas_keep_their_ratio_everywhere():
+    places = grid(24).reshape(-1, 2).requires_grad_()
+    rows = [torch.autograd.grad(disc(places)[:, k].sum(), places)[0] for k in (0, 1)]
+    areas = torch.linalg.det(torch.stack(rows, 1))
+    torch.testing.assert_close(areas, torch.full_like(areas, math.pi / 4))
+
+
+def test_it_is_continuous_across_diagonals_and_axes():
+    line = torch.linspace(-1, 1, 200, dtype=f64)
+    zero = torch.zeros_like(line)
+    for a, b in ((line, line), (line, -line), (line, zero), (zero, line)):
+        on = torch.stack((a, b), -1)
+        for step in ((1e-9, 0.0), (0.0, 1e-9), (-1e-9, 0.0), (0.0, -1e-9)):
+            moved = on + torch.tensor(step, dtype=f64)
+            assert (disc(moved) - disc(on)).abs().max() < 4e-9
+            there = disc(on) + torch.tensor(step, dtype=f64)
+            radius = there.norm(dim=-1)
+            back = disc_to_square(radius, there / radius.clamp(min=1e-30)[:, None])
+            assert (back - on).abs().max() < 4e-9
+
+
+EXAMPLES = {
+    "radial, off centre": (Spherical(0.6, 20.0, 1.4, center=[18.0, 25.0]).to(f64), (48, 40)),
+    "beyond 90°": (Polynomial([12.0, 0.5, -0.3, 0.1], 2.0).to(f64), (60, 60)),
+    "two lenses": (Spherical.from_fov([0.1, 0.9], 2.6, 20.0).to(f64), (40, 40)),
+    "general": (ASIDE["Mei"].resized(1 / 35), (40, 40)),
+}
+
+
+@pytest.mark.parametrize("name", EXAMPLES)
+@pytest.mark.parametrize("spacing", SPACINGS)
+def test_the_pixels_of_the_square_are_where_their_rays_land(name, spacing):
+    lens, size = EXAMPLES[name]
+    if spacing == "tan":
+        lens = lens.with_theta_max(1.3)
+    count = 9
+    view = square_view(lens, size, count, spacing)
+    steps = (2 * torch.arange(count, dtype=f64) + 1) / count - 1
+    last = lens.theta_max[:, None]
+    for row, b in enumerate(steps.tolist()):
+        for column, a in enumerate(steps.tolist()):
+            r, phi = published(a, b)
+            if spacing == "theta":
+                theta = r * last
+            elif spacing == "tan":
+                theta = torch.atan(r * torch.tan(last))
+            elif spacing == "radius":
+                theta = lens.unproject(r * lens.project(last))
+            else:
+                continue  # g: `test_there_and_back`, and tests/layers/test_grid.py
+            expected = lens.project_rays(theta, torch.full_like(theta, phi), size)
+            torch.testing.assert_close(view[:, row, column], expected[:, 0], atol=1e-7, rtol=1e-9)
+
+
+@pytest.mark.parametrize("name", EXAMPLES)
+@pytest.mark.parametrize("spacing", SPACINGS)
+def test_there_and_back(name, spacing):
+    lens, size = EXAMPLES[name]
+    if spacing == "tan":
+        lens = lens.with_theta_max(1.3)
+    places = square_places(lens, size, spacing)
+    beyond = (places == OUTSIDE).all(-1)
+    theta, azimuth = lens.unproject_pixels(
+        torch.stack(torch.meshgrid(*(torch.arange(s, dtype=f64) for s in size[::-1]),
+                                   indexing="xy"), -1)[None], size)  # fmt: skip
+    assert torch.equal(beyond, ~lens.sees(theta))
+    assert (places[~beyond].abs() <= 1).all()
+    # The square's own pixels, read where the image's pixels lie in it, are the image's rays.
+    radius, direction = square_to_disc(places)
+    got = torch.atan2(direction[..., 1], direction[..., 0])[~beyond & (radius > 1e-3)]
+    want = azimuth.expand_as(radius)[~beyond & (radius > 1e-3)]
+    assert torch.allclose(torch.cos(got - want), torch.ones((), dtype=f64))
+    if spacing == "theta":
+        share = (theta / lens.theta_max[:, None, None])[~beyond]
+        torch.testing.assert_close(radius[~beyond], share.clamp(max=1), atol=1e-7, rtol=1e-7)
+
+
+def test_tan_ends_before_90_degrees():
+    for function in (lambda lens: square_view(lens, (8, 8), 8, "tan"),
+                     lambda lens: square_places(lens, (8, 8), "tan")):  # fmt: skip
+        with pytest.raises(ValueError, match="spacing='tan' needs lenses with θ_max below 90°"):
+            function(Equidistant(4.0, 1.6))
+        assert function(Perspective(4.0, 1.2)).isfinite().all()
+
+
+def test_reading_a_square_of_any_resolution():
+    """A field that is linear in the square's places is read exactly, up to the outermost pixels."""
+    places = torch.rand(2, 7, 5, 2) * 1.6 - 0.8
+    places[0, 0, 0] = OUTSIDE
+    for size in (8, 13):
+        steps = (2 * torch.arange(size) + 1) / size - 1
+        a, b = torch.meshgrid(steps, steps, indexing="xy")
+        square = torch.stack((a, b, 1 + 0 * a)).expand(2, -1, -1, -1)
+        read = read_square(square, places)
+        expected = torch.cat((places, torch.ones(2, 7, 5, 1)), -1).permute(0, 3, 1, 2).clone()
+        expected[0, :, 0, 0] = 0
+        torch.testing.assert_close(read, expected)
+    corners = torch.tensor([[-1.0, -1.0], [1.0, 1.0]]).reshape(1, 1, 2, 2)
+    read = read_square(torch.arange(16.0).reshape(1, 1, 4, 4), corners)
+    assert read.flatten().tolist() == [0.0, 15.0]  # no fading at the rim
