@@ -16,7 +16,7 @@ from darswin.lens import save
 
 FOV = math.radians(165)  # full, of the lenses given by ξ
 SIZE = 128  # px
-PICTURES = 1000, 16, 105  # to train on, of validation, and of each test set: 7 a map
+PICTURES = 2000, 16, 75  # to train on, of validation, and of each test set: 5 a map
 
 # What is trained on: perspective lenses of 60° to 90°, and one band of ξ.
 BANDS = {"wide": "wide", "low": "0.2..0.35"}

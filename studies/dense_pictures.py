@@ -18,18 +18,15 @@ TARGETS = {"segmentation": "labels", "distance": "distance"}
 NEAR, FAR = 0.5, 40.0  # m, of the colours
 
 
-def samples(data: Path, task: str, size: int, name: str) -> DenseSamples:
-    """A test set as images of a size."""
-    return DenseSamples(open_scenes(str(data / "test" / name), "test", TARGETS[task]), size=size)
-
-
 def predict(run: Path, data: Path, task: str) -> None:
     """Writes what a run's last model says of `SHOWN` into its `shown.npz`."""
     model, card = load_model(model_of_run(run))
     model.eval()
     said = {}
     for name, place in SHOWN.items():
-        test = samples(data, task, card.size, name)
+        scenes = open_scenes(str(data / "test" / name), "test", TARGETS[task])
+        mean, std = card.options["mean"], card.options["std"]
+        test = DenseSamples(scenes, size=card.size, mean=mean, std=std)
         image, lens, _ = test[min(place, len(test) - 1)]
         with torch.inference_mode():
             found = model(image[None], lens)[0]

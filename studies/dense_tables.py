@@ -5,8 +5,8 @@ from collections import defaultdict
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from dense_cells import CONTROLLED, MODELS, TASKS, Cell
-from dense_data import BANDS, CAMERAS, SHUFFLED, SWEEP, WRONG, camera_set, xi_set
+from dense_cells import CONTROLLED, MODELS, STUDIED, TASKS, Cell
+from dense_data import CAMERAS, SHUFFLED, SWEEP, WRONG, camera_set, xi_set
 from dense_pictures import draw
 from matplotlib.figure import Figure
 from tables import spread
@@ -61,31 +61,27 @@ def mean_of(sets: dict, names: Sequence[str], score: str) -> float:
 
 
 def draw_curves(cells: list[dict], trivial: dict, path: Path) -> None:
-    """mIoU and δ1 against ξ: a column a training band, which is shaded; lines are means of the
-    seeds, bands their span, the dotted line what is said of a direction without looking."""
-    figure, xi = Figure(figsize=(10, 7.5), layout="constrained"), [float(name) for name in SWEEP]
-    panels = figure.subplots(len(TASKS), len(BANDS), sharex=True, sharey="row", squeeze=False)
-    for row, task in zip(panels, TASKS, strict=True):
-        found, score = runs_of(cells, task), SCORE[task]
-        blind = [100 * trivial[task]["direction"][name][score] for name in ALL_XI]
-        for axes, band in zip(row, BANDS, strict=True):
-            low, high = SHADED[band]
-            if high > low:
-                axes.axvspan(low, high, color="tab:pink", alpha=0.3, lw=0)
-            for label in MODELS:
-                runs = found.get((label, band))
-                if not runs:
-                    continue
+    """mIoU and δ1 against ξ: a panel for each task and training band, which is shaded; lines are
+    means of the seeds, bands their span, dots what is said of a direction without looking."""
+    figure, xi = Figure(figsize=(13, 4.8), layout="constrained"), [float(name) for name in SWEEP]
+    panels = figure.subplots(1, len(STUDIED), squeeze=False)[0]
+    for axes, (task, band) in zip(panels, STUDIED, strict=True):
+        found, score, (low, high) = runs_of(cells, task), SCORE[task], SHADED[band]
+        if high > low:
+            axes.axvspan(low, high, color="tab:pink", alpha=0.3, lw=0)
+        for label in MODELS:
+            runs = found.get((label, band))
+            if runs:
                 values = [[100 * run[name][score] for run in runs] for name in ALL_XI]
                 (line,) = axes.plot(xi, list(map(statistics.mean, values)), label=label)
                 ends = list(map(min, values)), list(map(max, values))
                 axes.fill_between(xi, *ends, color=line.get_color(), alpha=0.2, lw=0)
-            axes.plot(xi, blind, color="black", ls=":", label="by direction alone")
-            axes.set(title=f'{task}, trained on "{band}"', ylabel=f"{NAMES[score]} (%)")
-            axes.set(xlim=(0, 1), xlabel="distortion ξ")
-            axes.label_outer()
-            axes.grid(alpha=0.3)
-    handles, labels = panels[0][0].get_legend_handles_labels()
+        blind = [100 * trivial[task]["direction"][name][score] for name in ALL_XI]
+        axes.plot(xi, blind, color="black", ls=":", label="by direction alone")
+        axes.set(title=f'{task}, trained on "{band}"', ylabel=f"{NAMES[score]} (%)")
+        axes.set(xlim=(0, 1), xlabel="distortion ξ")
+        axes.grid(alpha=0.3)
+    handles, labels = panels[-1].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=4)
     save_figure(figure, path)
 
@@ -201,31 +197,30 @@ def times(cells: list[dict]) -> str:
 
 def tables(record: dict | None, folder: Path) -> dict[str, str]:
     """The tables and pictures, by the name of their place in a page; without a record, a line."""
-    names = [f"dense {kind} {band}" for kind in TASKS for band in BANDS]
-    places = [
-        *names, *(f"{name} zones" for name in names), *(f"{name} controls" for name in names),
-        *(f"dense cameras {task} {band}" for task in TASKS for band in BANDS),
-        *(f"dense errors {band}" for band in BANDS), "dense times", "dense curves",
-        *(f"dense pictures {task}" for task in TASKS),
-    ]  # fmt: skip
-    if record is None:
-        return dict.fromkeys(places, NOT_RUN)
-    cells, trivial = record["cells"], record["trivial"]
-    made = {
-        "dense times": times(cells),
-        "dense curves": _picture(folder / "dense.png", "Scores over ξ"),
-    }
-    for task in TASKS:
-        made[f"dense pictures {task}"] = _picture(folder / f"dense_{task}.png", "Predictions")
-        for band in BANDS:
-            name = f"dense {task} {band}"
-            made[name] = over_lenses(cells, trivial, task, band)
-            made[f"{name} zones"] = over_zones(cells, task, band)
-            made[f"{name} controls"] = controls(cells, task, band)
-            made[f"dense cameras {task} {band}"] = over_cameras(cells, task, band)
-    made |= {f"dense errors {band}": errors(cells, band) for band in BANDS}
+    made: dict[str, str] = {}
+    for task, band in STUDIED:
+        made |= _of_band(record, task, band)
+    for name, file, title in (
+        ("curves", "dense", "Scores over ξ"),
+        *((f"pictures {task}", f"dense_{task}", "Predictions") for task in TASKS),
+    ):
+        there = (folder / f"{file}.png").exists()
+        made[f"dense {name}"] = f"![{title}](../studies/results/{file}.png)" if there else NOT_RUN
+    cells = record["cells"] if record else []
+    made["dense times"] = times(cells) if cells else NOT_RUN
     return made
 
 
-def _picture(file: Path, title: str) -> str:
-    return f"![{title}](../studies/results/{file.name})" if file.exists() else NOT_RUN
+def _of_band(record: dict | None, task: str, band: str) -> dict[str, str]:
+    name = f"dense {task} {band}"
+    kinds = {
+        name: lambda cells, trivial: over_lenses(cells, trivial, task, band),
+        f"{name} zones": lambda cells, _: over_zones(cells, task, band),
+        f"{name} controls": lambda cells, _: controls(cells, task, band),
+        f"{name} cameras": lambda cells, _: over_cameras(cells, task, band),
+    }
+    if task == "distance":
+        kinds[f"{name} errors"] = lambda cells, _: errors(cells, band)
+    if record is None:
+        return dict.fromkeys(kinds, NOT_RUN)
+    return {name: made(record["cells"], record["trivial"]) for name, made in kinds.items()}

@@ -14,7 +14,7 @@ pytest.importorskip("omg")
 import dense  # noqa: E402
 import dense_data  # noqa: E402
 import dense_tables  # noqa: E402
-from dense_cells import CONTROLLED, MODELS, all_cells  # noqa: E402
+from dense_cells import CONTROLLED, MODELS, STUDIED, all_cells  # noqa: E402
 from dense_trivial import trivial  # noqa: E402
 from worlds import wad  # noqa: E402
 
@@ -33,7 +33,7 @@ QUICK = """
 def test_cells_have_folders_of_their_own():
     cells = all_cells(3)
     assert len({cell.key for cell in cells}) == len(cells)
-    assert len(cells) == len(MODELS) * 2 * 2 * 3 + len(CONTROLLED) * 2 * 2
+    assert len(cells) == len(STUDIED) * (len(MODELS) * 3 + len(CONTROLLED)) == 69
     assert cells[0].key == "darswin-unet-a-wide-segmentation-0"
 
 
