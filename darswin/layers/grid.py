@@ -127,6 +127,28 @@ def pixel_grid(
     return PixelGrid(radii, lens.r_max, points=torch.where(seen[..., None], flat, torch.nan))
 
 
+def token_rays(lens: Lens, *, rings: int, sectors: int, spacing: Spacing = "theta") -> Tensor:
+    """Where the tokens of a polar map look: (N, R, A, 3), unit vectors x, y, z of the camera.
+
+    Convention:
+        x to the right, y down, z forward, as `Lens.unproject_points`; a token's ray is that of the
+        middle of its ring and its sector on the radial curve, whatever offsets the lens has.
+
+    Args:
+        lens: N lenses. rings: R. sectors: A. spacing: as `polar_grid`.
+
+    Raises:
+        ValueError: an unknown spacing, a size below 1, or "tan" with a lens of θ_max ≥ 90°.
+    """
+    check_grid(rings, sectors, (1, 1), spacing, spacing, "centers")
+    _, centers = _rings(lens, rings, 1, spacing, spacing, "centers")
+    theta = change_spacing(lens, centers, spacing, "theta")[..., None]
+    sector = torch.arange(sectors, dtype=theta.dtype, device=theta.device)
+    azimuth = (sector + 0.5) * (2 * math.pi / sectors)
+    aside, forward = torch.sin(theta), torch.cos(theta).expand(-1, -1, sectors)
+    return torch.stack((aside * torch.cos(azimuth), aside * torch.sin(azimuth), forward), -1)
+
+
 def _rings(
     lens: Lens,
     rings: int,

@@ -1,14 +1,16 @@
 """DarSwin-Unet: a label or a distance for each pixel, from the polar map of a calibrated lens."""
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
-from darswin.layers.grid import PixelGrid, pixel_grid
+from darswin.layers.grid import PixelGrid, pixel_grid, token_rays
+from darswin.layers.linear import Linear
 from darswin.layers.sampling import check_lens
 from darswin.lens import Lens
+from darswin.models.base import init_weights
 from darswin.models.darswin import PRESETS, DarSwin
 from darswin.models.decoder import EXPANSION
 from darswin.models.dense import DenseModel, DenseTask
@@ -19,6 +21,14 @@ from darswin.ops import polar_to_image
 _PRESETS: Presets = dict(
     micro=PRESETS["micro"], nano=dict(samples=(4, 4), decoder_depths=1, skip_width=8)
 )
+
+
+class PolarWay(NamedTuple):
+    """Where the rings of the decoder's map are in the image, and where the tokens of each of the
+    encoder's maps look, (N, R, A, 3); empty where the model does not ask."""
+
+    grid: PixelGrid
+    rays: Sequence[Tensor]
 
 
 @register_model("darswin_unet_a", variant="A", presets=_PRESETS)
@@ -38,6 +48,9 @@ class DarSwinUnet(DenseModel):
             last; an int is for all.
         skip_width: channels of the skip from the image; 0 leaves it out.
         typical_distance: m, what "distance" starts from.
+        rays: adds to each of the encoder's maps, before the decoder, a learned linear function of
+            where its tokens look. Without it the network does not know which way is up in an image,
+            as its tokens know each other's places, but not their own azimuth.
         mlp_ratio, drop_path_rate: as `DarSwin`, of encoder and decoder.
         mean, std: of uint8 images, which count as `(pixel/255 - mean) / std`; others ignore them.
         options: others of `DarSwin`, but for compat.
@@ -46,11 +59,11 @@ class DarSwinUnet(DenseModel):
     tokens at a stage. "darswin_unet_*_nano" has R×A = 16×64, unlike the classifier of that size.
 
     Rotation:
-        In eval mode and without the skip from the image (skip_width=0), whose convolutions are not
-        symmetric, a turn of a square image about the principal point by 90° turns the result by
-        90°, up to rounding, where it turns the maps of `DarSwin`: for "darswin_unet_ra_nano", and
-        with `periodic_bias` for RA of every size and "darswin_unet_a_nano". A pixel at the very
-        middle has no azimuth and is left out.
+        In eval mode, without `rays` and without the skip from the image (skip_width=0), whose
+        convolutions are not symmetric, a turn of a square image about the principal point by 90°
+        turns the result by 90°, up to rounding, where it turns the maps of `DarSwin`: for
+        "darswin_unet_ra_nano", and with `periodic_bias` for RA of every size and
+        "darswin_unet_a_nano". A pixel at the very middle has no azimuth and is left out.
 
     Raises:
         ValueError: as `DarSwin`, or an option out of its range. TypeError: in forward, no lens.
@@ -73,6 +86,7 @@ class DarSwinUnet(DenseModel):
         decoder_depths: int | Sequence[int] = 2,
         skip_width: int = 16,
         typical_distance: float = 10.0,
+        rays: bool = True,
         mlp_ratio: float = 4.0,
         drop_path_rate: float = 0.2,
         mean: float | Sequence[float] = 0.0,
@@ -108,23 +122,41 @@ class DarSwinUnet(DenseModel):
             std=std,
         )
 
-    def way(self, lens: Lens | None, size: Pair) -> PixelGrid:
-        """The rings of the decoder's map, and where they are in images of (H, W)."""
+        infos = self.feature_info if rays else ()
+        self.rays = nn.ModuleList(Linear(3, info["num_chs"], bias=False) for info in infos)
+        self.rays.apply(init_weights)
+
+    def way(self, lens: Lens | None, size: Pair) -> PolarWay:
+        """The rings of the decoder's map and where they are in images of (H, W), and the rays."""
         sample = self.encoder.patch_embed.sample
-        return pixel_grid(
-            check_lens(lens, size),
+        lens = check_lens(lens, size)
+        grid = pixel_grid(
+            lens,
             size,
             rings=sample.rings,
             split=EXPANSION,
             spacing=sample.spacing,
             sample_spacing=sample.sample_spacing,
         )
+        sizes = self.feature_info.get("map_size")[: len(self.rays)]
+        return PolarWay(
+            grid,
+            [token_rays(lens, rings=r, sectors=a, spacing=sample.spacing) for r, a in sizes],
+        )
 
-    def to_pixels(self, x: Tensor, way: PixelGrid, size: Pair) -> Tensor:
+    def inform(self, maps: list[Tensor], way: PolarWay) -> list[Tensor]:
+        """The encoder's maps, and where their tokens look."""
+        if not self.rays:
+            return maps
+        steps = zip(maps, self.rays, way.rays, strict=True)
+        dtype = next(self.rays.parameters()).dtype
+        return [x + layer(rays.to(x.device, dtype)).to(x.dtype) for x, layer, rays in steps]
+
+    def to_pixels(self, x: Tensor, way: PolarWay, size: Pair) -> Tensor:
         """The projected map (B, 4·R, 4·A, K) → (B, K, H, W); 0 beyond θ_max."""
         dtype = torch.float64 if x.dtype == torch.float64 else torch.float32
         radii, r_max, center, affine, points = (
-            None if tensor is None else tensor.to(x.device, dtype) for tensor in way
+            None if tensor is None else tensor.to(x.device, dtype) for tensor in way.grid
         )
         assert radii is not None
         pixels = polar_to_image(

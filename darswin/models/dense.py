@@ -41,7 +41,8 @@ class DenseModel(Model):
     the lens reaches has no meaning.
 
     A model makes `encoder` and `decoder`, then calls `_finish`; it defines `way`, `to_pixels` and,
-    if it does not look at the images themselves, `look` and `back`.
+    if it does not look at the images themselves, `look` and `back`; if its decoder takes more than
+    the encoder's maps, `inform`.
 
     The encoder is a classifier without its head, and takes the weights of one of the same options:
 
@@ -146,6 +147,10 @@ class DenseModel(Model):
         """The images (B, C, H, W), in floating point → what the network takes in."""
         return images
 
+    def inform(self, maps: list[Tensor], way: Any) -> list[Tensor]:
+        """The encoder's maps as the decoder takes them."""
+        return maps
+
     def to_pixels(self, x: Tensor, way: Any, size: Pair) -> Tensor:
         """The projected map (B, R, A, K) → (B, K, H, W), of what `look` gave."""
         raise NotImplementedError
@@ -175,6 +180,7 @@ class DenseModel(Model):
         seen = self.look(self.image_input(check_images(images), dtype), prepared.way)
         maps = self.encoder.run(seen, prepared.encoder)
         maps[-1] = self.encoder.norm(maps[-1])
+        maps = self.inform(maps, prepared.way)
         x = self.head.project(self.decoder(maps, prepared.positions))
         height, width = seen.shape[2:]
         logits = self.head.refine(self.to_pixels(x, prepared.way, (height, width)), seen)

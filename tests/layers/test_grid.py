@@ -3,7 +3,7 @@ import math
 import pytest
 import torch
 
-from darswin.layers.grid import PLACEMENTS, polar_grid
+from darswin.layers.grid import PLACEMENTS, polar_grid, token_rays
 from darswin.lens import Mei, Perspective, Polynomial, Spherical
 from darswin.lens.spacing import SPACINGS
 
@@ -192,3 +192,13 @@ def test_points_are_where_the_lens_projects_their_rays(spacing, aside):
 def test_a_grid_of_a_round_lens_has_no_offsets():
     grid = polar_grid(camera(), (1400, 1400), **SIZES)
     assert grid.affine is None and grid.offsets is None
+
+
+@pytest.mark.parametrize("spacing", ["theta", "g", "radius"])
+def test_tokens_look_where_the_middle_of_their_patch_does(spacing):
+    lens = Polynomial([16.0, 0.4, -0.1, 0.05], 2.0, [30.0, 35.0]).to(f64)
+    rays = token_rays(lens, rings=4, sectors=8, spacing=spacing)
+    grid = polar_grid(lens, (64, 64), rings=4, sectors=8, samples=(1, 1), spacing=spacing)
+    x, y = (grid.radii[0, :, None] * wave(grid.azimuths) for wave in (torch.cos, torch.sin))
+    pixels = torch.stack((x, y), -1) + grid.center[0]
+    torch.testing.assert_close(rays, lens.unproject_points(pixels[None]))

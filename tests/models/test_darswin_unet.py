@@ -50,8 +50,8 @@ def test_the_decoders_rings_are_those_of_the_grid(spacing):
     way = model.way(lens, (64, 64))
     grid = polar_grid(lens, (64, 64), rings=16, sectors=64, samples=(4, 4), spacing=spacing,
                       sample_spacing="radius")  # fmt: skip
-    torch.testing.assert_close(way.radii, grid.radii)
-    assert torch.equal(way.center, grid.center) and torch.equal(way.r_max, lens.r_max)
+    torch.testing.assert_close(way.grid.radii, grid.radii)
+    assert torch.equal(way.grid.center, grid.center) and torch.equal(way.grid.r_max, lens.r_max)
     # `polar_to_image` takes sector a to be where the samples of column a stand.
     assert torch.allclose(grid.azimuths, 2 * math.pi * (torch.arange(256) + 0.5) / 256)
 
@@ -94,11 +94,12 @@ EVEN = dict(periodic_bias=True)
         ("darswin_unet_ra_nano", {}, {1, 2, 3}),
         ("darswin_unet_ra_micro", EVEN, {1, 2, 3}),
         ("darswin_unet_ra_nano", dict(skip_width=8), set()),
+        ("darswin_unet_ra_nano", dict(rays=True), set()),  # it knows which way is up
         ("darswin_unet_a_nano", EVEN, {1, 2, 3}),
     ],
 )
 def test_a_turned_image_gives_turned_logits(name, options, turns):
-    model = network(name, **(dict(skip_width=0, in_chans=1) | options)).to(f64)
+    model = network(name, **(dict(skip_width=0, rays=False, in_chans=1) | options)).to(f64)
     lens = Spherical.from_fov(0.6, 2.6, 31.0).to(f64)
     image = torch.randn(1, 1, 64, 64, dtype=f64)  # a pixel at the very middle has no azimuth
     logits = model(image, lens)
