@@ -6,7 +6,7 @@ found, so that a study that was stopped goes on. The pictures are rendered first
 needs `apt-get install freedoom`.
 
 What 3 hours on 2 cores allow: 69 cells (7 models × 3 seeds × [labels from two bands, distances from
-one], and 6 controls) of 10,000 pictures seen at 24 to 28 ms, 24 test sets of 75 pictures at 12 ms
+one], and 6 controls) of 10,000 pictures seen at 20 to 27 ms, 24 test sets of 75 pictures at 12 ms
 and 8 s of starting are 69 × (260 + 22 + 8) s, the pictures 600 s of 85 ms each: 20,600 s on one
 core, 2.9 hours on two. Distances from "wide" would be 21 cells more.
 """
