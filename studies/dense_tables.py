@@ -130,7 +130,8 @@ def over_zones(cells: list[dict], task: str, band: str) -> str:
     """A row a model, a column a zone of θ; the mean over the real cameras."""
     found, score = runs_of(cells, task), SCORE[task]
     zones = next(iter(found.values()))[0][REAL[0]]["zones"] if found else []
-    heads = [f"{z['from_deg']:g}° to {z['to_deg'] or 'the rim'}".replace(".0", "") for z in zones]
+    ends = [f"{zone['to_deg']:g}°" if zone["to_deg"] else "the rim" for zone in zones]
+    heads = [f"{z['from_deg']:g}° to {end}" for z, end in zip(zones, ends, strict=True)]
 
     def of_zone(number: int) -> Callable[[dict], float]:
         return lambda run: statistics.mean(run[name]["zones"][number][score] for name in REAL)
