@@ -81,8 +81,10 @@ def draw_curves(cells: list[dict], trivial: dict, path: Path) -> None:
         axes.set(title=f'{task}, trained on "{band}"', ylabel=f"{NAMES[score]} (%)")
         axes.set(xlim=(0, 1), xlabel="distortion ξ")
         axes.grid(alpha=0.3)
-    handles, labels = panels[-1].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=4)
+    legends = [axes.get_legend_handles_labels() for axes in panels]
+    figure.legend(
+        *max(legends, key=lambda legend: len(legend[1])), loc="outside lower center", ncols=4
+    )
     save_figure(figure, path)
 
 
