@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/installed
 
-.PHONY: help build demo test test-lowest test-isa test-asan fuzz kills lint format bench study learned-lens tables docs dist wheels repair published-wheels test-torch aarch64 clean
+.PHONY: help build demo test test-lowest test-isa test-asan fuzz kills lint format bench study learned-lens worlds study-dense tables docs dist wheels repair published-wheels test-torch aarch64 clean
 
 help:  ## this list
 	@grep -E '^[a-z0-9-]+:.*##' Makefile | sed -E 's/:.*## /\t/' | expand -t 18
@@ -95,6 +95,12 @@ study: build  ## the paper's experiments, small: an hour; goes on where it was s
 
 learned-lens: build  ## find unknown lenses by gradient descent: ten minutes; goes on where it was stopped
 	$(BIN)/python studies/learned_lens.py
+
+worlds: build  ## render pictures, labels and distances of a game's worlds: 3 minutes; needs `apt-get install freedoom`
+	$(BIN)/python studies/render_worlds.py --out out/worlds
+
+study-dense: build  ## labels and distances through unknown lenses: 3 hours; goes on where it was stopped
+	$(BIN)/python studies/dense.py
 
 tables: $(STAMP)  ## fill the tables of README and docs from the results of bench and study
 	$(BIN)/python docs/fill.py

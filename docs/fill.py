@@ -60,6 +60,7 @@ def demo_table(record: dict) -> str:
 
 def tables() -> dict[str, str]:
     """All tables, by the name of their place in a page."""
+    import dense_tables
     import learned_tables
     import tables as study
 
@@ -71,6 +72,8 @@ def tables() -> dict[str, str]:
     training = json.loads((RESULTS / "training--micro.json").read_text())
     cells = json.loads((studies / "study--nano.json").read_text())["cells"]
     cameras = json.loads((studies / "learned_lens.json").read_text())["cameras"]
+    dense = studies / "dense.json"  # there once `make study-dense` has run
+    found = json.loads(dense.read_text()) if dense.exists() else None
     return {
         "demo": demo_table(json.loads((ROOT / "docs" / "accuracy.json").read_text())),
         "drop-in": drop_in_line(sampling),
@@ -85,6 +88,7 @@ def tables() -> dict[str, str]:
         "training": bench.training_table(training["models"]),
         **study.tables(cells),
         **learned_tables.tables(cameras),
+        **dense_tables.tables(found, studies),
     }
 
 

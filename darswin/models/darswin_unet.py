@@ -4,13 +4,11 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from darswin.layers.grid import PixelGrid, pixel_grid, token_rays
-from darswin.layers.linear import Linear
 from darswin.layers.sampling import check_lens
 from darswin.lens import Lens
-from darswin.models.base import init_weights
 from darswin.models.darswin import PRESETS, DarSwin
 from darswin.models.decoder import EXPANSION
 from darswin.models.dense import DenseModel, DenseTask
@@ -48,9 +46,9 @@ class DarSwinUnet(DenseModel):
             last; an int is for all.
         skip_width: channels of the skip from the image; 0 leaves it out.
         typical_distance: m, what "distance" starts from.
-        rays: adds to each of the encoder's maps, before the decoder, a learned linear function of
-            where its tokens look. Without it the network does not know which way is up in an image,
-            as its tokens know each other's places, but not their own azimuth.
+        places: adds to each of the encoder's maps, before the decoder, a learned linear function of
+            where its tokens look, (x, y, z). Without it the network does not know which way is up,
+            as its tokens know where others are, but not their own azimuth.
         mlp_ratio, drop_path_rate: as `DarSwin`, of encoder and decoder.
         mean, std: of uint8 images, which count as `(pixel/255 - mean) / std`; others ignore them.
         options: others of `DarSwin`, but for compat.
@@ -59,7 +57,7 @@ class DarSwinUnet(DenseModel):
     tokens at a stage. "darswin_unet_*_nano" has R×A = 16×64, unlike the classifier of that size.
 
     Rotation:
-        In eval mode, without `rays` and without the skip from the image (skip_width=0), whose
+        In eval mode, without `places` and without the skip from the image (skip_width=0), whose
         convolutions are not symmetric, a turn of a square image about the principal point by 90°
         turns the result by 90°, up to rounding, where it turns the maps of `DarSwin`: for
         "darswin_unet_ra_nano", and with `periodic_bias` for RA of every size and
@@ -86,7 +84,7 @@ class DarSwinUnet(DenseModel):
         decoder_depths: int | Sequence[int] = 2,
         skip_width: int = 16,
         typical_distance: float = 10.0,
-        rays: bool = True,
+        places: bool = True,
         mlp_ratio: float = 4.0,
         drop_path_rate: float = 0.2,
         mean: float | Sequence[float] = 0.0,
@@ -114,6 +112,7 @@ class DarSwinUnet(DenseModel):
             task=task,
             decoder_depths=decoder_depths,
             num_heads=num_heads,
+            coordinates=3 if places else 0,
             mlp_ratio=mlp_ratio,
             drop_path_rate=drop_path_rate,
             skip_width=skip_width,
@@ -121,10 +120,6 @@ class DarSwinUnet(DenseModel):
             mean=mean,
             std=std,
         )
-
-        infos = self.feature_info if rays else ()
-        self.rays = nn.ModuleList(Linear(3, info["num_chs"], bias=False) for info in infos)
-        self.rays.apply(init_weights)
 
     def way(self, lens: Lens | None, size: Pair) -> PolarWay:
         """The rings of the decoder's map and where they are in images of (H, W), and the rays."""
@@ -138,19 +133,15 @@ class DarSwinUnet(DenseModel):
             spacing=sample.spacing,
             sample_spacing=sample.sample_spacing,
         )
-        sizes = self.feature_info.get("map_size")[: len(self.rays)]
+        sizes = self.feature_info.get("map_size")[: len(self.places)]
         return PolarWay(
             grid,
             [token_rays(lens, rings=r, sectors=a, spacing=sample.spacing) for r, a in sizes],
         )
 
-    def inform(self, maps: list[Tensor], way: PolarWay) -> list[Tensor]:
-        """The encoder's maps, and where their tokens look."""
-        if not self.rays:
-            return maps
-        steps = zip(maps, self.rays, way.rays, strict=True)
-        dtype = next(self.rays.parameters()).dtype
-        return [x + layer(rays.to(x.device, dtype)).to(x.dtype) for x, layer, rays in steps]
+    def token_places(self, way: PolarWay) -> Sequence[Tensor]:
+        """Where the tokens of each of the encoder's maps look."""
+        return way.rays
 
     def to_pixels(self, x: Tensor, way: PolarWay, size: Pair) -> Tensor:
         """The projected map (B, 4·R, 4·A, K) → (B, K, H, W); 0 beyond θ_max."""

@@ -7,6 +7,7 @@ from torch import Tensor, nn
 
 from darswin.layers.embed import ImageInput
 from darswin.layers.heads import DistanceHead, PixelHead, SegmentationHead
+from darswin.layers.linear import Linear
 from darswin.layers.sampling import check_images
 from darswin.lens import Lens
 from darswin.models.base import Model, init_weights
@@ -41,8 +42,7 @@ class DenseModel(Model):
     the lens reaches has no meaning.
 
     A model makes `encoder` and `decoder`, then calls `_finish`; it defines `way`, `to_pixels` and,
-    if it does not look at the images themselves, `look` and `back`; if its decoder takes more than
-    the encoder's maps, `inform`.
+    if it does not look at the images themselves, `look` and `back`; and `token_places`.
 
     The encoder is a classifier without its head, and takes the weights of one of the same options:
 
@@ -69,6 +69,7 @@ class DenseModel(Model):
         task: DenseTask,
         decoder_depths: int | Sequence[int],
         num_heads: Sequence[int],
+        coordinates: int,
         mlp_ratio: float,
         drop_path_rate: float,
         skip_width: int,
@@ -76,7 +77,10 @@ class DenseModel(Model):
         mean: float | Sequence[float],
         std: float | Sequence[float],
     ) -> None:
-        """Makes what follows the encoder, initialises it, and says what the model is."""
+        """Makes what follows the encoder, initialises it, and says what the model is.
+
+        `coordinates` are those of a place of `token_places`; 0 leaves the places out.
+        """
         if task not in get_args(DenseTask):
             raise ValueError(f"task must be one of {get_args(DenseTask)}, got {task!r}")
         if skip_width < 0:
@@ -95,6 +99,10 @@ class DenseModel(Model):
             attention=encoder.attention,
             mlp_ratio=mlp_ratio,
             drop_path_rate=drop_path_rate,
+        ).apply(init_weights)
+        told = self.feature_info if coordinates else ()
+        self.places = nn.ModuleList(
+            Linear(coordinates, info["num_chs"], bias=False) for info in told
         ).apply(init_weights)
         self.reset_classifier(num_classes)
         head = f"{task}_head"
@@ -147,9 +155,9 @@ class DenseModel(Model):
         """The images (B, C, H, W), in floating point → what the network takes in."""
         return images
 
-    def inform(self, maps: list[Tensor], way: Any) -> list[Tensor]:
-        """The encoder's maps as the decoder takes them."""
-        return maps
+    def token_places(self, way: Any) -> Sequence[Tensor]:
+        """Where the tokens of each of the encoder's maps are, (N or 1, R, A, coordinates)."""
+        raise NotImplementedError
 
     def to_pixels(self, x: Tensor, way: Any, size: Pair) -> Tensor:
         """The projected map (B, R, A, K) → (B, K, H, W), of what `look` gave."""
@@ -180,11 +188,18 @@ class DenseModel(Model):
         seen = self.look(self.image_input(check_images(images), dtype), prepared.way)
         maps = self.encoder.run(seen, prepared.encoder)
         maps[-1] = self.encoder.norm(maps[-1])
-        maps = self.inform(maps, prepared.way)
+        if self.places:
+            maps = self._told(maps, self.token_places(prepared.way))
         x = self.head.project(self.decoder(maps, prepared.positions))
         height, width = seen.shape[2:]
         logits = self.head.refine(self.to_pixels(x, prepared.way, (height, width)), seen)
         return self.head.finish(self.back(logits, prepared.way))
+
+    def _told(self, maps: Sequence[Tensor], places: Sequence[Tensor]) -> list[Tensor]:
+        """The encoder's maps, whose tokens are told where they are."""
+        dtype = next(self.places.parameters()).dtype
+        steps = zip(maps, self.places, places, strict=True)
+        return [x + layer(place.to(x.device, dtype)).to(x.dtype) for x, layer, place in steps]
 
     def forward(self, images: Tensor, lens: Lens | None = None) -> Tensor:
         """Images (B, C, H, W) and their lenses (B or 1) → (B, num_classes, H, W)."""

@@ -4,6 +4,7 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
+import torch
 import torch.nn.functional as F
 from torch import Tensor
 
@@ -35,6 +36,8 @@ class SwinUnet(DenseModel):
         image_size: (H, W), or the side of a square. patch_size: its side, in pixels.
         window: (rows, columns) where the map is large enough.
         task, decoder_depths, skip_width, typical_distance: as `DarSwinUnet`.
+        places: adds to each of the encoder's maps, before the decoder, a learned linear function of
+            where its tokens are in what the network looks at, x and y in [-1, 1].
         mlp_ratio, drop_path_rate: as `Swin`, of encoder and decoder.
         mean, std: of uint8 images, which count as `(pixel/255 - mean) / std`; others ignore them.
 
@@ -64,6 +67,7 @@ class SwinUnet(DenseModel):
         decoder_depths: int | Sequence[int] = 2,
         skip_width: int = 16,
         typical_distance: float = 10.0,
+        places: bool = True,
         mlp_ratio: float = 4.0,
         drop_path_rate: float = 0.2,
         mean: float | Sequence[float] = 0.0,
@@ -91,6 +95,7 @@ class SwinUnet(DenseModel):
             task=task,
             decoder_depths=decoder_depths,
             num_heads=num_heads,
+            coordinates=2 if places else 0,
             mlp_ratio=mlp_ratio,
             drop_path_rate=drop_path_rate,
             skip_width=skip_width,
@@ -99,12 +104,25 @@ class SwinUnet(DenseModel):
             std=std,
         )
 
+    def token_places(self, way: Any) -> Sequence[Tensor]:
+        """Where the tokens of each of the encoder's maps are, (1, H', W', 2)."""
+        device = self.head.proj.weight.device
+        sides = (
+            [_centers(side, device) for side in size] for size in self.feature_info.get("map_size")
+        )
+        return [torch.stack(torch.meshgrid(x, y, indexing="xy"), -1)[None] for y, x in sides]
+
     def to_pixels(self, x: Tensor, way: Any, size: Pair) -> Tensor:
         """The projected map (B, H', W', K) → (B, K, H, W)."""
         x = x.permute(0, 3, 1, 2)
         if x.shape[2:] == size:
             return x
         return F.interpolate(x, size, mode="bilinear", align_corners=False)
+
+
+def _centers(count: int, device: torch.device) -> Tensor:
+    """The middles of equal parts of [-1, 1]."""
+    return (2 * torch.arange(count, device=device) + 1) / count - 1
 
 
 @register_model("swin_unet_undis", presets=_PRESETS)

@@ -6,6 +6,7 @@ checked against what declares it: the Makefile, pyproject.toml, the programs' ow
 """
 
 import ast
+import importlib
 import re
 import runpy
 import shlex
@@ -27,7 +28,6 @@ from darswin.cli.main import main
 ROOT = Path(__file__).parents[2]
 sys.path.insert(0, str(ROOT / "studies"))
 
-import study  # noqa: E402
 
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 FENCE = re.compile(r"^(`{3,}|:{3,})(\S*)[^\n]*\n(.*?)^\1$", re.M | re.S)
@@ -147,10 +147,13 @@ def check_pip(arguments: list[str], monkeypatch) -> None:
 
 def check_study(arguments: list[str], monkeypatch) -> None:
     """Its own options are read as it reads them, the others as `darswin fit` does."""
-    asked: list = []
-    monkeypatch.setattr(study, "run_all", lambda _, jobs, *rest: asked.extend(jobs) or [])
-    monkeypatch.setattr(study, "collect", lambda *results: None)
-    study.main(arguments[1:])
+    assert arguments[0] in ("studies/study.py", "studies/dense.py")
+    program, asked = importlib.import_module(Path(arguments[0]).stem), []
+    monkeypatch.setattr(program, "run_all", lambda _, jobs, *rest: asked.extend(jobs) or [])
+    monkeypatch.setattr(program, "collect", lambda *results: None)
+    if program.__name__ == "dense":
+        monkeypatch.setattr(program.dense_data, "make", lambda *pictures: None)
+    program.main(arguments[1:])
     *_, options = asked[0]
     with pytest.raises(SystemExit) as end:
         main(["fit", "--run", "runs/parsed", "--data.path", "digits", *options, "--print_config"])

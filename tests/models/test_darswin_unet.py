@@ -94,12 +94,12 @@ EVEN = dict(periodic_bias=True)
         ("darswin_unet_ra_nano", {}, {1, 2, 3}),
         ("darswin_unet_ra_micro", EVEN, {1, 2, 3}),
         ("darswin_unet_ra_nano", dict(skip_width=8), set()),
-        ("darswin_unet_ra_nano", dict(rays=True), set()),  # it knows which way is up
+        ("darswin_unet_ra_nano", dict(places=True), set()),  # it knows which way is up
         ("darswin_unet_a_nano", EVEN, {1, 2, 3}),
     ],
 )
 def test_a_turned_image_gives_turned_logits(name, options, turns):
-    model = network(name, **(dict(skip_width=0, rays=False, in_chans=1) | options)).to(f64)
+    model = network(name, **(dict(skip_width=0, places=False, in_chans=1) | options)).to(f64)
     lens = Spherical.from_fov(0.6, 2.6, 31.0).to(f64)
     image = torch.randn(1, 1, 64, 64, dtype=f64)  # a pixel at the very middle has no azimuth
     logits = model(image, lens)

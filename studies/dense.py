@@ -1,0 +1,122 @@
+"""Runs the dense study: a label or a distance for each pixel, through lenses not trained on.
+
+Each cell is `darswin fit` and `darswin test` on one core; its folder under `--out` keeps what it
+found, so that a study that was stopped goes on. The pictures are rendered first, once: see
+`dense_data.py`. `dense_tables.py` makes tables and pictures. Run it with `make study-dense`, which
+needs `apt-get install freedoom`.
+
+What 3 hours on 2 cores allow: 69 cells (7 models × 3 seeds × [labels from two bands, distances from
+one], and 6 controls) of 10,000 pictures seen at 20 to 27 ms, 24 test sets of 75 pictures at 12 ms
+and 8 s of starting are 69 × (260 + 22 + 8) s, the pictures 600 s of 85 ms each: 20,600 s on one
+core, 2.9 hours on two. Distances from "wide" would be 21 cells more.
+"""
+
+import argparse
+import json
+import os
+import time
+from pathlib import Path
+
+import dense_data
+from dense_cells import Cell, all_cells
+from dense_pictures import predict
+from dense_tables import collect
+from dense_trivial import trivial
+from jobs import printing_to, run_all
+
+from darswin.cli.main import main as darswin
+from darswin.utils.files import replace_file
+
+HERE = Path(__file__).parent
+CONFIG = HERE / "dense.yaml"
+# What is kept of a test's row, in all and for each zone.
+SCORES = {
+    "segmentation": ("miou", "accuracy", "miou_sr"),
+    "distance": ("delta1", "abs_rel", "rmse", "delta1_sr", "abs_rel_sr"),
+}
+
+
+def run_cell(cell: Cell, out: Path, size: str, options: list[str]) -> dict:
+    """Trains and tests one cell, or reads what an earlier run found."""
+    folder, data = out / size / cell.key, out / "data"
+    found = folder / "cell.json"
+    given = dict(config=CONFIG.read_text(), options=list(cell.options), arguments=options)
+    if found.exists():
+        result = json.loads(found.read_text())
+        if result["given"] != given:
+            raise ValueError(f"{found} was made otherwise: remove it, or give the same options")
+        return result
+    run = ["--task", cell.task, "--run", str(folder)]
+    model = ["--model.name", f"{cell.family}_{size}", "--seed_everything", str(cell.seed)]
+    pictures = ["--data.path", str(data / "train" / cell.trained_on), *cell.options, *options]
+    tests = [str(data / "test" / name) for name in dense_data.test_sets()]
+    folder.mkdir(parents=True, exist_ok=True)
+    start = time.perf_counter()
+    with printing_to(folder / "log.txt"):
+        darswin(["fit", *run, "--config", str(CONFIG), *model, *pictures, "--resume"])
+        trained = time.perf_counter()
+        darswin(["test", *run, "--data.test_paths", json.dumps(tests)])
+        if cell.seed == 0 and cell.band == "low" and not cell.shuffled:
+            predict(folder, data, cell.task)
+    rows = json.loads((folder / "test.json").read_text())["results"]
+    result = dict(
+        label=cell.label,
+        band=cell.band,
+        task=cell.task,
+        seed=cell.seed,
+        shuffled=cell.shuffled,
+        model=f"{cell.family}_{size}",
+        given=given,
+        sets={row["data"]: summary(row, cell.task) for row in rows},
+        seconds=dict(train=trained - start, test=time.perf_counter() - trained),
+    )
+    replace_file(found, json.dumps(result, indent=1))
+    return result
+
+
+def summary(row: dict, task: str) -> dict:
+    """What is kept of a test set's row."""
+
+    def scores(of: dict) -> dict:
+        return {name: None if of[name] is None else round(of[name], 5) for name in SCORES[task]}
+
+    zones = [
+        {"from_deg": zone["from_deg"], "to_deg": zone["to_deg"]} | scores(zone)
+        for zone in row["per_zone"]
+    ]
+    classes = {
+        name: None if of["iou"] is None else round(of["iou"], 5)
+        for name, of in row["per_class"].items()
+    }
+    return scores(row) | dict(zones=zones) | (dict(iou=classes) if classes else {})
+
+
+def main(arguments: list[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--cell", help="only the cells whose key has this in it")
+    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--size", default="nano", help="of the models")
+    parser.add_argument("--pixels", type=int, default=dense_data.SIZE, help="of the pictures")
+    parser.add_argument(
+        "--pictures", type=int, nargs=3, default=dense_data.PICTURES,
+        metavar=("TRAIN", "VAL", "TEST"), help="of each lens",
+    )  # fmt: skip
+    parser.add_argument("--processes", type=int, default=os.cpu_count())
+    parser.add_argument("--out", type=Path, default=Path("out/dense"))
+    parser.add_argument("--results", type=Path, default=HERE / "results")
+    args, options = parser.parse_known_args(arguments)  # the others are options of `darswin fit`
+    cells = [cell for cell in all_cells(args.seeds) if (args.cell or "") in cell.key]
+    start = time.perf_counter()
+    dense_data.make(args.out / "data", args.processes, args.pixels, tuple(args.pictures))
+    print(f"pictures after {time.perf_counter() - start:.0f} s")
+    jobs = [(cell, args.out, args.size, options) for cell in cells]
+    results = run_all(run_cell, jobs, args.processes, "cell")
+    print(f"{len(results)} cells after {time.perf_counter() - start:.0f} s")
+    if args.cell:
+        print(json.dumps(results, indent=1))
+    else:
+        collect(results, trivial(args.out), args.out, args.results, args.size)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,72 @@
+"""The cells of the dense study: which model is trained on which lenses, for which task."""
+
+from dataclasses import dataclass
+
+from dense_data import SHUFFLED
+
+# Every picture as a lens of any ξ would have seen it.
+THROUGH_ANY = ("--data.lens_augmentation", "0..1")
+
+MODELS: dict[str, tuple[str, tuple[str, ...]]] = {
+    "DarSwin-Unet A": ("darswin_unet_a", ()),
+    "DarSwin-Unet RA": ("darswin_unet_ra", ()),
+    "Swin-Unet": ("swin_unet", ()),
+    "Swin-Unet (undis)": ("swin_unet_undis", ()),
+    "LensAdapter(Swin-Unet)": ("swin_unet_adapted", ()),
+    "LensAdapter, lens augmentation": ("swin_unet_adapted", THROUGH_ANY),
+    "Swin-Unet, lens augmentation": ("swin_unet", THROUGH_ANY),
+}
+# What is trained, and on which of the bands. Distance is left out for "wide": see dense.py.
+STUDIED = (("segmentation", "wide"), ("segmentation", "low"), ("distance", "low"))
+TASKS = ("segmentation", "distance")
+CONTROLLED = ("DarSwin-Unet A", "LensAdapter(Swin-Unet)")
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A model, the lenses that it is trained on, its task and its seed.
+
+    Attributes: shuffled: a control, in which each training picture is said to have been taken with
+    another one's lens.
+    """
+
+    label: str
+    band: str
+    task: str
+    seed: int = 0
+    shuffled: bool = False
+
+    @property
+    def family(self) -> str:
+        """The model's name without its size."""
+        return MODELS[self.label][0]
+
+    @property
+    def options(self) -> tuple[str, ...]:
+        """Of `darswin fit`."""
+        return MODELS[self.label][1]
+
+    @property
+    def trained_on(self) -> str:
+        """The folder of its training pictures."""
+        return f"{SHUFFLED}-{self.band}" if self.shuffled else self.band
+
+    @property
+    def key(self) -> str:
+        """The name of its folder."""
+        words = f"{self.label} {self.trained_on} {self.task} {self.seed}".lower()
+        return "-".join("".join(c if c.isalnum() else " " for c in words).split())
+
+
+def all_cells(seeds: int) -> list[Cell]:
+    """Seed by seed, so that what is stopped has whole tables; the controls after the first."""
+    cells = []
+    for seed in range(seeds):
+        cells += [Cell(label, band, task, seed) for task, band in STUDIED for label in MODELS]
+        if seed == 0:
+            cells += [
+                Cell(label, band, task, seed, shuffled=True)
+                for task, band in STUDIED
+                for label in CONTROLLED
+            ]
+    return cells

@@ -1,0 +1,107 @@
+"""The pictures of the dense study: worlds through lenses to train on and to test through.
+
+All test sets show the same poses, in maps that no training picture is of.
+"""
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+from jobs import run_all
+from worlds.dataset import Target, jobs_of, write_map
+from worlds.lenses import draw_lens
+
+from darswin.lens import save
+
+FOV = math.radians(165)  # full, of the lenses given by ξ
+SIZE = 128  # px
+PICTURES = 2000, 16, 75  # to train on, of validation, and of each test set: 5 a map
+
+# What is trained on: perspective lenses of 60° to 90°, and one band of ξ.
+BANDS = {"wide": "wide", "low": "0.2..0.35"}
+SWEEP = [f"{k / 10:g}" for k in range(11)]  # ξ = 0, 0.1, …, 1
+
+FILES = Path(__file__).parent.parent / "tests" / "lens" / "files"
+CAMERAS = {
+    "WoodScape front": "woodscape.json",
+    "SynWoodScape front": "synwoodscape.json",
+    "KITTI-360 left": "kitti360_02.yaml",
+    "KITTI-360 right": "kitti360_03.yaml",
+    "TUM-VI left": "kalibr_tumvi.yaml:cam0",
+    "OCamCalib": "ocamcalib.txt",
+}
+
+# The controls: what pictures are said to have been taken with is not true.
+TOLD = "0.275"  # the middle of "low"
+WRONG = ("0", "0.5", "1")  # the ξ of pictures that are said to be of TOLD
+SHUFFLED = "shuffled"  # each is said to be of another picture's lens
+
+
+def xi_set(xi: str) -> str:
+    """The name of the test set of one ξ."""
+    return f"xi-{xi}"
+
+
+def camera_set(name: str) -> str:
+    """The name of the test set of a real camera."""
+    return name.lower().replace(" ", "-")
+
+
+def test_sets() -> list[str]:
+    """The folders of all test sets."""
+    sets = [xi_set(xi) for xi in SWEEP] + [f"band-{band}" for band in BANDS]
+    sets += [camera_set(name) for name in CAMERAS]
+    sets += [f"wrong-{xi}" for xi in WRONG] + [f"{SHUFFLED}-band-{band}" for band in BANDS]
+    return sets
+
+
+def make(root: Path, processes: int, size: int, counts: tuple[int, int, int]) -> None:
+    """Renders what is missing of it into `root/train` and `root/test`, and the controls."""
+    train, val, test = counts
+    to_train = [Target(str(root / "train" / b), lenses, FOV) for b, lenses in BANDS.items()]
+    lenses = {xi_set(xi): xi for xi in SWEEP}
+    lenses |= {f"band-{band}": name for band, name in BANDS.items()}
+    lenses |= {camera_set(name): str(FILES / file) for name, file in CAMERAS.items()}
+    to_test = [Target(str(root / "test" / name), lens, FOV) for name, lens in lenses.items()]
+    jobs = jobs_of(to_train, "train", train, size, 0) + jobs_of(to_train, "val", val, size, 0)
+    jobs += jobs_of(to_test, "test", test, size, 0)
+    run_all(write_map, jobs, processes, "map")
+    told = draw_lens(TOLD, size, FOV, np.random.default_rng(0))
+    for xi in WRONG:
+        folder = same_pictures(root / "test" / xi_set(xi), root / "test" / f"wrong-{xi}", "test")
+        save(told, folder / "lens.json")
+    for band in BANDS:
+        name = f"band-{band}"
+        shuffle(root / "test" / name, root / "test" / f"{SHUFFLED}-{name}", "test")
+        shuffled = root / "train" / f"{SHUFFLED}-{band}"
+        shuffle(root / "train" / band, shuffled, "train")
+        shuffle(root / "train" / band, shuffled, "val")
+
+
+def shuffle(source: Path, copy: Path, split: str) -> None:
+    """The same pictures, each with the lens of another one."""
+    folder = same_pictures(source, copy, split)
+    (folder / "lenses").mkdir(exist_ok=True)
+    files = sorted((source / split / "lenses").iterdir())
+    order = np.random.default_rng(0).permutation(len(files))
+    for file, other in zip(files, np.roll(order, 1)[np.argsort(order)], strict=True):
+        (folder / "lenses" / file.name).write_text(files[other].read_text())
+
+
+def same_pictures(source: Path, copy: Path, split: str) -> Path:
+    """`copy/split` with the pictures, labels and distances of `source/split`, as links."""
+    folder = copy / split
+    folder.mkdir(parents=True, exist_ok=True)
+    for place, target in (
+        (copy / "classes.json", source / "classes.json"),
+        *((folder / kind, source / split / kind) for kind in ("images", "labels", "distance")),
+    ):
+        place.unlink(missing_ok=True)
+        place.symlink_to(target.resolve())
+    return folder
+
+
+def classes(root: Path) -> list[str]:
+    """The names of the classes."""
+    return json.loads((root / "train" / "low" / "classes.json").read_text())["names"]

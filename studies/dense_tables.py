@@ -1,0 +1,229 @@
+"""The tables and the pictures of the dense study, from what its cells found."""
+
+import statistics
+from collections import defaultdict
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from dense_cells import CONTROLLED, MODELS, STUDIED, TASKS, Cell
+from dense_data import CAMERAS, SHUFFLED, SWEEP, WRONG, camera_set, xi_set
+from dense_pictures import draw
+from matplotlib.figure import Figure
+from tables import spread
+
+from darswin.bench.machine import machine
+from darswin.bench.record import write
+from darswin.bench.tables import markdown
+from darswin.viz.plot import save_figure
+
+SCORE = {"segmentation": "miou", "distance": "delta1"}
+NAMES = {"miou": "mIoU", "delta1": "δ1"}
+SHADED = {"wide": (0.0, 0.0), "low": (0.2, 0.35)}  # ξ of the training lenses
+REAL = [camera_set(name) for name in CAMERAS]
+ALL_XI = [xi_set(xi) for xi in SWEEP]
+NOT_RUN = "Not run yet: `make study-dense`."
+
+
+def collect(cells: list[dict], trivial: dict, out: Path, folder: Path, size: str) -> None:
+    """Writes the results of a study, with the machine and versions, and draws its pictures."""
+    cells = sorted(
+        cells, key=lambda c: (c["task"], c["band"], c["label"], c["shuffled"], c["seed"])
+    )
+    kept = [{k: v for k, v in cell.items() if k != "given"} for cell in cells]
+    given = cells[0]["given"]["config"] if cells else ""
+    write(
+        folder / "dense.json",
+        machine=machine(), size=size, config=given, trivial=trivial, cells=kept,
+    )  # fmt: skip
+    draw_curves(kept, trivial, folder / "dense.png")
+    for task in TASKS:
+        runs = {
+            label: out / size / Cell(label, "low", task).key
+            for label in MODELS
+            if (out / size / Cell(label, "low", task).key / "shown.npz").exists()
+        }
+        if runs:
+            draw(runs, out / "data", task, folder / f"dense_{task}.png")
+
+
+def runs_of(cells: list[dict], task: str, shuffled: bool = False) -> dict[tuple, list[dict]]:
+    """What the test sets of every seed found, by label and band."""
+    found = defaultdict(list)
+    for cell in cells:
+        if cell["task"] == task and cell["shuffled"] == shuffled:
+            found[cell["label"], cell["band"]].append(cell["sets"])
+    return found
+
+
+def mean_of(sets: dict, names: Sequence[str], score: str) -> float:
+    """The mean of a score over test sets."""
+    return statistics.mean(sets[name][score] for name in names)
+
+
+def draw_curves(cells: list[dict], trivial: dict, path: Path) -> None:
+    """mIoU and δ1 against ξ: a panel for each task and training band, which is shaded; lines are
+    means of the seeds, bands their span, dots what is said of a direction without looking."""
+    figure, xi = Figure(figsize=(13, 4.8), layout="constrained"), [float(name) for name in SWEEP]
+    panels = figure.subplots(1, len(STUDIED), squeeze=False)[0]
+    for axes, (task, band) in zip(panels, STUDIED, strict=True):
+        found, score, (low, high) = runs_of(cells, task), SCORE[task], SHADED[band]
+        if high > low:
+            axes.axvspan(low, high, color="tab:pink", alpha=0.3, lw=0)
+        for label in MODELS:
+            runs = found.get((label, band))
+            if runs:
+                values = [[100 * run[name][score] for run in runs] for name in ALL_XI]
+                (line,) = axes.plot(xi, list(map(statistics.mean, values)), label=label)
+                ends = list(map(min, values)), list(map(max, values))
+                axes.fill_between(xi, *ends, color=line.get_color(), alpha=0.2, lw=0)
+        blind = [100 * trivial[task]["direction"][name][score] for name in ALL_XI]
+        axes.plot(xi, blind, color="black", ls=":", label="by direction alone")
+        axes.set(title=f'{task}, trained on "{band}"', ylabel=f"{NAMES[score]} (%)")
+        axes.set(xlim=(0, 1), xlabel="distortion ξ")
+        axes.grid(alpha=0.3)
+    legends = [axes.get_legend_handles_labels() for axes in panels]
+    figure.legend(
+        *max(legends, key=lambda legend: len(legend[1])), loc="outside lower center", ncols=4
+    )
+    save_figure(figure, path)
+
+
+# -- tables -----------------------------------------------------------------------------------
+
+
+def over_lenses(cells: list[dict], trivial: dict, task: str, band: str) -> str:
+    """A row a model, trained on a band: the score on its own lenses, on ξ and on real cameras."""
+    found, score = runs_of(cells, task), SCORE[task]
+    columns = {
+        "its own lenses": [f"band-{band}"],
+        "ξ = 0": [xi_set("0")],
+        "ξ = 0.5": [xi_set("0.5")],
+        "ξ = 1": [xi_set("1")],
+        "all ξ": ALL_XI,
+        "real cameras": REAL,
+    }
+    rows = _model_rows(found, band, score, list(columns.values()))
+    for name, sets in trivial[task].items():
+        rows.append(
+            [
+                f"by {name} alone",
+                *(f"{100 * mean_of(sets, s, score):.1f}" for s in columns.values()),
+            ]
+        )
+    return markdown([f"{NAMES[score]} (%)", *columns], rows)
+
+
+def over_cameras(cells: list[dict], task: str, band: str) -> str:
+    """A row a model, a column a real camera."""
+    score = SCORE[task]
+    rows = _model_rows(runs_of(cells, task), band, score, [[name] for name in REAL])
+    return markdown([f"{NAMES[score]} (%)", *CAMERAS], rows)
+
+
+def errors(cells: list[dict], band: str) -> str:
+    """AbsRel, a row a model."""
+    found = runs_of(cells, "distance")
+    sets = {"its own lenses": [f"band-{band}"], "all ξ": ALL_XI, "real cameras": REAL}
+    rows = _model_rows(found, band, "abs_rel", list(sets.values()))
+    return markdown(["AbsRel (%)", *sets], rows)
+
+
+def over_zones(cells: list[dict], task: str, band: str) -> str:
+    """A row a model, a column a zone of θ; the mean over the real cameras."""
+    found, score = runs_of(cells, task), SCORE[task]
+    zones = next(iter(found.values()))[0][REAL[0]]["zones"] if found else []
+    ends = [f"{zone['to_deg']:g}°" if zone["to_deg"] else "the rim" for zone in zones]
+    heads = [f"{z['from_deg']:g}° to {end}" for z, end in zip(zones, ends, strict=True)]
+
+    def of_zone(number: int) -> Callable[[dict], float]:
+        return lambda run: statistics.mean(run[name]["zones"][number][score] for name in REAL)
+
+    rows = [
+        [label, *(_spread(found.get((label, band)), of_zone(k)) for k in range(len(zones)))]
+        for label in MODELS
+    ]
+    return markdown([f"{NAMES[score]} (%)", *heads], rows)
+
+
+def controls(cells: list[dict], task: str, band: str) -> str:
+    """What happens where the lens is not the true one."""
+    true, shuffled = runs_of(cells, task), runs_of(cells, task, shuffled=True)
+    score, own = SCORE[task], f"band-{band}"
+    told, tests = [xi_set(xi) for xi in WRONG], [f"wrong-{xi}" for xi in WRONG]
+    rows = []
+    for label in MODELS:
+        runs = true.get((label, band))
+        row = [label]
+        for names in (told, tests, [own], [f"{SHUFFLED}-{own}"]):
+            row.append(_spread(runs, lambda run, names=names: mean_of(run, names, score)))
+        control = shuffled.get((label, band))
+        row.append(
+            _spread(control, lambda run: mean_of(run, [own], score)) if label in CONTROLLED else "–"
+        )
+        rows.append(row)
+    heads = [
+        "ξ 0, 0.5, 1, true", "said to be 0.275", "own lenses, true", "shuffled in testing",
+        "shuffled in training",
+    ]  # fmt: skip
+    return markdown([f"{NAMES[score]} (%)", *heads], rows)
+
+
+def _model_rows(
+    found: dict[tuple, list[dict]], band: str, score: str, columns: Sequence[Sequence[str]]
+) -> list[list[str]]:
+    return [
+        [
+            label,
+            *(
+                _spread(found.get((label, band)), lambda run, s=sets: mean_of(run, s, score))
+                for sets in columns
+            ),
+        ]
+        for label in MODELS
+    ]
+
+
+def _spread(runs: list[dict] | None, value: Callable[[dict], float]) -> str:
+    return spread([100 * value(run) for run in runs]) if runs else "not run"
+
+
+def times(cells: list[dict]) -> str:
+    """How long a cell took, in seconds on one core."""
+    rows = []
+    for task in TASKS:
+        of_task = [cell["seconds"] for cell in cells if cell["task"] == task]
+        if of_task:
+            train, test = (statistics.mean(s[part] for s in of_task) for part in ("train", "test"))
+            rows.append([task, str(len(of_task)), f"{train:.0f}", f"{test:.0f}"])
+    return markdown(["task", "cells", "training, s", "testing, s"], rows)
+
+
+def tables(record: dict | None, folder: Path) -> dict[str, str]:
+    """The tables and pictures, by the name of their place in a page; without a record, a line."""
+    made: dict[str, str] = {}
+    for task, band in STUDIED:
+        made |= _of_band(record, task, band)
+    for name, file, title in (
+        ("curves", "dense", "Scores over ξ"),
+        *((f"pictures {task}", f"dense_{task}", "Predictions") for task in TASKS),
+    ):
+        there = (folder / f"{file}.png").exists()
+        made[f"dense {name}"] = f"![{title}](../studies/results/{file}.png)" if there else NOT_RUN
+    cells = record["cells"] if record else []
+    made["dense times"] = times(cells) if cells else NOT_RUN
+    return made
+
+
+def _of_band(record: dict | None, task: str, band: str) -> dict[str, str]:
+    name = f"dense {task} {band}"
+    kinds = {
+        name: lambda cells, trivial: over_lenses(cells, trivial, task, band),
+        f"{name} zones": lambda cells, _: over_zones(cells, task, band),
+        f"{name} controls": lambda cells, _: controls(cells, task, band),
+        f"{name} cameras": lambda cells, _: over_cameras(cells, task, band),
+    }
+    if task == "distance":
+        kinds[f"{name} errors"] = lambda cells, _: errors(cells, band)
+    if record is None:
+        return dict.fromkeys(kinds, NOT_RUN)
+    return {name: made(record["cells"], record["trivial"]) for name, made in kinds.items()}

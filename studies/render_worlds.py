@@ -1,0 +1,51 @@
+"""Renders pictures, labels and distances of Freedoom's worlds through lenses.
+
+The textures are a game's, drawn by hand, under the BSD licence: `apt-get install freedoom`,
+https://freedoom.github.io. Training, validation and test pictures are of different maps. What is
+written is a data set for `darswin fit --task segmentation` and `--task distance`; a rendering that
+was stopped goes on. `make worlds` makes a small one.
+"""
+
+import argparse
+import math
+import os
+import time
+from pathlib import Path
+
+from jobs import run_all
+from worlds.dataset import SPLITS, Target, jobs_of, write_map
+from worlds.sheet import draw_sheet
+
+
+def main(arguments: list[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--out", type=Path, default=Path("out/worlds"))
+    parser.add_argument(
+        "--lens",
+        default="0..1",
+        help='"wide", ξ as "0.4", a range as "0.2..0.35", "polynomial", or a FILE[:CAMERA]',
+    )
+    parser.add_argument("--fov-deg", type=float, default=165, help="full, of lenses given by ξ")
+    parser.add_argument("--size", type=int, default=128, help="of the square pictures, px")
+    parser.add_argument("--train", type=int, default=1000, help="pictures")
+    parser.add_argument("--val", type=int, default=100, help="pictures")
+    parser.add_argument("--test", type=int, default=200, help="pictures")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--processes", type=int, default=os.cpu_count())
+    parser.add_argument("--sheet", type=Path, help="only draws a few pictures side by side, here")
+    args = parser.parse_args(arguments)
+    if args.sheet:
+        draw_sheet(args.sheet)
+        return
+    target = Target(str(args.out), args.lens, math.radians(args.fov_deg))
+    start = time.perf_counter()
+    jobs = []
+    for split in SPLITS:
+        jobs += jobs_of([target], split, getattr(args, split), args.size, args.seed)
+    run_all(write_map, jobs, args.processes, "map")
+    pictures = sum(job[4] for job in jobs)
+    print(f"{pictures} pictures in {args.out} after {time.perf_counter() - start:.0f} s")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,113 @@
+"""Writes what random poses see, through one lens or several, as folders that darswin reads."""
+
+import json
+import math
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from darswin.lens import to_dict
+from darswin.utils.files import replace_file
+from worlds.geometry import CLASSES, COLORS
+from worlds.lenses import draw_lens, is_one
+from worlds.poses import poses_of
+from worlds.render import View, rays_of, render
+from worlds.scene import Scene
+from worlds.textures import Textures
+from worlds.wad import load_map, map_names
+
+DISTANCE_UNIT = 256  # steps a metre in the PNGs of 16 bits
+SPLITS = ("train", "val", "test")
+
+
+@dataclass(frozen=True)
+class Target:
+    """A data set: its folder, and its lenses by a name of `draw_lens` and a field of view (rad)."""
+
+    folder: str
+    lenses: str
+    fov: float = math.radians(165)
+
+
+def write_map(name: str, split: str, targets: Sequence[Target], size: int, count: int, seed: int):
+    """Writes the pictures of one map into `split` of each target; all see the same poses.
+
+    A map that is there already is left as it is: its `done/MAP.json` is written last and says how
+    it was made.
+
+    Raises:
+        ValueError: what is there was made otherwise.
+    """
+    made = {t: dict(lenses=t.lenses, fov=t.fov, size=size, count=count, seed=seed) for t in targets}
+    open_targets = [t for t in targets if not _is_done(_done(t, split, name), made[t])]
+    if not open_targets:
+        return {}
+    wad, world = load_map(name)
+    scene = Scene(world, Textures(wad))
+    poses = poses_of(scene, name, count, seed)
+    for target in open_targets:
+        folder = Path(target.folder) / split
+        for kind in ("images", "labels", "distance", "done", *_lens_folder(target)):
+            (folder / kind).mkdir(parents=True, exist_ok=True)
+        rays = None
+        for k, pose in enumerate(poses):
+            stem = f"{name}-{k:03d}"
+            if rays is None or not is_one(target.lenses):
+                key = zlib.crc32(f"{target.lenses} {stem}".encode())
+                rng = np.random.default_rng([seed, key])
+                lens = draw_lens(target.lenses, size, target.fov, rng)
+                file = f"lenses/{stem}.json" if _lens_folder(target) else "lens.json"
+                (folder / file).write_text(json.dumps(to_dict(lens)) + "\n")
+                rays = rays_of(lens)
+            write_view(render(scene, pose, rays), folder, stem)
+        replace_file(_done(target, split, name), json.dumps(made[target]) + "\n")
+    return {}
+
+
+def write_view(view: View, folder: Path, stem: str) -> None:
+    """`images/`, `labels/` and `distance/STEM.png`; further than 255 m is not known."""
+    steps = np.round(view.distance * DISTANCE_UNIT)
+    distance = np.where(steps < 2**16, steps, 0).astype(np.uint16)
+    pictures = dict(images=view.image[..., ::-1], labels=view.labels, distance=distance)
+    for kind, picture in pictures.items():
+        _, data = cv2.imencode(".png", picture)
+        (folder / kind / f"{stem}.png").write_bytes(data)
+
+
+def jobs_of(
+    targets: Sequence[Target], split: str, pictures: int, size: int, seed: int
+) -> list[tuple]:
+    """The arguments of `write_map` for as many pictures of a split, as evenly of its maps as can
+    be; also writes the targets' classes.json."""
+    for target in targets:
+        Path(target.folder).mkdir(parents=True, exist_ok=True)
+        classes = dict(names=CLASSES, colors=COLORS)
+        replace_file(Path(target.folder) / "classes.json", json.dumps(classes) + "\n")
+    names = map_names(split)
+    counts = [len(part) for part in np.array_split(np.arange(pictures), len(names))]
+    return [
+        (name, split, targets, size, count, seed)
+        for name, count in zip(names, counts, strict=True)
+        if count
+    ]
+
+
+def _lens_folder(target: Target) -> tuple[str, ...]:
+    return () if is_one(target.lenses) else ("lenses",)
+
+
+def _done(target: Target, split: str, name: str) -> Path:
+    return Path(target.folder) / split / "done" / f"{name}.json"
+
+
+def _is_done(file: Path, made: dict) -> bool:
+    if not file.exists():
+        return False
+    before = json.loads(file.read_text())
+    if before != made:
+        raise ValueError(f"{file} was made with {before}, not {made}: remove its folder")
+    return True

@@ -1,0 +1,56 @@
+"""The lenses that worlds are seen through, by their names."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+
+from darswin.data.lenses import parse_lenses
+from darswin.lens import Lens, Perspective, load
+
+WIDE = (60.0, 90.0)  # degrees, horizontally and vertically: an ordinary wide-angle lens
+
+
+def draw_lens(name: str, size: int, fov: float, rng: np.random.Generator) -> Lens:
+    """One lens of square pictures of `size` px.
+
+    Args:
+        name: "wide", perspective lenses of 60° to 90° that fill the square; what
+            `darswin.data.lenses.parse_lenses` takes: a ξ, a range of them, a level of the paper or
+            "polynomial", whose field of view `fov` (rad) fills the circle in the square; or a
+            calibration file, FILE or FILE:CAMERA, whose picture is cut to a square around its
+            middle.
+
+    Raises:
+        ValueError: a name of no lens, or a calibration of unknown image size.
+    """
+    if name == "wide":
+        angle = math.radians(rng.uniform(*WIDE))
+        lens: Lens = Perspective.from_fov(fov=angle, radius=size / 2).with_theta_max(None)
+        # Up to the corners.
+        lens = lens.with_theta_max(math.atan(math.sqrt(2) * math.tan(angle / 2)))
+        return lens.replace(image_size=lens.theta_max.new_tensor([[size, size]]))
+    file, _, camera = name.partition(":")
+    if Path(file).is_file():
+        return _squared(load(file, camera=camera or None), size, name)
+    lens = parse_lenses(name).draw(rng, fov, size / 2)
+    return lens.replace(image_size=lens.theta_max.new_tensor([[size, size]]))
+
+
+def is_one(name: str) -> bool:
+    """Whether a name is always the same lens."""
+    if Path(name.partition(":")[0]).is_file():
+        return True
+    try:
+        return math.isfinite(float(name))
+    except ValueError:
+        return False
+
+
+def _squared(lens: Lens, size: int, name: str) -> Lens:
+    if lens.image_size is None:
+        raise ValueError(f"{name} must say the size of its images")
+    height, width = (round(side) for side in lens.image_size[0].tolist())
+    side = min(height, width)
+    square = lens.cropped((height - side) // 2, (width - side) // 2, side, side)
+    return square.resized((size, size))

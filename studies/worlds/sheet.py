@@ -1,0 +1,62 @@
+"""Draws the worlds through a few lenses: picture, labels and distance beside each other."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch
+from PIL import Image
+
+from darswin.viz.dense import distance_image, label_image
+from darswin.viz.plot import save_figure
+from worlds.geometry import CLASSES, COLORS
+from worlds.lenses import draw_lens
+from worlds.poses import poses_of
+from worlds.render import rays_of, render
+from worlds.scene import Scene
+from worlds.textures import Textures
+from worlds.wad import load_map
+
+FOV, SIZE = math.radians(165), 128
+NEAR, FAR = 0.5, 40.0  # m, of the colours
+# Maps, and which of their poses; names of `draw_lens` by what stands above them.
+PLACES = (
+    ("freedoom2-MAP01", 1),
+    ("freedoom2-MAP01", 3),
+    ("freedoom1-E1M1", 1),
+    ("freedoom1-E3M4", 1),
+)
+FRONT = Path(__file__).parents[2] / "tests" / "lens" / "files" / "woodscape.json"
+LENSES = {"perspective": "wide", "spherical, ξ = 0.3, 165°": "0.3", "WoodScape front": str(FRONT)}
+
+
+def draw_sheet(path: Path) -> None:
+    """Writes a PNG: a row for each of `PLACES`, three columns for each of `LENSES`."""
+    across = 3 * len(LENSES)
+    figure = Figure(figsize=(across, 1.04 * len(PLACES) + 0.5), layout="constrained")
+    panels = figure.subplots(len(PLACES), across, squeeze=False)
+    for row, (name, number) in zip(panels, PLACES, strict=True):
+        wad, world = load_map(name)
+        scene = Scene(world, Textures(wad))
+        pose = poses_of(scene, name, number + 1, seed=0)[number]
+        for k, lens_name in enumerate(LENSES.values()):
+            lens = draw_lens(lens_name, SIZE, FOV, np.random.default_rng(0))
+            view = render(scene, pose, rays_of(lens))
+            seen = (
+                view.image,
+                label_image(view.labels, COLORS),
+                distance_image(view.distance, NEAR, FAR),
+            )
+            for axes, picture in zip(row[3 * k : 3 * k + 3], seen, strict=True):
+                axes.imshow(picture)
+                axes.axis("off")
+    for k, title in enumerate(LENSES):
+        panels[0][3 * k + 1].set_title(title, fontsize=9)
+    entries = [
+        Patch(color=np.array(c) / 255, label=n) for n, c in zip(CLASSES, COLORS, strict=True)
+    ]
+    figure.legend(handles=entries, loc="outside lower center", ncols=len(CLASSES), fontsize=8)
+    save_figure(figure, path)
+    # 256 colours make a third of the size.
+    Image.open(path).convert("RGB").quantize(256).save(path, optimize=True)

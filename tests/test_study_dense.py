@@ -1,0 +1,112 @@
+"""The dense study's own code, on a few small pictures: a minute's version of `make study-dense`."""
+
+import json
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+sys.path.insert(0, str(ROOT / "studies"))
+pytest.importorskip("embreex")
+pytest.importorskip("omg")
+
+import dense  # noqa: E402
+import dense_data  # noqa: E402
+import dense_tables  # noqa: E402
+from dense_cells import CONTROLLED, MODELS, STUDIED, all_cells  # noqa: E402
+from dense_trivial import trivial  # noqa: E402
+from worlds import wad  # noqa: E402
+
+from darswin.data.scenes import open_scenes  # noqa: E402
+
+pytestmark = pytest.mark.skipif(
+    not (wad.FOLDER / "freedoom1.wad").exists(), reason="the game's files are not installed"
+)
+
+QUICK = """
+    --pixels 32 --data.size 32 --pictures 4 1 2 --data.batch_size 2 --trainer.max_epochs 1
+    --processes 2 --seeds 1
+""".split()  # noqa: SIM905
+
+
+def test_cells_have_folders_of_their_own():
+    cells = all_cells(3)
+    assert len({cell.key for cell in cells}) == len(cells)
+    assert len(cells) == len(STUDIED) * (len(MODELS) * 3 + len(CONTROLLED)) == 69
+    assert cells[0].key == "darswin-unet-a-wide-segmentation-0"
+
+
+@pytest.fixture(scope="module")
+def quick(tmp_path_factory) -> Path:
+    """A Swin-Unet and an adapted one, in the processes that `make study-dense` uses."""
+    folder = tmp_path_factory.mktemp("dense")
+    where = ["--out", str(folder / "out"), "--results", str(folder)]
+    dense.main([*where, "--cell", "swin-unet-low", *QUICK])
+    return folder
+
+
+def found(folder: Path) -> dict[str, dict]:
+    cells = folder.glob("out/nano/*/cell.json")
+    return {path.parent.name: json.loads(path.read_text()) for path in cells}
+
+
+def test_test_sets_show_the_same_scenes_and_controls_lie(quick):
+    data = quick / "out" / "data"
+    sets = {name: open_scenes(str(data / "test" / name), "test", "labels")
+            for name in dense_data.test_sets()}  # fmt: skip
+    stems = {name: [Path(s.file(k)).stem for k in range(len(s))] for name, s in sets.items()}
+    assert len({tuple(names) for names in stems.values()}) == 1 and len(stems["xi-0"]) == 2
+    true, told = sets["xi-1"][0], sets["wrong-1"][0]
+    assert (true.image == told.image).all()
+    assert true.lens.xi.item() == 1 and told.lens.xi.item() == pytest.approx(0.275)
+    one, other = (sets[f"{kind}band-low"] for kind in ("", "shuffled-"))
+    xi = [[scenes[k].lens.xi.item() for k in range(2)] for scenes in (one, other)]
+    assert xi[0] == xi[1][::-1] and xi[0][0] != xi[0][1]
+
+
+def test_cells_are_trained_and_tested_once(quick, capsys):
+    cells = found(quick)
+    assert cells.keys() == {
+        f"{name}-low-{task}-0"
+        for name in ("swin-unet", "lensadapter-swin-unet")
+        for task in ("segmentation", "distance")
+    }
+    for cell in cells.values():
+        assert cell["sets"].keys() == set(dense_data.test_sets())
+        scores = [row[dense_tables.SCORE[cell["task"]]] for row in cell["sets"].values()]
+        assert all(0 <= score <= 1 for score in scores)
+    # A study that was stopped reads what it has; a cell that is run again finds the same.
+    folder = quick / "out" / "nano" / "swin-unet-low-segmentation-0"
+    for file in folder.rglob("*"):
+        if file.is_file():
+            file.unlink()
+    capsys.readouterr()
+    where = ["--out", str(quick / "out"), "--results", str(quick)]
+    dense.main([*where, "--cell", "swin-unet-low-seg", *QUICK])
+    results = json.loads(capsys.readouterr().out.split("cells after", 1)[1].split("\n", 1)[1])
+    assert len(results) == 2
+    for cell in results:
+        before = next(c for c in cells.values() if c["model"] == cell["model"] and
+                      c["task"] == cell["task"])  # fmt: skip
+        assert cell["sets"] == before["sets"]
+    # With other options it says so, and mixes nothing.
+    with pytest.raises(ValueError, match="was made otherwise"):
+        dense.main([*where, "--cell", "swin-unet-low-seg", *QUICK, "--data.flip", "false"])
+
+
+def test_tables_and_pictures(quick):
+    cells, blind = list(found(quick).values()), trivial(quick / "out")
+    dense_tables.collect(cells, blind, quick / "out", quick, "nano")
+    for name in ("dense.png", "dense_segmentation.png", "dense_distance.png"):
+        assert (quick / name).read_bytes().startswith(b"\x89PNG")
+    record = json.loads((quick / "dense.json").read_text())
+    made = dense_tables.tables(record, quick)
+    lines = made["dense segmentation low"].splitlines()
+    assert any(line.startswith("| Swin-Unet |") and "not run" not in line for line in lines)
+    assert any(line.startswith("| by direction alone |") for line in lines)
+    assert "not run" in made["dense segmentation wide"]
+    assert made["dense curves"].startswith("![")
+    assert "60° to the rim" in made["dense distance low zones"]
+    # Without a record each place says so, by the same names.
+    assert dense_tables.tables(None, quick / "none") == dict.fromkeys(made, dense_tables.NOT_RUN)
