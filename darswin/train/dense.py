@@ -1,6 +1,6 @@
 """What the tasks that say something of each pixel share: their pixels, zones, test and samples."""
 
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import torch
@@ -34,8 +34,8 @@ class Measured(nn.Module):
 
 
 class DenseTask(Task):
-    """Base of the tasks for each pixel. A task defines `_criterion`, `_answer`, `_known`, `_sums`
-    and `_row`.
+    """Base of the tasks for each pixel. A task defines `_criterion`, `_answer`, `_known`,
+    `_sums`, `_row` and `nothing`, what stands for no answer.
 
     Args:
         name: of a model; None is that of `weights`, or the task's own default.
@@ -57,6 +57,7 @@ class DenseTask(Task):
     """
 
     default_model = "darswin_unet_a_micro"
+    nothing: ClassVar[int]
 
     def __init__(
         self,
@@ -134,11 +135,14 @@ class DenseTask(Task):
         assert isinstance(measured, Measured)
         images, lens, target = batch
         answer, known = self._said(batch, measured.loss)
-        zone = self.zones.of(_of_each(pixel_angles, lens, images))
+        theta = _of_each(pixel_angles, lens, images)
+        zone = self.zones.of(theta)
         area = _of_each(solid_angles, lens, images)
         measured.sums.update(answer[known], target[known], zone[known], area[known])
         if batch_idx == 0:
-            self._keep(images, lens, target, answer, known)
+            # What is said where the lens sees nothing has no meaning.
+            seen = torch.where(theta.isnan(), self.nothing, answer)
+            self._keep(images, lens, target, seen, known)
 
     def on_test_start(self) -> None:
         """Forgets the samples of a test before."""

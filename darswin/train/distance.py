@@ -34,6 +34,7 @@ class Distance(DenseTask):
     """
 
     task = "distance"
+    nothing = 0
     monitor = ("val/abs_rel", "min")
 
     def __init__(

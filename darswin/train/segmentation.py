@@ -35,6 +35,7 @@ class Segmentation(DenseTask):
     """
 
     task = "segmentation"
+    nothing = IGNORE
     monitor = ("val/miou", "max")
 
     def __init__(

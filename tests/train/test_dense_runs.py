@@ -16,6 +16,7 @@ from scenes import CLASSES, WOODSCAPE, write_plain
 
 from darswin.cli.main import main
 from darswin.models.saving import load_model
+from darswin.train import dense_results
 
 METRES = np.array([2.0, 5.0, 8.0])  # of the classes, so that a distance can be told from a colour
 TINY = "{embed_dim: 8, depths: [1, 1, 1], rings: 8, sectors: 32, samples: [2, 2]}"
@@ -96,7 +97,14 @@ def test_labels_are_learned_and_what_a_test_writes(labelled, data, capsys):
     assert "val/miou" in capsys.readouterr().out
 
 
-def test_a_test_on_other_folders(labelled, data, tmp_path):
+def test_a_test_on_other_folders(labelled, data, tmp_path, monkeypatch):
+    shown = []
+    draw = dense_results.draw_predictions
+    monkeypatch.setattr(
+        dense_results,
+        "draw_predictions",
+        lambda rows, *rest: shown.extend(rows) or draw(rows, *rest),
+    )
     lens = json.dumps({"model": "Equidistant", "focal": 16.0, "theta_max": 1.5})
     from darswin.lens import from_dict
 
@@ -104,6 +112,9 @@ def test_a_test_on_other_folders(labelled, data, tmp_path):
         tmp_path / "a" / "scenes", 3, lens=from_dict(json.loads(lens)), size=(45, 60)
     )
     rows = test(labelled, "--data.test_paths", str(other), str(data), "--model.zones", "45")
+    _, truth, said = shown[0]
+    assert (said[0, 0], said[-1, -1]) == (255, 255) and (said == 255).mean() < 0.3
+    assert (truth[said == 255] == 255).all()  # beyond θ_max nothing is known, nor said
     names = [row["data"] for row in rows]
     assert [name.split("/")[-1] for name in names] == ["scenes", "scenes"] and len({*names}) == 2
     assert len(rows[0]["per_zone"]) == 2
