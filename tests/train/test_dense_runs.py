@@ -126,7 +126,7 @@ def test_a_test_on_other_folders(labelled, data, tmp_path, monkeypatch):
 
 def test_distances_are_learned(tiny, data, tmp_path, capsys):
     run = tmp_path / "run"
-    options = ["--model.loss", "log_l1", "--trainer.max_epochs", "8"]
+    options = ["--model.loss", "log_l1", "--trainer.max_epochs", "12"]
     fit(run, "--task", "distance", *tiny, *options)
     (row,) = test(run)
     labels = [cv2.imread(str(f), -1) for f in (data / "labels").iterdir()]
