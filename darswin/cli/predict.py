@@ -15,9 +15,10 @@ from safetensors import safe_open
 from darswin.cli.answers import Answers, ClassAnswers
 from darswin.cli.dense_answers import ANSWERS, ANSWERS_OF, claim_folder, file_names
 from darswin.compat import load_official
-from darswin.data.calibrations import Calibrations, is_json
+from darswin.data.calibrations import Calibrations, PictureLenses, is_json
 from darswin.data.folders import PICTURES, pictures_and_videos_below
 from darswin.data.samples import IMAGENET_MEAN, IMAGENET_STD
+from darswin.data.scenes.lenses import OwnLenses
 from darswin.lens import Lens
 from darswin.models.pretrained import list_pretrained, pretrained_file
 from darswin.models.saving import ModelCard, NoCardError, Task, load_model, model_of_run
@@ -63,7 +64,8 @@ def predict(
             lens as JSON, in pixels of the pictures: {"model": "Spherical", "xi": 0.5, "focal": 300,
             "theta_max": 1.5}, or with "fov" (rad) in place of the last two where the field of view
             fills the circle inside the picture; or, for several cameras, a lenses.json, whose
-            folders and files are relative to its own folder: see `darswin.data.Calibrations`.
+            folders and files are relative to its own folder: see `darswin.data.Calibrations`; or a
+            folder with a calibration of each picture or video in it, STEM.json.
         run: the folder of a run, whose best model is taken.
         model: a model's safetensors file, instead; "digits", which comes with darswin; or what
             `darswin convert` makes of the authors' released weights, whose classes have numbers.
@@ -101,12 +103,11 @@ def predict(
     net, card = trained_model(weights)
     if task not in (None, card.task):
         raise ValueError(f"--task {task} was asked of {weights}, a model for {card.task}")
-    calibrations = Calibrations(lens, "." if is_json(lens) else Path(lens).parent, camera)
+    files = pictures_and_videos(paths, leave_out=None if card.task == "classification" else out)
+    calibrations = _calibrations(lens, camera, files)
     if card.task == "classification":
-        files = pictures_and_videos(paths)
         answers: Answers = ClassAnswers(net, card, top)
     else:
-        files = pictures_and_videos(paths, leave_out=out)
         folder = claim_folder(out)
         out = str(folder / ANSWERS)
         answers = ANSWERS_OF[card.task](net, card, folder, file_names(paths, files))
@@ -163,7 +164,7 @@ def _is_below(path: str, folder: str) -> bool:
     return Path(os.path.realpath(path)).is_relative_to(os.path.realpath(folder))
 
 
-def answer_video(name: str, every: int, calibrations: Calibrations, answers: Answers) -> None:
+def answer_video(name: str, every: int, calibrations: PictureLenses, answers: Answers) -> None:
     """Answers the frames of a video, and says how fast that went.
 
     Raises:
@@ -193,10 +194,29 @@ def answer_video(name: str, every: int, calibrations: Calibrations, answers: Ans
             )
 
 
-def _lens(calibrations: Calibrations, name: str, image: np.ndarray, orientation: int) -> Lens:
+def _calibrations(lens: str, camera: str | None, files: Sequence[File]) -> PictureLenses:
+    """What took the files.
+
+    Raises:
+        ValueError: as `Calibrations`. FileNotFoundError: a folder with none of their calibrations.
+    """
+    if is_json(lens) or not os.path.isdir(lens):
+        return Calibrations(lens, "." if is_json(lens) else Path(lens).parent, camera)
+    if camera is not None:
+        raise ValueError(f"--camera {camera} is one of a calibration file, and {lens} is a folder")
+    own = {Path(file.name): Path(lens, f"{Path(file.name).stem}.json") for file in files}
+    there = {file: calibration for file, calibration in own.items() if calibration.is_file()}
+    if not there:
+        raise FileNotFoundError(
+            f"no calibration in {lens}: the first would be {next(iter(own.values()))}"
+        )
+    return OwnLenses(there)
+
+
+def _lens(calibrations: PictureLenses, name: str, image: np.ndarray, orientation: int) -> Lens:
     """The lens in an upright picture or frame; BrokenImageError where there is none that fits."""
     try:
-        return calibrations.lens_of(name, (image.shape[0], image.shape[1]), orientation)
+        return calibrations.lens_of(Path(name), (image.shape[0], image.shape[1]), orientation)
     except ValueError as error:
         raise BrokenImageError(str(error)) from error
 

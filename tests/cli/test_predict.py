@@ -437,6 +437,30 @@ def test_a_lens_for_each_folder(run, folder, capsys):
         answers([str(run / "p.png"), "--lens", str(run / "lenses.json")], run, capsys)
 
 
+def test_a_lens_for_each_picture(run, folder, capsys, monkeypatch):
+    """As a folder of calibrations says: each picture as with its own lens alone."""
+    own = run / "lenses"
+    own.mkdir()
+    for k, stem in enumerate(("0", "1", "y", "10", "2")):
+        lens = {"model": "Spherical", "xi": k / 10, "fov": 2.8, "image_size": [64, 96]}
+        (own / f"{stem}.json").write_text(json.dumps(lens))
+    monkeypatch.chdir(folder)
+    found = answers(["./0.png", ".", "--lens", str(own)], run, capsys)
+    assert close(found[0], dict(found[1], image="./0.png"))
+    for answer in found[1:]:
+        stem = answer["image"].split("/")[-1].split(".")[0]
+        (alone,) = answers([answer["image"], "--lens", str(own / f"{stem}.json")], run, capsys)
+        assert close(answer, alone)
+    (own / "10.json").unlink()
+    with pytest.raises(SystemExit, match=r"no answer for 1 of 5 pictures:\n.*10\.png has no lens"):
+        answers([str(folder), "--lens", str(own)], run, capsys)
+    capsys.readouterr()
+    with pytest.raises(SystemExit, match=r"no calibration in .*: the first would be .*p\.json"):
+        answers([str(run / "p.png"), "--lens", str(own)], run, capsys)
+    with pytest.raises(SystemExit, match="--camera 1 is one of a calibration file, and"):
+        answers([str(folder), "--lens", str(own), "--camera", "1"], run, capsys)
+
+
 def as_pictures(video, folder, **options):
     """The frames of a video as upright pictures."""
     folder.mkdir()
