@@ -88,7 +88,7 @@ def tables() -> dict[str, str]:
         "training": bench.training_table(training["models"]),
         **study.tables(cells),
         **learned_tables.tables(cameras),
-        **dense_tables.tables(found, studies),
+        **(dense_tables.tables(found, studies) if found else {}),
     }
 
 

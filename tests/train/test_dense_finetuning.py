@@ -90,7 +90,7 @@ def test_a_dense_model_freezes_its_encoder_alone():
     net = ModelCard("darswin_unet_a_nano", SMALL).create()
     frozen = {id(p) for module in frozen_parts(net, 3) for p in module.parameters()}
     parts = {n.split(".")[0] for n, p in net.named_parameters() if id(p) not in frozen}
-    assert parts == {"decoder", "segmentation_head"}
+    assert parts == {"decoder", "places", "segmentation_head"}
 
 
 def test_which_model_starts_from_which():
