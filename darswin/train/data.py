@@ -1,31 +1,23 @@
 """What the data of all runs share: batches of a training's order, and of every test set."""
 
-from collections.abc import Sequence, Sized
-from typing import Any, ClassVar, Literal, Protocol
+from collections.abc import Sequence
+from typing import Any, ClassVar, Literal
 
 from lightning.pytorch import LightningDataModule
-from torch.utils.data import DataLoader, Dataset
+from torch.utils.data import DataLoader
 
 from darswin.data.augment import RandAugment
 from darswin.data.frames import Fit
-from darswin.data.samples import IMAGENET_MEAN, IMAGENET_STD
+from darswin.data.samples import IMAGENET_MEAN, IMAGENET_STD, Samples
 from darswin.data.sampling import EveryNth, ResumableLoader, TrainingOrder
 from darswin.data.splits import Split
 from darswin.data.turning import RandomTurns
 from darswin.train.stopping import ignore_signals
 
 
-class CountsBroken(Sized, Protocol):
-    """A data set that says which of its pictures could not be read so far."""
-
-    @property
-    def broken(self) -> Sequence[int]:
-        """Their indices."""
-        ...
-
-
 class RunData(LightningDataModule):
-    """Base of the data of a run. Such data define `classes`, `dataset` and `_training_order`.
+    """Base of the data of a run. Such data define `classes`, `test_names`, `dataset` and
+    `_training`.
 
     Args:
         path: what `open_source` or `open_scenes` opens.
@@ -108,7 +100,7 @@ class RunData(LightningDataModule):
         self.limit, self.batch_size, self.workers = limit, batch_size, workers
         self.turns = RandomTurns(flip, rotate_deg) if flip or rotate_deg else None
         self.randaugment, self.seed = randaugment, seed
-        self.datasets: list[CountsBroken] = []
+        self.datasets: list[Samples] = []
         self._loader: ResumableLoader | None = None
         self._progress: dict[str, Any] = {}
 
@@ -144,7 +136,7 @@ class RunData(LightningDataModule):
     def _colour_changes(self) -> RandAugment | None:
         return RandAugment() if self.randaugment else None
 
-    def _training(self) -> tuple[Dataset, TrainingOrder]:
+    def _training(self) -> tuple[Samples, TrainingOrder]:
         """The training split, augmented, and its order."""
         raise NotImplementedError
 
@@ -168,7 +160,7 @@ class RunData(LightningDataModule):
         """Goes on from there: the next training loader starts at that place."""
         self._progress = state_dict
 
-    def dataset(self, split: Split, name: str | None = None) -> Dataset:
+    def dataset(self, split: Split, name: str | None = None) -> Samples:
         """A split as it is evaluated; `name` is one of `test_names`."""
         raise NotImplementedError
 
@@ -182,7 +174,7 @@ class RunData(LightningDataModule):
                 f"--data.holdout 0 leaves no pictures for {split!r}, and {self.path} has none of "
                 "its own; --trainer.limit_val_batches 0 trains without validation"
             ) from error
-        count = len(dataset)  # type: ignore[arg-type]  # torch does not say that they have one
+        count = len(dataset)
         part = EveryNth(count, **self._place)
         if not part.indices:
             raise ValueError(

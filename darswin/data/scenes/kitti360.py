@@ -10,14 +10,12 @@ A stem is "DRIVE/image_02/NNNNNNNNNN". Whole drives are held out.
 Source: Liao et al., KITTI-360, PAMI 2022.
 """
 
-from functools import partial
 from pathlib import Path
 
 from darswin.data.calibrations import Calibrations, PictureLenses
 from darswin.data.scenes.files import Pairs, pair, stems
 from darswin.data.scenes.lenses import OwnLenses
 from darswin.data.scenes.options import Options
-from darswin.data.scenes.parts import choose
 from darswin.data.scenes.scene import Scenes
 from darswin.data.scenes.targets import DISTANCE_SUFFIXES
 
@@ -40,14 +38,7 @@ def open_split(root: Path, options: Options) -> Scenes:
             pictures[f"{drive}/{camera}/{stem}"] = file
     if not pictures:
         raise FileNotFoundError(f"no pictures in {root}/data_2d_raw/*/image_0[23]/data_rgb")
-    choice = partial(
-        choose,
-        split=options.split,
-        root=root,
-        splits=options.splits,
-        holdout=options.holdout,
-        group=drive_of,
-    )
+    choice = options.choice(root, group=drive_of)
     distances = stems(root / "distance", DISTANCE_SUFFIXES)
     pairs = pair(pictures, distances, choice, root=root, what="distance", strict=False)
     return Scenes(

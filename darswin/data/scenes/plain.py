@@ -11,7 +11,7 @@ from darswin.data.scenes.classes import Classes, read_palette
 from darswin.data.scenes.files import Pairs, pair, pictures_in, stems
 from darswin.data.scenes.lenses import OwnLenses
 from darswin.data.scenes.options import Options
-from darswin.data.scenes.parts import choose, taken_from, without_others
+from darswin.data.scenes.parts import taken_from, without_others
 from darswin.data.scenes.scene import Scenes
 from darswin.data.scenes.targets import DISTANCE_SUFFIXES, LABEL_SUFFIXES
 from darswin.data.splits import Split
@@ -37,10 +37,7 @@ def open_split(root: Path, options: Options) -> Scenes:
             raise ValueError(
                 f"{root / 'images'} and {next(iter(folders.values()))} may both be meant: {FORM}"
             )
-        choice = partial(
-            choose, split=options.split, root=root, splits=options.splits, holdout=options.holdout
-        )
-        return _scenes(root, root, options, choice)
+        return _scenes(root, root, options, options.choice(root))
     if options.splits is not None:
         raise ValueError(f"{options.splits} lists splits, and {root} has a folder for each")
     if options.split == "all":

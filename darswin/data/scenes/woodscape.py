@@ -9,7 +9,6 @@ Source: Yogamani et al., WoodScape, ICCV 2019, and github.com/valeoai/WoodScape.
 """
 
 from collections.abc import Mapping
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +18,6 @@ from darswin.data.scenes.classes import Classes, as_classes, read_palette
 from darswin.data.scenes.files import Pairs, pair, pictures_in, stems
 from darswin.data.scenes.lenses import OwnLenses
 from darswin.data.scenes.options import Options
-from darswin.data.scenes.parts import choose
 from darswin.data.scenes.scene import Scenes
 from darswin.data.scenes.targets import LABEL_SUFFIXES
 from darswin.data.splits import Split, read_json
@@ -57,14 +55,7 @@ def scenes(
     far: float | None = None,
 ) -> Scenes:
     """Scenes in `rgb_images/` with these targets and calibrations named after them."""
-    choice = partial(
-        choose,
-        split=options.split,
-        root=root,
-        splits=options.splits,
-        holdout=options.holdout,
-        named={"heal-swin": heal_swin},
-    )
+    choice = options.choice(root, named={"heal-swin": heal_swin})
     pictures = pictures_in(unnested(root / "rgb_images"))
     pairs = pair(pictures, targets, choice, root=root, what=options.target)
     return Scenes(
