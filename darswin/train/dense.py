@@ -78,6 +78,7 @@ class DenseTask(Task):
         self.zones = Zones([30, 60, 90] if zones is None else zones)
         self.solid_angle_weights = solid_angle_weights
         self.samples: list[Sample] = []
+        self._seen = Seen()
 
     @property
     def data(self) -> DenseData:
@@ -116,8 +117,9 @@ class DenseTask(Task):
         images, lens, target = batch
         weights = None
         if self.solid_angle_weights:
-            weights = _of_each(solid_angles, lens, images)
-            weights = weights / weights.mean((1, 2), keepdim=True)
+            area = solid_angles(one_if_same(lens), (images.shape[2], images.shape[3]))
+            weights = (area / area.mean((1, 2), keepdim=True)).to(images.device)
+            weights = weights.expand(len(images), -1, -1)
         return self._criterion(self.net(images, lens).float(), target, weights)
 
     def _said(self, batch: Batch, loss: MeanMetric) -> tuple[Tensor, Tensor]:
@@ -135,9 +137,8 @@ class DenseTask(Task):
         assert isinstance(measured, Measured)
         images, lens, target = batch
         answer, known = self._said(batch, measured.loss)
-        theta = _of_each(pixel_angles, lens, images)
+        theta, area = self._seen.of(lens, images)
         zone = self.zones.of(theta)
-        area = _of_each(solid_angles, lens, images)
         measured.sums.update(answer[known], target[known], zone[known], area[known])
         if batch_idx == 0:
             # What is said where the lens sees nothing has no meaning.
@@ -175,12 +176,39 @@ class DenseTask(Task):
             self.results.append(row | dict(per_class=per_class, per_zone=per_zone))
 
 
-def _of_each(function: Any, lens: Lens, images: Tensor) -> Tensor:
-    """`pixel_angles` or `solid_angles` of each image, (B, H, W), on its device; computed once where
-    all have one lens."""
-    size = (images.shape[2], images.shape[3])
-    names = (*lens.parameters, *lens.optional, *lens.common)
-    tensors = [value for name in names if (value := getattr(lens, name)) is not None]
-    if all(torch.equal(t, t[:1].expand_as(t)) for t in tensors):
-        lens = lens[:1]
-    return function(lens, size).to(images.device).expand(len(images), *size)
+class Seen:
+    """What lenses see in each pixel; kept for the next batch: a test set often has one lens."""
+
+    def __init__(self) -> None:
+        self._lens: Lens | None = None
+        self._angles = torch.empty(0)
+        self._areas = torch.empty(0)
+
+    def of(self, lens: Lens, images: Tensor) -> tuple[Tensor, Tensor]:
+        """`pixel_angles` and `solid_angles` of each image, (B, H, W), on its device."""
+        size = (images.shape[2], images.shape[3])
+        lens = one_if_same(lens)
+        known = self._angles.shape[1:] == size and self._angles.device == images.device
+        if not known or self._lens is None or not _same(lens, self._lens):
+            self._angles = pixel_angles(lens, size).to(images.device)
+            self._areas = solid_angles(lens, size).to(images.device)
+            self._lens = lens
+        shape = (len(images), *size)
+        return self._angles.expand(shape), self._areas.expand(shape)
+
+
+def one_if_same(lens: Lens) -> Lens:
+    """The first of lenses that are all the same; else all of them."""
+    numbers = [value for value in _numbers(lens) if value is not None]
+    return lens[:1] if all(torch.equal(n, n[:1].expand_as(n)) for n in numbers) else lens
+
+
+def _same(lens: Lens, other: Lens) -> bool:
+    return type(lens) is type(other) and all(
+        a is b is None or (a is not None and b is not None and torch.equal(a, b))
+        for a, b in zip(_numbers(lens), _numbers(other), strict=True)
+    )
+
+
+def _numbers(lens: Lens) -> list[Tensor | None]:
+    return [getattr(lens, name) for name in (*lens.parameters, *lens.optional, *lens.common)]

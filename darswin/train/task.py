@@ -8,6 +8,7 @@ from typing import Any, ClassVar, Literal, Self
 import numpy as np
 import torch
 from lightning.pytorch import LightningModule
+from lightning.pytorch.plugins import MixedPrecision
 from lightning.pytorch.utilities.types import OptimizerLRSchedulerConfig
 from torch import Tensor, nn
 from torchmetrics import Metric
@@ -201,8 +202,10 @@ class Task(LightningModule):
         warmup_steps = self.warmup_epochs * self.steps_per_epoch
         undecayed = () if self.decay_position_bias else self.net.no_weight_decay()
         optimizer = torch.optim.AdamW(
-            parameter_groups(self.net, self.weight_decay, undecayed), lr=rates["peak"]
-        )
+            parameter_groups(self.net, self.weight_decay, undecayed), lr=rates["peak"],
+            # One pass over each parameter. Lightning cannot clip its gradients under autocast.
+            fused=not isinstance(trainer.precision_plugin, MixedPrecision),
+        )  # fmt: skip
         schedule = Schedule(optimizer, warmup_steps=warmup_steps, steps=steps, **rates)
         return {
             "optimizer": optimizer,

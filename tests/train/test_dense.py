@@ -7,9 +7,10 @@ import torch
 from scenes import write_plain
 
 from darswin.data.scenes import IGNORE
-from darswin.lens import Equidistant, cat
+from darswin.lens import Equidistant, KannalaBrandt, cat
 from darswin.lens.pixels import pixel_angles, solid_angles
-from darswin.train.dense import _of_each
+from darswin.train import dense
+from darswin.train.dense import Seen
 from darswin.train.dense_data import DistanceData, LabelData
 from darswin.train.distance import Distance
 from darswin.train.segmentation import Segmentation
@@ -110,17 +111,28 @@ def test_solid_angles_weigh_the_loss(scenes):
 
 
 def test_lenses_of_a_batch_are_each_their_own():
-    images = torch.zeros(3, 1, 20, 24)
+    images, seen = torch.zeros(3, 1, 20, 24), Seen()
     several = Equidistant([8.0, 9.0, 10.0], 1.2)
-    for function in (pixel_angles, solid_angles):
-        found = _of_each(function, several, images)
-        torch.testing.assert_close(found, function(several, (20, 24)), equal_nan=True)
-        for same in (several[1], cat([several[1]] * 3)):
-            found = _of_each(function, same, images)
-            assert found.shape == (3, 20, 24)
-            torch.testing.assert_close(
-                found, function(several[[1, 1, 1]], (20, 24)), equal_nan=True
-            )
+    two, one = several[[0, 2, 2]], several[1]
+    # Each comes after another, and after itself.
+    for lens in (several, several, two, one, one, cat([one] * 3), one.with_theta_max(1.0), two):
+        angles, areas = seen.of(lens, images)
+        each = lens if len(lens) == 3 else cat([lens] * 3)
+        torch.testing.assert_close(angles, pixel_angles(each, (20, 24)), equal_nan=True)
+        torch.testing.assert_close(areas, solid_angles(each, (20, 24)))
+    assert seen.of(two, torch.zeros(3, 1, 10, 12))[0].shape == (3, 10, 12)
+
+
+def test_one_lens_is_asked_once_for_all_batches(monkeypatch):
+    asked = []
+    monkeypatch.setattr(dense, "pixel_angles", lambda *a: asked.append(a) or pixel_angles(*a))
+    seen, images = Seen(), torch.zeros(2, 1, 8, 8)
+    radial = [KannalaBrandt(8.0, radial=[0.1, 0.0, 0.0, 0.0]) for _ in range(2)]
+    for lens in (*radial, cat(radial)):
+        seen.of(lens, images)
+    assert len(asked) == 1
+    seen.of(KannalaBrandt(8.0), images)
+    assert len(asked) == 2
 
 
 def test_far_distances_are_not_known(scenes):
