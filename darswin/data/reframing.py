@@ -11,6 +11,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 import torch
+from torch import Tensor
 
 from darswin.data.frames import Fit, part_of
 from darswin.data.scenes.scene import Scene
@@ -125,9 +126,28 @@ def _only_seen(scene: Scene) -> Scene:
         places = torch.from_numpy(_grid(height, 1)).to(lens.theta_max)
         beyond = (length_of(lens.from_pixels(places[None])) > lens.r_max[:, None, None])[0]
     else:
-        beyond = pixel_angles(lens, (height, width))[0].isnan()
+        beyond = _unseen(_ByValue(lens), (height, width))
     scene.target[beyond.numpy()] = nothing_of(scene.target)
     return scene
+
+
+class _ByValue:
+    """A lens, equal to others with the same numbers."""
+
+    def __init__(self, lens: Lens):
+        self.lens = lens
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _ByValue) and self.lens.same_as(other.lens)
+
+    def __hash__(self) -> int:
+        return hash((type(self.lens), self.lens.theta_max.item()))
+
+
+@lru_cache(maxsize=8)  # since pictures often have one camera, whose angles take long to find
+def _unseen(lens: _ByValue, size: tuple[int, int]) -> Tensor:
+    """Where a lens sees nothing: bool (H, W)."""
+    return pixel_angles(lens.lens, size)[0].isnan()
 
 
 def _nearest(side: int, size: int) -> np.ndarray:

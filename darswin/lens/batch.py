@@ -158,6 +158,19 @@ class LensBatch:
         """The same lens with some of its tensors replaced, unchecked."""
         return self._from_tensors({name: getattr(self, name) for name in self._names()} | tensors)
 
+    def same_as(self, other: object) -> bool:
+        """Whether `other` is of the same class and has the same numbers, for as many lenses."""
+        if type(other) is not type(self):
+            return False
+        pairs = [(getattr(self, name), getattr(other, name)) for name in self._names()]
+        return all(a is b or (a is not None and b is not None and _same(a, b)) for a, b in pairs)
+
+    def merged(self) -> Self:
+        """A single lens, where all of them have the same numbers; else all of them."""
+        values = (getattr(self, name) for name in self._names())
+        same = all(v is None or torch.equal(v, v[:1].expand_as(v)) for v in values)
+        return self[:1] if same else self
+
     def expand(self, count: int) -> Self:
         """A single lens as a batch of `count` equal ones."""
         if len(self) not in (1, count):
@@ -168,6 +181,10 @@ class LensBatch:
         values = {name: getattr(self, name) for name in self._names()}
         shown = (f"{name}={value.tolist()}" for name, value in values.items() if value is not None)
         return f"{type(self).__name__}({', '.join(shown)})"
+
+
+def _same(a: Tensor, b: Tensor) -> bool:
+    return a.dtype == b.dtype and a.device == b.device and torch.equal(a, b)
 
 
 def as_tensors(values: Mapping[str, Number]) -> dict[str, Tensor]:

@@ -117,7 +117,7 @@ class DenseTask(Task):
         images, lens, target = batch
         weights = None
         if self.solid_angle_weights:
-            area = solid_angles(one_if_same(lens), (images.shape[2], images.shape[3]))
+            area = solid_angles(lens.merged(), (images.shape[2], images.shape[3]))
             weights = (area / area.mean((1, 2), keepdim=True)).to(images.device)
             weights = weights.expand(len(images), -1, -1)
         return self._criterion(self.net(images, lens).float(), target, weights)
@@ -125,7 +125,7 @@ class DenseTask(Task):
     def _said(self, batch: Batch, loss: MeanMetric) -> tuple[Tensor, Tensor]:
         """What is said of each pixel, and which of them are known; counts the loss of these."""
         images, lens, target = batch
-        predicted = self.net(images, lens).float()
+        predicted = self.net(images, lens.merged()).float()
         known = self._known(target)
         if known.any():
             loss.update(self._criterion(predicted, target, None), weight=known.sum())
@@ -187,28 +187,11 @@ class Seen:
     def of(self, lens: Lens, images: Tensor) -> tuple[Tensor, Tensor]:
         """`pixel_angles` and `solid_angles` of each image, (B, H, W), on its device."""
         size = (images.shape[2], images.shape[3])
-        lens = one_if_same(lens)
+        lens = lens.merged()
         known = self._angles.shape[1:] == size and self._angles.device == images.device
-        if not known or self._lens is None or not _same(lens, self._lens):
+        if not known or not lens.same_as(self._lens):
             self._angles = pixel_angles(lens, size).to(images.device)
             self._areas = solid_angles(lens, size).to(images.device)
             self._lens = lens
         shape = (len(images), *size)
         return self._angles.expand(shape), self._areas.expand(shape)
-
-
-def one_if_same(lens: Lens) -> Lens:
-    """The first of lenses that are all the same; else all of them."""
-    numbers = [value for value in _numbers(lens) if value is not None]
-    return lens[:1] if all(torch.equal(n, n[:1].expand_as(n)) for n in numbers) else lens
-
-
-def _same(lens: Lens, other: Lens) -> bool:
-    return type(lens) is type(other) and all(
-        a is b is None or (a is not None and b is not None and torch.equal(a, b))
-        for a, b in zip(_numbers(lens), _numbers(other), strict=True)
-    )
-
-
-def _numbers(lens: Lens) -> list[Tensor | None]:
-    return [getattr(lens, name) for name in (*lens.parameters, *lens.optional, *lens.common)]

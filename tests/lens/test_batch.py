@@ -9,7 +9,7 @@ import torch
 from lens_examples import example, f64
 from torch.utils import _pytree as pytree
 
-from darswin.lens import MODELS, KannalaBrandt, Perspective, Spherical, cat
+from darswin.lens import MODELS, Equidistant, KannalaBrandt, Perspective, Spherical, cat
 
 
 def test_wrong_types():
@@ -110,3 +110,21 @@ def test_a_column_of_coefficients_is_not_many_lenses():
             make()
     assert len(KannalaBrandt([300.0] * 4, column)) == 4
     assert len(KannalaBrandt(300.0, [[0.01]])) == 1
+
+
+def test_the_same_numbers_are_the_same_lens():
+    lens = KannalaBrandt([8.0, 9.0], radial=[0.1, 0.0, 0.0, 0.0])
+    assert lens.same_as(lens[:]) and lens[0].same_as(
+        KannalaBrandt(8.0, radial=[0.1, 0.0, 0.0, 0.0])
+    )
+    for other in (
+        lens[0], lens[[1, 0]], lens.to(torch.float64), lens.with_theta_max(1.0),
+        KannalaBrandt([8.0, 9.0]), Equidistant([8.0, 9.0], 1.0), None,
+    ):  # fmt: skip
+        assert not lens.same_as(other)
+
+
+def test_equal_lenses_merge():
+    lens = KannalaBrandt([8.0, 9.0, 8.0], radial=[0.1, 0.0, 0.0, 0.0])
+    assert lens.merged() is lens and lens[[0, 2]].merged().same_as(lens[0])
+    assert len(lens[:0].merged()) == 0 and lens[1].merged().same_as(lens[1])
