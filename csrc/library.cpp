@@ -38,6 +38,12 @@ STABLE_TORCH_LIBRARY(darswin, m) {
         ", Tensor grad_out, bool x_grad, bool lens_grad) -> "
         "(Tensor, Tensor, Tensor, Tensor, Tensor)");
   m.def("_add_norm_(Tensor(a!) x, Tensor(b!) y, Tensor weight, Tensor bias, float eps) -> ()");
+  m.def(
+      "_add_norm_quantized_(Tensor(a!) x, Tensor? y, Tensor weight, Tensor bias, float eps, "
+      "float scale, int zero_point) -> Tensor");
+  m.def(
+      "_window_attention_quantized(Tensor qkv, Tensor bias, int[] window, int[] shift, "
+      "int[] periodic, float scale, float out_scale, int zero_point) -> Tensor");
   m.def("_transpose_sum(Tensor x) -> (Tensor, Tensor)");
 }
 

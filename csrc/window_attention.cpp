@@ -14,6 +14,7 @@
 
 #include "dispatch.h"
 #include "parallel.h"
+#include "quantizer.h"
 
 namespace darswin {
 namespace {
@@ -93,6 +94,17 @@ Tensor forward(Call<T>&& call) {
   return out;
 }
 
+Tensor forward_quantized(Call<float>&& call, Quantizer quantizer) {
+  auto& args = call.args;
+  const Sizes size{call.qkv.size(0), args.rings, args.sectors, args.heads * args.head_dim};
+  const Tensor out = torch::stable::new_empty(call.qkv, size, ScalarType::Byte);
+  if (out.numel() == 0) return out;
+  args.quantized = static_cast<uint8_t*>(out.mutable_data_ptr());
+  args.quantizer = quantizer;
+  call.run(args.windows * args.heads, kernels<WindowAttentionKernels<float>>().forward);
+  return out;
+}
+
 // How many windows share one row of bias gradients: many, so that few rows are left to add up, but
 // not so many that threads get unequal work. It must not depend on the number of threads, or the
 // sums would.
@@ -154,6 +166,15 @@ Tensor window_attention(const Tensor& qkv, const Tensor& bias, Sizes window, Siz
                    periodic, scale);
 }
 
+Tensor window_attention_quantized(const Tensor& qkv, const Tensor& bias, Sizes window, Sizes shift,
+                                  Sizes periodic, double scale, double out_scale,
+                                  int64_t zero_point) {
+  STD_TORCH_CHECK(qkv.scalar_type() == ScalarType::Float,
+                  "window_attention_quantized: qkv must be float32");
+  return forward_quantized(Call<float>(qkv, bias, window, shift, periodic, scale),
+                           quantizer(out_scale, zero_point));
+}
+
 std::tuple<Tensor, Tensor> window_attention_backward(const Tensor& qkv, const Tensor& bias,
                                                      Sizes window, Sizes shift, Sizes periodic,
                                                      double scale, const Tensor& grad_out) {
@@ -166,5 +187,6 @@ std::tuple<Tensor, Tensor> window_attention_backward(const Tensor& qkv, const Te
 
 STABLE_TORCH_LIBRARY_IMPL(darswin, CPU, m) {
   m.impl("window_attention", TORCH_BOX(&darswin::window_attention));
+  m.impl("_window_attention_quantized", TORCH_BOX(&darswin::window_attention_quantized));
   m.impl("window_attention_backward", TORCH_BOX(&darswin::window_attention_backward));
 }

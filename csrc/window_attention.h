@@ -4,6 +4,7 @@
 #include <cstdint>
 
 #include "bfloat16.h"
+#include "quantized.h"
 #include "tier.h"
 
 namespace darswin {
@@ -22,7 +23,9 @@ struct WindowAttentionArgs {
   bool periodic_r, periodic_a;
   Real scale;
 
-  T* out;  // forward: (B, R, A, heads, d)
+  T* out;              // forward: (B, R, A, heads, d)
+  uint8_t* quantized;  // the same as 8 bits, in place of `out`; null but for float
+  Quantizer quantizer;
 
   const T* grad_out;  // backward
   T* grad_qkv;        // like qkv

@@ -1,13 +1,14 @@
-// Residual and layer norm in one pass over memory, in place.
+// Residual and layer norm in one pass over memory.
 //
 // A row holds a token's features. It is small enough for the first cache, so memory sees it once,
 // while three loops go over it: they make the sum and its mean; the differences from the mean and
 // their squares; the normalized row. Taking the mean off before squaring keeps the digits that a
 // large mean would cost. The differences have a small mean of their own, the rounding of the first
 // one, and that is taken off as well. Where rows are bfloat16, it is the rounded sum that is
-// normalized.
+// normalized. The norm may come out as 8 bits, as an integer product reads it.
 #include "../add_norm.h"
 
+#include "quantize.h"
 #include "simd.h"
 
 namespace darswin {
@@ -81,15 +82,22 @@ struct Sum {
   float all() const { return total<kL>(lanes[0] + lanes[1]) + rest; }
 };
 
-template <typename S>
-void add_norm_rows(const AddNormArgs<S>& a, int64_t begin, int64_t end) {
+template <typename S, typename Out>
+void add_norm_rows(const AddNormArgs<S, Out>& a, int64_t begin, int64_t end) {
+  const Quantize quantize(a.quantizer);
   const float part = 1 / static_cast<float>(a.width);
   for (int64_t row = begin; row < end; ++row) {
-    S *x = a.x + row * a.width, *y = a.y + row * a.width;
+    S* x = a.x + row * a.width;
+    const S* y = a.y == nullptr ? nullptr : a.y + row * a.width;
+    Out* out = a.out + row * a.width;
     Sum values, rest, squares;
-    along(a.width, [&]<typename V>(int64_t c, int turn) {
-      values.add(write(x + c, read<V>(x + c) + read<V>(y + c)), turn);
-    });
+    if (y == nullptr) {
+      along(a.width, [&]<typename V>(int64_t c, int turn) { values.add(read<V>(x + c), turn); });
+    } else {
+      along(a.width, [&]<typename V>(int64_t c, int turn) {
+        values.add(write(x + c, read<V>(x + c) + read<V>(y + c)), turn);
+      });
+    }
     const float mean = values.all() * part;
     along(a.width, [&]<typename V>(int64_t c, int turn) {
       const V left = read<V>(x + c) - mean;
@@ -101,7 +109,12 @@ void add_norm_rows(const AddNormArgs<S>& a, int64_t begin, int64_t end) {
     const float shift = more * scale;
     along(a.width, [&]<typename V>(int64_t c, int) {
       const V unit = (read<V>(x + c) - mean) * scale - shift;
-      write(y + c, unit * read<V>(a.weight + c) + read<V>(a.bias + c));
+      const V normalized = unit * read<V>(a.weight + c) + read<V>(a.bias + c);
+      if constexpr (kSame<Out, uint8_t>) {
+        quantize(out + c, normalized);
+      } else {
+        write(out + c, normalized);
+      }
     });
   }
 }
@@ -109,10 +122,13 @@ void add_norm_rows(const AddNormArgs<S>& a, int64_t begin, int64_t end) {
 }  // namespace
 
 template <>
-constinit const AddNormKernels<float> Kernels<AddNormKernels<float>, Tier::TIER>::table = {
-    .rows = add_norm_rows<float>};
+constinit const AddNormKernels<float, float>
+    Kernels<AddNormKernels<float, float>, Tier::TIER>::table = {.rows = add_norm_rows};
 template <>
-constinit const AddNormKernels<bfloat16> Kernels<AddNormKernels<bfloat16>, Tier::TIER>::table = {
-    .rows = add_norm_rows<bfloat16>};
+constinit const AddNormKernels<bfloat16, bfloat16>
+    Kernels<AddNormKernels<bfloat16, bfloat16>, Tier::TIER>::table = {.rows = add_norm_rows};
+template <>
+constinit const AddNormKernels<float, uint8_t>
+    Kernels<AddNormKernels<float, uint8_t>, Tier::TIER>::table = {.rows = add_norm_rows};
 
 }  // namespace darswin

@@ -11,6 +11,7 @@
 #include "../window_attention.h"
 
 #include "math.h"
+#include "quantize.h"
 #include "window_attention_scratch.h"
 #include "window_attention_tiles.h"
 
@@ -240,15 +241,32 @@ struct Attention {
   // One head of the current window.
   void forward(int64_t index) {
     begin(index);
+    if (a.quantized != nullptr) {
+      attend({s.dq_copy, s.copy}, nullptr);
+      if constexpr (kSame<S, float>) quantize(a.quantized + head * shape.d);
+      return;
+    }
     S* to = a.out + head * shape.d;
-    const Rows<T> out = write(to, s.window.out, s.dq_copy);
+    attend(write(to, s.window.out, s.dq_copy), to);
+    finish(to, s.window.out, s.dq_copy);
+  }
+
+  // The window's weighted values. Those of the next window will stand in `map`, if it is one.
+  void attend(Rows<T> out, const S* map) const {
     for (int64_t group = 0; group < shape.n; group += kGroup) {
       weights(group);
-      fetch(to, s.next.out, group);
+      if (map != nullptr) fetch(map, s.next.out, group);
       weighted_sums(Weights<1, kGroup, T>{s.p}, v, shape.n, out.from(group), group_size(group),
                     shape.d, Factors<T>{s.inverse, 1}, false);
     }
-    finish(to, s.window.out, s.dq_copy);
+  }
+
+  // Rows of a copy as 8 bits.
+  void quantize(uint8_t* map) const {
+    const Quantize quantized(a.quantizer);
+    for (int64_t t = 0; t < shape.n; ++t) {
+      quantized(map + s.window.out[t], s.dq_copy + s.copy[t], shape.d);
+    }
   }
 
   // The same backward; grad_bias is the head's row of bias gradients.

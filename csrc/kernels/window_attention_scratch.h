@@ -34,6 +34,7 @@ struct Shape {
   int64_t table_a, table;  // width and size of one head's bias table
   bool pairs;              // whether there are tables of all pairs
   bool far;                // whether the map is too large for the caches
+  bool quantized;          // whether results are 8 bits
 
   template <typename S>
   explicit Shape(const WindowAttentionArgs<S>& a)
@@ -50,7 +51,8 @@ struct Shape {
         table_a(2 * run - 1),
         table((2 * runs - 1) * table_a),
         pairs(n <= kPairTokens),
-        far(a.windows * n * 3 * heads * d * static_cast<int64_t>(sizeof(S)) > kCache) {}
+        far(a.windows * n * 3 * heads * d * static_cast<int64_t>(sizeof(S)) > kCache),
+        quantized(a.quantized != nullptr) {}
 
   // body(key, query, count, index) for all keys and the queries of [begin, end), in runs of queries
   // whose biases follow each other too: that of the first one stands at `index` of the table.
@@ -131,7 +133,7 @@ struct Scratch {
   int64_t* bias_row;         // (heads,): the row of the bias that pair_bias holds
   T* group_bias;  // (eights, group): biases of a group, where there are no tables of pairs
   T *q_copy, *k_copy, *v_copy, *g_copy;  // (padded, d): rows of a head, widened; g: the gradient
-  T *dq_copy, *dk_copy, *dv_copy;        // the same of results, yet to be rounded
+  T *dq_copy, *dk_copy, *dv_copy;        // the same of results, yet to be rounded: forward's is dq
 
   template <typename Sizes>
   Scratch(Arena& arena, const Sizes& shape) {
@@ -140,6 +142,7 @@ struct Scratch {
     const int64_t past =
         (shape.eights - n) * padded;  // keys are read in eights, here past the last
     const int64_t rows = sizeof(S) == sizeof(T) ? 0 : padded * shape.d;
+    const int64_t results = shape.quantized ? padded * shape.d : rows;
     window.take(arena, padded);
     next.take(arena, padded);
     copy = arena.take<int64_t>(padded);
@@ -156,7 +159,7 @@ struct Scratch {
     k_copy = arena.take<T>(rows);
     v_copy = arena.take<T>(rows);
     g_copy = arena.take<T>(rows);
-    dq_copy = arena.take<T>(rows);
+    dq_copy = arena.take<T>(results);
     dk_copy = arena.take<T>(rows);
     dv_copy = arena.take<T>(rows);
   }

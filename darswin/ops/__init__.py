@@ -4,8 +4,8 @@ They run on torch's number of threads. A process that is forked after such a cal
 another one on several: use `spawn`, or `torch.set_num_threads(1)` in the child.
 """
 
-# The first two are not public; they are imported so that their fakes and autograd are registered.
-from darswin.ops import _add_norm, _transpose_sum  # noqa: F401
+# The first three are not public; they are imported so that their fakes and autograd are registered.
+from darswin.ops import _add_norm, _quantized, _transpose_sum  # noqa: F401
 from darswin.ops._library import cpu_capability, reference_in_use, use_reference
 from darswin.ops.polar_embed import polar_embed
 from darswin.ops.polar_sample import polar_sample

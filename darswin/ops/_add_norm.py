@@ -2,7 +2,6 @@
 
 import torch
 from torch import Tensor
-from torch.autograd.graph import increment_version
 
 from darswin.ops import _library
 
@@ -31,30 +30,4 @@ def _fake(x, y, weight, bias, eps):
     return None
 
 
-_implementations = torch.library.Library("darswin", "IMPL")
-
-
-def _no_gradient(keyset, *arguments):
-    _library.refuse_other_derivatives("add_norm_", arguments)
-    wants = [isinstance(t, Tensor) and t.requires_grad for t in arguments[:4]]
-    if torch.is_grad_enabled() and any(wants):
-        raise RuntimeError(
-            "add_norm_ has no gradient, but one of its tensors requires one: call it under "
-            "torch.no_grad(), or use torch.layer_norm(x + y, ...)"
-        )
-    with torch._C._AutoDispatchBelowAutograd():
-        return torch.ops.darswin._add_norm_.default.redispatch(
-            keyset & torch._C._after_autograd_keyset, *arguments
-        )
-
-
-def _changed(keyset, x, y, *others):
-    # Autograd then notices where a value that it has saved was changed.
-    increment_version((x, y))
-    return torch.ops.darswin._add_norm_.default.redispatch(
-        keyset & torch._C._after_ADInplaceOrView_keyset, x, y, *others
-    )
-
-
-_implementations.impl("_add_norm_", _no_gradient, "Autograd", with_keyset=True)
-_implementations.impl("_add_norm_", _changed, "ADInplaceOrView", with_keyset=True)
+_library.without_gradient("_add_norm_", changes=2, instead="torch.layer_norm(x + y, ...)")

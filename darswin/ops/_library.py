@@ -7,6 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 from torch.autograd import forward_ad
+from torch.autograd.graph import increment_version
 
 from darswin.ops import _module
 
@@ -142,3 +143,36 @@ def no_second_derivative(name: str) -> None:
         )
 
     torch.library.register_autograd(f"{name}_backward", raise_error)
+
+
+_implementations = torch.library.Library("darswin", "IMPL")
+
+
+def without_gradient(name: str, *, changes: int, instead: str) -> None:
+    """Makes an operator raise where a gradient of it would be recorded: it has none.
+
+    Args:
+        changes: how many of its first arguments it changes in place, which autograd then notices.
+        instead: what has a gradient.
+    """
+    operator = getattr(torch.ops.darswin, name).default
+    plain = name.removeprefix("_")
+
+    def no_gradient(keyset, *arguments):
+        refuse_other_derivatives(plain, arguments)
+        wants = any(isinstance(a, Tensor) and a.requires_grad for a in arguments)
+        if torch.is_grad_enabled() and wants:
+            raise RuntimeError(
+                f"{plain} has no gradient, but one of its tensors requires one: call it under "
+                f"torch.no_grad(), or use {instead}"
+            )
+        with torch._C._AutoDispatchBelowAutograd():
+            return operator.redispatch(keyset & torch._C._after_autograd_keyset, *arguments)
+
+    def changed(keyset, *arguments):
+        increment_version([a for a in arguments[:changes] if a is not None])
+        return operator.redispatch(keyset & torch._C._after_ADInplaceOrView_keyset, *arguments)
+
+    _implementations.impl(name, no_gradient, "Autograd", with_keyset=True)
+    if changes:
+        _implementations.impl(name, changed, "ADInplaceOrView", with_keyset=True)
