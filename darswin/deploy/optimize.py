@@ -3,18 +3,17 @@ the norm behind it in one."""
 
 import copy
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, Self, TypeVar
 
 import torch
 from torch import Tensor, nn
 
+from darswin.deploy.quantize import quantize_model
+from darswin.deploy.stages import InDtype, OptimizedStage, pack
 from darswin.layers import onednn
-from darswin.layers.attention import WindowAttention
-from darswin.layers.block import Block, PatchMerging
-from darswin.layers.linear import Linear
 from darswin.layers.onednn import PackedLinear
-from darswin.layers.position_bias import RelativeBias, RelativeTable
+from darswin.layers.quantized import quantized_layers
 from darswin.lens import Lens
 from darswin.models.base import Model
 from darswin.models.dense import DenseModel, DensePrepared
@@ -23,15 +22,16 @@ from darswin.models.feature_maps import FeatureMaps
 from darswin.models.stages import Pair, Stage
 
 Net = TypeVar("Net", bound=Model)
-DTYPES = (torch.float32, torch.bfloat16)
-_ADD_NORM = torch.ops.darswin._add_norm_.default
-_CPU = torch._C.DispatchKeySet(torch._C.DispatchKey.CPU)
-# A stage runs on so many images at once that what lies between two products stays below this: it
-# is then in the caches, and in memory that the allocator has kept rather than in fresh pages.
-CACHED_BYTES = 16 * 2**20
+DTYPES = (torch.float32, torch.bfloat16, torch.int8)
 
 
-def optimize(model: Net, dtype: torch.dtype = torch.float32, *, lens: Lens | None = None) -> Net:
+def optimize(
+    model: Net,
+    dtype: torch.dtype = torch.float32,
+    *,
+    lens: Lens | None = None,
+    calibration: Iterable[Sequence] | None = None,
+) -> Net:
     """A copy of a model that computes the same, faster: on CPU, in inference only.
 
     Its products are oneDNN's, with weights laid out for them, and take bias and GELU along; a
@@ -42,17 +42,29 @@ def optimize(model: Net, dtype: torch.dtype = torch.float32, *, lens: Lens | Non
     Args:
         model: one of `create_model`, on the CPU.
         dtype: float32 or bfloat16, of what flows between the layers and of the result; distances
-            are float32, and so is what refines the pixels of dense models.
+            are float32, and so is what refines the pixels of dense models. int8: products of 8
+            bits, of a model of `quantize_model`; what lies between them is float32, and a picture
+            with numbers that are not finite gets a result that is finite and means nothing.
         lens: one camera's, for all images; the result is then called `optimized(images)`, and
             computes the grid and the position biases once for each image size.
+        calibration: batches (images, lens) of pictures like those to come: with int8, for a model
+            that is not quantized yet; it then goes through `quantize_model`.
 
     Where torch lacks oneDNN's products it warns, and uses its own.
 
     Raises:
         TypeError: another kind of model.
-        ValueError: another dtype or device, or `lens` is not a single lens.
+        ValueError: another dtype or device, `lens` is not a single lens, or a calibration where
+            there is nothing to calibrate, or none where there is.
+        RuntimeError: int8 on a CPU that has no products of 8 bits.
     """
     _check(model, dtype, lens)
+    if dtype == torch.int8:
+        if (lack := onednn.missing(dtype)) is not None:
+            raise RuntimeError(f"{lack}: use optimize(model, torch.float32), which runs anywhere")
+        model, dtype = _quantized(model, calibration), torch.float32
+    elif calibration is not None or quantized_layers(model):
+        raise ValueError(f"a quantized model and a calibration are for torch.int8, got {dtype}")
     if (lack := onednn.missing(dtype)) is not None:
         warnings.warn(f"optimize goes on with torch's own products: {lack}", stacklevel=2)
     optimized = copy.deepcopy(model).eval().requires_grad_(False)
@@ -73,6 +85,15 @@ def optimize(model: Net, dtype: torch.dtype = torch.float32, *, lens: Lens | Non
     return optimized
 
 
+def _quantized(model: Net, calibration: Iterable[Sequence] | None) -> Net:
+    if bool(quantized_layers(model)) == (calibration is not None):
+        raise ValueError(
+            "int8 needs either a model of quantize_model or a calibration: batches (images, lens) "
+            "of pictures like those to come"
+        )
+    return model if calibration is None else quantize_model(model, calibration)
+
+
 def _check(model: nn.Module, dtype: torch.dtype, lens: Lens | None) -> None:
     if not isinstance(model, (Encoder, DenseModel, FeatureMaps)):
         raise TypeError(f"model must be one of create_model, got {type(model).__name__}")
@@ -81,7 +102,7 @@ def _check(model: nn.Module, dtype: torch.dtype, lens: Lens | None) -> None:
     if lens is not None and (not isinstance(lens, Lens) or len(lens) != 1):
         raise ValueError(f"lens must be one lens, got {lens!r}")
     if dtype not in DTYPES:
-        raise ValueError(f"dtype must be torch.float32 or torch.bfloat16, got {dtype}")
+        raise ValueError(f"dtype must be one of {', '.join(map(str, DTYPES))}, got {dtype}")
     devices = sorted({parameter.device.type for parameter in model.parameters()})
     if devices != ["cpu"]:
         raise ValueError(f"model must be on the CPU, got one on {' and '.join(devices)}")
@@ -94,7 +115,7 @@ def _become(model: Model, *bases: type, **attributes: Any) -> None:
 
 
 def _pack_encoder(encoder: Encoder, dtype: torch.dtype) -> None:
-    encoder.patch_embed = _InDtype(encoder.patch_embed, dtype)
+    encoder.patch_embed = InDtype(encoder.patch_embed, dtype)
     encoder.stages = _stages(encoder.stages, dtype)
     encoder.norm.to(dtype)
     encoder.head.to(dtype)
@@ -104,30 +125,23 @@ def _pack_dense(model: DenseModel, dtype: torch.dtype) -> None:
     _pack_encoder(model.encoder, dtype)
     _become(model.encoder, _OptimizedEncoder)
     decoder, head = model.decoder, model.head
-    _pack(decoder.joins, dtype)
-    _pack(decoder.expand, dtype)
+    pack(decoder.joins, dtype)
+    pack(decoder.expand, dtype)
     decoder.stages = _stages(decoder.stages, dtype)
     head.set_submodule("proj", PackedLinear(head.proj, dtype))
 
 
-def _pack(module: nn.Module, dtype: torch.dtype) -> None:
-    """Packs the linear layers of a module for oneDNN; norms get `dtype`."""
-    for name, layer in list(module.named_modules()):
-        if isinstance(layer, Linear):
-            module.set_submodule(name, PackedLinear(layer, dtype))
-        elif isinstance(layer, nn.LayerNorm):
-            layer.to(dtype)
-
-
 def _stages(stages: nn.ModuleList, dtype: torch.dtype) -> nn.ModuleList:
-    return nn.ModuleList(_Stage(stage, dtype) for stage in stages if isinstance(stage, Stage))
+    return nn.ModuleList(
+        OptimizedStage(stage, dtype) for stage in stages if isinstance(stage, Stage)
+    )
 
 
 def _tables(
     stages: nn.ModuleList, positions: Sequence[Sequence[Tensor | None]]
 ) -> list[Sequence[Tensor | None]]:
     """The position biases of each stage's blocks."""
-    optimized = [stage for stage in stages if isinstance(stage, _Stage)]
+    optimized = [stage for stage in stages if isinstance(stage, OptimizedStage)]
     return [s.tables(*p) for s, p in zip(optimized, positions, strict=True)]
 
 
@@ -200,144 +214,3 @@ class FixedLens(_Optimized):
         if prepared is None:
             prepared = self._prepared[size] = super().prepare(self.fixed_lens, size)
         return prepared
-
-
-class _InDtype(nn.Module):
-    """A module as it is, in bfloat16 under autocast, and its result in `dtype`."""
-
-    def __init__(self, module: nn.Module, dtype: torch.dtype):
-        super().__init__()
-        self.module, self.dtype = module, dtype
-        self.sample = getattr(module, "sample", None)
-
-    def forward(self, *arguments) -> Tensor:
-        with torch.autocast("cpu", torch.bfloat16, enabled=self.dtype == torch.bfloat16):
-            return self.module(*arguments).to(self.dtype)
-
-
-class _Stage(nn.Module):
-    """A stage as calls of operators."""
-
-    def __init__(self, stage: Stage, dtype: torch.dtype):
-        super().__init__()
-        self.downsample = stage.downsample
-        if isinstance(stage.downsample, PatchMerging):
-            _pack(stage.downsample, dtype)
-        elif not isinstance(stage.downsample, nn.Identity):
-            self.downsample = _InDtype(stage.downsample, dtype)
-        blocks = [block for block in stage.blocks if isinstance(block, Block)]
-        self.blocks = [_Block(block, dtype) for block in blocks]
-        self.followers = [*self.blocks[1:], None]
-        self.mlp_ratio = blocks[0].mlp.fc1.out_features // blocks[0].mlp.fc1.in_features
-        attentions = [block.attn for block in blocks]
-        biases = [a.position_bias if isinstance(a, WindowAttention) else None for a in attentions]
-        self.bias = _joined([bias for bias in biases if isinstance(bias, RelativeBias)])
-        # Tables that depend on no position, and None for an attention that is not in windows.
-        self.fixed = [
-            bias().contiguous() if isinstance(bias, RelativeTable) else None for bias in biases
-        ]
-
-    def tables(self, *positions: Tensor | None) -> Sequence[Tensor | None]:
-        """The position bias of each block, for `forward`: (B or 1, heads, ...), contiguous."""
-        if self.bias is None:
-            return self.fixed
-        joined = self.bias(*positions)
-        return [table.contiguous() for table in joined.chunk(len(self.blocks), 1)]
-
-    def forward(self, x: Tensor, *tables: Tensor | None) -> Tensor:
-        """The map of the stage before → this stage's. Where nothing merges, x itself changes."""
-        if torch.is_grad_enabled() and x.requires_grad:
-            raise RuntimeError(
-                "an optimized model has no gradients, but its images or its lens require one: call "
-                "it under torch.no_grad(), or use the model it was made of"
-            )
-        x = self.downsample(x).contiguous()
-        widest = x[:1].numel() * self.mlp_ratio * x.element_size()
-        parts = -(-len(x) * widest // CACHED_BYTES)
-        if parts <= 1:
-            self._blocks(x, tables)
-            return x
-        start = 0
-        for part in x.tensor_split(min(parts, len(x))):
-            end = start + len(part)
-            self._blocks(part, [t if t is None or len(t) == 1 else t[start:end] for t in tables])
-            start = end
-        return x
-
-    def _blocks(self, x: Tensor, tables: Sequence[Tensor | None]) -> None:
-        """All blocks on x, in place: their residuals are added to it."""
-        y = self.blocks[0].norm1(x)
-        for block, follower, table in zip(self.blocks, self.followers, tables, strict=True):
-            y = block.norm2.after(x, block.attention(y, table))
-            y = block.fc2(block.fc1.gelu(y))
-            if follower is None:
-                x += y
-            else:
-                y = follower.norm1.after(x, y)
-
-
-def _joined(biases: Sequence[RelativeBias]) -> RelativeBias | None:
-    """The biases of several blocks as one with the heads of all: one computation for the stage."""
-    if not biases:
-        return None
-    joined = copy.deepcopy(biases[0])
-    for name, _ in list(joined.named_parameters()):
-        heads = torch.cat([getattr(bias, name).float() for bias in biases], 1)
-        setattr(joined, name, nn.Parameter(heads, requires_grad=False))
-    return joined
-
-
-class _Block:
-    """A block's parts, with everything at hand that their operators take."""
-
-    def __init__(self, block: Block, dtype: torch.dtype):
-        self.attention: _Windows | _Deformable
-        if isinstance(block.attn, WindowAttention):
-            self.attention = _Windows(block.attn, dtype)
-        else:
-            self.attention = _Deformable(block.attn, dtype)
-        self.norm1, self.norm2 = _Norm(block.norm1), _Norm(block.norm2)
-        self.fc1, self.fc2 = (PackedLinear(fc, dtype) for fc in (block.mlp.fc1, block.mlp.fc2))
-
-
-class _Norm:
-    """A layer norm; its parameters stay float32."""
-
-    def __init__(self, norm: nn.LayerNorm):
-        self.shape, self.eps = norm.normalized_shape, norm.eps
-        self.weight, self.bias = norm.weight.float(), norm.bias.float()
-
-    def __call__(self, x: Tensor) -> Tensor:
-        return torch.layer_norm(x, self.shape, self.weight, self.bias, self.eps)
-
-    def after(self, x: Tensor, y: Tensor) -> Tensor:
-        """Adds y to the residual x, in place, and normalizes the sum, in place of y."""
-        # Not by way of autograd, which would look for gradients and count versions: there are none.
-        _ADD_NORM.redispatch(_CPU, x, y, self.weight, self.bias, self.eps)
-        return y
-
-
-class _Windows:
-    """Attention in windows."""
-
-    def __init__(self, attn: WindowAttention, dtype: torch.dtype):
-        self.qkv, self.proj = PackedLinear(attn.qkv, dtype), PackedLinear(attn.proj, dtype)
-        dim = attn.proj.in_features // attn.num_heads
-        self.shape = (*attn.map_size, 3, attn.num_heads, dim)
-        self.settings = (attn.window, attn.shift, attn.periodic, dim**-0.5)
-
-    def __call__(self, x: Tensor, table: Tensor | None) -> Tensor:
-        qkv = self.qkv(x).view(x.shape[0], *self.shape)
-        # Not by way of darswin.ops: all that it would check is known to fit.
-        out = torch.ops.darswin.window_attention.default(qkv, table, *self.settings)
-        return self.proj(out)
-
-
-class _Deformable:
-    """Any other attention, as it is."""
-
-    def __init__(self, attn: nn.Module, dtype: torch.dtype):
-        self.attn = _InDtype(attn, dtype)
-
-    def __call__(self, x: Tensor, table: Tensor | None) -> Tensor:
-        return self.attn(x).contiguous()

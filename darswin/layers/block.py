@@ -99,15 +99,19 @@ class PatchMerging(nn.Module):
         self.norm = nn.LayerNorm(joined)
         self.reduction = Linear(joined, 2 * dim, bias=False)
 
-    def forward(self, x: Tensor) -> Tensor:
-        """(B, R, A, D) → (B, R/m_r, A/m_φ, 2·D)."""
+    def join(self, x: Tensor) -> Tensor:
+        """(B, R, A, D) → (B, R/m_r, A/m_φ, m_r·m_φ·D)."""
         batch, rings, sectors, dim = x.shape
         mr, ma = self.merge
         if rings % mr or sectors % ma:
             raise ValueError(f"merge {self.merge} must divide (R, A) = {(rings, sectors)}")
         # Inner order (φ, r, D): neighbours along the radius come first.
         x = x.reshape(batch, rings // mr, mr, sectors // ma, ma, dim).permute(0, 1, 3, 4, 2, 5)
-        return self.reduction(self.norm(x.flatten(3)))
+        return x.flatten(3)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(B, R, A, D) → (B, R/m_r, A/m_φ, 2·D)."""
+        return self.reduction(self.norm(self.join(x)))
 
     def extra_repr(self) -> str:
         return f"merge={self.merge}"
