@@ -11,15 +11,18 @@ from torch import Tensor
 
 from darswin.bench.timing import COMPILED, FIXED_LENS, MATMULS, OURS, REFERENCE
 from darswin.deploy.optimize import optimize
+from darswin.deploy.quantize import quantize_model
+from darswin.deploy.stages import Product, packed
 from darswin.layers.embed import PolarPatchEmbed
 from darswin.layers.linear import Linear
-from darswin.layers.onednn import PackedLinear
+from darswin.layers.quantized import QuantizedLinear
 from darswin.lens import Lens, Spherical
 from darswin.models import create_model
 from darswin.models.base import Model
 from darswin.models.dense import DenseModel
 from darswin.models.registry import model_class
 from darswin.ops import use_reference
+from darswin.ops._quantized import quantize
 
 Run = Callable[[], Tensor]
 CLASSES, PIXEL_CLASSES = 200, 10  # of images, and of pixels
@@ -49,12 +52,14 @@ def inference(
     """
     model, lens = network(name, size).eval(), lens_of(size)
     images = torch.randn(batch, 3, size, size)
-    ours_of_lens = optimize(model, dtype, lens=lens)
-    products = matmuls_of(model, images, lens, dtype)
-    peer = copy.deepcopy(model).to(dtype) if dtype == torch.bfloat16 else model
-    pixels = images.to(dtype)
+    ours = quantize_model(model, [(images, lens)]) if dtype == torch.int8 else model
+    ours_of_lens = optimize(ours, dtype, lens=lens)
+    products = matmuls_of(ours, images, lens, dtype)
+    # The reference has no products of 8 bits: there it computes in float32.
+    theirs = torch.float32 if dtype == torch.int8 else dtype
+    peer, pixels = copy.deepcopy(model).to(theirs), images.to(theirs)
     runs: dict[str, Run] = {
-        OURS: optimized_run(model, lens, dtype, images),
+        OURS: optimized_run(ours, lens, dtype, images),
         FIXED_LENS: lambda: ours_of_lens(images),
         MATMULS: lambda: _all(products),
         REFERENCE: reference_run(peer, lens, pixels),
@@ -66,7 +71,7 @@ def inference(
     return {name: torch.no_grad()(run) for name, run in runs.items()}
 
 
-def _all(products: list[tuple[PackedLinear, Tensor]]) -> Tensor:
+def _all(products: list[tuple[Product, Tensor]]) -> Tensor:
     """The last of the products. The others' memory is freed at once, as it is within a model."""
     for layer, x in products:
         result = layer(x)
@@ -74,7 +79,7 @@ def _all(products: list[tuple[PackedLinear, Tensor]]) -> Tensor:
 
 
 def optimized_run(model: Model, lens: Lens, dtype: torch.dtype, images: Tensor) -> Run:
-    """Inference by our operators."""
+    """Inference by our operators; int8 of a quantized model."""
     optimized = optimize(model, dtype)
     return lambda: optimized(images, lens)
 
@@ -92,19 +97,26 @@ def reference_run(model: Callable[..., Tensor], lens: Lens, images: Tensor) -> R
 
 def matmuls_of(
     model: Model, images: Tensor, lens: Lens, dtype: torch.dtype
-) -> list[tuple[PackedLinear, Tensor]]:
-    """The linear layers that a model runs, packed, and an input of each."""
-    found: list[tuple[PackedLinear, Tensor]] = []
+) -> list[tuple[Product, Tensor]]:
+    """The linear layers that a model runs, packed, and an input of each. With int8 those that are
+    not quantized are float32."""
+    found: list[tuple[Product, Tensor]] = []
+    rest = torch.float32 if dtype == torch.int8 else dtype
 
-    def add(layer: Linear, rows: int) -> None:
-        found.append((PackedLinear(layer, dtype), torch.randn(rows, layer.in_features).to(dtype)))
+    def add(layer: Linear | QuantizedLinear, rows: int) -> None:
+        x = torch.randn(rows, layer.in_features).to(rest)
+        if isinstance(layer, QuantizedLinear):
+            x = quantize(x, layer.activation)
+        found.append((packed(layer, rest), x))
 
-    def hook(layer: Linear | PolarPatchEmbed, _inputs: tuple[Tensor], output: Tensor) -> None:
+    kinds = (Linear, QuantizedLinear, PolarPatchEmbed)
+
+    def hook(layer: Any, _inputs: tuple[Tensor], output: Tensor) -> None:
         # A polar embedding's linear layer is not called: `polar_embed` takes its weight.
         linear = layer.proj if isinstance(layer, PolarPatchEmbed) else layer
         add(linear, output.numel() // linear.out_features)
 
-    layers = [layer for layer in model.modules() if isinstance(layer, (Linear, PolarPatchEmbed))]
+    layers = [layer for layer in model.modules() if isinstance(layer, kinds)]
     handles = [layer.register_forward_hook(hook) for layer in layers]
     with torch.no_grad():
         model(images, lens)

@@ -1,7 +1,7 @@
 """What a model says of a stream of images, several at once: their most probable classes."""
 
 import time
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import torch
@@ -14,6 +14,8 @@ from darswin.models.base import Model
 from darswin.models.dense import DenseModel
 from darswin.models.encoder import Encoder, Prepared
 from darswin.models.saving import ModelCard
+
+Net = TypeVar("Net", bound=Model)
 
 BATCH = 8  # images at once take a half or a third of the time of one after the other
 LENSES = 16  # of which what they decide is kept: as many cameras may take turns in a folder
@@ -108,7 +110,7 @@ class ClassAnswers(Answers):
     model: Encoder
 
     def __init__(self, model: Encoder, card: ModelCard, top: int):
-        super().__init__(optimize(model), card)
+        super().__init__(fast(model, card), card)
         self.top = top
 
     def ask(self, images: Tensor, prepared: Prepared) -> Tensor:
@@ -124,6 +126,11 @@ class ClassAnswers(Answers):
     def _class(self, index: int, probability: float) -> dict[str, Any]:
         name = self.card.classes[index] if self.card.classes else index
         return {"class": name, "probability": probability}
+
+
+def fast(model: Net, card: ModelCard) -> Net:
+    """The optimized model: in float32, or as fast as it goes where it is quantized anyway."""
+    return optimize(model, "fastest" if card.quantized else torch.float32)
 
 
 def resized(net: Model, card: ModelCard, image: np.ndarray, lens: Lens) -> tuple[Tensor, Lens]:

@@ -13,14 +13,15 @@ from darswin.bench.machine import THREADS, machine, num_threads
 from darswin.bench.record import Record
 from darswin.bench.timing import MATMULS, OURS, REFERENCE, TURNS, Case, Timing, measure
 from darswin.cli.arguments import with_lists
-from darswin.layers import linear
+from darswin.layers import linear, onednn
 from darswin.models import list_models
 
 DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16}
+INT8 = {"int8": torch.int8}  # inference, where the CPU has it
 MOST = 65536  # px, and images at once
 LATENCY_RUNS = 100  # at batch 1: what a 99th percentile takes
 # How far the results of two candidates may be apart, of their norm.
-TOLERANCES = {"float32": 1e-4, "bfloat16": 5e-2}
+TOLERANCES = {"float32": 1e-4, "bfloat16": 5e-2, "int8": 1e-1}
 
 
 def bench(
@@ -47,7 +48,7 @@ def bench(
     print(" ".join(f"{k}={v}" for k, v in head.items()), flush=True)
     timings: list[Timing] = []
     for mode in ("inference", "training"):
-        for dtype in DTYPES:
+        for dtype in _dtypes(mode):
             for batch in batches:
                 for threads in THREADS:
                     with_compiled = batch in compiled and threads == max(THREADS)
@@ -78,7 +79,8 @@ def _measure(
     threads = torch.get_num_threads()
     case = Case(model, f"{size}×{size}", batch, threads, f"{mode}, {dtype}")
     if mode == "inference":
-        runs = candidates.inference(model, size, DTYPES[dtype], batch, compiled=compiled)
+        kind = (DTYPES | INT8)[dtype]
+        runs = candidates.inference(model, size, kind, batch, compiled=compiled)
     else:
         runs = candidates.training(model, size, DTYPES[dtype], batch)
     _check(runs, TOLERANCES[dtype])
@@ -88,6 +90,11 @@ def _measure(
     times = ", ".join(f"{t.name} {1e3 * t.median:.1f} ms" for t in found)
     print(f"{mode}, {dtype}, batch {batch}, {threads} threads: {times}", flush=True)
     return found
+
+
+def _dtypes(mode: str) -> list[str]:
+    quantized = mode == "inference" and onednn.missing(torch.int8) is None
+    return [*DTYPES, *(INT8 if quantized else ())]
 
 
 def _check(runs: dict[str, candidates.Run], tolerance: float) -> None:

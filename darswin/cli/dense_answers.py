@@ -12,10 +12,9 @@ import numpy as np
 from PIL import Image
 from torch import Tensor
 
-from darswin.cli.answers import Answers, Asked, fit_of
+from darswin.cli.answers import Answers, Asked, fast, fit_of
 from darswin.data.full_size import FullSize
 from darswin.data.scenes.targets import IGNORE, PER_METRE
-from darswin.deploy.optimize import optimize
 from darswin.lens import Lens
 from darswin.models.dense import DenseModel, DensePrepared
 from darswin.models.saving import ModelCard
@@ -49,7 +48,7 @@ class DenseAnswers(Answers):
     model: DenseModel
 
     def __init__(self, model: DenseModel, card: ModelCard, out: Path, names: Mapping[str, str]):
-        super().__init__(optimize(model), card)
+        super().__init__(fast(model, card), card)
         self.out, self.names = out, names
 
     def look_through(self, lens: Lens) -> FullSize:

@@ -7,6 +7,7 @@ import torch
 
 from darswin.bench.machine import machine
 from darswin.layers import onednn
+from darswin.layers.packed import fastest_dtype
 from darswin.ops import _module
 from darswin.utils.extras import lack
 
@@ -31,10 +32,17 @@ def info() -> dict[str, str]:
         "CPU": f"{here['cpu']}, {torch.get_num_threads()} threads",
         "tier": f"{here['tier']}, of {', '.join(_module.tiers())}",
     }
-    for dtype in (torch.float32, torch.bfloat16):
+    for dtype in (torch.float32, torch.bfloat16, torch.int8):
         reason = onednn.missing(dtype)
-        name = str(dtype).removeprefix("torch.")
-        lines[name] = "oneDNN's products" if reason is None else f"torch's products: {reason}"
+        other = "none" if dtype == torch.int8 else "torch's products"
+        lines[_name(dtype)] = "oneDNN's products" if reason is None else f"{other}: {reason}"
+    fastest = _name(fastest_dtype())
+    quantized = onednn.missing(torch.int8) is None
+    lines["fastest"] = f"int8 of a quantized model, else {fastest}" if quantized else fastest
     for extra in EXTRAS:
         lines[f"[{extra}]"] = lack(extra) or "installed"
     return lines
+
+
+def _name(dtype: torch.dtype) -> str:
+    return str(dtype).removeprefix("torch.")

@@ -33,6 +33,13 @@ def _predict(argv: list[str]) -> None:
     run(argv[1:])
 
 
+def _quantize(argv: list[str]) -> None:
+    from darswin.cli.arguments import run_command
+    from darswin.cli.quantize import quantize
+
+    run_command(quantize, argv[1:], "darswin quantize")
+
+
 def _convert(argv: list[str]) -> None:
     from darswin.cli.arguments import run_command
     from darswin.compat import convert_checkpoint
@@ -85,6 +92,9 @@ COMMANDS = {
         "says what is in pictures taken through a known lens, or in each of their pixels",
         (*PICTURES, "matplotlib"),
         _predict,
+    ),
+    "quantize": Command(
+        "makes a file of a trained model that computes with 8 bits", TRAIN, _quantize
     ),
     "convert": Command(
         "makes a safetensors file of a pickled checkpoint, without executing it",

@@ -4,7 +4,7 @@ the norm behind it in one."""
 import copy
 import warnings
 from collections.abc import Iterable, Sequence
-from typing import Any, Self, TypeVar
+from typing import Any, Literal, Self, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -12,8 +12,8 @@ from torch import Tensor, nn
 from darswin.deploy.quantize import quantize_model
 from darswin.deploy.stages import InDtype, OptimizedStage, pack
 from darswin.layers import onednn
-from darswin.layers.onednn import PackedLinear
-from darswin.layers.quantized import quantized_layers
+from darswin.layers.packed import PackedLinear, fastest_dtype
+from darswin.layers.quantized import quantized_layers, without_quantized_layers
 from darswin.lens import Lens
 from darswin.models.base import Model
 from darswin.models.dense import DenseModel, DensePrepared
@@ -27,7 +27,7 @@ DTYPES = (torch.float32, torch.bfloat16, torch.int8)
 
 def optimize(
     model: Net,
-    dtype: torch.dtype = torch.float32,
+    dtype: torch.dtype | Literal["fastest"] = torch.float32,
     *,
     lens: Lens | None = None,
     calibration: Iterable[Sequence] | None = None,
@@ -45,6 +45,8 @@ def optimize(
             are float32, and so is what refines the pixels of dense models. int8: products of 8
             bits, of a model of `quantize_model`; what lies between them is float32, and a picture
             with numbers that are not finite gets a result that is finite and means nothing.
+            "fastest": int8 of a quantized model, where this CPU has it; else float32 or bfloat16,
+            whichever `fastest_dtype` measured.
         lens: one camera's, for all images; the result is then called `optimized(images)`, and
             computes the grid and the position biases once for each image size.
         calibration: batches (images, lens) of pictures like those to come: with int8, for a model
@@ -58,10 +60,16 @@ def optimize(
             there is nothing to calibrate, or none where there is.
         RuntimeError: int8 on a CPU that has no products of 8 bits.
     """
+    if dtype == "fastest":
+        whole = calibration is None and not quantized_layers(model)
+        lacks = onednn.missing(torch.int8) is not None
+        dtype = fastest_dtype() if whole or lacks else torch.int8
+        if lacks:
+            model, calibration = _without_8_bits(model), None
     _check(model, dtype, lens)
     if dtype == torch.int8:
         if (lack := onednn.missing(dtype)) is not None:
-            raise RuntimeError(f"{lack}: use optimize(model, torch.float32), which runs anywhere")
+            raise RuntimeError(f'{lack}: optimize(model, "fastest") takes what runs here')
         model, dtype = _quantized(model, calibration), torch.float32
     elif calibration is not None or quantized_layers(model):
         raise ValueError(f"a quantized model and a calibration are for torch.int8, got {dtype}")
@@ -83,6 +91,14 @@ def optimize(
     else:
         _become(optimized, FixedLens, kind, fixed_lens=lens, _prepared={})
     return optimized
+
+
+def _without_8_bits(model: Net) -> Net:
+    if not isinstance(model, nn.Module) or not quantized_layers(model):
+        return model
+    model = copy.deepcopy(model)
+    without_quantized_layers(model)
+    return model
 
 
 def _quantized(model: Net, calibration: Iterable[Sequence] | None) -> Net:

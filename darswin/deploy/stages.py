@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from darswin.layers.attention import WindowAttention
 from darswin.layers.block import Block, Mlp, PatchMerging
 from darswin.layers.linear import Linear
-from darswin.layers.onednn import PackedLinear, PackedQuantizedLinear
+from darswin.layers.packed import PackedLinear, PackedQuantizedLinear
 from darswin.layers.position_bias import RelativeBias, RelativeTable
 from darswin.layers.quantized import QuantizedLinear
 from darswin.models.stages import Stage

@@ -6,6 +6,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from darswin.layers.linear import Linear
 from darswin.ops._quantized import Quantization, dequantize, quantize
 
 _LARGEST = 127  # of a weight: -128 is left out, so that weights are symmetric
@@ -32,6 +33,7 @@ class QuantizedLinear(nn.Module):
     weight: Tensor
     weight_scale: Tensor
     bias: Tensor | None
+    _zero_points: Tensor
 
     def __init__(
         self,
@@ -47,6 +49,8 @@ class QuantizedLinear(nn.Module):
         self.register_buffer("weight", torch.zeros(out_features, in_features, dtype=torch.int8))
         self.register_buffer("weight_scale", torch.ones(out_features))
         self.register_buffer("bias", torch.zeros(out_features) if bias else None)
+        zeros = torch.zeros(out_features, dtype=torch.int64)
+        self.register_buffer("_zero_points", zeros, persistent=False)
 
     @classmethod
     def of(cls, linear: nn.Linear, activation: Quantization) -> "QuantizedLinear":
@@ -66,8 +70,28 @@ class QuantizedLinear(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """(..., D) → (..., D'), float32."""
+        if torch.compiler.is_compiling():
+            return self._for_graphs(x.float())
         x = dequantize(quantize(x.float(), self.activation), self.activation)
         return F.linear(x, self.weight.float() * self.weight_scale[:, None], self.bias)
+
+    def _for_graphs(self, x: Tensor) -> Tensor:
+        """The same by torch's operators for graphs, which ONNX has by the same names."""
+        import torch.ao.quantization.fx._decomposed  # registers them
+
+        operators = torch.ops.quantized_decomposed
+        steps = (*self.activation, 0, 255, torch.uint8)
+        x = operators.dequantize_per_tensor(operators.quantize_per_tensor(x, *steps), *steps)
+        rows = (self.weight_scale, self._zero_points, 0, -_LARGEST, _LARGEST, torch.int8)
+        return F.linear(x, operators.dequantize_per_channel(self.weight, *rows), self.bias)
+
+    def to_linear(self) -> Linear:
+        """A linear layer with the same weights, in float32; activations stay as they are."""
+        linear = Linear(self.in_features, self.out_features, bias=self.bias is not None)
+        linear.weight = nn.Parameter(self.weight.float() * self.weight_scale[:, None])
+        if self.bias is not None:
+            linear.bias = nn.Parameter(self.bias.clone())
+        return linear
 
     def extra_repr(self) -> str:
         scale, zero_point = self.activation
@@ -99,3 +123,11 @@ def with_quantized_layers(
         if not isinstance(linear := layers.get(name), nn.Linear):
             raise ValueError(f"the model has no linear layer {name!r}")
         model.set_submodule(name, QuantizedLinear.of(linear, Quantization(*activation)))
+
+
+def without_quantized_layers(model: nn.Module) -> None:
+    """Puts linear layers in place of quantized ones: see `QuantizedLinear.to_linear`."""
+    for name in quantized_layers(model):
+        layer = model.get_submodule(name)
+        assert isinstance(layer, QuantizedLinear)
+        model.set_submodule(name, layer.to_linear())

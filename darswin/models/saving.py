@@ -12,8 +12,10 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
 
+from darswin.layers.quantized import with_quantized_layers
 from darswin.models.pretrained import list_pretrained, pretrained_file
 from darswin.models.registry import create_model
+from darswin.ops._quantized import Quantization
 from darswin.utils.files import replace_file
 
 Task = Literal["classification", "segmentation", "distance"]
@@ -38,6 +40,8 @@ class ModelCard:
             "whole" where it was trained through the lenses of `darswin.data.WideAngle`.
         task: what it tells: a class for an image, or a class or a distance for each pixel.
         colors: (r, g, b) in 0 … 255 of each class, where the data say them.
+        quantized: for each layer of int8 weights its name and how its input becomes 8 bits, (scale,
+            zero point): see `darswin.deploy.quantize.quantize_model`.
     """
 
     model: str
@@ -48,10 +52,17 @@ class ModelCard:
     fit: Literal["crop", "stretch", "whole"] = "whole"
     task: Task = "classification"
     colors: Sequence[Sequence[int]] = field(default_factory=list)
+    quantized: Mapping[str, Sequence[float]] = field(default_factory=dict)
 
     def create(self) -> Any:
         """The model, with new weights."""
-        return create_model(self.model, **self.options)
+        model = create_model(self.model, **self.options)
+        activations = {
+            name: Quantization(float(scale), int(zero_point))
+            for name, (scale, zero_point) in self.quantized.items()
+        }
+        with_quantized_layers(model, activations)
+        return model
 
 
 def save_model(path: str | os.PathLike, weights: Mapping[str, Tensor], card: ModelCard) -> None:

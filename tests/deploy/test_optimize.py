@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from darswin import create_model, optimize
-from darswin.deploy import optimize as module
+from darswin.deploy import stages
 from darswin.layers import onednn
 from darswin.layers.position_bias import RelativeBias
 from darswin.lens import KannalaBrandt, Spherical
@@ -83,12 +83,14 @@ def test_large_batches_go_in_parts(monkeypatch, name, lenses):
     want = model(images, lens)
     image = 256 * 4 * 24 * 4  # bytes of a hidden map of the first stage
     sizes = []
-    blocks = module._Stage._blocks
+    blocks = stages.OptimizedStage._blocks
     monkeypatch.setattr(
-        module._Stage, "_blocks", lambda stage, x, t: sizes.append(len(x)) or blocks(stage, x, t)
+        stages.OptimizedStage,
+        "_blocks",
+        lambda stage, x, t: sizes.append(len(x)) or blocks(stage, x, t),
     )
     for most, parts in ((1, [1] * 5), (2 * image, [2, 2, 1]), (5 * image, [5])):
-        monkeypatch.setattr(module, "CACHED_BYTES", most)
+        monkeypatch.setattr(stages, "CACHED_BYTES", most)
         sizes.clear()
         assert error(optimize(model)(images, lens), want) < 1e-5
         assert sizes[: len(parts)] == parts

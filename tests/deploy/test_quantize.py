@@ -1,0 +1,227 @@
+"""Models with 8 bits: what they lose, what stays in float32, and that the fast one is the same."""
+
+import math
+
+import pytest
+import torch
+from torch import nn
+
+from darswin import create_model, optimize
+from darswin.deploy.quantize import quantize_model, sensitivities
+from darswin.layers import onednn, packed
+from darswin.layers.linear import Linear
+from darswin.layers.quantized import QuantizedLinear, quantized_layers
+from darswin.lens import Spherical
+from darswin.models import ModelCard, load_model, save_model
+from darswin.ops._quantized import Quantization, dequantize, quantize
+
+HAS_INT8 = onednn.missing(torch.int8) is None
+needs_int8 = pytest.mark.skipif(not HAS_INT8, reason="this CPU has no products of 8 bits")
+MODELS = ["darswin_a_nano", "darswin_ra_nano", "swin_nano", "swin_undis_nano", "dat_nano"]
+
+
+def network(name="darswin_a_nano", **options):
+    """A model whose every parameter counts, and whose signal neither grows nor dies."""
+    torch.manual_seed(0)
+    if name.startswith("swin_unet"):
+        options["image_size"] = 32
+    model = create_model(name, **(dict(num_classes=10) | options)).eval()
+    for module in model.modules():
+        if isinstance(module, nn.Linear):
+            nn.init.normal_(module.weight, std=module.in_features**-0.5)
+            if module.bias is not None:
+                nn.init.normal_(module.bias, std=0.1)
+    return model
+
+
+def batch(count=4, size=32):
+    lens = Spherical.from_fov(torch.rand(count), math.radians(160), size / 2)
+    return torch.randn(count, 3, size, size), lens
+
+
+def error(got, want):
+    return ((got - want).norm() / want.norm()).item()
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("name", [*MODELS, "darswin_unet_a_nano", "swin_unet_adapted_nano"])
+def test_a_quantized_model_is_close_and_its_fast_one_the_same(name):
+    model, seen = network(name), batch()
+    quantized = quantize_model(model, [seen], tolerance=math.inf)
+    layers = quantized_layers(quantized)
+    assert len(layers) >= 8 and not quantized_layers(model)
+    images, lens = batch()
+    want, got = model(images, lens), quantized(images, lens)
+    assert 0 < error(got, want) < 0.15
+    if HAS_INT8:
+        fast = optimize(quantized, torch.int8)(images, lens)
+        # A rounding in float32 may move an activation by one step.
+        assert error(fast, got) < 0.2 * error(got, want) + 1e-3
+        one = optimize(quantized, torch.int8, lens=lens[:1])
+        assert torch.equal(one(images[:1]), optimize(quantized, torch.int8)(images[:1], lens[:1]))
+
+
+@needs_int8
+@torch.no_grad()
+def test_calibration_and_quantized_models_come_to_the_same():
+    model, seen = network(), batch()
+    direct = optimize(model, torch.int8, calibration=iter([(*seen, torch.zeros(4))]))
+    by_model = optimize(quantize_model(model, [seen]), torch.int8)
+    assert torch.equal(direct(*seen), by_model(*seen))
+
+
+@torch.no_grad()
+def test_layers_of_8_bits():
+    linear = nn.Linear(40, 6)
+    linear.weight[2] = 0
+    x, steps = torch.randn(50, 40), Quantization(8 / 255, 128)
+    layer = QuantizedLinear.of(linear, steps)
+    assert layer.weight.dtype == torch.int8 and (layer.weight[2] == 0).all()
+    assert (layer.weight.abs().amax(1)[[0, 1, 3, 4, 5]] == 127).all()
+    rounded = dequantize(quantize(x, steps), steps)
+    assert (rounded - x).abs().max() <= 0.51 * steps.scale + (x.abs() - 4).clamp(min=0).max()
+    assert error(layer(x), linear(x)) < 0.02
+    torch.testing.assert_close(layer.to_linear()(rounded), layer(x))
+
+
+@torch.no_grad()
+def test_what_disturbs_most_stays_in_float32():
+    model, seen = network(), batch()
+    # A channel a thousand times as large as the others leaves these few of the 8 bits, and only
+    # the others count.
+    model.stages[1].blocks[0].norm1.weight[3] = 1000.0
+    model.stages[1].blocks[0].attn.qkv.weight[:, 3] = 0.0
+    found = sensitivities(model, [seen])
+    assert next(iter(found)) == "stages.1.blocks.0.attn.qkv"
+    assert list(found.values()) == sorted(found.values(), reverse=True)
+    all_of_it = quantized_layers(quantize_model(model, [seen], tolerance=math.inf))
+    some = quantized_layers(quantize_model(model, [seen], tolerance=1e-2))
+    assert "stages.1.blocks.0.attn.qkv" in all_of_it.keys() - some.keys()
+    nothing = quantize_model(model, [seen], tolerance=0.0)
+    assert not quantized_layers(nothing) and torch.equal(nothing(*seen), model(*seen))
+
+
+def test_what_is_to_stay_stays():
+    model, seen = network(), batch()
+    keep = ["stages.0", "stages.1.blocks.0.attn", "stages.2.blocks.0.mlp.fc1"]
+    layers = quantized_layers(quantize_model(model, [seen], keep=keep, tolerance=math.inf))
+    assert not any(name.startswith(tuple(keep)) for name in layers)
+    # The two products of an MLP go together.
+    assert "stages.2.blocks.0.mlp.fc2" not in layers and "stages.1.blocks.0.mlp.fc2" in layers
+    with pytest.raises(ValueError, match=r"the model has no stages\.9 to keep in float32"):
+        quantize_model(model, [seen], keep=["stages.9"])
+
+
+@needs_int8
+@torch.no_grad()
+def test_parts_in_float32_beside_parts_of_8_bits():
+    model, seen = network(), batch()
+    for keep in ("attn.qkv", "attn.proj", "mlp", "norm1"):
+        names = [name for name, _ in model.named_modules() if name.endswith(keep)]
+        quantized = quantize_model(model, [seen], keep=names, tolerance=math.inf)
+        assert error(optimize(quantized, torch.int8)(*seen), quantized(*seen)) < 0.02
+
+
+@torch.no_grad()
+def test_saved_and_loaded(tmp_path):
+    model, seen = network(), batch()
+    quantized = quantize_model(model, [seen])
+    card = ModelCard("darswin_a_nano", dict(num_classes=10), quantized=quantized_layers(quantized))
+    save_model(tmp_path / "q.safetensors", quantized.state_dict(), card)
+    loaded, read = load_model(tmp_path / "q.safetensors")
+    assert torch.equal(loaded(*seen), quantized(*seen))
+    assert set(read.quantized) == set(card.quantized)
+    # The file alone says all of it, and a wrong name is an error.
+    wrong = ModelCard("darswin_a_nano", dict(num_classes=10), quantized={"head.x": (1.0, 0)})
+    save_model(tmp_path / "w.safetensors", quantized.state_dict(), wrong)
+    with pytest.raises(ValueError, match=r"no linear layer 'head\.x'"):
+        load_model(tmp_path / "w.safetensors")
+
+
+def test_weights_take_a_quarter(tmp_path):
+    model, seen = network("darswin_a_tiny"), batch(2)
+    quantized = quantize_model(model, [seen], tolerance=math.inf)
+
+    def size(m):
+        return sum(t.numel() * t.element_size() for t in m.state_dict().values())
+
+    assert size(quantized) < 0.3 * size(model)
+
+
+@torch.no_grad()
+def test_fastest(monkeypatch):
+    model, seen = network(), batch()
+    quantized = quantize_model(model, [seen])
+    for dtype in (torch.float32, torch.bfloat16):
+        monkeypatch.setattr("darswin.deploy.optimize.fastest_dtype", lambda dtype=dtype: dtype)
+        if onednn.missing(dtype) is None:
+            assert torch.equal(optimize(model, "fastest")(*seen), optimize(model, dtype)(*seen))
+    monkeypatch.setattr("darswin.deploy.optimize.fastest_dtype", lambda: torch.float32)
+    if HAS_INT8:
+        want = optimize(quantized, torch.int8)(*seen)
+        assert torch.equal(optimize(quantized, "fastest")(*seen), want)
+        assert torch.equal(optimize(model, "fastest", calibration=[seen])(*seen), want)
+    # Elsewhere the weights are those of 8 bits, in float32.
+    monkeypatch.setattr(torch.cpu, "_is_vnni_supported", lambda: False)
+    monkeypatch.setattr(torch.cpu, "get_capabilities", dict, raising=False)
+    with pytest.raises(RuntimeError, match=r'no VNNI.*optimize\(model, "fastest"\)'):
+        optimize(quantized, torch.int8)
+    got = optimize(quantized, "fastest")(*seen)
+    assert error(got, quantized(*seen)) < 0.05
+    assert quantized_layers(quantized)
+
+
+def test_fastest_dtype_is_measured(monkeypatch):
+    packed.fastest_dtype.cache_clear()
+    assert packed.fastest_dtype() in (torch.float32, torch.bfloat16)
+    packed.fastest_dtype.cache_clear()
+    monkeypatch.setattr(torch.ops.mkldnn, "_is_mkldnn_bf16_supported", lambda: False)
+    assert packed.fastest_dtype() == torch.float32
+    packed.fastest_dtype.cache_clear()
+
+
+def test_wrong_arguments():
+    model, seen = network(), batch()
+    quantized = quantize_model(model, [seen])
+    with pytest.raises(TypeError, match="model must be one of create_model, got Linear"):
+        quantize_model(nn.Linear(2, 3), [seen])
+    with pytest.raises(ValueError, match="quantized already"):
+        quantize_model(quantized, [seen])
+    for nothing in ([], [(seen[0][:0], seen[1])]):
+        with pytest.raises(ValueError, match="calibration has no pictures"):
+            quantize_model(model, nothing)
+    images = seen[0].clone()
+    images[0, 0, 16, 16] = math.nan
+    with pytest.raises(ValueError, match="not finite: look at the calibration"):
+        quantize_model(model, [(images, seen[1])])
+    with pytest.raises(ValueError, match=r"for torch\.int8, got torch\.float32"):
+        optimize(quantized)
+    with pytest.raises(ValueError, match=r"for torch\.int8, got torch\.bfloat16"):
+        optimize(model, torch.bfloat16, calibration=[seen])
+    if HAS_INT8:
+        for given, calibration in ((model, None), (quantized, [seen])):
+            with pytest.raises(ValueError, match="either a model of quantize_model or a calib"):
+                optimize(given, torch.int8, calibration=calibration)
+    with pytest.raises(ValueError, match=r"dtype must be one of .*int8, got torch\.float64"):
+        optimize(model, torch.float64)
+    assert sum(isinstance(m, Linear) for m in quantized.modules())  # the head is one still
+
+
+def test_onnx_runtime_says_the_same(tmp_path):
+    pytest.importorskip("onnxscript")
+    runtime = pytest.importorskip("onnxruntime")
+    onnx = pytest.importorskip("onnx")
+    from darswin.deploy.export import export_onnx
+
+    model, seen = network(), batch(6)
+    quantized = quantize_model(model, [seen])
+    path, lens = tmp_path / "q.onnx", seen[1]
+    export_onnx(quantized, path, *seen)
+    kinds = [node.op_type for node in onnx.load(path).graph.node]
+    assert kinds.count("QuantizeLinear") == len(quantized_layers(quantized))
+    given = dict(images=seen[0], xi=lens.xi, focal=lens.focal, theta_max=lens.theta_max)
+    (logits,) = runtime.InferenceSession(path).run(None, {k: v.numpy() for k, v in given.items()})
+    with torch.no_grad():
+        want = quantized(*seen)
+    assert (torch.from_numpy(logits).argmax(1) == want.argmax(1)).all()
+    assert error(torch.from_numpy(logits), want) < 0.05
