@@ -7,7 +7,10 @@ from darswin.bench.record import Record
 from darswin.bench.timing import COMPILED, FIXED_LENS, MATMULS, OURS, REFERENCE
 from darswin.cli import bench as command
 from darswin.cli.main import main
+from darswin.layers import onednn
 from darswin.models import DarSwin
+
+INT8 = ["int8"] if onednn.missing(torch.int8) is None else []
 
 
 def test_it_measures_and_writes(tmp_path, capsys, monkeypatch):
@@ -27,7 +30,7 @@ def test_it_measures_and_writes(tmp_path, capsys, monkeypatch):
     assert {(t.subject, t.setting, t.batch, t.threads, t.mode) for t in record.timings} == {
         ("darswin_a_nano", "32×32", batch, 1, f"{mode}, {dtype}")
         for mode in ("inference", "training")
-        for dtype in ("float32", "bfloat16")
+        for dtype in ("float32", "bfloat16", *(INT8 if mode == "inference" else ()))
         for batch in (1, 2)
     }
     names = {

@@ -1,0 +1,82 @@
+"""`darswin quantize` of runs, and what `predict` makes of the file."""
+
+import json
+import re
+
+import numpy as np
+import pytest
+from PIL import Image
+from scenes import write_plain
+
+from darswin.cli.main import main
+from darswin.layers.quantized import quantized_layers
+from darswin.models import load_model
+from darswin.models.saving import read_card
+
+QUIET = """--data.workers 0 --trainer.enable_progress_bar false --trainer.logger false
+    --trainer.enable_model_summary false --model.learning_rate 1e-2""".split()  # noqa: SIM905
+TINY = "{embed_dim: 8, depths: [1, 1, 1], rings: 8, sectors: 32, samples: [2, 2]}"
+LENS = json.dumps({"model": "Spherical", "xi": 0.5, "fov": 2.8})
+
+
+@pytest.fixture(scope="module")
+def digits(tmp_path_factory):
+    """A run of a few steps on the bundled digits."""
+    run = tmp_path_factory.mktemp("runs") / "digits"
+    main(["fit", "--run", str(run), "-c", "minutes", "--data.path", "digits", "--data.limit", "200",
+          "--model.name", "darswin_a_nano", "--model.options", TINY, "--trainer.max_epochs", "2",
+          "--data.train_lenses", "low", *QUIET])  # fmt: skip
+    return run
+
+
+def test_a_run_s_model(digits, tmp_path, capsys):
+    main(["quantize", "--run", str(digits), "--pictures", "40"])
+    said = capsys.readouterr().out
+    file = digits / "checkpoints" / "best.int8.safetensors"
+    model, card = load_model(file)
+    layers = quantized_layers(model)
+    assert str(file) in said and f"{len(layers)} of " in said and len(layers) >= 8
+    assert card.quantized.keys() == layers.keys() and card.task == "classification"
+    changed = float(re.search(r"40 validation pictures: .* variance: (\S+)", said)[1])
+    assert 0 < changed < 0.02
+    same = float(re.search(r"the same is said in (\S+) %", said)[1])
+    assert same >= 90
+    Image.fromarray(np.zeros((40, 40), np.uint8)).save(tmp_path / "p.png")
+    answers = []
+    for weights in (["--run", str(digits)], ["--model", str(file)]):
+        main(["predict", str(tmp_path / "p.png"), *weights, "--lens", LENS, "--top", "10"])
+        (answer,) = json.loads(capsys.readouterr().out)
+        answers.append({t["class"]: t["probability"] for t in answer["top"]})
+    assert answers[0] != answers[1]
+    assert all(abs(answers[1][name] - p) < 0.1 for name, p in answers[0].items())
+
+
+def test_what_is_kept_and_where_it_goes(digits, tmp_path, capsys):
+    out = tmp_path / "q.safetensors"
+    given = ["quantize", "--run", str(digits), "--pictures", "8", "--out", str(out)]
+    main([*given, "--keep", '["stages.0", "stages.1"]'])
+    assert read_card(out).quantized
+    assert all(name.startswith("stages.2") for name in read_card(out).quantized)
+    for more, message in (
+        (["--keep", '["stages.7"]'], "the model has no stages.7"),
+        (["--pictures", "0"], "--pictures must be at least 1, got 0"),
+        (["--run", str(tmp_path)], f"no model in {tmp_path}"),
+    ):
+        with pytest.raises(SystemExit) as caught:
+            main([*given, *more])
+        assert message in f"{caught.value.code}{capsys.readouterr().err}"
+
+
+@pytest.mark.parametrize("task", ["segmentation", "distance"])
+def test_models_of_pixels(tmp_path, task, capsys):
+    data, run = write_plain(tmp_path / "scenes", 20, size=(45, 60)), tmp_path / "run"
+    main(["fit", "--run", str(run), "--task", task, "--data.path", str(data), "--data.size", "32",
+          "--data.batch_size", "8", "--model.name", "darswin_unet_a_nano", "--model.options", TINY,
+          "--trainer.max_epochs", "2", *QUIET])  # fmt: skip
+    main(["quantize", "--run", str(run), "--pictures", "4"])
+    said = capsys.readouterr().out
+    assert "2 validation pictures" in said and ("the same is said" in said) == (task != "distance")
+    file, lens = run / "checkpoints" / "best.int8.safetensors", data / "lens.json"
+    main(["predict", str(data / "images"), "--model", str(file), "--lens", str(lens),
+          "--out", str(tmp_path / "out")])  # fmt: skip
+    assert len(list((tmp_path / "out" / "overlays").iterdir())) == 20
