@@ -132,7 +132,13 @@ def _parts(model: nn.Module, keep: Collection[str]) -> dict[str, list[str]]:
 def _results(model: Model, batches: Batches) -> Tensor:
     """The results of all batches, one row a picture."""
     with torch.inference_mode(), _evaluating(model):
-        return torch.cat([model(images, lens).float().flatten(1) for images, lens in batches])
+        return torch.cat([_flat(model(images, lens)) for images, lens in batches])
+
+
+def _flat(result: Tensor | list[Tensor]) -> Tensor:
+    """The result, or the maps of a model of features, as (B, numbers)."""
+    maps = [result] if isinstance(result, Tensor) else result
+    return torch.cat([one.float().flatten(1) for one in maps], 1)
 
 
 def _error(found: Tensor, expected: Tensor) -> float:

@@ -65,11 +65,19 @@ class PackedQuantizedLinear(nn.Module):
 
     def forward(self, q: Tensor) -> Tensor:
         """(..., D), uint8 of `activation` → (..., D'), float32."""
+        if not q.numel():
+            return self._nothing(q, torch.float32)
         return self._product(q, *self._given, 1.0, 0, torch.float32, "none", [], "none")
 
     def quantized_gelu(self, q: Tensor, to: Quantization) -> Tensor:
         """(..., D), uint8 of `activation` → the GELU of the result, uint8 of `to`."""
+        if not q.numel():
+            return self._nothing(q, torch.uint8)
         return self._product(q, *self._given, *to, torch.uint8, "gelu", [], "none")
+
+    def _nothing(self, q: Tensor, dtype: torch.dtype) -> Tensor:
+        # Of no rows oneDNN's product has another shape.
+        return q.new_empty((*q.shape[:-1], self.out_features), dtype=dtype)
 
     def extra_repr(self) -> str:
         return f"in_features={self.in_features}, out_features={self.out_features}"

@@ -6,6 +6,7 @@ from typing import Any
 
 from torch import nn
 
+from darswin.layers.quantized import without_quantized_layers
 from darswin.models.base import Model
 from darswin.models.dense import DenseModel
 from darswin.models.encoder import Encoder
@@ -124,6 +125,7 @@ def start_from(net: Model, classes: list[str], weights: str | Path) -> None:
         ValueError: the weights of another model.
     """
     trained, card = load_model(weights_file(weights))
+    without_quantized_layers(trained)
     there = trained.state_dict()
     if isinstance(net, DenseModel) and card.task == "classification":
         there = {f"encoder.{name}": t for name, t in there.items() if not _of_head(name)}

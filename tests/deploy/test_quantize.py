@@ -61,6 +61,27 @@ def test_a_quantized_model_is_close_and_its_fast_one_the_same(name):
         assert torch.equal(one(images[:1]), optimize(quantized, torch.int8)(images[:1], lens[:1]))
 
 
+@torch.no_grad()
+def test_models_of_features():
+    model = network(features_only=True, num_classes=0)
+    seen = batch()
+    quantized = quantize_model(model, [seen])
+    maps, want = quantized(*seen), model(*seen)
+    assert all(0 < error(a, b) < 0.15 for a, b in zip(maps, want, strict=True))
+    if HAS_INT8:
+        fast = optimize(quantized, torch.int8)(*seen)
+        assert all(error(a, b) < 0.02 for a, b in zip(fast, maps, strict=True))
+
+
+@needs_int8
+@torch.no_grad()
+def test_no_images_and_one():
+    model, (images, lens) = network(), batch()
+    fast = optimize(model, torch.int8, calibration=[(images, lens)])
+    assert fast(images[:0], lens[:0]).shape == (0, 10)
+    assert error(fast(images[:1], lens[:1]), fast(images, lens)[:1]) < 1e-5
+
+
 @needs_int8
 @torch.no_grad()
 def test_calibration_and_quantized_models_come_to_the_same():
