@@ -14,6 +14,8 @@ from sklearn.model_selection import train_test_split
 
 from darswin.data.frames import at_size
 from darswin.data.warp import remap, warp_map
+from darswin.deploy.quantize import quantize_model
+from darswin.layers.quantized import quantized_layers
 from darswin.lens import Perspective, Spherical, load
 from darswin.models import ModelCard, list_pretrained, load_model, pretrained_file
 
@@ -28,13 +30,19 @@ def demo():
     return module
 
 
+def demo_test_indices():
+    """The scans that the demo tests on."""
+    target = load_digits().target
+    _, test = train_test_split(
+        np.arange(len(target)), test_size=500, random_state=0, stratify=target
+    )
+    return test
+
+
 @pytest.fixture(scope="module")
 def unseen():
     """The scans that the demo does not train on, and their labels."""
-    digits = load_digits()
-    _, test = train_test_split(
-        np.arange(len(digits.target)), test_size=500, random_state=0, stratify=digits.target
-    )
+    digits, test = load_digits(), demo_test_indices()
     return (digits.images[test] / 16).astype(np.float32), torch.from_numpy(digits.target[test])
 
 
@@ -49,6 +57,25 @@ def test_digits_reads_through_any_fisheye_as_its_card_says(demo, unseen):
         assert found >= 92
         # Another machine rounds otherwise: that may turn one close decision or two.
         assert found == pytest.approx(float(percent), abs=0.41)
+
+
+def test_digits_of_8_bits_read_as_well(demo, unseen):
+    """Calibrated on scans of training, through the lenses of training."""
+    model, _ = load_model("digits")
+    digits = load_digits()
+    trained_on = np.setdiff1d(np.arange(len(digits.target)), demo_test_indices())[:256]
+    rng = np.random.default_rng(0)
+    seen = demo.through_lenses(
+        (digits.images[trained_on] / 16).astype(np.float32), rng.uniform(0, 0.05, 256)
+    )
+    quantized = quantize_model(model, [seen])
+    assert len(quantized_layers(quantized)) >= 15
+    lost = []
+    for x in demo.XI:
+        images, lenses = demo.through_lenses(unseen[0], np.full(500, x))
+        before, after = (demo.accuracy(m, images, lenses, unseen[1]) for m in (model, quantized))
+        lost.append(before - after)
+    assert np.mean(lost) <= 0.3 and max(lost) <= 1.0
 
 
 def test_digits_in_picture_files(demo, unseen):
