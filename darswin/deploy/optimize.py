@@ -14,7 +14,7 @@ from darswin.layers.attention import WindowAttention
 from darswin.layers.block import Block, PatchMerging
 from darswin.layers.linear import Linear
 from darswin.layers.onednn import PackedLinear
-from darswin.layers.position_bias import RelativeBias, RelativeTable
+from darswin.layers.position_bias import RelativeBias, RelativeTable, joined_coefficients
 from darswin.lens import Lens
 from darswin.models.base import Model
 from darswin.models.dense import DenseModel, DensePrepared
@@ -281,9 +281,8 @@ def _joined(biases: Sequence[RelativeBias]) -> RelativeBias | None:
     if not biases:
         return None
     joined = copy.deepcopy(biases[0])
-    for name, _ in list(joined.named_parameters()):
-        heads = torch.cat([getattr(bias, name).float() for bias in biases], 1)
-        setattr(joined, name, nn.Parameter(heads, requires_grad=False))
+    for name, rows in joined_coefficients(biases).items():
+        setattr(joined, name, nn.Parameter(rows.float(), requires_grad=False))
     return joined
 
 

@@ -13,6 +13,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from darswin.ops._sampling import Sampling
+from darswin.ops.waiting import tensor_there
 
 _WORD = 0xFFFFFFFF
 
@@ -70,17 +71,12 @@ def normalized(
     dtype: torch.dtype = torch.float32,
 ) -> Tensor:
     """`(pixel/255 - mean) / std` of a uint8 image (B, C, H, W), in `dtype`; a value a channel."""
-    m, s = (made_there(values, image, dtype)[:, None, None] for values in (mean, std))
+    m, s = (
+        # One number for all channels where they are the same.
+        tensor_there(values if len(set(values)) > 1 else values[:1], image, dtype)[:, None, None]
+        for values in (mean, std)
+    )
     return (image.to(dtype) / 255 - m) / s
-
-
-def made_there(values: Sequence[float], like: Tensor, dtype: torch.dtype) -> Tensor:
-    """Numbers (K,), or (1,) where all are the same, on the device of `like` without a copy from the
-    host, which would be waited for."""
-    if like.device.type == "cpu":
-        return torch.tensor(values, dtype=dtype)
-    distinct = values if len(set(values)) > 1 else values[:1]
-    return torch.cat([torch.full((1,), v, dtype=dtype, device=like.device) for v in distinct])
 
 
 def polar_sample(sampling: Sampling, tokens: bool) -> Tensor:

@@ -9,6 +9,7 @@ from torchmetrics import MeanMetric
 
 from darswin.lens import Lens
 from darswin.lens.pixels import pixel_angles, solid_angles
+from darswin.ops.waiting import readable
 from darswin.train.dense_data import DenseData
 from darswin.train.pixel_metrics import Zones, ZoneSums
 from darswin.train.task import Batch, Task
@@ -117,7 +118,8 @@ class DenseTask(Task):
         images, lens, target = batch
         weights = None
         if self.solid_angle_weights:
-            area = solid_angles(one_if_same(lens), (images.shape[2], images.shape[3]))
+            lens_of_all = one_if_same(lens) if readable(lens.theta_max) else lens
+            area = solid_angles(lens_of_all, (images.shape[2], images.shape[3]))
             weights = (area / area.mean((1, 2), keepdim=True)).to(images.device)
             weights = weights.expand(len(images), -1, -1)
         return self._criterion(self.net(images, lens).float(), target, weights)
