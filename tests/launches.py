@@ -1,10 +1,13 @@
 """Kernel launches and waits of a device, counted without one: on tensors of the device "meta"."""
 
+import contextlib
 from collections import Counter
 from collections.abc import Callable, Iterator
 from typing import Any
+from unittest import mock
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 from torch.utils import _pytree as pytree
 from torch.utils._python_dispatch import TorchDispatchMode
@@ -35,11 +38,12 @@ class Launches(TorchDispatchMode):
 
     def __torch_dispatch__(self, func, types, args=(), kwargs=None):
         out = func(*args, **(kwargs or {}))
-        there = any(t.device.type == "meta" for t in _tensors(out))
+        made = {t.device.type for t in _tensors(out)}
+        # A number on the CPU comes along with what is launched.
         given = [t for t in _tensors((args, kwargs)) if t.dim() or "copy" in func.name()]
-        sides = {t.device.type for t in given}
-        assert sides <= {"meta" if there else "cpu"}, f"{func} copies between host and device"
-        if there and not _is_view(func) and func.name() not in _FREE:
+        mixed = made and {t.device.type for t in given} - made
+        assert not mixed, f"{func} copies between host and device"
+        if "meta" in made and not _is_view(func) and func.name() not in _FREE:
             self.names[func.name()] += 1
         return out
 
@@ -58,3 +62,16 @@ def launches(function: Callable[..., Any], *arguments: Any) -> Counter[str]:
     with Launches() as counted:
         function(*arguments)
     return counted.names
+
+
+@contextlib.contextmanager
+def fused_attention() -> Iterator[None]:
+    """Within it torch's attention is the kernel that it chooses on a GPU, in float32 and narrower;
+    elsewhere it consists of parts."""
+
+    def attention(q, k, v, attn_mask=None, scale=None):
+        kernel = torch.ops.aten._scaled_dot_product_efficient_attention
+        return kernel(q, k, v, attn_mask, torch.is_grad_enabled(), scale=scale)[0]
+
+    with mock.patch.object(F, "scaled_dot_product_attention", attention):
+        yield

@@ -57,25 +57,19 @@ class RelativeBias(nn.Module):
         along_phi = self._axis(phi[None], a_phi, b_phi).transpose(1, 2)
         return along_r[..., None] + along_phi[..., None, :]
 
-    def like(self, other: nn.Module) -> bool:
-        """Whether another bias is computed in the same way, but for its heads."""
-        return (
-            type(self) is type(other)
-            and (self.window, self.turn) == (other.window, other.turn)
-            and all(len(getattr(self, name)) == len(getattr(other, name)) for name in COEFFICIENTS)
-        )
+    def kind(self) -> tuple:
+        """What biases have in common that can be computed at once: all but their heads."""
+        rows = [len(getattr(self, name)) for name in COEFFICIENTS]
+        return (type(self).__name__, self.window, self.turn, *rows)
 
 
 def joined_coefficients(biases: Sequence[RelativeBias]) -> dict[str, Tensor]:
-    """The coefficients of biases that are `like` each other, as of one that has all heads."""
+    """The coefficients of biases of one `kind`, as of a single one that has all heads."""
     return {name: torch.cat([getattr(bias, name) for bias in biases], 1) for name in COEFFICIENTS}
 
 
 def joined_tables(biases: Sequence[RelativeBias], ring_angles: Tensor) -> Sequence[Tensor]:
-    """What biases that are `like` each other give, computed at once, with the heads of all.
-
-    The tables of a stage's blocks are small, and there are many steps to each.
-    """
+    """What biases of one `kind` give, computed at once: many steps, each of a few numbers."""
     if len(biases) == 1:
         return [biases[0](ring_angles)]
     table = biases[0]._table(ring_angles, **joined_coefficients(biases))

@@ -126,8 +126,8 @@ class Stage(nn.Module):
         attentions = [block.attn for block in self.blocks if isinstance(block, Block)]
         biases = [attn.position_bias for attn in attentions if isinstance(attn, WindowAttention)]
         relative = [bias for bias in biases if isinstance(bias, RelativeBias)]
-        whole = len(relative) == len(self.blocks) and all(map(relative[0].like, relative))
-        return relative if whole else []
+        kinds = [bias.kind() for bias in relative]
+        return relative if kinds == kinds[:1] * len(self.blocks) else []
 
 
 def make_stages(

@@ -19,4 +19,5 @@ def tensor_there(
     host, which would be waited for, but made."""
     if like.device.type == "cpu":
         return like.new_tensor(numbers, dtype=dtype)
-    return torch.cat([like.new_full((1,), number, dtype=dtype) for number in numbers])
+    made = [like.new_full((1,), number, dtype=dtype) for number in numbers]
+    return torch.cat(made) if len(made) > 1 else made[0]

@@ -113,8 +113,10 @@ class Classification(Task):
 
 
 class ImageMean(Metric):
-    """Base of means over the images whose label is known; -1 is none. No device is waited for before
-    `compute`, as torchmetrics' own would be."""
+    """Base of means over the images whose label is known; -1 is none.
+
+    No device is waited for before `compute`, as it is by torchmetrics' own.
+    """
 
     full_state_update = False
     total: Tensor

@@ -264,7 +264,7 @@ class Task(LightningModule):
         loss = self._loss(batch, rng)
         # A device is only waited for as often as Lightning logs, which waits too: once weights are
         # not finite, they and the loss stay so.
-        looks = batch_idx % max(self.trainer.log_every_n_steps, 1) == 0
+        looks = (batch_idx + 1) % max(self.trainer.log_every_n_steps, 1) == 0
         if (readable(loss) or looks) and not torch.isfinite(loss):
             raise FloatingPointError(
                 f"the loss is {loss.item()} in epoch {self.current_epoch}, batch {batch_idx}: "
