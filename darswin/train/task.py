@@ -264,14 +264,16 @@ class Task(LightningModule):
         loss = self._loss(batch, rng)
         # A device is only waited for as often as Lightning logs, which waits too: once weights are
         # not finite, they and the loss stay so.
-        looks = (batch_idx + 1) % max(self.trainer.log_every_n_steps, 1) == 0
-        if (readable(loss) or looks) and not torch.isfinite(loss):
+        every = self.trainer.log_every_n_steps  # type: ignore[attr-defined]  # Lightning adds it
+        looks = readable(loss) or (batch_idx + 1) % max(every, 1) == 0
+        if looks and not torch.isfinite(loss):
             raise FloatingPointError(
                 f"the loss is {loss.item()} in epoch {self.current_epoch}, batch {batch_idx}: "
                 f"{self._advice()}"
             )
         self.log("train/loss", loss, prog_bar=True, batch_size=len(batch[0]), sync_dist=True)
-        self.log("train/rate", self.trainer.optimizers[0].param_groups[0]["lr"])
+        # As a tensor of the device: Lightning would copy a number to it.
+        self.log("train/rate", loss.new_full((), self.trainer.optimizers[0].param_groups[0]["lr"]))
         return loss
 
     def _loss(self, batch: Batch, rng: np.random.Generator) -> Tensor:
