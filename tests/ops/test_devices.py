@@ -157,3 +157,34 @@ def test_they_have_no_derivatives_but_those_of_backward():
         for run, x in calls:
             with pytest.raises(NotImplementedError, match="use_reference"):
                 torch.func.jvp(run, (x,), (torch.ones_like(x),))
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
+@pytest.mark.parametrize("jitter", [0.0, 1.0])
+@pytest.mark.parametrize("rows", [1, 6])
+@pytest.mark.parametrize("spoiled", ["radii", "azimuths", "center", "affine", "offsets"])
+def test_points_at_nan_or_infinity_sample_nothing(spoiled, rows, jitter, bad):
+    radii, azimuths, center = make_lens(2, (20, 24), rows, 8, f64)
+    given = dict(
+        image=torch.randn(2, 3, 20, 24, dtype=f64), radii=radii * 0.5, center=center,
+        affine=torch.eye(2, dtype=f64) + 0.1 * torch.randn(2, 2, 2, dtype=f64),
+        offsets=torch.randn(2, 2, rows, 8, dtype=f64),
+    )  # fmt: skip
+    (azimuths if spoiled == "azimuths" else given[spoiled]).view(-1)[0] = bad
+    circular = [name for name in given if name not in ("affine", "offsets")]
+    for names in (circular, list(given)) if spoiled in (*circular, "azimuths") else (list(given),):
+
+        def run(*tensors, names=names):
+            lens = dict(zip(names, tensors, strict=True))
+            return polar_sample(
+                azimuths=azimuths, **lens, samples=(1, 1), jitter=jitter, seed=4, layout="image"
+            )
+
+        tensors = [given[name] for name in names]
+        expected = with_reference(run, tensors)
+        with as_on_devices():
+            ours = with_gradients(run, tensors)
+        for got, want in zip(ours, expected, strict=True):
+            assert got.isfinite().all()
+            torch.testing.assert_close(got, want, rtol=1e-9, atol=1e-9)
+        assert (ours[0][0, :, 0, 0] == 0).all() and ours[0][1, :, 0, 1].all()
