@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from darswin.lens import Lens
+from darswin.ops.waiting import readable
 
 
 @dataclass(frozen=True)
@@ -59,7 +60,7 @@ class Mixing:
             share = rng.beta(self.mixup, self.mixup)
             mixed = torch.lerp(partners, images, share)
         mixed_targets = torch.lerp(targets.flip(0), targets, share)
-        if may_mix is None or bool(may_mix.all()):
+        if may_mix is None or (readable(may_mix) and bool(may_mix.all())):
             return mixed, mixed_targets
         return (
             torch.where(may_mix[:, None, None, None], mixed, images),

@@ -11,7 +11,7 @@ from darswin.layers.attention import WindowAttention
 from darswin.layers.block import Block, Mlp, PatchMerging
 from darswin.layers.linear import Linear
 from darswin.layers.packed import PackedLinear, PackedQuantizedLinear
-from darswin.layers.position_bias import RelativeBias, RelativeTable
+from darswin.layers.position_bias import RelativeBias, RelativeTable, joined_coefficients
 from darswin.layers.quantized import QuantizedLinear
 from darswin.models.stages import Stage
 from darswin.ops._quantized import Quantization
@@ -123,9 +123,8 @@ def _joined(biases: Sequence[RelativeBias]) -> RelativeBias | None:
     if not biases:
         return None
     joined = copy.deepcopy(biases[0])
-    for name, _ in list(joined.named_parameters()):
-        heads = torch.cat([getattr(bias, name).float() for bias in biases], 1)
-        setattr(joined, name, nn.Parameter(heads, requires_grad=False))
+    for name, rows in joined_coefficients(biases).items():
+        setattr(joined, name, nn.Parameter(rows.float(), requires_grad=False))
     return joined
 
 

@@ -57,8 +57,9 @@ class WindowAttention(nn.Module):
         self.proj = Linear(dim, dim)
         self.position_bias = position_bias(self.window, num_heads)
 
-    def forward(self, x: Tensor, *positions: Tensor) -> Tensor:
-        """(B, R, A, D) → the same shape. `positions` are what the bias is made from."""
+    def forward(self, x: Tensor, *positions: Tensor, table: Tensor | None = None) -> Tensor:
+        """(B, R, A, D) → the same shape. `positions` are what the bias is made from; a stage that
+        has made it gives it as the `table`."""
         batch, rings, sectors, dim = x.shape
         if (rings, sectors) != self.map_size:
             raise ValueError(f"the map must be (R, A) = {self.map_size}, got {(rings, sectors)}")
@@ -66,7 +67,7 @@ class WindowAttention(nn.Module):
         attend = partial(
             window_attention, window=self.window, shift=self.shift, periodic=self.periodic
         )
-        bias = self.position_bias(*positions)
+        bias = self.position_bias(*positions) if table is None else table
         out = attend(qkv, bias)
         with recomputed(out, attend, qkv, bias, when=self.grad_checkpointing):
             return self.proj(out)

@@ -71,11 +71,11 @@ class Block(nn.Module):
         self.mlp = Mlp(dim, int(dim * mlp_ratio))
         self.drop_path = DropPath(drop_path)
 
-    def forward(self, x: Tensor, *positions: Tensor) -> Tensor:
-        """(B, R, A, D) → the same shape. `positions` are the attention's."""
+    def forward(self, x: Tensor, *positions: Tensor, **table: Tensor) -> Tensor:
+        """(B, R, A, D) → the same shape. `positions`, or the `table`, are the attention's."""
         y = self.norm1(x)
         with recomputed(y, self.norm1, x, when=self.grad_checkpointing):
-            y = self.attn(y, *positions)
+            y = self.attn(y, *positions, **table)
         x = x + self.drop_path(y)
         y = self.norm2(x)
         with recomputed(y, self.norm2, x, when=self.grad_checkpointing):

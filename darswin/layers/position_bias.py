@@ -1,6 +1,7 @@
 """The position biases of window attention: of angles, Fourier series or a table."""
 
 import math
+from collections.abc import Sequence
 from typing import Literal
 
 import torch
@@ -10,6 +11,8 @@ from darswin.layers.grid import PolarGrid
 from darswin.lens import Lens
 
 PositionBias = Literal["angular_relative", "angular", "polar"]
+
+COEFFICIENTS = ("a_theta", "b_theta", "a_phi", "b_phi")
 
 
 class RelativeBias(nn.Module):
@@ -24,7 +27,7 @@ class RelativeBias(nn.Module):
         self, window: tuple[int, int], sectors: int, heads: int, rows: tuple[int, int, int, int]
     ):
         super().__init__()
-        self.window, self.turn = window, 2 * math.pi / sectors
+        self.window, self.turn, self.heads = window, 2 * math.pi / sectors, heads
         self.a_theta, self.b_theta, self.a_phi, self.b_phi = (
             nn.Parameter(nn.init.trunc_normal_(torch.empty(count, heads), std=0.02))
             for count in rows
@@ -40,13 +43,37 @@ class RelativeBias(nn.Module):
         Returns:
             (N, heads, 2·M_r-1, 2·M_φ-1), the `bias` of `window_attention`.
         """
-        outward = ring_angles[:, : self.window[0]].to(self.a_theta)
+        return self._table(ring_angles, *(getattr(self, name) for name in COEFFICIENTS))
+
+    def _table(
+        self, ring_angles: Tensor, a_theta: Tensor, b_theta: Tensor, a_phi: Tensor, b_phi: Tensor
+    ) -> Tensor:
+        outward = ring_angles[:, : self.window[0]].to(a_theta)
         theta = torch.cat((-outward[:, 1:].flip(1), outward), 1)
         reach = self.window[1]
-        phi = self.turn * torch.arange(1 - reach, reach).to(outward)
-        along_r = self._axis(theta, self.a_theta, self.b_theta).transpose(1, 2)
-        along_phi = self._axis(phi[None], self.a_phi, self.b_phi).transpose(1, 2)
+        steps = torch.arange(1 - reach, reach, dtype=outward.dtype, device=outward.device)
+        phi = self.turn * steps
+        along_r = self._axis(theta, a_theta, b_theta).transpose(1, 2)
+        along_phi = self._axis(phi[None], a_phi, b_phi).transpose(1, 2)
         return along_r[..., None] + along_phi[..., None, :]
+
+    def kind(self) -> tuple:
+        """What biases have in common that can be computed at once: all but their heads."""
+        rows = [len(getattr(self, name)) for name in COEFFICIENTS]
+        return (type(self).__name__, self.window, self.turn, *rows)
+
+
+def joined_coefficients(biases: Sequence[RelativeBias]) -> dict[str, Tensor]:
+    """The coefficients of biases of one `kind`, as of a single one that has all heads."""
+    return {name: torch.cat([getattr(bias, name) for bias in biases], 1) for name in COEFFICIENTS}
+
+
+def joined_tables(biases: Sequence[RelativeBias], ring_angles: Tensor) -> Sequence[Tensor]:
+    """What biases of one `kind` give, computed at once: many steps, each of a few numbers."""
+    if len(biases) == 1:
+        return [biases[0](ring_angles)]
+    table = biases[0]._table(ring_angles, **joined_coefficients(biases))
+    return table.split([bias.heads for bias in biases], 1)
 
 
 class AngularRelativeBias(RelativeBias):

@@ -11,6 +11,7 @@ from darswin.lens import Lens
 from darswin.lens.spacing import Spacing
 from darswin.ops import polar_sample
 from darswin.ops.checks import channels_first, check_jitter, check_layout
+from darswin.ops.waiting import readable
 
 GridFunction = Callable[..., PolarGrid]
 
@@ -113,10 +114,10 @@ def check_images(images: Tensor) -> Tensor:
 def check_lens(lens: Lens | None, size: tuple[int, int]) -> Lens:
     """The lens, which must be one, for images of (H, W); else TypeError or ValueError.
 
-    Compiled graphs cannot look at a value, so they do not check sizes."""
+    Sizes are checked where they are `readable`."""
     if not isinstance(lens, Lens):
         raise TypeError(f"lens must be a darswin.lens.Lens, got {type(lens).__name__}")
-    if lens.image_size is None or torch.compiler.is_compiling():
+    if lens.image_size is None or not readable(lens.image_size):
         return lens
     for other in lens.image_size.unique(dim=0).tolist():
         if tuple(other) != size:

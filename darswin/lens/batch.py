@@ -10,6 +10,8 @@ import torch
 from torch import Tensor
 from torch.utils import _pytree as pytree
 
+from darswin.ops.waiting import readable
+
 Number = float | Sequence[float] | Sequence[Sequence[float]] | Tensor
 
 # What the user may give, for a parameter of 0, 1 or 2 dimensions a lens.
@@ -166,7 +168,12 @@ class LensBatch:
         return all(a is b or (a is not None and b is not None and _same(a, b)) for a, b in pairs)
 
     def merged(self) -> Self:
-        """A single lens, where all of them have the same numbers; else all of them."""
+        """A single lens, where all of them have the same numbers; else all of them.
+
+        On a device, which would be waited for, they stay as many as they are.
+        """
+        if not readable(self.theta_max):
+            return self
         values = (getattr(self, name) for name in self._names())
         same = all(v is None or torch.equal(v, v[:1].expand_as(v)) for v in values)
         return self[:1] if same else self

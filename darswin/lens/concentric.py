@@ -15,6 +15,7 @@ from darswin.lens.base import Lens
 from darswin.lens.pixels import pixel_rays
 from darswin.lens.reprojection import OUTSIDE, sample_at
 from darswin.lens.spacing import Spacing, check_tan, span, to_spacing, to_theta
+from darswin.ops.waiting import tensor_there
 
 
 def square_to_disc(places: Tensor) -> tuple[Tensor, Tensor]:
@@ -81,7 +82,7 @@ def read_square(square: Tensor, places: Tensor) -> Tensor:
     The outermost half pixel counts up to the edge; `OUTSIDE` is 0. S may be any.
     """
     height, width = square.shape[2:]
-    size = places.new_tensor((width, height))
+    size = tensor_there((width, height), places)
     pixels = ((places + 1) * size - 1) / 2
     inside = torch.minimum(pixels.clamp(min=0), size - 1)
     return sample_at(square, torch.where(places == OUTSIDE, OUTSIDE, inside))

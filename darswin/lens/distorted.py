@@ -20,6 +20,7 @@ from darswin.lens.inverse import rising_limit
 from darswin.lens.plane import determinant, newton, radial_slopes, solve
 from darswin.lens.polynomial import horner, slopes
 from darswin.lens.sphere import XI_STARTS, Spherical, sphere_angle, sphere_limit
+from darswin.ops.waiting import readable
 
 
 class DistortedLens(FocalLens, register=False):
@@ -202,7 +203,7 @@ class DistortedLens(FocalLens, register=False):
     def _find_points(self, goal: Tensor, start: Tensor, last: Tensor) -> Tensor:
         """(N, ..., 2): points of the ideal plane that `_distort` takes to `goal`, if there are any
         within `last`. The search begins half as far out as `start`, far from any fold."""
-        if torch.compiler.is_compiling():
+        if not readable(goal):  # no shape depends on values
             return newton(
                 self._distort, self._distort_slopes, goal, start / 2, 1.1 * last, rounds=30
             )

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from darswin.lens.batch import LensBatch
+from darswin.ops.waiting import tensor_there
 
 FRAME = ("center", "affine", "image_size")
 # Beside theta_max, and how each is written.
@@ -50,7 +51,7 @@ class ImageFrame(LensBatch):
         if self.center is not None:
             return self.center
         if image_size is not None:
-            size = self.theta_max.new_tensor([image_size])
+            size = tensor_there(image_size, self.theta_max)[None]
         elif self.image_size is not None:
             size = self.image_size
         else:
@@ -64,7 +65,11 @@ class ImageFrame(LensBatch):
     def from_pixels(self, pixels: Tensor, image_size: tuple[int, int] | None = None) -> Tensor:
         """The inverse of `to_pixels`."""
         flat = self._aligned(pixels)[0] - self._row(self.center_in(image_size), pixels.dim())
-        return flat if self.affine is None else _apply(torch.linalg.inv(self.affine), flat)
+        return flat if self.affine is None else _apply(self._inverse_affine(), flat)
+
+    def _inverse_affine(self) -> Tensor:
+        # `torch.linalg.inv` reads on the host whether there is one; that was checked.
+        return torch.linalg.inv_ex(self.affine).inverse
 
     def through_affine(self, flat: Tensor) -> Tensor:
         """`affine` @ points or offsets (N or 1, ..., 2)."""
@@ -75,7 +80,7 @@ class ImageFrame(LensBatch):
         and the column of the principal point."""
         cx, cy = self.center_in(image_size).expand(len(self), 2).unbind(1)
         if image_size is not None:
-            height, width = self.theta_max.new_tensor(image_size)
+            height, width = tensor_there(image_size, self.theta_max)
         elif self.image_size is not None:
             height, width = self.image_size.unbind(1)
         else:

@@ -5,6 +5,7 @@ from torch import Tensor
 
 from darswin.lens.base import length_of
 from darswin.lens.inverse import Function
+from darswin.ops.waiting import readable
 
 
 def newton(
@@ -22,7 +23,8 @@ def newton(
 
     Args:
         function: (..., 2) → (..., 2). slopes: (..., 2) → (..., 2, 2), its derivatives.
-        goal, point: (n, 2), or any shape while compiling. end: how far from the origin to look.
+        goal, point: (n, 2), or any shape where it is not `readable`.
+        end: how far from the origin to look.
     """
     found, places = point.clone(), torch.arange(len(point), device=point.device)
     error = function(point) - goal
@@ -39,8 +41,8 @@ def newton(
         step = torch.where(better[..., None], solve(slope, error), step)
         missed = torch.where(better, length_of(error), missed)
         part = torch.where(better, (2 * part).clamp(max=1), part / 4)
-        if torch.compiler.is_compiling():
-            continue  # no shape in a graph depends on values
+        if not readable(missed):
+            continue  # no shape depends on values
         found[places] = point
         going = missed > 16 * torch.finfo(goal.dtype).eps * (1 + length_of(goal))
         going &= part > 1e-6

@@ -11,6 +11,7 @@ from torch import Tensor
 from darswin.lens.base import Lens
 from darswin.lens.ideal import Perspective
 from darswin.lens.pixels import pixel_rays
+from darswin.ops.waiting import tensor_there
 
 OUTSIDE = -10.0  # px: beyond any image, also for an interpolation of several pixels
 
@@ -79,7 +80,7 @@ def sample_at(images: Tensor, pixels: Tensor) -> Tensor:
     exact = torch.promote_types(images.dtype, torch.float32)  # bfloat16 has no half pixels
     there = pixels.to(images.device, exact)
     # -1 and 1 are the image's edges, half a pixel beyond the centres of its outermost pixels.
-    places = (2 * there + 1) / there.new_tensor((width, height)) - 1
+    places = (2 * there + 1) / tensor_there((width, height), there) - 1
     places = places.expand(images.shape[0], -1, -1, -1)
     view = F.grid_sample(images.to(exact), places, padding_mode="zeros", align_corners=False)
     return view.to(images.dtype)

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from darswin.lens.base import Lens
 from darswin.lens.inverse import inverse
+from darswin.ops.waiting import readable
 
 Spacing = Literal["theta", "tan", "g", "radius"]
 SPACINGS: tuple[Spacing, ...] = ("theta", "tan", "g", "radius")
@@ -23,9 +24,8 @@ G_M, G_N, G_B, G_C = 2.288135593220339, 5, 8.31578947368421, 1 / 3
 
 
 def check_tan(lens: Lens) -> None:
-    """ValueError where tan θ ends before θ_max does. Compiled graphs cannot look at a value, so
-    they do not check."""
-    if torch.compiler.is_compiling():
+    """ValueError where tan θ ends before θ_max does, if θ_max is `readable`."""
+    if not readable(lens.theta_max):
         return
     largest = lens.theta_max.max().item() if len(lens) else 0.0
     if largest >= math.pi / 2:

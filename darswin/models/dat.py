@@ -13,6 +13,7 @@ from darswin.layers.position_bias import RelativeTable
 from darswin.models.encoder import ImageEncoder
 from darswin.models.registry import register_model
 from darswin.models.stages import Pair, StagePlan
+from darswin.ops.waiting import tensor_there
 
 
 class DeformableAttention(nn.Module):
@@ -74,7 +75,7 @@ class DeformableAttention(nn.Module):
         offset = torch.tanh(self.offset(F.gelu(self.norm(around))))  # (B·G, H, W, 2): y, x
         # Places in the map as parts of its half sides, -1 … 1 from edge to edge.
         pixels = _pixel_centers(height, width, offset)
-        places = pixels + offset * (self.offset_range / offset.new_tensor((height, width)))
+        places = pixels + offset * (self.offset_range / tensor_there((height, width), offset))
         # The released code samples as if the outermost pixels' centres were at the edges.
         sampled = F.grid_sample(self._grouped(x), places.flip(-1), align_corners=True)
         sampled = sampled.reshape(batch, dim, tokens).transpose(1, 2)

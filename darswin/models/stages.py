@@ -6,7 +6,9 @@ from typing import Literal
 
 from torch import Tensor, nn
 
+from darswin.layers.attention import WindowAttention
 from darswin.layers.block import Block, PatchMerging
+from darswin.layers.position_bias import RelativeBias, joined_tables
 from darswin.ops.checks import check_pair
 
 Pair = tuple[int, int]
@@ -110,9 +112,22 @@ class Stage(nn.Module):
     def forward(self, x: Tensor, *positions: Tensor) -> Tensor:
         """The map of the stage before → this stage's map. `positions` are the attention's."""
         x = self.downsample(x)
-        for block in self.blocks:
-            x = block(x, *positions)
+        biases = self._biases()
+        if not biases:
+            for block in self.blocks:
+                x = block(x, *positions)
+            return x
+        for block, table in zip(self.blocks, joined_tables(biases, *positions), strict=True):
+            x = block(x, table=table)
         return x
+
+    def _biases(self) -> list[RelativeBias]:
+        """The position biases of the blocks, where they can be computed at once; else none."""
+        attentions = [block.attn for block in self.blocks if isinstance(block, Block)]
+        biases = [attn.position_bias for attn in attentions if isinstance(attn, WindowAttention)]
+        relative = [bias for bias in biases if isinstance(bias, RelativeBias)]
+        kinds = [bias.kind() for bias in relative]
+        return relative if kinds == kinds[:1] * len(self.blocks) else []
 
 
 def make_stages(

@@ -1,4 +1,4 @@
-"""Decides between the compiled operators and their PyTorch reference."""
+"""Decides between the compiled operators and their twins in PyTorch."""
 
 import contextlib
 from collections.abc import Callable, Iterable, Iterator
@@ -26,6 +26,8 @@ def cpu_capability() -> str:
 @contextlib.contextmanager
 def use_reference(enabled: bool = True) -> Iterator[None]:
     """Within this context the operators run their PyTorch reference on every device, CPU included.
+
+    It is the definition in plain steps, with all derivatives; other devices do without it.
 
     The switch is one for the process, not one a thread.
     """
@@ -80,20 +82,28 @@ def autocast_off(device: str) -> contextlib.AbstractContextManager:
     return torch.autocast(device, enabled=False)
 
 
-def run(reference: Callable[..., Tensor], *arguments: Any) -> Tensor:
-    """An operator on checked arguments: compiled, or its twin of the same name in reference.py.
+def run(
+    reference: Callable[..., Tensor], on_devices: Callable[..., Tensor], *arguments: Any
+) -> Tensor:
+    """An operator on checked arguments: compiled, or one of its twins.
 
     The compiled one takes the fields of a NamedTuple one by one.
+
+    Args:
+        reference: the twin of the same name in reference.py.
+        on_devices: what runs on devices other than the CPU.
     """
     flat: list[Any] = []
     for argument in arguments:
         flat.extend(argument if hasattr(argument, "_fields") else (argument,))
-    if compiled(flat[0]):
-        operator = getattr(torch.ops.darswin, reference.__name__)
-        refuse_other_derivatives(operator, flat)
-        return operator(*flat)
+    on_cpu = compiled(flat[0])
+    twin = reference if _reference else on_devices
+    if on_cpu or twin is not reference:
+        refuse_other_derivatives(f"darswin.{reference.__name__}", flat)
+    if on_cpu:
+        return getattr(torch.ops.darswin, reference.__name__)(*flat)
     with autocast_off(flat[0].device.type):
-        return reference(*arguments)
+        return twin(*arguments)
 
 
 def refuse_other_derivatives(operator: object, tensors: Iterable[object]) -> None:

@@ -12,6 +12,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from darswin.ops.waiting import readable
+
 DTYPES = (torch.float32, torch.float64)
 LAYOUTS = ("tokens", "image")
 
@@ -61,9 +63,9 @@ def check_shape(name: str, value: Tensor, form: str, *allowed: Sequence[int | No
 def check_rising(name: str, value: Tensor) -> None:
     """ValueError unless each row of (N, R) is finite, at least 0, and rises.
 
-    Only values that can be read without waiting for a device, and outside of graphs and transforms.
+    Only values that are `readable`, and outside of transforms.
     """
-    if torch.compiler.is_compiling() or value.device.type != "cpu":
+    if not readable(value):
         return
     transformed = torch._C._functorch.peek_interpreter_stack() is not None
     if transformed or type(value) not in (Tensor, torch.nn.Parameter):

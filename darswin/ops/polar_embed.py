@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from darswin.ops import _library, reference
+from darswin.ops import _devices, _library, reference
 from darswin.ops._sampling import (
     TENSORS,
     Sampling,
@@ -67,7 +67,7 @@ def polar_embed(
     if bias is not None:
         check_tensor("bias", bias, like=image, dtypes=dtypes)
         check_shape("bias", bias, "(D,) = ({},)", (weight.shape[0],))
-    return _library.run(reference.polar_embed, sampling, weight, bias)
+    return _library.run(reference.polar_embed, _devices.polar_embed, sampling, weight, bias)
 
 
 @torch.library.register_fake("darswin::polar_embed")

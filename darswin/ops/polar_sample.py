@@ -6,7 +6,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from darswin.ops import _library, reference
+from darswin.ops import _devices, _library, reference
 from darswin.ops._sampling import (
     TENSORS,
     Sampling,
@@ -90,7 +90,7 @@ def polar_sample(
         image, radii, azimuths, center, affine, offsets, jitter, seed, samples, mean, std
     )
     check_layout(layout)
-    return _library.run(reference.polar_sample, sampling, layout == "tokens")
+    return _library.run(reference.polar_sample, _devices.polar_sample, sampling, layout == "tokens")
 
 
 @torch.library.register_fake("darswin::polar_sample")

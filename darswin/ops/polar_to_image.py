@@ -90,7 +90,7 @@ def polar_to_image(
     check_rising("radii", radii)
     check_layout(layout)
     return _library.run(
-        reference.polar_to_image,
+        reference.polar_to_image, reference.polar_to_image,
         x, radii, center, affine, points, r_max, (height, width), layout == "tokens",
     )  # fmt: skip
 

@@ -1,7 +1,8 @@
-"""The operators in plain PyTorch: oracle of the tests, and what runs on other devices.
+"""The operators in plain PyTorch: oracle of the tests, and what runs within `use_reference`.
 
-An operator and its twin have the same name and the same parameters, which come checked; those of a
-sampling come as one.
+Other devices run `_devices.py`, where it has the operator: the same in fewer launches. An operator
+and its twin have the same name and the same parameters, which come checked; those of a sampling
+come as one.
 """
 
 import math
@@ -12,6 +13,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from darswin.ops._sampling import Sampling
+from darswin.ops.waiting import tensor_there
 
 _WORD = 0xFFFFFFFF
 
@@ -69,8 +71,11 @@ def normalized(
     dtype: torch.dtype = torch.float32,
 ) -> Tensor:
     """`(pixel/255 - mean) / std` of a uint8 image (B, C, H, W), in `dtype`; a value a channel."""
-    values = torch.tensor([mean, std], device=image.device, dtype=dtype)
-    m, s = values[..., None, None]
+    m, s = (
+        # One number for all channels where they are the same.
+        tensor_there(values if len(set(values)) > 1 else values[:1], image, dtype)[:, None, None]
+        for values in (mean, std)
+    )
     return (image.to(dtype) / 255 - m) / s
 
 
@@ -114,17 +119,27 @@ def polar_sample(sampling: Sampling, tokens: bool) -> Tensor:
             # A pixel that is not there must not count, were it NaN.
             corner = torch.where(inside[:, None], corner, 0)
             out = out + (wx * wy)[:, None] * corner
+    return laid_out(out, sampling, tokens)
+
+
+def laid_out(out: Tensor, sampling: Sampling, tokens: bool) -> Tensor:
+    """The samples (B, C, R·S_r, A·S_φ) in the type of the output, as tokens or as they are."""
     out = out.bfloat16() if sampling.bfloat16 else out
     if not tokens:
         return out
     size, (along, around) = sampling.map_size(), sampling.samples
-    out = out.reshape(batch, channels, size[1], along, size[2], around)
+    out = out.reshape(*out.shape[:2], size[1], along, size[2], around)
     return out.permute(0, 2, 4, 3, 5, 1).reshape(*size, sampling.token_size())
 
 
 def polar_embed(sampling: Sampling, weight: Tensor, bias: Tensor | None) -> Tensor:
     """See `darswin.ops.polar_embed`."""
     samples = polar_sample(sampling._replace(bfloat16=False), tokens=True)
+    return embedded(samples, sampling, weight, bias)
+
+
+def embedded(samples: Tensor, sampling: Sampling, weight: Tensor, bias: Tensor | None) -> Tensor:
+    """The linear layer behind the samples (B, R, A, S_r·S_φ·C)."""
     weight = weight.to(samples.dtype)
     bias = None if bias is None else bias.to(samples.dtype)
     out = F.linear(samples, weight, bias)

@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from darswin.ops import _library, reference
+from darswin.ops import _devices, _library, reference
 from darswin.ops.checks import DTYPES, check_pair, check_shape, check_tensor
 
 
@@ -70,7 +70,9 @@ def window_attention(
     scale = head_dim**-0.5 if scale is None else float(scale)
     # As ints: torch.jit.trace takes no list of bools.
     wrap = tuple(int(bool(p)) for p in periodic)
-    return _library.run(reference.window_attention, qkv, bias, window, shift, wrap, scale)
+    return _library.run(
+        reference.window_attention, _devices.window_attention, qkv, bias, window, shift, wrap, scale
+    )
 
 
 def _arithmetic_types(qkv: Tensor, bias: Tensor) -> tuple[Tensor, Tensor]:

@@ -6,8 +6,7 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
-from torchmetrics import MeanMetric, Metric
-from torchmetrics.classification import MulticlassAccuracy
+from torchmetrics import Metric
 
 from darswin.data.mixing import Mixing, partners_share
 from darswin.train.task import Batch, Task, named_metrics
@@ -89,15 +88,9 @@ class Classification(Task):
 
     def _measure(self, batch: Batch, measured: nn.Module) -> None:
         images, lens, labels = batch
-        known = labels >= 0
-        logits = self.net(images, lens).float()[known]
-        for name, metric in named_metrics(measured):
-            if not known.any():
-                continue
-            if name == "loss":
-                metric.update(F.cross_entropy(logits, labels[known]), weight=known.sum())
-            else:
-                metric.update(logits, labels[known])
+        logits = self.net(images, lens).float()
+        for _, metric in named_metrics(measured):
+            metric.update(logits, labels)
 
     def validation_step(self, batch: Batch, batch_idx: int) -> None:
         """Counts a batch into the validation's loss and accuracy."""
@@ -119,11 +112,58 @@ class Classification(Task):
         ]
 
 
+class ImageMean(Metric):
+    """Base of means over the images whose label is known; -1 is none.
+
+    No device is waited for before `compute`, as it is by torchmetrics' own.
+    """
+
+    full_state_update = False
+    total: Tensor
+    count: Tensor
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.add_state("total", torch.zeros((), dtype=torch.float64), "sum")
+        self.add_state("count", torch.zeros((), dtype=torch.int64), "sum")
+
+    def update(self, logits: Tensor, labels: Tensor) -> None:
+        """Counts images: their logits (B, K) and their labels (B,)."""
+        known = labels >= 0
+        self.total += torch.where(known, self._values(logits, labels), 0).double().sum()
+        self.count += known.sum()
+
+    def _values(self, logits: Tensor, labels: Tensor) -> Tensor:
+        raise NotImplementedError
+
+    def compute(self) -> Tensor:
+        """The mean; NaN where there are no images."""
+        return (self.total / self.count).float()
+
+
+class MeanLoss(ImageMean):
+    """The mean cross-entropy."""
+
+    def _values(self, logits: Tensor, labels: Tensor) -> Tensor:
+        return F.cross_entropy(logits, labels, ignore_index=-1, reduction="none")
+
+
+class TopK(ImageMean):
+    """The share of images whose label is among the `top_k` likeliest."""
+
+    def __init__(self, top_k: int):
+        super().__init__()
+        self.top_k = top_k
+
+    def _values(self, logits: Tensor, labels: Tensor) -> Tensor:
+        # Of classes that are as likely as each other the first is taken.
+        one = self.top_k == 1
+        said = logits.argmax(1, keepdim=True) if one else logits.topk(self.top_k).indices
+        return (said == labels[:, None]).any(1).double()
+
+
 def metrics(classes: int) -> nn.ModuleDict:
     """What an evaluation measures: mean loss, and the shares that top-1 and top-5 get right."""
-
-    def accuracy(k: int) -> Metric:
-        top_k = min(k, classes)
-        return MulticlassAccuracy(classes, average="micro", top_k=top_k)
-
-    return nn.ModuleDict(dict(top1=accuracy(1), top5=accuracy(5), loss=MeanMetric()))
+    return nn.ModuleDict(
+        dict(top1=TopK(min(1, classes)), top5=TopK(min(5, classes)), loss=MeanLoss())
+    )

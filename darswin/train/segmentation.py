@@ -8,6 +8,7 @@ from torch import Tensor, nn
 from torchmetrics.classification import MulticlassAccuracy, MulticlassJaccardIndex
 
 from darswin.data.scenes import IGNORE
+from darswin.ops.waiting import tensor_there
 from darswin.train.dense import DenseTask
 from darswin.train.losses import LabelLoss, label_loss
 from darswin.train.pixel_metrics import BY_AREA, LabelSums, label_scores, none_of_nan
@@ -95,7 +96,7 @@ class Segmentation(DenseTask):
     def _criterion(self, predicted: Tensor, target: Tensor, weights: Tensor | None) -> Tensor:
         class_weights = None
         if self.class_weights is not None:
-            class_weights = predicted.new_tensor(self.class_weights)
+            class_weights = tensor_there(self.class_weights, predicted)
         target = torch.where(self._known(target), target, IGNORE)
         return label_loss(
             predicted, target, self.loss, class_weights=class_weights,

@@ -20,6 +20,7 @@ from darswin.models.encoder import Encoder
 from darswin.models.registry import model_class
 from darswin.models.saving import ModelCard, read_card
 from darswin.models.saving import Task as TaskName
+from darswin.ops.waiting import readable
 from darswin.train.data import RunData
 from darswin.train.finetuning import (
     check_name,
@@ -261,13 +262,18 @@ class Task(LightningModule):
         rng = np.random.default_rng(step)  # the same in all processes
         torch.manual_seed(int(np.random.default_rng((*step, self.global_rank)).integers(2**63)))
         loss = self._loss(batch, rng)
-        if not torch.isfinite(loss):
+        # A device is only waited for as often as Lightning logs, which waits too: once weights are
+        # not finite, they and the loss stay so.
+        every = self.trainer.log_every_n_steps  # type: ignore[attr-defined]  # Lightning adds it
+        looks = readable(loss) or (batch_idx + 1) % max(every, 1) == 0
+        if looks and not torch.isfinite(loss):
             raise FloatingPointError(
                 f"the loss is {loss.item()} in epoch {self.current_epoch}, batch {batch_idx}: "
                 f"{self._advice()}"
             )
         self.log("train/loss", loss, prog_bar=True, batch_size=len(batch[0]), sync_dist=True)
-        self.log("train/rate", self.trainer.optimizers[0].param_groups[0]["lr"])
+        # As a tensor of the device: Lightning would copy a number to it.
+        self.log("train/rate", loss.new_full((), self.trainer.optimizers[0].param_groups[0]["lr"]))
         return loss
 
     def _loss(self, batch: Batch, rng: np.random.Generator) -> Tensor:

@@ -487,7 +487,7 @@ def test_reference_switch(monkeypatch):
     assert not reference_in_use()
 
 
-def test_other_devices_run_the_reference():
+def test_other_devices_run_torch():
     image, radii, center, azimuths = (t.to("meta") for t in make_inputs())
     out = polar_sample(image, radii, azimuths, center, samples=(3, 4))
     assert out.shape == (2, 2, 2, 36) and out.device.type == "meta"

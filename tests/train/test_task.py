@@ -1,6 +1,7 @@
 import pytest
 import torch
 import torch.nn.functional as F
+from torchmetrics.classification import MulticlassAccuracy
 
 from darswin.train.classification import Classification, metrics
 
@@ -27,6 +28,19 @@ def test_metrics_count_images():
     measured["top1"].update(logits, torch.tensor([1, 2, 3, 5]))
     assert measured["top1"].compute() == 0.5
     assert metrics(3)["top5"].top_k == 3
+
+
+def test_metrics_are_those_of_torchmetrics_and_leave_broken_pictures_out():
+    measured, logits = metrics(8), torch.randn(60, 8)
+    labels = torch.randint(-1, 8, (60,))
+    for part in (slice(0, 40), slice(40, 60)):
+        for metric in measured.values():
+            metric.update(logits[part], labels[part])
+    logits, labels = logits[labels >= 0], labels[labels >= 0]
+    for name, k in (("top1", 1), ("top5", 5)):
+        expected = MulticlassAccuracy(8, average="micro", top_k=k)(logits, labels)
+        torch.testing.assert_close(measured[name].compute(), expected)
+    torch.testing.assert_close(measured["loss"].compute(), F.cross_entropy(logits, labels))
 
 
 @pytest.mark.parametrize(

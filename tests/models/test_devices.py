@@ -1,0 +1,134 @@
+"""What models do on a device, on "meta": they launch no more than they must, and no forward and no
+step waits. A value that is read fails there; a copy between host and device, in `Launches`."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from launches import Launches, fused_attention, launches
+
+from darswin import lens
+from darswin.lens import cat
+from darswin.models import create_model
+from darswin.train.classification import Classification, metrics
+from darswin.train.distance import Distance
+from darswin.train.segmentation import Segmentation
+
+SPHERICAL = lens.Spherical.from_fov(xi=[0.3, 0.5], fov=2.0, radius=32.0)
+LENSES = {
+    "spherical": SPHERICAL,
+    "of an image size": lens.Spherical(SPHERICAL.xi, SPHERICAL.focal, 1.0, image_size=(64, 64)),
+    "curves": cat([SPHERICAL, lens.Equidistant([20.0], 1.2)])[1:],
+    "tangential": lens.KannalaBrandt(
+        [20.0, 21.0], [0.01, 0.002], tangential=[1e-3, 2e-3], theta_max=1.0
+    ),
+    "affine": lens.Equidistant([20.0, 21.0], 1.2, affine=[[1.0, 0.01], [0.0, 1.1]]),
+}
+MODELS = {
+    "darswin_a_nano": {},
+    "darswin_ra_nano": dict(spacing="g", sample_spacing="radius"),
+    "darswin_a_micro": dict(position_bias="polar", spacing="tan"),
+    "swin_nano": dict(image_size=64),
+    "swin_undis_nano": dict(image_size=64),
+    "dat_nano": dict(image_size=64),
+}
+DENSE = {"darswin_unet_a_nano": {}, "swin_unet_undis_nano": dict(image_size=64)}
+
+
+def network(name, **options):
+    return create_model(name, **options).to("meta")
+
+
+def images(dtype=torch.float32, size=64):
+    return torch.empty(2, 3, size, size, device="meta", dtype=dtype)
+
+
+@pytest.mark.parametrize("kind", LENSES)
+def test_no_lens_is_waited_for(kind):
+    model, lenses = network("darswin_a_nano", num_classes=3).eval(), LENSES[kind].to("meta")
+    with Launches():
+        assert model(images(), lenses).shape == (2, 3)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.uint8])
+@pytest.mark.parametrize("name", MODELS)
+def test_no_classifier_waits_in_a_step(name, dtype):
+    model = network(name, num_classes=3, mean=[0.4, 0.5, 0.6], std=0.2, **MODELS[name])
+    lenses = SPHERICAL.to("meta")
+    with Launches():
+        model(images(dtype), lenses).square().mean().backward()
+
+
+@pytest.mark.parametrize("kind", LENSES)
+@pytest.mark.parametrize("name", DENSE)
+def test_no_dense_model_waits_in_a_step(name, kind):
+    model, lenses = network(name, task="distance", **DENSE[name]), LENSES[kind].to("meta")
+    with Launches():
+        model(images(), lenses).mean().backward()
+
+
+def attach(task, net, monkeypatch, **data):
+    """What Lightning and the data give a task."""
+    trainer = SimpleNamespace(
+        log_every_n_steps=50, optimizers=[SimpleNamespace(param_groups=[dict(lr=0.1)])],
+        datamodule=SimpleNamespace(**data),
+    )  # fmt: skip
+    monkeypatch.setattr(type(task), "trainer", trainer, raising=False)
+    monkeypatch.setattr(task, "log", lambda *arguments, **options: None)
+    task.net = net
+    return task
+
+
+@pytest.mark.parametrize("pairs", [False, True])
+def test_a_classifiers_task_does_not_wait(pairs, monkeypatch):
+    data = dict(calibrations=object() if pairs else None, pair_lenses=pairs)
+    net = network("darswin_a_nano", num_classes=3)
+    task = attach(Classification("darswin_a_nano"), net, monkeypatch, classes="abc", **data)
+    task.card = SimpleNamespace(classes="abc")
+    labels = torch.empty(2, device="meta", dtype=torch.int64)
+    batch = images(), SPHERICAL.to("meta"), labels
+    measured = metrics(3).to("meta")
+    with Launches():
+        for step in range(4):
+            task.training_step(batch, step).backward()
+        task._measure(batch, measured)
+
+
+@pytest.mark.parametrize("weighted", [False, True])
+def test_the_dense_tasks_do_not_wait_in_a_step(weighted, monkeypatch):
+    labels = torch.empty(2, 64, 64, device="meta", dtype=torch.int64)
+    batch, rng = (images(), SPHERICAL.to("meta")), np.random.default_rng(0)
+    tasks = (
+        (Segmentation("darswin_unet_a_nano", class_weights=[1.0, 2.0, 3.0],
+                      solid_angle_weights=weighted), dict(task="segmentation", num_classes=3)),
+        (Distance("darswin_unet_a_nano", solid_angle_weights=weighted), dict(task="distance")),
+    )  # fmt: skip
+    for task, options in tasks:
+        attach(task, network("darswin_unet_a_nano", **options), monkeypatch)
+        target = labels if options["task"] == "segmentation" else labels.float()
+        with Launches():
+            task._loss((*batch, target), rng).backward()
+
+
+def test_a_loss_that_is_not_finite_is_told_where_lightning_logs(monkeypatch):
+    task = attach(Classification("darswin_a_nano"), torch.nn.Identity(), monkeypatch)
+    for value, device in ((torch.nan, "cpu"), (0.5, "cpu")):
+        loss = torch.tensor(value, device=device)
+        monkeypatch.setattr(task, "_loss", lambda batch, rng, loss=loss: loss)
+        if value == value:
+            assert task.training_step(([0],), 3) == 0.5
+        else:
+            with pytest.raises(FloatingPointError, match="the loss is nan in epoch 0, batch 3"):
+                task.training_step(([0],), 3)
+
+
+def test_launches_of_darswin_a_small():
+    model, lenses = network("darswin_a_small", num_classes=10), SPHERICAL.to("meta")
+    with fused_attention(), torch.no_grad():
+        forward = launches(model.eval(), images(), lenses)
+    with fused_attention():
+        step = launches(lambda: model.train()(images(), lenses).sum().backward())
+    assert forward.total() <= 520 and step.total() <= 1650, (forward.total(), step.total())
+    # The position biases of a stage are computed at once.
+    assert forward["aten::sin"] <= 11 and forward["aten::cat"] <= 40, forward
