@@ -11,7 +11,7 @@ from jsonargparse import ArgumentParser
 from torch import Tensor
 from torch.utils.data import DataLoader, Subset
 
-from darswin.deploy.quantize import quantize_model
+from darswin.deploy.quantize import Change, quantize_model
 from darswin.layers.quantized import quantized_layers
 from darswin.lens import Lens
 from darswin.models.base import Model
@@ -86,24 +86,27 @@ def _comparison(
     model: Model, quantized: Model, task: str, batches: list[tuple[Tensor, Lens, Tensor]]
 ) -> Iterator[str]:
     """What both models say of pictures, in lines."""
-    before, after, truth = [], [], []
+    pictures = known = right = still = same = pixels = 0
+    results = Change()
     with torch.inference_mode():
         for images, lens, target in batches:
-            before.append(model(images, lens).float())
-            after.append(quantized(images, lens).float())
-            truth.append(target)
-    a, b, target = torch.cat(before), torch.cat(after), torch.cat(truth)
-    error = ((b - a).square().mean() / (a - a.mean()).square().mean()).item()
-    yield f"{len(a)} validation pictures: mean square of what changed, of the variance: {error:.1e}"
-    if task == "distance":
-        return
-    said, says = a.argmax(1), b.argmax(1)
-    known = (target >= 0) & (target < a.shape[1])
-    yield (
-        f"right: {_percent((said == target)[known])} before, {_percent((says == target)[known])} "
-        f"after; the same is said in {_percent(said == says)}"
-    )
+            a, b = model(images, lens).float(), quantized(images, lens).float()
+            results.add(a, b)
+            said, says = a.argmax(1), b.argmax(1)
+            valid = (target >= 0) & (target < a.shape[1])
+            pictures, pixels = pictures + len(a), pixels + said.numel()
+            known += int(valid.sum())
+            right += int((said == target)[valid].sum())
+            still += int((says == target)[valid].sum())
+            same += int((said == says).sum())
+    share = f"mean square of what changed, of the variance: {results.share():.1e}"
+    yield f"{pictures} validation pictures: {share}"
+    if task != "distance":
+        yield (
+            f"right: {_percent(right, known)} before, {_percent(still, known)} after; the same is "
+            f"said in {_percent(same, pixels)}"
+        )
 
 
-def _percent(which: Tensor) -> str:
-    return f"{100 * which.float().mean().item():.2f} %"
+def _percent(count: int, whole: int) -> str:
+    return f"{100 * count / whole:.2f} %" if whole else "nothing known"

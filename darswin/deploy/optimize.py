@@ -60,13 +60,13 @@ def optimize(
             there is nothing to calibrate, or none where there is.
         RuntimeError: int8 on a CPU that has no products of 8 bits.
     """
+    _check(model, dtype, lens)
     if dtype == "fastest":
         whole = calibration is None and not quantized_layers(model)
         lacks = onednn.missing(torch.int8) is not None
         dtype = fastest_dtype() if whole or lacks else torch.int8
         if lacks:
             model, calibration = _without_8_bits(model), None
-    _check(model, dtype, lens)
     if dtype == torch.int8:
         if (lack := onednn.missing(dtype)) is not None:
             raise RuntimeError(f'{lack}: optimize(model, "fastest") takes what runs here')
@@ -94,7 +94,7 @@ def optimize(
 
 
 def _without_8_bits(model: Net) -> Net:
-    if not isinstance(model, nn.Module) or not quantized_layers(model):
+    if not quantized_layers(model):
         return model
     model = copy.deepcopy(model)
     without_quantized_layers(model)
@@ -110,15 +110,16 @@ def _quantized(model: Net, calibration: Iterable[Sequence] | None) -> Net:
     return model if calibration is None else quantize_model(model, calibration)
 
 
-def _check(model: nn.Module, dtype: torch.dtype, lens: Lens | None) -> None:
+def _check(model: nn.Module, dtype: torch.dtype | str, lens: Lens | None) -> None:
     if not isinstance(model, (Encoder, DenseModel, FeatureMaps)):
         raise TypeError(f"model must be one of create_model, got {type(model).__name__}")
     if isinstance(model, _Optimized):
         raise TypeError("model must be one of create_model, got one that is optimized already")
     if lens is not None and (not isinstance(lens, Lens) or len(lens) != 1):
         raise ValueError(f"lens must be one lens, got {lens!r}")
-    if dtype not in DTYPES:
-        raise ValueError(f"dtype must be one of {', '.join(map(str, DTYPES))}, got {dtype}")
+    if dtype not in (*DTYPES, "fastest"):
+        known = ", ".join(map(str, DTYPES))
+        raise ValueError(f'dtype must be one of {known} or "fastest", got {dtype}')
     devices = sorted({parameter.device.type for parameter in model.parameters()})
     if devices != ["cpu"]:
         raise ValueError(f"model must be on the CPU, got one on {' and '.join(devices)}")

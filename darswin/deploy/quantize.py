@@ -1,10 +1,11 @@
 """Models whose large products take 8 bits: ranges and what stays in float32 come from pictures."""
 
 import copy
+import math
 from collections import defaultdict
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import TypeVar
+from typing import Generic, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -19,10 +20,10 @@ from darswin.ops._quantized import Quantization, dequantize, quantize
 Net = TypeVar("Net", bound=Model)
 Batches = Sequence[tuple[Tensor, Lens | None]]
 
-# Of an activation, so many numbers of each batch are kept, evenly spread, to choose its range by.
-_KEPT = 2**14
+# Of an activation, so many numbers of each batch are kept, drawn at random, to choose its range by.
+_KEPT = 2**15
 # A range is the whole one, or ends at one of these shares of it.
-_SHARES = torch.linspace(0.3, 1.0, 36).tolist()
+_SHARES = torch.linspace(0.1, 1.0, 46).tolist()
 
 
 def quantize_model(
@@ -35,7 +36,7 @@ def quantize_model(
     """A copy of a model whose blocks and mergings compute with weights and activations of 8 bits.
 
     The copy computes in float32 what integer products compute, so it can be evaluated, saved and
-    exported anywhere; `darswin.optimize` makes integer products of it.
+    exported anywhere; `darswin.optimize` makes integer products of it. It has no gradients.
 
     Each activation gets the range that loses least, in squares, over the calibration. What disturbs
     the result most stays in float32, one part after the other, until the copy's result is within
@@ -49,30 +50,23 @@ def quantize_model(
         tolerance: of the mean square of what changes, over the variance of the result.
 
     Raises:
-        TypeError: another kind of model. ValueError: no calibration, a name that the model lacks,
-            or a model that is quantized already.
+        TypeError: another kind of model, or of batches.
+        ValueError: no pictures; a name that the model lacks; a model of another dtype, on another
+            device, or quantized already; or no part of it stays within the tolerance.
     """
-    batches = _batches(model, calibration)
-    parts = _parts(model, keep)
-    activations = _activations(model, batches, [name for names in parts.values() for name in names])
-    expected = _results(model, batches)
-
-    def quantized(chosen: Iterable[str]) -> Net:
-        copied = copy.deepcopy(model).eval().requires_grad_(False)
-        with_quantized_layers(
-            copied, {name: activations[name] for part in chosen for name in parts[part]}
-        )
-        return copied
-
-    chosen = list(parts)
-    result = quantized(chosen)
-    if _error(_results(result, batches), expected) <= tolerance:
-        return result
-    errors = {part: _error(_results(quantized([part]), batches), expected) for part in parts}
-    chosen.sort(key=errors.__getitem__)
-    while chosen and _error(_results(result, batches), expected) > tolerance:
+    found = _Calibration(model, calibration, keep)
+    chosen = list(found.parts)
+    result = found.quantized(chosen)
+    error = found.error(result)
+    if error > tolerance:
+        alone = {part: found.error(found.quantized([part])) for part in chosen}
+        chosen.sort(key=alone.__getitem__)
+    while error > tolerance and len(chosen) > 1:
         chosen.pop()
-        result = quantized(chosen)
+        result = found.quantized(chosen)
+        error = found.error(result)
+    if error > tolerance or not chosen:
+        raise ValueError(f"no part of the model can have 8 bits within a tolerance of {tolerance}")
     return result
 
 
@@ -88,14 +82,60 @@ def sensitivities(model: Model, calibration: Iterable[Sequence]) -> dict[str, fl
         for each part the mean square of what changes over the variance of the result, the largest
         first.
     """
-    batches, parts = _batches(model, calibration), _parts(model, ())
-    activations = _activations(model, batches, [name for names in parts.values() for name in names])
-    expected, errors = _results(model, batches), {}
-    for part, names in parts.items():
-        copied = copy.deepcopy(model).eval().requires_grad_(False)
-        with_quantized_layers(copied, {name: activations[name] for name in names})
-        errors[part] = _error(_results(copied, batches), expected)
+    found = _Calibration(model, calibration, ())
+    errors = {part: found.error(found.quantized([part])) for part in found.parts}
     return dict(sorted(errors.items(), key=lambda item: -item[1]))
+
+
+class _Calibration(Generic[Net]):
+    """A model, pictures, and what they say of it.
+
+    Attributes:
+        parts: the names of the linear layers of each part that may become 8 bits.
+    """
+
+    def __init__(self, model: Net, calibration: Iterable[Sequence], keep: Collection[str]):
+        self.batches = _batches(model, calibration)
+        self.model, self.parts = model, _parts(model, keep)
+        names = [name for names in self.parts.values() for name in names]
+        self._activations = _activations(model, self.batches, names)
+        self._expected = list(_results(model, self.batches))
+
+    def quantized(self, parts: Iterable[str]) -> Net:
+        """A copy of the model whose given parts have 8 bits."""
+        copied = copy.deepcopy(self.model).eval().requires_grad_(False)
+        names = [name for part in parts for name in self.parts[part]]
+        with_quantized_layers(copied, {name: self._activations[name] for name in names})
+        return copied
+
+    def error(self, model: Net) -> float:
+        """The mean square of what a copy changes, over the variance of the result."""
+        change = Change()
+        for expected, found in zip(self._expected, _results(model, self.batches), strict=True):
+            change.add(expected, found)
+        return change.share()
+
+
+class Change:
+    """How much results differ: the mean square of the difference, over the variance."""
+
+    def __init__(self) -> None:
+        self.count, self.sums = 0, torch.zeros(3, dtype=torch.float64)
+
+    def add(self, expected: Tensor, found: Tensor) -> None:
+        """Counts the results of a batch."""
+        want, got = expected.double(), found.double()
+        self.count += want.numel()
+        squares = want.square().sum(), (got - want).square().sum()
+        self.sums += torch.stack((want.sum(), *squares))
+
+    def share(self) -> float:
+        """The change; infinite where something changed of what is constant."""
+        mean, square, changed = (self.sums / self.count).tolist()
+        variance = square - mean**2
+        if variance > 0:
+            return changed / variance
+        return math.inf if changed else 0.0
 
 
 def _batches(model: nn.Module, calibration: Iterable[Sequence]) -> Batches:
@@ -103,7 +143,17 @@ def _batches(model: nn.Module, calibration: Iterable[Sequence]) -> Batches:
         raise TypeError(f"model must be one of create_model, got {type(model).__name__}")
     if quantized_layers(model):
         raise ValueError("the model is quantized already")
-    batches = [(batch[0], batch[1]) for batch in calibration]
+    kinds = {(p.dtype, p.device.type) for p in model.parameters()}
+    if kinds != {(torch.float32, "cpu")}:
+        raise ValueError(f"model must be in float32 on the CPU, got {kinds}")
+    batches = []
+    for batch in calibration:
+        if isinstance(batch, Tensor) or len(batch) < 2 or not isinstance(batch[1], Lens | None):
+            raise TypeError(
+                "calibration must be batches (images, lens), as [(images, lens)], got one of "
+                f"{type(batch).__name__}"
+            )
+        batches.append((batch[0], batch[1]))
     if not sum(len(images) for images, _ in batches):
         raise ValueError("calibration has no pictures")
     return batches
@@ -111,7 +161,8 @@ def _batches(model: nn.Module, calibration: Iterable[Sequence]) -> Batches:
 
 def _parts(model: nn.Module, keep: Collection[str]) -> dict[str, list[str]]:
     """The names of the linear layers of each part that may become 8 bits."""
-    if unknown := sorted(set(keep) - {name for name, _ in model.named_modules()}):
+    keep = (keep,) if isinstance(keep, str) else keep
+    if unknown := sorted(set(keep) - {name for name, _ in model.named_modules() if name}):
         raise ValueError(f"the model has no {', '.join(unknown)} to keep in float32")
     parts: dict[str, list[str]] = {}
     for name, module in model.named_modules():
@@ -129,10 +180,13 @@ def _parts(model: nn.Module, keep: Collection[str]) -> dict[str, list[str]]:
     }
 
 
-def _results(model: Model, batches: Batches) -> Tensor:
-    """The results of all batches, one row a picture."""
-    with torch.inference_mode(), _evaluating(model):
-        return torch.cat([_flat(model(images, lens)) for images, lens in batches])
+def _results(model: Model, batches: Batches) -> Iterator[Tensor]:
+    """The result of each batch, one row a picture."""
+    with _evaluating(model):
+        for images, lens in batches:
+            with torch.inference_mode():
+                result = _flat(model(images, lens))
+            yield result
 
 
 def _flat(result: Tensor | list[Tensor]) -> Tensor:
@@ -141,46 +195,49 @@ def _flat(result: Tensor | list[Tensor]) -> Tensor:
     return torch.cat([one.float().flatten(1) for one in maps], 1)
 
 
-def _error(found: Tensor, expected: Tensor) -> float:
-    """The mean square of the difference, over the variance of what is expected."""
-    variance = (expected - expected.mean()).square().mean()
-    return ((found - expected).square().mean() / variance).item()
-
-
 def _activations(model: Model, batches: Batches, names: Collection[str]) -> dict[str, Quantization]:
     """How the input of each named layer becomes 8 bits."""
     kept: dict[str, list[Tensor]] = defaultdict(list)
+    ends: dict[str, list[Tensor]] = defaultdict(list)
+    chance = torch.Generator().manual_seed(0)
 
     def keeper(name):
         def keep(module, arguments):
             values = arguments[0].detach().float().flatten()
-            step = max(values.numel() // _KEPT, 1)
-            ends = torch.stack(values.aminmax()) if values.numel() else values
-            kept[name].append(torch.cat((values[::step], ends)))
+            if values.numel():
+                # Not every so many: that would be the same few channels.
+                drawn = torch.randint(values.numel(), (_KEPT,), generator=chance)
+                kept[name].append(values[drawn])
+                ends[name].extend(values.aminmax())
 
         return keep
 
     layers = dict(model.named_modules())
     hooks = [layers[name].register_forward_pre_hook(keeper(name)) for name in names]
     try:
-        _results(model, batches)
+        for _ in _results(model, batches):
+            pass
     finally:
         for hook in hooks:
             hook.remove()
-    return {name: _best_range(name, torch.cat(kept[name])) for name in names}
+    return {
+        name: _best_range(name, torch.cat(kept[name]), torch.stack(ends[name])) for name in names
+    }
 
 
-def _best_range(name: str, values: Tensor) -> Quantization:
-    """The quantization of least squared error: each end is a share of the whole range."""
-    if not values.isfinite().all():
+def _best_range(name: str, values: Tensor, ends: Tensor) -> Quantization:
+    """The quantization of least squared error: both ends are shares of the whole range, the same,
+    then each its own."""
+    if not ends.isfinite().all():
         raise ValueError(f"{name} takes numbers that are not finite: look at the calibration")
-    lower, upper = min(values.min().item(), 0.0), max(values.max().item(), 0.0)
+    lower, upper = min(ends.min().item(), 0.0), max(ends.max().item(), 0.0)
 
     def error(ends: tuple[float, float]) -> float:
         given = _of_range(*ends)
         return (dequantize(quantize(values, given), given) - values).square().sum().item()
 
-    best = min(((lower, share * upper) for share in _SHARES), key=error)
+    best = min(((share * lower, share * upper) for share in _SHARES), key=error)
+    best = min(((best[0], share * upper) for share in _SHARES), key=error)
     best = min(((share * lower, best[1]) for share in _SHARES), key=error)
     return _of_range(*best)
 
@@ -193,9 +250,10 @@ def _of_range(lower: float, upper: float) -> Quantization:
 
 @contextmanager
 def _evaluating(model: nn.Module) -> Iterator[None]:
-    training = model.training
+    modes = [(module, module.training) for module in model.modules()]
     model.eval()
     try:
         yield
     finally:
-        model.train(training)
+        for module, training in modes:
+            module.training = training

@@ -188,6 +188,8 @@ class _Mlp:
     """Linear, GELU, Linear: both products are quantized, or none."""
 
     def __init__(self, mlp: Mlp, dtype: torch.dtype):
+        if isinstance(mlp.fc1, QuantizedLinear) != isinstance(mlp.fc2, QuantizedLinear):
+            raise ValueError("both products of an MLP must be quantized, or none")
         fc1, self.fc2 = packed(mlp.fc1, dtype), packed(mlp.fc2, dtype)
         self.takes = _taken(fc1)
         self.fc1_gelu: Callable[[Tensor], Tensor]

@@ -72,8 +72,14 @@ class QuantizedLinear(nn.Module):
         """(..., D) → (..., D'), float32."""
         if torch.compiler.is_compiling():
             return self._for_graphs(x.float())
+        if torch.is_grad_enabled() and x.requires_grad:
+            raise RuntimeError(
+                "a quantized layer has no gradient, but its input requires one: use the model that "
+                "was quantized, or `darswin.layers.quantized.without_quantized_layers`"
+            )
         x = dequantize(quantize(x.float(), self.activation), self.activation)
-        return F.linear(x, self.weight.float() * self.weight_scale[:, None], self.bias)
+        bias = None if self.bias is None else self.bias.float()
+        return F.linear(x, self.weight.float() * self.weight_scale.float()[:, None], bias)
 
     def _for_graphs(self, x: Tensor) -> Tensor:
         """The same by torch's operators for graphs, which ONNX has by the same names."""

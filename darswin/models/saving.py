@@ -114,6 +114,8 @@ def load_model(path: str | os.PathLike) -> tuple[Any, ModelCard]:
     model.pretrained_cfg |= dict(label_names=tuple(card.classes), file=str(path))
     if model.image_size is None:
         model.pretrained_cfg["input_size"] = (model.in_chans, card.size, card.size)
+    if card.quantized:
+        model.requires_grad_(False)
     return model.eval(), card
 
 

@@ -161,6 +161,10 @@ class TopK(ImageMean):
         said = logits.argmax(1, keepdim=True) if one else logits.topk(self.top_k).indices
         return (said == labels[:, None]).any(1).double()
 
+    def compute(self) -> Tensor:
+        """The share; 0 where there are no images."""
+        return super().compute().nan_to_num(0.0)
+
 
 def metrics(classes: int) -> nn.ModuleDict:
     """What an evaluation measures: mean loss, and the shares that top-1 and top-5 get right."""

@@ -265,7 +265,7 @@ class Task(LightningModule):
         # A device is only waited for as often as Lightning logs, which waits too: once weights are
         # not finite, they and the loss stay so.
         every = self.trainer.log_every_n_steps  # type: ignore[attr-defined]  # Lightning adds it
-        looks = readable(loss) or (batch_idx + 1) % max(every, 1) == 0
+        looks = readable(loss) or (self.trainer.global_step + 1) % max(every, 1) == 0
         if looks and not torch.isfinite(loss):
             raise FloatingPointError(
                 f"the loss is {loss.item()} in epoch {self.current_epoch}, batch {batch_idx}: "

@@ -7,10 +7,11 @@ import torch
 from torch import nn
 
 from darswin import create_model, optimize
+from darswin.deploy import quantize as module
 from darswin.deploy.quantize import quantize_model, sensitivities
 from darswin.layers import onednn, packed
 from darswin.layers.linear import Linear
-from darswin.layers.quantized import QuantizedLinear, quantized_layers
+from darswin.layers.quantized import QuantizedLinear, quantized_layers, with_quantized_layers
 from darswin.lens import Spherical
 from darswin.models import ModelCard, load_model, save_model
 from darswin.ops._quantized import Quantization, dequantize, quantize
@@ -26,11 +27,11 @@ def network(name="darswin_a_nano", **options):
     if name.startswith("swin_unet"):
         options["image_size"] = 32
     model = create_model(name, **(dict(num_classes=10) | options)).eval()
-    for module in model.modules():
-        if isinstance(module, nn.Linear):
-            nn.init.normal_(module.weight, std=module.in_features**-0.5)
-            if module.bias is not None:
-                nn.init.normal_(module.bias, std=0.1)
+    for layer in model.modules():
+        if isinstance(layer, nn.Linear):
+            nn.init.normal_(layer.weight, std=layer.in_features**-0.5)
+            if layer.bias is not None:
+                nn.init.normal_(layer.bias, std=0.1)
     return model
 
 
@@ -118,8 +119,52 @@ def test_what_disturbs_most_stays_in_float32():
     all_of_it = quantized_layers(quantize_model(model, [seen], tolerance=math.inf))
     some = quantized_layers(quantize_model(model, [seen], tolerance=1e-2))
     assert "stages.1.blocks.0.attn.qkv" in all_of_it.keys() - some.keys()
-    nothing = quantize_model(model, [seen], tolerance=0.0)
-    assert not quantized_layers(nothing) and torch.equal(nothing(*seen), model(*seen))
+    with pytest.raises(ValueError, match=r"no part .* 8 bits within a tolerance of 0\.0"):
+        quantize_model(model, [seen], tolerance=0.0)
+
+
+def test_ranges_lose_least():
+    values = torch.randn(200_000)
+    values[:2] = torch.tensor([12.0, -12.0])
+
+    def loss(given):
+        return (dequantize(quantize(values, given), given) - values).square().mean().item()
+
+    found = module._best_range("x", values, torch.stack(values.aminmax()))
+    shares = torch.linspace(0.05, 1, 96).tolist()
+    best = min(loss(module._of_range(-12 * share, 12 * share)) for share in shares)
+    assert loss(found) < 1.05 * best < 0.5 * loss(module._of_range(-12, 12))
+
+
+def test_the_model_stays_as_it_is():
+    model, seen = network().train(), batch()
+    model.stages[0].eval()
+    modes = [m.training for m in model.modules()]
+    quantize_model(model, [seen])
+    assert [m.training for m in model.modules()] == modes
+    assert all(p.requires_grad for p in model.parameters())
+
+
+def test_there_are_no_gradients():
+    model, seen = network(), batch()
+    quantized = quantize_model(model, [seen])
+    assert not quantized(*seen).requires_grad
+    with pytest.raises(RuntimeError, match="a quantized layer has no gradient"):
+        quantized(seen[0].requires_grad_(), seen[1])
+
+
+def test_layers_that_cannot_go_together_are_named():
+    steps = Quantization(0.05, 128)
+    for name, layer, message in (
+        ("darswin_a_nano", "stages.0.blocks.0.mlp.fc1", "both products of an MLP"),
+        ("darswin_a_nano", "stages.0.blocks.0.mlp.fc2", "both products of an MLP"),
+        ("darswin_unet_a_nano", "segmentation_head.proj", "must be a linear one"),
+    ):
+        model = network(name)
+        with_quantized_layers(model, {layer: steps})
+        if HAS_INT8:
+            with pytest.raises(ValueError, match=message):
+                optimize(model, torch.int8)
 
 
 def test_what_is_to_stay_stays():
@@ -129,8 +174,11 @@ def test_what_is_to_stay_stays():
     assert not any(name.startswith(tuple(keep)) for name in layers)
     # The two products of an MLP go together.
     assert "stages.2.blocks.0.mlp.fc2" not in layers and "stages.1.blocks.0.mlp.fc2" in layers
-    with pytest.raises(ValueError, match=r"the model has no stages\.9 to keep in float32"):
-        quantize_model(model, [seen], keep=["stages.9"])
+    one = quantize_model(model, [seen], keep="stages.0", tolerance=math.inf)
+    assert not any(name.startswith("stages.0") for name in quantized_layers(one))
+    for wrong in ("stages.9", [""]):
+        with pytest.raises(ValueError, match=r"the model has no (stages\.9)? to keep in float32"):
+            quantize_model(model, [seen], keep=wrong)
 
 
 @needs_int8
@@ -194,7 +242,9 @@ def test_fastest(monkeypatch):
 
 def test_fastest_dtype_is_measured(monkeypatch):
     packed.fastest_dtype.cache_clear()
+    state = torch.get_rng_state()
     assert packed.fastest_dtype() in (torch.float32, torch.bfloat16)
+    assert torch.equal(torch.get_rng_state(), state)
     packed.fastest_dtype.cache_clear()
     monkeypatch.setattr(torch.ops.mkldnn, "_is_mkldnn_bf16_supported", lambda: False)
     assert packed.fastest_dtype() == torch.float32
@@ -208,6 +258,12 @@ def test_wrong_arguments():
         quantize_model(nn.Linear(2, 3), [seen])
     with pytest.raises(ValueError, match="quantized already"):
         quantize_model(quantized, [seen])
+    for wrong in (seen, seen[0], [(seen[0],)], [seen[0]], [(seen[0], 1.0)]):
+        with pytest.raises(TypeError, match=r"calibration must be batches \(images, lens\)"):
+            quantize_model(model, wrong)
+    for dtype in (torch.float64, torch.bfloat16):
+        with pytest.raises(ValueError, match="must be in float32 on the CPU"):
+            quantize_model(network().to(dtype), [seen])
     for nothing in ([], [(seen[0][:0], seen[1])]):
         with pytest.raises(ValueError, match="calibration has no pictures"):
             quantize_model(model, nothing)
@@ -223,8 +279,10 @@ def test_wrong_arguments():
         for given, calibration in ((model, None), (quantized, [seen])):
             with pytest.raises(ValueError, match="either a model of quantize_model or a calib"):
                 optimize(given, torch.int8, calibration=calibration)
-    with pytest.raises(ValueError, match=r"dtype must be one of .*int8, got torch\.float64"):
+    with pytest.raises(ValueError, match=r'dtype must be .*int8 or "fastest", got torch\.float64'):
         optimize(model, torch.float64)
+    with pytest.raises(TypeError, match="model must be one of create_model"):
+        optimize("model", "fastest")
     assert sum(isinstance(m, Linear) for m in quantized.modules())  # the head is one still
 
 
