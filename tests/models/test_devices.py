@@ -71,7 +71,8 @@ def test_no_dense_model_waits_in_a_step(name, kind):
 def attach(task, net, monkeypatch, **data):
     """What Lightning and the data give a task."""
     trainer = SimpleNamespace(
-        global_step=0, log_every_n_steps=50, optimizers=[SimpleNamespace(param_groups=[dict(lr=0.1)])],
+        global_step=0, log_every_n_steps=50,
+        optimizers=[SimpleNamespace(param_groups=[dict(lr=0.1)])],
         datamodule=SimpleNamespace(**data),
     )  # fmt: skip
     monkeypatch.setattr(type(task), "trainer", trainer, raising=False)
