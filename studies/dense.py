@@ -6,21 +6,22 @@ found, so that a study that was stopped goes on. The pictures are rendered first
 needs `apt-get install freedoom`.
 
 What 3 hours on 2 cores allow: 69 cells (7 models × 3 seeds × [labels from two bands, distances from
-one], and 6 controls) of 10,000 pictures seen at 20 to 27 ms, 24 test sets of 75 pictures at 12 ms
-and 8 s of starting are 69 × (260 + 22 + 8) s, the pictures 600 s of 85 ms each: 20,600 s on one
-core, 2.9 hours on two. Distances from "wide" would be 21 cells more.
+one], and 6 controls) of 6,000 pictures seen at 20 to 30 ms, 24 test sets of 75 pictures at 15 ms
+and 8 s of starting are 69 × (190 + 27 + 8) s, the pictures 600 s of 85 ms each: 16,100 s on one
+core, 2.3 hours on two. Distances from "wide" would be 21 cells more.
 """
 
 import argparse
 import json
 import os
 import time
+from dataclasses import fields
 from pathlib import Path
 
 import dense_data
 from dense_cells import Cell, all_cells
 from dense_pictures import predict
-from dense_tables import collect
+from dense_tables import collect, publish
 from dense_trivial import trivial
 from jobs import printing_to, run_all
 
@@ -91,6 +92,15 @@ def summary(row: dict, task: str) -> dict:
     return scores(row) | dict(zones=zones) | (dict(iou=classes) if classes else {})
 
 
+def known_cells(file: Path) -> dict[Cell, dict]:
+    """The cells of a record, which must be of the same configuration."""
+    record = json.loads(file.read_text())
+    if record["config"] != CONFIG.read_text():
+        raise ValueError(f"{file} is of another configuration than {CONFIG}")
+    names = [field.name for field in fields(Cell)]
+    return {Cell(**{name: cell[name] for name in names}): cell for cell in record["cells"]}
+
+
 def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--cell", help="only the cells whose key has this in it")
@@ -102,6 +112,10 @@ def main(arguments: list[str] | None = None) -> None:
         metavar=("TRAIN", "VAL", "TEST"), help="of each lens",
     )  # fmt: skip
     parser.add_argument("--processes", type=int, default=os.cpu_count())
+    parser.add_argument(
+        "--known", type=Path, help="a record, dense.json, whose cells are not run again"
+    )
+    parser.add_argument("--collect", action="store_true", help="runs nothing: what is there")
     parser.add_argument("--out", type=Path, default=Path("out/dense"))
     parser.add_argument("--results", type=Path, default=HERE / "results")
     args, options = parser.parse_known_args(arguments)  # the others are options of `darswin fit`
@@ -109,13 +123,18 @@ def main(arguments: list[str] | None = None) -> None:
     start = time.perf_counter()
     dense_data.make(args.out / "data", args.processes, args.pixels, tuple(args.pictures))
     print(f"pictures after {time.perf_counter() - start:.0f} s")
-    jobs = [(cell, args.out, args.size, options) for cell in cells]
+    known = known_cells(args.known) if args.known else {}
+    if args.collect:
+        cells = [c for c in cells if (args.out / args.size / c.key / "cell.json").exists()]
+    jobs = [(cell, args.out, args.size, options) for cell in cells if cell not in known]
     results = run_all(run_cell, jobs, args.processes, "cell")
+    results += [known[cell] for cell in known if cell not in {job[0] for job in jobs}]
     print(f"{len(results)} cells after {time.perf_counter() - start:.0f} s")
     if args.cell:
         print(json.dumps(results, indent=1))
     else:
-        collect(results, trivial(args.out), args.out, args.results, args.size)
+        record = collect(results, trivial(args.out), CONFIG.read_text(), args.size)
+        publish(record, args.out, args.results)
 
 
 if __name__ == "__main__":

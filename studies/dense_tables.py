@@ -24,24 +24,27 @@ ALL_XI = [xi_set(xi) for xi in SWEEP]
 NOT_RUN = "Not run yet: `make study-dense`."
 
 
-def collect(cells: list[dict], trivial: dict, out: Path, folder: Path, size: str) -> None:
-    """Writes the results of a study, with the machine and versions, and draws its pictures."""
+def collect(cells: list[dict], trivial: dict, config: str, size: str) -> dict:
+    """The record of a study."""
     cells = sorted(
         cells, key=lambda c: (c["task"], c["band"], c["label"], c["shuffled"], c["seed"])
     )
     kept = [{k: v for k, v in cell.items() if k != "given"} for cell in cells]
-    given = cells[0]["given"]["config"] if cells else ""
-    write(
-        folder / "dense.json",
-        machine=machine(), size=size, config=given, trivial=trivial, cells=kept,
-    )  # fmt: skip
-    draw_curves(kept, trivial, folder / "dense.png")
+    return dict(size=size, config=config, trivial=trivial, cells=kept)
+
+
+def publish(record: dict, out: Path, folder: Path) -> None:
+    """Writes a record, with the machine and versions, and draws its pictures.
+
+    Args:
+        out: the folder of the cells, whose predictions are drawn where they are there.
+    """
+    write(folder / "dense.json", machine=machine(), **record)
+    draw_curves(record["cells"], record["trivial"], folder / "dense.png")
     for task in TASKS:
-        runs = {
-            label: out / size / Cell(label, "low", task).key
-            for label in MODELS
-            if (out / size / Cell(label, "low", task).key / "shown.npz").exists()
-        }
+        keys = {label: Cell(label, "low", task).key for label in MODELS}
+        runs = {label: out / record["size"] / key for label, key in keys.items()}
+        runs = {label: run for label, run in runs.items() if (run / "shown.npz").exists()}
         if runs:
             draw(runs, out / "data", task, folder / f"dense_{task}.png")
 

@@ -97,7 +97,8 @@ def test_cells_are_trained_and_tested_once(quick, capsys):
 
 def test_tables_and_pictures(quick):
     cells, blind = list(found(quick).values()), trivial(quick / "out")
-    dense_tables.collect(cells, blind, quick / "out", quick, "nano")
+    record = dense_tables.collect(cells, blind, dense.CONFIG.read_text(), "nano")
+    dense_tables.publish(record, quick / "out", quick)
     for name in ("dense.png", "dense_segmentation.png", "dense_distance.png"):
         assert (quick / name).read_bytes().startswith(b"\x89PNG")
     record = json.loads((quick / "dense.json").read_text())
@@ -110,3 +111,22 @@ def test_tables_and_pictures(quick):
     assert "60° to the rim" in made["dense distance low zones"]
     # Without a record each place says so, by the same names.
     assert dense_tables.tables(None, quick / "none") == dict.fromkeys(made, dense_tables.NOT_RUN)
+
+
+def test_cells_of_a_record_are_not_run_again(quick, tmp_path, monkeypatch):
+    cells, blind = list(found(quick).values()), trivial(quick / "out")
+    record = dense_tables.collect(cells[:3], blind, dense.CONFIG.read_text(), "nano")
+    (tmp_path / "known.json").write_text(json.dumps(record))
+    ran = []
+    monkeypatch.setattr(dense, "run_all", lambda work, jobs, *rest: ran.extend(jobs) or [])
+    where = ["--out", str(quick / "out"), "--results", str(tmp_path)]
+    dense.main([*where, "--known", str(tmp_path / "known.json"), *QUICK])
+    assert len(ran) == 69 - 3
+    assert len(json.loads((tmp_path / "dense.json").read_text())["cells"]) == 3
+    # What is there is collected, and nothing is run.
+    monkeypatch.undo()
+    dense.main([*where, "--collect", *QUICK])
+    assert len(json.loads((tmp_path / "dense.json").read_text())["cells"]) == 4
+    (tmp_path / "known.json").write_text(json.dumps(record | dict(config="max_epochs: 9")))
+    with pytest.raises(ValueError, match="of another configuration"):
+        dense.main([*where, "--known", str(tmp_path / "known.json"), *QUICK])
