@@ -14,6 +14,7 @@ from darswin import create_model, list_models
 ROOT = Path(__file__).parents[2]
 sys.path[:0] = [str(ROOT / "docs"), str(ROOT / "studies")]
 
+import dense_tables  # noqa: E402
 import fill  # noqa: E402
 import resampling  # noqa: E402
 from cells import LEVELS, SWEEP  # noqa: E402
@@ -185,3 +186,58 @@ def test_what_is_said_of_resampling_is_computed():
     assert f"{100 * reached:.0f} % of the samples reach any pixel" in prose(
         "docs/explanation/dense.md"
     )
+
+
+def dense_scores() -> dict[tuple, dict[str, float]]:
+    """The mean over the seeds of each test set's score, by task, band, model and control."""
+    record = json.loads((ROOT / "studies/results/dense.json").read_text())
+    found: dict[tuple, list[dict]] = {}
+    for cell in record["cells"]:
+        key = cell["task"], cell["band"], cell["label"], cell["shuffled"]
+        found.setdefault(key, []).append(cell["sets"])
+    score = dense_tables.SCORE
+    return {
+        key: {n: 100 * statistics.mean(r[n][score[key[0]]] for r in runs) for n in runs[0]}
+        for key, runs in found.items()
+    }
+
+
+def test_what_is_said_of_the_dense_study():
+    scores = dense_scores()
+
+    def over(task, band, label, sets, shuffled=False):
+        return statistics.mean(scores[task, band, label, shuffled][name] for name in sets)
+
+    def all_xi(task, band):
+        labels = dense_tables.MODELS
+        return {label: over(task, band, label, dense_tables.ALL_XI) for label in labels}
+
+    wide, low = all_xi("segmentation", "wide"), all_xi("segmentation", "low")
+    far = all_xi("distance", "low")
+    a, adapter, raw, undis = (
+        "DarSwin-Unet A", "LensAdapter(Swin-Unet)", "Swin-Unet", "Swin-Unet (undis)",
+    )  # fmt: skip
+    best_other = max(value for label, value in far.items() if "DarSwin" not in label)
+    best = max(low, key=low.__getitem__)
+    for text in (
+        f"{wide[a]:.0f} % over all ξ, `LensAdapter` {wide[adapter]:.0f}, Swin-Unet on the picture "
+        f"as it is {wide[raw]:.0f}, and on the undistorted one {wide[undis]:.0f}",
+        f"all seven lie between {min(low.values()):.0f} and {max(low.values()):.0f} %",
+        f"{best} leads",
+        f"{far[a]:.0f} % where the best of the others reaches {best_other:.0f}",
+    ):
+        assert text in prose("docs/study_dense.md"), text
+    assert max(wide, key=wide.__getitem__) == a
+    told = [
+        (over(task, band, label, [f"xi-{xi}" for xi in ("0", "0.5", "1")]),
+         over(task, band, label, [f"wrong-{xi}" for xi in ("0", "0.5", "1")]))
+        for task, band in dense_tables.STUDIED
+        for label in ("DarSwin-Unet A", "DarSwin-Unet RA")
+    ]  # fmt: skip
+    costs = max(true - wrong for true, wrong in told)
+    assert f"costs the polar models at most {costs:.1f} points" in prose("docs/study_dense.md")
+    learned = max(
+        abs(over(task, band, a, [f"band-{band}"]) - over(task, band, a, [f"band-{band}"], True))
+        for task, band in dense_tables.STUDIED
+    )
+    assert f"changes its score by at most {learned:.1f} points" in prose("docs/study_dense.md")
