@@ -15,14 +15,13 @@ from darswin.deploy.quantize import quantize_model
 from darswin.deploy.stages import Product, packed
 from darswin.layers.embed import PolarPatchEmbed
 from darswin.layers.linear import Linear
-from darswin.layers.quantized import QuantizedLinear
+from darswin.layers.quantized import QuantizedLinear, quantize
 from darswin.lens import Lens, Spherical
 from darswin.models import create_model
 from darswin.models.base import Model
 from darswin.models.dense import DenseModel
 from darswin.models.registry import model_class
 from darswin.ops import use_reference
-from darswin.ops._quantized import quantize
 
 Run = Callable[[], Tensor]
 CLASSES, PIXEL_CLASSES = 200, 10  # of images, and of pixels

@@ -12,10 +12,15 @@ from torch import Tensor, nn
 
 from darswin.layers.attention import WindowAttention
 from darswin.layers.block import Block, PatchMerging
-from darswin.layers.quantized import quantized_layers, with_quantized_layers
+from darswin.layers.quantized import (
+    Quantization,
+    dequantize,
+    quantize,
+    quantized_layers,
+    with_quantized_layers,
+)
 from darswin.lens import Lens
 from darswin.models.base import Model
-from darswin.ops._quantized import Quantization, dequantize, quantize
 
 Net = TypeVar("Net", bound=Model)
 Batches = Sequence[tuple[Tensor, Lens | None]]

@@ -12,9 +12,8 @@ from darswin.layers.block import Block, Mlp, PatchMerging
 from darswin.layers.linear import Linear
 from darswin.layers.packed import PackedLinear, PackedQuantizedLinear
 from darswin.layers.position_bias import RelativeBias, RelativeTable, joined_coefficients
-from darswin.layers.quantized import QuantizedLinear
+from darswin.layers.quantized import Quantization, QuantizedLinear
 from darswin.models.stages import Stage
-from darswin.ops._quantized import Quantization
 
 _OPS = torch.ops.darswin
 _ADD_NORM = _OPS._add_norm_.default
@@ -53,6 +52,7 @@ class InDtype(nn.Module):
         self.sample = getattr(module, "sample", None)
 
     def forward(self, *arguments) -> Tensor:
+        """What the module gives, in `dtype`."""
         with torch.autocast("cpu", torch.bfloat16, enabled=self.dtype == torch.bfloat16):
             return self.module(*arguments).to(self.dtype)
 

@@ -8,8 +8,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from darswin.layers.onednn import missing
-from darswin.layers.quantized import QuantizedLinear
-from darswin.ops._quantized import Quantization
+from darswin.layers.quantized import Quantization, QuantizedLinear
 
 
 class PackedLinear(nn.Module):

@@ -1,15 +1,38 @@
 """A linear layer with weights of 8 bits, on activations of 8 bits."""
 
 from collections.abc import Mapping
+from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
 from darswin.layers.linear import Linear
-from darswin.ops._quantized import Quantization, dequantize, quantize
 
 _LARGEST = 127  # of a weight: -128 is left out, so that weights are symmetric
+
+
+class Quantization(NamedTuple):
+    """How numbers become 8 bits: q = round(x / scale) + zero_point, kept in 0 … 255.
+
+    Attributes: scale: of one step, positive. zero_point: what 0 becomes, in 0 … 255.
+    """
+
+    scale: float
+    zero_point: int
+
+
+def quantize(x: Tensor, quantization: Quantization) -> Tensor:
+    """float32 → uint8 of the same shape; ties go to even, and NaN becomes what 0 does."""
+    scale, zero_point = quantization
+    steps = torch.round(x * (1 / scale)).nan_to_num(0.0)
+    return (steps + zero_point).clamp(0, 255).to(torch.uint8)
+
+
+def dequantize(q: Tensor, quantization: Quantization) -> Tensor:
+    """uint8 → the float32 that stands for it."""
+    scale, zero_point = quantization
+    return (q.float() - zero_point) * scale
 
 
 class QuantizedLinear(nn.Module):

@@ -12,10 +12,9 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
 
-from darswin.layers.quantized import with_quantized_layers
+from darswin.layers.quantized import Quantization, with_quantized_layers
 from darswin.models.pretrained import list_pretrained, pretrained_file
 from darswin.models.registry import create_model
-from darswin.ops._quantized import Quantization
 from darswin.utils.files import replace_file
 
 Task = Literal["classification", "segmentation", "distance"]

@@ -11,10 +11,16 @@ from darswin.deploy import quantize as module
 from darswin.deploy.quantize import quantize_model, sensitivities
 from darswin.layers import onednn, packed
 from darswin.layers.linear import Linear
-from darswin.layers.quantized import QuantizedLinear, quantized_layers, with_quantized_layers
+from darswin.layers.quantized import (
+    Quantization,
+    QuantizedLinear,
+    dequantize,
+    quantize,
+    quantized_layers,
+    with_quantized_layers,
+)
 from darswin.lens import Spherical
 from darswin.models import ModelCard, load_model, save_model
-from darswin.ops._quantized import Quantization, dequantize, quantize
 
 HAS_INT8 = onednn.missing(torch.int8) is None
 needs_int8 = pytest.mark.skipif(not HAS_INT8, reason="this CPU has no products of 8 bits")

@@ -167,7 +167,8 @@ def write_rooms(arguments: list[str], monkeypatch) -> None:
 
 
 def run_program(arguments: list[str], monkeypatch) -> None:
-    known = {"studies/study.py": check_study, "examples/rooms.py": write_rooms}
+    studies = dict.fromkeys(("studies/study.py", "studies/dense.py"), check_study)
+    known = studies | {"examples/rooms.py": write_rooms}
     known[arguments[0]](arguments, monkeypatch)
 
 
