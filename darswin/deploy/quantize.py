@@ -64,8 +64,7 @@ def quantize_model(
     result = found.quantized(chosen)
     error = found.error(result)
     if error > tolerance:
-        alone = {part: found.error(found.quantized([part])) for part in chosen}
-        chosen.sort(key=alone.__getitem__)
+        chosen.sort(key=found.alone().__getitem__)
     while error > tolerance and len(chosen) > 1:
         chosen.pop()
         result = found.quantized(chosen)
@@ -87,8 +86,7 @@ def sensitivities(model: Model, calibration: Iterable[Sequence]) -> dict[str, fl
         for each part the mean square of what changes over the variance of the result, the largest
         first.
     """
-    found = _Calibration(model, calibration, ())
-    errors = {part: found.error(found.quantized([part])) for part in found.parts}
+    errors = _Calibration(model, calibration, ()).alone()
     return dict(sorted(errors.items(), key=lambda item: -item[1]))
 
 
@@ -119,6 +117,10 @@ class _Calibration(Generic[Net]):
         for expected, found in zip(self._expected, _results(model, self.batches), strict=True):
             change.add(expected, found)
         return change.share()
+
+    def alone(self) -> dict[str, float]:
+        """The error of each part, when it alone has 8 bits."""
+        return {part: self.error(self.quantized([part])) for part in self.parts}
 
 
 class Change:

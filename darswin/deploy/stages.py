@@ -26,11 +26,10 @@ CACHED_BYTES = 16 * 2**20
 Product = PackedLinear | PackedQuantizedLinear
 
 
-def packed(layer: nn.Module, dtype: torch.dtype) -> Product:
+def packed(layer: nn.Linear | QuantizedLinear, dtype: torch.dtype) -> Product:
     """A linear layer, or a quantized one, as oneDNN's product."""
     if isinstance(layer, QuantizedLinear):
         return PackedQuantizedLinear(layer)
-    assert isinstance(layer, nn.Linear)
     return PackedLinear(layer, dtype)
 
 
@@ -188,16 +187,15 @@ class _Mlp:
     """Linear, GELU, Linear: both products are quantized, or none."""
 
     def __init__(self, mlp: Mlp, dtype: torch.dtype):
-        if isinstance(mlp.fc1, QuantizedLinear) != isinstance(mlp.fc2, QuantizedLinear):
-            raise ValueError("both products of an MLP must be quantized, or none")
         fc1, self.fc2 = packed(mlp.fc1, dtype), packed(mlp.fc2, dtype)
         self.takes = _taken(fc1)
         self.fc1_gelu: Callable[[Tensor], Tensor]
-        if isinstance(fc1, PackedQuantizedLinear):
-            assert isinstance(self.fc2, PackedQuantizedLinear)
+        if isinstance(fc1, PackedLinear) and isinstance(self.fc2, PackedLinear):
+            self.fc1_gelu = fc1.gelu
+        elif isinstance(fc1, PackedQuantizedLinear) and isinstance(self.fc2, PackedQuantizedLinear):
             self.fc1_gelu = partial(fc1.quantized_gelu, to=self.fc2.activation)
         else:
-            self.fc1_gelu = fc1.gelu
+            raise ValueError("both products of an MLP must be quantized, or none")
 
     def __call__(self, x: Tensor) -> Tensor:
         return self.fc2(self.fc1_gelu(x))

@@ -102,7 +102,11 @@ class QuantizedLinear(nn.Module):
             )
         x = dequantize(quantize(x.float(), self.activation), self.activation)
         bias = None if self.bias is None else self.bias.float()
-        return F.linear(x, self.weight.float() * self.weight_scale.float()[:, None], bias)
+        return F.linear(x, self._dequantized(), bias)
+
+    def _dequantized(self) -> Tensor:
+        """The weights that stand for those of 8 bits, (D', D), float32."""
+        return self.weight.float() * self.weight_scale.float()[:, None]
 
     def _for_graphs(self, x: Tensor) -> Tensor:
         """The same by torch's operators for graphs, which ONNX has by the same names."""
@@ -117,7 +121,7 @@ class QuantizedLinear(nn.Module):
     def to_linear(self) -> Linear:
         """A linear layer with the same weights, in float32; activations stay as they are."""
         linear = Linear(self.in_features, self.out_features, bias=self.bias is not None)
-        linear.weight = nn.Parameter(self.weight.float() * self.weight_scale[:, None])
+        linear.weight = nn.Parameter(self._dequantized())
         if self.bias is not None:
             linear.bias = nn.Parameter(self.bias.clone())
         return linear
