@@ -34,10 +34,10 @@ def sampling_case(size: int, batch: int):
 
 
 def to_tokens(planes: Tensor) -> Tensor:
-    """(B, 3, 160, 640) → (B, 16, 64, 300), as the embedding wants them."""
-    batch = planes.shape[0]
-    patches = planes.reshape(batch, 3, 16, 10, 64, 10).permute(0, 2, 4, 3, 5, 1)
-    return patches.reshape(batch, 16, 64, 300)
+    """(B, C, 160, 640) → (B, 16, 64, 100·C), as the embedding wants them."""
+    batch, channels = planes.shape[:2]
+    patches = planes.reshape(batch, channels, 16, 10, 64, 10).permute(0, 2, 4, 3, 5, 1)
+    return patches.reshape(batch, 16, 64, 100 * channels)
 
 
 def as_tokens(result: Tensor) -> Tensor:
@@ -107,10 +107,34 @@ def sampling(size: int, batch: int, seconds: float) -> list[Timing]:
     }
     raw = torch.randint(256, images.shape, dtype=torch.uint8)
     timings += compare(case("forward, uint8"), normalized, [raw], seconds, tolerance=tolerance)
+    if not small:
+        timings += large(case, images, ours, tokens, remap, seconds)
     targets = {peer: 4.5, peer_tokens: 7.0} if small else {peer_tokens: 2.5}
     return timings + compare(
         case("forward+backward"), runs, [images], seconds,
         targets=targets, tolerance=tolerance, view=as_tokens,
+    )  # fmt: skip
+
+
+def large(case, images: Tensor, ours, tokens, remap, seconds: float) -> list[Timing]:
+    """Large images with a pixel's channels together, and gray ones; peers in their best layout."""
+    together = images.contiguous(memory_format=torch.channels_last)
+    peer = "F.grid_sample + permute"
+    step = forward(ours, [together])
+    runs = {
+        OURS: step,
+        f"{peer}, planes": forward(tokens, [images]),
+        peer: forward(tokens, [together]),
+    }
+    check(case("forward, channels_last"), runs, 1e-3)
+    targets = {f"{peer}, planes": 2.5, peer: 2.5, "cv2.remap": 1.3}
+    timings = measure(
+        case("forward, channels_last"), runs | {"cv2.remap": remap}, seconds, targets=targets
+    )
+    gray = images[:, :1].contiguous()
+    return timings + compare(
+        case("forward, gray"), {OURS: ours, peer: tokens}, [gray], seconds,
+        targets={peer: 1.5}, tolerance=1e-3,
     )  # fmt: skip
 
 

@@ -118,31 +118,73 @@ struct PlacedPoints {
   }
 };
 
-constexpr int64_t kAhead = 40;  // how many points ahead a far image's pixels are prefetched
+// Points of a far image that are visited in turn, by their places in a block: place, place + step
+// and so on.
+struct Line {
+  bool flat;                   // along the azimuth, else along the radius
+  int64_t row, token, sample;  // of the first point: its radius in the block, its place in a token
+  int64_t place, step, count;
+};
 
-// Writes the order in which to visit a block of a far image: points j to j + count of `rows` radii,
-// whose places are `columns` apart. Returns their number. The order goes token by token and, inside
-// a token, along the rows of the image: above and below the center that is along the azimuth, to
-// the left and right of it along the radius.
+// The lines of a block of a far image: `rows` radii, and of each the points j to j + columns. They
+// go token by token, `token_width` points of each radius, and inside a token along the azimuth. An
+// image that is read in several planes fills a set of the cache with few points; there they go
+// along the rows of the image, whose lines of memory the point before has touched: to the left and
+// right of the center that is along the radius.
 template <typename T>
-int64_t far_order(const PolarSampleArgs<T>& a, int64_t j, int64_t count, int64_t rows,
-                  int64_t columns, uint16_t* order) {
-  int64_t visited = 0;
-  for (int64_t k = 0; k < count; k += a.samples_a) {
-    const int64_t end = k + a.samples_a < count ? k + a.samples_a : count;
-    const double sin = a.sines[j + k], cos = a.cosines[j + k];
-    if (sin * sin > cos * cos) {
-      for (int64_t n = 0; n < rows; ++n) {
-        for (int64_t s = k; s < end; ++s) order[visited++] = static_cast<uint16_t>(n * columns + s);
-      }
-    } else {
-      for (int64_t s = k; s < end; ++s) {
-        for (int64_t n = 0; n < rows; ++n)
-          order[visited++] = static_cast<uint16_t>(n * columns + s);
-      }
+class Lines {
+ public:
+  Lines(const PolarSampleArgs<T>& a, int64_t j, int64_t rows, int64_t columns, int64_t token_width,
+        bool planes)
+      : a(a),
+        j(j),
+        rows(rows),
+        columns(columns),
+        width(smaller(token_width, columns)),
+        planes(planes && rows > 1) {}
+
+  bool any() const { return rows > 0 && column < columns; }
+
+  Line next() {
+    if (index == 0) {
+      const double sin = a.sines[j + column], cos = a.cosines[j + column];
+      flat = !planes || sin * sin > cos * cos;
     }
+    const int64_t at = index++, from = column, in = token;
+    if (index == (flat ? rows : width)) {
+      index = 0;
+      column += width;
+      ++token;
+    }
+    if (flat) return {true, at, in, 0, at * columns + from, 1, width};
+    return {false, 0, in, at, from + at, columns, rows};
   }
-  return visited;
+
+ private:
+  const PolarSampleArgs<T>& a;
+  const int64_t j, rows, columns, width;
+  const bool planes;
+  // The token at hand, its first column, which of its lines comes next, and whether these go along
+  // the azimuth.
+  int64_t token = 0, column = 0, index = 0;
+  bool flat = true;
+};
+
+// Calls visit(line) for the lines of a block, and fetch(line) some points before.
+template <typename T, typename Fetch, typename Visit>
+void visit_lines(const Lines<T>& all, Fetch fetch, Visit visit) {
+  constexpr int64_t kAhead = 80;  // points
+  Lines<T> lines = all, coming = all;
+  for (int64_t lead = 0; lines.any();) {
+    while (coming.any() && lead < kAhead) {
+      const Line line = coming.next();
+      fetch(line);
+      lead += line.count;
+    }
+    const Line line = lines.next();
+    visit(line);
+    lead -= line.count;
+  }
 }
 
 // Calls visit<E>() with the type of the pixels.

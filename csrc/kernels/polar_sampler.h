@@ -1,6 +1,7 @@
 // Forward: samples one token after another, from the packed image or, if it is far, where it lies.
 #pragma once
 
+#include "polar_far.h"
 #include "polar_interpolate.h"
 
 namespace darswin {
@@ -27,18 +28,14 @@ class Sampler {
         state(*static_cast<State*>(scratch)),
         points(state.points),
         image(reinterpret_cast<T*>(static_cast<char*>(scratch) + round_up(sizeof(State), 64))) {
-    if (a.packed && !in_line) return;
+    if (!in_line) return;
     int64_t k = 0;
     for (int64_t row = 0, columns = block_columns(); k + columns <= kBlock; ++row) {
       for (int64_t sector = 0; sector * a.samples_a < columns; ++sector) {
         for (int64_t s = 0; s < smaller(columns, a.samples_a); ++s, ++k) {
           const int64_t to = row * row_stride + sector * sector_stride + s * a.channels;
-          if (a.packed) {
-            state.near_to[k] = static_cast<int32_t>(to);
-            state.joined[k] = s + 4 <= a.samples_a;
-          } else {
-            state.far_to[k] = to;
-          }
+          state.target[k] = static_cast<int32_t>(to);
+          state.joined[k] = s + 4 <= a.samples_a;
         }
       }
     }
@@ -67,12 +64,8 @@ class Sampler {
  private:
   struct State {
     PlacedPoints<T> points;
-    union {  // where the points of a block go
-      int32_t near_to[kBlock];
-      int64_t far_to[kBlock];
-    };
-    bool joined[kBlock];              // whether the next three points follow there
-    uint16_t order[kBlock + kAhead];  // in which points of a far image are visited
+    int32_t target[kBlock];  // where the points of a block go
+    bool joined[kBlock];     // whether the next three points follow there
   };
 
   // No point of a block is stored further than this from the block's first.
@@ -96,16 +89,12 @@ class Sampler {
   // Points j to j + count of `rows` radii of a ring, from its radius `row` on.
   void block(int64_t b, int64_t ring, int64_t j, int64_t count, int64_t row, int64_t rows, T* to) {
     const int64_t first = ring * a.samples_r + row;
+    T* out = to + j / a.samples_a * sector_stride + j % a.samples_a * a.channels + row * row_stride;
     if (!a.packed) {
-      const int64_t columns = block_columns();
       for (int64_t n = 0; n < rows; ++n) {
-        points.find_far(a, a.image_stride + 2, b, first + n, j, count, n * columns);
+        points.find_far(a, a.image_stride + 2, b, first + n, j, count, n * count);
       }
-      const int64_t visits = far_order(a, j, count, rows, columns, state.order);
-      for (int64_t v = visits; v < visits + kAhead; ++v) state.order[v] = state.order[visits - 1];
-      T* out =
-          to + j / a.samples_a * sector_stride + j % a.samples_a * a.channels + row * row_stride;
-      with_pixel_type<T>(a.pixel, [&]<typename E>() { far_block<E>(b, visits, out); });
+      with_pixel_type<T>(a.pixel, [&]<typename E>() { far_lines<E>(b, j, rows, count, out); });
       return;
     }
     for (int64_t n = 0; n < rows; ++n) {
@@ -118,11 +107,9 @@ class Sampler {
         for (int64_t e = n * bytes; e < (n + 1) * bytes; e += 64) __builtin_prefetch(next + e, 1);
       }
     }
-    // near_to holds the places of a whole block. They hold for a smaller block only if its points
+    // target holds the places of a whole block. They hold for a smaller block only if its points
     // are of one radius.
     if (in_line && (rows == 1 || count == smaller(block_columns(), a.num_azimuths))) {
-      T* out =
-          to + j / a.samples_a * sector_stride + j % a.samples_a * a.channels + row * row_stride;
       lines(rows, count, out, row + rows == a.samples_r, j + count == a.num_azimuths);
       return;
     }
@@ -150,7 +137,7 @@ class Sampler {
     const auto& near = points.near;
     bool finite = true;
     const auto sample = [&](int64_t begin, int64_t end) {
-      finite &= sample_line<kWeights>(image, packed.row, near, begin, end, state.near_to,
+      finite &= sample_line<kWeights>(image, packed.row, near, begin, end, state.target,
                                       state.joined, channels, to);
     };
     if (!last_row) {
@@ -175,7 +162,7 @@ class Sampler {
       Piece<T> sum{};
       interpolate<kWeights>(pixel, pixel + packed.row, near.right[k], near.lower[k], v, &sum);
       finite &= all_finite(sum);
-      for (int64_t c = 0; c < channels; ++c) to[state.near_to[k] + c] = v[c];
+      for (int64_t c = 0; c < channels; ++c) to[state.target[k] + c] = v[c];
     }
     for (int64_t t = 1; t < overrun; ++t) {
       store(first + t * sector_stride, load<Vector<T, 4>>(kept[t]));
@@ -201,77 +188,23 @@ class Sampler {
     }
   }
 
-  // Samples the points of a block in the far image. Pixels of later points are prefetched into the
-  // second-level cache: in the first, rows of an image whose width is a power of two share few
-  // sets.
+  // Samples a block in the far image. What lies behind a line of samples may be overwritten where
+  // the token has more of them, which come later: all but the lines that end a row of it.
   template <typename E>
-  [[gnu::noinline]] void far_block(int64_t b, int64_t visits, T* to) const {
-    const E* pixels = static_cast<const E*>(a.image) + b * a.image_stride[0];
-    const int64_t *offset = points.far.offset, below = a.image_stride[2];
-    const int64_t channels = a.channels, channel = a.image_stride[1];
-    const bool planes = kSame<E, float> && a.image_stride[3] == 1 && channels == 3;
-    for (int64_t v = 0; v < visits; ++v) {
-      const int64_t next = offset[state.order[v + kAhead]];
-      for (int64_t c = 0; c < channels && next >= 0; ++c) {
-        const E* pixel = pixels + next + c * channel;
-        __builtin_prefetch(pixel, 0, 2);
-        __builtin_prefetch(pixel + below, 0, 2);
+  [[gnu::noinline]] void far_lines(int64_t b, int64_t j, int64_t rows, int64_t count, T* to) const {
+    const FarImage<T, E> far(a, b, points.far);
+    const bool joined = rows == 1 && sector_stride == a.samples_a * a.channels;
+    const Lines<T> lines(a, j, rows, count, joined ? count : a.samples_a, far.planes() > 1);
+    const auto fetch = [&](const Line& line) { far.fetch(line); };
+    const int64_t width = smaller(a.samples_a, count);
+    visit_lines(lines, fetch, [&](const Line& line) {
+      T* out = to + line.token * sector_stride + line.sample * a.channels + line.row * row_stride;
+      if (line.flat) {
+        far.sample(line, {out, a.channels, false});
+      } else {
+        far.sample(line, {out, row_stride, line.sample + 1 < width});
       }
-      const int64_t place = state.order[v];
-      T* out = to + state.far_to[place];
-      if (offset[place] < 0) {
-        border_point<E>(b, place, out);
-        continue;
-      }
-      if constexpr (kSame<E, float>) {
-        if (planes) {
-          planes_point(pixels + offset[place], channel, below, points.far.right[place],
-                       points.far.lower[place], out);
-          continue;
-        }
-      }
-      far_point(pixels + offset[place], place, out);
-    }
-  }
-
-  // Three planes of float: one load takes a pixel and its right neighbour.
-  static void planes_point(const float* pixel, int64_t plane, int64_t below, float right,
-                           float lower, float* to) {
-    using V = Vector<float, 4>;
-    const float* third = pixel + 2 * plane;
-    const V top = two_pairs(pixel, pixel + plane);
-    const V bottom = two_pairs(pixel + below, pixel + plane + below);
-    const V top3 = two_pairs(third, third), bottom3 = two_pairs(third + below, third + below);
-    const V ab = between(top, bottom, 1 - lower, lower);
-    const V c = between(top3, bottom3, 1 - lower, lower);
-    const V l = __builtin_shufflevector(ab, c, 0, 2, 4, 6);
-    const V r = __builtin_shufflevector(ab, c, 1, 3, 5, 7);
-    const V v = between(l, r, 1 - right, right);
-    to[0] = v[0];
-    to[1] = v[1];
-    to[2] = v[2];
-  }
-
-  template <typename E>
-  void far_point(const E* pixel, int64_t place, T* to) const {
-    const int64_t below = a.image_stride[2], next = a.image_stride[3];
-    const T right = points.far.right[place], lower = points.far.lower[place];
-    for (int64_t c = 0; c < a.channels; ++c, pixel += a.image_stride[1]) {
-      const T l = between(number<T>(pixel[0]), number<T>(pixel[below]), 1 - lower, lower);
-      const T r = between(number<T>(pixel[next]), number<T>(pixel[below + next]), 1 - lower, lower);
-      to[c] = normalized<E>(a, between(l, r, 1 - right, right), c);
-    }
-  }
-
-  template <typename E>
-  void border_point(int64_t b, int64_t place, T* to) const {
-    const Corners<T, E> corners(a, b, points.far.column[place], points.far.row[place]);
-    const T right = points.far.right[place], lower = points.far.lower[place];
-    for (int64_t c = 0; c < a.channels; ++c) {
-      const Vector<T, 4> p = corners.read(c);
-      const T l = between(p[0], p[2], 1 - lower, lower), r = between(p[1], p[3], 1 - lower, lower);
-      to[c] = between(l, r, 1 - right, right);
-    }
+    });
   }
 
   const PolarSampleArgs<T>& a;

@@ -55,9 +55,9 @@ class Scatter {
       bool any = false;
       for (int64_t n = 0; n < a.samples_r; ++n) any |= touches(first + n);
       if (!any) return;
-      const int64_t line = row_bytes(a) / sizeof(T);
-      for (int64_t n = 0; n < a.samples_r; ++n) read(n, grads + n * line);
-      add_in_place(first, line);
+      const int64_t line_size = row_bytes(a) / sizeof(T);
+      for (int64_t n = 0; n < a.samples_r; ++n) read(n, grads + n * line_size);
+      add_in_place(first, line_size);
       return;
     }
     for (int64_t n = 0; n < a.samples_r; ++n) {
@@ -216,8 +216,8 @@ class Scatter {
     return offset >= first_kept() * layout.row && offset < end_kept() * layout.row;
   }
 
-  // Blocks of points as in Sampler::far_block.
-  void add_in_place(int64_t first, int64_t line) {
+  // Blocks of points as in Sampler.
+  void add_in_place(int64_t first, int64_t line_size) {
     const int64_t strides[2] = {a.width, 1};
     const int64_t token = a.samples_r * a.samples_a;
     const int64_t columns =
@@ -228,28 +228,33 @@ class Scatter {
       for (int64_t row = 0; row < a.samples_r; row += rows) {
         const int64_t end = smaller(row + rows, a.samples_r);
         for (int64_t n = row; n < end; ++n) {
-          points.find_far(a, strides, image, first + n, j, count, (n - row) * columns);
+          points.find_far(a, strides, image, first + n, j, count, (n - row) * count);
         }
-        uint16_t order[kBlock + kAhead];
-        const int64_t visits = far_order(a, j, count, end - row, columns, order);
-        for (int64_t v = 0; v < visits; ++v) {
-          if (v + kAhead < visits) fetch(order[v + kAhead]);
-          const int64_t n = order[v] / columns, k = order[v] % columns;
-          add_point(order[v], grads + (row + n) * line + (j + k) * a.channels);
-        }
+        const auto add = [&](const Line& line) {
+          const int64_t step = line.flat ? a.channels : line_size;
+          const int64_t column = j + line.token * a.samples_a + line.sample;
+          const T* from = grads + (row + line.row) * line_size + column * a.channels;
+          for (int64_t k = 0; k < line.count; ++k) {
+            add_point(line.place + k * line.step, from + k * step);
+          }
+        };
+        visit_lines(
+            Lines<T>(a, j, end - row, count, a.samples_a, true),
+            [&](const Line& line) { fetch(line); }, add);
       }
     }
   }
 
-  // Prefetches the pixels of a point to come.
-  void fetch(int64_t place) const {
-    if (points.far.offset[place] < 0) return;
+  // Fetches the pixels of a line to come.
+  void fetch(const Line& line) const {
     const int64_t plane = a.height * a.width;
-    const T* pixel =
-        static_cast<T*>(a.grad_image) + image * a.channels * plane + points.far.offset[place];
-    for (int64_t c = 0; c < a.channels; ++c, pixel += plane) {
-      __builtin_prefetch(pixel, 1, 2);
-      __builtin_prefetch(pixel + a.width, 1, 2);
+    const T* pixels = static_cast<T*>(a.grad_image) + image * a.channels * plane;
+    for (int64_t k = 0; k < line.count; ++k) {
+      const int64_t offset = points.far.offset[line.place + k * line.step];
+      for (int64_t c = 0; c < a.channels && offset >= 0; ++c) {
+        darswin::fetch(pixels + c * plane + offset);
+        darswin::fetch(pixels + c * plane + offset + a.width);
+      }
     }
   }
 

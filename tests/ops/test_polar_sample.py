@@ -782,6 +782,32 @@ def test_the_patch_does_not_matter_to_an_image(size, rows, columns):
     torch.testing.assert_close(sampled[0], expected, rtol=0, atol=2e-6 * (10 + size))
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16, torch.uint8])
+@pytest.mark.parametrize("samples", [(4, 5), (3, 2), (1, 1), (6, 40)])
+@pytest.mark.parametrize("channels", [1, 2, 3, 4, 5])
+def test_the_layout_of_a_far_image_does_not_matter(channels, samples, dtype):
+    """Planes, pixels whose channels lie together, both with gaps, and one value after another."""
+    size = 150  # far: more than four pixels for each of the 24 x 120 points
+    image = (torch.rand(2, channels, size, size) * 255).to(dtype)
+    radii = torch.stack((torch.linspace(0, 75, 24), torch.linspace(10, 90, 24)))
+    arguments = (radii, torch.linspace(0, 6.2, 120), torch.full((1, 2), 74.5))
+    options = {} if dtype != torch.uint8 else {"mean": [0.5] * channels, "std": [0.25] * channels}
+    layouts = {"together": image.permute(0, 2, 3, 1).contiguous().permute(0, 3, 1, 2)}
+    layouts["padded"] = F.pad(layouts["together"].permute(0, 2, 3, 1), (0, 3))[..., :channels]
+    layouts["padded"] = layouts["padded"].permute(0, 3, 1, 2)
+    layouts["wide"] = torch.stack((image, image), -1)[..., 0]
+    layouts["turned"] = image.transpose(2, 3).contiguous().transpose(2, 3)
+    for output in ("tokens", "image"):
+        planes = polar_sample(image, *arguments, samples=samples, layout=output, **options)
+        with use_reference():
+            expected = polar_sample(image, *arguments, samples=samples, layout=output, **options)
+        torch.testing.assert_close(planes, expected, rtol=1e-2, atol=0.05)
+        for name, other in layouts.items():
+            assert torch.equal(other, image)
+            sampled = polar_sample(other, *arguments, samples=samples, layout=output, **options)
+            assert torch.equal(sampled, planes), name
+
+
 @pytest.mark.unsanitized
 def test_an_image_of_patches_of_one_point_is_as_fast_as_one_of_whole_rows(threads):
     threads(1)

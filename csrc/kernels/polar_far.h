@@ -1,0 +1,272 @@
+// Bilinear interpolation in a far image, where it lies: four points at a time where the channels
+// are planes, a point with all its channels at a time where a pixel's channels lie together, and
+// value by value in other layouts and for points that are not inside.
+#pragma once
+
+#include "polar_image.h"
+
+namespace darswin {
+namespace {
+
+// `N` values that lie together, as floats.
+template <int N>
+inline Vector<float, N> floats(const float* from) {
+  return load<Vector<float, N>>(from);
+}
+template <int N>
+inline Vector<float, N> floats(const bfloat16* from) {
+  const auto bits = load_bits<Vector<uint16_t, N>>(from);
+  return (Vector<float, N>)(__builtin_convertvector(bits, Vector<uint32_t, N>) << 16);
+}
+template <int N>
+inline Vector<float, N> floats(const uint8_t* from) {
+  return __builtin_convertvector(load_bits<Vector<uint8_t, N>>(from), Vector<float, N>);
+}
+
+// Two of them from here and two from there.
+template <typename E>
+inline Vector<float, 4> two_pairs(const E* here, const E* there) {
+  if constexpr (kSame<E, float>) {
+    using Pairs = Vector<double, 2>;
+    double first, second;
+    __builtin_memcpy(&first, here, 8);
+    __builtin_memcpy(&second, there, 8);
+    return (Vector<float, 4>)Pairs{first, second};
+  } else {
+    E both[4];
+    __builtin_memcpy(both, here, 2 * sizeof(E));
+    __builtin_memcpy(both + 2, there, 2 * sizeof(E));
+    return floats<4>(both);
+  }
+}
+
+// Where the samples of a line go: sample k to to[k * step]. A store of four values may reach beyond
+// a sample that has fewer, where the next sample of the line follows or, if `spare`, anywhere.
+template <typename T>
+struct FarOutput {
+  T* to;
+  int64_t step;
+  bool spare;
+};
+
+// An image whose pixels are of type E, read at the places of a block of points.
+template <typename T, typename E>
+class FarImage {
+ public:
+  FarImage(const PolarSampleArgs<T>& args, int64_t b, const FarPlaces<T>& places)
+      : a(args),
+        b(b),
+        places(places),
+        pixels(static_cast<const E*>(args.image) + b * args.image_stride[0]),
+        channels(args.channels),
+        channel(args.image_stride[1]),
+        below(args.image_stride[2]),
+        next(args.image_stride[3]),
+        layout(layout_of(args)) {}
+
+  // How many reads, far apart, the channels of a pixel take.
+  int64_t planes() const { return layout == kTogether ? 1 : channels; }
+
+  // Fetches the pixels of a line to come.
+  void fetch(const Line& line) const {
+    const int64_t reads = planes();
+    for (int64_t k = 0; k < line.count; ++k) {
+      const int64_t offset = places.offset[line.place + k * line.step];
+      if (offset < 0) continue;
+      for (int64_t c = 0; c < reads; ++c) {
+        darswin::fetch(pixels + offset + c * channel);
+        darswin::fetch(pixels + offset + c * channel + below);
+      }
+    }
+  }
+
+  void sample(const Line& line, const FarOutput<T>& out) const {
+    if constexpr (kSame<T, float>) {
+      switch (layout) {
+        case kGray:
+          return fours<1>(line, out);
+        case kThreePlanes:
+          return fours<3>(line, out);
+        case kPlanes:
+          return fours<0>(line, out);
+        case kTogether:
+          if (channels == 2) return together<2>(line, out);
+          if (channels == 3) return together<3>(line, out);
+          return together<4>(line, out);
+        case kAny:
+          break;
+      }
+    }
+    points(line, 0, line.count, out);
+  }
+
+ private:
+  enum Layout { kGray, kThreePlanes, kPlanes, kTogether, kAny };
+  using V = Vector<float, 4>;
+
+  static Layout layout_of(const PolarSampleArgs<T>& a) {
+    if (!kSame<T, float>) return kAny;
+    if (a.image_stride[3] == 1) {
+      return a.channels == 1 ? kGray : a.channels == 3 ? kThreePlanes : kPlanes;
+    }
+    const bool together = a.image_stride[1] == 1 && a.image_stride[3] >= a.channels;
+    return together && a.channels > 1 && a.channels <= 4 ? kTogether : kAny;
+  }
+
+  template <int kChannels>
+  void fours(const Line& line, const FarOutput<T>& out) const {
+    if (line.flat) {
+      fours<kChannels, true>(line, out);
+    } else {
+      fours<kChannels, false>(line, out);
+    }
+  }
+
+  // The last four points may have been sampled in part by those before. `kRow` says that the points
+  // and their samples follow each other.
+  template <int kChannels, bool kRow>
+  void fours(const Line& line, const FarOutput<T>& out) const {
+    if (line.count < 4) return points(line, 0, line.count, out);
+    const int64_t step = kRow ? 1 : line.step;
+    for (int64_t k = 0; k < line.count; k += 4) {
+      k = smaller(k, line.count - 4);
+      const int64_t place = line.place + k * step;
+      const int64_t* offset = places.offset + place;
+      if ((offset[0] | offset[step] | offset[2 * step] | offset[3 * step]) < 0) {
+        points(line, k, k + 4, out);
+      } else {
+        four<kChannels, kRow>(place, step, {out.to + k * out.step, out.step, out.spare});
+      }
+    }
+  }
+
+  static V every(const float* from, int64_t step) {
+    return V{from[0], from[step], from[2 * step], from[3 * step]};
+  }
+
+  // One load takes a pixel and its right neighbour.
+  template <int kChannels, bool kRow>
+  void four(int64_t place, int64_t step, const FarOutput<T>& out) const {
+    const V right = every(places.right + place, step), lower = every(places.lower + place, step);
+    const V down = __builtin_shufflevector(lower, lower, 0, 0, 1, 1);
+    const V down2 = __builtin_shufflevector(lower, lower, 2, 2, 3, 3);
+    const V up = 1 - down, up2 = 1 - down2, left = 1 - right;
+    const E* point[4];
+    for (int p = 0; p < 4; ++p) point[p] = pixels + places.offset[place + p * step];
+    const auto plane = [&](int64_t c) {
+      const int64_t top = c * channel, bottom = top + below;
+      const V pairs = between(two_pairs(point[0] + top, point[1] + top),
+                              two_pairs(point[0] + bottom, point[1] + bottom), up, down);
+      const V pairs2 = between(two_pairs(point[2] + top, point[3] + top),
+                               two_pairs(point[2] + bottom, point[3] + bottom), up2, down2);
+      const V l = __builtin_shufflevector(pairs, pairs2, 0, 2, 4, 6);
+      const V r = __builtin_shufflevector(pairs, pairs2, 1, 3, 5, 7);
+      const V v = between(l, r, left, right);
+      if constexpr (kSame<E, uint8_t>) return v * a.pixel_scale[c] + a.pixel_offset[c];
+      return v;
+    };
+    // Nothing is computed in two branches: the compiler would take what they share out of both and,
+    // with it, one half of what it fuses elsewhere.
+    if constexpr (kChannels == 3) {
+      store_three<kRow>(plane(0), plane(1), plane(2), out);
+      return;
+    }
+    for (int64_t c = 0; c < (kChannels > 0 ? kChannels : channels); ++c) {
+      const V v = plane(c);
+      if constexpr (kChannels == 1 && kRow) {
+        store(out.to, v);
+      } else {
+        for (int p = 0; p < 4; ++p) out.to[p * out.step + c] = v[p];
+      }
+    }
+  }
+
+  // Four samples of three channels.
+  template <bool kRow>
+  static void store_three(V x, V y, V z, const FarOutput<T>& out) {
+    if constexpr (kRow) {
+      const V xy = __builtin_shufflevector(x, y, 0, 4, 2, 6);
+      const V yz = __builtin_shufflevector(y, z, 1, 5, 3, 7);
+      const V zx = __builtin_shufflevector(z, x, 0, 5, 2, 7);
+      store(out.to, __builtin_shufflevector(xy, zx, 0, 1, 4, 5));
+      store(out.to + 4, __builtin_shufflevector(yz, xy, 0, 1, 6, 7));
+      store(out.to + 8, __builtin_shufflevector(zx, yz, 2, 3, 6, 7));
+    } else if (out.spare) {
+      transpose4(x, y, z, z, out.to, out.step);
+    } else {
+      for (int p = 0; p < 4; ++p) {
+        T* to = out.to + p * out.step;
+        to[0] = x[p], to[1] = y[p], to[2] = z[p];
+      }
+    }
+  }
+
+  template <int kChannels>
+  void together(const Line& line, const FarOutput<T>& out) const {
+    constexpr int kSkip = 4 - kChannels;
+    V scale{}, shift{};
+    for (int c = 0; kSame<E, uint8_t> && c < kChannels; ++c) {
+      scale[c] = a.pixel_scale[c];
+      shift[c] = a.pixel_offset[c];
+    }
+    const int64_t whole = kChannels == 4 || out.spare ? line.count : line.flat ? line.count - 1 : 0;
+    for (int64_t k = 0; k < line.count; ++k) {
+      const int64_t place = line.place + k * line.step;
+      if (places.offset[place] < 0) {
+        points(line, k, k + 1, out);
+        continue;
+      }
+      // The load of the right neighbour ends with its last channel, so that all stay in the image.
+      const E *pixel = pixels + places.offset[place], *neighbour = pixel + next - kSkip;
+      const V down = splat<V>(places.lower[place]), right = splat<V>(places.right[place]);
+      const V up = 1 - down;
+      const V l = between(floats<4>(pixel), floats<4>(pixel + below), up, down);
+      const V n = between(floats<4>(neighbour), floats<4>(neighbour + below), up, down);
+      const V r = __builtin_shufflevector(n, n, kSkip, kSkip + 1, (kSkip + 2) % 4, 3);
+      V v = between(l, r, 1 - right, right);
+      if constexpr (kSame<E, uint8_t>) v = v * scale + shift;
+      T* to = out.to + k * out.step;
+      if (k < whole) {
+        store(to, v);
+      } else {
+        for (int c = 0; c < kChannels; ++c) to[c] = v[c];
+      }
+    }
+  }
+
+  // Points [begin, end) of a line, which may lie on the border or outside.
+  void points(const Line& line, int64_t begin, int64_t end, const FarOutput<T>& out) const {
+    for (int64_t k = begin; k < end; ++k) {
+      const int64_t place = line.place + k * line.step, offset = places.offset[place];
+      const T right = places.right[place], lower = places.lower[place];
+      T* to = out.to + k * out.step;
+      if (offset < 0) {
+        const Corners<T, E> corners(a, b, places.column[place], places.row[place]);
+        for (int64_t c = 0; c < channels; ++c) {
+          const Vector<T, 4> p = corners.read(c);
+          const T l = between(p[0], p[2], 1 - lower, lower);
+          const T r = between(p[1], p[3], 1 - lower, lower);
+          to[c] = between(l, r, 1 - right, right);
+        }
+        continue;
+      }
+      const E* pixel = pixels + offset;
+      for (int64_t c = 0; c < channels; ++c, pixel += channel) {
+        const E* bottom = pixel + below;
+        const T l = between(number<T>(pixel[0]), number<T>(bottom[0]), 1 - lower, lower);
+        const T r = between(number<T>(pixel[next]), number<T>(bottom[next]), 1 - lower, lower);
+        to[c] = normalized<E>(a, between(l, r, 1 - right, right), c);
+      }
+    }
+  }
+
+  const PolarSampleArgs<T>& a;
+  const int64_t b;
+  const FarPlaces<T>& places;
+  const E* pixels;
+  const int64_t channels, channel, below, next;  // strides: to the next channel, row, column
+  const Layout layout;
+};
+
+}  // namespace
+}  // namespace darswin
