@@ -80,6 +80,7 @@ def tables() -> dict[str, str]:
         "speed": bench.best_table([*sampling, *to_image, *attention, *model.timings], SPEED),
         "missed": bench.missed_table([*sampling, *to_image, *attention]),
         "model": bench.models_table(model.timings),
+        "model int8": bench.quantized_table(model.timings),
         "model memory": bench.memory_table(model.memory),
         "sampling": bench.peers_table(sampling, "polar_sample", SAMPLING_PEERS),
         "embedding": bench.peers_table(sampling, "polar_embed", EMBED_PEERS),

@@ -9,10 +9,20 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from darswin.bench.timing import COMPILED, FIXED_LENS, MATMULS, OURS, REFERENCE
+from darswin.bench.timing import (
+    COMPILED,
+    COMPILED_BFLOAT16,
+    FIXED_LENS,
+    MATMULS,
+    OURS,
+    OURS_BFLOAT16,
+    OURS_FLOAT32,
+    REFERENCE,
+)
 from darswin.deploy.optimize import optimize
 from darswin.deploy.quantize import quantize_model
 from darswin.deploy.stages import Product, packed
+from darswin.layers import onednn
 from darswin.layers.embed import PolarPatchEmbed
 from darswin.layers.linear import Linear
 from darswin.layers.quantized import QuantizedLinear, quantize
@@ -48,25 +58,34 @@ def inference(
 
     The matrix products alone are those of the linear layers, one after the other with nothing
     between, by oneDNN and with weights packed for it: the roofline of a model on this machine.
+    A model of 8 bits takes turns with itself in float32 and, where the CPU has it, bfloat16; its
+    reference is one of float32.
     """
     model, lens = network(name, size).eval(), lens_of(size)
     images = torch.randn(batch, 3, size, size)
     ours = quantize_model(model, [(images, lens)]) if dtype == torch.int8 else model
     ours_of_lens = optimize(ours, dtype, lens=lens)
     products = matmuls_of(ours, images, lens, dtype)
-    # The reference has no products of 8 bits: there it computes in float32.
-    theirs = torch.float32 if dtype == torch.int8 else dtype
-    peer, pixels = copy.deepcopy(model).to(theirs), images.to(theirs)
+    theirs = [dtype]
+    if dtype == torch.int8:
+        half = onednn.missing(torch.bfloat16) is None
+        theirs = [torch.float32, torch.bfloat16] if half else [torch.float32]
+    peers = [(copy.deepcopy(model).to(kind), images.to(kind)) for kind in theirs]
+    peer, pixels = peers[0]
     runs: dict[str, Run] = {
         OURS: optimized_run(ours, lens, dtype, images),
         FIXED_LENS: lambda: ours_of_lens(images),
         MATMULS: lambda: _all(products),
         REFERENCE: reference_run(peer, lens, pixels),
     }
+    if dtype == torch.int8:
+        for name, kind in zip((OURS_FLOAT32, OURS_BFLOAT16), theirs, strict=False):
+            runs[name] = optimized_run(model, lens, kind, images)
     if compiled:
         torch._dynamo.reset()
-        graph = torch.compile(peer, options={"freezing": True}, dynamic=False)
-        runs[COMPILED] = reference_run(graph, lens, pixels)
+        for name, (peer, pixels) in zip((COMPILED, COMPILED_BFLOAT16), peers, strict=False):
+            graph = torch.compile(peer, options={"freezing": True}, dynamic=False)
+            runs[name] = reference_run(graph, lens, pixels)
     return {name: torch.no_grad()(run) for name, run in runs.items()}
 
 
@@ -99,21 +118,27 @@ def matmuls_of(
 ) -> list[tuple[Product, Tensor]]:
     """The linear layers that a model runs, packed, and an input of each. With int8 those that are
     not quantized are float32."""
-    found: list[tuple[Product, Tensor]] = []
     rest = torch.float32 if dtype == torch.int8 else dtype
-
-    def add(layer: Linear | QuantizedLinear, rows: int) -> None:
+    found: list[tuple[Product, Tensor]] = []
+    for layer, rows in products_of(model, images, lens):
         x = torch.randn(rows, layer.in_features).to(rest)
         if isinstance(layer, QuantizedLinear):
             x = quantize(x, layer.activation)
         found.append((packed(layer, rest), x))
+    return found
 
+
+def products_of(
+    model: Model, images: Tensor, lens: Lens
+) -> list[tuple[Linear | QuantizedLinear, int]]:
+    """The linear layers that a model runs, in turn, and the rows that each multiplies."""
+    found: list[tuple[Linear | QuantizedLinear, int]] = []
     kinds = (Linear, QuantizedLinear, PolarPatchEmbed)
 
     def hook(layer: Any, _inputs: tuple[Tensor], output: Tensor) -> None:
         # A polar embedding's linear layer is not called: `polar_embed` takes its weight.
         linear = layer.proj if isinstance(layer, PolarPatchEmbed) else layer
-        add(linear, output.numel() // linear.out_features)
+        found.append((linear, output.numel() // linear.out_features))
 
     layers = [layer for layer in model.modules() if isinstance(layer, kinds)]
     handles = [layer.register_forward_hook(hook) for layer in layers]
@@ -132,11 +157,35 @@ def operations_of(name: str, size: int) -> int:
 
 
 def training(name: str, size: int, dtype: torch.dtype, batch: int) -> dict[str, Run]:
-    """The candidates for a step of training, by name: forward, backward, AdamW; → the loss."""
+    """The candidates for a step of training, by name: forward, backward, AdamW; → the loss.
+
+    The matrix products alone are those of the linear layers, each with its backward, and with the
+    kinds of products that `autotune` chose.
+    """
     return {
         OURS: training_step(name, size, dtype, batch, reference=False),
         REFERENCE: training_step(name, size, dtype, batch, reference=True),
+        MATMULS: training_products(name, size, dtype, batch),
     }
+
+
+def training_products(name: str, size: int, dtype: torch.dtype, batch: int) -> Run:
+    """The matrix products of a step of training, forward and backward; → the last gradient."""
+    model = network(name, size)
+    model.set_matmul_backend("autotune")
+    images = torch.randn(batch, 3, size, size)
+    sides = []
+    for layer, rows in products_of(model.eval(), images, lens_of(size)):
+        x = torch.randn(rows, layer.in_features, dtype=dtype, requires_grad=True)
+        sides.append((layer, x, torch.randn(rows, layer.out_features, dtype=dtype)))
+
+    def run() -> Tensor:
+        with torch.autocast("cpu", torch.bfloat16, enabled=dtype == torch.bfloat16):
+            for layer, x, grad in sides:
+                found = torch.autograd.grad(layer(x), [x, *layer.parameters()], grad)
+        return found[0]
+
+    return run
 
 
 def training_step(name: str, size: int, dtype: torch.dtype, batch: int, *, reference: bool) -> Run:

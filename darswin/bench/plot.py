@@ -41,8 +41,9 @@ def draw_models(record: Record, path: Path) -> None:
         if t.threads == threads:
             rows = panels.setdefault(t.mode, {})
             rows.setdefault(f"batch {t.batch}", {})[t.name] = t.batch / t.median
-    found = {t.name for t in record.timings}
-    names = [n for n in (OURS, FIXED_LENS, REFERENCE, COMPILED, MATMULS) if n in found]
+    found = dict.fromkeys(t.name for t in record.timings)
+    order = (OURS, FIXED_LENS, REFERENCE, COMPILED, MATMULS)
+    names = sorted(found, key=lambda name: order.index(name) if name in order else len(order))
     unit = f"images a second, {record.timings[0].subject}, {threads} threads"
     _draw_panels(_batched(panels.items(), 2), names, unit, path)
 

@@ -4,7 +4,17 @@ from collections.abc import Iterable, Mapping, Sequence
 
 from darswin.bench.memory import Memory, compared
 from darswin.bench.record import Record
-from darswin.bench.timing import COMPILED, FIXED_LENS, MATMULS, OURS, REFERENCE, Timing
+from darswin.bench.timing import (
+    COMPILED,
+    COMPILED_BFLOAT16,
+    FIXED_LENS,
+    MATMULS,
+    OURS,
+    OURS_BFLOAT16,
+    OURS_FLOAT32,
+    REFERENCE,
+    Timing,
+)
 
 BOTH = "\u00a0/\u00a0"  # at one and at all threads, on one line
 
@@ -132,6 +142,17 @@ def models_table(timings: Sequence[Timing]) -> str:
     return markdown(heads, rows)
 
 
+def quantized_table(timings: Sequence[Timing]) -> str:
+    """A row a batch: how much longer a model takes in other types than with 8 bits."""
+    peers = (OURS_FLOAT32, OURS_BFLOAT16, COMPILED, COMPILED_BFLOAT16)
+    rows = [
+        [f"batch {batch}", *(_ratios(found.get(peer, ()), 2) for peer in peers)]
+        for (_, batch, mode), found in _by_case(timings).items()
+        if mode == "inference, int8"
+    ]
+    return markdown(["over 8 bits", *peers], rows)
+
+
 def memory_table(memory: Sequence[Memory]) -> str:
     """Peaks of resident memory, ours and the reference's."""
     rows = [
@@ -166,7 +187,9 @@ def roofline_lines(record: Record) -> list[str]:
     lines = []
     for t in record.timings:
         if t.name == MATMULS:
-            work = 1e-9 * record.operations * t.batch
+            # Backward takes two products for each of forward's.
+            products = 3 if t.mode.startswith("training") else 1
+            work = 1e-9 * record.operations * t.batch * products
             rates = f"{work / t.median:.0f} GFLOP/s, the model {work / ours[t.label]:.0f}"
             lines.append(f"{t.label}: {t.name} {rates} ({t.ratio:.0%})")
     return lines

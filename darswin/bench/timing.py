@@ -11,6 +11,9 @@ import torch
 
 OURS, FIXED_LENS, REFERENCE = "darswin", "darswin, fixed lens", "reference"
 COMPILED, MATMULS = "compiled reference", "matrix products alone"
+# What a model of 8 bits stands beside: the same in other types.
+OURS_FLOAT32, OURS_BFLOAT16 = f"{OURS}, float32", f"{OURS}, bfloat16"
+COMPILED_BFLOAT16 = f"{COMPILED}, bfloat16"
 TURNS = 7  # or more, for as long as a candidate's calls are short
 LONGEST_TURN = 0.2  # seconds: long enough for the caches to hold what the candidate uses
 

@@ -65,7 +65,8 @@ def bench(
         ],
     )
     print(*tables.autotune_lines(record.autotune), "", sep="\n")
-    print(tables.models_table(timings), "", tables.memory_table(record.memory), "", sep="\n")
+    print(tables.models_table(timings), "", tables.quantized_table(timings), "", sep="\n")
+    print(tables.memory_table(record.memory), "", sep="\n")
     print(*tables.roofline_lines(record), "", *targets.lines(timings), sep="\n")
     if (model, f"{size}×{size}") == (targets.MODEL, targets.SETTING):
         print(*targets.memory_lines(record.memory), sep="\n")
