@@ -51,3 +51,10 @@ def finish(sums: Tensor, largest: Tensor, out: Tensor, bits: int) -> None:
     """Writes sums of units as numbers. One launch."""
     grid = (triton.cdiv(out.numel(), BLOCK),)
     _finish[grid](sums, largest, out, out.numel(), BITS=bits, BLOCK=BLOCK)
+
+
+def like(gradients: Tensor, tensor: Tensor) -> Tensor:
+    """Gradients of each image, added up if the images share the tensor."""
+    if len(tensor) < len(gradients):
+        gradients = gradients.sum(0, keepdim=True)
+    return gradients.contiguous()
