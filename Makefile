@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/installed
 
-.PHONY: help build demo test test-lowest test-isa test-asan fuzz kills lint format bench study learned-lens worlds study-dense tables docs dist wheels repair published-wheels test-torch aarch64 clean
+.PHONY: help build demo test test-triton test-lowest test-isa test-asan fuzz kills lint format bench study learned-lens worlds study-dense tables docs dist wheels repair published-wheels test-torch aarch64 clean
 
 help:  ## this list
 	@grep -E '^[a-z0-9-]+:.*##' Makefile | sed -E 's/:.*## /\t/' | expand -t 18
@@ -24,6 +24,19 @@ demo: build  ## train on nearly undistorted digits, test through any fisheye, dr
 
 test: build  ## all tests
 	$(BIN)/python -m pytest
+
+# Triton stands in a folder of its own, so that all else is tested without it.
+TRITON := .triton
+TRITON_VERSION := 3.9.0
+
+$(TRITON)/$(TRITON_VERSION): $(STAMP)
+	rm -rf $(TRITON)
+	$(BIN)/pip install -q --no-deps --target $(TRITON) triton==$(TRITON_VERSION)
+	@touch $@
+
+test-triton: build $(TRITON)/$(TRITON_VERSION)  ## the kernels for GPUs without one: interpreted, and compiled
+	TRITON_INTERPRET=1 PYTHONPATH=$(CURDIR)/$(TRITON) $(BIN)/python -m pytest -q tests/gpu
+	PYTHONPATH=$(CURDIR):$(CURDIR)/$(TRITON) $(BIN)/python tests/gpu/compile_kernels.py
 
 # Everything that pyproject.toml declares, at its lowest version, but for torch.
 LOWEST := .venv-lowest

@@ -1,5 +1,7 @@
 """window_attention: attention in the windows of a polar map. Public function, fake, autograd."""
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -70,9 +72,18 @@ def window_attention(
     scale = head_dim**-0.5 if scale is None else float(scale)
     # As ints: torch.jit.trace takes no list of bools.
     wrap = tuple(int(bool(p)) for p in periodic)
+    arguments = (qkv, bias, window, shift, wrap, scale)
     return _library.run(
-        reference.window_attention, _devices.window_attention, qkv, bias, window, shift, wrap, scale
+        reference.window_attention,
+        _devices.window_attention,
+        *arguments,
+        kernel=_kernel_takes(bias.dtype, window, head_dim),
     )
+
+
+def _kernel_takes(dtype: torch.dtype, window: tuple[int, int], head_dim: int) -> bool:
+    """Whether the kernel for GPUs computes it: a program holds the pairs of a window's tokens."""
+    return dtype == torch.float32 and math.prod(window) <= 64 and head_dim <= 128
 
 
 def _arithmetic_types(qkv: Tensor, bias: Tensor) -> tuple[Tensor, Tensor]:

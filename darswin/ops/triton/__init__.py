@@ -1,0 +1,50 @@
+"""The operators' kernels for CUDA devices, in Triton: one launch where torch takes many.
+
+An operator is declared once, in C++, with its fake and autograd in `darswin/ops`; here it gets what
+it runs on a CUDA device. `LAUNCHERS` names the module of each. In it a function of the operator's
+name takes what the schema says, makes the outputs and launches; the public function has checked the
+arguments, and its `takes` says which of them the kernel does not compute (`_devices.py` does then).
+
+Triton is no dependency: without it nothing is registered, and with it nothing of it is imported
+before the first call on a CUDA device. The rules of the kernels:
+
+- A program owns what it writes. Nothing is added atomically in floating point, so two runs give the
+  same bits.
+- Numbers are widened to float32 as they are read, and rounded once as they are written. Each
+  product names its `input_precision`, each launch whether multiplications and additions are fused.
+- Places in tensors are int64: a batch may have more than 2³¹ numbers.
+"""
+
+import functools
+import importlib
+import importlib.util
+from collections.abc import Callable
+from typing import Any
+
+import torch
+
+INSTALLED = importlib.util.find_spec("triton") is not None
+
+# Operator → the module in this package that launches it.
+LAUNCHERS = {
+    "window_attention": "window_attention",
+    "window_attention_backward": "window_attention",
+}
+
+
+@functools.cache
+def launcher(operator: str) -> Callable[..., Any]:
+    """The function that launches an operator's kernels. Imports triton."""
+    return getattr(importlib.import_module(f"{__name__}.{LAUNCHERS[operator]}"), operator)
+
+
+def register() -> None:
+    """Gives the operators their kernels, if triton is installed."""
+    if not INSTALLED:
+        return
+    for operator in LAUNCHERS:
+
+        def launch(*arguments: Any, operator: str = operator) -> Any:
+            return launcher(operator)(*arguments)
+
+        torch.library.register_kernel(f"darswin::{operator}", "cuda", launch)
