@@ -92,7 +92,16 @@ def polar_to_image(
     return _library.run(
         reference.polar_to_image, reference.polar_to_image,
         x, radii, center, affine, points, r_max, (height, width), layout == "tokens",
+        kernel=_kernel_takes(x, height * width),
     )  # fmt: skip
+
+
+def _kernel_takes(x: Tensor, pixels: int) -> bool:
+    """Whether the kernel for GPUs is there and computes it: not float64, nor 2³¹ pixels or tokens
+    of an image."""
+    if not _library.has_kernels(x) or x.dtype == torch.float64:
+        return False
+    return max(pixels, x.shape[1] * x.shape[2]) < 2**31 - 2**16
 
 
 def _check_lens(

@@ -27,6 +27,12 @@ INSTALLED = importlib.util.find_spec("triton") is not None
 
 # Operator → the module in this package that launches it.
 LAUNCHERS = {
+    "polar_sample": "polar_sample",
+    "polar_sample_backward": "polar_sample",
+    "polar_embed": "polar_embed",
+    "polar_embed_backward": "polar_embed",
+    "polar_to_image": "polar_to_image",
+    "polar_to_image_backward": "polar_to_image",
     "window_attention": "window_attention",
     "window_attention_backward": "window_attention",
 }

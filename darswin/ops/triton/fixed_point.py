@@ -20,6 +20,11 @@ def bits(summands: int) -> int:
     return 60 - math.ceil(math.log2(max(summands, 1)))
 
 
+def sums(of: Tensor) -> Tensor:
+    """Zeros for the units of a gradient of a tensor, contiguous. One launch."""
+    return torch.zeros(of.shape, dtype=torch.int64, device=of.device)
+
+
 def largest(values: Tensor) -> Tensor:
     """The largest magnitude, float32 and 0-dim; NaN if any value is. One launch."""
     return torch.linalg.vector_norm(values, math.inf, dtype=torch.float32)
@@ -36,7 +41,7 @@ def near_one(largest):
     return (tl.maximum(255 - _exponent(largest), 1) << 23).to(tl.float32, bitcast=True)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["count"])
 def _finish(sums, largest, out, count, BITS: tl.constexpr, BLOCK: tl.constexpr):
     k = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     mask = k < count
@@ -49,12 +54,15 @@ def _finish(sums, largest, out, count, BITS: tl.constexpr, BLOCK: tl.constexpr):
 
 def finish(sums: Tensor, largest: Tensor, out: Tensor, bits: int) -> None:
     """Writes sums of units as numbers. One launch."""
-    grid = (triton.cdiv(out.numel(), BLOCK),)
-    _finish[grid](sums, largest, out, out.numel(), BITS=bits, BLOCK=BLOCK)
+    if out.numel() > 0:
+        _finish[(triton.cdiv(out.numel(), BLOCK),)](
+            sums, largest, out, out.numel(), BITS=bits, BLOCK=BLOCK, num_warps=4,
+            enable_fp_fusion=True,
+        )  # fmt: skip
 
 
 def like(gradients: Tensor, tensor: Tensor) -> Tensor:
-    """Gradients of each image, added up if the images share the tensor."""
+    """Gradients of each image as that of a tensor, added up if the images share it."""
     if len(tensor) < len(gradients):
         gradients = gradients.sum(0, keepdim=True)
-    return gradients.contiguous()
+    return gradients.to(tensor.dtype).contiguous()

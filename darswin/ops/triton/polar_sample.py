@@ -20,22 +20,14 @@ from torch import Tensor
 
 from darswin.ops._sampling import Sampling
 from darswin.ops.triton import fixed_point
-from darswin.ops.triton.fixed_point import near_one
+from darswin.ops.triton.fixed_point import like, near_one
 from darswin.ops.triton.points import cell, four_pixels, inside, locate, point_of, token_order
 
 BLOCK = 256  # samples of a program
-MOST_FRAME_CHANNELS = 16  # of uint8 images, whose mean and std are numbers in the kernel
-_LENS_SUMS = 9
+_LENS_SUMS = 9  # along the radius, of those jitter moved inward and outward, of x, y and the matrix
 
-
-def takes(sampling: Sampling) -> bool:
-    """Whether the kernels compute this: not float64, nor frames of many channels, nor 2³¹ samples
-    of one image."""
-    image = sampling.image
-    if image.dtype == torch.uint8 and image.shape[1] > MOST_FRAME_CHANNELS:
-        return False
-    points = sampling.radii.shape[1] * sampling.azimuths.shape[0]
-    return image.dtype != torch.float64 and max(points, *image.shape[2:]) < 2**31 - BLOCK
+# Numbers that change, or of which a 1 would be no number in the kernel but a constant.
+_SIZES = ["seed", "height", "width", "rows"]
 
 
 @triton.jit
@@ -49,7 +41,7 @@ def _mix(image, strides, scale, shift, column, row, right, lower, touches, heigh
     return total + before * lower * lower_left + right * lower * lower_right
 
 
-@triton.jit(do_not_specialize=["seed"])
+@triton.jit(do_not_specialize=_SIZES)
 def _forward(image, radii, azimuths, center, affine, offsets, jitter, seed, scale, shift, strides,
              steps, height, width, rows, out, COLUMNS: tl.constexpr, S_R: tl.constexpr,
              S_A: tl.constexpr, CHANNELS: tl.constexpr, TOKENS: tl.constexpr, CHUNK: tl.constexpr,
@@ -95,7 +87,7 @@ def _forward(image, radii, azimuths, center, affine, offsets, jitter, seed, scal
         tl.store(out + place, mixed.to(out.dtype.element_ty), mask=there)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=_SIZES)
 def _backward(image, radii, azimuths, center, affine, offsets, jitter, seed, scale, shift, strides,
               steps, height, width, rows, grad_out, largest, image_sums, lens_sums, grad_offsets,
               COLUMNS: tl.constexpr, S_R: tl.constexpr, S_A: tl.constexpr, CHANNELS: tl.constexpr,
@@ -180,95 +172,120 @@ def _backward(image, radii, azimuths, center, affine, offsets, jitter, seed, sca
 
 
 def _arguments(sampling: Sampling) -> tuple[Any, ...]:
-    """What both kernels begin with: all up to `rows`, then the constants up to CHANNELS."""
-    image, *geometry, jitter, seed = sampling[:8]
-    given = [None if t is None else t.contiguous() for t in geometry]
-    radii, azimuths, center, affine, offsets = given
-    steps = [0 if t is None or len(t) == 1 else t.stride(0) for t in (radii, center, affine, offsets)]
+    """What both kernels begin with, up to `rows`."""
+    image, *geometry = sampling[:6]
+    radii, azimuths, center, affine, offsets = (
+        None if tensor is None else tensor.contiguous() for tensor in geometry
+    )
+    lens = (radii, center, affine, offsets)
+    steps = tuple(0 if t is None or len(t) == 1 else t.stride(0) for t in lens)
+    # Numbers that are on the CPU come along with the launch.
+    jitter = None if sampling.jitter is None else sampling.jitter.item()
+    seed = sampling.seed if sampling.jitter is not None else None
+    key = seed.item() if seed is not None and seed.device.type == "cpu" else seed
     scale = shift = None
     if image.dtype == torch.uint8:
         scale = tuple(1 / (255 * std) for std in sampling.std)
         shift = tuple(-mean / std for mean, std in zip(sampling.mean, sampling.std, strict=True))
-    if seed is not None and jitter is not None:
-        jitter = jitter.item()
-        seed = seed.item() if seed.device.type == "cpu" else seed
-    return (image, *given, jitter, seed, scale, shift, image.stride(), (*steps,),
-            *image.shape[2:], radii.shape[1])
+    return (
+        image, radii, azimuths, center, affine, offsets, jitter, key, scale, shift,
+        image.stride(), steps, *image.shape[2:], sampling.radii.shape[1],
+    )  # fmt: skip
 
 
-def _constants(sampling: Sampling, tokens: bool) -> dict[str, Any]:
-    (along, around), channels = sampling.samples, sampling.image.shape[1]
-    return dict(COLUMNS=sampling.azimuths.shape[0], S_R=along, S_A=around, CHANNELS=channels, TOKENS=tokens)
+def _options(sampling: Sampling, tokens: bool) -> dict[str, Any]:
+    """The constants of both kernels, and how they are compiled."""
+    along, around = sampling.samples
+    return dict(
+        COLUMNS=len(sampling.azimuths), S_R=along, S_A=around, CHANNELS=sampling.image.shape[1],
+        TOKENS=tokens, enable_fp_fusion=True,
+    )  # fmt: skip
 
 
-def polar_sample(*arguments: Any) -> Tensor:
-    """`darswin::polar_sample`, one launch."""
-    *fields, tokens = arguments
-    sampling = Sampling(*fields)
+def forward(sampling: Sampling, tokens: bool) -> Tensor:
+    """The samples, in one launch."""
     batch, channels = sampling.image.shape[:2]
-    rows, columns = sampling.radii.shape[1], sampling.azimuths.shape[0]
-    shape = (*sampling.map_size(), sampling.token_size()) if tokens else (batch, channels, rows, columns)
-    out = sampling.new_output(shape)
+    rows, columns = sampling.radii.shape[1], len(sampling.azimuths)
+    out = sampling.new_output(
+        (*sampling.map_size(), sampling.token_size())
+        if tokens
+        else (batch, channels, rows, columns)
+    )
     if out.numel() > 0:
-        grid = (batch * triton.cdiv(rows * columns, BLOCK),)
-        _forward[grid](
-            *_arguments(sampling), out, **_constants(sampling, tokens),
-            CHUNK=min(triton.next_power_of_2(channels), 4), BLOCK=BLOCK,
+        _forward[(batch * triton.cdiv(rows * columns, BLOCK),)](
+            *_arguments(sampling), out, CHUNK=min(triton.next_power_of_2(channels), 4),
+            BLOCK=BLOCK, num_warps=4, **_options(sampling, tokens),
         )  # fmt: skip
     return out
 
 
-def polar_sample_backward(*arguments: Any) -> tuple[Tensor, ...]:
-    """`darswin::polar_sample_backward`."""
-    *fields, tokens, grad_out, image_grad, lens_grad, offsets_grad = arguments
-    return backward(Sampling(*fields), tokens, grad_out, image_grad, lens_grad, offsets_grad)
-
-
-def backward(sampling: Sampling, tokens: bool, grad_out: Tensor, image_grad: bool, lens_grad: bool, offsets_grad: bool) -> tuple[Tensor, ...]:
+def backward(
+    sampling: Sampling,
+    tokens: bool,
+    grad_out: Tensor,
+    image_grad: bool,
+    lens_grad: bool,
+    offsets_grad: bool,
+) -> tuple[Tensor, ...]:
     """The gradients of image, radii, center, affine and offsets; of size (0,) if not wanted."""
-    image, radii, azimuths, center, affine, offsets = sampling[:6]
     gradients = sampling.new_gradients(image_grad, lens_grad, offsets_grad)
     if grad_out.numel() == 0:
         return tuple(gradient.zero_() for gradient in gradients)
-    batch, rows, columns = len(image), radii.shape[1], azimuths.shape[0]
+    image, radii, azimuths, _, _, offsets = sampling[:6]
+    batch, rows, columns = len(image), radii.shape[1], len(azimuths)
     largest = image_sums = lens_sums = each_offsets = None
-    bits = fixed_point.bits(rows * columns)
     if image_grad:
         largest = fixed_point.largest(grad_out)
-        image_sums = torch.zeros(image.shape, dtype=torch.int64, device=image.device)
+        image_sums = fixed_point.sums(image)
     if lens_grad:
         lens_sums = radii.new_empty((batch, rows, _LENS_SUMS))
-    if offsets_grad:
-        each_offsets = radii.new_empty((batch, 2, rows, columns))
+    if offsets_grad and offsets is not None:
+        each_offsets = radii.new_empty((batch, *offsets.shape[1:]))
     block = min(128, max(32, triton.next_power_of_2(columns)))
+    bits = fixed_point.bits(rows * columns)
     _backward[(batch * rows,)](
         *_arguments(sampling), grad_out.contiguous(), largest, image_sums, lens_sums, each_offsets,
-        **_constants(sampling, tokens), BITS=bits, LENS_SUMS=_LENS_SUMS, BLOCK=block,
-        num_warps=block // 32,
+        BITS=bits, LENS_SUMS=_LENS_SUMS, BLOCK=block, num_warps=block // 32,
+        **_options(sampling, tokens),
     )  # fmt: skip
-    grads = list(gradients)
-    if image_grad and image.numel():
-        fixed_point.finish(image_sums, largest, grads[0], bits)
-    if lens_grad:
-        grads[1:4] = _fold(sampling, lens_sums)
-    if offsets_grad:
-        grads[4] = each_offsets if len(offsets) == batch else each_offsets.sum(0, keepdim=True)
-    return tuple(grads)
+    if image_sums is not None and largest is not None:
+        fixed_point.finish(image_sums, largest, gradients[0], bits)
+    of_lens = gradients[1:4] if lens_sums is None else _fold(sampling, lens_sums)
+    of_offsets = gradients[4]
+    if each_offsets is not None and offsets is not None:
+        of_offsets = like(each_offsets, offsets)
+    return gradients[0], *of_lens, of_offsets
 
 
 def _fold(sampling: Sampling, sums: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """The gradients of radii, center and affine from the sums of each radius."""
-    def shared(gradient: Tensor, like: Tensor) -> Tensor:
-        return gradient.sum(0, keepdim=True) if len(like) < len(gradient) else gradient
-
-    radii = sums[..., 0]
-    if sampling.seed is not None and radii.shape[1] > 1:
-        # By the steps between radii: the outermost and the innermost points use their only one.
+    sums = sums.double()
+    of_radii = sums[..., 0]
+    if sampling.seed is not None and of_radii.shape[1] > 1:
+        # By the steps between radii; at both ends of the row there is one for both sides.
         inward, outward = sums[..., 1], sums[..., 2]
         steps = inward[:, 1:] + outward[:, :-1]
         steps[:, 0] += inward[:, 0]
         steps[:, -1] += outward[:, -1]
-        radii = radii + F.pad(steps, (1, 0)) - F.pad(steps, (0, 1))
-    others = sums[..., 3:].sum(1)
-    affine = others.new_empty(0) if sampling.affine is None else shared(others[:, 2:].unflatten(1, (2, 2)), sampling.affine)
-    return shared(radii, sampling.radii).contiguous(), shared(others[:, :2], sampling.center).contiguous(), affine.contiguous()
+        of_radii = of_radii + F.pad(steps, (1, 0)) - F.pad(steps, (0, 1))
+    of_center, of_affine = sums[..., 3:].sum(1).split((2, 4), 1)
+    affine = sampling.affine
+    return (
+        like(of_radii, sampling.radii),
+        like(of_center, sampling.center),
+        sampling.radii.new_empty((0,))
+        if affine is None
+        else like(of_affine.view(-1, 2, 2), affine),
+    )
+
+
+def polar_sample(*arguments: Any) -> Tensor:
+    """`darswin::polar_sample`."""
+    *fields, tokens = arguments
+    return forward(Sampling(*fields), tokens)
+
+
+def polar_sample_backward(*arguments: Any) -> tuple[Tensor, ...]:
+    """`darswin::polar_sample_backward`."""
+    fields, others = arguments[: len(Sampling._fields)], arguments[len(Sampling._fields) :]
+    return backward(Sampling(*fields), *others)

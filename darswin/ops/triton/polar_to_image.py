@@ -20,9 +20,13 @@ from torch import Tensor
 from darswin.ops.triton import fixed_point
 from darswin.ops.triton.fixed_point import like, near_one
 
-BLOCK = 64  # pixels of a program
-MOST_CHANNELS = 32  # that it mixes at a time
-_PLANE_SUMS = 6
+# Pixels of a program, and how many channels it takes at a time at most.
+BLOCK, CHUNK = 64, 32
+BACKWARD_BLOCK, BACKWARD_CHUNK = 32, 16
+_PLANE_SUMS = 6  # of x and y, and of their products with the way from the centre
+
+# A 1 among them would be no number in the kernel but a constant.
+_SIZES = ["rings", "height", "width"]
 
 
 @triton.jit
@@ -126,7 +130,7 @@ def _in_image(k, channel, pixels, CHANNELS: tl.constexpr, TOKENS: tl.constexpr):
         return channel * pixels.to(tl.int64) + k[:, None]
 
 
-@triton.jit
+@triton.jit(do_not_specialize=_SIZES)
 def _forward(x, radii, center, affine, points, r_max, steps, rings, height, width, out,
              SECTORS: tl.constexpr, CHANNELS: tl.constexpr, RING_BITS: tl.constexpr,
              TOKENS: tl.constexpr, CHUNK: tl.constexpr, BLOCK: tl.constexpr):  # fmt: skip
@@ -155,7 +159,7 @@ def _forward(x, radii, center, affine, points, r_max, steps, rings, height, widt
                  mask=mask[:, None] & (channel < CHANNELS))  # fmt: skip
 
 
-@triton.jit
+@triton.jit(do_not_specialize=_SIZES)
 def _backward(x, radii, center, affine, points, r_max, steps, rings, height, width, grad_out,
               largest, map_sums, ring_sums, plane_sums, grad_points, SECTORS: tl.constexpr,
               CHANNELS: tl.constexpr, RING_BITS: tl.constexpr, TOKENS: tl.constexpr,
@@ -198,13 +202,14 @@ def _backward(x, radii, center, affine, points, r_max, steps, rings, height, wid
     if ring_sums is not None:
         by_t = by_outer - by_inner
         # Inside the first ring t = (r + first) / 2 first, else (r - inner) / (outer - inner).
-        slope = tl.where(known & (beyond == 0),
-                         tl.math.div_rn(by_t, tl.where(beyond, 1.0, second - first)), 0.0)  # fmt: skip
+        on_slope = known & (beyond == 0)
+        slope = tl.math.div_rn(by_t, tl.where(beyond, 1.0, second - first))
+        slope = tl.where(on_slope, slope, 0.0)
         ring_sums += tl.program_id(0).to(tl.int64) * rings
         for ring in range(rings):
             change = tl.where(inner == ring, (1.0 - t) * tl.where(pole, -1.0, 1.0), 0.0)
             change += tl.where(outer == ring, t, 0.0)
-            tl.store(ring_sums + ring, -tl.sum(tl.where(known & (beyond == 0), slope * change, 0.0)))
+            tl.store(ring_sums + ring, -tl.sum(tl.where(on_slope, slope * change, 0.0)))
         # At the centre itself radius and azimuth have no derivative.
         moves = known & (r > 0.0)
         near = tl.where(moves, r, 1.0)
@@ -228,24 +233,20 @@ def _backward(x, radii, center, affine, points, r_max, steps, rings, height, wid
             tl.store(to + 5, tl.sum(by_y * from_y))
 
 
-def _contiguous(tensor: Tensor | None) -> Tensor | None:
-    return None if tensor is None else tensor.contiguous()
-
-
 def _arguments(x: Tensor, lens: Sequence[Tensor | None], size: Sequence[int]) -> tuple[Any, ...]:
-    """What both kernels begin with: all up to `width`."""
-    x = x.contiguous()
-    lens = [_contiguous(tensor) for tensor in lens]
-    steps = [0 if t is None or len(t) == 1 else t.stride(0) for t in lens]
-    return (x, *lens, (*steps,), x.shape[1], *size)
+    """What both kernels begin with, up to `width`."""
+    given = [None if tensor is None else tensor.contiguous() for tensor in lens]
+    steps = tuple(0 if t is None or len(t) == 1 else t.stride(0) for t in given)
+    return x.contiguous(), *given, steps, x.shape[1], *size
 
 
-def _constants(x: Tensor, tokens: bool) -> dict[str, Any]:
-    channels = x.shape[3]
-    chunk = min(triton.next_power_of_2(channels), MOST_CHANNELS)
+def _options(x: Tensor, tokens: bool, most_channels: int) -> dict[str, Any]:
+    """The constants of both kernels, and how they are compiled."""
+    _, rings, sectors, channels = x.shape
     return dict(
-        SECTORS=x.shape[2], CHANNELS=channels, RING_BITS=x.shape[1].bit_length(), TOKENS=tokens,
-        CHUNK=chunk, BLOCK=BLOCK,
+        SECTORS=sectors, CHANNELS=channels, RING_BITS=rings.bit_length(), TOKENS=tokens,
+        CHUNK=min(triton.next_power_of_2(channels), most_channels), num_warps=4,
+        enable_fp_fusion=True,
     )  # fmt: skip
 
 
@@ -266,7 +267,7 @@ def polar_to_image(
     if out.numel() > 0:
         lens = (radii, center, affine, points, r_max)
         _forward[(batch * triton.cdiv(height * width, BLOCK),)](
-            *_arguments(x, lens, size), out, **_constants(x, tokens)
+            *_arguments(x, lens, size), out, BLOCK=BLOCK, **_options(x, tokens, CHUNK)
         )
     return out
 
@@ -291,12 +292,12 @@ def polar_to_image_backward(
         grads = [radii.new_zeros((0,) if t is None else t.shape) for t in wanted]
         return x.new_zeros(x.shape if x_grad else (0,)), *grads
     batch, (height, width) = len(x), size
-    programs = batch * triton.cdiv(height * width, BLOCK)
+    programs = batch * triton.cdiv(height * width, BACKWARD_BLOCK)
     bits = fixed_point.bits(height * width)
     largest = map_sums = ring_sums = plane_sums = of_points = None
     if x_grad:
         largest = fixed_point.largest(grad_out)
-        map_sums = torch.zeros(x.shape, dtype=torch.int64, device=x.device)
+        map_sums = fixed_point.sums(x)
     if lens_grad:
         ring_sums = radii.new_empty((programs, x.shape[1]))
         if points is None:
@@ -305,7 +306,8 @@ def polar_to_image_backward(
             of_points = radii.new_empty((batch, height, width, 2))
     _backward[(programs,)](
         *_arguments(x, (*lens, r_max), size), grad_out.contiguous(), largest, map_sums, ring_sums,
-        plane_sums, of_points, **_constants(x, tokens), BITS=bits,
+        plane_sums, of_points, BITS=bits, BLOCK=BACKWARD_BLOCK,
+        **_options(x, tokens, BACKWARD_CHUNK),
     )  # fmt: skip
     grad_x = x.new_empty(x.shape if x_grad else (0,))
     if map_sums is not None and largest is not None:
@@ -313,10 +315,11 @@ def polar_to_image_backward(
     none = radii.new_empty((0,))
     if ring_sums is None:
         return grad_x, none, none, none, none
-    of_radii = like(ring_sums.view(batch, -1, x.shape[1]).sum(1), radii)
+    of_radii = like(ring_sums.view(batch, -1, x.shape[1]).sum(1, dtype=torch.float64), radii)
     if of_points is not None and points is not None:
         return grad_x, of_radii, none, none, like(of_points, points)
-    sums = plane_sums.view(batch, -1, _PLANE_SUMS).sum(1)
+    assert plane_sums is not None and center is not None
+    sums = plane_sums.view(batch, -1, _PLANE_SUMS).sum(1, dtype=torch.float64)
     return grad_x, of_radii, *_of_lens(sums, center, affine), none
 
 
@@ -327,7 +330,7 @@ def _of_lens(sums: Tensor, center: Tensor, affine: Tensor | None) -> tuple[Tenso
     if affine is None:
         return like(-of_place, center), center.new_empty((0,))
     # The place is M (pixel - center), M the inverse of the matrix A: dA = -Mᵀ products Mᵀ.
-    (xx, xy), (yx, yy) = affine.permute(1, 2, 0)
+    (xx, xy), (yx, yy) = affine.double().permute(1, 2, 0)
     inverse = torch.stack((yy, -yx, -xy, xx), -1) / (xx * yy - xy * yx)[:, None]
     transposed = inverse.view(-1, 2, 2)
     of_center = -(transposed @ of_place[:, :, None])[:, :, 0]
