@@ -20,6 +20,7 @@ from triton.backends.compiler import GPUTarget
 from triton.runtime import driver
 from triton.runtime.jit import JITFunction
 
+from darswin.ops._sampling import checked_sampling
 from darswin.ops.triton import launcher
 
 # Bytes of shared memory that a program may have, by compute capability.
@@ -102,7 +103,68 @@ def attend(case: str, dtype: torch.dtype) -> None:
     launcher("window_attention_backward")(*call, out)
 
 
+# (R, A) and samples of the presets' patches, of three channels.
+PATCHES = {
+    "small, tiny: 10×10": ((16, 64), (10, 10)),
+    "micro: 6×6": ((16, 64), (6, 6)),
+    "nano: 4×4": ((8, 32), (4, 4)),
+    "U-Net, nano: 4×4": ((16, 64), (4, 4)),
+}
+
+
+def meta(*shape: int, dtype: torch.dtype = torch.float32) -> torch.Tensor:
+    return torch.empty(shape, dtype=dtype, device="meta")
+
+
+def sample(
+    case: str, dtype: torch.dtype, jitter: float = 0, general: bool = False, tokens: bool = True,
+    channels: int = 3, size: int = 64,
+) -> None:  # fmt: skip
+    """A forward and a backward of sampling; as polar_embed asks for them, or as images."""
+    (rings, sectors), (along, around) = PATCHES[case]
+    rows, columns = rings * along, sectors * around
+    sampling = checked_sampling(
+        meta(32, channels, size, size, dtype=dtype), meta(32, rows), meta(columns), meta(32, 2),
+        meta(32, 2, 2) if general else None, meta(32, 2, rows, columns) if general else None,
+        jitter, 5, (along, around), 0.5, 0.5,
+    )  # fmt: skip
+    out = launcher("polar_sample")(*sampling, tokens)
+    wanted = dtype != torch.uint8, True, general
+    launcher("polar_sample_backward")(*sampling, tokens, out, *wanted)
+
+
+def bring_back(
+    channels: int, dtype: torch.dtype, lens: str = "circular", tokens: bool = True
+) -> None:
+    """A forward and a backward of polar_to_image from the map of the U-Nets."""
+    points = meta(32, 64, 64, 2) if lens == "points" else None
+    affine = meta(32, 2, 2) if lens == "affine" else None
+    center = None if lens == "points" else meta(32, 2)
+    plane = center, affine, points, meta(32)
+    call = (meta(32, 64, 256, channels, dtype=dtype), meta(32, 64), *plane, (64, 64), tokens)
+    out = launcher("polar_to_image")(*call)
+    launcher("polar_to_image_backward")(*call, out, True, True)
+
+
+SMALL = "small, tiny: 10×10"
 CALLS: dict[str, Callable[[], object]] = {
+    **{f"{case}, {name}": lambda case=case, dtype=dtype: sample(case, dtype)
+       for case in PATCHES for name, dtype in DTYPES.items() if name != "float16"},
+    f"{SMALL}, jitter": lambda: sample(SMALL, torch.float32, jitter=1.0),
+    f"{SMALL}, jitter, any lens": lambda: sample(SMALL, torch.float32, 1.0, general=True),
+    f"{SMALL}, uint8": lambda: sample(SMALL, torch.uint8),
+    f"{SMALL}, as an image": lambda: sample(SMALL, torch.float32, tokens=False),
+    f"{SMALL}, one channel": lambda: sample(SMALL, torch.float32, channels=1),
+    f"{SMALL}, 96 channels of one pixel":
+        lambda: sample(SMALL, torch.float32, channels=96, size=1),
+    **{f"map to image, {channels} channels, {name}":
+       lambda channels=channels, dtype=dtype: bring_back(channels, dtype)
+       for channels in (1, 10, 96) for name, dtype in DTYPES.items() if name != "float16"},
+    "map to image, affine": lambda: bring_back(10, torch.float32, "affine"),
+    "map to image, any lens": lambda: bring_back(10, torch.float32, "points"),
+    "map to image, planes": lambda: bring_back(96, torch.float32, tokens=False),
+}  # fmt: skip
+CALLS |= {
     f"{case}, {name}": lambda case=case, dtype=dtype: attend(case, dtype)
     for case in ATTENTION
     for name, dtype in DTYPES.items()

@@ -1,6 +1,6 @@
 """polar_sample's kernels: the accuracy rule, the reference's random points, bits that do not depend
-on any order, arguments at the edge. Images and grids are small, since a program takes a while in the
-interpreter: backward has one for each radius of an image."""
+on any order, arguments at the edge. Images and grids are small, since a program takes a while in
+the interpreter: backward has one for each radius of an image."""
 
 import math
 
@@ -230,8 +230,8 @@ def test_strided_inputs(on):
     wide = torch.randn(2, 6, 34, 46)
     wide[:, ::2, ::2, ::2] = image
     inputs = (
-        wide[:, ::2, ::2, ::2], radii.t().contiguous().t(), torch.stack((center, center), 2)[..., 0],
-        affine.mT.contiguous().mT, offsets.flip(3).flip(3).transpose(2, 3).contiguous().mT,
+        wide[:, ::2, ::2, ::2], radii.mT.contiguous().mT, center.mT.contiguous().mT,
+        affine.mT.contiguous().mT, offsets.mT.contiguous().mT,
     )  # fmt: skip
     assert not any(t.is_contiguous() for t in inputs)
     strided = with_gradients(on(sampler(8, (2, 4))), inputs)
@@ -261,8 +261,7 @@ def test_camera_frames(layout, on):
     with use_reference():
         expected, *expected_grads = with_gradients(lambda *t: run(frames, *t), (radii, center))
     for image in (frames, frames.permute(0, 3, 1, 2).contiguous()):
-        ours = on(lambda image, *lens: run(image, *lens))
-        found, *grads = with_gradients(lambda *t, image=image: ours(image, *t), (radii, center))
+        found, *grads = with_gradients(lambda *t, image=image: on(run)(image, *t), (radii, center))
         torch.testing.assert_close(found, expected, rtol=1e-5, atol=2e-5)
         for grad, want in zip(grads, expected_grads, strict=True):
             torch.testing.assert_close(grad, want, rtol=1e-4, atol=1e-3)

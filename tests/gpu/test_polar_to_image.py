@@ -55,7 +55,9 @@ CASES = {
 @pytest.mark.parametrize("case", CASES)
 def test_accuracy_rule(case, on):
     sizes, options = CASES[case]
-    assert_accurate(on(back(**options)), lambda: make_inputs(**sizes), draws=1)
+    # The more numbers there are, the fewer draws measure their rounding.
+    draws = 8 if case == "one pixel" else 1
+    assert_accurate(on(back(**options)), lambda: make_inputs(**sizes), draws=draws)
 
 
 @pytest.mark.parametrize("sizes", [dict(batch=0), dict(channels=0), dict(size=(0, 4))])
@@ -119,8 +121,8 @@ def test_strided_inputs(on):
     run = on(back(general="affine"))
     plain = with_gradients(run, (x, radii, center, affine))
     strided = (
-        x.permute(3, 0, 2, 1).contiguous().permute(1, 3, 2, 0), radii.t().contiguous().t(),
-        torch.stack((center, center), 2)[..., 0], affine.mT.contiguous().mT,
+        x.permute(3, 0, 2, 1).contiguous().permute(1, 3, 2, 0), radii.mT.contiguous().mT,
+        center.mT.contiguous().mT, affine.mT.contiguous().mT,
     )  # fmt: skip
     assert not any(t.is_contiguous() for t in strided)
     for one, other in zip(plain, with_gradients(run, strided), strict=True):

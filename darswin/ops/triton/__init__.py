@@ -51,6 +51,7 @@ def register() -> None:
     for operator in LAUNCHERS:
 
         def launch(*arguments: Any, operator: str = operator) -> Any:
-            return launcher(operator)(*arguments)
+            with torch.cuda.device_of(arguments[0]):  # Triton launches on the current one
+                return launcher(operator)(*arguments)
 
         torch.library.register_kernel(f"darswin::{operator}", "cuda", launch)

@@ -22,7 +22,7 @@ from darswin.ops.triton.fixed_point import like, near_one
 
 # Pixels of a program, and how many channels it takes at a time at most.
 BLOCK, CHUNK = 64, 32
-BACKWARD_BLOCK, BACKWARD_CHUNK = 32, 16
+BACKWARD_BLOCK, BACKWARD_CHUNK = 32, 8
 _PLANE_SUMS = 6  # of x and y, and of their products with the way from the centre
 
 # A 1 among them would be no number in the kernel but a constant.
