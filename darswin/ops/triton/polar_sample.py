@@ -31,10 +31,11 @@ _SIZES = ["seed", "height", "width", "rows"]
 
 
 @triton.jit
-def _mix(image, strides, scale, shift, column, row, right, lower, touches, height, width, c):
-    """Channel c of points: their four pixels, weighted."""
+def _mix(image, strides, scale, shift, cells, height, width, c, CHANNELS: tl.constexpr):
+    """Channel c of points in cells: four pixels, weighted; 0 where there is no such channel."""
+    column, row, right, lower, touches = cells
     upper_left, upper_right, lower_left, lower_right = four_pixels(
-        image, strides, scale, shift, column, row, touches, height, width, c
+        image, strides, scale, shift, column, row, touches & (c < CHANNELS), height, width, c
     )
     above, before = 1.0 - lower, 1.0 - right
     total = before * above * upper_left + right * above * upper_right
@@ -58,26 +59,20 @@ def _forward(image, radii, azimuths, center, affine, offsets, jitter, seed, scal
     x, y, _, _, _, _, _, _ = locate(
         radii, azimuths, center, affine, offsets, jitter, seed, steps, b, i, j, mask, rows, COLUMNS
     )
-    column, row, right, lower, touches = cell(x, y, mask, height, width)
+    cells = cell(x, y, mask, height, width)
     image += b * strides[0]
     out += b * points * CHANNELS
     for c in range(0, CHANNELS, CHUNK):
-        first = _mix(image, strides, scale, shift, column, row, right, lower, touches,
-                     height, width, c)  # fmt: skip
+        mixed = _mix(image, strides, scale, shift, cells, height, width, c, CHANNELS)
         if CHUNK == 1:
-            mixed = first[:, None]
+            mixed = mixed[:, None]
         else:
-            second = _mix(image, strides, scale, shift, column, row, right, lower,
-                          touches & (c + 1 < CHANNELS), height, width, c + 1)  # fmt: skip
-            if CHUNK == 2:
-                mixed = tl.join(first, second)
-            else:
-                third = _mix(image, strides, scale, shift, column, row, right, lower,
-                             touches & (c + 2 < CHANNELS), height, width, c + 2)  # fmt: skip
-                fourth = _mix(image, strides, scale, shift, column, row, right, lower,
-                              touches & (c + 3 < CHANNELS), height, width, c + 3)  # fmt: skip
-                mixed = tl.join(tl.join(first, third), tl.join(second, fourth))
-                mixed = mixed.reshape(BLOCK, 4)
+            second = _mix(image, strides, scale, shift, cells, height, width, c + 1, CHANNELS)
+            if CHUNK == 4:
+                third = _mix(image, strides, scale, shift, cells, height, width, c + 2, CHANNELS)
+                fourth = _mix(image, strides, scale, shift, cells, height, width, c + 3, CHANNELS)
+                mixed, second = tl.join(mixed, third), tl.join(second, fourth)
+            mixed = tl.join(mixed, second).reshape(BLOCK, CHUNK)
         channel = c + tl.arange(0, CHUNK)[None, :]
         if TOKENS:
             place = k.to(tl.int64)[:, None] * CHANNELS + channel
