@@ -1,8 +1,7 @@
 """Compiles the kernels for GPUs, without one, as the launchers ask for them.
 
-Prints what each takes, and fails where a kernel has more than registers for its numbers or more shared
-memory than the architecture has. `make test-triton` runs it; triton must be there, and not in its
-interpreter.
+Prints what each takes, and fails where a kernel has too few registers for its numbers, or more
+shared memory than a GPU has. `make test-triton` runs it; triton must be there, and not interpret.
 """
 
 import re
@@ -40,7 +39,7 @@ class Use(NamedTuple):
 
 
 class _NoDevice:
-    """Stands in for Triton's driver: a GPU of a capability that is only compiled for."""
+    """In the place of Triton's driver: a GPU of some capability, which is only compiled for."""
 
     def __init__(self, capability: int):
         self.target = GPUTarget("cuda", capability, 32)
@@ -89,14 +88,13 @@ ATTENTION = {
     "RA, stage 4: 2×8": ((2, 8), 24, (2, 8)),
     "Swin: 7×7": ((56, 56), 3, (7, 7)),
     "Swin: 8×8": ((64, 64), 3, (8, 8)),
-}
-_32 = 32  # the head dim of all of them
+}  # the head dim is 32
 
 
 def attend(case: str, dtype: torch.dtype) -> None:
     """A forward and a backward of attention."""
     size, heads, window = ATTENTION[case]
-    qkv = torch.empty(32, *size, 3, heads, _32, dtype=dtype, device="meta")
+    qkv = torch.empty(32, *size, 3, heads, 32, dtype=dtype, device="meta")
     bias = torch.empty(32, heads, 2 * window[0] - 1, 2 * window[1] - 1, device="meta")
     call = (qkv, bias, window, (0, 0), (0, 1), 0.2)
     out = launcher("window_attention")(*call)

@@ -1,6 +1,7 @@
 """The kernels of `darswin.ops.triton`: on a CUDA device where there is one (`make test-gpu`), else
 in Triton's interpreter, on the CPU (`make test-triton`)."""
 
+import dataclasses
 import os
 import warnings
 
@@ -21,6 +22,11 @@ def device():
         return
     if os.environ.get("TRITON_INTERPRET") != "1":
         pytest.skip("no CUDA device, and TRITON_INTERPRET=1 is not set, as `make test-triton` does")
+    from triton.runtime.interpreter import interpreter_builder as builder
+
+    # It multiplies in float32 whatever the precision, but does not know all of a GPU's names.
+    names = (*builder.options.allowed_dot_input_precisions, "bf16x3")
+    builder.options = dataclasses.replace(builder.options, allowed_dot_input_precisions=names)
     library = torch.library.Library("darswin", "IMPL")
     with warnings.catch_warnings(action="ignore"):  # torch tells of each that it is replaced
         for operator in triton.LAUNCHERS:
