@@ -118,7 +118,7 @@ def sample(
     case: str, dtype: torch.dtype, jitter: float = 0, general: bool = False, tokens: bool = True,
     channels: int = 3, size: int = 64,
 ) -> None:  # fmt: skip
-    """A forward and a backward of sampling; as polar_embed asks for them, or as images."""
+    """A forward and a backward of sampling, as polar_embed asks for them, or as images."""
     (rings, sectors), (along, around) = PATCHES[case]
     rows, columns = rings * along, sectors * around
     sampling = checked_sampling(
@@ -157,7 +157,7 @@ CALLS: dict[str, Callable[[], object]] = {
         lambda: sample(SMALL, torch.float32, channels=96, size=1),
     **{f"map to image, {channels} channels, {name}":
        lambda channels=channels, dtype=dtype: bring_back(channels, dtype)
-       for channels in (1, 10, 96) for name, dtype in DTYPES.items() if name != "float16"},
+       for channels in (1, 10, 96) for name, dtype in DTYPES.items()},
     "map to image, affine": lambda: bring_back(10, torch.float32, "affine"),
     "map to image, any lens": lambda: bring_back(10, torch.float32, "points"),
     "map to image, planes": lambda: bring_back(96, torch.float32, tokens=False),

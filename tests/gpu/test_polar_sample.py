@@ -12,8 +12,8 @@ from strategies import places, to_tokens
 from darswin.ops import polar_sample, use_reference
 
 LAYOUTS = ("tokens", "image")
-# NumPy, which the interpreter computes with, tells of every NaN.
-pytestmark = pytest.mark.filterwarnings("ignore:invalid value:RuntimeWarning")
+# NumPy, which the interpreter computes with, tells of every NaN and infinity.
+pytestmark = pytest.mark.filterwarnings("ignore:(invalid value|overflow):RuntimeWarning")
 
 
 def make_inputs(batch=2, channels=3, size=(17, 23), rows=2, columns=8, shared=False, general=False):

@@ -2,15 +2,16 @@
 values at the edge. Maps and images are small, since a program takes a while in the interpreter."""
 
 import math
+from unittest import mock
 
 import pytest
 import torch
 from helpers import assert_accurate, with_gradients
 
-from darswin.ops import polar_to_image, use_reference
+from darswin.ops import _library, polar_to_image, use_reference
 
-# NumPy, which the interpreter computes with, tells of every NaN.
-pytestmark = pytest.mark.filterwarnings("ignore:invalid value:RuntimeWarning")
+# NumPy, which the interpreter computes with, tells of every NaN and infinity.
+pytestmark = pytest.mark.filterwarnings("ignore:(invalid value|overflow):RuntimeWarning")
 
 
 def make_inputs(batch=2, rings=4, sectors=8, channels=3, size=(7, 9), lenses=1, general=None):
@@ -129,13 +130,15 @@ def test_strided_inputs(on):
         assert torch.equal(one, other)
 
 
-def test_bfloat16(on):
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
+def test_types_of_16_bits(dtype, on):
     x, *lens = make_inputs()
-    run, half = on(back()), x.bfloat16()
-    found, grad, *grads = with_gradients(lambda *t: run(*t).float(), (half, *lens))
+    run, half = on(back()), x.to(dtype)
+    with mock.patch.object(_library, "has_kernels", return_value=True):  # the interpreter's, too
+        found, grad, *grads = with_gradients(lambda *t: run(*t).float(), (half, *lens))
+        assert run(half, *lens).dtype == grad.dtype == dtype
     expected, *expected_grads = with_gradients(run, (half.float(), *lens))
-    assert run(half, *lens).dtype == grad.dtype == torch.bfloat16
-    # The interpreter cuts off the digits that hardware rounds.
-    torch.testing.assert_close(found, expected, rtol=2**-7, atol=0)
+    # The interpreter cuts off the digits of bfloat16 that hardware rounds.
+    torch.testing.assert_close(found, expected, rtol=torch.finfo(dtype).eps, atol=1e-7)
     for got, want in zip((grad, *grads), expected_grads, strict=True):
         torch.testing.assert_close(got.float(), want, rtol=0.02, atol=0.02 * want.abs().max())
