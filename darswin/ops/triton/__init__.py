@@ -8,8 +8,8 @@ arguments, and its `takes` says which of them the kernel does not compute (`_dev
 Triton is no dependency: without it nothing is registered, and with it nothing of it is imported
 before the first call on a CUDA device. The rules of the kernels:
 
-- A program owns what it writes, or adds integers to it (`fixed_point`), whose order does not matter:
-  two runs give the same bits. Where such a sum has a summand that is not finite, all of it is NaN.
+- A program owns what it writes, or adds integers to it (`fixed_point`), in any order: two runs give
+  the same bits. Such a gradient is NaN all over where a number that arrives is not finite.
 - Numbers are widened to float32 as they are read, and rounded once as they are written. Each
   product names its `input_precision`, each launch whether multiplications and additions are fused.
 - Places in tensors are int64: a batch may have more than 2³¹ numbers.
