@@ -182,12 +182,12 @@ def _map(
     batch, rings, sectors, _, heads, _ = qkv.shape
     windows = (rings // window[0]) * (sectors // window[1])
     chunk = min(max(batch * heads * windows // PROGRAMS, 1), windows)
-    seams = (
-        size if wraps else size - shifted
-        for size, shifted, wraps in zip((rings, sectors), shift, periodic, strict=True)
-    )
-    chunks = triton.cdiv(windows, chunk)
-    return _Map(rings, sectors, *shift, *seams, heads, len(bias), chunks, chunk)
+    return _Map(
+        rings=rings, sectors=sectors, shift_r=shift[0], shift_a=shift[1],
+        seam_r=rings if periodic[0] else rings - shift[0],
+        seam_a=sectors if periodic[1] else sectors - shift[1],
+        heads=heads, tables=len(bias), chunks=triton.cdiv(windows, chunk), chunk=chunk,
+    )  # fmt: skip
 
 
 def _constants(qkv: Tensor, window: Sequence[int]) -> dict[str, Any]:
