@@ -202,11 +202,11 @@ def test_points_at_nan_or_infinity_sample_nothing(spoiled, rows, jitter, bad):
         assert (ours[0][0, :, 0, 0] == 0).all() and ours[0][1, :, 0, 1].all()
 
 
-def on_kernels(run, installed=True):
+def on_kernels(run, operator="window_attention", installed=True):
     """Whether a call on a CUDA device runs a kernel, with fake tensors and a fake twin."""
     with (
         mock.patch.object(triton, "INSTALLED", installed),
-        mock.patch.object(_devices, "window_attention") as twin,
+        mock.patch.object(_devices, operator) as twin,
         FakeTensorMode(),
     ):
         run()
@@ -218,6 +218,31 @@ def attend(window=(1, 16), head_dim=32, dtype=torch.float32):
     table = (1, 2, 2 * window[0] - 1, 2 * window[1] - 1)
     bias = torch.empty(table, device="cuda", dtype=f64 if dtype == f64 else torch.float32)
     window_attention(qkv, bias, window=window)
+
+
+def sample(operator, dtype=torch.float32, channels=3, size=8):
+    real = f64 if dtype == f64 else torch.float32
+    lens = (torch.empty(shape, device="cuda", dtype=real) for shape in ((1, 4), (8,), (1, 2)))
+    image = torch.empty(2, channels, size, size, device="cuda", dtype=dtype)
+    if operator == "polar_sample":
+        polar_sample(image, *lens, samples=(2, 2), jitter=1.0)
+    else:
+        weight = torch.empty(5, 4 * channels, device="cuda", dtype=real)
+        polar_embed(image, *lens, weight, samples=(2, 2))
+
+
+@pytest.mark.parametrize("operator", ["polar_sample", "polar_embed"])
+def test_a_cuda_device_samples_by_kernels_and_by_torch_what_they_do_not_take(operator):
+    def kernels(installed=True, **options):
+        return on_kernels(lambda: sample(operator, **options), operator, installed)
+
+    for dtype in (torch.float32, torch.bfloat16, torch.uint8):
+        assert kernels(dtype=dtype)
+    assert kernels(channels=300) and kernels(dtype=torch.uint8, channels=16)
+    assert not kernels(dtype=torch.uint8, channels=17)
+    assert not kernels(dtype=f64)
+    assert not kernels(size=50_000)
+    assert not kernels(installed=False)
 
 
 def test_a_cuda_device_runs_the_kernels_and_torch_what_they_do_not_take():
