@@ -77,3 +77,16 @@ def test_nothing_to_embed(sizes, on):
         expected = with_gradients(embedder(8, (2, 4)), inputs)
     for got, want in zip(results, expected, strict=True):
         torch.testing.assert_close(got, want)
+
+
+@pytest.mark.parametrize("wanted", [(True, True, False, True), (False, False, False, True),
+                                    (True, False, False, False)])  # fmt: skip
+def test_opcheck(wanted, device):
+    image, radii, center = (t.to(device) for t in make_inputs(batch=1))
+    weight = torch.randn(7, 24, device=device)
+    call = (image, radii, azimuths(8).to(device), center, None, None, None, None, (2, 4), (), (),
+            False, weight)  # fmt: skip
+    checks = dict(test_utils=("test_schema", "test_faketensor"))
+    torch.library.opcheck(torch.ops.darswin.polar_embed.default, (*call, None), **checks)
+    call = (*call, torch.randn(1, 1, 2, 7, device=device), *wanted)
+    torch.library.opcheck(torch.ops.darswin.polar_embed_backward.default, call, **checks)

@@ -289,3 +289,14 @@ def test_autocast_gives_bfloat16(device):
         found = sampler(8, (2, 4))(*inputs)
     assert found.dtype == torch.bfloat16
     torch.testing.assert_close(found.float(), expected, rtol=2**-7, atol=0)
+
+
+@pytest.mark.parametrize("wanted", [(True, True, True), (True, False, False), (False, True, False)])
+def test_opcheck(wanted, device):
+    tensors = [t.to(device) for t in make_inputs(batch=1, general=True)]
+    amount = torch.tensor(0.5, dtype=torch.float64), torch.tensor(3)
+    call = (*tensors[:2], azimuths(8).to(device), *tensors[2:], *amount, (2, 4), (), (), False)
+    checks = dict(test_utils=("test_schema", "test_faketensor"))
+    torch.library.opcheck(torch.ops.darswin.polar_sample.default, (*call, True), **checks)
+    call = (*call, True, torch.randn(1, 1, 2, 24, device=device), *wanted)
+    torch.library.opcheck(torch.ops.darswin.polar_sample_backward.default, call, **checks)

@@ -142,3 +142,15 @@ def test_types_of_16_bits(dtype, on):
     torch.testing.assert_close(found, expected, rtol=torch.finfo(dtype).eps, atol=1e-7)
     for got, want in zip((grad, *grads), expected_grads, strict=True):
         torch.testing.assert_close(got.float(), want, rtol=0.02, atol=0.02 * want.abs().max())
+
+
+@pytest.mark.parametrize("wanted", [(True, True), (True, False), (False, True)])
+@pytest.mark.parametrize("general", [None, "affine", "points"])
+def test_opcheck(general, wanted, device):
+    x, radii, *lens = (t.to(device) for t in make_inputs(batch=1, size=(3, 4), general=general))
+    plane = (None, None, lens[0]) if general == "points" else (*lens, None, None)[:3]
+    call = (x, radii, *plane, torch.ones(1, device=device), [3, 4], True)
+    checks = dict(test_utils=("test_schema", "test_faketensor"))
+    torch.library.opcheck(torch.ops.darswin.polar_to_image.default, call, **checks)
+    call = (*call, torch.randn(1, 3, 4, 3, device=device), *wanted)
+    torch.library.opcheck(torch.ops.darswin.polar_to_image_backward.default, call, **checks)

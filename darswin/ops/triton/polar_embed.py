@@ -6,7 +6,6 @@ again. Products are torch's, so `torch.backends.cuda.matmul` says how exact they
 
 from typing import Any
 
-import torch
 from torch import Tensor
 
 from darswin.ops import reference
@@ -40,7 +39,6 @@ def polar_embed_backward(*arguments: Any) -> tuple[Tensor, ...]:
         if any(wanted):
             of_samples = grad @ weight.float()
             gradients = polar_sample.backward(sampling, True, of_samples, *wanted)
-        of_weight = of_bias = torch.empty(0, device=grad.device)
-        if weight_grad:
-            of_weight, of_bias = grad.t() @ _samples(sampling), grad.sum(0)
-    return *gradients, of_weight, of_bias
+        if not weight_grad:
+            return *gradients, grad.new_empty((0,)), grad.new_empty((0,))
+        return *gradients, grad.t() @ _samples(sampling), grad.sum(0)

@@ -312,15 +312,16 @@ def polar_to_image_backward(
     grad_x = x.new_empty(x.shape if x_grad else (0,))
     if map_sums is not None and largest is not None:
         fixed_point.finish(map_sums, largest, grad_x, bits)
-    none = radii.new_empty((0,))
-    if ring_sums is None:
-        return grad_x, none, none, none, none
-    of_radii = like(ring_sums.view(batch, -1, x.shape[1]).sum(1, dtype=torch.float64), radii)
+    grads = [radii.new_empty((0,)) for _ in lens]
+    if ring_sums is not None:
+        rings = ring_sums.view(batch, -1, x.shape[1])
+        grads[0] = like(rings.sum(1, dtype=torch.float64), radii)
+    if plane_sums is not None and center is not None:
+        plane = plane_sums.view(batch, -1, _PLANE_SUMS)
+        grads[1:3] = _of_lens(plane.sum(1, dtype=torch.float64), center, affine)
     if of_points is not None and points is not None:
-        return grad_x, of_radii, none, none, like(of_points, points)
-    assert plane_sums is not None and center is not None
-    sums = plane_sums.view(batch, -1, _PLANE_SUMS).sum(1, dtype=torch.float64)
-    return grad_x, of_radii, *_of_lens(sums, center, affine), none
+        grads[3] = like(of_points, points)
+    return grad_x, *grads
 
 
 def _of_lens(sums: Tensor, center: Tensor, affine: Tensor | None) -> tuple[Tensor, Tensor]:
