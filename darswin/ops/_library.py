@@ -56,7 +56,14 @@ def has_kernels(tensor: Tensor) -> bool:
     A graph that is exported consists of torch's own operations: it runs without this package.
     """
     usable = triton.INSTALLED and not _reference and not torch.compiler.is_exporting()
-    return usable and tensor.device.type == "cuda"
+    return usable and tensor.device.type == "cuda" and _is_known_gpu(tensor.device.index)
+
+
+@torch.compiler.assume_constant_result
+def _is_known_gpu(index: int) -> bool:
+    """Whether the kernels were made for a CUDA device: NVIDIA's since the A100. AMD's are called
+    "cuda" too."""
+    return torch.version.hip is None and torch.cuda.get_device_capability(index) >= (8, 0)
 
 
 @torch.compiler.assume_constant_result  # before torch 2.12 Dynamo cannot trace what it calls

@@ -202,10 +202,11 @@ def test_points_at_nan_or_infinity_sample_nothing(spoiled, rows, jitter, bad):
         assert (ours[0][0, :, 0, 0] == 0).all() and ours[0][1, :, 0, 1].all()
 
 
-def on_kernels(run, operator="window_attention", installed=True):
+def on_kernels(run, operator="window_attention", installed=True, capability=(8, 0)):
     """Whether a call on a CUDA device runs a kernel, with fake tensors and a fake twin."""
     with (
         mock.patch.object(triton, "INSTALLED", installed),
+        mock.patch.object(torch.cuda, "get_device_capability", return_value=capability),
         mock.patch.object(_devices, operator) as twin,
         FakeTensorMode(),
     ):
@@ -252,6 +253,7 @@ def test_a_cuda_device_runs_the_kernels_and_torch_what_they_do_not_take():
     assert not on_kernels(lambda: attend((5, 13)))
     assert not on_kernels(lambda: attend(head_dim=129))
     assert not on_kernels(lambda: attend(dtype=f64))
+    assert not on_kernels(attend, capability=(7, 5))
     with mock.patch.object(torch.compiler, "is_exporting", return_value=True):
         assert not on_kernels(attend)  # what is exported runs without this package
 

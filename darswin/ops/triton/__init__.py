@@ -2,11 +2,11 @@
 
 An operator is declared once, in C++, with its fake and autograd in `darswin/ops`; here it gets what
 it runs on a CUDA device. `LAUNCHERS` names the module of each. In it a function of the operator's
-name takes what the schema says, makes the outputs and launches; the public function has checked the
-arguments, and its `takes` says which of them the kernel does not compute (`_devices.py` does then).
+name takes what the schema says, makes the outputs and launches. The public function has checked the
+arguments, and knows which of them the kernel does not take; then `_devices.py` computes.
 
-Triton is no dependency: without it nothing is registered, and with it nothing of it is imported
-before the first call on a CUDA device. The rules of the kernels:
+The kernels are for NVIDIA's GPUs since the A100. Triton is no dependency: without it nothing is
+registered, and with it no kernel is imported before the first call on a CUDA device. Their rules:
 
 - A program owns what it writes, or adds integers to it (`fixed_point`), in any order: two runs give
   the same bits. Such a gradient is NaN all over where a number that arrives is not finite.
