@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/installed
 
-.PHONY: help build demo test test-lowest test-isa test-asan fuzz kills lint format bench study learned-lens worlds study-dense tables docs dist wheels repair published-wheels test-torch aarch64 clean
+.PHONY: help build demo test test-triton test-gpu test-lowest test-isa test-asan fuzz kills lint format bench bench-gpu study learned-lens worlds study-dense tables docs dist wheels repair published-wheels test-torch aarch64 clean
 
 help:  ## this list
 	@grep -E '^[a-z0-9-]+:.*##' Makefile | sed -E 's/:.*## /\t/' | expand -t 18
@@ -24,6 +24,23 @@ demo: build  ## train on nearly undistorted digits, test through any fisheye, dr
 
 test: build  ## all tests
 	$(BIN)/python -m pytest
+
+# Triton stands in a folder of its own, so that all else is tested without it.
+TRITON := .triton
+TRITON_VERSION := 3.9.0
+
+$(TRITON)/$(TRITON_VERSION): $(STAMP)
+	rm -rf $(TRITON)
+	$(BIN)/pip install -q --no-deps --target $(TRITON) triton==$(TRITON_VERSION)
+	@touch $@
+
+test-triton: build $(TRITON)/$(TRITON_VERSION)  ## the kernels for GPUs without one: interpreted, and compiled
+	TRITON_INTERPRET=1 PYTHONPATH=$(CURDIR)/$(TRITON) $(BIN)/python -m pytest -q tests/gpu
+	PYTHONPATH=$(CURDIR):$(CURDIR)/$(TRITON) $(BIN)/python tests/gpu/compile_kernels.py
+
+# torch's builds for CUDA bring Triton. Without a device the tests say so and are skipped.
+test-gpu: build  ## the kernels and models on a CUDA device
+	$(BIN)/python -m pytest -q -rs tests/gpu
 
 # Everything that pyproject.toml declares, at its lowest version, but for torch.
 LOWEST := .venv-lowest
@@ -89,6 +106,9 @@ bench: build  ## time the operators against their peers, and training; nothing e
 	$(BIN)/python benchmarks/to_image.py --out benchmarks/results
 	$(BIN)/python benchmarks/training.py --out benchmarks/results
 	$(BIN)/python -m darswin bench --out benchmarks/results
+
+bench-gpu: build  ## time the operators and a model on a CUDA device
+	$(BIN)/python benchmarks/gpu.py
 
 study: build  ## the paper's experiments, small: an hour; goes on where it was stopped
 	$(BIN)/python studies/study.py

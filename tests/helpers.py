@@ -41,6 +41,7 @@ def assert_accurate(
         ours = _results(operator, inputs, torch.float32, mask, reference=False)
         for index, (exact, base, got) in enumerate(zip(oracle, baseline, ours, strict=True)):
             assert got.dtype == torch.float32 and got.shape == exact.shape
+            assert torch.equal(got.isnan(), exact.isnan()), f"result {index} is NaN elsewhere"
             if exact.numel() == 0:
                 continue
             eps = torch.finfo(torch.float32).eps

@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.autograd import forward_ad
 from torch.autograd.graph import increment_version
 
-from darswin.ops import _module
+from darswin.ops import _module, triton
 
 _reference = False
 
@@ -49,6 +49,23 @@ def compiled(tensor: Tensor) -> bool:
     return tensor.device.type == "cpu" and not _reference
 
 
+def has_kernels(tensor: Tensor) -> bool:
+    """Whether operators on `tensor` run the kernels of `darswin.ops.triton`, where these compute
+    what is asked for.
+
+    A graph that is exported consists of torch's own operations: it runs without this package.
+    """
+    usable = triton.INSTALLED and not _reference and not torch.compiler.is_exporting()
+    return usable and tensor.device.type == "cuda" and _is_known_gpu(tensor.device.index)
+
+
+@torch.compiler.assume_constant_result
+def _is_known_gpu(index: int) -> bool:
+    """Whether the kernels were made for a CUDA device: NVIDIA's since the A100. AMD's are called
+    "cuda" too."""
+    return torch.version.hip is None and torch.cuda.get_device_capability(index) >= (8, 0)
+
+
 @torch.compiler.assume_constant_result  # before torch 2.12 Dynamo cannot trace what it calls
 def _has_autocast(device: str) -> bool:
     return torch.amp.is_autocast_available(device)
@@ -83,24 +100,28 @@ def autocast_off(device: str) -> contextlib.AbstractContextManager:
 
 
 def run(
-    reference: Callable[..., Tensor], on_devices: Callable[..., Tensor], *arguments: Any
+    reference: Callable[..., Tensor],
+    on_devices: Callable[..., Tensor],
+    *arguments: Any,
+    kernel: bool = False,
 ) -> Tensor:
-    """An operator on checked arguments: compiled, or one of its twins.
+    """An operator on checked arguments: compiled, a kernel for GPUs, or one of its twins.
 
-    The compiled one takes the fields of a NamedTuple one by one.
+    The compiled one and the kernel take the fields of a NamedTuple one by one.
 
     Args:
         reference: the twin of the same name in reference.py.
-        on_devices: what runs on devices other than the CPU.
+        on_devices: what runs on devices other than the CPU, where there is no kernel.
+        kernel: whether there is a kernel that computes this, where `has_kernels`.
     """
     flat: list[Any] = []
     for argument in arguments:
         flat.extend(argument if hasattr(argument, "_fields") else (argument,))
-    on_cpu = compiled(flat[0])
+    fused = compiled(flat[0]) or (kernel and has_kernels(flat[0]))
     twin = reference if _reference else on_devices
-    if on_cpu or twin is not reference:
+    if fused or twin is not reference:
         refuse_other_derivatives(f"darswin.{reference.__name__}", flat)
-    if on_cpu:
+    if fused:
         return getattr(torch.ops.darswin, reference.__name__)(*flat)
     with autocast_off(flat[0].device.type):
         return twin(*arguments)

@@ -49,6 +49,17 @@ class Sampling(NamedTuple):
         rings = self.radii.shape[1] // self.samples[0]
         return self.image.shape[0], rings, self.azimuths.shape[0] // self.samples[1]
 
+    def kernel_takes(self) -> bool:
+        """Whether the kernels for GPUs are there and compute it: not float64, nor uint8 images of
+        many channels, whose mean and std are numbers in the kernel, nor 2³¹ samples or pixels of an
+        image."""
+        image = self.image
+        if not _library.has_kernels(image) or image.dtype == torch.float64:
+            return False
+        frames = image.dtype == torch.uint8 and image.shape[1] > 16
+        counts = self.radii.shape[1] * self.azimuths.shape[0], image.shape[2] * image.shape[3]
+        return not frames and max(counts) < 2**31 - 2**16
+
     def new_output(self, shape: tuple[int, ...]) -> Tensor:
         """An empty tensor of the output's type."""
         return self.radii.new_empty(shape, dtype=torch.bfloat16 if self.bfloat16 else None)

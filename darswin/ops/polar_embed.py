@@ -67,7 +67,10 @@ def polar_embed(
     if bias is not None:
         check_tensor("bias", bias, like=image, dtypes=dtypes)
         check_shape("bias", bias, "(D,) = ({},)", (weight.shape[0],))
-    return _library.run(reference.polar_embed, _devices.polar_embed, sampling, weight, bias)
+    return _library.run(
+        reference.polar_embed, _devices.polar_embed, sampling, weight, bias,
+        kernel=sampling.kernel_takes(),
+    )  # fmt: skip
 
 
 @torch.library.register_fake("darswin::polar_embed")

@@ -90,7 +90,10 @@ def polar_sample(
         image, radii, azimuths, center, affine, offsets, jitter, seed, samples, mean, std
     )
     check_layout(layout)
-    return _library.run(reference.polar_sample, _devices.polar_sample, sampling, layout == "tokens")
+    return _library.run(
+        reference.polar_sample, _devices.polar_sample, sampling, layout == "tokens",
+        kernel=sampling.kernel_takes(),
+    )  # fmt: skip
 
 
 @torch.library.register_fake("darswin::polar_sample")

@@ -39,7 +39,8 @@ def polar_to_image(
         points right, π/2 down. Sector a has its middle at 2π(a + ½)/A, as in `polar_grid`.
 
     Args:
-        x: (B, R, A, D), float32, float64 or bfloat16; under autocast float16 counts as float32.
+        x: (B, R, A, D), float32, float64 or bfloat16. float16 is taken like bfloat16 where
+            `darswin.ops.triton` has kernels, elsewhere as float32 under autocast.
         radii: (B or 1, R) px, of the rings' centres: finite, at least 0, rising. Like all tensors
             that follow float64 if x is, else float32.
         center: (B or 1, 2) px, x then y; None where there are `points`.
@@ -52,7 +53,7 @@ def polar_to_image(
         layout: "image" or "tokens".
 
     Returns:
-        "image": (B, D, H, W). "tokens": (B, H, W, D). Of the type of x; bfloat16 is computed in
+        "image": (B, D, H, W). "tokens": (B, H, W, D). Of the type of x; 16 bits are computed in
         float32 and rounded once.
 
     Gradients go to x, radii, center, affine and points; results and gradients do not depend on the
@@ -65,9 +66,12 @@ def polar_to_image(
         ValueError: a shape, device or range that does not fit, or radii that do not rise.
         NotImplementedError: forward-mode derivatives, those of torch.func, and second ones.
     """
-    if isinstance(x, Tensor):
+    half: tuple[torch.dtype, ...] = (torch.bfloat16,)
+    if isinstance(x, Tensor) and _library.has_kernels(x):
+        half = (torch.bfloat16, torch.float16)
+    elif isinstance(x, Tensor):
         x = _library.without_float16(x)
-    check_tensor("x", x, dtypes=(*DTYPES, torch.bfloat16))
+    check_tensor("x", x, dtypes=(*DTYPES, *half))
     check_shape("x", x, "(B, R, A, D)", (None,) * 4)
     rings, sectors = x.shape[1:3]
     if rings == 0 or sectors == 0:
@@ -92,7 +96,16 @@ def polar_to_image(
     return _library.run(
         reference.polar_to_image, reference.polar_to_image,
         x, radii, center, affine, points, r_max, (height, width), layout == "tokens",
+        kernel=_kernel_takes(x, height * width),
     )  # fmt: skip
+
+
+def _kernel_takes(x: Tensor, pixels: int) -> bool:
+    """Whether the kernel for GPUs is there and computes it: not float64, nor 2³¹ pixels or tokens
+    of an image."""
+    if not _library.has_kernels(x) or x.dtype == torch.float64:
+        return False
+    return max(pixels, x.shape[1] * x.shape[2]) < 2**31 - 2**16
 
 
 def _check_lens(

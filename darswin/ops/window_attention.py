@@ -1,5 +1,7 @@
 """window_attention: attention in the windows of a polar map. Public function, fake, autograd."""
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -24,10 +26,10 @@ def window_attention(
 
     Args:
         qkv: (B, R, A, 3, heads, d), float32, float64 or bfloat16. With bfloat16 the arithmetic is
-            float32, and the result and the gradient of qkv are rounded once. float16 is taken as
-            float32 under autocast.
+            float32, and the result and the gradient of qkv are rounded once. float16 is taken like
+            bfloat16 where `darswin.ops.triton` has kernels, elsewhere as float32 under autocast.
         bias: (B or 1, heads, 2·M_r-1, 2·M_φ-1): entry [Δr+M_r-1, Δφ+M_φ-1], Δ = query - key. Of
-            the type of qkv; with bfloat16 it may as well be float32, and is used as such.
+            the type of qkv; with one of 16 bits it may as well be float32, and is used as such.
         window: (M_r, M_φ), which divides (R, A).
         shift: (s_r, s_φ), 0 ≤ s_r < R and 0 ≤ s_φ < A.
         periodic: whether the map wraps around along (radius, azimuth). A plain Swin map is
@@ -47,10 +49,12 @@ def window_attention(
 
     Source: DarSwin, ICCV 2023, sec. 4.4; Swin Transformer, ICCV 2021, sec. 3.2.
     """
+    narrow: tuple[torch.dtype, ...] = (torch.bfloat16,)
     if isinstance(qkv, Tensor) and isinstance(bias, Tensor):
-        qkv, bias = _arithmetic_types(qkv, bias)
-    check_tensor("qkv", qkv, dtypes=(*DTYPES, torch.bfloat16))
-    half = qkv.dtype == torch.bfloat16
+        narrow = (torch.bfloat16, torch.float16) if _library.has_kernels(qkv) else narrow
+        qkv, bias = _arithmetic_types(qkv, bias, narrow)
+    check_tensor("qkv", qkv, dtypes=(*DTYPES, *narrow))
+    half = qkv.dtype in narrow
     check_tensor("bias", bias, like=qkv, dtypes=(torch.float32,) if half else None)
     check_shape("qkv", qkv, "(B, R, A, 3, heads, d)", (None, None, None, 3, None, None))
     batch, rings, sectors, _, heads, head_dim = qkv.shape
@@ -70,18 +74,31 @@ def window_attention(
     scale = head_dim**-0.5 if scale is None else float(scale)
     # As ints: torch.jit.trace takes no list of bools.
     wrap = tuple(int(bool(p)) for p in periodic)
+    arguments = (qkv, bias, window, shift, wrap, scale)
     return _library.run(
-        reference.window_attention, _devices.window_attention, qkv, bias, window, shift, wrap, scale
+        reference.window_attention,
+        _devices.window_attention,
+        *arguments,
+        kernel=_kernel_takes(bias.dtype, window, head_dim),
     )
 
 
-def _arithmetic_types(qkv: Tensor, bias: Tensor) -> tuple[Tensor, Tensor]:
-    """What autocast may have made of the arguments, as the operator takes it: qkv in bfloat16
-    stays, since the operator widens it as it reads; a bias that goes with it is float32."""
-    qkv, bias = _library.without_float16(qkv), _library.without_float16(bias)
-    if bias.dtype != torch.bfloat16:
+def _kernel_takes(dtype: torch.dtype, window: tuple[int, int], head_dim: int) -> bool:
+    """Whether the kernel for GPUs computes it: a program holds the pairs of a window's tokens."""
+    return dtype == torch.float32 and math.prod(window) <= 64 and head_dim <= 128
+
+
+def _arithmetic_types(
+    qkv: Tensor, bias: Tensor, narrow: tuple[torch.dtype, ...]
+) -> tuple[Tensor, Tensor]:
+    """What autocast may have made of the arguments, as the operator takes it: qkv in one of the
+    `narrow` types stays, since the operator widens it as it reads; a bias that goes with it is
+    float32."""
+    if torch.float16 not in narrow:
+        qkv, bias = _library.without_float16(qkv), _library.without_float16(bias)
+    if bias.dtype not in narrow:
         return qkv, bias
-    mixed = qkv.dtype == torch.bfloat16 or _library.autocast_dtype(qkv) is not None
+    mixed = qkv.dtype in narrow or _library.autocast_dtype(qkv) is not None
     return qkv, bias.float() if mixed else bias
 
 

@@ -2,12 +2,24 @@
 arguments are in test_properties.py, launches in test_launches.py."""
 
 import math
+import subprocess
+import sys
+from unittest import mock
 
 import pytest
 import torch
 from helpers import as_on_devices, assert_accurate, with_gradients
+from torch._subclasses import FakeTensorMode
 
-from darswin.ops import polar_embed, polar_sample, reference, use_reference, window_attention
+from darswin.ops import (
+    _devices,
+    polar_embed,
+    polar_sample,
+    reference,
+    triton,
+    use_reference,
+    window_attention,
+)
 from darswin.ops._devices import philox
 
 f64 = torch.float64
@@ -188,3 +200,77 @@ def test_points_at_nan_or_infinity_sample_nothing(spoiled, rows, jitter, bad):
             assert got.isfinite().all()
             torch.testing.assert_close(got, want, rtol=1e-9, atol=1e-9)
         assert (ours[0][0, :, 0, 0] == 0).all() and ours[0][1, :, 0, 1].all()
+
+
+def on_kernels(run, operator="window_attention", installed=True, capability=(8, 0)):
+    """Whether a call on a CUDA device runs a kernel, with fake tensors and a fake twin."""
+    with (
+        mock.patch.object(triton, "INSTALLED", installed),
+        mock.patch.object(torch.cuda, "get_device_capability", return_value=capability),
+        mock.patch.object(_devices, operator) as twin,
+        FakeTensorMode(),
+    ):
+        run()
+    return not twin.called
+
+
+def attend(window=(1, 16), head_dim=32, dtype=torch.float32):
+    qkv = torch.empty(2, window[0], window[1], 3, 2, head_dim, device="cuda", dtype=dtype)
+    table = (1, 2, 2 * window[0] - 1, 2 * window[1] - 1)
+    bias = torch.empty(table, device="cuda", dtype=f64 if dtype == f64 else torch.float32)
+    window_attention(qkv, bias, window=window)
+
+
+def sample(operator, dtype=torch.float32, channels=3, size=8):
+    real = f64 if dtype == f64 else torch.float32
+    lens = (torch.empty(shape, device="cuda", dtype=real) for shape in ((1, 4), (8,), (1, 2)))
+    image = torch.empty(2, channels, size, size, device="cuda", dtype=dtype)
+    if operator == "polar_sample":
+        polar_sample(image, *lens, samples=(2, 2), jitter=1.0)
+    else:
+        weight = torch.empty(5, 4 * channels, device="cuda", dtype=real)
+        polar_embed(image, *lens, weight, samples=(2, 2))
+
+
+@pytest.mark.parametrize("operator", ["polar_sample", "polar_embed"])
+def test_a_cuda_device_samples_by_kernels_and_by_torch_what_they_do_not_take(operator):
+    def kernels(installed=True, **options):
+        return on_kernels(lambda: sample(operator, **options), operator, installed)
+
+    for dtype in (torch.float32, torch.bfloat16, torch.uint8):
+        assert kernels(dtype=dtype)
+    assert kernels(channels=300) and kernels(dtype=torch.uint8, channels=16)
+    assert not kernels(dtype=torch.uint8, channels=17)
+    assert not kernels(dtype=f64)
+    assert not kernels(size=50_000)
+    assert not kernels(installed=False)
+
+
+def test_a_cuda_device_runs_the_kernels_and_torch_what_they_do_not_take():
+    for dtype in (torch.float32, torch.bfloat16, torch.float16):
+        assert on_kernels(lambda dtype=dtype: attend(dtype=dtype))
+    assert on_kernels(lambda: attend((8, 8), head_dim=128))
+    assert not on_kernels(lambda: attend((5, 13)))
+    assert not on_kernels(lambda: attend(head_dim=129))
+    assert not on_kernels(lambda: attend(dtype=f64))
+    assert not on_kernels(attend, capability=(7, 5))
+    with mock.patch.object(torch.compiler, "is_exporting", return_value=True):
+        assert not on_kernels(attend)  # what is exported runs without this package
+
+
+def test_without_triton_a_cuda_device_runs_torch():
+    assert not on_kernels(attend, installed=False)
+    with pytest.raises(TypeError, match=r"got torch.float16"):
+        on_kernels(lambda: attend(dtype=torch.float16), installed=False)
+
+
+def test_the_kernels_are_imported_by_the_first_call_alone():
+    code = (
+        "import sys, torch, darswin\n"
+        "from darswin.ops import triton\n"
+        "assert not any(name.startswith('darswin.ops.triton.') for name in sys.modules)\n"
+        "for name in triton.LAUNCHERS:\n"
+        "    there = torch._C._dispatch_has_kernel_for_dispatch_key(f'darswin::{name}', 'CUDA')\n"
+        "    assert there == triton.INSTALLED\n"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
