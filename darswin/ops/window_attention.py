@@ -87,7 +87,7 @@ def _kernel_takes(dtype: torch.dtype, window: tuple[int, int], head_dim: int) ->
     """Whether the kernel for GPUs computes it: a program holds the pairs of a window's tokens, and
     their queries, keys and values, in registers."""
     tokens = math.prod(window)
-    return dtype == torch.float32 and tokens <= 64 and tokens * head_dim <= 2048
+    return dtype == torch.float32 and tokens <= 64 and max(tokens, 16) * head_dim <= 2048
 
 
 def _arithmetic_types(
