@@ -249,9 +249,11 @@ def test_a_cuda_device_samples_by_kernels_and_by_torch_what_they_do_not_take(ope
 def test_a_cuda_device_runs_the_kernels_and_torch_what_they_do_not_take():
     for dtype in (torch.float32, torch.bfloat16, torch.float16):
         assert on_kernels(lambda dtype=dtype: attend(dtype=dtype))
-    assert on_kernels(lambda: attend((8, 8), head_dim=128))
-    assert not on_kernels(lambda: attend((5, 13)))
-    assert not on_kernels(lambda: attend(head_dim=129))
+    assert on_kernels(lambda: attend((8, 8), head_dim=32))
+    assert on_kernels(lambda: attend((1, 1), head_dim=1))
+    assert not on_kernels(lambda: attend((5, 13), head_dim=16))
+    assert not on_kernels(lambda: attend((8, 8), head_dim=33))
+    assert not on_kernels(lambda: attend((1, 1), head_dim=129))
     assert not on_kernels(lambda: attend(dtype=f64))
     assert not on_kernels(attend, capability=(7, 5))
     with mock.patch.object(torch.compiler, "is_exporting", return_value=True):

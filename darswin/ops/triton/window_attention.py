@@ -247,6 +247,7 @@ def window_attention_backward(
         grad_pairs = grad_pairs.sum(1 if of.tables > 1 else (0, 1))
         entries = triton.cdiv(grad_bias[0, 0].numel(), _ENTRIES)
         _fold[of.tables * of.heads, entries](
-            grad_pairs, grad_bias, *window, _ENTRIES, num_warps=_ENTRIES // 32
-        )
+            grad_pairs, grad_bias, *window, _ENTRIES,
+            num_warps=_ENTRIES // 32, enable_fp_fusion=True,
+        )  # fmt: skip
     return grad_qkv, grad_bias
