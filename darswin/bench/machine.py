@@ -58,12 +58,19 @@ def num_threads(count: int) -> Iterator[None]:
 
 
 def _cpu() -> str:
+    """Its name, and on x86 its family and model: the name of a virtual machine's may be its
+    maker's for years."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
     except OSError:
         return platform.processor()
-    names = (line.split(":")[1].strip() for line in lines if line.startswith("model name"))
-    return next(names, platform.processor())
+    facts = {
+        key.strip(): value.strip() for key, _, value in (line.partition(":") for line in lines)
+    }
+    name = facts.get("model name", platform.processor())
+    if "cpu family" not in facts:
+        return name
+    return f"{name} (family {facts['cpu family']}, model {facts['model']})"
 
 
 def _commit() -> str:

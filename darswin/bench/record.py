@@ -1,6 +1,7 @@
 """Records of what was measured, as JSON files."""
 
 import json
+import re
 import sys
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass, field
@@ -41,8 +42,10 @@ class Record:
         return cls(**content)
 
     def publish(self, folder: Path, suite: str, draw: Callable[["Record", Path], None]) -> None:
-        """Writes `SUITE--TIER.json` and, with matplotlib, its plot; prints their names."""
-        path = folder / f"{suite}--{self.machine['tier']}.json"
+        """Writes `SUITE--CPU-TIER.json` and, with matplotlib, its plot; prints their names."""
+        cpu = f"{self.machine['cpu']} {self.machine['tier']}".lower()
+        cpu = re.sub(r"\b(family|model|processor|cpu)\b", " ", cpu)
+        path = folder / f"{suite}--{'-'.join(re.findall('[a-z0-9]+', cpu))}.json"
         self.save(path)
         print(path)
         try:

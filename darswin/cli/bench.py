@@ -41,7 +41,7 @@ def bench(
         model: its name. size: px, of square images. batches: B.
         compiled: the batches at which the compiled reference is measured too, at all threads.
         seconds: of each timing, about.
-        out: the folder of the record, `model--<tier>.json`, and its plot.
+        out: the folder of the record, `model--<CPU>-<tier>.json`, and its plot.
     """
     out.mkdir(parents=True, exist_ok=True)  # before the work
     head = machine()
