@@ -21,6 +21,11 @@ from darswin.bench.timing import Timing  # noqa: E402
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 RESULTS = ROOT / "benchmarks" / "results"
 
+# The CPUs that there are records of, by the end of their names; the pages show the first one that
+# has a record of a suite.
+CPUS = {"amd-epyc-25-17-avx512": "Zen 4", "amd-epyc-avx512": "Zen 5"}
+SUITES = ("sampling", "to_image", "attention", "model")
+
 SAMPLING_PEERS = ("F.grid_sample", "F.grid_sample + permute", "cv2.remap")
 EMBED_PEERS = ("F.grid_sample + permute + F.linear", "F.linear alone")
 # The README's rows: subject, mode, setting, batch.
@@ -33,8 +38,15 @@ SPEED = (
     ("window_attention", "forward+backward", "A stage 1", 32),
     ("darswin_a_small", "inference, float32", "64×64", 8),
     ("darswin_a_small", "inference, bfloat16", "64×64", 8),
+    ("darswin_a_small", "inference, int8", "64×64", 8),
     ("darswin_a_small", "training, float32", "64×64", 8),
 )
+
+
+def records(suite: str) -> dict[str, Record]:
+    """Of a suite, by CPU."""
+    paths = {name: RESULTS / f"{suite}--{cpu}.json" for cpu, name in CPUS.items()}
+    return {name: Record.load(path) for name, path in paths.items() if path.exists()}
 
 
 def drop_in_line(timings: Sequence[Timing]) -> str:
@@ -65,10 +77,12 @@ def tables() -> dict[str, str]:
     import tables as study
 
     studies = ROOT / "studies" / "results"
-    sampling = Record.load(RESULTS / "sampling--avx512.json").timings
-    to_image = Record.load(RESULTS / "to_image--avx512.json").timings
-    attention = Record.load(RESULTS / "attention--avx512.json").timings
-    model = Record.load(RESULTS / "model--avx512.json")
+    suites = {suite: records(suite) for suite in SUITES}
+    sampling, to_image, attention, model = (next(iter(suites[suite].values())) for suite in SUITES)
+    cpus = {
+        cpu: [t for suite in SUITES if cpu in suites[suite] for t in suites[suite][cpu].timings]
+        for cpu in CPUS.values()
+    }
     training = json.loads((RESULTS / "training--micro.json").read_text())
     cells = json.loads((studies / "study--nano.json").read_text())["cells"]
     cameras = json.loads((studies / "learned_lens.json").read_text())["cameras"]
@@ -76,16 +90,16 @@ def tables() -> dict[str, str]:
     found = json.loads(dense.read_text()) if dense.exists() else None
     return {
         "demo": demo_table(json.loads((ROOT / "docs" / "accuracy.json").read_text())),
-        "drop-in": drop_in_line(sampling),
-        "speed": bench.best_table([*sampling, *to_image, *attention, *model.timings], SPEED),
-        "missed": bench.missed_table([*sampling, *to_image, *attention]),
+        "drop-in": drop_in_line(sampling.timings),
+        "speed": bench.best_table(cpus, SPEED),
+        "missed": bench.missed_table([*sampling.timings, *to_image.timings, *attention.timings]),
         "model": bench.models_table(model.timings),
         "model int8": bench.quantized_table(model.timings),
         "model memory": bench.memory_table(model.memory),
-        "sampling": bench.peers_table(sampling, "polar_sample", SAMPLING_PEERS),
-        "embedding": bench.peers_table(sampling, "polar_embed", EMBED_PEERS),
-        "to image": bench.peers_table(to_image, "polar_to_image", ("F.pad + F.grid_sample",)),
-        "attention": bench.attention_table(attention),
+        "sampling": bench.peers_table(sampling.timings, "polar_sample", SAMPLING_PEERS),
+        "embedding": bench.peers_table(sampling.timings, "polar_embed", EMBED_PEERS),
+        "to image": bench.peers_table(to_image.timings, "polar_to_image", ("F.pad + F.grid_sample",)),
+        "attention": bench.attention_table(attention.timings),
         "training": bench.training_table(training["models"]),
         **study.tables(cells),
         **learned_tables.tables(cameras),

@@ -79,36 +79,33 @@ def attention_table(timings: Sequence[Timing]) -> str:
     return markdown(["`window_attention`", "ours, forward (ms)", *heads], rows.values())
 
 
-def best_table(timings: Sequence[Timing], rows: Iterable[tuple[str, str, str, int]]) -> str:
-    """A row for each (subject, mode, setting, batch), at all threads: our time, the fastest peer's,
-    how much longer it takes, and how much longer the fastest takes in all settings and batches."""
-    threads = max(t.threads for t in timings)
+def best_table(
+    records: Mapping[str, Sequence[Timing]], rows: Iterable[tuple[str, str, str, int]]
+) -> str:
+    """A row for each (subject, mode, setting, batch), at all threads, and for each CPU its own
+    columns: our time, and the fastest peer with how much longer it takes."""
+    lines = [
+        [f"`{subject}`, {mode}, {setting}, batch {batch}"] for subject, mode, setting, batch in rows
+    ]
+    heads = [""]
+    for cpu, timings in records.items():
+        heads += [f"{cpu}: ours (ms)", "best peer"]
+        for line, case in zip(lines, rows, strict=True):
+            line += _best(timings, case)
+    return markdown(heads, lines)
+
+
+def _best(timings: Sequence[Timing], case: tuple[str, str, str, int]) -> list[str]:
     parts = (MATMULS, "F.linear alone")  # less work than ours: bounds, no peers
-    found: dict[tuple, list[Timing]] = {}
-    for t in timings:
-        if t.threads == threads and t.name not in parts and not t.name.startswith(f"{OURS}"):
-            found.setdefault((t.subject, t.mode, t.setting, t.batch), []).append(t)
-    best = {case: min(peers, key=lambda t: t.ratio) for case, peers in found.items()}
-    lines = []
-    for case in rows:
-        subject, mode, setting, batch = case
-        (ours,) = (
-            t
-            for t in timings
-            if (t.subject, t.mode, t.setting, t.batch) == case
-            and (t.name, t.threads) == (OURS, threads)
-        )
-        ratios = [t.ratio for other, t in best.items() if other[:2] == case[:2]]
-        lines.append(
-            [
-                f"`{subject}`, {mode}, {setting}, batch {batch}",
-                f"{1e3 * ours.median:.2f}" if ours.median < 0.01 else f"{1e3 * ours.median:.0f}",
-                best[case].name,
-                f"{best[case].ratio:.1f}×",
-                f"{min(ratios):.1f}× to {max(ratios):.1f}×",
-            ]
-        )
-    return markdown(["", "ours (ms)", "best peer", "takes", "in all sizes"], lines)
+    chosen = [t for t in timings if (t.subject, t.mode, t.setting, t.batch) == case]
+    if not chosen:
+        return ["", ""]
+    chosen = [t for t in chosen if t.threads == max(t.threads for t in timings)]
+    (ours,) = (t for t in chosen if t.name == OURS)
+    peers = [t for t in chosen if t.name not in parts and not t.name.startswith(OURS)]
+    best = min(peers, key=lambda t: t.ratio)
+    time = f"{1e3 * ours.median:.2f}" if ours.median < 0.01 else f"{1e3 * ours.median:.0f}"
+    return [time, f"{best.ratio:.1f}× ({best.name})"]
 
 
 def missed_table(timings: Iterable[Timing]) -> str:

@@ -51,10 +51,10 @@ def test_peers(operators, drawn, tmp_path):
     }
 
 
-@pytest.mark.parametrize("suite", ["sampling", "attention", "model"])
-def test_the_pictures_of_the_records_can_be_read(suite, tmp_path, monkeypatch):
+@pytest.mark.parametrize("path", sorted(RESULTS.glob("*-avx512.json")), ids=lambda path: path.stem)
+def test_the_pictures_of_the_records_can_be_read(path, tmp_path, monkeypatch):
     """At the width of a page, 740 px, text is at least 8 pt high, and the page is not endless."""
-    record = Record.load(RESULTS / f"{suite}--avx512.json")
+    record, suite = Record.load(path), path.stem.split("--")[0]
     figures = []
     monkeypatch.setattr("darswin.viz.plot.save_figure", lambda figure, path: figures.append(figure))
     (plot.draw_models if suite == "model" else plot.draw_peers)(record, tmp_path / "a.png")

@@ -7,7 +7,7 @@ def test_a_record_and_its_plot(record, tmp_path, capsys):
         path.write_text("a picture")
 
     record.publish(tmp_path / "new", "model", draw)
-    path = tmp_path / "new" / "model--avx512.json"
+    path = tmp_path / "new" / "model--amd-epyc-25-17-avx512.json"
     assert Record.load(path) == record
     assert capsys.readouterr().out.split() == [str(path), str(path.with_suffix(".png"))]
 
@@ -17,7 +17,7 @@ def test_a_plot_needs_matplotlib(record, tmp_path, capsys):
         raise ImportError("No module named 'matplotlib'")
 
     record.publish(tmp_path, "model", draw)
-    assert (tmp_path / "model--avx512.json").exists()
+    assert (tmp_path / "model--amd-epyc-25-17-avx512.json").exists()
     assert "no plot: No module named 'matplotlib'" in capsys.readouterr().err
 
 

@@ -38,3 +38,13 @@ def test_peers(operators):
     assert tables.missed_table(operators).splitlines()[2:] == [
         "| polar_sample, 64×64, batch 8, forward, 1 thread: fast | 1.50 | 2.00 |"
     ]
+
+
+def test_a_column_for_each_cpu(operators, record):
+    rows = [("polar_sample", "forward", "64×64", 8), ("another", "forward", "64×64", 8)]
+    assert tables.best_table({"new": operators, "old": record.timings}, rows).splitlines() == [
+        "|  | new: ours (ms) | best peer | old: ours (ms) | best peer |",
+        "|---|---|---|---|---|",
+        "| `polar_sample`, forward, 64×64, batch 8 | 1.00 | 6.0× (slow) |  |  |",
+        "| `another`, forward, 64×64, batch 8 | 0.50 | 2.0× (peer) |  |  |",
+    ]
