@@ -9,7 +9,6 @@ study-int8`, on a CPU with VNNI.
 import argparse
 import json
 import os
-import statistics
 import time
 from collections import defaultdict
 from pathlib import Path
@@ -19,11 +18,11 @@ import yaml
 from cells import LEVELS, MODELS, SWEEP, Cell, headline
 from jobs import printing_to, run_all
 from study import run_cell as run_float
+from tables import int8_table
 from torch.utils.data import DataLoader
 
 from darswin.bench.machine import machine
 from darswin.bench.record import write
-from darswin.bench.tables import markdown
 from darswin.cli.quantize import quantize
 from darswin.deploy.optimize import optimize
 from darswin.layers.quantized import quantized_layers
@@ -86,39 +85,6 @@ def compared(models: dict, pictures, batch: int) -> dict[str, float]:
     return {name: round(100 * count / len(pictures), 4) for name, count in counts.items()}
 
 
-def lost(cell: dict) -> list[float]:
-    """The points of top-1 that a cell loses at each ξ."""
-    before, after = (cell["accuracy"][name] for name in ("float32", "int8"))
-    return [before[xi] - after[xi] for xi in SWEEP]
-
-
-def by_model(cells: list[dict]) -> dict[str, list[dict]]:
-    """The cells of each model, in the study's order."""
-    found = {label: [cell for cell in cells if cell["label"] == label] for label in MODELS}
-    return {label: runs for label, runs in found.items() if runs}
-
-
-def table(cells: list[dict]) -> str:
-    """A row a model: its layers of 8 bits, its top-1 over all ξ, and what it loses."""
-    columns = [
-        "over all ξ, in points", "layers of 8 bits", "float32 (%)", "int8 (%)", "lost",
-        "most at one ξ, mean of the seeds", "most at one ξ, one seed", "answers changed (%)",
-    ]  # fmt: skip
-    rows = []
-    for label, runs in by_model(cells).items():
-        layers = " of ".join(map(str, min(run["layers"] for run in runs)))
-        before, after = (
-            statistics.mean(value for run in runs for value in run["accuracy"][name].values())
-            for name in ("float32", "int8")
-        )
-        losses = [lost(run) for run in runs]
-        means = [statistics.mean(at) for at in zip(*losses, strict=True)]
-        changed = statistics.mean(value for run in runs for value in run["changed"].values())
-        points = f"{before - after:.2f}", f"{max(means):.2f}", f"{max(map(max, losses)):.1f}"
-        rows.append([label, layers, f"{before:.2f}", f"{after:.2f}", *points, f"{changed:.1f}"])
-    return markdown(columns, rows)
-
-
 def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--level", choices=LEVELS, default="low", help="of the training lenses")
@@ -140,7 +106,7 @@ def main(arguments: list[str] | None = None) -> None:
     results = run_all(run_cell, jobs, args.processes, "cell")
     results.sort(key=lambda cell: (list(MODELS).index(cell["label"]), cell["seed"]))
     write(args.results / "int8.json", machine=machine(), size=args.size, cells=results)
-    print(table(results))
+    print(int8_table(results))
 
 
 if __name__ == "__main__":
