@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/installed
 
-.PHONY: help build demo test test-triton test-gpu test-lowest test-isa test-asan fuzz kills lint format bench bench-gpu study learned-lens worlds study-dense tables docs dist wheels repair published-wheels test-torch aarch64 clean
+.PHONY: help build demo test test-triton test-gpu test-lowest test-isa test-asan fuzz kills lint format bench bench-gpu study study-int8 learned-lens worlds study-dense tables docs dist wheels repair published-wheels test-torch aarch64 clean
 
 help:  ## this list
 	@grep -E '^[a-z0-9-]+:.*##' Makefile | sed -E 's/:.*## /\t/' | expand -t 18
@@ -112,6 +112,9 @@ bench-gpu: build  ## time the operators and a model on a CUDA device
 
 study: build  ## the paper's experiments, small: an hour; goes on where it was stopped
 	$(BIN)/python studies/study.py
+
+study-int8: build  ## what 8 bits cost the study's models: half an hour more; goes on where it was stopped
+	$(BIN)/python studies/quantized.py
 
 learned-lens: build  ## find unknown lenses by gradient descent: ten minutes; goes on where it was stopped
 	$(BIN)/python studies/learned_lens.py

@@ -85,6 +85,7 @@ def tables() -> dict[str, str]:
     }
     training = json.loads((RESULTS / "training--micro.json").read_text())
     cells = json.loads((studies / "study--nano.json").read_text())["cells"]
+    quantized = json.loads((studies / "int8.json").read_text())["cells"]
     cameras = json.loads((studies / "learned_lens.json").read_text())["cameras"]
     dense = studies / "dense.json"  # there once `make study-dense` has run
     found = json.loads(dense.read_text()) if dense.exists() else None
@@ -102,6 +103,7 @@ def tables() -> dict[str, str]:
         "attention": bench.attention_table(attention.timings),
         "training": bench.training_table(training["models"]),
         **study.tables(cells),
+        "int8": study.int8_table(quantized),
         **learned_tables.tables(cameras),
         **(dense_tables.tables(found, studies) if found else {}),
     }

@@ -112,6 +112,42 @@ def ablation_table(cells: list[dict]) -> str:
     return markdown(["tested on", *(f'"{level}"' for level in LEVELS)], rows)
 
 
+def points_lost(cell: dict) -> list[float]:
+    """What 8 bits cost a cell of `quantized.py` at each ξ."""
+    before, after = (cell["accuracy"][name] for name in ("float32", "int8"))
+    return [before[xi] - after[xi] for xi in SWEEP]
+
+
+def int8_table(cells: list[dict]) -> str:
+    """A row a model: its layers of 8 bits, its accuracy over all ξ, and what it loses."""
+    rows = []
+    for label in MODELS:
+        runs = [cell for cell in cells if cell["label"] == label]
+        if not runs:
+            rows.append([label, *["not run"] * 7])
+            continue
+        before, after = (
+            statistics.mean(value for run in runs for value in run["accuracy"][name].values())
+            for name in ("float32", "int8")
+        )
+        lost = [points_lost(run) for run in runs]
+        of_means = max(statistics.mean(at) for at in zip(*lost, strict=True))
+        changed = statistics.mean(value for run in runs for value in run["changed"].values())
+        rows.append(
+            [
+                label,
+                " of ".join(map(str, min(run["layers"] for run in runs))),
+                *(f"{before:.2f}", f"{after:.2f}", f"{before - after:z.2f}", f"{of_means:z.2f}"),
+                *(f"{max(map(max, lost)):z.1f}", f"{changed:.1f}"),
+            ]
+        )
+    columns = [
+        *("", "layers of 8 bits", "float32", "8 bits", "lost", "most at one ξ, mean of the seeds"),
+        *("most at one ξ, one seed", "answers that change"),
+    ]
+    return markdown(columns, rows)
+
+
 def tables(cells: list[dict]) -> dict[str, str]:
     """The tables, by the name of their place in a page."""
     return {

@@ -65,7 +65,19 @@ def test_test_sets_show_the_same_scenes_and_controls_lie(quick):
     assert xi[0] == xi[1][::-1] and xi[0][0] != xi[0][1]
 
 
-def test_cells_are_trained_and_tested_once(quick, capsys):
+@pytest.fixture
+def here(monkeypatch, threads):
+    """Jobs run one after the other in this process, as `make study-dense` runs them in others."""
+
+    def run_all(work, jobs, *rest):
+        return [work(*job) for job in jobs]
+
+    threads(1)
+    for program in (dense, dense_data):
+        monkeypatch.setattr(program, "run_all", run_all)
+
+
+def test_cells_are_trained_and_tested_once(quick, here, capsys):
     cells = found(quick)
     assert cells.keys() == {
         f"{name}-low-{task}-0"
@@ -113,18 +125,18 @@ def test_tables_and_pictures(quick):
     assert dense_tables.tables(None, quick / "none") == dict.fromkeys(made, dense_tables.NOT_RUN)
 
 
-def test_cells_of_a_record_are_not_run_again(quick, tmp_path, monkeypatch):
+def test_cells_of_a_record_are_not_run_again(quick, here, tmp_path):
     cells, blind = list(found(quick).values()), trivial(quick / "out")
     record = dense_tables.collect(cells[:3], blind, dense.CONFIG.read_text(), "nano")
     (tmp_path / "known.json").write_text(json.dumps(record))
     ran = []
-    monkeypatch.setattr(dense, "run_all", lambda work, jobs, *rest: ran.extend(jobs) or [])
     where = ["--out", str(quick / "out"), "--results", str(tmp_path)]
-    dense.main([*where, "--known", str(tmp_path / "known.json"), *QUICK])
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(dense, "run_all", lambda work, jobs, *rest: ran.extend(jobs) or [])
+        dense.main([*where, "--known", str(tmp_path / "known.json"), *QUICK])
     assert len(ran) == len(all_cells(1)) - 3
     assert len(json.loads((tmp_path / "dense.json").read_text())["cells"]) == 3
     # What is there is collected, and nothing is run.
-    monkeypatch.undo()
     dense.main([*where, "--collect", *QUICK])
     assert len(json.loads((tmp_path / "dense.json").read_text())["cells"]) == 4
     (tmp_path / "known.json").write_text(json.dumps(record | dict(config="max_epochs: 9")))

@@ -100,7 +100,7 @@ def _best(timings: Sequence[Timing], case: tuple[str, str, str, int]) -> list[st
     chosen = [t for t in timings if (t.subject, t.mode, t.setting, t.batch) == case]
     if not chosen:
         return ["", ""]
-    chosen = [t for t in chosen if t.threads == max(t.threads for t in timings)]
+    chosen = [t for t in chosen if t.threads == max(t.threads for t in chosen)]
     (ours,) = (t for t in chosen if t.name == OURS)
     peers = [t for t in chosen if t.name not in parts and not t.name.startswith(OURS)]
     best = min(peers, key=lambda t: t.ratio)

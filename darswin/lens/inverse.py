@@ -9,6 +9,8 @@ from darswin.ops.waiting import readable
 
 Function = Callable[[Tensor], Tensor]
 
+_STEPS = 40  # of Newton's method or of halving the bracket
+
 
 def inverse(function: Function, slope: Function, value: Tensor, end: Tensor) -> Tensor:
     """The x in [0, end] at which a function that rises from 0 takes a value.
@@ -26,7 +28,7 @@ def inverse(function: Function, slope: Function, value: Tensor, end: Tensor) -> 
         high = end.expand(torch.broadcast_shapes(value.shape, end.shape))
         low, x = torch.zeros_like(high), high * (value / last).clamp(0, 1)
         moved = high
-        for _ in range(40):
+        for _ in range(_STEPS):
             error = function(x) - value
             low, high = torch.where(error < 0, x, low), torch.where(error > 0, x, high)
             newton = x - error / slope(x)

@@ -46,5 +46,5 @@ def test_a_column_for_each_cpu(operators, record):
         "|  | new: ours (ms) | best peer | old: ours (ms) | best peer |",
         "|---|---|---|---|---|",
         "| `polar_sample`, forward, 64×64, batch 8 | 1.00 | 6.0× (slow) |  |  |",
-        "| `another`, forward, 64×64, batch 8 | 0.50 | 2.0× (peer) |  |  |",
+        "| `another`, forward, 64×64, batch 8 | 1.00 | 1.0× (peer) |  |  |",
     ]

@@ -298,7 +298,7 @@ def test_onnx_runtime_says_the_same(tmp_path):
     onnx = pytest.importorskip("onnx")
     from darswin.deploy.export import export_onnx
 
-    model, seen = network(), batch(6)
+    model, seen = network(depths=(1, 1), num_heads=(1, 2)), batch(6)
     quantized = quantize_model(model, [seen])
     path, lens = tmp_path / "q.onnx", seen[1]
     export_onnx(quantized, path, *seen)

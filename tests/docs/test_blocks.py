@@ -10,6 +10,7 @@ import importlib
 import re
 import runpy
 import shlex
+import shutil
 import sys
 import tomllib
 from collections.abc import Callable
@@ -68,24 +69,33 @@ def test_every_block_is_of_a_kind_that_is_checked():
     ]
 
 
-@pytest.fixture
-def scratch(tmp_path, monkeypatch):
+@pytest.fixture(scope="module")
+def granted(tmp_path_factory):
     """A folder with what pages take for granted: a checkout's examples, photos, scenes, weights."""
-    monkeypatch.chdir(tmp_path)
-    for folder in ("examples", "darswin"):
-        (tmp_path / folder).symlink_to(ROOT / folder)
+    folder = tmp_path_factory.mktemp("granted") / "folder"
+    folder.mkdir()
+    for name in ("examples", "darswin"):
+        (folder / name).symlink_to(ROOT / name)
     random = np.random.default_rng(0)
     for name in ("cat", "dog"):
-        (tmp_path / "photos" / name).mkdir(parents=True)
+        (folder / "photos" / name).mkdir(parents=True)
         for k in range(12):
             picture = random.integers(256, size=(48, 64, 3), dtype=np.uint8)
-            cv2.imwrite(f"photos/{name}/{k}.jpg", picture)
+            cv2.imwrite(str(folder / "photos" / name / f"{k}.jpg"), picture)
     for name in ("a.jpg", "b.jpg"):
-        cv2.imwrite(name, picture)
-    write_plain(tmp_path / "garage", 20, split="train")
-    write_plain(tmp_path / "garage", 4, split="val")
-    write_woodscape(tmp_path / "woodscape", 20)
-    torch.save(fixture("polar")[1], "checkpoint.pth")
+        cv2.imwrite(str(folder / name), picture)
+    write_plain(folder / "garage", 20, split="train")
+    write_plain(folder / "garage", 4, split="val")
+    write_woodscape(folder / "woodscape", 20)
+    torch.save(fixture("polar")[1], folder / "checkpoint.pth")
+    return folder
+
+
+@pytest.fixture
+def scratch(granted, tmp_path, monkeypatch):
+    """A copy of it for each page, which runs there."""
+    shutil.copytree(granted, tmp_path, symlinks=True, dirs_exist_ok=True)
+    monkeypatch.chdir(tmp_path)
     return tmp_path
 
 

@@ -17,8 +17,9 @@ sys.path[:0] = [str(ROOT / "docs"), str(ROOT / "studies")]
 import dense_tables  # noqa: E402
 import fill  # noqa: E402
 import resampling  # noqa: E402
-from cells import LEVELS, SWEEP  # noqa: E402
+from cells import LEVELS, MODELS, SWEEP  # noqa: E402
 from dense_tables import SCORE  # noqa: E402
+from tables import points_lost  # noqa: E402
 
 README = (ROOT / "README.md").read_text()
 
@@ -120,6 +121,28 @@ def test_what_is_said_of_the_study_is_in_its_record():
         for xi in SWEEP
     ]
     assert max(ahead) <= 2
+
+
+def test_what_8_bits_lose_is_in_its_record():
+    record = json.loads((ROOT / "studies/results/int8.json").read_text())
+    runs: dict[str, list] = {}
+    for cell in record["cells"]:
+        assert cell["given"]["test_images"] == 1000
+        runs.setdefault(cell["label"], []).append(points_lost(cell))
+    assert runs.keys() == set(MODELS) and {len(lost) for lost in runs.values()} == {3}
+    over_all = [statistics.mean(x for lost in of for x in lost) for of in runs.values()]
+    of_means = [statistics.mean(at) for of in runs.values() for at in zip(*of, strict=True)]
+    single = [x for of in runs.values() for lost in of for x in lost]
+    assert max(over_all) <= 0.3 and max(of_means) <= 1 and max(single) <= 1
+    changed = [x for cell in record["cells"] for x in cell["changed"].values()]
+    for said in (
+        f"no model's mean over all ξ and seeds moves by more than {max(map(abs, over_all)):.2f}",
+        f"at any one ξ the mean of the seeds falls by {max(of_means):.1f} at most, and a single "
+        f"model by {max(single):.1f}, {10 * max(single):.0f} of 1,000 pictures",
+        f"{statistics.mean(changed):.1f} % of the answers change",
+    ):
+        assert said in prose("docs/study.md"), said
+    assert f"{max(single):.1f} points at any distortion" in prose("docs/howto/speed.md")
 
 
 def test_what_is_said_of_loading_is_in_its_record():

@@ -5,6 +5,7 @@ import json
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -281,24 +282,35 @@ def test_two_processes_train_and_test_as_one(tiny, data, tmp_path):
     options += ["--trainer.max_epochs", "1", "--data.randaugment", "false"]
     one, two = tmp_path / "one", tmp_path / "two"
     fit(one, *options)
-    pair = ["--devices", "2", "--trainer.accelerator", "cpu"]
-    run_alone("fit", two, *options, *pair, "--data.batch_size", "4")
+    before = test(one)
+    train = ["fit", "--run", str(two), *options, *PAIR, "--data.batch_size", "4"]
+    run_pair(train, ["test", "--run", str(one), *PAIR, *QUIET[2:4]])
     for name, tensor in checkpoint(one)["state_dict"].items():
         torch.testing.assert_close(
             checkpoint(two)["state_dict"][name], tensor, rtol=1e-3, atol=1e-4
         )
-    before = test(one)
-    run_alone("test", one, *pair, "--trainer.enable_progress_bar", "false")
     after = json.loads((one / "test.json").read_text())["results"]
     assert after[0]["pixels"] == before[0]["pixels"]
     for name in ("miou", "accuracy", "miou_sr", "accuracy_sr", "loss"):
         assert after[0][name] == pytest.approx(before[0][name], abs=2e-3)
 
 
-def run_alone(command, run, *options):
-    """A command in a process of its own, as several processes need it."""
+PAIR = ["--devices", "2", "--trainer.accelerator", "cpu"]
+BOTH = """
+import json, sys
+from darswin.cli.main import main
+for words in json.loads(sys.argv[1]):
+    main(words)
+"""
+
+
+def run_pair(*commands):
+    """Commands, one after the other, in two processes: Lightning starts the second one, as a copy
+    of the first."""
+    script = Path(commands[0][2]).with_suffix(".py")
+    script.write_text(BOTH)
     done = subprocess.run(
-        [sys.executable, "-m", "darswin", command, "--run", str(run), *options],
+        [sys.executable, str(script), json.dumps(commands)],
         capture_output=True, text=True, env=os.environ | {"OMP_NUM_THREADS": "1"}, timeout=300,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr[-3000:]

@@ -1,4 +1,4 @@
-"""Whole runs of the command line, each in its own process, as a user starts them."""
+"""Whole runs of the command line in processes of their own, as a user starts them."""
 
 import csv
 import json
@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from darswin.cli.main import main
 from darswin.models.saving import load_model
 
 SMALL = """
@@ -114,7 +115,7 @@ def test_two_processes_train_as_one(tmp_path):
         "1",
     ]
     one, two = tmp_path / "one", tmp_path / "two"
-    finish(start("fit", one, *still), one)
+    main(["fit", "--run", str(one), *still])
     pair = ["--devices", "2", "--trainer.accelerator", "cpu", "--data.batch_size", "8"]
     finish(start("fit", two, *still, *pair), two)
     a, b = losses(one), losses(two)
@@ -127,8 +128,8 @@ def test_two_processes_train_as_one(tmp_path):
         )
 
 
-def test_one_test_over_all_distortions(whole):
-    finish(start("test", whole, "--xi", "0:1:0.5"), whole)
+def test_one_test_over_all_distortions(whole, capsys):
+    main(["test", "--run", str(whole), "--xi", "0:1:0.5"])
     rows = json.loads((whole / "test.json").read_text())["results"]
     assert [row["lenses"] for row in rows] == ["0", "0.5", "1"]
     with (whole / "test.csv").open() as lines:
@@ -136,7 +137,7 @@ def test_one_test_over_all_distortions(whole):
     assert [float(r["top1"]) for r in table] == [row["top1"] for row in rows]
     assert all(0 < row["top1"] <= row["top5"] <= 1 and row["loss"] > 0 for row in rows)
     assert (whole / "test.png").read_bytes().startswith(b"\x89PNG")
-    assert "top-1 (%)" in Path(f"{whole}.log").read_text()
+    assert "top-1 (%)" in capsys.readouterr().out
     finish(
         start("test", whole, "--devices", "2", "--trainer.accelerator", "cpu", "--xi", "0:1:0.5"),
         whole,
