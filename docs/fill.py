@@ -27,6 +27,7 @@ CPUS = {"amd-epyc-25-17-avx512": "Zen 4", "amd-epyc-avx512": "Zen 5"}
 SUITES = ("sampling", "to_image", "attention", "model")
 
 SAMPLING_PEERS = ("F.grid_sample", "F.grid_sample + permute", "cv2.remap")
+IMAGE_PEERS = ("F.pad + F.grid_sample",)
 EMBED_PEERS = ("F.grid_sample + permute + F.linear", "F.linear alone")
 # The README's rows: subject, mode, setting, batch.
 SPEED = (
@@ -99,7 +100,9 @@ def tables() -> dict[str, str]:
         "model memory": bench.memory_table(model.memory),
         "sampling": bench.peers_table(sampling.timings, "polar_sample", SAMPLING_PEERS),
         "embedding": bench.peers_table(sampling.timings, "polar_embed", EMBED_PEERS),
-        "to image": bench.peers_table(to_image.timings, "polar_to_image", ("F.pad + F.grid_sample",)),
+        "to image": bench.peers_table(
+            to_image.timings, "polar_to_image", ("F.pad + F.grid_sample",)
+        ),
         "attention": bench.attention_table(attention.timings),
         "training": bench.training_table(training["models"]),
         **study.tables(cells),

@@ -83,7 +83,7 @@ def best_table(
     records: Mapping[str, Sequence[Timing]], rows: Iterable[tuple[str, str, str, int]]
 ) -> str:
     """A row for each (subject, mode, setting, batch), at all threads, and for each CPU its own
-    columns: our time, and the fastest peer with how much longer it takes."""
+    columns: our time, and how much longer the fastest peer takes."""
     lines = [
         [f"`{subject}`, {mode}, {setting}, batch {batch}"] for subject, mode, setting, batch in rows
     ]
@@ -105,7 +105,7 @@ def _best(timings: Sequence[Timing], case: tuple[str, str, str, int]) -> list[st
     peers = [t for t in chosen if t.name not in parts and not t.name.startswith(OURS)]
     best = min(peers, key=lambda t: t.ratio)
     time = f"{1e3 * ours.median:.2f}" if ours.median < 0.01 else f"{1e3 * ours.median:.0f}"
-    return [time, f"{best.ratio:.1f}× ({best.name})"]
+    return [time, f"{best.ratio:.1f}×"]
 
 
 def missed_table(timings: Iterable[Timing]) -> str:

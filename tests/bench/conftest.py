@@ -28,7 +28,12 @@ def record() -> Record:
         Memory("training, float32", 8, OURS, 100 * 2**20, 300 * 2**20, 500 * 2**20),
         Memory("training, float32", 8, REFERENCE, 100 * 2**20, 300 * 2**20, 600 * 2**20),
     ]
-    return Record(dict(cpu="AMD EPYC (family 25, model 17)", tier="avx512"), timings, memory, operations=4_500_000_000)
+    return Record(
+        dict(cpu="AMD EPYC (family 25, model 17)", tier="avx512"),
+        timings,
+        memory,
+        operations=4_500_000_000,
+    )
 
 
 def operator(name, threads, milliseconds, ratio=1.0, target=None, subject="polar_sample"):
