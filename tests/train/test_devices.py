@@ -19,9 +19,7 @@ DENSE = ["--task", "segmentation", "--model.name", "darswin_unet_a_nano", "--mod
 
 
 @pytest.mark.parametrize("task", ["classification", "segmentation"])
-def test_with_a_gpu_as_lightnings_device_weights_and_data_are_the_same(
-    task, tmp_path, monkeypatch
-):
+def test_with_a_gpu_as_lightnings_device_weights_and_data_are_the_same(task, tmp_path, monkeypatch):
     options = DIGITS
     if task == "segmentation":
         options = [*DENSE, "--data.path", str(write_plain(tmp_path / "scenes", 16, size=(45, 60)))]
