@@ -11,6 +11,7 @@ from functools import partial
 
 import attention
 import sampling
+import to_image
 import torch
 import torch.nn.functional as F
 from torch import Tensor
@@ -18,7 +19,7 @@ from torch.nn.attention.flex_attention import flex_attention
 
 from darswin.bench.candidates import lens_of, network
 from darswin.bench.timing import OURS
-from darswin.ops import polar_sample, use_reference, window_attention
+from darswin.ops import polar_embed, polar_sample, polar_to_image, use_reference, window_attention
 
 CASES = ("A stage 1", "A stage 3", "RA stage 1", "Swin 8x8")
 Runs = dict[str, Callable[..., Tensor]]
@@ -132,13 +133,15 @@ def bench_attention(batch: int, device: torch.device) -> None:
 def bench_sampling(batch: int, device: torch.device) -> None:
     """Sampling, against F.grid_sample on a mesh that is there, and the permute to tokens."""
     for size in (64, 256):
-        runs, images = sampling_runs(size, batch, device)
-        peer = {"F.grid_sample + permute": 4}
-        compare(f"polar_sample, {size}×{size}, batch {batch}", runs, [images], peer, {})
+        runs, embeds, inputs = sampling_runs(size, batch, device)
+        peer, case = {"F.grid_sample + permute": 4}, f"{size}×{size}, batch {batch}"
+        compare(f"polar_sample, {case}", runs, inputs[:1], peer, {})
+        compare(f"polar_embed, {case}", embeds, inputs, {}, {})
 
 
-def sampling_runs(size: int, batch: int, device: torch.device) -> tuple[Runs, Tensor]:
-    """The candidates, functions of images, and the images."""
+def sampling_runs(size: int, batch: int, device: torch.device) -> tuple[Runs, Runs, list[Tensor]]:
+    """The candidates for polar_sample, functions of images; those for polar_embed, of images,
+    weight and bias; and these."""
     images, grid, mesh, _ = sampling.sampling_case(size, batch)
     arguments = [t.to(device) for t in (grid.radii, grid.azimuths, grid.center)]
     mesh = mesh.to(device)
@@ -149,7 +152,40 @@ def sampling_runs(size: int, batch: int, device: torch.device) -> tuple[Runs, Te
     def peer(image: Tensor) -> Tensor:
         return sampling.to_tokens(F.grid_sample(image, mesh, align_corners=True))
 
-    return {OURS: ours, "F.grid_sample + permute": peer}, images.to(device)
+    def embed(image: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+        return polar_embed(image, *arguments, weight, bias, samples=(10, 10))
+
+    def embed_peer(image: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+        return F.linear(peer(image), weight, bias)
+
+    name = "F.grid_sample + permute"
+    inputs = [images, torch.randn(96, 300) / 300**0.5, torch.randn(96)]
+    return (
+        {OURS: ours, name: peer},
+        {OURS: embed, f"{name} + F.linear": embed_peer},
+        [tensor.to(device) for tensor in inputs],
+    )
+
+
+def bench_to_image(device: torch.device) -> None:
+    """A map as an image, against a padded F.grid_sample on a mesh that is there."""
+    for sizes in to_image.CASES:
+        batch, rings, sectors, channels, size = sizes
+        runs, maps = to_image_runs(sizes, device)
+        case = f"{rings}×{sectors}×{channels} → {size}×{size}, batch {batch}"
+        compare(f"polar_to_image, {case}", runs, [maps], {}, {})
+
+
+def to_image_runs(
+    sizes: tuple[int, int, int, int, int], device: torch.device
+) -> tuple[Runs, Tensor]:
+    """The candidates, functions of maps, and the maps."""
+    maps, radii, center, places = (tensor.to(device) for tensor in to_image.inputs(*sizes))
+
+    def ours(maps: Tensor) -> Tensor:
+        return polar_to_image(maps, radii, center, (sizes[-1], sizes[-1]), layout="image")
+
+    return {OURS: ours, to_image.PEER: partial(to_image.padded, places=places)}, maps
 
 
 def bench_model(batch: int, device: torch.device) -> None:
@@ -197,6 +233,7 @@ def main() -> None:
     print(f"{torch.cuda.get_device_name()}, torch {torch.__version__}")
     bench_attention(batch, device)
     bench_sampling(batch, device)
+    bench_to_image(device)
     bench_model(batch, device)
 
 

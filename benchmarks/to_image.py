@@ -33,24 +33,34 @@ def mesh(rings: int, sectors: int, size: int) -> Tensor:
     return torch.stack(((2 * column + 1) / (sectors + 2) - 1, (2 * ring + 1) / (rings + 1) - 1), -1)
 
 
+def inputs(batch: int, rings: int, sectors: int, channels: int, size: int) -> tuple[Tensor, ...]:
+    """Maps, the radii of their rings, their centre, and the mesh of each."""
+    radii = ((torch.arange(rings) + 0.5) * (size / 2 / rings))[None]
+    places = mesh(rings, sectors, size).expand(batch, -1, -1, -1)
+    maps = torch.randn(batch, rings, sectors, channels)
+    return maps, radii, torch.full((1, 2), (size - 1) / 2), places
+
+
+def padded(maps: Tensor, places: Tensor) -> Tensor:
+    """Maps (B, R, A, C) as images (B, C, H, W), by `F.grid_sample`."""
+    planes = maps.permute(0, 3, 1, 2)
+    across = planes[:, :, :1].roll(maps.shape[2] // 2, 3)
+    planes = F.pad(torch.cat((across, planes), 2), (1, 1, 0, 0), mode="circular")
+    return F.grid_sample(planes, places, align_corners=False, padding_mode="border")
+
+
 def to_image(
     sizes: tuple[int, int, int, int, int], mode: str, layout: str, seconds: float
 ) -> list[Timing]:
     """Times one case; `layout` is that of the operator, and the peer permutes for "tokens"."""
-    batch, rings, sectors, channels, size = sizes
-    maps = torch.randn(batch, rings, sectors, channels)
-    radii = ((torch.arange(rings) + 0.5) * (size / 2 / rings))[None]
-    center = torch.full((1, 2), (size - 1) / 2)
-    places = mesh(rings, sectors, size).expand(batch, -1, -1, -1)
+    batch, rings, sectors, _, size = sizes
+    maps, radii, center, places = inputs(*sizes)
 
     def ours(maps: Tensor) -> Tensor:
         return polar_to_image(maps, radii, center, (size, size), layout=layout)
 
-    def padded(maps: Tensor) -> Tensor:
-        planes = maps.permute(0, 3, 1, 2)
-        across = planes[:, :, :1].roll(sectors // 2, 3)
-        planes = F.pad(torch.cat((across, planes), 2), (1, 1, 0, 0), mode="circular")
-        image = F.grid_sample(planes, places, align_corners=False, padding_mode="border")
+    def peer(maps: Tensor) -> Tensor:
+        image = padded(maps, places)
         return image.permute(0, 2, 3, 1).contiguous() if layout == "tokens" else image
 
     case = Case(
@@ -60,7 +70,7 @@ def to_image(
     target = CASES[sizes][layout == "image"] if mode == "forward" else 8.0
     # grid_sample's coordinates are float32, in units of the whole map.
     return compare(
-        case, {OURS: ours, PEER: padded}, [maps], seconds, targets={PEER: target}, tolerance=1e-4
+        case, {OURS: ours, PEER: peer}, [maps], seconds, targets={PEER: target}, tolerance=1e-4
     )
 
 

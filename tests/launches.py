@@ -12,11 +12,18 @@ from torch import Tensor
 from torch.utils import _pytree as pytree
 from torch.utils._python_dispatch import TorchDispatchMode
 
+from darswin.ops import _library
+
 # What makes memory, or another tensor of the same memory, and launches nothing.
 _FREE = {
     "aten::empty.memory_format", "aten::empty_like", "aten::empty_strided", "aten::new_empty",
     "aten::new_empty_strided", "aten::_unsafe_view", "aten::_reshape_alias", "aten::detach",
     "aten::lift_fresh",
+}  # fmt: skip
+# Of our operators with kernels, those of several launches: tests/gpu/test_launches.py counts them.
+_SEVERAL = {
+    "darswin::polar_embed": 2, "darswin::polar_embed_backward": 3,
+    "darswin::window_attention_backward": 3,
 }  # fmt: skip
 
 
@@ -44,7 +51,9 @@ class Launches(TorchDispatchMode):
         mixed = made and {t.device.type for t in given} - made
         assert not mixed, f"{func} copies between host and device"
         if "meta" in made and not _is_view(func) and func.name() not in _FREE:
-            self.names[func.name()] += 1
+            self.names[func.name()] += _SEVERAL.get(func.name(), 1)
+            if func.namespace == "darswin":  # whose kernels read contiguous tensors
+                self.names["aten::contiguous"] += sum(not t.is_contiguous() for t in given)
         return out
 
 
@@ -62,6 +71,13 @@ def launches(function: Callable[..., Any], *arguments: Any) -> Counter[str]:
     with Launches() as counted:
         function(*arguments)
     return counted.names
+
+
+@contextlib.contextmanager
+def with_kernels() -> Iterator[None]:
+    """Within it the operators run as on a GPU that has their kernels, with Triton or without."""
+    with mock.patch.object(_library, "has_kernels", lambda tensor: tensor.device.type == "meta"):
+        yield
 
 
 @contextlib.contextmanager

@@ -40,7 +40,8 @@ def optimize(
     which stays as it is, is there for that.
 
     Args:
-        model: one of `create_model`, on the CPU.
+        model: one of `create_model`, on the CPU. On a GPU a model needs none of this: it computes
+            a stage's position biases at once by itself, and is called as it is.
         dtype: float32 or bfloat16, of what flows between the layers and of the result; distances
             are float32, and so is what refines the pixels of dense models. int8: products of 8
             bits, of a model of `quantize_model`; what lies between them is float32, and a picture
@@ -122,7 +123,10 @@ def _check(model: nn.Module, dtype: torch.dtype | str, lens: Lens | None) -> Non
         raise ValueError(f'dtype must be one of {known} or "fastest", got {dtype}')
     devices = sorted({parameter.device.type for parameter in model.parameters()})
     if devices != ["cpu"]:
-        raise ValueError(f"model must be on the CPU, got one on {' and '.join(devices)}")
+        raise ValueError(
+            f"model must be on the CPU, whose products it is packed for, got one on "
+            f"{' and '.join(devices)}: call that as it is, by torch.compile or as a CUDA graph"
+        )
 
 
 def _become(model: Model, *bases: type, **attributes: Any) -> None:

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from typing import Any, ClassVar, Literal
 
+import torch
 from lightning.pytorch import LightningDataModule
 from torch.utils.data import DataLoader
 
@@ -126,8 +127,10 @@ class RunData(LightningDataModule):
 
     @property
     def _options(self) -> dict[str, Any]:
+        on_gpu = self.trainer is not None and self.trainer.strategy.root_device.type == "cuda"
         return dict(
             num_workers=self.workers,
+            pin_memory=on_gpu,
             prefetch_factor=4 if self.workers else None,
             worker_init_fn=ignore_signals,
         )
@@ -159,6 +162,12 @@ class RunData(LightningDataModule):
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Goes on from there: the next training loader starts at that place."""
         self._progress = state_dict
+
+    def transfer_batch_to_device(
+        self, batch: Sequence[Any], device: torch.device, dataloader_idx: int
+    ) -> list[Any]:
+        """Images, lenses and targets on the device; a GPU is not waited for."""
+        return [part.to(device, non_blocking=device.type == "cuda") for part in batch]
 
     def dataset(self, split: Split, name: str | None = None) -> Samples:
         """A split as it is evaluated; `name` is one of `test_names`."""

@@ -160,7 +160,7 @@ class DenseTask(Task):
                 continue  # of a picture that could not be read
             pixels = ((images[k] * std + mean) * 255).round().clamp(0, 255).to(torch.uint8)
             self.samples.append(Sample(
-                pixels.permute(1, 2, 0).cpu().numpy(), lens[k if len(lens) > 1 else 0],
+                pixels.permute(1, 2, 0).cpu().numpy(), lens[k if len(lens) > 1 else 0].to("cpu"),
                 target[k].cpu().numpy(), answer[k].cpu().numpy(),
             ))  # fmt: skip
 

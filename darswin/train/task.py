@@ -124,8 +124,13 @@ class Task(LightningModule):
 
     def configure_model(self) -> None:
         """Builds the network for the classes and channels of the data."""
-        if hasattr(self, "net"):
-            return
+        # Lightning calls this with a GPU as the default device, but what the data make stays on the
+        # CPU, for the worker processes, and so does the draw of the weights, for any device.
+        with torch.device("cpu"):
+            if not hasattr(self, "net"):
+                self._build()
+
+    def _build(self) -> None:
         data = self.data
         options: dict[str, Any] = self._head_options() | dict(in_chans=data.channels)
         options |= dict(mean=data.mean, std=data.std)

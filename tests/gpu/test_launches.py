@@ -72,6 +72,22 @@ def test_the_gradient_of_an_image_is_four():
     assert sorted(found) == ["_backward", "_finish", "aten::linalg_vector_norm", "aten::zeros"]
 
 
+def attention(*lead):
+    """The arguments of attention: a shifted stage 3 of darswin_a_small, and its biases."""
+    return meta(2, 16, 4, 3, 3, 32), meta(*lead, 3, 7, 7), (4, 4), (2, 0), (False, True), 0.2
+
+
+def test_attention_is_one_launch_and_one_more_for_biases_that_are_strided():
+    assert launches("window_attention", *attention(2)) == ["_forward"]
+    qkv, bias, *others = attention(2, 2)
+    assert launches("window_attention", qkv, bias[:, 0], *others) == ["aten::clone", "_forward"]
+
+
+def test_the_gradient_of_attention_is_three():
+    found = launches("window_attention_backward", *attention(2), meta(2, 16, 4, 96))
+    assert sorted(found) == ["_backward", "_fold", "aten::sum.dim_IntList"]
+
+
 def test_polar_to_image_is_one_launch():
     lens = meta(1, 64), meta(1, 2), None, None, meta(1)
     assert launches("polar_to_image", meta(2, 64, 256, 16), *lens, (64, 64), True) == ["_forward"]
