@@ -110,7 +110,9 @@ class Sampler {
     // target holds the places of a whole block. They hold for a smaller block only if its points
     // are of one radius.
     if (in_line && (rows == 1 || count == smaller(block_columns(), a.num_azimuths))) {
-      lines(rows, count, out, row + rows == a.samples_r, j + count == a.num_azimuths);
+      // Near the end of the ring, what a sample's store has too much would pass it.
+      const bool last = (a.num_azimuths - j - count) * a.channels < 4 - a.channels;
+      lines(rows, count, out, row + rows == a.samples_r, last || j + count == a.num_azimuths);
       return;
     }
     for (int64_t n = 0; n < rows; ++n) {

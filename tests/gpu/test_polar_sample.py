@@ -282,6 +282,21 @@ def test_bfloat16(layout, on):
         torch.testing.assert_close(got.float(), want, rtol=0.02, atol=0.02 * want.abs().max())
 
 
+def test_images_of_a_batch_do_not_matter_to_each_other(on):
+    """A gradient that is tiny beside another image's, or NaN there, is as exact as alone."""
+    image, radii, center = make_inputs(batch=2, shared=True)
+    leaf = image.clone().requires_grad_()
+    out = on(sampler(8, (2, 4)))(leaf, radii, center)
+    grad = torch.randn(out.shape, device=out.device)
+    (both,) = torch.autograd.grad(out, leaf, grad, retain_graph=True)
+    for factor in (1e-15, math.nan):
+        scaled = torch.stack((grad[0] * factor, grad[1]))
+        (found,) = torch.autograd.grad(out, leaf, scaled, retain_graph=True)
+        assert torch.equal(found[1], both[1])
+        expected = both[0] * factor if factor == factor else torch.full_like(both[0], math.nan)
+        torch.testing.assert_close(found[0], expected, rtol=1e-5, atol=1e-21, equal_nan=True)
+
+
 def test_autocast_gives_bfloat16(device):
     inputs = [t.to(device) for t in make_inputs()]
     expected = sampler(8, (2, 4))(*inputs)

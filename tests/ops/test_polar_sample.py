@@ -782,6 +782,25 @@ def test_the_patch_does_not_matter_to_an_image(size, rows, columns):
     torch.testing.assert_close(sampled[0], expected, rtol=0, atol=2e-6 * (10 + size))
 
 
+@pytest.mark.parametrize("columns", [1025, 1026, 1027, 2049])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("channels", [1, 2, 3])
+def test_a_token_longer_than_a_block_ends_where_it_ends(channels, dtype, columns, threads):
+    """What is left of it behind a block may be less than the block's last store writes."""
+    image = torch.rand(2, channels, 30, 30, dtype=dtype)
+    radii = torch.linspace(1, 12, 3, dtype=dtype)[None]
+    azimuths = torch.linspace(0, 6, columns, dtype=dtype)
+    arguments = (image, radii, azimuths, torch.full((1, 2), 14.5, dtype=dtype))
+    threads(1)
+    alone = polar_sample(*arguments, samples=(1, columns))
+    threads(2)
+    for _ in range(20):
+        assert torch.equal(polar_sample(*arguments, samples=(1, columns)), alone)
+    with use_reference():
+        expected = polar_sample(*arguments, samples=(1, columns))
+    torch.testing.assert_close(alone, expected, rtol=0, atol=1e-4)
+
+
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16, torch.uint8])
 @pytest.mark.parametrize("samples", [(4, 5), (3, 2), (1, 1), (6, 40)])
 @pytest.mark.parametrize("channels", [1, 2, 3, 4, 5])

@@ -26,8 +26,9 @@ def sums(of: Tensor) -> Tensor:
 
 
 def largest(values: Tensor) -> Tensor:
-    """The largest magnitude, float32 and 0-dim; NaN if any value is. One launch."""
-    return torch.linalg.vector_norm(values, math.inf, dtype=torch.float32)
+    """The largest magnitude of each image, (B,) float32; NaN if any value is. One launch."""
+    axes = tuple(range(1, values.ndim))
+    return torch.linalg.vector_norm(values, math.inf, axes, dtype=torch.float32)
 
 
 @triton.jit
@@ -41,11 +42,11 @@ def near_one(largest):
     return (tl.maximum(255 - _exponent(largest), 1) << 23).to(tl.float32, bitcast=True)
 
 
-@triton.jit(do_not_specialize=["count"])
-def _finish(sums, largest, out, count, BITS: tl.constexpr, BLOCK: tl.constexpr):
+@triton.jit(do_not_specialize=["count", "each"])
+def _finish(sums, largest, out, count, each, BITS: tl.constexpr, BLOCK: tl.constexpr):
     k = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     mask = k < count
-    exponent = _exponent(tl.load(largest))
+    exponent = _exponent(tl.load(largest + k // each, mask=mask, other=0.0))
     value = tl.load(sums + k, mask=mask, other=0).to(tl.float32) * (0.5 / (1 << BITS))
     # An exponent of 255 is that of infinity and NaN.
     power = tl.where(exponent == 255, 0x7FC00000, exponent << 23).to(tl.float32, bitcast=True)
@@ -56,7 +57,7 @@ def finish(sums: Tensor, largest: Tensor, out: Tensor, bits: int) -> None:
     """Writes sums of units as numbers. One launch."""
     if out.numel() > 0:
         _finish[(triton.cdiv(out.numel(), BLOCK),)](
-            sums, largest, out, out.numel(), BITS=bits, BLOCK=BLOCK, num_warps=4,
+            sums, largest, out, out.numel(), out[0].numel(), BITS=bits, BLOCK=BLOCK, num_warps=4,
             enable_fp_fusion=True,
         )  # fmt: skip
 

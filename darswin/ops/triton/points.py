@@ -142,7 +142,7 @@ def four_pixels(image, strides, scale, shift, column, row, touches, height, widt
     lower left, lower right. With scale and shift, a number a channel each, a pixel counts as
     pixel * scale + shift."""
     _, channel_stride, row_stride, column_stride = strides
-    upper = image + c * channel_stride + row.to(tl.int64) * row_stride
+    upper = image + tl.cast(c, tl.int64) * channel_stride + row.to(tl.int64) * row_stride
     left = column.to(tl.int64) * column_stride
     return (
         _pixel(upper + left, inside(column, row, touches, height, width), scale, shift, c),

@@ -94,7 +94,7 @@ def _backward(image, radii, azimuths, center, affine, offsets, jitter, seed, sca
     grad_out += b * rows * COLUMNS * CHANNELS
     if image_sums is not None:
         image_sums += b * CHANNELS * height * width
-        unit = near_one(tl.load(largest))
+        unit = near_one(tl.load(largest + b))
     along_sum = tl.zeros([BLOCK], tl.float32)
     inward_sum = tl.zeros([BLOCK], tl.float32)
     outward_sum = tl.zeros([BLOCK], tl.float32)

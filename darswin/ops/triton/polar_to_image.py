@@ -178,7 +178,7 @@ def _backward(x, radii, center, affine, points, r_max, steps, rings, height, wid
     weights = ((1.0 - t) * (1.0 - share), (1.0 - t) * share, t * (1.0 - share_2), t * share_2)
     if map_sums is not None:
         map_sums += b * rings * SECTORS * CHANNELS
-        unit = near_one(tl.load(largest))
+        unit = near_one(tl.load(largest + b))
     by_inner, by_outer = t * 0.0, t * 0.0
     by_column = t * 0.0
     for c in range(0, CHANNELS, CHUNK):
