@@ -86,8 +86,8 @@ def window_attention(
 def _kernel_takes(dtype: torch.dtype, window: tuple[int, int], head_dim: int) -> bool:
     """Whether the kernel for GPUs computes it: a program holds the pairs of a window's tokens, and
     their queries, keys and values, in registers."""
-    tokens, width = (max(16, 1 << (n - 1).bit_length()) for n in (math.prod(window), head_dim))
-    return dtype == torch.float32 and tokens <= 64 and width <= 64 and tokens * width <= 2048
+    tokens = math.prod(window)
+    return dtype == torch.float32 and tokens <= 64 and head_dim <= (64 if tokens <= 32 else 32)
 
 
 def _arithmetic_types(
