@@ -4,7 +4,15 @@ import torch
 from darswin.bench import candidates, tables, targets
 from darswin.bench.memory import Memory
 from darswin.bench.record import Record
-from darswin.bench.timing import COMPILED, FIXED_LENS, MATMULS, OURS, REFERENCE
+from darswin.bench.timing import (
+    COMPILED,
+    FIXED_LENS,
+    MATMULS,
+    OURS,
+    OURS_BFLOAT16,
+    OURS_FLOAT32,
+    REFERENCE,
+)
 from darswin.cli import bench as command
 from darswin.cli.main import main
 from darswin.layers import onednn
@@ -33,12 +41,16 @@ def test_it_measures_and_writes(tmp_path, capsys, monkeypatch):
         for dtype in ("float32", "bfloat16", *(INT8 if mode == "inference" else ()))
         for batch in (1, 2)
     }
-    names = {
-        mode: {t.name for t in record.timings if t.mode.startswith(mode)}
-        for mode in ("inference", "training")
-    }
-    assert names["inference"] == {OURS, FIXED_LENS, REFERENCE, MATMULS}
-    assert names["training"] == {OURS, REFERENCE}
+    names: dict[str, set[str]] = {}
+    for t in record.timings:
+        names.setdefault(t.mode, set()).add(t.name)
+    others = {OURS_FLOAT32}
+    if onednn.missing(torch.bfloat16) is None:
+        others.add(OURS_BFLOAT16)
+    for mode, found in names.items():
+        expected = {OURS, REFERENCE, MATMULS}
+        expected |= {FIXED_LENS} if mode.startswith("inference") else set()
+        assert found == expected | (others if mode.endswith("int8") else set())
     assert all(t.runs >= 100 for t in record.timings if t.mode[:9] == "inference" and t.batch == 1)
     assert all(t.target is None for t in record.timings)  # targets are for one model and size
     assert measured == [(m.mode, m.name) for m in record.memory]
