@@ -112,7 +112,7 @@ class Sampler {
     if (in_line && (rows == 1 || count == smaller(block_columns(), a.num_azimuths))) {
       // Near the end of the ring, what a sample's store has too much would pass it.
       const bool last = (a.num_azimuths - j - count) * a.channels < 4 - a.channels;
-      lines(rows, count, out, row + rows == a.samples_r, last || j + count == a.num_azimuths);
+      lines(rows, count, out, row + rows == a.samples_r, last);
       return;
     }
     for (int64_t n = 0; n < rows; ++n) {

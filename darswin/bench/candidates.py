@@ -174,15 +174,17 @@ def training_products(name: str, size: int, dtype: torch.dtype, batch: int) -> R
     model = network(name, size)
     model.set_matmul_backend("autotune")
     images = torch.randn(batch, 3, size, size)
-    sides = []
+    sides: list[tuple[Linear | QuantizedLinear, Tensor, list[Tensor], Tensor]] = []
     for layer, rows in products_of(model.eval(), images, lens_of(size)):
-        x = torch.randn(rows, layer.in_features, dtype=dtype, requires_grad=True)
-        sides.append((layer, x, torch.randn(rows, layer.out_features, dtype=dtype)))
+        # The first product takes the images, whose gradient no training asks for.
+        x = torch.randn(rows, layer.in_features, dtype=dtype, requires_grad=bool(sides))
+        wanted = [t for t in (x, *layer.parameters()) if t.requires_grad]
+        sides.append((layer, x, wanted, torch.randn(rows, layer.out_features, dtype=dtype)))
 
     def run() -> Tensor:
         with torch.autocast("cpu", torch.bfloat16, enabled=dtype == torch.bfloat16):
-            for layer, x, grad in sides:
-                found = torch.autograd.grad(layer(x), [x, *layer.parameters()], grad)
+            for layer, x, wanted, grad in sides:
+                found = torch.autograd.grad(layer(x), wanted, grad)
         return found[0]
 
     return run
