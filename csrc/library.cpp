@@ -6,6 +6,7 @@
 #include <string>
 
 #include "dispatch.h"
+#include "polar_call.h"
 
 // The arguments that polar_sample and polar_embed share, in the order of the fields of struct
 // Sampling (polar_call.h) and of darswin.ops._sampling.Sampling.
@@ -67,6 +68,9 @@ FACT const char* darswin_tiers() {
 
 // Runs the operators on another tier from now on; false where it is not offered.
 FACT bool darswin_set_tier(const char* name) { return darswin::set_tier(name); }
+
+// Reads far images without gathers (0), with them (1), or as is found to be faster (2).
+FACT void darswin_set_gathers(int way) { darswin::gathers = static_cast<darswin::Gathers>(way); }
 
 // What this module was built with, as JSON.
 FACT const char* darswin_build_info() {

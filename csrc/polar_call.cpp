@@ -130,6 +130,13 @@ PolarCall<T>::PolarCall(const Sampling& given)
                 pixels <= kPackedPixelsPerPoint * points;
 }
 
+std::atomic<Gathers> gathers{Gathers::measured};
+
+Faster& faster_with_gathers(bool gray, bool large, bool threads) {
+  static Faster all[2][2][2];
+  return all[gray][large][threads];
+}
+
 template <typename T>
 int64_t count_bands(const PolarCall<T>& call) {
   const int64_t threads = torch::stable::get_num_threads(), height = call.args.height;

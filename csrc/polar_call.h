@@ -6,11 +6,14 @@
 #include <torch/csrc/stable/tensor.h>
 #include <torch/headeronly/util/Exception.h>
 
+#include <atomic>
 #include <initializer_list>
 #include <optional>
 #include <tuple>
 #include <vector>
 
+#include "dispatch.h"
+#include "faster.h"
 #include "polar.h"
 
 namespace darswin {
@@ -71,6 +74,13 @@ struct Listed<run> {
   }
 };
 
+// How far images are read: with gathers, without, or as is found to be faster.
+enum class Gathers { never, always, measured };
+extern std::atomic<Gathers> gathers;
+
+// Whether gathers are faster for images like these, on so many threads.
+Faster& faster_with_gathers(bool gray, bool large, bool threads);
+
 // One call's arguments as the kernels take them. Owns what `args` points into.
 template <typename T>
 struct PolarCall {
@@ -95,6 +105,25 @@ struct PolarCall {
            static_cast<double>((args.channels + 3) / 4 * 4);
   }
   bool points() const { return batch > 0 && args.num_radii > 0 && args.num_azimuths > 0; }
+  // Calls forward(), with gathers or without: one or the other is faster, which depends on the CPU,
+  // on where the pixels come from, and on how many threads ask for them.
+  template <typename Forward>
+  void sample(Forward forward) {
+    args.gathers = gathers == Gathers::always;
+    const bool possible = current_tier() == Tier::avx512 && !args.packed && args.channels <= 4 &&
+                          args.pixel == Pixel::f32 && args.image_stride[3] == 1;
+    if (!possible || gathers != Gathers::measured) return forward();
+    constexpr double kLarge = 1 << 19, kTrial = 1 << 16;  // pixels and points
+    const double points = static_cast<double>(batch) * static_cast<double>(args.num_radii) *
+                          static_cast<double>(args.num_azimuths);
+    const bool large = packed_values() / ((args.channels + 3) / 4 * 4) > kLarge;
+    const bool threads = torch::stable::get_num_threads() > 1;
+    faster_with_gathers(args.channels == 1, large, threads)(points >= kTrial, [&](bool gather) {
+      args.gathers = gather;
+      forward();
+    });
+  }
+
   // Images that samples are taken of: none if there is no point or no channel.
   int64_t sampled_images() const { return points() && args.channels > 0 ? batch : 0; }
 };

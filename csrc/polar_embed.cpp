@@ -60,8 +60,10 @@ Tensor forward(PolarCall<T>&& call, const Tensor& weight_, const std::optional<T
                    transposed.data(), wide);
   embed.transposed = transposed.data();
   const int64_t bytes = kernel.scratch(args, embed, PolarPass::forward);
-  parallel_ranges(call.batch * call.rings(), [&](int64_t begin, int64_t end) {
-    kernel.forward(args, embed, begin, end, Scratch(bytes).get());
+  call.sample([&] {
+    parallel_ranges(call.batch * call.rings(), [&](int64_t begin, int64_t end) {
+      kernel.forward(args, embed, begin, end, Scratch(bytes).get());
+    });
   });
   return out;
 }

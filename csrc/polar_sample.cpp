@@ -51,8 +51,10 @@ Tensor forward(PolarCall<T>&& call, bool tokens) {
   args.out = out.mutable_data_ptr();
   const auto& kernel = kernels<PolarSampleKernels<T>>();
   const int64_t bytes = kernel.scratch(args, PolarPass::forward);
-  parallel_ranges(call.batch * call.rings(), [&](int64_t begin, int64_t end) {
-    kernel.forward(args, begin, end, Scratch(bytes).get());
+  call.sample([&] {
+    parallel_ranges(call.batch * call.rings(), [&](int64_t begin, int64_t end) {
+      kernel.forward(args, begin, end, Scratch(bytes).get());
+    });
   });
   return out;
 }

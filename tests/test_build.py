@@ -152,8 +152,8 @@ def test_the_module_exports_its_facts_only():
         ["nm", "-D", "--defined-only", _module.FILE], capture_output=True, text=True, check=True
     )
     exported = {line.split()[-1] for line in shown.stdout.splitlines()}
-    facts = {"darswin_tier", "darswin_tiers", "darswin_set_tier", "darswin_build_info"}
-    assert exported == facts
+    facts = {"tier", "tiers", "set_tier", "set_gathers", "build_info"}
+    assert exported == {f"darswin_{fact}" for fact in facts}
 
 
 def test_the_module_asks_for_nothing_newer_than_manylinux_2_28():

@@ -3,6 +3,7 @@
 // value by value in other layouts and for points that are not inside.
 #pragma once
 
+#include "polar_far_block.h"
 #include "polar_image.h"
 
 namespace darswin {
@@ -80,6 +81,23 @@ class FarImage {
     }
   }
 
+  // Whether `block` is to sample them.
+  bool takes_blocks() const {
+    return a.gathers && kRegister == 64 && kSame<E, float> && channels <= 4 &&
+           layout != kTogether && layout != kAny;
+  }
+
+  // Samples the first `count` points of the block, one behind the other.
+  void block(int64_t count, T* to) const {
+    if (layout == kGray) {
+      block<1>(count, to);
+    } else if (layout == kThreePlanes) {
+      block<3>(count, to);
+    } else {
+      block<0>(count, to);
+    }
+  }
+
   void sample(const Line& line, const FarOutput<T>& out) const {
     if constexpr (kSame<T, float>) {
       switch (layout) {
@@ -111,6 +129,38 @@ class FarImage {
     }
     const bool together = a.image_stride[1] == 1 && a.image_stride[3] >= a.channels;
     return together && a.channels > 1 && a.channels <= 4 ? kTogether : kAny;
+  }
+
+  // The last sixteen points may have been sampled in part by those before. There is no prefetching:
+  // gathers wait for many pixels at once.
+  template <int kChannels>
+  void block(int64_t count, T* to) const {
+    if constexpr (kRegister == 64 && kSame<E, float>) {
+      const Line all{true, 0, 0, 0, 0, 1, count};
+      if (count < 16) return points(all, 0, count, {to, channels, false});
+      for (int64_t k = 0; k < count; k += 16) {
+        k = smaller(k, count - 16);
+        const FarSixteen<T> sixteen(places, k);
+        if (!sixteen.inside()) {
+          points(all, k, k + 16, {to, channels, false});
+          continue;
+        }
+        T* out = to + k * channels;
+        const auto plane = [&](int64_t c) { return sixteen.sample(pixels + c * channel, below); };
+        if constexpr (kChannels == 3) {
+          store_sixteen(plane(0), plane(1), plane(2), out);
+          continue;
+        }
+        for (int64_t c = 0; c < (kChannels > 0 ? kChannels : channels); ++c) {
+          const auto v = plane(c);
+          if constexpr (kChannels == 1) {
+            store(out, v);
+          } else {
+            for (int p = 0; p < 16; ++p) out[p * channels + c] = v[p];
+          }
+        }
+      }
+    }
   }
 
   template <int kChannels>

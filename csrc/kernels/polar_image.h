@@ -67,22 +67,24 @@ inline void place(const PolarSampleArgs<T>& a, const Packed& packed, const Point
 }
 
 // In a far image a point that touches no pixel is put at column or row -3. `strides` are those of
-// the rows and columns of what is read or written.
-template <typename T>
+// the rows and columns of what is read or written. If all four pixels of every point are known to
+// be `inside`, columns and rows stay unknown.
+template <bool inside, typename T>
 inline void place(const PolarSampleArgs<T>& a, const int64_t strides[2], const Points& p, int64_t k,
                   FarPlaces<T>& places) {
   using Ints = Vector<int64_t, kDoubles>;
   const double width = static_cast<double>(a.width), height = static_cast<double>(a.height);
-  const Doubles column = split<false>(p.x, width, -2, places.right + k) - 1;
-  const Doubles row = split<false>(p.y, height, -2, places.lower + k) - 1;
+  const Doubles column = split<inside>(p.x, width, -2, places.right + k) - 1;
+  const Doubles row = split<inside>(p.y, height, -2, places.lower + k) - 1;
   // Exact in double below 2^53.
-  const Doubles offset =
-      row * static_cast<double>(strides[0]) + column * static_cast<double>(strides[1]);
-  const auto inside = (column >= 0) & (row >= 0) & (column < width - 1) & (row < height - 1);
-  store(places.column + k, __builtin_convertvector(column, Ints));
-  store(places.row + k, __builtin_convertvector(row, Ints));
-  store(places.offset + k,
-        __builtin_convertvector(select(inside, offset, splat<Doubles>(-1.0)), Ints));
+  Doubles offset = row * static_cast<double>(strides[0]) + column * static_cast<double>(strides[1]);
+  if constexpr (!inside) {
+    const auto whole = (column >= 0) & (row >= 0) & (column < width - 1) & (row < height - 1);
+    offset = select(whole, offset, splat<Doubles>(-1.0));
+    store(places.column + k, __builtin_convertvector(column, Ints));
+    store(places.row + k, __builtin_convertvector(row, Ints));
+  }
+  store(places.offset + k, __builtin_convertvector(offset, Ints));
 }
 
 // A block of points, in the packed image or in the far one.
@@ -97,11 +99,7 @@ struct PlacedPoints {
   // Finds points j to j + count of radius i of image b, and stores them from place `first` on.
   void find(const PolarSampleArgs<T>& a, const Packed& packed, int64_t b, int64_t i, int64_t j,
             int64_t count, int64_t first) {
-    const Reach most = reach(a, b, i);
-    const T* center = a.center + b * a.center_stride;
-    const auto width = static_cast<double>(a.width), height = static_cast<double>(a.height);
-    if (a.offsets == nullptr && a.directions_finite && center[0] - most.x > -1 &&
-        center[0] + most.x < width && center[1] - most.y > -1 && center[1] + most.y < height) {
+    if (within(a, b, i, -1)) {
       locate(a, b, i, j, count, random,
              [&](int64_t k, const Points& p) { place<true>(a, packed, p, first + k, near); });
     } else {
@@ -113,8 +111,26 @@ struct PlacedPoints {
   // The same in the far image.
   void find_far(const PolarSampleArgs<T>& a, const int64_t strides[2], int64_t b, int64_t i,
                 int64_t j, int64_t count, int64_t first) {
-    locate(a, b, i, j, count, random,
-           [&](int64_t k, const Points& p) { place(a, strides, p, first + k, far); });
+    constexpr double kSpare = 0.001;  // of a pixel, for what rounding does to a place
+    if (within(a, b, i, kSpare)) {
+      locate(a, b, i, j, count, random,
+             [&](int64_t k, const Points& p) { place<true>(a, strides, p, first + k, far); });
+    } else {
+      locate(a, b, i, j, count, random,
+             [&](int64_t k, const Points& p) { place<false>(a, strides, p, first + k, far); });
+    }
+  }
+
+ private:
+  // Whether all points of a radius are known to lie further than `margin` inside the outermost
+  // pixels' centers.
+  static bool within(const PolarSampleArgs<T>& a, int64_t b, int64_t i, double margin) {
+    if (a.offsets != nullptr || !a.directions_finite) return false;
+    const Reach most = reach(a, b, i);
+    const T* center = a.center + b * a.center_stride;
+    const auto right = static_cast<double>(a.width - 1), lower = static_cast<double>(a.height - 1);
+    return center[0] - most.x > margin && center[0] + most.x < right - margin &&
+           center[1] - most.y > margin && center[1] + most.y < lower - margin;
   }
 };
 

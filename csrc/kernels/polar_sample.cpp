@@ -85,7 +85,7 @@ void backward_lens(const PolarSampleArgs<T>& a, int64_t begin, int64_t end, void
     for (int64_t j = 0; j < a.num_azimuths; j += kBlock) {
       const int64_t count = smaller(kBlock, a.num_azimuths - j);
       locate(a, b, i, j, count, points.random, [&](int64_t k, const Points& p) {
-        place(a, a.image_stride + 2, p, k, places);
+        place<false>(a, a.image_stride + 2, p, k, places);
         // A radius that was clamped at 0 does not move.
         store(points.across + k, select(p.clamped, Doubles{}, p.across));
         store(points.down + k, select(p.clamped, Doubles{}, p.down));

@@ -66,6 +66,7 @@ class Sampler {
     PlacedPoints<T> points;
     int32_t target[kBlock];  // where the points of a block go
     bool joined[kBlock];     // whether the next three points follow there
+    T samples[4 * kBlock];
   };
 
   // No point of a block is stored further than this from the block's first.
@@ -195,6 +196,18 @@ class Sampler {
   template <typename E>
   [[gnu::noinline]] void far_lines(int64_t b, int64_t j, int64_t rows, int64_t count, T* to) const {
     const FarImage<T, E> far(a, b, points.far);
+    if (far.takes_blocks()) {
+      far.block(rows * count, state.samples);
+      const int64_t part = smaller(a.samples_a, count), piece = part * a.channels;
+      const T* from = state.samples;
+      for (int64_t row = 0; row < rows; ++row) {
+        T* out = to + row * row_stride;
+        for (int64_t k = 0; k < count; k += part, from += piece, out += sector_stride) {
+          copy(from, piece, out);
+        }
+      }
+      return;
+    }
     const bool joined = rows == 1 && sector_stride == a.samples_a * a.channels;
     const Lines<T> lines(a, j, rows, count, joined ? count : a.samples_a, far.planes() > 1);
     const auto fetch = [&](const Line& line) { far.fetch(line); };

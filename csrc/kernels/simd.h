@@ -30,6 +30,10 @@ inline void copy(const T* from, int64_t count, T* to) {
   if (e == count) return;
   if (count > lanes) {
     store(to + count - lanes, load<V>(from + count - lanes));
+  } else if (lanes > 2 && count >= lanes / 2) {
+    using Half = Vector<T, lanes / 2>;
+    store(to, load<Half>(from));
+    store(to + count - lanes / 2, load<Half>(from + count - lanes / 2));
   } else {
     for (; e < count; ++e) to[e] = from[e];
   }

@@ -29,6 +29,8 @@ def load() -> ctypes.CDLL:
         function.restype = ctypes.c_char_p
     module.darswin_set_tier.argtypes = [ctypes.c_char_p]
     module.darswin_set_tier.restype = ctypes.c_bool
+    module.darswin_set_gathers.argtypes = [ctypes.c_int]
+    module.darswin_set_gathers.restype = None
     return module
 
 
@@ -48,6 +50,14 @@ def set_tier(tier: str) -> None:
         raise ValueError(
             f"tier must be one that this CPU and build offer (best: {tiers()[-1]!r}), got {tier!r}"
         )
+
+
+def set_gathers(way: bool | None) -> None:
+    """Reads large images with gathers or without; None: as is found to be faster, the default.
+
+    The results are the same. Only the AVX-512 tier has gathers.
+    """
+    _loaded.darswin_set_gathers(2 if way is None else int(way))
 
 
 def build_info() -> dict[str, str | int]:

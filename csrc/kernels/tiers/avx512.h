@@ -88,6 +88,17 @@ inline Floats two_eights(const float* here, const float* there) {
   return (Floats)_mm512_mask_broadcast_f32x8(first, 0xFF00, _mm256_loadu_ps(there));
 }
 
+// Two floats from each of eight places.
+inline Floats gather_pairs(const float* from, Vector<int64_t, 8> offset) {
+  return (Floats)_mm512_i64gather_pd((__m512i)offset, from, sizeof(float));
+}
+
+inline bool any_negative(Vector<int64_t, 8> v) { return _mm512_movepi64_mask((__m512i)v) != 0; }
+
+inline Floats permuted(Floats v, Vector<int32_t, 16> index) {
+  return (Floats)_mm512_maskz_permutexvar_ps(0xFFFF, (__m512i)index, (__m512)v);
+}
+
 // The lanes of v that `index` names.
 inline Floats pick(Vector<float, 4> v, Vector<int32_t, 16> index) {
   const __m512 wide = _mm512_castps128_ps512((__m128)v);
