@@ -108,11 +108,12 @@ struct PlacedPoints {
     }
   }
 
-  // The same in the far image.
+  // The same in the far image, with or without the columns and rows of points that lie inside.
+  template <bool columns>
   void find_far(const PolarSampleArgs<T>& a, const int64_t strides[2], int64_t b, int64_t i,
                 int64_t j, int64_t count, int64_t first) {
     constexpr double kSpare = 0.001;  // of a pixel, for what rounding does to a place
-    if (within(a, b, i, kSpare)) {
+    if (!columns && within(a, b, i, kSpare)) {
       locate(a, b, i, j, count, random,
              [&](int64_t k, const Points& p) { place<true>(a, strides, p, first + k, far); });
     } else {

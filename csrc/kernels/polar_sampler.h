@@ -93,7 +93,7 @@ class Sampler {
     T* out = to + j / a.samples_a * sector_stride + j % a.samples_a * a.channels + row * row_stride;
     if (!a.packed) {
       for (int64_t n = 0; n < rows; ++n) {
-        points.find_far(a, a.image_stride + 2, b, first + n, j, count, n * count);
+        points.template find_far<false>(a, a.image_stride + 2, b, first + n, j, count, n * count);
       }
       with_pixel_type<T>(a.pixel, [&]<typename E>() { far_lines<E>(b, j, rows, count, out); });
       return;

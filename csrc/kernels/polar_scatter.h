@@ -228,7 +228,7 @@ class Scatter {
       for (int64_t row = 0; row < a.samples_r; row += rows) {
         const int64_t end = smaller(row + rows, a.samples_r);
         for (int64_t n = row; n < end; ++n) {
-          points.find_far(a, strides, image, first + n, j, count, (n - row) * count);
+          points.template find_far<true>(a, strides, image, first + n, j, count, (n - row) * count);
         }
         const auto add = [&](const Line& line) {
           const int64_t step = line.flat ? a.channels : line_size;
