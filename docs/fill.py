@@ -23,7 +23,11 @@ RESULTS = ROOT / "benchmarks" / "results"
 
 # The CPUs that there are records of, by the end of their names; the pages show the first one that
 # has a record of a suite.
-CPUS = {"amd-epyc-25-17-avx512": "Zen 4", "amd-epyc-avx512": "Zen 5"}
+CPUS = {
+    "intel-r-xeon-r-6-167-avx512": "Xeon",
+    "amd-epyc-25-17-avx512": "Zen 4",
+    "amd-epyc-avx512": "Zen 5",
+}
 SUITES = ("sampling", "to_image", "attention", "model")
 
 SAMPLING_PEERS = ("F.grid_sample", "F.grid_sample + permute", "cv2.remap")

@@ -78,6 +78,22 @@ def test_the_drop_in_call_is_faster_than_what_it_replaces():
         assert len(calls) == 6 and min(t.ratio for t in calls) > 1
 
 
+def test_what_is_said_of_cpus_is_in_their_records():
+    found = {
+        cpu: [
+            t.ratio
+            for t in record.timings
+            if (t.subject, t.mode, t.setting, t.name)
+            == ("polar_sample", "forward", "64×64", "F.grid_sample")
+        ]
+        for cpu, record in fill.records("sampling").items()
+    }
+    said = prose("docs/performance.md")
+    for cpu, ratios in found.items():
+        times = f"{min(ratios):.1f} to {max(ratios):.1f} times"
+        assert re.search(f"{times} (?:as fast as by `F.grid_sample` )?on (?:the )?{cpu}", said), cpu
+
+
 def test_what_is_said_of_the_study_is_in_its_record():
     cells = json.loads((ROOT / "studies/results/study--nano.json").read_text())["cells"]
     runs = {}
