@@ -10,6 +10,7 @@ from darswin.bench.timing import COMPILED, FIXED_LENS, MATMULS, OURS, REFERENCE
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
 
 WIDTH = 9  # inches: text of 10 pt is still 8 pt in a page 740 px wide
@@ -89,11 +90,18 @@ def _draw_panels(
             axes.xaxis.set_major_locator(LogLocator(2, numticks=8))
             axes.xaxis.set_major_formatter("{x:g}×")
     figure.supxlabel(unit, fontsize="medium")
-    shown = [name for name in names if name in legend]
-    columns = len(shown) if len(shown) < 5 else 3
-    handles = [legend[name] for name in shown]
-    figure.legend(handles=handles, loc="outside upper center", ncols=columns)
+    _name([legend[name] for name in names if name in legend], figure)
     save_figure(figure, path)
+
+
+def _name(handles: "list[Line2D]", figure: "Figure") -> None:
+    """A legend above all panels, of as many columns as fit beside each other, three at most where
+    there are many names."""
+    for columns in range(len(handles) if len(handles) < 5 else 3, 0, -1):
+        legend = figure.legend(handles=handles, loc="outside upper center", ncols=columns)
+        if columns == 1 or legend.get_window_extent().width <= figure.bbox.width:
+            return
+        legend.remove()
 
 
 def _draw_rows(axes: "Axes", rows: Rows, names: Sequence[str]) -> "dict[str, Line2D]":

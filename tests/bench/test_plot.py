@@ -53,7 +53,8 @@ def test_peers(operators, drawn, tmp_path):
 
 @pytest.mark.parametrize("path", sorted(RESULTS.glob("*-avx512.json")), ids=lambda path: path.stem)
 def test_the_pictures_of_the_records_can_be_read(path, tmp_path, monkeypatch):
-    """At the width of a page, 740 px, text is at least 8 pt high, and the page is not endless."""
+    """At the width of a page, 740 px, text is at least 8 pt high, the page is not endless, and the
+    legend lies inside."""
     record, suite = Record.load(path), path.stem.split("--")[0]
     figures = []
     monkeypatch.setattr("darswin.viz.plot.save_figure", lambda figure, path: figures.append(figure))
@@ -61,6 +62,9 @@ def test_the_pictures_of_the_records_can_be_read(path, tmp_path, monkeypatch):
     (figure,) = figures
     width, height = figure.get_size_inches() * 120
     assert height <= 1200
+    figure.draw_without_rendering()
+    legend = figure.legends[0].get_window_extent()
+    assert legend.x0 >= 0 and legend.x1 <= figure.bbox.width
     texts = [text for text in figure.findobj(Text) if text.get_text()]
     assert min(text.get_fontsize() for text in texts) * 120 / 72 * 740 / width * 72 / 96 >= 8
 
