@@ -13,11 +13,9 @@ class Faster {
   // `worth` a trial run both ways in turns and time them; then the way of the shortest time stays.
   template <typename Run>
   void operator()(bool worth, Run run) {
-    if (worth && trials < kTrials) {
-      if (!trying.test_and_set()) {
-        const Tried done{trying};
-        if (trials < kTrials) return try_both(run);
-      }
+    if (worth && trials < kTrials && !trying.test_and_set()) {
+      const Tried done{trying};
+      return try_both(run);
     }
     run(way.load());
   }

@@ -19,7 +19,7 @@ struct PolarSampleArgs {
   int64_t channels, height, width;
   int64_t image_stride[4];
   bool packed;            // whether images are sampled from a packed copy in cache
-  bool gathers;           // whether those that are not are read by gathers where that is possible
+  bool gathers;           // whether they are read by gathers: see PolarCall::sample
   const T* pixel_scale;   // (C,): a pixel p of type u8 counts as p * scale + offset
   const T* pixel_offset;  // (C,)
   const T* radii;         // (B or 1, num_radii) px

@@ -105,18 +105,19 @@ struct PolarCall {
            static_cast<double>((args.channels + 3) / 4 * 4);
   }
   bool points() const { return batch > 0 && args.num_radii > 0 && args.num_azimuths > 0; }
+
   // Calls forward(), with gathers or without: one or the other is faster, which depends on the CPU,
   // on where the pixels come from, and on how many threads ask for them.
   template <typename Forward>
   void sample(Forward forward) {
-    args.gathers = gathers == Gathers::always;
     const bool possible = current_tier() == Tier::avx512 && !args.packed && args.channels <= 4 &&
                           args.pixel == Pixel::f32 && args.image_stride[3] == 1;
+    args.gathers = possible && gathers == Gathers::always;
     if (!possible || gathers != Gathers::measured) return forward();
     constexpr double kLarge = 1 << 19, kTrial = 1 << 16;  // pixels and points
     const double points = static_cast<double>(batch) * static_cast<double>(args.num_radii) *
                           static_cast<double>(args.num_azimuths);
-    const bool large = packed_values() / ((args.channels + 3) / 4 * 4) > kLarge;
+    const bool large = static_cast<double>(args.height) * static_cast<double>(args.width) > kLarge;
     const bool threads = torch::stable::get_num_threads() > 1;
     faster_with_gathers(args.channels == 1, large, threads)(points >= kTrial, [&](bool gather) {
       args.gathers = gather;

@@ -81,13 +81,7 @@ class FarImage {
     }
   }
 
-  // Whether `block` is to sample them.
-  bool takes_blocks() const {
-    return a.gathers && kRegister == 64 && kSame<E, float> && channels <= 4 &&
-           layout != kTogether && layout != kAny;
-  }
-
-  // Samples the first `count` points of the block, one behind the other.
+  // Samples the first `count` points of the block, one behind the other: only with `gathers`.
   void block(int64_t count, T* to) const {
     if (layout == kGray) {
       block<1>(count, to);

@@ -196,7 +196,7 @@ class Sampler {
   template <typename E>
   [[gnu::noinline]] void far_lines(int64_t b, int64_t j, int64_t rows, int64_t count, T* to) const {
     const FarImage<T, E> far(a, b, points.far);
-    if (far.takes_blocks()) {
+    if (a.gathers) {
       far.block(rows * count, state.samples);
       const int64_t part = smaller(a.samples_a, count), piece = part * a.channels;
       const T* from = state.samples;

@@ -87,7 +87,7 @@ def test_nothing_beyond_the_image_is_read_at_its_end():
         assert_same_bits(run)
 
 
-def test_the_faster_way_is_measured_and_stays(threads):
+def test_calls_that_try_both_ways_give_the_same(threads):
     threads(1)
     image, azimuths = torch.randn(1, 1, 300, 300), torch.linspace(0, 6, 1024)
     radii, center = torch.linspace(1, 140, 128)[None], torch.full((1, 2), 150.0)

@@ -101,8 +101,7 @@ inline Floats permuted(Floats v, Vector<int32_t, 16> index) {
 
 // The lanes of v that `index` names.
 inline Floats pick(Vector<float, 4> v, Vector<int32_t, 16> index) {
-  const __m512 wide = _mm512_castps128_ps512((__m128)v);
-  return (Floats)_mm512_maskz_permutexvar_ps(0xFFFF, (__m512i)index, wide);
+  return permuted((Floats)_mm512_castps128_ps512((__m128)v), index);
 }
 
 // The first `lanes` of each quarter of v, one quarter behind the other.
