@@ -1,15 +1,21 @@
-"""Wide-angle and fisheye images for vision transformers, fast on CPUs."""
+"""Wide-angle and fisheye images for vision transformers, fast on CPUs.
 
-from importlib.metadata import version
+A public name is imported when it is first used, and torch with it: `import darswin` alone loads
+neither, and registers no operator. `import darswin.ops` registers those of `torch.ops.darswin`.
+"""
 
-from darswin import compat, lens, models, ops
-from darswin.deploy.optimize import optimize
-from darswin.layers.attention import PolarWindowAttention
-from darswin.layers.grid import PolarGrid, polar_grid
-from darswin.layers.sampling import PolarSample
-from darswin.models import DarSwin, create_model, list_models
+from importlib import import_module
+from typing import TYPE_CHECKING
 
-__version__ = version("darswin")
+if TYPE_CHECKING:
+    from darswin import compat, lens, models, ops
+    from darswin.deploy.optimize import optimize
+    from darswin.layers.attention import PolarWindowAttention
+    from darswin.layers.grid import PolarGrid, polar_grid
+    from darswin.layers.sampling import PolarSample
+    from darswin.models import DarSwin, create_model, list_models
+
+    __version__: str
 
 __all__ = [
     "DarSwin",
@@ -25,3 +31,36 @@ __all__ = [
     "optimize",
     "polar_grid",
 ]
+
+# The module of each public name that is no module.
+_MODULES = {
+    "DarSwin": "darswin.models",
+    "PolarGrid": "darswin.layers.grid",
+    "PolarSample": "darswin.layers.sampling",
+    "PolarWindowAttention": "darswin.layers.attention",
+    "create_model": "darswin.models",
+    "list_models": "darswin.models",
+    "optimize": "darswin.deploy.optimize",
+    "polar_grid": "darswin.layers.grid",
+}
+
+
+if not TYPE_CHECKING:  # with a `__getattr__`, mypy would take any name for a public one
+
+    def __getattr__(name: str) -> object:
+        if name == "__version__":
+            from importlib.metadata import version
+
+            value = version("darswin")
+        elif name in _MODULES:
+            value = getattr(import_module(_MODULES[name]), name)
+        elif name in __all__:
+            value = import_module(f"darswin.{name}")
+        else:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        globals()[name] = value
+        return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__, "__version__"})

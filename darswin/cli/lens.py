@@ -12,9 +12,6 @@ from darswin.lens.base import Lens
 from darswin.lens.files.load import Calibration, reach
 from darswin.lens.orientation import in_upright_picture, stored_size
 from darswin.lens.spacing import Spacing
-from darswin.utils.image import read_oriented
-from darswin.viz import views
-from darswin.viz.plot import draw_lens, figure_format, save_figure
 from darswin.viz.report import describe, sides
 
 Coefficients = Literal["fisheye", "pinhole", "omnidir"]
@@ -57,6 +54,11 @@ def show(
         camera: which one, in a file of several.
         coefficients: what they are, in an OpenCV or ROS file that does not say it.
     """
+    # Only `show` needs OpenCV and matplotlib. To import them takes a second.
+    from darswin.utils.image import read_oriented
+    from darswin.viz import views
+    from darswin.viz.plot import draw_lens, figure_format, save_figure
+
     figure_format(out)
     _check_partition(rings, sectors, samples)
     for name, angle in (("yaw_deg", yaw_deg), ("pitch_deg", pitch_deg)):

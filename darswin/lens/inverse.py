@@ -25,7 +25,7 @@ def inverse(function: Function, slope: Function, value: Tensor, end: Tensor) -> 
     """
     with torch.no_grad():
         last = function(end)
-        high = end.expand(torch.broadcast_shapes(value.shape, end.shape))
+        high = torch.broadcast_tensors(end, value)[0]
         low, x = torch.zeros_like(high), high * (value / last).clamp(0, 1)
         moved = high
         for _ in range(_STEPS):

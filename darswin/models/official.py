@@ -61,14 +61,14 @@ class OfficialPolynomial(Lens, register=False):
     def project(self, theta: Number) -> Tensor:
         theta, radius = self._aligned(theta, "radius")
         x, angles = self._table()
-        shape = torch.broadcast_shapes(theta.shape, radius.shape)
-        flat = theta.expand(shape).reshape(len(self), -1)
+        angle, radius = torch.broadcast_tensors(theta, radius)
+        flat = angle.reshape(len(self), -1)
         above = torch.searchsorted(angles.contiguous(), flat.contiguous(), right=True)
         above = above.clamp(1, len(x) - 1)
         low, high = angles.gather(1, above - 1), angles.gather(1, above)
         fraction = (flat - low) / (high - low)
         rho = x[above - 1] + fraction * (x[above] - x[above - 1])
-        return rho.reshape(shape) * radius
+        return rho.reshape(angle.shape) * radius
 
     def _angle_at(self, radius: Tensor) -> Tensor:
         radius, full = self._aligned(radius, "radius")

@@ -59,14 +59,24 @@ def has_kernels(tensor: Tensor) -> bool:
     return usable and tensor.device.type == "cuda" and _is_known_gpu(tensor.device.index)
 
 
-@torch.compiler.assume_constant_result
+def _constant(function: Callable[..., bool]) -> Callable[..., bool]:
+    """Lets Dynamo call a function while it traces and build the result into the graph.
+
+    `torch.compiler.assume_constant_result` sets the same mark, but it imports Dynamo, which takes
+    as long as torch itself.
+    """
+    function._dynamo_marked_constant = True  # type: ignore[attr-defined]
+    return function
+
+
+@_constant
 def _is_known_gpu(index: int) -> bool:
     """Whether the kernels were made for a CUDA device: NVIDIA's since the A100. AMD's are called
     "cuda" too."""
     return torch.version.hip is None and torch.cuda.get_device_capability(index) >= (8, 0)
 
 
-@torch.compiler.assume_constant_result  # before torch 2.12 Dynamo cannot trace what it calls
+@_constant  # before torch 2.12 Dynamo cannot trace what it calls
 def _has_autocast(device: str) -> bool:
     return torch.amp.is_autocast_available(device)
 

@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 from darswin.cli import lens as cli
 from darswin.cli.main import main
 from darswin.lens import Mei, Perspective, Polynomial, Spherical, from_dict, to_dict
+from darswin.viz import plot
 from darswin.viz.report import (
     best_spacing,
     describe,
@@ -145,8 +146,8 @@ def test_a_picture_is_what_its_ending_says(folder):
 def drawn(monkeypatch):
     """What would be drawn: the sampler, the rays of the view and its title."""
     found = []
-    monkeypatch.setattr(cli, "draw_lens", lambda image, lens, *rest: found.append(rest))
-    monkeypatch.setattr(cli, "save_figure", lambda figure, out: None)
+    monkeypatch.setattr(plot, "draw_lens", lambda image, lens, *rest: found.append(rest))
+    monkeypatch.setattr(plot, "save_figure", lambda figure, out: None)
     return found
 
 
@@ -259,8 +260,8 @@ def test_any_command_line_ends_with_an_answer_or_a_sentence(
 
     code, out, err = 0, io.StringIO(), io.StringIO()
     with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(out):
-        patch.setattr(cli, "draw_lens", draw)
-        patch.setattr(cli, "save_figure", lambda figure, out: None)
+        patch.setattr(plot, "draw_lens", draw)
+        patch.setattr(plot, "save_figure", lambda figure, out: None)
         with contextlib.redirect_stderr(err):
             try:
                 main(argv)

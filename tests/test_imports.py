@@ -1,0 +1,95 @@
+"""An import loads no more than it needs: what takes long is loaded where it is used."""
+
+import ast
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+import darswin
+
+LENS = Path(__file__).parent.parent / "examples" / "front.json"
+# Each takes a part of a second or more.
+HEAVY = {
+    "PIL", "cv2", "jsonargparse", "lightning", "matplotlib", "onnx", "sklearn", "sympy",
+    "torch._dynamo", "torch._inductor", "torch.utils.tensorboard", "torchmetrics",
+}  # fmt: skip
+COMMAND = """
+from importlib.metadata import entry_points
+(command,) = entry_points(group="console_scripts", name="darswin")
+command.load()({})
+"""
+
+
+def loaded(code: str) -> set[str]:
+    """The modules that a new Python has loaded after some code."""
+    report = "import json, sys; print(); print(json.dumps([*sys.modules]))"
+    done = subprocess.run(
+        [sys.executable, "-c", f"{code}\n{report}"], capture_output=True, text=True, check=True
+    )
+    return set(json.loads(done.stdout.splitlines()[-1]))
+
+
+@pytest.fixture(scope="module")
+def with_torch():
+    return loaded("import torch")
+
+
+def test_the_package_alone_loads_nothing():
+    modules = loaded("import darswin")
+    assert {name for name in modules if name.startswith("darswin")} == {"darswin"}
+    assert modules.isdisjoint({"numpy", "torch"})
+
+
+def test_the_help_needs_no_torch():
+    assert loaded(COMMAND.format(["--help"])).isdisjoint({"numpy", "torch"} | HEAVY)
+
+
+@pytest.mark.parametrize("code", ["import darswin.ops", "from darswin import *"])
+def test_public_names_load_nothing_heavy(code, with_torch):
+    modules = loaded(f"import torch\n{code}")
+    assert "darswin.ops" in modules
+    assert not (modules - with_torch) & HEAVY
+
+
+def test_a_description_of_a_lens_loads_nothing_heavy(with_torch):
+    modules = loaded("import torch" + COMMAND.format(["lens", "info", str(LENS)]))
+    assert "darswin.viz.report" in modules
+    # The command line is jsonargparse's.
+    assert (modules - with_torch) & HEAVY == {"jsonargparse"}
+
+
+def test_importing_the_operators_registers_them():
+    loaded("import darswin.ops, torch; torch.ops.darswin.polar_sample")
+
+
+def test_every_public_name_is_found():
+    names: dict[str, object] = {}
+    exec("from darswin import *", names)
+    assert set(darswin.__all__) <= names.keys()
+    assert {*darswin.__all__, "__version__"} <= set(dir(darswin))
+    assert darswin.optimize is sys.modules["darswin.deploy.optimize"].optimize
+    assert darswin.lens is sys.modules["darswin.lens"]
+    with pytest.raises(AttributeError, match="'darswin' has no attribute 'nothing'"):
+        _ = darswin.nothing
+
+
+def test_type_checkers_see_the_same_modules():
+    tree = ast.parse(Path(darswin.__file__).read_text())
+    imports = [node for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)]
+    seen = {name.name: node.module for node in imports for name in node.names}
+    assert {name: seen[name] for name in darswin.__all__} == {
+        name: darswin._MODULES.get(name, "darswin") for name in darswin.__all__
+    }
+
+
+def test_constants_are_marked_as_torch_marks_them():
+    from darswin.ops import _library
+
+    def function(): ...
+
+    marked = torch.compiler.assume_constant_result(function)
+    assert vars(marked) == vars(_library._is_known_gpu) == vars(_library._has_autocast) != {}
