@@ -12,6 +12,7 @@ from darswin.lens import MODELS, BrownConrady, Equidistant, Fisheye624, KannalaB
 from darswin.lens.base import Lens
 from darswin.lens.distorted import DistortedLens
 from darswin.lens.orientation import in_upright_picture, rotated, stored_size, turned
+from darswin.viz import plot
 
 f64 = torch.float64
 SIZE = (5, 7)
@@ -79,8 +80,8 @@ def test_a_lens_is_shown_in_the_picture_that_exif_turns(tmp_path, monkeypatch, o
     exif[ExifTags.Base.Orientation] = orientation
     image.save(tmp_path / "p.jpg", exif=exif)
     drawn = []
-    monkeypatch.setattr(cli, "draw_lens", lambda picture, lens, *_: drawn.append((picture, lens)))
-    monkeypatch.setattr(cli, "save_figure", lambda *_: None)
+    monkeypatch.setattr(plot, "draw_lens", lambda picture, lens, *_: drawn.append((picture, lens)))
+    monkeypatch.setattr(plot, "save_figure", lambda *_: None)
     cli.show(str(tmp_path / "lens.json"), str(tmp_path / "p.jpg"))
     ((picture, seen),) = drawn
     assert picture.shape[:2] == ((64, 48) if orientation == 6 else (48, 64))
