@@ -71,7 +71,7 @@ class PolarSample(nn.Module):
         )
 
     def arguments(self, images: Tensor, grid: PolarGrid) -> dict:
-        """What the operators sample images with, on a grid that `grid` gave."""
+        """What the operators sample images (B, C, H, W) with, on a grid that `grid` gave."""
         dtype = torch.float64 if images.dtype == torch.float64 else torch.float32
         radii, azimuths, center, _, affine, offsets = (
             None if t is None else t.to(images.device, dtype) for t in grid
@@ -82,12 +82,16 @@ class PolarSample(nn.Module):
         return dict(
             image=images, radii=radii, azimuths=azimuths, center=center, affine=affine,
             offsets=offsets, samples=self.samples, jitter=jitter, seed=seed, mean=self.mean,
-            std=self.std,
+            std=self.std, channels_last=False,
         )  # fmt: skip
 
-    def forward(self, images: Tensor, lens: Lens) -> Tensor:
-        """Images (B, C, H, W) and their lenses (B or 1) → the samples, in `layout`."""
-        images = check_images(images)
+    def forward(self, images: Tensor, lens: Lens, channels_last: bool | None = None) -> Tensor:
+        """Images and their lenses (B or 1) → the samples, in `layout`.
+
+        The images are (B, C, H, W) or (B, H, W, C), as `polar_sample` takes them with
+        `channels_last`.
+        """
+        images = check_images(images, channels_last)
         height, width = images.shape[2:]
         check_lens(lens, (height, width))
         check_count(len(lens), images)
@@ -102,13 +106,15 @@ class PolarSample(nn.Module):
         )
 
 
-def check_images(images: Tensor) -> Tensor:
-    """The images as (B, C, H, W), else TypeError or ValueError. uint8 ones may be (B, H, W, 3)."""
+def check_images(
+    images: Tensor, channels_last: bool | None = None, channels: int | None = None
+) -> Tensor:
+    """The images as (B, C, H, W), else TypeError or ValueError: see `channels_first`."""
     if not isinstance(images, Tensor):
         raise TypeError(f"images must be a tensor, got {type(images).__name__}")
     if images.dim() != 4:
         raise ValueError(f"images must have shape (B, C, H, W), got {tuple(images.shape)}")
-    return channels_first(images)
+    return channels_first("images", images, channels_last, channels)
 
 
 def check_lens(lens: Lens | None, size: tuple[int, int]) -> Lens:

@@ -81,9 +81,7 @@ class LensAdapter(nn.Module):
             TypeError: images that are not in floating point.
             ValueError: as many lenses as do not fit the images.
         """
-        images = check_images(images)
-        if not images.is_floating_point():
-            raise TypeError(f"images must be in floating point, got {images.dtype}")
+        images = _check_floating(images)
         check_count(len(prepared.there), images)
 
         def bring_back(out: Any) -> Any:
@@ -94,8 +92,15 @@ class LensAdapter(nn.Module):
 
     def forward(self, images: Tensor, lens: Lens) -> Any:
         """Images (B, C, H, W) and their lenses (B or 1) → what the network gives, at the pixels."""
-        height, width = check_images(images).shape[2:]
+        height, width = _check_floating(images).shape[2:]
         return self.run(images, self.prepare(lens, (height, width)))
 
     def extra_repr(self) -> str:
         return f"size={self.size}, spacing={self.spacing!r}"
+
+
+def _check_floating(images: Tensor) -> Tensor:
+    """The images (B, C, H, W) in floating point, else TypeError or ValueError."""
+    if isinstance(images, Tensor) and not images.is_floating_point():
+        raise TypeError(f"images must be in floating point, got {images.dtype}")
+    return check_images(images)

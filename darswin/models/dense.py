@@ -178,14 +178,16 @@ class DenseModel(Model):
         """As `forward`: `prepare` and `run` are the model.
 
         Args:
-            images: (B, C, H, W), or uint8 (B, H, W, 3).
+            images: (B, C, H, W); of uint8 also (B, H, W, C).
             prepared: of `prepare`, for the size of these images and B lenses or one.
 
         Raises:
             TypeError, ValueError: images of another kind, or as many lenses as do not fit them.
         """
         dtype = next(self.encoder.patch_embed.parameters()).dtype
-        seen = self.look(self.image_input(check_images(images), dtype), prepared.way)
+        seen = self.look(
+            self.image_input(check_images(images, channels=self.in_chans), dtype), prepared.way
+        )
         maps = self.encoder.run(seen, prepared.encoder)
         maps[-1] = self.encoder.norm(maps[-1])
         if self.places:
@@ -203,5 +205,5 @@ class DenseModel(Model):
 
     def forward(self, images: Tensor, lens: Lens | None = None) -> Tensor:
         """Images (B, C, H, W) and their lenses (B or 1) → (B, num_classes, H, W)."""
-        height, width = check_images(images).shape[2:]
+        height, width = check_images(images, channels=self.in_chans).shape[2:]
         return self.run(images, self.prepare(lens, (height, width)))

@@ -118,14 +118,14 @@ class Encoder(Model):
         """The map that each stage ends with: `prepare` and `run` are a model without its head.
 
         Args:
-            images: (B, C, H, W), or uint8 (B, H, W, 3).
+            images: (B, C, H, W); of uint8 also (B, H, W, C).
             prepared: of `prepare`, for the size of these images and B lenses or one.
             stop_after: the last stage that runs; None means all do.
 
         Raises:
             TypeError, ValueError: images of another kind, or as many lenses as do not fit them.
         """
-        x = self.embed(check_images(images), prepared.points)
+        x = self.embed(check_images(images, channels=self.in_chans), prepared.points)
         maps = []
         for stage, positions in zip(self.stages, prepared.positions, strict=True):
             x = stage(x, *positions)
@@ -137,7 +137,7 @@ class Encoder(Model):
     def _maps(
         self, images: Tensor, lens: Lens | None, stop_after: int | None = None
     ) -> list[Tensor]:
-        height, width = check_images(images).shape[2:]
+        height, width = check_images(images, channels=self.in_chans).shape[2:]
         return self.run(images, self.prepare(lens, (height, width)), stop_after=stop_after)
 
     def forward_features(self, images: Tensor, lens: Lens | None = None) -> Tensor:

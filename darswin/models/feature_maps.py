@@ -71,5 +71,5 @@ class FeatureMaps(Model):
 
     def forward(self, images: Tensor, lens: Lens | None = None) -> list[Tensor]:
         """Images (B, C, H, W) and their lenses (B or 1) → the maps."""
-        height, width = check_images(images).shape[2:]
+        height, width = check_images(images, channels=self.in_chans).shape[2:]
         return self.run(images, self.prepare(lens, (height, width)))

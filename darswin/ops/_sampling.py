@@ -92,13 +92,14 @@ def checked_sampling(
     samples: tuple[int, int],
     mean: float | Sequence[float],
     std: float | Sequence[float],
+    channels_last: bool | None,
 ) -> Sampling:
     """The arguments of the public functions, else TypeError or ValueError."""
     if isinstance(image, Tensor):
         image = _library.without_float16(image)
     check_tensor("image", image, dtypes=(*DTYPES, torch.bfloat16, torch.uint8))
     check_shape("image", image, "(B, C, H, W)", (None,) * 4)
-    image = channels_first(image)
+    image = channels_first("image", image, channels_last)
     geometry = None if image.dtype in DTYPES else (torch.float32,)
     tensors = dict(radii=radii, azimuths=azimuths, center=center, affine=affine, offsets=offsets)
     for name, value in tensors.items():

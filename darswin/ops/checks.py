@@ -16,6 +16,7 @@ from darswin.ops.waiting import readable
 
 DTYPES = (torch.float32, torch.float64)
 LAYOUTS = ("tokens", "image")
+FRAME_CHANNELS = (1, 3, 4)  # the numbers of channels that a camera frame can have
 
 
 def check_tensor(
@@ -98,10 +99,52 @@ def check_pair(name: str, value: Sequence[int], lowest: int) -> tuple[int, int]:
     return first, second
 
 
-def channels_first(image: Tensor) -> Tensor:
-    """uint8 camera frames (B, H, W, 3) as a view (B, 3, H, W); other images as they are."""
-    frames = image.dtype == torch.uint8 and image.shape[3] == 3 != image.shape[1]
-    return image.permute(0, 3, 1, 2) if frames else image
+def channels_first(
+    name: str, image: Tensor, channels_last: bool | None = None, channels: int | None = None
+) -> Tensor:
+    """An image as (B, C, H, W); one that is (B, H, W, C) is not copied.
+
+    Args:
+        image: of four dimensions.
+        channels_last: True for (B, H, W, C), False for (B, C, H, W). With None an image in floating
+            point is (B, C, H, W). The channels of a uint8 image are then its second or its last
+            axis, the one whose size is `channels`.
+        channels: the size of that axis. None allows each of `FRAME_CHANNELS`.
+
+    Raises:
+        TypeError: channels_last is neither a bool nor None.
+        ValueError: both axes of a uint8 image have such a size, or neither has.
+    """
+    if channels_last is None:
+        if image.dtype != torch.uint8:
+            return image
+        shape, sizes = image.shape, FRAME_CHANNELS if channels is None else (channels,)
+        if shape[1] in sizes:
+            # Where all three sizes are 1, both readings are the same image.
+            if shape[3] in sizes and shape[1:] != (1, 1, 1):
+                raise _unknown_axis(name, image, True, channels)
+        elif shape[3] in sizes:
+            channels_last = True
+        else:
+            raise _unknown_axis(name, image, False, channels)
+    elif not isinstance(channels_last, bool):
+        raise TypeError(f"channels_last must be True, False or None, got {channels_last!r}")
+    return image.permute(0, 3, 1, 2) if channels_last else image
+
+
+def _unknown_axis(name: str, image: Tensor, both: bool, channels: int | None) -> ValueError:
+    """The error of a uint8 image of which `both` axes can be that of the channels, or neither."""
+    if channels is None:
+        known = "1, 3 or 4"
+        hint = ": pass channels_last=True for (B, H, W, C), channels_last=False for (B, C, H, W)"
+    else:
+        known = str(channels)
+        hint = ": pass it in floating point, which is always (B, C, H, W)" if both else ""
+    found = "both have" if both else "neither has"
+    return ValueError(
+        f"{name} of uint8 must have {known} channels along either its second or its last axis, "
+        f"{found} in shape {tuple(image.shape)}{hint}"
+    )
 
 
 def per_channel(name: str, value: float | Sequence[float], channels: int) -> tuple[float, ...]:

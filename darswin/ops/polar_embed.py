@@ -31,14 +31,15 @@ def polar_embed(
     seed: int | Tensor = 0,
     mean: float | Sequence[float] = 0.0,
     std: float | Sequence[float] = 1.0,
+    channels_last: bool | None = None,
 ) -> Tensor:
     """Samples the patches of a polar grid and maps each to a token: `F.linear(polar_sample(...))`.
 
     The samples are never written to memory; backward recomputes them.
 
     Args:
-        image, radii, azimuths, center, affine, offsets, samples, jitter, seed, mean, std: as
-            `polar_sample`.
+        image, radii, azimuths, center, affine, offsets, samples, jitter, seed, mean, std,
+            channels_last: as `polar_sample`.
         weight: (D, S_r·S_φ·C), float64 if the image is, else float32 or bfloat16.
         bias: (D,) or None, as weight.
 
@@ -56,8 +57,9 @@ def polar_embed(
     Source: DarSwin, ICCV 2023, sec. 4.3.
     """
     sampling = checked_sampling(
-        image, radii, azimuths, center, affine, offsets, jitter, seed, samples, mean, std
-    )
+        image, radii, azimuths, center, affine, offsets, jitter, seed, samples, mean, std,
+        channels_last,
+    )  # fmt: skip
     image = sampling.image
     double = image.dtype == torch.float64
     dtypes = (torch.float64,) if double else (torch.float32, torch.bfloat16)

@@ -31,6 +31,7 @@ def polar_sample(
     layout: Literal["tokens", "image"] = "tokens",
     mean: float | Sequence[float] = 0.0,
     std: float | Sequence[float] = 1.0,
+    channels_last: bool | None = None,
 ) -> Tensor:
     """Samples an image bilinearly on a polar grid, zeros outside.
 
@@ -44,8 +45,8 @@ def polar_sample(
         infinite count with their weights, as in `F.grid_sample`.
 
     Args:
-        image: (B, C, H, W), any strides: float32, float64, bfloat16, or uint8 camera frames, which
-            may also be (B, H, W, 3).
+        image: (B, C, H, W) or (B, H, W, C), as channels_last says, of any strides: float32,
+            float64, bfloat16, or uint8 camera frames.
         radii: (B or 1, R·S_r) px. Like azimuths, center, affine and offsets float64 if the image
             is, else float32.
         azimuths: (A·S_φ,) rad. They get no gradient.
@@ -65,6 +66,9 @@ def polar_sample(
         mean, std: one number, or one a channel. Pixels of type uint8 count as
             `(pixel/255 - mean) / std`, zero outside the image; those of other types count as they
             are, whatever mean and std say.
+        channels_last: True for an image (B, H, W, C), False for (B, C, H, W). With None an image in
+            floating point is (B, C, H, W), and the channels of a uint8 image are its second or its
+            last axis, the one that has the size 1, 3 or 4.
 
     Returns:
         "tokens": (B, R, A, S_r·S_φ·C), inner order (S_r, S_φ, C).
@@ -81,14 +85,16 @@ def polar_sample(
 
     Raises:
         TypeError: a tensor of another dtype, or an argument of another type.
-        ValueError: a shape, device or range that does not fit.
+        ValueError: a shape, device or range that does not fit; without channels_last, a uint8 image
+            of which both axes can be that of the channels, or neither.
         NotImplementedError: forward-mode derivatives, those of torch.func, and second ones.
 
     Source: DarSwin, ICCV 2023, sec. 4.3.
     """
     sampling = checked_sampling(
-        image, radii, azimuths, center, affine, offsets, jitter, seed, samples, mean, std
-    )
+        image, radii, azimuths, center, affine, offsets, jitter, seed, samples, mean, std,
+        channels_last,
+    )  # fmt: skip
     check_layout(layout)
     return _library.run(
         reference.polar_sample, _devices.polar_sample, sampling, layout == "tokens",

@@ -58,9 +58,11 @@ def test_program(name, options, lens, monkeypatch):
         torch.testing.assert_close(program(images, **tensors), model(images, lenses))
 
 
-def test_program_of_camera_frames_through_one_lens():
-    model = short("darswin_a_nano", mean=0.5, std=0.2)
-    frames = torch.randint(256, (3, 20, 30, 3), dtype=torch.uint8)
+@pytest.mark.parametrize("shape", [(3, 20, 30, 3), (3, 20, 30, 1), (3, 4, 20, 30)])
+def test_program_of_camera_frames_through_one_lens(shape):
+    channels = min(shape[1], shape[3])
+    model = short("darswin_a_nano", mean=0.5, std=0.2, in_chans=channels)
+    frames = torch.randint(256, shape, dtype=torch.uint8)
     program = export_program(model, frames[:1], SPHERICAL[1], fixed_lens=True)
     torch.testing.assert_close(program.module()(frames), model(frames, SPHERICAL[1]))
 

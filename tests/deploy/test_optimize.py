@@ -97,9 +97,10 @@ def test_large_batches_go_in_parts(monkeypatch, name, lenses):
 
 
 @torch.no_grad()
-def test_methods_and_camera_frames():
-    model = network(mean=0.5, std=0.25)
-    frames = torch.randint(256, (2, 40, 32, 3), dtype=torch.uint8)
+@pytest.mark.parametrize("channels", [1, 3])
+def test_methods_and_camera_frames(channels):
+    model = network(mean=0.5, std=0.25, in_chans=channels)
+    frames = torch.randint(256, (2, 40, 32, channels), dtype=torch.uint8)
     lens = LENSES[0:1]
     for optimized, given in ((optimize(model), [lens]), (optimize(model, lens=lens), [])):
         features, maps = model.forward_intermediates(frames, lens)

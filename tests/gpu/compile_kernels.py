@@ -124,7 +124,7 @@ def sample(
     sampling = checked_sampling(
         meta(32, channels, size, size, dtype=dtype), meta(32, rows), meta(columns), meta(32, 2),
         meta(32, 2, 2) if general else None, meta(32, 2, rows, columns) if general else None,
-        jitter, 5, (along, around), 0.5, 0.5,
+        jitter, 5, (along, around), 0.5, 0.5, False,
     )  # fmt: skip
     out = launcher("polar_sample")(*sampling, tokens)
     wanted = dtype != torch.uint8, True, general

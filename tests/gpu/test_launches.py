@@ -34,7 +34,7 @@ def sampling(dtype=torch.float32, **options):
     given = dict(
         image=meta(2, 3, 64, 64, dtype=dtype), radii=meta(2, 160), azimuths=meta(640),
         center=meta(2, 2), affine=None, offsets=None, jitter=0.0, seed=0, samples=(10, 10),
-        mean=0.5, std=0.5,
+        mean=0.5, std=0.5, channels_last=False,
     )  # fmt: skip
     return _sampling.checked_sampling(**given | options)
 

@@ -58,6 +58,25 @@ def test_polar_sample_jitters_only_in_training_and_by_torchs_generator():
     assert torch.equal(sample(images, LENS), first) and not torch.equal(first, second)
 
 
+@pytest.mark.parametrize(
+    ("shape", "given", "last"),
+    [
+        ((2, 32, 33, 1), None, True),
+        ((2, 32, 33, 4), None, True),
+        ((2, 1, 32, 33), None, False),
+        ((2, 1, 32, 3), False, False),
+        ((2, 32, 3, 1), True, True),
+        ((2, 12, 32, 33), False, False),
+    ],
+)
+def test_uint8_images(shape, given, last):
+    images = torch.randint(256, shape, dtype=torch.uint8)
+    planes = images.permute(0, 3, 1, 2) if last else images
+    sample = PolarSample(4, 8, (3, 2), mean=0.4, std=0.2)
+    expected = sample((planes / 255 - 0.4) / 0.2, LENS)
+    torch.testing.assert_close(sample(images, LENS, given), expected, rtol=1e-4, atol=1e-4)
+
+
 def test_one_lens_serves_all_images():
     images = torch.randn(3, 1, 20, 24)
     one = Perspective.from_fov(2.0, 10.0)
@@ -72,6 +91,17 @@ def test_one_lens_serves_all_images():
         (lambda s: s(torch.zeros(3, 1, 32, 32), LENS), ValueError, "one an image, 3, got 2"),
         (lambda s: s(torch.zeros(2, 1, 32, 32), None), TypeError, "lens must be a darswin.lens"),
         (lambda s: s([1], LENS), TypeError, "images must be a tensor, got list"),
+        (lambda s: s(torch.zeros(2, 1, 32, 3).byte(), LENS), ValueError, "both .* pass channels_"),
+        (
+            lambda s: s(torch.zeros(2, 9, 32, 9).byte(), LENS),
+            ValueError,
+            "neither .* pass channels",
+        ),
+        (
+            lambda s: s(torch.zeros(2, 1, 9, 9), LENS, "yes"),
+            TypeError,
+            "channels_last must be True",
+        ),
         (lambda s: PolarSample(0, 8, (2, 2)), ValueError, "rings"),
         (lambda s: PolarSample(4, 8, (2, 2), jitter=2.0), ValueError, "jitter"),
         (lambda s: PolarSample(4, 8, (2, 2), layout="rows"), ValueError, "layout"),

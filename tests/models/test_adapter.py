@@ -97,6 +97,8 @@ def test_wrong_arguments():
         adapter(images, None)
     with pytest.raises(TypeError, match=r"images must be in floating point, got torch\.uint8"):
         adapter(images.byte(), LENSES[:1])
+    with pytest.raises(TypeError, match=r"images must be in floating point, got torch\.uint8"):
+        adapter.run(images[..., :3].byte(), adapter.prepare(LENSES[:1], (40, 3)))
     with pytest.raises(ValueError, match="one lens or one an image, 3, got 2"):
         adapter(images, LENSES)
     with pytest.raises(ValueError, match=r"belongs to images of \(H, W\) = \(20, 20\)"):

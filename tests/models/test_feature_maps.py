@@ -68,6 +68,18 @@ def test_channels_first_fixed_lenses_and_optimized():
             torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-5)
 
 
+@torch.no_grad()
+def test_uint8_images_have_as_many_channels_as_the_encoder_takes():
+    options = dict(features_only=True, in_chans=4, mean=0.5, std=0.2)
+    maps = create_model("darswin_a_nano", **options).eval()
+    frames = torch.randint(256, (2, 40, 32, 4), dtype=torch.uint8)
+    planes = frames.permute(0, 3, 1, 2)
+    for expected in (maps((planes / 255 - 0.5) / 0.2, LENSES), maps(planes, LENSES)):
+        torch.testing.assert_close(maps(frames, LENSES), expected, rtol=1e-4, atol=1e-4)
+    with pytest.raises(ValueError, match=r"images of uint8 must have 4 channels .* neither has"):
+        maps(frames[..., :3], LENSES)
+
+
 def test_what_it_says_of_itself():
     _, maps = pair("swin_undis", out_indices=[0])
     config = maps.pretrained_cfg

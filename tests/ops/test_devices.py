@@ -226,10 +226,10 @@ def sample(operator, dtype=torch.float32, channels=3, size=8):
     lens = (torch.empty(shape, device="cuda", dtype=real) for shape in ((1, 4), (8,), (1, 2)))
     image = torch.empty(2, channels, size, size, device="cuda", dtype=dtype)
     if operator == "polar_sample":
-        polar_sample(image, *lens, samples=(2, 2), jitter=1.0)
+        polar_sample(image, *lens, samples=(2, 2), jitter=1.0, channels_last=False)
     else:
         weight = torch.empty(5, 4 * channels, device="cuda", dtype=real)
-        polar_embed(image, *lens, weight, samples=(2, 2))
+        polar_embed(image, *lens, weight, samples=(2, 2), channels_last=False)
 
 
 @pytest.mark.parametrize("operator", ["polar_sample", "polar_embed"])

@@ -193,10 +193,14 @@ def test_bfloat16_weights_and_image():
                for g, t in zip(grads, leaves, strict=True))  # fmt: skip
 
 
-def test_uint8_frames():
+@pytest.mark.parametrize(
+    ("shape", "given"),
+    [((2, 31, 33, 3), None), ((2, 3, 31, 3), False), ((2, 31, 3, 3), True), ((2, 3, 31, 33), None)],
+)
+def test_uint8_frames(shape, given):
     _, radii, center, weight, bias, azimuths = make_inputs()
-    frames = torch.randint(256, (2, 31, 33, 3), dtype=torch.uint8)
-    options = dict(mean=0.4, std=(0.2, 0.3, 0.25))
+    frames = torch.randint(256, shape, dtype=torch.uint8)
+    options = dict(mean=0.4, std=(0.2, 0.3, 0.25), channels_last=given)
     weight.requires_grad_()
     run = embedder(azimuths, (4, 5), **options)
     ours = run(frames, radii, center, weight, bias)
@@ -244,6 +248,7 @@ def test_compile_fullgraph():
         (dict(bias="no"), TypeError, "bias must be a tensor, got str"),
         (dict(samples=(5, 5)), ValueError, "must divide"),
         (dict(jitter=2.0), ValueError, r"jitter must be in \[0, 1\]"),
+        (dict(image=torch.zeros(2, 3, 31, 3).byte()), ValueError, "pass channels_last=True"),
     ],
 )
 def test_errors_say_what_was_expected(change, error, message, reference):

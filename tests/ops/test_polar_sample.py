@@ -596,6 +596,74 @@ def test_images_that_are_not_uint8_count_as_they_are(dtype):
         torch.testing.assert_close(out, plain)
 
 
+READINGS = [  # shape, channels_last as it is given, and what is read
+    ((2, 17, 23, 1), None, True),
+    ((2, 17, 23, 3), None, True),
+    ((2, 17, 23, 4), None, True),
+    ((2, 1, 17, 23), None, False),
+    ((2, 3, 17, 23), None, False),
+    ((2, 4, 17, 23), None, False),
+    ((2, 12, 23, 3), None, True),
+    ((2, 3, 23, 12), None, False),
+    ((2, 1, 1, 1), None, False),
+    ((2, 1, 17, 3), False, False),
+    ((2, 1, 17, 3), True, True),
+    ((2, 3, 17, 3), False, False),
+    ((2, 3, 17, 3), True, True),
+    ((2, 12, 17, 23), False, False),
+    ((2, 17, 23, 12), True, True),
+]
+
+
+@pytest.mark.parametrize("reference", [False, True])
+@pytest.mark.parametrize(("shape", "given", "last"), READINGS)
+def test_which_axis_of_an_image_has_its_channels(shape, given, last, reference):
+    frames = torch.randint(256, shape, dtype=torch.uint8)
+    planes = frames.permute(0, 3, 1, 2) if last else frames
+    height, width = planes.shape[2:]
+    _, radii, center, azimuths = make_inputs(height=height, width=width)
+    run = sampler(azimuths, (3, 4))
+    expected = run(planes / 255, radii, center)
+    with use_reference(reference):
+        got = sampler(azimuths, (3, 4), channels_last=given)(frames, radii, center)
+        torch.testing.assert_close(got, expected, rtol=1e-5, atol=1e-5)
+        if given is not None:  # holds for an image of any type
+            got = sampler(azimuths, (3, 4), channels_last=given)(frames / 255, radii, center)
+            torch.testing.assert_close(got, expected, rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize("shape", [(2, 17, 3, 3), (2, 3, 17, 1), (2, 17, 23, 4), (2, 12, 9, 8)])
+def test_an_image_in_floating_point_has_its_channels_first(shape):
+    image = torch.rand(shape)
+    _, radii, center, azimuths = make_inputs(height=shape[2], width=shape[3])
+    run = sampler(azimuths, (3, 4))
+    expected = with_gradients(run, (image, radii, center))
+    told = sampler(azimuths, (3, 4), channels_last=False)
+    for got, want in zip(with_gradients(told, (image, radii, center)), expected, strict=True):
+        assert torch.equal(got, want)
+    last = sampler(azimuths, (3, 4), channels_last=True)
+    out, grad, *others = with_gradients(last, (image.permute(0, 2, 3, 1), radii, center))
+    for got, want in zip((out, grad.permute(0, 3, 1, 2), *others), expected, strict=True):
+        torch.testing.assert_close(got, want, rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.unsanitized
+@pytest.mark.parametrize("last", [False, True])
+def test_one_graph_for_uint8_images_of_any_size(last):
+    from torch._dynamo.testing import CompileCounter
+
+    _, radii, center, azimuths = make_inputs()
+    run = sampler(azimuths, (3, 4))
+    torch._dynamo.reset()
+    counter = CompileCounter()
+    compiled = torch.compile(run, fullgraph=True, dynamic=True, backend=counter)
+    for height, width in ((17, 23), (23, 17), (12, 5), (6, 40)):
+        image = torch.randint(256, (2, 3, height, width), dtype=torch.uint8)
+        image = image.permute(0, 2, 3, 1).contiguous() if last else image
+        assert torch.equal(compiled(image, radii, center), run(image, radii, center))
+    assert counter.frame_count == 1
+
+
 def test_uint8_frames_have_lens_gradients():
     _, radii, center, azimuths = make_inputs()
     frames = torch.randint(256, (2, 3, 17, 23), dtype=torch.uint8)
@@ -739,6 +807,11 @@ f32 = torch.float32
         (dict(jitter=0.5, seed=torch.zeros(1).long()), ValueError, "0-dim int64 tensor"),
         (dict(jitter=0.5, seed=torch.tensor(1.0)), ValueError, "0-dim int64 tensor"),
         (dict(layout="planes"), ValueError, "layout must be one of"),
+        (dict(image=torch.zeros(2, 1, 17, 3).byte()), ValueError, r"1, 3 or 4 channels .* both"),
+        (dict(image=torch.zeros(2, 3, 17, 3).byte()), ValueError, r"both .* \(2, 3, 17, 3\): pass"),
+        (dict(image=torch.zeros(2, 4, 4, 4).byte()), ValueError, "pass channels_last=True for"),
+        (dict(image=torch.zeros(2, 12, 17, 23).byte()), ValueError, r"neither .* \(2, 12, 17, 23"),
+        (dict(channels_last=1), TypeError, "channels_last must be True, False or None, got 1"),
     ],
 )
 def test_errors_say_what_was_expected(change, error, message, reference):
@@ -810,7 +883,7 @@ def test_the_layout_of_a_far_image_does_not_matter(channels, samples, dtype):
     image = (torch.rand(2, channels, size, size) * 255).to(dtype)
     radii = torch.stack((torch.linspace(0, 75, 24), torch.linspace(10, 90, 24)))
     arguments = (radii, torch.linspace(0, 6.2, 120), torch.full((1, 2), 74.5))
-    options = {} if dtype != torch.uint8 else {"mean": [0.5] * channels, "std": [0.25] * channels}
+    options = dict(mean=[0.5] * channels, std=[0.25] * channels, channels_last=False)
     layouts = {"together": image.permute(0, 2, 3, 1).contiguous().permute(0, 3, 1, 2)}
     layouts["padded"] = F.pad(layouts["together"].permute(0, 2, 3, 1), (0, 3))[..., :channels]
     layouts["padded"] = layouts["padded"].permute(0, 3, 1, 2)

@@ -218,13 +218,12 @@ def test_uint8_pixels_are_sampled_as_what_they_stand_for(case, frames):
     note(repr(case))
     inputs, settings = dict(case.inputs), dict(case.settings)
     image = (inputs.pop("image") * 50 + 128).clamp(0, 255).to(torch.uint8)
-    if (image.shape[3] == 3) != (image.shape[1] == 3):
-        return  # these are taken for (B, H, W, 3), or may be
     mean, std = 0.4, 0.25
     grid = (inputs["radii"], settings.pop("azimuths"), inputs["center"])
     general = {name: inputs[name] for name in ("affine", "offsets") if name in inputs}
-    given = image.permute(0, 2, 3, 1) if frames and image.shape[1] == 3 != image.shape[3] else image
-    ours = polar_sample(given, *grid, **general, **settings, mean=mean, std=std)
+    given = image.permute(0, 2, 3, 1) if frames else image
+    norm = dict(mean=mean, std=std, channels_last=frames)
+    ours = polar_sample(given, *grid, **general, **settings, **norm)
     with use_reference():
         exact = polar_sample(
             (image.double() / 255 - mean) / std, *(t.double() for t in grid),
