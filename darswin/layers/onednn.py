@@ -3,6 +3,7 @@
 torch uses them for bfloat16, but MKL for float32, which on AMD's CPUs is half as fast.
 """
 
+from functools import cache
 from typing import Any
 
 import torch
@@ -28,6 +29,8 @@ def missing(dtype: torch.dtype) -> str | None:
             return f"torch {torch.__version__} has no int8 products of oneDNN"
         if not _has_int8():
             return "this CPU has no VNNI, the instructions of int8 products"
+        if not _int8_is_exact():
+            return "oneDNN's int8 products overflow: ONEDNN_MAX_CPU_ISA keeps it from using VNNI"
     return None
 
 
@@ -37,6 +40,20 @@ def _has_int8() -> bool:
         return True
     tell: Any = getattr(torch.cpu, "get_capabilities", dict)  # older versions of torch lack it
     return any(tell().get(name) for name in ("avx_vnni", "amx_int8"))
+
+
+@cache
+def _int8_is_exact() -> bool:
+    """Whether the largest product that there is comes out right. Without VNNI it does not."""
+    size, largest = 64, 127
+    weight = torch.full((size, size), largest, dtype=torch.int8)
+    packed = torch.ops.onednn.qlinear_prepack(weight, None)
+    scales, zero_points = torch.ones(size), torch.zeros(size, dtype=torch.int64)
+    q = torch.full((size, size), 255, dtype=torch.uint8)
+    found = torch.ops.onednn.qlinear_pointwise.default(
+        q, 1.0, 0, packed, scales, zero_points, None, 1.0, 0, torch.float32, "none", [], "none"
+    )
+    return bool((found == size * largest * 255).all())
 
 
 def product(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:

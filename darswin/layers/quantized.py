@@ -1,13 +1,16 @@
 """A linear layer with weights of 8 bits, on activations of 8 bits."""
 
+import copy
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
 from darswin.layers.linear import Linear
+
+Net = TypeVar("Net", bound=nn.Module)
 
 _LARGEST = 127  # of a weight: -128 is left out, so that weights are symmetric
 
@@ -93,7 +96,7 @@ class QuantizedLinear(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """(..., D) → (..., D'), float32."""
-        if torch.compiler.is_compiling():
+        if torch.compiler.is_exporting():
             return self._for_graphs(x.float())
         if torch.is_grad_enabled() and x.requires_grad:
             raise RuntimeError(
@@ -106,7 +109,9 @@ class QuantizedLinear(nn.Module):
 
     def _dequantized(self) -> Tensor:
         """The weights that stand for those of 8 bits, (D', D), float32."""
-        return self.weight.float() * self.weight_scale.float()[:, None]
+        return (self.weight.float() - self._zero_points[:, None]) * self.weight_scale.float()[
+            :, None
+        ]
 
     def _for_graphs(self, x: Tensor) -> Tensor:
         """The same by torch's operators for graphs, which ONNX has by the same names."""
@@ -115,7 +120,9 @@ class QuantizedLinear(nn.Module):
         operators = torch.ops.quantized_decomposed
         steps = (*self.activation, 0, 255, torch.uint8)
         x = operators.dequantize_per_tensor(operators.quantize_per_tensor(x, *steps), *steps)
-        rows = (self.weight_scale, self._zero_points, 0, -_LARGEST, _LARGEST, torch.int8)
+        dtype = self.weight.dtype
+        limits = torch.iinfo(dtype)
+        rows = (self.weight_scale, self._zero_points, 0, limits.min, limits.max, dtype)
         return F.linear(x, operators.dequantize_per_channel(self.weight, *rows), self.bias)
 
     def to_linear(self) -> Linear:
@@ -156,6 +163,22 @@ def with_quantized_layers(
         if not isinstance(linear := layers.get(name), nn.Linear):
             raise ValueError(f"the model has no linear layer {name!r}")
         model.set_submodule(name, QuantizedLinear.of(linear, Quantization(*activation)))
+
+
+def with_unsigned_weights(model: Net) -> Net:
+    """A copy of a model whose quantized layers have uint8 weights, with a zero point of 128.
+
+    The copy is for graphs and computes the same. ONNX Runtime multiplies uint8 with uint8 exactly
+    on every CPU. It multiplies uint8 with int8 exactly on x86 CPUs with VNNI only: on others the
+    sum of two products overflows in 16 bits.
+    """
+    model = copy.deepcopy(model)
+    for name in quantized_layers(model):
+        layer = model.get_submodule(name)
+        assert isinstance(layer, QuantizedLinear)
+        layer.weight = (layer.weight.short() + 128).to(torch.uint8)
+        layer._zero_points += 128
+    return model
 
 
 def without_quantized_layers(model: nn.Module) -> None:

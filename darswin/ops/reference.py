@@ -82,9 +82,8 @@ def normalized(
 def polar_sample(sampling: Sampling, tokens: bool) -> Tensor:
     """See `darswin.ops.polar_sample`."""
     image, radii, azimuths, center, affine, offsets = sampling[:6]
-    if image.dtype == torch.uint8:
-        image = normalized(image, sampling.mean, sampling.std)
-    image = image.to(radii.dtype)  # bfloat16 is computed in float32
+    if image.dtype != torch.uint8:
+        image = image.to(radii.dtype)  # bfloat16 is computed in float32
     batch, channels, height, width = image.shape
     rows, columns = radii.shape[1], azimuths.shape[0]
     r, a = radii[:, :, None], azimuths[None, None, :]
@@ -106,16 +105,24 @@ def polar_sample(sampling: Sampling, tokens: bool) -> Tensor:
     x, y = torch.where(touches, x, -1), torch.where(touches, y, -1)
     left, top = x.detach().floor(), y.detach().floor()
     right, lower = x - left, y - top
-    pixels = image.flatten(2)
-    out = image.new_zeros(())
+    # Values are counted in the order in which they lie in memory, a camera frame's channels side by
+    # side: an exported graph would copy the whole image to change it.
+    if image.stride(1) == 1:
+        values, pixel_step, channel_step = image.permute(0, 2, 3, 1).flatten(1), channels, 1
+    else:
+        values, pixel_step, channel_step = image.flatten(1), 1, height * width
+    channel = torch.arange(channels, device=image.device)[:, None] * channel_step
+    out = radii.new_zeros(())
     for down, wy in ((0, 1 - lower), (1, lower)):
         for across, wx in ((0, 1 - right), (1, right)):
             column, row = left.long() + across, top.long() + down
             inside = touches & (column >= 0) & (column < width) & (row >= 0) & (row < height)
-            index = torch.where(inside, row * width + column, 0).flatten(1)
-            index = index[:, None].expand(batch, channels, -1)
-            corner = pixels.gather(2, index) if height * width else pixels.new_zeros(index.shape)
-            corner = corner.unflatten(2, (rows, columns))
+            pixel = torch.where(inside, row * width + column, 0).flatten(1)
+            index = (pixel[:, None] * pixel_step + channel).flatten(1).expand(batch, -1)
+            corner = values.gather(1, index) if height * width else values.new_zeros(index.shape)
+            corner = corner.unflatten(1, (channels, rows, columns))
+            if corner.dtype == torch.uint8:
+                corner = normalized(corner, sampling.mean, sampling.std)
             # A pixel that is not there must not count, were it NaN.
             corner = torch.where(inside[:, None], corner, 0)
             out = out + (wx * wy)[:, None] * corner

@@ -139,6 +139,29 @@ def test_onnx(name, options, lens, tmp_path):
         assert error <= 1e-4 * expected.abs().max()
 
 
+@pytest.mark.parametrize("shape", [(48, 64, 3), (3, 48, 64)], ids=["frames", "planes"])
+def test_onnx_gathers_from_a_frame_before_all_else(shape, tmp_path):
+    onnx, onnxruntime = (pytest.importorskip(name) for name in ("onnx", "onnxruntime"))
+    model, path = short("darswin_a_nano", mean=0.5, std=0.2, **ONE_BLOCK), tmp_path / "model.onnx"
+    frames, lens = torch.randint(256, (2, *shape), dtype=torch.uint8), SPHERICAL[1]
+    export_onnx(model, path, frames, lens, fixed_lens=True)
+    whole, takers = {"images"}, []
+    for node in onnx.load(path).graph.node:
+        if whole & {*node.input}:
+            takers.append(node.op_type)
+            if node.op_type == "Reshape":
+                whole |= {*node.output}
+    # A view of the frame, its batch size, and one gather for each of the four pixels of a sample.
+    assert set(takers) <= {"Reshape", "Shape", "GatherElements"}
+    assert takers.count("GatherElements") == 4
+    session = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
+    (logits,) = session.run(None, {"images": frames.numpy()})
+    with torch.no_grad():
+        torch.testing.assert_close(
+            torch.from_numpy(logits), model(frames, lens), rtol=1e-4, atol=1e-4
+        )
+
+
 def test_what_is_missing_is_named_with_packages_that_exist(monkeypatch):
     found = importlib.util.find_spec
     monkeypatch.setattr(

@@ -1,6 +1,9 @@
 """Models with 8 bits: what they lose, what stays in float32, and that the fast one is the same."""
 
 import math
+import os
+import subprocess
+import sys
 
 import pytest
 import torch
@@ -292,7 +295,44 @@ def test_wrong_arguments():
     assert sum(isinstance(m, Linear) for m in quantized.modules())  # the head is one still
 
 
-def test_onnx_runtime_says_the_same(tmp_path):
+def may_overflow(weight):
+    """Whether x86 CPUs without VNNI may multiply wrongly with weights (D', D), of 8 bits.
+
+    ONNX Runtime multiplies uint8 × int8 by `vpmaddubsw` there, which adds two products in 16 bits,
+    signed and saturated. Its products of uint8 × uint8 have 32 bits.
+    """
+    if weight.dtype == torch.uint8:
+        return False
+    pairs = weight.int().unflatten(1, (-1, 2))
+    largest = torch.stack([255 * pairs.clamp(min=0).sum(2), 255 * pairs.clamp(max=0).sum(2)])
+    return not torch.equal(largest, largest.clamp(-(2**15), 2**15 - 1))
+
+
+WITHOUT_VNNI = """
+import torch
+from darswin.layers import onednn
+from darswin.layers.quantized import Quantization, QuantizedLinear
+print(onednn.missing(torch.int8))
+linear = torch.nn.Linear(64, 64)
+linear.weight.data.fill_(1.0)
+layer, x = QuantizedLinear.of(linear, Quantization(1 / 255, 0)), torch.ones(64, 64)
+with torch.no_grad():
+    compiled = torch.compile(layer, options={"freezing": True})
+    torch.testing.assert_close(compiled(x), layer(x), rtol=1e-5, atol=1e-5)
+"""
+
+
+def test_no_integer_products_of_onednn_without_vnni():
+    run = subprocess.run(
+        [sys.executable, "-c", WITHOUT_VNNI], capture_output=True, text=True,
+        env=os.environ | {"ONEDNN_MAX_CPU_ISA": "AVX2"},
+    )  # fmt: skip
+    assert run.returncode == 0, run.stderr
+    assert "VNNI" in run.stdout
+
+
+@pytest.mark.parametrize("vnni_only", [False, True])
+def test_onnx_runtime_says_the_same(vnni_only, tmp_path):
     pytest.importorskip("onnxscript")
     runtime = pytest.importorskip("onnxruntime")
     onnx = pytest.importorskip("onnx")
@@ -301,9 +341,22 @@ def test_onnx_runtime_says_the_same(tmp_path):
     model, seen = network(depths=(1, 1), num_heads=(1, 2)), batch(6)
     quantized = quantize_model(model, [seen])
     path, lens = tmp_path / "q.onnx", seen[1]
-    export_onnx(quantized, path, *seen)
-    kinds = [node.op_type for node in onnx.load(path).graph.node]
+    export_onnx(quantized, path, *seen, vnni_only=vnni_only)
+    graph = onnx.load(path).graph
+    kinds = [node.op_type for node in graph.node]
     assert kinds.count("QuantizeLinear") == len(quantized_layers(quantized))
+    constants = {one.name: onnx.numpy_helper.to_array(one) for one in graph.initializer}
+    overflows = dict.fromkeys(quantized_layers(quantized))
+    for node in graph.node:
+        if node.op_type == "DequantizeLinear" and node.input[0] in constants:
+            weight, _, zero_points = (torch.tensor(constants[name]) for name in node.input)
+            name = node.input[0].removeprefix("model.").removesuffix(".weight")
+            steps = weight.int() - zero_points[:, None].int()
+            assert torch.equal(steps, quantized.get_submodule(name).weight.int())
+            overflows[name] = may_overflow(weight)
+    assert set(overflows.values()) == {vnni_only}
+    if vnni_only and not HAS_INT8:
+        return
     given = dict(images=seen[0], xi=lens.xi, focal=lens.focal, theta_max=lens.theta_max)
     (logits,) = runtime.InferenceSession(path).run(None, {k: v.numpy() for k, v in given.items()})
     with torch.no_grad():
