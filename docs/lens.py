@@ -1,5 +1,5 @@
 """Draws docs/lens.png, and examples/front.jpg with its calibration examples/front.json: a room that
-is computed, through the front lens of the WoodScape data set.
+is computed, through a lens of our own that sees 190° from left to right.
 
 Run it with `.venv/bin/python docs/lens.py`. The room is a box with a checkerboard on its walls, so
 that its lines are straight in the perspective view and nowhere else.
@@ -22,10 +22,10 @@ from darswin.viz.views import perspective
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 SIZE = (966, 1280)
-# The front camera's, as the data set's files have them.
-COEFFICIENTS = [339.749, -31.988, 48.275, -7.201]
+# They belong to no camera: they are chosen such that the image's sides are 190° apart.
+COEFFICIENTS = [350.4, -17.5, 27.5, -2.4]
 OFFSETS = dict(
-    cx_offset=3.942, cy_offset=-3.093, aspect_ratio=1.0, width=1280.0, height=966.0,
+    cx_offset=1.8, cy_offset=3.6, aspect_ratio=1.0, width=1280.0, height=966.0,
     model="radial_poly", poly_order=4,
 )  # fmt: skip
 HALF = np.array([2.0, 1.2, 2.5])  # the box around the camera, m
@@ -38,8 +38,8 @@ COLOURS = np.array([
 
 
 def front_lens() -> Polynomial:
-    """As published, used as far as the image's sides."""
-    lens = Polynomial(COEFFICIENTS, center=[643.442, 479.407], image_size=SIZE).to(torch.float64)
+    """The lens of examples/front.json, used as far as the image's sides."""
+    lens = Polynomial(COEFFICIENTS, center=[641.3, 486.1], image_size=SIZE).to(torch.float64)
     return lens.with_theta_max(lens.side_angles().amax())
 
 

@@ -93,10 +93,12 @@ def summary(row: dict, task: str) -> dict:
 
 
 def known_cells(file: Path) -> dict[Cell, dict]:
-    """The cells of a record, which must be of the same configuration."""
+    """The cells of a record, which must be of the same configuration and cameras."""
     record = json.loads(file.read_text())
     if record["config"] != CONFIG.read_text():
         raise ValueError(f"{file} is of another configuration than {CONFIG}")
+    if record["cameras"] != (cameras := list(dense_data.CAMERAS)):
+        raise ValueError(f"{file} must be of the cameras {cameras}, got {record['cameras']}")
     names = [field.name for field in fields(Cell)]
     return {Cell(**{name: cell[name] for name in names}): cell for cell in record["cells"]}
 

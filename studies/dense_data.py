@@ -23,11 +23,12 @@ BANDS = {"wide": "wide", "low": "0.2..0.35"}
 SWEEP = [f"{k / 10:g}" for k in range(11)]  # ξ = 0, 0.1, …, 1
 
 FILES = Path(__file__).parent.parent / "tests" / "lens" / "files"
+# TUM-VI's is a real camera. The numbers of the others are our own: see the README of the folder.
 CAMERAS = {
-    "WoodScape front": "woodscape.json",
-    "SynWoodScape front": "synwoodscape.json",
-    "KITTI-360 left": "kitti360_02.yaml",
-    "KITTI-360 right": "kitti360_03.yaml",
+    "front": "woodscape.json",
+    "second front": "synwoodscape.json",
+    "left": "kitti360_02.yaml",
+    "right": "kitti360_03.yaml",
     "TUM-VI left": "kalibr_tumvi.yaml:cam0",
     "OCamCalib": "ocamcalib.txt",
 }
@@ -44,7 +45,7 @@ def xi_set(xi: str) -> str:
 
 
 def camera_set(name: str) -> str:
-    """The name of the test set of a real camera."""
+    """The name of the test set of a camera of a calibration file."""
     return name.lower().replace(" ", "-")
 
 

@@ -13,7 +13,7 @@ from darswin.viz.dense import distance_image, label_image
 from darswin.viz.plot import save_figure
 
 # Test sets and the place of a picture in them; all sets have the same scenes in the same order.
-SHOWN = {"xi-0.3": 0, "xi-0": 1, "xi-1": 2, "woodscape-front": 3, "kitti-360-left": 4}
+SHOWN = {"xi-0.3": 0, "xi-0": 1, "xi-1": 2, "front": 3, "left": 4}
 TARGETS = {"segmentation": "labels", "distance": "distance"}
 NEAR, FAR = 0.5, 40.0  # m, of the colours
 

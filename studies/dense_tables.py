@@ -19,7 +19,6 @@ from darswin.viz.plot import save_figure
 SCORE = {"segmentation": "miou", "distance": "delta1"}
 NAMES = {"miou": "mIoU", "delta1": "δ1"}
 SHADED = {"wide": (0.0, 0.0), "low": (0.2, 0.35)}  # ξ of the training lenses
-REAL = [camera_set(name) for name in CAMERAS]
 ALL_XI = [xi_set(xi) for xi in SWEEP]
 NOT_RUN = "Not run yet: `make study-dense`."
 
@@ -30,7 +29,8 @@ def collect(cells: list[dict], trivial: dict, config: str, size: str) -> dict:
         cells, key=lambda c: (c["task"], c["band"], c["label"], c["shuffled"], c["seed"])
     )
     kept = [{k: v for k, v in cell.items() if k != "given"} for cell in cells]
-    return dict(size=size, config=config, trivial=trivial, cells=kept)
+    cameras = list(CAMERAS)
+    return dict(size=size, config=config, cameras=cameras, trivial=trivial, cells=kept)
 
 
 def publish(record: dict, out: Path, folder: Path) -> None:
@@ -56,6 +56,11 @@ def runs_of(cells: list[dict], task: str, shuffled: bool = False) -> dict[tuple,
         if cell["task"] == task and cell["shuffled"] == shuffled:
             found[cell["label"], cell["band"]].append(cell["sets"])
     return found
+
+
+def camera_sets(record: dict) -> list[str]:
+    """The test sets of a record's cameras."""
+    return [camera_set(name) for name in record["cameras"]]
 
 
 def mean_of(sets: dict, names: Sequence[str], score: str) -> float:
@@ -94,19 +99,19 @@ def draw_curves(cells: list[dict], trivial: dict, path: Path) -> None:
 # -- tables -----------------------------------------------------------------------------------
 
 
-def over_lenses(cells: list[dict], trivial: dict, task: str, band: str) -> str:
-    """A row a model, trained on a band: the score on its own lenses, on ξ and on real cameras."""
-    found, score = runs_of(cells, task), SCORE[task]
+def over_lenses(record: dict, task: str, band: str) -> str:
+    """A row a model, trained on a band: the score on its own lenses, on ξ and on the cameras."""
+    found, score = runs_of(record["cells"], task), SCORE[task]
     columns = {
         "its own lenses": [f"band-{band}"],
         "ξ = 0": [xi_set("0")],
         "ξ = 0.5": [xi_set("0.5")],
         "ξ = 1": [xi_set("1")],
         "all ξ": ALL_XI,
-        "real cameras": REAL,
+        "cameras": camera_sets(record),
     }
     rows = _model_rows(found, band, score, list(columns.values()))
-    for name, sets in trivial[task].items():
+    for name, sets in record["trivial"][task].items():
         rows.append(
             [
                 f"by {name} alone",
@@ -116,30 +121,31 @@ def over_lenses(cells: list[dict], trivial: dict, task: str, band: str) -> str:
     return markdown([f"{NAMES[score]} (%)", *columns], rows)
 
 
-def over_cameras(cells: list[dict], task: str, band: str) -> str:
-    """A row a model, a column a real camera."""
-    score = SCORE[task]
-    rows = _model_rows(runs_of(cells, task), band, score, [[name] for name in REAL])
-    return markdown([f"{NAMES[score]} (%)", *CAMERAS], rows)
+def over_cameras(record: dict, task: str, band: str) -> str:
+    """A row a model, a column a camera."""
+    score, sets = SCORE[task], [[name] for name in camera_sets(record)]
+    rows = _model_rows(runs_of(record["cells"], task), band, score, sets)
+    return markdown([f"{NAMES[score]} (%)", *record["cameras"]], rows)
 
 
-def errors(cells: list[dict], band: str) -> str:
+def errors(record: dict, band: str) -> str:
     """AbsRel, a row a model."""
-    found = runs_of(cells, "distance")
-    sets = {"its own lenses": [f"band-{band}"], "all ξ": ALL_XI, "real cameras": REAL}
+    found, cameras = runs_of(record["cells"], "distance"), camera_sets(record)
+    sets = {"its own lenses": [f"band-{band}"], "all ξ": ALL_XI, "cameras": cameras}
     rows = _model_rows(found, band, "abs_rel", list(sets.values()))
     return markdown(["AbsRel (%)", *sets], rows)
 
 
-def over_zones(cells: list[dict], task: str, band: str) -> str:
-    """A row a model, a column a zone of θ; the mean over the real cameras."""
-    found, score = runs_of(cells, task), SCORE[task]
-    zones = next(iter(found.values()))[0][REAL[0]]["zones"] if found else []
+def over_zones(record: dict, task: str, band: str) -> str:
+    """A row a model, a column a zone of θ; the mean over the cameras."""
+    found, score = runs_of(record["cells"], task), SCORE[task]
+    cameras = camera_sets(record)
+    zones = next(iter(found.values()))[0][cameras[0]]["zones"] if found else []
     ends = [f"{zone['to_deg']:g}°" if zone["to_deg"] else "the rim" for zone in zones]
     heads = [f"{z['from_deg']:g}° to {end}" for z, end in zip(zones, ends, strict=True)]
 
     def of_zone(number: int) -> Callable[[dict], float]:
-        return lambda run: statistics.mean(run[name]["zones"][number][score] for name in REAL)
+        return lambda run: statistics.mean(run[name]["zones"][number][score] for name in cameras)
 
     rows = [
         [label, *(_spread(found.get((label, band)), of_zone(k)) for k in range(len(zones)))]
@@ -148,8 +154,9 @@ def over_zones(cells: list[dict], task: str, band: str) -> str:
     return markdown([f"{NAMES[score]} (%)", *heads], rows)
 
 
-def controls(cells: list[dict], task: str, band: str) -> str:
+def controls(record: dict, task: str, band: str) -> str:
     """What happens where the lens is not the true one."""
+    cells = record["cells"]
     true, shuffled = runs_of(cells, task), runs_of(cells, task, shuffled=True)
     score, own = SCORE[task], f"band-{band}"
     told, tests = [xi_set(xi) for xi in WRONG], [f"wrong-{xi}" for xi in WRONG]
@@ -220,13 +227,13 @@ def tables(record: dict | None, folder: Path) -> dict[str, str]:
 def _of_band(record: dict | None, task: str, band: str) -> dict[str, str]:
     name = f"dense {task} {band}"
     kinds = {
-        name: lambda cells, trivial: over_lenses(cells, trivial, task, band),
-        f"{name} zones": lambda cells, _: over_zones(cells, task, band),
-        f"{name} controls": lambda cells, _: controls(cells, task, band),
-        f"{name} cameras": lambda cells, _: over_cameras(cells, task, band),
+        name: lambda record: over_lenses(record, task, band),
+        f"{name} zones": lambda record: over_zones(record, task, band),
+        f"{name} controls": lambda record: controls(record, task, band),
+        f"{name} cameras": lambda record: over_cameras(record, task, band),
     }
     if task == "distance":
-        kinds[f"{name} errors"] = lambda cells, _: errors(cells, band)
+        kinds[f"{name} errors"] = lambda record: errors(record, band)
     if record is None:
         return dict.fromkeys(kinds, NOT_RUN)
-    return {name: made(record["cells"], record["trivial"]) for name, made in kinds.items()}
+    return {name: made(record) for name, made in kinds.items()}

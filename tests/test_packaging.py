@@ -64,3 +64,11 @@ def test_the_citation_is_of_this_version():
     assert citation["version"] == project["version"] and citation["license"] == project["license"]
     assert citation["authors"] == project["authors"]
     assert citation["preferred-citation"]["url"] == project["urls"]["Paper"]
+
+
+@pytest.mark.parametrize("folder", ["tests/lens/files", "tests/fixtures"])
+def test_a_readme_names_the_source_of_each_data_file(folder):
+    files = {path.name for path in (ROOT / folder).iterdir()} - {"README.md"}
+    suffixes = {Path(name).suffix for name in files}
+    named = re.findall(r"`([\w.]+)`", (ROOT / folder / "README.md").read_text())
+    assert files == {name for name in named if Path(name).suffix in suffixes}

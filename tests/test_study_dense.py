@@ -142,3 +142,6 @@ def test_cells_of_a_record_are_not_run_again(quick, here, tmp_path):
     (tmp_path / "known.json").write_text(json.dumps(record | dict(config="max_epochs: 9")))
     with pytest.raises(ValueError, match="of another configuration"):
         dense.main([*where, "--known", str(tmp_path / "known.json"), *QUICK])
+    (tmp_path / "known.json").write_text(json.dumps(record | dict(cameras=["another"])))
+    with pytest.raises(ValueError, match=r"must be of the cameras .*, got \['another'\]"):
+        dense.main([*where, "--known", str(tmp_path / "known.json"), *QUICK])

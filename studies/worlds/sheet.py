@@ -27,8 +27,8 @@ PLACES = (
     ("freedoom1-E1M1", 1),
     ("freedoom1-E3M4", 1),
 )
-FRONT = Path(__file__).parents[2] / "tests" / "lens" / "files" / "woodscape.json"
-LENSES = {"perspective": "wide", "spherical, ξ = 0.3, 165°": "0.3", "WoodScape front": str(FRONT)}
+FRONT = Path(__file__).parents[2] / "examples" / "front.json"
+LENSES = {"perspective": "wide", "spherical, ξ = 0.3, 165°": "0.3", "a fisheye of 190°": str(FRONT)}
 
 
 def draw_sheet(path: Path) -> None:

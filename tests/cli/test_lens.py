@@ -27,20 +27,20 @@ from darswin.viz.report import (
     pixels_per_degree,
 )
 
-WOODSCAPE = Polynomial(
-    [339.749, -31.988, 48.275, -7.201], math.radians(95), [643.442, 479.407],
+FRONT = Polynomial(
+    [350.4, -17.5, 27.5, -2.4], math.radians(95), [641.3, 486.1],
     image_size=(966, 1280),
 )  # fmt: skip
-KITTI_360 = Mei(
-    2.2134047507854890, 1336.3220825849971, (0.016798235660113681, 1.6548773243373522),
-    math.radians(102), (716.943235, 705.764983), image_size=(1400, 1400),
-    tangential=(4.2223943394772046e-4, 4.2462134260997584e-4),
+MEI = Mei(
+    2.35, 1390.0, (0.032, 2.4),
+    math.radians(102), (708.5, 697.0), image_size=(1400, 1400),
+    tangential=(6e-4, -3.5e-4),
 )  # fmt: skip
 
 
 @pytest.fixture
 def folder(tmp_path):
-    (tmp_path / "front.json").write_text(json.dumps(to_dict(WOODSCAPE)))
+    (tmp_path / "front.json").write_text(json.dumps(to_dict(FRONT)))
     picture = np.random.default_rng(0).integers(256, size=(483, 640, 3), dtype=np.uint8)
     cv2.imwrite(str(tmp_path / "front.png"), picture)
     return tmp_path
@@ -67,7 +67,7 @@ def test_show_takes_a_picture_of_the_same_shape_only(folder):
 def test_info_prints_what_the_lens_is(folder, capsys):
     main(["lens", "info", str(folder / "front.json")])
     printed = capsys.readouterr().out
-    assert "1280 × 966 px" in printed and "339.749, -31.988" in printed
+    assert "1280 × 966 px" in printed and "350.4, -17.5" in printed
     main(["lens", "info", str(folder / "front.json"), "--theta_max_deg=60", "--rings=8"])
     printed = capsys.readouterr().out
     assert "60.00° (1.04720 rad)" in printed and "of 8 × 64 tokens" in printed
@@ -81,7 +81,7 @@ def test_convert_fits_and_writes(folder, capsys):
     assert fitted["model"] == "KannalaBrandt" and "KannalaBrandt up to 95.00°, at most" in printed
     lens = from_dict(fitted)
     theta = torch.linspace(0, math.radians(95), 20)
-    torch.testing.assert_close(lens.project(theta), WOODSCAPE.project(theta), rtol=0, atol=0.5)
+    torch.testing.assert_close(lens.project(theta), FRONT.project(theta), rtol=0, atol=0.5)
     main(["lens", "convert", str(folder / "front.json"), str(out)])
     assert json.loads(out.read_text())["model"] == "Polynomial"
 
@@ -189,7 +189,7 @@ def test_terminals_without_utf8(folder, monkeypatch, capsys):
         main(["lens", "info", str(folder / "front.json")])
         terminal.flush()
         printed = terminal.buffer.getvalue().decode(encoding)
-        assert "theta_max" in printed and "339.749, -31.988" in printed
+        assert "theta_max" in printed and "350.4, -17.5" in printed
         if encoding == "ascii":
             assert "image           1280 x 966 px (width x height)" in printed.splitlines()
             assert printed.count("deg") == usual.count("°")
@@ -285,7 +285,7 @@ def test_it_does_not_need_lightning(folder):
 
 
 def test_pixels_per_degree_are_those_between_neighbours():
-    lens = KITTI_360.to(torch.float64)
+    lens = MEI.to(torch.float64)
     theta = torch.tensor([0.0, 0.5, 1.7], dtype=torch.float64)
     along, around = pixels_per_degree(lens, theta)
     step = math.radians(1e-4)
@@ -299,13 +299,13 @@ def test_pixels_per_degree_are_those_between_neighbours():
 
 
 def test_field_of_view_and_sides():
-    text = describe(WOODSCAPE)
-    sides = WOODSCAPE.to(torch.float64).side_angles()[0].rad2deg().tolist()
+    text = describe(FRONT)
+    sides = FRONT.to(torch.float64).side_angles()[0].rad2deg().tolist()
     assert f"{sides[0] + sides[2]:.2f}° across, {sides[1] + sides[3]:.2f}° down" in text
     for side, angle in zip(("left", "top", "right", "bottom"), sides, strict=True):
         assert f"{side} {angle:.2f}°" in text
     assert "between the corners" in text
-    assert "the lens ends before the corners" in describe(KITTI_360)
+    assert "the lens ends before the corners" in describe(MEI)
     with pytest.raises(ValueError, match="needs the image_size"):
         describe(Spherical(0.5, 100.0))
     assert "640 × 480 px" in describe(Spherical(0.5, 100.0), (480, 640))
@@ -319,7 +319,7 @@ def test_a_principal_point_outside_the_sensor():
     across = math.degrees(math.atan(2.0)) - 45
     assert f"{across:.2f}° across, 53.13° down, on the row and the column" in text
     assert "left -45.00°" in text and "are integers), outside the sensor" in text
-    assert "outside the sensor" not in describe(WOODSCAPE)
+    assert "outside the sensor" not in describe(FRONT)
 
 
 def test_how_much_is_outside_the_sensor():
@@ -333,18 +333,18 @@ def test_how_much_is_outside_the_sensor():
 
 
 def test_tangential_size():
-    assert largest_offset(WOODSCAPE) == 0 and "tangential" not in describe(WOODSCAPE)
-    theta = KITTI_360.theta_max
+    assert largest_offset(FRONT) == 0 and "tangential" not in describe(FRONT)
+    theta = MEI.theta_max
     azimuth = torch.linspace(0, 2 * math.pi, 721)
-    radial = KITTI_360.replace(tangential=None)
-    apart = KITTI_360.project_rays(theta, azimuth) - radial.project_rays(theta, azimuth)
+    radial = MEI.replace(tangential=None)
+    apart = MEI.project_rays(theta, azimuth) - radial.project_rays(theta, azimuth)
     largest = apart.norm(dim=-1).max().item()
-    assert largest_offset(KITTI_360) == pytest.approx(largest, rel=1e-3)
-    assert f"{largest:.2f} px at most, by tangential" in describe(KITTI_360)
+    assert largest_offset(MEI) == pytest.approx(largest, rel=1e-3)
+    assert f"{largest:.2f} px at most, by tangential" in describe(MEI)
 
 
 def test_spacings():
-    text = describe(WOODSCAPE)
+    text = describe(FRONT)
     assert "tan θ ends at 90°" in text
     narrow = Spherical.from_fov(0.5, 2.0, 100.0, image_size=(200, 200))
     assert "tan θ ends" not in describe(narrow)

@@ -276,7 +276,7 @@ def test_what_is_said_of_the_dense_study():
     best_other = max(value for label, value in far.items() if "DarSwin" not in label)
     best = max(low, key=low.__getitem__)
     real = {
-        label: over("segmentation", "low", label, dense_tables.REAL)
+        label: over("segmentation", "low", label, dense_tables.camera_sets(dense_record()))
         for label in dense_tables.MODELS
     }
     others = min(value for label, value in real.items() if label != undis)

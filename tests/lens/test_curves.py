@@ -48,7 +48,7 @@ def test_stacking_needs_the_same_frame():
 
 
 def test_lenses_of_several_models_are_one_batch_of_curves():
-    lenses = [CALIBRATIONS[name][0] for name in ("WoodScape front", "Kalibr ds", "COLMAP")]
+    lenses = [CALIBRATIONS[name][0] for name in ("front", "Kalibr ds", "COLMAP")]
     lenses = [lens.with_theta_max(1.6).replace(center=double(1, 2)[None]) for lens in lenses]
     lenses[1] = lenses[1].replace(affine=2 * torch.eye(2, dtype=f64)[None])
     batch = cat(lenses)

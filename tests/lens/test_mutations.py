@@ -35,7 +35,7 @@ CAMERAS = [
     ("opencv_fisheye.yaml", None, r"camera_matrix.*?(?=avg)"),
     ("opencv_omnidir.xml", None, r"<camera_matrix.*"),
     ("opencv_stereo.json", "2", r'"M2".*(?="R")'),
-    ("ocamcalib.txt", None, r"(?<=13 )583.*?(?=#image size)"),
+    ("ocamcalib.txt", None, r"(?<=13 )605.*?(?=#image size)"),
     ("colmap.txt", None, r"OPENCV_FISHEYE.*"),
     ("colmap_all.txt", "12", r"(?<=12 RAD_TAN_THIN_PRISM_FISHEYE 640 480 ).*?\n"),
     ("colmap_all.txt", "17", r"(?<=17 DIVISION 640 480 ).*?\n"),

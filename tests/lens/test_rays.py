@@ -15,19 +15,13 @@ def double(*values):
     return torch.tensor(values, dtype=f64)
 
 
-# A public calibration of OpenCV's omnidir, whose curve turns shortly behind what it sees, and the
-# fisheyes of KITTI-360, whose curve turns at its sphere.
+# A camera of OpenCV's omnidir, whose curve turns shortly behind what it sees, and the cameras of
+# tests/lens/files/kitti360_0?.yaml, whose curve turns at its sphere; the left one's p₂ is larger.
 CALIBRATIONS = {
-    "omnidir": Mei(double(1.653), 1000.0, double(-0.1428, -0.4557),
-                   tangential=double(0.0017, -0.00053)),
-    "KITTI-360 image_02": Mei(
-        double(2.2134047507854890), 1336.3220825849971,
-        double(0.016798235660113681, 1.6548773243373522),
-        tangential=double(0.00042223943394772046, 0.0042462134260997584)),
-    "KITTI-360 image_03": Mei(
-        double(2.5535139132482758), 1485.4388981875156,
-        double(0.049370396274089505, 4.5068455478645308),
-        tangential=double(0.0013477698472982495, -0.0007034052109001101)),
+    "omnidir": Mei(double(1.72), 1040.0, double(-0.18, -0.5595),
+                   tangential=double(0.0014, -0.0006)),
+    "left": Mei(double(2.35), 1390.0, double(0.032, 2.4), tangential=double(6e-4, -3.5e-3)),
+    "right": Mei(double(2.7), 1600.4, double(-0.021, 5.2), tangential=double(-9e-4, 1.1e-3)),
 }  # fmt: skip
 RANDOM = ("Mei", "KannalaBrandt", "Fisheye624", "BrownConrady")
 

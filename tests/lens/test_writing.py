@@ -68,7 +68,7 @@ def test_a_written_file_reads_back_to_the_same_lens_or_is_refused(name, data, tm
 
 
 def cameras():
-    for path in sorted(FILES.iterdir()):
+    for path in sorted(set(FILES.iterdir()) - {FILES / "README.md"}):
         for name, lens in load_all(path, dtype=f64).items():
             yield f"{path.name}-{name}", lens
 
@@ -249,7 +249,7 @@ def test_convert(tmp_path, capsys):
     with pytest.raises(SystemExit, match=r"^darswin: COLMAP has no exact place for this Polynom"):
         main(["lens", "convert", woodscape, str(out), "--format", "colmap"])
     main(["lens", "convert", woodscape, str(tmp_path / "w.xml"), "--model", "KannalaBrandt"])
-    assert "opencv, KannalaBrandt up to 95.34°, at most" in capsys.readouterr().out
+    assert "opencv, KannalaBrandt up to 95.21°, at most" in capsys.readouterr().out
     assert type(load(tmp_path / "w.xml")).__name__ == "KannalaBrandt"
 
 
