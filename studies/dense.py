@@ -71,7 +71,7 @@ def run_cell(cell: Cell, out: Path, size: str, options: list[str]) -> dict:
         sets={row["data"]: summary(row, cell.task) for row in rows},
         seconds=dict(train=trained - start, test=time.perf_counter() - trained),
     )
-    replace_file(found, json.dumps(result, indent=1))
+    replace_file(found, json.dumps(result, indent=1, allow_nan=False))
     return result
 
 
@@ -133,7 +133,7 @@ def main(arguments: list[str] | None = None) -> None:
     results += [known[cell] for cell in known if cell not in {job[0] for job in jobs}]
     print(f"{len(results)} cells after {time.perf_counter() - start:.0f} s")
     if args.cell:
-        print(json.dumps(results, indent=1))
+        print(json.dumps(results, indent=1, allow_nan=False))
     else:
         record = collect(results, trivial(args.out), CONFIG.read_text(), args.size)
         publish(record, args.out, args.results)

@@ -45,7 +45,7 @@ def trivial(out: Path) -> dict:
             tested = list(_pictures(data / "test" / folder, "test", target))
             for name, sectors in BASELINES.items():
                 found[task][name][folder] = _scores(tested, said[name], sectors, task, data)
-    replace_file(file, json.dumps(found, indent=1))
+    replace_file(file, json.dumps(found, indent=1, allow_nan=False))
     return found
 
 

@@ -257,7 +257,7 @@ def run_camera(problem: str, camera: int, out: Path, data: str) -> dict:
         problem=problem, camera=camera, true=judge(true), losses=evaluate(true), search=search,
         trials=trials,
     )  # fmt: skip
-    replace_file(file, json.dumps(result))
+    replace_file(file, json.dumps(result, allow_nan=False))
     return result
 
 

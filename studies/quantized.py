@@ -67,7 +67,7 @@ def run_cell(
         changed={xi: tests[xi]["changed"] for xi in SWEEP},
         seconds=time.perf_counter() - start,
     )
-    replace_file(found, json.dumps(result, indent=1))
+    replace_file(found, json.dumps(result, indent=1, allow_nan=False))
     return result
 
 

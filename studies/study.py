@@ -53,7 +53,7 @@ def run_cell(cell: Cell, out: Path, size: str, test_images: int, options: list[s
         accuracy={row["lenses"]: round(100 * row["top1"], 4) for row in rows},
         seconds=dict(train=trained - start, test=time.perf_counter() - trained),
     )
-    replace_file(found, json.dumps(result, indent=1))
+    replace_file(found, json.dumps(result, indent=1, allow_nan=False))
     return result
 
 
@@ -77,7 +77,7 @@ def main(arguments: list[str] | None = None) -> None:
     results = run_all(run_cell, jobs, args.processes, "cell")
     print(f"{len(results)} cells after {time.perf_counter() - start:.0f} s")
     if args.cell:
-        print(json.dumps(results, indent=1))
+        print(json.dumps(results, indent=1, allow_nan=False))
     else:
         collect(results, args.results, args.size)
 

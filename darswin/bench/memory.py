@@ -98,4 +98,4 @@ def _measure_here(
 
 
 if __name__ == "__main__":
-    print(json.dumps(asdict(_measure_here(*sys.argv[1:]))))
+    print(json.dumps(asdict(_measure_here(*sys.argv[1:])), allow_nan=False))

@@ -67,8 +67,10 @@ def write(path: Path, **content: object) -> None:
 
 def _lines(value: object) -> str:
     if isinstance(value, dict):
-        rows = [f"  {json.dumps(key)}: {json.dumps(row)}" for key, row in value.items()]
+        rows = [
+            f"  {json.dumps(key)}: {json.dumps(row, allow_nan=False)}" for key, row in value.items()
+        ]
         return "{\n" + ",\n".join(rows) + "\n }"
     if isinstance(value, list):
-        return "[\n" + ",\n".join(f"  {json.dumps(row)}" for row in value) + "\n ]"
-    return json.dumps(value)
+        return "[\n" + ",\n".join(f"  {json.dumps(row, allow_nan=False)}" for row in value) + "\n ]"
+    return json.dumps(value, allow_nan=False)

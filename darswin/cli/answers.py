@@ -74,7 +74,11 @@ class Answers:
             self.flush()
 
     def flush(self) -> None:
-        """Answers the images that wait for others."""
+        """Answers the images that wait for others.
+
+        Raises:
+            FloatingPointError: naming an image for which the model computes NaN or infinity.
+        """
         waiting, self._waiting = self._waiting, []
         if not waiting:
             return
@@ -85,11 +89,22 @@ class Answers:
             output = self.ask(images, prepared)
         self.seconds += time.perf_counter() - start
         for asked, said in zip(waiting, output, strict=True):
+            if not self.is_finite(said, look):
+                entry = asked.entry
+                name = f"frame {entry['frame']} of {entry['video']}" if "video" in entry else ""
+                raise FloatingPointError(
+                    f"no answer for {name or entry['image']}: the model computes NaN or infinity; "
+                    "its weights may have diverged in training, take others"
+                )
             self.found.append(asked.entry | self.answer(asked, said, look))
 
     def look_through(self, lens: Lens) -> Any:
         """What `answer` needs of a lens."""
         return None
+
+    def is_finite(self, said: Tensor, look: Any) -> bool:
+        """Whether all that the network says of an image is finite."""
+        return bool(said.isfinite().all())
 
     def ask(self, images: Tensor, prepared: Any) -> Tensor:
         """What the network says of images (B, C, h, w): (B, …)."""

@@ -9,6 +9,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+import torch
 from PIL import Image
 from torch import Tensor
 
@@ -54,6 +55,10 @@ class DenseAnswers(Answers):
     def look_through(self, lens: Lens) -> FullSize:
         """The way back to the pixels of its pictures."""
         return FullSize(lens, self.card.size, fit_of(self.model, self.card))
+
+    def is_finite(self, said: Tensor, look: FullSize) -> bool:
+        """Whether it is finite in the pixels that a ray reaches."""
+        return bool(said[:, torch.from_numpy(look.reached)].isfinite().all())
 
     def ask(self, images: Tensor, prepared: DensePrepared) -> Tensor:
         """What the network says of each pixel, (B, K, h, w)."""

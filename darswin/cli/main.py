@@ -22,9 +22,12 @@ class Command(NamedTuple):
 
 # Each imports what it runs when it is called: that takes seconds.
 def _fit(argv: list[str]) -> None:
-    from darswin.cli.fit import run
+    from darswin.utils.processes import die_with_first_process
 
-    run(argv)
+    with die_with_first_process():  # the imports alone may take longer than the first one lives
+        from darswin.cli.fit import run
+
+        run(argv)
 
 
 def _predict(argv: list[str]) -> None:

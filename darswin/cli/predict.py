@@ -81,6 +81,7 @@ def predict(
 
     Raises:
         BrokenImageError: a picture or video that cannot be read, or that the lens does not fit.
+        FloatingPointError: a picture for which the model computes NaN or infinity.
         ValueError: arguments that are wrong, a lens that `darswin.lens.load` or the model refuses;
             another `task` than the model's.
     """
@@ -124,11 +125,13 @@ def predict(
             except BrokenImageError as error:
                 bad.append(str(error))
     finally:  # what was found is not lost
-        answers.flush()
-        found = answers.found
-        if found:
-            text = json.dumps(found, indent=1, ensure_ascii=False)
-            print(text) if out is None else replace_file(out, text)
+        try:
+            answers.flush()
+        finally:
+            found = answers.found
+            if found:
+                text = json.dumps(found, indent=1, ensure_ascii=False, allow_nan=False)
+                print(text) if out is None else replace_file(out, text)
     if bad:
         videos = any(file.is_video for file in files)
         what, kind = (", or not for all frames,", "files") if videos else ("", "pictures")

@@ -27,8 +27,21 @@ def at_size(image: np.ndarray, lens: Lens, size: int, fit: Fit) -> tuple[np.ndar
     top, left, height, width = part_of(image.shape[:2], fit)
     new_height, new_width = _new_size(height, width, size, fit)
     part = image[top : top + height, left : left + width]
-    resized = cv2.resize(part, (new_width, new_height), interpolation=cv2.INTER_AREA)
-    return resized.reshape(new_height, new_width, -1), lens_at_size(lens, size, fit)
+    return area_resized(part, (new_height, new_width)), lens_at_size(lens, size, fit)
+
+
+def area_resized(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """A picture (H, W, C) at another (H, W), each pixel the mean over its area.
+
+    An axis that becomes shorter is resized before one that becomes longer. OpenCV takes areas only
+    if no axis becomes longer; otherwise it shifts an axis that becomes much shorter by up to a
+    third of a new pixel.
+    """
+    height, width = size
+    less = min(image.shape[1], width), min(image.shape[0], height)
+    for sides in dict.fromkeys((less, (width, height))):
+        image = cv2.resize(image, sides, interpolation=cv2.INTER_AREA)
+    return image.reshape(height, width, -1)
 
 
 def lens_at_size(lens: Lens, size: int, fit: Fit) -> Lens:

@@ -18,6 +18,7 @@ class FullSize:
 
     Attributes:
         seen: (H, W), the pixels that have an answer.
+        reached: (h, w), of the pixels that the network sees, those that a ray reaches.
 
     Args:
         lens: of the pictures, with their image_size. size, fit: as `at_size` had them.
@@ -32,8 +33,8 @@ class FullSize:
         lens = lens.detach().to("cpu")
         height, width = _size(lens)
         self._part = top, left, rows, columns = part_of((height, width), fit)
-        self._reached = _reached(lens_at_size(lens, size, fit))
-        self._weight = self._enlarged(self._reached)
+        self.reached = _reached(lens_at_size(lens, size, fit))
+        self._weight = self._enlarged(self.reached)
         self.seen = np.zeros((height, width), bool)
         part = np.s_[top : top + rows, left : left + columns]
         self.seen[part] = _reached(lens)[part] & (self._weight > 0)
@@ -65,13 +66,13 @@ class FullSize:
         Returns:
             (H, W) float32, m: 0 where there is no answer.
         """
-        logarithm = np.log(np.where(self._reached, distance, 1))
+        logarithm = np.log(np.where(self.reached, distance, 1))
         weight = np.where(self._weight > 0, self._weight, 1)
         return self._in_picture(np.exp(self._weighted(logarithm) / weight), 0.0)
 
     def _weighted(self, values: np.ndarray) -> np.ndarray:
         """Values (h, w) at the pixels that `at_size` took, times how much of them a ray reaches."""
-        return self._enlarged(np.where(self._reached, values, 0))
+        return self._enlarged(np.where(self.reached, values, 0))
 
     def _enlarged(self, values: np.ndarray) -> np.ndarray:
         _, _, height, width = self._part

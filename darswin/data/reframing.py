@@ -1,8 +1,10 @@
 """Scenes in another frame: image, target and lens move together.
 
 A scene becomes square, of a size, in one step from its picture: a part of it resized, turned about
-the optical axis, or as another lens would have seen it. The image is averaged over areas; a target
-is never mixed of several pixels, each of its own takes that of the nearest.
+the optical axis, or as another lens would have seen it. The image is averaged over areas. A target
+is never mixed from several pixels: each new pixel takes the value of the nearest one. Where two are
+equally near, the side alternates from pixel to pixel, so that the target is not shifted relative to
+the image.
 """
 
 from functools import lru_cache
@@ -13,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from darswin.data.frames import Fit, part_of
+from darswin.data.frames import Fit, area_resized, part_of
 from darswin.data.scenes.scene import Scene
 from darswin.data.scenes.targets import nothing_of
 from darswin.data.turning import Turn, turned_lens
@@ -28,6 +30,7 @@ from darswin.lens.reprojection import as_map
 _MOST_POINTS = 5
 _APART = 1.5
 _RADII = 4096  # of a table
+_NUDGE = 1e-3  # px, more than the rounding of places in float32
 
 
 class Crop(NamedTuple):
@@ -62,10 +65,10 @@ def resized(scene: Scene, taken: tuple[int, int, int, int], size: int, mirrored:
         image, target = image[:, ::-1], target[:, ::-1]
     top, left, height, width = taken
     image, target = (a[top : top + height, left : left + width] for a in (image, target))
-    image = cv2.resize(np.ascontiguousarray(image), (size, size), interpolation=cv2.INTER_AREA)
+    image = area_resized(np.ascontiguousarray(image), (size, size))
     down, across = (_nearest(side, size) for side in (height, width))
     lens = lens.cropped(*taken).resized((size, size))
-    return _only_seen(Scene(image.reshape(size, size, -1), target[down[:, None], across], lens))
+    return _only_seen(Scene(image, target[down[:, None], across], lens))
 
 
 def turned(scene: Scene, turn: Turn, taken: tuple[int, int, int, int], size: int) -> Scene:
@@ -113,7 +116,9 @@ def _read(scene: Scene, places: np.ndarray, lens: Lens, size: int, points: int) 
     image = remap(scene.image, places)
     if points > 1:
         image = cv2.resize(image, (size, size), interpolation=cv2.INTER_AREA)
-    centres = np.ascontiguousarray(places[points // 2 :: points, points // 2 :: points])
+    aside = _aside(size).astype(np.float32)
+    centres = places[points // 2 :: points, points // 2 :: points].copy()
+    centres += np.stack(np.meshgrid(aside, aside), -1)
     target = remap(scene.target, centres, cv2.INTER_NEAREST, nothing_of(scene.target))
     return Scene(image.reshape(size, size, -1), target, lens)
 
@@ -152,7 +157,20 @@ def _unseen(lens: _ByValue, size: tuple[int, int]) -> Tensor:
 
 def _nearest(side: int, size: int) -> np.ndarray:
     """(size,): of a side of so many pixels, those nearest to the centres of `size` others."""
-    return ((2 * np.arange(size) + 1) * side) // (2 * size)
+    centres = (np.arange(size) + 0.5) * side / size - 0.5
+    return np.rint(centres + _aside(size)).astype(np.int64)
+
+
+@lru_cache(maxsize=8)
+def _aside(size: int) -> np.ndarray:
+    """(size,): which way the centre of a pixel is moved, px, before the nearest one is taken.
+
+    An even reduction puts every centre halfway between two pixels, and taking the upper one always
+    would shift the whole target. Neighbours are moved in opposite directions, and so are pixels
+    that mirror each other in the image's middle: the target of a mirrored picture is mirrored.
+    """
+    sign = (-1.0) ** np.arange(size // 2)
+    return _NUDGE * np.concatenate((-sign, np.zeros(size % 2), sign[::-1]))
 
 
 def _points(scale: float) -> int:

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from darswin.data.frames import area_resized
 from darswin.data.lenses import LensDistribution
 from darswin.data.samples import Draw, Samples
 from darswin.data.sources import Source
@@ -126,4 +127,4 @@ class WideAngle(Samples):
         side = min(max(picture.shape[:2]), self.picture_size)
         if picture.shape[:2] == (side, side):
             return np.ascontiguousarray(picture)
-        return cv2.resize(picture, (side, side), interpolation=cv2.INTER_AREA)
+        return area_resized(picture, (side, side))

@@ -67,7 +67,9 @@ class ModelCard:
 def save_model(path: str | os.PathLike, weights: Mapping[str, Tensor], card: ModelCard) -> None:
     """Writes a model's state dict and its card, replacing what stood there in one go."""
     contiguous = {name: tensor.detach().cpu().contiguous() for name, tensor in weights.items()}
-    replace_file(path, save(contiguous, metadata={_ENTRY: json.dumps(asdict(card))}))
+    replace_file(
+        path, save(contiguous, metadata={_ENTRY: json.dumps(asdict(card), allow_nan=False)})
+    )
 
 
 def model_of_run(run: str | os.PathLike, suffix: str = ".safetensors") -> Path:

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from torchmetrics import Metric
 
 from darswin.data.mixing import Mixing, partners_share
-from darswin.train.task import Batch, Task, named_metrics
+from darswin.train.task import Batch, Task, finite_loss, named_metrics
 from darswin.train.wide_angle import WideAngleData
 
 
@@ -104,12 +104,12 @@ class Classification(Task):
 
     def on_test_epoch_end(self) -> None:
         """Collects `results`: a row for each distribution of lenses."""
-        names = self.data.test_names
-        self.results = [
-            {"lenses": name}
-            | {key: metric.compute().item() for key, metric in named_metrics(measured)}
-            for name, measured in zip(names, self.test_metrics, strict=True)
-        ]
+        self.results = []
+        for name, measured in zip(self.data.test_names, self.test_metrics, strict=True):
+            row = {key: metric.compute().item() for key, metric in named_metrics(measured)}
+            (mean,) = (metric for metric in measured.children() if isinstance(metric, MeanLoss))
+            loss = finite_loss(row["loss"], name) if mean.count > 0 else None
+            self.results.append({"lenses": name} | row | {"loss": loss})
 
 
 class ImageMean(Metric):

@@ -11,7 +11,8 @@ from darswin.lens import Lens
 from darswin.lens.pixels import pixel_angles, solid_angles
 from darswin.train.dense_data import DenseData
 from darswin.train.pixel_metrics import Zones, ZoneSums
-from darswin.train.task import Batch, Task
+from darswin.train.target_check import TargetCheck
+from darswin.train.task import Batch, Task, finite_loss
 
 _SHOWN = 4  # samples of a test's picture
 
@@ -35,7 +36,7 @@ class Measured(nn.Module):
 
 class DenseTask(Task):
     """Base of the tasks for each pixel. A task defines `_criterion`, `_answer`, `_known`,
-    `_sums`, `_row` and `nothing`, what stands for no answer.
+    `_missing`, `_sums`, `_row` and `nothing`, what stands for no answer.
 
     Args:
         name: of a model; None is that of `weights`, or the task's own default.
@@ -79,6 +80,7 @@ class DenseTask(Task):
         self.solid_angle_weights = solid_angle_weights
         self.samples: list[Sample] = []
         self._seen = Seen()
+        self._targets = TargetCheck()
 
     @property
     def data(self) -> DenseData:
@@ -105,6 +107,18 @@ class DenseTask(Task):
 
     def _known(self, target: Tensor) -> Tensor:
         """Which pixels of (B, H, W) have a target."""
+        raise NotImplementedError
+
+    def _missing(self, there: list[bool], images: str, whole: bool) -> None:
+        """Stops or warns if something is missing in the training targets.
+
+        Args:
+            there: which ids the known pixels have had; of distances, whether any is known.
+            images: what has been looked at, in words. whole: whether that is a whole epoch.
+
+        Raises:
+            ValueError: targets that nothing can be learned from.
+        """
         raise NotImplementedError
 
     def _row(self, counts: Tensor, areas: Tensor) -> dict[str, Any]:
@@ -145,6 +159,14 @@ class DenseTask(Task):
             seen = torch.where(theta.isnan(), self.nothing, answer)
             self._keep(images, lens, target, seen, known)
 
+    def on_train_batch_end(self, outputs: Any, batch: Batch, batch_idx: int) -> None:
+        """Looks at the targets of the first whole epoch."""
+        self._targets.add(self, batch[2], batch_idx)
+
+    def on_train_end(self) -> None:
+        """Looks at the targets of a training that was shorter than an epoch."""
+        self._targets.end(self)
+
     def on_test_start(self) -> None:
         """Forgets the samples of a test before."""
         self.samples = []
@@ -171,7 +193,8 @@ class DenseTask(Task):
             assert isinstance(measured, Measured)
             counts, areas = measured.sums.compute()
             row = {"data": name} | self._row(counts, areas)
-            row["loss"] = measured.loss.compute().item()
+            loss = measured.loss.compute().item()
+            row["loss"] = finite_loss(loss, name) if row["pixels"] else None
             per_class, per_zone = row.pop("per_class"), row.pop("per_zone")
             self.results.append(row | dict(per_class=per_class, per_zone=per_zone))
 

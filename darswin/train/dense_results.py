@@ -67,7 +67,9 @@ def write_dense_results(folder: Path, rows: Sequence[dict[str, Any]], name: str)
             print(f"\n{_text(table)}")
             written.append(file)
     report = dict(model=name, results=list(rows))
-    replace_file(folder / "test.json", json.dumps(report, indent=1, ensure_ascii=False))
+    replace_file(
+        folder / "test.json", json.dumps(report, indent=1, ensure_ascii=False, allow_nan=False)
+    )
     return [*written, "test.json"]
 
 

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from darswin.train.dense import DenseTask
+from darswin.train.dense_data import DistanceData
 from darswin.train.losses import DistanceLoss, distance_loss
 from darswin.train.pixel_metrics import (
     BY_AREA,
@@ -66,6 +67,16 @@ class Distance(DenseTask):
 
     def _known(self, target: Tensor) -> Tensor:
         return target > 0
+
+    def _missing(self, there: list[bool], images: str, whole: bool) -> None:
+        if not any(there):
+            data = self.data
+            most = data.max_distance if isinstance(data, DistanceData) else None
+            raise ValueError(
+                f"none of the pixels of {images} has a known distance: all are 0 or not finite"
+                + (f", or above --data.max_distance {most:g} m" if most is not None else "")
+                + "; a PNG must hold metres × 256 in 16 bits, an NPY file metres"
+            )
 
     def validation_step(self, batch: Batch, batch_idx: int) -> None:
         """Counts a batch into the validation's loss and errors."""

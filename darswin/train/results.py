@@ -33,9 +33,10 @@ class WriteResults(Callback):
         width = max(16, *(len(row["lenses"]) + 2 for row in rows))
         print(f"\n{'lenses':<{width}}{'top-1 (%)':>10}{'top-5 (%)':>10}{'loss':>10}")
         for row in rows:
+            loss = "–" if row["loss"] is None else f"{row['loss']:.4f}"
             print(
                 f"{row['lenses']:<{width}}{100 * row['top1']:>10.2f}{100 * row['top5']:>10.2f}"
-                f"{row['loss']:>10.4f}"
+                f"{loss:>10}"
             )
         warped = pl_module.trained.fit == "whole"
         trained_on = pl_module.data.train_lenses if warped else None
@@ -49,7 +50,9 @@ def write_results(
     """The rows of a test as files; `trained_on` is the distribution that the picture shades, None
     where the lenses are those of cameras."""
     report = dict(model=name, results=rows)
-    replace_file(folder / "test.json", json.dumps(report, indent=1, ensure_ascii=False))
+    replace_file(
+        folder / "test.json", json.dumps(report, indent=1, ensure_ascii=False, allow_nan=False)
+    )
     table = io.StringIO(newline="")
     writer = csv.DictWriter(table, rows[0].keys())
     writer.writeheader()

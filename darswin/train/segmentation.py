@@ -1,6 +1,7 @@
 """Segmentation: a class for each pixel."""
 
 import math
+import warnings
 from typing import Any
 
 import torch
@@ -8,11 +9,16 @@ from torch import Tensor, nn
 from torchmetrics.classification import MulticlassAccuracy, MulticlassJaccardIndex
 
 from darswin.data.scenes import IGNORE
+from darswin.data.splits import some
 from darswin.ops.waiting import tensor_there
 from darswin.train.dense import DenseTask
 from darswin.train.losses import LabelLoss, label_loss
 from darswin.train.pixel_metrics import BY_AREA, LabelSums, label_scores, none_of_nan
 from darswin.train.task import Batch, named_metrics
+
+
+class AbsentClass(UserWarning):
+    """A class does not occur in the labels that a model is trained on."""
 
 
 class Segmentation(DenseTask):
@@ -109,6 +115,26 @@ class Segmentation(DenseTask):
     def _known(self, target: Tensor) -> Tensor:
         known = target != IGNORE
         return known if self.ignore_index is None else known & (target != self.ignore_index)
+
+    def _missing(self, there: list[bool], images: str, whole: bool) -> None:
+        classes = self.data.classes
+        if not any(there):
+            raise ValueError(
+                f"none of the pixels of {images} has a label: labels must hold the ids 0 to "
+                f"{len(classes) - 1}, and {IGNORE} means that a pixel is not labelled"
+            )
+        learned = [k for k in range(len(classes)) if k != self.ignore_index]
+        absent = [classes[k] for k in learned if not there[k]]
+        if not whole or not absent:
+            return
+        text = f"no pixel of {images} has a label of {some(absent)}"
+        if len(learned) - len(absent) < 2:
+            raise ValueError(
+                f"{text}, so that a single class is left to learn; {IGNORE} means that a pixel is "
+                "not labelled: a mask of 0 and 255 must be stored as the ids 0 and 1"
+            )
+        if not self.global_rank:
+            warnings.warn(f"{text}, which cannot be learned", AbsentClass, stacklevel=2)
 
     def validation_step(self, batch: Batch, batch_idx: int) -> None:
         """Counts a batch into the validation's loss and scores."""

@@ -292,6 +292,20 @@ class Task(LightningModule):
         )
 
 
+def finite_loss(loss: float, name: str) -> float:
+    """The loss of a test set.
+
+    Raises:
+        FloatingPointError: one that is not finite.
+    """
+    if not math.isfinite(loss):
+        raise FloatingPointError(
+            f"the loss on {name} is {loss}: the weights are not finite, or have diverged; "
+            "--ckpt_path takes another checkpoint"
+        )
+    return loss
+
+
 def named_metrics(measured: nn.Module) -> Iterator[tuple[str, Metric]]:
     """The metrics of a ModuleDict, and their names."""
     for name, metric in measured.named_children():

@@ -61,7 +61,7 @@ def write_map(name: str, split: str, targets: Sequence[Target], size: int, count
                 rng = np.random.default_rng([seed, key])
                 lens = draw_lens(target.lenses, size, target.fov, rng)
                 file = f"lenses/{stem}.json" if _lens_folder(target) else "lens.json"
-                (folder / file).write_text(json.dumps(to_dict(lens)) + "\n")
+                (folder / file).write_text(json.dumps(to_dict(lens), allow_nan=False) + "\n")
                 rays = rays_of(lens)
             write_view(render(scene, pose, rays), folder, stem)
         replace_file(_done(target, split, name), json.dumps(made[target]) + "\n")

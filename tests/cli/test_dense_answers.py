@@ -170,6 +170,28 @@ def test_a_label_png_keeps_every_id(tmp_path):
     assert np.array_equal(ids(tmp_path / "l.png"), labels)
 
 
+@pytest.mark.parametrize("task", ["segmentation", "distance"])
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_an_answer_that_is_not_finite_is_none(stub, monkeypatch, tmp_path, task, value):
+    net = stub(task)
+    run, reached = net.run, torch.ones(48, 48, dtype=torch.bool)
+
+    def broken(images, prepared):
+        said = run(images, prepared)
+        said[-1, 0].masked_fill_(reached, value)
+        return said
+
+    monkeypatch.setattr(net, "run", broken)
+    pictures = [write(tmp_path / f"{k}.png", np.full((48, 64, 3), 50, np.uint8)) for k in (0, 1)]
+    with pytest.raises(SystemExit, match=f"darswin: no answer for {pictures[1]}: .* NaN or"):
+        predict(*pictures, out=tmp_path / "out")
+    found = json.loads((tmp_path / "out" / "predictions.json").read_text())
+    assert [answer["image"] for answer in found] == pictures[:1]  # what was found is not lost
+    # Beyond θ_max it has no meaning.
+    reached = ~torch.from_numpy(FullSize(from_dict(LENS, (48, 64)), 48, "crop").reached)
+    assert len(predict(*pictures, out=tmp_path / "out")) == 2
+
+
 @pytest.fixture
 def folder(tmp_path, labels):
     """Pictures of the same name in two folders, and a video."""

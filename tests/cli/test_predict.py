@@ -1,4 +1,5 @@
 import json
+import math
 
 import cv2
 import hypothesis.strategies as st
@@ -19,7 +20,7 @@ from darswin.lens import Equidistant, Spherical, from_dict, load, save
 from darswin.lens.orientation import in_upright_picture
 from darswin.models import pretrained_file
 from darswin.models.encoder import Encoder
-from darswin.models.saving import ModelCard, save_model
+from darswin.models.saving import ModelCard, load_model, save_model
 from darswin.utils.exif import TURNS
 from darswin.utils.image import read_oriented
 from darswin.utils.video import read_frames
@@ -57,8 +58,6 @@ def test_the_most_probable_classes(run, capsys):
 
 
 def test_it_is_what_the_model_says_of_the_normalised_picture(run):
-    from darswin.models.saving import load_model
-
     (found,) = predict([str(run / "p.png")], lens=json.dumps(LENS), run=str(run), top=6)
     net, _ = load_model(run / "checkpoints" / "best.safetensors")
     image = cv2.imread(str(run / "p.png"))[..., ::-1]
@@ -68,6 +67,19 @@ def test_it_is_what_the_model_says_of_the_normalised_picture(run):
     for entry in found["top"]:
         k = "abcdef".index(entry["class"])
         assert entry["probability"] == pytest.approx(expected[k].item(), abs=1e-5)
+
+
+def test_weights_that_are_not_finite_give_no_answer(run, capsys):
+    path = run / "checkpoints" / "best.safetensors"
+    net, card = load_model(path)
+    weights = net.state_dict()
+    weights["head.weight"][0, 0] = math.nan
+    save_model(path, weights, card)
+    picture = str(run / "p.png")
+    with pytest.raises(SystemExit, match=f"darswin: no answer for {picture}: .* NaN or") as caught:
+        main(["predict", picture, "--run", str(run), "--lens", json.dumps(LENS)])
+    assert isinstance(caught.value.code, str)  # which Python prints, and ends with 1
+    assert capsys.readouterr().out == ""
 
 
 def test_what_is_missing_is_said(run):

@@ -3,7 +3,7 @@ import pytest
 import torch
 from frames import WOODSCAPE
 
-from darswin.data.frames import at_size, lens_at_size
+from darswin.data.frames import area_resized, at_size, lens_at_size
 from darswin.lens import Equidistant, load
 
 SIZE = (90, 120)
@@ -34,6 +34,19 @@ def test_a_ray_stays_on_the_same_content(fit, size):
         torch.testing.assert_close(
             centroid(image).float(), there.project_rays(*ray)[0], atol=0.1, rtol=0
         )
+
+
+@pytest.mark.parametrize(
+    ("before", "after"), [((90, 640), (128, 128)), ((400, 100), (96, 120)), ((60, 250), (60, 31))]
+)
+def test_an_axis_that_becomes_shorter_while_the_other_becomes_longer_is_not_shifted(before, after):
+    y, x = np.mgrid[: before[0], : before[1]].astype(np.float32)
+    resized = area_resized(np.stack((y, x), -1), after)
+    for axis in (0, 1):
+        scale = before[axis] / after[axis]
+        centres = (np.arange(after[axis]) + 0.5) * scale - 0.5
+        off = (resized[..., axis].mean(1 - axis) - centres)[2:-2] / scale
+        assert abs(off.mean()) < 1e-3 and np.abs(off).max() < 0.5 / min(scale, 1)
 
 
 def test_shapes():

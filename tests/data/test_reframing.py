@@ -251,3 +251,63 @@ def test_other_models_of_lenses():
     lens = OCam([-120.0, 0.0, 0.002], 1.4, [199.5, 149.5], image_size=SIZE)
     check(through(scene_of(lens), TARGETS[0], 128), scene_of(lens))
     assert isinstance(LENSES["kitti360"], Mei)
+
+
+def ramp(size, axis=0, dtype=np.float32):
+    """A scene whose image is x + 1 and y + 1, and whose target is one of them."""
+    y, x = np.mgrid[: size[0], : size[1]].astype(np.float32) + 1
+    lens = Equidistant(max(size), 2.5, (size[1] / 2 - 0.5, size[0] / 2 - 0.5), image_size=size)
+    return Scene(np.stack((x, y), -1), (x, y)[axis].astype(dtype), lens)
+
+
+def smaller(source, taken, size):
+    """`through` a lens of the same model, so that the picture becomes `size` px wide."""
+    focal = source.lens.focal.item() * size / taken[3]
+    lens = Equidistant(focal, 0.8, (size / 2 - 0.5, size / 2 - 0.5), image_size=(size, size))
+    return through(source, lens, size)
+
+
+SIZES = [
+    ((240, 320), 120), ((512, 512), 256), ((512, 512), 128), ((90, 120), 45), ((300, 300), 100),
+    ((320, 320), 120), ((768, 1024), 128), ((100, 133), 128), ((64, 64), 96), ((50, 40), 150),
+    ((60, 250), 120), ((90, 640), 128), ((480, 80), 160), ((128, 128), 128),
+]  # fmt: skip
+FRAMES = {
+    "resized": lambda *scene: resized(*scene, mirrored=False),
+    "mirrored": lambda *scene: resized(*scene, mirrored=True),
+    "upside down": lambda source, *taken: turned(source, Turn(math.pi, False), *taken),
+    "turned": lambda source, *taken: turned(source, Turn(0.3, True), *taken),
+    "smaller": smaller,
+}
+
+
+@pytest.mark.parametrize("frame", FRAMES)
+@pytest.mark.parametrize("fit", ["crop", "stretch"])
+@pytest.mark.parametrize(("whole", "size"), SIZES)
+def test_targets_are_not_shifted(whole, size, fit, frame):
+    if (frame, fit) == ("smaller", "stretch"):
+        pytest.skip("another lens shows a picture that is not stretched")
+    taken = part(whole, fit, None)
+    for axis, dtype in ((0, np.float32), (1, np.float32), (0, np.uint8), (1, np.uint8)):
+        if dtype == np.uint8 and max(whole) >= IGNORE:
+            continue
+        source = ramp(whole, axis, dtype)
+        scene = FRAMES[frame](source, taken, size)
+        pixel = taken[3 - axis] / size  # of the result, in px of the picture
+        known = (scene.target != IGNORE) if dtype == np.uint8 else (scene.target > 0)
+        margin = 2 + 2 * math.ceil(size / min(whole))
+        known = ndimage.binary_erosion(known, iterations=margin)
+        off = (scene.target - scene.image[..., axis]) / pixel
+        assert known.sum() > 100 and np.abs(off[known]).max() < 0.5 + 0.8 / pixel
+        # A column in the middle may have no pixel that is nearest and none that mirrors it.
+        limit = 0.5 / pixel / (size - 2 * margin) * (size % 2) + 2e-3
+        assert abs(off[known].mean()) < limit
+
+
+@pytest.mark.parametrize(("whole", "size"), SIZES)
+def test_a_mirrored_picture_has_mirrored_targets(whole, size):
+    taken = 0, 0, *whole
+    plain, mirrored = (resized(ramp(whole), taken, size, flip).target for flip in (False, True))
+    same = plain[:, ::-1] == mirrored
+    same[:, size // 2] |= size % 2 == 1  # which may be between two pixels, and mirrors itself
+    assert same.all()

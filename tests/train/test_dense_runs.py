@@ -3,6 +3,7 @@
 import csv
 import json
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -200,6 +201,95 @@ def test_skipped_pictures_weigh_nothing(tiny, tmp_path, capsys):
     assert "--data.skip_broken true leaves such" in error(capsys, tmp_path / "a", *start)
     fit(tmp_path / "b", *start, "--data.skip_broken", "true")
     assert "6 pictures could not be read" in capsys.readouterr().out
+
+
+def with_targets(data, folder, kind, change):
+    """The same scenes with other targets; as many as make 6 batches of training."""
+    shutil.copytree(data, folder)
+    for file in (folder / kind).iterdir():
+        target = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
+        cv2.imwrite(str(file), change(target).astype(target.dtype))
+    return folder
+
+
+def only(*labels):
+    return lambda target: np.where(np.isin(target, labels), target, 255)
+
+
+NOTHING_TO_LEARN = {
+    "all 255": ("segmentation", only(), [], "none of the pixels of 48 training images has a label"),
+    "0 and 255": ("segmentation", only(0), [], "0 and 255 must be stored as the ids 0 and 1"),
+    "one that counts": (
+        "segmentation", only(0, 1), ["--model.ignore_index", "0"],
+        "has a label of ['wall'], so that a single class is left to learn",
+    ),
+    "all 0": ("distance", np.zeros_like, [], "none of the pixels of 48 training images has a kno"),
+    "too far": (
+        "distance", lambda target: target, ["--data.max_distance", "0.5"],
+        "above --data.max_distance 0.5 m; a PNG must hold metres × 256",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", NOTHING_TO_LEARN)
+def test_targets_that_nothing_can_be_learned_from(tiny, data, tmp_path, capsys, case):
+    task, change, options, message = NOTHING_TO_LEARN[case]
+    kind = {"segmentation": "labels", "distance": "distance"}[task]
+    path = with_targets(data, tmp_path / "scenes", kind, change)
+    start = ["--task", task, *tiny, "--data.path", str(path), *options]
+    assert message in error(capsys, tmp_path / "run", *start, "--trainer.max_epochs", "3")
+    if "48 training images" in message:  # a few of them are enough, where nothing at all is known
+        few = error(capsys, tmp_path / "few", *start, "--trainer.max_steps", "2")
+        assert message.replace("48", "16") in few
+
+
+def test_two_processes_with_nothing_to_learn_say_so_once(tiny, data, tmp_path):
+    path = with_targets(data, tmp_path / "scenes", "labels", only())
+    options = [*tiny, "--data.path", str(path), *PAIR, "--data.batch_size", "4"]
+    done = subprocess.run(
+        [sys.executable, "-m", "darswin", "fit", "--run", str(tmp_path / "run"),
+         "--task", "segmentation", *options, "--trainer.max_epochs", "1"],
+        capture_output=True, text=True, env=os.environ | {"OMP_NUM_THREADS": "1"}, timeout=300,
+    )  # fmt: skip
+    assert done.returncode == 2 and "Traceback" not in done.stderr
+    assert done.stderr.count("none of the pixels of 48 training images has a label") == 1
+
+
+def test_a_class_that_is_never_there_is_named_once(tiny, data, tmp_path, capsys):
+    path = with_targets(data, tmp_path / "scenes", "labels", only(0, 2))
+    start = ["--task", "segmentation", *tiny, "--data.path", str(path)]
+    said = "no pixel of 48 training images has a label of ['ground'], which cannot be learned"
+    fit(tmp_path / "run", *start, "--trainer.max_epochs", "2")
+    assert capsys.readouterr().err.count(said) == 1
+    fit(tmp_path / "run", "--resume", "--trainer.max_epochs", "3")
+    assert capsys.readouterr().err.count(said) == 1
+    fit(tmp_path / "short", *start, "--trainer.max_steps", "2")  # it may come later
+    left_out = [*start, "--model.ignore_index", "1", "--trainer.max_epochs", "1"]
+    fit(tmp_path / "left out", *left_out)
+    assert "cannot be learned" not in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("task", ["segmentation", "distance"])
+def test_a_test_of_weights_that_are_not_finite_has_no_results(tiny, tmp_path, capsys, task):
+    run = tmp_path / "run"
+    fit(run, "--task", task, *tiny, "--trainer.max_epochs", "1", "--data.limit", "8")
+    broken = checkpoint(run, "best")
+    for tensor in broken["state_dict"].values():
+        if tensor.is_floating_point():
+            tensor.fill_(np.nan)
+    torch.save(broken, run / "checkpoints" / "best.ckpt")
+    with pytest.raises(SystemExit, match="the loss on scenes is nan: the weights are not finite"):
+        test(run)
+    assert not (run / "test.json").exists()
+
+
+def test_a_test_without_targets_is_valid_json(tiny, data, tmp_path):
+    run = tmp_path / "run"
+    fit(run, "--task", "segmentation", *tiny, "--trainer.max_epochs", "1", "--data.limit", "8")
+    path = with_targets(data, tmp_path / "scenes", "labels", only())
+    (row,) = test(run, "--data.test_paths", str(path))
+    assert row["loss"] is None and row["miou"] is None and row["pixels"] == 0
+    assert "NaN" not in (run / "test.json").read_text()
 
 
 @pytest.mark.parametrize(

@@ -72,7 +72,7 @@ def save(lens: Lens, path: str | os.PathLike, format: str | None = None) -> str:
     path = Path(path)
     format = format_of(path) if format is None else format
     if format == "darswin":
-        text = json.dumps(to_dict(lens), indent=2) + "\n"
+        text = json.dumps(to_dict(lens), indent=2, allow_nan=False) + "\n"
     elif format in WRITERS:
         text = _written(lens, WRITERS[format], path.suffix.lower())
     else:
