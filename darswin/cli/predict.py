@@ -20,6 +20,7 @@ from darswin.data.folders import PICTURES, pictures_and_videos_below
 from darswin.data.samples import IMAGENET_MEAN, IMAGENET_STD
 from darswin.data.scenes.lenses import OwnLenses
 from darswin.lens import Lens
+from darswin.lens.files.opencv import Coefficients
 from darswin.models.pretrained import list_pretrained, pretrained_file
 from darswin.models.saving import ModelCard, NoCardError, Task, load_model, model_of_run
 from darswin.utils.files import replace_file
@@ -47,7 +48,8 @@ def run(argv: list[str]) -> None:
 
 def predict(
     paths: Sequence[str] = (), *, lens: str | None = None, run: str | None = None,
-    model: str | None = None, camera: str | None = None, task: Task | None = None, top: int = 5,
+    model: str | None = None, camera: str | None = None,
+    coefficients: Coefficients | None = None, task: Task | None = None, top: int = 5,
     every: int = 1, out: str | None = None,
 ) -> list[dict]:  # fmt: skip
     """What a model says of pictures and of the frames of videos, as JSON: their most probable
@@ -70,6 +72,7 @@ def predict(
         model: a model's safetensors file, instead; "digits", which comes with darswin; or what
             `darswin convert` makes of the authors' released weights, whose classes have numbers.
         camera: which, of a calibration of several.
+        coefficients: what they are, in a calibration of OpenCV or ROS that does not say it.
         task: what the model is expected to tell; it says so itself.
         top: how many classes of an image.
         every: of a video the first frame, and each so many frames after it.
@@ -105,7 +108,7 @@ def predict(
     if task not in (None, card.task):
         raise ValueError(f"--task {task} was asked of {weights}, a model for {card.task}")
     files = pictures_and_videos(paths, leave_out=None if card.task == "classification" else out)
-    calibrations = _calibrations(lens, camera, files)
+    calibrations = _calibrations(lens, camera, coefficients, files)
     if card.task == "classification":
         answers: Answers = ClassAnswers(net, card, top)
     else:
@@ -197,14 +200,17 @@ def answer_video(name: str, every: int, calibrations: PictureLenses, answers: An
             )
 
 
-def _calibrations(lens: str, camera: str | None, files: Sequence[File]) -> PictureLenses:
+def _calibrations(
+    lens: str, camera: str | None, coefficients: str | None, files: Sequence[File]
+) -> PictureLenses:
     """What took the files.
 
     Raises:
         ValueError: as `Calibrations`. FileNotFoundError: a folder with none of their calibrations.
     """
     if is_json(lens) or not os.path.isdir(lens):
-        return Calibrations(lens, "." if is_json(lens) else Path(lens).parent, camera)
+        root = "." if is_json(lens) else Path(lens).parent
+        return Calibrations(lens, root, camera, coefficients)
     if camera is not None:
         raise ValueError(f"--camera {camera} is one of a calibration file, and {lens} is a folder")
     own = {Path(file.name): Path(lens, f"{Path(file.name).stem}.json") for file in files}
@@ -213,7 +219,7 @@ def _calibrations(lens: str, camera: str | None, files: Sequence[File]) -> Pictu
         raise FileNotFoundError(
             f"no calibration in {lens}: the first would be {next(iter(own.values()))}"
         )
-    return OwnLenses(there)
+    return OwnLenses(there, coefficients=coefficients)
 
 
 def _lens(calibrations: PictureLenses, name: str, image: np.ndarray, orientation: int) -> Lens:

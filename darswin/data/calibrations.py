@@ -21,12 +21,13 @@ class Camera(NamedTuple):
     """A camera that took pictures.
 
     Attributes: calibration: a file, or a description as JSON; camera: which of the file's;
-    name: what errors call it.
+    name: what errors call it; coefficients: as `Calibrations` has them.
     """
 
     calibration: str
     camera: str | None
     name: str
+    coefficients: str | None = None
 
     def lens(self, size: tuple[int, int]) -> Lens:
         """Its lens; `size` (H, W) is of pictures as stored, for a calibration without one."""
@@ -36,8 +37,8 @@ class Camera(NamedTuple):
 
     def _read(self) -> Calibration:
         if is_json(self.calibration):
-            return Calibration(self.calibration, self.name)
-        return Calibration.read(self.calibration)
+            return Calibration(self.calibration, self.name, self.coefficients)
+        return Calibration.read(self.calibration, self.coefficients)
 
 
 class PictureLenses:
@@ -114,27 +115,39 @@ class Calibrations(PictureLenses):
             - a lens as JSON, as `darswin.lens.from_dict` takes it: all pictures;
             - a `lenses.json`: a JSON object from folders and pictures, relative to `root`, to
               their cameras; "." is all, and the most specific counts. A camera is a calibration
-              file's path, relative to the lenses.json, or {"file": path, "camera": name}, or a
-              lens as above.
+              file's path, relative to the lenses.json, or {"file": path, "camera": name,
+              "coefficients": what they are}, of which the last two may be left out, or a lens as
+              above.
         root: the folder of the pictures.
         camera: which, of one calibration of several cameras.
+        coefficients: "fisheye", "pinhole" or "omnidir": what they are, in one calibration that
+            does not say it; the `model` of `darswin.lens.load`.
 
     Raises:
         ValueError: what says no lens, in a sentence that names it. FileNotFoundError: a file that
             is missing.
     """
 
-    def __init__(self, lens: str | Path, root: str | Path, camera: str | None = None):
+    def __init__(
+        self,
+        lens: str | Path,
+        root: str | Path,
+        camera: str | None = None,
+        coefficients: str | None = None,
+    ):
         self._root = os.path.abspath(root)
         self._lens = lens
         entries = None if is_json(lens) else _entries(Path(lens))
         if entries is None:
             name = "of the lens" if is_json(lens) else str(lens)
-            self._cameras = {_ALL: Camera(str(lens), camera, name)}
-        elif camera is not None:
+            self._cameras = {_ALL: Camera(str(lens), camera, name, coefficients)}
+        elif camera is not None or coefficients is not None:
+            said = {"camera": camera, "coefficients": coefficients}
+            said = {key: value for key, value in said.items() if value is not None}
+            what = "coefficients are said" if camera is None else "a camera is chosen"
             raise ValueError(
-                f"a camera is chosen of one calibration file, and {lens} lists several; say it "
-                f'there as {{"file": …, "camera": {json.dumps(camera)}}}'
+                f"{what} of one calibration file, and {lens} lists several; say it there as "
+                f'{{"file": …, {json.dumps(said)[1:]}'
             )
         else:
             self._cameras = _listed(Path(lens), entries, Path(root))
@@ -204,11 +217,11 @@ def _camera(file: Path, about: str, value: Any) -> Camera:
     if isinstance(value, dict) and "model" in value:
         return Camera(json.dumps(value), None, f"in {about}")
     given = {"file": value} if isinstance(value, str) else value
-    fits = isinstance(given, dict) and given.keys() <= {"file", "camera"}
+    fits = isinstance(given, dict) and given.keys() <= {"file", "camera", "coefficients"}
     if not fits or not isinstance(given.get("file"), str):
         raise ValueError(
-            f'{about} must be a calibration file, {{"file": …, "camera": …}} or a lens, '
-            f'{{"model": …}}, got {json.dumps(value, ensure_ascii=False)}'
+            f'{about} must be a calibration file, {{"file": …, "camera": …, "coefficients": …}} '
+            f'or a lens, {{"model": …}}, got {json.dumps(value, ensure_ascii=False)}'
         )
     calibration, camera = file.parent / given["file"], given.get("camera")
     if not calibration.is_file():
@@ -216,7 +229,8 @@ def _camera(file: Path, about: str, value: Any) -> Camera:
             f"{about} is to have the calibration {calibration}, which is no file"
         )
     name = str(calibration) if camera is None else f"camera {camera} of {calibration}"
-    return Camera(str(calibration), None if camera is None else str(camera), name)
+    camera, model = (None if x is None else str(x) for x in (camera, given.get("coefficients")))
+    return Camera(str(calibration), camera, name, model)
 
 
 def are_curves(cameras: Sequence[Camera], lenses: Sequence[Lens]) -> bool:

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping
-from typing import ClassVar, Self
+from typing import Any, ClassVar, Self
 
 import torch
 from torch import Tensor
@@ -97,14 +97,31 @@ class Lens(ImageFrame):
             return
         self._require("theta_max", wanted > 0, "greater than 0")
         # A limit found in another dtype differs by a rounding, which MARGIN leaves room for.
-        beyond = ~(wanted <= limit * (1 + 2 * torch.finfo(limit.dtype).eps))
+        slack = 1 + 2 * torch.finfo(limit.dtype).eps
+        beyond = ~(wanted <= limit * slack)
         if bool(beyond.any()):
-            last, got = (t.detach()[beyond][0].item() for t in (limit, wanted))
+            # Beyond the range of its dtype a lens is cut off; beyond its model's it is wrong.
+            exact = self.detach().to(torch.float64).theta_limit
+            beyond &= ~(wanted <= exact * slack)
+        if bool(beyond.any()):
+            last, got = (t.detach()[beyond][0].item() for t in (exact, wanted))
             raise ValueError(
                 f"theta_max must be at most {last:.6f} rad ({math.degrees(last):.2f}°), as far as "
                 f"this {type(self).__name__} lens's r rises, got {got:.6f}"
             )
         self.theta_max = torch.where(wanted > limit, limit, wanted)
+
+    def to(self, *args: Any, **kwargs: Any) -> Self:
+        """The same lens with another dtype or on another device, as `Tensor.to`.
+
+        From float64 to float32 θ_max becomes at most the `theta_limit` of the new lens: high powers
+        of w overflow earlier there.
+        """
+        lens = super().to(*args, **kwargs)
+        if self.theta_max.dtype == torch.float64 and lens.theta_max.dtype == torch.float32:
+            limit = lens.theta_limit
+            lens.theta_max = torch.where(lens.theta_max > limit, limit, lens.theta_max)
+        return lens
 
     def with_theta_max(self, theta_max: Number | None) -> Self:
         """The same lens used up to another angle (rad); None means `theta_limit`."""

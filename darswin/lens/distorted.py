@@ -214,8 +214,9 @@ class DistortedLens(FocalLens, register=False):
         goal, points = goal.reshape(len(self), -1, 2), start.clone()
         for k, end in enumerate(last.flatten()):
             lens = self[k]
-            # Most pixels that no ray reaches lie beyond the rim; they are skipped.
-            near = length_of(goal[k]) < 1.01 * length_of(lens._distort(end * circle)).max()
+            # Most pixels that no ray reaches lie beyond the rim; they are skipped. A rim that
+            # overflows, as NaN, is beyond all pixels.
+            near = ~(length_of(goal[k]) >= 1.01 * length_of(lens._distort(end * circle)).max())
             for share in (0.5, 0.0):  # from the axis, where a fold blocked the first way
                 points[k][near] = newton(
                     lens._distort,

@@ -42,20 +42,25 @@ def inverse(function: Function, slope: Function, value: Tensor, end: Tensor) -> 
 
 @torch.no_grad()
 def rising_limit(slope: Function, end: Tensor) -> Tensor:
-    """How far functions rise from 0: the first x at which a slope is not positive, or `end`.
+    """How far functions rise from 0: the first x at which a slope is not positive or overflows, or
+    `end`.
 
     Args:
         slope: of x (N, K), a row a function. end: (N,), how far to look, in 1024 steps.
     """
     steps = torch.linspace(0, 1, 1025, dtype=end.dtype, device=end.device)
     x = end[:, None] * steps
-    falls = ~(slope(x) > 0)
+    falls = ~_rises(slope(x))
     if readable(falls) and not falls.any():
         return end  # the usual case
     first = falls.int().argmax(1, keepdim=True)
     low, high = x.gather(1, (first - 1).clamp(min=0)), x.gather(1, first)
     for _ in range(50):
         middle = (low + high) / 2
-        rises = slope(middle) > 0
+        rises = _rises(slope(middle))
         low, high = torch.where(rises, middle, low), torch.where(rises, high, middle)
     return torch.where(falls.any(1), low[:, 0], end)
+
+
+def _rises(slope: Tensor) -> Tensor:
+    return (slope > 0) & (slope < torch.inf)

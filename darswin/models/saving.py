@@ -1,23 +1,26 @@
 """Models as files: safetensors, with what is needed to build the model in their metadata."""
 
 import json
+import math
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
 
 from darswin.layers.quantized import Quantization, with_quantized_layers
+from darswin.lens.files.fields import listed, short
 from darswin.models.pretrained import list_pretrained, pretrained_file
 from darswin.models.registry import create_model
 from darswin.utils.files import replace_file
 
 Task = Literal["classification", "segmentation", "distance"]
+Fit = Literal["crop", "stretch", "whole"]
 
 _ENTRY = "darswin"  # of the metadata
 
@@ -48,7 +51,7 @@ class ModelCard:
     classes: Sequence[str] = ()
     size: int = 64
     fov: float = 0.0
-    fit: Literal["crop", "stretch", "whole"] = "whole"
+    fit: Fit = "whole"
     task: Task = "classification"
     colors: Sequence[Sequence[int]] = field(default_factory=list)
     quantized: Mapping[str, Sequence[float]] = field(default_factory=dict)
@@ -107,11 +110,9 @@ def load_model(path: str | os.PathLike) -> tuple[Any, ModelCard]:
     with _opened(path) as file:
         card = _card(file, path)
         weights = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-    try:
-        model = card.create()
-        model.load_state_dict(weights)
-    except (ValueError, KeyError, TypeError, RuntimeError) as error:
-        raise _unknown(path, error) from error
+    with _about(path):
+        model = _created(card)
+        _take_weights(model, weights)
     model.pretrained_cfg |= dict(label_names=tuple(card.classes), file=str(path))
     if model.image_size is None:
         model.pretrained_cfg["input_size"] = (model.in_chans, card.size, card.size)
@@ -137,14 +138,91 @@ def _card(file: Any, path: str | os.PathLike) -> ModelCard:
     entry = (file.metadata() or {}).get(_ENTRY)
     if entry is None:
         raise NoCardError(f"{path} holds weights, but not the name of their model")
-    try:
-        values = json.loads(entry)
+    with _about(path):
+        try:
+            values = json.loads(entry)
+        except ValueError as error:
+            raise ValueError(f"what it says of its model is no JSON: {error}") from error
+        if not isinstance(values, dict) or "model" not in values:
+            raise ValueError(f'what it says of its model must name a "model", got {short(values)}')
         # Older files do not say all of it.
-        known = {field.name for field in fields(ModelCard)}
-        return ModelCard(**{name: values[name] for name in known if name in values})
-    except (ValueError, TypeError) as error:
-        raise _unknown(path, error) from error
+        known = {name: values[name] for name in _FIELDS if name in values}
+        for name, value in known.items():
+            fits, expected = _FIELDS[name]
+            if not fits(value):
+                raise ValueError(f"its {name} must be {expected}, got {short(value)}")
+        return ModelCard(**known)
 
 
-def _unknown(path: str | os.PathLike, error: Exception) -> ValueError:
-    return ValueError(f"{path} is no model that this darswin can build: {error}")
+def _created(card: ModelCard) -> Any:
+    """The card's model; ValueError where its options are not those of that model."""
+    try:
+        return card.create()
+    except ValueError:
+        raise
+    except Exception as error:  # a constructor's, for a value that it never expects
+        said = json.dumps(card.options)
+        raise ValueError(f"a {card.model} cannot be made with the options {said}") from error
+
+
+def _take_weights(model: Any, weights: Mapping[str, Tensor]) -> None:
+    """Loads all the weights of a model; ValueError where there are others."""
+    own = model.state_dict()
+    for what, names in (
+        ("has no weights", own.keys() - weights.keys()),
+        ("has the unknown weights", weights.keys() - own.keys()),
+    ):
+        if names:
+            raise ValueError(f"it {what} {listed(sorted(names))}")
+    for name, weight in weights.items():
+        if weight.shape != own[name].shape:
+            got, expected = tuple(weight.shape), tuple(own[name].shape)
+            raise ValueError(f"its weights {name} must have the shape {expected}, got {got}")
+    model.load_state_dict(weights)
+
+
+def _is_number(value: Any, least: float = -math.inf, most: float = math.inf) -> bool:
+    number = isinstance(value, (int, float)) and not isinstance(value, bool)
+    return number and math.isfinite(value) and least <= value <= most
+
+
+def _is_whole(value: Any, least: int, most: float = math.inf) -> bool:
+    return isinstance(value, int) and _is_number(value, least, most)
+
+
+def _are(kind: Callable[[Any], bool], values: Any) -> bool:
+    return isinstance(values, list) and all(map(kind, values))
+
+
+def _is_color(value: Any) -> bool:
+    return _are(lambda part: _is_whole(part, 0, 255), value) and len(value) == 3
+
+
+def _is_quantization(value: Any) -> bool:
+    return _are(_is_number, value) and len(value) == 2 and value[0] > 0
+
+
+# Of each field of a card as JSON: whether a value may stand there, and what must.
+_FIELDS: dict[str, tuple[Callable[[Any], bool], str]] = {
+    "model": (lambda value: isinstance(value, str), "the name of a model"),
+    "options": (lambda value: isinstance(value, dict), "an object"),
+    "classes": (
+        lambda value: _are(lambda name: isinstance(name, str), value), "a list of names"),
+    "size": (lambda value: _is_whole(value, 1), "a whole number above 0"),
+    "fov": (lambda value: _is_number(value, 0, 2 * math.pi), "an angle in rad, 0 to 2π"),
+    "fit": (lambda value: value in get_args(Fit), f"one of {get_args(Fit)}"),
+    "task": (lambda value: value in get_args(Task), f"one of {get_args(Task)}"),
+    "colors": (lambda value: _are(_is_color, value), "a list of three numbers, 0 to 255, each"),
+    "quantized": (
+        lambda value: isinstance(value, dict) and all(map(_is_quantization, value.values())),
+        "an object with a scale above 0 and a zero point for each layer"),
+}  # fmt: skip
+
+
+@contextmanager
+def _about(path: str | os.PathLike) -> Iterator[None]:
+    """Errors within name the file."""
+    try:
+        yield
+    except ValueError as error:
+        raise ValueError(f"{path} is no model that this darswin can build: {error}") from error

@@ -13,6 +13,7 @@ from darswin.data.samples import IMAGENET_MEAN, IMAGENET_STD, Samples
 from darswin.data.sampling import EveryNth, ResumableLoader, TrainingOrder
 from darswin.data.splits import Split
 from darswin.data.turning import RandomTurns
+from darswin.lens.files.opencv import Coefficients
 from darswin.train.stopping import ignore_signals
 
 
@@ -26,6 +27,7 @@ class RunData(LightningDataModule):
             `darswin.lens.load` reads, a lens as JSON, or a lenses.json that says which camera took
             which folder or picture (see `darswin.data.Calibrations`).
         camera: which, of a calibration of several cameras.
+        coefficients: what they are, in a calibration of OpenCV or ROS that does not say it.
         size: px, H = W of the images; null is that of model.weights, or the data's own default.
         fit: how a picture becomes a square: crop cuts it, stretch squashes it; its lens, if it has
             one, follows.
@@ -60,6 +62,7 @@ class RunData(LightningDataModule):
         *,
         lens: str | None = None,
         camera: str | None = None,
+        coefficients: Coefficients | None = None,
         size: int | None = None,
         fit: Literal["crop", "stretch"] = "crop",
         channels: Literal[1, 3] | None = None,
@@ -83,9 +86,12 @@ class RunData(LightningDataModule):
                 "--data.batch_size must be at least 1 and --data.workers at least 0, "
                 f"got {batch_size} and {workers}"
             )
-        if camera is not None and lens is None:
-            raise ValueError(f"--data.camera {camera} is one of a calibration: give --data.lens")
-        self.path, self._lens, self._camera = path, lens, camera
+        for name, value in (("camera", camera), ("coefficients", coefficients)):
+            if value is not None and lens is None:
+                said = f"--data.{name} {value}"
+                raise ValueError(f"{said} is one of a calibration: give --data.lens")
+        self.path, self._lens = path, lens
+        self._camera, self._coefficients = camera, coefficients
         self.size, self.channels = self.default_size if size is None else size, channels or 3
         self.mean = list(mean or (IMAGENET_MEAN if self.channels == 3 else [0.449]))
         self.std = list(std or (IMAGENET_STD if self.channels == 3 else [0.226]))

@@ -64,8 +64,9 @@ class DenseData(RunData):
         """The scenes of a split."""
         if split not in self._scenes:
             self._scenes[split] = open_scenes(
-                self.path, split, self.target, lens=self._lens, camera=self._camera, **self._opening
-            )
+                self.path, split, self.target, lens=self._lens, camera=self._camera,
+                coefficients=self._coefficients, **self._opening,
+            )  # fmt: skip
         return self._scenes[split]
 
     @property

@@ -13,7 +13,7 @@ CHANGEABLE = {
     *("model.loss", "model.class_weights", "model.solid_angle_weights", "model.zones"),
     *("model.matmul_backend", "model.grad_checkpointing"),
     *("data.path", "data.classes", "data.splits", "data.skip_broken"),
-    *("data.lens", "data.camera"),
+    *("data.lens", "data.camera", "data.coefficients"),
     *("data.batch_size", "data.workers"),
     *("data.train_lenses", "data.test_lenses", "data.pair_lenses"),
     *("data.render", "data.fit", "data.picture_size", "data.randaugment", "data.erasing"),

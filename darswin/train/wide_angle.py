@@ -85,7 +85,9 @@ class WideAngleData(RunData):
     @cached_property
     def calibrations(self) -> Calibrations | None:
         """The lenses that the pictures were taken with, if `lens` says them."""
-        return Calibrations(self._lens, self.path, self._camera) if self._lens else None
+        if not self._lens:
+            return None
+        return Calibrations(self._lens, self.path, self._camera, self._coefficients)
 
     def dataset(self, split: Split, name: str | None = None, **options: Any) -> Samples:
         """A split as it is, with its cameras' lenses; or through a distribution of lenses, where

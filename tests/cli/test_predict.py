@@ -215,6 +215,25 @@ def test_a_camera_that_is_called_by_a_number(run, capsys):
         assert close(answers(argv, run, capsys)[0], same)
 
 
+def test_coefficients_that_the_file_does_not_name(run, capsys):
+    picture, calibration = str(run / "p.png"), run / "kd.json"
+    matrix = [30.0, 0, 47.5, 0, 30.0, 31.5, 0, 0, 1]
+    calibration.write_text(json.dumps(dict(K=matrix, D=[0.1, 0.02, 0.01, 0], w=96, h=64)))
+    argv = [picture, "--lens", str(calibration)]
+    with pytest.raises(SystemExit):
+        main(["predict", *argv, "--run", str(run)])
+    assert 'give model="fisheye" or model="pinhole"' in (said := capsys.readouterr().err)
+    assert said.endswith("(on the command line as --coefficients)\n") and said.count("\n") == 1
+    for model in ("fisheye", "pinhole"):
+        save(load(calibration, model=model), run / "lens.json")
+        (same,) = answers([picture, "--lens", str(run / "lens.json")], run, capsys)
+        assert close(answers([*argv, "--coefficients", model], run, capsys)[0], same)
+    (run / "own").mkdir()
+    (run / "own" / "p.json").write_text(calibration.read_text())
+    argv = [picture, "--lens", str(run / "own"), "--coefficients", "pinhole"]
+    assert close(answers(argv, run, capsys)[0], same)
+
+
 def exif_picture(path, orientation, stored):
     """A picture file of these pixels (RGB) with an EXIF orientation."""
     exif = Image.Exif()

@@ -57,6 +57,23 @@ def test_a_camera_of_several(root):
         Calibrations(file, root, "none")
 
 
+def test_coefficients_that_the_file_does_not_name(root):
+    file = root.parent / "kd.json"
+    d = [-0.021, 0.0043, -0.0012, 0.00008]
+    matrix = [421.3, 0, 643.1, 0, 420.9, 478.6, 0, 0, 1]
+    file.write_text(json.dumps(dict(K=matrix, D=d, width=1280, height=960)))
+    with pytest.raises(ValueError, match="the coefficients of D may be"):
+        Calibrations(file, root)
+    for model in ("fisheye", "pinhole"):
+        expected = load(file, model=model)
+        same(Calibrations(file, root, coefficients=model).lens_of(None, (960, 1280)), expected)
+        entry = {"file": "kd.json", "coefficients": model}
+        lenses = Calibrations(listed(root, {".": entry}), root)
+        same(lenses.lens_of(None, (960, 1280)), expected)
+    with pytest.raises(ValueError, match=r"coefficients are said of one .*coefficients\": \"fish"):
+        Calibrations(listed(root, {".": "kd.json"}), root, coefficients="fisheye")
+
+
 def test_a_lens_as_json(root):
     lens = Calibrations(json.dumps(SPHERICAL), root).lens_of(None, SIZE)
     same(lens, from_dict(dict(SPHERICAL, center=[79.5, 60.0], image_size=SIZE)))

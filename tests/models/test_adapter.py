@@ -2,7 +2,7 @@ import pytest
 import torch
 from torch import nn
 
-from darswin.lens import Equidistant, KannalaBrandt, Polynomial, Spherical
+from darswin.lens import BrownConrady, Equidistant, KannalaBrandt, Polynomial, Spherical
 from darswin.models import LensAdapter
 
 LENSES = Spherical.from_fov([0.2, 0.9], 2.6, 24.0)
@@ -48,6 +48,15 @@ def test_what_is_taken_to_the_square_comes_back(lens, spacing):
     assert (out - images).abs()[inner].max() < 0.02
     coarse = LensAdapter(nn.AvgPool2d(4), 192, spacing)(images, lens)
     assert coarse.shape == images.shape and (coarse - images).abs()[inner].mean() < 0.02
+
+
+def test_a_lens_in_float32_sees_as_much_as_in_float64():
+    focal = torch.tensor([40.0], dtype=torch.float64)
+    exact = BrownConrady(focal, [-0.22, 0.13, 0.028], tangential=[1e-3, 1e-3], center=[25.0, 24.0])
+    adapter, images = LensAdapter(nn.Identity(), 192), 2 + smooth(48, 52)
+    for lens in (exact, exact.to(torch.float32)):
+        out = adapter(images, lens)[..., 2:-2, 2:-2]
+        assert (out - images[..., 2:-2, 2:-2]).abs().max() < 0.2
 
 
 def test_outputs_of_any_resolution_come_back_and_others_pass_through():

@@ -5,7 +5,7 @@ import torch
 from safetensors.torch import save_file
 
 from darswin.lens import Spherical
-from darswin.models.saving import ModelCard, load_model, save_model
+from darswin.models.saving import ModelCard, load_model, read_card, save_model
 
 CARD = ModelCard(
     "darswin_a_nano", {"num_classes": 3, "in_chans": 1, "spacing": "tan"}, ["a", "b", "c"], 32, 2.9
@@ -39,6 +39,62 @@ def test_what_is_no_model_of_ours(tmp_path):
         load_model(path)
     with pytest.raises(FileNotFoundError):
         load_model(tmp_path / "nothing.safetensors")
+
+
+def write(path, weights, **changes):
+    said = json.dumps(dict(vars(CARD)) | changes)
+    save_file(weights, path, metadata={"darswin": said})
+
+
+def refusal(path):
+    """What `load_model` says of a file, in one line."""
+    with pytest.raises(ValueError, match="is no model that this darswin can build: ") as error:
+        load_model(path)
+    assert type(error.value) is ValueError and "\n" not in str(error.value)
+    return str(error.value)
+
+
+def test_other_weights_are_named_in_a_sentence(tmp_path):
+    path, weights = tmp_path / "m.safetensors", CARD.create().state_dict()
+    assert "head.bias" in weights
+    write(path, {name: tensor for name, tensor in weights.items() if name != "head.bias"})
+    assert refusal(path).endswith("it has no weights head.bias")
+    write(path, weights | {"more": torch.zeros(1)})
+    assert refusal(path).endswith("it has the unknown weights more")
+    write(path, weights | {"head.bias": torch.zeros(4)})
+    assert refusal(path).endswith("its weights head.bias must have the shape (3,), got (4,)")
+
+
+WRONG = (None, True, -1, 0.5, "x", [], [1], {}, {"a": None}, [[None]], float("nan"), 1e400)
+
+
+@pytest.mark.parametrize("field", vars(CARD))
+def test_a_card_with_a_wrong_value_is_refused_in_a_sentence(field, tmp_path):
+    path, weights = tmp_path / "m.safetensors", CARD.create().state_dict()
+    refused = []
+    for value in WRONG:
+        write(path, weights, **{field: value})
+        try:
+            assert isinstance(load_model(path)[1], ModelCard)
+        except ValueError:
+            assert f"{field} must be" in refusal(path) or field in ("model", "options", "quantized")
+            refused.append(value)
+    assert None in refused and len(refused) >= 8
+    write(path, weights, **{field: None})
+    with pytest.raises(ValueError, match=f"its {field} must be .*, got None"):
+        read_card(path)
+
+
+@pytest.mark.parametrize("option", ["num_classes", "in_chans", "spacing", "embed_dim", "depths",
+                                    "num_heads", "mean", "x"])  # fmt: skip
+def test_options_of_a_wrong_kind_are_refused_in_a_sentence(option, tmp_path):
+    path, weights = tmp_path / "m.safetensors", CARD.create().state_dict()
+    for value in (*WRONG, "a", [None, 1]):
+        write(path, weights, options=dict(CARD.options) | {option: value})
+        try:
+            load_model(path)
+        except ValueError:
+            refusal(path)
 
 
 def test_an_older_file_lacks_what_came_later(tmp_path):

@@ -16,6 +16,9 @@ from darswin.models.saving import load_model
 EQUIDISTANT = {"model": "Equidistant", "focal": 45.0, "theta_max": 1.5, "image_size": [121, 160]}
 
 
+KD = "K and D"  # a calibration that does not say its model
+
+
 @pytest.fixture(scope="module")
 def data(tmp_path_factory):
     return write_frames(tmp_path_factory.mktemp("data") / "frames", count=90)
@@ -113,6 +116,14 @@ def test_other_models_train_on_them(tiny, tmp_path, name):
         (["--data.lens", '{"model": "Fish"}'], "must be one of"),
         (["--data.camera", "7"], "camera must be one of"),
         (["--data.lens", "null", "--data.camera", "7"], "--data.camera 7 is one of a calibration"),
+        (["--data.coefficients", "pinhole"], "its cameras say their model"),
+        (["--data.lens", KD], "(on the command line as --data.coefficients)"),
+        (["--data.lens", KD, "--data.coefficients", "fish"], "coefficients"),
+        (["--data.lens", KD, "--data.coefficients", "pinhole"], "the lens is of pictures of 80×80"),
+        (
+            ["--data.lens", "null", "--data.coefficients", "pinhole"],
+            "--data.coefficients pinhole i",
+        ),
         (["--data.path", "digits"], "the lens is of pictures of 966×1280 px, and 8×8"),
         (["--data.train_lenses", "low"], "--data.train_lenses warps pictures"),
         (["--data.test_lenses=low"], "--data.test_lenses warps pictures"),
@@ -120,5 +131,9 @@ def test_other_models_train_on_them(tiny, tmp_path, name):
     ],
 )
 def test_wrong_lenses_are_named(tiny, tmp_path, capsys, options, message):
+    file = tmp_path / "kd.json"
+    file.write_text(json.dumps(dict(K=[30, 0, 39.5, 0, 30, 29.5, 0, 0, 1], D=[0.1, 0, 0, 0],
+                                       width=80, height=80)))  # fmt: skip
+    options = [str(file) if option == KD else option for option in options]
     assert message in error(capsys, tmp_path / "run", *tiny, *options)
     assert not (tmp_path / "run" / "checkpoints").exists()

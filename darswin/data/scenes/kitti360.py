@@ -63,7 +63,7 @@ def camera_of(stem: str) -> str:
 
 def _lenses(root: Path, pairs: Pairs, options: Options) -> PictureLenses:
     if options.lens is not None:
-        return Calibrations(options.lens, root, options.camera)
+        return Calibrations(options.lens, root, options.camera, options.coefficients)
     files = {
         root / picture: root / "calibration" / f"{camera_of(stem)}.yaml"
         for stem, (picture, _) in pairs.items()

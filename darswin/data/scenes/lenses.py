@@ -22,37 +22,47 @@ class OwnLenses(PictureLenses):
     Args:
         files: pictures and their calibrations, of any format that `darswin.lens.load` reads; in
             JSON where there are many.
+        coefficients: of the files, as `Calibrations` has them.
 
     Raises:
         ValueError: a file that is no JSON or no lens, or lenses that cannot be joined; it names
             the file.
     """
 
-    def __init__(self, files: Mapping[Path, Path], shared: Calibrations | None = None):
+    def __init__(
+        self,
+        files: Mapping[Path, Path],
+        shared: Calibrations | None = None,
+        coefficients: str | None = None,
+    ):
+        self._coefficients = coefficients
         self._files = {str(picture): str(file) for picture, file in files.items()}
         self._shared = shared
         # Files that differ in numbers alone have lenses of one form: one of them stands for all.
         alike: dict[Hashable, Camera] = {}
         for file in dict.fromkeys(self._files.values()):
             form = _form(_content(file)) if file.endswith(".json") else file
-            alike.setdefault(form, Camera(file, None, file))
+            alike.setdefault(form, self._own(file))
         examples = [*alike.values(), *(shared.cameras if shared else ())]
         super().__init__(are_curves(examples, [camera.lens(NOMINAL) for camera in examples]))
 
     @property
     def cameras(self) -> list[Camera]:
         """The different cameras: the files, then those of the shared lens."""
-        own = [Camera(file, None, file) for file in dict.fromkeys(self._files.values())]
+        own = [self._own(file) for file in dict.fromkeys(self._files.values())]
         return own + (self._shared.cameras if self._shared else [])
 
     def camera_of(self, picture: str | Path | None) -> Camera:
         """What took a picture; ValueError for one that has neither a file nor a shared lens."""
         file = self._files.get(str(picture))
         if file is not None:
-            return Camera(file, None, file)
+            return self._own(file)
         if self._shared is not None:
             return self._shared.camera_of(picture)
         raise ValueError(f"{picture} has no lens: neither a file of its own nor one for all")
+
+    def _own(self, file: str) -> Camera:
+        return Camera(file, None, file, self._coefficients)
 
     def lens_of(
         self, picture: str | Path | None, size: tuple[int, int], orientation: int = 1

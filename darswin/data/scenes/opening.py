@@ -20,6 +20,7 @@ def open_scenes(
     channels: int = 3,
     lens: str | Path | None = None,
     camera: str | None = None,
+    coefficients: str | None = None,
     classes: str | Path | None = None,
     splits: str | Path | None = None,
     holdout: float = 0.1,
@@ -46,7 +47,7 @@ def open_scenes(
         split: "all" is every scene of a folder without splits.
         target: what is known of each pixel: "labels" or "distance", along the ray.
         channels: 3 or 1, of the images that come out.
-        lens, camera: as `darswin.data.Calibrations`, in place of the data set's own.
+        lens, camera, coefficients: as `darswin.data.Calibrations`, in place of the data set's own.
         classes: the names of the classes, in place of the data set's own: a text file with one a
             line, a JSON list, or {"names": [...], "colors": [[r, g, b], ...]}.
         splits: a JSON file `{"train": [stems], "val": …, "test": …}`, or a folder of `train.txt`,
@@ -66,13 +67,14 @@ def open_scenes(
         raise ValueError(f"channels must be 1 or 3, got {channels}")
     if not 0 <= holdout < 0.5:
         raise ValueError(f"holdout must be in [0, 0.5), got {holdout}")
-    if camera is not None and lens is None:
-        raise ValueError(f"camera {camera} is one of a calibration: give the lens too")
+    for name, value in (("camera", camera), ("coefficients", coefficients)):
+        if value is not None and lens is None:
+            raise ValueError(f"{name} {value} is one of a calibration: give the lens too")
     root = Path(path)
     if not root.is_dir():
         raise FileNotFoundError(f"no folder {root}")
     kind = next((kind for kind in KINDS if kind.fits(root)), None)
     if kind is None:
         raise FileNotFoundError(f"no scenes in {root}: {plain.FORM}")
-    options = Options(split, target, channels, lens, camera, classes, splits, holdout)
+    options = Options(split, target, channels, lens, camera, coefficients, classes, splits, holdout)
     return kind.open_split(root, options)

@@ -18,6 +18,7 @@ class Options:
     channels: int = 3
     lens: str | Path | None = None
     camera: str | None = None
+    coefficients: str | None = None
     classes: str | Path | None = None
     splits: str | Path | None = None
     holdout: float = 0.1

@@ -77,7 +77,7 @@ def _scenes(
 def _lenses(root: Path, folder: Path, pairs: Pairs, options: Options) -> PictureLenses:
     """The lens that was given; else those of the pictures themselves, else the folder's."""
     if options.lens is not None:
-        return Calibrations(options.lens, root, options.camera)
+        return Calibrations(options.lens, root, options.camera, options.coefficients)
     own: dict[str, str] = {}
     if (folder / "lenses").is_dir():
         own = stems(folder / "lenses", (".json",))

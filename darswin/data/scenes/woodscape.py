@@ -127,7 +127,7 @@ def _info(file: Path) -> Classes:
 def _lenses(root: Path, pairs: Pairs, options: Options) -> PictureLenses:
     """The calibrations of the pictures, by their names, or else by their cameras'."""
     if options.lens is not None:
-        return Calibrations(options.lens, root, options.camera)
+        return Calibrations(options.lens, root, options.camera, options.coefficients)
     places = unnested(root / "calibration"), root / "calibration_data" / "calibration"
     folder = next((place for place in places if place.is_dir()), None)
     if folder is None:

@@ -1,13 +1,17 @@
 """What a text file says, in any notation: nothing in it is ever run, and no size makes it hang."""
 
+import contextlib
+import io
 import json
 import os
 import re
+import zipfile
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
+import numpy as np
 import yaml
 
 from darswin.lens.files.fields import is_number, short
@@ -20,6 +24,8 @@ MAX_TABLE = 4 << 20
 MAX_YAML = 128 << 10  # it is parsed at some 100 KB a second
 MAX_XML = 256 << 10
 MAX_DEPTH = 16
+MAX_ARRAY = 64 << 10  # of an .npz file's, which has a matrix and some coefficients
+MAX_ARRAYS = 256
 
 # The corner points of a calibration, in YAML and in XML: megabytes of numbers, and no lens's.
 _POINTS = re.compile(r"\[[\s\d.,eE+-]{2048,}\]|(?<=>)[\s\d.eE+-]{2048,}(?=<)")
@@ -39,6 +45,34 @@ def read_bytes(path: str | os.PathLike) -> bytes:
     if len(data) > MAX_BYTES:
         raise ValueError(f"it must be at most {MAX_BYTES >> 20} MiB large")
     return data
+
+
+def is_npz(data: bytes) -> bool:
+    """Whether a file is a zip archive, as `np.savez` writes."""
+    return data.startswith(b"PK\x03\x04")
+
+
+def from_npz(data: bytes) -> str:
+    """The arrays of a file of `np.savez` as JSON, but for large ones and for objects, which are no
+    lens's; nothing is unpickled.
+
+    Raises:
+        ValueError: no archive, or a damaged one.
+    """
+    arrays: dict[str, Any] = {}
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            small = [entry for entry in archive.infolist() if entry.file_size <= MAX_ARRAY]
+            for entry in small[:MAX_ARRAYS]:
+                array = io.BytesIO(archive.read(entry))
+                with contextlib.suppress(ValueError):
+                    name = entry.filename.removesuffix(".npy")
+                    arrays[name] = np.load(array, allow_pickle=False).tolist()
+        return json.dumps(arrays)
+    except Exception as error:  # zipfile, zlib and NumPy have a dozen kinds for broken files
+        raise ValueError(
+            "it must be an undamaged file of np.savez, of arrays of numbers"
+        ) from error
 
 
 def to_text(data: bytes) -> str:

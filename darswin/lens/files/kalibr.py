@@ -1,4 +1,7 @@
-"""Kalibr's camchain YAML: pinhole, omni, ds and eucm with radtan, equidistant, fov or none."""
+"""Kalibr's camchain YAML: pinhole, omni, ds and eucm with radtan, equidistant, fov or none.
+
+Also EuRoC's sensor.yaml, which calls the coefficients and their model by other names.
+"""
 
 import re
 from collections.abc import Mapping
@@ -22,6 +25,8 @@ MODELS = {
     "eucm": (("alpha", "beta"), ("none",)),
 }
 COEFFICIENTS = {"radtan": 4, "equidistant": 4, "fov": 1, "none": 0}
+NAMES = ("distortion_coeffs", "distortion_coefficients")  # Kalibr's and EuRoC's
+RADTAN = ("radial-tangential", "radial_tangential")  # EuRoC's
 LIKE = re.compile("coef|dist(?!ance)")
 
 
@@ -53,14 +58,18 @@ def cameras(file: Fields) -> Cameras:
 def _camera(fields: Fields) -> Description:
     model = _one_of(fields, "camera_model", tuple(MODELS))
     names, distortions = MODELS[model]
-    distortion = _one_of(fields, "distortion_model", distortions)
+    if fields.entries.get("distortion_model") in RADTAN and "radtan" in distortions:
+        distortion = "radtan"
+    else:
+        distortion = _one_of(fields, "distortion_model", distortions)
     *own, fu, fv, pu, pv = fields.numbers("intrinsics", (len(names) + 4,))
     for index, focal in ((-4, fu), (-3, fv)):
         if not focal > 0:
             where = fields.path(f"intrinsics[{len(names) + 4 + index}]")
             raise ValueError(f"{where} must be a focal length above 0, got {focal:g}")
     count = COEFFICIENTS[distortion]
-    coefficients = fields.numbers("distortion_coeffs", (count,)) if count else []
+    listed = next((name for name in NAMES if name in fields), NAMES[0])
+    coefficients = fields.numbers(listed, (count,)) if count else []
     fields.check_all_read(f"a {distortion} camera", like=lambda name, _: LIKE.search(name))
     size = None
     if "resolution" in fields:

@@ -16,6 +16,7 @@ from darswin.lens.files import (
     basalt,
     camodocal,
     colmap,
+    flat,
     kalibr,
     nerfstudio,
     ocamcalib,
@@ -24,7 +25,7 @@ from darswin.lens.files import (
     woodscape,
 )
 from darswin.lens.files.cameras import Cameras, Description
-from darswin.lens.files.content import Content, parse, read_bytes, to_text
+from darswin.lens.files.content import Content, from_npz, is_npz, parse, read_bytes, to_text
 from darswin.lens.files.fields import Fields, short
 
 # A curve that lands further out than this, px, is of no use: a pinhole's near 90°.
@@ -55,6 +56,7 @@ FORMATS = (
     Format("nerfstudio", nerfstudio.fits, nerfstudio.cameras, 0.5),
     Format("KITTI-360 or CamOdoCal", camodocal.fits, camodocal.cameras, 0.0),
     Format("Kalibr", kalibr.fits, kalibr.cameras, 0.0),
+    Format("intrinsics by name", flat.fits, flat.cameras, 0.0, takes_model=True),
     Format("ROS camera_info", opencv.fits_ros, opencv.cameras, 0.0, takes_model=True),
     Format("OpenCV", opencv.fits, opencv.cameras, 0.0, takes_model=True),
     Format("OCamCalib", ocamcalib.fits, ocamcalib.cameras, 0.0),
@@ -73,9 +75,10 @@ def load(
 ) -> Lens:
     """The lens of a calibration file.
 
-    Reads WoodScape, KITTI-360 and CamOdoCal, Kalibr, OpenCV (fisheye, omnidir and pinhole), ROS
-    camera_info, OCamCalib, COLMAP (cameras.txt, cameras.bin), nerfstudio, basalt, and what `save`
-    writes; the format is told from the content. The lens has our pixel origin, whatever the file's.
+    Reads WoodScape, KITTI-360 and CamOdoCal, Kalibr, EuRoC, OpenCV (fisheye, omnidir and pinhole;
+    also `np.savez` of its arrays, or fx, fy, cx, cy, k1, … by name), ROS camera_info, OCamCalib,
+    COLMAP (cameras.txt, cameras.bin), nerfstudio, basalt, and what `save` writes; the format is
+    told from the content. The lens has our pixel origin, whatever the file's.
 
     Args:
         path: the file.
@@ -161,8 +164,12 @@ class Calibration:
         name = os.fspath(path)
         try:
             data = read_bytes(path)
-            binary = colmap.is_binary(data)
-            text = colmap.from_binary(data, MAX_CAMERAS) if binary else to_text(data)
+            if is_npz(data):
+                text = from_npz(data)
+            elif colmap.is_binary(data):
+                text = colmap.from_binary(data, MAX_CAMERAS)
+            else:
+                text = to_text(data)
         except ValueError as error:
             raise ValueError(f"calibration {name}: {error}") from error
         return cls(text, name, model)

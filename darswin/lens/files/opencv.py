@@ -3,19 +3,20 @@
 YAML, XML and JSON; of one camera, or of several whose keys end with 1 and 2, or left and right.
 """
 
+import math
 import re
 from collections.abc import Mapping
 from functools import partial
-from typing import Any
+from typing import Any, Literal, get_args
 
 import numpy as np
 
 from darswin.lens.distorted import BrownConrady, KannalaBrandt, Mei
 from darswin.lens.files.cameras import Camera, Cameras, Description, describe
 from darswin.lens.files.content import Content
-from darswin.lens.files.fields import Fields, holds_numbers, listed, short
+from darswin.lens.files.fields import MAX_SIDE, Fields, holds_numbers, listed, short
 
-# Names as `_plain` leaves them.
+# Names as `plain_name` leaves them.
 MATRIX = ("k", "cameramatrix", "intrinsicmatrix", "mtx", "m")
 COEFFICIENTS = re.compile(
     r"d|coef{1,2}s?|coefficients|(camera|lens)?(dist|distort|distortions?|distorsion)"
@@ -24,25 +25,37 @@ COEFFICIENTS = re.compile(
 # What else may be some: d0, a name with a word like the above, or a number by the name of k1.
 LIKE_COEFFICIENTS = re.compile(r"^d(\d*|left|right)$|coef|(?<!un)dist(?!an[ct])")
 LIKE_A_COEFFICIENT = re.compile(r"[kps]\d+")
-SIZE = ("imagesize", "imgsize", "size", "dim", "resolution")
+# How sure they are, which OpenCV's interactive calibration writes beside them.
+DEVIATIONS = re.compile(r"std(dev|deviations?)?$")
+SIZE = ("imagesize", "imgsize", "size", "dim", "resolution", "cameraresolution")
 WIDTH, HEIGHT = ("imagewidth", "width", "w"), ("imageheight", "height", "h")
 SAYS_FISHEYE = ("fisheyemodel", "fisheye", "isfisheye")
 SAYS_MODEL = ("distortionmodel", "model", "cameramodel", "modeltype", "calibrationmodel")
 SUFFIXES = ("0", "1", "2", "3", "left", "right")
 
-MODELS = ("fisheye", "pinhole", "omnidir")
+Coefficients = Literal["fisheye", "pinhole", "omnidir"]
+MODELS: tuple[Coefficients, ...] = get_args(Coefficients)
 WORDS = {
     "fisheye": ("fisheye", "equidistant", "equi", "kannalabrandt", "kannalabrandt4", "kb", "kb4",
                 "opencvfisheye"),
-    "pinhole": ("pinhole", "plumbbob", "rationalpolynomial", "radtan", "perspective",
-                "brownconrady", "thinprism"),
+    "pinhole": ("pinhole", "plumbbob", "rationalpolynomial", "radtan", "radialtangential",
+                "perspective", "brownconrady", "thinprism"),
     "omnidir": ("omnidir", "omni", "mei", "omnidirectional"),
 }  # fmt: skip
 # How many coefficients there may be.
-COUNTS = {"fisheye": (4,), "pinhole": (4, 5, 8, 12, 14), "omnidir": (4,)}
+COUNTS: dict[str, tuple[int, ...]] = {
+    "fisheye": (4,),
+    "pinhole": (4, 5, 8, 12, 14),
+    "omnidir": (4,),
+}
+
+Pair = tuple[float, float]
+Size = tuple[int, int] | None
+Plane = tuple[Pair, Pair, Size]
 
 
-def _plain(name: str) -> str:
+def plain_name(name: str) -> str:
+    """A name without what writers of files differ in."""
     return name.lower().replace("_", "").replace("-", "").replace(" ", "")
 
 
@@ -50,7 +63,7 @@ def fits(content: Content) -> bool:
     """Whether a file's content is OpenCV's or ROS's: it has a camera matrix."""
     if not isinstance(content, Mapping):
         return False
-    names = {_plain(name) for name in content}
+    names = {plain_name(name) for name in content}
     return any(m + suffix in names for m in MATRIX for suffix in ("", *SUFFIXES))
 
 
@@ -65,7 +78,7 @@ def cameras(file: Fields, hint: str | None = None) -> Cameras:
     Args:
         hint: one of `MODELS`, which rules where the file does not say it or is wrong.
     """
-    reader = _Reader(file, hint)
+    reader = Reader(file, hint)
     suffixes = [suffix for suffix in SUFFIXES if reader.find(MATRIX, suffix) is not None]
     if reader.find(MATRIX) is not None:
         suffixes = [""]
@@ -105,11 +118,13 @@ def write(camera: Camera, suffix: str) -> str | None:
     return storage.releaseAndGetString()
 
 
-class _Reader:
+class Reader:
+    """A file whose entries go by several names."""
+
     def __init__(self, file: Fields, hint: str | None):
         self.file, self.hint = file, hint
         # Of two names that are one here, the first counts.
-        self.names = {_plain(name): name for name in reversed(list(file.entries))}
+        self.names = {plain_name(name): name for name in reversed(list(file.entries))}
 
     def find(self, names: tuple[str, ...], suffix: str = "") -> str | None:
         """The file's name of an entry that goes by several."""
@@ -118,7 +133,7 @@ class _Reader:
     def find_coefficients(self, suffix: str) -> str | None:
         found = [
             name for name in self.file.entries
-            if (plain := _plain(name)).endswith(suffix)
+            if (plain := plain_name(name)).endswith(suffix)
             and COEFFICIENTS.fullmatch(plain.removesuffix(suffix))
         ]  # fmt: skip
         if len(found) > 1:
@@ -130,8 +145,9 @@ class _Reader:
         read = [self.find_coefficients(suffix) for suffix in suffixes]
         left = [
             name for name, value in self.file.entries.items()
-            if name not in read and holds_numbers(value) and (
-                LIKE_COEFFICIENTS.search(plain := _plain(name)) or (
+            if name not in read and holds_numbers(value)
+            and not DEVIATIONS.search(plain := plain_name(name)) and (
+                LIKE_COEFFICIENTS.search(plain) or (
                     LIKE_A_COEFFICIENT.fullmatch(plain) and not isinstance(value, (list, Mapping))
                 )
             )
@@ -171,7 +187,9 @@ class _Reader:
             )
         if name is not None:
             self.check_shape(name, len(coefficients))
-        plane = ((fx, fy), (cx, cy), self.image_size(suffix))
+        plane: Plane = (fx, fy), (cx, cy), self.image_size(suffix)
+        if fits_ros(self.file.entries):
+            plane, skew = self.in_message(*plane), skew / self.binning()[0]
         if kind == "fisheye":
             return describe(KannalaBrandt, *plane, {"radial": coefficients}, skew)
         terms = {"radial": coefficients[:2] + coefficients[4:5], "tangential": coefficients[2:4]}
@@ -188,20 +206,22 @@ class _Reader:
         terms |= {"denominator": coefficients[5:8], "prism": coefficients[8:12]}
         return describe(BrownConrady, *plane, terms, skew)
 
-    def kind(self, name: str | None, coefficients: list[float], xi: str | None) -> str:
+    def kind(
+        self, name: str | None, coefficients: list[float], xi: str | None, only: str | None = None
+    ) -> str:
         """Which of `MODELS`: the hint, what the file says, or what only one of them has."""
         if self.hint is not None:
             return self.hint
         flag = self.find(SAYS_FISHEYE)
         if flag is not None:
             value = self.file.entries[flag]
-            word = _plain(str(value)) if isinstance(value, (str, int)) else ""
+            word = plain_name(str(value)) if isinstance(value, (str, int)) else ""
             if word not in ("0", "1", "true", "false"):
                 raise ValueError(f"{flag} must be 0 or 1, got {short(value)}")
             return "fisheye" if word in ("1", "true") else "pinhole"
         said = self.find(SAYS_MODEL)
         if said is not None:
-            word = _plain(self.file.text(said))
+            word = plain_name(self.file.text(said))
             found = next((kind for kind, words in WORDS.items() if word in words), None)
             if found is None:
                 known = sorted(word for words in WORDS.values() for word in words)
@@ -212,9 +232,9 @@ class _Reader:
             return found
         if xi is not None:
             return "omnidir"
-        if len(coefficients) > 4:
-            return "pinhole"
-        what = f"the 4 coefficients of {name}" if coefficients else "a camera without coefficients"
+        if only is not None or len(coefficients) > 4:
+            return only or "pinhole"
+        what = f"the coefficients of {name}" if coefficients else "a camera without coefficients"
         raise ValueError(
             f"{what} may be cv2.fisheye's (k1 to k4) or a pinhole's (k1, k2, p1, p2), and "
             'the file does not say which: give model="fisheye" or model="pinhole", or write '
@@ -245,6 +265,35 @@ class _Reader:
             if rows * columns != count:
                 raise ValueError(f"{name}.data must be {rows:g} × {columns:g} numbers, got {count}")
 
+    def binning(self) -> tuple[int, int]:
+        """How many pixels across and down are one in a ROS message's image."""
+        across, down = (_count(self.file, f"binning_{axis}") for axis in "xy")
+        return max(across, 1), max(down, 1)  # 0 means 1
+
+    def in_message(self, focal: Pair, center: Pair, size: Size) -> Plane:
+        """Where a ROS message's image has the camera: its matrix is of the whole sensor, of which
+        the image shows the region `roi`, with `binning_x` by `binning_y` pixels as one."""
+        roi = self.file.section("roi") if "roi" in self.file else Fields({})
+        left, top, width, height = (
+            _count(roi, name) for name in ("x_offset", "y_offset", "width", "height")
+        )
+        across, down = self.binning()
+        if width or height or left or top:
+            rows, columns = size or (math.inf, math.inf)
+            if not (0 < width <= columns - left and 0 < height <= rows - top):
+                raise ValueError(
+                    "roi must be a region of the image of 1 pixel or more, or all 0, got "
+                    f"{width}×{height} px at ({left}, {top})"
+                )
+            size = height, width
+        if size is not None:
+            size = size[0] // down, size[1] // across
+            if 0 in size:
+                raise ValueError(f"binning must leave a pixel, got {across} by {down} as one")
+        x, y = center[0] - left, center[1] - top
+        center = (x + 0.5) / across - 0.5, (y + 0.5) / down - 0.5
+        return (focal[0] / across, focal[1] / down), center, size
+
     def image_size(self, suffix: str) -> tuple[int, int] | None:
         for end in (suffix, ""):
             pair = self.find(SIZE, end)
@@ -256,6 +305,15 @@ class _Reader:
                 return (self.file.side(down or "image_height"),
                         self.file.side(across or "image_width"))  # fmt: skip
         return None
+
+
+def _count(fields: Fields, name: str) -> int:
+    """A number of pixels, 0 where it is missing."""
+    number = fields.number(name, 0.0)
+    if not (0 <= number <= MAX_SIDE and number.is_integer()):
+        expected = f"a whole number of pixels, 0 to {MAX_SIDE}"
+        raise ValueError(f"{fields.path(name)} must be {expected}, got {number:g}")
+    return int(number)
 
 
 def _flattened(rows: list[Any]) -> list[Any]:
