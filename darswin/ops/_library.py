@@ -141,28 +141,34 @@ def refuse_other_derivatives(operator: object, tensors: Iterable[object]) -> Non
     """NotImplementedError where forward-mode AD or torch.func differentiates one of the tensors.
 
     The first would come to zeros without a word, the second to an error about autograd's insides.
-    A graph that is being compiled does not look.
+    While a graph is compiled only forward-mode AD is looked for: torch.func.grad fails by itself.
     """
-    if torch.compiler.is_compiling():
-        return
     forward = forward_ad._current_level >= 0
-    functional = torch._C._functorch.peek_interpreter_stack() is not None
+    functional = (
+        not torch.compiler.is_compiling()
+        and torch._C._functorch.peek_interpreter_stack() is not None
+    )
     if not forward and not functional:
         return
     for tensor in tensors:
         if not isinstance(tensor, Tensor):
             continue
-        tracked, tensor = _unwrapped(tensor)
+        tracked, tensor = _unwrapped(tensor) if functional else (False, tensor)
         if tracked:
             mode = "torch.func's derivatives"
         elif forward and forward_ad.unpack_dual(tensor).tangent is not None:
             mode = "forward-mode derivatives"
         else:
             continue
-        raise NotImplementedError(
+        message = (
             f"{operator} has no {mode}, only backward(); run it within "
             "darswin.ops.use_reference() for them"
         )
+        if torch.compiler.is_dynamo_compiling():
+            # After an exception Dynamo would compile the parts of the function without tangents.
+            with torch._dynamo.error_on_graph_break(True):
+                torch._dynamo.graph_break(message)
+        raise NotImplementedError(message)
 
 
 def _unwrapped(tensor: Tensor) -> tuple[bool, Tensor]:

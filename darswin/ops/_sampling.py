@@ -108,6 +108,12 @@ def checked_sampling(
     batch, channels = image.shape[:2]
     check_shape("radii", radii, "(B or 1, R·S_r) = ({} or 1, any)", (batch, None), (1, None))
     check_shape("azimuths", azimuths, "(A·S_φ,)", (None,))
+    if azimuths.requires_grad and torch.is_grad_enabled() and not _library.reference_in_use():
+        raise NotImplementedError(
+            "azimuths require a gradient, but only the reference has one: turn the grid with affine "
+            "or move its points with offsets, which have gradients, or run within "
+            "darswin.ops.use_reference()"
+        )
     check_shape("center", center, "(B or 1, 2) = ({} or 1, 2)", (batch, 2), (1, 2))
     if affine is not None:
         form = "(B or 1, 2, 2) = ({} or 1, 2, 2)"

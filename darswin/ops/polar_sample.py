@@ -49,7 +49,8 @@ def polar_sample(
             float64, bfloat16, or uint8 camera frames.
         radii: (B or 1, R·S_r) px. Like azimuths, center, affine and offsets float64 if the image
             is, else float32.
-        azimuths: (A·S_φ,) rad. They get no gradient.
+        azimuths: (A·S_φ,) rad. They have a gradient only within `use_reference()`; use affine to
+            turn the grid, or offsets to move its points, where a gradient is wanted.
         center: (B or 1, 2) px, x then y.
         affine: (B or 1, 2, 2), of rows x and y: aspect ratio and skew. None is the identity.
         offsets: (B or 1, 2, R·S_r, A·S_φ) px, x then y: what else moves the points of a
@@ -77,8 +78,8 @@ def polar_sample(
         float32. bfloat16 is computed in float32 and rounded once.
 
     Gradients go to image (unless uint8), radii, center, affine and offsets; results and gradients
-    do not depend on the number of threads. There are no others than those of backward(); in eager
-    mode, asking for others is an error.
+    do not depend on the number of threads. There are no others than those of backward(); asking for
+    others is an error.
 
     A large fresh output costs its memory's first touch, about as much time as sampling. Where the
     linear layer of a patch embedding comes next, `polar_embed` never writes the samples at all.
@@ -87,7 +88,8 @@ def polar_sample(
         TypeError: a tensor of another dtype, or an argument of another type.
         ValueError: a shape, device or range that does not fit; without channels_last, a uint8 image
             of which both axes can be that of the channels, or neither.
-        NotImplementedError: forward-mode derivatives, those of torch.func, and second ones.
+        NotImplementedError: forward-mode derivatives, those of torch.func, second ones, and azimuths
+            that require a gradient.
 
     Source: DarSwin, ICCV 2023, sec. 4.3.
     """

@@ -1,5 +1,6 @@
 """What the operators share: which of two runs, autocast, and the derivatives that there are not."""
 
+import contextlib
 import functools
 import inspect
 from pathlib import Path
@@ -7,11 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from helpers import as_on_devices
 from torch.autograd import forward_ad
 from torch.func import vmap
 
 from darswin import ops
+from darswin.layers.grid import PolarGrid
 from darswin.layers.sampling import PolarSample
+from darswin.lens import Equidistant
 from darswin.ops import (
     polar_embed,
     polar_sample,
@@ -106,6 +110,120 @@ def test_derivatives_that_there_are_not_are_refused(name, kind):
     run, x = CALLS[name]
     with pytest.raises(NotImplementedError, match=rf"{name} has no .*use_reference"):
         DERIVATIVES[kind](run, x)
+
+
+@pytest.mark.unsanitized
+@pytest.mark.parametrize("fullgraph", [False, True])
+@pytest.mark.parametrize("kind", ["forward mode", "jvp"])
+@operators
+def test_a_compiled_function_refuses_forward_mode(name, kind, fullgraph):
+    torch._dynamo.reset()
+    run, x = CALLS[name]
+    compiled = torch.compile(
+        lambda x: DERIVATIVES[kind](lambda x: run(x * 2), x), fullgraph=fullgraph, backend="eager"
+    )
+    with pytest.raises(RuntimeError, match=rf"{name} has no .*use_reference"):
+        compiled(x)
+    assert forward_ad._current_level == -1
+
+
+@pytest.mark.unsanitized
+@pytest.mark.parametrize("kind", ["grad", "vjp", "grad of vmap"])
+@operators
+def test_a_compiled_function_fails_with_other_derivatives(name, kind):
+    torch._dynamo.reset()
+    run, x = CALLS[name]
+    with pytest.raises(RuntimeError):
+        torch.compile(lambda x: DERIVATIVES[kind](run, x), backend="eager")(x)
+
+
+@pytest.mark.unsanitized
+@pytest.mark.parametrize("kind", ["forward mode", "jvp"])
+@operators
+def test_a_compiled_function_may_differentiate_other_tensors(name, kind):
+    torch._dynamo.reset()
+    run, x = CALLS[name]
+    compiled = torch.compile(
+        lambda x, scale: DERIVATIVES[kind](lambda scale: run(x) * scale, scale),
+        fullgraph=True, backend="eager",
+    )  # fmt: skip
+    torch.testing.assert_close(compiled(x, torch.ones(())), run(x))
+
+
+@pytest.mark.unsanitized
+@operators
+def test_a_compiled_function_may_map_over_the_operator(name):
+    torch._dynamo.reset()
+    run, x = CALLS[name]
+    images = torch.stack((x, 2 * x))
+    compiled = torch.compile(vmap(run), fullgraph=True, backend="eager")
+    torch.testing.assert_close(compiled(images), torch.stack([run(image) for image in images]))
+
+
+@pytest.mark.unsanitized
+@operators
+def test_one_graph_for_inference_and_one_for_training(name):
+    from torch._dynamo.testing import CompileCounter
+
+    torch._dynamo.reset()
+    counter = CompileCounter()
+    run, x = CALLS[name]
+    compiled = torch.compile(run, fullgraph=True, backend=counter)
+    for inputs in (x, x.clone().requires_grad_()):
+        for _ in range(3):
+            compiled(inputs)
+    assert counter.frame_count == 2
+
+
+AZIMUTHS = {
+    "polar_sample": lambda azimuths: polar_sample(
+        image, radii, azimuths, center, samples=(2, 2), jitter=0.5, seed=3
+    ),
+    "polar_embed": lambda azimuths: polar_embed(
+        image, radii, azimuths, center, weight, samples=(2, 2)
+    ),
+    "PolarSample": lambda azimuths: PolarSample(
+        2, 4, (2, 2), grid=lambda *_, **__: PolarGrid(radii, azimuths, center, radii)
+    )(image, Equidistant.from_fov(2.0, 4.0)),
+}
+takes_azimuths = pytest.mark.parametrize("name", AZIMUTHS)
+
+
+@pytest.mark.parametrize("on", [contextlib.nullcontext, as_on_devices], ids=["CPU", "devices"])
+@takes_azimuths
+def test_azimuths_that_require_a_gradient_are_refused(name, on):
+    run, wanted = AZIMUTHS[name], azimuths.clone().requires_grad_()
+    with on():
+        with pytest.raises(NotImplementedError, match="azimuths require a gradient"):
+            run(wanted)
+        with torch.no_grad():
+            assert torch.equal(run(wanted), run(azimuths))
+
+
+@pytest.mark.unsanitized
+@takes_azimuths
+def test_a_compiled_function_refuses_azimuths_that_require_a_gradient(name):
+    torch._dynamo.reset()
+    compiled = torch.compile(AZIMUTHS[name], backend="eager")
+    with pytest.raises(NotImplementedError, match="azimuths require a gradient"):
+        compiled(azimuths.clone().requires_grad_())
+
+
+@pytest.mark.parametrize("jitter", [0.0, 0.5])
+@pytest.mark.parametrize("operator", [polar_sample, polar_embed])
+def test_the_reference_differentiates_azimuths(operator, jitter):
+    images, distances, middle, rows = (
+        tensor.double() for tensor in (image, radii, center, weight)
+    )
+    layer = (rows,) if operator is polar_embed else ()
+
+    def run(angles):
+        return operator(
+            images, distances, angles, middle, *layer, samples=(2, 2), jitter=jitter, seed=3
+        )
+
+    with use_reference():
+        assert torch.autograd.gradcheck(run, azimuths.double().requires_grad_())
 
 
 @operators

@@ -113,6 +113,23 @@ def test_opcheck(layout, points):
         torch.library.opcheck(torch.ops.darswin.polar_to_image, arguments)
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.bfloat16])
+@pytest.mark.parametrize(
+    "place",
+    [(math.nan, 1e30), (1e30, math.nan), (math.nan, -1e30), (math.inf, -math.inf), (-math.inf, 1)],
+    ids=str,
+)
+def test_places_that_are_no_numbers_are_zero(place, dtype):
+    # Their azimuths may come out infinite, which no integer holds: `make test-asan` would tell.
+    real = torch.promote_types(dtype, torch.float32)
+    points = torch.tensor(place, dtype=real).expand(1, 1, 35, 2).clone().requires_grad_()
+    radii = torch.tensor([[1.0, 2.0]], dtype=real)
+    x = torch.ones(1, 2, 4, 3, dtype=dtype, requires_grad=True)
+    out = polar_to_image(x, radii, None, (1, 35), points=points)
+    assert not out.any()
+    assert not any(grad.any() for grad in torch.autograd.grad(out.sum(), (x, points)))
+
+
 def test_compiles_for_any_batch():
     torch._dynamo.reset()
     compiled = torch.compile(back(), fullgraph=True, dynamic=True, backend="aot_eager")
