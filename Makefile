@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/installed
 
-.PHONY: help build demo test test-triton test-gpu test-lowest test-isa test-asan fuzz kills lint format bench bench-gpu study study-int8 learned-lens worlds study-dense tables docs dist wheels repair published-wheels test-torch aarch64 clean
+.PHONY: help build demo test test-triton test-gpu test-lowest test-isa test-asan fuzz kills mutants lint format bench bench-gpu study study-int8 learned-lens worlds study-dense tables docs dist wheels repair published-wheels test-torch aarch64 clean
 
 help:  ## this list
 	@grep -E '^[a-z0-9-]+:.*##' Makefile | sed -E 's/:.*## /\t/' | expand -t 18
@@ -88,6 +88,9 @@ fuzz: build  ## random and hostile calls of the operators, 100,000 wrong calibra
 
 kills: build  ## kill runs at random, and see that they end as if nothing had been (10 minutes)
 	$(BIN)/python tests/train/kills.py
+
+mutants: build  ## change one thing in the code at a time and count what the tests notice (hours); goes on where it was stopped
+	PATH=$(CURDIR)/$(BIN):$$PATH $(BIN)/python tests/mutants.py
 
 lint: $(STAMP)  ## ruff, mypy and clang-format, without changing anything
 	$(BIN)/ruff check .

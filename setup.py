@@ -32,7 +32,8 @@ class CMakeBuild(build_ext):
              f"-DCMAKE_MAKE_PROGRAM={shutil.which('ninja')}",
              f"-DTORCH_DIR={Path(torch.origin).parent}",
              f"-DDARSWIN_OUTPUT_DIR={output}",
-             f"-DDARSWIN_SANITIZE={sanitize}"]
+             f"-DDARSWIN_SANITIZE={sanitize}",
+             f"-DDARSWIN_ONLY_TIER={os.environ.get('DARSWIN_ONLY_TIER', '')}"]
         )  # fmt: skip
         subprocess.check_call(["cmake", "--build", build])
 

@@ -16,20 +16,16 @@ struct TierFacts {
 };
 
 TierFacts facts(Tier tier) {
-  switch (tier) {
-    case Tier::generic:
-      return {"generic", true};
 #if defined(__x86_64__)
-    case Tier::avx2:
-      return {"avx2", __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma")};
-    case Tier::avx512:
-      return {"avx512",
-              __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma") &&
-                  __builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512bw") &&
-                  __builtin_cpu_supports("avx512vl") && __builtin_cpu_supports("avx512dq")};
-#endif
+  const bool avx2 = __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma");
+  if (tier == Tier::avx2) return {"avx2", avx2};
+  if (tier == Tier::avx512) {
+    return {"avx512", avx2 && __builtin_cpu_supports("avx512f") &&
+                          __builtin_cpu_supports("avx512bw") &&
+                          __builtin_cpu_supports("avx512vl") && __builtin_cpu_supports("avx512dq")};
   }
-  __builtin_unreachable();
+#endif
+  return {"generic", true};
 }
 
 std::optional<Tier> find(const char* name) {

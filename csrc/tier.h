@@ -9,8 +9,9 @@
 
 namespace darswin {
 
-// From low to high. CMakeLists.txt lists them: generic and, on x86, avx2 and avx512.
-enum class Tier { DARSWIN_TIERS };
+// From low to high. A build has the first few: those that CMakeLists.txt lists in DARSWIN_TIERS,
+// which is generic alone where the CPU is not an x86.
+enum class Tier { generic, avx2, avx512 };
 
 // The kernels of one operator on one tier. `Table` is a struct of function pointers, which the
 // operator's header declares; kernels/OPERATOR.cpp defines `table`.
