@@ -9,6 +9,7 @@ from torch.utils.data._utils.collate import default_collate_fn_map
 from darswin.lens.base import Lens
 from darswin.lens.batch import Number
 from darswin.lens.inverse import inverse
+from darswin.ops.waiting import readable
 
 
 class Tabulated(Lens):
@@ -149,10 +150,11 @@ def as_curves(lens: Lens, count: int = 512) -> Tabulated:
     In float64, 512 angles are within 1e-7 of `r_max` of any formula here up to 0.99 of its
     `theta_limit`; in float32, within rounding. Two things are lost: the kinks of a
     `Tabulated` lens without slopes (to some 1e-4 of `r_max`), and an r(0) of `OCamInverse` that is
-    not 0.
+    not quite 0, as of polynomials that were fitted.
 
     Raises:
-        ValueError: a lens with tangential or thin-prism terms, which no curve has.
+        ValueError: a lens with tangential or thin-prism terms, or with an r(0) of more than
+            1/1000 of `r_max` or 1 px, which no curve has.
     """
     if not lens.is_radial:
         raise ValueError(
@@ -161,10 +163,25 @@ def as_curves(lens: Lens, count: int = 512) -> Tabulated:
         )
     angles = lens.theta_max[:, None] * _fractions(lens, count)
     radii, slopes = lens.project(angles), lens._slope(angles)
+    _check_start(radii)
     radii = torch.cat((torch.zeros_like(radii[:, :1]), radii[:, 1:]), 1)
     slopes = torch.minimum(slopes.clamp(min=0), _steepest(angles, radii))
     tensors = {name: getattr(lens, name) for name in lens.common}
     return Tabulated._from_tensors(dict(angles=angles, radii=radii, slopes=slopes) | tensors)
+
+
+def _check_start(radii: Tensor) -> None:
+    """That tables (N, K) that begin at 0 stay what they are, and rise."""
+    if not readable(radii):
+        return
+    first, second, last = (radii.detach()[:, k] for k in (0, 1, -1))
+    most = 1e-3 * last.clamp(max=1000)
+    off = (first.abs() > most) | ~(second > 0)
+    if bool(off.any()):
+        raise ValueError(
+            f"a lens is a curve only if r(0) is 0, to {most[off][0].item():.2g} px, and r rises "
+            f"from there; got r(0) = {first[off][0].item():.4g} px"
+        )
 
 
 @torch.no_grad()
@@ -193,7 +210,7 @@ def cat(lenses: Sequence[Lens]) -> Lens:
 
     Raises:
         ValueError: no lens, principal points or image sizes for only some, or several models of
-            which one has tangential or thin-prism terms.
+            which one is no curve.
     """
     lenses = list(lenses)
     if not lenses:

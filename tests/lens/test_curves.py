@@ -89,6 +89,38 @@ def test_a_curve_is_its_lens_to_1e_7_of_the_largest_radius(name):
         assert error.max() < (1e-3 if name == "Tabulated" else 1e-5)
 
 
+@pytest.mark.parametrize("name", MODELS)
+@pytest.mark.parametrize("other", [Equidistant(double(300.0), 2.0), Perspective(double(300.0))])
+def test_lenses_that_are_joined_project_as_before(name, other):
+    for seed in range(3):
+        lens = example(name, torch.Generator().manual_seed(seed), (100, 600))
+        joined = cat([lens, other])
+        for before, after in zip((*lens, other), joined, strict=True):
+            theta = before.theta_max * torch.linspace(0, 1, 2001, dtype=f64)
+            radius = before.project(theta)
+            inside = radius < 1000
+            error = (after.project(theta) - radius)[inside].abs().max()
+            assert error < {"Tabulated": 0.1, "OCamInverse": 0.01}.get(name, 1e-3)
+            assert after.theta_max == before.theta_max
+
+
+@pytest.mark.parametrize("shift", [-30.0, -1.5, 2.0, 30.0])
+def test_a_lens_that_begins_beside_the_axis_is_no_curve(shift):
+    lens = CALIBRATIONS["OCam kodak"][0]
+    lens = lens.with_theta_max(1.9)
+    moved = lens.replace(coefficients=lens.coefficients + double(shift, *[0] * 12))
+    other = Equidistant(double(300.0))
+    with pytest.raises(ValueError, match=r"only if r\(0\) is 0, .* got r\(0\) = -?[\d.]+ px"):
+        cat([moved, other])
+    with pytest.raises(ValueError, match="only if"):
+        cat([other, moved.with_theta_max(1.7).resized(0.01)])
+    theta = 0.9 * moved.theta_max * torch.linspace(0, 1, 50, dtype=f64)
+    same = cat([moved, moved])
+    assert torch.equal(same.project(theta[None])[1], moved.project(theta))
+    # What a fitted polynomial leaves does not count.
+    assert isinstance(cat([lens, other]), Tabulated)
+
+
 def test_mixed_ideal_lenses_in_one_batch_are_exact_to_1e_5_px():
     ends = {
         Perspective: 89.0,
