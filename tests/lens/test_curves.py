@@ -106,7 +106,7 @@ def test_lenses_that_are_joined_project_as_before(name, other):
 
 @pytest.mark.parametrize("shift", [-30.0, -1.5, 2.0, 30.0])
 def test_a_lens_that_begins_beside_the_axis_is_no_curve(shift):
-    lens = CALIBRATIONS["OCam kodak"][0]
+    lens = CALIBRATIONS["OCam"][0]
     lens = lens.with_theta_max(1.9)
     moved = lens.replace(coefficients=lens.coefficients + double(shift, *[0] * 12))
     other = Equidistant(double(300.0))

@@ -131,6 +131,7 @@ class Reader:
         return next((self.names[n + suffix] for n in names if n + suffix in self.names), None)
 
     def find_coefficients(self, suffix: str) -> str | None:
+        """The file's name of a camera's coefficients, if it has any; ValueError for several."""
         found = [
             name for name in self.file.entries
             if (plain := plain_name(name)).endswith(suffix)
@@ -159,6 +160,7 @@ class Reader:
             )
 
     def camera(self, suffix: str) -> Description:
+        """The camera whose entries end with `suffix`."""
         matrices = [self.names[n + suffix] for n in MATRIX if n + suffix in self.names]
         matrix = matrices[0]
         if any(self.matrix(other, (9,)) != self.matrix(matrix, (9,)) for other in matrices[1:]):
@@ -295,6 +297,7 @@ class Reader:
         return (focal[0] / across, focal[1] / down), center, size
 
     def image_size(self, suffix: str) -> tuple[int, int] | None:
+        """(H, W) of a camera's images, or of all cameras', if the file says it."""
         for end in (suffix, ""):
             pair = self.find(SIZE, end)
             if pair is not None:
