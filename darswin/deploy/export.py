@@ -102,7 +102,8 @@ def export_onnx(
         path: of the file; it holds the weights too.
         vnni_only: of a quantized model, the file is faster on x86 CPUs with VNNI and wrong on x86
             CPUs without it. By default it is right on every CPU. Other models stay the same.
-        Others, and errors: as `export_program`.
+
+    The other arguments and the errors are those of `export_program`.
 
     Raises:
         ModuleNotFoundError: onnx or onnxscript is not installed.

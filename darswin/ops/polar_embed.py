@@ -38,8 +38,8 @@ def polar_embed(
     The samples are never written to memory; backward recomputes them.
 
     Args:
-        image, radii, azimuths, center, affine, offsets, samples, jitter, seed, mean, std,
-            channels_last: as `polar_sample`.
+        image, radii, azimuths, center, affine, offsets, samples: as `polar_sample`.
+        jitter, seed, mean, std, channels_last: as `polar_sample`.
         weight: (D, S_r·S_φ·C), float64 if the image is, else float32 or bfloat16.
         bias: (D,) or None, as weight.
 

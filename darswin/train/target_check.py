@@ -17,7 +17,8 @@ class Checked(Protocol):
     trainer: Trainer
 
     @property
-    def global_rank(self) -> int: ...
+    def global_rank(self) -> int:
+        """The number of this process in the run."""
 
     def _known(self, target: Tensor) -> Tensor: ...
 
