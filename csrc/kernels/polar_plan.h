@@ -117,9 +117,8 @@ class Planner {
     // Infinity less itself is NaN, which nothing equals.
     const I known = (x - x == 0) & (y - y == 0) & (r <= limit) & (r < infinity);
     const V t = (r - load<V>(plan.from + k)) / load<V>(plan.span + k);
-    // The azimuth of a pixel that is not known may be infinite or NaN, which no integer stands for.
-    const V turns = arc_tangent(y, x) * static_cast<Real>(a.sectors / (2 * kPi)) - Real{0.5};
-    const V column = select(known, turns, V{});
+    const V column =
+        arc_tangent(y, x, known) * static_cast<Real>(a.sectors / (2 * kPi)) - Real{0.5};
     const auto sectors = static_cast<Index>(a.sectors);
     const I none{};
     const auto side = [&](int ring, const Index* of, V at, V weight, Real* share_to) {

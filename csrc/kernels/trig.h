@@ -58,12 +58,14 @@ inline void tiny_sin_cos(Doubles t, Doubles* sin, Doubles* cos) {
   *cos = 1 + z * (-1 / 2.0 + z * (1 / 24.0));
 }
 
-// The azimuth of (x, y), in [-pi, pi], to two units in the last place; 0 at (0, 0).
-inline Floats arc_tangent(Floats y, Floats x) {
+// The azimuth of (x, y), in [-pi, pi], to two units in the last place; 0 at (0, 0). Where a lane is
+// not `known`, its x and y may be anything, and the azimuth is some number.
+template <typename Mask>
+inline Floats arc_tangent(Floats y, Floats x, Mask known) {
   const Floats across = x < 0 ? -x : x, down = y < 0 ? -y : y;
   const auto steep = down > across;
   const Floats most = steep ? down : across, least = steep ? across : down;
-  const Floats ratio = least / (most > 0 ? most : splat<Floats>(1.0f));
+  const Floats ratio = select(known & (most > 0), least / most, Floats{});
   // atan(q) / q as a polynomial of q^2, at the nodes of Chebyshev's on [0, 1].
   constexpr float terms[] = {1.0487650e-2f, -3.0351866e-2f, 5.7089556e-2f, -8.3497249e-2f,
                              1.0932341e-1f, -1.4260016e-1f, 1.9998075e-1f, -3.3333278e-1f};
@@ -76,9 +78,10 @@ inline Floats arc_tangent(Floats y, Floats x) {
   angle = x < 0 ? static_cast<float>(kPi) - angle : angle;
   return y < 0 ? -angle : angle;
 }
-inline Doubles arc_tangent(Doubles y, Doubles x) {
+template <typename Mask>
+inline Doubles arc_tangent(Doubles y, Doubles x, Mask known) {
   for (int lane = 0; lane < kDoubles; ++lane) y[lane] = __builtin_atan2(y[lane], x[lane]);
-  return y;
+  return select(known, y, Doubles{});
 }
 
 }  // namespace

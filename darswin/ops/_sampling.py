@@ -110,7 +110,7 @@ def checked_sampling(
     check_shape("azimuths", azimuths, "(A·S_φ,)", (None,))
     if azimuths.requires_grad and torch.is_grad_enabled() and not _library.reference_in_use():
         raise NotImplementedError(
-            "azimuths require a gradient, but only the reference has one: turn the grid with affine "
+            "azimuths require a gradient, which only the reference has: turn the grid with affine "
             "or move its points with offsets, which have gradients, or run within "
             "darswin.ops.use_reference()"
         )

@@ -88,8 +88,8 @@ def polar_sample(
         TypeError: a tensor of another dtype, or an argument of another type.
         ValueError: a shape, device or range that does not fit; without channels_last, a uint8 image
             of which both axes can be that of the channels, or neither.
-        NotImplementedError: forward-mode derivatives, those of torch.func, second ones, and azimuths
-            that require a gradient.
+        NotImplementedError: forward-mode derivatives, those of torch.func, second ones, and
+            azimuths that require a gradient.
 
     Source: DarSwin, ICCV 2023, sec. 4.3.
     """

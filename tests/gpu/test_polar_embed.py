@@ -36,7 +36,19 @@ def test_accuracy_rule(jitter, bias, on):
         return *make_inputs(batch=2), *layer[: 1 + bias]
 
     run = on(embedder(8, (2, 4), **options))
-    assert_accurate(run, make, smooth_tokens(8, (2, 4), **options), draws=1)
+    assert_accurate(run, make, smooth_tokens(8, (2, 4), **options))
+
+
+def test_a_token_without_a_gradient_leaves_the_images_gradient_right(on):
+    def other_tokens(*inputs):
+        mask = smooth_tokens(8, (2, 2))(*inputs)
+        mask.view(2, -1)[:, :2] = 0  # the first ones of both images
+        return mask
+
+    def make():
+        return *make_inputs(), torch.randn(7, 12)
+
+    assert_accurate(on(embedder(8, (2, 2))), make, other_tokens)
 
 
 def test_only_the_layer_is_learned(on):

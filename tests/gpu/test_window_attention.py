@@ -54,9 +54,15 @@ def test_accuracy_rule(case, on):
 def test_accuracy_rule_at_extreme_values(size, on):
     def make():
         qkv, bias = make_inputs("DarSwin-A, stage 3")
+        if size > 1:
+            # Pairs of keys between which a query's logits differ by about 1. Else almost every
+            # probability is exactly 0 or 1, and the largest error is that of the few queries whose
+            # two largest logits happen to be close: it depends on the draw and on the CPU.
+            keys = qkv[:, ::2, :, 1]
+            qkv[:, 1::2, :, 1] = keys + torch.randn_like(keys) / size**2
         return qkv * size, bias
 
-    assert_accurate(on(attention("DarSwin-A, stage 3")), make, draws=1)
+    assert_accurate(on(attention("DarSwin-A, stage 3")), make)
 
 
 @pytest.fixture

@@ -212,9 +212,7 @@ def test_a_compiled_function_refuses_azimuths_that_require_a_gradient(name):
 @pytest.mark.parametrize("jitter", [0.0, 0.5])
 @pytest.mark.parametrize("operator", [polar_sample, polar_embed])
 def test_the_reference_differentiates_azimuths(operator, jitter):
-    images, distances, middle, rows = (
-        tensor.double() for tensor in (image, radii, center, weight)
-    )
+    images, distances, middle, rows = (tensor.double() for tensor in (image, radii, center, weight))
     layer = (rows,) if operator is polar_embed else ()
 
     def run(angles):

@@ -222,15 +222,19 @@ def backward(
     lens_grad: bool,
     offsets_grad: bool,
 ) -> tuple[Tensor, ...]:
-    """The gradients of image, radii, center, affine and offsets; of size (0,) if not wanted."""
+    """The gradients of image, radii, center, affine and offsets; of size (0,) if not wanted.
+
+    grad_out: in the order of the output, of any shape.
+    """
     gradients = sampling.new_gradients(image_grad, lens_grad, offsets_grad)
     if grad_out.numel() == 0:
         return tuple(gradient.zero_() for gradient in gradients)
     image, radii, azimuths, _, _, offsets = sampling[:6]
     batch, rows, columns = len(image), radii.shape[1], len(azimuths)
     largest = image_sums = lens_sums = each_offsets = None
+    grad_out = grad_out.contiguous()
     if image_grad:
-        largest = fixed_point.largest(grad_out)
+        largest = fixed_point.largest(grad_out.view(batch, -1))
         image_sums = fixed_point.sums(image)
     if lens_grad:
         lens_sums = radii.new_empty((batch, rows, _LENS_SUMS))
@@ -239,7 +243,7 @@ def backward(
     block = min(128, max(32, triton.next_power_of_2(columns)))
     bits = fixed_point.bits(rows * columns)
     _backward[(batch * rows,)](
-        *_arguments(sampling), grad_out.contiguous(), largest, image_sums, lens_sums, each_offsets,
+        *_arguments(sampling), grad_out, largest, image_sums, lens_sums, each_offsets,
         BITS=bits, LENS_SUMS=_LENS_SUMS, BLOCK=block, num_warps=block // 32,
         **_options(sampling, tokens),
     )  # fmt: skip
