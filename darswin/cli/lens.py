@@ -10,11 +10,11 @@ from darswin.cli.arguments import run_command
 from darswin.layers.sampling import PolarSample
 from darswin.lens.base import Lens
 from darswin.lens.files.load import Calibration, reach
+from darswin.lens.files.opencv import Coefficients
 from darswin.lens.orientation import in_upright_picture, stored_size
 from darswin.lens.spacing import Spacing
 from darswin.viz.report import describe, sides
 
-Coefficients = Literal["fisheye", "pinhole", "omnidir"]
 Format = Literal["darswin", "opencv", "colmap", "kalibr"]
 View = Literal["perspective", "cylindrical", "equirectangular"]
 VIEW_SIDE = 800  # px, the longer one
