@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/installed
 
-.PHONY: help build demo test test-triton test-gpu test-lowest test-isa test-asan fuzz kills mutants lint format bench bench-gpu study study-int8 learned-lens worlds study-dense tables docs dist wheels repair published-wheels test-torch aarch64 clean
+.PHONY: help build demo test test-all test-triton test-gpu test-lowest test-isa test-asan fuzz kills mutants lint format bench bench-gpu study study-int8 learned-lens worlds study-dense tables docs dist wheels repair published-wheels test-torch aarch64 clean
 
 help:  ## this list
 	@grep -E '^[a-z0-9-]+:.*##' Makefile | sed -E 's/:.*## /\t/' | expand -t 18
@@ -22,8 +22,14 @@ build: $(STAMP)  ## (re)build darswin/libdarswin.so in place
 demo: build  ## train on nearly undistorted digits, test through any fisheye, draw it (2 minutes)
 	$(BIN)/python examples/digits.py
 
-test: build  ## all tests
-	$(BIN)/python -m pytest
+# As many processes as cores, four at most: a process takes more than a gigabyte.
+PYTEST := OMP_NUM_THREADS=1 $(CURDIR)/$(BIN)/python -m pytest -n auto --maxprocesses=4 --dist worksteal
+
+test: build  ## the tests that take no time: values, gradients, errors
+	$(PYTEST) -m "not slow"
+
+test-all: build  ## all tests: compiled graphs, processes, training and the pages' code too
+	$(PYTEST)
 
 # Triton stands in a folder of its own, so that all else is tested without it.
 TRITON := .triton
@@ -35,7 +41,7 @@ $(TRITON)/$(TRITON_VERSION): $(STAMP)
 	@touch $@
 
 test-triton: build $(TRITON)/$(TRITON_VERSION)  ## the kernels for GPUs without one: interpreted, and compiled
-	TRITON_INTERPRET=1 PYTHONPATH=$(CURDIR)/$(TRITON) $(BIN)/python -m pytest -q tests/gpu
+	TRITON_INTERPRET=1 PYTHONPATH=$(CURDIR)/$(TRITON) $(PYTEST) -q tests/gpu
 	PYTHONPATH=$(CURDIR):$(CURDIR)/$(TRITON) $(BIN)/python tests/gpu/compile_kernels.py
 
 # torch's builds for CUDA bring Triton. Without a device the tests say so and are skipped.
@@ -60,7 +66,7 @@ test-isa: build  ## the operators' tests on every instruction-set tier of this m
 	@set -e; for tier in $$($(BIN)/python -c 'from darswin.ops import _module; print(*_module.tiers())'); do \
 	  echo "== $$tier"; \
 	  ATEN_CPU_CAPABILITY=$$(echo $$tier | sed s/generic/default/) \
-	    $(BIN)/python -m pytest -q tests/ops \
+	    $(PYTEST) -q tests/ops \
 	      tests/test_build.py::test_the_tier_in_use_is_the_one_asked_for; \
 	done
 
@@ -78,7 +84,7 @@ test-asan: build  ## the operators' tests on every tier under AddressSanitizer a
 	  echo "== $$tier, sanitized"; \
 	  LD_PRELOAD="$(PRELOAD)" ASAN_OPTIONS=detect_leaks=0:allocator_may_return_null=1 \
 	  UBSAN_OPTIONS=print_stacktrace=1 ATEN_CPU_CAPABILITY=$$(echo $$tier | sed s/generic/default/) \
-	    $(CURDIR)/$(BIN)/python -m pytest -q -c $(CURDIR)/pyproject.toml --rootdir $(CURDIR) \
+	    $(PYTEST) -q -c $(CURDIR)/pyproject.toml --rootdir $(CURDIR) \
 	      -m "not unsanitized" $(CURDIR)/tests/ops; \
 	done
 

@@ -38,16 +38,19 @@ def with_torch():
     return loaded("import torch")
 
 
+@pytest.mark.slow
 def test_the_package_alone_loads_nothing():
     modules = loaded("import darswin")
     assert {name for name in modules if name.startswith("darswin")} == {"darswin"}
     assert modules.isdisjoint({"numpy", "torch"})
 
 
+@pytest.mark.slow
 def test_the_help_needs_no_torch():
     assert loaded(COMMAND.format(["--help"])).isdisjoint({"numpy", "torch"} | HEAVY)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("code", ["import darswin.ops", "from darswin import *"])
 def test_public_names_load_nothing_heavy(code, with_torch):
     modules = loaded(f"import torch\n{code}")
@@ -55,6 +58,7 @@ def test_public_names_load_nothing_heavy(code, with_torch):
     assert not (modules - with_torch) & HEAVY
 
 
+@pytest.mark.slow
 def test_a_description_of_a_lens_loads_nothing_heavy(with_torch):
     modules = loaded("import torch" + COMMAND.format(["lens", "info", str(LENS)]))
     assert "darswin.viz.report" in modules
@@ -62,6 +66,7 @@ def test_a_description_of_a_lens_loads_nothing_heavy(with_torch):
     assert (modules - with_torch) & HEAVY == {"jsonargparse"}
 
 
+@pytest.mark.slow
 def test_importing_the_operators_registers_them():
     loaded("import darswin.ops, torch; torch.ops.darswin.polar_sample")
 

@@ -99,7 +99,7 @@ def scratch(granted, tmp_path, monkeypatch):
     return tmp_path
 
 
-@pytest.mark.unsanitized
+@pytest.mark.slow
 @pytest.mark.parametrize("page", CODE, ids=page_name)
 def test_code_runs_as_it_stands(page, scratch, monkeypatch):
     scope: dict = {}
@@ -190,7 +190,7 @@ PROGRAMS: dict[str, Callable] = {
 }
 
 
-@pytest.mark.unsanitized
+@pytest.mark.slow
 def test_the_drop_in_gives_the_values_of_what_it_replaces(scratch):
     scope: dict = {}
     for block in blocks(ROOT / "docs/howto/use.md"):
