@@ -94,5 +94,5 @@ def _reached(lens: Lens) -> np.ndarray:
 
 
 def _size(lens: Lens) -> tuple[int, int]:
-    height, width = lens.image_size[0].tolist()  # type: ignore[index]
+    height, width = lens.image_size[0].tolist()
     return round(height), round(width)

@@ -21,9 +21,8 @@ from darswin.data.scenes.targets import nothing_of
 from darswin.data.turning import Turn, turned_lens
 from darswin.data.warp import remap
 from darswin.lens import Lens
-from darswin.lens.base import length_of
-from darswin.lens.pixels import pixel_angles
-from darswin.lens.reprojection import as_map
+from darswin.lens.pixels import as_map, pixel_angles
+from darswin.lens.solve import length_of
 
 # An image is read at up to so many points a pixel and axis, an odd number, so that one of them is
 # the pixel's centre, and so close together, in pixels of the picture.

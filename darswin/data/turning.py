@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from darswin.lens import Lens
-from darswin.lens.orientation import rotated, turned
+from darswin.lens.orientation import rotated, upright
 
 _MIRRORED = 2  # the EXIF orientation of a picture whose left and right are swapped
 
@@ -68,7 +68,7 @@ def turned_lens(lens: Lens, turn: Turn) -> tuple[Lens, np.ndarray]:
         assert lens.image_size is not None
         moves = moves * [[-1.0], [1.0]]
         moves[0, 2] += lens.image_size[0, 1].item() - 1
-        lens = turned(lens, _MIRRORED)
+        lens = upright(lens, _MIRRORED)
     return lens, moves
 
 
@@ -88,5 +88,5 @@ def turned_picture(image: np.ndarray, lens: Lens, turn: Turn) -> tuple[np.ndarra
         shape = image.shape
         image = cv2.warpAffine(image, matrix.numpy(), (width, height)).reshape(shape)
     if turn.mirrored:
-        image, lens = np.ascontiguousarray(image[:, ::-1]), turned(lens, _MIRRORED)
+        image, lens = np.ascontiguousarray(image[:, ::-1]), upright(lens, _MIRRORED)
     return image, lens

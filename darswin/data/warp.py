@@ -5,13 +5,13 @@ import numpy as np
 import torch
 
 from darswin.lens import Lens
-from darswin.lens.reprojection import reprojection
+from darswin.lens.pixels import reprojection
 
 
 def warp_map(
     source: Lens, source_size: tuple[int, int], target: Lens, size: tuple[int, int]
 ) -> np.ndarray:
-    """`darswin.lens.reprojection.reprojection` in double precision, as maps of `cv2.remap`.
+    """`darswin.lens.pixels.reprojection` in double precision, as maps of `cv2.remap`.
 
     Returns:
         (N, H, W, 2) float32, x and y; outside the image where a ray is beyond either θ_max.

@@ -16,7 +16,7 @@ from darswin.data.sources import Source
 from darswin.data.turning import Turn
 from darswin.data.warp import remap
 from darswin.lens import Lens, Perspective
-from darswin.lens.reprojection import OUTSIDE, radial_reprojection
+from darswin.lens.pixels import OUTSIDE, radial_reprojection
 
 # The paper's pictures, 384 px wide, have a focal length of 9 px.
 PAPER_FOV = 2 * math.atan(192 / 9)

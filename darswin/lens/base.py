@@ -1,15 +1,16 @@
 """The base of all lens models: rays to pixels and pixels to rays, of a batch of lenses."""
 
+import functools
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, ClassVar, Self
 
 import torch
 from torch import Tensor
 
-from darswin.lens.batch import Number
 from darswin.lens.frame import ImageFrame
-from darswin.lens.inverse import inverse
+from darswin.lens.parameter import Number
+from darswin.lens.solve import direction_of, inverse, length_of
 
 # A lens ends this far (rad) before the angle where r stops rising or becomes infinite: there θ
 # cannot be told from r.
@@ -20,7 +21,7 @@ MODELS: dict[str, type["Lens"]] = {}
 
 
 class Lens(ImageFrame):
-    """Base of all lenses. A lens defines `parameters`, `theta_limit` and `project`.
+    """Base of all lenses. A lens declares each `Parameter` and defines `theta_limit` and `project`.
 
     A ray at incident angle θ and azimuth φ lands at
 
@@ -54,12 +55,8 @@ class Lens(ImageFrame):
     bases of several models are.
     """
 
-    # Of `fit`: values to start from, in all combinations; bounds; the usual number of terms.
-    starts: ClassVar[Mapping[str, tuple[float, ...]]] = {}
-    bounds: ClassVar[Mapping[str, tuple[float, float]]] = {}
-    terms: ClassVar[int] = 4
-    # The longest list of numbers that a calibration file may give for a parameter.
-    max_numbers: ClassVar[int] = 64
+    terms: ClassVar[int] = 4  # of its polynomial, that `fit` finds unless told otherwise
+    max_numbers: ClassVar[int] = 64  # that a calibration file may give for a parameter
 
     def __init_subclass__(cls, register: bool = True) -> None:
         super().__init_subclass__()
@@ -68,23 +65,17 @@ class Lens(ImageFrame):
                 raise ValueError(f"there is a lens model {cls.__name__} already")
             MODELS[cls.__name__] = cls
 
-    def __init__(
-        self,
-        theta_max: Number | None = None,
-        center: Number | None = None,
-        affine: Number | None = None,
-        image_size: Number | None = None,
-        **parameters: Number | None,
-    ):
-        super().__init__(
-            **parameters, theta_max=theta_max, center=center, affine=affine, image_size=image_size
-        )
-        self._check_frame()
+    def __init__(self, *arguments: Number | None, **named: Number | None):
+        super().__init__(*arguments, **named)
+        for name in self._tensors():
+            self._check(name)
+        if self.affine is not None:
+            self._require("affine", self.affine.detach().det() != 0, "invertible")
         self._validate()
         self._set_theta_max(self.theta_max)
 
     def _validate(self) -> None:
-        """Raises ValueError, naming the parameter, where one is out of its range."""
+        """Raises ValueError where parameters are wrong in another way than their range."""
 
     def _set_theta_max(self, wanted: Tensor | None) -> None:
         limit = self.theta_limit
@@ -95,7 +86,7 @@ class Lens(ImageFrame):
         self.theta_max = limit if wanted is None else wanted
         if wanted is None:
             return
-        self._require("theta_max", wanted > 0, "greater than 0")
+        self._check("theta_max")
         # A limit found in another dtype differs by a rounding, which MARGIN leaves room for.
         slack = 1 + 2 * torch.finfo(limit.dtype).eps
         beyond = ~(wanted <= limit * slack)
@@ -215,8 +206,7 @@ class Lens(ImageFrame):
             (..., 2) px.
         """
         theta, azimuth = self._aligned(theta)[0], self._aligned(azimuth)[0]
-        direction = torch.stack((torch.cos(azimuth), torch.sin(azimuth)), -1)
-        return self.pixels(theta, direction, image_size)
+        return self.pixels(theta, direction_of(azimuth), image_size)
 
     def unproject_pixels(
         self, pixels: Tensor, image_size: tuple[int, int] | None = None
@@ -248,7 +238,8 @@ class Lens(ImageFrame):
         square = points.square()
         length = square.sum(-1)
         # As `length_of`, so that there is a gradient on the axis, whatever the unit of length.
-        least = (1e-12 * torch.finfo(points.dtype).eps * length).clamp(min=_tiny(points))
+        eps, tiny = torch.finfo(points.dtype).eps, torch.finfo(points.dtype).tiny
+        least = (1e-12 * eps * length).clamp(min=tiny)
         aside = torch.maximum(square[..., :2].sum(-1), least).sqrt()
         theta = torch.atan2(aside, points[..., 2])
         theta = torch.where(length > 0, theta, torch.nan)
@@ -320,19 +311,55 @@ class Lens(ImageFrame):
         theta = whole.rays(self._side_pixels(image_size), image_size)[0]
         return torch.where(theta.isnan(), whole.theta_max[:, None], theta)
 
-    def _turned(self, turn: Tensor) -> dict[str, Tensor]:
-        """The parameters that change when the camera is turned about its axis, or mirrored.
-
-        Args:
-            turn: (2, 2), orthogonal: what it makes of points around the principal point.
-        """
+    def _rotated_terms(self, turn: Tensor) -> dict[str, Tensor]:
+        """The parameters that change when the image around the principal point is multiplied by
+        `turn`, (2, 2), orthogonal: a rotation or a mirror."""
         return {}
 
 
-def length_of(points: Tensor) -> Tensor:
-    """The length of (..., 2), never 0, where a root has no slope."""
-    return points.square().sum(-1).clamp(min=1e-12 * torch.finfo(points.dtype).eps).sqrt()
+def from_dict(description: Mapping[str, Any], image_size: tuple[int, int] | None = None) -> Lens:
+    """The lens that a JSON object describes.
+
+    Args:
+        description: {"model": "Spherical", "xi": 0.5, "focal": 300, "theta_max": 1.5}: a name of
+            `MODELS` and the arguments of its constructor, angles in rad and lengths in px. For
+            models with a focal length, "fov" may stand in place of it and of "theta_max": the
+            full field of view, which fills the circle inside the image.
+        image_size: (H, W) px of the lens's images, which "fov" needs.
+
+    Raises:
+        ValueError: an unknown model, or arguments that are not its own or out of range, by name.
+    """
+    if not isinstance(description, Mapping):
+        raise ValueError(f"a lens must be a JSON object, got {description!r}")
+    arguments = dict(description)
+    name = arguments.pop("model", None)
+    if not isinstance(name, str) or name not in MODELS:
+        raise ValueError(f'a lens\'s "model" must be one of {sorted(MODELS)}, got {name!r}')
+    make: Callable[..., Lens] = MODELS[name]
+    if "fov" in arguments and hasattr(make, "from_fov"):
+        size = image_size or arguments.get("image_size")
+        if size is None:
+            raise ValueError('a lens of a "fov" needs the image_size, (H, W)')
+        make = functools.partial(make.from_fov, radius=min(size) / 2)
+    try:
+        return make(**arguments)
+    except TypeError as error:
+        raise ValueError(f"a {name} lens cannot be made of {arguments}: {error}") from error
 
 
-def _tiny(like: Tensor) -> float:
-    return torch.finfo(like.dtype).tiny
+def to_dict(lens: Lens) -> dict[str, Any]:
+    """One lens as a JSON object, the inverse of `from_dict`.
+
+    Raises:
+        ValueError: several lenses, or a lens of a model that is not in `MODELS`.
+    """
+    if len(lens) != 1:
+        raise ValueError(f"to_dict takes one lens, got {len(lens)}")
+    name = type(lens).__name__
+    if MODELS.get(name) is not type(lens):
+        raise ValueError(f"to_dict takes a lens of {sorted(MODELS)}, got {name}")
+    described = {name: value.detach()[0].tolist() for name, value in lens._tensors().items()}
+    if "image_size" in described:
+        described["image_size"] = [round(side) for side in described["image_size"]]
+    return {"model": name} | described

@@ -1,8 +1,8 @@
 """A batch of lenses as tensors: one entry a lens in each, all of one dtype, on one device."""
 
 import copy
+import inspect
 from collections.abc import Callable, Mapping, Sequence
-from functools import reduce
 from numbers import Integral
 from typing import Any, ClassVar, Self
 
@@ -10,28 +10,43 @@ import torch
 from torch import Tensor
 from torch.utils import _pytree as pytree
 
+from darswin.lens.parameter import Number, Parameter, as_tensors, bind, signature
 from darswin.ops.waiting import readable
 
-Number = float | Sequence[float] | Sequence[Sequence[float]] | Tensor
-
-# What the user may give, for a parameter of 0, 1 or 2 dimensions a lens.
-FORMS = ("a number or (N,)", "(K,) or (N, K)", "(K, L) or (N, K, L)")
+NUMBER = Parameter()
 
 
 class LensBatch:
-    """The tensors of N lenses: how they are given, indexed, joined, moved and copied.
+    """The tensors of N lenses: how they are given, indexed, joined, moved and copied."""
 
-    A class says what its tensors are in `parameters`, `optional` and `lists`; all lenses also
-    have those of `common`.
-    """
+    theta_max = Parameter(low=0, open=True, optional=True, by_place=True)
+    center = Parameter(shape=(2,), optional=True, by_place=True)
+    affine = Parameter(shape=(2, 2), optional=True)
+    image_size = Parameter(low=1, shape=(2,), optional=True)
 
-    parameters: ClassVar[tuple[str, ...]] = ()
-    optional: ClassVar[tuple[str, ...]] = ()  # parameters that may be None
-    lists: ClassVar[tuple[str, ...]] = ()  # those of the parameters that are several numbers a lens
-    common: ClassVar[tuple[str, ...]] = ("theta_max",)
-    theta_max: Tensor
+    # The parameters that all lenses have; those of a class that it needs; its others; all, in the
+    # order of the constructor.
+    common: ClassVar[tuple[str, ...]] = ("theta_max", "center", "affine", "image_size")
+    parameters: ClassVar[tuple[str, ...]]
+    optional: ClassVar[tuple[str, ...]]
+    declared: ClassVar[dict[str, Parameter]] = {
+        "theta_max": theta_max, "center": center, "affine": affine, "image_size": image_size,
+    }  # fmt: skip
+    __signature__: ClassVar[inspect.Signature]
 
     def __init_subclass__(cls) -> None:
+        own = {name: p for name, p in vars(cls).items() if isinstance(p, Parameter)}
+        found = own | {name: p for name, p in cls.declared.items() if name not in own}
+        cls.parameters = tuple(name for name, p in found.items() if not p.optional)
+        cls.optional = tuple(
+            name for name, p in found.items() if p.optional and name not in cls.common
+        )
+        cls.declared = {n: found[n] for n in (*cls.parameters, *cls.optional, *cls.common)}
+        others = (*cls.optional, *cls.common)
+        by_place = [name for name in others if found[name].by_place]
+        cls.__signature__ = signature(
+            cls.parameters, by_place, [name for name in others if name not in by_place]
+        )
         # So that a lens crosses torch.compile, torch.export and torch.func as its tensors.
         pytree.register_pytree_node(
             cls,
@@ -46,12 +61,9 @@ class LensBatch:
             from_dumpable_context=lambda _: None,
         )
 
-    def __init__(self, **given: Number | None):
-        if unknown := sorted(given.keys() - set(self._names())):
-            raise TypeError(
-                f"{type(self).__name__} takes {', '.join(self._names())}, got {', '.join(unknown)}"
-            )
-        rows = self._expanded({name: v for name, v in given.items() if v is not None})
+    def __init__(self, *arguments: Number | None, **named: Number | None):
+        given = bind(type(self).__name__, self.__signature__, arguments, named)
+        rows = self._expanded(given)
         for name in self._names():
             setattr(self, name, rows.get(name))
 
@@ -61,27 +73,13 @@ class LensBatch:
 
     @classmethod
     def _names(cls) -> tuple[str, ...]:
-        return (*cls.parameters, *cls.optional, *cls.common)
-
-    @classmethod
-    def _dims(cls, name: str) -> int:
-        """How many dimensions one lens's part of a tensor has."""
-        return int(name in cls.lists)
+        return tuple(cls.declared)
 
     @classmethod
     def _rows(cls, given: Mapping[str, Number]) -> dict[str, Tensor]:
-        """Values as tensors (N or 1, ...).
-
-        Raises:
-            ValueError: a wrong number of dimensions. TypeError: what is no number.
-        """
-        rows = as_tensors(given)
-        for name, tensor in rows.items():
-            dims = cls._dims(name)
-            if tensor.dim() not in (dims, dims + 1):
-                raise ValueError(f"{name} must be {FORMS[dims]}, got shape {tuple(tensor.shape)}")
-            rows[name] = tensor[None] if tensor.dim() == dims else tensor
-        return rows
+        """Values as tensors (N or 1, ...)."""
+        tensors = as_tensors(given).items()
+        return {name: cls.declared.get(name, NUMBER).rows(name, value) for name, value in tensors}
 
     @classmethod
     def _expanded(cls, given: Mapping[str, Number]) -> dict[str, Tensor]:
@@ -101,11 +99,15 @@ class LensBatch:
             setattr(lens, name, tensors.get(name))
         return lens
 
+    def _tensors(self) -> dict[str, Tensor]:
+        """Its parameters by their names, but for those that are None."""
+        values = {name: getattr(self, name) for name in self._names()}
+        return {name: value for name, value in values.items() if value is not None}
+
     def _map(self, function: Callable[[Tensor], Tensor]) -> Self:
         lens = copy.copy(self)
-        for name in self._names():
-            value = getattr(self, name)
-            setattr(lens, name, None if value is None else function(value))
+        for name, value in self._tensors().items():
+            setattr(lens, name, function(value))
         return lens
 
     def _require(self, name: str, ok: Tensor, range_: str) -> None:
@@ -113,6 +115,11 @@ class LensBatch:
         if not bool(ok.all()):  # NaN is not ok
             bad = getattr(self, name).detach()[~ok][0].tolist()
             raise ValueError(f"{name} must be {range_}, got {bad}")
+
+    def _check(self, name: str) -> None:
+        """ValueError where a parameter is out of its range."""
+        declared = self.declared[name]
+        self._require(name, declared.holds(getattr(self, name)), declared.range)
 
     @staticmethod
     def _row(tensor: Tensor, dims: int) -> Tensor:
@@ -158,14 +165,17 @@ class LensBatch:
 
     def replace(self, **tensors: Tensor | None) -> Self:
         """The same lens with some of its tensors replaced, unchecked."""
-        return self._from_tensors({name: getattr(self, name) for name in self._names()} | tensors)
+        return self._from_tensors(self._tensors() | tensors)
 
     def same_as(self, other: object) -> bool:
         """Whether `other` is of the same class and has the same numbers, for as many lenses."""
         if type(other) is not type(self):
             return False
-        pairs = [(getattr(self, name), getattr(other, name)) for name in self._names()]
-        return all(a is b or (a is not None and b is not None and _same(a, b)) for a, b in pairs)
+        mine, others = self._tensors(), other._tensors()
+        return mine.keys() == others.keys() and all(
+            (a.dtype, a.device) == (b.dtype, b.device) and torch.equal(a, b)
+            for a, b in zip(mine.values(), others.values(), strict=True)
+        )
 
     def merged(self) -> Self:
         """A single lens, where all of them have the same numbers; else all of them.
@@ -174,8 +184,7 @@ class LensBatch:
         """
         if not readable(self.theta_max):
             return self
-        values = (getattr(self, name) for name in self._names())
-        same = all(v is None or torch.equal(v, v[:1].expand_as(v)) for v in values)
+        same = all(torch.equal(v, v[:1].expand_as(v)) for v in self._tensors().values())
         return self[:1] if same else self
 
     def expand(self, count: int) -> Self:
@@ -185,25 +194,5 @@ class LensBatch:
         return self._map(lambda tensor: tensor.expand(count, *tensor.shape[1:]))
 
     def __repr__(self) -> str:
-        values = {name: getattr(self, name) for name in self._names()}
-        shown = (f"{name}={value.tolist()}" for name, value in values.items() if value is not None)
+        shown = (f"{name}={value.tolist()}" for name, value in self._tensors().items())
         return f"{type(self).__name__}({', '.join(shown)})"
-
-
-def _same(a: Tensor, b: Tensor) -> bool:
-    return a.dtype == b.dtype and a.device == b.device and torch.equal(a, b)
-
-
-def as_tensors(values: Mapping[str, Number]) -> dict[str, Tensor]:
-    """All values as tensors of one dtype and device: those of the tensors among them, if any."""
-    given = [v for v in values.values() if isinstance(v, Tensor) and v.is_floating_point()]
-    dtype, device = torch.get_default_dtype(), None
-    if given:
-        dtype, device = reduce(torch.promote_types, (v.dtype for v in given)), given[0].device
-    tensors = {}
-    for name, value in values.items():
-        try:
-            tensors[name] = torch.as_tensor(value, dtype=dtype, device=device)
-        except (TypeError, ValueError, RuntimeError) as error:
-            raise TypeError(f"{name} must be a number or a tensor, got {value!r}") from error
-    return tensors

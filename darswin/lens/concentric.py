@@ -12,8 +12,7 @@ import torch
 from torch import Tensor
 
 from darswin.lens.base import Lens
-from darswin.lens.pixels import pixel_rays
-from darswin.lens.reprojection import OUTSIDE, sample_at
+from darswin.lens.pixels import OUTSIDE, pixel_rays, sample_at
 from darswin.lens.spacing import Spacing, check_tan, span, to_spacing, to_theta
 from darswin.ops.waiting import tensor_there
 

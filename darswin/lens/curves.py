@@ -7,8 +7,8 @@ from torch import Tensor
 from torch.utils.data._utils.collate import default_collate_fn_map
 
 from darswin.lens.base import Lens
-from darswin.lens.batch import Number
-from darswin.lens.inverse import inverse
+from darswin.lens.parameter import Number, Parameter
+from darswin.lens.solve import inverse
 from darswin.ops.waiting import readable
 
 
@@ -24,24 +24,10 @@ class Tabulated(Lens):
     Source: Fritsch and Carlson, SINUM 1980; Fritsch and Butland, SISSC 1984.
     """
 
-    parameters = ("angles", "radii")
-    optional = ("slopes",)
-    lists = ("angles", "radii", "slopes")
-    lengths = ("radii", "slopes")
+    angles = Parameter(shape=(None,))
+    radii = Parameter(shape=(None,), in_pixels=True)
+    slopes = Parameter(shape=(None,), optional=True, in_pixels=True)
     max_numbers = 65536
-    angles: Tensor
-    radii: Tensor
-    slopes: Tensor | None
-
-    def __init__(
-        self,
-        angles: Number,
-        radii: Number,
-        theta_max: Number | None = None,
-        center: Number | None = None,
-        **frame: Number | None,
-    ):
-        super().__init__(theta_max, center, angles=angles, radii=radii, **frame)
 
     def _validate(self) -> None:
         if self.angles.shape != self.radii.shape or self.angles.shape[1] < 2:
@@ -166,8 +152,8 @@ def as_curves(lens: Lens, count: int = 512) -> Tabulated:
     _check_start(radii)
     radii = torch.cat((torch.zeros_like(radii[:, :1]), radii[:, 1:]), 1)
     slopes = torch.minimum(slopes.clamp(min=0), _steepest(angles, radii))
-    tensors = {name: getattr(lens, name) for name in lens.common}
-    return Tabulated._from_tensors(dict(angles=angles, radii=radii, slopes=slopes) | tensors)
+    frame = {name: getattr(lens, name) for name in lens.common}
+    return Tabulated._from_tensors({"angles": angles, "radii": radii, "slopes": slopes} | frame)
 
 
 def _check_start(radii: Tensor) -> None:
@@ -226,17 +212,16 @@ def cat(lenses: Sequence[Lens]) -> Lens:
             lens if lens.affine is not None else lens.replace(affine=eye.expand(len(lens), 2, 2))
             for lens in lenses
         ]
-    tensors = {}
-    for name in lenses[0]._names():
-        values = [getattr(lens, name) for lens in lenses]
-        tensors[name] = None if values[0] is None else torch.cat(values)
+    tensors = {
+        name: torch.cat([getattr(lens, name) for lens in lenses]) for name in lenses[0]._tensors()
+    }
     return lenses[0]._from_tensors(tensors)
 
 
 def form_of(lens: Lens) -> tuple:
     """Lenses of the same form are joined as they are."""
-    parameters = [getattr(lens, name) for name in (*lens.parameters, *lens.optional)]
-    return type(lens), tuple(None if p is None else p.shape[1:] for p in parameters)
+    shapes = {n: v.shape[1:] for n, v in lens._tensors().items() if n not in lens.common}
+    return type(lens), tuple(shapes.items())
 
 
 def _collate(batch: Sequence[Lens], *, collate_fn_map: object = None) -> Lens:

@@ -12,13 +12,19 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from darswin.lens.base import MARGIN, Lens, length_of
-from darswin.lens.batch import Number
-from darswin.lens.focal import FocalLens
-from darswin.lens.ideal import Equidistant, Perspective
-from darswin.lens.inverse import rising_limit
-from darswin.lens.plane import determinant, newton, radial_slopes, solve
+from darswin.lens.base import MARGIN, Lens
+from darswin.lens.ideal import Equidistant, FocalLens, Perspective
+from darswin.lens.parameter import Number, Parameter
 from darswin.lens.polynomial import horner, slopes
+from darswin.lens.solve import (
+    determinant,
+    direction_of,
+    length_of,
+    newton,
+    radial_slopes,
+    rising_limit,
+    solve,
+)
 from darswin.lens.sphere import XI_STARTS, Spherical, sphere_angle, sphere_limit
 from darswin.ops.waiting import readable
 
@@ -37,23 +43,11 @@ class DistortedLens(FocalLens, register=False):
         Others: as `Lens`.
     """
 
-    optional: ClassVar[tuple[str, ...]] = ("radial", "tangential", "prism")
-    lists: ClassVar[tuple[str, ...]] = optional
+    radial = Parameter(shape=(None,), optional=True, by_place=True)
+    tangential = Parameter(shape=(2,), optional=True)
+    prism = Parameter(shape=(4,), optional=True)
     # What is left of the model when all its terms are zero, with a closed inverse.
     plain: ClassVar[type[Lens]]
-    radial: Tensor | None
-    tangential: Tensor | None
-    prism: Tensor | None
-
-    def __init__(
-        self,
-        focal: Number,
-        radial: Number | None = None,
-        theta_max: Number | None = None,
-        center: Number | None = None,
-        **others: Number | None,
-    ):
-        super().__init__(theta_max, center, focal=focal, radial=radial, **others)
 
     @classmethod
     def _rows(cls, given: Mapping[str, Number]) -> dict[str, Tensor]:
@@ -66,16 +60,6 @@ class DistortedLens(FocalLens, register=False):
                 f"({count},) for one lens, or another parameter with {count} numbers"
             )
         return rows
-
-    def _validate(self) -> None:
-        super()._validate()
-        for name in self.optional:
-            if getattr(self, name) is not None:
-                self._require(name, getattr(self, name).isfinite().all(1), "finite")
-        for name, count in (("tangential", 2), ("prism", 4)):
-            value = getattr(self, name)
-            if value is not None and value.shape[1] != count:
-                raise ValueError(f"{name} must be {count} numbers a lens, got {value.shape[1]}")
 
     def _plane(self, theta: Tensor) -> Tensor:
         """w(θ)."""
@@ -185,7 +169,7 @@ class DistortedLens(FocalLens, register=False):
         It is a trigonometric polynomial of degree 3 in φ: 8 azimuths determine all others.
         """
         azimuth = torch.arange(8, dtype=theta.dtype, device=theta.device) * (math.pi / 4)
-        direction = torch.stack((torch.cos(azimuth), torch.sin(azimuth)), -1)
+        direction = direction_of(azimuth)
         area = determinant(self._distort_slopes(self._plane(theta)[..., None, None] * direction))
         terms = torch.fft.rfft(area, norm="forward")[..., :4]
         area = torch.fft.irfft(terms, 256, norm="forward")
@@ -208,7 +192,7 @@ class DistortedLens(FocalLens, register=False):
                 self._distort, self._distort_slopes, goal, start / 2, 1.1 * last, rounds=30
             )
         azimuth = torch.arange(256, dtype=goal.dtype, device=goal.device) * (math.pi / 128)
-        circle = torch.stack((torch.cos(azimuth), torch.sin(azimuth)), -1)
+        circle = direction_of(azimuth)
         # One lens at a time: each has its own shape of selected pixels.
         shape, start = goal.shape, start.expand_as(goal).reshape(len(self), -1, 2)
         goal, points = goal.reshape(len(self), -1, 2), start.clone()
@@ -228,7 +212,7 @@ class DistortedLens(FocalLens, register=False):
                 near &= length_of(lens._distort(points[k]) - goal[k]) > self._slack(goal[k])
         return points.reshape(shape)
 
-    def _turned(self, turn: Tensor) -> dict[str, Tensor]:
+    def _rotated_terms(self, turn: Tensor) -> dict[str, Tensor]:
         # The terms are vectors of the image plane: (p₂, p₁), (s₁, s₃) and (s₂, s₄).
         changed = {}
         if self.tangential is not None:
@@ -305,27 +289,9 @@ class Mei(DistortedLens):
     Source: Mei and Rives, ICRA 2007.
     """
 
-    parameters = ("xi", "focal")
-    starts: ClassVar = {"xi": XI_STARTS}
-    bounds: ClassVar = {**FocalLens.bounds, "xi": (0.0, math.inf)}
+    xi = Parameter(low=0, starts=XI_STARTS)
     terms = 2
     plain = Spherical
-    xi: Tensor
-
-    def __init__(
-        self,
-        xi: Number,
-        focal: Number,
-        radial: Number | None = None,
-        theta_max: Number | None = None,
-        center: Number | None = None,
-        **others: Number | None,
-    ):
-        super().__init__(focal, radial, theta_max, center, xi=xi, **others)
-
-    def _validate(self) -> None:
-        self._require("xi", (self.xi >= 0) & self.xi.isfinite(), "finite and at least 0")
-        super()._validate()
 
     def _plane(self, theta: Tensor) -> Tensor:
         return torch.sin(theta) / (self._row(self.xi, theta.dim()) + torch.cos(theta))
@@ -351,11 +317,10 @@ class BrownConrady(DistortedLens):
     Source: Brown, 1966; OpenCV, calib3d.
     """
 
-    optional = ("radial", "denominator", "tangential", "prism")
-    lists = optional
+    radial = DistortedLens.radial  # its place is before the denominator
+    denominator = Parameter(shape=(None,), optional=True)
     terms = 3
     plain = Perspective
-    denominator: Tensor | None
 
     def _plane(self, theta: Tensor) -> Tensor:
         return torch.tan(theta)

@@ -11,6 +11,7 @@ from torch import Tensor
 from darswin.lens.base import MODELS, Lens
 from darswin.lens.curves import Tabulated, as_curves
 from darswin.lens.polynomial import PolynomialLens
+from darswin.lens.solve import direction_of
 
 # How finely rays are compared.
 RINGS, SPOKES = 200, 16
@@ -49,12 +50,8 @@ def fit(model: str | type[Lens], lens: Lens, *, terms: int | None = None) -> Fit
     terms = model.terms if terms is None else terms
     exact = lens.detach().to(torch.float64)
     parts = [_fit_one(model, exact[k], terms) for k in range(len(lens))]
-    names = parts[0].parameters + parts[0].optional
-    tensors = {
-        name: torch.cat([getattr(part, name) for part in parts])
-        for name in names
-        if getattr(parts[0], name) is not None
-    }
+    found = [name for name in parts[0]._tensors() if name not in model.common]
+    tensors = {name: torch.cat([getattr(part, name) for part in parts]) for name in found}
     fitted = model(**tensors, **{name: getattr(exact, name) for name in exact.common})
     return Fit(fitted.to(lens.theta_max.dtype), largest_distance(fitted, exact).to(lens.theta_max))
 
@@ -84,7 +81,7 @@ def _fractions(like: Lens, count: int) -> Tensor:
 def _directions(like: Lens, count: int) -> Tensor:
     """(1, 1, count, 2): cos φ and sin φ all around."""
     azimuth = torch.arange(count, dtype=like.theta_max.dtype) * (2 * math.pi / count)
-    return torch.stack((torch.cos(azimuth), torch.sin(azimuth)), -1)[None, None]
+    return direction_of(azimuth)[None, None]
 
 
 def _fit_one(model: type[Lens], lens: Lens, terms: int) -> Lens:
@@ -94,25 +91,27 @@ def _fit_one(model: type[Lens], lens: Lens, terms: int) -> Lens:
     direction = _directions(lens, SPOKES if aside else 1)
     goal = lens._flat(theta, direction) if aside else lens.project(theta)[..., None] * direction
     if issubclass(model, PolynomialLens):
-        coefficients = _coefficients(model, lens, terms)
+        line = theta[:, :, 0]
+        radius, slope = lens.project(line), Lens._slope(lens, line)
+        coefficients = model.closest(line[0], radius[0], slope[0], terms)
         return model._from_tensors({"coefficients": coefficients, "theta_max": lens.theta_max})
-    best = None
-    for start in _starts(model, lens, terms, aside):
-        found, cost = _least_squares(model, start, lens.theta_max, theta, direction, goal)
-        if best is None or cost < best[1]:
-            best = found, cost
-    if best is None or not math.isfinite(best[1]):
+    found = (
+        _least_squares(model, start, lens.theta_max, theta, direction, goal)
+        for start in _starts(model, lens, terms, aside)
+    )
+    best, cost = min(found, key=lambda pair: pair[1])
+    if not math.isfinite(cost):
         degrees = math.degrees(lens.theta_max.item())
         raise ValueError(f"no {model.__name__} lens was found that reaches {degrees:.2f}°")
-    return model._from_tensors(best[0] | {"theta_max": lens.theta_max})
+    return best
 
 
 def _starts(model: type[Lens], lens: Lens, terms: int, aside: bool) -> Iterator[dict[str, Tensor]]:
     """Parameters to start from, with the shapes that all shall have."""
     slope = lens.project(1e-4 * lens.theta_max) / (1e-4 * lens.theta_max)
-    free = [name for name in model.parameters if name in model.starts]
-    for values in itertools.product(*(model.starts[name] for name in free)):
-        start = {n: slope.new_tensor([v]) for n, v in zip(free, values, strict=True)}
+    starts = {name: p.starts for name, p in model.declared.items() if p.starts}
+    for values in itertools.product(*starts.values()):
+        start = {name: slope.new_tensor([v]) for name, v in zip(starts, values, strict=True)}
         if "radial" in model.optional:
             start["radial"] = slope.new_zeros(1, terms)
         if aside:
@@ -123,13 +122,6 @@ def _starts(model: type[Lens], lens: Lens, terms: int, aside: bool) -> Iterator[
         yield start
 
 
-def _coefficients(model: type[PolynomialLens], lens: Lens, terms: int) -> Tensor:
-    theta = lens.theta_max[0] * _fractions(lens, RINGS)
-    radius = lens.project(theta[None])[0]
-    slope = torch.func.jvp(lens.project, (theta[None],), (torch.ones_like(theta)[None],))[1][0]
-    return model.closest(theta, radius, slope, terms)
-
-
 def _least_squares(
     model: type[Lens],
     start: dict[str, Tensor],
@@ -137,27 +129,28 @@ def _least_squares(
     theta: Tensor,
     direction: Tensor,
     goal: Tensor,
-) -> tuple[dict[str, Tensor], float]:
-    """Levenberg and Marquardt's method, within bounds."""
+) -> tuple[Lens, float]:
+    """The closest lens from a start by Levenberg and Marquardt's method, within bounds, and its
+    mean squared distance, infinite where none was found."""
     names = list(start)
     shapes = [start[name].shape for name in names]
     sizes = [shape.numel() for shape in shapes]
-    bounds = [model.bounds.get(name, (-math.inf, math.inf)) for name in names]
+    bounds = [model.declared[name].bounds for name in names]
     low, high = (
         torch.cat([theta.new_full((s,), b[end]) for b, s in zip(bounds, sizes, strict=True)])
         for end in (0, 1)
     )
 
-    def parameters(vector: Tensor) -> dict[str, Tensor]:
-        pieces = vector.split(sizes)
-        return {n: p.reshape(s) for n, p, s in zip(names, pieces, shapes, strict=True)}
+    def lens_of(vector: Tensor) -> Lens:
+        pieces = zip(names, vector.split(sizes), shapes, strict=True)
+        tensors = {name: piece.reshape(shape) for name, piece, shape in pieces}
+        return model._from_tensors(tensors | {"theta_max": theta_max})
 
     def miss(vector: Tensor) -> Tensor:
-        lens = model._from_tensors(parameters(vector) | {"theta_max": theta_max})
-        return (lens._flat(theta, direction) - goal).flatten()
+        return (lens_of(vector)._flat(theta, direction) - goal).flatten()
 
     def cost_of(vector: Tensor) -> float:
-        lens = model._from_tensors(parameters(vector) | {"theta_max": theta_max})
+        lens = lens_of(vector)
         rises = bool((lens.project(theta).flatten().diff() > 0).all())
         value = (lens._flat(theta, direction) - goal).square().mean().item()
         return value if rises and value >= 0 else math.inf
@@ -165,7 +158,7 @@ def _least_squares(
     vector = torch.cat([start[name].flatten() for name in names]).clamp(low, high)
     cost, damping = cost_of(vector), 1e-3
     if not math.isfinite(cost):
-        return start, math.inf
+        return lens_of(vector), math.inf
     axes = torch.eye(len(vector), dtype=vector.dtype)
     for _ in range(200):
         columns = [torch.func.jvp(miss, (vector,), (axis,)) for axis in axes]
@@ -184,4 +177,4 @@ def _least_squares(
             damping *= 10
         if cost > 0.9999 * before or cost < 1e-26:
             break
-    return parameters(vector), cost
+    return lens_of(vector), cost

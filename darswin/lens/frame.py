@@ -1,10 +1,8 @@
 """The image that lenses belong to: principal point, shape of the pixels, size; resized or cut."""
 
 import math
-import operator
 from collections.abc import Sequence
-from numbers import Real
-from typing import Any, ClassVar, Self
+from typing import Any, Self
 
 import torch
 from torch import Tensor
@@ -12,39 +10,9 @@ from torch import Tensor
 from darswin.lens.batch import LensBatch
 from darswin.ops.waiting import tensor_there
 
-FRAME = ("center", "affine", "image_size")
-# Beside theta_max, and how each is written.
-_SHAPES = {"center": (2,), "affine": (2, 2), "image_size": (2,)}
-_FORMS = {"center": "(x, y)", "affine": "(2, 2)", "image_size": "(H, W)"}
-
 
 class ImageFrame(LensBatch):
     """Lenses and where their images have them: from points around the principal point to pixels."""
-
-    common = ("theta_max", *FRAME)
-    lengths: ClassVar[tuple[str, ...]]  # those of the parameters that are in pixels
-    center: Tensor | None
-    affine: Tensor | None
-    image_size: Tensor | None
-
-    @classmethod
-    def _dims(cls, name: str) -> int:
-        return len(_SHAPES[name]) if name in _SHAPES else super()._dims(name)
-
-    def _check_frame(self) -> None:
-        for name, shape in _SHAPES.items():
-            tensor = getattr(self, name)
-            if tensor is None:
-                continue
-            if tensor.shape[1:] != shape:
-                raise ValueError(
-                    f"{name} must be {_FORMS[name]} or {('N', *shape)}, got {tuple(tensor.shape)}"
-                )
-            self._require(name, tensor.isfinite().flatten(1).all(1), "finite")
-        if self.affine is not None:
-            self._require("affine", self.affine.detach().det() != 0, "invertible")
-        if self.image_size is not None:
-            self._require("image_size", (self.image_size >= 1).all(1), "at least (1, 1)")
 
     def center_in(self, image_size: tuple[int, int] | None = None) -> Tensor:
         """(N or 1, 2) px: the principal point (x, y) in an image of (H, W)."""
@@ -65,11 +33,8 @@ class ImageFrame(LensBatch):
     def from_pixels(self, pixels: Tensor, image_size: tuple[int, int] | None = None) -> Tensor:
         """The inverse of `to_pixels`."""
         flat = self._aligned(pixels)[0] - self._row(self.center_in(image_size), pixels.dim())
-        return flat if self.affine is None else _apply(self._inverse_affine(), flat)
-
-    def _inverse_affine(self) -> Tensor:
         # `torch.linalg.inv` reads on the host whether there is one; that was checked.
-        return torch.linalg.inv_ex(self.affine).inverse
+        return flat if self.affine is None else _apply(torch.linalg.inv_ex(self.affine)[0], flat)
 
     def through_affine(self, flat: Tensor) -> Tensor:
         """`affine` @ points or offsets (N or 1, ..., 2)."""
@@ -102,8 +67,8 @@ class ImageFrame(LensBatch):
             ValueError: a scale or a size that is no image's, or an (H, W) for a lens that does not
                 know its image_size. TypeError: neither a number nor two.
         """
-        number = _number(scale)
-        if number is not None:
+        number = _plain(scale)
+        if isinstance(number, float):
             if not 0 < number < math.inf:
                 raise ValueError(f"resized must be given a finite scale above 0, got {number}")
             size = self.image_size
@@ -112,7 +77,7 @@ class ImageFrame(LensBatch):
         elif self.image_size is None:
             raise ValueError(f"resized to (H, W) = {scale} needs a lens that has an image_size")
         else:
-            size = self.theta_max.new_tensor([_size(scale)]).expand(len(self), 2)
+            size = self.theta_max.new_tensor([_image_size(number)]).expand(len(self), 2)
             down, across = (size / self.image_size).unbind(1)
         lens = self._scaled(across)
         lens.image_size = size
@@ -147,12 +112,13 @@ class ImageFrame(LensBatch):
 
     def _scaled(self, scale: Tensor) -> Self:
         """The same lens with all its lengths `scale`, (N or 1,), times as long."""
-        lengths = {}
-        for name in self.lengths:
-            value = getattr(self, name)
-            if value is not None:
-                lengths[name] = value * self._row(scale, value.dim())
-        return self.replace(**lengths)
+        return self.replace(
+            **{
+                name: value * self._row(scale, value.dim())
+                for name, value in self._tensors().items()
+                if self.declared[name].in_pixels
+            }
+        )
 
     def cropped(self, top: int, left: int, height: int, width: int) -> Self:
         """The same lens in a part of the image: `image[..., top:top + height, left:left + width]`.
@@ -163,35 +129,34 @@ class ImageFrame(LensBatch):
             ValueError: a part of no pixels, or a lens with neither a center nor an image_size.
             TypeError: what is not in whole pixels.
         """
-        top, left = (_whole(side) for side in (top, left))
-        height, width = _size((height, width))
+        top, left = _whole((top, left))
+        height, width = _image_size((height, width))
         center = self.center_in() - self.theta_max.new_tensor([left, top])
         size = self.theta_max.new_tensor([[height, width]]).expand(len(self), 2)
         return self.replace(center=center.expand(len(self), 2), image_size=size)
 
 
-def _number(value: Any) -> float | None:
-    """A number, also one of NumPy or torch; None for anything else."""
-    is_number = isinstance(value, Real) or getattr(value, "ndim", None) == 0
-    return float(value) if is_number else None
-
-
-def _whole(value: Any) -> int:
+def _plain(value: Any) -> Any:
+    """A number as a float, several as a list: of Python, NumPy or torch."""
     try:
-        return operator.index(value)
-    except TypeError:
-        if isinstance(value, Real) and float(value).is_integer():
-            return int(float(value))
-        raise TypeError(f"an image has whole pixels, got {value!r}") from None
+        return torch.as_tensor(value, dtype=torch.float64).tolist()
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise TypeError(f"an image has whole pixels, got {value!r}") from error
 
 
-def _size(size: Any) -> tuple[int, int]:
-    """(H, W) of an image, or ValueError."""
-    try:
-        height, width = size
-    except (TypeError, ValueError):
-        raise TypeError(f"an image's size must be (H, W), got {size!r}") from None
-    height, width = _whole(height), _whole(width)
+def _whole(sides: Any) -> tuple[int, int]:
+    """Two numbers of pixels."""
+    numbers = _plain(sides)
+    if not isinstance(numbers, list) or len(numbers) != 2:
+        raise TypeError(f"an image's size must be (H, W), got {sides!r}")
+    if not all(isinstance(number, float) and number.is_integer() for number in numbers):
+        raise TypeError(f"an image has whole pixels, got {sides!r}")
+    return int(numbers[0]), int(numbers[1])
+
+
+def _image_size(size: Any) -> tuple[int, int]:
+    """(H, W) of an image of one pixel or more."""
+    height, width = _whole(size)
     if height < 1 or width < 1:
         raise ValueError(f"an image's (H, W) must be at least (1, 1), got {(height, width)}")
     return height, width

@@ -1,41 +1,54 @@
 """Lenses of one focal length: the projections that a lens designer aims at."""
 
 import math
-from typing import ClassVar
+from collections.abc import Callable
+from typing import ClassVar, Self
 
 import torch
 from torch import Tensor
 
-from darswin.lens.base import MARGIN
-from darswin.lens.batch import Number
-from darswin.lens.focal import FocalLens
+from darswin.lens.base import MARGIN, Lens
+from darswin.lens.parameter import Number, Parameter, bind, signature
+
+
+class FocalLens(Lens, register=False):
+    """Base of the lenses whose only length is the focal length, f > 0, px: r = f u(θ)."""
+
+    focal = Parameter(low=0, open=True, in_pixels=True, bounds=(1e-9, math.inf))
+
+    @classmethod
+    def from_fov(cls, *arguments: Number | None, **named: Number | None) -> Self:
+        """The lens whose full field of view fills a circle.
+
+        Args:
+            arguments: the model's parameters but `focal`, in the order of its constructor, then
+                `fov`, rad, the full field of view, `radius`, px, of the circle, and `center`, as
+                `Lens` has it.
+            named: any of them by name, also `affine`, `image_size` and what is optional.
+
+        Raises what the constructor does.
+        """
+        own = (name for name in cls.parameters if name != "focal")
+        others = (*cls.optional, "affine", "image_size")
+        taken = signature((*own, "fov", "radius"), ("center",), others)
+        rows = cls._expanded(bind(f"{cls.__name__}.from_fov", taken, arguments, named))
+        theta_max, radius = rows.pop("fov") / 2, rows.pop("radius")
+        unit = rows | {"focal": torch.ones_like(radius), "theta_max": theta_max}
+        focal = cls._from_tensors(unit)._scale_to(radius)
+        return cls(**rows, focal=focal, theta_max=theta_max)
+
+    def _scale_to(self, radius: Tensor) -> Tensor:
+        """(N,): how many times larger the lens must be for θ_max to land at a radius."""
+        return radius / self.r_max
 
 
 class IdealLens(FocalLens, register=False):
-    """Base of the lenses r = f u(θ) that have no other parameter.
+    """Base of the lenses r = f u(θ) that have no other parameter."""
 
-    Args:
-        focal: f > 0, px. Others: as `Lens`.
-    """
-
-    def __init__(
-        self,
-        focal: Number,
-        theta_max: Number | None = None,
-        center: Number | None = None,
-        **frame: Number | None,
-    ):
-        super().__init__(theta_max, center, focal=focal, **frame)
-
-    @staticmethod
-    def _rise(theta: Tensor) -> Tensor:
-        """u(θ)."""
-        raise NotImplementedError
-
-    @staticmethod
-    def _fall(rise: Tensor) -> Tensor:
-        """θ at which u takes a value."""
-        raise NotImplementedError
+    _rise: ClassVar[Callable[..., Tensor]]  # u(θ)
+    _fall: ClassVar[Callable[..., Tensor]]  # θ at which u takes a value
+    _end = math.pi  # θ where u stops rising, or becomes infinite
+    _top: float | None = None  # u there, if it is finite
 
     def project(self, theta: Number) -> Tensor:
         theta, focal = self._aligned(theta, "focal")
@@ -46,9 +59,6 @@ class IdealLens(FocalLens, register=False):
         # Rounding can take u above its largest value, which no angle has.
         return self._fall(rise if self._top is None else rise.clamp(max=self._top))
 
-    _end = math.pi  # θ where u stops rising, or becomes infinite
-    _top: float | None = None  # u there, if it is finite
-
     @property
     def theta_limit(self) -> Tensor:
         return torch.full_like(self.focal, self._end - MARGIN)
@@ -58,52 +68,30 @@ class Perspective(IdealLens):
     """r = f tan θ, θ < 90°: the pinhole camera. Arguments: `focal`, and those of `Lens`."""
 
     _end = math.pi / 2
-
-    @staticmethod
-    def _rise(theta: Tensor) -> Tensor:
-        return torch.tan(theta)
-
-    @staticmethod
-    def _fall(rise: Tensor) -> Tensor:
-        return torch.atan(rise)
+    _rise = staticmethod(torch.tan)
+    _fall = staticmethod(torch.atan)
 
 
 class Equidistant(IdealLens):
     """r = f θ: equal angles are equal steps. Arguments: `focal`, and those of `Lens`."""
 
-    @staticmethod
-    def _rise(theta: Tensor) -> Tensor:
-        return theta
-
-    @staticmethod
-    def _fall(rise: Tensor) -> Tensor:
-        return rise
+    _rise = staticmethod(lambda theta: theta)
+    _fall = staticmethod(lambda rise: rise)
 
 
 class Equisolid(IdealLens):
     """r = 2 f sin(θ/2): equal solid angles are equal areas. Arguments: `focal`, those of `Lens`."""
 
     _top = 2.0
-
-    @staticmethod
-    def _rise(theta: Tensor) -> Tensor:
-        return 2 * torch.sin(theta / 2)
-
-    @staticmethod
-    def _fall(rise: Tensor) -> Tensor:
-        return 2 * torch.asin(rise / 2)
+    _rise = staticmethod(lambda theta: 2 * torch.sin(theta / 2))
+    _fall = staticmethod(lambda rise: 2 * torch.asin(rise / 2))
 
 
 class Stereographic(IdealLens):
     """r = 2 f tan(θ/2): keeps angles between lines. Arguments: `focal`, and those of `Lens`."""
 
-    @staticmethod
-    def _rise(theta: Tensor) -> Tensor:
-        return 2 * torch.tan(theta / 2)
-
-    @staticmethod
-    def _fall(rise: Tensor) -> Tensor:
-        return 2 * torch.atan(rise / 2)
+    _rise = staticmethod(lambda theta: 2 * torch.tan(theta / 2))
+    _fall = staticmethod(lambda rise: 2 * torch.atan(rise / 2))
 
 
 class Orthographic(IdealLens):
@@ -111,14 +99,8 @@ class Orthographic(IdealLens):
 
     _end = math.pi / 2
     _top = 1.0
-
-    @staticmethod
-    def _rise(theta: Tensor) -> Tensor:
-        return torch.sin(theta)
-
-    @staticmethod
-    def _fall(rise: Tensor) -> Tensor:
-        return torch.asin(rise)
+    _rise = staticmethod(torch.sin)
+    _fall = staticmethod(torch.asin)
 
 
 class FieldOfView(FocalLens):
@@ -130,24 +112,7 @@ class FieldOfView(FocalLens):
     Source: Devernay and Faugeras, MVA 2001, sec. 3.1.
     """
 
-    parameters = ("omega", "focal")
-    starts: ClassVar = {"omega": (1.0,)}
-    bounds: ClassVar = {**FocalLens.bounds, "omega": (1e-3, 3.14)}
-    omega: Tensor
-
-    def __init__(
-        self,
-        omega: Number,
-        focal: Number,
-        theta_max: Number | None = None,
-        center: Number | None = None,
-        **frame: Number | None,
-    ):
-        super().__init__(theta_max, center, omega=omega, focal=focal, **frame)
-
-    def _validate(self) -> None:
-        self._require("omega", (self.omega > 0) & (self.omega < math.pi), "in (0, π)")
-        super()._validate()
+    omega = Parameter(low=0, high=math.pi, open=True, starts=(1.0,), bounds=(1e-3, 3.14))
 
     def project(self, theta: Number) -> Tensor:
         theta, omega, focal = self._aligned(theta, "omega", "focal")

@@ -29,7 +29,7 @@ def in_upright_picture(lens: Lens, size: tuple[int, int], orientation: int) -> L
         ValueError: a picture of another shape than the calibration's.
     """
     try:
-        return turned(lens.in_picture(stored_size(size, orientation)), orientation)
+        return upright(lens.in_picture(stored_size(size, orientation)), orientation)
     except ValueError as error:
         try:
             return lens.in_picture(size)
@@ -40,7 +40,7 @@ def in_upright_picture(lens: Lens, size: tuple[int, int], orientation: int) -> L
             raise ValueError(f"{error}{turn}") from error
 
 
-def turned(lens: Lens, orientation: int) -> Lens:
+def upright(lens: Lens, orientation: int) -> Lens:
     """The lens of the upright picture, from that of the picture as it is stored; exact.
 
     Args:
@@ -64,7 +64,7 @@ def turned(lens: Lens, orientation: int) -> Lens:
     changed = {"image_size": size, "center": off_middle @ turn.T + (size.flip(1) - 1) / 2}
     if lens.affine is not None:
         changed["affine"] = turn @ lens.affine @ turn.T
-    return lens.replace(**changed, **lens._turned(turn))
+    return lens.replace(**changed, **lens._rotated_terms(turn))
 
 
 def rotated(lens: Lens, angle: float) -> tuple[Lens, Tensor]:
@@ -92,4 +92,4 @@ def rotated(lens: Lens, angle: float) -> tuple[Lens, Tensor]:
         affine = lens.affine[0].detach().double()
         moves = affine @ turn @ torch.linalg.inv(affine)
     matrix = torch.cat((moves, (center - moves @ center)[:, None]), 1)
-    return lens.replace(**lens._turned(turn.to(lens.theta_max))), matrix.cpu()
+    return lens.replace(**lens._rotated_terms(turn.to(lens.theta_max))), matrix.cpu()

@@ -1,13 +1,21 @@
-"""What a lens says of every pixel of an image: its ray, its solid angle, and z from distance.
+"""All pixels of an image: their rays and solid angles, z from distance, and what another lens sees.
 
-Nothing here depends on what the image shows.
+A map tells for each pixel of a target where in the source's image its ray lands: (..., 2), x and y,
+and (`OUTSIDE`, `OUTSIDE`) where no ray does. Nothing here depends on what the image shows.
 """
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
-from darswin.lens.base import Lens, length_of
-from darswin.lens.plane import determinant
+from darswin.lens.base import Lens
+from darswin.lens.ideal import Perspective
+from darswin.lens.solve import determinant, length_of
+from darswin.ops.waiting import tensor_there
+
+__all__ = ["distance_to_z", "pixel_rays", "reproject", "solid_angles", "z_to_distance"]
+
+OUTSIDE = -10.0  # px: beyond any image, also for an interpolation of several pixels
 
 
 def pixel_rays(lens: Lens, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
@@ -20,23 +28,15 @@ def pixel_rays(lens: Lens, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
         θ (N, H, W), rad, NaN where no ray lands or the lens does not see it; and (cos φ, sin φ),
         (N, H, W, 2).
     """
-    height, width = size
     like = lens.theta_max
-    y, x = torch.meshgrid(
-        torch.arange(height, dtype=like.dtype, device=like.device),
-        torch.arange(width, dtype=like.dtype, device=like.device),
-        indexing="ij",
-    )
-    theta, direction = lens.rays(torch.stack((x, y), -1)[None], size)
+    rows, columns = (torch.arange(side, dtype=like.dtype, device=like.device) for side in size)
+    pixels = torch.stack(torch.meshgrid(columns, rows, indexing="xy"), -1)
+    theta, direction = lens.rays(pixels[None], size)
     return torch.where(lens.sees(theta), theta, torch.nan), direction
 
 
 def pixel_angles(lens: Lens, size: tuple[int, int]) -> Tensor:
-    """θ at the pixels' centres, (N, H, W), rad; NaN where no ray lands, and beyond θ_max.
-
-    Args:
-        lens: N lenses. size: (H, W) of the image.
-    """
+    """θ of `pixel_rays`."""
     return pixel_rays(lens, size)[0]
 
 
@@ -109,3 +109,66 @@ def _cosines(values: Tensor, lens: Lens) -> Tensor:
     theta = pixel_angles(lens, (values.shape[-2], values.shape[-1]))
     cosine = torch.nan_to_num(torch.cos(theta)).to(values)
     return cosine[:, None] if values.dim() == 4 else cosine
+
+
+def reprojection(
+    source: Lens, source_size: tuple[int, int], target: Lens, size: tuple[int, int]
+) -> Tensor:
+    """The map (N, H, W, 2) of `target`'s pixels in `source`'s image; `OUTSIDE` where a ray is
+    beyond either θ_max. Differentiable in both lenses; the sizes are (H, W) of their images."""
+    theta, direction = pixel_rays(target, size)
+    return as_map(source.seen_pixels(theta, direction, source_size))
+
+
+def radial_reprojection(source: Lens, target: Lens, radii: Tensor) -> Tensor:
+    """`reprojection` of two radial lenses without `affine`, along one azimuth.
+
+    For radii (1, K) px, above 0, in the image of `target`, one lens: how many times as far from
+    its own principal point `source` has the same ray; NaN where it is beyond either θ_max.
+    """
+    theta = target.unproject(radii)
+    seen = target.sees(theta) & source.sees(theta)
+    return torch.where(seen, source.project(torch.where(seen, theta, 0.0)) / radii, torch.nan)
+
+
+def as_map(pixels: Tensor) -> Tensor:
+    """Pixels (..., 2) with `OUTSIDE` in place of NaN."""
+    return torch.where(pixels.isnan(), OUTSIDE, pixels)
+
+
+def reproject(images: Tensor, source: Lens, target: Lens, size: tuple[int, int]) -> Tensor:
+    """The view of `target` on what `source` saw, bilinear; 0 beyond either θ_max.
+
+    Runs on the images' device. Gradients go to the images and both lenses.
+
+    Args:
+        images: (B, C, H, W), floating point, taken with `source`.
+        source, target: B lenses each, or one.
+        size: (H', W') of the view.
+
+    Returns:
+        (B, C, H', W').
+    """
+    height, width = images.shape[2:]
+    return sample_at(images, reprojection(source, (height, width), target, size))
+
+
+def sample_at(images: Tensor, pixels: Tensor) -> Tensor:
+    """Images (B, C, H, W) read at pixels (B or 1, H', W', 2), bilinear and 0 outside, on the
+    images' device and in their dtype → (B, C, H', W')."""
+    height, width = images.shape[2:]
+    exact = torch.promote_types(images.dtype, torch.float32)  # bfloat16 has no half pixels
+    there = pixels.to(images.device, exact)
+    # -1 and 1 are the image's edges, half a pixel beyond the centres of its outermost pixels.
+    places = (2 * there + 1) / tensor_there((width, height), there) - 1
+    places = places.expand(images.shape[0], -1, -1, -1)
+    view = F.grid_sample(images.to(exact), places, padding_mode="zeros", align_corners=False)
+    return view.to(images.dtype)
+
+
+def perspective_view(lens: Lens, size: tuple[int, int], max_fov: float) -> Perspective:
+    """The perspective lens that shows a lens's field of view in (H, W), with θ_max at half the
+    shorter side; of a wider lens than `max_fov` (rad, below π) it shows the middle."""
+    theta_max = lens.theta_max.clamp(max=max_fov / 2)
+    focal = min(size) / 2 / torch.tan(theta_max)
+    return Perspective._from_tensors(dict(focal=focal, theta_max=theta_max, center=None))

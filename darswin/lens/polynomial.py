@@ -6,8 +6,8 @@ import torch
 from torch import Tensor
 
 from darswin.lens.base import MARGIN, Lens
-from darswin.lens.batch import Number
-from darswin.lens.inverse import inverse, rising_limit
+from darswin.lens.parameter import Number, Parameter
+from darswin.lens.solve import inverse, rising_limit
 
 
 def horner(x: Tensor, coefficients: Tensor) -> Tensor:
@@ -25,30 +25,13 @@ def slopes(coefficients: Tensor, first: int, step: int = 1) -> Tensor:
 
 
 class PolynomialLens(Lens, register=False):
-    """Base of the lenses that are all coefficients, lowest power first.
+    """Base of the lenses that are all coefficients, (n,) or (N, n), lowest power first."""
 
-    Args:
-        coefficients: (n,) or (N, n). Others: as `Lens`.
-    """
-
-    parameters = ("coefficients",)
-    lists = ("coefficients",)
-    lengths = ("coefficients",)
-    coefficients: Tensor
-
-    def __init__(
-        self,
-        coefficients: Number,
-        theta_max: Number | None = None,
-        center: Number | None = None,
-        **frame: Number | None,
-    ):
-        super().__init__(theta_max, center, coefficients=coefficients, **frame)
+    coefficients = Parameter(shape=(None,), in_pixels=True)
 
     def _validate(self) -> None:
         if self.coefficients.shape[1] < 1:
             raise ValueError("coefficients must be at least one a lens, got none")
-        self._require("coefficients", self.coefficients.isfinite().all(1), "finite")
 
     @property
     def theta_limit(self) -> Tensor:

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from darswin.lens.base import Lens
-from darswin.lens.inverse import inverse
+from darswin.lens.solve import inverse
 from darswin.ops.waiting import readable
 
 Spacing = Literal["theta", "tan", "g", "radius"]

@@ -1,14 +1,13 @@
 """Lenses that project by way of a sphere or an ellipsoid, with a closed inverse."""
 
 import math
-from typing import ClassVar
 
 import torch
 from torch import Tensor
 
 from darswin.lens.base import MARGIN
-from darswin.lens.batch import Number
-from darswin.lens.focal import FocalLens
+from darswin.lens.ideal import FocalLens
+from darswin.lens.parameter import Number, Parameter
 
 # Where `fit` starts from.
 XI_STARTS = (1.0, -0.2, 0.5, 2.0)
@@ -24,25 +23,7 @@ class Spherical(FocalLens):
     Source: DarSwin, ICCV 2023, eq. 5; Barreto, CVIU 2006.
     """
 
-    parameters = ("xi", "focal")
-    starts: ClassVar = {"xi": XI_STARTS}
-    bounds: ClassVar = {**FocalLens.bounds, "xi": (0.0, math.inf)}
-    xi: Tensor
-    focal: Tensor
-
-    def __init__(
-        self,
-        xi: Number,
-        focal: Number,
-        theta_max: Number | None = None,
-        center: Number | None = None,
-        **frame: Number | None,
-    ):
-        super().__init__(theta_max, center, xi=xi, focal=focal, **frame)
-
-    def _validate(self) -> None:
-        self._require("xi", (self.xi >= 0) & self.xi.isfinite(), "finite and at least 0")
-        super()._validate()
+    xi = Parameter(low=0, starts=XI_STARTS)
 
     @property
     def theta_limit(self) -> Tensor:
@@ -71,30 +52,11 @@ class EnhancedUnified(FocalLens):
     Source: Khomutenko, Garcia and Martinet, RA-L 2016.
     """
 
-    parameters = ("alpha", "beta", "focal")
-    starts: ClassVar = {"alpha": ALPHA_STARTS, "beta": (1.0,)}
-    bounds: ClassVar = {**FocalLens.bounds, "alpha": (0.0, 1.0), "beta": (1e-6, math.inf)}
-    alpha: Tensor
-    beta: Tensor
-    focal: Tensor
-
-    def __init__(
-        self,
-        alpha: Number,
-        beta: Number,
-        focal: Number,
-        theta_max: Number | None = None,
-        center: Number | None = None,
-        **frame: Number | None,
-    ):
-        super().__init__(theta_max, center, alpha=alpha, beta=beta, focal=focal, **frame)
+    alpha = Parameter(low=0, high=1, starts=ALPHA_STARTS)
+    beta = Parameter(starts=(1.0,), bounds=(1e-6, math.inf))
 
     def _validate(self) -> None:
-        self._require("alpha", (self.alpha >= 0) & (self.alpha <= 1), "in [0, 1]")
-        self._require(
-            "beta", (self.beta != 0) & self.beta.isfinite(), "finite and above 0, or below"
-        )
-        super()._validate()
+        self._require("beta", self.beta != 0, "finite and above 0, or below")
 
     @property
     def theta_limit(self) -> Tensor:
@@ -129,28 +91,8 @@ class DoubleSphere(FocalLens):
     Source: Usenko, Demmel and Cremers, 3DV 2018.
     """
 
-    parameters = ("xi", "alpha", "focal")
-    starts: ClassVar = {"xi": XI_STARTS, "alpha": ALPHA_STARTS}
-    bounds: ClassVar = {**FocalLens.bounds, "xi": (-0.999, math.inf), "alpha": (0.0, 1.0)}
-    xi: Tensor
-    alpha: Tensor
-    focal: Tensor
-
-    def __init__(
-        self,
-        xi: Number,
-        alpha: Number,
-        focal: Number,
-        theta_max: Number | None = None,
-        center: Number | None = None,
-        **frame: Number | None,
-    ):
-        super().__init__(theta_max, center, xi=xi, alpha=alpha, focal=focal, **frame)
-
-    def _validate(self) -> None:
-        self._require("xi", (self.xi > -1) & self.xi.isfinite(), "finite and above -1")
-        self._require("alpha", (self.alpha >= 0) & (self.alpha <= 1), "in [0, 1]")
-        super()._validate()
+    xi = Parameter(low=-1, open=True, starts=XI_STARTS, bounds=(-0.999, math.inf))
+    alpha = Parameter(low=0, high=1, starts=ALPHA_STARTS)
 
     @property
     def theta_limit(self) -> Tensor:

@@ -8,7 +8,7 @@ from torch.utils import _pytree as pytree
 from darswin.layers.sampling import check_count, check_images, check_lens
 from darswin.lens import Lens
 from darswin.lens.concentric import read_square, square_places, square_view
-from darswin.lens.reprojection import sample_at
+from darswin.lens.pixels import sample_at
 from darswin.lens.spacing import SPACINGS, Spacing
 from darswin.models.stages import Pair
 from darswin.ops.checks import as_int

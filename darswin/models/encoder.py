@@ -11,7 +11,7 @@ from darswin.layers.grid import PolarGrid
 from darswin.layers.linear import Linear
 from darswin.layers.sampling import check_count, check_images
 from darswin.lens import Lens
-from darswin.lens.reprojection import sample_at
+from darswin.lens.pixels import sample_at
 from darswin.models.base import Model, init_weights
 from darswin.models.features import FeatureInfo, feature_info, take_indices
 from darswin.models.stages import Pair, StagePlan, check_depths, make_stages, plan_stages

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from darswin.layers.grid import PolarGrid
 from darswin.lens import Lens, Number, Spherical
+from darswin.lens.parameter import Parameter
 from darswin.lens.spacing import check_tan
 from darswin.models.stages import Pair, StagePlan
 
@@ -28,17 +29,10 @@ class OfficialPolynomial(Lens, register=False):
         radius: px, of the image circle: half the image's side.
     """
 
-    parameters = ("coefficients", "radius")
-    lists = ("coefficients",)
-    lengths = ("radius",)
-    coefficients: Tensor
-    radius: Tensor
-
-    def __init__(self, coefficients: Number, radius: Number, center: Number | None = None):
-        super().__init__(None, center, coefficients=coefficients, radius=radius)
+    coefficients = Parameter(shape=(4,))
+    radius = Parameter(low=0, open=True, in_pixels=True)
 
     def _validate(self) -> None:
-        self._require("radius", self.radius > 0, "greater than 0")
         self._require(
             "coefficients", (self._table()[1].diff(dim=1) > 0).all(1), "such that θ rises"
         )

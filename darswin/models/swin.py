@@ -8,7 +8,7 @@ from torch import Tensor
 from darswin.layers.attention import WindowAttention
 from darswin.layers.sampling import check_lens
 from darswin.lens import Lens
-from darswin.lens.reprojection import perspective_view, reprojection
+from darswin.lens.pixels import perspective_view, reprojection
 from darswin.models.encoder import ImageEncoder, Prepared
 from darswin.models.registry import Presets, register_model
 from darswin.models.stages import Pair, StagePlan

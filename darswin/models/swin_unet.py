@@ -11,7 +11,7 @@ from torch import Tensor
 from darswin.layers.sampling import check_count, check_lens
 from darswin.lens import Lens
 from darswin.lens.concentric import read_square
-from darswin.lens.reprojection import reprojection, sample_at
+from darswin.lens.pixels import reprojection, sample_at
 from darswin.lens.spacing import SPACINGS, Spacing
 from darswin.models.adapter import SquareView, prepare_square
 from darswin.models.dense import DenseModel, DenseTask

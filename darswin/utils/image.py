@@ -32,7 +32,7 @@ def read_oriented(path: str | Path, channels: int = 3) -> tuple[np.ndarray, int]
     """`read_image`, and the EXIF orientation that it was turned from, which its lens needs.
 
     Returns:
-        The upright picture, and 1 to 8; see `darswin.lens.orientation.turned`.
+        The upright picture, and 1 to 8; see `darswin.lens.orientation.upright`.
 
     Raises:
         BrokenImageError: as `read_image`; an orientation that cannot be read.

@@ -23,7 +23,7 @@ from torch import Tensor
 from darswin.layers.grid import PolarGrid
 from darswin.layers.sampling import PolarSample
 from darswin.lens import Lens
-from darswin.lens.reprojection import OUTSIDE
+from darswin.lens.pixels import OUTSIDE
 from darswin.ops import polar_sample
 from darswin.utils.files import replace_file
 from darswin.viz.report import SIDES, beyond_lens, pixels_per_degree

@@ -23,7 +23,7 @@ from torch import Tensor
 
 from darswin.data.warp import remap
 from darswin.lens import Lens
-from darswin.lens.reprojection import as_map
+from darswin.lens.pixels import as_map
 
 
 def perspective(
@@ -98,7 +98,7 @@ def view_map(lens: Lens, rays: Tensor, image_size: tuple[int, int] | None = None
             point of a lens that has none.
 
     Returns:
-        (H, W, 2) float32, x and y; `darswin.lens.reprojection.OUTSIDE` beyond θ_max.
+        (H, W, 2) float32, x and y; `darswin.lens.pixels.OUTSIDE` beyond θ_max.
 
     Raises:
         ValueError: more than one lens, or rays of another shape.

@@ -142,7 +142,7 @@ def test_official_polynomial():
     assert OfficialPolynomial([7.7, 7.7, 7.7, 7.7], 32.0).theta_max > 30  # as in the released data
     with pytest.raises(ValueError, match="coefficients must be such that θ rises"):
         OfficialPolynomial([1.0, -3.0, 0.5, 3.0], 32.0)
-    with pytest.raises(ValueError, match="radius must be greater than 0"):
+    with pytest.raises(ValueError, match="radius must be finite and above 0"):
         OfficialPolynomial([1.0, 0.0, 0.0, 0.0], 0.0)
 
 

@@ -7,7 +7,7 @@ from frames import CALIBRATIONS, WOODSCAPE
 
 from darswin.data import Calibrations
 from darswin.lens import Tabulated, from_dict, load, load_all
-from darswin.lens.orientation import turned
+from darswin.lens.orientation import upright
 
 SIZE = (121, 160)
 SPHERICAL = {"model": "Spherical", "xi": 0.5, "focal": 60.0, "theta_max": 1.4}
@@ -111,7 +111,7 @@ def test_lenses_of_several_models_are_curves(root):
 
 def test_a_turned_picture_has_a_turned_lens(root):
     lens = Calibrations(WOODSCAPE, root).lens_of(root / "a/0.png", SIZE[::-1], 6)
-    same(lens, turned(load(WOODSCAPE).in_picture(SIZE), 6))
+    same(lens, upright(load(WOODSCAPE).in_picture(SIZE), 6))
 
 
 @pytest.mark.parametrize(

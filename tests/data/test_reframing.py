@@ -16,8 +16,7 @@ from darswin.data.reframing import Crop, part, resized, through, turned
 from darswin.data.scenes import Scene
 from darswin.data.turning import Turn, turned_picture
 from darswin.lens import BrownConrady, Equidistant, Mei, OCam, Polynomial, Spherical, load
-from darswin.lens.pixels import pixel_angles
-from darswin.lens.reprojection import reprojection
+from darswin.lens.pixels import pixel_angles, reprojection
 
 SIZE = (300, 400)
 LENSES = {

@@ -14,7 +14,7 @@ from darswin.data.sampling import TrainingOrder
 from darswin.data.sources import Arrays
 from darswin.data.turning import RandomTurns, Turn, turned_picture
 from darswin.lens import BrownConrady, Equidistant, KannalaBrandt, load
-from darswin.lens.orientation import turned
+from darswin.lens.orientation import upright
 
 SIZE = (120, 160)
 # Oblong and skewed pixels, an off-middle principal point, terms that are not radial.
@@ -66,7 +66,7 @@ def test_only_what_must_turn_with_a_picture_does():
         LENSES["tangential"]
     )
     lens = turned_picture(image, LENSES["oblong"], TURNS[0])[1]
-    assert str(lens) == str(turned(LENSES["oblong"], 2))
+    assert str(lens) == str(upright(LENSES["oblong"], 2))
 
 
 def test_mirrored_pixels_are_the_same_pixels():

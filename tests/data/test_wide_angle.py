@@ -11,7 +11,7 @@ from darswin.data.samples import IMAGENET_MEAN, IMAGENET_STD, Draw
 from darswin.data.sources import Arrays, ImageFiles
 from darswin.data.wide_angle import PAPER_FOV
 from darswin.lens import Perspective, Spherical
-from darswin.lens.reprojection import OUTSIDE, reprojection
+from darswin.lens.pixels import OUTSIDE, reprojection
 from darswin.utils.image import BrokenImageError
 
 

@@ -9,7 +9,7 @@ import torch
 
 from darswin import create_model
 from darswin.deploy.export import export_onnx, export_program
-from darswin.lens import Polynomial, Spherical, inverse
+from darswin.lens import Polynomial, Spherical, solve
 from darswin.ops import _module
 
 SPHERICAL = Spherical.from_fov([0.2, 0.9], 2.6, 16.0)
@@ -50,7 +50,7 @@ def tensors_of(lens):
 )
 def test_program(name, options, lens, monkeypatch):
     # Each of Newton's steps is 60 nodes; these radii need no more of them.
-    monkeypatch.setattr(inverse, "_STEPS", 8)
+    monkeypatch.setattr(solve, "_STEPS", 8)
     model = short(name, **options)
     program = export_program(model, *batch_of(lens, 1)[:2]).module()
     for count in (1, 2, 5):

@@ -17,7 +17,7 @@ def test_wrong_types():
         Perspective("wide", 1.0)
     with pytest.raises(TypeError, match="xi must be a number"):
         Spherical(object(), 1.0, 1.0)
-    with pytest.raises(TypeError, match=r"Spherical takes xi, focal, theta_max, .* got thetamax"):
+    with pytest.raises(TypeError, match=r"Spherical\(xi, focal, theta_max=None, .*\): .*thetamax"):
         Spherical(0.5, 1.0, thetamax=1.0)
 
 

@@ -13,7 +13,7 @@ from darswin.lens.concentric import (
     square_to_disc,
     square_view,
 )
-from darswin.lens.reprojection import OUTSIDE
+from darswin.lens.pixels import OUTSIDE
 from darswin.lens.spacing import SPACINGS
 
 f64 = torch.float64

@@ -7,7 +7,7 @@ import torch
 from lens_examples import example, f64
 
 from darswin.lens import MODELS, Equidistant, Mei, Perspective, Polynomial, Spherical
-from darswin.lens.focal import FocalLens
+from darswin.lens.ideal import FocalLens
 
 
 def test_spherical_has_the_papers_focal_lengths():
@@ -42,11 +42,13 @@ def test_arguments_of_a_lens_of_a_field_of_view():
         lambda: Spherical.from_fov(0.5, 2.0, 30.0, None, 1.0),
         lambda: Spherical.from_fov(0.5, 2.0, 30.0, xi=0.5),
     ):
-        with pytest.raises(TypeError, match="from_fov takes xi, fov, radius, center, got"):
+        with pytest.raises(
+            TypeError, match=r"Spherical.from_fov\(xi, fov, radius, center=None, .*\): "
+        ):
             wrong()
     with pytest.raises(TypeError, match="focal"):
         Spherical.from_fov(0.5, 2.0, 30.0, focal=3.0)
-    with pytest.raises(TypeError, match=r"takes xi, focal, .* got zeta"):
+    with pytest.raises(TypeError, match="zeta"):
         Spherical.from_fov(0.5, 2.0, 30.0, zeta=3.0)
     with pytest.raises(ValueError, match="focal must be"):
         Perspective.from_fov(math.pi + 0.1, 10.0)

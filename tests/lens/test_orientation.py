@@ -11,7 +11,7 @@ from darswin.cli import lens as cli
 from darswin.lens import MODELS, BrownConrady, Equidistant, Fisheye624, KannalaBrandt, Mei, save
 from darswin.lens.base import Lens
 from darswin.lens.distorted import DistortedLens
-from darswin.lens.orientation import in_upright_picture, rotated, stored_size, turned
+from darswin.lens.orientation import in_upright_picture, rotated, stored_size, upright
 from darswin.viz import plot
 
 f64 = torch.float64
@@ -54,14 +54,14 @@ lenses = st.builds(
 
 @given(lenses, st.integers(1, 8), st.floats(0.01, 1.1), st.floats(-3.1, 3.1))
 def test_a_ray_lands_where_its_pixel_went(lens, orientation, theta, azimuth):
-    upright = turned(lens, orientation)
-    assert stored_size(tuple(upright.image_size[0].int().tolist()), orientation) == SIZE
+    oriented = upright(lens, orientation)
+    assert stored_size(tuple(oriented.image_size[0].int().tolist()), orientation) == SIZE
     direction = torch.tensor([[np.cos(azimuth), np.sin(azimuth)]], dtype=f64)
     origin = torch.zeros(2, dtype=f64)
     turn = from_stored(direction, orientation) - from_stored(origin, orientation)
     theta = torch.tensor([theta], dtype=f64)
     expected = from_stored(lens.pixels(theta, direction), orientation)
-    torch.testing.assert_close(upright.pixels(theta, turn), expected, atol=1e-9, rtol=0)
+    torch.testing.assert_close(oriented.pixels(theta, turn), expected, atol=1e-9, rtol=0)
 
 
 def test_every_model_that_moves_rays_aside_is_among_them():
@@ -85,7 +85,7 @@ def test_a_lens_is_shown_in_the_picture_that_exif_turns(tmp_path, monkeypatch, o
     cli.show(str(tmp_path / "lens.json"), str(tmp_path / "p.jpg"))
     ((picture, seen),) = drawn
     assert picture.shape[:2] == ((64, 48) if orientation == 6 else (48, 64))
-    expected = turned(lens, orientation)
+    expected = upright(lens, orientation)
     torch.testing.assert_close(seen.center.float(), expected.center)
     assert torch.equal(seen.image_size.float(), expected.image_size)
 
@@ -101,9 +101,9 @@ def test_a_calibration_fits_the_stored_picture_or_else_the_upright_one():
     ):
         in_upright_picture(lens, (50, 50), 8)
     with pytest.raises(ValueError, match="orientation must be 1 to 8, got 9"):
-        turned(lens, 9)
+        upright(lens, 9)
     with pytest.raises(ValueError, match="needs an image_size"):
-        turned(Equidistant(20.0), 6)
+        upright(Equidistant(20.0), 6)
 
 
 @given(lenses, st.floats(-3.2, 3.2), st.floats(0.01, 1.1), st.floats(-3.1, 3.1))

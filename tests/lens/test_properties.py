@@ -35,7 +35,7 @@ def lenses(draw, radial=False):
             steps = rows(draw, 0.01, 0.4, count, 6)
             most = 1 if key == "angles" else draw(st.floats(1, 2000))
             values[key] = [[0.0] + [most * sum(row[: k + 1]) for k in range(6)] for row in steps]
-        elif model._dims(key):
+        elif len(model.declared[key].shape):
             width = COUNTS.get(key) or draw(st.integers(1, 4))
             values[key] = rows(draw, *RANGES[key], count, width)
         else:
@@ -164,7 +164,7 @@ def test_any_numbers_make_a_lens_that_rises_or_an_error_in_a_sentence(name, data
         width = data.draw(st.integers(0, 5))
         values[key] = (
             data.draw(st.lists(numbers, min_size=width, max_size=width))
-            if model._dims(key)
+            if len(model.declared[key].shape)
             else data.draw(numbers)
         )
     if data.draw(st.booleans()):

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from darswin.lens import KannalaBrandt, Mei, Perspective, Polynomial, Spherical
-from darswin.lens.reprojection import OUTSIDE, perspective_view, reproject, reprojection
+from darswin.lens.pixels import OUTSIDE, perspective_view, reproject, reprojection
 
 
 def test_a_ray_keeps_its_angles():

@@ -5,7 +5,7 @@ import torch
 
 from darswin import create_model
 from darswin.lens import Perspective, Polynomial, Spherical
-from darswin.lens.reprojection import reproject
+from darswin.lens.pixels import reproject
 from darswin.ops import use_reference
 
 LENS = Spherical.from_fov([0.2, 0.9], 2.0, 16.0)

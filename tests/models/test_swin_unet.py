@@ -4,7 +4,7 @@ import torch.nn.functional as F
 
 from darswin import create_model
 from darswin.lens import Perspective, Spherical
-from darswin.lens.reprojection import reproject
+from darswin.lens.pixels import reproject
 from darswin.models import LensAdapter
 
 LENSES = Spherical.from_fov([0.2, 0.9], 2.6, 32.0)

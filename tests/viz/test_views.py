@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from darswin.lens import KannalaBrandt, Mei, Perspective, Polynomial
-from darswin.lens.reprojection import OUTSIDE
+from darswin.lens.pixels import OUTSIDE
 from darswin.viz.views import cylindrical, equirectangular, perspective, turned, undistort, view_map
 
 VIEWS = {

@@ -10,6 +10,7 @@ from typing import Any
 
 import yaml
 
+from darswin.lens.base import Lens
 from darswin.lens.distorted import BrownConrady, KannalaBrandt, Mei
 from darswin.lens.files.cameras import Camera, Cameras, Description, describe
 from darswin.lens.files.content import Content
@@ -91,7 +92,7 @@ def write(camera: Camera) -> str | None:
     """A camchain.yaml of cam0; None if Kalibr has no such camera."""
     if camera.size is None:
         raise ValueError("Kalibr's cameras have an image_size, (H, W), and this lens has none")
-    kinds = {
+    kinds: dict[type[Lens], tuple[str, str, str]] = {
         BrownConrady: ("pinhole", "radtan", "k1 k2 p1 p2"),
         KannalaBrandt: ("pinhole", "equidistant", "k1 k2 k3 k4"),
         FieldOfView: ("pinhole", "fov", "omega"),

@@ -10,8 +10,7 @@ from typing import Any, Self
 import torch
 from torch import Tensor
 
-from darswin.lens.base import MODELS, Lens
-from darswin.lens.description import from_dict
+from darswin.lens.base import MODELS, Lens, from_dict
 from darswin.lens.files import (
     basalt,
     camodocal,

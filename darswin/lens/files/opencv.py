@@ -11,6 +11,7 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
+from darswin.lens.base import Lens
 from darswin.lens.distorted import BrownConrady, KannalaBrandt, Mei
 from darswin.lens.files.cameras import Camera, Cameras, Description, describe
 from darswin.lens.files.content import Content
@@ -91,7 +92,11 @@ def write(camera: Camera, suffix: str) -> str | None:
     import cv2  # only here: reading does without
 
     order = "k1 k2 p1 p2 k3 d1 d2 d3 s1 s2 s3 s4"
-    orders = {KannalaBrandt: "k1 k2 k3 k4", Mei: "k1 k2 p1 p2", BrownConrady: order}
+    orders: dict[type[Lens], str] = {
+        KannalaBrandt: "k1 k2 k3 k4",
+        Mei: "k1 k2 p1 p2",
+        BrownConrady: order,
+    }
     order = orders.get(camera.model, "")
     if not camera.terms.keys() <= {*order.split()} or camera.model not in orders:
         return None

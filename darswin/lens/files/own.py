@@ -7,7 +7,7 @@ from darswin.lens.base import MODELS
 from darswin.lens.files.cameras import Cameras, Description
 from darswin.lens.files.content import Content
 from darswin.lens.files.fields import Fields, short, to_number, to_positive
-from darswin.lens.focal import FocalLens
+from darswin.lens.ideal import FocalLens
 
 
 def fits(content: Content) -> bool:
@@ -35,7 +35,7 @@ def _lens(file: Fields) -> Description:
             raise ValueError(f"{file.path(key)} is not of a {name} lens, which has {known}")
     description: Description = {"model": name}
     for key in (*required, *(key for key in optional if key in file)):
-        dims = model._dims(key)
+        dims = 0 if key == "fov" else len(model.declared[key].shape)
         value = file.get(key, "a list of numbers" if dims else "a finite number")
         description[key] = _value(value, file.path(key), dims, model.max_numbers)
     if "image_size" in file:

@@ -7,8 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
-from darswin.lens.base import Lens
-from darswin.lens.description import to_dict
+from darswin.lens.base import Lens, to_dict
 from darswin.lens.files import colmap, kalibr, opencv
 from darswin.lens.files.cameras import Camera, camera_of
 from darswin.utils.files import replace_file

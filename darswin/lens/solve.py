@@ -1,0 +1,134 @@
+"""Rising functions and maps of the plane: how far they rise, and where they take a value."""
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from darswin.ops.waiting import readable
+
+Function = Callable[[Tensor], Tensor]
+
+_STEPS = 40  # of Newton's method or of halving the bracket
+
+
+def inverse(function: Function, slope: Function, value: Tensor, end: Tensor) -> Tensor:
+    """The x in [0, end] at which a function that rises from 0 takes a value, elementwise.
+
+    Newton's method inside a bracket; a step that would leave it, or is more than half as long as
+    the one before, is replaced by the bracket's middle. Two more steps carry the gradients of the
+    inverse, to `value` and to whatever `function` and `slope` depend on: each step doubles the
+    order of the error, so that derivatives up to the third are exact.
+    """
+    with torch.no_grad():
+        last = function(end)
+        high = torch.broadcast_tensors(end, value)[0]
+        low, x = torch.zeros_like(high), high * (value / last).clamp(0, 1)
+        moved = high
+        for _ in range(_STEPS):
+            error = function(x) - value
+            low, high = torch.where(error < 0, x, low), torch.where(error > 0, x, high)
+            newton = x - error / slope(x)
+            fine = (newton >= low) & (newton <= high) & (2 * (newton - x).abs() <= moved)
+            before, x = x, torch.where(fine, newton, (low + high) / 2)
+            moved = (x - before).abs()
+    for _ in range(2):
+        x = x - (function(x) - value) / slope(x)
+    return x
+
+
+@torch.no_grad()
+def rising_limit(slope: Function, end: Tensor) -> Tensor:
+    """How far functions (N,) rise from 0: the first x at which a slope is not positive or
+    overflows, or `end`, (N,), up to which 1024 steps are looked at."""
+
+    def rises(x: Tensor) -> Tensor:
+        value = slope(x)
+        return (value > 0) & (value < torch.inf)
+
+    x = end[:, None] * torch.linspace(0, 1, 1025, dtype=end.dtype, device=end.device)
+    falls = ~rises(x)
+    if readable(falls) and not falls.any():
+        return end  # the usual case
+    first = falls.int().argmax(1, keepdim=True)
+    low, high = x.gather(1, (first - 1).clamp(min=0)), x.gather(1, first)
+    for _ in range(50):
+        middle = (low + high) / 2
+        rising = rises(middle)
+        low, high = torch.where(rising, middle, low), torch.where(rising, high, middle)
+    return torch.where(falls.any(1), low[:, 0], end)
+
+
+def newton(
+    function: Function,
+    slopes: Function,
+    goal: Tensor,
+    point: Tensor,
+    end: Tensor,
+    rounds: int = 60,
+) -> Tensor:
+    """Where a map of the plane takes the value `goal`.
+
+    Newton's steps, each shortened until it comes nearer to the goal and stays where the map keeps
+    its orientation. From a point where it does, they end at the goal or at a fold of the map.
+
+    Args:
+        function: (..., 2) → (..., 2). slopes: (..., 2) → (..., 2, 2), its derivatives.
+        goal, point: (n, 2), or any shape where it is not `readable`.
+        end: how far from the origin to look.
+    """
+    found, places = point.clone(), torch.arange(len(point), device=point.device)
+    error = function(point) - goal
+    step, missed = solve(slopes(point), error), length_of(error)
+    part = torch.ones_like(missed)
+    for _ in range(rounds):
+        trial = point - part[..., None] * step
+        error, slope = function(trial) - goal, slopes(trial)
+        better = (length_of(error) < missed) & (determinant(slope) > 0) & (length_of(trial) <= end)
+        point = torch.where(better[..., None], trial, point)
+        step = torch.where(better[..., None], solve(slope, error), step)
+        missed = torch.where(better, length_of(error), missed)
+        part = torch.where(better, (2 * part).clamp(max=1), part / 4)
+        if not readable(missed):
+            continue  # no shape depends on values
+        found[places] = point
+        going = missed > 16 * torch.finfo(goal.dtype).eps * (1 + length_of(goal))
+        going &= part > 1e-6
+        if not going.any():
+            return found
+        places, goal, point, step, missed, part = (
+            x[going] for x in (places, goal, point, step, missed, part)
+        )
+    found[places] = point
+    return found
+
+
+def length_of(points: Tensor) -> Tensor:
+    """The length of (..., 2), never 0, where a root has no slope."""
+    return points.square().sum(-1).clamp(min=1e-12 * torch.finfo(points.dtype).eps).sqrt()
+
+
+def determinant(matrix: Tensor) -> Tensor:
+    """The determinants (...) of matrices (..., 2, 2)."""
+    (a, b), (c, d) = (row.unbind(-1) for row in matrix.unbind(-2))
+    return a * d - b * c
+
+
+def solve(matrix: Tensor, vector: Tensor) -> Tensor:
+    """(..., 2, 2)⁻¹ @ (..., 2)."""
+    (a, b), (c, d) = (row.unbind(-1) for row in matrix.unbind(-2))
+    x, y = vector.unbind(-1)
+    solved = torch.stack((d * x - b * y, a * y - c * x), -1)
+    return solved / determinant(matrix)[..., None]
+
+
+def radial_slopes(ratio: Tensor, slope: Tensor, direction: Tensor) -> Tensor:
+    """(..., 2, 2): the derivatives of a radial map, `ratio` across and `slope` along a radius."""
+    along = direction[..., :, None] * direction[..., None, :]
+    across = torch.eye(2, dtype=ratio.dtype, device=ratio.device) - along
+    return ratio[..., None, None] * across + slope[..., None, None] * along
+
+
+def direction_of(azimuth: Tensor) -> Tensor:
+    """(..., 2): cos φ and sin φ."""
+    return torch.stack((torch.cos(azimuth), torch.sin(azimuth)), -1)
