@@ -1,9 +1,7 @@
 """What several test files share."""
 
-import contextlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from unittest import mock
 
 import torch
 from safetensors.torch import load_file
@@ -11,7 +9,7 @@ from torch import Tensor
 
 from darswin.compat import OfficialPolynomial
 from darswin.lens import Spherical
-from darswin.ops import _library, use_reference
+from darswin.ops import use_reference
 
 
 def assert_accurate(
@@ -82,13 +80,6 @@ def assert_equals_reference(
         expected = with_gradients(operator, inputs)
     for got, want in zip(ours, expected, strict=True):
         torch.testing.assert_close(got, want, rtol=rtol, atol=atol)
-
-
-@contextlib.contextmanager
-def as_on_devices() -> Iterator[None]:
-    """Within it the operators run on the CPU what they run on other devices."""
-    with mock.patch.object(_library, "compiled", return_value=False):
-        yield
 
 
 CALIBRATIONS = Path(__file__).parent / "lens" / "files"

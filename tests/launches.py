@@ -6,8 +6,6 @@ from collections.abc import Callable, Iterator
 from typing import Any
 from unittest import mock
 
-import torch
-import torch.nn.functional as F
 from torch import Tensor
 from torch.utils import _pytree as pytree
 from torch.utils._python_dispatch import TorchDispatchMode
@@ -77,17 +75,4 @@ def launches(function: Callable[..., Any], *arguments: Any) -> Counter[str]:
 def with_kernels() -> Iterator[None]:
     """Within it the operators run as on a GPU that has their kernels, with Triton or without."""
     with mock.patch.object(_library, "has_kernels", lambda tensor: tensor.device.type == "meta"):
-        yield
-
-
-@contextlib.contextmanager
-def fused_attention() -> Iterator[None]:
-    """Within it torch's attention is the kernel that it chooses on a GPU, in float32 and narrower;
-    elsewhere it consists of parts."""
-
-    def attention(q, k, v, attn_mask=None, scale=None):
-        kernel = torch.ops.aten._scaled_dot_product_efficient_attention
-        return kernel(q, k, v, attn_mask, torch.is_grad_enabled(), scale=scale)[0]
-
-    with mock.patch.object(F, "scaled_dot_product_attention", attention):
         yield

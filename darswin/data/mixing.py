@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from darswin.lens import Lens
-from darswin.ops.waiting import readable
+from darswin.ops.checks import readable
 
 
 @dataclass(frozen=True)

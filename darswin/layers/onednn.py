@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from darswin.ops._transpose_sum import transpose_sum
+from darswin.ops._inference import transpose_sum
 
 
 def missing(dtype: torch.dtype) -> str | None:

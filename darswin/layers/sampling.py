@@ -10,8 +10,7 @@ from darswin.layers.grid import Placement, PolarGrid, check_grid, polar_grid
 from darswin.lens import Lens
 from darswin.lens.spacing import Spacing
 from darswin.ops import polar_sample
-from darswin.ops.checks import channels_first, check_jitter, check_layout
-from darswin.ops.waiting import readable
+from darswin.ops.checks import channels_first, check_jitter, check_layout, readable
 
 GridFunction = Callable[..., PolarGrid]
 

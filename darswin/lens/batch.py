@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.utils import _pytree as pytree
 
 from darswin.lens.parameter import Number, Parameter, as_tensors, bind, signature
-from darswin.ops.waiting import readable
+from darswin.ops.checks import readable
 
 NUMBER = Parameter()
 

@@ -14,7 +14,7 @@ from torch import Tensor
 from darswin.lens.base import Lens
 from darswin.lens.pixels import OUTSIDE, pixel_rays, sample_at
 from darswin.lens.spacing import Spacing, check_tan, span, to_spacing, to_theta
-from darswin.ops.waiting import tensor_there
+from darswin.ops.checks import tensor_there
 
 
 def square_to_disc(places: Tensor) -> tuple[Tensor, Tensor]:

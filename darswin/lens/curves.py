@@ -9,7 +9,7 @@ from torch.utils.data._utils.collate import default_collate_fn_map
 from darswin.lens.base import Lens
 from darswin.lens.parameter import Number, Parameter
 from darswin.lens.solve import inverse
-from darswin.ops.waiting import readable
+from darswin.ops.checks import readable
 
 
 class Tabulated(Lens):

@@ -26,7 +26,7 @@ from darswin.lens.solve import (
     solve,
 )
 from darswin.lens.sphere import XI_STARTS, Spherical, sphere_angle, sphere_limit
-from darswin.ops.waiting import readable
+from darswin.ops.checks import readable
 
 
 class DistortedLens(FocalLens, register=False):

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from darswin.lens.batch import LensBatch
-from darswin.ops.waiting import tensor_there
+from darswin.ops.checks import tensor_there
 
 
 class ImageFrame(LensBatch):

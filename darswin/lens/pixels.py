@@ -11,7 +11,7 @@ from torch import Tensor
 from darswin.lens.base import Lens
 from darswin.lens.ideal import Perspective
 from darswin.lens.solve import determinant, length_of
-from darswin.ops.waiting import tensor_there
+from darswin.ops.checks import tensor_there
 
 __all__ = ["distance_to_z", "pixel_rays", "reproject", "solid_angles", "z_to_distance"]
 

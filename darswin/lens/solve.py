@@ -5,7 +5,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from darswin.ops.waiting import readable
+from darswin.ops.checks import readable
 
 Function = Callable[[Tensor], Tensor]
 

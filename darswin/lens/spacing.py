@@ -14,7 +14,7 @@ from torch import Tensor
 
 from darswin.lens.base import Lens
 from darswin.lens.solve import inverse
-from darswin.ops.waiting import readable
+from darswin.ops.checks import readable
 
 Spacing = Literal["theta", "tan", "g", "radius"]
 SPACINGS: tuple[Spacing, ...] = ("theta", "tan", "g", "radius")

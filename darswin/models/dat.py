@@ -13,7 +13,7 @@ from darswin.layers.position_bias import RelativeTable
 from darswin.models.encoder import ImageEncoder
 from darswin.models.registry import register_model
 from darswin.models.stages import Pair, StagePlan
-from darswin.ops.waiting import tensor_there
+from darswin.ops.checks import tensor_there
 
 
 class DeformableAttention(nn.Module):

@@ -1,12 +1,11 @@
-"""The operators: compiled on CPU, in Triton on CUDA devices where it is installed, plain PyTorch
-elsewhere and under `use_reference`.
+"""The operators: compiled on CPU, in Triton on CUDA devices where it is installed, the PyTorch
+reference elsewhere and within `use_reference`.
 
 They run on torch's number of threads. A process that is forked after such a call must not make
 another one on several: use `spawn`, or `torch.set_num_threads(1)` in the child.
 """
 
-# The first three are not public; they are imported so that their fakes and autograd are registered.
-from darswin.ops import _add_norm, _quantized, _transpose_sum, triton  # noqa: F401
+from darswin.ops import _inference, triton  # noqa: F401  # registers the private operators
 from darswin.ops._library import cpu_capability, reference_in_use, use_reference
 from darswin.ops.polar_embed import polar_embed
 from darswin.ops.polar_sample import polar_sample

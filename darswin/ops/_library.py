@@ -1,11 +1,12 @@
-"""Decides between the compiled operators and their twins in PyTorch."""
+"""Which code an operator runs, the compiled one or the reference, and the derivatives it has."""
 
 import contextlib
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
+from torch._ops import OpOverload
 from torch.autograd import forward_ad
 from torch.autograd.graph import increment_version
 
@@ -44,14 +45,9 @@ def reference_in_use() -> bool:
     return _reference
 
 
-def compiled(tensor: Tensor) -> bool:
-    """Whether an operator on `tensor` runs compiled code rather than the reference."""
-    return tensor.device.type == "cpu" and not _reference
-
-
 def has_kernels(tensor: Tensor) -> bool:
     """Whether operators on `tensor` run the kernels of `darswin.ops.triton`, where these compute
-    what is asked for.
+    the given arguments.
 
     A graph that is exported consists of torch's own operations: it runs without this package.
     """
@@ -60,19 +56,16 @@ def has_kernels(tensor: Tensor) -> bool:
 
 
 def _constant(function: Callable[..., bool]) -> Callable[..., bool]:
-    """Lets Dynamo call a function while it traces and build the result into the graph.
-
-    `torch.compiler.assume_constant_result` sets the same mark, but it imports Dynamo, which takes
-    as long as torch itself.
-    """
+    """Lets Dynamo call a function while it traces and build the result into the graph."""
+    # torch.compiler.assume_constant_result sets the same mark, but it imports Dynamo: that takes as
+    # long as torch itself.
     function._dynamo_marked_constant = True  # type: ignore[attr-defined]
     return function
 
 
 @_constant
 def _is_known_gpu(index: int) -> bool:
-    """Whether the kernels were made for a CUDA device: NVIDIA's since the A100. AMD's are called
-    "cuda" too."""
+    """Whether a CUDA device is NVIDIA's, since the A100. AMD's are called "cuda" too."""
     return torch.version.hip is None and torch.cuda.get_device_capability(index) >= (8, 0)
 
 
@@ -82,7 +75,7 @@ def _has_autocast(device: str) -> bool:
 
 
 def autocast_dtype(tensor: Tensor) -> torch.dtype | None:
-    """What autocast, where it is on for the tensor's device, computes in."""
+    """The type that autocast computes in, where it is on for the tensor's device."""
     device = tensor.device.type
     if not _has_autocast(device) or not torch.is_autocast_enabled(device):
         return None
@@ -110,44 +103,52 @@ def autocast_off(device: str) -> contextlib.AbstractContextManager:
 
 
 def run(
+    operator: OpOverload,
     reference: Callable[..., Tensor],
-    on_devices: Callable[..., Tensor],
+    kernel_takes: Callable[..., bool],
     *arguments: Any,
-    kernel: bool = False,
 ) -> Tensor:
-    """An operator on checked arguments: compiled, a kernel for GPUs, or one of its twins.
-
-    The compiled one and the kernel take the fields of a NamedTuple one by one.
+    """An operator on checked arguments: compiled on CPU, a kernel on GPUs that have it, otherwise
+    the reference.
 
     Args:
-        reference: the twin of the same name in reference.py.
-        on_devices: what runs on devices other than the CPU, where there is no kernel.
-        kernel: whether there is a kernel that computes this, where `has_kernels`.
+        reference: the function of the same name in reference.py.
+        kernel_takes: whether the kernel for GPUs computes these arguments, where `has_kernels`.
+        arguments: of the reference. The operator takes the fields of a NamedTuple one by one.
     """
     flat: list[Any] = []
     for argument in arguments:
         flat.extend(argument if hasattr(argument, "_fields") else (argument,))
-    fused = compiled(flat[0]) or (kernel and has_kernels(flat[0]))
-    twin = reference if _reference else on_devices
-    if fused or twin is not reference:
+    first = flat[0]
+    if not _reference:
         refuse_other_derivatives(f"darswin.{reference.__name__}", flat)
-    if fused:
-        return getattr(torch.ops.darswin, reference.__name__)(*flat)
-    with autocast_off(flat[0].device.type):
-        return twin(*arguments)
+        if first.device.type == "cpu" or (has_kernels(first) and kernel_takes(*arguments)):
+            return call(operator, flat)
+    with autocast_off(first.device.type):
+        return reference(*arguments)
+
+
+def call(operator: OpOverload, arguments: Iterable[Any]) -> Any:
+    """The operator, past autograd where no gradient can be recorded: that saves a third."""
+    if torch.is_grad_enabled() or torch.compiler.is_compiling() or _transformed():
+        return operator(*arguments)
+    with torch._C._AutoDispatchBelowAutograd():
+        return operator(*arguments)
+
+
+def _transformed() -> bool:
+    """Whether a transform of torch.func is under way."""
+    return torch._C._functorch.peek_interpreter_stack() is not None
 
 
 def refuse_other_derivatives(operator: object, tensors: Iterable[object]) -> None:
     """NotImplementedError where forward-mode AD or torch.func differentiates one of the tensors.
 
-    The first would come to zeros without a word, the second to an error about autograd's insides.
-    While a graph is compiled only forward-mode AD is looked for: torch.func.grad fails by itself.
+    The first would silently give zeros, the second an error about the internals of autograd. While
+    a graph is compiled only forward-mode AD is looked for: torch.func.grad fails by itself.
     """
     forward = forward_ad._current_level >= 0
-    functional = (
-        not torch.compiler.is_compiling()
-        and torch._C._functorch.peek_interpreter_stack() is not None
-    )
+    functional = not torch.compiler.is_compiling() and _transformed()
     if not forward and not functional:
         return
     for tensor in tensors:
@@ -172,8 +173,7 @@ def refuse_other_derivatives(operator: object, tensors: Iterable[object]) -> Non
 
 
 def _unwrapped(tensor: Tensor) -> tuple[bool, Tensor]:
-    """Whether a transform of torch.func differentiates with respect to the tensor, and what it
-    wraps."""
+    """Whether torch.func differentiates by the tensor, and the tensor that it wraps."""
     functorch, tracked = torch._C._functorch, False
     while functorch.is_functorch_wrapped_tensor(tensor):
         tracked |= functorch.is_gradtrackingtensor(tensor)
@@ -181,27 +181,75 @@ def _unwrapped(tensor: Tensor) -> tuple[bool, Tensor]:
     return tracked, tensor
 
 
-def no_second_derivative(name: str) -> None:
-    """Makes an operator's backward raise where it is differentiated again, rather than be wrong."""
+def empty_gradients(
+    arguments: Sequence[Any], groups: dict[int, int], wanted: Sequence[bool]
+) -> tuple[Tensor, ...]:
+    """Empty gradients of arguments, as backward gives them: of size (0,) where they are not wanted
+    or the argument is None. `groups` as in `register_gradients`."""
+    gradients = []
+    for index, group in groups.items():
+        value = arguments[index]
+        like = arguments[1] if value is None else value  # the radii: all of a lens have their type
+        shape = (0,) if value is None or not (wanted[group] if wanted else True) else value.shape
+        gradients.append(like.new_empty(shape))
+    return tuple(gradients)
 
-    def raise_error(ctx, *grads):
+
+def register_gradients(
+    name: str, groups: dict[int, int], fake: Callable[..., tuple[Tensor, ...]] | None = None
+) -> None:
+    """Registers the autograd of an operator, and the fake of its backward. A second derivative is
+    an error.
+
+    Its backward operator takes the operator's first arguments, the gradient of the output, and a
+    bool for each group of gradients: whether one of them is wanted.
+
+    Args:
+        groups: the arguments that have gradients, in the order in which backward gives them, and
+            the group of each. A backward without bools gives all.
+        fake: of backward, where its gradients are not like its arguments.
+    """
+    backward = getattr(torch.ops.darswin, f"{name}_backward").default
+    names = [argument.name for argument in backward._schema.arguments]
+    taken = names.index("grad_out")
+    bools = len(names) - taken - 1
+
+    def fake_backward(*arguments):
+        return empty_gradients(arguments, groups, arguments[taken + 1 :])
+
+    def setup_context(ctx, inputs, output):
+        ctx.save_for_backward(*(x if isinstance(x, Tensor) else None for x in inputs))
+        ctx.others = [None if isinstance(x, Tensor) else x for x in inputs]
+
+    def gradients(ctx, grad_out):
+        refuse_other_derivatives(f"{name}'s backward", (grad_out,))
+        tensors, needs = ctx.saved_tensors, ctx.needs_input_grad
+        inputs = [o if t is None else t for t, o in zip(tensors, ctx.others, strict=True)]
+        wanted = [any(needs[i] for i, of in groups.items() if of == k) for k in range(bools)]
+        results = [None] * len(inputs)
+        found = call(backward, [*inputs[:taken], grad_out, *wanted])
+        for index, gradient in zip(groups, found, strict=True):
+            if needs[index]:
+                results[index] = gradient.to(inputs[index].dtype)
+        return tuple(results)
+
+    def second_derivative(ctx, *grads):
         raise NotImplementedError(
-            f"{name} has no second derivative; run it within darswin.ops.use_reference() for one"
+            f"darswin::{name} has no second derivative; run it within "
+            "darswin.ops.use_reference() for one"
         )
 
-    torch.library.register_autograd(f"{name}_backward", raise_error)
+    torch.library.register_fake(f"darswin::{name}_backward", fake or fake_backward)
+    torch.library.register_autograd(f"darswin::{name}", gradients, setup_context=setup_context)
+    torch.library.register_autograd(f"darswin::{name}_backward", second_derivative)
 
 
 _implementations = torch.library.Library("darswin", "IMPL")
 
 
 def without_gradient(name: str, *, changes: int, instead: str) -> None:
-    """Makes an operator raise where a gradient of it would be recorded: it has none.
-
-    Args:
-        changes: how many of its first arguments it changes in place, which autograd then notices.
-        instead: what has a gradient.
-    """
+    """Makes an operator raise where a gradient would be recorded; `instead` is code that has one.
+    Autograd notices that it changes its first `changes` arguments in place."""
     operator = getattr(torch.ops.darswin, name).default
     plain = name.removeprefix("_")
 

@@ -1,4 +1,4 @@
-"""What polar_sample and polar_embed share: the arguments of a sampling, checked, and gradients."""
+"""The arguments that polar_sample and polar_embed share, and their checks."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -13,12 +13,12 @@ from darswin.ops.checks import (
     channels_first,
     check_jitter,
     check_pair,
-    check_shape,
     check_tensor,
     per_channel,
 )
 
-TENSORS = 8  # how many fields of `Sampling` are tensors; they come first
+# The fields of `Sampling` that have gradients: of the image, of the lens, of the offsets.
+GRADIENTS = {0: 0, 1: 1, 3: 1, 4: 1, 5: 2}
 
 
 class Sampling(NamedTuple):
@@ -49,35 +49,17 @@ class Sampling(NamedTuple):
         rings = self.radii.shape[1] // self.samples[0]
         return self.image.shape[0], rings, self.azimuths.shape[0] // self.samples[1]
 
-    def kernel_takes(self) -> bool:
-        """Whether the kernels for GPUs are there and compute it: not float64, nor uint8 images of
-        many channels, whose mean and std are numbers in the kernel, nor 2³¹ samples or pixels of an
-        image."""
+    def kernel_takes(self, *others: object) -> bool:
+        """Whether the kernels for GPUs compute it: not float64, nor uint8 images of many channels,
+        whose mean and std are numbers in the kernel, nor 2³¹ samples or pixels of an image."""
         image = self.image
-        if not _library.has_kernels(image) or image.dtype == torch.float64:
-            return False
         frames = image.dtype == torch.uint8 and image.shape[1] > 16
         counts = self.radii.shape[1] * self.azimuths.shape[0], image.shape[2] * image.shape[3]
-        return not frames and max(counts) < 2**31 - 2**16
+        return image.dtype != torch.float64 and not frames and max(counts) < 2**31 - 2**16
 
     def new_output(self, shape: tuple[int, ...]) -> Tensor:
         """An empty tensor of the output's type."""
         return self.radii.new_empty(shape, dtype=torch.bfloat16 if self.bfloat16 else None)
-
-    def new_gradients(
-        self, image_grad: bool, lens_grad: bool, offsets_grad: bool
-    ) -> tuple[Tensor, ...]:
-        """Empty gradients, as the backward operators give them: of size (0,) if not wanted."""
-        return tuple(
-            value.new_empty(value.shape) if wanted and value is not None else like.new_empty((0,))
-            for value, like, wanted in (
-                (self.image, self.image, image_grad),
-                (self.radii, self.radii, lens_grad),
-                (self.center, self.radii, lens_grad),
-                (self.affine, self.radii, lens_grad),
-                (self.offsets, self.radii, offsets_grad),
-            )
-        )
 
 
 def checked_sampling(
@@ -97,31 +79,29 @@ def checked_sampling(
     """The arguments of the public functions, else TypeError or ValueError."""
     if isinstance(image, Tensor):
         image = _library.without_float16(image)
-    check_tensor("image", image, dtypes=(*DTYPES, torch.bfloat16, torch.uint8))
-    check_shape("image", image, "(B, C, H, W)", (None,) * 4)
+    pixels = (*DTYPES, torch.bfloat16, torch.uint8)
+    check_tensor("image", image, pixels, "(B, C, H, W)", (None,) * 4)
     image = channels_first("image", image, channels_last)
-    geometry = None if image.dtype in DTYPES else (torch.float32,)
-    tensors = dict(radii=radii, azimuths=azimuths, center=center, affine=affine, offsets=offsets)
-    for name, value in tensors.items():
-        if value is not None or name not in ("affine", "offsets"):
-            check_tensor(name, value, like=image, dtypes=geometry)
     batch, channels = image.shape[:2]
-    check_shape("radii", radii, "(B or 1, R·S_r) = ({} or 1, any)", (batch, None), (1, None))
-    check_shape("azimuths", azimuths, "(A·S_φ,)", (None,))
+    real = (torch.float64 if image.dtype == torch.float64 else torch.float32,)
+    form = "(B or 1, R·S_r) = ({} or 1, any)"
+    check_tensor("radii", radii, real, form, (batch, None), (1, None), like=image)
+    check_tensor("azimuths", azimuths, real, "(A·S_φ,)", (None,), like=image)
     if azimuths.requires_grad and torch.is_grad_enabled() and not _library.reference_in_use():
         raise NotImplementedError(
             "azimuths require a gradient, which only the reference has: turn the grid with affine "
             "or move its points with offsets, which have gradients, or run within "
             "darswin.ops.use_reference()"
         )
-    check_shape("center", center, "(B or 1, 2) = ({} or 1, 2)", (batch, 2), (1, 2))
+    form = "(B or 1, 2) = ({} or 1, 2)"
+    check_tensor("center", center, real, form, (batch, 2), (1, 2), like=image)
     if affine is not None:
         form = "(B or 1, 2, 2) = ({} or 1, 2, 2)"
-        check_shape("affine", affine, form, (batch, 2, 2), (1, 2, 2))
+        check_tensor("affine", affine, real, form, (batch, 2, 2), (1, 2, 2), like=image)
     if offsets is not None:
         points = (2, radii.shape[1], azimuths.shape[0])
         form = "(B or 1, 2, R·S_r, A·S_φ) = ({} or 1, {}, {}, {})"
-        check_shape("offsets", offsets, form, (batch, *points), (1, *points))
+        check_tensor("offsets", offsets, real, form, (batch, *points), (1, *points), like=image)
     samples = check_pair("samples", samples, lowest=1)
     if radii.shape[1] % samples[0] or azimuths.shape[0] % samples[1]:
         raise ValueError(
@@ -160,28 +140,3 @@ def _seed_tensor(seed: int | Tensor) -> Tensor:
     if not -(2**63) <= key < 2**63:
         raise ValueError(f"seed must fit 64 bits, got {seed}")
     return torch.tensor(key, dtype=torch.int64, device="cpu")
-
-
-def wanted_groups(needs_input_grad: Sequence[bool]) -> tuple[bool, bool, bool]:
-    """Whether backward needs the gradients of the image, of the lens and of the offsets."""
-    image, radii, _, center, affine, offsets = needs_input_grad[:6]
-    return image, radii or center or affine, offsets
-
-
-def input_gradients(
-    needs_input_grad: Sequence[bool],
-    image: Tensor,
-    radii: Tensor,
-    center: Tensor,
-    affine: Tensor,
-    offsets: Tensor,
-    *others: Tensor | None,
-) -> tuple[Tensor | None, ...]:
-    """A gradient for each input that needs one, None for the rest: the fields of a `Sampling`, then
-    the operator's other arguments."""
-    settings = (None,) * (len(Sampling._fields) - 6)
-    gradients = (image, radii, None, center, affine, offsets, *settings, *others)
-    return tuple(
-        gradient if wanted else None
-        for gradient, wanted in zip(gradients, needs_input_grad, strict=True)
-    )

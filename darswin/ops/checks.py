@@ -1,4 +1,4 @@
-"""The argument checks that the operators and their layers share.
+"""The argument checks that the operators and their layers share; and how not to wait for a device.
 
 A message says what was expected and what came.
 """
@@ -12,8 +12,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from darswin.ops.waiting import readable
-
 DTYPES = (torch.float32, torch.float64)
 LAYOUTS = ("tokens", "image")
 FRAME_CHANNELS = (1, 3, 4)  # the numbers of channels that a camera frame can have
@@ -22,43 +20,41 @@ FRAME_CHANNELS = (1, 3, 4)  # the numbers of channels that a camera frame can ha
 def check_tensor(
     name: str,
     value: object,
+    dtypes: Sequence[torch.dtype],
+    form: str,
+    *shapes: Sequence[int | None],
     like: Tensor | None = None,
-    dtypes: Sequence[torch.dtype] | None = None,
 ) -> None:
-    """TypeError or ValueError unless `value` is a tensor on the device of `like`.
+    """TypeError or ValueError unless `value` is a tensor of one of the dtypes and shapes (None: any
+    size), on the device of `like`.
 
-    Of one of `dtypes`; without them float32 or float64, the one of the two that `like` is.
-    """
-    if not isinstance(value, Tensor):
-        raise TypeError(f"{name} must be a tensor, got {type(value).__name__}")
-    if value.dtype not in (dtypes or DTYPES):
-        names = [str(dtype).removeprefix("torch.") for dtype in dtypes or DTYPES]
-        known = " or ".join(filter(None, (", ".join(names[:-1]), names[-1])))
-        raise TypeError(f"{name} must be {known}, got {value.dtype}")
-    if like is not None and dtypes is None and value.dtype != like.dtype:
-        raise TypeError(f"{name} must have the same dtype, {like.dtype}, got {value.dtype}")
-    if like is not None and value.device != like.device:
-        raise ValueError(f"{name} must be on the same device, {like.device}, got {value.device}")
-
-
-def check_shape(name: str, value: Tensor, form: str, *allowed: Sequence[int | None]) -> None:
-    """ValueError unless the shape is one of `allowed` (None: any size).
-
-    `form` says it in words; its fields, {}, are the sizes that the first of `allowed` knows. They
+    `form` is the shape in words; its fields, {}, are the known sizes of the first of `shapes`. They
     are filled in where the error is raised: as an f-string they would tie a graph that is being
     compiled to these sizes.
     """
+    if not isinstance(value, Tensor):
+        raise TypeError(f"{name} must be a tensor, got {type(value).__name__}")
+    if value.dtype not in dtypes:
+        names = [str(dtype).removeprefix("torch.") for dtype in dtypes]
+        known = " or ".join(filter(None, (", ".join(names[:-1]), names[-1])))
+        raise TypeError(f"{name} must be {known}, got {value.dtype}")
+    if like is not None and value.device != like.device:
+        raise ValueError(f"{name} must be on the same device, {like.device}, got {value.device}")
     shape = tuple(value.shape)
-    if shape in allowed:
-        return
-    for sizes in allowed:
-        if len(shape) != len(sizes):
-            continue
-        # Not with all(): Dynamo of torch 2.10 cannot trace it.
-        if shape == tuple(n if s is None else s for s, n in zip(sizes, shape, strict=True)):
+    for sizes in shapes:
+        if shape == sizes or _fits(shape, sizes):
             return
-    expected = form.format(*(s for s in allowed[0] if s is not None))
+    expected = form.format(*(size for size in shapes[0] if size is not None))
     raise ValueError(f"{name} must have shape {expected}, got {shape}")
+
+
+def _fits(shape: Sequence[int], sizes: Sequence[int | None]) -> bool:
+    if len(shape) != len(sizes):
+        return False
+    for size, allowed in zip(shape, sizes, strict=True):  # Dynamo of torch 2.10 cannot trace all()
+        if allowed is not None and size != allowed:
+            return False
+    return True
 
 
 def check_rising(name: str, value: Tensor) -> None:
@@ -74,6 +70,23 @@ def check_rising(name: str, value: Tensor) -> None:
     rows = value.detach().numpy()
     if not ((rows[:, 1:] > rows[:, :-1]).all() and (rows >= 0).all() and (rows < math.inf).all()):
         raise ValueError(f"{name} must be finite, at least 0, and rise from ring to ring")
+
+
+def readable(value: Tensor) -> bool:
+    """Whether values can be read: not in a graph that is being compiled, and not on a device, since
+    the host would wait for it."""
+    return not torch.compiler.is_compiling() and value.device.type == "cpu"
+
+
+def tensor_there(
+    numbers: Sequence[float], like: Tensor, dtype: torch.dtype | None = None
+) -> Tensor:
+    """Numbers as a tensor (K,) beside `like`. On a device they are made there, not copied from the
+    host, which would wait."""
+    if like.device.type == "cpu":
+        return like.new_tensor(numbers, dtype=dtype)
+    made = [like.new_full((1,), number, dtype=dtype) for number in numbers]
+    return torch.cat(made) if len(made) > 1 else made[0]
 
 
 def as_int(value: Any) -> int | None:
@@ -104,16 +117,9 @@ def channels_first(
 ) -> Tensor:
     """An image as (B, C, H, W); one that is (B, H, W, C) is not copied.
 
-    Args:
-        image: of four dimensions.
-        channels_last: True for (B, H, W, C), False for (B, C, H, W). With None an image in floating
-            point is (B, C, H, W). The channels of a uint8 image are then its second or its last
-            axis, the one whose size is `channels`.
-        channels: the size of that axis. None allows each of `FRAME_CHANNELS`.
-
-    Raises:
-        TypeError: channels_last is neither a bool nor None.
-        ValueError: both axes of a uint8 image have such a size, or neither has.
+    With channels_last None an image in floating point is (B, C, H, W), and the channels of a uint8
+    image are its second or its last axis, the one whose size is `channels`, or one of
+    `FRAME_CHANNELS`; ValueError where both have such a size, or neither has.
     """
     if channels_last is None:
         if image.dtype != torch.uint8:
@@ -133,7 +139,6 @@ def channels_first(
 
 
 def _unknown_axis(name: str, image: Tensor, both: bool, channels: int | None) -> ValueError:
-    """The error of a uint8 image of which `both` axes can be that of the channels, or neither."""
     if channels is None:
         known = "1, 3 or 4"
         hint = ": pass channels_last=True for (B, H, W, C), channels_last=False for (B, C, H, W)"

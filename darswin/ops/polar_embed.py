@@ -5,15 +5,9 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from darswin.ops import _devices, _library, reference
-from darswin.ops._sampling import (
-    TENSORS,
-    Sampling,
-    checked_sampling,
-    input_gradients,
-    wanted_groups,
-)
-from darswin.ops.checks import check_shape, check_tensor
+from darswin.ops import _library, reference
+from darswin.ops._sampling import GRADIENTS, Sampling, checked_sampling
+from darswin.ops.checks import check_tensor
 
 
 def polar_embed(
@@ -60,18 +54,16 @@ def polar_embed(
         image, radii, azimuths, center, affine, offsets, jitter, seed, samples, mean, std,
         channels_last,
     )  # fmt: skip
-    image = sampling.image
+    image, size = sampling.image, sampling.token_size()
     double = image.dtype == torch.float64
     dtypes = (torch.float64,) if double else (torch.float32, torch.bfloat16)
-    check_tensor("weight", weight, like=image, dtypes=dtypes)
     form = "(D, S_r·S_φ·C) = (any, {})"
-    check_shape("weight", weight, form, (None, sampling.token_size()))
+    check_tensor("weight", weight, dtypes, form, (None, size), like=image)
     if bias is not None:
-        check_tensor("bias", bias, like=image, dtypes=dtypes)
-        check_shape("bias", bias, "(D,) = ({},)", (weight.shape[0],))
+        check_tensor("bias", bias, dtypes, "(D,) = ({},)", (weight.shape[0],), like=image)
     return _library.run(
-        reference.polar_embed, _devices.polar_embed, sampling, weight, bias,
-        kernel=sampling.kernel_takes(),
+        torch.ops.darswin.polar_embed.default, reference.polar_embed, Sampling.kernel_takes,
+        sampling, weight, bias,
     )  # fmt: skip
 
 
@@ -82,34 +74,14 @@ def _fake(*arguments):
     return sampling.new_output((*sampling.map_size(), weight.shape[0]))
 
 
-@torch.library.register_fake("darswin::polar_embed_backward")
+_FIELDS = len(Sampling._fields)  # weight and bias come after them
+
+
 def _fake_backward(*arguments):
-    *fields, weight, _grad_out, image_grad, lens_grad, offsets_grad, weight_grad = arguments
-    sampling = Sampling(*fields)
-    return (
-        *sampling.new_gradients(image_grad, lens_grad, offsets_grad),
-        sampling.radii.new_empty(weight.shape if weight_grad else (0,)),
-        sampling.radii.new_empty(weight.shape[:1] if weight_grad else (0,)),
-    )
+    weight, *_, weight_grad = arguments[_FIELDS:]
+    of_sampling = _library.empty_gradients(arguments, GRADIENTS, arguments[-4:-1])
+    shapes = (weight.shape, weight.shape[:1]) if weight_grad else ((0,), (0,))
+    return *of_sampling, *(arguments[1].new_empty(shape) for shape in shapes)
 
 
-def _setup_context(ctx, inputs, output):
-    *settings, weight, bias = inputs[TENSORS:]
-    ctx.save_for_backward(*inputs[:TENSORS], weight)
-    ctx.settings = settings
-    ctx.bias_dtype = weight.dtype if bias is None else bias.dtype
-
-
-def _backward(ctx, grad_out):
-    _library.refuse_other_derivatives("polar_embed's backward", (grad_out,))
-    *tensors, weight = ctx.saved_tensors
-    needs = ctx.needs_input_grad
-    *gradients, grad_weight, grad_bias = torch.ops.darswin.polar_embed_backward(
-        *tensors, *ctx.settings, weight, grad_out, *wanted_groups(needs), needs[-2] or needs[-1]
-    )
-    layer = grad_weight.to(weight.dtype), grad_bias.to(ctx.bias_dtype)
-    return input_gradients(needs, *gradients, *layer)
-
-
-torch.library.register_autograd("darswin::polar_embed", _backward, setup_context=_setup_context)
-_library.no_second_derivative("darswin::polar_embed")
+_library.register_gradients("polar_embed", GRADIENTS | {_FIELDS: 3, _FIELDS + 1: 3}, _fake_backward)

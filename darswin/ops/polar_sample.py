@@ -1,4 +1,4 @@
-"""polar_sample: an image on a polar grid, with jitter. Public function, fake, autograd."""
+"""polar_sample: an image on a polar grid, with jitter. Public function, fakes, autograd."""
 
 from collections.abc import Sequence
 from typing import Literal
@@ -6,14 +6,8 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from darswin.ops import _devices, _library, reference
-from darswin.ops._sampling import (
-    TENSORS,
-    Sampling,
-    checked_sampling,
-    input_gradients,
-    wanted_groups,
-)
+from darswin.ops import _library, reference
+from darswin.ops._sampling import GRADIENTS, Sampling, checked_sampling
 from darswin.ops.checks import check_layout
 
 
@@ -99,8 +93,8 @@ def polar_sample(
     )  # fmt: skip
     check_layout(layout)
     return _library.run(
-        reference.polar_sample, _devices.polar_sample, sampling, layout == "tokens",
-        kernel=sampling.kernel_takes(),
+        torch.ops.darswin.polar_sample.default, reference.polar_sample, Sampling.kernel_takes,
+        sampling, layout == "tokens",
     )  # fmt: skip
 
 
@@ -114,24 +108,4 @@ def _fake(*arguments):
     return sampling.new_output((*sampling.image.shape[:2], rows, columns))
 
 
-@torch.library.register_fake("darswin::polar_sample_backward")
-def _fake_backward(*arguments):
-    *fields, _tokens, _grad_out, image_grad, lens_grad, offsets_grad = arguments
-    return Sampling(*fields).new_gradients(image_grad, lens_grad, offsets_grad)
-
-
-def _setup_context(ctx, inputs, output):
-    ctx.save_for_backward(*inputs[:TENSORS])
-    ctx.settings = inputs[TENSORS:]
-
-
-def _backward(ctx, grad_out):
-    _library.refuse_other_derivatives("polar_sample's backward", (grad_out,))
-    gradients = torch.ops.darswin.polar_sample_backward(
-        *ctx.saved_tensors, *ctx.settings, grad_out, *wanted_groups(ctx.needs_input_grad)
-    )
-    return input_gradients(ctx.needs_input_grad, *gradients, None)
-
-
-torch.library.register_autograd("darswin::polar_sample", _backward, setup_context=_setup_context)
-_library.no_second_derivative("darswin::polar_sample")
+_library.register_gradients("polar_sample", GRADIENTS)

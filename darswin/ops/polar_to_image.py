@@ -1,4 +1,4 @@
-"""polar_to_image: a polar map as an image. Public function, fake, autograd."""
+"""polar_to_image: a polar map as an image. Public function, fakes, autograd."""
 
 from typing import Literal
 
@@ -6,14 +6,7 @@ import torch
 from torch import Tensor
 
 from darswin.ops import _library, reference
-from darswin.ops.checks import (
-    DTYPES,
-    check_layout,
-    check_pair,
-    check_rising,
-    check_shape,
-    check_tensor,
-)
+from darswin.ops.checks import DTYPES, check_layout, check_pair, check_rising, check_tensor
 
 
 def polar_to_image(
@@ -71,8 +64,7 @@ def polar_to_image(
         half = (torch.bfloat16, torch.float16)
     elif isinstance(x, Tensor):
         x = _library.without_float16(x)
-    check_tensor("x", x, dtypes=(*DTYPES, *half))
-    check_shape("x", x, "(B, R, A, D)", (None,) * 4)
+    check_tensor("x", x, (*DTYPES, *half), "(B, R, A, D)", (None,) * 4)
     rings, sectors = x.shape[1:3]
     if rings == 0 or sectors == 0:
         raise ValueError(f"x must have rings and sectors, got {tuple(x.shape)}")
@@ -82,38 +74,27 @@ def polar_to_image(
         raise ValueError("polar_to_image takes center, and affine if need be, or else points")
     if isinstance(r_max, (int, float)):
         r_max = radii.new_full((1,), float(r_max)) if isinstance(radii, Tensor) else None
-    _check_lens("radii", radii, x, real, "(B or 1, R) = ({} or 1, {})", rings)
     for name, tensor, form, *shape in (
+        ("radii", radii, "(B or 1, R) = ({} or 1, {})", rings),
         ("center", center, "(B or 1, 2) = ({} or 1, {})", 2),
         ("affine", affine, "(B or 1, 2, 2) = ({} or 1, {}, {})", 2, 2),
         ("points", points, "(B or 1, H, W, 2) = ({} or 1, {}, {}, {})", height, width, 2),
         ("r_max", r_max, "(B or 1,) = ({} or 1,)"),
     ):
-        if tensor is not None:
-            _check_lens(name, tensor, x, real, form, *shape)
+        if tensor is not None or name == "radii":
+            check_tensor(name, tensor, (real,), form, (len(x), *shape), (1, *shape), like=x)
     check_rising("radii", radii)
     check_layout(layout)
     return _library.run(
-        reference.polar_to_image, reference.polar_to_image,
+        torch.ops.darswin.polar_to_image.default, reference.polar_to_image, _kernel_takes,
         x, radii, center, affine, points, r_max, (height, width), layout == "tokens",
-        kernel=_kernel_takes(x, height * width),
     )  # fmt: skip
 
 
-def _kernel_takes(x: Tensor, pixels: int) -> bool:
-    """Whether the kernel for GPUs is there and computes it: not float64, nor 2³¹ pixels or tokens
-    of an image."""
-    if not _library.has_kernels(x) or x.dtype == torch.float64:
-        return False
-    return max(pixels, x.shape[1] * x.shape[2]) < 2**31 - 2**16
-
-
-def _check_lens(
-    name: str, tensor: Tensor, x: Tensor, dtype: torch.dtype, form: str, *shape: int
-) -> None:
-    """TypeError or ValueError unless a tensor of the lens is (B or 1, *shape), beside x."""
-    check_tensor(name, tensor, like=x, dtypes=(dtype,))
-    check_shape(name, tensor, form, (len(x), *shape), (1, *shape))
+def _kernel_takes(x, radii, center, affine, points, r_max, size, tokens) -> bool:
+    """Whether the kernel for GPUs computes it: not float64, nor 2³¹ pixels or tokens an image."""
+    most = max(size[0] * size[1], x.shape[1] * x.shape[2])
+    return x.dtype != torch.float64 and most < 2**31 - 2**16
 
 
 @torch.library.register_fake("darswin::polar_to_image")
@@ -124,29 +105,4 @@ def _fake(x, radii, center, affine, points, r_max, size, tokens):
     )
 
 
-@torch.library.register_fake("darswin::polar_to_image_backward")
-def _fake_backward(
-    x, radii, center, affine, points, r_max, size, tokens, grad_out, x_grad, lens_grad
-):
-    lens = (radii, center, affine, points)
-    gradients = [radii.new_empty(t.shape if lens_grad and t is not None else (0,)) for t in lens]
-    return x.new_empty(x.shape if x_grad else (0,)), *gradients
-
-
-def _setup_context(ctx, inputs, output):
-    ctx.save_for_backward(*inputs[:6])
-    ctx.settings = inputs[6:]
-
-
-def _backward(ctx, grad_out):
-    _library.refuse_other_derivatives("polar_to_image's backward", (grad_out,))
-    wanted = ctx.needs_input_grad
-    gradients = torch.ops.darswin.polar_to_image_backward(
-        *ctx.saved_tensors, *ctx.settings, grad_out, wanted[0], any(wanted[1:5])
-    )
-    kept = [g if want else None for g, want in zip(gradients, wanted, strict=False)]
-    return *kept, None, None, None
-
-
-torch.library.register_autograd("darswin::polar_to_image", _backward, setup_context=_setup_context)
-_library.no_second_derivative("darswin::polar_to_image")
+_library.register_gradients("polar_to_image", {0: 0, 1: 1, 2: 1, 3: 1, 4: 1})

@@ -1,8 +1,8 @@
-"""The operators in plain PyTorch: oracle of the tests, and what runs within `use_reference`.
+"""The operators in plain PyTorch: their definition, the oracle of the tests, and the code that
+runs within `use_reference` and on devices without a kernel.
 
-Other devices run `_devices.py`, where it has the operator: the same in fewer launches. An operator
-and its twin have the same name and the same parameters, which come checked; those of a sampling
-come as one.
+An operator and its twin have the same name and the same parameters, which come checked; those of a
+sampling come as one.
 """
 
 import math
@@ -13,7 +13,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from darswin.ops._sampling import Sampling
-from darswin.ops.waiting import tensor_there
+from darswin.ops.checks import tensor_there
 
 _WORD = 0xFFFFFFFF
 
@@ -49,7 +49,7 @@ def _jittered(
     point = torch.arange(rows * columns, device=device).reshape(1, rows, columns)
     image = torch.arange(batch, device=device).reshape(-1, 1, 1)
     # Word p % 4 of counter p / 4; u and v in [-1/2, 1/2) are its halves.
-    words = torch.stack(philox(seed.to(device), point // 4, image))
+    words = torch.stack(philox(seed, point // 4, image))
     word = words.gather(0, (point % 4).expand(1, batch, rows, columns))[0]
     u, v = (
         (half.to(radii.dtype) * 2.0**-16 - 0.5) * jitter for half in (word >> 16, word & 0xFFFF)
@@ -141,8 +141,7 @@ def laid_out(out: Tensor, sampling: Sampling, tokens: bool) -> Tensor:
 
 def polar_embed(sampling: Sampling, weight: Tensor, bias: Tensor | None) -> Tensor:
     """See `darswin.ops.polar_embed`."""
-    samples = polar_sample(sampling._replace(bfloat16=False), tokens=True)
-    return embedded(samples, sampling, weight, bias)
+    return embedded(polar_sample(sampling._replace(bfloat16=False), True), sampling, weight, bias)
 
 
 def embedded(samples: Tensor, sampling: Sampling, weight: Tensor, bias: Tensor | None) -> Tensor:

@@ -1,12 +1,12 @@
-"""window_attention: attention in the windows of a polar map. Public function, fake, autograd."""
+"""window_attention: attention in the windows of a polar map. Public function, fakes, autograd."""
 
 import math
 
 import torch
 from torch import Tensor
 
-from darswin.ops import _devices, _library, reference
-from darswin.ops.checks import DTYPES, check_pair, check_shape, check_tensor
+from darswin.ops import _library, reference
+from darswin.ops.checks import DTYPES, check_pair, check_tensor
 
 
 def window_attention(
@@ -53,10 +53,8 @@ def window_attention(
     if isinstance(qkv, Tensor) and isinstance(bias, Tensor):
         narrow = (torch.bfloat16, torch.float16) if _library.has_kernels(qkv) else narrow
         qkv, bias = _arithmetic_types(qkv, bias, narrow)
-    check_tensor("qkv", qkv, dtypes=(*DTYPES, *narrow))
-    half = qkv.dtype in narrow
-    check_tensor("bias", bias, like=qkv, dtypes=(torch.float32,) if half else None)
-    check_shape("qkv", qkv, "(B, R, A, 3, heads, d)", (None, None, None, 3, None, None))
+    shape = (None, None, None, 3, None, None)
+    check_tensor("qkv", qkv, (*DTYPES, *narrow), "(B, R, A, 3, heads, d)", shape)
     batch, rings, sectors, _, heads, head_dim = qkv.shape
     if rings == 0 or sectors == 0 or head_dim == 0:
         raise ValueError(f"qkv must have rings, sectors and a head dim, got {tuple(qkv.shape)}")
@@ -68,34 +66,31 @@ def window_attention(
         raise ValueError(f"shift must lie inside (R, A) = ({rings}, {sectors}), got {shift}")
     if not isinstance(periodic, (tuple, list)) or len(periodic) != 2:
         raise TypeError(f"periodic must be a pair of bools, got {periodic!r}")
-    table = (2 * window[0] - 1, 2 * window[1] - 1)
+    real = torch.float32 if qkv.dtype in narrow else qkv.dtype
+    table = (heads, 2 * window[0] - 1, 2 * window[1] - 1)
     form = "(B or 1, heads, 2·M_r-1, 2·M_φ-1) = ({} or 1, {}, {}, {})"
-    check_shape("bias", bias, form, (batch, heads, *table), (1, heads, *table))
+    check_tensor("bias", bias, (real,), form, (batch, *table), (1, *table), like=qkv)
     scale = head_dim**-0.5 if scale is None else float(scale)
-    # As ints: torch.jit.trace takes no list of bools.
-    wrap = tuple(int(bool(p)) for p in periodic)
-    arguments = (qkv, bias, window, shift, wrap, scale)
+    wrap = tuple(int(bool(p)) for p in periodic)  # torch.jit.trace takes no list of bools
     return _library.run(
-        reference.window_attention,
-        _devices.window_attention,
-        *arguments,
-        kernel=_kernel_takes(bias.dtype, window, head_dim),
-    )
+        torch.ops.darswin.window_attention.default, reference.window_attention, _kernel_takes,
+        qkv, bias, window, shift, wrap, scale,
+    )  # fmt: skip
 
 
-def _kernel_takes(dtype: torch.dtype, window: tuple[int, int], head_dim: int) -> bool:
+def _kernel_takes(qkv: Tensor, bias: Tensor, window: tuple[int, int], *others: object) -> bool:
     """Whether the kernel for GPUs computes it: a program holds the pairs of a window's tokens, and
     their queries, keys and values, in registers."""
-    tokens = math.prod(window)
-    return dtype == torch.float32 and tokens <= 64 and head_dim <= (64 if tokens <= 32 else 32)
+    tokens, head_dim = math.prod(window), qkv.shape[5]
+    dims = 64 if tokens <= 32 else 32
+    return bias.dtype == torch.float32 and tokens <= 64 and head_dim <= dims
 
 
 def _arithmetic_types(
     qkv: Tensor, bias: Tensor, narrow: tuple[torch.dtype, ...]
 ) -> tuple[Tensor, Tensor]:
-    """What autocast may have made of the arguments, as the operator takes it: qkv in one of the
-    `narrow` types stays, since the operator widens it as it reads; a bias that goes with it is
-    float32."""
+    """The arguments in types that the operator takes, where autocast changed them: qkv stays in one
+    of the `narrow` types, which the operator reads; its bias becomes float32."""
     if torch.float16 not in narrow:
         qkv, bias = _library.without_float16(qkv), _library.without_float16(bias)
     if bias.dtype not in narrow:
@@ -110,26 +105,4 @@ def _fake(qkv, bias, window, shift, periodic, scale):
     return qkv.new_empty((batch, rings, sectors, heads * head_dim))
 
 
-@torch.library.register_fake("darswin::window_attention_backward")
-def _fake_backward(qkv, bias, window, shift, periodic, scale, grad_out):
-    return qkv.new_empty(qkv.shape), bias.new_empty(bias.shape)
-
-
-def _setup_context(ctx, inputs, output):
-    qkv, bias, window, shift, periodic, scale = inputs
-    ctx.save_for_backward(qkv, bias)
-    ctx.settings = (window, shift, periodic, scale)
-
-
-def _backward(ctx, grad_out):
-    _library.refuse_other_derivatives("window_attention's backward", (grad_out,))
-    grad_qkv, grad_bias = torch.ops.darswin.window_attention_backward(
-        *ctx.saved_tensors, *ctx.settings, grad_out
-    )
-    return grad_qkv, grad_bias, None, None, None, None
-
-
-torch.library.register_autograd(
-    "darswin::window_attention", _backward, setup_context=_setup_context
-)
-_library.no_second_derivative("darswin::window_attention")
+_library.register_gradients("window_attention", {0: 0, 1: 0})

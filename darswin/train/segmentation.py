@@ -10,7 +10,7 @@ from torchmetrics.classification import MulticlassAccuracy, MulticlassJaccardInd
 
 from darswin.data.scenes import IGNORE
 from darswin.data.splits import some
-from darswin.ops.waiting import tensor_there
+from darswin.ops.checks import tensor_there
 from darswin.train.dense import DenseTask
 from darswin.train.losses import LabelLoss, label_loss
 from darswin.train.pixel_metrics import BY_AREA, LabelSums, label_scores, none_of_nan

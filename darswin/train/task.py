@@ -20,7 +20,7 @@ from darswin.models.encoder import Encoder
 from darswin.models.registry import model_class
 from darswin.models.saving import ModelCard, read_card
 from darswin.models.saving import Task as TaskName
-from darswin.ops.waiting import readable
+from darswin.ops.checks import readable
 from darswin.train.data import RunData
 from darswin.train.finetuning import (
     check_name,

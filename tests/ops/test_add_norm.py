@@ -7,7 +7,7 @@ import torch
 import torch.nn.functional as F
 
 from darswin.ops import _module, cpu_capability
-from darswin.ops._add_norm import add_norm_
+from darswin.ops._inference import add_norm_
 
 EPS = 1e-5
 # Less than a register, registers and a rest, what the models have, and enough for many threads.

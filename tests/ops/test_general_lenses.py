@@ -513,7 +513,7 @@ def test_export():
          r"affine must have shape \(B or 1, 2, 2\) = \(2 or 1, 2, 2\), got \(2, 2\)"),
         (dict(affine=torch.zeros(3, 2, 2)), ValueError, "affine must have shape"),
         (dict(affine=torch.zeros(2, 2, 3)), ValueError, "affine must have shape"),
-        (dict(affine=torch.zeros(2, 2, 2).double()), TypeError, "affine must have the same dtype"),
+        (dict(affine=torch.zeros(2, 2, 2).double()), TypeError, "affine must be float32, got"),
         (dict(affine=torch.zeros(2, 2, 2, device="meta")), ValueError, "affine must be on the"),
         (dict(offsets="no"), TypeError, "offsets must be a tensor, got str"),
         (dict(offsets=torch.zeros(2, 6, 8)), ValueError,
@@ -521,7 +521,7 @@ def test_export():
          r"got \(2, 6, 8\)"),
         (dict(offsets=torch.zeros(2, 2, 8, 6)), ValueError, "offsets must have shape"),
         (dict(offsets=torch.zeros(3, 2, 6, 8)), ValueError, "offsets must have shape"),
-        (dict(offsets=torch.zeros(2, 2, 6, 8).long()), TypeError, "offsets must be float32"),
+        (dict(offsets=torch.zeros(2, 2, 6, 8).long()), TypeError, "offsets must be float32, got"),
     ],
 )  # fmt: skip
 def test_errors_say_what_was_expected(change, error, message, reference):

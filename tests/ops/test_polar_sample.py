@@ -787,7 +787,11 @@ f32 = torch.float32
         (dict(image="no"), TypeError, "image must be a tensor, got str"),
         (dict(image=torch.zeros(2, 3, 17)), ValueError, r"\(B, C, H, W\), got \(2, 3, 17\)"),
         (dict(image=torch.zeros(2, 3, 17, 23).int()), TypeError, "image must be float32"),
-        (dict(radii=torch.zeros(2, 6).double()), TypeError, "radii must have the same dtype"),
+        (
+            dict(radii=torch.zeros(2, 6).double()),
+            TypeError,
+            "radii must be float32, got",
+        ),
         (dict(radii=torch.zeros(2, 6, device="meta")), ValueError, "radii must be on the same"),
         (dict(radii=torch.zeros(3, 6)), ValueError, r"radii must have shape .*\(2 or 1, any\)"),
         (dict(radii=torch.zeros(6)), ValueError, r"radii must have shape .*, got \(6,\)"),

@@ -9,15 +9,13 @@ from collections.abc import Sequence
 import pytest
 import strategies
 import torch
-from helpers import as_on_devices
 from hypothesis import given, note
 from hypothesis import strategies as st
 from strategies import Case, f32, f64
 from torch import Tensor
 
 from darswin.ops import polar_sample, reference, use_reference
-from darswin.ops._add_norm import add_norm_
-from darswin.ops._transpose_sum import transpose_sum
+from darswin.ops._inference import add_norm_, transpose_sum
 
 bf16 = torch.bfloat16
 THREADS = (1, 2, 3)
@@ -413,57 +411,3 @@ def test_the_reference_is_what_the_operators_are_compared_with():
 
 
 pytestmark = pytest.mark.filterwarnings("error")
-
-
-# -- what other devices run ------------------------------------------------------------------------
-
-
-def assert_devices_equal_the_reference(case: Case) -> None:
-    """In float64, where all that differs is rounding."""
-    note(repr(case))
-    expected = results(case, is_reference=True)
-    with as_on_devices():
-        ours = results(case, is_reference=False)
-    for name, value in ours.items():
-        size = 1 + largest(torch.nan_to_num(expected[name], 0, 0, 0))
-        torch.testing.assert_close(
-            value, expected[name], rtol=1e-9, atol=1e-9 * size, equal_nan=True
-        )
-
-
-@given(strategies.sampling(dtypes=(f64,)))
-def test_devices_sample_as_the_reference(case):
-    assert_devices_equal_the_reference(case)
-
-
-@given(strategies.sampling(dtypes=(f64,), embed=True))
-def test_devices_embed_as_the_reference(case):
-    assert_devices_equal_the_reference(case)
-
-
-@given(strategies.attention(dtypes=(f64,)))
-def test_devices_attend_as_the_reference(case):
-    assert_devices_equal_the_reference(case)
-
-
-@given(strategies.sampling(dtypes=(f64,)), strategies.generators(), bad_values, st.data())
-def test_a_lens_that_is_not_finite_samples_nothing_on_devices_either(case, generator, bad, data):
-    names = [name for name in ("radii", "center", "affine", "offsets") if name in case.inputs]
-    name = data.draw(st.sampled_from([*names, "azimuths"]))
-    place = case.settings if name == "azimuths" else case.inputs
-    place[name] = spoiled(generator, place[name], bad, 0.2)
-    assert_devices_equal_the_reference(case)
-
-
-@given(strategies.sampling(dtypes=(f64,)), strategies.generators(), bad_values)
-def test_pixels_that_are_not_finite_spoil_no_other_points_on_devices(case, generator, bad):
-    note(repr(case))
-    image = case.inputs["image"]
-    case.inputs["image"] = spoiled(generator, image, bad, 0.02)
-    smooth = case.mask(**case.inputs) > 0
-    with torch.no_grad():
-        with use_reference():
-            expected = case.run(**case.inputs)
-        with as_on_devices():
-            ours = case.run(**case.inputs)
-    assert_same_kinds(torch.where(smooth, ours, 0), torch.where(smooth, expected, 0), atol=1e-9)

@@ -9,8 +9,7 @@ from hypothesis import strategies as st
 
 from darswin.layers.quantized import Quantization, dequantize, quantize
 from darswin.ops import _module, cpu_capability, use_reference, window_attention
-from darswin.ops._add_norm import add_norm_
-from darswin.ops._quantized import add_norm_quantized_, window_attention_quantized
+from darswin.ops._inference import add_norm_, add_norm_quantized_, window_attention_quantized
 
 EPS = 1e-5
 SHAPES = [(1, 1), (3, 7), (2, 5, 37), (4, 16, 96), (128, 768)]

@@ -3,7 +3,7 @@ import math
 import pytest
 import torch
 
-from darswin.ops._transpose_sum import transpose_sum
+from darswin.ops._inference import transpose_sum
 
 # Less than a register, registers and rests of both sides, groups of rows and a rest, and what the
 # models have.

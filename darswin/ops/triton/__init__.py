@@ -2,8 +2,8 @@
 
 An operator is declared once, in C++, with its fake and autograd in `darswin/ops`; here it gets what
 it runs on a CUDA device. `LAUNCHERS` names the module of each. In it a function of the operator's
-name takes what the schema says, makes the outputs and launches. The public function has checked the
-arguments, and knows which of them the kernel does not take; then `_devices.py` computes.
+name takes the arguments of the schema, makes the outputs and launches. The public function has
+checked the arguments; those that the kernel does not compute go to the reference.
 
 The kernels are for NVIDIA's GPUs since the A100. Triton is no dependency: without it nothing is
 registered, and with it no kernel is imported before the first call on a CUDA device. Their rules:
@@ -29,8 +29,8 @@ INSTALLED = importlib.util.find_spec("triton") is not None
 LAUNCHERS = {
     "polar_sample": "polar_sample",
     "polar_sample_backward": "polar_sample",
-    "polar_embed": "polar_embed",
-    "polar_embed_backward": "polar_embed",
+    "polar_embed": "polar_sample",
+    "polar_embed_backward": "polar_sample",
     "polar_to_image": "polar_to_image",
     "polar_to_image_backward": "polar_to_image",
     "window_attention": "window_attention",

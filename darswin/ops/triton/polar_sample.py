@@ -1,4 +1,4 @@
-"""polar_sample on CUDA devices: forward and backward.
+"""polar_sample and polar_embed on CUDA devices: forward and backward.
 
 Forward is one launch. A program takes a block of samples in the order of the output, finds each
 sample's place and mixes its four pixels, a few channels at a time, which are then written together.
@@ -8,6 +8,10 @@ come in any order, so it is a sum of integers: each share is counted in units of
 largest gradient that arrives, and a second kernel turns the sums into numbers. What the lens gets
 are sums over the points of a radius, which its program adds up and torch adds to each other. So
 two runs give the same bits. Where a gradient that arrives is not finite, that of the image is NaN.
+
+polar_embed is the kernels of polar_sample and torch's products, of which
+`torch.backends.cuda.matmul` decides the precision. Its samples are float32; backward makes them
+again.
 """
 
 from typing import Any
@@ -18,7 +22,9 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from darswin.ops._sampling import Sampling
+from darswin.ops import reference
+from darswin.ops._library import autocast_off, empty_gradients
+from darswin.ops._sampling import GRADIENTS, Sampling
 from darswin.ops.triton import fixed_point
 from darswin.ops.triton.fixed_point import like, near_one
 from darswin.ops.triton.points import cell, four_pixels, inside, locate, point_of, token_order
@@ -226,7 +232,8 @@ def backward(
 
     grad_out: in the order of the output, of any shape.
     """
-    gradients = sampling.new_gradients(image_grad, lens_grad, offsets_grad)
+    wanted = image_grad, lens_grad, offsets_grad
+    gradients = empty_gradients(sampling, GRADIENTS, wanted)
     if grad_out.numel() == 0:
         return tuple(gradient.zero_() for gradient in gradients)
     image, radii, azimuths, _, _, offsets = sampling[:6]
@@ -288,3 +295,31 @@ def polar_sample_backward(*arguments: Any) -> tuple[Tensor, ...]:
     """`darswin::polar_sample_backward`."""
     fields, others = arguments[: len(Sampling._fields)], arguments[len(Sampling._fields) :]
     return backward(Sampling(*fields), *others)
+
+
+def _samples(sampling: Sampling) -> Tensor:
+    """(B·R·A, S_r·S_φ·C): torch adds the bias within the product of a matrix."""
+    return forward(sampling._replace(bfloat16=False), tokens=True).flatten(0, 2)
+
+
+def polar_embed(*arguments: Any) -> Tensor:
+    """`darswin::polar_embed`."""
+    *fields, weight, bias = arguments
+    sampling = Sampling(*fields)
+    with autocast_off(weight.device.type):
+        out = reference.embedded(_samples(sampling), sampling, weight, bias)
+    return out.view(*sampling.map_size(), len(weight))
+
+
+def polar_embed_backward(*arguments: Any) -> tuple[Tensor, ...]:
+    """`darswin::polar_embed_backward`."""
+    *fields, weight, grad_out, image_grad, lens_grad, offsets_grad, weight_grad = arguments
+    sampling, wanted = Sampling(*fields), (image_grad, lens_grad, offsets_grad)
+    with autocast_off(weight.device.type):
+        grad = grad_out.float().flatten(0, 2)
+        gradients = empty_gradients(sampling, GRADIENTS, wanted)
+        if any(wanted):
+            gradients = backward(sampling, True, grad @ weight.float(), *wanted)
+        if not weight_grad:
+            return *gradients, grad.new_empty((0,)), grad.new_empty((0,))
+        return *gradients, grad.t() @ _samples(sampling), grad.sum(0)
