@@ -6,8 +6,8 @@ import numpy as np
 import torch
 from matplotlib.figure import Figure
 
-from darswin.data.dense import DenseSamples
-from darswin.data.scenes import open_scenes
+from darswin.data import open_scenes
+from darswin.data.scenes.dataset import SceneSamples
 from darswin.models.saving import load_model, model_of_run
 from darswin.viz.dense import distance_image, label_image
 from darswin.viz.plot import save_figure
@@ -26,7 +26,7 @@ def predict(run: Path, data: Path, task: str) -> None:
     for name, place in SHOWN.items():
         scenes = open_scenes(str(data / "test" / name), "test", TARGETS[task])
         mean, std = card.options["mean"], card.options["std"]
-        test = DenseSamples(scenes, size=card.size, mean=mean, std=std)
+        test = SceneSamples(scenes, size=card.size, mean=mean, std=std)
         image, lens, _ = test[min(place, len(test) - 1)]
         with torch.inference_mode():
             found = model(image[None], lens)[0]

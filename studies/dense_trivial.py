@@ -17,7 +17,7 @@ import dense_data
 import numpy as np
 import torch
 
-from darswin.data.scenes import IGNORE, open_scenes
+from darswin.data import IGNORE, open_scenes
 from darswin.lens.pixels import pixel_rays
 from darswin.train.pixel_metrics import DistanceSums, LabelSums, distance_scores, label_scores
 from darswin.utils.files import replace_file

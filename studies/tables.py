@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from darswin.bench.machine import machine
 from darswin.bench.record import write
 from darswin.bench.tables import markdown
-from darswin.data.lenses import LEVELS as RANGES
+from darswin.data.lens_distributions import LEVELS as RANGES
 from darswin.viz.plot import save_figure
 
 # The paper's tables (DarSwin, ICCV 2023), by the training level.

@@ -18,7 +18,7 @@ from dense_cells import CONTROLLED, MODELS, STUDIED, all_cells  # noqa: E402
 from dense_trivial import trivial  # noqa: E402
 from worlds import wad  # noqa: E402
 
-from darswin.data.scenes import open_scenes  # noqa: E402
+from darswin.data import open_scenes  # noqa: E402
 
 pytestmark = pytest.mark.skipif(
     not (wad.FOLDER / "freedoom1.wad").exists(), reason="the game's files are not installed"

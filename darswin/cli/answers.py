@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from darswin.data.frames import Fit, at_size
+from darswin.data.warp import Framing, at_size
 from darswin.deploy.optimize import optimize
 from darswin.lens import Lens
 from darswin.models.base import Model
@@ -151,12 +151,12 @@ def fast(model: Net, card: ModelCard) -> Net:
 def resized(net: Model, card: ModelCard, image: np.ndarray, lens: Lens) -> tuple[Tensor, Lens]:
     """A picture as the model saw them in training: (1, C, H, W) uint8 with its lens, in its pixels.
 
-    `darswin.data.frames.at_size` as the model's card says, and `fit_of`.
+    `darswin.data.at_size` as the model's card says, and `fit_of`.
     """
     image, lens = at_size(image, lens, card.size, fit_of(net, card))
     return torch.from_numpy(image[None]).permute(0, 3, 1, 2).contiguous(), lens
 
 
-def fit_of(net: Model, card: ModelCard) -> Fit:
+def fit_of(net: Model, card: ModelCard) -> Framing:
     """How pictures get the model's size. One that takes only squares gets one in any case."""
     return "crop" if net.square_images and card.fit == "whole" else card.fit

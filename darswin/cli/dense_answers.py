@@ -14,8 +14,8 @@ from PIL import Image
 from torch import Tensor
 
 from darswin.cli.answers import Answers, Asked, fast, fit_of
-from darswin.data.full_size import FullSize
-from darswin.data.scenes.targets import IGNORE, PER_METRE
+from darswin.data.scenes.scene import IGNORE, PER_METRE
+from darswin.data.warp import FullSize
 from darswin.lens import Lens
 from darswin.models.dense import DenseModel, DensePrepared
 from darswin.models.saving import ModelCard

@@ -26,7 +26,7 @@ from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from darswin.cli.arguments import with_lists, with_words
 from darswin.cli.configs import FIRST_TASK, check_free, last_of, presets, task_of, with_configs
 from darswin.cli.help import ALL, format_help
-from darswin.data.lenses import parse_sweep
+from darswin.data.lens_distributions import parse_sweep
 from darswin.models.saving import Task, model_of_run, read_card
 from darswin.train.checkpoints import RunCheckpoint, SafeCheckpointIO
 from darswin.train.finetuning import settle, weights_file

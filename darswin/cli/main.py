@@ -4,6 +4,7 @@ import argparse
 import codecs
 import json
 import os
+import re
 import sys
 import warnings
 from collections.abc import Callable, Mapping
@@ -145,18 +146,19 @@ def main(argv: list[str] | None = None) -> None:
         broken = "BrokenImageError" in f"{type(error).__name__}{message}"
         if broken and command.run is _fit:
             message += " (--data.skip_broken true leaves such files out)"
-        message += _option(message, command.run is _fit)
+        message = _with_flags(message, command.run is _fit)
         if isinstance(error, FloatingPointError):
             raise SystemExit(f"darswin: {message}") from error
         raise misuse(message) from error
 
 
-def _option(message: str, of_data: bool) -> str:
-    """The option that has the argument of a function that an error asks for."""
+def _with_flags(message: str, of_data: bool) -> str:
+    """A library's error, in which flags stand for the parameters in backticks."""
+    data = "data." if of_data else ""
+    message = re.sub(r"`(\w+)`", rf"--{data}\1", message)
     options = {"give model=": "coefficients", "choose one as camera=": "camera"}
     name = next((options[said] for said in options if said in message), None)
-    data = "data." if of_data else ""
-    return "" if name is None else f" (on the command line as --{data}{name})"
+    return message if name is None else f"{message} (on the command line as --{data}{name})"
 
 
 def misuse(message: str) -> SystemExit:

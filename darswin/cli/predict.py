@@ -15,10 +15,9 @@ from safetensors import safe_open
 from darswin.cli.answers import Answers, ClassAnswers
 from darswin.cli.dense_answers import ANSWERS, ANSWERS_OF, claim_folder, file_names
 from darswin.compat import load_official
-from darswin.data.calibrations import Calibrations, PictureLenses, is_json
+from darswin.data.cameras import Calibrations, is_json
 from darswin.data.folders import PICTURES, pictures_and_videos_below
 from darswin.data.samples import IMAGENET_MEAN, IMAGENET_STD
-from darswin.data.scenes.lenses import OwnLenses
 from darswin.lens import Lens
 from darswin.lens.files.opencv import Coefficients
 from darswin.models.pretrained import list_pretrained, pretrained_file
@@ -170,7 +169,7 @@ def _is_below(path: str, folder: str) -> bool:
     return Path(os.path.realpath(path)).is_relative_to(os.path.realpath(folder))
 
 
-def answer_video(name: str, every: int, calibrations: PictureLenses, answers: Answers) -> None:
+def answer_video(name: str, every: int, calibrations: Calibrations, answers: Answers) -> None:
     """Answers the frames of a video, and says how fast that went.
 
     Raises:
@@ -202,7 +201,7 @@ def answer_video(name: str, every: int, calibrations: PictureLenses, answers: An
 
 def _calibrations(
     lens: str, camera: str | None, coefficients: str | None, files: Sequence[File]
-) -> PictureLenses:
+) -> Calibrations:
     """What took the files.
 
     Raises:
@@ -219,10 +218,10 @@ def _calibrations(
         raise FileNotFoundError(
             f"no calibration in {lens}: the first would be {next(iter(own.values()))}"
         )
-    return OwnLenses(there, coefficients=coefficients)
+    return Calibrations(None, coefficients=coefficients, files=there)
 
 
-def _lens(calibrations: PictureLenses, name: str, image: np.ndarray, orientation: int) -> Lens:
+def _lens(calibrations: Calibrations, name: str, image: np.ndarray, orientation: int) -> Lens:
     """The lens in an upright picture or frame; BrokenImageError where there is none that fits."""
     try:
         return calibrations.lens_of(Path(name), (image.shape[0], image.shape[1]), orientation)

@@ -1,12 +1,20 @@
 """Data: images seen through lenses."""
 
-from darswin.data.calibrated import Calibrated
-from darswin.data.calibrations import Calibrations
-from darswin.data.datasets import open_source
-from darswin.data.dense import DenseSamples
-from darswin.data.lenses import LEVELS, PolynomialLenses, SphericalLenses, parse_lenses
-from darswin.data.scenes import IGNORE, Scene, Scenes, open_scenes
-from darswin.data.warp import warp, warp_map
+from darswin.data.augment import Mixing, RandAugment, RandomErasing
+from darswin.data.cameras import Calibrations
+from darswin.data.lens_distributions import (
+    LEVELS,
+    PolynomialLenses,
+    SphericalLenses,
+    parse_lenses,
+)
+from darswin.data.pictures import open_source
+from darswin.data.samples import Calibrated
+from darswin.data.scenes import open_scenes
+from darswin.data.scenes.dataset import SceneSamples
+from darswin.data.scenes.scene import IGNORE, Scene, Scenes
+from darswin.data.splits import LeftOut
+from darswin.data.warp import FullSize, RandomTurns, at_size, lens_at_size, warp, warp_map
 from darswin.data.wide_angle import WideAngle
 
 __all__ = [
@@ -14,12 +22,20 @@ __all__ = [
     "LEVELS",
     "Calibrated",
     "Calibrations",
-    "DenseSamples",
+    "FullSize",
+    "LeftOut",
+    "Mixing",
     "PolynomialLenses",
+    "RandAugment",
+    "RandomErasing",
+    "RandomTurns",
     "Scene",
+    "SceneSamples",
     "Scenes",
     "SphericalLenses",
     "WideAngle",
+    "at_size",
+    "lens_at_size",
     "open_scenes",
     "open_source",
     "parse_lenses",

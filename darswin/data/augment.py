@@ -1,4 +1,4 @@
-"""Augmentation of single images: RandAugment without its geometric operations, and random erasing.
+"""Augmentation: RandAugment without its geometric operations, random erasing, mixup and CutMix.
 
 An image seen through a known lens may change its colours but not its geometry, or the lens would be
 wrong.
@@ -6,14 +6,22 @@ wrong.
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
+import torch
 from PIL import Image, ImageEnhance, ImageOps
+from torch import Tensor
+
+from darswin.lens import Lens
+from darswin.ops.checks import readable
 
 LARGEST = 10  # the magnitude that the strongest form of an operation has
+# An operation takes a picture, a magnitude and a random generator.
+Operation = Callable[[Image.Image, float, np.random.Generator], Image.Image]
 
 
-def _enhance(kind: type) -> Callable[[Image.Image, float, np.random.Generator], Image.Image]:
+def _enhance(kind: type) -> Operation:
     def enhance(image: Image.Image, magnitude: float, rng: np.random.Generator) -> Image.Image:
         change = 0.9 * magnitude / LARGEST
         return kind(image).enhance(max(0.1, 1 + (change if rng.random() < 0.5 else -change)))
@@ -21,8 +29,14 @@ def _enhance(kind: type) -> Callable[[Image.Image, float, np.random.Generator], 
     return enhance
 
 
+def _solarize_add(image: Image.Image, add: int, threshold: int = 128) -> Image.Image:
+    """Brightens dark pixels."""
+    table = [min(255, value + add) if value < threshold else value for value in range(256)]
+    return image.point(table * len(image.getbands()))
+
+
 # The stronger the magnitude, the stronger the change ("increasing").
-OPERATIONS: dict[str, Callable[[Image.Image, float, np.random.Generator], Image.Image]] = {
+OPERATIONS: dict[str, Operation] = {
     "auto_contrast": lambda image, magnitude, rng: ImageOps.autocontrast(image),
     "equalize": lambda image, magnitude, rng: ImageOps.equalize(image),
     "invert": lambda image, magnitude, rng: ImageOps.invert(image),
@@ -40,12 +54,6 @@ OPERATIONS: dict[str, Callable[[Image.Image, float, np.random.Generator], Image.
     "brightness": _enhance(ImageEnhance.Brightness),
     "sharpness": _enhance(ImageEnhance.Sharpness),
 }
-
-
-def _solarize_add(image: Image.Image, add: int, threshold: int = 128) -> Image.Image:
-    """Brightens what is dark."""
-    table = [min(255, value + add) if value < threshold else value for value in range(256)]
-    return image.point(table * len(image.getbands()))
 
 
 class RandAugment:
@@ -106,3 +114,80 @@ class RandomErasing:
                 image[:, top : top + h, left : left + w] = noise
                 break
         return image
+
+
+@dataclass(frozen=True)
+class Mixing:
+    """Mixup and CutMix of a batch of images and their labels.
+
+    Mixes each image of a batch with its partner, that of the reversed batch, by mixup or CutMix.
+
+    One λ for a whole batch: from Beta(α, α) of mixup's or CutMix's α. Mixup takes λ of the image
+    and 1 - λ of its partner, CutMix puts a box of the partner into it and corrects λ to the box's
+    area.
+
+    Args:
+        mixup, cutmix: α of each; 0 turns it off. With both, each has half of the batches.
+        p: the share of batches that are mixed.
+
+    Source: Zhang et al., mixup, 2018; Yun et al., CutMix, 2019; timm's "batch" mode.
+    """
+
+    mixup: float = 0.8
+    cutmix: float = 1.0
+    p: float = 1.0
+
+    def __post_init__(self) -> None:
+        if self.mixup < 0 or self.cutmix < 0 or not 0 <= self.p <= 1:
+            raise ValueError(f"mixing needs mixup, cutmix ≥ 0 and p in [0, 1], got {self}")
+
+    def __call__(
+        self,
+        images: Tensor,
+        targets: Tensor,
+        rng: np.random.Generator,
+        may_mix: Tensor | None = None,
+    ) -> tuple[Tensor, Tensor]:
+        """Images (B, C, H, W) and class probabilities (B, K) → mixed, of the same shapes.
+
+        Where `may_mix`, (B,) bool, is False, an image stays as it is; None is True for all.
+        """
+        if not (self.mixup or self.cutmix) or rng.random() >= self.p:
+            return images, targets
+        partners = images.flip(0)
+        cut = rng.random() < 0.5 if self.mixup and self.cutmix else self.cutmix > 0
+        if cut:
+            share = rng.beta(self.cutmix, self.cutmix)
+            top, bottom, left, right = _box(images.shape[2], images.shape[3], share, rng)
+            mixed = images.clone()
+            mixed[..., top:bottom, left:right] = partners[..., top:bottom, left:right]
+            area = (bottom - top) * (right - left)
+            share = 1 - area / (images.shape[2] * images.shape[3])
+        else:
+            share = rng.beta(self.mixup, self.mixup)
+            mixed = torch.lerp(partners, images, share)
+        mixed_targets = torch.lerp(targets.flip(0), targets, share)
+        if may_mix is None or (readable(may_mix) and bool(may_mix.all())):
+            return mixed, mixed_targets
+        return (
+            torch.where(may_mix[:, None, None, None], mixed, images),
+            torch.where(may_mix[:, None], mixed_targets, targets),
+        )
+
+
+def partners_share(lens: Lens) -> Tensor:
+    """(B,) bool: True where an image of a batch and its partner have the same lens."""
+    tensors = (getattr(lens, name) for name in lens._names())
+    same = [(t == t.flip(0)).reshape(len(t), -1).all(1) for t in tensors if t is not None]
+    return torch.stack(same).all(0)
+
+
+def _box(
+    height: int, width: int, share: float, rng: np.random.Generator
+) -> tuple[int, int, int, int]:
+    """Top, bottom, left, right of a box of 1 - share of the area, cut off at the image's border."""
+    side = math.sqrt(1 - share)
+    h, w = int(height * side), int(width * side)
+    y, x = int(rng.integers(height)), int(rng.integers(width))
+    top, bottom = max(y - h // 2, 0), min(y + h // 2, height)
+    return top, bottom, max(x - w // 2, 0), min(x + w // 2, width)

@@ -1,26 +1,26 @@
-"""Which pictures a folder holds, and which of them are for training, validation and testing.
+"""Reads which pictures a folder holds, and which of them are for each split.
 
-Nothing is left out silently: what can be read in two ways is refused with a sentence that names the
-folder, and what no split takes is said as a `LeftOut` warning.
+Nothing is left out silently: a folder that can be read in two ways is refused, with its name, and
+pictures that no split takes are named in a `LeftOut` warning.
 """
 
 import os
-import warnings
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator
 from pathlib import Path
+from typing import NamedTuple
 
-from darswin.data.sources import ImageFiles
-from darswin.data.splits import Split, hold_out, read_json, read_list, some
+from darswin.data.splits import (
+    SPLIT_NAMES,
+    Split,
+    part_of_split,
+    read_split_lists,
+    some,
+    taken_from,
+    warn_left_out,
+)
 from darswin.utils.video import SUFFIXES as VIDEOS
 
-# What folders and lists of a split are called, in any case.
-SPLIT_NAMES: dict[str, Split] = {
-    "train": "train", "training": "train",
-    "val": "val", "valid": "val", "validation": "val",
-    "test": "test", "testing": "test",
-}  # fmt: skip
 SUFFIXES = frozenset((
     ".jpg", ".jpeg", ".jpe", ".jfif", ".png", ".bmp", ".dib", ".webp", ".tif", ".tiff", ".ppm",
     ".pgm", ".pbm", ".pnm",
@@ -37,122 +37,67 @@ LOOKED_FOR = (
 )
 
 
-class LeftOut(UserWarning):
-    """Pictures that are in no split, or in fewer than they should be."""
-
-
-@dataclass(frozen=True)
-class Pictures:
-    """Attributes: folder; paths: "class/….jpg" below it."""
+class Pictures(NamedTuple):
+    """A folder, and paths "class/….jpg" in it."""
 
     folder: Path
     paths: list[str]
 
 
-def pictures_of(
-    split: Split,
-    root: Path,
-    *,
-    names: list[str] | None = None,
-    lists: str | Path | None = None,
-    holdout: float = 0.1,
+def open_folder(
+    root: Path, split: Split, names: list[str] | None, lists: str | Path | None, holdout: float
 ) -> tuple[Pictures, list[str]]:
-    """The pictures of a split, and the names of all classes. See `darswin.data.open_source`.
-
-    Raises:
-        FileNotFoundError: no pictures. ValueError: folders or lists that can be read in two ways,
-            or do not fit each other.
-    """
+    """The pictures of a split, and the names of all classes; errors as `open_source`."""
     given = _found(root, names) if lists is None else _listed(root, Path(lists))
     if "train" not in given or (split == "train" and not given["train"].paths):
         raise FileNotFoundError(f"no images for the 'train' split in {root}: {LOOKED_FOR}")
     classes = names or _classes(given["train"].paths)
-    for part, pictures in given.items():
-        if unknown := sorted(set(_classes(pictures.paths)) - set(classes)):
+    for part, (folder, paths) in given.items():
+        if unknown := sorted(set(_classes(paths)) - set(classes)):
             reason = "the list of classes does not name" if names else "training has no pictures of"
             raise ValueError(
-                f"{pictures.folder} holds pictures for the {part!r} split of the classes "
-                f"{some(unknown)}, which {reason}: move them away, or list the classes to take in "
-                "--data.classes"
+                f"{folder} holds pictures for the {part!r} split of the classes {some(unknown)}, "
+                f"which {reason}: move them away, or list the classes to take in `classes`"
             )
-    # Without a test set of its own, "val" serves as one.
-    held_out: list[Split] = [part for part in ("test", "val") if part not in given]
-    if held_out == ["test"]:
-        held_out, given["test"] = [], given["val"]
-    if held_out and split in ("train", *held_out):
-        given |= _held_out(given["train"], held_out, holdout)
-    pictures = given[split]
-    if not pictures.paths:
-        none_left = f"--data.holdout {holdout:g} leaves none for it"
-        raise FileNotFoundError(
-            f"no images for the {split!r} split in {pictures.folder}: "
-            f"{none_left if split in held_out else LOOKED_FOR}"
+    part, held_out = taken_from(split, given)
+    folder, paths = given[part]
+    if not paths:
+        raise FileNotFoundError(f"no images for the {split!r} split in {folder}: {LOOKED_FOR}")
+    counts = Counter(map(class_of, paths))
+    small = sorted(name for name, count in counts.items() if count <= len(held_out))
+    if small and holdout > 0:
+        warn_left_out(
+            f"{folder}: too few pictures to hold any out of the classes {some(small)}: all of them "
+            f"are trained on, none is for {' or '.join(held_out)}"
         )
-    return pictures, classes
+    paths = part_of_split(paths, split, held_out, holdout, folder, label=class_of)
+    return Pictures(folder, paths), classes
 
 
 def pictures_and_videos_below(folder: Path) -> list[str]:
     """The pictures and videos in a folder and in those below it, sorted; links are followed, hidden
-    ones not.
-
-    Raises:
-        FileNotFoundError: none that darswin reads.
-    """
+    ones not. FileNotFoundError where darswin reads none of them."""
     files = sorted(files_below(folder), key=_parts)
     read = [file for file in files if _suffix(file) in SUFFIXES | VIDEOS]
     others = [file for file in files if _suffix(file) in OTHER_SUFFIXES]
     if not read:
         found = f", but {_kinds(others)}, which darswin does not read" if others else ""
         raise FileNotFoundError(f"no pictures or videos in {folder}{found}")
-    _say_unread(folder, others)
+    _warn_of_unread(folder, others)
     return read
-
-
-def open_folder(
-    root: Path, split: Split, channels: int, names: list[str] | None,
-    lists: str | Path | None, holdout: float,
-) -> ImageFiles:  # fmt: skip
-    """The pictures of a split as a source; arguments and errors as `darswin.data.open_source`."""
-    pictures, names = pictures_of(split, root, names=names, lists=lists, holdout=holdout)
-    label = {name: k for k, name in enumerate(names)}
-    files = [(path, label[class_of(path)]) for path in pictures.paths]
-    return ImageFiles(pictures.folder, files, names, channels)
-
-
-def _held_out(training: Pictures, parts: Sequence[Split], holdout: float) -> dict[Split, Pictures]:
-    """A share of the training pictures for each of `parts`, and for "train" what is left."""
-    labels = [class_of(path) for path in training.paths]
-    small = sorted(name for name, count in Counter(labels).items() if count <= len(parts))
-    if small and holdout > 0:
-        _say(
-            f"{training.folder}: too few pictures to hold any out of the classes {some(small)}: "
-            f"all of them are trained on, none is for {' or '.join(parts)}"
-        )
-    return {
-        part: Pictures(training.folder, [training.paths[k] for k in chosen])
-        for part, chosen in hold_out(labels, training.paths, holdout, parts).items()
-    }
 
 
 def files_below(folder: Path) -> list[str]:
     """The files in a folder and in those below it; links are followed, hidden ones not."""
-    return list(_below(folder, {}, strict=False))
+    return list(_below(folder))
 
 
 def class_of(path: str) -> str:
-    """The first folder of a path."""
     return path.split(os.sep, 1)[0]
 
 
 def _classes(paths: Iterable[str]) -> list[str]:
-    return sorted({class_of(path) for path in paths})
-
-
-def _say(text: str) -> None:
-    warnings.warn(text, LeftOut, stacklevel=2)
-
-
-# -- folders ----------------------------------------------------------------------------------
+    return sorted(set(map(class_of, paths)))
 
 
 def _found(root: Path, names: list[str] | None) -> dict[Split, Pictures]:
@@ -160,9 +105,7 @@ def _found(root: Path, names: list[str] | None) -> dict[Split, Pictures]:
     # Folders by their real path: a link to one of them, or to one above, gives its pictures twice.
     real = Path(os.path.realpath(root))
     seen = {str(folder): str(folder) for folder in (real, *real.parents)}
-    folders = _split_folders(root, names)
-    if folders is None:
-        return {"train": _pictures(root, names, seen, whole=True)}
+    folders = _split_folders(root, names) or {"train": root}
     return {
         split: _pictures(folder, names, seen, whole=split == "train")
         for split, folder in folders.items()
@@ -192,8 +135,10 @@ def _split_folders(root: Path, names: list[str] | None) -> dict[Split, Path] | N
     has_classes = "train" in named and any(map(_has_pictures, _entries(named["train"])[0]))
     if has_classes and (len(named) > 1 or not others):
         for folder in others:
-            _say(f"{folder} holds pictures, but is no split beside {named['train']}: left out")
-        _say_loose(root, loose)
+            warn_left_out(
+                f"{folder} holds pictures, but is no split beside {named['train']}: left out"
+            )
+        _warn_of_loose(root, loose)
         return named
     if names and all((root / name).is_dir() for name in names):
         return None
@@ -202,19 +147,14 @@ def _split_folders(root: Path, names: list[str] | None) -> dict[Split, Path] | N
     shown = " and ".join(str(folder) for folder in named.values())
     raise ValueError(
         f"{shown} may be meant as splits or as classes: {LOOKED_FOR}; if they are classes, list "
-        "all classes in --data.classes"
+        "all classes in `classes`"
     )
 
 
 def _pictures(folder: Path, names: list[str] | None, seen: dict[str, str], whole: bool) -> Pictures:
-    """The pictures in the folders of classes, of these classes or of all.
-
-    Args:
-        seen: real paths of folders that were read, to which those read here are added.
-        whole: each of `names` must have pictures.
-    """
+    """The pictures in the folders of these classes, or of all; if `whole`, each must have some."""
     folders, loose = _entries(folder)
-    _say_loose(folder, loose)
+    _warn_of_loose(folder, loose)
     by_name = {f.name: f for f in folders}
     paths, others = [], []
     for name in by_name if names is None else [name for name in names if name in by_name]:
@@ -224,32 +164,32 @@ def _pictures(folder: Path, names: list[str] | None, seen: dict[str, str], whole
         if unread and not read:
             raise ValueError(
                 f"{by_name[name]} holds no picture that darswin reads, but {_kinds(unread)}: "
-                "convert them, or list the classes to take in --data.classes"
+                "convert them, or list the classes to take in `classes`"
             )
         if files and not read:
-            _say(f"{by_name[name]} holds files, but no pictures: it is no class")
+            warn_left_out(f"{by_name[name]} holds files, but no pictures: it is no class")
         start = len(str(by_name[name])) - len(name)
         paths += sorted((file[start:] for file in read), key=_parts)
         others += unread
-    _say_unread(folder, others)
+    _warn_of_unread(folder, others)
     found = set(_classes(paths))
     if whole and names and (missing := [name for name in names if name not in found]):
         raise FileNotFoundError(f"no pictures of the classes {some(missing)} in {folder}")
     return Pictures(folder, paths)
 
 
-def _say_unread(folder: Path, files: list[str]) -> None:
+def _warn_of_unread(folder: Path, files: list[str]) -> None:
     if files:
-        _say(
+        warn_left_out(
             f"{folder} holds pictures that darswin does not read, {_kinds(files)}, e.g. "
             f"{files[0]}: left out"
         )
 
 
-def _say_loose(folder: Path, files: list[Path]) -> None:
+def _warn_of_loose(folder: Path, files: list[Path]) -> None:
     if loose := [file for file in files if _is_picture(file)]:
         count = f"{len(loose)}, e.g. {loose[0]}"
-        _say(f"{folder} holds pictures in no class's folder ({count}): left out")
+        warn_left_out(f"{folder} holds pictures in no class's folder ({count}): left out")
 
 
 def _entries(folder: Path) -> tuple[list[Path], list[Path]]:
@@ -258,18 +198,17 @@ def _entries(folder: Path) -> tuple[list[Path], list[Path]]:
     files: list[Path] = []
     with os.scandir(folder) as entries:
         for entry in sorted(entries, key=lambda entry: entry.name):
-            if not _hidden(entry.name):
+            if not entry.name.startswith("."):
                 (folders if entry.is_dir() else files).append(folder / entry.name)
     return folders, files
 
 
-def _below(folder: Path, seen: dict[str, str], strict: bool = True) -> Iterator[str]:
+def _below(folder: Path, seen: dict[str, str] | None = None) -> Iterator[str]:
     """Files below a folder, through links too, no hidden ones.
 
-    Args:
-        seen: real paths of folders that were read. One of them is refused, or left out if not
-            `strict`.
+    A folder whose real path is in `seen` is refused. Without `seen`, each is read once.
     """
+    strict, seen = seen is not None, {} if seen is None else seen
     for here, folders, files in os.walk(folder, followlinks=True, onerror=_raise):
         real = os.path.realpath(here)
         if real in seen and strict:
@@ -281,8 +220,8 @@ def _below(folder: Path, seen: dict[str, str], strict: bool = True) -> Iterator[
             folders.clear()
             continue
         seen[real] = here
-        folders[:] = sorted(name for name in folders if not _hidden(name))
-        yield from (os.path.join(here, name) for name in sorted(files) if not _hidden(name))
+        folders[:] = sorted(name for name in folders if not name.startswith("."))
+        yield from (os.path.join(here, name) for name in sorted(files) if not name.startswith("."))
 
 
 def _raise(error: OSError) -> None:
@@ -290,7 +229,7 @@ def _raise(error: OSError) -> None:
 
 
 def _has_pictures(folder: Path) -> bool:
-    return any(map(_is_picture, _below(folder, {}, strict=False)))
+    return any(map(_is_picture, _below(folder)))
 
 
 def _is_picture(path: str | Path) -> bool:
@@ -309,43 +248,6 @@ def _kinds(paths: Iterable[str]) -> str:
     """ "3 .gif, 1 .heic" """
     counts = Counter(map(_suffix, paths))
     return ", ".join(f"{count} {suffix}" for suffix, count in counts.most_common())
-
-
-def _hidden(name: str) -> bool:
-    return name.startswith(".")
-
-
-# -- lists ------------------------------------------------------------------------------------
-
-
-def read_split_lists(lists: Path) -> dict[Split, list]:
-    """What lists say is in each split: a JSON file, or a folder of text files, one a split. Whether
-    it is paths is left to the reader.
-
-    Raises:
-        ValueError: what is no such list, or two of one split; it names them. OSError: it cannot be
-            read.
-    """
-    if lists.is_dir():
-        content = {
-            file.stem: read_list(file)
-            for file in sorted(lists.glob("*.txt"))
-            if file.stem.lower() in SPLIT_NAMES
-        }
-    else:
-        content = read_json(lists)
-    form = f'{lists} must hold {{"train": [paths], "val": [paths], "test": [paths]}}'
-    if not isinstance(content, dict):
-        raise ValueError(form)
-    given: dict[Split, list] = {}
-    for name, paths in content.items():
-        split = SPLIT_NAMES.get(name.lower())
-        if split is None or split in given:
-            raise ValueError(f"{form}, got {list(content)}")
-        if not isinstance(paths, list):
-            raise ValueError(f"{form}, got {paths!r} for {name!r}")
-        given[split] = paths
-    return given
 
 
 def _listed(root: Path, lists: Path) -> dict[Split, Pictures]:

@@ -15,11 +15,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from darswin.data.frames import Fit, area_resized, part_of
-from darswin.data.scenes.scene import Scene
-from darswin.data.scenes.targets import nothing_of
-from darswin.data.turning import Turn, turned_lens
-from darswin.data.warp import remap
+from darswin.data.scenes.scene import Scene, nothing_of
+from darswin.data.warp import Framing, Turn, area_resized, remap, taken_part, turned_lens
 from darswin.lens import Lens
 from darswin.lens.pixels import as_map, pixel_angles
 from darswin.lens.solve import length_of
@@ -41,10 +38,10 @@ class Crop(NamedTuple):
     down: float
 
 
-def part(size: tuple[int, int], fit: Fit, crop: Crop | None) -> tuple[int, int, int, int]:
-    """What is taken of a picture (H, W): top, left, height, width. A crop of "crop" is a square
-    anywhere in the picture."""
-    top, left, height, width = part_of(size, fit)
+def part(size: tuple[int, int], framing: Framing, crop: Crop | None) -> tuple[int, int, int, int]:
+    """The part that is taken of a picture (H, W): top, left, height, width. A crop of "crop" is a
+    square anywhere in the picture."""
+    top, left, height, width = taken_part(size, framing)
     if crop is None:
         return top, left, height, width
     height, width = (max(1, round(crop.share * side)) for side in (height, width))
@@ -52,12 +49,11 @@ def part(size: tuple[int, int], fit: Fit, crop: Crop | None) -> tuple[int, int, 
     return top, left, height, width
 
 
-def resized(scene: Scene, taken: tuple[int, int, int, int], size: int, mirrored: bool) -> Scene:
-    """A part of a scene, mirrored first if that is asked for, as (size, size).
-
-    Args:
-        taken: top, left, height, width.
-    """
+def resize_scene(
+    scene: Scene, taken: tuple[int, int, int, int], size: int, mirrored: bool
+) -> Scene:
+    """A part of a scene (top, left, height, width), after mirroring the scene if `mirrored`, as
+    (size, size)."""
     image, target, lens = scene
     if mirrored:
         lens = turned_lens(lens, Turn(0.0, True))[0]
@@ -70,7 +66,7 @@ def resized(scene: Scene, taken: tuple[int, int, int, int], size: int, mirrored:
     return _only_seen(Scene(image, target[down[:, None], across], lens))
 
 
-def turned(scene: Scene, turn: Turn, taken: tuple[int, int, int, int], size: int) -> Scene:
+def turn_scene(scene: Scene, turn: Turn, taken: tuple[int, int, int, int], size: int) -> Scene:
     """A part of a scene turned about its lens's optical axis, as (size, size); what turns in from
     beyond the picture is black, and nothing is known of it."""
     lens, matrix = turned_lens(scene.lens, turn)
@@ -84,14 +80,11 @@ def turned(scene: Scene, turn: Turn, taken: tuple[int, int, int, int], size: int
     return _only_seen(_read(scene, places.astype(np.float32), lens, size, points))
 
 
-def through(scene: Scene, lens: Lens, size: int, turn: Turn | None = None) -> Scene:
-    """A scene as another lens would have seen it, as (size, size).
+def warp_scene(scene: Scene, lens: Lens, size: int, turn: Turn | None = None) -> Scene:
+    """A scene, turned if there is a turn, as another lens would have seen it, (size, size).
 
-    A distance along the ray stays what it is. What the picture does not show is black, and nothing
-    is known of it.
-
-    Args:
-        lens: one radial lens without `affine`. turn: of the scene about the optical axis.
+    The lens is radial and has no `affine`. A distance along the ray stays the same. Pixels that the
+    picture does not show are black, and nothing is known of them.
     """
     exact, source = lens.to(torch.float64), scene.lens.to(torch.float64)
     last = exact.r_max.item()
@@ -162,7 +155,7 @@ def _nearest(side: int, size: int) -> np.ndarray:
 
 @lru_cache(maxsize=8)
 def _aside(size: int) -> np.ndarray:
-    """(size,): which way the centre of a pixel is moved, px, before the nearest one is taken.
+    """(size,): px by which the centre of a pixel is moved before the nearest one is taken.
 
     An even reduction puts every centre halfway between two pixels, and taking the upper one always
     would shift the whole target. Neighbours are moved in opposite directions, and so are pixels
@@ -173,7 +166,8 @@ def _aside(size: int) -> np.ndarray:
 
 
 def _points(scale: float) -> int:
-    """At how many points along an axis a pixel is read that is as large as `scale` others."""
+    """The number of points along an axis at which a pixel is read that is as large as `scale`
+    others."""
     return min(_MOST_POINTS, 2 * int(np.ceil((scale / _APART - 1) / 2)) + 1) if scale > 1 else 1
 
 

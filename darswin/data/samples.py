@@ -1,4 +1,4 @@
-"""What the data sets of images with lenses share: a sample's random numbers and its form."""
+"""Data sets of images with lenses: their common base, and pictures that calibrated cameras took."""
 
 from collections.abc import Callable, Sequence, Sized
 from typing import NamedTuple
@@ -9,7 +9,9 @@ import torch
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from darswin.data.turning import RandomTurns, Turn
+from darswin.data.cameras import Calibrations
+from darswin.data.pictures import Source
+from darswin.data.warp import Framing, RandomTurns, Turn, at_size, lens_at_size, turned_picture
 from darswin.lens import Lens
 from darswin.utils.image import BrokenImageError
 
@@ -20,7 +22,7 @@ Augmentation = Callable[[np.ndarray, np.random.Generator], np.ndarray]
 
 
 class Draw(NamedTuple):
-    """Which image, and which random numbers: all that a sample depends on.
+    """The number of an image, and what keys the random numbers of its sample.
 
     `epoch` and `picture` key its augmentation, `epoch` and `lens` its lens and its turn.
     """
@@ -39,6 +41,8 @@ class Samples(Dataset):
     Args:
         source: the pictures, which a data set reads.
         size: px, H = W of the images.
+        framing: how a picture becomes a square: "crop" cuts its longer side, "stretch" squashes it;
+            the lens follows exactly.
         mean, std: per channel, in [0, 1]; the image comes out as (pixel/255 - mean) / std.
         turns: of the images with their lenses; None is none.
         augment: changes the (H, W, C) uint8 image, given it and a random generator.
@@ -59,6 +63,7 @@ class Samples(Dataset):
         source: Sized,
         *,
         size: int = 64,
+        framing: Framing = "crop",
         mean: Sequence[float] = IMAGENET_MEAN,
         std: Sequence[float] = IMAGENET_STD,
         turns: RandomTurns | None = None,
@@ -67,7 +72,9 @@ class Samples(Dataset):
         seed: int = 0,
         skip_broken: bool = False,
     ):
-        self.source, self.size = source, size
+        if framing not in ("crop", "stretch"):
+            raise ValueError(f"framing must be 'crop' or 'stretch', got {framing!r}")
+        self.source, self.size, self.framing = source, size, framing
         self.mean = np.asarray(mean, np.float32)[:, None, None]
         self.std = np.asarray(std, np.float32)[:, None, None]
         self.turns, self.augment, self.erase, self.seed = turns, augment, erase, seed
@@ -123,3 +130,40 @@ class Samples(Dataset):
     def _unknown(self) -> int | Tensor:
         """The label of a picture that cannot be read."""
         return -1
+
+
+class Calibrated(Samples):
+    """Pictures as they are, with the lenses that took them: `dataset[i]` is (image, lens, label).
+
+    A picture is reduced to `size` and its lens with it. Its EXIF turns both upright.
+
+    Args:
+        source: the pictures. calibrations: which lens took which.
+        options: size, framing, mean, std, turns, augment, erase, seed and skip_broken.
+
+    Attributes:
+        cameras: (N,), the number of each picture's camera.
+
+    Raises:
+        ValueError: a picture without a lens, or of another shape than its calibration; named.
+    """
+
+    source: Source
+
+    def __init__(self, source: Source, calibrations: Calibrations, **options):
+        super().__init__(source, **options)
+        self.calibrations = calibrations
+        self.cameras = calibrations.cameras_of([source.file(k) for k in range(len(source))])
+
+    def _seen(self, draw: Draw) -> tuple[np.ndarray, Lens, int]:
+        picture, label, orientation = self.source.oriented(draw.picture)
+        file, size = self.source.file(draw.picture), (picture.shape[0], picture.shape[1])
+        lens = self.calibrations.lens_of(file, size, orientation)
+        if (turn := self._turn(draw)) is not None:
+            picture, lens = turned_picture(picture, lens, turn)
+        image, lens = at_size(picture, lens, self.size, self.framing)
+        return image, lens, label
+
+    def _lens_alone(self, draw: Draw) -> Lens:
+        lens = self.calibrations.lens_alone(self.source.file(draw.picture))
+        return lens_at_size(lens, self.size, self.framing)

@@ -1,16 +1,89 @@
-"""The parts of a data set, for training, validation and testing, and lists of what is in them."""
+"""One rule for the parts of a data set: which pictures are for training, validation and testing."""
 
+import copy
 import hashlib
 import json
 import math
 import os
+import warnings
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal, Self, get_args
+
+import numpy as np
 
 Split = Literal["train", "val", "test"]
-SPLITS = ("train", "val", "test")
+SPLITS: tuple[Split, ...] = get_args(Split)
+# What folders and lists of a split are called, in any case.
+SPLIT_NAMES: dict[str, Split] = {
+    "train": "train", "training": "train",
+    "val": "val", "valid": "val", "validation": "val",
+    "test": "test", "testing": "test",
+}  # fmt: skip
+
+
+class LeftOut(UserWarning):
+    """Pictures that are in no split, or in fewer than they should be."""
+
+
+def warn_left_out(text: str) -> None:
+    warnings.warn(text, LeftOut, stacklevel=2)
+
+
+def check_split(split: str, allowed: tuple[str, ...], holdout: float) -> None:
+    """ValueError for an unknown split or a share that is out of range."""
+    if split not in allowed:
+        raise ValueError(f"`split` must be one of {allowed}, got {split!r}")
+    if not 0 <= holdout < 0.5:
+        raise ValueError(f"`holdout` must be in [0, 0.5), got {holdout}")
+
+
+def taken_from(split: Split, given: Collection[Split]) -> tuple[Split, list[Split]]:
+    """The given part that a split is taken from, and the splits that are held out of that part.
+
+    Without a test set of its own, "val" serves as one. "train" gives what else is missing.
+    """
+    missing: list[Split] = [part for part in ("test", "val") if part not in given]
+    part: Split = split
+    held_out: list[Split] = missing if split == "train" else []
+    if missing == ["test"]:
+        part, held_out = ("val" if split == "test" else split), []
+    elif split in missing:
+        part, held_out = "train", missing
+    if part not in given:
+        raise FileNotFoundError(f"there are {sorted(given)} pictures, and none for {split!r}")
+    return part, held_out
+
+
+def part_of_split(
+    paths: list[str],
+    split: Split,
+    held_out: Sequence[Split],
+    holdout: float,
+    where: Path,
+    *,
+    label: Callable[[str], str] = lambda path: "",
+    group: Callable[[str], str] | None = None,
+) -> list[str]:
+    """The paths of a split, where `held_out` and "train" share them.
+
+    Args:
+        where: the folder, for errors. label: each label gives the same share. group: paths of one
+            group stay together.
+    """
+    if not held_out:
+        return paths
+    groups = {path: group(path) if group else path for path in paths}
+    keys = sorted(set(groups.values()))
+    chosen = hold_out([label(key) for key in keys], keys, holdout, held_out)[split]
+    kept = {keys[k] for k in chosen}
+    if not kept:
+        raise FileNotFoundError(
+            f"no pictures for the {split!r} split in {where}: `holdout` {holdout:g} of "
+            f"{len(keys)} {'groups' if group else 'pictures'} leaves none for it"
+        )
+    return [path for path in paths if groups[path] in kept]
 
 
 def hold_out(
@@ -28,13 +101,59 @@ def hold_out(
         classes.setdefault(labels[index], []).append(index)
     chosen: dict[Split, list[int]] = {part: [] for part in (*parts, "train")}
     for members in classes.values():
-        count = math.ceil(share * len(members))
-        if parts:
-            count = min(count, (len(members) - 1) // len(parts))
+        count = min(math.ceil(share * len(members)), (len(members) - 1) // len(parts))
         for place, part in enumerate(parts):
             chosen[part] += members[place * count : (place + 1) * count]
         chosen["train"] += members[len(parts) * count :]
     return {part: sorted(indices) for part, indices in chosen.items()}
+
+
+class Limited:
+    """Pictures that a class keeps as arrays, one entry a picture, in its `PER_PICTURE`."""
+
+    PER_PICTURE: ClassVar[tuple[str, ...]]
+
+    def limited(self, count: int) -> Self:
+        """At most `count` of the pictures, chosen by a fixed shuffle; ValueError below 1."""
+        if count < 1:
+            raise ValueError(f"`limit` must be at least 1, got {count}")
+        arrays = {name: getattr(self, name) for name in self.PER_PICTURE}
+        total = len(arrays[self.PER_PICTURE[0]])
+        chosen = np.sort(np.random.default_rng(0).permutation(total)[:count])
+        part = copy.copy(self)
+        vars(part).update({name: array[chosen] for name, array in arrays.items()})
+        return part
+
+
+# -- lists ------------------------------------------------------------------------------------
+
+
+def read_split_lists(lists: Path) -> dict[Split, list]:
+    """The entries of each split, from a JSON file, or from a folder with a text file per split.
+
+    Raises:
+        ValueError: another form, or two lists of one split. OSError: it cannot be read.
+    """
+    if lists.is_dir():
+        content = {
+            file.stem: read_list(file)
+            for file in sorted(lists.glob("*.txt"))
+            if file.stem.lower() in SPLIT_NAMES
+        }
+    else:
+        content = read_json(lists)
+    form = f'{lists} must hold {{"train": [paths], "val": [paths], "test": [paths]}}'
+    if not isinstance(content, dict):
+        raise ValueError(form)
+    given: dict[Split, list] = {}
+    for name, paths in content.items():
+        split = SPLIT_NAMES.get(name.lower())
+        if split is None or split in given:
+            raise ValueError(f"{form}, got {list(content)}")
+        if not isinstance(paths, list):
+            raise ValueError(f"{form}, got {paths!r} for {name!r}")
+        given[split] = paths
+    return given
 
 
 def read_list(path: str | Path) -> list[str]:
@@ -57,15 +176,15 @@ def read_classes(path: str | Path) -> list[str]:
     return names
 
 
-def some(names: Sequence) -> str:
-    """The first few of them, and how many more."""
-    more = f" and {len(names) - 5} more" if len(names) > 5 else ""
-    return f"{list(names[:5])}{more}"
-
-
 def read_json(path: str | Path) -> Any:
-    """What a JSON file holds; ValueError names a file that is none."""
+    """The content of a JSON file; ValueError names a file that is none."""
     try:
         return json.loads(Path(path).read_text())
     except ValueError as error:
         raise ValueError(f"{path} must be JSON: {error}") from error
+
+
+def some(names: Sequence) -> str:
+    """The first few of them, and how many more."""
+    more = f" and {len(names) - 5} more" if len(names) > 5 else ""
+    return f"{list(names[:5])}{more}"

@@ -1,11 +1,25 @@
-"""Shows an image taken with one lens as another lens would have taken it, through OpenCV."""
+"""Pictures and their lenses in another frame: through another lens, turned, or at another size."""
+
+import math
+from dataclasses import dataclass
+from typing import Literal, NamedTuple, get_args
 
 import cv2
 import numpy as np
 import torch
 
+from darswin.data.scenes.scene import IGNORE
 from darswin.lens import Lens
-from darswin.lens.pixels import reprojection
+from darswin.lens.orientation import rotated, upright
+from darswin.lens.pixels import pixel_angles, reprojection
+
+# How a picture gets a model's size: "crop" cuts the longer side, "stretch" squashes it; "whole"
+# keeps the picture's shape, and its shorter side gets the size.
+Framing = Literal["crop", "stretch", "whole"]
+_MIRRORED = 2  # the EXIF orientation of a picture whose left and right are swapped
+
+
+# -- through another lens ---------------------------------------------------------------------
 
 
 def warp_map(
@@ -26,8 +40,7 @@ def remap(
     interpolation: int = cv2.INTER_LINEAR,
     border: float = 0,
 ) -> np.ndarray:
-    """An image (H, W) or (H, W, C) at the places (H', W', 2) of a map; `border` outside the image,
-    0 is black."""
+    """An image (H, W) or (H, W, C) at the places (H', W', 2) of a map; `border` outside it."""
     # None: x and y are in one array, which OpenCV's types do not know.
     return cv2.remap(image, places, None, interpolation, borderValue=border)  # type: ignore[call-overload]
 
@@ -54,3 +67,233 @@ def warp(
         raise ValueError(f"warp takes one lens each, got {len(source)} and {len(target)}")
     height, width = image.shape[:2]
     return remap(image, warp_map(source, (height, width), target, size)[0], interpolation)
+
+
+# -- turned about the optical axis ------------------------------------------------------------
+
+
+class Turn(NamedTuple):
+    """A turn by `angle` (rad, from x to y: clockwise as images are shown), then, if `mirrored`,
+    left and right swapped."""
+
+    angle: float
+    mirrored: bool
+
+    @property
+    def matrix(self) -> np.ndarray:
+        """(2, 2), applied to points around the principal point of a lens without affine."""
+        cos, sin = math.cos(self.angle), math.sin(self.angle)
+        across = -1.0 if self.mirrored else 1.0
+        return np.array([[across * cos, -across * sin], [sin, cos]])
+
+
+@dataclass(frozen=True)
+class RandomTurns:
+    """The turns of an augmentation.
+
+    Args:
+        flip: mirrors half of the images.
+        rotate_deg: degrees in [0, 180]: the angle is uniform in ± this.
+
+    Raises:
+        ValueError: an angle out of range.
+    """
+
+    flip: bool = False
+    rotate_deg: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.rotate_deg <= 180:
+            raise ValueError(f"`rotate_deg` must be in [0, 180], got {self.rotate_deg}")
+
+    def draw(self, rng: np.random.Generator) -> Turn:
+        """A turn, drawn from `rng`."""
+        angle = rng.uniform(-1, 1) * math.radians(self.rotate_deg)
+        return Turn(angle, bool(rng.random() < 0.5) and self.flip)
+
+
+def turned_lens(lens: Lens, turn: Turn) -> tuple[Lens, np.ndarray]:
+    """The lens of a picture after a turn about its optical axis, and (2, 3) float64, which takes a
+    pixel (x, y, 1) to its new place. The lens has the picture's image_size."""
+    lens, matrix = rotated(lens, turn.angle)
+    moves = matrix.numpy()
+    if turn.mirrored:
+        assert lens.image_size is not None
+        moves = moves * [[-1.0], [1.0]]
+        moves[0, 2] += lens.image_size[0, 1].item() - 1
+        lens = upright(lens, _MIRRORED)
+    return lens, moves
+
+
+def turned_picture(image: np.ndarray, lens: Lens, turn: Turn) -> tuple[np.ndarray, Lens]:
+    """A picture (H, W, C) uint8 and its lens after a turn about the lens's optical axis.
+
+    The picture keeps its size; what turns in from beyond it is black. Exact for every lens: where
+    pixels are oblong the picture is sheared so that it looks turned through that lens, and
+    tangential terms turn with it.
+    """
+    if turn.angle:
+        lens, matrix = rotated(lens, turn.angle)
+        height, width = image.shape[:2]
+        shape = image.shape
+        image = cv2.warpAffine(image, matrix.numpy(), (width, height)).reshape(shape)
+    if turn.mirrored:
+        image, lens = np.ascontiguousarray(image[:, ::-1]), upright(lens, _MIRRORED)
+    return image, lens
+
+
+# -- at a model's size, and back --------------------------------------------------------------
+
+
+def at_size(image: np.ndarray, lens: Lens, size: int, framing: Framing) -> tuple[np.ndarray, Lens]:
+    """A picture (H, W, C) uint8 and its lens as a model of `size` px sees them.
+
+    Args:
+        lens: with the picture's image_size.
+        framing: "crop" cuts the longer side, "stretch" squashes it; "whole" keeps the picture's
+            shape, and its shorter side gets the size.
+
+    Returns:
+        (size, size, C) uint8, or as high and wide as "whole" makes it, and `lens_at_size`.
+
+    Raises:
+        ValueError: an unknown `framing`.
+    """
+    top, left, height, width = taken_part(image.shape[:2], framing)
+    part = image[top : top + height, left : left + width]
+    new_size = _new_size(height, width, size, framing)
+    return area_resized(part, new_size), lens_at_size(lens, size, framing)
+
+
+def area_resized(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """A picture (H, W, C) at another (H, W), each pixel the mean over its area.
+
+    An axis that becomes shorter is resized before one that becomes longer. OpenCV takes areas only
+    if no axis becomes longer; otherwise it shifts an axis that becomes much shorter by up to a
+    third of a new pixel.
+    """
+    height, width = size
+    less = min(image.shape[1], width), min(image.shape[0], height)
+    for sides in dict.fromkeys((less, (width, height))):
+        image = cv2.resize(image, sides, interpolation=cv2.INTER_AREA)
+    return image.reshape(height, width, -1)
+
+
+def lens_at_size(lens: Lens, size: int, framing: Framing) -> Lens:
+    """The lens of a picture after `at_size`; exact, also where its pixels become oblong.
+
+    Args:
+        lens: one that has an image_size.
+    """
+    part = taken_part(picture_size(lens), framing)
+    if framing == "crop":
+        lens = lens.cropped(*part)
+    return lens.resized(_new_size(*part[2:], size, framing))
+
+
+def picture_size(lens: Lens) -> tuple[int, int]:
+    """(H, W) of the pictures of a lens; ValueError if it does not have their image_size."""
+    if lens.image_size is None:
+        raise ValueError("a lens that follows its picture needs an image_size")
+    height, width = lens.image_size[0].tolist()
+    return round(height), round(width)
+
+
+def taken_part(size: tuple[int, ...], framing: Framing) -> tuple[int, int, int, int]:
+    """The part of a picture (H, W) that is kept: top, left, height, width."""
+    if framing not in get_args(Framing):
+        allowed = ", ".join(get_args(Framing))
+        raise ValueError(f"framing must be one of {allowed}, got {framing!r}")
+    height, width = size
+    if framing != "crop":
+        return 0, 0, height, width
+    side = min(height, width)
+    return (height - side) // 2, (width - side) // 2, side, side
+
+
+def _new_size(height: int, width: int, size: int, framing: Framing) -> tuple[int, int]:
+    if framing != "whole":
+        return size, size
+    scale = size / min(height, width)
+    return round(height * scale), round(width * scale)
+
+
+class FullSize:
+    """Undoes `at_size` for a network's answers for each pixel of pictures through one lens.
+
+    Between the network's pixels it is bilinear, of those pixels alone that a ray reaches. Pixels of
+    the picture that the network did not see, since "crop" cut them off, and those beyond θ_max have
+    no label and no distance.
+
+    Attributes:
+        seen: (H, W), the pixels that have an answer.
+        reached: (h, w), of the pixels that the network sees, those that a ray reaches.
+
+    Args:
+        lens: of the pictures, with their image_size. size, framing: as `at_size` had them.
+
+    Raises:
+        ValueError: a lens without an image_size, or several; an unknown `framing`.
+    """
+
+    def __init__(self, lens: Lens, size: int, framing: Framing):
+        if lens.image_size is None or len(lens) != 1:
+            raise ValueError("FullSize takes one lens, with the image_size of its pictures")
+        lens = lens.detach().to("cpu")
+        top, left, self._height, self._width = taken_part(picture_size(lens), framing)
+        self._part = np.s_[top : top + self._height, left : left + self._width]
+        self.reached = _reached(lens_at_size(lens, size, framing))
+        self._weight = self._enlarged(self.reached)
+        reached = _reached(lens)
+        self.seen = np.zeros_like(reached)
+        self.seen[self._part] = reached[self._part] & (self._weight > 0)
+
+    def labels(self, logits: np.ndarray) -> np.ndarray:
+        """The classes with the largest logits.
+
+        Args:
+            logits: (K, h, w) of the pictures as the network sees them, of at most 255 classes.
+
+        Returns:
+            (H, W) uint8: ids, `IGNORE` where there is no answer.
+        """
+        best = self._weighted(logits[0])
+        labels = np.zeros(best.shape, np.uint8)
+        for k, map_of_class in enumerate(logits[1:], 1):
+            here = self._weighted(map_of_class)
+            larger = here > best
+            np.copyto(best, here, where=larger)
+            labels[larger] = k
+        return self._in_picture(labels, IGNORE)
+
+    def distance(self, distance: np.ndarray) -> np.ndarray:
+        """Distances, whose logarithm is what is bilinear.
+
+        Args:
+            distance: (h, w), m, above 0 where a ray reaches.
+
+        Returns:
+            (H, W) float32, m: 0 where there is no answer.
+        """
+        logarithm = np.log(np.where(self.reached, distance, 1))
+        weight = np.where(self._weight > 0, self._weight, 1)
+        return self._in_picture(np.exp(self._weighted(logarithm) / weight), 0.0)
+
+    def _weighted(self, values: np.ndarray) -> np.ndarray:
+        """Values (h, w) at the pixels that `at_size` took, times how much of them a ray reaches."""
+        return self._enlarged(np.where(self.reached, values, 0))
+
+    def _enlarged(self, values: np.ndarray) -> np.ndarray:
+        size = self._width, self._height
+        return cv2.resize(values.astype(np.float32), size, interpolation=cv2.INTER_LINEAR)
+
+    def _in_picture(self, values: np.ndarray, missing: float) -> np.ndarray:
+        whole = np.full(self.seen.shape, missing, values.dtype)
+        whole[self._part] = values
+        whole[~self.seen] = missing
+        return whole
+
+
+def _reached(lens: Lens) -> np.ndarray:
+    """The pixels of a lens's pictures that a ray reaches, (H, W)."""
+    return ~pixel_angles(lens, picture_size(lens))[0].isnan().numpy()

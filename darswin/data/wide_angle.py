@@ -2,39 +2,22 @@
 
 import math
 from functools import lru_cache
-from typing import Any, Literal
+from typing import Any
 
 import cv2
 import numpy as np
 import torch
 from torch import Tensor
 
-from darswin.data.frames import area_resized
-from darswin.data.lenses import LensDistribution
+from darswin.data.lens_distributions import LensDistribution
+from darswin.data.pictures import Source
 from darswin.data.samples import Draw, Samples
-from darswin.data.sources import Source
-from darswin.data.turning import Turn
-from darswin.data.warp import remap
+from darswin.data.warp import Turn, area_resized, remap, taken_part
 from darswin.lens import Lens, Perspective
 from darswin.lens.pixels import OUTSIDE, radial_reprojection
 
 # The paper's pictures, 384 px wide, have a focal length of 9 px.
 PAPER_FOV = 2 * math.atan(192 / 9)
-
-
-@lru_cache(maxsize=256)
-def _camera(fov: float, side: int) -> Perspective:
-    """What a square picture was taken with."""
-    return Perspective.from_fov(fov, side / 2)
-
-
-@lru_cache(maxsize=4)
-def _rays(side: int) -> tuple[Tensor, np.ndarray, np.ndarray]:
-    """The different radii (1, K) of a square's pixels, which one each pixel has, and its offset."""
-    y, x = np.mgrid[:side, :side] - (side - 1) / 2
-    square, place = np.unique(x * x + y * y, return_inverse=True)
-    radii = torch.from_numpy(np.sqrt(square)).to(torch.float32).clamp(min=1e-6)
-    return radii[None], place.reshape(side, side), np.stack((x, y), -1).astype(np.float32)
 
 
 class WideAngle(Samples):
@@ -51,10 +34,9 @@ class WideAngle(Samples):
         source: the pictures. lenses: the distribution of lenses.
         size: px, H = W of the images. render: px, what they are reduced from; at least `size`.
         fov: rad, the full field of view, below π.
-        fit: how a picture becomes a square: "crop" cuts its longer side, "stretch" squashes it, as
-            the authors' code does.
         picture_size: px, the width that larger pictures are reduced to before they are warped.
-        options: mean, std, turns, augment, erase, seed and skip_broken, as `Samples`.
+        options: framing ("stretch" in the authors' code), mean, std, turns, augment, erase, seed
+            and skip_broken, as `Calibrated` takes them.
 
     Raises:
         ValueError: sizes or angles out of range.
@@ -73,7 +55,6 @@ class WideAngle(Samples):
         size: int = 64,
         render: int = 224,
         fov: float = PAPER_FOV,
-        fit: Literal["crop", "stretch"] = "crop",
         picture_size: int = 384,
         **options: Any,
     ):
@@ -81,10 +62,8 @@ class WideAngle(Samples):
             raise ValueError(f"sizes must be 0 < size ≤ render, got {size} and {render}")
         if not 0 < fov < math.pi:
             raise ValueError(f"fov must be in (0, π), got {fov}")
-        if fit not in ("crop", "stretch"):
-            raise ValueError(f"fit must be 'crop' or 'stretch', got {fit!r}")
         super().__init__(source, size=size, **options)
-        self.lenses, self.fov, self.fit = lenses, fov, fit
+        self.lenses, self.fov = lenses, fov
         self.render, self.picture_size = render, picture_size
 
     def _seen(self, draw: Draw) -> tuple[np.ndarray, Lens, int]:
@@ -97,8 +76,7 @@ class WideAngle(Samples):
         return self.lenses.draw(self._random(draw.epoch, draw.lens, 1), self.fov, self.size / 2)
 
     def through(self, lens: Lens, picture: np.ndarray, turn: Turn | None = None) -> np.ndarray:
-        """The picture (H, W, C) uint8 through a lens of this data set, turned if there is a turn
-        → (size, size, C) uint8."""
+        """The picture (H, W, C) uint8 through a lens → (size, size, C) uint8."""
         picture = self._square(picture)
         image = remap(picture, self._map(lens, picture.shape[0], turn))
         if self.render != self.size:
@@ -112,19 +90,31 @@ class WideAngle(Samples):
         """
         radii, place, offset = _rays(self.render)
         large = lens.resized(self.render / self.size)
-        ratio = radial_reprojection(_camera(self.fov, side), large, radii)[0].numpy()[place]
+        ratio = radial_reprojection(_view(self.fov, side), large, radii)[0].numpy()[place]
         if turn is not None:
             offset = offset @ turn.matrix.astype(np.float32)
         places = offset * ratio[..., None] + np.float32((side - 1) / 2)
         return np.fmax(places, np.float32(OUTSIDE), out=places)  # NaN becomes OUTSIDE
 
     def _square(self, picture: np.ndarray) -> np.ndarray:
-        height, width = picture.shape[:2]
-        if self.fit == "crop":
-            side = min(height, width)
-            top, left = (height - side) // 2, (width - side) // 2
-            picture = picture[top : top + side, left : left + side]
-        side = min(max(picture.shape[:2]), self.picture_size)
-        if picture.shape[:2] == (side, side):
+        top, left, height, width = taken_part(picture.shape[:2], self.framing)
+        picture = picture[top : top + height, left : left + width]
+        side = min(max(height, width), self.picture_size)
+        if (height, width) == (side, side):
             return np.ascontiguousarray(picture)
         return area_resized(picture, (side, side))
+
+
+@lru_cache(maxsize=256)
+def _view(fov: float, side: int) -> Perspective:
+    """The lens that a square picture is taken for."""
+    return Perspective.from_fov(fov, side / 2)
+
+
+@lru_cache(maxsize=4)
+def _rays(side: int) -> tuple[Tensor, np.ndarray, np.ndarray]:
+    """The different radii (1, K) of a square's pixels, which one each pixel has, and its offset."""
+    y, x = np.mgrid[:side, :side] - (side - 1) / 2
+    square, place = np.unique(x * x + y * y, return_inverse=True)
+    radii = torch.from_numpy(np.sqrt(square)).to(torch.float32).clamp(min=1e-6)
+    return radii[None], place.reshape(side, side), np.stack((x, y), -1).astype(np.float32)

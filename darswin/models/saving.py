@@ -38,7 +38,7 @@ class ModelCard:
         classes: names of the logits.
         size: px, of the images it was trained on. fov: rad, the field of view of their lenses, 0
             where calibrations say it.
-        fit: how a camera's pictures get that size, as `darswin.data.frames.at_size` takes it:
+        fit: how a camera's pictures get that size, as `darswin.data.at_size` takes it:
             "whole" where it was trained through the lenses of `darswin.data.WideAngle`.
         task: what it tells: a class for an image, or a class or a distance for each pixel.
         colors: (r, g, b) in 0 … 255 of each class, where the data say them.

@@ -8,7 +8,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 from torchmetrics import Metric
 
-from darswin.data.mixing import Mixing, partners_share
+from darswin.data.augment import Mixing, partners_share
 from darswin.train.task import Batch, Task, finite_loss, named_metrics
 from darswin.train.wide_angle import WideAngleData
 

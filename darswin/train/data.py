@@ -8,11 +8,10 @@ from lightning.pytorch import LightningDataModule
 from torch.utils.data import DataLoader
 
 from darswin.data.augment import RandAugment
-from darswin.data.frames import Fit
+from darswin.data.order import EveryNth, ResumableLoader, TrainingOrder
 from darswin.data.samples import IMAGENET_MEAN, IMAGENET_STD, Samples
-from darswin.data.sampling import EveryNth, ResumableLoader, TrainingOrder
 from darswin.data.splits import Split
-from darswin.data.turning import RandomTurns
+from darswin.data.warp import Framing, RandomTurns
 from darswin.lens.files.opencv import Coefficients
 from darswin.train.stopping import ignore_signals
 
@@ -53,7 +52,7 @@ class RunData(LightningDataModule):
     default_size: ClassVar[int] = 64
     # What a model's card says of its pictures.
     fov: float
-    frame_fit: Fit
+    frame_fit: Framing
     colors: Sequence[Sequence[int]] = []
 
     def __init__(
@@ -101,7 +100,7 @@ class RunData(LightningDataModule):
             channels=self.channels, classes=classes, splits=splits, holdout=holdout
         )
         self._form: dict[str, Any] = dict(
-            size=self.size, fit=fit, mean=self.mean, std=self.std, seed=seed,
+            size=self.size, framing=fit, mean=self.mean, std=self.std, seed=seed,
             skip_broken=skip_broken,
         )  # fmt: skip
         self.limit, self.batch_size, self.workers = limit, batch_size, workers

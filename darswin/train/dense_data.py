@@ -7,11 +7,11 @@ from typing import Any, ClassVar
 
 import torch
 
-from darswin.data.dense import DenseSamples
-from darswin.data.lenses import parse_lenses
-from darswin.data.sampling import TrainingOrder
-from darswin.data.scenes import Scenes, open_scenes
-from darswin.data.scenes.scene import Target
+from darswin.data.lens_distributions import parse_lenses
+from darswin.data.order import TrainingOrder
+from darswin.data.scenes import open_scenes
+from darswin.data.scenes.dataset import SceneSamples
+from darswin.data.scenes.scene import Scenes, Target
 from darswin.data.splits import Split
 from darswin.train.data import RunData
 from darswin.train.task import Batch
@@ -52,10 +52,10 @@ class DenseData(RunData):
         **common: Any,
     ):
         super().__init__(path, lens=lens, batch_size=batch_size, **common)
-        self.frame_fit = self._form["fit"]
+        self.frame_fit = self._form["framing"]
         self.test_paths = test_paths or []
         if crop is not None and not 0 < crop <= 1:
-            raise ValueError(f"--data.crop must be a share in (0, 1], got {crop}")
+            raise ValueError(f"`crop` must be a share in (0, 1], got {crop}")
         self.crop = crop
         self.lenses = None if lens_augmentation is None else parse_lenses(lens_augmentation)
         self._scenes: dict[str, Scenes] = {}
@@ -102,7 +102,7 @@ class DenseData(RunData):
             )
         return scenes
 
-    def dataset(self, split: Split, name: str | None = None, **options: Any) -> DenseSamples:
+    def dataset(self, split: Split, name: str | None = None, **options: Any) -> SceneSamples:
         """A split with its cameras' lenses; `name` is one of `test_names`."""
         if split == "test" and self.test_paths and name is not None:
             scenes = self._test_scenes(self.test_paths[self.test_names.index(name)])
@@ -110,11 +110,11 @@ class DenseData(RunData):
             scenes = self.scenes(split)
         if self.limit is not None:
             scenes = scenes.limited(self.limit)
-        dataset = DenseSamples(scenes, **self._form, **options)
+        dataset = SceneSamples(scenes, **self._form, **options)
         self.datasets.append(dataset)
         return dataset
 
-    def _training(self) -> tuple[DenseSamples, TrainingOrder]:
+    def _training(self) -> tuple[SceneSamples, TrainingOrder]:
         dataset = self.dataset(
             "train", turns=self.turns, crop=self.crop, lenses=self.lenses,
             augment=self._colour_changes,

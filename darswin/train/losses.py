@@ -6,7 +6,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from darswin.data.scenes import IGNORE
+from darswin.data.scenes.scene import IGNORE
 
 LabelLoss = Literal["ce", "dice", "ce+dice"]
 DistanceLoss = Literal["silog", "l1", "log_l1"]

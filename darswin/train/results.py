@@ -9,7 +9,7 @@ from lightning.pytorch import Callback, LightningModule, Trainer
 from lightning.pytorch.utilities import rank_zero_only
 from matplotlib.figure import Figure
 
-from darswin.data.lenses import LensDistribution, SphericalLenses, parse_lenses
+from darswin.data.lens_distributions import LensDistribution, SphericalLenses, parse_lenses
 from darswin.train.classification import Classification
 from darswin.utils.files import replace_file
 from darswin.viz.plot import draw_accuracy, save_figure

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 from torchmetrics.classification import MulticlassAccuracy, MulticlassJaccardIndex
 
-from darswin.data.scenes import IGNORE
+from darswin.data.scenes.scene import IGNORE
 from darswin.data.splits import some
 from darswin.ops.checks import tensor_there
 from darswin.train.dense import DenseTask

@@ -6,7 +6,7 @@ import torch
 from lightning.pytorch import Trainer
 from torch import Tensor
 
-from darswin.data.scenes import IGNORE
+from darswin.data.scenes.scene import IGNORE
 
 _EARLY = 100  # batches: a training does not go on for longer without any target
 

@@ -6,13 +6,11 @@ from pathlib import Path
 from typing import Any
 
 from darswin.data.augment import RandomErasing
-from darswin.data.calibrated import Calibrated
-from darswin.data.calibrations import Calibrations, is_json
-from darswin.data.datasets import open_source
-from darswin.data.lenses import parse_lenses, parse_sweep
-from darswin.data.samples import Samples
-from darswin.data.sampling import TrainingOrder
-from darswin.data.sources import Part, Source
+from darswin.data.cameras import Calibrations, is_json
+from darswin.data.lens_distributions import parse_lenses, parse_sweep
+from darswin.data.order import TrainingOrder
+from darswin.data.pictures import Source, open_source
+from darswin.data.samples import Calibrated, Samples
 from darswin.data.splits import Split
 from darswin.data.wide_angle import PAPER_FOV, WideAngle
 from darswin.train.data import RunData
@@ -60,7 +58,7 @@ class WideAngleData(RunData):
             render=render, fov=math.radians(fov_deg), picture_size=picture_size
         )
         self.fov = 0.0 if self._lens else math.radians(fov_deg)
-        self.frame_fit = self._form["fit"] if self._lens else "whole"
+        self.frame_fit = self._form["framing"] if self._lens else "whole"
         self.erasing, self.pair_lenses = erasing, pair_lenses
         self._sources: dict[str, Source] = {}
 
@@ -93,8 +91,8 @@ class WideAngleData(RunData):
         """A split as it is, with its cameras' lenses; or through a distribution of lenses, where
         None means that of training."""
         source = self.source(split)
-        if self.limit is not None and self.limit < len(source):
-            source = Part(source, self.limit)
+        if self.limit is not None:
+            source = source.limited(self.limit)
         dataset: Samples
         if self.calibrations is not None:
             dataset = Calibrated(source, self.calibrations, **self._form, **options)

@@ -1,1 +1,1 @@
-"""What has nothing to do with lenses: files, memory, reading an image."""
+"""Helpers without lenses: files, memory, processes, reading images and videos."""

@@ -1,5 +1,4 @@
-"""The packages that some of darswin needs beyond its own requirements: what is missing, and how to
-get it."""
+"""The packages that some of darswin needs beyond its own requirements."""
 
 import importlib.util
 import re
@@ -12,12 +11,8 @@ _MODULES = {"pillow": "PIL", "opencv-python-headless": "cv2", "scikit-learn": "s
 
 
 def lack(extra: str, modules: Sequence[str] | None = None) -> str | None:
-    """None if all modules are installed, else a sentence on which are not and what installs them.
-
-    Args:
-        extra: of darswin, which declares the modules' packages and their versions.
-        modules: some of that extra's; None means all.
-    """
+    """None if all modules of an extra are installed (or of `modules`, some of them), else a
+    sentence that names those missing and what installs them."""
     of_extra = re.compile(rf"extra == ['\"]{extra}['\"]")
     declared = {}
     for requirement in requires("darswin") or ():

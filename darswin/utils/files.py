@@ -12,11 +12,8 @@ _PARTIAL = ".partial"
 
 
 def replace_file(path: str | os.PathLike, content: bytes | memoryview | str) -> None:
-    """Writes a file whole, beside the old one and then in its place; makes its folder.
-
-    Raises:
-        OSError: no room, or no right to write; it names `path`, which is as it was.
-    """
+    """Writes a file whole, beside the old one and then in its place; makes its folder. An OSError
+    names `path`, which is then as it was."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     data = content.encode() if isinstance(content, str) else content
@@ -29,7 +26,9 @@ def replace_file(path: str | os.PathLike, content: bytes | memoryview | str) -> 
             file.write(data)
             file.flush()
             os.fsync(file.fileno())
-        temporary.chmod(0o666 & ~_umask())
+        umask = os.umask(0)
+        os.umask(umask)
+        temporary.chmod(0o666 & ~umask)
         temporary.replace(path)
     except OSError as error:
         if temporary is not None:
@@ -50,9 +49,7 @@ def locked(path: str | os.PathLike) -> Iterator[None]:
     """A context in which no other process can lock the same file. The file is created, and stays.
 
     The lock is the process's own: its forks do not hold it, and its end, even by a kill, frees it.
-
-    Raises:
-        BlockingIOError: another process has locked it.
+    BlockingIOError: another process has locked it.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -64,9 +61,3 @@ def locked(path: str | os.PathLike) -> Iterator[None]:
                 raise BlockingIOError(errno.EAGAIN, "another process holds it", str(path)) from None
             # Some network file systems have no locks: go on without one there.
         yield
-
-
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask

@@ -11,6 +11,8 @@ from PIL import ExifTags, Image, UnidentifiedImageError
 
 from darswin.utils.exif import TURNS
 
+__all__ = ["BrokenImageError", "read_image", "read_oriented"]
+
 _PNG = b"\x89PNG\r\n\x1a\n"
 _SAYS_MORE = frozenset((b"eXIf", b"tEXt", b"zTXt", b"iTXt"))  # chunks that may hold an orientation
 
@@ -25,40 +27,44 @@ def read_image(path: str | Path, channels: int = 3) -> np.ndarray:
     Raises:
         BrokenImageError: a file that is missing, unreadable or no image; it names the file.
     """
-    return _decoded(_content(path), path, channels)
+    return _picture(file_content(path), path, channels)
 
 
 def read_oriented(path: str | Path, channels: int = 3) -> tuple[np.ndarray, int]:
-    """`read_image`, and the EXIF orientation that it was turned from, which its lens needs.
-
-    Returns:
-        The upright picture, and 1 to 8; see `darswin.lens.orientation.upright`.
+    """`read_image`, and the EXIF orientation, 1 to 8, that it was turned from; its lens needs it.
 
     Raises:
         BrokenImageError: as `read_image`; an orientation that cannot be read.
     """
-    data = _content(path)
-    upright = _decoded(data, path, channels)
+    data = file_content(path)
+    upright = _picture(data, path, channels)
     orientation, kind = _exif(data, path)
     if orientation == 1 or kind == "TIFF":  # OpenCV turns TIFFs upright in any case
         return upright, orientation
     # Turned here, because some versions of OpenCV do not turn every kind of file.
-    image = _decoded(data, path, channels, cv2.IMREAD_IGNORE_ORIENTATION)
+    image = _picture(data, path, channels, cv2.IMREAD_IGNORE_ORIENTATION)
     swapped, *reversed_ = TURNS[orientation]
     image = image.swapaxes(0, 1) if swapped else image
     across, down = (slice(None, None, -1 if r else 1) for r in reversed_)
     return np.ascontiguousarray(image[down, across]), orientation
 
 
-def _content(path: str | Path) -> np.ndarray:
+def file_content(path: str | Path) -> np.ndarray:
+    """The bytes of a file; BrokenImageError where it cannot be read."""
     try:
         return np.fromfile(path, np.uint8)
     except OSError as error:
         raise BrokenImageError(f"cannot read {path}: {error.strerror}") from error
 
 
-def _decoded(data: np.ndarray, path: str | Path, channels: int, flags: int = 0) -> np.ndarray:
+def _picture(data: np.ndarray, path: str | Path, channels: int, flags: int = 0) -> np.ndarray:
     flags |= cv2.IMREAD_COLOR_RGB if channels == 3 else cv2.IMREAD_GRAYSCALE
+    image = decoded(data, path, flags)
+    return image.reshape(*image.shape[:2], channels)
+
+
+def decoded(data: np.ndarray, path: str | Path, flags: int) -> np.ndarray:
+    """A file's content as OpenCV decodes it; BrokenImageError where it cannot."""
     try:
         image = cv2.imdecode(data, flags) if data.size else None
     except (cv2.error, MemoryError) as error:  # too many pixels for OpenCV, or for the memory
@@ -68,7 +74,7 @@ def _decoded(data: np.ndarray, path: str | Path, channels: int, flags: int = 0) 
         ) from error
     if image is None:
         raise BrokenImageError(f"cannot read {path}: no image that OpenCV can decode")
-    return image.reshape(*image.shape[:2], channels)
+    return image
 
 
 def _exif(data: np.ndarray, path: str | Path) -> tuple[int, str | None]:

@@ -1,7 +1,9 @@
-"""What glibc does with freed memory: keep it for the process, or give it back to the system."""
+"""Settings of glibc's malloc: keep freed memory for the process, or give it back to the system."""
 
 import ctypes
 from collections.abc import Callable
+
+__all__ = ["keep_freed_memory"]
 
 # Of glibc's malloc.h.
 _TRIM_THRESHOLD, _MMAP_MAX = -1, -4
@@ -16,7 +18,7 @@ def keep_freed_memory() -> bool:
     `darswin fit` and `darswin bench` do.
 
     Returns:
-        whether there is a glibc to tell.
+        True if there is a glibc.
     """
     mallopt = _function("mallopt")
     if mallopt is None:

@@ -15,10 +15,7 @@ def die_with_first_process() -> Iterator[None]:
     """Within it, the processes that Lightning starts for a run die as soon as the first one does.
 
     Without it they would wait for the first one for minutes. Processes that torchrun, SLURM or a
-    user starts have other parents, and stay as they are.
-
-    Raises:
-        SystemExit: in such a process, if the first one has died before.
+    user starts have other parents, and stay as they are. SystemExit: the first one has died before.
     """
     first = os.environ.get(_FIRST)
     if first is not None and os.environ.get("LOCAL_RANK", "0") != "0":

@@ -1,4 +1,4 @@
-"""Reading what `torch.save` wrote, without executing anything in it."""
+"""Reads files of `torch.save` without executing anything in them."""
 
 import os
 import pickle
@@ -14,14 +14,12 @@ _STAND_INS: list[Any] = [(OrderedDict, "yacs.config.CfgNode")]
 
 
 def read_pickle(path: str | os.PathLike, map_location: Any = "cpu") -> object:
-    """What `torch.save` wrote; ValueError where that is more than tensors and plain values."""
+    """A file of `torch.save`; ValueError where it holds more than tensors and plain values."""
     try:
         with torch.serialization.safe_globals(_STAND_INS):
             return torch.load(path, map_location=map_location, weights_only=True)
     except Exception as error:  # a file that is no checkpoint may fail in any way
-        if (
-            isinstance(error, OSError) and error.filename
-        ):  # a file that cannot be read; cut-off archives name none
+        if isinstance(error, OSError) and error.filename:  # cut-off archives name none
             raise
         found = re.search(r"GLOBAL (\S+)", str(error))
         if not isinstance(error, pickle.UnpicklingError) or not found:

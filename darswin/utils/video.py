@@ -24,8 +24,8 @@ _PART = 0.05
 
 
 class Frame(NamedTuple):
-    """Attributes: number: from 0; time: s; image: (H, W, C) uint8, upright; orientation: as EXIF's,
-    what it was turned upright from."""
+    """Attributes: number: from 0; time: s; image: (H, W, C) uint8, upright; orientation: EXIF's,
+    that it was turned upright from."""
 
     number: int
     time: float
@@ -34,7 +34,7 @@ class Frame(NamedTuple):
 
 
 def is_video(path: str | Path) -> bool:
-    """Whether a file is a video: by its name, or because OpenCV opens it as one and as no image."""
+    """True for a file with a video's name, or that OpenCV opens as a video and as no image."""
     if os.path.splitext(path)[1].lower() in SUFFIXES:
         return True
     return os.path.isfile(path) and not cv2.haveImageReader(str(path)) and _opened(path) is not None
@@ -70,7 +70,7 @@ def read_frames(path: str | Path, channels: int = 3, every: int = 1) -> Iterator
 
 
 def _opened(path: str | Path) -> cv2.VideoCapture | None:
-    """None for what is no video."""
+    """None for a file that is no video."""
     # FFmpeg would describe damage on stderr, line after line.
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
     capture = cv2.VideoCapture(str(path)) if os.path.isfile(path) else None

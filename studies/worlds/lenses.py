@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from darswin.data.lenses import parse_lenses
+from darswin.data.lens_distributions import parse_lenses
 from darswin.lens import Lens, Perspective, load
 
 WIDE = (60.0, 90.0)  # degrees, horizontally and vertically: an ordinary wide-angle lens
@@ -16,7 +16,7 @@ def draw_lens(name: str, size: int, fov: float, rng: np.random.Generator) -> Len
 
     Args:
         name: "wide", perspective lenses of 60° to 90° that fill the square; what
-            `darswin.data.lenses.parse_lenses` takes: a ξ, a range of them, a level of the paper or
+            `darswin.data.parse_lenses` takes: a ξ, a range of them, a level of the paper or
             "polynomial", whose field of view `fov` (rad) fills the circle in the square; or a
             calibration file, FILE or FILE:CAMERA, whose picture is cut to a square around its
             middle.

@@ -14,8 +14,7 @@ from darswin.cli import dense_answers
 from darswin.cli import predict as predict_module
 from darswin.cli.dense_answers import claim_folder, distance_png, file_names, label_png
 from darswin.cli.main import main
-from darswin.data.frames import at_size
-from darswin.data.full_size import FullSize
+from darswin.data.warp import FullSize, at_size
 from darswin.lens import from_dict
 from darswin.models.encoder import Encoder, Prepared
 from darswin.models.saving import ModelCard, save_model

@@ -9,9 +9,9 @@ from PIL import ExifTags, Image
 from torch.utils.data import DataLoader
 
 from darswin.data import Calibrated, Calibrations, open_source
-from darswin.data.frames import at_size
+from darswin.data.pictures import Arrays
 from darswin.data.samples import Draw
-from darswin.data.sources import Arrays, Part
+from darswin.data.warp import at_size
 from darswin.lens import Tabulated, load
 from darswin.lens.orientation import in_upright_picture
 from darswin.utils.image import BrokenImageError, read_oriented
@@ -31,7 +31,7 @@ def of(folder, lens=WOODSCAPE, **options):
 
 @pytest.mark.parametrize("fit", ["crop", "stretch"])
 def test_a_sample_is_the_picture_at_the_size_with_its_lens(folder, fit):
-    dataset = of(folder, fit=fit)
+    dataset = of(folder, framing=fit)
     image, lens, label = dataset[3]
     picture = cv2.imread(str(dataset.source.file(3)), cv2.IMREAD_GRAYSCALE)[..., None]
     expected, there = at_size(picture, load(WOODSCAPE).in_picture(picture.shape[:2]), 32, fit)
@@ -78,7 +78,7 @@ def test_cameras_of_several_models_make_one_batch(folder, tmp_path):
 def test_pictures_without_files():
     images = np.random.default_rng(0).integers(256, size=(4, 8, 8), dtype=np.uint8)
     lens = '{"model": "Equidistant", "fov": 3.0}'
-    source = Part(Arrays(images, np.arange(4), list("abcd"), 1), 3)
+    source = Arrays(images, np.arange(4), list("abcd"), 1).limited(3)
     dataset = Calibrated(source, Calibrations(lens, "digits"), **PLAIN)
     assert dataset[0][1].r_max.item() == pytest.approx(16) and len(dataset) == 3
 
@@ -98,8 +98,8 @@ def test_broken_files_have_a_lens_too(tmp_path):
 
 
 def test_what_does_not_fit(folder, tmp_path):
-    with pytest.raises(ValueError, match="fit must be 'crop' or 'stretch', got 'whole'"):
-        of(folder, fit="whole")
+    with pytest.raises(ValueError, match="framing must be 'crop' or 'stretch', got 'whole'"):
+        of(folder, framing="whole")
     file = tmp_path / "lenses.json"
     file.write_text(json.dumps({"1": str(WOODSCAPE)}))
     with pytest.raises(ValueError, match=r"has no lens for .*\.png"):

@@ -70,7 +70,9 @@ def test_coefficients_that_the_file_does_not_name(root):
         entry = {"file": "kd.json", "coefficients": model}
         lenses = Calibrations(listed(root, {".": entry}), root)
         same(lenses.lens_of(None, (960, 1280)), expected)
-    with pytest.raises(ValueError, match=r"coefficients are said of one .*coefficients\": \"fish"):
+    with pytest.raises(
+        ValueError, match=r"`coefficients` is of one calibration.*coefficients\": \"fish"
+    ):
         Calibrations(listed(root, {".": "kd.json"}), root, coefficients="fisheye")
 
 
@@ -151,7 +153,7 @@ def test_what_has_no_lens(root):
         lenses.camera_of(None)
     with pytest.raises(FileNotFoundError):
         Calibrations(root / "none.json", root)
-    with pytest.raises(ValueError, match="a camera is chosen of one calibration file"):
+    with pytest.raises(ValueError, match="`camera` is of one calibration file"):
         Calibrations(listed(root, {"a": "woodscape.json"}), root, "0")
 
 

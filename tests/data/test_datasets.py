@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from darswin.data import SphericalLenses, WideAngle
-from darswin.data.datasets import open_source
-from darswin.data.sources import Part
+from darswin.data.pictures import open_source
 from darswin.utils.image import BrokenImageError, read_image, read_oriented
 
 
@@ -102,12 +101,12 @@ def test_digits():
 
 def test_a_part_is_a_sample_of_the_whole():
     whole = open_source("digits", "train", channels=1)
-    part = Part(whole, 50)
+    part = whole.limited(50)
     assert len(part) == 50 and len({part[k][1] for k in range(50)}) == 10
-    assert len(Part(whole, 10_000)) == len(whole)
+    assert len(whole.limited(10_000)) == len(whole)
     for count in (0, -1):
-        with pytest.raises(ValueError, match=rf"--data\.limit must be at least 1, got {count}"):
-            Part(whole, count)
+        with pytest.raises(ValueError, match=rf"`limit` must be at least 1, got {count}"):
+            whole.limited(count)
 
 
 def huge_png(path):
@@ -136,7 +135,7 @@ def test_a_picture_that_is_too_large_is_named_and_can_be_skipped(tmp_path):
 
 @pytest.mark.parametrize(
     ("options", "message"),
-    [(dict(split="fit"), "split must be"), (dict(split="val", holdout=0.5), "holdout must be")],
+    [(dict(split="fit"), "`split` must be"), (dict(split="val", holdout=0.5), "`holdout` must be")],
 )
 def test_wrong_options(options, message):
     with pytest.raises(ValueError, match=message):

@@ -9,16 +9,15 @@ from torch.utils.data import DataLoader
 
 from darswin.data import (
     IGNORE,
-    DenseSamples,
     PolynomialLenses,
+    SceneSamples,
     SphericalLenses,
     open_scenes,
 )
 from darswin.data.augment import RandAugment
-from darswin.data.frames import at_size
+from darswin.data.order import TrainingOrder
 from darswin.data.samples import Draw
-from darswin.data.sampling import TrainingOrder
-from darswin.data.turning import RandomTurns
+from darswin.data.warp import RandomTurns, at_size
 from darswin.lens import Polynomial, Spherical, Tabulated
 from darswin.lens.pixels import pixel_angles
 
@@ -49,7 +48,7 @@ def mixed(tmp_path_factory):
 
 def of(folder, target="labels", **options):
     channels = len(options.get("mean", RAW["mean"]))
-    return DenseSamples(open_scenes(folder, "all", target, channels=channels), **RAW | options)
+    return SceneSamples(open_scenes(folder, "all", target, channels=channels), **RAW | options)
 
 
 def same(one, other):
@@ -62,7 +61,7 @@ def same(one, other):
 
 @pytest.mark.parametrize("fit", ["crop", "stretch"])
 def test_a_sample_is_the_scene_at_the_size(folder, fit):
-    dataset = of(folder, fit=fit)
+    dataset = of(folder, framing=fit)
     image, lens, labels = dataset[2]
     scene = dataset.scenes[2]
     expected, there = at_size(scene.image, scene.lens, 48, fit)
@@ -72,7 +71,7 @@ def test_a_sample_is_the_scene_at_the_size(folder, fit):
     assert set(labels.unique().tolist()) <= {0, 1, 2, IGNORE}
     beyond = pixel_angles(lens, (48, 48))[0].isnan()
     assert torch.equal(labels == IGNORE, beyond)
-    distance = of(folder, "distance", fit=fit)[2][2]
+    distance = of(folder, "distance", framing=fit)[2][2]
     assert distance.dtype == torch.float32 and torch.equal(distance == 0, beyond)
     assert same(dataset[2], dataset[Draw(7, 2, 5)])  # nothing is random
 
@@ -114,19 +113,19 @@ def test_cameras_of_several_models_make_one_batch(mixed):
     scenes = open_scenes(mixed, "all", "labels")
     assert len(scenes.cameras) == 3
     assert [scenes.camera_of(k) for k in range(6)] == [0, 0, 2, 2, 1, 1]
-    dataset = DenseSamples(scenes, size=32)
+    dataset = SceneSamples(scenes, size=32)
     assert dataset.cameras.tolist() == [0, 0, 2, 2, 1, 1]
     images, lenses, labels = next(iter(DataLoader(dataset, 6, num_workers=1)))
     assert isinstance(lenses, Tabulated) and len(lenses) == len(images) == len(labels) == 6
     assert lenses[5].theta_max.item() == pytest.approx(1.3)
-    drawn = DenseSamples(scenes, size=32, lenses=SphericalLenses(0, 1))
+    drawn = SceneSamples(scenes, size=32, lenses=SphericalLenses(0, 1))
     assert isinstance(next(iter(DataLoader(drawn, 6)))[1], Spherical)
 
 
 def test_what_a_worker_reads_is_counted_here(folder):
     scenes = open_scenes(folder, "all", "distance")
     assert scenes.unknown.tolist() == [-1] * 6
-    for _ in DataLoader(DenseSamples(scenes, size=16), 3, num_workers=1):
+    for _ in DataLoader(SceneSamples(scenes, size=16), 3, num_workers=1):
         pass
     assert scenes.unknown.tolist() == [int((scenes[0].target == 0).sum())] * 6
 
@@ -176,9 +175,9 @@ def test_a_broken_picture_is_black_with_a_lens_that_joins(tmp_path):
 
 def test_wrong_options(folder):
     for wrong, said in (
-        (dict(fit="whole"), "fit must be 'crop' or 'stretch', got 'whole'"),
-        (dict(crop=0.0), r"crop must be a share in \(0, 1\], got 0.0"),
-        (dict(crop=1.5), "crop must be a share"),
+        (dict(framing="whole"), "framing must be 'crop' or 'stretch', got 'whole'"),
+        (dict(crop=0.0), r"`crop` must be a share in \(0, 1\], got 0.0"),
+        (dict(crop=1.5), "`crop` must be a share"),
     ):
         with pytest.raises(ValueError, match=said):
             of(folder, **wrong)

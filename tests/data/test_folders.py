@@ -11,9 +11,8 @@ import hypothesis.strategies as st
 import pytest
 from hypothesis import given
 
-from darswin.data.datasets import open_source
-from darswin.data.folders import LeftOut
-from darswin.data.splits import SPLITS
+from darswin.data.pictures import open_source
+from darswin.data.splits import SPLITS, LeftOut
 
 
 def touch(root: Path, *names: str) -> None:
@@ -75,7 +74,7 @@ def test_classes_may_have_the_names_of_splits(tmp_path):
         (["train/1.jpg", "test/2.jpg"], r"test and .*train may be meant as splits or as classes"),
         (["train/1.jpg"], "train may be meant as splits or as classes"),
         (["val/a/1.jpg", "test/a/2.jpg"], "may be meant as splits or as classes"),
-        (["train/a/1.jpg", "other/a/1.jpg"], r"train may be meant .*--data\.classes"),
+        (["train/a/1.jpg", "other/a/1.jpg"], r"train may be meant .*`classes`"),
         (["train/a/1.jpg", "val/a/1.jpg", "valid/a/2.jpg"], r"val and .*valid both have a name"),
         (["train/a/1.jpg", "val/a/1.jpg", "val/b/2.jpg"], r"val holds .* the classes \['b'\], wh"),
         (["train/a/1.jpg", "test/b/1.jpg"], r"test holds .* which training has no pictures of"),
@@ -173,7 +172,7 @@ def test_every_class_of_a_list_has_pictures(tmp_path):
 def test_a_holdout_that_leaves_nothing_is_named(tmp_path):
     pictures(tmp_path, "a", "b")
     for path in (tmp_path, "digits"):
-        with pytest.raises(FileNotFoundError, match=r"'val' split .*--data\.holdout 0 leaves none"):
+        with pytest.raises(FileNotFoundError, match=r"'val' split .*`holdout` 0 .*leaves none"):
             open_source(path, "val", holdout=0)
 
 
@@ -197,7 +196,7 @@ def test_lists_that_are_wrong(tmp_path, lists, message):
     file.write_text(lists if isinstance(lists, str) else json.dumps(lists))
     with pytest.raises(ValueError, match=message):
         open_source(tmp_path, "train", splits=file)
-    with pytest.raises(ValueError, match=r"--data\.splits is for folders"):
+    with pytest.raises(ValueError, match=r"`splits` is for folders"):
         open_source("digits", "train", splits=file)
 
 

@@ -3,7 +3,7 @@ import pytest
 import torch
 from frames import WOODSCAPE
 
-from darswin.data.frames import area_resized, at_size, lens_at_size
+from darswin.data.warp import area_resized, at_size, lens_at_size
 from darswin.lens import Equidistant, load
 
 SIZE = (90, 120)
@@ -62,7 +62,7 @@ def test_shapes():
 
 def test_what_is_no_way():
     lens = Equidistant(30.0, 1.5, image_size=SIZE)
-    with pytest.raises(ValueError, match="fit must be one of crop, stretch, whole, got 'pad'"):
+    with pytest.raises(ValueError, match="framing must be one of crop, stretch, whole, got 'pad'"):
         at_size(np.zeros((*SIZE, 1), np.uint8), lens, 32, "pad")
     with pytest.raises(ValueError, match="needs an image_size"):
         lens_at_size(Equidistant(30.0, 1.5), 32, "crop")

@@ -6,9 +6,8 @@ import pytest
 import torch
 from hypothesis import given
 
-from darswin.data.frames import at_size
-from darswin.data.full_size import FullSize
-from darswin.data.scenes import IGNORE
+from darswin.data import IGNORE
+from darswin.data.warp import FullSize, at_size
 from darswin.lens import Equidistant, KannalaBrandt
 
 FITS = ("crop", "stretch", "whole")
@@ -123,5 +122,5 @@ def test_a_lens_that_says_no_size():
     for lens in (Equidistant(20.0, math.pi / 2), two):
         with pytest.raises(ValueError, match="one lens, with the image_size"):
             FullSize(lens, 9, "crop")
-    with pytest.raises(ValueError, match="fit must be one of"):
+    with pytest.raises(ValueError, match="framing must be one of"):
         FullSize(all_seen((9, 9)), 9, "cut")

@@ -3,8 +3,7 @@ import gzip
 import numpy as np
 import pytest
 
-from darswin.data.datasets import open_source
-from darswin.data.idx import read_idx
+from darswin.data.pictures import open_source, read_idx
 
 
 def write_idx(path, array):

@@ -4,7 +4,13 @@ import numpy as np
 import pytest
 import torch
 
-from darswin.data.lenses import LEVELS, PolynomialLenses, SphericalLenses, parse_lenses, parse_sweep
+from darswin.data.lens_distributions import (
+    LEVELS,
+    PolynomialLenses,
+    SphericalLenses,
+    parse_lenses,
+    parse_sweep,
+)
 
 
 def test_levels_of_the_paper():

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import torch
 
-from darswin.data.mixing import Mixing, partners_share
+from darswin.data.augment import Mixing, partners_share
 from darswin.lens import Spherical
 
 

@@ -11,10 +11,9 @@ from hypothesis import strategies as st
 from scenes import CALIBRATIONS, distance_of, labels_of, rays_of
 from scipy import ndimage
 
-from darswin.data import IGNORE
-from darswin.data.reframing import Crop, part, resized, through, turned
-from darswin.data.scenes import Scene
-from darswin.data.turning import Turn, turned_picture
+from darswin.data import IGNORE, Scene
+from darswin.data.reframing import Crop, part, resize_scene, turn_scene, warp_scene
+from darswin.data.warp import Turn, turned_picture
 from darswin.lens import BrownConrady, Equidistant, Mei, OCam, Polynomial, Spherical, load
 from darswin.lens.pixels import pixel_angles, reprojection
 
@@ -111,7 +110,7 @@ def test_a_part_resized(name, fit, target):
     source = scene_of(LENSES[name], target)
     for crop, mirrored in ((None, False), (Crop(0.6, 0.2, 0.9), True), (Crop(0.8, 1, 0), False)):
         taken = part(source.target.shape, fit, crop)
-        scene = resized(source, taken, 128, mirrored)
+        scene = resize_scene(source, taken, 128, mirrored)
         assert scene.image.shape == (128, 128, 1) and size_of(scene.lens) == (128, 128)
         check(scene, source, Turn(0.0, True) if mirrored else None)
 
@@ -122,7 +121,7 @@ def test_a_part_resized(name, fit, target):
 def test_a_part_turned(name, turn, target):
     source = scene_of(LENSES[name], target)
     for fit, crop in (("crop", None), ("stretch", Crop(0.7, 0.4, 0.1))):
-        scene = turned(source, turn, part(source.target.shape, fit, crop), 128)
+        scene = turn_scene(source, turn, part(source.target.shape, fit, crop), 128)
         check(scene, source, turn)
 
 
@@ -132,7 +131,7 @@ def test_a_part_turned(name, turn, target):
 def test_another_lens(name, turn, target):
     source = scene_of(LENSES[name], target)
     for lens in TARGETS:
-        scene = through(source, lens, 128, turn)
+        scene = warp_scene(source, lens, 128, turn)
         assert scene.lens is lens
         check(scene, source, turn)
 
@@ -142,8 +141,8 @@ def test_a_turn_without_an_angle_is_a_mirror():
     taken = part(source.target.shape, "crop", None)
     for mirrored in (False, True):
         one, other = (
-            resized(source, taken, 100, mirrored),
-            turned(source, Turn(0, mirrored), taken, 100),
+            resize_scene(source, taken, 100, mirrored),
+            turn_scene(source, Turn(0, mirrored), taken, 100),
         )
         assert str(one.lens) == str(other.lens)
         assert (one.target != other.target).mean() < 0.005  # but for halves of a pixel
@@ -154,7 +153,7 @@ def test_turned_labels_are_those_of_scipy():
     height, width = SIZE
     taken = 0, 0, height, width
     turn = Turn(0.6, False)
-    scene = turned(source, turn, taken, 200)
+    scene = turn_scene(source, turn, taken, 200)
     cos, sin = math.cos(0.6), math.sin(0.6)
     down, across = height / 200, width / 200
     x, y = 190.0, 155.0
@@ -178,7 +177,7 @@ def test_the_places_are_those_of_the_exact_reprojection():
             source = Scene(np.stack((x, y), -1), np.zeros(SIZE, np.float32), LENSES[name])
             pair = (source.lens.to(torch.float64), SIZE, lens.to(torch.float64), (128, 128))
             exact = reprojection(*pair)[0]
-            got = torch.from_numpy(through(source, lens, 128).image)
+            got = torch.from_numpy(warp_scene(source, lens, 128).image)
             inside = (exact[..., 0] > 2) & (exact[..., 0] < width - 3)
             inside &= (exact[..., 1] > 2) & (exact[..., 1] < height - 3)
             inside = torch.from_numpy(ndimage.binary_erosion(inside.numpy(), iterations=2))
@@ -194,10 +193,10 @@ def test_what_is_much_larger_is_averaged():
     small = Equidistant.from_fov(3.0, 40.0, image_size=(80, 80), center=[39.5, 39.5])
     middle = (slice(20, 60), slice(20, 60))
     taken = (0, 0, 800, 800)
-    for scene in (through(source, small, 80), turned(source, Turn(0.5, False), taken, 80)):
+    for scene in (warp_scene(source, small, 80), turn_scene(source, Turn(0.5, False), taken, 80)):
         # Of 10 × 10 pixels that are read at 5 × 5 points: a sixth of the noise at most.
         assert scene.image[middle].std() < noise.std() / 6
-    assert resized(source, taken, 80, False).image[middle].std() < noise.std() / 9
+    assert resize_scene(source, taken, 80, False).image[middle].std() < noise.std() / 9
 
 
 @given(
@@ -219,9 +218,9 @@ def test_image_and_labels_move_together(angle, mirrored, share, across, down, si
     drawn = Spherical.from_fov(share, 2.4, size * share, center=[size * across, size * down])
     drawn = drawn.replace(image_size=torch.tensor([[float(size)] * 2]))
     for scene in (
-        turned(source, turn, taken, size),
-        resized(source, taken, size, mirrored),
-        through(source, drawn, size, turn),
+        turn_scene(source, turn, taken, size),
+        resize_scene(source, taken, size, mirrored),
+        warp_scene(source, drawn, size, turn),
     ):
         assert scene.target.shape == (size, size) and size_of(scene.lens) == (size, size)
         inner = even(scene.target) & (scene.target != IGNORE)
@@ -240,7 +239,7 @@ def test_a_picture_turns_as_it_does_for_classification():
     image, lens = turned_picture(source.image, source.lens, turn)
     height, width = SIZE
     expected = cv2.resize(image, (width, width), interpolation=cv2.INTER_AREA)
-    scene = turned(source, turn, (0, 0, height, width), width)
+    scene = turn_scene(source, turn, (0, 0, height, width), width)
     assert str(scene.lens) == str(lens.resized((width, width)))
     flat = even(expected) & (expected > 0)
     assert np.abs(scene.image[..., 0].astype(int) - expected)[flat].max() <= 1
@@ -248,7 +247,7 @@ def test_a_picture_turns_as_it_does_for_classification():
 
 def test_other_models_of_lenses():
     lens = OCam([-120.0, 0.0, 0.002], 1.4, [199.5, 149.5], image_size=SIZE)
-    check(through(scene_of(lens), TARGETS[0], 128), scene_of(lens))
+    check(warp_scene(scene_of(lens), TARGETS[0], 128), scene_of(lens))
     assert isinstance(LENSES["kitti360"], Mei)
 
 
@@ -263,7 +262,7 @@ def smaller(source, taken, size):
     """`through` a lens of the same model, so that the picture becomes `size` px wide."""
     focal = source.lens.focal.item() * size / taken[3]
     lens = Equidistant(focal, 0.8, (size / 2 - 0.5, size / 2 - 0.5), image_size=(size, size))
-    return through(source, lens, size)
+    return warp_scene(source, lens, size)
 
 
 SIZES = [
@@ -272,10 +271,10 @@ SIZES = [
     ((60, 250), 120), ((90, 640), 128), ((480, 80), 160), ((128, 128), 128),
 ]  # fmt: skip
 FRAMES = {
-    "resized": lambda *scene: resized(*scene, mirrored=False),
-    "mirrored": lambda *scene: resized(*scene, mirrored=True),
-    "upside down": lambda source, *taken: turned(source, Turn(math.pi, False), *taken),
-    "turned": lambda source, *taken: turned(source, Turn(0.3, True), *taken),
+    "resized": lambda *scene: resize_scene(*scene, mirrored=False),
+    "mirrored": lambda *scene: resize_scene(*scene, mirrored=True),
+    "upside down": lambda source, *taken: turn_scene(source, Turn(math.pi, False), *taken),
+    "turned": lambda source, *taken: turn_scene(source, Turn(0.3, True), *taken),
     "smaller": smaller,
 }
 
@@ -306,7 +305,9 @@ def test_targets_are_not_shifted(whole, size, fit, frame):
 @pytest.mark.parametrize(("whole", "size"), SIZES)
 def test_a_mirrored_picture_has_mirrored_targets(whole, size):
     taken = 0, 0, *whole
-    plain, mirrored = (resized(ramp(whole), taken, size, flip).target for flip in (False, True))
+    plain, mirrored = (
+        resize_scene(ramp(whole), taken, size, flip).target for flip in (False, True)
+    )
     same = plain[:, ::-1] == mirrored
     same[:, size // 2] |= size % 2 == 1  # which may be between two pixels, and mirrors itself
     assert same.all()

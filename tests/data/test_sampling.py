@@ -3,8 +3,8 @@ import pytest
 import torch
 from torch.utils.data import Dataset
 
+from darswin.data.order import EveryNth, ResumableLoader, TrainingOrder
 from darswin.data.samples import Draw
-from darswin.data.sampling import EveryNth, ResumableLoader, TrainingOrder
 
 
 def batches(order):

@@ -9,10 +9,10 @@ import torch
 from frames import CALIBRATIONS, WOODSCAPE
 
 from darswin.data import Calibrated, Calibrations, SphericalLenses, WideAngle
+from darswin.data.order import TrainingOrder
+from darswin.data.pictures import Arrays
 from darswin.data.samples import Draw
-from darswin.data.sampling import TrainingOrder
-from darswin.data.sources import Arrays
-from darswin.data.turning import RandomTurns, Turn, turned_picture
+from darswin.data.warp import RandomTurns, Turn, turned_picture
 from darswin.lens import BrownConrady, Equidistant, KannalaBrandt, load
 from darswin.lens.orientation import upright
 
@@ -129,7 +129,7 @@ def test_angles_and_mirrors_are_drawn_as_said():
     assert 0.45 < np.mean([turn.mirrored for turn in turns]) < 0.55
     assert RandomTurns(False, 0).draw(rng) == (0.0, False)
     for angle in (-1, 181, math.nan):
-        with pytest.raises(ValueError, match=r"rotate_deg must be in \[0, 180\]"):
+        with pytest.raises(ValueError, match=r"`rotate_deg` must be in \[0, 180\]"):
             RandomTurns(rotate_deg=angle)
 
 

@@ -7,8 +7,8 @@ import torch
 from torch.utils.data import DataLoader
 
 from darswin.data import PolynomialLenses, SphericalLenses, WideAngle, warp
+from darswin.data.pictures import Arrays, ImageFiles
 from darswin.data.samples import IMAGENET_MEAN, IMAGENET_STD, Draw
-from darswin.data.sources import Arrays, ImageFiles
 from darswin.data.wide_angle import PAPER_FOV
 from darswin.lens import Perspective, Spherical
 from darswin.lens.pixels import OUTSIDE, reprojection
@@ -111,7 +111,7 @@ def test_pictures_that_are_not_square(fit, left_is_black):
     wide[:, :20] = 255  # cut off by "crop"
     source = Arrays(wide[None], np.array([0]), ["a"], 1)
     dataset = WideAngle(
-        source, SphericalLenses(0, 0), size=16, render=16, fov=1.5, fit=fit, mean=[0], std=[1]
+        source, SphericalLenses(0, 0), size=16, render=16, fov=1.5, framing=fit, mean=[0], std=[1]
     )
     image = dataset[0][0][0]
     assert (image[8, 1].item() == 0) == left_is_black
@@ -144,7 +144,7 @@ def test_broken_files(tmp_path):
     [
         (dict(size=64, render=32), "0 < size ≤ render"),
         (dict(fov=4.0), r"fov must be in \(0, π\)"),
-        (dict(fit="pad"), "fit must be"),
+        (dict(framing="pad"), "framing must be"),
     ],
 )
 def test_wrong_options(options, message):

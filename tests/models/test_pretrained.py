@@ -12,8 +12,7 @@ import torch
 from sklearn.datasets import load_digits
 from sklearn.model_selection import train_test_split
 
-from darswin.data.frames import at_size
-from darswin.data.warp import remap, warp_map
+from darswin.data.warp import at_size, remap, warp_map
 from darswin.deploy.quantize import quantize_model
 from darswin.layers.quantized import quantized_layers
 from darswin.lens import Perspective, Spherical, load

@@ -6,7 +6,7 @@ import pytest
 import torch
 from scenes import write_plain
 
-from darswin.data.scenes import IGNORE
+from darswin.data import IGNORE
 from darswin.lens import Equidistant, KannalaBrandt, cat
 from darswin.lens.pixels import pixel_angles, solid_angles
 from darswin.train import dense

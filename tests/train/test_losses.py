@@ -7,7 +7,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from darswin.data.scenes import IGNORE
+from darswin.data import IGNORE
 from darswin.train.losses import distance_loss, label_loss
 
 f64 = torch.float64

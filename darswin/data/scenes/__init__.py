@@ -1,7 +1,88 @@
 """Scenes: pictures with a label or a distance for each pixel, and readers of data sets of them."""
 
-from darswin.data.scenes.opening import open_scenes
-from darswin.data.scenes.scene import Scene, Scenes
-from darswin.data.scenes.targets import IGNORE
+from pathlib import Path
+from typing import get_args
 
-__all__ = ["IGNORE", "Scene", "Scenes", "open_scenes"]
+from darswin.data.scenes.files import Options, ScenesSplit
+from darswin.data.scenes.kitti360 import is_kitti360, open_kitti360
+from darswin.data.scenes.plain import FORM, is_plain, open_plain
+from darswin.data.scenes.scene import Scenes, Target
+from darswin.data.scenes.woodscape import (
+    is_synwoodscape,
+    is_woodscape,
+    open_synwoodscape,
+    open_woodscape,
+)
+from darswin.data.splits import check_split
+
+# The first that recognizes a path opens it.
+READERS = (
+    (is_plain, open_plain),
+    (is_kitti360, open_kitti360),
+    (is_synwoodscape, open_synwoodscape),
+    (is_woodscape, open_woodscape),
+)
+
+
+def open_scenes(
+    path: str | Path,
+    split: ScenesSplit,
+    target: Target,
+    *,
+    channels: int = 3,
+    lens: str | Path | None = None,
+    camera: str | None = None,
+    coefficients: str | None = None,
+    classes: str | Path | None = None,
+    splits: str | Path | None = None,
+    holdout: float = 0.1,
+) -> Scenes:
+    """The scenes of one split of a data set.
+
+    What `path` may be, told from its folders:
+
+    - the plain form: `images/STEM.png` (also jpg, bmp, webp, tif, ppm), and for each
+      `labels/STEM.png`, ids of 8 bits, or `distance/STEM.png`, 16 bits of metres × 256, or
+      `distance/STEM.npy`, floating-point metres; 0 is not known. STEM may have folders. All that in
+      ROOT, or in `ROOT/train`, `ROOT/val` and `ROOT/test`. The lens is in `lenses/STEM.json`, one
+      for a picture, or in `lens.json` beside `images/` or in ROOT: a calibration, or what
+      `darswin.data.Calibrations` takes as a lenses.json, with paths relative to its folder.
+      `classes.json` beside `images/` or in ROOT names the classes;
+    - WoodScape, SynWoodScape or KITTI-360, as their authors publish them.
+
+    Without a test set, "val" serves as one. What has neither, or no "val", gets `holdout` of
+    "train" for each, chosen by a hash of their names; at least one is left to train on. Pictures
+    that are in no split are named in `LeftOut` warnings.
+
+    Args:
+        split: "all" is every scene of a folder without splits.
+        target: what is known of each pixel: "labels" or "distance", along the ray.
+        channels: 3 or 1, of the images that come out.
+        lens, camera, coefficients: as `darswin.data.Calibrations`, in place of the data set's own.
+        classes: the names of the classes, in place of the data set's own: a text file with one a
+            line, a JSON list, or {"names": [...], "colors": [[r, g, b], ...]}.
+        splits: a JSON file `{"train": [stems], "val": …, "test": …}`, or a folder of `train.txt`,
+            `val.txt`, `test.txt` with one stem a line; with or without the pictures' suffix. A
+            split without a list is held out. For WoodScape and SynWoodScape also "heal-swin".
+        holdout: a share, in [0, 0.5).
+
+    Raises:
+        FileNotFoundError: a folder, lens, label or list that is missing, or a split without scenes.
+        ValueError: what can be read in two ways or does not fit. Both name it.
+    """
+    check_split(split, get_args(ScenesSplit), holdout)
+    if target not in get_args(Target):
+        raise ValueError(f"target must be one of {get_args(Target)}, got {target!r}")
+    if channels not in (1, 3):
+        raise ValueError(f"`channels` must be 1 or 3, got {channels}")
+    for name, value in (("camera", camera), ("coefficients", coefficients)):
+        if value is not None and lens is None:
+            raise ValueError(f"`{name}` {value} is one of a calibration: give `lens` too")
+    root = Path(path)
+    if not root.is_dir():
+        raise FileNotFoundError(f"no folder {root}")
+    options = Options(split, target, channels, lens, camera, coefficients, classes, splits, holdout)
+    for recognizes, open_split in READERS:
+        if recognizes(root):
+            return open_split(root, options)
+    raise FileNotFoundError(f"no scenes in {root}: {FORM}")

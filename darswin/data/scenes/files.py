@@ -1,14 +1,105 @@
-"""Which files are scenes: pictures and the files of the same names beside them."""
+"""Finds the files of scenes: pictures and the files of the same names beside them."""
 
 import os
-import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
-from darswin.data.folders import OTHER_SUFFIXES, SUFFIXES, LeftOut, files_below
-from darswin.data.splits import some
+from darswin.data.cameras import Calibrations
+from darswin.data.folders import OTHER_SUFFIXES, PICTURES, SUFFIXES, files_below
+from darswin.data.scenes.scene import Target
+from darswin.data.splits import (
+    Split,
+    part_of_split,
+    read_split_lists,
+    some,
+    taken_from,
+    warn_left_out,
+)
 
 Pairs = dict[str, tuple[str, str]]  # by their stems: (picture, target), relative to a folder
+ScenesSplit = Literal["train", "val", "test", "all"]
+# Named splits: stems, sorted → those of each part.
+Named = Mapping[str, Callable[[list[str]], dict[Split, list[str]]]]
+
+
+@dataclass(frozen=True)
+class Options:
+    """The arguments of `darswin.data.open_scenes`, for its readers."""
+
+    split: ScenesSplit
+    target: Target
+    channels: int
+    lens: str | Path | None
+    camera: str | None
+    coefficients: str | None
+    classes: str | Path | None
+    splits: str | Path | None
+    holdout: float
+
+    def given_lens(self, root: Path) -> Calibrations | None:
+        """The lens that the caller gave in place of the data set's own."""
+        if self.lens is None:
+            return None
+        return Calibrations(self.lens, root, self.camera, self.coefficients)
+
+    def choose(
+        self,
+        found: list[str],
+        root: Path,
+        *,
+        group: Callable[[str], str] | None = None,
+        named: Named | None = None,
+    ) -> list[str]:
+        """The split's stems of all those found in a folder that has no folders of splits.
+
+        Args:
+            group: stems of one group are held out together. named: splits that `splits` may name.
+
+        Raises:
+            ValueError: lists that are wrong, or a stem in two of them. FileNotFoundError: a stem in
+                the split's list that is not there; a split that has none.
+        """
+        if self.split == "all":
+            return found
+        given: dict[Split, list[str]] = {"train": found}
+        if self.splits is not None:
+            make = (named or {}).get(str(self.splits))
+            given = make(sorted(found)) if make else _listed(Path(self.splits), found, named)
+        part, held_out = taken_from(self.split, given)
+        chosen = given[part]
+        if unknown := sorted(set(chosen) - set(found)):
+            raise FileNotFoundError(
+                f"{self.splits} lists {len(unknown)} pictures for {part!r} that are not in {root}: "
+                f"{some(unknown)}"
+            )
+        if not chosen:
+            raise FileNotFoundError(f"{self.splits} lists no pictures for {part!r}")
+        return part_of_split(chosen, self.split, held_out, self.holdout, root, group=group)
+
+
+def _listed(path: Path, found: Sequence[str], named: Named | None) -> dict[Split, list[str]]:
+    """The stems of each list; pictures are listed with or without their suffixes."""
+    if named and not path.exists():
+        raise FileNotFoundError(f"no lists of splits {path}; splits with a name: {sorted(named)}")
+    given: dict[Split, list[str]] = {}
+    split_of: dict[str, Split] = {}
+    for split, names in read_split_lists(path).items():
+        if wrong := [name for name in names if not isinstance(name, str)]:
+            raise ValueError(f"{path} must list names for {split!r}, got {wrong[0]!r}")
+        given[split] = list(dict.fromkeys(map(_stem, names)))
+        for stem in given[split]:
+            if split_of.setdefault(stem, split) != split and "train" in (split_of[stem], split):
+                raise ValueError(f"{path} lists {stem} for {split_of[stem]!r} and for {split!r}")
+    if left := [stem for stem in found if stem not in split_of]:
+        warn_left_out(f"{path} lists {len(left)} pictures for no split, {some(left)}: left out")
+    return given
+
+
+def _stem(name: str) -> str:
+    stem, suffix = os.path.splitext(name)
+    return os.path.normpath(stem if suffix.lower() in PICTURES else name)
 
 
 def stems(folder: Path, suffixes: Sequence[str] | frozenset[str]) -> dict[str, str]:
@@ -31,46 +122,46 @@ def stems(folder: Path, suffixes: Sequence[str] | frozenset[str]) -> dict[str, s
 
 
 def pictures_in(folder: Path) -> dict[str, str]:
-    """The pictures below a folder, as `stems`.
-
-    Raises:
-        FileNotFoundError: none.
-    """
+    """The pictures below a folder, as `stems`; FileNotFoundError where there are none."""
     found = stems(folder, SUFFIXES)
-    others = stems(folder, OTHER_SUFFIXES)
+    others = list(stems(folder, OTHER_SUFFIXES))
     if not found:
         raise FileNotFoundError(f"no pictures in {folder}")
     if others:
-        _say(f"{folder} holds pictures that darswin does not read, {some(list(others))}: left out")
+        warn_left_out(
+            f"{folder} holds pictures that darswin does not read, {some(others)}: left out"
+        )
     return found
 
 
 def pair(
     pictures: dict[str, str],
     targets: dict[str, str],
-    choice: Callable[[list[str]], list[str]],
+    choose: Callable[[list[str]], list[str]],
     *,
     root: Path,
     what: str,
     strict: bool = True,
 ) -> Pairs:
-    """The pictures that `choice` takes, and the targets of the same stems.
+    """The pictures whose stems `choose` takes, and the targets of the same stems.
 
     Args:
-        root: what the paths become relative to. what: the targets, as errors call them.
+        root: the paths become relative to it. what: the targets, for errors.
         strict: pictures without a target are an error if they are chosen, else left out.
 
     Raises:
         FileNotFoundError: pictures without a target, by name.
     """
-    stems = list(pictures)
+    found = list(pictures)
     if not strict:
-        stems = [stem for stem in pictures if stem in targets]
-        if without := len(pictures) - len(stems):
-            _say(f"{without} of {len(pictures)} pictures in {root} have no {what}: left out")
+        found = [stem for stem in pictures if stem in targets]
+        if without := len(pictures) - len(found):
+            warn_left_out(
+                f"{without} of {len(pictures)} pictures in {root} have no {what}: left out"
+            )
     if alone := [targets[stem] for stem in targets if stem not in pictures]:
-        _say(f"{len(alone)} files of {what} have no picture, {some(alone)}: left out")
-    chosen = choice(stems)
+        warn_left_out(f"{len(alone)} files of {what} have no picture, {some(alone)}: left out")
+    chosen = choose(found)
     if missing := [pictures[stem] for stem in chosen if stem not in targets]:
         raise FileNotFoundError(
             f"no {what} for {len(missing)} of {len(chosen)} pictures, {some(missing)}: add them, "
@@ -80,7 +171,3 @@ def pair(
         stem: (os.path.relpath(pictures[stem], root), os.path.relpath(targets[stem], root))
         for stem in chosen
     }
-
-
-def _say(text: str) -> None:
-    warnings.warn(text, LeftOut, stacklevel=2)

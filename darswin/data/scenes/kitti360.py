@@ -12,22 +12,16 @@ Source: Liao et al., KITTI-360, PAMI 2022.
 
 from pathlib import Path
 
-from darswin.data.calibrations import Calibrations, PictureLenses
-from darswin.data.scenes.files import Pairs, pair, stems
-from darswin.data.scenes.lenses import OwnLenses
-from darswin.data.scenes.options import Options
-from darswin.data.scenes.scene import Scenes
-from darswin.data.scenes.targets import DISTANCE_SUFFIXES
-
-CAMERAS = ("image_02", "image_03")
+from darswin.data.cameras import Calibrations
+from darswin.data.scenes.files import Options, Pairs, pair, stems
+from darswin.data.scenes.scene import SUFFIXES, Scenes
 
 
-def fits(root: Path) -> bool:
-    """Whether a folder holds KITTI-360's pictures."""
+def is_kitti360(root: Path) -> bool:
     return (root / "data_2d_raw").is_dir()
 
 
-def open_split(root: Path, options: Options) -> Scenes:
+def open_kitti360(root: Path, options: Options) -> Scenes:
     """A split; options and errors as `darswin.data.open_scenes`."""
     if options.target != "distance":
         raise ValueError(f"{root} is of KITTI-360's form, whose fisheye pictures have no labels")
@@ -38,36 +32,33 @@ def open_split(root: Path, options: Options) -> Scenes:
             pictures[f"{drive}/{camera}/{stem}"] = file
     if not pictures:
         raise FileNotFoundError(f"no pictures in {root}/data_2d_raw/*/image_0[23]/data_rgb")
-    choice = options.choice(root, group=drive_of)
-    distances = stems(root / "distance", DISTANCE_SUFFIXES)
-    pairs = pair(pictures, distances, choice, root=root, what="distance", strict=False)
+    pairs = pair(
+        pictures,
+        stems(root / "distance", SUFFIXES["distance"]),
+        lambda found: options.choose(found, root, group=lambda stem: stem.split("/")[0]),
+        root=root,
+        what="distance",
+        strict=False,
+    )
     return Scenes(
         root,
         list(pairs.values()),
-        _lenses(root, pairs, options),
+        options.given_lens(root) or _lenses(root, pairs),
         target="distance",
         channels=options.channels,
-        views=[camera_of(stem) for stem in pairs],
+        views=[_camera_of(stem) for stem in pairs],
     )
 
 
-def drive_of(stem: str) -> str:
-    """The drive of a stem."""
-    return stem.split("/")[0]
-
-
-def camera_of(stem: str) -> str:
-    """The camera of a stem."""
+def _camera_of(stem: str) -> str:
     return stem.split("/")[1]
 
 
-def _lenses(root: Path, pairs: Pairs, options: Options) -> PictureLenses:
-    if options.lens is not None:
-        return Calibrations(options.lens, root, options.camera, options.coefficients)
+def _lenses(root: Path, pairs: Pairs) -> Calibrations:
     files = {
-        root / picture: root / "calibration" / f"{camera_of(stem)}.yaml"
+        root / picture: root / "calibration" / f"{_camera_of(stem)}.yaml"
         for stem, (picture, _) in pairs.items()
     }
     if missing := sorted({str(file) for file in files.values() if not file.is_file()}):
-        raise FileNotFoundError(f"no {missing[0]}: add it, or give the lens")
-    return OwnLenses(files)
+        raise FileNotFoundError(f"no {missing[0]}: add it, or give `lens`")
+    return Calibrations(None, files=files)

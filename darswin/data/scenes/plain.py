@@ -5,31 +5,23 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
-from darswin.data.calibrations import Calibrations, PictureLenses
-from darswin.data.folders import SPLIT_NAMES
-from darswin.data.scenes.classes import Classes, read_palette
-from darswin.data.scenes.files import Pairs, pair, pictures_in, stems
-from darswin.data.scenes.lenses import OwnLenses
-from darswin.data.scenes.options import Options
-from darswin.data.scenes.parts import taken_from, without_others
-from darswin.data.scenes.scene import Scenes
-from darswin.data.scenes.targets import DISTANCE_SUFFIXES, LABEL_SUFFIXES
-from darswin.data.splits import Split
+from darswin.data.cameras import Calibrations
+from darswin.data.scenes.files import Options, Pairs, pair, pictures_in, stems
+from darswin.data.scenes.scene import NO_CLASSES, SUFFIXES, Scenes, read_palette
+from darswin.data.splits import SPLIT_NAMES, Split, part_of_split, taken_from
 
 FORM = (
     "darswin looks for images/STEM.png (or jpg, bmp, webp, tif, ppm) with labels/STEM.png or "
     "distance/STEM.png or .npy, and for lens.json or lenses/STEM.json, in ROOT, or in ROOT/train, "
     "ROOT/val and ROOT/test"
 )
-SUFFIXES = {"labels": LABEL_SUFFIXES, "distance": DISTANCE_SUFFIXES}
 
 
-def fits(root: Path) -> bool:
-    """Whether a folder, or one of a split in it, holds `images/`."""
+def is_plain(root: Path) -> bool:
     return (root / "images").is_dir() or bool(_split_folders(root))
 
 
-def open_split(root: Path, options: Options) -> Scenes:
+def open_plain(root: Path, options: Options) -> Scenes:
     """A split; options and errors as `darswin.data.open_scenes`."""
     folders = _split_folders(root)
     if (root / "images").is_dir():
@@ -37,66 +29,52 @@ def open_split(root: Path, options: Options) -> Scenes:
             raise ValueError(
                 f"{root / 'images'} and {next(iter(folders.values()))} may both be meant: {FORM}"
             )
-        return _scenes(root, root, options, options.choice(root))
+        return _scenes(root, root, options, partial(options.choose, root=root))
     if options.splits is not None:
         raise ValueError(f"{options.splits} lists splits, and {root} has a folder for each")
-    if options.split == "all":
+    split = options.split
+    if split == "all":
         raise ValueError(f"{root} has a folder for each split: 'all' is of a folder without splits")
-    part, held_out = taken_from(options.split, folders)
-    choice = partial(
-        without_others,
-        split=options.split,
-        held_out=held_out,
-        where=folders[part],
-        holdout=options.holdout,
+    part, held_out = taken_from(split, folders)
+    folder = folders[part]
+    return _scenes(
+        root,
+        folder,
+        options,
+        lambda found: part_of_split(found, split, held_out, options.holdout, folder),
     )
-    return _scenes(root, folders[part], options, choice)
 
 
 def _scenes(
-    root: Path, folder: Path, options: Options, choice: Callable[[list[str]], list[str]]
+    root: Path, folder: Path, options: Options, choose: Callable[[list[str]], list[str]]
 ) -> Scenes:
-    """The scenes of a folder with `images/`, of the stems that `choice` takes."""
+    """The scenes of a folder with `images/`, of the stems that `choose` takes."""
     target = options.target
     targets = stems(folder / target, SUFFIXES[target])
-    pairs = pair(pictures_in(folder / "images"), targets, choice, root=folder, what=target)
-    classes = Classes([], [])
+    pairs = pair(pictures_in(folder / "images"), targets, choose, root=folder, what=target)
+    classes = NO_CLASSES
     if target == "labels":
         classes = read_palette(options.classes or _beside("classes.json", folder, root))
-    return Scenes(
-        folder,
-        list(pairs.values()),
-        _lenses(root, folder, pairs, options),
-        target=target,
-        channels=options.channels,
-        classes=classes.names,
-        colors=classes.colors,
-    )
+    lenses = options.given_lens(root) or _lenses(root, folder, pairs)
+    files = list(pairs.values())
+    return Scenes(folder, files, lenses, target=target, channels=options.channels, classes=classes)
 
 
-def _lenses(root: Path, folder: Path, pairs: Pairs, options: Options) -> PictureLenses:
-    """The lens that was given; else those of the pictures themselves, else the folder's."""
-    if options.lens is not None:
-        return Calibrations(options.lens, root, options.camera, options.coefficients)
-    own: dict[str, str] = {}
-    if (folder / "lenses").is_dir():
-        own = stems(folder / "lenses", (".json",))
-    missing = [stem for stem in pairs if stem not in own]
-    shared = None
-    if missing:
-        try:
-            file = _beside("lens.json", folder, root)
-        except FileNotFoundError as error:
-            has = f"{folder / 'lenses' / missing[0]}.json" if own else f"lens.json in {folder}"
-            raise FileNotFoundError(
-                f"no lens for {folder / pairs[missing[0]][0]}: add {has}, or give the lens"
-            ) from error
-        shared = Calibrations(file, file.parent, options.camera)
-    if not own:
-        assert shared is not None  # as all pictures miss one of their own
-        return shared
+def _lenses(root: Path, folder: Path, pairs: Pairs) -> Calibrations:
+    """The lenses of the pictures themselves, else the folder's."""
+    own = stems(folder / "lenses", (".json",)) if (folder / "lenses").is_dir() else {}
     files = {folder / pairs[stem][0]: Path(own[stem]) for stem in pairs if stem in own}
-    return OwnLenses(files, shared)
+    missing = [stem for stem in pairs if stem not in own]
+    if not missing:
+        return Calibrations(None, files=files)
+    try:
+        shared = _beside("lens.json", folder, root)
+    except FileNotFoundError as error:
+        has = f"{folder / 'lenses' / missing[0]}.json" if own else f"lens.json in {folder}"
+        raise FileNotFoundError(
+            f"no lens for {folder / pairs[missing[0]][0]}: add {has}, or give `lens`"
+        ) from error
+    return Calibrations(shared, shared.parent, files=files)
 
 
 def _beside(name: str, folder: Path, root: Path) -> Path:
@@ -110,8 +88,6 @@ def _beside(name: str, folder: Path, root: Path) -> Path:
 def _split_folders(root: Path) -> dict[Split, Path]:
     """The folders of the splits, which hold `images/`."""
     named: dict[Split, Path] = {}
-    if not root.is_dir():
-        return named
     for entry in sorted(os.scandir(root), key=lambda entry: entry.name):
         split, folder = SPLIT_NAMES.get(entry.name.lower()), root / entry.name
         if split is None or not (folder / "images").is_dir():

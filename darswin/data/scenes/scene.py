@@ -1,24 +1,30 @@
 """Scenes: pictures with a label or a distance for each pixel, and the lenses that took them."""
 
-import copy
 import os
-from collections.abc import Sequence
+import warnings
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Literal, NamedTuple, Self
+from typing import Any, Literal, NamedTuple, Self
 
+import cv2
 import numpy as np
 import torch
+from PIL import Image
 
-from darswin.data.calibrations import PictureLenses
-from darswin.data.scenes.targets import nothing_of, read_distance, read_labels
+from darswin.data.cameras import Calibrations
+from darswin.data.splits import Limited, read_classes, read_json, some
 from darswin.lens import Lens
-from darswin.utils.image import read_oriented
+from darswin.utils.image import BrokenImageError, decoded, file_content, read_oriented
 
+IGNORE = 255  # the label of a pixel that is of no class
+PER_METRE = 256  # of a distance in a PNG of 16 bits
 Target = Literal["labels", "distance"]
+# Of the files with targets.
+SUFFIXES: dict[Target, tuple[str, ...]] = {"labels": (".png",), "distance": (".png", ".npy")}
 
 
 class Scene(NamedTuple):
-    """A picture and what is known of each of its pixels.
+    """A picture with a label or a distance for each of its pixels.
 
     Attributes: image: (H, W, C) uint8; target: (H, W), uint8 ids with `IGNORE`, or float32 metres
     along the ray with 0 where it is not known; lens: one lens, with a center and this image_size.
@@ -29,14 +35,25 @@ class Scene(NamedTuple):
     lens: Lens
 
 
-class Scenes:
+class Classes(NamedTuple):
+    """Attributes: names: in the order of the ids; colors: (r, g, b) in 0 … 255 of each, or none."""
+
+    names: list[str]
+    colors: list[list[int]]
+
+
+NO_CLASSES = Classes([], [])
+
+
+class Scenes(Limited):
     """A sequence of scenes, read from their files when they are asked for.
 
     Args:
         root: the folder that the files are relative to. files: (picture, target) pairs.
-        lenses: which lens took which picture. target: what the second file of a pair holds.
+        lenses: which lens took which picture. target: "labels" or "distance", the second file of a
+            pair.
         channels: 3 or 1, of the images.
-        classes: names of the labels' ids. colors: (r, g, b) of each, or none.
+        classes: names of the labels' ids, and their colours.
         views: of each picture, what `cameras` calls the camera that took it; None takes them from
             `lenses`.
         trim: (rows, height): so many rows are cut at the top and at the bottom of a picture that is
@@ -44,27 +61,28 @@ class Scenes:
         far: metres, from which on a distance is that of the sky, which is not known.
 
     Attributes:
-        cameras: names of what took the pictures.
+        classes, colors: of the labels. cameras: names of what took the pictures.
         unknown: (N,) int64, pixels of each target that say nothing: labels of `IGNORE`, distances
             that are not finite or not above 0; -1 until it was read, in any process.
     """
+
+    PER_PICTURE = ("_pictures", "_targets", "_camera", "unknown")
 
     def __init__(
         self,
         root: Path,
         files: Sequence[tuple[str, str]],
-        lenses: PictureLenses,
+        lenses: Calibrations,
         *,
         target: Target,
         channels: int = 3,
-        classes: Sequence[str] = (),
-        colors: Sequence[Sequence[int]] = (),
+        classes: Classes = NO_CLASSES,
         views: Sequence[str] | None = None,
         trim: tuple[int, int] = (0, 1),
         far: float | None = None,
     ):
         self.root, self.lenses, self.target, self.channels = Path(root), lenses, target, channels
-        self.classes, self.colors = list(classes), [list(color) for color in colors]
+        self.classes, self.colors = list(classes.names), list(classes.colors)
         self.trim, self.far = trim, far
         # As arrays, so that worker processes share them instead of copying every object.
         self._pictures = np.array([os.fsencode(picture) for picture, _ in files], np.bytes_)
@@ -94,7 +112,10 @@ class Scenes:
                 f"{self.file(index)} is stored turned, as its EXIF orientation {orientation} says, "
                 "and its labels or distances may be of either picture: store it upright"
             )
-        target = self._target(index)
+        if self.target == "labels":
+            target = read_labels(self.target_file(index), len(self.classes))
+        else:
+            target = read_distance(self.target_file(index), self.far)
         size = image.shape[0], image.shape[1]
         if target.shape != size:
             shapes = [f"{height}×{width}" for height, width in (target.shape, size)]
@@ -110,14 +131,9 @@ class Scenes:
         return Scene(image, target, self._trimmed(lens, rows))
 
     def limited(self, count: int) -> Self:
-        """At most so many of the scenes, chosen by a fixed shuffle."""
-        if count < 1:
-            raise ValueError(f"--data.limit must be at least 1, got {count}")
-        chosen = np.sort(np.random.default_rng(0).permutation(len(self))[:count])
-        part = copy.copy(self)
-        part._pictures, part._targets = self._pictures[chosen], self._targets[chosen]
-        part._camera = self._camera[chosen]
-        part.unknown = self.unknown[torch.from_numpy(chosen)].share_memory_()
+        """At most `count` of the scenes, chosen by a fixed shuffle; ValueError below 1."""
+        part = super().limited(count)
+        part.unknown.share_memory_()
         return part
 
     def file(self, index: int) -> Path:
@@ -129,7 +145,7 @@ class Scenes:
         return self.root / os.fsdecode(self._targets[index])
 
     def camera_of(self, index: int) -> int:
-        """What took a picture, as a number in `cameras`."""
+        """The camera that took a picture, as a number in `cameras`."""
         return int(self._camera[index])
 
     def lens_alone(self, index: int) -> Lens:
@@ -138,13 +154,8 @@ class Scenes:
         height = 1 if lens.image_size is None else round(lens.image_size[0, 0].item())
         return self._trimmed(lens, self._rows(height))
 
-    def _target(self, index: int) -> np.ndarray:
-        if self.target == "labels":
-            return read_labels(self.target_file(index), len(self.classes))
-        return read_distance(self.target_file(index), self.far)
-
     def _rows(self, height: int) -> int:
-        """How many rows are cut at the top of a picture."""
+        """The number of rows that are cut at the top of a picture."""
         rows, of = self.trim
         return -(-rows * height // of)
 
@@ -153,3 +164,121 @@ class Scenes:
             return lens
         height, width = (round(side) for side in lens.image_size[0].tolist())
         return lens.cropped(rows, 0, height - 2 * rows, width)
+
+
+# -- targets ----------------------------------------------------------------------------------
+
+
+def nothing_of(target: np.ndarray) -> int:
+    """The value of pixels of which nothing is known: `IGNORE` of labels (uint8), 0 of distances."""
+    return IGNORE if target.dtype == np.uint8 else 0
+
+
+def read_labels(path: Path, classes: int) -> np.ndarray:
+    """A label PNG as (H, W) uint8: ids of so many classes, or `IGNORE`. Of a PNG with a palette
+    the ids count, not their colours.
+
+    Raises:
+        BrokenImageError: a file that is missing or cannot be read. ValueError: one of 16 bits or of
+            colours, or an id that is no class's. Both name the file.
+    """
+    try:
+        with warnings.catch_warnings(action="ignore"), Image.open(path) as file:
+            mode = file.mode
+            if mode in ("L", "P", "1"):
+                labels = np.array(file, np.uint8)
+    except Exception as error:  # a file that is no PNG fails in many ways
+        raise BrokenImageError(f"cannot read {path}: {_reason(error)}") from error
+    if mode not in ("L", "P", "1"):
+        raise ValueError(
+            f"{path} must hold an id of 8 bits for each pixel, grey or with a palette, but "
+            f"holds {'16 bits' if mode.startswith('I') else f'colours ({mode})'}"
+        )
+    ids = np.flatnonzero(np.bincount(labels.ravel(), minlength=256)).tolist()
+    if wrong := [id_ for id_ in ids if classes <= id_ != IGNORE]:
+        raise ValueError(
+            f"{path} holds the ids {some(wrong)}, and there are {classes} classes, of the ids 0 to "
+            f"{classes - 1}; {IGNORE} is no class"
+        )
+    return labels
+
+
+def read_distance(path: Path, far: float | None = None) -> np.ndarray:
+    """Distances along the rays (H, W) float32, metres; 0 where they are not known: where they are
+    not finite, not above 0, or at least `far`.
+
+    Args:
+        path: a PNG of 16 bits, metres × 256; or a NumPy file of floating-point metres.
+
+    Raises:
+        BrokenImageError: a file that is missing or cannot be read. ValueError: one of another form.
+            Both name the file.
+    """
+    metres = _numbers(path) if path.suffix.lower() == ".npy" else _sixteen_bits(path)
+    with np.errstate(invalid="ignore"):
+        known = np.isfinite(metres) & (metres > 0)
+        if far is not None:
+            known &= metres < far
+    return np.where(known, metres, np.float32(0))
+
+
+def _numbers(path: Path) -> np.ndarray:
+    try:
+        metres = np.load(path, allow_pickle=False)
+    except Exception as error:  # as above
+        raise BrokenImageError(f"cannot read {path}: {_reason(error)}") from error
+    if not isinstance(metres, np.ndarray) or metres.ndim != 2 or metres.dtype.kind != "f":
+        form = f"{metres.dtype} {metres.shape}" if isinstance(metres, np.ndarray) else "an archive"
+        raise ValueError(f"{path} must hold floating-point metres (H, W), but holds {form}")
+    with np.errstate(over="ignore"):  # infinite is not known
+        return metres.astype(np.float32)
+
+
+def _sixteen_bits(path: Path) -> np.ndarray:
+    image = decoded(file_content(path), path, cv2.IMREAD_UNCHANGED)
+    if image.dtype != np.uint16 or image.ndim != 2:
+        colours = 1 if image.ndim == 2 else image.shape[2]
+        raise ValueError(
+            f"{path} must hold a distance of 16 bits for each pixel, metres × {PER_METRE}, but "
+            f"holds {colours} × {8 * image.dtype.itemsize} bits"
+        )
+    return image.astype(np.float32) / np.float32(PER_METRE)
+
+
+def _reason(error: Exception) -> str:
+    return getattr(error, "strerror", None) or str(error) or type(error).__name__
+
+
+# -- classes ----------------------------------------------------------------------------------
+
+
+def read_palette(path: str | Path) -> Classes:
+    """Names of classes as `read_classes`, or a JSON object {"names": [...], "colors":
+    [[r, g, b], ...]}, whose colours may be left out; ValueError names a file of another form."""
+    content = read_json(path) if Path(path).suffix == ".json" else None
+    if isinstance(content, Mapping):
+        return as_classes(content.get("names"), content.get("colors", []), path)
+    return as_classes(read_classes(path), [], path)
+
+
+def as_classes(names: Any, colors: Any, path: str | Path) -> Classes:
+    """The classes of a file; ValueError where that is not one name, and one colour, each."""
+    if not _is_list(names, str) or not names:
+        raise ValueError(f"{path} must name the classes as a list of words, got {names!r}")
+    if len(set(names)) < len(names) or len(names) > IGNORE:
+        raise ValueError(f"{path} must name each class once, and at most {IGNORE}, got {names}")
+    matches = _is_list(colors, list) and len(colors) in (0, len(names))
+    if not matches or not all(_is_color(color) for color in colors):
+        raise ValueError(
+            f"{path} must give each of {len(names)} classes a color [r, g, b] in 0 … 255, or none "
+            f"a color, got {colors!r}"
+        )
+    return Classes(list(names), [list(color) for color in colors])
+
+
+def _is_list(value: Any, kind: type) -> bool:
+    return isinstance(value, list) and all(isinstance(entry, kind) for entry in value)
+
+
+def _is_color(value: Sequence) -> bool:
+    return len(value) == 3 and all(type(v) is int and 0 <= v <= 255 for v in value)

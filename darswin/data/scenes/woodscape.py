@@ -1,11 +1,18 @@
-"""WoodScape, as its authors publish it: labels of ten classes, four cameras of a car.
+"""WoodScape and SynWoodScape, as their authors publish them: four cameras of a car.
 
-Read: `rgb_images/`, `semantic_annotations/[semantic_annotations/]gtLabels/`, the classes of
-`seg_annotation_info.json` beside it, and `calibration/[calibration/]` or
-`calibration_data/calibration/`. All else is left alone: boxes, polygons, motion, soiling, previous
-images, and the test set, whose labels are withheld.
+Of WoodScape, labels of ten classes are read: `rgb_images/`,
+`semantic_annotations/[semantic_annotations/]gtLabels/`, the classes of `seg_annotation_info.json`
+beside it, and `calibration/[calibration/]` or `calibration_data/calibration/`. All else is left
+alone: boxes, polygons, motion, soiling, previous images, and the test set, whose labels are
+withheld.
 
-Source: Yogamani et al., WoodScape, ICCV 2019, and github.com/valeoai/WoodScape.
+Of SynWoodScape, the same four cameras in a simulator, labels of 25 classes and distances are read:
+`rgb_images/[rgb_images/]`, `semantic_annotations/[semantic_annotations/]gtLabels/`,
+`depth_maps/[depth_maps/]raw_data/` and `calibration/[calibration/]`. The depth maps are taken for
+metres along the ray; 1000 is the sky, whose distance is not known.
+
+Source: Yogamani et al., WoodScape, ICCV 2019, and github.com/valeoai/WoodScape; Sekkat et al.,
+SynWoodScape, RA-L 2022.
 """
 
 from collections.abc import Mapping
@@ -13,60 +20,81 @@ from pathlib import Path
 
 import numpy as np
 
-from darswin.data.calibrations import Calibrations, PictureLenses
-from darswin.data.scenes.classes import Classes, as_classes, read_palette
-from darswin.data.scenes.files import Pairs, pair, pictures_in, stems
-from darswin.data.scenes.lenses import OwnLenses
-from darswin.data.scenes.options import Options
-from darswin.data.scenes.scene import Scenes
-from darswin.data.scenes.targets import LABEL_SUFFIXES
+from darswin.data.cameras import Calibrations
+from darswin.data.scenes.files import Options, Pairs, pair, pictures_in, stems
+from darswin.data.scenes.scene import NO_CLASSES, Classes, Scenes, as_classes, read_palette
 from darswin.data.splits import Split, read_json
 
 NAMES = ["void", "road", "lanemarks", "curb", "person", "rider", "vehicles", "bicycle",
          "motorcycle", "traffic_sign"]  # fmt: skip
+SYN_NAMES = [
+    "unlabelled", "building", "fence", "other", "pedestrian", "pole", "road line", "road",
+    "sidewalk", "vegetation", "four-wheeler", "wall", "traffic sign", "sky", "ground", "bridge",
+    "rail track", "guard rail", "traffic light", "water", "terrain", "two-wheeler", "static",
+    "dynamic", "ego",
+]  # fmt: skip
 INFO = "seg_annotation_info.json"
 # Rows at the top and at the bottom that are green, of a picture so high.
 GREEN = (3, 966)
+SKY = 1000.0  # m
 
 
-def fits(root: Path) -> bool:
-    """Whether a folder holds WoodScape's pictures and labels, or calibrations."""
+def is_woodscape(root: Path) -> bool:
     beside = ("semantic_annotations", "calibration", "calibration_data")
     return (root / "rgb_images").is_dir() and any((root / name).is_dir() for name in beside)
 
 
-def open_split(root: Path, options: Options) -> Scenes:
+def is_synwoodscape(root: Path) -> bool:
+    """True for a folder that has depth maps, or nested pictures."""
+    pictures = root / "rgb_images"
+    return pictures.is_dir() and (
+        (root / "depth_maps").is_dir() or (pictures / "rgb_images").is_dir()
+    )
+
+
+def open_woodscape(root: Path, options: Options) -> Scenes:
     """A split; options and errors as `darswin.data.open_scenes`."""
     if options.target != "labels":
         raise ValueError(f"{root} is of WoodScape's form, which has labels, no distances")
-    annotations = unnested(root / "semantic_annotations")
-    targets = stems(annotations / "gtLabels", LABEL_SUFFIXES)
-    classes = classes_of(root, options, NAMES)
-    return scenes(root, options, targets, classes, trim=GREEN)
+    return _scenes(root, options, NAMES, trim=GREEN)
 
 
-def scenes(
+def open_synwoodscape(root: Path, options: Options) -> Scenes:
+    """A split; options and errors as `darswin.data.open_scenes`."""
+    return _scenes(root, options, SYN_NAMES, far=SKY if options.target == "distance" else None)
+
+
+def _scenes(
     root: Path,
     options: Options,
-    targets: dict[str, str],
-    classes: Classes,
+    names: list[str],
     *,
     trim: tuple[int, int] = (0, 1),
     far: float | None = None,
 ) -> Scenes:
-    """Scenes in `rgb_images/` with these targets and calibrations named after them."""
-    choice = options.choice(root, named={"heal-swin": heal_swin})
-    pictures = pictures_in(unnested(root / "rgb_images"))
-    pairs = pair(pictures, targets, choice, root=root, what=options.target)
+    """Scenes in `rgb_images/` with their targets and calibrations named after them."""
+    target = options.target
+    if target == "labels":
+        targets = stems(_unnested(root / "semantic_annotations") / "gtLabels", (".png",))
+        classes = _classes(root, options, names)
+    else:
+        targets = stems(_unnested(root / "depth_maps") / "raw_data", (".npy",))
+        classes = NO_CLASSES
+    pairs = pair(
+        pictures_in(_unnested(root / "rgb_images")),
+        targets,
+        lambda found: options.choose(found, root, named={"heal-swin": heal_swin}),
+        root=root,
+        what=target,
+    )
     return Scenes(
         root,
         list(pairs.values()),
-        _lenses(root, pairs, options),
-        target=options.target,
+        options.given_lens(root) or _lenses(root, pairs),
+        target=target,
         channels=options.channels,
-        classes=classes.names,
-        colors=classes.colors,
-        views=[view_of(stem) for stem in pairs],
+        classes=classes,
+        views=[_view_of(stem) for stem in pairs],
         trim=trim,
         far=far,
     )
@@ -85,18 +113,18 @@ def heal_swin(stems: list[str]) -> dict[Split, list[str]]:
     return {"train": shuffled[:count], "val": shuffled[count:]}
 
 
-def view_of(stem: str) -> str:
+def _view_of(stem: str) -> str:
     """The camera of NNNNN_VIEW: FV, RV, MVL or MVR."""
     return stem.rsplit("_", 1)[-1]
 
 
-def unnested(folder: Path) -> Path:
+def _unnested(folder: Path) -> Path:
     """A folder; or the one of its name in it, as some archives unpack."""
     inner = folder / folder.name
     return inner if inner.is_dir() else folder
 
 
-def classes_of(root: Path, options: Options, published: list[str]) -> Classes:
+def _classes(root: Path, options: Options, published: list[str]) -> Classes:
     """Those given, of the data set's own file, or as published."""
     if options.classes is not None:
         return read_palette(options.classes)
@@ -119,26 +147,24 @@ def _info(file: Path) -> Classes:
             f"{file}: class_indexes must be the ids 0 to {len(classes.names) - 1}, got {ids!r}"
         )
     order = sorted(range(len(ids)), key=ids.__getitem__)
-    turn = -1 if str(content.get("color_scheme")).lower() == "bgr" else 1
-    colors = [classes.colors[k][::turn] for k in order] if classes.colors else []
+    step = -1 if str(content.get("color_scheme")).lower() == "bgr" else 1
+    colors = [classes.colors[k][::step] for k in order] if classes.colors else []
     return Classes([classes.names[k] for k in order], colors)
 
 
-def _lenses(root: Path, pairs: Pairs, options: Options) -> PictureLenses:
+def _lenses(root: Path, pairs: Pairs) -> Calibrations:
     """The calibrations of the pictures, by their names, or else by their cameras'."""
-    if options.lens is not None:
-        return Calibrations(options.lens, root, options.camera, options.coefficients)
-    places = unnested(root / "calibration"), root / "calibration_data" / "calibration"
+    places = _unnested(root / "calibration"), root / "calibration_data" / "calibration"
     folder = next((place for place in places if place.is_dir()), None)
     if folder is None:
-        raise FileNotFoundError(f"no folder {places[0]} or {places[1]}: give the lens")
+        raise FileNotFoundError(f"no folder {places[0]} or {places[1]}: give `lens`")
     found = stems(folder, (".json",))
     files = {}
     for stem, (picture, _) in pairs.items():
-        file = found.get(stem) or found.get(view_of(stem))
+        file = found.get(stem) or found.get(_view_of(stem))
         if file is None:
             raise FileNotFoundError(
-                f"no lens for {root / picture}: add {folder / stem}.json, or give the lens"
+                f"no lens for {root / picture}: add {folder / stem}.json, or give `lens`"
             )
         files[root / picture] = Path(file)
-    return OwnLenses(files)
+    return Calibrations(None, files=files)

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-from darswin.data.scenes.targets import IGNORE, read_distance, read_labels
+from darswin.data.scenes.scene import IGNORE, read_distance, read_labels
 from darswin.utils.image import BrokenImageError
 
 LABELS = np.random.default_rng(0).integers(0, 4, size=(9, 13), dtype=np.uint8)

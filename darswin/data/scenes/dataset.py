@@ -1,23 +1,23 @@
 """A data set of scenes: images with their lenses, and a label or a distance for each pixel."""
 
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from darswin.data.lenses import LensDistribution
-from darswin.data.reframing import Crop, part, resized, through, turned
+from darswin.data.lens_distributions import LensDistribution
+from darswin.data.reframing import Crop, part, resize_scene, turn_scene, warp_scene
 from darswin.data.samples import Draw, Samples
-from darswin.data.scenes.scene import Scene, Scenes
-from darswin.data.scenes.targets import IGNORE
+from darswin.data.scenes.scene import IGNORE, Scene, Scenes
+from darswin.data.warp import picture_size
 from darswin.lens import Lens
 
 # Of a drawn lens's own limit, where its curve may have no end: how far it is used.
 _USED = 0.95
 
 
-class DenseSamples(Samples):
+class SceneSamples(Samples):
     """Scenes at a size: `dataset[i]` is (image, lens, target), which move together.
 
     The target is labels, (size, size) int64 with `IGNORE`, or distances along the ray, (size, size)
@@ -26,14 +26,13 @@ class DenseSamples(Samples):
 
     Args:
         scenes: the pictures, their targets and lenses.
-        fit: how a picture becomes a square: "crop" cuts its longer side, "stretch" squashes it;
-            the lens follows exactly.
         crop: the least share of a picture's side that a random part of it has, in (0, 1]; the lens
             follows, its principal point moves off the middle. None takes no parts.
         lenses: a distribution of lenses. Each picture is shown as one drawn from it would have seen
             it, of the same θ_max where that lens can have it, whose circle touches the image's
-            sides; `fit` then has no effect.
-        options: size, mean, std, turns, augment, erase, seed and skip_broken, as `Samples`.
+            sides; `framing` then has no effect.
+        options: size, framing, mean, std, turns, augment, erase, seed and skip_broken, as
+            `Calibrated` takes them.
 
     Raises:
         ValueError: a share out of range; from `dataset[i]`, as `Scenes`.
@@ -44,17 +43,14 @@ class DenseSamples(Samples):
         self,
         scenes: Scenes,
         *,
-        fit: Literal["crop", "stretch"] = "crop",
         crop: float | None = None,
         lenses: LensDistribution | None = None,
         **options: Any,
     ):
-        if fit not in ("crop", "stretch"):
-            raise ValueError(f"fit must be 'crop' or 'stretch', got {fit!r}")
         if crop is not None and not 0 < crop <= 1:
-            raise ValueError(f"crop must be a share in (0, 1], got {crop}")
+            raise ValueError(f"`crop` must be a share in (0, 1], got {crop}")
         super().__init__(scenes, **options)
-        self.scenes, self.fit, self.crop, self.lenses = scenes, fit, crop, lenses
+        self.scenes, self.crop, self.lenses = scenes, crop, lenses
 
     @property
     def cameras(self) -> np.ndarray:
@@ -69,12 +65,12 @@ class DenseSamples(Samples):
     def _reframed(self, scene: Scene, draw: Draw) -> Scene:
         turn, crop = self._turn(draw), self._crop(draw)
         if self.lenses is not None:
-            return through(scene, self._drawn(draw, scene.lens, crop), self.size, turn)
+            return warp_scene(scene, self._drawn(draw, scene.lens, crop), self.size, turn)
         height, width = scene.target.shape
-        taken = part((height, width), self.fit, crop)
+        taken = part((height, width), self.framing, crop)
         if turn is not None and turn.angle:
-            return turned(scene, turn, taken, self.size)
-        return resized(scene, taken, self.size, turn is not None and turn.mirrored)
+            return turn_scene(scene, turn, taken, self.size)
+        return resize_scene(scene, taken, self.size, turn is not None and turn.mirrored)
 
     def _crop(self, draw: Draw) -> Crop | None:
         if self.crop is None:
@@ -103,9 +99,8 @@ class DenseSamples(Samples):
         own = self.scenes.lens_alone(draw.picture)
         if self.lenses is not None:
             return self._drawn(draw, own, self._crop(draw))
-        assert own.image_size is not None
-        height, width = (round(side) for side in own.image_size[0].tolist())
-        return own.cropped(*part((height, width), self.fit, None)).resized((self.size, self.size))
+        taken = part(picture_size(own), self.framing, None)
+        return own.cropped(*taken).resized((self.size, self.size))
 
     def _unknown(self) -> Tensor:
         shape = self.size, self.size

@@ -1,4 +1,4 @@
-"""Which images come when: the order of training, for any number of processes, and resumable."""
+"""The order of images in training, for any number of processes, which a checkpoint brings back."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -21,7 +21,7 @@ class TrainingOrder(Sampler[Draw]):
         count: of images. batch: of one process; even unless world is 1. rank, world: of processes.
         pairs: partners share their lens, so that a mixture is an image through one lens.
         seed: of the shuffle.
-        cameras: (count,), what took each image, if cameras did: with `pairs`, partners are of one
+        cameras: (count,), the camera of each image, or None: with `pairs`, partners are of one
             camera, but for those that are left over.
     """
 
@@ -61,7 +61,7 @@ class TrainingOrder(Sampler[Draw]):
         self._resume = (epoch, done)
 
     def shuffle(self) -> list[int]:
-        """What the order depends on: the pictures, the global batch and the seed."""
+        """All that the order depends on: the pictures, the global batch and the seed."""
         return [self.count, self.batch * self.world, self.seed]
 
     def done(self) -> int:
@@ -124,7 +124,7 @@ class EveryNth(Sampler[int]):
 
 
 class ResumableLoader(DataLoader):
-    """A DataLoader over `TrainingOrder` that a checkpoint in the middle of an epoch brings back."""
+    """A DataLoader over a `TrainingOrder` that goes on in the middle of an epoch."""
 
     def __init__(self, dataset: Dataset, order: TrainingOrder, **options: Any):
         super().__init__(dataset, order.batch, sampler=order, drop_last=True, **options)
@@ -138,7 +138,7 @@ class ResumableLoader(DataLoader):
             yield batch
 
     def state_dict(self) -> dict[str, Any]:
-        """Which epoch it is, how many of its batches have been handed out, and of what."""
+        """The epoch, the number of its batches that were handed out, and the shuffle."""
         order = self._order
         return {"epoch": order.epoch, "done": self._done, "shuffle": order.shuffle()}
 

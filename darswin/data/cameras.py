@@ -1,0 +1,265 @@
+"""The lens of each picture: one calibration for all, a lenses.json, or a file for each picture."""
+
+import json
+import os
+import re
+from collections.abc import Hashable, Iterator, Mapping, Sequence
+from pathlib import Path, PurePosixPath
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from darswin.lens import Lens
+from darswin.lens.curves import as_curves, form_of
+from darswin.lens.files.load import FORMATS, Calibration
+from darswin.lens.orientation import in_upright_picture, stored_size
+
+_ALL = PurePosixPath(".")
+_NOMINAL = (1024, 1024)  # px, for a calibration without a size where no picture has one
+# What names a lens model in any format; other words in a file say nothing of its lens's form.
+_SAYS_MODEL = re.compile("model|distortion")
+_KEPT = 8192  # lenses in memory
+
+
+class PictureCamera(NamedTuple):
+    """A camera that took pictures.
+
+    Attributes: calibration: a file, or a description as JSON; camera: which of the file's;
+    name: for errors; coefficients: as `Calibrations` has them.
+    """
+
+    calibration: str
+    camera: str | None
+    name: str
+    coefficients: str | None = None
+
+    def lens(self, size: tuple[int, int]) -> Lens:
+        """Its lens; `size` (H, W) is of pictures as stored, for a calibration without one."""
+        if is_json(self.calibration):
+            calibration = Calibration(self.calibration, self.name, self.coefficients)
+        else:
+            calibration = Calibration.read(self.calibration, self.coefficients)
+        lens = calibration.lens(self.camera, image_size=size)
+        # All lenses have a center, so that they can be joined.
+        return lens if lens.center is not None else lens.replace(center=lens.center_in())
+
+
+class Calibrations:
+    """The lenses of pictures, by their files.
+
+    Args:
+        lens: the cameras that took them:
+
+            - a calibration file, of any format that `darswin.lens.load` reads: all pictures;
+            - a lens as JSON, as `darswin.lens.from_dict` takes it: all pictures;
+            - a `lenses.json`: a JSON object from folders and pictures, relative to `root`, to
+              their cameras; "." is all, and the most specific counts. A camera is a calibration
+              file's path, relative to the lenses.json, or {"file": path, "camera": name,
+              "coefficients": what they are}, of which the last two may be left out, or a lens as
+              above;
+            - None, if `files` has a calibration for every picture.
+        root: the folder of the pictures.
+        camera: which, of one calibration of several cameras.
+        coefficients: "fisheye", "pinhole" or "omnidir": what they are, in a calibration that does
+            not say it; the `model` of `darswin.lens.load`.
+        files: pictures and their own calibration files, which count before `lens`. Each is read
+            when its picture is; in JSON where there are many.
+
+    Raises:
+        ValueError: what is no lens, or lenses that cannot be joined, by name. FileNotFoundError: a
+            file that is missing.
+    """
+
+    def __init__(
+        self,
+        lens: str | Path | None,
+        root: str | Path = ".",
+        camera: str | None = None,
+        coefficients: str | None = None,
+        *,
+        files: Mapping[Path, Path] | None = None,
+    ):
+        self._root = os.path.abspath(root)
+        self._lens, self._coefficients = lens, coefficients
+        self._files = {str(picture): str(file) for picture, file in (files or {}).items()}
+        self._places = {} if lens is None else _places(lens, Path(root), camera, coefficients)
+        # Early, so that what is no lens is said before any work.
+        self._as_curves = _are_curves([*self._own_examples(), *self._shared()])
+        self._lenses: dict[tuple, Lens] = {}
+
+    @property
+    def cameras(self) -> list[PictureCamera]:
+        """The different cameras: those of `files`, then those of `lens`."""
+        return [*map(self._own, dict.fromkeys(self._files.values())), *self._shared()]
+
+    def camera_of(self, picture: str | Path | None) -> PictureCamera:
+        """The camera that took a picture; None is a picture without a file of its own.
+
+        Raises:
+            ValueError: a picture that has no lens.
+        """
+        if (own := self._files.get(str(picture))) is not None:
+            return self._own(own)
+        key, file = _ALL, Path(os.path.abspath(picture or self._root))
+        if file.is_relative_to(self._root):
+            key = PurePosixPath(file.relative_to(self._root).as_posix())
+        for place in (key, *key.parents):
+            if place in self._places:
+                return self._places[place]
+        pictures = picture or "pictures without a file"
+        if self._lens is None:
+            raise ValueError(f"no calibration file for {pictures}")
+        raise ValueError(f'{self._lens} has no lens for {pictures}: an entry "." is of all')
+
+    def cameras_of(self, pictures: Sequence[str | Path | None]) -> np.ndarray:
+        """(N,): the number of each picture's camera in `cameras`; errors as `camera_of`."""
+        number = {camera: k for k, camera in enumerate(self.cameras)}
+        return np.array([number[self.camera_of(picture)] for picture in pictures], np.int64)
+
+    def lens_of(
+        self, picture: str | Path | None, size: tuple[int, int], orientation: int = 1
+    ) -> Lens:
+        """The lens in an upright picture.
+
+        Args:
+            picture: its file. size: (H, W), upright. orientation: the EXIF's that it was turned
+                from, 1 to 8.
+
+        Returns:
+            One lens with a center and this image_size.
+
+        Raises:
+            ValueError: as `darswin.lens.load`; a picture of another shape than the calibration's.
+        """
+        camera = self.camera_of(picture)
+        key = camera, tuple(size), orientation
+        if key not in self._lenses:
+            stored = stored_size(size, orientation)
+            try:
+                lens = in_upright_picture(camera.lens(stored), size, orientation)
+            except ValueError as error:
+                of = f"{picture}: " if picture is not None else ""
+                raise ValueError(f"{of}{error} ({camera.name})") from error
+            if len(self._lenses) >= _KEPT:
+                self._lenses.clear()
+            self._lenses[key] = self._form(lens)
+        return self._lenses[key]
+
+    def lens_alone(self, picture: str | Path | None) -> Lens:
+        """The lens of a picture that cannot be read: in one of the size that it was made for."""
+        return self._form(self.camera_of(picture).lens(_NOMINAL))
+
+    def _form(self, lens: Lens) -> Lens:
+        return as_curves(lens) if self._as_curves else lens
+
+    def _own(self, file: str) -> PictureCamera:
+        return PictureCamera(file, None, file, self._coefficients)
+
+    def _shared(self) -> list[PictureCamera]:
+        return list(dict.fromkeys(self._places.values()))
+
+    def _own_examples(self) -> Iterator[PictureCamera]:
+        """One of the pictures' files for all those that differ from it in numbers alone."""
+        seen: set[Hashable] = set()
+        for file in dict.fromkeys(self._files.values()):
+            form = _form(_content(file)) if file.endswith(".json") else file
+            if form not in seen:
+                seen.add(form)
+                yield self._own(file)
+
+
+def is_json(lens: str | Path) -> bool:
+    """True for a lens as JSON, False for a file."""
+    return str(lens).lstrip().startswith("{")
+
+
+def _places(
+    lens: str | Path, root: Path, camera: str | None, coefficients: str | None
+) -> dict[PurePosixPath, PictureCamera]:
+    """The cameras of folders and pictures; the arguments are those of `Calibrations`."""
+    name = "of the lens" if is_json(lens) else str(lens)
+    entries = None if is_json(lens) else _entries(Path(lens))
+    if entries is None:
+        return {_ALL: PictureCamera(str(lens), camera, name, coefficients)}
+    options = {"camera": camera, "coefficients": coefficients}
+    if given := {key: value for key, value in options.items() if value is not None}:
+        raise ValueError(
+            f"`{next(iter(given))}` is of one calibration file, and {lens} lists several; write "
+            f'there {{"file": …, {json.dumps(given)[1:]}'
+        )
+    if not entries:
+        raise ValueError(f"{lens} must give the lenses of the pictures, but is empty")
+    cameras: dict[PurePosixPath, PictureCamera] = {}
+    for place, value in entries.items():
+        key = PurePosixPath(place)
+        about = f"{lens}: {json.dumps(place, ensure_ascii=False)}"
+        if key.is_absolute() or ".." in key.parts or (key != _ALL and not (root / key).exists()):
+            raise ValueError(
+                f"{about} must name a folder or a picture in {root}, and there is none"
+            )
+        if key in cameras:
+            raise ValueError(f"{about} is there twice")
+        cameras[key] = _camera(Path(lens), about, value)
+    return cameras
+
+
+def _entries(path: Path) -> Mapping[str, Any] | None:
+    """The entries of a lenses.json; None for a calibration file, and for what is no JSON object."""
+    try:
+        content = json.loads(path.read_bytes())
+    except ValueError:
+        return None
+    if not isinstance(content, dict) or any(f.fits(content) for f in FORMATS):
+        return None
+    return content
+
+
+def _camera(file: Path, about: str, value: Any) -> PictureCamera:
+    """The camera of an entry."""
+    if isinstance(value, dict) and "model" in value:
+        return PictureCamera(json.dumps(value), None, f"in {about}")
+    given = {"file": value} if isinstance(value, str) else value
+    known = isinstance(given, dict) and given.keys() <= {"file", "camera", "coefficients"}
+    if not known or not isinstance(given.get("file"), str):
+        raise ValueError(
+            f'{about} must be a calibration file, {{"file": …, "camera": …, "coefficients": …}} '
+            f'or a lens, {{"model": …}}, got {json.dumps(value, ensure_ascii=False)}'
+        )
+    calibration, camera = file.parent / given["file"], given.get("camera")
+    if not calibration.is_file():
+        raise FileNotFoundError(f"{about} names the calibration {calibration}, which is no file")
+    name = str(calibration) if camera is None else f"camera {camera} of {calibration}"
+    camera, model = (None if x is None else str(x) for x in (camera, given.get("coefficients")))
+    return PictureCamera(str(calibration), camera, name, model)
+
+
+def _are_curves(cameras: Sequence[PictureCamera]) -> bool:
+    """True if the cameras' lenses can be joined only as curves; ValueError if not even so."""
+    lenses = [camera.lens(_NOMINAL) for camera in cameras]
+    if len({form_of(lens) for lens in lenses}) == 1:
+        return False
+    for camera, lens in zip(cameras, lenses, strict=True):
+        if not lens.is_radial:
+            raise ValueError(
+                f"{camera.name}: cameras of several lens models are joined as curves, and this "
+                "one's tangential or thin-prism terms have none; leave those terms out of it, or "
+                "take cameras of one model"
+            )
+    return True
+
+
+def _content(file: str) -> Any:
+    try:
+        return json.loads(Path(file).read_bytes())
+    except ValueError as error:
+        raise ValueError(f"calibration {file}: it is no JSON: {error}") from error
+
+
+def _form(value: Any, name: str = "") -> Hashable:
+    """The content of a calibration file without its numbers."""
+    if isinstance(value, dict):
+        return frozenset((key, _form(entry, key)) for key, entry in value.items())
+    if isinstance(value, list):
+        nested = [_form(entry) for entry in value if isinstance(entry, dict | list)]
+        return len(value), *nested
+    return value if isinstance(value, str) and _SAYS_MODEL.search(name) else None

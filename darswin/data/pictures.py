@@ -1,0 +1,206 @@
+"""Pictures with a label each: folders of images, IDX files and scikit-learn's digits."""
+
+import gzip
+import math
+import os
+import zlib
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from darswin.data.folders import class_of, open_folder
+from darswin.data.splits import SPLITS, Limited, Split, check_split, hold_out, read_classes
+from darswin.utils.image import read_image, read_oriented, with_channels
+
+
+class Source(Limited):
+    """A sequence of pictures: `source[i]` is (image (H, W, C) uint8, label).
+
+    Attributes: classes: the names behind the labels; labels: (N,); channels: 3 or 1.
+    """
+
+    def __init__(self, labels: np.ndarray, classes: Sequence[str], channels: int):
+        self.labels, self.classes, self.channels = labels, list(classes), channels
+
+    def __len__(self) -> int:
+        return len(self.labels)
+
+    def __getitem__(self, index: int) -> tuple[np.ndarray, int]:
+        """The image and its label; BrokenImageError names a file that is none."""
+        raise NotImplementedError
+
+    def oriented(self, index: int) -> tuple[np.ndarray, int, int]:
+        """The image, its label, and the EXIF orientation that it was turned upright from."""
+        return *self[index], 1
+
+    def file(self, index: int) -> Path | None:
+        """The image's own file, if it has one."""
+        return None
+
+
+class ImageFiles(Source):
+    """Picture files in `root`, given as (path, label) pairs."""
+
+    PER_PICTURE = ("labels", "paths")
+
+    def __init__(
+        self,
+        root: Path,
+        files: Sequence[tuple[str, int]],
+        classes: Sequence[str],
+        channels: int = 3,
+    ):
+        super().__init__(np.array([label for _, label in files], np.int64), classes, channels)
+        self.root = Path(root)
+        # As arrays, so that worker processes share them instead of copying a million objects.
+        self.paths = np.array([os.fsencode(path) for path, _ in files], dtype=np.bytes_)
+
+    def __getitem__(self, index: int) -> tuple[np.ndarray, int]:
+        return read_image(self.file(index), self.channels), int(self.labels[index])
+
+    def oriented(self, index: int) -> tuple[np.ndarray, int, int]:
+        image, orientation = read_oriented(self.file(index), self.channels)
+        return image, int(self.labels[index]), orientation
+
+    def file(self, index: int) -> Path:
+        return self.root / os.fsdecode(self.paths[index])
+
+
+class Arrays(Source):
+    """Images in memory: (N, H, W) or (N, H, W, C) uint8, and their labels (N,)."""
+
+    PER_PICTURE = ("labels", "images")
+
+    def __init__(
+        self, images: np.ndarray, labels: np.ndarray, classes: Sequence[str], channels: int = 3
+    ):
+        if len(images) != len(labels):
+            raise ValueError(f"there are {len(images)} images and {len(labels)} labels")
+        super().__init__(labels, classes, channels)
+        self.images = images if images.ndim == 4 else images[..., None]
+
+    def __getitem__(self, index: int) -> tuple[np.ndarray, int]:
+        return with_channels(self.images[index], self.channels), int(self.labels[index])
+
+
+def open_source(
+    path: str | Path,
+    split: Split,
+    *,
+    channels: int = 3,
+    classes: str | Path | None = None,
+    splits: str | Path | None = None,
+    holdout: float = 0.1,
+) -> Source:
+    """The pictures of one split of a data set: `source[i]` is (image (H, W, C) uint8, label).
+
+    What `path` may be:
+
+    - "digits": scikit-learn's 1797 scanned digits of 8×8 pixels;
+    - a folder of IDX files, the MNIST family: `train-images-idx3-ubyte[.gz]` and its three
+      companions. "test" is its test set, "val" the last `holdout` of its training set;
+    - a folder of images, one folder a class; or `train/`, `val/` (also `valid/`, `validation/`)
+      and `test/` folders of that kind. Links to folders are followed, hidden ones left out.
+
+    Without a test set, "val" serves as one. What has neither, or no "val", gets `holdout` of each
+    class of "train" for each, chosen by a hash of their names; at least one is left to train on.
+    Pictures that are in no split are named in `LeftOut` warnings.
+
+    Args:
+        channels: 3 or 1, of the images that come out.
+        classes: a list of class names, as a text file with one a line or a JSON list: which
+            folders to take and in which order. For IDX files and digits, the labels' names.
+        splits: a JSON file `{"train": ["class/a.jpg", …], "val": …, "test": …}` with paths relative
+            to `path`, or a folder of `train.txt`, `val.txt`, `test.txt` with one path a line. The
+            first folder of a path is its class. A split without a list is held out.
+        holdout: a share, in [0, 0.5).
+
+    Raises:
+        FileNotFoundError: no such folder, or nothing in it. ValueError: folders whose meaning is
+            not clear, and lists that do not fit them; it names them.
+    """
+    check_split(split, SPLITS, holdout)
+    names = None if classes is None else read_classes(classes)
+    root = Path(path)
+    in_memory = str(path) == "digits" or _idx_file(root, "train-images-idx3-ubyte") is not None
+    if in_memory and splits is not None:
+        raise ValueError(f"`splits` is for folders of images, and {path} is none")
+    if not in_memory and not root.is_dir():
+        raise FileNotFoundError(f"no folder {root}")
+    source: Source
+    if str(path) == "digits":
+        source = _digits(split, channels, names, holdout)
+    elif in_memory:
+        source = _idx(root, split, channels, names, holdout)
+    else:
+        (folder, paths), names = open_folder(root, split, names, splits, holdout)
+        label = {name: k for k, name in enumerate(names)}
+        source = ImageFiles(folder, [(p, label[class_of(p)]) for p in paths], names, channels)
+    if not len(source):
+        raise FileNotFoundError(
+            f"no images for the {split!r} split of {path}: `holdout` {holdout:g} leaves none for it"
+        )
+    return source
+
+
+def _digits(split: Split, channels: int, names: list[str] | None, holdout: float) -> Arrays:
+    """scikit-learn's 1797 scanned digits of 8×8 pixels."""
+    from sklearn.datasets import load_digits
+
+    digits = load_digits()
+    labels = digits.target.tolist()
+    keys = [str(k) for k in range(len(labels))]
+    part = hold_out(labels, keys, holdout, ("test", "val"))[split]
+    images = np.round(digits.images[part] * (255 / 16)).astype(np.uint8)
+    return Arrays(images, digits.target[part], names or [str(k) for k in range(10)], channels)
+
+
+# -- IDX files, the MNIST family --------------------------------------------------------------
+
+
+def _idx(
+    root: Path, split: Split, channels: int, names: list[str] | None, holdout: float
+) -> Arrays:
+    labels = _idx_array(root, "train-labels-idx1-ubyte")
+    names = names or [str(k) for k in range(int(labels.max(initial=0)) + 1)]
+    if split == "test":
+        images = _idx_array(root, "t10k-images-idx3-ubyte")
+        labels = _idx_array(root, "t10k-labels-idx1-ubyte")
+    else:
+        images = _idx_array(root, "train-images-idx3-ubyte")
+        kept = len(images) - math.ceil(holdout * len(images))
+        part = slice(kept) if split == "train" else slice(kept, None)
+        images, labels = images[part], labels[part]
+    if (last := int(labels.max(initial=0))) >= len(names):
+        raise ValueError(
+            f"{root} has labels up to {last} for the {split!r} split, but its classes are {names}"
+        )
+    return Arrays(images, labels, names, channels)
+
+
+def _idx_array(root: Path, name: str) -> np.ndarray:
+    file = _idx_file(root, name)
+    if file is None:
+        raise FileNotFoundError(f"no {name} or .gz in {root}")
+    return read_idx(file)
+
+
+def _idx_file(root: Path, name: str) -> Path | None:
+    return next((p for p in (root / name, root / f"{name}.gz") if p.exists()), None)
+
+
+def read_idx(path: Path) -> np.ndarray:
+    """A file of unsigned bytes in the IDX format, gzipped or not; ValueError where it is none."""
+    try:
+        with gzip.open(path) if path.suffix == ".gz" else path.open("rb") as file:
+            head = file.read(4)
+            if len(head) != 4 or head[:3] != b"\0\0\x08" or not 1 <= head[3] <= 4:
+                raise ValueError(f"{path} is no IDX file of unsigned bytes")
+            sizes = np.frombuffer(file.read(4 * head[3]), ">u4")
+            data = np.frombuffer(file.read(), np.uint8)
+    except (EOFError, gzip.BadGzipFile, zlib.error) as error:
+        raise ValueError(f"{path} is no whole gzip file: {error}") from error
+    if len(sizes) != head[3] or data.size != math.prod(sizes.tolist()):
+        raise ValueError(f"{path} says it holds {sizes.tolist()} bytes, but holds {data.size}")
+    return data.reshape(sizes)
