@@ -11,8 +11,7 @@ if TYPE_CHECKING:
     from darswin import compat, lens, models, ops
     from darswin.deploy.optimize import optimize
     from darswin.layers.attention import PolarWindowAttention
-    from darswin.layers.grid import PolarGrid, polar_grid
-    from darswin.layers.sampling import PolarSample
+    from darswin.layers.polar import PolarGrid, PolarSample, polar_grid
     from darswin.models import DarSwin, create_model, list_models
 
     __version__: str
@@ -35,13 +34,13 @@ __all__ = [
 # The module of each public name that is no module.
 _MODULES = {
     "DarSwin": "darswin.models",
-    "PolarGrid": "darswin.layers.grid",
-    "PolarSample": "darswin.layers.sampling",
+    "PolarGrid": "darswin.layers.polar",
+    "PolarSample": "darswin.layers.polar",
     "PolarWindowAttention": "darswin.layers.attention",
     "create_model": "darswin.models",
     "list_models": "darswin.models",
     "optimize": "darswin.deploy.optimize",
-    "polar_grid": "darswin.layers.grid",
+    "polar_grid": "darswin.layers.polar",
 }
 
 

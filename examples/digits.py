@@ -28,7 +28,7 @@ from tqdm import tqdm
 from darswin import create_model, lens
 from darswin.data import LEVELS, warp_map
 from darswin.data.warp import remap
-from darswin.layers.sampling import PolarSample
+from darswin.layers.polar import PolarSample
 from darswin.models import ModelCard, save_model
 from darswin.models.encoder import Encoder
 from darswin.utils.files import replace_file

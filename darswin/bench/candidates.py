@@ -29,8 +29,8 @@ from darswin.layers.quantized import QuantizedLinear, quantize
 from darswin.lens import Lens, Spherical
 from darswin.models import create_model
 from darswin.models.base import Model
-from darswin.models.dense import DenseModel
-from darswin.models.registry import model_class
+from darswin.models.registry import has_image_size, model_class
+from darswin.models.unet import Unet
 from darswin.ops import use_reference
 
 Run = Callable[[], Tensor]
@@ -45,9 +45,8 @@ def lens_of(size: int) -> Lens:
 def network(name: str, size: int) -> Model:
     """A model of random weights, the same at every call."""
     torch.manual_seed(0)
-    kind = model_class(name)
-    options: dict[str, Any] = {} if kind.image_size is None else dict(image_size=size)
-    classes = PIXEL_CLASSES if issubclass(kind, DenseModel) else CLASSES
+    options: dict[str, Any] = dict(image_size=size) if has_image_size(name) else {}
+    classes = PIXEL_CLASSES if issubclass(model_class(name), Unet) else CLASSES
     return create_model(name, num_classes=classes, **options)
 
 
@@ -198,7 +197,7 @@ def training_step(name: str, size: int, dtype: torch.dtype, batch: int, *, refer
         model.set_grad_checkpointing(True)
     optimizer = torch.optim.AdamW(model.parameters(), lr=1e-4, fused=True)
     images = torch.randn(batch, 3, size, size)
-    pixels = (size, size) if isinstance(model, DenseModel) else ()
+    pixels = (size, size) if isinstance(model, Unet) else ()
     labels = torch.randint(model.num_classes, (batch, *pixels))
 
     def step() -> Tensor:

@@ -11,9 +11,9 @@ from darswin.data.warp import Framing, at_size
 from darswin.deploy.optimize import optimize
 from darswin.lens import Lens
 from darswin.models.base import Model
-from darswin.models.dense import DenseModel
 from darswin.models.encoder import Encoder, Prepared
 from darswin.models.saving import ModelCard
+from darswin.models.unet import Unet
 
 Net = TypeVar("Net", bound=Model)
 
@@ -44,7 +44,7 @@ class Answers:
         model: of `create_model`, or what `optimize` makes of one. card: as `load_model` gives it.
     """
 
-    def __init__(self, model: Encoder | DenseModel, card: ModelCard):
+    def __init__(self, model: Encoder | Unet, card: ModelCard):
         self.model, self.card = model, card
         self.found: list[dict[str, Any]] = []
         self.seconds = 0.0
@@ -130,8 +130,7 @@ class ClassAnswers(Answers):
 
     def ask(self, images: Tensor, prepared: Prepared) -> Tensor:
         """The probabilities of all classes, (B, K)."""
-        features = self.model.norm(self.model.run(images, prepared)[-1])
-        return self.model.forward_head(features).softmax(-1)
+        return self.model.run(images, prepared).softmax(-1)
 
     def answer(self, asked: Asked, said: Tensor, look: Any) -> dict[str, Any]:
         """The most probable classes."""

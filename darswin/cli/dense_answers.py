@@ -17,8 +17,8 @@ from darswin.cli.answers import Answers, Asked, fast, fit_of
 from darswin.data.scenes.scene import IGNORE, PER_METRE
 from darswin.data.warp import FullSize
 from darswin.lens import Lens
-from darswin.models.dense import DenseModel, DensePrepared
 from darswin.models.saving import ModelCard
+from darswin.models.unet import Unet, UnetPrepared
 from darswin.utils.files import replace_file
 from darswin.viz.dense import (
     UNKNOWN,
@@ -46,9 +46,9 @@ class DenseAnswers(Answers):
     """
 
     kind: str  # of the answers, and the name of their folder
-    model: DenseModel
+    model: Unet
 
-    def __init__(self, model: DenseModel, card: ModelCard, out: Path, names: Mapping[str, str]):
+    def __init__(self, model: Unet, card: ModelCard, out: Path, names: Mapping[str, str]):
         super().__init__(fast(model, card), card)
         self.out, self.names = out, names
 
@@ -60,7 +60,7 @@ class DenseAnswers(Answers):
         """Whether it is finite in the pixels that a ray reaches."""
         return bool(said[:, torch.from_numpy(look.reached)].isfinite().all())
 
-    def ask(self, images: Tensor, prepared: DensePrepared) -> Tensor:
+    def ask(self, images: Tensor, prepared: UnetPrepared) -> Tensor:
         """What the network says of each pixel, (B, K, h, w)."""
         return self.model.run(images, prepared)
 
@@ -93,7 +93,7 @@ class LabelAnswers(DenseAnswers):
 
     kind = "labels"
 
-    def __init__(self, model: DenseModel, card: ModelCard, out: Path, names: Mapping[str, str]):
+    def __init__(self, model: Unet, card: ModelCard, out: Path, names: Mapping[str, str]):
         super().__init__(model, card, out, names)
         if model.num_classes > IGNORE:
             raise ValueError(f"labels of 8 bits are for {IGNORE} classes, got {model.num_classes}")
@@ -119,7 +119,7 @@ class DistanceAnswers(DenseAnswers):
 
     kind = "distance"
 
-    def __init__(self, model: DenseModel, card: ModelCard, out: Path, names: Mapping[str, str]):
+    def __init__(self, model: Unet, card: ModelCard, out: Path, names: Mapping[str, str]):
         super().__init__(model, card, out, names)
         self._range: tuple[Any, tuple[float, float]] = (None, (1.0, 2.0))
 

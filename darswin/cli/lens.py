@@ -7,7 +7,7 @@ import torch
 
 import darswin.lens
 from darswin.cli.arguments import run_command
-from darswin.layers.sampling import PolarSample
+from darswin.layers.polar import PolarSample
 from darswin.lens.base import Lens
 from darswin.lens.files.load import Calibration, reach
 from darswin.lens.files.opencv import Coefficients

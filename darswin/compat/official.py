@@ -1,17 +1,205 @@
-"""The authors' released DarSwin."""
+"""The authors' released DarSwin-A: all that it does otherwise than the paper, and its weights.
 
+Rings and samples equal in tan θ with both borders sampled, azimuth 0 pointing down and running
+counterclockwise, radii scaled as align_corners=True does, the field of view of image 0 for the
+whole batch, tan θ_max as the angle of the bias, a seam in the azimuth, and other shifts.
+"""
+
+import dataclasses
+import math
 import os
 import warnings
 from collections.abc import Mapping
+from typing import Any
 
-from torch import Tensor
+import torch
+from torch import Tensor, nn
 
 from darswin.compat.checkpoint import count_blocks, read_state, refused
+from darswin.layers.attention import PolarWindowAttention
+from darswin.layers.polar import PolarGrid, PolarGridSpec, check_lens
+from darswin.lens import Lens, Number, Spherical
+from darswin.lens.parameter import Parameter
+from darswin.lens.spacing import check_tan
 from darswin.models.darswin import DarSwin
+from darswin.models.encoder import Prepared
+from darswin.models.stages import Pair, StagePlan
+
+__all__ = ["OfficialDarSwin", "OfficialPolynomial", "load_official"]
+
+
+class OfficialPolynomial(Lens, register=False):
+    """The released code's polynomial lens, an angle as a function of the radius.
+
+    θ(x) = x (d₁ + d₂ x + d₃ x² + d₄ x³) with x = r / radius in [0, 1], inverted on a table of 50
+    points, straight between them. θ(1) is θ_max, in units of its own: it need not be an angle.
+
+    Args:
+        coefficients: (4,) or (N, 4): d₁ … d₄, such that θ rises.
+        radius: px, of the image circle: half the image's side.
+    """
+
+    coefficients = Parameter(shape=(4,))
+    radius = Parameter(low=0, open=True, in_pixels=True)
+
+    def _validate(self) -> None:
+        self._require(
+            "coefficients", (self._table()[1].diff(dim=1) > 0).all(1), "such that θ rises"
+        )
+
+    @property
+    def theta_limit(self) -> Tensor:
+        return self.coefficients.detach().sum(1)
+
+    def _angle(self, x: Tensor) -> Tensor:
+        columns = self.coefficients.reshape(*self.coefficients.shape, *(1,) * (x.dim() - 1))
+        terms = (column * x**power for power, column in enumerate(columns.unbind(1), start=1))
+        return sum(terms, torch.zeros_like(x))
+
+    def _table(self) -> tuple[Tensor, Tensor]:
+        """x (50,) and its θ (N, 50)."""
+        like = self.coefficients
+        x = torch.linspace(0, 1, 50, dtype=like.dtype, device=like.device)
+        return x, self._angle(x[None])
+
+    def project(self, theta: Number) -> Tensor:
+        theta, radius = self._aligned(theta, "radius")
+        x, angles = self._table()
+        angle, radius = torch.broadcast_tensors(theta, radius)
+        flat = angle.reshape(len(self), -1)
+        above = torch.searchsorted(angles.contiguous(), flat.contiguous(), right=True)
+        above = above.clamp(1, len(x) - 1)
+        low, high = angles.gather(1, above - 1), angles.gather(1, above)
+        fraction = (flat - low) / (high - low)
+        rho = x[above - 1] + fraction * (x[above] - x[above - 1])
+        return rho.reshape(angle.shape) * radius
+
+    def _angle_at(self, radius: Tensor) -> Tensor:
+        radius, full = self._aligned(radius, "radius")
+        return self._angle(radius / full)
+
+
+class OfficialDarSwin(DarSwin):
+    """The authors' released DarSwin-A; `create_model(name, compat="official")` makes it too.
+
+    Args: as `DarSwin`, but for spacing, sample_spacing, placement and jitter, which are given.
+
+    Raises:
+        ValueError: as `DarSwin`; variant "RA" or `merges`, which the released code does not have;
+            in forward, images that are not square, or lenses that are not radial.
+    """
+
+    square_images = True
+
+    def __init__(self, *arguments: Any, **options: Any):
+        if options.get("variant", "A") != "A" or options.get("merges") is not None:
+            raise ValueError("the released DarSwin has variant 'A' and merges of its own")
+        grid = dict(spacing="tan", sample_spacing="tan", placement="edges", jitter=0.0)
+        super().__init__(*arguments, **(options | grid))
+
+    def _plan(self, plan: StagePlan, window: Pair) -> StagePlan:
+        shift = (window[0], window[1] // 4)
+        if plan.map_size[1] < 4:
+            shift = shift[::-1]
+        # Rolling by whole windows of one token, or once around, moves nothing.
+        along_r, along_phi = (
+            s % size if w > 1 else 0
+            for s, size, w in zip(shift, plan.map_size, plan.window, strict=True)
+        )
+        return dataclasses.replace(plan, shift=(along_r, along_phi))
+
+    def attention(self, dim: int, heads: int, plan: StagePlan, block: int) -> nn.Module:
+        return PolarWindowAttention(
+            dim,
+            heads,
+            map_size=plan.map_size,
+            window=plan.window,
+            shift=plan.shift_of(block),
+            periodic=(False, False),
+            position_bias=self.position_bias,
+            harmonics=self.harmonics,
+            # It has M_φ rows of coefficients where one window is the map.
+            periodic_bias=plan.window == plan.map_size,
+        )
+
+    def prepare(self, lens: Lens | None, size: Pair) -> Prepared:
+        """As `DarSwin`; the angles of the bias are equal steps up to tan θ_max of image 0."""
+        lens = check_lens(lens, size)
+        grid = _grid(lens, size, self.spec)
+        last = _last_angle(lens[:1])[:, None]
+        rings = [plan.map_size[0] for plan in self.plans]
+        return Prepared(grid, [(last * _inclusive(count, lens.theta_max),) for count in rings])
+
+    def embed(self, images: Tensor, points: PolarGrid) -> Tensor:
+        """As `DarSwin`, of the transposed images: x runs down there, and y to the right."""
+        return super().embed(images.transpose(2, 3), points)
+
+
+# It is a grid of the transposed image: azimuth 0 points down there. Near 90° the rounding of
+# float32 tangents moves samples by 1e-4 px, so the released steps are followed one by one, and the
+# samples still depend that much on the maths library (MKL's differs between CPUs).
+def _grid(lens: Lens, image_size: Pair, spec: PolarGridSpec) -> PolarGrid:
+    """The grid of the released code, in place of `PolarGridSpec.grid`."""
+    height, width = image_size
+    if height != width:
+        raise ValueError(f"compat='official' needs square images, got (H, W) = {image_size}")
+    if lens.affine is not None or not lens.is_radial:
+        raise ValueError("compat='official' needs radial lenses, with no affine, got " + repr(lens))
+    like = lens.theta_max
+    lens = lens.replace(theta_max=like[:1].expand(len(lens)))
+    along_r, along_phi = (_inclusive(count - 1, like) for count in spec.samples)
+    ends = _last_angle(lens)[:, None] * _inclusive(spec.rings, like)
+    if isinstance(lens, OfficialPolynomial):
+        borders = lens.project(ends)
+        radii = _between(borders[:, :-1], borders[:, 1:], along_r)
+    else:
+        check_tan(lens)
+        borders = _radius(lens, ends)
+        inner, outer = borders[:, :-1], borders[:, :-1] + borders.diff(dim=1)
+        tangents = _between(_tangent(lens, inner), _tangent(lens, outer), along_r)
+        radii = _radius(lens, tangents)
+    step = (torch.tensor(2 * math.pi, dtype=like.dtype) / spec.sectors).item()
+    # Half a step less than once around: the end itself must not come in by rounding.
+    start = torch.arange(0, (spec.sectors - 0.5) * step, step, dtype=like.dtype, device=like.device)
+    azimuths = _between(start, step + start, along_phi)
+    scale = (height - 1) / 2 / (height // 2)
+    center = lens.center_in(image_size).flip(1)
+    return PolarGrid(radii * scale, azimuths, center, borders * scale)
+
+
+def _inclusive(count: int, like: Tensor) -> Tensor:
+    """0 … 1 in `count` equal steps."""
+    return torch.arange(count + 1, dtype=like.dtype, device=like.device) / count
+
+
+def _between(inner: Tensor, outer: Tensor, steps: Tensor) -> Tensor:
+    """Borders (..., R) and fractions (S,) → (..., R·S)."""
+    return (inner[..., None] + steps * (outer - inner)[..., None]).flatten(-2)
+
+
+def _radius(lens: Lens, tangent: Tensor) -> Tensor:
+    """r at tan θ."""
+    return lens.project(torch.atan(tangent))
+
+
+def _tangent(lens: Lens, radius: Tensor) -> Tensor:
+    """tan θ at r, in the released steps where the released code has the lens."""
+    if not isinstance(lens, Spherical):
+        return torch.tan(lens.unproject(radius))
+    xi, rho = lens.xi[:, None], radius / lens.focal[:, None]
+    sine = xi * radius / lens.focal[:, None] / torch.sqrt(1 + rho * rho)
+    return torch.tan(torch.asin(sine) + torch.atan(rho))
+
+
+def _last_angle(lens: Lens) -> Tensor:
+    """(N,): what the released code splits into rings and takes for θ_max in the bias."""
+    if isinstance(lens, OfficialPolynomial):
+        return lens.theta_max
+    return torch.tan(lens.theta_max)
 
 
 def load_official(source: str | os.PathLike | Mapping[str, Tensor], **options) -> DarSwin:
-    """The authors' released DarSwin from its state dict, in eval mode with `compat="official"`.
+    """The authors' released DarSwin from its state dict, in eval mode, as `OfficialDarSwin`.
 
     Angular and "polar" models give the released code's outputs; the latter's bias is the paper's
     angular PE (Fourier in θ and φ), so it is called "angular" here. The released radial model
@@ -31,15 +219,15 @@ def load_official(source: str | os.PathLike | Mapping[str, Tensor], **options) -
     state = read_state(source)
     with refused("a released DarSwin"):
         settings = _settings(state)
-    model = DarSwin(**(settings | options))
-    sample = model.patch_embed.sample
+    kind = DarSwin if settings.get("variant") == "RA" else OfficialDarSwin
+    model = kind(**(settings | options))
     converted = {}
     for key, value in state.items():
         if key.endswith("attn_mask"):
             continue  # the operator needs no masks
         if key == "patch_embed.mlp.weight":
             # Columns (C, S_r, S_φ) → (S_r, S_φ, C).
-            value = value.unflatten(1, (model.in_chans, *sample.samples))
+            value = value.unflatten(1, (model.in_chans, *model.spec.samples))
             value = value.permute(0, 2, 3, 1).flatten(1)
         converted[_renamed(key)] = value
     with refused("a released DarSwin"):
@@ -59,7 +247,7 @@ def _settings(state: Mapping[str, Tensor]) -> dict:
     )
     cosines, sines = (state[f"layers.0.blocks.0.attn.{name}_r"].shape[0] for name in "ab")
     if cosines == sines:
-        return settings | dict(position_bias="angular_relative", compat="official")
+        return settings | dict(position_bias="angular_relative")
     settings["harmonics"] = sines
     last_stage_masked = f"layers.{len(depths) - 1}.blocks.1.attn_mask" in state
     if depths[-1] > 1 and not last_stage_masked:
@@ -70,7 +258,7 @@ def _settings(state: Mapping[str, Tensor]) -> dict:
         )
         grid = dict(spacing="tan", placement="edges", jitter=0.0)
         return settings | grid | dict(variant="RA", position_bias="polar")
-    return settings | dict(position_bias="angular", compat="official")
+    return settings | dict(position_bias="angular")
 
 
 def _renamed(key: str) -> str:

@@ -16,10 +16,9 @@ from darswin.layers.packed import PackedLinear, fastest_dtype
 from darswin.layers.quantized import quantized_layers, without_quantized_layers
 from darswin.lens import Lens
 from darswin.models.base import Model
-from darswin.models.dense import DenseModel, DensePrepared
-from darswin.models.encoder import Encoder, Prepared
-from darswin.models.feature_maps import FeatureMaps
+from darswin.models.encoder import Encoder, FeatureMaps, Prepared
 from darswin.models.stages import Pair, Stage
+from darswin.models.unet import Unet, UnetPrepared
 
 Net = TypeVar("Net", bound=Model)
 DTYPES = (torch.float32, torch.bfloat16, torch.int8)
@@ -78,7 +77,7 @@ def optimize(
         warnings.warn(f"optimize goes on with torch's own products: {lack}", stacklevel=2)
     optimized = copy.deepcopy(model).eval().requires_grad_(False)
     kind: type[_Optimized] = _OptimizedEncoder
-    if isinstance(optimized, DenseModel):
+    if isinstance(optimized, Unet):
         _pack_dense(optimized, dtype)
         kind = _OptimizedDense
     elif isinstance(optimized, FeatureMaps):
@@ -112,7 +111,7 @@ def _quantized(model: Net, calibration: Iterable[Sequence] | None) -> Net:
 
 
 def _check(model: nn.Module, dtype: torch.dtype | str, lens: Lens | None) -> None:
-    if not isinstance(model, (Encoder, DenseModel, FeatureMaps)):
+    if not isinstance(model, (Encoder, Unet, FeatureMaps)):
         raise TypeError(f"model must be one of create_model, got {type(model).__name__}")
     if isinstance(model, _Optimized):
         raise TypeError("model must be one of create_model, got one that is optimized already")
@@ -142,7 +141,7 @@ def _pack_encoder(encoder: Encoder, dtype: torch.dtype) -> None:
     encoder.head.to(dtype)
 
 
-def _pack_dense(model: DenseModel, dtype: torch.dtype) -> None:
+def _pack_dense(model: Unet, dtype: torch.dtype) -> None:
     _pack_encoder(model.encoder, dtype)
     _become(model.encoder, _OptimizedEncoder)
     decoder, head = model.decoder, model.head
@@ -205,16 +204,17 @@ class _OptimizedEncoder(_Optimized, Encoder):
         return prepared._replace(positions=_tables(self.stages, prepared.positions))
 
 
-class _OptimizedDense(_Optimized, DenseModel):
+class _OptimizedDense(_Optimized, Unet):
     """How an optimized dense model differs from the one it was made of."""
 
     encoder: _OptimizedEncoder  # type: ignore[assignment]  # of a class that is made of both
 
-    def prepare(self, lens: Lens | None, size: Pair) -> DensePrepared:
+    def prepare(self, lens: Lens | None, size: Pair) -> UnetPrepared:
         """As the model it was made of, but `positions` are the tables of each stage's blocks."""
         angles = self.encoder.prepare_angles(lens, size)
         tables = _tables(self.decoder.stages, angles.positions[:-1])
-        return DensePrepared(self.encoder.with_tables(angles), tables, self.way(lens, size))
+        way = self.view.prepare(lens, size)
+        return UnetPrepared(self.encoder.with_tables(angles), tables, way)
 
 
 class FixedLens(_Optimized):

@@ -7,7 +7,7 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
-from darswin.layers.grid import PolarGrid
+from darswin.layers.polar import PolarGrid
 from darswin.lens import Lens
 
 PositionBias = Literal["angular_relative", "angular", "polar"]

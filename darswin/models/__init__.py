@@ -1,26 +1,20 @@
 """The models, by name, and their files."""
 
-from darswin.models.adapter import LensAdapter
 from darswin.models.darswin import DarSwin
-from darswin.models.darswin_unet import DarSwinUnet
 from darswin.models.dat import DAT
-from darswin.models.pretrained import list_pretrained, pretrained_file
-from darswin.models.registry import create_model, list_models
+from darswin.models.registry import create_model, list_models, list_pretrained, pretrained_file
 from darswin.models.saving import ModelCard, load_model, save_model
-from darswin.models.swin import Swin, SwinUndis
-from darswin.models.swin_unet import SwinUnet, SwinUnetAdapted, SwinUnetUndis
+from darswin.models.swin import Swin
+from darswin.models.unet import Unet
+from darswin.models.views import LensAdapter
 
 __all__ = [
     "DAT",
     "DarSwin",
-    "DarSwinUnet",
     "LensAdapter",
     "ModelCard",
     "Swin",
-    "SwinUndis",
-    "SwinUnet",
-    "SwinUnetAdapted",
-    "SwinUnetUndis",
+    "Unet",
     "create_model",
     "list_models",
     "list_pretrained",

@@ -1,21 +1,20 @@
 """DarSwin: an image encoder in the polar coordinates of a calibrated lens."""
 
 from collections.abc import Sequence
-from typing import Literal
+from typing import Any, Literal
 
-from torch import Tensor
+from torch import Tensor, nn
 
 from darswin.layers.attention import PolarWindowAttention
 from darswin.layers.embed import PolarPatchEmbed
-from darswin.layers.grid import Placement, PolarGrid, polar_grid
+from darswin.layers.polar import PolarGrid, check_count, check_lens
 from darswin.layers.position_bias import PositionBias, ring_angles
-from darswin.layers.sampling import check_count, check_lens
 from darswin.lens import Lens
-from darswin.lens.spacing import Spacing
-from darswin.models import official
 from darswin.models.encoder import Encoder, Prepared
 from darswin.models.registry import Presets, register_model
 from darswin.models.stages import Pair, StagePlan, check_depths, make_stages, plan_stages
+
+__all__ = ["DarSwin"]
 
 # All models of a size have as many tokens.
 PRESETS: Presets = dict(micro=dict(samples=(6, 6)), nano=dict(rings=8, sectors=32, samples=(4, 4)))
@@ -38,14 +37,12 @@ class DarSwin(Encoder):
         window: (M_r, M_φ) where the map is large enough; None means (1, 16) for A, (4, 4) for RA.
         merges: (m_r, m_φ) before each stage but the first; None means (1, 4) for A, (2, 2) for RA.
         mlp_ratio: hidden width of the MLPs over D. drop_path_rate: of the last block; linear.
-        spacing, sample_spacing, placement: as `darswin.polar_grid`. "radius" for both is a
-            model without lens knowledge, "radius" for the samples alone samples uniformly.
         jitter: in [0, 1], of the sample points in training; 0 is off.
         position_bias: "angular_relative", or the ablations "angular" and "polar" with `harmonics`.
         periodic_bias: see `AngularRelativeBias`.
         mean, std: of uint8 images, which count as `(pixel/255 - mean) / std`; others ignore them.
-        compat: "official" reproduces the authors' released DarSwin-A: its sampling grid, masks,
-            shifts and bias angles. Overrides spacing, sample_spacing, placement and jitter.
+        grid: spacing, sample_spacing and placement, as `PolarGridSpec`. "radius" for both spacings
+            is a model without lens knowledge, for the samples alone it samples uniformly.
 
     Rotation:
         In eval mode a turn of a square image about the principal point by 90° turns the maps by a
@@ -81,51 +78,36 @@ class DarSwin(Encoder):
         merges: Sequence[Pair] | None = None,
         mlp_ratio: float = 4.0,
         drop_path_rate: float = 0.2,
-        spacing: Spacing = "theta",
-        sample_spacing: Spacing | None = None,
-        placement: Placement = "centers",
         jitter: float = 1.0,
         position_bias: PositionBias = "angular_relative",
         harmonics: int = 16,
         periodic_bias: bool = False,
         mean: float | Sequence[float] = 0.0,
         std: float | Sequence[float] = 1.0,
-        compat: Literal["official"] | None = None,
+        **grid: Any,
     ):
         super().__init__()
         if variant not in ("A", "RA"):
             raise ValueError(f"variant must be 'A' or 'RA', got {variant!r}")
-        if compat not in (None, "official") or (compat and variant != "A"):
-            raise ValueError(
-                f"compat must be None, or 'official' with variant 'A'; got {compat!r}, {variant!r}"
-            )
-        if compat and merges is not None:
-            raise ValueError("compat='official' has merges of its own: leave them out")
         check_depths(depths, num_heads)
         window = window or ((1, 16) if variant == "A" else (4, 4))
         plans = plan_stages(rings, sectors, len(depths), variant, window, merges)
-        if compat:
-            plans = [official.plan(plan, window) for plan in plans]
-        self.in_chans = in_chans
-        self.square_images = compat == "official"
-        self.compat, self.position_bias = compat, position_bias
-        self.harmonics, self.periodic_bias = harmonics, periodic_bias
-
+        plans = [self._plan(plan, window) for plan in plans]
+        self._set_pixels(in_chans, mean, std)
+        self.position_bias, self.harmonics = position_bias, harmonics
+        self.periodic_bias = periodic_bias
         self.patch_embed = PolarPatchEmbed(
             rings,
             sectors,
             samples,
             in_chans=in_chans,
             embed_dim=embed_dim,
-            spacing="tan" if compat else spacing,
-            sample_spacing="tan" if compat else sample_spacing,
-            placement="edges" if compat else placement,
-            jitter=0.0 if compat else jitter,
+            jitter=jitter,
             mean=mean,
             std=std,
-            grid=official.grid if compat else polar_grid,
+            **grid,
         )
-
+        self.spec = self.patch_embed.sample.spec
         self.stages = make_stages(
             plans,
             embed_dim,
@@ -135,10 +117,13 @@ class DarSwin(Encoder):
             mlp_ratio=mlp_ratio,
             drop_path_rate=drop_path_rate,
         )
-        self._rings = [plan.map_size[0] for plan in plans]
-        self._finish(num_classes, plans, embed_dim, patch=samples, mean=mean, std=std)
+        self._finish(num_classes, plans, embed_dim, samples)
 
-    def attention(self, dim: int, heads: int, plan: StagePlan, block: int) -> PolarWindowAttention:
+    def _plan(self, plan: StagePlan, window: Pair) -> StagePlan:
+        """A stage's sizes, which a subclass may change."""
+        return plan
+
+    def attention(self, dim: int, heads: int, plan: StagePlan, block: int) -> nn.Module:
         """The attention of a block of a stage, which a decoder's blocks have too."""
         return PolarWindowAttention(
             dim,
@@ -146,27 +131,19 @@ class DarSwin(Encoder):
             map_size=plan.map_size,
             window=plan.window,
             shift=plan.shift_of(block),
-            periodic=(False, not self.compat),
             position_bias=self.position_bias,
             harmonics=self.harmonics,
-            # The released code has M_φ rows of coefficients where one window is the map.
-            periodic_bias=plan.window == plan.map_size if self.compat else self.periodic_bias,
+            periodic_bias=self.periodic_bias,
         )
 
     def prepare(self, lens: Lens | None, size: Pair) -> Prepared:
         """The grid of the samples, and for each stage its `ring_angles`; else as `Encoder`."""
         lens = check_lens(lens, size)
-        grid = self.patch_embed.sample.grid(lens, size)
-        counts = self._rings[: len(self.stages)]
-        if self.compat:
-            angles = [official.ring_angles(lens, rings) for rings in counts]
-        else:
-            angles = [ring_angles(lens, grid, rings, self.position_bias) for rings in counts]
-        return Prepared(grid, [(of_stage,) for of_stage in angles])
+        grid = self.spec.grid(lens, size)
+        rings = [plan.map_size[0] for plan in self.plans]
+        return Prepared(grid, [(ring_angles(lens, grid, r, self.position_bias),) for r in rings])
 
     def embed(self, images: Tensor, points: PolarGrid) -> Tensor:
         """Images (B, C, H, W) on a grid of `prepare` → the first map, (B, R, A, D)."""
         check_count(len(points.radii), images)
-        if self.compat:
-            images = images.transpose(2, 3)  # its x runs down and its y to the right
         return self.patch_embed(images, points)

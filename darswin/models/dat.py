@@ -1,6 +1,7 @@
 """DAT, the Deformable Attention Transformer, in its CVPR 2022 form: a baseline of the paper."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -14,6 +15,8 @@ from darswin.models.encoder import ImageEncoder
 from darswin.models.registry import register_model
 from darswin.models.stages import Pair, StagePlan
 from darswin.ops.checks import tensor_there
+
+__all__ = ["DAT"]
 
 
 class DeformableAttention(nn.Module):
@@ -106,6 +109,7 @@ def _pixel_centers(height: int, width: int, like: Tensor) -> Tensor:
 
 @register_model(
     "dat",
+    image_size=64,
     presets=dict(
         micro=dict(groups=(1, 1, 1, 2)),
         nano=dict(image_size=32, blocks=("L", "LD", "D"), groups=(1, 1, 2)),
@@ -115,16 +119,12 @@ class DAT(ImageEncoder):
     """The Deformable Attention Transformer. It is called as DarSwin is, and ignores the lens.
 
     Args:
-        num_classes: 0 leaves out the head. in_chans: C of the images.
-        embed_dim, depths, num_heads: of the stages; width doubles at each.
-        image_size: (H, W), or the side of a square. patch_size: its side, in pixels.
-        window: (rows, columns) where the map is large enough.
+        num_classes, in_chans, embed_dim, depths, num_heads: as `ImageEncoder`.
         blocks: of each stage the kinds of its blocks, repeated: "L" attends in windows, "S" in
             shifted ones, "D" is deformable.
         groups: of the heads of each stage's deformable blocks; others ignore it.
         offset_range: as `DeformableAttention`.
-        mlp_ratio: hidden width of the MLPs over D. drop_path_rate: of the last block; linear.
-        mean, std: of uint8 images, which count as `(pixel/255 - mean) / std`; others ignore them.
+        options: others of `ImageEncoder`.
 
     Raises:
         ValueError: sizes that do not divide; in forward, images of another size.
@@ -140,16 +140,10 @@ class DAT(ImageEncoder):
         depths: Sequence[int] = (2, 2, 18, 2),
         num_heads: Sequence[int] = (3, 6, 12, 24),
         *,
-        image_size: int | Pair = 64,
-        patch_size: int = 2,
-        window: Pair = (4, 4),
         blocks: Sequence[str] = ("LS", "LS", "LD", "LD"),
         groups: Sequence[int] = (1, 1, 3, 6),
         offset_range: float = 2.0,
-        mlp_ratio: float = 4.0,
-        drop_path_rate: float = 0.2,
-        mean: float | Sequence[float] = 0.0,
-        std: float | Sequence[float] = 1.0,
+        **options: Any,
     ):
         if not len(blocks) == len(groups) == len(depths):
             raise ValueError(
@@ -158,38 +152,30 @@ class DAT(ImageEncoder):
             )
         if not all(blocks) or not set("".join(blocks)) <= set("LSD"):
             raise ValueError(f"blocks must be of the kinds 'L', 'S' and 'D', got {blocks}")
-
-        def attention(dim: int, heads: int, plan: StagePlan, block: int) -> nn.Module:
-            kinds = blocks[plan.index]
-            kind = kinds[block % len(kinds)]
-            if kind == "D":
-                return DeformableAttention(
-                    dim,
-                    heads,
-                    map_size=plan.map_size,
-                    groups=groups[plan.index],
-                    kernel=2 * (len(depths) - plan.index) + 1,  # 9, 7, 5, 3: smaller, as the maps
-                    offset_range=offset_range,
-                )
-            rows, columns = plan.window
-            shift = ((rows + 1) // 2, (columns + 1) // 2) if kind == "S" else (0, 0)
-            return WindowAttention(
-                dim, heads, map_size=plan.map_size, window=plan.window, shift=shift
-            )
-
+        self.blocks, self.groups, self.offset_range = blocks, groups, offset_range
         super().__init__(
             num_classes,
             in_chans,
             embed_dim,
             depths,
             num_heads,
-            image_size=image_size,
-            patch_size=patch_size,
-            window=window,
-            mlp_ratio=mlp_ratio,
-            drop_path_rate=drop_path_rate,
-            mean=mean,
-            std=std,
-            attention=attention,
             downsample=lambda dim, _merge: PatchProjection(dim, 2 * dim, 2, bias=False),
+            **options,
         )
+
+    def attention(self, dim: int, heads: int, plan: StagePlan, block: int) -> nn.Module:
+        """The attention of a block of a stage."""
+        kinds = self.blocks[plan.index]
+        kind = kinds[block % len(kinds)]
+        if kind == "D":
+            return DeformableAttention(
+                dim,
+                heads,
+                map_size=plan.map_size,
+                groups=self.groups[plan.index],
+                kernel=2 * (len(self.blocks) - plan.index) + 1,  # 9, 7, 5, 3: smaller, as the maps
+                offset_range=self.offset_range,
+            )
+        rows, columns = plan.window
+        shift = ((rows + 1) // 2, (columns + 1) // 2) if kind == "S" else (0, 0)
+        return WindowAttention(dim, heads, map_size=plan.map_size, window=plan.window, shift=shift)

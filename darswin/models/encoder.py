@@ -1,25 +1,27 @@
-"""What the models share: lens and images → maps of stages, features and logits."""
+"""The classifiers: lens and images → maps of stages, features and logits."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import chain
 from typing import Any, Literal, NamedTuple
 
 from torch import Tensor, nn
 
-from darswin.layers.embed import ImageInput, PatchProjection
-from darswin.layers.grid import PolarGrid
+from darswin.layers.block import PatchMerging
+from darswin.layers.embed import PatchProjection
 from darswin.layers.linear import Linear
-from darswin.layers.sampling import check_count, check_images
+from darswin.layers.polar import PolarGrid
 from darswin.lens import Lens
-from darswin.lens.pixels import sample_at
-from darswin.models.base import Model, init_weights
-from darswin.models.features import FeatureInfo, feature_info, take_indices
+from darswin.models.base import FeatureInfo, Model, feature_info, init_weights, take_indices
 from darswin.models.stages import Pair, StagePlan, check_depths, make_stages, plan_stages
-from darswin.ops.checks import per_channel
+from darswin.models.views import ViewName, make_view
+
+__all__ = ["Encoder", "FeatureMaps", "ImageEncoder", "Prepared"]
+
+Format = Literal["NHWC", "NCHW"]
 
 
 class Prepared(NamedTuple):
-    """What the lenses alone decide about images of one size: `Encoder.prepare` computes it.
+    """All that the lenses alone decide about images of one size: `Encoder.prepare` computes it.
 
     Args:
         points: where the images are read: on a polar grid, or at pixels (N, H, W, 2); None means
@@ -34,9 +36,9 @@ class Prepared(NamedTuple):
 class Encoder(Model):
     """Base of the classifiers.
 
-    A model sets `in_chans`, makes `patch_embed` and `stages`, then calls `_finish`; it defines
-    `embed` and, if its lens matters, `prepare`. Maps are channels last: (B, R, A, D) where they are
-    polar, else (B, H, W, D).
+    A model makes `patch_embed` and `stages`, then calls `_finish`; it defines `embed` and, if its
+    lens matters, `prepare`. Maps are channels last: (B, R, A, D) where they are polar, else
+    (B, H, W, D).
 
     Attributes:
         num_features, head_hidden_size: D of the last map, and of what the head takes.
@@ -52,16 +54,9 @@ class Encoder(Model):
     head: nn.Module
 
     def _finish(
-        self,
-        num_classes: int,
-        plans: Sequence[StagePlan],
-        embed_dim: int,
-        *,
-        patch: Pair,
-        mean: float | Sequence[float],
-        std: float | Sequence[float],
+        self, num_classes: int, plans: Sequence[StagePlan], embed_dim: int, patch: Pair
     ) -> None:
-        """Makes what ends a model, initialises it, and says what it is."""
+        """Makes what ends a model, initialises it, and describes it."""
         self.plans = plans
         self.feature_info = feature_info(plans, embed_dim, patch)
         self.num_features = self.feature_info.channels(-1)
@@ -74,8 +69,8 @@ class Encoder(Model):
             fixed_input_size=self.image_size is not None,
             interpolation="box",  # as `darswin predict`
             crop_pct=1.0,
-            mean=tuple(per_channel("mean", mean, self.in_chans)),
-            std=tuple(per_channel("std", std, self.in_chans)),
+            mean=self.mean,
+            std=self.std,
             first_conv="patch_embed.proj",
             classifier="head",
         )
@@ -105,27 +100,22 @@ class Encoder(Model):
             self.head = nn.Identity()
 
     def prepare(self, lens: Lens | None, size: Pair) -> Prepared:
-        """As `Model`: where the images are read, and what the position biases need."""
+        """As `Model`: where the images are read, and the input of the position biases."""
         return Prepared(None, [()] * len(self.stages))
 
     def embed(self, images: Tensor, points: Any) -> Tensor:
         """Images (B, C, H, W) and the `points` of `prepare` → the first map."""
         raise NotImplementedError
 
-    def run(
+    def maps(
         self, images: Tensor, prepared: Prepared, *, stop_after: int | None = None
     ) -> list[Tensor]:
-        """The map that each stage ends with: `prepare` and `run` are a model without its head.
+        """The map that each stage ends with, of images (B, C, H, W) that fit the model.
 
         Args:
-            images: (B, C, H, W); of uint8 also (B, H, W, C).
-            prepared: of `prepare`, for the size of these images and B lenses or one.
-            stop_after: the last stage that runs; None means all do.
-
-        Raises:
-            TypeError, ValueError: images of another kind, or as many lenses as do not fit them.
+            prepared: of `prepare`. stop_after: the last stage that runs; None means all do.
         """
-        x = self.embed(check_images(images, channels=self.in_chans), prepared.points)
+        x = self.embed(images, prepared.points)
         maps = []
         for stage, positions in zip(self.stages, prepared.positions, strict=True):
             x = stage(x, *positions)
@@ -134,15 +124,17 @@ class Encoder(Model):
                 break
         return maps
 
-    def _maps(
-        self, images: Tensor, lens: Lens | None, stop_after: int | None = None
-    ) -> list[Tensor]:
-        height, width = check_images(images, channels=self.in_chans).shape[2:]
-        return self.run(images, self.prepare(lens, (height, width)), stop_after=stop_after)
+    def _run(self, images: Tensor, prepared: Prepared) -> Tensor:
+        return self.forward_head(self.norm(self.maps(images, prepared)[-1]))
 
     def forward_features(self, images: Tensor, lens: Lens | None = None) -> Tensor:
         """Images (B, C, H, W) and their lenses (B or 1) → the last map, (B, R', A', D'), normed."""
-        return self.norm(self._maps(images, lens)[-1])
+        return self.norm(self.maps(*self._checked_and_prepared(images, lens))[-1])
+
+    def forward_head(self, features: Tensor, pre_logits: bool = False) -> Tensor:
+        """Features (B, R', A', D') → logits (B, num_classes), or their mean (B, D')."""
+        pooled = features.mean((1, 2))
+        return pooled if pre_logits else self.head(pooled)
 
     def forward_intermediates(
         self,
@@ -152,13 +144,13 @@ class Encoder(Model):
         indices: int | Sequence[int] | None = None,
         norm: bool = False,
         stop_early: bool = False,
-        output_fmt: Literal["NHWC", "NCHW"] = "NHWC",
+        output_fmt: Format = "NHWC",
         intermediates_only: bool = False,
     ) -> list[Tensor] | tuple[Tensor, list[Tensor]]:
         """The maps of some stages, in their order, and the last map.
 
         Args:
-            indices: which stages; an int means the last so many, None all.
+            indices: which stages, from 0 or from the end; an int means the last so many, None all.
             norm: the last stage's map is normed; the norm fits no other.
             stop_early: no stage runs after the last of `indices`.
             output_fmt: of the maps: "NHWC" as (B, R, A, D), "NCHW" as (B, D, R, A).
@@ -173,17 +165,15 @@ class Encoder(Model):
         """
         last = len(self.stages) - 1
         taken = take_indices(len(self.stages), indices)
-        if output_fmt not in ("NHWC", "NCHW"):
-            raise ValueError(f"output_fmt must be 'NHWC' or 'NCHW', got {output_fmt!r}")
-        maps = self._maps(images, lens, max(taken) if stop_early else last)
+        _check_format(output_fmt)
+        ready = self._checked_and_prepared(images, lens)
+        maps = self.maps(*ready, stop_after=max(taken) if stop_early else last)
         final = maps[-1]
         if len(maps) - 1 == last and (norm or not intermediates_only):
             final = self.norm(final)
             if norm:
                 maps[-1] = final
-        intermediates = [maps[i] for i in sorted(set(taken))]
-        if output_fmt == "NCHW":
-            intermediates = [x.permute(0, 3, 1, 2).contiguous() for x in intermediates]
+        intermediates = _chosen(maps, sorted(set(taken)), output_fmt)
         return intermediates if intermediates_only else (final, intermediates)
 
     def prune_intermediate_layers(
@@ -215,39 +205,46 @@ class Encoder(Model):
             self.reset_classifier(0)
         return taken
 
-    def forward_head(self, features: Tensor, pre_logits: bool = False) -> Tensor:
-        """Features (B, R', A', D') → logits (B, num_classes), or their mean (B, D')."""
-        pooled = features.mean((1, 2))
-        return pooled if pre_logits else self.head(pooled)
-
-    def forward(self, images: Tensor, lens: Lens | None = None) -> Tensor:
-        """Images (B, C, H, W) and their lenses (B or 1) → logits (B, num_classes)."""
-        return self.forward_head(self.forward_features(images, lens))
-
 
 class ImageEncoder(Encoder):
     """Base of the models that cut images of one size into square patches.
 
     Args:
-        attention, downsample: as `make_stages`. Others: as `Swin`.
+        num_classes: 0 leaves out the head. in_chans: C of the images.
+        embed_dim, depths, num_heads: of the stages; width doubles at each.
+        image_size: (H, W), or the side of a square. patch_size: its side, in pixels.
+        window: (rows, columns) where the map is large enough.
+        mlp_ratio: hidden width of the MLPs over D. drop_path_rate: of the last block; linear.
+        mean, std: of uint8 images, which count as `(pixel/255 - mean) / std`; others ignore them.
+        view: "none" takes the images as they are and ignores the lens; "perspective" and "square"
+            are views through it, of the same size, see `darswin.models.views`.
+        view_options: of the view: `max_fov` of "perspective", `spacing` of "square".
+
+    Raises:
+        ValueError: sizes that do not divide, a wrong option; in forward, images of another size.
+        TypeError: in forward, no lens where there is a view.
     """
 
-    image_size: Pair = (64, 64)
+    image_size: Pair
 
     def __init__(
         self,
-        num_classes: int,
-        in_chans: int,
-        embed_dim: int,
-        depths: Sequence[int],
-        num_heads: Sequence[int],
+        num_classes: int = 1000,
+        in_chans: int = 3,
+        embed_dim: int = 96,
+        depths: Sequence[int] = (2, 2, 18, 2),
+        num_heads: Sequence[int] = (3, 6, 12, 24),
         *,
-        image_size: int | Pair,
-        patch_size: int,
-        window: Pair,
-        mean: float | Sequence[float],
-        std: float | Sequence[float],
-        **stages,
+        image_size: int | Pair = 64,
+        patch_size: int = 2,
+        window: Pair = (4, 4),
+        mlp_ratio: float = 4.0,
+        drop_path_rate: float = 0.2,
+        mean: float | Sequence[float] = 0.0,
+        std: float | Sequence[float] = 1.0,
+        view: ViewName = "none",
+        downsample: Callable[[int, Pair], nn.Module] = PatchMerging,
+        **view_options: Any,
     ):
         super().__init__()
         check_depths(depths, num_heads)
@@ -257,18 +254,95 @@ class ImageEncoder(Encoder):
             raise ValueError(
                 f"patch_size must divide image_size = {self.image_size}, got {patch_size}"
             )
+        self._set_pixels(in_chans, mean, std)
+        self.view = make_view(view, self.image_size, **view_options)
         plans = plan_stages(height // patch_size, width // patch_size, len(depths), "RA", window)
-        self.in_chans = in_chans
-        self.image_input = ImageInput(self.image_size, in_chans, mean, std)
         self.patch_embed = PatchProjection(in_chans, embed_dim, patch_size)
-        self.stages = make_stages(plans, embed_dim, depths, num_heads, **stages)
-        patch = (patch_size, patch_size)
-        self._finish(num_classes, plans, embed_dim, patch=patch, mean=mean, std=std)
+        self.stages = make_stages(
+            plans,
+            embed_dim,
+            depths,
+            num_heads,
+            attention=self.attention,
+            downsample=downsample,
+            mlp_ratio=mlp_ratio,
+            drop_path_rate=drop_path_rate,
+        )
+        self._finish(num_classes, plans, embed_dim, (patch_size, patch_size))
+
+    def attention(self, dim: int, heads: int, plan: StagePlan, block: int) -> nn.Module:
+        """The attention of a block of a stage."""
+        raise NotImplementedError
+
+    def prepare(self, lens: Lens | None, size: Pair) -> Prepared:
+        """As `Encoder`: the pixels of the images that the view shows."""
+        way = self.view.prepare(lens, size, both=False)
+        return super().prepare(lens, size)._replace(points=way.there)
 
     def embed(self, images: Tensor, points: Tensor | None) -> Tensor:
         """Images (B, C, H, W), read at the pixels `points` (N, H, W, 2) if any → the first map."""
-        images = self.image_input(images, next(self.patch_embed.parameters()).dtype)
-        if points is not None:
-            check_count(len(points), images)
-            images = sample_at(images, points)
-        return self.patch_embed(images.permute(0, 2, 3, 1))
+        seen = self.view.look(self._floating(images), points)
+        return self.patch_embed(seen.permute(0, 2, 3, 1))
+
+
+class FeatureMaps(Model):
+    """The maps of some stages of an encoder, which loses what they do not need.
+
+    `create_model(name, features_only=True, out_indices=…)` makes it, as timm does. It is called
+    `model(images, lens)` and gives a list of maps (B, R, A, D), those of the stages in their order,
+    not normed.
+
+    Args:
+        encoder: it is pruned in place: of later stages, the norm and the head.
+        out_indices: of the stages, from 0; they may count from the end. An int means the last so
+            many, None all.
+        output_fmt: of the maps: "NHWC" as (B, R, A, D), "NCHW" as (B, D, R, A).
+
+    Attributes:
+        encoder: what is left of it, with the names of its weights.
+        feature_info: of the stages of `out_indices`.
+        output_fmt: as given.
+
+    Raises:
+        ValueError: stages that there are not, another format.
+    """
+
+    def __init__(
+        self,
+        encoder: Encoder,
+        out_indices: int | Sequence[int] | None = None,
+        output_fmt: Format = "NHWC",
+    ):
+        super().__init__()
+        _check_format(output_fmt)
+        taken = sorted(set(take_indices(len(encoder.stages), out_indices)))
+        encoder.prune_intermediate_layers(taken, prune_norm=True)
+        self.encoder, self.out_indices, self.output_fmt = encoder, tuple(taken), output_fmt
+        self.image_size, self.square_images = encoder.image_size, encoder.square_images
+        self.in_chans, self.num_classes = encoder.in_chans, 0
+        self.feature_info = FeatureInfo(
+            dict(encoder.feature_info[i], module=f"encoder.{encoder.feature_info[i]['module']}")
+            for i in taken
+        )
+        self.pretrained_cfg = encoder.pretrained_cfg | dict(
+            num_classes=0, first_conv=f"encoder.{encoder.pretrained_cfg['first_conv']}"
+        )
+
+    def prepare(self, lens: Lens | None, size: Pair) -> Prepared:
+        """As the encoder."""
+        return self.encoder.prepare(lens, size)
+
+    def _run(self, images: Tensor, prepared: Prepared) -> list[Tensor]:
+        return _chosen(self.encoder.maps(images, prepared), self.out_indices, self.output_fmt)
+
+
+def _check_format(output_fmt: str) -> None:
+    if output_fmt not in ("NHWC", "NCHW"):
+        raise ValueError(f"output_fmt must be 'NHWC' or 'NCHW', got {output_fmt!r}")
+
+
+def _chosen(maps: Sequence[Tensor], indices: Sequence[int], output_fmt: Format) -> list[Tensor]:
+    chosen = [maps[i] for i in indices]
+    if output_fmt == "NCHW":
+        return [x.permute(0, 3, 1, 2).contiguous() for x in chosen]
+    return chosen

@@ -15,9 +15,10 @@ from torch import Tensor
 
 from darswin.layers.quantized import Quantization, with_quantized_layers
 from darswin.lens.files.fields import listed, short
-from darswin.models.pretrained import list_pretrained, pretrained_file
-from darswin.models.registry import create_model
+from darswin.models.registry import create_model, list_pretrained, pretrained_file
 from darswin.utils.files import replace_file
+
+__all__ = ["ModelCard", "NoCardError", "load_model", "model_of_run", "read_card", "save_model"]
 
 Task = Literal["classification", "segmentation", "distance"]
 Fit = Literal["crop", "stretch", "whole"]

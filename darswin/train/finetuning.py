@@ -8,10 +8,10 @@ from torch import nn
 
 from darswin.layers.quantized import without_quantized_layers
 from darswin.models.base import Model
-from darswin.models.dense import DenseModel
 from darswin.models.encoder import Encoder
 from darswin.models.registry import list_models, model_class
 from darswin.models.saving import ModelCard, Task, load_model, model_of_run
+from darswin.models.unet import Unet
 
 # What the data decide of a model's options.
 OF_DATA = ("task", "num_classes", "in_chans", "mean", "std", "image_size")
@@ -31,7 +31,7 @@ def own_options(card: ModelCard) -> dict[str, Any]:
 
 def models_for(task: Task) -> list[str]:
     """The names of the models that a task trains."""
-    base = Encoder if task == "classification" else DenseModel
+    base = Encoder if task == "classification" else Unet
     return [name for name in list_models() if issubclass(model_class(name), base)]
 
 
@@ -127,7 +127,7 @@ def start_from(net: Model, classes: list[str], weights: str | Path) -> None:
     trained, card = load_model(weights_file(weights))
     without_quantized_layers(trained)
     there = trained.state_dict()
-    if isinstance(net, DenseModel) and card.task == "classification":
+    if isinstance(net, Unet) and card.task == "classification":
         there = {f"encoder.{name}": t for name, t in there.items() if not _of_head(name)}
         rest = {name for name in net.state_dict() if not name.startswith("encoder.")}
     else:
@@ -151,14 +151,14 @@ def _of_head(name: str) -> bool:
     return name.startswith(("head.", "segmentation_head.", "distance_head."))
 
 
-def frozen_parts(net: Encoder | DenseModel, stages: int) -> list[nn.Module]:
+def frozen_parts(net: Encoder | Unet, stages: int) -> list[nn.Module]:
     """The modules that are not trained: the embedding and the first stages; all but the head, where
     these are all stages. Of a dense model they are its encoder's.
 
     Raises:
         ValueError: more stages than there are.
     """
-    net = net.encoder if isinstance(net, DenseModel) else net
+    net = net.encoder if isinstance(net, Unet) else net
     if not 0 <= stages <= len(net.stages):
         raise ValueError(
             f"--model.freeze_stages must be from 0 to the model's {len(net.stages)} stages, got "

@@ -15,11 +15,11 @@ from torchmetrics import Metric
 
 from darswin.layers.linear import MatmulBackend
 from darswin.lens import Lens
-from darswin.models.dense import DenseModel
 from darswin.models.encoder import Encoder
-from darswin.models.registry import model_class
+from darswin.models.registry import has_image_size
 from darswin.models.saving import ModelCard, read_card
 from darswin.models.saving import Task as TaskName
+from darswin.models.unet import Unet
 from darswin.ops.checks import readable
 from darswin.train.data import RunData
 from darswin.train.finetuning import (
@@ -69,7 +69,7 @@ class Task(LightningModule):
     default_model: ClassVar[str]
     monitor: ClassVar[tuple[str, Literal["min", "max"]]]  # which decides on the best checkpoint
     results: list[dict[str, Any]]
-    net: Encoder | DenseModel  # of `configure_model`, as is what describes it
+    net: Encoder | Unet  # of `configure_model`, as is what describes it
     card: ModelCard
     trained: ModelCard  # of the checkpoint that was read; else `card`
 
@@ -134,7 +134,7 @@ class Task(LightningModule):
         data = self.data
         options: dict[str, Any] = self._head_options() | dict(in_chans=data.channels)
         options |= dict(mean=data.mean, std=data.std)
-        if model_class(self.name).image_size is not None:
+        if has_image_size(self.name):
             options["image_size"] = data.size
         if taken := sorted(options.keys() & self.options.keys()):
             raise ValueError(

@@ -20,8 +20,7 @@ from matplotlib.patheffects import AbstractPathEffect, Normal, Stroke
 from matplotlib.ticker import MaxNLocator
 from torch import Tensor
 
-from darswin.layers.grid import PolarGrid
-from darswin.layers.sampling import PolarSample
+from darswin.layers.polar import PolarGrid, PolarSample
 from darswin.lens import Lens
 from darswin.lens.pixels import OUTSIDE
 from darswin.ops import polar_sample
@@ -117,7 +116,7 @@ def _draw_borders(
     rings = lens.unproject(grid.borders[0])[:, None]
     around = torch.linspace(0, 2 * math.pi, 361)
     outwards = torch.linspace(rings.min(), rings.max(), 65)
-    sectors = torch.arange(sampler.sectors)[:, None] * (2 * math.pi / sampler.sectors)
+    sectors = torch.arange(sampler.spec.sectors)[:, None] * (2 * math.pi / sampler.spec.sectors)
     for theta, azimuth, width in zip((rings, outwards), (around, sectors), widths, strict=True):
         lines = lens.project_rays(theta, azimuth, size).numpy()
         effects = _outline(width, "black")
@@ -155,9 +154,9 @@ def draw_polar(
     _show(axes, np.stack(colours, -1) / scale, outside, extent=(0, 360, rows, 0), aspect="auto")
     sides = ("right", "below", "left", "above", "right")
     axes.set_xticks(range(0, 361, 90), [f"{90 * k}°\n{side}" for k, side in enumerate(sides)])
-    step = -(-sampler.rings // 8)  # at most nine labels
+    step = -(-sampler.spec.rings // 8)  # at most nine labels
     angles = torch.rad2deg(lens.unproject(grid.borders[0]))[::step].tolist()
-    axes.set_yticks([k * step * sampler.samples[0] for k in range(len(angles))],
+    axes.set_yticks([k * step * sampler.spec.samples[0] for k in range(len(angles))],
                     [f"{angle:.0f}°" for angle in angles])  # fmt: skip
     axes.set(xlabel=_label("azimuth φ", outside), ylabel="incident angle θ")
     return _figure_of(axes)
@@ -281,8 +280,8 @@ def draw_lens(
     draw_view(image, lens, view, axes=panels["view"])
     draw_polar(image, lens, sampler, axes=panels["polar"])
     draw_curve(lens, image.shape[:2], axes=panels["curve"])
-    (rows, columns), rings, sectors = sampler.samples, sampler.rings, sampler.sectors
-    equal = SPACING_SYMBOLS[sampler.spacing]
+    (rows, columns), rings, sectors = sampler.spec.samples, sampler.spec.rings, sampler.spec.sectors
+    equal = SPACING_SYMBOLS[sampler.spec.spacing]
     panels["partition"].set_title(f"{rings} rings × {sectors} sectors, equal steps of {equal}")
     panels["samples"].set_title(f"{rows} × {columns} samples in each, enlarged")
     panels["view"].set_title(title)

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from darswin.layers.grid import polar_grid
+from darswin.layers.polar import polar_grid
 from darswin.lens.base import Lens
 from darswin.lens.spacing import SPACINGS, Spacing
 

@@ -158,7 +158,7 @@ def test_lists_are_taken_as_people_type_them(folder, drawn, capsys, typed):
     calib, picture = str(folder / "front.json"), str(folder / "front.png")
     main(["lens", "show", "--samp", *typed, calib, picture])
     main(["lens", "show", calib, picture, "--samples=" + typed[0], *typed[1:], "--rings=4"])
-    assert [sampler.samples for sampler, *_ in drawn] == [(3, 2), (3, 2)]
+    assert [sampler.spec.samples for sampler, *_ in drawn] == [(3, 2), (3, 2)]
     bare = Polynomial([300.0], 1.5)
     (folder / "bare.json").write_text(json.dumps(to_dict(bare)))
     main(["lens", "info", str(folder / "bare.json"), "--image_size", *typed])
@@ -256,7 +256,7 @@ def test_any_command_line_ends_with_an_answer_or_a_sentence(
 
     def draw(image, lens, sampler, rays, title):
         assert rays.shape[0] * rays.shape[1] <= 800**2 and len(title) < 100
-        assert sampler.rings * sampler.sectors * math.prod(sampler.samples) <= 2**22
+        assert sampler.spec.rings * sampler.spec.sectors * math.prod(sampler.spec.samples) <= 2**22
 
     code, out, err = 0, io.StringIO(), io.StringIO()
     with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(out):

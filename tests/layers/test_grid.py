@@ -3,7 +3,7 @@ import math
 import pytest
 import torch
 
-from darswin.layers.grid import PLACEMENTS, polar_grid, token_rays
+from darswin.layers.polar import PLACEMENTS, polar_grid, token_rays
 from darswin.lens import Mei, Perspective, Polynomial, Spherical
 from darswin.lens.spacing import SPACINGS
 

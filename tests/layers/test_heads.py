@@ -2,7 +2,6 @@ import math
 
 import pytest
 import torch
-
 from darswin.layers.heads import DistanceHead, SegmentationHead
 
 

@@ -8,7 +8,7 @@ import hypothesis.strategies as st
 import torch
 from lens_examples import COUNTS, RANGES, f64, first_coefficients
 
-from darswin.layers.grid import PLACEMENTS, polar_grid
+from darswin.layers.polar import PLACEMENTS, polar_grid
 from darswin.lens import MODELS, cat, from_dict, to_dict
 from darswin.lens.spacing import SPACINGS
 

@@ -3,9 +3,9 @@ import math
 import pytest
 import torch
 import torch.nn.functional as F
+from darswin.layers.grid import pixel_grid
 
 from darswin import create_model, polar_grid
-from darswin.layers.grid import pixel_grid
 from darswin.lens import KannalaBrandt, Mei, Polynomial, Spherical
 from darswin.ops import polar_to_image
 

@@ -5,10 +5,10 @@ import copy
 import pytest
 import torch
 import torch.nn.functional as F
+from darswin.models.dense import DenseModel
 
 from darswin import create_model, list_models, optimize
 from darswin.lens import KannalaBrandt, Polynomial, Spherical
-from darswin.models.dense import DenseModel
 from darswin.models.registry import model_class
 from darswin.models.saving import ModelCard, load_model, save_model
 from darswin.ops import use_reference

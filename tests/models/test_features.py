@@ -9,6 +9,7 @@ import functools
 
 import pytest
 import torch
+from darswin.models.features import take_indices
 from helpers import FIXTURES
 from safetensors.torch import load_file
 
@@ -16,7 +17,6 @@ from darswin import create_model, list_models, optimize
 from darswin.compat import load_timm_swin
 from darswin.lens import Spherical
 from darswin.models.encoder import Encoder
-from darswin.models.features import take_indices
 from darswin.models.registry import model_class
 
 ENCODERS = [name for name in list_models() if issubclass(model_class(name), Encoder)]

@@ -5,10 +5,10 @@ from collections.abc import Callable
 import pytest
 import torch
 import torch.nn.functional as F
+from darswin.layers.grid import PolarGrid
 from torch import Tensor
 
 from darswin import create_model
-from darswin.layers.grid import PolarGrid
 from darswin.lens import KannalaBrandt, Lens, Mei, Spherical
 from darswin.models.encoder import Prepared
 

@@ -11,8 +11,7 @@ from torch.autograd import forward_ad
 from torch.func import vmap
 
 from darswin import ops
-from darswin.layers.grid import PolarGrid
-from darswin.layers.sampling import PolarSample
+from darswin.layers.polar import PolarGrid, PolarSample
 from darswin.lens import Equidistant
 from darswin.ops import (
     polar_embed,

@@ -6,7 +6,7 @@ import torch
 import torch.nn.functional as F
 from helpers import assert_accurate, assert_equals_reference, with_gradients
 
-from darswin.layers.grid import polar_grid
+from darswin.layers.polar import polar_grid
 from darswin.lens import Equidistant
 from darswin.ops import polar_sample, polar_to_image, use_reference
 

@@ -11,7 +11,7 @@ import torch
 from helpers import with_gradients
 
 from darswin import create_model
-from darswin.layers.sampling import PolarSample
+from darswin.layers.polar import PolarSample
 from darswin.lens import Spherical
 from darswin.ops import polar_embed, polar_sample, use_reference, window_attention
 

@@ -1,0 +1,290 @@
+"""The polar grid: the rings and sectors that a lens's image is cut into, the samples in them, and
+the way from a polar map back to pixels.
+
+Rings and samples are each split into equal steps of a *spacing*, see `darswin.lens.spacing`.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from darswin.lens import Lens
+from darswin.lens.pixels import pixel_rays
+from darswin.lens.spacing import SPACINGS, Spacing, change_spacing, check_tan, span, to_theta
+from darswin.ops import polar_sample
+from darswin.ops.checks import as_int, channels_first, check_jitter, check_layout
+from darswin.ops.checks import readable
+
+__all__ = ["PolarGrid", "PolarGridSpec", "PolarSample", "polar_grid"]
+
+Placement = Literal["centers", "edges"]
+PLACEMENTS = ("centers", "edges")
+
+
+class PolarGrid(NamedTuple):
+    """The places that `polar_sample` reads in the images of N lenses, and the borders of the rings.
+
+    Shapes: radii (N, R·S_r) px, azimuths (A·S_φ,) rad, center (N or 1, 2) px, borders (N, R+1) px;
+    for general lenses also affine (N or 1, 2, 2) and offsets (N or 1, 2, R·S_r, A·S_φ) px.
+    """
+
+    radii: Tensor
+    azimuths: Tensor
+    center: Tensor
+    borders: Tensor
+    affine: Tensor | None = None
+    offsets: Tensor | None = None
+
+
+class PixelGrid(NamedTuple):
+    """The arguments of `polar_to_image` that bring back a polar map, by their names.
+
+    Shapes: radii (N, R) px, of the rings' centres; r_max (N,) px; for radial lenses center
+    (N or 1, 2) px and affine (N, 2, 2), for general ones points (N, H, W, 2) px.
+    """
+
+    radii: Tensor
+    r_max: Tensor
+    center: Tensor | None = None
+    affine: Tensor | None = None
+    points: Tensor | None = None
+
+
+@dataclass(frozen=True)
+class PolarGridSpec:
+    """The settings of a polar grid: R rings × A sectors, with S_r × S_φ samples in each.
+
+    Convention:
+        Ring 0 is the innermost and ring R-1 ends at θ_max. Sector a covers azimuths from 2πa/A to
+        2π(a+1)/A; azimuth 0 points right, π/2 down.
+
+    Args:
+        rings: R. sectors: A. samples: (S_r, S_φ).
+        spacing: the quantity that the ring borders split equally.
+        sample_spacing: the one that the samples inside a ring split equally; None means `spacing`.
+        placement: "centers" of equal cells, or "edges": from border to border, both included.
+
+    Raises:
+        ValueError: an unknown name, a size below 1, or "edges" with one sample along an axis; in
+            the methods, "tan" with a lens of θ_max ≥ 90°.
+
+    Source: DarSwin, ICCV 2023, sec. 4.2 and 4.3.
+    """
+
+    rings: int
+    sectors: int
+    samples: tuple[int, int]
+    spacing: Spacing = "theta"
+    sample_spacing: Spacing | None = None
+    placement: Placement = "centers"
+
+    def __post_init__(self) -> None:
+        for name in ("rings", "sectors"):
+            value = getattr(self, name)
+            if (as_int(value) or 0) < 1:
+                raise ValueError(f"{name} must be an int of at least 1, got {value!r}")
+            object.__setattr__(self, name, int(value))  # NumPy's ints become Python's
+        samples = self.samples
+        if len(samples) != 2 or any((as_int(s) or 0) < 1 for s in samples):
+            raise ValueError(f"samples must be (S_r, S_φ), ints of at least 1, got {samples!r}")
+        object.__setattr__(self, "samples", (int(samples[0]), int(samples[1])))
+        for name, choice in (("spacing", self.spacing), ("sample_spacing", self.inner_spacing)):
+            if choice not in SPACINGS:
+                raise ValueError(f"{name} must be one of {SPACINGS}, got {choice!r}")
+        if self.placement not in PLACEMENTS:
+            raise ValueError(f"placement must be one of {PLACEMENTS}, got {self.placement!r}")
+        if self.placement == "edges" and min(samples) < 2:
+            raise ValueError(f"placement='edges' needs at least 2 samples an axis, got {samples!r}")
+
+    @property
+    def inner_spacing(self) -> Spacing:
+        """`sample_spacing`, or `spacing` where that is None."""
+        return self.spacing if self.sample_spacing is None else self.sample_spacing
+
+    def grid(self, lens: Lens, image_size: tuple[int, int]) -> PolarGrid:
+        """The grid of N lenses; (H, W) is for the principal point of a lens that has none."""
+        steps_r, steps_phi = (_steps(s, self.placement, lens.theta_max) for s in self.samples)
+        borders, points = self._rings(lens, self.inner_spacing, steps_r)
+        sector = torch.arange(self.sectors, dtype=borders.dtype, device=borders.device)[:, None]
+        azimuths = (sector + steps_phi).flatten() * (2 * math.pi / self.sectors)
+        offsets = None
+        if not lens.is_radial:
+            offsets = _offsets(lens, to_theta(lens, points, self.inner_spacing), azimuths)
+        return PolarGrid(
+            change_spacing(lens, points, self.inner_spacing, "radius"),
+            azimuths,
+            lens.center_in(image_size),
+            change_spacing(lens, borders, self.spacing, "radius"),
+            lens.affine,
+            offsets,
+        )
+
+    def pixel_grid(self, lens: Lens, image_size: tuple[int, int], split: int = 1) -> PixelGrid:
+        """The way back to images of (H, W) from a map whose rings are these, each split in some."""
+        steps = _steps(split, "centers", lens.theta_max)
+        _, centers = self._rings(lens, self.inner_spacing, steps)
+        radii = change_spacing(lens, centers, self.inner_spacing, "radius")
+        if lens.is_radial:
+            return PixelGrid(radii, lens.r_max, lens.center_in(image_size), lens.affine)
+        theta, direction = pixel_rays(lens, image_size)
+        seen = ~theta.isnan()  # NaN must not meet the gradients
+        flat = lens.project(torch.where(seen, theta, 0.0))[..., None] * direction
+        return PixelGrid(radii, lens.r_max, points=torch.where(seen[..., None], flat, torch.nan))
+
+    def token_rays(self, lens: Lens) -> Tensor:
+        """The directions in which the tokens of a map look: (N, R, A, 3), unit vectors (x, y, z).
+
+        x to the right, y down, z forward; a token's ray is that of the middle of its ring and its
+        sector on the radial curve, whatever offsets the lens has.
+        """
+        _, centers = self._rings(lens, self.spacing, _steps(1, "centers", lens.theta_max))
+        theta = change_spacing(lens, centers, self.spacing, "theta")[..., None]
+        sector = torch.arange(self.sectors, dtype=theta.dtype, device=theta.device)
+        azimuth = (sector + 0.5) * (2 * math.pi / self.sectors)
+        aside, forward = torch.sin(theta), torch.cos(theta).expand(-1, -1, self.sectors)
+        return torch.stack((aside * torch.cos(azimuth), aside * torch.sin(azimuth), forward), -1)
+
+    def _rings(self, lens: Lens, inner: Spacing, steps: Tensor) -> tuple[Tensor, Tensor]:
+        """Ring borders (N, R+1) in units of `spacing`, and points in those of `inner`,
+        (N, R·len(steps)): `steps` are fractions of a ring."""
+        if "tan" in (self.spacing, inner):
+            check_tan(lens)
+        fractions = torch.linspace(0, 1, self.rings + 1, dtype=steps.dtype, device=steps.device)
+        first, last = span(lens, self.spacing)
+        borders = first + (last - first) * fractions
+        edges = change_spacing(lens, borders, self.spacing, inner)
+        begin, end = edges[:, :-1, None], edges[:, 1:, None]
+        return borders, (begin + (end - begin) * steps).flatten(1)
+
+
+def polar_grid(lens: Lens, image_size: tuple[int, int], **settings: Any) -> PolarGrid:
+    """Cuts the image of each lens into rings × sectors and places samples in each.
+
+    Args:
+        lens: N lenses. image_size: (H, W), only for the principal point of a lens that has none.
+        settings: `rings`, `sectors`, `samples` and the others of `PolarGridSpec`.
+
+    Raises:
+        ValueError: as `PolarGridSpec`, or spacing "tan" with a lens of θ_max ≥ 90°.
+    """
+    return PolarGridSpec(**settings).grid(lens, image_size)
+
+
+def _steps(count: int, placement: Placement, like: Tensor) -> Tensor:
+    """Fractions of a cell at which its samples stand."""
+    steps = torch.arange(count, dtype=like.dtype, device=like.device)
+    return steps / (count - 1) if placement == "edges" else (steps + 0.5) / count
+
+
+def _offsets(lens: Lens, theta: Tensor, azimuths: Tensor) -> Tensor:
+    """(N, 2, N_r, N_a) px: how far from the radial curve the lens lets each point land."""
+    theta = theta[:, :, None].expand(-1, -1, len(azimuths))
+    direction = torch.stack((torch.cos(azimuths), torch.sin(azimuths)), -1)
+    offsets = lens.offset(theta, direction.expand(*theta.shape, 2))
+    return lens.through_affine(offsets).permute(0, 3, 1, 2)
+
+
+class PolarSample(nn.Module):
+    """Samples images on the polar grid of their lenses: `polar_sample` and the grid it needs.
+
+    Args:
+        rings, sectors, samples: as `PolarGridSpec`. settings: others of it, by name.
+        jitter: in [0, 1], how far a sample may move, in cells; only in training. The seed of each
+            call comes from torch's generator.
+        layout: "tokens" gives (B, R, A, S_r·S_φ·C), "image" (B, C, R·S_r, A·S_φ).
+        mean, std: of uint8 images, which count as `(pixel/255 - mean) / std`; others ignore them.
+
+    Raises:
+        ValueError: settings that make no grid, here; images and lenses that do not fit, in forward.
+
+    Source: DarSwin, ICCV 2023, sec. 4.2 and 4.3.
+    """
+
+    def __init__(
+        self,
+        rings: int,
+        sectors: int,
+        samples: tuple[int, int],
+        *,
+        jitter: float = 0.0,
+        layout: Literal["tokens", "image"] = "tokens",
+        mean: float | Sequence[float] = 0.0,
+        std: float | Sequence[float] = 1.0,
+        **settings: Any,
+    ):
+        super().__init__()
+        self.spec = PolarGridSpec(rings, sectors, samples, **settings)
+        check_layout(layout)
+        self.jitter, self.layout = check_jitter(jitter), layout
+        self.mean, self.std = mean, std
+
+    def grid(self, lens: Lens, image_size: tuple[int, int]) -> PolarGrid:
+        """The grid of a lens in images of (H, W)."""
+        return self.spec.grid(lens, image_size)
+
+    def arguments(self, images: Tensor, grid: PolarGrid) -> dict[str, Any]:
+        """The operators' arguments that sample images (B, C, H, W) on a grid."""
+        dtype = torch.float64 if images.dtype == torch.float64 else torch.float32
+        radii, azimuths, center, _, affine, offsets = (
+            None if t is None else t.to(images.device, dtype) for t in grid
+        )
+        jitter = self.jitter if self.training else 0.0
+        # 62 bits, so that the seed is a tensor that compiled training does not specialise on.
+        seed = torch.randint(2**62, ()) if jitter else 0
+        return dict(
+            image=images, radii=radii, azimuths=azimuths, center=center, affine=affine,
+            offsets=offsets, samples=self.spec.samples, jitter=jitter, seed=seed, mean=self.mean,
+            std=self.std, channels_last=False,
+        )  # fmt: skip
+
+    def forward(self, images: Tensor, lens: Lens, channels_last: bool | None = None) -> Tensor:
+        """Images and their lenses (B or 1) → the samples, in `layout`.
+
+        The images are (B, C, H, W) or (B, H, W, C), as `polar_sample` takes them with
+        `channels_last`.
+        """
+        images = check_images(images, channels_last)
+        height, width = images.shape[2:]
+        check_lens(lens, (height, width))
+        check_count(len(lens), images)
+        grid = self.grid(lens, (height, width))
+        return polar_sample(**self.arguments(images, grid), layout=self.layout)
+
+    def extra_repr(self) -> str:
+        return f"{self.spec}, jitter={self.jitter}, layout={self.layout!r}"
+
+
+def check_images(
+    images: Tensor, channels_last: bool | None = None, channels: int | None = None
+) -> Tensor:
+    """The images as (B, C, H, W), else TypeError or ValueError: see `channels_first`."""
+    if not isinstance(images, Tensor):
+        raise TypeError(f"images must be a tensor, got {type(images).__name__}")
+    if images.dim() != 4:
+        raise ValueError(f"images must have shape (B, C, H, W), got {tuple(images.shape)}")
+    return channels_first("images", images, channels_last, channels)
+
+
+def check_lens(lens: Lens | None, size: tuple[int, int]) -> Lens:
+    """The lens, which must be one, for images of (H, W); sizes are checked where `readable`."""
+    if not isinstance(lens, Lens):
+        raise TypeError(f"lens must be a darswin.lens.Lens, got {type(lens).__name__}")
+    if lens.image_size is None or not readable(lens.image_size):
+        return lens
+    for other in lens.image_size.unique(dim=0).tolist():
+        if tuple(other) != size:
+            raise ValueError(
+                f"the lens belongs to images of (H, W) = {tuple(round(s) for s in other)}, got "
+                f"images of {size}; lens.resized({size}) is the lens of a resized image"
+            )
+    return lens
+
+
+def check_count(lenses: int, images: Tensor) -> None:
+    """ValueError unless there is a lens for each image, or one for all."""
+    if lenses not in (1, images.shape[0]):
+        raise ValueError(f"there must be one lens or one an image, {images.shape[0]}, got {lenses}")
