@@ -25,8 +25,6 @@ from darswin.models.darswin import DarSwin
 from darswin.models.encoder import Prepared
 from darswin.models.stages import Pair, StagePlan
 
-__all__ = ["OfficialDarSwin", "OfficialPolynomial", "load_official"]
-
 
 class OfficialPolynomial(Lens, register=False):
     """The released code's polynomial lens, an angle as a function of the radius.

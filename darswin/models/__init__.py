@@ -1,9 +1,11 @@
 """The models, by name, and their files."""
 
+from darswin.models.base import FeatureInfo, Model
 from darswin.models.darswin import DarSwin
 from darswin.models.dat import DAT
+from darswin.models.encoder import Encoder, FeatureMaps
 from darswin.models.registry import create_model, list_models, list_pretrained, pretrained_file
-from darswin.models.saving import ModelCard, load_model, save_model
+from darswin.models.saving import ModelCard, NoCardError, load_model, read_card, save_model
 from darswin.models.swin import Swin
 from darswin.models.unet import Unet
 from darswin.models.views import LensAdapter
@@ -11,8 +13,13 @@ from darswin.models.views import LensAdapter
 __all__ = [
     "DAT",
     "DarSwin",
+    "Encoder",
+    "FeatureInfo",
+    "FeatureMaps",
     "LensAdapter",
+    "Model",
     "ModelCard",
+    "NoCardError",
     "Swin",
     "Unet",
     "create_model",
@@ -20,5 +27,6 @@ __all__ = [
     "list_pretrained",
     "load_model",
     "pretrained_file",
+    "read_card",
     "save_model",
 ]

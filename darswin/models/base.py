@@ -15,8 +15,6 @@ from darswin.models.stages import Pair, StagePlan
 from darswin.ops.checks import per_channel
 from darswin.ops.reference import normalized
 
-__all__ = ["FeatureInfo", "Model"]
-
 
 class FeatureInfo(list[dict[str, Any]]):
     """A dict for each stage, and timm's accessors.

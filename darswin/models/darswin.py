@@ -14,8 +14,6 @@ from darswin.models.encoder import Encoder, Prepared
 from darswin.models.registry import Presets, register_model
 from darswin.models.stages import Pair, StagePlan, check_depths, make_stages, plan_stages
 
-__all__ = ["DarSwin"]
-
 # All models of a size have as many tokens.
 PRESETS: Presets = dict(micro=dict(samples=(6, 6)), nano=dict(rings=8, sectors=32, samples=(4, 4)))
 

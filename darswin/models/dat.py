@@ -16,8 +16,6 @@ from darswin.models.registry import register_model
 from darswin.models.stages import Pair, StagePlan
 from darswin.ops.checks import tensor_there
 
-__all__ = ["DAT"]
-
 
 class DeformableAttention(nn.Module):
     """Multi-head attention whose keys are sampled where the queries of each group say.

@@ -15,8 +15,6 @@ from darswin.models.base import FeatureInfo, Model, feature_info, init_weights, 
 from darswin.models.stages import Pair, StagePlan, check_depths, make_stages, plan_stages
 from darswin.models.views import ViewName, make_view
 
-__all__ = ["Encoder", "FeatureMaps", "ImageEncoder", "Prepared"]
-
 Format = Literal["NHWC", "NCHW"]
 
 

@@ -9,8 +9,6 @@ from typing import Any, Literal, TypeVar
 from darswin.models.base import Model
 from darswin.models.encoder import Encoder, FeatureMaps
 
-__all__ = ["create_model", "list_models", "list_pretrained", "pretrained_file"]
-
 _SMALL = dict(embed_dim=96, depths=(2, 2, 18, 2), num_heads=(3, 6, 12, 24), drop_path_rate=0.2)
 _SIZES: dict[str, dict[str, Any]] = dict(
     small=_SMALL,

@@ -18,8 +18,6 @@ from darswin.lens.files.fields import listed, short
 from darswin.models.registry import create_model, list_pretrained, pretrained_file
 from darswin.utils.files import replace_file
 
-__all__ = ["ModelCard", "NoCardError", "load_model", "model_of_run", "read_card", "save_model"]
-
 Task = Literal["classification", "segmentation", "distance"]
 Fit = Literal["crop", "stretch", "whole"]
 

@@ -5,8 +5,6 @@ from darswin.models.encoder import ImageEncoder
 from darswin.models.registry import Presets, register_model
 from darswin.models.stages import StagePlan
 
-__all__ = ["Swin"]
-
 _PRESETS: Presets = dict(nano=dict(image_size=32))
 
 

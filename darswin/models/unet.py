@@ -17,8 +17,6 @@ from darswin.models.stages import Pair, StagePlan, make_stages
 from darswin.models.swin import Swin
 from darswin.models.views import PlainView, PolarView, Way, make_view
 
-__all__ = ["Unet"]
-
 PixelTask = Literal["segmentation", "distance"]
 EXPANSION = 4  # how many tokens along each axis the decoder's last expansion makes of one
 # exp(±8): from a three-thousandth of the typical distance to three thousand times as far.

@@ -21,8 +21,6 @@ from darswin.models.stages import Pair
 from darswin.ops import polar_to_image
 from darswin.ops.checks import as_int
 
-__all__ = ["LensAdapter"]
-
 ViewName = Literal["none", "perspective", "square"]
 
 

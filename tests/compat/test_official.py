@@ -17,7 +17,7 @@ import torch
 from helpers import fixture
 
 from darswin import DarSwin
-from darswin.compat import OfficialPolynomial, load_official
+from darswin.compat import OfficialDarSwin, OfficialPolynomial, load_official
 
 NAMES = ("angular", "polar", "poly")
 
@@ -41,7 +41,7 @@ def differences(name) -> dict[str, float]:
         results[key] = (value.reshape(expected.shape) - expected).abs().max().item()
     # Patches in the released order: (azimuth, ring), and of them every 37th; the grid is that of
     # the transposed image.
-    grid = model.patch_embed.sample.grid(lens, (64, 64))
+    grid = model.prepare(lens, (64, 64)).points
     r, a = grid.radii[:, :, None], grid.azimuths
     xy = torch.stack((r * torch.sin(a), r * torch.cos(a)), -1) / 31.5
     patches = xy.reshape(-1, 16, 10, 64, 10, 2).permute(0, 3, 1, 2, 4, 5).reshape(-1, 1024, 100, 2)
@@ -89,14 +89,14 @@ def test_every_part_of_the_compatibility_matters():
 
 def test_full_size_parameter_count():
     with torch.device("meta"):
-        model = DarSwin(200, compat="official")
+        model = OfficialDarSwin(200)
     assert sum(p.numel() for p in model.parameters()) == 48_977_864
 
 
 def test_the_polar_model_is_the_papers_angular_encoding():
     _, state, _ = fixture("polar")
     model = load_official(state)
-    assert model.position_bias == "angular" and model.compat == "official"
+    assert model.position_bias == "angular" and isinstance(model, OfficialDarSwin)
     assert model.stages[0].blocks[0].attn.position_bias.a_phi.shape == (16, 1)
     assert not model.training
 

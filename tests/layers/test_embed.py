@@ -12,15 +12,12 @@ def test_general_lenses():
     images = torch.randn(2, 3, 32, 33, dtype=torch.float64)
     affine, offsets = torch.eye(2) + 0.3 * torch.randn(2, 2, 2), torch.randn(1, 2, 12, 16)
 
-    def general(*arguments, **settings):
-        return polar_grid(*arguments, **settings)._replace(affine=affine, offsets=offsets)
-
     grid = polar_grid(LENS, (32, 33), rings=4, sectors=8, samples=(3, 2))
     radii, azimuths, center = (t.double() for t in grid[:3])
-    embed = PolarPatchEmbed(4, 8, (3, 2), grid=general).double()
+    embed = PolarPatchEmbed(4, 8, (3, 2)).double()
     tokens = polar_embed(
         images, radii, azimuths, center, embed.proj.weight, embed.proj.bias,
         affine=affine.double(), offsets=offsets.double(), samples=(3, 2),
     )  # fmt: skip
-    got = embed(images, embed.sample.grid(LENS, (32, 33)))
+    got = embed(images, grid._replace(affine=affine, offsets=offsets))
     assert torch.equal(got, embed.norm(tokens))

@@ -3,7 +3,7 @@ import math
 import pytest
 import torch
 
-from darswin.layers.polar import PLACEMENTS, polar_grid, token_rays
+from darswin.layers.polar import PLACEMENTS, PolarGridSpec, polar_grid
 from darswin.lens import Mei, Perspective, Polynomial, Spherical
 from darswin.lens.spacing import SPACINGS
 
@@ -196,7 +196,7 @@ def test_a_grid_of_a_round_lens_has_no_offsets():
 @pytest.mark.parametrize("spacing", ["theta", "g", "radius"])
 def test_tokens_look_where_the_middle_of_their_patch_does(spacing):
     lens = Polynomial([16.0, 0.4, -0.1, 0.05], 2.0, [30.0, 35.0]).to(f64)
-    rays = token_rays(lens, rings=4, sectors=8, spacing=spacing)
+    rays = PolarGridSpec(4, 8, (1, 1), spacing).token_rays(lens)
     grid = polar_grid(lens, (64, 64), rings=4, sectors=8, samples=(1, 1), spacing=spacing)
     x, y = (grid.radii[0, :, None] * wave(grid.azimuths) for wave in (torch.cos, torch.sin))
     pixels = torch.stack((x, y), -1) + grid.center[0]

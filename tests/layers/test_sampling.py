@@ -34,16 +34,14 @@ def test_general_lenses():
     images = torch.randn(2, 3, 32, 33, dtype=torch.float64)
     affine, offsets = torch.eye(2) + 0.3 * torch.randn(2, 2, 2), torch.randn(1, 2, 12, 16)
 
-    def general(*arguments, **settings):
-        return polar_grid(*arguments, **settings)._replace(affine=affine, offsets=offsets)
-
     grid = polar_grid(LENS, (32, 33), rings=4, sectors=8, samples=(3, 2))
     radii, azimuths, center = (t.double() for t in grid[:3])
     expected = polar_sample(
         images, radii, azimuths, center, affine=affine.double(), offsets=offsets.double(),
         samples=(3, 2), layout="image",
     )  # fmt: skip
-    sample = PolarSample(4, 8, (3, 2), layout="image", grid=general)
+    sample = PolarSample(4, 8, (3, 2), layout="image")
+    sample.grid = lambda lens, size: grid._replace(affine=affine, offsets=offsets)
     assert torch.equal(sample(images, LENS), expected)
 
 

@@ -3,9 +3,9 @@ import math
 import pytest
 import torch
 import torch.nn.functional as F
-from darswin.layers.grid import pixel_grid
 
 from darswin import create_model, polar_grid
+from darswin.layers.polar import PolarGridSpec
 from darswin.lens import KannalaBrandt, Mei, Polynomial, Spherical
 from darswin.ops import polar_to_image
 
@@ -31,9 +31,9 @@ def test_projecting_first_is_projecting_on_the_pixels(lens):
     """A linear layer commutes with the interpolation, to rounding."""
     model = network(skip_width=0)
     x, size = torch.randn(2, 64, 256, 24), (64, 64)
-    way = model.way(lens, size)
-    first = model.to_pixels(model.segmentation_head.project(x), way, size)
-    pixels = model.to_pixels(x, way, size)
+    back = model.view.prepare(lens, size).back
+    first = model.view.to_pixels(model.segmentation_head.proj(x), back, size)
+    pixels = model.view.to_pixels(x, back, size)
     proj = model.segmentation_head.proj
     after = F.linear(pixels.permute(0, 2, 3, 1), proj.weight, proj.bias).permute(0, 3, 1, 2)
     # Beyond θ_max a map is 0, and the bias alone is left of what is projected after.
@@ -47,11 +47,11 @@ def test_the_decoders_rings_are_those_of_the_grid(spacing):
     """Four to a ring: the samples of a grid of 4 × 4 samples a token stand at their centres."""
     lens = Spherical.from_fov([0.1, 0.9], 2.6, 32.0)
     model = create_model("darswin_unet_ra_nano", spacing=spacing, sample_spacing="radius")
-    way = model.way(lens, (64, 64))
+    way, _ = model.view.prepare(lens, (64, 64)).back
     grid = polar_grid(lens, (64, 64), rings=16, sectors=64, samples=(4, 4), spacing=spacing,
                       sample_spacing="radius")  # fmt: skip
-    torch.testing.assert_close(way.grid.radii, grid.radii)
-    assert torch.equal(way.grid.center, grid.center) and torch.equal(way.grid.r_max, lens.r_max)
+    torch.testing.assert_close(way.radii, grid.radii)
+    assert torch.equal(way.center, grid.center) and torch.equal(way.r_max, lens.r_max)
     # `polar_to_image` takes sector a to be where the samples of column a stand.
     assert torch.allclose(grid.azimuths, 2 * math.pi * (torch.arange(256) + 0.5) / 256)
 
@@ -62,7 +62,7 @@ def test_the_decoders_rings_are_those_of_the_grid(spacing):
 def test_what_the_rays_show_comes_back_to_their_pixels(lens, spacing):
     """A field of (θ, φ) on the rings and sectors, brought back, is that of each pixel's ray."""
     lens, size = lens.to(f64), (60, 66)
-    way = pixel_grid(lens, size, rings=32, split=4, spacing=spacing)
+    way = PolarGridSpec(32, 1, (1, 1), spacing).pixel_grid(lens, size, split=4)
     theta = lens.unproject(way.radii)[0][:, None]
     azimuth = 2 * math.pi * (torch.arange(512, dtype=f64) + 0.5) / 512
 
@@ -151,7 +151,7 @@ def test_a_lens_is_learned_through_the_way_back(make, values):
         if whole:
             logits = model(images, lens)
         else:
-            logits = model.run(images, prepared._replace(way=model.way(lens, size)))
+            logits = model.run(images, prepared._replace(way=model.view.prepare(lens, size)))
         return (F.cross_entropy(logits, labels, reduction="none") * weights).mean() * 100
 
     for whole in (False, True):
@@ -172,5 +172,5 @@ def test_a_lens_is_learned_through_the_way_back(make, values):
 
 
 def test_compat_is_not_for_unets():
-    with pytest.raises(ValueError, match="DarSwinUnet has no compat, got 'official'"):
+    with pytest.raises(ValueError, match="got 'official' for Unet"):
         create_model("darswin_unet_a_nano", compat="official")

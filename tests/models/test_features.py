@@ -9,13 +9,13 @@ import functools
 
 import pytest
 import torch
-from darswin.models.features import take_indices
 from helpers import FIXTURES
 from safetensors.torch import load_file
 
 from darswin import create_model, list_models, optimize
 from darswin.compat import load_timm_swin
 from darswin.lens import Spherical
+from darswin.models.base import take_indices
 from darswin.models.encoder import Encoder
 from darswin.models.registry import model_class
 
@@ -72,8 +72,7 @@ def test_what_a_model_says_of_its_stages_is_what_they_give(name):
         assert net.pretrained_cfg == model.pretrained_cfg
     # A map is as large as its images, or the samples of its grid, over the reduction.
     whole = model.image_size or [
-        count * s
-        for count, s in zip(info[0]["map_size"], model.patch_embed.sample.samples, strict=True)
+        count * s for count, s in zip(info[0]["map_size"], model.spec.samples, strict=True)
     ]
     for (rows, columns), reduction in zip(info.get("map_size"), info.reduction(), strict=True):
         assert max(whole[0] // rows, whole[1] // columns) == reduction

@@ -5,10 +5,10 @@ from collections.abc import Callable
 import pytest
 import torch
 import torch.nn.functional as F
-from darswin.layers.grid import PolarGrid
 from torch import Tensor
 
 from darswin import create_model
+from darswin.layers.polar import PolarGrid
 from darswin.lens import KannalaBrandt, Lens, Mei, Spherical
 from darswin.models.encoder import Prepared
 
@@ -92,13 +92,13 @@ def differences(loss: Callable[[Lens], Tensor], make: Callable, step: float) -> 
 
 def without_sampling(model, monkeypatch) -> None:
     """The lens's parameters reach the model through the bias alone."""
-    sampler = model.patch_embed.sample
-    grid = sampler.grid
-    monkeypatch.setattr(
-        sampler,
-        "grid",
-        lambda *args: PolarGrid(*(None if t is None else t.detach() for t in grid(*args))),
-    )
+    prepare = model.prepare
+
+    def detached(*args):
+        points, positions = prepare(*args)
+        return Prepared(PolarGrid(*(None if t is None else t.detach() for t in points)), positions)
+
+    monkeypatch.setattr(model, "prepare", detached)
 
 
 def without_bias(model, monkeypatch) -> None:

@@ -33,10 +33,10 @@ def test_it_ignores_the_lens():
 @torch.no_grad()
 def test_a_map_coarser_than_the_image_is_resized():
     model = network("swin_unet_nano", image_size=(128, 64), patch_size=8, skip_width=0)
-    maps = model.encoder.run(torch.randn(2, 3, 128, 64), model.encoder.prepare(None, (128, 64)))
-    x = model.segmentation_head.project(model.decoder(maps, [(), ()]))
+    maps = model.encoder.forward_intermediates(torch.randn(2, 3, 128, 64), intermediates_only=True)
+    x = model.segmentation_head.proj(model.decoder(maps, [(), ()]))
     assert x.shape == (2, 64, 32, 4)
-    got = model.to_pixels(x, None, (128, 64))
+    got = model.view.to_pixels(x, None, (128, 64))
     x = x.permute(0, 3, 1, 2)
     torch.testing.assert_close(got, F.interpolate(x, (128, 64), mode="bilinear"))
 

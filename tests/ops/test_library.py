@@ -12,7 +12,6 @@ from torch.func import vmap
 
 from darswin import ops
 from darswin.layers.polar import PolarGrid, PolarSample
-from darswin.lens import Equidistant
 from darswin.ops import (
     polar_embed,
     polar_sample,
@@ -178,9 +177,9 @@ AZIMUTHS = {
     "polar_embed": lambda azimuths: polar_embed(
         image, radii, azimuths, center, weight, samples=(2, 2)
     ),
-    "PolarSample": lambda azimuths: PolarSample(
-        2, 4, (2, 2), grid=lambda *_, **__: PolarGrid(radii, azimuths, center, radii)
-    )(image, Equidistant.from_fov(2.0, 4.0)),
+    "PolarSample": lambda azimuths: polar_sample(
+        **PolarSample(2, 4, (2, 2)).arguments(image, PolarGrid(radii, azimuths, center, radii))
+    ),
 }
 takes_azimuths = pytest.mark.parametrize("name", AZIMUTHS)
 
@@ -308,7 +307,7 @@ def test_numpy_numbers_are_taken():
     expected = window_attention(qkv, bias, window=(1, 4), shift=(1, 2))
     assert torch.equal(window_attention(qkv, bias, window=(one, four), shift=(one, two)), expected)
     layer = PolarSample(four, np.int64(8), samples=(two, one), jitter=np.float64(0.5))
-    assert (layer.rings, layer.sectors, layer.samples) == (4, 8, (2, 1))
+    assert repr(layer.spec).startswith("PolarGridSpec(rings=4, sectors=8, samples=(2, 1),")
     frames = torch.randint(256, (1, 8, 8, 3), dtype=torch.uint8)
     means = [np.float32(0.5), 0.5]
     first, second = (

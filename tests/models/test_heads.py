@@ -2,11 +2,12 @@ import math
 
 import pytest
 import torch
-from darswin.layers.heads import DistanceHead, SegmentationHead
+
+from darswin.models.unet import DistanceHead, PixelHead
 
 
 def test_the_skip_adds_what_the_image_shows():
-    head = SegmentationHead(6, 4, in_chans=3, skip_width=8)
+    head = PixelHead(6, 4, in_chans=3, skip_width=8)
     coarse, images = torch.randn(2, 4, 9, 7), torch.randn(2, 3, 9, 7)
     out = head.refine(coarse, images)
     assert out.shape == coarse.shape and not torch.equal(out, coarse)
@@ -16,7 +17,7 @@ def test_the_skip_adds_what_the_image_shows():
     assert differs[0, 2:7, 1:6].sum() == differs.sum() > 9
     torch.nn.init.zeros_(head.out.weight)
     assert torch.equal(head.refine(coarse, images), coarse)
-    without = SegmentationHead(6, 4, in_chans=3, skip_width=0)
+    without = PixelHead(6, 4, in_chans=3, skip_width=0)
     assert torch.equal(without.refine(coarse, images), coarse)
     assert [name for name, _ in without.named_parameters()] == ["proj.weight", "proj.bias"]
 

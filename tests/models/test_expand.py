@@ -1,8 +1,8 @@
 import pytest
 import torch
-from darswin.layers.expand import PatchExpand, SkipJoin
 
 from darswin.layers.block import PatchMerging
+from darswin.models.unet import PatchExpand, SkipJoin
 
 
 @pytest.mark.parametrize("split", [(1, 4), (2, 2), (4, 1), (4, 4)])
