@@ -16,8 +16,7 @@ from darswin.lens import Lens
 from darswin.lens.pixels import pixel_rays
 from darswin.lens.spacing import SPACINGS, Spacing, change_spacing, check_tan, span, to_theta
 from darswin.ops import polar_sample
-from darswin.ops.checks import as_int, channels_first, check_jitter, check_layout
-from darswin.ops.checks import readable
+from darswin.ops.checks import as_int, channels_first, check_jitter, check_layout, readable
 
 __all__ = ["PolarGrid", "PolarGridSpec", "PolarSample", "polar_grid"]
 
