@@ -25,8 +25,14 @@ from darswin.lens import (
     Stereographic,
     Tabulated,
 )
+from darswin.lens.files.load import Calibration
 
 f64 = torch.float64
+
+
+def loads(text: str, model: str | None = None, **options) -> Lens:
+    """`load` for the text of a file."""
+    return Calibration(text, "in a string", model).lens(**options)
 
 
 def double(*values):

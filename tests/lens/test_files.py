@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 import torch
 from helpers import changed
-from lens_examples import assert_projects, points_around
+from lens_examples import assert_projects, loads, points_around
 
 from darswin import lens as lenses
 from darswin.lens import MODELS, load, load_all, save, to_dict
-from darswin.lens.files import colmap, loads
+from darswin.lens.files import colmap
 
 FILES = Path(__file__).parent / "files"
 f64 = torch.float64
@@ -536,7 +536,7 @@ def test_our_own_json_may_say_a_field_of_view():
         (changed("ros_fisheye.yaml", "equidistant", "magic"),
          "ROS .*: distortion_model must be one of brownconrady,.*, got 'magic'; or give model="),
         (changed("ros_fisheye.yaml", "0.007163902584170265]", "0.009, 0.1]"),
-         "distortion_coefficients must have 4 coefficients for the fisheye model, got 5"),
+         r"distortion_coefficients.data must be .* numbers, got 5"),
         (changed("opencv_fisheye.yaml", "4.2134e+02, ", "-1, "), r"camera_matrix must be \[fx"),
         (changed("opencv_fisheye.yaml", "fisheye_model: 1", "fisheye_model: 7"),
          "OpenCV .*: fisheye_model must be 0 or 1, got '7'"),

@@ -11,11 +11,10 @@ import numpy as np
 import pytest
 import torch
 from helpers import changed
-from lens_examples import assert_projects
+from lens_examples import assert_projects, loads
 
 from darswin.cli.main import main
 from darswin.lens import EnhancedUnified, load, load_all
-from darswin.lens.files import loads
 
 FILES = Path(__file__).parent / "files"
 f64 = torch.float64
@@ -72,10 +71,10 @@ BASE = dict(width=640, height=480, K=[500.0, 0, 320, 0, 510, 240, 0, 0, 1])
 
 @pytest.mark.parametrize(
     "key",
-    ["D", "d", "distortion_coefficients", "distortion_coefficents", "distortion_coeficients",
-     "distortion_coefs", "distortion_coeffs", "distCoeffs", "distCoefs", "dist_coeff", "distCoeff",
-     "dist", "distortion", "distortions", "coeffs", "coefficients", "Distortion_Parameters",
-     "distortion_params", "camera_distortion", "cameraDistortionCoefficients", "dist_vec"],
+    ["D", "d", "distortion_coefficients", "distortion_coefs", "distortion_coeffs", "distCoeffs",
+     "distCoefs", "dist_coeff", "distCoeff", "dist", "distortion", "coeffs", "coefficients",
+     "Distortion_Parameters", "distortion_params", "camera_distortion",
+     "cameraDistortionCoefficients"],
 )  # fmt: skip
 @pytest.mark.parametrize("model", [dict(distortion_model="plumb_bob"), dict(fisheye_model=0), {}])
 def test_coefficients_are_read_by_all_their_names(key, model):

@@ -1,67 +1,54 @@
 """basalt's JSON: `value0` with one entry of `intrinsics` and of `resolution` a camera."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import partial
 
 from darswin.lens.base import Lens
 from darswin.lens.distorted import BrownConrady, KannalaBrandt
-from darswin.lens.files.cameras import Cameras, Description, Parameters, describe
-from darswin.lens.files.content import Content
-from darswin.lens.files.fields import Fields
+from darswin.lens.files.fields import Fields, short, to_sides
+from darswin.lens.files.format import Cameras, Description, Format, Size, describe
 from darswin.lens.ideal import FieldOfView
 from darswin.lens.sphere import DoubleSphere, EnhancedUnified
 
-MODELS = ("ds", "eucm", "ucm", "kb4", "fov", "pinhole", "pinhole-radtan8")
+MODELS: dict[str, tuple[type[Lens], str]] = {
+    "ds": (DoubleSphere, "xi alpha"),
+    "eucm": (EnhancedUnified, "alpha beta"),
+    "ucm": (EnhancedUnified, "alpha"),
+    "kb4": (KannalaBrandt, "k1 k2 k3 k4"),
+    "fov": (FieldOfView, "omega=w"),
+    "pinhole": (BrownConrady, ""),
+    "pinhole-radtan8": (BrownConrady, "k1 k2 p1 p2 k3 d1=k4 d2=k5 d3=k6"),
+}
 
 
-def fits(content: Content) -> bool:
-    """Whether a file's content is basalt's: it has `value0`."""
-    return isinstance(content, Mapping) and "value0" in content
+class Basalt(Format):
+    """Cameras by the names cam0, cam1, …"""
+
+    name = "basalt"
+    keys = ("value0",)
+
+    def cameras(self, file: Fields, model: str | None) -> Cameras:
+        calibration = file.section("value0")
+        entries = calibration.sections("intrinsics")
+        sizes: Sequence[Size] = [None] * len(entries)
+        if calibration.entries.get("resolution"):
+            sizes = _sizes(calibration, len(entries))
+        pairs = zip(entries, sizes, strict=True)
+        return {f"cam{i}": partial(_camera, entry, size) for i, (entry, size) in enumerate(pairs)}
 
 
-def cameras(file: Fields) -> Cameras:
-    """Its cameras, as cam0, cam1, …"""
-    calibration = file.section("value0")
-    entries = calibration.sections("intrinsics")
-    sizes: Sequence[tuple[int, int] | None] = [None] * len(entries)
-    if calibration.entries.get("resolution"):
-        sizes = calibration.sizes("resolution", len(entries))
-    pairs = zip(entries, sizes, strict=True)
-    return {f"cam{i}": partial(_camera, entry, size) for i, (entry, size) in enumerate(pairs)}
+def _sizes(calibration: Fields, count: int) -> list[tuple[int, int]]:
+    expected = f"{count} pairs of a width and a height"
+    pairs, where = calibration.get("resolution", expected), calibration.path("resolution")
+    if not isinstance(pairs, list) or len(pairs) != count:
+        raise ValueError(f"{where} must be {expected}, got {short(pairs)}")
+    return [to_sides(pair, f"{where}[{i}]")[::-1] for i, pair in enumerate(pairs)]
 
 
-def _camera(entry: Fields, size: tuple[int, int] | None) -> Description:
-    kind = entry.text("camera_type", f"one of {', '.join(MODELS)}")
-    values = entry.section("intrinsics")
-    focal = (values.positive("fx"), values.positive("fy"))
-    center = (values.number("cx"), values.number("cy"))
-
-    def listed(*names: str) -> list[float]:
-        return [values.number(name) for name in names]
-
-    model: type[Lens]
-    parameters: Parameters
-    if kind == "ds":
-        model, parameters = DoubleSphere, {n: values.number(n) for n in ("xi", "alpha")}
-    elif kind == "eucm":
-        model, parameters = EnhancedUnified, {n: values.number(n) for n in ("alpha", "beta")}
-    elif kind == "ucm":
-        model, parameters = EnhancedUnified, {"alpha": values.number("alpha"), "beta": 1.0}
-    elif kind == "kb4":
-        model, parameters = KannalaBrandt, {"radial": listed("k1", "k2", "k3", "k4")}
-    elif kind == "fov":
-        model, parameters = FieldOfView, {"omega": values.number("w")}
-    elif kind == "pinhole":
-        model, parameters = BrownConrady, {}
-    elif kind == "pinhole-radtan8":
-        model = BrownConrady
-        parameters = {
-            "radial": listed("k1", "k2", "k3"),
-            "denominator": listed("k4", "k5", "k6"),
-            "tangential": listed("p1", "p2"),
-        }
-    else:
-        where, expected = entry.path("camera_type"), ", ".join(MODELS)
-        raise ValueError(f"{where} must be one of {expected}, got {kind!r}")
-    values.check_all_read(f"basalt's {kind}", known=("rpmax",))
-    return describe(model, focal, center, size, parameters)
+def _camera(entry: Fields, size: Size) -> Description:
+    kind = entry.one_of("camera_type", MODELS)
+    model, names = MODELS[kind]
+    intrinsics = entry.section("intrinsics")
+    values = intrinsics.values(f"fx fy cx cy {names}")
+    intrinsics.check_all_read(f"basalt's {kind}", known=("rpmax",))
+    return describe(model, {"beta": 1.0} | values, size)

@@ -1,96 +1,173 @@
-"""CamOdoCal's YAML, which KITTI-360 and VINS use: MEI, KANNALA_BRANDT, PINHOLE and SCARAMUZZA."""
+"""CamOdoCal's YAML, which KITTI-360 and VINS use, and OCamCalib's calib_results.txt."""
 
+import math
 from collections.abc import Mapping
 from functools import partial
 
+from darswin.lens.base import Lens
 from darswin.lens.distorted import BrownConrady, KannalaBrandt, Mei
-from darswin.lens.files.cameras import Cameras, Description, describe, in_image
 from darswin.lens.files.content import Content
-from darswin.lens.files.fields import Fields
-from darswin.lens.files.ocamcalib import check_inverse
+from darswin.lens.files.fields import Fields, is_number, short, to_number, to_side
+from darswin.lens.files.format import Cameras, Description, Format, describe, in_image
 from darswin.lens.polynomial import OCam, OCamInverse
 
-Plane = tuple[tuple[float, float], tuple[float, float]]  # focal lengths, principal point
-MODELS = ("MEI", "KANNALA_BRANDT", "PINHOLE", "SCARAMUZZA")
+# The class of each model and the values in each of its sections; SCARAMUZZA has polynomials.
+DISTORTION = "k1 k2 p1 p2"
+MODELS: dict[str, tuple[type[Lens], dict[str, str]]] = {
+    "MEI": (Mei, {"projection_parameters": "fx=gamma1 fy=gamma2 cx=u0 cy=v0",
+                  "mirror_parameters": "xi", "distortion_parameters": DISTORTION}),
+    "KANNALA_BRANDT": (KannalaBrandt, {
+        "projection_parameters": "fx=mu fy=mv cx=u0 cy=v0 k1=k2 k2=k3 k3=k4 k4=k5"}),
+    "PINHOLE": (BrownConrady, {"projection_parameters": "fx fy cx cy",
+                               "distortion_parameters": DISTORTION}),
+    "SCARAMUZZA": (OCam, {}),
+}  # fmt: skip
+BLOCKS = (
+    "the direct polynomial", "the inverse polynomial", "the center (row and column)",
+    "the affine parameters (c, d, e)", "the image size (height and width)",
+)  # fmt: skip
+MOST_APART = 1.0  # px, between the two polynomials; the toolbox fits to some hundredths
+MAX_COEFFICIENTS = 64
+
+Size = tuple[int, int]
 
 
-def fits(content: Content) -> bool:
-    """Whether a file's content is CamOdoCal's: it has a model type, or parameters of one."""
+class CamOdoCal(Format):
+    """One camera, by its name if it has one."""
+
+    name = "KITTI-360 or CamOdoCal"
     keys = ("model_type", "mirror_parameters", "projection_parameters")
-    return isinstance(content, Mapping) and any(key in content for key in keys)
+
+    def cameras(self, file: Fields, model: str | None) -> Cameras:
+        name = file.text("camera_name") if "camera_name" in file else "camera"
+        return {name: partial(_camera, file)}
 
 
-def cameras(file: Fields) -> Cameras:
-    """Its one camera, by its name if it has one."""
-    return {file.text("camera_name") if "camera_name" in file else "camera": partial(_camera, file)}
+class OCamCalib(Format):
+    """Rows of numbers, of one camera."""
+
+    name = "OCamCalib"
+
+    def fits(self, content: Content) -> bool:
+        return isinstance(content, list) and (len(content[0]) < 2 or is_number(content[0][1]))
+
+    def cameras(self, file: list[list[str]], model: str | None) -> Cameras:
+        return {"camera": partial(_camera_of_rows, file)}
 
 
 def _camera(file: Fields) -> Description:
-    said = file.text("model_type", f"one of {', '.join(MODELS)}")
-    model = said.upper()
+    expected = f"one of {', '.join(MODELS)}"
+    kind = file.text("model_type", expected).upper()
+    if kind not in MODELS:
+        raise ValueError(f"model_type must be {expected}, got {kind!r}")
     size = (file.side("image_height"), file.side("image_width"))
-    if model == "SCARAMUZZA":
-        description = _scaramuzza(file, size)
-    elif model == "KANNALA_BRANDT":
-        projection = file.section("projection_parameters")
-        radial = [projection.number(f"k{i}") for i in (2, 3, 4, 5)]
-        plane = _plane(projection, "mu", "mv", "u0", "v0")
-        description = describe(KannalaBrandt, *plane, size, {"radial": radial})
-    elif model == "PINHOLE":
-        plane = _plane(file.section("projection_parameters"), "fx", "fy", "cx", "cy")
-        description = describe(BrownConrady, *plane, size, _distortion(file))
-    elif model == "MEI":
-        plane = _plane(file.section("projection_parameters"), "gamma1", "gamma2", "u0", "v0")
-        mirror = file.section("mirror_parameters")
-        xi = mirror.number("xi")
-        mirror.check_all_read(model)
-        description = describe(Mei, *plane, size, {"xi": xi, **_distortion(file)})
-    else:
-        raise ValueError(f"model_type must be one of {', '.join(MODELS)}, got {said!r}")
+    model, sections = MODELS[kind]
+    values: dict[str, float] = {}
+    for name, names in sections.items():
+        section = file.section(name)
+        values |= section.values(names)
+        section.check_all_read(kind)
+    description = describe(model, values, size) if sections else _scaramuzza(file, size)
     # Other mappings are matrices: where the camera stands.
-    file.check_all_read(
-        model, like=lambda _, value: isinstance(value, Mapping) and "data" not in value
-    )
+    file.check_all_read(kind, lambda _, value: isinstance(value, Mapping) and "data" not in value)
     return description
 
 
-def _plane(fields: Fields, fx: str, fy: str, cx: str, cy: str) -> Plane:
-    plane = (fields.positive(fx), fields.positive(fy)), (fields.number(cx), fields.number(cy))
-    fields.check_all_read("this camera")
-    return plane
-
-
-def _distortion(file: Fields) -> dict[str, list[float]]:
-    fields = file.section("distortion_parameters")
-    k1, k2, p1, p2 = (fields.number(name) for name in ("k1", "k2", "p1", "p2"))
-    fields.check_all_read("this camera")
-    return {"radial": [k1, k2], "tangential": [p1, p2]}
-
-
-def _scaramuzza(file: Fields, size: tuple[int, int]) -> Description:
-    """OCamCalib's polynomials, whose axis may point either way: a₀ tells."""
-    affine = file.section("affine_parameters")
-    center = (affine.number("cx"), affine.number("cy"))
-    matrix = [[affine.number("ac"), affine.number("ad")], [affine.number("ae"), 1.0]]
-    affine.check_all_read("SCARAMUZZA")
+def _scaramuzza(file: Fields, size: Size) -> Description:
+    """OCamCalib's polynomials, whose axis may point either way, as a₀ tells."""
+    section = file.section("affine_parameters")
+    affine = section.values("cx cy c=ac d=ad e=ae")
+    section.check_all_read("SCARAMUZZA")
+    matrix = [[affine["c"], affine["d"]], [affine["e"], 1.0]]
     direct = _polynomial(file.section("poly_parameters"))
-    backwards = direct[0] > 0
-    if backwards:
+    inverse = []
+    if "inv_poly_parameters" in file:
+        inverse = _polynomial(file.section("inv_poly_parameters"))
+    if not any(inverse):
+        inverse = []
+    if direct[0] > 0:
         direct = [-c for c in direct]
-    inverse = file.section("inv_poly_parameters") if "inv_poly_parameters" in file else None
-    if inverse is not None and any(coefficients := _polynomial(inverse)):
-        if backwards:
-            coefficients = [c * (-1) ** i for i, c in enumerate(coefficients)]
-        check_inverse(direct, coefficients, size)
-        return in_image(OCamInverse, center, matrix, size, {"coefficients": coefficients})
-    return in_image(OCam, center, matrix, size, {"coefficients": direct})
+        inverse = [c * (-1) ** i for i, c in enumerate(inverse)]
+    return _ocam(direct, inverse, (affine["cx"], affine["cy"]), matrix, size)
 
 
 def _polynomial(fields: Fields) -> list[float]:
     """p0, p1, … as far as they go."""
     count = 1
-    while count < 64 and f"p{count}" in fields:
+    while count < MAX_COEFFICIENTS and f"p{count}" in fields:
         count += 1
-    coefficients = [fields.number(f"p{i}") for i in range(count)]
+    coefficients = fields.values(" ".join(f"p{i}" for i in range(count)))
     fields.check_all_read("SCARAMUZZA")
-    return coefficients
+    return list(coefficients.values())
+
+
+def _camera_of_rows(rows: list[list[str]]) -> Description:
+    names = BLOCKS if len(rows) != len(BLOCKS) - 1 else (BLOCKS[0], *BLOCKS[2:])
+    if len(rows) != len(names):
+        raise ValueError(
+            f"it must have {len(BLOCKS)} lines of numbers, {', '.join(BLOCKS)}; got {len(rows)}"
+        )
+    block = dict(zip(names, rows, strict=True))
+    direct = _counted(block, BLOCKS[0])
+    inverse = _counted(block, BLOCKS[1]) if BLOCKS[1] in block else []
+    row, column = _numbers(block, BLOCKS[2], 2)
+    c, d, e = _numbers(block, BLOCKS[3], 3)
+    height, width = (to_side(number, BLOCKS[4]) for number in _numbers(block, BLOCKS[4], 2))
+    # Its x' is down and its y' to the right: row = c x' + d y' + …, column = e x' + y' + ….
+    return _ocam(direct, inverse, (column, row), [[1.0, e], [d, c]], (height, width))
+
+
+def _numbers(block: dict[str, list[str]], name: str, count: int) -> list[float]:
+    if len(block[name]) != count:
+        raise ValueError(f"{name} must be {count} numbers, got {short(block[name])}")
+    return [to_number(word, name, f"{count} numbers") for word in block[name]]
+
+
+def _counted(block: dict[str, list[str]], name: str) -> list[float]:
+    """The coefficients after their number."""
+    count, *words = block[name]
+    if count != str(len(words)) or len(words) > MAX_COEFFICIENTS:
+        raise ValueError(
+            f"{name} must be the number of its coefficients, {MAX_COEFFICIENTS} at most, and "
+            f"these, got {short(count)} and {len(words)} of them"
+        )
+    return [to_number(word, name, "finite numbers") for word in words]
+
+
+def _ocam(
+    direct: list[float],
+    inverse: list[float],
+    center: tuple[float, float],
+    affine: list[list[float]],
+    size: Size,
+) -> Description:
+    """The lens of the inverse polynomial if there is one, else of the direct one."""
+    if not inverse:
+        return in_image(OCam, center, affine, size, {"coefficients": direct})
+    _check_inverse(direct, inverse, size)
+    return in_image(OCamInverse, center, affine, size, {"coefficients": inverse})
+
+
+def _check_inverse(direct: list[float], inverse: list[float], size: Size) -> None:
+    """ValueError unless both polynomials are of one lens, up to half the image's diagonal."""
+    reach, last = math.hypot(*size) / 2, -1.0
+    for step in range(257):
+        radius = reach * step / 256
+        theta = math.atan2(radius, -_value(direct, radius))
+        if theta <= last:
+            return  # no ray lands beyond
+        last = theta
+        found = _value(inverse, theta - math.pi / 2)
+        if not abs(found - radius) <= MOST_APART:
+            raise ValueError(
+                f"the inverse polynomial must give back the direct one's radii to {MOST_APART:g} "
+                f"px, got {found:.6g} px for {radius:.6g} px; the file without the inverse "
+                "polynomial means the direct one"
+            )
+
+
+def _value(coefficients: list[float], x: float) -> float:
+    value = 0.0
+    for coefficient in reversed(coefficients):
+        value = value * x + coefficient
+    return value

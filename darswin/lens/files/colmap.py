@@ -5,9 +5,9 @@ from functools import partial
 
 from darswin.lens.base import Lens
 from darswin.lens.distorted import BrownConrady, Fisheye624, KannalaBrandt
-from darswin.lens.files.cameras import Camera, Cameras, Description, Parameters, describe
 from darswin.lens.files.content import Content
 from darswin.lens.files.fields import Fields, is_number, short
+from darswin.lens.files.format import Cameras, Description, Format, Intrinsics, describe
 from darswin.lens.ideal import FieldOfView, Perspective
 from darswin.lens.sphere import EnhancedUnified
 
@@ -43,20 +43,69 @@ NUMBERED = (
 )  # fmt: skip
 _COUNT, _HEAD = struct.Struct("<Q"), struct.Struct("<IiQQ")  # id, model, width, height
 
+# A written camera has the first of its class that has a place for all its terms.
+WRITTEN = ("PINHOLE", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE", "THIN_PRISM_FISHEYE",
+           "RAD_TAN_THIN_PRISM_FISHEYE", "FOV", "EUCM", "DIVISION")  # fmt: skip
 
-def fits(content: Content) -> bool:
-    """Whether a file's content is COLMAP's: rows whose second word is the name of a model."""
-    return isinstance(content, list) and len(content[0]) > 1 and not is_number(content[0][1])
+
+class Colmap(Format):
+    """Rows whose second word is the name of a model: cameras by their ids."""
+
+    name = "COLMAP"
+    origin = 0.5
+    holds = (
+        "without skew, Perspective and BrownConrady (3 radial, no prism), Equidistant and "
+        "KannalaBrandt (4 radial), Fisheye624 (6 radial), FieldOfView and EnhancedUnified"
+    )
+
+    def fits(self, content: Content) -> bool:
+        return isinstance(content, list) and len(content[0]) > 1 and not is_number(content[0][1])
+
+    def cameras(self, file: list[list[str]], model: str | None) -> Cameras:
+        found: Cameras = {}
+        for row in file:
+            if row[0] in found:
+                raise ValueError(f"there must be one camera {short(row[0])}, got two")
+            found[row[0]] = partial(_camera, row)
+        return found
+
+    def _text(self, camera: Intrinsics, suffix: str) -> str | None:
+        height, width = self._size(camera)
+        values = dict(camera.values)
+        if values.get("beta", 1) < 0 and values["alpha"] == 0.5:
+            values["division"] = values.pop("beta") / -4
+            del values["alpha"]
+        camera = camera._replace(values=values)
+        name = next((name for name in WRITTEN if camera.fits(*MODELS[name])), None)
+        if name is None:
+            return None
+        numbers = " ".join(map(repr, camera.listed(MODELS[name][1])))
+        return (
+            "# Camera list with one line of data per camera:\n"
+            "#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n# Number of cameras: 1\n"
+            f"1 {name} {width} {height} {numbers}\n"
+        )
 
 
-def cameras(rows: list[list[str]]) -> Cameras:
-    """Its cameras, by their ids."""
-    found: Cameras = {}
-    for row in rows:
-        if row[0] in found:
-            raise ValueError(f"there must be one camera {short(row[0])}, got two")
-        found[row[0]] = partial(_camera, row)
-    return found
+def _camera(row: list[str]) -> Description:
+    where = f"camera {short(row[0])}, "
+    if len(row) < 4:
+        raise ValueError(f"{where}must be an id, a model, a width, a height and parameters")
+    name = row[1]
+    if name not in MODELS:
+        raise ValueError(f"{where}model must be one of {', '.join(MODELS)}, got {short(name)}")
+    model, order = MODELS[name]
+    names = order.split()
+    if len(row) != 4 + len(names):
+        raise ValueError(f"{where}{name} must have {len(names)} parameters, got {len(row) - 4}")
+    file = Fields(dict(zip(["width", "height", *names], row[2:], strict=True)), where)
+    values = file.values(order.replace("f cx", "fx=f fy=f cx"))
+    division = values.pop("division", 0.0)
+    if division:  # r / (1 + k r²) = tan θ is an EUCM
+        values |= {"alpha": 0.5, "beta": -4 * division}
+    elif "division" in names:
+        model = Perspective
+    return describe(model, values, (file.side("height"), file.side("width")))
 
 
 def is_binary(data: bytes) -> bool:
@@ -65,14 +114,7 @@ def is_binary(data: bytes) -> bool:
 
 
 def from_binary(data: bytes, most: int) -> str:
-    """A cameras.bin as the cameras.txt of the same cameras.
-
-    Args:
-        most: cameras that it may have.
-
-    Raises:
-        ValueError: more cameras, an unknown model, or another length than its cameras have.
-    """
+    """A cameras.bin of at most so many cameras as the cameras.txt of the same ones."""
     (count,), place = _COUNT.unpack_from(data), _COUNT.size
     if count > most:
         raise ValueError(f"it must have 1 to {most} cameras, got {count}")
@@ -97,71 +139,3 @@ def from_binary(data: bytes, most: int) -> str:
     if place != len(data):
         raise ValueError(f"it holds {len(data) - place} bytes after its {count} cameras")
     return "\n".join(lines)
-
-
-# What `write` makes of a camera: the first of its class that has a place for all its terms.
-WRITTEN = ("PINHOLE", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE", "THIN_PRISM_FISHEYE",
-           "RAD_TAN_THIN_PRISM_FISHEYE", "FOV", "EUCM", "DIVISION")  # fmt: skip
-
-
-def write(camera: Camera) -> str | None:
-    """A cameras.txt of camera 1; None if COLMAP has no such camera."""
-    if camera.size is None:
-        raise ValueError("COLMAP's cameras have an image_size, (H, W), and this lens has none")
-    values = camera.plane | camera.terms
-    if values.get("beta", 1) < 0 and values["alpha"] == 0.5:
-        values["division"] = values.pop("beta") / -4
-        del values["alpha"]
-    for name in WRITTEN:
-        model, names = MODELS[name]
-        if model is camera.model and camera.skew == 0 and values.keys() <= {*names.split()}:
-            numbers = (values.get(n, 0.0) for n in names.split())
-            height, width = camera.size
-            return (
-                "# Camera list with one line of data per camera:\n"
-                "#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n# Number of cameras: 1\n"
-                f"1 {name} {width} {height} {' '.join(map(repr, numbers))}\n"
-            )
-    return None
-
-
-def _camera(row: list[str]) -> Description:
-    where = f"camera {short(row[0])}, "
-    if len(row) < 4:
-        raise ValueError(f"{where}must be an id, a model, a width, a height and parameters")
-    name = row[1]
-    if name not in MODELS:
-        raise ValueError(f"{where}model must be one of {', '.join(MODELS)}, got {short(name)}")
-    model, order = MODELS[name]
-    names = order.split()
-    if len(row) != 4 + len(names):
-        raise ValueError(f"{where}{name} must have {len(names)} parameters, got {len(row) - 4}")
-    values = Fields(dict(zip(["width", "height", *names], row[2:], strict=True)), where)
-    fx, fy = ("f", "f") if "f" in values else ("fx", "fy")
-    focal = (values.positive(fx), values.positive(fy))
-    center = (values.number("cx"), values.number("cy"))
-    size = (values.side("height"), values.side("width"))
-    parameters: Parameters
-    if "division" in values:
-        model, parameters = _division(values)
-    elif model in (FieldOfView, EnhancedUnified):
-        parameters = {n: values.number(n) for n in names[4:]}
-    else:
-        parameters = _terms(values, names)
-    return describe(model, focal, center, size, parameters)
-
-
-def _terms(values: Fields, names: list[str]) -> dict[str, list[float]]:
-    terms = {"radial": "k1 k2 k3 k4 k5 k6", "denominator": "d1 d2 d3", "tangential": "p1 p2",
-             "prism": "s1 s2 s3 s4"}  # fmt: skip
-    # THIN_PRISM_FISHEYE has s₁ and s₃ only: sx1 and sy1.
-    present = {term: [n for n in order.split() if n in names] for term, order in terms.items()}
-    if present["prism"]:
-        present["prism"] = terms["prism"].split()
-    return {t: [values.number(n, 0.0) for n in order] for t, order in present.items() if order}
-
-
-def _division(values: Fields) -> tuple[type[Lens], dict[str, float]]:
-    """The division model, r / (1 + k r²) = tan θ, is an EUCM of α = 1/2 and β = -4 k."""
-    k = values.number("division")
-    return (EnhancedUnified, {"alpha": 0.5, "beta": -4 * k}) if k else (Perspective, {})

@@ -7,6 +7,8 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 _NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", re.ASCII)
+_COEFFICIENTS = re.compile(r"^d(\d*|left|right)$|coef|(?<!un)dist(?!an[ct])")
+_COEFFICIENT = re.compile(r"[kps]\d+")
 _MAX_WORD = 64
 MAX_SIDE = 1_000_000
 
@@ -47,19 +49,28 @@ def to_number(value: Any, name: str, expected: str = "a finite number") -> float
 
 def to_positive(value: Any, name: str) -> float:
     """A finite number above 0."""
-    number = to_number(value, name, "a finite number above 0")
+    expected = "a finite number above 0"
+    number = to_number(value, name, expected)
     if not number > 0:
-        raise ValueError(f"{name} must be a finite number above 0, got {short(value)}")
+        raise ValueError(f"{name} must be {expected}, got {short(value)}")
     return number
 
 
-def to_side(value: Any, name: str) -> int:
-    """A side of an image, in pixels."""
-    expected = f"a whole number of pixels, 1 to {MAX_SIDE}"
+def to_side(value: Any, name: str, least: int = 1) -> int:
+    """A number of pixels."""
+    expected = f"a whole number of pixels, {least} to {MAX_SIDE}"
     number = to_number(value, name, expected)
-    if not (1 <= number <= MAX_SIDE and number.is_integer()):
+    if not (least <= number <= MAX_SIDE and number.is_integer()):
         raise ValueError(f"{name} must be {expected}, got {short(value)}")
     return int(number)
+
+
+def to_sides(value: Any, name: str) -> tuple[int, int]:
+    """Two numbers of pixels, in the file's order; as text, they stand between spaces."""
+    words = value.split() if isinstance(value, str) else value
+    if not isinstance(words, list) or len(words) != 2:
+        raise ValueError(f"{name} must be two whole numbers of pixels, got {short(value)}")
+    return to_side(words[0], f"{name}[0]"), to_side(words[1], f"{name}[1]")
 
 
 def holds_numbers(value: Any) -> bool:
@@ -73,11 +84,23 @@ def holds_numbers(value: Any) -> bool:
     return isinstance(value, (int, float)) and not isinstance(value, bool) and value != 0
 
 
+def plain_name(name: str) -> str:
+    """A name without what writers of files differ in."""
+    return name.lower().replace("_", "").replace("-", "").replace(" ", "")
+
+
+def like_coefficients(name: str, value: Any) -> bool:
+    """Whether an entry may be of coefficients, or be one; not how sure they are."""
+    plain = plain_name(name)
+    alone = not isinstance(value, (list, Mapping))
+    found = _COEFFICIENTS.search(plain) or (alone and _COEFFICIENT.fullmatch(plain))
+    return bool(found) and "std" not in plain
+
+
 class Fields:
     """A mapping of a file. Its methods read an entry by name, and it knows which ones were read.
 
-    Raises:
-        ValueError: an entry that is missing or of the wrong kind.
+    They raise ValueError for an entry that is missing or of the wrong kind.
     """
 
     def __init__(self, entries: Mapping[str, Any], where: str = ""):
@@ -101,24 +124,22 @@ class Fields:
     def check_all_read(
         self,
         camera: str,
-        *,
-        known: tuple[str, ...] = (),
-        like: Callable[[str, Any], Any] = lambda name, value: True,
+        like: Callable[[str, Any], bool] = lambda name, value: True,
+        known: Iterable[str] = (),
     ) -> None:
-        """That no number was left out, which might be a coefficient under another name.
+        """ValueError if a number was left out, which might be a coefficient under another name.
 
         Args:
-            camera: what the numbers are of. known: names of what may be left out. like: whether
-                an entry, a name and a value, looks like coefficients.
+            camera: what the numbers are of. like: whether an entry, by its name and value, may be
+                one of them. known: names of what may be left out.
         """
         left = [
-            name for name, value in self.entries.items()
-            if name not in self._read and name not in known and holds_numbers(value)
-            and like(str(name), value)
+            self.path(name) for name, value in self.entries.items()
+            if name not in self._read and name not in known and like(str(name), value)
+            and holds_numbers(value)
         ]  # fmt: skip
         if left:
-            where = listed(self.path(name) for name in left)
-            raise ValueError(f"{camera} has no place for the numbers of {where}")
+            raise ValueError(f"{camera} has no place for the numbers of {listed(left)}")
 
     def section(self, name: str) -> "Fields":
         """The entry as a mapping."""
@@ -144,14 +165,38 @@ class Fields:
         """The entry as a finite number above 0."""
         return to_positive(self.get(name, "a finite number above 0"), self.path(name))
 
+    def values(self, names: str, default: float | None = None) -> dict[str, float]:
+        """Several numbers by our names, such as "fx fy k1": where the file has another name for
+        one, as "fx=gamma1". Focal lengths are above 0."""
+        found = {}
+        for word in names.split():
+            ours, _, theirs = word.partition("=")
+            name = theirs or ours
+            is_focal = ours in ("fx", "fy")
+            found[ours] = self.positive(name) if is_focal else self.number(name, default)
+        return found
+
     def side(self, name: str) -> int:
         """The entry as a side of an image, in pixels."""
         return to_side(self.get(name, "a whole number of pixels"), self.path(name))
+
+    def sides(self, name: str) -> tuple[int, int]:
+        """Two sides of an image, in the file's order."""
+        return to_sides(self.get(name, "two whole numbers of pixels"), self.path(name))
 
     def text(self, name: str, expected: str = "text") -> str:
         """The entry as text."""
         value = self.get(name, expected)
         if not isinstance(value, str):
+            raise ValueError(f"{self.path(name)} must be {expected}, got {short(value)}")
+        return value
+
+    def one_of(self, name: str, allowed: Iterable[str]) -> str:
+        """The entry as one of some words."""
+        allowed = tuple(allowed)
+        expected = f"one of {', '.join(allowed)}"
+        value = self.text(name, expected)
+        if value not in allowed:
             raise ValueError(f"{self.path(name)} must be {expected}, got {short(value)}")
         return value
 
@@ -163,24 +208,3 @@ class Fields:
         if not isinstance(words, list) or len(words) not in counts:
             raise ValueError(f"{self.path(name)} must be {expected}, got {short(value)}")
         return [to_number(word, f"{self.path(name)}[{i}]") for i, word in enumerate(words)]
-
-    def sides(self, name: str) -> tuple[int, int]:
-        """Two sides of an image, in the file's order."""
-        return _pair(self.get(name, "two whole numbers of pixels"), self.path(name))
-
-    def sizes(self, name: str, count: int) -> list[tuple[int, int]]:
-        """A list of as many pairs, each a width and a height, as (H, W)."""
-        value = self.get(name, f"{count} pairs of a width and a height")
-        if not isinstance(value, list) or len(value) != count:
-            raise ValueError(
-                f"{self.path(name)} must be {count} pairs of a width and a height, got "
-                f"{short(value)}"
-            )
-        return [_pair(pair, f"{self.path(name)}[{i}]")[::-1] for i, pair in enumerate(value)]
-
-
-def _pair(value: Any, name: str) -> tuple[int, int]:
-    words = value.split() if isinstance(value, str) else value
-    if not isinstance(words, list) or len(words) != 2:
-        raise ValueError(f"{name} must be two whole numbers of pixels, got {short(value)}")
-    return to_side(words[0], f"{name}[0]"), to_side(words[1], f"{name}[1]")

@@ -1,31 +1,28 @@
-"""Reading a calibration file of any format."""
+"""Reading and writing a calibration file of any format."""
 
 import math
 import os
-from collections.abc import Callable, Iterator, Mapping
+import re
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Self
 
 import torch
 from torch import Tensor
 
 from darswin.lens.base import MODELS, Lens, from_dict
-from darswin.lens.files import (
-    basalt,
-    camodocal,
-    colmap,
-    flat,
-    kalibr,
-    nerfstudio,
-    ocamcalib,
-    opencv,
-    own,
-    woodscape,
-)
-from darswin.lens.files.cameras import Cameras, Description
-from darswin.lens.files.content import Content, from_npz, is_npz, parse, read_bytes, to_text
-from darswin.lens.files.fields import Fields, short
+from darswin.lens.files import colmap, opencv
+from darswin.lens.files.basalt import Basalt
+from darswin.lens.files.camodocal import CamOdoCal, OCamCalib
+from darswin.lens.files.content import from_npz, is_npz, parse, read_bytes, to_text
+from darswin.lens.files.fields import Fields, listed, short
+from darswin.lens.files.format import Description, Format
+from darswin.lens.files.kalibr import Kalibr
+from darswin.lens.files.nerfstudio import Nerfstudio
+from darswin.lens.files.own import Own
+from darswin.lens.files.woodscape import WoodScape
+from darswin.utils.files import replace_file
 
 # A curve that lands further out than this, px, is of no use: a pinhole's near 90°.
 MAX_RADIUS = 1e6
@@ -33,34 +30,15 @@ MAX_RADIUS = 1e6
 ROUNDING = 1e-4
 MAX_CAMERAS = 10_000
 
-
-@dataclass(frozen=True)
-class Format:
-    """Attributes: name; fits: whether content is of this format; cameras: its descriptions;
-    origin: where the format has the center of the upper left pixel, along both axes: ours is 0;
-    takes_model: whether `load`'s model may say what its coefficients are."""
-
-    name: str
-    fits: Callable[[Content], bool]
-    cameras: Callable[..., Cameras]
-    origin: float
-    takes_model: bool = False
-
-
 # The first that fits is taken.
-FORMATS = (
-    Format("darswin", own.fits, own.cameras, 0.0),
-    Format("WoodScape", woodscape.fits, woodscape.cameras, 0.5),
-    Format("basalt", basalt.fits, basalt.cameras, 0.0),
-    Format("nerfstudio", nerfstudio.fits, nerfstudio.cameras, 0.5),
-    Format("KITTI-360 or CamOdoCal", camodocal.fits, camodocal.cameras, 0.0),
-    Format("Kalibr", kalibr.fits, kalibr.cameras, 0.0),
-    Format("intrinsics by name", flat.fits, flat.cameras, 0.0, takes_model=True),
-    Format("ROS camera_info", opencv.fits_ros, opencv.cameras, 0.0, takes_model=True),
-    Format("OpenCV", opencv.fits, opencv.cameras, 0.0, takes_model=True),
-    Format("OCamCalib", ocamcalib.fits, ocamcalib.cameras, 0.0),
-    Format("COLMAP", colmap.fits, colmap.cameras, 0.5),
-)
+FORMATS: tuple[Format, ...] = (
+    Own(), WoodScape(), Basalt(), Nerfstudio(), CamOdoCal(), Kalibr(), opencv.ByName(),
+    opencv.Ros(), opencv.OpenCV(), OCamCalib(), colmap.Colmap(),
+)  # fmt: skip
+# Those that `save` writes.
+WRITTEN: dict[str, Format] = {
+    "darswin": Own(), "opencv": opencv.OpenCV(), "colmap": colmap.Colmap(), "kalibr": Kalibr()
+}  # fmt: skip
 
 
 def load(
@@ -98,20 +76,6 @@ def load(
     return Calibration.read(path, model).lens(camera, theta_max, image_size, dtype)
 
 
-def loads(
-    text: str,
-    *,
-    camera: str | int | None = None,
-    theta_max: float | None = None,
-    image_size: tuple[int, int] | None = None,
-    model: str | None = None,
-    dtype: torch.dtype | None = None,
-    name: str = "in a string",
-) -> Lens:
-    """`load` for a file's text; `name` is what errors call it."""
-    return Calibration(text, name, model).lens(camera, theta_max, image_size, dtype)
-
-
 def load_all(
     path: str | os.PathLike,
     *,
@@ -124,8 +88,39 @@ def load_all(
     return Calibration.read(path, model).lenses(theta_max, image_size, dtype)
 
 
+def save(lens: Lens, path: str | os.PathLike, format: str | None = None) -> str:
+    """Writes one lens as a file that `load` reads, and `darswin predict --lens`.
+
+    Our own JSON holds any lens. The other formats hold those of their own models, all but θ_max:
+    `load` finds it from the image's sides.
+
+    Args:
+        format: "darswin", "opencv", "colmap" or "kalibr". None tells it from the path: OpenCV's for
+            .xml, .yaml and .yml, but Kalibr's where the name has "camchain" or "kalibr"; COLMAP's
+            for .txt; else ours.
+
+    Returns:
+        The format.
+
+    Raises:
+        ValueError: several lenses, a lens of a model that is not in `MODELS`, or one that the
+            format cannot hold exactly.
+    """
+    path = Path(path)
+    suffix = path.suffix.lower()
+    if format is None:
+        by_suffix = {".xml": "opencv", ".yaml": "opencv", ".yml": "opencv", ".txt": "colmap"}
+        format = by_suffix.get(suffix, "darswin")
+        if suffix in (".yaml", ".yml") and re.search("camchain|kalibr", path.stem.lower()):
+            format = "kalibr"
+    if format not in WRITTEN:
+        raise ValueError(f"format must be {', '.join(WRITTEN)} or None, got {format!r}")
+    replace_file(path, WRITTEN[format].write(lens, suffix))
+    return format
+
+
 class Calibration:
-    """A calibration file: its format, and its cameras, which are described when asked for.
+    """The text of a calibration file: its format, and its cameras, described when asked for.
 
     Attributes: format; names: of the cameras.
     """
@@ -137,29 +132,26 @@ class Calibration:
             found = next((f for f in FORMATS if f.fits(content)), None)
             if found is None:
                 known = ", ".join(f.name for f in FORMATS)
-                said = content.get("model") if isinstance(content, Mapping) else None
+                given = content.get("model") if isinstance(content, Mapping) else None
                 raise ValueError(
                     f'it must be of one of the formats {known}; darswin\'s own "model" must be '
-                    f"one of {', '.join(sorted(MODELS))}, got {short(said)}"
+                    f"one of {', '.join(sorted(MODELS))}, got {short(given)}"
                 )
         self.format, self.what = found, f"{found.name} {self.what}"
         with self._about():
-            fields = content if isinstance(content, list) else Fields(content)
-            if model is None:
-                self._cameras = found.cameras(fields)
-            elif not found.takes_model:
+            if model is not None and not found.takes_model:
                 raise ValueError(f"its cameras say their model, but model={model!r} was given")
-            elif model not in opencv.MODELS:
+            if model not in (None, *opencv.MODELS):
                 raise ValueError(f"model must be one of {', '.join(opencv.MODELS)}, got {model!r}")
-            else:
-                self._cameras = found.cameras(fields, model)
+            fields = content if isinstance(content, list) else Fields(content)
+            self._cameras = found.cameras(fields, model)
             self.names = list(self._cameras)
             if not 1 <= len(self.names) <= MAX_CAMERAS:
                 raise ValueError(f"it must have 1 to {MAX_CAMERAS} cameras, got {len(self.names)}")
 
     @classmethod
     def read(cls, path: str | os.PathLike, model: str | None = None) -> Self:
-        """`model`, and errors: as `load`."""
+        """The file at a path; `model` as of `load`."""
         name = os.fspath(path)
         try:
             data = read_bytes(path)
@@ -175,13 +167,9 @@ class Calibration:
 
     def choose(self, camera: str | int | None) -> str:
         """The name of a camera: by its name; by its number from 0, in a file that does not call
-        its cameras by numbers; or by None, if all are the same.
-
-        Raises:
-            ValueError: there is no such camera, or there are several.
-        """
+        its cameras by numbers; or by None, if all are the same."""
         names = self.names
-        shown = ", ".join(short(name) for name in names[:20]) + (", …" if len(names) > 20 else "")
+        shown = listed(map(short, names))
         with self._about():
             if camera is None:
                 first = self._describe(names[0]) if len(names) > 1 else None
@@ -237,9 +225,8 @@ class Calibration:
             if len(names) == 1:
                 raise
             half = len(names) // 2
-            return self._together(names[:half], *arguments) | self._together(
-                names[half:], *arguments
-            )
+            first = self._together(names[:half], *arguments)
+            return first | self._together(names[half:], *arguments)
         return {name: lenses[i] for i, name in enumerate(names)}
 
     def _describe(self, name: str) -> Description:
@@ -308,7 +295,7 @@ def reach(lens: Lens) -> Tensor:
 
 
 def _check(lens: Lens, most: float) -> None:
-    """That rays land at finite places, and within `most` px of the center."""
+    """ValueError unless rays land at finite places, within `most` px of the center."""
     theta = lens.theta_max[:, None] * torch.linspace(0, 1, 33, dtype=lens.theta_max.dtype)
     azimuth = torch.linspace(0, 2 * math.pi, 5, dtype=theta.dtype)[:4]
     shape = (len(lens), 33, 4)

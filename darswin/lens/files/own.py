@@ -1,24 +1,30 @@
 """Our own JSON: a model's name and the arguments of its constructor."""
 
+import json
 from collections.abc import Mapping
 from typing import Any
 
-from darswin.lens.base import MODELS
-from darswin.lens.files.cameras import Cameras, Description
+from darswin.lens.base import MODELS, Lens, to_dict
 from darswin.lens.files.content import Content
 from darswin.lens.files.fields import Fields, short, to_number, to_positive
+from darswin.lens.files.format import Cameras, Description, Format
 from darswin.lens.ideal import FocalLens
 
 
-def fits(content: Content) -> bool:
-    """Whether a file's content is our own: it names one of `MODELS`."""
-    model = content.get("model") if isinstance(content, Mapping) else None
-    return isinstance(model, str) and model in MODELS
+class Own(Format):
+    """One lens of any of `MODELS`."""
 
+    name = "darswin"
 
-def cameras(file: Fields) -> Cameras:
-    """Its one lens."""
-    return {"lens": lambda: _lens(file)}
+    def fits(self, content: Content) -> bool:
+        model = content.get("model") if isinstance(content, Mapping) else None
+        return isinstance(model, str) and model in MODELS
+
+    def cameras(self, file: Fields, model: str | None) -> Cameras:
+        return {"lens": lambda: _lens(file)}
+
+    def write(self, lens: Lens, suffix: str) -> str:
+        return json.dumps(to_dict(lens), indent=2, allow_nan=False) + "\n"
 
 
 def _lens(file: Fields) -> Description:

@@ -1,10 +1,7 @@
 """WoodScape's and SynWoodScape's JSON: `intrinsic`, a polynomial of the angle."""
 
-from collections.abc import Mapping
-
-from darswin.lens.files.cameras import Cameras, Description, in_image
-from darswin.lens.files.content import Content
 from darswin.lens.files.fields import Fields
+from darswin.lens.files.format import Cameras, Description, Format, in_image
 from darswin.lens.polynomial import Polynomial
 
 # The least k₁, px per rad, of an image of a few dozen pixels.
@@ -12,14 +9,15 @@ LEAST_K1 = 10.0
 MAX_ORDER = 16
 
 
-def fits(content: Content) -> bool:
-    """Whether a file's content is WoodScape's: it has `intrinsic`."""
-    return isinstance(content, Mapping) and "intrinsic" in content
+class WoodScape(Format):
+    """One camera, by its name if it has one."""
 
+    name = "WoodScape"
+    origin = 0.5
+    keys = ("intrinsic",)
 
-def cameras(file: Fields) -> Cameras:
-    """Its one camera, by its name if it has one."""
-    return {file.text("name") if "name" in file else "camera": lambda: _camera(file)}
+    def cameras(self, file: Fields, model: str | None) -> Cameras:
+        return {file.text("name") if "name" in file else "camera": lambda: _camera(file)}
 
 
 def _camera(file: Fields) -> Description:
@@ -34,15 +32,12 @@ def _camera(file: Fields) -> Description:
     if coefficients[0] < LEAST_K1:
         raise ValueError(
             f"intrinsic.k1 must be in pixels per radian, at least {LEAST_K1:g}, got "
-            f"{coefficients[0]:g}: if these are Kannala–Brandt coefficients (OpenCV's fisheye), "
-            "they are not radial_poly's; give them with their camera matrix, as an OpenCV file "
-            "or a KannalaBrandt lens"
+            f"{coefficients[0]:g}: Kannala–Brandt coefficients (OpenCV's fisheye) are not "
+            "radial_poly's; write them into an OpenCV file or a KannalaBrandt lens"
         )
     width, height = intrinsic.side("width"), intrinsic.side("height")
-    center = (
-        width / 2 + intrinsic.number("cx_offset"),
-        height / 2 + intrinsic.number("cy_offset"),
-    )
+    offset = intrinsic.values("x=cx_offset y=cy_offset")
+    center = (width / 2 + offset["x"], height / 2 + offset["y"])
     aspect = intrinsic.positive("aspect_ratio") if "aspect_ratio" in intrinsic else 1.0
     affine = None if aspect == 1 else [[1.0, 0.0], [0.0, aspect]]
     intrinsic.check_all_read(f"a radial_poly of order {order:g}")
