@@ -1,6 +1,7 @@
 """Examples of every lens model: a new model is added here, and all tests of all models run it."""
 
 import math
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -24,15 +25,22 @@ from darswin.lens import (
     Spherical,
     Stereographic,
     Tabulated,
+    load,
 )
 from darswin.lens.files.load import Calibration
 
 f64 = torch.float64
+FILES = Path(__file__).parent / "lens" / "files"
 
 
 def loads(text: str, model: str | None = None, **options) -> Lens:
     """`load` for the text of a file."""
     return Calibration(text, "in a string", model).lens(**options)
+
+
+def file_text(name: str) -> str:
+    """The text of a calibration of the tests."""
+    return FILES.joinpath(name).read_text()
 
 
 def double(*values):
@@ -94,42 +102,66 @@ ASIDE = {
                                affine=double(1.001, -8e-4, 2e-4, 1).view(2, 2)),
 }  # fmt: skip
 
-# The lenses of tests/lens/files, and r in px at 10, 30, 45, 60, 75, 85, 90 and 95°, computed from
-# the models' formulas with 40 digits (mpmath). Only TUM-VI's is a real camera's.
+# Of calibrations of tests/lens/files, and their cameras: r in px at `DEGREES`, computed from the
+# models' formulas with 40 digits (mpmath). Only TUM-VI's is a real camera's.
+DEGREES = double(10, 30, 45, 60, 75, 85, 90, 95)
+TUMVI = (33.336, 100.093, 150.289, 200.445, 249.862, 281.623, 296.876, 311.559)
+EUCM = (34.619, 103.857, 155.807, 207.761, 259.431, 293.235, 309.708, 325.715)
+OCAM = (50.691, 159.562, 253.543, 360.432, 478.438, 562.226, 605.753, 650.602)
 CALIBRATIONS = {
-    "front": (
-        Polynomial(double(350.4, -17.5, 27.5, -2.4)),
-        (60.767, 182.438, 276.818, 376.441, 483.321, 559.477, 599.200, 640.089)),
-    "second front": (
-        Polynomial(double(344.6, -12.8, 19.7, 1.4)),
-        (59.860, 179.856, 272.829, 371.134, 477.444, 554.156, 594.590, 636.559)),
-    "left": (
-        Mei(double(2.35), 1390.0, double(0.032, 2.4)),
-        (72.387, 216.575, 324.265, 432.268, 540.123, 609.270, 641.463, 670.895)),
-    "right": (
-        Mei(double(2.7), 1600.4, double(-0.021, 5.2)),
-        (75.418, 224.754, 335.049, 444.537, 552.149, 619.031, 649.031, 675.367)),
-    "TUM-VI Kalibr": (
-        KannalaBrandt(double(190.97847715128717), double(
-            .0034823894022493434, .0007150348452162257, -.0020532361418706202,
-            .00020293673591811182)),
-        (33.336, 100.093, 150.289, 200.445, 249.862, 281.623, 296.876, 311.559)),
-    "basalt eucm": (
-        EnhancedUnified(double(0.614508), 1.086231, 198.3542),
-        (34.619, 103.857, 155.807, 207.761, 259.431, 293.235, 309.708, 325.715)),
-    "Kalibr ds": (
-        DoubleSphere(double(-0.21350274), 0.578016, 331.24405),
-        (73.511, 220.677, 331.414, 442.589, 553.504, 626.021, 661.234, 695.292)),
-    "basalt ds": (
-        DoubleSphere(double(-0.091265), 0.731608, 388.4),
-        (74.461, 220.044, 322.610, 415.103, 492.213, 531.685, 546.924, 558.704)),
-    "COLMAP": (
-        KannalaBrandt(double(2080.51634), double(.00461, -.00284, .00135, -.00021)),
-        (363.169, 1090.529, 1637.383, 2185.502, 2735.760, 3104.577, 3289.572, 3474.684)),
-    "OCam": (
-        OCamInverse(double(*OCAM_INVERSE)),
-        (50.691, 159.562, 253.543, 360.432, 478.438, 562.226, 605.753, 650.602)),
+    ("woodscape.json", None): (
+        60.767, 182.438, 276.818, 376.441, 483.321, 559.477, 599.200, 640.089),
+    ("synwoodscape.json", None): (
+        59.860, 179.856, 272.829, 371.134, 477.444, 554.156, 594.590, 636.559),
+    ("kitti360_02.yaml", None): (
+        72.387, 216.575, 324.265, 432.268, 540.123, 609.270, 641.463, 670.895),
+    ("kitti360_03.yaml", None): (
+        75.418, 224.754, 335.049, 444.537, 552.149, 619.031, 649.031, 675.367),
+    ("kalibr_tumvi.yaml", "cam0"): TUMVI,
+    ("camodocal_kb.yaml", None): TUMVI,
+    ("basalt.json", "cam0"): EUCM,
+    ("kalibr_fov.yaml", "cam1"): EUCM,
+    ("kalibr_ds.yaml", None): (
+        73.511, 220.677, 331.414, 442.589, 553.504, 626.021, 661.234, 695.292),
+    ("basalt.json", "cam1"): (
+        74.461, 220.044, 322.610, 415.103, 492.213, 531.685, 546.924, 558.704),
+    ("colmap.txt", None): (
+        363.169, 1090.529, 1637.383, 2185.502, 2735.760, 3104.577, 3289.572, 3474.684),
+    ("ocamcalib.txt", None): OCAM,
+    ("camodocal_scaramuzza.yaml", None): OCAM,
 }  # fmt: skip
+
+
+def calibrated(name: str, camera: str | None = None) -> Lens:
+    """The lens of a file of tests/lens/files, as far as its model goes."""
+    return load(FILES / name, camera=camera, dtype=f64).with_theta_max(None)
+
+
+RANDOM = ("Mei", "KannalaBrandt", "Fisheye624", "BrownConrady", "rational")
+
+
+def random_lens(name: str, seed: int, aside: float = 1.0, count: int = 8) -> Lens:
+    """Lenses with terms as calibrations have them, times `aside`, used as far as they go."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def uniform(low: float, high: float, *shape: int):
+        return low + (high - low) * torch.rand(count, *shape, generator=generator, dtype=f64)
+
+    focal = uniform(200, 2000)
+    terms = dict(tangential=aside * uniform(-5e-3, 5e-3, 2))
+    if name == "Mei":
+        radial = uniform(-1, 1, 2) * double(0.3, 0.5)
+        return Mei(uniform(0.5, 3), focal, radial, **terms)
+    terms["prism"] = aside * uniform(-1e-2, 1e-2, 4)
+    if name == "rational":
+        terms["denominator"] = uniform(-0.1, 0.1, 3)
+    if name in ("BrownConrady", "rational"):
+        return BrownConrady(focal, uniform(-1, 1, 3) * double(0.4, 0.2, 0.1), **terms)
+    radial = uniform(-1, 1, 6) * double(0.05, 0.02, 0.01, 0.005, 0.002, 0.001)
+    if name == "KannalaBrandt":
+        return KannalaBrandt(focal, radial[:, :4], **terms)
+    return Fisheye624(focal, 3 * radial, **terms)
+
 
 # For hypothesis: parameters as calibrations have them, and further out.
 RANGES = {

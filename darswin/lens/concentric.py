@@ -18,10 +18,8 @@ from darswin.ops.checks import tensor_there
 
 
 def square_to_disc(places: Tensor) -> tuple[Tensor, Tensor]:
-    """Places (..., 2) of the square → the disc's radius (...), in [0, 1], and (cos φ, sin φ).
-
-    The direction of the middle is (1, 0).
-    """
+    """Places (..., 2) of the square → the disc's radius (...), in [0, 1], and (cos φ, sin φ), which
+    is (1, 0) in the middle."""
     a, b = places.unbind(-1)
     wide = a.abs() >= b.abs()
     long, short = torch.where(wide, a, b), torch.where(wide, b, a)
@@ -45,11 +43,7 @@ def disc_to_square(radius: Tensor, direction: Tensor) -> Tensor:
 
 
 def square_view(lens: Lens, image_size: tuple[int, int], size: int, spacing: Spacing) -> Tensor:
-    """(N, S, S, 2) px: where in the images of (H, W) each pixel of the square of `size` S lies.
-
-    Raises:
-        ValueError: spacing "tan" with a lens of θ_max ≥ 90°.
-    """
+    """(N, S, S, 2) px: where in the images of (H, W) each pixel of the square of `size` S lies."""
     if spacing == "tan":
         check_tan(lens)
     like = lens.theta_max
@@ -76,10 +70,8 @@ def square_places(lens: Lens, image_size: tuple[int, int], spacing: Spacing) -> 
 
 
 def read_square(square: Tensor, places: Tensor) -> Tensor:
-    """Squares (B, C, S, S) read at places (B or 1, H, W, 2), bilinear → (B, C, H, W).
-
-    The outermost half pixel counts up to the edge; `OUTSIDE` is 0. S may be any.
-    """
+    """Squares (B, C, S, S) read at places (B or 1, H, W, 2), bilinear → (B, C, H, W). The outermost
+    half pixel counts up to the edge; `OUTSIDE` is 0."""
     height, width = square.shape[2:]
     size = tensor_there((width, height), places)
     pixels = ((places + 1) * size - 1) / 2

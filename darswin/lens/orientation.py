@@ -18,15 +18,10 @@ def stored_size(size: tuple[int, int], orientation: int) -> tuple[int, int]:
 
 
 def in_upright_picture(lens: Lens, size: tuple[int, int], orientation: int) -> Lens:
-    """The lens in a picture that shows all that it was calibrated with, and was turned upright.
+    """The lens, with an image_size, in an upright picture of (H, W) that shows all that it was
+    calibrated with. The calibration was made upright if only so it has the picture's shape.
 
-    If only the upright picture has the calibration's shape, the calibration was made upright.
-
-    Args:
-        lens: one that has an image_size. size: (H, W), upright. orientation: EXIF's, 1 to 8.
-
-    Raises:
-        ValueError: a picture of another shape than the calibration's.
+    `orientation` is EXIF's, 1 to 8, before. ValueError for a picture of another shape.
     """
     try:
         return upright(lens.in_picture(stored_size(size, orientation)), orientation)
@@ -43,22 +38,15 @@ def in_upright_picture(lens: Lens, size: tuple[int, int], orientation: int) -> L
 def upright(lens: Lens, orientation: int) -> Lens:
     """The lens of the upright picture, from that of the picture as it is stored; exact.
 
-    Args:
-        lens: one that has an image_size. orientation: EXIF's, 1 to 8.
-
-    Raises:
-        ValueError: another orientation, or a lens without an image_size.
-
-    Source: EXIF 2.3, tag 0x0112.
+    ValueError for another orientation than 1 to 8 (EXIF 2.3, tag 0x0112), or without image_size.
     """
     if orientation not in TURNS:
         raise ValueError(f"an EXIF orientation must be 1 to 8, got {orientation}")
     if lens.image_size is None:
         raise ValueError("a lens that is turned with its picture needs an image_size")
-    swapped, *reversed_ = TURNS[orientation]
-    turn = lens.theta_max.new_tensor([[1, 0], [0, 1]])
-    turn = turn.flip(0) if swapped else turn
-    turn = turn * turn.new_tensor([[-1.0 if r else 1.0] for r in reversed_])
+    swapped, *mirrored = TURNS[orientation]
+    turn = lens.theta_max.new_tensor([[0, 1], [1, 0]] if swapped else [[1, 0], [0, 1]])
+    turn = turn * turn.new_tensor([[-1.0 if axis else 1.0] for axis in mirrored])
     size = lens.image_size.flip(1) if swapped else lens.image_size
     off_middle = lens.center_in() - (lens.image_size.flip(1) - 1) / 2
     changed = {"image_size": size, "center": off_middle @ turn.T + (size.flip(1) - 1) / 2}
@@ -79,9 +67,6 @@ def rotated(lens: Lens, angle: float) -> tuple[Lens, Tensor]:
     Returns:
         The lens, which is the same unless it has tangential or thin-prism terms; and (2, 3)
         float64: what takes a pixel (x, y, 1) to its new place, as of `cv2.warpAffine`.
-
-    Raises:
-        ValueError: several lenses, or one with neither an image_size nor a center.
     """
     if len(lens) != 1:
         raise ValueError(f"rotated takes one lens, got {len(lens)}")

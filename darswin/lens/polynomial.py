@@ -40,11 +40,8 @@ class PolynomialLens(Lens, register=False):
 
     @classmethod
     def closest(cls, theta: Tensor, radius: Tensor, slope: Tensor, terms: int) -> Tensor:
-        """(1, n): the coefficients of the closest polynomial of as many terms, for `fit`.
-
-        Args:
-            theta: (K,) rad. radius, slope: (K,), r there in px and dr/dθ.
-        """
+        """(1, n): the coefficients of the polynomial of so many terms that comes closest to radii
+        (K,) and their slopes at θ (K,)."""
         raise NotImplementedError
 
 

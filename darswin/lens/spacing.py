@@ -37,11 +37,8 @@ def check_tan(lens: Lens) -> None:
 
 def span(lens: Lens, spacing: Spacing) -> tuple[Tensor, Tensor]:
     """(N, 1) each: θ = 0 and θ_max in units of a spacing."""
-    theta_max = lens.theta_max[:, None]
-    return (
-        to_spacing(lens, torch.zeros_like(theta_max), spacing),
-        to_spacing(lens, theta_max, spacing),
-    )
+    last = lens.theta_max[:, None]
+    return to_spacing(lens, torch.zeros_like(last), spacing), to_spacing(lens, last, spacing)
 
 
 def change_spacing(lens: Lens, value: Tensor, source: Spacing, target: Spacing) -> Tensor:
@@ -59,7 +56,7 @@ def to_spacing(lens: Lens, theta: Tensor, spacing: Spacing) -> Tensor:
         return torch.tan(theta)
     if spacing == "radius":
         return lens.project(theta)
-    return _g(theta / _theta_max(lens, theta))
+    return _g(theta / lens._row(lens.theta_max, theta.dim()))
 
 
 def to_theta(lens: Lens, value: Tensor, spacing: Spacing) -> Tensor:
@@ -70,11 +67,8 @@ def to_theta(lens: Lens, value: Tensor, spacing: Spacing) -> Tensor:
         return torch.atan(value)
     if spacing == "radius":
         return lens.unproject(value)
-    return _inverse_g(value) * _theta_max(lens, value)
-
-
-def _theta_max(lens: Lens, like: Tensor) -> Tensor:
-    return lens.theta_max.reshape(-1, *(1,) * (like.dim() - 1))
+    t = inverse(_g, _g_slope, value, value.new_ones(()))
+    return t * lens._row(lens.theta_max, value.dim())
 
 
 def _g(t: Tensor) -> Tensor:
@@ -83,8 +77,5 @@ def _g(t: Tensor) -> Tensor:
     return G_C * G_B * t**G_N + (1 - G_C) * (1 - (1 - t) ** G_M)
 
 
-def _inverse_g(value: Tensor) -> Tensor:
-    def slope(t: Tensor) -> Tensor:
-        return G_C * G_B * G_N * t ** (G_N - 1) + (1 - G_C) * G_M * (1 - t) ** (G_M - 1)
-
-    return inverse(_g, slope, value, value.new_ones(()))
+def _g_slope(t: Tensor) -> Tensor:
+    return G_C * G_B * G_N * t ** (G_N - 1) + (1 - G_C) * G_M * (1 - t) ** (G_M - 1)

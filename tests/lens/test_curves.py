@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from lens_examples import ASIDE, CALIBRATIONS, double, example, f64
+from lens_examples import ASIDE, calibrated, double, example, f64
 from torch.utils.data import DataLoader, Dataset
 
 from darswin.lens import (
@@ -21,6 +21,11 @@ from darswin.lens import (
     as_curves,
     cat,
 )
+
+
+def alone(name, camera=None):
+    """A calibrated lens without its image."""
+    return calibrated(name, camera).replace(center=None, affine=None, image_size=None)
 
 
 class Lenses(Dataset):
@@ -48,7 +53,7 @@ def test_stacking_needs_the_same_frame():
 
 
 def test_lenses_of_several_models_are_one_batch_of_curves():
-    lenses = [CALIBRATIONS[name][0] for name in ("front", "Kalibr ds", "COLMAP")]
+    lenses = [alone(name) for name in ("woodscape.json", "kalibr_ds.yaml", "colmap.txt")]
     lenses = [lens.with_theta_max(1.6).replace(center=double(1, 2)[None]) for lens in lenses]
     lenses[1] = lenses[1].replace(affine=2 * torch.eye(2, dtype=f64)[None])
     batch = cat(lenses)
@@ -106,8 +111,7 @@ def test_lenses_that_are_joined_project_as_before(name, other):
 
 @pytest.mark.parametrize("shift", [-30.0, -1.5, 2.0, 30.0])
 def test_a_lens_that_begins_beside_the_axis_is_no_curve(shift):
-    lens = CALIBRATIONS["OCam"][0]
-    lens = lens.with_theta_max(1.9)
+    lens = alone("ocamcalib.txt").with_theta_max(1.9)
     moved = lens.replace(coefficients=lens.coefficients + double(shift, *[0] * 12))
     other = Equidistant(double(300.0))
     with pytest.raises(ValueError, match=r"only if r\(0\) is 0, .* got r\(0\) = -?[\d.]+ px"):

@@ -1,10 +1,11 @@
-"""The lens models: their curves, how far they reach, and that what they do can be undone."""
+"""The lens models: their curves, their limits, derivatives, constructors and errors."""
 
+import json
 import math
 
 import pytest
 import torch
-from lens_examples import CALIBRATIONS, double, example, f64
+from lens_examples import ASIDE, RANDOM, calibrated, double, example, f64, random_lens
 
 from darswin.lens import (
     MODELS,
@@ -14,49 +15,25 @@ from darswin.lens import (
     Equidistant,
     FieldOfView,
     KannalaBrandt,
+    Lens,
     Mei,
     OCam,
     Perspective,
     Polynomial,
     Spherical,
+    Stereographic,
     Tabulated,
+    from_dict,
+    to_dict,
 )
-
-
-@pytest.mark.parametrize("name", CALIBRATIONS)
-def test_radii_of_calibrations_to_a_thousandth_of_a_pixel(name):
-    lens, radii = CALIBRATIONS[name]
-    theta = torch.deg2rad(double(10, 30, 45, 60, 75, 85, 90, 95))
-    torch.testing.assert_close(lens.project(theta), double(*radii), rtol=0, atol=1e-3)
+from darswin.lens.ideal import FocalLens
 
 
 def test_the_direct_polynomial_of_ocamcalib_agrees_with_its_inverse():
     direct = OCam(double(-288.5, 0, 3.6e-4, 7.4e-7, -6e-11))
     radius = torch.linspace(50, 605, 100, dtype=f64)
-    inverse = CALIBRATIONS["OCam"][0]
+    inverse = calibrated("ocamcalib.txt")
     torch.testing.assert_close(inverse.project(direct.unproject(radius)), radius, rtol=0, atol=2e-3)
-
-
-@pytest.mark.parametrize("name", MODELS)
-def test_unproject_undoes_project_on_the_whole_valid_range(name):
-    generator = torch.Generator().manual_seed(5)
-    near = double(0, 1e-12, 1e-9, 1e-6, 1e-3)
-    fractions = torch.cat((near, torch.linspace(0.01, 1, 997, dtype=f64), 1 - near))
-    for _ in range(25):
-        lens = example(name, generator)
-        assert torch.equal(lens.theta_max, lens.theta_limit)
-        theta = (lens.theta_max[:, None] * fractions).sort(dim=1).values
-        radius = lens.project(theta)
-        assert radius.isfinite().all()
-        evenly = lens.theta_max[:, None] * torch.linspace(0, 0.999, 1000, dtype=f64)
-        assert (lens.project(evenly).diff(dim=1) > 0).all()
-        found = lens.unproject(radius)
-        if name == "OCamInverse":  # its polynomial need not be 0 at θ = 0
-            theta, found = theta[:, 5:], found[:, 5:]
-        else:
-            small = found[:, 1:6] - theta[:, 1:6]
-            assert (small.abs() <= 1e-9 * theta[:, 1:6]).all()
-        assert (found - theta).abs().max() < 1e-9
 
 
 @pytest.mark.parametrize("coefficients", [[20.0], [30.0, 0, -1.1, 0, 0.4, 0, -0.05, 0, 0.003]])
@@ -89,91 +66,6 @@ def test_nothing_is_valid_beyond_the_limit(name):
             assert (half_turn | ends).all(), (limit, before, after)
 
 
-@pytest.mark.parametrize("name", MODELS)
-def test_gradients_of_both_directions(name):
-    lens = example(name, torch.Generator().manual_seed(7), (0.8, 3))
-    lens = lens.with_theta_max(0.7 * lens.theta_limit)
-    names = [n for n in (*lens.parameters, *lens.optional) if getattr(lens, n) is not None]
-    values = [getattr(lens, n).clone().requires_grad_() for n in names]
-
-    def run(x, *values, direction):
-        return getattr(lens.replace(**dict(zip(names, values, strict=True))), direction)(x)
-
-    theta = (lens.theta_max[:, None] * double(0.12, 0.51, 0.83)).requires_grad_()
-    assert torch.autograd.gradcheck(lambda *a: run(*a, direction="project"), (theta, *values))
-    radius = lens.project(theta).detach().requires_grad_()
-    assert torch.autograd.gradcheck(lambda *a: run(*a, direction="unproject"), (radius, *values))
-
-
-@pytest.mark.parametrize("name", MODELS)
-def test_radii_that_no_ray_up_to_theta_max_reaches_have_no_angle(name):
-    lens = example(name, torch.Generator().manual_seed(10))
-    for end in (1.0, 0.5):
-        used = lens.with_theta_max(end * lens.theta_limit)
-        beyond = double(-1e-3, -1, -1e9, math.inf, -math.inf, math.nan).expand(4, -1)
-        # At the limit r may rise so steeply that it is known to 1e-9 only.
-        more = double(1.5, 1e6) if end == 1 else double(1 + 1e-9, 1.5, 1e6)
-        beyond = torch.cat((beyond, used.r_max[:, None] * more), 1)
-        assert used.unproject(beyond).isnan().all()
-        assert used.unproject(used.r_max[:, None]).isfinite().all()
-
-
-@pytest.mark.parametrize("name", MODELS)
-def test_float32_finds_angles_that_land_where_they_were_asked_for(name):
-    """Near the limit, where r hardly rises, an angle is known no better; its radius is."""
-    exact = example(name, torch.Generator().manual_seed(8))
-    lens = exact.with_theta_max(0.999 * exact.theta_limit).to(torch.float32)
-    radius = lens.project(lens.theta_max[:, None] * torch.linspace(0.01, 1, 200))
-    error = (lens.project(lens.unproject(radius)) - radius).abs()
-    # Rounding of θ, where r is steep, and of r.
-    allowed = torch.finfo(torch.float32).eps * (8 * radius + 4 * 3.2 * lens._slope(
-        lens.theta_max[:, None] * torch.linspace(0.01, 1, 200)))  # fmt: skip
-    assert (error <= allowed).all()
-
-
-@pytest.mark.parametrize("name", MODELS)
-def test_second_and_third_derivatives(name):
-    lens = example(name, torch.Generator().manual_seed(7), (0.8, 3))[0]
-    lens = lens.with_theta_max(0.7 * lens.theta_limit)
-    names = [n for n in (*lens.parameters, *lens.optional) if getattr(lens, n) is not None]
-
-    def run(x, *values, direction):
-        return getattr(lens.replace(**dict(zip(names, values, strict=True))), direction)(x)
-
-    theta = (lens.theta_max * double(0.52, 0.83)).requires_grad_()
-    radius = lens.project(theta).detach().requires_grad_()
-    for x, direction in ((theta, "project"), (radius, "unproject")):
-        values = [getattr(lens, n).clone().requires_grad_() for n in names]
-        assert torch.autograd.gradgradcheck(
-            lambda *a, direction=direction: run(*a, direction=direction), (x, *values), atol=1e-6
-        )
-
-        def second(value, x=x, rest=values[1:], direction=direction):
-            slope = run(x, value, *rest, direction=direction)
-            for _ in range(2):
-                (slope,) = torch.autograd.grad(
-                    slope.sum(), x, create_graph=True, materialize_grads=True
-                )
-            return slope
-
-        if second(values[0]).requires_grad:
-            assert torch.autograd.gradcheck(second, (values[0],), atol=1e-5)
-
-
-@pytest.mark.parametrize("name", MODELS)
-def test_float32(name):
-    exact = example(name, torch.Generator().manual_seed(8))
-    exact = exact.with_theta_max(0.9 * exact.theta_limit)
-    lens = exact.to(torch.float32)
-    theta = exact.theta_max[:, None] * torch.linspace(0.01, 1, 200, dtype=f64)
-    radius = lens.project(theta.float())
-    assert radius.dtype == torch.float32
-    error = (radius - exact.project(theta)).abs() / exact.r_max[:, None]
-    assert error.max() < 1e-5
-    found = lens.unproject(radius)
-    assert found.dtype == torch.float32 and (found - theta).abs().max() < 2e-5
-
-
 def test_models_that_contain_each_other():
     theta = torch.linspace(0.01, 1.4, 50, dtype=f64)
     xi = 1.7
@@ -187,8 +79,11 @@ def test_models_that_contain_each_other():
     ):
         torch.testing.assert_close(lens.project(theta), spherical.project(theta))
         torch.testing.assert_close(lens.theta_limit, spherical.theta_limit, rtol=0, atol=3e-6)
-    pinhole = Perspective(double(300.0))
-    for lens in (BrownConrady(double(300.0)), Mei(double(0.0), 300.0)):
+    conformal, pinhole = Stereographic(double(300.0)), Perspective(double(300.0))
+    torch.testing.assert_close(
+        Spherical(double(1.0), 600.0).project(theta), conformal.project(theta)
+    )
+    for lens in (BrownConrady(double(300.0)), Mei(double(0.0), 300.0), Spherical(double(0), 300)):
         torch.testing.assert_close(lens.project(theta), pinhole.project(theta))
     k = double(0.01, -0.002)
     torch.testing.assert_close(
@@ -200,52 +95,253 @@ def test_models_that_contain_each_other():
     )
 
 
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (lambda: EnhancedUnified(1.1, 1.0, 1.0), r"alpha must be in \[0, 1\], got 1.1"),
-        (lambda: EnhancedUnified(0.5, 0.0, 1.0), "beta must be finite and above 0"),
-        (lambda: DoubleSphere(-1.0, 0.5, 1.0), "xi must be finite and above -1"),
-        (lambda: FieldOfView(3.2, 1.0), r"omega must be in \(0, 3.14159\)"),
-        (lambda: OCam([100.0, 0.0]), "coefficients must be such that a₀ is below 0"),
-        (lambda: Polynomial([-1.0, 2.0]), "coefficients must be such that r rises"),
-        (lambda: KannalaBrandt(1.0, [math.nan]), "radial must be finite"),
-        (
-            lambda: KannalaBrandt(1.0, [0.1], tangential=[0.1, 0.1, 0.1]),
-            r"tangential must be \(2\) or \(N, 2\)",
-        ),
-        (lambda: KannalaBrandt(1.0, [-1.0], 1.0), r"theta_max must be at most 0.57734.*got 1.0"),
-        (lambda: Tabulated([0.0, 1.0], [0.0, 1.0, 2.0]), "angles and radii must have the same"),
-        (lambda: Tabulated([0.0, 1.0, 0.5], [0.0, 1.0, 2.0]), "angles must be finite and rising"),
-        (lambda: Tabulated([0.0, 1.0], [1.0, 2.0]), "radii must be finite and rising from 0"),
-        (lambda: Equidistant(1.0, affine=[[1.0, 0.0], [0.0, 0.0]]), "affine must be invertible"),
-        (lambda: Equidistant(1.0, affine=[1.0, 2.0]), r"affine must be \(2, 2\) or \(N, 2, 2\)"),
-        (lambda: Equidistant(1.0, image_size=(0, 5)), "image_size must be finite and at least 1"),
-    ],
-)
-def test_a_parameter_out_of_range_is_named(make, message):
-    with pytest.raises(ValueError, match=message):
-        make()
+# -- derivatives --------------------------------------------------------------------------------
+
+
+def in_parameters(lens, method):
+    """`lens.method` as a function of its arguments and the lens's parameters; these."""
+    tensors = {n: t.clone().requires_grad_() for n, t in lens._tensors().items()}
+    tensors.pop("theta_max")
+
+    def run(*values):
+        x, values = values[: -len(tensors)], values[-len(tensors) :]
+        return getattr(lens.replace(**dict(zip(tensors, values, strict=True))), method)(*x)
+
+    return run, list(tensors.values())
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_gradients_of_both_directions(name):
+    lens = example(name, torch.Generator().manual_seed(7), (0.8, 3))
+    lens = lens.with_theta_max(0.7 * lens.theta_limit)
+    theta = (lens.theta_max[:, None] * double(0.12, 0.51, 0.83)).requires_grad_()
+    radius = lens.project(theta).detach().requires_grad_()
+    for method, x in (("project", theta), ("unproject", radius)):
+        run, values = in_parameters(lens, method)
+        assert torch.autograd.gradcheck(run, (x, *values))
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_second_and_third_derivatives(name):
+    lens = example(name, torch.Generator().manual_seed(7), (0.8, 3))[0]
+    lens = lens.with_theta_max(0.7 * lens.theta_limit)
+    theta = (lens.theta_max * double(0.52, 0.83)).requires_grad_()
+    radius = lens.project(theta).detach().requires_grad_()
+    for method, x in (("project", theta), ("unproject", radius)):
+        run, values = in_parameters(lens, method)
+        assert torch.autograd.gradgradcheck(run, (x, *values), atol=1e-6)
+
+        def second(value, run=run, x=x, rest=values[1:]):
+            slope = run(x, value, *rest)
+            for _ in range(2):
+                (slope,) = torch.autograd.grad(
+                    slope.sum(), x, create_graph=True, materialize_grads=True
+                )
+            return slope
+
+        if second(values[0]).requires_grad:
+            assert torch.autograd.gradcheck(second, (values[0],), atol=1e-5)
+
+
+@pytest.mark.parametrize("name", ASIDE)
+def test_gradients_of_rays_and_pixels(name):
+    lens = ASIDE[name]
+    theta = (lens.theta_max * double(0.1, 0.5, 0.9)).requires_grad_()
+    azimuth = double(0.3, 2.5, -1.2).requires_grad_()
+    run, values = in_parameters(lens, "project_rays")
+    assert torch.autograd.gradcheck(run, (theta, azimuth, *values))
+    pixels = run(theta, azimuth, *values).detach().requires_grad_()
+    assert torch.autograd.gradcheck(in_parameters(lens, "unproject_pixels")[0], (pixels, *values))
+
+
+@pytest.mark.parametrize("name", RANDOM)
+def test_second_derivatives_of_rays(name):
+    lens = random_lens(name, 3)[0]
+    lens = lens.with_theta_max(0.8 * lens.theta_limit)
+    pixels = lens.project_rays(lens.theta_max * double(0.3, 0.9), double(0.4, 2.0), (1, 1))
+    names = ("focal", "radial", "tangential")
+
+    def rays(pixels, *values):
+        made = lens.replace(**dict(zip(names, values, strict=True)))
+        return made.unproject_pixels(pixels, (1, 1))
+
+    values = [getattr(lens, n).clone().requires_grad_() for n in names]
+    inputs = (pixels.detach().requires_grad_(), *values)
+    assert torch.autograd.gradgradcheck(rays, inputs, atol=1e-6)
+
+
+def test_gradients_of_points():
+    lens = ASIDE["Mei"]
+    points = double(0.3, -0.2, 0.5, 0, 0, 2, 0.9, 0.1, 0.1, 1, 1, -9).view(4, 3)
+    seen = torch.tensor([0, 1, 2])
+
+    def project(points, focal):
+        return lens.replace(focal=focal).project_points(points)[seen]
+
+    leaves = points.requires_grad_(), lens.focal.clone().requires_grad_()
+    assert torch.autograd.gradcheck(project, leaves)
+    pixels = project(*leaves).detach().requires_grad_()
+    assert torch.autograd.gradcheck(lens.unproject_points, (pixels,))
+    lens.replace(focal=leaves[1]).project_points(points).nan_to_num().sum().backward()
+    assert points.grad.isfinite().all() and leaves[1].grad.isfinite().all()
+    assert points.grad.any(1).tolist() == [True, True, True, False]
 
 
 @pytest.mark.parametrize("name", MODELS)
 def test_where_nothing_lands_there_is_no_gradient_either(name):
     lens = example(name, torch.Generator().manual_seed(9), (0.8, 3))
     lens = lens.with_theta_max(0.9 * lens.theta_limit)
-    names = [n for n in (*lens.parameters, *lens.optional) if getattr(lens, n) is not None]
-    values = [getattr(lens, n).clone().requires_grad_() for n in names]
-    made = lens.replace(**dict(zip(names, values, strict=True)))
+    tensors = {n: t.clone().requires_grad_() for n, t in lens._tensors().items()}
+    theta_max, values = tensors.pop("theta_max"), tensors.values()
+    made = lens.replace(**tensors)
     radius = torch.cat((lens.r_max[:, None] * double(0.3, 0.8), double(1e9).expand(4, 1)), 1)
     theta = made.unproject(radius)
-    torch.where(theta <= lens.theta_max[:, None], theta, 0.0).sum().backward()
+    torch.where(theta <= theta_max[:, None], theta, 0.0).sum().backward()
     assert all(value.grad.isfinite().all() and value.grad.any() for value in values)
 
 
-def test_spherical_is_perspective_at_0_and_stereographic_at_1():
-    theta = torch.linspace(0, 1.4, 50, dtype=f64)
-    flat, conformal = (Spherical(torch.tensor(x, dtype=f64), 10.0, 1.5) for x in (0.0, 1.0))
-    torch.testing.assert_close(flat.project(theta), 10 * torch.tan(theta))
-    torch.testing.assert_close(conformal.project(theta), 10 * torch.tan(theta / 2))
-    torch.testing.assert_close(
-        Perspective.from_fov(2.8, 7.0).r_max, torch.tensor([7.0]), rtol=1e-5, atol=0
-    )
+# -- arguments ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: Perspective(0.0, 1.0), "focal must be finite and above 0, got 0.0"),
+        (lambda: Perspective(math.inf, 1.0), "focal must be"),
+        (lambda: Perspective(1.0, math.pi / 2 + 1e-3),
+         r"theta_max must be at most 1.570795 rad \(90.00°\).* got 1.57179"),
+        (lambda: Perspective(1.0, 0.0), "theta_max must be finite and above 0"),
+        (lambda: Perspective(1.0, math.nan), "theta_max must be"),
+        (lambda: Spherical(-0.1, 1.0, 1.0), "xi must be finite and at least 0, got -0.1"),
+        (lambda: Spherical(math.nan, 1.0, 1.0), "xi must be"),
+        (lambda: Spherical(0.0, 1.0, 1.6), "at most 1.57.*Spherical lens's r rises"),
+        (lambda: Spherical(0.5, 1.0, 2.2), "theta_max must be at most 2.09"),
+        (lambda: Spherical(2.0, 1.0, 2.2), "theta_max must be at most 2.09"),
+        (lambda: Spherical([0.1, 0.2], [1.0, 2.0, 3.0], 1.0), "agree in the number of lenses"),
+        (lambda: Spherical([0.1, -0.2], 1.0, 1.0), "xi must be .* got -0.2"),
+        (lambda: Spherical([[0.1]], 1.0, 1.0), r"xi must be a number or \(N,\)"),
+        (lambda: EnhancedUnified(1.1, 1.0, 1.0), r"alpha must be in \[0, 1\], got 1.1"),
+        (lambda: EnhancedUnified(0.5, 0.0, 1.0), "beta must be finite and above 0"),
+        (lambda: DoubleSphere(-1.0, 0.5, 1.0), "xi must be finite and above -1"),
+        (lambda: FieldOfView(3.2, 1.0), r"omega must be in \(0, 3.14159\)"),
+        (lambda: FieldOfView(0.0, 1.0), r"omega must be in \(0, 3.14159\)"),
+        (lambda: OCam([100.0, 0.0]), "coefficients must be such that a₀ is below 0"),
+        (lambda: Polynomial([1.0, -5.0], 1.0), "at most 0.09999.*as far as .* r rises"),
+        (lambda: Polynomial([0.0, 1.0], 1.0), "coefficients must be such that r rises"),
+        (lambda: Polynomial([]), "coefficients must be at least one a lens"),
+        (lambda: Polynomial([1.0, math.nan], 1.0), "coefficients must be finite"),
+        (lambda: Polynomial(1.0, 1.0), r"coefficients must be \(K\) or \(N, K\)"),
+        (lambda: Polynomial([1.0], 3.2), "theta_max must be at most 3.14159"),
+        (lambda: KannalaBrandt(1.0, [math.nan]), "radial must be finite"),
+        (lambda: KannalaBrandt(1.0, [0.1], tangential=[0.1] * 3), r"tangential must be \(2\) or"),
+        (lambda: KannalaBrandt(1.0, [0.1], prism=[0.1] * 2), r"prism must be \(4\) or"),
+        (lambda: KannalaBrandt(1.0, [-1.0], 1.0), "theta_max must be at most 0.57734.*got 1.0"),
+        (lambda: Tabulated([0.0, 1.0], [0.0, 1.0, 2.0]), "angles and radii must have the same"),
+        (lambda: Tabulated([0.0, 1.0, 0.5], [0.0, 1.0, 2.0]), "angles must be finite and rising"),
+        (lambda: Tabulated([0.0, 1.0], [1.0, 2.0]), "radii must be finite and rising from 0"),
+        (lambda: Perspective(1.0, 1.0, center=[1.0, 2.0, 3.0]), r"center must be \(2\) or"),
+        (lambda: Perspective(1.0, 1.0, center=3.0), "center must be"),
+        (lambda: Equidistant(1.0, affine=[[1.0, 0.0], [0.0, 0.0]]), "affine must be invertible"),
+        (lambda: Equidistant(1.0, affine=[1.0, 2.0]), r"affine must be \(2, 2\) or \(N, 2, 2\)"),
+        (lambda: Equidistant(1.0, image_size=(0, 5)), "image_size must be finite and at least 1"),
+        (lambda: Perspective.from_fov(3.2, 10.0), "focal must be"),  # tan(θ_max) < 0
+        (lambda: Spherical.from_fov(0.5, 2.0, -1.0), "focal must be"),
+    ],
+)  # fmt: skip
+def test_a_parameter_out_of_range_is_named(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: Perspective("wide", 1.0), "focal must be a number or a tensor, got 'wide'"),
+        (lambda: Spherical(object(), 1.0, 1.0), "xi must be a number"),
+        (lambda: Spherical(0.5, 1.0, thetamax=1.0), r"^Spherical\(xi, focal, .*thetamax"),
+        (lambda: Spherical.from_fov(2.0, 30.0), "'radius'"),
+        (lambda: Spherical.from_fov(0.5, 2.0, 30.0, None, 1.0), "too many positional"),
+        (lambda: Spherical.from_fov(0.5, 2.0, 30.0, xi=0.5), "multiple values"),
+        (lambda: Spherical.from_fov(0.5, 2.0, 30.0, focal=3.0), "'focal'"),
+    ],
+)
+def test_wrong_arguments(make, message):
+    with pytest.raises(TypeError, match=message):
+        make()
+
+
+def test_a_class_is_a_model_unless_it_says_otherwise():
+    assert all(model.__name__ == name for name, model in MODELS.items())
+    bases = {base for model in MODELS.values() for base in model.__mro__} - {*MODELS.values()}
+    assert not {base.__name__ for base in bases} & {*MODELS}
+    with pytest.raises(ValueError, match="there is a lens model Spherical already"):
+        type("Spherical", (Lens,), {})
+
+    class OfNoName(Spherical, register=False):
+        pass
+
+    assert "OfNoName" not in MODELS and len(OfNoName(0.5, 10.0)) == 1
+
+
+def test_another_theta_max():
+    lens = Spherical([0.5, 2.0], 10.0, 1.0)
+    assert torch.equal(lens.with_theta_max(None).theta_max, lens.theta_limit)
+    assert lens.with_theta_max(1.5).theta_max.tolist() == [1.5, 1.5]
+    assert lens.theta_max.tolist() == [1.0, 1.0]
+    with pytest.raises(ValueError, match=r"theta_max must be at most 2\.09"):
+        lens.with_theta_max(2.5)
+
+
+def test_angles_at_the_sides_of_the_image():
+    lens = Polynomial([350.4, -17.5, 27.5, -2.4], None, [639.5, 482.5],
+                      image_size=(966, 1280))  # fmt: skip
+    left, top, right, bottom = torch.rad2deg(lens.side_angles()[0]).tolist()
+    # The roots of r(θ) = 640 and r(θ) = 483, by bisection with 40 digits.
+    assert left == pytest.approx(94.989, abs=1e-3) and right == pytest.approx(left, abs=1e-4)
+    assert top == pytest.approx(74.957, abs=1e-3) and bottom == pytest.approx(top, abs=1e-4)
+    # An image that ends beyond the circle sees as far as the lens.
+    small = Spherical(2.0, 10.0, image_size=(100, 8))
+    assert small.side_angles()[0].tolist()[1] == small.theta_limit.item()
+
+
+def test_spherical_has_the_papers_focal_lengths():
+    # The circle fills a 64 px image at a field of view of 174.63° (released data).
+    xi = double(0.0, 0.05, 0.2, 0.35, 0.5, 0.7, 0.93, 1.0)
+    lens = Spherical.from_fov(xi, 3.0479112779, 32.0)
+    expected = double(1.5, 3.102, 7.907, 12.712, 17.518, 23.925, 31.293, 33.535)
+    torch.testing.assert_close(lens.focal, expected, rtol=0, atol=1e-3)
+    torch.testing.assert_close(lens.r_max, torch.full((8,), 32.0, dtype=f64))
+
+
+@pytest.mark.parametrize("name", [name for name, m in MODELS.items() if issubclass(m, FocalLens)])
+def test_the_field_of_view_fills_the_circle(name):
+    lens = example(name, torch.Generator().manual_seed(2))
+    lens = lens.with_theta_max(0.9 * lens.theta_limit)
+    own = {n: t for n, t in lens._tensors().items() if n not in ("focal", "theta_max")}
+    made = type(lens).from_fov(fov=2 * lens.theta_max, radius=37.0, **own)
+    assert torch.equal(made.theta_max, lens.theta_max)
+    torch.testing.assert_close(made.r_max, torch.full((4,), 37.0, dtype=f64))
+    torch.testing.assert_close(made.focal, lens.focal * 37 / lens.r_max)
+
+
+def test_arguments_by_place_and_by_name():
+    by_place = Mei.from_fov(0.5, 2.0, 30.0, [3.0, 4.0], radial=[0.1, 0.2], image_size=(60, 80))
+    by_name = Mei.from_fov(xi=0.5, fov=2.0, radius=30.0, center=[3.0, 4.0], radial=[0.1, 0.2])
+    assert repr(by_place.replace(image_size=None)) == repr(by_name)
+    assert len(Spherical.from_fov([0.1, 0.2], 2.0, 30.0)) == len(Equidistant.from_fov([1, 2], 3))
+    made = Mei(0.5, 300.0, [0.1, 0.2], 1.2, [3.0, 4.0])
+    named = Mei(xi=0.5, focal=300.0, radial=[0.1, 0.2], theta_max=1.2, center=[3.0, 4.0])
+    assert made.same_as(named) and not hasattr(Polynomial, "from_fov")
+
+
+def test_as_json_and_back():
+    lens = Spherical(double(0.1), 300.0, 1.3, [3.0, 4.0], image_size=(480, 640))
+    described = to_dict(lens)
+    assert described == {
+        "model": "Spherical", "xi": 0.1, "focal": 300.0, "theta_max": 1.3, "center": [3.0, 4.0],
+        "image_size": [480, 640],
+    }  # fmt: skip
+    again = from_dict(json.loads(json.dumps(described)))
+    assert to_dict(again) == to_dict(lens.to(torch.float32))
+    with pytest.raises(ValueError, match="one lens, got 2"):
+        to_dict(lens.expand(2))
