@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from darswin.layers.linear import Linear
-from darswin.layers.polar import PolarGrid, PolarSample
+from darswin.layers.polar import PolarGrid, PolarGridSpec, PolarSample
 from darswin.ops import polar_embed
 from darswin.ops.checks import per_channel
 from darswin.ops.reference import normalized
@@ -44,24 +44,17 @@ class PolarPatchEmbed(nn.Module):
     """Images on a polar grid → polar map: samples of each patch, a linear layer, a LayerNorm.
 
     Args:
-        in_chans: C. embed_dim: D. Others: as `PolarSample`.
+        spec: of the grid. in_chans: C. embed_dim: D. options: as `PolarSample`.
 
     Source: DarSwin, ICCV 2023, sec. 4.3.
     """
 
     def __init__(
-        self,
-        rings: int,
-        sectors: int,
-        samples: tuple[int, int],
-        *,
-        in_chans: int = 3,
-        embed_dim: int = 96,
-        **options: Any,
+        self, spec: PolarGridSpec, *, in_chans: int = 3, embed_dim: int = 96, **options: Any
     ):
         super().__init__()
-        self.sample = PolarSample(rings, sectors, samples, **options)
-        self.proj = Linear(samples[0] * samples[1] * in_chans, embed_dim)
+        self.sample = PolarSample(**vars(spec), **options)
+        self.proj = Linear(spec.samples[0] * spec.samples[1] * in_chans, embed_dim)
         self.norm = nn.LayerNorm(embed_dim)
 
     def forward(self, images: Tensor, grid: PolarGrid) -> Tensor:

@@ -12,7 +12,6 @@ from darswin.layers.linear import MATMUL_BACKENDS, Linear, MatmulBackend
 from darswin.layers.polar import check_images
 from darswin.lens import Lens
 from darswin.models.stages import Pair, StagePlan
-from darswin.ops.checks import per_channel
 from darswin.ops.reference import normalized
 
 
@@ -69,6 +68,8 @@ class Model(nn.Module):
     square_images = False
     in_chans: int
     num_classes: int
+    mean: Sequence[float]
+    std: Sequence[float]
     matmul_backend: MatmulBackend = "torch"  # see `set_matmul_backend`
 
     def __init__(self) -> None:
@@ -124,14 +125,6 @@ class Model(nn.Module):
                 f"got {tuple(images.shape[2:])}"
             )
         return images
-
-    def _set_pixels(
-        self, in_chans: int, mean: float | Sequence[float], std: float | Sequence[float]
-    ) -> None:
-        """Sets the channels, and how uint8 images are normalized."""
-        self.in_chans = in_chans
-        self.mean = per_channel("mean", mean, in_chans)
-        self.std = per_channel("std", std, in_chans)
 
     def _floating(self, images: Tensor) -> Tensor:
         """The images normalized, where they are uint8, in the dtype of the first layer."""

@@ -7,12 +7,13 @@ from torch import Tensor, nn
 
 from darswin.layers.attention import PolarWindowAttention
 from darswin.layers.embed import PolarPatchEmbed
-from darswin.layers.polar import PolarGrid, check_count, check_lens
+from darswin.layers.polar import Placement, PolarGrid, PolarGridSpec, check_count, check_lens
 from darswin.layers.position_bias import PositionBias, ring_angles
 from darswin.lens import Lens
+from darswin.lens.spacing import Spacing
 from darswin.models.encoder import Encoder, Prepared
 from darswin.models.registry import Presets, register_model
-from darswin.models.stages import Pair, StagePlan, check_depths, make_stages, plan_stages
+from darswin.models.stages import Pair, StagePlan, plan_stages
 
 # All models of a size have as many tokens.
 PRESETS: Presets = dict(micro=dict(samples=(6, 6)), nano=dict(rings=8, sectors=32, samples=(4, 4)))
@@ -28,19 +29,17 @@ class DarSwin(Encoder):
     merging in between. Any image size works; R and A are those of the model.
 
     Args:
-        num_classes: 0 leaves out the head. in_chans: C of the images.
-        embed_dim, depths, num_heads: of the stages; width doubles at each.
+        arguments, options: num_classes, in_chans, embed_dim, depths, num_heads and others of
+            `Encoder`.
         rings, sectors: R and A. samples: (S_r, S_φ).
+        spacing, sample_spacing, placement: as `PolarGridSpec`. "radius" for both spacings is a
+            model without lens knowledge, for the samples alone it samples uniformly.
+        jitter: in [0, 1], of the sample points in training; 0 is off.
         variant: "A" has windows and merging along azimuth, "RA" along radius and azimuth.
         window: (M_r, M_φ) where the map is large enough; None means (1, 16) for A, (4, 4) for RA.
         merges: (m_r, m_φ) before each stage but the first; None means (1, 4) for A, (2, 2) for RA.
-        mlp_ratio: hidden width of the MLPs over D. drop_path_rate: of the last block; linear.
-        jitter: in [0, 1], of the sample points in training; 0 is off.
         position_bias: "angular_relative", or the ablations "angular" and "polar" with `harmonics`.
         periodic_bias: see `AngularRelativeBias`.
-        mean, std: of uint8 images, which count as `(pixel/255 - mean) / std`; others ignore them.
-        grid: spacing, sample_spacing and placement, as `PolarGridSpec`. "radius" for both spacings
-            is a model without lens knowledge, for the samples alone it samples uniformly.
 
     Rotation:
         In eval mode a turn of a square image about the principal point by 90° turns the maps by a
@@ -62,67 +61,46 @@ class DarSwin(Encoder):
 
     def __init__(
         self,
-        num_classes: int = 1000,
-        in_chans: int = 3,
-        embed_dim: int = 96,
-        depths: Sequence[int] = (2, 2, 18, 2),
-        num_heads: Sequence[int] = (3, 6, 12, 24),
-        *,
+        *arguments: Any,
         rings: int = 16,
         sectors: int = 64,
         samples: Pair = (10, 10),
+        spacing: Spacing = "theta",
+        sample_spacing: Spacing | None = None,
+        placement: Placement = "centers",
+        jitter: float = 1.0,
         variant: Literal["A", "RA"] = "A",
         window: Pair | None = None,
         merges: Sequence[Pair] | None = None,
-        mlp_ratio: float = 4.0,
-        drop_path_rate: float = 0.2,
-        jitter: float = 1.0,
         position_bias: PositionBias = "angular_relative",
         harmonics: int = 16,
         periodic_bias: bool = False,
-        mean: float | Sequence[float] = 0.0,
-        std: float | Sequence[float] = 1.0,
-        **grid: Any,
+        **options: Any,
     ):
-        super().__init__()
+        super().__init__(*arguments, **options)
         if variant not in ("A", "RA"):
             raise ValueError(f"variant must be 'A' or 'RA', got {variant!r}")
-        check_depths(depths, num_heads)
         window = window or ((1, 16) if variant == "A" else (4, 4))
-        plans = plan_stages(rings, sectors, len(depths), variant, window, merges)
-        plans = [self._plan(plan, window) for plan in plans]
-        self._set_pixels(in_chans, mean, std)
+        plans = plan_stages(rings, sectors, len(self.depths), variant, window, merges)
         self.position_bias, self.harmonics = position_bias, harmonics
         self.periodic_bias = periodic_bias
+        self.spec = PolarGridSpec(rings, sectors, samples, spacing, sample_spacing, placement)
         self.patch_embed = PolarPatchEmbed(
-            rings,
-            sectors,
-            samples,
-            in_chans=in_chans,
-            embed_dim=embed_dim,
+            self.spec,
+            in_chans=self.in_chans,
+            embed_dim=self.embed_dim,
             jitter=jitter,
-            mean=mean,
-            std=std,
-            **grid,
+            mean=self.mean,
+            std=self.std,
         )
-        self.spec = self.patch_embed.sample.spec
-        self.stages = make_stages(
-            plans,
-            embed_dim,
-            depths,
-            num_heads,
-            attention=self.attention,
-            mlp_ratio=mlp_ratio,
-            drop_path_rate=drop_path_rate,
-        )
-        self._finish(num_classes, plans, embed_dim, samples)
+        self._finish([self._plan(plan, window) for plan in plans], samples)
 
     def _plan(self, plan: StagePlan, window: Pair) -> StagePlan:
         """A stage's sizes, which a subclass may change."""
         return plan
 
     def attention(self, dim: int, heads: int, plan: StagePlan, block: int) -> nn.Module:
-        """The attention of a block of a stage, which a decoder's blocks have too."""
+        """As `Encoder`."""
         return PolarWindowAttention(
             dim,
             heads,

@@ -117,12 +117,11 @@ class DAT(ImageEncoder):
     """The Deformable Attention Transformer. It is called as DarSwin is, and ignores the lens.
 
     Args:
-        num_classes, in_chans, embed_dim, depths, num_heads: as `ImageEncoder`.
+        arguments, depths, options: as `ImageEncoder`.
         blocks: of each stage the kinds of its blocks, repeated: "L" attends in windows, "S" in
             shifted ones, "D" is deformable.
         groups: of the heads of each stage's deformable blocks; others ignore it.
         offset_range: as `DeformableAttention`.
-        options: others of `ImageEncoder`.
 
     Raises:
         ValueError: sizes that do not divide; in forward, images of another size.
@@ -132,12 +131,8 @@ class DAT(ImageEncoder):
 
     def __init__(
         self,
-        num_classes: int = 1000,
-        in_chans: int = 3,
-        embed_dim: int = 96,
+        *arguments: Any,
         depths: Sequence[int] = (2, 2, 18, 2),
-        num_heads: Sequence[int] = (3, 6, 12, 24),
-        *,
         blocks: Sequence[str] = ("LS", "LS", "LD", "LD"),
         groups: Sequence[int] = (1, 1, 3, 6),
         offset_range: float = 2.0,
@@ -151,18 +146,14 @@ class DAT(ImageEncoder):
         if not all(blocks) or not set("".join(blocks)) <= set("LSD"):
             raise ValueError(f"blocks must be of the kinds 'L', 'S' and 'D', got {blocks}")
         self.blocks, self.groups, self.offset_range = blocks, groups, offset_range
-        super().__init__(
-            num_classes,
-            in_chans,
-            embed_dim,
-            depths,
-            num_heads,
-            downsample=lambda dim, _merge: PatchProjection(dim, 2 * dim, 2, bias=False),
-            **options,
-        )
+        super().__init__(*arguments, depths=depths, **options)
+
+    def downsample(self, dim: int, merge: Pair) -> nn.Module:
+        """As `Encoder`."""
+        return PatchProjection(dim, 2 * dim, 2, bias=False)
 
     def attention(self, dim: int, heads: int, plan: StagePlan, block: int) -> nn.Module:
-        """The attention of a block of a stage."""
+        """As `Encoder`."""
         kinds = self.blocks[plan.index]
         kind = kinds[block % len(kinds)]
         if kind == "D":

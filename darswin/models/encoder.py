@@ -1,6 +1,6 @@
 """The classifiers: lens and images → maps of stages, features and logits."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from itertools import chain
 from typing import Any, Literal, NamedTuple
 
@@ -12,8 +12,9 @@ from darswin.layers.linear import Linear
 from darswin.layers.polar import PolarGrid
 from darswin.lens import Lens
 from darswin.models.base import FeatureInfo, Model, feature_info, init_weights, take_indices
-from darswin.models.stages import Pair, StagePlan, check_depths, make_stages, plan_stages
+from darswin.models.stages import Pair, StagePlan, make_stages, plan_stages
 from darswin.models.views import ViewName, make_view
+from darswin.ops.checks import per_channel
 
 Format = Literal["NHWC", "NCHW"]
 
@@ -34,9 +35,15 @@ class Prepared(NamedTuple):
 class Encoder(Model):
     """Base of the classifiers.
 
-    A model makes `patch_embed` and `stages`, then calls `_finish`; it defines `embed` and, if its
+    A model makes `patch_embed`, then calls `_finish`; it defines `attention`, `embed` and, if its
     lens matters, `prepare`. Maps are channels last: (B, R, A, D) where they are polar, else
     (B, H, W, D).
+
+    Args:
+        num_classes: 0 leaves out the head. in_chans: C of the images.
+        embed_dim, depths, num_heads: of the stages; width doubles at each.
+        mlp_ratio: hidden width of the MLPs over D. drop_path_rate: of the last block; linear.
+        mean, std: of uint8 images, which count as `(pixel/255 - mean) / std`; others ignore them.
 
     Attributes:
         num_features, head_hidden_size: D of the last map, and of what the head takes.
@@ -47,22 +54,49 @@ class Encoder(Model):
     num_features: int
     patch_embed: nn.Module
     plans: Sequence[StagePlan]
-    stages: nn.ModuleList
-    norm: nn.Module
     head: nn.Module
 
-    def _finish(
-        self, num_classes: int, plans: Sequence[StagePlan], embed_dim: int, patch: Pair
-    ) -> None:
-        """Makes what ends a model, initialises it, and describes it."""
+    def __init__(
+        self,
+        num_classes: int = 1000,
+        in_chans: int = 3,
+        embed_dim: int = 96,
+        depths: Sequence[int] = (2, 2, 18, 2),
+        num_heads: Sequence[int] = (3, 6, 12, 24),
+        *,
+        mlp_ratio: float = 4.0,
+        drop_path_rate: float = 0.2,
+        mean: float | Sequence[float] = 0.0,
+        std: float | Sequence[float] = 1.0,
+    ):
+        super().__init__()
+        if len(depths) != len(num_heads) or not depths:
+            raise ValueError(f"depths and num_heads must pair up, got {depths} and {num_heads}")
+        self.num_classes, self.in_chans, self.embed_dim = num_classes, in_chans, embed_dim
+        self.depths, self.num_heads = depths, num_heads
+        self.mlp_ratio, self.drop_path_rate = mlp_ratio, drop_path_rate
+        self.mean, self.std = per_channel("mean", mean, in_chans), per_channel("std", std, in_chans)
+
+    def _finish(self, plans: Sequence[StagePlan], patch: Pair) -> None:
+        """Makes what follows `patch_embed`, initialises all of it, and describes the model."""
         self.plans = plans
-        self.feature_info = feature_info(plans, embed_dim, patch)
+        self.feature_info = feature_info(plans, self.embed_dim, patch)
         self.num_features = self.feature_info.channels(-1)
-        self.norm = nn.LayerNorm(self.num_features)
-        self.reset_classifier(num_classes)
+        self.stages = make_stages(
+            plans,
+            self.embed_dim,
+            self.depths,
+            self.num_heads,
+            attention=self.attention,
+            downsample=self.downsample,
+            mlp_ratio=self.mlp_ratio,
+            drop_path_rate=self.drop_path_rate,
+        )
+        self.norm: nn.Module = nn.LayerNorm(self.num_features)
+        self.reset_classifier(self.num_classes)
         self.apply(init_weights)
         self.pretrained_cfg = dict(
-            num_classes=num_classes,
+            num_classes=self.num_classes,
             input_size=(self.in_chans, *(self.image_size or (64, 64))),  # else the paper's
             fixed_input_size=self.image_size is not None,
             interpolation="box",  # as `darswin predict`
@@ -72,6 +106,14 @@ class Encoder(Model):
             first_conv="patch_embed.proj",
             classifier="head",
         )
+
+    def attention(self, dim: int, heads: int, plan: StagePlan, block: int) -> nn.Module:
+        """The attention of a block of a stage, which a decoder's blocks have too."""
+        raise NotImplementedError
+
+    def downsample(self, dim: int, merge: Pair) -> nn.Module:
+        """The layer that begins every stage but the first."""
+        return PatchMerging(dim, merge)
 
     @property
     def head_hidden_size(self) -> int:
@@ -208,15 +250,12 @@ class ImageEncoder(Encoder):
     """Base of the models that cut images of one size into square patches.
 
     Args:
-        num_classes: 0 leaves out the head. in_chans: C of the images.
-        embed_dim, depths, num_heads: of the stages; width doubles at each.
+        arguments, options: as `Encoder`.
         image_size: (H, W), or the side of a square. patch_size: its side, in pixels.
         window: (rows, columns) where the map is large enough.
-        mlp_ratio: hidden width of the MLPs over D. drop_path_rate: of the last block; linear.
-        mean, std: of uint8 images, which count as `(pixel/255 - mean) / std`; others ignore them.
-        view: "none" takes the images as they are and ignores the lens; "perspective" and "square"
-            are views through it, of the same size, see `darswin.models.views`.
-        view_options: of the view: `max_fov` of "perspective", `spacing` of "square".
+        view: "none" takes the images as they are and ignores the lens; "perspective", with the
+            option `max_fov`, and "square", with `spacing`, are views of that size through the lens:
+            see `darswin.models.views`.
 
     Raises:
         ValueError: sizes that do not divide, a wrong option; in forward, images of another size.
@@ -227,50 +266,25 @@ class ImageEncoder(Encoder):
 
     def __init__(
         self,
-        num_classes: int = 1000,
-        in_chans: int = 3,
-        embed_dim: int = 96,
-        depths: Sequence[int] = (2, 2, 18, 2),
-        num_heads: Sequence[int] = (3, 6, 12, 24),
-        *,
+        *arguments: Any,
         image_size: int | Pair = 64,
         patch_size: int = 2,
         window: Pair = (4, 4),
-        mlp_ratio: float = 4.0,
-        drop_path_rate: float = 0.2,
-        mean: float | Sequence[float] = 0.0,
-        std: float | Sequence[float] = 1.0,
         view: ViewName = "none",
-        downsample: Callable[[int, Pair], nn.Module] = PatchMerging,
-        **view_options: Any,
+        **options: Any,
     ):
-        super().__init__()
-        check_depths(depths, num_heads)
         height, width = (image_size,) * 2 if isinstance(image_size, int) else image_size
-        self.image_size, self.square_images = (height, width), height == width
+        made = make_view(view, (height, width), options)
+        super().__init__(*arguments, **options)
+        self.view, self.image_size, self.square_images = made, (height, width), height == width
         if any(side < 1 or side % patch_size for side in (height, width)):
             raise ValueError(
                 f"patch_size must divide image_size = {self.image_size}, got {patch_size}"
             )
-        self._set_pixels(in_chans, mean, std)
-        self.view = make_view(view, self.image_size, **view_options)
-        plans = plan_stages(height // patch_size, width // patch_size, len(depths), "RA", window)
-        self.patch_embed = PatchProjection(in_chans, embed_dim, patch_size)
-        self.stages = make_stages(
-            plans,
-            embed_dim,
-            depths,
-            num_heads,
-            attention=self.attention,
-            downsample=downsample,
-            mlp_ratio=mlp_ratio,
-            drop_path_rate=drop_path_rate,
-        )
-        self._finish(num_classes, plans, embed_dim, (patch_size, patch_size))
-
-    def attention(self, dim: int, heads: int, plan: StagePlan, block: int) -> nn.Module:
-        """The attention of a block of a stage."""
-        raise NotImplementedError
+        rows, columns = height // patch_size, width // patch_size
+        self.patch_embed = PatchProjection(self.in_chans, self.embed_dim, patch_size)
+        plans = plan_stages(rows, columns, len(self.depths), "RA", window)
+        self._finish(plans, (patch_size, patch_size))
 
     def prepare(self, lens: Lens | None, size: Pair) -> Prepared:
         """As `Encoder`: the pixels of the images that the view shows."""

@@ -7,7 +7,7 @@ from typing import Literal
 from torch import Tensor, nn
 
 from darswin.layers.attention import WindowAttention
-from darswin.layers.block import Block, PatchMerging
+from darswin.layers.block import Block
 from darswin.layers.position_bias import RelativeBias, joined_tables
 from darswin.ops.checks import check_pair
 
@@ -137,7 +137,7 @@ def make_stages(
     num_heads: Sequence[int],
     *,
     attention: Callable[[int, int, StagePlan, int], nn.Module],
-    downsample: Callable[[int, Pair], nn.Module] = PatchMerging,
+    downsample: Callable[[int, Pair], nn.Module],
     mlp_ratio: float,
     drop_path_rate: float,
 ) -> nn.ModuleList:
@@ -165,9 +165,3 @@ def make_stages(
         stages.append(Stage(merging, blocks))
         before += depth
     return stages
-
-
-def check_depths(depths: Sequence[int], num_heads: Sequence[int]) -> None:
-    """ValueError unless there are heads for each stage."""
-    if len(depths) != len(num_heads) or not depths:
-        raise ValueError(f"depths and num_heads must pair up, got {depths} and {num_heads}")

@@ -20,7 +20,7 @@ class Swin(ImageEncoder):
     """
 
     def attention(self, dim: int, heads: int, plan: StagePlan, block: int) -> WindowAttention:
-        """The attention of a block of a stage, which a decoder's blocks have too."""
+        """As `Encoder`."""
         return WindowAttention(
             dim,
             heads,

@@ -15,7 +15,7 @@ from darswin.models.encoder import Prepared
 from darswin.models.registry import Presets, register_model
 from darswin.models.stages import Pair, StagePlan, make_stages
 from darswin.models.swin import Swin
-from darswin.models.views import PlainView, PolarView, Way, make_view
+from darswin.models.views import PlainView, PolarView, Way
 
 PixelTask = Literal["segmentation", "distance"]
 EXPANSION = 4  # how many tokens along each axis the decoder's last expansion makes of one
@@ -73,15 +73,7 @@ class Decoder(nn.Module):
     """Mirrors an encoder: for each stage on the way back a `SkipJoin` that undoes its merging, then
     blocks on its windows; at the end ×4 along both axes."""
 
-    def __init__(
-        self,
-        encoder: DarSwin | Swin,
-        depths: int | Sequence[int],
-        num_heads: Sequence[int],
-        *,
-        mlp_ratio: float,
-        drop_path_rate: float,
-    ):
+    def __init__(self, encoder: DarSwin | Swin, depths: int | Sequence[int]):
         super().__init__()
         plans: Sequence[StagePlan] = encoder.plans
         upper, dim = plans[:-1], encoder.feature_info.channels(0)
@@ -100,11 +92,11 @@ class Decoder(nn.Module):
             upper,
             dim,
             depths,
-            num_heads[: len(upper)],
+            encoder.num_heads[: len(upper)],
             attention=encoder.attention,
             downsample=lambda _dim, _merge: nn.Identity(),
-            mlp_ratio=mlp_ratio,
-            drop_path_rate=drop_path_rate,
+            mlp_ratio=encoder.mlp_ratio,
+            drop_path_rate=encoder.drop_path_rate,
         )
         self.expand = PatchExpand(dim, dim, (EXPANSION, EXPANSION))
 
@@ -218,7 +210,6 @@ class Unet(Model):
 
     Args:
         num_classes: of "segmentation"; "distance" ignores it. in_chans: C of the images.
-        embed_dim, depths, num_heads: of the encoder's stages.
         view: as above. task: "segmentation" or "distance".
         decoder_depths: blocks of each stage of the decoder, one for each of the encoder but the
             last; an int is for all.
@@ -227,12 +218,8 @@ class Unet(Model):
         places: adds to each of the encoder's maps, before the decoder, a learned linear function of
             where its tokens are: for "polar" the direction (x, y, z) in which they look, as without
             it the network does not know which way is up; else x and y in the view, in [-1, 1].
-        image_size, patch_size, window: as `Swin`, by default 128, 4 and (4, 4), of every view but
-            "polar".
-        mlp_ratio, drop_path_rate: as `DarSwin`, of encoder and decoder.
-        mean, std: of uint8 images, which count as `(pixel/255 - mean) / std`; others ignore them.
-        options: of "polar" others of `DarSwin`; `max_fov` of "perspective" and `spacing` of
-            "square".
+        options: of the encoder: of `DarSwin` for "polar"; else of `Swin`, where image_size is 128
+            and patch_size is 4 by default, with those of the view.
 
     The models of a size have as many parameters, to 1 %. "darswin_unet_*_nano" has R×A = 16×64,
     unlike the classifier of that size.
@@ -265,9 +252,6 @@ class Unet(Model):
         self,
         num_classes: int = 10,
         in_chans: int = 3,
-        embed_dim: int = 96,
-        depths: Sequence[int] = (2, 2, 18, 2),
-        num_heads: Sequence[int] = (3, 6, 12, 24),
         *,
         view: Literal["polar", "none", "perspective", "square"] = "polar",
         task: PixelTask = "segmentation",
@@ -275,10 +259,6 @@ class Unet(Model):
         skip_width: int = 16,
         typical_distance: float = 10.0,
         places: bool = True,
-        mlp_ratio: float = 4.0,
-        drop_path_rate: float = 0.2,
-        mean: float | Sequence[float] = 0.0,
-        std: float | Sequence[float] = 1.0,
         **options: Any,
     ):
         super().__init__()
@@ -286,27 +266,23 @@ class Unet(Model):
             raise ValueError(f"task must be one of {get_args(PixelTask)}, got {task!r}")
         if skip_width < 0:
             raise ValueError(f"skip_width must be at least 0, got {skip_width}")
-        widths: Any = dict(mlp_ratio=mlp_ratio, drop_path_rate=drop_path_rate)
-        shared = widths | dict(num_classes=0, in_chans=in_chans, embed_dim=embed_dim)
-        shared |= dict(depths=depths, num_heads=num_heads, mean=mean, std=std)
-        self._set_pixels(in_chans, mean, std)
         if view == "polar":
-            self.encoder = DarSwin(**shared, **options)
+            self.encoder = DarSwin(0, in_chans, **options)
             sizes = [plan.map_size for plan in self.encoder.plans] if places else []
             self.view = PolarView(self.encoder.spec, EXPANSION, sizes)
         else:
-            defaults = dict(image_size=128, patch_size=4, window=(4, 4))
-            sizing: Any = {name: options.pop(name, size) for name, size in defaults.items()}
-            self.encoder = Swin(**shared, **sizing)
+            options = dict(image_size=128, patch_size=4) | options
+            self.encoder = Swin(0, in_chans, view=view, **options)
             self.image_size = self.encoder.image_size
             self.square_images = self.encoder.square_images
-            self.view = make_view(view, self.encoder.image_size, **options)
-        self.task = task
+            # The head sees the view too, so it is made here, and the encoder takes it as it is.
+            self.view, self.encoder.view = self.encoder.view, PlainView(self.image_size)
+        self.task, self.in_chans = task, in_chans
+        self.mean, self.std = self.encoder.mean, self.encoder.std
         self.feature_info = self.encoder.feature_info
         self._head_options = dict(in_chans=in_chans, skip_width=skip_width)
         self._typical_distance = typical_distance
-        self.decoder = Decoder(self.encoder, decoder_depths, num_heads, **widths)
-        self.decoder.apply(init_weights)
+        self.decoder = Decoder(self.encoder, decoder_depths).apply(init_weights)
         self.places = nn.ModuleList(
             Linear(self.view.coordinates, channels, bias=False)
             for channels in (self.feature_info.channels() if places else ())

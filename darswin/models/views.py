@@ -166,16 +166,19 @@ class PolarView(PlainView):
         return pixels.permute(0, 3, 1, 2)
 
 
-_VIEWS: dict[str, type[PlainView]] = {
-    "none": PlainView, "perspective": PerspectiveView, "square": SquareView,
-}  # fmt: skip
+_VIEWS: dict[str, tuple[type[PlainView], Sequence[str]]] = {
+    "none": (PlainView, ()),
+    "perspective": (PerspectiveView, ("max_fov",)),
+    "square": (SquareView, ("spacing",)),
+}
 
 
-def make_view(view: ViewName, size: Pair, **options: Any) -> PlainView:
-    """The view of that name, of (H, W)."""
+def make_view(view: ViewName, size: Pair, options: dict[str, Any]) -> PlainView:
+    """The view of that name, of (H, W); takes its option out of `options`."""
     if view not in _VIEWS:
         raise ValueError(f"view must be one of {tuple(_VIEWS)}, got {view!r}")
-    return _VIEWS[view](size, **options)
+    kind, names = _VIEWS[view]
+    return kind(size, **{name: options.pop(name) for name in names if name in options})
 
 
 class LensAdapter(Model):
