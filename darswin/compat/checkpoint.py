@@ -1,20 +1,22 @@
-"""State dicts and the files that hold them. Nothing that a file says is ever executed."""
+"""State dicts and the files that hold them. Nothing in a file is ever executed."""
 
 import contextlib
 import json
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import TypeVar
 
 import torch
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save
-from torch import Tensor
+from torch import Tensor, nn
 
 from darswin.utils.files import replace_file
 from darswin.utils.unpickle import read_pickle
 
 Source = str | os.PathLike | Mapping[str, Tensor]
+Net = TypeVar("Net", bound=nn.Module)
 
 
 def read_state(source: Source) -> dict[str, Tensor]:
@@ -72,23 +74,33 @@ def _model(checkpoint: object, path: Path | None = None) -> dict[str, Tensor]:
     return dict(state)
 
 
-@contextlib.contextmanager
-def refused(what: str) -> Iterator[None]:
-    """Within it, keys and shapes that are not those expected raise ValueError, naming `what`."""
+def load_as(
+    name: str,
+    source: Source,
+    make: Callable[[Mapping[str, Tensor]], Net],
+    convert: Callable[[str, Tensor, Net], tuple[str, Tensor]],
+) -> Net:
+    """The model of another implementation's state dict, in eval mode.
+
+    Args:
+        name: of the implementation, for the ValueError where keys or shapes are not its own.
+        make: the state dict → the model. convert: a key and its tensor → the model's own.
+    """
+    state = read_state(source)
     try:
-        yield
+        model = make(state)
+        # The operator needs neither masks nor indices.
+        kept = [key for key in state if not key.endswith(("attn_mask", "relative_position_index"))]
+        model.load_state_dict(dict(convert(key, state[key], model) for key in kept))
     except (KeyError, IndexError) as error:
-        raise ValueError(f"not a state dict of {what}: no key {error}") from error
+        raise ValueError(f"not a state dict of {name}: no key {error}") from error
     except RuntimeError as error:
-        raise ValueError(f"not a state dict of {what}: {error}") from error
+        raise ValueError(f"not a state dict of {name}: {error}") from error
+    return model.eval()
 
 
 def count_blocks(state: Mapping[str, Tensor], form: str) -> list[int]:
-    """The stages' numbers of blocks, from a key of each; KeyError where there is none.
-
-    Args:
-        form: the key, with {} for the stage and {} for the block.
-    """
+    """The stages' numbers of blocks, from `form`, a key of each with {} for stage and block."""
     depths: list[int] = []
     while form.format(len(depths), 0) in state:
         depth = 1

@@ -7,7 +7,6 @@ whole batch, tan θ_max as the angle of the bias, a seam in the azimuth, and oth
 
 import dataclasses
 import math
-import os
 import warnings
 from collections.abc import Mapping
 from typing import Any
@@ -15,7 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from darswin.compat.checkpoint import count_blocks, read_state, refused
+from darswin.compat.checkpoint import Source, count_blocks, load_as
 from darswin.layers.attention import PolarWindowAttention
 from darswin.layers.polar import PolarGrid, PolarGridSpec, check_lens
 from darswin.lens import Lens, Number, Spherical
@@ -196,7 +195,7 @@ def _last_angle(lens: Lens) -> Tensor:
     return torch.tan(lens.theta_max)
 
 
-def load_official(source: str | os.PathLike | Mapping[str, Tensor], **options) -> DarSwin:
+def load_official(source: Source, **options) -> DarSwin:
     """The authors' released DarSwin from its state dict, in eval mode, as `OfficialDarSwin`.
 
     Angular and "polar" models give the released code's outputs; the latter's bias is the paper's
@@ -214,23 +213,20 @@ def load_official(source: str | os.PathLike | Mapping[str, Tensor], **options) -
     Raises:
         ValueError: keys or shapes that are not those of a released model.
     """
-    state = read_state(source)
-    with refused("a released DarSwin"):
+
+    def make(state: Mapping[str, Tensor]) -> DarSwin:
         settings = _settings(state)
-    kind = DarSwin if settings.get("variant") == "RA" else OfficialDarSwin
-    model = kind(**(settings | options))
-    converted = {}
-    for key, value in state.items():
-        if key.endswith("attn_mask"):
-            continue  # the operator needs no masks
+        kind = DarSwin if settings.get("variant") == "RA" else OfficialDarSwin
+        return kind(**(settings | options))
+
+    def convert(key: str, value: Tensor, model: DarSwin) -> tuple[str, Tensor]:
         if key == "patch_embed.mlp.weight":
             # Columns (C, S_r, S_φ) → (S_r, S_φ, C).
             value = value.unflatten(1, (model.in_chans, *model.spec.samples))
             value = value.permute(0, 2, 3, 1).flatten(1)
-        converted[_renamed(key)] = value
-    with refused("a released DarSwin"):
-        model.load_state_dict(converted)
-    return model.eval()
+        return _renamed(key), value
+
+    return load_as("a released DarSwin", source, make, convert)
 
 
 def _settings(state: Mapping[str, Tensor]) -> dict:
@@ -252,7 +248,7 @@ def _settings(state: Mapping[str, Tensor]) -> dict:
         warnings.warn(
             "the released radial model does not run, so there are no outputs to match: its weights "
             "are loaded into DarSwin-RA with the polar position bias",
-            stacklevel=3,
+            stacklevel=5,
         )
         grid = dict(spacing="tan", placement="edges", jitter=0.0)
         return settings | grid | dict(variant="RA", position_bias="polar")

@@ -11,9 +11,9 @@ from darswin.layers.attention import WindowAttention, check_heads
 from darswin.layers.embed import PatchProjection
 from darswin.layers.linear import Linear
 from darswin.layers.position_bias import RelativeTable
-from darswin.models.encoder import ImageEncoder
 from darswin.models.registry import register_model
 from darswin.models.stages import Pair, StagePlan
+from darswin.models.swin import Swin
 from darswin.ops.checks import tensor_there
 
 
@@ -113,11 +113,11 @@ def _pixel_centers(height: int, width: int, like: Tensor) -> Tensor:
         nano=dict(image_size=32, blocks=("L", "LD", "D"), groups=(1, 1, 2)),
     ),
 )
-class DAT(ImageEncoder):
-    """The Deformable Attention Transformer. It is called as DarSwin is, and ignores the lens.
+class DAT(Swin):
+    """The Deformable Attention Transformer: Swin with other attention in some of its blocks.
 
     Args:
-        arguments, depths, options: as `ImageEncoder`.
+        arguments, depths, options: as `Swin`.
         blocks: of each stage the kinds of its blocks, repeated: "L" attends in windows, "S" in
             shifted ones, "D" is deformable.
         groups: of the heads of each stage's deformable blocks; others ignore it.

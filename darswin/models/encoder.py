@@ -7,13 +7,11 @@ from typing import Any, Literal, NamedTuple
 from torch import Tensor, nn
 
 from darswin.layers.block import PatchMerging
-from darswin.layers.embed import PatchProjection
 from darswin.layers.linear import Linear
 from darswin.layers.polar import PolarGrid
 from darswin.lens import Lens
 from darswin.models.base import FeatureInfo, Model, feature_info, init_weights, take_indices
-from darswin.models.stages import Pair, StagePlan, make_stages, plan_stages
-from darswin.models.views import ViewName, make_view
+from darswin.models.stages import Pair, StagePlan, make_stages
 from darswin.ops.checks import per_channel
 
 Format = Literal["NHWC", "NCHW"]
@@ -244,57 +242,6 @@ class Encoder(Model):
         if prune_head or shorter:
             self.reset_classifier(0)
         return taken
-
-
-class ImageEncoder(Encoder):
-    """Base of the models that cut images of one size into square patches.
-
-    Args:
-        arguments, options: as `Encoder`.
-        image_size: (H, W), or the side of a square. patch_size: its side, in pixels.
-        window: (rows, columns) where the map is large enough.
-        view: "none" takes the images as they are and ignores the lens; "perspective", with the
-            option `max_fov`, and "square", with `spacing`, are views of that size through the lens:
-            see `darswin.models.views`.
-
-    Raises:
-        ValueError: sizes that do not divide, a wrong option; in forward, images of another size.
-        TypeError: in forward, no lens where there is a view.
-    """
-
-    image_size: Pair
-
-    def __init__(
-        self,
-        *arguments: Any,
-        image_size: int | Pair = 64,
-        patch_size: int = 2,
-        window: Pair = (4, 4),
-        view: ViewName = "none",
-        **options: Any,
-    ):
-        height, width = (image_size,) * 2 if isinstance(image_size, int) else image_size
-        made = make_view(view, (height, width), options)
-        super().__init__(*arguments, **options)
-        self.view, self.image_size, self.square_images = made, (height, width), height == width
-        if any(side < 1 or side % patch_size for side in (height, width)):
-            raise ValueError(
-                f"patch_size must divide image_size = {self.image_size}, got {patch_size}"
-            )
-        rows, columns = height // patch_size, width // patch_size
-        self.patch_embed = PatchProjection(self.in_chans, self.embed_dim, patch_size)
-        plans = plan_stages(rows, columns, len(self.depths), "RA", window)
-        self._finish(plans, (patch_size, patch_size))
-
-    def prepare(self, lens: Lens | None, size: Pair) -> Prepared:
-        """As `Encoder`: the pixels of the images that the view shows."""
-        way = self.view.prepare(lens, size, both=False)
-        return super().prepare(lens, size)._replace(points=way.there)
-
-    def embed(self, images: Tensor, points: Tensor | None) -> Tensor:
-        """Images (B, C, H, W), read at the pixels `points` (N, H, W, 2) if any → the first map."""
-        seen = self.view.look(self._floating(images), points)
-        return self.patch_embed(seen.permute(0, 2, 3, 1))
 
 
 class FeatureMaps(Model):

@@ -14,7 +14,7 @@ from safetensors.torch import save
 from torch import Tensor
 
 from darswin.layers.quantized import Quantization, with_quantized_layers
-from darswin.lens.files.fields import listed, short
+from darswin.lens.files.fields import short
 from darswin.models.registry import create_model, list_pretrained, pretrained_file
 from darswin.utils.files import replace_file
 
@@ -30,7 +30,7 @@ class NoCardError(ValueError):
 
 @dataclass(frozen=True)
 class ModelCard:
-    """What a model file says besides its weights.
+    """The description of a model in its file, beside the weights.
 
     Args:
         model: a name of `create_model`. options: its options.
@@ -39,7 +39,7 @@ class ModelCard:
             where calibrations say it.
         fit: how a camera's pictures get that size, as `darswin.data.at_size` takes it:
             "whole" where it was trained through the lenses of `darswin.data.WideAngle`.
-        task: what it tells: a class for an image, or a class or a distance for each pixel.
+        task: a class for an image, or a class or a distance for each pixel.
         colors: (r, g, b) in 0 … 255 of each class, where the data say them.
         quantized: for each layer of int8 weights its name and how its input becomes 8 bits, (scale,
             zero point): see `darswin.deploy.quantize.quantize_model`.
@@ -93,9 +93,7 @@ def read_card(path: str | os.PathLike) -> ModelCard:
     Raises:
         NoCardError: other weights. ValueError: no model file of darswin.
     """
-    path = _model_file(path)
-    with _opened(path) as file:
-        return _card(file, path)
+    return _read(path, with_weights=False)[1]
 
 
 def load_model(path: str | os.PathLike) -> tuple[Any, ModelCard]:
@@ -105,13 +103,9 @@ def load_model(path: str | os.PathLike) -> tuple[Any, ModelCard]:
         NoCardError: other weights. ValueError: no model file of darswin, or weights that are not
             those of its model.
     """
-    path = _model_file(path)
-    with _opened(path) as file:
-        card = _card(file, path)
-        weights = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    path, card, weights = _read(path, with_weights=True)
     with _about(path):
-        model = _created(card)
-        _take_weights(model, weights)
+        model = _created(card, weights)
     model.pretrained_cfg |= dict(label_names=tuple(card.classes), file=str(path))
     if model.image_size is None:
         model.pretrained_cfg["input_size"] = (model.in_chans, card.size, card.size)
@@ -120,64 +114,54 @@ def load_model(path: str | os.PathLike) -> tuple[Any, ModelCard]:
     return model.eval(), card
 
 
-def _model_file(path: str | os.PathLike) -> str | os.PathLike:
-    return pretrained_file(str(path)) if path in list_pretrained() else path
-
-
-@contextmanager
-def _opened(path: str | os.PathLike) -> Iterator[Any]:
+def _read(
+    path: str | os.PathLike, *, with_weights: bool
+) -> tuple[str | os.PathLike, ModelCard, dict[str, Tensor]]:
+    """The path of a file, or of a trained model's name, and what the file holds."""
+    path = pretrained_file(str(path)) if path in list_pretrained() else path
     try:
         with safe_open(path, "pt") as file:
-            yield file
+            entry = (file.metadata() or {}).get(_ENTRY)
+            names = file.keys() if with_weights else ()
+            weights = {name: file.get_tensor(name) for name in names}
     except SafetensorError as error:
         raise ValueError(f"{path} is no safetensors file: {error}") from error
-
-
-def _card(file: Any, path: str | os.PathLike) -> ModelCard:
-    entry = (file.metadata() or {}).get(_ENTRY)
     if entry is None:
         raise NoCardError(f"{path} holds weights, but not the name of their model")
     with _about(path):
-        try:
-            values = json.loads(entry)
-        except ValueError as error:
-            raise ValueError(f"what it says of its model is no JSON: {error}") from error
-        if not isinstance(values, dict) or "model" not in values:
-            raise ValueError(f'what it says of its model must name a "model", got {short(values)}')
-        # Older files do not say all of it.
-        known = {name: values[name] for name in _FIELDS if name in values}
-        for name, value in known.items():
-            fits, expected = _FIELDS[name]
-            if not fits(value):
-                raise ValueError(f"its {name} must be {expected}, got {short(value)}")
-        return ModelCard(**known)
+        return path, _card(entry), weights
 
 
-def _created(card: ModelCard) -> Any:
-    """The card's model; ValueError where its options are not those of that model."""
+def _card(entry: str) -> ModelCard:
     try:
-        return card.create()
+        values = json.loads(entry)
+    except ValueError as error:
+        raise ValueError(f"its description of the model is no JSON: {error}") from error
+    if not isinstance(values, dict) or "model" not in values:
+        raise ValueError(f'its description must name a "model", got {short(values)}')
+    # Older files lack some fields.
+    known = {name: values[name] for name in _FIELDS if name in values}
+    for name, value in known.items():
+        fits, expected = _FIELDS[name]
+        if not fits(value):
+            raise ValueError(f"its {name} must be {expected}, got {short(value)}")
+    return ModelCard(**known)
+
+
+def _created(card: ModelCard, weights: Mapping[str, Tensor]) -> Any:
+    """The card's model with these weights; ValueError where they do not fit each other."""
+    try:
+        model = card.create()
     except ValueError:
         raise
     except Exception as error:  # a constructor's, for a value that it never expects
-        said = json.dumps(card.options)
-        raise ValueError(f"a {card.model} cannot be made with the options {said}") from error
-
-
-def _take_weights(model: Any, weights: Mapping[str, Tensor]) -> None:
-    """Loads all the weights of a model; ValueError where there are others."""
-    own = model.state_dict()
-    for what, names in (
-        ("has no weights", own.keys() - weights.keys()),
-        ("has the unknown weights", weights.keys() - own.keys()),
-    ):
-        if names:
-            raise ValueError(f"it {what} {listed(sorted(names))}")
-    for name, weight in weights.items():
-        if weight.shape != own[name].shape:
-            got, expected = tuple(weight.shape), tuple(own[name].shape)
-            raise ValueError(f"its weights {name} must have the shape {expected}, got {got}")
-    model.load_state_dict(weights)
+        options = json.dumps(card.options)
+        raise ValueError(f"a {card.model} cannot be made with the options {options}") from error
+    try:
+        model.load_state_dict(weights)
+    except RuntimeError as error:
+        raise ValueError(" ".join(str(error).split())[:1000]) from error
+    return model
 
 
 def _is_number(value: Any, least: float = -math.inf, most: float = math.inf) -> bool:

@@ -2,6 +2,7 @@ import torch
 
 from darswin import polar_grid
 from darswin.layers.embed import PolarPatchEmbed
+from darswin.layers.polar import PolarGridSpec
 from darswin.lens import Spherical
 from darswin.ops import polar_embed
 
@@ -14,7 +15,7 @@ def test_general_lenses():
 
     grid = polar_grid(LENS, (32, 33), rings=4, sectors=8, samples=(3, 2))
     radii, azimuths, center = (t.double() for t in grid[:3])
-    embed = PolarPatchEmbed(4, 8, (3, 2)).double()
+    embed = PolarPatchEmbed(PolarGridSpec(4, 8, (3, 2))).double()
     tokens = polar_embed(
         images, radii, azimuths, center, embed.proj.weight, embed.proj.bias,
         affine=affine.double(), offsets=offsets.double(), samples=(3, 2),
