@@ -22,7 +22,7 @@ from darswin.bench.tables import training_table
 from darswin.data.augment import RandAugment, RandomErasing
 from darswin.ops import use_reference
 from darswin.train.classification import Classification
-from darswin.train.wide_angle import WideAngleData
+from darswin.train.data import WideAngleData
 
 FAMILIES = ("darswin_a", "darswin_ra", "swin", "swin_undis", "dat")
 WARM_UP = 3  # steps that are not counted

@@ -19,7 +19,7 @@ import torch
 
 from darswin.data import IGNORE, open_scenes
 from darswin.lens.pixels import pixel_rays
-from darswin.train.pixel_metrics import DistanceSums, LabelSums, distance_scores, label_scores
+from darswin.train.pixel_metrics import DistanceSums, LabelSums
 from darswin.utils.files import replace_file
 
 RINGS, SECTORS = 9, 16  # of 10° and 22.5°; what is further out is of the last ring
@@ -103,6 +103,5 @@ def _scores(
         answer = torch.from_numpy(said[_cells(ring, sector, sectors)]).to(kind)
         zone = torch.zeros(len(truth), dtype=torch.int64)
         sums.update(answer, torch.from_numpy(truth).to(kind), zone, zone.double())
-    counts = sums.compute()[0][0]
-    scores = label_scores(counts)[0] if of_labels else distance_scores(counts)
+    scores = sums.scores(sums.compute()[0][0])
     return {name: round(value, 5) for name, value in scores.items()}

@@ -27,7 +27,7 @@ from darswin.cli.quantize import quantize
 from darswin.deploy.optimize import optimize
 from darswin.layers.quantized import quantized_layers
 from darswin.models.saving import load_model, model_of_run
-from darswin.train.wide_angle import WideAngleData
+from darswin.train.data import WideAngleData
 from darswin.utils.files import replace_file
 
 HERE = Path(__file__).parent

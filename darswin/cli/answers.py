@@ -1,29 +1,49 @@
-"""What a model says of a stream of images, several at once: their most probable classes."""
+"""Answers of a model to a stream of images: classes, or files with labels or distances."""
 
+import io
+import json
+import os
 import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
+import cv2
 import numpy as np
 import torch
+from PIL import Image
 from torch import Tensor
 
-from darswin.data.warp import Framing, at_size
+from darswin.data.scenes.scene import IGNORE, PER_METRE
+from darswin.data.warp import Framing, FullSize, at_size
 from darswin.deploy.optimize import optimize
 from darswin.lens import Lens
 from darswin.models.base import Model
-from darswin.models.encoder import Encoder, Prepared
+from darswin.models.encoder import Encoder
 from darswin.models.saving import ModelCard
 from darswin.models.unet import Unet
+from darswin.utils.files import replace_file
+from darswin.viz.dense import (
+    UNKNOWN,
+    distance_image,
+    distance_range,
+    is_known,
+    label_image,
+    overlay,
+    palette,
+)
 
 Net = TypeVar("Net", bound=Model)
 
 BATCH = 8  # images at once take a half or a third of the time of one after the other
-LENSES = 16  # of which what they decide is kept: as many cameras may take turns in a folder
+LENSES = 16  # whose prepared values are kept: as many cameras may take turns in a folder
+ANSWERS = "predictions.json"
+FARTHEST = 2**16 - 1  # the largest number of 16 bits
 
 
-class Asked(NamedTuple):
-    """Attributes: entry: what is said of an image beside the answer; image: (H, W, C) uint8;
-    pixels: (1, C, h, w), what the model gets of it."""
+class Request(NamedTuple):
+    """entry: the part of the answer that is known before; image: (H, W, C) uint8; pixels:
+    (1, C, h, w), the model's input."""
 
     entry: dict[str, Any]
     image: np.ndarray
@@ -31,96 +51,82 @@ class Asked(NamedTuple):
 
 
 class Answers:
-    """Collects what a model says of images, in their order.
+    """Collects a model's answers to images, in their order.
 
-    Images that follow each other and have the same lens go through the model together, and what a
-    lens alone decides is computed once. A subclass says what is asked of the model, in `ask`, and
-    what is made of that, in `answer`.
+    Images that follow each other and have the same lens go through the model together, and the
+    values that depend on the lens alone are computed once. A subclass defines `_run`, the network,
+    and `_answer`, which makes an entry of its output.
 
     Attributes:
         found: an entry for each image answered. seconds: what the network took for them.
-
-    Args:
-        model: of `create_model`, or what `optimize` makes of one. card: as `load_model` gives it.
     """
 
     def __init__(self, model: Encoder | Unet, card: ModelCard):
         self.model, self.card = model, card
         self.found: list[dict[str, Any]] = []
         self.seconds = 0.0
-        self._lens: Lens | None = None  # of the images that wait
-        self._decided: dict[int, tuple[Lens, Any, Any]] = {}  # by the identity of a lens
-        self._waiting: list[Asked] = []
+        self._lens: Lens | None = None  # of the queue
+        self._prepared: dict[int, tuple[Lens, Any, FullSize | None]] = {}  # by a lens's identity
+        self._queue: list[Request] = []
 
     def add(self, entry: dict[str, Any], image: np.ndarray, lens: Lens) -> None:
-        """An image (H, W, C) uint8 and its lens; the same object is the same lens.
-
-        Args:
-            entry: what is said of the image beside the answer.
-        """
+        """An image (H, W, C) uint8 and its lens; the same object is the same lens."""
         pixels, resized_lens = resized(self.model, self.card, image, lens)
         if lens is not self._lens:
             self.flush()
             self._lens = lens
-            if id(lens) not in self._decided:
-                if len(self._decided) == LENSES:
-                    del self._decided[next(iter(self._decided))]
+            if id(lens) not in self._prepared:
+                if len(self._prepared) == LENSES:
+                    del self._prepared[next(iter(self._prepared))]
                 with torch.inference_mode():
                     size = (pixels.shape[2], pixels.shape[3])
                     prepared = self.model.prepare(resized_lens, size)
-                self._decided[id(lens)] = lens, prepared, self.look_through(lens)
-        self._waiting.append(Asked(entry, image, pixels))
-        if len(self._waiting) == BATCH:
+                self._prepared[id(lens)] = lens, prepared, self._full_size(lens)
+        self._queue.append(Request(entry, image, pixels))
+        if len(self._queue) == BATCH:
             self.flush()
 
     def flush(self) -> None:
-        """Answers the images that wait for others.
+        """Answers the images in the queue.
 
         Raises:
             FloatingPointError: naming an image for which the model computes NaN or infinity.
         """
-        waiting, self._waiting = self._waiting, []
-        if not waiting:
+        queue, self._queue = self._queue, []
+        if not queue:
             return
-        _, prepared, look = self._decided[id(self._lens)]
-        images = torch.cat([asked.pixels for asked in waiting])
+        _, prepared, full = self._prepared[id(self._lens)]
+        images = torch.cat([request.pixels for request in queue])
         start = time.perf_counter()
         with torch.inference_mode():
-            output = self.ask(images, prepared)
+            outputs = self._run(images, prepared)
         self.seconds += time.perf_counter() - start
-        for asked, said in zip(waiting, output, strict=True):
-            if not self.is_finite(said, look):
-                entry = asked.entry
+        for request, output in zip(queue, outputs, strict=True):
+            # Outside the pixels that a ray reaches it has no meaning.
+            used = output if full is None else output[:, torch.from_numpy(full.reached)]
+            if not used.isfinite().all():
+                entry = request.entry
                 name = f"frame {entry['frame']} of {entry['video']}" if "video" in entry else ""
                 raise FloatingPointError(
                     f"no answer for {name or entry['image']}: the model computes NaN or infinity; "
                     "its weights may have diverged in training, take others"
                 )
-            self.found.append(asked.entry | self.answer(asked, said, look))
+            self.found.append(request.entry | self._answer(request, output, full))
 
-    def look_through(self, lens: Lens) -> Any:
-        """What `answer` needs of a lens."""
+    def _full_size(self, lens: Lens) -> FullSize | None:
+        """The way back to the pixels of a lens's pictures, if the answer needs it."""
         return None
 
-    def is_finite(self, said: Tensor, look: Any) -> bool:
-        """Whether all that the network says of an image is finite."""
-        return bool(said.isfinite().all())
-
-    def ask(self, images: Tensor, prepared: Any) -> Tensor:
-        """What the network says of images (B, C, h, w): (B, …)."""
+    def _run(self, images: Tensor, prepared: Any) -> Tensor:
+        """The network's output (B, …) for images (B, C, h, w)."""
         raise NotImplementedError
 
-    def answer(self, asked: Asked, said: Tensor, look: Any) -> dict[str, Any]:
-        """The answer for an image of which the network says that; `look` is of `look_through`."""
+    def _answer(self, request: Request, output: Tensor, full: Any) -> dict[str, Any]:
         raise NotImplementedError
 
 
 class ClassAnswers(Answers):
-    """The most probable classes of images.
-
-    Args:
-        model, card: as `load_model` gives them. top: how many classes of each image.
-    """
+    """The `top` most probable classes of images."""
 
     model: Encoder
 
@@ -128,18 +134,115 @@ class ClassAnswers(Answers):
         super().__init__(fast(model, card), card)
         self.top = top
 
-    def ask(self, images: Tensor, prepared: Prepared) -> Tensor:
-        """The probabilities of all classes, (B, K)."""
+    def _run(self, images: Tensor, prepared: Any) -> Tensor:
         return self.model.run(images, prepared).softmax(-1)
 
-    def answer(self, asked: Asked, said: Tensor, look: Any) -> dict[str, Any]:
-        """The most probable classes."""
-        best = said.topk(min(self.top, len(said)))
-        return {"top": [*map(self._class, best.indices.tolist(), best.values.tolist())]}
+    def _answer(self, request: Request, output: Tensor, full: Any) -> dict[str, Any]:
+        best = output.topk(min(self.top, len(output)))
+        names = self.card.classes or range(len(output))
+        return {
+            "top": [
+                {"class": names[index], "probability": probability}
+                for index, probability in zip(
+                    best.indices.tolist(), best.values.tolist(), strict=True
+                )
+            ]
+        }
 
-    def _class(self, index: int, probability: float) -> dict[str, Any]:
-        name = self.card.classes[index] if self.card.classes else index
-        return {"class": name, "probability": probability}
+
+class PixelAnswers(Answers):
+    """Writes a file of the answers for an image's pixels, and an overlay of the image.
+
+    Files of pixels and overlays are in folders of their own, below which each image has the name
+    that `names`, of `file_names`, gives it, or a frame of a video that name and its number.
+    """
+
+    kind: str  # of the answers, and the name of their folder
+    model: Unet
+
+    def __init__(self, model: Unet, card: ModelCard, out: Path, names: Mapping[str, str]):
+        super().__init__(fast(model, card), card)
+        self.out, self.names = out, names
+
+    def _full_size(self, lens: Lens) -> FullSize:
+        return FullSize(lens, self.card.size, fit_of(self.model, self.card))
+
+    def _run(self, images: Tensor, prepared: Any) -> Tensor:
+        return self.model.run(images, prepared)
+
+    def _answer(self, request: Request, output: Tensor, full: FullSize) -> dict[str, Any]:
+        content, picture, where, summary = self._picture(request, output.float().numpy(), full)
+        entry = request.entry
+        if "video" in entry:
+            name = f"{self.names[entry['video']]}/{entry['frame']:06d}"
+        else:
+            name = self.names[entry["image"]]
+        files = {self.kind: f"{self.kind}/{name}.png", "overlay": f"overlays/{name}.jpg"}
+        replace_file(self.out / files[self.kind], content)
+        laid = overlay(request.image, picture, where=where)
+        _, jpeg = cv2.imencode(".jpg", laid[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 90])
+        replace_file(self.out / files["overlay"], jpeg.data)
+        return files | summary
+
+    def _picture(
+        self, request: Request, output: np.ndarray, full: FullSize
+    ) -> tuple[bytes | memoryview, np.ndarray, np.ndarray, dict[str, Any]]:
+        """Of an output (K, h, w): a PNG file's content, a picture for the overlay and where it is
+        laid, and a summary."""
+        raise NotImplementedError
+
+
+class LabelAnswers(PixelAnswers):
+    """A class for each pixel: PNGs whose pixels are the classes' ids, with a palette."""
+
+    kind = "labels"
+
+    def __init__(self, model: Unet, card: ModelCard, out: Path, names: Mapping[str, str]):
+        super().__init__(model, card, out, names)
+        if model.num_classes > IGNORE:
+            raise ValueError(f"labels of 8 bits are for {IGNORE} classes, got {model.num_classes}")
+        self.classes = list(card.classes) or [str(k) for k in range(model.num_classes)]
+        self.colors = list(card.colors) or palette(len(self.classes))
+
+    def _picture(self, request, output, full):
+        labels = full.labels(output)
+        counts = np.bincount(labels.ravel(), minlength=IGNORE + 1)
+        answered = max(1, labels.size - counts[IGNORE])
+        shares = {
+            name: round(float(count / answered), 6)
+            for name, count in zip(self.classes, counts, strict=False)
+        }
+        summary = {"shares": shares, "unanswered": round(float(counts[IGNORE] / labels.size), 6)}
+        picture = label_image(labels, self.colors)
+        return label_png(labels, self.colors), picture, labels != IGNORE, summary
+
+
+class DistanceAnswers(PixelAnswers):
+    """A distance along the ray for each pixel: 16-bit PNGs, metres × 256, 0 for none."""
+
+    kind = "distance"
+
+    def __init__(self, model: Unet, card: ModelCard, out: Path, names: Mapping[str, str]):
+        super().__init__(model, card, out, names)
+        self._range: tuple[Any, tuple[float, float]] = (None, (1.0, 2.0))
+
+    def _picture(self, request, output, full):
+        distance = full.distance(output[0])
+        known = is_known(distance)
+        values = distance[known] if known.any() else np.zeros(1)
+        unanswered = round(float(1 - known.mean()), 6)
+        ends = np.quantile(values, (0, 0.5, 1)).tolist()
+        metres = dict(zip(("min_m", "median_m", "max_m"), (round(v, 4) for v in ends), strict=True))
+        # Frames of a video have the colours of its first.
+        video = request.entry.get("video")
+        if video is None or video != self._range[0]:
+            self._range = video, distance_range(distance)
+        near, far = self._range[1]
+        summary = metres | {"unanswered": unanswered, "colors_m": [round(near, 4), round(far, 4)]}
+        return distance_png(distance), distance_image(distance, near, far), known, summary
+
+
+ANSWERS_OF = {"segmentation": LabelAnswers, "distance": DistanceAnswers}
 
 
 def fast(model: Net, card: ModelCard) -> Net:
@@ -148,10 +251,8 @@ def fast(model: Net, card: ModelCard) -> Net:
 
 
 def resized(net: Model, card: ModelCard, image: np.ndarray, lens: Lens) -> tuple[Tensor, Lens]:
-    """A picture as the model saw them in training: (1, C, H, W) uint8 with its lens, in its pixels.
-
-    `darswin.data.at_size` as the model's card says, and `fit_of`.
-    """
+    """A picture as the model saw them in training: (1, C, H, W) uint8 with its lens, in its
+    pixels."""
     image, lens = at_size(image, lens, card.size, fit_of(net, card))
     return torch.from_numpy(image[None]).permute(0, 3, 1, 2).contiguous(), lens
 
@@ -159,3 +260,65 @@ def resized(net: Model, card: ModelCard, image: np.ndarray, lens: Lens) -> tuple
 def fit_of(net: Model, card: ModelCard) -> Framing:
     """How pictures get the model's size. One that takes only squares gets one in any case."""
     return "crop" if net.square_images and card.fit == "whole" else card.fit
+
+
+def label_png(labels: np.ndarray, colors: Sequence[Sequence[int]]) -> bytes:
+    """Ids (H, W) uint8 as a PNG with a palette: its pixels are the ids, in their colours."""
+    image = Image.fromarray(labels)  # which a palette makes one of mode "P"
+    table = [*map(tuple, colors), *[UNKNOWN] * (256 - len(colors))]
+    image.putpalette([int(value) for color in table for value in color])
+    file = io.BytesIO()
+    image.save(file, "PNG")
+    return file.getvalue()
+
+
+def distance_png(distance: np.ndarray) -> memoryview:
+    """Distances (H, W) in metres as a PNG of 16 bits: metres × 256, 0 where they are not known.
+
+    From 255.996 m on, the end of its range, pixels are 65535; from 0 to 1/256 m they are 1.
+    """
+    known = is_known(distance)
+    steps = np.rint(np.where(known, distance, 0) * PER_METRE).clip(known, FARTHEST)
+    _, png = cv2.imencode(".png", steps.astype(np.uint16))
+    return png.data
+
+
+def file_names(paths: Sequence[str], files: Sequence[tuple[str, bool]]) -> dict[str, str]:
+    """Names for the files of pictures and videos, without an ending: different for different ones.
+
+    They are paths relative to the folder that all arguments are in: the one folder that was given,
+    or what several paths have in common. Pictures lose their endings if they still differ then.
+
+    Args:
+        paths: the arguments. files: of (path, whether it is a video).
+    """
+    places = [os.path.abspath(p if os.path.isdir(p) else os.path.dirname(p) or ".") for p in paths]
+    root = os.path.commonpath(places)
+    whole = {name: os.path.relpath(os.path.abspath(name), root) for name, _ in files}
+    videos = {name for name, is_video in files if is_video}
+    short = {n: w if n in videos else os.path.splitext(w)[0] for n, w in whole.items()}
+    return short if len(set(short.values())) == len(set(whole.values())) else whole
+
+
+def claim_folder(out: str | None) -> Path:
+    """The folder for the files of `PixelAnswers`; ValueError unless it is new, empty, or of an
+    earlier `predict`."""
+    if out is None:
+        raise ValueError("predict writes pictures for such a model: `out` must be their folder")
+    folder = Path(out)
+    if folder.exists() and not folder.is_dir():
+        raise ValueError(f"`out` must be a folder for the pictures, and {out} is a file")
+    if folder.is_dir() and not _is_ours(folder / ANSWERS) and any(folder.iterdir()):
+        raise ValueError(
+            f"`out` {out} holds files that are none of predict's: give a new or an empty folder, "
+            "or one of an earlier predict, whose files are replaced"
+        )
+    replace_file(folder / ANSWERS, "[]")
+    return folder
+
+
+def _is_ours(file: Path) -> bool:
+    try:
+        return isinstance(json.loads(file.read_bytes()), list)
+    except (OSError, ValueError):
+        return False

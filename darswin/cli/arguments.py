@@ -1,117 +1,156 @@
-"""Command lines of functions, by jsonargparse: lists as people type them, errors in a sentence."""
+"""Command lines of functions: a sentence says what is wrong with the arguments of a command."""
 
+import argparse
 import inspect
 import json
 import re
 import types
 import typing
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Sequence
 from typing import Any, Literal, NoReturn
 
+import yaml
+
 _NUMBERS = re.compile(r"[\s\[\](),.+\-eE\d]*\d[\s\[\](),.+\-eE\d]*")
-_WORDS = {int: "a whole number", float: "a number", bool: "true or false"}
+_WORDS = {int: "a whole number", float: "a number"}
 
 
-def run_command(commands: Callable[..., Any] | dict[str, Any], argv: list[str], prog: str) -> None:
-    """Calls the function, or the one of several that `argv` names, with the arguments in `argv`.
+class Parser(argparse.ArgumentParser):
+    """A parser that ends the program with one sentence and exit code 2."""
+
+    def error(self, message: str) -> NoReturn:
+        message = " ".join(message.split())
+        self.exit(2, f"{self.prog}: {message}; `{self.prog} --help` tells more\n")
+
+
+def run_command(commands: Callable | dict[str, Callable], argv: list[str], prog: str) -> None:
+    """Calls a function, or the one of several that `argv` names first, with the arguments.
+
+    Its keyword-only parameters are options, its others are words that stand in their order. Their
+    types and the docstring's section `Args` say what may be typed, and the help.
 
     Raises:
         SystemExit: code 2 and a sentence on stderr for arguments that the function does not take.
     """
-    from jsonargparse import ArgumentParser, auto_cli
-
-    functions = commands.values() if isinstance(commands, dict) else [commands]
-    kinds = {
-        name: parameter.annotation
-        for function in functions
-        for name, parameter in inspect.signature(function).parameters.items()
-    }
-
-    class Parser(ArgumentParser):
-        def error(self, message: str, ex: Exception | None = None) -> NoReturn:
-            of = getattr(ex, "subcommand_parser", None) or self
-            of = of.prog.replace(" [options]", "")
-            self.exit(2, f"{of}: {_sentence(message, kinds)}; `{of} --help` tells more\n")
-
-    lists = [name for name, kind in kinds.items() if _length(kind)]
-    auto_cli(
-        commands, args=with_lists(argv, lists), prog=prog, parser_class=Parser, fail_untyped=False
-    )
-
-
-def with_lists(argv: Sequence[str], names: Collection[str]) -> list[str]:
-    """The arguments with the numbers of each list in one: `--size 10,10`, `--size 10 10` and
-    `--size=[10, 10]` become `--size=[10,10]`.
-
-    Args:
-        names: of the options that take a list, without dashes.
-    """
-    found, left = [], list(argv)
-    while left:
-        argument = left.pop(0)
-        option, equals, value = argument.partition("=")
-        # argparse also takes an unambiguous beginning of an option's name.
-        if option[:2] != "--" or not any(name.startswith(option[2:] or "-") for name in names):
-            found.append(argument)
-            continue
-        parts = [value] if equals else []
-        while (not parts or _NUMBERS.fullmatch(parts[-1])) and left and _NUMBERS.fullmatch(left[0]):
-            parts.append(left.pop(0))
-        if all(_NUMBERS.fullmatch(part) for part in parts) and parts:
-            numbers = re.findall(r"[^\s\[\](),]+", " ".join(parts))
-            argument = f"{option}=[{','.join(numbers)}]"
-        found.append(argument)
-    return found
+    if isinstance(commands, dict):
+        if argv and argv[0] in commands:
+            run_command(commands[argv[0]], argv[1:], f"{prog} {argv[0]}")
+            return
+        parser = Parser(prog=prog)
+        each = (f"{name}: {_summary(function)}" for name, function in commands.items())
+        parser.add_argument("command", choices=commands, help=" ".join(each))
+        parser.parse_args(argv or ["--help"])
+        return
+    parser = Parser(prog=prog, description=_summary(commands))
+    section = (inspect.getdoc(commands) or "").partition("\nArgs:\n")[2]
+    texts = dict(re.findall(r"^    (\w+): (.*(?:\n        .*)*)", section, re.M))
+    kinds = {}
+    for name, parameter in inspect.signature(commands).parameters.items():
+        kinds[name] = kind = _without_none(parameter.annotation)
+        words = [*texts.get(name, "").replace("%", "%%").split()]
+        if _kind(kind).startswith("one of"):
+            words.append(_kind(kind))
+        settings: dict[str, Any] = dict(default=parameter.default)
+        if parameter.kind is not parameter.KEYWORD_ONLY:
+            settings |= dict(nargs="*") if _is_list(kind) else {}
+        elif parameter.default is parameter.empty:
+            settings |= dict(required=True)
+        else:
+            settings |= dict(nargs="?", const="[]") if _is_list(kind) else {}
+            words.append(f"[{_typed(parameter.default)}]")
+        option = f"--{name}" if parameter.kind is parameter.KEYWORD_ONLY else name
+        parser.add_argument(option, help=" ".join(words), **settings)
+    lists = [name for name, kind in kinds.items() if _is_list(kind)]
+    given = vars(parser.parse_args(with_lists(argv, lists)))
+    for name, text in given.items():
+        if text == "null" and parser.get_default(name) is None:
+            given[name] = None
+        elif isinstance(text, str):
+            try:
+                given[name] = _value(text, kinds[name])
+            except (ValueError, yaml.YAMLError):
+                parser.error(f"--{name} must be {_kind(kinds[name])}, got {text or 'nothing'}")
+    commands(**given)
 
 
-def with_words(argv: Sequence[str], name: str) -> list[str]:
-    """The arguments with all words that follow an option in one list: `--paths A B` becomes
-    `--paths=["A", "B"]`; what is a list already stays.
-
-    Args:
-        name: of the option, without dashes.
-    """
-    found, left = [], list(argv)
-    while left:
-        argument = left.pop(0)
-        option, equals, value = argument.partition("=")
-        if option == f"--{name}" and not value.startswith("[") and value != "null":
-            words = [value] if equals else []
-            while left and not left[0].startswith("-"):
-                words.append(left.pop(0))
-            if words not in ([], ["null"]) and not words[0].startswith("["):
-                argument = f"{option}={json.dumps(words)}"
-            else:
-                argument = "=".join((option, *words))
-        found.append(argument)
-    return found
+def _summary(function: Callable) -> str:
+    """The first paragraph of a docstring."""
+    return " ".join((inspect.getdoc(function) or "").partition("\n\n")[0].split())
 
 
-def _sentence(message: str, kinds: Mapping[str, Any]) -> str:
-    """What jsonargparse says of an argument, in one line and with options as people type them."""
-    key = re.search(r'[Kk]ey "([^"]+)"', message)
-    name = key[1].rpartition(".")[2] if key else ""
-    got = re.search(r"(?:Got|Given) value: (.*)", message)
-    if name in kinds and got:
-        return f"--{name} must be {_kind(kinds[name])}, got {got[1] or 'nothing'}"
-    return " ".join(message.split()).rstrip(".")
+def _without_none(kind: Any) -> Any:
+    """The type of a value that is there; of several types the first."""
+    if typing.get_origin(kind) in (typing.Union, types.UnionType):
+        return next(choice for choice in typing.get_args(kind) if choice is not types.NoneType)
+    return kind
 
 
-def _kind(annotation: Any) -> str:
+def _is_list(kind: Any) -> bool:
+    return typing.get_origin(kind) in (tuple, list, Sequence)
+
+
+def _value(text: str, kind: Any) -> Any:
+    """The text as a value of a type; ValueError or YAMLError where it is none."""
+    choices = typing.get_args(kind)
+    if not _is_list(kind):
+        if choices and text not in choices:
+            raise ValueError
+        return text if choices else kind(text)
+    values = yaml.safe_load(text)
+    values = values if isinstance(values, list) else [values]
+    fixed = typing.get_origin(kind) is tuple
+    if any(type(value) is not choices[0] for value in values):
+        raise ValueError
+    if fixed and len(values) != len(choices):
+        raise ValueError
+    return tuple(values) if fixed else values
+
+
+def _kind(kind: Any) -> str:
     """A type in words."""
-    options = typing.get_args(annotation)
-    if typing.get_origin(annotation) in (typing.Union, types.UnionType):
-        kinds = dict.fromkeys(_kind(option) for option in options if option is not types.NoneType)
-        return " or ".join(kinds)
-    if typing.get_origin(annotation) is Literal:
-        return f"one of {', '.join(map(str, options))}"
-    if length := _length(annotation):
-        return f"{length} whole numbers, such as {','.join(['10'] * length)}"
-    return _WORDS.get(annotation, "a text")
+    choices = typing.get_args(kind)
+    if typing.get_origin(kind) is Literal:
+        return f"one of {', '.join(choices)}"
+    if typing.get_origin(kind) is tuple:
+        return f"{len(choices)} whole numbers, such as {','.join(['10'] * len(choices))}"
+    if _is_list(kind):
+        return "whole numbers, such as 1,8" if choices[0] is int else "a list of texts"
+    return _WORDS.get(kind, "a text")
 
 
-def _length(annotation: Any) -> int:
-    """How many numbers an option of a tuple type takes; 0 for other types."""
-    if typing.get_origin(annotation) is tuple:
-        return len(typing.get_args(annotation))
-    return max((_length(option) for option in typing.get_args(annotation)), default=0)
+def _typed(default: Any) -> str:
+    """A default as people type it."""
+    if isinstance(default, Sequence) and not isinstance(default, str):
+        return ",".join(map(str, default))
+    if isinstance(default, float):
+        return f"{default:g}"
+    return "null" if default is None else str(default)
+
+
+def with_lists(
+    argv: Sequence[str], numbers: Collection[str], words: Collection[str] = ()
+) -> list[str]:
+    """The arguments with what follows an option in one list: `--size 10,10`, `--size 10 10` and
+    `--size=[10, 10]` become `--size=[10,10]`; `--paths A B` becomes `--paths=["A", "B"]`.
+
+    Args:
+        numbers, words: the names of options that take lists of them, without dashes.
+    """
+    found, left = [], list(argv)
+    while left:
+        option, equals, value = left.pop(0).partition("=")
+        parts = [value] if equals else []
+        # argparse also takes an unambiguous beginning of an option's name.
+        if option[:2] == "--" and any(name.startswith(option[2:] or "-") for name in numbers):
+            while all(map(_NUMBERS.fullmatch, parts)) and left and _NUMBERS.fullmatch(left[0]):
+                parts.append(left.pop(0))
+            if parts and all(map(_NUMBERS.fullmatch, parts)):
+                each = re.findall(r"[^\s\[\](),]+", " ".join(parts))
+                parts = [f"[{','.join(each)}]"]
+        elif option[2:] in words and not value.startswith("[") and value != "null":
+            while left and not left[0].startswith("-"):
+                parts.append(left.pop(0))
+            if parts not in ([], ["null"]) and not parts[0].startswith("["):
+                parts = [json.dumps(parts)]
+        found.append("=".join((option, *parts)))
+    return found

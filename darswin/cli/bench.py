@@ -1,7 +1,5 @@
 """The command `darswin bench`."""
 
-import argparse
-import math
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -12,9 +10,9 @@ from darswin.bench import candidates, memory, plot, tables, targets
 from darswin.bench.machine import THREADS, machine, num_threads
 from darswin.bench.record import Record
 from darswin.bench.timing import MATMULS, OURS, REFERENCE, TURNS, Case, Timing, measure
-from darswin.cli.arguments import with_lists
 from darswin.layers import linear, onednn
-from darswin.models import list_models
+from darswin.models.registry import model_class
+from darswin.utils.malloc import keep_freed_memory
 
 DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16}
 INT8 = {"int8": torch.int8}  # inference, where the CPU has it
@@ -33,17 +31,29 @@ def bench(
     seconds: float = 2.0,
     out: Path = Path(),
 ) -> Record:
-    """Measures inference and training of a model on this machine, and prints what it found.
+    """Measures inference and training of a model on this machine, and prints the results.
 
     With the default options it takes a quarter of an hour.
 
     Args:
-        model: its name. size: px, of square images. batches: B.
-        compiled: the batches at which the compiled reference is measured too, at all threads.
+        model: its name.
+        size: px, of the square images.
+        batches: images at once.
+        compiled: batches at which torch.compile is measured too, about a minute each, at all
+            threads; none: no value.
         seconds: of each timing, about.
-        out: the folder of the record, `model--<CPU>-<tier>.json`, and its plot.
+        out: folder of the record, `model--<CPU>-<tier>.json`, and its plot.
     """
-    out.mkdir(parents=True, exist_ok=True)  # before the work
+    model_class(model)  # all is checked before the work
+    for name, count in (("size", size), *(("batches", b) for b in (*batches, *compiled))):
+        if not 1 <= count <= MOST:
+            raise ValueError(f"`{name}` must be from 1 to {MOST}, got {count}")
+    if not batches:
+        raise ValueError("`batches` must be one number at least")
+    if not 0 < seconds < float("inf"):
+        raise ValueError(f"`seconds` must be above 0, got {seconds}")
+    keep_freed_memory()
+    out.mkdir(parents=True, exist_ok=True)
     head = machine()
     print(" ".join(f"{k}={v}" for k, v in head.items()), flush=True)
     timings: list[Timing] = []
@@ -120,42 +130,3 @@ def _memory(model: str, size: int, batch: int) -> list[memory.Memory]:
         for dtype in DTYPES
         for name in (OURS, REFERENCE)
     ]
-
-
-def run(argv: list[str]) -> None:
-    """Runs `darswin bench` with the arguments that follow it."""
-    parser = argparse.ArgumentParser(
-        prog="darswin bench", description=(bench.__doc__ or "").split("\n")[0],
-        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
-    )  # fmt: skip
-    parser.add_argument("--model", choices=list_models(), metavar="NAME", help="a model's name")
-    parser.add_argument("--size", type=_count, help="px, of the square images")
-    parser.add_argument("--batches", type=_counts, metavar="B,B", help="images at once")
-    parser.add_argument(
-        "--compiled", type=_counts, nargs="?", const=(), metavar="B,B",
-        help="batches at which torch.compile is measured too, about a minute each; none: no value",
-    )  # fmt: skip
-    parser.add_argument("--seconds", type=_seconds, help="of each timing, about")
-    parser.add_argument("--out", type=Path, help="folder of the record and the plot")
-    parser.set_defaults(**(bench.__kwdefaults__ or {}))
-    bench(**vars(parser.parse_args(with_lists(argv, ("batches", "compiled")))))
-
-
-def _count(text: str) -> int:
-    if not text.isdecimal() or not 1 <= int(text) <= MOST:
-        raise argparse.ArgumentTypeError(f"must be a whole number from 1 to {MOST}, got {text}")
-    return int(text)
-
-
-def _counts(text: str) -> list[int]:
-    return [_count(part) for part in text.strip("[]").split(",")]
-
-
-def _seconds(text: str) -> float:
-    try:
-        seconds = float(text)
-    except ValueError:
-        seconds = math.nan
-    if not 0 < seconds < math.inf:
-        raise argparse.ArgumentTypeError(f"must be a number above 0, got {text}")
-    return seconds

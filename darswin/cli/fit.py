@@ -6,6 +6,7 @@ which data, is the task's: `darswin.train.tasks`.
 """
 
 import contextlib
+import inspect
 import re
 import shlex
 import sys
@@ -23,26 +24,51 @@ from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
 from lightning.pytorch.utilities import rank_zero_only
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
-from darswin.cli.arguments import with_lists, with_words
-from darswin.cli.configs import FIRST_TASK, check_free, last_of, presets, task_of, with_configs
-from darswin.cli.help import ALL, format_help
+from darswin.cli.arguments import with_lists
+from darswin.cli.options import (
+    ALL,
+    FIRST_TASK,
+    RUN,
+    check_free,
+    complete,
+    format_help,
+    last_of,
+    presets,
+)
 from darswin.data.lens_distributions import parse_sweep
 from darswin.models.saving import Task, model_of_run, read_card
-from darswin.train.checkpoints import RunCheckpoint, SafeCheckpointIO
 from darswin.train.finetuning import settle, weights_file
-from darswin.train.resuming import check_changes
-from darswin.train.stopping import StopSignals, StopWhenTold
+from darswin.train.results import WriteResults
+from darswin.train.runs import (
+    RunCheckpoint,
+    SafeCheckpointIO,
+    StopOnSignal,
+    StopSignals,
+    check_changes,
+)
 from darswin.train.tasks import TASKS
 from darswin.utils.files import locked, remove_partial_files, replace_file
 from darswin.utils.malloc import keep_freed_memory
+
+
+def flag_of(name: str) -> str:
+    """The flag of a parameter that an error of the library names."""
+    if name in RUN or "." in name:
+        return f"--{name}"
+    classes = [("data", part) for task in TASKS.values() for part in task.data.__mro__]
+    for group, part in (*classes, ("trainer", Trainer)):
+        ours = part.__module__.startswith(("darswin.", "lightning.pytorch.trainer"))
+        if ours and name in inspect.signature(part).parameters:
+            return f"--{group}.{name}"
+    return f"--model.{name}"
 
 
 def run(argv: list[str]) -> None:
     """Runs `fit`, `validate` or `test`, the first of `argv`, with the others as its options."""
     if argv[0] == "fit":
         keep_freed_memory()
-    argv = with_lists(argv, ("data.mean", "data.std", "model.class_weights", "model.zones"))
-    argv = with_words(argv, "data.test_paths")
+    numbers = ("data.mean", "data.std", "model.class_weights", "model.zones")
+    argv = with_lists(argv, numbers, words=("data.test_paths",))
     # Lightning warns of arguments that are not sys.argv: ours add the run's configuration.
     warnings.filterwarnings("ignore", "LightningCLI's args parameter")
     warnings.filterwarnings("ignore", r".*isinstance\(treespec, LeafSpec\)")  # Lightning's own
@@ -60,26 +86,19 @@ def run(argv: list[str]) -> None:
             other = rank_zero_only.rank  # type: ignore[attr-defined]  # Lightning adds it as it runs
             raise SystemExit(0 if other else 128 + signals.number) from None
         except (MemoryError, RuntimeError) as error:
-            if not _lacks_memory(error):
+            # Torch's own exception class is for GPUs. On Linux, the system kills a worker instead.
+            lack = re.search("can't allocate memory|DataLoader worker .*: Killed", str(error))
+            if not (lack or isinstance(error, MemoryError | torch.OutOfMemoryError)):
                 raise
             raise MemoryError(
-                "not enough memory: a smaller --data.batch_size or --model.name, or "
-                "--model.grad_checkpointing true, needs less "
-                f"({str(error).strip().splitlines()[-1]})"
+                "not enough memory: a smaller `batch_size` or model, or `grad_checkpointing` true, "
+                f"needs less ({str(error).strip().splitlines()[-1]})"
             ) from error
-
-
-def _lacks_memory(error: Exception) -> bool:
-    # Torch has an exception class for GPUs only. On Linux, the system kills a worker instead.
-    said = re.search("can't allocate memory|DataLoader worker .*: Killed", str(error))
-    return isinstance(error, MemoryError | torch.OutOfMemoryError) or said is not None
 
 
 def _run(argv: list[str], signals: StopSignals) -> None:
     whole_help = ALL in argv
-    argv = ["--help" if word == ALL else word for word in argv]
-    argv = with_configs(argv)
-    task = task_of(argv)
+    argv, task = complete(["--help" if word == ALL else word for word in argv])
     RunCLI(
         signals,
         task,
@@ -102,12 +121,11 @@ def _run(argv: list[str], signals: StopSignals) -> None:
 
 
 class RunParser(LightningArgumentParser):
-    """Names options in its errors as people type them, and shows ours first in its help."""
+    """Names options in its errors as people type them, and ours first in its help."""
 
     whole_help = False
 
     def format_help(self) -> str:
-        """The help of `darswin.cli.help`: ours first."""
         command = self.prog.split()[-1]
         if command not in RunCLI.subcommands():
             return super().format_help()
@@ -125,7 +143,7 @@ class RunParser(LightningArgumentParser):
         super().error(" ".join(message.split()), *rest)
 
     def print_usage(self, *arguments) -> None:
-        """Prints nothing before an error: the usage would have 150 options, see `--help`."""
+        """Nothing before an error: the usage would have 150 options, see `--help`."""
 
 
 class WholeHelpParser(RunParser):
@@ -192,10 +210,10 @@ class RunCLI(LightningCLI):
         if config.devices is not None:
             config.trainer.devices = config.devices
         if config.trainer.overfit_batches:
-            raise ValueError("--trainer.overfit_batches shuffles otherwise: take --data.limit")
+            raise ValueError("`overfit_batches` shuffles otherwise: take `limit`")
         if config.checkpoint_steps < 1:
             raise ValueError(
-                f"--checkpoint_steps must be at least 1, got {config.checkpoint_steps}"
+                f"`checkpoint_steps` must be at least 1, got {config.checkpoint_steps}"
             )
         if self.subcommand != "fit":
             config.ckpt_path = config.ckpt_path or str(model_of_run(self.folder, ".ckpt"))
@@ -213,7 +231,7 @@ class RunCLI(LightningCLI):
         if config.resume and last_of(self.folder).exists():
             before = yaml.safe_load((self.folder / "config.yaml").read_text())
             for change in check_changes(before, yaml.safe_load(self.record)):
-                _say(change)
+                _say(re.sub("`(.*?)`", r"--\1", change))
 
     def _check_lenses(self, config) -> None:
         """ValueError for lenses to warp to, typed beside those that took the pictures."""
@@ -244,10 +262,29 @@ class RunCLI(LightningCLI):
         if given.enable_progress_bar and not any(isinstance(c, ProgressBar) for c in callbacks):
             callbacks.append(RunProgressBar())
         if self.subcommand == "fit":
-            loggers = self._loggers() if given.logger is None else []
-            callbacks.insert(0, BeginRun(self.folder, self.record, loggers))
-        kwargs["callbacks"] = [*callbacks, *self._callbacks(config.checkpoint_steps)]
-        return super().instantiate_trainer(**kwargs)
+            callbacks = self._fit_callbacks(callbacks, config)
+        elif self.subcommand == "test":
+            callbacks.append(WriteResults(self.folder))
+        return super().instantiate_trainer(**kwargs, callbacks=callbacks)
+
+    def _fit_callbacks(self, others: list[Callback], config) -> list[Callback]:
+        loggers = [] if config.trainer.logger is not None else [
+            # A new version each time: nothing is overwritten.
+            CSVLogger(self.folder, name="csv", flush_logs_every_n_steps=1),
+            TensorBoardLogger(self.folder, name="", version="tensorboard"),
+        ]  # fmt: skip
+        monitor, mode = TASKS[self.task].module.monitor
+        checkpoint = partial(
+            RunCheckpoint, self.folder / "checkpoints", enable_version_counter=False
+        )
+        return [
+            BeginRun(self.folder, self.record, loggers),
+            *others,
+            StopOnSignal(self.signals, last_of(self.folder)),
+            checkpoint("best", monitor=monitor, mode=mode, save_on_train_epoch_end=False),
+            checkpoint("last", every_n_train_steps=config.checkpoint_steps),
+            checkpoint("last", save_on_train_epoch_end=True),
+        ]
 
     def _run_subcommand(self, subcommand: str) -> None:
         super()._run_subcommand(subcommand)
@@ -282,28 +319,6 @@ class RunCLI(LightningCLI):
         else:
             _say(f"{last} is not there yet: starting from the beginning")
         return config.ckpt_path
-
-    def _loggers(self) -> list:
-        return [
-            # A new version each time: nothing is overwritten.
-            CSVLogger(self.folder, name="csv", flush_logs_every_n_steps=1),
-            TensorBoardLogger(self.folder, name="", version="tensorboard"),
-        ]
-
-    def _callbacks(self, steps: int) -> list[Callback]:
-        if self.subcommand != "fit":
-            writer = TASKS[self.task].write(self.folder)
-            return [writer] if self.subcommand == "test" else []
-        monitor, mode = TASKS[self.task].module.monitor
-        checkpoint = partial(
-            RunCheckpoint, self.folder / "checkpoints", enable_version_counter=False
-        )
-        return [
-            StopWhenTold(self.signals, last_of(self.folder)),
-            checkpoint("best", monitor=monitor, mode=mode, save_on_train_epoch_end=False),
-            checkpoint("last", every_n_train_steps=steps),
-            checkpoint("last", save_on_train_epoch_end=True),
-        ]
 
 
 class BeginRun(Callback):

@@ -1,6 +1,5 @@
-"""`darswin info`: what a report of an issue needs to say about this installation and machine."""
+"""`darswin info` and `darswin models`."""
 
-import argparse
 import platform
 
 import torch
@@ -8,20 +7,27 @@ import torch
 from darswin.bench.machine import machine
 from darswin.layers import onednn
 from darswin.layers.packed import fastest_dtype
+from darswin.models import list_models, list_pretrained
 from darswin.ops import _module
 from darswin.utils.extras import lack
 
 EXTRAS = ("demo", "onnx", "train")
 
 
-def run(argv: list[str]) -> None:
-    """Runs `darswin info` with the arguments that follow it, of which there are none."""
-    argparse.ArgumentParser(prog="darswin info", description=__doc__).parse_args(argv)
-    for name, value in info().items():
+def models() -> None:
+    """Lists the models."""
+    print("\n".join(list_models()))
+    print("\ntrained, for --model of predict:")
+    print("\n".join(list_pretrained()))
+
+
+def info() -> None:
+    """Prints what a report of an issue needs to say about this installation and machine."""
+    for name, value in facts().items():
         print(f"{name:<10}{value}")
 
 
-def info() -> dict[str, str]:
+def facts() -> dict[str, str]:
     """Versions, CPU, instruction-set tiers, threads, oneDNN, and which extras are installed."""
     here = machine()
     commit = f", commit {here['commit']}" if here["commit"] else ""

@@ -6,7 +6,6 @@ from typing import Literal
 import torch
 
 import darswin.lens
-from darswin.cli.arguments import run_command
 from darswin.layers.polar import PolarSample
 from darswin.lens.base import Lens
 from darswin.lens.files.load import Calibration, reach
@@ -23,13 +22,8 @@ MOST = {"rings": 1024, "sectors": 4096, "samples": 256}
 MOST_SAMPLES = 2**22
 
 
-def run(argv: list[str]) -> None:
-    """Runs `darswin lens` with the arguments that follow it."""
-    run_command({"show": show, "info": info, "convert": convert}, argv, "darswin lens")
-
-
 def show(
-    calib: str, image: str, out: str = "lens.png", rings: int = 16, sectors: int = 64,
+    calib: str, image: str, *, out: str = "lens.png", rings: int = 16, sectors: int = 64,
     samples: tuple[int, int] = (10, 10), spacing: Spacing = "theta",
     view: View = "perspective", fov_deg: float | None = None, yaw_deg: float = 0.0,
     pitch_deg: float = 0.0, theta_max_deg: float | None = None, camera: str | None = None,
@@ -76,7 +70,7 @@ def show(
         if not fov_deg > 0:
             raise ValueError(
                 "the picture shows nothing on the row of the lens's principal point: choose the "
-                "view with --fov_deg and --yaw_deg"
+                "view with `fov_deg` and `yaw_deg`"
             )
     aspect = {
         "perspective": size[0] / size[1],
@@ -92,7 +86,7 @@ def show(
 
 
 def info(
-    calib: str, image_size: tuple[int, int] | None = None, rings: int = 16, sectors: int = 64,
+    calib: str, *, image_size: tuple[int, int] | None = None, rings: int = 16, sectors: int = 64,
     theta_max_deg: float | None = None, camera: str | None = None,
     coefficients: Coefficients | None = None,
 ) -> None:  # fmt: skip
@@ -111,7 +105,7 @@ def info(
     file, lens = _read(calib, camera, theta_max_deg, image_size, coefficients)
     if lens.image_size is None:
         raise ValueError(
-            f"{calib} does not say how large its images are: give --image_size, their height and "
+            f"{calib} does not say how large its images are: give `image_size`, their height and "
             "width, e.g. 960,1280"
         )
     origin = f"({file.format.origin:g}, {file.format.origin:g})"
@@ -123,7 +117,7 @@ def info(
 
 
 def convert(
-    calib: str, out: str, model: str | None = None, theta_max_deg: float | None = None,
+    calib: str, out: str, *, model: str | None = None, theta_max_deg: float | None = None,
     image_size: tuple[int, int] | None = None, camera: str | None = None,
     coefficients: Coefficients | None = None, format: Format | None = None,
 ) -> None:  # fmt: skip
@@ -173,7 +167,7 @@ def _read(
 
 def _check(name: str, value: float, ok: bool, range_: str) -> None:
     if not ok:
-        raise ValueError(f"--{name} must be {range_}, got {str(value)[:40]}")
+        raise ValueError(f"`{name}` must be {range_}, got {str(value)[:40]}")
 
 
 def _check_partition(rings: int, sectors: int, samples: tuple[int, int] = (1, 1)) -> None:
@@ -183,7 +177,7 @@ def _check_partition(rings: int, sectors: int, samples: tuple[int, int] = (1, 1)
         _check(name, value, 1 <= value <= MOST[name], f"from 1 to {MOST[name]}")
     if (total := rings * sectors * math.prod(samples)) > MOST_SAMPLES:
         raise ValueError(
-            f"--rings × --sectors × --samples must be at most {MOST_SAMPLES} samples, got {total}"
+            f"`rings` × `sectors` × `samples` must be at most {MOST_SAMPLES} samples, got {total}"
         )
 
 
@@ -208,3 +202,6 @@ def _fields_of_view(lens: Lens, size: tuple[int, int]) -> tuple[float, float]:
     end = lens.theta_max.item()
     angles = torch.rad2deg(sides(lens, size).clamp(-end, end))
     return min(angles[::2].sum().item(), 360.0), angles[1::2].sum().clamp(max=180).item()
+
+
+COMMANDS = {"show": show, "info": info, "convert": convert}

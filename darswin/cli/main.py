@@ -1,6 +1,5 @@
 """The command line: `darswin COMMAND`, or `python -m darswin COMMAND`."""
 
-import argparse
 import codecs
 import json
 import os
@@ -8,111 +7,60 @@ import re
 import sys
 import warnings
 from collections.abc import Callable, Mapping
+from pkgutil import resolve_name
 from typing import NamedTuple
 
+from darswin.cli.arguments import run_command
 from darswin.utils.extras import lack
+from darswin.utils.processes import die_with_first_process
 
 
 class Command(NamedTuple):
-    """A command: its help, the modules of the extra `train` that it imports, and what runs it."""
+    """A command: its help, the modules of the extra `train` that it imports, and its function, or
+    functions. It is imported when the command is called, which takes seconds."""
 
     text: str
     needs: tuple[str, ...]
-    run: Callable[[list[str]], None]
-
-
-# Each imports what it runs when it is called: that takes seconds.
-def _fit(argv: list[str]) -> None:
-    from darswin.utils.processes import die_with_first_process
-
-    with die_with_first_process():  # the imports alone may take longer than the first one lives
-        from darswin.cli.fit import run
-
-        run(argv)
-
-
-def _predict(argv: list[str]) -> None:
-    from darswin.cli.predict import run
-
-    run(argv[1:])
-
-
-def _quantize(argv: list[str]) -> None:
-    from darswin.cli.arguments import run_command
-    from darswin.cli.quantize import quantize
-
-    run_command(quantize, argv[1:], "darswin quantize")
-
-
-def _convert(argv: list[str]) -> None:
-    from darswin.cli.arguments import run_command
-    from darswin.compat import convert_checkpoint
-
-    run_command(convert_checkpoint, argv[1:], "darswin convert")
-
-
-def _models(argv: list[str]) -> None:
-    from darswin.models import list_models, list_pretrained
-
-    parser = argparse.ArgumentParser(prog="darswin models", description=COMMANDS["models"].text)
-    parser.parse_args(argv[1:])
-    print("\n".join(list_models()))
-    print("\ntrained, for --model of predict:")
-    print("\n".join(list_pretrained()))
-
-
-def _lens(argv: list[str]) -> None:
-    from darswin.cli.lens import run
-
-    run(argv[1:])
-
-
-def _bench(argv: list[str]) -> None:
-    from darswin.cli.bench import run
-    from darswin.utils.malloc import keep_freed_memory
-
-    keep_freed_memory()
-    run(argv[1:])
-
-
-def _info(argv: list[str]) -> None:
-    from darswin.cli.info import run
-
-    run(argv[1:])
+    function: str
 
 
 TRAIN = (
     "PIL", "cv2", "jsonargparse", "lightning", "matplotlib", "sklearn", "tensorboard",
     "torchmetrics",
 )  # fmt: skip
-PICTURES = ("PIL", "cv2", "jsonargparse")
+PICTURES = ("PIL", "cv2", "matplotlib")
+RUN = "darswin.cli.fit:run"
 COMMANDS = {
-    "fit": Command("trains a model", TRAIN, _fit),
-    "validate": Command("measures a trained model on the validation set", TRAIN, _fit),
-    "test": Command(
-        "measures a trained model through lenses, for one after the other", TRAIN, _fit
-    ),
+    "fit": Command("trains a model", TRAIN, RUN),
+    "validate": Command("measures a trained model on the validation set", TRAIN, RUN),
+    "test": Command("measures a trained model through lenses, for one after the other", TRAIN, RUN),
     "predict": Command(
         "says what is in pictures taken through a known lens, or in each of their pixels",
-        (*PICTURES, "matplotlib"),
-        _predict,
+        PICTURES,
+        "darswin.cli.predict:predict",
     ),
     "quantize": Command(
-        "makes a file of a trained model that computes with 8 bits", TRAIN, _quantize
+        "makes a file of a trained model that computes with 8 bits",
+        TRAIN,
+        "darswin.cli.quantize:quantize",
     ),
     "convert": Command(
         "makes a safetensors file of a pickled checkpoint, without executing it",
-        ("jsonargparse",),
-        _convert,
+        (),
+        "darswin.compat:convert_checkpoint",
     ),
-    "models": Command("lists the models", (), _models),
+    "models": Command("lists the models", (), "darswin.cli.info:models"),
     "lens": Command(
-        "draws, describes or converts a calibrated lens", (*PICTURES, "matplotlib"), _lens
+        "draws, describes or converts a calibrated lens", PICTURES, "darswin.cli.lens:COMMANDS"
     ),
     "bench": Command(
-        "measures how fast a model is on this machine, in a quarter of an hour", (), _bench
+        "measures how fast a model is on this machine, in a quarter of an hour",
+        (),
+        "darswin.cli.bench:bench",
     ),
-    "info": Command("says what an issue's report needs: versions, CPU, extras", (), _info),
+    "info": Command(
+        "says what an issue's report needs: versions, CPU, extras", (), "darswin.cli.info:info"
+    ),
 }
 # For terminals that know no more than ASCII.
 PLAIN = {"°": "deg", "×": "x", "±": "+/-", "–": "-", "…": "...", "²": "^2", "θ": "theta",
@@ -120,7 +68,7 @@ PLAIN = {"°": "deg", "×": "x", "±": "+/-", "–": "-", "…": "...", "²": "^
 
 
 def main(argv: list[str] | None = None) -> None:
-    """Runs a command; what a user can mend is said in one line, without a traceback."""
+    """Runs a command; an error that a user can mend is one line, without a traceback."""
     argv = sys.argv[1:] if argv is None else argv
     name = argv[0] if argv else "--help"
     print_anywhere({} if name == "predict" else PLAIN)  # which prints JSON, to be read again
@@ -136,7 +84,11 @@ def main(argv: list[str] | None = None) -> None:
         raise SystemExit(f"darswin {name}: {without}")
     warnings.showwarning = _one_line(warnings.showwarning)
     try:
-        command.run(argv)
+        if command.function == RUN:
+            with die_with_first_process():  # which may end while this one still imports
+                resolve_name(RUN)(argv)
+        else:
+            run_command(resolve_name(command.function), argv[1:], f"darswin {name}")
         sys.stdout.flush()
     except BrokenPipeError:  # `darswin lens info … | head`: who reads has enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -144,25 +96,29 @@ def main(argv: list[str] | None = None) -> None:
         # A worker process puts its whole traceback into the message; the last line is the error's.
         message = str(error).strip().splitlines()[-1] if "Traceback" in str(error) else str(error)
         broken = "BrokenImageError" in f"{type(error).__name__}{message}"
-        if broken and command.run is _fit:
-            message += " (--data.skip_broken true leaves such files out)"
-        message = _with_flags(message, command.run is _fit)
+        if broken and command.function == RUN:
+            message += " (`skip_broken` true leaves such files out)"
+        message = with_flags(message, command)
         if isinstance(error, FloatingPointError):
             raise SystemExit(f"darswin: {message}") from error
         raise misuse(message) from error
 
 
-def _with_flags(message: str, of_data: bool) -> str:
-    """A library's error, in which flags stand for the parameters in backticks."""
-    data = "data." if of_data else ""
-    message = re.sub(r"`(\w+)`", rf"--{data}\1", message)
-    options = {"give model=": "coefficients", "choose one as camera=": "camera"}
-    name = next((options[said] for said in options if said in message), None)
-    return message if name is None else f"{message} (on the command line as --{data}{name})"
+def with_flags(message: str, command: Command) -> str:
+    """An error's message with flags in place of parameters, which the library writes as `name`;
+    darswin.lens as name=, and its `model` is the command's `coefficients`."""
+    flag_of = resolve_name("darswin.cli.fit:flag_of") if command.function == RUN else "--{}".format
+    names = {"camera": "camera", "model": "coefficients"}
+    message = re.sub(
+        r"\b(camera|model)=([\"']?)",
+        lambda m: flag_of(names[m[1]]) + (f" {m[2]}" if m[2] else ""),
+        message,
+    )
+    return re.sub(r"`([\w.]+)`", lambda m: flag_of(m[1]), message)
 
 
 def misuse(message: str) -> SystemExit:
-    """Says what is wrong with a command, and gives what ends the program with exit code 2."""
+    """Prints an error, and gives the exception that ends the program with exit code 2."""
     end = SystemExit(f"darswin: {message}")
     print(end, file=sys.stderr)
     end.code = 2
@@ -187,13 +143,13 @@ def print_anywhere(words: Mapping[str, str]) -> None:
 
 def _one_line(show: Callable[..., None]) -> Callable[..., None]:
     """Shows our own warnings in one line, each once, as errors are; others as `show` does."""
-    said = set()
+    shown = set()
 
-    def shown(message: Warning, category: type[Warning], *where, **options) -> None:
+    def show_once(message: Warning, category: type[Warning], *where, **options) -> None:
         if not category.__module__.startswith("darswin."):
             show(message, category, *where, **options)
-        elif str(message) not in said:
-            said.add(str(message))
+        elif str(message) not in shown:
+            shown.add(str(message))
             print(f"darswin: {message}", file=sys.stderr)
 
-    return shown
+    return show_once

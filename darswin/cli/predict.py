@@ -9,11 +9,16 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from jsonargparse import ArgumentParser
 from safetensors import safe_open
 
-from darswin.cli.answers import Answers, ClassAnswers
-from darswin.cli.dense_answers import ANSWERS, ANSWERS_OF, claim_folder, file_names
+from darswin.cli.answers import (
+    ANSWERS,
+    ANSWERS_OF,
+    Answers,
+    ClassAnswers,
+    claim_folder,
+    file_names,
+)
 from darswin.compat import load_official
 from darswin.data.cameras import Calibrations, is_json
 from darswin.data.folders import PICTURES, pictures_and_videos_below
@@ -32,17 +37,6 @@ class File(NamedTuple):
 
     name: str
     is_video: bool
-
-
-def run(argv: list[str]) -> None:
-    """Runs `darswin predict` with the arguments that follow it."""
-    described = (predict.__doc__ or "").splitlines()[0]
-    parser = ArgumentParser(prog="darswin predict", description=described)
-    parser.add_argument(
-        "paths", nargs="*", type=str, default=[], help="pictures, videos, folders of both"
-    )
-    parser.add_function_arguments(predict, skip={"paths"})
-    predict(**parser.parse_args(argv).as_dict())
 
 
 def predict(
@@ -72,7 +66,7 @@ def predict(
             `darswin convert` makes of the authors' released weights, whose classes have numbers.
         camera: which, of a calibration of several.
         coefficients: what they are, in a calibration of OpenCV or ROS that does not say it.
-        task: what the model is expected to tell; it says so itself.
+        task: of the model, to be sure; it says so itself.
         top: how many classes of an image.
         every: of a video the first frame, and each so many frames after it.
         out: a JSON file to write; without it, the classes are printed. Of a model for segmentation
@@ -93,19 +87,19 @@ def predict(
         weights = model
     else:
         raise ValueError(
-            "predict needs either --run, a run's folder, or --model, a safetensors file or one of "
+            "predict needs either `run`, a run's folder, or `model`, a safetensors file or one of "
             + ", ".join(list_pretrained())
         )
     for name, value in (("top", top), ("every", every)):
         if value < 1:
-            raise ValueError(f"--{name} must be at least 1, got {value}")
+            raise ValueError(f"`{name}` must be at least 1, got {value}")
     if not paths and lens is None and model in list_pretrained():
         paths, lens = [str(pretrained_file(model, "png"))], str(pretrained_file(model, "json"))
     if not paths or lens is None:
-        raise ValueError("predict needs pictures or videos, and --lens, what they were taken with")
+        raise ValueError("predict needs pictures or videos, and `lens`, the camera's")
     net, card = trained_model(weights)
     if task not in (None, card.task):
-        raise ValueError(f"--task {task} was asked of {weights}, a model for {card.task}")
+        raise ValueError(f"`task` {task} was asked of {weights}, a model for {card.task}")
     files = pictures_and_videos(paths, leave_out=None if card.task == "classification" else out)
     calibrations = _calibrations(lens, camera, coefficients, files)
     if card.task == "classification":
@@ -211,7 +205,7 @@ def _calibrations(
         root = "." if is_json(lens) else Path(lens).parent
         return Calibrations(lens, root, camera, coefficients)
     if camera is not None:
-        raise ValueError(f"--camera {camera} is one of a calibration file, and {lens} is a folder")
+        raise ValueError(f"`camera` {camera} is one of a calibration file, and {lens} is a folder")
     own = {Path(file.name): Path(lens, f"{Path(file.name).stem}.json") for file in files}
     there = {file: calibration for file, calibration in own.items() if calibration.is_file()}
     if not there:

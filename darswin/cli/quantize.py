@@ -7,10 +7,10 @@ from typing import Any
 
 import torch
 import yaml
-from jsonargparse import ArgumentParser
 from torch import Tensor
 from torch.utils.data import DataLoader, Subset
 
+from darswin.cli.options import FIRST_TASK
 from darswin.deploy.quantize import Change, quantize_model
 from darswin.layers.quantized import quantized_layers
 from darswin.lens import Lens
@@ -46,7 +46,7 @@ def quantize(
         ValueError: fewer than one picture, or names that the model lacks.
     """
     if pictures < 1:
-        raise ValueError(f"--pictures must be at least 1, got {pictures}")
+        raise ValueError(f"`pictures` must be at least 1, got {pictures}")
     weights = model_of_run(run)
     model, card = load_model(weights)
     data = _data_of(Path(run))
@@ -68,10 +68,8 @@ def quantize(
 def _data_of(run: Path) -> RunData:
     """The data of a run, as its configuration says them."""
     config = yaml.safe_load((run / "config.yaml").read_text())
-    parser = ArgumentParser(exit_on_error=False)
-    parser.add_class_arguments(TASKS[config.get("task", "classification")].data, "data")
-    given = config["data"] | {"batch_size": BATCH, "workers": 0}
-    return parser.instantiate_classes(parser.parse_object({"data": given})).data
+    options = config["data"] | dict(batch_size=BATCH, workers=0)
+    return TASKS[config.get("task", FIRST_TASK)].data(**options)
 
 
 def _batches(data: RunData, split: Any, count: int) -> Iterator[tuple[Tensor, Lens, Tensor]]:
@@ -85,25 +83,25 @@ def _batches(data: RunData, split: Any, count: int) -> Iterator[tuple[Tensor, Le
 def _comparison(
     model: Model, quantized: Model, task: str, batches: list[tuple[Tensor, Lens, Tensor]]
 ) -> Iterator[str]:
-    """What both models say of pictures, in lines."""
-    pictures = known = right = still = same = pixels = 0
+    """How the models' results differ, in lines."""
+    pictures = known = right = kept = same = pixels = 0
     results = Change()
     with torch.inference_mode():
         for images, lens, target in batches:
             a, b = model(images, lens).float(), quantized(images, lens).float()
             results.add(a, b)
-            said, says = a.argmax(1), b.argmax(1)
+            before, after = a.argmax(1), b.argmax(1)
             valid = (target >= 0) & (target < a.shape[1])
-            pictures, pixels = pictures + len(a), pixels + said.numel()
+            pictures, pixels = pictures + len(a), pixels + before.numel()
             known += int(valid.sum())
-            right += int((said == target)[valid].sum())
-            still += int((says == target)[valid].sum())
-            same += int((said == says).sum())
+            right += int((before == target)[valid].sum())
+            kept += int((after == target)[valid].sum())
+            same += int((before == after).sum())
     share = f"mean square of what changed, of the variance: {results.share():.1e}"
     yield f"{pictures} validation pictures: {share}"
     if task != "distance":
         yield (
-            f"right: {_percent(right, known)} before, {_percent(still, known)} after; the same is "
+            f"right: {_percent(right, known)} before, {_percent(kept, known)} after; the same is "
             f"said in {_percent(same, pixels)}"
         )
 

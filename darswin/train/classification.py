@@ -1,16 +1,21 @@
-"""Image classification: what is trained and what is measured."""
+"""Image classification."""
 
 from typing import Any
 
 import numpy as np
 import torch
 import torch.nn.functional as F
+from matplotlib.figure import Figure
 from torch import Tensor, nn
 from torchmetrics import Metric
+from torchmetrics.classification import MulticlassAccuracy
 
 from darswin.data.augment import Mixing, partners_share
-from darswin.train.task import Batch, Task, finite_loss, named_metrics
-from darswin.train.wide_angle import WideAngleData
+from darswin.data.lens_distributions import LensDistribution, SphericalLenses, parse_lenses
+from darswin.train.task import Batch, Task, finite_loss
+from darswin.viz.plot import draw_accuracy
+
+__all__ = ["Classification"]
 
 
 class Classification(Task):
@@ -47,14 +52,9 @@ class Classification(Task):
     ):
         super().__init__(name, options, **common)
         if not 0 <= label_smoothing < 1:
-            raise ValueError(f"--model.label_smoothing must be in [0, 1), got {label_smoothing}")
+            raise ValueError(f"`label_smoothing` must be in [0, 1), got {label_smoothing}")
         self.label_smoothing = label_smoothing
         self.mixing = Mixing(mixup, cutmix, mix_p)
-
-    @property
-    def data(self) -> WideAngleData:
-        """The data of the run."""
-        return self.trainer.datamodule  # type: ignore[attr-defined]  # Lightning attaches it
 
     def _head_options(self) -> dict[str, Any]:
         classes = self.data.classes
@@ -64,13 +64,12 @@ class Classification(Task):
 
     def _make_metrics(self) -> None:
         count = len(self.data.classes)
-        self.val_metrics = metrics(count)
-        self.test_metrics = nn.ModuleList(metrics(count) for _ in self.data.test_names)
+        self.val_metrics = ClassMetrics(count)
+        self.test_metrics = nn.ModuleList(ClassMetrics(count) for _ in self.data.test_names)
 
     # -- training -----------------------------------------------------------------------------
 
     def _loss(self, batch: Batch, rng: np.random.Generator) -> Tensor:
-        """Of the batch, mixed if mixing is on."""
         images, lens, labels = batch
         targets = self._targets(labels, len(self.card.classes))
         shared = partners_share(lens) if self.data.calibrations and self.data.pair_lenses else None
@@ -86,37 +85,60 @@ class Classification(Task):
 
     # -- evaluation ---------------------------------------------------------------------------
 
-    def _measure(self, batch: Batch, measured: nn.Module) -> None:
-        images, lens, labels = batch
-        logits = self.net(images, lens).float()
-        for _, metric in named_metrics(measured):
-            metric.update(logits, labels)
-
     def validation_step(self, batch: Batch, batch_idx: int) -> None:
         """Counts a batch into the validation's loss and accuracy."""
-        self._measure(batch, self.val_metrics)
-        for name, metric in named_metrics(self.val_metrics):
+        images, lens, labels = batch
+        self.val_metrics.update(self.net(images, lens).float(), labels)
+        for name, metric in self.val_metrics.all().items():
             self.log(f"val/{name}", metric, prog_bar=name != "top5", on_step=False, on_epoch=True)
 
     def test_step(self, batch: Batch, batch_idx: int, dataloader_idx: int = 0) -> None:
         """Counts a batch into the loss and accuracy of its lenses."""
-        self._measure(batch, self.test_metrics[dataloader_idx])
+        images, lens, labels = batch
+        metrics: Any = self.test_metrics[dataloader_idx]
+        metrics.update(self.net(images, lens).float(), labels)
 
     def on_test_epoch_end(self) -> None:
         """Collects `results`: a row for each distribution of lenses."""
         self.results = []
-        for name, measured in zip(self.data.test_names, self.test_metrics, strict=True):
-            row = {key: metric.compute().item() for key, metric in named_metrics(measured)}
-            (mean,) = (metric for metric in measured.children() if isinstance(metric, MeanLoss))
-            loss = finite_loss(row["loss"], name) if mean.count > 0 else None
+        metrics: Any
+        for name, metrics in zip(self.data.test_names, self.test_metrics, strict=True):
+            row = {key: metric.compute().item() for key, metric in metrics.all().items()}
+            loss = finite_loss(row["loss"], name) if metrics.loss.count > 0 else None
             self.results.append({"lenses": name} | row | {"loss": loss})
 
+    def results_figure(self) -> Figure:
+        """Accuracy against ξ where every distribution is one ξ, else bars."""
+        warped = self.trained.fit == "whole"
+        trained_on = self.data.train_lenses if warped else None
+        return draw_results(self.results, self.card.model, trained_on)
 
-class ImageMean(Metric):
-    """Base of means over the images whose label is known; -1 is none.
 
-    No device is waited for before `compute`, as it is by torchmetrics' own.
-    """
+class ClassMetrics(nn.Module):
+    """The shares that top-1 and top-5 get right, and the mean loss."""
+
+    def __init__(self, classes: int):
+        super().__init__()
+        self.top1, self.top5 = (
+            MulticlassAccuracy(classes, top_k=min(k, classes), average="micro", validate_args=False)
+            for k in (1, 5)
+        )
+        self.loss = MeanLoss()
+
+    def update(self, logits: Tensor, labels: Tensor) -> None:
+        """Counts images: their logits (B, K) and their labels (B,), -1 where none is known."""
+        known = labels >= 0
+        logits, labels = logits[known], labels[known]
+        for metric in (self.top1, self.top5):
+            metric.update(logits, labels)
+        self.loss.update(F.cross_entropy(logits, labels, reduction="none"))
+
+    def all(self) -> dict[str, Any]:
+        return dict(top1=self.top1, top5=self.top5, loss=self.loss)
+
+
+class MeanLoss(Metric):
+    """A mean of sums in float64; torchmetrics' own leaves NaN out."""
 
     full_state_update = False
     total: Tensor
@@ -127,47 +149,43 @@ class ImageMean(Metric):
         self.add_state("total", torch.zeros((), dtype=torch.float64), "sum")
         self.add_state("count", torch.zeros((), dtype=torch.int64), "sum")
 
-    def update(self, logits: Tensor, labels: Tensor) -> None:
-        """Counts images: their logits (B, K) and their labels (B,)."""
-        known = labels >= 0
-        self.total += torch.where(known, self._values(logits, labels), 0).double().sum()
-        self.count += known.sum()
-
-    def _values(self, logits: Tensor, labels: Tensor) -> Tensor:
-        raise NotImplementedError
+    def update(self, values: Tensor) -> None:
+        self.total += values.double().sum()
+        self.count += values.numel()
 
     def compute(self) -> Tensor:
-        """The mean; NaN where there are no images."""
         return (self.total / self.count).float()
 
 
-class MeanLoss(ImageMean):
-    """The mean cross-entropy."""
+def draw_results(rows: list[dict], name: str, trained_on: LensDistribution | None) -> Figure:
+    """The accuracy of rows of `Classification.results`.
 
-    def _values(self, logits: Tensor, labels: Tensor) -> Tensor:
-        return F.cross_entropy(logits, labels, ignore_index=-1, reduction="none")
+    Args:
+        trained_on: the distribution that is shaded; None where the lenses are those of cameras.
+    """
+    figure = Figure(figsize=(7, 4.2), layout="constrained")
+    axes = figure.subplots()
+    accuracy = [100 * row["top1"] for row in rows]
+    lenses = [_distribution(row["lenses"]) for row in rows]
+    of_one_xi = [
+        lens for lens in lenses if isinstance(lens, SphericalLenses) and lens.low == lens.high
+    ]
+    if len(of_one_xi) == len(rows):
+        shaded = trained_on if isinstance(trained_on, SphericalLenses) else None
+        band = None if shaded is None else (shaded.low, shaded.high)
+        draw_accuracy([lens.low for lens in of_one_xi], {name: accuracy}, band, axes=axes)
+        axes.set_ylim(0, 100)
+    else:
+        axes.bar([row["lenses"] for row in rows], accuracy, label=name)
+        axes.set(ylabel="accuracy (%)", ylim=(0, 100))
+        axes.tick_params(axis="x", rotation=90)
+        axes.legend()
+    return figure
 
 
-class TopK(ImageMean):
-    """The share of images whose label is among the `top_k` likeliest."""
-
-    def __init__(self, top_k: int):
-        super().__init__()
-        self.top_k = top_k
-
-    def _values(self, logits: Tensor, labels: Tensor) -> Tensor:
-        # Of classes that are as likely as each other the first is taken.
-        one = self.top_k == 1
-        said = logits.argmax(1, keepdim=True) if one else logits.topk(self.top_k).indices
-        return (said == labels[:, None]).any(1).double()
-
-    def compute(self) -> Tensor:
-        """The share; 0 where there are no images."""
-        return super().compute().nan_to_num(0.0)
-
-
-def metrics(classes: int) -> nn.ModuleDict:
-    """What an evaluation measures: mean loss, and the shares that top-1 and top-5 get right."""
-    return nn.ModuleDict(
-        dict(top1=TopK(min(1, classes)), top5=TopK(min(5, classes)), loss=MeanLoss())
-    )
+def _distribution(name: str) -> LensDistribution | None:
+    """The distribution of a row; None where it is a camera's calibration."""
+    try:
+        return parse_lenses(name)
+    except ValueError:
+        return None

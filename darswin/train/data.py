@@ -1,19 +1,28 @@
-"""What the data of all runs share: batches of a training's order, and of every test set."""
+"""The data of runs: batches in the order of a training, and of every test set."""
 
+import math
 from collections.abc import Sequence
+from functools import cached_property
+from pathlib import Path
 from typing import Any, ClassVar, Literal
 
 import torch
 from lightning.pytorch import LightningDataModule
 from torch.utils.data import DataLoader
 
-from darswin.data.augment import RandAugment
+from darswin.data.augment import RandAugment, RandomErasing
+from darswin.data.cameras import Calibrations, is_json
+from darswin.data.lens_distributions import parse_lenses, parse_sweep
 from darswin.data.order import EveryNth, ResumableLoader, TrainingOrder
-from darswin.data.samples import IMAGENET_MEAN, IMAGENET_STD, Samples
+from darswin.data.pictures import Source, open_source
+from darswin.data.samples import IMAGENET_MEAN, IMAGENET_STD, Calibrated, Samples
 from darswin.data.splits import Split
 from darswin.data.warp import Framing, RandomTurns
+from darswin.data.wide_angle import PAPER_FOV, WideAngle
 from darswin.lens.files.opencv import Coefficients
-from darswin.train.stopping import ignore_signals
+from darswin.train.runs import ignore_signals
+
+__all__ = ["RunData", "WideAngleData"]
 
 
 class RunData(LightningDataModule):
@@ -82,13 +91,12 @@ class RunData(LightningDataModule):
         super().__init__()
         if batch_size < 1 or workers < 0:
             raise ValueError(
-                "--data.batch_size must be at least 1 and --data.workers at least 0, "
-                f"got {batch_size} and {workers}"
+                "`batch_size` must be at least 1 and `workers` at least 0, got "
+                f"{batch_size} and {workers}"
             )
         for name, value in (("camera", camera), ("coefficients", coefficients)):
             if value is not None and lens is None:
-                said = f"--data.{name} {value}"
-                raise ValueError(f"{said} is one of a calibration: give --data.lens")
+                raise ValueError(f"`{name}` {value} is one of a calibration: give `lens`")
         self.path, self._lens = path, lens
         self._camera, self._coefficients = camera, coefficients
         self.size, self.channels = self.default_size if size is None else size, channels or 3
@@ -105,7 +113,8 @@ class RunData(LightningDataModule):
         )  # fmt: skip
         self.limit, self.batch_size, self.workers = limit, batch_size, workers
         self.turns = RandomTurns(flip, rotate_deg) if flip or rotate_deg else None
-        self.randaugment, self.seed = randaugment, seed
+        self.colour_changes = RandAugment() if randaugment else None
+        self.seed = seed
         self.datasets: list[Samples] = []
         self._loader: ResumableLoader | None = None
         self._progress: dict[str, Any] = {}
@@ -117,7 +126,7 @@ class RunData(LightningDataModule):
 
     @property
     def test_names(self) -> list[str]:
-        """Of the sets that a test measures, one after the other."""
+        """The names of the sets that a test measures, one after the other."""
         raise NotImplementedError
 
     def broken(self) -> int:
@@ -139,10 +148,6 @@ class RunData(LightningDataModule):
             prefetch_factor=4 if self.workers else None,
             worker_init_fn=ignore_signals,
         )
-
-    @property
-    def _colour_changes(self) -> RandAugment | None:
-        return RandAugment() if self.randaugment else None
 
     def _training(self) -> tuple[Samples, TrainingOrder]:
         """The training split, augmented, and its order."""
@@ -185,8 +190,8 @@ class RunData(LightningDataModule):
             if self._opening["holdout"]:
                 raise
             raise ValueError(
-                f"--data.holdout 0 leaves no pictures for {split!r}, and {self.path} has none of "
-                "its own; --trainer.limit_val_batches 0 trains without validation"
+                f"`holdout` 0 leaves no pictures for {split!r}, and {self.path} has none of its "
+                "own; `limit_val_batches` 0 trains without validation"
             ) from error
         count = len(dataset)
         part = EveryNth(count, **self._place)
@@ -203,3 +208,98 @@ class RunData(LightningDataModule):
     def test_dataloader(self) -> list[DataLoader]:
         """Batches of what a test measures, one loader for each of `test_names`."""
         return [self._evaluation("test", name) for name in self.test_names]
+
+
+class WideAngleData(RunData):
+    """Pictures as wide-angle images, or wide-angle pictures with the lenses that took them.
+
+    Args:
+        path: a folder of images, a folder of IDX files, or "digits": see
+            `darswin.data.open_source`. Pictures that `lens` took are not warped, and what is said
+            of train_lenses, test_lenses, fov_deg, render and picture_size has no effect on them.
+        train_lenses: what training and validation go through: a level of the paper ("very low",
+            "low", "medium", "high"), one ξ ("0.4"), a range ("0.2..0.35"), or "polynomial".
+        test_lenses: what testing goes through, one after the other: such names, or a sweep
+            "0:1:0.1".
+        render: px, what images are reduced from.
+        fov_deg: degrees, the field of view that a picture's width spans, and that of every lens.
+        picture_size: px, the width that larger pictures are first reduced to.
+        erasing: how often a box of an image is erased in training.
+        pair_lenses: gives both images of a mixture the same lens, so that the mixture is an image
+            through one lens. Without it, the mixed-in image is taken for one through the other's
+            lens, as in the authors' code; or, without mixing, every image has a lens of its own.
+            Calibrated pictures are paired by their cameras, and those left over stay unmixed.
+        common: as `RunData`; the default size is 64.
+    """
+
+    def __init__(
+        self,
+        path: str,
+        *,
+        train_lenses: str = "low",
+        test_lenses: str | list[str] = "0:1:0.1",
+        render: int = 224,
+        fov_deg: float = math.degrees(PAPER_FOV),
+        picture_size: int = 384,
+        erasing: float = 0.25,
+        pair_lenses: bool = True,
+        **common: Any,
+    ):
+        super().__init__(path, **common)
+        self.train_lenses = parse_lenses(train_lenses)
+        self._test_lenses = parse_sweep(test_lenses)
+        self._warping: dict[str, Any] = dict(
+            render=render, fov=math.radians(fov_deg), picture_size=picture_size
+        )
+        self.fov = 0.0 if self._lens else math.radians(fov_deg)
+        self.frame_fit = self._form["framing"] if self._lens else "whole"
+        self.erasing, self.pair_lenses = erasing, pair_lenses
+        self._sources: dict[str, Source] = {}
+
+    def source(self, split: Split) -> Source:
+        """The pictures of a split."""
+        if split not in self._sources:
+            self._sources[split] = open_source(self.path, split, **self._opening)
+        return self._sources[split]
+
+    @property
+    def classes(self) -> list[str]:
+        return self.source("train").classes
+
+    @property
+    def test_names(self) -> list[str]:
+        """The distributions of lenses of a test, or the calibration."""
+        if self._lens is None:
+            return self._test_lenses
+        return ["lens" if is_json(self._lens) else Path(self._lens).name]
+
+    @cached_property
+    def calibrations(self) -> Calibrations | None:
+        """The lenses that the pictures were taken with, if `lens` says them."""
+        if not self._lens:
+            return None
+        return Calibrations(self._lens, self.path, self._camera, self._coefficients)
+
+    def dataset(self, split: Split, name: str | None = None, **options: Any) -> Samples:
+        """A split as it is, with its cameras' lenses; or through a distribution of lenses, where
+        None means that of training."""
+        source = self.source(split)
+        if self.limit is not None:
+            source = source.limited(self.limit)
+        dataset: Samples
+        if self.calibrations is not None:
+            dataset = Calibrated(source, self.calibrations, **self._form, **options)
+        else:
+            lenses = self.train_lenses if name is None else parse_lenses(name)
+            dataset = WideAngle(source, lenses, **self._warping, **self._form, **options)
+        self.datasets.append(dataset)
+        return dataset
+
+    def _training(self) -> tuple[Samples, TrainingOrder]:
+        erase = RandomErasing(self.erasing) if self.erasing else None
+        dataset = self.dataset("train", turns=self.turns, augment=self.colour_changes, erase=erase)
+        order = TrainingOrder(
+            len(dataset), self.batch_size, pairs=self.pair_lenses, seed=self.seed,
+            cameras=dataset.cameras if isinstance(dataset, Calibrated) else None, **self._place,
+        )  # fmt: skip
+        return dataset, order

@@ -1,4 +1,4 @@
-"""Runs that start from a trained model: what its card decides, its weights, its frozen stages."""
+"""Runs that start from a trained model: its options, its weights, its frozen stages."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -13,7 +13,7 @@ from darswin.models.registry import list_models, model_class
 from darswin.models.saving import ModelCard, Task, load_model, model_of_run
 from darswin.models.unet import Unet
 
-# What the data decide of a model's options.
+# Options of a model that the data decide.
 OF_DATA = ("task", "num_classes", "in_chans", "mean", "std", "image_size")
 # Options that change nothing but how a model trains.
 OF_TRAINING = ("drop_path_rate", "jitter")
@@ -36,27 +36,21 @@ def models_for(task: Task) -> list[str]:
 
 
 def name_from(card: ModelCard, task: Task) -> str:
-    """The model that starts from a trained one: the same, or a dense one with that encoder.
-
-    Raises:
-        ValueError: the task has no such model.
-    """
-    names = models_for(task)
-    found = [name for name in names if card.model in (name, name.replace("_unet_", "_"))]
-    if not found:
-        raise ValueError(
-            f"no model for {task} starts from a {card.model}, which is one for {card.task}"
-        )
-    return found[0]
+    """The model that starts from a trained one: the same, or a dense one with that encoder."""
+    for name in models_for(task):
+        if card.model in (name, name.replace("_unet_", "_")):
+            return name
+    raise ValueError(
+        f"no model for {task} starts from a {card.model}, which is one for {card.task}"
+    )
 
 
 def check_name(name: str, task: Task) -> None:
-    """ValueError for a model that there is not, or that is none for the task."""
+    """ValueError for the name of no model, or of none for the task."""
     model_class(name)
     if name not in models_for(task):
         raise ValueError(
-            f"--model.name {name} is no model for --task {task}; there are "
-            f"{', '.join(models_for(task))}"
+            f"`name` {name} is no model for `task` {task}; there are {', '.join(models_for(task))}"
         )
 
 
@@ -70,10 +64,10 @@ def settle(
     """The options of a run that starts from a model: those not given, None, are the model's.
 
     Args:
-        task: of the run. model: `name` and `options`. data: `size`, `channels`, `mean` and `std`.
+        model: `name` and `options`. data: `size`, `channels`, `mean` and `std`.
 
     Returns:
-        The same, all of them said.
+        The same, without None.
 
     Raises:
         ValueError: an option that disagrees with the model; it names both.
@@ -81,13 +75,13 @@ def settle(
 
     def refuse(option: str, value: Any, theirs: Any) -> ValueError:
         return ValueError(
-            f"--{option} {value} disagrees with --model.weights {weights}, whose model has "
-            f"{theirs}; leave it out"
+            f"`{option}` {value} disagrees with `weights` {weights}, whose model has {theirs}; "
+            "leave it out"
         )
 
     name = name_from(card, task)
     if model["name"] not in (None, name):
-        raise refuse("model.name", model["name"], card.model)
+        raise refuse("name", model["name"], card.model)
     own = own_options(card)
     options = dict(model["options"] or {})
     for option, value in options.items():
@@ -95,7 +89,7 @@ def settle(
         if option not in own and name != card.model:
             continue
         if option not in OF_TRAINING and _plain(own.get(option)) != _plain(value):
-            raise refuse("model.options", {option: value}, {option: own.get(option)})
+            raise refuse("options", {option: value}, {option: own.get(option)})
     found = {}
     theirs = {
         "size": card.size,
@@ -108,7 +102,7 @@ def settle(
         # A model that takes images of any size may go on with another one.
         free = option == "size" and "image_size" not in card.options
         if not free and value is not None and _plain(found[option]) != _plain(value):
-            raise refuse(f"data.{option}", found[option], value)
+            raise refuse(option, found[option], value)
     return {"name": name, "options": own | options}, found
 
 
@@ -118,33 +112,25 @@ def _plain(value: Any) -> Any:
 
 
 def start_from(net: Model, classes: list[str], weights: str | Path) -> None:
-    """Copies a model's weights into a network; its head too, if it is of the same classes. Those of
-    a classifier go into a dense model's encoder.
-
-    Raises:
-        ValueError: the weights of another model.
-    """
+    """Copies a model's weights into a network: its head only if it is of the same classes, those of
+    a classifier into a dense model's encoder. ValueError for the weights of another model."""
     trained, card = load_model(weights_file(weights))
     without_quantized_layers(trained)
-    there = trained.state_dict()
+    own, given = net.state_dict(), trained.state_dict()
     if isinstance(net, Unet) and card.task == "classification":
-        there = {f"encoder.{name}": t for name, t in there.items() if not _of_head(name)}
-        rest = {name for name in net.state_dict() if not name.startswith("encoder.")}
+        given = {f"encoder.{name}": t for name, t in given.items() if not _of_head(name)}
+        new = {name for name in own if not name.startswith("encoder.")}
     else:
-        if list(card.classes) != list(classes):
-            there = {name: t for name, t in there.items() if not _of_head(name)}
         # A model for another task has another head.
-        there = {n: t for n, t in there.items() if not _of_head(n) or n in net.state_dict()}
-        rest = {name for name in net.state_dict() if _of_head(name)}
-    own = net.state_dict()
-    other = sorted(
-        name for name in own.keys() | there.keys()
-        if not (name in rest and name not in there)
-        and (name not in own or name not in there or own[name].shape != there[name].shape)
-    )  # fmt: skip
+        same = list(card.classes) == list(classes)
+        given = {n: t for n, t in given.items() if not _of_head(n) or (same and n in own)}
+        new = {name for name in own if _of_head(name)}
+    other = [name for name in given if name not in own or own[name].shape != given[name].shape]
+    other += own.keys() - given.keys() - new
     if other:
-        raise ValueError(f"{weights} holds the weights of another model: {', '.join(other[:3])}")
-    net.load_state_dict(there, strict=False)
+        named = ", ".join(sorted(other)[:3])
+        raise ValueError(f"{weights} holds the weights of another model: {named}")
+    net.load_state_dict(given, strict=False)
 
 
 def _of_head(name: str) -> bool:
@@ -152,17 +138,12 @@ def _of_head(name: str) -> bool:
 
 
 def frozen_parts(net: Encoder | Unet, stages: int) -> list[nn.Module]:
-    """The modules that are not trained: the embedding and the first stages; all but the head, where
-    these are all stages. Of a dense model they are its encoder's.
-
-    Raises:
-        ValueError: more stages than there are.
-    """
+    """The modules of the encoder that are not trained: the embedding and the first stages; all but
+    the head, where these are all stages. ValueError for more stages than there are."""
     net = net.encoder if isinstance(net, Unet) else net
     if not 0 <= stages <= len(net.stages):
         raise ValueError(
-            f"--model.freeze_stages must be from 0 to the model's {len(net.stages)} stages, got "
-            f"{stages}"
+            f"`freeze_stages` must be from 0 to the model's {len(net.stages)} stages, got {stages}"
         )
     if not stages:
         return []

@@ -8,6 +8,8 @@ from torch import Tensor
 
 from darswin.data.scenes.scene import IGNORE
 
+__all__ = ["distance_loss", "label_loss"]
+
 LabelLoss = Literal["ce", "dice", "ce+dice"]
 DistanceLoss = Literal["silog", "l1", "log_l1"]
 
@@ -37,50 +39,36 @@ def label_loss(
     """
     loss = logits.new_zeros(())
     if kind != "dice":
-        loss = loss + cross_entropy(logits, labels, class_weights, label_smoothing, weights)
+        each = F.cross_entropy(
+            logits, labels, class_weights, ignore_index=IGNORE, reduction="none",
+            label_smoothing=label_smoothing,
+        )  # fmt: skip
+        known = labels != IGNORE
+        share = known.to(each.dtype)
+        if class_weights is not None:
+            share = share * class_weights[torch.where(known, labels, 0)]
+        if weights is not None:
+            each, share = each * weights, share * weights
+        loss = loss + each.sum() / _or_one(share.sum())
     if kind != "ce":
-        loss = loss + dice(logits, labels, class_weights, weights)
+        loss = loss + _dice(logits, labels, class_weights, weights)
     return loss
 
 
-def cross_entropy(
-    logits: Tensor,
-    labels: Tensor,
-    class_weights: Tensor | None,
-    label_smoothing: float,
-    weights: Tensor | None,
-) -> Tensor:
-    """The mean over the known pixels, each of the weight of its class, as torch takes it."""
-    each = F.cross_entropy(
-        logits, labels, class_weights, ignore_index=IGNORE, reduction="none",
-        label_smoothing=label_smoothing,
-    )  # fmt: skip
-    known = labels != IGNORE
-    share = known.to(each.dtype)
-    if class_weights is not None:
-        share = share * class_weights[torch.where(known, labels, 0)]
-    if weights is not None:
-        each, share = each * weights, share * weights
-    return each.sum() / _or_one(share.sum())
-
-
-def dice(
+def _dice(
     logits: Tensor, labels: Tensor, class_weights: Tensor | None, weights: Tensor | None
 ) -> Tensor:
     """1 - Dice of the probabilities in all pixels of the batch, a mean over the classes that the
-    labels have.
-
-    Source: V-Net, 3DV 2016, with a sum in place of squares in the denominator.
-    """
+    labels have: V-Net, 3DV 2016, with a sum in place of squares in the denominator."""
     known = labels != IGNORE
     share = known.to(logits.dtype) if weights is None else known * weights
     truth = F.one_hot(torch.where(known, labels, 0), logits.shape[1]).permute(0, 3, 1, 2)
     truth = truth * share[:, None]
     predicted = logits.softmax(1) * share[:, None]
     both, either = (predicted * truth.gt(0)).sum((0, 2, 3)), (predicted + truth).sum((0, 2, 3))
-    there = truth.sum((0, 2, 3)) > 0
-    missed = torch.where(there, 1 - 2 * both / _or_one(either), 0.0)
-    counts = there.to(logits.dtype) if class_weights is None else there * class_weights
+    present = truth.sum((0, 2, 3)) > 0
+    missed = torch.where(present, 1 - 2 * both / _or_one(either), 0.0)
+    counts = present.to(logits.dtype) if class_weights is None else present * class_weights
     return (missed * counts).sum() / _or_one(counts.sum())
 
 
@@ -91,7 +79,7 @@ def distance_loss(
     *,
     weights: Tensor | None = None,
 ) -> Tensor:
-    """SILog, or the mean of what distances, or their logarithms, differ by.
+    """SILog, or the mean difference of distances or of their logarithms.
 
     SILog is 10 √(mean g² - 0.85 (mean g)²) with g the difference of the logarithms, over all known
     pixels of the batch.
@@ -124,5 +112,5 @@ def distance_loss(
 
 
 def _or_one(whole: Tensor) -> Tensor:
-    """What to divide by, where there may be nothing."""
+    """A divisor that is 1 where there is nothing."""
     return torch.where(whole > 0, whole, 1.0)

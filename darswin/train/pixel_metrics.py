@@ -1,7 +1,5 @@
-"""What predictions for each pixel are measured by: in all, and in zones of θ; as pixels count, and
-as their solid angles do.
-
-Sums are taken over all pixels of a test set, in integers and float64, and over all processes.
+"""Scores of predictions for each pixel: in all, and in zones of θ; as pixels count, and as their
+solid angles do. Sums are taken in integers and float64, over all processes.
 """
 
 import math
@@ -32,9 +30,7 @@ class Zones:
     def __init__(self, borders: Sequence[float]):
         inner = [0.0, *map(float, borders), 180.0]
         if any(not a < b for a, b in pairwise(inner)):
-            raise ValueError(
-                f"--model.zones must rise, between 0 and 180 degrees, got {list(borders)}"
-            )
+            raise ValueError(f"`zones` must rise, between 0 and 180 degrees, got {list(borders)}")
         self.borders = inner[1:-1]
 
     def __len__(self) -> int:
@@ -52,12 +48,8 @@ class Zones:
         return [dict(from_deg=a, to_deg=b) for a, b in zip(starts, ends, strict=True)]
 
 
-class ZoneSums(Metric):
-    """Base of sums over the pixels of each zone: `counts` and, weighted by solid angle, `areas`.
-
-    Args:
-        zones: how many. shape: of what is summed in each.
-    """
+class PixelSums(Metric):
+    """Base of sums over the pixels of each zone: `counts` and, weighted by solid angle, `areas`."""
 
     full_state_update = False
     counts: Tensor
@@ -72,49 +64,62 @@ class ZoneSums(Metric):
         """The sums (Z, …): as pixels count, and as solid angles do."""
         return self.counts, self.areas
 
+    def pixels(self, counts: Tensor) -> int:
+        """How many pixels the sums of a zone are of."""
+        raise NotImplementedError
 
-class LabelSums(ZoneSums):
-    """How often a pixel of class i was taken for one of class j: (Z, K, K)."""
+    def scores(self, sums: Tensor) -> dict[str, float]:
+        """The scores of the sums of a zone; NaN where there are no pixels."""
+        raise NotImplementedError
 
-    def __init__(self, classes: int, zones: int):
+
+class LabelSums(PixelSums):
+    """How often a pixel of class i was taken for one of class j: (Z, K, K).
+
+    torchmetrics counts confusions too, but not weighted ones.
+
+    Args:
+        classes, zones: how many. left_out: a class that has no part in the mean IoU.
+    """
+
+    def __init__(self, classes: int, zones: int, left_out: int | None = None):
         super().__init__(zones, (classes, classes), torch.int64)
-        self.classes = classes
+        self.classes, self.left_out = classes, left_out
 
     def update(self, predicted: Tensor, labels: Tensor, zone: Tensor, area: Tensor) -> None:
-        """Counts pixels (P,): what they were taken for, what they are, their zone, their sr."""
+        """Counts pixels (P,): their predictions, their labels, their zone, their sr."""
         cell = (zone * self.classes + labels) * self.classes + predicted
         cells = self.counts.numel()
         self.counts += torch.bincount(cell, minlength=cells).view_as(self.counts)
         weighted = torch.bincount(cell, area.double(), minlength=cells)
         self.areas += weighted.view_as(self.areas)
 
+    def pixels(self, counts: Tensor) -> int:
+        return int(counts.sum())
 
-def label_scores(confusion: Tensor, left_out: int | None = None) -> tuple[dict, Tensor, Tensor]:
-    """The scores of a confusion (K, K), from truth to prediction.
+    def scores(self, sums: Tensor) -> dict[str, float]:
+        """`miou`, over the classes that occur in the truth or the prediction, and `accuracy`."""
+        iou, _ = iou_and_recall(sums)
+        if self.left_out is not None:
+            iou[self.left_out] = torch.nan
+        accuracy = _ratio(sums.diagonal().double().sum(), sums.double().sum())
+        return dict(miou=iou.nanmean().item(), accuracy=accuracy.item())
 
-    A class that neither the truth nor the prediction has does not count.
+
+def iou_and_recall(confusion: Tensor) -> tuple[Tensor, Tensor]:
+    """IoU and recall of each class, (K,), of a confusion (K, K), from truth to prediction; NaN
+    where a class does not occur."""
+    confusion = confusion.double()
+    right, present = confusion.diagonal(), confusion.sum(1)
+    return _ratio(right, present + confusion.sum(0) - right), _ratio(right, present)
+
+
+class DistanceSums(PixelSums):
+    """Sums of the terms of distances' mean errors: (Z, 9), the first of which is the weight.
 
     Args:
-        left_out: a class that has no part in the mean.
-
-    Returns:
-        `miou` and `accuracy`, NaN where there are no pixels; IoU and recall of each class, (K,),
-        NaN where it does not occur.
+        zones: how many.
     """
-    confusion = confusion.double()
-    right, there = confusion.diagonal(), confusion.sum(1)
-    iou = _ratio(right, there + confusion.sum(0) - right)
-    counted = iou.clone()
-    if left_out is not None:
-        counted[left_out] = torch.nan
-    overall = dict(
-        miou=counted.nanmean().item(), accuracy=_ratio(right.sum(), confusion.sum()).item()
-    )
-    return overall, iou, _ratio(right, there)
-
-
-class DistanceSums(ZoneSums):
-    """What the mean errors of distances are made of: (Z, 9), the first of which is the weight."""
 
     def __init__(self, zones: int):
         super().__init__(zones, (9,))
@@ -133,21 +138,21 @@ class DistanceSums(ZoneSums):
             self.counts[number] += terms[inside].sum(0)
             self.areas[number] += (terms[inside] * area[inside].double()[:, None]).sum(0)
 
+    def pixels(self, counts: Tensor) -> int:
+        return round(counts[0].item())
 
-def distance_scores(sums: Tensor) -> dict[str, float]:
-    """`DISTANCE_METRICS` of sums (9,); NaN where there are no pixels.
+    def scores(self, sums: Tensor) -> dict[str, float]:
+        """`DISTANCE_METRICS`; `silog` is 100 √(mean g² - (mean g)²), g the difference of logs.
 
-    `silog` is 100 √(mean g² - (mean g)²), g the difference of the logarithms, over all pixels.
-
-    Source: Eigen et al., NeurIPS 2014; SILog as in KITTI's depth benchmark.
-    """
-    weight = sums[0].item()
-    if weight == 0:
-        return dict.fromkeys(DISTANCE_METRICS, math.nan)
-    abs_rel, sq_rel, square, log_square, log, *deltas = (sums[1:] / weight).tolist()
-    silog = 100 * math.sqrt(max(log_square - log**2, 0.0))
-    found = (abs_rel, sq_rel, math.sqrt(square), math.sqrt(log_square), silog, *deltas)
-    return dict(zip(DISTANCE_METRICS, found, strict=True))
+        Source: Eigen et al., NeurIPS 2014; SILog as in KITTI's depth benchmark.
+        """
+        weight = sums[0].item()
+        if weight == 0:
+            return dict.fromkeys(DISTANCE_METRICS, math.nan)
+        abs_rel, sq_rel, square, log_square, log, *deltas = (sums[1:] / weight).tolist()
+        silog = 100 * math.sqrt(max(log_square - log**2, 0.0))
+        found = (abs_rel, sq_rel, math.sqrt(square), math.sqrt(log_square), silog, *deltas)
+        return dict(zip(DISTANCE_METRICS, found, strict=True))
 
 
 def none_of_nan(value: float) -> float | None:

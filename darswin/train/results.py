@@ -1,24 +1,34 @@
-"""What a test over lenses found, as a table, CSV, JSON and a picture."""
+"""The results of a test as tables, CSV, JSON and a picture."""
 
 import csv
 import io
 import json
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from lightning.pytorch import Callback, LightningModule, Trainer
 from lightning.pytorch.utilities import rank_zero_only
-from matplotlib.figure import Figure
 
-from darswin.data.lens_distributions import LensDistribution, SphericalLenses, parse_lenses
-from darswin.train.classification import Classification
+from darswin.train.pixel_metrics import BY_AREA
+from darswin.train.task import Task
 from darswin.utils.files import replace_file
-from darswin.viz.plot import draw_accuracy, save_figure
+from darswin.viz.plot import save_figure
+
+Table = Sequence[dict[str, Any]]
+
+_IN_PERCENT = ("top1", "top5", "miou", "accuracy", "iou", "recall", "delta1", "delta2", "delta3")
+# They are in the files alone.
+_NOT_SHOWN = ("pixels", "sq_rel", "rmse_log", "delta2", "delta3", "to_deg")
+_NOT_SHOWN_BY_AREA = (*_NOT_SHOWN, "rmse", "silog", "recall")
 
 
 class WriteResults(Callback):
-    """After a test: prints the accuracy for each distribution of lenses, and writes it to a folder.
+    """After a test: prints the scores of each set, class and zone, and writes them to a folder.
 
-    Files: `test.csv` and `test.json` with lenses, top1, top5 and loss, and `test.png`.
+    Files: `test.csv` with a row for each set, `test_classes.csv` for each class of it,
+    `test_zones.csv` for each zone of θ, `test.json` with all of it, and `test.png`. Names that end
+    in `_sr` are of scores weighted by solid angle.
     """
 
     def __init__(self, folder: Path):
@@ -26,66 +36,75 @@ class WriteResults(Callback):
 
     @rank_zero_only
     def on_test_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Prints the table and writes the files."""
-        if not isinstance(pl_module, Classification):
-            raise TypeError(f"results are of Classification, got {type(pl_module).__name__}")
-        rows = pl_module.results
-        width = max(16, *(len(row["lenses"]) + 2 for row in rows))
-        print(f"\n{'lenses':<{width}}{'top-1 (%)':>10}{'top-5 (%)':>10}{'loss':>10}")
-        for row in rows:
-            loss = "–" if row["loss"] is None else f"{row['loss']:.4f}"
-            print(
-                f"{row['lenses']:<{width}}{100 * row['top1']:>10.2f}{100 * row['top5']:>10.2f}"
-                f"{loss:>10}"
-            )
-        warped = pl_module.trained.fit == "whole"
-        trained_on = pl_module.data.train_lenses if warped else None
-        write_results(self.folder, rows, pl_module.card.model, trained_on)
-        print(f"\n{self.folder}/test.csv, test.json and test.png")
+        """Prints the tables and writes the files."""
+        assert isinstance(pl_module, Task)
+        names = []
+        for name, table in tables(pl_module.results).items():
+            replace_file(self.folder / name, _csv(table))
+            print(f"\n{_text(table)}")
+            names.append(name)
+        report = dict(model=pl_module.card.model, results=pl_module.results)
+        content = json.dumps(report, indent=1, ensure_ascii=False, allow_nan=False)
+        replace_file(self.folder / "test.json", content)
+        names.append("test.json")
+        figure = pl_module.results_figure()
+        if figure is not None:
+            save_figure(figure, self.folder / "test.png")
+            names.append("test.png")
+        print(f"\n{self.folder}/{', '.join(names[:-1])} and {names[-1]}")
 
 
-def write_results(
-    folder: Path, rows: list[dict], name: str, trained_on: LensDistribution | None
-) -> None:
-    """The rows of a test as files; `trained_on` is the distribution that the picture shades, None
-    where the lenses are those of cameras."""
-    report = dict(model=name, results=rows)
-    replace_file(
-        folder / "test.json", json.dumps(report, indent=1, ensure_ascii=False, allow_nan=False)
-    )
+def tables(rows: Table) -> dict[str, Table]:
+    """The rows of a test by the names of their files, with those of classes and zones apart."""
+    nested = ("per_class", "per_zone")
+    found: dict[str, Table] = {
+        "test.csv": [{key: v for key, v in row.items() if key not in nested} for row in rows],
+        "test_classes.csv": [
+            {"data": row["data"], "class": name} | scores
+            for row in rows
+            for name, scores in row.get("per_class", {}).items()
+        ],
+        "test_zones.csv": [
+            {"data": row["data"]} | zone for row in rows for zone in row.get("per_zone", ())
+        ],
+    }
+    return {name: table for name, table in found.items() if table}
+
+
+def _csv(rows: Table) -> str:
     table = io.StringIO(newline="")
     writer = csv.DictWriter(table, rows[0].keys())
     writer.writeheader()
     writer.writerows(rows)
-    replace_file(folder / "test.csv", table.getvalue())
-    save_figure(draw_results(rows, name, trained_on), folder / "test.png")
+    return table.getvalue()
 
 
-def draw_results(rows: list[dict], name: str, trained_on: LensDistribution | None) -> Figure:
-    """A figure: accuracy against ξ where every distribution is one ξ, else bars."""
-    figure = Figure(figsize=(7, 4.2), layout="constrained")
-    axes = figure.subplots()
-    accuracy = [100 * row["top1"] for row in rows]
-    lenses = [_distribution(row["lenses"]) for row in rows]
-    of_one_xi = [
-        lens for lens in lenses if isinstance(lens, SphericalLenses) and lens.low == lens.high
-    ]
-    if len(of_one_xi) == len(rows):
-        shaded = trained_on if isinstance(trained_on, SphericalLenses) else None
-        band = None if shaded is None else (shaded.low, shaded.high)
-        draw_accuracy([lens.low for lens in of_one_xi], {name: accuracy}, band, axes=axes)
-        axes.set_ylim(0, 100)
-    else:
-        axes.bar([row["lenses"] for row in rows], accuracy, label=name)
-        axes.set(ylabel="accuracy (%)", ylim=(0, 100))
-        axes.tick_params(axis="x", rotation=90)
-        axes.legend()
-    return figure
+def _text(rows: Table) -> str:
+    """Rows for people: in columns, of which those of words are flush left, shares in percent."""
+    hidden = {*_NOT_SHOWN, *(f"{key}{BY_AREA}" for key in _NOT_SHOWN_BY_AREA)}
+    columns = []
+    for key in rows[0]:
+        if key not in hidden:
+            cells = [_title(key), *(_cell(key, row) for row in rows)]
+            words = key in ("lenses", "data", "class", "from_deg")
+            width = max(map(len, cells))
+            columns.append([c.ljust(width) if words else c.rjust(width) for c in cells])
+    return "\n".join("  ".join(line).rstrip() for line in zip(*columns, strict=True))
 
 
-def _distribution(name: str) -> LensDistribution | None:
-    """The distribution of a row; None where it is a camera's calibration."""
-    try:
-        return parse_lenses(name)
-    except ValueError:
-        return None
+def _title(key: str) -> str:
+    if key == "from_deg":
+        return "zone"
+    return f"{key} (%)" if key.removesuffix(BY_AREA) in _IN_PERCENT else key
+
+
+def _cell(key: str, row: dict[str, Any]) -> str:
+    value = row[key]
+    if key == "from_deg":
+        end = row["to_deg"]
+        return f"≥ {value:g}°" if end is None else f"{value:g}–{end:g}°"
+    if value is None:
+        return "–"
+    if not isinstance(value, float):
+        return str(value)
+    return f"{100 * value:.2f}" if key.removesuffix(BY_AREA) in _IN_PERCENT else f"{value:.4g}"

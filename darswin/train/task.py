@@ -1,7 +1,7 @@
-"""What the tasks share: the model, its optimiser and rates, its weights, its steps."""
+"""The base of the tasks: the model, its optimiser and learning rates, its weights, its steps."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable
 from dataclasses import asdict
 from typing import Any, ClassVar, Literal, Self
 
@@ -10,8 +10,10 @@ import torch
 from lightning.pytorch import LightningModule
 from lightning.pytorch.plugins import MixedPrecision
 from lightning.pytorch.utilities.types import OptimizerLRSchedulerConfig
+from matplotlib.figure import Figure
 from torch import Tensor, nn
-from torchmetrics import Metric
+from torch.optim import Optimizer
+from torch.optim.lr_scheduler import LambdaLR
 
 from darswin.layers.linear import MatmulBackend
 from darswin.lens import Lens
@@ -21,7 +23,6 @@ from darswin.models.saving import ModelCard, read_card
 from darswin.models.saving import Task as TaskName
 from darswin.models.unet import Unet
 from darswin.ops.checks import readable
-from darswin.train.data import RunData
 from darswin.train.finetuning import (
     check_name,
     frozen_parts,
@@ -30,7 +31,8 @@ from darswin.train.finetuning import (
     start_from,
     weights_file,
 )
-from darswin.train.recipe import Schedule, parameter_groups
+
+__all__ = ["Task"]
 
 Batch = tuple[Tensor, Lens, Tensor]
 
@@ -38,8 +40,8 @@ Batch = tuple[Tensor, Lens, Tensor]
 class Task(LightningModule):
     """Base of the tasks: a model of wide-angle images, its optimiser and its steps.
 
-    A task says what its models are, defines `_loss`, `_make_metrics` and the steps of validation
-    and test, and leaves in `results`, after a test, a row for each set that it was tested on.
+    A task defines `_head_options`, `_make_metrics`, `_loss`, `results_figure` and the steps of
+    validation and test. A test leaves in `results` a row for each set that it was tested on.
 
     Learning rates are those of `reference_batch` images a step and grow in proportion to the batch.
 
@@ -94,7 +96,7 @@ class Task(LightningModule):
         super().__init__()
         if freeze_stages and weights is None:
             raise ValueError(
-                f"--model.freeze_stages {freeze_stages} keeps trained stages: give --model.weights"
+                f"`freeze_stages` {freeze_stages} keeps trained stages: give `weights`"
             )
         if name is None and weights is not None:
             card = read_card(weights_file(weights))
@@ -104,15 +106,15 @@ class Task(LightningModule):
         check_name(self.name, self.task)
         self.weights, self.freeze_stages = weights, freeze_stages
         self._frozen: list[nn.Module] = []
-        for option, value in dict(
-            learning_rate=learning_rate, reference_batch=reference_batch
-        ).items():
-            if not 0 < value < math.inf:
-                raise ValueError(f"--model.{option} must be above 0, got {value}")
-        rates = dict(warmup_rate=warmup_rate, final_rate=final_rate, weight_decay=weight_decay)
-        for option, value in (rates | dict(warmup_epochs=warmup_epochs)).items():
-            if not 0 <= value < math.inf:
-                raise ValueError(f"--model.{option} must be at least 0, got {value}")
+        positive = dict(learning_rate=learning_rate, reference_batch=reference_batch)
+        others = dict(
+            warmup_rate=warmup_rate, final_rate=final_rate, weight_decay=weight_decay,
+            warmup_epochs=warmup_epochs,
+        )  # fmt: skip
+        for option, value in (positive | others).items():
+            if not 0 <= value < math.inf or (value == 0 and option in positive):
+                least = "above 0" if option in positive else "at least 0"
+                raise ValueError(f"`{option}` must be {least}, got {value}")
         self.rates = dict(peak=learning_rate, warmup=warmup_rate, final=final_rate)
         self.warmup_epochs, self.reference_batch = warmup_epochs, reference_batch
         self.weight_decay, self.decay_position_bias = weight_decay, decay_position_bias
@@ -137,9 +139,7 @@ class Task(LightningModule):
         if has_image_size(self.name):
             options["image_size"] = data.size
         if taken := sorted(options.keys() & self.options.keys()):
-            raise ValueError(
-                f"--model.options cannot set {', '.join(taken)}: the data decides on it"
-            )
+            raise ValueError(f"`options` cannot set {', '.join(taken)}: the data decides on it")
         options |= self.options
         self.card = ModelCard(
             self.name, options, data.classes, data.size, data.fov, data.frame_fit,
@@ -152,9 +152,9 @@ class Task(LightningModule):
         except (TypeError, ValueError) as error:
             if isinstance(error, TypeError) and not self.options:
                 raise
-            given = f"--data.size {data.size}"
+            given = f"`size` {data.size}"
             if self.options:
-                given += f" and --model.options {self.options}"
+                given += f" and `options` {self.options}"
             raise ValueError(f"no {self.name} with {given}: {error}") from error
         if self.weights is not None and self.trainer.training:
             start_from(self.net, data.classes, self.weights)
@@ -168,7 +168,11 @@ class Task(LightningModule):
         raise NotImplementedError
 
     def _make_metrics(self) -> None:
-        """Makes what validation and test measure."""
+        """Makes the metrics of validation and test."""
+        raise NotImplementedError
+
+    def results_figure(self) -> Figure | None:
+        """A picture of `results`."""
         raise NotImplementedError
 
     def _freeze(self) -> None:
@@ -185,8 +189,8 @@ class Task(LightningModule):
         return self
 
     @property
-    def data(self) -> RunData:
-        """The data of the run."""
+    def data(self) -> Any:
+        """The run's data, a `RunData`."""
         return self.trainer.datamodule  # type: ignore[attr-defined]  # Lightning attaches it
 
     def configure_optimizers(self) -> OptimizerLRSchedulerConfig:
@@ -197,12 +201,12 @@ class Task(LightningModule):
         trainer.fit_loop.setup_data()  # with max_steps alone, Lightning has not yet
         steps = trainer.estimated_stepping_batches
         if not math.isfinite(steps):
-            raise ValueError("the cosine needs an end: set --trainer.max_epochs or max_steps")
+            raise ValueError("the cosine needs an end: set `max_epochs` or `max_steps`")
         if self._steps_there not in (None, self.steps_per_epoch):
             raise ValueError(
                 f"an epoch of this run has {self._steps_there} steps, and would now have "
                 f"{self.steps_per_epoch}, which its schedule cannot follow; the number of "
-                "pictures, --data.batch_size, --devices and --trainer.limit_train_batches decide it"
+                "pictures, `batch_size`, `devices` and `limit_train_batches` decide it"
             )
         rates = {name: rate * scale for name, rate in self.rates.items()}
         warmup_steps = self.warmup_epochs * self.steps_per_epoch
@@ -256,10 +260,6 @@ class Task(LightningModule):
 
     # -- training -----------------------------------------------------------------------------
 
-    def forward(self, images: Tensor, lens: Lens) -> Tensor:
-        """Images (B, C, H, W) and their lenses → what the model says of them."""
-        return self.net(images, lens)
-
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
         """The loss of a batch, with a step's own random numbers."""
         # A step's random numbers depend on its place alone, so that a resumed run repeats them.
@@ -270,8 +270,8 @@ class Task(LightningModule):
         # A device is only waited for as often as Lightning logs, which waits too: once weights are
         # not finite, they and the loss stay so.
         every = self.trainer.log_every_n_steps  # type: ignore[attr-defined]  # Lightning adds it
-        looks = readable(loss) or (self.trainer.global_step + 1) % max(every, 1) == 0
-        if looks and not torch.isfinite(loss):
+        checked = readable(loss) or (self.trainer.global_step + 1) % max(every, 1) == 0
+        if checked and not torch.isfinite(loss):
             raise FloatingPointError(
                 f"the loss is {loss.item()} in epoch {self.current_epoch}, batch {batch_idx}: "
                 f"{self._advice()}"
@@ -287,27 +287,73 @@ class Task(LightningModule):
 
     def _advice(self) -> str:
         return (
-            f"go on with --resume and a --model.learning_rate below {self.rates['peak']:g}; if the "
-            "last checkpoint has diverged too, add --ckpt_path for best.ckpt, or begin anew"
+            f"go on with `resume` and a `learning_rate` below {self.rates['peak']:g}; if the last "
+            "checkpoint has diverged too, add `ckpt_path` for best.ckpt, or begin anew"
         )
 
 
 def finite_loss(loss: float, name: str) -> float:
-    """The loss of a test set.
-
-    Raises:
-        FloatingPointError: one that is not finite.
-    """
+    """The loss of a test set; FloatingPointError if it is not finite."""
     if not math.isfinite(loss):
         raise FloatingPointError(
             f"the loss on {name} is {loss}: the weights are not finite, or have diverged; "
-            "--ckpt_path takes another checkpoint"
+            "`ckpt_path` takes another checkpoint"
         )
     return loss
 
 
-def named_metrics(measured: nn.Module) -> Iterator[tuple[str, Metric]]:
-    """The metrics of a ModuleDict, and their names."""
-    for name, metric in measured.named_children():
-        assert isinstance(metric, Metric)
-        yield name, metric
+# -- optimiser --------------------------------------------------------------------------------
+
+
+def parameter_groups(model: nn.Module, weight_decay: float, undecayed: Iterable[str]) -> list[dict]:
+    """Two groups for an optimiser: weight decay for matrices, none for vectors, biases and those
+    named in `undecayed`."""
+    undecayed = set(undecayed)
+    groups: dict[bool, list[nn.Parameter]] = {True: [], False: []}
+    for name, parameter in model.named_parameters():
+        if parameter.requires_grad:
+            decays = parameter.dim() > 1 and not name.endswith(".bias") and name not in undecayed
+            groups[decays].append(parameter)
+    return [
+        {"params": groups[True], "weight_decay": weight_decay},
+        {"params": groups[False], "weight_decay": 0.0},
+    ]
+
+
+def learning_rate(
+    step: int, *, peak: float, warmup: float, final: float, warmup_steps: float, steps: int
+) -> float:
+    """Linear from `warmup` to `peak` over `warmup_steps`, then a cosine down to `final` at `steps`.
+
+    The cosine counts from step 0, so that the rate falls a little where the two meet, as in the
+    recipe of Swin and DarSwin.
+    """
+    if step < warmup_steps:
+        return warmup + (peak - warmup) * step / warmup_steps
+    return final + (peak - final) * (1 + math.cos(math.pi * min(step / max(steps, 1), 1))) / 2
+
+
+class Schedule(LambdaLR):
+    """AdamW's `learning_rate`, each step.
+
+    A checkpoint brings back the step alone: rates and weight decay stay those that the optimizer
+    and the schedule were made with. The schedule is to be restored after the optimizer.
+    """
+
+    def __init__(self, optimizer: Optimizer, **rates: Any):
+        super().__init__(optimizer, lambda step: learning_rate(step, **rates) / rates["peak"])
+        optimizer.register_load_state_dict_pre_hook(_with_own_options)
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"last_epoch": self.last_epoch}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        self.last_epoch = state_dict["last_epoch"] - 1
+        self._step_count = 0  # else torch takes this for a step before the optimizer's first
+        self.step()
+
+
+def _with_own_options(optimizer: Optimizer, state: dict[str, Any]) -> dict[str, Any]:
+    theirs, own = state["param_groups"], optimizer.param_groups
+    groups = [mine | {"params": group["params"]} for group, mine in zip(theirs, own, strict=True)]
+    return state | {"param_groups": groups}

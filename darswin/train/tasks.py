@@ -4,27 +4,23 @@ from typing import NamedTuple
 
 from darswin.models.saving import Task as TaskName
 from darswin.train.classification import Classification
-from darswin.train.data import RunData
-from darswin.train.dense_data import DistanceData, LabelData
-from darswin.train.dense_results import WriteDenseResults
-from darswin.train.distance import Distance
-from darswin.train.results import WriteResults
-from darswin.train.segmentation import Segmentation
+from darswin.train.data import RunData, WideAngleData
+from darswin.train.scene_data import DistanceData, LabelData
+from darswin.train.segmentation import Distance, Segmentation
 from darswin.train.task import Task
-from darswin.train.wide_angle import WideAngleData
+
+__all__ = ["TASKS"]
 
 
 class Kind(NamedTuple):
-    """The classes of a task: the module that Lightning trains, its data, and what writes down the
-    results of a test."""
+    """The module that Lightning trains, and its data."""
 
     module: type[Task]
     data: type[RunData]
-    write: type[WriteResults] | type[WriteDenseResults]
 
 
 TASKS: dict[TaskName, Kind] = {
-    "classification": Kind(Classification, WideAngleData, WriteResults),
-    "segmentation": Kind(Segmentation, LabelData, WriteDenseResults),
-    "distance": Kind(Distance, DistanceData, WriteDenseResults),
+    "classification": Kind(Classification, WideAngleData),
+    "segmentation": Kind(Segmentation, LabelData),
+    "distance": Kind(Distance, DistanceData),
 }

@@ -12,8 +12,8 @@ import yaml
 from safetensors.torch import load_file
 from scenes import write_plain
 
-from darswin.cli.configs import PRESETS, task_of, with_configs
 from darswin.cli.main import COMMANDS, main
+from darswin.cli.options import PRESETS, complete
 from darswin.layers import linear
 from darswin.models import load_model
 
@@ -214,15 +214,15 @@ def test_skipped_pictures_are_counted(capsys, tmp_path):
 
 def test_presets_and_a_run_s_own_configuration(tmp_path):
     preset = str(PRESETS / "iccv2023.yaml")
-    assert with_configs(["fit", "--config", "iccv2023", "--run", "r", "--x", "1"]) == [
+    assert complete(["fit", "--config", "iccv2023", "--run", "r", "--x", "1"])[0] == [
         "fit", f"--config={preset}", "--x", "1", "--run", "r",
     ]  # fmt: skip
     own = tmp_path / "config.yaml"
     own.write_text("")
     run = ["--run", str(tmp_path)]
-    assert with_configs(["test", *run]) == ["test", f"--config={own}", *run]
-    assert with_configs(["fit", *run]) == ["fit", *run]
-    assert with_configs(["fit", *run, "--resume"]) == [
+    assert complete(["test", *run])[0] == ["test", f"--config={own}", *run]
+    assert complete(["fit", *run])[0] == ["fit", *run]
+    assert complete(["fit", *run, "--resume"])[0] == [
         "fit", f"--config={own}", *run, "--resume=true",
     ]  # fmt: skip
 
@@ -295,17 +295,17 @@ def test_the_task_is_said_once(tmp_path, capsys):
     config = tmp_path / "config.yaml"
     config.write_text("task: distance\n")
     run = ["--run", str(tmp_path / "run")]
-    assert task_of(with_configs(["fit", *run])) == "classification"
-    assert task_of(with_configs(["fit", "-c", str(config), *run])) == "distance"
+    assert complete(["fit", *run])[1] == "classification"
+    assert complete(["fit", "-c", str(config), *run])[1] == "distance"
     both = ["fit", "-c", str(config), "--task", "segmentation", *run]
-    assert task_of(with_configs(both)) == "segmentation"
+    assert complete(both)[1] == "segmentation"
     own = ["test", "--run", str(tmp_path)]
-    assert task_of(with_configs(own)) == "distance"
+    assert complete(own)[1] == "distance"
     assert "is a run of --task distance, not of segmentation" in error(
         capsys, *own, "--task", "segmentation"
     )
     config.write_text("data: {path: digits}\n")  # of a run before there were tasks
-    assert task_of(with_configs(own)) == "classification"
+    assert complete(own)[1] == "classification"
     assert "--task must be one of classification, segmentation, distance, got 'odd'" in error(
         capsys, "fit", *run, "--task", "odd"
     )

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 import darswin
-from darswin.cli.info import EXTRAS, info
+from darswin.cli.info import EXTRAS, facts
 from darswin.cli.main import main
 from darswin.ops import cpu_capability
 
@@ -26,7 +26,7 @@ def test_every_extra_is_told_and_what_it_lacks(monkeypatch):
     declared = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     assert set(EXTRAS) == declared["optional-dependencies"].keys()
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    said = info()
+    said = facts()
     for extra, packages in declared["optional-dependencies"].items():
         told = said[f"[{extra}]"]
         assert all(package.partition(">")[0] in told for package in packages)
@@ -34,7 +34,7 @@ def test_every_extra_is_told_and_what_it_lacks(monkeypatch):
 
 def test_why_onednn_is_not_used(monkeypatch):
     monkeypatch.setattr(torch.backends.mkldnn, "is_available", lambda: False)
-    assert "is built without oneDNN" in info()["float32"]
+    assert "is built without oneDNN" in facts()["float32"]
 
 
 def test_it_takes_no_arguments(capsys):

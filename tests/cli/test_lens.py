@@ -113,7 +113,7 @@ def refusal(capsys, *arguments):
         (["--fov_deg=180"], "--fov_deg must be above 0° and below 180° .*, got 180"),
         (["--view=cylindrical", "--fov_deg=361"], "at most 360° in a view that is cylindrical"),
         (["--fov_deg=wide"], "--fov_deg must be a number, got wide"),
-        (["--yaw_deg=.inf"], "--yaw_deg must be a finite number of degrees, got inf"),
+        (["--yaw_deg=inf"], "--yaw_deg must be a finite number of degrees, got inf"),
         (["--theta_max_deg=0"], "--theta_max_deg must be above 0° and at most 180°, got 0"),
         (["--rings=100000000"], "--rings must be from 1 to 1024, got 100000000"),
         (["--sectors=0"], "--sectors must be from 1 to 4096, got 0"),

@@ -6,6 +6,7 @@ checked against what declares it: the Makefile, pyproject.toml, the programs' ow
 """
 
 import ast
+import functools
 import importlib
 import re
 import runpy
@@ -24,6 +25,7 @@ import torch
 from helpers import fixture
 from scenes import write_plain, write_woodscape
 
+from darswin.cli.bench import bench
 from darswin.cli.main import main
 
 ROOT = Path(__file__).parents[2]
@@ -131,7 +133,8 @@ def commands(text: str) -> list[list[str]]:
 
 def run_darswin(arguments: list[str], monkeypatch) -> None:
     """Runs a command; `bench` is only parsed."""
-    monkeypatch.setattr("darswin.cli.bench.bench", lambda **options: None)
+    parsed = functools.wraps(bench)(lambda **options: None)
+    monkeypatch.setattr("darswin.cli.bench.bench", parsed)
     command, *options = arguments
     main([command, *options, *(QUICK if command == "fit" else ())])
 

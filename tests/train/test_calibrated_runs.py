@@ -117,7 +117,7 @@ def test_other_models_train_on_them(tiny, tmp_path, name):
         (["--data.camera", "7"], "camera must be one of"),
         (["--data.lens", "null", "--data.camera", "7"], "--data.camera 7 is one of a calibration"),
         (["--data.coefficients", "pinhole"], "its cameras say their model"),
-        (["--data.lens", KD], "(on the command line as --data.coefficients)"),
+        (["--data.lens", KD], 'give --data.coefficients "fisheye"'),
         (["--data.lens", KD, "--data.coefficients", "fish"], "coefficients"),
         (["--data.lens", KD, "--data.coefficients", "pinhole"], "the lens is of pictures of 80×80"),
         (

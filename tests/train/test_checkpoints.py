@@ -2,7 +2,7 @@ from types import SimpleNamespace
 
 import torch
 
-from darswin.train.checkpoints import RunCheckpoint
+from darswin.train.runs import RunCheckpoint
 
 
 def test_a_moved_run_keeps_its_best(tmp_path):

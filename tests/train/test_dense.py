@@ -9,11 +9,10 @@ from scenes import write_plain
 from darswin.data import IGNORE
 from darswin.lens import Equidistant, KannalaBrandt, cat
 from darswin.lens.pixels import pixel_angles, solid_angles
-from darswin.train import dense
-from darswin.train.dense import Seen
-from darswin.train.dense_data import DistanceData, LabelData
-from darswin.train.distance import Distance
-from darswin.train.segmentation import Segmentation
+from darswin.train import pixel_task as dense
+from darswin.train.pixel_task import Rays as Seen
+from darswin.train.scene_data import DistanceData, LabelData
+from darswin.train.segmentation import Distance, Segmentation
 from darswin.train.tasks import TASKS
 
 

@@ -110,7 +110,7 @@ def test_which_model_starts_from_which():
     model, data = settle(card, "w", "distance", {"name": None, "options": options}, NONE)
     assert model["name"] == "darswin_unet_a_nano" and data["channels"] == 1
     assert model["options"] == {"spacing": "tan", "typical_distance": 3.0}
-    with pytest.raises(ValueError, match=r"disagrees with --model\.weights w"):
+    with pytest.raises(ValueError, match="disagrees with `weights` w"):
         settle(card, "w", "distance", {"name": None, "options": {"spacing": "theta"}}, NONE)
 
 

@@ -18,7 +18,7 @@ from scenes import CLASSES, WOODSCAPE, write_plain
 
 from darswin.cli.main import main
 from darswin.models.saving import load_model
-from darswin.train import dense_results
+from darswin.train import pixel_task as dense_results
 
 METRES = np.array([2.0, 5.0, 8.0])  # of the classes, so that a distance can be told from a colour
 TINY = "{embed_dim: 8, depths: [1, 1, 1], rings: 8, sectors: 32, samples: [2, 2]}"

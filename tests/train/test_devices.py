@@ -9,7 +9,7 @@ from runs import assert_same, error, fit
 from scenes import write_plain
 
 from darswin import lens
-from darswin.train.wide_angle import WideAngleData
+from darswin.train.data import WideAngleData
 
 FEW = """--trainer.max_steps 2 --data.batch_size 4 --data.size 32 --data.workers 1
     --trainer.logger false --trainer.enable_progress_bar false""".split()  # noqa: SIM905

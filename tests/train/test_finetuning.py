@@ -145,7 +145,7 @@ def test_options_not_given_are_the_model_s():
     assert again == (model, data)
     assert settle(CARD, "w", "classification", model, NONE | {"size": 64})[1]["size"] == 64
     swin = replace(CARD, options={**CARD.options, "image_size": 32})
-    with pytest.raises(ValueError, match=r"--data\.size 64 disagrees with --model.weights w"):
+    with pytest.raises(ValueError, match="`size` 64 disagrees with `weights` w"):
         settle(swin, "w", "classification", model, NONE | {"size": 64})
 
 

@@ -12,8 +12,7 @@ from darswin.train.pixel_metrics import (
     DistanceSums,
     LabelSums,
     Zones,
-    distance_scores,
-    label_scores,
+    iou_and_recall,
 )
 
 
@@ -47,7 +46,8 @@ def test_scores_of_labels(left_out):
     assert counts.dtype == torch.int64 and counts.sum() == known.sum()
 
     def check(found, weights, where):
-        overall, iou, recall = label_scores(found, left_out)
+        overall = LabelSums(classes, zones, left_out).scores(found)
+        iou, recall = iou_and_recall(found)
         p, t, w = predicted[known & where], labels[known & where], weights[known & where]
         expected = numpy_iou(p, t, w, classes)
         np.testing.assert_allclose(iou.numpy(), expected, rtol=1e-12)
@@ -76,7 +76,8 @@ def test_miou_is_torchmetrics(left_out):
         LabelSums(7, 1), predicted[known], labels[known], torch.zeros(500).long()[known],
         torch.ones(500)[known],
     )  # fmt: skip
-    found, iou, _ = label_scores(counts[0], left_out)
+    found = LabelSums(7, 1, left_out).scores(counts[0])
+    iou, _ = iou_and_recall(counts[0])
     assert found["miou"] == pytest.approx(jaccard(predicted, labels).item())
     assert iou[4] == 0 and iou[5:].isnan().all()
 
@@ -103,12 +104,12 @@ def test_scores_of_distances():
         )  # fmt: skip
 
     for weights, sums in ((np.ones(3000), counts), (area, areas)):
-        found = distance_scores(sums.sum(0))
+        found = DistanceSums(1).scores(sums.sum(0))
         assert tuple(found) == DISTANCE_METRICS
         every = expected(np.ones(3000, bool), weights)
         assert list(found.values()) == pytest.approx(every, rel=1e-9)
         for number in range(3):
-            found = distance_scores(sums[number])
+            found = DistanceSums(1).scores(sums[number])
             assert list(found.values()) == pytest.approx(expected(zone == number, weights))
     assert 0.2 < found["delta1"] < found["delta2"] < found["delta3"] < 1
 
@@ -140,9 +141,10 @@ def test_many_pixels_lose_none():
 
 
 def test_nothing_known_is_nan():
-    overall, iou, _ = label_scores(torch.zeros(3, 3))
+    overall = LabelSums(3, 1).scores(torch.zeros(3, 3))
+    iou, _ = iou_and_recall(torch.zeros(3, 3))
     assert math.isnan(overall["miou"]) and math.isnan(overall["accuracy"]) and iou.isnan().all()
-    assert all(math.isnan(value) for value in distance_scores(torch.zeros(9)).values())
+    assert all(math.isnan(value) for value in DistanceSums(1).scores(torch.zeros(9)).values())
 
 
 def test_zones():
@@ -154,5 +156,5 @@ def test_zones():
     ]  # fmt: skip
     assert len(Zones([])) == 1 and not Zones([]).of(theta).any()
     for wrong in ([0], [60, 30], [30, 30], [200], [math.nan]):
-        with pytest.raises(ValueError, match="zones must rise"):
+        with pytest.raises(ValueError, match="`zones` must rise"):
             Zones(wrong)

@@ -3,7 +3,7 @@ from torch import nn
 from torch.optim.lr_scheduler import CosineAnnealingLR, LinearLR
 
 from darswin import create_model
-from darswin.train.recipe import Schedule, parameter_groups
+from darswin.train.task import Schedule, parameter_groups
 
 
 def rates(schedule_of, steps):

@@ -16,8 +16,8 @@ import yaml
 from runs import KilledError, assert_same, checkpoint, error, files, fit, killed, patch_batch
 
 from darswin.cli.main import main
-from darswin.train.recipe import learning_rate
-from darswin.train.resuming import CHANGEABLE, check_changes
+from darswin.train.runs import CHANGEABLE, check_changes
+from darswin.train.task import learning_rate
 from darswin.train.tasks import TASKS
 from darswin.utils.files import locked
 
@@ -177,7 +177,7 @@ def test_a_run_of_before_there_were_tasks_goes_on():
         check_changes({"data": {"size": 32}}, {"task": "classification", "data": {"size": 32}})
         == []
     )
-    with pytest.raises(ValueError, match="--task 'distance' in place of 'classification'"):
+    with pytest.raises(ValueError, match="`task` 'distance' in place of 'classification'"):
         check_changes({}, {"task": "distance"})
 
 
@@ -186,9 +186,9 @@ def test_changes_are_named():
     now = {"data": {"size": 32, "workers": 2}, "trainer": {"devices": 2}, "run": "a"}
     assert check_changes(before, before) == []
     assert check_changes(before, now) == [
-        "--data.workers 2 in place of 1", "--trainer.devices 2 in place of 1",
+        "`data.workers` 2 in place of 1", "`trainer.devices` 2 in place of 1",
     ]  # fmt: skip
-    with pytest.raises(ValueError, match=r"not with --data\.size 64 in place of 32$"):
+    with pytest.raises(ValueError, match=r"not with `data\.size` 64 in place of 32$"):
         check_changes(before, now | {"data": {"size": 64, "workers": 2}})
 
 

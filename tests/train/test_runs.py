@@ -137,7 +137,7 @@ def test_one_test_over_all_distortions(whole, capsys):
     assert [float(r["top1"]) for r in table] == [row["top1"] for row in rows]
     assert all(0 < row["top1"] <= row["top5"] <= 1 and row["loss"] > 0 for row in rows)
     assert (whole / "test.png").read_bytes().startswith(b"\x89PNG")
-    assert "top-1 (%)" in capsys.readouterr().out
+    assert "top1 (%)" in capsys.readouterr().out
     finish(
         start("test", whole, "--devices", "2", "--trainer.accelerator", "cpu", "--xi", "0:1:0.5"),
         whole,

@@ -3,7 +3,7 @@ import torch
 import torch.nn.functional as F
 from torchmetrics.classification import MulticlassAccuracy
 
-from darswin.train.classification import Classification, metrics
+from darswin.train.classification import Classification, ClassMetrics
 
 
 def test_targets_smooth_as_torch_does():
@@ -21,26 +21,25 @@ def test_a_broken_picture_weighs_nothing():
 
 
 def test_metrics_count_images():
-    measured = metrics(10)
+    measured = ClassMetrics(10).all()
     logits = torch.zeros(4, 10)
     logits[torch.arange(4), torch.tensor([1, 2, 3, 4])] = 1
     logits[2, 3] = -1  # last of all
     measured["top1"].update(logits, torch.tensor([1, 2, 3, 5]))
     assert measured["top1"].compute() == 0.5
-    assert metrics(3)["top5"].top_k == 3
+    assert ClassMetrics(3).top5.top_k == 3
 
 
 def test_metrics_are_those_of_torchmetrics_and_leave_broken_pictures_out():
-    measured, logits = metrics(8), torch.randn(60, 8)
+    measured, logits = ClassMetrics(8), torch.randn(60, 8)
     labels = torch.randint(-1, 8, (60,))
     for part in (slice(0, 40), slice(40, 60)):
-        for metric in measured.values():
-            metric.update(logits[part], labels[part])
+        measured.update(logits[part], labels[part])
     logits, labels = logits[labels >= 0], labels[labels >= 0]
     for name, k in (("top1", 1), ("top5", 5)):
         expected = MulticlassAccuracy(8, average="micro", top_k=k)(logits, labels)
-        torch.testing.assert_close(measured[name].compute(), expected)
-    torch.testing.assert_close(measured["loss"].compute(), F.cross_entropy(logits, labels))
+        torch.testing.assert_close(measured.all()[name].compute(), expected)
+    torch.testing.assert_close(measured.loss.compute(), F.cross_entropy(logits, labels))
 
 
 @pytest.mark.parametrize(

@@ -49,7 +49,7 @@ def test_a_full_disk_is_said_and_leaves_the_old_file_alone(tmp_path):
     path.write_text("old")
     code = f"""
         import resource, signal, torch
-        from darswin.train.checkpoints import SafeCheckpointIO
+        from darswin.train.runs import SafeCheckpointIO
         signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
         resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, {resource.RLIM_INFINITY}))
         SafeCheckpointIO().save_checkpoint({{"state_dict": torch.zeros(100_000)}}, {str(path)!r})

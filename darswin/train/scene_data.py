@@ -1,4 +1,4 @@
-"""Scenes with a label or a distance for each pixel: what the dense tasks train on."""
+"""Scenes with a label or a distance for each pixel, for segmentation and distance."""
 
 import math
 import os
@@ -16,8 +16,10 @@ from darswin.data.splits import Split
 from darswin.train.data import RunData
 from darswin.train.task import Batch
 
+__all__ = ["DistanceData", "LabelData", "SceneData"]
 
-class DenseData(RunData):
+
+class SceneData(RunData):
     """Scenes of calibrated cameras: images, their lenses, and what is known of each pixel.
 
     Args:
@@ -71,7 +73,7 @@ class DenseData(RunData):
 
     @property
     def classes(self) -> list[str]:
-        """The names of the labels; none where distances are told."""
+        """The names of the labels; none for distances."""
         return self.scenes("train").classes
 
     @property
@@ -117,7 +119,7 @@ class DenseData(RunData):
     def _training(self) -> tuple[SceneSamples, TrainingOrder]:
         dataset = self.dataset(
             "train", turns=self.turns, crop=self.crop, lenses=self.lenses,
-            augment=self._colour_changes,
+            augment=self.colour_changes,
         )  # fmt: skip
         order = TrainingOrder(
             len(dataset), self.batch_size, pairs=False, seed=self.seed, cameras=None, **self._place
@@ -125,12 +127,12 @@ class DenseData(RunData):
         return dataset, order
 
 
-class LabelData(DenseData):
+class LabelData(SceneData):
     """Scenes with a label for each pixel.
 
     Args:
         path: a folder of scenes: see `darswin.data.open_scenes`.
-        common: as `DenseData`.
+        common: as `SceneData`.
     """
 
     target = "labels"
@@ -139,13 +141,13 @@ class LabelData(DenseData):
         super().__init__(path, **common)
 
 
-class DistanceData(DenseData):
+class DistanceData(SceneData):
     """Scenes with a distance for each pixel.
 
     Args:
         path: a folder of scenes: see `darswin.data.open_scenes`.
         max_distance: m, beyond which distances count as not known; null is none.
-        common: as `DenseData`.
+        common: as `SceneData`.
     """
 
     target = "distance"
@@ -153,7 +155,7 @@ class DistanceData(DenseData):
     def __init__(self, path: str, *, max_distance: float | None = None, **common: Any):
         super().__init__(path, **common)
         if max_distance is not None and not 0 < max_distance < math.inf:
-            raise ValueError(f"--data.max_distance must be above 0, got {max_distance}")
+            raise ValueError(f"`max_distance` must be above 0, got {max_distance}")
         self.max_distance = max_distance
 
     def on_after_batch_transfer(self, batch: Batch, dataloader_idx: int) -> Batch:

@@ -10,9 +10,9 @@ import torch
 from PIL import Image
 from videos import write_video
 
-from darswin.cli import dense_answers
+from darswin.cli import answers as dense_answers
 from darswin.cli import predict as predict_module
-from darswin.cli.dense_answers import claim_folder, distance_png, file_names, label_png
+from darswin.cli.answers import claim_folder, distance_png, file_names, label_png
 from darswin.cli.main import main
 from darswin.data.warp import FullSize, at_size
 from darswin.lens import from_dict

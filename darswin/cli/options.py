@@ -1,0 +1,180 @@
+"""The options of `fit`, `validate` and `test`: their help, presets, and the run's own folder."""
+
+import argparse
+import textwrap
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any, get_args
+
+import yaml
+
+from darswin.models.saving import Task
+
+PRESETS = Path(__file__).parent.parent / "train" / "presets"
+FIRST_TASK: Task = "classification"  # of runs that say none
+
+
+def complete(argv: list[str]) -> tuple[list[str], Task]:
+    """The arguments with presets' names as their files, and a run's own configuration first; and
+    the task.
+
+    `test`, `validate` and `fit --resume` start from `RUN/config.yaml`, so that they need no other
+    option.
+
+    Raises:
+        ValueError: an unknown preset or task; another task than that of the run.
+        FileExistsError, FileNotFoundError: a run, or none, in RUN.
+    """
+    scan = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    scan.add_argument("-c", "--config", action="append", default=[])
+    scan.add_argument("--run")
+    scan.add_argument("--resume", action="store_true")
+    scan.add_argument("--task")
+    given, others = scan.parse_known_args(argv[1:])
+    tasks = {file: _task_in(file) for file in map(_config_file, given.config)}
+    before = None
+    if given.run:
+        others += ["--run", given.run]
+        own = Path(given.run) / "config.yaml"
+        if argv[0] == "fit" and not given.resume:
+            check_free(Path(given.run))
+        elif own.exists():
+            before = _task_in(own) or FIRST_TASK
+            tasks = {own: before} | tasks
+        elif last_of(Path(given.run)).exists() if argv[0] == "fit" else not tasks:
+            raise FileNotFoundError(f"there is no run in {given.run}: it has no config.yaml")
+    if given.resume:
+        others.append("--resume=true")
+    said = [*tasks.values(), given.task]
+    task = next((task for task in reversed(said) if task is not None), FIRST_TASK)
+    if task not in get_args(Task):
+        raise ValueError(f"`task` must be one of {', '.join(get_args(Task))}, got {task!r}")
+    if before not in (None, task):
+        raise ValueError(f"{given.run} is a run of `task` {before}, not of {task}")
+    if given.task:
+        others += ["--task", given.task]
+    return [argv[0], *(f"--config={file}" for file in tasks), *others], task
+
+
+def _config_file(name: str) -> Path:
+    preset = PRESETS / f"{name}.yaml"
+    if Path(name).exists():
+        return Path(name)
+    if not preset.exists():
+        raise ValueError(f"there is no file {name} and no such preset; the presets are {presets()}")
+    return preset
+
+
+def _task_in(config: Path) -> Any:
+    try:
+        content = yaml.safe_load(config.read_text())
+    except (yaml.YAMLError, OSError):
+        return None  # the parser says what is wrong with it
+    return content.get("task") if isinstance(content, dict) else None
+
+
+def presets() -> str:
+    """The names of the presets, in words."""
+    return ", ".join(sorted(path.stem for path in PRESETS.glob("*.yaml")))
+
+
+def last_of(folder: Path) -> Path:
+    """The last checkpoint of a run."""
+    return folder / "checkpoints" / "last.ckpt"
+
+
+def check_free(folder: Path) -> None:
+    """FileExistsError for a folder that holds a run."""
+    if last_of(folder).exists():
+        raise FileExistsError(
+            f"{folder} holds a run already: go on with `resume`, or choose another one"
+        )
+
+
+# -- help: our options first, then the trainer's that people need -----------------------------
+
+ALL = "--help.all"  # shows those of Lightning's trainer that are left, too
+# Options by what argparse calls them; a text stands in place of Lightning's own.
+RUN = {
+    "config": "",
+    "run": "",
+    "resume": "",
+    "task": "",
+    "checkpoint_steps": "",
+    "xi": "",
+    "devices": "",
+    "ckpt_path": "a checkpoint to start from, in place of the run's own",
+    "seed_everything": "of shuffles, lenses, augmentation, weights, jitter, drop path and mixing",
+}
+TRAINER = {
+    "trainer.max_epochs": "epochs to train",
+    "trainer.max_steps": "steps to train, in place of epochs; -1 is any number",
+    "trainer.max_time": "time to train, as DD:HH:MM:SS",
+    "trainer.accelerator": "cpu, gpu or auto",
+    "trainer.precision": "32-true, bf16-mixed or 16-mixed",
+    "trainer.accumulate_grad_batches": "batches of a step",
+    "trainer.gradient_clip_val": "the norm that gradients are cut to; null is none",
+    "trainer.limit_train_batches": "batches of an epoch, or the share of them",
+    "trainer.limit_val_batches": "batches of a validation, or the share of them; 0 is none",
+    "trainer.check_val_every_n_epoch": "epochs between validations",
+    "trainer.log_every_n_steps": "steps between lines of the logs",
+    "trainer.logger": "false writes no logs",
+    "trainer.enable_progress_bar": "true or false",
+}
+GROUPS = {"data": "pictures and lenses", "model": "the model and its training"}
+REQUIRED = ("run", "data.path")
+WIDTH, COLUMN = 118, 34
+
+
+def format_help(
+    actions: Iterable[argparse.Action],
+    formatter: argparse.HelpFormatter,
+    command: str,
+    whole: bool,
+) -> str:
+    """The help of a command, in lines of at most `WIDTH`.
+
+    Args:
+        actions: its options. formatter: an empty one, for the trainer's other options.
+        whole: shows those too.
+    """
+    # An option that is linked to another one has no name that could be typed.
+    typed = (a for a in actions if any(name.startswith("-") for name in a.option_strings))
+    left = {action.dest: action for action in typed}
+    lines = [f"usage: darswin {command} --run RUN [-c PRESET] --data.path PATH [options]"]
+
+    def section(title: str, texts: dict[str, str]) -> None:
+        lines.extend(("", f"{title}:"))
+        for name, text in texts.items():
+            if name in left:
+                lines.extend(_option(left.pop(name), text))
+
+    section("the run", RUN)
+    for group, title in GROUPS.items():
+        section(title, {name: "" for name in left if name.startswith(f"{group}.")})
+    section("the trainer", TRAINER)
+    if not whole:
+        lines += ["", f"`darswin {command} {ALL}` shows all options of Lightning's trainer."]
+        return "\n".join(lines) + "\n"
+    formatter._width, formatter._max_help_position = WIDTH, COLUMN
+    formatter.start_section("all others")
+    formatter.add_arguments(list(left.values()))
+    formatter.end_section()
+    return "\n".join(lines) + "\n\n" + formatter.format_help()
+
+
+def _option(action: argparse.Action, text: str) -> list[str]:
+    """An option, its help, and in brackets its default."""
+    names = ", ".join(name for name in action.option_strings if not name.endswith("+"))
+    default = action.default
+    if action.dest in REQUIRED:
+        shown = "required"
+    elif isinstance(default, float):
+        shown = f"{default:g}"
+    else:
+        shown = "null" if default is None else str(default).lower()
+    lines = textwrap.wrap(f"{(text or str(action.help)).rstrip('.')} [{shown}]", WIDTH - COLUMN)
+    head = f"  {names}"
+    if len(head) < COLUMN - 1:
+        head = f"{head:<{COLUMN}}{lines.pop(0)}"
+    return [head, *(" " * COLUMN + line for line in lines)]

@@ -1,0 +1,269 @@
+"""The base of the tasks that predict a label or a distance for each pixel."""
+
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+from matplotlib.figure import Figure
+from torch import Tensor, nn
+from torchmetrics import MeanMetric
+
+from darswin.data.scenes.scene import IGNORE
+from darswin.lens import Lens
+from darswin.lens.pixels import pixel_angles, solid_angles
+from darswin.train.pixel_metrics import BY_AREA, PixelSums, Zones, none_of_nan
+from darswin.train.task import Batch, Task, finite_loss
+from darswin.viz.dense import Row, draw_predictions
+
+__all__ = ["PixelTask"]
+
+_SHOWN = 4  # samples of a test's picture
+_EARLY = 100  # batches: a training does not go on for longer without any target
+
+
+class Measured(nn.Module):
+    """The metrics of a set: sums over its pixels in each zone, and the mean loss."""
+
+    def __init__(self, sums: PixelSums):
+        super().__init__()
+        self.sums, self.loss = sums, MeanMetric()
+
+
+class PixelTask(Task):
+    """Base of the tasks for each pixel.
+
+    A task defines `_criterion`, `_answer`, `_known`, `_check_targets`, `_sums`, `nothing`, which
+    stands for no answer, and `shown`, its scores that are logged after each epoch.
+
+    Args:
+        name: of a model; None is that of `weights`, or the task's own default.
+        options: of the model. With `weights` they are its own.
+        learning_rate: its peak.
+        warmup_epochs: of linear warm-up; may be a fraction.
+        reference_batch: images that the rates are meant for.
+        zones: degrees from the axis, between the zones that a test measures one by one; null is
+            30, 60, 90.
+        solid_angle_weights: pixels count in the loss as their solid angles do, of which the mean is
+            1 in each image.
+        common: as `Task`.
+
+    Attributes:
+        results: after a test a row for each set: `data`, its name; the scores, and again with
+            solid angles as weights, named `…_sr`; `pixels`, how many were known; `per_class` and
+            `per_zone`. A score of nothing known is None.
+        samples: some of the tested images, (H, W, C) uint8, with their targets and predictions,
+            (H, W), ids or m.
+    """
+
+    default_model = "darswin_unet_a_micro"
+    nothing: ClassVar[int]
+    shown: ClassVar[tuple[str, ...]]
+
+    def __init__(
+        self,
+        name: str | None = None,
+        options: dict[str, Any] | None = None,
+        *,
+        learning_rate: float = 1e-3,
+        warmup_epochs: float = 1,
+        reference_batch: int = 16,
+        zones: list[float] | None = None,
+        solid_angle_weights: bool = False,
+        **common: Any,
+    ):
+        super().__init__(
+            name, options, learning_rate=learning_rate, warmup_epochs=warmup_epochs,
+            reference_batch=reference_batch, **common,
+        )  # fmt: skip
+        self.zones = Zones([30, 60, 90] if zones is None else zones)
+        self.solid_angle_weights = solid_angle_weights
+        self.samples: list[Row] = []
+        self._rays = Rays()
+        # Which ids the targets of the first epoch hold, (256,), and of how many images.
+        self._found: Tensor | None = None
+        self._images = 0
+
+    def _make_metrics(self) -> None:
+        self.val_metrics = Measured(self._sums(1))
+        count = len(self.zones)
+        self.test_metrics = nn.ModuleList(Measured(self._sums(count)) for _ in self.data.test_names)
+
+    # -- what a task defines ------------------------------------------------------------------
+
+    def _sums(self, zones: int) -> PixelSums:
+        raise NotImplementedError
+
+    def _criterion(self, predicted: Tensor, target: Tensor, weights: Tensor | None) -> Tensor:
+        """The loss of the model's output (B, K, H, W)."""
+        raise NotImplementedError
+
+    def _answer(self, predicted: Tensor) -> Tensor:
+        """The model's output (B, K, H, W) → ids or metres, (B, H, W)."""
+        raise NotImplementedError
+
+    def _known(self, target: Tensor) -> Tensor:
+        """Which pixels of (B, H, W) have a target."""
+        raise NotImplementedError
+
+    def _check_targets(self, found: list[bool], images: str, whole: bool) -> None:
+        """Raises ValueError, or warns, if something is missing in the training targets.
+
+        Args:
+            found: which ids the known pixels have had; of distances, whether any is known.
+            images: those looked at, in words. whole: whether they are a whole epoch.
+        """
+        raise NotImplementedError
+
+    def _per_class(self, counts: Tensor, areas: Tensor) -> dict[str, Any]:
+        return {}
+
+    # -- training -----------------------------------------------------------------------------
+
+    def _loss(self, batch: Batch, rng: np.random.Generator) -> Tensor:
+        images, lens, target = batch
+        weights = None
+        if self.solid_angle_weights:
+            area = solid_angles(lens.merged(), (images.shape[2], images.shape[3]))
+            weights = (area / area.mean((1, 2), keepdim=True)).to(images.device)
+            weights = weights.expand(len(images), -1, -1)
+        return self._criterion(self.net(images, lens).float(), target, weights)
+
+    def on_train_batch_end(self, outputs: Any, batch: Batch, batch_idx: int) -> None:
+        """Notes which ids occur in the first whole epoch, and checks them at its end; earlier, if
+        the epoch is long. A device is waited for only then."""
+        target = batch[2]
+        if batch_idx == 0 and self._images == 0:
+            self._found = torch.zeros(IGNORE + 1, dtype=torch.bool, device=target.device)
+        if self._found is None:  # a resumed run is amid an epoch, or the first one is over
+            return
+        ids = torch.zeros_like(target, dtype=torch.int64) if target.is_floating_point() else target
+        self._found.scatter_(0, torch.where(self._known(target), ids, IGNORE).flatten(), True)
+        self._images += len(target) * self.trainer.world_size
+        whole = self.trainer.is_last_batch
+        if whole or batch_idx + 1 == _EARLY:
+            self._check_found(self._found, whole)
+        if whole:
+            self._found = None
+
+    def on_train_end(self) -> None:
+        """Checks the targets of a training that was shorter than an epoch."""
+        if self._found is not None:
+            self._check_found(self._found, False)
+
+    def _check_found(self, found: Tensor, whole: bool) -> None:
+        total: Any = self.trainer.strategy.reduce(found.int(), reduce_op="sum")
+        ids = total[:IGNORE].bool().tolist()
+        try:
+            self._check_targets(ids, f"{self._images} training images", whole)
+        except ValueError:
+            if self.global_rank:  # Lightning kills the first process, which says it, if this fails
+                raise SystemExit from None
+            raise
+
+    # -- evaluation ---------------------------------------------------------------------------
+
+    def _predict(self, batch: Batch, measured: Measured) -> tuple[Tensor, Tensor]:
+        """The answer for each pixel, and which of them are known; counts the loss of these."""
+        images, lens, target = batch
+        predicted = self.net(images, lens.merged()).float()
+        known = self._known(target)
+        if known.any():
+            measured.loss.update(self._criterion(predicted, target, None), weight=known.sum())
+        return self._answer(predicted), known
+
+    def validation_step(self, batch: Batch, batch_idx: int) -> None:
+        """Counts a batch into the validation's loss and scores."""
+        answer, known = self._predict(batch, self.val_metrics)
+        answer, truth = answer[known], batch[2][known]
+        zone = torch.zeros_like(truth, dtype=torch.int64)
+        self.val_metrics.sums.update(answer, truth, zone, torch.ones_like(zone))
+        self.log("val/loss", self.val_metrics.loss, prog_bar=True, on_step=False, on_epoch=True)
+
+    def on_validation_epoch_end(self) -> None:
+        """Logs the scores, which are the same in all processes."""
+        counts, _ = self.val_metrics.sums.compute()
+        scores = self.val_metrics.sums.scores(counts[0])
+        self.val_metrics.sums.reset()
+        for name in self.shown:
+            self.log(f"val/{name}", scores[name], prog_bar=True)
+
+    def on_test_start(self) -> None:
+        """Forgets the samples of a test before."""
+        self.samples = []
+
+    def test_step(self, batch: Batch, batch_idx: int, dataloader_idx: int = 0) -> None:
+        """Counts the pixels of a batch into the sums of its set."""
+        measured: Any = self.test_metrics[dataloader_idx]
+        images, lens, target = batch
+        answer, known = self._predict(batch, measured)
+        theta, area = self._rays.of(lens, images)
+        zone = self.zones.of(theta)
+        measured.sums.update(answer[known], target[known], zone[known], area[known])
+        if batch_idx == 0:
+            # An answer where the lens sees nothing has no meaning.
+            seen = torch.where(theta.isnan(), self.nothing, answer)
+            self._keep_samples(images, target, seen, known)
+
+    def _keep_samples(self, images: Tensor, target: Tensor, answer: Tensor, known: Tensor) -> None:
+        """Adds the first images of a set to `samples`."""
+        mean, std = (images.new_tensor(v)[:, None, None] for v in (self.data.mean, self.data.std))
+        count = max(_SHOWN // len(self.test_metrics), 1)
+        for k in range(min(count, len(images), _SHOWN - len(self.samples))):
+            if not known[k].any():
+                continue  # of a picture that could not be read
+            pixels = ((images[k] * std + mean) * 255).round().clamp(0, 255).to(torch.uint8)
+            arrays = (pixels.permute(1, 2, 0), target[k], answer[k])
+            image, truth, prediction = (array.cpu().numpy() for array in arrays)
+            self.samples.append((image, truth, prediction))
+
+    def on_test_epoch_end(self) -> None:
+        """Collects `results`: a row for each set."""
+        self.results = []
+        measured: Any
+        for name, measured in zip(self.data.test_names, self.test_metrics, strict=True):
+            counts, areas = measured.sums.compute()
+            scores = _scores(measured.sums, counts.sum(0), areas.sum(0))
+            loss = measured.loss.compute().item()
+            loss = finite_loss(loss, name) if scores["pixels"] else None
+            per_zone = [
+                zone | _scores(measured.sums, count, area)
+                for zone, count, area in zip(self.zones.ranges(), counts, areas, strict=True)
+            ]
+            per_class = self._per_class(counts.sum(0), areas.sum(0))
+            nested = dict(per_class=per_class, per_zone=per_zone)
+            self.results.append({"data": name} | scores | {"loss": loss} | nested)
+
+    def results_figure(self) -> Figure | None:
+        """The samples: images, targets and predictions."""
+        if not self.samples:
+            return None
+        return draw_predictions(self.samples, self.card.classes, self.card.colors)
+
+
+def _scores(sums: PixelSums, counts: Tensor, areas: Tensor) -> dict[str, Any]:
+    """The scores of sums over pixels: as pixels count, and as solid angles do."""
+    found: dict[str, Any] = dict(pixels=sums.pixels(counts))
+    for end, summed in (("", counts), (BY_AREA, areas)):
+        scores = sums.scores(summed)
+        found |= {f"{name}{end}": none_of_nan(value) for name, value in scores.items()}
+    return found
+
+
+class Rays:
+    """Angles and solid angles of pixels; kept for the next batch: a test set often has one lens."""
+
+    def __init__(self) -> None:
+        self._lens: Lens | None = None
+        self._angles = self._areas = torch.empty(0)
+
+    def of(self, lens: Lens, images: Tensor) -> tuple[Tensor, Tensor]:
+        """`pixel_angles` and `solid_angles` of each image, (B, H, W), on its device."""
+        size = (images.shape[2], images.shape[3])
+        lens = lens.merged()
+        known = self._angles.shape[1:] == size and self._angles.device == images.device
+        if not known or not lens.same_as(self._lens):
+            self._angles = pixel_angles(lens, size).to(images.device)
+            self._areas = solid_angles(lens, size).to(images.device)
+            self._lens = lens
+        shape = (len(images), *size)
+        return self._angles.expand(shape), self._areas.expand(shape)

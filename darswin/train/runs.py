@@ -1,0 +1,238 @@
+"""A run's checkpoints, how it stops on a signal, and which options may change when it goes on."""
+
+import io
+import os
+import signal
+import threading
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from lightning.pytorch import Callback, LightningModule, Trainer
+from lightning.pytorch.callbacks import ModelCheckpoint
+from lightning.pytorch.plugins.io import TorchCheckpointIO
+
+from darswin.models.saving import ModelCard, save_model
+from darswin.utils.files import replace_file
+from darswin.utils.unpickle import read_pickle
+
+# -- checkpoints ------------------------------------------------------------------------------
+
+
+class RunCheckpoint(ModelCheckpoint):
+    """A checkpoint in a run's folder, wherever that folder has been moved.
+
+    At an epoch's last step nothing is written before the validation: a run that resumed from there
+    would take the epoch for finished and skip its validation. Between the batches of an accumulated
+    step nothing is written either, because a checkpoint does not hold gradients.
+    """
+
+    def on_train_batch_end(
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
+        if ends_step(trainer, batch_idx) and not trainer.is_last_batch:
+            super().on_train_batch_end(trainer, pl_module, outputs, batch, batch_idx)
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        folder = Path(self.dirpath or "")
+
+        def here(path: str) -> str:
+            return str(folder / Path(path).name) if path else path
+
+        state = dict(state_dict, dirpath=self.dirpath)
+        for key in ("best_model_path", "kth_best_model_path", "last_model_path"):
+            state[key] = here(state[key])
+        state["best_k_models"] = {here(path): k for path, k in state["best_k_models"].items()}
+        super().load_state_dict(state)
+
+
+def ends_step(trainer: Trainer, batch_idx: int) -> bool:
+    """Whether the optimizer has stepped on this batch of an epoch."""
+    return (batch_idx + 1) % trainer.accumulate_grad_batches == 0 or trainer.is_last_batch
+
+
+class SafeCheckpointIO(TorchCheckpointIO):
+    """Replaces a checkpoint in one go, with its weights as safetensors beside it, and reads
+    checkpoints without executing what they hold."""
+
+    def save_checkpoint(
+        self, checkpoint: dict[str, Any], path: str | Path, storage_options: Any = None
+    ) -> None:
+        content = io.BytesIO()
+        torch.save(checkpoint, content)
+        replace_file(path, content.getbuffer())
+        weights = {
+            name.removeprefix("net."): tensor
+            for name, tensor in checkpoint["state_dict"].items()
+            if name.startswith("net.")
+        }
+        file = Path(path).with_suffix(".safetensors")
+        save_model(file, weights, ModelCard(**checkpoint["darswin"]))
+
+    def remove_checkpoint(self, path: str | Path) -> None:
+        super().remove_checkpoint(path)
+        Path(path).with_suffix(".safetensors").unlink(missing_ok=True)
+
+    def load_checkpoint(
+        self, path: str | Path, map_location: Any = "cpu", weights_only: bool | None = None
+    ) -> dict[str, Any]:
+        if not Path(path).is_file():
+            raise FileNotFoundError(f"no checkpoint {path}")
+        try:
+            checkpoint = read_pickle(path, map_location)
+        except ValueError as error:
+            others = sorted(set(Path(path).parent.glob("*.ckpt")) - {Path(path)})
+            hint = f"; `ckpt_path` {others[0]} goes on from that one" if others else ""
+            raise ValueError(f"{error}{hint}") from error
+        if not isinstance(checkpoint, dict) or "darswin" not in checkpoint:
+            raise ValueError(f"{path} is no checkpoint of `darswin fit`: it names no model")
+        return checkpoint
+
+
+# -- Ctrl-C and SIGTERM: training stops after a whole step, with a checkpoint -----------------
+
+_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+
+class StopSignals:
+    """Within it, Ctrl-C and SIGTERM raise KeyboardInterrupt; while `patient`, only the second does.
+
+    Attributes:
+        number: of the last signal, None before the first.
+        patient: whether the program itself looks at `number`, and stops when it can.
+    """
+
+    def __init__(self) -> None:
+        self.number: int | None = None
+        self.patient = False
+
+    def __enter__(self) -> "StopSignals":
+        self._before = {number: signal.getsignal(number) for number in _SIGNALS}
+        self.listen()
+        return self
+
+    def __exit__(self, *error: Any) -> None:
+        for number, handler in self._before.items():
+            _handle(number, handler)
+
+    def listen(self) -> None:
+        """Installs the handlers, in place of any that were installed since."""
+        for number in _SIGNALS:
+            _handle(number, self._received)
+
+    def _received(self, number: int, frame: Any) -> None:
+        first, self.number = self.number is None, number
+        if not (first and self.patient):
+            raise KeyboardInterrupt
+        # print() fails in a handler that interrupts a print().
+        os.write(2, b"\nstopping at the end of this step; a second signal stops at once\n")
+
+
+def _handle(number: int, handler: Any) -> None:
+    if threading.current_thread() is threading.main_thread():  # Python allows it in no other thread
+        signal.signal(number, handler)
+
+
+def ignore_signals(worker: int) -> None:
+    """Called in the worker processes of a DataLoader: the training process ends them itself."""
+    for number in _SIGNALS:
+        signal.signal(number, signal.SIG_IGN)
+
+
+class StopOnSignal(Callback):
+    """Once any process of a run gets a signal, all stop after the same step, with a checkpoint.
+
+    After an epoch's last step they validate first; the checkpoint is then the epoch's own.
+    """
+
+    def __init__(self, signals: StopSignals, checkpoint: Path):
+        self.signals, self.checkpoint = signals, checkpoint
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        self.signals.listen()  # Lightning has just installed its own for SIGTERM
+        self.signals.patient = True
+
+    def on_train_batch_end(
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
+        ends = ends_step(trainer, batch_idx) and not trainer.is_last_batch
+        if ends and self._any_signal(trainer):
+            trainer.save_checkpoint(self.checkpoint)
+            raise SystemExit
+
+    def on_train_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        # The signal came in the last step of an epoch, whose checkpoint is there.
+        if trainer.global_step > 0 and self._any_signal(trainer):
+            raise SystemExit
+
+    def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        self.signals.patient = False
+
+    def on_exception(
+        self, trainer: Trainer, pl_module: LightningModule, exception: BaseException
+    ) -> None:
+        self.signals.patient = False
+
+    def _any_signal(self, trainer: Trainer) -> bool:
+        here = self.signals.number is not None
+        if not trainer.strategy.reduce_boolean_decision(here, all=False):
+            return False
+        self.signals.number = self.signals.number or signal.SIGTERM  # another process got it
+        return True
+
+
+# -- options that change when a run goes on ---------------------------------------------------
+
+# A change takes effect from the checkpoint on. Options of the trainer may change as well, except
+# for accumulate_grad_batches, which is part of a step's size.
+CHANGEABLE = {
+    *("checkpoint_steps", "weights_only"),
+    *(f"model.{rate}_rate" for rate in ("learning", "warmup", "final")),
+    *("model.warmup_epochs", "model.reference_batch", "model.weight_decay"),
+    *("model.label_smoothing", "model.mixup", "model.cutmix", "model.mix_p"),
+    *("model.loss", "model.class_weights", "model.solid_angle_weights", "model.zones"),
+    *("model.matmul_backend", "model.grad_checkpointing"),
+    *("data.path", "data.classes", "data.splits", "data.skip_broken"),
+    *("data.lens", "data.camera", "data.coefficients"),
+    *("data.batch_size", "data.workers"),
+    *("data.train_lenses", "data.test_lenses", "data.pair_lenses"),
+    *("data.render", "data.fit", "data.picture_size", "data.randaugment", "data.erasing"),
+    *("data.flip", "data.rotate_deg", "data.crop", "data.lens_augmentation"),
+    *("data.test_paths", "data.max_distance"),
+}
+
+
+def check_changes(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
+    """The differences between a run's configuration and the one to resume with, a line an option.
+
+    Raises:
+        ValueError: an option that cannot change.
+    """
+    before, now = _options(before), _options(now)
+    changes = {
+        name: f"`{name}` {now[name]!r} in place of {before.get(name)!r}"
+        for name in now
+        # An option that is off is none that an older run lacks.
+        if now[name] != before.get(name) and (name in before or now[name])
+    }
+    refused = [
+        text
+        for name, text in changes.items()
+        if name not in CHANGEABLE
+        and (not name.startswith("trainer.") or name == "trainer.accumulate_grad_batches")
+    ]
+    if refused:
+        raise ValueError(f"a run goes on with what it began with, not with {'; '.join(refused)}")
+    return list(changes.values())
+
+
+def _options(config: Mapping[str, Any]) -> dict[str, Any]:
+    """The options of a configuration by their qualified names."""
+    found: dict[str, Any] = {"task": "classification"}  # before there were others
+    for group, value in config.items():
+        if group in ("model", "data", "trainer"):
+            found |= {f"{group}.{name}": own for name, own in value.items()}
+        elif group != "run":  # it may have moved
+            found[group] = value
+    return found
