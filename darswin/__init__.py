@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from darswin import compat, lens, models, ops
     from darswin.deploy.optimize import optimize
-    from darswin.layers.attention import PolarWindowAttention
     from darswin.layers.polar import PolarGrid, PolarSample, polar_grid
+    from darswin.layers.transformer import PolarWindowAttention
     from darswin.models import DarSwin, create_model, list_models
 
     __version__: str
@@ -36,7 +36,7 @@ _MODULES = {
     "DarSwin": "darswin.models",
     "PolarGrid": "darswin.layers.polar",
     "PolarSample": "darswin.layers.polar",
-    "PolarWindowAttention": "darswin.layers.attention",
+    "PolarWindowAttention": "darswin.layers.transformer",
     "create_model": "darswin.models",
     "list_models": "darswin.models",
     "optimize": "darswin.deploy.optimize",

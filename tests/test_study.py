@@ -16,7 +16,7 @@ import tables  # noqa: E402
 from cells import LEVELS, POLYNOMIAL, SWEEP, ablations, headline  # noqa: E402
 
 from darswin import create_model  # noqa: E402
-from darswin.layers import onednn  # noqa: E402
+from darswin.layers.linear import onednn_lack  # noqa: E402
 
 QUICK = """
     --data.path digits --data.limit 96 --data.batch_size 16 --trainer.max_epochs 1 --data.render 32
@@ -86,7 +86,7 @@ def test_tables_and_picture(quick):
     assert "not run" not in tables.tables(cells + others)["ablations"]
 
 
-@pytest.mark.skipif(onednn.missing(torch.int8) is not None, reason="no products of 8 bits")
+@pytest.mark.skipif(onednn_lack(torch.int8) is not None, reason="no products of 8 bits")
 def test_cells_of_8_bits(quick, here):
     where = ["--out", str(quick / "out"), "--results", str(quick)]
     how = [*where, "--seeds", "1", "--cell", "dat", "--test-images", "20", "--pictures", "8"]

@@ -20,11 +20,10 @@ from darswin.bench.timing import (
     REFERENCE,
 )
 from darswin.deploy.optimize import optimize
+from darswin.deploy.packed import Product, packed
 from darswin.deploy.quantize import quantize_model
-from darswin.deploy.stages import Product, packed
-from darswin.layers import onednn
 from darswin.layers.embed import PolarPatchEmbed
-from darswin.layers.linear import Linear
+from darswin.layers.linear import Linear, onednn_lack
 from darswin.layers.quantized import QuantizedLinear, quantize
 from darswin.lens import Lens, Spherical
 from darswin.models import create_model
@@ -67,7 +66,7 @@ def inference(
     products = matmuls_of(ours, images, lens, dtype)
     theirs = [dtype]
     if dtype == torch.int8:
-        half = onednn.missing(torch.bfloat16) is None
+        half = onednn_lack(torch.bfloat16) is None
         theirs = [torch.float32, torch.bfloat16] if half else [torch.float32]
     peers = [(copy.deepcopy(model).to(kind), images.to(kind)) for kind in theirs]
     peer, pixels = peers[0]

@@ -10,7 +10,7 @@ from darswin.bench import candidates, memory, plot, tables, targets
 from darswin.bench.machine import THREADS, machine, num_threads
 from darswin.bench.record import Record
 from darswin.bench.timing import MATMULS, OURS, REFERENCE, TURNS, Case, Timing, measure
-from darswin.layers import linear, onednn
+from darswin.layers import linear
 from darswin.models.registry import model_class
 from darswin.utils.malloc import keep_freed_memory
 
@@ -104,7 +104,7 @@ def _measure(
 
 
 def _dtypes(mode: str) -> list[str]:
-    quantized = mode == "inference" and onednn.missing(torch.int8) is None
+    quantized = mode == "inference" and linear.onednn_lack(torch.int8) is None
     return [*DTYPES, *(INT8 if quantized else ())]
 
 

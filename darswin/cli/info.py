@@ -5,8 +5,8 @@ import platform
 import torch
 
 from darswin.bench.machine import machine
-from darswin.layers import onednn
-from darswin.layers.packed import fastest_dtype
+from darswin.deploy.packed import fastest_dtype
+from darswin.layers.linear import onednn_lack
 from darswin.models import list_models, list_pretrained
 from darswin.ops import _module
 from darswin.utils.extras import lack
@@ -39,11 +39,11 @@ def facts() -> dict[str, str]:
         "tier": f"{here['tier']}, of {', '.join(_module.tiers())}",
     }
     for dtype in (torch.float32, torch.bfloat16, torch.int8):
-        reason = onednn.missing(dtype)
+        reason = onednn_lack(dtype)
         other = "none" if dtype == torch.int8 else "torch's products"
         lines[_name(dtype)] = "oneDNN's products" if reason is None else f"{other}: {reason}"
     fastest = _name(fastest_dtype())
-    quantized = onednn.missing(torch.int8) is None
+    quantized = onednn_lack(torch.int8) is None
     lines["fastest"] = f"int8 of a quantized model, else {fastest}" if quantized else fastest
     for extra in EXTRAS:
         lines[f"[{extra}]"] = lack(extra) or "installed"

@@ -15,8 +15,8 @@ import torch
 from torch import Tensor, nn
 
 from darswin.compat.checkpoint import Source, count_blocks, load_as
-from darswin.layers.attention import PolarWindowAttention
 from darswin.layers.polar import PolarGrid, PolarGridSpec, check_lens
+from darswin.layers.transformer import PolarWindowAttention
 from darswin.lens import Lens, Number, Spherical
 from darswin.lens.parameter import Parameter
 from darswin.lens.spacing import check_tan

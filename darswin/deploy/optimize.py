@@ -3,25 +3,39 @@ the norm behind it in one."""
 
 import copy
 import warnings
-from collections.abc import Iterable, Sequence
-from typing import Any, Literal, Self, TypeVar
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, Literal, TypeVar
 
 import torch
 from torch import Tensor, nn
 
+from darswin.deploy.packed import (
+    PackedLinear,
+    PackedNorm,
+    PackedQuantizedLinear,
+    fastest_dtype,
+    packed,
+    packed_attention,
+    taken,
+)
 from darswin.deploy.quantize import quantize_model
-from darswin.deploy.stages import InDtype, OptimizedStage, pack
-from darswin.layers import onednn
-from darswin.layers.packed import PackedLinear, fastest_dtype
-from darswin.layers.quantized import quantized_layers, without_quantized_layers
+from darswin.layers.linear import onednn_lack
+from darswin.layers.position_bias import RelativeBias, joined_coefficients
+from darswin.layers.quantized import QuantizedLinear, quantized_layers, without_quantized_layers
+from darswin.layers.transformer import Block, PatchMerging, Stage, Tables, WindowAttention
 from darswin.lens import Lens
 from darswin.models.base import Model
-from darswin.models.encoder import Encoder, FeatureMaps, Prepared
-from darswin.models.stages import Pair, Stage
-from darswin.models.unet import Unet, UnetPrepared
+from darswin.models.encoder import Encoder, FeatureMaps
+from darswin.models.stages import Pair
+from darswin.models.unet import PatchExpand, PixelHead, SkipJoin, Unet
+
+__all__ = ["optimize"]
 
 Net = TypeVar("Net", bound=Model)
 DTYPES = (torch.float32, torch.bfloat16, torch.int8)
+# A stage runs on so many images at once that what lies between two products stays below this: it
+# is then in the caches, and in memory that the allocator has kept rather than in fresh pages.
+CACHED_BYTES = 16 * 2**20
 
 
 def optimize(
@@ -62,43 +76,28 @@ def optimize(
     """
     _check(model, dtype, lens)
     if dtype == "fastest":
-        whole = calibration is None and not quantized_layers(model)
-        lacks = onednn.missing(torch.int8) is not None
-        dtype = fastest_dtype() if whole or lacks else torch.int8
-        if lacks:
-            model, calibration = _without_8_bits(model), None
+        is_whole = calibration is None and not quantized_layers(model)
+        lacks_int8 = onednn_lack(torch.int8) is not None
+        dtype = fastest_dtype() if is_whole or lacks_int8 else torch.int8
+        if lacks_int8:
+            model, calibration = copy.deepcopy(model), None
+            without_quantized_layers(model)
     if dtype == torch.int8:
-        if (lack := onednn.missing(dtype)) is not None:
+        if (lack := onednn_lack(dtype)) is not None:
             raise RuntimeError(f'{lack}: optimize(model, "fastest") takes what runs here')
         model, dtype = _quantized(model, calibration), torch.float32
     elif calibration is not None or quantized_layers(model):
         raise ValueError(f"a quantized model and a calibration are for torch.int8, got {dtype}")
-    if (lack := onednn.missing(dtype)) is not None:
+    if (lack := onednn_lack(dtype)) is not None:
         warnings.warn(f"optimize goes on with torch's own products: {lack}", stacklevel=2)
     optimized = copy.deepcopy(model).eval().requires_grad_(False)
-    kind: type[_Optimized] = _OptimizedEncoder
-    if isinstance(optimized, Unet):
-        _pack_dense(optimized, dtype)
-        kind = _OptimizedDense
-    elif isinstance(optimized, FeatureMaps):
-        _pack_encoder(optimized.encoder, dtype)
-        _become(optimized.encoder, _OptimizedEncoder)
-        kind = _Optimized
-    elif isinstance(optimized, Encoder):
-        _pack_encoder(optimized, dtype)
-    if lens is None:
-        _become(optimized, kind)
-    else:
-        _become(optimized, FixedLens, kind, fixed_lens=lens, _prepared={})
+    for module in list(optimized.modules()):
+        _pack(module, dtype)
+    optimized.prepare = _with_tables(optimized, lens)  # type: ignore[assignment]
+    for module in optimized.modules():
+        if isinstance(module, Model):
+            _restrict(module)
     return optimized
-
-
-def _without_8_bits(model: Net) -> Net:
-    if not quantized_layers(model):
-        return model
-    model = copy.deepcopy(model)
-    without_quantized_layers(model)
-    return model
 
 
 def _quantized(model: Net, calibration: Iterable[Sequence] | None) -> Net:
@@ -113,7 +112,7 @@ def _quantized(model: Net, calibration: Iterable[Sequence] | None) -> Net:
 def _check(model: nn.Module, dtype: torch.dtype | str, lens: Lens | None) -> None:
     if not isinstance(model, (Encoder, Unet, FeatureMaps)):
         raise TypeError(f"model must be one of create_model, got {type(model).__name__}")
-    if isinstance(model, _Optimized):
+    if any(isinstance(vars(block).get("norm1"), PackedNorm) for block in model.modules()):
         raise TypeError("model must be one of create_model, got one that is optimized already")
     if lens is not None and (not isinstance(lens, Lens) or len(lens) != 1):
         raise ValueError(f"lens must be one lens, got {lens!r}")
@@ -128,110 +127,134 @@ def _check(model: nn.Module, dtype: torch.dtype | str, lens: Lens | None) -> Non
         )
 
 
-def _become(model: Model, *bases: type, **attributes: Any) -> None:
-    """Gives a model the class that it has, behind `bases`."""
-    name = f"Optimized{type(model).__name__}"
-    model.__class__ = type(name, (*bases, type(model)), attributes)
+class InDtype(nn.Module):
+    """A module as it is, in bfloat16 under autocast, and its result in `dtype`."""
+
+    def __init__(self, module: nn.Module, dtype: torch.dtype):
+        super().__init__()
+        self.module, self.dtype = module, dtype
+        self.sample = getattr(module, "sample", None)
+
+    def forward(self, *arguments, **options) -> Tensor:
+        with torch.autocast("cpu", torch.bfloat16, enabled=self.dtype == torch.bfloat16):
+            result = self.module(*arguments, **options).to(self.dtype)
+        if torch.is_grad_enabled() and result.requires_grad:
+            raise RuntimeError(
+                "an optimized model has no gradients, but its images or its lens require one: call "
+                "it under torch.no_grad(), or use the model it was made of"
+            )
+        return result
 
 
-def _pack_encoder(encoder: Encoder, dtype: torch.dtype) -> None:
-    encoder.patch_embed = InDtype(encoder.patch_embed, dtype)
-    encoder.stages = _stages(encoder.stages, dtype)
-    encoder.norm.to(dtype)
-    encoder.head.to(dtype)
+def _pack(module: nn.Module, dtype: torch.dtype) -> None:
+    """Replaces the linear layers and the norms of a module, and what is computed in its dtype."""
+    if isinstance(module, Encoder):
+        module.patch_embed = InDtype(module.patch_embed, dtype)
+        module.norm.to(dtype)
+        module.head.to(dtype)
+    elif isinstance(module, Stage):
+        blocks: list[Any] = list(module.blocks)
+        fc1 = blocks[0].mlp.fc1
+        module.add = Tensor.add_
+        module.most_numbers = CACHED_BYTES // dtype.itemsize * fc1.in_features // fc1.out_features
+        if not isinstance(module.downsample, (PatchMerging, nn.Identity)):
+            module.downsample = InDtype(module.downsample, dtype)
+        attentions = [block.attn for block in blocks]
+        biases = [a.position_bias for a in attentions if isinstance(a, WindowAttention)]
+        relative = [bias for bias in biases if isinstance(bias, RelativeBias)]
+        if relative:
+            joined = joined_coefficients(relative)
+            module.coefficients = {name: rows.float() for name, rows in joined.items()}
+    elif isinstance(module, PatchMerging):
+        reduction = packed(module.reduction, dtype)
+        _replace(module, reduction=reduction, norm=PackedNorm(module.norm, taken(reduction)))
+    elif isinstance(module, Block):
+        _pack_block(module, dtype)
+    elif isinstance(module, (PatchExpand, SkipJoin, PixelHead)):
+        for name, layer in list(module.named_children()):
+            if isinstance(layer, nn.LayerNorm):
+                layer.to(dtype)
+            elif isinstance(layer, (nn.Linear, QuantizedLinear)):
+                _replace(module, **{name: PackedLinear(layer, dtype)})
 
 
-def _pack_dense(model: Unet, dtype: torch.dtype) -> None:
-    _pack_encoder(model.encoder, dtype)
-    _become(model.encoder, _OptimizedEncoder)
-    decoder, head = model.decoder, model.head
-    pack(decoder.joins, dtype)
-    pack(decoder.expand, dtype)
-    decoder.stages = _stages(decoder.stages, dtype)
-    head.set_submodule("proj", PackedLinear(head.proj, dtype))
+def _pack_block(block: Block, dtype: torch.dtype) -> None:
+    attn, mlp = block.attn, block.mlp
+    quantization = None
+    if isinstance(attn, WindowAttention):
+        qkv, proj = packed(attn.qkv, dtype), packed(attn.proj, dtype)
+        quantization = taken(qkv)
+        _replace(attn, qkv=qkv, proj=proj, attend=packed_attention(attn, taken(proj)))
+    else:
+        block.attn = InDtype(attn, dtype)
+    fc1: PackedLinear | PackedQuantizedLinear
+    fc2 = packed(mlp.fc2, dtype)
+    if isinstance(mlp.fc1, QuantizedLinear) != isinstance(fc2, PackedQuantizedLinear):
+        raise ValueError("both products of an MLP must be quantized, or none")
+    if isinstance(mlp.fc1, QuantizedLinear):
+        fc1 = PackedQuantizedLinear(mlp.fc1, gelu=taken(fc2))
+    else:
+        fc1 = PackedLinear(mlp.fc1, dtype, gelu=True)
+    _replace(mlp, fc1=fc1, fc2=fc2, activation=None)
+    norm1, norm2 = PackedNorm(block.norm1, quantization), PackedNorm(block.norm2, taken(fc1))
+    _replace(block, norm1=norm1, norm2=norm2)
 
 
-def _stages(stages: nn.ModuleList, dtype: torch.dtype) -> nn.ModuleList:
-    return nn.ModuleList(
-        OptimizedStage(stage, dtype) for stage in stages if isinstance(stage, Stage)
-    )
+def _replace(module: nn.Module, **layers: Any) -> None:
+    """Puts plain functions in place of submodules and functions."""
+    for name, layer in layers.items():
+        delattr(module, name)
+        setattr(module, name, layer)
 
 
-def _tables(
-    stages: nn.ModuleList, positions: Sequence[Sequence[Tensor | None]]
-) -> list[Sequence[Tensor | None]]:
-    """The position biases of each stage's blocks."""
-    optimized = [stage for stage in stages if isinstance(stage, OptimizedStage)]
-    return [s.tables(*p) for s, p in zip(optimized, positions, strict=True)]
+def _with_tables(model: Model, fixed_lens: Lens | None) -> Callable[[Lens | None, Pair], Any]:
+    """`model.prepare`, but with tables in place of what they are computed from.
 
+    With a fixed lens it is called without one, and computes once for each size of the images.
+    """
+    prepare, known = model.prepare, dict[Pair, Any]()
 
-class _Optimized(Model):
-    """What an optimized model refuses."""
-
-    def train(self, mode: bool = True) -> Self:
-        if mode:
-            raise TypeError("an optimized model is not trained: train the model it was made of")
-        return super().train(mode)
-
-    def prune_intermediate_layers(self, *args, **kwargs):
-        raise TypeError(
-            "an optimized model is not pruned: prune it first, and optimize what is left"
-        )
-
-    def state_dict(self, *args, **kwargs):
-        raise TypeError("an optimized model is not saved: save the model it was made of")
-
-    def __reduce_ex__(self, protocol):
-        raise TypeError(
-            "an optimized model is neither copied nor pickled, since oneDNN's weights cannot be: "
-            "copy the model it was made of, and optimize that"
-        )
-
-
-class _OptimizedEncoder(_Optimized, Encoder):
-    """How an optimized encoder differs from the one it was made of."""
-
-    def prepare(self, lens: Lens | None, size: Pair) -> Prepared:
-        """As the model it was made of, but `positions` are the tables of each stage's blocks."""
-        return self.with_tables(self.prepare_angles(lens, size))
-
-    def prepare_angles(self, lens: Lens | None, size: Pair) -> Prepared:
-        """As the model it was made of."""
-        return super().prepare(lens, size)
-
-    def with_tables(self, prepared: Prepared) -> Prepared:
-        """Tables in place of what they are computed from."""
-        return prepared._replace(positions=_tables(self.stages, prepared.positions))
-
-
-class _OptimizedDense(_Optimized, Unet):
-    """How an optimized dense model differs from the one it was made of."""
-
-    encoder: _OptimizedEncoder  # type: ignore[assignment]  # of a class that is made of both
-
-    def prepare(self, lens: Lens | None, size: Pair) -> UnetPrepared:
-        """As the model it was made of, but `positions` are the tables of each stage's blocks."""
-        angles = self.encoder.prepare_angles(lens, size)
-        tables = _tables(self.decoder.stages, angles.positions[:-1])
-        way = self.view.prepare(lens, size)
-        return UnetPrepared(self.encoder.with_tables(angles), tables, way)
-
-
-class FixedLens(_Optimized):
-    """An optimized model and the single lens of all its images, which it is called without."""
-
-    fixed_lens: Lens
-    _prepared: dict[Pair, Any]  # by image size
-
-    def prepare(self, lens: Lens | None, size: Pair) -> Any:
-        """What the fixed lens decides about images of (H, W), computed once for each size.
-
-        Raises:
-            ValueError: a lens, or images of another size than the fixed lens's.
-        """
+    def with_tables(lens: Lens | None, size: Pair) -> Any:
+        if fixed_lens is None:
+            return _tables(model, prepare(lens, size))
         if lens is not None:
             raise ValueError("this model is optimized for a fixed lens: call it without one")
-        prepared = self._prepared.get(size)
-        if prepared is None:
-            prepared = self._prepared[size] = super().prepare(self.fixed_lens, size)
-        return prepared
+        if size not in known:
+            known[size] = _tables(model, prepare(fixed_lens, size))
+        return known[size]
+
+    return with_tables
+
+
+def _tables(model: Any, prepared: Any) -> Any:
+    if isinstance(model, FeatureMaps):
+        return _tables(model.encoder, prepared)
+    if isinstance(model, Unet):
+        prepared = prepared._replace(encoder=_tables(model.encoder, prepared.encoder))
+        model = model.decoder
+    found = []
+    for stage, positions in zip(model.stages, prepared.positions, strict=True):
+        tables = stage.tables(*positions)
+        found.append((Tables(None if t is None else t.contiguous() for t in tables),))
+    return prepared._replace(positions=found)
+
+
+def _restrict(model: Model) -> None:
+    """Makes a model refuse what its packed weights cannot do."""
+
+    def refuse(message: str) -> Callable:
+        def raise_error(*_arguments, **_options):
+            raise TypeError(f"an optimized model is {message}")
+
+        return raise_error
+
+    not_trained = refuse("not trained: train the model it was made of")
+    model.__dict__.update(
+        train=lambda mode=True: not_trained() if mode else model,
+        state_dict=refuse("not saved: save the model it was made of"),
+        prune_intermediate_layers=refuse("not pruned: prune it first, and optimize what is left"),
+        __reduce_ex__=refuse(
+            "neither copied nor pickled, since oneDNN's weights cannot be: copy the model it was "
+            "made of, and optimize that"
+        ),
+    )

@@ -10,8 +10,6 @@ from typing import Generic, TypeVar
 import torch
 from torch import Tensor, nn
 
-from darswin.layers.attention import WindowAttention
-from darswin.layers.block import Block, PatchMerging
 from darswin.layers.quantized import (
     Quantization,
     dequantize,
@@ -19,6 +17,7 @@ from darswin.layers.quantized import (
     quantized_layers,
     with_quantized_layers,
 )
+from darswin.layers.transformer import Block, PatchMerging, WindowAttention
 from darswin.lens import Lens
 from darswin.models.base import Model
 

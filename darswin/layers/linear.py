@@ -1,21 +1,82 @@
 """A linear layer whose three products, the gradients' included, may be oneDNN's or torch's BLAS.
 
-In float32 torch asks its BLAS, which is MKL in the wheels for x86-64 and slow on AMD's CPUs.
+In float32 torch asks its BLAS, which is MKL in the wheels for x86-64 and half as fast as oneDNN on
+AMD's CPUs. oneDNN's products are those that torch's own library carries.
 """
 
 import time
-from collections.abc import Callable
-from typing import Literal, NamedTuple, get_args
+from collections.abc import Callable, Mapping
+from functools import cache, partial
+from typing import Any, Literal, NamedTuple, TypeVar, get_args
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
-from darswin.layers import onednn
+from darswin.ops._inference import transpose_sum
 
+__all__ = ["Linear", "autotune_results"]
+
+Key = TypeVar("Key")
 MatmulBackend = Literal["torch", "onednn", "autotune"]
 MATMUL_BACKENDS = get_args(MatmulBackend)
+
+
+def onednn_lack(dtype: torch.dtype) -> str | None:
+    """The reason why this torch has no products of oneDNN in `dtype` here; None where it has."""
+    if dtype not in (torch.float32, torch.bfloat16, torch.int8):
+        return f"oneDNN has no products in {dtype}"
+    if not torch.backends.mkldnn.is_available():
+        return f"torch {torch.__version__} is built without oneDNN"
+    if not torch.backends.mkldnn.enabled:
+        return "torch.backends.mkldnn.enabled is False"
+    if not hasattr(torch.ops.mkldnn, "_linear_pointwise"):
+        return f"torch {torch.__version__} has no linear operator of oneDNN"
+    if dtype == torch.bfloat16 and not torch.ops.mkldnn._is_mkldnn_bf16_supported():
+        return "oneDNN has no bfloat16 products on this CPU"
+    if dtype == torch.int8:
+        if not hasattr(torch.ops.onednn, "qlinear_pointwise"):
+            return f"torch {torch.__version__} has no int8 products of oneDNN"
+        if not _has_int8():
+            return "this CPU has no VNNI, the instructions of int8 products"
+        if not _int8_is_exact():
+            return "oneDNN's int8 products overflow: ONEDNN_MAX_CPU_ISA keeps it from using VNNI"
+    return None
+
+
+def _has_int8() -> bool:
+    # Such a CPU adds up products of 8 bits in 32 bits: others overflow in 16.
+    if torch.cpu._is_vnni_supported():
+        return True
+    capabilities: Any = getattr(torch.cpu, "get_capabilities", dict)  # missing in older torch
+    return any(capabilities().get(name) for name in ("avx_vnni", "amx_int8"))
+
+
+@cache
+def _int8_is_exact() -> bool:
+    """Computes the largest product that there is. Without VNNI it comes out wrong."""
+    size, largest = 64, 127
+    weight = torch.full((size, size), largest, dtype=torch.int8)
+    packed = torch.ops.onednn.qlinear_prepack(weight, None)
+    scales, zero_points = torch.ones(size), torch.zeros(size, dtype=torch.int64)
+    q = torch.full((size, size), 255, dtype=torch.uint8)
+    found = torch.ops.onednn.qlinear_pointwise.default(
+        q, 1.0, 0, packed, scales, zero_points, None, 1.0, 0, torch.float32, "none", [], "none"
+    )
+    return bool((found == size * largest * 255).all())
+
+
+def _onednn_product(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
+    return torch.ops.mkldnn._linear_pointwise.default(x, weight, bias, "none", [], "")
+
+
+def _onednn_parameter_gradients(
+    g: Tensor, x: Tensor, with_bias: bool
+) -> tuple[Tensor, Tensor | None]:
+    # oneDNN's product wants one of the two transposed in memory; torch's own copy is a slow one.
+    transposed, grad_bias = transpose_sum(g.contiguous())
+    return _onednn_product(transposed, x.t()), grad_bias if with_bias else None
 
 
 def _parameter_gradients(g: Tensor, x: Tensor, with_bias: bool) -> tuple[Tensor, Tensor | None]:
@@ -23,19 +84,19 @@ def _parameter_gradients(g: Tensor, x: Tensor, with_bias: bool) -> tuple[Tensor,
 
 
 # Of rows x (M, D), a weight w (D', D) and the gradient g (M, D') of the result.
-_WAYS: dict[str, dict[str, Callable]] = {
-    "forward": {"torch": F.linear, "onednn": onednn.product},
+_PRODUCTS: dict[str, dict[str, Callable]] = {
+    "forward": {"torch": F.linear, "onednn": _onednn_product},
     "input gradient": {
         "torch": lambda g, w: g @ w,
-        "onednn": lambda g, w: onednn.product(g, w.t()),
+        "onednn": lambda g, w: _onednn_product(g, w.t()),
     },
     # The bias's gradient comes along.
-    "weight gradient": {"torch": _parameter_gradients, "onednn": onednn.parameter_gradients},
+    "weight gradient": {"torch": _parameter_gradients, "onednn": _onednn_parameter_gradients},
 }
 
 
 class Shape(NamedTuple):
-    """What a measurement is of."""
+    """A product that is measured."""
 
     product: str  # "forward", "input gradient" or "weight gradient"
     rows: int  # of the input, rounded up to a power of two
@@ -48,7 +109,7 @@ _measured: dict[Shape, dict[str, float]] = {}
 
 
 def autotune_results() -> dict[Shape, dict[str, float]]:
-    """What was measured so far: for each shape the seconds of each way, the one taken first."""
+    """The seconds of each library for each shape measured so far, the one taken first."""
     return {
         shape: dict(sorted(seconds.items(), key=lambda item: item[1]))
         for shape, seconds in _measured.items()
@@ -72,7 +133,7 @@ class Linear(nn.Linear):
 
     def forward(self, x: Tensor) -> Tensor:
         """(..., D) → (..., D')."""
-        if self.matmul_backend == "torch" or not _concerned(x, self.weight):
+        if self.matmul_backend == "torch" or not _is_concerned(x, self.weight):
             return super().forward(x)
         return _Product.apply(x, self.weight, self.bias, self.matmul_backend)
 
@@ -80,14 +141,14 @@ class Linear(nn.Linear):
         return f"{super().extra_repr()}, matmul_backend={self.matmul_backend!r}"
 
 
-def _concerned(x: Tensor, weight: Tensor) -> bool:
+def _is_concerned(x: Tensor, weight: Tensor) -> bool:
     return (
         not torch.compiler.is_compiling()
         and x.dtype == weight.dtype == torch.float32
         and x.device.type == weight.device.type == "cpu"
         and x.numel() > 0
         and not torch.is_autocast_enabled("cpu")
-        and onednn.missing(torch.float32) is None
+        and onednn_lack(torch.float32) is None
     )
 
 
@@ -121,26 +182,28 @@ class _Product(torch.autograd.Function):
 
 
 def _multiply(product: str, matmul_backend: MatmulBackend, weight: Tensor, rows: Tensor, *others):
-    """The product of a layer with `weight`, of (M, ...) rows and others, in the way to take."""
-    ways = _WAYS[product]
+    """The product of a layer with `weight`, of (M, ...) rows and others, by the library to take."""
+    libraries = _PRODUCTS[product]
     if matmul_backend == "onednn":
-        return ways["onednn"](rows, *others)
+        return libraries["onednn"](rows, *others)
     height = 1 << (rows.shape[0] - 1).bit_length()
     out_features, in_features = weight.shape
     shape = Shape(product, height, in_features, out_features, torch.get_num_threads())
     if shape not in _measured:
-        _measured[shape] = _measure(ways, (rows, *others))
+        _measured[shape] = best_seconds(
+            {name: partial(library, rows, *others) for name, library in libraries.items()}, turns=5
+        )
     seconds = _measured[shape]
-    return ways[min(seconds, key=seconds.__getitem__)](rows, *others)
+    return libraries[min(seconds, key=seconds.__getitem__)](rows, *others)
 
 
-def _measure(ways: dict[str, Callable], arguments: tuple) -> dict[str, float]:
-    """Seconds of each way: the best of a few, taken in turns."""
-    seconds = dict.fromkeys(ways, float("inf"))
-    for turn in range(5):
-        for name, way in ways.items():
+def best_seconds(runs: Mapping[Key, Callable[[], object]], turns: int) -> dict[Key, float]:
+    """The seconds of each run: the best of some, taken in turns."""
+    seconds = dict.fromkeys(runs, float("inf"))
+    for turn in range(turns):
+        for name, run in runs.items():
             start = time.perf_counter()
-            way(*arguments)
+            run()
             if turn:  # the first one makes what oneDNN keeps for the shape
                 seconds[name] = min(seconds[name], time.perf_counter() - start)
     return seconds

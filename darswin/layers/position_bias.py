@@ -19,12 +19,12 @@ class RelativeBias(nn.Module):
     """B_θ + B_φ: a bias table from the angles between tokens. Subclasses say what one axis gives.
 
     Args:
-        window: (M_r, M_φ). sectors: A of the map. heads: attention heads.
+        window: (M_r, M_φ). heads: attention heads. sectors: A of the map.
         rows: of coefficients for each head: a_θ, b_θ, a_φ and b_φ.
     """
 
     def __init__(
-        self, window: tuple[int, int], sectors: int, heads: int, rows: tuple[int, int, int, int]
+        self, window: tuple[int, int], heads: int, sectors: int, rows: tuple[int, int, int, int]
     ):
         super().__init__()
         self.window, self.turn, self.heads = window, 2 * math.pi / sectors, heads
@@ -43,11 +43,12 @@ class RelativeBias(nn.Module):
         Returns:
             (N, heads, 2·M_r-1, 2·M_φ-1), the `bias` of `window_attention`.
         """
-        return self._table(ring_angles, *(getattr(self, name) for name in COEFFICIENTS))
+        return self.table(ring_angles, **joined_coefficients([self]))
 
-    def _table(
+    def table(
         self, ring_angles: Tensor, a_theta: Tensor, b_theta: Tensor, a_phi: Tensor, b_phi: Tensor
     ) -> Tensor:
+        """As `forward`, of these coefficients: each is (rows, heads)."""
         outward = ring_angles[:, : self.window[0]].to(a_theta)
         theta = torch.cat((-outward[:, 1:].flip(1), outward), 1)
         reach = self.window[1]
@@ -57,23 +58,10 @@ class RelativeBias(nn.Module):
         along_phi = self._axis(phi[None], a_phi, b_phi).transpose(1, 2)
         return along_r[..., None] + along_phi[..., None, :]
 
-    def kind(self) -> tuple:
-        """What biases have in common that can be computed at once: all but their heads."""
-        rows = [len(getattr(self, name)) for name in COEFFICIENTS]
-        return (type(self).__name__, self.window, self.turn, *rows)
-
 
 def joined_coefficients(biases: Sequence[RelativeBias]) -> dict[str, Tensor]:
-    """The coefficients of biases of one `kind`, as of a single one that has all heads."""
+    """The coefficients of biases that differ in their heads only, as of one that has all heads."""
     return {name: torch.cat([getattr(bias, name) for bias in biases], 1) for name in COEFFICIENTS}
-
-
-def joined_tables(biases: Sequence[RelativeBias], ring_angles: Tensor) -> Sequence[Tensor]:
-    """What biases of one `kind` give, computed at once: many steps, each of a few numbers."""
-    if len(biases) == 1:
-        return [biases[0](ring_angles)]
-    table = biases[0]._table(ring_angles, **joined_coefficients(biases))
-    return table.split([bias.heads for bias in biases], 1)
 
 
 class AngularRelativeBias(RelativeBias):
@@ -91,7 +79,7 @@ class AngularRelativeBias(RelativeBias):
 
     def __init__(self, window: tuple[int, int], heads: int, sectors: int, periodic: bool = False):
         theta, phi = 2 * window[0] - 1, window[1] if periodic else 2 * window[1] - 1
-        super().__init__(window, sectors, heads, (theta, theta, phi, phi))
+        super().__init__(window, heads, sectors, (theta, theta, phi, phi))
 
     def _axis(self, angle: Tensor, a: Tensor, b: Tensor) -> Tensor:
         reach, angle = angle.shape[1] // 2, angle[..., None]
@@ -113,7 +101,7 @@ class FourierBias(RelativeBias):
     """
 
     def __init__(self, window: tuple[int, int], heads: int, sectors: int, harmonics: int = 16):
-        super().__init__(window, sectors, heads, (harmonics, harmonics + 1) * 2)
+        super().__init__(window, heads, sectors, (harmonics, harmonics + 1) * 2)
 
     def _axis(self, angle: Tensor, a: Tensor, b: Tensor) -> Tensor:
         harmonics = a.shape[0]

@@ -6,10 +6,9 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from darswin.layers.attention import WindowAttention
-from darswin.layers.block import Block, Mlp
 from darswin.layers.linear import MATMUL_BACKENDS, Linear, MatmulBackend
 from darswin.layers.polar import check_images
+from darswin.layers.transformer import Block
 from darswin.lens import Lens
 from darswin.models.stages import Pair, StagePlan
 from darswin.ops.reference import normalized
@@ -158,7 +157,7 @@ class Model(nn.Module):
         of the work, are recomputed in backward. The gradients are the same, bit for bit.
         """
         for module in self.modules():
-            if isinstance(module, (Block, Mlp, WindowAttention)):
+            if isinstance(module, Block):
                 module.grad_checkpointing = enable
 
 

@@ -5,10 +5,10 @@ from typing import Any, Literal
 
 from torch import Tensor, nn
 
-from darswin.layers.attention import PolarWindowAttention
 from darswin.layers.embed import PolarPatchEmbed
 from darswin.layers.polar import Placement, PolarGrid, PolarGridSpec, check_count, check_lens
 from darswin.layers.position_bias import PositionBias, ring_angles
+from darswin.layers.transformer import PolarWindowAttention
 from darswin.lens import Lens
 from darswin.lens.spacing import Spacing
 from darswin.models.encoder import Encoder, Prepared

@@ -6,9 +6,9 @@ from typing import Any, Literal, NamedTuple
 
 from torch import Tensor, nn
 
-from darswin.layers.block import PatchMerging
 from darswin.layers.linear import Linear
 from darswin.layers.polar import PolarGrid
+from darswin.layers.transformer import PatchMerging
 from darswin.lens import Lens
 from darswin.models.base import FeatureInfo, Model, feature_info, init_weights, take_indices
 from darswin.models.stages import Pair, StagePlan, make_stages

@@ -1,14 +1,12 @@
-"""Stages: their sizes, and the merging and blocks that they are made of."""
+"""The sizes of the stages, and their blocks."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from torch import Tensor, nn
+from torch import nn
 
-from darswin.layers.attention import WindowAttention
-from darswin.layers.block import Block
-from darswin.layers.position_bias import RelativeBias, joined_tables
+from darswin.layers.transformer import Block, Stage
 from darswin.ops.checks import check_pair
 
 Pair = tuple[int, int]
@@ -99,35 +97,6 @@ def _shift(size: Pair, window: Pair, variant: str) -> Pair:
     if variant == "RA":
         return along_r, along_phi
     return (0, window[1] // 4) if size[1] > window[1] else (along_r, 0)
-
-
-class Stage(nn.Module):
-    """Merging, then blocks."""
-
-    def __init__(self, downsample: nn.Module, blocks: Iterable[nn.Module]):
-        super().__init__()
-        self.downsample = downsample
-        self.blocks = nn.ModuleList(blocks)
-
-    def forward(self, x: Tensor, *positions: Tensor) -> Tensor:
-        """The map of the stage before → this stage's map. `positions` are the attention's."""
-        x = self.downsample(x)
-        biases = self._biases()
-        if not biases:
-            for block in self.blocks:
-                x = block(x, *positions)
-            return x
-        for block, table in zip(self.blocks, joined_tables(biases, *positions), strict=True):
-            x = block(x, table=table)
-        return x
-
-    def _biases(self) -> list[RelativeBias]:
-        """The position biases of the blocks, where they can be computed at once; else none."""
-        attentions = [block.attn for block in self.blocks if isinstance(block, Block)]
-        biases = [attn.position_bias for attn in attentions if isinstance(attn, WindowAttention)]
-        relative = [bias for bias in biases if isinstance(bias, RelativeBias)]
-        kinds = [bias.kind() for bias in relative]
-        return relative if kinds == kinds[:1] * len(self.blocks) else []
 
 
 def make_stages(

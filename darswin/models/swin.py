@@ -4,8 +4,8 @@ from typing import Any
 
 from torch import Tensor, nn
 
-from darswin.layers.attention import WindowAttention
 from darswin.layers.embed import PatchProjection
+from darswin.layers.transformer import WindowAttention
 from darswin.lens import Lens
 from darswin.models.encoder import Encoder, Prepared
 from darswin.models.registry import Presets, register_model

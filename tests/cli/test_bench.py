@@ -15,10 +15,10 @@ from darswin.bench.timing import (
 )
 from darswin.cli import bench as command
 from darswin.cli.main import main
-from darswin.layers import onednn
+from darswin.layers.linear import onednn_lack
 from darswin.models import DarSwin
 
-INT8 = ["int8"] if onednn.missing(torch.int8) is None else []
+INT8 = ["int8"] if onednn_lack(torch.int8) is None else []
 
 
 def test_it_measures_and_writes(tmp_path, capsys, monkeypatch):
@@ -45,7 +45,7 @@ def test_it_measures_and_writes(tmp_path, capsys, monkeypatch):
     for t in record.timings:
         names.setdefault(t.mode, set()).add(t.name)
     others = {OURS_FLOAT32}
-    if onednn.missing(torch.bfloat16) is None:
+    if onednn_lack(torch.bfloat16) is None:
         others.add(OURS_BFLOAT16)
     for mode, found in names.items():
         expected = {OURS, REFERENCE, MATMULS}

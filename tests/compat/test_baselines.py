@@ -6,7 +6,7 @@ from helpers import FIXTURES
 from safetensors.torch import load_file, save_file
 
 from darswin.compat import load_dat, load_timm_swin
-from darswin.layers.attention import WindowAttention
+from darswin.layers.transformer import WindowAttention
 from darswin.models.dat import DeformableAttention
 
 BASELINES = {"timm_swin": load_timm_swin, "dat_v1": load_dat}

@@ -7,7 +7,7 @@ import torch
 
 from darswin import create_model, optimize
 from darswin.deploy import stages
-from darswin.layers import onednn
+from darswin.layers.linear import onednn_lack
 from darswin.layers.position_bias import RelativeBias
 from darswin.lens import KannalaBrandt, Spherical
 from darswin.ops import use_reference
@@ -180,11 +180,11 @@ def test_what_cannot_be_optimized():
 
 
 def test_missing_says_why(monkeypatch):
-    assert "float64" in onednn.missing(torch.float64)
+    assert "float64" in onednn_lack(torch.float64)
     with torch.backends.mkldnn.flags(enabled=False):
-        assert "enabled is False" in onednn.missing(torch.float32)
+        assert "enabled is False" in onednn_lack(torch.float32)
     monkeypatch.setattr(torch.ops.mkldnn, "_is_mkldnn_bf16_supported", lambda: False)
-    assert "this CPU" in onednn.missing(torch.bfloat16)
+    assert "this CPU" in onednn_lack(torch.bfloat16)
 
 
 def test_a_fixed_lens_refuses_images_of_another_size_than_its_own():

@@ -10,10 +10,10 @@ import torch
 from torch import nn
 
 from darswin import create_model, optimize
+from darswin.deploy import packed
 from darswin.deploy import quantize as module
 from darswin.deploy.quantize import quantize_model, sensitivities
-from darswin.layers import onednn, packed
-from darswin.layers.linear import Linear
+from darswin.layers.linear import Linear, onednn_lack
 from darswin.layers.quantized import (
     Quantization,
     QuantizedLinear,
@@ -25,7 +25,7 @@ from darswin.layers.quantized import (
 from darswin.lens import Spherical
 from darswin.models import ModelCard, load_model, save_model
 
-HAS_INT8 = onednn.missing(torch.int8) is None
+HAS_INT8 = onednn_lack(torch.int8) is None
 needs_int8 = pytest.mark.skipif(not HAS_INT8, reason="this CPU has no products of 8 bits")
 MODELS = ["darswin_a_nano", "darswin_ra_nano", "swin_nano", "swin_undis_nano", "dat_nano"]
 
@@ -232,7 +232,7 @@ def test_fastest(monkeypatch):
     quantized = quantize_model(model, [seen])
     for dtype in (torch.float32, torch.bfloat16):
         monkeypatch.setattr("darswin.deploy.optimize.fastest_dtype", lambda dtype=dtype: dtype)
-        if onednn.missing(dtype) is None:
+        if onednn_lack(dtype) is None:
             assert torch.equal(optimize(model, "fastest")(*seen), optimize(model, dtype)(*seen))
     monkeypatch.setattr("darswin.deploy.optimize.fastest_dtype", lambda: torch.float32)
     if HAS_INT8:
@@ -310,9 +310,9 @@ def may_overflow(weight):
 
 WITHOUT_VNNI = """
 import torch
-from darswin.layers import onednn
+from darswin.layers.linear import onednn_lack
 from darswin.layers.quantized import Quantization, QuantizedLinear
-print(onednn.missing(torch.int8))
+print(onednn_lack(torch.int8))
 linear = torch.nn.Linear(64, 64)
 linear.weight.data.fill_(1.0)
 layer, x = QuantizedLinear.of(linear, Quantization(1 / 255, 0)), torch.ones(64, 64)

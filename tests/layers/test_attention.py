@@ -53,7 +53,7 @@ def test_autocast_makes_no_float32_map_of_the_window_attention_layer(monkeypatch
         taken.append((qkv.dtype, bias.dtype, out.dtype))
         return out
 
-    monkeypatch.setattr("darswin.layers.attention.window_attention", record)
+    monkeypatch.setattr("darswin.layers.transformer.window_attention", record)
     layer = PolarWindowAttention(8, 2, map_size=(2, 4), window=(2, 4))
     with torch.autocast("cpu", dtype=torch.bfloat16):
         out = layer(torch.randn(1, 2, 4, 8), torch.linspace(0, 1, 3)[None])

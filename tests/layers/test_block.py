@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from darswin.layers.block import DropPath, PatchMerging
+from darswin.layers.transformer import DropPath, PatchMerging
 
 
 def test_merging_joins_neighbours_radius_first():

@@ -1,11 +1,11 @@
 import pytest
 import torch
 import torch.nn.functional as F
+from darswin.layers.recompute import recomputed
 from torch import nn
 from torch.multiprocessing.reductions import StorageWeakRef
 
 from darswin import create_model
-from darswin.layers.recompute import recomputed
 from darswin.lens import Spherical
 
 LENSES = Spherical.from_fov([0.2, 0.9], 2.6, 16.0)

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from darswin.layers.block import PatchMerging
+from darswin.layers.transformer import PatchMerging
 from darswin.models.unet import PatchExpand, SkipJoin
 
 

@@ -1,0 +1,143 @@
+"""Layers for inference on the CPU: weights laid out as oneDNN's products read them, and operators
+that take along what stands between two products.
+
+They are no modules: these take a microsecond more for each call, and have weights to save or move.
+"""
+
+from collections.abc import Callable
+from functools import cache, partial
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from darswin.layers.linear import best_seconds, onednn_lack
+from darswin.layers.quantized import Quantization, QuantizedLinear
+from darswin.layers.transformer import WindowAttention
+
+__all__ = ["fastest_dtype"]
+
+_OPS = torch.ops.darswin
+_ADD_NORM = _OPS._add_norm_.default
+_ADD_NORM_QUANTIZED = _OPS._add_norm_quantized_.default
+_CPU = torch._C.DispatchKeySet(torch._C.DispatchKey.CPU)
+
+
+class PackedLinear:
+    """A linear layer in `dtype`, with GELU if asked; torch's own product where oneDNN lacks it."""
+
+    def __init__(self, linear: object, dtype: torch.dtype, *, gelu: bool = False):
+        if not isinstance(linear, nn.Linear):
+            raise ValueError(f"this layer must be a linear one, got {type(linear).__name__}")
+        self.in_features, self.out_features = linear.in_features, linear.out_features
+        self.packed, self.gelu = onednn_lack(dtype) is None, gelu
+        # Tensors that are no parameters: in this layout they can be neither moved nor saved.
+        weight, self.bias = (
+            None if t is None else t.detach().to(dtype, copy=True)
+            for t in (linear.weight, linear.bias)
+        )
+        self.weight = torch.ops.mkldnn._reorder_linear_weight(weight) if self.packed else weight
+        if self.packed:
+            self._product = torch.ops.mkldnn._linear_pointwise.default
+            self._after: tuple = ("gelu", [], "none") if gelu else ("none", [], "")
+
+    def __call__(self, x: Tensor) -> Tensor:
+        """(..., D) → (..., D')."""
+        if self.packed:
+            return self._product(x, self.weight, self.bias, *self._after)
+        x = F.linear(x, self.weight, self.bias)
+        return F.gelu(x) if self.gelu else x
+
+
+class PackedQuantizedLinear:
+    """A quantized layer as an integer product: (..., D), uint8 of `activation` → (..., D').
+
+    The result is float32, or its GELU as uint8 of the quantization `gelu`.
+    """
+
+    def __init__(self, layer: QuantizedLinear, gelu: Quantization | None = None):
+        self.in_features, self.out_features = layer.in_features, layer.out_features
+        self.activation = layer.activation
+        weight = torch.ops.onednn.qlinear_prepack(layer.weight.cpu(), None)
+        zero_points = torch.zeros(self.out_features, dtype=torch.int64)
+        scales = layer.weight_scale.detach().clone()
+        self._dtype = torch.float32 if gelu is None else torch.uint8
+        result: tuple = (1.0, 0, torch.float32, "none", [], "none")
+        if gelu is not None:
+            result = (*gelu, torch.uint8, "gelu", [], "none")
+        self._given = (*self.activation, weight, scales, zero_points, layer.bias, *result)
+        self._product = torch.ops.onednn.qlinear_pointwise.default
+
+    def __call__(self, q: Tensor) -> Tensor:
+        if not q.numel():  # oneDNN gives another shape
+            return q.new_empty((*q.shape[:-1], self.out_features), dtype=self._dtype)
+        return self._product(q, *self._given)
+
+
+Product = PackedLinear | PackedQuantizedLinear
+
+
+def packed(layer: object, dtype: torch.dtype) -> Product:
+    """A linear layer, or a quantized one, as oneDNN's product."""
+    if isinstance(layer, QuantizedLinear):
+        return PackedQuantizedLinear(layer)
+    return PackedLinear(layer, dtype)
+
+
+def taken(product: object) -> Quantization | None:
+    """How the input of a product becomes 8 bits; None where it does not."""
+    return product.activation if isinstance(product, PackedQuantizedLinear) else None
+
+
+class PackedNorm:
+    """`AddNorm` in one pass over memory. The norm is of 8 bits where a quantization is given."""
+
+    def __init__(self, norm: object, quantization: Quantization | None):
+        assert isinstance(norm, nn.LayerNorm)
+        self.shape, self.eps, self.quantization = norm.normalized_shape, norm.eps, quantization
+        self.weight, self.bias = (t.detach().float() for t in (norm.weight, norm.bias))
+
+    def __call__(self, x: Tensor, branch: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """As `AddNorm`. The sum takes the place of x, and the norm may take that of `branch`."""
+        x = x.contiguous()
+        # Not by way of autograd, which would look for gradients and count versions: there are none.
+        if self.quantization is not None:
+            given = (self.weight, self.bias, self.eps, *self.quantization)
+            return x, _ADD_NORM_QUANTIZED.redispatch(_CPU, x, branch, *given)
+        if branch is None:
+            return x, torch.layer_norm(x, self.shape, self.weight, self.bias, self.eps)
+        branch = branch.contiguous()
+        _ADD_NORM.redispatch(_CPU, x, branch, self.weight, self.bias, self.eps)
+        return x, branch
+
+
+def packed_attention(
+    attn: WindowAttention, quantization: Quantization | None
+) -> Callable[[Tensor, Tensor], Tensor]:
+    """`attn.attend` without the checks, as all is known to fit; 8 bits if quantized."""
+    head_dim = attn.dim // attn.num_heads
+    settings = (attn.window, attn.shift, attn.periodic, head_dim**-0.5)
+    if quantization is None:
+        return lambda qkv, bias: _OPS.window_attention.default(qkv, bias, *settings)
+    operator = _OPS._window_attention_quantized.default
+    return lambda qkv, bias: operator(qkv, bias, *settings, *quantization)
+
+
+@cache
+def fastest_dtype() -> torch.dtype:
+    """float32 or bfloat16: in which this CPU computes a usual product sooner.
+
+    Measured once a process, in a tenth of a second: bfloat16 wins by far where the CPU has
+    instructions for it, and loses where oneDNN has to do without them. 8 bits, which need a
+    calibration, are not asked.
+    """
+    dtypes = [d for d in (torch.float32, torch.bfloat16) if onednn_lack(d) is None]
+    if len(dtypes) < 2:
+        return torch.float32
+    x = torch.ones(512, 384)
+    linear = nn.utils.skip_init(nn.Linear, 384, 1536)  # which draws no random numbers
+    nn.init.ones_(linear.weight)
+    runs = {d: partial(PackedLinear(linear, d), x.to(d)) for d in dtypes}
+    with torch.inference_mode():
+        seconds = best_seconds(runs, turns=9)
+    return min(seconds, key=seconds.__getitem__)

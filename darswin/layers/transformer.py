@@ -1,0 +1,364 @@
+"""Transformer layers: attention in windows, the MLP, blocks, stages, and the merging of tokens.
+
+A polar map is (B, R, A, D) from the embedding to the head; the maps of Swin and DAT are
+(B, H, W, D), rows and columns.
+"""
+
+from collections.abc import Callable, Iterable, Sequence
+from functools import partial
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+from torch.utils.checkpoint import (
+    CheckpointPolicy,
+    checkpoint,
+    create_selective_checkpoint_contexts,
+)
+
+from darswin.layers.linear import Linear
+from darswin.layers.position_bias import (
+    AngularRelativeBias,
+    FourierBias,
+    PositionBias,
+    RelativeBias,
+    RelativeTable,
+    joined_coefficients,
+)
+from darswin.ops import window_attention
+from darswin.ops.checks import check_pair
+
+__all__ = ["PolarWindowAttention", "WindowAttention"]
+
+# A module, or what `darswin.optimize` puts in its place.
+Layer = Callable[[Tensor], Tensor]
+
+
+class WindowAttention(nn.Module):
+    """Multi-head attention in the windows of a map, as in Swin.
+
+    Args:
+        dim: D. num_heads: divides D. map_size: (R, A), or of a plain map (H, W).
+        window: (M_r, M_φ), which divides the map. shift: (s_r, s_φ).
+        periodic: whether the map wraps around along each axis.
+        position_bias: makes the bias from the window and the heads.
+
+    Raises:
+        ValueError: sizes that do not divide.
+
+    Source: Swin Transformer, ICCV 2021, sec. 3.2.
+    """
+
+    def __init__(
+        self,
+        dim: int,
+        num_heads: int,
+        *,
+        map_size: tuple[int, int],
+        window: tuple[int, int],
+        shift: tuple[int, int] = (0, 0),
+        periodic: tuple[bool, bool] = (False, False),
+        position_bias: Callable[[tuple[int, int], int], nn.Module] = RelativeTable,
+    ):
+        super().__init__()
+        check_heads(dim, num_heads)
+        self.dim, self.num_heads, self.periodic = dim, num_heads, periodic
+        self.map_size = check_pair("map_size", map_size, lowest=1)
+        self.window = check_pair("window", window, lowest=1)
+        self.shift = check_pair("shift", shift, lowest=0)
+        if map_size[0] % window[0] or map_size[1] % window[1]:
+            raise ValueError(f"window must divide the map (R, A) = {map_size}, got {window}")
+        self.qkv: Layer = Linear(dim, 3 * dim)
+        self.proj: Layer = Linear(dim, dim)
+        self.position_bias = position_bias(self.window, num_heads)
+        self.attend: Callable[[Tensor, Tensor], Tensor] = partial(
+            window_attention, window=self.window, shift=self.shift, periodic=periodic
+        )
+
+    def forward(self, x: Tensor, *positions: Tensor, table: Tensor | None = None) -> Tensor:
+        """(B, R, A, D) → the same shape.
+
+        Args:
+            positions: what the position bias is computed from. table: the bias itself, where the
+                stage has computed it.
+        """
+        batch, rings, sectors, dim = x.shape
+        if (rings, sectors) != self.map_size:
+            raise ValueError(f"the map must be (R, A) = {self.map_size}, got {(rings, sectors)}")
+        qkv = self.qkv(x).reshape(batch, rings, sectors, 3, self.num_heads, dim // self.num_heads)
+        bias = self.position_bias(*positions) if table is None else table
+        return self.proj(self.attend(qkv, bias))
+
+    def extra_repr(self) -> str:
+        return (
+            f"map_size={self.map_size}, window={self.window}, shift={self.shift}, "
+            f"periodic={self.periodic}"
+        )
+
+
+def check_heads(dim: int, num_heads: int) -> None:
+    """ValueError unless the heads divide the width."""
+    if dim % num_heads:
+        raise ValueError(f"num_heads must divide dim = {dim}, got {num_heads}")
+
+
+class PolarWindowAttention(WindowAttention):
+    """Multi-head attention in the windows of a polar map, with a bias that knows the angles.
+
+    It is called `layer(x, ring_angles)`: x (B, R, A, D), and (B or 1, R+1) of
+    `darswin.layers.position_bias.ring_angles`.
+
+    Args:
+        dim, num_heads, map_size, window, shift, periodic: as `WindowAttention`.
+        position_bias: "angular_relative", "angular" or "polar".
+        harmonics: of the last two. periodic_bias: see `AngularRelativeBias`; it acts where the
+            window spans the ring.
+
+    Raises:
+        ValueError: sizes that do not divide, or an unknown position bias.
+
+    Source: DarSwin, ICCV 2023, sec. 4.4 and 4.5.
+    """
+
+    def __init__(
+        self,
+        dim: int,
+        num_heads: int,
+        *,
+        map_size: tuple[int, int],
+        window: tuple[int, int],
+        shift: tuple[int, int] = (0, 0),
+        periodic: tuple[bool, bool] = (False, True),
+        position_bias: PositionBias = "angular_relative",
+        harmonics: int = 16,
+        periodic_bias: bool = False,
+    ):
+        sectors = map_size[1]
+        bias: Callable[[tuple[int, int], int], nn.Module]
+        if position_bias == "angular_relative":
+            whole = periodic_bias and window[1] == sectors
+            bias = partial(AngularRelativeBias, sectors=sectors, periodic=whole)
+        elif position_bias in ("angular", "polar"):
+            bias = partial(FourierBias, sectors=sectors, harmonics=harmonics)
+        else:
+            raise ValueError(
+                "position_bias must be 'angular_relative', 'angular' or 'polar', "
+                f"got {position_bias!r}"
+            )
+        super().__init__(
+            dim,
+            num_heads,
+            map_size=map_size,
+            window=window,
+            shift=shift,
+            periodic=periodic,
+            position_bias=bias,
+        )
+
+
+class DropPath(nn.Module):
+    """Stochastic depth: in training, drops a branch for whole images with probability p."""
+
+    def __init__(self, p: float = 0.0):
+        super().__init__()
+        if not 0 <= p < 1:
+            raise ValueError(f"drop path must be in [0, 1), got {p}")
+        self.p = p
+
+    def forward(self, x: Tensor) -> Tensor:
+        """x, any shape → the same with each image's branch kept, and scaled, or zero."""
+        if self.p == 0 or not self.training:
+            return x
+        keep = 1 - self.p
+        mask = torch.bernoulli(x.new_full((x.shape[0], *(1,) * (x.dim() - 1)), keep))
+        return x * (mask / keep)
+
+    def extra_repr(self) -> str:
+        return f"p={self.p}"
+
+
+class AddNorm(nn.LayerNorm):
+    """A residual and the layer norm behind it."""
+
+    def forward(self, x: Tensor, branch: Tensor | None = None) -> tuple[Tensor, Tensor]:  # type: ignore[override]
+        """The residual x and what is added to it, if anything → their sum, and its norm."""
+        x = x if branch is None else x + branch
+        return x, super().forward(x)
+
+
+class Mlp(nn.Module):
+    """Linear, GELU, Linear."""
+
+    def __init__(self, dim: int, hidden: int):
+        super().__init__()
+        self.fc1: Layer = Linear(dim, hidden)
+        self.activation: Layer | None = F.gelu  # None: `fc1` includes it
+        self.fc2: Layer = Linear(hidden, dim)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(..., D) → (..., D)."""
+        x = self.fc1(x)
+        return self.fc2(x if self.activation is None else self.activation(x))
+
+
+class Block(nn.Module):
+    """Pre-norm transformer block: attention, then an MLP, each behind a residual.
+
+    What the MLP gives is not added to the residual here: the norm of the next block does that.
+
+    Args:
+        dim: D. attn: maps (B, R, A, D), and the `table` of its position bias if the stage has made
+            it, to the same shape.
+        mlp_ratio: hidden width of the MLP over D. drop_path: probability.
+    """
+
+    grad_checkpointing = False  # see `Model.set_grad_checkpointing`
+
+    def __init__(
+        self, dim: int, attn: nn.Module, *, mlp_ratio: float = 4.0, drop_path: float = 0.0
+    ):
+        super().__init__()
+        self.norm1: Callable[..., tuple[Tensor, Tensor]] = AddNorm(dim)
+        self.attn = attn
+        self.norm2: Callable[..., tuple[Tensor, Tensor]] = AddNorm(dim)
+        self.mlp = Mlp(dim, int(dim * mlp_ratio))
+        self.drop_path = DropPath(drop_path)
+
+    def forward(
+        self, x: Tensor, branch: Tensor | None, table: Tensor | None
+    ) -> tuple[Tensor, Tensor]:
+        """The residual x (B, R, A, D), what the block before adds to it, and the position bias →
+        the same two for the next block."""
+        # Where a graph is compiled, the compiler decides what is kept.
+        if (
+            self.grad_checkpointing
+            and torch.is_grad_enabled()
+            and not torch.compiler.is_compiling()
+        ):
+            return checkpoint(
+                self._run,
+                x,
+                branch,
+                table,
+                use_reentrant=False,
+                preserve_rng_state=False,
+                context_fn=partial(create_selective_checkpoint_contexts, _policy),
+            )
+        return self._run(x, branch, table)
+
+    def _run(self, x: Tensor, branch: Tensor | None, table: Tensor | None) -> tuple[Tensor, Tensor]:
+        x, y = self.norm1(x, branch)
+        y = self.attn(y) if table is None else self.attn(y, table=table)
+        x, y = self.norm2(x, self.drop_path(y) if self.training else y)
+        y = self.mlp(y)
+        return x, self.drop_path(y) if self.training else y
+
+
+_ATEN = torch.ops.aten
+# Results that are kept for backward: of products of matrices, and what is random.
+_KEPT = {
+    _ATEN.addmm.default,
+    _ATEN.mm.default,
+    _ATEN.bmm.default,
+    _ATEN.linear.default,
+    _ATEN.convolution.default,
+    _ATEN.grid_sampler_2d.default,
+    _ATEN._scaled_dot_product_flash_attention_for_cpu.default,
+    _ATEN.bernoulli.default,
+}
+
+
+def _policy(context: object, operator: object, *args: object, **kwargs: object) -> CheckpointPolicy:
+    """Norms, GELUs and attention in windows, a few percent of the work, are computed again."""
+    kept = operator in _KEPT or "_linear_pointwise" in str(operator)
+    return CheckpointPolicy.MUST_SAVE if kept else CheckpointPolicy.PREFER_RECOMPUTE
+
+
+class PatchMerging(nn.Module):
+    """Joins m_r × m_φ neighbouring tokens into one of twice the width.
+
+    Args:
+        dim: D. merge: (m_r, m_φ): (1, 4) in DarSwin-A, (2, 2) in DarSwin-RA.
+
+    Source: DarSwin, ICCV 2023, sec. 4.4.
+    """
+
+    def __init__(self, dim: int, merge: tuple[int, int]):
+        super().__init__()
+        self.merge = tuple(merge)
+        joined = dim * merge[0] * merge[1]
+        self.norm: Callable[[Tensor], tuple[Tensor, Tensor]] = AddNorm(joined)
+        self.reduction: Layer = Linear(joined, 2 * dim, bias=False)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(B, R, A, D) → (B, R/m_r, A/m_φ, 2·D)."""
+        batch, rings, sectors, dim = x.shape
+        mr, ma = self.merge
+        if rings % mr or sectors % ma:
+            raise ValueError(f"merge {self.merge} must divide (R, A) = {(rings, sectors)}")
+        # Inner order (φ, r, D): neighbours along the radius come first.
+        x = x.reshape(batch, rings // mr, mr, sectors // ma, ma, dim).permute(0, 1, 3, 4, 2, 5)
+        _, x = self.norm(x.flatten(3))
+        return self.reduction(x)
+
+    def extra_repr(self) -> str:
+        return f"merge={self.merge}"
+
+
+class Tables(tuple[Tensor | None, ...]):
+    """The position biases of a stage's blocks, (B or 1, heads, 2·M_r-1, 2·M_φ-1); None where the
+    attention is not in windows."""
+
+
+class Stage(nn.Module):
+    """Merging, then blocks, whose position biases are all of one kind."""
+
+    # In an optimized model: the joined coefficients of the blocks' position biases, and the numbers
+    # that a map may have. More images are computed in parts. The blocks change a map in place.
+    coefficients: dict[str, Tensor] | None = None
+    most_numbers: int | None = None
+    add: Callable[[Tensor, Tensor], Tensor] = torch.add
+
+    def __init__(self, downsample: nn.Module, blocks: Iterable[Block]):
+        super().__init__()
+        self.downsample = downsample
+        self.blocks = nn.ModuleList(blocks)
+
+    def tables(self, *positions: Any) -> Tables:
+        """What `forward` computes from the positions first; it takes these tables instead, too."""
+        if positions and isinstance(positions[0], Tables):
+            return positions[0]
+        attentions = [block.attn for block in self.blocks]
+        biases = [a.position_bias if isinstance(a, WindowAttention) else None for a in attentions]
+        relative = [bias for bias in biases if isinstance(bias, RelativeBias)]
+        if relative:
+            # All at once: there are many steps, each of a few numbers.
+            coefficients = self.coefficients or joined_coefficients(relative)
+            table = relative[0].table(*positions, **coefficients)
+            return Tables(table.split([bias.heads for bias in relative], 1))
+        return Tables(None if bias is None else bias(*positions) for bias in biases)
+
+    def forward(self, x: Tensor, *positions: Any) -> Tensor:
+        """The map of the stage before → this stage's map."""
+        x, tables = self.downsample(x), self.tables(*positions)
+        most = x.numel() if self.most_numbers is None else self.most_numbers
+        if x.numel() <= most:
+            return self._run(x, tables)
+        count = min(-(-x.numel() // most), len(x))
+        x = x.contiguous()
+        parts = zip(x.tensor_split(count), *(_split(t, count) for t in tables), strict=True)
+        for part, *of_part in parts:
+            self._run(part, of_part)
+        return x
+
+    def _run(self, x: Tensor, tables: Iterable[Tensor | None]) -> Tensor:
+        branch = None
+        for block, table in zip(self.blocks, tables, strict=True):
+            x, branch = block(x, branch, table)
+        return x if branch is None else self.add(x, branch)
+
+
+def _split(table: Tensor | None, count: int) -> Sequence[Tensor | None]:
+    """The table of each part of the images: one for all of them is whole in each."""
+    return [table] * count if table is None or len(table) == 1 else table.tensor_split(count)
