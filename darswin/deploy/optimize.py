@@ -133,7 +133,6 @@ class InDtype(nn.Module):
     def __init__(self, module: nn.Module, dtype: torch.dtype):
         super().__init__()
         self.module, self.dtype = module, dtype
-        self.sample = getattr(module, "sample", None)
 
     def forward(self, *arguments, **options) -> Tensor:
         with torch.autocast("cpu", torch.bfloat16, enabled=self.dtype == torch.bfloat16):
@@ -156,7 +155,8 @@ def _pack(module: nn.Module, dtype: torch.dtype) -> None:
         blocks: list[Any] = list(module.blocks)
         fc1 = blocks[0].mlp.fc1
         module.add = Tensor.add_
-        module.most_numbers = CACHED_BYTES // dtype.itemsize * fc1.in_features // fc1.out_features
+        widest = fc1.out_features // fc1.in_features * dtype.itemsize
+        module.most_numbers = max(CACHED_BYTES // widest, 1)
         if not isinstance(module.downsample, (PatchMerging, nn.Identity)):
             module.downsample = InDtype(module.downsample, dtype)
         attentions = [block.attn for block in blocks]
@@ -167,7 +167,8 @@ def _pack(module: nn.Module, dtype: torch.dtype) -> None:
             module.coefficients = {name: rows.float() for name, rows in joined.items()}
     elif isinstance(module, PatchMerging):
         reduction = packed(module.reduction, dtype)
-        _replace(module, reduction=reduction, norm=PackedNorm(module.norm, taken(reduction)))
+        norm = PackedNorm(module.norm, taken(reduction))
+        _replace(module, reduction=reduction, norm=lambda x: norm(x)[1])
     elif isinstance(module, Block):
         _pack_block(module, dtype)
     elif isinstance(module, (PatchExpand, SkipJoin, PixelHead)):

@@ -288,7 +288,7 @@ class PatchMerging(nn.Module):
         super().__init__()
         self.merge = tuple(merge)
         joined = dim * merge[0] * merge[1]
-        self.norm: Callable[[Tensor], tuple[Tensor, Tensor]] = AddNorm(joined)
+        self.norm: Layer = nn.LayerNorm(joined)
         self.reduction: Layer = Linear(joined, 2 * dim, bias=False)
 
     def forward(self, x: Tensor) -> Tensor:
@@ -299,8 +299,7 @@ class PatchMerging(nn.Module):
             raise ValueError(f"merge {self.merge} must divide (R, A) = {(rings, sectors)}")
         # Inner order (φ, r, D): neighbours along the radius come first.
         x = x.reshape(batch, rings // mr, mr, sectors // ma, ma, dim).permute(0, 1, 3, 4, 2, 5)
-        _, x = self.norm(x.flatten(3))
-        return self.reduction(x)
+        return self.reduction(self.norm(x.flatten(3)))
 
     def extra_repr(self) -> str:
         return f"merge={self.merge}"

@@ -35,6 +35,7 @@ def tensors_of(lens):
     return {name: getattr(lens, name) for name in names if getattr(lens, name) is not None}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "options", "lens"),
     [
@@ -58,6 +59,7 @@ def test_program(name, options, lens, monkeypatch):
         torch.testing.assert_close(program(images, **tensors), model(images, lenses))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shape", [(3, 20, 30, 3), (3, 20, 30, 1), (3, 4, 20, 30)])
 def test_program_of_camera_frames_through_one_lens(shape):
     channels = min(shape[1], shape[3])
@@ -80,6 +82,7 @@ assert "darswin" not in sys.modules
 """
 
 
+@pytest.mark.slow
 def test_package_in_a_process_without_the_package(tmp_path):
     # docs/howto/export.md, whose code the tests run, compiles two stages.
     model = short("darswin_a_nano", mean=0.5, std=0.2, **ONE_BLOCK)
@@ -110,6 +113,7 @@ def test_package_in_a_process_without_the_package(tmp_path):
     assert run.returncode == 0, run.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "options", "lens"),
     [
@@ -139,6 +143,7 @@ def test_onnx(name, options, lens, tmp_path):
         assert error <= 1e-4 * expected.abs().max()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shape", [(48, 64, 3), (3, 48, 64)], ids=["frames", "planes"])
 def test_onnx_gathers_from_a_frame_before_all_else(shape, tmp_path):
     onnx, onnxruntime = (pytest.importorskip(name) for name in ("onnx", "onnxruntime"))

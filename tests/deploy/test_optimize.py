@@ -6,9 +6,8 @@ import pytest
 import torch
 
 from darswin import create_model, optimize
-from darswin.deploy import stages
-from darswin.layers.linear import onednn_lack
 from darswin.layers.position_bias import RelativeBias
+from darswin.layers.transformer import Stage
 from darswin.lens import KannalaBrandt, Spherical
 from darswin.ops import use_reference
 
@@ -83,14 +82,10 @@ def test_large_batches_go_in_parts(monkeypatch, name, lenses):
     want = model(images, lens)
     image = 256 * 4 * 24 * 4  # bytes of a hidden map of the first stage
     sizes = []
-    blocks = stages.OptimizedStage._blocks
-    monkeypatch.setattr(
-        stages.OptimizedStage,
-        "_blocks",
-        lambda stage, x, t: sizes.append(len(x)) or blocks(stage, x, t),
-    )
+    run = Stage._run
+    monkeypatch.setattr(Stage, "_run", lambda stage, x, t: sizes.append(len(x)) or run(stage, x, t))
     for most, parts in ((1, [1] * 5), (2 * image, [2, 2, 1]), (5 * image, [5])):
-        monkeypatch.setattr(stages, "CACHED_BYTES", most)
+        monkeypatch.setattr("darswin.deploy.optimize.CACHED_BYTES", most)
         sizes.clear()
         assert error(optimize(model)(images, lens), want) < 1e-5
         assert sizes[: len(parts)] == parts
@@ -120,7 +115,7 @@ def test_a_fixed_lens_is_prepared_once_for_each_size(monkeypatch):
     want = {size: model(images[size], LENSES[:1]) for size in sizes}
     for size in sizes:
         assert error(optimized(images[size]), want[size]) < 1e-5
-    monkeypatch.setattr(RelativeBias, "forward", None)
+    monkeypatch.setattr(RelativeBias, "table", None)
     monkeypatch.setattr(type(LENSES), "project", None)
     for size in sizes:
         assert error(optimized(images[size]), want[size]) < 1e-5
@@ -177,14 +172,6 @@ def test_what_cannot_be_optimized():
         optimize(optimize(network()))
     with pytest.raises(ValueError, match="lens must be one lens"):
         optimize(network(), lens=LENSES)
-
-
-def test_missing_says_why(monkeypatch):
-    assert "float64" in onednn_lack(torch.float64)
-    with torch.backends.mkldnn.flags(enabled=False):
-        assert "enabled is False" in onednn_lack(torch.float32)
-    monkeypatch.setattr(torch.ops.mkldnn, "_is_mkldnn_bf16_supported", lambda: False)
-    assert "this CPU" in onednn_lack(torch.bfloat16)
 
 
 def test_a_fixed_lens_refuses_images_of_another_size_than_its_own():

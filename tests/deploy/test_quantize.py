@@ -322,6 +322,7 @@ with torch.no_grad():
 """
 
 
+@pytest.mark.slow
 def test_no_integer_products_of_onednn_without_vnni():
     run = subprocess.run(
         [sys.executable, "-c", WITHOUT_VNNI], capture_output=True, text=True,
@@ -331,6 +332,7 @@ def test_no_integer_products_of_onednn_without_vnni():
     assert "VNNI" in run.stdout
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("vnni_only", [False, True])
 def test_onnx_runtime_says_the_same(vnni_only, tmp_path):
     pytest.importorskip("onnxscript")

@@ -6,7 +6,7 @@ import torch.nn.functional as F
 
 from darswin import create_model
 from darswin.layers import linear
-from darswin.layers.linear import Linear, autotune_results
+from darswin.layers.linear import Linear, autotune_results, onednn_lack
 from darswin.lens import Spherical
 
 LENSES = Spherical.from_fov([0.2, 0.9], 2.6, 16.0)
@@ -28,22 +28,26 @@ def results(layer, x):
     return [out.detach(), x.grad, *(p.grad.clone() for p in layer.parameters())]
 
 
-def pick(monkeypatch, way):
-    """Makes the measuring find this way the fastest."""
-    monkeypatch.setattr(
-        linear, "_measure", lambda ways, _: {name: float(name != way) for name in ways}
-    )
+def measure(monkeypatch, seconds, calls=None):
+    """Makes the measuring find these seconds of each library."""
+
+    def found(runs, turns):
+        if calls is not None:
+            calls.append(next(iter(runs.values())).args[0].shape)
+        return {name: seconds[name] for name in runs}
+
+    monkeypatch.setattr(linear, "best_seconds", found)
 
 
 @pytest.mark.parametrize("bias", [True, False])
 @pytest.mark.parametrize("shape", [(12,), (1, 12), (2, 3, 5, 12), (300, 12)])
-@pytest.mark.parametrize("way", ["torch", "onednn"])
-def test_every_way_is_the_same(monkeypatch, way, shape, bias):
+@pytest.mark.parametrize("library", ["torch", "onednn"])
+def test_both_libraries_give_the_same(monkeypatch, library, shape, bias):
     layer = Linear(12, 20, bias=bias)
     x = torch.randn(shape)
     exact = results(copy.deepcopy(layer).double(), x.double())
     usual = results(layer, x)
-    pick(monkeypatch, way)
+    measure(monkeypatch, {"torch": 1.0, "onednn": 1.0} | {library: 0.0})
     layer.matmul_backend = "autotune"
     for got, base, want in zip(results(layer, x), usual, exact, strict=True):
         assert got.is_contiguous()
@@ -52,12 +56,12 @@ def test_every_way_is_the_same(monkeypatch, way, shape, bias):
 
 
 def test_onednn_asks_onednn_alone(monkeypatch):
-    monkeypatch.setattr(linear, "_measure", None)
+    monkeypatch.setattr(linear, "best_seconds", None)
     calls = []
-    for product, ways in linear._WAYS.items():
-        way = ways["onednn"]
+    for product, libraries in linear._PRODUCTS.items():
+        run = libraries["onednn"]
         monkeypatch.setitem(
-            ways, "onednn", lambda *a, way=way, name=product: calls.append(name) or way(*a)
+            libraries, "onednn", lambda *a, run=run, name=product: calls.append(name) or run(*a)
         )
     layer = Linear(12, 20)
     layer.matmul_backend = "onednn"
@@ -65,19 +69,14 @@ def test_onednn_asks_onednn_alone(monkeypatch):
     assert calls == ["forward", "input gradient", "weight gradient"] and not autotune_results()
 
 
-def test_fastest_measures_each_shape_once(monkeypatch):
-    measured = []
-
-    def measure(ways, arguments):
-        measured.append(arguments[0].shape)
-        return dict(zip(ways, (0.2, 0.1), strict=True))
-
-    monkeypatch.setattr(linear, "_measure", measure)
+def test_autotune_measures_each_shape_once(monkeypatch):
+    shapes = []
+    measure(monkeypatch, dict(torch=0.2, onednn=0.1), shapes)
     layer = Linear(12, 20)
     layer.matmul_backend = "autotune"
     for rows in (5, 8, 8, 2):  # 5 to 8 rows are one shape
         results(layer, torch.randn(rows, 12))
-    assert measured == [(5, 12), (5, 20), (5, 20), (2, 12), (2, 20), (2, 20)]
+    assert shapes == [(5, 12), (5, 20), (5, 20), (2, 12), (2, 20), (2, 20)]
     threads = torch.get_num_threads()
     assert autotune_results() == {
         (product, rows, 12, 20, threads): {"onednn": 0.1, "torch": 0.2}
@@ -85,6 +84,15 @@ def test_fastest_measures_each_shape_once(monkeypatch):
         for product in ("forward", "input gradient", "weight gradient")
     }
     assert all(next(iter(seconds)) == "onednn" for seconds in autotune_results().values())
+
+
+def test_the_best_of_some_turns_counts_but_not_the_first(monkeypatch):
+    times = iter([0, 0, 0, 3, 3, 7, 7, 9, 9, 16])  # seconds: 3 and 4, then 2 and 7
+    monkeypatch.setattr(linear.time, "perf_counter", lambda: next(times))
+    calls = []
+    runs = dict(a=lambda: calls.append("a"), b=lambda: calls.append("b"))
+    assert linear.best_seconds(runs, turns=3) == dict(a=2, b=4)
+    assert calls == ["a", "b"] * 3
 
 
 def test_only_wanted_gradients():
@@ -95,6 +103,9 @@ def test_only_wanted_gradients():
     layer(x).sum().backward()
     assert {shape.product for shape in autotune_results()} == {"forward", "input gradient"}
     torch.testing.assert_close(x.grad, layer.weight.sum(0).expand(4, 12))
+    layer.bias.requires_grad_()
+    layer(x).sum().backward()
+    torch.testing.assert_close(layer.bias.grad, torch.full((20,), 4.0))
 
 
 @pytest.mark.parametrize("backend", ["onednn", "autotune"])
@@ -139,5 +150,23 @@ def test_models_train_with_each_choice(name):
     for backend in ("onednn", "autotune"):
         for got, want in zip(gradients[backend], gradients["torch"], strict=True):
             assert (got - want).norm() <= 1e-4 * want.norm() + 1e-6
-    with pytest.raises(ValueError, match=r"matmul_backend must be one of .* got 'mkl'"):
+    with pytest.raises(ValueError, match="got 'mkl'"):
         model.set_matmul_backend("mkl")
+
+
+def test_the_reason_why_there_is_no_onednn(monkeypatch):
+    assert "float64" in onednn_lack(torch.float64)
+    with torch.backends.mkldnn.flags(enabled=False):
+        assert "enabled is False" in onednn_lack(torch.float32)
+    monkeypatch.setattr(torch.ops.mkldnn, "_is_mkldnn_bf16_supported", lambda: False)
+    assert "this CPU" in onednn_lack(torch.bfloat16)
+    monkeypatch.setattr(torch.cpu, "_is_vnni_supported", lambda: False)
+    monkeypatch.setattr(torch.cpu, "get_capabilities", dict, raising=False)
+    assert "no VNNI" in onednn_lack(torch.int8)
+    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: {"amx_int8": True}, raising=False)
+    monkeypatch.setattr(linear, "_int8_is_exact", lambda: False)
+    assert "overflow" in onednn_lack(torch.int8)
+    monkeypatch.setattr(linear, "_int8_is_exact", lambda: True)
+    assert onednn_lack(torch.int8) is None
+    monkeypatch.setattr(torch.backends.mkldnn, "is_available", lambda: False)
+    assert "without oneDNN" in onednn_lack(torch.float32)

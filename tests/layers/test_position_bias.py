@@ -1,13 +1,11 @@
 import math
 
-import pytest
 import torch
 
 from darswin import polar_grid
 from darswin.layers.position_bias import (
     AngularRelativeBias,
     FourierBias,
-    joined_tables,
     ring_angles,
 )
 from darswin.lens import Spherical
@@ -59,16 +57,3 @@ def test_radial_positions():
     torch.testing.assert_close(angles[0], torch.linspace(0, 1.3, 5))
     radii = ring_angles(LENS, grid, 4, "polar")
     torch.testing.assert_close(radii, grid.borders[:, ::2] * math.pi / 16)
-
-
-@pytest.mark.parametrize("kind", [AngularRelativeBias, FourierBias])
-def test_joined_tables_and_their_gradients_are_those_of_each_bias(kind):
-    biases = [kind((3, 4), heads, sectors=8) for heads in (2, 2, 3)]
-    angles = torch.tensor([[0.0, 0.1, 0.2], [0.0, 0.3, 0.6]], requires_grad=True)
-    results = []
-    for tables in ([bias(angles) for bias in biases], joined_tables(biases, angles)):
-        loss = sum(((k + 2) * table).sin().sum() for k, table in enumerate(tables))
-        leaves = [angles, *(p for bias in biases for p in bias.parameters())]
-        results.append([*tables, *torch.autograd.grad(loss, leaves)])
-    for apart, joined in zip(*results, strict=True):
-        torch.testing.assert_close(joined, apart)
