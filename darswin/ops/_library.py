@@ -114,11 +114,10 @@ def run(
     Args:
         reference: the function of the same name in reference.py.
         kernel_takes: whether the kernel for GPUs computes these arguments, where `has_kernels`.
-        arguments: of the reference. The operator takes the fields of a NamedTuple one by one.
+        arguments: of the reference. The operator takes the fields of a `Sampling` one by one.
     """
-    flat: list[Any] = []
-    for argument in arguments:
-        flat.extend(argument if hasattr(argument, "_fields") else (argument,))
+    first, *others = arguments
+    flat = [*first, *others] if isinstance(first, tuple) else arguments
     first = flat[0]
     if not _reference:
         refuse_other_derivatives(f"darswin.{reference.__name__}", flat)

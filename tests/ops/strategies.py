@@ -2,36 +2,11 @@
 dtype, stride and storage offset, and sizes around what the kernels' blocks and registers hold."""
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass, field
 
 import torch
+from cases import Case, attention_call, bf16, f32, f64, map_call, on_polar_plane, sampling_call
 from hypothesis import strategies as st
 from torch import Tensor
-
-from darswin.ops import polar_embed, polar_sample, polar_to_image, reference, window_attention
-
-f32, f64 = torch.float32, torch.float64
-
-
-@dataclass
-class Case:
-    """One call: `run(**inputs)` is differentiable in every input."""
-
-    run: Callable[..., Tensor]
-    inputs: dict[str, Tensor]
-    # float64 inputs -> what the gradient of the output is multiplied with: 0 where it has a jump.
-    mask: Callable[..., Tensor] | None = None
-    settings: dict = field(default_factory=dict)
-
-    def __repr__(self):
-        shapes = {name: (tuple(t.shape), t.stride()) for name, t in self.inputs.items()}
-        dtype = next(iter(self.inputs.values())).dtype
-        return f"{dtype} {shapes} {self.settings}"
-
-    def to(self, dtype: torch.dtype) -> "Case":
-        inputs = {name: t.to(dtype) for name, t in self.inputs.items()}
-        return Case(self.run, inputs, self.mask, self.settings)
 
 
 def sizes(*values: int):
@@ -115,34 +90,6 @@ def lenses(draw, generator, batch, size, rows, columns, dtype):
     return radii.to(dtype), azimuths.to(dtype), center.to(dtype), affine, offsets
 
 
-def places(radii, azimuths, center, affine, offsets, batch, jitter, seed) -> tuple[Tensor, ...]:
-    """x, y and radius of the points, (B, N_r, N_a) each, in float64."""
-    radii, azimuths, center = radii.double(), azimuths.double(), center.double()
-    r, a = radii[:, :, None], azimuths[None, None]
-    if jitter > 0 and radii.shape[1] and len(azimuths):
-        amount = torch.tensor(jitter, dtype=f64)
-        r, a = reference._jittered(radii, azimuths, batch, amount, torch.tensor(seed))
-    x, y = r * torch.cos(a), r * torch.sin(a)
-    if affine is not None:
-        (xx, xy), (yx, yy) = affine.double().permute(1, 2, 0)[..., None, None]
-        x, y = xx * x + xy * y, yx * x + yy * y
-    x, y = center[:, 0, None, None] + x, center[:, 1, None, None] + y
-    if offsets is not None:
-        x, y = x + offsets[:, 0].double(), y + offsets[:, 1].double()
-    shape = (batch, radii.shape[1], len(azimuths))
-    return x.expand(shape), y.expand(shape), r.expand(shape)
-
-
-def to_tokens(planes: Tensor, samples: tuple[int, int]) -> Tensor:
-    """(B, C, R·S_r, A·S_φ) → (B, R, A, S_r·S_φ·C), by torch alone."""
-    batch, channels, rows, columns = planes.shape
-    rings, sectors = rows // samples[0], columns // samples[1]
-    parts = planes.reshape(batch, channels, rings, samples[0], sectors, samples[1])
-    return parts.permute(0, 2, 4, 3, 5, 1).reshape(
-        batch, rings, sectors, samples[0] * samples[1] * channels
-    )
-
-
 @st.composite
 def sampling(draw, dtypes=(f32, f64), embed: bool = False) -> Case:
     """A call of polar_sample, or of polar_embed."""
@@ -172,29 +119,7 @@ def sampling(draw, dtypes=(f32, f64), embed: bool = False) -> Case:
             inputs["bias"] = draw(strided(normal(generator, features, dtype=dtype)))
     else:
         options["layout"] = draw(st.sampled_from(["tokens", "image"]))
-
-    settings = options | dict(azimuths=azimuths)
-
-    def run(image, radii, center, weight=None, bias=None, **general):
-        grid = (image, radii, settings["azimuths"].to(radii.dtype), center)
-        if embed:
-            return polar_embed(*grid, weight, bias, **general, **options)
-        return polar_sample(*grid, **general, **options)
-
-    def mask(image, radii, center, weight=None, bias=None, affine=None, offsets=None):
-        """Bilinear gradients jump at borders of pixels, and where jitter meets the radius 0."""
-        azimuths = settings["azimuths"]
-        x, y, r = places(radii, azimuths, center, affine, offsets, len(image), jitter, seed)
-        smooth = ((x - x.round()).abs() > 1e-3) & ((y - y.round()).abs() > 1e-3)
-        if jitter > 0:
-            smooth &= r > 1e-3
-        planes = smooth[:, None].expand(-1, channels, -1, -1).to(f64)
-        if embed:  # a token has a gradient if all of its samples may have one
-            tokens = to_tokens(smooth[:, None].to(f64), samples)
-            return tokens.amin(-1, keepdim=True)
-        return planes if options["layout"] == "image" else to_tokens(planes, samples)
-
-    return Case(run, inputs, mask, settings)
+    return sampling_call(inputs, azimuths, **options)
 
 
 @st.composite
@@ -216,16 +141,16 @@ def attention(draw, dtypes=(f32, f64)) -> Case:
         scale=draw(st.sampled_from([None, 0.7, 0.0])),
     )
     qkv = normal(generator, batch, rings, sectors, 3, heads, head_dim, dtype=dtype)
-    bias = normal(generator, *table, dtype=f32 if dtype == torch.bfloat16 else dtype)
+    bias = normal(generator, *table, dtype=f32 if dtype == bf16 else dtype)
     inputs = dict(qkv=draw(strided(qkv)), bias=draw(strided(bias)))
-    return Case(lambda qkv, bias: window_attention(qkv, bias, **options), inputs, None, options)
+    return attention_call(inputs, **options)
 
 
 @st.composite
 def polar_maps(draw, dtypes=(f32, f64)) -> Case:
     """A call of polar_to_image."""
     generator, dtype = draw(generators()), draw(st.sampled_from(dtypes))
-    real = f32 if dtype == torch.bfloat16 else dtype
+    real = f32 if dtype == bf16 else dtype
     batch, channels = draw(sizes(0, 1, 2, 3)), draw(sizes(0, 1, 2, 3, 8, 10, 16, 17, 31, 33, 65))
     rings, sectors = draw(sizes(1, 2, 3, 5, 16)), draw(sizes(1, 2, 3, 8, 17, 64))
     size = height, width = draw(sizes(0, 1, 2, 7, 16, 33)), draw(sizes(0, 1, 2, 7, 16, 33, 90))
@@ -256,33 +181,7 @@ def polar_maps(draw, dtypes=(f32, f64)) -> Case:
         gap = radius.diff().argmax()
         options["r_max"] = (radius[gap] + radius[gap + 1]).item() / 2
     inputs = {name: draw(strided(t)) if name != "radii" else t for name, t in inputs.items()}
-
-    def run(x, radii, center=None, **lens):
-        return polar_to_image(x, radii, center, **lens, **options)
-
-    def mask(x, radii, **lens):
-        """Gradients of the lens jump at ring centres, at the middles of sectors and at the pole."""
-        r, azimuth = on_polar_plane(size, **lens)
-        column = azimuth * (sectors / (2 * math.pi)) - 0.5
-        columns = torch.stack((column, column + sectors / 2))
-        smooth = ((columns - columns.round()).abs() > 1e-3).all(0) & (r > 0.5)
-        smooth = smooth & ((r[..., None] - radii[:, None, None]).abs() > 1e-3).all(-1)
-        smooth = smooth.expand(batch, *smooth.shape[1:]).to(f64)
-        return smooth[..., None] if options["layout"] == "tokens" else smooth[:, None]
-
-    return Case(run, inputs, mask, options)
-
-
-def on_polar_plane(size, radii=None, center=None, affine=None, points=None):
-    """Radius and azimuth of the pixels, (N, H, W) each, in float64."""
-    if points is None:
-        y, x = (torch.arange(n, dtype=f64) for n in size)
-        pixels = torch.stack(torch.meshgrid(x, y, indexing="xy"), -1)
-        points = pixels - center[:, None, None]
-        if affine is not None:
-            points = torch.linalg.solve(affine[:, None, None], points[..., None])[..., 0]
-    x, y = points.unbind(-1)
-    return torch.hypot(x, y), torch.atan2(y, x)
+    return map_call(inputs, **options)
 
 
 WIDTHS = (1, 2, 3, 7, 15, 16, 17, 31, 33, 64, 96, 200, 384, 1500)

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from cases import SMALL, raw_calls
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
@@ -25,53 +26,26 @@ DTYPES = (
 )  # fmt: skip
 
 
-def sampling(dtype=torch.float32, batch=2, seed=3):
-    """The arguments that polar_sample and polar_embed share."""
-    radii, azimuths = torch.rand(batch, 4, dtype=dtype) * 5, torch.linspace(0, 6, 6, dtype=dtype)
-    affine = torch.eye(2, dtype=dtype)[None]
-    offsets = torch.rand(1, 2, 4, 6, dtype=dtype)
-    image = torch.rand(batch, 3, 5, 7, dtype=dtype)
-    jitter = torch.tensor(0.5, dtype=torch.float64)
-    center = torch.full((1, 2), 3.0, dtype=dtype)
-    return [image, radii, azimuths, center, affine, offsets, jitter, torch.tensor(seed), [2, 3],
-            [], [], False]  # fmt: skip
+# The case whose backward is called, if it is another one.
+OF_BACKWARD = {"polar_to_image": "polar_to_image, points"}
+ROWS = [(3, 4), (3, 4), (4,), (4,)]
 
 
-def polar_map(general):
-    """The arguments that polar_to_image and its backward share."""
-    plane = [torch.full((1, 2), 3.0), torch.eye(2)[None], None]
-    if general:
-        plane = [None, None, torch.rand(2, 5, 7, 2) * 6 - 3]
-    radii = torch.tensor([[0.5, 1.5, 2.5]])
-    return [torch.rand(2, 3, 4, 5), radii, *plane, torch.tensor([3.0]), [5, 7], True]
+def valid(name: str) -> list:
+    """The arguments of a valid call of an operator."""
+    if name == "_add_norm_":
+        return [*(torch.rand(shape) for shape in ROWS), 1e-5]
+    if name == "_transpose_sum":
+        return [torch.rand(5, 7)]
+    public = name.removesuffix("_backward")
+    case = SMALL[public if public == name else OF_BACKWARD.get(public, public)]()
+    _, arguments = raw_calls(case)[public != name]
+    arguments = [list(a) if isinstance(a, tuple) else a for a in arguments]
+    return [a.detach() if isinstance(a, Tensor) else a for a in arguments]
 
 
-# A valid call of each operator.
-CALLS = {
-    "polar_sample": lambda: [*sampling(), True],
-    "polar_sample_backward": lambda: [
-        *sampling(), True, torch.rand(2, 2, 2, 18), True, True, True,
-    ],
-    "polar_embed": lambda: [*sampling(), torch.rand(5, 18), torch.rand(5)],
-    "polar_embed_backward": lambda: [
-        *sampling(), torch.rand(5, 18), torch.rand(2, 2, 2, 5), True, True, True, True,
-    ],
-    "window_attention": lambda: [
-        torch.rand(2, 4, 6, 3, 2, 5), torch.rand(1, 2, 3, 5), [2, 3], [1, 2], [0, 1], 0.5,
-    ],
-    "window_attention_backward": lambda: [
-        torch.rand(2, 4, 6, 3, 2, 5), torch.rand(2, 2, 3, 5), [2, 3], [1, 2], [0, 1], 0.5,
-        torch.rand(2, 4, 6, 10),
-    ],
-    "polar_to_image": lambda: polar_map(False),
-    "polar_to_image_backward": lambda: [
-        *polar_map(True), torch.rand(2, 5, 7, 5), True, True,
-    ],
-    "_add_norm_": lambda: [
-        torch.rand(3, 4), torch.rand(3, 4), torch.rand(4), torch.rand(4), 1e-5,
-    ],
-    "_transpose_sum": lambda: [torch.rand(5, 7)],
-}  # fmt: skip
+PUBLIC = ("polar_sample", "polar_embed", "window_attention", "polar_to_image")
+NAMES = [*PUBLIC, *(f"{name}_backward" for name in PUBLIC), "_add_norm_", "_transpose_sum"]
 
 
 @st.composite
@@ -116,7 +90,7 @@ def tensors(draw, like: Tensor) -> Tensor | None:
 @st.composite
 def hostile(draw, name: str) -> list:
     """A call with one to three of its arguments replaced."""
-    arguments = CALLS[name]()
+    arguments = valid(name)
     if draw(st.integers(0, 3)) == 0 and name.startswith("polar"):
         arguments = [a.double() if isinstance(a, Tensor) and a.dtype == torch.float32 else a
                      for a in arguments]  # fmt: skip
@@ -144,13 +118,13 @@ def describe(value) -> str:
     return repr(value)
 
 
-@pytest.mark.parametrize("name", CALLS)
+@pytest.mark.parametrize("name", NAMES)
 def test_valid_calls_are_valid(name):
     with torch.no_grad():
-        getattr(ops, name)(*CALLS[name]())
+        getattr(ops, name)(*valid(name))
 
 
-@pytest.mark.parametrize("name", CALLS)
+@pytest.mark.parametrize("name", NAMES)
 @settings(max_examples=3 * settings().max_examples)
 @given(data=st.data())
 def test_a_hostile_call_returns_or_raises(name, data):

@@ -4,53 +4,26 @@ A few dozen of each in `make test`, always the same; `make fuzz` draws 2,000 oth
 """
 
 import math
-from collections.abc import Sequence
 
 import pytest
 import strategies
 import torch
+from cases import (
+    Case,
+    assert_same_bits_on_any_number_of_threads,
+    bf16,
+    f32,
+    f64,
+    results,
+)
 from hypothesis import given, note
 from hypothesis import strategies as st
-from strategies import Case, f32, f64
 from torch import Tensor
 
-from darswin.ops import polar_sample, reference, use_reference
+from darswin.ops import polar_sample, use_reference
 from darswin.ops._inference import add_norm_, transpose_sum
 
-bf16 = torch.bfloat16
-THREADS = (1, 2, 3)
-
-
-def results(case: Case, *, is_reference: bool, absolute: Sequence[str] = ()) -> dict[str, Tensor]:
-    """The output, a random gradient of it, and the gradients of every input that this one gives.
-
-    `absolute` inputs are taken without their signs, and then so is the gradient: nothing cancels,
-    and what comes out is the size of what is added up.
-    """
-    leaves = {name: (t.abs() if name in absolute else t.detach()).requires_grad_()
-              for name, t in case.inputs.items()}  # fmt: skip
-    with use_reference(is_reference):
-        out = case.run(**leaves)
-    grad = strategies.normal(torch.Generator().manual_seed(7), *out.shape)
-    if case.mask is not None:
-        grad = grad * case.mask(**{name: t.detach().double() for name, t in case.inputs.items()})
-    grad = (grad.abs() if absolute else grad).to(out.dtype)
-    grads = torch.autograd.grad(out, list(leaves.values()), grad, materialize_grads=True)
-    return dict(out=out.detach(), grad=grad, **dict(zip(leaves, grads, strict=True)))
-
-
-def assert_same_bits_on_any_number_of_threads(run) -> None:
-    before = torch.get_num_threads()
-    try:
-        all_results = []
-        for count in THREADS:
-            torch.set_num_threads(count)
-            all_results.append(run())
-    finally:
-        torch.set_num_threads(before)
-    for others in all_results[1:]:
-        for one, other in zip(all_results[0], others, strict=True):
-            torch.testing.assert_close(other, one, rtol=0, atol=0, equal_nan=True)
+pytestmark = pytest.mark.filterwarnings("error")
 
 
 def assert_accurate(ours: Tensor, base: Tensor, exact: Tensor, size: float) -> None:
@@ -70,12 +43,10 @@ def assert_equals_reference(case: Case, size_of) -> None:
     note(repr(case))
     exact = results(case.to(f64), is_reference=True)
     base = results(case, is_reference=True)
-    ours = results(case, is_reference=False)
+    ours = results(case)
     for name in exact:
         assert_accurate(ours[name], base[name], exact[name], size_of(name))
-    assert_same_bits_on_any_number_of_threads(
-        lambda: list(results(case, is_reference=False).values())
-    )
+    assert_same_bits_on_any_number_of_threads(lambda: results(case))
 
 
 def largest(tensor: Tensor) -> float:
@@ -166,7 +137,7 @@ def test_add_norm_is_as_accurate_as_torch(arguments):
         a, b = x.clone(), y.clone()
         return a, add_norm_(a, b, weight, bias, 1e-5)
 
-    assert_same_bits_on_any_number_of_threads(run)
+    assert_same_bits_on_any_number_of_threads(lambda: dict(enumerate(run())))
     changed, out = run()
     assert torch.equal(changed, total)
     if x.numel() == 0:
@@ -180,7 +151,7 @@ def test_add_norm_is_as_accurate_as_torch(arguments):
 @given(strategies.matrices())
 def test_transpose_sum_equals_torch(x):
     note(f"{x.shape} {x.storage_offset()}")
-    assert_same_bits_on_any_number_of_threads(lambda: transpose_sum(x))
+    assert_same_bits_on_any_number_of_threads(lambda: dict(enumerate(transpose_sum(x))))
     transposed, sums = transpose_sum(x)
     assert torch.equal(transposed, x.t()) and transposed.is_contiguous()
     assert_accurate(sums, x.sum(0), x.double().sum(0), largest(x.double().abs().sum(0)) / 4)
@@ -200,15 +171,13 @@ def test_bfloat16_pixels_are_sampled_as_float32_and_rounded_once(case):
     rounded, wide = (
         Case(case.run, dict(inputs, image=image), case.mask) for image in (narrow, narrow.float())
     )
-    ours, same = (results(c, is_reference=False) for c in (rounded, wide))
+    ours, same = (results(c) for c in (rounded, wide))
     assert ours["out"].dtype == bf16 and torch.equal(ours["out"], same["out"].bfloat16())
     with torch.no_grad(), use_reference():
         exact = case.run(image=narrow.double(), **{name: t.double() for name, t in inputs.items()})
     size = largest(narrow) * (1 + largest(inputs.get("weight", narrow))) * narrow.shape[1]
     torch.testing.assert_close(ours["out"].double(), exact, rtol=2**-7, atol=1e-3 * (1 + size))
-    assert_same_bits_on_any_number_of_threads(
-        lambda: list(results(rounded, is_reference=False).values())
-    )
+    assert_same_bits_on_any_number_of_threads(lambda: results(rounded))
 
 
 @given(strategies.sampling(dtypes=(f32,)), st.booleans())
@@ -234,24 +203,20 @@ def test_uint8_pixels_are_sampled_as_what_they_stand_for(case, frames):
 def test_bfloat16_attention_is_float32_rounded_once(case):
     note(repr(case))
     wide = Case(case.run, {name: t.float() for name, t in case.inputs.items()})
-    ours, exact = (results(c, is_reference=False) for c in (case, wide))
+    ours, exact = (results(c) for c in (case, wide))
     assert ours["out"].dtype == ours["qkv"].dtype == bf16
     torch.testing.assert_close(ours["out"].float(), exact["out"], rtol=2**-7, atol=1e-5)
-    assert_same_bits_on_any_number_of_threads(
-        lambda: list(results(case, is_reference=False).values())
-    )
+    assert_same_bits_on_any_number_of_threads(lambda: results(case))
 
 
 @given(strategies.polar_maps(dtypes=(bf16,)))
 def test_bfloat16_maps_are_brought_back_in_float32_and_rounded_once(case):
     note(repr(case))
     wide = Case(case.run, {name: t.float() for name, t in case.inputs.items()}, case.mask)
-    ours, exact = (results(c, is_reference=False) for c in (case, wide))
+    ours, exact = (results(c) for c in (case, wide))
     assert ours["out"].dtype == ours["x"].dtype == bf16
     assert torch.equal(ours["out"], exact["out"].bfloat16())
-    assert_same_bits_on_any_number_of_threads(
-        lambda: list(results(case, is_reference=False).values())
-    )
+    assert_same_bits_on_any_number_of_threads(lambda: results(case))
 
 
 @given(strategies.norms(dtypes=(bf16,)))
@@ -259,7 +224,7 @@ def test_bfloat16_norm_is_float32_rounded_once(arguments):
     x, y, weight, bias = arguments
     total = x + y
     assert_same_bits_on_any_number_of_threads(
-        lambda: [add_norm_(x.clone(), y.clone(), weight, bias, 1e-5)]
+        lambda: dict(out=add_norm_(x.clone(), y.clone(), weight, bias, 1e-5))
     )
     out = add_norm_(x, y, weight, bias, 1e-5)
     assert torch.equal(x, total)
@@ -295,14 +260,12 @@ def test_a_lens_that_is_not_finite_samples_nothing_there(case, generator, bad, d
     place = case.settings if name == "azimuths" else case.inputs
     place[name] = spoiled(generator, place[name], bad, 0.2)
     exact = results(case.to(f64), is_reference=True)
-    ours = results(case, is_reference=False)
+    ours = results(case)
     lever = 1e-3 * (1 + exact["out"].numel()) * (1 + largest(case.inputs["image"]))
     for key, value in ours.items():
         assert value.isfinite().all()
         assert_same_kinds(value, exact[key], atol=1e-3 if key in ("out", "image") else lever)
-    assert_same_bits_on_any_number_of_threads(
-        lambda: list(results(case, is_reference=False).values())
-    )
+    assert_same_bits_on_any_number_of_threads(lambda: results(case))
 
 
 @given(strategies.sampling(), strategies.generators(), bad_values)
@@ -310,7 +273,7 @@ def test_pixels_that_are_not_finite_spoil_what_touches_them(case, generator, bad
     note(repr(case))
     image = case.inputs["image"]
     case.inputs["image"] = spoiled(generator, image, bad, 0.02)
-    smooth = case.mask(**{name: t.double() for name, t in case.inputs.items()}) > 0
+    smooth = case.smooth() > 0
     with torch.no_grad():
         ours = case.run(**case.inputs)
         with use_reference():
@@ -324,9 +287,7 @@ def test_gradients_that_are_not_finite_reach_the_pixels_that_were_touched(case, 
     note(repr(case))
     if case.inputs["image"].numel() == 0:
         return
-    mask = case.mask(**{name: t.double() for name, t in case.inputs.items()}).expand(
-        case.run(**case.inputs).shape
-    )
+    mask = case.smooth().expand(case.run(**case.inputs).shape)
     grad = strategies.normal(generator, *mask.shape) * mask
     grad = torch.where(mask > 0, spoiled(generator, grad, bad, 0.02), grad)
     grads = []
@@ -358,7 +319,7 @@ def test_pixels_that_lie_nowhere_on_the_map_are_zero(case, generator, bad, data)
     case.inputs[name] = spoiled(generator, case.inputs[name], bad, 0.2)
     note(repr(case))
     exact = results(Case(case.run, case.to(f64).inputs), is_reference=True)
-    ours = results(Case(case.run, case.inputs), is_reference=False)
+    ours = results(Case(case.run, case.inputs))
     for key in ("out", "x"):
         assert ours[key].isfinite().all()
         assert_same_kinds(ours[key], exact[key], atol=1e-2 * (1 + largest(exact[key])))
@@ -367,7 +328,7 @@ def test_pixels_that_lie_nowhere_on_the_map_are_zero(case, generator, bad, data)
 @given(strategies.polar_maps(), strategies.generators(), bad_values)
 def test_tokens_that_are_not_finite_spoil_the_pixels_around_them(case, generator, bad):
     note(repr(case))
-    smooth = case.mask(**{name: t.double() for name, t in case.inputs.items()}) > 0
+    smooth = case.smooth() > 0
     case.inputs["x"] = spoiled(generator, case.inputs["x"], bad, 0.02)
     with torch.no_grad():
         ours = case.run(**case.inputs)
@@ -388,26 +349,9 @@ def test_a_token_that_is_not_finite_spoils_its_window_alone(case, generator, bad
     windows = hit.view(batch, rings // mr, mr, sectors // ma, ma).amax((2, 4), keepdim=True)
     hit = windows.expand(-1, -1, mr, -1, ma).reshape(hit.shape).roll(settings["shift"], (1, 2))
     spoilt = Case(case.run, dict(case.inputs, qkv=qkv))
-    ours, clean = (results(c, is_reference=False) for c in (spoilt, case))
+    ours, clean = (results(c) for c in (spoilt, case))
     exact = results(spoilt.to(f64), is_reference=True)
     for name in ("out", "qkv"):
         keep = ~hit.reshape(*hit.shape, *(1,) * (ours[name].dim() - 3))
         assert torch.equal(torch.where(keep, ours[name], 0), torch.where(keep, clean[name], 0))
     assert torch.equal(ours["out"].isfinite(), exact["out"].isfinite())
-
-
-def test_the_reference_is_what_the_operators_are_compared_with():
-    # Else these properties would compare the operators with themselves.
-    assert reference.polar_sample.__module__ == "darswin.ops.reference"
-    with use_reference():
-        image = torch.ones(1, 1, 4, 4, requires_grad=True)
-        case = Case(
-            lambda image: strategies.polar_sample(
-                image, torch.ones(1, 2), torch.zeros(2), torch.ones(1, 2), samples=(1, 1)
-            ),
-            dict(),
-        )
-        assert "polar_sample" not in type(case.run(image).grad_fn).__name__
-
-
-pytestmark = pytest.mark.filterwarnings("error")

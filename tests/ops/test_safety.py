@@ -8,12 +8,8 @@ import textwrap
 
 import pytest
 import torch
-from helpers import with_gradients
 
-from darswin import create_model
-from darswin.layers.polar import PolarSample
-from darswin.lens import Spherical
-from darswin.ops import polar_embed, polar_sample, use_reference, window_attention
+from darswin.ops import polar_sample, use_reference
 
 f64 = torch.float64
 
@@ -51,86 +47,7 @@ def test_patches_of_few_points(samples, channels, sectors):
     torch.testing.assert_close(ours, expected, rtol=1e-4, atol=1e-4)
 
 
-def test_the_layer_and_the_model_take_patches_of_one_radius():
-    lens, images = Spherical.from_fov(0.4, 2.6, 16.0), torch.randn(2, 3, 32, 32)
-    layer = PolarSample(16, 64, samples=(1, 4))
-    model = create_model("darswin_a_nano", num_classes=3, samples=(1, 8)).eval()
-    for module in (layer, model):
-        with torch.no_grad():
-            ours = module(images, lens)
-            with use_reference():
-                expected = module(images, lens)
-        torch.testing.assert_close(ours, expected, rtol=1e-4, atol=1e-4)
-
-
-# -- azimuths that are NaN or infinite, and none at all -------------------------------------------
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, f64])
-@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
-def test_azimuths_at_nan_or_infinity_sample_nothing_of_a_packed_image(bad, dtype):
-    # A small image and many points: the image is packed, and no point but these leaves it.
-    image = torch.randn(2, 3, 20, 20, dtype=dtype)
-    radii, azimuths, center = grid(16, 40, 20, dtype)
-    azimuths[7] = bad
-    for jitter in (0.0, 1.0):
-        out, *grads = with_gradients(
-            lambda i, r, c, j=jitter: polar_sample(
-                i, r, azimuths, c, samples=(4, 4), jitter=j, layout="image"
-            ),
-            (image, radii, center),
-        )
-        assert (out[..., 7] == 0).all() and (out[..., 8] != 0).all()
-        with use_reference():
-            expected = with_gradients(
-                lambda i, r, c, j=jitter: polar_sample(
-                    i, r, azimuths, c, samples=(4, 4), jitter=j, layout="image"
-                ),
-                (image, radii, center),
-            )
-        for got, want in zip((out, *grads), expected, strict=True):
-            assert got.isfinite().all()
-            torch.testing.assert_close(got, want, rtol=1e-3, atol=1e-2)
-
-
-@pytest.mark.parametrize("channels", [0, 3])
-def test_polar_embed_of_no_azimuths_has_a_backward(channels):
-    inputs = (torch.randn(2, channels, 8, 8), torch.rand(1, 6), torch.ones(1, 2),
-              torch.randn(5, 2 * 3 * channels), torch.randn(5))  # fmt: skip
-
-    def embed(image, radii, center, weight, bias):
-        none = torch.zeros(0)
-        return polar_embed(image, radii, none, center, weight, bias, samples=(2, 3))
-
-    out, *grads = with_gradients(embed, inputs)
-    assert out.shape == (2, 3, 0, 5)
-    for grad, value in zip(grads, inputs, strict=True):
-        assert torch.equal(grad, torch.zeros_like(value))
-
-
-def test_the_bias_of_polar_embed_has_a_gradient_without_channels():
-    radii, azimuths, center = grid(4, 6, 8)
-
-    def embed(bias):
-        image, weight = torch.zeros(2, 0, 8, 8), torch.zeros(5, 0)
-        return polar_embed(image, radii, azimuths, center, weight, bias, samples=(2, 3))
-
-    (grad,) = with_gradients(embed, (torch.randn(5),))[1:]
-    with use_reference():
-        (expected,) = with_gradients(embed, (torch.randn(5),))[1:]
-    torch.testing.assert_close(grad, expected)
-
-
 # -- memory ----------------------------------------------------------------------------------------
-
-
-def test_windows_without_tables_read_nothing_past_their_biases():
-    # 65 tokens: keys come in eights, their biases did not. AddressSanitizer sees it.
-    qkv, bias = torch.randn(1, 1, 65, 3, 1, 32), torch.randn(1, 1, 1, 129)
-    out = window_attention(qkv, bias, window=(1, 65))
-    with use_reference():
-        expected = window_attention(qkv, bias, window=(1, 65))
-    torch.testing.assert_close(out, expected, rtol=1e-4, atol=1e-5)
 
 
 LACKING_MEMORY = """
@@ -173,6 +90,7 @@ LACKING_MEMORY = """
 """
 
 
+@pytest.mark.slow
 @pytest.mark.unsanitized
 @pytest.mark.skipif(sys.platform != "linux", reason="limits memory and reads /proc")
 def test_out_of_memory_is_an_error_and_large_working_memory_is_given_back():
@@ -183,6 +101,7 @@ def test_out_of_memory_is_an_error_and_large_working_memory_is_given_back():
     assert int(kept) < 80  # MB, of two threads, which once kept 512
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 def test_sampling_bfloat16_needs_no_memory_of_its_gradient():
     done = run("""
@@ -252,25 +171,6 @@ def test_any_stride_of_a_single_row_is_as_good():
     assert torch.equal(SAMPLE(odd, *lens, *plain((1, 1))), SAMPLE(image, *lens, *plain((1, 1))))
 
 
-# -- raw calls -------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("jitter", [1e300, -0.1, 1.5, math.nan, math.inf])
-def test_jitter_outside_its_range_is_refused_by_the_operator_itself(jitter):
-    radii, azimuths, center = grid(4, 6, 8)
-    moved = (torch.tensor(jitter, dtype=f64), torch.tensor(1))
-    with pytest.raises(RuntimeError, match=r"jitter must be in \[0, 1\]"):
-        SAMPLE(torch.rand(1, 3, 8, 8), radii, azimuths, center, None, None, *moved,
-               (2, 3), [], [], False, True)  # fmt: skip
-
-
-def test_float64_samples_are_not_rounded_by_the_operator_itself():
-    radii, azimuths, center = grid(4, 6, 8, f64)
-    with pytest.raises(RuntimeError, match="float64 image are not rounded"):
-        SAMPLE(torch.rand(1, 3, 8, 8, dtype=f64), radii, azimuths, center, None, None,
-               None, None, (2, 3), [], [], True, True)  # fmt: skip
-
-
 # -- pixels beyond half of what a float holds ------------------------------------------------------
 
 
@@ -309,6 +209,7 @@ FORKED = """
 """
 
 
+@pytest.mark.slow
 @pytest.mark.unsanitized
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="forks")
 def test_a_forked_process_works_on_one_thread():

@@ -1,0 +1,461 @@
+"""Calls of the operators: named ones at the sizes that the kernels tell apart, and how results are
+compared. test_contract.py and tests/gpu take them; strategies.py draws random ones."""
+
+import functools
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from unittest import mock
+
+import torch
+from torch import Tensor
+
+from darswin.ops import (
+    _library,
+    polar_embed,
+    polar_sample,
+    polar_to_image,
+    reference,
+    use_reference,
+    window_attention,
+)
+
+f32, f64, bf16 = torch.float32, torch.float64, torch.bfloat16
+
+
+@dataclass
+class Case:
+    """One call: `run(**inputs)` is differentiable in every input."""
+
+    run: Callable[..., Tensor]
+    inputs: dict[str, Tensor]
+    # float64 inputs -> what the gradient of the output is multiplied with: 0 where it has a jump.
+    mask: Callable[..., Tensor] | None = None
+    settings: dict = field(default_factory=dict)
+
+    def __repr__(self):
+        shapes = {name: (tuple(t.shape), t.stride()) for name, t in self.inputs.items()}
+        dtype = next(iter(self.inputs.values())).dtype
+        return f"{dtype} {shapes} {self.settings}"
+
+    def replace(self, **inputs: Tensor) -> "Case":
+        return Case(self.run, self.inputs | inputs, self.mask, self.settings)
+
+    def to(self, to: torch.dtype | torch.device) -> "Case":
+        return self.replace(**{name: t.to(to) for name, t in self.inputs.items()})
+
+    def first_image(self) -> "Case":
+        """The call for the first image of the batch alone."""
+        layer = ("weight", "bias") if "weight" in self.inputs else ()
+        return self.replace(**{name: t[:1] for name, t in self.inputs.items() if name not in layer})
+
+    def smooth(self) -> Tensor:
+        """The mask of these inputs."""
+        return self.mask(**{name: t.detach().double() for name, t in self.inputs.items()})
+
+
+# -- results, and how they compare -----------------------------------------------------------------
+
+
+def results(
+    case: Case,
+    *,
+    is_reference: bool = False,
+    masked: bool = True,
+    absolute: Sequence[str] = (),
+    only: Sequence[str] = (),
+) -> dict[str, Tensor]:
+    """The output, a random gradient of it, and the gradients of the inputs, or of `only` some.
+
+    `absolute` inputs are taken without their signs, and then so is the gradient: nothing cancels,
+    and each result is as large as the numbers that are added up for it.
+    """
+    leaves = {
+        name: (t.abs() if name in absolute else t.detach()) for name, t in case.inputs.items()
+    }
+    wanted = [leaves[name].requires_grad_() for name in only or leaves]
+    with use_reference(is_reference):
+        out = case.run(**leaves)
+    grad = torch.randn(out.shape, generator=torch.Generator().manual_seed(7), dtype=f64)
+    if masked and case.mask is not None:
+        grad = grad * case.smooth().to(grad.device)
+    grad = (grad.abs() if absolute else grad).to(out)
+    grads = torch.autograd.grad(out, wanted, grad, materialize_grads=True)
+    return dict(out=out.detach(), grad=grad, **dict(zip(only or leaves, grads, strict=True)))
+
+
+def assert_equal_results(ours: dict[str, Tensor], others: dict[str, Tensor], tolerance: float = 0):
+    """Each result of `others` is that of ours; with a tolerance, within as much of the largest."""
+    for name, want in others.items():
+        size = want.nan_to_num(0, 0, 0).abs().max().item() if want.numel() else 0.0
+        torch.testing.assert_close(
+            ours[name], want, rtol=tolerance, atol=tolerance * (1 + size) if tolerance else 0,
+            equal_nan=True, msg=lambda text, name=name: f"{name}: {text}",
+        )  # fmt: skip
+
+
+def assert_same_bits_on_any_number_of_threads(
+    run: Callable[[], dict[str, Tensor]], counts: Sequence[int] = (1, 2, 3)
+) -> None:
+    before = torch.get_num_threads()
+    try:
+        torch.set_num_threads(counts[0])
+        alone = run()
+        for count in counts[1:]:
+            torch.set_num_threads(count)
+            assert_equal_results(run(), alone)
+    finally:
+        torch.set_num_threads(before)
+
+
+def assert_accurate(
+    make: Callable[[], Case], on: torch.device | str = "cpu", draws: int = 3, times: float = 2.0
+) -> None:
+    """The accuracy rule: the float32 operator's error against the float64 reference is at most
+    twice the float32 reference's own, for the output and for each gradient.
+
+    Errors are largest absolute differences over all draws of `make`: a tensor of four numbers is
+    too few to measure rounding with. Below four roundings of the largest value, a reference that
+    happens to be exact sets no bar.
+    """
+    errors: dict[str, list[float]] = {}
+    for _ in range(draws):
+        case = make()
+        oracle = results(case.to(f64), is_reference=True)
+        baseline = results(case, is_reference=True)
+        ours = results(case.to(on))
+        for name, exact in oracle.items():
+            got = ours[name].cpu()
+            assert got.dtype == f32 and got.shape == exact.shape
+            assert torch.equal(got.isnan(), exact.isnan()), f"{name} is NaN elsewhere"
+            if exact.numel() == 0:
+                continue
+            rounding = torch.finfo(f32).eps * exact.abs().max()
+            row = [(got - exact).abs().max(), (baseline[name] - exact).abs().max(), rounding]
+            before = errors.get(name, [0.0] * 3)
+            errors[name] = [max(a, b.item()) for a, b in zip(before, row, strict=True)]
+    for name, (error, base, rounding) in errors.items():
+        allowed = max(times * base, 4 * rounding)
+        assert error <= allowed, f"{name}: error {error:.3g}, allowed {allowed:.3g}"
+
+
+def raw_calls(case: Case) -> list[tuple[torch._ops.OpOverload, list]]:
+    """The compiled operator and its backward, each with the arguments that the case gives them."""
+    calls, call = [], _library.call
+
+    def spy(operator, arguments):
+        calls.append((operator, list(arguments)))
+        return call(operator, arguments)
+
+    with mock.patch.object(_library, "call", spy), torch.enable_grad():
+        results(case)
+    return calls
+
+
+# -- calls -----------------------------------------------------------------------------------------
+
+
+def places(radii, azimuths, center, affine, offsets, batch, jitter, seed) -> tuple[Tensor, ...]:
+    """x, y and radius of the points, (B, N_r, N_a) each, in float64."""
+    radii, azimuths, center = radii.double(), azimuths.double(), center.double()
+    r, a = radii[:, :, None], azimuths[None, None]
+    if jitter > 0 and radii.shape[1] and len(azimuths):
+        amount = torch.tensor(jitter, dtype=f64)
+        r, a = reference._jittered(radii, azimuths, batch, amount, torch.tensor(seed))
+    x, y = r * torch.cos(a), r * torch.sin(a)
+    if affine is not None:
+        (xx, xy), (yx, yy) = affine.double().permute(1, 2, 0)[..., None, None]
+        x, y = xx * x + xy * y, yx * x + yy * y
+    x, y = center[:, 0, None, None] + x, center[:, 1, None, None] + y
+    if offsets is not None:
+        x, y = x + offsets[:, 0].double(), y + offsets[:, 1].double()
+    shape = (batch, radii.shape[1], len(azimuths))
+    return x.expand(shape), y.expand(shape), r.expand(shape)
+
+
+def to_tokens(planes: Tensor, samples: tuple[int, int]) -> Tensor:
+    """(B, C, R·S_r, A·S_φ) → (B, R, A, S_r·S_φ·C), by torch alone."""
+    batch, channels, rows, columns = planes.shape
+    rings, sectors = rows // samples[0], columns // samples[1]
+    parts = planes.reshape(batch, channels, rings, samples[0], sectors, samples[1])
+    return parts.permute(0, 2, 4, 3, 5, 1).reshape(
+        batch, rings, sectors, samples[0] * samples[1] * channels
+    )
+
+
+def sampling_call(
+    inputs: dict[str, Tensor], azimuths: Tensor, samples: tuple[int, int], layout: str = "tokens",
+    jitter: float = 0.0, seed: int = 0, **others,
+) -> Case:  # fmt: skip
+    """A call of polar_sample, or of polar_embed if the inputs have a weight."""
+    embed, channels = "weight" in inputs, inputs["image"].shape[1]
+    options = dict(samples=samples, jitter=jitter, seed=seed)
+    if not embed:
+        options["layout"] = layout
+    settings = options | dict(azimuths=azimuths)
+
+    def run(image, radii, center, weight=None, bias=None, **general):
+        grid = (image, radii, settings["azimuths"].to(radii), center)
+        if embed:
+            return polar_embed(*grid, weight, bias, **general, **options, **others)
+        return polar_sample(*grid, **general, **options, **others)
+
+    def mask(image, radii, center, weight=None, bias=None, affine=None, offsets=None):
+        """Bilinear gradients jump at borders of pixels, and where jitter meets the radius 0."""
+        grid = (radii, settings["azimuths"], center, affine, offsets)
+        lens = (t if t is None else t.cpu() for t in grid)
+        x, y, r = places(*lens, len(image), jitter, seed)
+        smooth = ((x - x.round()).abs() > 1e-3) & ((y - y.round()).abs() > 1e-3)
+        if jitter > 0:
+            smooth &= r > 1e-3
+        if embed:  # a token has a gradient if all of its samples may have one
+            return to_tokens(smooth[:, None].to(f64), samples).amin(-1, keepdim=True)
+        planes = smooth[:, None].expand(-1, channels, -1, -1).to(f64)
+        return planes if layout == "image" else to_tokens(planes, samples)
+
+    return Case(run, inputs, mask, settings)
+
+
+def sampling(
+    batch=2, channels=3, size=(17, 23), rows=6, columns=8, samples=(3, 4), shared=False,
+    affine=False, offsets=False, far=1.0, features=None, bias=True, dtype=f32, **options,
+) -> Case:  # fmt: skip
+    """polar_sample, or with `features` polar_embed: points inside, on the border and outside. The
+    matrix more than doubles some lengths; offsets are of `far` px, now and then of the image's
+    size."""
+    lenses, reach = 1 if shared else batch, max(size)
+    center = torch.tensor([(size[1] - 1) / 2, (size[0] - 1) / 2], dtype=dtype)
+    inputs = dict(
+        image=torch.randn(batch, channels, *size, dtype=dtype),
+        radii=torch.rand(lenses, rows, dtype=dtype).sort(1).values * reach * 0.7,
+        center=center + torch.rand(lenses, 2, dtype=dtype),
+    )
+    if affine:
+        inputs["affine"] = torch.eye(2, dtype=dtype) + 0.5 * torch.randn(lenses, 2, 2, dtype=dtype)
+    if offsets:
+        moves = far * torch.randn(lenses, 2, rows, columns, dtype=dtype)
+        jumps = torch.rand(lenses, 1, rows, columns) < 0.1
+        inputs["offsets"] = torch.where(jumps, moves * reach, moves)
+    if features is not None:
+        depth = samples[0] * samples[1] * channels
+        inputs["weight"] = torch.randn(features, depth, dtype=dtype) / math.sqrt(depth or 1)
+        if bias:
+            inputs["bias"] = torch.randn(features, dtype=dtype)
+    azimuths = (torch.arange(columns, dtype=f64) + 0.37) * (2 * math.pi / max(columns, 1))
+    return sampling_call(inputs, azimuths.to(dtype), samples, **options)
+
+
+def attention_call(inputs: dict[str, Tensor], **options) -> Case:
+    """A call of window_attention."""
+    return Case(lambda qkv, bias: window_attention(qkv, bias, **options), inputs, None, options)
+
+
+def attention(
+    batch=2, rings=4, sectors=8, heads=2, head_dim=5, window=(2, 4), bias_rows=1, dtype=f32,
+    **options,
+) -> Case:  # fmt: skip
+    table = (bias_rows, heads, 2 * window[0] - 1, 2 * window[1] - 1)
+    inputs = dict(qkv=torch.randn(batch, rings, sectors, 3, heads, head_dim, dtype=dtype))
+    inputs["bias"] = torch.randn(table, dtype=f32 if dtype == bf16 else dtype)
+    return attention_call(inputs, window=window, **options)
+
+
+def on_polar_plane(size, radii=None, center=None, affine=None, points=None):
+    """Radius and azimuth of the pixels, (N, H, W) each, in float64."""
+    if points is None:
+        y, x = (torch.arange(n, dtype=f64) for n in size)
+        pixels = torch.stack(torch.meshgrid(x, y, indexing="xy"), -1)
+        points = pixels - center[:, None, None]
+        if affine is not None:
+            points = torch.linalg.solve(affine[:, None, None], points[..., None])[..., 0]
+    x, y = points.unbind(-1)
+    return torch.hypot(x, y), torch.atan2(y, x)
+
+
+def map_call(inputs: dict[str, Tensor], size: tuple[int, int], layout="image", **options) -> Case:
+    """A call of polar_to_image."""
+    sectors = inputs["x"].shape[2]
+
+    def run(x, radii, center=None, **lens):
+        return polar_to_image(x, radii, center, size, layout=layout, **lens, **options)
+
+    def mask(x, radii, **lens):
+        """Gradients of the lens jump at ring centres, at the middles of sectors and at the pole."""
+        r, azimuth = on_polar_plane(size, **{name: t.cpu() for name, t in lens.items()})
+        column = azimuth * (sectors / (2 * math.pi)) - 0.5
+        columns = torch.stack((column, column + sectors / 2))
+        smooth = ((columns - columns.round()).abs() > 1e-3).all(0) & (r > 0.5)
+        smooth = smooth & ((r[..., None] - radii.cpu()[:, None, None]).abs() > 1e-3).all(-1)
+        smooth = smooth.expand(len(x), *smooth.shape[1:]).to(f64)
+        return smooth[..., None] if layout == "tokens" else smooth[:, None]
+
+    return Case(run, inputs, mask, dict(size=size, layout=layout, **options))
+
+
+def polar_map(
+    batch=2, rings=4, sectors=8, channels=3, size=(19, 23), lenses=1, general=None, reach=9.0,
+    dtype=f32, **options,
+) -> Case:  # fmt: skip
+    """polar_to_image through a circular lens, with `affine`, or of `points`."""
+    rising = (torch.rand(lenses, rings, dtype=f64) + 0.3).cumsum(1) * reach / rings
+    inputs = dict(x=torch.randn(batch, rings, sectors, channels, dtype=dtype))
+    inputs["radii"] = rising.to(f32 if dtype == bf16 else dtype)
+    middle = torch.tensor([(size[1] - 1) / 2, (size[0] - 1) / 2], dtype=f64)
+    if general == "points":
+        inputs["points"] = reach / 2 * torch.randn(lenses, *size, 2, dtype=f64)
+    else:
+        inputs["center"] = middle + 0.3 + 0.1 * torch.rand(lenses, 2, dtype=f64)
+    if general == "affine":
+        skew = torch.randn(lenses, 2, 2, dtype=f64).clamp(-2, 2)
+        inputs["affine"] = torch.eye(2, dtype=f64) + 0.15 * skew
+    lens = {name: t.to(inputs["radii"].dtype) for name, t in inputs.items() if name != "x"}
+    return map_call(inputs | lens, size, **options)
+
+
+# -- named cases -----------------------------------------------------------------------------------
+
+NEAR = dict(size=(31, 33), rows=40, columns=64)
+SAMPLING = {
+    "plain": dict(),
+    "shared lens": dict(batch=5, shared=True, samples=(2, 2)),
+    "one ring, one sector": dict(rows=4, columns=3, samples=(4, 3)),
+    "one point": dict(rows=1, columns=1, samples=(1, 1)),
+    "odd rows": dict(rows=3, columns=13, samples=(1, 13)),
+    "one pixel": dict(size=(1, 1), samples=(3, 2)),
+    "thin image": dict(size=(1, 37), channels=1, samples=(1, 8)),
+    "many channels": dict(channels=33, batch=1, samples=(2, 4)),
+    "empty batch": dict(batch=0, shared=True),
+    "no lenses": dict(batch=0),
+    "no points": dict(rows=0),
+    "no channels": dict(channels=0),
+    # What csrc/kernels tells apart.
+    "cells": NEAR | dict(samples=(10, 8)),
+    "cells, one channel": NEAR | dict(columns=63, channels=1, samples=(8, 3)),
+    "cells, two channels": NEAR | dict(channels=2, samples=(4, 4)),
+    "cells, four channels": NEAR | dict(channels=4, batch=1, samples=(4, 4)),
+    "packed, six channels": NEAR | dict(channels=6, samples=(4, 4)),
+    "packed, 64 channels": dict(size=(16, 17), rows=20, columns=32, channels=64, batch=1,
+                                samples=(4, 4)),
+    "packed, large": dict(size=(200, 180), rows=80, columns=160, batch=1, samples=(8, 8)),
+    "in place": dict(size=(200, 180), rows=8, columns=16, samples=(4, 4)),
+    "in place, large": dict(size=(400, 390), rows=20, columns=16, batch=1, samples=(4, 4)),
+    "in place, shared": dict(size=(90, 80), rows=8, columns=15, shared=True, samples=(4, 5)),
+    "many tokens": dict(size=(31, 33), rows=80, columns=640, batch=1, samples=(10, 10)),
+    "long rows": dict(size=(31, 33), rows=2, columns=3001, batch=1, samples=(1, 3001)),
+    "long tokens": dict(size=(31, 33), rows=60, columns=120, batch=1, samples=(60, 60)),
+}  # fmt: skip
+SAMPLING_WITH = {
+    "circular": dict(),
+    "jitter": dict(jitter=0.8, seed=3, layout="image"),
+    "affine": dict(affine=True, layout="image"),
+    "offsets": dict(offsets=True, jitter=0.8, seed=3),
+    "general": dict(affine=True, offsets=True, jitter=0.8, seed=-5),
+}
+EMBEDDING = {
+    "plain": dict(size=(31, 33), rows=12, columns=40, samples=(4, 5), features=20),
+    "no bias": dict(features=20, bias=False),
+    "paper": dict(size=(64, 66), rows=20, columns=640, samples=(10, 10), features=96, batch=1),
+    "one token": dict(rows=1, columns=1, samples=(1, 1), features=1, channels=1),
+    "odd": dict(size=(31, 33), rows=9, columns=21, samples=(3, 3), features=37, channels=2),
+    "many features": dict(rows=12, columns=25, samples=(4, 5), features=200),
+    "deep": dict(rows=36, columns=36, samples=(12, 12), features=50, channels=4),
+    "six channels": NEAR | dict(samples=(4, 4), channels=6, features=48),
+    "large image": dict(size=(300, 302), rows=8, columns=20, samples=(4, 5), features=20),
+    "shared lens": dict(batch=5, shared=True, samples=(2, 2), features=20),
+    "empty batch": dict(batch=0, features=20),
+    "no rings": dict(rows=0, features=20),
+    "no azimuths": dict(columns=0, features=20),
+    "no channels": dict(channels=0, features=20),
+    "no features": dict(features=0),
+}
+EMBEDDING_WITH = {
+    "circular": dict(),
+    "general": dict(affine=True, offsets=True, jitter=0.8, seed=3),
+}
+ATTENTION = {
+    "DarSwin-A stage 1": dict(rings=3, sectors=64, head_dim=32, window=(1, 16), shift=(0, 4)),
+    "DarSwin-A stage 2": dict(rings=3, sectors=16, head_dim=32, window=(1, 16), shift=(0, 4),
+                              periodic=(False, False)),
+    "DarSwin-A stage 3": dict(rings=16, sectors=4, window=(4, 4), bias_rows=2, shift=(2, 0)),
+    "DarSwin-A stage 4": dict(rings=16, sectors=1, window=(16, 1), bias_rows=2, shift=(4, 0)),
+    "DarSwin-RA": dict(rings=8, sectors=32, window=(4, 4), shift=(2, 2)),
+    "Swin": dict(rings=8, sectors=8, window=(4, 4), shift=(2, 2), periodic=(False, False)),
+    "both axes periodic": dict(shift=(3, 7), periodic=(True, True)),
+    "radius periodic": dict(shift=(1, 3), periodic=(True, False)),
+    "head dim 1": dict(head_dim=1, heads=3, window=(4, 2), scale=0.7),
+    "head dim 33": dict(head_dim=33, shift=(1, 1)),
+    "odd windows": dict(rings=9, sectors=35, window=(3, 7), bias_rows=2, shift=(2, 5)),
+    "one token a window": dict(window=(1, 1), shift=(1, 1)),
+    "one token": dict(rings=1, sectors=1, window=(1, 1)),
+    "one window of 1024": dict(batch=1, rings=16, sectors=64, heads=1, window=(16, 64),
+                               shift=(3, 0)),
+    "windows without tables of pairs": dict(rings=16, sectors=18, head_dim=24, window=(8, 9),
+                                            bias_rows=2, shift=(3, 4), periodic=(False, False)),
+    "several chunks of windows": dict(batch=3, rings=16, sectors=32, heads=3, head_dim=8,
+                                      shift=(1, 2)),
+    "empty batch": dict(batch=0),
+    "no heads": dict(heads=0),
+}  # fmt: skip
+MAPS = {
+    "small": dict(),
+    "tokens": dict(channels=33, layout="tokens"),
+    "a lens an image": dict(lenses=2, channels=17, r_max=8.7),
+    "affine": dict(lenses=2, general="affine"),
+    "points": dict(general="points", layout="tokens"),
+    "one ring": dict(rings=1, sectors=16, r_max=7.3),
+    "one sector": dict(sectors=1, channels=16, layout="tokens"),
+    "odd sectors": dict(sectors=7, channels=40),
+    "one channel": dict(channels=1, sectors=64, rings=16),
+    "wide": dict(channels=20, size=(5, 150)),
+    "one pixel": dict(size=(1, 1)),
+    "empty batch": dict(batch=0),
+    "no channels": dict(channels=0),
+    "no pixels": dict(size=(0, 4)),
+}
+
+# (operator, name) → a function that makes the case in a dtype.
+CASES: dict[tuple[str, str], Callable[..., Case]] = {}
+for table, variants, operator in (
+    (SAMPLING, SAMPLING_WITH, "polar_sample"), (EMBEDDING, EMBEDDING_WITH, "polar_embed"),
+):  # fmt: skip
+    for name, sizes in table.items():
+        for variant, more in variants.items():
+            CASES[operator, f"{name}, {variant}"] = functools.partial(sampling, **sizes, **more)
+for name, sizes in ATTENTION.items():
+    CASES["window_attention", name] = functools.partial(attention, **sizes)
+for name, sizes in MAPS.items():
+    CASES["polar_to_image", name] = functools.partial(polar_map, **sizes)
+
+# A small case of each operator with every input that it has, and one without the optional ones.
+SMALL = {
+    "polar_sample": functools.partial(
+        sampling, size=(7, 8), rows=4, columns=6, samples=(2, 3), affine=True, offsets=True,
+        jitter=0.6, seed=11,
+    ),
+    "polar_sample, circular": functools.partial(
+        sampling, size=(7, 8), rows=4, columns=6, samples=(2, 3), layout="image"
+    ),
+    "polar_embed": functools.partial(
+        sampling, size=(7, 8), rows=4, columns=6, samples=(2, 3), features=3, affine=True,
+        offsets=True, jitter=0.5, seed=1,
+    ),
+    "polar_embed, circular": functools.partial(
+        sampling, size=(7, 8), rows=4, columns=6, samples=(2, 2), features=3, bias=False
+    ),
+    "window_attention": functools.partial(attention, rings=4, sectors=4, head_dim=3, shift=(1, 2)),
+    "window_attention, a bias an image": functools.partial(
+        attention, rings=4, sectors=4, head_dim=3, shift=(1, 2), periodic=(False, False),
+        bias_rows=2, scale=0.7,
+    ),
+    "polar_to_image": functools.partial(
+        polar_map, rings=3, sectors=5, channels=2, size=(5, 4), lenses=2, reach=3.0,
+        general="affine", r_max=40.0,
+    ),
+    "polar_to_image, circular": functools.partial(
+        polar_map, rings=3, sectors=5, channels=2, size=(5, 4), reach=3.0, layout="tokens"
+    ),
+    "polar_to_image, points": functools.partial(
+        polar_map, rings=3, sectors=5, channels=2, size=(5, 4), lenses=2, reach=3.0,
+        general="points",
+    ),
+}  # fmt: skip

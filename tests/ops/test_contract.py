@@ -1,0 +1,367 @@
+"""The contract of the public operators: each property holds for each of them.
+
+Random arguments are in test_properties.py, derivatives that the operators lack in test_library.py,
+wrong arguments in test_errors.py."""
+
+import pytest
+import torch
+from cases import (
+    CASES,
+    SMALL,
+    assert_accurate,
+    assert_equal_results,
+    assert_same_bits_on_any_number_of_threads,
+    attention,
+    bf16,
+    f32,
+    f64,
+    polar_map,
+    raw_calls,
+    results,
+    sampling,
+)
+from torch._dynamo.testing import CompileCounter
+
+from darswin.ops import use_reference
+
+every_case = pytest.mark.parametrize("case", CASES, ids=": ".join)
+small_cases = pytest.mark.parametrize("name", SMALL)
+references = pytest.mark.parametrize("reference", [False, True])
+
+
+# -- values, on every path of the kernels ----------------------------------------------------------
+
+
+@every_case
+def test_equals_the_reference_in_float64(case):
+    made = CASES[case](dtype=f64)
+    expected = results(made, is_reference=True, masked=False)
+    assert_equal_results(results(made, masked=False), expected, 1e-11)
+
+
+@every_case
+def test_accuracy_rule(case):
+    assert_accurate(CASES[case], draws=10 if "general" in case[1] else 3)
+
+
+@every_case
+def test_same_bits_for_any_number_of_threads(case):
+    every, counts = CASES[case](), (1, 2, 3, 7)
+    first = next(iter(every.inputs))
+    # One image is cut into bands, one a thread.
+    for made in (every, every.first_image())[: 1 + (len(every.inputs[first]) > 1)]:
+        assert_same_bits_on_any_number_of_threads(lambda c=made: results(c), counts)
+        # The gradient of the first input alone takes another way through the kernels.
+        assert_same_bits_on_any_number_of_threads(lambda c=made: results(c, only=[first]), counts)
+
+
+@every_case
+def test_bfloat16_is_float32_rounded_once(case):
+    wide = CASES[case]()
+    first = next(iter(wide.inputs))
+    narrow = wide.replace(**{first: wide.inputs[first].to(bf16)})
+    wide = wide.replace(**{first: narrow.inputs[first].float()})
+    ours, expected = results(narrow), results(wide)
+    assert ours["out"].dtype == ours[first].dtype == bf16
+    if case[0] == "window_attention":
+        # Sums may run in another order: the last bit of float32 may differ, and so the rounding.
+        torch.testing.assert_close(ours["out"].float(), expected["out"], rtol=2**-7, atol=1e-5)
+        same = (ours["out"] == expected["out"].to(bf16)).float()
+        assert same.numel() == 0 or same.mean() > 0.99
+    else:
+        assert torch.equal(ours["out"], expected["out"].to(bf16))
+    # The gradient that arrives is rounded to bfloat16 as well.
+    for name in wide.inputs:
+        want = expected[name]
+        assert ours[name].dtype == (bf16 if name == first else f32)
+        size = want.abs().max().item() if want.numel() else 0.0
+        torch.testing.assert_close(ours[name].float(), want, rtol=0.02, atol=0.02 * size)
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: attention(rings=4, sectors=16, head_dim=16, window=(4, 4), shift=(2, 1)),
+        lambda: sampling(rows=40, columns=32, samples=(4, 4)),
+    ],
+    ids=["window_attention", "polar_sample"],
+)
+@pytest.mark.parametrize("scale", [1e-30, 1e-20, 30.0, 1e30])
+def test_accuracy_rule_at_extreme_values(make, scale):
+    def scaled():
+        case = make()
+        name, values = next(iter(case.inputs.items()))
+        # Logits of 1e60 are infinite: attention's softmax is sharp with far less.
+        return case.replace(**{name: values * (min(scale, 30.0) if name == "qkv" else scale)})
+
+    assert_accurate(scaled)
+
+
+# -- arguments in memory ---------------------------------------------------------------------------
+
+
+def elsewhere(tensor: torch.Tensor, kind: str) -> torch.Tensor:
+    """The same values with gaps, or in another order in memory."""
+    if kind == "gaps":
+        return torch.stack((tensor, tensor), -1)[..., 0]
+    back = list(range(tensor.dim() - 1, -1, -1))
+    return tensor.permute(back).contiguous().permute(back)
+
+
+@pytest.mark.parametrize("kind", ["gaps", "turned"])
+@small_cases
+def test_strides_do_not_matter(name, kind):
+    made = SMALL[name](dtype=f64)
+    strided = made.replace(**{name: elsewhere(t, kind) for name, t in made.inputs.items()})
+    if "azimuths" in made.settings:
+        made.settings["azimuths"] = elsewhere(made.settings["azimuths"], "gaps")
+    assert any(not t.is_contiguous() for t in strided.inputs.values())
+    assert_equal_results(results(strided), results(made), 1e-12)
+    assert torch.equal(results(strided)["out"], results(made)["out"])
+
+
+@small_cases
+def test_gradients_may_arrive_expanded(name):
+    made = SMALL[name]()
+    leaves = {name: t.requires_grad_() for name, t in made.inputs.items()}
+    from_sum = torch.autograd.grad(made.run(**leaves).sum(), leaves.values())  # stride 0 arrives
+    out = made.run(**leaves)
+    from_ones = torch.autograd.grad(out, leaves.values(), torch.ones_like(out))
+    assert all(torch.equal(a, b) for a, b in zip(from_sum, from_ones, strict=True))
+
+
+@small_cases
+def test_an_expanded_image_is_one_image(name):
+    one = SMALL[name]().first_image()
+    first, values = next(iter(one.inputs.items()))
+    many = one.replace(**{first: values.expand(2, *values.shape[1:])})
+    out, alone = many.run(**many.inputs), one.run(**one.inputs)
+    assert torch.equal(out[:1], alone)
+    assert one.settings.get("jitter") or torch.equal(out[1:], alone)  # jitter is each image's own
+
+
+@small_cases
+def test_only_the_gradients_asked_for(name):
+    made = SMALL[name]()
+    every = results(made)
+    for one in made.inputs:
+        assert_equal_results(results(made, only=[one]), {one: every[one]})
+
+
+@small_cases
+def test_a_lens_of_all_images_gets_the_sum_over_them(name):
+    made = SMALL[name](dtype=f64)
+    shared = [n for n in made.inputs if n not in ("image", "weight", "bias", "qkv", "x")]
+    shared += ["bias"] if "qkv" in made.inputs else []
+    one = {n: made.inputs[n][:1] for n in shared}
+    rows = {n: t.repeat(2, *[1] * (t.dim() - 1)) for n, t in one.items()}
+    own = results(made.replace(**rows))
+    for given in ([n] for n in shared), (shared,):
+        for names in given:
+            ours = results(made.replace(**(rows | {n: one[n] for n in names})))
+            expected = dict(own, **{n: own[n].sum(0, keepdim=True) for n in names})
+            assert_equal_results(ours, expected, 1e-12)
+
+
+# -- torch's own machinery -------------------------------------------------------------------------
+
+
+@references
+@small_cases
+def test_gradcheck(name, reference):
+    made = SMALL[name](dtype=f64)
+    leaves = [t.requires_grad_() for t in made.inputs.values()]
+    with use_reference(reference):
+        assert torch.autograd.gradcheck(
+            lambda *tensors: made.run(**dict(zip(made.inputs, tensors, strict=True))), leaves
+        )
+
+
+@pytest.mark.parametrize("dtype", [f32, bf16])
+@small_cases
+def test_opcheck(name, dtype):
+    made = SMALL[name]()
+    first = next(iter(made.inputs))
+    made = made.replace(**{first: made.inputs[first].to(dtype)})
+    (operator, arguments), (backward, of_backward) = raw_calls(made)
+    for wanted in (False, True):
+        given = [
+            a.detach().requires_grad_(wanted) if any(a is t for t in made.inputs.values()) else a
+            for a in arguments
+        ]
+        torch.library.opcheck(operator, given)
+    names = [argument.name for argument in backward._schema.arguments]
+    bools = range(names.index("grad_out") + 1, len(names))
+    for one in (None, *bools):  # all gradients, then each group of them alone
+        given = [one in (None, k) if k in bools else a for k, a in enumerate(of_backward)]
+        found = backward(*given)
+        fake = backward(*(a.to("meta") if isinstance(a, torch.Tensor) else a for a in given))
+        assert [(t.shape, t.dtype) for t in found] == [(t.shape, t.dtype) for t in fake]
+        if sum(t.numel() == 0 for t in found) < 2:  # to opcheck, two empty tensors are one
+            checks = ("test_schema", "test_faketensor")
+            torch.library.opcheck(backward, given, test_utils=checks)
+
+
+@small_cases
+def test_no_second_derivative(name):
+    made = SMALL[name]()
+    leaf = next(iter(made.inputs.values())).requires_grad_()
+    for reference in (True, False):
+        with use_reference(reference):
+            out = made.run(**made.inputs)
+        (grad,) = torch.autograd.grad(out.square().sum(), leaf, create_graph=True)
+        if reference:
+            grad.sum().backward()
+            continue
+        with pytest.raises(NotImplementedError, match="no second derivative"):
+            grad.sum().backward()
+
+
+@pytest.mark.slow
+@pytest.mark.unsanitized
+@pytest.mark.parametrize("backend", ["aot_eager", "inductor"])
+@small_cases
+def test_compile_fullgraph(name, backend):
+    made = SMALL[name]()
+    torch._dynamo.reset()
+    run = made.run
+    expected = results(made)
+    made.run = torch.compile(
+        lambda **inputs: run(**{n: t * 1 for n, t in inputs.items()}) * 1,
+        fullgraph=True, backend=backend,
+    )  # fmt: skip
+    assert_equal_results(results(made), expected, 1e-5)
+
+
+@pytest.mark.slow
+@pytest.mark.unsanitized
+@small_cases
+def test_one_graph_for_inference_and_one_for_training(name):
+    torch._dynamo.reset()
+    counter, made = CompileCounter(), SMALL[name]()
+    compiled = torch.compile(made.run, fullgraph=True, backend=counter)
+    for training in (False, True):
+        for _ in range(3):
+            compiled(**{n: t.detach().requires_grad_(training) for n, t in made.inputs.items()})
+    assert counter.frame_count == 2
+
+
+@pytest.mark.slow
+@pytest.mark.unsanitized
+@small_cases
+def test_compiles_for_any_batch(name):
+    torch._dynamo.reset()
+    made = SMALL[name]()
+    compiled = torch.compile(made.run, fullgraph=True, dynamic=True, backend="aot_eager")
+    images = ("image", "qkv", "x")
+    for count in (1, 2):
+        many = {n: t.repeat(count, *[1] * (t.dim() - 1)) if n in images else t[:1]
+                if n not in ("weight", "bias") else t for n, t in made.inputs.items()}  # fmt: skip
+        if "qkv" in many:
+            many["bias"] = made.inputs["bias"][:1]
+        assert torch.equal(compiled(**many), made.run(**many))
+
+
+@pytest.mark.slow
+@pytest.mark.unsanitized
+@small_cases
+def test_export(name):
+    class Module(torch.nn.Module):
+        def forward(self, inputs):
+            return made.run(**inputs)
+
+    made = SMALL[name]()
+    first = next(iter(made.inputs))
+    program = torch.export.export(Module(), (made.inputs,))
+    other = {n: torch.rand_like(t) if n == first else t for n, t in made.inputs.items()}
+    assert torch.equal(program.module()(other), made.run(**other))
+
+
+@small_cases
+def test_other_devices_run_the_reference(name):
+    made = SMALL[name]()
+    out = made.run(**made.inputs)
+    there = made.to(torch.device("meta"))
+    if "azimuths" in there.settings:
+        there.settings["azimuths"] = there.settings["azimuths"].to("meta")
+    with torch.library._scoped_library("darswin", "FRAGMENT"):
+        found = there.run(**{n: t.requires_grad_() for n, t in there.inputs.items()})
+    assert found.shape == out.shape and found.dtype == out.dtype and found.device.type == "meta"
+    assert "darswin" not in str(found.grad_fn) and "Generated" not in type(found.grad_fn).__name__
+
+
+# -- types -----------------------------------------------------------------------------------------
+
+
+@references
+@small_cases
+def test_autocast(name, reference):
+    made = SMALL[name]()
+    samples = name.startswith(("polar_sample", "polar_embed"))
+    expected = results(made)
+    run = made.run
+
+    def autocast(**inputs):
+        with torch.autocast("cpu", dtype=bf16):
+            return run(**inputs)
+
+    made.run = autocast
+    with use_reference(reference):
+        ours = results(made, is_reference=reference)
+        assert ours["out"].dtype == (bf16 if samples else f32)
+        for key, want in expected.items():
+            size = want.abs().max().item()
+            assert key in ("out", "grad") or ours[key].dtype == f32
+            torch.testing.assert_close(ours[key].float(), want, rtol=0.02, atol=0.02 * size)
+        assert autocast(**SMALL[name](dtype=f64).inputs).dtype == f64 or samples
+
+
+@references
+@pytest.mark.parametrize("name", ["polar_sample, circular", "window_attention", "polar_to_image"])
+def test_float16_is_float32_under_autocast(name, reference):
+    made = SMALL[name]()
+    first, values = next(iter(made.inputs.items()))
+    half, wide = (made.replace(**{first: v}) for v in (values.half(), values.half().float()))
+    with use_reference(reference):
+        with torch.autocast("cpu", dtype=torch.float16):
+            assert torch.equal(half.run(**half.inputs), wide.run(**wide.inputs))
+        with pytest.raises(TypeError, match=r"bfloat16.*, got torch.float16"):
+            half.run(**half.inputs)
+
+
+@references
+def test_a_bias_and_weights_may_be_bfloat16(reference):
+    made = SMALL["window_attention"](dtype=bf16)
+    narrow = made.replace(bias=made.inputs["bias"].to(bf16))
+    layer = SMALL["polar_embed"]()
+    half = {n: layer.inputs[n].to(bf16) for n in ("weight", "bias")}
+    with use_reference(reference):
+        for case, names in ((narrow, ("bias",)), (layer.replace(**half), ("weight", "bias"))):
+            wide = case.replace(**{n: case.inputs[n].float() for n in names})
+            ours, expected = (results(c, is_reference=reference) for c in (case, wide))
+            assert torch.equal(ours["out"], expected["out"])
+            for n in names:
+                assert ours[n].dtype == bf16
+                torch.testing.assert_close(ours[n], expected[n].to(bf16), rtol=2**-7, atol=1e-3)
+
+
+@references
+def test_the_reference_rounds_bfloat16_once(reference):
+    """As the operators do, and so do the operators under autocast that has narrowed a bias."""
+    for name in ("window_attention", "polar_to_image", "polar_sample", "polar_embed, circular"):
+        made = SMALL[name]()
+        first = next(iter(made.inputs))
+        made = made.replace(**{first: made.inputs[first].to(bf16)})
+        with torch.autocast("cpu", dtype=bf16, enabled=reference):
+            ours, expected = results(made), results(made, is_reference=True)
+        for key, want in expected.items():
+            assert ours[key].dtype == want.dtype
+            size = want.abs().max().item()
+            torch.testing.assert_close(ours[key], want, rtol=2**-7, atol=2**-7 * size)
+
+
+def test_maps_of_any_type_keep_it_under_autocast():
+    made = polar_map(channels=20)
+    expected = made.run(**made.inputs)
+    with torch.autocast("cpu", dtype=bf16):
+        assert torch.equal(made.run(**made.inputs), expected)
