@@ -2,6 +2,7 @@
 
 import re
 from importlib.metadata import version as installed
+from pydoc import locate
 
 from sphinx.util.typing import stringify_annotation
 
@@ -28,16 +29,11 @@ napoleon_numpy_docstring = False
 napoleon_custom_sections = ["Convention", ("Keys", "params_style")]
 napoleon_use_rtype = False  # "(N,) rad" is a shape and a unit
 
-# Names of other projects, since the site is built without a network; and bases that are not public.
+# Names of other projects, since the site is built without a network.
 OTHERS = "torch|torchmetrics|numpy|np|matplotlib|lightning|"
 OTHERS += "collections|typing|os|pathlib|datetime|contextlib"
 UNITS = r"[A-Z]|\d|rad|px"  # of properties, whose docstrings begin with shape and unit
-PRIVATE = "LensBatch|LensDistribution|_Optimized|Sampling|Net|_Class|T"
-nitpick_ignore_regex = [
-    ("py:.*", rf"({OTHERS})\..*"),
-    ("py:.*", rf"darswin\..*\.({PRIVATE})"),
-    ("py:class", UNITS),
-]
+nitpick_ignore_regex = [("py:.*", rf"({OTHERS})\..*"), ("py:class", UNITS)]
 
 
 def one_a_line(app, what, name, obj, options, lines):
@@ -63,6 +59,13 @@ def short(app, what, name, obj, options, signature, returns):
     return signature and signature.replace(number, "~darswin.lens.Number"), returns
 
 
+def private(app, env, node, contnode):
+    """Leaves a name without a link where darswin has it, but not as a public name."""
+    target = node["reftarget"]
+    return contnode if target.startswith("darswin.") and locate(target) else None
+
+
 def setup(app):
     app.connect("autodoc-process-docstring", one_a_line, priority=1)  # before napoleon's
     app.connect("autodoc-process-signature", short)
+    app.connect("missing-reference", private)

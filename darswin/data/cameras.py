@@ -89,7 +89,7 @@ class Calibrations:
 
     @property
     def cameras(self) -> list[PictureCamera]:
-        """The different cameras: those of `files`, then those of `lens`."""
+        """The different cameras, those of `files` first, then those of `lens`."""
         return [*map(self._own, dict.fromkeys(self._files.values())), *self._shared()]
 
     def camera_of(self, picture: str | Path | None) -> PictureCamera:
