@@ -9,16 +9,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from darswin.bench.timing import (
-    COMPILED,
-    COMPILED_BFLOAT16,
-    FIXED_LENS,
-    MATMULS,
-    OURS,
-    OURS_BFLOAT16,
-    OURS_FLOAT32,
-    REFERENCE,
-)
+from darswin.bench import timing
 from darswin.deploy.optimize import optimize
 from darswin.deploy.packed import Product, packed
 from darswin.deploy.quantize import quantize_model
@@ -54,10 +45,9 @@ def inference(
 ) -> dict[str, Run]:
     """The candidates for inference, by name: images (B, 3, size, size) → logits.
 
-    The matrix products alone are those of the linear layers, one after the other with nothing
-    between, by oneDNN and with weights packed for it: the roofline of a model on this machine.
-    A model of 8 bits takes turns with itself in float32 and, where the CPU has it, bfloat16; its
-    reference is one of float32.
+    The matrix products alone are those of the linear layers, one after the other, by oneDNN and
+    with packed weights: the roofline of a model on this machine. A model of 8 bits takes turns with
+    itself in float32 and, where the CPU has it, bfloat16; its reference is one of float32.
     """
     model, lens = network(name, size).eval(), lens_of(size)
     images = torch.randn(batch, 3, size, size)
@@ -71,31 +61,31 @@ def inference(
     peers = [(copy.deepcopy(model).to(kind), images.to(kind)) for kind in theirs]
     peer, pixels = peers[0]
     runs: dict[str, Run] = {
-        OURS: optimized_run(ours, lens, dtype, images),
-        FIXED_LENS: lambda: ours_of_lens(images),
-        MATMULS: lambda: _all(products),
-        REFERENCE: reference_run(peer, lens, pixels),
+        timing.OURS: optimized_run(ours, lens, dtype, images),
+        timing.FIXED_LENS: lambda: ours_of_lens(images),
+        timing.MATMULS: lambda: _all(products),
+        timing.REFERENCE: reference_run(peer, lens, pixels),
     }
     if dtype == torch.int8:
-        for name, kind in zip((OURS_FLOAT32, OURS_BFLOAT16), theirs, strict=False):
+        for name, kind in zip((timing.OURS_FLOAT32, timing.OURS_BFLOAT16), theirs, strict=False):
             runs[name] = optimized_run(model, lens, kind, images)
     if compiled:
         torch._dynamo.reset()
-        for name, (peer, pixels) in zip((COMPILED, COMPILED_BFLOAT16), peers, strict=False):
+        names = (timing.COMPILED, timing.COMPILED_BFLOAT16)
+        for name, (peer, pixels) in zip(names, peers, strict=False):
             graph = torch.compile(peer, options={"freezing": True}, dynamic=False)
             runs[name] = reference_run(graph, lens, pixels)
     return {name: torch.no_grad()(run) for name, run in runs.items()}
 
 
 def _all(products: list[tuple[Product, Tensor]]) -> Tensor:
-    """The last of the products. The others' memory is freed at once, as it is within a model."""
+    # Only the last result is kept. The others' memory is freed at once, as it is within a model.
     for layer, x in products:
         result = layer(x)
     return result
 
 
 def optimized_run(model: Model, lens: Lens, dtype: torch.dtype, images: Tensor) -> Run:
-    """Inference by our operators; int8 of a quantized model."""
     optimized = optimize(model, dtype)
     return lambda: optimized(images, lens)
 
@@ -120,24 +110,21 @@ def matmuls_of(
     found: list[tuple[Product, Tensor]] = []
     for layer, rows in products_of(model, images, lens):
         x = torch.randn(rows, layer.in_features).to(rest)
-        if isinstance(layer, QuantizedLinear):
-            x = quantize(x, layer.activation)
-        found.append((packed(layer, rest), x))
+        is_quantized = isinstance(layer, QuantizedLinear)
+        found.append((packed(layer, rest), quantize(x, layer.activation) if is_quantized else x))
     return found
 
 
-def products_of(
-    model: Model, images: Tensor, lens: Lens
-) -> list[tuple[Linear | QuantizedLinear, int]]:
+def products_of(model: Model, images: Tensor, lens: Lens) -> list[tuple[Any, int]]:
     """The linear layers that a model runs, in turn, and the rows that each multiplies."""
-    found: list[tuple[Linear | QuantizedLinear, int]] = []
-    kinds = (Linear, QuantizedLinear, PolarPatchEmbed)
+    found: list[tuple[Any, int]] = []
 
     def hook(layer: Any, _inputs: tuple[Tensor], output: Tensor) -> None:
         # A polar embedding's linear layer is not called: `polar_embed` takes its weight.
         linear = layer.proj if isinstance(layer, PolarPatchEmbed) else layer
         found.append((linear, output.numel() // linear.out_features))
 
+    kinds = (Linear, QuantizedLinear, PolarPatchEmbed)
     layers = [layer for layer in model.modules() if isinstance(layer, kinds)]
     handles = [layer.register_forward_hook(hook) for layer in layers]
     with torch.no_grad():
@@ -150,8 +137,8 @@ def products_of(
 def operations_of(name: str, size: int) -> int:
     """Floating-point operations of a model's matrix products for one image."""
     image, lens = torch.randn(1, 3, size, size), lens_of(size)
-    products = matmuls_of(network(name, size).eval(), image, lens, torch.float32)
-    return sum(2 * x.numel() * layer.out_features for layer, x in products)
+    products = products_of(network(name, size).eval(), image, lens)
+    return sum(2 * rows * layer.in_features * layer.out_features for layer, rows in products)
 
 
 def training(name: str, size: int, dtype: torch.dtype, batch: int) -> dict[str, Run]:
@@ -161,9 +148,9 @@ def training(name: str, size: int, dtype: torch.dtype, batch: int) -> dict[str, 
     kinds of products that `autotune` chose.
     """
     return {
-        OURS: training_step(name, size, dtype, batch, reference=False),
-        REFERENCE: training_step(name, size, dtype, batch, reference=True),
-        MATMULS: training_products(name, size, dtype, batch),
+        timing.OURS: training_step(name, size, dtype, batch, reference=False),
+        timing.REFERENCE: training_step(name, size, dtype, batch, reference=True),
+        timing.MATMULS: training_products(name, size, dtype, batch),
     }
 
 
@@ -172,7 +159,7 @@ def training_products(name: str, size: int, dtype: torch.dtype, batch: int) -> R
     model = network(name, size)
     model.set_matmul_backend("autotune")
     images = torch.randn(batch, 3, size, size)
-    sides: list[tuple[Linear | QuantizedLinear, Tensor, list[Tensor], Tensor]] = []
+    sides: list[tuple[Any, Tensor, list[Tensor], Tensor]] = []
     for layer, rows in products_of(model.eval(), images, lens_of(size)):
         # The first product takes the images, whose gradient no training asks for.
         x = torch.randn(rows, layer.in_features, dtype=dtype, requires_grad=bool(sides))
@@ -198,12 +185,10 @@ def training_step(name: str, size: int, dtype: torch.dtype, batch: int, *, refer
     images = torch.randn(batch, 3, size, size)
     pixels = (size, size) if isinstance(model, Unet) else ()
     labels = torch.randint(model.num_classes, (batch, *pixels))
+    half = dtype == torch.bfloat16
 
     def step() -> Tensor:
-        with (
-            use_reference(reference),
-            torch.autocast("cpu", torch.bfloat16, enabled=dtype == torch.bfloat16),
-        ):
+        with use_reference(reference), torch.autocast("cpu", torch.bfloat16, enabled=half):
             loss = F.cross_entropy(model(images, lens).float(), labels)
         loss.backward()
         optimizer.step()

@@ -1,4 +1,4 @@
-"""What a measurement runs on: the machine, its instruction-set tiers, the number of threads."""
+"""The machine that is measured: CPU, instruction-set tiers, number of threads."""
 
 import contextlib
 import platform
@@ -58,15 +58,12 @@ def num_threads(count: int) -> Iterator[None]:
 
 
 def _cpu() -> str:
-    """Its name, and on x86 its family and model: the name of a virtual machine's may be its
-    maker's for years."""
+    # On x86 with family and model: a virtual machine may give its maker's name for years.
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
     except OSError:
         return platform.processor()
-    facts = {
-        key.strip(): value.strip() for key, _, value in (line.partition(":") for line in lines)
-    }
+    facts = {key.strip(): value.strip() for key, _, value in (s.partition(":") for s in lines)}
     name = facts.get("model name", platform.processor())
     if "cpu family" not in facts:
         return name
@@ -77,6 +74,5 @@ def _commit() -> str:
     root = Path(__file__).parent.parent.parent
     if not (root / ".git").exists():
         return ""
-    return subprocess.run(
-        ["git", "describe", "--always", "--dirty"], cwd=root, capture_output=True, text=True
-    ).stdout.strip()
+    command = ["git", "describe", "--always", "--dirty"]
+    return subprocess.run(command, cwd=root, capture_output=True, text=True).stdout.strip()

@@ -29,12 +29,12 @@ class Memory:
 
     @property
     def whole(self) -> int:
-        """Of the model, its optimizer and a batch."""
+        """Bytes of the model, its optimizer and a batch."""
         return self.peak - self.before
 
     @property
     def own(self) -> int:
-        """Of a batch, over what is there between two."""
+        """Bytes of a batch, over what is there between two."""
         return self.peak - self.between
 
 
@@ -58,8 +58,8 @@ def measure(
     mode: str, model: str, size: int, dtype: str, batch: int, name: str, threads: int
 ) -> Memory:
     """Measures `OURS` or `REFERENCE` in a new process."""
-    arguments = [mode, model, size, dtype, batch, name, threads]
-    command = [sys.executable, "-m", "darswin.bench.memory", *map(str, arguments)]
+    arguments = map(str, (mode, model, size, dtype, batch, name, threads))
+    command = [sys.executable, "-m", "darswin.bench.memory", *arguments]
     done = subprocess.run(command, capture_output=True, text=True)
     if done.returncode:
         raise RuntimeError(f"the peak memory of {name} cannot be measured: {done.stderr.strip()}")

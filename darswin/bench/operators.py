@@ -1,8 +1,7 @@
 """Operators against their peers: called alike, checked to be equal, timed on every tier.
 
-The contract: the median and interquartile range of calls; ours and every peer in the same process
-and run, in turns; outputs checked equal before anything is timed; every result is published,
-losses too.
+Ours and every peer run in the same process, in turns. Outputs are checked equal before anything is
+timed. Every result is published, losses too.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -32,9 +31,9 @@ def forward(run: Callable[..., Tensor], inputs: Sequence[Tensor]) -> Step:
 
 
 def forward_backward(run: Callable[..., Tensor], inputs: Sequence[Tensor], view: View) -> Step:
-    """A function that runs, and backpropagates a fixed gradient; returns output and gradients.
+    """A function that runs and backpropagates; returns output and gradients.
 
-    The gradient is the same for all candidates whose outputs are equal in `view`.
+    The output's gradient is the same for all candidates whose outputs are equal in `view`.
     """
     leaves = [t.detach().requires_grad_() for t in inputs]
     out = run(*leaves)
@@ -58,8 +57,7 @@ def check(
 ) -> None:
     """Calls all candidates; AssertionError unless they agree with `OURS` in `view`.
 
-    Args:
-        tolerance: of each value and of the largest one; None lets them differ.
+    The tolerance is of each value and of the largest one; None lets them differ.
     """
     expected = [view(result) for result in steps[OURS]()]
     for name, step in steps.items():
@@ -71,9 +69,8 @@ def check(
             try:
                 torch.testing.assert_close(got, want, rtol=tolerance, atol=tolerance * largest)
             except AssertionError as error:
-                raise AssertionError(
-                    f"{name} disagrees with ours in {case.label}: {error}"
-                ) from None
+                message = f"{name} disagrees with ours in {case.label}: {error}"
+                raise AssertionError(message) from None
 
 
 def compare(
@@ -86,13 +83,8 @@ def compare(
     tolerance: float | None = 1e-4,
     view: View = lambda result: result,
 ) -> list[Timing]:
-    """Checks that all candidates agree, then times them, as `case.mode` says with their gradients.
-
-    Ours is timed on every instruction-set tier of the machine: "darswin (avx2)" and so on.
-
-    Args:
-        targets: as `measure`. tolerance, view: as `check`.
-    """
+    """Checks that all candidates agree, then times them, as `case.mode` says with their gradients,
+    and ours on every instruction-set tier: "darswin (avx2)" and so on."""
     if case.mode.startswith("forward+backward"):
         steps = {name: forward_backward(run, inputs, view) for name, run in candidates.items()}
     else:
@@ -106,11 +98,8 @@ def compare(
 def run_suite(
     suite: str, jobs: Sequence[Callable[[], list[Timing]]], avx2_share: float, out: Path | None
 ) -> list[Timing]:
-    """Runs jobs at one and at all threads, and prints tables and targets.
-
-    Args:
-        avx2_share: of each target, on the AVX2 tier. out: a folder for the record and its plot.
-    """
+    """Runs jobs at one and at all threads, prints tables and targets, of which the AVX2 tier is to
+    reach a share, and writes the record and its plot to the folder `out`."""
     head = machine()
     print(" ".join(f"{k}={v}" for k, v in head.items()))
     timings: list[Timing] = []

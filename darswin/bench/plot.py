@@ -1,6 +1,6 @@
 """Pictures of what was measured. Only drawing needs matplotlib."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from textwrap import fill
 from typing import TYPE_CHECKING
@@ -29,9 +29,10 @@ def draw_peers(record: Record, path: Path) -> None:
             operator = t.subject.partition(",")[0]
             rows = found.setdefault(operator, {}).setdefault(f"{t.subject}\n{fill(t.mode, 26)}", {})
             rows.setdefault(f"{t.setting}, batch {t.batch}", {})[t.name] = t.ratio
-    lines = [line for panels in found.values() for line in _batched(panels.items(), COLUMNS)]
+    lines = [line for panels in found.values() for line in _lines(panels, COLUMNS)]
     names = dict.fromkeys(t.name for t in record.timings if not t.name.startswith(OURS))
-    _draw_panels(lines, list(names), "time of the peer / time of darswin, 1 thread", path, mark=1)
+    unit = "time of the peer / time of darswin, 1 thread"
+    _draw_panels(lines, list(names), unit, path, is_ratio=True)
 
 
 def draw_models(record: Record, path: Path) -> None:
@@ -43,22 +44,20 @@ def draw_models(record: Record, path: Path) -> None:
             rows = panels.setdefault(t.mode, {})
             rows.setdefault(f"batch {t.batch}", {})[t.name] = t.batch / t.median
     found = dict.fromkeys(t.name for t in record.timings)
-    order = (OURS, FIXED_LENS, REFERENCE, COMPILED, MATMULS)
-    names = sorted(found, key=lambda name: order.index(name) if name in order else len(order))
+    order = [OURS, FIXED_LENS, REFERENCE, COMPILED, MATMULS, *found]
     unit = f"images a second, {record.timings[0].subject}, {threads} threads"
-    _draw_panels(_batched(panels.items(), 2), names, unit, path)
+    _draw_panels(_lines(panels, 2), sorted(found, key=order.index), unit, path)
 
 
-def _batched(items: Iterable[tuple[str, Rows]], count: int) -> Panels:
-    """Lines of so many panels."""
-    panels = list(items)
-    return [panels[k : k + count] for k in range(0, len(panels), count)]
+def _lines(panels: dict[str, Rows], count: int) -> Panels:
+    items = list(panels.items())
+    return [items[k : k + count] for k in range(0, len(items), count)]
 
 
 def _draw_panels(
-    lines: Panels, names: Sequence[str], unit: str, path: Path, mark: float | None = None
+    lines: Panels, names: Sequence[str], unit: str, path: Path, is_ratio: bool = False
 ) -> None:
-    """Panels on one scale; on a logarithmic one with a line at `mark`, if there is one."""
+    """Panels on one scale, which for ratios is logarithmic, with a line at 1."""
     from matplotlib.figure import Figure
     from matplotlib.ticker import LogLocator
 
@@ -78,25 +77,24 @@ def _draw_panels(
             axes.tick_params(labelbottom=True)
             if axes is not beside[0] and list(rows) == list(line[0][1]):
                 axes.set_yticklabels([])
-            if mark is not None:
-                axes.axvline(mark, color="black", lw=1)
+            if is_ratio:
+                axes.axvline(1, color="black", lw=1)
         for axes in beside[len(line) :]:
             axes.set_axis_off()
-    if mark is None:
-        grid[0, 0].set_xlim(left=0)
-    else:
+    if is_ratio:
         grid[0, 0].set_xscale("log", base=2)
         for axes in grid.flat:
             axes.xaxis.set_major_locator(LogLocator(2, numticks=8))
             axes.xaxis.set_major_formatter("{x:g}×")
+    else:
+        grid[0, 0].set_xlim(left=0)
     figure.supxlabel(unit, fontsize="medium")
-    _name([legend[name] for name in names if name in legend], figure)
+    _draw_legend([legend[name] for name in names if name in legend], figure)
     save_figure(figure, path)
 
 
-def _name(handles: "list[Line2D]", figure: "Figure") -> None:
-    """A legend above all panels, of as many columns as fit beside each other, three at most where
-    there are many names."""
+def _draw_legend(handles: "list[Line2D]", figure: "Figure") -> None:
+    """As many columns as fit beside each other, three at most where there are many names."""
     for columns in range(len(handles) if len(handles) < 5 else 3, 0, -1):
         legend = figure.legend(handles=handles, loc="outside upper center", ncols=columns)
         if columns == 1 or legend.get_window_extent().width <= figure.bbox.width:
@@ -108,12 +106,10 @@ def _draw_rows(axes: "Axes", rows: Rows, names: Sequence[str]) -> "dict[str, Lin
     """A dot a name in each row, `MATMULS` pale; the dots by name."""
     drawn = {}
     for index, name in enumerate(names):
-        places = {k: group[name] for k, group in enumerate(rows.values()) if name in group}
-        if places:
+        dots = [(row[name], k) for k, row in enumerate(rows.values()) if name in row]
+        if dots:
             color = "0.7" if name == MATMULS else f"C{index}"
-            (drawn[name],) = axes.plot(
-                list(places.values()), list(places), "o", ms=6, color=color, label=name
-            )
+            (drawn[name],) = axes.plot(*zip(*dots, strict=True), "o", ms=6, color=color, label=name)
     axes.set_yticks(range(len(rows)), list(rows))
     axes.set_ylim(len(rows) - 0.4, -0.6)
     axes.grid(alpha=0.3)

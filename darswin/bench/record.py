@@ -5,6 +5,7 @@ import re
 import sys
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from pathlib import Path
 
 from darswin.bench.memory import Memory
@@ -14,28 +15,20 @@ from darswin.utils.files import replace_file
 
 @dataclass
 class Record:
-    """All that one run of a benchmark found.
+    """All that one run of a benchmark found."""
 
-    Args:
-        machine: as `darswin.bench.machine.machine` has it. operations: floating-point operations
-            of a model's matrix products for one image. autotune: rows of
-            `darswin.layers.linear.autotune_results`.
-    """
-
-    machine: dict
+    machine: dict  # of `darswin.bench.machine`
     timings: list[Timing]
     memory: list[Memory] = field(default_factory=list)
-    operations: int = 0
-    autotune: list[dict] = field(default_factory=list)
+    operations: int = 0  # of floating point, in a model's matrix products for one image
+    autotune: list[dict] = field(default_factory=list)  # rows of `autotune_results`
 
     def save(self, path: Path) -> None:
-        """Writes what is in it."""
         content = asdict(self, dict_factory=_known)
         write(path, **{key: value for key, value in content.items() if value})
 
     @classmethod
     def load(cls, path: Path) -> "Record":
-        """What `save` wrote."""
         content = json.loads(path.read_text())
         content["timings"] = [Timing(**row) for row in content["timings"]]
         content["memory"] = [Memory(**row) for row in content.get("memory", ())]
@@ -66,11 +59,10 @@ def write(path: Path, **content: object) -> None:
 
 
 def _lines(value: object) -> str:
+    dumps = partial(json.dumps, allow_nan=False)
     if isinstance(value, dict):
-        rows = [
-            f"  {json.dumps(key)}: {json.dumps(row, allow_nan=False)}" for key, row in value.items()
-        ]
+        rows = [f"  {dumps(key)}: {dumps(row)}" for key, row in value.items()]
         return "{\n" + ",\n".join(rows) + "\n }"
     if isinstance(value, list):
-        return "[\n" + ",\n".join(f"  {json.dumps(row, allow_nan=False)}" for row in value) + "\n ]"
-    return json.dumps(value, allow_nan=False)
+        return "[\n" + ",\n".join(f"  {dumps(row)}" for row in value) + "\n ]"
+    return dumps(value)

@@ -1,4 +1,4 @@
-"""What was measured as tables in Markdown; "a / b" is at one and at all threads."""
+"""Measurements as tables in Markdown; "a / b" is at one and at all threads."""
 
 from collections.abc import Iterable, Mapping, Sequence
 
@@ -45,15 +45,11 @@ def peers_table(timings: Sequence[Timing], subject: str, peers: Sequence[str] = 
     """A row a case of an operator, a column a peer, all by default, with its time over ours."""
     chosen = [t for t in timings if t.subject == subject]
     peers = peers or [name for name in dict.fromkeys(t.name for t in chosen) if name != OURS]
-    rows = [
-        [
-            f"{setting}, batch {batch}, {mode}",
-            _milliseconds(found[OURS]),
-            *(_ratios(found.get(peer, ())) for peer in peers),
-        ]
-        for (setting, batch, mode), found in _by_case(chosen).items()
-        if not found.keys().isdisjoint(peers)
-    ]
+    rows = []
+    for (setting, batch, mode), found in _by_case(chosen).items():
+        if not found.keys().isdisjoint(peers):
+            ratios = [_ratios(found.get(peer, ())) for peer in peers]
+            rows.append([f"{setting}, batch {batch}, {mode}", _milliseconds(found[OURS]), *ratios])
     return markdown([f"`{subject}`", "ours (ms)", *peers], rows)
 
 
@@ -84,9 +80,7 @@ def best_table(
 ) -> str:
     """A row for each (subject, mode, setting, batch), at all threads, and for each CPU its own
     columns: our time, and how much longer the fastest peer takes."""
-    lines = [
-        [f"`{subject}`, {mode}, {setting}, batch {batch}"] for subject, mode, setting, batch in rows
-    ]
+    lines = [[f"`{name}`, {mode}, {setting}, batch {batch}"] for name, mode, setting, batch in rows]
     heads = [""]
     for cpu, timings in records.items():
         heads += [f"{cpu}: ours (ms)", "best peer"]
@@ -152,10 +146,8 @@ def quantized_table(timings: Sequence[Timing]) -> str:
 
 def memory_table(memory: Sequence[Memory]) -> str:
     """Peaks of resident memory, ours and the reference's."""
-    rows = [
-        [what, f"{a / 2**20:.0f}", f"{b / 2**20:.0f}", f"{a / b:.2f}"]
-        for what, a, b in compared(memory)
-    ]
+    found = compared(memory)
+    rows = [[what, f"{a / 2**20:.0f}", f"{b / 2**20:.0f}", f"{a / b:.2f}"] for what, a, b in found]
     return markdown(["peak memory (MB)", OURS, REFERENCE, "ratio"], rows)
 
 

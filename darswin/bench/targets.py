@@ -1,4 +1,4 @@
-"""The ratios that we want to reach, and whether we do."""
+"""The ratios that we want to reach."""
 
 from collections.abc import Sequence
 

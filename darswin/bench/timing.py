@@ -11,7 +11,7 @@ import torch
 
 OURS, FIXED_LENS, REFERENCE = "darswin", "darswin, fixed lens", "reference"
 COMPILED, MATMULS = "compiled reference", "matrix products alone"
-# What a model of 8 bits stands beside: the same in other types.
+# A model of 8 bits is compared with the same model in other types.
 OURS_FLOAT32, OURS_BFLOAT16 = f"{OURS}, float32", f"{OURS}, bfloat16"
 COMPILED_BFLOAT16 = f"{COMPILED}, bfloat16"
 TURNS = 7  # or more, for as long as a candidate's calls are short
@@ -32,7 +32,6 @@ class Case:
 
     @property
     def label(self) -> str:
-        """All of it, in words."""
         threads = "1 thread" if self.threads == 1 else f"{self.threads} threads"
         return f"{self.subject}, {self.setting}, batch {self.batch}, {self.mode}, {threads}"
 
@@ -51,7 +50,6 @@ class Timing(Case):
 
     @property
     def missed(self) -> bool:
-        """Whether there is a target that the ratio does not reach."""
         return self.target is not None and self.ratio < self.target
 
 
@@ -63,21 +61,15 @@ def measure(
     least: int = TURNS,
     targets: Mapping[str, float] | None = None,
 ) -> list[Timing]:
-    """Times candidates, `OURS` among them, as `in_turns` does.
-
-    Args:
-        targets: by candidate, how many times as long as ours it should at least take.
-    """
+    """Times candidates, `OURS` among them; `targets` are the least ratios, by name."""
     turns = in_turns(candidates, seconds, least)
-    targets = targets or {}
-    return [summary(case, name, turns, targets.get(name)) for name in candidates]
+    return [summary(case, name, turns, (targets or {}).get(name)) for name in candidates]
 
 
 def in_turns(
     candidates: Mapping[str, Callable[[], object]], seconds: float, least: int = TURNS
 ) -> Turns:
-    """Calls each candidate, which has run before, for about `seconds`, at least `least` times; all
-    have as many turns."""
+    """Calls each candidate for about `seconds`, at least `least` times; all have as many turns."""
     calls, turns = {}, 1
     for name, run in candidates.items():
         once = _time(run)
@@ -99,7 +91,6 @@ def _time(run: Callable[[], object]) -> float:
 
 
 def summary(case: Case, name: str, turns: Turns, target: float | None = None) -> Timing:
-    """The timing of a candidate from what `in_turns` found of it and of `OURS`."""
     values = torch.tensor(list(itertools.chain(*turns[name])), dtype=torch.float64)
     low, median, high = values.quantile(values.new_tensor((0.25, 0.5, 0.75))).tolist()
     p99 = values.quantile(0.99, interpolation="higher").item()

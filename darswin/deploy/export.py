@@ -13,6 +13,8 @@ from darswin.lens import Lens
 from darswin.ops import use_reference
 from darswin.utils.extras import lack
 
+__all__ = ["export_onnx", "export_program"]
+
 
 class _OfTensors(nn.Module):
     """A model that takes its lens as tensors, by name; what is not given is the lens's own.

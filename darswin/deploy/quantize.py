@@ -21,6 +21,8 @@ from darswin.layers.transformer import Block, PatchMerging, WindowAttention
 from darswin.lens import Lens
 from darswin.models.base import Model
 
+__all__ = ["quantize_model", "sensitivities"]
+
 Net = TypeVar("Net", bound=Model)
 Batches = Sequence[tuple[Tensor, Lens | None]]
 

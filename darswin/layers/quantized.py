@@ -10,6 +10,8 @@ from torch import Tensor, nn
 
 from darswin.layers.linear import Linear
 
+__all__ = ["quantized_layers", "without_quantized_layers"]
+
 Net = TypeVar("Net", bound=nn.Module)
 
 _LARGEST = 127  # of a weight: -128 is left out, so that weights are symmetric
