@@ -169,8 +169,6 @@ RANGES = {
     "radial": (-0.3, 0.3), "denominator": (-0.2, 0.2), "tangential": (-0.02, 0.02),
     "prism": (-0.02, 0.02),
 }  # fmt: skip
-# How many numbers a list has, where the model says it.
-COUNTS = {"tangential": 2, "prism": 4}
 
 
 def first_coefficients(name: str, size: float) -> tuple[list[float], float]:

@@ -11,6 +11,7 @@ from torch import Tensor
 from darswin.lens.frame import ImageFrame
 from darswin.lens.parameter import Number
 from darswin.lens.solve import direction_of, inverse, length_of
+from darswin.ops.checks import tensor_there
 
 # A lens ends this far (rad) before the angle where r stops rising or becomes infinite: there θ
 # cannot be told from r.
@@ -43,7 +44,8 @@ class Lens(ImageFrame):
         center: (x, y) or (N, 2) px, the principal point. None means the middle of whatever image
             the lens is used with.
         affine: (2, 2) or (N, 2, 2): pixels that are not square, or skewed. None means the identity.
-        image_size: (H, W) or (N, 2) of the images that the lens belongs to. None means any.
+        image_size: (H, W) or (N, 2) of the images that the lens belongs to. None means any: methods
+            then take it where they need the principal point of a lens without a center.
 
     Raises:
         ValueError: a parameter out of its range, by name. TypeError: one that is no number.
@@ -78,6 +80,7 @@ class Lens(ImageFrame):
         """Raises ValueError where parameters are wrong in another way than their range."""
 
     def _set_theta_max(self, wanted: Tensor | None) -> None:
+        """Checks and sets how far the lens is used; None means as far as its model goes."""
         limit = self.theta_limit
         if not bool((limit > 0).all()):
             raise ValueError(
@@ -186,11 +189,8 @@ class Lens(ImageFrame):
         return True
 
     def offset(self, theta: Tensor, direction: Tensor) -> Tensor:
-        """(..., 2) px: how far from its place on the radial curve a ray lands, before `affine`.
-
-        Args:
-            theta: (N or 1, ...) rad. direction: (N or 1, ..., 2), cos φ and sin φ.
-        """
+        """(..., 2) px: how far from its place on the radial curve a ray lands, before `affine`;
+        direction: (N or 1, ..., 2), cos φ and sin φ."""
         return torch.zeros_like(theta)[..., None] * direction
 
     def project_rays(
@@ -199,13 +199,12 @@ class Lens(ImageFrame):
         """Rays (θ, φ) → the pixels (x, y) where they land.
 
         Args:
-            theta, azimuth: rad, shapes as in `project`, which broadcast.
-            image_size: (H, W), for the principal point of a lens that has none.
+            theta, azimuth: rad, shapes as in `project`, which broadcast. image_size: (H, W).
 
         Returns:
             (..., 2) px.
         """
-        theta, azimuth = self._aligned(theta)[0], self._aligned(azimuth)[0]
+        (theta,), (azimuth,) = self._aligned(theta), self._aligned(azimuth)
         return self.pixels(theta, direction_of(azimuth), image_size)
 
     def unproject_pixels(
@@ -214,8 +213,7 @@ class Lens(ImageFrame):
         """Pixels (x, y) → the rays (θ, φ) that land there, the inverse of `project_rays`.
 
         Args:
-            pixels: (N or 1, ..., 2) px; for a single lens (..., 2).
-            image_size: (H, W), for the principal point of a lens that has none.
+            pixels: (N or 1, ..., 2) px; for a single lens (..., 2). image_size: (H, W).
 
         Returns:
             θ and φ, (N, ...) rad. θ is NaN where no ray lands.
@@ -229,7 +227,7 @@ class Lens(ImageFrame):
         Args:
             points: (N or 1, ..., 3), for a single lens (..., 3), in any unit of length: x to the
                 right, y down, z forward. How far away a point is changes nothing.
-            image_size: (H, W), for the principal point of a lens that has none.
+            image_size: (H, W).
 
         Returns:
             (N, ..., 2) px; NaN for points beyond θ_max, and for (0, 0, 0).
@@ -247,14 +245,7 @@ class Lens(ImageFrame):
 
     def unproject_points(self, pixels: Tensor, image_size: tuple[int, int] | None = None) -> Tensor:
         """Pixels → unit vectors (x, y, z) that point at what is seen there, the inverse of
-        `project_points`.
-
-        Args:
-            pixels, image_size: as `unproject_pixels`.
-
-        Returns:
-            (N, ..., 3); NaN where no ray lands.
-        """
+        `project_points`: (N, ..., 3); NaN where no ray lands. Arguments: as `unproject_pixels`."""
         theta, direction = self.rays(pixels, image_size)
         aside = torch.sin(theta)[..., None] * direction
         return torch.cat((aside, torch.cos(theta)[..., None]), -1)
@@ -262,8 +253,8 @@ class Lens(ImageFrame):
     def rays(
         self, pixels: Tensor, image_size: tuple[int, int] | None = None
     ) -> tuple[Tensor, Tensor]:
-        """`unproject_pixels` with (cos φ, sin φ), (N, ..., 2), which has a gradient at the
-        principal point too; there it is (0, 0)."""
+        """`unproject_pixels` with (cos φ, sin φ), (N, ..., 2), in place of φ. It has a gradient at
+        the principal point too; there it is (0, 0)."""
         flat = self.from_pixels(pixels, image_size)
         radius = length_of(flat)
         theta, direction = self.unproject(radius), flat / radius[..., None]
@@ -272,21 +263,15 @@ class Lens(ImageFrame):
         return self._find_rays(flat, theta, direction)
 
     def _find_rays(self, flat: Tensor, theta: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
-        """The rays that land at points before `affine`, of a lens that has an `offset`.
-
-        Args:
-            flat: (N, ..., 2) px. theta, direction: where the rays would come from without it.
-        """
+        """The rays that land at points (N, ..., 2), before `affine`, of a lens with an `offset`;
+        theta, direction: where they would come from without it."""
         raise NotImplementedError
 
     def pixels(
         self, theta: Tensor, direction: Tensor, image_size: tuple[int, int] | None = None
     ) -> Tensor:
-        """`project_rays` with (cos φ, sin φ) in place of φ: the inverse of `rays`.
-
-        Args:
-            theta: (N or 1, ...) rad. direction: (N or 1, ..., 2).
-        """
+        """`project_rays` with (cos φ, sin φ), (N or 1, ..., 2), in place of φ: the inverse of
+        `rays`."""
         return self.to_pixels(self._flat(theta, direction), image_size)
 
     def seen_pixels(
@@ -307,8 +292,18 @@ class Lens(ImageFrame):
         On the row and the column of the principal point; `theta_limit` where the image reaches
         further than the lens.
         """
+        cx, cy = self.center_in(image_size).expand(len(self), 2).unbind(1)
+        if image_size is not None:
+            height, width = tensor_there(image_size, self.theta_max)
+        elif self.image_size is not None:
+            height, width = self.image_size.unbind(1)
+        else:
+            raise ValueError("side_angles needs the image_size, (H, W)")
+        low = torch.full_like(cx, -0.5)
+        right, below = (width - 0.5).expand_as(cx), (height - 0.5).expand_as(cy)
+        pixels = torch.stack((low, cy, cx, low, right, cy, cx, below), 1).unflatten(1, (4, 2))
         whole = self.with_theta_max(None)
-        theta = whole.rays(self._side_pixels(image_size), image_size)[0]
+        theta = whole.rays(pixels, image_size)[0]
         return torch.where(theta.isnan(), whole.theta_max[:, None], theta)
 
     def _rotated_terms(self, turn: Tensor) -> dict[str, Tensor]:

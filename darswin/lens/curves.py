@@ -157,13 +157,11 @@ def as_curves(lens: Lens, count: int = 512) -> Tabulated:
 
 
 def _check_start(radii: Tensor) -> None:
-    """That tables (N, K) that begin at 0 stay what they are, and rise."""
-    if not readable(radii):
-        return
+    """ValueError unless tables (N, K) begin at 0, nearly, and rise."""
     first, second, last = (radii.detach()[:, k] for k in (0, 1, -1))
     most = 1e-3 * last.clamp(max=1000)
     off = (first.abs() > most) | ~(second > 0)
-    if bool(off.any()):
+    if readable(radii) and bool(off.any()):
         raise ValueError(
             f"a lens is a curve only if r(0) is 0, to {most[off][0].item():.2g} px, and r rises "
             f"from there; got r(0) = {first[off][0].item():.4g} px"
@@ -209,7 +207,7 @@ def cat(lenses: Sequence[Lens]) -> Lens:
     if len({lens.affine is None for lens in lenses}) > 1:
         eye = torch.eye(2, dtype=lenses[0].theta_max.dtype, device=lenses[0].theta_max.device)
         lenses = [
-            lens if lens.affine is not None else lens.replace(affine=eye.expand(len(lens), 2, 2))
+            lens.replace(affine=eye.expand(len(lens), 2, 2)) if lens.affine is None else lens
             for lens in lenses
         ]
     tensors = {

@@ -48,6 +48,8 @@ class DistortedLens(FocalLens, register=False):
     prism = Parameter(shape=(4,), optional=True)
     # What is left of the model when all its terms are zero, with a closed inverse.
     plain: ClassVar[type[Lens]]
+    # Tangential and thin-prism terms are functions of the plane after the radial ones.
+    aside_last: ClassVar[bool] = False
 
     @classmethod
     def _rows(cls, given: Mapping[str, Number]) -> dict[str, Tensor]:
@@ -66,10 +68,11 @@ class DistortedLens(FocalLens, register=False):
         raise NotImplementedError
 
     def _plane_slope(self, theta: Tensor) -> Tensor:
+        """dw/dθ."""
         raise NotImplementedError
 
     def _plane_angle(self, w: Tensor) -> Tensor:
-        """θ at which w takes a value."""
+        """The inverse of `_plane`."""
         raise NotImplementedError
 
     def _plane_limit(self) -> Tensor:
@@ -103,19 +106,13 @@ class DistortedLens(FocalLens, register=False):
         theta, focal = self._aligned(theta, "focal")
         return focal * self._stretch(self._plane(theta))
 
-    def _offset_plane(self, w: Tensor) -> Tensor:
-        """The radius of the plane that tangential and thin-prism terms are functions of."""
-        return w
-
-    def _offset_plane_slope(self, w: Tensor) -> Tensor:
-        return torch.ones_like(w)
-
     @property
     def is_radial(self) -> bool:
         return self.tangential is None and self.prism is None
 
     def offset(self, theta: Tensor, direction: Tensor) -> Tensor:
-        w = self._offset_plane(self._plane(theta))
+        w = self._plane(theta)
+        w = self._stretch(w) if self.aside_last else w
         return self._row(self.focal, w.dim() + 1) * self._aside(w[..., None] * direction)
 
     def _aside(self, point: Tensor) -> Tensor:
@@ -150,18 +147,19 @@ class DistortedLens(FocalLens, register=False):
     def _distort(self, point: Tensor) -> Tensor:
         """(..., 2): where a point w (cos φ, sin φ) of the ideal plane lands, in focal lengths."""
         w = length_of(point)
-        direction = point / w[..., None]
-        aside = self._aside(self._offset_plane(w)[..., None] * direction)
-        return self._stretch(w)[..., None] * direction + aside
+        direction, stretched = point / w[..., None], self._stretch(w)
+        plane = stretched if self.aside_last else w
+        return stretched[..., None] * direction + self._aside(plane[..., None] * direction)
 
     def _distort_slopes(self, point: Tensor) -> Tensor:
         """(..., 2, 2): the derivatives of `_distort`."""
         w = length_of(point)
         direction = point / w[..., None]
-        u, slope = self._offset_plane(w), self._offset_plane_slope(w)
-        aside = self._aside_slopes(u[..., None] * direction)
-        straight = radial_slopes(self._stretch(w) / w, self._stretch_slope(w), direction)
-        return straight + aside @ radial_slopes(u / w, slope, direction)
+        ratio = self._stretch(w) / w
+        straight = radial_slopes(ratio, self._stretch_slope(w), direction)
+        if self.aside_last:
+            return straight + self._aside_slopes(ratio[..., None] * point) @ straight
+        return straight + self._aside_slopes(point)
 
     def _least_area(self, theta: Tensor) -> Tensor:
         """(N, K): by how much the distortion enlarges an area at θ, at the azimuth of the least.
@@ -272,11 +270,7 @@ class Fisheye624(KannalaBrandt):
     RAD_TAN_THIN_PRISM_FISHEYE. Arguments: as `KannalaBrandt`; their p₀ and p₁ are our p₂ and p₁.
     """
 
-    def _offset_plane(self, w: Tensor) -> Tensor:
-        return self._stretch(w)
-
-    def _offset_plane_slope(self, w: Tensor) -> Tensor:
-        return self._stretch_slope(w)
+    aside_last = True
 
 
 class Mei(DistortedLens):

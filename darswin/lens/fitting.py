@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from darswin.lens.base import MODELS, Lens
-from darswin.lens.curves import Tabulated, as_curves
+from darswin.lens.curves import Tabulated, as_curves, cat
 from darswin.lens.polynomial import PolynomialLens
 from darswin.lens.solve import direction_of
 
@@ -43,58 +43,47 @@ def fit(model: str | type[Lens], lens: Lens, *, terms: int | None = None) -> Fit
     Raises:
         ValueError: an unknown model, or one that cannot reach θ_max.
     """
-    model = _model(model)
+    if isinstance(model, str):
+        if model not in MODELS:
+            raise ValueError(f"model must be one of {sorted(MODELS)}, got {model!r}")
+        model = MODELS[model]
+    if not isinstance(model, type) or not issubclass(model, Lens):
+        raise TypeError(f"model must be a lens class or its name, got {model!r}")
     if issubclass(model, Tabulated):
         curves = as_curves(lens if lens.is_radial else lens.replace(tangential=None, prism=None))
         return Fit(curves, largest_distance(curves, lens))
     terms = model.terms if terms is None else terms
     exact = lens.detach().to(torch.float64)
-    parts = [_fit_one(model, exact[k], terms) for k in range(len(lens))]
-    found = [name for name in parts[0]._tensors() if name not in model.common]
-    tensors = {name: torch.cat([getattr(part, name) for part in parts]) for name in found}
-    fitted = model(**tensors, **{name: getattr(exact, name) for name in exact.common})
+    found = cat([_fit_one(model, exact[k], terms) for k in range(len(lens))])._tensors()
+    fitted = model(**found | {name: getattr(exact, name) for name in exact.common})
     return Fit(fitted.to(lens.theta_max.dtype), largest_distance(fitted, exact).to(lens.theta_max))
 
 
 def largest_distance(lens: Lens, other: Lens) -> Tensor:
     """(N,) px: how far apart two lenses with the same principal point let a ray land, at most."""
-    theta = other.theta_max[:, None, None] * _fractions(other, 1024)[:, None]
-    direction = _directions(other, 72)
+    theta, direction = _rays(other, 1024, 72)
     apart = lens._flat(theta, direction) - other._flat(theta, direction)
     return other.through_affine(apart).norm(dim=-1).flatten(1).amax(1)
 
 
-def _model(model: str | type[Lens]) -> type[Lens]:
-    if isinstance(model, str):
-        if model not in MODELS:
-            raise ValueError(f"model must be one of {sorted(MODELS)}, got {model!r}")
-        return MODELS[model]
-    if not isinstance(model, type) or not issubclass(model, Lens):
-        raise TypeError(f"model must be a lens class or its name, got {model!r}")
-    return model
-
-
-def _fractions(like: Lens, count: int) -> Tensor:
-    return torch.arange(1, count + 1, dtype=like.theta_max.dtype) / count
-
-
-def _directions(like: Lens, count: int) -> Tensor:
-    """(1, 1, count, 2): cos φ and sin φ all around."""
-    azimuth = torch.arange(count, dtype=like.theta_max.dtype) * (2 * math.pi / count)
-    return direction_of(azimuth)[None, None]
+def _rays(lens: Lens, rings: int, spokes: int) -> tuple[Tensor, Tensor]:
+    """θ (N, rings, 1), above 0 up to θ_max, and cos φ and sin φ (1, 1, spokes, 2) all around."""
+    dtype = lens.theta_max.dtype
+    theta = lens.theta_max[:, None] * (torch.arange(1, rings + 1, dtype=dtype) / rings)
+    azimuth = torch.arange(spokes, dtype=dtype) * (2 * math.pi / spokes)
+    return theta[..., None], direction_of(azimuth)[None, None]
 
 
 def _fit_one(model: type[Lens], lens: Lens, terms: int) -> Lens:
-    theta = lens.theta_max[:, None, None] * _fractions(lens, RINGS)[:, None]
     # A radial lens is the same along all azimuths.
     aside = not lens.is_radial and "tangential" in model.optional
-    direction = _directions(lens, SPOKES if aside else 1)
-    goal = lens._flat(theta, direction) if aside else lens.project(theta)[..., None] * direction
+    theta, direction = _rays(lens, RINGS, SPOKES if aside else 1)
     if issubclass(model, PolynomialLens):
         line = theta[:, :, 0]
         radius, slope = lens.project(line), Lens._slope(lens, line)
         coefficients = model.closest(line[0], radius[0], slope[0], terms)
         return model._from_tensors({"coefficients": coefficients, "theta_max": lens.theta_max})
+    goal = lens._flat(theta, direction) if aside else lens.project(theta)[..., None] * direction
     found = (
         _least_squares(model, start, lens.theta_max, theta, direction, goal)
         for start in _starts(model, lens, terms, aside)

@@ -40,21 +40,6 @@ class ImageFrame(LensBatch):
         """`affine` @ points or offsets (N or 1, ..., 2)."""
         return flat if self.affine is None else _apply(self.affine, flat)
 
-    def _side_pixels(self, image_size: tuple[int, int] | None) -> Tensor:
-        """(N, 4, 2) px: where the image ends to the left, above, to the right and below, on the row
-        and the column of the principal point."""
-        cx, cy = self.center_in(image_size).expand(len(self), 2).unbind(1)
-        if image_size is not None:
-            height, width = tensor_there(image_size, self.theta_max)
-        elif self.image_size is not None:
-            height, width = self.image_size.unbind(1)
-        else:
-            raise ValueError("side_angles needs the image_size, (H, W)")
-        low = torch.full_like(cx, -0.5)
-        sides = ((low, cy), (cx, low), ((width - 0.5).expand_as(cx), cy),
-                 (cx, (height - 0.5).expand_as(cy)))  # fmt: skip
-        return torch.stack([torch.stack(side, -1) for side in sides], 1)
-
     def resized(self, scale: float | Tensor | Sequence[int]) -> Self:
         """The same lens in a resized image, as `cv2.resize` makes it.
 

@@ -10,10 +10,9 @@ import hypothesis
 import pytest
 import torch
 from hypothesis import strategies as st
+from lens_examples import FILES
 
 from darswin.lens import load
-
-FILES = Path(__file__).parent / "files"
 
 # A camera of each file, and where in the file its numbers stand.
 CAMERAS = [
@@ -69,8 +68,8 @@ def of_camera(name: str, place: str) -> tuple[bytes, list[re.Match]]:
 
 def numbers_of(lens) -> torch.Tensor:
     """All that a file may say of a lens, in its own terms and in the file's."""
-    values = {name: getattr(lens, name) for name in lens._names()}
-    found = [value[0] for value in values.values() if value is not None]
+    values = lens._tensors()
+    found = [value[0] for value in values.values()]
     center = lens.center_in((1, 1))[0]
     found += [center + 0.5]
     if lens.image_size is not None:
@@ -136,95 +135,81 @@ def mutated(data: bytes, rng: random.Random) -> bytes:
     return data
 
 
-def _number(data: bytes, rng: random.Random, new) -> bytes:
-    matches = list(NUMBER.finditer(data))
-    if not matches:
+def at(pattern, data, rng, new):
+    """`data` with one place of a pattern, chosen at random, replaced by what `new` makes of it."""
+    places = list(re.finditer(pattern, data))
+    if not places:
         return data
-    match = rng.choice(matches)
+    match = rng.choice(places)
     return data[: match.start()] + new(match[0]) + data[match.end() :]
 
 
-def _value(data, rng):
-    return _number(data, rng, lambda old: rng.choice(VALUES).encode())
-
-
-def _scaled(data, rng):
+def scaled(data, rng):
+    """One number times another."""
     factor = rng.choice((-1, 0.1, 10, 1e3, 1e-3, 1e9)) * rng.uniform(0.9, 1.1)
-    return _number(data, rng, lambda old: f"{float(old) * factor:.9g}".encode())
+    return at(NUMBER, data, rng, lambda old: f"{float(old) * factor:.9g}".encode())
 
 
-def _digit(data, rng):
-    digit = str(rng.randrange(10)).encode()
+def digit(data, rng):
+    def new(old):
+        place = rng.randrange(len(old))
+        return old[:place] + str(rng.randrange(10)).encode() + old[place + 1 :]
+
+    return at(NUMBER, data, rng, new)
+
+
+def nested(data, rng):
+    left, right = rng.choice(((b"[", b"]"), (b'"', b'"'), (b"[[", b"]]"), (b'{"a": ', b"}")))
+    return at(NUMBER, data, rng, lambda old: left + old + right)
+
+
+def key(data, rng):
+    """A key renamed, or written otherwise."""
 
     def new(old):
         place = rng.randrange(len(old))
-        return old[:place] + digit + old[place + 1 :]
+        return rng.choice((
+            rng.choice(NAMES).encode(), old + b"x", old[:place] + old[place + 1 :], old.upper(),
+            b"_" + old, old[:place] + old[place:][::-1], old + b"2",
+        ))  # fmt: skip
 
-    return _number(data, rng, new)
-
-
-def _nested(data, rng):
-    left, right = rng.choice(((b"[", b"]"), (b'"', b'"'), (b"[[", b"]]"), (b'{"a": ', b"}")))
-    return _number(data, rng, lambda old: left + old + right)
+    return at(rb"[A-Za-z_]\w*(?=\"?\s*[:>])", data, rng, new)
 
 
-def _key(data, rng):
-    """Renamed, or written otherwise."""
-    matches = list(re.finditer(rb"[A-Za-z_]\w*(?=\"?\s*[:>])", data))
-    if not matches:
-        return data
-    match = rng.choice(matches)
-    old = match[0]
-    place = rng.randrange(len(old))
-    new = rng.choice((
-        rng.choice(NAMES).encode(), old + b"x", old[:place] + old[place + 1 :], old.upper(),
-        b"_" + old, old[:place] + old[place:][::-1], old + b"2",
-    ))  # fmt: skip
-    return data[: match.start()] + new + data[match.end() :]
-
-
-def _lines(data, rng):
-    """One dropped, or twice there, perhaps with another number."""
+def lines(data, rng):
+    """A line dropped, or twice there, perhaps with another number."""
     lines = data.split(b"\n")
     line = rng.randrange(len(lines))
     if rng.random() < 0.5:
         del lines[line]
     else:
-        other = lines[line] if rng.random() < 0.5 else _scaled(lines[line], rng)
+        other = lines[line] if rng.random() < 0.5 else scaled(lines[line], rng)
         lines.insert(rng.choice((line, line + 1, rng.randrange(len(lines)))), other)
     return b"\n".join(lines)
 
 
-def _entry(data, rng):
+def entry(data, rng):
     """`"key": number,` dropped, or twice there with another number."""
-    entry = rb"[\"\w]+\s*:\s*" + NUMBER.pattern + rb",?"
-    matches = list(re.finditer(entry, data))
-    if not matches:
-        return data
-    match = rng.choice(matches)
-    new = b"" if rng.random() < 0.5 else match[0] + b" " + _scaled(match[0], rng)
-    return data[: match.start()] + new + data[match.end() :]
+    twice = rng.random() < 0.5
+    pattern = rb"[\"\w]+\s*:\s*" + NUMBER.pattern + rb",?"
+    return at(pattern, data, rng, lambda old: old + b" " + scaled(old, rng) if twice else b"")
 
 
-def _byte(data, rng):
+def bit(data, rng):
     if not data:
         return data
     start = rng.randrange(len(data))
     return data[:start] + bytes([data[start] ^ (1 << rng.randrange(8))]) + data[start + 1 :]
 
 
-def _piece(data, rng):
-    """Cut out, or twice there."""
+def piece(data, rng):
+    """A piece cut out, or twice there."""
     start = rng.randrange(len(data) + 1)
     end = min(len(data), start + rng.choice((1, 1, 3, 20, 200)))
     return data[:start] + data[end:] if rng.random() < 0.5 else data[:end] + data[start:]
 
 
-def _truncated(data, rng):
-    return data[: rng.randrange(len(data) + 1)]
-
-
-def _encoded(data, rng):
+def encoded(data, rng):
     text = data.decode(errors="replace")
     return rng.choice((
         text.encode("utf-16"), text.encode("utf-8-sig"), text.replace("\n", "\r\n").encode(),
@@ -235,8 +220,9 @@ def _encoded(data, rng):
 
 
 MUTATIONS = (
-    _value, _scaled, _scaled, _digit, _digit, _nested, _key, _key, _lines, _entry, _byte, _byte,
-    _piece, _truncated, _encoded,
+    lambda data, rng: at(NUMBER, data, rng, lambda old: rng.choice(VALUES).encode()),
+    lambda data, rng: data[: rng.randrange(len(data) + 1)],
+    scaled, scaled, digit, digit, nested, key, key, lines, entry, bit, bit, piece, encoded,
 )  # fmt: skip
 
 

@@ -6,7 +6,7 @@ import math
 import hypothesis
 import hypothesis.strategies as st
 import torch
-from lens_examples import COUNTS, RANGES, f64, first_coefficients
+from lens_examples import RANGES, f64, first_coefficients
 
 from darswin.layers.polar import PLACEMENTS, polar_grid
 from darswin.lens import MODELS, cat, from_dict, to_dict
@@ -36,7 +36,7 @@ def lenses(draw, radial=False):
             most = 1 if key == "angles" else draw(st.floats(1, 2000))
             values[key] = [[0.0] + [most * sum(row[: k + 1]) for k in range(6)] for row in steps]
         elif len(model.declared[key].shape):
-            width = COUNTS.get(key) or draw(st.integers(1, 4))
+            width = model.declared[key].shape[0] or draw(st.integers(1, 4))
             values[key] = rows(draw, *RANGES[key], count, width)
         else:
             values[key] = [row[0] for row in rows(draw, *RANGES[key], count, 1)]

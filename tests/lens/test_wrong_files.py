@@ -398,7 +398,7 @@ def test_binary_files_that_are_wrong(tmp_path):
             load_all(path)
         return str(error.value)
 
-    for length in range(8, len(whole)):
+    for length in range(8, len(whole), 7):
         assert "it must hold 17 cameras, but ends in number" in error_of(whole[:length])
     assert "it holds 3 bytes after its 17 cameras" in error_of(whole + b"abc")
     assert "cameras, got 4294967295" in error_of(b"\xff" * 4 + whole[4:])

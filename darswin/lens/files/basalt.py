@@ -32,17 +32,13 @@ class Basalt(Format):
         entries = calibration.sections("intrinsics")
         sizes: Sequence[Size] = [None] * len(entries)
         if calibration.entries.get("resolution"):
-            sizes = _sizes(calibration, len(entries))
-        pairs = zip(entries, sizes, strict=True)
-        return {f"cam{i}": partial(_camera, entry, size) for i, (entry, size) in enumerate(pairs)}
-
-
-def _sizes(calibration: Fields, count: int) -> list[tuple[int, int]]:
-    expected = f"{count} pairs of a width and a height"
-    pairs, where = calibration.get("resolution", expected), calibration.path("resolution")
-    if not isinstance(pairs, list) or len(pairs) != count:
-        raise ValueError(f"{where} must be {expected}, got {short(pairs)}")
-    return [to_sides(pair, f"{where}[{i}]")[::-1] for i, pair in enumerate(pairs)]
+            expected = f"{len(entries)} pairs of a width and a height"
+            pairs, where = calibration.get("resolution", expected), calibration.path("resolution")
+            if not isinstance(pairs, list) or len(pairs) != len(entries):
+                raise ValueError(f"{where} must be {expected}, got {short(pairs)}")
+            sizes = [to_sides(pair, f"{where}[{i}]")[::-1] for i, pair in enumerate(pairs)]
+        cameras = enumerate(zip(entries, sizes, strict=True))
+        return {f"cam{i}": partial(_camera, entry, size) for i, (entry, size) in cameras}
 
 
 def _camera(entry: Fields, size: Size) -> Description:

@@ -53,6 +53,7 @@ class Colmap(Format):
 
     name = "COLMAP"
     origin = 0.5
+    needs_size = True
     holds = (
         "without skew, Perspective and BrownConrady (3 radial, no prism), Equidistant and "
         "KannalaBrandt (4 radial), Fisheye624 (6 radial), FieldOfView and EnhancedUnified"
@@ -70,7 +71,7 @@ class Colmap(Format):
         return found
 
     def _text(self, camera: Intrinsics, suffix: str) -> str | None:
-        height, width = self._size(camera)
+        height, width = camera.size
         values = dict(camera.values)
         if values.get("beta", 1) < 0 and values["alpha"] == 0.5:
             values["division"] = values.pop("beta") / -4

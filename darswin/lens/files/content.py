@@ -32,11 +32,7 @@ _POINTS = re.compile(r"\[[\s\d.,eE+-]{2048,}\]|(?<=>)[\s\d.eE+-]{2048,}(?=<)")
 
 
 def read_bytes(path: str | os.PathLike) -> bytes:
-    """A file whole.
-
-    Raises:
-        ValueError: what is no file, or too large. OSError: it cannot be read.
-    """
+    """A file whole; ValueError for what is no file, or too large."""
     path = Path(path)
     if path.exists() and not path.is_file():
         raise ValueError("it must be a file")
@@ -47,18 +43,18 @@ def read_bytes(path: str | os.PathLike) -> bytes:
     return data
 
 
-def is_npz(data: bytes) -> bool:
-    """Whether a file is a zip archive, as `np.savez` writes."""
-    return data.startswith(b"PK\x03\x04")
+def to_text(data: bytes) -> str:
+    """The text of a file: of UTF-8, or the arrays of `np.savez`'s zip archive as JSON."""
+    if data.startswith(b"PK\x03\x04"):
+        return _from_npz(data)
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise ValueError(f"it must be text in UTF-8: {error}") from error
 
 
-def from_npz(data: bytes) -> str:
-    """The arrays of a file of `np.savez` as JSON, but for large ones and for objects, which are no
-    lens's; nothing is unpickled.
-
-    Raises:
-        ValueError: no archive, or a damaged one.
-    """
+def _from_npz(data: bytes) -> str:
+    """But for large arrays and for objects, which are no lens's; nothing is unpickled."""
     arrays: dict[str, Any] = {}
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
@@ -75,20 +71,8 @@ def from_npz(data: bytes) -> str:
         ) from error
 
 
-def to_text(data: bytes) -> str:
-    """A text file's content; ValueError where it is no UTF-8."""
-    try:
-        return data.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise ValueError(f"it must be text in UTF-8: {error}") from error
-
-
 def parse(text: str) -> Content:
-    """Tells the notation from the text's beginning.
-
-    Raises:
-        ValueError: text that breaks its notation's rules, or is neither mapping nor table.
-    """
+    """The mapping or table that a text is, in the notation that its beginning tells."""
     start = text.lstrip()
     if not start:
         raise ValueError("it must not be empty")
@@ -123,15 +107,14 @@ def _mapping(pairs: Iterable[tuple[Any, Any]]) -> dict[Any, Any]:
 
 
 def _parse_table(text: str) -> list[list[str]]:
-    _check_size("a table", text, MAX_TABLE)
-    rows = [line.split() for line in text.splitlines() if not line.lstrip().startswith("#")]
-    return [row for row in rows if row]
+    rows = (line.split() for line in _limited("a table", text, MAX_TABLE).splitlines())
+    return [row for row in rows if row and row[0][0] != "#"]
 
 
 def _parse_yaml(text: str) -> Mapping:
     """YAML whose scalars stay text and whose tags, !!opencv-matrix or worse, mean nothing."""
     # OpenCV begins its files with %YAML:1.0, which is no YAML.
-    text = re.sub(r"\A%YAML[^\n]*\n", "", _without_points("YAML", text, MAX_YAML))
+    text = re.sub(r"\A%YAML[^\n]*\n", "", _limited("YAML", text, MAX_YAML))
     lines = text.split("\n")
     while lines and lines[-1].strip() in ("", "---", "..."):  # as `ros2 topic echo` ends
         lines.pop()
@@ -158,7 +141,7 @@ class _Loader(yaml.BaseLoader):
 
 
 def _parse_xml(text: str) -> Mapping:
-    text = _without_points("XML", text, MAX_XML)
+    text = _limited("XML", text, MAX_XML)
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
         raise ValueError("an XML file must not have a DOCTYPE or an ENTITY")
     try:
@@ -183,14 +166,10 @@ def _element(element: ElementTree.Element, depth: int) -> Mapping | list | str:
     return _mapping(children)
 
 
-def _without_points(notation: str, text: str, most: int) -> str:
+def _limited(notation: str, text: str, most: int) -> str:
     """Text that is parsed soon: where it is large, long lists of numbers become words."""
     if len(text) > most:
         text = _POINTS.sub("many numbers", text)
-    _check_size(notation, text, most)
-    return text
-
-
-def _check_size(notation: str, text: str, most: int) -> None:
     if len(text) > most:
         raise ValueError(f"{notation} must be at most {most >> 10} KiB large")
+    return text

@@ -48,7 +48,6 @@ def to_number(value: Any, name: str, expected: str = "a finite number") -> float
 
 
 def to_positive(value: Any, name: str) -> float:
-    """A finite number above 0."""
     expected = "a finite number above 0"
     number = to_number(value, name, expected)
     if not number > 0:
@@ -142,14 +141,12 @@ class Fields:
             raise ValueError(f"{camera} has no place for the numbers of {listed(left)}")
 
     def section(self, name: str) -> "Fields":
-        """The entry as a mapping."""
         value = self.get(name, "a mapping")
         if not isinstance(value, Mapping):
             raise ValueError(f"{self.path(name)} must be a mapping, got {short(value)}")
         return Fields(value, f"{self.path(name)}.")
 
     def sections(self, name: str) -> "list[Fields]":
-        """The entry as a list of mappings."""
         value = self.get(name, "a list of mappings")
         if not isinstance(value, list) or not all(isinstance(v, Mapping) for v in value):
             raise ValueError(f"{self.path(name)} must be a list of mappings, got {short(value)}")
@@ -162,7 +159,6 @@ class Fields:
         return to_number(self.get(name, "a finite number"), self.path(name))
 
     def positive(self, name: str) -> float:
-        """The entry as a finite number above 0."""
         return to_positive(self.get(name, "a finite number above 0"), self.path(name))
 
     def values(self, names: str, default: float | None = None) -> dict[str, float]:
@@ -177,7 +173,6 @@ class Fields:
         return found
 
     def side(self, name: str) -> int:
-        """The entry as a side of an image, in pixels."""
         return to_side(self.get(name, "a whole number of pixels"), self.path(name))
 
     def sides(self, name: str) -> tuple[int, int]:
@@ -185,14 +180,12 @@ class Fields:
         return to_sides(self.get(name, "two whole numbers of pixels"), self.path(name))
 
     def text(self, name: str, expected: str = "text") -> str:
-        """The entry as text."""
         value = self.get(name, expected)
         if not isinstance(value, str):
             raise ValueError(f"{self.path(name)} must be {expected}, got {short(value)}")
         return value
 
     def one_of(self, name: str, allowed: Iterable[str]) -> str:
-        """The entry as one of some words."""
         allowed = tuple(allowed)
         expected = f"one of {', '.join(allowed)}"
         value = self.text(name, expected)

@@ -31,7 +31,7 @@ class Intrinsics(NamedTuple):
 
     model: type[Lens]
     values: dict[str, float]
-    size: Size
+    size: Any  # (H, W), or None
 
     def fits(self, model: type[Lens], names: str) -> bool:
         """Whether it is of a model and has no other values than these, skew among them."""
@@ -51,6 +51,7 @@ class Format:
     keys: tuple[str, ...] = ()  # of the mappings that are of this format: any of them
     takes_model = False  # whether `load`'s model may say what its coefficients are
     holds = ""  # what `write` can write, in errors
+    needs_size = False  # whether a written camera must have an image_size
 
     def fits(self, content: Content) -> bool:
         """Whether a file's content is of this format."""
@@ -63,6 +64,8 @@ class Format:
     def write(self, lens: Lens, suffix: str) -> str:
         """The text of a file with this suffix; ValueError for a lens that the format lacks."""
         camera = intrinsics_of(lens, self.origin)
+        if camera is not None and camera.size is None and self.needs_size:
+            raise ValueError(f"{self.name}'s cameras have an image_size, and this lens has none")
         text = None if camera is None else self._text(camera, suffix)
         if text is None:
             raise ValueError(
@@ -75,20 +78,12 @@ class Format:
     def _text(self, camera: Intrinsics, suffix: str) -> str | None:
         raise NotImplementedError
 
-    def _size(self, camera: Intrinsics) -> tuple[int, int]:
-        if camera.size is None:
-            raise ValueError(
-                f"{self.name}'s cameras have an image_size, (H, W), and this lens has none"
-            )
-        return camera.size
-
 
 def describe(model: type[Lens], values: Mapping[str, float], size: Size) -> Description:
-    """A camera of two focal lengths.
+    """A camera of two focal lengths: x = fx x' + skew y' + cx.
 
-    Args:
-        values: px, of `PLANE`, skew if there is any: x = fx x' + skew y' + cx; k1, p2 and other
-            coefficients, which are left out where all are zero; and the model's other numbers.
+    `values` are those of `PLANE`, px, skew if there is any; k1, p2 and other coefficients, which
+    are left out where all are zero; and the model's other numbers.
     """
     coefficients = {}
     for name, letter in LETTERS.items():

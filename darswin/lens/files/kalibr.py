@@ -37,6 +37,7 @@ class Kalibr(Format):
     """Cameras by their names, or one alone."""
 
     name = "Kalibr"
+    needs_size = True
     holds = (
         "without skew, Perspective and BrownConrady (2 radial, tangential), Equidistant and "
         "KannalaBrandt (4 radial only), FieldOfView, Spherical and Mei (2 radial, tangential), "
@@ -60,7 +61,7 @@ class Kalibr(Format):
         return {name: partial(_camera, file.section(name)) for name in names}
 
     def _text(self, camera: Intrinsics, suffix: str) -> str | None:
-        height, width = self._size(camera)
+        height, width = camera.size
         found = [
             key for key, (of, *names) in MODELS.items() if camera.fits(of, " ".join(names))
         ]  # fmt: skip

@@ -15,7 +15,7 @@ from darswin.lens.base import MODELS, Lens, from_dict
 from darswin.lens.files import colmap, opencv
 from darswin.lens.files.basalt import Basalt
 from darswin.lens.files.camodocal import CamOdoCal, OCamCalib
-from darswin.lens.files.content import from_npz, is_npz, parse, read_bytes, to_text
+from darswin.lens.files.content import parse, read_bytes, to_text
 from darswin.lens.files.fields import Fields, listed, short
 from darswin.lens.files.format import Description, Format
 from darswin.lens.files.kalibr import Kalibr
@@ -155,9 +155,7 @@ class Calibration:
         name = os.fspath(path)
         try:
             data = read_bytes(path)
-            if is_npz(data):
-                text = from_npz(data)
-            elif colmap.is_binary(data):
+            if colmap.is_binary(data):
                 text = colmap.from_binary(data, MAX_CAMERAS)
             else:
                 text = to_text(data)
@@ -166,10 +164,8 @@ class Calibration:
         return cls(text, name, model)
 
     def choose(self, camera: str | int | None) -> str:
-        """The name of a camera: by its name; by its number from 0, in a file that does not call
-        its cameras by numbers; or by None, if all are the same."""
-        names = self.names
-        shown = listed(map(short, names))
+        """The name of a camera, as `load` chooses it."""
+        names, shown = self.names, listed(map(short, self.names))
         with self._about():
             if camera is None:
                 first = self._describe(names[0]) if len(names) > 1 else None

@@ -226,18 +226,15 @@ class _Reader:
         kind = self.kind(listed(terms), [*terms.values()][:1], xi, only)
         model, order, _ = ORDERS[kind]
         # OpenCV calls the denominator's k4 to k6.
-        ours = dict(zip(("k4", "k5", "k6"), ("d1", "d2", "d3"), strict=True))
-        theirs = {ours_: name for name, ours_ in ours.items()} if kind == "pinhole" else {}
-        taken = [theirs.get(name, name) for name in order.split() if "tilt" not in name]
-        if left := [name for name in terms if name not in taken]:
-            raise ValueError(f"the {kind} model has no {listed(left)}, only {', '.join(taken)}")
-        if kind == "pinhole":
-            if 0 < len(ours.keys() & terms.keys()) < 3:
-                raise ValueError(
-                    "k4 of the pinhole model is of its denominator, 1 + k4 r² + k5 r⁴ + k6 r⁶: "
-                    f"write k4, k5 and k6, got {listed(terms)}"
-                )
-            terms = {ours.get(name, name): value for name, value in terms.items()}
+        ours = {"k4": "d1", "k5": "d2", "k6": "d3"} if kind == "pinhole" else {}
+        if left := [name for name in found if ours.get(name, name) not in order.split()]:
+            raise ValueError(f"the {kind} model has no {listed(left)}")
+        if 0 < len(ours.keys() & terms.keys()) < 3:
+            raise ValueError(
+                "k4 of the pinhole model is of its denominator, 1 + k4 r² + k5 r⁴ + k6 r⁶: write "
+                f"k4, k5 and k6, got {listed(terms)}"
+            )
+        terms = {ours.get(name, name): value for name, value in terms.items()}
         values = plane | dict.fromkeys(order.split(), 0.0) | terms
         if kind == "omnidir":
             values["xi"] = file.number(xi or "xi")
