@@ -1,10 +1,12 @@
 """Frames of a fisheye camera: scanned digits, warped through a calibration of tests/lens/files."""
 
 import os
+from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
 import numpy as np
+import torch
 from sklearn.datasets import load_digits
 
 from darswin.data.warp import remap, warp_map
@@ -32,3 +34,18 @@ def write_frames(
         picture = (digits.images[k] * (255 / 16)).astype(np.uint8)
         cv2.imwrite(str(file), remap(cv2.resize(picture, (96, 96)), places))
     return folder
+
+
+def blob(at: Sequence[float], size: tuple[int, int], width: float) -> np.ndarray:
+    """A grey picture (H, W, 1) of a bright spot around (x, y)."""
+    y, x = np.mgrid[: size[0], : size[1]]
+    spot = np.exp(-((x - float(at[0])) ** 2 + (y - float(at[1])) ** 2) / (2 * width**2))
+    return (250 * spot).astype(np.uint8)[..., None]
+
+
+def centroid(image: np.ndarray) -> torch.Tensor:
+    """(x, y) of the middle of what is bright."""
+    weight = image[..., 0].astype(float)
+    y, x = np.mgrid[: image.shape[0], : image.shape[1]]
+    middle = np.array([(x * weight).sum(), (y * weight).sum()]) / weight.sum()
+    return torch.from_numpy(middle).float()

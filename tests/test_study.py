@@ -1,6 +1,7 @@
 """The study's own code, on digits: a minute's version of `make study`."""
 
 import json
+import shutil
 import sys
 from pathlib import Path
 
@@ -48,15 +49,12 @@ def quick(tmp_path_factory) -> Path:
 @pytest.fixture
 def here(monkeypatch, threads):
     """Jobs run one after the other in this process, as `make study` runs them in others."""
-
-    def run_all(work, jobs, *rest):
-        return [work(*job) for job in jobs]
-
     threads(1)
     for program in (study, quantized):
-        monkeypatch.setattr(program, "run_all", run_all)
+        monkeypatch.setattr(program, "run_all", lambda work, jobs, *_: [work(*job) for job in jobs])
 
 
+@pytest.mark.slow
 def test_cells_are_trained_and_tested_once(quick, here, capsys):
     cells = {p.parent.name: json.loads(p.read_text()) for p in quick.glob("out/nano/*/cell.json")}
     names = {"darswin-a", "dat", "swin", "swin--undis-", "spacing-g"}
@@ -65,10 +63,7 @@ def test_cells_are_trained_and_tested_once(quick, here, capsys):
         assert cell["accuracy"].keys() == {*SWEEP, POLYNOMIAL, *LEVELS}
         assert all(0 <= value <= 100 for value in cell["accuracy"].values())
     # A study that was stopped reads what it has; a cell that is run again finds the same.
-    (quick / "out" / "nano" / "swin-low-0" / "cell.json").unlink()
-    for file in (quick / "out" / "nano" / "swin-low-0").rglob("*"):
-        if file.is_file():
-            file.unlink()
+    shutil.rmtree(quick / "out" / "nano" / "swin-low-0")
     capsys.readouterr()
     where = ["--out", str(quick / "out"), "--results", str(quick)]
     study.main([*where, "--seeds", "1", "--cell", "swin-low-0", "--test-images", "20", *QUICK])
@@ -76,6 +71,7 @@ def test_cells_are_trained_and_tested_once(quick, here, capsys):
     assert again["accuracy"] == cells["swin-low-0"]["accuracy"]
 
 
+@pytest.mark.slow
 def test_tables_and_picture(quick):
     cells = json.loads((quick / "study--nano.json").read_text())["cells"]
     assert len(cells) == 5 and (quick / "study--nano.png").read_bytes().startswith(b"\x89PNG")
@@ -86,6 +82,7 @@ def test_tables_and_picture(quick):
     assert "not run" not in tables.tables(cells + others)["ablations"]
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(onednn_lack(torch.int8) is not None, reason="no products of 8 bits")
 def test_cells_of_8_bits(quick, here):
     where = ["--out", str(quick / "out"), "--results", str(quick)]

@@ -20,9 +20,12 @@ from worlds import wad  # noqa: E402
 
 from darswin.data import open_scenes  # noqa: E402
 
-pytestmark = pytest.mark.skipif(
-    not (wad.FOLDER / "freedoom1.wad").exists(), reason="the game's files are not installed"
-)
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(
+        not (wad.FOLDER / "freedoom1.wad").exists(), reason="the game's files are not installed"
+    ),
+]
 
 QUICK = """
     --pixels 32 --data.size 32 --pictures 4 1 2 --data.batch_size 2 --trainer.max_epochs 1
@@ -68,13 +71,9 @@ def test_test_sets_show_the_same_scenes_and_controls_lie(quick):
 @pytest.fixture
 def here(monkeypatch, threads):
     """Jobs run one after the other in this process, as `make study-dense` runs them in others."""
-
-    def run_all(work, jobs, *rest):
-        return [work(*job) for job in jobs]
-
     threads(1)
     for program in (dense, dense_data):
-        monkeypatch.setattr(program, "run_all", run_all)
+        monkeypatch.setattr(program, "run_all", lambda work, jobs, *_: [work(*job) for job in jobs])
 
 
 def test_cells_are_trained_and_tested_once(quick, here, capsys):

@@ -52,6 +52,7 @@ def cameras(out) -> list[dict]:
     return [learned_lens.run_camera(name, 0, out, "digits") for name in learned_lens.PROBLEMS]
 
 
+@pytest.mark.slow
 def test_a_camera_is_searched_for_in_every_way(cameras, out):
     for camera in cameras:
         problem = camera["problem"]
@@ -81,6 +82,7 @@ def test_the_distance_of_two_lenses():
     assert learned_lens.distance(moved, lens) == pytest.approx(3, abs=1e-4)
 
 
+@pytest.mark.slow
 def test_tables_and_picture(cameras, tmp_path):
     learned_tables.collect(cameras, tmp_path)
     assert (tmp_path / "learned_lens.png").read_bytes().startswith(b"\x89PNG")

@@ -20,9 +20,13 @@ from worlds.lenses import draw_lens  # noqa: E402
 
 from darswin.lens import Equidistant, Perspective, Spherical, load  # noqa: E402
 
-needs_game = pytest.mark.skipif(
-    not (wad.FOLDER / "freedoom1.wad").exists(), reason="the game's files are not installed"
-)
+
+def needs_game(test):
+    there = (wad.FOLDER / "freedoom1.wad").exists()
+    reason = "the game's files are not installed"
+    return pytest.mark.slow(pytest.mark.skipif(not there, reason=reason)(test))
+
+
 LABEL = geometry.LABEL
 
 # -- a box of 512 × 256 × 128 units with a step of 16 in its eastern half ---------------------
@@ -90,9 +94,6 @@ def test_a_box_has_exact_labels_and_distances(box):
     beyond = [32 / 0.2 * length[4], 156 * length[5], 32 / 0.15 * length[6]]
     expected = np.array([100, 136, 48, 80, *beyond]) / wad.METRE
     np.testing.assert_allclose(hits.distance, expected, rtol=1e-12)
-
-
-def test_the_sky_has_no_distance(box):
     hits = box.cast(eye(400, 120, 48), np.array([[0.0, 0.0, 1.0]]))
     assert hits.label[0] == LABEL["sky"] and np.isinf(hits.distance[0])
 
@@ -146,7 +147,7 @@ def test_distance_is_that_of_planes(box, lens):
     assert (view.distance[view.labels == LABEL["sky"]] == 0).all()
 
 
-def test_rotations_are_those_of_a_camera():
+def test_rotations_are_those_of_a_camera_and_colours_linear():
     rotation = poses.look(0.3, 0.2, 0.1)
     np.testing.assert_allclose(rotation.T @ rotation, np.eye(3), atol=1e-12)
     assert np.linalg.det(rotation) == pytest.approx(1)
@@ -154,28 +155,24 @@ def test_rotations_are_those_of_a_camera():
     np.testing.assert_allclose(level.T, [[1, 0, 0], [0, 0, -1], [0, 1, 0]], atol=1e-12)
     assert poses.look(0.0, pitch=0.5)[2, 2] > 0  # up
     assert poses.look(0.0, roll=0.5)[2, 0] < 0  # clockwise: the right side sinks
-
-
-def test_colours_are_averaged_in_linear_light():
+    # Colours are averaged in linear light.
     assert (render.to_srgb(render.to_linear(np.arange(256))) == np.arange(256)).all()
     assert render.to_srgb(np.array([0.5])) == 188
 
 
 def test_outlines_with_holes_and_gaps_are_filled():
+    def sides(corners):
+        return np.stack((corners, np.roll(corners, -1, 0)), 1).astype(float)
+
+    def area(triangles):
+        return float(np.abs(np.linalg.det(triangles[:, 1:] - triangles[:, :1])).sum() / 2)
+
     square = np.array([[0, 0], [0, 4], [4, 4], [4, 0]])
     ring = np.concatenate((sides(square), sides(square / 2 + 1)))
     assert area(geometry.triangulate(ring)) == pytest.approx(12)
     triangle = np.array([[0, 0], [3, 5], [7, 1]])
     assert area(geometry.triangulate(sides(triangle))) == pytest.approx(16)
     assert area(geometry.triangulate(sides(square)[:2])) == 0
-
-
-def sides(corners: np.ndarray) -> np.ndarray:
-    return np.stack((corners, np.roll(corners, -1, 0)), 1).astype(float)
-
-
-def area(triangles: np.ndarray) -> float:
-    return float(np.abs(np.linalg.det(triangles[:, 1:] - triangles[:, :1])).sum() / 2)
 
 
 # -- the game's maps --------------------------------------------------------------------------
@@ -261,7 +258,7 @@ def test_a_data_set_is_the_same_bits_from_the_seed(tmp_path):
         dataset.write_map(*job[:3], 64, *job[4:])
 
 
-def test_real_cameras_are_cut_to_a_square():
+def test_real_cameras_are_cut_to_a_square_and_a_missing_game_is_named():
     name = str(ROOT / "tests" / "lens" / "files" / "woodscape.json")
     lens = draw_lens(name, 128, 2.9, np.random.default_rng(0))
     assert lens.image_size.tolist() == [[128, 128]]
@@ -272,8 +269,5 @@ def test_real_cameras_are_cut_to_a_square():
     np.testing.assert_allclose(
         lens.unproject_points(pixel), whole.unproject_points(there), atol=1e-5
     )
-
-
-def test_a_missing_game_is_said_in_a_sentence(tmp_path):
     with pytest.raises(SystemExit, match="apt-get install freedoom"):
-        wad.map_names(folder=tmp_path)
+        wad.map_names(folder=ROOT)

@@ -108,7 +108,7 @@ class Calibrations:
                 return self._places[place]
         pictures = picture or "pictures without a file"
         if self._lens is None:
-            raise ValueError(f"no calibration file for {pictures}")
+            raise ValueError(f"{pictures} has no lens: no calibration file of its own")
         raise ValueError(f'{self._lens} has no lens for {pictures}: an entry "." is of all')
 
     def cameras_of(self, pictures: Sequence[str | Path | None]) -> np.ndarray:

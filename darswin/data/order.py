@@ -110,19 +110,6 @@ def _paired(
     return np.concatenate((chosen[..., 0], alone, chosen[:, ::-1, 1]), 1)
 
 
-class EveryNth(Sampler[int]):
-    """Indices rank, rank + world, …: a process's part of a test set."""
-
-    def __init__(self, count: int, rank: int, world: int):
-        self.indices = range(rank, count, world)
-
-    def __len__(self) -> int:
-        return len(self.indices)
-
-    def __iter__(self) -> Iterator[int]:
-        return iter(self.indices)
-
-
 class ResumableLoader(DataLoader):
     """A DataLoader over a `TrainingOrder` that goes on in the middle of an epoch."""
 

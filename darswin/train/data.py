@@ -13,7 +13,7 @@ from torch.utils.data import DataLoader
 from darswin.data.augment import RandAugment, RandomErasing
 from darswin.data.cameras import Calibrations, is_json
 from darswin.data.lens_distributions import parse_lenses, parse_sweep
-from darswin.data.order import EveryNth, ResumableLoader, TrainingOrder
+from darswin.data.order import ResumableLoader, TrainingOrder
 from darswin.data.pictures import Source, open_source
 from darswin.data.samples import IMAGENET_MEAN, IMAGENET_STD, Calibrated, Samples
 from darswin.data.splits import Split
@@ -193,9 +193,9 @@ class RunData(LightningDataModule):
                 f"`holdout` 0 leaves no pictures for {split!r}, and {self.path} has none of its "
                 "own; `limit_val_batches` 0 trains without validation"
             ) from error
-        count = len(dataset)
-        part = EveryNth(count, **self._place)
-        if not part.indices:
+        count, place = len(dataset), self._place
+        part = range(place["rank"], count, place["world"])
+        if not part:
             raise ValueError(
                 f"the {split!r} split has too few pictures for as many processes: {count}"
             )

@@ -1,4 +1,4 @@
-"""Folders as people have them: understood, or refused with a sentence that names the folder."""
+"""Folders as people have them: read, or refused with a sentence that names the folder."""
 
 import json
 import os
@@ -11,6 +11,7 @@ import hypothesis.strategies as st
 import pytest
 from hypothesis import given
 
+from darswin.data.folders import pictures_and_videos_below
 from darswin.data.pictures import open_source
 from darswin.data.splits import SPLITS, LeftOut
 
@@ -22,86 +23,97 @@ def touch(root: Path, *names: str) -> None:
         (root / name).touch()
 
 
-def pictures(root: Path, *classes: str, count: int = 10) -> None:
-    touch(root, *(f"{name}/{k}.jpg" for name in classes for k in range(count)))
+def pictures(root: Path, *folders: str, count: int = 10) -> None:
+    touch(root, *(f"{folder}/{k}.jpg" for folder in folders for k in range(count)))
 
 
 def files(source) -> list[str]:
-    return [str(source.root / os.fsdecode(path)) for path in source.paths]
+    return [str(source.file(k)) for k in range(len(source))]
 
 
 def opened(root: Path, **options) -> dict:
     return {split: open_source(root, split, **options) for split in SPLITS}
 
 
-@pytest.mark.filterwarnings("error")
-@pytest.mark.parametrize("name", ["val", "valid", "Validation"])
-def test_the_names_of_validation(tmp_path, name):
-    pictures(tmp_path / "train", "a", "b", count=5)
-    pictures(tmp_path / name, "a", "b", count=3)
-    parts = opened(tmp_path)
-    assert [len(parts[s]) for s in SPLITS] == [10, 6, 6]
-    pictures(tmp_path / "test", "b", count=2)
-    parts = opened(tmp_path)
-    assert [len(parts[s]) for s in SPLITS] == [10, 6, 2]
-    assert all(part.classes == ["a", "b"] for part in parts.values())
+def counts(root: Path, **options) -> list[int]:
+    return [len(part) for part in opened(root, **options).values()]
 
 
 @pytest.mark.filterwarnings("error")
-def test_training_and_test_folders_alone(tmp_path):
-    """Validation is a share of training, and of a lone `train/` the test set too."""
-    pictures(tmp_path / "train", "cat", "dog", count=20)
-    parts = opened(tmp_path)
-    assert [len(parts[s]) for s in SPLITS] == [32, 4, 4]
-    pictures(tmp_path / "testing", "cat", "dog", count=3)
-    parts = opened(tmp_path)
-    assert [len(parts[s]) for s in SPLITS] == [36, 4, 6]
-    assert all(part.classes == ["cat", "dog"] for part in parts.values())
-    assert not set(files(parts["train"])) & set(files(parts["val"]))
-
-
-@pytest.mark.filterwarnings("error")
-def test_classes_may_have_the_names_of_splits(tmp_path):
-    pictures(tmp_path, "bus", "car", "train", "test")
-    assert open_source(tmp_path, "train").classes == ["bus", "car", "test", "train"]
-    (tmp_path / "names.txt").write_text("test\ntrain\n")
-    assert open_source(tmp_path, "val", classes=tmp_path / "names.txt").classes == ["test", "train"]
-
-
 @pytest.mark.parametrize(
-    ("there", "message"),
+    ("there", "expected"),
     [
-        (["train/1.jpg", "test/2.jpg"], r"test and .*train may be meant as splits or as classes"),
-        (["train/1.jpg"], "train may be meant as splits or as classes"),
-        (["val/a/1.jpg", "test/a/2.jpg"], "may be meant as splits or as classes"),
-        (["train/a/1.jpg", "other/a/1.jpg"], r"train may be meant .*`classes`"),
-        (["train/a/1.jpg", "val/a/1.jpg", "valid/a/2.jpg"], r"val and .*valid both have a name"),
-        (["train/a/1.jpg", "val/a/1.jpg", "val/b/2.jpg"], r"val holds .* the classes \['b'\], wh"),
-        (["train/a/1.jpg", "test/b/1.jpg"], r"test holds .* which training has no pictures of"),
-        (["a/1.jpg", "b/1.gif", "b/2.HEIC"], r"b holds no picture .*, but 1 \.gif, 1 \.heic: co"),
+        ({"train": 20}, [32, 4, 4]),
+        ({"train": 20, "testing": 3}, [36, 4, 6]),
+        ({"train": 5, "val": 3}, [10, 6, 6]),  # "val" serves as the test set
+        ({"Training": 5, "valid": 3, "test": 2}, [10, 6, 4]),
+        ({"train": 5, "Validation": 3}, [10, 6, 6]),
+        ({"": 20}, [32, 4, 4]),
     ],
 )
-def test_what_can_be_read_in_two_ways_is_refused(tmp_path, there, message):
+def test_splits_of_folders(tmp_path, there, expected):
+    for name, count in there.items():
+        pictures(tmp_path / name, "a", "b/c", count=count)
+    parts = opened(tmp_path)
+    assert [len(part) for part in parts.values()] == expected
+    assert all(part.classes == ["a", "b"] for part in parts.values())
+    assert not set(files(parts["train"])) & set(files(parts["val"]) + files(parts["test"]))
+
+
+@pytest.mark.filterwarnings("error")
+def test_class_lists_choose_and_order(tmp_path):
+    pictures(tmp_path, "bus", "car", "train", "test", ".hidden")
+    touch(tmp_path, "bus/._0.jpg")
+    (tmp_path / "car" / "folder.png").mkdir()
+    (tmp_path / "empty").mkdir()
+    assert open_source(tmp_path, "train").classes == ["bus", "car", "test", "train"]
+    (tmp_path / "names.txt").write_text("test\ncar\n")
+    (tmp_path / "names.json").write_text('["test", "car"]')
+    for name in ("names.txt", "names.json"):
+        source = open_source(tmp_path, "train", classes=tmp_path / name)
+        assert source.classes == ["test", "car"] and len(source) == 16
+        assert source.paths[0].startswith(b"test/") and source.labels[0] == 0
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize(
+    ("there", "classes", "error", "message"),
+    [
+        (["train/1.jpg", "test/2.jpg"], None, ValueError, "test and .*train may be meant as"),
+        (["train/1.jpg"], None, ValueError, "train may be meant as splits or as classes"),
+        (["val/a/1.jpg", "test/a/2.jpg"], None, ValueError, "may be meant as splits or as"),
+        (["train/a/1.jpg", "more/a/1.jpg"], None, ValueError, "train may be meant .*`classes`"),
+        (["train/a/1.jpg", "val/a/1.jpg", "valid/a/2.jpg"], None, ValueError, "val and .*valid"),
+        (["train/a/1.jpg", "val/a/1.jpg", "val/b/2.jpg"], None, ValueError, r"val holds .*\['b'\]"),
+        (["train/a/1.jpg", "test/b/1.jpg"], None, ValueError, "test holds .* which training has"),
+        (["a/1.jpg", "b/1.gif", "b/2.HEIC"], None, ValueError, "b holds no picture .* 1 .heic"),
+        (["a/1.jpg", "c/1.txt"], "a\nc\n", FileNotFoundError, r"no pictures of the .*\['c'\]"),
+        (["a/1.jpg"], "", ValueError, "names.txt must .* is empty"),
+        (["a/1.jpg"], "a\nb\na\n", ValueError, r"names.txt must .* repeats \['a'\]"),
+        ([], None, FileNotFoundError, "no images for the '(train|val|test)' split"),
+    ],
+)
+def test_what_is_refused(tmp_path, there, classes, error, message):
     touch(tmp_path, *there)
+    if classes is not None:
+        (tmp_path / "names.txt").write_text(classes)
+        classes = tmp_path / "names.txt"
     for split in SPLITS:
-        with pytest.raises(ValueError, match=message):
-            open_source(tmp_path, split)
+        with pytest.raises(error, match=message):
+            open_source(tmp_path, split, classes=classes)
 
 
 @pytest.mark.parametrize(
     ("there", "message"),
     [
-        (
-            ["stray.png"],
-            r"holds pictures in no class's folder \(1, e\.g\. .*stray\.png\): left out",
-        ),
+        (["stray.png"], r"holds pictures in no class's folder \(1, e\.g\. .*stray\.png"),
         (["a/x.gif", "b/y.gif"], r"does not read, 2 \.gif, e\.g\. .*a/x\.gif: left out"),
         (["labels/x.txt"], "labels holds files, but no pictures: it is no class"),
-        (["few/1.jpg"], r"too few pictures .* the classes \['few'\].*none is for test or val"),
+        (["few/1.jpg"], r"too few .* the classes \['few'\].*none is for test or val"),
         (["few/1.jpg", "few/2.jpg"], r"too few pictures .* the classes \['few'\]"),
     ],
 )
-def test_what_is_left_out_is_said(tmp_path, there, message):
+def test_what_is_left_out_is_named(tmp_path, there, message):
     pictures(tmp_path, "a", "b")
     touch(tmp_path, *there)
     with pytest.warns(LeftOut, match=message):
@@ -110,70 +122,49 @@ def test_what_is_left_out_is_said(tmp_path, there, message):
     assert len(few) == sum("few" in name for name in there)
 
 
-def test_pictures_beside_the_splits_are_said(tmp_path):
+def test_pictures_beside_the_splits_are_named(tmp_path):
     pictures(tmp_path / "train", "a", "b")
     pictures(tmp_path / "val", "a", "b")
     touch(tmp_path, "test/1.jpg", "more/2.jpg")
-    with pytest.warns(LeftOut) as said:
+    with pytest.warns(LeftOut) as caught:
         assert len(open_source(tmp_path, "val")) == 20
-    text = "\n".join(str(warning.message) for warning in said)
+        with pytest.raises(FileNotFoundError, match="no images for the 'test' split"):
+            open_source(tmp_path, "test")
+    text = "\n".join(str(warning.message) for warning in caught)
     assert f"{tmp_path / 'more'} holds pictures, but is no split" in text
     assert f"{tmp_path / 'test'} holds pictures in no class's folder (1" in text
-    with (
-        pytest.warns(LeftOut),
-        pytest.raises(FileNotFoundError, match="no images for the 'test' split"),
-    ):
-        open_source(tmp_path, "test")
 
 
 @pytest.mark.filterwarnings("error")
-def test_links_are_followed_once(tmp_path):
+def test_links_are_followed_once(tmp_path, monkeypatch):
     pictures(tmp_path / "elsewhere", "more")
-    pictures(tmp_path / "root", "a", "b")
-    (tmp_path / "root" / "a" / "link").symlink_to(tmp_path / "elsewhere" / "more")
-    parts = opened(tmp_path / "root")
-    assert sum(len(part) for part in parts.values()) == 30
-    for target in (tmp_path / "elsewhere" / "more", tmp_path / "root", tmp_path):
-        (tmp_path / "root" / "b" / "link").symlink_to(target)
+    root = tmp_path / "root"
+    pictures(root, "a", "b")
+    (root / "a" / "link").symlink_to(tmp_path / "elsewhere" / "more")
+    assert sum(counts(root)) == 30
+    for target in (tmp_path / "elsewhere" / "more", root, tmp_path):
+        (root / "b" / "link").symlink_to(target)
         with pytest.raises(ValueError, match=r"b/link.* are the same folder"):
-            open_source(tmp_path / "root", "train")
-        (tmp_path / "root" / "b" / "link").unlink()
-
-
-@pytest.mark.filterwarnings("error")
-def test_a_test_set_that_is_a_link_to_validation(tmp_path):
-    pictures(tmp_path / "train", "a", "b")
-    pictures(tmp_path / "val", "a", "b", count=2)
-    (tmp_path / "test").symlink_to("val")
-    assert [len(part) for part in opened(tmp_path).values()] == [20, 4, 4]
-
-
-def test_the_folder_one_is_in(tmp_path, monkeypatch):
-    pictures(tmp_path / "train", "a", "b/c")
-    pictures(tmp_path / "val", "a", "b", count=1)
-    for folder, path in ((tmp_path, "."), (tmp_path / "train", "../train"), (tmp_path, "train")):
+            open_source(root, "train")
+        (root / "b" / "link").unlink()
+    splits = tmp_path / "splits"
+    pictures(splits / "train", "a", "b")
+    pictures(splits / "val", "a", "b", count=2)
+    (splits / "test").symlink_to("val")
+    assert counts(splits) == [20, 4, 4]
+    for folder, path in ((splits, "."), (splits / "train", "../train"), (splits, "train")):
         monkeypatch.chdir(folder)
         source = open_source(path, "train")
         assert source.classes == ["a", "b"] and all(map(os.path.exists, files(source)))
 
 
-def test_every_class_of_a_list_has_pictures(tmp_path):
-    pictures(tmp_path, "a", "b")
-    (tmp_path / "c").mkdir()
-    (tmp_path / "classes.txt").write_text("a\nc\n")
-    with pytest.raises(FileNotFoundError, match=r"no pictures of the classes \['c'\]"):
-        open_source(tmp_path, "train", classes=tmp_path / "classes.txt")
-    for text, message in (("", "is empty"), ("a\nb\na\n", r"repeats \['a'\]")):
-        (tmp_path / "classes.txt").write_text(text)
-        with pytest.raises(ValueError, match=rf"classes\.txt must .*{message}"):
-            open_source(tmp_path, "train", classes=tmp_path / "classes.txt")
-
-
-def test_a_holdout_that_leaves_nothing_is_named(tmp_path):
-    pictures(tmp_path, "a", "b")
-    for path in (tmp_path, "digits"):
-        with pytest.raises(FileNotFoundError, match=r"'val' split .*`holdout` 0 .*leaves none"):
-            open_source(path, "val", holdout=0)
+def test_pictures_and_videos_below_a_folder(tmp_path):
+    touch(tmp_path, "b/1.jpg", "a/2.MP4", "3.txt", ".x/4.jpg")
+    found = [str(tmp_path / name) for name in ("a/2.MP4", "b/1.jpg")]
+    assert pictures_and_videos_below(tmp_path) == found
+    with pytest.raises(FileNotFoundError, match=r"no pictures or videos in .*\.x/y"):
+        (tmp_path / ".x" / "y").mkdir()
+        pictures_and_videos_below(tmp_path / ".x" / "y")
 
 
 @pytest.mark.parametrize(
@@ -196,16 +187,41 @@ def test_lists_that_are_wrong(tmp_path, lists, message):
     file.write_text(lists if isinstance(lists, str) else json.dumps(lists))
     with pytest.raises(ValueError, match=message):
         open_source(tmp_path, "train", splits=file)
-    with pytest.raises(ValueError, match=r"`splits` is for folders"):
+    with pytest.raises(ValueError, match="`splits` is for folders"):
         open_source("digits", "train", splits=file)
 
 
-def test_a_split_without_a_list_is_held_out(tmp_path):
+def test_lists_of_splits(tmp_path):
+    lists = {"train": ["dog/01.png", "cat/02.png"], "val": ["cat/03.png"], "test": []}
+    (tmp_path / "splits.json").write_text(json.dumps(lists))
+    (tmp_path / "lists").mkdir()
+    for name, paths in lists.items():
+        (tmp_path / "lists" / f"{name}.txt").write_text("\n".join(paths))
+    for splits in (tmp_path / "splits.json", tmp_path / "lists"):
+        train, val = (open_source(tmp_path, part, splits=splits) for part in ("train", "val"))
+        assert train.labels.tolist() == [1, 0] and train.file(0) == tmp_path / "dog" / "01.png"
+        assert files(val) == [str(tmp_path / "cat" / "03.png")]
+        with pytest.raises(FileNotFoundError, match="no images for the 'test' split"):
+            open_source(tmp_path, "test", splits=splits)
     paths = [f"{name}/{k}.jpg" for name in "ab" for k in range(10)]
     (tmp_path / "train.txt").write_text("\n".join(paths))
-    assert [len(part) for part in opened(tmp_path, splits=tmp_path).values()] == [16, 2, 2]
+    assert counts(tmp_path, splits=tmp_path) == [16, 2, 2]  # a split without a list is held out
     (tmp_path / "validation.txt").write_text("a/x.jpg")
-    assert [len(part) for part in opened(tmp_path, splits=tmp_path).values()] == [20, 1, 1]
+    assert counts(tmp_path, splits=tmp_path) == [20, 1, 1]
+
+
+def test_the_share_that_is_held_out(tmp_path):
+    pictures(tmp_path, "a", count=60)
+    before = opened(tmp_path)
+    assert [len(part) for part in before.values()] == [48, 6, 6]
+    assert files(before["val"]) == files(open_source(tmp_path, "val"))
+    touch(tmp_path, "a/new.jpg")
+    after = opened(tmp_path)
+    moved = [set(files(after[split])) - set(files(before[split])) for split in SPLITS]
+    assert sum(map(len, moved)) <= 5  # one picture more moves hardly any
+    for path in (tmp_path, "digits"):
+        with pytest.raises(FileNotFoundError, match=r"'val' split .*`holdout` 0 .*leaves none"):
+            open_source(path, "val", holdout=0)
 
 
 # -- any tree ---------------------------------------------------------------------------------
@@ -246,7 +262,7 @@ def test_every_picture_is_in_one_split_or_named(tmp_path_factory, tree, links, h
                 parts[split] = open_source(root, split, holdout=holdout)
             except (ValueError, FileNotFoundError) as error:
                 errors.append(str(error))
-    said = "\n".join(str(warning.message) for warning in caught)
+    text = "\n".join(str(warning.message) for warning in caught)
     assert all(str(root) in error for error in errors)
     if "train" not in parts:
         return
@@ -259,5 +275,5 @@ def test_every_picture_is_in_one_split_or_named(tmp_path_factory, tree, links, h
     found = Counter(file for part in parts.values() for file in files(part))
     assert set(found.values()) == {1}
     for picture in map(str, there):
-        named = any(f"{folder} holds" in said for folder in Path(picture).parents)
+        named = any(f"{folder} holds" in text for folder in Path(picture).parents)
         assert found[picture] == 1 or named, picture

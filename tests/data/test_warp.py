@@ -1,11 +1,28 @@
+"""A ray stays on the same content, however picture and lens are warped, turned or resized."""
+
 import math
 
+import hypothesis.strategies as st
 import numpy as np
 import pytest
 import torch
+from frames import WOODSCAPE, blob, centroid
+from hypothesis import given
 
-from darswin.data import warp, warp_map
-from darswin.lens import Perspective, Polynomial, Spherical
+from darswin.data import IGNORE, FullSize, RandomTurns, at_size, lens_at_size, warp, warp_map
+from darswin.data.warp import Turn, area_resized, turned_picture
+from darswin.lens import (
+    BrownConrady,
+    Equidistant,
+    KannalaBrandt,
+    Perspective,
+    Polynomial,
+    Spherical,
+    load,
+)
+from darswin.lens.orientation import upright
+
+# -- through another lens ---------------------------------------------------------------------
 
 
 def wave(lens, size):
@@ -21,31 +38,21 @@ def test_the_warped_image_is_what_the_other_lens_sees(xi):
     source = Perspective.from_fov(math.radians(120), 200)
     target = Spherical.from_fov(xi, math.radians(120), 60)
     got = warp(wave(source, 400), source, target, (120, 120))
-    expected = wave(target, 120)
     y, x = np.mgrid[:120, :120] - 59.5
     inside = np.hypot(x, y) < 58
-    assert np.abs(got - expected)[inside].max() < 0.02
+    assert np.abs(got - wave(target, 120))[inside].max() < 0.02
     assert (got[np.hypot(x, y) > 61] == 0).all()
 
 
-def test_the_same_lens_changes_nothing():
-    lens = Spherical.from_fov(0.4, 2.0, 100)
-    image = np.random.default_rng(0).integers(0, 255, (64, 48, 3), np.uint8)
-    assert np.array_equal(warp(image, lens, lens, (64, 48)), image)
-
-
-def test_principal_points_move_the_view():
-    image = np.random.default_rng(0).random((40, 40)).astype(np.float32)
+def test_warps_that_are_known():
+    image = np.random.default_rng(0).random((40, 48)).astype(np.float32)
     lens = Perspective(30.0, 1.0)
-    moved = Perspective(30.0, 1.0, center=[24.5, 16.5])
-    got = warp(image, lens, moved, (40, 40))
-    np.testing.assert_allclose(got[5:30, 10:40], image[8:33, 5:35], atol=1e-5)
-
-
-def test_beyond_the_source_is_black():
+    assert np.array_equal(warp(image, lens, lens, (40, 48)), image)
+    moved = Perspective(30.0, 1.0, center=[28.5, 16.5])
+    got = warp(image, lens, moved, (40, 48))
+    np.testing.assert_allclose(got[5:30, 10:45], image[8:33, 5:40], atol=1e-5)
     source = Perspective.from_fov(math.radians(90), 50)
-    wide = Polynomial([40.0], math.radians(100))
-    got = warp(np.ones((100, 100), np.float32), source, wide, (140, 140))
+    got = warp(np.ones((100, 100), np.float32), source, Polynomial([40.0], 1.75), (140, 140))
     y, x = np.mgrid[:140, :140] - 69.5
     theta = np.hypot(x, y) / 40
     assert (got[theta < math.radians(44)] == 1).all()
@@ -59,9 +66,194 @@ def test_maps_of_many_lenses_are_those_of_each():
     for k in range(3):
         alone = warp_map(source, (100, 100), many[k], (60, 64))
         assert together.shape == (3, 60, 64, 2) and np.array_equal(together[k], alone[0])
+    with pytest.raises(ValueError, match="one lens each, got 3 and 1"):
+        warp(np.zeros((4, 4), np.float32), many, source, (4, 4))
 
 
-def test_one_lens_at_a_time():
-    two = Perspective([10.0, 20.0], 1.0)
-    with pytest.raises(ValueError, match="one lens each, got 2 and 1"):
-        warp(np.zeros((4, 4), np.float32), two, two[0], (4, 4))
+# -- turned about the optical axis ------------------------------------------------------------
+
+SIZE = (120, 160)
+# Oblong and skewed pixels, an off-middle principal point, terms that are not radial.
+LENSES = {
+    "round": Equidistant(60.0, 1.2, image_size=SIZE),
+    "oblong": KannalaBrandt(
+        60.0, [0.01], 1.0, [75.0, 64.0], affine=[[1.0, 0.05], [0.0, 0.9]], image_size=SIZE
+    ),
+    "tangential": BrownConrady(
+        60.0, [0.01], 0.8, [75.0, 64.0], tangential=[0.02, -0.03], image_size=SIZE
+    ),
+    "woodscape": load(WOODSCAPE).in_picture((121, 160)),
+}
+TURNS = [Turn(0.0, True), Turn(0.7, False), Turn(math.pi / 2, False), Turn(-2.5, True)]
+
+
+@pytest.mark.parametrize("turn", TURNS)
+@pytest.mark.parametrize("name", LENSES)
+def test_a_ray_stays_on_its_content_after_a_turn(name, turn):
+    lens = LENSES[name]
+    size = tuple(int(side) for side in lens.image_size[0])
+    for theta, azimuth in ((0.3, 0.5), (0.5, -1.0), (0.4, 2.5)):
+        before = blob(lens.project_rays(theta, azimuth)[0], size, 3.0)
+        image, after = turned_picture(before, lens, turn)
+        assert image.shape == (*size, 1) and tuple(after.image_size[0].tolist()) == size
+        across = torch.tensor([math.cos(azimuth), math.sin(azimuth)], dtype=torch.float64)
+        seen = torch.from_numpy(turn.matrix) @ across
+        there = after.project_rays(theta, math.atan2(seen[1], seen[0]))[0]
+        torch.testing.assert_close(centroid(image), there, atol=0.15, rtol=0)
+
+
+def test_only_what_must_turn_with_a_picture_does():
+    image = np.random.default_rng(0).integers(256, size=(*SIZE, 3), dtype=np.uint8)
+    for name, changes in (("oblong", False), ("tangential", True)):
+        lens = turned_picture(image, LENSES[name], TURNS[1])[1]
+        assert (str(lens) != str(LENSES[name])) == changes
+    mirrored, lens = turned_picture(image, LENSES["oblong"], TURNS[0])
+    assert (mirrored == image[:, ::-1]).all() and str(lens) == str(upright(LENSES["oblong"], 2))
+
+
+def test_how_turns_are_drawn():
+    rng = np.random.default_rng(0)
+    turns = [RandomTurns(True, 30).draw(rng) for _ in range(2000)]
+    angles = np.degrees([turn.angle for turn in turns])
+    assert np.abs(angles).max() <= 30 and np.abs(angles.std() - 30 / math.sqrt(3)) < 0.5
+    assert abs(angles.mean()) < 2 and 0.45 < np.mean([turn.mirrored for turn in turns]) < 0.55
+    assert RandomTurns(False, 0).draw(rng) == (0.0, False)
+    for angle in (-1, 181, math.nan):
+        with pytest.raises(ValueError, match=r"`rotate_deg` must be in \[0, 180\]"):
+            RandomTurns(rotate_deg=angle)
+
+
+# -- at a model's size, and back --------------------------------------------------------------
+
+FRAMINGS = ("crop", "stretch", "whole")
+
+
+@pytest.mark.parametrize("framing", FRAMINGS)
+@pytest.mark.parametrize("size", [32, 64])
+def test_a_ray_stays_on_its_content_at_another_size(framing, size):
+    lens = load(WOODSCAPE).in_picture((242, 320))
+    for theta, azimuth in ((0.3, 0.4), (0.6, 2.0), (0.5, -2.5)):
+        before = blob(lens.project_rays(theta, azimuth)[0], (242, 320), 6.0)
+        image, there = at_size(before, lens, size, framing)
+        across = round(size * 320 / 242) if framing == "whole" else size
+        assert image.shape == (size, across, 1)
+        assert tuple(there.image_size[0].tolist()) == image.shape[:2]
+        place = there.project_rays(theta, azimuth)[0]
+        torch.testing.assert_close(centroid(image), place, atol=0.1, rtol=0)
+
+
+@pytest.mark.parametrize(
+    ("before", "after"), [((90, 640), (128, 128)), ((400, 100), (96, 120)), ((60, 250), (60, 31))]
+)
+def test_an_axis_that_becomes_shorter_while_the_other_becomes_longer_is_not_shifted(before, after):
+    y, x = np.mgrid[: before[0], : before[1]].astype(np.float32)
+    resized = area_resized(np.stack((y, x), -1), after)
+    for axis in (0, 1):
+        scale = before[axis] / after[axis]
+        centres = (np.arange(after[axis]) + 0.5) * scale - 0.5
+        off = (resized[..., axis].mean(1 - axis) - centres)[2:-2] / scale
+        assert abs(off.mean()) < 1e-3 and np.abs(off).max() < 0.5 / min(scale, 1)
+
+
+def test_a_picture_of_the_size_stays_and_wrong_arguments_are_named():
+    square = np.random.default_rng(0).integers(256, size=(32, 32, 1), dtype=np.uint8)
+    same, _ = at_size(square, Equidistant(9.0, 1.5, image_size=(32, 32)), 32, "crop")
+    assert (same == square).all()
+    with pytest.raises(ValueError, match="framing must be one of crop, stretch, whole, got 'pad'"):
+        at_size(square, Equidistant(9.0, 1.5, image_size=(32, 32)), 32, "pad")
+    with pytest.raises(ValueError, match="needs an image_size"):
+        lens_at_size(Equidistant(30.0, 1.5), 32, "crop")
+    two = Equidistant([20.0, 30.0], math.pi / 2, image_size=(9, 9))
+    for lens in (Equidistant(20.0, math.pi / 2), two):
+        with pytest.raises(ValueError, match="one lens, with the image_size"):
+            FullSize(lens, 9, "crop")
+
+
+def all_seen(size):
+    """A lens that sees all of its picture."""
+    return Equidistant(max(size), theta_max=1.5, image_size=size, center=(size[1] / 2, size[0] / 2))
+
+
+def part(size, framing):
+    height, width = size
+    side = min(size)
+    if framing != "crop":
+        return np.s_[:, :]
+    top, left = (height - side) // 2, (width - side) // 2
+    return np.s_[top : top + side, left : left + side]
+
+
+def enlarged(values, size, framing):
+    """By torch, which has the same convention of pixels."""
+    size = (min(size),) * 2 if framing == "crop" else size
+    values = torch.from_numpy(values)[None]
+    return torch.nn.functional.interpolate(values, size, mode="bilinear")[0].numpy()
+
+
+@pytest.mark.parametrize("framing", FRAMINGS)
+@pytest.mark.parametrize("size", [(61, 90), (90, 61), (7, 9)])
+def test_answers_at_full_size_are_interpolated(size, framing):
+    """Logits are interpolated linearly, distances in their logarithm."""
+    rng = np.random.default_rng(0)
+    small = at_size(np.zeros((*size, 3), np.uint8), all_seen(size), 16, framing)[0].shape[:2]
+    full, inside = FullSize(all_seen(size), 16, framing), part(size, framing)
+    logits = rng.standard_normal((5, *small)).astype(np.float32)
+    labels, expected = full.labels(logits), np.full(size, IGNORE)
+    expected[inside] = enlarged(logits, size, framing).argmax(0)
+    assert labels.dtype == np.uint8 and (labels == expected).mean() > 0.999  # rounding decides some
+    assert np.array_equal(labels == IGNORE, expected == IGNORE)
+    distance = np.exp(rng.standard_normal(small)).astype(np.float32)
+    metres, expected = full.distance(distance), np.zeros(size, np.float32)
+    expected[inside] = np.exp(enlarged(np.log(distance[None]), size, framing)[0])
+    assert metres.dtype == np.float32
+    np.testing.assert_allclose(metres, expected, rtol=2e-4)  # OpenCV rounds the weights
+    for count in (1, 3):  # equal logits are the first class
+        assert not full.labels(np.zeros((count, *small), np.float32))[inside].any()
+
+
+@given(st.integers(10, 80), st.integers(10, 80), st.sampled_from(FRAMINGS), st.floats(0.3, 3.0))
+def test_pixels_beyond_the_lens_have_no_answer(height, width, framing, theta_max):
+    lens = KannalaBrandt(
+        15.0, (0.01, 0, 0, 0), theta_max, center=(width / 3, height / 2), image_size=(height, width)
+    )
+    full, inside = FullSize(lens, 8, framing), part((height, width), framing)
+    y, x = np.mgrid[:height, :width]
+    radius = np.hypot(x - width / 3, y - height / 2)
+    edge = 15 * (theta_max + 0.01 * theta_max**3)
+    seen = np.zeros((height, width), bool)
+    seen[inside] = (radius <= edge)[inside]
+    pixel = (max(height, width) if framing == "stretch" else min(height, width)) / 8
+    assert not full.seen[~seen & (np.abs(radius - edge) > 1e-3)].any()
+    assert full.seen[seen & (radius < edge - 1.5 * pixel)].all()
+    small = at_size(np.zeros((height, width, 3), np.uint8), lens, 8, framing)[0].shape[:2]
+    labels = full.labels(np.ones((2, *small), np.float32))
+    distance = full.distance(np.full(small, 3, np.float32))
+    assert np.array_equal(labels == IGNORE, ~full.seen)
+    assert np.array_equal(distance == 0, ~full.seen)
+
+
+@pytest.mark.parametrize("framing", FRAMINGS)
+def test_full_size_undoes_at_size(framing):
+    """A smooth map comes back to the pixels that it was taken of."""
+    size = (96, 128)
+    y, x = np.mgrid[:96, :128]
+    smooth = (120 + 60 * np.sin(x / 30) + 60 * np.cos(y / 25)).astype(np.uint8)[..., None]
+    small, _ = at_size(smooth, all_seen(size), 64, framing)
+    back = FullSize(all_seen(size), 64, framing).distance(small[..., 0].astype(np.float32))
+    inside = part(size, framing)
+    exact = smooth[inside][..., 0].astype(float)
+    error = np.abs(back[inside] - exact).mean()
+    assert error < 1 and np.abs(np.roll(back, 2, 1)[inside] - exact).mean() > 2 * error
+
+
+def test_answers_beyond_the_lens_have_no_part_in_the_others():
+    """The distance is 5 m and the class 1 up to the rim, whatever stands beyond it."""
+    full = FullSize(Equidistant(30.0, theta_max=1.5, image_size=(97, 113)), 16, "stretch")
+    y, x = np.mgrid[:16, :16]
+    inside = np.hypot((x - 7.5) * 113 / 16, (y - 7.5) * 97 / 16) <= 45
+    distance = np.where(inside, 5, 1e-6).astype(np.float32)
+    found = full.distance(distance)
+    np.testing.assert_allclose(found[full.seen], 5, rtol=1e-5)
+    logits = np.stack((np.where(inside, 0, 1000), inside)).astype(np.float32)
+    assert (full.labels(logits)[full.seen] == 1).all()
+    assert np.array_equal(full.distance(np.where(inside, distance, np.nan)), found)

@@ -11,31 +11,33 @@ from darswin.utils import files
 from darswin.utils.files import locked, remove_partial_files, replace_file
 
 
+def python(code):
+    """A process that runs the code."""
+    command = [sys.executable, "-c", textwrap.dedent(code)]
+    return subprocess.run(command, capture_output=True, text=True, check=False)
+
+
 def test_the_new_file_takes_the_place_of_the_old(tmp_path):
     path = tmp_path / "new" / "a.txt"
-    for text in ("one", "two"):
-        replace_file(path, text)
-        assert path.read_text() == text
+    for content in ("one", b"two"):
+        replace_file(path, content)
+        assert path.read_text() == (content if content == "one" else "two")
     assert os.listdir(path.parent) == ["a.txt"]
     (tmp_path / "plain").write_text("")
     assert path.stat().st_mode == (tmp_path / "plain").stat().st_mode
+    with pytest.raises(OSError, match=r"cannot write it.*new"):
+        replace_file(tmp_path / "new", b"x")
+    assert sorted(os.listdir(tmp_path)) == ["new", "plain"]
 
 
-def test_what_cannot_be_written_is_named(tmp_path):
-    (tmp_path / "folder").mkdir()
-    with pytest.raises(OSError, match=r"cannot write it.*folder"):
-        replace_file(tmp_path / "folder", b"x")
-    assert os.listdir(tmp_path) == ["folder"]
-
-
+@pytest.mark.slow
 def test_what_a_kill_left_is_removed(tmp_path):
-    code = f"""
+    done = python(f"""
         import os
         from darswin.utils.files import replace_file
         os.fsync = lambda file: os._exit(9)
         replace_file({str(tmp_path / "a.ckpt")!r}, b"half")
-    """
-    done = subprocess.run([sys.executable, "-c", textwrap.dedent(code)], check=False)
+    """)
     (left,) = tmp_path.iterdir()
     assert done.returncode == 9 and left.name.startswith(".a.ckpt.")
     (tmp_path / ".hidden").write_text("")
@@ -43,20 +45,18 @@ def test_what_a_kill_left_is_removed(tmp_path):
     assert os.listdir(tmp_path) == [".hidden"]
 
 
-def test_a_full_disk_is_said_and_leaves_the_old_file_alone(tmp_path):
+@pytest.mark.slow
+def test_a_full_disk_leaves_the_old_file_alone(tmp_path):
     """A limit on file sizes stands for the full disk: writing fails in the same place."""
     path = tmp_path / "last.ckpt"
     path.write_text("old")
-    code = f"""
-        import resource, signal, torch
-        from darswin.train.runs import SafeCheckpointIO
+    done = python(f"""
+        import resource, signal
+        from darswin.utils.files import replace_file
         signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
         resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, {resource.RLIM_INFINITY}))
-        SafeCheckpointIO().save_checkpoint({{"state_dict": torch.zeros(100_000)}}, {str(path)!r})
-    """
-    done = subprocess.run(
-        [sys.executable, "-c", textwrap.dedent(code)], capture_output=True, text=True, check=False
-    )
+        replace_file({str(path)!r}, bytes(400_000))
+    """)
     assert done.returncode == 1
     assert "last.ckpt" in done.stderr.splitlines()[-1] and "OSError" in done.stderr
     assert path.read_text() == "old" and os.listdir(tmp_path) == ["last.ckpt"]
@@ -71,6 +71,7 @@ with runpy.run_path(sys.argv[1])["locked"](sys.argv[2]):
 """
 
 
+@pytest.mark.slow
 def test_a_kill_frees_a_lock_while_forks_live_on(tmp_path):
     path = tmp_path / "new" / "lock"
     holder = subprocess.Popen(

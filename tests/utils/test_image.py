@@ -1,3 +1,6 @@
+import struct
+import zlib
+
 import cv2
 import numpy as np
 import pytest
@@ -6,12 +9,30 @@ from PIL import ExifTags, Image, ImageOps
 from darswin.utils.image import BrokenImageError, read_image, read_oriented
 
 
-@pytest.mark.parametrize("content", [b"", b"no picture", None])
-def test_a_broken_picture_is_named(tmp_path, content):
+def chunk(kind, data):
+    return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+
+# A header of 60,000 × 60,000 pixels: more than OpenCV reads.
+HUGE = b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", struct.pack(">IIBBBBB", 60_000, 60_000, 8, 0, 0, 0, 0))
+HUGE += chunk(b"IDAT", zlib.compress(b"\0" * 1000)) + chunk(b"IEND", b"")
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"", "no image that"),
+        (b"no picture", "no image that"),
+        (None, "No such file"),
+        (HUGE, "too many pixels"),
+    ],
+)
+@pytest.mark.parametrize("read", [read_image, read_oriented])
+def test_a_broken_picture_is_named(tmp_path, content, message, read):
     if content is not None:
-        (tmp_path / "x.jpg").write_bytes(content)
-    with pytest.raises(BrokenImageError, match=r"cannot read .*x\.jpg"):
-        read_image(tmp_path / "x.jpg")
+        (tmp_path / "x.png").write_bytes(content)
+    with pytest.raises(BrokenImageError, match=rf"cannot read .*x\.png: {message}"):
+        read(tmp_path / "x.png")
 
 
 @pytest.mark.parametrize("channels", [1, 3])

@@ -33,6 +33,7 @@ def faults(call: str, what: str) -> int:
     return int(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="glibc's malloc is what is told")
 def test_kept_memory_needs_no_new_pages():
     assert faults("assert malloc.keep_freed_memory()", f"({LARGE}, {SMALL})") < 100

@@ -11,6 +11,8 @@ from darswin.lens.orientation import upright
 
 SIZE = (121, 160)
 SPHERICAL = {"model": "Spherical", "xi": 0.5, "focal": 60.0, "theta_max": 1.4}
+TANGENTIAL = {"model": "KannalaBrandt", "focal": 60.0, "radial": [0.1], "tangential": [0.1, 0],
+              "theta_max": 1.0}  # fmt: skip
 
 
 @pytest.fixture
@@ -42,8 +44,11 @@ def test_one_calibration_is_of_all_pictures(root):
     expected = load(WOODSCAPE).in_picture(SIZE)
     for picture in (root / "a/0.png", root / "b/c/2.png", None, "elsewhere.png"):
         same(lenses.lens_of(picture, SIZE), expected)
-    assert lenses.lens_of(None, SIZE) is lenses.lens_of(root / "a/0.png", SIZE)
+    assert lenses.lens_of(None, SIZE) is lenses.lens_of(None, SIZE)  # read once
     assert lenses.cameras_of([None, root / "a/0.png"]).tolist() == [0, 0]
+    same(lenses.lens_of(root / "a/0.png", SIZE[::-1], 6), upright(expected, 6))
+    with pytest.raises(ValueError, match=r"0\.png: the lens is of pictures of 966×1280 px.*woods"):
+        lenses.lens_of(root / "a/0.png", (100, 100))
 
 
 def test_a_camera_of_several(root):
@@ -65,15 +70,13 @@ def test_coefficients_that_the_file_does_not_name(root):
     with pytest.raises(ValueError, match="the coefficients of D may be"):
         Calibrations(file, root)
     for model in ("fisheye", "pinhole"):
-        expected = load(file, model=model)
-        same(Calibrations(file, root, coefficients=model).lens_of(None, (960, 1280)), expected)
         entry = {"file": "kd.json", "coefficients": model}
-        lenses = Calibrations(listed(root, {".": entry}), root)
-        same(lenses.lens_of(None, (960, 1280)), expected)
-    with pytest.raises(
-        ValueError, match=r"`coefficients` is of one calibration.*coefficients\": \"fish"
-    ):
-        Calibrations(listed(root, {".": "kd.json"}), root, coefficients="fisheye")
+        for lenses in (
+            Calibrations(file, root, coefficients=model),
+            Calibrations(listed(root, {".": entry}), root),
+            Calibrations(None, root, coefficients=model, files={root / "a/0.png": file}),
+        ):
+            same(lenses.lens_of(root / "a/0.png", (960, 1280)), load(file, model=model))
 
 
 def test_a_lens_as_json(root):
@@ -85,35 +88,29 @@ def test_a_lens_as_json(root):
 
 
 def test_the_most_specific_entry_counts(root):
-    file = listed(
-        root,
-        {".": "woodscape.json", "a/": SPHERICAL, "a/1.png": {"file": "woodscape.json"}},
-    )
-    lenses = Calibrations(file, root)
-    assert len(lenses.cameras) == 2
+    entries = {".": "woodscape.json", "a/": SPHERICAL, "a/1.png": {"file": "woodscape.json"}}
     pictures = [root / name for name in ("a/0.png", "a/1.png", "b/c/2.png")]
-    assert lenses.cameras_of(pictures).tolist() == [1, 0, 0]
-    assert lenses.cameras_of([None]).tolist() == [0]
+    lenses = Calibrations(listed(root, entries), root)
+    assert len(lenses.cameras) == 2
+    assert lenses.cameras_of([*pictures, None]).tolist() == [1, 0, 0, 0]
+    own = root.parent / "own.json"
+    own.write_text(json.dumps(SPHERICAL))
+    lenses = Calibrations(listed(root, entries), root, files={pictures[2]: own})
+    assert lenses.cameras_of([*pictures, None]).tolist() == [2, 1, 0, 1]
+    assert lenses.camera_of(pictures[2]).calibration == str(own)
 
 
 def test_lenses_of_several_models_are_curves(root):
-    file = listed(root, {"a": "woodscape.json", "b/c": "kalibr_ds.yaml"})
+    entries = {"a": "woodscape.json", "b/c": {"file": "kalibr_ds.yaml", "camera": "cam0"}}
     camera = load(CALIBRATIONS / "kalibr_ds.yaml", camera="cam0")
     size = tuple(int(side) for side in camera.image_size[0])
-    file = listed(
-        root, {"a": "woodscape.json", "b/c": {"file": "kalibr_ds.yaml", "camera": "cam0"}}
-    )
-    lens = Calibrations(file, root).lens_of(root / "b/c/2.png", size)
+    lens = Calibrations(listed(root, entries), root).lens_of(root / "b/c/2.png", size)
     assert isinstance(lens, Tabulated)
     theta = torch.linspace(0, 0.95 * camera.theta_max.item(), 20)
     torch.testing.assert_close(lens.project(theta), camera.project(theta), rtol=1e-4, atol=1e-3)
     alone = Calibrations(listed(root, {".": "woodscape.json"}), root)
     assert not isinstance(alone.lens_of(root / "a/0.png", SIZE), Tabulated)
-
-
-def test_a_turned_picture_has_a_turned_lens(root):
-    lens = Calibrations(WOODSCAPE, root).lens_of(root / "a/0.png", SIZE[::-1], 6)
-    same(lens, upright(load(WOODSCAPE).in_picture(SIZE), 6))
+    assert isinstance(Calibrations(listed(root, entries), root).lens_alone(root / "a"), Tabulated)
 
 
 @pytest.mark.parametrize(
@@ -137,6 +134,7 @@ def test_a_turned_picture_has_a_turned_lens(root):
         ("[]", "it must be a mapping"),
         ("3", "calibration"),
         ("{", "calibration"),
+        ({"a": SPHERICAL, "b": TANGENTIAL}, r'in .*"b": cameras of several lens models'),
     ],
 )
 def test_a_wrong_lenses_json_is_named(root, entries, message):
@@ -146,25 +144,15 @@ def test_a_wrong_lenses_json_is_named(root, entries, message):
 
 def test_what_has_no_lens(root):
     lenses = Calibrations(listed(root, {"a": "woodscape.json"}), root)
-    for picture in (root / "b/c/2.png", root.parent / "x.png"):
-        with pytest.raises(ValueError, match=f"has no lens for {picture}: an entry"):
+    for picture in (root / "b/c/2.png", root.parent / "x.png", None):
+        with pytest.raises(ValueError, match=f"no lens for {picture or 'pictures without a file'}"):
             lenses.camera_of(picture)
-    with pytest.raises(ValueError, match="no lens for pictures without a file"):
-        lenses.camera_of(None)
+    own = Calibrations(None, files={root / "a/0.png": WOODSCAPE})
+    with pytest.raises(ValueError, match=r"1\.png has no lens"):
+        own.camera_of(root / "a/1.png")
     with pytest.raises(FileNotFoundError):
         Calibrations(root / "none.json", root)
-    with pytest.raises(ValueError, match="`camera` is of one calibration file"):
-        Calibrations(listed(root, {"a": "woodscape.json"}), root, "0")
-
-
-def test_a_picture_of_another_shape_is_named(root):
-    lenses = Calibrations(WOODSCAPE, root)
-    with pytest.raises(ValueError, match=r"0\.png: the lens is of pictures of 966×1280 px.*woods"):
-        lenses.lens_of(root / "a/0.png", (100, 100))
-
-
-def test_terms_that_no_curve_has_are_named(root):
-    tangential = {"model": "KannalaBrandt", "focal": 60.0, "radial": [0.1], "tangential": [0.1, 0]}
-    file = listed(root, {"a": SPHERICAL, "b": dict(tangential, theta_max=1.0)})
-    with pytest.raises(ValueError, match=r'in .*"b": cameras of several lens models'):
-        Calibrations(file, root)
+    for options in ({"camera": "0"}, {"coefficients": "fisheye"}):
+        (name,) = options
+        with pytest.raises(ValueError, match=rf'`{name}` is of one .*"file": …, "{name}"'):
+            Calibrations(listed(root, {"a": "woodscape.json"}), root, **options)

@@ -1,0 +1,95 @@
+"""Sources of pictures: digits, IDX files, and parts of any source."""
+
+import gzip
+
+import numpy as np
+import pytest
+
+from darswin.data import open_source
+from darswin.data.pictures import Arrays, ImageFiles, read_idx
+from darswin.data.splits import SPLITS
+
+
+def write_idx(path, array):
+    head = b"\0\0\x08" + bytes([array.ndim]) + np.array(array.shape, ">u4").tobytes()
+    data = head + array.tobytes()
+    path.write_bytes(gzip.compress(data) if path.suffix == ".gz" else data)
+
+
+def test_digits():
+    parts = [open_source("digits", split, channels=1) for split in SPLITS]
+    assert sum(map(len, parts)) == 1797 and all(len(part) > 180 for part in parts)
+    image, _ = parts[0][0]
+    assert image.shape == (8, 8, 1) and max(parts[0][k][0].max() for k in range(9)) == 255
+    assert open_source("digits", "val")[0][0].shape == (8, 8, 3)
+
+
+def test_a_limit_takes_a_sample_of_the_whole(tmp_path):
+    whole = open_source("digits", "train", channels=1)
+    part = whole.limited(50)
+    labels = [part[k][1] for k in range(50)]
+    assert len(part) == 50 and len(set(labels)) == 10 and len(whole) > 50
+    assert len(whole.limited(10_000)) == len(whole)
+    files = ImageFiles(tmp_path, [(f"{k}.png", k) for k in range(len(whole))], range(len(whole)))
+    chosen = files.limited(50)  # the same pictures of any source
+    assert [whole.labels[k] for k in chosen.labels] == labels
+    assert chosen.file(3) == tmp_path / f"{chosen.labels[3]}.png" and part.file(3) is None
+    for count in (0, -1):
+        with pytest.raises(ValueError, match=f"`limit` must be at least 1, got {count}"):
+            whole.limited(count)
+
+
+@pytest.mark.parametrize("suffix", ["", ".gz"])
+def test_idx_files(tmp_path, suffix):
+    rng = np.random.default_rng(0)
+    arrays = {}
+    for part, count in (("train", 20), ("t10k", 5)):
+        arrays[part] = rng.integers(256, size=(count, 28, 28), dtype=np.uint8)
+        write_idx(tmp_path / f"{part}-images-idx3-ubyte{suffix}", arrays[part])
+        labels = (np.arange(count) % 10).astype(np.uint8)
+        write_idx(tmp_path / f"{part}-labels-idx1-ubyte{suffix}", labels)
+    train, val, test = (open_source(tmp_path, split, channels=1) for split in SPLITS)
+    assert (len(train), len(val), len(test)) == (18, 2, 5) and len(train.classes) == 10
+    image, label = val[1]
+    assert np.array_equal(image[..., 0], arrays["train"][19]) and label == 9
+    assert np.array_equal(test[4][0][..., 0], arrays["t10k"][4])
+    assert test.oriented(4)[1:] == (4, 1)
+
+
+def test_the_classes_of_idx_files_are_those_of_training(tmp_path):
+    for part, labels in (("train", [0, 1, 2, 0]), ("t10k", [1, 0])):
+        write_idx(tmp_path / f"{part}-images-idx3-ubyte", np.zeros((len(labels), 2, 2), np.uint8))
+        write_idx(tmp_path / f"{part}-labels-idx1-ubyte", np.array(labels, np.uint8))
+    assert all(open_source(tmp_path, split).classes == ["0", "1", "2"] for split in SPLITS)
+    (tmp_path / "names.txt").write_text("zero\none\n")
+    with pytest.raises(ValueError, match=r"labels up to 2 for the 'train' split.*\['zero', 'one"):
+        open_source(tmp_path, "train", classes=tmp_path / "names.txt")
+    write_idx(tmp_path / "t10k-labels-idx1-ubyte", np.array([7, 0], np.uint8))
+    with pytest.raises(ValueError, match="labels up to 7 for the 'test' split"):
+        open_source(tmp_path, "test")
+    (tmp_path / "t10k-labels-idx1-ubyte").unlink()
+    with pytest.raises(FileNotFoundError, match="no t10k-labels-idx1-ubyte"):
+        open_source(tmp_path, "test")
+
+
+def test_a_cut_idx_file_is_named(tmp_path):
+    write_idx(tmp_path / "a", np.zeros((4, 3, 3), np.uint8))
+    whole = (tmp_path / "a").read_bytes()
+    for name, content, message in (
+        ("a", whole[:-1], r"a says it holds \[4, 3, 3\] bytes, but holds 35"),
+        ("a.gz", gzip.compress(whole)[:-12], r"a\.gz is no whole gzip file"),
+        ("a", b"GIF89a", "a is no IDX file"),
+    ):
+        (tmp_path / name).write_bytes(content)
+        with pytest.raises(ValueError, match=message):
+            read_idx(tmp_path / name)
+
+
+def test_wrong_options(tmp_path):
+    for options in (dict(split="all"), dict(split="val", holdout=0.5)):
+        with pytest.raises(ValueError, match=f"`{list(options)[-1]}` must be"):
+            open_source("digits", **options)
+    with pytest.raises(FileNotFoundError, match=r"no folder .*nowhere"):
+        open_source(tmp_path / "nowhere", "train")
+    with pytest.raises(ValueError, match="2 images and 3 labels"):
+        Arrays(np.zeros((2, 4, 4), np.uint8), np.zeros(3), ["a"])
