@@ -3,7 +3,7 @@
 import json
 import os
 import re
-from collections.abc import Hashable, Iterator, Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple
 
@@ -65,6 +65,9 @@ class Calibrations:
         files: pictures and their own calibration files, which count before `lens`. Each is read
             when its picture is; in JSON where there are many.
 
+    Attributes:
+        cameras: the different cameras: those of `files`, then those of `lens`.
+
     Raises:
         ValueError: what is no lens, or lenses that cannot be joined, by name. FileNotFoundError: a
             file that is missing.
@@ -79,18 +82,23 @@ class Calibrations:
         *,
         files: Mapping[Path, Path] | None = None,
     ):
-        self._root = os.path.abspath(root)
-        self._lens, self._coefficients = lens, coefficients
-        self._files = {str(picture): str(file) for picture, file in (files or {}).items()}
+        self._root, self._lens = os.path.abspath(root), lens
+        paths = {str(picture): str(file) for picture, file in (files or {}).items()}
+        own = {
+            file: PictureCamera(file, None, file, coefficients)
+            for file in dict.fromkeys(paths.values())
+        }
+        self._own = {picture: own[file] for picture, file in paths.items()}
         self._places = {} if lens is None else _places(lens, Path(root), camera, coefficients)
-        # Early, so that what is no lens is said before any work.
-        self._as_curves = _are_curves([*self._own_examples(), *self._shared()])
+        shared = dict.fromkeys(self._places.values())
+        self.cameras = [*own.values(), *shared]
+        # Early, so that what is no lens is said before any work. Of the pictures' own files, one
+        # stands for all those that differ from it in numbers alone.
+        forms: dict[Hashable, PictureCamera] = {}
+        for file, own_camera in own.items():
+            forms.setdefault(_form_of(file), own_camera)
+        self._as_curves = _are_curves([*forms.values(), *shared])
         self._lenses: dict[tuple, Lens] = {}
-
-    @property
-    def cameras(self) -> list[PictureCamera]:
-        """The different cameras, those of `files` first, then those of `lens`."""
-        return [*map(self._own, dict.fromkeys(self._files.values())), *self._shared()]
 
     def camera_of(self, picture: str | Path | None) -> PictureCamera:
         """The camera that took a picture; None is a picture without a file of its own.
@@ -98,8 +106,8 @@ class Calibrations:
         Raises:
             ValueError: a picture that has no lens.
         """
-        if (own := self._files.get(str(picture))) is not None:
-            return self._own(own)
+        if (own := self._own.get(str(picture))) is not None:
+            return own
         key, file = _ALL, Path(os.path.abspath(picture or self._root))
         if file.is_relative_to(self._root):
             key = PurePosixPath(file.relative_to(self._root).as_posix())
@@ -151,21 +159,6 @@ class Calibrations:
 
     def _form(self, lens: Lens) -> Lens:
         return as_curves(lens) if self._as_curves else lens
-
-    def _own(self, file: str) -> PictureCamera:
-        return PictureCamera(file, None, file, self._coefficients)
-
-    def _shared(self) -> list[PictureCamera]:
-        return list(dict.fromkeys(self._places.values()))
-
-    def _own_examples(self) -> Iterator[PictureCamera]:
-        """One of the pictures' files for all those that differ from it in numbers alone."""
-        seen: set[Hashable] = set()
-        for file in dict.fromkeys(self._files.values()):
-            form = _form(_content(file)) if file.endswith(".json") else file
-            if form not in seen:
-                seen.add(form)
-                yield self._own(file)
 
 
 def is_json(lens: str | Path) -> bool:
@@ -248,18 +241,21 @@ def _are_curves(cameras: Sequence[PictureCamera]) -> bool:
     return True
 
 
-def _content(file: str) -> Any:
+def _form_of(file: str) -> Hashable:
+    """The content of a calibration file without its numbers; of another file than JSON, its name."""
+    if not file.endswith(".json"):
+        return file
     try:
-        return json.loads(Path(file).read_bytes())
+        content = json.loads(Path(file).read_bytes())
     except ValueError as error:
         raise ValueError(f"calibration {file}: it is no JSON: {error}") from error
+    return _without_numbers(content)
 
 
-def _form(value: Any, name: str = "") -> Hashable:
-    """The content of a calibration file without its numbers."""
+def _without_numbers(value: Any, name: str = "") -> Hashable:
     if isinstance(value, dict):
-        return frozenset((key, _form(entry, key)) for key, entry in value.items())
+        return frozenset((key, _without_numbers(entry, key)) for key, entry in value.items())
     if isinstance(value, list):
-        nested = [_form(entry) for entry in value if isinstance(entry, dict | list)]
+        nested = [_without_numbers(entry) for entry in value if isinstance(entry, dict | list)]
         return len(value), *nested
     return value if isinstance(value, str) and _SAYS_MODEL.search(name) else None

@@ -6,7 +6,6 @@ they distribute the angles, not in what they see.
 
 import math
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 import torch
@@ -22,15 +21,16 @@ LEVELS = {
 }
 
 
-class LensDistribution(Protocol):
+class LensDistribution:
     """A distribution of lenses."""
 
     def draw(self, rng: np.random.Generator, fov: float, radius: float) -> Lens:
         """A lens whose full field of view `fov` (rad) fills a circle of `radius` px."""
+        raise NotImplementedError
 
 
 @dataclass(frozen=True)
-class SphericalLenses:
+class SphericalLenses(LensDistribution):
     """ξ uniform in [low, high]."""
 
     low: float
@@ -41,12 +41,11 @@ class SphericalLenses:
             raise ValueError(f"ξ must be 0 ≤ low ≤ high, got {self.low} to {self.high}")
 
     def draw(self, rng: np.random.Generator, fov: float, radius: float) -> Lens:
-        """A Spherical lens whose full field of view `fov` (rad) fills a circle of `radius` px."""
         return Spherical.from_fov(rng.uniform(self.low, self.high), fov, radius)
 
 
 @dataclass(frozen=True)
-class PolynomialLenses:
+class PolynomialLenses(LensDistribution):
     """r ∝ k₁ θ + … + k₄ θ⁴, (k₁, …, k₄) a random direction in which every component is positive.
 
     Source: the test set of DarSwin, ICCV 2023, table 5, whose coefficients are positive and of
@@ -54,7 +53,6 @@ class PolynomialLenses:
     """
 
     def draw(self, rng: np.random.Generator, fov: float, radius: float) -> Lens:
-        """A Polynomial lens whose full field of view `fov` (rad) fills a circle of `radius` px."""
         direction = np.abs(rng.standard_normal(4))
         theta_max = fov / 2
         scale = radius / sum(k * theta_max**power for power, k in enumerate(direction, start=1))
@@ -90,15 +88,8 @@ def parse_lenses(text: str | float) -> LensDistribution:
 
 
 def parse_sweep(text: str | float | list) -> list[str]:
-    """Several distributions: a list of them, or "start:stop:step" for equally spaced ξ, stop
-    included.
-
-    Returns:
-        What `parse_lenses` takes, one each: ["0", "0.1", …].
-
-    Raises:
-        ValueError: what is no sweep.
-    """
+    """The names of several distributions: of a list of them, or of "start:stop:step", equally
+    spaced ξ with the stop included; ValueError for another form."""
     if isinstance(text, list):
         return [name for part in text for name in parse_sweep(part)]
     parts = str(text).split(":")

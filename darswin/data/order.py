@@ -17,12 +17,9 @@ class TrainingOrder(Sampler[Draw]):
     of each in the first half of its batch and the second in the mirrored place, so that its batch,
     too, mixes with its own reverse; and any number of processes trains on the same mixtures.
 
-    Args:
-        count: of images. batch: of one process; even unless world is 1. rank, world: of processes.
-        pairs: partners share their lens, so that a mixture is an image through one lens.
-        seed: of the shuffle.
-        cameras: (count,), the camera of each image, or None: with `pairs`, partners are of one
-            camera, but for those that are left over.
+    With `pairs`, partners share their lens, so that a mixture is an image through one lens, and, if
+    `cameras` (count,) gives each image's, their camera, but for those that are left over. `batch`
+    is that of one process, and even unless `world` is 1.
     """
 
     def __init__(
@@ -47,11 +44,8 @@ class TrainingOrder(Sampler[Draw]):
         self.epoch = epoch
 
     def resume(self, epoch: int, done: int, shuffle: list[int]) -> None:
-        """Leaves out the first `done` batches of an epoch.
-
-        Raises:
-            ValueError: batches of another shuffle, unless the epoch was whole.
-        """
+        """Leaves out the first `done` batches of an epoch; ValueError if they are of another
+        shuffle, unless the epoch was whole."""
         count, size, _ = shuffle
         if shuffle != self.shuffle() and done < count // size:
             raise ValueError(
@@ -69,7 +63,6 @@ class TrainingOrder(Sampler[Draw]):
         return self._resume[1] if self._resume[0] == self.epoch else 0
 
     def batches(self) -> int:
-        """Of an epoch."""
         return self.count // (self.batch * self.world)
 
     def __len__(self) -> int:

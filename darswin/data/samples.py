@@ -22,41 +22,15 @@ Augmentation = Callable[[np.ndarray, np.random.Generator], np.ndarray]
 
 
 class Draw(NamedTuple):
-    """The number of an image, and what keys the random numbers of its sample.
-
-    `epoch` and `picture` key its augmentation, `epoch` and `lens` its lens and its turn.
-    """
+    """The number of an image, and the keys of a sample's random numbers."""
 
     epoch: int
-    picture: int
-    lens: int
+    picture: int  # with the epoch, keys the augmentation
+    lens: int  # with the epoch, keys the lens and the turn
 
 
 class Samples(Dataset):
-    """Base of the data sets: `dataset[i]` is (image, lens, label). A data set defines `_seen`.
-
-    A sample depends on the seed and its `Draw` alone, not on what was read before: `dataset[i]`
-    means `dataset[Draw(0, i, i)]`.
-
-    Args:
-        source: the pictures, which a data set reads.
-        size: px, H = W of the images.
-        framing: how a picture becomes a square: "crop" cuts its longer side, "stretch" squashes it;
-            the lens follows exactly.
-        mean, std: per channel, in [0, 1]; the image comes out as (pixel/255 - mean) / std.
-        turns: of the images with their lenses; None is none.
-        augment: changes the (H, W, C) uint8 image, given it and a random generator.
-        erase: changes the normalised (C, H, W) float32 image, likewise.
-        seed: of everything random.
-        skip_broken: makes a picture that cannot be read a black image with label -1 (or, where a
-            label is one of each pixel, that of none), and counts it in `broken`, instead of
-            raising.
-
-    Making one sets OpenCV to one thread, in all of the process.
-
-    Raises:
-        BrokenImageError: from `dataset[i]`, naming a file that cannot be read.
-    """
+    """Base of the data sets, which define `_seen` and `_lens_alone`; see `Calibrated`."""
 
     def __init__(
         self,
@@ -135,17 +109,30 @@ class Samples(Dataset):
 class Calibrated(Samples):
     """Pictures as they are, with the lenses that took them: `dataset[i]` is (image, lens, label).
 
-    A picture is reduced to `size` and its lens with it. Its EXIF turns both upright.
+    A picture is reduced to `size` and its lens with it. Its EXIF turns both upright. A sample
+    depends on the seed and its `Draw` alone, not on what was read before: `dataset[i]` means
+    `dataset[Draw(0, i, i)]`. Making a data set sets OpenCV to one thread, in all of the process.
 
     Args:
         source: the pictures. calibrations: which lens took which.
-        options: size, framing, mean, std, turns, augment, erase, seed and skip_broken.
+        size: px, H = W of the images.
+        framing: how a picture becomes a square: "crop" cuts its longer side, "stretch" squashes it;
+            the lens follows exactly.
+        mean, std: per channel, in [0, 1]; the image comes out as (pixel/255 - mean) / std.
+        turns: of the images with their lenses; None is none.
+        augment: changes the (H, W, C) uint8 image, given it and a random generator.
+        erase: changes the normalised (C, H, W) float32 image, likewise.
+        seed: of everything random.
+        skip_broken: makes a picture that cannot be read a black image with label -1 (or, where a
+            label is one of each pixel, that of none), and counts it in `broken`, instead of
+            raising.
 
     Attributes:
         cameras: (N,), the number of each picture's camera.
 
     Raises:
         ValueError: a picture without a lens, or of another shape than its calibration; named.
+        BrokenImageError: from `dataset[i]`, naming a file that cannot be read.
     """
 
     source: Source

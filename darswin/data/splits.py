@@ -66,12 +66,8 @@ def part_of_split(
     label: Callable[[str], str] = lambda path: "",
     group: Callable[[str], str] | None = None,
 ) -> list[str]:
-    """The paths of a split, where `held_out` and "train" share them.
-
-    Args:
-        where: the folder, for errors. label: each label gives the same share. group: paths of one
-            group stay together.
-    """
+    """The paths of a split, where `held_out` and "train" share them: of each label the same share,
+    and paths of one group together. `where` is the folder, for errors."""
     if not held_out:
         return paths
     groups = {path: group(path) if group else path for path in paths}
@@ -129,11 +125,8 @@ class Limited:
 
 
 def read_split_lists(lists: Path) -> dict[Split, list]:
-    """The entries of each split, from a JSON file, or from a folder with a text file per split.
-
-    Raises:
-        ValueError: another form, or two lists of one split. OSError: it cannot be read.
-    """
+    """The entries of each split, from a JSON file, or from a folder with a text file per split;
+    ValueError for another form, or for two lists of one split."""
     if lists.is_dir():
         content = {
             file.stem: read_list(file)

@@ -128,9 +128,8 @@ def turned_lens(lens: Lens, turn: Turn) -> tuple[Lens, np.ndarray]:
 def turned_picture(image: np.ndarray, lens: Lens, turn: Turn) -> tuple[np.ndarray, Lens]:
     """A picture (H, W, C) uint8 and its lens after a turn about the lens's optical axis.
 
-    The picture keeps its size; what turns in from beyond it is black. Exact for every lens: where
-    pixels are oblong the picture is sheared so that it looks turned through that lens, and
-    tangential terms turn with it.
+    The picture keeps its size; what turns in from beyond it is black. Where pixels are oblong the
+    picture is sheared so that it looks turned through that lens.
     """
     if turn.angle:
         lens, matrix = rotated(lens, turn.angle)
@@ -166,13 +165,11 @@ def at_size(image: np.ndarray, lens: Lens, size: int, framing: Framing) -> tuple
 
 
 def area_resized(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """A picture (H, W, C) at another (H, W), each pixel the mean over its area.
-
-    An axis that becomes shorter is resized before one that becomes longer. OpenCV takes areas only
-    if no axis becomes longer; otherwise it shifts an axis that becomes much shorter by up to a
-    third of a new pixel.
-    """
+    """A picture (H, W, C) at another (H, W), each pixel the mean over its area."""
     height, width = size
+    # An axis that becomes shorter is resized before one that becomes longer. OpenCV takes areas
+    # only if no axis becomes longer; otherwise it shifts an axis that becomes much shorter by up to
+    # a third of a new pixel.
     less = min(image.shape[1], width), min(image.shape[0], height)
     for sides in dict.fromkeys((less, (width, height))):
         image = cv2.resize(image, sides, interpolation=cv2.INTER_AREA)

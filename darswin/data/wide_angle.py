@@ -27,9 +27,6 @@ class WideAngle(Samples):
     lens whose circle, of the same field of view, touches the image's sides, at `render` pixels, and
     reduced to `size` by averaging areas. Beyond the field of view it is black.
 
-    A sample depends on the seed and its `Draw` alone, not on what was read before: `dataset[i]`
-    means `dataset[Draw(0, i, i)]`, always the same image through the same lens.
-
     Args:
         source: the pictures. lenses: the distribution of lenses.
         size: px, H = W of the images. render: px, what they are reduced from; at least `size`.
@@ -40,7 +37,6 @@ class WideAngle(Samples):
 
     Raises:
         ValueError: sizes or angles out of range.
-        BrokenImageError: from `dataset[i]`, naming a file that cannot be read.
 
     Source: DarSwin, ICCV 2023, sec. 5.1.
     """

@@ -52,15 +52,8 @@ class Options:
         group: Callable[[str], str] | None = None,
         named: Named | None = None,
     ) -> list[str]:
-        """The split's stems of all those found in a folder that has no folders of splits.
-
-        Args:
-            group: stems of one group are held out together. named: splits that `splits` may name.
-
-        Raises:
-            ValueError: lists that are wrong, or a stem in two of them. FileNotFoundError: a stem in
-                the split's list that is not there; a split that has none.
-        """
+        """The split's stems of all those found in a folder that has no folders of splits. Stems of
+        one group are held out together; `named` are splits that `splits` may name."""
         if self.split == "all":
             return found
         given: dict[Split, list[str]] = {"train": found}
@@ -103,11 +96,8 @@ def _stem(name: str) -> str:
 
 
 def stems(folder: Path, suffixes: Sequence[str] | frozenset[str]) -> dict[str, str]:
-    """The files below a folder by their paths in it without a suffix, sorted.
-
-    Raises:
-        FileNotFoundError: no such folder. ValueError: two files of one stem.
-    """
+    """The files below a folder by their paths in it without a suffix, sorted; ValueError where two
+    have one stem."""
     if not folder.is_dir():
         raise FileNotFoundError(f"no folder {folder}")
     found: dict[str, str] = {}
@@ -143,15 +133,9 @@ def pair(
     what: str,
     strict: bool = True,
 ) -> Pairs:
-    """The pictures whose stems `choose` takes, and the targets of the same stems.
-
-    Args:
-        root: the paths become relative to it. what: the targets, for errors.
-        strict: pictures without a target are an error if they are chosen, else left out.
-
-    Raises:
-        FileNotFoundError: pictures without a target, by name.
-    """
+    """The pictures whose stems `choose` takes, and the targets of the same stems, with paths
+    relative to `root`. `what` names the targets in errors. If `strict`, pictures without a target
+    are an error if they are chosen, else they are left out."""
     found = list(pictures)
     if not strict:
         found = [stem for stem in pictures if stem in targets]

@@ -128,7 +128,7 @@ class Scenes(Limited):
         kept = slice(rows, size[0] - rows)
         image, target = image[kept], target[kept]
         self.unknown[index] = int(np.count_nonzero(target == nothing_of(target)))
-        return Scene(image, target, self._trimmed(lens, rows))
+        return Scene(image, target, self._trimmed(lens))
 
     def limited(self, count: int) -> Self:
         """At most `count` of the scenes, chosen by a fixed shuffle; ValueError below 1."""
@@ -151,18 +151,18 @@ class Scenes(Limited):
     def lens_alone(self, index: int) -> Lens:
         """The lens of a picture that cannot be read: in one of the size that it was made for."""
         lens = self.lenses.lens_alone(self.file(index))
-        height = 1 if lens.image_size is None else round(lens.image_size[0, 0].item())
-        return self._trimmed(lens, self._rows(height))
+        return self._trimmed(lens)
 
     def _rows(self, height: int) -> int:
         """The number of rows that are cut at the top of a picture."""
         rows, of = self.trim
         return -(-rows * height // of)
 
-    def _trimmed(self, lens: Lens, rows: int) -> Lens:
-        if not rows or lens.image_size is None:
+    def _trimmed(self, lens: Lens) -> Lens:
+        if not self.trim[0] or lens.image_size is None:
             return lens
         height, width = (round(side) for side in lens.image_size[0].tolist())
+        rows = self._rows(height)
         return lens.cropped(rows, 0, height - 2 * rows, width)
 
 
@@ -170,18 +170,13 @@ class Scenes(Limited):
 
 
 def nothing_of(target: np.ndarray) -> int:
-    """The value of pixels of which nothing is known: `IGNORE` of labels (uint8), 0 of distances."""
+    """The target of pixels of which nothing is known: `IGNORE` in labels (uint8), 0 in distances."""
     return IGNORE if target.dtype == np.uint8 else 0
 
 
 def read_labels(path: Path, classes: int) -> np.ndarray:
     """A label PNG as (H, W) uint8: ids of so many classes, or `IGNORE`. Of a PNG with a palette
-    the ids count, not their colours.
-
-    Raises:
-        BrokenImageError: a file that is missing or cannot be read. ValueError: one of 16 bits or of
-            colours, or an id that is no class's. Both name the file.
-    """
+    the ids count, not their colours. Errors name the file."""
     try:
         with warnings.catch_warnings(action="ignore"), Image.open(path) as file:
             mode = file.mode
@@ -204,45 +199,35 @@ def read_labels(path: Path, classes: int) -> np.ndarray:
 
 
 def read_distance(path: Path, far: float | None = None) -> np.ndarray:
-    """Distances along the rays (H, W) float32, metres; 0 where they are not known: where they are
-    not finite, not above 0, or at least `far`.
-
-    Args:
-        path: a PNG of 16 bits, metres × 256; or a NumPy file of floating-point metres.
-
-    Raises:
-        BrokenImageError: a file that is missing or cannot be read. ValueError: one of another form.
-            Both name the file.
-    """
-    metres = _numbers(path) if path.suffix.lower() == ".npy" else _sixteen_bits(path)
+    """Distances along the rays (H, W) float32, metres, of a PNG of 16 bits, metres × 256, or of a
+    NumPy file of floating-point metres. They are 0 where they are not known: where they are not
+    finite, not above 0, or at least `far`. Errors name the file."""
+    if path.suffix.lower() == ".npy":
+        try:
+            metres = np.load(path, allow_pickle=False)
+        except Exception as error:  # as above
+            raise BrokenImageError(f"cannot read {path}: {_reason(error)}") from error
+        if not isinstance(metres, np.ndarray) or metres.ndim != 2 or metres.dtype.kind != "f":
+            form = "an archive"
+            if isinstance(metres, np.ndarray):
+                form = f"{metres.dtype} {metres.shape}"
+            raise ValueError(f"{path} must hold floating-point metres (H, W), but holds {form}")
+        with np.errstate(over="ignore"):  # infinite is not known
+            metres = metres.astype(np.float32)
+    else:
+        image = decoded(file_content(path), path, cv2.IMREAD_UNCHANGED)
+        if image.dtype != np.uint16 or image.ndim != 2:
+            colours = 1 if image.ndim == 2 else image.shape[2]
+            raise ValueError(
+                f"{path} must hold a distance of 16 bits for each pixel, metres × {PER_METRE}, but "
+                f"holds {colours} × {8 * image.dtype.itemsize} bits"
+            )
+        metres = image.astype(np.float32) / np.float32(PER_METRE)
     with np.errstate(invalid="ignore"):
         known = np.isfinite(metres) & (metres > 0)
         if far is not None:
             known &= metres < far
     return np.where(known, metres, np.float32(0))
-
-
-def _numbers(path: Path) -> np.ndarray:
-    try:
-        metres = np.load(path, allow_pickle=False)
-    except Exception as error:  # as above
-        raise BrokenImageError(f"cannot read {path}: {_reason(error)}") from error
-    if not isinstance(metres, np.ndarray) or metres.ndim != 2 or metres.dtype.kind != "f":
-        form = f"{metres.dtype} {metres.shape}" if isinstance(metres, np.ndarray) else "an archive"
-        raise ValueError(f"{path} must hold floating-point metres (H, W), but holds {form}")
-    with np.errstate(over="ignore"):  # infinite is not known
-        return metres.astype(np.float32)
-
-
-def _sixteen_bits(path: Path) -> np.ndarray:
-    image = decoded(file_content(path), path, cv2.IMREAD_UNCHANGED)
-    if image.dtype != np.uint16 or image.ndim != 2:
-        colours = 1 if image.ndim == 2 else image.shape[2]
-        raise ValueError(
-            f"{path} must hold a distance of 16 bits for each pixel, metres × {PER_METRE}, but "
-            f"holds {colours} × {8 * image.dtype.itemsize} bits"
-        )
-    return image.astype(np.float32) / np.float32(PER_METRE)
 
 
 def _reason(error: Exception) -> str:
@@ -263,12 +248,13 @@ def read_palette(path: str | Path) -> Classes:
 
 def as_classes(names: Any, colors: Any, path: str | Path) -> Classes:
     """The classes of a file; ValueError where that is not one name, and one colour, each."""
-    if not _is_list(names, str) or not names:
+    is_list = isinstance(names, list) and names and all(isinstance(name, str) for name in names)
+    if not is_list:
         raise ValueError(f"{path} must name the classes as a list of words, got {names!r}")
     if len(set(names)) < len(names) or len(names) > IGNORE:
         raise ValueError(f"{path} must name each class once, and at most {IGNORE}, got {names}")
-    matches = _is_list(colors, list) and len(colors) in (0, len(names))
-    if not matches or not all(_is_color(color) for color in colors):
+    is_list = isinstance(colors, list) and len(colors) in (0, len(names))
+    if not is_list or not all(_is_color(color) for color in colors):
         raise ValueError(
             f"{path} must give each of {len(names)} classes a color [r, g, b] in 0 … 255, or none "
             f"a color, got {colors!r}"
@@ -276,9 +262,6 @@ def as_classes(names: Any, colors: Any, path: str | Path) -> Classes:
     return Classes(list(names), [list(color) for color in colors])
 
 
-def _is_list(value: Any, kind: type) -> bool:
-    return isinstance(value, list) and all(isinstance(entry, kind) for entry in value)
-
-
-def _is_color(value: Sequence) -> bool:
-    return len(value) == 3 and all(type(v) is int and 0 <= v <= 255 for v in value)
+def _is_color(value: Any) -> bool:
+    numbers = isinstance(value, list) and len(value) == 3
+    return numbers and all(type(v) is int and 0 <= v <= 255 for v in value)
