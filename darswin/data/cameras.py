@@ -242,7 +242,7 @@ def _are_curves(cameras: Sequence[PictureCamera]) -> bool:
 
 
 def _form_of(file: str) -> Hashable:
-    """The content of a calibration file without its numbers; of another file than JSON, its name."""
+    """The content of a JSON calibration without its numbers; of another file, its name."""
     if not file.endswith(".json"):
         return file
     try:

@@ -170,7 +170,7 @@ class Scenes(Limited):
 
 
 def nothing_of(target: np.ndarray) -> int:
-    """The target of pixels of which nothing is known: `IGNORE` in labels (uint8), 0 in distances."""
+    """The target of unknown pixels: `IGNORE` in labels (uint8), 0 in distances."""
     return IGNORE if target.dtype == np.uint8 else 0
 
 
