@@ -16,6 +16,7 @@ from darswin.data.splits import (
     part_of_split,
     read_split_lists,
     some,
+    split_folders,
     taken_from,
     warn_left_out,
 )
@@ -64,7 +65,7 @@ def open_folder(
     if not paths:
         raise FileNotFoundError(f"no images for the {split!r} split in {folder}: {LOOKED_FOR}")
     counts = Counter(map(class_of, paths))
-    small = sorted(name for name, count in counts.items() if count <= len(held_out))
+    small = sorted(name for name in counts if counts[name] <= len(held_out))
     if small and holdout > 0:
         warn_left_out(
             f"{folder}: too few pictures to hold any out of the classes {some(small)}: all of them "
@@ -114,24 +115,13 @@ def _found(root: Path, names: list[str] | None) -> dict[Split, Pictures]:
 
 def _split_folders(root: Path, names: list[str] | None) -> dict[Split, Path] | None:
     """The folders of the splits, or None where the folders in `root` are those of the classes."""
-    named: dict[Split, Path] = {}
-    others = []
     folders, loose = _entries(root)
-    for folder in folders:
-        split = SPLIT_NAMES.get(folder.name.lower())
-        if split is None:
-            others.append(folder)
-        elif _has_pictures(folder):
-            if split in named and not folder.samefile(named[split]):
-                raise ValueError(
-                    f"{named[split]} and {folder} both have a name of the {split!r} split: keep one"
-                )
-            named[split] = folder
+    named = split_folders(folders, _has_pictures)
     if not named or {folder.name for folder in named.values()} & set(names or ()):
         return None
     if "test" in named and "val" in named and named["test"].samefile(named["val"]):
         del named["test"]  # "val" serves as the test set
-    others = [folder for folder in others if _has_pictures(folder)]
+    others = [f for f in folders if f.name.lower() not in SPLIT_NAMES and _has_pictures(f)]
     has_classes = "train" in named and any(map(_has_pictures, _entries(named["train"])[0]))
     if has_classes and (len(named) > 1 or not others):
         for folder in others:

@@ -162,13 +162,13 @@ def _digits(split: Split, channels: int, names: list[str] | None, holdout: float
 def _idx(
     root: Path, split: Split, channels: int, names: list[str] | None, holdout: float
 ) -> Arrays:
-    labels = _idx_array(root, "train-labels-idx1-ubyte")
+    labels = read_idx(root, "train-labels-idx1-ubyte")
     names = names or [str(k) for k in range(int(labels.max(initial=0)) + 1)]
     if split == "test":
-        images = _idx_array(root, "t10k-images-idx3-ubyte")
-        labels = _idx_array(root, "t10k-labels-idx1-ubyte")
+        images = read_idx(root, "t10k-images-idx3-ubyte")
+        labels = read_idx(root, "t10k-labels-idx1-ubyte")
     else:
-        images = _idx_array(root, "train-images-idx3-ubyte")
+        images = read_idx(root, "train-images-idx3-ubyte")
         kept = len(images) - math.ceil(holdout * len(images))
         part = slice(kept) if split == "train" else slice(kept, None)
         images, labels = images[part], labels[part]
@@ -179,19 +179,15 @@ def _idx(
     return Arrays(images, labels, names, channels)
 
 
-def _idx_array(root: Path, name: str) -> np.ndarray:
-    file = _idx_file(root, name)
-    if file is None:
-        raise FileNotFoundError(f"no {name} or .gz in {root}")
-    return read_idx(file)
-
-
 def _idx_file(root: Path, name: str) -> Path | None:
     return next((p for p in (root / name, root / f"{name}.gz") if p.exists()), None)
 
 
-def read_idx(path: Path) -> np.ndarray:
+def read_idx(root: Path, name: str) -> np.ndarray:
     """A file of unsigned bytes in the IDX format, gzipped or not; ValueError where it is none."""
+    path = _idx_file(root, name)
+    if path is None:
+        raise FileNotFoundError(f"no {name} or .gz in {root}")
     try:
         with gzip.open(path) if path.suffix == ".gz" else path.open("rb") as file:
             head = file.read(4)

@@ -7,7 +7,7 @@ import math
 import os
 import warnings
 from collections import Counter
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, Literal, Self, get_args
 
@@ -119,6 +119,22 @@ class Limited:
         part = copy.copy(self)
         vars(part).update({name: array[chosen] for name, array in arrays.items()})
         return part
+
+
+def split_folders(folders: Iterable[Path], holds: Callable[[Path], bool]) -> dict[Split, Path]:
+    """Those of the folders that have a split's name and for which `holds` is true; ValueError for
+    two of one split."""
+    named: dict[Split, Path] = {}
+    for folder in folders:
+        split = SPLIT_NAMES.get(folder.name.lower())
+        if split is None or not holds(folder):
+            continue
+        if split in named and not folder.samefile(named[split]):
+            raise ValueError(
+                f"{named[split]} and {folder} both have a name of the {split!r} split: keep one"
+            )
+        named[split] = folder
+    return named
 
 
 # -- lists ------------------------------------------------------------------------------------

@@ -82,7 +82,8 @@ def test_a_cut_idx_file_is_named(tmp_path):
     ):
         (tmp_path / name).write_bytes(content)
         with pytest.raises(ValueError, match=message):
-            read_idx(tmp_path / name)
+            read_idx(tmp_path, name.removesuffix(".gz"))
+        (tmp_path / name).unlink()
 
 
 def test_wrong_options(tmp_path):

@@ -1,6 +1,5 @@
 """The plain form: `images/`, `labels/` or `distance/`, and a lens beside them."""
 
-import os
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -8,7 +7,7 @@ from pathlib import Path
 from darswin.data.cameras import Calibrations
 from darswin.data.scenes.files import Options, Pairs, pair, pictures_in, stems
 from darswin.data.scenes.scene import NO_CLASSES, SUFFIXES, Scenes, read_palette
-from darswin.data.splits import SPLIT_NAMES, Split, part_of_split, taken_from
+from darswin.data.splits import Split, part_of_split, split_folders, taken_from
 
 FORM = (
     "darswin looks for images/STEM.png (or jpg, bmp, webp, tif, ppm) with labels/STEM.png or "
@@ -37,12 +36,11 @@ def open_plain(root: Path, options: Options) -> Scenes:
         raise ValueError(f"{root} has a folder for each split: 'all' is of a folder without splits")
     part, held_out = taken_from(split, folders)
     folder = folders[part]
-    return _scenes(
-        root,
-        folder,
-        options,
-        lambda found: part_of_split(found, split, held_out, options.holdout, folder),
-    )
+
+    def choose(found: list[str]) -> list[str]:
+        return part_of_split(found, split, held_out, options.holdout, folder)
+
+    return _scenes(root, folder, options, choose)
 
 
 def _scenes(
@@ -87,14 +85,4 @@ def _beside(name: str, folder: Path, root: Path) -> Path:
 
 def _split_folders(root: Path) -> dict[Split, Path]:
     """The folders of the splits, which hold `images/`."""
-    named: dict[Split, Path] = {}
-    for entry in sorted(os.scandir(root), key=lambda entry: entry.name):
-        split, folder = SPLIT_NAMES.get(entry.name.lower()), root / entry.name
-        if split is None or not (folder / "images").is_dir():
-            continue
-        if split in named:
-            raise ValueError(
-                f"{named[split]} and {folder} both have a name of the {split!r} split: keep one"
-            )
-        named[split] = folder
-    return named
+    return split_folders(sorted(root.iterdir()), lambda folder: (folder / "images").is_dir())
