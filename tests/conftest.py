@@ -1,10 +1,14 @@
 import os
+import sys
+from pathlib import Path
 
 import hypothesis
 import pytest
 import torch
 
 from darswin.ops import _module, cpu_capability
+
+sys.path.append(str(Path(__file__).parents[1] / "studies"))  # for the tests of its programs
 
 # Properties: the same few cases in each `make test`; `make fuzz` draws new ones.
 _common = dict(deadline=None, database=None, suppress_health_check=list(hypothesis.HealthCheck))

@@ -2,22 +2,17 @@
 
 import json
 import shutil
-import sys
 from pathlib import Path
 
 import pytest
+import quantized
+import study
+import tables
 import torch
+from cells import LEVELS, POLYNOMIAL, SWEEP, ablations, headline
 
-ROOT = Path(__file__).parent.parent
-sys.path.insert(0, str(ROOT / "studies"))
-
-import quantized  # noqa: E402
-import study  # noqa: E402
-import tables  # noqa: E402
-from cells import LEVELS, POLYNOMIAL, SWEEP, ablations, headline  # noqa: E402
-
-from darswin import create_model  # noqa: E402
-from darswin.layers.linear import onednn_lack  # noqa: E402
+from darswin import create_model
+from darswin.layers.linear import onednn_lack
 
 QUICK = """
     --data.path digits --data.limit 96 --data.batch_size 16 --trainer.max_epochs 1 --data.render 32

@@ -1,24 +1,17 @@
 """The dense study's own code, on a few small pictures: a minute's version of `make study-dense`."""
 
 import json
-import sys
 from pathlib import Path
 
+import dense
+import dense_data
+import dense_tables
 import pytest
+from dense_cells import CONTROLLED, MODELS, STUDIED, all_cells
+from dense_trivial import trivial
+from worlds import wad
 
-ROOT = Path(__file__).parent.parent
-sys.path.insert(0, str(ROOT / "studies"))
-pytest.importorskip("embreex")
-pytest.importorskip("omg")
-
-import dense  # noqa: E402
-import dense_data  # noqa: E402
-import dense_tables  # noqa: E402
-from dense_cells import CONTROLLED, MODELS, STUDIED, all_cells  # noqa: E402
-from dense_trivial import trivial  # noqa: E402
-from worlds import wad  # noqa: E402
-
-from darswin.data import open_scenes  # noqa: E402
+from darswin.data import open_scenes
 
 pytestmark = [
     pytest.mark.slow,

@@ -2,20 +2,15 @@
 
 import json
 import math
-import sys
 from pathlib import Path
 
+import learned_lens
+import learned_tables
 import pytest
 import torch
 
 from darswin import create_model
 from darswin.models.saving import ModelCard, save_model
-
-ROOT = Path(__file__).parent.parent
-sys.path.insert(0, str(ROOT / "studies"))
-
-import learned_lens  # noqa: E402
-import learned_tables  # noqa: E402
 
 SMALL = dict(
     IMAGES=dict(xi=(4, 8), place=(8,), all=(8,)), STEPS=dict(xi=2, place=2, all=2), BATCH=4,

@@ -3,22 +3,18 @@
 import json
 import math
 import struct
-import sys
 from pathlib import Path
 
 import cv2
 import numpy as np
+import omg
 import pytest
+from worlds import dataset, geometry, poses, render, scene, textures, wad
+from worlds.lenses import draw_lens
+
+from darswin.lens import Equidistant, Perspective, Spherical, load
 
 ROOT = Path(__file__).parent.parent
-sys.path.insert(0, str(ROOT / "studies"))
-pytest.importorskip("embreex")
-omg = pytest.importorskip("omg")
-
-from worlds import dataset, geometry, poses, render, scene, textures, wad  # noqa: E402
-from worlds.lenses import draw_lens  # noqa: E402
-
-from darswin.lens import Equidistant, Perspective, Spherical, load  # noqa: E402
 
 
 def needs_game(test):

@@ -29,9 +29,9 @@ def _enhance(kind: type) -> Operation:
     return enhance
 
 
-def _solarize_add(image: Image.Image, add: int, threshold: int = 128) -> Image.Image:
+def _solarize_add(image: Image.Image, add: int) -> Image.Image:
     """Brightens dark pixels."""
-    table = [min(255, value + add) if value < threshold else value for value in range(256)]
+    table = [min(255, value + add) if value < 128 else value for value in range(256)]
     return image.point(table * len(image.getbands()))
 
 

@@ -66,7 +66,7 @@ class Calibrations:
             when its picture is; in JSON where there are many.
 
     Attributes:
-        cameras: the different cameras: those of `files`, then those of `lens`.
+        cameras: the different cameras, those of `files` first, then those of `lens`.
 
     Raises:
         ValueError: what is no lens, or lenses that cannot be joined, by name. FileNotFoundError: a

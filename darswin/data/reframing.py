@@ -8,7 +8,6 @@ the image.
 """
 
 from functools import lru_cache
-from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -16,7 +15,7 @@ import torch
 from torch import Tensor
 
 from darswin.data.scenes.scene import Scene, nothing_of
-from darswin.data.warp import Framing, Turn, area_resized, remap, taken_part, turned_lens
+from darswin.data.warp import Turn, area_resized, remap, turned_lens
 from darswin.lens import Lens
 from darswin.lens.pixels import as_map, pixel_angles
 from darswin.lens.solve import length_of
@@ -27,26 +26,6 @@ _MOST_POINTS = 5
 _APART = 1.5
 _RADII = 4096  # of a table
 _NUDGE = 1e-3  # px, more than the rounding of places in float32
-
-
-class Crop(NamedTuple):
-    """A part of a picture: its side as a share of the whole, and where it is, in [0, 1] of what is
-    left across and down."""
-
-    share: float
-    across: float
-    down: float
-
-
-def part(size: tuple[int, int], framing: Framing, crop: Crop | None) -> tuple[int, int, int, int]:
-    """The part that is taken of a picture (H, W): top, left, height, width. A crop of "crop" is a
-    square anywhere in the picture."""
-    top, left, height, width = taken_part(size, framing)
-    if crop is None:
-        return top, left, height, width
-    height, width = (max(1, round(crop.share * side)) for side in (height, width))
-    top, left = round(crop.down * (size[0] - height)), round(crop.across * (size[1] - width))
-    return top, left, height, width
 
 
 def resize_scene(

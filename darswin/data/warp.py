@@ -196,16 +196,29 @@ def picture_size(lens: Lens) -> tuple[int, int]:
     return round(height), round(width)
 
 
-def taken_part(size: tuple[int, ...], framing: Framing) -> tuple[int, int, int, int]:
-    """The part of a picture (H, W) that is kept: top, left, height, width."""
+class Crop(NamedTuple):
+    """A part of a picture: its side as a share of the whole, and its place, in [0, 1] of what is
+    left across and down."""
+
+    share: float
+    across: float
+    down: float
+
+
+def taken_part(
+    size: tuple[int, ...], framing: Framing, crop: Crop | None = None
+) -> tuple[int, int, int, int]:
+    """The part of a picture (H, W) that is kept: top, left, height, width. With "crop", a `Crop` is
+    a square anywhere in the picture."""
     if framing not in get_args(Framing):
         allowed = ", ".join(get_args(Framing))
         raise ValueError(f"framing must be one of {allowed}, got {framing!r}")
-    height, width = size
-    if framing != "crop":
-        return 0, 0, height, width
-    side = min(height, width)
-    return (height - side) // 2, (width - side) // 2, side, side
+    height, width = (min(size),) * 2 if framing == "crop" else size
+    if crop is None:
+        return (size[0] - height) // 2, (size[1] - width) // 2, height, width
+    height, width = (max(1, round(crop.share * side)) for side in (height, width))
+    top, left = round(crop.down * (size[0] - height)), round(crop.across * (size[1] - width))
+    return top, left, height, width
 
 
 def _new_size(height: int, width: int, size: int, framing: Framing) -> tuple[int, int]:

@@ -12,8 +12,8 @@ from scenes import CALIBRATIONS, distance_of, labels_of, rays_of
 from scipy import ndimage
 
 from darswin.data import IGNORE, Scene
-from darswin.data.reframing import Crop, part, resize_scene, turn_scene, warp_scene
-from darswin.data.warp import Turn, turned_picture
+from darswin.data.reframing import resize_scene, turn_scene, warp_scene
+from darswin.data.warp import Crop, Turn, taken_part, turned_picture
 from darswin.lens import BrownConrady, Equidistant, OCam, Polynomial, Spherical, load
 from darswin.lens.pixels import pixel_angles, reprojection
 
@@ -117,7 +117,7 @@ def test_a_ray_keeps_its_content(name, target):
         ("stretch", Crop(0.6, 0.2, 0.9), TURNS[1]),
         ("crop", Crop(0.8, 1, 0), TURNS[2]),
     ):
-        taken = part(whole, framing, crop)
+        taken = taken_part(whole, framing, crop)
         scene = resize_scene(source, taken, 128, turn.mirrored)
         assert scene.image.shape == (128, 128, 1) and size_of(scene.lens) == (128, 128)
         check(scene, source, Turn(0.0, turn.mirrored))
@@ -136,7 +136,7 @@ def test_a_ray_keeps_its_content(name, target):
 )
 def test_image_and_labels_move_together(turn, crop, size, name):
     source = SCENES[name]
-    taken = part(source.target.shape, "crop", crop)
+    taken = taken_part(source.target.shape, "crop", crop)
     top, left, height, width = taken
     assert top >= 0 and left >= 0 and height == width
     assert top + height <= source.target.shape[0] and left + width <= source.target.shape[1]
@@ -165,7 +165,7 @@ def test_turns_are_those_of_scipy_and_of_pictures():
     assert str(scene.lens) == str(lens.resized((400, 400)))
     flat = even(expected) & (expected > 0)
     assert np.abs(scene.image[..., 0].astype(int) - expected)[flat].max() <= 1
-    square = part(SIZE, "crop", None)
+    square = taken_part(SIZE, "crop")
     for mirrored in (False, True):  # a turn without an angle is a mirror
         one = resize_scene(source, square, 100, mirrored)
         other = turn_scene(source, Turn(0, mirrored), square, 100)
@@ -252,7 +252,7 @@ def test_targets_are_not_shifted(whole, size, frame):
     for framing in ("crop", "stretch"):
         if (frame, framing) == ("smaller", "stretch"):
             continue  # another lens shows a picture that is not stretched
-        taken = part(whole, framing, None)
+        taken = taken_part(whole, framing)
         for axis, dtype in ((0, np.float32), (1, np.float32), (0, np.uint8), (1, np.uint8)):
             if dtype == np.uint8 and max(whole) >= IGNORE:
                 continue

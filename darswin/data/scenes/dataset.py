@@ -7,10 +7,10 @@ import torch
 from torch import Tensor
 
 from darswin.data.lens_distributions import LensDistribution
-from darswin.data.reframing import Crop, part, resize_scene, turn_scene, warp_scene
+from darswin.data.reframing import resize_scene, turn_scene, warp_scene
 from darswin.data.samples import Draw, Samples
 from darswin.data.scenes.scene import IGNORE, Scene, Scenes
-from darswin.data.warp import picture_size
+from darswin.data.warp import Crop, picture_size, taken_part
 from darswin.lens import Lens
 
 # Of a drawn lens's own limit, where its curve may have no end: how far it is used.
@@ -67,7 +67,7 @@ class SceneSamples(Samples):
         if self.lenses is not None:
             return warp_scene(scene, self._drawn(draw, scene.lens, crop), self.size, turn)
         height, width = scene.target.shape
-        taken = part((height, width), self.framing, crop)
+        taken = taken_part((height, width), self.framing, crop)
         if turn is not None and turn.angle:
             return turn_scene(scene, turn, taken, self.size)
         return resize_scene(scene, taken, self.size, turn is not None and turn.mirrored)
@@ -99,7 +99,7 @@ class SceneSamples(Samples):
         own = self.scenes.lens_alone(draw.picture)
         if self.lenses is not None:
             return self._drawn(draw, own, self._crop(draw))
-        taken = part(picture_size(own), self.framing, None)
+        taken = taken_part(picture_size(own), self.framing)
         return own.cropped(*taken).resized((self.size, self.size))
 
     def _unknown(self) -> Tensor:
