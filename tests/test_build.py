@@ -18,6 +18,15 @@ from darswin.ops import _module, cpu_capability, polar_sample
 ROOT = Path(__file__).parent.parent
 
 
+def output(*command, **options) -> str:
+    """What a command prints; it must succeed."""
+    path = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
+    environment = os.environ | {"PATH": path} | options.pop("env", {})
+    done = subprocess.run(command, capture_output=True, text=True, env=environment, **options)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
 def test_the_tier_in_use_is_the_one_asked_for():
     asked = os.environ.get("ATEN_CPU_CAPABILITY", _module.tiers()[-1])
     assert cpu_capability() == {"default": "generic"}.get(asked, asked)
@@ -32,18 +41,16 @@ def test_tiers_of_this_machine():
         assert len(_module.tiers()) == expected
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("asked", "expected"),
     [("default", "generic"), ("avx2", "avx2"), ("avx512", "avx512"), ("nonsense", None)],
 )
 def test_environment_chooses_the_tier_at_load(asked, expected):
     code = "from darswin.ops import cpu_capability; print(cpu_capability())"
-    environment = dict(os.environ, ATEN_CPU_CAPABILITY=asked)
-    done = subprocess.run(
-        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True
-    )
+    found = output(sys.executable, "-c", code, env=dict(ATEN_CPU_CAPABILITY=asked))
     best = _module.tiers()[-1]
-    assert done.stdout.strip() == (expected if expected in _module.tiers() else best)
+    assert found.strip() == (expected if expected in _module.tiers() else best)
 
 
 def test_tiers_can_be_forced_and_agree():
@@ -70,33 +77,22 @@ def test_build_info():
     assert "stable" in info["torch_abi"]
 
 
-def python(*arguments, **options) -> str:
-    """What a Python of this environment prints; it must succeed."""
-    path = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
-    environment = os.environ | {"PATH": path} | options.pop("env", {})
-    done = subprocess.run(
-        [sys.executable, *arguments], capture_output=True, text=True, env=environment, **options
-    )
-    assert done.returncode == 0, done.stdout + done.stderr
-    return done.stdout
-
-
 @pytest.fixture(scope="module")
 def unpacked(tmp_path_factory) -> Path:
     """The sdist, unpacked, and the wheel made there, in its `dist`: without optimization, in a
     fraction of the time."""
     folder = tmp_path_factory.mktemp("sdist")
-    how = ["-m", "build", "--no-isolation"]
-    python(*how, "--sdist", "--outdir", folder, ROOT)
+    build = [sys.executable, "-m", "build", "--no-isolation"]
+    output(*build, "--sdist", "--outdir", folder, ROOT)
     (sdist,) = folder.glob("darswin-*.tar.gz")
     with tarfile.open(sdist) as archive:
         archive.extractall(folder, filter="data")
     root = folder / sdist.name.removesuffix(".tar.gz")
-    python(*how, "--wheel", root, env={"CMAKE_BUILD_TYPE": "None"})
+    output(*build, "--wheel", root, env={"CMAKE_BUILD_TYPE": "None"})
     return root
 
 
-@pytest.mark.parametrize("optimized", [True, False])
+@pytest.mark.parametrize("optimized", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_no_inline_function_leaks_from_a_tier(optimized, request):
     """A weak symbol compiled with AVX-512 could be the copy that the linker keeps for every CPU.
 
@@ -113,10 +109,8 @@ def test_no_inline_function_leaks_from_a_tier(optimized, request):
     assert tiers >= set(_module.tiers()) and len(kernels) == len(tiers) * len(sources)
     for command in kernels:
         path = build / command["output"]
-        shown = subprocess.run(
-            ["nm", "-C", "--defined-only", path], capture_output=True, text=True, check=True
-        )
-        symbols = re.findall(r"^\w+ (\w) (.*)$", shown.stdout, re.MULTILINE)
+        shown = output("nm", "-C", "--defined-only", path)
+        symbols = re.findall(r"^\w+ (\w) (.*)$", shown, re.MULTILINE)
         outside = [(kind, name) for kind, name in symbols if kind not in "tbdr"]
         assert outside, "not even a table of kernels"
         for kind, name in outside:
@@ -138,9 +132,7 @@ def test_the_module_holds_no_path_of_the_build_machine():
     assert sources and not [name for name in sources if name.startswith(b"/")]
     for folder in (ROOT, Path(torch.__file__).parent, sys.prefix, sys.base_prefix):
         assert str(folder).encode() not in module
-    dynamic = subprocess.run(
-        ["readelf", "-d", _module.FILE], capture_output=True, text=True, check=True
-    ).stdout
+    dynamic = output("readelf", "-d", _module.FILE)
     assert "RPATH" not in dynamic and "RUNPATH" not in dynamic
     needed = [line for line in dynamic.splitlines() if "NEEDED" in line]
     assert any("libtorch_cpu.so" in line for line in needed)
@@ -148,10 +140,8 @@ def test_the_module_holds_no_path_of_the_build_machine():
 
 
 def test_the_module_exports_its_facts_only():
-    shown = subprocess.run(
-        ["nm", "-D", "--defined-only", _module.FILE], capture_output=True, text=True, check=True
-    )
-    exported = {line.split()[-1] for line in shown.stdout.splitlines()}
+    shown = output("nm", "-D", "--defined-only", _module.FILE)
+    exported = {line.split()[-1] for line in shown.splitlines()}
     facts = {"tier", "tiers", "set_tier", "set_gathers", "build_info"}
     assert exported == {f"darswin_{fact}" for fact in facts}
 
@@ -161,10 +151,8 @@ def test_the_module_asks_for_nothing_newer_than_manylinux_2_28():
     if major > 12:
         pytest.skip("headers of a newer compiler may ask for more: use the container")
     newest = {"GLIBC": (2, 28), "GLIBCXX": (3, 4, 24), "CXXABI": (1, 3, 11)}
-    shown = subprocess.run(
-        ["readelf", "-V", _module.FILE], capture_output=True, text=True, check=True
-    )
-    found = re.findall(r"Name: (GLIBC|GLIBCXX|CXXABI)_([\d.]+)", shown.stdout)
+    shown = output("readelf", "-V", _module.FILE)
+    found = re.findall(r"Name: (GLIBC|GLIBCXX|CXXABI)_([\d.]+)", shown)
     assert {library for library, _ in found} == set(newest)
     for library, version in found:
         assert tuple(map(int, version.split("."))) <= newest[library], f"{library}_{version}"
@@ -181,34 +169,34 @@ def test_a_missing_module_is_explained(monkeypatch, tmp_path):
     assert isinstance(caught.value.__cause__, OSError)
 
 
+@pytest.mark.slow
 def test_a_broken_module_names_its_file(tmp_path):
     package = tmp_path / "darswin"
     package.mkdir()
     for name in ("__init__.py", "ops"):
         (package / name).symlink_to(ROOT / "darswin" / name)
     (package / "libdarswin.so").write_bytes(b"not a library")
-    code = "import darswin.ops"
-    done = subprocess.run(
-        [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True
-    )
+    command = [sys.executable, "-c", "import darswin.ops"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode != 0
     assert "libdarswin.so: file too short" in done.stderr and "make build" in done.stderr
 
 
+@pytest.mark.slow
 def test_the_sdist_builds_a_wheel_that_runs_from_another_folder(unpacked, tmp_path):
     (wheel,) = (unpacked / "dist").glob("darswin-*-py3-none-linux_*.whl")
     names = zipfile.ZipFile(wheel).namelist()
     assert [name for name in names if name.endswith(".so")] == ["darswin/libdarswin.so"]
     assert all(name.startswith(("darswin/", "darswin-")) for name in names)
     elsewhere = tmp_path / "site"
-    python("-m", "pip", "install", "-q", "--no-deps", "--target", elsewhere, wheel)
+    output(sys.executable, "-m", "pip", "install", "-q", "--no-deps", "--target", elsewhere, wheel)
     code = (
         "import torch, darswin; print(darswin.__file__, darswin.ops._module.FILE);"
         "lens = darswin.lens.Spherical.from_fov(0.4, 2.6, 16.0);"
         "model = darswin.create_model('darswin_a_nano', num_classes=3);"
         "print(model(torch.zeros(1, 3, 32, 32), lens).shape)"
     )
-    out = python("-c", code, cwd=tmp_path, env={"PYTHONPATH": str(elsewhere)})
+    out = output(sys.executable, "-c", code, cwd=tmp_path, env={"PYTHONPATH": str(elsewhere)})
     assert out.count(str(elsewhere)) == 2 and "torch.Size([1, 3])" in out
     assert (elsewhere / "darswin" / "train" / "presets" / "iccv2023.yaml").is_file()
     assert (elsewhere / "bin" / "darswin").is_file()

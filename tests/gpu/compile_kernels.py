@@ -28,13 +28,12 @@ CUOBJDUMP = Path(triton.__file__).parent / "backends/nvidia/bin/cuobjdump"
 
 
 class Use(NamedTuple):
-    """What a kernel takes: 32-bit registers a thread, bytes of memory of a thread's own, to which
-    the compiler resorts for want of registers, bytes of shared memory a program, and threads."""
+    """What a kernel takes."""
 
     kernel: str
-    registers: int
-    stack: int
-    shared: int
+    registers: int  # of 32 bits, a thread
+    stack: int  # bytes a thread, which the compiler uses for want of registers
+    shared: int  # bytes a program
     threads: int
 
 

@@ -13,8 +13,8 @@ from darswin.ops import triton
 
 @pytest.fixture(scope="session")
 def device():
-    """Where the kernels run. In the interpreter they stand in for the CPU's operators; what they
-    do not take on a device (see `kernel` of `_library.run`), tests must not ask of them."""
+    """Where the kernels run. In the interpreter they stand in for the CPU's operators: tests must
+    not give them arguments that they do not take on a device (`kernel_takes` of `_library.run`)."""
     if not triton.INSTALLED:
         pytest.skip("triton is not installed; `make test-triton` puts it into a folder of its own")
     if torch.cuda.is_available():
@@ -33,13 +33,3 @@ def device():
             library.impl(operator, triton.launcher(operator), "CPU", allow_override=True)
     yield torch.device("cpu")
     library._destroy()
-
-
-@pytest.fixture
-def on(device):
-    """Runs a function of CPU tensors on the device: `on(function)(*tensors)`."""
-
-    def moved(function):
-        return lambda *tensors: function(*(t.to(device) for t in tensors)).cpu()
-
-    return moved

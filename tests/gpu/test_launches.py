@@ -15,20 +15,6 @@ def meta(*shape, dtype=torch.float32):
     return torch.empty(shape, device="meta", dtype=dtype)
 
 
-def launches(operator, *arguments):
-    """The names of what the launcher of an operator launches: torch's operations and kernels."""
-    from triton.runtime.jit import KernelInterface
-
-    launch, kernels = triton.launcher(operator), []
-
-    def counting(kernel, grid):
-        return lambda *arguments, **options: kernels.append(kernel.fn.__name__)
-
-    with mock.patch.object(KernelInterface, "__getitem__", counting), Launches() as counted:
-        launch(*arguments)
-    return [*counted.names.elements(), *kernels]
-
-
 def sampling(dtype=torch.float32, **options):
     """The arguments of darswin_a_small's sampling: 64×64, S = 10."""
     given = dict(
@@ -40,54 +26,48 @@ def sampling(dtype=torch.float32, **options):
 
 
 GENERAL = dict(affine=meta(2, 2, 2), offsets=meta(2, 2, 160, 640), jitter=1.0, seed=5)
+# A shifted stage 3 of darswin_a_small: qkv, bias and settings.
+STAGE = meta(2, 16, 4, 3, 3, 32), meta(2, 3, 7, 7), (4, 4), (2, 0), (False, True), 0.2
+MAP = meta(2, 64, 256, 16), meta(1, 64), meta(1, 2), None, None, meta(1), (64, 64)
+SAMPLES, TOKENS = meta(2, 16, 64, 300), meta(2, 16, 64, 96)
+LAUNCHES = {
+    **{f"samples, {name}, tokens {tokens}": ("polar_sample", (*case, tokens), ["_forward"])
+       for name, case in dict(plain=sampling(), jitter=sampling(jitter=1.0),
+                              general=sampling(**GENERAL), frames=sampling(torch.uint8)).items()
+       for tokens in (False, True)},
+    "an image's gradient": (
+        "polar_sample_backward", (*sampling(), True, SAMPLES, True, False, False),
+        ["_backward", "_finish", "aten::linalg_vector_norm", "aten::zeros"],
+    ),
+    "embedding": ("polar_embed", (*sampling(**GENERAL), meta(96, 300), None),
+                  ["_forward", "aten::mm"]),
+    "embedding with bias": ("polar_embed", (*sampling(**GENERAL), meta(96, 300), meta(96)),
+                            ["_forward", "aten::addmm"]),
+    "the layer's gradient": (  # of samples made again
+        "polar_embed_backward", (*sampling(), meta(96, 300), TOKENS, False, False, False, True),
+        ["_forward", "aten::mm", "aten::sum.dim_IntList"],
+    ),
+    "attention": ("window_attention", STAGE, ["_forward"]),
+    "attention, a strided bias": (
+        "window_attention", (STAGE[0], meta(2, 2, 3, 7, 7)[:, 0], *STAGE[2:]),
+        ["_forward", "aten::clone"],
+    ),
+    "attention's gradient": ("window_attention_backward", (*STAGE, meta(2, 16, 4, 96)),
+                             ["_backward", "_fold", "aten::sum.dim_IntList"]),
+    "map to image": ("polar_to_image", (*MAP, True), ["_forward"]),
+}  # fmt: skip
 
 
-@pytest.mark.parametrize("tokens", [False, True])
-@pytest.mark.parametrize(
-    "options",
-    [dict(), dict(jitter=1.0), GENERAL, dict(dtype=torch.uint8)],
-    ids=["plain", "jitter", "general", "frames"],
-)
-def test_sampling_is_one_launch(options, tokens):
-    assert launches("polar_sample", *sampling(**options), tokens) == ["_forward"]
+@pytest.mark.parametrize("name", LAUNCHES)
+def test_launches(name):
+    from triton.runtime.jit import KernelInterface
 
+    operator, arguments, expected = LAUNCHES[name]
+    launch, kernels = triton.launcher(operator), []
 
-@pytest.mark.parametrize("bias", [None, meta(96)])
-def test_embedding_is_two(bias):
-    found = launches("polar_embed", *sampling(**GENERAL), meta(96, 300), bias)
-    assert found == ["aten::mm" if bias is None else "aten::addmm", "_forward"]
+    def counting(kernel, grid):
+        return lambda *arguments, **options: kernels.append(kernel.fn.__name__)
 
-
-def test_the_gradient_of_the_layer_is_three():
-    # The samples, which are made again, a product and a sum.
-    wanted = False, False, False, True
-    grad = meta(2, 16, 64, 96)
-    found = launches("polar_embed_backward", *sampling(), meta(96, 300), grad, *wanted)
-    assert sorted(found) == ["_forward", "aten::mm", "aten::sum.dim_IntList"]
-
-
-def test_the_gradient_of_an_image_is_four():
-    wanted = True, False, False
-    found = launches("polar_sample_backward", *sampling(), True, meta(2, 16, 64, 300), *wanted)
-    assert sorted(found) == ["_backward", "_finish", "aten::linalg_vector_norm", "aten::zeros"]
-
-
-def attention(*lead):
-    """The arguments of attention: a shifted stage 3 of darswin_a_small, and its biases."""
-    return meta(2, 16, 4, 3, 3, 32), meta(*lead, 3, 7, 7), (4, 4), (2, 0), (False, True), 0.2
-
-
-def test_attention_is_one_launch_and_one_more_for_biases_that_are_strided():
-    assert launches("window_attention", *attention(2)) == ["_forward"]
-    qkv, bias, *others = attention(2, 2)
-    assert launches("window_attention", qkv, bias[:, 0], *others) == ["aten::clone", "_forward"]
-
-
-def test_the_gradient_of_attention_is_three():
-    found = launches("window_attention_backward", *attention(2), meta(2, 16, 4, 96))
-    assert sorted(found) == ["_backward", "_fold", "aten::sum.dim_IntList"]
-
-
-def test_polar_to_image_is_one_launch():
-    lens = meta(1, 64), meta(1, 2), None, None, meta(1)
-    assert launches("polar_to_image", meta(2, 64, 256, 16), *lens, (64, 64), True) == ["_forward"]
+    with mock.patch.object(KernelInterface, "__getitem__", counting), Launches() as counted:
+        launch(*arguments)
+    assert sorted([*counted.names.elements(), *kernels]) == expected

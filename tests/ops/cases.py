@@ -139,6 +139,14 @@ def assert_accurate(
         assert error <= allowed, f"{name}: error {error:.3g}, allowed {allowed:.3g}"
 
 
+def elsewhere(tensor: Tensor, kind: str) -> Tensor:
+    """The same values with gaps, or in another order in memory."""
+    if kind == "gaps":
+        return torch.stack((tensor, tensor), -1)[..., 0]
+    back = list(range(tensor.dim() - 1, -1, -1))
+    return tensor.permute(back).contiguous().permute(back)
+
+
 def raw_calls(case: Case) -> list[tuple[torch._ops.OpOverload, list]]:
     """The compiled operator and its backward, each with the arguments that the case gives them."""
     calls, call = [], _library.call

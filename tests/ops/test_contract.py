@@ -13,6 +13,7 @@ from cases import (
     assert_same_bits_on_any_number_of_threads,
     attention,
     bf16,
+    elsewhere,
     f32,
     f64,
     polar_map,
@@ -98,14 +99,6 @@ def test_accuracy_rule_at_extreme_values(make, scale):
 
 
 # -- arguments in memory ---------------------------------------------------------------------------
-
-
-def elsewhere(tensor: torch.Tensor, kind: str) -> torch.Tensor:
-    """The same values with gaps, or in another order in memory."""
-    if kind == "gaps":
-        return torch.stack((tensor, tensor), -1)[..., 0]
-    back = list(range(tensor.dim() - 1, -1, -1))
-    return tensor.permute(back).contiguous().permute(back)
 
 
 @pytest.mark.parametrize("kind", ["gaps", "turned"])
