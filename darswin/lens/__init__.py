@@ -7,7 +7,7 @@ from darswin.lens.base import MODELS, Lens, from_dict, to_dict
 from darswin.lens.curves import Tabulated, as_curves, cat
 from darswin.lens.distorted import BrownConrady, Fisheye624, KannalaBrandt, Mei
 from darswin.lens.files import load, load_all, save
-from darswin.lens.fitting import fit
+from darswin.lens.fitting import Fit, fit
 from darswin.lens.ideal import (
     Equidistant,
     Equisolid,
@@ -23,8 +23,8 @@ from darswin.lens.sphere import DoubleSphere, EnhancedUnified, Spherical
 
 __all__ = [
     "MODELS", "BrownConrady", "DoubleSphere", "EnhancedUnified", "Equidistant", "Equisolid",
-    "FieldOfView", "Fisheye624", "KannalaBrandt", "Lens", "Mei", "Number", "OCam", "OCamInverse",
-    "Orthographic", "Perspective", "Polynomial", "Spherical", "Stereographic", "Tabulated",
-    "as_curves", "cat", "distance_to_z", "fit", "from_dict", "load", "load_all", "pixel_rays",
-    "reproject", "save", "solid_angles", "to_dict", "z_to_distance",
+    "FieldOfView", "Fisheye624", "Fit", "KannalaBrandt", "Lens", "Mei", "Number", "OCam",
+    "OCamInverse", "Orthographic", "Perspective", "Polynomial", "Spherical", "Stereographic",
+    "Tabulated", "as_curves", "cat", "distance_to_z", "fit", "from_dict", "load", "load_all",
+    "pixel_rays", "reproject", "save", "solid_angles", "to_dict", "z_to_distance",
 ]  # fmt: skip

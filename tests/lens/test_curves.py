@@ -1,7 +1,5 @@
 """Lenses as curves, and several models in one batch."""
 
-import math
-
 import pytest
 import torch
 from lens_examples import ASIDE, calibrated, double, example, f64
@@ -11,9 +9,6 @@ from darswin.lens import (
     MODELS,
     DoubleSphere,
     Equidistant,
-    Equisolid,
-    Orthographic,
-    Perspective,
     Polynomial,
     Spherical,
     Stereographic,
@@ -94,21 +89,6 @@ def test_a_curve_is_its_lens_to_1e_7_of_the_largest_radius(name):
         assert error.max() < (1e-3 if name == "Tabulated" else 1e-5)
 
 
-@pytest.mark.parametrize("name", MODELS)
-@pytest.mark.parametrize("other", [Equidistant(double(300.0), 2.0), Perspective(double(300.0))])
-def test_lenses_that_are_joined_project_as_before(name, other):
-    for seed in range(3):
-        lens = example(name, torch.Generator().manual_seed(seed), (100, 600))
-        joined = cat([lens, other])
-        for before, after in zip((*lens, other), joined, strict=True):
-            theta = before.theta_max * torch.linspace(0, 1, 2001, dtype=f64)
-            radius = before.project(theta)
-            inside = radius < 1000
-            error = (after.project(theta) - radius)[inside].abs().max()
-            assert error < {"Tabulated": 0.1, "OCamInverse": 0.01}.get(name, 1e-3)
-            assert after.theta_max == before.theta_max
-
-
 @pytest.mark.parametrize("shift", [-30.0, -1.5, 2.0, 30.0])
 def test_a_lens_that_begins_beside_the_axis_is_no_curve(shift):
     lens = alone("ocamcalib.txt").with_theta_max(1.9)
@@ -123,24 +103,6 @@ def test_a_lens_that_begins_beside_the_axis_is_no_curve(shift):
     assert torch.equal(same.project(theta[None])[1], moved.project(theta))
     # What a fitted polynomial leaves does not count.
     assert isinstance(cat([lens, other]), Tabulated)
-
-
-def test_mixed_ideal_lenses_in_one_batch_are_exact_to_1e_5_px():
-    ends = {
-        Perspective: 89.0,
-        Equidistant: 110,
-        Equisolid: 110,
-        Stereographic: 110,
-        Orthographic: 85,
-    }
-    lenses = [model(double(300.0), math.radians(end)) for model, end in ends.items()]
-    batch = cat(lenses)
-    theta = batch.theta_max[:, None] * torch.linspace(0, 1, 30001, dtype=f64)
-    exact = torch.cat([lens.project(t[None]) for lens, t in zip(lenses, theta, strict=True)])
-    error = (batch.project(theta) - exact).abs().amax(1)
-    assert error[1:].max() < 1e-6 and error[0] < 1e-4  # r_max is 17,187 px there
-    radius = exact[:, ::7]
-    torch.testing.assert_close(batch.unproject(radius), theta[:, ::7], rtol=0, atol=1e-8)
 
 
 def test_slopes_of_a_table_are_used_and_checked():

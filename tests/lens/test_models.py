@@ -5,7 +5,7 @@ import math
 
 import pytest
 import torch
-from lens_examples import ASIDE, RANDOM, calibrated, double, example, f64, random_lens
+from lens_examples import ASIDE, RANDOM, double, example, f64, random_lens
 
 from darswin.lens import (
     MODELS,
@@ -27,25 +27,6 @@ from darswin.lens import (
     to_dict,
 )
 from darswin.lens.ideal import FocalLens
-
-
-def test_the_direct_polynomial_of_ocamcalib_agrees_with_its_inverse():
-    direct = OCam(double(-288.5, 0, 3.6e-4, 7.4e-7, -6e-11))
-    radius = torch.linspace(50, 605, 100, dtype=f64)
-    inverse = calibrated("ocamcalib.txt")
-    torch.testing.assert_close(inverse.project(direct.unproject(radius)), radius, rtol=0, atol=2e-3)
-
-
-@pytest.mark.parametrize("coefficients", [[20.0], [30.0, 0, -1.1, 0, 0.4, 0, -0.05, 0, 0.003]])
-def test_a_polynomial_has_any_degree(coefficients):
-    lens = Polynomial(double(*coefficients), 2.5)
-    theta = torch.linspace(0.01, 2.5, 50, dtype=f64)
-    torch.testing.assert_close(lens.unproject(lens.project(theta)), theta, rtol=1e-9, atol=0)
-    leaves = theta[::10].requires_grad_(), lens.coefficients.requires_grad_()
-    for direction, x in (("project", 1), ("unproject", 20)):
-        assert torch.autograd.gradcheck(
-            lambda t, c, d=direction, x=x: getattr(lens.replace(coefficients=c), d)(x * t), leaves
-        )
 
 
 @pytest.mark.parametrize("name", MODELS)
