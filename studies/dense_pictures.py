@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from darswin.data import open_scenes
 from darswin.data.scenes.dataset import SceneSamples
 from darswin.models.saving import load_model, model_of_run
-from darswin.viz.dense import distance_image, label_image
+from darswin.viz.pixels import distance_image, label_image
 from darswin.viz.plot import save_figure
 
 # Test sets and the place of a picture in them; all sets have the same scenes in the same order.

@@ -23,7 +23,7 @@ from darswin.models.encoder import Encoder
 from darswin.models.saving import ModelCard
 from darswin.models.unet import Unet
 from darswin.utils.files import replace_file
-from darswin.viz.dense import (
+from darswin.viz.pixels import (
     UNKNOWN,
     distance_image,
     distance_range,

@@ -198,7 +198,7 @@ def _pack_block(block: Block, dtype: torch.dtype) -> None:
         fc1 = PackedLinear(mlp.fc1, dtype, gelu=True)
     _replace(mlp, fc1=fc1, fc2=fc2, activation=None)
     norm1, norm2 = PackedNorm(block.norm1, quantization), PackedNorm(block.norm2, taken(fc1))
-    _replace(block, norm1=norm1, norm2=norm2)
+    _replace(block, norm1=norm1, norm2=norm2, mlp=mlp.forward)
 
 
 def _replace(module: nn.Module, **layers: Any) -> None:

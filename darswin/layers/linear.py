@@ -13,7 +13,6 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
-from torch.utils._python_dispatch import _disable_current_modes
 
 from darswin.ops._inference import transpose_sum
 
@@ -192,9 +191,7 @@ def _multiply(product: str, matmul_backend: MatmulBackend, weight: Tensor, rows:
     shape = Shape(product, height, in_features, out_features, torch.get_num_threads())
     if shape not in _measured:
         runs = {name: partial(library, rows, *others) for name, library in libraries.items()}
-        # Checkpointing would take these products for the layer's.
-        with _disable_current_modes():
-            _measured[shape] = best_seconds(runs, turns=5)
+        _measured[shape] = best_seconds(runs, turns=5)
     seconds = _measured[shape]
     return libraries[min(seconds, key=seconds.__getitem__)](rows, *others)
 

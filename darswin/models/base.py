@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 from darswin.layers.linear import MATMUL_BACKENDS, Linear, MatmulBackend
 from darswin.layers.polar import check_images
-from darswin.layers.transformer import Block
+from darswin.layers.transformer import Block, Mlp, WindowAttention
 from darswin.lens import Lens
 from darswin.models.stages import Pair, StagePlan
 from darswin.ops.reference import normalized
@@ -157,7 +157,7 @@ class Model(nn.Module):
         of the work, are recomputed in backward. The gradients are the same, bit for bit.
         """
         for module in self.modules():
-            if isinstance(module, Block):
+            if isinstance(module, (Block, Mlp, WindowAttention)):
                 module.grad_checkpointing = enable
 
 

@@ -13,7 +13,7 @@ from darswin.lens import Lens
 from darswin.lens.pixels import pixel_angles, solid_angles
 from darswin.train.pixel_metrics import BY_AREA, PixelSums, Zones, none_of_nan
 from darswin.train.task import Batch, Task, finite_loss
-from darswin.viz.dense import Row, draw_predictions
+from darswin.viz.pixels import Row, draw_predictions
 
 __all__ = ["PixelTask"]
 

@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from PIL import Image
 
-from darswin.viz.dense import distance_image, label_image
+from darswin.viz.pixels import distance_image, label_image
 from darswin.viz.plot import save_figure
 from worlds.geometry import CLASSES, COLORS
 from worlds.lenses import draw_lens

@@ -18,7 +18,7 @@ from darswin.data.warp import FullSize, at_size
 from darswin.lens import from_dict
 from darswin.models.encoder import Encoder, Prepared
 from darswin.models.saving import ModelCard, save_model
-from darswin.viz.dense import UNKNOWN, palette
+from darswin.viz.pixels import UNKNOWN, palette
 
 # A circle inside of pictures of 48×64, of whose middle square it leaves the corners out.
 LENS = {"model": "Spherical", "xi": 0.5, "fov": 2.8, "image_size": [48, 64]}

@@ -3,12 +3,21 @@ from collections import Counter
 import pytest
 import torch
 from torch import nn
+from torch.multiprocessing.reductions import StorageWeakRef
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from darswin import PolarWindowAttention, create_model
 from darswin.layers import linear
-from darswin.layers.transformer import Block, DropPath, PatchMerging, Stage, WindowAttention
+from darswin.layers.transformer import (
+    Block,
+    DropPath,
+    PatchMerging,
+    Stage,
+    WindowAttention,
+    recomputed,
+)
 from darswin.lens import Spherical
+from darswin.models.base import Model
 from darswin.ops import use_reference, window_attention
 
 LENSES = Spherical.from_fov([0.2, 0.9], 2.6, 16.0)
@@ -228,8 +237,7 @@ def test_products_are_kept_and_what_is_cheap_is_computed_again(backend):
             layer.matmul_backend = backend
     found = {}
     for enable in (False, True):
-        for block in stage.blocks:
-            block.grad_checkpointing = enable
+        Model.set_grad_checkpointing(stage, enable)
         x = torch.randn(2, 4, 8, 12, requires_grad=True)
         with Count() as count:
             stage(x, ANGLES).sum().backward()
@@ -239,8 +247,22 @@ def test_products_are_kept_and_what_is_cheap_is_computed_again(backend):
         assert count.calls["gelu"] == 3
     for product in ("addmm", "mm", "_linear_pointwise", "bernoulli"):
         assert found[True][product] == found[False][product]
-    for cheap in ("gelu", "native_layer_norm", "window_attention"):
-        assert found[True][cheap] > found[False][cheap] > 0
+    for cheap, times in (("gelu", 3), ("native_layer_norm", 6), ("window_attention", 3)):
+        assert (found[False][cheap], found[True][cheap]) == (times, 2 * times)
+
+
+def test_the_value_is_not_kept_and_other_tensors_are():
+    hidden, other = torch.randn(2, 6, requires_grad=True), torch.randn(2, 6, requires_grad=True)
+    for when in (False, True):
+        value = nn.functional.gelu(hidden)
+        memory = StorageWeakRef(value.untyped_storage())
+        with recomputed(value, nn.functional.gelu, hidden, when=when):
+            out = (value * other).sum() + (value * (other + 1)[:, :6]).sum()
+        exact = value.detach().clone()
+        del value
+        assert memory.expired() == when
+        (grad,) = torch.autograd.grad(out, other)
+        torch.testing.assert_close(grad, 2 * exact)
 
 
 @pytest.mark.slow

@@ -3,7 +3,7 @@ import matplotlib
 import numpy as np
 import pytest
 
-from darswin.viz.dense import (
+from darswin.viz.pixels import (
     UNKNOWN,
     distance_image,
     distance_range,

@@ -4,25 +4,27 @@ Labels are ids (H, W) of integers; an id without a colour, as that of pixels wit
 grey. Distances are (H, W) in metres, and grey where they are 0 or not finite: not known.
 """
 
-from collections.abc import Sequence
-from functools import cache
+from collections.abc import Callable, Sequence
+from functools import cache, partial
 
 import cv2
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
-from matplotlib.colors import Colormap, LogNorm, Normalize
+from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
-from matplotlib.ticker import FixedLocator, PercentFormatter, StrMethodFormatter
+from matplotlib.ticker import LogLocator, PercentFormatter, StrMethodFormatter
+
+__all__ = ["distance_image", "distance_range", "label_image", "overlay", "palette"]
 
 UNKNOWN = (128, 128, 128)  # the colour of pixels without a label or distance
 MOST_CLASSES = 255  # 8 bits of a label picture, of which 255 means none
 
 # Near is bright. Equal steps look equal, also to those who see few colours.
 _DISTANCES = "viridis_r"
-_ERRORS = "magma"
+_ERRORS, _WORST = "magma", Normalize(0, 0.5, clip=True)
 _WRONG, _RIGHT = (213, 0, 50), (222, 222, 222)
 # Okabe and Ito's colours without black.
 _FIRST = ((0, 114, 178), (230, 159, 0), (0, 158, 115), (204, 121, 167), (86, 180, 233),
@@ -36,7 +38,9 @@ _SEEN = np.array([
      [-0.011820, 0.042940, 0.968881]],
 ])  # fmt: skip
 
-Row = tuple[np.ndarray, np.ndarray, np.ndarray]  # image, truth, prediction
+Row = tuple[np.ndarray, np.ndarray, np.ndarray]  # image (H, W, 1 or 3) uint8, truth, prediction
+# Pictures of truth, prediction and error, and the error in words.
+Painted = tuple[np.ndarray, np.ndarray, np.ndarray, str]
 
 
 def palette(count: int) -> list[list[int]]:
@@ -112,7 +116,7 @@ def distance_image(distance: np.ndarray, near: float, far: float) -> np.ndarray:
         raise ValueError(f"0 < near < far must hold, got {near:g} and {far:g} m")
     known = is_known(distance)
     part = np.log(np.where(known, distance, near).clip(near, far) / near) / np.log(far / near)
-    table = [*_distances()(np.arange(256), bytes=True)[:, :3], UNKNOWN]
+    table = [*matplotlib.colormaps[_DISTANCES](np.arange(256), bytes=True)[:, :3], UNKNOWN]
     steps = np.where(known, np.rint(255 * part), 256).astype(np.int16)
     return np.take(np.array(table, np.uint8), steps, 0)
 
@@ -127,7 +131,7 @@ def distance_range(distance: np.ndarray) -> tuple[float, float]:
 
 
 def is_known(distance: np.ndarray) -> np.ndarray:
-    """Which distances (H, W) are some: finite and above 0."""
+    """Distances (H, W) that are finite and above 0."""
     return np.isfinite(distance) & (distance > 0)
 
 
@@ -163,56 +167,53 @@ def draw_predictions(
     *,
     titles: Sequence[str] = (),
 ) -> Figure:
-    """Image, truth, prediction and error, a row a sample.
+    """Draws image, truth, prediction and error, a row a sample.
 
-    Args:
-        rows: of (image (H, W, 1 or 3) uint8, truth (H, W), prediction (H, W)): labels of integers,
-            or distances of floats in metres. The error is shown where the truth is known: wrong
-            pixels red, or the distance's relative error.
-        classes, colors: of labels, by id; without colors those of `palette`.
-        titles: a row each, to its left.
-
-    Raises:
-        ValueError: no rows; labels without classes.
+    Truth and prediction are labels of integers, with the names and colours of their classes, or
+    distances of floats in metres. The error is shown where the truth is known: wrong pixels are
+    red, or the distance's relative error. The titles stand left of the rows.
     """
     if not rows:
         raise ValueError("there are no predictions to draw")
-    of_labels = np.issubdtype(rows[0][1].dtype, np.integer)
-    if of_labels and not classes:
+    are_labels = np.issubdtype(rows[0][1].dtype, np.integer)
+    if are_labels and not classes:
         raise ValueError("predictions of labels are drawn with the names of their classes")
     height, width = rows[0][1].shape
-    tall = len(rows) * (2.5 * height / width + 0.25) + (0.9 if of_labels else 1.5)
+    tall = len(rows) * (2.5 * height / width + 0.25) + (0.9 if are_labels else 1.5)
     figure = Figure(figsize=(10.4, tall), layout="constrained")
     panels = figure.subplots(len(rows), 4, squeeze=False)
+    paint: Callable[[np.ndarray, np.ndarray], Painted]
+    if are_labels:
+        colors = colors or palette(len(classes))
+        paint = partial(_label_pictures, colors=colors)
+        _draw_legend(figure, classes, colors)
+    else:
+        near, far = distance_range(np.concatenate([truth[is_known(truth)] for _, truth, _ in rows]))
+        paint = partial(_distance_pictures, near=near, far=far)
+        _draw_bars(figure, panels[-1], near, far)
+    for axes, (image, truth, prediction) in zip(panels, rows, strict=True):
+        *pictures, text = paint(truth, prediction)
+        for panel, picture in zip(axes, (image, *pictures), strict=True):
+            _show(panel, picture)
+        axes[3].set_xlabel(text, fontsize=9)
     for axes, title in zip(panels[0], ("image", "truth", "prediction", "error"), strict=True):
         axes.set_title(title, fontsize=11)
-    if of_labels:
-        _draw_labels(figure, panels, rows, classes, colors or palette(len(classes)))
-    else:
-        _draw_distances(figure, panels, rows)
     for axes, title in zip(panels[:, 0], titles, strict=False):
         axes.set_ylabel(title, fontsize=9)
     return figure
 
 
-def _draw_labels(
-    figure: Figure,
-    panels: np.ndarray,
-    rows: Sequence[Row],
-    classes: Sequence[str],
-    colors: Sequence[Sequence[int]],
-) -> None:
-    for axes, (image, truth, prediction) in zip(panels, rows, strict=True):
-        known = (truth >= 0) & (truth < len(colors))
-        error = np.where(
-            (truth == prediction)[..., None], np.array(_RIGHT, np.uint8), np.array(_WRONG, np.uint8)
-        )
-        error = np.where(known[..., None], error, np.array(UNKNOWN, np.uint8))
-        pictures = (image, label_image(truth, colors), label_image(prediction, colors), error)
-        for panel, picture in zip(axes, pictures, strict=True):
-            _show(panel, picture)
-        share = (truth == prediction)[known].mean() if known.any() else float("nan")
-        axes[3].set_xlabel(f"{share:.0%} right", fontsize=9)
+def _label_pictures(
+    truth: np.ndarray, prediction: np.ndarray, colors: Sequence[Sequence[int]]
+) -> Painted:
+    known, right = (truth >= 0) & (truth < len(colors)), truth == prediction
+    error = label_image(np.where(known, right, 2), (_WRONG, _RIGHT))
+    share = right[known].mean() if known.any() else float("nan")
+    pictures = label_image(truth, colors), label_image(prediction, colors)
+    return *pictures, error, f"{share:.0%} right"
+
+
+def _draw_legend(figure: Figure, classes: Sequence[str], colors: Sequence[Sequence[int]]) -> None:
     meanings = [*zip(classes, colors, strict=False), ("wrong", _WRONG), ("no label", UNKNOWN)]
     entries = [
         Patch(color=(red / 255, green / 255, blue / 255), label=name)
@@ -221,45 +222,34 @@ def _draw_labels(
     figure.legend(handles=entries, loc="outside lower center", ncols=8, fontsize=9)
 
 
-def _draw_distances(figure: Figure, panels: np.ndarray, rows: Sequence[Row]) -> None:
-    known = [truth[is_known(truth)] for _, truth, _ in rows]
-    near, far = distance_range(np.concatenate(known))
-    worst = Normalize(0, 0.5, clip=True)
-    for axes, (image, truth, prediction) in zip(panels, rows, strict=True):
-        both = is_known(truth) & is_known(prediction)
-        relative = np.abs(prediction - truth) / np.where(both, truth, 1)
-        error = matplotlib.colormaps[_ERRORS](worst(np.where(both, relative, 0)), bytes=True)
-        error = np.where(both[..., None], error[..., :3], np.array(UNKNOWN, np.uint8))
-        maps = (distance_image(d, near, far) for d in (truth, prediction))
-        for panel, picture in zip(axes, (image, *maps, error), strict=True):
-            _show(panel, picture)
-        mean = relative[both].mean() if both.any() else float("nan")
-        axes[3].set_xlabel(f"mean {mean:.0%}", fontsize=9)
-    distances = ScalarMappable(LogNorm(near, far), _distances())
+def _distance_pictures(
+    truth: np.ndarray, prediction: np.ndarray, near: float, far: float
+) -> Painted:
+    both = is_known(truth) & is_known(prediction)
+    relative = np.abs(prediction - truth) / np.where(both, truth, 1)
+    error = matplotlib.colormaps[_ERRORS](_WORST(np.where(both, relative, 0)), bytes=True)
+    error = np.where(both[..., None], error[..., :3], np.array(UNKNOWN, np.uint8))
+    mean = relative[both].mean() if both.any() else float("nan")
+    pictures = distance_image(truth, near, far), distance_image(prediction, near, far)
+    return *pictures, error, f"mean {mean:.0%}"
+
+
+def _draw_bars(figure: Figure, panels: np.ndarray, near: float, far: float) -> None:
+    """The scales of distances and of their errors, below the panels."""
+    distances = ScalarMappable(LogNorm(near, far), matplotlib.colormaps[_DISTANCES])
     bar = figure.colorbar(
-        distances, ax=panels[-1, :3], location="bottom", shrink=0.5, aspect=40, extend="both"
+        distances, ax=panels[:3], location="bottom", shrink=0.5, aspect=40, extend="both"
     )
     bar.set_label("distance (m), log scale; grey: not known", fontsize=9)
-    bar.ax.xaxis.set_major_locator(FixedLocator(_round_steps(near, far)))
+    bar.ax.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
     bar.ax.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
     bar.ax.minorticks_off()
     bar.ax.tick_params(labelsize=9)
-    errors = ScalarMappable(worst, matplotlib.colormaps[_ERRORS])
-    bar = figure.colorbar(errors, ax=panels[-1, 3], location="bottom", aspect=15, extend="max")
+    errors = ScalarMappable(_WORST, matplotlib.colormaps[_ERRORS])
+    bar = figure.colorbar(errors, ax=panels[3], location="bottom", aspect=15, extend="max")
     bar.set_label("error of the true distance", fontsize=9)
     bar.ax.xaxis.set_major_formatter(PercentFormatter(1, 0))
     bar.ax.tick_params(labelsize=9)
-
-
-def _round_steps(near: float, far: float) -> list[float]:
-    """1, 2, 5, 10 … between two distances; the two where there are fewer than two of them."""
-    decades = 10.0 ** np.arange(np.floor(np.log10(near)), np.ceil(np.log10(far)) + 1)
-    steps = [float(f"{d * k:.1g}") for d in decades for k in (1, 2, 5) if near <= d * k <= far]
-    return steps if len(steps) > 1 else [float(f"{end:.3g}") for end in (near, far)]
-
-
-def _distances() -> Colormap:
-    return matplotlib.colormaps[_DISTANCES]
 
 
 def _show(axes: Axes, picture: np.ndarray) -> None:
