@@ -84,8 +84,14 @@ def autocast_dtype(tensor: Tensor) -> torch.dtype | None:
 
 def without_float16(tensor: Tensor) -> Tensor:
     """Under autocast, a float16 tensor as float32: the operators have no float16."""
-    half = tensor.dtype == torch.float16 and autocast_dtype(tensor) is not None
-    return tensor.float() if half else tensor
+    half = isinstance(tensor, Tensor) and tensor.dtype == torch.float16
+    return tensor.float() if half and autocast_dtype(tensor) is not None else tensor
+
+
+def narrow_types(tensor: Tensor) -> tuple[torch.dtype, ...]:
+    """The types of 16 bits that an operator with kernels for float16 takes."""
+    kernels = isinstance(tensor, Tensor) and has_kernels(tensor)
+    return (torch.bfloat16, torch.float16) if kernels else (torch.bfloat16,)
 
 
 def output_bfloat16(image: Tensor) -> bool:

@@ -77,8 +77,7 @@ def checked_sampling(
     channels_last: bool | None,
 ) -> Sampling:
     """The arguments of the public functions, else TypeError or ValueError."""
-    if isinstance(image, Tensor):
-        image = _library.without_float16(image)
+    image = _library.without_float16(image)
     pixels = (*DTYPES, torch.bfloat16, torch.uint8)
     check_tensor("image", image, pixels, "(B, C, H, W)", (None,) * 4)
     image = channels_first("image", image, channels_last)

@@ -30,8 +30,8 @@ def polar_sample(
     """Samples an image bilinearly on a polar grid, zeros outside.
 
     Point (i, j) of image b stands at `(x, y) = center + affine @ (r cos a, r sin a) +
-    offsets[b, :, i, j]` with `r = radii[b, i]` and `a = azimuths[j]`. A lens that is circular
-    needs neither affine nor offsets, and pays nothing for them.
+    offsets[b, :, i, j]` with `r = radii[b, i]` and `a = azimuths[j]`. A circular lens needs
+    neither affine nor offsets. `polar_embed` takes the linear layer of a patch embedding along.
 
     Convention:
         Pixel centres are integers, x to the right in [0, W-1] and y down in [0, H-1]; azimuth 0
@@ -71,12 +71,8 @@ def polar_sample(
         bfloat16 where the image is, or under bfloat16 autocast; float64 where the image is; else
         float32. bfloat16 is computed in float32 and rounded once.
 
-    Gradients go to image (unless uint8), radii, center, affine and offsets; results and gradients
-    do not depend on the number of threads. There are no others than those of backward(); asking for
-    others is an error.
-
-    A large fresh output costs its memory's first touch, about as much time as sampling. Where the
-    linear layer of a patch embedding comes next, `polar_embed` never writes the samples at all.
+    Gradients go to image (unless uint8), radii, center, affine and offsets, by backward() alone;
+    results and gradients do not depend on the number of threads.
 
     Raises:
         TypeError: a tensor of another dtype, or an argument of another type.

@@ -52,19 +52,14 @@ def polar_to_image(
     Gradients go to x, radii, center, affine and points; results and gradients do not depend on the
     number of threads. At the centre itself radius and azimuth have none.
 
-    A linear layer behind it may as well come first, on the map: fewer channels are brought back.
-
     Raises:
         TypeError: a tensor of another dtype, or an argument of another type.
         ValueError: a shape, device or range that does not fit, or radii that do not rise.
         NotImplementedError: forward-mode derivatives, those of torch.func, and second ones.
     """
-    half: tuple[torch.dtype, ...] = (torch.bfloat16,)
-    if isinstance(x, Tensor) and _library.has_kernels(x):
-        half = (torch.bfloat16, torch.float16)
-    elif isinstance(x, Tensor):
-        x = _library.without_float16(x)
-    check_tensor("x", x, (*DTYPES, *half), "(B, R, A, D)", (None,) * 4)
+    narrow = _library.narrow_types(x)
+    x = x if torch.float16 in narrow else _library.without_float16(x)
+    check_tensor("x", x, (*DTYPES, *narrow), "(B, R, A, D)", (None,) * 4)
     rings, sectors = x.shape[1:3]
     if rings == 0 or sectors == 0:
         raise ValueError(f"x must have rings and sectors, got {tuple(x.shape)}")

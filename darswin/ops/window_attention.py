@@ -49,10 +49,9 @@ def window_attention(
 
     Source: DarSwin, ICCV 2023, sec. 4.4; Swin Transformer, ICCV 2021, sec. 3.2.
     """
-    narrow: tuple[torch.dtype, ...] = (torch.bfloat16,)
-    if isinstance(qkv, Tensor) and isinstance(bias, Tensor):
-        narrow = (torch.bfloat16, torch.float16) if _library.has_kernels(qkv) else narrow
-        qkv, bias = _arithmetic_types(qkv, bias, narrow)
+    narrow = _library.narrow_types(qkv)
+    if torch.float16 not in narrow:
+        qkv, bias = _library.without_float16(qkv), _library.without_float16(bias)
     shape = (None, None, None, 3, None, None)
     check_tensor("qkv", qkv, (*DTYPES, *narrow), "(B, R, A, 3, heads, d)", shape)
     batch, rings, sectors, _, heads, head_dim = qkv.shape
@@ -66,7 +65,11 @@ def window_attention(
         raise ValueError(f"shift must lie inside (R, A) = ({rings}, {sectors}), got {shift}")
     if not isinstance(periodic, (tuple, list)) or len(periodic) != 2:
         raise TypeError(f"periodic must be a pair of bools, got {periodic!r}")
-    real = torch.float32 if qkv.dtype in narrow else qkv.dtype
+    # The bias of a qkv in 16 bits is float32; autocast may have made it narrow.
+    half = qkv.dtype in narrow
+    if isinstance(bias, Tensor) and bias.dtype in narrow:
+        bias = bias.float() if half or _library.autocast_dtype(qkv) is not None else bias
+    real = torch.float32 if half else qkv.dtype
     table = (heads, 2 * window[0] - 1, 2 * window[1] - 1)
     form = "(B or 1, heads, 2·M_r-1, 2·M_φ-1) = ({} or 1, {}, {}, {})"
     check_tensor("bias", bias, (real,), form, (batch, *table), (1, *table), like=qkv)
@@ -84,19 +87,6 @@ def _kernel_takes(qkv: Tensor, bias: Tensor, window: tuple[int, int], *others: o
     tokens, head_dim = math.prod(window), qkv.shape[5]
     dims = 64 if tokens <= 32 else 32
     return bias.dtype == torch.float32 and tokens <= 64 and head_dim <= dims
-
-
-def _arithmetic_types(
-    qkv: Tensor, bias: Tensor, narrow: tuple[torch.dtype, ...]
-) -> tuple[Tensor, Tensor]:
-    """The arguments in types that the operator takes, where autocast changed them: qkv stays in one
-    of the `narrow` types, which the operator reads; its bias becomes float32."""
-    if torch.float16 not in narrow:
-        qkv, bias = _library.without_float16(qkv), _library.without_float16(bias)
-    if bias.dtype not in narrow:
-        return qkv, bias
-    mixed = qkv.dtype in narrow or _library.autocast_dtype(qkv) is not None
-    return qkv, bias.float() if mixed else bias
 
 
 @torch.library.register_fake("darswin::window_attention")

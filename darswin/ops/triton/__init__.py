@@ -1,12 +1,9 @@
 """The operators' kernels for CUDA devices, in Triton: one launch where torch takes many.
 
-An operator is declared once, in C++, with its fake and autograd in `darswin/ops`; here it gets what
-it runs on a CUDA device. `LAUNCHERS` names the module of each. In it a function of the operator's
-name takes the arguments of the schema, makes the outputs and launches. The public function has
-checked the arguments; those that the kernel does not compute go to the reference.
-
-The kernels are for NVIDIA's GPUs since the A100. Triton is no dependency: without it nothing is
-registered, and with it no kernel is imported before the first call on a CUDA device. Their rules:
+A function of the operator's name takes the arguments of the schema, makes the outputs and launches.
+The public function has checked the arguments; the reference runs those that the kernel does not
+take. Triton is no dependency, and no kernel is imported before the first call on a CUDA device.
+docs/explanation/gpu.md describes the kernels. Their rules:
 
 - A program owns what it writes, or adds integers to it (`fixed_point`), in any order: two runs give
   the same bits. Such a gradient is NaN all over where a number that arrives is not finite.
@@ -25,17 +22,14 @@ import torch
 
 INSTALLED = importlib.util.find_spec("triton") is not None
 
-# Operator → the module in this package that launches it.
-LAUNCHERS = {
+# Operator → the module in this package that launches it and its backward.
+_MODULES = {
     "polar_sample": "polar_sample",
-    "polar_sample_backward": "polar_sample",
     "polar_embed": "polar_sample",
-    "polar_embed_backward": "polar_sample",
     "polar_to_image": "polar_to_image",
-    "polar_to_image_backward": "polar_to_image",
     "window_attention": "window_attention",
-    "window_attention_backward": "window_attention",
 }
+LAUNCHERS = {name + way: module for name, module in _MODULES.items() for way in ("", "_backward")}
 
 
 @functools.cache

@@ -1,8 +1,7 @@
 """Where the points of a polar grid stand, and the pixels around them, for kernels.
 
-A point is found from its radius and azimuth, as everywhere; there is no mesh. Angles are brought
-near 0 in float64, which takes three operations, and all the rest is float32: cosine and sine are
-right to a rounding, whatever the angle. Jitter draws the random words of the reference.
+Angles are brought near 0 in float64, and all the rest is float32: cosine and sine are right to a
+rounding, whatever the angle. Jitter draws the random words of the reference.
 """
 
 import triton

@@ -1,17 +1,8 @@
 """polar_sample and polar_embed on CUDA devices: forward and backward.
 
-Forward is one launch. A program takes a block of samples in the order of the output, finds each
-sample's place and mixes its four pixels, a few channels at a time, which are then written together.
-
-In backward a program takes one radius of one image. A pixel's gradient is a sum over points that
-come in any order, so it is a sum of integers: each share is counted in units of 2⁻ᵇⁱᵗˢ of the
-largest gradient that arrives, and a second kernel turns the sums into numbers. What the lens gets
-are sums over the points of a radius, which its program adds up and torch adds to each other. So
-two runs give the same bits. Where a gradient that arrives is not finite, that of the image is NaN.
-
-polar_embed is the kernels of polar_sample and torch's products, of which
-`torch.backends.cuda.matmul` decides the precision. Its samples are float32; backward makes them
-again.
+Forward is one launch: a program takes a block of samples in the order of the output. In backward a
+program takes one radius of one image; the image's gradient is a sum of integers (`fixed_point`).
+The linear layer of polar_embed is torch's product, of samples in float32 that backward makes again.
 """
 
 from typing import Any

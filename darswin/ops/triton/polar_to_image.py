@@ -1,12 +1,8 @@
 """polar_to_image on CUDA devices: forward and backward.
 
-A program takes a block of an image's pixels. It finds where they lie on the map, between which two
-rings and two sectors, once, and mixes the four tokens some channels at a time. Ring centres rise,
-so a search that halves finds the ring. Radius and azimuth are right to a rounding.
-
-In backward a token's gradient is a sum of integers (`fixed_point`), and each program writes its
-own sums for the lens, which torch adds up: two runs give the same bits. Where a gradient that
-arrives is not finite, that of the map is NaN.
+A program takes a block of an image's pixels. It finds their two rings and two sectors once, and
+mixes the four tokens some channels at a time. In backward a token's gradient is a sum of integers
+(`fixed_point`), and each program writes its own sums for the lens, which torch adds up.
 """
 
 from collections.abc import Sequence

@@ -1,14 +1,8 @@
 """window_attention on CUDA devices: forward and backward.
 
-A program attends in some windows of one image, one after the other, for one head. It reads queries,
-keys and values where they lie: the shift and the wrap are in the places. The pairs of a window's
-tokens are a square that stays in registers, probabilities and bias too; backward computes the
-probabilities again. Tokens and head dim are filled up to powers of two, at least 16, which is what
-tensor cores multiply; what is filled in is neither read nor written.
-
-The gradient of the bias is a sum over all windows. Each program adds up the pairs of its own
-windows in turn and writes them, torch adds up the programs', and a second kernel gathers the pairs
-of each entry of the table. So every sum has its order, and two runs give the same bits.
+A program attends in some windows of one image, one after the other, for one head. The pairs of a
+window's tokens are a square in registers. Tokens and head dim are filled up to powers of two, at
+least 16, which is what tensor cores multiply; the filling is neither read nor written.
 
 In a window that a seam parts, a NaN or an infinity among the values, or among the gradients, of one
 side reaches the other, since 0 times NaN is NaN; one among queries and keys does not.
@@ -213,7 +207,7 @@ def window_attention(
     periodic: Sequence[int],
     scale: float,
 ) -> Tensor:
-    """See `darswin.ops.window_attention`."""
+    """`darswin::window_attention`."""
     qkv, bias = qkv.contiguous(), bias.contiguous()
     out = qkv.new_empty((*qkv.shape[:3], qkv.shape[4] * qkv.shape[5]))
     if out.numel() > 0:
@@ -233,7 +227,8 @@ def window_attention_backward(
     scale: float,
     grad_out: Tensor,
 ) -> tuple[Tensor, Tensor]:
-    """The gradients of qkv and of the bias."""
+    """`darswin::window_attention_backward`: of qkv and bias. Each sum has one order: a program adds
+    up the pairs of its windows, torch adds up programs, `_fold` gathers an entry's pairs."""
     qkv, bias, grad_out = qkv.contiguous(), bias.contiguous(), grad_out.contiguous()
     grad_qkv, grad_bias = torch.empty_like(qkv), torch.empty_like(bias)
     if qkv.numel() == 0:
