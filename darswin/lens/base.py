@@ -177,7 +177,7 @@ class Lens(ImageFrame):
         return self.project(self.theta_max)
 
     def sees(self, theta: Tensor) -> Tensor:
-        """Whether θ (N or 1, ...), rad, is at most θ_max, but for rounding; False for NaN."""
+        """True where θ (N or 1, ...), rad, is at most θ_max, but for rounding; False for NaN."""
         last = self.theta_max * (1 + 8 * torch.finfo(self.theta_max.dtype).eps)
         return theta <= self._row(last, theta.dim())
 
@@ -185,7 +185,7 @@ class Lens(ImageFrame):
 
     @property
     def is_radial(self) -> bool:
-        """Whether a ray keeps its azimuth, but for `affine`: there is no `offset`."""
+        """True if a ray keeps its azimuth, but for `affine`: there is no `offset`."""
         return True
 
     def offset(self, theta: Tensor, direction: Tensor) -> Tensor:

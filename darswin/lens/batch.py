@@ -168,7 +168,7 @@ class LensBatch:
         return self._from_tensors(self._tensors() | tensors)
 
     def same_as(self, other: object) -> bool:
-        """Whether `other` is of the same class and has the same numbers, for as many lenses."""
+        """True if `other` is of the same class and has the same numbers, for as many lenses."""
         if type(other) is not type(self):
             return False
         mine, others = self._tensors(), other._tensors()

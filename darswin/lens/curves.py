@@ -76,8 +76,8 @@ class Tabulated(Lens):
         return torch.cat((first, inside, last), 1)
 
     def _pieces(self, x: Tensor, table: Tensor) -> tuple[Tensor, ...]:
-        """Of the piece of the table that each x is in: its first θ and its width; its first r, its
-        rise, and its slopes at both ends, in units of the width."""
+        """The first θ and the width of the table's piece that each x is in; its first r, its rise,
+        and its slopes at both ends, in units of the width."""
         rows = max(len(self), x.shape[0])
         flat = x.detach().expand(rows, *x.shape[1:]).reshape(rows, -1)
         table = table.detach().expand(rows, -1).contiguous()

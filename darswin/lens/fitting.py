@@ -124,7 +124,8 @@ def _least_squares(
     names = list(start)
     shapes = [start[name].shape for name in names]
     sizes = [shape.numel() for shape in shapes]
-    bounds = [model.declared[name].bounds for name in names]
+    declared = [model.declared[name] for name in names]
+    bounds = [p.bounds or (p.low, p.high) for p in declared]
     low, high = (
         torch.cat([theta.new_full((s,), b[end]) for b, s in zip(bounds, sizes, strict=True)])
         for end in (0, 1)

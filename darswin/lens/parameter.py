@@ -3,6 +3,7 @@
 import inspect
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import KW_ONLY, dataclass
 from functools import reduce
 from typing import TYPE_CHECKING, Any
 
@@ -12,6 +13,7 @@ from torch import Tensor
 Number = float | Sequence[float] | Sequence[Sequence[float]] | Tensor
 
 
+@dataclass(frozen=True, eq=False)
 class Parameter:
     """A parameter of a lens class: `xi = Parameter(low=0)` in the body of the class.
 
@@ -23,22 +25,16 @@ class Parameter:
         starts: values that `fit` starts from. bounds: of `fit`; None means low and high.
     """
 
-    def __init__(
-        self,
-        low: float = -math.inf,
-        high: float = math.inf,
-        *,
-        open: bool = False,
-        shape: tuple[int | None, ...] = (),
-        optional: bool = False,
-        by_place: bool = False,
-        in_pixels: bool = False,
-        starts: tuple[float, ...] = (),
-        bounds: tuple[float, float] | None = None,
-    ):
-        self.low, self.high, self.open, self.shape = low, high, open, shape
-        self.optional, self.by_place, self.in_pixels = optional, by_place, in_pixels
-        self.starts, self.bounds = starts, bounds or (low, high)
+    low: float = -math.inf
+    high: float = math.inf
+    _: KW_ONLY
+    open: bool = False
+    shape: tuple[int | None, ...] = ()
+    optional: bool = False
+    by_place: bool = False
+    in_pixels: bool = False
+    starts: tuple[float, ...] = ()
+    bounds: tuple[float, float] | None = None
 
     if TYPE_CHECKING:  # a lens's own attribute hides this one, which is the class's
 
@@ -59,7 +55,7 @@ class Parameter:
         return rows
 
     def holds(self, value: Tensor) -> Tensor:
-        """Whether each lens's values are in range, (N,)."""
+        """True for each lens, (N,), whose values are in range."""
         value = value.detach()[..., None].flatten(1)
         if self.open:
             inside = (value > self.low) & (value < self.high)

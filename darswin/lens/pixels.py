@@ -41,7 +41,7 @@ def pixel_angles(lens: Lens, size: tuple[int, int]) -> Tensor:
 
 
 def solid_angles(lens: Lens, size: tuple[int, int]) -> Tensor:
-    """How much of the sphere around the camera each pixel shows, (N, H, W), sr.
+    """The solid angle of the sphere around the camera that each pixel shows, (N, H, W), sr.
 
     The area of a pixel times dΩ/dA at its centre, found in float64; 0 where θ is NaN. Those of an
     image that the whole circle lies in sum up to 2π (1 − cos θ_max), but for the pixels that the

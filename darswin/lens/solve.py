@@ -39,8 +39,8 @@ def inverse(function: Function, slope: Function, value: Tensor, end: Tensor) -> 
 
 @torch.no_grad()
 def rising_limit(slope: Function, end: Tensor) -> Tensor:
-    """How far functions (N,) rise from 0: the first x at which a slope is not positive or
-    overflows, or `end`, (N,), up to which 1024 steps are looked at."""
+    """The first x, (N,), at which the slope of a function is not positive or overflows, or `end`,
+    (N,), up to which 1024 steps from 0 are looked at."""
 
     def rises(x: Tensor) -> Tensor:
         value = slope(x)
@@ -67,7 +67,7 @@ def newton(
     end: Tensor,
     rounds: int = 60,
 ) -> Tensor:
-    """Where a map of the plane takes the value `goal`.
+    """The points that a map of the plane takes to `goal`.
 
     Newton's steps, each shortened until it comes nearer to the goal and stays where the map keeps
     its orientation. From a point where it does, they end at the goal or at a fold of the map.

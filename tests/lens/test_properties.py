@@ -1,4 +1,4 @@
-"""What holds for any lens, of any model, with any parameters, and for any grid of one."""
+"""Properties of any lens, of any model, with any parameters, and of any grid of one."""
 
 import json
 import math

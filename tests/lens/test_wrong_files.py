@@ -288,7 +288,7 @@ def frames(count, **shared):
 
 @pytest.fixture
 def frozen(threads):
-    """What other tests left in memory is not looked through for garbage meanwhile."""
+    """The garbage collector does not look through the memory of other tests meanwhile."""
     threads(1)  # others, waiting, would count
     gc.collect()
     gc.freeze()

@@ -110,7 +110,7 @@ def _camera(row: list[str]) -> Description:
 
 
 def is_binary(data: bytes) -> bool:
-    """Whether a file is a cameras.bin: it begins with a number of cameras, of eight bytes."""
+    """True for a cameras.bin: it begins with a number of cameras, of eight bytes."""
     return len(data) >= _COUNT.size and data[4:8] == bytes(4)
 
 

@@ -1,4 +1,4 @@
-"""What a text file says, in any notation: nothing in it is ever run, and no size makes it hang."""
+"""The content of a text file in any notation: nothing in it is run, and no size makes it hang."""
 
 import contextlib
 import io

@@ -28,7 +28,7 @@ def listed(names: Iterable[str]) -> str:
 
 
 def is_number(word: str) -> bool:
-    """Whether a word is written as a number; "nan" is not."""
+    """True for a word that is written as a number; "nan" is not."""
     return len(word) <= _MAX_WORD and _NUMBER.fullmatch(word) is not None
 
 
@@ -73,7 +73,7 @@ def to_sides(value: Any, name: str) -> tuple[int, int]:
 
 
 def holds_numbers(value: Any) -> bool:
-    """Whether a value is a number other than 0, or may hold some."""
+    """True for a number other than 0, or a value that may hold some."""
     if isinstance(value, str):
         words = value[:1000].replace(",", " ").split()
         return all(map(is_number, words)) and any(float(word) for word in words)
@@ -89,7 +89,7 @@ def plain_name(name: str) -> str:
 
 
 def like_coefficients(name: str, value: Any) -> bool:
-    """Whether an entry may be of coefficients, or be one; not how sure they are."""
+    """True for an entry that may be of coefficients, or be one; not for their deviations."""
     plain = plain_name(name)
     alone = not isinstance(value, (list, Mapping))
     found = _COEFFICIENTS.search(plain) or (alone and _COEFFICIENT.fullmatch(plain))

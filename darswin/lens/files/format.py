@@ -34,7 +34,7 @@ class Intrinsics(NamedTuple):
     size: Any  # (H, W), or None
 
     def fits(self, model: type[Lens], names: str) -> bool:
-        """Whether it is of a model and has no other values than these, skew among them."""
+        """True if it is of a model and has no other values than these, skew among them."""
         others = self.values.keys() - {"fx", "fy", "cx", "cy"}
         return self.model is model and others <= {*names.split()}
 
@@ -54,7 +54,7 @@ class Format:
     needs_size = False  # whether a written camera must have an image_size
 
     def fits(self, content: Content) -> bool:
-        """Whether a file's content is of this format."""
+        """True for a file's content that is of this format."""
         return isinstance(content, Mapping) and any(key in content for key in self.keys)
 
     def cameras(self, file: Any, model: str | None) -> Cameras:

@@ -246,7 +246,7 @@ class _Reader:
     def kind(
         self, name: str | None, coefficients: list[float], xi: str | None, only: str | None = None
     ) -> str:
-        """Which of `MODELS`: the user's, what the file says, or what only one of them has."""
+        """One of `MODELS`: the user's, the file's, or the one that alone has such coefficients."""
         if self.model is not None:
             return self.model
         flag = self.find(SAYS_FISHEYE)
