@@ -1,6 +1,7 @@
-"""What the tests of runs share: training in this process, kills, and what a run left."""
+"""Shared by the tests of runs: tiny runs of each task in this process, kills, and their files."""
 
 import itertools
+import json
 from pathlib import Path
 
 import pytest
@@ -9,16 +10,43 @@ import torch
 from darswin.cli.main import main
 from darswin.train.task import Task
 
+QUIET = """--data.workers 0 --trainer.enable_progress_bar false
+    --trainer.enable_model_summary false""".split()  # noqa: SIM905
+UNET = "{embed_dim: 8, depths: [1, 1, 1], rings: 8, sectors: 32, samples: [2, 2]}"
+# 12 batches an epoch, in steps of 5, 5 and 2.
+DIGITS = [
+    *("--config", "minutes", "--data.path", "digits", "--data.limit", "96"),
+    *("--data.batch_size", "8", "--trainer.max_epochs", "2", "--checkpoint_steps", "1", *QUIET),
+    *("--trainer.accumulate_grad_batches", "5", "--trainer.log_every_n_steps", "1"),
+    *("--model.options", "{embed_dim: 8, depths: [1, 1, 1]}", "--model.mixup", "0.8"),
+    *("--data.randaugment", "true"),
+]
+PIXELS = [
+    *("--data.size", "32", "--data.batch_size", "8", "--model.name", "darswin_unet_a_nano"),
+    *("--model.options", UNET, "--model.learning_rate", "1e-2", "--model.reference_batch", "8"),
+    *("--checkpoint_steps", "1", *QUIET),
+]
 
-def fit(run: Path, *options: str) -> None:
-    main(["fit", "--run", str(run), *options])
+
+def fit(run: Path, *options) -> None:
+    main(["fit", "--run", str(run), *map(str, options)])
 
 
-def error(capsys, run: Path, *options: str) -> str:
+def test(run: Path, *options) -> list[dict]:
+    main(["test", "--run", str(run), "--trainer.enable_progress_bar", "false", *map(str, options)])
+    return json.loads((run / "test.json").read_text())["results"]
+
+
+test.__test__ = False
+
+
+def error(capsys, *argv) -> str:
+    """All that a command which fails prints: Python prints an exit code that is no number."""
     capsys.readouterr()
     with pytest.raises(SystemExit) as caught:
-        fit(run, *options)
-    code = caught.value.code  # which Python prints if it is no number
+        main([str(word) for word in argv])
+    code = caught.value.code
+    assert code != 0
     return f"{'' if isinstance(code, int) else code}{capsys.readouterr().err}"
 
 
@@ -37,9 +65,8 @@ def assert_same(run: Path, other: Path) -> None:
     for name, tensor in theirs["state_dict"].items():
         assert torch.equal(ours["state_dict"][name], tensor), name
     a, b = (c["optimizer_states"][0]["state"] for c in (ours, theirs))
-    assert (
-        all(torch.equal(a[k][key], b[k][key]) for k in b for key in b[k]) and a.keys() == b.keys()
-    )
+    assert a.keys() == b.keys()
+    assert all(torch.equal(a[k][key], b[k][key]) for k in b for key in b[k])
 
 
 class KilledError(BaseException):
@@ -60,5 +87,13 @@ def patch_batch(monkeypatch, number: int, action) -> None:
     monkeypatch.setattr(Task, "training_step", acting)
 
 
-def killed(self):
-    raise KilledError
+def killed_fit(monkeypatch, run: Path, number: int, *options) -> None:
+    """A `fit` that is killed in its n-th batch."""
+
+    def kill(self):
+        raise KilledError
+
+    patch_batch(monkeypatch, number, kill)
+    with pytest.raises(KilledError):
+        fit(run, *options)
+    monkeypatch.setattr(Task, "training_step", STEP)

@@ -1,16 +1,27 @@
+"""Answers to a stream of images: classes, and files of a network whose answer is known."""
+
+import json
+from pathlib import Path
+
+import cv2
 import numpy as np
 import pytest
 import torch
+from PIL import Image
+from videos import write_video
 
 from darswin import create_model
 from darswin.cli import answers as module
-from darswin.cli.answers import ClassAnswers
-from darswin.layers.position_bias import RelativeBias
-from darswin.lens import Spherical
-from darswin.models.saving import ModelCard
+from darswin.cli import predict as predict_module
+from darswin.cli.answers import ClassAnswers, claim_folder, distance_png, file_names, label_png
+from darswin.cli.main import main
+from darswin.data.warp import FullSize, at_size
+from darswin.lens import Spherical, from_dict
+from darswin.models.encoder import Encoder, Prepared
+from darswin.models.saving import ModelCard, save_model
+from darswin.viz.pixels import UNKNOWN, palette
 
-CARD = ModelCard("darswin_a_nano", dict(num_classes=6), "abcdef", 32)
-SIZE = torch.tensor([[48, 64]])
+# -- classes ----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", ["darswin_a_nano", "swin_nano"])
@@ -18,55 +29,348 @@ SIZE = torch.tensor([[48, 64]])
 def test_answers_are_the_models_in_order_whatever_the_lenses(name, monkeypatch):
     model = create_model(name, num_classes=6).eval()
     card = ModelCard(name, dict(num_classes=6), "abcdef", 32, fit="crop")
-    lenses = [Spherical.from_fov(xi, 2.6, 24.0).replace(image_size=SIZE) for xi in (0.1, 0.8)]
-    order = [0] * 10 + [1, 0, 1, 1] + [0] * 3
+    size = torch.tensor([[48, 64]])
+    lenses = [
+        Spherical.from_fov(xi / 20, 2.6, 24.0).replace(image_size=size) for xi in range(20)
+    ]  # fmt: skip
+    # Two that take turns, then more than are kept.
+    order = [2] * 10 + [16, 2, 16, 16] + [2] * 3 + [*range(3, 16), 17, 18, 19] + [19, 18, 2]
     rng = np.random.default_rng(0)
     images = [rng.integers(256, size=(48, 64, 3), dtype=np.uint8) for _ in order]
     answers = ClassAnswers(model, card, 6)
-    sizes = []
-    run = answers.model.run
+    sizes, prepared = [], []
+    run, prepare = answers.model.run, answers.model.prepare
     monkeypatch.setattr(answers.model, "run", lambda x, p: sizes.append(len(x)) or run(x, p))
+    monkeypatch.setattr(answers.model, "prepare", lambda *a: prepared.append(a) or prepare(*a))
     for k, (image, which) in enumerate(zip(images, order, strict=True)):
         answers.add({"image": k}, image, lenses[which])
     answers.flush()
     answers.flush()
-    assert sizes == [module.BATCH, 2, 1, 1, 2, 3] and answers.seconds > 0
+    assert sizes[:6] == [module.BATCH, 2, 1, 1, 2, 3] and answers.seconds > 0
+    assert len(prepared) == 18 + 1  # the first one was no longer kept
     assert [entry["image"] for entry in answers.found] == list(range(len(order)))
     for entry, image, which in zip(answers.found, images, order, strict=True):
         pixels, lens = module.resized(model, card, image, lenses[which])
         assert pixels.shape == (1, 3, 32, 32)
         expected = model(pixels, lens).softmax(-1)[0]
+        assert len(entry["top"]) == 6
         for found in entry["top"]:
             k = "abcdef".index(found["class"])
             assert found["probability"] == pytest.approx(expected[k].item(), abs=1e-5)
 
 
-def test_a_lens_is_prepared_once(monkeypatch):
-    answers = ClassAnswers(create_model("darswin_a_nano", num_classes=6), CARD, 2)
-    lens = Spherical.from_fov(0.3, 2.6, 24.0).replace(image_size=SIZE)
-    image = np.zeros((48, 64, 3), np.uint8)
-    answers.add({}, image, lens)
-    monkeypatch.setattr(RelativeBias, "forward", None)
-    for _ in range(2 * module.BATCH):
-        answers.add({}, image, lens)
-    answers.flush()
-    assert len(answers.found) == 2 * module.BATCH + 1
-    assert all(len(entry["top"]) == 2 for entry in answers.found)
+# -- labels and distances ---------------------------------------------------------------------
+
+# A circle inside of pictures of 48×64, of whose middle square it leaves the corners out.
+LENS = {"model": "Spherical", "xi": 0.5, "fov": 2.8, "image_size": [48, 64]}
+COLORS = [[250, 0, 0], [0, 250, 0], [0, 0, 250]]
+NAMES = ["red", "green", "blue"]
+SEEN = FullSize(from_dict(LENS, (48, 64)), 48, "crop").seen
 
 
-def test_lenses_that_take_turns_are_prepared_once(monkeypatch):
-    answers = ClassAnswers(create_model("darswin_a_nano", num_classes=6), CARD, 1)
-    prepared = []
-    prepare = answers.model.prepare
-    monkeypatch.setattr(answers.model, "prepare", lambda *a: prepared.append(a) or prepare(*a))
-    image = np.zeros((48, 64, 3), np.uint8)
-    lenses = [
-        Spherical.from_fov(xi / 20, 2.6, 24.0).replace(image_size=SIZE) for xi in range(20)
+class Stub(Encoder):
+    """The class is a pixel's strongest colour; the distance is its red, in quarters of a metre."""
+
+    in_chans, square_images = 3, True
+
+    def __init__(self, task):
+        super().__init__()
+        self.task, self.num_classes, self.prepared = task, 3, 0
+
+    def prepare(self, lens, size):
+        assert tuple(lens.image_size[0].tolist()) == size == (48, 48)
+        self.prepared += 1
+        return Prepared(None, ())
+
+    def run(self, images, prepared, *, stop_after=None):
+        images = images.float()
+        return images if self.task == "segmentation" else images[:, :1] / 4
+
+
+@pytest.fixture
+def stub(monkeypatch):
+    """A function that makes `predict` take a stub for a task."""
+
+    def install(task, **card):
+        net = Stub(task)
+        known = dict(classes=NAMES, colors=COLORS, size=48, fit="crop", task=task)
+        card = ModelCard("stub", **(known | card))
+        monkeypatch.setattr(predict_module, "trained_model", lambda path: (net, card))
+        monkeypatch.setattr(module, "fast", lambda model, card: model)
+        return net
+
+    return install
+
+
+def picture_of(labels):
+    """RGB to which the stub answers these labels."""
+    return np.take(np.array(COLORS, np.uint8), labels, 0)
+
+
+def write(path, image):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    cv2.imwrite(str(path), image[..., ::-1])
+    return str(path)
+
+
+@pytest.fixture
+def labels():
+    """Large regions; one class is nowhere."""
+    labels = np.zeros((48, 64), np.uint8)
+    labels[:, 32:] = 2
+    return labels
+
+
+def predict(*argv, out, lens=LENS):
+    lens = json.dumps(lens) if isinstance(lens, dict) else str(lens)
+    main(["predict", *map(str, argv), "--model", "m", "--lens", lens, "--out", str(out)])
+    return json.loads((Path(out) / "predictions.json").read_text())
+
+
+def ids(path):
+    with Image.open(path) as image:
+        assert image.mode == "P"
+        return np.asarray(image)
+
+
+def colored(path):
+    with Image.open(path) as image:
+        return np.asarray(image.convert("RGB"))
+
+
+def test_labels_of_a_picture(stub, labels, tmp_path):
+    stub("segmentation")
+    image, out = picture_of(labels), tmp_path / "out"
+    picture = write(tmp_path / "p.png", image)
+    (answer,) = predict(picture, out=out)
+    assert answer["image"] == picture
+    assert (answer["labels"], answer["overlay"]) == ("labels/p.png", "overlays/p.jpg")
+    assert np.array_equal(ids(out / "labels/p.png"), np.where(SEEN, labels, 255))
+    colors = colored(out / "labels/p.png")
+    assert (colors[SEEN] == image[SEEN]).all() and (colors[~SEEN] == UNKNOWN).all()
+    shares = {name: (labels[SEEN] == k).mean() for k, name in enumerate(NAMES)}
+    assert answer["shares"] == pytest.approx(shares, abs=1e-6) and list(shares) == NAMES
+    assert answer["unanswered"] == pytest.approx((~SEEN).mean(), abs=1e-6)
+    overlay = cv2.imread(str(out / "overlays/p.jpg"))[..., ::-1].astype(int)
+    assert overlay.shape == (48, 64, 3)
+    assert np.abs(overlay - image)[20:28, 8:24].max() < 40  # the colours are the picture's own
+
+
+def test_the_overlay_shows_the_picture_where_there_is_no_answer(stub, labels, tmp_path):
+    stub("segmentation", classes=(), colors=[[255, 255, 255]] * 3)
+    image = picture_of(labels)
+    (answer,) = predict(write(tmp_path / "p.png", image), out=tmp_path / "out")
+    laid = cv2.imread(str(tmp_path / "out/overlays/p.jpg"))[..., ::-1].astype(int)
+    middle = np.s_[16:32, 20:28]  # away from edges, which JPEG blurs
+    assert np.abs(laid - (image.astype(int) + 255) // 2)[middle].max() < 12
+    assert np.abs(laid - image)[:, :4].max() < 12
+    assert list(answer["shares"]) == ["0", "1", "2"]
+    stub("segmentation", colors=[])
+    predict(write(tmp_path / "p.png", image), out=tmp_path / "out")
+    assert colored(tmp_path / "out/labels/p.png")[24, 24].tolist() == palette(3)[0]
+
+
+def test_distances_of_a_picture(stub, tmp_path):
+    stub("distance")
+    red = np.tile(np.linspace(40, 240, 64).astype(np.uint8), (48, 1))
+    image = np.stack((red, red, red), -1)
+    out = tmp_path / "out"
+    (answer,) = predict(write(tmp_path / "p.png", image), "--task", "distance", out=out)
+    assert answer["distance"] == "distance/p.png"
+    steps = cv2.imread(str(out / "distance/p.png"), cv2.IMREAD_UNCHANGED)
+    assert steps.dtype == np.uint16 and steps.shape == (48, 64)
+    expected = np.where(SEEN, red / 4, 0)
+    np.testing.assert_allclose(steps / 256, expected, atol=0.5 / 256)
+    known = expected[SEEN]
+    for key, value in (("min_m", known.min()), ("median_m", np.median(known)),
+                       ("max_m", known.max())):  # fmt: skip
+        assert answer[key] == pytest.approx(value, abs=1e-3)
+    assert answer["unanswered"] == pytest.approx((~SEEN).mean(), abs=1e-6)
+    near, far = answer["colors_m"]
+    assert known.min() <= near < far <= known.max()
+    laid = cv2.imread(str(out / "overlays/p.jpg"))
+    assert laid.shape == (48, 64, 3) and np.ptp(laid[24], 1).max() > 30  # colours over grey
+
+
+def test_pngs_keep_every_value(tmp_path):
+    distance = np.array([[0, 1e-4, 1, 255.996, 1e6, np.nan, np.inf, -1]], np.float32)
+    png = np.frombuffer(distance_png(distance), np.uint8)
+    steps = cv2.imdecode(png, cv2.IMREAD_UNCHANGED)
+    assert steps.tolist() == [[0, 1, 256, 65535, 65535, 0, 0, 0]]
+    labels = np.arange(256, dtype=np.uint8).reshape(16, 16)
+    (tmp_path / "l.png").write_bytes(label_png(labels, palette(255)))
+    assert np.array_equal(ids(tmp_path / "l.png"), labels)
+
+
+@pytest.mark.parametrize(("task", "value"), [("segmentation", np.nan), ("distance", np.inf)])
+def test_an_answer_that_is_not_finite_is_none(stub, monkeypatch, tmp_path, task, value):
+    net = stub(task)
+    run, reached = net.run, torch.ones(48, 48, dtype=torch.bool)
+
+    def broken(images, prepared):
+        output = run(images, prepared)
+        output[-1, 0].masked_fill_(reached, value)
+        return output
+
+    monkeypatch.setattr(net, "run", broken)
+    pictures = [write(tmp_path / f"{k}.png", np.full((48, 64, 3), 50, np.uint8)) for k in (0, 1)]
+    with pytest.raises(SystemExit, match=f"darswin: no answer for {pictures[1]}: .* NaN or"):
+        predict(*pictures, out=tmp_path / "out")
+    found = json.loads((tmp_path / "out" / "predictions.json").read_text())
+    assert [answer["image"] for answer in found] == pictures[:1]  # what was found is not lost
+    # Beyond θ_max it has no meaning.
+    reached = ~torch.from_numpy(FullSize(from_dict(LENS, (48, 64)), 48, "crop").reached)
+    assert len(predict(*pictures, out=tmp_path / "out")) == 2
+
+
+def test_a_folder_means_pictures_and_videos(stub, labels, tmp_path, capsys):
+    net = stub("segmentation")
+    folder, out = tmp_path / "in", tmp_path / "out"
+    for name in ("front/1.png", "rear/1.png", "rear/deep/2.jpg"):
+        write(folder / name, picture_of(labels if "front" in name else labels[:, ::-1]))
+    frames = write_video(folder / "rear/drive.avi", 5, size=(48, 64), codec="MJPG")
+    *found, speed = predict(folder, "--every", "2", out=out)
+    files = [answer["labels"] for answer in found]
+    assert files == [
+        "labels/front/1.png", "labels/rear/1.png", "labels/rear/deep/2.png",
+        *(f"labels/rear/drive.avi/{k:06}.png" for k in (0, 2, 4)),
     ]  # fmt: skip
-    for lens in lenses[:4] * 3:
-        answers.add({}, image, lens)
-    assert len(prepared) == 4
-    for lens in lenses + lenses[-module.LENSES :]:  # no more than so many are kept
-        answers.add({}, image, lens)
-    answers.flush()
-    assert len(prepared) == 20 and len(answers.found) == 12 + 20 + module.LENSES
+    for answer in found:
+        assert ids(out / answer["labels"]).shape == (48, 64)
+        assert cv2.imread(str(out / answer["overlay"])).shape == (48, 64, 3)
+    front, rear = (ids(out / name) for name in files[:2])
+    assert front[24, 20] == 0 and rear[24, 20] == 2
+    middle = np.s_[16:32, 24:40]
+    for answer, k in zip(found[3:], (0, 2, 4), strict=True):
+        same = ids(out / answer["labels"])[middle] == frames[k][middle].argmax(-1)
+        assert answer["frame"] == k and same.mean() > 0.9
+    assert speed["frames"] == 3 and speed["frames_per_second"] > 0
+    assert speed["frames_per_second"] <= speed["network_frames_per_second"]
+    assert "3 frames at" in capsys.readouterr().err
+    assert net.prepared == 1  # one lens
+    assert len(list(out.rglob("*.png"))) == len(list(out.rglob("*.jpg"))) == 6
+
+
+def test_colours_of_distance_stay_for_a_video(stub, tmp_path):
+    stub("distance")
+    write_video(tmp_path / "v.avi", 4, size=(48, 64), codec="MJPG")
+    write(tmp_path / "p.png", np.full((48, 64, 3), 40, np.uint8))
+    *frames, _, picture = predict(tmp_path / "v.avi", tmp_path / "p.png", out=tmp_path / "out")
+    assert len({tuple(answer["colors_m"]) for answer in frames}) == 1
+    assert picture["colors_m"] != frames[0]["colors_m"]
+
+
+@pytest.mark.parametrize(
+    ("paths", "videos", "expected"),
+    [
+        (["a"], [], {"a/1.png": "1", "a/b/1.png": "b/1"}),
+        (["a", "c"], [], {"a/1.png": "a/1", "c/1.jpg": "c/1"}),
+        (["a/1.png"], [], {"a/1.png": "1"}),
+        (["a/1.png", "c/1.png"], [], {"a/1.png": "a/1", "c/1.png": "c/1"}),
+        (["a/1.png", "a/1.jpg"], [], {"a/1.png": "1.png", "a/1.jpg": "1.jpg"}),
+        (["a"], ["a/v.mp4"], {"a/v.mp4": "v.mp4", "a/v/000000.png": "v/000000"}),
+        (["a", "a/1.png"], [], {"a/1.png": "1"}),
+    ],
+)
+def test_names_of_files_differ_and_keep_their_folders(
+    paths, videos, expected, tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    for name in expected:
+        Path(name).parent.mkdir(parents=True, exist_ok=True)
+        Path(name).touch()
+    assert file_names(paths, [(name, name in videos) for name in expected]) == expected
+
+
+def test_files_that_cannot_be_read_are_named_when_the_others_are_written(stub, labels, tmp_path):
+    stub("segmentation")
+    good = [write(tmp_path / f"in/{k}.png", picture_of(labels)) for k in "ac"]
+    (tmp_path / "in/b.png").write_text("no picture")
+    write(tmp_path / "in/d.png", np.zeros((20, 20, 3), np.uint8))
+    (tmp_path / "in/e.avi").write_text("no video")
+    out = tmp_path / "in/out"
+    for _ in range(2):  # its own pictures are not predicted again
+        with pytest.raises(SystemExit) as caught:
+            predict(tmp_path / "in", out=out)
+        first, *lines = str(caught.value).splitlines()
+        assert "for 3 of 5 files" in first
+        for name, line in zip(("b.png", "d.png", "e.avi"), lines, strict=True):
+            assert name in line
+        found = json.loads((out / "predictions.json").read_text())
+        assert [answer["image"] for answer in found] == good
+        assert sorted(path.name for path in (out / "labels").iterdir()) == ["a.png", "c.png"]
+    assert predict(out / "labels/a.png", out=tmp_path / "again")  # if asked for
+
+
+def test_nothing_but_its_own_is_replaced(tmp_path):
+    (tmp_path / "in").mkdir()
+    (tmp_path / "in/p.png").touch()
+    (tmp_path / "list").mkdir()
+    (tmp_path / "list/predictions.json").write_text('{"mine": 1}')
+    for out, said in ((None, "must be their folder"), ("in", "none of predict's"),
+                      ("in/p.png", "is a file"), ("list", "none of predict's")):  # fmt: skip
+        with pytest.raises(ValueError, match=said):
+            claim_folder(out and str(tmp_path / out))
+    assert [path.name for path in (tmp_path / "in").iterdir()] == ["p.png"]
+    (tmp_path / "empty").mkdir()
+    for out in ("empty", "new/out"):
+        assert claim_folder(str(tmp_path / out)) == tmp_path / out
+        assert json.loads((tmp_path / out / "predictions.json").read_text()) == []
+        (tmp_path / out / "labels").mkdir()  # of a run that was killed
+        claim_folder(str(tmp_path / out))
+
+
+def test_wrong_arguments_are_named(stub, labels, tmp_path, capsys):
+    picture = write(tmp_path / "p.png", picture_of(labels))
+    net = stub("segmentation")
+    argv = ["predict", picture, "--model", "m", "--lens", json.dumps(LENS)]
+    with pytest.raises(SystemExit, match="--out must be their folder"):
+        main(argv)
+    with pytest.raises(SystemExit, match="--task distance was asked of m, a model for segm"):
+        main([*argv, "--out", str(tmp_path / "o"), "--task", "distance"])
+    net.num_classes = 256
+    with pytest.raises(SystemExit, match="for 255 classes, got 256"):
+        main([*argv, "--out", str(tmp_path / "o")])
+
+
+def test_pictures_of_several_lenses_go_through_their_own(stub, labels, tmp_path):
+    stub("segmentation")
+    narrow = {"model": "Spherical", "xi": 0.5, "focal": 10.0, "theta_max": 0.8}
+    lenses = {"a": LENS, "b": narrow | {"image_size": [48, 64]}}
+    for name in lenses:
+        write(tmp_path / name / "p.png", picture_of(labels))
+    (tmp_path / "lenses.json").write_text(json.dumps(lenses))
+    out = tmp_path / "out"
+    predict(tmp_path / "a", tmp_path / "b", lens=tmp_path / "lenses.json", out=out)
+    for name, described in lenses.items():
+        seen = FullSize(from_dict(described, (48, 64)), 48, "crop").seen
+        assert np.array_equal(ids(out / f"labels/{name}/p.png") != 255, seen)
+
+
+@pytest.mark.parametrize(
+    ("name", "task"),
+    [("darswin_unet_a_nano", "segmentation"), ("swin_unet_adapted_nano", "distance")],
+)
+def test_a_real_model_answers_as_in_python(name, task, tmp_path):
+    options = dict(task=task, num_classes=3, in_chans=3, mean=[0.5] * 3, std=[0.25] * 3)
+    size = 128
+    card = ModelCard(name, options, NAMES, size, fit="crop", task=task, colors=COLORS)
+    model = card.create().eval()
+    save_model(tmp_path / "m.safetensors", model.state_dict(), card)
+    rng = np.random.default_rng(0)
+    image = cv2.resize(rng.integers(256, size=(9, 12, 3), dtype=np.uint8), (160, 140))
+    picture, out = write(tmp_path / "p.png", image), tmp_path / "out"
+    lens = {"model": "Spherical", "xi": 0.5, "fov": 2.8, "image_size": [140, 160]}
+    argv = ["predict", picture, "--model", str(tmp_path / "m.safetensors"), "--out", str(out)]
+    main([*argv, "--lens", json.dumps(lens)])
+    taken_with = from_dict(lens, (140, 160))
+    small, small_lens = at_size(image, taken_with, size, "crop")
+    with torch.no_grad():
+        output = model(torch.from_numpy(small)[None], small_lens)[0].numpy()
+    full = FullSize(taken_with, size, "crop")
+    if task == "segmentation":
+        assert (ids(out / "labels/p.png") == full.labels(output)).mean() > 0.998
+    else:
+        steps = cv2.imread(str(out / "distance/p.png"), cv2.IMREAD_UNCHANGED)
+        expected = full.distance(output[0])
+        np.testing.assert_allclose(steps / 256, expected, atol=1 / 256, rtol=1e-3)

@@ -1,13 +1,16 @@
 """Command lines but for `darswin lens`, `fit`, `test` and `predict`, which have their own tests."""
 
 import functools
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Literal
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from darswin.cli import bench as command
-from darswin.cli.arguments import with_lists
+from darswin.cli.arguments import run_command, with_lists
 from darswin.cli.main import main
 
 
@@ -19,27 +22,77 @@ def test_only_numbers_after_the_option_are_its_list():
 
 def test_words_after_the_option_are_its_list():
     for argv in (["--paths", "a b", "c"], ["--paths=a b", "c"]):
-        assert with_lists([*argv, "--x", "1"], (), ["paths"]) == [
-            '--paths=["a b", "c"]',
-            "--x",
-            "1",
-        ]
-    for argv in (
-        ["--paths", "null", "--x"],
-        ["--paths", '["a"]'],
-        ["--paths=null"],
-        ["--pathsx", "a"],
-    ):
-        assert "=".join(with_lists(argv, (), ["paths"])) == "=".join(argv)
-    assert with_lists(["--paths"], (), ["paths"]) == ["--paths"]
+        found = with_lists([*argv, "--x", "1"], (), ["paths"])
+        assert found == ['--paths=["a b", "c"]', "--x", "1"]
+    for text in ("--paths null --x", '--paths ["a"]', "--paths=null", "--pathsx a", "--paths"):
+        found = with_lists(text.split(), (), ["paths"])
+        assert "=".join(found) == "=".join(text.split())
 
 
-def refused(capsys, *argv):
-    """What is said of arguments that end a command with exit code 2."""
+def command_of(*argv):
+    """What a function with parameters of all kinds is called with."""
+    found = {}
+
+    def function(source: str, others: Sequence[str] = (), *, count: int, rate: float = 0.5,
+                 kind: Literal["a", "b"] | None = None, sides: tuple[int, int] = (1, 2),
+                 names: list[str] | None = None, out: Path | None = None):  # fmt: skip
+        """Does nothing.
+
+        Args:
+            count: of 100%
+                of things.
+            kind: of it.
+        """
+        found.update(locals())
+
+    run_command(function, list(argv), "prog")
+    found.pop("found")
+    return found
+
+
+def test_a_function_gets_its_arguments(capsys):
+    usual = dict(source="s", others=(), count=3, rate=0.5, kind=None, sides=(1, 2), names=None)
+    assert command_of("s", "--count", "3") == usual | {"out": None}
+    assert command_of("s", "a", "b", "--count=-3", "--rate", "1e-3", "--kind", "b", "--sides",
+                      "4", "5", "--names", '["x", "y"]', "--out", "o") == dict(
+        source="s", others=["a", "b"], count=-3, rate=1e-3, kind="b", sides=(4, 5),
+        names=["x", "y"], out=Path("o"))  # fmt: skip
+    given = ("s", "--count", "3", "--rate", "2", "--kind", "null", "--names", "[]", "--out", "null")
+    assert command_of(*given) == usual | dict(rate=2.0, names=[], out=None)
     with pytest.raises(SystemExit) as end:
-        main(list(argv))
+        command_of("--help")
+    text = " ".join(capsys.readouterr().out.split())
+    assert end.value.code == 0 and "Does nothing." in text and "of 100% of things." in text
+    assert "of it. one of a, b [null]" in text and "[1,2]" in text and "[0.5]" in text
+
+
+@pytest.mark.parametrize(
+    ("typed", "said"),
+    [
+        ("s", "the following arguments are required: --count"),
+        ("--count 3", "the following arguments are required: source"),
+        ("s --count x", "--count must be a whole number, got x"),
+        ("s --count 1.5", "--count must be a whole number, got 1.5"),
+        ("s --count=", "--count must be a whole number, got nothing"),
+        ("s --count 3 --rate x", "--rate must be a number, got x"),
+        ("s --count 3 --kind c", "--kind must be one of a, b, got c"),
+        ("s --count 3 --sides 1", "--sides must be 2 whole numbers, such as 10,10, got [1]"),
+        (
+            "s --count 3 --sides 1,2,3",
+            "--sides must be 2 whole numbers, such as 10,10, got [1,2,3]",
+        ),
+        ("s --count 3 --sides 1,x", "--sides must be 2 whole numbers, such as 10,10, got 1,x"),
+        ("s --count 3 --names [1]", "--names must be a list of texts, got [1]"),
+        ("s --count 3 --names [", "--names must be a list of texts, got ["),
+        ("s --count 3 --speed 2", "unrecognized arguments: --speed 2"),
+    ],
+)
+def test_wrong_arguments_are_one_sentence(capsys, typed, said):
+    with pytest.raises(SystemExit) as end:
+        command_of(*typed.split())
     assert end.value.code == 2
-    return capsys.readouterr().err.splitlines()[-1]
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith(f"prog: {said}") and line.endswith("; `prog --help` tells more")
 
 
 @pytest.mark.parametrize(
@@ -61,7 +114,9 @@ def refused(capsys, *argv):
 )
 def test_misuse_ends_with_a_sentence_before_any_work(capsys, monkeypatch, argv, said):
     monkeypatch.setattr(command, "machine", lambda: pytest.fail("it was refused too late"))
-    assert said in refused(capsys, *argv)
+    with pytest.raises(SystemExit) as end:
+        main(argv)
+    assert end.value.code == 2 and said in capsys.readouterr().err.splitlines()[-1]
 
 
 @pytest.mark.parametrize("typed", [["1", "8"], ["1,8"], ["[1,8]"], ["[1,", "8]"]])

@@ -1,10 +1,11 @@
+"""`darswin lens`."""
+
 import contextlib
 import io
 import json
 import math
 import os
 import re
-import subprocess
 import sys
 
 import cv2
@@ -16,25 +17,12 @@ from hypothesis import strategies as st
 
 from darswin.cli import lens as cli
 from darswin.cli.main import main
-from darswin.lens import Mei, Perspective, Polynomial, Spherical, from_dict, to_dict
+from darswin.lens import Perspective, Polynomial, from_dict, to_dict
 from darswin.viz import plot
-from darswin.viz.report import (
-    best_spacing,
-    describe,
-    largest_offset,
-    outside_share,
-    patches,
-    pixels_per_degree,
-)
 
 FRONT = Polynomial(
     [350.4, -17.5, 27.5, -2.4], math.radians(95), [641.3, 486.1],
     image_size=(966, 1280),
-)  # fmt: skip
-MEI = Mei(
-    2.35, 1390.0, (0.032, 2.4),
-    math.radians(102), (708.5, 697.0), image_size=(1400, 1400),
-    tangential=(6e-4, -3.5e-4),
 )  # fmt: skip
 
 
@@ -46,22 +34,16 @@ def folder(tmp_path):
     return tmp_path
 
 
-def test_show_writes_a_figure(folder, capsys):
+@pytest.mark.parametrize(
+    ("name", "magic"), [("new/figure.png", b"\x89PNG"), ("a.jpg", b"\xff\xd8")]
+)
+def test_show_writes_a_figure(folder, capsys, name, magic):
     calib, picture = str(folder / "front.json"), str(folder / "front.png")
-    out = folder / "new" / "figure.png"
+    out = folder / name
     main(["lens", "show", calib, picture, "--out", str(out), "--rings=4", "--sectors=8",
           "--samples=[3,2]", "--view=cylindrical", "--yaw_deg=20", "--spacing=g"])  # fmt: skip
-    assert capsys.readouterr().out == f"{out}\n"
+    assert capsys.readouterr().out == f"{out}\n" and out.read_bytes().startswith(magic)
     assert cv2.imread(str(out)).shape == (1080, 1800, 3)
-
-
-def test_show_takes_a_picture_of_the_same_shape_only(folder):
-    calib = str(folder / "front.json")
-    cv2.imwrite(str(folder / "square.png"), np.zeros((400, 400, 3), np.uint8))
-    with pytest.raises(SystemExit, match="pictures of 966×1280 px, and 400×400 is"):
-        main(["lens", "show", calib, str(folder / "square.png")])
-    with pytest.raises(SystemExit, match=r"^darswin: cannot read none.png: No such file[^(]*$"):
-        main(["lens", "show", calib, "none.png"])
 
 
 def test_info_prints_what_the_lens_is(folder, capsys):
@@ -84,16 +66,6 @@ def test_convert_fits_and_writes(folder, capsys):
     torch.testing.assert_close(lens.project(theta), FRONT.project(theta), rtol=0, atol=0.5)
     main(["lens", "convert", str(folder / "front.json"), str(out)])
     assert json.loads(out.read_text())["model"] == "Polynomial"
-
-
-def test_errors_are_one_line(folder):
-    with pytest.raises(SystemExit, match=r"^darswin: [^\n]*$"):
-        main(["lens", "info", str(folder / "none.json")])
-    (folder / "wrong.json").write_text('{"model": "Spherical"}')
-    with pytest.raises(SystemExit, match=r"^darswin: [^\n]*$"):
-        main(["lens", "info", str(folder / "wrong.json")])
-    with pytest.raises(SystemExit, match=r"^darswin: [^\n]*model[^\n]*$"):
-        main(["lens", "convert", str(folder / "front.json"), "out.json", "--model", "Sfera"])
 
 
 def refusal(capsys, *arguments):
@@ -122,7 +94,7 @@ def refusal(capsys, *arguments):
         (["--view=fish"], "--view must be one of perspective, cylindrical, equirectangular, got"),
         (["--out=lens.gif"], r"must end in one of \.png, \.jpg, .*, got 'lens.gif'"),
         (["--out=lens"], "must end in one of"),
-        (["--wings=4"], "(?i)unrecognized arguments: --wings=4"),
+        (["--wings=4"], "unrecognized arguments: --wings=4"),
     ],
 )
 def test_misuse_is_refused_before_any_work(folder, capsys, monkeypatch, options, said):
@@ -135,11 +107,25 @@ def test_misuse_is_refused_before_any_work(folder, capsys, monkeypatch, options,
     assert line.startswith("darswin") and re.search(said, line)
 
 
-def test_a_picture_is_what_its_ending_says(folder):
-    calib, picture, out = (str(folder / name) for name in ("front.json", "front.png", "a.jpg"))
-    main(["lens", "show", calib, picture, "--out", out, "--rings=4", "--sectors=8"])
-    assert (folder / "a.jpg").read_bytes().startswith(b"\xff\xd8\xff")
-    assert cv2.imread(out).shape == (1080, 1800, 3)
+@pytest.mark.parametrize(
+    ("argv", "said"),
+    [
+        ("show front.json square.png", "pictures of 966×1280 px, and 400×400 is"),
+        ("show front.json none.png", r"^darswin: cannot read none.png: No such file[^(]*$"),
+        ("info none.json", "none.json"),
+        ("info wrong.json", "wrong.json"),
+        ("info bare.json", "how large its images are: give --image_size, their height"),
+        ("convert front.json out.json --model Sfera", "model"),
+        ("draw front.json", "invalid choice: 'draw'"),
+        ("show", "arguments are required: calib, image"),
+    ],
+)
+def test_what_is_wrong_is_one_line(folder, capsys, monkeypatch, argv, said):
+    monkeypatch.chdir(folder)
+    cv2.imwrite("square.png", np.zeros((400, 400, 3), np.uint8))
+    (folder / "wrong.json").write_text('{"model": "Spherical"}')
+    (folder / "bare.json").write_text(json.dumps(to_dict(Polynomial([300.0], 1.5))))
+    assert re.search(said, refusal(capsys, "lens", *argv.split()))
 
 
 @pytest.fixture
@@ -151,9 +137,7 @@ def drawn(monkeypatch):
     return found
 
 
-@pytest.mark.parametrize(
-    "typed", [["3,2"], ["3", "2"], ["[3,2]"], ["[3, 2]"], ["[3,", "2]"], ["3,", "2"], ["(3,2)"]]
-)
+@pytest.mark.parametrize("typed", [["3,2"], ["3", "2"], ["[3,", "2]"], ["(3,2)"]])
 def test_lists_are_taken_as_people_type_them(folder, drawn, capsys, typed):
     calib, picture = str(folder / "front.json"), str(folder / "front.png")
     main(["lens", "show", "--samp", *typed, calib, picture])
@@ -166,7 +150,7 @@ def test_lists_are_taken_as_people_type_them(folder, drawn, capsys, typed):
 
 
 @pytest.mark.parametrize("view", ["perspective", "cylindrical", "equirectangular"])
-@pytest.mark.parametrize("fov", [1e-9, 0.01, 20, 179, None])
+@pytest.mark.parametrize("fov", [1e-9, 20, 179, None])
 @pytest.mark.parametrize("size", [(483, 640), (1, 400), (400, 1)])
 def test_views_stay_small(folder, drawn, view, fov, size):
     """The equirectangular one of 0.01° asked for 92 GB."""
@@ -271,100 +255,3 @@ def test_any_command_line_ends_with_an_answer_or_a_sentence(
         assert out.getvalue() and not err.getvalue()
     else:
         assert code == 2 and len(err.getvalue().splitlines()) == 1
-
-
-def test_it_does_not_need_lightning(folder):
-    script = (
-        "import sys\n"
-        "for name in ('lightning', 'torchmetrics', 'tensorboard', 'sklearn'):\n"
-        "    sys.modules[name] = None\n"
-        "from darswin.__main__ import main\n"
-        f"main(['lens', 'info', {str(folder / 'front.json')!r}])\n"
-    )
-    subprocess.run([sys.executable, "-c", script], check=True, capture_output=True)
-
-
-def test_pixels_per_degree_are_those_between_neighbours():
-    lens = MEI.to(torch.float64)
-    theta = torch.tensor([0.0, 0.5, 1.7], dtype=torch.float64)
-    along, around = pixels_per_degree(lens, theta)
-    step = math.radians(1e-4)
-    torch.testing.assert_close(
-        along, (lens.project(theta + step) - lens.project(theta - step)) / 2e-4, rtol=1e-5, atol=0
-    )
-    # Two rays that are a small angle apart on a cone of half angle θ.
-    torch.testing.assert_close(around[0], along[0])
-    apart = lens.project(theta)[1:] * step / (torch.sin(theta[1:]) * step * 180 / math.pi)
-    torch.testing.assert_close(around[1:], apart)
-
-
-def test_field_of_view_and_sides():
-    text = describe(FRONT)
-    sides = FRONT.to(torch.float64).side_angles()[0].rad2deg().tolist()
-    assert f"{sides[0] + sides[2]:.2f}° across, {sides[1] + sides[3]:.2f}° down" in text
-    for side, angle in zip(("left", "top", "right", "bottom"), sides, strict=True):
-        assert f"{side} {angle:.2f}°" in text
-    assert "between the corners" in text
-    assert "the lens ends before the corners" in describe(MEI)
-    with pytest.raises(ValueError, match="needs the image_size"):
-        describe(Spherical(0.5, 100.0))
-    assert "640 × 480 px" in describe(Spherical(0.5, 100.0), (480, 640))
-
-
-def test_a_principal_point_outside_the_sensor():
-    """A part of an image to the right of the principal point."""
-    lens = Perspective(100.0, 1.2, center=[-100.5, 49.5], image_size=(100, 100))
-    text = describe(lens)
-    # The part begins 45° to the right of the axis.
-    across = math.degrees(math.atan(2.0)) - 45
-    assert f"{across:.2f}° across, 53.13° down, on the row and the column" in text
-    assert "left -45.00°" in text and "are integers), outside the sensor" in text
-    assert "outside the sensor" not in describe(FRONT)
-
-
-def test_how_much_is_outside_the_sensor():
-    lens = Perspective(100.0, math.atan(0.5), image_size=(100, 100))  # a circle in a square
-    assert outside_share(lens.to(torch.float64), (100, 100)) == 0
-    # Half of each circle's radii end in the upper half.
-    half = lens.replace(center=torch.tensor([[49.5, -0.5]]))
-    assert outside_share(half.to(torch.float64), (100, 100)) == pytest.approx(0.5, abs=0.01)
-    assert "50.0% of the samples up to θ_max" in describe(half)
-    assert "left: the lens ends before" in describe(Polynomial([30.0, 0.0, -3.0], 1.0), (99, 99))
-
-
-def test_tangential_size():
-    assert largest_offset(FRONT) == 0 and "tangential" not in describe(FRONT)
-    theta = MEI.theta_max
-    azimuth = torch.linspace(0, 2 * math.pi, 721)
-    radial = MEI.replace(tangential=None)
-    apart = MEI.project_rays(theta, azimuth) - radial.project_rays(theta, azimuth)
-    largest = apart.norm(dim=-1).max().item()
-    assert largest_offset(MEI) == pytest.approx(largest, rel=1e-3)
-    assert f"{largest:.2f} px at most, by tangential" in describe(MEI)
-
-
-def test_spacings():
-    text = describe(FRONT)
-    assert "tan θ ends at 90°" in text
-    narrow = Spherical.from_fov(0.5, 2.0, 100.0, image_size=(200, 200))
-    assert "tan θ ends" not in describe(narrow)
-    # Equal steps of the radius: the areas of the rings are as 1, 3, 5, …
-    found = patches(narrow, "radius", 16, 64)
-    assert found.ratio == pytest.approx(31, rel=1e-3)
-    assert found.width == pytest.approx((100 / 16, 100 / 16), rel=1e-3)
-    assert found.area[0] == pytest.approx(math.pi * (100 / 16) ** 2 / 64, rel=1e-3)
-    ratios = {s: patches(narrow, s, 16, 64).ratio for s in ("theta", "tan", "g")}
-    assert best_spacing(narrow, 16, 64) == min(ratios, key=ratios.get)
-    halved = narrow.replace(affine=torch.tensor([[[1.0, 0.0], [0.0, 0.5]]]))
-    assert patches(halved, "theta", 16, 64).area[0] == pytest.approx(
-        patches(narrow, "theta", 16, 64).area[0] / 2
-    )
-
-
-@pytest.mark.parametrize("focal", [1e-300, 1e-200, 1e200, 1e300])
-def test_lengths_whose_squares_are_no_numbers(focal):
-    usual, extreme = (Perspective(torch.tensor(f, dtype=torch.float64), 1.0) for f in (1.0, focal))
-    for spacing in ("theta", "tan", "g", "radius"):
-        ratio = patches(usual, spacing, 16, 64).ratio
-        assert patches(extreme, spacing, 16, 64).ratio == pytest.approx(ratio, rel=1e-6)
-    assert describe(extreme, (100, 100))

@@ -6,6 +6,7 @@ import re
 import numpy as np
 import pytest
 from PIL import Image
+from runs import PIXELS, QUIET, UNET, error, fit
 from scenes import write_plain
 
 from darswin.cli.main import main
@@ -13,9 +14,7 @@ from darswin.layers.quantized import quantized_layers
 from darswin.models import load_model
 from darswin.models.saving import read_card
 
-QUIET = """--data.workers 0 --trainer.enable_progress_bar false --trainer.logger false
-    --trainer.enable_model_summary false --model.learning_rate 1e-2""".split()  # noqa: SIM905
-TINY = "{embed_dim: 8, depths: [1, 1, 1], rings: 8, sectors: 32, samples: [2, 2]}"
+FAST = [*QUIET, "--trainer.logger", "false", "--model.learning_rate", "1e-2"]
 LENS = json.dumps({"model": "Spherical", "xi": 0.5, "fov": 2.8})
 
 
@@ -23,9 +22,8 @@ LENS = json.dumps({"model": "Spherical", "xi": 0.5, "fov": 2.8})
 def digits(tmp_path_factory):
     """A run of a few steps on the bundled digits."""
     run = tmp_path_factory.mktemp("runs") / "digits"
-    main(["fit", "--run", str(run), "-c", "minutes", "--data.path", "digits", "--data.limit", "200",
-          "--model.name", "darswin_a_nano", "--model.options", TINY, "--trainer.max_epochs", "2",
-          "--data.train_lenses", "low", *QUIET])  # fmt: skip
+    fit(run, "-c", "minutes", "--data.path", "digits", "--data.limit", "200", "--model.options",
+        UNET, "--trainer.max_epochs", "2", *FAST)  # fmt: skip
     return run
 
 
@@ -62,17 +60,13 @@ def test_what_is_kept_and_where_it_goes(digits, tmp_path, capsys):
         (["--pictures", "0"], "--pictures must be at least 1, got 0"),
         (["--run", str(tmp_path)], f"no model in {tmp_path}"),
     ):
-        with pytest.raises(SystemExit) as caught:
-            main([*given, *more])
-        assert message in f"{caught.value.code}{capsys.readouterr().err}"
+        assert message in error(capsys, *given, *more)
 
 
 @pytest.mark.parametrize("task", ["segmentation", "distance"])
 def test_models_of_pixels(tmp_path, task, capsys):
     data, run = write_plain(tmp_path / "scenes", 20, size=(45, 60)), tmp_path / "run"
-    main(["fit", "--run", str(run), "--task", task, "--data.path", str(data), "--data.size", "32",
-          "--data.batch_size", "8", "--model.name", "darswin_unet_a_nano", "--model.options", TINY,
-          "--trainer.max_epochs", "2", *QUIET])  # fmt: skip
+    fit(run, "--task", task, "--data.path", data, *PIXELS, *FAST, "--trainer.max_epochs", "2")
     main(["quantize", "--run", str(run), "--pictures", "4"])
     said = capsys.readouterr().out
     assert "2 validation pictures" in said and ("the same is said" in said) == (task != "distance")

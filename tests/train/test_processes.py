@@ -1,5 +1,6 @@
-"""Runs of two processes, of which one is killed: all others end, within seconds."""
+"""Runs in processes of their own, as a user starts them: kills, and two that train as one."""
 
+import json
 import os
 import signal
 import subprocess
@@ -8,15 +9,27 @@ import time
 from pathlib import Path
 
 import pytest
-from train.kills import ALL, start, wait_for_steps
+import torch
+from runs import DIGITS, PIXELS, assert_same, checkpoint, fit, test
+from train.kills import finish, start, wait_for_steps
 
 from darswin.utils.processes import die_with_first_process
 
-TINY = [
-    *("--config", "minutes", "--data.path", "digits", "--data.limit", "64"),
-    *("--data.batch_size", "4", "--trainer.max_epochs", "100000", "--devices", "2", *ALL),
-    *("--data.workers", "1", "--model.options", "{embed_dim: 8}"),
-]
+PAIR = ["--devices", "2", "--trainer.accelerator", "cpu"]
+ENDLESS = [*DIGITS, *PAIR, "--trainer.max_epochs", "100000", "--data.workers", "1"]
+
+
+@pytest.mark.slow
+def test_a_killed_process_goes_on_bit_for_bit(whole, tmp_path):
+    run = tmp_path / "killed"
+    process = start(run, *DIGITS)
+    while not (run / "checkpoints" / "last.ckpt").exists() and process.poll() is None:
+        time.sleep(0.005)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    assert checkpoint(run)["global_step"] > 0
+    finish(run, start(run, "--resume"))
+    assert_same(run, whole)
 
 
 def of_session(session: int) -> dict[int, int]:
@@ -39,12 +52,13 @@ def seconds_of(first: int) -> list[int]:
     return [p for p in children if b"LOCAL_RANK=1\0" in Path(f"/proc/{p}/environ").read_bytes()]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("victim", "moment"), [("first", "start"), ("first", "training"), ("second", "training")]
 )
 def test_when_a_process_is_killed_all_end(tmp_path, victim, moment):
     run = tmp_path / "run"
-    first = start(run, *TINY)
+    first = start(run, *ENDLESS)
     try:
         if moment == "training":
             wait_for_steps(run, first)
@@ -65,6 +79,7 @@ def test_when_a_process_is_killed_all_end(tmp_path, victim, moment):
         first.wait()
 
 
+@pytest.mark.slow
 def test_an_orphan_ends_at_once():
     script = "from darswin.utils.processes import *\nwith die_with_first_process(): pass"
     # The first process has died before this one looked: Linux has no such number.
@@ -87,3 +102,44 @@ def test_other_processes_stay_as_they_are(monkeypatch, rank, first):
     with die_with_first_process():
         assert os.environ["DARSWIN_FIRST_PROCESS"] == str(os.getpid())
     assert "DARSWIN_FIRST_PROCESS" not in os.environ
+
+
+BOTH = """
+import json, sys
+from darswin.cli.main import main
+for words in json.loads(sys.argv[1]):
+    main(words)
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("task", ["classification", "segmentation"])
+def test_two_processes_train_and_test_as_one(scenes, tmp_path, task):
+    still, options = "jitter: 0, drop_path_rate: 0}", DIGITS
+    if task == "segmentation":
+        options = ["--task", task, "--data.path", str(scenes), *PIXELS, "--data.limit", "40"]
+    own = options[options.index("--model.options") + 1]
+    options += ["--model.options", own.replace("}", f", {still}"), "--trainer.max_epochs", "1"]
+    options += ["--data.randaugment", "false", "--trainer.accumulate_grad_batches", "1"]
+    one, two = tmp_path / "one", tmp_path / "two"
+    fit(one, *options)
+    lenses = [] if task == "segmentation" else ["--xi", "0,0.5"]
+    before = test(one, *lenses)
+    commands = [
+        ["fit", "--run", str(two), *options, *PAIR, "--data.batch_size", "4"],
+        ["test", "--run", str(one), *PAIR, *lenses, "--trainer.enable_progress_bar", "false"],
+    ]
+    script = tmp_path / "both.py"
+    script.write_text(BOTH)
+    # Lightning starts the second process as a copy of the first.
+    done = subprocess.run(
+        [sys.executable, str(script), json.dumps(commands)],
+        capture_output=True, text=True, env=os.environ | {"OMP_NUM_THREADS": "1"}, timeout=300,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr[-3000:]
+    for name, tensor in checkpoint(one)["state_dict"].items():
+        found = checkpoint(two)["state_dict"][name]
+        torch.testing.assert_close(found, tensor, rtol=1e-3, atol=1e-4)
+    for a, b in zip(json.loads((one / "test.json").read_text())["results"], before, strict=True):
+        numbers = {name: value for name, value in b.items() if isinstance(value, float | int)}
+        assert {name: a[name] for name in numbers} == pytest.approx(numbers, abs=2e-3)

@@ -1,55 +1,234 @@
+"""Parts of tasks and runs that need no run: optimiser, metrics, devices, checkpoints, options."""
+
+from types import SimpleNamespace
+
 import pytest
 import torch
 import torch.nn.functional as F
+from frames import WOODSCAPE
+from runs import DIGITS, error
+from torch import nn
+from torch.optim.lr_scheduler import CosineAnnealingLR, LinearLR
 from torchmetrics.classification import MulticlassAccuracy
 
+from darswin import create_model, lens
+from darswin.models.saving import ModelCard
 from darswin.train.classification import Classification, ClassMetrics
+from darswin.train.data import WideAngleData
+from darswin.train.runs import CHANGEABLE, RunCheckpoint, check_changes
+from darswin.train.task import Schedule, parameter_groups
+from darswin.train.tasks import TASKS
+
+# -- optimiser --------------------------------------------------------------------------------
 
 
-def test_targets_smooth_as_torch_does():
-    logits, labels = torch.randn(6, 4), torch.tensor([0, 1, 2, 3, 1, 1])
-    targets = Classification("darswin_a_nano", label_smoothing=0.1)._targets(labels, 4)
-    expected = F.cross_entropy(logits, labels, label_smoothing=0.1)
-    torch.testing.assert_close(F.cross_entropy(logits, targets), expected)
+def rates(schedule_of, steps):
+    """The learning rate of each step, of AdamW with a peak of 1e-3."""
+    optimizer = torch.optim.AdamW([nn.Parameter(torch.zeros(1))], lr=1e-3)
+    schedule = schedule_of(optimizer)
+    found = []
+    for _ in range(steps):
+        found.append(optimizer.param_groups[0]["lr"])
+        optimizer.step()
+        schedule.step()
+    return found
 
 
-def test_a_broken_picture_weighs_nothing():
+def test_a_line_up_then_torch_s_cosine_from_step_0():
+    steps, warmup = 200, 20
+    ours = dict(peak=1e-3, warmup=1e-6, final=1e-5, warmup_steps=warmup, steps=steps)
+    found = rates(lambda optimizer: Schedule(optimizer, **ours), steps + 10)
+    line = rates(lambda optimizer: LinearLR(optimizer, 1e-3, total_iters=warmup), warmup)
+    cosine = rates(lambda optimizer: CosineAnnealingLR(optimizer, steps, 1e-5), steps)
+    torch.testing.assert_close(found[:warmup], line)
+    torch.testing.assert_close(found[warmup:steps], cosine[warmup:])
+    torch.testing.assert_close(found[steps:], [1e-5] * 10)  # the end stays
+    without = rates(lambda optimizer: Schedule(optimizer, **ours | dict(warmup_steps=0)), steps)
+    torch.testing.assert_close(without, cosine)
+
+
+def test_matrices_decay_and_nothing_else():
+    model = create_model("darswin_a_nano", num_classes=4)
+    decayed, others = parameter_groups(model, 0.05, model.no_weight_decay())
+    assert decayed["weight_decay"] == 0.05 and others["weight_decay"] == 0
+    matrices = {id(m.weight) for m in model.modules() if isinstance(m, nn.Linear | nn.Conv2d)}
+    assert {id(p) for p in decayed["params"]} == matrices
+    assert len(decayed["params"]) + len(others["params"]) == len(list(model.parameters()))
+    with_biases, _ = parameter_groups(model, 0.05, ())
+    assert len(with_biases["params"]) > len(decayed["params"])
+    layer = nn.Linear(2, 2)
+    layer.weight.requires_grad_(False)  # frozen parameters are left out
+    assert [len(g["params"]) for g in parameter_groups(layer, 0.1, ())] == [0, 1]
+
+
+# -- classification ---------------------------------------------------------------------------
+
+
+def test_targets_smooth_as_torch_does_and_a_broken_picture_weighs_nothing():
+    logits, labels = torch.randn(6, 4, requires_grad=True), torch.tensor([0, 1, 2, 3, 1, 1])
     task = Classification("darswin_a_nano", label_smoothing=0.1)
-    logits = torch.randn(2, 4, requires_grad=True)
-    F.cross_entropy(logits, task._targets(torch.tensor([2, -1]), 4)).backward()
+    expected = F.cross_entropy(logits, labels, label_smoothing=0.1)
+    torch.testing.assert_close(F.cross_entropy(logits, task._targets(labels, 4)), expected)
+    labels[1] = -1
+    F.cross_entropy(logits, task._targets(labels, 4)).backward()
     assert (logits.grad[1] == 0).all() and (logits.grad[0] != 0).all()
-
-
-def test_metrics_count_images():
-    measured = ClassMetrics(10).all()
-    logits = torch.zeros(4, 10)
-    logits[torch.arange(4), torch.tensor([1, 2, 3, 4])] = 1
-    logits[2, 3] = -1  # last of all
-    measured["top1"].update(logits, torch.tensor([1, 2, 3, 5]))
-    assert measured["top1"].compute() == 0.5
-    assert ClassMetrics(3).top5.top_k == 3
 
 
 def test_metrics_are_those_of_torchmetrics_and_leave_broken_pictures_out():
     measured, logits = ClassMetrics(8), torch.randn(60, 8)
     labels = torch.randint(-1, 8, (60,))
-    for part in (slice(0, 40), slice(40, 60)):
+    for part in (slice(0, 40), slice(40, 60), slice(60, 60)):
         measured.update(logits[part], labels[part])
     logits, labels = logits[labels >= 0], labels[labels >= 0]
     for name, k in (("top1", 1), ("top5", 5)):
         expected = MulticlassAccuracy(8, average="micro", top_k=k)(logits, labels)
         torch.testing.assert_close(measured.all()[name].compute(), expected)
     torch.testing.assert_close(measured.loss.compute(), F.cross_entropy(logits, labels))
+    assert measured.loss.count == len(labels) < 60
+    assert ClassMetrics(3).top5.top_k == 3
+
+
+# -- devices ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", ["cuda", "cpu"])
+def test_memory_is_pinned_for_a_gpu_alone(kind):
+    data = WideAngleData("digits", workers=0)
+    strategy = SimpleNamespace(root_device=torch.device(kind))
+    data.trainer = SimpleNamespace(strategy=strategy, global_rank=0, world_size=1)
+    for loader in (data.train_dataloader(), data.val_dataloader()):
+        assert loader.pin_memory == (kind == "cuda")
+
+
+def test_a_batch_moves_with_its_lenses():
+    batch = [torch.randn(2, 3, 8, 8), lens.Equidistant([20.0, 21.0], 1.2), torch.tensor([1, 2])]
+    moved = WideAngleData("digits").transfer_batch_to_device(batch, torch.device("meta"), 0)
+    images, lenses, labels = moved
+    assert images.device.type == labels.device.type == lenses.theta_max.device.type == "meta"
+    assert isinstance(lenses, lens.Equidistant) and len(lenses) == 2
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
+def test_a_gpu_that_is_not_there_is_one_line(tmp_path, capsys):
+    said = error(capsys, "fit", "--run", tmp_path, *DIGITS, "--trainer.accelerator", "gpu")
+    assert "darswin: No supported gpu backend found!" in said and "Traceback" not in said
+
+
+# -- checkpoints ------------------------------------------------------------------------------
+
+
+def test_a_moved_run_keeps_its_best(tmp_path):
+    before, after = tmp_path / "before", tmp_path / "after"
+    first = RunCheckpoint(before, filename="best", monitor="val/top1", mode="max")
+    first.best_model_score = first.current_score = torch.tensor(0.9)
+    first.best_model_path = first.kth_best_model_path = str(before / "best.ckpt")
+    first.best_k_models = {str(before / "best.ckpt"): torch.tensor(0.9)}
+    moved = RunCheckpoint(after, filename="best", monitor="val/top1", mode="max")
+    moved.load_state_dict(first.state_dict())
+    assert moved.best_model_score == 0.9 and moved.best_model_path == str(after / "best.ckpt")
+    assert list(moved.best_k_models) == [str(after / "best.ckpt")]
+    strategy = SimpleNamespace(reduce_boolean_decision=lambda decision, all=True: decision)
+    assert not moved.check_monitor_top_k(SimpleNamespace(strategy=strategy), torch.tensor(0.5))
+
+
+def test_an_epoch_s_last_step_waits_for_its_validation(tmp_path, monkeypatch):
+    saved = []
+    monkeypatch.setattr(
+        "lightning.pytorch.callbacks.ModelCheckpoint.on_train_batch_end",
+        lambda self, trainer, *rest: saved.append(trainer.is_last_batch),
+    )
+    run = RunCheckpoint(tmp_path, every_n_train_steps=1)
+    for last in (False, True, False):
+        trainer = SimpleNamespace(is_last_batch=last, accumulate_grad_batches=1)
+        run.on_train_batch_end(trainer, None, None, None, 0)
+    assert saved == [False, False]
+
+
+def test_a_checkpoint_of_another_model_is_refused():
+    options = dict(num_classes=4, in_chans=1)
+    task = Classification("darswin_a_nano")
+    task.card = ModelCard("darswin_a_nano", options, list("abcd"), 32, 2.8)
+    ours = vars(task.card)
+    # A model may be measured on pictures that come to it in another way.
+    for same in ({}, {"fit": "crop", "fov": 0.0}, {"colors": [[0, 0, 0]]}):
+        task.on_load_checkpoint({"darswin": ours | same, "steps_per_epoch": 7})
+    for other, said in (
+        ({"options": options | {"embed_dim": 12}}, "embed_dim 12 there, None here"),
+        ({"size": 64}, "size 64 there, 32 here"),
+        ({"fov": 2.0}, "fov 2.0 there, 2.8 here"),
+        ({"classes": list("abce")}, "classes"),
+    ):
+        with pytest.raises(ValueError, match=f"is one of another model: {said}"):
+            task.on_load_checkpoint({"darswin": ours | other})
+
+
+# -- options ----------------------------------------------------------------------------------
+
+
+def test_changes_are_named():
+    before = {"data": {"size": 32, "workers": 1}, "trainer": {"devices": 1}, "run": "a"}
+    now = {"data": {"size": 32, "workers": 2}, "trainer": {"devices": 2}, "run": "b"}
+    assert check_changes(before, before) == []
+    assert check_changes(before, now) == [
+        "`data.workers` 2 in place of 1", "`trainer.devices` 2 in place of 1",
+    ]  # fmt: skip
+    for name, value in (("data.size", 64), ("trainer.accumulate_grad_batches", 4),
+                        ("model.name", "b"), ("data.limit", 9)):  # fmt: skip
+        group, _, option = name.partition(".")
+        changed = now | {group: now.get(group, {}) | {option: value}}
+        with pytest.raises(ValueError, match=f"not with `{name}` {value!r} in place of [^;]*$"):
+            check_changes(before, changed)
+    # Of before there were tasks.
+    assert check_changes({}, {"task": "classification"}) == []
+    with pytest.raises(ValueError, match="`task` 'distance' in place of 'classification'"):
+        check_changes({}, {"task": "distance"})
+    assert (
+        check_changes({"data": {}}, {"data": {"crop": None}, "model": {"freeze_stages": 0}}) == []
+    )
+
+
+def test_what_may_change_is_an_option():
+    for name in CHANGEABLE - {"checkpoint_steps", "weights_only"}:
+        group, _, option = name.partition(".")
+        kinds = [kind.data if group == "data" else kind.module for kind in TASKS.values()]
+        codes = [part.__init__.__code__.co_varnames for kind in kinds for part in kind.__mro__[:-1]
+                 if part.__module__.startswith("darswin.")]  # fmt: skip
+        assert any(option in names for names in codes), name
+
+
+def test_every_task_has_its_classes():
+    for name, kind in TASKS.items():
+        assert kind.module.task == name and kind.module.monitor[0].startswith("val/")
 
 
 @pytest.mark.parametrize(
-    ("options", "message"),
+    ("make", "message"),
     [
-        (dict(name="resnet"), "unknown model 'resnet'"),
-        (dict(label_smoothing=1.0), "label_smoothing"),
-        (dict(mixup=-1.0), "mixing needs"),
+        (lambda: Classification("resnet"), "unknown model 'resnet'"),
+        (lambda: Classification("swin_unet_nano"), "`name` swin_unet_nano is no model for `task`"),
+        (lambda: Classification(label_smoothing=1.0), r"`label_smoothing` must be in \[0, 1\)"),
+        (lambda: Classification(label_smoothing=-0.1), r"`label_smoothing` must be in \[0, 1\)"),
+        (lambda: Classification(mixup=-1.0), "mixing needs"),
+        (lambda: Classification(learning_rate=0), "`learning_rate` must be above 0, got 0"),
+        (lambda: Classification(learning_rate=torch.nan), "`learning_rate` must be above 0, got n"),
+        (lambda: Classification(reference_batch=0), "`reference_batch` must be above 0"),
+        (lambda: Classification(weight_decay=-1), "`weight_decay` must be at least 0"),
+        (lambda: Classification(warmup_epochs=torch.inf), "`warmup_epochs` must be at least 0"),
+        (lambda: Classification(freeze_stages=1), "`freeze_stages` 1 .*: give `weights`"),
+        (lambda: WideAngleData("digits", batch_size=0), "`batch_size` must be at least 1"),
+        (lambda: WideAngleData("digits", workers=-1), "`workers` at least 0, got 128 and -1"),
+        (lambda: WideAngleData("digits", camera="7"), "`camera` 7 is one of a calibration: give"),
+        (lambda: WideAngleData("digits", coefficients="pinhole"), "`coefficients` pinhole is one"),
+        (lambda: WideAngleData("digits", mean=[0.5]), "mean and std must have 3 values"),
+        (lambda: WideAngleData("digits", train_lenses="odd"), "lenses must be one of"),
+        (lambda: WideAngleData("digits", limit=0).dataset("train"), "`limit` must be at least 1"),
+        (lambda: WideAngleData("digits", lens="none.json").dataset("train"), "none.json"),
+        (
+            lambda: WideAngleData("digits", lens=str(WOODSCAPE)).dataset("train")[0],
+            "the lens is of pictures of 966×1280 px, and 8×8",
+        ),
     ],
-)
-def test_wrong_options(options, message):
-    with pytest.raises(ValueError, match=message):
-        Classification(**options)
+)  # fmt: skip
+def test_wrong_options_are_named(make, message):
+    with pytest.raises((ValueError, OSError), match=message):
+        make()
