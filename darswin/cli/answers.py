@@ -140,14 +140,8 @@ class ClassAnswers(Answers):
     def _answer(self, request: Request, output: Tensor, full: Any) -> dict[str, Any]:
         best = output.topk(min(self.top, len(output)))
         names = self.card.classes or range(len(output))
-        return {
-            "top": [
-                {"class": names[index], "probability": probability}
-                for index, probability in zip(
-                    best.indices.tolist(), best.values.tolist(), strict=True
-                )
-            ]
-        }
+        pairs = zip(best.indices.tolist(), best.values.tolist(), strict=True)
+        return {"top": [{"class": names[k], "probability": value} for k, value in pairs]}
 
 
 class PixelAnswers(Answers):

@@ -74,9 +74,25 @@ def run(argv: list[str]) -> None:
     warnings.filterwarnings("ignore", r".*isinstance\(treespec, LeafSpec\)")  # Lightning's own
     warnings.filterwarnings("ignore", "Checkpoint directory .* exists and is not empty")
     warnings.filterwarnings("ignore", "The number of training batches .* is smaller than the log")
+    parser = WholeHelpParser if ALL in argv else RunParser
+    argv, task = complete(["--help" if word == ALL else word for word in argv])
     with StopSignals() as signals:
         try:
-            _run(argv, signals)
+            RunCLI(
+                signals,
+                task,
+                model_class=TASKS[task].module,
+                datamodule_class=TASKS[task].data,
+                args=argv,
+                seed_everything_default=0,
+                auto_configure_optimizers=False,
+                save_config_callback=None,
+                trainer_defaults=dict(
+                    accelerator="auto", use_distributed_sampler=False, num_sanity_val_steps=0
+                ),
+                parser_class=parser,
+                parser_kwargs=dict(prog="darswin"),
+            )
         except MisconfigurationException as error:
             raise ValueError(str(error)) from error
         except (KeyboardInterrupt, SystemExit):
@@ -96,30 +112,6 @@ def run(argv: list[str]) -> None:
             ) from error
 
 
-def _run(argv: list[str], signals: StopSignals) -> None:
-    whole_help = ALL in argv
-    argv, task = complete(["--help" if word == ALL else word for word in argv])
-    RunCLI(
-        signals,
-        task,
-        model_class=TASKS[task].module,
-        datamodule_class=TASKS[task].data,
-        args=argv,
-        seed_everything_default=0,
-        auto_configure_optimizers=False,
-        save_config_callback=None,
-        trainer_defaults=dict(
-            accelerator="auto",
-            use_distributed_sampler=False,
-            num_sanity_val_steps=0,
-        ),
-        parser_class=WholeHelpParser if whole_help else RunParser,
-        parser_kwargs=dict(
-            prog="darswin", description="Trains and tests models on wide-angle images."
-        ),
-    )
-
-
 class RunParser(LightningArgumentParser):
     """Names options in its errors as people type them, and ours first in its help."""
 
@@ -133,7 +125,6 @@ class RunParser(LightningArgumentParser):
         return format_help(self._actions, formatter, command, self.whole_help)
 
     def error(self, message: str, *rest: Any) -> NoReturn:
-        """Ends the command with one sentence, in the words that people type."""
         message = re.sub(r'Parser key "([\w.]+)":', r"--\1:", message)
         message = re.sub(
             r"Subcommand '\w+' does not accept option '", "there is no option '--", message
@@ -161,31 +152,22 @@ class RunCLI(LightningCLI):
 
     @staticmethod
     def subcommands() -> dict[str, set[str]]:
-        """The three of Lightning's that a run has, and what each of them fills in itself."""
         commands = LightningCLI.subcommands()
         return {name: commands[name] for name in ("fit", "validate", "test")}
 
     def add_arguments_to_parser(self, parser: LightningArgumentParser) -> None:
-        """Adds the options that are the run's, and neither the model's nor the data's."""
         (config,) = (action for action in parser._actions if action.dest == "config")
         config.help = f"a preset ({presets()}) or a YAML file of options; later ones win"
         parser.add_argument("--run", type=str, required=True, help="the folder of the run")
-        parser.add_argument(
-            "--resume", type=bool, default=False, help="fit: goes on from the run's last checkpoint"
-        )
-        parser.add_argument(
-            "--checkpoint_steps", type=int, default=200, help="fit: steps between checkpoints"
-        )
-        parser.add_argument(
-            "--task", type=Task, default=self.task,
-            help=f"one of {', '.join(get_args(Task))}; `--task TASK --help` lists its options",
-        )  # fmt: skip
+        text = "fit: goes on from the run's last checkpoint"
+        parser.add_argument("--resume", type=bool, default=False, help=text)
+        text = "fit: steps between checkpoints"
+        parser.add_argument("--checkpoint_steps", type=int, default=200, help=text)
+        text = f"one of {', '.join(get_args(Task))}; `--task TASK --help` lists its options"
+        parser.add_argument("--task", type=Task, default=self.task, help=text)
         if self.task == FIRST_TASK:
-            parser.add_argument(
-                "--xi",
-                type=str,
-                help="test: the same as --data.test_lenses, e.g. 0:1:0.1 for every ξ",
-            )
+            text = "test: the same as --data.test_lenses, e.g. 0:1:0.1 for every ξ"
+            parser.add_argument("--xi", type=str, help=text)
         parser.add_argument("--devices", type=int, help="the same as --trainer.devices")
         parser.link_arguments("seed_everything", "data.seed", compute_fn=int)
         parser.link_arguments("seed_everything", "model.seed", compute_fn=int)
@@ -211,10 +193,8 @@ class RunCLI(LightningCLI):
             config.trainer.devices = config.devices
         if config.trainer.overfit_batches:
             raise ValueError("`overfit_batches` shuffles otherwise: take `limit`")
-        if config.checkpoint_steps < 1:
-            raise ValueError(
-                f"`checkpoint_steps` must be at least 1, got {config.checkpoint_steps}"
-            )
+        if (steps := config.checkpoint_steps) < 1:
+            raise ValueError(f"`checkpoint_steps` must be at least 1, got {steps}")
         if self.subcommand != "fit":
             config.ckpt_path = config.ckpt_path or str(model_of_run(self.folder, ".ckpt"))
             return
@@ -235,14 +215,13 @@ class RunCLI(LightningCLI):
 
     def _check_lenses(self, config) -> None:
         """ValueError for lenses to warp to, typed beside those that took the pictures."""
-        warping = ("--xi", "--data.test_lenses", "--data.train_lenses")
-        typed = [word.partition("=")[0] for word in self.typed]
-        both = [name for name in warping if name in typed]
-        if both and config.data.lens is not None:
-            raise ValueError(
-                f"{both[0]} warps pictures through lenses, and --data.lens says which lens took "
-                "them: give one, or --data.lens null"
-            )
+        typed = {word.partition("=")[0] for word in self.typed}
+        for name in ("--xi", "--data.test_lenses", "--data.train_lenses"):
+            if name in typed and config.data.lens is not None:
+                raise ValueError(
+                    f"{name} warps pictures through lenses, and --data.lens says which lens took "
+                    "them: give one, or --data.lens null"
+                )
 
     def _recorded(self, config) -> str:
         """What config.yaml says: all but the options of this call alone."""
@@ -252,7 +231,6 @@ class RunCLI(LightningCLI):
         return self._parser("fit").dump(config, skip_none=False)
 
     def instantiate_trainer(self, **kwargs) -> Trainer:
-        """The trainer, with the run's callbacks, loggers and safe checkpoints."""
         config = self.config_init[str(self.subcommand)]
         given = config.trainer
         kwargs["plugins"] = [SafeCheckpointIO(), *(given.plugins or [])]
@@ -293,10 +271,17 @@ class RunCLI(LightningCLI):
 
     def fit(self, **options) -> None:
         """Trains, holding the lock of the run's folder; Lightning calls it."""
-        lock = self.folder / ".lock"
+        config, last = self.config_init["fit"], last_of(self.folder)
+        lock = locked(self.folder / ".lock")
         try:
-            with locked(lock) if self.trainer.is_global_zero else contextlib.nullcontext():
-                start = self._start()
+            with lock if self.trainer.is_global_zero else contextlib.nullcontext():
+                start = config.ckpt_path
+                if not config.resume:
+                    check_free(self.folder)
+                elif last.exists():
+                    start = start or str(last)
+                else:
+                    _say(f"{last} is not there yet: starting from the beginning")
                 if start is not None:
                     self.model.weights = None  # the checkpoint has its own
                 self.trainer.fit(**options | {"ckpt_path": start})
@@ -309,17 +294,6 @@ class RunCLI(LightningCLI):
                 _say(f"stopped at step {step}: `{again}` goes on from the last checkpoint")
             raise
 
-    def _start(self) -> str | None:
-        """The checkpoint to start from."""
-        config, last = self.config_init["fit"], last_of(self.folder)
-        if not config.resume:
-            check_free(self.folder)
-        elif last.exists():
-            return config.ckpt_path or str(last)
-        else:
-            _say(f"{last} is not there yet: starting from the beginning")
-        return config.ckpt_path
-
 
 class BeginRun(Callback):
     """Writes config.yaml and starts the loggers once training begins.
@@ -331,7 +305,6 @@ class BeginRun(Callback):
         self.folder, self.config, self.loggers = folder, config, loggers
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Writes the configuration and hands the trainer the loggers."""
         # A short epoch has its line in the logs, too. Lightning adds these two as it runs.
         most = trainer.log_every_n_steps  # type: ignore[attr-defined]
         trainer.log_every_n_steps = min(most, pl_module.steps_per_epoch)  # type: ignore[attr-defined]
@@ -347,7 +320,6 @@ class RunProgressBar(TQDMProgressBar):
     """Lightning's progress bar without the version number of the logs."""
 
     def get_metrics(self, trainer: Trainer, pl_module: LightningModule) -> dict:
-        """What the bar shows."""
         shown = super().get_metrics(trainer, pl_module)
         shown.pop("v_num", None)
         return shown

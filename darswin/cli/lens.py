@@ -57,7 +57,11 @@ def show(
     _check_partition(rings, sectors, samples)
     for name, angle in (("yaw_deg", yaw_deg), ("pitch_deg", pitch_deg)):
         _check(name, angle, math.isfinite(angle), "a finite number of degrees")
-    _check_fov(view, fov_deg)
+    if fov_deg is not None:
+        flat = view == "perspective"
+        most = "below 180°" if flat else "at most 360°"
+        in_range = 0 < fov_deg < 180 if flat else 0 < fov_deg <= 360
+        _check("fov_deg", fov_deg, in_range, f"above 0° and {most} in a view that is {view}")
     picture, orientation = read_oriented(image)
     size = picture.shape[:2]
     stored = stored_size(size, orientation)
@@ -79,7 +83,9 @@ def show(
         "equirectangular": down / max(fov_deg, across),
     }[view]
     fov, yaw, pitch = (math.radians(angle) for angle in (fov_deg, yaw_deg, pitch_deg))
-    rays = getattr(views, view)(_view_size(aspect), fov, yaw=yaw, pitch=pitch)
+    longer = max(aspect, 1.0)
+    view_size = (max(1, round(VIEW_SIDE * aspect / longer)), max(1, round(VIEW_SIDE / longer)))
+    rays = getattr(views, view)(view_size, fov, yaw=yaw, pitch=pitch)
     title = f"{view} view, {fov_deg:.4g}° across\nyaw {yaw_deg:.4g}°, pitch {pitch_deg:.4g}°"
     save_figure(draw_lens(picture, lens, sampler, rays, title), out)
     print(out)
@@ -179,22 +185,6 @@ def _check_partition(rings: int, sectors: int, samples: tuple[int, int] = (1, 1)
         raise ValueError(
             f"`rings` × `sectors` × `samples` must be at most {MOST_SAMPLES} samples, got {total}"
         )
-
-
-def _check_fov(view: View, fov_deg: float | None) -> None:
-    if fov_deg is None:
-        return
-    if view == "perspective":
-        in_range, range_ = 0 < fov_deg < 180, "below 180°"
-    else:
-        in_range, range_ = 0 < fov_deg <= 360, "at most 360°"
-    _check("fov_deg", fov_deg, in_range, f"above 0° and {range_} in a view that is {view}")
-
-
-def _view_size(aspect: float) -> tuple[int, int]:
-    """(H, W) of a view whose height is `aspect` times its width."""
-    longer = max(aspect, 1.0)
-    return max(1, round(VIEW_SIDE * aspect / longer)), max(1, round(VIEW_SIDE / longer))
 
 
 def _fields_of_view(lens: Lens, size: tuple[int, int]) -> tuple[float, float]:

@@ -137,14 +137,8 @@ def predict(
 
 
 def pictures_and_videos(paths: Sequence[str], leave_out: str | None = None) -> list[File]:
-    """The files that are meant by paths, of which folders mean all pictures and videos in them.
-
-    Args:
-        leave_out: a folder whose files other folders do not mean.
-
-    Raises:
-        FileNotFoundError: a folder without any.
-    """
+    """The files of paths, of which folders mean all pictures and videos in them, but for those in
+    `leave_out`; FileNotFoundError for a folder without any."""
     files = []
     for path in paths:
         names = [str(path)]
@@ -164,11 +158,7 @@ def _is_below(path: str, folder: str) -> bool:
 
 
 def answer_video(name: str, every: int, calibrations: Calibrations, answers: Answers) -> None:
-    """Answers the frames of a video, and says how fast that went.
-
-    Raises:
-        BrokenImageError: as `read_frames`, and a lens that does not fit, after what was answered.
-    """
+    """Answers the frames of a video, and prints how fast that went."""
     answers.flush()
     done, before, start = len(answers.found), answers.seconds, time.perf_counter()
     try:
@@ -196,11 +186,7 @@ def answer_video(name: str, every: int, calibrations: Calibrations, answers: Ans
 def _calibrations(
     lens: str, camera: str | None, coefficients: str | None, files: Sequence[File]
 ) -> Calibrations:
-    """What took the files.
-
-    Raises:
-        ValueError: as `Calibrations`. FileNotFoundError: a folder with none of their calibrations.
-    """
+    """The lenses that took the files."""
     if is_json(lens) or not os.path.isdir(lens):
         root = "." if is_json(lens) else Path(lens).parent
         return Calibrations(lens, root, camera, coefficients)
@@ -227,9 +213,6 @@ def trained_model(path: str | Path) -> tuple[Any, ModelCard]:
     """The model of a file of ours, or of the released DarSwin's weights, and its card.
 
     The released code normalises pixels as ImageNet's; a model's classes have numbers there.
-
-    Raises:
-        ValueError: as `darswin.models.load_model`; weights of neither.
     """
     try:
         return load_model(path)

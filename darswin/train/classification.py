@@ -11,7 +11,7 @@ from torchmetrics import Metric
 from torchmetrics.classification import MulticlassAccuracy
 
 from darswin.data.augment import Mixing, partners_share
-from darswin.data.lens_distributions import LensDistribution, SphericalLenses, parse_lenses
+from darswin.data.lens_distributions import SphericalLenses, parse_lenses
 from darswin.train.task import Batch, Task, finite_loss
 from darswin.viz.plot import draw_accuracy
 
@@ -109,9 +109,24 @@ class Classification(Task):
 
     def results_figure(self) -> Figure:
         """Accuracy against ξ where every distribution is one ξ, else bars."""
-        warped = self.trained.fit == "whole"
-        trained_on = self.data.train_lenses if warped else None
-        return draw_results(self.results, self.card.model, trained_on)
+        figure = Figure(figsize=(7, 4.2), layout="constrained")
+        axes = figure.subplots()
+        name, rows = self.card.model, self.results
+        accuracy = [100 * row["top1"] for row in rows]
+        lenses = [_distribution(row["lenses"]) for row in rows]
+        xi = [lens.low for lens in lenses if lens is not None and lens.low == lens.high]
+        if len(xi) == len(rows):
+            trained_on, warped = self.data.train_lenses, self.trained.fit == "whole"
+            is_range = warped and isinstance(trained_on, SphericalLenses)
+            band = (trained_on.low, trained_on.high) if is_range else None
+            draw_accuracy(xi, {name: accuracy}, band, axes=axes)
+            axes.set_ylim(0, 100)
+        else:
+            axes.bar([row["lenses"] for row in rows], accuracy, label=name)
+            axes.set(ylabel="accuracy (%)", ylim=(0, 100))
+            axes.tick_params(axis="x", rotation=90)
+            axes.legend()
+        return figure
 
 
 class ClassMetrics(nn.Module):
@@ -129,6 +144,8 @@ class ClassMetrics(nn.Module):
         """Counts images: their logits (B, K) and their labels (B,), -1 where none is known."""
         known = labels >= 0
         logits, labels = logits[known], labels[known]
+        if len(labels) == 0:  # which torchmetrics does not take
+            return
         for metric in (self.top1, self.top5):
             metric.update(logits, labels)
         self.loss.update(F.cross_entropy(logits, labels, reduction="none"))
@@ -157,35 +174,10 @@ class MeanLoss(Metric):
         return (self.total / self.count).float()
 
 
-def draw_results(rows: list[dict], name: str, trained_on: LensDistribution | None) -> Figure:
-    """The accuracy of rows of `Classification.results`.
-
-    Args:
-        trained_on: the distribution that is shaded; None where the lenses are those of cameras.
-    """
-    figure = Figure(figsize=(7, 4.2), layout="constrained")
-    axes = figure.subplots()
-    accuracy = [100 * row["top1"] for row in rows]
-    lenses = [_distribution(row["lenses"]) for row in rows]
-    of_one_xi = [
-        lens for lens in lenses if isinstance(lens, SphericalLenses) and lens.low == lens.high
-    ]
-    if len(of_one_xi) == len(rows):
-        shaded = trained_on if isinstance(trained_on, SphericalLenses) else None
-        band = None if shaded is None else (shaded.low, shaded.high)
-        draw_accuracy([lens.low for lens in of_one_xi], {name: accuracy}, band, axes=axes)
-        axes.set_ylim(0, 100)
-    else:
-        axes.bar([row["lenses"] for row in rows], accuracy, label=name)
-        axes.set(ylabel="accuracy (%)", ylim=(0, 100))
-        axes.tick_params(axis="x", rotation=90)
-        axes.legend()
-    return figure
-
-
-def _distribution(name: str) -> LensDistribution | None:
-    """The distribution of a row; None where it is a camera's calibration."""
+def _distribution(name: str) -> SphericalLenses | None:
+    """The lenses of a row; None where they are others, or those of a camera."""
     try:
-        return parse_lenses(name)
+        lenses = parse_lenses(name)
     except ValueError:
         return None
+    return lenses if isinstance(lenses, SphericalLenses) else None

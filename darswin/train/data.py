@@ -166,7 +166,7 @@ class RunData(LightningDataModule):
     # Lightning restores a loader's own state only if it was made after the optimiser, and the
     # optimiser's schedule needs its length.
     def state_dict(self) -> dict[str, Any]:
-        """How far the training's order has come."""
+        """The place in the training's order."""
         return self._loader.state_dict() if self._loader else {}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:

@@ -28,11 +28,9 @@ class RunCheckpoint(ModelCheckpoint):
     step nothing is written either, because a checkpoint does not hold gradients.
     """
 
-    def on_train_batch_end(
-        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
-    ) -> None:
-        if ends_step(trainer, batch_idx) and not trainer.is_last_batch:
-            super().on_train_batch_end(trainer, pl_module, outputs, batch, batch_idx)
+    def on_train_batch_end(self, trainer: Trainer, *batch: Any) -> None:
+        if ends_step_amid_epoch(trainer, batch[-1]):
+            super().on_train_batch_end(trainer, *batch)
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         folder = Path(self.dirpath or "")
@@ -47,9 +45,10 @@ class RunCheckpoint(ModelCheckpoint):
         super().load_state_dict(state)
 
 
-def ends_step(trainer: Trainer, batch_idx: int) -> bool:
-    """Whether the optimizer has stepped on this batch of an epoch."""
-    return (batch_idx + 1) % trainer.accumulate_grad_batches == 0 or trainer.is_last_batch
+def ends_step_amid_epoch(trainer: Trainer, batch_idx: int) -> bool:
+    """Whether the optimizer has stepped on this batch, which is not an epoch's last."""
+    steps = (batch_idx + 1) % trainer.accumulate_grad_batches == 0
+    return steps and not trainer.is_last_batch
 
 
 class SafeCheckpointIO(TorchCheckpointIO):
@@ -153,11 +152,8 @@ class StopOnSignal(Callback):
         self.signals.listen()  # Lightning has just installed its own for SIGTERM
         self.signals.patient = True
 
-    def on_train_batch_end(
-        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
-    ) -> None:
-        ends = ends_step(trainer, batch_idx) and not trainer.is_last_batch
-        if ends and self._any_signal(trainer):
+    def on_train_batch_end(self, trainer: Trainer, *batch: Any) -> None:
+        if ends_step_amid_epoch(trainer, batch[-1]) and self._any_signal(trainer):
             trainer.save_checkpoint(self.checkpoint)
             raise SystemExit
 
@@ -166,12 +162,10 @@ class StopOnSignal(Callback):
         if trainer.global_step > 0 and self._any_signal(trainer):
             raise SystemExit
 
-    def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+    def on_train_end(self, *run: Any) -> None:
         self.signals.patient = False
 
-    def on_exception(
-        self, trainer: Trainer, pl_module: LightningModule, exception: BaseException
-    ) -> None:
+    def on_exception(self, *run: Any) -> None:
         self.signals.patient = False
 
     def _any_signal(self, trainer: Trainer) -> bool:
