@@ -63,6 +63,7 @@ class RunData(LightningDataModule):
     fov: float
     frame_fit: Framing
     colors: Sequence[Sequence[int]] = []
+    pair_lenses = False  # whether images that are mixed in training have one lens
 
     def __init__(
         self,
@@ -149,16 +150,19 @@ class RunData(LightningDataModule):
             worker_init_fn=ignore_signals,
         )
 
-    def _training(self) -> tuple[Samples, TrainingOrder]:
-        """The training split, augmented, and its order."""
+    def _training(self) -> Samples:
+        """The training split, augmented."""
         raise NotImplementedError
 
     def train_dataloader(self) -> ResumableLoader:
         """Batches of the training split, in an order that can be resumed."""
-        dataset, order = self._training()
-        self._loader = ResumableLoader(
-            dataset, order, persistent_workers=self.workers > 0, **self._options
-        )
+        dataset = self._training()
+        order = TrainingOrder(
+            len(dataset), self.batch_size, pairs=self.pair_lenses, seed=self.seed,
+            cameras=dataset.cameras if isinstance(dataset, Calibrated) else None, **self._place,
+        )  # fmt: skip
+        keep = self.workers > 0
+        self._loader = ResumableLoader(dataset, order, persistent_workers=keep, **self._options)
         if self._progress:
             self._loader.load_state_dict(self._progress)
         return self._loader
@@ -295,11 +299,6 @@ class WideAngleData(RunData):
         self.datasets.append(dataset)
         return dataset
 
-    def _training(self) -> tuple[Samples, TrainingOrder]:
+    def _training(self) -> Samples:
         erase = RandomErasing(self.erasing) if self.erasing else None
-        dataset = self.dataset("train", turns=self.turns, augment=self.colour_changes, erase=erase)
-        order = TrainingOrder(
-            len(dataset), self.batch_size, pairs=self.pair_lenses, seed=self.seed,
-            cameras=dataset.cameras if isinstance(dataset, Calibrated) else None, **self._place,
-        )  # fmt: skip
-        return dataset, order
+        return self.dataset("train", turns=self.turns, augment=self.colour_changes, erase=erase)

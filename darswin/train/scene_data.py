@@ -8,7 +8,6 @@ from typing import Any, ClassVar
 import torch
 
 from darswin.data.lens_distributions import parse_lenses
-from darswin.data.order import TrainingOrder
 from darswin.data.scenes import open_scenes
 from darswin.data.scenes.dataset import SceneSamples
 from darswin.data.scenes.scene import Scenes, Target
@@ -116,29 +115,17 @@ class SceneData(RunData):
         self.datasets.append(dataset)
         return dataset
 
-    def _training(self) -> tuple[SceneSamples, TrainingOrder]:
-        dataset = self.dataset(
+    def _training(self) -> SceneSamples:
+        return self.dataset(
             "train", turns=self.turns, crop=self.crop, lenses=self.lenses,
             augment=self.colour_changes,
         )  # fmt: skip
-        order = TrainingOrder(
-            len(dataset), self.batch_size, pairs=False, seed=self.seed, cameras=None, **self._place
-        )
-        return dataset, order
 
 
 class LabelData(SceneData):
-    """Scenes with a label for each pixel.
-
-    Args:
-        path: a folder of scenes: see `darswin.data.open_scenes`.
-        common: as `SceneData`.
-    """
+    """Scenes with a label for each pixel; the arguments are those of `SceneData`."""
 
     target = "labels"
-
-    def __init__(self, path: str, **common: Any):
-        super().__init__(path, **common)
 
 
 class DistanceData(SceneData):
