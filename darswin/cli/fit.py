@@ -42,8 +42,7 @@ from darswin.train.results import WriteResults
 from darswin.train.runs import (
     RunCheckpoint,
     SafeCheckpointIO,
-    StopOnSignal,
-    StopSignals,
+    StopOnSignals,
     check_changes,
 )
 from darswin.train.tasks import TASKS
@@ -76,7 +75,7 @@ def run(argv: list[str]) -> None:
     warnings.filterwarnings("ignore", "The number of training batches .* is smaller than the log")
     parser = WholeHelpParser if ALL in argv else RunParser
     argv, task = complete(["--help" if word == ALL else word for word in argv])
-    with StopSignals() as signals:
+    with StopOnSignals() as signals:
         try:
             RunCLI(
                 signals,
@@ -146,7 +145,7 @@ class WholeHelpParser(RunParser):
 class RunCLI(LightningCLI):
     """Lightning's command line with `--run`, `--resume` and `--xi`."""
 
-    def __init__(self, signals: StopSignals, task: Task, **options):
+    def __init__(self, signals: StopOnSignals, task: Task, **options):
         self.signals, self.task, self.typed = signals, task, options["args"]
         super().__init__(**options)
 
@@ -251,6 +250,7 @@ class RunCLI(LightningCLI):
             CSVLogger(self.folder, name="csv", flush_logs_every_n_steps=1),
             TensorBoardLogger(self.folder, name="", version="tensorboard"),
         ]  # fmt: skip
+        self.signals.checkpoint = last_of(self.folder)
         monitor, mode = TASKS[self.task].module.monitor
         checkpoint = partial(
             RunCheckpoint, self.folder / "checkpoints", enable_version_counter=False
@@ -258,7 +258,7 @@ class RunCLI(LightningCLI):
         return [
             BeginRun(self.folder, self.record, loggers),
             *others,
-            StopOnSignal(self.signals, last_of(self.folder)),
+            self.signals,
             checkpoint("best", monitor=monitor, mode=mode, save_on_train_epoch_end=False),
             checkpoint("last", every_n_train_steps=config.checkpoint_steps),
             checkpoint("last", save_on_train_epoch_end=True),

@@ -94,63 +94,48 @@ class SafeCheckpointIO(TorchCheckpointIO):
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
-class StopSignals:
-    """Within it, Ctrl-C and SIGTERM raise KeyboardInterrupt; while `patient`, only the second does.
+class StopOnSignals(Callback):
+    """Within it, Ctrl-C and SIGTERM raise KeyboardInterrupt. While a run trains, only the second
+    does: once any process gets the first, all stop after the same step, with a checkpoint.
+
+    After an epoch's last step they validate first; the checkpoint is then the epoch's own.
 
     Attributes:
         number: of the last signal, None before the first.
-        patient: whether the program itself looks at `number`, and stops when it can.
+        checkpoint: the file that is written.
     """
+
+    checkpoint: Path
 
     def __init__(self) -> None:
         self.number: int | None = None
-        self.patient = False
+        self._trains = False
 
-    def __enter__(self) -> "StopSignals":
+    def __enter__(self) -> "StopOnSignals":
         self._before = {number: signal.getsignal(number) for number in _SIGNALS}
-        self.listen()
+        self._handle(dict.fromkeys(_SIGNALS, self._received))
         return self
 
     def __exit__(self, *error: Any) -> None:
-        for number, handler in self._before.items():
-            _handle(number, handler)
+        self._handle(self._before)
 
-    def listen(self) -> None:
-        """Installs the handlers, in place of any that were installed since."""
-        for number in _SIGNALS:
-            _handle(number, self._received)
+    def _handle(self, handlers: Mapping[Any, Any]) -> None:
+        for number, handler in handlers.items():
+            # Python allows it in no other thread.
+            if threading.current_thread() is threading.main_thread():
+                signal.signal(number, handler)
 
     def _received(self, number: int, frame: Any) -> None:
         first, self.number = self.number is None, number
-        if not (first and self.patient):
+        if not (first and self._trains):
             raise KeyboardInterrupt
         # print() fails in a handler that interrupts a print().
         os.write(2, b"\nstopping at the end of this step; a second signal stops at once\n")
 
-
-def _handle(number: int, handler: Any) -> None:
-    if threading.current_thread() is threading.main_thread():  # Python allows it in no other thread
-        signal.signal(number, handler)
-
-
-def ignore_signals(worker: int) -> None:
-    """Called in the worker processes of a DataLoader: the training process ends them itself."""
-    for number in _SIGNALS:
-        signal.signal(number, signal.SIG_IGN)
-
-
-class StopOnSignal(Callback):
-    """Once any process of a run gets a signal, all stop after the same step, with a checkpoint.
-
-    After an epoch's last step they validate first; the checkpoint is then the epoch's own.
-    """
-
-    def __init__(self, signals: StopSignals, checkpoint: Path):
-        self.signals, self.checkpoint = signals, checkpoint
-
-    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        self.signals.listen()  # Lightning has just installed its own for SIGTERM
-        self.signals.patient = True
+    def on_train_start(self, *run: Any) -> None:
+        # Lightning has just installed a handler of its own for SIGTERM.
+        self._handle(dict.fromkeys(_SIGNALS, self._received))
+        self._trains = True
 
     def on_train_batch_end(self, trainer: Trainer, *batch: Any) -> None:
         if ends_step_amid_epoch(trainer, batch[-1]) and self._any_signal(trainer):
@@ -163,17 +148,23 @@ class StopOnSignal(Callback):
             raise SystemExit
 
     def on_train_end(self, *run: Any) -> None:
-        self.signals.patient = False
+        self._trains = False
 
     def on_exception(self, *run: Any) -> None:
-        self.signals.patient = False
+        self._trains = False
 
     def _any_signal(self, trainer: Trainer) -> bool:
-        here = self.signals.number is not None
+        here = self.number is not None
         if not trainer.strategy.reduce_boolean_decision(here, all=False):
             return False
-        self.signals.number = self.signals.number or signal.SIGTERM  # another process got it
+        self.number = self.number or signal.SIGTERM  # another process got it
         return True
+
+
+def ignore_signals(worker: int) -> None:
+    """Called in the worker processes of a DataLoader: the training process ends them itself."""
+    for number in _SIGNALS:
+        signal.signal(number, signal.SIG_IGN)
 
 
 # -- options that change when a run goes on ---------------------------------------------------

@@ -123,9 +123,17 @@ class SceneData(RunData):
 
 
 class LabelData(SceneData):
-    """Scenes with a label for each pixel; the arguments are those of `SceneData`."""
+    """Scenes with a label for each pixel.
+
+    Args:
+        path: a folder of scenes: see `darswin.data.open_scenes`.
+        common: as `SceneData`.
+    """
 
     target = "labels"
+
+    def __init__(self, path: str, **common: Any):  # without it the help has no texts
+        super().__init__(path, **common)
 
 
 class DistanceData(SceneData):

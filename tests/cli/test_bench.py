@@ -21,6 +21,7 @@ from darswin.models import DarSwin
 INT8 = ["int8"] if onednn_lack(torch.int8) is None else []
 
 
+@pytest.mark.slow
 def test_it_measures_and_writes(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(command, "THREADS", [1])
     measured = []
@@ -67,6 +68,7 @@ def test_it_measures_and_writes(tmp_path, capsys, monkeypatch):
     assert tables.models_table(record.timings) in printed and str(path) in printed
 
 
+@pytest.mark.slow
 def test_targets_are_for_all_threads(monkeypatch):
     monkeypatch.setattr(targets, "MODEL", "darswin_a_nano")
     monkeypatch.setattr(command, "THREADS", [1, 2])

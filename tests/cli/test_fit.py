@@ -133,7 +133,8 @@ def test_a_run_s_options_and_checkpoints_of_other_models(capsys, tmp_path):
     linear._measured.clear()
     backend = ["--model.matmul_backend", "autotune", "--model.grad_checkpointing", "true"]
     fit(tmp_path, *DIGITS, "--trainer.max_steps", "1", "--data.limit", "48", *backend)
-    assert {shape.product for shape in linear.autotune_results()} == set(linear._WAYS)
+    products = {shape.product for shape in linear.autotune_results()}
+    assert products == {"forward", "input gradient", "weight gradient"}
     saved = yaml.safe_load((tmp_path / "config.yaml").read_text())["model"]
     assert saved["matmul_backend"] == "autotune" and saved["grad_checkpointing"] is True
     test = ["test", "--run", tmp_path]
