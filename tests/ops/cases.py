@@ -326,6 +326,7 @@ NEAR = dict(size=(31, 33), rows=40, columns=64)
 SAMPLING = {
     "plain": dict(),
     "shared lens": dict(batch=5, shared=True, samples=(2, 2)),
+    "64 images, one lens": dict(batch=64, rows=8, columns=16, shared=True, samples=(1, 1)),
     "one ring, one sector": dict(rows=4, columns=3, samples=(4, 3)),
     "one point": dict(rows=1, columns=1, samples=(1, 1)),
     "odd rows": dict(rows=3, columns=13, samples=(1, 13)),
@@ -435,35 +436,22 @@ for name, sizes in MAPS.items():
     CASES["polar_to_image", name] = functools.partial(polar_map, **sizes)
 
 # A small case of each operator with every input that it has, and one without the optional ones.
+GRID = dict(size=(7, 8), rows=4, columns=6, samples=(2, 3))
+MAP = dict(rings=3, sectors=5, channels=2, size=(5, 4), reach=3.0)
+WINDOWS = dict(rings=4, sectors=4, head_dim=3, shift=(1, 2))
 SMALL = {
-    "polar_sample": functools.partial(
-        sampling, size=(7, 8), rows=4, columns=6, samples=(2, 3), affine=True, offsets=True,
-        jitter=0.6, seed=11,
-    ),
-    "polar_sample, circular": functools.partial(
-        sampling, size=(7, 8), rows=4, columns=6, samples=(2, 3), layout="image"
-    ),
-    "polar_embed": functools.partial(
-        sampling, size=(7, 8), rows=4, columns=6, samples=(2, 3), features=3, affine=True,
-        offsets=True, jitter=0.5, seed=1,
-    ),
-    "polar_embed, circular": functools.partial(
-        sampling, size=(7, 8), rows=4, columns=6, samples=(2, 2), features=3, bias=False
-    ),
-    "window_attention": functools.partial(attention, rings=4, sectors=4, head_dim=3, shift=(1, 2)),
-    "window_attention, a bias an image": functools.partial(
-        attention, rings=4, sectors=4, head_dim=3, shift=(1, 2), periodic=(False, False),
-        bias_rows=2, scale=0.7,
-    ),
-    "polar_to_image": functools.partial(
-        polar_map, rings=3, sectors=5, channels=2, size=(5, 4), lenses=2, reach=3.0,
-        general="affine", r_max=40.0,
-    ),
-    "polar_to_image, circular": functools.partial(
-        polar_map, rings=3, sectors=5, channels=2, size=(5, 4), reach=3.0, layout="tokens"
-    ),
-    "polar_to_image, points": functools.partial(
-        polar_map, rings=3, sectors=5, channels=2, size=(5, 4), lenses=2, reach=3.0,
-        general="points",
-    ),
+    name: functools.partial(make, **sizes, **options)
+    for name, make, sizes, options in (
+        ("polar_sample", sampling, GRID, dict(affine=True, offsets=True, jitter=0.6, seed=11)),
+        ("polar_sample, circular", sampling, GRID, dict(layout="image")),
+        ("polar_embed", sampling, GRID,
+         dict(features=3, affine=True, offsets=True, jitter=0.5, seed=1)),
+        ("polar_embed, circular", sampling, GRID, dict(features=3, bias=False)),
+        ("window_attention", attention, WINDOWS, dict()),
+        ("window_attention, a bias an image", attention, WINDOWS,
+         dict(periodic=(False, False), bias_rows=2, scale=0.7)),
+        ("polar_to_image", polar_map, MAP, dict(lenses=2, general="affine", r_max=40.0)),
+        ("polar_to_image, circular", polar_map, MAP, dict(layout="tokens")),
+        ("polar_to_image, points", polar_map, MAP, dict(lenses=2, general="points")),
+    )
 }  # fmt: skip

@@ -62,46 +62,6 @@ def test_layouts_hold_the_same_samples():
     assert torch.equal(tokens[0, 1, 0].reshape(3, 4, 3), planes[0, :, 3:6, 0:4].permute(1, 2, 0))
 
 
-@jitters
-def test_a_rotation_turns_the_azimuths(jitter):
-    image, radii, azimuths, center = grid(dtype=f64)
-    c, s = math.cos(0.4), math.sin(0.4)
-    turn = torch.tensor([[[c, -s], [s, c]]], dtype=f64)
-    options = dict(samples=(3, 4), jitter=jitter, seed=2)
-    torch.testing.assert_close(
-        polar_sample(image, radii, azimuths, center, affine=turn, **options),
-        polar_sample(image, radii, azimuths + 0.4, center, **options),
-    )
-
-
-@jitters
-def test_equal_offsets_move_the_center(jitter):
-    image, radii, azimuths, center = grid(dtype=f64)
-    shift = torch.tensor([1.5, -2.25], dtype=f64)
-    options = dict(samples=(3, 4), jitter=jitter, seed=2)
-    torch.testing.assert_close(
-        polar_sample(image, radii, azimuths, center,
-                     offsets=shift[None, :, None, None].expand(2, 2, 6, 8), **options),
-        polar_sample(image, radii, azimuths, center + shift, **options),
-    )  # fmt: skip
-
-
-@pytest.mark.parametrize("dtype", [f32, f64])
-@pytest.mark.parametrize(
-    "sizes", [{}, NEAR, dict(size=(200, 180), rows=8, columns=16), dict(size=(1, 1))], ids=str
-)
-@jitters
-def test_an_identity_changes_no_bit(sizes, jitter, dtype):
-    sizes = dict(samples=(2, 4)) | sizes
-    circular = sampling(**sizes, jitter=jitter, seed=3, dtype=dtype)
-    rows, columns = circular.inputs["radii"].shape[1], len(circular.settings["azimuths"])
-    for part in (
-        dict(affine=torch.eye(2, dtype=dtype)[None]),
-        dict(offsets=torch.zeros(2, 2, rows, columns, dtype=dtype)),
-    ):
-        assert_equal_results(results(circular.replace(**part)), results(circular))
-
-
 def test_points_thrown_far_outside_are_zero():
     case = sampling(**GENERAL)
     inputs = case.inputs
@@ -137,13 +97,6 @@ def test_accuracy_rule_where_all_points_meet():
         return case.replace(radii=torch.linspace(0, 0.4, 64)[None], center=center)
 
     assert_accurate(make)
-
-
-@pytest.mark.parametrize("affine", [False, True])
-@pytest.mark.parametrize("offsets", [False, True])
-def test_accuracy_rule_where_many_images_share_a_lens(affine, offsets):
-    sizes = dict(batch=64, rows=8, columns=16, shared=True, samples=(1, 1), layout="image")
-    assert_accurate(lambda: sampling(**sizes, affine=affine, offsets=offsets))
 
 
 def test_indices_beyond_two_to_the_31():

@@ -3,7 +3,9 @@
 A few dozen of each in `make test`, always the same; `make fuzz` draws 2,000 others of each.
 """
 
+import functools
 import math
+from collections.abc import Callable
 
 import pytest
 import strategies
@@ -15,12 +17,13 @@ from cases import (
     f32,
     f64,
     results,
+    sampling_call,
 )
 from hypothesis import given, note
 from hypothesis import strategies as st
 from torch import Tensor
 
-from darswin.ops import polar_sample, use_reference
+from darswin.ops import use_reference
 from darswin.ops._inference import add_norm_, transpose_sum
 
 pytestmark = pytest.mark.filterwarnings("error")
@@ -38,22 +41,14 @@ def assert_accurate(ours: Tensor, base: Tensor, exact: Tensor, size: float) -> N
     assert error <= allowed, f"error {error:.3g}, allowed {allowed:.3g}"
 
 
-def assert_equals_reference(case: Case, size_of) -> None:
-    """`size_of` a result's name: how large the numbers are that are added up for it."""
-    note(repr(case))
-    exact = results(case.to(f64), is_reference=True)
-    base = results(case, is_reference=True)
-    ours = results(case)
-    for name in exact:
-        assert_accurate(ours[name], base[name], exact[name], size_of(name))
-    assert_same_bits_on_any_number_of_threads(lambda: results(case))
-
-
 def largest(tensor: Tensor) -> float:
     return tensor.abs().max().item() if tensor.numel() else 0.0
 
 
-def check_sampling(case: Case) -> None:
+# How large the numbers are that are added up for a result, by its name.
+
+
+def sampling_size(case: Case) -> Callable[[str], float]:
     exact = case.to(f64)
     linear = [name for name in ("image", "weight", "bias") if name in case.inputs]
     sizes = results(exact, is_reference=True, absolute=linear)
@@ -70,39 +65,20 @@ def check_sampling(case: Case) -> None:
         stretch = largest(exact.inputs["affine"]) if "affine" in exact.inputs else 1.0
         turns = 1 + largest(case.settings["azimuths"])
         places += 4 * largest(exact.inputs["radii"]) * max(stretch, 1.0) * turns + 100
-    assert_equals_reference(
-        case,
-        lambda name: places * (largest(sizes[name]) if name in ("out", "grad", *linear) else lens),
-    )
+    known = ("out", "grad", *linear)
+    return lambda name: places * (largest(sizes[name]) if name in known else lens)
 
 
-@given(strategies.sampling())
-def test_polar_sample_equals_the_reference(case):
-    check_sampling(case)
-
-
-@given(strategies.sampling(embed=True))
-def test_polar_embed_equals_the_reference(case):
-    check_sampling(case)
-
-
-@given(strategies.attention())
-def test_window_attention_equals_the_reference(case):
-    qkv = largest(case.inputs["qkv"])
-    head_dim = case.inputs["qkv"].shape[-1]
+def attention_size(case: Case) -> Callable[[str], float]:
+    qkv, head_dim = largest(case.inputs["qkv"]), case.inputs["qkv"].shape[-1]
     tokens = math.prod(case.settings["window"])
-
-    def size_of(name: str) -> float:
-        if name == "out":
-            return qkv
-        pair = 4.0 * qkv * head_dim  # the gradient of a logit
-        windows = case.inputs["qkv"].numel() / max(3 * head_dim * tokens, 1)
-        return pair * windows * tokens if name == "bias" else pair * max(qkv, 1.0)
-
-    assert_equals_reference(case, size_of)
+    pair = 4.0 * qkv * head_dim  # the gradient of a logit
+    windows = case.inputs["qkv"].numel() / max(3 * head_dim * tokens, 1)
+    sizes = dict(out=qkv, bias=pair * windows * tokens)
+    return lambda name: sizes.get(name, pair * max(qkv, 1.0))
 
 
-def check_polar_map(case: Case) -> None:
+def map_size(case: Case) -> Callable[[str], float]:
     exact = case.to(f64)
     sizes = results(exact, is_reference=True, absolute=["x"])
     x, radii = exact.inputs["x"], exact.inputs["radii"]
@@ -110,21 +86,72 @@ def check_polar_map(case: Case) -> None:
     # a pixel from the pole, by the azimuth; a matrix has as long a lever as the image is wide.
     steps = torch.cat((2 * radii[:, :1], radii.diff(dim=1)), 1)
     narrow = steps[steps > 0].min().item() if (steps > 0).any() else 1.0
-    lens = sizes["grad"].sum().item() * 2 * largest(x) * (1 / narrow + x.shape[2])
-    lens *= 1 + max(case.settings["size"])
     # A weight is right to the rounding of a place, in units of a ring or of a sector.
     weights = (1 + max(case.settings["size"])) * (1 / narrow + x.shape[2])
-    assert_equals_reference(
-        case,
-        lambda name: (
-            weights * largest(sizes[name]) if name in ("out", "grad", "x") else weights * lens
-        ),
-    )
+    lens = sizes["grad"].sum().item() * 2 * largest(x) * weights
+    known = ("out", "grad", "x")
+    return lambda name: weights * (largest(sizes[name]) if name in known else lens)
 
 
-@given(strategies.polar_maps())
-def test_polar_to_image_equals_the_reference(case):
-    check_polar_map(case)
+# Operator → its calls, a function of the types, and the sizes of their results.
+CALLS = {
+    "polar_sample": (strategies.sampling, sampling_size),
+    "polar_embed": (functools.partial(strategies.sampling, embed=True), sampling_size),
+    "window_attention": (strategies.attention, attention_size),
+    "polar_to_image": (strategies.polar_maps, map_size),
+}
+
+
+def draw(data: st.DataObject, name: str, **options) -> Case:
+    case = data.draw(CALLS[name][0](**options))
+    note(repr(case))
+    return case
+
+
+@pytest.mark.parametrize("name", CALLS)
+@given(data=st.data())
+def test_equals_the_reference(name, data):
+    case = draw(data, name)
+    size_of = CALLS[name][1](case)
+    exact = results(case.to(f64), is_reference=True)
+    base, ours = results(case, is_reference=True), results(case)
+    for key in exact:
+        assert_accurate(ours[key], base[key], exact[key], size_of(key))
+    assert_same_bits_on_any_number_of_threads(lambda: results(case))
+
+
+@pytest.mark.parametrize("name", CALLS)
+@given(data=st.data())
+def test_bfloat16_is_float32_rounded_once(name, data):
+    case = draw(data, name, dtypes=(f32,))
+    first, values = next(iter(case.inputs.items()))
+    narrow, wide = (case.replace(**{first: t}) for t in (values.to(bf16), values.to(bf16).float()))
+    ours, same = results(narrow), results(wide)
+    assert ours["out"].dtype == ours[first].dtype == bf16
+    if name == "window_attention":  # whose sums may run in another order
+        torch.testing.assert_close(ours["out"].float(), same["out"], rtol=2**-7, atol=1e-5)
+    else:
+        assert torch.equal(ours["out"], same["out"].bfloat16())
+    with torch.no_grad(), use_reference():
+        exact = case.run(**wide.to(f64).inputs)
+    size = largest(values) * (1 + largest(case.inputs.get("weight", values))) * values.shape[1]
+    torch.testing.assert_close(ours["out"].double(), exact, rtol=2**-7, atol=1e-3 * (1 + size))
+    assert_same_bits_on_any_number_of_threads(lambda: results(narrow))
+
+
+@given(strategies.sampling(dtypes=(f32,)), st.booleans())
+def test_uint8_pixels_are_sampled_as_what_they_stand_for(case, frames):
+    note(repr(case))
+    image = (case.inputs["image"] * 50 + 128).clamp(0, 255).to(torch.uint8)
+    mean, std = 0.4, 0.25
+    norm = dict(mean=mean, std=std, channels_last=frames)
+    raw = sampling_call(case.inputs, **case.settings, **norm)
+    given = image.permute(0, 2, 3, 1) if frames else image
+    ours = raw.run(**case.inputs | dict(image=given))
+    with use_reference():
+        wide = case.to(f64).inputs | dict(image=(image.double() / 255 - mean) / std)
+        exact = case.run(**wide)
+    torch.testing.assert_close(ours.double(), exact, rtol=1e-5, atol=1e-5)
 
 
 @given(strategies.norms())
@@ -155,68 +182,6 @@ def test_transpose_sum_equals_torch(x):
     transposed, sums = transpose_sum(x)
     assert torch.equal(transposed, x.t()) and transposed.is_contiguous()
     assert_accurate(sums, x.sum(0), x.double().sum(0), largest(x.double().abs().sum(0)) / 4)
-
-
-# -- other types of pixels -------------------------------------------------------------------------
-
-
-narrow_cases = st.booleans().flatmap(lambda embed: strategies.sampling(dtypes=(f32,), embed=embed))
-
-
-@given(narrow_cases)
-def test_bfloat16_pixels_are_sampled_as_float32_and_rounded_once(case):
-    note(repr(case))
-    inputs = dict(case.inputs)
-    narrow = inputs.pop("image").to(bf16)
-    rounded, wide = (
-        Case(case.run, dict(inputs, image=image), case.mask) for image in (narrow, narrow.float())
-    )
-    ours, same = (results(c) for c in (rounded, wide))
-    assert ours["out"].dtype == bf16 and torch.equal(ours["out"], same["out"].bfloat16())
-    with torch.no_grad(), use_reference():
-        exact = case.run(image=narrow.double(), **{name: t.double() for name, t in inputs.items()})
-    size = largest(narrow) * (1 + largest(inputs.get("weight", narrow))) * narrow.shape[1]
-    torch.testing.assert_close(ours["out"].double(), exact, rtol=2**-7, atol=1e-3 * (1 + size))
-    assert_same_bits_on_any_number_of_threads(lambda: results(rounded))
-
-
-@given(strategies.sampling(dtypes=(f32,)), st.booleans())
-def test_uint8_pixels_are_sampled_as_what_they_stand_for(case, frames):
-    note(repr(case))
-    inputs, settings = dict(case.inputs), dict(case.settings)
-    image = (inputs.pop("image") * 50 + 128).clamp(0, 255).to(torch.uint8)
-    mean, std = 0.4, 0.25
-    grid = (inputs["radii"], settings.pop("azimuths"), inputs["center"])
-    general = {name: inputs[name] for name in ("affine", "offsets") if name in inputs}
-    given = image.permute(0, 2, 3, 1) if frames else image
-    norm = dict(mean=mean, std=std, channels_last=frames)
-    ours = polar_sample(given, *grid, **general, **settings, **norm)
-    with use_reference():
-        exact = polar_sample(
-            (image.double() / 255 - mean) / std, *(t.double() for t in grid),
-            **{name: t.double() for name, t in general.items()}, **settings,
-        )  # fmt: skip
-    torch.testing.assert_close(ours.double(), exact, rtol=1e-5, atol=1e-5)
-
-
-@given(strategies.attention(dtypes=(bf16,)))
-def test_bfloat16_attention_is_float32_rounded_once(case):
-    note(repr(case))
-    wide = Case(case.run, {name: t.float() for name, t in case.inputs.items()})
-    ours, exact = (results(c) for c in (case, wide))
-    assert ours["out"].dtype == ours["qkv"].dtype == bf16
-    torch.testing.assert_close(ours["out"].float(), exact["out"], rtol=2**-7, atol=1e-5)
-    assert_same_bits_on_any_number_of_threads(lambda: results(case))
-
-
-@given(strategies.polar_maps(dtypes=(bf16,)))
-def test_bfloat16_maps_are_brought_back_in_float32_and_rounded_once(case):
-    note(repr(case))
-    wide = Case(case.run, {name: t.float() for name, t in case.inputs.items()}, case.mask)
-    ours, exact = (results(c) for c in (case, wide))
-    assert ours["out"].dtype == ours["x"].dtype == bf16
-    assert torch.equal(ours["out"], exact["out"].bfloat16())
-    assert_same_bits_on_any_number_of_threads(lambda: results(case))
 
 
 @given(strategies.norms(dtypes=(bf16,)))
@@ -268,18 +233,25 @@ def test_a_lens_that_is_not_finite_samples_nothing_there(case, generator, bad, d
     assert_same_bits_on_any_number_of_threads(lambda: results(case))
 
 
-@given(strategies.sampling(), strategies.generators(), bad_values)
-def test_pixels_that_are_not_finite_spoil_what_touches_them(case, generator, bad):
-    note(repr(case))
-    image = case.inputs["image"]
-    case.inputs["image"] = spoiled(generator, image, bad, 0.02)
+@pytest.mark.parametrize("name", ["polar_sample", "polar_to_image"])
+@given(data=st.data())
+def test_pixels_and_tokens_that_are_not_finite_spoil_what_touches_them(name, data):
+    case, generator, bad = (
+        draw(data, name),
+        data.draw(strategies.generators()),
+        data.draw(bad_values),
+    )
     smooth = case.smooth() > 0
+    first, values = next(iter(case.inputs.items()))
+    case = case.replace(**{first: spoiled(generator, values, bad, 0.02)})
     with torch.no_grad():
         ours = case.run(**case.inputs)
         with use_reference():
-            exact = case.to(f64).run(**case.to(f64).inputs)
-    # Right on the border of a pixel its weight is 0 or a rounding: NaN and infinity may differ.
-    assert_same_kinds(torch.where(smooth, ours, 0), torch.where(smooth, exact, 0), atol=1e-3)
+            exact = case.run(**case.to(f64).inputs)
+    # Right on the border of a pixel or the middle of a token its weight is 0 or a rounding: NaN and
+    # infinity may differ.
+    atol = 1e-3 if name == "polar_sample" else 1e-2
+    assert_same_kinds(torch.where(smooth, ours, 0), torch.where(smooth, exact, 0), atol=atol)
 
 
 @given(strategies.sampling(), strategies.generators(), bad_values)
@@ -323,19 +295,6 @@ def test_pixels_that_lie_nowhere_on_the_map_are_zero(case, generator, bad, data)
     for key in ("out", "x"):
         assert ours[key].isfinite().all()
         assert_same_kinds(ours[key], exact[key], atol=1e-2 * (1 + largest(exact[key])))
-
-
-@given(strategies.polar_maps(), strategies.generators(), bad_values)
-def test_tokens_that_are_not_finite_spoil_the_pixels_around_them(case, generator, bad):
-    note(repr(case))
-    smooth = case.smooth() > 0
-    case.inputs["x"] = spoiled(generator, case.inputs["x"], bad, 0.02)
-    with torch.no_grad():
-        ours = case.run(**case.inputs)
-        with use_reference():
-            exact = case.to(f64).run(**case.to(f64).inputs)
-    # Right on the middle of a token the others' weights are 0 or a rounding.
-    assert_same_kinds(torch.where(smooth, ours, 0), torch.where(smooth, exact, 0), atol=1e-2)
 
 
 @given(strategies.attention(), strategies.generators(), bad_values)
