@@ -70,7 +70,8 @@ class Lens(ImageFrame):
     def __init__(self, *arguments: Number | None, **named: Number | None):
         super().__init__(*arguments, **named)
         for name in self._tensors():
-            self._check(name)
+            if name != "theta_max":  # which is held against its limit below
+                self._check(name)
         if self.affine is not None:
             self._require("affine", self.affine.detach().det() != 0, "invertible")
         self._validate()

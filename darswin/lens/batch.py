@@ -19,23 +19,19 @@ NUMBER = Parameter()
 class LensBatch:
     """The tensors of N lenses: how they are given, indexed, joined, moved and copied."""
 
-    theta_max = Parameter(low=0, open=True, optional=True, by_place=True)
-    center = Parameter(shape=(2,), optional=True, by_place=True)
-    affine = Parameter(shape=(2, 2), optional=True)
-    image_size = Parameter(low=1, shape=(2,), optional=True)
-
     # The parameters that all lenses have; those of a class that it needs; its others; all, in the
     # order of the constructor.
     common: ClassVar[tuple[str, ...]] = ("theta_max", "center", "affine", "image_size")
     parameters: ClassVar[tuple[str, ...]]
     optional: ClassVar[tuple[str, ...]]
-    declared: ClassVar[dict[str, Parameter]] = {
-        "theta_max": theta_max, "center": center, "affine": affine, "image_size": image_size,
-    }  # fmt: skip
+    declared: ClassVar[dict[str, Parameter]] = {}
     __signature__: ClassVar[inspect.Signature]
+    theta_max: Tensor
 
     def __init_subclass__(cls) -> None:
         own = {name: p for name, p in vars(cls).items() if isinstance(p, Parameter)}
+        for name in own:
+            delattr(cls, name)  # attributes that only lenses have are read faster
         found = own | {name: p for name, p in cls.declared.items() if name not in own}
         cls.parameters = tuple(name for name, p in found.items() if not p.optional)
         cls.optional = tuple(

@@ -311,7 +311,7 @@ class BrownConrady(DistortedLens):
     Source: Brown, 1966; OpenCV, calib3d.
     """
 
-    radial = DistortedLens.radial  # its place is before the denominator
+    radial = DistortedLens.declared["radial"]  # its place is before the denominator
     denominator = Parameter(shape=(None,), optional=True)
     terms = 3
     plain = Perspective

@@ -8,11 +8,17 @@ import torch
 from torch import Tensor
 
 from darswin.lens.batch import LensBatch
+from darswin.lens.parameter import Parameter
 from darswin.ops.checks import tensor_there
 
 
 class ImageFrame(LensBatch):
     """Lenses and where their images have them: from points around the principal point to pixels."""
+
+    theta_max = Parameter(low=0, open=True, optional=True, by_place=True)
+    center = Parameter(shape=(2,), optional=True, by_place=True)
+    affine = Parameter(shape=(2, 2), optional=True)
+    image_size = Parameter(low=1, shape=(2,), optional=True)
 
     def center_in(self, image_size: tuple[int, int] | None = None) -> Tensor:
         """(N or 1, 2) px: the principal point (x, y) in an image of (H, W)."""

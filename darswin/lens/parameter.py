@@ -36,7 +36,7 @@ class Parameter:
     starts: tuple[float, ...] = ()
     bounds: tuple[float, float] | None = None
 
-    if TYPE_CHECKING:  # a lens's own attribute hides this one, which is the class's
+    if TYPE_CHECKING:  # a class's declaration is a lens's attribute, a tensor
 
         def __get__(self, lens: object, owner: type) -> Any: ...
 
@@ -56,12 +56,11 @@ class Parameter:
 
     def holds(self, value: Tensor) -> Tensor:
         """True for each lens, (N,), whose values are in range."""
-        value = value.detach()[..., None].flatten(1)
-        if self.open:
-            inside = (value > self.low) & (value < self.high)
-        else:
-            inside = (value >= self.low) & (value <= self.high)
-        return (inside & value.isfinite()).all(1)
+        value, low, high = value.detach(), self.low, self.high
+        above = value > low if self.open or low == -math.inf else value >= low
+        below = value < high if self.open or high == math.inf else value <= high
+        inside = above & below  # NaN and infinities are not
+        return inside.flatten(1).all(1) if self.shape else inside
 
     @property
     def range(self) -> str:
