@@ -28,10 +28,12 @@ from darswin.utils.files import replace_file
 from darswin.viz.report import SIDES, beyond_lens, pixels_per_degree
 from darswin.viz.views import undistort, view_map
 
+__all__ = ["draw_lens", "save_figure"]
+
 SPACING_SYMBOLS = {"theta": "θ", "tan": "tan θ", "g": "g(θ)", "radius": "r"}
 
 
-# What matplotlib writes without another program, and the format it is.
+# The formats that matplotlib writes without another program, by their endings.
 FORMATS = {".png": "png", ".jpg": "jpeg", ".jpeg": "jpeg", ".webp": "webp", ".tif": "tiff",
            ".tiff": "tiff", ".pdf": "pdf", ".svg": "svg"}  # fmt: skip
 # Where an image has nothing to show.
@@ -52,7 +54,7 @@ def save_figure(figure: Figure, path: str | os.PathLike) -> None:
     """Writes a figure as the file that its ending names, whole or not at all.
 
     Raises:
-        ValueError: as `figure_format`. OSError: as `darswin.utils.files.replace_file`.
+        ValueError: another ending. OSError: as `darswin.utils.files.replace_file`.
     """
     picture = io.BytesIO()
     figure.savefig(picture, format=figure_format(path), dpi=120)
@@ -69,13 +71,8 @@ def draw_grid(
 ) -> Figure:
     """An image with the borders of its polar patches and, over them, the sample points.
 
-    All follow the lens: with affine, tangential or thin-prism terms they are on no circles.
-
-    Args:
-        lens: of the image. sampler: how it is cut and sampled, as `model.patch_embed.sample`.
-
-    Raises:
-        ValueError: more than one lens.
+    All follow the lens: with affine, tangential or thin-prism terms they are on no circles. The
+    sampler is that of a model, `model.patch_embed.sample`.
     """
     axes = axes or _new_axes()
     lens, grid = _grid(lens, sampler, image)
@@ -138,10 +135,7 @@ def _outline(width: float, colour: str) -> list[AbstractPathEffect]:
 def draw_polar(
     image: np.ndarray, lens: Lens, sampler: PolarSample, *, axes: Axes | None = None
 ) -> Figure:
-    """The polar image that a network gets: a row a radius, a column an azimuth, without jitter.
-
-    Arguments: as `draw_grid`.
-    """
+    """The polar image that a network gets: a row a radius, a column an azimuth, without jitter."""
     axes = axes or _new_axes(9, 3)
     lens, grid = _grid(lens, sampler, image)
     pixels = torch.from_numpy(np.atleast_3d(image)).permute(2, 0, 1)[None].float()
@@ -163,11 +157,8 @@ def draw_polar(
 
 
 def draw_view(image: np.ndarray, lens: Lens, rays: Tensor, *, axes: Axes | None = None) -> Figure:
-    """What the image shows along rays (H, W, 3), which `darswin.viz.views` makes.
-
-    Ticks are angles from the ray in the middle, along the view's middle row and column, to the
-    right and upwards.
-    """
+    """The image along rays (H, W, 3) of `darswin.viz.views`. Ticks are angles from the ray in the
+    middle, along the view's middle row and column, to the right and upwards."""
     axes = axes or _new_axes()
     x, y = np.moveaxis(view_map(lens, rays, image.shape[:2]), -1, 0)
     height, width = image.shape[:2]
@@ -216,13 +207,9 @@ def _label(text: str, outside: np.ndarray, beyond: np.ndarray | None = None) -> 
 def draw_curve(
     lens: Lens, image_size: tuple[int, int] | None = None, *, axes: Axes | None = None
 ) -> Figure:
-    """The projection curve r(θ) up to θ_max, and how many pixels a degree has along the radius and
-    around the axis; where the image (H, W) ends, if it is given, dashed to the left and right and
-    dotted above and below.
-
-    Raises:
-        ValueError: more than one lens.
-    """
+    """The projection curve r(θ) up to θ_max, and the pixels of a degree along the radius and around
+    the axis; the ends of the image (H, W), if given, are dashed at the left and right and dotted
+    above and below."""
     axes = axes or _new_axes()
     lens = _one(lens)
     theta = torch.linspace(0, lens.theta_max.item(), 257, dtype=torch.float64)
@@ -263,10 +250,15 @@ def _draw_sides(axes: Axes, lens: Lens, image_size: tuple[int, int]) -> None:
 def draw_lens(
     image: np.ndarray, lens: Lens, sampler: PolarSample, view: Tensor, title: str = "undistorted"
 ) -> Figure:
-    """All of it in one figure: partition, sample points, a view, polar image, projection curve.
+    """Draws a lens: partition, sample points, a view, polar image, projection curve.
 
     Args:
-        lens, sampler: as `draw_grid`. view: (H, W, 3), its rays. title: of the view.
+        image: (H, W) or (H, W, 3), uint8 or floats in [0, 1]. lens: one, of the image.
+        sampler: how it is cut and sampled, as `model.patch_embed.sample`.
+        view: (H, W, 3), the rays of the view. title: of the view.
+
+    Raises:
+        ValueError: more than one lens.
     """
     figure = Figure(figsize=(15, 9), layout="constrained")
     panels = figure.subplot_mosaic([["partition", "samples", "view"], ["polar", "polar", "curve"]])
@@ -297,12 +289,8 @@ def draw_accuracy(
     *,
     axes: Axes | None = None,
 ) -> Figure:
-    """Accuracy (%) against ξ, a line a model, with the range of training, if any, shaded.
-
-    Args:
-        accuracy: at each ξ; or a list of that for each seed, whose mean is the line and whose span
-            is a band.
-    """
+    """Accuracy (%) against ξ, a line a model, with the range of training, if any, shaded. Of
+    several seeds, a list each, the mean is the line and the span is a band."""
     axes = axes or _new_axes(7, 4.2)
     if trained is not None:
         axes.axvspan(*trained, color="tab:pink", alpha=0.3, lw=0, label="seen in training")
@@ -312,9 +300,7 @@ def draw_accuracy(
         if len(seeds) > 1:
             span = seeds.min(0), seeds.max(0)
             axes.fill_between(xi, *span, color=line.get_color(), alpha=0.2, lw=0)
-    axes.set_xlabel("distortion ξ")
-    axes.set_ylabel("accuracy (%)")
-    axes.set_xlim(min(xi), max(xi))
+    axes.set(xlabel="distortion ξ", ylabel="accuracy (%)", xlim=(min(xi), max(xi)))
     axes.grid(alpha=0.3)
     axes.legend()
     return _figure_of(axes)
@@ -341,8 +327,7 @@ def _show(axes: Axes, image: np.ndarray, outside: np.ndarray | None = None, **op
         image = np.concatenate((image, alpha[..., None]), 2)
         axes.patch.set(**HATCH)
     axes.imshow(image, **options)
-    axes.set_xticks([])
-    axes.set_yticks([])
+    axes.set(xticks=[], yticks=[])
 
 
 def _one(lens: Lens) -> Lens:

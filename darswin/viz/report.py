@@ -1,4 +1,4 @@
-"""What a lens shows, in words: field of view, pixels per degree, and which spacing fits."""
+"""A lens in words: field of view, pixels per degree, and the spacing that fits."""
 
 import math
 from typing import NamedTuple
@@ -10,18 +10,14 @@ from darswin.layers.polar import polar_grid
 from darswin.lens.base import Lens
 from darswin.lens.spacing import SPACINGS, Spacing
 
+__all__ = ["describe"]
+
 SIDES = ("left", "top", "right", "bottom")
 
 
 def pixels_per_degree(lens: Lens, theta: Tensor) -> tuple[Tensor, Tensor]:
-    """How many pixels a degree has at θ, along the radius and around the axis, before `affine`.
-
-    Args:
-        lens: one lens. theta: any shape, rad.
-
-    Returns:
-        dr/dθ and r / sin θ, px/°, of the shape of θ.
-    """
+    """dr/dθ and r / sin θ of one lens at θ, rad: the pixels of a degree along the radius and around
+    the axis, before `affine`."""
     theta = theta.detach().clone().requires_grad_()
     lens = lens.detach()
     with torch.enable_grad():
@@ -33,7 +29,7 @@ def pixels_per_degree(lens: Lens, theta: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def largest_offset(lens: Lens) -> float:
-    """px: how far tangential and thin-prism terms move a ray at most, up to θ_max, of one lens."""
+    """The longest way in px that tangential and thin-prism terms move a ray up to θ_max."""
     theta = lens.theta_max * torch.linspace(0, 1, 129).to(lens.theta_max)[:, None]
     azimuth = torch.linspace(0, 2 * math.pi, 181).to(theta)
     direction = torch.stack((torch.cos(azimuth), torch.sin(azimuth)), -1)
@@ -41,12 +37,12 @@ def largest_offset(lens: Lens) -> float:
 
 
 def beyond_lens(lens: Lens, image_size: tuple[int, int]) -> Tensor:
-    """(4,), in the order of SIDES: whether the image reaches further than the one lens."""
+    """(4,), in the order of SIDES: True where the image reaches further than the lens."""
     return lens.side_angles(image_size)[0] >= lens.with_theta_max(None).theta_max
 
 
 def sides(lens: Lens, image_size: tuple[int, int]) -> Tensor:
-    """(4,) rad: `side_angles` of one lens, below 0 where the principal point is past that side."""
+    """(4,) rad: `side_angles`, below 0 where the principal point is past that side."""
     cx, cy = lens.center_in(image_size)[0].tolist()
     height, width = image_size
     past = (cx < -0.5, cy < -0.5, cx > width - 0.5, cy > height - 0.5)
@@ -71,7 +67,7 @@ class Patches(NamedTuple):
 
 
 def patches(lens: Lens, spacing: Spacing, rings: int, sectors: int) -> Patches:
-    """How large the patches of one lens's partition are."""
+    """The sizes of the patches of one lens's partition."""
     grid = polar_grid(lens, (1, 1), rings=rings, sectors=sectors, samples=(1, 1), spacing=spacing)
     borders = grid.borders[0]
     stretch = 1.0 if lens.affine is None else lens.affine[0].det().abs().item()
@@ -91,7 +87,7 @@ def best_spacing(lens: Lens, rings: int, sectors: int) -> Spacing:
 def describe(
     lens: Lens, image_size: tuple[int, int] | None = None, *, rings: int = 16, sectors: int = 64
 ) -> str:
-    """What a user wants to know of a lens: some twenty lines of text.
+    """Describes a lens in some twenty lines of text.
 
     Args:
         lens: one lens. image_size: (H, W); None means the lens's own.
@@ -108,15 +104,9 @@ def describe(
             raise ValueError("this lens needs the image_size, (H, W)")
         height, width = (round(side) for side in lens.image_size[0].tolist())
         image_size = height, width
-    return "\n".join(
-        f"{name:<16}{text}".rstrip()
-        for name, text in (
-            *_model(lens, image_size),
-            *_view(lens, image_size),
-            *_density(lens),
-            *_spacings(lens, rings, sectors),
-        )
-    )
+    rows = _model(lens, image_size) + _view(lens, image_size)
+    rows += _density(lens) + _spacings(lens, rings, sectors)
+    return "\n".join(f"{name:<16}{text}".rstrip() for name, text in rows)
 
 
 def _model(lens: Lens, image_size: tuple[int, int]) -> list[tuple[str, str]]:
@@ -143,7 +133,7 @@ def _model(lens: Lens, image_size: tuple[int, int]) -> list[tuple[str, str]]:
 
 
 def _is_outside(lens: Lens, image_size: tuple[int, int]) -> bool:
-    """Whether the principal point is not in the image."""
+    # The principal point is not in the image.
     return bool((sides(lens, image_size) < 0).any())
 
 

@@ -25,21 +25,19 @@ from darswin.data.warp import remap
 from darswin.lens import Lens
 from darswin.lens.pixels import as_map
 
+__all__ = ["cylindrical", "equirectangular", "perspective", "undistort"]
+
 
 def perspective(
     size: tuple[int, int], fov: float, *, yaw: float = 0.0, pitch: float = 0.0
 ) -> Tensor:
     """The rays of a pinhole camera, in whose view straight lines are straight.
 
-    Args:
-        size: (H, W) of the view. fov: in (0, π), rad. yaw, pitch: rad.
-
-    Returns:
-        (H, W, 3), float64.
+    Of a view of (H, W), with a `fov` in (0, π) rad; yaw and pitch are in rad → (H, W, 3), float64.
     """
     _check_fov(fov, math.pi, "below π")
     x, y = _plane(size, 2 * math.tan(fov / 2))
-    return turned(torch.stack((x, y, torch.ones_like(x)), -1), yaw, pitch)
+    return rotated(torch.stack((x, y, torch.ones_like(x)), -1), yaw, pitch)
 
 
 def cylindrical(
@@ -47,15 +45,11 @@ def cylindrical(
 ) -> Tensor:
     """The rays of a panorama on an upright cylinder: columns are equal angles, verticals straight.
 
-    Args:
-        size: (H, W) of the view. fov: in (0, 2π], rad. yaw, pitch: rad.
-
-    Returns:
-        (H, W, 3), float64.
+    As `perspective`, but with a `fov` in (0, 2π] rad.
     """
     _check_fov(fov, 2 * math.pi, "at most 2π", closed=True)
     longitude, y = _plane(size, fov)
-    return turned(torch.stack((torch.sin(longitude), y, torch.cos(longitude)), -1), yaw, pitch)
+    return rotated(torch.stack((torch.sin(longitude), y, torch.cos(longitude)), -1), yaw, pitch)
 
 
 def equirectangular(
@@ -63,13 +57,8 @@ def equirectangular(
 ) -> Tensor:
     """The rays of a map of the sphere: columns are equal longitudes, rows equal latitudes.
 
-    With the `fov` of 2π and H = W/2 it is the whole sphere, its middle the optical axis.
-
-    Args:
-        size: (H, W) of the view. fov: in (0, 2π], rad. yaw, pitch: rad.
-
-    Returns:
-        (H, W, 3), float64. Zeros, which see nothing, in rows beyond the poles.
+    As `perspective`, but with a `fov` in (0, 2π] rad: with 2π and H = W/2 it is the whole sphere,
+    its middle the optical axis. Rows beyond the poles are zeros, which see nothing.
     """
     _check_fov(fov, 2 * math.pi, "at most 2π", closed=True)
     longitude, latitude = _plane(size, fov)
@@ -78,11 +67,11 @@ def equirectangular(
         (level * torch.sin(longitude), torch.sin(latitude), level * torch.cos(longitude)), -1
     )
     rays = torch.where((latitude.abs() <= math.pi / 2)[..., None], rays, 0.0)
-    return turned(rays, yaw, pitch)
+    return rotated(rays, yaw, pitch)
 
 
-def turned(rays: Tensor, yaw: float, pitch: float) -> Tensor:
-    """Rays (..., 3) seen by a camera that looks `yaw` to the right and `pitch` up, rad."""
+def rotated(rays: Tensor, yaw: float, pitch: float) -> Tensor:
+    """Rays (..., 3) of a camera that looks `yaw` to the right and `pitch` up, rad."""
     cos, sin = math.cos(pitch), math.sin(pitch)
     pitched = rays.new_tensor([[1, 0, 0], [0, cos, -sin], [0, sin, cos]])
     cos, sin = math.cos(yaw), math.sin(yaw)
@@ -91,18 +80,8 @@ def turned(rays: Tensor, yaw: float, pitch: float) -> Tensor:
 
 
 def view_map(lens: Lens, rays: Tensor, image_size: tuple[int, int] | None = None) -> np.ndarray:
-    """Where in the image of a lens its rays land, as a map of `cv2.remap`.
-
-    Args:
-        lens: one lens. rays: (H, W, 3). image_size: (H', W') of the lens's image, for the principal
-            point of a lens that has none.
-
-    Returns:
-        (H, W, 2) float32, x and y; `darswin.lens.pixels.OUTSIDE` beyond θ_max.
-
-    Raises:
-        ValueError: more than one lens, or rays of another shape.
-    """
+    """The places in the image of a lens where rays (H, W, 3) land, as a map of `cv2.remap`:
+    (H, W, 2) float32, x and y; `OUTSIDE` beyond θ_max."""
     if len(lens) != 1:
         raise ValueError(f"a view is of one lens, got {len(lens)}")
     if rays.dim() != 3 or rays.shape[2] != 3:
@@ -114,18 +93,17 @@ def view_map(lens: Lens, rays: Tensor, image_size: tuple[int, int] | None = None
 def undistort(
     image: np.ndarray, lens: Lens, rays: Tensor, *, interpolation: int = cv2.INTER_LINEAR
 ) -> np.ndarray:
-    """What a camera sees along rays; black beyond its lens's θ_max and outside its image.
+    """The image that a camera sees along rays; black beyond its θ_max and outside of its image.
 
     Args:
         image: (H, W) or (H, W, C), uint8 or float32, taken with `lens`.
-        lens: one lens. rays: (H', W', 3), from `perspective`, `cylindrical`, `equirectangular` or
-            elsewhere. interpolation: of `cv2.remap`.
+        lens: one lens. rays: (H', W', 3). interpolation: of `cv2.remap`.
 
     Returns:
         (H', W') or (H', W', C), of the image's type.
 
     Raises:
-        ValueError: as `view_map`.
+        ValueError: more than one lens, or rays of another shape.
     """
     height, width = image.shape[:2]
     return remap(image, view_map(lens, rays, (height, width)), interpolation)
@@ -133,10 +111,8 @@ def undistort(
 
 def _plane(size: tuple[int, int], width: float) -> tuple[Tensor, Tensor]:
     """The coordinates of the pixels of (H, W) from their middle, where W of them are `width`."""
-    rows, columns = size
-    step = width / columns
-    y = (torch.arange(rows, dtype=torch.float64) - (rows - 1) / 2) * step
-    x = (torch.arange(columns, dtype=torch.float64) - (columns - 1) / 2) * step
+    step = width / size[1]
+    y, x = ((torch.arange(side, dtype=torch.float64) - (side - 1) / 2) * step for side in size)
     y, x = torch.meshgrid(y, x, indexing="ij")
     return x, y
 

@@ -10,6 +10,7 @@ from darswin import PolarSample
 from darswin.lens import KannalaBrandt, Mei, Polynomial, Spherical
 from darswin.viz.plot import (
     FORMATS,
+    _angle_ticks,
     draw_accuracy,
     draw_curve,
     draw_grid,
@@ -20,7 +21,7 @@ from darswin.viz.plot import (
     figure_format,
     save_figure,
 )
-from darswin.viz.views import cylindrical, equirectangular, perspective
+from darswin.viz.views import equirectangular, perspective
 
 SAMPLER = PolarSample(rings=4, sectors=8, samples=(3, 2), layout="image")
 ROUND = Spherical.from_fov(0.4, 2.6, 16.0)
@@ -83,8 +84,6 @@ def test_draw_polar_is_what_the_layer_samples(shape):
         channels = torch.from_numpy(np.atleast_3d(image)).permute(2, 0, 1)[None]
         expected = SAMPLER(channels, ROUND)[0].permute(1, 2, 0).expand(-1, -1, 3)
         np.testing.assert_allclose(axes.images[0].get_array()[..., :3], expected, atol=1e-5)
-        labels = [text.get_text() for text in axes.get_yticklabels()]
-        assert labels == ["0°", "19°", "37°", "56°", "74°"]
 
 
 def test_draw_view_is_the_undistorted_image():
@@ -94,36 +93,7 @@ def test_draw_view_is_the_undistorted_image():
     assert drawn.shape == (6, 8, 4) and (drawn[..., :3] == 200).all()
 
 
-def ticks(axis):
-    """Places and labels, the labels as degrees."""
-    labels = [text.get_text() for text in axis.get_ticklabels()]
-    return np.array(axis.get_ticklocs()), np.array([float(text.rstrip("°")) for text in labels])
-
-
-@pytest.mark.parametrize("turn", [dict(), dict(yaw=0.7, pitch=-0.4)])
-def test_ticks_of_a_view_are_degrees_from_its_middle(turn):
-    image = np.zeros((32, 32, 3), np.uint8)
-    for make, fov in ((perspective, 110), (cylindrical, 200), (equirectangular, 360)):
-        (axes,) = draw_view(image, ROUND, make((61, 121), math.radians(fov), **turn)).axes
-        across, degrees = ticks(axes.xaxis)
-        step = 2 * math.tan(math.radians(fov) / 2) if make is perspective else math.radians(fov)
-        angle = np.radians(degrees)
-        right = np.tan(angle) if make is perspective else angle
-        np.testing.assert_allclose(across, 60 + right / (step / 121), atol=0.02)
-        down, degrees = ticks(axes.yaxis)
-        angle = np.radians(degrees)
-        up = angle if make is equirectangular else np.tan(angle)
-        np.testing.assert_allclose(down, 30 - up / (step / 121), atol=0.02)
-        assert len(across) >= 3 and len(down) >= 3
-
-
-def test_rays_in_no_order_have_no_ticks():
-    rays = torch.randn(9, 9, 3, generator=torch.Generator().manual_seed(0))
-    (axes,) = draw_view(np.zeros((32, 32, 3), np.uint8), ROUND, rays).axes
-    assert not len(axes.get_xticks()) and not len(axes.get_yticks())
-
-
-def test_it_is_said_where_there_is_no_picture():
+def test_it_is_hatched_where_there_is_no_picture():
     image = np.full((20, 60, 3), 200, np.uint8)
     lens = ROUND  # its circle is 32 px wide
     (axes,) = draw_polar(image, lens, SAMPLER).axes
@@ -131,10 +101,9 @@ def test_it_is_said_where_there_is_no_picture():
     grid = SAMPLER.grid(lens.to(torch.float64), (20, 60))
     down = np.abs(grid.radii[0].numpy()[:, None] * np.sin(grid.azimuths.numpy()))
     np.testing.assert_array_equal(alpha == 0, down > 10)  # the sensor ends 10 px from the middle
-    assert "hatched: outside the sensor" in axes.get_xlabel() and axes.patch.get_hatch()
+    assert axes.patch.get_hatch()
     (axes,) = draw_polar(np.zeros((40, 40)), lens, SAMPLER).axes
-    assert (axes.images[0].get_array()[..., 3] == 1).all() and "hatched" not in axes.get_xlabel()
-
+    assert (axes.images[0].get_array()[..., 3] == 1).all()
     rays = equirectangular((45, 90))
     (axes,) = draw_view(image, lens, rays).axes
     theta = torch.atan2(rays[..., :2].norm(dim=-1), rays[..., 2])
@@ -142,11 +111,6 @@ def test_it_is_said_where_there_is_no_picture():
                                                 (20, 60))  # fmt: skip
     seen = (theta <= lens.theta_max) & ((place[..., 1] - 9.5).abs() <= 10)
     np.testing.assert_array_equal(axes.images[0].get_array()[..., 3] == 255, seen)
-    assert "hatched: outside the sensor or beyond θ_max" in axes.get_xlabel()
-    (axes,) = draw_view(np.zeros((40, 40)), lens, rays).axes
-    assert "hatched: beyond θ_max" in axes.get_xlabel()
-    (axes,) = draw_view(image, lens, perspective((6, 8), 0.1)).axes
-    assert "hatched" not in axes.get_xlabel()
 
 
 def test_what_is_enlarged_is_in_the_image():
@@ -155,7 +119,7 @@ def test_what_is_enlarged_is_in_the_image():
     assert axes.get_xlim() == (-0.5, 7.5) and axes.get_ylim() == (59.5, 53.5)
 
 
-@pytest.mark.parametrize("tone", [0, 60, 200, 240, 255])
+@pytest.mark.parametrize("tone", [0, 240])
 @pytest.mark.parametrize("panel", [draw_grid, draw_samples])
 def test_borders_show_on_dark_and_on_pale_walls(panel, tone, tmp_path):
     image = np.full((64, 64, 3), tone, np.uint8)
@@ -179,25 +143,16 @@ def test_draw_curve_shows_radius_and_density():
     ends = sorted(line.get_xdata()[0] for line in left.lines[1:])
     seen = lens.side_angles((48, 80))[0].rad2deg()
     np.testing.assert_allclose(ends, seen[seen < degrees[-1] - 1e-6].sort().values, rtol=1e-6)
-    labels = [text.get_text() for text in left.get_legend().get_texts()]
-    assert labels == ["r", "px/° along r", "px/° around"]
     assert len(draw_curve(lens).axes[0].lines) == 1
 
 
-def test_sides_of_the_image_are_told_apart():
+def test_the_ends_of_the_image_are_at_their_angles():
     lens = Polynomial([20.0, 1.0, 0.5], 1.7, [45.0, 22.0])
     axes = draw_curve(lens, (48, 80)).axes[0]
     angles = lens.side_angles((48, 80))[0].rad2deg().tolist()
-    names = [
-        f"{s} {a:.1f}°" for s, a in zip(("left", "top", "right", "bottom"), angles, strict=True)
-    ]
-    shown = [a <= math.degrees(1.7) for a in angles]
-    assert shown == [False, True, True, True]
-    assert [text.get_text() for text in axes.texts] == names[1:]
-    styles = [line.get_linestyle() for line in axes.lines[1:]]
-    assert styles == [":", "--", ":"]
-    heights = [text.get_position()[1] for text in axes.texts]
-    assert min(np.diff(sorted(heights))) > 0.15  # no name over another one
+    drawn = [line.get_xdata()[0] for line in axes.lines[1:]]
+    assert angles[0] > math.degrees(1.7) and drawn == pytest.approx(angles[1:])
+    assert [line.get_linestyle() for line in axes.lines[1:]] == [":", "--", ":"]
 
 
 def test_sides_that_the_lens_does_not_reach_are_not_drawn():
@@ -210,11 +165,7 @@ def test_draw_lens_has_all_panels(tmp_path):
     image = np.zeros((48, 64, 3), np.uint8)
     lens = KannalaBrandt(20.0, [0.01], 1.7)
     figure = draw_lens(image, lens, SAMPLER, perspective((6, 8), 1.0), "ahead")
-    titles = [axes.get_title() for axes in figure.axes]
-    assert titles[:5] == [
-        "4 rings × 8 sectors, equal steps of θ", "3 × 2 samples in each, enlarged", "ahead",
-        "polar image, 12 × 16 samples", "projection: KannalaBrandt",
-    ]  # fmt: skip
+    assert len(figure.axes) == 6  # five panels, and the second scale of the curve
     heads = {"png": b"\x89PNG", "jpeg": b"\xff\xd8\xff", "webp": b"RIFF", "tiff": b"II*\0",
              "pdf": b"%PDF", "svg": b"<?xml"}  # fmt: skip
     small = draw_curve(lens)
@@ -237,16 +188,25 @@ def test_drawing_on_axes_of_ones_own():
         draw_grid(np.zeros((32, 32)), Spherical([0.1, 0.2], 10.0), SAMPLER)
 
 
-def test_draw_accuracy_shows_each_model():
+def test_accuracy_of_each_model():
     figure = draw_accuracy([0.0, 0.5, 1.0], {"a": [1, 2, 3], "b": [3, 2, 1]}, (0.2, 0.35))
     (axes,) = figure.axes
-    labels = [text.get_text() for text in axes.get_legend().get_texts()]
-    assert labels == ["seen in training", "a", "b"]
-    assert list(axes.lines[0].get_ydata()) == [1, 2, 3]
-
-
-def test_draw_accuracy_shows_the_mean_and_the_span_of_seeds():
+    assert [list(line.get_ydata()) for line in axes.lines] == [[1, 2, 3], [3, 2, 1]]
+    # Of several seeds it shows the mean and the span.
     (axes,) = draw_accuracy([0.0, 1.0], {"a": [[1, 2], [3, 8]]}, None).axes
     assert list(axes.lines[0].get_ydata()) == [2, 5]
     (band,) = axes.collections
     assert band.get_datalim(axes.transData).get_points().tolist() == [[0, 1], [1, 8]]
+
+
+@pytest.mark.parametrize("make", [perspective, equirectangular])
+def test_ticks_of_a_view_are_degrees_from_its_middle(make):
+    fov = math.radians(110)
+    line = make((61, 121), fov, yaw=0.7, pitch=-0.4)[30]
+    places, degrees = _angle_ticks(torch.nn.functional.normalize(line, dim=-1), 7)
+    angle = np.radians(degrees)
+    right = np.tan(angle) / math.tan(fov / 2) if make is perspective else 2 * angle / fov
+    np.testing.assert_allclose(places, 60 + 60.5 * right, atol=0.02)
+    assert len(places) >= 3 and (np.diff(degrees) > 0).all()
+    for rays in (torch.randn(9, 3, generator=torch.Generator().manual_seed(0)), line[:1]):
+        assert not len(_angle_ticks(rays.double(), 7)[0])  # in no order, or too few

@@ -7,7 +7,14 @@ import torch
 
 from darswin.lens import KannalaBrandt, Mei, Perspective, Polynomial
 from darswin.lens.pixels import OUTSIDE
-from darswin.viz.views import cylindrical, equirectangular, perspective, turned, undistort, view_map
+from darswin.viz.views import (
+    cylindrical,
+    equirectangular,
+    perspective,
+    rotated,
+    undistort,
+    view_map,
+)
 
 VIEWS = {
     "perspective": perspective((60, 80), math.radians(100)),
@@ -135,10 +142,10 @@ def test_yaw_looks_right_and_pitch_up(make):
     right = direction(math.sin(0.3), 0, math.cos(0.3))
     torch.testing.assert_close(middle(yaw=0.3), right)
     torch.testing.assert_close(middle(pitch=0.3), direction(0, -math.sin(0.3), math.cos(0.3)))
-    # The horizon stays level: turned by yaw, a pitched view looks as far up as before.
+    # The horizon stays level: rotated by yaw, a pitched view looks as far up as before.
     both = middle(yaw=1.2, pitch=0.3)
     torch.testing.assert_close(both[1], middle(pitch=0.3)[1])
-    torch.testing.assert_close(both, turned(direction(0, 0, 1), 1.2, 0.3))
+    torch.testing.assert_close(both, rotated(direction(0, 0, 1), 1.2, 0.3))
 
 
 def test_fields_of_view_are_between_the_pixels_edges():
