@@ -1,24 +1,15 @@
 // _add_norm_ and _add_norm_quantized_ on CPU: check, thread, call the kernel.
 #include "add_norm.h"
 
-#include <torch/csrc/stable/library.h>
-#include <torch/csrc/stable/ops.h>
-#include <torch/csrc/stable/tensor.h>
-#include <torch/headeronly/util/Exception.h>
-
 #include <algorithm>
 #include <optional>
 
-#include "bfloat16.h"
+#include "checks.h"
 #include "dispatch.h"
 #include "parallel.h"
-#include "quantizer.h"
 
 namespace darswin {
 namespace {
-
-using torch::headeronly::ScalarType;
-using torch::stable::Tensor;
 
 // Values that are worth a thread of their own.
 constexpr int64_t kGrain = 8192;
@@ -26,9 +17,9 @@ constexpr int64_t kGrain = 8192;
 template <typename S, typename Out>
 void run(AddNormArgs<S, Out> args, const Tensor& x, const Tensor& weight, const Tensor& bias,
          double eps) {
-  args.x = static_cast<S*>(x.mutable_data_ptr());
-  args.weight = static_cast<const float*>(weight.const_data_ptr());
-  args.bias = static_cast<const float*>(bias.const_data_ptr());
+  args.x = mutable_pointer<S>(x);
+  args.weight = pointer<float>(weight);
+  args.bias = pointer<float>(bias);
   args.eps = static_cast<float>(eps);
   args.width = weight.numel();
   if (x.numel() == 0) return;
@@ -42,7 +33,7 @@ void run(AddNormArgs<S, Out> args, const Tensor& x, const Tensor& weight, const 
 struct Bytes {
   const char *begin, *end;
   explicit Bytes(const Tensor& t)
-      : begin(static_cast<const char*>(t.const_data_ptr())),
+      : begin(pointer<char>(t)),
         end(begin + t.numel() * (t.scalar_type() == ScalarType::BFloat16 ? 2 : 4)) {}
   bool apart(const Bytes& other) const { return end <= other.begin || other.end <= begin; }
 };
@@ -65,36 +56,30 @@ void check_parameters(const Tensor& changes, const Tensor& weight, const Tensor&
   }
 }
 
-void add_norm_(Tensor x, Tensor y, const Tensor& weight, const Tensor& bias, double eps) {
-  const bool half = x.scalar_type() == ScalarType::BFloat16;
-  STD_TORCH_CHECK(half || x.scalar_type() == ScalarType::Float,
-                  "add_norm_: x must be float32 or bfloat16");
+void add_norm_(Tensor x, Tensor y, Tensor weight, Tensor bias, double eps) {
   check_alike(x, y);
   check_parameters(x, weight, bias);
   check_parameters(y, weight, bias);
-  const auto in_type = [&]<typename S>(S* out) {
-    run(AddNormArgs<S, S>{.y = out, .out = out}, x, weight, bias, eps);
-  };
-  if (half) {
-    in_type(static_cast<bfloat16*>(y.mutable_data_ptr()));
-  } else {
-    in_type(static_cast<float*>(y.mutable_data_ptr()));
+  if (x.scalar_type() == ScalarType::BFloat16) {
+    auto* out = mutable_pointer<bfloat16>(y);
+    return run(AddNormArgs<bfloat16, bfloat16>{.y = out, .out = out}, x, weight, bias, eps);
   }
+  STD_TORCH_CHECK(x.scalar_type() == ScalarType::Float, "add_norm_: x must be float32 or bfloat16");
+  auto* out = mutable_pointer<float>(y);
+  run(AddNormArgs<float, float>{.y = out, .out = out}, x, weight, bias, eps);
 }
 
-Tensor add_norm_quantized_(Tensor x, std::optional<Tensor> y, const Tensor& weight,
-                           const Tensor& bias, double eps, double scale, int64_t zero_point) {
+Tensor add_norm_quantized_(Tensor x, MaybeTensor y, Tensor weight, Tensor bias, double eps,
+                           double scale, int64_t zero_point) {
   STD_TORCH_CHECK(
       x.is_cpu() && x.scalar_type() == ScalarType::Float && x.dim() > 0 && x.is_contiguous(),
       "add_norm_quantized_: x must be float32 and contiguous");
-  if (y.has_value()) check_alike(x, *y);
+  if (y) check_alike(x, *y);
   check_parameters(x, weight, bias);
-  const Tensor out = torch::stable::new_empty(x, x.sizes(), ScalarType::Byte);
-  run(
-      AddNormArgs<float, uint8_t>{
-          .y = y.has_value() ? static_cast<const float*>(y->const_data_ptr()) : nullptr,
-          .out = static_cast<uint8_t*>(out.mutable_data_ptr()),
-          .quantizer = quantizer(scale, zero_point)},
+  const Tensor out = new_empty(x, x.sizes(), ScalarType::Byte);
+  run(AddNormArgs<float, uint8_t>{.y = y ? pointer<float>(*y) : nullptr,
+                                  .out = mutable_pointer<uint8_t>(out),
+                                  .quantizer = quantizer(scale, zero_point)},
       x, weight, bias, eps);
   return out;
 }

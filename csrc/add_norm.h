@@ -3,7 +3,7 @@
 
 #include <cstdint>
 
-#include "quantized.h"
+#include "numbers.h"
 #include "tier.h"
 
 namespace darswin {

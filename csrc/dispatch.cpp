@@ -51,6 +51,14 @@ std::atomic<Tier>& current() {
 
 }  // namespace
 
+bool cpu_is_intel() {
+#if defined(__x86_64__)
+  return __builtin_cpu_is("intel");
+#else
+  return false;
+#endif
+}
+
 Tier current_tier() { return current().load(std::memory_order_relaxed); }
 
 const char* tier_name(Tier tier) { return facts(tier).name; }

@@ -13,15 +13,20 @@ Tier current_tier();
 const char* tier_name(Tier tier);
 std::vector<Tier> available_tiers();  // those of this build that the CPU has, from low to high
 bool set_tier(const char* name);      // false where the CPU or the build lacks that tier
+bool cpu_is_intel();
 
 template <typename Table, Tier... tiers>
-constexpr const Table* kTables[] = {&Kernels<Table, tiers>::table...};
+const Table* find_table(Tier tier) {
+  const Table* found = nullptr;
+  ((tier == tiers ? void(found = &Kernels<Table, tiers>::table) : void()), ...);
+  return found;
+}
 
 // The kernels of the operator that `Table` belongs to, for the tier in use.
 template <typename Table>
 const Table& kernels() {
   using enum Tier;
-  return *kTables<Table, DARSWIN_TIERS>[static_cast<int>(current_tier())];
+  return *find_table<Table, DARSWIN_TIERS>(current_tier());
 }
 
 }  // namespace darswin

@@ -69,7 +69,7 @@ FACT const char* darswin_tiers() {
 // Runs the operators on another tier from now on; false where it is not offered.
 FACT bool darswin_set_tier(const char* name) { return darswin::set_tier(name); }
 
-// Reads far images without gathers (0), with them (1), or as is found to be faster (2).
+// Reads far images without gathers (0), with them (1), or as is faster on this CPU (2).
 FACT void darswin_set_gathers(int way) { darswin::gathers = static_cast<darswin::Gathers>(way); }
 
 // What this module was built with, as JSON.

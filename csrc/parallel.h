@@ -41,11 +41,12 @@ inline void ask_for_large_pages(const torch::stable::Tensor& tensor) {
 
 // Working memory of the calling thread for as long as this lives: at least `bytes`, aligned to
 // cache lines, contents undefined. Up to kKept bytes stay with the thread from use to use, since
-// fresh pages cost more than what the kernels do with them; so a thread has one Scratch at a time.
+// fresh pages cost more than what the kernels do with them; so a thread has one ThreadMemory at a
+// time.
 // Throws std::bad_alloc.
-class Scratch {
+class ThreadMemory {
  public:
-  explicit Scratch(size_t bytes) {
+  explicit ThreadMemory(size_t bytes) {
     static thread_local Memory kept;
     static thread_local size_t kept_bytes = 0;
     if (bytes > kKept) {
@@ -110,6 +111,15 @@ void parallel_ranges(int64_t count, Body&& body) {
     }
   }
   if (failure != nullptr) std::rethrow_exception(failure);
+}
+
+// body(begin, end, scratch) in the same way, each thread with `bytes` of working memory.
+template <typename Body>
+void run_with_scratch(int64_t count, int64_t bytes, Body&& body) {
+  parallel_ranges(count, [&](int64_t begin, int64_t end) {
+    const ThreadMemory scratch(bytes);
+    body(begin, end, scratch.get());
+  });
 }
 
 }  // namespace darswin

@@ -19,7 +19,7 @@ struct PolarSampleArgs {
   int64_t channels, height, width;
   int64_t image_stride[4];
   bool packed;            // whether images are sampled from a packed copy in cache
-  bool gathers;           // whether they are read by gathers: see PolarCall::sample
+  bool gathers;           // whether they are read by gathers
   const T* pixel_scale;   // (C,): a pixel p of type u8 counts as p * scale + offset
   const T* pixel_offset;  // (C,)
   const T* radii;         // (B or 1, num_radii) px
@@ -83,11 +83,11 @@ struct PolarSampleKernels {
 constexpr int64_t kRowUnit = 16;
 template <typename T>
 struct PolarEmbedArgs {
-  int64_t features;     // D
-  const T* transposed;  // forward: the weight as (S_r * S_phi * C, padded D)
-  const T* bias;        // (D,) or null
-  const T* weight;      // backward: (D, padded S_r * S_phi * C)
-  T* grad_samples;      // (B, R, A, S_r * S_phi * C)
+  int64_t features = 0;           // D
+  const T* transposed = nullptr;  // forward: the weight as (S_r * S_phi * C, padded D)
+  const T* bias = nullptr;        // (D,) or null
+  const T* weight = nullptr;      // backward: (D, padded S_r * S_phi * C)
+  T* grad_samples = nullptr;      // (B, R, A, S_r * S_phi * C)
 };
 
 template <typename T>
@@ -95,8 +95,6 @@ struct PolarEmbedKernels {
   using Args = PolarSampleArgs<T>;
   using Embed = PolarEmbedArgs<T>;
 
-  // (rows, columns) -> (columns, to_stride)
-  void (*transpose)(const T* from, int64_t rows, int64_t columns, T* to, int64_t to_stride);
   // bytes of scratch that each thread needs in one of the functions below
   int64_t (*scratch)(const Args&, const Embed&, PolarPass);
   // item: (image, ring)

@@ -1,8 +1,4 @@
 // polar_embed and its backward on CPU: allocate, thread, call the kernel.
-#include <torch/csrc/stable/library.h>
-
-#include <algorithm>
-#include <optional>
 #include <tuple>
 #include <vector>
 
@@ -13,21 +9,20 @@
 namespace darswin {
 namespace {
 
-using torch::stable::Tensor;
-
 int64_t padded(int64_t n) { return (n + kRowUnit - 1) / kRowUnit * kRowUnit; }
 
 // A weight (D, S_r * S_phi * C) or a bias (D,), contiguous and in the type that is computed in.
 template <typename T>
-Tensor parameter(const PolarCall<T>& call, const Tensor& value) {
+Tensor parameter(const Tensor& value) {
   STD_TORCH_CHECK(value.is_cpu(), "polar_embed: weight and bias must be on the CPU");
-  return torch::stable::contiguous(torch::stable::to(value, call.radii.scalar_type()));
+  return contiguous(torch::stable::to(value, type_of<T>()));
 }
 
 template <typename T>
-void check_weight(const PolarCall<T>& call, const Tensor& weight) {
+Tensor checked_weight(const PolarCall<T>& call, const Tensor& weight) {
   STD_TORCH_CHECK(weight.dim() == 2 && weight.size(1) == call.token_size(),
                   "polar_embed: weight does not fit the samples of a token");
+  return parameter<T>(weight);
 }
 
 template <typename T>
@@ -36,35 +31,27 @@ Sizes output_sizes(const PolarCall<T>& call, int64_t features) {
 }
 
 template <typename T>
-Tensor forward(PolarCall<T>&& call, const Tensor& weight_, const std::optional<Tensor>& bias_) {
-  check_weight(call, weight_);
-  const Tensor weight = parameter(call, weight_);
+Tensor forward(PolarCall<T>& call, Tensor weight, MaybeTensor bias) {
   const auto& kernel = kernels<PolarEmbedKernels<T>>();
   PolarSampleArgs<T>& args = call.args;
   args.tokens = true;
-  PolarEmbedArgs<T> embed{};
-  embed.features = weight.size(0);
-  const Tensor bias = bias_.has_value() ? parameter(call, *bias_) : weight;
-  if (bias_.has_value()) {
-    STD_TORCH_CHECK(bias.dim() == 1 && bias.size(0) == embed.features,
+  weight = checked_weight(call, weight);
+  PolarEmbedArgs<T> embed{.features = weight.size(0)};
+  if (bias) {
+    bias = parameter<T>(*bias);
+    STD_TORCH_CHECK(bias->dim() == 1 && bias->size(0) == embed.features,
                     "polar_embed: bias does not fit the weight");
-    embed.bias = bias.template const_data_ptr<T>();
+    embed.bias = pointer<T>(*bias);
   }
-  const Tensor out =
-      torch::stable::new_empty(call.radii, output_sizes(call, embed.features), call.output_type());
+  const Tensor out = new_empty(call.radii, output_sizes(call, embed.features), call.output_type());
   if (out.numel() == 0) return out;
   args.out = out.mutable_data_ptr();
-  const int64_t wide = padded(embed.features);
-  std::vector<T> transposed(call.token_size() * wide);
-  kernel.transpose(weight.template const_data_ptr<T>(), embed.features, call.token_size(),
-                   transposed.data(), wide);
-  embed.transposed = transposed.data();
-  const int64_t bytes = kernel.scratch(args, embed, PolarPass::forward);
-  call.sample([&] {
-    parallel_ranges(call.batch * call.rings(), [&](int64_t begin, int64_t end) {
-      kernel.forward(args, embed, begin, end, Scratch(bytes).get());
-    });
-  });
+  const Sizes rows_to_pad = {0, 0, 0, padded(embed.features) - embed.features};
+  const Tensor transposed =
+      contiguous(torch::stable::transpose(torch::stable::pad(weight, rows_to_pad), 0, 1));
+  embed.transposed = pointer<T>(transposed);
+  run_with_scratch(call.batch * call.rings(), kernel.scratch(args, embed, PolarPass::forward),
+                   [&](auto... range) { kernel.forward(args, embed, range...); });
   return out;
 }
 
@@ -101,23 +88,21 @@ std::tuple<Tensor, Tensor> weight_gradients(const PolarCall<T>& call,
   const int64_t depth = call.token_size(), row = padded(depth), features = embed.features;
   const int64_t items = call.points() ? call.batch * call.rings() : 0;
   const int64_t chunks = std::min<int64_t>(items, 16);
-  std::vector<T> weights(chunks * features * row, T(0));
-  std::vector<double> biases(chunks * features, 0.0);
-  const int64_t bytes =
-      chunks > 0 ? kernels<PolarEmbedKernels<T>>().scratch(call.args, embed, PolarPass::forward)
-                 : 0;
-  parallel_ranges(chunks, [&](int64_t begin, int64_t end) {
-    const Scratch scratch(bytes);
+  std::vector<T> weights(chunks * features * row);
+  std::vector<double> biases(chunks * features);
+  const auto add_chunks = [&](int64_t begin, int64_t end, void* scratch) {
     for (int64_t chunk = begin; chunk < end; ++chunk) {
       add_weight_gradient(call, embed, items * chunk / chunks, items * (chunk + 1) / chunks,
                           weights.data() + chunk * features * row, biases.data() + chunk * features,
-                          scratch.get());
+                          scratch);
     }
-  });
-  const Tensor weight = torch::stable::new_empty(call.radii, Sizes{features, depth});
-  const Tensor bias = torch::stable::new_empty(call.radii, Sizes{features});
-  T *to_weight = weight.template mutable_data_ptr<T>(),
-    *to_bias = bias.template mutable_data_ptr<T>();
+  };
+  const int64_t bytes =
+      kernels<PolarEmbedKernels<T>>().scratch(call.args, embed, PolarPass::forward);
+  run_with_scratch(chunks, bytes, add_chunks);
+  const Tensor weight = new_empty(call.radii, Sizes{features, depth});
+  const Tensor bias = new_empty(call.radii, Sizes{features});
+  T *to_weight = mutable_pointer<T>(weight), *to_bias = mutable_pointer<T>(bias);
   parallel_ranges(features, [&](int64_t begin, int64_t end) {
     for (int64_t f = begin; f < end; ++f) {
       double sum = 0;
@@ -138,84 +123,55 @@ template <typename T>
 PolarGradients sampling_gradients(PolarCall<T>& call, PolarEmbedArgs<T>& embed,
                                   const Tensor& weight, const PolarWanted& wanted) {
   const auto& kernel = kernels<PolarEmbedKernels<T>>();
-  const int64_t depth = call.token_size(), row = padded(depth);
-  const int64_t images = call.sampled_images();
-  std::vector<T> rows(images > 0 ? embed.features * row : 0, T(0));
-  const T* from = weight.template const_data_ptr<T>();
-  for (int64_t f = 0; images > 0 && f < embed.features; ++f) {
-    std::copy(from + f * depth, from + (f + 1) * depth, rows.begin() + f * row);
-  }
-  embed.weight = rows.data();
-  const bool image_alone = !wanted.lens && !wanted.offsets;
-  if (image_alone && count_bands(call) == 1) {
-    PolarGradients grads(call);
-    grads.image = new_image_gradient(call);
+  const int64_t depth = call.token_size(), images = call.sampled_images();
+  const Tensor rows = torch::stable::pad(weight, Sizes{0, padded(depth) - depth});
+  embed.weight = pointer<T>(rows);
+  if (!wanted.lens && !wanted.offsets && call.count_bands() == 1) {
+    PolarGradients grads = call.no_gradients();
+    grads.image = call.new_image_gradient();
     call.args.bands = 1;
     if (images > 0 && grads.image.numel() > 0) {
-      const int64_t bytes = kernel.scratch(call.args, embed, PolarPass::backward_image);
-      parallel_ranges(images, [&](int64_t begin, int64_t end) {
-        kernel.backward_image(call.args, embed, begin, end, Scratch(bytes).get());
-      });
+      run_with_scratch(images, kernel.scratch(call.args, embed, PolarPass::backward_image),
+                       [&](auto... range) { kernel.backward_image(call.args, embed, range...); });
     }
     return grads;
   }
-  const Tensor grad_samples = torch::stable::new_empty(call.radii, output_sizes(call, depth));
-  embed.grad_samples = grad_samples.template mutable_data_ptr<T>();
-  if (images > 0) {
-    const int64_t bytes = kernel.scratch(call.args, embed, PolarPass::backward_samples);
-    parallel_ranges(images * call.rings(), [&](int64_t begin, int64_t end) {
-      kernel.backward_samples(call.args, embed, begin, end, Scratch(bytes).get());
-    });
-  }
+  const Tensor grad_samples = new_empty(call.radii, output_sizes(call, depth));
+  embed.grad_samples = mutable_pointer<T>(grad_samples);
+  run_with_scratch(images * call.rings(),
+                   kernel.scratch(call.args, embed, PolarPass::backward_samples),
+                   [&](auto... range) { kernel.backward_samples(call.args, embed, range...); });
   call.args.grad_out = embed.grad_samples;
   call.args.narrow = false;
-  return polar_backward(call, wanted);
+  return call.backward(wanted);
 }
 
 template <typename T>
-auto backward(PolarCall<T>&& call, const Tensor& grad_out_, const Tensor& weight_,
-              const PolarWanted& wanted, bool weight_grad) {
-  check_weight(call, weight_);
-  const Tensor grad_out = torch::stable::contiguous(grad_out_);
-  const Tensor weight = parameter(call, weight_);
-  PolarSampleArgs<T>& args = call.args;
-  args.tokens = true;
-  args.bands = 1;
-  PolarEmbedArgs<T> embed{};
-  embed.features = weight.size(0);
-  STD_TORCH_CHECK(grad_out.sizes().vec() == output_sizes(call, embed.features) &&
-                      grad_out.scalar_type() == call.output_type(),
-                  "polar_embed_backward: grad_out must look like the output");
-  args.grad_out = grad_out.const_data_ptr();
-  const Sizes none = {0};
-  Tensor grad_weight = torch::stable::new_empty(call.radii, none), grad_bias = grad_weight;
-  if (weight_grad) {
-    std::tie(grad_weight, grad_bias) = weight_gradients(call, embed);
-  }
-  const bool sampling = wanted.image || wanted.lens || wanted.offsets;
+auto backward(PolarCall<T>& call, Tensor weight, Tensor grad, bool image_grad, bool lens_grad,
+              bool offsets_grad, bool weight_grad) {
+  weight = checked_weight(call, weight);
+  PolarEmbedArgs<T> embed{.features = weight.size(0)};
+  grad =
+      checked_gradient(grad, output_sizes(call, embed.features), call.output_type(), "polar_embed");
+  call.args.tokens = true;
+  call.args.bands = 1;
+  call.args.grad_out = grad.const_data_ptr();
+  Tensor grad_weight = nothing_like(weight), grad_bias = nothing_like(weight);
+  if (weight_grad) std::tie(grad_weight, grad_bias) = weight_gradients(call, embed);
+  const PolarWanted wanted{image_grad, lens_grad, offsets_grad};
+  const bool sampling = image_grad || lens_grad || offsets_grad;
   const PolarGradients grads =
-      sampling ? sampling_gradients(call, embed, weight, wanted) : PolarGradients(call);
+      sampling ? sampling_gradients(call, embed, weight, wanted) : call.no_gradients();
   return std::tuple_cat(grads.tuple(), std::tuple(grad_weight, grad_bias));
 }
 
-Tensor polar_embed(const Sampling& sampling, const Tensor& weight, std::optional<Tensor> bias) {
-  return with_polar_call(sampling,
-                         [&](auto&& call) { return forward(std::move(call), weight, bias); });
-}
-
-auto polar_embed_backward(const Sampling& sampling, const Tensor& weight, const Tensor& grad_out,
-                          bool image_grad, bool lens_grad, bool offsets_grad, bool weight_grad) {
-  return with_polar_call(sampling, [&](auto&& call) {
-    return backward(std::move(call), grad_out, weight, {image_grad, lens_grad, offsets_grad},
-                    weight_grad);
-  });
-}
+using Forward = Listed<forward<float>, forward<double>>;
+using Backward = Listed<backward<float>, backward<double>>;
 
 }  // namespace
 }  // namespace darswin
 
 STABLE_TORCH_LIBRARY_IMPL(darswin, CPU, m) {
-  using namespace darswin;
-  m.impl("polar_embed", TORCH_BOX(&Listed<polar_embed>::call));
-  m.impl("polar_embed_backward", TORCH_BOX(&Listed<polar_embed_backward>::call));
+  m.impl("polar_embed", TORCH_BOX(&darswin::Forward::call));
+  m.impl("polar_embed_backward", TORCH_BOX(&darswin::Backward::call));
 }

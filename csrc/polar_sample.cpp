@@ -1,19 +1,10 @@
 // polar_sample and its backward on CPU: allocate, thread, call the kernel.
-#include <torch/csrc/stable/library.h>
-
-#include <algorithm>
-#include <optional>
-#include <tuple>
-#include <vector>
-
 #include "dispatch.h"
 #include "parallel.h"
 #include "polar_call.h"
 
 namespace darswin {
 namespace {
-
-using torch::stable::Tensor;
 
 template <typename T>
 Sizes output_sizes(const PolarCall<T>& call) {
@@ -32,8 +23,10 @@ int64_t largest_divisor(int64_t number, int64_t most) {
 // whose samples stay in the nearest cache; far, pieces that are about square, whose points share
 // pixels.
 template <typename T>
-void choose_samples(PolarSampleArgs<T>& args) {
+void choose_layout(PolarSampleArgs<T>& args, bool tokens) {
   constexpr int64_t kSide = 16;
+  args.tokens = tokens;
+  if (tokens) return;
   const bool near = args.packed;
   args.samples_r = near ? 1 : largest_divisor(args.num_radii, kSide);
   args.samples_a =
@@ -41,55 +34,35 @@ void choose_samples(PolarSampleArgs<T>& args) {
 }
 
 template <typename T>
-Tensor forward(PolarCall<T>&& call, bool tokens) {
+Tensor forward(PolarCall<T>& call, bool tokens) {
   PolarSampleArgs<T>& args = call.args;
-  args.tokens = tokens;
-  if (!tokens) choose_samples(args);
-  const Tensor out = torch::stable::new_empty(call.radii, output_sizes(call), call.output_type());
+  choose_layout(args, tokens);
+  const Tensor out = new_empty(call.radii, output_sizes(call), call.output_type());
   if (out.numel() == 0) return out;
   ask_for_large_pages(out);
   args.out = out.mutable_data_ptr();
   const auto& kernel = kernels<PolarSampleKernels<T>>();
-  const int64_t bytes = kernel.scratch(args, PolarPass::forward);
-  call.sample([&] {
-    parallel_ranges(call.batch * call.rings(), [&](int64_t begin, int64_t end) {
-      kernel.forward(args, begin, end, Scratch(bytes).get());
-    });
-  });
+  run_with_scratch(call.batch * call.rings(), kernel.scratch(args, PolarPass::forward),
+                   [&](auto... range) { kernel.forward(args, range...); });
   return out;
 }
 
 template <typename T>
-auto backward(PolarCall<T>&& call, const Tensor& grad_out_, bool tokens,
-              const PolarWanted& wanted) {
-  PolarSampleArgs<T>& args = call.args;
-  args.tokens = tokens;
-  if (!tokens) choose_samples(args);
-  // Gradients arrive expanded or strided: `.sum().backward()` gives stride 0.
-  const Tensor grad_out = torch::stable::contiguous(grad_out_);
-  STD_TORCH_CHECK(
-      grad_out.sizes().vec() == output_sizes(call) && grad_out.scalar_type() == call.output_type(),
-      "polar_sample_backward: grad_out must look like the output");
-  args.grad_out = grad_out.const_data_ptr();
-  return polar_backward(call, wanted).tuple();
+auto backward(PolarCall<T>& call, bool tokens, Tensor grad, bool image_grad, bool lens_grad,
+              bool offsets_grad) {
+  choose_layout(call.args, tokens);
+  grad = checked_gradient(grad, output_sizes(call), call.output_type(), "polar_sample");
+  call.args.grad_out = grad.const_data_ptr();
+  return call.backward({image_grad, lens_grad, offsets_grad}).tuple();
 }
 
-Tensor polar_sample(const Sampling& sampling, bool tokens) {
-  return with_polar_call(sampling, [&](auto&& call) { return forward(std::move(call), tokens); });
-}
-
-auto polar_sample_backward(const Sampling& sampling, bool tokens, const Tensor& grad_out,
-                           bool image_grad, bool lens_grad, bool offsets_grad) {
-  return with_polar_call(sampling, [&](auto&& call) {
-    return backward(std::move(call), grad_out, tokens, {image_grad, lens_grad, offsets_grad});
-  });
-}
+using Forward = Listed<forward<float>, forward<double>>;
+using Backward = Listed<backward<float>, backward<double>>;
 
 }  // namespace
 }  // namespace darswin
 
 STABLE_TORCH_LIBRARY_IMPL(darswin, CPU, m) {
-  using namespace darswin;
-  m.impl("polar_sample", TORCH_BOX(&Listed<polar_sample>::call));
-  m.impl("polar_sample_backward", TORCH_BOX(&Listed<polar_sample_backward>::call));
+  m.impl("polar_sample", TORCH_BOX(&darswin::Forward::call));
+  m.impl("polar_sample_backward", TORCH_BOX(&darswin::Backward::call));
 }

@@ -1,37 +1,21 @@
 // polar_to_image and its backward on CPU: check, allocate, thread, call the kernel.
-// The checks here only keep memory safe; darswin/ops/polar_to_image.py explains wrong arguments.
 #include "polar_to_image.h"
 
-#include <torch/csrc/stable/library.h>
-#include <torch/csrc/stable/ops.h>
-#include <torch/csrc/stable/tensor.h>
-#include <torch/headeronly/util/Exception.h>
-
-#include <algorithm>
-#include <optional>
 #include <tuple>
-#include <utility>
 #include <vector>
 
+#include "checks.h"
 #include "dispatch.h"
 #include "parallel.h"
-#include "polar_call.h"
 
 namespace darswin {
 namespace {
 
-using torch::headeronly::ScalarType;
-using torch::stable::Tensor;
-using MaybeTensor = std::optional<Tensor>;
-
-MaybeTensor contiguous(const MaybeTensor& tensor) {
-  if (!tensor) return tensor;
-  return torch::stable::contiguous(*tensor);
-}
+constexpr char kName[] = "polar_to_image";
 
 // One call's arguments as the kernels take them. Owns what `args` points into.
 template <typename T>
-struct Call {
+struct ToImageCall {
   using Real = Arithmetic<T>;
 
   Tensor x, radii;
@@ -39,59 +23,47 @@ struct Call {
   std::vector<double> plane;
   PolarToImageArgs<T> args{};
 
-  Call(const Tensor& x_, const Tensor& radii_, const MaybeTensor& center_,
-       const MaybeTensor& affine_, const MaybeTensor& points_, const MaybeTensor& r_max_,
-       const Sizes& size, bool tokens)
-      : x(torch::stable::contiguous(x_)),
-        radii(torch::stable::contiguous(radii_)),
+  ToImageCall(const Tensor& x_, const Tensor& radii_, const MaybeTensor& center_,
+              const MaybeTensor& affine_, const MaybeTensor& points_, const MaybeTensor& r_max_,
+              const Sizes& size, bool tokens)
+      : x(contiguous(x_)),
+        radii(contiguous(radii_)),
         center(contiguous(center_)),
         affine(contiguous(affine_)),
         points(contiguous(points_)),
         r_max(contiguous(r_max_)) {
     STD_TORCH_CHECK(x.dim() == 4 && x.size(1) > 0 && x.size(2) > 0 && size.size() == 2 &&
                         size[0] >= 0 && size[1] >= 0,
-                    "polar_to_image: x must be (B, R, A, D) and size (H, W)");
+                    kName, ": x must be (B, R, A, D) and size (H, W)");
     args.batch = x.size(0), args.rings = x.size(1), args.sectors = x.size(2);
     args.channels = x.size(3), args.height = size[0], args.width = size[1], args.tokens = tokens;
     check_product({args.batch, args.height, args.width, args.channels});
     check_product({args.batch, args.height, args.rings + kSums});
-    STD_TORCH_CHECK(args.rings <= INT32_MAX / args.sectors, "polar_to_image: too many tokens");
+    STD_TORCH_CHECK(args.rings <= INT32_MAX / args.sectors, kName, ": too many tokens");
     check_product({args.rings, args.sectors, std::max(args.channels, kChannelBlock)});
-    STD_TORCH_CHECK(center.has_value() != points.has_value() && !(points && affine),
-                    "polar_to_image: takes center, and affine if need be, or else points");
-    args.radii_rows = checked(radii, {args.rings});
-    args.place_rows = center ? checked(*center, {2}) : checked(*points, {size[0], size[1], 2});
-    args.r_max_rows = r_max ? checked(*r_max, {}) : 1;
-    args.x = static_cast<const T*>(x.const_data_ptr());
-    args.radii = pointer(radii);
-    args.r_max = r_max ? pointer(*r_max) : nullptr;
-    args.points = points ? pointer(*points) : nullptr;
+    STD_TORCH_CHECK(center.has_value() != points.has_value() && !(points && affine), kName,
+                    ": takes center, and affine if need be, or else points");
+    args.radii_rows = rows(radii, {args.rings});
+    args.place_rows = center ? rows(*center, {2}) : rows(*points, {size[0], size[1], 2});
+    args.r_max_rows = r_max ? rows(*r_max, {}) : 1;
+    args.x = pointer<T>(x);
+    args.radii = pointer<Real>(radii);
+    args.r_max = r_max ? pointer<Real>(*r_max) : nullptr;
+    args.points = points ? pointer<Real>(*points) : nullptr;
     if (center) find_plane();
     args.bands = 1;
     const bool shared = args.radii_rows == 1 && args.place_rows == 1;
     args.lenses = shared ? 1 : args.batch;
   }
 
-  // How many rows a tensor (B or 1, sizes...) has.
-  int64_t checked(const Tensor& tensor, const Sizes& sizes) const {
-    constexpr auto type = sizeof(Real) == sizeof(float) ? ScalarType::Float : ScalarType::Double;
-    const auto given = tensor.sizes().vec();
-    STD_TORCH_CHECK(tensor.is_cpu() && tensor.scalar_type() == type &&
-                        given.size() == sizes.size() + 1 &&
-                        (given[0] == 1 || given[0] == args.batch) &&
-                        std::equal(sizes.begin(), sizes.end(), given.begin() + 1),
-                    "polar_to_image: radii, center, affine, points and r_max must fit x");
-    return given[0];
-  }
-
-  static const Real* pointer(const Tensor& tensor) {
-    return static_cast<const Real*>(tensor.const_data_ptr());
+  int64_t rows(const Tensor& tensor, const Sizes& sizes) const {
+    return count_rows<Real>(tensor, args.batch, sizes, kName);
   }
 
   // The centres, and the matrices undone; a singular one leaves nothing that is finite.
   void find_plane() {
-    const int64_t matrices = affine ? checked(*affine, {2, 2}) : 1;
-    const Real *c = pointer(*center), *m = affine ? pointer(*affine) : nullptr;
+    const int64_t matrices = affine ? rows(*affine, {2, 2}) : 1;
+    const Real *c = pointer<Real>(*center), *m = affine ? pointer<Real>(*affine) : nullptr;
     if (args.place_rows == 1) args.place_rows = matrices;
     for (int64_t n = 0; n < args.place_rows; ++n) {
       const Real* at = c + (center->size(0) == 1 ? 0 : 2 * n);
@@ -114,19 +86,18 @@ struct Call {
 
   template <typename Kernel>
   void run(int64_t items, Kernel kernel) {
-    const int64_t bytes = kernels<PolarToImageKernels<T>>().scratch(args);
-    parallel_ranges(
-        items, [&](int64_t begin, int64_t end) { kernel(args, begin, end, Scratch(bytes).get()); });
+    run_with_scratch(items, kernels<PolarToImageKernels<T>>().scratch(args),
+                     [&](auto... range) { kernel(args, range...); });
   }
 };
 
 template <typename T>
-Tensor forward(Call<T>&& call) {
+Tensor forward(ToImageCall<T>&& call) {
   auto& args = call.args;
-  const Tensor out = torch::stable::new_empty(call.x, call.output_sizes());
+  const Tensor out = new_empty(call.x, call.output_sizes());
   if (out.numel() == 0) return out;
   ask_for_large_pages(out);
-  args.out = static_cast<T*>(out.mutable_data_ptr());
+  args.out = mutable_pointer<T>(out);
   call.run(args.batch * args.height, kernels<PolarToImageKernels<T>>().forward);
   return out;
 }
@@ -142,29 +113,28 @@ int64_t count_bands(const PolarToImageArgs<T>& args) {
 }
 
 template <typename T>
-Tensor map_gradient(Call<T>& call) {
+Tensor map_gradient(ToImageCall<T>& call) {
   auto& args = call.args;
   const auto& kernel = kernels<PolarToImageKernels<T>>();
   const int64_t pixels = args.height * args.width;
-  if (call.x.numel() == 0 || pixels == 0) return torch::stable::new_zeros(call.x, call.x.sizes());
-  const Tensor grad = torch::stable::new_empty(call.x, call.x.sizes());
+  if (call.x.numel() == 0 || pixels == 0) return new_zeros(call.x, call.x.sizes());
+  const Tensor grad = new_empty(call.x, call.x.sizes());
   ask_for_large_pages(grad);
-  args.grad_x = static_cast<T*>(grad.mutable_data_ptr());
+  args.grad_x = mutable_pointer<T>(grad);
   args.bands = count_bands(args);
   std::vector<Arithmetic<T>> partial(args.bands > 1 ? args.bands * grad.numel() : 0);
   args.partial = partial.data();
   const int64_t blocks = (args.channels + kChannelBlock - 1) / kChannelBlock;
   call.run(args.batch * args.bands * blocks, kernel.backward_map);
   if (args.bands > 1) {
-    parallel_ranges(grad.numel(),
-                    [&](int64_t begin, int64_t end) { kernel.sum_bands(args, begin, end); });
+    parallel_ranges(grad.numel(), [&](auto... range) { kernel.sum_bands(args, range...); });
   }
   return grad;
 }
 
 // The gradients of radii, center, affine and points, in this order.
 template <typename T>
-std::vector<Tensor> lens_gradients(Call<T>& call) {
+std::vector<Tensor> lens_gradients(ToImageCall<T>& call) {
   auto& args = call.args;
   const int64_t row = args.rings + kSums;
   std::vector<double> sums(args.lenses * args.height * row, 0.0);
@@ -180,15 +150,13 @@ std::vector<Tensor> lens_gradients(Call<T>& call) {
   }
   // The gradient of a tensor, for which add(lens, its values) adds up what a lens gives.
   const auto summed = [&](const MaybeTensor& of, auto add) {
-    if (!of) return torch::stable::new_empty(call.radii, Sizes{0});
-    const Tensor grad = torch::stable::new_empty(*of, of->sizes());
+    if (!of) return nothing_like(call.radii);
     const int64_t values = of->size(0) == 0 ? 0 : of->numel() / of->size(0);
     std::vector<double> total(of->numel(), 0.0);
     for (int64_t n = 0; n < args.lenses && of->size(0) > 0; ++n) {
       add(n, total.data() + (of->size(0) == 1 ? 0 : n * values));
     }
-    std::copy(total.begin(), total.end(), static_cast<Arithmetic<T>*>(grad.mutable_data_ptr()));
-    return grad;
+    return rounded_like<Arithmetic<T>>(*of, total);
   };
   const auto on_plane = [&](int64_t n) {
     return args.plane + (args.place_rows == 1 ? 0 : n) * kPlane;
@@ -221,50 +189,30 @@ std::vector<Tensor> lens_gradients(Call<T>& call) {
 }
 
 template <typename T>
-auto backward(Call<T>&& call, const Tensor& grad_out_, bool x_grad, bool lens_grad) {
-  // Gradients arrive expanded or strided: `.sum().backward()` gives stride 0.
-  const Tensor grad_out = torch::stable::contiguous(grad_out_);
-  STD_TORCH_CHECK(grad_out.sizes().vec() == call.output_sizes() && grad_out.is_cpu() &&
-                      grad_out.scalar_type() == call.x.scalar_type(),
-                  "polar_to_image_backward: grad_out must look like the output");
-  call.args.grad_out = static_cast<const T*>(grad_out.const_data_ptr());
-  const Tensor none = torch::stable::new_empty(call.radii, Sizes{0});
-  std::vector<Tensor> lens(4, none);
+std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> backward(ToImageCall<T>&& call, Tensor grad,
+                                                            bool x_grad, bool lens_grad) {
+  grad = checked_gradient(grad, call.output_sizes(), call.x.scalar_type(), kName);
+  call.args.grad_out = pointer<T>(grad);
+  std::vector<Tensor> lens(4, nothing_like(call.radii));
   if (lens_grad) lens = lens_gradients(call);
-  const Tensor x = x_grad ? map_gradient(call) : torch::stable::new_empty(call.x, Sizes{0});
-  return std::tuple(x, lens[0], lens[1], lens[2], lens[3]);
-}
-
-// use(Call) for the type of x.
-template <typename Use>
-auto with_call(Use use, const Tensor& x, const Tensor& radii, const MaybeTensor& center,
-               const MaybeTensor& affine, const MaybeTensor& points, const MaybeTensor& r_max,
-               const Sizes& size, bool tokens) {
-  STD_TORCH_CHECK(x.is_cpu(), "polar_to_image: x must be on the CPU");
-  switch (x.scalar_type()) {
-    case ScalarType::Float:
-      return use(Call<float>(x, radii, center, affine, points, r_max, size, tokens));
-    case ScalarType::Double:
-      return use(Call<double>(x, radii, center, affine, points, r_max, size, tokens));
-    default:
-      STD_TORCH_CHECK(x.scalar_type() == ScalarType::BFloat16,
-                      "polar_to_image: x must be float32, float64 or bfloat16");
-      return use(Call<bfloat16>(x, radii, center, affine, points, r_max, size, tokens));
-  }
+  const Tensor x = x_grad ? map_gradient(call) : nothing_like(call.x);
+  return {x, lens[0], lens[1], lens[2], lens[3]};
 }
 
 Tensor polar_to_image(Tensor x, Tensor radii, MaybeTensor center, MaybeTensor affine,
                       MaybeTensor points, MaybeTensor r_max, Sizes size, bool tokens) {
-  return with_call([](auto&& call) { return forward(std::move(call)); }, x, radii, center, affine,
-                   points, r_max, size, tokens);
+  return with_real_type(x, kName, [&]<typename T>() {
+    return forward(ToImageCall<T>(x, radii, center, affine, points, r_max, size, tokens));
+  });
 }
 
-std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> polar_to_image_backward(
-    Tensor x, Tensor radii, MaybeTensor center, MaybeTensor affine, MaybeTensor points,
-    MaybeTensor r_max, Sizes size, bool tokens, Tensor grad_out, bool x_grad, bool lens_grad) {
-  return with_call(
-      [&](auto&& call) { return backward(std::move(call), grad_out, x_grad, lens_grad); }, x, radii,
-      center, affine, points, r_max, size, tokens);
+auto polar_to_image_backward(Tensor x, Tensor radii, MaybeTensor center, MaybeTensor affine,
+                             MaybeTensor points, MaybeTensor r_max, Sizes size, bool tokens,
+                             Tensor grad, bool x_grad, bool lens_grad) {
+  return with_real_type(x, kName, [&]<typename T>() {
+    return backward(ToImageCall<T>(x, radii, center, affine, points, r_max, size, tokens), grad,
+                    x_grad, lens_grad);
+  });
 }
 
 }  // namespace

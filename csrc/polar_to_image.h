@@ -3,7 +3,7 @@
 
 #include <cstdint>
 
-#include "bfloat16.h"
+#include "numbers.h"
 #include "tier.h"
 
 namespace darswin {

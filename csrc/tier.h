@@ -14,10 +14,14 @@ namespace darswin {
 enum class Tier { generic, avx2, avx512 };
 
 // The kernels of one operator on one tier. `Table` is a struct of function pointers, which the
-// operator's header declares; kernels/OPERATOR.cpp defines `table`.
+// operator's header declares; kernels/OPERATOR.cpp defines `table`, on the tier that is compiled,
+// as TIER_TABLE(Table) = {...};
 template <typename Table, Tier tier>
 struct Kernels {
   static const Table table;
 };
+#define TIER_TABLE(...) \
+  template <>           \
+  constinit const __VA_ARGS__ Kernels<__VA_ARGS__, Tier::TIER>::table
 
 }  // namespace darswin

@@ -30,7 +30,7 @@ std::tuple<Tensor, Tensor> transpose_sum(const Tensor& x) {
   const int64_t groups = (rows + kGroupRows - 1) / kGroupRows;
   const Tensor transposed = torch::stable::new_empty(x, std::vector<int64_t>{columns, rows});
   const Tensor sum = torch::stable::new_empty(x, std::vector<int64_t>{columns});
-  const Scratch memory(groups * columns * sizeof(float));
+  const ThreadMemory memory(groups * columns * sizeof(float));
   auto* sums = static_cast<float*>(memory.get());
   const TransposeSumArgs args{.from = static_cast<const float*>(x.const_data_ptr()),
                               .to = static_cast<float*>(transposed.mutable_data_ptr()),

@@ -9,41 +9,22 @@
 #include "../add_norm.h"
 
 #include "quantize.h"
-#include "simd.h"
 
 namespace darswin {
 namespace {
 
 constexpr int64_t kL = kLanes<float>;
 
-// Lanes of V, which is Floats or float, as they are stored.
-template <typename V>
-inline V read(const float* from) {
-  return load_bits<V>(from);
-}
-template <typename V>
-inline V read(const bfloat16* from) {
-  if constexpr (kSame<V, float>) {
-    return widen(*from);
-  } else {
-    return widen_lanes(from);
-  }
-}
 // Stores v, and returns what is stored: v, or its bfloat16.
 template <typename V>
 inline V write(float* to, V v) {
-  store_bits(to, v);
+  store(to, v);
   return v;
 }
 template <typename V>
 inline V write(bfloat16* to, V v) {
-  if constexpr (kSame<V, float>) {
-    *to = narrow(v);
-    return widen(*to);
-  } else {
-    narrow_lanes(to, v);
-    return (V)(rounded(v) & 0xFFFF0000);
-  }
+  store(to, v);
+  return __builtin_bit_cast(V, rounded(v) & 0xFFFF0000);
 }
 
 // body<V>(column, turn) on whole registers of a row, and on the columns that are left. Turns go 0,
@@ -92,15 +73,15 @@ void add_norm_rows(const AddNormArgs<S, Out>& a, int64_t begin, int64_t end) {
     Out* out = a.out + row * a.width;
     Sum values, rest, squares;
     if (y == nullptr) {
-      along(a.width, [&]<typename V>(int64_t c, int turn) { values.add(read<V>(x + c), turn); });
+      along(a.width, [&]<typename V>(int64_t c, int turn) { values.add(load<V>(x + c), turn); });
     } else {
       along(a.width, [&]<typename V>(int64_t c, int turn) {
-        values.add(write(x + c, read<V>(x + c) + read<V>(y + c)), turn);
+        values.add(write(x + c, load<V>(x + c) + load<V>(y + c)), turn);
       });
     }
     const float mean = values.all() * part;
     along(a.width, [&]<typename V>(int64_t c, int turn) {
-      const V left = read<V>(x + c) - mean;
+      const V left = load<V>(x + c) - mean;
       rest.add(left, turn);
       squares.add(left * left, turn);
     });
@@ -108,12 +89,12 @@ void add_norm_rows(const AddNormArgs<S, Out>& a, int64_t begin, int64_t end) {
     const float scale = 1 / __builtin_sqrtf((variance < 0 ? 0 : variance) + a.eps);
     const float shift = more * scale;
     along(a.width, [&]<typename V>(int64_t c, int) {
-      const V unit = (read<V>(x + c) - mean) * scale - shift;
-      const V normalized = unit * read<V>(a.weight + c) + read<V>(a.bias + c);
-      if constexpr (kSame<Out, uint8_t>) {
+      const V unit = (load<V>(x + c) - mean) * scale - shift;
+      const V normalized = unit * load<V>(a.weight + c) + load<V>(a.bias + c);
+      if constexpr (is_same_v<Out, uint8_t>) {
         quantize(out + c, normalized);
       } else {
-        write(out + c, normalized);
+        store(out + c, normalized);
       }
     });
   }
@@ -121,14 +102,8 @@ void add_norm_rows(const AddNormArgs<S, Out>& a, int64_t begin, int64_t end) {
 
 }  // namespace
 
-template <>
-constinit const AddNormKernels<float, float>
-    Kernels<AddNormKernels<float, float>, Tier::TIER>::table = {.rows = add_norm_rows};
-template <>
-constinit const AddNormKernels<bfloat16, bfloat16>
-    Kernels<AddNormKernels<bfloat16, bfloat16>, Tier::TIER>::table = {.rows = add_norm_rows};
-template <>
-constinit const AddNormKernels<float, uint8_t>
-    Kernels<AddNormKernels<float, uint8_t>, Tier::TIER>::table = {.rows = add_norm_rows};
+TIER_TABLE(AddNormKernels<float, float>) = {.rows = add_norm_rows};
+TIER_TABLE(AddNormKernels<bfloat16, bfloat16>) = {.rows = add_norm_rows};
+TIER_TABLE(AddNormKernels<float, uint8_t>) = {.rows = add_norm_rows};
 
 }  // namespace darswin

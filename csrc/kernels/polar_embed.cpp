@@ -9,14 +9,13 @@
 #include "polar_rows.h"
 #include "polar_sampler.h"
 #include "polar_scatter.h"
-#include "transpose.h"
 
 namespace darswin {
 namespace {
 
 // Scratch of one thread, part after part.
 template <typename T>
-struct Scratch {
+struct EmbedScratch {
   int64_t depth, row, wide;  // samples of a token, and padded; padded features
   char *sampler, *scatter;
   T* samples;   // (A, row)
@@ -24,7 +23,8 @@ struct Scratch {
   T* grads;     // (A, D)
   int64_t bytes;
 
-  Scratch(const PolarSampleArgs<T>& a, const PolarEmbedArgs<T>& e, PolarPass pass, void* memory)
+  EmbedScratch(const PolarSampleArgs<T>& a, const PolarEmbedArgs<T>& e, PolarPass pass,
+               void* memory)
       : depth(a.samples_r * a.samples_a * a.channels),
         row(round_up(depth, kRowUnit)),
         wide(round_up(e.features, kRowUnit)) {
@@ -47,7 +47,7 @@ int64_t sectors_of(const PolarSampleArgs<T>& a) {
 template <typename T>
 void embed(const PolarSampleArgs<T>& a, const PolarEmbedArgs<T>& e, int64_t begin, int64_t end,
            void* scratch) {
-  const Scratch<T> s(a, e, PolarPass::forward, scratch);
+  const EmbedScratch<T> s(a, e, PolarPass::forward, scratch);
   const int64_t rings = a.num_radii / a.samples_r, sectors = sectors_of(a);
   Sampler<T> sampler(a, s.row, a.samples_a * a.channels, s.sampler);
   // The product is written straight into the output if rows there are whole registers of the type
@@ -67,9 +67,9 @@ void embed(const PolarSampleArgs<T>& a, const PolarEmbedArgs<T>& e, int64_t begi
     for (int64_t t = 0; t < sectors && !in_place; ++t) {
       const int64_t to = first + t * e.features;
       const T* from = s.products + t * s.wide;
-      if constexpr (kSame<T, float>) {
+      if constexpr (is_same_v<T, float>) {
         if (a.narrow) {
-          narrow_all(from, e.features, static_cast<bfloat16*>(a.out) + to);
+          copy(from, e.features, static_cast<bfloat16*>(a.out) + to);
           continue;
         }
       }
@@ -81,12 +81,12 @@ void embed(const PolarSampleArgs<T>& a, const PolarEmbedArgs<T>& e, int64_t begi
 // The gradients (A, D) of a ring's tokens, in the type that is computed in.
 template <typename T>
 const T* ring_grads(const PolarSampleArgs<T>& a, const PolarEmbedArgs<T>& e, int64_t item,
-                    const Scratch<T>& s) {
+                    const EmbedScratch<T>& s) {
   const int64_t count = sectors_of(a) * e.features;
   if (!a.narrow) return static_cast<const T*>(a.grad_out) + item * count;
   if constexpr (sizeof(T) == sizeof(float)) {
     const bfloat16* from = static_cast<const bfloat16*>(a.grad_out) + item * count;
-    for (int64_t n = 0; n < count; ++n) s.grads[n] = widen(from[n]);
+    copy(from, count, s.grads);
   }
   return s.grads;
 }
@@ -94,7 +94,7 @@ const T* ring_grads(const PolarSampleArgs<T>& a, const PolarEmbedArgs<T>& e, int
 template <typename T>
 void backward_weight(const PolarSampleArgs<T>& a, const PolarEmbedArgs<T>& e, int64_t begin,
                      int64_t end, T* weight, double* bias, void* scratch) {
-  const Scratch<T> s(a, e, PolarPass::forward, scratch);
+  const EmbedScratch<T> s(a, e, PolarPass::forward, scratch);
   const int64_t rings = a.num_radii / a.samples_r, sectors = sectors_of(a);
   Sampler<T> sampler(a, s.row, a.samples_a * a.channels, s.sampler);
   for (int64_t item = begin; item < end; ++item) {
@@ -111,7 +111,7 @@ void backward_weight(const PolarSampleArgs<T>& a, const PolarEmbedArgs<T>& e, in
 // The gradients of a ring's samples, (A, row) in s.samples.
 template <typename T>
 void sample_grads(const PolarSampleArgs<T>& a, const PolarEmbedArgs<T>& e, int64_t item,
-                  const Scratch<T>& s) {
+                  const EmbedScratch<T>& s) {
   const int64_t sectors = sectors_of(a);
   for (int64_t n = 0; n < sectors * s.row; ++n) s.samples[n] = 0;
   add_product(sectors, s.row, e.features, ring_grads(a, e, item, s), e.features, 1, e.weight, s.row,
@@ -121,7 +121,7 @@ void sample_grads(const PolarSampleArgs<T>& a, const PolarEmbedArgs<T>& e, int64
 template <typename T>
 void backward_samples(const PolarSampleArgs<T>& a, const PolarEmbedArgs<T>& e, int64_t begin,
                       int64_t end, void* scratch) {
-  const Scratch<T> s(a, e, PolarPass::backward_samples, scratch);
+  const EmbedScratch<T> s(a, e, PolarPass::backward_samples, scratch);
   const int64_t sectors = sectors_of(a);
   for (int64_t item = begin; item < end; ++item) {
     sample_grads(a, e, item, s);
@@ -134,7 +134,7 @@ void backward_samples(const PolarSampleArgs<T>& a, const PolarEmbedArgs<T>& e, i
 template <typename T>
 void backward_image(const PolarSampleArgs<T>& args, const PolarEmbedArgs<T>& e, int64_t begin,
                     int64_t end, void* scratch) {
-  const Scratch<T> s(args, e, PolarPass::backward_image, scratch);
+  const EmbedScratch<T> s(args, e, PolarPass::backward_image, scratch);
   PolarSampleArgs<T> a = args;
   a.narrow = false;  // the gradients of the samples are not
   const int64_t rings = a.num_radii / a.samples_r, piece = a.samples_a * a.channels;
@@ -151,35 +151,12 @@ void backward_image(const PolarSampleArgs<T>& args, const PolarEmbedArgs<T>& e, 
 }
 
 template <typename T>
-void transposed(const T* from, int64_t rows, int64_t columns, T* to, int64_t to_stride) {
-  using V = Vector<T, 4>;
-  int64_t i = 0;
-  for (; i + 4 <= rows; i += 4) {
-    int64_t j = 0;
-    for (; j + 4 <= columns; j += 4) {
-      const T* block = from + i * columns + j;
-      const V a = load<V>(block), b = load<V>(block + columns);
-      const V c = load<V>(block + 2 * columns), d = load<V>(block + 3 * columns);
-      T* target = to + j * to_stride + i;
-      transpose4(a, b, c, d, target, to_stride);
-    }
-    for (; j < columns; ++j) {
-      for (int64_t r = i; r < i + 4; ++r) to[j * to_stride + r] = from[r * columns + j];
-    }
-  }
-  for (; i < rows; ++i) {
-    for (int64_t j = 0; j < columns; ++j) to[j * to_stride + i] = from[i * columns + j];
-  }
-}
-
-template <typename T>
 int64_t scratch_bytes(const PolarSampleArgs<T>& a, const PolarEmbedArgs<T>& e, PolarPass pass) {
-  return Scratch<T>(a, e, pass, nullptr).bytes;
+  return EmbedScratch<T>(a, e, pass, nullptr).bytes;
 }
 
 template <typename T>
-constexpr PolarEmbedKernels<T> kTable = {.transpose = transposed<T>,
-                                         .scratch = scratch_bytes<T>,
+constexpr PolarEmbedKernels<T> kTable = {.scratch = scratch_bytes<T>,
                                          .forward = embed<T>,
                                          .backward_weight = backward_weight<T>,
                                          .backward_samples = backward_samples<T>,
@@ -187,11 +164,7 @@ constexpr PolarEmbedKernels<T> kTable = {.transpose = transposed<T>,
 
 }  // namespace
 
-template <>
-constinit const PolarEmbedKernels<float> Kernels<PolarEmbedKernels<float>, Tier::TIER>::table =
-    kTable<float>;
-template <>
-constinit const PolarEmbedKernels<double> Kernels<PolarEmbedKernels<double>, Tier::TIER>::table =
-    kTable<double>;
+TIER_TABLE(PolarEmbedKernels<float>) = kTable<float>;
+TIER_TABLE(PolarEmbedKernels<double>) = kTable<double>;
 
 }  // namespace darswin

@@ -1,33 +1,18 @@
 // Bilinear interpolation in a far image, where it lies: four points at a time where the channels
-// are planes, a point with all its channels at a time where a pixel's channels lie together, and
-// value by value in other layouts and for points that are not inside.
+// are planes, sixteen by gathers where the CPU is fast at them, a point with all its channels at a
+// time where a pixel's channels lie together, and value by value in other layouts and for points
+// that are not inside.
 #pragma once
 
-#include "polar_far_block.h"
 #include "polar_image.h"
 
 namespace darswin {
 namespace {
 
-// `N` values that lie together, as floats.
-template <int N>
-inline Vector<float, N> floats(const float* from) {
-  return load<Vector<float, N>>(from);
-}
-template <int N>
-inline Vector<float, N> floats(const bfloat16* from) {
-  const auto bits = load_bits<Vector<uint16_t, N>>(from);
-  return (Vector<float, N>)(__builtin_convertvector(bits, Vector<uint32_t, N>) << 16);
-}
-template <int N>
-inline Vector<float, N> floats(const uint8_t* from) {
-  return __builtin_convertvector(load_bits<Vector<uint8_t, N>>(from), Vector<float, N>);
-}
-
-// Two of them from here and two from there.
+// Two values from here and two from there, as floats.
 template <typename E>
 inline Vector<float, 4> two_pairs(const E* here, const E* there) {
-  if constexpr (kSame<E, float>) {
+  if constexpr (is_same_v<E, float>) {
     using Pairs = Vector<double, 2>;
     double first, second;
     __builtin_memcpy(&first, here, 8);
@@ -37,8 +22,62 @@ inline Vector<float, 4> two_pairs(const E* here, const E* there) {
     E both[4];
     __builtin_memcpy(both, here, 2 * sizeof(E));
     __builtin_memcpy(both + 2, there, 2 * sizeof(E));
-    return floats<4>(both);
+    return load<Vector<float, 4>>(both);
   }
+}
+
+// The pixels around sixteen points, for registers of 512 bits. Gathers bring a pixel and its right
+// neighbour as one value of 64 bits. A template, since only tiers with such registers have
+// gather_pairs and permuted.
+template <typename T>
+struct FarSixteen {
+  using V = Vector<T, 16>;
+  using Offsets = Vector<int64_t, 32 / sizeof(T)>;
+  using Index = Vector<int32_t, 16>;
+
+  Offsets offset, offset2;  // of the upper left pixels
+  V up, up2, down, down2;   // weights of the upper and the lower pixels, each twice
+  V left, right;
+
+  FarSixteen(const FarPlaces<T>& places, int64_t k)
+      : offset(load<Offsets>(places.offset + k)), offset2(load<Offsets>(places.offset + k + 8)) {
+    constexpr Index twice = {0, 0, 1, 1, 2, 2, 3, 3, 4, 4, 5, 5, 6, 6, 7, 7};
+    const V lower = load<V>(places.lower + k);
+    down = permuted(lower, twice);
+    down2 = permuted(lower, twice + 8);
+    up = 1 - down, up2 = 1 - down2;
+    right = load<V>(places.right + k);
+    left = 1 - right;
+  }
+
+  bool inside() const { return !any_negative(offset | offset2); }
+
+  // Bilinear samples of a plane whose rows are `below` apart.
+  V sample(const T* plane, int64_t below) const {
+    const T* bottom = plane + below;
+    const V pairs = between(gather_pairs(plane, offset), gather_pairs(bottom, offset), up, down);
+    const V pairs2 =
+        between(gather_pairs(plane, offset2), gather_pairs(bottom, offset2), up2, down2);
+    const V l = __builtin_shufflevector(pairs, pairs2, 0, 2, 4, 6, 8, 10, 12, 14, 16, 18, 20, 22,
+                                        24, 26, 28, 30);
+    const V r = __builtin_shufflevector(pairs, pairs2, 1, 3, 5, 7, 9, 11, 13, 15, 17, 19, 21, 23,
+                                        25, 27, 29, 31);
+    return between(l, r, left, right);
+  }
+};
+
+// Sixteen samples of three channels, one behind the other.
+template <typename T, typename V = Vector<T, 16>>
+inline void store_sixteen(const V& x, const V& y, const V& z, T* to) {
+  const V a = __builtin_shufflevector(x, y, 0, 16, 0, 1, 17, 0, 2, 18, 0, 3, 19, 0, 4, 20, 0, 5);
+  const V b = __builtin_shufflevector(x, y, 21, 0, 6, 22, 0, 7, 23, 0, 8, 24, 0, 9, 25, 0, 10, 26);
+  const V c =
+      __builtin_shufflevector(x, y, 0, 11, 27, 0, 12, 28, 0, 13, 29, 0, 14, 30, 0, 15, 31, 0);
+  store(to, __builtin_shufflevector(a, z, 0, 1, 16, 3, 4, 17, 6, 7, 18, 9, 10, 19, 12, 13, 20, 15));
+  store(to + 16,
+        __builtin_shufflevector(b, z, 0, 21, 2, 3, 22, 5, 6, 23, 8, 9, 24, 11, 12, 25, 14, 15));
+  store(to + 32,
+        __builtin_shufflevector(c, z, 26, 1, 2, 27, 4, 5, 28, 7, 8, 29, 10, 11, 30, 13, 14, 31));
 }
 
 // Where the samples of a line go: sample k to to[k * step]. A store of four values may reach beyond
@@ -81,19 +120,34 @@ class FarImage {
     }
   }
 
-  // Samples the first `count` points of the block, one behind the other: only with `gathers`.
+  // Samples the first `count` points of the block by gathers, one behind the other: gray images and
+  // those of three planes. The last sixteen points may have been sampled in part by those before.
+  // There is no prefetching: gathers wait for many pixels at once.
   void block(int64_t count, T* to) const {
-    if (layout == kGray) {
-      block<1>(count, to);
-    } else if (layout == kThreePlanes) {
-      block<3>(count, to);
-    } else {
-      block<0>(count, to);
+    if constexpr (kRegister == 64 && is_same_v<E, float>) {
+      const Line all{true, 0, 0, 0, 0, 1, count};
+      if (count < 16) return points(all, 0, count, {to, channels, false});
+      for (int64_t k = 0; k < count; k += 16) {
+        k = smaller(k, count - 16);
+        const FarSixteen<T> sixteen(places, k);
+        if (!sixteen.inside()) {
+          points(all, k, k + 16, {to, channels, false});
+          continue;
+        }
+        T* out = to + k * channels;
+        const auto plane = [&](int64_t c) { return sixteen.sample(pixels + c * channel, below); };
+        const auto first = plane(0);
+        if (channels == 1) {
+          store(out, first);
+        } else {
+          store_sixteen<T>(first, plane(1), plane(2), out);
+        }
+      }
     }
   }
 
   void sample(const Line& line, const FarOutput<T>& out) const {
-    if constexpr (kSame<T, float>) {
+    if constexpr (is_same_v<T, float>) {
       switch (layout) {
         case kGray:
           return fours<1>(line, out);
@@ -117,44 +171,12 @@ class FarImage {
   using V = Vector<float, 4>;
 
   static Layout layout_of(const PolarSampleArgs<T>& a) {
-    if (!kSame<T, float>) return kAny;
+    if (!is_same_v<T, float>) return kAny;
     if (a.image_stride[3] == 1) {
       return a.channels == 1 ? kGray : a.channels == 3 ? kThreePlanes : kPlanes;
     }
     const bool together = a.image_stride[1] == 1 && a.image_stride[3] >= a.channels;
     return together && a.channels > 1 && a.channels <= 4 ? kTogether : kAny;
-  }
-
-  // The last sixteen points may have been sampled in part by those before. There is no prefetching:
-  // gathers wait for many pixels at once.
-  template <int kChannels>
-  void block(int64_t count, T* to) const {
-    if constexpr (kRegister == 64 && kSame<E, float>) {
-      const Line all{true, 0, 0, 0, 0, 1, count};
-      if (count < 16) return points(all, 0, count, {to, channels, false});
-      for (int64_t k = 0; k < count; k += 16) {
-        k = smaller(k, count - 16);
-        const FarSixteen<T> sixteen(places, k);
-        if (!sixteen.inside()) {
-          points(all, k, k + 16, {to, channels, false});
-          continue;
-        }
-        T* out = to + k * channels;
-        const auto plane = [&](int64_t c) { return sixteen.sample(pixels + c * channel, below); };
-        if constexpr (kChannels == 3) {
-          store_sixteen(plane(0), plane(1), plane(2), out);
-          continue;
-        }
-        for (int64_t c = 0; c < (kChannels > 0 ? kChannels : channels); ++c) {
-          const auto v = plane(c);
-          if constexpr (kChannels == 1) {
-            store(out, v);
-          } else {
-            for (int p = 0; p < 16; ++p) out[p * channels + c] = v[p];
-          }
-        }
-      }
-    }
   }
 
   template <int kChannels>
@@ -206,7 +228,7 @@ class FarImage {
       const V l = __builtin_shufflevector(pairs, pairs2, 0, 2, 4, 6);
       const V r = __builtin_shufflevector(pairs, pairs2, 1, 3, 5, 7);
       const V v = between(l, r, left, right);
-      if constexpr (kSame<E, uint8_t>) return v * a.pixel_scale[c] + a.pixel_offset[c];
+      if constexpr (is_same_v<E, uint8_t>) return v * a.pixel_scale[c] + a.pixel_offset[c];
       return v;
     };
     // Nothing is computed in two branches: the compiler would take what they share out of both and,
@@ -249,7 +271,7 @@ class FarImage {
   void together(const Line& line, const FarOutput<T>& out) const {
     constexpr int kSkip = 4 - kChannels;
     V scale{}, shift{};
-    for (int c = 0; kSame<E, uint8_t> && c < kChannels; ++c) {
+    for (int c = 0; is_same_v<E, uint8_t> && c < kChannels; ++c) {
       scale[c] = a.pixel_scale[c];
       shift[c] = a.pixel_offset[c];
     }
@@ -264,11 +286,11 @@ class FarImage {
       const E *pixel = pixels + places.offset[place], *neighbour = pixel + next - kSkip;
       const V down = splat<V>(places.lower[place]), right = splat<V>(places.right[place]);
       const V up = 1 - down;
-      const V l = between(floats<4>(pixel), floats<4>(pixel + below), up, down);
-      const V n = between(floats<4>(neighbour), floats<4>(neighbour + below), up, down);
+      const V l = between(load<V>(pixel), load<V>(pixel + below), up, down);
+      const V n = between(load<V>(neighbour), load<V>(neighbour + below), up, down);
       const V r = __builtin_shufflevector(n, n, kSkip, kSkip + 1, (kSkip + 2) % 4, 3);
       V v = between(l, r, 1 - right, right);
-      if constexpr (kSame<E, uint8_t>) v = v * scale + shift;
+      if constexpr (is_same_v<E, uint8_t>) v = v * scale + shift;
       T* to = out.to + k * out.step;
       if (k < whole) {
         store(to, v);
@@ -297,8 +319,8 @@ class FarImage {
       const E* pixel = pixels + offset;
       for (int64_t c = 0; c < channels; ++c, pixel += channel) {
         const E* bottom = pixel + below;
-        const T l = between(number<T>(pixel[0]), number<T>(bottom[0]), 1 - lower, lower);
-        const T r = between(number<T>(pixel[next]), number<T>(bottom[next]), 1 - lower, lower);
+        const T l = between(load<T>(pixel), load<T>(bottom), 1 - lower, lower);
+        const T r = between(load<T>(pixel + next), load<T>(bottom + next), 1 - lower, lower);
         to[c] = normalized<E>(a, between(l, r, 1 - right, right), c);
       }
     }

@@ -7,13 +7,12 @@
 // at it: it is read where it lies, with whatever strides and type it has.
 #pragma once
 
+#include "convert.h"
 #include "polar_points.h"
 #include "transpose.h"
 
 namespace darswin {
 namespace {
-
-inline int64_t smaller(int64_t x, int64_t y) { return x < y ? x : y; }
 
 // The layout of a packed image. Pixel (x, y) of the image is its pixel (x + 1, y + 1). Only for
 // images that are packed, or whose gradient is: the sizes of others may not fit 64 bits.
@@ -218,24 +217,15 @@ void with_pixel_type(Pixel pixel, Visit visit) {
   }
 }
 
-// A pixel in the type that is computed in.
-template <typename T, typename E>
-inline T number(E pixel) {
-  if constexpr (kSame<E, bfloat16>) {
-    return widen(pixel);
-  } else {
-    return pixel;
-  }
-}
 // The value of a pixel: one of type uint8 has a scale and an offset for each channel, others count
 // as they are. Interpolation between pixels may come before or after this.
 template <typename E, typename T>
 inline T normalized(const PolarSampleArgs<T>& a, T pixel, int64_t channel) {
-  return kSame<E, uint8_t> ? pixel * a.pixel_scale[channel] + a.pixel_offset[channel] : pixel;
+  return is_same_v<E, uint8_t> ? pixel * a.pixel_scale[channel] + a.pixel_offset[channel] : pixel;
 }
 template <typename T, typename E>
-inline T value(const PolarSampleArgs<T>& a, E pixel, int64_t channel) {
-  return normalized<E>(a, number<T>(pixel), channel);
+inline T value(const PolarSampleArgs<T>& a, const E* pixel, int64_t channel) {
+  return normalized<E>(a, load<T>(pixel), channel);
 }
 
 // Interleaves planes of four channels: (4, width) -> (width, 4).
@@ -281,7 +271,7 @@ void pack(const PolarSampleArgs<T>& a, const Packed& packed, int64_t b, T* plane
           }
         }
         for (int64_t x = 0; x < a.width; ++x) {
-          copy[x] = value(a, source[x * column_stride], first + c);
+          copy[x] = value(a, source + x * column_stride, first + c);
         }
       }
       if (packed.pixel == 4) {
@@ -323,10 +313,10 @@ struct Corners {
   Vector<T, 4> read(int64_t channel) const {
     const E* p = image + first + channel * args.image_stride[1];
     const int64_t row = args.image_stride[2], column = args.image_stride[3];
-    const T top_left = upper && left ? value(args, p[0], channel) : T(0);
-    const T top_right = upper && right ? value(args, p[column], channel) : T(0);
-    const T bottom_left = lower && left ? value(args, p[row], channel) : T(0);
-    const T bottom_right = lower && right ? value(args, p[row + column], channel) : T(0);
+    const T top_left = upper && left ? value(args, p, channel) : T(0);
+    const T top_right = upper && right ? value(args, p + column, channel) : T(0);
+    const T bottom_left = lower && left ? value(args, p + row, channel) : T(0);
+    const T bottom_right = lower && right ? value(args, p + row + column, channel) : T(0);
     return Vector<T, 4>{top_left, top_right, bottom_left, bottom_right};
   }
 };

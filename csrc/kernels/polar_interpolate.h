@@ -15,7 +15,7 @@ namespace {
 // sample is not finite, take the whole block of points again with weights; its other samples may
 // then differ in their last bit.
 template <typename T>
-constexpr bool kTryDifferences = kSame<T, float> && kRegister < 64;
+constexpr bool kTryDifferences = is_same_v<T, float> && kRegister < 64;
 
 template <bool kWeights, typename V>
 inline V between(V a, V b, V t) {
@@ -40,7 +40,7 @@ inline void interpolate(const T* pixel, const T* below, T right, T lower, T* to,
     store(to + e, v);
     if constexpr (!kWeights) *sum += v;
   };
-  if constexpr (kSame<T, float> && kRegister > 16) {
+  if constexpr (is_same_v<T, float> && kRegister > 16) {
     // One load takes a pixel and its right neighbour.
     using Pair = Vector<T, 8>;
     const Pair pair = between<kWeights>(load<Pair>(pixel), load<Pair>(below), splat<Pair>(lower));
@@ -90,38 +90,54 @@ inline bool all_finite(const V& v) {
   return finite;
 }
 
-// Samples points of a packed image, point k to to[target[k]]; joined[k] says whether the next three
-// points follow it there. Returns false if it used differences and a sample is not finite, which
-// the sum of all samples shows. A function of its own, so that all it needs stays in registers.
+// Where the points of a block go: point k to to[place[k]]. joined[k] says whether the next three
+// points follow it there.
+struct Targets {
+  int32_t place[kBlock];
+  bool joined[kBlock];
+};
+
+// Samples `count` points of a packed image. A point stores four values even if it has fewer
+// channels: the point that belongs behind it comes later and overwrites the rest. But behind a
+// token may be what is written already, or what another thread writes. So from `last_row` on, where
+// the last rows of tokens are, `width` points each, their last points store only their own values.
+// Returns false if it used differences and a sample is not finite, which the sum of all samples
+// shows. A function of its own, so that all it needs stays in registers.
 template <bool kWeights, typename T>
-[[gnu::noinline]] bool sample_line(const T* pixels, int64_t row, const PackedPlaces<T>& places,
-                                   int64_t begin, int64_t end, const int32_t* target,
-                                   [[maybe_unused]] const bool* joined,
-                                   [[maybe_unused]] int64_t channels, T* to) {
+[[gnu::noinline]] bool sample_points(const T* pixels, int64_t row, const PackedPlaces<T>& places,
+                                     int64_t last_row, int64_t count, int64_t width,
+                                     const Targets& targets, int64_t channels, T* to) {
   const T* below = pixels + row;
-  const int32_t* offset = places.offset;
+  const int32_t *offset = places.offset, *target = targets.place;
   const T *right = places.right, *lower = places.lower;
-  int64_t k = begin;
-  if constexpr (kSame<T, float> && kRegister == 64) {
-    for (; k + 4 <= end; k += 4) {
-      const auto v = interpolate_four(pixels, below, offset + k, right + k, lower + k);
-      if (joined[k]) {
-        store_quarters(to + target[k], v, channels);
-      } else {
-        scatter_quarters(to, v, target + k);
+  Piece<T> sums[4]{};  // used in turn, so that no addition waits for the one before
+  const auto sample = [&](int64_t k, T* out, Piece<T>* sum) {
+    interpolate<kWeights>(pixels + offset[k], below + offset[k], right[k], lower[k], out, sum);
+  };
+  // First the rows before the last as one, then the last row, token by token.
+  for (int64_t k = 0, end = last_row, exact = last_row; k < count;
+       end = k + width, exact = end - 3 / channels) {
+    if constexpr (is_same_v<T, float> && kRegister == 64) {
+      for (; k + 4 <= exact; k += 4) {
+        const auto v = interpolate_four(pixels, below, offset + k, right + k, lower + k);
+        if (targets.joined[k]) {
+          store_quarters(to + target[k], v, channels);
+        } else {
+          scatter_quarters(to, v, target + k);
+        }
       }
     }
-  }
-  Piece<T> sums[4]{};  // used in turn, so that no addition waits for the one before
-  const auto sample = [&](int64_t k, Piece<T>* sum) {
-    interpolate<kWeights>(pixels + offset[k], below + offset[k], right[k], lower[k], to + target[k],
-                          sum);
-  };
-  for (; k + 4 <= end; k += 4) {
+    for (; k + 4 <= exact; k += 4) {
 #pragma GCC unroll 4
-    for (int turn = 0; turn < 4; ++turn) sample(k + turn, sums + turn);
+      for (int turn = 0; turn < 4; ++turn) sample(k + turn, to + target[k + turn], sums + turn);
+    }
+    for (; k < exact; ++k) sample(k, to + target[k], sums);
+    for (; k < end; ++k) {
+      T v[4];
+      sample(k, v, sums);
+      for (int64_t c = 0; c < channels; ++c) to[target[k] + c] = v[c];
+    }
   }
-  for (; k < end; ++k) sample(k, sums);
   return kWeights || all_finite((sums[0] + sums[1]) + (sums[2] + sums[3]));
 }
 

@@ -11,8 +11,6 @@ namespace {
 
 constexpr int64_t kTile = 64;  // pixels that are planned together; a multiple of every register
 
-inline int64_t smaller(int64_t x, int64_t y) { return x < y ? x : y; }
-
 // An integer as wide as a real number.
 template <typename Real>
 struct IndexOf {
@@ -170,12 +168,12 @@ int64_t kept_rows(const PolarToImageArgs<T>& a) {
 // The mixes of whole rows of pixels, kept for the images and channels that come next: images of one
 // lens share them. Row y has its place at y % rows.
 template <typename T>
-class Rows {
+class MixRows {
  public:
   using Args = PolarToImageArgs<T>;
   using Real = Arithmetic<T>;
 
-  Rows(const Args& args, int64_t rows, Arena& arena)
+  MixRows(const Args& args, int64_t rows, Arena& arena)
       : a(args),
         planner(args),
         rows(rows),

@@ -31,11 +31,6 @@ int64_t row_bytes(const PolarSampleArgs<T>& a) {
   return round_up((a.num_azimuths * round_up(a.channels, 4) + 16) * sizeof(T), 64);
 }
 
-inline void convert(float* to, float from) { *to = from; }
-inline void convert(double* to, double from) { *to = from; }
-inline void convert(bfloat16* to, float from) { *to = narrow(from); }
-inline void convert(float* to, bfloat16 from) { *to = widen(from); }
-
 // Writes (num_azimuths, C) samples to a row of the output, of type E.
 template <typename T, typename E>
 void write_row(const PolarSampleArgs<T>& a, const Row& row, const T* samples, E* out) {
@@ -45,11 +40,7 @@ void write_row(const PolarSampleArgs<T>& a, const Row& row, const T* samples, E*
     for (int64_t sector = 0; sector * a.samples_a < a.num_azimuths; ++sector) {
       E* to = out + sector * row.sector_stride;
       const T* from = samples + sector * piece;
-      if constexpr (kSame<E, bfloat16>) {
-        narrow_all(from, piece, to);
-      } else {
-        copy(from, piece, to);
-      }
+      copy(from, piece, to);
     }
     return;
   }
@@ -58,9 +49,9 @@ void write_row(const PolarSampleArgs<T>& a, const Row& row, const T* samples, E*
     const T* from = samples + c;
     if (a.channels == 3) {  // a constant stride becomes shuffles
 #pragma omp simd
-      for (int64_t j = 0; j < a.num_azimuths; ++j) convert(to + j, from[j * 3]);
+      for (int64_t j = 0; j < a.num_azimuths; ++j) store(to + j, from[j * 3]);
     } else {
-      for (int64_t j = 0; j < a.num_azimuths; ++j) convert(to + j, from[j * a.channels]);
+      for (int64_t j = 0; j < a.num_azimuths; ++j) store(to + j, from[j * a.channels]);
     }
   }
 }
@@ -83,14 +74,11 @@ void read_row(const PolarSampleArgs<T>& a, const E* grad, const Row& row, T* to)
     if (row.channel_stride != 1) {
       for (int64_t s = 0; s < a.samples_a; ++s) {
         for (int64_t c = 0; c < a.channels; ++c) {
-          convert(to + s * a.channels + c, from[s * row.sample_stride + c * row.channel_stride]);
+          to[s * a.channels + c] = load<T>(from + s * row.sample_stride + c * row.channel_stride);
         }
       }
-    } else if constexpr (sizeof(E) == sizeof(T)) {
-      copy(from, piece, to);
     } else {
-#pragma omp simd
-      for (int64_t e = 0; e < piece; ++e) convert(to + e, from[e]);
+      copy(from, piece, to);
     }
   }
 }

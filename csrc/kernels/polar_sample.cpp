@@ -146,11 +146,7 @@ constexpr PolarSampleKernels<T> kTable = {.directions = directions,
 
 }  // namespace
 
-template <>
-constinit const PolarSampleKernels<float> Kernels<PolarSampleKernels<float>, Tier::TIER>::table =
-    kTable<float>;
-template <>
-constinit const PolarSampleKernels<double> Kernels<PolarSampleKernels<double>, Tier::TIER>::table =
-    kTable<double>;
+TIER_TABLE(PolarSampleKernels<float>) = kTable<float>;
+TIER_TABLE(PolarSampleKernels<double>) = kTable<double>;
 
 }  // namespace darswin

@@ -34,8 +34,8 @@ class Sampler {
       for (int64_t sector = 0; sector * a.samples_a < columns; ++sector) {
         for (int64_t s = 0; s < smaller(columns, a.samples_a); ++s, ++k) {
           const int64_t to = row * row_stride + sector * sector_stride + s * a.channels;
-          state.target[k] = static_cast<int32_t>(to);
-          state.joined[k] = s + 4 <= a.samples_a;
+          state.targets.place[k] = static_cast<int32_t>(to);
+          state.targets.joined[k] = s + 4 <= a.samples_a;
         }
       }
     }
@@ -64,8 +64,7 @@ class Sampler {
  private:
   struct State {
     PlacedPoints<T> points;
-    int32_t target[kBlock];  // where the points of a block go
-    bool joined[kBlock];     // whether the next three points follow there
+    Targets targets;
     T samples[4 * kBlock];
   };
 
@@ -108,69 +107,23 @@ class Sampler {
         for (int64_t e = n * bytes; e < (n + 1) * bytes; e += 64) __builtin_prefetch(next + e, 1);
       }
     }
-    // target holds the places of a whole block. They hold for a smaller block only if its points
-    // are of one radius.
+    // The targets are those of a whole block. They hold for a smaller block only if its points are
+    // of one radius.
     if (in_line && (rows == 1 || count == smaller(block_columns(), a.num_azimuths))) {
-      // Near the end of the ring, what a sample's store has too much would pass it.
-      const bool last = (a.num_azimuths - j - count) * a.channels < 4 - a.channels;
-      lines(rows, count, out, row + rows == a.samples_r, last);
+      const int64_t all = rows * count, last_row = row + rows == a.samples_r ? all - count : all;
+      const auto sample = [&]<bool kWeights>() {
+        return sample_points<kWeights>(image, packed.row, points.near, last_row, all,
+                                       smaller(a.samples_a, count), state.targets, a.channels, out);
+      };
+      if constexpr (kTryDifferences<T>) {
+        if (sample.template operator()<false>()) return;
+      }
+      sample.template operator()<true>();
       return;
     }
     for (int64_t n = 0; n < rows; ++n) {
       near_row(j, count, n * count, to + (row + n) * row_stride);
     }
-  }
-
-  // Samples rows of a block whose pixels have up to four channels.
-  void lines(int64_t rows, int64_t count, T* to, bool last_row, bool last_token) {
-    if constexpr (kTryDifferences<T>) {
-      if (lines<false>(rows, count, to, last_row, last_token)) return;
-    }
-    lines<true>(rows, count, to, last_row, last_token);
-  }
-
-  // A point stores four values even if it has fewer channels: the point that belongs behind it
-  // comes later and overwrites the rest. There are two exceptions. Behind the last row of a token
-  // is the first row of the next token, which is written already if tokens have several rows: its
-  // values are kept and put back. Behind the last token may be what another thread writes: its last
-  // points store only their own values.
-  template <bool kWeights>
-  bool lines(int64_t rows, int64_t count, T* to, bool last_row, bool last_token) {
-    const int64_t channels = a.channels, all = rows * count, tokens = count / a.samples_a;
-    const auto& near = points.near;
-    bool finite = true;
-    const auto sample = [&](int64_t begin, int64_t end) {
-      finite &= sample_line<kWeights>(image, packed.row, near, begin, end, state.target,
-                                      state.joined, channels, to);
-    };
-    if (!last_row) {
-      sample(0, all);
-      return finite;
-    }
-    const int64_t before = all - count;
-    sample(0, before);
-    // kBlock / 4 tokens are enough: one that overruns has two rows at least, and two points in
-    // each, since a row has at least four values and a point fewer.
-    T* first = to + (rows - a.samples_r) * row_stride;  // row 0 of the first token
-    T kept[kBlock / 4][4];
-    const int64_t overrun = channels < 4 && a.samples_r > 1 ? tokens : 0;
-    for (int64_t t = 1; t < overrun; ++t) {
-      store(kept[t], load<Vector<T, 4>>(first + t * sector_stride));
-    }
-    const int64_t whole = last_token && before < all - 4 ? all - 4 : last_token ? before : all;
-    sample(before, whole);
-    for (int64_t k = whole; k < all; ++k) {
-      const T* pixel = image + near.offset[k];
-      T v[4];
-      Piece<T> sum{};
-      interpolate<kWeights>(pixel, pixel + packed.row, near.right[k], near.lower[k], v, &sum);
-      finite &= all_finite(sum);
-      for (int64_t c = 0; c < channels; ++c) to[state.target[k] + c] = v[c];
-    }
-    for (int64_t t = 1; t < overrun; ++t) {
-      store(first + t * sector_stride, load<Vector<T, 4>>(kept[t]));
-    }
-    return finite;
   }
 
   // Samples points j to j + count of one radius, whose places are `place` on, of any number of

@@ -86,7 +86,7 @@ class Scatter {
           if (keep == kCells) collect(from);
           for (int64_t c = 0; c < a.channels; ++c) {
             E* line = to + (c * a.height + y) * a.width;
-            for (int64_t x = 0; x < a.width; ++x) convert(line + x, from[x * layout.pixel + c]);
+            for (int64_t x = 0; x < a.width; ++x) store(line + x, from[x * layout.pixel + c]);
           }
         }
       }

@@ -13,25 +13,12 @@
 #include "../polar_to_image.h"
 
 #include "arena.h"
+#include "convert.h"
 #include "polar_plan.h"
 #include "transpose.h"
 
 namespace darswin {
 namespace {
-
-// Values of a token, widened, and back.
-inline Floats values(const float* from) { return load<Floats>(from); }
-inline Doubles values(const double* from) { return load<Doubles>(from); }
-inline Floats values(const bfloat16* from) { return widen_lanes(from); }
-inline void put(float* to, const Floats& v) { store(to, v); }
-inline void put(double* to, const Doubles& v) { store(to, v); }
-inline void put(bfloat16* to, const Floats& v) { narrow_lanes(to, v); }
-inline float value(float x) { return x; }
-inline double value(double x) { return x; }
-inline float value(bfloat16 x) { return widen(x); }
-inline void put_one(float* to, float x) { *to = x; }
-inline void put_one(double* to, double x) { *to = x; }
-inline void put_one(bfloat16* to, float x) { *to = narrow(x); }
 
 template <typename T>
 class Forward {
@@ -41,7 +28,7 @@ class Forward {
   using V = Vector<Real, kLanes<Real>>;
   static constexpr int64_t kL = kLanes<Real>;
 
-  Forward(const Args& args, Rows<T>& rows) : a(args), rows(rows) {}
+  Forward(const Args& args, MixRows<T>& rows) : a(args), rows(rows) {}
 
   void row(int64_t b, int64_t y) {
     const int64_t pixels = a.height * a.width;
@@ -58,20 +45,14 @@ class Forward {
   }
 
  private:
-  V mix(const T* map, int64_t k, int64_t c) const {
-    if (!tile->known[k]) return V{};
-    const V inner = tile->weight[0][k] * values(map + a.channels * tile->token[0][k] + c) +
-                    tile->weight[1][k] * values(map + a.channels * tile->token[1][k] + c);
-    const V outer = tile->weight[2][k] * values(map + a.channels * tile->token[2][k] + c) +
-                    tile->weight[3][k] * values(map + a.channels * tile->token[3][k] + c);
-    return inner + outer;
-  }
-  Real mix_one(const T* map, int64_t k, int64_t c) const {
-    if (!tile->known[k]) return 0;
-    const Real inner = tile->weight[0][k] * value(map[a.channels * tile->token[0][k] + c]) +
-                       tile->weight[1][k] * value(map[a.channels * tile->token[1][k] + c]);
-    const Real outer = tile->weight[2][k] * value(map[a.channels * tile->token[2][k] + c]) +
-                       tile->weight[3][k] * value(map[a.channels * tile->token[3][k] + c]);
+  // Channel c of pixel k or, where W is a register, the channels from c on.
+  template <typename W>
+  W mix(const T* map, int64_t k, int64_t c) const {
+    if (!tile->known[k]) return W{};
+    const W inner = tile->weight[0][k] * load<W>(map + a.channels * tile->token[0][k] + c) +
+                    tile->weight[1][k] * load<W>(map + a.channels * tile->token[1][k] + c);
+    const W outer = tile->weight[2][k] * load<W>(map + a.channels * tile->token[2][k] + c) +
+                    tile->weight[3][k] * load<W>(map + a.channels * tile->token[3][k] + c);
     return inner + outer;
   }
 
@@ -82,9 +63,9 @@ class Forward {
     for (int corner = 0; corner < 4; ++corner) {
       inside &= a.channels * tile->token[corner][k] <= end;
     }
-    if (inside) return mix(map, k, c);
+    if (inside) return mix<V>(map, k, c);
     V v{};
-    for (int64_t e = c; e < a.channels; ++e) v[e - c] = mix_one(map, k, e);
+    for (int64_t e = c; e < a.channels; ++e) v[e - c] = mix<Real>(map, k, e);
     return v;
   }
 
@@ -92,13 +73,13 @@ class Forward {
     const T* end = to + count * a.channels;
     for (int64_t k = 0; k < count; ++k, to += a.channels) {
       int64_t c = 0;
-      for (; c + kL <= a.channels; c += kL) put(to + c, mix(map, k, c));
+      for (; c + kL <= a.channels; c += kL) store(to + c, mix<V>(map, k, c));
       if (c == a.channels) continue;
       const V last = mix_last(map, k, c);
       if (end - (to + c) >= kL) {
-        put(to + c, last);  // the next pixel overwrites what is too much
+        store(to + c, last);  // the next pixel overwrites what is too much
       } else {
-        for (; c < a.channels; ++c) put_one(to + c, last[c % kL]);
+        for (; c < a.channels; ++c) store(to + c, last[c % kL]);
       }
     }
   }
@@ -107,12 +88,12 @@ class Forward {
     for (int64_t c = 0; c < a.channels; c += kL) {
       const int64_t channels = smaller(kL, a.channels - c);
       int64_t k = 0;
-      if constexpr (kSame<Real, float>) {
+      if constexpr (is_same_v<Real, float>) {
         for (; k + kL <= count; k += kL) square(map, k, c, channels, to + c * stride + k, stride);
       }
       for (; k < count; ++k) {
-        const V v = channels == kL ? mix(map, k, c) : mix_last(map, k, c);
-        for (int64_t e = 0; e < channels; ++e) put_one(to + (c + e) * stride + k, v[e]);
+        const V v = channels == kL ? mix<V>(map, k, c) : mix_last(map, k, c);
+        for (int64_t e = 0; e < channels; ++e) store(to + (c + e) * stride + k, v[e]);
       }
     }
   }
@@ -125,19 +106,19 @@ class Forward {
       for (int i = 0; i < kL; ++i) {
         // The planes lie apart, which the hardware does not foresee.
         __builtin_prefetch(to + i * stride + kL, 1);
-        rows[i] = mix(map, k + i, c);
+        rows[i] = mix<V>(map, k + i, c);
       }
-      if constexpr (kSame<T, float>) return transpose_square(rows, to, stride);
+      if constexpr (is_same_v<T, float>) return transpose_square(rows, to, stride);
     } else {
       for (int i = 0; i < kL; ++i) rows[i] = mix_last(map, k + i, c);
     }
     float turned[kL * kL];
     transpose_square(rows, turned, kL);
-    for (int64_t i = 0; i < channels; ++i) put(to + i * stride, load<Floats>(turned + i * kL));
+    for (int64_t i = 0; i < channels; ++i) store(to + i * stride, load<Floats>(turned + i * kL));
   }
 
   const Args& a;
-  Rows<T>& rows;
+  MixRows<T>& rows;
   const Mix<Real>* tile = nullptr;
 };
 
@@ -145,6 +126,7 @@ class Forward {
 template <typename T, typename Real = Arithmetic<T>>
 void gather(const PolarToImageArgs<T>& a, int64_t b, int64_t place, int64_t count, int64_t c,
             int64_t width, int64_t row, Real* to) {
+  using V = Vector<Real, kLanes<Real>>;
   constexpr int64_t kAhead = 16, kBytes = sizeof(T);
   const int64_t pixels = a.height * a.width;
   if (a.tokens) {
@@ -154,15 +136,15 @@ void gather(const PolarToImageArgs<T>& a, int64_t b, int64_t place, int64_t coun
       const char* ahead = reinterpret_cast<const char*>(from + kAhead * a.channels);
       for (int64_t byte = 0; byte < width * kBytes; byte += 64) __builtin_prefetch(ahead + byte);
       int64_t e = 0;
-      for (; e + kLanes<Real> <= width; e += kLanes<Real>) store(to + e, values(from + e));
-      for (; e < width; ++e) to[e] = value(from[e]);
+      for (; e + kLanes<Real> <= width; e += kLanes<Real>) store(to + e, load<V>(from + e));
+      for (; e < width; ++e) to[e] = load<Real>(from + e);
       for (; e < row; ++e) to[e] = 0;
     }
     return;
   }
   const T* from = a.grad_out + (b * a.channels + c) * pixels + place;
   int64_t e = 0;
-  if constexpr (kSame<Real, float>) {
+  if constexpr (is_same_v<Real, float>) {
     constexpr int64_t kL = kLanes<float>;
     for (; e + kL <= width; e += kL) {
       int64_t k = 0;
@@ -172,17 +154,17 @@ void gather(const PolarToImageArgs<T>& a, int64_t b, int64_t place, int64_t coun
         for (int i = 0; i < kL; ++i) {
           const T* plane = from + (e + i) * pixels + k;
           __builtin_prefetch(plane + kTile);
-          rows[i] = values(plane);
+          rows[i] = load<Floats>(plane);
         }
         transpose_square(rows, to + k * row + e, row);
       }
       for (; k < count; ++k) {
-        for (int64_t i = e; i < e + kL; ++i) to[k * row + i] = value(from[i * pixels + k]);
+        for (int64_t i = e; i < e + kL; ++i) to[k * row + i] = load<Real>(from + i * pixels + k);
       }
     }
   }
   for (; e < width; ++e) {
-    for (int64_t k = 0; k < count; ++k) to[k * row + e] = value(from[e * pixels + k]);
+    for (int64_t k = 0; k < count; ++k) to[k * row + e] = load<Real>(from + e * pixels + k);
   }
   for (; e < row; ++e) {
     for (int64_t k = 0; k < count; ++k) to[k * row + e] = 0;
@@ -195,7 +177,7 @@ struct Workspace {
   using Real = Arithmetic<T>;
 
   Arena arena;
-  Rows<T> rows;
+  MixRows<T> rows;
   Mix<Real>* tile;  // of backward through the lens
   Origin<Real>* origin;
   Real *gradients, *sums;
@@ -276,10 +258,8 @@ void backward_map(const PolarToImageArgs<T>& a, int64_t begin, int64_t end, void
       const Real* from = work.sums + token * row;
       if (a.bands > 1) {
         copy(from, width, a.partial + band * a.batch * map * a.channels + to);
-      } else if constexpr (kSame<T, Real>) {
-        copy(from, width, a.grad_x + to);
       } else {
-        narrow_all(from, width, a.grad_x + to);
+        copy(from, width, a.grad_x + to);
       }
     }
   }
@@ -291,7 +271,7 @@ void sum_bands(const PolarToImageArgs<T>& a, int64_t begin, int64_t end) {
   for (int64_t k = begin; k < end; ++k) {
     Arithmetic<T> sum = a.partial[k];
     for (int64_t band = 1; band < a.bands; ++band) sum += a.partial[band * values + k];
-    put_one(a.grad_x + k, sum);
+    store(a.grad_x + k, sum);
   }
 }
 
@@ -302,10 +282,10 @@ double product(const Real* g, const T* token, int64_t channels) {
   constexpr int64_t kL = kLanes<Real>;
   V sums{};
   int64_t c = 0;
-  for (; c + kL <= channels; c += kL) sums += load<V>(g + c) * values(token + c);
+  for (; c + kL <= channels; c += kL) sums += load<V>(g + c) * load<V>(token + c);
   double sum = 0;
   for (int64_t e = 0; e < kL; ++e) sum += sums[e];
-  for (; c < channels; ++c) sum += static_cast<double>(g[c]) * value(token[c]);
+  for (; c < channels; ++c) sum += static_cast<double>(g[c]) * load<Real>(token + c);
   return sum;
 }
 
@@ -378,14 +358,8 @@ constexpr PolarToImageKernels<T> kKernels = {.scratch = scratch<T>,
 
 }  // namespace
 
-template <>
-constinit const PolarToImageKernels<float> Kernels<PolarToImageKernels<float>, Tier::TIER>::table =
-    kKernels<float>;
-template <>
-constinit const PolarToImageKernels<double>
-    Kernels<PolarToImageKernels<double>, Tier::TIER>::table = kKernels<double>;
-template <>
-constinit const PolarToImageKernels<bfloat16>
-    Kernels<PolarToImageKernels<bfloat16>, Tier::TIER>::table = kKernels<bfloat16>;
+TIER_TABLE(PolarToImageKernels<float>) = kKernels<float>;
+TIER_TABLE(PolarToImageKernels<double>) = kKernels<double>;
+TIER_TABLE(PolarToImageKernels<bfloat16>) = kKernels<bfloat16>;
 
 }  // namespace darswin

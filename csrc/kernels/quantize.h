@@ -5,12 +5,12 @@
 // before, so no conversion overflows; NaN becomes what 0 does.
 #pragma once
 
-#include "../quantized.h"
-#include "simd.h"
+#include "convert.h"
 
 namespace darswin {
 namespace {
 
+// V is float or Floats.
 class Quantize {
  public:
   explicit Quantize(Quantizer q)
@@ -19,17 +19,18 @@ class Quantize {
         highest(static_cast<float>(255 - q.zero_point)),
         zero_point(static_cast<uint32_t>(q.zero_point)) {}
 
-  void operator()(uint8_t* to, Floats x) const {
-    using Bits = Vector<uint32_t, kLanes<float>>;
-    const Floats cut = bounded(x * steps, x);
-    store_bits(to, __builtin_convertvector((Bits)(cut + kShift) + zero_point,
-                                           Vector<uint8_t, kLanes<float>>));
-  }
-  void operator()(uint8_t* to, float x) const {
-    const float shifted = bounded(x * steps, x) + kShift;
-    uint32_t bits;
-    __builtin_memcpy(&bits, &shifted, sizeof(bits));
-    *to = static_cast<uint8_t>(bits + zero_point);
+  template <typename V>
+  void operator()(uint8_t* to, V x) const {
+    constexpr float kShift = 12582912.0f;  // its own lowest 22 bits are 0
+    V value = x == x ? x * steps : V{};
+    value = value > lowest ? value : V{} + lowest;
+    value = value < highest ? value : V{} + highest;
+    const auto bits = __builtin_bit_cast(BitsOf<V>, value + kShift) + zero_point;
+    if constexpr (is_same_v<V, float>) {
+      *to = static_cast<uint8_t>(bits);
+    } else {
+      store_bits(to, __builtin_convertvector(bits, Vector<uint8_t, kLanes<float>>));
+    }
   }
   void operator()(uint8_t* to, const float* from, int64_t count) const {
     int64_t e = 0;
@@ -38,15 +39,6 @@ class Quantize {
   }
 
  private:
-  static constexpr float kShift = 12582912.0f;  // its own lowest 22 bits are 0
-
-  template <typename V>
-  V bounded(V value, V x) const {
-    value = x == x ? value : V{};
-    value = value > lowest ? value : V{} + lowest;
-    return value < highest ? value : V{} + highest;
-  }
-
   float steps, lowest, highest;
   uint32_t zero_point;
 };

@@ -55,8 +55,6 @@ void transpose_groups(const TransposeSumArgs& a, int64_t begin, int64_t end) {
 
 }  // namespace
 
-template <>
-constinit const TransposeSumKernels Kernels<TransposeSumKernels, Tier::TIER>::table = {
-    .groups = transpose_groups};
+TIER_TABLE(TransposeSumKernels) = {.groups = transpose_groups};
 
 }  // namespace darswin

@@ -3,9 +3,12 @@
 #pragma once
 
 #include <cstdint>
+#include <type_traits>
 
 namespace darswin {
 namespace {
+
+using std::is_same_v;
 
 template <typename T, int N>
 struct VectorOf {

@@ -28,7 +28,7 @@ struct Attention {
   const WindowAttentionArgs<S>& a;
   Shape<kTokens, kDim> shape;
   Arena arena;
-  Scratch<S> s;
+  AttentionScratch<S> s;
   int64_t part;            // from a token's queries to its keys, and on to its values
   int64_t bias_row, head;  // the current ones
   Rows<const T> q, k, v;   // of the head
@@ -243,7 +243,7 @@ struct Attention {
     begin(index);
     if (a.quantized != nullptr) {
       attend({s.dq_copy, s.copy}, nullptr);
-      if constexpr (kSame<S, float>) quantize(a.quantized + head * shape.d);
+      if constexpr (is_same_v<S, float>) quantize(a.quantized + head * shape.d);
       return;
     }
     S* to = a.out + head * shape.d;
@@ -371,7 +371,7 @@ void backward(const WindowAttentionArgs<S>& args, int64_t begin, int64_t end, vo
 template <typename S>
 int64_t scratch_bytes(const WindowAttentionArgs<S>& args) {
   Arena arena{nullptr};
-  Scratch<S>(arena, Shape<0, 0>(args));
+  AttentionScratch<S>(arena, Shape<0, 0>(args));
   return arena.used;
 }
 
@@ -381,14 +381,8 @@ constexpr WindowAttentionKernels<S> kTable = {
 
 }  // namespace
 
-template <>
-constinit const WindowAttentionKernels<float>
-    Kernels<WindowAttentionKernels<float>, Tier::TIER>::table = kTable<float>;
-template <>
-constinit const WindowAttentionKernels<double>
-    Kernels<WindowAttentionKernels<double>, Tier::TIER>::table = kTable<double>;
-template <>
-constinit const WindowAttentionKernels<bfloat16>
-    Kernels<WindowAttentionKernels<bfloat16>, Tier::TIER>::table = kTable<bfloat16>;
+TIER_TABLE(WindowAttentionKernels<float>) = kTable<float>;
+TIER_TABLE(WindowAttentionKernels<double>) = kTable<double>;
+TIER_TABLE(WindowAttentionKernels<bfloat16>) = kTable<bfloat16>;
 
 }  // namespace darswin

@@ -121,7 +121,7 @@ struct Tokens {
 
 // Working memory of one thread.
 template <typename S>
-struct Scratch {
+struct AttentionScratch {
   using T = Arithmetic<S>;
 
   Tokens<T> window, next;    // the current window, and the one after it
@@ -136,7 +136,7 @@ struct Scratch {
   T *dq_copy, *dk_copy, *dv_copy;        // the same of results, yet to be rounded: forward's is dq
 
   template <typename Sizes>
-  Scratch(Arena& arena, const Sizes& shape) {
+  AttentionScratch(Arena& arena, const Sizes& shape) {
     const int64_t n = shape.n, padded = shape.padded;
     const int64_t pairs = shape.pairs ? shape.heads * n * padded : 0;
     const int64_t past =

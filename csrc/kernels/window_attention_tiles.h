@@ -7,6 +7,7 @@
 // which needs no transpose back. Backward is made of the same three.
 #pragma once
 
+#include "convert.h"
 #include "transpose.h"
 
 namespace darswin {
@@ -161,7 +162,7 @@ inline void widen(const bfloat16* from, int64_t d, float* to) {
     store_bits(to + c, pairs << 16);
     store_bits(to + c + kL, pairs & 0xFFFF0000);
   }
-  for (; c < d; ++c) to[c] = widen(from[c]);
+  for (; c < d; ++c) to[c] = load<float>(from + c);
 }
 inline void narrow(const float* from, int64_t d, bfloat16* to) {
   constexpr int kL = kLanes<float>;
@@ -170,7 +171,7 @@ inline void narrow(const float* from, int64_t d, bfloat16* to) {
     const auto even = rounded(load<Floats>(from + c)), odd = rounded(load<Floats>(from + c + kL));
     store_bits(to + c, (even >> 16) | (odd & 0xFFFF0000));
   }
-  for (; c < d; ++c) to[c] = narrow(from[c]);
+  for (; c < d; ++c) store(to + c, from[c]);
 }
 
 }  // namespace

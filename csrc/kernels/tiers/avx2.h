@@ -3,7 +3,7 @@
 
 #include <immintrin.h>
 
-#include "../../bfloat16.h"
+#include "../../numbers.h"
 #include "../vector.h"
 
 namespace darswin {

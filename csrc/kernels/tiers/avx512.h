@@ -4,7 +4,7 @@
 
 #include <immintrin.h>
 
-#include "../../bfloat16.h"
+#include "../../numbers.h"
 #include "../vector.h"
 
 namespace darswin {

@@ -9,7 +9,7 @@
 #  include <emmintrin.h>
 #endif
 
-#include "../../bfloat16.h"
+#include "../../numbers.h"
 #include "../vector.h"
 
 namespace darswin {

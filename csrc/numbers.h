@@ -1,10 +1,11 @@
-// bfloat16 as drivers and kernels hand it to each other: the upper half of a float32.
+// Numbers as drivers and kernels hand them to each other.
 #pragma once
 
 #include <cstdint>
 
 namespace darswin {
 
+// The upper half of a float32.
 struct bfloat16 {
   uint16_t bits;
 };
@@ -20,5 +21,11 @@ struct ArithmeticOf<bfloat16> {
 };
 template <typename T>
 using Arithmetic = typename ArithmeticOf<T>::type;
+
+// How numbers become 8 bits: round(x / scale) + zero_point, kept in 0 ... 255.
+struct Quantizer {
+  float steps = 1;  // 1 / scale
+  int32_t zero_point = 0;
+};
 
 }  // namespace darswin

@@ -1,0 +1,74 @@
+// Loads that widen, stores that round: a kernel computes in float or double, whatever its numbers
+// are stored as. bfloat16 is the upper half of a float32. Here V is a float or a vector of floats.
+#pragma once
+
+#include "simd.h"
+
+namespace darswin {
+namespace {
+
+template <typename V>
+inline V load(const bfloat16* from) {
+  if constexpr (is_same_v<V, float>) {
+    return __builtin_bit_cast(float, static_cast<uint32_t>(from->bits) << 16);
+  } else if constexpr (is_same_v<V, Floats>) {
+    return widen_lanes(from);
+  } else {
+    constexpr int kCount = sizeof(V) / sizeof(float);
+    const auto bits = load_bits<Vector<uint16_t, kCount>>(from);
+    return (V)(__builtin_convertvector(bits, Vector<uint32_t, kCount>) << 16);
+  }
+}
+template <typename V>
+inline V load(const uint8_t* from) {
+  if constexpr (is_same_v<V, float>) {
+    return *from;
+  } else {
+    return __builtin_convertvector(load_bits<Vector<uint8_t, sizeof(V) / sizeof(float)>>(from), V);
+  }
+}
+
+template <typename V>
+using BitsOf = std::conditional_t<is_same_v<V, float>, uint32_t, Vector<uint32_t, kLanes<float>>>;
+
+// The bits of a float or of Floats, rounded to those that bfloat16 has, which are the upper ones:
+// to nearest, ties to even. NaN stays NaN, even if its payload lies in the lower half.
+template <typename V>
+inline BitsOf<V> rounded(V x) {
+  const auto bits = __builtin_bit_cast(BitsOf<V>, x);
+  return x == x ? bits + 0x7FFF + ((bits >> 16) & 1) : bits | 0x400000;
+}
+
+inline void store(bfloat16* to, float x) { to->bits = static_cast<uint16_t>(rounded(x) >> 16); }
+inline void store(bfloat16* to, Floats x) {
+  store_bits(to, __builtin_convertvector(rounded(x) >> 16, Vector<uint16_t, kLanes<float>>));
+}
+
+// Copies short runs: whole registers, the last of them over the one before.
+template <typename T>
+inline void copy(const T* from, int64_t count, T* to) {
+  constexpr int64_t lanes = kLanes<T>;
+  using V = Vector<T, lanes>;
+  int64_t e = 0;
+  for (; e + lanes <= count; e += lanes) store(to + e, load<V>(from + e));
+  if (e == count) return;
+  if (count > lanes) {
+    store(to + count - lanes, load<V>(from + count - lanes));
+  } else if (lanes > 2 && count >= lanes / 2) {
+    using Half = Vector<T, lanes / 2>;
+    store(to, load<Half>(from));
+    store(to + count - lanes / 2, load<Half>(from + count - lanes / 2));
+  } else {
+    for (; e < count; ++e) to[e] = from[e];
+  }
+}
+template <typename From, typename To>  // one of them bfloat16, the other one float
+inline void copy(const From* from, int64_t count, To* to) {
+  constexpr int64_t lanes = kLanes<float>;
+  int64_t e = 0;
+  for (; e + lanes <= count; e += lanes) store(to + e, load<Floats>(from + e));
+  for (; e < count; ++e) store(to + e, load<float>(from + e));
+}
+
+}  // namespace
+}  // namespace darswin
