@@ -2,7 +2,6 @@
 // above what the CPU has.
 #include "dispatch.h"
 
-#include <atomic>
 #include <cstdlib>
 #include <cstring>
 #include <optional>
@@ -10,22 +9,17 @@
 namespace darswin {
 namespace {
 
-struct TierFacts {
-  const char* name;
-  bool supported;  // by this CPU
-};
-
-TierFacts facts(Tier tier) {
+bool has(Tier tier) {
 #if defined(__x86_64__)
+  __builtin_cpu_init();
   const bool avx2 = __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma");
-  if (tier == Tier::avx2) return {"avx2", avx2};
+  if (tier == Tier::avx2) return avx2;
   if (tier == Tier::avx512) {
-    return {"avx512", avx2 && __builtin_cpu_supports("avx512f") &&
-                          __builtin_cpu_supports("avx512bw") &&
-                          __builtin_cpu_supports("avx512vl") && __builtin_cpu_supports("avx512dq")};
+    return avx2 && __builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512bw") &&
+           __builtin_cpu_supports("avx512vl") && __builtin_cpu_supports("avx512dq");
   }
 #endif
-  return {"generic", true};
+  return tier == Tier::generic;
 }
 
 std::optional<Tier> find(const char* name) {
@@ -61,17 +55,15 @@ bool cpu_is_intel() {
 
 Tier current_tier() { return current().load(std::memory_order_relaxed); }
 
-const char* tier_name(Tier tier) { return facts(tier).name; }
+const char* tier_name(Tier tier) {
+  constexpr const char* names[] = {"generic", "avx2", "avx512"};
+  return names[static_cast<int>(tier)];
+}
 
 std::vector<Tier> available_tiers() {
   using enum Tier;
-#if defined(__x86_64__)
-  __builtin_cpu_init();
-#endif
-  std::vector<Tier> tiers;
-  for (const Tier tier : {DARSWIN_TIERS}) {
-    if (facts(tier).supported) tiers.push_back(tier);
-  }
+  std::vector<Tier> tiers{DARSWIN_TIERS};
+  std::erase_if(tiers, [](Tier tier) { return !has(tier); });
   return tiers;
 }
 

@@ -6,7 +6,6 @@
 #include <string>
 
 #include "dispatch.h"
-#include "polar_call.h"
 
 // The arguments that polar_sample and polar_embed share, in the order of the fields of struct
 // Sampling (polar_call.h) and of darswin.ops._sampling.Sampling.

@@ -2,6 +2,7 @@
 #pragma once
 
 #include <cstdint>
+#include <type_traits>
 
 namespace darswin {
 
@@ -12,15 +13,7 @@ struct bfloat16 {
 
 // The type in which a storage type is computed.
 template <typename T>
-struct ArithmeticOf {
-  using type = T;
-};
-template <>
-struct ArithmeticOf<bfloat16> {
-  using type = float;
-};
-template <typename T>
-using Arithmetic = typename ArithmeticOf<T>::type;
+using Arithmetic = std::conditional_t<std::is_same_v<T, bfloat16>, float, T>;
 
 // How numbers become 8 bits: round(x / scale) + zero_point, kept in 0 ... 255.
 struct Quantizer {

@@ -1,11 +1,13 @@
 // A call of polar_sample or polar_embed, checked and laid out as the kernels take it.
 #pragma once
 
-#include <atomic>
+#include <numeric>
 #include <tuple>
 #include <vector>
 
 #include "checks.h"
+#include "dispatch.h"
+#include "parallel.h"
 #include "polar.h"
 
 namespace darswin {
@@ -19,9 +21,35 @@ struct Sampling {
   bool bfloat16;  // the type of the output
 };
 
-// Whether far images are read by gathers where that is possible, or as is faster on this CPU.
-enum class Gathers { never, always, by_cpu };
-extern std::atomic<Gathers> gathers;
+// An image is packed if its copy takes at most this many bytes, which stay in the second-level
+// cache, and if it has at most this many pixels a point.
+constexpr int64_t kPackedBytes = 3 << 19;
+constexpr int64_t kPackedPixelsPerPoint = 4;
+// Sums of bfloat16 pixels are float32, of four channels: no thread keeps more of them than this.
+constexpr int64_t kSumsBytes = 24 << 20;
+
+inline Pixel pixel_type(const Tensor& image) {
+  switch (image.scalar_type()) {
+    case ScalarType::Float:
+      return Pixel::f32;
+    case ScalarType::Double:
+      return Pixel::f64;
+    case ScalarType::BFloat16:
+      return Pixel::bf16;
+    default:
+      STD_TORCH_CHECK(image.scalar_type() == ScalarType::Byte,
+                      "polar_sample: pixels must be float32, float64, bfloat16 or uint8");
+      return Pixel::u8;
+  }
+}
+
+// The value of a tensor of one number.
+template <typename T>
+T single(const Tensor& tensor, ScalarType type, const char* what) {
+  STD_TORCH_CHECK(tensor.is_cpu() && tensor.numel() == 1 && tensor.scalar_type() == type,
+                  "polar_sample: ", what, " must be one number on the CPU");
+  return *pointer<T>(tensor);
+}
 
 // Which gradients backward is asked for. Those of radii, center and affine come together.
 struct PolarWanted {
@@ -45,7 +73,44 @@ struct PolarCall {
   PolarSampleArgs<T> args{};
   int64_t batch = 0;
 
-  explicit PolarCall(const Sampling& given);
+  explicit PolarCall(const Sampling& given)
+      : image(given.image),
+        radii(contiguous(given.radii)),
+        center(contiguous(given.center)),
+        affine(contiguous(given.affine)),
+        offsets(contiguous(given.offsets)) {
+    const Tensor azimuths = contiguous(given.azimuths);
+    const Sizes& samples = given.samples;
+    STD_TORCH_CHECK(
+        image.dim() == 4 && radii.dim() == 2 && azimuths.dim() == 1 && samples.size() == 2,
+        "polar_sample: wrong number of dimensions");
+    STD_TORCH_CHECK(image.is_cpu() && azimuths.is_cpu() && azimuths.scalar_type() == type_of<T>(),
+                    "polar_sample: wrong type or device of image or azimuths");
+    STD_TORCH_CHECK(samples[0] > 0 && samples[1] > 0 && radii.size(1) % samples[0] == 0 &&
+                        azimuths.size(0) % samples[1] == 0,
+                    "polar_sample: samples must divide the radii and the azimuths");
+    STD_TORCH_CHECK(sizeof(T) == sizeof(float) || !given.bfloat16,
+                    "polar_sample: samples of a float64 image are not rounded to bfloat16");
+    batch = image.size(0);
+    args.pixel = pixel_type(image);
+    args.image = image.const_data_ptr();
+    args.channels = image.size(1), args.height = image.size(2), args.width = image.size(3);
+    // The stride of a single row or column may be any number, and is never used.
+    for (int axis = 0; axis < 4; ++axis) {
+      args.image_stride[axis] = image.size(axis) > 1 ? image.stride(axis) : 0;
+    }
+    args.num_radii = radii.size(1), args.num_azimuths = azimuths.size(0);
+    args.samples_r = samples[0], args.samples_a = samples[1];
+    args.narrow = given.bfloat16;
+    // What is counted below: points, values of samples, sums of a lens.
+    check_product({batch, args.num_radii, args.num_azimuths, args.channels});
+    check_product({args.samples_r, args.samples_a, args.channels});
+    take_lens();
+    take_jitter(given);
+    take_normalization(given);
+    take_directions(azimuths);
+    choose_reading();
+  }
 
   int64_t rings() const { return args.num_radii / args.samples_r; }
   int64_t sectors() const { return args.num_azimuths / args.samples_a; }
@@ -57,25 +122,182 @@ struct PolarCall {
 
   // Into how many bands of rows backward cuts an image, so that a small batch of large images uses
   // all threads, and a thread never needs much memory for the sums of bfloat16 pixels.
-  int64_t count_bands() const;
-  PolarGradients no_gradients() const;
+  int64_t count_bands() const {
+    const int64_t threads = torch::stable::get_num_threads();
+    int64_t bands = 1;
+    if (batch > 0 && batch < 4 * threads) bands = threads / std::gcd(batch, threads);
+    if (args.pixel == Pixel::bf16) {
+      const double bytes = packed_values() * sizeof(T);
+      bands = std::max<int64_t>(bands, static_cast<int64_t>(bytes / kSumsBytes) + 1);
+    }
+    return std::clamp<int64_t>(bands, 1, std::max<int64_t>(args.height, 1));
+  }
+
+  PolarGradients no_gradients() const {
+    return {nothing_like(image), nothing_like(radii), nothing_like(radii), nothing_like(radii),
+            nothing_like(radii)};
+  }
+
   // The image's gradient, for backward kernels to fill.
-  Tensor new_image_gradient();
+  Tensor new_image_gradient() {
+    STD_TORCH_CHECK(args.pixel != Pixel::u8, "polar_sample: uint8 pixels have no gradient");
+    // Sums of bfloat16 pixels are kept packed whatever the size, and indexed with 32 bits.
+    STD_TORCH_CHECK(args.pixel != Pixel::bf16 || packed_values() < 2147483648.0,
+                    "polar_sample_backward: too large an image for a bfloat16 gradient");
+    // Where there are points the kernels write every pixel.
+    const Tensor grad =
+        points() ? new_empty(image, image.sizes()) : new_zeros(image, image.sizes());
+    ask_for_large_pages(grad);
+    args.grad_image = grad.mutable_data_ptr();
+    return grad;
+  }
+
   // The gradients that are wanted, from args.grad_out.
-  PolarGradients backward(const PolarWanted& wanted);
+  PolarGradients backward(const PolarWanted& wanted) {
+    const int64_t images = sampled_images();
+    const auto& kernel = kernels<PolarSampleKernels<T>>();
+    PolarGradients grads = no_gradients();
+    if (wanted.image) {
+      grads.image = new_image_gradient();
+      args.bands = count_bands();
+      if (images > 0 && grads.image.numel() > 0) {
+        run_with_scratch(images * args.bands, kernel.scratch(args, PolarPass::backward_image),
+                         [&](auto... range) { kernel.backward_image(args, range...); });
+      }
+    }
+    const bool to_offsets = wanted.offsets && offsets;
+    if (!wanted.lens && !to_offsets) return grads;
+    if (to_offsets) {
+      grads.offsets = new_zeros(*offsets, offsets->sizes());
+      args.grad_offsets = mutable_pointer<T>(grads.offsets);
+    }
+    // Images that share their offsets add to one gradient, so one thread takes a ring of all
+    // images, one after another.
+    const int64_t sharing =
+        to_offsets && args.offsets_stride == 0 ? std::max<int64_t>(batch, 1) : 1;
+    std::vector<double> sums(batch * args.num_radii * kLensSums);
+    args.grad_lens = sums.data();
+    const auto rings_of_images = [&](int64_t begin, int64_t end, void* scratch) {
+      for (int64_t ring = begin; ring < end; ++ring) {
+        for (int64_t b = 0; b < sharing; ++b) {
+          const int64_t item = ring + b * rings();
+          kernel.backward_lens(args, item, item + 1, scratch);
+        }
+      }
+    };
+    run_with_scratch(images * rings() / sharing, kernel.scratch(args, PolarPass::backward_lens),
+                     rings_of_images);
+    if (wanted.lens) fold_lens(sums, grads);
+    return grads;
+  }
 
  private:
-  void take_lens();
-  void take_jitter(const Sampling& given);
-  void take_normalization(const Sampling& given);
-  void take_directions(const Tensor& azimuths);
-  void choose_reading();
-  double packed_values() const;
-  void fold_lens(const std::vector<double>& sums, PolarGradients& grads) const;
-};
+  void take_lens() {
+    const auto take = [&](const Tensor& tensor, const Sizes& sizes, const T*& values,
+                          int64_t& stride) {
+      const int64_t rows = count_rows<T>(tensor, batch, sizes, "polar_sample");
+      values = pointer<T>(tensor);
+      stride = rows > 1 ? tensor.numel() / rows : 0;
+    };
+    take(radii, {args.num_radii}, args.radii, args.radii_stride);
+    take(center, {2}, args.center, args.center_stride);
+    if (affine) take(*affine, {2, 2}, args.affine, args.affine_stride);
+    if (!offsets) return;
+    take(*offsets, {2, args.num_radii, args.num_azimuths}, args.offsets, args.offsets_stride);
+    args.offsets_end = args.offsets + offsets->numel();
+  }
 
-extern template struct PolarCall<float>;
-extern template struct PolarCall<double>;
+  void take_jitter(const Sampling& given) {
+    if (given.jitter) {
+      STD_TORCH_CHECK(given.seed.has_value(), "polar_sample: jitter needs a seed");
+      args.jitter = single<double>(*given.jitter, ScalarType::Double, "jitter, a float64,");
+      STD_TORCH_CHECK(args.jitter >= 0 && args.jitter <= 1,
+                      "polar_sample: jitter must be in [0, 1]");
+    }
+    if (given.seed) {
+      args.seed = single<uint64_t>(*given.seed, ScalarType::Long, "seed, an int64,");
+    }
+  }
+
+  // uint8 pixels p count as (p / 255 - mean) / std.
+  void take_normalization(const Sampling& given) {
+    if (args.pixel != Pixel::u8) return;
+    const size_t channels = static_cast<size_t>(args.channels);
+    STD_TORCH_CHECK(given.mean.size() == channels && given.std.size() == channels,
+                    "polar_sample: uint8 pixels need a mean and a std for each channel");
+    for (size_t c = 0; c < channels; ++c) {
+      scale.push_back(static_cast<T>(1 / (255 * given.std[c])));
+      offset.push_back(static_cast<T>(-given.mean[c] / given.std[c]));
+    }
+    args.pixel_scale = scale.data();
+    args.pixel_offset = offset.data();
+  }
+
+  // Angles, cosines, sines, each padded for whole registers.
+  void take_directions(const Tensor& azimuths) {
+    const int64_t padded = (args.num_azimuths + 15) / 8 * 8;
+    directions.assign(3 * padded, 0.0);
+    std::copy_n(pointer<T>(azimuths), args.num_azimuths, directions.begin());
+    double* cosines = directions.data() + padded;
+    kernels<PolarSampleKernels<T>>().directions(directions.data(), padded, cosines,
+                                                cosines + padded);
+    args.cosines = cosines;
+    args.sines = cosines + padded;
+    args.directions_finite =
+        std::all_of(cosines, cosines + args.num_azimuths, [](double x) { return x == x; });
+  }
+
+  // Whether the image is packed, or else read by gathers. Gathers pay for gray images on the CPUs
+  // of AMD and Intel, and for those of three planes on Intel's (docs/performance.md); elsewhere
+  // they are slower than loads, down to half the speed.
+  void choose_reading() {
+    const double pixels = static_cast<double>(args.height) * static_cast<double>(args.width);
+    const double points =
+        static_cast<double>(args.num_radii) * static_cast<double>(args.num_azimuths);
+    args.packed = packed_values() * sizeof(T) <= static_cast<double>(kPackedBytes) &&
+                  pixels <= kPackedPixelsPerPoint * points;
+    const bool gray = args.channels == 1;
+    const bool possible = current_tier() == Tier::avx512 && !args.packed &&
+                          args.pixel == Pixel::f32 && args.image_stride[3] == 1 &&
+                          (gray || args.channels == 3);
+    const bool faster =
+        gathers == Gathers::by_cpu ? gray || cpu_is_intel() : gathers == Gathers::always;
+    args.gathers = possible && faster;
+  }
+
+  // Values of the packed image of the kernels; in double, since it may not fit 64 bits.
+  double packed_values() const {
+    return static_cast<double>(args.height + 3) * static_cast<double>(args.width + 3) *
+           static_cast<double>((args.channels + 3) / 4 * 4);
+  }
+
+  // From the sums of each row of points to the gradients of radii, center and affine.
+  void fold_lens(const std::vector<double>& sums, PolarGradients& grads) const {
+    const int64_t count = args.num_radii;
+    std::vector<double> of_radii(radii.numel()), of_center(center.numel());
+    std::vector<double> of_affine(affine ? affine->numel() : 0);
+    for (int64_t b = 0; b < batch; ++b) {
+      double* row = of_radii.data() + b * args.radii_stride;
+      double* xy = of_center.data() + b * args.center_stride;
+      double* matrix = of_affine.data() + b * args.affine_stride;
+      for (int64_t i = 0; i < count; ++i) {
+        const double* sum = sums.data() + (b * count + i) * kLensSums;
+        const Steps steps(i, count);
+        row[i] += sum[kAlong];
+        for (int side = 0; side < 2; ++side) {
+          row[steps.above[side]] += sum[kInward + side];
+          row[steps.below[side]] -= sum[kInward + side];
+        }
+        xy[0] += sum[kAcross];
+        xy[1] += sum[kDown];
+        for (int e = 0; e < 4 && affine; ++e) matrix[e] += sum[kAffine + e];
+      }
+    }
+    grads.radii = rounded_like<T>(radii, of_radii);
+    grads.center = rounded_like<T>(center, of_center);
+    if (affine) grads.affine = rounded_like<T>(*affine, of_affine);
+  }
+};
 
 // Listed<run<float>, run<double>>::call is run(PolarCall, others...) as the dispatcher calls it,
 // argument by argument, for the type of the image.

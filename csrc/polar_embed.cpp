@@ -2,8 +2,6 @@
 #include <tuple>
 #include <vector>
 
-#include "dispatch.h"
-#include "parallel.h"
 #include "polar_call.h"
 
 namespace darswin {

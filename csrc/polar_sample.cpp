@@ -1,6 +1,4 @@
 // polar_sample and its backward on CPU: allocate, thread, call the kernel.
-#include "dispatch.h"
-#include "parallel.h"
 #include "polar_call.h"
 
 namespace darswin {

@@ -54,7 +54,7 @@ void add_product(int64_t rows, int64_t columns, int64_t depth, const T* a, int64
   constexpr int64_t lanes = kLanes<T>;
   constexpr int64_t most = 128;  // depth of a panel of b that stays in the nearest cache
   for (int64_t k = 0; k < depth; k += most) {
-    const int64_t part = depth - k < most ? depth - k : most;
+    const int64_t part = smaller(depth - k, most);
     const T *from = a + k * a_column, *panel = b + k * b_row;
     int64_t n = 0;
     for (; n + 3 * lanes <= columns; n += 3 * lanes) {

@@ -65,15 +65,9 @@ void embed(const PolarSampleArgs<T>& a, const PolarEmbedArgs<T>& e, int64_t begi
     add_product(sectors, s.wide, s.depth, s.samples, s.row, 1, e.transposed, s.wide, products,
                 s.wide);
     for (int64_t t = 0; t < sectors && !in_place; ++t) {
-      const int64_t to = first + t * e.features;
-      const T* from = s.products + t * s.wide;
-      if constexpr (is_same_v<T, float>) {
-        if (a.narrow) {
-          copy(from, e.features, static_cast<bfloat16*>(a.out) + to);
-          continue;
-        }
-      }
-      copy(from, e.features, static_cast<T*>(a.out) + to);
+      with_output_type(a, [&]<typename E>() {
+        copy(s.products + t * s.wide, e.features, static_cast<E*>(a.out) + first + t * e.features);
+      });
     }
   }
 }
@@ -84,10 +78,9 @@ const T* ring_grads(const PolarSampleArgs<T>& a, const PolarEmbedArgs<T>& e, int
                     const EmbedScratch<T>& s) {
   const int64_t count = sectors_of(a) * e.features;
   if (!a.narrow) return static_cast<const T*>(a.grad_out) + item * count;
-  if constexpr (sizeof(T) == sizeof(float)) {
-    const bfloat16* from = static_cast<const bfloat16*>(a.grad_out) + item * count;
-    copy(from, count, s.grads);
-  }
+  with_output_type(a, [&]<typename E>() {
+    copy(static_cast<const E*>(a.grad_out) + item * count, count, s.grads);
+  });
   return s.grads;
 }
 

@@ -58,26 +58,22 @@ struct FarSixteen {
     const V pairs = between(gather_pairs(plane, offset), gather_pairs(bottom, offset), up, down);
     const V pairs2 =
         between(gather_pairs(plane, offset2), gather_pairs(bottom, offset2), up2, down2);
-    const V l = __builtin_shufflevector(pairs, pairs2, 0, 2, 4, 6, 8, 10, 12, 14, 16, 18, 20, 22,
-                                        24, 26, 28, 30);
-    const V r = __builtin_shufflevector(pairs, pairs2, 1, 3, 5, 7, 9, 11, 13, 15, 17, 19, 21, 23,
-                                        25, 27, 29, 31);
-    return between(l, r, left, right);
+    return between(evens(pairs, pairs2), odds(pairs, pairs2), left, right);
   }
 };
 
-// Sixteen samples of three channels, one behind the other.
+// Sixteen samples of three channels, one behind the other: value n is of channel n % 3.
+template <typename T, int kFirst, typename V>
+inline void store_third(const V& x, const V& y, const V& z, T* to) {
+  constexpr auto of_two = [](int i) { return (kFirst + i) % 3 * 16 % 32 + (kFirst + i) / 3; };
+  constexpr auto of_all = [](int i) { return (kFirst + i) % 3 < 2 ? i : 16 + (kFirst + i) / 3; };
+  store(to + kFirst, shuffle<of_all>(shuffle<of_two>(x, y), z));
+}
 template <typename T, typename V = Vector<T, 16>>
 inline void store_sixteen(const V& x, const V& y, const V& z, T* to) {
-  const V a = __builtin_shufflevector(x, y, 0, 16, 0, 1, 17, 0, 2, 18, 0, 3, 19, 0, 4, 20, 0, 5);
-  const V b = __builtin_shufflevector(x, y, 21, 0, 6, 22, 0, 7, 23, 0, 8, 24, 0, 9, 25, 0, 10, 26);
-  const V c =
-      __builtin_shufflevector(x, y, 0, 11, 27, 0, 12, 28, 0, 13, 29, 0, 14, 30, 0, 15, 31, 0);
-  store(to, __builtin_shufflevector(a, z, 0, 1, 16, 3, 4, 17, 6, 7, 18, 9, 10, 19, 12, 13, 20, 15));
-  store(to + 16,
-        __builtin_shufflevector(b, z, 0, 21, 2, 3, 22, 5, 6, 23, 8, 9, 24, 11, 12, 25, 14, 15));
-  store(to + 32,
-        __builtin_shufflevector(c, z, 26, 1, 2, 27, 4, 5, 28, 7, 8, 29, 10, 11, 30, 13, 14, 31));
+  store_third<T, 0>(x, y, z, to);
+  store_third<T, 16>(x, y, z, to);
+  store_third<T, 32>(x, y, z, to);
 }
 
 // Where the samples of a line go: sample k to to[k * step]. A store of four values may reach beyond
@@ -225,9 +221,7 @@ class FarImage {
                               two_pairs(point[0] + bottom, point[1] + bottom), up, down);
       const V pairs2 = between(two_pairs(point[2] + top, point[3] + top),
                                two_pairs(point[2] + bottom, point[3] + bottom), up2, down2);
-      const V l = __builtin_shufflevector(pairs, pairs2, 0, 2, 4, 6);
-      const V r = __builtin_shufflevector(pairs, pairs2, 1, 3, 5, 7);
-      const V v = between(l, r, left, right);
+      const V v = between(evens(pairs, pairs2), odds(pairs, pairs2), left, right);
       if constexpr (is_same_v<E, uint8_t>) return v * a.pixel_scale[c] + a.pixel_offset[c];
       return v;
     };

@@ -98,13 +98,11 @@ struct PlacedPoints {
   // Finds points j to j + count of radius i of image b, and stores them from place `first` on.
   void find(const PolarSampleArgs<T>& a, const Packed& packed, int64_t b, int64_t i, int64_t j,
             int64_t count, int64_t first) {
-    if (within(a, b, i, -1)) {
+    const auto put = [&]<bool inside>() {
       locate(a, b, i, j, count, random,
-             [&](int64_t k, const Points& p) { place<true>(a, packed, p, first + k, near); });
-    } else {
-      locate(a, b, i, j, count, random,
-             [&](int64_t k, const Points& p) { place<false>(a, packed, p, first + k, near); });
-    }
+             [&](int64_t k, const Points& p) { place<inside>(a, packed, p, first + k, near); });
+    };
+    within(a, b, i, -1) ? put.template operator()<true>() : put.template operator()<false>();
   }
 
   // The same in the far image, with or without the columns and rows of points that lie inside.
@@ -112,13 +110,12 @@ struct PlacedPoints {
   void find_far(const PolarSampleArgs<T>& a, const int64_t strides[2], int64_t b, int64_t i,
                 int64_t j, int64_t count, int64_t first) {
     constexpr double kSpare = 0.001;  // of a pixel, for what rounding does to a place
-    if (!columns && within(a, b, i, kSpare)) {
+    const auto put = [&]<bool inside>() {
       locate(a, b, i, j, count, random,
-             [&](int64_t k, const Points& p) { place<true>(a, strides, p, first + k, far); });
-    } else {
-      locate(a, b, i, j, count, random,
-             [&](int64_t k, const Points& p) { place<false>(a, strides, p, first + k, far); });
-    }
+             [&](int64_t k, const Points& p) { place<inside>(a, strides, p, first + k, far); });
+    };
+    const bool inside = !columns && within(a, b, i, kSpare);
+    inside ? put.template operator()<true>() : put.template operator()<false>();
   }
 
  private:

@@ -74,10 +74,7 @@ inline Vector<T, 16> interpolate_four(const T* pixels, const T* below, const int
   const V bottom2 = two_eights(below + offset[2], below + offset[3]);
   const V pairs = between<true>(top, bottom, pick(down, first_two));
   const V pairs2 = between<true>(top2, bottom2, pick(down, first_two + 2));
-  const V l = __builtin_shufflevector(pairs, pairs2, 0, 1, 2, 3, 8, 9, 10, 11, 16, 17, 18, 19, 24,
-                                      25, 26, 27);
-  const V r = __builtin_shufflevector(pairs, pairs2, 4, 5, 6, 7, 12, 13, 14, 15, 20, 21, 22, 23, 28,
-                                      29, 30, 31);
+  const V l = even_quads(pairs, pairs2), r = odd_quads(pairs, pairs2);
   return between<true>(l, r, pick(along, all));
 }
 

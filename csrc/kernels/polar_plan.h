@@ -13,18 +13,12 @@ constexpr int64_t kTile = 64;  // pixels that are planned together; a multiple o
 
 // An integer as wide as a real number.
 template <typename Real>
-struct IndexOf {
-  using type = int32_t;
-};
-template <>
-struct IndexOf<double> {
-  using type = int64_t;
-};
+using IndexOf = std::conditional_t<is_same_v<Real, double>, int64_t, int32_t>;
 
 // What a tile of pixels is mixed from.
 template <typename Real>
 struct Mix {
-  using Index = typename IndexOf<Real>::type;
+  using Index = IndexOf<Real>;
 
   Index token[4][kTile];  // of the inner ring left, right; of the outer ring left, right
   Real weight[4][kTile];
@@ -34,7 +28,7 @@ struct Mix {
 // How that came about.
 template <typename Real>
 struct Origin {
-  using Index = typename IndexOf<Real>::type;
+  using Index = IndexOf<Real>;
 
   Real across[kTile], down[kTile], radius[kTile];  // the place on the polar plane
   Index inner[kTile], outer[kTile];                // the rings on both sides
@@ -50,7 +44,7 @@ class Planner {
   using Args = PolarToImageArgs<T>;
   using Real = Arithmetic<T>;
   using V = Vector<Real, kLanes<Real>>;
-  using Index = typename Mix<Real>::Index;
+  using Index = IndexOf<Real>;
   using I = Vector<Index, kLanes<Real>>;
 
   explicit Planner(const Args& args) : a(args) {}

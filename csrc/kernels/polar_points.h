@@ -42,8 +42,10 @@ struct RandomWords {
       const Words front = (w[0] & 0xFFFFFFFF) | (w[1] << 32);
       const Words back = (w[2] & 0xFFFFFFFF) | (w[3] << 32);
       using Halves = Vector<uint32_t, 2 * lanes>;
-      store(word + k, (Halves)interleave_lower(front, back));
-      store(word + k + 2 * lanes, (Halves)interleave_upper(front, back));
+      constexpr auto lower = [](int i) { return i % 2 * lanes + i / 2; };
+      constexpr auto upper = [](int i) { return i % 2 * lanes + (i + lanes) / 2; };
+      store(word + k, (Halves)shuffle<lower>(front, back));
+      store(word + k + 2 * lanes, (Halves)shuffle<upper>(front, back));
     }
   }
 };

@@ -31,64 +31,57 @@ int64_t row_bytes(const PolarSampleArgs<T>& a) {
   return round_up((a.num_azimuths * round_up(a.channels, 4) + 16) * sizeof(T), 64);
 }
 
-// Writes (num_azimuths, C) samples to a row of the output, of type E.
-template <typename T, typename E>
-void write_row(const PolarSampleArgs<T>& a, const Row& row, const T* samples, E* out) {
-  out += row.first;
-  const int64_t piece = a.samples_a * a.channels;
-  if (a.tokens) {
-    for (int64_t sector = 0; sector * a.samples_a < a.num_azimuths; ++sector) {
-      E* to = out + sector * row.sector_stride;
-      const T* from = samples + sector * piece;
-      copy(from, piece, to);
-    }
-    return;
+// Calls use<E>() with the type of the output, or of its gradient.
+template <typename T, typename Use>
+void with_output_type(const PolarSampleArgs<T>& a, Use use) {
+  if constexpr (is_same_v<T, float>) {
+    if (a.narrow) return use.template operator()<bfloat16>();
   }
-  for (int64_t c = 0; c < a.channels; ++c) {
-    E* to = out + c * row.channel_stride;
-    const T* from = samples + c;
-    if (a.channels == 3) {  // a constant stride becomes shuffles
-#pragma omp simd
-      for (int64_t j = 0; j < a.num_azimuths; ++j) store(to + j, from[j * 3]);
-    } else {
-      for (int64_t j = 0; j < a.num_azimuths; ++j) store(to + j, from[j * a.channels]);
-    }
-  }
+  use.template operator()<T>();
 }
 
+// Writes (num_azimuths, C) samples to a row of the output.
 template <typename T>
 void write_row(const PolarSampleArgs<T>& a, const Row& row, const T* samples) {
-  if constexpr (sizeof(T) == sizeof(float)) {
-    if (a.narrow) return write_row(a, row, samples, static_cast<bfloat16*>(a.out));
-  }
-  write_row(a, row, samples, static_cast<T*>(a.out));
-}
-
-// Reads a row of gradients of type E as (num_azimuths, C).
-template <typename T, typename E>
-void read_row(const PolarSampleArgs<T>& a, const E* grad, const Row& row, T* to) {
-  grad += row.first;
-  const int64_t piece = a.samples_a * a.channels;
-  for (int64_t sector = 0; sector * a.samples_a < a.num_azimuths; ++sector, to += piece) {
-    const E* from = grad + sector * row.sector_stride;
-    if (row.channel_stride != 1) {
-      for (int64_t s = 0; s < a.samples_a; ++s) {
-        for (int64_t c = 0; c < a.channels; ++c) {
-          to[s * a.channels + c] = load<T>(from + s * row.sample_stride + c * row.channel_stride);
-        }
-      }
-    } else {
-      copy(from, piece, to);
+  with_output_type(a, [&]<typename E>() {
+    E* out = static_cast<E*>(a.out) + row.first;
+    const int64_t piece = a.samples_a * a.channels;
+    for (int64_t sector = 0; a.tokens && sector * a.samples_a < a.num_azimuths; ++sector) {
+      copy(samples + sector * piece, piece, out + sector * row.sector_stride);
     }
-  }
+    for (int64_t c = 0; !a.tokens && c < a.channels; ++c) {
+      E* to = out + c * row.channel_stride;
+      const T* from = samples + c;
+      if (a.channels == 3) {  // a constant stride becomes shuffles
+#pragma omp simd
+        for (int64_t j = 0; j < a.num_azimuths; ++j) store(to + j, from[j * 3]);
+      } else {
+        for (int64_t j = 0; j < a.num_azimuths; ++j) store(to + j, from[j * a.channels]);
+      }
+    }
+  });
 }
 
+// Reads a row of gradients as (num_azimuths, C).
 template <typename T>
 void read_row(const PolarSampleArgs<T>& a, const void* grad, const Row& row, T* to) {
-  if constexpr (sizeof(T) == sizeof(float)) {
-    if (a.narrow) return read_row(a, static_cast<const bfloat16*>(grad), row, to);
-  }
-  read_row(a, static_cast<const T*>(grad), row, to);
+  with_output_type(a, [&]<typename E>() {
+    const E* from = static_cast<const E*>(grad) + row.first;
+    const int64_t piece = a.samples_a * a.channels;
+    for (int64_t j = 0; j < a.num_azimuths; j += a.samples_a, from += row.sector_stride) {
+      T* sector = to + j * a.channels;
+      if (row.channel_stride == 1) {
+        copy(from, piece, sector);
+        continue;
+      }
+      for (int64_t s = 0; s < a.samples_a; ++s) {
+        for (int64_t c = 0; c < a.channels; ++c) {
+          sector[s * a.channels + c] =
+              load<T>(from + s * row.sample_stride + c * row.channel_stride);
+        }
+      }
+    }
+  });
 }
 
 }  // namespace

@@ -48,6 +48,13 @@ inline V between(V a, V b, Weight one_less_t, Weight t) {
 inline Vector<float, 4> lower_half(Vector<float, 8> v) {
   return __builtin_shufflevector(v, v, 0, 1, 2, 3);
 }
+inline Vector<float, 4> upper_half(Vector<float, 8> v) {
+#if defined(__AVX__)  // the compiler's own shuffle is a slow one
+  return (Vector<float, 4>)_mm256_extractf128_ps((__m256)v, 1);
+#else
+  return __builtin_shufflevector(v, v, 4, 5, 6, 7);
+#endif
+}
 
 }  // namespace
 }  // namespace darswin

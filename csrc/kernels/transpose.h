@@ -22,15 +22,27 @@ inline void transpose4(V a, V b, V c, V d, T* to, int64_t stride) {
 // Writes the transpose of a square of kLanes x kLanes, its rows `stride` apart: of each 4 x 4
 // inside its 128 bits, then of the 128 bits among themselves.
 inline void transpose_square(Floats* rows, float* to, int64_t stride) {
-  constexpr int kQuads = kLanes<float> / 4;
+  constexpr int kL = kLanes<float>, kQuads = kL / 4;
+  // As evens and odds, within each 128 bits.
+  const auto even = [](Floats a, Floats b) {
+    return shuffle<[](int i) { return i / 4 * 4 + i % 2 * 2 + i / 2 % 2 * kL; }>(a, b);
+  };
+  const auto odd = [](Floats a, Floats b) {
+    return shuffle<[](int i) { return i / 4 * 4 + i % 2 * 2 + i / 2 % 2 * kL + 1; }>(a, b);
+  };
 #pragma GCC unroll 4
   for (int quad = 0; quad < kQuads; ++quad) {
-    split_pairs<4>(rows + 4 * quad, 1, even_lanes, odd_lanes);
-    split_pairs<4>(rows + 4 * quad, 1, even_lanes, odd_lanes);
+    split_pairs<4>(rows + 4 * quad, 1, even, odd);
+    split_pairs<4>(rows + 4 * quad, 1, even, odd);
   }
-  transpose_quads(rows);
+#pragma GCC unroll 4
+  for (int lane = 0; lane < 4; ++lane) {
+    for (int step = 1; step < kQuads; step *= 2) {
+      split_pairs<kQuads>(rows + lane, 4, even_quads<Floats>, odd_quads<Floats>);
+    }
+  }
 #pragma GCC unroll 16
-  for (int i = 0; i < kLanes<float>; ++i) store(to + i * stride, rows[i]);
+  for (int i = 0; i < kL; ++i) store(to + i * stride, rows[i]);
 }
 
 }  // namespace

@@ -28,7 +28,7 @@ inline Floats square(const float* from, int64_t columns, float* to, int64_t to_s
 void transpose_groups(const TransposeSumArgs& a, int64_t begin, int64_t end) {
   for (int64_t group = begin; group < end; ++group) {
     const int64_t first = group * kGroupRows;
-    const int64_t rows = a.rows - first < kGroupRows ? a.rows - first : kGroupRows;
+    const int64_t rows = smaller(a.rows - first, kGroupRows);
     const float* from = a.from + first * a.columns;
     float *to = a.to + first, *sums = a.sums + group * a.columns;
     const int64_t whole_rows = rows / kL * kL, whole_columns = a.columns / kL * kL;

@@ -4,6 +4,7 @@
 
 #include <cstdint>
 #include <type_traits>
+#include <utility>
 
 namespace darswin {
 namespace {
@@ -61,6 +62,46 @@ inline V splat(T value) {
 template <typename M, typename V>
 inline V select(M mask, V a, V b) {
   return mask ? a : b;
+}
+
+// A value that is rounded as it stands. The compiler may else fuse the product in it into a sum in
+// one copy of the code and not in another, and results would depend on which copy runs.
+template <typename V>
+inline V unfused(V value) {
+#if defined(__AVX__)
+  asm("" : "+x"(value));
+#elif !defined(__SSE2__)
+  asm("" : "+m"(value));
+#endif
+  return value;
+}
+
+// Lanes index(0), index(1), ... of a and, behind them, b.
+template <auto index, typename V, int... lane>
+inline V shuffle(V a, V b, std::integer_sequence<int, lane...>) {
+  return __builtin_shufflevector(a, b, index(lane)...);
+}
+template <auto index, typename V>
+inline V shuffle(V a, V b) {
+  return shuffle<index>(a, b, std::make_integer_sequence<int, sizeof(V) / kLaneBytes<V>>());
+}
+
+// a0 a2 ... b0 b2 ... and a1 a3 ... b1 b3 ..., of lanes and of fours of lanes.
+template <typename V>
+inline V evens(V a, V b) {
+  return shuffle<[](int i) { return 2 * i; }>(a, b);
+}
+template <typename V>
+inline V odds(V a, V b) {
+  return shuffle<[](int i) { return 2 * i + 1; }>(a, b);
+}
+template <typename V>
+inline V even_quads(V a, V b) {
+  return shuffle<[](int i) { return i / 4 * 8 + i % 4; }>(a, b);
+}
+template <typename V>
+inline V odd_quads(V a, V b) {
+  return shuffle<[](int i) { return i / 4 * 8 + 4 + i % 4; }>(a, b);
 }
 
 // One step of the square transpose of N vectors: pairs are split into their even and odd parts,

@@ -44,9 +44,7 @@ struct Attention {
   }
 
   // Queries of the group that begins with this one.
-  int64_t group_size(int64_t group) const {
-    return shape.n - group < kGroup ? shape.n - group : kGroup;
-  }
+  int64_t group_size(int64_t group) const { return smaller(shape.n - group, kGroup); }
 
   // Makes `window` the current one. Finds the one after it as well, whose rows are prefetched
   // meanwhile.
@@ -304,29 +302,31 @@ struct Attention {
     finish(to + 2 * part, s.window.in, s.dv_copy);
   }
 
-  // Windows outside, heads inside: a token's heads stand side by side in memory.
-  void forward_range(int64_t begin, int64_t end) {
-    for (int64_t item = begin; item < end;) {
-      const int64_t window = item / shape.heads, head = item % shape.heads;
-      const int64_t left = end - item, heads = shape.heads - head;
-      const int64_t count = left < heads ? left : heads;
-      enter(window);
-      for (int64_t h = head; h < head + count; ++h) forward(h);
-      item += count;
+  // Items are windows outside and heads inside, since a token's heads stand side by side in memory:
+  // calls body(outer, head, end) for the heads [head, end) of each `outer` of [begin, end).
+  template <typename Body>
+  void for_heads(int64_t begin, int64_t end, Body body) const {
+    for (int64_t item = begin, next; item < end; item = next) {
+      const int64_t outer = item / shape.heads;
+      next = smaller((outer + 1) * shape.heads, end);
+      body(outer, item % shape.heads, next - outer * shape.heads);
     }
+  }
+
+  void forward_range(int64_t begin, int64_t end) {
+    for_heads(begin, end, [&](int64_t window, int64_t head, int64_t last) {
+      enter(window);
+      for (; head < last; ++head) forward(head);
+    });
   }
 
   void backward_range(int64_t begin, int64_t end) {
     const int64_t row_windows = a.windows / a.bias_rows;
-    for (int64_t item = begin; item < end;) {
-      const int64_t chunk = item / shape.heads, head = item % shape.heads;
-      const int64_t left = end - item, heads = shape.heads - head;
-      const int64_t count = left < heads ? left : heads;
+    for_heads(begin, end, [&](int64_t chunk, int64_t head, int64_t last) {
       const int64_t row = chunk % a.bias_rows * row_windows, first = chunk / a.bias_rows * a.chunk;
-      const int64_t last = first + a.chunk < row_windows ? first + a.chunk : row_windows;
-      backward_chunk(row + first, row + last, head, head + count, a.grad_bias + item * shape.table);
-      item += count;
-    }
+      backward_chunk(row + first, row + smaller(first + a.chunk, row_windows), head, last,
+                     a.grad_bias + (chunk * shape.heads + head) * shape.table);
+    });
   }
 
   // Windows [begin, end), heads [first, last); grad_bias has a row for each of these heads.

@@ -64,7 +64,7 @@ struct Shape {
         int64_t query = begin, place = begin - first_run * run;
         int64_t row = (first_run - k_run + runs - 1) * table_a + run - 1 - k;
         for (; query < end; row += table_a, place = 0) {
-          const int64_t count = run - place < end - query ? run - place : end - query;
+          const int64_t count = smaller(run - place, end - query);
           body(key, query, count, row + place);
           query += count;
         }

@@ -135,7 +135,7 @@ __attribute__((noinline)) void weighted_sums(W weights, Rows<const T> from, Summ
                                              bool add) {
   constexpr int kL = kLanes<T>, kRows = kTileRows, kPiece = 64;
   for (int64_t j = 0; j < summands; j += kPiece, add = true) {
-    const int64_t piece = summands - j < kPiece ? summands - j : kPiece;
+    const int64_t piece = smaller(summands - j, kPiece);
     for (int64_t i = 0; i < rows; i += kRows) {
       const auto tile = [&]<typename V, int kColumns>(int64_t c) {
         const Rows<const T> source{from.base + c, from.offset + j};

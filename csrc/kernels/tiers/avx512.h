@@ -18,17 +18,6 @@ using Floats = Vector<float, 16>;
 using Doubles = Vector<double, 8>;
 using Words = Vector<uint64_t, 8>;
 
-template <typename V>
-inline V unfused(V value) {
-  asm("" : "+x"(value));
-  return value;
-}
-
-// The compiler's own shuffle is a slow one.
-inline Vector<float, 4> upper_half(Vector<float, 8> v) {
-  return (Vector<float, 4>)_mm256_extractf128_ps((__m256)v, 1);
-}
-
 inline Floats repeat(Vector<float, 4> v) {
   return (Floats)_mm512_maskz_broadcast_f32x4(0xFFFF, (__m128)v);
 }
@@ -52,34 +41,6 @@ inline Words lower_product(Words a, uint32_t b) {
   return (Words)_mm512_maskz_mul_epu32(0xFF, (__m512i)a, (__m512i)factor);
 }
 
-inline Words interleave_lower(Words a, Words b) {
-  return __builtin_shufflevector(a, b, 0, 8, 1, 9, 2, 10, 3, 11);
-}
-inline Words interleave_upper(Words a, Words b) {
-  return __builtin_shufflevector(a, b, 4, 12, 5, 13, 6, 14, 7, 15);
-}
-
-inline Floats even_lanes(Floats a, Floats b) {
-  return __builtin_shufflevector(a, b, 0, 2, 16, 18, 4, 6, 20, 22, 8, 10, 24, 26, 12, 14, 28, 30);
-}
-inline Floats odd_lanes(Floats a, Floats b) {
-  return __builtin_shufflevector(a, b, 1, 3, 17, 19, 5, 7, 21, 23, 9, 11, 25, 27, 13, 15, 29, 31);
-}
-
-inline Floats even_quads(Floats a, Floats b) {
-  return __builtin_shufflevector(a, b, 0, 1, 2, 3, 8, 9, 10, 11, 16, 17, 18, 19, 24, 25, 26, 27);
-}
-inline Floats odd_quads(Floats a, Floats b) {
-  return __builtin_shufflevector(a, b, 4, 5, 6, 7, 12, 13, 14, 15, 20, 21, 22, 23, 28, 29, 30, 31);
-}
-inline void transpose_quads(Floats* rows) {
-#pragma GCC unroll 4
-  for (int lane = 0; lane < 4; ++lane) {
-    split_pairs<4>(rows + lane, 4, even_quads, odd_quads);
-    split_pairs<4>(rows + lane, 4, even_quads, odd_quads);
-  }
-}
-
 // What follows is for registers of 512 bits alone, which hold four pixels of four channels.
 
 // Eight floats from here and eight from there: a masked load, which needs no shuffle.
@@ -90,7 +51,8 @@ inline Floats two_eights(const float* here, const float* there) {
 
 // Two floats from each of eight places.
 inline Floats gather_pairs(const float* from, Vector<int64_t, 8> offset) {
-  return (Floats)_mm512_i64gather_pd((__m512i)offset, from, sizeof(float));
+  return (Floats)_mm512_mask_i64gather_pd(_mm512_setzero_pd(), 0xFF, (__m512i)offset, from,
+                                          sizeof(float));
 }
 
 inline bool any_negative(Vector<int64_t, 8> v) { return _mm512_movepi64_mask((__m512i)v) != 0; }

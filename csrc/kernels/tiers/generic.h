@@ -23,16 +23,6 @@ using Floats = Vector<float, 4>;
 using Doubles = Vector<double, 2>;
 using Words = Vector<uint64_t, 2>;
 
-// A value that is rounded as it stands. The compiler may else fuse the product in it into a sum in
-// one copy of the code and not in another, and results would depend on which copy runs.
-template <typename V>
-inline V unfused(V value) {
-#if !defined(__SSE2__)
-  asm("" : "+m"(value));
-#endif
-  return value;
-}
-
 // Four lanes, in every 128 bits of a register.
 inline Floats repeat(Vector<float, 4> v) { return v; }
 
@@ -59,17 +49,6 @@ inline Words lower_product(Words a, uint32_t b) {
   return (a & 0xFFFFFFFF) * factor;
 #endif
 }
-
-// a0 b0 a1 b1 ... of the lower and of the upper halves of two registers.
-inline Words interleave_lower(Words a, Words b) { return __builtin_shufflevector(a, b, 0, 2); }
-inline Words interleave_upper(Words a, Words b) { return __builtin_shufflevector(a, b, 1, 3); }
-
-// a0 a2 .. b0 b2 .. within each 128 bits, and a1 a3 .. b1 b3 ..
-inline Floats even_lanes(Floats a, Floats b) { return __builtin_shufflevector(a, b, 0, 2, 4, 6); }
-inline Floats odd_lanes(Floats a, Floats b) { return __builtin_shufflevector(a, b, 1, 3, 5, 7); }
-
-// Of a square of registers, transposes the 128-bit parts among themselves: here there is one.
-inline void transpose_quads(Floats*) {}
 
 }  // namespace
 }  // namespace darswin
