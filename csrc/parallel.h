@@ -41,30 +41,25 @@ inline void ask_for_large_pages(const torch::stable::Tensor& tensor) {
 
 // Working memory of the calling thread for as long as this lives: at least `bytes`, aligned to
 // cache lines, contents undefined. Up to kKept bytes stay with the thread from use to use, since
-// fresh pages cost more than what the kernels do with them; so a thread has one ThreadMemory at a
-// time.
+// fresh pages cost more than what the kernels do with them; so a thread has one of these at a time.
 // Throws std::bad_alloc.
 class ThreadMemory {
  public:
   explicit ThreadMemory(size_t bytes) {
-    static thread_local Memory kept;
-    static thread_local size_t kept_bytes = 0;
-    if (bytes > kKept) {
-      own_ = allocate(bytes);
-      ask_for_large_pages(own_.get(), bytes);
-      memory_ = own_.get();
-      return;
-    }
-    if (kept_bytes < bytes) {
-      kept_bytes = 0;  // nothing is kept while, or if, the allocation fails
-      kept.reset();
-      kept = allocate(bytes);
-      kept_bytes = bytes;
-    }
-    memory_ = kept.get();
+    if (bytes <= size) return;
+    free();
+    if (bytes > PTRDIFF_MAX) throw std::bad_alloc();
+    memory.reset(std::aligned_alloc(64, (bytes + kUnit - 1) / kUnit * kUnit));
+    if (memory == nullptr) throw std::bad_alloc();
+    ask_for_large_pages(memory.get(), bytes);
+    size = bytes;
   }
+  ~ThreadMemory() {
+    if (size > kKept) free();
+  }
+  ThreadMemory(const ThreadMemory&) = delete;
 
-  void* get() const { return memory_; }
+  void* get() const { return memory.get(); }
 
  private:
 #if defined(__SANITIZE_ADDRESS__)  // so that it sees every step beyond the end
@@ -76,17 +71,13 @@ class ThreadMemory {
   struct Free {
     void operator()(void* memory) const { std::free(memory); }
   };
-  using Memory = std::unique_ptr<void, Free>;
-
-  static Memory allocate(size_t bytes) {
-    if (bytes > PTRDIFF_MAX) throw std::bad_alloc();
-    Memory memory(std::aligned_alloc(64, (bytes + kUnit - 1) / kUnit * kUnit));
-    if (memory == nullptr) throw std::bad_alloc();
-    return memory;
+  static void free() {
+    memory.reset();
+    size = 0;
   }
 
-  Memory own_;
-  void* memory_ = nullptr;
+  static inline thread_local std::unique_ptr<void, Free> memory;
+  static inline thread_local size_t size = 0;
 };
 
 // body(begin, end) on contiguous ranges that cover [0, count), each in a thread of its own. An

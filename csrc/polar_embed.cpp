@@ -57,47 +57,33 @@ Tensor forward(PolarCall<T>& call, Tensor weight, MaybeTensor bias) {
 // of a sum grows with its length.
 constexpr int64_t kRunTokens = 1024;
 
-// Adds the weight's gradient from items [begin, end) to `weight`, (D, padded samples), and the
-// bias's to `bias`, (D,).
-template <typename T>
-void add_weight_gradient(const PolarCall<T>& call, const PolarEmbedArgs<T>& embed, int64_t begin,
-                         int64_t end, T* weight, double* bias, void* scratch) {
-  const auto& kernel = kernels<PolarEmbedKernels<T>>();
-  const int64_t run = std::max<int64_t>(1, kRunTokens / call.sectors());
-  if (end - begin <= run) {
-    kernel.backward_weight(call.args, embed, begin, end, weight, bias, scratch);
-    return;
-  }
-  std::vector<T> part(embed.features * padded(call.token_size()));
-  for (int64_t first = begin; first < end; first += run) {
-    std::fill(part.begin(), part.end(), T(0));
-    const int64_t last = std::min(first + run, end);
-    kernel.backward_weight(call.args, embed, first, last, part.data(), bias, scratch);
-    for (size_t k = 0; k < part.size(); ++k) weight[k] += part[k];
-  }
-}
-
 // Gradients of weight and bias. Each chunk of items has sums of its own, which are then added up in
 // order. The number of chunks does not depend on that of the threads, so the result does not
 // either.
 template <typename T>
 std::tuple<Tensor, Tensor> weight_gradients(const PolarCall<T>& call,
                                             const PolarEmbedArgs<T>& embed) {
+  const auto& kernel = kernels<PolarEmbedKernels<T>>();
   const int64_t depth = call.token_size(), row = padded(depth), features = embed.features;
   const int64_t items = call.points() ? call.batch * call.rings() : 0;
   const int64_t chunks = std::min<int64_t>(items, 16);
   std::vector<T> weights(chunks * features * row);
   std::vector<double> biases(chunks * features);
   const auto add_chunks = [&](int64_t begin, int64_t end, void* scratch) {
+    const int64_t run = std::max<int64_t>(1, kRunTokens / call.sectors());
+    std::vector<T> part(features * row);
     for (int64_t chunk = begin; chunk < end; ++chunk) {
-      add_weight_gradient(call, embed, items * chunk / chunks, items * (chunk + 1) / chunks,
-                          weights.data() + chunk * features * row, biases.data() + chunk * features,
-                          scratch);
+      T* sums = weights.data() + chunk * features * row;
+      const int64_t last = items * (chunk + 1) / chunks;
+      for (int64_t item = items * chunk / chunks; item < last; item += run) {
+        std::fill(part.begin(), part.end(), T(0));
+        kernel.backward_weight(call.args, embed, item, std::min(item + run, last), part.data(),
+                               biases.data() + chunk * features, scratch);
+        for (size_t k = 0; k < part.size(); ++k) sums[k] += part[k];
+      }
     }
   };
-  const int64_t bytes =
-      kernels<PolarEmbedKernels<T>>().scratch(call.args, embed, PolarPass::forward);
-  run_with_scratch(chunks, bytes, add_chunks);
+  run_with_scratch(chunks, kernel.scratch(call.args, embed, PolarPass::forward), add_chunks);
   const Tensor weight = new_empty(call.radii, Sizes{features, depth});
   const Tensor bias = new_empty(call.radii, Sizes{features});
   T *to_weight = mutable_pointer<T>(weight), *to_bias = mutable_pointer<T>(bias);

@@ -105,15 +105,7 @@ class FarImage {
 
   // Fetches the pixels of a line to come.
   void fetch(const Line& line) const {
-    const int64_t reads = planes();
-    for (int64_t k = 0; k < line.count; ++k) {
-      const int64_t offset = places.offset[line.place + k * line.step];
-      if (offset < 0) continue;
-      for (int64_t c = 0; c < reads; ++c) {
-        darswin::fetch(pixels + offset + c * channel);
-        darswin::fetch(pixels + offset + c * channel + below);
-      }
-    }
+    fetch_pixels(places, line, pixels, planes(), channel, below);
   }
 
   // Samples the first `count` points of the block by gathers, one behind the other: gray images and
@@ -146,11 +138,11 @@ class FarImage {
     if constexpr (is_same_v<T, float>) {
       switch (layout) {
         case kGray:
-          return fours<1>(line, out);
+          return line.flat ? fours<1, true>(line, out) : fours<1, false>(line, out);
         case kThreePlanes:
-          return fours<3>(line, out);
+          return line.flat ? fours<3, true>(line, out) : fours<3, false>(line, out);
         case kPlanes:
-          return fours<0>(line, out);
+          return line.flat ? fours<0, true>(line, out) : fours<0, false>(line, out);
         case kTogether:
           if (channels == 2) return together<2>(line, out);
           if (channels == 3) return together<3>(line, out);
@@ -173,15 +165,6 @@ class FarImage {
     }
     const bool together = a.image_stride[1] == 1 && a.image_stride[3] >= a.channels;
     return together && a.channels > 1 && a.channels <= 4 ? kTogether : kAny;
-  }
-
-  template <int kChannels>
-  void fours(const Line& line, const FarOutput<T>& out) const {
-    if (line.flat) {
-      fours<kChannels, true>(line, out);
-    } else {
-      fours<kChannels, false>(line, out);
-    }
   }
 
   // The last four points may have been sampled in part by those before. `kRow` says that the points

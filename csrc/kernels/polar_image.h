@@ -200,6 +200,19 @@ void visit_lines(const Lines<T>& all, Fetch fetch, Visit visit) {
   }
 }
 
+// Fetches the pixels around the points of a line, of `planes` planes, with rows `below` apart.
+template <typename T, typename E>
+void fetch_pixels(const FarPlaces<T>& places, const Line& line, const E* pixels, int64_t planes,
+                  int64_t plane, int64_t below) {
+  for (int64_t k = 0; k < line.count; ++k) {
+    const int64_t offset = places.offset[line.place + k * line.step];
+    for (int64_t c = 0; c < planes && offset >= 0; ++c) {
+      fetch(pixels + c * plane + offset);
+      fetch(pixels + c * plane + offset + below);
+    }
+  }
+}
+
 // Calls visit<E>() with the type of the pixels.
 template <typename T, typename Visit>
 void with_pixel_type(Pixel pixel, Visit visit) {

@@ -4,7 +4,6 @@
 #include "../polar_to_image.h"
 #include "arena.h"
 #include "math.h"
-#include "trig.h"
 
 namespace darswin {
 namespace {
@@ -174,11 +173,8 @@ class MixRows {
         tiles(round_up(args.width, kTile) / kTile),
         kept(arena.take<int64_t>(rows)),
         mixes(arena.take<Mix<Real>>(rows * tiles)),
-        origin(arena.take<Origin<Real>>(1)) {}
-
-  // Before the first row: the memory says nothing yet.
-  void forget() const {
-    for (int64_t k = 0; k < rows; ++k) kept[k] = -1;
+        origin(arena.take<Origin<Real>>(1)) {
+    for (int64_t k = 0; arena.memory != nullptr && k < rows; ++k) kept[k] = -1;
   }
 
   // The tiles of row y of image b.

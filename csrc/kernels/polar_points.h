@@ -14,9 +14,6 @@
 
 #include "../polar.h"
 #include "math.h"
-#include "philox.h"
-#include "simd.h"
-#include "trig.h"
 
 namespace darswin {
 namespace {
@@ -24,6 +21,33 @@ namespace {
 constexpr int kBlock = 1024;  // points that are worked on at a time
 
 using Masks = Vector<int64_t, kDoubles>;
+
+// Philox4x32-10, a counter-based generator: the words of (key, counter) depend on nothing else, so
+// any thread can make the jitter of any point, forward and again in backward.
+// Salmon, Moraes, Dror, Shaw: "Parallel random numbers: as easy as 1, 2, 3", SC 2011.
+//
+// A register of counters runs at once, each 32-bit word in the lower half of a 64-bit lane. The
+// upper halves hold whatever the last product left there: the next product does not read them.
+// The four words for each counter, 128 bits in two parts, in the lower halves of word[0..3].
+inline void philox(uint64_t key, Words counter, uint64_t counter_upper, Words word[4]) {
+  uint32_t k0 = static_cast<uint32_t>(key), k1 = static_cast<uint32_t>(key >> 32);
+  Words c0 = counter, c1 = counter >> 32;
+  Words c2 = splat<Words>(counter_upper), c3 = splat<Words>(counter_upper >> 32);
+#pragma GCC unroll 10
+  for (int round = 0; round < 10; ++round) {
+    const Words p0 = lower_product(c0, 0xD2511F53), p1 = lower_product(c2, 0xCD9E8D57);
+    c0 = (p1 >> 32) ^ c1 ^ splat<Words>(uint64_t{k0});
+    c2 = (p0 >> 32) ^ c3 ^ splat<Words>(uint64_t{k1});
+    c1 = p1;
+    c3 = p0;
+    k0 += 0x9E3779B9;
+    k1 += 0xBB67AE85;
+  }
+  word[0] = c0;
+  word[1] = c1;
+  word[2] = c2;
+  word[3] = c3;
+}
 
 // The random words of a block of points: word p % 4 of counter p / 4 for point p of the image.
 struct RandomWords {
@@ -117,8 +141,6 @@ struct General {
   }
 };
 
-inline double magnitude(double x) { return x < 0 ? -x : x; }
-
 // x, or NaN where it is infinite: a radius of minus infinity, moved and clamped, would become 0.
 inline double finite(double x) { return x - x == 0 ? x : __builtin_nan(""); }
 
@@ -130,17 +152,18 @@ struct Reach {
 template <typename T>
 Reach reach(const PolarSampleArgs<T>& a, int64_t b, int64_t i) {
   const T* radii = a.radii + b * a.radii_stride;
-  double most = magnitude(radii[i]);
+  double most = __builtin_fabs(radii[i]);
   if (a.jitter > 0) {
     const Steps steps(i, a.num_radii);
     for (int side = 0; side < 2; ++side) {
-      most += magnitude(static_cast<double>(radii[steps.above[side]]) - radii[steps.below[side]]);
+      most +=
+          __builtin_fabs(static_cast<double>(radii[steps.above[side]]) - radii[steps.below[side]]);
     }
   }
   if (a.affine == nullptr) return {most, most};
   const T* matrix = a.affine + b * a.affine_stride;
-  return {most * (magnitude(matrix[0]) + magnitude(matrix[1])),
-          most * (magnitude(matrix[2]) + magnitude(matrix[3]))};
+  return {most * (__builtin_fabs(matrix[0]) + __builtin_fabs(matrix[1])),
+          most * (__builtin_fabs(matrix[2]) + __builtin_fabs(matrix[3]))};
 }
 
 // The largest offset along y of the points of radius i. NaN does not count.

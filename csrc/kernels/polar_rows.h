@@ -46,10 +46,13 @@ void write_row(const PolarSampleArgs<T>& a, const Row& row, const T* samples) {
   with_output_type(a, [&]<typename E>() {
     E* out = static_cast<E*>(a.out) + row.first;
     const int64_t piece = a.samples_a * a.channels;
-    for (int64_t sector = 0; a.tokens && sector * a.samples_a < a.num_azimuths; ++sector) {
-      copy(samples + sector * piece, piece, out + sector * row.sector_stride);
+    if (a.tokens) {
+      for (int64_t sector = 0; sector * a.samples_a < a.num_azimuths; ++sector) {
+        copy(samples + sector * piece, piece, out + sector * row.sector_stride);
+      }
+      return;
     }
-    for (int64_t c = 0; !a.tokens && c < a.channels; ++c) {
+    for (int64_t c = 0; c < a.channels; ++c) {
       E* to = out + c * row.channel_stride;
       const T* from = samples + c;
       if (a.channels == 3) {  // a constant stride becomes shuffles

@@ -238,22 +238,12 @@ class Scatter {
             add_point(line.place + k * line.step, from + k * step);
           }
         };
-        visit_lines(
-            Lines<T>(a, j, end - row, count, a.samples_a, true),
-            [&](const Line& line) { fetch(line); }, add);
-      }
-    }
-  }
-
-  // Fetches the pixels of a line to come.
-  void fetch(const Line& line) const {
-    const int64_t plane = a.height * a.width;
-    const T* pixels = static_cast<T*>(a.grad_image) + image * a.channels * plane;
-    for (int64_t k = 0; k < line.count; ++k) {
-      const int64_t offset = points.far.offset[line.place + k * line.step];
-      for (int64_t c = 0; c < a.channels && offset >= 0; ++c) {
-        darswin::fetch(pixels + c * plane + offset);
-        darswin::fetch(pixels + c * plane + offset + a.width);
+        const auto fetch = [&](const Line& line) {
+          const int64_t plane = a.height * a.width;
+          const T* pixels = static_cast<T*>(a.grad_image) + image * a.channels * plane;
+          fetch_pixels(points.far, line, pixels, a.channels, plane, a.width);
+        };
+        visit_lines(Lines<T>(a, j, end - row, count, a.samples_a, true), fetch, add);
       }
     }
   }

@@ -191,7 +191,6 @@ struct Workspace {
     gradients =
         arena.take<Real>(backward ? kTile * (row > kChannelBlock ? row : kChannelBlock) : 0);
     sums = arena.take<Real>(backward ? a.rings * a.sectors * kChannelBlock : 0);
-    if (memory != nullptr) rows.forget();
   }
 };
 

@@ -129,11 +129,7 @@ struct Attention {
       biases = s.group_bias;
       stride = kGroup;
     }
-    if (s.window.parted) {
-      logits<true>(biases, stride, group);
-    } else {
-      logits<false>(biases, stride, group);
-    }
+    s.window.parted ? logits<true>(biases, stride, group) : logits<false>(biases, stride, group);
   }
 
   // s.p = the logits, s.largest = the largest of each query. Keys that pad the last eight
@@ -236,34 +232,23 @@ struct Attention {
     exponentials();
   }
 
-  // One head of the current window.
+  // One head of the current window. Results of 8 bits are made of a copy.
   void forward(int64_t index) {
     begin(index);
-    if (a.quantized != nullptr) {
-      attend({s.dq_copy, s.copy}, nullptr);
-      if constexpr (is_same_v<S, float>) quantize(a.quantized + head * shape.d);
-      return;
-    }
-    S* to = a.out + head * shape.d;
-    attend(write(to, s.window.out, s.dq_copy), to);
-    finish(to, s.window.out, s.dq_copy);
-  }
-
-  // The window's weighted values. Those of the next window will stand in `map`, if it is one.
-  void attend(Rows<T> out, const S* map) const {
+    S* to = a.quantized == nullptr ? a.out + head * shape.d : nullptr;
+    const Rows<T> copy{s.dq_copy, s.copy};
+    const Rows<T> out = to == nullptr ? copy : write(to, s.window.out, s.dq_copy);
     for (int64_t group = 0; group < shape.n; group += kGroup) {
       weights(group);
-      if (map != nullptr) fetch(map, s.next.out, group);
+      if (to != nullptr) fetch(to, s.next.out, group);
       weighted_sums(Weights<1, kGroup, T>{s.p}, v, shape.n, out.from(group), group_size(group),
                     shape.d, Factors<T>{s.inverse, 1}, false);
     }
-  }
-
-  // Rows of a copy as 8 bits.
-  void quantize(uint8_t* map) const {
-    const Quantize quantized(a.quantizer);
-    for (int64_t t = 0; t < shape.n; ++t) {
-      quantized(map + s.window.out[t], s.dq_copy + s.copy[t], shape.d);
+    if (to != nullptr) return finish(to, s.window.out, s.dq_copy);
+    if constexpr (is_same_v<S, float>) {
+      const Quantize quantize(a.quantizer);
+      uint8_t* map = a.quantized + head * shape.d;
+      for (int64_t t = 0; t < shape.n; ++t) quantize(map + s.window.out[t], copy[t], shape.d);
     }
   }
 
