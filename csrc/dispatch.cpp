@@ -38,10 +38,7 @@ Tier initial() {
   return find(wanted).value_or(best);
 }
 
-std::atomic<Tier>& current() {
-  static std::atomic<Tier> chosen{initial()};
-  return chosen;
-}
+std::atomic<Tier> current{initial()};
 
 }  // namespace
 
@@ -53,7 +50,7 @@ bool cpu_is_intel() {
 #endif
 }
 
-Tier current_tier() { return current().load(std::memory_order_relaxed); }
+Tier current_tier() { return current.load(std::memory_order_relaxed); }
 
 const char* tier_name(Tier tier) {
   constexpr const char* names[] = {"generic", "avx2", "avx512"};
@@ -69,7 +66,7 @@ std::vector<Tier> available_tiers() {
 
 bool set_tier(const char* name) {
   const std::optional<Tier> found = find(name);
-  if (found.has_value()) current().store(*found, std::memory_order_relaxed);
+  if (found.has_value()) current.store(*found, std::memory_order_relaxed);
   return found.has_value();
 }
 

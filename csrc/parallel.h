@@ -18,10 +18,6 @@
 
 namespace darswin {
 
-inline int64_t num_threads(int64_t count) {
-  return std::clamp<int64_t>(count, 1, torch::stable::get_num_threads());
-}
-
 // It takes longer to map memory that is new from the system, page by page, than to write it. Large
 // pages make it faster. Below 32 MB glibc hands out memory that it has kept, already mapped.
 inline void ask_for_large_pages(void* memory, size_t bytes) {
@@ -86,7 +82,7 @@ class ThreadMemory {
 template <typename Body>
 void parallel_ranges(int64_t count, Body&& body) {
   if (count <= 0) return;
-  const int64_t threads = num_threads(count);
+  const int64_t threads = std::min<int64_t>(count, torch::stable::get_num_threads());
   std::exception_ptr failure;
 #pragma omp parallel num_threads(threads) if (threads > 1)
   {

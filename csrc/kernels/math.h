@@ -25,8 +25,8 @@ inline float root(float x) { return __builtin_sqrtf(x); }
 inline double root(double x) { return __builtin_sqrt(x); }
 
 // e^x for x <= 0, within 1 unit in the last place; below 2^-126 it becomes 0. NaN stays NaN.
-inline Vector<float, kLanes<float>> exponential_of_negative(Vector<float, kLanes<float>> x) {
-  using V = Vector<float, kLanes<float>>;
+inline Floats exponential_of_negative(Floats x) {
+  using V = Floats;
   using Bits = Vector<uint32_t, kLanes<float>>;
   // x = n ln 2 + r. Adding 1.5 * 2^23 rounds to the nearest integer n and leaves it in the lower
   // bits; at the lowest x it is -127, which makes the power of two below a zero.
@@ -43,8 +43,8 @@ inline Vector<float, kLanes<float>> exponential_of_negative(Vector<float, kLanes
   const V q = r2 * tail + (r * 0.16666521f + 0.49999994f);
   return power + power * (r2 * q + r);
 }
-inline Vector<double, kLanes<double>> exponential_of_negative(Vector<double, kLanes<double>> x) {
-  for (int i = 0; i < kLanes<double>; ++i) x[i] = __builtin_exp(x[i]);
+inline Doubles exponential_of_negative(Doubles x) {
+  for (int i = 0; i < kDoubles; ++i) x[i] = __builtin_exp(x[i]);
   return x;
 }
 

@@ -5,7 +5,6 @@
 // backward recomputes them. The gradient of the samples goes the same way, from the product
 // straight to the pixels.
 #include "arena.h"
-#include "matmul.h"
 #include "polar_rows.h"
 #include "polar_sampler.h"
 #include "polar_scatter.h"
@@ -13,9 +12,72 @@
 namespace darswin {
 namespace {
 
+// The products are of matrices that are in cache.
+//
+// A tile of the result stays in registers while a loop runs over the depth: each step multiplies a
+// few whole registers of b with a few single values of a. The tile is as large as the registers
+// allow, so that every value is used often once it is loaded.
+
+// c[i * c_row + n] += sum over k < depth of a[i * a_row + k * a_column] * b[k * b_row + n] for rows
+// i < kRows and kWide registers of n.
+template <int kRows, int kWide, typename T>
+[[gnu::noinline]] void add_tile(int64_t depth, const T* a, int64_t a_row, int64_t a_column,
+                                const T* b, int64_t b_row, T* c, int64_t c_row) {
+  constexpr int lanes = kLanes<T>;
+  using V = Vector<T, lanes>;
+  V sum[kRows][kWide];
+  for (int i = 0; i < kRows; ++i) {
+    for (int w = 0; w < kWide; ++w) sum[i][w] = load<V>(c + i * c_row + w * lanes);
+  }
+  for (int64_t k = 0; k < depth; ++k, a += a_column, b += b_row) {
+    V row[kWide];
+    for (int w = 0; w < kWide; ++w) row[w] = load<V>(b + w * lanes);
+    for (int i = 0; i < kRows; ++i) {
+      for (int w = 0; w < kWide; ++w) sum[i][w] += a[i * a_row] * row[w];
+    }
+  }
+  for (int i = 0; i < kRows; ++i) {
+    for (int w = 0; w < kWide; ++w) store(c + i * c_row + w * lanes, sum[i][w]);
+  }
+}
+
+template <int kWide, typename T>
+void add_columns(int64_t rows, int64_t depth, const T* a, int64_t a_row, int64_t a_column,
+                 const T* b, int64_t b_row, T* c, int64_t c_row) {
+  int64_t i = 0;
+  for (; i + kTileRows <= rows; i += kTileRows) {
+    add_tile<kTileRows, kWide>(depth, a + i * a_row, a_row, a_column, b, b_row, c + i * c_row,
+                               c_row);
+  }
+  for (; i < rows; ++i) {
+    add_tile<1, kWide>(depth, a + i * a_row, a_row, a_column, b, b_row, c + i * c_row, c_row);
+  }
+}
+
+// c (rows, columns) += a (rows, depth) * b (depth, columns). Rows of b and c are contiguous,
+// columns a multiple of the lanes; a may be transposed.
+template <typename T>
+void add_product(int64_t rows, int64_t columns, int64_t depth, const T* a, int64_t a_row,
+                 int64_t a_column, const T* b, int64_t b_row, T* c, int64_t c_row) {
+  constexpr int64_t lanes = kLanes<T>;
+  constexpr int64_t most = 128;  // depth of a panel of b that stays in the nearest cache
+  for (int64_t k = 0; k < depth; k += most) {
+    const int64_t part = smaller(depth - k, most);
+    const T *from = a + k * a_column, *panel = b + k * b_row;
+    int64_t n = 0;
+    for (; n + 3 * lanes <= columns; n += 3 * lanes) {
+      add_columns<3>(rows, part, from, a_row, a_column, panel + n, b_row, c + n, c_row);
+    }
+    for (; n < columns; n += lanes) {
+      add_columns<1>(rows, part, from, a_row, a_column, panel + n, b_row, c + n, c_row);
+    }
+  }
+}
+
 // Scratch of one thread, part after part.
 template <typename T>
 struct EmbedScratch {
+  int64_t rings, sectors;
   int64_t depth, row, wide;  // samples of a token, and padded; padded features
   char *sampler, *scatter;
   T* samples;   // (A, row)
@@ -25,11 +87,12 @@ struct EmbedScratch {
 
   EmbedScratch(const PolarSampleArgs<T>& a, const PolarEmbedArgs<T>& e, PolarPass pass,
                void* memory)
-      : depth(a.samples_r * a.samples_a * a.channels),
+      : rings(a.num_radii / a.samples_r),
+        sectors(a.num_azimuths / a.samples_a),
+        depth(a.samples_r * a.samples_a * a.channels),
         row(round_up(depth, kRowUnit)),
         wide(round_up(e.features, kRowUnit)) {
     Arena arena{static_cast<char*>(memory)};
-    const int64_t sectors = a.num_azimuths / a.samples_a;
     sampler = arena.take<char>(pass == PolarPass::forward ? Sampler<T>::bytes(a) : 0);
     scatter = arena.take<char>(pass == PolarPass::backward_image ? Scatter<T>::bytes(a) : 0);
     samples = arena.take<T>(sectors * row + kRowUnit);
@@ -40,31 +103,25 @@ struct EmbedScratch {
 };
 
 template <typename T>
-int64_t sectors_of(const PolarSampleArgs<T>& a) {
-  return a.num_azimuths / a.samples_a;
-}
-
-template <typename T>
 void embed(const PolarSampleArgs<T>& a, const PolarEmbedArgs<T>& e, int64_t begin, int64_t end,
            void* scratch) {
   const EmbedScratch<T> s(a, e, PolarPass::forward, scratch);
-  const int64_t rings = a.num_radii / a.samples_r, sectors = sectors_of(a);
   Sampler<T> sampler(a, s.row, a.samples_a * a.channels, s.sampler);
   // The product is written straight into the output if rows there are whole registers of the type
   // that is computed in.
   const bool in_place = !a.narrow && e.features == s.wide;
   for (int64_t item = begin; item < end; ++item) {
-    const int64_t first = item * sectors * e.features;
+    const int64_t first = item * s.sectors * e.features;
     T* products = in_place ? static_cast<T*>(a.out) + first : s.products;
-    sampler.ring(item / rings, item % rings, s.samples);
-    for (int64_t t = 0; t < sectors; ++t) {
+    sampler.ring(item / s.rings, item % s.rings, s.samples);
+    for (int64_t t = 0; t < s.sectors; ++t) {
       T* to = products + t * s.wide;
       if (e.bias != nullptr) copy(e.bias, e.features, to);
       for (int64_t f = e.bias != nullptr ? e.features : 0; f < s.wide; ++f) to[f] = 0;
     }
-    add_product(sectors, s.wide, s.depth, s.samples, s.row, 1, e.transposed, s.wide, products,
+    add_product(s.sectors, s.wide, s.depth, s.samples, s.row, 1, e.transposed, s.wide, products,
                 s.wide);
-    for (int64_t t = 0; t < sectors && !in_place; ++t) {
+    for (int64_t t = 0; t < s.sectors && !in_place; ++t) {
       with_output_type(a, [&]<typename E>() {
         copy(s.products + t * s.wide, e.features, static_cast<E*>(a.out) + first + t * e.features);
       });
@@ -76,7 +133,7 @@ void embed(const PolarSampleArgs<T>& a, const PolarEmbedArgs<T>& e, int64_t begi
 template <typename T>
 const T* ring_grads(const PolarSampleArgs<T>& a, const PolarEmbedArgs<T>& e, int64_t item,
                     const EmbedScratch<T>& s) {
-  const int64_t count = sectors_of(a) * e.features;
+  const int64_t count = s.sectors * e.features;
   if (!a.narrow) return static_cast<const T*>(a.grad_out) + item * count;
   with_output_type(a, [&]<typename E>() {
     copy(static_cast<const E*>(a.grad_out) + item * count, count, s.grads);
@@ -88,13 +145,13 @@ template <typename T>
 void backward_weight(const PolarSampleArgs<T>& a, const PolarEmbedArgs<T>& e, int64_t begin,
                      int64_t end, T* weight, double* bias, void* scratch) {
   const EmbedScratch<T> s(a, e, PolarPass::forward, scratch);
-  const int64_t rings = a.num_radii / a.samples_r, sectors = sectors_of(a);
   Sampler<T> sampler(a, s.row, a.samples_a * a.channels, s.sampler);
   for (int64_t item = begin; item < end; ++item) {
     const T* grads = ring_grads(a, e, item, s);
-    sampler.ring(item / rings, item % rings, s.samples);
-    add_product(e.features, s.row, sectors, grads, 1, e.features, s.samples, s.row, weight, s.row);
-    for (int64_t t = 0; t < sectors; ++t) {
+    sampler.ring(item / s.rings, item % s.rings, s.samples);
+    add_product(e.features, s.row, s.sectors, grads, 1, e.features, s.samples, s.row, weight,
+                s.row);
+    for (int64_t t = 0; t < s.sectors; ++t) {
 #pragma omp simd
       for (int64_t f = 0; f < e.features; ++f) bias[f] += grads[t * e.features + f];
     }
@@ -105,21 +162,19 @@ void backward_weight(const PolarSampleArgs<T>& a, const PolarEmbedArgs<T>& e, in
 template <typename T>
 void sample_grads(const PolarSampleArgs<T>& a, const PolarEmbedArgs<T>& e, int64_t item,
                   const EmbedScratch<T>& s) {
-  const int64_t sectors = sectors_of(a);
-  for (int64_t n = 0; n < sectors * s.row; ++n) s.samples[n] = 0;
-  add_product(sectors, s.row, e.features, ring_grads(a, e, item, s), e.features, 1, e.weight, s.row,
-              s.samples, s.row);
+  for (int64_t n = 0; n < s.sectors * s.row; ++n) s.samples[n] = 0;
+  add_product(s.sectors, s.row, e.features, ring_grads(a, e, item, s), e.features, 1, e.weight,
+              s.row, s.samples, s.row);
 }
 
 template <typename T>
 void backward_samples(const PolarSampleArgs<T>& a, const PolarEmbedArgs<T>& e, int64_t begin,
                       int64_t end, void* scratch) {
   const EmbedScratch<T> s(a, e, PolarPass::backward_samples, scratch);
-  const int64_t sectors = sectors_of(a);
   for (int64_t item = begin; item < end; ++item) {
     sample_grads(a, e, item, s);
-    for (int64_t t = 0; t < sectors; ++t) {
-      copy(s.samples + t * s.row, s.depth, e.grad_samples + (item * sectors + t) * s.depth);
+    for (int64_t t = 0; t < s.sectors; ++t) {
+      copy(s.samples + t * s.row, s.depth, e.grad_samples + (item * s.sectors + t) * s.depth);
     }
   }
 }
@@ -130,11 +185,11 @@ void backward_image(const PolarSampleArgs<T>& args, const PolarEmbedArgs<T>& e, 
   const EmbedScratch<T> s(args, e, PolarPass::backward_image, scratch);
   PolarSampleArgs<T> a = args;
   a.narrow = false;  // the gradients of the samples are not
-  const int64_t rings = a.num_radii / a.samples_r, piece = a.samples_a * a.channels;
+  const int64_t piece = a.samples_a * a.channels;
   for (int64_t b = begin; b < end; ++b) {
     Scatter<T> scatter(a, b, 0, s.scatter);
-    for (int64_t ring = 0; ring < rings; ++ring) {
-      sample_grads(args, e, b * rings + ring, s);
+    for (int64_t ring = 0; ring < s.rings; ++ring) {
+      sample_grads(args, e, b * s.rings + ring, s);
       scatter.ring(ring, [&](int64_t n, T* to) {
         read_row(a, s.samples, Row{n * piece, s.row, a.channels, 1}, to);
       });

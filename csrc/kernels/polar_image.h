@@ -21,8 +21,10 @@ struct Packed {
 
   Packed() = default;
   template <typename T>
-  explicit Packed(const PolarSampleArgs<T>& a)
-      : pixel(round_up(a.channels, 4)), row((a.width + 3) * pixel), size((a.height + 3) * row) {}
+  explicit Packed(const PolarSampleArgs<T>& a, int64_t values = 1)  // of a pixel's channel
+      : pixel(round_up(a.channels, 4) * values),
+        row((a.width + 3) * pixel),
+        size((a.height + 3) * row) {}
 };
 
 // Where a block of points lies among the pixels. `right` and `lower` say how far a point is on the

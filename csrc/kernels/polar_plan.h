@@ -139,47 +139,51 @@ class Planner {
 };
 
 template <typename T>
-bool shares_lens(const PolarToImageArgs<T>& a) {
-  return a.radii_rows == 1 && a.place_rows == 1 && a.r_max_rows == 1;
-}
-
-template <typename T>
 int64_t rows_of_band(const PolarToImageArgs<T>& a) {
   return (a.height + a.bands - 1) / a.bands;
 }
 
-// How many rows of mixes are kept: those that come again, of other images or other channels, where
-// they need no more memory than this.
+// The working memory of a thread. It keeps the mixes of whole rows of pixels for the images and the
+// channels that come next: row y has its place at y % rows.
 template <typename T>
-int64_t kept_rows(const PolarToImageArgs<T>& a) {
-  constexpr int64_t kMost = int64_t{16} << 20;
-  const bool again = a.grad_out != nullptr || (a.batch > 1 && shares_lens(a));
-  const int64_t row = round_up(a.width, kTile) / kTile * sizeof(Mix<Arithmetic<T>>);
-  return again && rows_of_band(a) * row <= kMost ? rows_of_band(a) : 1;
-}
-
-// The mixes of whole rows of pixels, kept for the images and channels that come next: images of one
-// lens share them. Row y has its place at y % rows.
-template <typename T>
-class MixRows {
+class Workspace {
  public:
-  using Args = PolarToImageArgs<T>;
   using Real = Arithmetic<T>;
 
-  MixRows(const Args& args, int64_t rows, Arena& arena)
-      : a(args),
-        planner(args),
-        rows(rows),
-        tiles(round_up(args.width, kTile) / kTile),
-        kept(arena.take<int64_t>(rows)),
-        mixes(arena.take<Mix<Real>>(rows * tiles)),
-        origin(arena.take<Origin<Real>>(1)) {
-    for (int64_t k = 0; arena.memory != nullptr && k < rows; ++k) kept[k] = -1;
+  Planner<T> planner;
+  Mix<Real>* tile;  // of backward through the lens
+  Origin<Real>* origin;
+  Real *gradients, *sums;
+  int64_t bytes;
+
+  Workspace(const PolarToImageArgs<T>& args, void* memory)
+      : planner(args),
+        a(args),
+        shared(a.radii_rows == 1 && a.place_rows == 1 && a.r_max_rows == 1),
+        tiles(round_up(a.width, kTile) / kTile) {
+    // Rows are kept where they come again and need no more memory than this.
+    constexpr int64_t kMost = int64_t{16} << 20;
+    const bool backward = a.grad_out != nullptr;  // or there are no channels
+    const bool again = backward || (a.batch > 1 && shared);
+    const int64_t row_bytes = tiles * static_cast<int64_t>(sizeof(Mix<Real>));
+    rows = again && rows_of_band(a) * row_bytes <= kMost ? rows_of_band(a) : 1;
+
+    Arena arena{static_cast<char*>(memory)};
+    kept = arena.take<int64_t>(rows);
+    mixes = arena.take<Mix<Real>>(rows * tiles);
+    tile = arena.take<Mix<Real>>(1);
+    origin = arena.take<Origin<Real>>(1);
+    const int64_t row = round_up(a.channels, kLanes<Real>);
+    gradients =
+        arena.take<Real>(backward ? kTile * (row > kChannelBlock ? row : kChannelBlock) : 0);
+    sums = arena.take<Real>(backward ? a.rings * a.sectors * kChannelBlock : 0);
+    bytes = arena.used;
+    for (int64_t k = 0; memory != nullptr && k < rows; ++k) kept[k] = -1;
   }
 
-  // The tiles of row y of image b.
+  // The tiles of row y of image b. Images of one lens share them.
   const Mix<Real>* row(int64_t b, int64_t y) {
-    const int64_t at = y % rows, key = (shares_lens(a) ? 0 : b) * a.height + y;
+    const int64_t at = y % rows, key = (shared ? 0 : b) * a.height + y;
     Mix<Real>* to = mixes + at * tiles;
     if (kept[at] == key) return to;
     kept[at] = key;
@@ -191,12 +195,12 @@ class MixRows {
   }
 
  private:
-  const Args& a;
-  Planner<T> planner;
-  int64_t rows, tiles;
-  int64_t* kept;
+  const PolarToImageArgs<T>& a;
+  const bool shared;
+  const int64_t tiles;
+  int64_t rows;
+  int64_t* kept;  // the row whose mixes are there, or -1
   Mix<Real>* mixes;
-  Origin<Real>* origin;
 };
 
 }  // namespace

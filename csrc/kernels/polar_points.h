@@ -170,18 +170,14 @@ Reach reach(const PolarSampleArgs<T>& a, int64_t b, int64_t i) {
 template <typename T>
 double largest_offset(const PolarSampleArgs<T>& a, int64_t b, int64_t i) {
   if (a.offsets == nullptr) return 0;
-  using V = Vector<T, kLanes<T>>;
   const T* row = a.offsets + b * a.offsets_stride + (a.num_radii + i) * a.num_azimuths;
-  V most = {};
-  int64_t j = 0;
-  for (; j + kLanes<T> <= a.num_azimuths; j += kLanes<T>) {
-    const V y = load<V>(row + j);
-    most = larger(y, larger(-y, most));
+  T most = 0;
+#pragma omp simd reduction(max : most)
+  for (int64_t j = 0; j < a.num_azimuths; ++j) {
+    const T y = row[j] < 0 ? -row[j] : row[j];
+    most = larger(y, most);
   }
-  T largest = 0;
-  for (int lane = 0; lane < kLanes<T>; ++lane) largest = larger(most[lane], largest);
-  for (; j < a.num_azimuths; ++j) largest = larger(row[j], larger(-row[j], largest));
-  return largest;
+  return most;
 }
 
 // locate_through() with jitter. `tiny` turns are small enough for short sums to give their sines.

@@ -62,19 +62,24 @@ void slope(const Corners<T, E>& corners, const T* grad, T right, T lower, T* gx,
   *gy = (sums[2] - sums[0]) * (1 - right) + (sums[3] - sums[1]) * right;
 }
 
+template <typename T>
 struct LensScratch {
   RandomWords random;
+  FarPlaces<T> places;
   double across[kPlaces], down[kPlaces], shift[kPlaces];
   double x[kPlaces], y[kPlaces];  // of points before the matrix, from the center
 };
 
 template <typename T>
+constexpr int64_t lens_bytes() {
+  return round_up(sizeof(LensScratch<T>), 64);
+}
+
+template <typename T>
 void backward_lens(const PolarSampleArgs<T>& a, int64_t begin, int64_t end, void* scratch) {
-  char* memory = static_cast<char*>(scratch);
-  auto& points = *reinterpret_cast<LensScratch*>(memory);
-  memory += round_up(sizeof(LensScratch), 64);
-  auto& places = *reinterpret_cast<FarPlaces<T>*>(memory);
-  T* grads = reinterpret_cast<T*>(memory + round_up(sizeof(FarPlaces<T>), 64));
+  auto& points = *static_cast<LensScratch<T>*>(scratch);
+  FarPlaces<T>& places = points.places;
+  T* grads = reinterpret_cast<T*>(static_cast<char*>(scratch) + lens_bytes<T>());
   for (int64_t item = begin * a.samples_r; item < end * a.samples_r; ++item) {
     const int64_t b = item / a.num_radii, i = item % a.num_radii;
     double* sums = a.grad_lens + item * kLensSums;
@@ -125,7 +130,7 @@ template <typename T>
 int64_t scratch_bytes(const PolarSampleArgs<T>& a, PolarPass pass) {
   if (pass == PolarPass::forward) return sampler_bytes(a) + a.samples_r * row_bytes(a);
   if (pass == PolarPass::backward_image) return Scatter<T>::bytes(a);
-  return round_up(sizeof(LensScratch), 64) + round_up(sizeof(FarPlaces<T>), 64) + row_bytes(a);
+  return lens_bytes<T>() + row_bytes(a);
 }
 
 void directions(const double* angles, int64_t n, double* cosines, double* sines) {

@@ -105,14 +105,7 @@ class Scatter {
   }
 
   static Packed sums_layout(const PolarSampleArgs<T>& a) {
-    if (keeping(a) == kInPlace) return Packed();
-    Packed layout(a);
-    if (keeping(a) == kCells) {
-      layout.pixel *= 4;
-      layout.row *= 4;
-      layout.size *= 4;
-    }
-    return layout;
+    return keeping(a) == kInPlace ? Packed() : Packed(a, keeping(a) == kCells ? 4 : 1);
   }
 
   // The rows of sums that the band keeps: those of its pixels and, in the outermost bands, of the

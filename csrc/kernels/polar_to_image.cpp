@@ -12,7 +12,6 @@
 // few channels, whose sums stay in the cache: no two items write the same place.
 #include "../polar_to_image.h"
 
-#include "arena.h"
 #include "convert.h"
 #include "polar_plan.h"
 #include "transpose.h"
@@ -28,11 +27,11 @@ class Forward {
   using V = Vector<Real, kLanes<Real>>;
   static constexpr int64_t kL = kLanes<Real>;
 
-  Forward(const Args& args, MixRows<T>& rows) : a(args), rows(rows) {}
+  Forward(const Args& args, Workspace<T>& work) : a(args), work(work) {}
 
   void row(int64_t b, int64_t y) {
     const int64_t pixels = a.height * a.width;
-    tile = rows.row(b, y);
+    tile = work.row(b, y);
     for (int64_t first = 0; first < a.width; first += kTile, ++tile) {
       const int64_t count = smaller(kTile, a.width - first), place = y * a.width + first;
       const T* map = a.x + b * a.rings * a.sectors * a.channels;
@@ -118,7 +117,7 @@ class Forward {
   }
 
   const Args& a;
-  MixRows<T>& rows;
+  Workspace<T>& work;
   const Mix<Real>* tile = nullptr;
 };
 
@@ -171,38 +170,15 @@ void gather(const PolarToImageArgs<T>& a, int64_t b, int64_t place, int64_t coun
   }
 }
 
-// The working memory of a thread.
-template <typename T>
-struct Workspace {
-  using Real = Arithmetic<T>;
-
-  Arena arena;
-  MixRows<T> rows;
-  Mix<Real>* tile;  // of backward through the lens
-  Origin<Real>* origin;
-  Real *gradients, *sums;
-
-  Workspace(const PolarToImageArgs<T>& a, void* memory)
-      : arena{static_cast<char*>(memory)}, rows(a, kept_rows(a), arena) {
-    const bool backward = a.grad_out != nullptr;  // or there are no channels
-    const int64_t row = round_up(a.channels, kLanes<Real>);
-    tile = arena.take<Mix<Real>>(1);
-    origin = arena.take<Origin<Real>>(1);
-    gradients =
-        arena.take<Real>(backward ? kTile * (row > kChannelBlock ? row : kChannelBlock) : 0);
-    sums = arena.take<Real>(backward ? a.rings * a.sectors * kChannelBlock : 0);
-  }
-};
-
 template <typename T>
 int64_t scratch(const PolarToImageArgs<T>& a) {
-  return Workspace<T>(a, nullptr).arena.used;
+  return Workspace<T>(a, nullptr).bytes;
 }
 
 template <typename T>
 void forward(const PolarToImageArgs<T>& a, int64_t begin, int64_t end, void* memory) {
   Workspace<T> work(a, memory);
-  Forward<T> forward(a, work.rows);
+  Forward<T> forward(a, work);
   for (int64_t item = begin; item < end; ++item) forward.row(item / a.height, item % a.height);
 }
 
@@ -241,7 +217,7 @@ void backward_map(const PolarToImageArgs<T>& a, int64_t begin, int64_t end, void
     for (int64_t e = 0; e < map * row; ++e) work.sums[e] = 0;
     const int64_t rows = rows_of_band(a);
     for (int64_t y = band * rows; y < smaller((band + 1) * rows, a.height); ++y) {
-      const Mix<Real>* tile = work.rows.row(b, y);
+      const Mix<Real>* tile = work.row(b, y);
       for (int64_t first = 0; first < a.width; first += kTile, ++tile) {
         const int64_t count = smaller(kTile, a.width - first);
         gather(a, b, y * a.width + first, count, c, width, row, work.gradients);
@@ -291,10 +267,9 @@ double product(const Real* g, const T* token, int64_t channels) {
 template <typename T>
 void backward_lens(const PolarToImageArgs<T>& a, int64_t begin, int64_t end, void* memory) {
   using Real = Arithmetic<T>;
-  const Workspace<T> work(a, memory);
+  Workspace<T> work(a, memory);
   Mix<Real>& tile = *work.tile;
   Origin<Real>& plan = *work.origin;
-  Planner<T> planner(a);
   const int64_t map = a.rings * a.sectors * a.channels, row = round_up(a.channels, kLanes<Real>);
   const double per_turn = a.sectors / (2 * kPi);
   for (int64_t item = begin; item < end; ++item) {
@@ -305,7 +280,7 @@ void backward_lens(const PolarToImageArgs<T>& a, int64_t begin, int64_t end, voi
       const double* m = a.plane == nullptr ? nullptr : a.plane + (a.place_rows == 1 ? 0 : b) * 6;
       for (int64_t first = 0; first < a.width; first += kTile) {
         const int64_t count = smaller(kTile, a.width - first);
-        planner.plan(b, y, first, count, tile, plan);
+        work.planner.plan(b, y, first, count, tile, plan);
         gather(a, b, y * a.width + first, count, int64_t{0}, a.channels, row, work.gradients);
         for (int64_t k = 0; k < count; ++k) {
           if (!tile.known[k]) continue;
