@@ -55,14 +55,15 @@ inline void check_product(std::initializer_list<int64_t> sizes) {
   }
 }
 
-// How many rows a tensor has that must be (B or 1, sizes...), on the CPU and of T.
+// How many rows a tensor has that must be (B or 1, sizes...), on the CPU and of T. `names` says
+// which tensors it is one of.
 template <typename T>
-int64_t count_rows(const Tensor& tensor, int64_t batch, const Sizes& sizes, const char* name) {
+int64_t count_rows(const Tensor& tensor, int64_t batch, const Sizes& sizes, const char* names) {
   const Sizes given = tensor.sizes().vec();
   STD_TORCH_CHECK(tensor.is_cpu() && tensor.scalar_type() == type_of<T>() &&
                       given.size() == sizes.size() + 1 && (given[0] == 1 || given[0] == batch) &&
                       std::equal(sizes.begin(), sizes.end(), given.begin() + 1),
-                  name, ": wrong type, device or shape of a tensor that has rows for images");
+                  "wrong type, device or shape of ", names);
   return given[0];
 }
 

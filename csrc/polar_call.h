@@ -195,7 +195,7 @@ struct PolarCall {
   void take_lens() {
     const auto take = [&](const Tensor& tensor, const Sizes& sizes, const T*& values,
                           int64_t& stride) {
-      const int64_t rows = count_rows<T>(tensor, batch, sizes, "polar_sample");
+      const int64_t rows = count_rows<T>(tensor, batch, sizes, "radii, center, affine or offsets");
       values = pointer<T>(tensor);
       stride = rows > 1 ? tensor.numel() / rows : 0;
     };

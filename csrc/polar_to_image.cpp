@@ -57,7 +57,7 @@ struct ToImageCall {
   }
 
   int64_t rows(const Tensor& tensor, const Sizes& sizes) const {
-    return count_rows<Real>(tensor, args.batch, sizes, kName);
+    return count_rows<Real>(tensor, args.batch, sizes, "radii, center, affine, points or r_max");
   }
 
   // The centres, and the matrices undone; a singular one leaves nothing that is finite.

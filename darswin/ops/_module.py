@@ -53,9 +53,9 @@ def set_tier(tier: str) -> None:
 
 
 def set_gathers(way: bool | None) -> None:
-    """Reads large images with gathers or without; None: as is found to be faster, the default.
+    """Reads large gray or RGB images with gathers or without; None: as is faster on this CPU.
 
-    The results are the same. Only the AVX-512 tier has gathers.
+    None is the default. The results are the same. Only the AVX-512 tier has gathers.
     """
     _loaded.darswin_set_gathers(2 if way is None else int(way))
 
