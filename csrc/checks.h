@@ -23,8 +23,7 @@ using MaybeTensor = std::optional<Tensor>;
 using Sizes = std::vector<int64_t>;
 
 inline MaybeTensor contiguous(const MaybeTensor& tensor) {
-  if (!tensor) return tensor;
-  return contiguous(*tensor);
+  return tensor ? MaybeTensor(contiguous(*tensor)) : tensor;
 }
 
 // A tensor of no values, where a gradient is not asked for.

@@ -25,6 +25,8 @@ struct Sampling {
 // cache, and if it has at most this many pixels a point.
 constexpr int64_t kPackedBytes = 3 << 19;
 constexpr int64_t kPackedPixelsPerPoint = 4;
+// Up to this size AMD's CPUs read gray images faster by gathers: 1 MB of float32.
+constexpr int64_t kGatheredPixels = 1 << 18;
 // Sums of bfloat16 pixels are float32, of four channels: no thread keeps more of them than this.
 constexpr int64_t kSumsBytes = 24 << 20;
 
@@ -175,7 +177,7 @@ struct PolarCall {
     // images, one after another.
     const int64_t sharing =
         to_offsets && args.offsets_stride == 0 ? std::max<int64_t>(batch, 1) : 1;
-    std::vector<double> sums(batch * args.num_radii * kLensSums);
+    std::vector<double> sums(images * args.num_radii * kLensSums);
     args.grad_lens = sums.data();
     const auto rings_of_images = [&](int64_t begin, int64_t end, void* scratch) {
       for (int64_t ring = begin; ring < end; ++ring) {
@@ -247,9 +249,9 @@ struct PolarCall {
         std::all_of(cosines, cosines + args.num_azimuths, [](double x) { return x == x; });
   }
 
-  // Whether the image is packed, or else read by gathers. Gathers pay for gray images on the CPUs
-  // of AMD and Intel, and for those of three planes on Intel's (docs/performance.md); elsewhere
-  // they are slower than loads, down to half the speed.
+  // Whether the image is packed, or else read by gathers. They are faster than loads for gray and
+  // RGB images on Intel's CPUs, and for small gray images on AMD's (docs/performance.md); others
+  // they would read at down to half the speed.
   void choose_reading() {
     const double pixels = static_cast<double>(args.height) * static_cast<double>(args.width);
     const double points =
@@ -260,9 +262,8 @@ struct PolarCall {
     const bool possible = current_tier() == Tier::avx512 && !args.packed &&
                           args.pixel == Pixel::f32 && args.image_stride[3] == 1 &&
                           (gray || args.channels == 3);
-    const bool faster =
-        gathers == Gathers::by_cpu ? gray || cpu_is_intel() : gathers == Gathers::always;
-    args.gathers = possible && faster;
+    const bool faster = cpu_is_intel() || (gray && pixels <= kGatheredPixels);
+    args.gathers = possible && (gathers == Gathers::by_cpu ? faster : gathers == Gathers::always);
   }
 
   // Values of the packed image of the kernels; in double, since it may not fit 64 bits.
@@ -276,7 +277,7 @@ struct PolarCall {
     const int64_t count = args.num_radii;
     std::vector<double> of_radii(radii.numel()), of_center(center.numel());
     std::vector<double> of_affine(affine ? affine->numel() : 0);
-    for (int64_t b = 0; b < batch; ++b) {
+    for (int64_t b = 0; b < sampled_images(); ++b) {
       double* row = of_radii.data() + b * args.radii_stride;
       double* xy = of_center.data() + b * args.center_stride;
       double* matrix = of_affine.data() + b * args.affine_stride;

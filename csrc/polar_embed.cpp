@@ -2,6 +2,7 @@
 #include <tuple>
 #include <vector>
 
+#include "kernels/vector.h"
 #include "polar_call.h"
 
 namespace darswin {
@@ -28,6 +29,25 @@ Sizes output_sizes(const PolarCall<T>& call, int64_t features) {
   return {call.batch, call.rings(), call.sectors(), features};
 }
 
+// (rows, columns) -> (columns, to_stride), four by four in registers.
+template <typename T>
+void transpose(const T* from, int64_t rows, int64_t columns, T* to, int64_t to_stride) {
+  using V = Vector<T, 4>;
+  const int64_t whole_rows = rows / 4 * 4, whole_columns = columns / 4 * 4;
+  for (int64_t i = 0; i < whole_rows; i += 4) {
+    for (int64_t j = 0; j < whole_columns; j += 4) {
+      const T* block = from + i * columns + j;
+      transpose4(load<V>(block), load<V>(block + columns), load<V>(block + 2 * columns),
+                 load<V>(block + 3 * columns), to + j * to_stride + i, to_stride);
+    }
+  }
+  for (int64_t i = 0; i < rows; ++i) {
+    for (int64_t j = i < whole_rows ? whole_columns : 0; j < columns; ++j) {
+      to[j * to_stride + i] = from[i * columns + j];
+    }
+  }
+}
+
 template <typename T>
 Tensor forward(PolarCall<T>& call, Tensor weight, MaybeTensor bias) {
   const auto& kernel = kernels<PolarEmbedKernels<T>>();
@@ -44,10 +64,10 @@ Tensor forward(PolarCall<T>& call, Tensor weight, MaybeTensor bias) {
   const Tensor out = new_empty(call.radii, output_sizes(call, embed.features), call.output_type());
   if (out.numel() == 0) return out;
   args.out = out.mutable_data_ptr();
-  const Sizes rows_to_pad = {0, 0, 0, padded(embed.features) - embed.features};
-  const Tensor transposed =
-      contiguous(torch::stable::transpose(torch::stable::pad(weight, rows_to_pad), 0, 1));
-  embed.transposed = pointer<T>(transposed);
+  const int64_t depth = call.token_size(), wide = padded(embed.features);
+  std::vector<T> transposed(depth * wide);
+  transpose(pointer<T>(weight), embed.features, depth, transposed.data(), wide);
+  embed.transposed = transposed.data();
   run_with_scratch(call.batch * call.rings(), kernel.scratch(args, embed, PolarPass::forward),
                    [&](auto... range) { kernel.forward(args, embed, range...); });
   return out;
@@ -71,14 +91,17 @@ std::tuple<Tensor, Tensor> weight_gradients(const PolarCall<T>& call,
   std::vector<double> biases(chunks * features);
   const auto add_chunks = [&](int64_t begin, int64_t end, void* scratch) {
     const int64_t run = std::max<int64_t>(1, kRunTokens / call.sectors());
-    std::vector<T> part(features * row);
+    std::vector<T> part;
     for (int64_t chunk = begin; chunk < end; ++chunk) {
       T* sums = weights.data() + chunk * features * row;
-      const int64_t last = items * (chunk + 1) / chunks;
-      for (int64_t item = items * chunk / chunks; item < last; item += run) {
-        std::fill(part.begin(), part.end(), T(0));
+      double* bias = biases.data() + chunk * features;
+      const int64_t first = items * chunk / chunks, last = items * (chunk + 1) / chunks;
+      kernel.backward_weight(call.args, embed, first, std::min(first + run, last), sums, bias,
+                             scratch);
+      for (int64_t item = first + run; item < last; item += run) {
+        part.assign(features * row, T(0));
         kernel.backward_weight(call.args, embed, item, std::min(item + run, last), part.data(),
-                               biases.data() + chunk * features, scratch);
+                               bias, scratch);
         for (size_t k = 0; k < part.size(); ++k) sums[k] += part[k];
       }
     }

@@ -16,15 +16,11 @@ namespace {
 constexpr int64_t kL = kLanes<float>;
 
 // Stores v, and returns what is stored: v, or its bfloat16.
-template <typename V>
-inline V write(float* to, V v) {
+template <typename S, typename V>
+inline V write(S* to, V v) {
   store(to, v);
+  if constexpr (is_same_v<S, bfloat16>) return __builtin_bit_cast(V, rounded(v) & 0xFFFF0000);
   return v;
-}
-template <typename V>
-inline V write(bfloat16* to, V v) {
-  store(to, v);
-  return __builtin_bit_cast(V, rounded(v) & 0xFFFF0000);
 }
 
 // body<V>(column, turn) on whole registers of a row, and on the columns that are left. Turns go 0,
@@ -41,16 +37,16 @@ inline void along(int64_t width, Body body) {
 }
 
 // The lanes' sum, by halves.
-template <int kCount>
-inline float total(Vector<float, kCount> v) {
-  if constexpr (kCount == 2) {
+template <int kWide>
+inline float total(Vector<float, kWide> v) {
+  if constexpr (kWide == 2) {
     return v[0] + v[1];
   } else {
     struct {
-      Vector<float, kCount / 2> lower, upper;
+      Vector<float, kWide / 2> lower, upper;
     } halves;
     __builtin_memcpy(&halves, &v, sizeof(v));
-    return total<kCount / 2>(halves.lower + halves.upper);
+    return total<kWide / 2>(halves.lower + halves.upper);
   }
 }
 

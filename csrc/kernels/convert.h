@@ -14,9 +14,8 @@ inline V load(const bfloat16* from) {
   } else if constexpr (is_same_v<V, Floats>) {
     return widen_lanes(from);
   } else {
-    constexpr int kCount = sizeof(V) / sizeof(float);
-    const auto bits = load_bits<Vector<uint16_t, kCount>>(from);
-    return (V)(__builtin_convertvector(bits, Vector<uint32_t, kCount>) << 16);
+    const auto bits = load_bits<Vector<uint16_t, kCount<V>>>(from);
+    return (V)(__builtin_convertvector(bits, Vector<uint32_t, kCount<V>>) << 16);
   }
 }
 template <typename V>
@@ -24,7 +23,7 @@ inline V load(const uint8_t* from) {
   if constexpr (is_same_v<V, float>) {
     return *from;
   } else {
-    return __builtin_convertvector(load_bits<Vector<uint8_t, sizeof(V) / sizeof(float)>>(from), V);
+    return __builtin_convertvector(load_bits<Vector<uint8_t, kCount<V>>>(from), V);
   }
 }
 

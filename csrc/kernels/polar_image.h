@@ -9,7 +9,6 @@
 
 #include "convert.h"
 #include "polar_points.h"
-#include "transpose.h"
 
 namespace darswin {
 namespace {

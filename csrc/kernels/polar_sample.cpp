@@ -15,13 +15,8 @@ namespace darswin {
 namespace {
 
 template <typename T>
-int64_t sampler_bytes(const PolarSampleArgs<T>& a) {
-  return round_up(Sampler<T>::bytes(a), 64);
-}
-
-template <typename T>
 void sample(const PolarSampleArgs<T>& a, int64_t begin, int64_t end, void* scratch) {
-  T* samples = reinterpret_cast<T*>(static_cast<char*>(scratch) + sampler_bytes(a));
+  T* samples = reinterpret_cast<T*>(static_cast<char*>(scratch) + Sampler<T>::bytes(a));
   const int64_t rings = a.num_radii / a.samples_r, piece = a.samples_a * a.channels;
   const int64_t values = a.num_azimuths * a.channels + 3;  // of a radius, as Sampler wants it
   const bool in_place = a.tokens && !a.narrow;
@@ -128,7 +123,7 @@ void backward_lens(const PolarSampleArgs<T>& a, int64_t begin, int64_t end, void
 
 template <typename T>
 int64_t scratch_bytes(const PolarSampleArgs<T>& a, PolarPass pass) {
-  if (pass == PolarPass::forward) return sampler_bytes(a) + a.samples_r * row_bytes(a);
+  if (pass == PolarPass::forward) return Sampler<T>::bytes(a) + a.samples_r * row_bytes(a);
   if (pass == PolarPass::backward_image) return Scatter<T>::bytes(a);
   return lens_bytes<T>() + row_bytes(a);
 }

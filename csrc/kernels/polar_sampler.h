@@ -2,8 +2,6 @@
 // Interpolation in a packed image goes first downwards, then to the right, four channels at a time.
 #pragma once
 
-#include <cstddef>
-
 #include "polar_far.h"
 
 namespace darswin {
@@ -82,57 +80,59 @@ inline Vector<T, 16> interpolate_four(const T* pixels, const T* below, const int
 template <typename V>
 inline bool all_finite(const V& v) {
   bool finite = true;
-  for (std::size_t lane = 0; lane < sizeof(V) / sizeof(v[0]); ++lane)
-    finite &= v[lane] - v[lane] == 0;
+  for (int lane = 0; lane < kCount<V>; ++lane) finite &= v[lane] - v[lane] == 0;
   return finite;
 }
 
-// Where the points of a block go: point k to to[place[k]]. joined[k] says whether the next three
-// points follow it there.
+// Where the points of a block go: point k to to[place[k]]. room[k] is how many values follow from
+// there to the end of a token's row; more than kRoom count as that.
+constexpr int64_t kRoom = 16;
 struct Targets {
-  int32_t place[kBlock];
-  bool joined[kBlock];
+  int32_t place[kBlock], room[kBlock];
 };
 
 // Samples `count` points of a packed image. A point stores four values even if it has fewer
 // channels: the point that belongs behind it comes later and overwrites the rest. But behind a
-// token may be what is written already, or what another thread writes. So from `last_row` on, where
-// the last rows of tokens are, `width` points each, their last points store only their own values.
-// Returns false if it used differences and a sample is not finite, which the sum of all samples
-// shows. A function of its own, so that all it needs stays in registers.
+// token may be what is written already, or what another thread writes. So the last points of a
+// token's last row, which begins at point `last_row`, store only their own values. Returns false if
+// it used differences and a sample is not finite, which the sum of all samples shows. A function of
+// its own, so that all it needs stays in registers.
 template <bool kWeights, typename T>
 [[gnu::noinline]] bool sample_points(const T* pixels, int64_t row, const PackedPlaces<T>& places,
-                                     int64_t last_row, int64_t count, int64_t width,
-                                     const Targets& targets, int64_t channels, T* to) {
+                                     int64_t last_row, int64_t count, const Targets& targets,
+                                     int64_t channels, T* to) {
   const T* below = pixels + row;
-  const int32_t *offset = places.offset, *target = targets.place;
+  const int32_t *offset = places.offset, *target = targets.place, *room = targets.room;
   const T *right = places.right, *lower = places.lower;
+  int64_t k = 0;
+  if constexpr (is_same_v<T, float> && kRegister == 64) {
+    for (; k + 4 <= count; k += 4) {
+      const auto v = interpolate_four(pixels, below, offset + k, right + k, lower + k);
+      if (room[k] >= 4 * channels) {
+        store_quarters(to + target[k], v, channels);
+      } else {
+        scatter_quarters(to, v, target + k, channels);
+      }
+    }
+  }
   Piece<T> sums[4]{};  // used in turn, so that no addition waits for the one before
   const auto sample = [&](int64_t k, T* out, Piece<T>* sum) {
     interpolate<kWeights>(pixels + offset[k], below + offset[k], right[k], lower[k], out, sum);
   };
-  // First the rows before the last as one, then the last row, token by token.
-  for (int64_t k = 0, end = last_row, exact = last_row; k < count;
-       end = k + width, exact = end - 3 / channels) {
-    if constexpr (is_same_v<T, float> && kRegister == 64) {
-      for (; k + 4 <= exact; k += 4) {
-        const auto v = interpolate_four(pixels, below, offset + k, right + k, lower + k);
-        if (targets.joined[k]) {
-          store_quarters(to + target[k], v, channels);
-        } else {
-          scatter_quarters(to, v, target + k);
-        }
-      }
-    }
-    for (; k + 4 <= exact; k += 4) {
+  for (; k + 4 <= last_row; k += 4) {
 #pragma GCC unroll 4
-      for (int turn = 0; turn < 4; ++turn) sample(k + turn, to + target[k + turn], sums + turn);
+    for (int turn = 0; turn < 4; ++turn) sample(k + turn, to + target[k + turn], sums + turn);
+  }
+  for (; k < count; ++k) {
+    if (k < last_row || (room[k] >= 4 && k + 4 <= count)) {
+      sample(k, to + target[k], sums);
+      continue;
     }
-    for (; k < exact; ++k) sample(k, to + target[k], sums);
-    for (; k < end; ++k) {
-      T v[4];
-      sample(k, v, sums);
-      for (int64_t c = 0; c < channels; ++c) to[target[k] + c] = v[c];
+    T v[4];
+    sample(k, v, sums + 1);
+#pragma GCC unroll 4
+    for (int c = 0; c < 4; ++c) {
+      if (c < channels) to[target[k] + c] = v[c];
     }
   }
   return kWeights || all_finite((sums[0] + sums[1]) + (sums[2] + sums[3]));
@@ -143,7 +143,7 @@ class Sampler {
  public:
   static int64_t bytes(const PolarSampleArgs<T>& a) {
     const int64_t values = a.packed ? Packed(a).size + 16 + 4 * a.width : 0;
-    return round_up(sizeof(State), 64) + values * static_cast<int64_t>(sizeof(T));
+    return round_up(sizeof(State), 64) + round_up(values * sizeof(T), 64);
   }
 
   // Channel c of sample (row, s) of a sector's token goes to to[sector * sector_stride + row *
@@ -166,7 +166,8 @@ class Sampler {
         for (int64_t s = 0; s < smaller(columns, a.samples_a); ++s, ++k) {
           const int64_t to = row * row_stride + sector * sector_stride + s * a.channels;
           state.targets.place[k] = static_cast<int32_t>(to);
-          state.targets.joined[k] = s + 4 <= a.samples_a;
+          const int64_t room = smaller((a.samples_a - s) * a.channels, kRoom);
+          state.targets.room[k] = static_cast<int32_t>(room);
         }
       }
     }
@@ -241,10 +242,13 @@ class Sampler {
     // The targets are those of a whole block. They hold for a smaller block only if its points are
     // of one radius.
     if (in_line && (rows == 1 || count == smaller(block_columns(), a.num_azimuths))) {
-      const int64_t all = rows * count, last_row = row + rows == a.samples_r ? all - count : all;
+      // Behind the last row of tokens of several rows is what is written already. All else comes
+      // later, but for what lies behind the block's last three points.
+      const bool last = row + rows == a.samples_r && a.samples_r > 1;
+      const int64_t all = rows * count, last_row = last ? all - count : all - 3;
       const auto sample = [&]<bool kWeights>() {
-        return sample_points<kWeights>(image, packed.row, points.near, last_row, all,
-                                       smaller(a.samples_a, count), state.targets, a.channels, out);
+        return sample_points<kWeights>(image, packed.row, points.near, last_row, all, state.targets,
+                                       a.channels, out);
       };
       if constexpr (kTryDifferences<T>) {
         if (sample.template operator()<false>()) return;

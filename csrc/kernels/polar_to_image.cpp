@@ -14,7 +14,6 @@
 
 #include "convert.h"
 #include "polar_plan.h"
-#include "transpose.h"
 
 namespace darswin {
 namespace {

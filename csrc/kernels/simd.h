@@ -56,5 +56,45 @@ inline Vector<float, 4> upper_half(Vector<float, 8> v) {
 #endif
 }
 
+// One step of the square transpose of N vectors: pairs are split into their even and odd parts,
+// these go to the lower and the upper half. After log2(N) steps row i of lane j is row j of lane i.
+template <int N, typename V, typename Even, typename Odd>
+inline void split_pairs(V* rows, int stride, Even even, Odd odd) {
+  V next[N];
+#pragma GCC unroll 8
+  for (int i = 0; i < N / 2; ++i) {
+    next[i] = even(rows[2 * i * stride], rows[(2 * i + 1) * stride]);
+    next[i + N / 2] = odd(rows[2 * i * stride], rows[(2 * i + 1) * stride]);
+  }
+#pragma GCC unroll 16
+  for (int i = 0; i < N; ++i) rows[i * stride] = next[i];
+}
+
+// Writes the transpose of a square of kLanes x kLanes, its rows `stride` apart: of each 4 x 4
+// inside its 128 bits, then of the 128 bits among themselves.
+inline void transpose_square(Floats* rows, float* to, int64_t stride) {
+  constexpr int kL = kLanes<float>, kQuads = kL / 4;
+  // As evens and odds, within each 128 bits.
+  const auto even = [](Floats a, Floats b) {
+    return shuffle<[](int i) { return i / 4 * 4 + i % 2 * 2 + i / 2 % 2 * kL; }>(a, b);
+  };
+  const auto odd = [](Floats a, Floats b) {
+    return shuffle<[](int i) { return i / 4 * 4 + i % 2 * 2 + i / 2 % 2 * kL + 1; }>(a, b);
+  };
+#pragma GCC unroll 4
+  for (int quad = 0; quad < kQuads; ++quad) {
+    split_pairs<4>(rows + 4 * quad, 1, even, odd);
+    split_pairs<4>(rows + 4 * quad, 1, even, odd);
+  }
+#pragma GCC unroll 4
+  for (int lane = 0; lane < 4; ++lane) {
+    for (int step = 1; step < kQuads; step *= 2) {
+      split_pairs<kQuads>(rows + lane, 4, even_quads<Floats>, odd_quads<Floats>);
+    }
+  }
+#pragma GCC unroll 16
+  for (int i = 0; i < kL; ++i) store(to + i * stride, rows[i]);
+}
+
 }  // namespace
 }  // namespace darswin

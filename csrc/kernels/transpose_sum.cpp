@@ -5,7 +5,7 @@
 // what is written of a column is whole cache lines.
 #include "../transpose_sum.h"
 
-#include "transpose.h"
+#include "simd.h"
 
 namespace darswin {
 namespace {

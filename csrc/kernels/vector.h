@@ -30,6 +30,8 @@ template <>
 constexpr int64_t kLaneBytes<float> = sizeof(float);
 template <>
 constexpr int64_t kLaneBytes<double> = sizeof(double);
+template <typename V>
+constexpr int kCount = sizeof(V) / kLaneBytes<V>;
 template <typename V, typename T>
 inline V load(const T* from) {
   static_assert(kLaneBytes<V> == sizeof(T));
@@ -83,7 +85,7 @@ inline V shuffle(V a, V b, std::integer_sequence<int, lane...>) {
 }
 template <auto index, typename V>
 inline V shuffle(V a, V b) {
-  return shuffle<index>(a, b, std::make_integer_sequence<int, sizeof(V) / kLaneBytes<V>>());
+  return shuffle<index>(a, b, std::make_integer_sequence<int, kCount<V>>());
 }
 
 // a0 a2 ... b0 b2 ... and a1 a3 ... b1 b3 ..., of lanes and of fours of lanes.
@@ -104,18 +106,17 @@ inline V odd_quads(V a, V b) {
   return shuffle<[](int i) { return i / 4 * 8 + 4 + i % 4; }>(a, b);
 }
 
-// One step of the square transpose of N vectors: pairs are split into their even and odd parts,
-// these go to the lower and the upper half. After log2(N) steps row i of lane j is row j of lane i.
-template <int N, typename V, typename Even, typename Odd>
-inline void split_pairs(V* rows, int stride, Even even, Odd odd) {
-  V next[N];
-#pragma GCC unroll 8
-  for (int i = 0; i < N / 2; ++i) {
-    next[i] = even(rows[2 * i * stride], rows[(2 * i + 1) * stride]);
-    next[i + N / 2] = odd(rows[2 * i * stride], rows[(2 * i + 1) * stride]);
-  }
-#pragma GCC unroll 16
-  for (int i = 0; i < N; ++i) rows[i * stride] = next[i];
+// Writes the transpose of four rows of four, its rows `stride` apart.
+template <typename V, typename T>
+inline void transpose4(V a, V b, V c, V d, T* to, int64_t stride) {
+  const V ab = __builtin_shufflevector(a, b, 0, 4, 1, 5);
+  const V cd = __builtin_shufflevector(c, d, 0, 4, 1, 5);
+  const V ab2 = __builtin_shufflevector(a, b, 2, 6, 3, 7);
+  const V cd2 = __builtin_shufflevector(c, d, 2, 6, 3, 7);
+  store(to, __builtin_shufflevector(ab, cd, 0, 1, 4, 5));
+  store(to + stride, __builtin_shufflevector(ab, cd, 2, 3, 6, 7));
+  store(to + 2 * stride, __builtin_shufflevector(ab2, cd2, 0, 1, 4, 5));
+  store(to + 3 * stride, __builtin_shufflevector(ab2, cd2, 2, 3, 6, 7));
 }
 
 }  // namespace

@@ -8,7 +8,6 @@
 #pragma once
 
 #include "convert.h"
-#include "transpose.h"
 
 namespace darswin {
 namespace {
