@@ -44,8 +44,7 @@ T* mutable_pointer(const Tensor& tensor) {
   return static_cast<T*>(tensor.mutable_data_ptr());
 }
 
-// RuntimeError unless 64 times the product of the sizes that are not 0 fits 64 bits. No size is
-// negative.
+// RuntimeError unless 64 times the product of the sizes above 0 fits 64 bits. None is negative.
 inline void check_product(std::initializer_list<int64_t> sizes) {
   int64_t result = 64;
   for (const int64_t size : sizes) {

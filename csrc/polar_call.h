@@ -25,7 +25,7 @@ struct Sampling {
 // cache, and if it has at most this many pixels a point.
 constexpr int64_t kPackedBytes = 3 << 19;
 constexpr int64_t kPackedPixelsPerPoint = 4;
-// Up to this size AMD's CPUs read gray images faster by gathers: 1 MB of float32.
+// Up to this size, 1 MB of float32, CPUs not of Intel read gray images faster by gathers.
 constexpr int64_t kGatheredPixels = 1 << 18;
 // Sums of bfloat16 pixels are float32, of four channels: no thread keeps more of them than this.
 constexpr int64_t kSumsBytes = 24 << 20;
@@ -173,8 +173,7 @@ struct PolarCall {
       grads.offsets = new_zeros(*offsets, offsets->sizes());
       args.grad_offsets = mutable_pointer<T>(grads.offsets);
     }
-    // Images that share their offsets add to one gradient, so one thread takes a ring of all
-    // images, one after another.
+    // Images that share offsets add to one gradient: one thread takes a ring of all, in turn.
     const int64_t sharing =
         to_offsets && args.offsets_stride == 0 ? std::max<int64_t>(batch, 1) : 1;
     std::vector<double> sums(images * args.num_radii * kLensSums);
@@ -249,9 +248,8 @@ struct PolarCall {
         std::all_of(cosines, cosines + args.num_azimuths, [](double x) { return x == x; });
   }
 
-  // Whether the image is packed, or else read by gathers. They are faster than loads for gray and
-  // RGB images on Intel's CPUs, and for small gray images on AMD's (docs/performance.md); others
-  // they would read at down to half the speed.
+  // Whether the image is packed, or else read by gathers: where docs/performance.md shows them to
+  // be faster than loads. They take up to twice as long for other images.
   void choose_reading() {
     const double pixels = static_cast<double>(args.height) * static_cast<double>(args.width);
     const double points =

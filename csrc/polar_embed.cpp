@@ -77,9 +77,8 @@ Tensor forward(PolarCall<T>& call, Tensor weight, MaybeTensor bias) {
 // of a sum grows with its length.
 constexpr int64_t kRunTokens = 1024;
 
-// Gradients of weight and bias. Each chunk of items has sums of its own, which are then added up in
-// order. The number of chunks does not depend on that of the threads, so the result does not
-// either.
+// Gradients of weight and bias. Each chunk of items has sums of its own, which are added up in
+// order. The number of chunks does not depend on that of the threads, nor does the result.
 template <typename T>
 std::tuple<Tensor, Tensor> weight_gradients(const PolarCall<T>& call,
                                             const PolarEmbedArgs<T>& embed) {

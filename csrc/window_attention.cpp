@@ -88,8 +88,7 @@ Tensor forward(AttentionCall<T>&& call, const Quantizer* quantizer = nullptr) {
 }
 
 // How many windows share one row of bias gradients: many, so that few rows are left to add up, but
-// not so many that threads get unequal work. It must not depend on the number of threads, or the
-// sums would.
+// not so many that threads get unequal work. If it depended on the threads, the sums would.
 template <typename T>
 int64_t chunk_size(const WindowAttentionArgs<T>& args) {
   const int64_t most = std::clamp<int64_t>(args.windows * args.heads / 32, 1, 16);

@@ -1,5 +1,4 @@
-// A row of samples is all points of one radius: where the operator's output, or its gradient, holds
-// them.
+// Rows of samples, which are all points of one radius, in the operator's output or its gradient.
 #pragma once
 
 #include "polar_image.h"

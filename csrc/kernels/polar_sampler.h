@@ -261,8 +261,7 @@ class Sampler {
     }
   }
 
-  // Samples points j to j + count of one radius, whose places are `place` on, of any number of
-  // channels.
+  // Samples points j to j + count of a radius, of any number of channels, from place `place` on.
   void near_row(int64_t j, int64_t count, int64_t place, T* row) const {
     for (int64_t k = 0; k < count; ++k) {
       T* to = row + (j + k) / a.samples_a * sector_stride + (j + k) % a.samples_a * a.channels;

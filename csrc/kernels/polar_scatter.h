@@ -157,15 +157,13 @@ class Scatter {
   }
   static void add_cell(double*, const double*, double, double) {}  // doubles are never in cells
 
-  // Adds up the pixels of a row from the cells around each; a pixel's sum replaces the front of its
-  // own cell.
+  // Adds up the pixels of a row from the cells around each; the sum replaces its own cell's front.
   void collect(const T* row) const {
     using V = Vector<T, 4>;
     T* cell = const_cast<T*>(row);
     for (int64_t x = 0; x < a.width; ++x, cell += layout.pixel) {
       const T *left = cell - layout.pixel, *above = cell - layout.row;
-      // The front of the cell to the left is that pixel's sum by now; the part for this pixel is
-      // still there.
+      // The front of the cell to the left is a sum by now; the part for this pixel is still there.
       store(cell, load<V>(cell) + load<V>(left + 4) +
                       (load<V>(above + 8) + load<V>(above - layout.pixel + 12)));
     }

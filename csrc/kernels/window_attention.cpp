@@ -46,8 +46,7 @@ struct Attention {
   // Queries of the group that begins with this one.
   int64_t group_size(int64_t group) const { return smaller(shape.n - group, kGroup); }
 
-  // Makes `window` the current one. Finds the one after it as well, whose rows are prefetched
-  // meanwhile.
+  // Makes `window` the current one, and finds the next, whose rows are prefetched meanwhile.
   void enter(int64_t window) {
     s.next.find(a, shape, window);
     const Tokens<T> last = s.window;
@@ -62,8 +61,7 @@ struct Attention {
   __attribute__((always_inline)) void fetch(const S* map, const int64_t* offset,
                                             int64_t group) const {
     if (!shape.far) return;
-    // Not unrolled: thirty-two prefetches in a row were measured to take much longer than none at
-    // all.
+    // Not unrolled: thirty-two prefetches in a row took much longer than none at all.
     const int64_t end = group + group_size(group), row = shape.d * static_cast<int64_t>(sizeof(S));
 #pragma GCC unroll 1
     for (int64_t t = group; t < end; ++t) {
