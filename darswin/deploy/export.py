@@ -17,11 +17,8 @@ __all__ = ["export_onnx", "export_program"]
 
 
 class _OfTensors(nn.Module):
-    """A model that takes its lens as tensors, by name; what is not given is the lens's own.
-
-    Args:
-        any_strides: reads its inputs by the strides they come with, whatever the example's were.
-    """
+    """A model that takes its lens as tensors, by name; those that are not given are the lens's own.
+    With `any_strides` it reads its inputs by the strides they come with."""
 
     def __init__(self, model: nn.Module, lens: Lens | None, any_strides: bool):
         super().__init__()
@@ -35,11 +32,9 @@ class _OfTensors(nn.Module):
 
 
 def _in_order(tensor: Tensor) -> Tensor:
-    """A contiguous copy, made by an operator that AOTInductor calls with the tensor itself.
-
-    Kernels that it writes take the example's strides for granted, and it drops a `clone` of what is
-    contiguous in the example. `masked_scatter` it leaves to torch, on the CPU.
-    """
+    # A contiguous copy. The kernels that AOTInductor writes take the example's strides for granted,
+    # and it drops a `clone` of what is contiguous in the example. It leaves `masked_scatter` to
+    # torch, on the CPU.
     copy = torch.empty_like(tensor, memory_format=torch.contiguous_format)
     return copy.masked_scatter(torch.ones((), dtype=torch.bool, device=tensor.device), tensor)
 

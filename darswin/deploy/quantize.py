@@ -92,11 +92,7 @@ def sensitivities(model: Model, calibration: Iterable[Sequence]) -> dict[str, fl
 
 
 class _Calibration(Generic[Net]):
-    """A model, pictures, and what they say of it.
-
-    Attributes:
-        parts: the names of the linear layers of each part that may become 8 bits.
-    """
+    """A model, pictures, and the ranges of its activations on them."""
 
     def __init__(self, model: Net, calibration: Iterable[Sequence], keep: Collection[str]):
         self.batches = _batches(model, calibration)
@@ -125,7 +121,7 @@ class _Calibration(Generic[Net]):
 
 
 class Change:
-    """How much results differ: the mean square of the difference, over the variance."""
+    """The mean square of the difference of results, over their variance."""
 
     def __init__(self) -> None:
         self.count, self.sums = 0, torch.zeros(3, dtype=torch.float64)
@@ -234,8 +230,7 @@ def _activations(model: Model, batches: Batches, names: Collection[str]) -> dict
 
 
 def _best_range(name: str, values: Tensor, ends: Tensor) -> Quantization:
-    """The quantization of least squared error: both ends are shares of the whole range, the same,
-    then each its own."""
+    """The quantization of least squared error: its ends are shares of the whole range."""
     if not ends.isfinite().all():
         raise ValueError(f"{name} takes numbers that are not finite: look at the calibration")
     lower, upper = min(ends.min().item(), 0.0), max(ends.max().item(), 0.0)

@@ -16,12 +16,8 @@ COEFFICIENTS = ("a_theta", "b_theta", "a_phi", "b_phi")
 
 
 class RelativeBias(nn.Module):
-    """B_θ + B_φ: a bias table from the angles between tokens. Subclasses say what one axis gives.
-
-    Args:
-        window: (M_r, M_φ). heads: attention heads. sectors: A of the map.
-        rows: of coefficients for each head: a_θ, b_θ, a_φ and b_φ.
-    """
+    """B_θ + B_φ: a bias table from the angles between tokens, by coefficients a_θ, b_θ, a_φ and b_φ
+    of so many `rows` for each head. Subclasses define one axis."""
 
     def __init__(
         self, window: tuple[int, int], heads: int, sectors: int, rows: tuple[int, int, int, int]
@@ -38,11 +34,8 @@ class RelativeBias(nn.Module):
         raise NotImplementedError
 
     def forward(self, ring_angles: Tensor) -> Tensor:
-        """`ring_angles` (N, at least M_r) rad: how far 0, 1, … rings reach.
-
-        Returns:
-            (N, heads, 2·M_r-1, 2·M_φ-1), the `bias` of `window_attention`.
-        """
+        """The angles that 0, 1, … rings reach, (N, at least M_r) rad → (N, heads, 2·M_r-1,
+        2·M_φ-1), the `bias` of `window_attention`."""
         return self.table(ring_angles, **joined_coefficients([self]))
 
     def table(
@@ -67,12 +60,9 @@ def joined_coefficients(biases: Sequence[RelativeBias]) -> dict[str, Tensor]:
 class AngularRelativeBias(RelativeBias):
     """B = a_Δ sin α + b_Δ cos α, α the angle between two tokens Δ apart.
 
-    Coefficients are stored by Δ modulo their number: Δ = 0, 1, …, -2, -1.
-
-    Args:
-        window, sectors: as `RelativeBias`. heads: attention heads.
-        periodic: φ coefficients by Δφ modulo M_φ rather than modulo 2·M_φ-1, which makes them, and
-            so the bias, periodic; for a window that spans the ring.
+    Coefficients are stored by Δ modulo their number: Δ = 0, 1, …, -2, -1. With `periodic`, for a
+    window that spans the ring, those of φ are by Δφ modulo M_φ rather than modulo 2·M_φ-1, which
+    makes the bias periodic.
 
     Source: DarSwin, ICCV 2023, eq. 9 to 11.
     """
@@ -92,10 +82,7 @@ class FourierBias(RelativeBias):
     """B = b_0 + (1/P) Σ_{p=1..P} (a_p sin pα + b_p cos pα), P harmonics.
 
     α is the angle between two tokens ("angular"), or along the radius their distance in the image,
-    the circle's radius being π ("polar"): what `ring_angles` holds decides.
-
-    Args:
-        window, sectors: as `RelativeBias`. heads: attention heads. harmonics: P.
+    the circle's radius being π ("polar"): `ring_angles` decides.
 
     Source: DarSwin, ICCV 2023, table 3, after Ning et al., IJCAI 2020.
     """
@@ -111,9 +98,6 @@ class FourierBias(RelativeBias):
 
 class RelativeTable(nn.Module):
     """A learned bias for each offset between two tokens, which knows no angle.
-
-    Args:
-        window: (M_r, M_φ), or of a plain map rows and columns. heads: attention heads.
 
     Source: Swin Transformer, ICCV 2021, eq. 4.
     """

@@ -18,13 +18,10 @@ _LARGEST = 127  # of a weight: -128 is left out, so that weights are symmetric
 
 
 class Quantization(NamedTuple):
-    """How numbers become 8 bits: q = round(x / scale) + zero_point, kept in 0 … 255.
+    """The way of numbers to 8 bits: q = round(x / scale) + zero_point, kept in 0 … 255."""
 
-    Attributes: scale: of one step, positive. zero_point: what 0 becomes, in 0 … 255.
-    """
-
-    scale: float
-    zero_point: int
+    scale: float  # of one step, positive
+    zero_point: int  # of 0, in 0 … 255
 
 
 def quantize(x: Tensor, quantization: Quantization) -> Tensor:
@@ -46,21 +43,13 @@ class QuantizedLinear(nn.Module):
     It computes in float32 what integer products compute, so it runs everywhere and is exported;
     `darswin.optimize` makes integer products of it. For inference: it has no gradients.
 
-    Args:
-        in_features, out_features: D and D'. bias: whether there is one.
-        activation: how the input becomes 8 bits.
-
-    Attributes:
-        weight: (D', D), int8. weight_scale: (D',), what one step of a row's weights is worth.
-        bias: (D',) or None.
-
     Source: Jacob et al., "Quantization and training of neural networks for efficient
     integer-arithmetic-only inference", CVPR 2018; weights symmetric, a scale for each output.
     """
 
-    weight: Tensor
-    weight_scale: Tensor
-    bias: Tensor | None
+    weight: Tensor  # (D', D), int8
+    weight_scale: Tensor  # (D',), of one step of a row's weights
+    bias: Tensor | None  # (D',)
     _zero_points: Tensor
 
     def __init__(
@@ -111,9 +100,8 @@ class QuantizedLinear(nn.Module):
 
     def _dequantized(self) -> Tensor:
         """The weights that stand for those of 8 bits, (D', D), float32."""
-        return (self.weight.float() - self._zero_points[:, None]) * self.weight_scale.float()[
-            :, None
-        ]
+        steps = self.weight.float() - self._zero_points[:, None]
+        return steps * self.weight_scale.float()[:, None]
 
     def _for_graphs(self, x: Tensor) -> Tensor:
         """The same by torch's operators for graphs, which ONNX has by the same names."""
@@ -152,14 +140,8 @@ def quantized_layers(model: nn.Module) -> dict[str, Quantization]:
 def with_quantized_layers(
     model: nn.Module, activations: Mapping[str, Quantization | tuple[float, int]]
 ) -> None:
-    """Puts quantized layers in place of linear ones, with their weights.
-
-    Args:
-        activations: for each layer's name, how its input becomes 8 bits.
-
-    Raises:
-        ValueError: a name that no linear layer has.
-    """
+    """Puts quantized layers in place of the linear ones of these names; ValueError where no linear
+    layer has a name. The values say how their inputs become 8 bits."""
     layers = dict(model.named_modules())
     for name, activation in activations.items():
         if not isinstance(linear := layers.get(name), nn.Linear):
@@ -168,12 +150,9 @@ def with_quantized_layers(
 
 
 def with_unsigned_weights(model: Net) -> Net:
-    """A copy of a model whose quantized layers have uint8 weights, with a zero point of 128.
-
-    The copy is for graphs and computes the same. ONNX Runtime multiplies uint8 with uint8 exactly
-    on every CPU. It multiplies uint8 with int8 exactly on x86 CPUs with VNNI only: on others the
-    sum of two products overflows in 16 bits.
-    """
+    """A copy of a model, for graphs, whose quantized layers have uint8 weights, with a zero point
+    of 128. ONNX Runtime multiplies uint8 with uint8 exactly on every CPU, but uint8 with int8 on
+    x86 CPUs with VNNI only: on others the sum of two products overflows in 16 bits."""
     model = copy.deepcopy(model)
     for name in quantized_layers(model):
         layer = model.get_submodule(name)
@@ -184,7 +163,7 @@ def with_unsigned_weights(model: Net) -> Net:
 
 
 def without_quantized_layers(model: nn.Module) -> None:
-    """Puts linear layers in place of quantized ones: see `QuantizedLinear.to_linear`."""
+    """Puts float32 linear layers of the same weights in place of a model's quantized ones."""
     for name in quantized_layers(model):
         layer = model.get_submodule(name)
         assert isinstance(layer, QuantizedLinear)

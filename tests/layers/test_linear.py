@@ -120,10 +120,17 @@ def test_where_torch_multiplies_anyway(monkeypatch, backend):
     assert torch.equal(half(x.bfloat16()), F.linear(x.bfloat16(), half.weight, half.bias))
     assert double(x.double()).dtype == torch.float64
     assert layer(x[:0]).shape == (0, 20)
-    compiled = torch.compile(layer, fullgraph=True, backend="aot_eager")
-    torch.testing.assert_close(compiled(x), F.linear(x, layer.weight, layer.bias))
     with torch.backends.mkldnn.flags(enabled=False):
         assert layer(x).shape == (4, 20)
+
+
+@pytest.mark.slow
+def test_compiled_graphs_have_torchs_product(monkeypatch):
+    monkeypatch.setattr(linear, "_multiply", None)
+    layer, x = Linear(12, 20), torch.randn(4, 12)
+    layer.matmul_backend = "onednn"
+    compiled = torch.compile(layer, fullgraph=True, backend="aot_eager")
+    torch.testing.assert_close(compiled(x), F.linear(x, layer.weight, layer.bias))
 
 
 def test_no_second_derivative():
