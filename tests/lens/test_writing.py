@@ -124,6 +124,7 @@ def check_kalibr(path, lens):
     return kind, distortion
 
 
+@pytest.mark.slow
 def test_which_formats_hold_which_cameras_and_their_libraries_read_them(tmp_path):
     seen, kinds, points = set(), set(), points_around(0.6)
     for path in sorted(set(FILES.iterdir()) - {FILES / "README.md"}):
