@@ -12,7 +12,7 @@ from scenes import CALIBRATIONS, distance_of, labels_of, rays_of
 from scipy import ndimage
 
 from darswin.data import IGNORE, Scene
-from darswin.data.reframing import resize_scene, turn_scene, warp_scene
+from darswin.data.reframing import _points, resize_scene, turn_scene, warp_scene
 from darswin.data.warp import Crop, Turn, taken_part, turned_picture
 from darswin.lens import BrownConrady, Equidistant, OCam, Polynomial, Spherical, load
 from darswin.lens.pixels import pixel_angles, reprojection
@@ -203,6 +203,7 @@ def test_the_places_are_those_of_the_exact_reprojection():
 
 
 def test_what_is_much_larger_is_averaged():
+    assert [_points(scale) for scale in (0.5, 1, 1.5, 2, 4.5, 5, 20)] == [1, 1, 1, 3, 3, 5, 5]
     lens = Equidistant.from_fov(3.0, 400.0, image_size=(800, 800), center=[399.5, 399.5])
     noise = np.random.default_rng(0).integers(256, size=(800, 800, 1), dtype=np.uint8)
     source = Scene(noise, np.zeros((800, 800), np.uint8), lens)

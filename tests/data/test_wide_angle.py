@@ -28,6 +28,7 @@ def of(picture, lenses, **options):
 
 
 def test_an_image_is_the_warp_of_the_picture_reduced():
+    assert IMAGENET_MEAN == (0.485, 0.456, 0.406) and IMAGENET_STD == (0.229, 0.224, 0.225)
     assert math.degrees(PAPER_FOV) == pytest.approx(174.6324, abs=1e-4)
     image, lens, label = of(smooth(), SphericalLenses(0.6, 0.6))[0]
     assert image.shape == (3, 64, 64) and image.dtype == torch.float32 and label == 0
