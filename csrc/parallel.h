@@ -76,8 +76,8 @@ class ThreadMemory {
   static inline thread_local size_t size = 0;
 };
 
-// body(begin, end) on contiguous ranges that cover [0, count), each in a thread of its own. It would
-// end the process if an exception left an OpenMP region: it is thrown again when all are done.
+// body(begin, end) on contiguous ranges that cover [0, count), each in a thread of its own. An
+// exception must not leave an OpenMP region: it is kept, and thrown again when all threads end.
 template <typename Body>
 void parallel_ranges(int64_t count, Body&& body) {
   if (count <= 0) return;
