@@ -1,99 +1,47 @@
+"""Swin, and DAT's deformable attention; the contract of all models is in test_models.py."""
+
 import math
 
 import pytest
 import torch
+import torch.nn.functional as F
 
 from darswin import create_model
-from darswin.lens import Perspective, Polynomial, Spherical
-from darswin.lens.pixels import reproject
+from darswin.layers.transformer import WindowAttention
+from darswin.models.dat import DeformableAttention
 from darswin.ops import use_reference
 
-LENS = Spherical.from_fov([0.2, 0.9], 2.0, 16.0)
 
-
-def nano(name="swin_nano", **options):
-    return create_model(name, **(dict(num_classes=10) | options))
-
-
-def images(batch=2, height=32, width=32):
-    return torch.randn(batch, 3, height, width)
-
-
-def scene(size):
-    """A smooth picture (1, 1, size, size)."""
-    y, x = torch.meshgrid(torch.linspace(-1, 1, size), torch.linspace(-1, 1, size), indexing="ij")
-    return (torch.sin(9 * x + 1) * torch.cos(8 * y + 5 * x * y))[None, None]
-
-
-def circle(size, radius):
-    y, x = torch.meshgrid(*[torch.arange(size) - (size - 1) / 2] * 2, indexing="ij")
-    return torch.hypot(x, y) <= radius
-
-
-@pytest.mark.parametrize("name", ["swin_small", "swin_undis_small"])
-@pytest.mark.parametrize(("classes", "parameters"), [(200, 48_953_762), (1000, 49_568_962)])
-def test_parameter_counts(name, classes, parameters):
-    with torch.device("meta"):
-        model = create_model(name, num_classes=classes)
-    assert sum(p.numel() for p in model.parameters()) == parameters
-
-
-def test_stages_of_the_small_model():
-    with torch.device("meta"):
-        model = create_model("swin_small")
-    sizes = [[(b.attn.map_size, b.attn.window, b.attn.shift) for b in s.blocks[:2]]
-             for s in model.stages]  # fmt: skip
-    assert sizes == [
-        [((32, 32), (4, 4), (0, 0)), ((32, 32), (4, 4), (2, 2))],
-        [((16, 16), (4, 4), (0, 0)), ((16, 16), (4, 4), (2, 2))],
-        [((8, 8), (4, 4), (0, 0)), ((8, 8), (4, 4), (2, 2))],
-        [((4, 4), (4, 4), (0, 0)), ((4, 4), (4, 4), (0, 0))],
-    ]
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [
+        ("swin_nano", dict(image_size=(16, 32))),
+        ("swin_nano", dict(window=(2, 4))),
+        ("dat_nano", dict(image_size=(16, 32))),
+        ("dat_nano", dict(blocks=("S", "LS", "D"), groups=(1, 1, 4))),
+    ],
+)
+def test_options_train_and_agree_with_the_reference(name, options):
+    model = create_model(name, num_classes=10, **options)
+    x = torch.randn(2, 3, *model.image_size, requires_grad=True)
+    model(x).square().sum().backward()
+    for key, parameter in model.named_parameters():
+        assert parameter.grad.isfinite().all() and parameter.grad.any(), key
+    with torch.no_grad(), use_reference():
+        expected = model(x)
+    torch.testing.assert_close(model(x), expected, rtol=1e-4, atol=1e-5)
 
 
 def test_stochastic_depth_rises_from_block_to_block():
-    model = nano(drop_path_rate=0.3)
+    model = create_model("swin_nano", drop_path_rate=0.3)
     rates = [block.drop_path.p for stage in model.stages for block in stage.blocks]
     assert rates == pytest.approx([0.0, 0.1, 0.2, 0.3])
-
-
-@pytest.mark.parametrize("size", ["tiny", "micro", "nano"])
-def test_as_many_tokens_as_darswin(size):
-    with torch.device("meta"):
-        swin, darswin = create_model(f"swin_{size}"), create_model(f"darswin_a_{size}")
-    rows, columns = swin.stages[0].blocks[0].attn.map_size
-    rings, sectors = darswin.stages[0].blocks[0].attn.map_size
-    assert rows * columns == rings * sectors
-    counts = [sum(p.numel() for p in model.parameters()) for model in (swin, darswin)]
-    assert abs(counts[0] / counts[1] - 1) < 0.03, counts
-
-
-@pytest.mark.parametrize("options", [{}, dict(image_size=(16, 32)), dict(window=(2, 4))])
-@pytest.mark.parametrize("name", ["swin_nano", "swin_undis_nano"])
-def test_gradients_reach_every_parameter_and_agree_with_the_reference(name, options):
-    model = nano(name, **options)
-    x = images(2, *model.image_size).requires_grad_()
-    model(x, LENS).square().sum().backward()
-    for parameter_name, parameter in model.named_parameters():
-        assert parameter.grad.isfinite().all() and parameter.grad.any(), parameter_name
-    assert x.grad.any()
-    with torch.no_grad():
-        ours = model(x, LENS)
-        with use_reference():
-            expected = model(x, LENS)
-    torch.testing.assert_close(ours, expected, rtol=1e-4, atol=1e-5)
-
-
-def test_swin_ignores_the_lens():
-    model = nano().eval()
-    x = images()
-    assert torch.equal(model(x, LENS), model(x, None)) and torch.equal(model(x, LENS), model(x))
 
 
 def test_no_axis_wraps():
     # The corner's shifted window holds the map's four corners, each of 2 × 2 tokens; a
     # token there sees its own corner.
-    model = nano()
+    model = create_model("swin_nano")
     shifted = model.stages[1].blocks[1]
     x = torch.randn(1, 8, 8, 48, requires_grad=True)
     (grad,) = torch.autograd.grad(shifted(x)[0, 0, 0].sum(), x)
@@ -101,170 +49,103 @@ def test_no_axis_wraps():
     assert seen[:2, :2].all() and seen.sum() == 4
 
 
-@pytest.mark.parametrize("name", ["swin_micro", "swin_undis_micro"])
-def test_the_micro_models_run(name):
-    model = create_model(name, num_classes=7).eval()
-    with torch.no_grad():
-        assert model(images(1, 64, 64), Spherical.from_fov(0.5, 2.0, 32.0)).shape == (1, 7)
+def test_blocks_of_the_small_models():
+    with torch.device("meta"):
+        swin, dat = create_model("swin_small"), create_model("dat_small")
+    shifts = [[block.attn.shift for block in stage.blocks[:2]] for stage in swin.stages]
+    assert shifts == [[(0, 0), (2, 2)]] * 3 + [[(0, 0), (0, 0)]]
+    stages = [[block.attn for block in stage.blocks] for stage in dat.stages]
+    for stage in stages[:2]:
+        assert [attn.shift for attn in stage] == [(0, 0), (2, 2)]
+    for stage, groups, kernel in ((stages[2], 3, 5), (stages[3], 6, 3)):
+        assert all(isinstance(a, WindowAttention) and a.shift == (0, 0) for a in stage[::2])
+        for attn in stage[1::2]:
+            assert isinstance(attn, DeformableAttention) and attn.groups == groups
+            assert attn.around.kernel_size == (kernel, kernel)
+    assert len(stages[2]) == 18
 
 
-def test_features_intermediates_and_head():
-    model = nano().eval()
-    x = images()
-    features, maps = model.forward_intermediates(x)
-    assert [tuple(m.shape) for m in maps] == [(2, 16, 16, 24), (2, 8, 8, 48), (2, 4, 4, 96)]
-    assert torch.equal(features, model.forward_features(x))
-    assert torch.equal(features, model.norm(maps[-1]))
-    assert torch.equal(model.forward_head(features), model(x))
-    assert torch.equal(model.forward_head(features, pre_logits=True), features.mean((1, 2)))
-    (last,) = model.forward_intermediates(x, LENS, indices=1, intermediates_only=True)
-    assert torch.equal(last, maps[-1])
-    model.reset_classifier(0)
-    assert model(x).shape == (2, 96)
-    excluded = model.no_weight_decay()
-    assert excluded == {name for name, p in model.named_parameters() if p.dim() == 3}
-    assert len(excluded) == 4
+def bilinear(table, y, x):
+    """The entry (y, x) of (C, H, W), between its neighbours; 0 outside."""
+    out = table.new_zeros(table.shape[0])
+    for row in (math.floor(y), math.floor(y) + 1):
+        for column in (math.floor(x), math.floor(x) + 1):
+            if 0 <= row < table.shape[1] and 0 <= column < table.shape[2]:
+                out = out + (1 - abs(y - row)) * (1 - abs(x - column)) * table[:, row, column]
+    return out
 
 
-def test_camera_frames():
-    mean, std = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
-    frames = torch.randint(256, (2, 32, 32, 3), dtype=torch.uint8)
-    planes = frames.permute(0, 3, 1, 2)
-    values = (planes / 255 - torch.tensor(mean)[:, None, None]) / torch.tensor(std)[:, None, None]
-    for name in ("swin_nano", "swin_undis_nano"):
-        model = nano(name, mean=mean, std=std).eval()
-        expected = model(values, LENS)
-        torch.testing.assert_close(model(frames, LENS), expected)
-        torch.testing.assert_close(model(planes, LENS), expected)
+def test_deformable_attention_as_written_out():
+    # Key after key and query after query, in pixels.
+    height, width, heads, groups, dim = 3, 4, 4, 2, 8
+    layer = DeformableAttention(dim, heads, map_size=(height, width), groups=groups, kernel=3)
+    layer = layer.double()
+    torch.nn.init.normal_(layer.offset.weight, std=2.0)
+    torch.nn.init.normal_(layer.position_bias.table)
+    x = torch.randn(1, height, width, dim, dtype=torch.float64)
+
+    q = layer.q(x)[0]
+    places, sampled = [], []  # of each group's keys, from the map's upper left corner
+    for group in range(groups):
+        channels = slice(group * dim // groups, (group + 1) * dim // groups)
+        around = layer.around(q[..., channels].permute(2, 0, 1)[None])[0].permute(1, 2, 0)
+        moves = torch.tanh(layer.offset(F.gelu(layer.norm(around)))).tolist()  # up to one pixel
+        places.append(
+            [
+                (row + 0.5 + moves[row][column][0], column + 0.5 + moves[row][column][1])
+                for row in range(height)
+                for column in range(width)
+            ]
+        )
+        # Sampled as if the outermost pixels' centres were at the edges.
+        pixels = x[0, ..., channels].permute(2, 0, 1)
+        shrink = ((height - 1) / height, (width - 1) / width)
+        samples = [bilinear(pixels, y * shrink[0], x * shrink[1]) for y, x in places[-1]]
+        sampled.append(torch.stack(samples))
+    k, v = layer.kv(torch.cat(sampled, 1)).chunk(2, 1)
+
+    out = torch.zeros_like(q)
+    for head in range(heads):
+        part = slice(head * dim // heads, (head + 1) * dim // heads)
+        table = layer.position_bias.table[head : head + 1]
+        for row in range(height):
+            for column in range(width):
+                logits = k[:, part] @ q[row, column, part] / math.sqrt(dim // heads)
+                bias = [
+                    bilinear(
+                        table,
+                        (row + 0.5 - y) * shrink[0] + height - 1,
+                        (column + 0.5 - x) * shrink[1] + width - 1,
+                    )
+                    for y, x in places[head * groups // heads]
+                ]
+                out[row, column, part] = (logits + torch.cat(bias)).softmax(0) @ v[:, part]
+    torch.testing.assert_close(layer(x)[0], layer.proj(out))
 
 
-# -- undistortion ---------------------------------------------------------------------------------
-
-
-class Seen(torch.nn.Module):
-    """In place of the first layer: keeps what comes in."""
-
-    def __init__(self, model):
-        super().__init__()
-        self.images, self.inner = None, model.patch_embed
-        model.patch_embed = self
-
-    def forward(self, x):
-        self.images = x.permute(0, 3, 1, 2).detach()
-        return self.inner(x)
-
-
-def undistorted(picture, lens, **options):
-    side = picture.shape[2]
-    model = nano("swin_undis_nano", in_chans=1, image_size=side, **options).eval()
-    seen = Seen(model)
-    with torch.no_grad():
-        model(picture, lens)
-    return seen.images
-
-
-@pytest.mark.parametrize("xi", [0.0, 0.4, 0.9])
-def test_the_perspective_image_comes_back(xi):
-    fov, side = math.radians(110), 128
-    perspective = Perspective.from_fov(fov, side / 2)
-    picture = scene(side)
-    lens = Spherical.from_fov(xi, fov, side / 2)
-    distorted = reproject(picture, perspective, lens, (side, side))
-    back = undistorted(distorted, lens)
-    inside = circle(side, side / 2 - 2)
-    error = (back - picture)[0, 0][inside].abs().max()
-    assert error < (1e-5 if xi == 0 else 0.02), error
-    if xi:  # the picture was indeed another one
-        assert (distorted - picture)[0, 0][inside].abs().max() > 0.3
-    assert not back[0, 0][~circle(side, side / 2 + 1)].any()
-
-
-def test_a_view_keeps_the_lenss_field_of_view_up_to_the_limit():
-    side, wide = 64, Polynomial([20.0], math.radians(95))
-    picture = scene(side)
-    limited = undistorted(picture, wide, max_fov=math.radians(100))
-    narrow = Polynomial([20.0], math.radians(50))
-    expected = reproject(
-        picture, narrow, Perspective.from_fov(math.radians(100), side / 2), (side, side)
-    )
-    torch.testing.assert_close(limited, expected, rtol=0, atol=1e-5)
-    assert (undistorted(picture, wide) - limited).abs().max() > 0.1  # 175° otherwise
-
-
-def test_each_image_has_its_lens():
-    picture = scene(64).expand(2, -1, -1, -1)
-    lenses = Spherical.from_fov([0.1, 0.9], 2.0, 32.0, center=[[30.0, 31.5], [31.5, 33.0]])
-    together = undistorted(picture, lenses)
-    for k in range(2):
-        torch.testing.assert_close(together[k : k + 1], undistorted(picture[:1], lenses[k]))
-    one = undistorted(picture, lenses[:1])
-    torch.testing.assert_close(one[0], together[0])
-    assert not torch.allclose(one[1], together[1], atol=0.05)
-
-
-def test_gradients_reach_the_lens_through_the_view():
-    xi = torch.tensor([0.4], requires_grad=True)
-    model = nano("swin_undis_nano")
-    model(images(), Spherical(xi, 12.0, 1.0)).square().sum().backward()
-    assert xi.grad.isfinite().all() and xi.grad.all()
-
-
-# -- compilation and errors -----------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("name", ["swin_nano", "swin_undis_nano"])
-def test_compile_fullgraph(name):
-    model = nano(name, depths=(1, 2), num_heads=(1, 2)).eval()
-    x = images()
-    with torch.no_grad():
-        expected = model(x, LENS)
-        got = torch.compile(model, fullgraph=True, backend="aot_eager")(x, LENS)
-    torch.testing.assert_close(got, expected, rtol=1e-4, atol=1e-5)
-
-
-@pytest.mark.parametrize("name", ["swin_nano", "swin_undis_nano"])
-def test_autocast_and_empty_batches(name):
-    model = nano(name).eval()
-    x = images()
-    with torch.no_grad():
-        expected = model(x, LENS)
-        with torch.autocast("cpu", dtype=torch.bfloat16):
-            half = model(x, LENS)
-    assert half.dtype == torch.bfloat16
-    torch.testing.assert_close(half.float(), expected, rtol=0.1, atol=0.05)
-    assert model(images(0), LENS[:0]).shape == (0, 10)
+def test_keys_move_with_the_offsets():
+    layer = DeformableAttention(8, 2, map_size=(4, 4), groups=1, kernel=3)
+    x = torch.randn(1, 4, 4, 8)
+    before = layer(x)
+    torch.nn.init.normal_(layer.offset.weight, std=2.0)
+    moved = layer(x)
+    assert (moved - before).abs().max() > 1e-3
+    layer.offset_range = 0.0
+    still = layer(x)
+    torch.nn.init.normal_(layer.offset.weight, std=2.0)
+    assert torch.equal(layer(x), still)
 
 
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (dict(image_size=33), r"patch_size must divide image_size = \(33, 33\), got 2"),
-        (dict(image_size=36), r"stage 1: window \(4, 4\) must divide the map, \(18, 18\)"),
-        (dict(image_size=24), r"stage 2: window \(4, 4\) must divide the map, \(6, 6\)"),
-        (dict(depths=(2, 2)), "depths and num_heads must pair up"),
+        (dict(blocks=("L", "N", "D")), "blocks must be of the kinds 'L', 'S' and 'D'"),
+        (dict(blocks=("L", "", "D")), "blocks must be of the kinds"),
+        (dict(blocks=("L", "D")), "one entry a stage, 3"),
+        (dict(groups=(1, 1, 3)), "groups must divide num_heads = 4, got 3"),
         (dict(num_heads=(5, 5, 5)), "num_heads must divide"),
-        (dict(drop_path_rate=1.0), "drop path must be"),
-        (dict(std=0.0), "std must be positive"),
     ],
 )
 def test_constructor_errors(options, message):
     with pytest.raises(ValueError, match=message):
-        nano(**options)
-
-
-def test_call_errors():
-    model = nano()
-    with pytest.raises(ValueError, match=r"image_size, \(H, W\) = \(32, 32\), got \(32, 40\)"):
-        model(images(2, 32, 40))
-    with pytest.raises(ValueError, match="images must have 3 channels, got 1"):
-        model(images()[:, :1])
-    with pytest.raises(TypeError, match="images must be a tensor, got list"):
-        model([1])
-    undis = nano("swin_undis_nano")
-    with pytest.raises(TypeError, match=r"lens must be a darswin.lens.Lens, got NoneType"):
-        undis(images(), None)
-    with pytest.raises(ValueError, match="one lens or one an image, 3, got 2"):
-        undis(images(3), LENS)
-    for wrong in (0.0, math.pi):
-        with pytest.raises(ValueError, match=r"max_fov must be in \(0, π\)"):
-            nano("swin_undis_nano", max_fov=wrong)
+        create_model("dat_nano", **options)

@@ -1,0 +1,540 @@
+"""The contract of all models, over `list_models()`: how they are called, what comes out, what they
+refuse, and how they are described, optimized, saved and compiled.
+
+timm's own Swin (1.0.31) was run beside ours for what is expected of intermediates and pruning.
+"""
+
+import copy
+
+import pytest
+import torch
+from helpers import FIXTURES
+from safetensors.torch import load_file
+from torch._dynamo.testing import CompileCounter
+
+from darswin import create_model, list_models, optimize
+from darswin.compat import load_timm_swin
+from darswin.lens import KannalaBrandt, Polynomial, Spherical
+from darswin.models import ModelCard, load_model, save_model
+from darswin.models.base import take_indices
+from darswin.models.encoder import Encoder
+from darswin.models.registry import has_image_size, model_class
+from darswin.ops import use_reference
+
+NAMES = list_models()
+ENCODERS = [name for name in NAMES if issubclass(model_class(name), Encoder)]
+NANOS = [name for name in NAMES if name.endswith("nano")]
+NANO_ENCODERS = [name for name in NANOS if name in ENCODERS]
+NANO_UNETS = [name for name in NANOS if name not in ENCODERS]
+IGNORE_THE_LENS = ("swin_nano", "swin_unet_nano", "dat_nano")
+CASES = {name: (name, {}) for name in NANOS} | {
+    f"{name} distance": (name, dict(task="distance")) for name in NANO_UNETS
+} | {
+    "official": ("darswin_a_nano", dict(compat="official", rings=16, sectors=64)),
+    "feature maps": ("darswin_ra_nano", dict(features_only=True, out_indices=(0, 2))),
+    "square view": ("swin_nano", dict(view="square", spacing="g")),
+}  # fmt: skip
+cases = pytest.mark.parametrize("case", CASES)
+nanos = pytest.mark.parametrize("name", NANOS)
+MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
+
+
+def side_of(name):
+    """The side of the images of a test: of `image_size`, where the model has one."""
+    return 64 if "unet" in name else 32
+
+
+def network(name, **options):
+    """A nano in eval mode whose every parameter counts."""
+    if has_image_size(name):
+        options = dict(image_size=side_of(name)) | options
+    model = create_model(name, **(dict(num_classes=5) | options)).eval()
+    for key, parameter in model.named_parameters():
+        spread = 1.0 if parameter.dim() == 1 and key.endswith("weight") else 0.0
+        torch.nn.init.normal_(parameter, mean=spread, std=0.1)
+    return model
+
+
+def made(case, **options):
+    """A model, images and their lenses."""
+    name, own = CASES[case]
+    side = side_of(name)
+    lenses = Spherical.from_fov([0.2, 0.9], 2.6, side / 2)
+    return network(name, **(own | options)), torch.randn(2, 3, side, side), lenses
+
+
+def tensors_of(out):
+    return out if isinstance(out, list) else [out]
+
+
+def total(out):
+    return sum(tensor.square().mean() for tensor in tensors_of(out))
+
+
+def assert_close(got, expected, tolerance=1e-4):
+    """Each of the tensors, to a part of the largest number."""
+    for a, b in zip(tensors_of(got), tensors_of(expected), strict=True):
+        torch.testing.assert_close(a, b, rtol=0, atol=tolerance * b.abs().max().item())
+
+
+# -- results --------------------------------------------------------------------------------------
+
+
+@cases
+def test_gradients_reach_all_parameters(case):
+    model, images, lenses = made(case)
+    out = model.train()(images, lenses)
+    if "unet" in case:
+        assert model.num_classes == out.shape[1] == (1 if "distance" in case else 5)
+        assert out.shape[2:] == images.shape[2:]
+    loss = out.log().square().mean() if "distance" in case else total(out)
+    loss.backward()
+    for key, parameter in model.named_parameters():
+        assert parameter.grad is not None and parameter.grad.isfinite().all(), key
+        # A window of one ring has no two rings apart: sin 0 is 0.
+        alone = ".position_bias.a_theta" in key and len(parameter) == 1
+        assert alone or parameter.grad.any(), key
+
+
+@torch.no_grad()
+@cases
+def test_one_preparation_serves_many_runs_and_the_reference_agrees(case):
+    model, images, lenses = made(case, mean=MEAN, std=STD)
+    size = tuple(images.shape[2:])
+    frames = torch.randint(256, (2, *size, 3), dtype=torch.uint8)
+    planes = frames.permute(0, 3, 1, 2).contiguous()
+    mean, std = torch.tensor([MEAN, STD])[..., None, None]
+    others = [Polynomial([size[0] / 4, 0.4], 1.3)]
+    if case != "official":
+        center = [size[0] / 2 - 2, size[0] / 2 + 3]
+        affine, tangential = [[1.0, 0.1], [0.0, 1.1]], [0.02, 0.01]
+        others += [KannalaBrandt(9.0, [0.01], 1.5, center, affine=affine, tangential=tangential)]
+    for lens in (lenses, *others):
+        prepared = model.prepare(lens, size)
+        for pixels in (images, frames, planes):
+            out = model(pixels, lens)
+            for a, b in zip(tensors_of(model.run(pixels, prepared)), tensors_of(out), strict=True):
+                assert torch.equal(a, b) and a.isfinite().all()
+        assert_close(model((planes / 255 - mean) / std, lens), out, 1e-3)
+        with use_reference():
+            assert_close(out, model(planes, lens), 1e-3)
+
+
+@torch.no_grad()
+@cases
+def test_a_batch_is_one_image_after_the_other_and_may_be_empty(case):
+    model, images, lenses = made(case)
+    if case == "official":  # the field of view of image 0 counts for all
+        lenses = Spherical(lenses.xi, lenses.focal, 1.3)
+    together = tensors_of(model(images, lenses))
+    alone = [tensors_of(model(images[k : k + 1], lenses[k])) for k in range(2)]
+    assert_close([torch.cat(pair) for pair in zip(*alone, strict=True)], together)
+    for lens in (lenses[:0], lenses[:1]):
+        for empty, out in zip(tensors_of(model(images[:0], lens)), together, strict=True):
+            assert empty.shape == (0, *out.shape[1:])
+
+
+@torch.no_grad()
+@cases
+def test_optimized_it_is_the_same(case):
+    model, images, lenses = made(case)
+    want = tensors_of(model(images, lenses))
+    fast, fixed = optimize(model), optimize(model, lens=lenses[:1])
+    assert_close(fast(images, lenses), want, 1e-4)
+    prepared = fast.prepare(lenses, tuple(images.shape[2:]))
+    again = tensors_of(fast(images, lenses))
+    for a, b in zip(tensors_of(fast.run(images, prepared)), again, strict=True):
+        assert torch.equal(a, b)
+    assert_close(fixed(images), model(images, lenses[:1]), 1e-4)
+    if CASES[case][0] in NANO_UNETS:  # of classifiers, tests/deploy
+        with torch.autocast("cpu", torch.bfloat16):
+            autocast = model(images, lenses)
+        half = optimize(model, torch.bfloat16)(images, lenses)
+        assert half.dtype == (torch.float32 if "distance" in case else torch.bfloat16)
+        errors = [((out.float() - want[0]).norm() / want[0].norm()) for out in (half, autocast)]
+        assert errors[0] < 2 * errors[1] < 0.1
+
+
+@nanos
+def test_gradients_with_checkpointing_are_the_same(name):
+    model, images, lenses = made(name)
+    model.train()
+    if name.startswith("darswin"):
+        getattr(model, "encoder", model).patch_embed.sample.jitter = 0.0
+    gradients = []
+    for enable in (False, True):
+        model.set_grad_checkpointing(enable)
+        gradients.append(torch.autograd.grad(total(model(images, lenses)), [*model.parameters()]))
+    assert all(torch.equal(a, b) for a, b in zip(*gradients, strict=True))
+
+
+@torch.no_grad()
+@nanos
+def test_dtypes(name):
+    model, images, lenses = made(name, mean=MEAN, std=STD)
+    frames = torch.randint(256, tuple(images.shape), dtype=torch.uint8)
+    mean, std = torch.tensor([MEAN, STD], dtype=torch.float64)[..., None, None]
+    expected = model(frames, lenses)
+    with torch.autocast("cpu", dtype=torch.bfloat16):  # makes images and weights equal
+        for dtype in (torch.float32, torch.bfloat16):
+            half = model(images.to(dtype), lenses)
+            assert half.dtype == torch.bfloat16 or "unet" in name
+            assert_close(half.float(), model.float()(images, lenses).float(), 0.2)
+    for dtype, tolerance in ((torch.float64, 1e-5), (torch.bfloat16, 0.1)):
+        got = model.to(dtype)(frames, lenses)
+        assert got.dtype == dtype
+        assert (got.float() - expected).norm() <= tolerance * expected.norm()
+        message = f"images must be uint8, or {dtype} as the model's weights are, got torch.float32"
+        with pytest.raises(TypeError, match=message):
+            model(images, lenses)
+    exact = model.double()((frames.double() / 255 - mean) / std, lenses)
+    assert_close(model(frames, lenses), exact, 1e-10)
+
+
+# -- what they take -------------------------------------------------------------------------------
+
+
+@cases
+def test_the_images_and_the_lens_that_it_takes(case):
+    model, images, lenses = made(case)
+    name, side = CASES[case][0], images.shape[2]
+    any_size = name.startswith("darswin")
+    assert model.image_size == (None if any_size else (side, side))
+    assert has_image_size(name) != any_size
+    assert model.square_images == (not any_size or case == "official")
+    with pytest.raises(ValueError, match="images must have 3 channels, got 4"):
+        model(torch.zeros(1, 4, side, side), lenses[:1])
+    with pytest.raises(TypeError, match="images must be a tensor, got list"):
+        model([1], lenses)
+    with pytest.raises(ValueError, match=r"shape \(B, C, H, W\), got \(3, 8, 8\)"):
+        model(torch.zeros(3, 8, 8), lenses)
+    if any_size and case != "official":
+        for size in ((1, 1), (17, 40)):
+            for out in tensors_of(model(torch.randn(2, 3, *size), lenses)):
+                assert out.isfinite().all() and (out.shape[2:] == size or "unet" not in name)
+    else:
+        with pytest.raises(ValueError, match=r"image_size, \(H, W\) = |needs square images, got"):
+            model(torch.zeros(1, 3, side, side + 8), lenses[:1])
+    if case in (*IGNORE_THE_LENS, "swin_unet_nano distance"):
+        model.requires_grad_(False)
+        assert torch.equal(model(images, lenses), model(images))
+        return
+    with pytest.raises(TypeError, match=r"lens must be a darswin\.lens\.Lens, got NoneType"):
+        model(images)
+    camera = lenses.replace(image_size=torch.tensor([[side, side]] * 2))
+    with pytest.raises(ValueError, match=rf"belongs to images of \(H, W\) = \({side}, {side}\), g"):
+        model.prepare(camera, (side + 8, side))
+    with pytest.raises(ValueError, match="one lens or one an image, 3, got 2"):
+        model.run(images[[0, 0, 1]], model.prepare(camera, (side, side)))
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("channels", [1, 3, 4])
+@nanos
+def test_uint8_images_have_as_many_channels_as_the_model_takes(name, channels):
+    model, side = network(name, in_chans=channels, mean=0.5, std=0.2), side_of(name)
+    lenses = Spherical.from_fov([0.2, 0.9], 2.6, 16.0)
+    sizes = ((side, side), (20, 7 - channels), (1, 1))[: 1 if has_image_size(name) else 3]
+    for size in sizes:
+        planes = torch.randint(256, (2, channels, *size), dtype=torch.uint8)
+        expected = model((planes / 255 - 0.5) / 0.2, lenses)
+        if size != (1, 1) or channels == 1:  # 1 × 1 × C may be both
+            assert_close(model(planes.permute(0, 2, 3, 1), lenses), expected, 1e-3)
+        assert_close(model(planes, lenses), expected, 1e-3)
+    for shape, message in (
+        ((2, channels, side, channels), r"both have .*: pass it in floating point"),
+        ((2, side, side, 2), rf"neither has in shape \(2, {side}, {side}, 2\)$"),
+        ((2, 12, side, side), rf"neither has in shape \(2, 12, {side}, {side}\)$"),
+    ):
+        with pytest.raises(ValueError, match=f"uint8 must have {channels} channels .*{message}"):
+            model.run(torch.zeros(shape, dtype=torch.uint8), None)
+
+
+# -- descriptions, heads, files -------------------------------------------------------------------
+
+# Of "small", with 200 and with 1000 classes.
+PARAMETERS = {
+    "darswin_a_small": (48_977_864, 49_593_064),
+    "swin_small": (48_953_762, 49_568_962),
+    "swin_undis_small": (48_953_762, 49_568_962),
+    "dat_small": (49_006_434, 49_621_634),
+}
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_sizes(name):
+    with torch.device("meta"):
+        model = create_model(name)
+        of_its_size = create_model(f"darswin{'_unet' * ('unet' in name)}_a_{name.split('_')[-1]}")
+        for classes, count in zip((200, 1000), PARAMETERS.get(name, ()), strict=False):
+            model.reset_classifier(classes)
+            assert sum(p.numel() for p in model.parameters()) == count
+        model = create_model(name)
+    counts = [sum(p.numel() for p in net.parameters()) for net in (model, of_its_size)]
+    assert abs(counts[0] / counts[1] - 1) < (0.01 if "unet" in name else 0.03), counts
+    sides = [net.feature_info.get("map_size", 0) for net in (model, of_its_size)]
+    assert sides[0][0] * sides[0][1] == sides[1][0] * sides[1][1]  # tokens of the first map
+    width = 24 if "nano" in name else 32 if "micro" in name else 96
+    assert model.feature_info.channels() == [width * 2**k for k in range(len(model.feature_info))]
+
+
+@nanos
+def test_it_is_described_as_timm_describes_models(name):
+    model, config = network(name, num_classes=7), create_model(name, num_classes=7).pretrained_cfg
+    encoder, part = (model.encoder, "encoder.") if name in NANO_UNETS else (model, "")
+    assert config["architecture"] == name and config["num_classes"] == model.num_classes == 7
+    assert config["first_conv"] == f"{part}patch_embed.proj"
+    assert model.get_submodule(config["first_conv"]) is encoder.patch_embed.proj
+    head = model.get_submodule(config["classifier"])
+    assert head is getattr(model.get_classifier(), "proj", model.head) and head.out_features == 7
+    assert config["fixed_input_size"] == has_image_size(name)
+    assert model.pretrained_cfg["input_size"] == (3, *(model.image_size or [2 * side_of(name)] * 2))
+    assert config["mean"] == (0, 0, 0) and config["std"] == (1, 1, 1)
+    undecayed = model.no_weight_decay()
+    names = {key for key, _ in model.named_parameters()}
+    assert undecayed == {key for key in names if ".position_bias." in key} and len(undecayed) > 3
+
+
+@nanos
+def test_a_new_head_is_of_the_models_kind(name):
+    model, images, lenses = made(name)
+    model.bfloat16().set_matmul_backend("onednn")
+    for classes in (7, 3):
+        model.reset_classifier(classes)
+        head = model.get_submodule(model.pretrained_cfg["classifier"])
+        assert head.out_features == model.num_classes == classes
+        assert head.matmul_backend == "onednn" and not head.training
+    assert {p.dtype for p in model.parameters()} == {torch.bfloat16}
+    assert model(images.bfloat16(), lenses).shape[:2] == (2, 3)
+    if name in NANO_UNETS:
+        with pytest.raises(ValueError, match="num_classes must be at least 1, got 0"):
+            model.reset_classifier(0)
+        return
+    model.to("meta").reset_classifier(4)
+    assert model.head.weight.device.type == "meta"
+    model.reset_classifier(0)
+    assert isinstance(model.head, torch.nn.Identity) and model.num_classes == 0
+
+
+@torch.no_grad()
+@cases
+def test_a_saved_model_computes_the_same(case, tmp_path):
+    name, options = CASES[case]
+    sized = dict(image_size=side_of(name)) if has_image_size(name) else {}
+    if "features_only" in options:
+        return  # a backbone in another model, not a file
+    card = ModelCard(name, dict(options, num_classes=5, **sized), list("abcde"), size=side_of(name))
+    model, images, lenses = made(case)
+    save_model(tmp_path / "m.safetensors", model.state_dict(), card)
+    loaded, read = load_model(tmp_path / "m.safetensors")
+    assert read == card and not loaded.training and type(loaded) is type(model)
+    assert loaded.pretrained_cfg["input_size"] == (3, *images.shape[2:])
+    assert torch.equal(loaded(images, lenses), model(images, lenses))
+
+
+# -- intermediates, as timm has them --------------------------------------------------------------
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("name", ENCODERS)
+def test_what_a_model_tells_of_its_stages_is_what_they_give(name):
+    model = create_model(name, num_classes=5, depths=(1,) * (3 if "nano" in name else 4)).eval()
+    height, width = model.image_size or (32, 32)
+    x, lens = torch.randn(1, 3, height, width), Spherical.from_fov(0.4, 2.6, height / 2)
+    info = model.feature_info
+    maps = model.forward_intermediates(x, lens, intermediates_only=True)
+    assert [m.shape[3] for m in maps] == info.channels()
+    assert [tuple(m.shape[1:3]) for m in maps] == info.get("map_size")
+    assert model.num_features == model.head_hidden_size == info.channels(-1)
+    # A map is as large as its images, or the samples of its grid, over the reduction.
+    whole = model.image_size or [
+        count * s for count, s in zip(info[0]["map_size"], model.spec.samples, strict=True)
+    ]
+    for (rows, columns), reduction in zip(info.get("map_size"), info.reduction(), strict=True):
+        assert max(whole[0] // rows, whole[1] // columns) == reduction
+    for module, one in zip(info.module_name(), maps, strict=True):
+        found = []
+        handle = model.get_submodule(module).register_forward_hook(lambda *a: found.append(a[2]))  # noqa: B023
+        model(x, lens)
+        handle.remove()
+        assert torch.equal(found[0], one)
+    assert info.channels([0, -1]) == [info.channels(0), info.channels(-1)]
+
+
+def stages_that_run(model, call):
+    ran = []
+    hooks = [
+        stage.register_forward_hook(lambda *_, k=k: ran.append(k))
+        for k, stage in enumerate(model.stages)
+    ]
+    out = call()
+    for hook in hooks:
+        hook.remove()
+    return ran, out
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("optimized", [False, True])
+@pytest.mark.parametrize("name", NANO_ENCODERS)
+def test_the_intermediates_that_timm_gives(name, optimized):
+    model, x, lens = made(name)
+    model = optimize(model) if optimized else model
+    features, every = model.forward_intermediates(x, lens)
+    assert torch.equal(features, model.forward_features(x, lens))
+    assert torch.equal(features, model.norm(every[-1]))
+    assert torch.equal(model.forward_head(features, pre_logits=True), features.mean((1, 2)))
+    assert torch.equal(model.forward_head(features), model(x, lens))
+    for indices, stages in (
+        (None, [0, 1, 2]), (1, [2]), ([0], [0]), ([1, 0], [0, 1]), ([-2, 1], [1]), ((0, -1), [0, 2])
+    ):  # fmt: skip
+        last, maps = model.forward_intermediates(x, lens, indices=indices)
+        assert torch.equal(last, features) and len(maps) == len(stages)
+        assert all(torch.equal(m, every[k]) for m, k in zip(maps, stages, strict=True))
+        chosen = dict(indices=indices, intermediates_only=True)
+        normed = model.forward_intermediates(x, lens, norm=True, **chosen)
+        for got, k in zip(normed, stages, strict=True):
+            assert torch.equal(got, features if k == 2 else every[k])
+        end = max(stages)
+        ran, (last, maps) = stages_that_run(
+            model,
+            lambda indices=indices: model.forward_intermediates(
+                x, lens, indices=indices, stop_early=True, output_fmt="NCHW"
+            ),
+        )
+        assert ran == [0, 1, 2][: end + 1]
+        assert torch.equal(last, features if end == 2 else every[end])
+        for got, k in zip(maps, stages, strict=True):
+            assert got.is_contiguous() and torch.equal(got, every[k].permute(0, 3, 1, 2))
+        ran, _ = stages_that_run(
+            model, lambda chosen=chosen: model.forward_intermediates(x, lens, **chosen)
+        )
+        assert ran == [0, 1, 2]
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("name", NANO_ENCODERS)
+def test_pruning_and_feature_maps(name):
+    model, x, lens = made(name)
+    every = model.forward_intermediates(x, lens, intermediates_only=True)
+    pruned = copy.deepcopy(model)
+    assert pruned.prune_intermediate_layers([0, -2]) == [0, 1]
+    assert len(pruned.stages) == len(pruned.feature_info) == 2
+    assert torch.equal(pruned.forward_features(x, lens), every[1])
+    assert pruned(x, lens).shape == (2, 48) and pruned.num_features == 48
+    pruned.reset_classifier(7)
+    assert pruned(x, lens).shape == (2, 7)
+    whole = copy.deepcopy(model)  # nothing is cut: the norm stays, and the head if asked
+    assert whole.prune_intermediate_layers(1, prune_head=False) == [2]
+    assert torch.equal(whole(x, lens), model(x, lens))
+    whole.prune_intermediate_layers(prune_norm=True)
+    assert torch.equal(whole.forward_features(x, lens), every[2]) and whole.num_classes == 0
+    with pytest.raises(TypeError, match="prune it first"):
+        optimize(model).prune_intermediate_layers()
+    sized = dict(image_size=32) if has_image_size(name) else {}
+    for out_indices, stages in ((None, [0, 1, 2]), ([0], [0]), ((1, 0), [0, 1]), (2, [1, 2])):
+        for output_fmt in ("NHWC", "NCHW"):
+            maps = create_model(name, features_only=True, out_indices=out_indices,
+                                output_fmt=output_fmt, **sized).eval()  # fmt: skip
+            names = {f"encoder.{key}": value for key, value in model.state_dict().items()}
+            assert not any(key.startswith(("encoder.norm", "encoder.head")) for key in
+                           maps.state_dict())  # fmt: skip
+            maps.load_state_dict({key: names[key] for key in maps.state_dict()})
+            for k, one in zip(stages, maps(x, lens), strict=True):
+                expected = every[k] if output_fmt == "NHWC" else every[k].permute(0, 3, 1, 2)
+                assert torch.equal(one, expected) and one.is_contiguous()
+            info = maps.feature_info
+            assert info.channels() == model.feature_info.channels(stages)
+            for module, k in zip(info.module_name(), stages, strict=True):
+                assert maps.get_submodule(module) is maps.encoder.stages[k]
+            first = maps.get_submodule(maps.pretrained_cfg["first_conv"])
+            assert first is maps.encoder.patch_embed.proj and maps.num_classes == 0
+            assert maps.image_size == model.image_size and maps.out_indices == tuple(stages)
+            assert len(maps.encoder.stages) == max(stages) + 1
+
+
+def test_wrong_arguments_of_intermediates():
+    model, x, lens = made("darswin_a_nano")
+    for wrong in (0, 4, -1, [3], [-4], []):
+        for call in (
+            lambda wrong=wrong: model.forward_intermediates(x, lens, indices=wrong),
+            lambda wrong=wrong: create_model("swin_nano", features_only=True, out_indices=wrong),
+        ):
+            with pytest.raises(ValueError, match="indices must name some of 3 stages, got"):
+                call()
+    for call in (
+        lambda: model.forward_intermediates(x, lens, output_fmt="NLC"),
+        lambda: create_model("swin_nano", features_only=True, output_fmt="NLC"),
+    ):
+        with pytest.raises(ValueError, match="output_fmt must be 'NHWC' or 'NCHW', got 'NLC'"):
+            call()
+    with pytest.raises(ValueError, match="out_indices and output_fmt need features_only=True"):
+        create_model("swin_nano", out_indices=[0])
+    with pytest.raises(ValueError, match="features_only is for encoders, and swin_unet_nano is"):
+        create_model("swin_unet_nano", features_only=True)
+    assert take_indices(4, 2) == [2, 3] and take_indices(4, (-1, 0)) == [3, 0]
+
+
+@torch.no_grad()
+def test_the_last_intermediate_of_timms_swin():
+    tensors = load_file(FIXTURES / "timm_swin.safetensors")
+    state = {k.removeprefix("state."): v for k, v in tensors.items() if k.startswith("state.")}
+    (last,) = load_timm_swin(state).forward_intermediates(
+        tensors["images"], indices=1, norm=True, intermediates_only=True
+    )
+    assert (last - tensors["out.features"]).abs().max() <= 1e-5
+
+
+# -- graphs ---------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def no_graphs_before_or_after():
+    """All models share a forward, of which torch.compile keeps eight graphs at most."""
+    torch._dynamo.reset()
+    yield
+    torch._dynamo.reset()
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("no_graphs_before_or_after")
+@nanos
+def test_one_graph_at_any_batch_size_with_the_same_results(name):
+    model, _, _ = made(name, drop_path_rate=0.1)
+    side, counter = side_of(name), CompileCounter()
+    compiled = torch.compile(model.train(), fullgraph=True, dynamic=True, backend=counter)
+    for batch in (2, 3, 5):
+        lens = Spherical.from_fov(torch.linspace(0.2, 0.9, batch), 2.6, side / 2)
+        assert compiled(torch.randn(batch, 3, side, side), lens).shape[:2] == (batch, 5)
+    assert counter.frame_count == 1
+    torch._dynamo.reset()
+    model, images, lenses = made(name)
+    with torch.no_grad():
+        eager = torch.compile(model, fullgraph=True, backend="aot_eager")
+        assert_close(eager(images, lenses), model(images, lenses), 1e-3)
+        program = torch.export.export(model, (images, lenses))
+        assert_close(program.module()(images, lenses), model(images, lenses), 1e-3)
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("no_graphs_before_or_after")
+@pytest.mark.parametrize("name", ["darswin_a_nano", "swin_undis_nano"])
+def test_a_compiled_training_step_with_the_default_backend(name):
+    options = dict(jitter=0.0) if name.startswith("darswin") else {}
+    # Inductor's C++ of one block is built in seconds.
+    model, images, lenses = made(name, depths=(1,), num_heads=(1,), **options)
+    parameters = [*model.train().parameters()]
+    expected = torch.autograd.grad(model(images, lenses).square().sum(), parameters)
+    compiled = torch.compile(model, fullgraph=True)
+    got = torch.autograd.grad(compiled(images, lenses).square().sum(), parameters)
+    for a, b in zip(got, expected, strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-3, atol=1e-4 * b.abs().max().item())
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("no_graphs_before_or_after")
+def test_compiled_inference_with_the_default_backend():  # DarSwin's: the package in test_export.py
+    options = dict(depths=(1,), num_heads=(1,), blocks=("D",), groups=(1,))
+    model, images, lenses = made("dat_nano", **options)
+    with torch.no_grad():
+        compiled = torch.compile(model, fullgraph=True)
+        assert_close(compiled(images, lenses), model(images, lenses))

@@ -1,0 +1,340 @@
+"""The Unet: from polar maps to the pixels, its parts, and a lens that is learned through it."""
+
+import copy
+import math
+
+import pytest
+import torch
+import torch.nn.functional as F
+
+from darswin import create_model, optimize, polar_grid
+from darswin.layers.transformer import PatchMerging
+from darswin.layers.polar import PolarGridSpec
+from darswin.lens import KannalaBrandt, Mei, Polynomial, Spherical
+from darswin.models.unet import DistanceHead, PatchExpand, PixelHead, SkipJoin
+from darswin.ops import polar_to_image
+
+f64 = torch.float64
+WIDE = Polynomial([16.0, 0.4, -0.1, 0.05], 2.0, [30.0, 35.0])  # θ_max = 115°, off centre
+GENERAL = Mei(
+    1.5, 60.0, [0.02, 0.01], 1.4, [30.0, 35.0], tangential=[0.02, -0.01],
+    affine=[[1.0, 0.05], [0.0, 1.1]],
+)  # fmt: skip
+
+
+def network(name="darswin_unet_a_nano", **options):
+    model = create_model(name, **(dict(num_classes=4) | options)).eval()
+    for key, parameter in model.named_parameters():
+        spread = 1.0 if parameter.dim() == 1 and key.endswith("weight") else 0.0
+        torch.nn.init.normal_(parameter, mean=spread, std=0.1)
+    return model
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("lens", [WIDE, GENERAL], ids=["wide", "general"])
+def test_projecting_first_is_projecting_on_the_pixels(lens):
+    """A linear layer commutes with the interpolation, to rounding."""
+    model = network(skip_width=0)
+    x, size = torch.randn(2, 64, 256, 24), (64, 64)
+    back = model.view.prepare(lens, size).back
+    first = model.view.to_pixels(model.segmentation_head.proj(x), back, size)
+    pixels = model.view.to_pixels(x, back, size)
+    proj = model.segmentation_head.proj
+    after = F.linear(pixels.permute(0, 2, 3, 1), proj.weight, proj.bias).permute(0, 3, 1, 2)
+    # Beyond θ_max a map is 0, and the bias alone is left of what is projected after.
+    beyond = (pixels == 0).all(1, keepdim=True).expand_as(after)
+    assert 0.02 < beyond.float().mean() < 0.7 and (first[beyond] == 0).all()
+    torch.testing.assert_close(first[~beyond], after[~beyond], rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("spacing", ["theta", "tan", "g", "radius"])
+def test_the_decoders_rings_are_those_of_the_grid(spacing):
+    """Four to a ring: the samples of a grid of 4 × 4 samples a token stand at their centres."""
+    lens = Spherical.from_fov([0.1, 0.9], 2.6, 32.0)
+    model = create_model("darswin_unet_ra_nano", spacing=spacing, sample_spacing="radius")
+    way, _ = model.view.prepare(lens, (64, 64)).back
+    grid = polar_grid(lens, (64, 64), rings=16, sectors=64, samples=(4, 4), spacing=spacing,
+                      sample_spacing="radius")  # fmt: skip
+    torch.testing.assert_close(way.radii, grid.radii)
+    assert torch.equal(way.center, grid.center) and torch.equal(way.r_max, lens.r_max)
+    # `polar_to_image` takes sector a to be where the samples of column a stand.
+    assert torch.allclose(grid.azimuths, 2 * math.pi * (torch.arange(256) + 0.5) / 256)
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("lens", [WIDE, GENERAL], ids=["wide", "general"])
+@pytest.mark.parametrize("spacing", ["theta", "g"])
+def test_what_the_rays_show_comes_back_to_their_pixels(lens, spacing):
+    """A field of (θ, φ) on the rings and sectors, brought back, is that of each pixel's ray."""
+    lens, size = lens.to(f64), (60, 66)
+    way = PolarGridSpec(32, 1, (1, 1), spacing).pixel_grid(lens, size, split=4)
+    theta = lens.unproject(way.radii)[0][:, None]
+    azimuth = 2 * math.pi * (torch.arange(512, dtype=f64) + 0.5) / 512
+
+    def field(theta, azimuth):
+        across, down = theta * torch.cos(azimuth), theta * torch.sin(azimuth)
+        return torch.stack(torch.broadcast_tensors(across, down, theta), -1)
+
+    got = polar_to_image(field(theta, azimuth)[None], size=size, layout="tokens", **way._asdict())
+    pixels = torch.stack(
+        torch.meshgrid(torch.arange(66, dtype=f64), torch.arange(60, dtype=f64), indexing="xy"), -1
+    )
+    rays = lens.unproject_pixels(pixels[None], size)
+    inside = rays[0] < lens.theta_max * 0.99
+    assert inside.float().mean() > 0.4
+    # Between two rings the field is not quite linear in the radius; θ has a kink in the middle.
+    error = (got - field(*rays)).abs()[inside & (rays[0] > 0.1)]
+    assert error.max() < 2e-3
+    seen = lens.sees(rays[0])
+    assert (got[~seen] == 0).all() and (got[seen] != 0).any(-1).all()
+
+
+EVEN = dict(periodic_bias=True)
+
+
+@torch.no_grad()
+@pytest.mark.parametrize(
+    ("name", "options", "turns"),
+    [  # the quarter turns that the logits follow exactly
+        ("darswin_unet_ra_nano", {}, {1, 2, 3}),
+        ("darswin_unet_ra_micro", EVEN, {1, 2, 3}),
+        ("darswin_unet_ra_nano", dict(skip_width=8), set()),
+        ("darswin_unet_ra_nano", dict(places=True), set()),  # it knows which way is up
+        ("darswin_unet_a_nano", EVEN, {1, 2, 3}),
+    ],
+)
+def test_a_turned_image_gives_turned_logits(name, options, turns):
+    model = network(name, **(dict(skip_width=0, places=False, in_chans=1) | options)).to(f64)
+    lens = Spherical.from_fov(0.6, 2.6, 31.0).to(f64)
+    image = torch.randn(1, 1, 64, 64, dtype=f64)  # a pixel at the very middle has no azimuth
+    logits = model(image, lens)
+    for quarters in (1, 2, 3):
+        turned = model(image.rot90(quarters, (2, 3)), lens)
+        expected = logits.rot90(quarters, (2, 3))
+        off = (turned - expected).abs().max() / expected.abs().max()
+        assert (off < 1e-9) == (quarters in turns), (quarters, off)
+
+
+def kannala_brandt(focal, radial, center):
+    lens = KannalaBrandt(focal, radial, center=center, tangential=[[0.02, 0.01]])
+    return lens.with_theta_max(1.4)
+
+
+def polynomial(coefficients, center):
+    return Polynomial(coefficients, 1.9, center)
+
+
+@pytest.mark.parametrize(
+    ("make", "values"),
+    [
+        (polynomial, dict(coefficients=[[16.0, 0.4, -0.1]], center=[[30.3, 33.1]])),
+        pytest.param(
+            kannala_brandt,
+            dict(focal=[20.0], radial=[[0.02, -0.01]], center=[[30.3, 33.1]]),
+            marks=pytest.mark.slow,
+        ),
+    ],
+)
+def test_a_lens_is_learned_through_the_way_back(make, values):
+    """Against central differences, with the encoder's part left out and in."""
+    model = network(in_chans=1).to(f64).requires_grad_(False)
+    images, size = torch.randn(1, 1, 48, 64, dtype=f64), (48, 64)
+    labels = torch.randint(4, (1, *size))
+    weights = torch.rand(1, *size, dtype=f64)
+    fixed = make(**{k: torch.tensor(v, dtype=f64) for k, v in values.items()})
+    prepared = model.prepare(fixed, size)
+
+    def loss(whole: bool, **parameters):
+        lens = make(**parameters)
+        if whole:
+            logits = model(images, lens)
+        else:
+            logits = model.run(images, prepared._replace(way=model.view.prepare(lens, size)))
+        return (F.cross_entropy(logits, labels, reduction="none") * weights).mean() * 100
+
+    for whole in (False, True):
+        leaves = {k: torch.tensor(v, dtype=f64, requires_grad=True) for k, v in values.items()}
+        gradients = torch.autograd.grad(loss(whole, **leaves), list(leaves.values()))
+        for (name, value), gradient in zip(leaves.items(), gradients, strict=True):
+            assert gradient.isfinite().all() and (gradient != 0).all()
+            # Pixels change their cell somewhere in any step: no closer than a few percent.
+            for k in range(value.numel()):
+                ends = []
+                for sign in (-1, 1):
+                    moved = {n: v.detach().clone() for n, v in leaves.items()}
+                    moved[name].view(-1)[k] += sign * 1e-7
+                    ends.append(loss(whole, **moved))
+                difference = ((ends[1] - ends[0]) / 2e-7).item()
+                got = gradient.view(-1)[k].item()
+                assert abs(got - difference) < 1e-3 * max(1.0, abs(difference)), (name, k)
+
+
+# -- expansion and heads --------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("split", [(1, 4), (2, 2), (4, 1), (4, 4)])
+def test_tokens_stand_where_merging_took_them_from(split):
+    """Behind a merging of the same tokens that keeps them all, an expansion puts each back."""
+    dim = 3
+    joined = dim * split[0] * split[1]
+    merging, expand = PatchMerging(dim, split), PatchExpand(joined, dim, split)
+    merging.norm = expand.norm = torch.nn.Identity()
+    merging.reduction = expand.expansion = torch.nn.Identity()
+    x = torch.randn(2, 8, 16, dim)
+    assert torch.equal(expand(merging(x)), x)
+
+
+@pytest.mark.parametrize("split", [(1, 4), (2, 2), (4, 4)])
+def test_a_turned_map_gives_a_turned_map(split):
+    expand, x = PatchExpand(6, 4, split), torch.randn(2, 3, 8, 6)
+    out = expand(x)
+    assert out.shape == (2, 3 * split[0], 8 * split[1], 4)
+    for turn in (1, 3):
+        torch.testing.assert_close(expand(x.roll(turn, 2)), out.roll(turn * split[1], 2))
+
+
+def test_each_token_alone_makes_its_part_and_is_normed():
+    expand, x = PatchExpand(6, 4, (2, 4)), torch.randn(1, 2, 3, 6)
+    out = expand(x)
+    torch.testing.assert_close(out.mean(-1), torch.zeros(1, 4, 12), atol=1e-6, rtol=0)
+    changed = x.clone()
+    changed[0, 1, 2] += torch.randn(6)
+    differs = (expand(changed) != out).any(-1)
+    assert differs[0, 2:, 8:].all() and differs.sum() == 8
+
+
+def test_joining():
+    join = SkipJoin(4, (1, 4))
+    x, skip = torch.randn(2, 3, 2, 8, requires_grad=True), torch.randn(2, 3, 8, 4)
+    out = join(x, skip.requires_grad_())
+    expected = join.expand(x) @ join.fuse.weight[:, :4].T + skip @ join.fuse.weight[:, 4:].T
+    torch.testing.assert_close(out, expected + join.fuse.bias)
+    out.square().sum().backward()
+    assert x.grad.abs().sum() > 0 and skip.grad.abs().sum() > 0
+
+
+def test_the_skip_adds_what_the_image_shows():
+    head = PixelHead(6, 4, in_chans=3, skip_width=8)
+    coarse, images = torch.randn(2, 4, 9, 7), torch.randn(2, 3, 9, 7)
+    out = head.refine(coarse, images)
+    assert out.shape == coarse.shape and not torch.equal(out, coarse)
+    changed = images.clone()
+    changed[0, :, 4, 3] += 1  # two convolutions of 3×3: it reaches two pixels far
+    differs = (head.refine(coarse, changed) != out).any(1)
+    assert differs[0, 2:7, 1:6].sum() == differs.sum() > 9
+    torch.nn.init.zeros_(head.out.weight)
+    assert torch.equal(head.refine(coarse, images), coarse)
+    without = PixelHead(6, 4, in_chans=3, skip_width=0)
+    assert torch.equal(without.refine(coarse, images), coarse)
+    assert [name for name, _ in without.named_parameters()] == ["proj.weight", "proj.bias"]
+
+
+def test_distances_are_positive_and_finite():
+    head = DistanceHead(6, in_chans=3, skip_width=0, typical_distance=4.0)
+    x = torch.tensor([-1e30, -math.inf, -3.0, 0.0, 1e-3, 3.0, 1e30, math.inf])
+    meters = head.finish(x)
+    assert meters.isfinite().all() and (meters > 0).all()
+    torch.testing.assert_close(meters[3:5], 4 * torch.exp(x[3:5]))  # near 0 it is e^x itself
+    assert meters[0] == meters[1] < 2e-3 and meters[-1] > 10_000
+    assert (meters.diff()[1:6] > 0).all()
+    assert head.finish(x.bfloat16()).dtype == torch.float32
+    assert head.finish(x.double()).dtype == torch.float64
+
+
+# -- the whole ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["darswin_unet_a_nano", "swin_unet_nano"])
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (dict(task="classification"), r"task must be one of \('segmentation', 'distance'\)"),
+        (dict(num_classes=0), "num_classes must be at least 1, got 0"),
+        (dict(skip_width=-1), "skip_width must be at least 0, got -1"),
+        (dict(decoder_depths=0), "decoder_depths must be an int of at least 1, or one for"),
+        (dict(decoder_depths=(1, 2, 3)), r"each stage but the last, 2, got \[1, 2, 3\]"),
+        (dict(task="distance", typical_distance=0), "typical_distance must be above 0 m"),
+        (dict(task="distance", typical_distance=math.inf), "typical_distance must be above 0 m"),
+        (dict(task="distance", typical_distance=math.nan), "typical_distance must be above 0 m"),
+        (dict(compat="official"), "got 'official' for Unet"),
+    ],
+)
+def test_wrong_options(name, options, message):
+    with pytest.raises(ValueError, match=message):
+        create_model(name, **options)
+
+
+def test_heads_and_depths_are_options():
+    model = create_model("swin_unet_nano", decoder_depths=(1, 3))
+    assert [len(stage.blocks) for stage in model.decoder.stages] == [1, 3]
+    far = network(task="distance", typical_distance=40.0)
+    far.reset_classifier(9)
+    assert far.num_classes == 1 and far.distance_head.typical_distance == 40.0
+    assert far.get_classifier() is far.head is far.distance_head
+
+
+@torch.no_grad()
+@pytest.mark.parametrize(
+    ("classifier", "unet", "options"),
+    [
+        ("darswin_a_micro", "darswin_unet_a_micro", {}),
+        ("darswin_ra_nano", "darswin_unet_ra_nano", dict(rings=8, sectors=32)),
+        ("swin_nano", "swin_unet_nano", dict(image_size=32, patch_size=2)),
+        ("swin_undis_nano", "swin_unet_undis_nano", dict(image_size=32, patch_size=2)),
+    ],
+)
+def test_its_encoder_starts_from_a_trained_classifier(classifier, unet, options):
+    trained = create_model(classifier, num_classes=4).eval()
+    for parameter in trained.parameters():
+        torch.nn.init.normal_(parameter, std=0.1)
+    model = create_model(unet, num_classes=5, **options).eval()
+    x, lens = torch.randn(1, 3, 32, 32), Spherical.from_fov(0.5, 2.6, 16.0)
+    maps = trained.forward_intermediates(x, lens, intermediates_only=True)
+    trained.reset_classifier(0)
+    model.encoder.load_state_dict(trained.state_dict())
+    if "undis" in classifier:  # the unet makes the view
+        x = model.view.look(x, model.view.prepare(lens, (32, 32)).there)
+    got = model.encoder.forward_intermediates(x, lens, intermediates_only=True)
+    assert all(torch.equal(a, b) for a, b in zip(got, maps, strict=True))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["darswin_unet_a_nano", "swin_unet_undis_nano"])
+def test_it_learns(name):
+    """Which side of an edge a pixel is on: 30 steps find it to a pixel or two."""
+    torch.manual_seed(0)
+    options = {} if name.startswith("darswin") else dict(image_size=64)
+    model = create_model(name, num_classes=2, in_chans=1, **options)
+    lens = Spherical.from_fov(0.5, 2.6, 32.0)
+    images = torch.randn(4, 1, 64, 64) * 0.1
+    labels = torch.zeros(4, 64, 64, dtype=torch.long)
+    for k, edge in enumerate((20, 28, 36, 44)):
+        labels[k, :, edge:] = 1
+    images += labels[:, None]
+    optimizer = torch.optim.AdamW(model.parameters(), lr=5e-3)
+    for _ in range(30):
+        loss = F.cross_entropy(model(images, lens), labels)
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+    with torch.no_grad():
+        right = (model.eval()(images, lens).argmax(1) == labels).float()
+    assert right[:, 12:52, 12:52].mean() > 0.97
+
+
+@torch.no_grad()
+def test_an_optimized_model_prepares_a_fixed_lens_once(monkeypatch):
+    model, images = network(), torch.randint(256, (1, 80, 64, 3), dtype=torch.uint8)
+    lens = Spherical.from_fov(0.2, 2.6, 32.0)
+    fixed, want = optimize(model, lens=lens), model(images, lens)
+    for _ in range(2):
+        torch.testing.assert_close(fixed(images), want, rtol=0, atol=1e-5 * want.abs().max().item())
+        monkeypatch.setattr(type(lens), "project", None)
+    with pytest.raises(ValueError, match="call it without one"):
+        fixed(images, lens)
+    with pytest.raises(TypeError, match="neither copied nor pickled"):
+        copy.deepcopy(fixed)
+    with pytest.raises(TypeError, match="not saved"):
+        fixed.state_dict()
+    with torch.enable_grad(), pytest.raises(RuntimeError, match="has no gradients"):
+        fixed(torch.rand(1, 3, 80, 64, requires_grad=True))

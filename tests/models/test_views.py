@@ -1,0 +1,291 @@
+"""Views of images and the ways back: perspective views, squares, and any network behind them."""
+
+import math
+
+import pytest
+import torch
+import torch.nn.functional as F
+from torch import nn
+
+from darswin import create_model
+from darswin.lens import (
+    BrownConrady,
+    Equidistant,
+    KannalaBrandt,
+    Perspective,
+    Polynomial,
+    Spherical,
+)
+from darswin.lens.pixels import reproject
+from darswin.models import LensAdapter
+
+LENSES = Spherical.from_fov([0.2, 0.9], 2.6, 24.0)
+GENERAL = KannalaBrandt(
+    14.0, [0.01], 1.5, center=[22.0, 27.0], affine=[[1.0, 0.1], [0.0, 1.1]], tangential=[0.02, 0.01]
+)
+WIDE = Spherical.from_fov([0.2, 0.9], 2.6, 32.0)
+
+
+class Network(nn.Module):
+    """Answers as segmentation_models_pytorch and timm do: masks of several sizes, a label."""
+
+    def __init__(self):
+        super().__init__()
+        self.conv = nn.Conv2d(3, 5, 3, padding=1)
+        self.down = nn.Conv2d(5, 6, 2, 2)
+
+    def forward(self, x):
+        fine = self.conv(x)
+        coarse = self.down(fine)
+        return dict(masks=[fine, coarse], label=coarse.mean((2, 3)))
+
+
+def smooth(height, width):
+    y, x = torch.meshgrid(torch.arange(float(height)), torch.arange(float(width)), indexing="ij")
+    return torch.stack((torch.sin(x / 12), torch.cos(y / 12), torch.sin((x + y) / 16)))[None]
+
+
+@pytest.mark.parametrize(
+    "lens", [LENSES, Polynomial([10.0, 0.4], 2.1), GENERAL], ids=["two", "beyond 90°", "general"]
+)
+@pytest.mark.parametrize("spacing", ["theta", "g", "radius"])
+def test_what_is_taken_to_the_square_comes_back(lens, spacing):
+    images = smooth(48, 52).expand(2, -1, -1, -1)
+    out = LensAdapter(nn.Identity(), 192, spacing)(images, lens)
+    y, x = torch.meshgrid(torch.arange(48.0), torch.arange(52.0), indexing="ij")
+    theta, _ = lens.unproject_pixels(torch.stack((x, y), -1)[None], (48, 52))
+    seen = lens.sees(theta).expand(2, -1, -1)[:, None].expand_as(out)
+    inner = (theta < 0.9 * lens.theta_max[:, None, None]).expand(2, -1, -1)[:, None]
+    inside = torch.zeros(48, 52, dtype=torch.bool)
+    inside[4:-4, 4:-4] = True  # the image ends there, its views do not
+    inner = (inner & inside).expand_as(out)
+    assert (out[~seen] == 0).all() and inner.float().mean() > 0.3
+    assert (out - images).abs()[inner].max() < 0.02
+    coarse = LensAdapter(nn.AvgPool2d(4), 192, spacing)(images, lens)
+    assert coarse.shape == images.shape and (coarse - images).abs()[inner].mean() < 0.02
+
+
+def test_a_lens_in_float32_sees_as_much_as_in_float64():
+    focal = torch.tensor([40.0], dtype=torch.float64)
+    exact = BrownConrady(focal, [-0.22, 0.13, 0.028], tangential=[1e-3, 1e-3], center=[25.0, 24.0])
+    adapter, images = LensAdapter(nn.Identity(), 192), 2 + smooth(48, 52)
+    for lens in (exact, exact.to(torch.float32)):
+        out = adapter(images, lens)[..., 2:-2, 2:-2]
+        assert (out - images[..., 2:-2, 2:-2]).abs().max() < 0.2
+
+
+def test_outputs_of_any_resolution_come_back_and_others_pass_through():
+    network = Network().eval()
+    adapter, images = LensAdapter(network, 32), torch.randn(2, 3, 48, 40)
+    prepared = adapter.prepare(LENSES, (48, 40))
+    out = adapter.run(images, prepared)
+    assert [m.shape for m in out["masks"]] == [(2, 5, 48, 40), (2, 6, 48, 40)]
+    assert out["label"].shape == (2, 6)
+    again = adapter(images, LENSES)
+    assert all(torch.equal(a, b) for a, b in zip(again["masks"], out["masks"], strict=True))
+    one = adapter(images, LENSES[:1])
+    assert torch.equal(one["label"][0], out["label"][0])
+
+
+@pytest.mark.parametrize("general", [False, True])
+def test_it_trains_end_to_end_with_its_lens(general):
+    adapter, images = LensAdapter(Network(), 32), torch.randn(2, 3, 48, 48, requires_grad=True)
+    focal = torch.tensor([14.0], requires_grad=True)
+    center = torch.tensor([[22.0, 27.0]], requires_grad=True)
+    tangential = dict(tangential=[[0.02, 0.01]]) if general else {}
+    lens = KannalaBrandt(focal, [[0.01]], 1.5, center=center, **tangential)
+    out = adapter(images, lens)
+    (out["masks"][0].square().mean() + out["masks"][1].square().mean()).backward()
+    for tensor in (images, focal, center, *adapter.parameters()):
+        assert tensor.grad.isfinite().all() and tensor.grad.abs().sum() > 0
+
+
+def test_double_precision_and_half():
+    lens, images = LENSES.to(torch.float64), torch.rand(2, 3, 40, 40)
+    exact = LensAdapter(nn.Identity(), 64)(images.double(), lens)
+    assert exact.dtype == torch.float64
+    rounded = LensAdapter(nn.Identity(), 64)(images, LENSES)
+    torch.testing.assert_close(rounded.double(), exact, atol=1e-3, rtol=0)
+    half = LensAdapter(nn.Identity(), 64)(images.bfloat16(), LENSES)
+    assert half.dtype == torch.bfloat16 and (half - rounded).abs().max() < 0.02
+
+
+def test_wrong_arguments_of_an_adapter():
+    for size in (0, -1, 2.5, "8"):
+        with pytest.raises(ValueError, match="size must be an int of at least 1, got"):
+            LensAdapter(nn.Identity(), size)
+    with pytest.raises(ValueError, match=r"spacing must be one of .*, got 'r'"):
+        LensAdapter(nn.Identity(), 8, "r")
+    adapter, images = LensAdapter(nn.Identity(), 8), torch.zeros(3, 3, 40, 40)
+    with pytest.raises(TypeError, match=r"lens must be a darswin\.lens\.Lens, got NoneType"):
+        adapter(images, None)
+    with pytest.raises(TypeError, match=r"images must be in floating point, got torch\.uint8"):
+        adapter(images.byte(), LENSES[:1])
+    with pytest.raises(TypeError, match=r"images must be in floating point, got torch\.uint8"):
+        adapter.run(images[..., :3].byte(), adapter.prepare(LENSES[:1], (40, 3)))
+    with pytest.raises(ValueError, match="one lens or one an image, 3, got 2"):
+        adapter(images, LENSES)
+    with pytest.raises(ValueError, match=r"belongs to images of \(H, W\) = \(20, 20\)"):
+        adapter(images, LENSES.replace(image_size=torch.tensor([[20.0, 20.0]] * 2)))
+    with pytest.raises(ValueError, match="spacing='tan' needs lenses"):
+        LensAdapter(nn.Identity(), 8, "tan")(images, Equidistant(9.0, 1.7))
+
+
+# -- perspective views ----------------------------------------------------------------------------
+
+
+def scene(size):
+    """A smooth picture (1, 1, size, size)."""
+    y, x = torch.meshgrid(torch.linspace(-1, 1, size), torch.linspace(-1, 1, size), indexing="ij")
+    return (torch.sin(9 * x + 1) * torch.cos(8 * y + 5 * x * y))[None, None]
+
+
+def circle(size, radius):
+    y, x = torch.meshgrid(*[torch.arange(size) - (size - 1) / 2] * 2, indexing="ij")
+    return torch.hypot(x, y) <= radius
+
+
+class Seen(torch.nn.Module):
+    """In place of the first layer: keeps what comes in."""
+
+    def __init__(self, model):
+        super().__init__()
+        self.images, self.inner = None, model.patch_embed
+        model.patch_embed = self
+
+    def forward(self, x):
+        self.images = x.permute(0, 3, 1, 2).detach()
+        return self.inner(x)
+
+
+def undistorted(picture, lens, **options):
+    side = picture.shape[2]
+    model = create_model("swin_undis_nano", in_chans=1, image_size=side, **options).eval()
+    seen = Seen(model)
+    with torch.no_grad():
+        model(picture, lens)
+    return seen.images
+
+
+@pytest.mark.parametrize("xi", [0.0, 0.4, 0.9])
+def test_the_perspective_image_comes_back(xi):
+    fov, side = math.radians(110), 128
+    perspective = Perspective.from_fov(fov, side / 2)
+    picture = scene(side)
+    lens = Spherical.from_fov(xi, fov, side / 2)
+    distorted = reproject(picture, perspective, lens, (side, side))
+    back = undistorted(distorted, lens)
+    inside = circle(side, side / 2 - 2)
+    error = (back - picture)[0, 0][inside].abs().max()
+    assert error < (1e-5 if xi == 0 else 0.02), error
+    if xi:  # the picture was indeed another one
+        assert (distorted - picture)[0, 0][inside].abs().max() > 0.3
+    assert not back[0, 0][~circle(side, side / 2 + 1)].any()
+
+
+def test_a_view_keeps_the_lenss_field_of_view_up_to_the_limit():
+    side, wide = 64, Polynomial([20.0], math.radians(95))
+    picture = scene(side)
+    limited = undistorted(picture, wide, max_fov=math.radians(100))
+    narrow = Polynomial([20.0], math.radians(50))
+    expected = reproject(
+        picture, narrow, Perspective.from_fov(math.radians(100), side / 2), (side, side)
+    )
+    torch.testing.assert_close(limited, expected, rtol=0, atol=1e-5)
+    assert (undistorted(picture, wide) - limited).abs().max() > 0.1  # 175° otherwise
+
+
+def test_each_image_has_its_lens():
+    picture = scene(64).expand(2, -1, -1, -1)
+    lenses = Spherical.from_fov([0.1, 0.9], 2.0, 32.0, center=[[30.0, 31.5], [31.5, 33.0]])
+    together = undistorted(picture, lenses)
+    for k in range(2):
+        torch.testing.assert_close(together[k : k + 1], undistorted(picture[:1], lenses[k]))
+    one = undistorted(picture, lenses[:1])
+    torch.testing.assert_close(one[0], together[0])
+    assert not torch.allclose(one[1], together[1], atol=0.05)
+
+
+def test_gradients_reach_the_lens_through_the_view():
+    xi = torch.tensor([0.4], requires_grad=True)
+    model = create_model("swin_undis_nano")
+    model(torch.randn(2, 3, 32, 32), Spherical(xi, 12.0, 1.0)).square().sum().backward()
+    assert xi.grad.isfinite().all() and xi.grad.all()
+
+
+# -- Unets on views ------------------------------------------------------------------------------
+
+
+def network(name, **options):
+    model = create_model(name, **(dict(num_classes=4, image_size=64) | options)).eval()
+    for key, parameter in model.named_parameters():
+        spread = 1.0 if parameter.dim() == 1 and key.endswith("weight") else 0.0
+        torch.nn.init.normal_(parameter, mean=spread, std=0.1)
+    return model
+
+
+def of_the_same_weights(model, name, **options):
+    other = network(name, **options)
+    other.load_state_dict(model.state_dict())
+    return other
+
+
+@torch.no_grad()
+def test_a_map_coarser_than_the_image_is_resized():
+    model = network("swin_unet_nano", image_size=(128, 64), patch_size=8, skip_width=0)
+    maps = model.encoder.forward_intermediates(torch.randn(2, 3, 128, 64), intermediates_only=True)
+    x = model.segmentation_head.proj(model.decoder(maps, [(), ()]))
+    assert x.shape == (2, 64, 32, 4)
+    got = model.view.to_pixels(x, None, (128, 64))
+    x = x.permute(0, 3, 1, 2)
+    torch.testing.assert_close(got, F.interpolate(x, (128, 64), mode="bilinear"))
+
+
+@torch.no_grad()
+def test_undistorted_it_predicts_in_the_view_and_brings_back():
+    undis = network("swin_unet_undis_nano", max_fov=2.0)
+    plain = of_the_same_weights(undis, "swin_unet_nano")
+    images = torch.randn(2, 3, 64, 64)
+    half = torch.full((2,), 1.0)  # of 2.6 rad the view shows 2.0
+    view = Perspective(32 / torch.tan(half), half)
+    logits = plain(reproject(images, WIDE, view, (64, 64)))
+    torch.testing.assert_close(undis(images, WIDE), reproject(logits, view, WIDE, (64, 64)))
+    theta, _ = WIDE.unproject_pixels(torch.tensor([[[0.0, 32.0]]]), (64, 64))
+    assert (theta > 1.0).all() and (undis(images, WIDE)[:, :, 32, 0] == 0).all()
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("spacing", ["theta", "g", "radius"])
+def test_adapted_it_is_a_lens_adapter_around_it(spacing):
+    adapted = network("swin_unet_adapted_nano", spacing=spacing)
+    plain = of_the_same_weights(adapted, "swin_unet_nano")
+    images = torch.randn(2, 3, 64, 64)
+    got = adapted(images, WIDE)
+    assert torch.equal(got, LensAdapter(plain, 64, spacing)(images, WIDE))
+    assert (got[:, :, 0, 0] == 0).all() and (got[:, :, 32, 1] != 0).all()
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "message"),
+    [
+        ("swin_unet_adapted_nano", dict(spacing="r"), "spacing must be one of .*, got 'r'"),
+        ("swin_unet_adapted_nano", dict(image_size=(64, 128)), r"must be square, got \(64, 128\)"),
+        ("swin_unet_undis_nano", dict(max_fov=4), r"max_fov must be in \(0, π\), got 4"),
+        ("swin_undis_nano", dict(max_fov=0.0), r"max_fov must be in \(0, π\), got 0"),
+        ("swin_undis_nano", dict(max_fov=math.pi), r"max_fov must be in \(0, π\), got 3"),
+        ("swin_unet_nano", dict(view="round"), "view must be one of .*, got 'round'"),
+        ("swin_unet_nano", dict(image_size=66), r"divide image_size = \(66, 66\), got 4"),
+        ("swin_nano", dict(image_size=33), r"divide image_size = \(33, 33\), got 2"),
+        ("swin_nano", dict(image_size=36), r"stage 1: window \(4, 4\) must divide the map, \(18,"),
+        ("swin_nano", dict(image_size=24), r"stage 2: window \(4, 4\) must divide the map, \(6, 6"),
+    ],
+)
+def test_wrong_options(name, options, message):
+    with pytest.raises(ValueError, match=message):
+        create_model(name, **options)
+
+
+def test_a_view_has_options_of_its_own():
+    for name, option in (("swin_nano", "max_fov"), ("swin_unet_undis_nano", "spacing")):
+        with pytest.raises(TypeError, match=option):
+            create_model(name, **{option: 1.0})
