@@ -8,8 +8,8 @@ import torch
 import torch.nn.functional as F
 
 from darswin import create_model, optimize, polar_grid
-from darswin.layers.transformer import PatchMerging
 from darswin.layers.polar import PolarGridSpec
+from darswin.layers.transformer import PatchMerging
 from darswin.lens import KannalaBrandt, Mei, Polynomial, Spherical
 from darswin.models.unet import DistanceHead, PatchExpand, PixelHead, SkipJoin
 from darswin.ops import polar_to_image
