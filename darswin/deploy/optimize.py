@@ -202,9 +202,9 @@ def _pack_block(block: Block, dtype: torch.dtype) -> None:
 
 
 def _replace(module: nn.Module, **layers: Any) -> None:
-    """Puts plain functions in place of submodules and functions."""
+    """Puts plain functions in place of submodules and methods."""
     for name, layer in layers.items():
-        delattr(module, name)
+        module._modules.pop(name, None)
         setattr(module, name, layer)
 
 

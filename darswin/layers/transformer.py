@@ -98,8 +98,11 @@ class WindowAttention(nn.Module):
         self.qkv: Layer = Linear(dim, 3 * dim)
         self.proj: Layer = Linear(dim, dim)
         self.position_bias = position_bias(self.window, num_heads)
-        self.attend: Callable[[Tensor, Tensor], Tensor] = partial(
-            window_attention, window=self.window, shift=self.shift, periodic=periodic
+
+    def attend(self, qkv: Tensor, bias: Tensor) -> Tensor:
+        """(B, R, A, 3, heads, d) and the bias → (B, R, A, D)."""
+        return window_attention(
+            qkv, bias, window=self.window, shift=self.shift, periodic=self.periodic
         )
 
     def forward(self, x: Tensor, *positions: Tensor, table: Tensor | None = None) -> Tensor:
