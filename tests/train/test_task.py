@@ -16,6 +16,7 @@ from darswin.models.saving import ModelCard
 from darswin.train.classification import Classification, ClassMetrics
 from darswin.train.data import WideAngleData
 from darswin.train.runs import CHANGEABLE, RunCheckpoint, check_changes
+from darswin.train.segmentation import Segmentation
 from darswin.train.task import Schedule, parameter_groups
 from darswin.train.tasks import TASKS
 
@@ -199,6 +200,16 @@ def test_what_may_change_is_an_option():
 def test_every_task_has_its_classes():
     for name, kind in TASKS.items():
         assert kind.module.task == name and kind.module.monitor[0].startswith("val/")
+
+
+@pytest.mark.parametrize("kind", [Classification, Segmentation])
+def test_one_class_is_not_enough(kind):
+    task = kind()
+    task._trainer = SimpleNamespace(datamodule=SimpleNamespace(classes=["a"]))
+    with pytest.raises(ValueError, match=r"needs two classes, the data has only \['a'\]"):
+        task._head_options()
+    task.data.classes += ["b"]
+    assert task._head_options()["num_classes"] == 2
 
 
 @pytest.mark.parametrize(
