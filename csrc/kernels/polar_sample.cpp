@@ -60,9 +60,9 @@ void slope(const Corners<T, E>& corners, const T* grad, T right, T lower, T* gx,
 template <typename T>
 struct LensScratch {
   RandomWords random;
-  FarPlaces<T> places;
   double across[kPlaces], down[kPlaces], shift[kPlaces];
   double x[kPlaces], y[kPlaces];  // of points before the matrix, from the center
+  FarPlaces<T> places;
 };
 
 template <typename T>
