@@ -27,7 +27,7 @@ from tqdm import tqdm
 
 from darswin import create_model, lens
 from darswin.data import LEVELS, warp_map
-from darswin.data.warp import remap
+from darswin.data.warping import remap
 from darswin.layers.polar import PolarSample
 from darswin.models import ModelCard, save_model
 from darswin.models.encoder import Encoder

@@ -34,7 +34,7 @@ from torch import Tensor
 
 from darswin.cli.main import main as darswin
 from darswin.data import open_source, warp_map
-from darswin.data.warp import remap
+from darswin.data.warping import remap
 from darswin.lens import Lens, Perspective, Spherical
 from darswin.models import DarSwin
 from darswin.models.saving import load_model, model_of_run

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from sklearn.datasets import load_digits
 
-from darswin.data.warp import remap, warp_map
+from darswin.data.warping import remap, warp_map
 from darswin.lens import Perspective, load
 
 CALIBRATIONS = Path(__file__).parent / "lens" / "files"

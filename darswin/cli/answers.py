@@ -15,7 +15,7 @@ from PIL import Image
 from torch import Tensor
 
 from darswin.data.scenes.scene import IGNORE, PER_METRE
-from darswin.data.warp import Framing, FullSize, at_size
+from darswin.data.warping import Framing, FullSize, at_size
 from darswin.deploy.optimize import optimize
 from darswin.lens import Lens
 from darswin.models.base import Model

@@ -14,7 +14,7 @@ from darswin.data.scenes import open_scenes
 from darswin.data.scenes.dataset import SceneSamples
 from darswin.data.scenes.scene import IGNORE, Scene, Scenes
 from darswin.data.splits import LeftOut
-from darswin.data.warp import FullSize, RandomTurns, at_size, lens_at_size, warp, warp_map
+from darswin.data.warping import FullSize, RandomTurns, at_size, lens_at_size, warp, warp_map
 from darswin.data.wide_angle import WideAngle
 
 __all__ = [

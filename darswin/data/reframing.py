@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from darswin.data.scenes.scene import Scene, nothing_of
-from darswin.data.warp import Turn, area_resized, remap, turned_lens
+from darswin.data.warping import Turn, area_resized, remap, turned_lens
 from darswin.lens import Lens
 from darswin.lens.pixels import as_map, pixel_angles
 from darswin.lens.solve import length_of

@@ -11,7 +11,7 @@ from torch.utils.data import Dataset
 
 from darswin.data.cameras import Calibrations
 from darswin.data.pictures import Source
-from darswin.data.warp import Framing, RandomTurns, Turn, at_size, lens_at_size, turned_picture
+from darswin.data.warping import Framing, RandomTurns, Turn, at_size, lens_at_size, turned_picture
 from darswin.lens import Lens
 from darswin.utils.image import BrokenImageError
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from darswin.data.lens_distributions import LensDistribution
 from darswin.data.pictures import Source
 from darswin.data.samples import Draw, Samples
-from darswin.data.warp import Turn, area_resized, remap, taken_part
+from darswin.data.warping import Turn, area_resized, remap, taken_part
 from darswin.lens import Lens, Perspective
 from darswin.lens.pixels import OUTSIDE, radial_reprojection
 

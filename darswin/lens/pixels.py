@@ -13,8 +13,6 @@ from darswin.lens.ideal import Perspective
 from darswin.lens.solve import determinant, length_of
 from darswin.ops.checks import tensor_there
 
-__all__ = ["distance_to_z", "pixel_rays", "reproject", "solid_angles", "z_to_distance"]
-
 OUTSIDE = -10.0  # px: beyond any image, also for an interpolation of several pixels
 
 

@@ -15,6 +15,8 @@ from torch import Tensor
 from darswin.ops._sampling import Sampling
 from darswin.ops.checks import tensor_there
 
+__all__ = ["polar_embed", "polar_sample", "polar_to_image", "window_attention"]
+
 _WORD = 0xFFFFFFFF
 
 

@@ -17,7 +17,7 @@ from darswin.data.order import ResumableLoader, TrainingOrder
 from darswin.data.pictures import Source, open_source
 from darswin.data.samples import IMAGENET_MEAN, IMAGENET_STD, Calibrated, Samples
 from darswin.data.splits import Split
-from darswin.data.warp import Framing, RandomTurns
+from darswin.data.warping import Framing, RandomTurns
 from darswin.data.wide_angle import PAPER_FOV, WideAngle
 from darswin.lens.files.opencv import Coefficients
 from darswin.train.runs import ignore_signals

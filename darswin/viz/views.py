@@ -21,7 +21,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from darswin.data.warp import remap
+from darswin.data.warping import remap
 from darswin.lens import Lens
 from darswin.lens.pixels import as_map
 

@@ -15,7 +15,7 @@ from darswin.cli import answers as module
 from darswin.cli import predict as predict_module
 from darswin.cli.answers import ClassAnswers, claim_folder, distance_png, file_names, label_png
 from darswin.cli.main import main
-from darswin.data.warp import FullSize, at_size
+from darswin.data.warping import FullSize, at_size
 from darswin.lens import Spherical, from_dict
 from darswin.models.encoder import Encoder, Prepared
 from darswin.models.saving import ModelCard, save_model

@@ -13,7 +13,7 @@ from scipy import ndimage
 
 from darswin.data import IGNORE, Scene
 from darswin.data.reframing import _points, resize_scene, turn_scene, warp_scene
-from darswin.data.warp import Crop, Turn, taken_part, turned_picture
+from darswin.data.warping import Crop, Turn, taken_part, turned_picture
 from darswin.lens import BrownConrady, Equidistant, OCam, Polynomial, Spherical, load
 from darswin.lens.pixels import pixel_angles, reprojection
 

@@ -9,7 +9,7 @@ from frames import blob, centroid
 from darswin.data import PolynomialLenses, SphericalLenses, WideAngle, warp
 from darswin.data.pictures import Arrays
 from darswin.data.samples import IMAGENET_MEAN, IMAGENET_STD
-from darswin.data.warp import Turn
+from darswin.data.warping import Turn
 from darswin.data.wide_angle import PAPER_FOV
 from darswin.lens import Perspective, Spherical
 from darswin.lens.pixels import OUTSIDE, reprojection

@@ -12,7 +12,7 @@ import torch
 from sklearn.datasets import load_digits
 from sklearn.model_selection import train_test_split
 
-from darswin.data.warp import at_size, remap, warp_map
+from darswin.data.warping import at_size, remap, warp_map
 from darswin.deploy.quantize import quantize_model
 from darswin.layers.quantized import quantized_layers
 from darswin.lens import Perspective, Spherical, load

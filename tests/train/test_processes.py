@@ -119,8 +119,10 @@ def test_two_processes_train_and_test_as_one(scenes, tmp_path, task):
     if task == "segmentation":
         options = ["--task", task, "--data.path", str(scenes), *PIXELS, "--data.limit", "40"]
     own = options[options.index("--model.options") + 1]
-    options += ["--model.options", own.replace("}", f", {still}"), "--trainer.max_epochs", "1"]
-    options += ["--data.randaugment", "false", "--trainer.accumulate_grad_batches", "1"]
+    options = [
+        *(*options, "--model.options", own.replace("}", f", {still}"), "--trainer.max_epochs", "1"),
+        *("--data.randaugment", "false", "--trainer.accumulate_grad_batches", "1"),
+    ]
     one, two = tmp_path / "one", tmp_path / "two"
     fit(one, *options)
     lenses = [] if task == "segmentation" else ["--xi", "0,0.5"]

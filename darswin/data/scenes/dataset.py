@@ -10,7 +10,7 @@ from darswin.data.lens_distributions import LensDistribution
 from darswin.data.reframing import resize_scene, turn_scene, warp_scene
 from darswin.data.samples import Draw, Samples
 from darswin.data.scenes.scene import IGNORE, Scene, Scenes
-from darswin.data.warp import Crop, picture_size, taken_part
+from darswin.data.warping import Crop, picture_size, taken_part
 from darswin.lens import Lens
 
 # Of a drawn lens's own limit, where its curve may have no end: how far it is used.

@@ -10,7 +10,7 @@ from frames import WOODSCAPE, blob, centroid
 from hypothesis import given
 
 from darswin.data import IGNORE, FullSize, RandomTurns, at_size, lens_at_size, warp, warp_map
-from darswin.data.warp import Turn, area_resized, turned_picture
+from darswin.data.warping import Turn, area_resized, turned_picture
 from darswin.lens import (
     BrownConrady,
     Equidistant,
