@@ -16,23 +16,27 @@ from darswin.cli import predict as predict_module
 from darswin.cli.answers import ClassAnswers, claim_folder, distance_png, file_names, label_png
 from darswin.cli.main import main
 from darswin.data.warping import FullSize, at_size
-from darswin.lens import Spherical, from_dict
+from darswin.lens import from_dict
 from darswin.models.encoder import Encoder, Prepared
 from darswin.models.saving import ModelCard, save_model
 from darswin.viz.pixels import UNKNOWN, palette
 
+# A circle inside of pictures of 48×64, of whose middle square it leaves the corners out.
+LENS = {"model": "Spherical", "xi": 0.5, "fov": 2.8, "image_size": [48, 64]}
+COLORS = [[250, 0, 0], [0, 250, 0], [0, 0, 250]]
+NAMES = ["red", "green", "blue"]
+FULL = FullSize(from_dict(LENS), 48, "crop")
+SEEN = FULL.seen
+
+
 # -- classes ----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", ["darswin_a_nano", "swin_nano"])
 @torch.no_grad()
-def test_answers_are_the_models_in_order_whatever_the_lenses(name, monkeypatch):
-    model = create_model(name, num_classes=6).eval()
-    card = ModelCard(name, dict(num_classes=6), "abcdef", 32, fit="crop")
-    size = torch.tensor([[48, 64]])
-    lenses = [
-        Spherical.from_fov(xi / 20, 2.6, 24.0).replace(image_size=size) for xi in range(20)
-    ]  # fmt: skip
+def test_answers_are_the_models_in_order_whatever_the_lenses(monkeypatch):
+    model = create_model("darswin_a_nano", num_classes=6).eval()
+    card = ModelCard("", dict(num_classes=6), "abcdef", 32, fit="crop")
+    lenses = [from_dict(LENS | {"xi": xi / 20}) for xi in range(20)]
     # Two that take turns, then more than are kept.
     order = [2] * 10 + [16, 2, 16, 16] + [2] * 3 + [*range(3, 16), 17, 18, 19] + [19, 18, 2]
     rng = np.random.default_rng(0)
@@ -60,12 +64,6 @@ def test_answers_are_the_models_in_order_whatever_the_lenses(name, monkeypatch):
 
 
 # -- labels and distances ---------------------------------------------------------------------
-
-# A circle inside of pictures of 48×64, of whose middle square it leaves the corners out.
-LENS = {"model": "Spherical", "xi": 0.5, "fov": 2.8, "image_size": [48, 64]}
-COLORS = [[250, 0, 0], [0, 250, 0], [0, 0, 250]]
-NAMES = ["red", "green", "blue"]
-SEEN = FullSize(from_dict(LENS, (48, 64)), 48, "crop").seen
 
 
 class Stub(Encoder):
@@ -151,23 +149,15 @@ def test_labels_of_a_picture(stub, labels, tmp_path):
     shares = {name: (labels[SEEN] == k).mean() for k, name in enumerate(NAMES)}
     assert answer["shares"] == pytest.approx(shares, abs=1e-6) and list(shares) == NAMES
     assert answer["unanswered"] == pytest.approx((~SEEN).mean(), abs=1e-6)
-    overlay = cv2.imread(str(out / "overlays/p.jpg"))[..., ::-1].astype(int)
-    assert overlay.shape == (48, 64, 3)
-    assert np.abs(overlay - image)[20:28, 8:24].max() < 40  # the colours are the picture's own
-
-
-def test_the_overlay_shows_the_picture_where_there_is_no_answer(stub, labels, tmp_path):
-    stub("segmentation", classes=(), colors=[[255, 255, 255]] * 3)
-    image = picture_of(labels)
-    (answer,) = predict(write(tmp_path / "p.png", image), out=tmp_path / "out")
-    laid = cv2.imread(str(tmp_path / "out/overlays/p.jpg"))[..., ::-1].astype(int)
-    middle = np.s_[16:32, 20:28]  # away from edges, which JPEG blurs
-    assert np.abs(laid - (image.astype(int) + 255) // 2)[middle].max() < 12
-    assert np.abs(laid - image)[:, :4].max() < 12
+    # Classes without names and colours; the overlay is half of the colour, where there is one.
+    stub("segmentation", classes=(), colors=[])
+    (answer,) = predict(picture, out=out)
     assert list(answer["shares"]) == ["0", "1", "2"]
-    stub("segmentation", colors=[])
-    predict(write(tmp_path / "p.png", image), out=tmp_path / "out")
-    assert colored(tmp_path / "out/labels/p.png")[24, 24].tolist() == palette(3)[0]
+    assert colored(out / "labels/p.png")[24, 24].tolist() == (laid := palette(3)[0])
+    overlay = cv2.imread(str(out / "overlays/p.jpg"))[..., ::-1].astype(int)
+    middle = np.s_[16:32, 18:26]  # away from edges, which JPEG blurs
+    assert np.abs(overlay - (image.astype(int) + laid) // 2)[middle].max() < 12
+    assert np.abs(overlay - image)[:, :4].max() < 12
 
 
 def test_distances_of_a_picture(stub, tmp_path):
@@ -218,8 +208,7 @@ def test_an_answer_that_is_not_finite_is_none(stub, monkeypatch, tmp_path, task,
         predict(*pictures, out=tmp_path / "out")
     found = json.loads((tmp_path / "out" / "predictions.json").read_text())
     assert [answer["image"] for answer in found] == pictures[:1]  # what was found is not lost
-    # Beyond θ_max it has no meaning.
-    reached = ~torch.from_numpy(FullSize(from_dict(LENS, (48, 64)), 48, "crop").reached)
+    reached = ~torch.from_numpy(FULL.reached)  # beyond θ_max it has no meaning
     assert len(predict(*pictures, out=tmp_path / "out")) == 2
 
 
@@ -235,20 +224,14 @@ def test_a_folder_means_pictures_and_videos(stub, labels, tmp_path, capsys):
         "labels/front/1.png", "labels/rear/1.png", "labels/rear/deep/2.png",
         *(f"labels/rear/drive.avi/{k:06}.png" for k in (0, 2, 4)),
     ]  # fmt: skip
-    for answer in found:
-        assert ids(out / answer["labels"]).shape == (48, 64)
-        assert cv2.imread(str(out / answer["overlay"])).shape == (48, 64, 3)
-    front, rear = (ids(out / name) for name in files[:2])
-    assert front[24, 20] == 0 and rear[24, 20] == 2
+    assert all((out / answer["overlay"]).exists() for answer in found)
+    assert [ids(out / name)[24, 20] for name in files[:2]] == [0, 2]
     middle = np.s_[16:32, 24:40]
     for answer, k in zip(found[3:], (0, 2, 4), strict=True):
         same = ids(out / answer["labels"])[middle] == frames[k][middle].argmax(-1)
         assert answer["frame"] == k and same.mean() > 0.9
-    assert speed["frames"] == 3 and speed["frames_per_second"] > 0
-    assert speed["frames_per_second"] <= speed["network_frames_per_second"]
-    assert "3 frames at" in capsys.readouterr().err
+    assert speed["frames"] == 3 and "3 frames at" in capsys.readouterr().err
     assert net.prepared == 1  # one lens
-    assert len(list(out.rglob("*.png"))) == len(list(out.rglob("*.jpg"))) == 6
 
 
 def test_colours_of_distance_stay_for_a_video(stub, tmp_path):
@@ -333,44 +316,21 @@ def test_wrong_arguments_are_named(stub, labels, tmp_path, capsys):
         main([*argv, "--out", str(tmp_path / "o")])
 
 
-def test_pictures_of_several_lenses_go_through_their_own(stub, labels, tmp_path):
-    stub("segmentation")
-    narrow = {"model": "Spherical", "xi": 0.5, "focal": 10.0, "theta_max": 0.8}
-    lenses = {"a": LENS, "b": narrow | {"image_size": [48, 64]}}
-    for name in lenses:
-        write(tmp_path / name / "p.png", picture_of(labels))
-    (tmp_path / "lenses.json").write_text(json.dumps(lenses))
-    out = tmp_path / "out"
-    predict(tmp_path / "a", tmp_path / "b", lens=tmp_path / "lenses.json", out=out)
-    for name, described in lenses.items():
-        seen = FullSize(from_dict(described, (48, 64)), 48, "crop").seen
-        assert np.array_equal(ids(out / f"labels/{name}/p.png") != 255, seen)
-
-
-@pytest.mark.parametrize(
-    ("name", "task"),
-    [("darswin_unet_a_nano", "segmentation"), ("swin_unet_adapted_nano", "distance")],
-)
-def test_a_real_model_answers_as_in_python(name, task, tmp_path):
-    options = dict(task=task, num_classes=3, in_chans=3, mean=[0.5] * 3, std=[0.25] * 3)
+def test_a_real_model_answers_as_in_python(tmp_path):
     size = 128
-    card = ModelCard(name, options, NAMES, size, fit="crop", task=task, colors=COLORS)
+    options = dict(task="segmentation", num_classes=3, mean=[0.5] * 3, std=[0.25] * 3)
+    name, more = "darswin_unet_a_nano", dict(fit="crop", task="segmentation", colors=COLORS)
+    card = ModelCard(name, options, NAMES, size, **more)
     model = card.create().eval()
     save_model(tmp_path / "m.safetensors", model.state_dict(), card)
     rng = np.random.default_rng(0)
     image = cv2.resize(rng.integers(256, size=(9, 12, 3), dtype=np.uint8), (160, 140))
     picture, out = write(tmp_path / "p.png", image), tmp_path / "out"
-    lens = {"model": "Spherical", "xi": 0.5, "fov": 2.8, "image_size": [140, 160]}
+    lens = LENS | {"image_size": [140, 160]}
     argv = ["predict", picture, "--model", str(tmp_path / "m.safetensors"), "--out", str(out)]
     main([*argv, "--lens", json.dumps(lens)])
-    taken_with = from_dict(lens, (140, 160))
-    small, small_lens = at_size(image, taken_with, size, "crop")
+    small, small_lens = at_size(image, from_dict(lens), size, "crop")
     with torch.no_grad():
         output = model(torch.from_numpy(small)[None], small_lens)[0].numpy()
-    full = FullSize(taken_with, size, "crop")
-    if task == "segmentation":
-        assert (ids(out / "labels/p.png") == full.labels(output)).mean() > 0.998
-    else:
-        steps = cv2.imread(str(out / "distance/p.png"), cv2.IMREAD_UNCHANGED)
-        expected = full.distance(output[0])
-        np.testing.assert_allclose(steps / 256, expected, atol=1 / 256, rtol=1e-3)
+    expected = FullSize(from_dict(lens), size, "crop").labels(output)
+    assert (ids(out / "labels/p.png") == expected).mean() > 0.998

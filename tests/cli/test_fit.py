@@ -2,7 +2,6 @@
 
 import inspect
 import re
-import resource
 
 import cv2
 import numpy as np
@@ -29,12 +28,6 @@ def scenes(tmp_path_factory):
     return write_plain(tmp_path_factory.mktemp("data") / "scenes", 8, size=(45, 60))
 
 
-def write_pictures(folder, count):
-    folder.mkdir(parents=True, exist_ok=True)
-    for k in range(count):
-        cv2.imwrite(str(folder / f"{k}.png"), np.full((8, 8), 20 * k, np.uint8))
-
-
 # -- errors -----------------------------------------------------------------------------------
 
 
@@ -43,24 +36,16 @@ def write_pictures(folder, count):
     [
         # Of this program, of the data, the model and the trainer: each by its flag.
         ("--data.path nowhere", "no folder nowhere"),
-        ("--data.limit -1", "--data.limit must be at least 1, got -1"),
         ("--data.batch_size 0", "--data.batch_size must be at least 1 and --data.workers at least"),
-        ("--data.holdout 0", "--data.holdout 0 leaves no pictures for 'val'"),
-        ("--data.holdout 0", "--trainer.limit_val_batches 0 trains without validation"),
-        ("--data.train_lenses odd", "lenses must be one of"),
+        ("--data.holdout 0", "none of its own; --trainer.limit_val_batches 0 trains without val"),
         ("--data.train_lenses low --data.lens {}", "--data.train_lenses warps pictures through"),
         ("--data.test_lenses=low --data.lens {}", "--data.test_lenses warps pictures through"),
         ("--xi 0.3 --data.lens {}", "--xi warps pictures through lenses, and --data.lens says"),
-        ('--data.lens {"model":"Fish"}', "must be one of"),
         ("--model.learning_rate 0", "--model.learning_rate must be above 0, got 0"),
-        ("--model.learning_rate .nan", "--model.learning_rate must be above 0, got nan"),
         ("--model.options {foo:1}", "--model.options "),
-        ("--model.options {num_classes:3}", "--model.options cannot set num_classes"),
         ("--model.options {embed_dim:1099511627776}", "not enough memory: a smaller --data.batch"),
-        ("--model.name resnet", "unknown model 'resnet'"),
         ("--model.name swin_unet_nano", "swin_unet_nano is no model for --task classification"),
         ("--model.matmul_backend mkl", "model.matmul_backend"),
-        ("--model.speed 9", "model.speed"),
         ("--trainer.overfit_batches 2", "--trainer.overfit_batches shuffles otherwise: take --dat"),
         ("--trainer.max_epochs many", "error: --trainer.max_epochs: "),
         ("--trainer.max_epochs -1", "the cosine needs an end: set --trainer.max_epochs or"),
@@ -83,9 +68,6 @@ def test_wrong_options_are_named_in_one_line(capsys, tmp_path, options, message)
         ("--data.max_distance 3", "unrecognized arguments: --data.max_distance 3"),
         ("--xi 0.3", "xi"),
         ("--model.loss silog", "--model.loss"),
-        ("--data.crop 2", "--data.crop must be a share in (0, 1], got 2"),
-        ("--model.zones 60,30", "--model.zones must rise"),
-        ("--model.class_weights 1 2", "one for each of the 3 classes sky, ground, wall, got 2"),
     ],
 )
 def test_wrong_options_of_scenes_are_named(capsys, tmp_path, scenes, options, message):
@@ -107,17 +89,6 @@ def test_flags_of_parameters():
     flags = dict(limit="data.limit", xi="xi", name="model.name", max_epochs="trainer.max_epochs",
                  crop="data.crop", zones="model.zones", task="task")  # fmt: skip
     assert {name: flag_of(name).removeprefix("--") for name in flags} == flags
-
-
-def test_a_disk_that_is_full_from_the_start(capsys, tmp_path):
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, before[1]))  # the configuration needs more
-    try:
-        message = error(capsys, "fit", "--run", tmp_path, *DIGITS[:4], *QUIET, "--data.limit", "96")
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
-    assert re.search(r"^darswin: .*cannot write it.*config\.yaml'$", message, re.M)
-    assert [p.name for p in tmp_path.rglob("*")] == [".lock"]
 
 
 def test_a_run_is_not_overwritten(capsys, tmp_path, monkeypatch):
@@ -148,27 +119,25 @@ def test_a_run_s_options_and_checkpoints_of_other_models(capsys, tmp_path):
     assert "no checkpoint" in error(capsys, *test, "--ckpt_path", "none.ckpt")
 
 
-@pytest.mark.parametrize("workers", ["0", pytest.param("1", marks=pytest.mark.slow)])
-def test_a_broken_picture_is_named_in_one_line(capsys, tmp_path, workers):
+@pytest.mark.slow
+def test_a_broken_picture_is_named_in_one_line(capsys, tmp_path):
     for file in (tmp_path / name / f"{k}.jpg" for name in "ab" for k in range(6)):
         file.parent.mkdir(exist_ok=True)
         file.write_bytes(b"no picture")
-    options = ["--data.path", tmp_path, "--data.batch_size", "4", "--data.workers", workers]
+    options = ["--data.path", tmp_path, "--data.batch_size", "4", "--data.workers", "1"]
     message = error(capsys, "fit", "--run", tmp_path / "r", *DIGITS, *options).splitlines()[0]
     assert re.search(r"cannot read .*\.jpg: no image .*--data\.skip_broken true", message)
 
 
 def test_our_warnings_are_one_line_once(capsys, tmp_path):
-    for name in ("a", "b"):
-        write_pictures(tmp_path / name, 12)
-    write_pictures(tmp_path, 1)
+    for name in ("a", "b", "."):
+        (tmp_path / name).mkdir(exist_ok=True)
+        for k in range(12):
+            cv2.imwrite(str(tmp_path / name / f"{k}.png"), np.full((8, 8), 20 * k, np.uint8))
     options = [*DIGITS, "--data.path", tmp_path, "--trainer.max_steps", "1"]
     fit(tmp_path / "r", *options, "--data.batch_size", "4")
-    said = [line for line in capsys.readouterr().err.splitlines() if "left out" in line]
-    assert said == [
-        f"darswin: {tmp_path} holds pictures in no class's folder (1, e.g. {tmp_path}/0.png): "
-        "left out"
-    ]
+    (said,) = (line for line in capsys.readouterr().err.splitlines() if "left out" in line)
+    assert said.startswith(f"darswin: {tmp_path} holds pictures in no class's folder (12, e.g. ")
 
 
 # -- presets and configurations ---------------------------------------------------------------
@@ -204,35 +173,18 @@ def test_the_paper_s_preset_holds_the_recipe():
     assert (data["batch_size"], data["erasing"], data["size"]) == (128, 0.25, 64)
 
 
-@pytest.mark.parametrize(
-    ("preset", "task"),
-    [
-        ("iccv2023", None),
-        ("minutes", None),
-        ("two_cores", None),
-        ("scenes_minutes", None),
-        ("scenes_minutes", "distance"),
-    ],
-)
-def test_every_preset_trains(preset, task, tmp_path, scenes):
-    few = [
-        "--trainer.max_steps",
-        "1",
-        "--data.batch_size",
-        "4",
-        "--trainer.logger",
-        "false",
-        *QUIET,
-    ]
-    if preset == "scenes_minutes":
-        more = ["--data.path", scenes, *(["--task", task] if task else [])]
-    else:
+@pytest.mark.parametrize("preset", ["iccv2023", "minutes", "two_cores", "scenes_minutes"])
+def test_every_preset_trains(preset, tmp_path, scenes):
+    few = ["--trainer.max_steps", "1", "--data.batch_size", "4", "--trainer.logger", "false"]
+    dense = preset == "scenes_minutes"
+    more = ["--data.path", scenes, "--task", "distance"]
+    if not dense:
         more = ["--data.path", "digits", "--model.name", "darswin_a_nano", "--data.limit", "8"]
-    fit(tmp_path, "-c", preset, *few, *more)
+    fit(tmp_path, "-c", preset, *few, *QUIET, *more)
     model, card = load_model(tmp_path / "checkpoints" / "last.safetensors")
-    if preset == "scenes_minutes":
+    if dense:
         assert card.model == "darswin_unet_a_nano" and card.size == 128
-        assert model.task == card.task == (task or "segmentation")
+        assert model.task == card.task == "distance"
     else:
         assert card.model == "darswin_a_nano" and model.num_classes == 10
     assert {path.stem for path in PRESETS.glob("*.yaml")} == {
