@@ -2,10 +2,13 @@
 
 from pathlib import Path
 
+import torch
 from safetensors.torch import load_file
 
+from darswin import create_model
 from darswin.compat import OfficialPolynomial
 from darswin.lens import Spherical
+from darswin.models.registry import has_image_size
 
 CALIBRATIONS = Path(__file__).parent / "lens" / "files"
 
@@ -29,3 +32,24 @@ def fixture(name):
         return tensors, state, OfficialPolynomial(dist, 32.0)
     xi, focal, fov = dist.unbind(1)
     return tensors, state, Spherical(xi, focal, fov / 2)
+
+
+def side_of(name):
+    """The side of the images of a test: of `image_size`, where the model has one."""
+    return 64 if "unet" in name else 32
+
+
+def network(name, **options):
+    """A nano in eval mode whose every parameter counts."""
+    if has_image_size(name):
+        options = dict(image_size=side_of(name)) | options
+    model = create_model(name, **(dict(num_classes=5) | options)).eval()
+    for key, parameter in model.named_parameters():
+        mean = 1.0 if parameter.dim() == 1 and key.endswith("weight") else 0.0
+        torch.nn.init.normal_(parameter, mean=mean, std=0.1)
+    return model
+
+
+def relative_error(got, expected):
+    """The norm of the difference, over the norm of what is expected."""
+    return ((got.float() - expected).norm() / expected.norm()).item()

@@ -9,7 +9,6 @@ from darswin import create_model, optimize
 from darswin.layers.position_bias import RelativeBias
 from darswin.layers.transformer import Stage
 from darswin.lens import KannalaBrandt, Spherical
-from darswin.ops import use_reference
 
 LENSES = Spherical.from_fov([0.2, 0.9], math.radians(160), 16.0)
 GENERAL = KannalaBrandt(
@@ -28,48 +27,6 @@ def network(name="darswin_a_nano", **options):
 
 def error(got, want):
     return ((got.float() - want).norm() / want.norm()).item()
-
-
-@torch.no_grad()
-@pytest.mark.parametrize("count", [1, 2])
-@pytest.mark.parametrize("name", MODELS)
-def test_float32_is_the_same(name, count):
-    model, images = network(name), torch.randn(count, 3, 32, 32)
-    with use_reference():
-        want = model(images, LENSES[:count])
-    assert error(optimize(model)(images, LENSES[:count]), want) < 1e-5
-
-
-@torch.no_grad()
-@pytest.mark.parametrize(
-    ("options", "lens"),
-    [
-        (dict(position_bias="angular"), LENSES[:1]),
-        (dict(position_bias="polar"), LENSES[:1]),
-        (dict(periodic_bias=True), LENSES[:1]),
-        (dict(compat="official"), LENSES[:1]),
-        (dict(num_classes=0), GENERAL),
-        (dict(mlp_ratio=1.0), LENSES[:1]),
-    ],
-    ids=str,
-)
-def test_options_and_a_fixed_lens(options, lens):
-    model, images = network(**options), torch.randn(2, 3, 32, 32)
-    want = model(images, lens)
-    assert error(optimize(model)(images, lens), want) < 1e-5
-    assert error(optimize(model, lens=lens)(images), want) < 1e-5
-
-
-@torch.no_grad()
-@pytest.mark.parametrize("name", MODELS)
-def test_bfloat16_is_as_close_as_autocast(name):
-    model, images = network(name), torch.randn(2, 3, 32, 32)
-    want = model(images, LENSES)
-    with torch.autocast("cpu", torch.bfloat16):
-        autocast = error(model(images, LENSES), want)
-    got = optimize(model, torch.bfloat16)(images, LENSES)
-    assert got.dtype == torch.bfloat16
-    assert error(got, want) < 2 * autocast < 0.1
 
 
 @torch.no_grad()

@@ -6,7 +6,6 @@ import torch
 from darswin import create_model
 from darswin.lens import Spherical
 from darswin.models.stages import plan_stages
-from darswin.ops import use_reference
 
 LENS = Spherical.from_fov([0.2, 0.9], 2.6, 16.0)
 
@@ -62,37 +61,6 @@ def test_stage_plans(arguments, first, expected):
 def test_sizes_that_do_not_divide(arguments, message):
     with pytest.raises(ValueError, match=message):
         plan_stages(*arguments)
-
-
-OPTIONS = {
-    "RA": dict(variant="RA", rings=8, sectors=16),
-    "angular": dict(position_bias="angular"),
-    "polar": dict(position_bias="polar", harmonics=4),
-    "periodic bias": dict(periodic_bias=True),
-    "few samples": dict(samples=(2, 5)),
-    "no jitter": dict(jitter=0.0),
-    "uniform sampling": dict(sample_spacing="radius"),
-    "partition without lens": dict(spacing="radius"),
-    "tan, edges": dict(spacing="tan", placement="edges"),
-    "g": dict(spacing="g"),
-    "drop path": dict(drop_path_rate=0.5),
-    "window": dict(window=(1, 8)),
-    "one stage": dict(depths=(2,), num_heads=(2,)),
-}
-
-
-@pytest.mark.parametrize("option", OPTIONS)
-def test_every_option_trains_and_agrees_with_the_reference(option):
-    model = nano(**OPTIONS[option])
-    x = images()
-    model(x, LENS).square().sum().backward()
-    assert all(p.grad.isfinite().all() for p in model.parameters())
-    model.eval()
-    with torch.no_grad():
-        ours = model(x, LENS)
-        with use_reference():
-            expected = model(x, LENS)
-    torch.testing.assert_close(ours, expected, rtol=1e-4, atol=1e-5)
 
 
 EVEN = dict(periodic_bias=True)
@@ -161,29 +129,6 @@ def test_another_lens_shows_the_same_tokens():
             a, b = (model.forward_features(scene(lens, 200), lens) for lens in lenses)
         errors[spacing] = ((a - b).norm() / a.norm()).item()
     assert errors["theta"] < 0.02 < 0.1 < errors["radius"], errors
-
-
-def test_gradients_reach_the_lens_through_sampling_and_bias():
-    xi = torch.tensor([0.3], requires_grad=True)
-    focal = torch.tensor([12.0], requires_grad=True)
-    theta_max = torch.tensor([1.3], requires_grad=True)
-    center = torch.tensor([[15.0, 16.0]], requires_grad=True)
-    model = nano().eval()
-    model(images(), Spherical(xi, focal, theta_max, center)).square().sum().backward()
-    for parameter in (xi, focal, theta_max, center):
-        assert parameter.grad.isfinite().all() and (parameter.grad != 0).all()
-
-
-def test_same_seed_same_training_step():
-    results = []
-    for _ in range(2):
-        torch.manual_seed(5)
-        model = nano(jitter=1.0, drop_path_rate=0.2)
-        x = torch.randn(2, 3, 32, 32)
-        loss = model(x, LENS).square().sum()
-        loss.backward()
-        results.append([loss.detach(), *(p.grad for p in model.parameters())])
-    assert all(torch.equal(a, b) for a, b in zip(*results, strict=True))
 
 
 @pytest.mark.parametrize(
