@@ -13,9 +13,9 @@ from pathlib import Path
 import peaks
 import torch
 import torch.nn.functional as F
+from peers import compare, run_suite
 from torch import Tensor
 
-from darswin.bench.operators import compare, run_suite
 from darswin.bench.timing import OURS, Case, Timing
 from darswin.ops import reference, window_attention
 

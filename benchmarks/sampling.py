@@ -13,10 +13,10 @@ import cv2
 import numpy as np
 import torch
 import torch.nn.functional as F
+from peers import check, compare, forward, run_suite
 from torch import Tensor
 
 from darswin import polar_grid
-from darswin.bench.operators import check, compare, forward, run_suite
 from darswin.bench.timing import OURS, Case, Timing, measure
 from darswin.lens import Spherical
 from darswin.ops import polar_embed, polar_sample

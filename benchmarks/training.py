@@ -13,12 +13,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 from lightning.pytorch import Callback, Trainer
+from peers import training_table
 from torch.utils.data import DataLoader
 from tqdm import tqdm
 
 from darswin.bench.machine import machine, num_threads
 from darswin.bench.record import write
-from darswin.bench.tables import training_table
 from darswin.data.augment import RandAugment, RandomErasing
 from darswin.ops import use_reference
 from darswin.train.classification import Classification

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 ROOT = Path(__file__).parent.parent
-sys.path[:0] = [str(ROOT), str(ROOT / "studies")]
+sys.path[:0] = [str(ROOT), str(ROOT / "studies"), str(ROOT / "benchmarks")]
 
 from darswin.bench import tables as bench  # noqa: E402
 from darswin.bench.record import Record  # noqa: E402
@@ -79,6 +79,7 @@ def tables() -> dict[str, str]:
     """All tables, by the name of their place in a page."""
     import dense_tables
     import learned_tables
+    import peers
     import tables as study
 
     studies = ROOT / "studies" / "results"
@@ -97,18 +98,18 @@ def tables() -> dict[str, str]:
     return {
         "demo": demo_table(json.loads((ROOT / "docs" / "accuracy.json").read_text())),
         "drop-in": drop_in_line(sampling.timings),
-        "speed": bench.best_table(cpus, SPEED),
-        "missed": bench.missed_table([*sampling.timings, *to_image.timings, *attention.timings]),
+        "speed": peers.best_table(cpus, SPEED),
+        "missed": peers.missed_table([*sampling.timings, *to_image.timings, *attention.timings]),
         "model": bench.models_table(model.timings),
         "model int8": bench.quantized_table(model.timings),
         "model memory": bench.memory_table(model.memory),
-        "sampling": bench.peers_table(sampling.timings, "polar_sample", SAMPLING_PEERS),
-        "embedding": bench.peers_table(sampling.timings, "polar_embed", EMBED_PEERS),
-        "to image": bench.peers_table(
+        "sampling": peers.peers_table(sampling.timings, "polar_sample", SAMPLING_PEERS),
+        "embedding": peers.peers_table(sampling.timings, "polar_embed", EMBED_PEERS),
+        "to image": peers.peers_table(
             to_image.timings, "polar_to_image", ("F.pad + F.grid_sample",)
         ),
-        "attention": bench.attention_table(attention.timings),
-        "training": bench.training_table(training["models"]),
+        "attention": peers.attention_table(attention.timings),
+        "training": peers.training_table(training["models"]),
         **study.tables(cells),
         "int8": study.int8_table(quantized),
         **learned_tables.tables(cameras),

@@ -8,7 +8,8 @@ import torch
 
 from darswin.ops import _module, cpu_capability
 
-sys.path.append(str(Path(__file__).parents[1] / "studies"))  # for the tests of its programs
+# For the tests of these programs.
+sys.path += [str(Path(__file__).parents[1] / name) for name in ("studies", "benchmarks")]
 
 # Properties: the same few cases in each `make test`; `make fuzz` draws new ones.
 _common = dict(deadline=None, database=None, suppress_health_check=list(hypothesis.HealthCheck))

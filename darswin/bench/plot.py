@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from textwrap import fill
 from typing import TYPE_CHECKING
 
 from darswin.bench.record import Record
@@ -14,25 +13,9 @@ if TYPE_CHECKING:
     from matplotlib.lines import Line2D
 
 WIDTH = 9  # inches: text of 10 pt is still 8 pt in a page 740 px wide
-COLUMNS = 3  # panels beside each other, at most
 
 Rows = dict[str, dict[str, float]]  # by case, then by name
 Panels = list[list[tuple[str, Rows]]]  # line by line, with their titles
-
-
-def draw_peers(record: Record, path: Path) -> None:
-    """Draws the peers' times over ours at one thread: lines of panels for each operator, a panel a
-    mode, in it a row a case."""
-    found: dict[str, dict[str, Rows]] = {}
-    for t in record.timings:
-        if t.threads == 1 and not t.name.startswith(OURS):
-            operator = t.subject.partition(",")[0]
-            rows = found.setdefault(operator, {}).setdefault(f"{t.subject}\n{fill(t.mode, 26)}", {})
-            rows.setdefault(f"{t.setting}, batch {t.batch}", {})[t.name] = t.ratio
-    lines = [line for panels in found.values() for line in _lines(panels, COLUMNS)]
-    names = dict.fromkeys(t.name for t in record.timings if not t.name.startswith(OURS))
-    unit = "time of the peer / time of darswin, 1 thread"
-    _draw_panels(lines, list(names), unit, path, is_ratio=True)
 
 
 def draw_models(record: Record, path: Path) -> None:
@@ -46,15 +29,15 @@ def draw_models(record: Record, path: Path) -> None:
     found = dict.fromkeys(t.name for t in record.timings)
     order = [OURS, FIXED_LENS, REFERENCE, COMPILED, MATMULS, *found]
     unit = f"images a second, {record.timings[0].subject}, {threads} threads"
-    _draw_panels(_lines(panels, 2), sorted(found, key=order.index), unit, path)
+    draw_panels(in_lines(panels, 2), sorted(found, key=order.index), unit, path)
 
 
-def _lines(panels: dict[str, Rows], count: int) -> Panels:
+def in_lines(panels: dict[str, Rows], count: int) -> Panels:
     items = list(panels.items())
     return [items[k : k + count] for k in range(0, len(items), count)]
 
 
-def _draw_panels(
+def draw_panels(
     lines: Panels, names: Sequence[str], unit: str, path: Path, is_ratio: bool = False
 ) -> None:
     """Panels on one scale, which for ratios is logarithmic, with a line at 1."""

@@ -1,5 +1,6 @@
 from pathlib import Path
 
+import peers
 import pytest
 from matplotlib.text import Text
 
@@ -44,7 +45,7 @@ def test_models(record, drawn, tmp_path):
 
 
 def test_peers(operators, drawn, tmp_path):
-    plot.draw_peers(Record({}, operators), tmp_path / "peers.png")
+    peers.draw_peers(Record({}, operators), tmp_path / "peers.png")
     assert drawn() == {
         "polar_sample\nforward": (["64×64, batch 8"], {"slow": {0: 5.0}, "fast": {0: 1.5}}),
         "another\nforward": (["64×64, batch 8"], {"peer": {0: 1.0}}),
@@ -58,7 +59,7 @@ def test_the_pictures_of_the_records_can_be_read(suite, tmp_path, monkeypatch):
     record = Record.load(next(RESULTS.glob(f"{suite}--*-avx512.json")))
     figures = []
     monkeypatch.setattr("darswin.viz.plot.save_figure", lambda figure, path: figures.append(figure))
-    (plot.draw_models if suite == "model" else plot.draw_peers)(record, tmp_path / "a.png")
+    (plot.draw_models if suite == "model" else peers.draw_peers)(record, tmp_path / "a.png")
     (figure,) = figures
     width, height = figure.get_size_inches() * 120
     assert height <= 1200

@@ -1,3 +1,5 @@
+import peers
+
 from darswin.bench import tables
 from darswin.bench.tables import BOTH
 
@@ -28,21 +30,21 @@ def test_autotune():
 
 
 def test_peers(operators):
-    assert tables.peers_table(operators, "polar_sample").splitlines() == [
+    assert peers.peers_table(operators, "polar_sample").splitlines() == [
         "| `polar_sample` | ours (ms) | slow | fast | darswin (avx2) |",
         "|---|---|---|---|---|",
         f"| 64×64, batch 8, forward | 2.00{BOTH}1.00 | 5.0×{BOTH}6.0× | 1.5× | 2.5× |",
     ]
-    assert tables.peers_table(operators, "polar_sample", ["fast"]).count("\n") == 2
-    assert tables.peers_table(operators, "polar_sample", ["peer"]).count("\n") == 1
-    assert tables.missed_table(operators).splitlines()[2:] == [
+    assert peers.peers_table(operators, "polar_sample", ["fast"]).count("\n") == 2
+    assert peers.peers_table(operators, "polar_sample", ["peer"]).count("\n") == 1
+    assert peers.missed_table(operators).splitlines()[2:] == [
         "| polar_sample, 64×64, batch 8, forward, 1 thread: fast | 1.50 | 2.00 |"
     ]
 
 
 def test_a_column_for_each_cpu(operators, record):
     rows = [("polar_sample", "forward", "64×64", 8), ("another", "forward", "64×64", 8)]
-    assert tables.best_table({"new": operators, "old": record.timings}, rows).splitlines() == [
+    assert peers.best_table({"new": operators, "old": record.timings}, rows).splitlines() == [
         "|  | new: ours (ms) | best peer | old: ours (ms) | best peer |",
         "|---|---|---|---|---|",
         "| `polar_sample`, forward, 64×64, batch 8 | 1.00 | 6.0× |  |  |",

@@ -1,7 +1,7 @@
+import peers
 import pytest
 import torch
 
-from darswin.bench import operators
 from darswin.bench.record import Record
 from darswin.bench.timing import OURS, Case
 from darswin.ops import _module, cpu_capability
@@ -26,7 +26,7 @@ def test_ours_is_timed_on_every_tier(mode):
         seen.add(cpu_capability())
         return double(x, y)
 
-    found = operators.compare(
+    found = peers.compare(
         case(mode), {OURS: ours, "peer": double}, INPUTS, 1e-4, targets=dict(peer=3.0)
     )
     others = [f"{OURS} ({tier})" for tier in _module.tiers() if tier != best]
@@ -38,7 +38,7 @@ def test_ours_is_timed_on_every_tier(mode):
 @pytest.mark.parametrize("mode", ["forward", "forward+backward"])
 def test_candidates_that_disagree_are_not_timed(mode):
     def compare(peer, **options):
-        return operators.compare(case(mode), {OURS: double, "peer": peer}, INPUTS, 1e-4, **options)
+        return peers.compare(case(mode), {OURS: double, "peer": peer}, INPUTS, 1e-4, **options)
 
     def wrong(x, y):
         return 2.01 * x + y
@@ -52,21 +52,21 @@ def test_candidates_that_disagree_are_not_timed(mode):
 
 def test_a_wrong_gradient_is_a_disagreement():
     runs = {OURS: double, "peer": lambda x, y: double(x, y.detach()) + 0 * y}
-    operators.compare(case(), runs, INPUTS, 1e-4)
+    peers.compare(case(), runs, INPUTS, 1e-4)
     with pytest.raises(AssertionError, match="disagrees"):
-        operators.compare(case("forward+backward"), runs, INPUTS, 1e-4)
+        peers.compare(case("forward+backward"), runs, INPUTS, 1e-4)
 
 
 def test_a_suite_prints_and_writes_what_it_found(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(operators, "THREADS", [1, 2])
+    monkeypatch.setattr(peers, "THREADS", [1, 2])
     before = torch.get_num_threads()
     runs = {OURS: double, "peer": double}
     targets = dict(peer=1e6)
 
     def job():
-        return operators.compare(case(), runs, INPUTS, 1e-4, targets=targets)
+        return peers.compare(case(), runs, INPUTS, 1e-4, targets=targets)
 
-    found = operators.run_suite("suite", [job, job], 1.0, tmp_path)
+    found = peers.run_suite("suite", [job, job], 1.0, tmp_path)
     assert [t.threads for t in found if t.name == "peer"] == [1, 2] * 2
     assert torch.get_num_threads() == before
     (path,) = tmp_path.glob("suite--*.json")

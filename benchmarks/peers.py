@@ -1,0 +1,221 @@
+"""Operators against their peers: called alike, checked to be equal, timed on every tier.
+
+Ours and every peer run in the same process, in turns. Outputs are checked equal before anything is
+timed. Every result is published, losses too.
+"""
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from textwrap import fill
+
+import torch
+from torch import Tensor
+from tqdm import tqdm
+
+from darswin.bench import targets
+from darswin.bench.machine import THREADS, machine, num_threads, on_other_tiers
+from darswin.bench.plot import Rows, draw_panels, in_lines
+from darswin.bench.record import Record
+from darswin.bench.tables import by_case, markdown, milliseconds, ratios
+from darswin.bench.timing import MATMULS, OURS, REFERENCE, Case, Timing, measure
+
+Step = Callable[[], list[Tensor]]
+View = Callable[[Tensor], Tensor]
+COLUMNS = 3  # panels of a plot beside each other, at most
+
+
+def forward(run: Callable[..., Tensor], inputs: Sequence[Tensor]) -> Step:
+    """A function that runs without recording gradients; returns the output."""
+
+    def step() -> list[Tensor]:
+        with torch.no_grad():
+            return [run(*inputs)]
+
+    return step
+
+
+def forward_backward(run: Callable[..., Tensor], inputs: Sequence[Tensor], view: View) -> Step:
+    """A function that runs and backpropagates; returns output and gradients.
+
+    The output's gradient is the same for all candidates whose outputs are equal in `view`.
+    """
+    leaves = [t.detach().requires_grad_() for t in inputs]
+    out = run(*leaves)
+    viewed = view(out)
+    grad = torch.randn(viewed.shape, generator=torch.Generator().manual_seed(0)).to(out.dtype)
+    if viewed.shape != out.shape:  # back through the view
+        (grad,) = torch.autograd.grad(viewed, out, grad)
+
+    def step() -> list[Tensor]:
+        out = run(*leaves)
+        return [out.detach(), *torch.autograd.grad(out, leaves, grad)]
+
+    return step
+
+
+def check(
+    case: Case,
+    steps: Mapping[str, Step],
+    tolerance: float | None,
+    view: View = lambda result: result,
+) -> None:
+    """Calls all candidates; AssertionError unless they agree with `OURS` in `view`.
+
+    The tolerance is of each value and of the largest one; None lets them differ.
+    """
+    expected = [view(result) for result in steps[OURS]()]
+    for name, step in steps.items():
+        results = step()
+        if tolerance is None:
+            continue
+        for got, want in zip(map(view, results), expected, strict=True):
+            largest = want.abs().max().item()
+            try:
+                torch.testing.assert_close(got, want, rtol=tolerance, atol=tolerance * largest)
+            except AssertionError as error:
+                message = f"{name} disagrees with ours in {case.label}: {error}"
+                raise AssertionError(message) from None
+
+
+def compare(
+    case: Case,
+    candidates: Mapping[str, Callable[..., Tensor]],
+    inputs: Sequence[Tensor],
+    seconds: float,
+    *,
+    targets: Mapping[str, float] | None = None,
+    tolerance: float | None = 1e-4,
+    view: View = lambda result: result,
+) -> list[Timing]:
+    """Checks that all candidates agree, then times them, as `case.mode` says with their gradients,
+    and ours on every instruction-set tier: "darswin (avx2)" and so on."""
+    if case.mode.startswith("forward+backward"):
+        steps = {name: forward_backward(run, inputs, view) for name, run in candidates.items()}
+    else:
+        steps = {name: forward(run, inputs) for name, run in candidates.items()}
+    for tier, step in on_other_tiers(steps[OURS]).items():
+        steps[f"{OURS} ({tier})"] = step
+    check(case, steps, tolerance, view)
+    return measure(case, steps, seconds, targets=targets)
+
+
+def run_suite(
+    suite: str, jobs: Sequence[Callable[[], list[Timing]]], avx2_share: float, out: Path | None
+) -> list[Timing]:
+    """Runs jobs at one and at all threads, prints tables and targets, of which the AVX2 tier is to
+    reach a share, and writes the record and its plot to the folder `out`."""
+    head = machine()
+    print(" ".join(f"{k}={v}" for k, v in head.items()))
+    timings: list[Timing] = []
+    for job in tqdm(jobs, unit="case"):
+        for threads in THREADS:
+            with num_threads(threads):
+                timings += job()
+    for subject in dict.fromkeys(t.subject for t in timings):
+        print(peers_table(timings, subject), end="\n\n")
+    print(*targets.lines(timings, avx2_share), sep="\n")
+    if out:
+        Record(head, timings).publish(out, suite, draw_peers)
+    return timings
+
+
+def draw_peers(record: Record, path: Path) -> None:
+    """Draws the peers' times over ours at one thread: lines of panels for each operator, a panel a
+    mode, in it a row a case."""
+    found: dict[str, dict[str, Rows]] = {}
+    for t in record.timings:
+        if t.threads == 1 and not t.name.startswith(OURS):
+            operator = t.subject.partition(",")[0]
+            rows = found.setdefault(operator, {}).setdefault(f"{t.subject}\n{fill(t.mode, 26)}", {})
+            rows.setdefault(f"{t.setting}, batch {t.batch}", {})[t.name] = t.ratio
+    lines = [line for panels in found.values() for line in in_lines(panels, COLUMNS)]
+    names = dict.fromkeys(t.name for t in record.timings if not t.name.startswith(OURS))
+    unit = "time of the peer / time of darswin, 1 thread"
+    draw_panels(lines, list(names), unit, path, is_ratio=True)
+
+
+def peers_table(timings: Sequence[Timing], subject: str, peers: Sequence[str] = ()) -> str:
+    """A row a case of an operator, a column a peer, all by default, with its time over ours."""
+    chosen = [t for t in timings if t.subject == subject]
+    peers = peers or [name for name in dict.fromkeys(t.name for t in chosen) if name != OURS]
+    rows = []
+    for (setting, batch, mode), found in by_case(chosen).items():
+        if not found.keys().isdisjoint(peers):
+            over = [ratios(found.get(peer, ())) for peer in peers]
+            rows.append([f"{setting}, batch {batch}, {mode}", milliseconds(found[OURS]), *over])
+    return markdown([f"`{subject}`", "ours (ms)", *peers], rows)
+
+
+def attention_table(timings: Sequence[Timing]) -> str:
+    """A row a case; for each mode the peer that is the fastest, and eager attention."""
+    columns = {
+        "forward": ("window_attention", "forward"),
+        "forward+backward": ("window_attention", "forward+backward"),
+        "forward+backward, bfloat16": ("window_attention, bfloat16", "forward+backward"),
+    }
+    rows: dict[tuple[str, int], list[str]] = {}
+    for subject, mode in columns.values():
+        chosen = [t for t in timings if (t.subject, t.mode) == (subject, mode)]
+        for (setting, batch, _), found in by_case(chosen).items():
+            # At each number of threads.
+            peers = zip(*(found[n] for n in found if not n.startswith(OURS)), strict=True)
+            best = [min(those, key=lambda t: t.ratio) for those in peers]
+            row = rows.setdefault(
+                (setting, batch), [f"{setting}, batch {batch}", milliseconds(found[OURS])]
+            )
+            row += [ratios(best), ratios(found["eager"])]
+    heads = [head for mode in columns for head in (f"{mode}: best peer", f"{mode}: eager")]
+    return markdown(["`window_attention`", "ours, forward (ms)", *heads], rows.values())
+
+
+def best_table(
+    records: Mapping[str, Sequence[Timing]], rows: Iterable[tuple[str, str, str, int]]
+) -> str:
+    """A row for each (subject, mode, setting, batch), at all threads, and for each CPU its own
+    columns: our time, and how much longer the fastest peer takes."""
+    lines = [[f"`{name}`, {mode}, {setting}, batch {batch}"] for name, mode, setting, batch in rows]
+    heads = [""]
+    for cpu, timings in records.items():
+        heads += [f"{cpu}: ours (ms)", "best peer"]
+        for line, case in zip(lines, rows, strict=True):
+            line += _best(timings, case)
+    return markdown(heads, lines)
+
+
+def _best(timings: Sequence[Timing], case: tuple[str, str, str, int]) -> list[str]:
+    parts = (MATMULS, "F.linear alone")  # less work than ours: bounds, no peers
+    chosen = [t for t in timings if (t.subject, t.mode, t.setting, t.batch) == case]
+    if not chosen:
+        return ["", ""]
+    chosen = [t for t in chosen if t.threads == max(t.threads for t in chosen)]
+    (ours,) = (t for t in chosen if t.name == OURS)
+    peers = [t for t in chosen if t.name not in parts and not t.name.startswith(OURS)]
+    best = min(peers, key=lambda t: t.ratio)
+    time = f"{1e3 * ours.median:.2f}" if ours.median < 0.01 else f"{1e3 * ours.median:.0f}"
+    return [time, f"{best.ratio:.1f}×"]
+
+
+def missed_table(timings: Iterable[Timing]) -> str:
+    """The ratios that are below their target."""
+    missed = [t for t in timings if t.missed]
+    rows = [[f"{t.label}: {t.name}", f"{t.ratio:.2f}", f"{t.target:.2f}"] for t in missed]
+    return markdown(["", "ratio", "target"], rows)
+
+
+def training_table(models: Mapping[str, Mapping]) -> str:
+    """A row a model: images a second in training and testing, and over the reference operators."""
+    rows = []
+    for name, modes in models.items():
+        cells = [f"`{name}`"]
+        for mode in ("train", "test"):
+            ours, theirs = modes[mode][OURS], modes[mode][REFERENCE]
+            rate = ours["images_per_second"]
+            cells += [f"{rate:.0f}", f"{rate / theirs['images_per_second']:.2f}×"]
+            if mode == "train":
+                cells.append(f"{ours['outside']:.1%}")
+        rows.append(cells)
+    heads = [
+        "model", "training (images/s)", "over the reference", "outside the model",
+        "testing (images/s)", "over the reference",
+    ]  # fmt: skip
+    return markdown(heads, rows)
