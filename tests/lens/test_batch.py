@@ -96,9 +96,7 @@ def test_a_column_of_coefficients_is_not_many_lenses():
 
 def test_the_same_numbers_are_the_same_lens():
     lens = KannalaBrandt([8.0, 9.0], radial=[0.1, 0.0, 0.0, 0.0])
-    assert lens.same_as(lens[:]) and lens[0].same_as(
-        KannalaBrandt(8.0, radial=[0.1, 0.0, 0.0, 0.0])
-    )
+    assert lens.same_as(lens[:])
     for other in (
         lens[0], lens[[1, 0]], lens.to(torch.float64), lens.with_theta_max(1.0),
         KannalaBrandt([8.0, 9.0]), Equidistant([8.0, 9.0], 1.0), None,

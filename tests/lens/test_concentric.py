@@ -37,25 +37,36 @@ def grid(count):
     return torch.stack(torch.meshgrid(steps, steps, indexing="xy"), -1)
 
 
+def disc(places):
+    radius, direction = square_to_disc(places)
+    return radius[..., None] * direction
+
+
 @pytest.mark.parametrize("count", [40, 41])  # without and with the middle and the axes
 def test_it_is_the_published_map_and_back(count):
     places = grid(count)
-    radius, direction = square_to_disc(places)
     r, phi = torch.tensor([published(*p) for p in places.view(-1, 2).tolist()], dtype=f64).unbind(1)
     expected = r[:, None] * torch.stack((phi.cos(), phi.sin()), -1)
-    found = (radius[..., None] * direction).view(-1, 2)
-    torch.testing.assert_close(found, expected, rtol=0, atol=1e-14)
+    torch.testing.assert_close(disc(places).view(-1, 2), expected, rtol=0, atol=1e-14)
+    radius, direction = square_to_disc(places)
     assert torch.allclose(direction.norm(dim=-1), torch.ones((), dtype=f64))
     torch.testing.assert_close(disc_to_square(radius, direction), places)
-    azimuth = torch.linspace(-math.pi, math.pi, 97, dtype=f64)
-    direction = torch.stack((azimuth.cos(), azimuth.sin()), -1)
-    for r in (0.0, 1e-9, 0.3, 1.0):
-        radius = torch.full_like(azimuth, r)
-        back, aside = square_to_disc(disc_to_square(radius, direction))
-        torch.testing.assert_close(back, radius)
-        torch.testing.assert_close(back[:, None] * aside, radius[:, None] * direction)
     middle = disc_to_square(torch.zeros(1), torch.zeros(1, 2))  # as `rays` gives it
     assert torch.equal(middle, torch.zeros(1, 2))
+
+
+def test_areas_keep_their_ratio_and_nothing_jumps_at_diagonals_and_axes():
+    areas = torch.linalg.det(torch.func.vmap(torch.func.jacrev(disc))(grid(24).view(-1, 2)))
+    torch.testing.assert_close(areas, torch.full_like(areas, math.pi / 4))
+    line = torch.linspace(-1, 1, 201, dtype=f64)[:, None]
+    sides = torch.tensor([(1, 1), (1, -1), (1, 0), (0, 1)], dtype=f64)
+    steps = torch.tensor([(1, 0), (0, 1), (-1, 0), (0, -1)], dtype=f64)
+    on = (sides[:, None] * line)[:, :, None]
+    assert (disc(on + 1e-9 * steps) - disc(on)).abs().max() < 4e-9
+    there = disc(on) + 1e-9 * steps
+    radius = there.norm(dim=-1)
+    back = disc_to_square(radius, there / radius[..., None])
+    assert (back - on).abs().max() < 4e-9
 
 
 EXAMPLES = {

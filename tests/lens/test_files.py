@@ -21,7 +21,7 @@ from lens_examples import (
     points_around,
 )
 
-from darswin.lens import EnhancedUnified, KannalaBrandt, load, load_all, to_dict
+from darswin.lens import EnhancedUnified, load, load_all, to_dict
 
 K = [[421.3, 0.0, 643.1], [0.0, 420.9, 478.6], [0.0, 0.0, 1.0]]
 FISHEYE = [-0.021, 0.0043, -0.0012, 0.00008]
@@ -78,18 +78,14 @@ def write(path, **entries):
     return path
 
 
-def fisheye(points, d=FISHEYE, alpha=0.0, k=K):
-    zero = np.zeros(3)
-    k, d = np.array(k), np.array(d)
+def fisheye(points, d, alpha):
+    zero, k, d = np.zeros(3), np.array(K), np.array(d)
     return cv2.fisheye.projectPoints(points[None], zero, zero, k, d, alpha=alpha)[0][0]
 
 
 def pinhole(points, d, k=K):
-    return cv2.projectPoints(points, np.zeros(3), np.zeros(3), np.array(k), np.array(d))[0][:, 0]
-
-
-def assert_fisheye(lens, d=FISHEYE, alpha=0.0):
-    assert_projects(lens, points_around(1.4), fisheye(points_around(1.4), d, alpha))
+    zero = np.zeros(3)
+    return cv2.projectPoints(points, zero, zero, np.array(k), np.array(d))[0][:, 0]
 
 
 def assert_pinhole(lens, d, k=K):
@@ -103,7 +99,8 @@ def test_opencv_fisheye(tmp_path, suffix, alpha):
     k[0, 1] = alpha * k[0, 0]
     path = write(tmp_path / f"c.{suffix}", K=k.tolist(), D=FISHEYE, image_width=1280,
                  image_height=960, fisheye_model=1)  # fmt: skip
-    assert_fisheye(load(path, dtype=f64), alpha=alpha)
+    points = points_around(1.4)
+    assert_projects(load(path, dtype=f64), points, fisheye(points, FISHEYE, alpha))
 
 
 @pytest.mark.parametrize("suffix", ["yaml", "xml", "json"])
@@ -129,80 +126,58 @@ def test_opencv_pinhole(tmp_path, suffix, d):
         assert type(lens).__name__ == "Perspective"
 
 
-def mei(points, xi, k1, k2, p1, p2, fx, fy, s, cx, cy):
-    """Mei's model as its users write it: in x and y of the plane before the unit sphere's."""
-    x, y, z = points.T
-    x, y = x / (z + xi), y / (z + xi)
-    r2 = x * x + y * y
-    radial = 1 + k1 * r2 + k2 * r2 * r2
-    xd = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
-    yd = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
-    return torch.from_numpy(np.stack((fx * xd + s * yd + cx, fy * yd + cy), -1))
+def distorted(u, v, plane, k=(), p=(0, 0), d=(), s=(0, 0, 0, 0), skew=0):
+    """The pixels of points of a plane, with the terms as users of OpenCV write them."""
+    (fx, fy, cx, cy), r2 = plane, u * u + v * v
+    radial = 1 + sum(c * r2**i for i, c in enumerate(k, 1))
+    radial = radial / (1 + sum(c * r2**i for i, c in enumerate(d, 1)))
+    ud = u * radial + 2 * p[0] * u * v + p[1] * (r2 + 2 * u * u) + s[0] * r2 + s[1] * r2 * r2
+    vd = v * radial + 2 * p[1] * u * v + p[0] * (r2 + 2 * v * v) + s[2] * r2 + s[3] * r2 * r2
+    return np.stack((fx * ud + skew * vd + cx, fy * vd + cy), -1)
 
 
-@pytest.mark.parametrize(
-    ("name", "theta_max", "parameters"),
-    [
-        ("kitti360_02.yaml", 1.7, (2.35, 0.032, 2.4, 6e-4, -3.5e-4, 1390.0, 1389.2, 0, 708.5,
-                                   697.0)),
-        ("kalibr_omni.yaml", 1.0, (0.9526, -0.18, 0.046, 0.0009, -0.0011, 690.4, 691.2, 0, 380.6,
-                                   243.5)),
-        ("opencv_omnidir.xml", 1.2, (1.2345, -0.22, 0.13, 0.0007, -0.0004, 980, 979, 1.5, 641,
-                                     478)),
-        ("camodocal_pinhole.yaml", 0.7, (0, -0.2751, 0.07133, -1.142e-4, 9.065e-5, 455.2, 453.9, 0,
-                                         371.4, 236.2)),
-    ],
-)  # fmt: skip
-def test_mei(name, theta_max, parameters):
-    lens = load(FILES / name, dtype=f64)
-    points = points_around(theta_max)
-    assert_projects(lens, points, mei(points, *parameters))
-    assert not lens.is_radial
+def mei(xi, plane, k, p, skew=0):
+    def pixels(points):
+        x, y, z = points.T
+        return distorted(x / (z + xi), y / (z + xi), plane, k, p, skew=skew)
+
+    return pixels
 
 
 def colmap_pixels(model, params, points):
     """As COLMAP's ImgFromCam, without its 0.5."""
     x, y, z = points.T
-    single = model in ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEYE",
-                       "RADIAL_FISHEYE", "SIMPLE_DIVISION", "BROWN_CONRADY",
-                       "SIMPLE_FISHEYE")  # fmt: skip
-    fx, fy, cx, cy, *extra = params[:1] * 2 + params[1:] if single else params
+    single = model.startswith("SIMPLE") or model in ("RADIAL", "RADIAL_FISHEYE", "BROWN_CONRADY")
+    params = params[:1] * 2 + params[1:] if single else params
+    plane, extra = params[:4], params[4:]
+    u, v = x / z, y / z
     if "FISHEYE" in model:
         theta = np.arctan2(np.hypot(x, y), z)
         u, v = theta * x / np.hypot(x, y), theta * y / np.hypot(x, y)
-    else:
-        u, v = x / z, y / z
-    r2 = u * u + v * v
-    k, d, p, s = [], [], [0, 0], [0, 0, 0, 0]
+    terms = dict(k=extra)
     if model == "FULL_OPENCV":
-        k, p, d = [*extra[:2], extra[4]], extra[2:4], extra[5:]
+        terms = dict(k=[*extra[:2], extra[4]], p=extra[2:4], d=extra[5:])
     elif model == "OPENCV":
-        k, p = extra[:2], extra[2:]
+        terms = dict(k=extra[:2], p=extra[2:])
     elif model == "BROWN_CONRADY":
-        k, p = extra[:3], extra[3:]
+        terms = dict(k=extra[:3], p=extra[3:])
     elif model == "THIN_PRISM_FISHEYE":
-        k, p, s = [*extra[:2], *extra[4:6]], extra[2:4], [extra[6], 0, extra[7], 0]
+        terms = dict(k=[*extra[:2], *extra[4:6]], p=extra[2:4], s=[extra[6], 0, extra[7], 0])
     elif model == "RAD_TAN_THIN_PRISM_FISHEYE":
-        radial = 1 + sum(c * r2 ** (i + 1) for i, c in enumerate(extra[:6]))
-        u, v = u * radial, v * radial
-        r2, p, s = u * u + v * v, extra[7:5:-1], extra[8:]
+        radial = 1 + sum(c * (u * u + v * v) ** i for i, c in enumerate(extra[:6], 1))
+        u, v, terms = u * radial, v * radial, dict(p=extra[7:5:-1], s=extra[8:])
     elif model == "FOV":
-        radial = np.arctan(2 * np.sqrt(r2) * np.tan(extra[0] / 2)) / (np.sqrt(r2) * extra[0])
-        u, v, r2 = u * radial, v * radial, 0 * r2
+        r = np.hypot(u, v)
+        radial = np.arctan(2 * r * np.tan(extra[0] / 2)) / (r * extra[0])
+        u, v, terms = u * radial, v * radial, {}
     elif model == "EUCM":
         alpha, beta = extra
         den = alpha * np.sqrt(beta * (x * x + y * y) + z * z) + (1 - alpha) * z
-        u, v = x / den, y / den
-    elif model in ("SIMPLE_DIVISION", "DIVISION"):
+        u, v, terms = x / den, y / den, {}
+    elif "DIVISION" in model:
         den = (z + np.sqrt(z * z - 4 * (x * x + y * y) * extra[0])) / 2
-        u, v = x / den, y / den
-    else:
-        k = extra
-    radial = 1 + sum(c * r2 ** (i + 1) for i, c in enumerate(k))
-    radial = radial / (1 + sum(c * r2 ** (i + 1) for i, c in enumerate(d)))
-    ud = u * radial + 2 * p[0] * u * v + p[1] * (r2 + 2 * u * u) + s[0] * r2 + s[1] * r2 * r2
-    vd = v * radial + 2 * p[1] * u * v + p[0] * (r2 + 2 * v * v) + s[2] * r2 + s[3] * r2 * r2
-    return torch.from_numpy(np.stack((fx * ud + cx, fy * vd + cy), -1))
+        u, v, terms = x / den, y / den, {}
+    return distorted(u, v, plane, **terms)
 
 
 def test_every_model_of_colmap():
@@ -214,16 +189,6 @@ def test_every_model_of_colmap():
     for lens, row in zip(found.values(), rows, strict=True):
         pixels = colmap_pixels(row[1], [float(p) for p in row[4:]], points) - 0.5
         assert_projects(lens, points, pixels)
-
-
-def nerfstudio_pixels(points):
-    """A pinhole camera with four radial terms."""
-    x, y = points[:, 0] / points[:, 2], points[:, 1] / points[:, 2]
-    r = x * x + y * y
-    d = 1 + r * (0.1 + r * (-0.05 + r * (0.02 + r * -0.003)))
-    u = x * d + 2 * 0.001 * x * y - 0.002 * (r + 2 * x * x)
-    v = y * d - 2 * 0.002 * x * y + 0.001 * (r + 2 * y * y)
-    return np.stack((500 * u + 319.5, 510 * v + 239.5), -1)
 
 
 NERFSTUDIO = dict(camera_model="OPENCV", fl_x=500, fl_y=510, cx=320, cy=240, w=640, h=480, k1=0.1,
@@ -251,6 +216,16 @@ def world2cam(points):
 @pytest.mark.parametrize(
     ("text", "camera", "theta_max", "pixels"),
     [
+        (file_text("kitti360_02.yaml"), None, 1.7, mei(
+            2.35, (1390.0, 1389.2, 708.5, 697.0), (0.032, 2.4), (6e-4, -3.5e-4))),
+        (file_text("kalibr_omni.yaml"), None, 1.0, mei(
+            0.9526, (690.4, 691.2, 380.6, 243.5), (-0.18, 0.046), (0.0009, -0.0011))),
+        (file_text("opencv_omnidir.xml"), None, 1.2, mei(
+            1.2345, (980, 979, 641, 478), (-0.22, 0.13), (0.0007, -0.0004), skew=1.5)),
+        (file_text("camodocal_pinhole.yaml"), None, 0.7, mei(
+            0, (455.2, 453.9, 371.4, 236.2), (-0.2751, 0.07133), (-1.142e-4, 9.065e-5))),
+        (json.dumps(NERFSTUDIO), None, 0.6, mei(  # a pinhole camera with four radial terms
+            0, (500, 510, 319.5, 239.5), (0.1, -0.05, 0.02, -0.003), (0.001, -0.002))),
         (file_text("colmap_all.txt"), "7", 0.8, lambda points: pinhole(
             points, RATIONAL, [[500, 0, 319.5], [0, 510.0, 239.5], [0, 0, 1]])),
         (file_text("basalt.json"), "cam4", 0.8, lambda points: pinhole(
@@ -258,9 +233,9 @@ def world2cam(points):
             [[274.4, 0, 317.8], [0, 274.9, 236.4], [0, 0, 1]])),
         (file_text("basalt.json"), 2, 1.3, unified_pixels),
         (file_text("ocamcalib.txt"), None, 1.8, world2cam),
-        (json.dumps(NERFSTUDIO), None, 0.6, nerfstudio_pixels),
     ],
-    ids=["COLMAP", "radtan8", "ucm", "OCamCalib", "nerfstudio"],
+    ids=["KITTI-360", "omni", "omnidir", "PINHOLE", "nerfstudio", "COLMAP", "radtan8", "ucm",
+         "OCamCalib"],
 )  # fmt: skip
 def test_other_models(text, camera, theta_max, pixels):
     points = points_around(theta_max)
@@ -280,19 +255,12 @@ def test_scaramuzzas_axis_may_point_either_way():
     text = file_text("camodocal_scaramuzza.yaml")
     lens = loads(text, dtype=f64)
     theta, phi = torch.linspace(0, 1.8, 200, dtype=f64), torch.linspace(-31, 31, 200, dtype=f64)
-    before, inverse = text.split("inv_poly_parameters")
-
-    def flipped(text, sign):
-        return re.sub(
-            r" p(\d+): (\S+)", lambda m: f" p{m[1]}: {sign(int(m[1])) * float(m[2])!r}", text
-        )
-
-    other = (
-        flipped(before, lambda i: -1)
-        + "inv_poly_parameters"
-        + flipped(inverse, lambda i: (-1) ** i)
+    direct, inverse = text.split("inv_poly_parameters")
+    direct = re.sub(r"( p\d+:) (\S+)", lambda m: f"{m[1]} {-float(m[2])}", direct)
+    inverse = re.sub(
+        r" p(\d+): (\S+)", lambda m: f" p{m[1]}: {(-1) ** int(m[1]) * float(m[2])}", inverse
     )
-    other = loads(other, dtype=f64)
+    other = loads(f"{direct}inv_poly_parameters{inverse}", dtype=f64)
     torch.testing.assert_close(other.project_rays(theta, phi), lens.project_rays(theta, phi))
     # x = c x' + d y' + cx, y = e x' + y' + cy
     x, y = phi.cos() * lens.project(theta), phi.sin() * lens.project(theta)
@@ -306,31 +274,13 @@ def test_woodscapes_aspect_ratio_stretches_the_rows():
     assert (down[1] / right[0]).item() == pytest.approx(1.0004, abs=1e-12)
 
 
-@pytest.mark.parametrize("k", [0.23, 0.001, 40.0, -0.2])
-def test_colmaps_division_model(k):
-    """Its inverse, p / (1 + k |p|²), is the definition; and COLMAP's own where it is installed."""
-    lens = loads(f"1 DIVISION 640 480 300 310 320.5 240.5 {k}", dtype=f64)
-    limit = 1 / math.sqrt(k) if k > 0 else 2.0  # of |p|
-    radius = torch.linspace(0, min(limit, 2.0), 50, dtype=f64)[:-1]
-    theta = torch.atan2(radius, 1 + k * radius**2)
-    azimuth = torch.linspace(-3, 3, 49, dtype=f64)
-    pixels = radius[:, None] * torch.stack((300 * azimuth.cos(), 310 * azimuth.sin()), -1)
-    expected = pixels + torch.tensor([320.0, 240.0])
-    whole = lens.with_theta_max(None)
-    assert (theta <= whole.theta_limit + 2e-6).all()
-    torch.testing.assert_close(whole.project_rays(theta, azimuth), expected, rtol=0, atol=1e-9)
-    found, _ = whole.unproject_pixels(expected)
-    torch.testing.assert_close(found, theta, rtol=0, atol=1e-12)
-    if k > 0:
-        assert whole.theta_limit.item() == pytest.approx(math.atan(0.5 / math.sqrt(k)), abs=2e-6)
-        assert whole.unproject(torch.tensor([300 * limit * 1.01], dtype=f64)).isnan().all()
-
-
 @pytest.mark.parametrize("alpha", [0.1, 0.5, 0.9, 1.0])
 @pytest.mark.parametrize("beta", [-0.3, -50.0, -1e-3])
 @pytest.mark.parametrize("dtype", [torch.float32, f64])
 def test_enhanced_unified_with_a_beta_below_0(alpha, beta, dtype):
+    """COLMAP's division model is one of α = ½."""
     lens = EnhancedUnified(torch.tensor(alpha, dtype=dtype), beta, 300.0)
+    assert lens.theta_limit.item() == pytest.approx(math.atan((-beta) ** -0.5), abs=2e-6)
     theta = lens.theta_limit * torch.linspace(0, 1, 200, dtype=dtype)
     radius = lens.project(theta)
     assert radius.isfinite().all() and (radius.diff() > 0).all()
@@ -350,71 +300,111 @@ def test_colmap_s_binary_file_has_the_cameras_of_its_text_file():
 
 # -- as other tools and short scripts write them ------------------------------------------------
 
-
-@pytest.mark.parametrize("word", ["radial-tangential", "radial_tangential", "radtan"])
-def test_eurocs_sensor_yaml(word):
-    text = (
-        "sensor_type: camera\nT_BS:\n  cols: 2\n  rows: 1\n  data: [1.0, 0.1]\nrate_hz: 20\n"
-        "resolution: [1280, 960]\ncamera_model: pinhole\n"
-        "intrinsics: [421.3, 420.9, 643.1, 478.6] #fu, fv, cu, cv\n"
-        f"distortion_model: {word}\ndistortion_coefficients: {PLUMB_BOB[:4]}\n"
-    )
-    lens = loads(text, dtype=f64)
-    assert_pinhole(lens, PLUMB_BOB[:4])
-    assert lens.image_size.tolist() == [[960, 1280]]
-
-
-def test_eurocs_name_beside_a_camera_matrix():
-    described = {"distortion_model": "radial-tangential", "K": K, "D": PLUMB_BOB[:4]}
-    assert_pinhole(loads(json.dumps(described), **SIZE), PLUMB_BOB[:4])
-
-
 PLANE = {"fx": 421.3, "fy": 420.9, "cx": 643.1, "cy": 478.6, "width": 1280, "height": 960}
+RADTAN = dict(model="BrownConrady", radial=[-0.22, 0.05], tangential=[0.001, -0.002])
+PLUMB = dict(RADTAN, radial=[-0.22, 0.05, 0.003], image_size=[960, 1280], center=[643.1, 478.6])
+KB = dict(model="KannalaBrandt", radial=FISHEYE, image_size=[960, 1280])
+EUROC = """sensor_type: camera
+T_BS:
+  cols: 2
+  rows: 1
+  data: [1.0, 0.1]
+rate_hz: 20
+resolution: [1280, 960]
+camera_model: pinhole
+intrinsics: [421.3, 420.9, 643.1, 478.6] #fu, fv, cu, cv
+distortion_model: {}
+distortion_coefficients: [-0.22, 0.05, 0.001, -0.002]
+"""
+NAMES = ("D", "d", "distortion_coefficients", "distortion_coefs", "distCoeffs", "dist_coeff",
+         "dist", "distortion", "coeffs", "coefficients", "Distortion_Parameters",
+         "distortion_params", "camera_distortion", "cameraDistortionCoefficients")  # fmt: skip
+# What is no coefficient may stand beside them.
+BESIDE = dict(R=[1.0] * 9, P1=[1.0] * 12, R1=[1.0] * 9, board_distance=0.3, p=[1.0] * 12,
+              undistorted_size=[9, 9], distortion_model="plumb_bob", dist_note="none", d2=[],
+              avg_reprojection_error=0.3, D_std_dev=[0.1] * 5)  # fmt: skip
+
+
+def opencv(**entries):
+    return json.dumps(dict(width=1280, height=960, K=K) | entries)
 
 
 def flat(*names, **entries):
     return json.dumps(PLANE | dict(zip(names, FISHEYE)) | entries)  # noqa: B905
 
 
-def test_k1_to_k4_are_the_fisheye_models():
-    lens = loads(flat("k1", "k2", "k3", "k4"), dtype=f64)
-    assert_fisheye(lens)
-    assert lens.image_size.tolist() == [[960, 1280]]
-    assert_fisheye(loads(yaml.safe_dump(json.loads(flat("k1", "k2", "k3", "k4"))), dtype=f64))
-    plain = loads(flat("k1", "k2", "k3", model="fisheye"), dtype=f64)
-    assert isinstance(plain, KannalaBrandt) and plain.radial[0, 3] == 0
+def fisheye_or_pinhole(**entries):
+    """Four coefficients, which a word about their model decides on."""
+    return opencv(D=FISHEYE, **entries)
 
 
-def test_intrinsics_with_p1_are_a_pinholes():
-    assert_pinhole(loads(flat("k1", "k2", "p1", "p2"), dtype=f64), FISHEYE)
-    names = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
-    eight = dict(zip(names, RATIONAL, strict=True))
-    assert_pinhole(loads(flat(**eight), dtype=f64), RATIONAL)
-    skewed = loads(flat("k1", "k2", "p1", "p2", skew=1.5), dtype=f64)
-    assert (skewed.focal * skewed.affine[:, 0, 1]).item() == pytest.approx(1.5)
-    mei = loads(flat("k1", "k2", "p1", "p2", xi=1.1), dtype=f64)
-    assert mei.xi.item() == 1.1 and mei.tangential.tolist() == [FISHEYE[2:]]
+ROS2 = file_text("ros2_echo.yaml")
+ECHOED = dict(image_size=[480, 640], center=[317.8, 236.4], denominator=[0.548, -0.071, 0.029])
+PINHOLE = dict(model="BrownConrady", radial=FISHEYE[:2], tangential=FISHEYE[2:])
+EIGHT = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+DIVIDED = dict(radial=[0.2, 0.05, 0.003], denominator=[0.25, 0.04, 0.002])
+
+
+@pytest.mark.parametrize(
+    ("text", "options", "expected"),
+    [
+        *((EUROC.format(word), {}, RADTAN | dict(image_size=[960, 1280]))
+          for word in ("radial-tangential", "radial_tangential", "radtan")),
+        (opencv(distortion_model="radial-tangential", D=PLUMB_BOB[:4]), {}, RADTAN),
+        *((opencv(**{name: PLUMB_BOB}, **says), {}, PLUMB)
+          for name in NAMES for says in (dict(distortion_model="plumb_bob"), dict(fisheye=0), {})),
+        *((opencv(D=layout), {}, PLUMB) for layout in ([PLUMB_BOB], [[d] for d in PLUMB_BOB])),
+        (opencv(D=PLUMB_BOB, **BESIDE), {}, PLUMB),
+        # As people write it with NumPy, and as `rostopic echo` and `ros2 topic echo` print it.
+        (json.dumps(dict(mtx=K, dist=[PLUMB_BOB], img_size=[1280, 960])), {}, PLUMB),
+        (f"height: 960\nwidth: 1280\ndistortion_model: plumb_bob\nD: {PLUMB_BOB}\n"
+         f"K: {K[0] + K[1] + K[2]}\n", {}, PLUMB),
+        *((ROS2 + end, {}, ECHOED) for end in ("", "\n---\n---\n\n", "...\n", "\r\n---\r\n")),
+        # Which model.
+        (opencv(D=[], fisheye=0), {}, dict(model="Perspective")),
+        (opencv(), dict(model="fisheye"), dict(model="Equidistant")),
+        (fisheye_or_pinhole(), dict(model="fisheye"), KB),
+        (fisheye_or_pinhole(), dict(model="pinhole"), PINHOLE),
+        (fisheye_or_pinhole(fisheye_model=1), {}, KB),
+        (fisheye_or_pinhole(fisheye_model=0), {}, PINHOLE),
+        (fisheye_or_pinhole(distortion_model="equidistant"), {}, KB),
+        (fisheye_or_pinhole(distortion_model="plumb_bob"), {}, PINHOLE),
+        (fisheye_or_pinhole(camera_model="fisheye"), {}, KB),
+        (fisheye_or_pinhole(xi=1.1), {}, PINHOLE | dict(model="Mei", xi=1.1)),
+        (fisheye_or_pinhole(xi=[[1.1]]), {}, PINHOLE | dict(model="Mei", xi=1.1)),
+        (fisheye_or_pinhole(xi=1.1, model="fisheye"), {}, KB),
+        # Single numbers.
+        (flat("k1", "k2", "k3", "k4"), {}, KB | {"center": [643.1, 478.6], "focal": 421.3}),
+        (yaml.safe_dump(json.loads(flat("k1", "k2", "k3", "k4"))), {}, KB),
+        (flat("k1", "k2", "k3", model="fisheye"), {}, KB | dict(radial=[*FISHEYE[:3], 0.0])),
+        (flat("k1", "k2", "p1", "p2"), {}, PINHOLE | dict(radial=[*FISHEYE[:2], 0.0])),
+        (flat(**dict(zip(EIGHT, RATIONAL, strict=True))), {}, DIVIDED),
+        (flat("k1", "k2", "p1", "p2", fy=421.3, skew=421.3), {}, {"affine": [[1, 1], [0, 1]]}),
+        (flat("k1", "k2", "p1", "p2", xi=1.1), {}, PINHOLE | dict(model="Mei", xi=1.1)),
+    ],
+)  # fmt: skip
+def test_what_is_read(text, options, expected):
+    described = to_dict(loads(text, dtype=f64, **options))
+    assert described | expected == described
+
+
+def test_two_messages_are_no_file():
+    with pytest.raises(ValueError, match="it is no YAML: line"):
+        loads(ROS2 + ROS2)
 
 
 @pytest.mark.parametrize("save", [np.savez, np.savez_compressed])
 def test_arrays_of_numpy(save, tmp_path):
     path = tmp_path / "calib.npz"
     points = np.random.default_rng(0).normal(size=(20, 5000, 3))  # megabytes, and no lens's
+    rvecs = np.array([np.zeros(3), np.zeros(2)], dtype=object)  # never unpickled
     save(path, mtx=np.array(K), dist=np.array([PLUMB_BOB]), DIM=np.array([1280, 960]), ret=0.31,
-         objpoints=points)  # fmt: skip
-    lens = load(path, dtype=f64)
-    assert_pinhole(lens, PLUMB_BOB)
-    assert lens.image_size.tolist() == [[960, 1280]]
+         objpoints=points, rvecs=rvecs)  # fmt: skip
+    described = to_dict(load(path, dtype=f64))
+    assert described | PLUMB == described
     save(path, cameraMatrix=np.array(K), distCoeffs=np.array(FISHEYE)[:, None])
-    assert_fisheye(load(path, model="fisheye", dtype=f64))
-
-
-def test_objects_in_numpys_files_are_never_unpickled(tmp_path):
-    path = tmp_path / "calib.npz"
-    rvecs = np.array([np.zeros(3), np.zeros(2)], dtype=object)
-    np.savez(path, K=K, D=PLUMB_BOB, rvecs=rvecs)
-    assert_pinhole(load(path, **SIZE), PLUMB_BOB)
-    np.savez(path, K=K, D=np.array(PLUMB_BOB, dtype=object))
+    assert load(path, model="fisheye", dtype=f64).radial.tolist() == [FISHEYE]
+    save(path, K=K, D=np.array(PLUMB_BOB, dtype=object))
     with pytest.raises(ValueError, match="a camera without coefficients"):
         load(path)
 
@@ -432,7 +422,6 @@ def message(binning=(0, 0), roi=(0, 0, 0, 0), **entries):
 @pytest.mark.parametrize("roi", [(0, 0, 0, 0), (0, 0, 1280, 960), (101, 52, 640, 483)])
 def test_binned_regions_show_what_the_sensor_sees(binning, roi):
     whole = loads(message(), dtype=f64)
-    assert_pinhole(whole, PLUMB_BOB)
     lens = loads(message(binning, roi), dtype=f64).with_theta_max(None)
     left, top, width, height = roi if any(roi) else (0, 0, 1280, 960)
     across, down = (max(side, 1) for side in binning)
@@ -459,8 +448,7 @@ def test_theta_max_is_the_widest_side():
     assert load(FILES / "ours.json").theta_max.item() == pytest.approx(1.6)
     # An image that sees more than the lens: the lens's limit.
     lens = load(FILES / "opencv_fisheye.yaml", dtype=f64)
-    text = FILES.joinpath("opencv_fisheye.yaml").read_text().replace("1280", "12800")
-    wide = loads(text, dtype=f64)
+    wide = loads(file_text("opencv_fisheye.yaml").replace("1280", "12800"), dtype=f64)
     assert wide.theta_max.item() == wide.theta_limit.item() > lens.theta_max.item()
 
 
@@ -480,15 +468,6 @@ def test_without_an_image_size(tmp_path):
     assert load(FILES / "woodscape.json", image_size=(9, 9)).image_size.tolist() == [[966, 1280]]
 
 
-COLMAP = "".join(f"{i} SIMPLE_FISHEYE 640 480 {100 * i} 320 240\n" for i in (1, 2, 5, 7))
-
-
-@pytest.mark.parametrize("camera", [1, 2, 5, 7])
-def test_where_names_are_numbers_a_number_is_a_name(camera):
-    for name in (camera, str(camera)):
-        assert loads(COLMAP, camera=name).focal.item() == 100 * camera
-
-
 def test_several_cameras(tmp_path):
     path = FILES / "kalibr_tumvi.yaml"
     focal = load(path, camera="cam1").focal.item()
@@ -505,41 +484,13 @@ def test_several_cameras(tmp_path):
     pair = write(tmp_path / "s.yaml", M1=K, D1=[0.1, 0, 0, 0, 0], M2=K, D2=[0.2, 0, 0, 0, 0],
                  image_width=640, image_height=480)  # fmt: skip
     assert [lens.radial[0, 0].item() for lens in load_all(pair, dtype=f64).values()] == [0.1, 0.2]
+    # Where names are numbers, a number is a name.
+    colmap = "".join(f"{i} SIMPLE_FISHEYE 640 480 {100 * i} 320 240\n" for i in (1, 2, 5, 7))
+    for name in (1, 2, 5, 7, "1", "2", "5", "7"):
+        assert loads(colmap, camera=name).focal.item() == 100 * int(name)
     # One that lacks something is missed only where it is wanted.
     text = file_text("kalibr_tumvi.yaml").replace("camera_model", "model", 1)
     assert loads(text, camera="cam1").focal.item() == focal
-
-
-@pytest.mark.parametrize(
-    ("entries", "model"),
-    [
-        (dict(fisheye_model=1), "KannalaBrandt"),
-        (dict(fisheye_model=0), "BrownConrady"),
-        (dict(distortion_model="equidistant"), "KannalaBrandt"),
-        (dict(distortion_model="plumb_bob"), "BrownConrady"),
-        (dict(camera_model="fisheye"), "KannalaBrandt"),
-        (dict(xi=1.1), "Mei"),
-        (dict(xi=[[1.1]]), "Mei"),
-        (dict(xi=1.1, model="fisheye"), "KannalaBrandt"),
-    ],
-)
-def test_four_coefficients_need_a_word_about_their_model(tmp_path, entries, model):
-    base = dict(K=K, D=[-0.021, 0.0043, 0.0012, 0.0008], image_width=1280, image_height=960)
-    assert type(load(write(tmp_path / "c.yaml", **base, **entries))).__name__ == model
-    path = write(tmp_path / "open.yaml", **base)
-    for hint, name in (("fisheye", "KannalaBrandt"), ("pinhole", "BrownConrady")):
-        assert type(load(path, model=hint)).__name__ == name
-
-
-def test_ros_messages_and_notations_that_people_write():
-    """As `rostopic echo` prints it; and nested lists."""
-    text = ("height: 480\nwidth: 640\ndistortion_model: plumb_bob\nD: [0.1, 0.01, 0.0, 0.0, 0.0]\n"
-            "K: [500.0, 0.0, 320.0, 0.0, 500.0, 240.0, 0.0, 0.0, 1.0]\n")  # fmt: skip
-    lens = loads(text, dtype=f64)
-    assert lens.center.tolist() == [[320, 240]] and lens.image_size.tolist() == [[480, 640]]
-    text = '{"mtx": [[5e2, 0, 320], [0, 500, 240], [0, 0, 1]], "dist": [[0.1, 0.01, 0, 0, 0]], ' \
-           '"img_size": [640, 480]}'  # fmt: skip
-    torch.testing.assert_close(loads(text, dtype=f64).project(0.4), lens.project(0.4))
 
 
 def test_our_own_json_may_say_a_field_of_view():
@@ -548,47 +499,3 @@ def test_our_own_json_may_say_a_field_of_view():
     assert lens.r_max.item() == pytest.approx(20) and lens.theta_max.item() == pytest.approx(1.4)
     with pytest.raises(ValueError, match="needs the image_size"):
         loads(text)
-
-
-D = [-0.3, 0.1, 0.001, -0.002, 0.01]
-BASE = dict(width=640, height=480, K=[500.0, 0, 320, 0, 510, 240, 0, 0, 1])
-
-
-@pytest.mark.parametrize(
-    "key",
-    ["D", "d", "distortion_coefficients", "distortion_coefs", "distCoeffs", "dist_coeff", "dist",
-     "distortion", "coeffs", "coefficients", "Distortion_Parameters", "distortion_params",
-     "camera_distortion", "cameraDistortionCoefficients"],
-)  # fmt: skip
-def test_coefficients_are_read_by_all_their_names(key):
-    for model in (dict(distortion_model="plumb_bob"), dict(fisheye_model=0), {}):
-        lens = loads(json.dumps(BASE | model | {key: D}), dtype=f64)
-        assert lens.radial.tolist() == [[-0.3, 0.1, 0.01]]
-        assert lens.tangential.tolist() == [[0.001, -0.002]]
-
-
-@pytest.mark.parametrize("layout", [D, [D], [[d] for d in D]])
-def test_coefficients_of_any_layout(layout):
-    text = json.dumps(BASE | {"D": layout})
-    assert loads(text, dtype=f64).radial.tolist() == [[-0.3, 0.1, 0.01]]
-
-
-def test_what_is_no_coefficient_may_stand_beside_them():
-    others = dict(D=D, R=[1.0] * 9, P1=[1.0] * 12, R1=[1.0] * 9, board_distance=0.3, p=[1.0] * 12,
-                  undistorted_size=[9, 9], distortion_model="plumb_bob", dist_note="none", d2=[],
-                  avg_reprojection_error=0.3, D_std_dev=[0.1] * 5)  # fmt: skip
-    assert loads(json.dumps(BASE | others)).radial.shape == (1, 3)
-    # No coefficients: the file says so, or the user.
-    assert type(loads(json.dumps(BASE | dict(D=[], fisheye=0)))).__name__ == "Perspective"
-    assert type(loads(json.dumps(BASE), model="fisheye")).__name__ == "Equidistant"
-
-
-def test_what_ros2_topic_echo_prints():
-    lens = load(FILES / "ros2_echo.yaml", dtype=f64)
-    assert lens.image_size.tolist() == [[480, 640]] and lens.center.tolist() == [[317.8, 236.4]]
-    assert lens.denominator.tolist() == [[0.548, -0.071, 0.029]]
-    text = file_text("ros2_echo.yaml")
-    for end in ("", "\n---\n---\n\n", "...\n", "\r\n---\r\n"):
-        assert loads(text + end, dtype=f64).radial.tolist() == lens.radial.tolist()
-    with pytest.raises(ValueError, match="it is no YAML: line"):
-        loads(text + text)

@@ -30,21 +30,19 @@ from darswin.lens.ideal import FocalLens
 
 
 @pytest.mark.parametrize("name", MODELS)
-def test_nothing_is_valid_beyond_the_limit(name):
+def test_the_limit_is_where_r_stops_rising(name):
     """Just beyond it r falls, is infinite, or the angle is none."""
-    generator = torch.Generator().manual_seed(6)
-    for _ in range(5):
-        lens = example(name, generator)
-        limit = lens.theta_limit
-        half_turn = limit > math.pi - 1e-5
-        before, after = lens.project(limit - 2e-5), lens.project(limit + 2e-5)
-        ends = (after <= lens.r_max + 1e-9) | (before > 1e3 * lens.project(limit / 2))
-        if name == "Tabulated":
-            assert torch.equal(limit, lens.angles[:, -1])
-        elif name in ("OCam", "OCamInverse"):
-            assert (limit <= math.pi).all()
-        else:
-            assert (half_turn | ends).all(), (limit, before, after)
+    lens = example(name, torch.Generator().manual_seed(6))
+    limit = lens.theta_limit
+    half_turn = limit > math.pi - 1e-5
+    before, after = lens.project(limit - 2e-5), lens.project(limit + 2e-5)
+    ends = (after <= lens.r_max + 1e-9) | (before > 1e3 * lens.project(limit / 2))
+    if name == "Tabulated":
+        assert torch.equal(limit, lens.angles[:, -1])
+    elif name in ("OCam", "OCamInverse"):
+        assert (limit <= math.pi).all()
+    else:
+        assert (half_turn | ends).all(), (limit, before, after)
 
 
 def test_models_that_contain_each_other():
@@ -92,24 +90,16 @@ def in_parameters(lens, method):
 
 
 @pytest.mark.parametrize("name", MODELS)
-def test_gradients_of_both_directions(name):
-    lens = example(name, torch.Generator().manual_seed(7), (0.8, 3))
+def test_derivatives_of_both_directions_up_to_the_third(name):
+    lens = example(name, torch.Generator().manual_seed(7), (0.8, 3))[:2]
     lens = lens.with_theta_max(0.7 * lens.theta_limit)
-    theta = (lens.theta_max[:, None] * double(0.12, 0.51, 0.83)).requires_grad_()
+    theta = (lens.theta_max[:, None] * double(0.12, 0.83)).requires_grad_()
     radius = lens.project(theta).detach().requires_grad_()
     for method, x in (("project", theta), ("unproject", radius)):
         run, values = in_parameters(lens, method)
         assert torch.autograd.gradcheck(run, (x, *values))
-
-
-@pytest.mark.parametrize("name", MODELS)
-def test_second_and_third_derivatives(name):
-    lens = example(name, torch.Generator().manual_seed(7), (0.8, 3))[0]
-    lens = lens.with_theta_max(0.7 * lens.theta_limit)
-    theta = (lens.theta_max * double(0.52, 0.83)).requires_grad_()
-    radius = lens.project(theta).detach().requires_grad_()
-    for method, x in (("project", theta), ("unproject", radius)):
-        run, values = in_parameters(lens, method)
+        run, values = in_parameters(lens[0], method)
+        x = x[0].detach().requires_grad_()
         assert torch.autograd.gradgradcheck(run, (x, *values), atol=1e-6)
 
         def second(value, run=run, x=x, rest=values[1:]):
@@ -135,6 +125,7 @@ def test_gradients_of_rays_and_pixels(name):
     assert torch.autograd.gradcheck(in_parameters(lens, "unproject_pixels")[0], (pixels, *values))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", RANDOM)
 def test_second_derivatives_of_rays(name):
     lens = random_lens(name, 3)[0]
@@ -185,78 +176,80 @@ def test_where_nothing_lands_there_is_no_gradient_either(name):
 
 
 @pytest.mark.parametrize(
-    ("make", "message"),
+    ("make", "said"),
     [
         (lambda: Perspective(0.0, 1.0), "focal must be finite and above 0, got 0.0"),
         (lambda: Perspective(math.inf, 1.0), "focal must be"),
-        (lambda: Perspective(1.0, math.pi / 2 + 1e-3),
-         r"theta_max must be at most 1.570795 rad \(90.00°\).* got 1.57179"),
+        (lambda: Perspective(1.0, math.pi / 2 + 1e-3), "theta_max must be at most 1.570795 rad"),
         (lambda: Perspective(1.0, 0.0), "theta_max must be finite and above 0"),
         (lambda: Perspective(1.0, math.nan), "theta_max must be"),
         (lambda: Spherical(-0.1, 1.0, 1.0), "xi must be finite and at least 0, got -0.1"),
         (lambda: Spherical(math.nan, 1.0, 1.0), "xi must be"),
-        (lambda: Spherical(0.0, 1.0, 1.6), "at most 1.57.*Spherical lens's r rises"),
+        (lambda: Spherical(0.0, 1.0, 1.6), "at most 1.57"),
         (lambda: Spherical(0.5, 1.0, 2.2), "theta_max must be at most 2.09"),
         (lambda: Spherical(2.0, 1.0, 2.2), "theta_max must be at most 2.09"),
         (lambda: Spherical([0.1, 0.2], [1.0, 2.0, 3.0], 1.0), "agree in the number of lenses"),
-        (lambda: Spherical([0.1, -0.2], 1.0, 1.0), "xi must be .* got -0.2"),
-        (lambda: Spherical([[0.1]], 1.0, 1.0), r"xi must be a number or \(N,\)"),
-        (lambda: EnhancedUnified(1.1, 1.0, 1.0), r"alpha must be in \[0, 1\], got 1.1"),
+        (lambda: Spherical([0.1, -0.2], 1.0, 1.0), "got -0.2"),
+        (lambda: Spherical([[0.1]], 1.0, 1.0), "xi must be a number or (N,)"),
+        (lambda: EnhancedUnified(1.1, 1.0, 1.0), "alpha must be in [0, 1], got 1.1"),
         (lambda: EnhancedUnified(0.5, 0.0, 1.0), "beta must be finite and above 0"),
         (lambda: DoubleSphere(-1.0, 0.5, 1.0), "xi must be finite and above -1"),
-        (lambda: FieldOfView(math.pi, 1.0), r"omega must be in \(0, 3.14159\)"),
-        (lambda: FieldOfView(0.0, 1.0), r"omega must be in \(0, 3.14159\)"),
+        (lambda: FieldOfView(math.pi, 1.0), "omega must be in (0, 3.14159)"),
+        (lambda: FieldOfView(0.0, 1.0), "omega must be in (0, 3.14159)"),
         (lambda: OCam([100.0, 0.0]), "coefficients must be such that a₀ is below 0"),
-        (lambda: Polynomial([1.0, -5.0], 1.0), "at most 0.09999.*as far as .* r rises"),
+        (lambda: Polynomial([1.0, -5.0], 1.0), "at most 0.09999"),
         (lambda: Polynomial([0.0, 1.0], 1.0), "coefficients must be such that r rises"),
         (lambda: Polynomial([]), "coefficients must be at least one a lens"),
         (lambda: Polynomial([1.0, math.nan], 1.0), "coefficients must be finite"),
-        (lambda: Polynomial(1.0, 1.0), r"coefficients must be \(K\) or \(N, K\)"),
+        (lambda: Polynomial(1.0, 1.0), "coefficients must be (K) or (N, K)"),
         (lambda: Polynomial([1.0], 3.2), "theta_max must be at most 3.14159"),
         (lambda: KannalaBrandt(1.0, [math.nan]), "radial must be finite"),
-        (lambda: KannalaBrandt(1.0, [0.1], tangential=[0.1] * 3), r"tangential must be \(2\) or"),
-        (lambda: KannalaBrandt(1.0, [0.1], prism=[0.1] * 2), r"prism must be \(4\) or"),
-        (lambda: KannalaBrandt(1.0, [-1.0], 1.0), "theta_max must be at most 0.57734.*got 1.0"),
+        (lambda: KannalaBrandt(1.0, [0.1], tangential=[0.1] * 3), "tangential must be (2) or"),
+        (lambda: KannalaBrandt(1.0, [0.1], prism=[0.1] * 2), "prism must be (4) or"),
+        (lambda: KannalaBrandt(1.0, [-1.0], 1.0), "theta_max must be at most 0.57734"),
         (lambda: Tabulated([0.0, 1.0], [0.0, 1.0, 2.0]), "angles and radii must have the same"),
         (lambda: Tabulated([0.0, 1.0, 0.5], [0.0, 1.0, 2.0]), "angles must be finite and rising"),
         (lambda: Tabulated([0.0, 1.0], [1.0, 2.0]), "radii must be finite and rising from 0"),
-        (lambda: Perspective(1.0, 1.0, center=[1.0, 2.0, 3.0]), r"center must be \(2\) or"),
+        (lambda: Perspective(1.0, 1.0, center=[1.0, 2.0, 3.0]), "center must be (2) or"),
         (lambda: Perspective(1.0, 1.0, center=3.0), "center must be"),
         (lambda: Equidistant(1.0, affine=[[1.0, 0.0], [0.0, 0.0]]), "affine must be invertible"),
-        (lambda: Equidistant(1.0, affine=[1.0, 2.0]), r"affine must be \(2, 2\) or \(N, 2, 2\)"),
+        (lambda: Equidistant(1.0, affine=[1.0, 2.0]), "affine must be (2, 2) or (N, 2, 2)"),
         (lambda: Equidistant(1.0, image_size=(0, 5)), "image_size must be finite and at least 1"),
         (lambda: Perspective.from_fov(3.2, 10.0), "focal must be"),  # tan(θ_max) < 0
         (lambda: Spherical.from_fov(0.5, 2.0, -1.0), "focal must be"),
+        (lambda: Spherical(0.5, 10.0).with_theta_max(2.5), "theta_max must be at most 2.09"),
+        (lambda: to_dict(Spherical([0.1, 0.2], 300.0)), "one lens, got 2"),
+        (lambda: type("Spherical", (Lens,), {}), "there is a lens model Spherical already"),
     ],
 )  # fmt: skip
-def test_a_parameter_out_of_range_is_named(make, message):
-    with pytest.raises(ValueError, match=message):
+def test_a_value_out_of_range_is_named(make, said):
+    with pytest.raises(ValueError) as error:
         make()
+    assert said in str(error.value)
 
 
 @pytest.mark.parametrize(
-    ("make", "message"),
+    ("make", "said"),
     [
         (lambda: Perspective("wide", 1.0), "focal must be a number or a tensor, got 'wide'"),
         (lambda: Spherical(object(), 1.0, 1.0), "xi must be a number"),
-        (lambda: Spherical(0.5, 1.0, thetamax=1.0), r"^Spherical\(xi, focal, .*thetamax"),
+        (lambda: Spherical(0.5, 1.0, thetamax=1.0), "thetamax"),
         (lambda: Spherical.from_fov(2.0, 30.0), "'radius'"),
         (lambda: Spherical.from_fov(0.5, 2.0, 30.0, None, 1.0), "too many positional"),
         (lambda: Spherical.from_fov(0.5, 2.0, 30.0, xi=0.5), "multiple values"),
         (lambda: Spherical.from_fov(0.5, 2.0, 30.0, focal=3.0), "'focal'"),
     ],
-)
-def test_wrong_arguments(make, message):
-    with pytest.raises(TypeError, match=message):
+)  # fmt: skip
+def test_an_argument_of_a_wrong_type_is_named(make, said):
+    with pytest.raises(TypeError) as error:
         make()
+    assert said in str(error.value)
 
 
 def test_a_class_is_a_model_unless_it_says_otherwise():
     assert all(model.__name__ == name for name, model in MODELS.items())
     bases = {base for model in MODELS.values() for base in model.__mro__} - {*MODELS.values()}
     assert not {base.__name__ for base in bases} & {*MODELS}
-    with pytest.raises(ValueError, match="there is a lens model Spherical already"):
-        type("Spherical", (Lens,), {})
 
     class OfNoName(Spherical, register=False):
         pass
@@ -269,8 +262,6 @@ def test_another_theta_max():
     assert torch.equal(lens.with_theta_max(None).theta_max, lens.theta_limit)
     assert lens.with_theta_max(1.5).theta_max.tolist() == [1.5, 1.5]
     assert lens.theta_max.tolist() == [1.0, 1.0]
-    with pytest.raises(ValueError, match=r"theta_max must be at most 2\.09"):
-        lens.with_theta_max(2.5)
 
 
 def test_angles_at_the_sides_of_the_image():
@@ -324,5 +315,3 @@ def test_as_json_and_back():
     }  # fmt: skip
     again = from_dict(json.loads(json.dumps(described)))
     assert to_dict(again) == to_dict(lens.to(torch.float32))
-    with pytest.raises(ValueError, match="one lens, got 2"):
-        to_dict(lens.expand(2))

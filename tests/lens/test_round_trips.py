@@ -16,6 +16,7 @@ from lens_examples import (
     points_around,
     random_lens,
 )
+from torch import Tensor
 from torch.utils import _pytree as pytree
 
 from darswin.lens import MODELS, BrownConrady, Mei, Spherical, cat, from_dict, load, save, to_dict
@@ -30,18 +31,18 @@ OMNIDIR = Mei(double(1.72), 1040.0, double(-0.18, -0.5595), tangential=double(0.
 
 
 @pytest.mark.parametrize("name", MODELS)
-def test_unproject_undoes_project_on_the_whole_valid_range(name):
+def test_unproject_undoes_project_and_finds_nothing_beyond(name):
     generator = torch.Generator().manual_seed(5)
     near = double(0, 1e-12, 1e-9, 1e-6, 1e-3)
     fractions = torch.cat((near, torch.linspace(0.01, 1, 997, dtype=f64), 1 - near))
-    for _ in range(25):
+    nowhere = double(-1e-3, -1, -1e9, math.inf, -math.inf, math.nan).expand(4, -1)
+    for _ in range(5):
         lens = example(name, generator)
         assert torch.equal(lens.theta_max, lens.theta_limit)
         theta = (lens.theta_max[:, None] * fractions).sort(dim=1).values
         radius = lens.project(theta)
-        assert radius.isfinite().all()
         evenly = lens.theta_max[:, None] * torch.linspace(0, 0.999, 1000, dtype=f64)
-        assert (lens.project(evenly).diff(dim=1) > 0).all()
+        assert radius.isfinite().all() and (lens.project(evenly).diff(dim=1) > 0).all()
         found = lens.unproject(radius)
         if name == "OCamInverse":  # its polynomial need not be 0 at θ = 0
             theta, found = theta[:, 5:], found[:, 5:]
@@ -49,25 +50,19 @@ def test_unproject_undoes_project_on_the_whole_valid_range(name):
             small = found[:, 1:6] - theta[:, 1:6]
             assert (small.abs() <= 1e-9 * theta[:, 1:6]).all()
         assert (found - theta).abs().max() < 1e-9
-
-
-@pytest.mark.parametrize("name", MODELS)
-def test_radii_that_no_ray_up_to_theta_max_reaches_have_no_angle(name):
-    lens = example(name, torch.Generator().manual_seed(10))
-    for end in (1.0, 0.5):
-        used = lens.with_theta_max(end * lens.theta_limit)
-        beyond = double(-1e-3, -1, -1e9, math.inf, -math.inf, math.nan).expand(4, -1)
-        # At the limit r may rise so steeply that it is known to 1e-9 only.
-        more = double(1.5, 1e6) if end == 1 else double(1 + 1e-9, 1.5, 1e6)
-        beyond = torch.cat((beyond, used.r_max[:, None] * more), 1)
-        assert used.unproject(beyond).isnan().all()
-        assert used.unproject(used.r_max[:, None]).isfinite().all()
+        for end in (1.0, 0.5):
+            used = lens.with_theta_max(end * lens.theta_limit)
+            # At the limit r may rise so steeply that it is known to 1e-9 only.
+            more = double(1.5, 1e6) if end == 1 else double(1 + 1e-9, 1.5, 1e6)
+            beyond = torch.cat((nowhere, used.r_max[:, None] * more), 1)
+            assert used.unproject(beyond).isnan().all()
+            assert used.unproject(used.r_max[:, None]).isfinite().all()
 
 
 # -- rays and pixels ----------------------------------------------------------------------------
 
 
-def rays_of(lens, rings=60, spokes=72):
+def rays_of(lens, rings=40, spokes=72):
     """θ (N, rings, 1), up to θ_max itself, and φ (1, 1, spokes)."""
     near = 1 - double(1e-3, 1e-5, 1e-7)
     fractions = torch.cat((torch.linspace(0.01, 1, rings - 3, dtype=f64), near))
@@ -75,26 +70,23 @@ def rays_of(lens, rings=60, spokes=72):
     return (lens.theta_max[:, None] * fractions)[..., None], azimuth[None, None]
 
 
-def check_rays(lens):
+@pytest.mark.parametrize(
+    "name",
+    [*ASIDE, "omnidir", "kitti360_02.yaml", "kitti360_03.yaml",
+     *((name, aside) for name in RANDOM[:4] for aside in (1, 10))],
+)  # fmt: skip
+def test_every_ray_is_found(name):
+    if isinstance(name, tuple):
+        lens = random_lens(name[0], 0, name[1])
+    else:
+        lens = ASIDE.get(name) or (OMNIDIR if name == "omnidir" else calibrated(name))
+    lens = lens.with_theta_max(None)
     theta, azimuth = rays_of(lens)
     found, direction = lens.unproject_pixels(lens.project_rays(theta, azimuth, (1, 1)), (1, 1))
     # Where a curve turns, an angle is known to the root of what the pixel is.
     assert (found - theta).abs().max() < 1e-8
     off = torch.remainder(direction - azimuth + math.pi, 2 * math.pi) - math.pi
     assert off.abs().max() < 1e-9
-
-
-@pytest.mark.parametrize("name", [*ASIDE, "omnidir", "kitti360_02.yaml", "kitti360_03.yaml"])
-def test_every_ray_of_a_calibration_is_found(name):
-    lens = ASIDE.get(name) or (OMNIDIR if name == "omnidir" else calibrated(name))
-    check_rays(lens.with_theta_max(None))
-
-
-@pytest.mark.parametrize("aside", [1, 10])
-@pytest.mark.parametrize("name", RANDOM[:4])
-def test_every_ray_of_random_lenses_is_found(name, aside):
-    for seed in range(3):
-        check_rays(random_lens(name, seed, aside))
 
 
 def area(lens, theta, azimuth):
@@ -161,11 +153,11 @@ def test_a_pixel_outside_the_circle_has_no_ray_and_no_gradient():
 
 
 def test_rays_are_found_in_inference_mode():
-    for lens in ASIDE.values():
-        expected = lens.unproject_pixels(lens.project_rays(0.5, 0.3))
-        with torch.inference_mode():
-            found = lens.to(f64).unproject_pixels(lens.project_rays(0.5, 0.3))
-        torch.testing.assert_close(found, expected)
+    lens = ASIDE["Mei"]
+    expected = lens.unproject_pixels(lens.project_rays(0.5, 0.3))
+    with torch.inference_mode():
+        found = lens.to(f64).unproject_pixels(lens.project_rays(0.5, 0.3))
+    torch.testing.assert_close(found, expected)
 
 
 # -- points -------------------------------------------------------------------------------------
@@ -242,7 +234,7 @@ def check(exact, lens):
 
 
 LENSES = {
-    **{f"random {n}": lambda n=n: random_lens(n, 1, 0.4, 16) for n in RANDOM},
+    **{f"random {n}": lambda n=n: random_lens(n, 1, 0.4, 6) for n in RANDOM},
     **{n: lambda n=n: example(n, torch.Generator().manual_seed(1), (100, 600)) for n in MODELS},
     **{f"aside {n}": lambda n=n: ASIDE[n] for n in ASIDE},
     **{name: lambda name=name, camera=camera: calibrated(name, camera)
@@ -277,15 +269,18 @@ def test_conversions(convert, tmp_path):
     check(PINHOLE, convert(PINHOLE, tmp_path))
 
 
-@pytest.mark.parametrize("how", ["pytree", "replace", "cat"])
-def test_unchecked_conversions_find_the_same_rays(how):
+@pytest.mark.parametrize(
+    "convert",
+    [
+        lambda lens: pytree.tree_map_only(torch.Tensor, Tensor.float, lens),
+        lambda lens: lens.replace(**{name: t.float() for name, t in lens._tensors().items()}),
+        lambda lens: cat([lens.to(torch.float32), lens])[0],
+    ],
+    ids=["pytree", "replace", "cat"],
+)
+def test_unchecked_conversions_find_the_same_rays(convert):
     """Their θ_max may be beyond what float32 can represent."""
-    if how == "pytree":
-        lens = pytree.tree_map(lambda tensor: None if tensor is None else tensor.float(), PINHOLE)
-    elif how == "replace":
-        lens = PINHOLE.replace(**{name: t.float() for name, t in PINHOLE._tensors().items()})
-    else:
-        lens = cat([PINHOLE.to(torch.float32), PINHOLE])[0]
+    lens = convert(PINHOLE)
     theta, _ = PINHOLE.unproject_pixels(PIXELS)
     found, _ = lens.unproject_pixels(PIXELS.to(lens.theta_max.dtype))
     assert not theta.isnan().any()

@@ -5,11 +5,11 @@ import gc
 import io
 import json
 import random
-import struct
 import time
 import zipfile
 from itertools import pairwise
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -18,12 +18,12 @@ from helpers import changed
 from lens_examples import FILES, f64, file_text, loads
 
 from darswin.lens import load, load_all
-from darswin.lens.files import colmap
 
 K = [500.0, 0, 320, 0, 510, 240, 0, 0, 1]
 D = [-0.3, 0.1, 0.001, -0.002, 0.01]
 FRAME = {"fl_x": 800.0, "fl_y": 800.0, "cx": 320.0, "cy": 240.0, "w": 640, "h": 480}
 COLMAP = "".join(f"{i} SIMPLE_FISHEYE 640 480 {100 * i} 320 240\n" for i in (1, 2, 5, 7))
+TUMVI = file_text("kalibr_tumvi.yaml")
 
 
 def opencv(**entries):
@@ -43,176 +43,168 @@ def message(binning=(0, 0), roi=(0, 0, 0, 0), **entries):
     )  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    "case",
-    [
-        (changed("woodscape.json", '"k2": -17.5', '"k2": "abc"'),
-         r"^WoodScape calibration .*f: intrinsic.k2 must be a finite number, got 'abc'$"),
-        (changed("woodscape.json", '"k2": -17.5,', ""), "intrinsic.k2 is missing, it must"),
-        (changed("woodscape.json", "350.4", "0.0035"), "intrinsic.k1 must be in pixels"),
-        (changed("woodscape.json", "radial_poly", "kb"), 'must be "radial_poly", got \'kb\''),
-        (changed("woodscape.json", "966.0", "966.5"), "height must be a whole number"),
-        (changed("woodscape.json", "966.0", "NaN"), "intrinsic.height must be .*, got nan"),
-        (changed("woodscape.json", '"poly_order": 4', '"poly_order": 5'), "intrinsic.k5 is"),
-        (changed("woodscape.json", '"poly_order": 4', '"poly_order": 0'), "must be 1 to 16"),
-        (changed("woodscape.json", "1280.0", "1280.0,,"), "it is no JSON: .*line 17"),
-        (changed("kitti360_02.yaml", "MEI", "CATA"), "KITTI-360 .*: model_type must be one"),
-        (changed("kitti360_02.yaml", "   xi: ", "   x: "), "mirror_parameters.xi is missing"),
-        (changed("kitti360_02.yaml", "2.3500000000000001e+00", "-2"), "xi must be finite an"),
-        (changed("kitti360_02.yaml", "gamma1: 1.3900000000000000e+03", "gamma1: 0"),
-         "gamma1 must be .* above 0"),
-        (changed("kalibr_ds.yaml", "  intrinsics: [-0.21350274, ", "  intrinsics: ["),
-         r"Kalibr .*: cam0.intrinsics must be 6 finite numbers, got \['0.578016'"),
-        (changed("kalibr_ds.yaml", "distortion_model: none", "distortion_model: radtan"),
-         "must be one of none"),
-        (changed("kalibr_ds.yaml", "camera_model: ds", "camera_model: dss"), "eucm, got 'dss'"),
-        (changed("kalibr_ds.yaml", "331.24405", "-3"), r"cam0.intrinsics\[2\] must be a foc"),
-        (changed("kalibr_ds.yaml", "1080]", "abc]"), r"cam0.resolution\[1\] must be a whole"),
-        (file_text("kalibr_tumvi.yaml").replace("camera_model", "model", 1),
-         "cam0.camera_model is missing", 0),
-        (changed("ros_fisheye.yaml", "equidistant", "magic"),
-         "ROS .*: distortion_model must be one of brownconrady,.*, got 'magic'; or give model="),
-        (changed("ros_fisheye.yaml", "0.007163902584170265]", "0.009, 0.1]"), "got 5"),
-        (changed("opencv_fisheye.yaml", "4.2134e+02, ", "-1, "), r"camera_matrix must be \["),
-        (changed("opencv_fisheye.yaml", "fisheye_model: 1", "fisheye_model: 7"),
-         "must be 0 or 1, got"),
-        (changed("opencv_fisheye.yaml", "image_height: 960", ""), "image_height is missing"),
-        (changed("opencv_omnidir.xml", "</xi>", ""), "it is no XML: .*mismatched tag"),
-        (changed("opencv_omnidir.xml", "1.2345", "abc"), "xi must be 1 finite|xi.*'abc'"),
-        (changed("ocamcalib.txt", "13 605", "12 605"),
-         "OCamCalib .*: the inverse polynomial must be the number of its coefficients"),
-        (changed("ocamcalib.txt", "1440 1440", ""), "the center .* must be 2 numbers"),
-        (changed("ocamcalib.txt", "1440 1440\n", "\n1 2\n3 4\n"), "must have 5 lines of num"),
-        (changed("ocamcalib.txt", "723.600000", "x"), "the center .* 2 numbers, got 'x'"),
-        (changed("colmap.txt", " 3008", ""), "camera '1', OPENCV_FISHEYE must have 8"),
-        (changed("colmap.txt", "OPENCV_FISHEYE", "EQUI"), "model must be one of SIMPLE_PIN"),
-        (changed("colmap.txt", "1504", "NaN"), "camera '1', cx must be .*, got 'NaN'"),
-        (COLMAP + "2 SIMPLE_FISHEYE 640 480 400 320 240", "one camera '2', got two"),
-        (changed("nerfstudio.json", "OPENCV_FISHEYE", "EQUI"), "camera_model must be one of"),
-        (changed("nerfstudio.json", '"fl_y": 852.9,', ""), "fl_y is missing"),
-        (changed("nerfstudio_frames.json", '"fl_x": 612.0,', ""), r"frames\[2\].fl_x is missing"),
-        (changed("nerfstudio_frames.json", "images/2", "images/1"), "that of another frame"),
-        (changed("nerfstudio_frames.json", '"camera_m', '"is_fisheye": true, "camera_m'),
-         "is_fisheye is true, and camera_model must not be OPENCV"),
-        (changed("basalt.json", '"eucm"', '"eucn"'),
-         r"value0.intrinsics\[0\].camera_type must be one of ds, eucm, .*, got 'eucn'", 0),
-        (changed("basalt.json", "[960, 960], ", ""), "value0.resolution must be 5 pairs of a", 0),
-        (changed("basalt.json", '"k3": -0.214', '"k3": []'),
-         r"value0.intrinsics\[3\].intrinsics.k3 must be a finite number, got \[\]", 3),
-        (changed("ours.json", '"focal": 300.0,', ""), "darswin .*: focal is missing"),
-        (changed("ours.json", '"radial"', '"k"'), "k is not of a KannalaBrandt lens, which"),
-        (changed("ours.json", "KannalaBrandt", "Kb"), "\"model\" must be .*, got 'Kb'"),
-        (changed("ours.json", "1.01]]", "1.01, 2]]"), "affine must have rows of one length"),
-        (changed("ours.json", "1.01]]", "0]]"), "affine must be invertible"),
-        (changed("ours.json", "1.6", "3.3"), "theta_max must be at most 3.14"),
-        ("{}", 'must be of one of the formats .*"model" must be one of .*, got None'),
-        ("[1, 2]", "it must be a mapping"),
-        ("word", "it must be a mapping"),
-        ("", "it must not be empty"),
-        (" \n\t\n", "it must not be empty"),
-        ("a: [1, 2", "it is no YAML: line 1: expected"),
-        ("a: 1\n---\nb: 1", "it is no YAML"),
-        ("a: \x00", "it is no YAML"),
-        ('a: "\\UFFFFFFFF"', "it is no YAML"),
-        # Numbers that nobody reads, which may be coefficients.
-        (changed("woodscape.json", '"k4"', '"k5": 1.5, "k4"'), r"no place .*nsic.k5$"),
-        (changed("woodscape.json", "aspect_ratio", "aspect"), r"no place .*sic.aspect$"),
-        (changed("nerfstudio.json", '"k4": -0.0001', '"k_4": 0.1'), "k4 is missing"),
-        (changed("nerfstudio.json", '"camera_m', '"k5": 0.1, "camera_m'), "FISHEYE .* k5$"),
-        (changed("nerfstudio.json", '"camera_m', '"distortion_params": [0.1], "camera_m'),
-         "numbers of distortion_params$"),
-        (changed("kalibr_ds.yaml", "distortion_coeffs: []", "distortion_coeffs: [0.1, 0.2, 0, 0]"),
+# Of each file: what is replaced, by what, and what the error then says.
+CHANGED = {
+    "woodscape.json": (
+        ('"k2": -17.5', '"k2": "abc"', "intrinsic.k2 must be a finite number, got 'abc'"),
+        ('"k2": -17.5,', "", "WoodScape calibration in a string: intrinsic.k2 is missing"),
+        ("350.4", "0.0035", "intrinsic.k1 must be in pixels"),
+        ("radial_poly", "kb", "must be \"radial_poly\", got 'kb'"),
+        ("966.0", "966.5", "intrinsic.height must be a whole number of pixels"),
+        ("966.0", "NaN", "got nan"),
+        ('"poly_order": 4', '"poly_order": 5', "intrinsic.k5 is missing"),
+        ('"poly_order": 4', '"poly_order": 0', "intrinsic.poly_order must be 1 to 16"),
+        ("1280.0", "1280.0,,", "line 17"),
+        ('"k4"', '"k5": 1.5, "k4"', "no place for the numbers of intrinsic.k5"),
+        ("aspect_ratio", "aspect", "no place for the numbers of intrinsic.aspect"),
+        ('"k2"', '"k1": 300.0, "k2"', "'k1' stands there twice"),
+    ),
+    "kitti360_02.yaml": (
+        ("MEI", "CATA", "model_type must be one of MEI, KANNALA_BRANDT, PINHOLE, SCARAMUZZA"),
+        ("   xi: ", "   x: ", "mirror_parameters.xi is missing"),
+        ("2.3500000000000001e+00", "-2", "xi must be finite and at least 0"),
+        ("gamma1: 1.3900000000000000e+03", "gamma1: 0", "gamma1 must be a finite number above 0"),
+        ("   k2:", "   k1: 0.1\n   k2:", "'k1' stands there twice"),
+    ),
+    "camodocal_pinhole.yaml": (
+        ("   p1:", "   k3: 0.1\n   p1:", "numbers of distortion_parameters.k3"),
+    ),
+    "camodocal_kb.yaml": (("projection_p", "distortion_p:\n  k1: 0.1\nprojection_p",
+                           "numbers of distortion_p"),),
+    "camodocal_scaramuzza.yaml": (
+        ("inv_poly_parameters", "inverse", "numbers of inverse"),
+        ("p1: 505.8", "p1: 5058.", "inverse polynomial must give back"),
+    ),
+    "kalibr_ds.yaml": (
+        ("  intrinsics: [-0.21350274, ", "  intrinsics: [", "cam0.intrinsics must be 6 finite"),
+        ("distortion_model: none", "distortion_model: radtan", "must be one of none"),
+        ("camera_model: ds", "camera_model: dss", "must be one of pinhole, omni, ds, eucm, got"),
+        ("331.24405", "-3", "cam0.intrinsics[2] must be a focal length above 0"),
+        ("1080]", "abc]", "cam0.resolution[1] must be a whole number"),
+        ("distortion_coeffs: []", "distortion_coeffs: [0.1, 0.2, 0, 0]",
          "none camera has no place for the numbers of cam0.distortion_coeffs"),
-        (changed("camodocal_pinhole.yaml", "   p1:", "   k3: 0.1\n   p1:"), "no place .*k3$"),
-        (changed("camodocal_kb.yaml", "projection_p", "distortion_p:\n  k1: 0.1\nprojection_p"),
-         "KANNALA_BRANDT has no place for the numbers of distortion_p$"),
-        (changed("camodocal_scaramuzza.yaml", "inv_poly_parameters", "inverse"),
-         "SCARAMUZZA has no place for the numbers of inverse$"),
-        (changed("basalt.json", '"k4": 0.083', '"k4": 0.083, "k5": 0.1'), r"kb4 has no .*\.k5$", 3),
-        # Twice there.
-        (changed("kitti360_02.yaml", "   k2:", "   k1: 0.1\n   k2:"), "'k1' stands there tw"),
-        (changed("woodscape.json", '"k2"', '"k1": 300.0, "k2"'), "'k1' stands there twice"),
-        (changed("opencv_omnidir.xml", "<xi>", "<xi>1.1</xi><xi>"), "'xi' stands there tw"),
-        # Which camera.
-        (file_text("kalibr_tumvi.yaml"), "several cameras, choose one as camera=: 'cam0', 'cam1'"),
-        *((file_text("kalibr_tumvi.yaml"), "one of 'cam0', 'cam1', or its number", camera)
-          for camera in ("cam2", 2, "2", -1, 1.5)),
-        *((COLMAP, "camera must be one of '1', '2', '5', '7', got", camera)
-          for camera in ("0", "3", 3, "-1", "4", True, 1.0)),
-    ],
-)  # fmt: skip
-def test_errors_say_what_is_wrong(case, tmp_path):
-    text, message, *camera = case
-    path = tmp_path / "f"
-    path.write_text(text)
-    with pytest.raises(ValueError, match=message) as error:
-        load(path, camera=camera[0] if camera else None)
-    assert str(path) in str(error.value) and len(str(error.value)) < 1000
-
-
-NO_MODEL = r"may be cv2.fisheye's \(k1 to k4\) or a pinhole's \(k1, k2, p1, p2\).*model=\"fisheye\""
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        # A model, and no coefficients under any name.
-        (opencv(distortion_model="plumb_bob", lens=D), "D is missing.*distortion_model, lens"),
-        (opencv(fisheye_model=1), r"D is missing; write D: \[\] if the camera has none"),
+    ),
+    "ros_fisheye.yaml": (
+        ("equidistant", "magic", "got 'magic'; or give model="),
+        ("0.007163902584170265]", "0.009, 0.1]", "got 5"),
+    ),
+    "opencv_fisheye.yaml": (
+        ("4.2134e+02, ", "-1, ", "camera_matrix must be [fx, skew, cx"),
+        ("fisheye_model: 1", "fisheye_model: 7", "must be 0 or 1, got"),
+        ("image_height: 960", "", "image_height is missing"),
+    ),
+    "opencv_omnidir.xml": (
+        ("</xi>", "", "it is no XML: mismatched tag"),
+        ("1.2345", "abc", "'abc'"),
+        ("<xi>", "<xi>1.1</xi><xi>", "'xi' stands there twice"),
+    ),
+    "ocamcalib.txt": (
+        ("13 605", "12 605", "the inverse polynomial must be the number of its coefficients"),
+        ("1440 1440", "", "the center (row and column) must be 2 numbers"),
+        ("1440 1440\n", "\n1 2\n3 4\n", "it must have 5 lines of numbers"),
+        ("723.600000", "x", "2 numbers, got 'x'"),
+    ),
+    "colmap.txt": (
+        (" 3008", "", "camera '1', OPENCV_FISHEYE must have 8 parameters"),
+        ("OPENCV_FISHEYE", "EQUI", "model must be one of SIMPLE_PINHOLE"),
+        ("1504", "NaN", "camera '1', cx must be a finite number, got 'NaN'"),
+    ),
+    "nerfstudio.json": (
+        ("OPENCV_FISHEYE", "EQUI", "camera_model must be one of"),
+        ('"fl_y": 852.9,', "", "fl_y is missing"),
+        ('"k4": -0.0001', '"k_4": 0.1', "k4 is missing beside k3"),
+        ('"camera_m', '"k5": 0.1, "camera_m', "numbers of k5"),
+        ('"camera_m', '"distortion_params": [0.1], "camera_m', "numbers of distortion_params"),
+    ),
+    "nerfstudio_frames.json": (
+        ('"fl_x": 612.0,', "", "frames[2].fl_x is missing"),
+        ("images/2", "images/1", "that of another frame"),
+        ('"camera_m', '"is_fisheye": true, "camera_m', "camera_model must not be OPENCV then"),
+    ),
+    "basalt.json": (("[960, 960], ", "", "value0.resolution must be 5 pairs of a width"),),
+    "ours.json": (
+        ('"focal": 300.0,', "", "focal is missing"),
+        ('"radial"', '"k"', "k is not of a KannalaBrandt lens, which has"),
+        ("KannalaBrandt", "Kb", "got 'Kb'"),
+        ("1.01]]", "1.01, 2]]", "affine must have rows of one length"),
+        ("1.01]]", "0]]", "affine must be invertible"),
+        ("1.6", "3.3", "theta_max must be at most 3.14"),
+    ),
+}  # fmt: skip
+OPEN = "may be cv2.fisheye's (k1 to k4) or a pinhole's (k1, k2, p1, p2)"
+# A text, what its error says, and of which camera or with which model.
+TEXTS = (
+    (changed("basalt.json", '"eucm"', '"eucn"'),
+     "value0.intrinsics[0].camera_type must be one of ds, eucm", dict(camera=0)),
+    (changed("basalt.json", '"k3": -0.214', '"k3": []'),
+     "value0.intrinsics[3].intrinsics.k3 must be a finite number, got []", dict(camera=3)),
+    (changed("basalt.json", '"k4": 0.083', '"k4": 0.083, "k5": 0.1'), "kb4 has no place",
+     dict(camera=3)),
+    (TUMVI.replace("camera_model", "model", 1), "cam0.camera_model is missing", dict(camera=0)),
+    (COLMAP + "2 SIMPLE_FISHEYE 640 480 400 320 240", "one camera '2', got two"),
+    ("{}", 'one of the formats darswin, WoodScape'), ("[1, 2]", "it must be a mapping"),
+    ("word", "it must be a mapping"), ("", "it must not be empty"), (" \n\t\n", "be empty"),
+    ("a: [1, 2", "it is no YAML: line 1: expected"), ("a: 1\n---\nb: 1", "it is no YAML"),
+    ("a: \x00", "it is no YAML"), ('a: "\\UFFFFFFFF"', "it is no YAML"),
+    # Which camera.
+    (TUMVI, "several cameras, choose one as camera=: 'cam0', 'cam1'"),
+    *((TUMVI, "one of 'cam0', 'cam1', or its number", dict(camera=camera))
+      for camera in ("cam2", 2, "2", -1, 1.5)),
+    *((COLMAP, "camera must be one of '1', '2', '5', '7', got", dict(camera=camera))
+      for camera in ("0", "3", 3, "-1", "4", True, 1.0)),
+    # Which model.
+    (opencv(D=D[:4]), "the coefficients of D " + OPEN),
+    (opencv(D=D[:4]), "xi is missing", dict(model="omnidir")),
+    (opencv(D=D[:4]), "model must be one of fisheye, pinhole, omnidir", dict(model="x")),
+    (file_text("woodscape.json"), "its cameras say their model", dict(model="fisheye")),
+    (flat("k1", "k2"), "the coefficients of k1, k2 " + OPEN),
+    (flat(), "a camera without coefficients " + OPEN),
+    (flat("k1", "k2", "k3", "k4", model="pinhole"), "k4 of the pinhole model is of its denom"),
+    (flat("k1", "k2", "k3", "k4", "p1", model="fisheye"), "fisheye model has no p1"),
+    (flat("k1", "k2", "k3", "k4", "k5"), "the coefficients of k1, k2, k3, k4, k5 " + OPEN),
+    (flat("k1", "k2", "k3", "k4", "D0"), "the fisheye model has no place for the numbers of D0"),
+    (flat("k1", "k2", "k3", "k4", fx=-1), "fx must be a finite number above 0, got -1"),
+    (flat("k1", "k3", "k4", k2=None), "k2 must be a finite number, got None"),
+    (flat("k1", "k2", model="magic"), "got 'magic'"),
+    (flat("k1", "k2", xi="a"), "xi must be a finite number"),
+    # Which part of the sensor.
+    (message((-1, 1)), "binning_x must be a whole number of pixels, 0 to"),
+    (message((1, 1.5)), "binning_y must be a whole number of pixels, 0 to"),
+    (message((1, 481)), "binning must leave a pixel, got 1 by 481 as one"),
+    (message(roi=(5, 0, 0, 0)), "roi must be a region of the image of 1 pixel or more"),
+    (message(roi=(0, 0, 641, 9)), "641×9 px at (0, 0)"),
+    (message(roi=(-1, 0, 10, 9)), "roi.x_offset must be a whole number of pixels"),
+    (message(roi=(0, 0, "a", 9)), "roi.width must be a whole number"),
+    # Coefficients that stand under no name, or under one that nobody reads: never left out.
+    *((text, said, dict(model=model)) for model in (None, "pinhole") for text, said in (
+        (opencv(distortion_model="plumb_bob", lens=D), "D is missing"),
+        (opencv(fisheye_model=1), "write D: [] if the camera has none"),
         (opencv(xi=1.2), "distortion_coefficients or D is missing"),
-        # Coefficients that nobody reads.
-        (opencv(distortion_model="plumb_bob", D0=D), "must stand in one entry, .*got D0"),
-        (opencv(model="pinhole", k1=-0.3, k2=0.1), "must stand in one entry, .*got k1, k2"),
-        (opencv(D=D, my_distortion_x=[0.1]), "must stand in one entry, .*got my_distortion_x"),
-        (opencv(D=D, rational_coefs={"data": "0.1 0.2"}), "one entry, .*got rational_coefs"),
-        (opencv(D=D, dist_coeffs=D), "coefficients must stand in one entry, got D, dist_coeffs"),
+        (opencv(distortion_model="plumb_bob", D0=D), "must stand in one entry, such as"),
+        (opencv(model="pinhole", k1=-0.3, k2=0.1), "got k1, k2"),
+        (opencv(D=D, my_distortion_x=[0.1]), "got my_distortion_x"),
+        (opencv(D=D, rational_coefs={"data": "0.1 0.2"}), "got rational_coefs"),
+        (opencv(D=D, dist_coeffs=D), "must stand in one entry, got D, dist_coeffs"),
         (opencv(distortion={"k1": 0.1, "k2": 0.2}, fisheye=0), "distortion.data is missing"),
         (opencv(fisheye=0, D="", ts=D), "D must be 0 or 4 or 5 or 8 or 12 or 14 finite numbers"),
-        (opencv(fisheye=0, D={"data": ""}, ts=D), "D.data must be 0 or 4 or 5 or .*, got None"),
-        (opencv(fisheye=0, D=[*D, 0, 0, 0, 0, 0, 0, 0, 0.1, 0]), "a tilted sensor is not suppor"),
-        # Matrices that do not agree with themselves or each other.
-        (
-            opencv(D={"rows": 1, "cols": 5, "data": D[:4]}, fisheye=0),
-            "must be 1 × 5 numbers, got 4",
-        ),
+        (opencv(fisheye=0, D={"data": ""}, ts=D), "D.data must be 0 or 4 or 5"),
+        (opencv(fisheye=0, D=[*D, 0, 0, 0, 0, 0, 0, 0, 0.1, 0]), "a tilted sensor is not sup"),
+        (opencv(D={"rows": 1, "cols": 5, "data": D[:4]}, fisheye=0), "must be 1 × 5 numbers"),
         (opencv(D=D, camera_matrix=[501.0, *K[1:]]), "K and camera_matrix must be the same"),
-    ],
-)
-def test_coefficients_are_never_left_out(text, message):
-    for model in (None, "pinhole"):
-        with pytest.raises(ValueError, match=message):
-            loads(text, model=model)
+    )),
+)  # fmt: skip
+CASES = [*TEXTS, *(
+    (changed(name, old, new), said) for name, rows in CHANGED.items() for old, new, said in rows
+)]  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    ("text", "model", "message"),
-    [
-        (opencv(D=D[:4]), None, "the coefficients of D " + NO_MODEL),
-        (opencv(D=D[:4]), "omnidir", "xi is missing"),
-        (opencv(D=D[:4]), "x", "model must be one of fisheye, pinhole, omnidir, got 'x'"),
-        (file_text("woodscape.json"), "fisheye", "its cameras say their model"),
-        (flat("k1", "k2"), None, "the coefficients of k1, k2 " + NO_MODEL),
-        (flat(), None, "a camera without coefficients " + NO_MODEL),
-        (flat("k1", "k2", "k3", "k4", model="pinhole"), None, "k4 of the pinhole model is of its"),
-        (flat("k1", "k2", "k3", "k4", "p1", model="fisheye"), None, "fisheye model has no p1"),
-        (flat("k1", "k2", "k3", "k4", "k5"), None, "the coefficients of k1, .* may be"),
-        (flat("k1", "k2", "k3", "k4", "D0"), None, "the fisheye model has no place for the numb"),
-        (flat("k1", "k2", "k3", "k4", fx=-1), None, "fx must be a finite number above 0, got -1"),
-        (flat("k1", "k3", "k4", k2=None), None, "k2 must be a finite number, got None"),
-        (flat("k1", "k2", model="magic"), None, "model must be one of .*, got 'magic'"),
-        (flat("k1", "k2", xi="a"), None, "xi must be a finite number"),
-        (message((-1, 1)), None, "binning_x must be a whole number of pixels, 0 to .*, got '-1'"),
-        (message((1, 1.5)), None, r"binning_y must be a whole number of pixels, .*, got '1\.5'"),
-        (message((1, 481)), None, "binning must leave a pixel, got 1 by 481 as one"),
-        (message(roi=(5, 0, 0, 0)), None, "roi must be a region of the image of 1 pixel or more"),
-        (message(roi=(0, 0, 641, 9)), None, r"roi must be .*, got 641×9 px at \(0, 0\)"),
-        (message(roi=(-1, 0, 10, 9)), None, "roi.x_offset must be a whole number of pixels"),
-        (message(roi=(0, 0, "a", 9)), None, "roi.width must be a whole number .*, got 'a'"),
-    ],
-)
-def test_what_a_file_of_opencv_ros_or_single_numbers_lacks(text, model, message):
-    with pytest.raises(ValueError, match=message):
-        loads(text, model=model)
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case[1][-40:])
+def test_errors_say_what_is_wrong(case):
+    text, said, *options = case
+    with pytest.raises(ValueError) as error:
+        loads(text, **dict(*options))
+    assert said in str(error.value) and "calibration in a string: " in str(error.value)
+    assert len(str(error.value)) < 1000
 
 
 def test_paths(tmp_path):
@@ -222,7 +214,7 @@ def test_paths(tmp_path):
         with pytest.raises(ValueError, match="it must be a file"):
             load(path)
     (tmp_path / "large").write_bytes(b" " * ((16 << 20) + 1))
-    with pytest.raises(ValueError, match="at most 16 MiB"):
+    with pytest.raises(ValueError, match=r"calibration /.*large: it must be at most 16 MiB"):
         load(tmp_path / "large")
     (tmp_path / "latin").write_bytes("name: caf\xe9".encode("latin-1"))
     with pytest.raises(ValueError, match=r"must be text in UTF-8: .* 0xe9"):
@@ -240,38 +232,24 @@ INVERSE = ("320.321696 164.783531 -14.771348 31.623465 8.044023 -1.452569 13.685
            "-9.709705 2.309502 5.628928 1.507985")  # fmt: skip
 
 
-def ocam(direct, inverse, size="480 752"):
-    lines = [f"{len(p.split())} {p}" for p in (direct, inverse)]
-    height, width = map(int, size.split())
-    return "\n".join([*lines, f"{height / 2} {width / 2}", "1 0 0", size])
+def ocam(direct, inverse):
+    lines = [f"{len(p.split())} {p}" for p in (direct, inverse) if p]
+    return "\n".join([*lines, "240 376", "1 0 0", "480 752"])
 
 
 def test_ocamcalibs_polynomials_are_held_against_each_other():
     assert loads(ocam(DIRECT, INVERSE), dtype=f64).project(0.0).abs().item() < 0.02
-    for wrong in (0, 1, 5):
-        words = INVERSE.split()
-        words[wrong] = str(10 * float(words[wrong]))
-        with pytest.raises(ValueError, match="inverse polynomial must give back the direct one's"):
-            loads(ocam(DIRECT, " ".join(words)))
-        words = DIRECT.split()
-        words[0 if wrong == 0 else 2] += "1"  # a digit to the exponent
-        with pytest.raises(ValueError, match=r"inverse polynomial must give back|such that a₀"):
-            loads(ocam(" ".join(words), INVERSE))
-    text = changed("camodocal_scaramuzza.yaml", "SCARAMUZZA", "scaramuzza")
-    assert type(loads(text)).__name__ == "OCamInverse"  # as LF-VIO's files write it
-    with pytest.raises(ValueError, match="inverse polynomial must give back"):
-        loads(text.replace("p1: 505.8", "p1: 5058."))
-
-
-def test_an_inverse_that_leaves_the_middle_of_the_image_out():
-    """Fitted to radii from 127 px on: -40 px at θ = 0. Without it the direct polynomial holds."""
-    direct = "-2.530000e+02 0 1.620000e-03 -1.550000e-06 3.900000e-09"
-    inverse = ("395.543775 260.322718 17.811437 23.778806 21.331835 7.443123 0.823603 2.526589 "
-               "3.870006 2.855098 -1.470720 -1.989770 1.083557 1.023780")  # fmt: skip
-    with pytest.raises(ValueError, match=r"got -39\.96.* for 0 px; the file without the inverse"):
-        loads(ocam(direct, inverse, "960 1280"))
-    lines = ocam(direct, inverse, "960 1280").splitlines()
-    assert type(loads("\n".join([lines[0], *lines[2:]]))).__name__ == "OCam"
+    assert type(loads(ocam(DIRECT, ""))).__name__ == "OCam"
+    lower = changed("camodocal_scaramuzza.yaml", "SCARAMUZZA", "scaramuzza")
+    assert type(loads(lower)).__name__ == "OCamInverse"  # as LF-VIO's files write it
+    for old, new in (("320.3", "3203"), ("320.3", "318.3"), ("164.7", "1647"), ("-1.45", "-14.5")):
+        with pytest.raises(
+            ValueError, match=r"must give back the direct one's .* px for [\d.]+ px"
+        ):
+            loads(ocam(DIRECT, INVERSE.replace(old, new)))
+    for old, new in (("e+02", "e+021"), ("e-03", "e-031")):
+        with pytest.raises(ValueError, match=r"must give back|such that a₀"):
+            loads(ocam(DIRECT.replace(old, new), INVERSE))
 
 
 # -- hostile and large files --------------------------------------------------------------------
@@ -306,11 +284,9 @@ def soon():
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("[" * 100_000, "nested"),
         ('{"a":' * 100_000, "nested"),
         ("a: " + "[" * 100_000, "nested"),
-        ("a: " + "{b: " * 20_000, "nested"),
-        ("<a>" * 50_000 + "</a>" * 50_000, "XML must be at most"),
+        ("<a>" * 50_000 + "</a>" * 50_000, "XML must be at most 256 KiB"),
         ("<a>" * 30_000 + "</a>" * 30_000, "XML must be at most 16 elements deep"),
         ("a: " + "1" * 300_000, "YAML must be at most 128 KiB"),
         (BOMB, "must be of one of the formats"),
@@ -342,6 +318,7 @@ def test_hostile_files_end_soon_and_run_nothing(text, message, tmp_path, monkeyp
     assert len(str(error.value)) < 1000 and not list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 def test_large_files_are_read_soon(tmp_path, frozen):
     with soon():
         assert loads(frames(9_000), camera="8888.png").focal.item() == 805
@@ -352,30 +329,40 @@ def test_large_files_are_read_soon(tmp_path, frozen):
     path = tmp_path / "cameras.txt"
     path.write_text("".join(rows))
     with soon():
-        lenses = load_all(path, dtype=f64)
-    for camera in ("1", "500", "1000"):
+        load_all(path)
+    # The first bad one is named, soon too.
+    rows[700] = rows[700].replace("310", "1e-300")
+    path.write_text("".join(rows))
+    with soon(), pytest.raises(ValueError, match=r"COLMAP calibration .*: camera '701': "):
+        load_all(path)
+
+
+def test_cameras_that_are_read_together_are_those_read_alone(tmp_path):
+    rows = [f"{i} OPENCV_FISHEYE 640 480 {300 + i} 310 320 240 0.01 -0.002 0.0003 0\n"
+            for i in range(9)]  # fmt: skip
+    path = tmp_path / "cameras.txt"
+    path.write_text("".join(rows))
+    lenses = load_all(path, dtype=f64)
+    for camera in ("0", "5", "8"):
         alone = load(path, camera=camera, dtype=f64)
         for name, value in alone._tensors().items():
             torch.testing.assert_close(getattr(lenses[camera], name), value, rtol=1e-12, atol=0)
-    # The first bad one is named, soon too.
-    rows[700] = rows[700].replace("0.01 ", "-9e9 ")
-    rows[900] = rows[900].replace("310", "1e-300")
+    for bad in (6, 8):
+        rows[bad] = rows[bad].replace("310", "1e-300")
     path.write_text("".join(rows))
-    with soon(), pytest.raises(ValueError, match=r"COLMAP calibration .*: camera '(701|901)': "):
+    with pytest.raises(ValueError, match=r"COLMAP calibration .*: camera '6': "):
         load_all(path)
-    assert load(path, camera="5").focal.item() == pytest.approx(300.5)
+    assert load(path, camera="5").focal.item() == 305
 
 
 @pytest.mark.parametrize("suffix", ["yaml", "xml", "json"])
 def test_a_calibration_with_its_image_points(suffix, tmp_path):
-    cv2 = pytest.importorskip("cv2")
     path = tmp_path / f"c.{suffix}"
     storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
-    points = np.random.default_rng(0).uniform(0, 1000, (60, 500, 2))
-    storage.write("image_points", points.astype(np.float32).reshape(60, 1000))
+    points = np.random.default_rng(0).uniform(0, 1000, (60, 1000)).astype(np.float32)
+    storage.write("image_points", points)
     storage.write("camera_matrix", np.reshape(K, (3, 3)))
     storage.write("distortion_coefficients", np.array([D]))
-    storage.write("grid_points", points[:1])
     storage.release()
     assert path.stat().st_size > 600_000
     with soon():
@@ -401,29 +388,20 @@ def test_binary_files_that_are_wrong(tmp_path):
     assert "it holds 3 bytes after its 17 cameras" in error_of(whole + b"abc")
     assert "cameras, got 4294967295" in error_of(b"\xff" * 4 + whole[4:])
     assert "to 16 (EUCM), got 17" in error_of(whole[:12] + bytes([17]) + whole[13:])
-    # Any bytes give a lens or a sentence. Each file holds one camera: a camera at a time is what a
-    # file of all is read as.
-    alone, place = [], 8
-    while place < len(whole):
-        (model,) = struct.unpack_from("<i", whole, place + 4)
-        end = place + 24 + 8 * len(colmap.MODELS[colmap.NUMBERED[model]][1].split())
-        alone.append(struct.pack("<Q", 1) + whole[place:end])
-        place = end
-    assert len(alone) == 17
     random.seed(0)
-    for _ in range(60):
-        data = bytearray(random.choice(alone))
+    for _ in range(60):  # any bytes give a lens or a sentence
+        data = bytearray(whole)
         data[random.randrange(len(data))] = random.randrange(256)
         path.write_bytes(data)
         with contextlib.suppress(ValueError):
-            load_all(path)
+            load(path, camera=random.choice([*range(1, 16), 17, 18]))
 
 
 def test_damaged_archives_are_refused_in_a_sentence(tmp_path):
     path, data = tmp_path / "calib.npz", io.BytesIO()
     np.savez(data, K=np.reshape(K, (3, 3)), D=D)
     rng = np.random.default_rng(0)
-    for _ in range(300):
+    for _ in range(100):
         broken = bytearray(data.getvalue())
         for place in rng.integers(4, len(broken), rng.integers(1, 4)):
             broken[place] = rng.integers(256)
