@@ -124,11 +124,12 @@ def test_augmentation_differs_from_image_to_image_and_epoch_to_epoch(folders):
     def noise(image, rng):
         return (image * 0 + rng.integers(256)).astype(np.uint8)
 
-    dataset = DATASETS["wide"](folders, augment=noise)
-    values = [dataset[Draw(e, i, i)][0][0, 0, 0].item() for e in range(3) for i in range(5)]
-    assert len(set(values)) > 12
-    erased = DATASETS["wide"](folders, erase=lambda image, rng: image * 0 + rng.random())
-    assert erased[0][0].unique().numel() == 1
+    dataset = DATASETS["wide"](
+        folders, augment=noise, erase=lambda image, rng: image + rng.random()
+    )
+    drawn = [dataset[Draw(e, i, i)][0] for e in range(3) for i in range(5)]
+    assert all(image.unique().numel() == 1 for image in drawn)
+    assert len({image[0, 0, 0].item() for image in drawn}) > 12
 
 
 @pytest.mark.parametrize("name", DATASETS)
@@ -156,10 +157,9 @@ def test_a_picture_that_cannot_be_read(folders, name):
         torch.testing.assert_close(lenses[1].project(0.5), lens.project(0.5), rtol=0.01, atol=0)
 
 
-@pytest.mark.parametrize("name", DATASETS)
-def test_unknown_framings(folders, name):
+def test_unknown_framings(folders):
     with pytest.raises(ValueError, match="framing must be 'crop' or 'stretch', got 'whole'"):
-        DATASETS[name](folders, framing="whole")
+        DATASETS["wide"](folders, framing="whole")
 
 
 # -- calibrated pictures ----------------------------------------------------------------------
@@ -201,9 +201,6 @@ def test_cameras_of_several_models_make_one_batch(folders):
     assert dataset.cameras.tolist() == [int(label == 1) for label in labels]
     _, lenses, _ = next(iter(DataLoader(dataset, len(dataset))))
     assert isinstance(lenses, Tabulated) and len(lenses) == len(dataset)
-    alone = Calibrated(frames(folders), Calibrations(WOODSCAPE), **GREY)[0][1]
-    theta = torch.linspace(0, 1.4, 9)
-    torch.testing.assert_close(lenses[0].project(theta), alone.project(theta))
 
 
 def test_pictures_without_files():
@@ -212,16 +209,6 @@ def test_pictures_without_files():
     source = Arrays(images, np.arange(4), list("abcd"), 1).limited(3)
     dataset = Calibrated(source, Calibrations(lens, "digits"), **GREY)
     assert dataset[0][1].r_max.item() == pytest.approx(12) and len(dataset) == 3
-
-
-def test_wrong_lenses(folders, tmp_path):
-    file = tmp_path / "lenses.json"
-    file.write_text(json.dumps({"1": str(WOODSCAPE)}))
-    with pytest.raises(ValueError, match=r"has no lens for .*\.png"):
-        Calibrated(frames(folders), Calibrations(file, folders / "frames"))
-    narrow = Calibrations(json.dumps(EQUIDISTANT | {"image_size": [50, 50]}))
-    with pytest.raises(ValueError, match=r"\.png: the lens is of pictures of 50×50 px"):
-        Calibrated(frames(folders), narrow, **GREY)[0]
 
 
 def test_partners_turn_together_and_share_a_lens_with_tangential_terms():

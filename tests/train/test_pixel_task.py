@@ -9,7 +9,7 @@ from frames import WOODSCAPE
 from scenes import write_plain
 
 from darswin.data import IGNORE
-from darswin.lens import Equidistant, KannalaBrandt, cat
+from darswin.lens import Equidistant, cat
 from darswin.lens.pixels import pixel_angles, solid_angles
 from darswin.train import pixel_task
 from darswin.train.pixel_task import Rays
@@ -149,7 +149,9 @@ def test_solid_angles_weigh_the_loss(folder):
     assert plain._loss(batch, None) != task._loss(batch, None)
 
 
-def test_lenses_of_a_batch_are_each_their_own():
+def test_lenses_of_a_batch_are_each_their_own_and_one_lens_is_computed_once(monkeypatch):
+    calls = []
+    monkeypatch.setattr(pixel_task, "pixel_angles", lambda *a: calls.append(a) or pixel_angles(*a))
     images, rays = torch.zeros(3, 1, 20, 24), Rays()
     several = Equidistant([8.0, 9.0, 10.0], 1.2)
     two, one = several[[0, 2, 2]], several[1]
@@ -159,19 +161,8 @@ def test_lenses_of_a_batch_are_each_their_own():
         each = lens if len(lens) == 3 else cat([lens] * 3)
         torch.testing.assert_close(angles, pixel_angles(each, (20, 24)), equal_nan=True)
         torch.testing.assert_close(areas, solid_angles(each, (20, 24)))
+    assert len(calls) == 5
     assert rays.of(two, torch.zeros(3, 1, 10, 12))[0].shape == (3, 10, 12)
-
-
-def test_the_rays_of_one_lens_are_computed_once_for_all_batches(monkeypatch):
-    calls = []
-    monkeypatch.setattr(pixel_task, "pixel_angles", lambda *a: calls.append(a) or pixel_angles(*a))
-    rays, images = Rays(), torch.zeros(2, 1, 8, 8)
-    radial = [KannalaBrandt(8.0, radial=[0.1, 0.0, 0.0, 0.0]) for _ in range(2)]
-    for lens in (*radial, cat(radial)):
-        rays.of(lens, images)
-    assert len(calls) == 1
-    rays.of(KannalaBrandt(8.0), images)
-    assert len(calls) == 2
 
 
 # -- targets of a training --------------------------------------------------------------------
@@ -252,12 +243,9 @@ def test_far_distances_are_not_known(folder):
 
 def test_the_order_of_the_data_is_that_of_the_seed(folder):
     options = dict(size=32, batch_size=4, workers=0, limit=9, lens_augmentation="0..1")
-    one, again = (LabelData(str(folder), **options) for _ in range(2))
-    batches = [target for _, _, target in one.train_dataloader()]
-    assert len(batches) == 2 and batches[0].shape == (4, 32, 32)
-    for (_, lens, target), before in zip(again.train_dataloader(), batches, strict=True):
-        assert torch.equal(target, before) and len(lens) == 4
-    assert (batches[0] == IGNORE).any()
+    one, again = (list(LabelData(str(folder), **options).train_dataloader()) for _ in range(2))
+    assert len(one) == 2 and one[0][2].shape == (4, 32, 32) and len(one[0][1]) == 4
+    assert all(torch.equal(a[2], b[2]) for a, b in zip(one, again, strict=True))
 
 
 def test_test_sets_have_the_classes_of_the_training(folder, tmp_path):
@@ -268,39 +256,34 @@ def test_test_sets_have_the_classes_of_the_training(folder, tmp_path):
     assert LabelData(str(folder), lens=str(WOODSCAPE), fit="stretch").frame_fit == "stretch"
 
 
+def of_task(path, name=NAME, size=None, **options):
+    return attached(Segmentation(name, **options), LabelData(path, size=size))
+
+
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda path: LabelData(path, crop=2.0), r"`crop` must be a share in \(0, 1\], got 2"),
         (lambda path: LabelData(path, lens_augmentation="odd"), "lenses must be one of"),
         (lambda path: DistanceData(path, max_distance=-1), "`max_distance` must be above 0, got"),
+        (lambda path: DistanceData(path, max_distance=0), "`max_distance` must be above 0, got"),
         (lambda _: Segmentation("swin_nano"), "`name` swin_nano is no model for `task` segm"),
         (lambda _: Segmentation(NAME, class_weights=[0.0, 0.0]), "and not all 0"),
         (lambda _: Segmentation(NAME, class_weights=[1.0, -1.0]), "at least 0, and not all 0"),
         (lambda _: Segmentation(NAME, label_smoothing=1), r"`label_smoothing` must be in \[0, 1\)"),
-        (lambda _: Segmentation(NAME, zones=[60, 30]), "`zones` must rise"),
         (
-            lambda path: attached(
-                Segmentation(NAME, class_weights=[1.0, 2.0]), LabelData(path)
-            )._head_options(),
+            lambda path: of_task(path, class_weights=[1.0, 2.0])._head_options(),
             "one for each of the 3 classes sky, ground, wall, got 2",
         ),
         (
-            lambda path: attached(
-                Segmentation(NAME, ignore_index=3), LabelData(path)
-            )._head_options(),
+            lambda path: of_task(path, ignore_index=3)._head_options(),
             "`ignore_index` must be a class, 0 to 2, or 255",
         ),
         (
-            lambda path: attached(
-                Segmentation(NAME, dict(num_classes=3)), LabelData(path)
-            ).configure_model(),
+            lambda path: of_task(path, options=dict(num_classes=3)).configure_model(),
             "`options` cannot set num_classes",
         ),
         (
-            lambda path: attached(
-                Segmentation("swin_unet_nano"), LabelData(path, size=33)
-            ).configure_model(),
+            lambda path: of_task(path, "swin_unet_nano", 33).configure_model(),
             "no swin_unet_nano with `size` 33: ",
         ),
     ],

@@ -82,7 +82,7 @@ def test_parts_have_their_principal_point_off_the_middle(folder, options):
     assert 1 <= scales.min() < 1.2 and 2 < scales.max() <= 2.55
 
 
-@pytest.mark.parametrize("crop", [0.0, 1.5])
-def test_wrong_parts(folder, crop):
-    with pytest.raises(ValueError, match=rf"`crop` must be a share in \(0, 1\], got {crop}"):
-        of(folder, crop=crop)
+def test_wrong_parts(folder):
+    for crop in (0.0, 1.5):
+        with pytest.raises(ValueError, match=rf"`crop` must be a share in \(0, 1\], got {crop}"):
+            of(folder, crop=crop)

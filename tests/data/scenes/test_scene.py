@@ -93,13 +93,11 @@ LABEL = np.arange(121 * 160, dtype=np.uint8).reshape(121, 160) % 3
 @pytest.mark.parametrize(
     ("name", "content", "error", "message"),
     [
-        ("labels.png", png(np.where(LABEL == 1, 7, LABEL)), ValueError, r"ids \[7\], .* 3 classes"),
         ("labels.png", png(np.where(LABEL == 1, 3, LABEL)), ValueError, r"ids \[3\], .* 3 classes"),
         ("labels.png", png(LABEL.astype(np.uint16)), ValueError, "an id of 8 bits .* 16 bits"),
         ("labels.png", png(np.dstack([LABEL] * 3)), ValueError, r"an id .* colours \(RGB\)"),
         ("labels.png", png(LABEL[:-1]), ValueError, r"has 120×160 px, .*001\.png has 121×160"),
         ("labels.png", b"", BrokenImageError, "cannot read"),
-        ("labels.png", b"nothing", BrokenImageError, "cannot read"),
         ("labels.png", png(LABEL)[:400], BrokenImageError, "cannot read"),
         ("distance.png", png(LABEL), ValueError, "a distance of 16 bits .* 1 × 8 bits"),
         ("distance.png", None, BrokenImageError, "cannot read"),
@@ -160,7 +158,6 @@ def test_wrong_lenses_and_turned_pictures_are_named(tmp_path):
         ({"names": ["a", 3]}, "must name the classes as a list of words"),
         ({"names": ["a", "b"], "colors": [[0, 0, 0]]}, "must give each of 2 classes a color"),
         ({"names": ["a"], "colors": [[0, 0, 256]]}, "must give each of 1 classes a color"),
-        ({"names": ["a"], "colors": [[0, -1, 0]]}, "must give each of 1 classes a color"),
         ({"names": ["a"], "colors": [[0, 0]]}, "must give each of 1 classes a color"),
         ({"names": [str(k) for k in range(256)]}, "must name each class once, and at most 255"),
     ],
