@@ -7,7 +7,7 @@ from safetensors.torch import load_file
 
 from darswin import create_model
 from darswin.compat import OfficialPolynomial
-from darswin.lens import Spherical
+from darswin.lens import Mei, Polynomial, Spherical
 from darswin.models.registry import has_image_size
 
 CALIBRATIONS = Path(__file__).parent / "lens" / "files"
@@ -32,6 +32,19 @@ def fixture(name):
         return tensors, state, OfficialPolynomial(dist, 32.0)
     xi, focal, fov = dist.unbind(1)
     return tensors, state, Spherical(xi, focal, fov / 2)
+
+
+# Cameras that people have: beyond 90°, off centre, rectangular, not round.
+CAMERAS = [
+    Polynomial(
+        [350.4, -17.5, 27.5, -2.4], 1.658, [641.3, 486.1], affine=[[1.0, 0.0], [0.0, 1.0004]],
+        image_size=(966, 1280),
+    ),
+    Mei(
+        2.35, 1390.0, [0.032, 2.4], 1.726, [708.5, 697.0], tangential=[6e-4, -3.5e-4],
+        affine=[[1.0, 0.0], [0.0, 1389.2 / 1390.0]], image_size=(1400, 1400),
+    ),
+]  # fmt: skip
 
 
 def side_of(name):

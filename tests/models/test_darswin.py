@@ -129,33 +129,3 @@ def test_another_lens_shows_the_same_tokens():
             a, b = (model.forward_features(scene(lens, 200), lens) for lens in lenses)
         errors[spacing] = ((a - b).norm() / a.norm()).item()
     assert errors["theta"] < 0.02 < 0.1 < errors["radius"], errors
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (dict(variant="B"), "variant must be 'A' or 'RA', got 'B'"),
-        (dict(compat="timm"), "compat must be None, or one of"),
-        (dict(compat="official", variant="RA"), "variant 'A' and merges of its own"),
-        (dict(depths=(2, 2)), "depths and num_heads must pair up"),
-        (dict(spacing="log"), "spacing must be one of"),
-        (dict(position_bias="rotary"), "position_bias must be"),
-        (dict(jitter=3.0), "jitter must be"),
-        (dict(num_heads=(5, 5, 5)), "num_heads must divide"),
-        (dict(drop_path_rate=1.0), "drop path must be"),
-        (dict(sectors=30), "window"),
-        (dict(std=0.0), "std must be positive"),
-        (dict(merges=((1, 4),)), "merges must have one entry for each stage but the first, 2, got"),
-        (dict(merges=((1, 4), (3, 1))), r"a map of \(8, 8\) cannot be merged by \(3, 1\)"),
-        (dict(merges=((1, 4), (0, 1))), "merges must be at least 1"),
-        (dict(compat="official", merges=((1, 4), (4, 1))), "merges of its own"),
-    ],
-)
-def test_constructor_errors(options, message):
-    with pytest.raises(ValueError, match=message):
-        nano(**options)
-
-
-def test_tan_needs_lenses_below_90_degrees():
-    with pytest.raises(ValueError, match="below 90°"):
-        nano(spacing="tan")(images(), Spherical(0.9, 10.0, 1.8))

@@ -5,19 +5,20 @@ timm's own Swin (1.0.31) was run beside ours for what is expected of intermediat
 """
 
 import copy
+import math
 from collections import defaultdict
 
 import pytest
 import torch
-from helpers import FIXTURES, network, relative_error, side_of
+from helpers import CAMERAS, FIXTURES, network, relative_error, side_of
 from safetensors.torch import load_file
 from torch._dynamo.testing import CompileCounter
 
 from darswin import create_model, list_models, optimize
 from darswin.compat import load_timm_swin
 from darswin.layers.linear import autotune_results
-from darswin.lens import KannalaBrandt, Mei, Polynomial, Spherical
-from darswin.models import ModelCard, load_model, save_model
+from darswin.lens import KannalaBrandt, Polynomial, Spherical, cat
+from darswin.models import ModelCard, load_model, registry, save_model
 from darswin.models.base import take_indices
 from darswin.models.encoder import Encoder
 from darswin.models.registry import has_image_size, model_class
@@ -39,17 +40,6 @@ CASES = {name: (name, {}) for name in NANOS} | {
 cases = pytest.mark.parametrize("case", CASES)
 nanos = pytest.mark.parametrize("name", NANOS)
 MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
-# Cameras that people have: beyond 90°, off centre, and not round.
-CAMERAS = [
-    Polynomial(
-        [350.4, -17.5, 27.5, -2.4], 1.658, [641.3, 486.1], affine=[[1.0, 0.0], [0.0, 1.0004]],
-        image_size=(966, 1280),
-    ),
-    Mei(
-        2.35, 1390.0, [0.032, 2.4], 1.726, [708.5, 697.0], tangential=[6e-4, -3.5e-4],
-        affine=[[1.0, 0.0], [0.0, 0.9994]], image_size=(1400, 1400),
-    ),
-]  # fmt: skip
 
 
 def made(case, **options):
@@ -293,6 +283,76 @@ def test_the_images_and_the_lens_that_it_takes(case):
 
 
 @torch.no_grad()
+def test_a_batch_of_several_lens_models_is_each_of_them():
+    spherical = Spherical.from_fov(0.7, 3.0, 48.0, center=[63.5, 47.5], image_size=(96, 128))
+    lenses = [CAMERAS[0], CAMERAS[1].replace(tangential=None), spherical]
+    lenses = [lens.resized((96, 128)) for lens in lenses]
+    model, images = network("darswin_a_nano"), torch.rand(3, 3, 96, 128)
+    alone = [model(images[k : k + 1], lens) for k, lens in enumerate(lenses)]
+    assert_close(model(images, cat(lenses)), torch.cat(alone), 2e-5)
+
+
+WRONG = [
+    ("darswin_a_nano", dict(variant="B"), "variant must be 'A' or 'RA', got 'B'"),
+    ("darswin_a_nano", dict(compat="timm"), "compat must be None, or one of"),
+    ("darswin_a_nano", dict(compat="official", variant="RA"), "'A' and merges of its own"),
+    ("darswin_a_nano", dict(compat="official", merges=((1, 4), (4, 1))), "merges of its own"),
+    ("darswin_a_nano", dict(depths=(2, 2)), "depths and num_heads must pair up"),
+    ("darswin_a_nano", dict(spacing="log"), "spacing must be one of"),
+    ("darswin_a_nano", dict(position_bias="rotary"), "position_bias must be"),
+    ("darswin_a_nano", dict(jitter=3.0), "jitter must be"),
+    ("darswin_a_nano", dict(num_heads=(5, 5, 5)), "num_heads must divide"),
+    ("darswin_a_nano", dict(drop_path_rate=1.0), "drop path must be"),
+    ("darswin_a_nano", dict(sectors=30), "window"),
+    ("darswin_a_nano", dict(std=0.0), "std must be positive"),
+    ("darswin_a_nano", dict(merges=((1, 4),)), "merges must have one .* but the first, 2, got"),
+    ("darswin_a_nano", dict(merges=((1, 4), (3, 1))), r"\(8, 8\) cannot be merged by \(3, 1\)"),
+    ("darswin_a_nano", dict(merges=((1, 4), (0, 1))), "merges must be at least 1"),
+    ("swin_nano", dict(view="round"), "view must be one of .*, got 'round'"),
+    ("swin_nano", dict(image_size=33), r"divide image_size = \(33, 33\), got 2"),
+    ("swin_nano", dict(image_size=36), r"stage 1: window \(4, 4\) must divide the map, \(18,"),
+    ("swin_nano", dict(image_size=24), r"stage 2: window \(4, 4\) must divide the map, \(6, 6"),
+    ("swin_undis_nano", dict(max_fov=0.0), r"max_fov must be in \(0, π\), got 0"),
+    ("swin_undis_nano", dict(max_fov=math.pi), r"max_fov must be in \(0, π\), got 3"),
+    ("dat_nano", dict(blocks=("L", "N", "D")), "blocks must be of the kinds 'L', 'S' and 'D'"),
+    ("dat_nano", dict(blocks=("L", "", "D")), "blocks must be of the kinds"),
+    ("dat_nano", dict(blocks=("L", "D")), "one entry a stage, 3"),
+    ("dat_nano", dict(groups=(1, 1, 3)), "groups must divide num_heads = 4, got 3"),
+    ("dat_nano", dict(num_heads=(5, 5, 5)), "num_heads must divide"),
+    ("swin_unet_nano", dict(image_size=66), r"divide image_size = \(66, 66\), got 4"),
+    ("swin_unet_adapted_nano", dict(spacing="r"), "spacing must be one of .*, got 'r'"),
+    ("swin_unet_adapted_nano", dict(image_size=(64, 128)), r"must be square, got \(64, 128\)"),
+    ("swin_unet_undis_nano", dict(max_fov=4), r"max_fov must be in \(0, π\), got 4"),
+] + [
+    (name, options, message)
+    for name in ("darswin_unet_a_nano", "swin_unet_nano")
+    for options, message in (
+        (dict(task="classification"), r"task must be one of \('segmentation', 'distance'\)"),
+        (dict(num_classes=0), "num_classes must be at least 1, got 0"),
+        (dict(skip_width=-1), "skip_width must be at least 0, got -1"),
+        (dict(decoder_depths=0), "decoder_depths must be an int of at least 1, or one for"),
+        (dict(decoder_depths=(1, 2, 3)), r"each stage but the last, 2, got \[1, 2, 3\]"),
+        (dict(task="distance", typical_distance=0), "typical_distance must be above 0 m"),
+        (dict(task="distance", typical_distance=math.inf), "typical_distance must be above 0 m"),
+        (dict(task="distance", typical_distance=math.nan), "typical_distance must be above 0 m"),
+        (dict(compat="official"), "got 'official' for Unet"),
+    )
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("name", "options", "message"), WRONG)
+def test_wrong_options(name, options, message):
+    with pytest.raises(ValueError, match=message):
+        create_model(name, **options)
+
+
+def test_a_view_has_options_of_its_own():
+    for name, option in (("swin_nano", "max_fov"), ("swin_unet_undis_nano", "spacing")):
+        with pytest.raises(TypeError, match=option):
+            create_model(name, **{option: 1.0})
+
+
+@torch.no_grad()
 @pytest.mark.parametrize("channels", [1, 3, 4])
 @nanos
 def test_uint8_images_have_as_many_channels_as_the_model_takes(name, channels):
@@ -340,6 +400,26 @@ def test_sizes(name):
     assert sides[0][0] * sides[0][1] == sides[1][0] * sides[1][1]  # tokens of the first map
     width = 24 if "nano" in name else 32 if "micro" in name else 96
     assert model.feature_info.channels() == [width * 2**k for k in range(len(model.feature_info))]
+
+
+def test_a_model_is_registered_in_four_sizes(monkeypatch):
+    monkeypatch.setattr(registry, "_MODELS", {})
+
+    @registry.register_model("ours", presets=dict(nano=dict(embed_dim=8)), variant="A")
+    class Ours(Encoder):
+        def __init__(self, **options):
+            super().__init__()
+            self.options = options
+
+    names = [f"ours_{size}" for size in ("micro", "nano", "small", "tiny")]
+    assert registry.list_models() == names
+    assert all(registry.model_class(name) is Ours for name in names)
+    nano, small = (registry.create_model(f"ours_{size}").options for size in ("nano", "small"))
+    assert nano["embed_dim"] == 8 and small["embed_dim"] == 96  # a preset goes before its size's
+    assert nano.keys() == small.keys() and nano["variant"] == small["variant"] == "A"
+    assert registry.create_model("ours_nano", variant="B").options["variant"] == "B"
+    with pytest.raises(ValueError, match="unknown model 'swin_nano'; there are ours_micro, ours_n"):
+        registry.model_class("swin_nano")
 
 
 @nanos

@@ -113,18 +113,3 @@ def test_keys_move_with_the_offsets():
     still = layer(x)
     torch.nn.init.normal_(layer.offset.weight, std=2.0)
     assert torch.equal(layer(x), still)
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (dict(blocks=("L", "N", "D")), "blocks must be of the kinds 'L', 'S' and 'D'"),
-        (dict(blocks=("L", "", "D")), "blocks must be of the kinds"),
-        (dict(blocks=("L", "D")), "one entry a stage, 3"),
-        (dict(groups=(1, 1, 3)), "groups must divide num_heads = 4, got 3"),
-        (dict(num_heads=(5, 5, 5)), "num_heads must divide"),
-    ],
-)
-def test_constructor_errors(options, message):
-    with pytest.raises(ValueError, match=message):
-        create_model("dat_nano", **options)

@@ -1,11 +1,17 @@
+"""The polar grid, its samples, and their embedding."""
+
 import math
 
 import pytest
 import torch
+import torch.nn.functional as F
+from helpers import CAMERAS
 
-from darswin.layers.polar import PLACEMENTS, PolarGridSpec, polar_grid
-from darswin.lens import Mei, Perspective, Polynomial, Spherical
+from darswin.layers.embed import PolarPatchEmbed
+from darswin.layers.polar import PLACEMENTS, PolarGridSpec, PolarSample, polar_grid
+from darswin.lens import Mei, Perspective, Polynomial, Spherical, cat
 from darswin.lens.spacing import SPACINGS
+from darswin.ops import polar_embed, polar_sample
 
 f64 = torch.float64
 SIZES = dict(rings=16, sectors=64, samples=(10, 10))
@@ -148,11 +154,13 @@ def test_gradients_reach_the_lens(spacing, sample_spacing):
         (dict(sample_spacing="log"), "sample_spacing must be one of"),
         (dict(placement="middle"), "placement must be one of"),
         (dict(placement="edges", samples=(1, 4)), "at least 2 samples"),
+        (dict(jitter=2.0), "jitter"),
+        (dict(layout="rows"), "layout"),
     ],
 )
-def test_errors(change, message):
+def test_wrong_settings(change, message):
     with pytest.raises(ValueError, match=message):
-        polar_grid(spherical(), (64, 64), **(SIZES | change))
+        PolarSample(**(SIZES | change))
 
 
 def camera(**aside):
@@ -165,6 +173,7 @@ def camera(**aside):
 @pytest.mark.parametrize(
     "aside",
     [
+        {},
         {"affine": [[1.0, 0.01], [0.0, 0.9996]]},
         {"tangential": [6e-4, -3.5e-3]},
         {"affine": [[1.0, 0.0], [0.0, 1.2]], "prism": [1e-3, 0.0, -2e-3, 0.0]},
@@ -183,14 +192,9 @@ def test_points_are_where_the_lens_projects_their_rays(spacing, aside):
     expected = lens.project_rays(theta[:, None], grid.azimuths[None])
     torch.testing.assert_close(points, expected, rtol=0, atol=1e-8)
     assert (grid.affine is None) == ("affine" not in aside)
-    assert (grid.offsets is None) == ("affine" in aside and "prism" not in aside)
+    assert (grid.offsets is None) == (not {"tangential", "prism"} & aside.keys())
     if grid.offsets is not None:
         assert grid.offsets.shape == (1, 2, 160, 640) and 0.5 < grid.offsets.abs().max() < 10
-
-
-def test_a_grid_of_a_round_lens_has_no_offsets():
-    grid = polar_grid(camera(), (1400, 1400), **SIZES)
-    assert grid.affine is None and grid.offsets is None
 
 
 @pytest.mark.parametrize("spacing", ["theta", "g", "radius"])
@@ -201,3 +205,116 @@ def test_tokens_look_where_the_middle_of_their_patch_does(spacing):
     x, y = (grid.radii[0, :, None] * wave(grid.azimuths) for wave in (torch.cos, torch.sin))
     pixels = torch.stack((x, y), -1) + grid.center[0]
     torch.testing.assert_close(rays, lens.unproject_points(pixels[None]))
+
+
+# -- samples and their embedding ----------------------------------------------------------------
+
+LENSES = Spherical.from_fov([0.2, 0.9], 2.6, 16.0)
+
+
+def test_polar_sample_replaces_grid_sample_on_a_polar_grid():
+    images = torch.randn(2, 3, 32, 33)
+    sample = PolarSample(4, 8, (3, 2), spacing="tan", layout="image")
+    grid = polar_grid(LENSES, (32, 33), rings=4, sectors=8, samples=(3, 2), spacing="tan")
+    x = grid.center[:, 0, None, None] + grid.radii[:, :, None] * torch.cos(grid.azimuths)
+    y = grid.center[:, 1, None, None] + grid.radii[:, :, None] * torch.sin(grid.azimuths)
+    mesh = torch.stack((2 * x / 32 - 1, 2 * y / 31 - 1), -1)
+    expected = F.grid_sample(images, mesh, align_corners=True)
+    torch.testing.assert_close(sample(images, LENSES), expected, rtol=1e-4, atol=1e-4)
+    one = sample(images, LENSES[:1])  # one lens serves all images
+    assert torch.equal(one, sample(images, LENSES[[0, 0]]))
+
+
+def test_the_operators_take_all_of_a_grid():
+    images = torch.randn(2, 3, 32, 33, dtype=torch.float64)
+    affine, offsets = torch.eye(2) + 0.3 * torch.randn(2, 2, 2), torch.randn(1, 2, 12, 16)
+    spec = PolarGridSpec(4, 8, (3, 2))
+    grid = spec.grid(LENSES, (32, 33))._replace(affine=affine, offsets=offsets)
+    radii, azimuths, center, _, affine, offsets = (t.double() for t in grid)
+    options = dict(samples=(3, 2), affine=affine, offsets=offsets)
+    for layout in ({}, dict(layout="tokens"), dict(layout="image")):  # tokens by default in both
+        sample = PolarSample(4, 8, (3, 2), **layout)
+        sample.grid = lambda lens, size: grid
+        expected = polar_sample(images, radii, azimuths, center, **options, **layout)
+        assert torch.equal(sample(images, LENSES), expected)
+    embed = PolarPatchEmbed(spec).double()
+    weights = embed.proj.weight, embed.proj.bias
+    tokens = polar_embed(images, radii, azimuths, center, *weights, **options)
+    assert torch.equal(embed(images, grid), embed.norm(tokens))
+
+
+def test_it_jitters_only_in_training_and_by_torchs_generator():
+    images = torch.randn(2, 3, 32, 32)
+    sample = PolarSample(4, 8, (3, 2), jitter=1.0).eval()
+    assert torch.equal(sample(images, LENSES), sample(images, LENSES))
+    sample.train()
+    torch.manual_seed(3)
+    first, second = sample(images, LENSES), sample(images, LENSES)
+    torch.manual_seed(3)
+    assert torch.equal(sample(images, LENSES), first) and not torch.equal(first, second)
+
+
+@pytest.mark.parametrize(
+    ("shape", "given", "last"),
+    [
+        ((2, 32, 33, 1), None, True),
+        ((2, 32, 33, 4), None, True),
+        ((2, 1, 32, 33), None, False),
+        ((2, 1, 32, 3), False, False),
+        ((2, 32, 3, 1), True, True),
+        ((2, 12, 32, 33), False, False),
+    ],
+)
+def test_uint8_images(shape, given, last):
+    images = torch.randint(256, shape, dtype=torch.uint8)
+    planes = images.permute(0, 3, 1, 2) if last else images
+    sample = PolarSample(4, 8, (3, 2), mean=0.4, std=0.2)
+    expected = sample((planes / 255 - 0.4) / 0.2, LENSES)
+    torch.testing.assert_close(sample(images, LENSES, given), expected, rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.slow
+def test_rays_keep_their_place_in_the_polar_image():
+    """Two cameras that see the same scene give the same polar image, but for interpolation."""
+    sample = PolarSample(8, 32, (4, 4), layout="image")
+    views = []
+    for lens in CAMERAS:
+        size = tuple(int(s) // 2 for s in lens.image_size[0].tolist())
+        lens = lens.resized(size).with_theta_max(1.3)
+        y, x = torch.meshgrid(*(torch.arange(float(s)) for s in size), indexing="ij")
+        theta, azimuth = lens.with_theta_max(None).unproject_pixels(torch.stack((x, y), -1))
+        scene = torch.stack((torch.cos(3 * theta), torch.cos(2 * azimuth), torch.sin(azimuth)))
+        views.append(sample(scene.nan_to_num(0)[None], lens))
+    grid = polar_grid(lens, size, rings=8, sectors=32, samples=(4, 4))
+    apart = (views[0] - views[1])[..., 2:, :].abs().amax((0, 2, 3))  # azimuths have no centre
+    # Most beside the principal point, where the azimuth changes from pixel to pixel.
+    assert apart[0] < 1e-3 and apart.max() < 2e-2, (apart, grid.radii[0, :3])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "lens", [*CAMERAS, cat([CAMERAS[1].replace(tangential=None), CAMERAS[0]])[:1]]
+)
+def test_a_calibrated_camera_compiles(lens):
+    sample = PolarSample(8, 32, (2, 2))
+    images, lens = torch.rand(1, 3, 96, 128), lens.resized((96, 128))
+    compiled = torch.compile(sample, fullgraph=True, backend="aot_eager")
+    torch.testing.assert_close(compiled(images, lens), sample(images, lens))
+
+
+@pytest.mark.parametrize(
+    ("images", "lens", "last", "error", "message"),
+    [
+        (torch.zeros(3, 32, 32), LENSES, None, ValueError, r"\(B, C, H, W\), got \(3, 32"),
+        (torch.zeros(3, 1, 32, 32), LENSES, None, ValueError, "one an image, 3, got 2"),
+        (torch.zeros(2, 1, 32, 32), None, None, TypeError, "lens must be a darswin.lens"),
+        ([1], LENSES, None, TypeError, "images must be a tensor, got list"),
+        (torch.zeros(2, 1, 32, 3).byte(), LENSES, None, ValueError, "both .* pass channels_"),
+        (torch.zeros(2, 9, 32, 9).byte(), LENSES, None, ValueError, "neither .* pass channels"),
+        (torch.zeros(2, 1, 9, 9), LENSES, "yes", TypeError, "channels_last must be True"),
+        (torch.zeros(1, 1, 9, 9), CAMERAS[0], None, ValueError, r"\(H, W\) = \(966, 1280\), got"),
+    ],
+)
+def test_images_and_lenses_that_do_not_fit(images, lens, last, error, message):
+    with pytest.raises(error, match=message):
+        PolarSample(4, 8, (2, 2))(images, lens, last)
