@@ -1,5 +1,6 @@
-"""Draws docs/lens.png, and examples/front.jpg with its calibration examples/front.json: a room that
-is computed, through a lens of our own that sees 190° from left to right.
+"""Draws docs/lens.png and docs/polar.png, and writes examples/front.jpg and its calibration
+examples/front.json. The picture is a computed room through a lens of our own, which sees 190° from
+left to right.
 
 Run it with `.venv/bin/python docs/lens.py`. The room is a box with a checkerboard on its walls, so
 that its lines are straight in the perspective view and nowhere else.
@@ -12,12 +13,13 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from matplotlib.figure import Figure
 from PIL import Image
 
 from darswin import PolarSample
 from darswin.lens import Polynomial
 from darswin.utils.files import replace_file
-from darswin.viz.plot import draw_lens
+from darswin.viz.plot import draw_grid, draw_lens, draw_polar
 from darswin.viz.views import perspective
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
@@ -68,6 +70,26 @@ def row(lens: Polynomial, y: int, width: int) -> np.ndarray:
     return room(rays).reshape(1, 2, width, 2, 3).mean((1, 3)).round().astype(np.uint8)
 
 
+def draw_polar_image(image: np.ndarray, lens: Polynomial) -> Figure:
+    """The first picture of the README: the rings of the lens, and the polar image."""
+    sampler = PolarSample(rings=8, sectors=32, samples=(20, 20))
+    figure = Figure(figsize=(12, 4.4), layout="constrained")
+    left, right = figure.subplots(1, 2, width_ratios=(1, 1.3))
+    draw_grid(image, lens, sampler, samples=False, axes=left)
+    left.set_title("fisheye picture, cut into polar patches that follow the lens")
+    draw_polar(image, lens, sampler, axes=right)
+    right.set_title("polar image: what the network sees")
+    return figure
+
+
+def save(figure: Figure, name: str) -> None:
+    """Writes a figure to this folder as a small PNG."""
+    drawn, small = io.BytesIO(), io.BytesIO()
+    figure.savefig(drawn, format="png", dpi=80)
+    Image.open(drawn).convert("RGB").quantize(256).save(small, format="png", optimize=True)
+    replace_file(Path(__file__).parent / name, small.getvalue())
+
+
 def main() -> None:
     lens = front_lens().with_theta_max(None)
     image = photograph(lens)
@@ -79,10 +101,8 @@ def main() -> None:
     view = perspective((604, 800), math.radians(110))
     sampler = PolarSample(rings=16, sectors=64, samples=(10, 10))
     figure = draw_lens(image, front_lens(), sampler, view, "perspective view, 110° across")
-    drawn, small = io.BytesIO(), io.BytesIO()
-    figure.savefig(drawn, format="png", dpi=80)
-    Image.open(drawn).convert("RGB").quantize(256).save(small, format="png", optimize=True)
-    replace_file(Path(__file__).parent / "lens.png", small.getvalue())
+    save(figure, "lens.png")
+    save(draw_polar_image(image, front_lens()), "polar.png")
 
 
 if __name__ == "__main__":
