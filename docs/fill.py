@@ -67,7 +67,7 @@ def drop_in_line(timings: Sequence[Timing]) -> str:
     ]
     cases = "; ".join(dict.fromkeys(f"{t.setting}, batch {t.batch}" for t in found))
     low, high = (end(t.ratio for t in found) for end in (min, max))
-    return f"{low:.1f} to {high:.1f} times as fast as `F.grid_sample`, this very call ({cases})."
+    return f"This call is {low:.1f} to {high:.1f} times as fast as `F.grid_sample` ({cases})."
 
 
 def demo_table(record: dict) -> str:
