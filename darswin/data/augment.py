@@ -177,7 +177,7 @@ class Mixing:
 
 def partners_share(lens: Lens) -> Tensor:
     """(B,) bool: True where an image of a batch and its partner have the same lens."""
-    tensors = (getattr(lens, name) for name in lens._names())
+    tensors = (getattr(lens, name) for name in lens.names)
     same = [(t == t.flip(0)).reshape(len(t), -1).all(1) for t in tensors if t is not None]
     return torch.stack(same).all(0)
 

@@ -11,7 +11,6 @@ from torch import Tensor
 from darswin.lens.frame import ImageFrame
 from darswin.lens.parameter import Number
 from darswin.lens.solve import direction_of, inverse, length_of
-from darswin.ops.checks import tensor_there
 
 # A lens ends this far (rad) before the angle where r stops rising or becomes infinite: there θ
 # cannot be told from r.
@@ -51,10 +50,8 @@ class Lens(ImageFrame):
         ValueError: a parameter out of its range, by name. TypeError: one that is no number.
 
     Indexing gives lenses (`lens[3]` is a batch of one), `len` counts them, `cat` joins them, and
-    a DataLoader batches a dataset's lenses like its tensors.
-
-    A class is a model of `MODELS`, by its name, unless it is defined with `register=False`, as
-    bases of several models are.
+    a DataLoader batches a dataset's lenses like its tensors. A class is a model of `MODELS`, by its
+    name, unless it is defined with `register=False`, as bases of several models are.
     """
 
     terms: ClassVar[int] = 4  # of its polynomial, that `fit` finds unless told otherwise
@@ -84,9 +81,8 @@ class Lens(ImageFrame):
         """Checks and sets how far the lens is used; None means as far as its model goes."""
         limit = self.theta_limit
         if not bool((limit > 0).all()):
-            raise ValueError(
-                f"{' and '.join(self.parameters)} must be such that r rises with θ, got {self}"
-            )
+            names = " and ".join(self.parameters)
+            raise ValueError(f"{names} must be such that r rises with θ, got {self}")
         self.theta_max = limit if wanted is None else wanted
         if wanted is None:
             return
@@ -107,12 +103,9 @@ class Lens(ImageFrame):
         self.theta_max = torch.where(wanted > limit, limit, wanted)
 
     def to(self, *args: Any, **kwargs: Any) -> Self:
-        """The same lens with another dtype or on another device, as `Tensor.to`.
-
-        From float64 to float32 θ_max becomes at most the `theta_limit` of the new lens: high powers
-        of w overflow earlier there.
-        """
+        """The same lens with another dtype or on another device, as `Tensor.to`."""
         lens = super().to(*args, **kwargs)
+        # High powers of w overflow earlier in float32.
         if self.theta_max.dtype == torch.float64 and lens.theta_max.dtype == torch.float32:
             limit = lens.theta_limit
             lens.theta_max = torch.where(lens.theta_max > limit, limit, lens.theta_max)
@@ -120,12 +113,10 @@ class Lens(ImageFrame):
 
     def with_theta_max(self, theta_max: Number | None) -> Self:
         """The same lens used up to another angle (rad); None means `theta_limit`."""
-        lens, wanted = self._map(lambda tensor: tensor), None
-        if theta_max is not None:
-            like = self.theta_max
-            wanted = torch.as_tensor(theta_max, dtype=like.dtype, device=like.device)
-            wanted = wanted.expand(len(self))
-        lens._set_theta_max(wanted)
+        lens = self._map(lambda tensor: tensor)
+        lens._set_theta_max(
+            None if theta_max is None else self._aligned(theta_max)[0].expand(len(self))
+        )
         return lens
 
     # -- the radial curve ---------------------------------------------------------------------
@@ -199,11 +190,7 @@ class Lens(ImageFrame):
     ) -> Tensor:
         """Rays (θ, φ) → the pixels (x, y) where they land.
 
-        Args:
-            theta, azimuth: rad, shapes as in `project`, which broadcast. image_size: (H, W).
-
-        Returns:
-            (..., 2) px.
+        θ and φ, rad, broadcast; shapes as in `project`. image_size: (H, W). → (..., 2) px.
         """
         (theta,), (azimuth,) = self._aligned(theta), self._aligned(azimuth)
         return self.pixels(theta, direction_of(azimuth), image_size)
@@ -213,11 +200,8 @@ class Lens(ImageFrame):
     ) -> tuple[Tensor, Tensor]:
         """Pixels (x, y) → the rays (θ, φ) that land there, the inverse of `project_rays`.
 
-        Args:
-            pixels: (N or 1, ..., 2) px; for a single lens (..., 2). image_size: (H, W).
-
-        Returns:
-            θ and φ, (N, ...) rad. θ is NaN where no ray lands.
+        Pixels are (N or 1, ..., 2) px; for a single lens (..., 2). image_size: (H, W). → θ and φ,
+        (N, ...) rad. θ is NaN where no ray lands.
         """
         theta, direction = self.rays(pixels, image_size)
         return theta, torch.atan2(direction[..., 1], direction[..., 0])
@@ -294,12 +278,7 @@ class Lens(ImageFrame):
         further than the lens.
         """
         cx, cy = self.center_in(image_size).expand(len(self), 2).unbind(1)
-        if image_size is not None:
-            height, width = tensor_there(image_size, self.theta_max)
-        elif self.image_size is not None:
-            height, width = self.image_size.unbind(1)
-        else:
-            raise ValueError("side_angles needs the image_size, (H, W)")
+        height, width = self._size_in(image_size).unbind(1)
         low = torch.full_like(cx, -0.5)
         right, below = (width - 0.5).expand_as(cx), (height - 0.5).expand_as(cy)
         pixels = torch.stack((low, cy, cx, low, right, cy, cx, below), 1).unflatten(1, (4, 2))
@@ -318,9 +297,9 @@ def from_dict(description: Mapping[str, Any], image_size: tuple[int, int] | None
 
     Args:
         description: {"model": "Spherical", "xi": 0.5, "focal": 300, "theta_max": 1.5}: a name of
-            `MODELS` and the arguments of its constructor, angles in rad and lengths in px. For
-            models with a focal length, "fov" may stand in place of it and of "theta_max": the
-            full field of view, which fills the circle inside the image.
+            `MODELS` and the arguments of its constructor, rad and px. For models with a focal
+            length, "fov" may stand in place of it and of "theta_max": the full field of view, which
+            fills the circle inside the image.
         image_size: (H, W) px of the lens's images, which "fov" needs.
 
     Raises:

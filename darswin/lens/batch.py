@@ -1,7 +1,6 @@
 """A batch of lenses as tensors: one entry a lens in each, all of one dtype, on one device."""
 
 import copy
-import inspect
 from collections.abc import Callable, Mapping, Sequence
 from numbers import Integral
 from typing import Any, ClassVar, Self
@@ -10,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.utils import _pytree as pytree
 
-from darswin.lens.parameter import Number, Parameter, as_tensors, bind, signature
+from darswin.lens.parameter import Arguments, Number, Parameter, as_tensors
 from darswin.ops.checks import readable
 
 NUMBER = Parameter()
@@ -19,13 +18,15 @@ NUMBER = Parameter()
 class LensBatch:
     """The tensors of N lenses: how they are given, indexed, joined, moved and copied."""
 
-    # The parameters that all lenses have; those of a class that it needs; its others; all, in the
-    # order of the constructor.
+    # The parameters that all lenses have; those of a class that it needs; its others; all by their
+    # names, in the order of the constructor.
     common: ClassVar[tuple[str, ...]] = ("theta_max", "center", "affine", "image_size")
     parameters: ClassVar[tuple[str, ...]]
     optional: ClassVar[tuple[str, ...]]
     declared: ClassVar[dict[str, Parameter]] = {}
-    __signature__: ClassVar[inspect.Signature]
+    names: ClassVar[tuple[str, ...]]
+    _arguments: ClassVar[Arguments]
+    __signature__: ClassVar[object]  # what `help` shows
     theta_max: Tensor
 
     def __init_subclass__(cls) -> None:
@@ -37,20 +38,21 @@ class LensBatch:
         cls.optional = tuple(
             name for name, p in found.items() if p.optional and name not in cls.common
         )
-        cls.declared = {n: found[n] for n in (*cls.parameters, *cls.optional, *cls.common)}
         others = (*cls.optional, *cls.common)
+        cls.names = (*cls.parameters, *others)
+        cls.declared = {name: found[name] for name in cls.names}
         by_place = [name for name in others if found[name].by_place]
-        cls.__signature__ = signature(
-            cls.parameters, by_place, [name for name in others if name not in by_place]
-        )
+        by_name = [name for name in others if not found[name].by_place]
+        cls._arguments = Arguments(cls.parameters, by_place, by_name)
+        cls.__signature__ = cls._arguments.signature
         # So that a lens crosses torch.compile, torch.export and torch.func as its tensors.
         pytree.register_pytree_node(
             cls,
-            lambda lens: ([getattr(lens, name) for name in lens._names()], None),
-            lambda tensors, _: cls._from_tensors(dict(zip(cls._names(), tensors, strict=True))),
+            lambda lens: ([getattr(lens, name) for name in lens.names], None),
+            lambda tensors, _: cls._from_tensors(dict(zip(cls.names, tensors, strict=True))),
             serialized_type_name=f"darswin.lens.{cls.__name__}",
             flatten_with_keys_fn=lambda lens: (
-                [(pytree.GetAttrKey(name), getattr(lens, name)) for name in lens._names()],
+                [(pytree.GetAttrKey(name), getattr(lens, name)) for name in lens.names],
                 None,
             ),
             to_dumpable_context=lambda _: None,
@@ -58,18 +60,13 @@ class LensBatch:
         )
 
     def __init__(self, *arguments: Number | None, **named: Number | None):
-        given = bind(type(self).__name__, self.__signature__, arguments, named)
-        rows = self._expanded(given)
-        for name in self._names():
+        rows = self._expanded(self._arguments.bind(type(self).__name__, arguments, named))
+        for name in self.names:
             setattr(self, name, rows.get(name))
 
     def __setattr__(self, name: str, value: object) -> None:
         # What is compiled ahead of time may take memory in order, whatever the strides.
         super().__setattr__(name, value.contiguous() if isinstance(value, Tensor) else value)
-
-    @classmethod
-    def _names(cls) -> tuple[str, ...]:
-        return tuple(cls.declared)
 
     @classmethod
     def _rows(cls, given: Mapping[str, Number]) -> dict[str, Tensor]:
@@ -82,23 +79,24 @@ class LensBatch:
         """`_rows`, all of N lenses."""
         rows = cls._rows(given)
         sizes = {name: tensor.shape[0] for name, tensor in rows.items()}
-        count = next((size for size in sizes.values() if size != 1), 1)
-        if any(size not in (1, count) for size in sizes.values()):
+        counts = {*sizes.values()} - {1} or {1}
+        if len(counts) > 1:
             raise ValueError(f"parameters must agree in the number of lenses, got {sizes}")
+        (count,) = counts
         return {name: tensor.expand(count, *tensor.shape[1:]) for name, tensor in rows.items()}
 
     @classmethod
     def _from_tensors(cls, tensors: Mapping[str, Tensor | None]) -> Self:
         """A lens of tensors (N, ...) that need no check: they come from a lens that was checked."""
         lens = object.__new__(cls)
-        for name in cls._names():
+        for name in cls.names:
             setattr(lens, name, tensors.get(name))
         return lens
 
     def _tensors(self) -> dict[str, Tensor]:
         """Its parameters by their names, but for those that are None."""
-        values = {name: getattr(self, name) for name in self._names()}
-        return {name: value for name, value in values.items() if value is not None}
+        values = ((name, getattr(self, name)) for name in self.names)
+        return {name: value for name, value in values if value is not None}
 
     def _map(self, function: Callable[[Tensor], Tensor]) -> Self:
         lens = copy.copy(self)
@@ -114,8 +112,10 @@ class LensBatch:
 
     def _check(self, name: str) -> None:
         """ValueError where a parameter is out of its range."""
-        declared = self.declared[name]
-        self._require(name, declared.holds(getattr(self, name)), declared.range)
+        declared, value = self.declared[name], getattr(self, name)
+        if not declared.holds(value):
+            ok = torch.tensor([declared.holds(row) for row in value], device=value.device)
+            self._require(name, ok, declared.range)
 
     @staticmethod
     def _row(tensor: Tensor, dims: int) -> Tensor:

@@ -42,9 +42,9 @@ class Tabulated(Lens):
         if self.slopes is None:
             return
         if self.slopes.shape != self.angles.shape:
+            shape, given = tuple(self.angles.shape), tuple(self.slopes.shape)
             raise ValueError(
-                "slopes must have the shape of angles and radii, "
-                f"{tuple(self.angles.shape)}, got {tuple(self.slopes.shape)}"
+                f"slopes must have the shape of angles and radii, {shape}, got {given}"
             )
         steepest = _steepest(self.angles, self.radii)
         rise = (self.slopes >= 0) & (self.slopes <= steepest)
@@ -205,15 +205,14 @@ def cat(lenses: Sequence[Lens]) -> Lens:
     if len({form_of(lens) for lens in lenses}) > 1:
         lenses = [as_curves(lens) for lens in lenses]
     if len({lens.affine is None for lens in lenses}) > 1:
-        eye = torch.eye(2, dtype=lenses[0].theta_max.dtype, device=lenses[0].theta_max.device)
         lenses = [
-            lens.replace(affine=eye.expand(len(lens), 2, 2)) if lens.affine is None else lens
+            lens.replace(affine=lens._eye().expand(len(lens), 2, 2))
+            if lens.affine is None
+            else lens
             for lens in lenses
         ]
-    tensors = {
-        name: torch.cat([getattr(lens, name) for lens in lenses]) for name in lenses[0]._tensors()
-    }
-    return lenses[0]._from_tensors(tensors)
+    names = lenses[0]._tensors()
+    return lenses[0]._from_tensors({n: torch.cat([getattr(x, n) for x in lenses]) for n in names})
 
 
 def form_of(lens: Lens) -> tuple:
@@ -222,9 +221,5 @@ def form_of(lens: Lens) -> tuple:
     return type(lens), tuple(shapes.items())
 
 
-def _collate(batch: Sequence[Lens], *, collate_fn_map: object = None) -> Lens:
-    return cat(batch)
-
-
 # A DataLoader batches lenses of any class.
-default_collate_fn_map[Lens] = _collate
+default_collate_fn_map[Lens] = lambda batch, *, collate_fn_map=None: cat(batch)

@@ -6,7 +6,7 @@ focal length turns the distorted plane into pixels.
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import ClassVar
 
 import torch
@@ -41,15 +41,20 @@ class DistortedLens(FocalLens, register=False):
         focal: f > 0, px. radial: (n,) or (N, n): k₁, k₂, …, or None.
         tangential: (2,) or (N, 2): p₁, p₂, or None. prism: (4,) or (N, 4): s₁ … s₄, or None.
         Others: as `Lens`.
+
+    A class defines the plane: `_plane`, w(θ), its slope and its inverse, and `_plane_end`, rad, up
+    to where w rises.
     """
 
     radial = Parameter(shape=(None,), optional=True, by_place=True)
     tangential = Parameter(shape=(2,), optional=True)
     prism = Parameter(shape=(4,), optional=True)
-    # What is left of the model when all its terms are zero, with a closed inverse.
-    plain: ClassVar[type[Lens]]
-    # Tangential and thin-prism terms are functions of the plane after the radial ones.
-    aside_last: ClassVar[bool] = False
+    plain: ClassVar[type[Lens]]  # what is left of the model when all its terms are zero
+    aside_last: ClassVar[bool] = False  # the other terms are of the plane after the radial ones
+    _plane: ClassVar[Callable[..., Tensor]]
+    _plane_slope: ClassVar[Callable[..., Tensor]]
+    _plane_angle: ClassVar[Callable[..., Tensor]]
+    _plane_end = math.pi - MARGIN
 
     @classmethod
     def _rows(cls, given: Mapping[str, Number]) -> dict[str, Tensor]:
@@ -63,21 +68,8 @@ class DistortedLens(FocalLens, register=False):
             )
         return rows
 
-    def _plane(self, theta: Tensor) -> Tensor:
-        """w(θ)."""
-        raise NotImplementedError
-
-    def _plane_slope(self, theta: Tensor) -> Tensor:
-        """dw/dθ."""
-        raise NotImplementedError
-
-    def _plane_angle(self, w: Tensor) -> Tensor:
-        """The inverse of `_plane`."""
-        raise NotImplementedError
-
     def _plane_limit(self) -> Tensor:
-        """(N,) rad: up to where w rises."""
-        raise NotImplementedError
+        return torch.full_like(self.focal.detach(), self._plane_end)
 
     def _stretch(self, w: Tensor) -> Tensor:
         """w with the radial terms."""
@@ -154,21 +146,19 @@ class DistortedLens(FocalLens, register=False):
     def _distort_slopes(self, point: Tensor) -> Tensor:
         """(..., 2, 2): the derivatives of `_distort`."""
         w = length_of(point)
-        direction = point / w[..., None]
-        ratio = self._stretch(w) / w
-        straight = radial_slopes(ratio, self._stretch_slope(w), direction)
+        direction, stretched = point / w[..., None], self._stretch(w)
+        straight = radial_slopes(stretched / w, self._stretch_slope(w), direction)
         if self.aside_last:
-            return straight + self._aside_slopes(ratio[..., None] * point) @ straight
-        return straight + self._aside_slopes(point)
+            return straight + self._aside_slopes(stretched[..., None] * direction) @ straight
+        return straight + self._aside_slopes(w[..., None] * direction)
 
     def _least_area(self, theta: Tensor) -> Tensor:
         """(N, K): by how much the distortion enlarges an area at θ, at the azimuth of the least.
 
         It is a trigonometric polynomial of degree 3 in φ: 8 azimuths determine all others.
         """
-        azimuth = torch.arange(8, dtype=theta.dtype, device=theta.device) * (math.pi / 4)
-        direction = direction_of(azimuth)
-        area = determinant(self._distort_slopes(self._plane(theta)[..., None, None] * direction))
+        points = self._plane(theta)[..., None, None] * _circle(8, theta)
+        area = determinant(self._distort_slopes(points))
         terms = torch.fft.rfft(area, norm="forward")[..., :4]
         area = torch.fft.irfft(terms, 256, norm="forward")
         # The minimum between the samples, of the parabola through the smallest and its neighbours.
@@ -185,12 +175,10 @@ class DistortedLens(FocalLens, register=False):
     def _find_points(self, goal: Tensor, start: Tensor, last: Tensor) -> Tensor:
         """(N, ..., 2): points of the ideal plane that `_distort` takes to `goal`, if there are any
         within `last`. The search begins half as far out as `start`, far from any fold."""
+        maps = self._distort, self._distort_slopes
         if not readable(goal):  # no shape depends on values
-            return newton(
-                self._distort, self._distort_slopes, goal, start / 2, 1.1 * last, rounds=30
-            )
-        azimuth = torch.arange(256, dtype=goal.dtype, device=goal.device) * (math.pi / 128)
-        circle = direction_of(azimuth)
+            return newton(*maps, goal, start / 2, 1.1 * last, rounds=30)
+        circle = _circle(256, goal)
         # One lens at a time: each has its own shape of selected pixels.
         shape, start = goal.shape, start.expand_as(goal).reshape(len(self), -1, 2)
         goal, points = goal.reshape(len(self), -1, 2), start.clone()
@@ -200,13 +188,8 @@ class DistortedLens(FocalLens, register=False):
             # overflows, as NaN, is beyond all pixels.
             near = ~(length_of(goal[k]) >= 1.01 * length_of(lens._distort(end * circle)).max())
             for share in (0.5, 0.0):  # from the axis, where a fold blocked the first way
-                points[k][near] = newton(
-                    lens._distort,
-                    lens._distort_slopes,
-                    goal[k][near],
-                    share * start[k][near],
-                    1.1 * end,
-                )
+                maps = lens._distort, lens._distort_slopes
+                points[k][near] = newton(*maps, goal[k][near], share * start[k][near], 1.1 * end)
                 near &= length_of(lens._distort(points[k]) - goal[k]) > self._slack(goal[k])
         return points.reshape(shape)
 
@@ -240,6 +223,12 @@ class DistortedLens(FocalLens, register=False):
         return theta, torch.where(lands[..., None], point / w[..., None], direction)
 
 
+def _circle(count: int, like: Tensor) -> Tensor:
+    """(count, 2): directions all around."""
+    steps = torch.arange(count, dtype=like.dtype, device=like.device)
+    return direction_of(steps * (2 * math.pi / count))
+
+
 class KannalaBrandt(DistortedLens):
     """r = f (θ + k₁ θ³ + k₂ θ⁵ + …): OpenCV's fisheye model, Kalibr's and ROS's "equidistant".
 
@@ -249,18 +238,9 @@ class KannalaBrandt(DistortedLens):
     """
 
     plain = Equidistant
-
-    def _plane(self, theta: Tensor) -> Tensor:
-        return theta
-
-    def _plane_slope(self, theta: Tensor) -> Tensor:
-        return torch.ones_like(theta)
-
-    def _plane_angle(self, w: Tensor) -> Tensor:
-        return w
-
-    def _plane_limit(self) -> Tensor:
-        return torch.full_like(self.focal.detach(), math.pi - MARGIN)
+    _plane = staticmethod(lambda theta: theta)
+    _plane_slope = staticmethod(torch.ones_like)
+    _plane_angle = staticmethod(lambda w: w)
 
 
 class Fisheye624(KannalaBrandt):
@@ -315,18 +295,10 @@ class BrownConrady(DistortedLens):
     denominator = Parameter(shape=(None,), optional=True)
     terms = 3
     plain = Perspective
-
-    def _plane(self, theta: Tensor) -> Tensor:
-        return torch.tan(theta)
-
-    def _plane_slope(self, theta: Tensor) -> Tensor:
-        return torch.cos(theta) ** -2
-
-    def _plane_angle(self, w: Tensor) -> Tensor:
-        return torch.atan(w)
-
-    def _plane_limit(self) -> Tensor:
-        return torch.full_like(self.focal.detach(), math.pi / 2 - MARGIN)
+    _plane = staticmethod(torch.tan)
+    _plane_slope = staticmethod(lambda theta: torch.cos(theta) ** -2)
+    _plane_angle = staticmethod(torch.atan)
+    _plane_end = math.pi / 2 - MARGIN
 
     def _stretch(self, w: Tensor) -> Tensor:
         stretched = super()._stretch(w)

@@ -24,13 +24,17 @@ class ImageFrame(LensBatch):
         """(N or 1, 2) px: the principal point (x, y) in an image of (H, W)."""
         if self.center is not None:
             return self.center
+        return (self._size_in(image_size).flip(1) - 1) / 2
+
+    def _size_in(self, image_size: tuple[int, int] | None) -> Tensor:
+        """(N or 1, 2): the given size of the image, else the lens's own."""
         if image_size is not None:
-            size = tensor_there(image_size, self.theta_max)[None]
-        elif self.image_size is not None:
-            size = self.image_size
-        else:
-            raise ValueError("a lens with no center needs the image_size, (H, W)")
-        return (size.flip(1) - 1) / 2
+            return tensor_there(image_size, self.theta_max)[None]
+        if self.image_size is None:
+            raise ValueError(
+                "this lens has no image_size of its own and needs the image_size, (H, W)"
+            )
+        return self.image_size
 
     def to_pixels(self, flat: Tensor, image_size: tuple[int, int] | None = None) -> Tensor:
         """Points (N, ..., 2) around the principal point, before `affine` → pixels."""
@@ -51,41 +55,42 @@ class ImageFrame(LensBatch):
 
         Args:
             scale: how many times as large the image is, above 0; or its new (H, W), in whole
-                pixels, for a lens with an `image_size`. Images have whole pixels, so that (H, W)
-                is exact where a number is not.
+                pixels, which is exact where a number is not, for a lens with an `image_size`.
 
         Raises:
             ValueError: a scale or a size that is no image's, or an (H, W) for a lens that does not
                 know its image_size. TypeError: neither a number nor two.
         """
-        number = _plain(scale)
+        number, size = _plain(scale), self.image_size
         if isinstance(number, float):
             if not 0 < number < math.inf:
                 raise ValueError(f"resized must be given a finite scale above 0, got {number}")
-            size = self.image_size
             size = None if size is None else (size * number).round().clamp(min=1)
             across = down = self.theta_max.new_tensor([number])
-        elif self.image_size is None:
+        elif size is None:
             raise ValueError(f"resized to (H, W) = {scale} needs a lens that has an image_size")
         else:
-            size = self.theta_max.new_tensor([_image_size(number)]).expand(len(self), 2)
-            down, across = (size / self.image_size).unbind(1)
+            before, size = size, self._sizes(_image_size(number))
+            down, across = (size / before).unbind(1)
         lens = self._scaled(across)
         lens.image_size = size
         if self.center is not None:
             lens.center = (self.center + 0.5) * torch.stack((across, down), -1) - 0.5
         if down is not across and bool((down != across).any()):
-            affine = self.affine
-            if affine is None:
-                affine = torch.eye(2, dtype=down.dtype, device=down.device)
+            affine = self._eye() if self.affine is None else self.affine
             rows = torch.stack((torch.ones_like(down), down / across), -1)
             lens.affine = rows[..., None] * affine
         return lens
 
-    def in_picture(self, size: tuple[int, int]) -> Self:
-        """The lens in a picture of (H, W) that shows all that the lens was calibrated with.
+    def _eye(self) -> Tensor:
+        return torch.eye(2, dtype=self.theta_max.dtype, device=self.theta_max.device)
 
-        A lens without an `image_size` stays as it is.
+    def _sizes(self, size: tuple[int, int]) -> Tensor:
+        """(N, 2): one size for all lenses."""
+        return self.theta_max.new_tensor([size]).expand(len(self), 2)
+
+    def in_picture(self, size: tuple[int, int]) -> Self:
+        """The lens, if it has an `image_size`, in a picture of (H, W) of the same view.
 
         Raises:
             ValueError: a picture of another shape, by more than the rounding of its sides.
@@ -103,13 +108,8 @@ class ImageFrame(LensBatch):
 
     def _scaled(self, scale: Tensor) -> Self:
         """The same lens with all its lengths `scale`, (N or 1,), times as long."""
-        return self.replace(
-            **{
-                name: value * self._row(scale, value.dim())
-                for name, value in self._tensors().items()
-                if self.declared[name].in_pixels
-            }
-        )
+        lengths = {n: v for n, v in self._tensors().items() if self.declared[n].in_pixels}
+        return self.replace(**{n: v * self._row(scale, v.dim()) for n, v in lengths.items()})
 
     def cropped(self, top: int, left: int, height: int, width: int) -> Self:
         """The same lens in a part of the image: `image[..., top:top + height, left:left + width]`.
@@ -123,7 +123,7 @@ class ImageFrame(LensBatch):
         top, left = _whole((top, left))
         height, width = _image_size((height, width))
         center = self.center_in() - self.theta_max.new_tensor([left, top])
-        size = self.theta_max.new_tensor([[height, width]]).expand(len(self), 2)
+        size = self._sizes((height, width))
         return self.replace(center=center.expand(len(self), 2), image_size=size)
 
 

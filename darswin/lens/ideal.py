@@ -2,13 +2,14 @@
 
 import math
 from collections.abc import Callable
+from functools import cache
 from typing import ClassVar, Self
 
 import torch
 from torch import Tensor
 
 from darswin.lens.base import MARGIN, Lens
-from darswin.lens.parameter import Number, Parameter, bind, signature
+from darswin.lens.parameter import Arguments, Number, Parameter
 
 
 class FocalLens(Lens, register=False):
@@ -28,14 +29,18 @@ class FocalLens(Lens, register=False):
 
         Raises what the constructor does.
         """
-        own = (name for name in cls.parameters if name != "focal")
-        others = (*cls.optional, "affine", "image_size")
-        taken = signature((*own, "fov", "radius"), ("center",), others)
-        rows = cls._expanded(bind(f"{cls.__name__}.from_fov", taken, arguments, named))
+        rows = cls._expanded(cls._of_fov().bind(f"{cls.__name__}.from_fov", arguments, named))
         theta_max, radius = rows.pop("fov") / 2, rows.pop("radius")
         unit = rows | {"focal": torch.ones_like(radius), "theta_max": theta_max}
         focal = cls._from_tensors(unit)._scale_to(radius)
         return cls(**rows, focal=focal, theta_max=theta_max)
+
+    @classmethod
+    @cache
+    def _of_fov(cls) -> Arguments:
+        own = [name for name in cls.parameters if name != "focal"]
+        by_name = (*cls.optional, "affine", "image_size")
+        return Arguments((*own, "fov", "radius"), ("center",), by_name)
 
     def _scale_to(self, radius: Tensor) -> Tensor:
         """(N,): how many times larger the lens must be for θ_max to land at a radius."""

@@ -2,7 +2,7 @@
 
 import inspect
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass
 from functools import reduce
 from typing import TYPE_CHECKING, Any
@@ -45,22 +45,26 @@ class Parameter:
     def rows(self, name: str, value: Tensor) -> Tensor:
         """The value as (N or 1, ...); ValueError for another shape."""
         rows = value[None] if value.dim() == len(self.shape) else value
+        sides = rows.shape[1:]
         if rows.dim() != len(self.shape) + 1 or any(
-            side not in (None, given)
-            for side, given in zip(self.shape, rows.shape[1:], strict=True)
+            side is not None and side != given
+            for side, given in zip(self.shape, sides, strict=True)
         ):
             one = ", ".join("K" if side is None else str(side) for side in self.shape)
             form = f"({one}) or (N, {one})" if one else "a number or (N,)"
             raise ValueError(f"{name} must be {form}, got shape {tuple(value.shape)}")
         return rows
 
-    def holds(self, value: Tensor) -> Tensor:
-        """True for each lens, (N,), whose values are in range."""
-        value, low, high = value.detach(), self.low, self.high
-        above = value > low if self.open or low == -math.inf else value >= low
-        below = value < high if self.open or high == math.inf else value <= high
-        inside = above & below  # NaN and infinities are not
-        return inside.flatten(1).all(1) if self.shape else inside
+    def holds(self, value: Tensor) -> bool:
+        """True if all values are finite and in range."""
+        if not value.numel():
+            return True
+        least, most = (end.item() for end in value.detach().aminmax())
+        if not (math.isfinite(least) and math.isfinite(most)):  # NaN is both, if there is one
+            return False
+        if self.open:
+            return self.low < least and most < self.high
+        return self.low <= least and most <= self.high
 
     @property
     def range(self) -> str:
@@ -73,37 +77,41 @@ class Parameter:
         return f"finite and {'above' if self.open else 'at least'} {self.low:g}"
 
 
-def signature(
-    required: Iterable[str], optional: Iterable[str], by_name: Iterable[str]
-) -> inspect.Signature:
-    """The signature of a constructor."""
-    kind = inspect.Parameter
-    return inspect.Signature(
-        [
-            *(kind(name, kind.POSITIONAL_OR_KEYWORD) for name in required),
-            *(kind(name, kind.POSITIONAL_OR_KEYWORD, default=None) for name in optional),
-            *(kind(name, kind.KEYWORD_ONLY, default=None) for name in by_name),
-        ]
-    )
+class Arguments:
+    """The arguments of a constructor: those that it needs, others by their place, and by name."""
 
+    def __init__(self, required: Sequence[str], optional: Sequence[str], by_name: Sequence[str]):
+        self.places, self.required = (*required, *optional), {*required}
+        self.known = {*self.places, *by_name}
+        kind = inspect.Parameter
+        self.signature = inspect.Signature(
+            [
+                *(kind(name, kind.POSITIONAL_OR_KEYWORD) for name in required),
+                *(kind(name, kind.POSITIONAL_OR_KEYWORD, default=None) for name in optional),
+                *(kind(name, kind.KEYWORD_ONLY, default=None) for name in by_name),
+            ]
+        )
 
-def bind(
-    function: str, signature: inspect.Signature, arguments: tuple, named: Mapping[str, Any]
-) -> dict[str, Any]:
-    """The arguments by their names, but for those that are None; TypeError for wrong ones."""
-    try:
-        given = signature.bind(*arguments, **named).arguments
-    except TypeError as error:
-        raise TypeError(f"{function}{signature}: {error}") from error
-    return {name: value for name, value in given.items() if value is not None}
+    def bind(
+        self, function: str, arguments: Sequence[Any], named: dict[str, Any]
+    ) -> dict[str, Any]:
+        """Values by their names, but for those that are None; TypeError for wrong arguments."""
+        given = dict(zip(self.places, arguments, strict=False)) | named
+        all_bound = len(given) == len(arguments) + len(named)
+        if not (all_bound and self.required <= given.keys() <= self.known):
+            try:
+                self.signature.bind(*arguments, **named)  # it says what is wrong
+            except TypeError as error:
+                raise TypeError(f"{function}{self.signature}: {error}") from error
+        return {name: value for name, value in given.items() if value is not None}
 
 
 def as_tensors(values: Mapping[str, Number]) -> dict[str, Tensor]:
     """All values as tensors of one dtype and device: those of the tensors among them, if any."""
     given = [v for v in values.values() if isinstance(v, Tensor) and v.is_floating_point()]
-    dtype, device = torch.get_default_dtype(), None
-    if given:
-        dtype, device = reduce(torch.promote_types, (v.dtype for v in given)), given[0].device
+    dtypes = (tensor.dtype for tensor in given)
+    dtype = reduce(torch.promote_types, dtypes) if given else torch.get_default_dtype()
+    device = given[0].device if given else None
     tensors = {}
     for name, value in values.items():
         try:

@@ -104,7 +104,7 @@ def test_a_batch_is_its_lenses_and_json_is_the_lens(lens):
     theta = 0.9 * lens.theta_max[:, None]
     together = lens.project_rays(theta, torch.full_like(theta, 0.7), (480, 640))
     joined = cat([lens[k] for k in range(len(lens))])
-    for name in lens._names():
+    for name in lens.names:
         value, other = getattr(lens, name), getattr(joined, name)
         assert (value is None) == (other is None) and (value is None or torch.equal(value, other))
     for k in range(len(lens)):
@@ -114,7 +114,7 @@ def test_a_batch_is_its_lenses_and_json_is_the_lens(lens):
             read = from_dict(described)
         finally:
             torch.set_default_dtype(torch.float32)
-        assert read._names() == lens._names()
+        assert read.names == lens.names
         alone = lens[k].project_rays(theta[k : k + 1], 0.7, (480, 640))
         torch.testing.assert_close(alone, together[k : k + 1])
 
