@@ -1,6 +1,7 @@
 """The dense study's own code, on a few small pictures: a minute's version of `make study-dense`."""
 
 import json
+import shutil
 from pathlib import Path
 
 import dense
@@ -71,29 +72,22 @@ def here(monkeypatch, threads):
 
 def test_cells_are_trained_and_tested_once(quick, here, capsys):
     cells = found(quick)
-    assert cells.keys() == {
-        f"{name}-low-{task}-0"
-        for name in ("swin-unet", "lensadapter-swin-unet")
-        for task in ("segmentation", "distance")
-    }
+    tasks = ("segmentation", "distance")
+    models = ("swin-unet", "lensadapter-swin-unet")
+    assert cells.keys() == {f"{name}-low-{task}-0" for name in models for task in tasks}
     for cell in cells.values():
         assert cell["sets"].keys() == set(dense_data.test_sets())
         scores = [row[dense_tables.SCORE[cell["task"]]] for row in cell["sets"].values()]
         assert all(0 <= score <= 1 for score in scores)
     # A study that was stopped reads what it has; a cell that is run again finds the same.
-    folder = quick / "out" / "nano" / "swin-unet-low-segmentation-0"
-    for file in folder.rglob("*"):
-        if file.is_file():
-            file.unlink()
+    shutil.rmtree(quick / "out" / "nano" / "swin-unet-low-segmentation-0")
     capsys.readouterr()
     where = ["--out", str(quick / "out"), "--results", str(quick)]
     dense.main([*where, "--cell", "swin-unet-low-seg", *QUICK])
     results = json.loads(capsys.readouterr().out.split("cells after", 1)[1].split("\n", 1)[1])
+    before = {(cell["model"], cell["task"]): cell["sets"] for cell in cells.values()}
     assert len(results) == 2
-    for cell in results:
-        before = next(c for c in cells.values() if c["model"] == cell["model"] and
-                      c["task"] == cell["task"])  # fmt: skip
-        assert cell["sets"] == before["sets"]
+    assert all(cell["sets"] == before[cell["model"], cell["task"]] for cell in results)
     # With other options it says so, and mixes nothing.
     with pytest.raises(ValueError, match="was made otherwise"):
         dense.main([*where, "--cell", "swin-unet-low-seg", *QUICK, "--data.flip", "false"])
@@ -131,9 +125,10 @@ def test_cells_of_a_record_are_not_run_again(quick, here, tmp_path):
     # What is there is collected, and nothing is run.
     dense.main([*where, "--collect", *QUICK])
     assert len(json.loads((tmp_path / "dense.json").read_text())["cells"]) == 4
-    (tmp_path / "known.json").write_text(json.dumps(record | dict(config="max_epochs: 9")))
-    with pytest.raises(ValueError, match="of another configuration"):
-        dense.main([*where, "--known", str(tmp_path / "known.json"), *QUICK])
-    (tmp_path / "known.json").write_text(json.dumps(record | dict(cameras=["another"])))
-    with pytest.raises(ValueError, match=r"must be of the cameras .*, got \['another'\]"):
-        dense.main([*where, "--known", str(tmp_path / "known.json"), *QUICK])
+    for other, message in (
+        (dict(config="max_epochs: 9"), "of another configuration"),
+        (dict(cameras=["another"]), r"must be of the cameras .*, got \['another'\]"),
+    ):
+        (tmp_path / "known.json").write_text(json.dumps(record | other))
+        with pytest.raises(ValueError, match=message):
+            dense.main([*where, "--known", str(tmp_path / "known.json"), *QUICK])

@@ -67,9 +67,9 @@ def options(frames, scenes, tmp_path):
 @pytest.mark.parametrize(
     ("data", "kills"),
     [
-        ("digits", (8, 3, 9)),
+        ("digits", (8, 9)),
         pytest.param("frames", (5, 6), marks=pytest.mark.slow),
-        ("labels", (4, 4)),
+        pytest.param("labels", (4, 4), marks=pytest.mark.slow),
         pytest.param("distances", (4, 4), marks=pytest.mark.slow),
     ],
 )
@@ -83,7 +83,7 @@ def test_a_killed_run_goes_on_bit_for_bit(options, tmp_path, monkeypatch, data, 
     assert_same(tmp_path / "killed", tmp_path / "whole")
 
 
-@pytest.mark.parametrize("data", ["digits", "labels"])
+@pytest.mark.parametrize("data", ["digits", pytest.param("labels", marks=pytest.mark.slow)])
 def test_with_a_gpu_as_lightnings_device_weights_and_data_are_the_same(
     options, tmp_path, monkeypatch, data
 ):
@@ -96,15 +96,17 @@ def test_with_a_gpu_as_lightnings_device_weights_and_data_are_the_same(
     assert_same(tmp_path / "gpu", tmp_path / "cpu")
 
 
-MODELS = {
-    "digits": ["darswin_ra_nano", "swin_nano", "dat_nano"],
-    "frames": ["swin_undis_nano"],
-    "labels": ["swin_unet_nano", "swin_unet_undis_nano", "swin_unet_adapted_nano"],
-}
-
-
-@pytest.mark.parametrize(("data", "name"), [(d, name) for d in MODELS for name in MODELS[d]])
-def test_every_model_trains_and_tests(options, tmp_path, data, name):
+@pytest.mark.parametrize(
+    ("data", "name"),
+    [
+        ("digits", "darswin_ra_nano"),
+        pytest.param("digits", "dat_nano", marks=pytest.mark.slow),
+        ("frames", "swin_undis_nano"),
+        pytest.param("labels", "swin_unet_nano", marks=pytest.mark.slow),
+        ("labels", "swin_unet_adapted_nano"),
+    ],
+)
+def test_models_train_and_test(options, tmp_path, data, name):
     own = "{embed_dim: 8, depths: [1, 1, 1]}" if data == "labels" else "{}"
     few = ["--trainer.max_steps", "2", "--trainer.accumulate_grad_batches", "1"]
     few += ["--model.name", name, "--model.options", own]
@@ -112,10 +114,9 @@ def test_every_model_trains_and_tests(options, tmp_path, data, name):
     weights = checkpoint(tmp_path / "run")["state_dict"]
     assert all(torch.isfinite(tensor).all() for tensor in weights.values())
     more = ["--xi", "0.1,polynomial"] if data == "digits" else []
-    rows = test(tmp_path / "run", *more)
-    assert [row.get("lenses") for row in rows] == (
-        ["0.1", "polynomial"] if more else [None if data == "labels" else "lenses.json"]
-    )
+    lenses = [row.get("lenses") for row in test(tmp_path / "run", *more)]
+    expected = dict(digits=["0.1", "polynomial"], frames=["lenses.json"], labels=[None])
+    assert lenses == expected[data]
     assert json.loads((tmp_path / "run" / "test.json").read_text())["model"] == name
 
 
@@ -225,7 +226,7 @@ def test_a_cut_off_checkpoint_is_named_with_the_other_one(whole, begun, capsys):
     last, best = (begun / "checkpoints" / f"{name}.ckpt" for name in ("last", "best"))
     data = last.read_bytes()
     resume = ["fit", "--run", begun, "--resume"]
-    for size in (0, 100, len(data) - 10):
+    for size in (0, len(data) - 10):
         last.write_bytes(data[:size])
         message = error(capsys, *resume)
         assert f"{last} cannot be read as a checkpoint; --ckpt_path {best}" in message
@@ -311,8 +312,6 @@ def test_labels_are_learned_and_what_a_test_writes(labelled, capsys):
     assert [zone["from_deg"] for zone in row["per_zone"]] == [0, 30, 60, 90]
     pixels = [zone["pixels"] for zone in row["per_zone"]]
     assert sum(pixels) == row["pixels"] == sum(c["pixels"] for c in row["per_class"].values())
-    ious = [scores["iou"] for scores in row["per_class"].values()]
-    assert sum(ious) / 3 == pytest.approx(row["miou"])
     said = capsys.readouterr().out
     assert "miou (%)" in said and "wall" in said and "30–60°" in said and "≥ 90°" in said
     assert "test.csv, test_classes.csv, test_zones.csv, test.json and test.png" in said
@@ -389,8 +388,7 @@ def test_targets_that_nothing_can_be_learned_from(scenes, tmp_path, capsys):
     path = shutil.copytree(scenes, tmp_path / "scenes")
     for file in (path / "labels").iterdir():
         cv2.imwrite(str(file), np.full((45, 60), 255, np.uint8))
-    start = ["--task", "segmentation", *PIXELS, "--data.path", path, "--trainer.max_epochs", "3"]
-    message = "none of the pixels of {} training images has a label"
-    assert message.format(48) in error(capsys, "fit", "--run", tmp_path / "run", *start)
-    few = [*start, "--trainer.max_steps", "2"]  # a few are enough, where nothing at all is known
-    assert message.format(16) in error(capsys, "fit", "--run", tmp_path / "few", *few)
+    start = ["--task", "segmentation", *PIXELS, "--data.path", path]
+    for end, images in (("max_epochs", 48), ("max_steps", 16)):  # a whole epoch, and less than one
+        said = error(capsys, "fit", "--run", tmp_path / end, *start, f"--trainer.{end}", 2)
+        assert f"none of the pixels of {images} training images has a label" in said
