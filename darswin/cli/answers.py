@@ -42,29 +42,22 @@ FARTHEST = 2**16 - 1  # the largest number of 16 bits
 
 
 class Request(NamedTuple):
-    """entry: the part of the answer that is known before; image: (H, W, C) uint8; pixels:
-    (1, C, h, w), the model's input."""
-
-    entry: dict[str, Any]
-    image: np.ndarray
-    pixels: Tensor
+    entry: dict[str, Any]  # the part of the answer that is known before
+    image: np.ndarray  # (H, W, C) uint8
+    pixels: Tensor  # (1, C, h, w), the model's input
 
 
 class Answers:
     """Collects a model's answers to images, in their order.
 
     Images that follow each other and have the same lens go through the model together, and the
-    values that depend on the lens alone are computed once. A subclass defines `_run`, the network,
-    and `_answer`, which makes an entry of its output.
-
-    Attributes:
-        found: an entry for each image answered. seconds: what the network took for them.
+    values that depend on the lens alone are computed once.
     """
 
     def __init__(self, model: Encoder | Unet, card: ModelCard):
         self.model, self.card = model, card
         self.found: list[dict[str, Any]] = []
-        self.seconds = 0.0
+        self.seconds = 0.0  # that the network took
         self._lens: Lens | None = None  # of the queue
         self._prepared: dict[int, tuple[Lens, Any, FullSize | None]] = {}  # by a lens's identity
         self._queue: list[Request] = []
@@ -87,11 +80,7 @@ class Answers:
             self.flush()
 
     def flush(self) -> None:
-        """Answers the images in the queue.
-
-        Raises:
-            FloatingPointError: naming an image for which the model computes NaN or infinity.
-        """
+        """Answers the images in the queue; FloatingPointError where the model computes NaN."""
         queue, self._queue = self._queue, []
         if not queue:
             return
@@ -145,11 +134,8 @@ class ClassAnswers(Answers):
 
 
 class PixelAnswers(Answers):
-    """Writes a file of the answers for an image's pixels, and an overlay of the image.
-
-    Files of pixels and overlays are in folders of their own, below which each image has the name
-    that `names`, of `file_names`, gives it, or a frame of a video that name and its number.
-    """
+    """Writes a file of the answers for an image's pixels, and an overlay of the image, by the names
+    of `file_names`."""
 
     kind: str  # of the answers, and the name of their folder
     model: Unet
@@ -215,10 +201,7 @@ class DistanceAnswers(PixelAnswers):
     """A distance along the ray for each pixel: 16-bit PNGs, metres × 256, 0 for none."""
 
     kind = "distance"
-
-    def __init__(self, model: Unet, card: ModelCard, out: Path, names: Mapping[str, str]):
-        super().__init__(model, card, out, names)
-        self._range: tuple[Any, tuple[float, float]] = (None, (1.0, 2.0))
+    _range: tuple[Any, tuple[float, float]] = (None, (1.0, 2.0))  # of a video's first frame
 
     def _picture(self, request, output, full):
         distance = full.distance(output[0])
@@ -227,7 +210,7 @@ class DistanceAnswers(PixelAnswers):
         unanswered = round(float(1 - known.mean()), 6)
         ends = np.quantile(values, (0, 0.5, 1)).tolist()
         metres = dict(zip(("min_m", "median_m", "max_m"), (round(v, 4) for v in ends), strict=True))
-        # Frames of a video have the colours of its first.
+        # Frames of a video have the colours of its first one.
         video = request.entry.get("video")
         if video is None or video != self._range[0]:
             self._range = video, distance_range(distance)
@@ -267,10 +250,8 @@ def label_png(labels: np.ndarray, colors: Sequence[Sequence[int]]) -> bytes:
 
 
 def distance_png(distance: np.ndarray) -> memoryview:
-    """Distances (H, W) in metres as a PNG of 16 bits: metres × 256, 0 where they are not known.
-
-    From 255.996 m on, the end of its range, pixels are 65535; from 0 to 1/256 m they are 1.
-    """
+    """Distances (H, W) in metres as a PNG of 16 bits: metres × 256, 0 where they are not known, and
+    cut to 1 … 65535 where they are."""
     known = is_known(distance)
     steps = np.rint(np.where(known, distance, 0) * PER_METRE).clip(known, FARTHEST)
     _, png = cv2.imencode(".png", steps.astype(np.uint16))
@@ -278,14 +259,8 @@ def distance_png(distance: np.ndarray) -> memoryview:
 
 
 def file_names(paths: Sequence[str], files: Sequence[tuple[str, bool]]) -> dict[str, str]:
-    """Names for the files of pictures and videos, without an ending: different for different ones.
-
-    They are paths relative to the folder that all arguments are in: the one folder that was given,
-    or what several paths have in common. Pictures lose their endings if they still differ then.
-
-    Args:
-        paths: the arguments. files: of (path, whether it is a video).
-    """
+    """Names for the files of pictures and videos: their paths in the folder that all arguments are
+    in, the one given or what several have in common, without endings if they still differ then."""
     places = [os.path.abspath(p if os.path.isdir(p) else os.path.dirname(p) or ".") for p in paths]
     root = os.path.commonpath(places)
     whole = {name: os.path.relpath(os.path.abspath(name), root) for name, _ in files}
@@ -295,8 +270,7 @@ def file_names(paths: Sequence[str], files: Sequence[tuple[str, bool]]) -> dict[
 
 
 def claim_folder(out: str | None) -> Path:
-    """The folder for the files of `PixelAnswers`; ValueError unless it is new, empty, or of an
-    earlier `predict`."""
+    """The folder for the files of `PixelAnswers`, which must be new, empty, or an earlier one."""
     if out is None:
         raise ValueError("predict writes pictures for such a model: `out` must be their folder")
     folder = Path(out)

@@ -137,8 +137,7 @@ def predict(
 
 
 def pictures_and_videos(paths: Sequence[str], leave_out: str | None = None) -> list[File]:
-    """The files of paths, of which folders mean all pictures and videos in them, but for those in
-    `leave_out`; FileNotFoundError for a folder without any."""
+    """The files of paths, of which folders mean all pictures and videos in them."""
     files = []
     for path in paths:
         names = [str(path)]
@@ -225,8 +224,7 @@ def trained_model(path: str | Path) -> tuple[Any, ModelCard]:
 
 
 def _released_size(path: str | Path) -> int:
-    """px of the images that released weights were trained on, 64 unless their configuration says
-    another size."""
+    """px of the images that released weights were trained on, as their configuration says."""
     with safe_open(path, "pt") as file:
         config = (file.metadata() or {}).get("config", "{}")
     try:

@@ -76,8 +76,7 @@ def open_folder(
 
 
 def pictures_and_videos_below(folder: Path) -> list[str]:
-    """The pictures and videos in a folder and in those below it, sorted; links are followed, hidden
-    ones not. FileNotFoundError where darswin reads none of them."""
+    """The pictures and videos below a folder, sorted; FileNotFoundError where there are none."""
     files = sorted(files_below(folder), key=_parts)
     read = [file for file in files if _suffix(file) in SUFFIXES | VIDEOS]
     others = [file for file in files if _suffix(file) in OTHER_SUFFIXES]
@@ -183,7 +182,6 @@ def _warn_of_loose(folder: Path, files: list[Path]) -> None:
 
 
 def _entries(folder: Path) -> tuple[list[Path], list[Path]]:
-    """The folders and the files in a folder, sorted, links to them too, no hidden ones."""
     folders: list[Path] = []
     files: list[Path] = []
     with os.scandir(folder) as entries:
@@ -194,10 +192,8 @@ def _entries(folder: Path) -> tuple[list[Path], list[Path]]:
 
 
 def _below(folder: Path, seen: dict[str, str] | None = None) -> Iterator[str]:
-    """Files below a folder, through links too, no hidden ones.
-
-    A folder whose real path is in `seen` is refused. Without `seen`, each is read once.
-    """
+    """As `files_below`. A folder whose real path is in `seen` is refused; without it, each is read
+    once."""
     strict, seen = seen is not None, {} if seen is None else seen
     for here, folders, files in os.walk(folder, followlinks=True, onerror=_raise):
         real = os.path.realpath(here)

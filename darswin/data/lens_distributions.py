@@ -88,8 +88,7 @@ def parse_lenses(text: str | float) -> LensDistribution:
 
 
 def parse_sweep(text: str | float | list) -> list[str]:
-    """The names of several distributions: of a list of them, or of "start:stop:step", equally
-    spaced ξ with the stop included; ValueError for another form."""
+    """The names of several distributions; "start:stop:step" stands for equally spaced ξ."""
     if isinstance(text, list):
         return [name for part in text for name in parse_sweep(part)]
     parts = str(text).split(":")

@@ -40,7 +40,6 @@ class TrainingOrder(Sampler[Draw]):
         self._resume = (-1, 0)  # an epoch, and how many of its batches are done
 
     def set_epoch(self, epoch: int) -> None:
-        """Called by Lightning before each epoch."""
         self.epoch = epoch
 
     def resume(self, epoch: int, done: int, shuffle: list[int]) -> None:
@@ -55,11 +54,9 @@ class TrainingOrder(Sampler[Draw]):
         self._resume = (epoch, done)
 
     def shuffle(self) -> list[int]:
-        """All that the order depends on: the pictures, the global batch and the seed."""
         return [self.count, self.batch * self.world, self.seed]
 
     def done(self) -> int:
-        """Batches that the next iteration leaves out."""
         return self._resume[1] if self._resume[0] == self.epoch else 0
 
     def batches(self) -> int:
@@ -118,10 +115,8 @@ class ResumableLoader(DataLoader):
             yield batch
 
     def state_dict(self) -> dict[str, Any]:
-        """The epoch, the number of its batches that were handed out, and the shuffle."""
         order = self._order
         return {"epoch": order.epoch, "done": self._done, "shuffle": order.shuffle()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Goes on where the loader stood that gave this state."""
         self._order.resume(**state)

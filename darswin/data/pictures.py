@@ -15,10 +15,7 @@ from darswin.utils.image import read_image, read_oriented, with_channels
 
 
 class Source(Limited):
-    """A sequence of pictures: `source[i]` is (image (H, W, C) uint8, label).
-
-    Attributes: classes: the names behind the labels; labels: (N,); channels: 3 or 1.
-    """
+    """A sequence of pictures: `source[i]` is (image (H, W, C) uint8, label)."""
 
     def __init__(self, labels: np.ndarray, classes: Sequence[str], channels: int):
         self.labels, self.classes, self.channels = labels, list(classes), channels
@@ -27,7 +24,6 @@ class Source(Limited):
         return len(self.labels)
 
     def __getitem__(self, index: int) -> tuple[np.ndarray, int]:
-        """The image and its label; BrokenImageError names a file that is none."""
         raise NotImplementedError
 
     def oriented(self, index: int) -> tuple[np.ndarray, int, int]:

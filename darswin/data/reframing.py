@@ -31,8 +31,7 @@ _NUDGE = 1e-3  # px, more than the rounding of places in float32
 def resize_scene(
     scene: Scene, taken: tuple[int, int, int, int], size: int, mirrored: bool
 ) -> Scene:
-    """A part of a scene (top, left, height, width), after mirroring the scene if `mirrored`, as
-    (size, size)."""
+    """A part (top, left, height, width) of a scene, or of its mirror image, as (size, size)."""
     image, target, lens = scene
     if mirrored:
         lens = turned_lens(lens, Turn(0.0, True))[0]
@@ -46,8 +45,7 @@ def resize_scene(
 
 
 def turn_scene(scene: Scene, turn: Turn, taken: tuple[int, int, int, int], size: int) -> Scene:
-    """A part of a scene turned about its lens's optical axis, as (size, size); what turns in from
-    beyond the picture is black, and nothing is known of it."""
+    """A part of a scene turned about its lens's optical axis, as (size, size)."""
     lens, matrix = turned_lens(scene.lens, turn)
     top, left, height, width = taken
     scale = np.array([width, height]) / size
@@ -60,11 +58,7 @@ def turn_scene(scene: Scene, turn: Turn, taken: tuple[int, int, int, int], size:
 
 
 def warp_scene(scene: Scene, lens: Lens, size: int, turn: Turn | None = None) -> Scene:
-    """A scene, turned if there is a turn, as another lens would have seen it, (size, size).
-
-    The lens is radial and has no `affine`. A distance along the ray stays the same. Pixels that the
-    picture does not show are black, and nothing is known of them.
-    """
+    """A scene as another lens, radial and without `affine`, would have seen it, (size, size)."""
     exact, source = lens.to(torch.float64), scene.lens.to(torch.float64)
     last = exact.r_max.item()
     points = _points(source.r_max.item() / last)
@@ -145,8 +139,7 @@ def _aside(size: int) -> np.ndarray:
 
 
 def _points(scale: float) -> int:
-    """The number of points along an axis at which a pixel is read that is as large as `scale`
-    others."""
+    """Points along an axis at which a pixel is read that is as large as `scale` others."""
     return min(_MOST_POINTS, 2 * int(np.ceil((scale / _APART - 1) / 2)) + 1) if scale > 1 else 1
 
 

@@ -40,10 +40,7 @@ def check_split(split: str, allowed: tuple[str, ...], holdout: float) -> None:
 
 
 def taken_from(split: Split, given: Collection[Split]) -> tuple[Split, list[Split]]:
-    """The given part that a split is taken from, and the splits that are held out of that part.
-
-    Without a test set of its own, "val" serves as one. "train" gives what else is missing.
-    """
+    """The given part that a split is taken from, and the splits that are held out of that part."""
     missing: list[Split] = [part for part in ("test", "val") if part not in given]
     part: Split = split
     held_out: list[Split] = missing if split == "train" else []
@@ -67,7 +64,7 @@ def part_of_split(
     group: Callable[[str], str] | None = None,
 ) -> list[str]:
     """The paths of a split, where `held_out` and "train" share them: of each label the same share,
-    and paths of one group together. `where` is the folder, for errors."""
+    and paths of one group together."""
     if not held_out:
         return paths
     groups = {path: group(path) if group else path for path in paths}
@@ -122,8 +119,7 @@ class Limited:
 
 
 def split_folders(folders: Iterable[Path], holds: Callable[[Path], bool]) -> dict[Split, Path]:
-    """Those of the folders that have a split's name and for which `holds` is true; ValueError for
-    two of one split."""
+    """Those of the folders that have a split's name and for which `holds` is true."""
     named: dict[Split, Path] = {}
     for folder in folders:
         split = SPLIT_NAMES.get(folder.name.lower())
@@ -141,8 +137,7 @@ def split_folders(folders: Iterable[Path], holds: Callable[[Path], bool]) -> dic
 
 
 def read_split_lists(lists: Path) -> dict[Split, list]:
-    """The entries of each split, from a JSON file, or from a folder with a text file per split;
-    ValueError for another form, or for two lists of one split."""
+    """The entries of each split, from a JSON file, or from a folder with a text file per split."""
     if lists.is_dir():
         content = {
             file.stem: read_list(file)
@@ -176,7 +171,7 @@ def read_list(path: str | Path) -> list[str]:
 
 
 def read_classes(path: str | Path) -> list[str]:
-    """Names of classes as `read_list`; ValueError where there are none, or one is there twice."""
+    """Names of classes as `read_list`, each once."""
     names = read_list(path)
     if not names:
         raise ValueError(f"{path} must name the classes, but is empty")

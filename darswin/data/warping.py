@@ -113,8 +113,8 @@ class RandomTurns:
 
 
 def turned_lens(lens: Lens, turn: Turn) -> tuple[Lens, np.ndarray]:
-    """The lens of a picture after a turn about its optical axis, and (2, 3) float64, which takes a
-    pixel (x, y, 1) to its new place. The lens has the picture's image_size."""
+    """The lens of a picture after a turn about its optical axis, and (2, 3), which takes a pixel
+    (x, y, 1) to its new place."""
     lens, matrix = rotated(lens, turn.angle)
     moves = matrix.numpy()
     if turn.mirrored:
@@ -126,11 +126,8 @@ def turned_lens(lens: Lens, turn: Turn) -> tuple[Lens, np.ndarray]:
 
 
 def turned_picture(image: np.ndarray, lens: Lens, turn: Turn) -> tuple[np.ndarray, Lens]:
-    """A picture (H, W, C) uint8 and its lens after a turn about the lens's optical axis.
-
-    The picture keeps its size; what turns in from beyond it is black. Where pixels are oblong the
-    picture is sheared so that it looks turned through that lens.
-    """
+    """A picture and its lens after a turn about the optical axis; the picture keeps its size, and
+    is sheared where pixels are oblong, so that it looks turned through that lens."""
     if turn.angle:
         lens, matrix = rotated(lens, turn.angle)
         height, width = image.shape[:2]
@@ -189,7 +186,6 @@ def lens_at_size(lens: Lens, size: int, framing: Framing) -> Lens:
 
 
 def picture_size(lens: Lens) -> tuple[int, int]:
-    """(H, W) of the pictures of a lens; ValueError if it does not have their image_size."""
     if lens.image_size is None:
         raise ValueError("a lens that follows its picture needs an image_size")
     height, width = lens.image_size[0].tolist()
@@ -208,8 +204,7 @@ class Crop(NamedTuple):
 def taken_part(
     size: tuple[int, ...], framing: Framing, crop: Crop | None = None
 ) -> tuple[int, int, int, int]:
-    """The part of a picture (H, W) that is kept: top, left, height, width. With "crop", a `Crop` is
-    a square anywhere in the picture."""
+    """The part of a picture (H, W) that is kept: top, left, height, width."""
     if framing not in get_args(Framing):
         allowed = ", ".join(get_args(Framing))
         raise ValueError(f"framing must be one of {allowed}, got {framing!r}")

@@ -4,7 +4,7 @@ import math
 from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal, TypeVar
 
 import torch
 from lightning.pytorch import LightningDataModule
@@ -24,10 +24,11 @@ from darswin.train.runs import ignore_signals
 
 __all__ = ["RunData", "WideAngleData"]
 
+SamplesT = TypeVar("SamplesT", bound=Samples)
+
 
 class RunData(LightningDataModule):
-    """Base of the data of a run. Such data define `classes`, `test_names`, `dataset` and
-    `_training`.
+    """Base of the data of a run. Such data define `_open`, `test_names`, `dataset`, `_training`.
 
     Args:
         path: what `open_source` or `open_scenes` opens.
@@ -116,19 +117,38 @@ class RunData(LightningDataModule):
         self.turns = RandomTurns(flip, rotate_deg) if flip or rotate_deg else None
         self.colour_changes = RandAugment() if randaugment else None
         self.seed = seed
+        self._sources: dict[Split, Any] = {}
         self.datasets: list[Samples] = []
         self._loader: ResumableLoader | None = None
         self._progress: dict[str, Any] = {}
 
+    def _open(self, split: Split) -> Any:
+        """The pictures of a split."""
+        raise NotImplementedError
+
+    def source(self, split: Split) -> Any:
+        """The pictures of a split, opened once."""
+        if split not in self._sources:
+            self._sources[split] = self._open(split)
+        return self._sources[split]
+
     @property
     def classes(self) -> list[str]:
-        """The names behind the labels."""
-        raise NotImplementedError
+        """The names behind the labels; none for distances."""
+        return self.source("train").classes
 
     @property
     def test_names(self) -> list[str]:
         """The names of the sets that a test measures, one after the other."""
         raise NotImplementedError
+
+    def _limited(self, source: Any) -> Any:
+        return source if self.limit is None else source.limited(self.limit)
+
+    def _noted(self, dataset: SamplesT) -> SamplesT:
+        """A data set whose broken pictures are counted."""
+        self.datasets.append(dataset)
+        return dataset
 
     def broken(self) -> int:
         """How many pictures could not be read so far."""
@@ -170,7 +190,7 @@ class RunData(LightningDataModule):
     # Lightning restores a loader's own state only if it was made after the optimiser, and the
     # optimiser's schedule needs its length.
     def state_dict(self) -> dict[str, Any]:
-        """The place in the training's order."""
+        """The place in the order of the training."""
         return self._loader.state_dict() if self._loader else {}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
@@ -258,17 +278,9 @@ class WideAngleData(RunData):
         self.fov = 0.0 if self._lens else math.radians(fov_deg)
         self.frame_fit = self._form["framing"] if self._lens else "whole"
         self.erasing, self.pair_lenses = erasing, pair_lenses
-        self._sources: dict[str, Source] = {}
 
-    def source(self, split: Split) -> Source:
-        """The pictures of a split."""
-        if split not in self._sources:
-            self._sources[split] = open_source(self.path, split, **self._opening)
-        return self._sources[split]
-
-    @property
-    def classes(self) -> list[str]:
-        return self.source("train").classes
+    def _open(self, split: Split) -> Source:
+        return open_source(self.path, split, **self._opening)
 
     @property
     def test_names(self) -> list[str]:
@@ -287,17 +299,11 @@ class WideAngleData(RunData):
     def dataset(self, split: Split, name: str | None = None, **options: Any) -> Samples:
         """A split as it is, with its cameras' lenses; or through a distribution of lenses, where
         None means that of training."""
-        source = self.source(split)
-        if self.limit is not None:
-            source = source.limited(self.limit)
-        dataset: Samples
+        source = self._limited(self.source(split))
         if self.calibrations is not None:
-            dataset = Calibrated(source, self.calibrations, **self._form, **options)
-        else:
-            lenses = self.train_lenses if name is None else parse_lenses(name)
-            dataset = WideAngle(source, lenses, **self._warping, **self._form, **options)
-        self.datasets.append(dataset)
-        return dataset
+            return self._noted(Calibrated(source, self.calibrations, **self._form, **options))
+        lenses = self.train_lenses if name is None else parse_lenses(name)
+        return self._noted(WideAngle(source, lenses, **self._warping, **self._form, **options))
 
     def _training(self) -> Samples:
         erase = RandomErasing(self.erasing) if self.erasing else None

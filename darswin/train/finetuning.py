@@ -61,17 +61,8 @@ def settle(
     model: Mapping[str, Any],
     data: Mapping[str, Any],
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """The options of a run that starts from a model: those not given, None, are the model's.
-
-    Args:
-        model: `name` and `options`. data: `size`, `channels`, `mean` and `std`.
-
-    Returns:
-        The same, without None.
-
-    Raises:
-        ValueError: an option that disagrees with the model; it names both.
-    """
+    """The options `name` and `options` of a run's model, and `size`, `channels`, `mean` and `std`
+    of its data: those not given, None, are the trained model's. ValueError where they disagree."""
 
     def refuse(option: str, value: Any, theirs: Any) -> ValueError:
         return ValueError(
@@ -113,7 +104,7 @@ def _plain(value: Any) -> Any:
 
 def start_from(net: Model, classes: list[str], weights: str | Path) -> None:
     """Copies a model's weights into a network: its head only if it is of the same classes, those of
-    a classifier into a dense model's encoder. ValueError for the weights of another model."""
+    a classifier into a dense model's encoder."""
     trained, card = load_model(weights_file(weights))
     without_quantized_layers(trained)
     own, given = net.state_dict(), trained.state_dict()
@@ -139,7 +130,7 @@ def _of_head(name: str) -> bool:
 
 def frozen_parts(net: Encoder | Unet, stages: int) -> list[nn.Module]:
     """The modules of the encoder that are not trained: the embedding and the first stages; all but
-    the head, where these are all stages. ValueError for more stages than there are."""
+    the head, where these are all stages."""
     net = net.encoder if isinstance(net, Unet) else net
     if not 0 <= stages <= len(net.stages):
         raise ValueError(

@@ -18,14 +18,7 @@ DISTANCE_METRICS = ("abs_rel", "sq_rel", "rmse", "rmse_log", "silog", "delta1", 
 
 
 class Zones:
-    """Zones of θ between the axis and whatever a lens sees.
-
-    Args:
-        borders: degrees, rising, between zones; none makes one zone.
-
-    Raises:
-        ValueError: borders that do not rise, or are not within 0 and 180.
-    """
+    """Zones of θ between the axis and whatever a lens sees; `borders` between them in degrees."""
 
     def __init__(self, borders: Sequence[float]):
         inner = [0.0, *map(float, borders), 180.0]
@@ -74,13 +67,10 @@ class PixelSums(Metric):
 
 
 class LabelSums(PixelSums):
-    """How often a pixel of class i was taken for one of class j: (Z, K, K).
+    """How often a pixel of class i was taken for one of class j: (Z, K, K). The class `left_out`
+    has no part in the mean IoU."""
 
-    torchmetrics counts confusions too, but not weighted ones.
-
-    Args:
-        classes, zones: how many. left_out: a class that has no part in the mean IoU.
-    """
+    # torchmetrics counts confusions too, but not weighted ones.
 
     def __init__(self, classes: int, zones: int, left_out: int | None = None):
         super().__init__(zones, (classes, classes), torch.int64)
@@ -115,11 +105,7 @@ def iou_and_recall(confusion: Tensor) -> tuple[Tensor, Tensor]:
 
 
 class DistanceSums(PixelSums):
-    """Sums of the terms of distances' mean errors: (Z, 9), the first of which is the weight.
-
-    Args:
-        zones: how many.
-    """
+    """Sums of the terms of distances' mean errors: (Z, 9), the first of which is the weight."""
 
     def __init__(self, zones: int):
         super().__init__(zones, (9,))

@@ -106,12 +106,8 @@ class PixelTask(Task):
         raise NotImplementedError
 
     def _check_targets(self, found: list[bool], images: str, whole: bool) -> None:
-        """Raises ValueError, or warns, if something is missing in the training targets.
-
-        Args:
-            found: which ids the known pixels have had; of distances, whether any is known.
-            images: those looked at, in words. whole: whether they are a whole epoch.
-        """
+        """Raises ValueError, or warns, if something is missing in the training targets, of which
+        `found` says which ids they have, and `whole`, whether they are those of an epoch."""
         raise NotImplementedError
 
     def _per_class(self, counts: Tensor, areas: Tensor) -> dict[str, Any]:

@@ -99,13 +99,9 @@ class StopOnSignals(Callback):
     does: once any process gets the first, all stop after the same step, with a checkpoint.
 
     After an epoch's last step they validate first; the checkpoint is then the epoch's own.
-
-    Attributes:
-        number: of the last signal, None before the first.
-        checkpoint: the file that is written.
     """
 
-    checkpoint: Path
+    checkpoint: Path  # the file that is written
 
     def __init__(self) -> None:
         self.number: int | None = None
@@ -189,11 +185,8 @@ CHANGEABLE = {
 
 
 def check_changes(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
-    """The differences between a run's configuration and the one to resume with, a line an option.
-
-    Raises:
-        ValueError: an option that cannot change.
-    """
+    """What differs between a run's configuration and the one to resume with, a line an option;
+    ValueError for an option that cannot change."""
     before, now = _options(before), _options(now)
     changes = {
         name: f"`{name}` {now[name]!r} in place of {before.get(name)!r}"

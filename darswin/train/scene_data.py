@@ -55,30 +55,19 @@ class SceneData(RunData):
         super().__init__(path, lens=lens, batch_size=batch_size, **common)
         self.frame_fit = self._form["framing"]
         self.test_paths = test_paths or []
-        if crop is not None and not 0 < crop <= 1:
-            raise ValueError(f"`crop` must be a share in (0, 1], got {crop}")
         self.crop = crop
         self.lenses = None if lens_augmentation is None else parse_lenses(lens_augmentation)
-        self._scenes: dict[str, Scenes] = {}
 
-    def scenes(self, split: Split) -> Scenes:
-        """The scenes of a split."""
-        if split not in self._scenes:
-            self._scenes[split] = open_scenes(
-                self.path, split, self.target, lens=self._lens, camera=self._camera,
-                coefficients=self._coefficients, **self._opening,
-            )  # fmt: skip
-        return self._scenes[split]
-
-    @property
-    def classes(self) -> list[str]:
-        """The names of the labels; none for distances."""
-        return self.scenes("train").classes
+    def _open(self, split: Split) -> Scenes:
+        return open_scenes(
+            self.path, split, self.target, lens=self._lens, camera=self._camera,
+            coefficients=self._coefficients, **self._opening,
+        )  # fmt: skip
 
     @property
     def colors(self) -> list[list[int]]:  # type: ignore[override]  # as `classes`
         """(r, g, b) of each class, where the data say them."""
-        return self.scenes("train").colors
+        return self.source("train").colors
 
     @property
     def test_names(self) -> list[str]:
@@ -108,12 +97,8 @@ class SceneData(RunData):
         if split == "test" and self.test_paths and name is not None:
             scenes = self._test_scenes(self.test_paths[self.test_names.index(name)])
         else:
-            scenes = self.scenes(split)
-        if self.limit is not None:
-            scenes = scenes.limited(self.limit)
-        dataset = SceneSamples(scenes, **self._form, **options)
-        self.datasets.append(dataset)
-        return dataset
+            scenes = self.source(split)
+        return self._noted(SceneSamples(self._limited(scenes), **self._form, **options))
 
     def _training(self) -> SceneSamples:
         return self.dataset(

@@ -11,8 +11,7 @@ _MODULES = {"pillow": "PIL", "opencv-python-headless": "cv2", "scikit-learn": "s
 
 
 def lack(extra: str, modules: Sequence[str] | None = None) -> str | None:
-    """None if all modules of an extra are installed (or of `modules`, some of them), else a
-    sentence that names those missing and what installs them."""
+    """A sentence that names those of an extra's modules, or of `modules`, that are missing."""
     of_extra = re.compile(rf"extra == ['\"]{extra}['\"]")
     declared = {}
     for requirement in requires("darswin") or ():

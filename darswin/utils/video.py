@@ -24,13 +24,10 @@ _PART = 0.05
 
 
 class Frame(NamedTuple):
-    """Attributes: number: from 0; time: s; image: (H, W, C) uint8, upright; orientation: EXIF's,
-    that it was turned upright from."""
-
-    number: int
-    time: float
-    image: np.ndarray
-    orientation: int
+    number: int  # from 0
+    time: float  # s
+    image: np.ndarray  # (H, W, C) uint8, upright
+    orientation: int  # EXIF's, that it was turned upright from
 
 
 def is_video(path: str | Path) -> bool:

@@ -214,7 +214,7 @@ def test_an_answer_that_is_not_finite_is_none(stub, monkeypatch, tmp_path, task,
 
 def test_a_folder_means_pictures_and_videos(stub, labels, tmp_path, capsys):
     net = stub("segmentation")
-    folder, out = tmp_path / "in", tmp_path / "out"
+    folder, out = tmp_path / "in", tmp_path / "in" / "out"
     for name in ("front/1.png", "rear/1.png", "rear/deep/2.jpg"):
         write(folder / name, picture_of(labels if "front" in name else labels[:, ::-1]))
     frames = write_video(folder / "rear/drive.avi", 5, size=(48, 64), codec="MJPG")
@@ -232,6 +232,9 @@ def test_a_folder_means_pictures_and_videos(stub, labels, tmp_path, capsys):
         assert answer["frame"] == k and same.mean() > 0.9
     assert speed["frames"] == 3 and "3 frames at" in capsys.readouterr().err
     assert net.prepared == 1  # one lens
+    # Its own pictures are not predicted again, unless they are asked for.
+    assert len(predict(folder, "--every", "2", out=out)) == len(found) + 1
+    assert predict(out / files[0], out=tmp_path / "again")
 
 
 def test_colours_of_distance_stay_for_a_video(stub, tmp_path):
@@ -263,26 +266,6 @@ def test_names_of_files_differ_and_keep_their_folders(
         Path(name).parent.mkdir(parents=True, exist_ok=True)
         Path(name).touch()
     assert file_names(paths, [(name, name in videos) for name in expected]) == expected
-
-
-def test_files_that_cannot_be_read_are_named_when_the_others_are_written(stub, labels, tmp_path):
-    stub("segmentation")
-    good = [write(tmp_path / f"in/{k}.png", picture_of(labels)) for k in "ac"]
-    (tmp_path / "in/b.png").write_text("no picture")
-    write(tmp_path / "in/d.png", np.zeros((20, 20, 3), np.uint8))
-    (tmp_path / "in/e.avi").write_text("no video")
-    out = tmp_path / "in/out"
-    for _ in range(2):  # its own pictures are not predicted again
-        with pytest.raises(SystemExit) as caught:
-            predict(tmp_path / "in", out=out)
-        first, *lines = str(caught.value).splitlines()
-        assert "for 3 of 5 files" in first
-        for name, line in zip(("b.png", "d.png", "e.avi"), lines, strict=True):
-            assert name in line
-        found = json.loads((out / "predictions.json").read_text())
-        assert [answer["image"] for answer in found] == good
-        assert sorted(path.name for path in (out / "labels").iterdir()) == ["a.png", "c.png"]
-    assert predict(out / "labels/a.png", out=tmp_path / "again")  # if asked for
 
 
 def test_nothing_but_its_own_is_replaced(tmp_path):

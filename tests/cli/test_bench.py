@@ -24,10 +24,10 @@ INT8 = ["int8"] if onednn_lack(torch.int8) is None else []
 @pytest.mark.slow
 def test_it_measures_and_writes(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(command, "THREADS", [1])
-    measured = []
+    measured = set()
 
     def measure(mode, model, size, dtype, batch, name, threads):
-        measured.append((f"{mode}, {dtype}", name))
+        measured.add((mode, dtype, name))
         return Memory(f"{mode}, {dtype}", batch, name, 1, 2, 3)
 
     monkeypatch.setattr(command.memory, "measure", measure)
@@ -36,31 +36,22 @@ def test_it_measures_and_writes(tmp_path, capsys, monkeypatch):
     (path,) = tmp_path.glob("model--*.json")
     assert path.with_suffix(".png").exists()
     record = Record.load(path)
-    assert {(t.subject, t.setting, t.batch, t.threads, t.mode) for t in record.timings} == {
-        ("darswin_a_nano", "32×32", batch, 1, f"{mode}, {dtype}")
-        for mode in ("inference", "training")
-        for dtype in ("float32", "bfloat16", *(INT8 if mode == "inference" else ()))
-        for batch in (1, 2)
-    }
-    names: dict[str, set[str]] = {}
+    both = [(m, d) for m in ("inference", "training") for d in ("float32", "bfloat16")]
+    modes = both + [("inference", dtype) for dtype in INT8]
+    found: dict[tuple[str, int], set[str]] = {}
     for t in record.timings:
-        names.setdefault(t.mode, set()).add(t.name)
-    others = {OURS_FLOAT32}
-    if onednn_lack(torch.bfloat16) is None:
-        others.add(OURS_BFLOAT16)
-    for mode, found in names.items():
-        expected = {OURS, REFERENCE, MATMULS}
-        expected |= {FIXED_LENS} if mode.startswith("inference") else set()
-        assert found == expected | (others if mode.endswith("int8") else set())
-    assert all(t.runs >= 100 for t in record.timings if t.mode[:9] == "inference" and t.batch == 1)
-    assert all(t.target is None for t in record.timings)  # targets are for one model and size
-    assert measured == [(m.mode, m.name) for m in record.memory]
-    assert set(measured) == {
-        (f"{mode}, {dtype}", name)
-        for mode in ("inference", "training")
-        for dtype in ("float32", "bfloat16")
-        for name in (OURS, REFERENCE)
-    }
+        assert (t.subject, t.setting, t.threads, t.target) == ("darswin_a_nano", "32×32", 1, None)
+        assert t.runs >= 100 or t.batch == 2 or t.mode.startswith("training")
+        found.setdefault((t.mode, t.batch), set()).add(t.name)
+    expected = {}
+    for mode, dtype in modes:
+        names = {OURS, REFERENCE, MATMULS} | ({FIXED_LENS} if mode == "inference" else set())
+        if dtype == "int8":
+            bfloat16 = onednn_lack(torch.bfloat16) is None
+            names |= {OURS_FLOAT32, OURS_BFLOAT16} if bfloat16 else {OURS_FLOAT32}
+        expected |= {(f"{mode}, {dtype}", batch): names for batch in (1, 2)}
+    assert found == expected
+    assert measured == {(*both_of, name) for both_of in both for name in (OURS, REFERENCE)}
     assert {row["product"] for row in record.autotune} == {
         "forward", "input gradient", "weight gradient",
     }  # fmt: skip

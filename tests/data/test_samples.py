@@ -203,14 +203,6 @@ def test_cameras_of_several_models_make_one_batch(folders):
     assert isinstance(lenses, Tabulated) and len(lenses) == len(dataset)
 
 
-def test_pictures_without_files():
-    images = np.random.default_rng(0).integers(256, size=(4, 8, 8), dtype=np.uint8)
-    lens = '{"model": "Equidistant", "fov": 3.0}'
-    source = Arrays(images, np.arange(4), list("abcd"), 1).limited(3)
-    dataset = Calibrated(source, Calibrations(lens, "digits"), **GREY)
-    assert dataset[0][1].r_max.item() == pytest.approx(12) and len(dataset) == 3
-
-
 def test_partners_turn_together_and_share_a_lens_with_tangential_terms():
     file = CALIBRATIONS / "ros_plumb_bob.yaml"
     size = tuple(int(side) for side in load(file).image_size[0])

@@ -53,12 +53,10 @@ def test_warps_that_are_known():
 
 def test_maps_of_many_lenses_are_those_of_each():
     source = Perspective.from_fov(2.0, 50)
-    many = Spherical.from_fov([0.1, 0.5, 0.9], 2.0, 30, center=[[29.5, 30.0]] * 3)
-    together = warp_map(source, (100, 100), many, (60, 64))
-    for k in range(3):
-        alone = warp_map(source, (100, 100), many[k], (60, 64))
-        assert together.shape == (3, 60, 64, 2) and np.array_equal(together[k], alone[0])
-    with pytest.raises(ValueError, match="one lens each, got 3 and 1"):
+    many = Spherical.from_fov([0.1, 0.9], 2.0, 30, center=[[29.5, 30.0]] * 2)
+    alone = [warp_map(source, (100, 100), lens, (60, 64)) for lens in many]
+    assert np.array_equal(warp_map(source, (100, 100), many, (60, 64)), np.concatenate(alone))
+    with pytest.raises(ValueError, match="one lens each, got 2 and 1"):
         warp(np.zeros((4, 4), np.float32), many, source, (4, 4))
 
 

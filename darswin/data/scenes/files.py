@@ -95,9 +95,20 @@ def _stem(name: str) -> str:
     return os.path.normpath(stem if suffix.lower() in PICTURES else name)
 
 
+def lenses_beside(
+    root: Path, pairs: Pairs, calibration_of: Callable[[str], str | Path]
+) -> Calibrations:
+    """The lenses of pictures with a calibration each, by their stems."""
+    files = {root / picture: Path(calibration_of(stem)) for stem, (picture, _) in pairs.items()}
+    there = {file: file.is_file() for file in set(files.values())}
+    for picture, file in files.items():
+        if not there[file]:
+            raise FileNotFoundError(f"no lens for {picture}: add {file}, or give `lens`")
+    return Calibrations(None, files=files)
+
+
 def stems(folder: Path, suffixes: Sequence[str] | frozenset[str]) -> dict[str, str]:
-    """The files below a folder by their paths in it without a suffix, sorted; ValueError where two
-    have one stem."""
+    """The files below a folder by their paths in it without a suffix, sorted."""
     if not folder.is_dir():
         raise FileNotFoundError(f"no folder {folder}")
     found: dict[str, str] = {}
@@ -134,8 +145,8 @@ def pair(
     strict: bool = True,
 ) -> Pairs:
     """The pictures whose stems `choose` takes, and the targets of the same stems, with paths
-    relative to `root`. `what` names the targets in errors. If `strict`, pictures without a target
-    are an error if they are chosen, else they are left out."""
+    relative to `root`. A chosen picture without a target is an error, or left out if not `strict`.
+    """
     found = list(pictures)
     if not strict:
         found = [stem for stem in pictures if stem in targets]

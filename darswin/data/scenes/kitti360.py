@@ -12,8 +12,7 @@ Source: Liao et al., KITTI-360, PAMI 2022.
 
 from pathlib import Path
 
-from darswin.data.cameras import Calibrations
-from darswin.data.scenes.files import Options, Pairs, pair, stems
+from darswin.data.scenes.files import Options, lenses_beside, pair, stems
 from darswin.data.scenes.scene import SUFFIXES, Scenes
 
 
@@ -40,25 +39,11 @@ def open_kitti360(root: Path, options: Options) -> Scenes:
         what="distance",
         strict=False,
     )
-    return Scenes(
-        root,
-        list(pairs.values()),
-        options.given_lens(root) or _lenses(root, pairs),
-        target="distance",
-        channels=options.channels,
-        views=[_camera_of(stem) for stem in pairs],
+    views = {stem: stem.split("/")[1] for stem in pairs}
+    lenses = options.given_lens(root) or lenses_beside(
+        root, pairs, lambda stem: root / "calibration" / f"{views[stem]}.yaml"
     )
-
-
-def _camera_of(stem: str) -> str:
-    return stem.split("/")[1]
-
-
-def _lenses(root: Path, pairs: Pairs) -> Calibrations:
-    files = {
-        root / picture: root / "calibration" / f"{_camera_of(stem)}.yaml"
-        for stem, (picture, _) in pairs.items()
-    }
-    if missing := sorted({str(file) for file in files.values() if not file.is_file()}):
-        raise FileNotFoundError(f"no {missing[0]}: add it, or give `lens`")
-    return Calibrations(None, files=files)
+    return Scenes(
+        root, list(pairs.values()), lenses, target="distance", channels=options.channels,
+        views=list(views.values()),
+    )  # fmt: skip

@@ -100,12 +100,7 @@ class Scenes(Limited):
         return len(self._pictures)
 
     def __getitem__(self, index: int) -> Scene:
-        """The scene.
-
-        Raises:
-            BrokenImageError: a file that is missing or cannot be read. ValueError: a label that is
-                no class's, a picture, target and lens of different sizes. Both name the file.
-        """
+        """The scene; BrokenImageError or ValueError name a file that is broken or does not fit."""
         image, orientation = read_oriented(self.file(index), self.channels)
         if orientation != 1:
             raise ValueError(
@@ -131,7 +126,6 @@ class Scenes(Limited):
         return Scene(image, target, self._trimmed(lens))
 
     def limited(self, count: int) -> Self:
-        """At most `count` of the scenes, chosen by a fixed shuffle; ValueError below 1."""
         part = super().limited(count)
         part.unknown.share_memory_()
         return part
@@ -175,8 +169,7 @@ def nothing_of(target: np.ndarray) -> int:
 
 
 def read_labels(path: Path, classes: int) -> np.ndarray:
-    """A label PNG as (H, W) uint8: ids of so many classes, or `IGNORE`. Of a PNG with a palette
-    the ids count, not their colours. Errors name the file."""
+    """A label PNG, grey or with a palette, as (H, W) uint8: ids of so many classes, or `IGNORE`."""
     try:
         with warnings.catch_warnings(action="ignore"), Image.open(path) as file:
             mode = file.mode
@@ -199,9 +192,8 @@ def read_labels(path: Path, classes: int) -> np.ndarray:
 
 
 def read_distance(path: Path, far: float | None = None) -> np.ndarray:
-    """Distances along the rays (H, W) float32, metres, of a PNG of 16 bits, metres × 256, or of a
-    NumPy file of floating-point metres. They are 0 where they are not known: where they are not
-    finite, not above 0, or at least `far`. Errors name the file."""
+    """Distances (H, W) float32, metres, of a PNG of 16 bits or of a NumPy file; 0 where they are
+    not finite, not above 0, or at least `far`."""
     if path.suffix.lower() == ".npy":
         try:
             metres = np.load(path, allow_pickle=False)
@@ -238,8 +230,7 @@ def _reason(error: Exception) -> str:
 
 
 def read_palette(path: str | Path) -> Classes:
-    """Names of classes as `read_classes`, or a JSON object {"names": [...], "colors":
-    [[r, g, b], ...]}, whose colours may be left out; ValueError names a file of another form."""
+    """Names of classes as `read_classes`, or a JSON object with "names" and perhaps "colors"."""
     content = read_json(path) if Path(path).suffix == ".json" else None
     if isinstance(content, Mapping):
         return as_classes(content.get("names"), content.get("colors", []), path)
@@ -247,7 +238,7 @@ def read_palette(path: str | Path) -> Classes:
 
 
 def as_classes(names: Any, colors: Any, path: str | Path) -> Classes:
-    """The classes of a file; ValueError where that is not one name, and one colour, each."""
+    """The classes of a file, checked."""
     is_list = isinstance(names, list) and names and all(isinstance(name, str) for name in names)
     if not is_list:
         raise ValueError(f"{path} must name the classes as a list of words, got {names!r}")

@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from darswin.data.cameras import Calibrations
-from darswin.data.scenes.files import Options, Pairs, pair, pictures_in, stems
+from darswin.data.scenes.files import Options, Pairs, lenses_beside, pair, pictures_in, stems
 from darswin.data.scenes.scene import NO_CLASSES, Classes, Scenes, as_classes, read_palette
 from darswin.data.splits import Split, read_json
 
@@ -72,7 +72,6 @@ def _scenes(
     trim: tuple[int, int] = (0, 1),
     far: float | None = None,
 ) -> Scenes:
-    """Scenes in `rgb_images/` with their targets and calibrations named after them."""
     target = options.target
     if target == "labels":
         targets = stems(_unnested(root / "semantic_annotations") / "gtLabels", (".png",))
@@ -87,17 +86,11 @@ def _scenes(
         root=root,
         what=target,
     )
+    lenses, views = options.given_lens(root) or _lenses(root, pairs), [_view_of(s) for s in pairs]
     return Scenes(
-        root,
-        list(pairs.values()),
-        options.given_lens(root) or _lenses(root, pairs),
-        target=target,
-        channels=options.channels,
-        classes=classes,
-        views=[_view_of(stem) for stem in pairs],
-        trim=trim,
-        far=far,
-    )
+        root, list(pairs.values()), lenses, target=target, channels=options.channels,
+        classes=classes, views=views, trim=trim, far=far,
+    )  # fmt: skip
 
 
 def heal_swin(stems: list[str]) -> dict[Split, list[str]]:
@@ -136,7 +129,6 @@ def _classes(root: Path, options: Options, published: list[str]) -> Classes:
 
 
 def _info(file: Path) -> Classes:
-    """Names and colours in the order of their ids."""
     content = read_json(file)
     if not isinstance(content, Mapping):
         raise ValueError(f"{file} must be a JSON object with class_names")
@@ -159,12 +151,8 @@ def _lenses(root: Path, pairs: Pairs) -> Calibrations:
     if folder is None:
         raise FileNotFoundError(f"no folder {places[0]} or {places[1]}: give `lens`")
     found = stems(folder, (".json",))
-    files = {}
-    for stem, (picture, _) in pairs.items():
-        file = found.get(stem) or found.get(_view_of(stem))
-        if file is None:
-            raise FileNotFoundError(
-                f"no lens for {root / picture}: add {folder / stem}.json, or give `lens`"
-            )
-        files[root / picture] = Path(file)
-    return Calibrations(None, files=files)
+
+    def calibration_of(stem: str) -> str:
+        return found.get(stem) or found.get(_view_of(stem)) or f"{folder / stem}.json"
+
+    return lenses_beside(root, pairs, calibration_of)

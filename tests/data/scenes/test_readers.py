@@ -144,7 +144,9 @@ def test_kitti360(tmp_path):
     with pytest.raises(ValueError, match="KITTI-360's form, whose fisheye pictures have no labels"):
         open_scenes(tmp_path, "train", "labels")
     (tmp_path / "calibration" / "image_03.yaml").unlink()
-    with pytest.raises(FileNotFoundError, match=r"no .*image_03\.yaml: add it, or give `lens`"):
+    with pytest.raises(
+        FileNotFoundError, match=r"no lens for .*: add .*image_03\.yaml, or give `lens`"
+    ):
         open_scenes(tmp_path, "train", "distance")
 
 
