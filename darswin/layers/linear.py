@@ -14,7 +14,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
-from darswin.ops._inference import transpose_sum
+from darswin.ops._transpose_sum import transpose_sum
 
 __all__ = ["Linear", "autotune_results"]
 

@@ -5,7 +5,7 @@ They run on torch's number of threads. A process that is forked after such a cal
 another one on several: use `spawn`, or `torch.set_num_threads(1)` in the child.
 """
 
-from darswin.ops import _inference, triton  # noqa: F401  # registers the private operators
+from darswin.ops import triton
 from darswin.ops._library import cpu_capability, reference_in_use, use_reference
 from darswin.ops.polar_embed import polar_embed
 from darswin.ops.polar_sample import polar_sample

@@ -8,7 +8,6 @@ import torch
 from torch import Tensor
 from torch._ops import OpOverload
 from torch.autograd import forward_ad
-from torch.autograd.graph import increment_version
 
 from darswin.ops import _module, triton
 
@@ -247,32 +246,3 @@ def register_gradients(
     torch.library.register_fake(f"darswin::{name}_backward", fake or fake_backward)
     torch.library.register_autograd(f"darswin::{name}", gradients, setup_context=setup_context)
     torch.library.register_autograd(f"darswin::{name}_backward", second_derivative)
-
-
-_implementations = torch.library.Library("darswin", "IMPL")
-
-
-def without_gradient(name: str, *, changes: int, instead: str) -> None:
-    """Makes an operator raise where a gradient would be recorded; `instead` is code that has one.
-    Autograd notices that it changes its first `changes` arguments in place."""
-    operator = getattr(torch.ops.darswin, name).default
-    plain = name.removeprefix("_")
-
-    def no_gradient(keyset, *arguments):
-        refuse_other_derivatives(plain, arguments)
-        wants = any(isinstance(a, Tensor) and a.requires_grad for a in arguments)
-        if torch.is_grad_enabled() and wants:
-            raise RuntimeError(
-                f"{plain} has no gradient, but one of its tensors requires one: call it under "
-                f"torch.no_grad(), or use {instead}"
-            )
-        with torch._C._AutoDispatchBelowAutograd():
-            return operator.redispatch(keyset & torch._C._after_autograd_keyset, *arguments)
-
-    def changed(keyset, *arguments):
-        increment_version([a for a in arguments[:changes] if a is not None])
-        return operator.redispatch(keyset & torch._C._after_ADInplaceOrView_keyset, *arguments)
-
-    _implementations.impl(name, no_gradient, "Autograd", with_keyset=True)
-    if changes:
-        _implementations.impl(name, changed, "ADInplaceOrView", with_keyset=True)

@@ -125,31 +125,24 @@ def channels_first(
         if image.dtype != torch.uint8:
             return image
         shape, sizes = image.shape, FRAME_CHANNELS if channels is None else (channels,)
-        if shape[1] in sizes:
-            # Where all three sizes are 1, both readings are the same image.
-            if shape[3] in sizes and shape[1:] != (1, 1, 1):
-                raise _unknown_axis(name, image, True, channels)
-        elif shape[3] in sizes:
-            channels_last = True
-        else:
-            raise _unknown_axis(name, image, False, channels)
+        first, last = shape[1] in sizes, shape[3] in sizes
+        # Where all three sizes are 1, both readings are the same image.
+        if first == last and not (first and shape[1:] == (1, 1, 1)):
+            known: object = channels
+            hint = ""
+            if channels is None:
+                known = "1, 3 or 4"
+                hint = ": pass channels_last=True for (B, H, W, C), or False for (B, C, H, W)"
+            elif first:
+                hint = ": pass it in floating point, which is always (B, C, H, W)"
+            raise ValueError(
+                f"{name} of uint8 must have {known} channels along either its second or its last "
+                f"axis, {'both have' if first else 'neither has'} in shape {tuple(shape)}{hint}"
+            )
+        channels_last = not first
     elif not isinstance(channels_last, bool):
         raise TypeError(f"channels_last must be True, False or None, got {channels_last!r}")
     return image.permute(0, 3, 1, 2) if channels_last else image
-
-
-def _unknown_axis(name: str, image: Tensor, both: bool, channels: int | None) -> ValueError:
-    if channels is None:
-        known = "1, 3 or 4"
-        hint = ": pass channels_last=True for (B, H, W, C), channels_last=False for (B, C, H, W)"
-    else:
-        known = str(channels)
-        hint = ": pass it in floating point, which is always (B, C, H, W)" if both else ""
-    found = "both have" if both else "neither has"
-    return ValueError(
-        f"{name} of uint8 must have {known} channels along either its second or its last axis, "
-        f"{found} in shape {tuple(image.shape)}{hint}"
-    )
 
 
 def per_channel(name: str, value: float | Sequence[float], channels: int) -> tuple[float, ...]:

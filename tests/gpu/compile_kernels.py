@@ -9,8 +9,9 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any
 from unittest import mock
 
 import torch
@@ -25,16 +26,6 @@ from darswin.ops.triton import launcher
 # Bytes of shared memory that a program may have, by compute capability.
 SHARED_MEMORY = {80: 163 * 1024, 90: 227 * 1024}
 CUOBJDUMP = Path(triton.__file__).parent / "backends/nvidia/bin/cuobjdump"
-
-
-class Use(NamedTuple):
-    """What a kernel takes."""
-
-    kernel: str
-    registers: int  # of 32 bits, a thread
-    stack: int  # bytes a thread, which the compiler uses for want of registers
-    shared: int  # bytes a program
-    threads: int
 
 
 class _NoDevice:
@@ -53,8 +44,10 @@ class _NoDevice:
         return 0
 
 
-def compiled(capability: int, call: Callable[[], object]) -> Iterator[Use]:
-    """The kernels that a call launches, compiled instead. Its tensors are on the device "meta"."""
+def compiled(capability: int, call: Callable[[], object]) -> Iterator[dict[str, Any]]:
+    """Of each kernel that a call launches, compiled instead: its name, threads, registers of a
+    thread, stack in bytes, which is used for want of registers, and shared memory of a program.
+    The call's tensors are on the device "meta"."""
     kernels, run = [], JITFunction.run
 
     def compile_only(self, *arguments, grid, warmup, **options):
@@ -70,9 +63,10 @@ def compiled(capability: int, call: Callable[[], object]) -> Iterator[Use]:
             command = [CUOBJDUMP, "--dump-resource-usage", file.name]
             said = subprocess.run(command, check=True, capture_output=True, text=True).stdout
         use = dict(re.findall(r"(REG|STACK|LOCAL):(\d+)", said))
-        yield Use(
-            kernel.metadata.name.strip("_"), int(use["REG"]), int(use["STACK"]) + int(use["LOCAL"]),
-            kernel.metadata.shared, 32 * kernel.metadata.num_warps,
+        yield dict(
+            kernel=kernel.metadata.name.strip("_"), threads=32 * kernel.metadata.num_warps,
+            registers=int(use["REG"]), stack=int(use["STACK"]) + int(use["LOCAL"]),
+            shared=kernel.metadata.shared,
         )  # fmt: skip
 
 
@@ -90,16 +84,6 @@ ATTENTION = {
 }  # the head dim is 32
 
 
-def attend(case: str, dtype: torch.dtype) -> None:
-    """A forward and a backward of attention."""
-    size, heads, window = ATTENTION[case]
-    qkv = torch.empty(32, *size, 3, heads, 32, dtype=dtype, device="meta")
-    bias = torch.empty(32, heads, 2 * window[0] - 1, 2 * window[1] - 1, device="meta")
-    call = (qkv, bias, window, (0, 0), (0, 1), 0.2)
-    out = launcher("window_attention")(*call)
-    launcher("window_attention_backward")(*call, out)
-
-
 # (R, A) and samples of the presets' patches, of three channels.
 PATCHES = {
     "small, tiny: 10×10": ((16, 64), (10, 10)),
@@ -113,11 +97,22 @@ def meta(*shape: int, dtype: torch.dtype = torch.float32) -> torch.Tensor:
     return torch.empty(shape, dtype=dtype, device="meta")
 
 
+# Each of these calls a forward and a backward.
+
+
+def attend(case: str, dtype: torch.dtype) -> None:
+    size, heads, window = ATTENTION[case]
+    qkv = meta(32, *size, 3, heads, 32, dtype=dtype)
+    bias = meta(32, heads, 2 * window[0] - 1, 2 * window[1] - 1)
+    call = (qkv, bias, window, (0, 0), (0, 1), 0.2)
+    out = launcher("window_attention")(*call)
+    launcher("window_attention_backward")(*call, out)
+
+
 def sample(
     case: str, dtype: torch.dtype, jitter: float = 0, general: bool = False, tokens: bool = True,
     channels: int = 3, size: int = 64,
 ) -> None:  # fmt: skip
-    """A forward and a backward of sampling, as polar_embed asks for them, or as images."""
     (rings, sectors), (along, around) = PATCHES[case]
     rows, columns = rings * along, sectors * around
     sampling = checked_sampling(
@@ -133,7 +128,6 @@ def sample(
 def bring_back(
     channels: int, dtype: torch.dtype, lens: str = "circular", tokens: bool = True
 ) -> None:
-    """A forward and a backward of polar_to_image from the map of the U-Nets."""
     points = meta(32, 64, 64, 2) if lens == "points" else None
     affine = meta(32, 2, 2) if lens == "affine" else None
     center = None if lens == "points" else meta(32, 2)
@@ -143,29 +137,24 @@ def bring_back(
     launcher("polar_to_image_backward")(*call, out, True, True)
 
 
-SMALL = "small, tiny: 10×10"
-CALLS: dict[str, Callable[[], object]] = {
-    **{f"{case}, {name}": lambda case=case, dtype=dtype: sample(case, dtype)
+SMALL, f32 = "small, tiny: 10×10", torch.float32
+CALLS = {
+    **{f"{case}, {name}": partial(sample, case, dtype)
        for case in PATCHES for name, dtype in DTYPES.items() if name != "float16"},
-    f"{SMALL}, jitter": lambda: sample(SMALL, torch.float32, jitter=1.0),
-    f"{SMALL}, jitter, any lens": lambda: sample(SMALL, torch.float32, 1.0, general=True),
-    f"{SMALL}, uint8": lambda: sample(SMALL, torch.uint8),
-    f"{SMALL}, as an image": lambda: sample(SMALL, torch.float32, tokens=False),
-    f"{SMALL}, one channel": lambda: sample(SMALL, torch.float32, channels=1),
-    f"{SMALL}, 96 channels of one pixel":
-        lambda: sample(SMALL, torch.float32, channels=96, size=1),
-    **{f"map to image, {channels} channels, {name}":
-       lambda channels=channels, dtype=dtype: bring_back(channels, dtype)
+    f"{SMALL}, jitter": partial(sample, SMALL, f32, jitter=1.0),
+    f"{SMALL}, jitter, any lens": partial(sample, SMALL, f32, 1.0, general=True),
+    f"{SMALL}, uint8": partial(sample, SMALL, torch.uint8),
+    f"{SMALL}, as an image": partial(sample, SMALL, f32, tokens=False),
+    f"{SMALL}, one channel": partial(sample, SMALL, f32, channels=1),
+    f"{SMALL}, 96 channels of one pixel": partial(sample, SMALL, f32, channels=96, size=1),
+    **{f"map to image, {channels} channels, {name}": partial(bring_back, channels, dtype)
        for channels in (1, 10, 96) for name, dtype in DTYPES.items()},
-    "map to image, affine": lambda: bring_back(10, torch.float32, "affine"),
-    "map to image, any lens": lambda: bring_back(10, torch.float32, "points"),
-    "map to image, planes": lambda: bring_back(96, torch.float32, tokens=False),
+    "map to image, affine": partial(bring_back, 10, f32, "affine"),
+    "map to image, any lens": partial(bring_back, 10, f32, "points"),
+    "map to image, planes": partial(bring_back, 96, f32, tokens=False),
+    **{f"{case}, {name}": partial(attend, case, dtype)
+       for case in ATTENTION for name, dtype in DTYPES.items()},
 }  # fmt: skip
-CALLS |= {
-    f"{case}, {name}": lambda case=case, dtype=dtype: attend(case, dtype)
-    for case in ATTENTION
-    for name, dtype in DTYPES.items()
-}
 
 
 def main() -> None:
@@ -178,11 +167,12 @@ def main() -> None:
     for name, call in CALLS.items():
         columns = [list(compiled(capability, call)) for capability in SHARED_MEMORY]
         for uses in zip(*columns, strict=True):
-            registers = " | ".join(str(use.registers) for use in uses)
-            shared = " | ".join(f"{use.shared / 1024:.0f}" for use in uses)
-            print(f"| {name} | {uses[0].kernel} | {uses[0].threads} | {registers} | {shared} |")
+            kernel, threads = uses[0]["kernel"], uses[0]["threads"]
+            registers = " | ".join(str(use["registers"]) for use in uses)
+            shared = " | ".join(f"{use['shared'] / 1024:.0f}" for use in uses)
+            print(f"| {name} | {kernel} | {threads} | {registers} | {shared} |")
             for use, (capability, most) in zip(uses, SHARED_MEMORY.items(), strict=True):
-                if use.stack or use.shared > most:
+                if use["stack"] or use["shared"] > most:
                     broken.append(f"{name}: {use} on sm_{capability}")
     sys.exit("\n".join(broken) or 0)
 

@@ -1,5 +1,5 @@
-"""The kernels for GPUs under the contract of the operators, with its cases; then what only they do.
-Few and small cases, since a program takes 20 ms in the interpreter."""
+"""The kernels for GPUs under the operators' contract, with its cases and some of its tests; then
+what only they do. Few and small cases, since a program takes 20 ms in the interpreter."""
 
 import functools
 import math
@@ -12,7 +12,6 @@ from cases import (
     CASES,
     MAPS,
     SMALL,
-    Case,
     assert_accurate,
     assert_equal_results,
     attention,
@@ -22,6 +21,17 @@ from cases import (
     results,
     sampling,
 )
+from test_contract import (  # noqa: F401  # pytest runs them here on the device
+    test_gradients_may_arrive_expanded,
+    test_only_the_gradients_asked_for,
+)
+from test_polar_sample import (  # noqa: F401
+    test_pixels_that_are_nan_or_infinite_count_where_they_are_touched,
+    test_points_at_nan_or_infinity_sample_nothing,
+    test_uint8_pixels_are_what_they_stand_for,
+)
+from test_polar_to_image import test_the_pole_and_the_axes  # noqa: F401
+from test_window_attention import test_minus_infinity_in_the_bias_hides_a_pair  # noqa: F401
 
 from darswin.ops import _library, polar_sample, triton, use_reference
 
@@ -30,8 +40,8 @@ pytestmark = pytest.mark.filterwarnings("ignore:(invalid value|overflow|divide):
 
 f64 = torch.float64
 LARGE = ("one window of 1024", "windows without tables of pairs", "several chunks of windows")
-OF_POINTS = ("plain", "one ring, one sector", "one point", "odd rows", "one pixel", "thin image",
-             "empty batch", "no points", "no channels")  # fmt: skip
+OF_POINTS = ("plain", "shared lens", "one ring, one sector", "one point", "odd rows", "one pixel",
+             "thin image", "empty batch", "no points", "no channels")  # fmt: skip
 OF_TOKENS = ("no bias", "one token", "empty batch", "no rings", "no channels")
 KERNELS = {
     f"{operator}: {name}": CASES[operator, name]
@@ -80,19 +90,6 @@ def test_strides_do_not_matter(name, device):
     turned = {name: elsewhere(t, "turned") for name, t in made.inputs.items()}
     tolerance = 1e-6 if "weight" in turned else 0  # torch's products depend on strides
     assert_equal_results(results(made.replace(**turned)), results(made), tolerance)
-    leaves = {n: t.requires_grad_() for n, t in made.inputs.items()}
-    out = made.run(**leaves)
-    from_sum = torch.autograd.grad(out.sum(), leaves.values(), retain_graph=True)  # of stride 0
-    from_ones = torch.autograd.grad(out, leaves.values(), torch.ones_like(out))
-    assert all(torch.equal(a, b) for a, b in zip(from_sum, from_ones, strict=True))
-
-
-@small_cases
-def test_only_the_gradients_asked_for(name, device):
-    made = SMALL[name]().to(device)
-    every = results(made)
-    for one in made.inputs:
-        assert_equal_results(results(made, only=[one]), {one: every[one]})
 
 
 @small_cases
@@ -129,22 +126,6 @@ def test_types_of_16_bits_are_float32_rounded_once(name, dtype, device):
         torch.testing.assert_close(ours[key].float(), want, rtol=2 * eps, atol=eps * size)
 
 
-@pytest.mark.parametrize("layout", ["tokens", "image"])
-def test_camera_frames(layout, device):
-    case = sampling(samples=(3, 4), layout=layout, mean=(0.4, 0.5, 0.6), std=(0.2, 0.3, 0.1),
-                    channels_last=True)  # fmt: skip
-    frames = torch.randint(256, (2, 17, 23, 3), dtype=torch.uint8)
-    lens = {n: t for n, t in case.inputs.items() if n != "image"}
-
-    def of(image):
-        return Case(lambda **lens: case.run(image=image.to(lens["radii"].device), **lens), lens)
-
-    expected = results(of(frames), is_reference=True)
-    for image in (frames, frames.permute(0, 3, 1, 2).contiguous().permute(0, 2, 3, 1)):
-        found = {n: t.cpu() for n, t in results(of(image).to(device)).items()}
-        assert_equal_results(found, expected, 1e-4)
-
-
 # -- sums in units ---------------------------------------------------------------------------------
 
 
@@ -153,34 +134,27 @@ def wide_range(*shape):
     return torch.randn(shape) * 2.0 ** torch.randint(-40, 0, shape)
 
 
-def test_the_gradient_of_an_image_does_not_depend_on_any_order(device):
-    # All points fall into four pixels.
-    case = sampling(1, rows=6, columns=16, samples=(1, 1), layout="image").to(device)
-    radii, center = torch.linspace(0, 0.4, 6)[None], case.inputs["center"].round() + 0.5
-    grad = wide_range(1, 3, 6, 16).to(device)
+@pytest.mark.parametrize("name", ["polar_sample", "polar_to_image"])
+def test_gradients_do_not_depend_on_any_order(name, device):
+    count = 6 if name == "polar_sample" else 70
+    grad = wide_range(1, 2, count, 16).to(device)
+    if name == "polar_sample":  # all points fall into four pixels
+        case = sampling(1, 2, rows=count, columns=16, samples=(1, 1), layout="image").to(device)
+        radii, center = torch.linspace(0, 0.4, count)[None], case.inputs["center"].round() + 0.5
+    else:  # all pixels lie between the same tokens
+        case = polar_map(1, 2, 4, 2, (count, 16), general="points").to(device)
+        radii = torch.tensor([[1.0, 2.0]], device=device)
+        points = 0.1 * torch.rand(1, count, 16, 2) + torch.tensor([0.9, 1.1])
 
     def run(order):
-        leaf = case.inputs["image"].detach().requires_grad_()
-        out = case.run(leaf, radii[:, order].to(device), center)
+        leaf = next(iter(case.inputs.values())).detach().requires_grad_()
+        if name == "polar_sample":
+            out = case.run(leaf, radii[:, order].to(device), center)
+        else:
+            out = case.run(leaf, radii, points=points[:, order].to(device))
         return torch.autograd.grad(out, leaf, grad[:, :, order])[0]
 
-    plain, turned = run(torch.arange(6)), run(torch.tensor([5, 2, 3, 0, 4, 1]))
-    assert torch.equal(plain, turned) and plain.count_nonzero() == 12
-
-
-def test_the_gradient_of_a_map_does_not_depend_on_any_order(device):
-    # All pixels lie between the same tokens.
-    case = polar_map(1, 2, 4, 2, (70, 1), general="points").to(device)
-    radii = torch.tensor([[1.0, 2.0]], device=device)
-    points = (0.1 * torch.rand(1, 70, 1, 2) + torch.tensor([0.9, 1.1])).to(device)
-    grad, order = wide_range(1, 2, 70, 1).to(device), torch.randperm(70)
-
-    def run(order):
-        leaf = case.inputs["x"].detach().requires_grad_()
-        out = case.run(leaf, radii, points=points[:, order])
-        return torch.autograd.grad(out, leaf, grad[:, :, order])[0]
-
-    plain, turned = run(torch.arange(70)), run(order)
+    plain, turned = run(torch.arange(count)), run(torch.randperm(count))
     assert torch.equal(plain, turned) and plain.count_nonzero() == 8
 
 
@@ -221,22 +195,6 @@ def test_images_of_a_batch_do_not_matter_to_each_other(sampled):
             assert found[0].isnan().all()
 
 
-def test_a_token_without_a_gradient_leaves_the_images_gradient_right(device):
-    def make():
-        case = sampling(rows=2, samples=(2, 2), features=7)
-        mask = case.mask
-
-        def others(**inputs):
-            smooth = mask(**inputs)
-            smooth.view(2, -1)[:, :2] = 0  # the first tokens of both images
-            return smooth
-
-        case.mask = others
-        return case
-
-    assert_accurate(make, device)
-
-
 # -- points and pixels -----------------------------------------------------------------------------
 
 
@@ -261,37 +219,6 @@ def test_azimuths_of_many_turns(angle, device):
     torch.testing.assert_close(found.double(), expected, rtol=0, atol=2e-5)
 
 
-@pytest.mark.parametrize(
-    ("rows", "jitter", "bad"), [(3, 0.0, math.inf), (1, 1.0, math.nan), (3, 1.0, -math.inf)]
-)
-def test_points_at_nan_or_infinity_sample_nothing(rows, jitter, bad, device):
-    # In each image something else is bad, and one azimuth in all.
-    case = sampling(4, 1, rows=rows, columns=4, samples=(1, 1), affine=True, offsets=True,
-                    jitter=jitter, seed=4, layout="image")  # fmt: skip
-    for b, tensor in enumerate(list(case.inputs.values())[1:]):
-        tensor[b].view(-1)[0] = bad
-    case.settings["azimuths"][2] = bad
-    expected = results(case, is_reference=True)
-    found = {n: t.cpu() for n, t in results(case.to(device)).items()}
-    assert all(t.isfinite().all() for t in found.values())
-    assert_equal_results(found, expected, 1e-4)
-    assert not expected["out"][:, :, 0, 0].any() and not expected["out"][..., 2].any()
-
-
-@pytest.mark.parametrize("bad", [math.nan, math.inf])
-def test_pixels_that_are_nan_or_infinite_count_where_they_are_touched(bad, device):
-    image = torch.zeros(1, 3, 7, 7)
-    image[0, 1, 3, 3] = bad
-    case = sampling(1, rows=2, samples=(1, 1), layout="image").to(device)
-    center, radii = (t.to(device) for t in (torch.full((1, 2), 3.25), torch.tensor([[0.25, 2.5]])))
-    found = case.run(image.to(device), radii, center)
-    assert not found[:, 0::2].any() and not found[0, 1, 1].any()
-    assert not found[0, 1, 0].isfinite().any()
-    # Points just outside of an image touch none of its pixels.
-    spoilt = torch.full_like(image, bad).to(device)
-    assert not case.run(spoilt, radii * 0, 0 * center - 1).any()
-
-
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf, 1e30])
 def test_pixels_at_nan_or_infinity_are_zero(bad, device):
     case = polar_map(1, general="points", r_max=1e6)
@@ -301,16 +228,6 @@ def test_pixels_at_nan_or_infinity_are_zero(bad, device):
     assert all(t.isfinite().all() for t in found.values())
     assert_equal_results(found, expected, 1e-4)
     assert not expected["out"][:, :, 2, 3].any() and not expected["out"][:, :, 4, 1].any()
-
-
-def test_the_pole_and_the_axes(device):
-    # Pixels at the pole, on the axes and the diagonals, where the pieces of the arctangent meet.
-    case = polar_map(1, 3, 8, 2, (7, 7))
-    case = case.replace(radii=torch.tensor([[0.5, 1.5, 3.0]]), center=torch.full((1, 2), 3.0))
-    expected = results(case.to(f64), is_reference=True, masked=False)
-    found = {n: t.cpu().double() for n, t in results(case.to(device), masked=False).items()}
-    assert found.pop("center").isfinite().all() and len(expected.pop("center")) == 1
-    assert_equal_results(found, expected, 1e-5)
 
 
 # -- windows ---------------------------------------------------------------------------------------
@@ -356,12 +273,3 @@ def test_a_bad_query_and_key_spoil_nothing_beyond_the_seam(bad, device):
     case.inputs["qkv"][0, 0, 1, :2] = bad  # in the window of the rings 3 and 0, apart by the seam
     out = case.run(**case.to(device).inputs)
     assert out[0, 1:].isfinite().all() and not out[0, 0].isfinite().all()
-
-
-def test_minus_infinity_in_the_bias_hides_a_pair(device):
-    case = attention(1, 1, 2, 1, 4, (1, 2)).to(device)
-    qkv, bias = case.inputs.values()
-    bias[..., 0] = -math.inf  # Δφ = -1: token 0 does not see token 1
-    torch.testing.assert_close(case.run(qkv, bias)[0, 0, 0], qkv[0, 0, 0, 2, 0])
-    bias[:] = -math.inf
-    assert case.run(qkv, bias).isnan().all()

@@ -31,7 +31,7 @@ def gradients(model, images, view):
 
 
 @pytest.mark.parametrize("name", MODELS)
-def test_logits_and_gradients_are_those_of_the_cpu(name, cuda):
+def test_logits_and_gradients_are_those_of_the_cpu_in_any_run(name, cuda):
     model, images, view = make(name, cuda)
     there = copy.deepcopy(model).cpu(), images.cpu(), view.to("cpu")
     with torch.no_grad():
@@ -42,13 +42,8 @@ def test_logits_and_gradients_are_those_of_the_cpu(name, cuda):
     for key, want in expected.items():
         size = want.abs().max().item()
         torch.testing.assert_close(ours[key].cpu(), want, rtol=1e-2, atol=1e-3 * size, msg=key)
-
-
-@pytest.mark.parametrize("name", MODELS)
-def test_two_runs_give_the_same_bits(name, cuda):
-    model, images, view = make(name, cuda)
-    one, two = (gradients(model, images, view) for _ in range(2))
-    assert all(torch.equal(one[key], two[key]) for key in one)
+    again = gradients(model, images, view)
+    assert all(torch.equal(ours[key], again[key]) for key in ours)
 
 
 @pytest.mark.parametrize("mode", ["default", "reduce-overhead"])

@@ -139,6 +139,21 @@ def assert_accurate(
         assert error <= allowed, f"{name}: error {error:.3g}, allowed {allowed:.3g}"
 
 
+def assert_rounded_once(
+    case: Case, same_order: bool = True
+) -> tuple[Case, dict[str, Tensor], dict[str, Tensor]]:
+    """With the first input in bfloat16, the output is that of float32 rounded once, to the bit if
+    sums run in the same order. Returns the call in bfloat16, its results and those of float32."""
+    first, values = next(iter(case.inputs.items()))
+    narrow, wide = (case.replace(**{first: t}) for t in (values.to(bf16), values.to(bf16).float()))
+    ours, expected = results(narrow), results(wide)
+    assert ours["out"].dtype == ours[first].dtype == bf16
+    torch.testing.assert_close(ours["out"].float(), expected["out"], rtol=2**-7, atol=1e-5)
+    same = (ours["out"] == expected["out"].to(bf16)).float()
+    assert same.numel() == 0 or (same.all() if same_order else same.mean() > 0.99)
+    return narrow, ours, expected
+
+
 def elsewhere(tensor: Tensor, kind: str) -> Tensor:
     """The same values with gaps, or in another order in memory."""
     if kind == "gaps":
@@ -161,6 +176,12 @@ def raw_calls(case: Case) -> list[tuple[torch._ops.OpOverload, list]]:
 
 
 # -- calls -----------------------------------------------------------------------------------------
+
+
+def add_norm_(x: Tensor, y: Tensor, weight: Tensor, bias: Tensor, eps: float = 1e-5) -> Tensor:
+    """The private operator: adds y to x, makes y the layer norm of the sum, and returns y."""
+    torch.ops.darswin._add_norm_(x, y, weight, bias, eps)
+    return y
 
 
 def places(radii, azimuths, center, affine, offsets, batch, jitter, seed) -> tuple[Tensor, ...]:
@@ -402,6 +423,7 @@ ATTENTION = {
                                             bias_rows=2, shift=(3, 4), periodic=(False, False)),
     "several chunks of windows": dict(batch=3, rings=16, sectors=32, heads=3, head_dim=8,
                                       shift=(1, 2)),
+    "65 tokens": dict(batch=1, rings=1, sectors=65, heads=1, head_dim=32, window=(1, 65)),
     "empty batch": dict(batch=0),
     "no heads": dict(heads=0),
 }  # fmt: skip

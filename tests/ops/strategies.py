@@ -1,10 +1,13 @@
 """Random arguments of every operator, for hypothesis: sizes 0 and 1 in every place, every layout,
-dtype, stride and storage offset, and sizes around what the kernels' blocks and registers hold."""
+dtype, stride and storage offset, and sizes around what the kernels' blocks and registers hold.
+
+Hypothesis draws shapes and a seed, but not every number: those come from torch's own generator."""
 
 import math
 
+import cases
 import torch
-from cases import Case, attention_call, bf16, f32, f64, map_call, on_polar_plane, sampling_call
+from cases import Case, f32, f64, on_polar_plane
 from hypothesis import strategies as st
 from torch import Tensor
 
@@ -13,14 +16,9 @@ def sizes(*values: int):
     return st.sampled_from(values)
 
 
-@st.composite
-def generators(draw) -> torch.Generator:
-    """A generator of tensors; hypothesis draws its seed, and shapes, but not every number."""
-    return torch.Generator().manual_seed(draw(st.integers(0, 2**31)))
-
-
-def normal(generator: torch.Generator, *shape: int, dtype: torch.dtype = f64) -> Tensor:
-    return torch.randn(shape, generator=generator, dtype=f64).to(dtype)
+def one_in(count: int):
+    """True in one of so many draws."""
+    return st.integers(1, count).map(lambda drawn: drawn == count)
 
 
 @st.composite
@@ -44,11 +42,17 @@ def strided(draw, tensor: Tensor) -> Tensor:
 
 
 @st.composite
+def of_lens(draw, tensor: Tensor) -> Tensor:
+    """A tensor with a row for each image, or with one for all."""
+    return draw(strided(tensor[:1] if draw(st.booleans()) else tensor))
+
+
+@st.composite
 def grids(draw):
     """Rings, sectors and samples of a patch, no more than 4,000 points in all."""
     rings, sectors = draw(sizes(0, 1, 2, 3, 5)), draw(sizes(0, 1, 2, 3, 8, 17, 64, 257, 300))
     across = sizes(1, 2, 3, 4, 5, 10, 33)
-    if draw(st.integers(0, 6)) == 0:
+    if draw(one_in(7)):
         across = sizes(341, 512, 1023, 1024, 1025, 1026, 1030)  # a block of the kernels is 1024
     samples = draw(sizes(1, 2, 3, 4, 7, 10)), draw(across)
     while rings * samples[0] * sectors * samples[1] > 4000:
@@ -62,126 +66,83 @@ def grids(draw):
 
 
 @st.composite
-def lenses(draw, generator, batch, size, rows, columns, dtype):
-    """radii, azimuths, center, and affine and offsets or None, for images of `size` = (H, W)."""
-    reach = max(*size, 2)
-    count = draw(st.sampled_from([1, batch]))
-    spread = draw(st.sampled_from([0.4, 0.7, 1.5, 0.0]))
-    radii = torch.rand(count, rows, generator=generator, dtype=f64) * spread * reach
-    if draw(st.booleans()):
-        radii = radii.sort(1).values
-    if draw(st.integers(0, 7)) == 0:
-        radii = -radii
-    azimuths = (torch.arange(columns, dtype=f64) + 0.37) * (2 * math.pi / max(columns, 1))
-    if draw(st.integers(0, 3)) == 0:
-        azimuths = 1e6 * normal(generator, columns)
-    center = torch.tensor([(size[1] - 1) / 2, (size[0] - 1) / 2], dtype=f64)
-    count = draw(st.sampled_from([1, batch]))
-    center = center + draw(st.sampled_from([0.3, 3.0])) * normal(generator, count, 2)
-    affine = offsets = None
-    if draw(st.integers(0, 2)) == 0:
-        count = draw(st.sampled_from([1, batch]))
-        affine = torch.eye(2, dtype=f64) + 0.4 * normal(generator, count, 2, 2)
-        affine = affine.to(dtype)
-    if draw(st.integers(0, 2)) == 0:
-        count = draw(st.sampled_from([1, batch]))
-        far = draw(st.sampled_from([0.5, 30.0]))
-        offsets = (far * normal(generator, count, 2, rows, columns)).to(dtype)
-    return radii.to(dtype), azimuths.to(dtype), center.to(dtype), affine, offsets
-
-
-@st.composite
 def sampling(draw, dtypes=(f32, f64), embed: bool = False) -> Case:
     """A call of polar_sample, or of polar_embed."""
-    generator, dtype = draw(generators()), draw(st.sampled_from(dtypes))
-    batch, channels = draw(sizes(0, 1, 2, 3, 5)), draw(sizes(0, 1, 2, 3, 3, 4, 5, 8, 17))
-    size = draw(sizes(0, 1, 2, 7, 16, 33, 90)), draw(sizes(0, 1, 2, 7, 16, 33, 90))
+    torch.manual_seed(draw(st.integers(0, 2**31)))
     rings, sectors, samples = draw(grids())
-    rows, columns = rings * samples[0], sectors * samples[1]
-    image = draw(strided(normal(generator, batch, channels, *size, dtype=dtype)))
-    lens = draw(lenses(generator, batch, size, rows, columns, dtype))
-    radii, azimuths, center, affine, offsets = (
-        None if t is None else draw(strided(t)) for t in lens
+    pairs = st.tuples(*[sizes(0, 1, 2, 7, 16, 33, 90)] * 2)
+    options = dict(
+        jitter=draw(sizes(0.0, 0.0, 1.0, 0.3)), seed=draw(st.integers(-(2**63), 2**63 - 1))
     )
-    jitter = draw(st.sampled_from([0.0, 0.0, 1.0, 0.3]))
-    seed = draw(st.integers(-(2**63), 2**63 - 1))
-    options = dict(samples=samples, jitter=jitter, seed=seed)
-    inputs = dict(image=image, radii=radii, center=center)
-    if affine is not None:
-        inputs["affine"] = affine
-    if offsets is not None:
-        inputs["offsets"] = offsets
     if embed:
-        features = draw(sizes(0, 1, 2, 15, 16, 17, 48))
-        depth = samples[0] * samples[1] * channels
-        inputs["weight"] = draw(strided(normal(generator, features, depth, dtype=dtype)))
-        if draw(st.booleans()):
-            inputs["bias"] = draw(strided(normal(generator, features, dtype=dtype)))
+        options |= dict(features=draw(sizes(0, 1, 2, 15, 16, 17, 48)), bias=draw(st.booleans()))
     else:
-        options["layout"] = draw(st.sampled_from(["tokens", "image"]))
-    return sampling_call(inputs, azimuths, **options)
+        options |= dict(layout=draw(sizes("tokens", "image")))
+    case = cases.sampling(
+        draw(sizes(0, 1, 2, 3, 5)), draw(sizes(0, 1, 2, 3, 3, 4, 5, 8, 17)), draw(pairs),
+        rings * samples[0], sectors * samples[1], samples, shared=draw(st.booleans()),
+        affine=draw(one_in(3)), offsets=draw(one_in(3)), far=draw(sizes(0.5, 30.0)),
+        dtype=draw(st.sampled_from(dtypes)), **options,
+    )  # fmt: skip
+    inputs, settings = case.inputs, case.settings
+    inputs["radii"] = inputs["radii"] * draw(sizes(0.5, 1.0, 2.0, 0.0, -1.0))
+    if draw(st.booleans()):  # in no order
+        inputs["radii"] = inputs["radii"][:, torch.randperm(inputs["radii"].shape[1])]
+    inputs["center"] += draw(sizes(0.3, 3.0)) * torch.randn_like(inputs["center"])
+    if draw(one_in(4)):
+        settings["azimuths"] = 1e6 * torch.randn_like(settings["azimuths"])
+    settings["azimuths"] = draw(strided(settings["azimuths"]))
+    for name, tensor in inputs.items():
+        of_all = name in ("image", "weight", "bias")
+        inputs[name] = draw(strided(tensor) if of_all else of_lens(tensor))
+    return case
 
 
 @st.composite
 def attention(draw, dtypes=(f32, f64)) -> Case:
     """A call of window_attention."""
-    generator, dtype = draw(generators()), draw(st.sampled_from(dtypes))
-    batch, heads = draw(sizes(0, 1, 2, 3)), draw(sizes(0, 1, 2, 3))
-    head_dim = draw(sizes(1, 2, 5, 8, 16, 17, 32, 33))
+    torch.manual_seed(draw(st.integers(0, 2**31)))
     window = draw(sizes(1, 2, 3, 4, 8)), draw(sizes(1, 2, 3, 4, 5, 16, 65))
     rings, sectors = window[0] * draw(sizes(1, 2, 3)), window[1] * draw(sizes(1, 2, 3))
     if rings * sectors > 600:
         rings, sectors = window
-    rows = draw(st.sampled_from([1, batch]))
-    table = (rows, heads, 2 * window[0] - 1, 2 * window[1] - 1)
-    options = dict(
-        window=window,
+    batch = draw(sizes(0, 1, 2, 3))
+    case = cases.attention(
+        batch, rings, sectors, draw(sizes(0, 1, 2, 3)), draw(sizes(1, 2, 5, 8, 16, 17, 32, 33)),
+        window, draw(sizes(1, batch)), draw(st.sampled_from(dtypes)),
         shift=(draw(st.integers(0, rings - 1)), draw(st.integers(0, sectors - 1))),
-        periodic=(draw(st.booleans()), draw(st.booleans())),
-        scale=draw(st.sampled_from([None, 0.7, 0.0])),
-    )
-    qkv = normal(generator, batch, rings, sectors, 3, heads, head_dim, dtype=dtype)
-    bias = normal(generator, *table, dtype=f32 if dtype == bf16 else dtype)
-    inputs = dict(qkv=draw(strided(qkv)), bias=draw(strided(bias)))
-    return attention_call(inputs, **options)
+        periodic=(draw(st.booleans()), draw(st.booleans())), scale=draw(sizes(None, 0.7, 0.0)),
+    )  # fmt: skip
+    return case.replace(**{name: draw(strided(t)) for name, t in case.inputs.items()})
 
 
 @st.composite
 def polar_maps(draw, dtypes=(f32, f64)) -> Case:
     """A call of polar_to_image."""
-    generator, dtype = draw(generators()), draw(st.sampled_from(dtypes))
-    real = f32 if dtype == bf16 else dtype
-    batch, channels = draw(sizes(0, 1, 2, 3)), draw(sizes(0, 1, 2, 3, 8, 10, 16, 17, 31, 33, 65))
-    rings, sectors = draw(sizes(1, 2, 3, 5, 16)), draw(sizes(1, 2, 3, 8, 17, 64))
-    size = height, width = draw(sizes(0, 1, 2, 7, 16, 33)), draw(sizes(0, 1, 2, 7, 16, 33, 90))
-    rows = st.sampled_from([1, batch])
-    spread = draw(st.sampled_from([0.2, 0.5, 1.5])) * max(*size, 2)
-    radii = (torch.rand(draw(rows), rings, generator=generator, dtype=f64) + 0.3).cumsum(1)
-    radii = radii / rings * spread
-    if draw(st.integers(0, 4)) == 0:
-        radii = radii - radii[:, :1]  # a ring at the pole itself
-    options = dict(size=size, layout=draw(st.sampled_from(["tokens", "image"])))
-    inputs = dict(x=normal(generator, batch, rings, sectors, channels, dtype=dtype))
-    inputs["radii"] = radii.to(real)
-    general = draw(st.sampled_from(["circular", "affine", "points"]))
-    if general == "points":
-        points = 0.4 * max(*size, 2) * normal(generator, draw(rows), *size, 2)
-        inputs["points"] = points.to(real)
-    else:
-        center = torch.tensor([(width - 1) / 2, (height - 1) / 2], dtype=f64)
-        spread = draw(st.sampled_from([0.3, 3.0]))
-        inputs["center"] = (center + spread * normal(generator, draw(rows), 2)).to(real)
-    if general == "affine":
-        skew = normal(generator, draw(rows), 2, 2).clamp(-2, 2)
-        inputs["affine"] = (torch.eye(2, dtype=f64) + 0.15 * skew).to(real)
+    torch.manual_seed(draw(st.integers(0, 2**31)))
+    batch, side = draw(sizes(0, 1, 2, 3)), sizes(0, 1, 2, 7, 16, 33)
+    size = draw(side), draw(side | sizes(90))
+    case = cases.polar_map(
+        batch, draw(sizes(1, 2, 3, 5, 16)), draw(sizes(1, 2, 3, 8, 17, 64)),
+        draw(sizes(0, 1, 2, 3, 8, 10, 16, 17, 31, 33, 65)), size, draw(sizes(1, batch)),
+        draw(sizes(None, "affine", "points")), draw(sizes(0.2, 0.5, 1.5)) * max(*size, 2),
+        draw(st.sampled_from(dtypes)), layout=draw(sizes("tokens", "image")),
+    )  # fmt: skip
+    inputs = case.inputs
+    if draw(one_in(5)):
+        inputs["radii"] = inputs["radii"] - inputs["radii"][:, :1]  # a ring at the pole itself
+    if "center" in inputs:
+        inputs["center"] += draw(sizes(0.3, 3.0)) * torch.randn_like(inputs["center"])
     r, _ = on_polar_plane(size, **{name: t.double() for name, t in inputs.items() if name != "x"})
+    r_max = None
     if draw(st.booleans()) and r.numel() > 1:
         # Between two pixels, since what lies on the border may count as inside or outside.
         radius = r.flatten().sort().values
         gap = radius.diff().argmax()
-        options["r_max"] = (radius[gap] + radius[gap + 1]).item() / 2
-    inputs = {name: draw(strided(t)) if name != "radii" else t for name, t in inputs.items()}
-    return map_call(inputs, **options)
+        r_max = (radius[gap] + radius[gap + 1]).item() / 2
+    for name, tensor in inputs.items():
+        inputs[name] = tensor if name == "radii" else draw(strided(tensor))
+    return cases.map_call(inputs, **case.settings, r_max=r_max)
 
 
 WIDTHS = (1, 2, 3, 7, 15, 16, 17, 31, 33, 64, 96, 200, 384, 1500)
@@ -190,23 +151,22 @@ WIDTHS = (1, 2, 3, 7, 15, 16, 17, 31, 33, 64, 96, 200, 384, 1500)
 @st.composite
 def norms(draw, dtypes=(f32,)) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """x, y, weight and bias of add_norm_."""
-    generator, dtype = draw(generators()), draw(st.sampled_from(dtypes))
+    torch.manual_seed(draw(st.integers(0, 2**31)))
+    dtype = draw(st.sampled_from(dtypes))
     shape = (*draw(st.lists(sizes(0, 1, 2, 3, 9), max_size=3)), draw(sizes(*WIDTHS)))
-    mean = draw(st.sampled_from([0.0, 300.0, -1e4]))
+    mean = draw(sizes(0.0, 300.0, -1e4))
     room = draw(sizes(0, 1, 5))  # an odd storage offset
     x, y = (
-        (normal(generator, math.prod(shape) + room) + m).to(dtype)[room:].view(shape)
-        for m in (mean, 0.0)
+        (torch.randn(math.prod(shape) + room) + m).to(dtype)[room:].view(shape) for m in (mean, 0.0)
     )
-    return x, y, normal(generator, shape[-1], dtype=f32), normal(generator, shape[-1], dtype=f32)
+    return x, y, torch.randn(shape[-1]), torch.randn(shape[-1])
 
 
 @st.composite
 def matrices(draw) -> Tensor:
     """x of transpose_sum."""
-    generator = draw(generators())
+    torch.manual_seed(draw(st.integers(0, 2**31)))
     counts = sizes(0, 1, 2, 3, 15, 16, 17, 33, 63, 64, 65, 130, 700)
-    room, mean = draw(sizes(0, 1, 5)), draw(st.sampled_from([0.0, 1.0, 1e4]))
-    rows, columns = draw(counts), draw(counts)
-    values = normal(generator, rows * columns + room) + mean
-    return values.to(f32)[room:].view(rows, columns)
+    rows, columns, room = draw(counts), draw(counts), draw(sizes(0, 1, 5))
+    values = torch.randn(rows * columns + room) + draw(sizes(0.0, 1.0, 1e4))
+    return values[room:].view(rows, columns)

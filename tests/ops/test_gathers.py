@@ -21,7 +21,6 @@ def avx512():
     _module.set_tier("avx512")
     yield
     _module.set_tier(before)
-    _module.set_gathers(None)
 
 
 def assert_same_bits(case: Case) -> None:

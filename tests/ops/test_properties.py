@@ -12,6 +12,8 @@ import strategies
 import torch
 from cases import (
     Case,
+    add_norm_,
+    assert_rounded_once,
     assert_same_bits_on_any_number_of_threads,
     bf16,
     f32,
@@ -24,7 +26,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from darswin.ops import use_reference
-from darswin.ops._inference import add_norm_, transpose_sum
+from darswin.ops._transpose_sum import transpose_sum
 
 pytestmark = pytest.mark.filterwarnings("error")
 
@@ -124,16 +126,10 @@ def test_equals_the_reference(name, data):
 @given(data=st.data())
 def test_bfloat16_is_float32_rounded_once(name, data):
     case = draw(data, name, dtypes=(f32,))
-    first, values = next(iter(case.inputs.items()))
-    narrow, wide = (case.replace(**{first: t}) for t in (values.to(bf16), values.to(bf16).float()))
-    ours, same = results(narrow), results(wide)
-    assert ours["out"].dtype == ours[first].dtype == bf16
-    if name == "window_attention":  # whose sums may run in another order
-        torch.testing.assert_close(ours["out"].float(), same["out"], rtol=2**-7, atol=1e-5)
-    else:
-        assert torch.equal(ours["out"], same["out"].bfloat16())
+    narrow, ours, _ = assert_rounded_once(case, same_order=name != "window_attention")
+    values = next(iter(narrow.inputs.values()))
     with torch.no_grad(), use_reference():
-        exact = case.run(**wide.to(f64).inputs)
+        exact = case.run(**narrow.to(f64).inputs)
     size = largest(values) * (1 + largest(case.inputs.get("weight", values))) * values.shape[1]
     torch.testing.assert_close(ours["out"].double(), exact, rtol=2**-7, atol=1e-3 * (1 + size))
     assert_same_bits_on_any_number_of_threads(lambda: results(narrow))
@@ -154,25 +150,28 @@ def test_uint8_pixels_are_sampled_as_what_they_stand_for(case, frames):
     torch.testing.assert_close(ours.double(), exact, rtol=1e-5, atol=1e-5)
 
 
-@given(strategies.norms())
-def test_add_norm_is_as_accurate_as_torch(arguments):
-    x, y, weight, bias = arguments
+@pytest.mark.parametrize("dtype", [f32, bf16])
+@given(data=st.data())
+def test_add_norm_is_the_norm_of_the_sum_as_it_is_rounded(dtype, data):
+    x, y, weight, bias = data.draw(strategies.norms(dtypes=(dtype,)))
     note(f"{x.shape} {x.storage_offset()}")
-    total = x + y
 
     def run():
-        a, b = x.clone(), y.clone()
-        return a, add_norm_(a, b, weight, bias, 1e-5)
+        total, norm = x.clone(), y.clone()
+        add_norm_(total, norm, weight, bias)
+        return dict(total=total, norm=norm)
 
-    assert_same_bits_on_any_number_of_threads(lambda: dict(enumerate(run())))
-    changed, out = run()
-    assert torch.equal(changed, total)
+    assert_same_bits_on_any_number_of_threads(run)
+    total, norm = run().values()
+    assert torch.equal(total, x + y)
     if x.numel() == 0:
         return
-    # Of the sum as it is rounded: what the norm is given.
+    base = torch.layer_norm(total.float(), weight.shape, weight, bias, 1e-5)
+    if dtype == bf16:
+        torch.testing.assert_close(norm.float(), base, rtol=2**-7, atol=2e-3)
+        return
     exact = torch.layer_norm(total.double(), weight.shape, weight.double(), bias.double(), 1e-5)
-    base = torch.layer_norm(total, weight.shape, weight, bias, 1e-5)
-    assert_accurate(out, base, exact, largest(exact) + largest(bias))
+    assert_accurate(norm, base, exact, largest(exact) + largest(bias))
 
 
 @given(strategies.matrices())
@@ -184,28 +183,14 @@ def test_transpose_sum_equals_torch(x):
     assert_accurate(sums, x.sum(0), x.double().sum(0), largest(x.double().abs().sum(0)) / 4)
 
 
-@given(strategies.norms(dtypes=(bf16,)))
-def test_bfloat16_norm_is_float32_rounded_once(arguments):
-    x, y, weight, bias = arguments
-    total = x + y
-    assert_same_bits_on_any_number_of_threads(
-        lambda: dict(out=add_norm_(x.clone(), y.clone(), weight, bias, 1e-5))
-    )
-    out = add_norm_(x, y, weight, bias, 1e-5)
-    assert torch.equal(x, total)
-    if x.numel():
-        want = torch.layer_norm(total.float(), weight.shape, weight, bias, 1e-5)
-        torch.testing.assert_close(out.float(), want, rtol=2**-7, atol=2e-3)
-
-
 # -- what is not finite, and what nearly is not ----------------------------------------------------
 
 
-def spoiled(generator: torch.Generator, tensor: Tensor, value: float, share: float) -> Tensor:
+def spoiled(tensor: Tensor, value: float, share: float) -> Tensor:
     """A copy in which about a `share` of the numbers, and one at least, are `value`."""
-    hit = torch.rand(tensor.shape, generator=generator) < share
+    hit = torch.rand(tensor.shape) < share
     if tensor.numel():
-        hit.view(-1)[torch.randint(tensor.numel(), (), generator=generator)] = True
+        hit.view(-1)[torch.randint(tensor.numel(), ())] = True
     return tensor.masked_fill(hit, value)
 
 
@@ -217,13 +202,13 @@ def assert_same_kinds(ours: Tensor, exact: Tensor, atol: float) -> None:
 bad_values = st.sampled_from([math.nan, math.inf, -math.inf])
 
 
-@given(strategies.sampling(), strategies.generators(), bad_values, st.data())
-def test_a_lens_that_is_not_finite_samples_nothing_there(case, generator, bad, data):
+@given(strategies.sampling(), bad_values, st.data())
+def test_a_lens_that_is_not_finite_samples_nothing_there(case, bad, data):
     note(repr(case))
     names = [name for name in ("radii", "center", "affine", "offsets") if name in case.inputs]
     name = data.draw(st.sampled_from([*names, "azimuths"]))
     place = case.settings if name == "azimuths" else case.inputs
-    place[name] = spoiled(generator, place[name], bad, 0.2)
+    place[name] = spoiled(place[name], bad, 0.2)
     exact = results(case.to(f64), is_reference=True)
     ours = results(case)
     lever = 1e-3 * (1 + exact["out"].numel()) * (1 + largest(case.inputs["image"]))
@@ -236,14 +221,10 @@ def test_a_lens_that_is_not_finite_samples_nothing_there(case, generator, bad, d
 @pytest.mark.parametrize("name", ["polar_sample", "polar_to_image"])
 @given(data=st.data())
 def test_pixels_and_tokens_that_are_not_finite_spoil_what_touches_them(name, data):
-    case, generator, bad = (
-        draw(data, name),
-        data.draw(strategies.generators()),
-        data.draw(bad_values),
-    )
+    case, bad = draw(data, name), data.draw(bad_values)
     smooth = case.smooth() > 0
     first, values = next(iter(case.inputs.items()))
-    case = case.replace(**{first: spoiled(generator, values, bad, 0.02)})
+    case = case.replace(**{first: spoiled(values, bad, 0.02)})
     with torch.no_grad():
         ours = case.run(**case.inputs)
         with use_reference():
@@ -254,14 +235,14 @@ def test_pixels_and_tokens_that_are_not_finite_spoil_what_touches_them(name, dat
     assert_same_kinds(torch.where(smooth, ours, 0), torch.where(smooth, exact, 0), atol=atol)
 
 
-@given(strategies.sampling(), strategies.generators(), bad_values)
-def test_gradients_that_are_not_finite_reach_the_pixels_that_were_touched(case, generator, bad):
+@given(strategies.sampling(), bad_values)
+def test_gradients_that_are_not_finite_reach_the_pixels_that_were_touched(case, bad):
     note(repr(case))
     if case.inputs["image"].numel() == 0:
         return
     mask = case.smooth().expand(case.run(**case.inputs).shape)
-    grad = strategies.normal(generator, *mask.shape) * mask
-    grad = torch.where(mask > 0, spoiled(generator, grad, bad, 0.02), grad)
+    grad = torch.randn(mask.shape, dtype=f64) * mask
+    grad = torch.where(mask > 0, spoiled(grad, bad, 0.02), grad)
     grads = []
     for c, is_reference in ((case, False), (case.to(f64), True)):
         leaf = c.inputs["image"].detach().requires_grad_()
@@ -284,11 +265,11 @@ def test_huge_pixels_do_not_overflow(case, huge):
     torch.testing.assert_close(ours.double(), exact, rtol=1e-4, atol=1e-5 * 3e38)
 
 
-@given(strategies.polar_maps(), strategies.generators(), bad_values, st.data())
-def test_pixels_that_lie_nowhere_on_the_map_are_zero(case, generator, bad, data):
+@given(strategies.polar_maps(), bad_values, st.data())
+def test_pixels_that_lie_nowhere_on_the_map_are_zero(case, bad, data):
     names = [name for name in ("center", "affine", "points") if name in case.inputs]
     name = data.draw(st.sampled_from(names))
-    case.inputs[name] = spoiled(generator, case.inputs[name], bad, 0.2)
+    case.inputs[name] = spoiled(case.inputs[name], bad, 0.2)
     note(repr(case))
     exact = results(Case(case.run, case.to(f64).inputs), is_reference=True)
     ours = results(Case(case.run, case.inputs))
@@ -297,10 +278,10 @@ def test_pixels_that_lie_nowhere_on_the_map_are_zero(case, generator, bad, data)
         assert_same_kinds(ours[key], exact[key], atol=1e-2 * (1 + largest(exact[key])))
 
 
-@given(strategies.attention(), strategies.generators(), bad_values)
-def test_a_token_that_is_not_finite_spoils_its_window_alone(case, generator, bad):
+@given(strategies.attention(), bad_values)
+def test_a_token_that_is_not_finite_spoils_its_window_alone(case, bad):
     note(repr(case))
-    qkv = spoiled(generator, case.inputs["qkv"], bad, 0.01)
+    qkv = spoiled(case.inputs["qkv"], bad, 0.01)
     settings = case.settings
     # Windows that hold one, as the tokens of the map.
     hit = (~qkv.isfinite()).flatten(3).any(3).roll([-s for s in settings["shift"]], (1, 2))

@@ -194,15 +194,16 @@ def _options(sampling: Sampling, tokens: bool) -> dict[str, Any]:
     )  # fmt: skip
 
 
-def forward(sampling: Sampling, tokens: bool) -> Tensor:
-    """The samples, in one launch."""
+def polar_sample(*arguments: Any) -> Tensor:
+    """`darswin::polar_sample`, one launch."""
+    *fields, tokens = arguments
+    sampling = Sampling(*fields)
     batch, channels = sampling.image.shape[:2]
     rows, columns = sampling.radii.shape[1], len(sampling.azimuths)
-    out = sampling.new_output(
-        (*sampling.map_size(), sampling.token_size())
-        if tokens
-        else (batch, channels, rows, columns)
-    )
+    shape: tuple[int, ...] = (batch, channels, rows, columns)
+    if tokens:
+        shape = (*sampling.map_size(), sampling.token_size())
+    out = sampling.new_output(shape)
     if out.numel() > 0:
         _forward[(batch * triton.cdiv(rows * columns, BLOCK),)](
             *_arguments(sampling), out, CHUNK=min(triton.next_power_of_2(channels), 4),
@@ -211,20 +212,11 @@ def forward(sampling: Sampling, tokens: bool) -> Tensor:
     return out
 
 
-def backward(
-    sampling: Sampling,
-    tokens: bool,
-    grad_out: Tensor,
-    image_grad: bool,
-    lens_grad: bool,
-    offsets_grad: bool,
-) -> tuple[Tensor, ...]:
-    """The gradients of image, radii, center, affine and offsets; of size (0,) if not wanted.
-
-    grad_out: in the order of the output, of any shape.
-    """
-    wanted = image_grad, lens_grad, offsets_grad
-    gradients = empty_gradients(sampling, GRADIENTS, wanted)
+def polar_sample_backward(*arguments: Any) -> tuple[Tensor, ...]:
+    """`darswin::polar_sample_backward`, of a gradient in the order of the output and any shape."""
+    *fields, tokens, grad_out, image_grad, lens_grad, offsets_grad = arguments
+    sampling = Sampling(*fields)
+    gradients = empty_gradients(sampling, GRADIENTS, (image_grad, lens_grad, offsets_grad))
     if grad_out.numel() == 0:
         return tuple(gradient.zero_() for gradient in gradients)
     image, radii, azimuths, _, _, offsets = sampling[:6]
@@ -276,21 +268,9 @@ def _fold(sampling: Sampling, sums: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     )
 
 
-def polar_sample(*arguments: Any) -> Tensor:
-    """`darswin::polar_sample`."""
-    *fields, tokens = arguments
-    return forward(Sampling(*fields), tokens)
-
-
-def polar_sample_backward(*arguments: Any) -> tuple[Tensor, ...]:
-    """`darswin::polar_sample_backward`."""
-    fields, others = arguments[: len(Sampling._fields)], arguments[len(Sampling._fields) :]
-    return backward(Sampling(*fields), *others)
-
-
 def _samples(sampling: Sampling) -> Tensor:
     """(B·R·A, S_r·S_φ·C): torch adds the bias within the product of a matrix."""
-    return forward(sampling._replace(bfloat16=False), tokens=True).flatten(0, 2)
+    return polar_sample(*sampling._replace(bfloat16=False), True).flatten(0, 2)
 
 
 def polar_embed(*arguments: Any) -> Tensor:
@@ -310,7 +290,7 @@ def polar_embed_backward(*arguments: Any) -> tuple[Tensor, ...]:
         grad = grad_out.float().flatten(0, 2)
         gradients = empty_gradients(sampling, GRADIENTS, wanted)
         if any(wanted):
-            gradients = backward(sampling, True, grad @ weight.float(), *wanted)
+            gradients = polar_sample_backward(*sampling, True, grad @ weight.float(), *wanted)
         if not weight_grad:
             return *gradients, grad.new_empty((0,)), grad.new_empty((0,))
         return *gradients, grad.t() @ _samples(sampling), grad.sum(0)

@@ -213,8 +213,7 @@ def window_attention(
     if out.numel() > 0:
         of = _map(qkv, bias, window, shift, periodic)
         programs = len(qkv) * of.chunks * of.heads
-        with torch.cuda.device_of(qkv):
-            _forward[programs,](qkv, bias, out, scale, of, **_constants(qkv, window))
+        _forward[programs,](qkv, bias, out, scale, of, **_constants(qkv, window))
     return out
 
 
@@ -235,14 +234,12 @@ def window_attention_backward(
         return grad_qkv, grad_bias.zero_()
     of, tokens = _map(qkv, bias, window, shift, periodic), window[0] * window[1]
     grad_pairs = bias.new_empty((len(qkv), of.chunks, of.heads, tokens, tokens))
-    with torch.cuda.device_of(qkv):
-        _backward[grad_pairs[..., 0, 0].numel(),](
-            qkv, bias, grad_out, grad_qkv, grad_pairs, scale, of, **_constants(qkv, window)
-        )
-        grad_pairs = grad_pairs.sum(1 if of.tables > 1 else (0, 1))
-        entries = triton.cdiv(grad_bias[0, 0].numel(), _ENTRIES)
-        _fold[of.tables * of.heads, entries](
-            grad_pairs, grad_bias, *window, _ENTRIES,
-            num_warps=_ENTRIES // 32, enable_fp_fusion=True,
-        )  # fmt: skip
+    _backward[grad_pairs[..., 0, 0].numel(),](
+        qkv, bias, grad_out, grad_qkv, grad_pairs, scale, of, **_constants(qkv, window)
+    )
+    grad_pairs = grad_pairs.sum(1 if of.tables > 1 else (0, 1))
+    entries = triton.cdiv(grad_bias[0, 0].numel(), _ENTRIES)
+    _fold[of.tables * of.heads, entries](
+        grad_pairs, grad_bias, *window, _ENTRIES, num_warps=_ENTRIES // 32, enable_fp_fusion=True
+    )
     return grad_qkv, grad_bias
