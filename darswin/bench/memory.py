@@ -39,7 +39,7 @@ class Memory:
 
 
 def compared(memory: Sequence[Memory]) -> Iterator[tuple[str, int, int]]:
-    """What was measured, in words, and our bytes and the reference's."""
+    """Yields a name for each measurement, our bytes and the reference's."""
     found = {(m.mode, m.batch, m.name): m for m in memory}
     for ours in memory:
         if ours.name == OURS:
@@ -50,7 +50,7 @@ def compared(memory: Sequence[Memory]) -> Iterator[tuple[str, int, int]]:
 
 
 def available() -> bool:
-    """Whether this system tells a process the peak of its memory, and lets it reset that."""
+    """True if a process can read and reset its peak memory on this system."""
     return _STATUS.exists() and _RESET.exists()
 
 

@@ -84,7 +84,7 @@ def memory_table(memory: Sequence[Memory]) -> str:
 
 
 def roofline_lines(record: Record) -> list[str]:
-    """What the matrix products alone reach a second, and with the model around them."""
+    """Operations per second of the matrix products alone, and of the whole model."""
     ours = {t.label: t.median for t in record.timings if t.name == OURS}
     lines = []
     for t in record.timings:
@@ -98,7 +98,7 @@ def roofline_lines(record: Record) -> list[str]:
 
 
 def autotune_lines(autotune: Iterable[Mapping]) -> list[str]:
-    """Which backend of each matrix product was the fastest in training, and by how much."""
+    """The fastest backend of each matrix product in training, and the ratios of the others."""
     lines = []
     for row in autotune:
         best, *others = row["seconds"].items()

@@ -22,7 +22,7 @@ Turns = dict[str, list[list[float]]]  # by candidate and turn, the seconds of ea
 
 @dataclass
 class Case:
-    """What is timed, and how."""
+    """The subject of a timing and its settings."""
 
     subject: str  # an operator or a model
     setting: str  # its sizes

@@ -167,8 +167,8 @@ class PixelAnswers(Answers):
     def _picture(
         self, request: Request, output: np.ndarray, full: FullSize
     ) -> tuple[bytes | memoryview, np.ndarray, np.ndarray, dict[str, Any]]:
-        """Of an output (K, h, w): a PNG file's content, a picture for the overlay and where it is
-        laid, and a summary."""
+        """An output (K, h, w) → content of a PNG file, picture and mask of the overlay, and a
+        summary."""
         raise NotImplementedError
 
 
@@ -235,7 +235,7 @@ def resized(net: Model, card: ModelCard, image: np.ndarray, lens: Lens) -> tuple
 
 
 def fit_of(net: Model, card: ModelCard) -> Framing:
-    """How pictures get the model's size. One that takes only squares gets one in any case."""
+    """The framing that brings pictures to the model's size; some models take only squares."""
     return "crop" if net.square_images and card.fit == "whole" else card.fit
 
 

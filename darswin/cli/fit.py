@@ -223,7 +223,7 @@ class RunCLI(LightningCLI):
                 )
 
     def _recorded(self, config) -> str:
-        """What config.yaml says: all but the options of this call alone."""
+        """The content of config.yaml: all options but those of this call alone."""
         config = config.clone()
         for name in ("config", "resume", "xi", "devices", "ckpt_path", "trainer.default_root_dir"):
             config.pop(name, None)

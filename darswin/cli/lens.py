@@ -188,7 +188,7 @@ def _check_partition(rings: int, sectors: int, samples: tuple[int, int] = (1, 1)
 
 
 def _fields_of_view(lens: Lens, size: tuple[int, int]) -> tuple[float, float]:
-    """Of the lens up to θ_max in a picture of (H, W): across and down, degrees."""
+    """Horizontal and vertical field of view up to θ_max in a picture (H, W), in degrees."""
     end = lens.theta_max.item()
     angles = torch.rad2deg(sides(lens, size).clamp(-end, end))
     return min(angles[::2].sum().item(), 360.0), angles[1::2].sum().clamp(max=180).item()

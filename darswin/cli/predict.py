@@ -45,35 +45,35 @@ def predict(
     coefficients: Coefficients | None = None, task: Task | None = None, top: int = 5,
     every: int = 1, out: str | None = None,
 ) -> list[dict]:  # fmt: skip
-    """What a model says of pictures and of the frames of videos, as JSON: their most probable
-    classes, or files with a class or a distance for each pixel.
+    """Predicts classes, or a class or a distance for every pixel, of pictures and video frames.
 
-    A picture or video that its metadata turns upright is turned, as in training, and its lens with
-    it. What has no answer is named once the others' answers are written. After the frames of a
-    video stands how fast they were answered, on stderr too.
+    Prints the most probable classes as JSON, or writes picture files. Pictures and videos that
+    their metadata turns are turned upright, with their lens. If some files cannot be predicted, the
+    command writes all other predictions first and then names these files. The speed in frames per
+    second follows the frames of each video.
 
     Args:
-        paths: image files, videos, and folders, of which all pictures and videos are taken; a model
-            that comes with darswin brings a picture and its lens, for want of others.
-        lens: the camera's calibration file, of any format that `darswin.lens.load` reads; or its
-            lens as JSON, in pixels of the pictures: {"model": "Spherical", "xi": 0.5, "focal": 300,
-            "theta_max": 1.5}, or with "fov" (rad) in place of the last two where the field of view
-            fills the circle inside the picture; or, for several cameras, a lenses.json, whose
-            folders and files are relative to its own folder: see `darswin.data.Calibrations`; or a
-            folder with a calibration of each picture or video in it, STEM.json.
-        run: the folder of a run, whose best model is taken.
-        model: a model's safetensors file, instead; "digits", which comes with darswin; or what
-            `darswin convert` makes of the authors' released weights, whose classes have numbers.
-        camera: which, of a calibration of several.
-        coefficients: what they are, in a calibration of OpenCV or ROS that does not say it.
-        task: of the model, to be sure; it says so itself.
-        top: how many classes of an image.
-        every: of a video the first frame, and each so many frames after it.
-        out: a JSON file to write; without it, the classes are printed. Of a model for segmentation
-            or distance the folder of what it writes: labels/NAME.png, whose pixels are ids of
-            classes, or distance/NAME.png, metres × 256 in 16 bits, up to 255.996 m; where nothing
-            is known, 255 or 0; and overlays/NAME.jpg. Its predictions.json is the answer. It must
-            be new, empty, or of an earlier predict.
+        paths: image files, videos, and folders of them. A model that comes with darswin has a
+            picture and its lens, which are taken if no paths are given.
+        lens: the camera's calibration file, in any format that `darswin.lens.load` reads. Or a lens
+            as JSON, in pixels of the pictures: {"model": "Spherical", "xi": 0.5, "focal": 300,
+            "theta_max": 1.5}; "fov" (rad) can replace the last two if the field of view fills the
+            circle inside the picture. For several cameras, either a lenses.json, whose paths are
+            relative to its own folder (see `darswin.data.Calibrations`), or a folder with one
+            calibration, STEM.json, for each picture or video.
+        run: a run's folder; its best model predicts.
+        model: a model's safetensors file in place of `run`, or "digits", which comes with darswin.
+            `darswin convert` makes such files of the authors' released weights; their classes have
+            numbers.
+        camera: the name or number of the camera, if the calibration has several.
+        coefficients: the distortion model of a calibration of OpenCV or ROS that does not name it.
+        task: an error is raised if the model was trained for another task.
+        top: number of classes for each image.
+        every: the first frame of a video is predicted, and every so many frames after it.
+        out: a JSON file to write; without it the classes are printed. For segmentation and
+            distance, a folder that is new, empty, or from an earlier predict. It gets
+            labels/NAME.png with class ids (255: unknown), or distance/NAME.png with metres × 256
+            in 16 bits, up to 255.996 m (0: unknown); overlays/NAME.jpg; and predictions.json.
 
     Raises:
         BrokenImageError: a picture or video that cannot be read, or that the lens does not fit.
@@ -96,7 +96,7 @@ def predict(
     if not paths and lens is None and model in list_pretrained():
         paths, lens = [str(pretrained_file(model, "png"))], str(pretrained_file(model, "json"))
     if not paths or lens is None:
-        raise ValueError("predict needs pictures or videos, and `lens`, the camera's")
+        raise ValueError("predict needs pictures or videos, and `lens`, the camera's calibration")
     net, card = trained_model(weights)
     if task not in (None, card.task):
         raise ValueError(f"`task` {task} was asked of {weights}, a model for {card.task}")

@@ -83,7 +83,7 @@ def _batches(data: RunData, split: Any, count: int) -> Iterator[tuple[Tensor, Le
 def _comparison(
     model: Model, quantized: Model, task: str, batches: list[tuple[Tensor, Lens, Tensor]]
 ) -> Iterator[str]:
-    """How the models' results differ, in lines."""
+    """Lines that compare the results of both models."""
     pictures = known = right = kept = same = pixels = 0
     results = Change()
     with torch.inference_mode():

@@ -116,7 +116,7 @@ class _ByValue:
 
 @lru_cache(maxsize=8)  # since pictures often have one camera, whose angles take long to find
 def _unseen(lens: _ByValue, size: tuple[int, int]) -> Tensor:
-    """Where a lens sees nothing: bool (H, W)."""
+    """The pixels (H, W) that no ray of the lens reaches, as bool."""
     return pixel_angles(lens.lens, size)[0].isnan()
 
 

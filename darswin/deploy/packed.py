@@ -85,7 +85,7 @@ def packed(layer: object, dtype: torch.dtype) -> Product:
 
 
 def taken(product: object) -> Quantization | None:
-    """How the input of a product becomes 8 bits; None where it does not."""
+    """The quantization of a product's input; None for a product without one."""
     return product.activation if isinstance(product, PackedQuantizedLinear) else None
 
 

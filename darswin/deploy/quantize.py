@@ -76,7 +76,7 @@ def quantize_model(
 
 
 def sensitivities(model: Model, calibration: Iterable[Sequence]) -> dict[str, float]:
-    """How much each part of a model disturbs its result when it alone computes with 8 bits.
+    """Error of the model's result for each part, if only that part computes with 8 bits.
 
     Parts are a block's "attn.qkv", "attn.proj" and "mlp", and a merging's "reduction", by name.
 
@@ -200,7 +200,7 @@ def _flat(result: Tensor | list[Tensor]) -> Tensor:
 
 
 def _activations(model: Model, batches: Batches, names: Collection[str]) -> dict[str, Quantization]:
-    """How the input of each named layer becomes 8 bits."""
+    """The quantization of the input of each named layer."""
     kept: dict[str, list[Tensor]] = defaultdict(list)
     ends: dict[str, list[Tensor]] = defaultdict(list)
     chance = torch.Generator().manual_seed(0)

@@ -326,7 +326,7 @@ class Stage(nn.Module):
         self.blocks = nn.ModuleList(blocks)
 
     def tables(self, *positions: Any) -> Tables:
-        """What `forward` computes from the positions first; it takes these tables instead, too."""
+        """The tables that `forward` computes from the positions, and accepts in their place."""
         if positions and isinstance(positions[0], Tables):
             return positions[0]
         attentions = [block.attn for block in self.blocks]

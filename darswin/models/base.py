@@ -37,7 +37,7 @@ class FeatureInfo(list[dict[str, Any]]):
         return self.get("num_chs", idx)
 
     def reduction(self, idx: int | Sequence[int] | None = None) -> Any:
-        """How many px a token spans; see `FeatureInfo` for whose px."""
+        """Pixels that a token spans; `FeatureInfo` says which pixels."""
         return self.get("reduction", idx)
 
     def module_name(self, idx: int | Sequence[int] | None = None) -> Any:

@@ -87,7 +87,7 @@ def model_class(name: str) -> type[Model]:
 
 
 def has_image_size(name: str) -> bool:
-    """Whether the models of that name take images of one size only, their option `image_size`."""
+    """True if models of this name take images of one size only, the option `image_size`."""
     model_class(name)
     return "image_size" in _MODELS[name][1]
 

@@ -56,7 +56,7 @@ class PlainView:
         return sample_at(images, there)
 
     def token_places(self, sizes: Sequence[Pair], back: Any, like: Tensor) -> list[Tensor]:
-        """Where the tokens of maps of these sizes are in the view, x and y in [-1, 1]:
+        """Places of the tokens of maps of these sizes in the view, x and y in [-1, 1]:
         (1, H', W', 2) each."""
         sides = ([_centers(side, like.device) for side in size] for size in sizes)
         return [torch.stack(torch.meshgrid(x, y, indexing="xy"), -1)[None] for y, x in sides]

@@ -1,4 +1,4 @@
-"""Which code an operator runs, the compiled one or the reference, and the derivatives it has."""
+"""Chooses the code that an operator runs, compiled or reference, and defines its derivatives."""
 
 import contextlib
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -40,12 +40,12 @@ def use_reference(enabled: bool = True) -> Iterator[None]:
 
 
 def reference_in_use() -> bool:
-    """Whether `use_reference` is in force."""
+    """True within `use_reference`."""
     return _reference
 
 
 def has_kernels(tensor: Tensor) -> bool:
-    """Whether operators on `tensor` run the kernels of `darswin.ops.triton`, where these compute
+    """True if operators on `tensor` run the kernels of `darswin.ops.triton` where these compute
     the given arguments.
 
     A graph that is exported consists of torch's own operations: it runs without this package.
@@ -64,7 +64,7 @@ def _constant(function: Callable[..., bool]) -> Callable[..., bool]:
 
 @_constant
 def _is_known_gpu(index: int) -> bool:
-    """Whether a CUDA device is NVIDIA's, since the A100. AMD's are called "cuda" too."""
+    """True for NVIDIA's devices from the A100 on. AMD's devices are called "cuda" too."""
     return torch.version.hip is None and torch.cuda.get_device_capability(index) >= (8, 0)
 
 
@@ -94,7 +94,7 @@ def narrow_types(tensor: Tensor) -> tuple[torch.dtype, ...]:
 
 
 def output_bfloat16(image: Tensor) -> bool:
-    """Whether an operator on `image` gives bfloat16: as the image is, or as autocast says."""
+    """True if an operator on `image` returns bfloat16, by the image's dtype or by autocast."""
     if image.dtype == torch.float64:
         return False
     return image.dtype == torch.bfloat16 or autocast_dtype(image) == torch.bfloat16
@@ -141,7 +141,7 @@ def call(operator: OpOverload, arguments: Iterable[Any]) -> Any:
 
 
 def _transformed() -> bool:
-    """Whether a transform of torch.func is under way."""
+    """True within a transform of torch.func."""
     return torch._C._functorch.peek_interpreter_stack() is not None
 
 
@@ -177,7 +177,7 @@ def refuse_other_derivatives(operator: object, tensors: Iterable[object]) -> Non
 
 
 def _unwrapped(tensor: Tensor) -> tuple[bool, Tensor]:
-    """Whether torch.func differentiates by the tensor, and the tensor that it wraps."""
+    """True if torch.func differentiates by the tensor; and the tensor that it wraps."""
     functorch, tracked = torch._C._functorch, False
     while functorch.is_functorch_wrapped_tensor(tensor):
         tracked |= functorch.is_gradtrackingtensor(tensor)

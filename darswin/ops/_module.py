@@ -61,7 +61,7 @@ def set_gathers(way: bool | None) -> None:
 
 
 def build_info() -> dict[str, str | int]:
-    """What the module was built with: compiler, cxx_standard, openmp, torch_abi."""
+    """Facts of the module's build: compiler, cxx_standard, openmp, torch_abi."""
     return json.loads(_loaded.darswin_build_info())
 
 

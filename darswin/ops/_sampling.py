@@ -50,7 +50,7 @@ class Sampling(NamedTuple):
         return self.image.shape[0], rings, self.azimuths.shape[0] // self.samples[1]
 
     def kernel_takes(self, *others: object) -> bool:
-        """Whether the kernels for GPUs compute it: not float64, nor uint8 images of many channels,
+        """True if the kernels for GPUs compute it: not float64, nor uint8 images of many channels,
         whose mean and std are numbers in the kernel, nor 2³¹ samples or pixels of an image."""
         image = self.image
         frames = image.dtype == torch.uint8 and image.shape[1] > 16

@@ -73,8 +73,7 @@ def check_rising(name: str, value: Tensor) -> None:
 
 
 def readable(value: Tensor) -> bool:
-    """Whether values can be read: not in a graph that is being compiled, and not on a device, since
-    the host would wait for it."""
+    """True if reading `value` is free: eager mode on the CPU. The host would wait for a device."""
     return not torch.compiler.is_compiling() and value.device.type == "cpu"
 
 

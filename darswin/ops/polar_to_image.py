@@ -87,7 +87,7 @@ def polar_to_image(
 
 
 def _kernel_takes(x, radii, center, affine, points, r_max, size, tokens) -> bool:
-    """Whether the kernel for GPUs computes it: not float64, nor 2³¹ pixels or tokens an image."""
+    """True if the kernel for GPUs computes it: not float64, nor 2³¹ pixels or tokens an image."""
     most = max(size[0] * size[1], x.shape[1] * x.shape[2])
     return x.dtype != torch.float64 and most < 2**31 - 2**16
 

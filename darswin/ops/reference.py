@@ -212,7 +212,7 @@ def polar_to_image(
 
 
 def _rings_within(radii: Tensor, r: Tensor) -> Tensor:
-    """How many of the rising radii (N, R) are at most r (N, K): (N, K)."""
+    """Counts the rising radii (N, R) that are at most r (N, K): (N, K)."""
     if torch.compiler.is_compiling():  # ONNX has no searchsorted; this takes R times the memory
         return (radii[:, :, None] <= r[:, None]).sum(1)
     return torch.searchsorted(radii.contiguous(), r.contiguous(), right=True)

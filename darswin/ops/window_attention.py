@@ -82,7 +82,7 @@ def window_attention(
 
 
 def _kernel_takes(qkv: Tensor, bias: Tensor, window: tuple[int, int], *others: object) -> bool:
-    """Whether the kernel for GPUs computes it: a program holds the pairs of a window's tokens, and
+    """True if the kernel for GPUs computes it: a program holds the pairs of a window's tokens, and
     their queries, keys and values, in registers."""
     tokens, head_dim = math.prod(window), qkv.shape[5]
     dims = 64 if tokens <= 32 else 32

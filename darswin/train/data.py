@@ -151,7 +151,7 @@ class RunData(LightningDataModule):
         return dataset
 
     def broken(self) -> int:
-        """How many pictures could not be read so far."""
+        """Number of pictures that could not be read so far."""
         return sum(len(dataset.broken) for dataset in self.datasets)
 
     @property

@@ -35,7 +35,7 @@ class Zones:
         return torch.bucketize(theta.rad2deg(), borders, right=True)
 
     def ranges(self) -> list[dict[str, Any]]:
-        """Of each zone `from_deg` and `to_deg`; the last one has no end, None."""
+        """`from_deg` and `to_deg` of each zone; the last zone ends at None."""
         ends: list[float | None] = [*self.borders, None]
         starts = [0.0, *self.borders]
         return [dict(from_deg=a, to_deg=b) for a, b in zip(starts, ends, strict=True)]
@@ -58,7 +58,7 @@ class PixelSums(Metric):
         return self.counts, self.areas
 
     def pixels(self, counts: Tensor) -> int:
-        """How many pixels the sums of a zone are of."""
+        """Number of pixels in the sums of a zone."""
         raise NotImplementedError
 
     def scores(self, sums: Tensor) -> dict[str, float]:
@@ -67,8 +67,8 @@ class PixelSums(Metric):
 
 
 class LabelSums(PixelSums):
-    """How often a pixel of class i was taken for one of class j: (Z, K, K). The class `left_out`
-    has no part in the mean IoU."""
+    """Confusion counts (Z, K, K): pixels of class i that were predicted as class j. The class
+    `left_out` has no part in the mean IoU."""
 
     # torchmetrics counts confusions too, but not weighted ones.
 

@@ -102,7 +102,7 @@ class PixelTask(Task):
         raise NotImplementedError
 
     def _known(self, target: Tensor) -> Tensor:
-        """Which pixels of (B, H, W) have a target."""
+        """True for pixels (B, H, W) that have a target."""
         raise NotImplementedError
 
     def _check_targets(self, found: list[bool], images: str, whole: bool) -> None:

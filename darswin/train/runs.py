@@ -46,7 +46,7 @@ class RunCheckpoint(ModelCheckpoint):
 
 
 def ends_step_amid_epoch(trainer: Trainer, batch_idx: int) -> bool:
-    """Whether the optimizer has stepped on this batch, which is not an epoch's last."""
+    """True if the optimizer stepped on this batch and the epoch goes on."""
     steps = (batch_idx + 1) % trainer.accumulate_grad_batches == 0
     return steps and not trainer.is_last_batch
 
@@ -185,7 +185,7 @@ CHANGEABLE = {
 
 
 def check_changes(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
-    """What differs between a run's configuration and the one to resume with, a line an option;
+    """Lines that name each option that differs between a run's configuration and the new one;
     ValueError for an option that cannot change."""
     before, now = _options(before), _options(now)
     changes = {

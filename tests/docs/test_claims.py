@@ -34,6 +34,16 @@ def test_the_readme_is_short_and_lines_fit():
             assert len(line) < 120 or line.startswith("|"), (path, line)
 
 
+def test_sentences_are_short():
+    for path in fill.PAGES:
+        text = re.sub(r"^(`{3,}|:{3,})[^\n]*\n.*?^\1$", "\n\n", path.read_text(), flags=re.M | re.S)
+        text = re.sub(r"^(?:\||#).*$", "", text, flags=re.M)  # tables and headings
+        text = re.sub(r"^\s*(?:[-*]|\d+\.)\s", "\n\n", text, flags=re.M)
+        for paragraph in re.split(r"\n\s*\n", text):
+            for sentence in re.split(r"(?<=[.!?:;])\s+", paragraph):
+                assert len(sentence.split()) <= 40, (path, sentence)
+
+
 def test_pictures_and_links_exist():
     for path in fill.PAGES:
         for target in re.findall(r"(?:\]\(|\]: |`[^`<]* <)([^)#>\s]+)[)#>]", path.read_text()):

@@ -16,7 +16,7 @@ BLOCK = 1024
 
 
 def bits(summands: int) -> int:
-    """How many bits a number below 4 may have so that `summands` of them fit 63."""
+    """Bits that a number below 4 may have so that the sum of `summands` of them fits 63 bits."""
     return 60 - math.ceil(math.log2(max(summands, 1)))
 
 

@@ -1,4 +1,4 @@
-"""Where the points of a polar grid stand, and the pixels around them, for kernels.
+"""Places of the points of a polar grid, and the pixels around them, for kernels.
 
 Angles are brought near 0 in float64, and all the rest is float32: cosine and sine are right to a
 rounding, whatever the angle. Jitter draws the random words of the reference.
@@ -107,13 +107,13 @@ def cell(x, y, mask, height, width):
 
 @triton.jit
 def inside(column, row, touches, height, width):
-    """Which pixels of points that touch the image are in it."""
+    """True for pixels in the image, among those of points that touch it."""
     return touches & (column >= 0) & (column < width) & (row >= 0) & (row < height)
 
 
 @triton.jit
 def token_order(i, j, COLUMNS: tl.constexpr, S_R: tl.constexpr, S_A: tl.constexpr):
-    """Where points (i, j) stand among the samples of all tokens."""
+    """Index of points (i, j) among the samples of all tokens."""
     token = i // S_R * (COLUMNS // S_A) + j // S_A
     return token * (S_R * S_A) + i % S_R * S_A + j % S_A
 

@@ -164,7 +164,7 @@ def _backward(image, radii, azimuths, center, affine, offsets, jitter, seed, sca
 
 
 def _arguments(sampling: Sampling) -> tuple[Any, ...]:
-    """What both kernels begin with, up to `rows`."""
+    """The first arguments of both kernels, up to `rows`."""
     image, *geometry = sampling[:6]
     radii, azimuths, center, affine, offsets = (
         None if tensor is None else tensor.contiguous() for tensor in geometry

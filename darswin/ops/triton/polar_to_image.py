@@ -55,8 +55,8 @@ def _split(column, SECTORS: tl.constexpr):
 
 @triton.jit
 def _plane(center, affine, points, steps, b, k, mask, width):
-    """Where pixels k lie on the plane of radius and azimuth; how far they are from the centre; and
-    the inverse matrix. points, or else center, with affine or None."""
+    """Places of pixels k on the plane of radius and azimuth, their distances from the centre, and
+    the inverse matrix. Takes points, or else center, with affine or None."""
     _, center_step, affine_step, points_step, _ = steps
     if points is not None:
         place = points + b * points_step + 2 * k.to(tl.int64)
@@ -80,9 +80,9 @@ def _plane(center, affine, points, steps, b, k, mask, width):
 @triton.jit
 def _place(radii, r_max, steps, x, y, b, mask, rings, SECTORS: tl.constexpr,
            RING_BITS: tl.constexpr):  # fmt: skip
-    """Of places on the plane: whether they are on the map, the radius, the inner and outer ring and
-    the share of the outer, both rings' radii, how many rings are within, and the four tokens with
-    the shares of the second of each ring."""
+    """For places on the plane: whether they are on the map, the radius, the inner and outer ring
+    and the share of the outer, both rings' radii, how many rings are within, and the four tokens
+    with the shares of the second of each ring."""
     radii_step, _, _, _, r_max_step = steps
     known = mask & (tl.abs(x) < float("inf")) & (tl.abs(y) < float("inf"))
     x, y = tl.where(known, x, 1.0), tl.where(known, y, 0.0)
@@ -119,7 +119,7 @@ def _tile(place, token, channel, CHANNELS: tl.constexpr, mask):
 
 @triton.jit
 def _in_image(k, channel, pixels, CHANNELS: tl.constexpr, TOKENS: tl.constexpr):
-    """Where channels of pixels k stand in an image."""
+    """Index of the channels of pixels k in an image."""
     if TOKENS:
         return k.to(tl.int64)[:, None] * CHANNELS + channel
     else:
@@ -230,7 +230,7 @@ def _backward(x, radii, center, affine, points, r_max, steps, rings, height, wid
 
 
 def _arguments(x: Tensor, lens: Sequence[Tensor | None], size: Sequence[int]) -> tuple[Any, ...]:
-    """What both kernels begin with, up to `width`."""
+    """The first arguments of both kernels, up to `width`."""
     given = [None if tensor is None else tensor.contiguous() for tensor in lens]
     steps = tuple(0 if t is None or len(t) == 1 else t.stride(0) for t in given)
     return x.contiguous(), *given, steps, x.shape[1], *size

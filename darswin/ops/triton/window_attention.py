@@ -22,7 +22,7 @@ _ENTRIES = 64  # of the table, a program
 
 
 class _Map(NamedTuple):
-    """What all programs of a launch share."""
+    """Values that all programs of a launch share."""
 
     rings: int
     sectors: int
@@ -52,7 +52,7 @@ def _share(of, M_R: tl.constexpr, M_A: tl.constexpr):
 
 @triton.jit
 def _pairs(M_R: tl.constexpr, M_A: tl.constexpr, TOKENS: tl.constexpr):
-    """Of each pair (query, key) of a window: its entry of the table, and whether it is there."""
+    """Entry of the table for each pair (query, key) of a window, and whether the pair exists."""
     token = tl.arange(0, TOKENS)
     r, a, there = token // M_A, token % M_A, token < M_R * M_A
     along, across = r[:, None] - r[None, :] + M_R - 1, a[:, None] - a[None, :] + M_A - 1
@@ -61,7 +61,7 @@ def _pairs(M_R: tl.constexpr, M_A: tl.constexpr, TOKENS: tl.constexpr):
 
 @triton.jit
 def _places(image, window, of, M_R: tl.constexpr, M_A: tl.constexpr, TOKENS: tl.constexpr):
-    """Of each token of a window: its place among all, and its side of the seams."""
+    """Index of each token of a window in the map, and its side of the seams."""
     token, across = tl.arange(0, TOKENS), of.sectors // M_A
     r, a = window // across * M_R + token // M_A, window % across * M_A + token % M_A
     side = (r >= of.seam_r).to(tl.int32) * 2 + (a >= of.seam_a).to(tl.int32)
@@ -185,7 +185,7 @@ def _map(
 
 
 def _constants(qkv: Tensor, window: Sequence[int]) -> dict[str, Any]:
-    """What a kernel is compiled for."""
+    """The constants that a kernel is compiled for."""
     tokens, head_dim = window[0] * window[1], qkv.shape[5]
     # The tensor cores multiply numbers that came in 16 bits exactly, and float32 probabilities in
     # two parts of 8 bits, right to 2⁻¹⁶. Products of float32 are left to the other cores.
