@@ -169,6 +169,13 @@ def test_a_missing_module_is_explained(monkeypatch, tmp_path):
     assert isinstance(caught.value.__cause__, OSError)
 
 
+def test_python_in_a_checkout_that_is_not_built_is_explained(monkeypatch, tmp_path):
+    monkeypatch.setattr(_module, "FILE", tmp_path / "darswin" / "libdarswin.so")
+    (tmp_path / "setup.py").touch()
+    with pytest.raises(ImportError, match=r"from its source code in .*, which has no compiled"):
+        _module.load()
+
+
 @pytest.mark.slow
 def test_a_broken_module_names_its_file(tmp_path):
     package = tmp_path / "darswin"

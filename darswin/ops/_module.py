@@ -14,6 +14,13 @@ FILE = Path(__file__).parent.parent / "libdarswin.so"
 
 def load() -> ctypes.CDLL:
     """Loads `FILE`; its ImportError says what was tried and how to rebuild."""
+    checkout = FILE.parent.parent
+    if not FILE.exists() and (checkout / "setup.py").exists():
+        raise ImportError(
+            f"Python imports darswin from its source code in {checkout}, which has no compiled "
+            "module. Build it with `make build` or `pip install --no-build-isolation -e .`, or "
+            "start Python in another folder to import an installed package."
+        )
     try:
         torch.ops.load_library(FILE)
     except OSError as error:

@@ -155,7 +155,7 @@ def check_pip(arguments: list[str], monkeypatch) -> None:
         if word.startswith("."):
             assert word == "." or word[2:-1] in extras, word
         else:
-            assert word == "--no-build-isolation" or word in names, word
+            assert word in ("--no-build-isolation", "-e", *names), word
 
 
 def check_study(arguments: list[str], monkeypatch) -> None:
