@@ -49,9 +49,8 @@ def write_plain(
     folder: Path,
     count: int = 4,
     *,
-    lens: str | Path | Lens = WOODSCAPE,
+    lens: Lens | None = None,
     size: tuple[int, int] = (121, 160),
-    targets: Sequence[str] = ("labels", "distance"),
     split: str | None = None,
     own_lenses: bool = False,
     classes: dict | list | None = CLASSES,
@@ -63,21 +62,17 @@ def write_plain(
         split: a folder of a split in `folder`, or None. own_lenses: a file a picture.
     """
     place = folder if split is None else folder / split
-    seen = (lens if isinstance(lens, Lens) else load(lens)).in_picture(size)
+    seen = (load(WOODSCAPE) if lens is None else lens).in_picture(size)
     if seen.image_size is None:
         seen = seen.replace(image_size=torch.tensor([size], dtype=torch.float32))
     theta, azimuth = rays_of(seen, size)
-    for part in ("images", *targets):
-        (place / part).mkdir(parents=True, exist_ok=True)
     for k in range(count):
-        turned = azimuth + 0.3 * k
-        colors = CLASSES["colors"]
-        write(place / "images" / f"{name(k)}.png", picture_of(theta, turned, colors, k)[..., ::-1])
-        if "labels" in targets:
-            write(place / "labels" / f"{name(k)}.png", labels_of(theta, turned))
-        if "distance" in targets:
-            metres = np.round(distance_of(theta, turned) * 256).astype(np.uint16)
-            write(place / "distance" / f"{name(k)}.png", metres)
+        turned, file = azimuth + 0.3 * k, f"{name(k)}.png"
+        picture = picture_of(theta, turned, CLASSES["colors"], k)
+        write(place / "images" / file, picture[..., ::-1])
+        write(place / "labels" / file, labels_of(theta, turned))
+        metres = np.round(distance_of(theta, turned) * 256).astype(np.uint16)
+        write(place / "distance" / file, metres)
         if own_lenses:
             (place / "lenses").mkdir(exist_ok=True)
             save(seen, place / "lenses" / f"{name(k)}.json")
@@ -134,9 +129,10 @@ def write_woodscape(
     return folder
 
 
-def write_synwoodscape(folder: Path, count: int = 4, *, size: tuple[int, int] = (121, 160)) -> Path:
+def write_synwoodscape(folder: Path) -> Path:
     """SynWoodScape's tree: labels of 25 classes, depth maps in metres in which 1000 is the sky."""
-    for k in range(count):
+    size = (121, 160)
+    for k in range(4):
         view = VIEWS[k % 4]
         stem = f"{k:05d}_{view}"
         lens = _woodscape_lens(folder / "calibration" / "calibration", k, view, size)
@@ -153,13 +149,12 @@ def write_synwoodscape(folder: Path, count: int = 4, *, size: tuple[int, int] = 
     return folder
 
 
-def write_kitti360(
-    folder: Path, drives: int = 3, count: int = 3, *, size: tuple[int, int] = (140, 140)
-) -> Path:
+def write_kitti360(folder: Path) -> Path:
     """KITTI-360's tree of both fisheye cameras; every frame but the last of a drive has distances,
     as sparse as those of a LiDAR."""
+    size, count = (140, 140), 3
     (folder / "calibration").mkdir(parents=True, exist_ok=True)
-    for drive in range(drives):
+    for drive in range(3):
         name = f"2013_05_28_drive_{drive:04d}_sync"
         for camera in ("image_02", "image_03"):
             source = CALIBRATIONS / f"kitti360_{camera[-2:]}.yaml"

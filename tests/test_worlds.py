@@ -205,22 +205,6 @@ def test_no_ray_leaves_a_world(game):
 
 
 @needs_game
-def test_one_pose_through_two_lenses_agrees(game):
-    """Where two lenses have a pixel of the same ray, label and distance are equal."""
-    built, found = game
-    small = Equidistant(20.0, theta_max=1.5, image_size=(61, 61))
-    large = Equidistant(40.0, theta_max=1.5, image_size=(121, 121))  # every second pixel
-    for pose in found:
-        one, two = (render.render(built, pose, render.rays_of(lens)) for lens in (small, large))
-        labels, distance = two.labels[::2, ::2], two.distance[::2, ::2]
-        same = (one.labels == labels) | (one.labels == 255) | (labels == 255)
-        assert same.mean() > 0.999
-        known = same & (one.distance > 0) & (distance > 0)
-        near = np.isclose(one.distance, distance, rtol=1e-5)
-        assert known.sum() > 500 and near[known].mean() > 0.999
-
-
-@needs_game
 def test_a_data_set_is_the_same_bits_from_the_seed(tmp_path):
     for folder in ("one", "two"):
         out = str(tmp_path / folder)

@@ -28,9 +28,6 @@ def run_command(commands: Callable | dict[str, Callable], argv: list[str], prog:
 
     Its keyword-only parameters are options, its others are words that stand in their order. Their
     types and the docstring's section `Args` say what may be typed, and the help.
-
-    Raises:
-        SystemExit: code 2 and a sentence on stderr for arguments that the function does not take.
     """
     if isinstance(commands, dict):
         if argv and argv[0] in commands:
@@ -131,11 +128,7 @@ def with_lists(
     argv: Sequence[str], numbers: Collection[str], words: Collection[str] = ()
 ) -> list[str]:
     """The arguments with what follows an option in one list: `--size 10,10`, `--size 10 10` and
-    `--size=[10, 10]` become `--size=[10,10]`; `--paths A B` becomes `--paths=["A", "B"]`.
-
-    Args:
-        numbers, words: the names of options that take lists of them, without dashes.
-    """
+    `--size=[10, 10]` become `--size=[10,10]`; `--paths A B` becomes `--paths=["A", "B"]`."""
     found, left = [], list(argv)
     while left:
         option, equals, value = left.pop(0).partition("=")

@@ -15,16 +15,8 @@ FIRST_TASK: Task = "classification"  # of runs that say none
 
 
 def complete(argv: list[str]) -> tuple[list[str], Task]:
-    """The arguments with presets' names as their files, and a run's own configuration first; and
-    the task.
-
-    `test`, `validate` and `fit --resume` start from `RUN/config.yaml`, so that they need no other
-    option.
-
-    Raises:
-        ValueError: an unknown preset or task; another task than that of the run.
-        FileExistsError, FileNotFoundError: a run, or none, in RUN.
-    """
+    """The arguments with presets' names as their files, and the task. `test`, `validate` and
+    `fit --resume` begin with the configuration of the run, so that they need no other option."""
     scan = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     scan.add_argument("-c", "--config", action="append", default=[])
     scan.add_argument("--run")
@@ -132,12 +124,8 @@ def format_help(
     command: str,
     whole: bool,
 ) -> str:
-    """The help of a command, in lines of at most `WIDTH`.
-
-    Args:
-        actions: its options. formatter: an empty one, for the trainer's other options.
-        whole: shows those too.
-    """
+    """The help of a command, in lines of at most `WIDTH`; `whole` shows the trainer's other options
+    too, by the `formatter`."""
     # An option that is linked to another one has no name that could be typed.
     typed = (a for a in actions if any(name.startswith("-") for name in a.option_strings))
     left = {action.dest: action for action in typed}

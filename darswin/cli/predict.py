@@ -74,12 +74,6 @@ def predict(
             distance, a folder that is new, empty, or from an earlier predict. It gets
             labels/NAME.png with class ids (255: unknown), or distance/NAME.png with metres × 256
             in 16 bits, up to 255.996 m (0: unknown); overlays/NAME.jpg; and predictions.json.
-
-    Raises:
-        BrokenImageError: a picture or video that cannot be read, or that the lens does not fit.
-        FloatingPointError: a picture for which the model computes NaN or infinity.
-        ValueError: arguments that are wrong, a lens that `darswin.lens.load` or the model refuses;
-            another `task` than the model's.
     """
     if run is not None and model is None:
         weights: str | Path = model_of_run(run)

@@ -40,10 +40,6 @@ def quantize(
             in float32 until it is kept.
         keep: modules that stay in float32, by name, as ["stages.0", "stages.1.blocks.0.attn"].
         out: the safetensors file; without it checkpoints/best.int8.safetensors of the run.
-
-    Raises:
-        FileNotFoundError: there is no model in the run, or no data where they were.
-        ValueError: fewer than one picture, or names that the model lacks.
     """
     if pictures < 1:
         raise ValueError(f"`pictures` must be at least 1, got {pictures}")

@@ -57,10 +57,7 @@ class Classification(Task):
         self.mixing = Mixing(mixup, cutmix, mix_p)
 
     def _head_options(self) -> dict[str, Any]:
-        classes = self.data.classes
-        if len(classes) < 2:
-            raise ValueError(f"a classifier needs two classes, the data has only {classes}")
-        return dict(num_classes=len(classes))
+        return dict(num_classes=len(self._two_classes()))
 
     def _make_metrics(self) -> None:
         count = len(self.data.classes)

@@ -77,10 +77,8 @@ class Segmentation(PixelTask):
         self.label_smoothing = label_smoothing
 
     def _head_options(self) -> dict[str, Any]:
-        classes = self.data.classes
+        classes = self._two_classes()
         count = len(classes)
-        if count < 2:
-            raise ValueError(f"segmentation needs two classes, the data has only {classes}")
         if self.class_weights is not None and len(self.class_weights) != count:
             raise ValueError(
                 f"`class_weights` must be one for each of the {count} classes "

@@ -167,6 +167,13 @@ class Task(LightningModule):
         """The model's options that the task and the data's classes decide on."""
         raise NotImplementedError
 
+    def _two_classes(self) -> list[str]:
+        if len(self.data.classes) < 2:
+            raise ValueError(
+                f"{self.task} needs two classes, the data has only {self.data.classes}"
+            )
+        return self.data.classes
+
     def _make_metrics(self) -> None:
         """Makes the metrics of validation and test."""
         raise NotImplementedError
