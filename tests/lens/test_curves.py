@@ -3,6 +3,7 @@
 import pytest
 import torch
 from lens_examples import ASIDE, calibrated, double, example, f64
+from scipy.interpolate import PchipInterpolator
 from torch.utils.data import DataLoader, Dataset
 
 from darswin.lens import (
@@ -130,8 +131,11 @@ def test_slopes_of_a_table_are_used_and_checked():
     assert error < 1e-5 < 1e-3 < usual
     double_size = lens.resized(2).project(theta)
     torch.testing.assert_close(double_size, 2 * lens.project(theta))
-    with pytest.raises(ValueError, match="slopes must be from 0 to 3 times the table's"):
-        Tabulated(angles, exact.project(angles), slopes=4 * slopes)
+    straight = dict(angles=[0.0, 1.0, 2.0], radii=[0.0, 10.0, 20.0])
+    assert len(Tabulated(**straight, slopes=[30.0, 0.0, 30.0])) == 1
+    for wrong in (30.1, -0.1):
+        with pytest.raises(ValueError, match="slopes must be from 0 to 3 times the table's"):
+            Tabulated(**straight, slopes=[wrong, 10.0, 10.0])
     with pytest.raises(
         ValueError, match=r"slopes must have the shape of angles and radii, \(1, 40"
     ):
@@ -142,3 +146,11 @@ def test_a_table_of_two_is_straight():
     lens = Tabulated([0.0, 1.0], [0.0, 50.0])
     torch.testing.assert_close(lens.project(torch.tensor([0.25, 1.0])), torch.tensor([12.5, 50.0]))
     assert lens.theta_limit.item() == 1.0
+
+
+def test_a_table_without_slopes_is_scipys_pchip():
+    """But for the first and the last piece, whose slopes at the ends scipy limits otherwise."""
+    lens = example("Tabulated", torch.Generator().manual_seed(0))[0]
+    exact = PchipInterpolator(lens.angles[0], lens.radii[0])
+    theta = torch.linspace(lens.angles[0, 1], lens.angles[0, -2], 100, dtype=f64)
+    torch.testing.assert_close(lens.project(theta), torch.from_numpy(exact(theta)))

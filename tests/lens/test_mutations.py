@@ -17,9 +17,7 @@ from darswin.lens import load
 # A camera of each file, and where in the file its numbers stand.
 CAMERAS = [
     ("woodscape.json", None, r'"intrinsic": .*?}'),
-    ("synwoodscape.json", None, r'"intrinsic": .*?}'),
     ("kitti360_02.yaml", None, r"mirror_parameters.*"),
-    ("kitti360_03.yaml", None, r"mirror_parameters.*"),
     ("camodocal_kb.yaml", None, r"projection_parameters.*"),
     ("camodocal_pinhole.yaml", None, r"distortion_parameters.*"),
     ("camodocal_scaramuzza.yaml", None, r"inv_poly_parameters.*"),

@@ -52,15 +52,16 @@ LENSES = {
 @pytest.mark.parametrize("name", LENSES)
 def test_solid_angles_are_those_of_spherical_polygons(name):
     lens = LENSES[name]
-    found = solid_angles(lens, (46, 64))[0]
-    theta = pixel_angles(lens, (46, 64))[0]
+    found, theta = solid_angles(lens, (46, 64))[0], pixel_angles(lens, (46, 64))[0]
     assert torch.equal(found == 0, theta.isnan()) and (found >= 0).all()
+    y, x = (~theta.isnan()).nonzero().unbind(1)
+    points = lens.unproject_points(torch.stack((x, y), -1).to(f64))
+    torch.testing.assert_close(theta[y, x], torch.acos(points[..., 2].clamp(-1, 1)))
     # Not where a corner of the pixel is beyond what the model is valid for.
     y, x = (theta < lens.theta_max - 0.1).nonzero().unbind(1)
     assert len(x) > 300
     expected = polygons(lens, x.to(f64), y.to(f64))
     torch.testing.assert_close(found[y, x], expected, rtol=2e-3, atol=0)
-    assert found.sum() > 0
 
 
 @pytest.mark.parametrize("theta_max", [0.8, math.pi / 2, 2.4])
@@ -70,17 +71,6 @@ def test_a_whole_circle_sums_up_to_the_cap(theta_max):
         lens = make(150 / one.r_max.item(), theta_max).to(f64)
         total = solid_angles(lens, (310, 311)).sum().item()
         assert total == pytest.approx(2 * math.pi * (1 - math.cos(theta_max)), rel=3e-3)
-
-
-def test_angles_are_those_of_the_rays():
-    lens = LENSES["general"]
-    theta = pixel_angles(lens, (46, 64))
-    assert theta.shape == (1, 46, 64) and 0.2 < theta.isnan().double().mean() < 0.8
-    y, x = (~theta[0].isnan()).nonzero().unbind(1)
-    points = lens.unproject_points(torch.stack((x, y), -1).to(f64))
-    torch.testing.assert_close(theta[0, y, x], torch.acos(points[..., 2].clamp(-1, 1)))
-    seen = lens.unproject_pixels(torch.stack((x, y), -1).to(f64))[0]
-    assert (seen <= lens.theta_max * (1 + 1e-12)).all()
 
 
 def test_float32_and_batches():
@@ -120,13 +110,10 @@ def test_what_is_not_known_stays_so():
     front = pixel_angles(lens, (51, 51)) < math.pi / 2
     assert not z_to_distance(-z, lens).any()
     assert z_to_distance(torch.ones_like(z), lens)[~front].sum() == 0
-
-
-def test_gradients_go_to_the_distance():
-    lens = Equidistant(3.0, 1.4).to(f64)
-    distance = torch.rand(1, 7, 7, dtype=f64).add(0.5).requires_grad_()
-    assert torch.autograd.gradcheck(lambda d: distance_to_z(d, lens), distance)
-    assert torch.autograd.gradcheck(lambda z: z_to_distance(z, lens), distance)
+    few = distance[:, 27:34, :7].clone().requires_grad_()
+    lens = lens.resized(0.1)
+    assert torch.autograd.gradcheck(lambda d: distance_to_z(d, lens), few)
+    assert torch.autograd.gradcheck(lambda z: z_to_distance(z, lens), few)
 
 
 def test_wrong_maps_are_named():
@@ -154,16 +141,6 @@ def test_a_ray_keeps_its_angles():
     azimuth = math.atan2(dy, dx)
     expected = torch.stack((90 + r * math.cos(azimuth), 104 + r * math.sin(azimuth)), -1)
     torch.testing.assert_close(there[:, 20, 40], expected)
-
-
-def test_gradients_reach_both_lenses_also_at_the_centre():
-    focal = torch.tensor([20.0], dtype=f64, requires_grad=True)
-    xi = torch.tensor([0.5], dtype=f64, requires_grad=True)
-
-    def places(focal, xi):
-        return reprojection(Perspective(focal, 1.2), (40, 40), Spherical(xi, focal, 1.2), (9, 9))
-
-    assert torch.autograd.gradcheck(places, (focal, xi))
 
 
 def test_reproject_is_bilinear_between_pixel_centres():
@@ -223,13 +200,16 @@ def test_general_lenses():
         torch.testing.assert_close(there[seen], expected)
 
 
-def test_gradients_of_general_lenses_also_where_nothing_is_seen():
-    def places(focal, tangential, affine, center):
-        source = Mei(1.5, focal, (0.05, 0.2), 1.2, center, affine=affine, tangential=tangential)
+@pytest.mark.parametrize("radial", [True, False])
+def test_gradients_reach_both_lenses_also_at_the_centre_and_where_nothing_is_seen(radial):
+    def places(focal, xi, tangential, affine, center):
+        if radial:
+            return reprojection(Perspective(focal, 1.2), (4, 4), Spherical(xi, focal, 1.2), (9, 9))
+        source = Mei(xi, focal, (0.05, 0.2), 1.2, center, affine=affine, tangential=tangential)
         target = Mei(1.0, focal, None, 1.3, affine=affine, tangential=tangential)
         return reprojection(source, (40, 40), target, (9, 9))
 
-    parameters = [[2.9], [0.01, -0.02], [[1.0, 0.1], [0.0, 0.9]], [19.0, 20.5]]
+    parameters = [[2.9], [1.5], [0.01, -0.02], [[1.0, 0.1], [0.0, 0.9]], [19.0, 20.5]]
     tensors = [torch.tensor(p, dtype=f64, requires_grad=True) for p in parameters]
     there = places(*tensors)
     assert (there == OUTSIDE).any() and (there[0, 4, 4] != OUTSIDE).all()

@@ -108,19 +108,20 @@ def opencvs(path, points):
     return cv2.projectPoints(points, zero, zero, matrix, d)[0][:, 0]
 
 
+KALIBR = {"pinhole": 4, "omni": 5, "ds": 6, "eucm": 6}  # the numbers of its intrinsics
+COEFFICIENTS = {"radtan": 4, "equidistant": 4, "fov": 1, "none": 0}
+
+
 def check_kalibr(path, lens):
     """As Kalibr's ConfigReader checks: the numbers of values, and where they stand."""
     camera = yaml.safe_load(path.read_text())["cam0"]
-    kind, distortion = camera["camera_model"], camera["distortion_model"]
-    counts = {"pinhole": 4, "omni": 5, "ds": 6, "eucm": 6}
-    coefficients = {"radtan": 4, "equidistant": 4, "fov": 1, "none": 0}
-    assert len(camera["intrinsics"]) == counts[kind]
-    assert len(camera["distortion_coeffs"]) == coefficients[distortion]
-    assert all(isinstance(v, float) for v in camera["intrinsics"] + camera["distortion_coeffs"])
+    intrinsics, coefficients = camera["intrinsics"], camera["distortion_coeffs"]
+    assert len(intrinsics) == KALIBR[camera["camera_model"]]
+    assert len(coefficients) == COEFFICIENTS[camera["distortion_model"]]
+    assert all(isinstance(value, float) for value in intrinsics + coefficients)
     assert camera["resolution"] == lens.image_size[0].flip(0).int().tolist()
-    assert camera["intrinsics"][-2:] == lens.center[0].tolist()
-    assert camera["rostopic"] == "/cam0/image_raw"
-    return kind, distortion
+    assert intrinsics[-2:] == lens.center[0].tolist()
+    return camera["camera_model"], camera["distortion_model"]
 
 
 @pytest.mark.slow

@@ -100,9 +100,9 @@ CHANGED = {
     ),
     "ocamcalib.txt": (
         ("13 605", "12 605", "the inverse polynomial must be the number of its coefficients"),
-        ("1440 1440", "", "the center (row and column) must be 2 numbers"),
+        ("1440 1440", "", "the center (row and column) must be 2 finite numbers"),
         ("1440 1440\n", "\n1 2\n3 4\n", "it must have 5 lines of numbers"),
-        ("723.600000", "x", "2 numbers, got 'x'"),
+        ("723.600000", "x", "the center (row and column)[1] must be a finite number, got 'x'"),
     ),
     "colmap.txt": (
         (" 3008", "", "camera '1', OPENCV_FISHEYE must have 8 parameters"),

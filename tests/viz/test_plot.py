@@ -1,6 +1,5 @@
 import math
 
-import cv2
 import numpy as np
 import pytest
 import torch
@@ -10,7 +9,6 @@ from darswin import PolarSample
 from darswin.lens import KannalaBrandt, Mei, Polynomial, Spherical
 from darswin.viz.plot import (
     FORMATS,
-    _angle_ticks,
     draw_accuracy,
     draw_curve,
     draw_grid,
@@ -30,42 +28,31 @@ BENT = Mei(
 )  # fmt: skip
 
 
-def borders(axes):
-    rings, sectors = ([np.array(s) for s in c.get_segments()] for c in axes.collections)
-    return rings, sectors
-
-
-def test_draw_grid_shows_borders_and_samples():
-    (axes,) = draw_grid(np.zeros((32, 32)), ROUND, SAMPLER).axes
-    rings, sectors = borders(axes)
-    radii = [np.hypot(*(ring - 15.5).T) for ring in rings]
-    expected = SAMPLER.grid(ROUND, (32, 32)).borders[0].numpy()
-    assert len(rings) == 5
-    for radius, border in zip(radii, expected, strict=True):
-        np.testing.assert_allclose(radius, border, atol=1e-4)
-    azimuths = [math.atan2(*(sector[-1] - 15.5)[::-1]) % (2 * math.pi) for sector in sectors]
-    np.testing.assert_allclose(azimuths, np.arange(8) * math.pi / 4, atol=1e-6)
-    (points,) = axes.lines
-    assert len(points.get_xdata()) == 4 * 3 * 8 * 2
-    assert not draw_grid(np.zeros((32, 32)), ROUND, SAMPLER, samples=False).axes[0].lines
-
-
-def test_borders_and_samples_follow_a_lens_that_is_not_round():
+@pytest.mark.parametrize("lens", [ROUND, BENT], ids=["round", "bent"])
+def test_draw_grid_shows_borders_and_samples(lens):
     size = (60, 80)
-    (axes,) = draw_grid(np.zeros(size), BENT, SAMPLER).axes
-    rings, _ = borders(axes)
-    exact = BENT.to(torch.float64)
+    (axes,) = draw_grid(np.zeros(size), lens, SAMPLER).axes
+    rings, sectors = ([np.array(s) for s in c.get_segments()] for c in axes.collections)
+    exact = lens.to(torch.float64)
     for k, ring in enumerate(rings):  # equal steps of θ
         theta, _ = exact.unproject_pixels(torch.from_numpy(ring), size)
         np.testing.assert_allclose(theta, k / 4 * exact.theta_max.item(), atol=1e-6)
-    spread = np.hypot(*(rings[-1] - (39.5, 29.5)).T)
-    assert spread.max() > 1.2 * spread.min()
+    assert len(rings) == 5
+    for k, sector in enumerate(sectors):
+        _, azimuth = exact.unproject_pixels(torch.from_numpy(sector[1:]), size)
+        off = torch.remainder(azimuth - k * math.pi / 4 + 1, 2 * math.pi) - 1
+        assert off.abs().max() < 1e-6
     points = np.stack(axes.lines[0].get_data(), -1)
     theta, azimuth = exact.unproject_pixels(torch.from_numpy(points), size)
     expected = (np.arange(12) + 0.5) / 12 * exact.theta_max.item()
     np.testing.assert_allclose(np.sort(theta), np.repeat(expected, 16), atol=1e-6)
     turns = azimuth.numpy() % (2 * math.pi) / (2 * math.pi) * 16
     np.testing.assert_allclose(np.sort(turns), np.repeat(np.arange(16) + 0.5, 12), atol=1e-6)
+    own = Figure().subplots()
+    assert draw_grid(np.zeros(size), lens, SAMPLER, samples=False, axes=own) is own.figure
+    assert not own.lines
+    with pytest.raises(ValueError, match="one lens, got 2"):
+        draw_grid(np.zeros(size), lens.expand(1)[[0, 0]], SAMPLER)
 
 
 def test_draw_samples_is_a_part_of_the_grid():
@@ -74,6 +61,9 @@ def test_draw_samples_is_a_part_of_the_grid():
     x, y = BENT.project_rays(0.85, -math.pi / 4, (60, 80))[0].tolist()
     assert np.mean(axes.get_xlim()) == pytest.approx(x, abs=1e-3)
     assert np.mean(axes.get_ylim()) == pytest.approx(y, abs=1e-3)
+    lens = ROUND.replace(center=torch.tensor([[-40.0, 300.0]]))  # outside the image
+    (axes,) = draw_samples(np.zeros((60, 80)), lens, SAMPLER).axes
+    assert axes.get_xlim() == (-0.5, 7.5) and axes.get_ylim() == (59.5, 53.5)
 
 
 @pytest.mark.parametrize("shape", [(32, 32), (32, 32, 3)])
@@ -84,13 +74,6 @@ def test_draw_polar_is_what_the_layer_samples(shape):
         channels = torch.from_numpy(np.atleast_3d(image)).permute(2, 0, 1)[None]
         expected = SAMPLER(channels, ROUND)[0].permute(1, 2, 0).expand(-1, -1, 3)
         np.testing.assert_allclose(axes.images[0].get_array()[..., :3], expected, atol=1e-5)
-
-
-def test_draw_view_is_the_undistorted_image():
-    image = np.full((32, 32, 3), 200, np.uint8)
-    (axes,) = draw_view(image, ROUND, perspective((6, 8), 1.0)).axes
-    drawn = axes.images[0].get_array()
-    assert drawn.shape == (6, 8, 4) and (drawn[..., :3] == 200).all()
 
 
 def test_it_is_hatched_where_there_is_no_picture():
@@ -113,49 +96,19 @@ def test_it_is_hatched_where_there_is_no_picture():
     np.testing.assert_array_equal(axes.images[0].get_array()[..., 3] == 255, seen)
 
 
-def test_what_is_enlarged_is_in_the_image():
-    lens = ROUND.replace(center=torch.tensor([[-40.0, 300.0]]))
-    (axes,) = draw_samples(np.zeros((60, 80)), lens, SAMPLER).axes
-    assert axes.get_xlim() == (-0.5, 7.5) and axes.get_ylim() == (59.5, 53.5)
-
-
-@pytest.mark.parametrize("tone", [0, 240])
-@pytest.mark.parametrize("panel", [draw_grid, draw_samples])
-def test_borders_show_on_dark_and_on_pale_walls(panel, tone, tmp_path):
-    image = np.full((64, 64, 3), tone, np.uint8)
-    lens = Spherical.from_fov(0.4, 2.6, 32.0)
-    figure = panel(image, lens, SAMPLER)
-    for line in figure.axes[0].lines:  # the sample points
-        line.remove()
-    save_figure(figure, tmp_path / "walls.png")
-    grey = cv2.imread(str(tmp_path / "walls.png"), cv2.IMREAD_GRAYSCALE)[100:-100, 100:-100]
-    assert (np.abs(grey.astype(int) - tone) > 80).mean() > 0.002
-
-
-def test_draw_curve_shows_radius_and_density():
-    lens = Polynomial([20.0, 1.0, 0.5], 1.7)
+def test_draw_curve_shows_radius_density_and_the_ends_of_the_image():
+    lens = Polynomial([20.0, 1.0, 0.5], 1.7, [45.0, 22.0])
     left, right = draw_curve(lens, (48, 80)).axes
     degrees, radius = (np.array(values) for values in left.lines[0].get_data())
     theta = torch.deg2rad(torch.from_numpy(degrees)).float()
     np.testing.assert_allclose(radius, lens.project(theta), rtol=1e-5)
     along = right.lines[0].get_ydata()
     np.testing.assert_allclose(np.gradient(radius, degrees)[1:-1], along[1:-1], rtol=1e-3)
-    ends = sorted(line.get_xdata()[0] for line in left.lines[1:])
-    seen = lens.side_angles((48, 80))[0].rad2deg()
-    np.testing.assert_allclose(ends, seen[seen < degrees[-1] - 1e-6].sort().values, rtol=1e-6)
-    assert len(draw_curve(lens).axes[0].lines) == 1
-
-
-def test_the_ends_of_the_image_are_at_their_angles():
-    lens = Polynomial([20.0, 1.0, 0.5], 1.7, [45.0, 22.0])
-    axes = draw_curve(lens, (48, 80)).axes[0]
     angles = lens.side_angles((48, 80))[0].rad2deg().tolist()
-    drawn = [line.get_xdata()[0] for line in axes.lines[1:]]
+    drawn = [line.get_xdata()[0] for line in left.lines[1:]]
     assert angles[0] > math.degrees(1.7) and drawn == pytest.approx(angles[1:])
-    assert [line.get_linestyle() for line in axes.lines[1:]] == [":", "--", ":"]
-
-
-def test_sides_that_the_lens_does_not_reach_are_not_drawn():
+    assert [line.get_linestyle() for line in left.lines[1:]] == [":", "--", ":"]
+    assert len(draw_curve(lens).axes[0].lines) == 1
     lens = Polynomial([30.0, 0.0, -3.0])  # r rises up to 105°, 36 px
     assert not draw_curve(lens, (400, 400)).axes[0].texts
     assert len(draw_curve(lens, (40, 40)).axes[0].texts) == 4
@@ -181,13 +134,6 @@ def test_other_endings_are_refused(name):
         figure_format(name)
 
 
-def test_drawing_on_axes_of_ones_own():
-    axes = Figure().subplots()
-    assert draw_grid(np.zeros((32, 32)), ROUND, SAMPLER, axes=axes) is axes.figure
-    with pytest.raises(ValueError, match="one lens, got 2"):
-        draw_grid(np.zeros((32, 32)), Spherical([0.1, 0.2], 10.0), SAMPLER)
-
-
 def test_accuracy_of_each_model():
     figure = draw_accuracy([0.0, 0.5, 1.0], {"a": [1, 2, 3], "b": [3, 2, 1]}, (0.2, 0.35))
     (axes,) = figure.axes
@@ -197,16 +143,3 @@ def test_accuracy_of_each_model():
     assert list(axes.lines[0].get_ydata()) == [2, 5]
     (band,) = axes.collections
     assert band.get_datalim(axes.transData).get_points().tolist() == [[0, 1], [1, 8]]
-
-
-@pytest.mark.parametrize("make", [perspective, equirectangular])
-def test_ticks_of_a_view_are_degrees_from_its_middle(make):
-    fov = math.radians(110)
-    line = make((61, 121), fov, yaw=0.7, pitch=-0.4)[30]
-    places, degrees = _angle_ticks(torch.nn.functional.normalize(line, dim=-1), 7)
-    angle = np.radians(degrees)
-    right = np.tan(angle) / math.tan(fov / 2) if make is perspective else 2 * angle / fov
-    np.testing.assert_allclose(places, 60 + 60.5 * right, atol=0.02)
-    assert len(places) >= 3 and (np.diff(degrees) > 0).all()
-    for rays in (torch.randn(9, 3, generator=torch.Generator().manual_seed(0)), line[:1]):
-        assert not len(_angle_ticks(rays.double(), 7)[0])  # in no order, or too few

@@ -4,10 +4,13 @@ import math
 from collections.abc import Mapping
 from functools import partial
 
+import numpy as np
+from numpy.polynomial.polynomial import polyval
+
 from darswin.lens.base import Lens
 from darswin.lens.distorted import BrownConrady, KannalaBrandt, Mei
 from darswin.lens.files.content import Content
-from darswin.lens.files.fields import Fields, is_number, short, to_number, to_side
+from darswin.lens.files.fields import Fields, is_number, short, to_number
 from darswin.lens.files.format import Cameras, Description, Format, describe, in_image
 from darswin.lens.polynomial import OCam, OCamInverse
 
@@ -107,23 +110,17 @@ def _camera_of_rows(rows: list[list[str]]) -> Description:
         raise ValueError(
             f"it must have {len(BLOCKS)} lines of numbers, {', '.join(BLOCKS)}; got {len(rows)}"
         )
-    block = dict(zip(names, rows, strict=True))
-    direct = _counted(block, BLOCKS[0])
-    inverse = _counted(block, BLOCKS[1]) if BLOCKS[1] in block else []
-    row, column = _numbers(block, BLOCKS[2], 2)
-    c, d, e = _numbers(block, BLOCKS[3], 3)
-    height, width = (to_side(number, BLOCKS[4]) for number in _numbers(block, BLOCKS[4], 2))
+    file = Fields(dict(zip(names, rows, strict=True)))
+    direct = _counted(file.entries, BLOCKS[0])
+    inverse = _counted(file.entries, BLOCKS[1]) if BLOCKS[1] in file else []
+    row, column = file.numbers(BLOCKS[2], (2,))
+    c, d, e = file.numbers(BLOCKS[3], (3,))
+    height, width = file.sides(BLOCKS[4])
     # Its x' is down and its y' to the right: row = c x' + d y' + …, column = e x' + y' + ….
     return _ocam(direct, inverse, (column, row), [[1.0, e], [d, c]], (height, width))
 
 
-def _numbers(block: dict[str, list[str]], name: str, count: int) -> list[float]:
-    if len(block[name]) != count:
-        raise ValueError(f"{name} must be {count} numbers, got {short(block[name])}")
-    return [to_number(word, name, f"{count} numbers") for word in block[name]]
-
-
-def _counted(block: dict[str, list[str]], name: str) -> list[float]:
+def _counted(block: Mapping[str, list[str]], name: str) -> list[float]:
     """The coefficients after their number."""
     count, *words = block[name]
     if count != str(len(words)) or len(words) > MAX_COEFFICIENTS:
@@ -150,24 +147,16 @@ def _ocam(
 
 def _check_inverse(direct: list[float], inverse: list[float], size: Size) -> None:
     """ValueError unless both polynomials are of one lens, up to half the image's diagonal."""
-    reach, last = math.hypot(*size) / 2, -1.0
-    for step in range(257):
-        radius = reach * step / 256
-        theta = math.atan2(radius, -_value(direct, radius))
+    last = -1.0
+    for radius in np.linspace(0, math.hypot(*size) / 2, 257).tolist():
+        theta = math.atan2(radius, -polyval(radius, direct))
         if theta <= last:
             return  # no ray lands beyond
         last = theta
-        found = _value(inverse, theta - math.pi / 2)
+        found = polyval(theta - math.pi / 2, inverse)
         if not abs(found - radius) <= MOST_APART:
             raise ValueError(
                 f"the inverse polynomial must give back the direct one's radii to {MOST_APART:g} "
                 f"px, got {found:.6g} px for {radius:.6g} px; the file without the inverse "
                 "polynomial means the direct one"
             )
-
-
-def _value(coefficients: list[float], x: float) -> float:
-    value = 0.0
-    for coefficient in reversed(coefficients):
-        value = value * x + coefficient
-    return value

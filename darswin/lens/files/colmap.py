@@ -134,9 +134,8 @@ def from_binary(data: bytes, most: int) -> str:
             lines.append(f"{camera} {name} {width} {height} {' '.join(map(repr, numbers))}")
             place += _HEAD.size + values.size
     except struct.error as error:
-        raise ValueError(
-            f"it must hold {count} cameras, but ends in number {len(lines)}"
-        ) from error
+        ends = f"it must hold {count} cameras, but ends in number {len(lines)}"
+        raise ValueError(ends) from error
     if place != len(data):
         raise ValueError(f"it holds {len(data) - place} bytes after its {count} cameras")
     return "\n".join(lines)

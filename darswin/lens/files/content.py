@@ -44,7 +44,7 @@ def read_bytes(path: str | os.PathLike) -> bytes:
 
 
 def to_text(data: bytes) -> str:
-    """The text of a file: of UTF-8, or the arrays of `np.savez`'s zip archive as JSON."""
+    """The text of a file in UTF-8, or the arrays of `np.savez`'s zip archive as JSON."""
     if data.startswith(b"PK\x03\x04"):
         return _from_npz(data)
     try:
@@ -97,12 +97,11 @@ def _parse_json(text: str) -> Mapping:
 
 def _mapping(pairs: Iterable[tuple[Any, Any]]) -> dict[Any, Any]:
     """A mapping; two entries of one name, of which a parser keeps the last, are an error."""
-    pairs = list(pairs)
-    mapping = dict(pairs)
-    if len(mapping) < len(pairs):
-        names = [name for name, _ in pairs]
-        twice = next(name for name in names if names.count(name) > 1)
-        raise ValueError(f"{short(twice)} stands there twice")
+    mapping: dict[Any, Any] = {}
+    for name, value in pairs:
+        if name in mapping:
+            raise ValueError(f"{short(name)} stands there twice")
+        mapping[name] = value
     return mapping
 
 
@@ -118,9 +117,8 @@ def _parse_yaml(text: str) -> Mapping:
     lines = text.split("\n")
     while lines and lines[-1].strip() in ("", "---", "..."):  # as `ros2 topic echo` ends
         lines.pop()
-    text = "\n".join(lines)
     try:
-        content = yaml.load(text, _Loader)
+        content = yaml.load("\n".join(lines), _Loader)
     except (yaml.YAMLError, ValueError, OverflowError) as error:
         mark = getattr(error, "problem_mark", None)
         where = "" if mark is None else f"line {mark.line + 1}: "

@@ -32,8 +32,13 @@ def is_number(word: str) -> bool:
     return len(word) <= _MAX_WORD and _NUMBER.fullmatch(word) is not None
 
 
-def to_number(value: Any, name: str, expected: str = "a finite number") -> float:
-    """A finite number, from a number or the text of one."""
+def to_number(
+    value: Any,
+    name: str,
+    expected: str = "a finite number",
+    holds: Callable[[float], bool] = math.isfinite,
+) -> float:
+    """A finite number that is as expected, from a number or the text of one."""
     number = math.nan
     if isinstance(value, str) and is_number(value.strip()):
         number = float(value)
@@ -42,15 +47,7 @@ def to_number(value: Any, name: str, expected: str = "a finite number") -> float
             number = float(value)
         except OverflowError:
             number = math.inf
-    if not math.isfinite(number):
-        raise ValueError(f"{name} must be {expected}, got {short(value)}")
-    return number
-
-
-def to_positive(value: Any, name: str) -> float:
-    expected = "a finite number above 0"
-    number = to_number(value, name, expected)
-    if not number > 0:
+    if not (math.isfinite(number) and holds(number)):
         raise ValueError(f"{name} must be {expected}, got {short(value)}")
     return number
 
@@ -58,10 +55,11 @@ def to_positive(value: Any, name: str) -> float:
 def to_side(value: Any, name: str, least: int = 1) -> int:
     """A number of pixels."""
     expected = f"a whole number of pixels, {least} to {MAX_SIDE}"
-    number = to_number(value, name, expected)
-    if not (least <= number <= MAX_SIDE and number.is_integer()):
-        raise ValueError(f"{name} must be {expected}, got {short(value)}")
-    return int(number)
+
+    def is_side(number: float) -> bool:
+        return least <= number <= MAX_SIDE and number.is_integer()
+
+    return int(to_number(value, name, expected, is_side))
 
 
 def to_sides(value: Any, name: str) -> tuple[int, int]:
@@ -126,12 +124,8 @@ class Fields:
         like: Callable[[str, Any], bool] = lambda name, value: True,
         known: Iterable[str] = (),
     ) -> None:
-        """ValueError if a number was left out, which might be a coefficient under another name.
-
-        Args:
-            camera: what the numbers are of. like: whether an entry, by its name and value, may be
-                one of them. known: names of what may be left out.
-        """
+        """ValueError if a number was left out, which might be a coefficient under another name:
+        an entry that is `like` one by its name and value, but for those that are `known`."""
         left = [
             self.path(name) for name, value in self.entries.items()
             if name not in self._read and name not in known and like(str(name), value)
@@ -140,17 +134,21 @@ class Fields:
         if left:
             raise ValueError(f"{camera} has no place for the numbers of {listed(left)}")
 
+    def of_kind(self, name: str, kind: type, expected: str) -> Any:
+        value = self.get(name, expected)
+        if not isinstance(value, kind):
+            raise ValueError(f"{self.path(name)} must be {expected}, got {short(value)}")
+        return value
+
     def section(self, name: str) -> "Fields":
-        value = self.get(name, "a mapping")
-        if not isinstance(value, Mapping):
-            raise ValueError(f"{self.path(name)} must be a mapping, got {short(value)}")
-        return Fields(value, f"{self.path(name)}.")
+        return Fields(self.of_kind(name, Mapping, "a mapping"), f"{self.path(name)}.")
 
     def sections(self, name: str) -> "list[Fields]":
-        value = self.get(name, "a list of mappings")
-        if not isinstance(value, list) or not all(isinstance(v, Mapping) for v in value):
-            raise ValueError(f"{self.path(name)} must be a list of mappings, got {short(value)}")
-        return [Fields(v, f"{self.path(name)}[{i}].") for i, v in enumerate(value)]
+        expected = "a list of mappings"
+        entries = self.of_kind(name, list, expected)
+        if not all(isinstance(entry, Mapping) for entry in entries):
+            raise ValueError(f"{self.path(name)} must be {expected}, got {short(entries)}")
+        return [Fields(entry, f"{self.path(name)}[{i}].") for i, entry in enumerate(entries)]
 
     def number(self, name: str, default: float | None = None) -> float:
         """The entry as a finite number; `default`, if there is one, where it is missing."""
@@ -159,7 +157,8 @@ class Fields:
         return to_number(self.get(name, "a finite number"), self.path(name))
 
     def positive(self, name: str) -> float:
-        return to_positive(self.get(name, "a finite number above 0"), self.path(name))
+        expected = "a finite number above 0"
+        return to_number(self.get(name, expected), self.path(name), expected, lambda n: n > 0)
 
     def values(self, names: str, default: float | None = None) -> dict[str, float]:
         """Several numbers by our names, such as "fx fy k1": where the file has another name for
@@ -180,10 +179,7 @@ class Fields:
         return to_sides(self.get(name, "two whole numbers of pixels"), self.path(name))
 
     def text(self, name: str, expected: str = "text") -> str:
-        value = self.get(name, expected)
-        if not isinstance(value, str):
-            raise ValueError(f"{self.path(name)} must be {expected}, got {short(value)}")
-        return value
+        return self.of_kind(name, str, expected)
 
     def one_of(self, name: str, allowed: Iterable[str]) -> str:
         allowed = tuple(allowed)

@@ -15,7 +15,7 @@ from darswin.lens.base import MODELS, Lens, from_dict
 from darswin.lens.files import colmap, opencv
 from darswin.lens.files.basalt import Basalt
 from darswin.lens.files.camodocal import CamOdoCal, OCamCalib
-from darswin.lens.files.content import parse, read_bytes, to_text
+from darswin.lens.files.content import Content, parse, read_bytes, to_text
 from darswin.lens.files.fields import Fields, listed, short
 from darswin.lens.files.format import Description, Format
 from darswin.lens.files.kalibr import Kalibr
@@ -50,15 +50,14 @@ def load(
     model: str | None = None,
     dtype: torch.dtype | None = None,
 ) -> Lens:
-    """The lens of a calibration file.
+    """The lens of a calibration file, in our pixel origin.
 
     Reads WoodScape, KITTI-360 and CamOdoCal, Kalibr, EuRoC, OpenCV (fisheye, omnidir and pinhole;
     also `np.savez` of its arrays, or fx, fy, cx, cy, k1, … by name), ROS camera_info, OCamCalib,
     COLMAP (cameras.txt, cameras.bin), nerfstudio, basalt, and what `save` writes; the format is
-    told from the content. The lens has our pixel origin, whatever the file's.
+    told from the content.
 
     Args:
-        path: the file.
         camera: of a file with several different cameras: a name, or a number from 0. Where names
             are numbers, as COLMAP's are, a number is a name.
         theta_max: rad. None means the file's, or the widest of the lens's `side_angles`: the
@@ -70,8 +69,7 @@ def load(
 
     Raises:
         ValueError: an unknown format, a field that is missing or wrong, several cameras and none
-            chosen, a theta_max beyond the lens's limit; it names the file. OSError: the file cannot
-            be read.
+            chosen, a theta_max beyond the limit; it names the file. OSError: as `open`.
     """
     return Calibration.read(path, model).lens(camera, theta_max, image_size, dtype)
 
@@ -89,7 +87,7 @@ def load_all(
 
 
 def save(lens: Lens, path: str | os.PathLike, format: str | None = None) -> str:
-    """Writes one lens as a file that `load` reads, and `darswin predict --lens`.
+    """Writes one lens as a file that `load` reads; returns the format.
 
     Our own JSON holds any lens. The other formats hold those of their own models, all but θ_max:
     `load` finds it from the image's sides.
@@ -98,9 +96,6 @@ def save(lens: Lens, path: str | os.PathLike, format: str | None = None) -> str:
         format: "darswin", "opencv", "colmap" or "kalibr". None tells it from the path: OpenCV's for
             .xml, .yaml and .yml, but Kalibr's where the name has "camchain" or "kalibr"; COLMAP's
             for .txt; else ours.
-
-    Returns:
-        The format.
 
     Raises:
         ValueError: several lenses, a lens of a model that is not in `MODELS`, or one that the
@@ -120,31 +115,21 @@ def save(lens: Lens, path: str | os.PathLike, format: str | None = None) -> str:
 
 
 class Calibration:
-    """The text of a calibration file: its format, and its cameras, described when asked for.
-
-    Attributes: format; names: of the cameras.
-    """
+    """The text of a calibration file: its format, and its cameras, described when asked for."""
 
     def __init__(self, text: str, name: str, model: str | None = None):
         self.what = f"calibration {name}"  # in errors
         with self._about():
             content = parse(text)
-            found = next((f for f in FORMATS if f.fits(content)), None)
-            if found is None:
-                known = ", ".join(f.name for f in FORMATS)
-                given = content.get("model") if isinstance(content, Mapping) else None
-                raise ValueError(
-                    f'it must be of one of the formats {known}; darswin\'s own "model" must be '
-                    f"one of {', '.join(sorted(MODELS))}, got {short(given)}"
-                )
-        self.format, self.what = found, f"{found.name} {self.what}"
+            self.format = _format_of(content)
+        self.what = f"{self.format.name} {self.what}"
         with self._about():
-            if model is not None and not found.takes_model:
+            if model is not None and not self.format.takes_model:
                 raise ValueError(f"its cameras say their model, but model={model!r} was given")
             if model not in (None, *opencv.MODELS):
                 raise ValueError(f"model must be one of {', '.join(opencv.MODELS)}, got {model!r}")
             fields = content if isinstance(content, list) else Fields(content)
-            self._cameras = found.cameras(fields, model)
+            self._cameras = self.format.cameras(fields, model)
             self.names = list(self._cameras)
             if not 1 <= len(self.names) <= MAX_CAMERAS:
                 raise ValueError(f"it must have 1 to {MAX_CAMERAS} cameras, got {len(self.names)}")
@@ -155,10 +140,8 @@ class Calibration:
         name = os.fspath(path)
         try:
             data = read_bytes(path)
-            if colmap.is_binary(data):
-                text = colmap.from_binary(data, MAX_CAMERAS)
-            else:
-                text = to_text(data)
+            is_binary = colmap.is_binary(data)
+            text = colmap.from_binary(data, MAX_CAMERAS) if is_binary else to_text(data)
         except ValueError as error:
             raise ValueError(f"calibration {name}: {error}") from error
         return cls(text, name, model)
@@ -202,11 +185,14 @@ class Calibration:
     ) -> dict[str, Lens]:
         """As `load_all`."""
         # By description, for frames often repeat one camera; those alike are computed together.
-        keys = {name: repr(self._describe(name)) for name in self.names}
-        firsts = {key: name for name, key in reversed(keys.items())}
+        keys: dict[str, str] = {}
+        firsts: dict[str, str] = {}
         alike: dict[str, list[str]] = {}
-        for name in sorted(firsts.values(), key=self.names.index):
-            alike.setdefault(_shape(self._describe(name)), []).append(name)
+        for name in self.names:
+            description = self._describe(name)
+            keys[name] = repr(description)
+            if firsts.setdefault(keys[name], name) == name:
+                alike.setdefault(_shape(description), []).append(name)
         found: dict[str, Lens] = {}
         for names in alike.values():
             found |= self._together(names, theta_max, image_size, dtype)
@@ -243,6 +229,18 @@ class Calibration:
                 raise
             which = f"camera {short(camera)}: " if camera and len(self.names) > 1 else ""
             raise ValueError(f"{self.what}: {which}{error}") from error
+
+
+def _format_of(content: Content) -> Format:
+    found = next((format for format in FORMATS if format.fits(content)), None)
+    if found is None:
+        known = ", ".join(format.name for format in FORMATS)
+        given = content.get("model") if isinstance(content, Mapping) else None
+        raise ValueError(
+            f'it must be of one of the formats {known}; darswin\'s own "model" must be one of '
+            f"{', '.join(sorted(MODELS))}, got {short(given)}"
+        )
+    return found
 
 
 def _shape(value: object) -> str:

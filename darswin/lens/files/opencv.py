@@ -141,13 +141,16 @@ class _Reader:
         # Of two names that are one here, the first counts.
         self.names = {plain_name(name): name for name in reversed(list(file.entries))}
 
+    def find_all(self, names: tuple[str, ...], suffix: str) -> list[str]:
+        """The file's names of entries that go by several."""
+        return [self.names[n + suffix] for n in names if n + suffix in self.names]
+
     def find(self, names: tuple[str, ...], suffix: str = "") -> str | None:
-        """The file's name of an entry that goes by several."""
-        return next((self.names[n + suffix] for n in names if n + suffix in self.names), None)
+        return next(iter(self.find_all(names, suffix)), None)
 
     def coefficients(self, suffix: str) -> str | None:
         """The file's name of a camera's coefficients, if it has any; ValueError for several."""
-        found = [self.names[n + suffix] for n in COEFFICIENTS if n + suffix in self.names]
+        found = self.find_all(COEFFICIENTS, suffix)
         if len(found) > 1:
             raise ValueError(f"coefficients must stand in one entry, got {listed(found)}")
         return found[0] if found else None
@@ -167,16 +170,14 @@ class _Reader:
 
     def camera(self, suffix: str) -> Description:
         """The camera whose entries end with `suffix`."""
-        matrices = [self.names[n + suffix] for n in MATRIX if n + suffix in self.names]
+        matrices = self.find_all(MATRIX, suffix)
         values = [self.matrix(name, (9,)) for name in matrices]
         if any(other != values[0] for other in values[1:]):
             raise ValueError(f"{' and '.join(matrices)} must be the same, a camera's matrix")
         fx, skew, cx, zero, fy, cy, *last = values[0]
         if not (fx > 0 and fy > 0 and zero == 0 and last == [0, 0, 1]):
-            raise ValueError(
-                f"{matrices[0]} must be [fx, skew, cx, 0, fy, cy, 0, 0, 1] with fx and fy above 0, "
-                f"got {values[0]}"
-            )
+            form = "[fx, skew, cx, 0, fy, cy, 0, 0, 1] with fx and fy above 0"
+            raise ValueError(f"{matrices[0]} must be {form}, got {values[0]}")
         plane = {"fx": fx, "fy": fy, "cx": cx, "cy": cy, "skew": skew}
         name = self.coefficients(suffix)
         coefficients = [] if name is None else self.matrix(name, (0, 4, 5, 8, 12, 14))
@@ -190,15 +191,10 @@ class _Reader:
             )
         model, order, counts = ORDERS[kind]
         if coefficients and len(coefficients) not in counts:
-            raise ValueError(
-                f"{name} must have {' or '.join(map(str, counts))} coefficients for the {kind} "
-                f"model, got {len(coefficients)}"
-            )
-        if any(coefficients[12:]):
-            raise ValueError(
-                f"{name} must end with a tilt of 0, 0: a tilted sensor is not supported, got "
-                f"{coefficients[12:]}"
-            )
+            expected = f"{' or '.join(map(str, counts))} coefficients for the {kind} model"
+            raise ValueError(f"{name} must have {expected}, got {len(coefficients)}")
+        if tilt := [angle for angle in coefficients[12:] if angle]:
+            raise ValueError(f"{name} must end with 0, 0: a tilted sensor is not supported: {tilt}")
         terms = dict(zip(order.split(), coefficients, strict=False))
         if kind == "omnidir":
             if xi is None:
@@ -261,10 +257,11 @@ class _Reader:
             word = plain_name(self.file.text(entry))
             found = next((kind for kind, words in WORDS.items() if word in words), None)
             if found is None:
-                known = sorted(word for words in WORDS.values() for word in words)
+                known = ", ".join(sorted(word for words in WORDS.values() for word in words))
+                given = short(self.file.entries[entry])
                 raise ValueError(
-                    f"{entry} must be one of {', '.join(known)}, got "
-                    f"{short(self.file.entries[entry])}; or give model=, one of {', '.join(MODELS)}"
+                    f"{entry} must be one of {known}, got {given}; or give model=, one of "
+                    f"{', '.join(MODELS)}"
                 )
             return found
         if xi is not None:
@@ -294,9 +291,9 @@ class _Reader:
             rows = [row[:32] if isinstance(row, list) else [row] for row in value[:32]]
             value = [entry for row in rows for entry in row]
         numbers = Fields({where: value}).numbers(where, counts)
-        if shape is not None and shape[0] * shape[1] != len(numbers):
-            rows_, columns = shape
-            raise ValueError(f"{where} must be {rows_:g} × {columns:g} numbers, got {len(numbers)}")
+        if shape is not None and math.prod(shape) != len(numbers):
+            height, width = shape
+            raise ValueError(f"{where} must be {height:g} × {width:g} numbers, got {len(numbers)}")
         return numbers
 
     def in_message(self, plane: dict[str, float], size: Size) -> Size:

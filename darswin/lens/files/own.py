@@ -6,7 +6,7 @@ from typing import Any
 
 from darswin.lens.base import MODELS, Lens, to_dict
 from darswin.lens.files.content import Content
-from darswin.lens.files.fields import Fields, short, to_number, to_positive
+from darswin.lens.files.fields import Fields, short, to_number
 from darswin.lens.files.format import Cameras, Description, Format
 from darswin.lens.ideal import FocalLens
 
@@ -41,7 +41,10 @@ def _lens(file: Fields) -> Description:
             raise ValueError(f"{file.path(key)} is not of a {name} lens, which has {known}")
     description: Description = {"model": name}
     for key in (*required, *(key for key in optional if key in file)):
-        dims = 0 if key == "fov" else len(model.declared[key].shape)
+        if key == "fov":
+            description[key] = file.positive(key)
+            continue
+        dims = len(model.declared[key].shape)
         value = file.get(key, "a list of numbers" if dims else "a finite number")
         description[key] = _value(value, file.path(key), dims, model.max_numbers)
     if "image_size" in file:
@@ -52,7 +55,7 @@ def _lens(file: Fields) -> Description:
 def _value(value: Any, name: str, dims: int, most: int) -> Any:
     """A number, or lists of at most `most` numbers, `dims` deep."""
     if dims == 0:
-        return to_positive(value, name) if name == "fov" else to_number(value, name)
+        return to_number(value, name)
     if not isinstance(value, list) or not value:
         raise ValueError(f"{name} must be a list of numbers, got {short(value)}")
     if len(value) > most:
