@@ -389,12 +389,12 @@ def test_binary_files_that_are_wrong(tmp_path):
     assert "cameras, got 4294967295" in error_of(b"\xff" * 4 + whole[4:])
     assert "to 16 (EUCM), got 17" in error_of(whole[:12] + bytes([17]) + whole[13:])
     random.seed(0)
-    for _ in range(60):  # any bytes give a lens or a sentence
+    for _ in range(30):  # any bytes give a lens or a sentence
         data = bytearray(whole)
         data[random.randrange(len(data))] = random.randrange(256)
         path.write_bytes(data)
         with contextlib.suppress(ValueError):
-            load(path, camera=random.choice([*range(1, 16), 17, 18]))
+            load(path, camera=random.choice([*range(1, 16), 17, 18]), theta_max=0.3)
 
 
 def test_damaged_archives_are_refused_in_a_sentence(tmp_path):
