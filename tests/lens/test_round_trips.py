@@ -292,4 +292,6 @@ def test_theta_max_in_another_dtype():
     with pytest.raises(ValueError, match=r"theta_max must be at most 1\.57079"):
         from_dict(described | {"theta_max": 1.58})
     assert from_dict(described | {"theta_max": 1.5}).theta_max.item() == pytest.approx(1.5)
+    # Also where only the radial terms overflow.
+    assert PINHOLE.replace(tangential=None).to(torch.float32).r_max.isfinite()
     assert PINHOLE.to(f64).same_as(PINHOLE) and PINHOLE.to("cpu").same_as(PINHOLE)
