@@ -109,9 +109,7 @@ class OfficialDarSwin(DarSwin):
         return PolarWindowAttention(
             dim,
             heads,
-            map_size=plan.map_size,
-            window=plan.window,
-            shift=plan.shift_of(block),
+            **plan.windows(block),
             periodic=(False, False),
             position_bias=self.position_bias,
             harmonics=self.harmonics,

@@ -60,15 +60,17 @@ def joined_coefficients(biases: Sequence[RelativeBias]) -> dict[str, Tensor]:
 class AngularRelativeBias(RelativeBias):
     """B = a_Δ sin α + b_Δ cos α, α the angle between two tokens Δ apart.
 
-    Coefficients are stored by Δ modulo their number: Δ = 0, 1, …, -2, -1. With `periodic`, for a
-    window that spans the ring, those of φ are by Δφ modulo M_φ rather than modulo 2·M_φ-1, which
+    Coefficients are stored by Δ modulo their number: Δ = 0, 1, …, -2, -1. With `periodic`, where
+    the window spans the ring, those of φ are by Δφ modulo M_φ rather than modulo 2·M_φ-1, which
     makes the bias periodic.
 
     Source: DarSwin, ICCV 2023, eq. 9 to 11.
     """
 
     def __init__(self, window: tuple[int, int], heads: int, sectors: int, periodic: bool = False):
-        theta, phi = 2 * window[0] - 1, window[1] if periodic else 2 * window[1] - 1
+        theta, phi = (2 * reach - 1 for reach in window)
+        if periodic and window[1] == sectors:
+            phi = sectors
         super().__init__(window, heads, sectors, (theta, theta, phi, phi))
 
     def _axis(self, angle: Tensor, a: Tensor, b: Tensor) -> Tensor:

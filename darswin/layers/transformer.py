@@ -158,34 +158,24 @@ class PolarWindowAttention(WindowAttention):
         num_heads: int,
         *,
         map_size: tuple[int, int],
-        window: tuple[int, int],
-        shift: tuple[int, int] = (0, 0),
         periodic: tuple[bool, bool] = (False, True),
         position_bias: PositionBias = "angular_relative",
         harmonics: int = 16,
         periodic_bias: bool = False,
+        **windows: Any,
     ):
-        sectors = map_size[1]
         bias: Callable[[tuple[int, int], int], nn.Module]
         if position_bias == "angular_relative":
-            whole = periodic_bias and window[1] == sectors
-            bias = partial(AngularRelativeBias, sectors=sectors, periodic=whole)
+            bias = partial(AngularRelativeBias, sectors=map_size[1], periodic=periodic_bias)
         elif position_bias in ("angular", "polar"):
-            bias = partial(FourierBias, sectors=sectors, harmonics=harmonics)
+            bias = partial(FourierBias, sectors=map_size[1], harmonics=harmonics)
         else:
             raise ValueError(
                 "position_bias must be 'angular_relative', 'angular' or 'polar', "
                 f"got {position_bias!r}"
             )
-        super().__init__(
-            dim,
-            num_heads,
-            map_size=map_size,
-            window=window,
-            shift=shift,
-            periodic=periodic,
-            position_bias=bias,
-        )
+        options = dict(map_size=map_size, periodic=periodic, position_bias=bias)
+        super().__init__(dim, num_heads, **options, **windows)
 
 
 class DropPath(nn.Module):

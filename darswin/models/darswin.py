@@ -104,9 +104,7 @@ class DarSwin(Encoder):
         return PolarWindowAttention(
             dim,
             heads,
-            map_size=plan.map_size,
-            window=plan.window,
-            shift=plan.shift_of(block),
+            **plan.windows(block),
             position_bias=self.position_bias,
             harmonics=self.harmonics,
             periodic_bias=self.periodic_bias,

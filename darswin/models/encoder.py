@@ -1,6 +1,6 @@
 """The classifiers: lens and images → maps of stages, features and logits."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import chain
 from typing import Any, Literal, NamedTuple
 
@@ -8,10 +8,10 @@ from torch import Tensor, nn
 
 from darswin.layers.linear import Linear
 from darswin.layers.polar import PolarGrid
-from darswin.layers.transformer import PatchMerging
+from darswin.layers.transformer import Block, PatchMerging, Stage
 from darswin.lens import Lens
 from darswin.models.base import FeatureInfo, Model, feature_info, init_weights, take_indices
-from darswin.models.stages import Pair, StagePlan, make_stages
+from darswin.models.stages import Pair, StagePlan
 from darswin.ops.checks import per_channel
 
 Format = Literal["NHWC", "NCHW"]
@@ -80,16 +80,7 @@ class Encoder(Model):
         self.plans = plans
         self.feature_info = feature_info(plans, self.embed_dim, patch)
         self.num_features = self.feature_info.channels(-1)
-        self.stages = make_stages(
-            plans,
-            self.embed_dim,
-            self.depths,
-            self.num_heads,
-            attention=self.attention,
-            downsample=self.downsample,
-            mlp_ratio=self.mlp_ratio,
-            drop_path_rate=self.drop_path_rate,
-        )
+        self.stages = self.make_stages(self.depths, self.downsample)
         self.norm: nn.Module = nn.LayerNorm(self.num_features)
         self.reset_classifier(self.num_classes)
         self.apply(init_weights)
@@ -104,6 +95,29 @@ class Encoder(Model):
             first_conv="patch_embed.proj",
             classifier="head",
         )
+
+    def make_stages(
+        self, depths: Sequence[int], downsample: Callable[[int, Pair], nn.Module]
+    ) -> nn.ModuleList:
+        """Stages of so many blocks, of the first of the plans: their width doubles, and stochastic
+        depth rises linearly from block to block."""
+        stages = nn.ModuleList()
+        before, last = 0, max(sum(depths) - 1, 1)
+        for plan, depth in zip(self.plans, depths, strict=False):
+            dim, heads = self.embed_dim * 2**plan.index, self.num_heads[plan.index]
+            merging = downsample(dim // 2, plan.merge) if plan.merge else nn.Identity()
+            blocks = [
+                Block(
+                    dim,
+                    self.attention(dim, heads, plan, block),
+                    mlp_ratio=self.mlp_ratio,
+                    drop_path=self.drop_path_rate * (before + block) / last,
+                )
+                for block in range(depth)
+            ]
+            stages.append(Stage(merging, blocks))
+            before += depth
+        return stages
 
     def attention(self, dim: int, heads: int, plan: StagePlan, block: int) -> nn.Module:
         """The attention of a block of a stage, which a decoder's blocks have too."""
@@ -145,21 +159,13 @@ class Encoder(Model):
         """Images (B, C, H, W) and the `points` of `prepare` → the first map."""
         raise NotImplementedError
 
-    def maps(
-        self, images: Tensor, prepared: Prepared, *, stop_after: int | None = None
-    ) -> list[Tensor]:
-        """The map that each stage ends with, of images (B, C, H, W) that fit the model.
-
-        Args:
-            prepared: of `prepare`. stop_after: the last stage that runs; None means all do.
-        """
+    def maps(self, images: Tensor, prepared: Prepared, count: int | None = None) -> list[Tensor]:
+        """The maps that the first `count` stages, or all, end with, of images that were checked."""
         x = self.embed(images, prepared.points)
         maps = []
-        for stage, positions in zip(self.stages, prepared.positions, strict=True):
+        for stage, positions in zip(list(self.stages)[:count], prepared.positions, strict=False):
             x = stage(x, *positions)
             maps.append(x)
-            if len(maps) - 1 == stop_after:
-                break
         return maps
 
     def _run(self, images: Tensor, prepared: Prepared) -> Tensor:
@@ -201,13 +207,12 @@ class Encoder(Model):
         Raises:
             ValueError: stages that there are not, another format.
         """
-        last = len(self.stages) - 1
         taken = take_indices(len(self.stages), indices)
         _check_format(output_fmt)
         ready = self._checked_and_prepared(images, lens)
-        maps = self.maps(*ready, stop_after=max(taken) if stop_early else last)
+        maps = self.maps(*ready, count=max(taken) + 1 if stop_early else None)
         final = maps[-1]
-        if len(maps) - 1 == last and (norm or not intermediates_only):
+        if len(maps) == len(self.stages) and (norm or not intermediates_only):
             final = self.norm(final)
             if norm:
                 maps[-1] = final

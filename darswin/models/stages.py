@@ -1,12 +1,9 @@
-"""The sizes of the stages, and their blocks."""
+"""The sizes of the stages."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
-from torch import nn
-
-from darswin.layers.transformer import Block, Stage
 from darswin.ops.checks import check_pair
 
 Pair = tuple[int, int]
@@ -23,9 +20,10 @@ class StagePlan:
     shift: Pair
     merge: Pair | None
 
-    def shift_of(self, block: int) -> Pair:
-        """The shift of the windows of a block: every second block has one."""
-        return self.shift if block % 2 else (0, 0)
+    def windows(self, block: int) -> dict[str, Any]:
+        """The options of a block's attention: every second block has shifted windows."""
+        shift = self.shift if block % 2 else (0, 0)
+        return dict(map_size=self.map_size, window=self.window, shift=shift)
 
 
 def plan_stages(
@@ -54,8 +52,8 @@ def plan_stages(
     size, merge = (rings, sectors), None
     for stage in range(count):
         if stage > 0:
-            choices = merges[stage - 1 : stage] if merges else _merges_of(variant, size)
-            merge = _merging(size, choices, stage)
+            usual = [(2, 2)] if variant == "RA" else [(1, 4), (4, 1)] if size[1] < 4 else [(1, 4)]
+            merge = _merging(size, merges[stage - 1 : stage] if merges else usual, stage)
             size = (size[0] // merge[0], size[1] // merge[1])
         fitted = _fit_window(window, size)
         if size[0] % fitted[0] or size[1] % fitted[1]:
@@ -67,11 +65,8 @@ def plan_stages(
     return plans
 
 
-def _merges_of(variant: str, size: Pair) -> Sequence[Pair]:
-    return [(2, 2)] if variant == "RA" else [(1, 4), (4, 1)] if size[1] < 4 else [(1, 4)]
-
-
 def _merging(size: Pair, choices: Sequence[Pair], stage: int) -> Pair:
+    """The first merging of the choices that divides the map."""
     for merge in choices:
         merge = check_pair("merges", merge, lowest=1)
         if size[0] % merge[0] == 0 and size[1] % merge[1] == 0:
@@ -97,40 +92,3 @@ def _shift(size: Pair, window: Pair, variant: str) -> Pair:
     if variant == "RA":
         return along_r, along_phi
     return (0, window[1] // 4) if size[1] > window[1] else (along_r, 0)
-
-
-def make_stages(
-    plans: Sequence[StagePlan],
-    embed_dim: int,
-    depths: Sequence[int],
-    num_heads: Sequence[int],
-    *,
-    attention: Callable[[int, int, StagePlan, int], nn.Module],
-    downsample: Callable[[int, Pair], nn.Module],
-    mlp_ratio: float,
-    drop_path_rate: float,
-) -> nn.ModuleList:
-    """The stages; their width doubles, and stochastic depth rises from block to block.
-
-    Args:
-        attention: the width, heads, plan and number of a block → its attention.
-        downsample: the width before and (m_r, m_φ) → what begins every stage but the first.
-        drop_path_rate: of the last block; it rises linearly from 0.
-    """
-    stages = nn.ModuleList()
-    before, last = 0, max(sum(depths) - 1, 1)
-    for plan, depth, heads in zip(plans, depths, num_heads, strict=True):
-        dim = embed_dim * 2**plan.index
-        merging = downsample(dim // 2, plan.merge) if plan.merge else nn.Identity()
-        blocks = [
-            Block(
-                dim,
-                attention(dim, heads, plan, block),
-                mlp_ratio=mlp_ratio,
-                drop_path=drop_path_rate * (before + block) / last,
-            )
-            for block in range(depth)
-        ]
-        stages.append(Stage(merging, blocks))
-        before += depth
-    return stages

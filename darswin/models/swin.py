@@ -62,13 +62,7 @@ class Swin(Encoder):
 
     def attention(self, dim: int, heads: int, plan: StagePlan, block: int) -> nn.Module:
         """As `Encoder`."""
-        return WindowAttention(
-            dim,
-            heads,
-            map_size=plan.map_size,
-            window=plan.window,
-            shift=plan.shift_of(block),
-        )
+        return WindowAttention(dim, heads, **plan.windows(block))
 
     def prepare(self, lens: Lens | None, size: Pair) -> Prepared:
         """As `Encoder`: the pixels of the images that the view shows."""

@@ -13,7 +13,7 @@ from darswin.models.base import Model, init_weights
 from darswin.models.darswin import PRESETS, DarSwin
 from darswin.models.encoder import Prepared
 from darswin.models.registry import Presets, register_model
-from darswin.models.stages import Pair, StagePlan, make_stages
+from darswin.models.stages import Pair
 from darswin.models.swin import Swin
 from darswin.models.views import PlainView, PolarView, Way
 
@@ -75,29 +75,19 @@ class Decoder(nn.Module):
 
     def __init__(self, encoder: DarSwin | Swin, depths: int | Sequence[int]):
         super().__init__()
-        plans: Sequence[StagePlan] = encoder.plans
-        upper, dim = plans[:-1], encoder.feature_info.channels(0)
-        depths = [depths] * len(upper) if isinstance(depths, int) else list(depths)
-        if len(depths) != len(upper) or min(depths, default=1) < 1:
+        count, dim = len(encoder.plans) - 1, encoder.embed_dim
+        depths = [depths] * count if isinstance(depths, int) else list(depths)
+        if len(depths) != count or min(depths, default=1) < 1:
             raise ValueError(
                 "decoder_depths must be an int of at least 1, or one for each stage but the last, "
-                f"{len(upper)}, got {depths}"
+                f"{count}, got {depths}"
             )
         self.joins = nn.ModuleList(
-            SkipJoin(dim * 2**plan.index, after.merge)
-            for plan, after in zip(upper, plans[1:], strict=True)
-            if after.merge is not None
+            SkipJoin(dim * 2 ** (plan.index - 1), plan.merge)
+            for plan in encoder.plans
+            if plan.merge
         )
-        self.stages = make_stages(
-            upper,
-            dim,
-            depths,
-            encoder.num_heads[: len(upper)],
-            attention=encoder.attention,
-            downsample=lambda _dim, _merge: nn.Identity(),
-            mlp_ratio=encoder.mlp_ratio,
-            drop_path_rate=encoder.drop_path_rate,
-        )
+        self.stages = encoder.make_stages(depths, lambda _dim, _merge: nn.Identity())
         self.expand = PatchExpand(dim, dim, (EXPANSION, EXPANSION))
 
     def forward(

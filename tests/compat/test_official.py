@@ -49,6 +49,7 @@ def differences(name) -> dict[str, float]:
     return results
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_equals_the_released_code_to_1e_4(name):
     code = f"import test_official, json; print(json.dumps(test_official.differences({name!r})))"
@@ -67,7 +68,8 @@ def test_equals_the_released_code_to_1e_4(name):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_logits_equal_with_any_maths_library(name):
-    results = differences(name)
+    with warnings.catch_warnings(action="error"):
+        results = differences(name)
     assert results["logits"] <= 1e-5 and results["grid"] <= 5e-6, results
 
 
@@ -85,12 +87,6 @@ def test_every_part_of_the_compatibility_matters():
     with torch.no_grad():
         other = paper.eval()(tensors["images"], lens)
     assert (other - tensors["logits"]).abs().max() > 1e-2
-
-
-def test_full_size_parameter_count():
-    with torch.device("meta"):
-        model = OfficialDarSwin(200)
-    assert sum(p.numel() for p in model.parameters()) == 48_977_864
 
 
 def test_the_polar_model_is_the_papers_angular_encoding():
@@ -144,10 +140,3 @@ def test_official_polynomial():
         OfficialPolynomial([1.0, -3.0, 0.5, 3.0], 32.0)
     with pytest.raises(ValueError, match="radius must be finite and above 0"):
         OfficialPolynomial([1.0, 0.0, 0.0, 0.0], 0.0)
-
-
-def test_no_warning_for_models_that_run():
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        for name in NAMES:
-            load_official(fixture(name)[1])

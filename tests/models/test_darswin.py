@@ -46,7 +46,9 @@ def images(batch=2, height=32, width=32):
 def test_stage_plans(arguments, first, expected):
     plans = plan_stages(*arguments)[first:]
     assert [(p.map_size, p.window, p.shift) for p in plans] == expected
-    assert [plans[0].shift_of(block) for block in range(3)] == [(0, 0), plans[0].shift, (0, 0)]
+    assert [plans[0].windows(block)["shift"] for block in range(3)] == [
+        (0, 0), plans[0].shift, (0, 0)
+    ]  # fmt: skip
 
 
 @pytest.mark.parametrize(
