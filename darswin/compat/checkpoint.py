@@ -80,12 +80,8 @@ def load_as(
     make: Callable[[Mapping[str, Tensor]], Net],
     convert: Callable[[str, Tensor, Net], tuple[str, Tensor]],
 ) -> Net:
-    """The model of another implementation's state dict, in eval mode.
-
-    Args:
-        name: of the implementation, for the ValueError where keys or shapes are not its own.
-        make: the state dict → the model. convert: a key and its tensor → the model's own.
-    """
+    """The model of another implementation's state dict, in eval mode: `make` makes it, and
+    `convert` gives its own name and tensor for each. ValueError where they do not fit."""
     state = read_state(source)
     try:
         model = make(state)

@@ -53,14 +53,12 @@ def optimize(
     which stays as it is, is there for that.
 
     Args:
-        model: one of `create_model`, on the CPU. On a GPU a model needs none of this: it computes
-            a stage's position biases at once by itself, and is called as it is.
+        model: one of `create_model`, on the CPU; a GPU needs none of this.
         dtype: float32 or bfloat16, of what flows between the layers and of the result; distances
             are float32, and so is what refines the pixels of dense models. int8: products of 8
-            bits, of a model of `quantize_model`; what lies between them is float32, and a picture
-            with numbers that are not finite gets a result that is finite and means nothing.
-            "fastest": int8 of a quantized model, where this CPU has it; else float32 or bfloat16,
-            whichever `fastest_dtype` measured.
+            bits, of a model of `quantize_model`, and float32 between them; a picture with numbers
+            that are not finite gets a result that is finite and means nothing. "fastest": int8 of
+            a quantized model, where this CPU has it; else the one that `fastest_dtype` measured.
         lens: one camera's, for all images; the result is then called `optimized(images)`, and
             computes the grid and the position biases once for each image size.
         calibration: batches (images, lens) of pictures like those to come: with int8, for a model
@@ -209,10 +207,8 @@ def _replace(module: nn.Module, **layers: Any) -> None:
 
 
 def _with_tables(model: Model, fixed_lens: Lens | None) -> Callable[[Lens | None, Pair], Any]:
-    """`model.prepare`, but with tables in place of what they are computed from.
-
-    With a fixed lens it is called without one, and computes once for each size of the images.
-    """
+    """`model.prepare`, but with tables in place of what they are computed from; for a fixed lens,
+    it is called without one, and computes once for each size of the images."""
     prepare, known = model.prepare, dict[Pair, Any]()
 
     def with_tables(lens: Lens | None, size: Pair) -> Any:

@@ -4,7 +4,6 @@ import copy
 import math
 from collections import defaultdict
 from collections.abc import Collection, Iterable, Iterator, Sequence
-from contextlib import contextmanager
 from typing import Generic, TypeVar
 
 import torch
@@ -185,18 +184,19 @@ def _parts(model: nn.Module, keep: Collection[str]) -> dict[str, list[str]]:
 
 
 def _results(model: Model, batches: Batches) -> Iterator[Tensor]:
-    """The result of each batch, one row a picture."""
-    with _evaluating(model):
+    """The result of each batch, or the maps of a model of features, as (B, numbers)."""
+    modes = [(module, module.training) for module in model.modules()]
+    model.eval()
+    try:
         for images, lens in batches:
             with torch.inference_mode():
-                result = _flat(model(images, lens))
-            yield result
-
-
-def _flat(result: Tensor | list[Tensor]) -> Tensor:
-    """The result, or the maps of a model of features, as (B, numbers)."""
-    maps = [result] if isinstance(result, Tensor) else result
-    return torch.cat([one.float().flatten(1) for one in maps], 1)
+                result = model(images, lens)
+                maps = [result] if isinstance(result, Tensor) else result
+                flat = torch.cat([one.float().flatten(1) for one in maps], 1)
+            yield flat
+    finally:
+        for module, training in modes:
+            module.training = training
 
 
 def _activations(model: Model, batches: Batches, names: Collection[str]) -> dict[str, Quantization]:
@@ -249,14 +249,3 @@ def _of_range(lower: float, upper: float) -> Quantization:
     """The steps that reach from `lower` to `upper`, 0 being one of them exactly."""
     scale = max((upper - lower) / 255, 1e-12)
     return Quantization(scale, min(max(round(-lower / scale), 0), 255))
-
-
-@contextmanager
-def _evaluating(model: nn.Module) -> Iterator[None]:
-    modes = [(module, module.training) for module in model.modules()]
-    model.eval()
-    try:
-        yield
-    finally:
-        for module, training in modes:
-            module.training = training

@@ -8,8 +8,6 @@ from torch import Tensor, nn
 from darswin.layers.linear import Linear
 from darswin.layers.polar import PolarGrid, PolarGridSpec, PolarSample
 from darswin.ops import polar_embed
-from darswin.ops.checks import per_channel
-from darswin.ops.reference import normalized
 
 
 def check_dtype(images: Tensor, dtype: torch.dtype) -> None:
@@ -24,10 +22,7 @@ def check_dtype(images: Tensor, dtype: torch.dtype) -> None:
 
 
 class PatchProjection(nn.Module):
-    """Joins p × p neighbours of a map into one: a convolution as wide as its step, a LayerNorm.
-
-    Source: Swin Transformer, ICCV 2021, sec. 3.1; DAT, CVPR 2022, sec. 3.3.
-    """
+    """Joins p × p neighbours of a map into one: a convolution as wide as its step, a LayerNorm."""
 
     def __init__(self, dim: int, out_dim: int, patch: int, *, bias: bool = True):
         super().__init__()
@@ -41,13 +36,7 @@ class PatchProjection(nn.Module):
 
 
 class PolarPatchEmbed(nn.Module):
-    """Images on a polar grid → polar map: samples of each patch, a linear layer, a LayerNorm.
-
-    Args:
-        spec: of the grid. in_chans: C. embed_dim: D. options: as `PolarSample`.
-
-    Source: DarSwin, ICCV 2023, sec. 4.3.
-    """
+    """Images on a polar grid → polar map: samples of each patch, a linear layer, a LayerNorm."""
 
     def __init__(
         self, spec: PolarGridSpec, *, in_chans: int = 3, embed_dim: int = 96, **options: Any
@@ -61,12 +50,6 @@ class PolarPatchEmbed(nn.Module):
         """(B, C, H, W), uint8 or of the weights' dtype → (B, R, A, D)."""
         weight, bias = self.proj.weight, self.proj.bias
         check_dtype(images, weight.dtype)
-        if images.dtype == torch.uint8 and weight.dtype == torch.float64:
-            mean, std = (
-                per_channel(name, getattr(self.sample, name), images.shape[1])
-                for name in ("mean", "std")
-            )
-            images = normalized(images, mean, std, weight.dtype)  # the operator would use float32
         tokens = polar_embed(**self.sample.arguments(images, grid), weight=weight, bias=bias)
         if weight.dtype == torch.bfloat16:
             tokens = tokens.bfloat16()  # of uint8 images they are float32

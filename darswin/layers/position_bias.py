@@ -99,10 +99,7 @@ class FourierBias(RelativeBias):
 
 
 class RelativeTable(nn.Module):
-    """A learned bias for each offset between two tokens, which knows no angle.
-
-    Source: Swin Transformer, ICCV 2021, eq. 4.
-    """
+    """A learned bias for each offset between two tokens, which knows no angle, as Swin's."""
 
     def __init__(self, window: tuple[int, int], heads: int):
         super().__init__()
@@ -115,10 +112,8 @@ class RelativeTable(nn.Module):
 
 
 def ring_angles(lens: Lens, grid: PolarGrid, rings: int, kind: PositionBias) -> Tensor:
-    """(N, rings+1): how far from the centre the borders of a map of `rings` rings are, in rad.
-
-    The angle θ, equally split; for "polar" the radius in the image, the circle's radius being π.
-    """
+    """(N, rings+1), rad: the θ of the borders of a map of `rings` rings; for "polar" their radius
+    in the image, the circle's radius being π."""
     if kind == "polar":
         step = (grid.borders.shape[1] - 1) // rings
         borders = grid.borders[:, ::step]

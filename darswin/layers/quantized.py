@@ -38,13 +38,10 @@ def dequantize(q: Tensor, quantization: Quantization) -> Tensor:
 
 
 class QuantizedLinear(nn.Module):
-    """A linear layer of int8 weights, each row with its scale, on activations quantized to uint8.
+    """A linear layer of symmetric int8 weights, each row with its scale, on activations quantized
+    to uint8, after Jacob et al., CVPR 2018. It has no gradients.
 
-    It computes in float32 what integer products compute, so it runs everywhere and is exported;
-    `darswin.optimize` makes integer products of it. For inference: it has no gradients.
-
-    Source: Jacob et al., "Quantization and training of neural networks for efficient
-    integer-arithmetic-only inference", CVPR 2018; weights symmetric, a scale for each output.
+    It computes in float32 what integer products compute, so it runs everywhere and is exported.
     """
 
     weight: Tensor  # (D', D), int8

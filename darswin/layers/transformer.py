@@ -174,8 +174,9 @@ class PolarWindowAttention(WindowAttention):
                 "position_bias must be 'angular_relative', 'angular' or 'polar', "
                 f"got {position_bias!r}"
             )
-        options = dict(map_size=map_size, periodic=periodic, position_bias=bias)
-        super().__init__(dim, num_heads, **options, **windows)
+        super().__init__(
+            dim, num_heads, map_size=map_size, periodic=periodic, position_bias=bias, **windows
+        )
 
 
 class DropPath(nn.Module):
@@ -233,11 +234,6 @@ class Block(nn.Module):
     """Pre-norm transformer block: attention, then an MLP, each behind a residual.
 
     What the MLP gives is not added to the residual here: the norm of the next block does that.
-
-    Args:
-        dim: D. attn: maps (B, R, A, D), and the `table` of its position bias if the stage has made
-            it, to the same shape.
-        mlp_ratio: hidden width of the MLP over D. drop_path: probability.
     """
 
     grad_checkpointing = False  # see `Model.set_grad_checkpointing`
@@ -267,13 +263,7 @@ class Block(nn.Module):
 
 
 class PatchMerging(nn.Module):
-    """Joins m_r × m_φ neighbouring tokens into one of twice the width.
-
-    Args:
-        dim: D. merge: (m_r, m_φ): (1, 4) in DarSwin-A, (2, 2) in DarSwin-RA.
-
-    Source: DarSwin, ICCV 2023, sec. 4.4.
-    """
+    """Joins m_r × m_φ neighbouring tokens into one of twice the width."""
 
     def __init__(self, dim: int, merge: tuple[int, int]):
         super().__init__()

@@ -186,11 +186,7 @@ def feature_info(plans: Sequence[StagePlan], embed_dim: int, patch: Pair) -> Fea
 
 
 def take_indices(count: int, indices: int | Sequence[int] | None) -> list[int]:
-    """The stages that `indices` names, of `count`: the last so many for an int, all for None.
-
-    Raises:
-        ValueError: a stage that there is not, or none at all.
-    """
+    """The stages that `indices` names, of `count`: the last so many for an int, all for None."""
     if isinstance(indices, int):
         chosen: Sequence[int] = range(count)[-indices:] if 0 < indices <= count else ()
     else:

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from typing import Any, Literal
 
+import torch
 from torch import Tensor, nn
 
 from darswin.layers.embed import PolarPatchEmbed
@@ -120,4 +121,6 @@ class DarSwin(Encoder):
     def embed(self, images: Tensor, points: PolarGrid) -> Tensor:
         """Images (B, C, H, W) on a grid of `prepare` → the first map, (B, R, A, D)."""
         check_count(len(points.radii), images)
+        if images.dtype == torch.uint8 and next(self.parameters()).dtype == torch.float64:
+            images = self._floating(images)  # the operator would normalize in float32
         return self.patch_embed(images, points)

@@ -18,21 +18,10 @@ from darswin.ops.checks import tensor_there
 
 
 class DeformableAttention(nn.Module):
-    """Multi-head attention whose keys are sampled where the queries of each group say.
+    """Multi-head attention (DAT, CVPR 2022, sec. 3.2) whose keys stand at the map's pixels, each
+    moved by at most `offset_range` half pixels, as a small network reads from the queries around.
 
-    Keys stand at the map's pixels, moved by an offset that a small network reads from the queries
-    around. The bias of a query and a key is a table, between whose entries it is bilinear.
-
-    Args:
-        dim: D. num_heads: divides D. map_size: (H, W).
-        groups: of heads that share their keys; divides num_heads.
-        kernel: of the offset network, odd.
-        offset_range: how far a key may move, in half pixels of the map.
-
-    Raises:
-        ValueError: sizes that do not divide.
-
-    Source: DAT, CVPR 2022, sec. 3.2.
+    The heads of a group share their keys. The bias of a query and a key is bilinear in a table.
     """
 
     def __init__(
@@ -63,10 +52,6 @@ class DeformableAttention(nn.Module):
         """(B, H, W, D) → (B·G, D/G, H, W)."""
         return x.unflatten(3, (self.groups, -1)).permute(0, 3, 4, 1, 2).flatten(0, 1)
 
-    def _heads(self, x: Tensor) -> Tensor:
-        """(B, N, D) → (B, heads, N, d)."""
-        return x.unflatten(2, (self.num_heads, -1)).transpose(1, 2)
-
     def forward(self, x: Tensor) -> Tensor:
         """(B, H, W, D) → the same shape."""
         batch, height, width, dim = x.shape
@@ -87,9 +72,10 @@ class DeformableAttention(nn.Module):
         table = table.expand(batch, -1, -1, -1, -1).flatten(0, 1)
         bias = F.grid_sample(table, reach.flip(-1), align_corners=True)  # (B·G, heads/G, N, N)
         bias = bias.reshape(batch, self.num_heads, tokens, tokens)
-        out = F.scaled_dot_product_attention(
-            self._heads(q.flatten(1, 2)), self._heads(k), self._heads(v), attn_mask=bias
+        q, k, v = (
+            t.flatten(1, -2).unflatten(2, (self.num_heads, -1)).transpose(1, 2) for t in (q, k, v)
         )
+        out = F.scaled_dot_product_attention(q, k, v, attn_mask=bias)
         return self.proj(out.transpose(1, 2).reshape(x.shape))
 
     def extra_repr(self) -> str:

@@ -18,15 +18,11 @@ Format = Literal["NHWC", "NCHW"]
 
 
 class Prepared(NamedTuple):
-    """All that the lenses alone decide about images of one size: `Encoder.prepare` computes it.
+    """All that the lenses alone decide about images of one size."""
 
-    Args:
-        points: where the images are read: on a polar grid, or at pixels (N, H, W, 2); None means
-            as they are.
-        positions: for each stage, the tensors that its position biases are computed from.
-    """
-
+    # Where the images are read: on a polar grid, or at pixels (N, H, W, 2); None: as they are.
     points: PolarGrid | Tensor | None
+    # For each stage, the tensors that its position biases are computed from.
     positions: Sequence[Sequence[Tensor | None]]
 
 
@@ -258,14 +254,7 @@ class FeatureMaps(Model):
 
     Args:
         encoder: it is pruned in place: of later stages, the norm and the head.
-        out_indices: of the stages, from 0; they may count from the end. An int means the last so
-            many, None all.
-        output_fmt: of the maps: "NHWC" as (B, R, A, D), "NCHW" as (B, D, R, A).
-
-    Attributes:
-        encoder: what is left of it, with the names of its weights.
-        feature_info: of the stages of `out_indices`.
-        output_fmt: as given.
+        out_indices, output_fmt: `indices` and `output_fmt` of `Encoder.forward_intermediates`.
 
     Raises:
         ValueError: stages that there are not, another format.

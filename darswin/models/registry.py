@@ -25,12 +25,9 @@ _Class = TypeVar("_Class", bound=type[Model])
 
 
 def register_model(family: str, *, presets: Presets, **options: Any) -> Callable[[_Class], _Class]:
-    """Decorates a model's class: `create_model` knows it as `FAMILY_small`, `FAMILY_tiny` …
-
-    Args:
-        presets: for a size, the constructor's arguments that only its models have.
-        options: the arguments of every size, "image_size" where all images must have one.
-    """
+    """Decorates a model's class: `create_model` makes it as `FAMILY_small`, `FAMILY_tiny` … with
+    the options of every size and the presets of its own. "image_size" is an option of those whose
+    images must all have one."""
 
     def register(model: _Class) -> _Class:
         for size, common in _SIZES.items():
@@ -69,7 +66,13 @@ def create_model(
         raise ValueError("out_indices and output_fmt need features_only=True")
     kind = model_class(name)
     if compat is not None:
-        kind = _form(kind, compat)
+        forms = import_module("darswin.compat").FORMS  # when asked for: the room lies above
+        if compat not in forms or not issubclass(forms[compat], kind):
+            raise ValueError(
+                f"compat must be None, or one of {tuple(forms)} for DarSwin; got {compat!r} for "
+                f"{kind.__name__}"
+            )
+        kind = forms[compat]
     model = kind(**(_MODELS[name][1] | options))
     model.pretrained_cfg["architecture"] = name
     if not features_only:
@@ -90,19 +93,6 @@ def has_image_size(name: str) -> bool:
     """True if models of this name take images of one size only, the option `image_size`."""
     model_class(name)
     return "image_size" in _MODELS[name][1]
-
-
-def _form(kind: type[Model], compat: str) -> type[Model]:
-    """The class that `compat` names in place of `kind`; looked up when it is asked for, as the room
-    lies above this one."""
-    forms = import_module("darswin.compat").FORMS
-    form = forms.get(compat)
-    if form is None or not issubclass(form, kind):
-        raise ValueError(
-            f"compat must be None, or one of {tuple(forms)} for DarSwin; got {compat!r} for "
-            f"{kind.__name__}"
-        )
-    return form
 
 
 def list_pretrained() -> list[str]:

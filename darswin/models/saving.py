@@ -75,11 +75,7 @@ def save_model(path: str | os.PathLike, weights: Mapping[str, Tensor], card: Mod
 
 
 def model_of_run(run: str | os.PathLike, suffix: str = ".safetensors") -> Path:
-    """The best model of a run of `darswin fit`, or, before there is one, the last.
-
-    Raises:
-        FileNotFoundError: neither.
-    """
+    """The best model of a run of `darswin fit`, or, before there is one, the last."""
     folder = Path(run) / "checkpoints"
     for name in ("best", "last"):
         if (path := folder / f"{name}{suffix}").exists():

@@ -11,8 +11,7 @@ Pair = tuple[int, int]
 
 @dataclass(frozen=True)
 class StagePlan:
-    """Sizes of a stage: its number, from 0, its map (R, A), its windows, the shift of its odd
-    blocks, and the merging that leads to it."""
+    """The sizes of a stage; the shift is that of its odd blocks, the merging leads to it."""
 
     index: int
     map_size: Pair
@@ -36,13 +35,10 @@ def plan_stages(
 ) -> list[StagePlan]:
     """The stages' sizes; ValueError where a window or a merging does not divide its map.
 
-    `merges` are those before each stage but the first; None means those of the variant.
-
     A window keeps its number of tokens when an axis runs out. DarSwin-A merges 4 along azimuth,
     once the ring is used up along the radius; it shifts by a quarter window along azimuth, or,
-    where one window spans the ring, by half along the radius. DarSwin-RA merges 2×2 and shifts by
-    half the window along both axes. There is no shift along an axis that one window spans. Swin's
-    sizes, with rows and columns for rings and sectors, are those of DarSwin-RA.
+    where one window spans the ring, by half along the radius. DarSwin-RA, and so Swin, merges 2×2
+    and shifts by half the window along both axes, but not along an axis that one window spans.
     """
     if merges is not None and len(merges) != count - 1:
         raise ValueError(

@@ -28,11 +28,7 @@ _PLAIN: Presets = dict(nano=_NANO)
 
 
 class PatchExpand(nn.Module):
-    """Splits each token into m_r × m_φ neighbours, the inverse of `PatchMerging`: a linear layer,
-    then a LayerNorm.
-
-    Source: Swin-Unet, ECCV 2022 workshops, sec. 3.4.
-    """
+    """Splits each token into m_r × m_φ, as Swin-Unet's sec. 3.4: the inverse of `PatchMerging`."""
 
     def __init__(self, dim: int, out_dim: int, split: Pair):
         super().__init__()
@@ -54,10 +50,7 @@ class PatchExpand(nn.Module):
 
 
 class SkipJoin(nn.Module):
-    """Splits the tokens of a map, and joins them with the encoder's map of that resolution.
-
-    Source: Swin-Unet, ECCV 2022 workshops, sec. 3.5.
-    """
+    """Splits the tokens of a map, and joins them with the encoder's map of that resolution."""
 
     def __init__(self, dim: int, split: Pair):
         super().__init__()
@@ -70,8 +63,7 @@ class SkipJoin(nn.Module):
 
 
 class Decoder(nn.Module):
-    """Mirrors an encoder: for each stage on the way back a `SkipJoin` that undoes its merging, then
-    blocks on its windows; at the end ×4 along both axes."""
+    """Mirrors an encoder: each stage is a `SkipJoin`, then blocks; at the end ×4 on both axes."""
 
     def __init__(self, encoder: DarSwin | Swin, depths: int | Sequence[int]):
         super().__init__()
@@ -93,8 +85,7 @@ class Decoder(nn.Module):
     def forward(
         self, maps: Sequence[Tensor], positions: Sequence[Sequence[Tensor | None]]
     ) -> Tensor:
-        """The encoder's maps, (B, R, A, D) the first, and the `positions` of all but the last, as
-        `Prepared` has them → (B, 4·R, 4·A, D)."""
+        """The encoder's maps, and `positions` for all but the last → (B, 4·R, 4·A, D)."""
         x = maps[-1]
         steps = zip(self.joins, self.stages, maps[:-1], positions, strict=True)
         for join, stage, skip, of_stage in reversed(list(steps)):
@@ -103,11 +94,9 @@ class Decoder(nn.Module):
 
 
 class PixelHead(nn.Module):
-    """The decoder's map → K logits of each pixel, refined by what the image shows there.
+    """The decoder's map → K logits of each pixel, refined by what the image shows there."""
 
-    The map is projected (`proj`) before it is brought to the pixels, which is the same as after it,
-    to rounding, and cheaper; then come `refine` and `finish`.
-    """
+    # The map is projected before it is brought to the pixels: the same as after it, and cheaper.
 
     def __init__(self, dim: int, channels: int, in_chans: int, skip_width: int):
         super().__init__()
@@ -137,8 +126,7 @@ class PixelHead(nn.Module):
 
 
 class DistanceHead(PixelHead):
-    """Distances along the ray, in metres: `typical_distance` times e^x, with x bounded smoothly, so
-    that the distance is above 0 and finite."""
+    """Distances, m: `typical_distance` times e^x, with x bounded, so above 0 and finite."""
 
     def __init__(self, dim: int, in_chans: int, skip_width: int, typical_distance: float):
         super().__init__(dim, 1, in_chans, skip_width)
@@ -157,17 +145,11 @@ class DistanceHead(PixelHead):
 
 
 class UnetPrepared(NamedTuple):
-    """All that the lenses alone decide about images of one size: `Unet.prepare` computes it.
-
-    Args:
-        encoder: of `Encoder.prepare`.
-        positions: for each stage of the decoder, the input of its position biases.
-        way: from the images to the view that the model has of them, and back.
-    """
+    """All that the lenses alone decide about images of one size."""
 
     encoder: Prepared
-    positions: Sequence[Sequence[Tensor | None]]
-    way: Way
+    positions: Sequence[Sequence[Tensor | None]]  # of the decoder's stages
+    way: Way  # to the view of the images, and back
 
 
 @register_model("darswin_unet_a", variant="A", presets=_POLAR)
@@ -184,19 +166,15 @@ class Unet(Model):
     encoder's first; its projection to the classes is brought to the pixels, and refined by a few
     convolutions that see the image too, since the map is coarser than the image.
 
-    The `view` says what the network looks at, and with which encoder:
+    The `view` is what the network looks at:
 
-    - "polar" is DarSwin-Unet: DarSwin reads images of any size through any lens, and
-      `polar_to_image` brings the map back;
-    - "none" is Swin-Unet: Swin takes the images as they are and ignores the lens;
-    - "perspective" is Swin-Unet on perspective views; pixels beyond them are 0: unknown;
-    - "square" is Swin-Unet on the image disc as a square, as `LensAdapter` makes it, with distances
-      that are brought back before they are positive, as logarithms.
+    - "polar", DarSwin-Unet: DarSwin reads images of any size through any lens;
+    - "none", Swin-Unet: Swin takes the images as they are and ignores the lens;
+    - "perspective", Swin-Unet on perspective views; pixels beyond them are 0: unknown;
+    - "square", Swin-Unet on the image disc as a square, as `LensAdapter` makes it.
 
-    The encoder is a classifier without its head, and takes the weights of one of the same options:
-
-        classifier.reset_classifier(0)
-        model.encoder.load_state_dict(classifier.state_dict())
+    The encoder is a classifier without its head, whose weights it takes:
+    `classifier.reset_classifier(0)`, `model.encoder.load_state_dict(classifier.state_dict())`.
 
     Args:
         num_classes: of "segmentation"; "distance" ignores it. in_chans: C of the images.
@@ -211,19 +189,16 @@ class Unet(Model):
         options: of the encoder: of `DarSwin` for "polar"; else of `Swin`, where image_size is 128
             and patch_size is 4 by default, with those of the view.
 
-    The models of a size have as many parameters, to 1 %. "darswin_unet_*_nano" has R×A = 16×64,
-    unlike the classifier of that size.
+    "darswin_unet_*_nano" has R×A = 16×64, unlike the classifier of that size.
 
     Rotation:
-        In eval mode, without `places` and without the skip from the image (skip_width=0), whose
-        convolutions are not symmetric, a turn of a square image about the principal point by 90°
-        turns the result by 90°, up to rounding, where it turns the maps of `DarSwin`: for
-        "darswin_unet_ra_nano", and with `periodic_bias` for RA of every size and
-        "darswin_unet_a_nano". A pixel at the very middle has no azimuth and is left out.
+        In eval mode, without `places` and the skip (skip_width=0), whose convolutions are not
+        symmetric, a turn of a square image about the principal point by 90° turns the result, up
+        to rounding, where it turns the maps of `DarSwin`: for "darswin_unet_ra_nano", and with
+        `periodic_bias` for RA of every size and "darswin_unet_a_nano".
 
     Attributes:
         encoder, decoder: of maps. segmentation_head or distance_head: from maps to pixels.
-        num_classes: K of the logits; 1 for distances.
         feature_info, pretrained_cfg: as `Model`, of the encoder.
 
     Raises:

@@ -25,15 +25,10 @@ ViewName = Literal["none", "perspective", "square"]
 
 
 class Way(NamedTuple):
-    """The way to a view and back, as the lenses decide it.
+    """The way to a view and back, as the lenses decide it."""
 
-    Args:
-        there: (N, H', W', 2) px, where the images show each pixel of the view; None where the view
-            is the images. back: whatever the view's `to_pixels` and `back` take.
-    """
-
-    there: Tensor | None
-    back: Any
+    there: Tensor | None  # (N, H', W', 2) px of the images; None where they are the view
+    back: Any  # what the view's `to_pixels` and `back` take
 
 
 class PlainView:
@@ -56,8 +51,7 @@ class PlainView:
         return sample_at(images, there)
 
     def token_places(self, sizes: Sequence[Pair], back: Any, like: Tensor) -> list[Tensor]:
-        """Places of the tokens of maps of these sizes in the view, x and y in [-1, 1]:
-        (1, H', W', 2) each."""
+        """Places of the tokens of maps in the view, x and y in [-1, 1]: (1, H', W', 2) each."""
         sides = ([_centers(side, like.device) for side in size] for size in sizes)
         return [torch.stack(torch.meshgrid(x, y, indexing="xy"), -1)[None] for y, x in sides]
 
@@ -79,13 +73,8 @@ def _centers(count: int, device: torch.device) -> Tensor:
 
 
 class PerspectiveView(PlainView):
-    """The perspective view of each image, which its lens gives; pixels beyond it are 0.
-
-    It has the lens's field of view, θ_max at half the image's shorter side. A perspective lens ends
-    below 180° and shrinks the middle long before: of a wider lens it shows the middle `max_fov`.
-
-    Source: "Swin (undis)" of DarSwin, ICCV 2023, sec. 5.1.
-    """
+    """The perspective view of each image, with the lens's field of view or, of a wider lens, its
+    middle `max_fov`; pixels beyond it are 0."""
 
     def __init__(self, size: Pair, max_fov: float = math.radians(175)):
         super().__init__(size)
@@ -104,13 +93,8 @@ class PerspectiveView(PlainView):
 
 
 class SquareView(PlainView):
-    """The image disc as a square, by the concentric map; pixels that no ray reaches are 0.
-
-    Equal steps of `spacing` are at equal distances from the middle of the square, whatever the
-    lens.
-
-    Source: the concentric map of Shirley and Chiu, JGT 1997.
-    """
+    """The image disc as a square, by the concentric map of Shirley and Chiu (JGT 1997), equal steps
+    of `spacing` being equal distances there; pixels that no ray reaches are 0."""
 
     def __init__(self, size: Pair, spacing: Spacing = "theta"):
         super().__init__(size)
@@ -130,17 +114,12 @@ class SquareView(PlainView):
 
 
 class PolarView(PlainView):
-    """The polar maps of DarSwin, whose encoder reads the images itself.
+    """The polar maps of DarSwin, whose encoder reads the images itself."""
 
-    Args:
-        spec: of the encoder's grid. split: how many rings of the finest map are one of its rings.
-        sizes: of the maps whose tokens have places, the directions in which they look.
-    """
-
-    coordinates = 3
+    coordinates = 3  # the direction in which a token looks
 
     def __init__(self, spec: PolarGridSpec, split: int, sizes: Sequence[Pair]):
-        self.spec, self.split = spec, split
+        self.spec, self.split = spec, split  # of each ring, in the map that is brought back
         self.specs = [replace(spec, rings=rings, sectors=sectors) for rings, sectors in sizes]
 
     def prepare(self, lens: Lens | None, size: Pair, *, both: bool = True) -> Way:

@@ -31,8 +31,14 @@ MODELS = {
     "swin_nano": dict(image_size=64),
     "swin_undis_nano": dict(image_size=64),
     "dat_nano": dict(image_size=64),
+    "darswin_unet_a_nano": dict(task="distance"),
+    "swin_unet_undis_nano": dict(task="distance", image_size=64),
 }
-DENSE = {"darswin_unet_a_nano": {}, "swin_unet_undis_nano": dict(image_size=64)}
+CALLS = [(name, "spherical") for name in MODELS] + [
+    (name, kind)
+    for name in ("darswin_a_nano", "darswin_unet_a_nano", "swin_unet_undis_nano")
+    for kind in ("of an image size", "curves", "tangential", "affine")
+]
 
 
 def network(name, **options):
@@ -43,28 +49,13 @@ def images(dtype=torch.float32, size=64):
     return torch.empty(2, 3, size, size, device="meta", dtype=dtype)
 
 
-@pytest.mark.parametrize("kind", LENSES)
-def test_no_lens_is_waited_for(kind):
-    model, lenses = network("darswin_a_nano", num_classes=3).eval(), LENSES[kind].to("meta")
-    with Launches():
-        assert model(images(), lenses).shape == (2, 3)
-
-
 @pytest.mark.parametrize("dtype", [torch.float32, torch.uint8])
-@pytest.mark.parametrize("name", MODELS)
-def test_no_classifier_waits_in_a_step(name, dtype):
-    model = network(name, num_classes=3, mean=[0.4, 0.5, 0.6], std=0.2, **MODELS[name])
-    lenses = SPHERICAL.to("meta")
+@pytest.mark.parametrize(("name", "kind"), CALLS)
+def test_no_model_waits_in_a_step(name, kind, dtype):
+    model = network(name, mean=[0.4, 0.5, 0.6], std=0.2, **MODELS[name])
+    lenses = LENSES[kind].to("meta")
     with Launches():
         model(images(dtype), lenses).square().mean().backward()
-
-
-@pytest.mark.parametrize("kind", LENSES)
-@pytest.mark.parametrize("name", DENSE)
-def test_no_dense_model_waits_in_a_step(name, kind):
-    model, lenses = network(name, task="distance", **DENSE[name]), LENSES[kind].to("meta")
-    with Launches():
-        model(images(), lenses).mean().backward()
 
 
 def attach(task, net, monkeypatch, **data):

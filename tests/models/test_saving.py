@@ -4,59 +4,48 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from darswin.lens import Spherical
-from darswin.models.saving import ModelCard, load_model, read_card, save_model
+from darswin.models.saving import ModelCard, load_model, read_card
 
 CARD = ModelCard(
     "darswin_a_nano", {"num_classes": 3, "in_chans": 1, "spacing": "tan"}, ["a", "b", "c"], 32, 2.9
 )
 
 
-def test_a_saved_model_computes_the_same(tmp_path):
-    model = CARD.create().eval()
-    save_model(tmp_path / "m.safetensors", model.state_dict(), CARD)
-    loaded, card = load_model(tmp_path / "m.safetensors")
-    assert card == CARD and not loaded.training
-    images, lens = torch.rand(2, 1, 32, 32), Spherical.from_fov(0.3, 2.9, 16)
-    assert torch.equal(loaded(images, lens), model(images, lens))
-
-
-def test_what_is_no_model_of_ours(tmp_path):
-    path = tmp_path / "m.safetensors"
-    path.write_bytes(b"no model")
-    with pytest.raises(ValueError, match=r"m\.safetensors is no safetensors file"):
-        load_model(path)
-    weights = CARD.create().state_dict()
-    save_file(weights, path)
-    with pytest.raises(ValueError, match="not the name of their model"):
-        load_model(path)
-    for entry in ('{"model": 1}', "[]", "{", json.dumps(dict(vars(CARD), model="os.system"))):
-        save_file(weights, path, metadata={"darswin": entry})
-        with pytest.raises(ValueError, match="no model that this darswin can build"):
-            load_model(path)
-    save_model(path, {"head.weight": torch.zeros(2, 2)}, CARD)
-    with pytest.raises(ValueError, match="no model that this darswin can build"):
-        load_model(path)
-    with pytest.raises(FileNotFoundError):
-        load_model(tmp_path / "nothing.safetensors")
+@pytest.fixture(scope="module")
+def weights():
+    return CARD.create().state_dict()
 
 
 def write(path, weights, **changes):
-    said = json.dumps(dict(vars(CARD)) | changes)
-    save_file(weights, path, metadata={"darswin": said})
+    entry = json.dumps(dict(vars(CARD)) | changes)
+    save_file(weights, path, metadata={"darswin": entry})
 
 
 def refusal(path):
-    """What `load_model` says of a file, in one line."""
+    """The error of `load_model` for a file, in one line."""
     with pytest.raises(ValueError, match="is no model that this darswin can build: ") as error:
         load_model(path)
     assert type(error.value) is ValueError and "\n" not in str(error.value)
     return str(error.value)
 
 
-def test_other_weights_are_named_in_a_sentence(tmp_path):
-    path, weights = tmp_path / "m.safetensors", CARD.create().state_dict()
-    assert "head.bias" in weights
+def test_files_that_are_no_model_of_ours(weights, tmp_path):
+    path = tmp_path / "m.safetensors"
+    with pytest.raises(FileNotFoundError):
+        load_model(path)
+    path.write_bytes(b"no model")
+    with pytest.raises(ValueError, match=r"m\.safetensors is no safetensors file"):
+        load_model(path)
+    save_file(weights, path)
+    with pytest.raises(ValueError, match="not the name of their model"):
+        load_model(path)
+    for entry in ('{"model": 1}', "[]", "{", json.dumps(dict(vars(CARD), model="os.system"))):
+        save_file(weights, path, metadata={"darswin": entry})
+        refusal(path)
+
+
+def test_other_weights_are_named_in_a_sentence(weights, tmp_path):
+    path = tmp_path / "m.safetensors"
     write(path, {name: tensor for name, tensor in weights.items() if name != "head.bias"})
     assert 'Missing key(s) in state_dict: "head.bias"' in refusal(path)
     write(path, weights | {"more": torch.zeros(1)})
@@ -69,9 +58,8 @@ WRONG = (None, True, -1, 0.5, "x", [], [1], {}, {"a": None}, [[None]], float("na
 
 
 @pytest.mark.parametrize("field", vars(CARD))
-def test_a_card_with_a_wrong_value_is_refused_in_a_sentence(field, tmp_path):
-    path, weights = tmp_path / "m.safetensors", CARD.create().state_dict()
-    refused = []
+def test_a_card_with_a_wrong_value_is_refused_in_a_sentence(field, weights, tmp_path):
+    path, refused = tmp_path / "m.safetensors", []
     for value in WRONG:
         write(path, weights, **{field: value})
         try:
@@ -87,8 +75,8 @@ def test_a_card_with_a_wrong_value_is_refused_in_a_sentence(field, tmp_path):
 
 @pytest.mark.parametrize("option", ["num_classes", "in_chans", "spacing", "embed_dim", "depths",
                                     "num_heads", "mean", "x"])  # fmt: skip
-def test_options_of_a_wrong_kind_are_refused_in_a_sentence(option, tmp_path):
-    path, weights = tmp_path / "m.safetensors", CARD.create().state_dict()
+def test_options_of_a_wrong_kind_are_refused_in_a_sentence(option, weights, tmp_path):
+    path = tmp_path / "m.safetensors"
     for value in (*WRONG, "a", [None, 1]):
         write(path, weights, options=dict(CARD.options) | {option: value})
         try:
@@ -97,8 +85,8 @@ def test_options_of_a_wrong_kind_are_refused_in_a_sentence(option, tmp_path):
             refusal(path)
 
 
-def test_an_older_file_lacks_what_came_later(tmp_path):
+def test_an_older_file_lacks_what_came_later(weights, tmp_path):
     path, older = tmp_path / "m.safetensors", dict(vars(CARD))
     del older["fit"]
-    save_file(CARD.create().state_dict(), path, metadata={"darswin": json.dumps(older)})
+    save_file(weights, path, metadata={"darswin": json.dumps(older)})
     assert load_model(path)[1] == CARD and CARD.fit == "whole"
