@@ -34,8 +34,10 @@ MODELS = {
     "darswin_unet_a_nano": dict(task="distance"),
     "swin_unet_undis_nano": dict(task="distance", image_size=64),
 }
-CALLS = [(name, "spherical") for name in MODELS] + [
-    (name, kind)
+CALLS = [
+    (name, "spherical", dtype) for name in MODELS for dtype in (torch.float32, torch.uint8)
+] + [
+    (name, kind, torch.float32)
     for name in ("darswin_a_nano", "darswin_unet_a_nano", "swin_unet_undis_nano")
     for kind in ("of an image size", "curves", "tangential", "affine")
 ]
@@ -49,8 +51,7 @@ def images(dtype=torch.float32, size=64):
     return torch.empty(2, 3, size, size, device="meta", dtype=dtype)
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.uint8])
-@pytest.mark.parametrize(("name", "kind"), CALLS)
+@pytest.mark.parametrize(("name", "kind", "dtype"), CALLS)
 def test_no_model_waits_in_a_step(name, kind, dtype):
     model = network(name, mean=[0.4, 0.5, 0.6], std=0.2, **MODELS[name])
     lenses = LENSES[kind].to("meta")

@@ -39,6 +39,7 @@ def unseen():
     return images[test], torch.from_numpy(digits.target[test]), images[np.sort(rest)[:256]]
 
 
+@pytest.mark.slow
 def test_digits_reads_through_any_fisheye_as_its_card_says(demo, unseen):
     model, _ = load_model("digits")
     table = re.findall(r"^\|(.+)\|$", pretrained_file("digits", "md").read_text(), re.M)
@@ -59,6 +60,7 @@ def test_digits_reads_through_any_fisheye_as_its_card_says(demo, unseen):
     assert np.mean(lost) <= 0.3 and max(lost) <= 1.0
 
 
+@pytest.mark.slow
 def test_digits_in_picture_files(demo, unseen):
     """8-bit pictures as `darswin predict` reads them, at the accuracies that the card says."""
     model, card = load_model("digits")
