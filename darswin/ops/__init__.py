@@ -6,9 +6,9 @@ another one on several: use `spawn`, or `torch.set_num_threads(1)` in the child.
 """
 
 from darswin.ops import triton
-from darswin.ops._library import cpu_capability, reference_in_use, use_reference
-from darswin.ops.polar_embed import polar_embed
-from darswin.ops.polar_sample import polar_sample
+from darswin.ops._library import reference_in_use, use_reference
+from darswin.ops._module import cpu_capability
+from darswin.ops.polar_sample import polar_embed, polar_sample
 from darswin.ops.polar_to_image import polar_to_image
 from darswin.ops.window_attention import window_attention
 

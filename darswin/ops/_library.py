@@ -9,18 +9,9 @@ from torch import Tensor
 from torch._ops import OpOverload
 from torch.autograd import forward_ad
 
-from darswin.ops import _module, triton
+from darswin.ops import triton
 
 _reference = False
-
-
-def cpu_capability() -> str:
-    """The instruction-set tier that the operators run on: "generic", "avx2" or "avx512".
-
-    It is the best one of this CPU; ATEN_CPU_CAPABILITY (default, avx2, avx512) lowers it, as it
-    does in torch.
-    """
-    return _module.tier()
 
 
 @contextlib.contextmanager
@@ -45,11 +36,8 @@ def reference_in_use() -> bool:
 
 
 def has_kernels(tensor: Tensor) -> bool:
-    """True if operators on `tensor` run the kernels of `darswin.ops.triton` where these compute
-    the given arguments.
-
-    A graph that is exported consists of torch's own operations: it runs without this package.
-    """
+    """True if operators on `tensor` run the kernels for GPUs, where these take the arguments."""
+    # A graph that is exported consists of torch's own operations: it runs without this package.
     usable = triton.INSTALLED and not _reference and not torch.compiler.is_exporting()
     return usable and tensor.device.type == "cuda" and _is_known_gpu(tensor.device.index)
 
@@ -113,14 +101,8 @@ def run(
     kernel_takes: Callable[..., bool],
     *arguments: Any,
 ) -> Tensor:
-    """An operator on checked arguments: compiled on CPU, a kernel on GPUs that have it, otherwise
-    the reference.
-
-    Args:
-        reference: the function of the same name in reference.py.
-        kernel_takes: whether the kernel for GPUs computes these arguments, where `has_kernels`.
-        arguments: of the reference. The operator takes the fields of a `Sampling` one by one.
-    """
+    """An operator on the checked arguments of its reference: compiled on CPU, by a kernel on GPUs
+    if `kernel_takes` them, otherwise by the reference. The fields of a `Sampling` go one by one."""
     first, *others = arguments
     flat = [*first, *others] if isinstance(first, tuple) else arguments
     first = flat[0]
@@ -148,9 +130,9 @@ def _transformed() -> bool:
 def refuse_other_derivatives(operator: object, tensors: Iterable[object]) -> None:
     """NotImplementedError where forward-mode AD or torch.func differentiates one of the tensors.
 
-    The first would silently give zeros, the second an error about the internals of autograd. While
-    a graph is compiled only forward-mode AD is looked for: torch.func.grad fails by itself.
+    The first would silently give zeros, the second an error about the internals of autograd.
     """
+    # While a graph is compiled torch.func.grad fails by itself.
     forward = forward_ad._current_level >= 0
     functional = not torch.compiler.is_compiling() and _transformed()
     if not forward and not functional:
@@ -188,8 +170,7 @@ def _unwrapped(tensor: Tensor) -> tuple[bool, Tensor]:
 def empty_gradients(
     arguments: Sequence[Any], groups: dict[int, int], wanted: Sequence[bool]
 ) -> tuple[Tensor, ...]:
-    """Empty gradients of arguments, as backward gives them: of size (0,) where they are not wanted
-    or the argument is None. `groups` as in `register_gradients`."""
+    """Empty gradients as backward gives them: of size (0,) for None and where not wanted."""
     gradients = []
     for index, group in groups.items():
         value = arguments[index]
@@ -202,16 +183,11 @@ def empty_gradients(
 def register_gradients(
     name: str, groups: dict[int, int], fake: Callable[..., tuple[Tensor, ...]] | None = None
 ) -> None:
-    """Registers the autograd of an operator, and the fake of its backward. A second derivative is
-    an error.
+    """Registers the autograd of an operator, and the fake of its backward, which may be given.
 
-    Its backward operator takes the operator's first arguments, the gradient of the output, and a
-    bool for each group of gradients: whether one of them is wanted.
-
-    Args:
-        groups: the arguments that have gradients, in the order in which backward gives them, and
-            the group of each. A backward without bools gives all.
-        fake: of backward, where its gradients are not like its arguments.
+    `groups` are the arguments that have gradients, in the order of backward, and the group of each.
+    The backward operator takes the operator's first arguments, the gradient of the output and, for
+    each group, whether one of it is wanted; without these bools it gives all gradients.
     """
     backward = getattr(torch.ops.darswin, f"{name}_backward").default
     names = [argument.name for argument in backward._schema.arguments]

@@ -41,8 +41,12 @@ def load() -> ctypes.CDLL:
     return module
 
 
-def tier() -> str:
-    """The instruction-set tier in use: "generic", "avx2" or "avx512"."""
+def cpu_capability() -> str:
+    """The instruction-set tier that the operators run on: "generic", "avx2" or "avx512".
+
+    It is the best one of this CPU; ATEN_CPU_CAPABILITY (default, avx2, avx512) lowers it, as it
+    does in torch.
+    """
     return _loaded.darswin_tier().decode()
 
 

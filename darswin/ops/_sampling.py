@@ -122,20 +122,17 @@ def _jitter_tensors(jitter: float, seed: int | Tensor) -> tuple[Tensor | None, T
     jitter = check_jitter(jitter)
     if jitter == 0:
         return None, None
-    return torch.tensor(jitter, dtype=torch.float64, device="cpu"), _seed_tensor(seed)
-
-
-def _seed_tensor(seed: int | Tensor) -> Tensor:
+    amount = torch.tensor(jitter, dtype=torch.float64, device="cpu")
     if isinstance(seed, Tensor):
         if seed.dtype != torch.int64 or seed.dim() != 0:
             raise ValueError(
                 f"seed must be an int or a 0-dim int64 tensor, got {seed.dtype} of shape "
                 f"{tuple(seed.shape)}"
             )
-        return seed
+        return amount, seed
     key = as_int(seed)
     if key is None:
         raise TypeError(f"seed must be an int or a 0-dim int64 tensor, got {type(seed).__name__}")
     if not -(2**63) <= key < 2**63:
         raise ValueError(f"seed must fit 64 bits, got {seed}")
-    return torch.tensor(key, dtype=torch.int64, device="cpu")
+    return amount, torch.tensor(key, dtype=torch.int64, device="cpu")

@@ -26,12 +26,8 @@ def check_tensor(
     like: Tensor | None = None,
 ) -> None:
     """TypeError or ValueError unless `value` is a tensor of one of the dtypes and shapes (None: any
-    size), on the device of `like`.
-
-    `form` is the shape in words; its fields, {}, are the known sizes of the first of `shapes`. They
-    are filled in where the error is raised: as an f-string they would tie a graph that is being
-    compiled to these sizes.
-    """
+    size), on the device of `like`. `form` is the shape in words; its fields, {}, are the known
+    sizes of the first of `shapes`."""
     if not isinstance(value, Tensor):
         raise TypeError(f"{name} must be a tensor, got {type(value).__name__}")
     if value.dtype not in dtypes:
@@ -44,6 +40,7 @@ def check_tensor(
     for sizes in shapes:
         if shape == sizes or _fits(shape, sizes):
             return
+    # Filled in here alone: an f-string would tie a graph that is being compiled to these sizes.
     expected = form.format(*(size for size in shapes[0] if size is not None))
     raise ValueError(f"{name} must have shape {expected}, got {shape}")
 
@@ -58,14 +55,10 @@ def _fits(shape: Sequence[int], sizes: Sequence[int | None]) -> bool:
 
 
 def check_rising(name: str, value: Tensor) -> None:
-    """ValueError unless each row of (N, R) is finite, at least 0, and rises.
-
-    Only values that are `readable`, and outside of transforms.
-    """
-    if not readable(value):
-        return
-    transformed = torch._C._functorch.peek_interpreter_stack() is not None
-    if transformed or type(value) not in (Tensor, torch.nn.Parameter):
+    """ValueError unless each row of (N, R) is finite, at least 0, and rises, where it is `readable`
+    and no transform of torch.func is under way."""
+    transformed = torch._C._functorch.peek_interpreter_stack
+    if not readable(value) or transformed() or type(value) not in (Tensor, torch.nn.Parameter):
         return
     rows = value.detach().numpy()
     if not ((rows[:, 1:] > rows[:, :-1]).all() and (rows >= 0).all() and (rows < math.inf).all()):
@@ -114,12 +107,8 @@ def check_pair(name: str, value: Sequence[int], lowest: int) -> tuple[int, int]:
 def channels_first(
     name: str, image: Tensor, channels_last: bool | None = None, channels: int | None = None
 ) -> Tensor:
-    """An image as (B, C, H, W); one that is (B, H, W, C) is not copied.
-
-    With channels_last None an image in floating point is (B, C, H, W), and the channels of a uint8
-    image are its second or its last axis, the one whose size is `channels`, or one of
-    `FRAME_CHANNELS`; ValueError where both have such a size, or neither has.
-    """
+    """A view (B, C, H, W) of an image. With channels_last None, the channels of a uint8 image are
+    the axis, second or last, whose size is `channels`, or one of `FRAME_CHANNELS`."""
     if channels_last is None:
         if image.dtype != torch.uint8:
             return image

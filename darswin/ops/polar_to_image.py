@@ -100,4 +100,5 @@ def _fake(x, radii, center, affine, points, r_max, size, tokens):
     )
 
 
-_library.register_gradients("polar_to_image", {0: 0, 1: 1, 2: 1, 3: 1, 4: 1})
+GRADIENTS = {0: 0, 1: 1, 2: 1, 3: 1, 4: 1}  # of x, and of the lens
+_library.register_gradients("polar_to_image", GRADIENTS)

@@ -26,20 +26,15 @@ DTYPES = (
 )  # fmt: skip
 
 
-# The case whose backward is called, if it is another one.
-OF_BACKWARD = {"polar_to_image": "polar_to_image, points"}
-ROWS = [(3, 4), (3, 4), (4,), (4,)]
-
-
 def valid(name: str) -> list:
     """The arguments of a valid call of an operator."""
     if name == "_add_norm_":
-        return [*(torch.rand(shape) for shape in ROWS), 1e-5]
+        return [*(torch.rand(shape) for shape in ((3, 4), (3, 4), (4,), (4,))), 1e-5]
     if name == "_transpose_sum":
         return [torch.rand(5, 7)]
     public = name.removesuffix("_backward")
-    case = SMALL[public if public == name else OF_BACKWARD.get(public, public)]()
-    _, arguments = raw_calls(case)[public != name]
+    case = "polar_to_image, points" if name == "polar_to_image_backward" else public
+    _, arguments = raw_calls(SMALL[case]())[public != name]
     arguments = [list(a) if isinstance(a, tuple) else a for a in arguments]
     return [a.detach() if isinstance(a, Tensor) else a for a in arguments]
 

@@ -92,15 +92,9 @@ def _backward(image, radii, azimuths, center, affine, offsets, jitter, seed, sca
     if image_sums is not None:
         image_sums += b * CHANNELS * height * width
         unit = near_one(tl.load(largest + b))
-    along_sum = tl.zeros([BLOCK], tl.float32)
-    inward_sum = tl.zeros([BLOCK], tl.float32)
-    outward_sum = tl.zeros([BLOCK], tl.float32)
-    x_sum = tl.zeros([BLOCK], tl.float32)
-    y_sum = tl.zeros([BLOCK], tl.float32)
-    xx_sum = tl.zeros([BLOCK], tl.float32)
-    xy_sum = tl.zeros([BLOCK], tl.float32)
-    yx_sum = tl.zeros([BLOCK], tl.float32)
-    yy_sum = tl.zeros([BLOCK], tl.float32)
+    zero = tl.zeros([BLOCK], tl.float32)
+    along_sum, inward_sum, outward_sum, x_sum, y_sum = zero, zero, zero, zero, zero
+    xx_sum, xy_sum, yx_sum, yy_sum = zero, zero, zero, zero
     for start in range(0, COLUMNS, BLOCK):
         j = start + tl.arange(0, BLOCK)
         mask = j < COLUMNS
@@ -152,15 +146,9 @@ def _backward(image, radii, azimuths, center, affine, offsets, jitter, seed, sca
                 yy_sum += tl.where(touches, by_y * south, 0.0)
     if lens_sums is not None:
         to = lens_sums + tl.program_id(0).to(tl.int64) * LENS_SUMS
-        tl.store(to, tl.sum(along_sum))
-        tl.store(to + 1, tl.sum(inward_sum))
-        tl.store(to + 2, tl.sum(outward_sum))
-        tl.store(to + 3, tl.sum(x_sum))
-        tl.store(to + 4, tl.sum(y_sum))
-        tl.store(to + 5, tl.sum(xx_sum))
-        tl.store(to + 6, tl.sum(xy_sum))
-        tl.store(to + 7, tl.sum(yx_sum))
-        tl.store(to + 8, tl.sum(yy_sum))
+        sums = (along_sum, inward_sum, outward_sum, x_sum, y_sum, xx_sum, xy_sum, yx_sum, yy_sum)
+        for n in tl.static_range(LENS_SUMS):
+            tl.store(to + n, tl.sum(sums[n]))
 
 
 def _arguments(sampling: Sampling) -> tuple[Any, ...]:

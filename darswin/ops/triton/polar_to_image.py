@@ -13,6 +13,8 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
+from darswin.ops._library import empty_gradients
+from darswin.ops.polar_to_image import GRADIENTS
 from darswin.ops.triton import fixed_point
 from darswin.ops.triton.fixed_point import like, near_one
 
@@ -221,12 +223,9 @@ def _backward(x, radii, center, affine, points, r_max, steps, rings, height, wid
         else:
             from_x, from_y = tl.where(moves, from_x, 0.0), tl.where(moves, from_y, 0.0)
             to = plane_sums + tl.program_id(0).to(tl.int64) * 6
-            tl.store(to, tl.sum(by_x))
-            tl.store(to + 1, tl.sum(by_y))
-            tl.store(to + 2, tl.sum(by_x * from_x))
-            tl.store(to + 3, tl.sum(by_x * from_y))
-            tl.store(to + 4, tl.sum(by_y * from_x))
-            tl.store(to + 5, tl.sum(by_y * from_y))
+            sums = (by_x, by_y, by_x * from_x, by_x * from_y, by_y * from_x, by_y * from_y)
+            for n in tl.static_range(6):
+                tl.store(to + n, tl.sum(sums[n]))
 
 
 def _arguments(x: Tensor, lens: Sequence[Tensor | None], size: Sequence[int]) -> tuple[Any, ...]:
@@ -246,47 +245,26 @@ def _options(x: Tensor, tokens: bool, most_channels: int) -> dict[str, Any]:
     )  # fmt: skip
 
 
-def polar_to_image(
-    x: Tensor,
-    radii: Tensor,
-    center: Tensor | None,
-    affine: Tensor | None,
-    points: Tensor | None,
-    r_max: Tensor | None,
-    size: Sequence[int],
-    tokens: bool,
-) -> Tensor:
+def polar_to_image(x: Tensor, *arguments: Any) -> Tensor:
     """`darswin::polar_to_image`, one launch."""
+    *lens, size, tokens = arguments
     (batch, _, _, channels), (height, width) = x.shape, size
     shape = (batch, height, width, channels) if tokens else (batch, channels, height, width)
     out = x.new_empty(shape)
     if out.numel() > 0:
-        lens = (radii, center, affine, points, r_max)
         _forward[(batch * triton.cdiv(height * width, BLOCK),)](
             *_arguments(x, lens, size), out, BLOCK=BLOCK, **_options(x, tokens, CHUNK)
         )
     return out
 
 
-def polar_to_image_backward(
-    x: Tensor,
-    radii: Tensor,
-    center: Tensor | None,
-    affine: Tensor | None,
-    points: Tensor | None,
-    r_max: Tensor | None,
-    size: Sequence[int],
-    tokens: bool,
-    grad_out: Tensor,
-    x_grad: bool,
-    lens_grad: bool,
-) -> tuple[Tensor, ...]:
+def polar_to_image_backward(x: Tensor, *arguments: Any) -> tuple[Tensor, ...]:
     """`darswin::polar_to_image_backward`: of x, radii, center, affine and points."""
-    lens = (radii, center, affine, points)
-    wanted = [t if lens_grad else None for t in lens]
+    *lens, size, tokens, grad_out, x_grad, lens_grad = arguments
+    radii, center, affine, points, _ = lens
+    gradients = empty_gradients((x, *lens), GRADIENTS, (x_grad, lens_grad))
     if grad_out.numel() == 0:
-        grads = [radii.new_zeros((0,) if t is None else t.shape) for t in wanted]
-        return x.new_zeros(x.shape if x_grad else (0,)), *grads
+        return tuple(gradient.zero_() for gradient in gradients)
     batch, (height, width) = len(x), size
     programs = batch * triton.cdiv(height * width, BACKWARD_BLOCK)
     bits = fixed_point.bits(height * width)
@@ -301,14 +279,13 @@ def polar_to_image_backward(
         else:
             of_points = radii.new_empty((batch, height, width, 2))
     _backward[(programs,)](
-        *_arguments(x, (*lens, r_max), size), grad_out.contiguous(), largest, map_sums, ring_sums,
+        *_arguments(x, lens, size), grad_out.contiguous(), largest, map_sums, ring_sums,
         plane_sums, of_points, BITS=bits, BLOCK=BACKWARD_BLOCK,
         **_options(x, tokens, BACKWARD_CHUNK),
     )  # fmt: skip
-    grad_x = x.new_empty(x.shape if x_grad else (0,))
+    grad_x, *grads = gradients
     if map_sums is not None and largest is not None:
         fixed_point.finish(map_sums, largest, grad_x, bits)
-    grads = [radii.new_empty((0,)) for _ in lens]
     if ring_sums is not None:
         rings = ring_sums.view(batch, -1, x.shape[1])
         grads[0] = like(rings.sum(1, dtype=torch.float64), radii)

@@ -166,13 +166,10 @@ def _fold(grad_pairs, grad_bias, M_R: tl.constexpr, M_A: tl.constexpr, ENTRIES: 
     tl.store(grad_bias + table * SIZE + entry, total, mask=entry < SIZE)
 
 
-def _map(
-    qkv: Tensor,
-    bias: Tensor,
-    window: Sequence[int],
-    shift: Sequence[int],
-    periodic: Sequence[int],
-) -> _Map:
+Pair = Sequence[int]
+
+
+def _map(qkv: Tensor, bias: Tensor, window: Pair, shift: Pair, periodic: Pair) -> _Map:
     batch, rings, sectors, _, heads, _ = qkv.shape
     windows = (rings // window[0]) * (sectors // window[1])
     chunk = min(max(batch * heads * windows // PROGRAMS, 1), windows)
@@ -184,7 +181,7 @@ def _map(
     )  # fmt: skip
 
 
-def _constants(qkv: Tensor, window: Sequence[int]) -> dict[str, Any]:
+def _constants(qkv: Tensor, window: Pair) -> dict[str, Any]:
     """The constants that a kernel is compiled for."""
     tokens, head_dim = window[0] * window[1], qkv.shape[5]
     # The tensor cores multiply numbers that came in 16 bits exactly, and float32 probabilities in
@@ -200,12 +197,7 @@ def _constants(qkv: Tensor, window: Sequence[int]) -> dict[str, Any]:
 
 
 def window_attention(
-    qkv: Tensor,
-    bias: Tensor,
-    window: Sequence[int],
-    shift: Sequence[int],
-    periodic: Sequence[int],
-    scale: float,
+    qkv: Tensor, bias: Tensor, window: Pair, shift: Pair, periodic: Pair, scale: float
 ) -> Tensor:
     """`darswin::window_attention`."""
     qkv, bias = qkv.contiguous(), bias.contiguous()
@@ -218,14 +210,9 @@ def window_attention(
 
 
 def window_attention_backward(
-    qkv: Tensor,
-    bias: Tensor,
-    window: Sequence[int],
-    shift: Sequence[int],
-    periodic: Sequence[int],
-    scale: float,
+    qkv: Tensor, bias: Tensor, window: Pair, shift: Pair, periodic: Pair, scale: float,
     grad_out: Tensor,
-) -> tuple[Tensor, Tensor]:
+) -> tuple[Tensor, Tensor]:  # fmt: skip
     """`darswin::window_attention_backward`: of qkv and bias. Each sum has one order: a program adds
     up the pairs of its windows, torch adds up programs, `_fold` gathers an entry's pairs."""
     qkv, bias, grad_out = qkv.contiguous(), bias.contiguous(), grad_out.contiguous()
