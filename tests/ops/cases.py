@@ -345,7 +345,7 @@ def polar_map(
 
 NEAR = dict(size=(31, 33), rows=40, columns=64)
 # More tokens a block than their first rows had room for, and tokens of a single row.
-FEW = dict(size=(12, 12), rows=2, batch=1)
+FEW = dict(size=(40, 42), rows=8, batch=1)
 SAMPLING = {
     "plain": dict(),
     "shared lens": dict(batch=5, shared=True, samples=(2, 2)),
@@ -376,7 +376,7 @@ SAMPLING = {
     "long rows": dict(size=(31, 33), rows=2, columns=3001, batch=1, samples=(1, 3001)),
     "two points a token": FEW | dict(columns=600, samples=(1, 2)),
     "five points a token": FEW | dict(columns=1500, samples=(1, 5), channels=1),
-    "two radii a token": FEW | dict(columns=1024, samples=(2, 1), channels=4),
+    "two radii a token": FEW | dict(columns=512, samples=(2, 1), channels=4),
     "long tokens": dict(size=(31, 33), rows=60, columns=120, batch=1, samples=(60, 60)),
 }  # fmt: skip
 SAMPLING_WITH = {
