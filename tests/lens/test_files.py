@@ -362,6 +362,11 @@ DIVIDED = dict(radial=[0.2, 0.05, 0.003], denominator=[0.25, 0.04, 0.002])
         (f"height: 960\nwidth: 1280\ndistortion_model: plumb_bob\nD: {PLUMB_BOB}\n"
          f"K: {K[0] + K[1] + K[2]}\n", {}, PLUMB),
         *((ROS2 + end, {}, ECHOED) for end in ("", "\n---\n---\n\n", "...\n", "\r\n---\r\n")),
+        (file_text("kalibr_fov.yaml").replace("0.92", "0"), dict(camera="cam0"),
+         dict(model="Perspective", center=[255.5, 254.5])),
+        # A θ_max that was rounded beyond the limit.
+        ('{"model": "Equidistant", "focal": 300, "theta_max": 3.14159265}', {},
+         dict(model="Equidistant", focal=300.0)),
         # Which model.
         (opencv(D=[], fisheye=0), {}, dict(model="Perspective")),
         (opencv(), dict(model="fisheye"), dict(model="Equidistant")),
