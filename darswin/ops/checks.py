@@ -113,9 +113,10 @@ def channels_first(
         if image.dtype != torch.uint8:
             return image
         shape, sizes = image.shape, FRAME_CHANNELS if channels is None else (channels,)
-        first, last = shape[1] in sizes, shape[3] in sizes
+        # Not compared with ==, which Dynamo cannot do with conditions on symbolic sizes.
+        first, last = bool(shape[1] in sizes), bool(shape[3] in sizes)
         # Where all three sizes are 1, both readings are the same image.
-        if first == last and not (first and shape[1:] == (1, 1, 1)):
+        if (first and last and shape[1:] != (1, 1, 1)) or not (first or last):
             known: object = channels
             hint = ""
             if channels is None:
