@@ -24,6 +24,7 @@ MAX_TABLE = 4 << 20
 MAX_YAML = 128 << 10  # it is parsed at some 100 KB a second
 MAX_XML = 256 << 10
 MAX_DEPTH = 16
+MAX_OPEN = 100  # brackets that YAML opens and does not close
 MAX_ARRAY = 64 << 10  # of an .npz file's, which has a matrix and some coefficients
 MAX_ARRAYS = 256
 
@@ -117,6 +118,8 @@ def _parse_yaml(text: str) -> Mapping:
     lines = text.split("\n")
     while lines and lines[-1].strip() in ("", "---", "..."):  # as `ros2 topic echo` ends
         lines.pop()
+    if len(re.findall(r"[\[{]", text)) - len(re.findall(r"[\]}]", text)) > MAX_OPEN:
+        raise RecursionError  # the parser would need a second to find that
     try:
         content = yaml.load("\n".join(lines), _Loader)
     except (yaml.YAMLError, ValueError, OverflowError) as error:
