@@ -256,6 +256,8 @@ def main() -> None:
 
     python = draw([folder for folder in TESTS if folder != "csrc"], options.python, options.seed)
     cpp = draw(["csrc"], 2 * options.cpp, options.seed)  # some do not compile
+    drawn = {mutant.name for mutant in (*python, *cpp)}  # the code may have changed since
+    results = {name: result for name, result in results.items() if name in drawn}
     with ThreadPoolExecutor(2) as pool:  # the two kinds side by side, on a core each
         parts = [pool.submit(run, cpp, options.cpp), pool.submit(run, python, options.python)]
     for part in parts:

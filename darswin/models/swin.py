@@ -71,5 +71,5 @@ class Swin(Encoder):
 
     def embed(self, images: Tensor, points: Tensor | None) -> Tensor:
         """Images (B, C, H, W), read at the pixels `points` (N, H, W, 2) if any → the first map."""
-        seen = self.view.look(self._floating(images), points)
+        seen = self.view.to_view(self._floating(images), points)
         return self.patch_embed(seen.permute(0, 2, 3, 1))

@@ -299,7 +299,7 @@ class Unet(Model):
 
     def _run(self, images: Tensor, prepared: UnetPrepared) -> Tensor:
         there, back = prepared.way
-        seen = self.view.look(self._floating(images), there)
+        seen = self.view.to_view(self._floating(images), there)
         maps = self.encoder.maps(seen, prepared.encoder)
         maps[-1] = self.encoder.norm(maps[-1])
         if self.places:

@@ -43,7 +43,7 @@ class PlainView:
         """The way from images of (H, W) to the view, and, for `both`, the way back."""
         return Way(None, None)
 
-    def look(self, images: Tensor, there: Tensor | None) -> Tensor:
+    def to_view(self, images: Tensor, there: Tensor | None) -> Tensor:
         """Images (B, C, H, W) in floating point → the view of them."""
         if there is None:
             return images
@@ -202,7 +202,7 @@ class LensAdapter(Model):
             dense = isinstance(out, Tensor) and out.dim() == 4
             return self.view.back(out, prepared.back) if dense else out
 
-        square = self.view.look(images, prepared.there)
+        square = self.view.to_view(images, prepared.there)
         return pytree.tree_map(bring_back, self.network(square))
 
     def extra_repr(self) -> str:

@@ -95,8 +95,12 @@ def test_z_is_that_of_points_in_space(name):
     torch.testing.assert_close(z[seen], points[..., 2][seen])
     assert not z[~seen].any()
     torch.testing.assert_close(z_to_distance(z, lens), torch.where(seen, distance, 0.0))
+
+
+def test_maps_with_a_channel_have_a_lens_each():
+    lens, distance = Spherical([0.2, 0.9], 20.0, 1.2), torch.rand(2, 30, 40)
     with_channel = distance_to_z(distance[:, None], lens)
-    torch.testing.assert_close(with_channel[:, 0], z)
+    torch.testing.assert_close(with_channel, distance_to_z(distance, lens)[:, None])
 
 
 def test_what_is_not_known_stays_so():

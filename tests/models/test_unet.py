@@ -244,6 +244,6 @@ def test_its_encoder_starts_from_a_trained_classifier(classifier, unet, options)
     trained.reset_classifier(0)
     model.encoder.load_state_dict(trained.state_dict())
     if "undis" in classifier:  # the unet makes the view
-        x = model.view.look(x, model.view.prepare(lens, (32, 32)).there)
+        x = model.view.to_view(x, model.view.prepare(lens, (32, 32)).there)
     got = model.encoder.forward_intermediates(x, lens, intermediates_only=True)
     assert all(torch.equal(a, b) for a, b in zip(got, maps, strict=True))

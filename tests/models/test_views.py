@@ -19,6 +19,7 @@ from darswin.lens import (
 )
 from darswin.lens.pixels import reproject
 from darswin.models import LensAdapter
+from darswin.models.views import PlainView
 
 LENSES = Spherical.from_fov([0.2, 0.9], 2.6, 24.0)
 GENERAL = KannalaBrandt(
@@ -231,3 +232,10 @@ def test_adapted_it_is_a_lens_adapter_around_it(spacing):
     got = adapted(images, WIDE)
     assert torch.equal(got, LensAdapter(plain, 64, spacing)(images, WIDE))
     assert (got[:, :, 0, 0] == 0).all() and (got[:, :, 32, 1] != 0).all()
+
+
+def test_tokens_of_a_picture_are_at_the_middles_of_equal_parts():
+    (places,) = PlainView((64, 64)).token_places([(2, 4)], None, torch.zeros(()))
+    x, y = torch.tensor([-0.75, -0.25, 0.25, 0.75]), torch.tensor([-0.5, 0.5])
+    expected = torch.stack(torch.meshgrid(x, y, indexing="xy"), -1)
+    torch.testing.assert_close(places, expected[None])
