@@ -40,7 +40,10 @@ def test_equals_the_reference_in_float64(case):
 
 @every_case
 def test_accuracy_rule(case):
-    assert_accurate(CASES[case], draws=10 if "general" in case[1] else 3)
+    # Few numbers need more draws to measure rounding with: of 900 sums of 576 products the largest
+    # error of three draws varies by a third.
+    draws = 30 if case[1].startswith("deep") else 10 if "general" in case[1] else 3
+    assert_accurate(CASES[case], draws=draws)
 
 
 @every_case
