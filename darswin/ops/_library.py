@@ -116,13 +116,13 @@ def run(
 
 def call(operator: OpOverload, arguments: Iterable[Any]) -> Any:
     """The operator, past autograd where no gradient can be recorded: that saves a third."""
-    if torch.is_grad_enabled() or torch.compiler.is_compiling() or _transformed():
+    if torch.is_grad_enabled() or torch.compiler.is_compiling() or transformed():
         return operator(*arguments)
     with torch._C._AutoDispatchBelowAutograd():
         return operator(*arguments)
 
 
-def _transformed() -> bool:
+def transformed() -> bool:
     """True within a transform of torch.func."""
     return torch._C._functorch.peek_interpreter_stack() is not None
 
@@ -134,7 +134,7 @@ def refuse_other_derivatives(operator: object, tensors: Iterable[object]) -> Non
     """
     # While a graph is compiled torch.func.grad fails by itself.
     forward = forward_ad._current_level >= 0
-    functional = not torch.compiler.is_compiling() and _transformed()
+    functional = not torch.compiler.is_compiling() and transformed()
     if not forward and not functional:
         return
     for tensor in tensors:

@@ -12,6 +12,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from darswin.ops._library import transformed
+
 DTYPES = (torch.float32, torch.float64)
 LAYOUTS = ("tokens", "image")
 FRAME_CHANNELS = (1, 3, 4)  # the numbers of channels that a camera frame can have
@@ -57,7 +59,6 @@ def _fits(shape: Sequence[int], sizes: Sequence[int | None]) -> bool:
 def check_rising(name: str, value: Tensor) -> None:
     """ValueError unless each row of (N, R) is finite, at least 0, and rises, where it is `readable`
     and no transform of torch.func is under way."""
-    transformed = torch._C._functorch.peek_interpreter_stack
     if not readable(value) or transformed() or type(value) not in (Tensor, torch.nn.Parameter):
         return
     rows = value.detach().numpy()
@@ -113,8 +114,7 @@ def channels_first(
         if image.dtype != torch.uint8:
             return image
         shape, sizes = image.shape, FRAME_CHANNELS if channels is None else (channels,)
-        # Not compared with ==, which Dynamo cannot do with conditions on symbolic sizes.
-        first, last = bool(shape[1] in sizes), bool(shape[3] in sizes)
+        first, last = shape[1] in sizes, shape[3] in sizes
         # Where all three sizes are 1, both readings are the same image.
         if (first and last and shape[1:] != (1, 1, 1)) or not (first or last):
             known: object = channels
