@@ -1,7 +1,8 @@
 """Measures the tests: changes one thing in the code at a time, and counts what the tests notice.
 
 A mutant is a copy of the checkout in which one operator, constant, sign, bound or index differs.
-The tests of its folder run on it until the first failure; on the unchanged code they must pass.
+The tests of its folder run on it until the first failure: first those of `make test`, then the
+slow ones that `make test-all` adds. On the unchanged code they must pass.
 `make mutants` draws the mutants with a fixed seed, so the same code gives the same mutants, and
 writes tests/mutants.json. A mutant that survives shows a gap in the tests, or a change that no
 result depends on. The C++ mutants are built for the generic tier alone. A stopped run continues
@@ -27,6 +28,8 @@ ROOT = Path(__file__).resolve().parents[1]
 FOLDER = ROOT / "build" / "mutants"
 RECORD = ROOT / "tests" / "mutants.json"
 SECONDS = 900  # for the tests of a mutant; one that takes longer is killed
+NO_TESTS = 5  # pytest's exit code if it finds none
+SLOW = "slow: "  # starts the result of a mutant that only slow tests notice
 # The folders of tests for each folder of code, the nearest first.
 TESTS = {
     "csrc": ["ops"],
@@ -178,7 +181,7 @@ class Worker:
             shutil.copy2(ROOT / path, target)
         shutil.copy2(ROOT / "darswin" / "libdarswin.so", self.root / "darswin")
 
-    def test(self, mutant: Mutant, marked: str) -> str:
+    def test(self, mutant: Mutant) -> str:
         """ "survived", or the reason why not: the first test that fails, "build" or "time"."""
         file = self.root / mutant.path
         before = file.read_text()
@@ -186,15 +189,18 @@ class Worker:
         try:
             if mutant.path.startswith("csrc") and not self.build():
                 return "build"
-            return self.run_tests(mutant, marked)
+            result = self.run_tests(mutant, "not slow")
+            if result == "survived" and (result := self.run_tests(mutant, "slow")) != "survived":
+                result = SLOW + result
+            return result
         finally:
             file.write_text(before)
             if mutant.path.startswith("csrc"):
                 shutil.copy2(ROOT / "darswin" / "libdarswin.so", self.root / "darswin")
 
-    def check(self, path: str, marked: str) -> str:
+    def check(self, path: str) -> str:
         """The result for a file without a change: "survived" if its tests pass."""
-        return self.test(Mutant(path, 0, "", "", (self.root / path).read_text()), marked)
+        return self.test(Mutant(path, 0, "", "", (self.root / path).read_text()))
 
     def build(self) -> bool:
         """Compiles the generic tier of the copy's module."""
@@ -203,7 +209,7 @@ class Worker:
         return self.call(command, environment).returncode == 0
 
     def run_tests(self, mutant: Mutant, marked: str) -> str:
-        """The tests of the mutant's folder, until the first failure."""
+        """The marked tests of the mutant's folder, until the first failure."""
         folder = folder_of(mutant.path)
         tests = [f"tests/{name}" for name in TESTS[folder]]
         command = [sys.executable, "-m", "pytest", "-x", "-q", "--no-header", "--tb=no", "-rfE"]
@@ -214,7 +220,7 @@ class Worker:
             done = self.call([*command, "-m", marked, *tests], environment)
         except subprocess.TimeoutExpired:
             return "time"
-        if done.returncode == 0:
+        if done.returncode in (0, NO_TESTS):
             return "survived"
         failed = re.search(r"^(?:FAILED|ERROR) (.+?)(?: - .*)?$", done.stdout, re.M)
         return failed[1] if failed else "crash"
@@ -232,7 +238,6 @@ def main() -> None:
     parser.add_argument("--cpp", type=int, default=20, help="number of mutants of csrc/")
     parser.add_argument("--python", type=int, default=40, help="number of mutants of darswin/")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("-m", dest="marked", default="", help="pytest's -m: which tests run")
     parser.add_argument("--out", type=Path, default=RECORD, help="record of the results")
     options = parser.parse_args()
     results: dict[str, str] = json.loads(options.out.read_text()) if options.out.exists() else {}
@@ -246,10 +251,10 @@ def main() -> None:
                 return
             if mutant.name not in results:
                 if (folder := folder_of(mutant.path)) not in sound:
-                    if (failed := worker.check(mutant.path, options.marked)) != "survived":
+                    if (failed := worker.check(mutant.path)) != "survived":
                         sys.exit(f"a test of {folder} fails on the unchanged code: {failed}")
                     sound.add(folder)
-                results[mutant.name] = worker.test(mutant, options.marked)
+                results[mutant.name] = worker.test(mutant)
                 options.out.write_text(json.dumps(results, indent=1, ensure_ascii=False) + "\n")
                 print(f"{results[mutant.name]:60} {mutant.name}", flush=True)
             count -= results[mutant.name] != "build"
@@ -263,7 +268,9 @@ def main() -> None:
     for part in parts:
         part.result()
     tested = [result for result in results.values() if result != "build"]
-    print(f"{len(tested) - tested.count('survived')} of {len(tested)} mutants killed")
+    killed = [result for result in tested if result != "survived"]
+    slow = sum(result.startswith(SLOW) for result in killed)
+    print(f"{len(killed)} of {len(tested)} mutants killed, {slow} of them by slow tests alone")
 
 
 if __name__ == "__main__":
