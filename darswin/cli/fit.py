@@ -9,8 +9,10 @@ import contextlib
 import inspect
 import re
 import shlex
+import shutil
 import sys
 import warnings
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any, NoReturn, get_args
@@ -179,8 +181,14 @@ class RunCLI(LightningCLI):
         config = self.config[str(self.subcommand)]
         self.folder = Path(config.run)
         config.trainer.default_root_dir = str(self.folder)
-        for name in ("path", "classes", "splits", "lens"):  # so that the run works from anywhere
-            if config.data[name] and Path(config.data[name]).exists():
+        for name in (
+            "path",
+            "classes",
+            "splits",
+            "lens",
+            "label_map",
+        ):  # so that the run works from anywhere
+            if config.data.get(name) and Path(config.data[name]).exists():
                 config.data[name] = str(Path(config.data[name]).resolve())
         if self.task == FIRST_TASK:
             self._check_lenses(config)
@@ -206,10 +214,9 @@ class RunCLI(LightningCLI):
             for group, settled in ((config.model, model), (config.data, data)):
                 for name, value in settled.items():
                     group[name] = value
-        self.record = self._recorded(config)
         if config.resume and last_of(self.folder).exists():
             before = yaml.safe_load((self.folder / "config.yaml").read_text())
-            for change in check_changes(before, yaml.safe_load(self.record)):
+            for change in check_changes(before, yaml.safe_load(self._recorded(config))):
                 _say(re.sub("`(.*?)`", r"--\1", change))
 
     def _check_lenses(self, config) -> None:
@@ -236,7 +243,9 @@ class RunCLI(LightningCLI):
         if given.logger is None:
             kwargs["logger"] = False  # BeginRun adds the run's own loggers
         callbacks = list(given.callbacks or [])
-        if given.enable_progress_bar and not any(isinstance(c, ProgressBar) for c in callbacks):
+        if given.enable_progress_bar is not False and not any(
+            isinstance(c, ProgressBar) for c in callbacks
+        ):
             callbacks.append(RunProgressBar())
         if self.subcommand == "fit":
             callbacks = self._fit_callbacks(callbacks, config)
@@ -250,13 +259,16 @@ class RunCLI(LightningCLI):
             CSVLogger(self.folder, name="csv", flush_logs_every_n_steps=1),
             TensorBoardLogger(self.folder, name="", version="tensorboard"),
         ]  # fmt: skip
+        record = self.config["fit"].clone()
+        for name in ("size", "channels"):  # where the pictures decide on them
+            record.data[name] = getattr(self.datamodule, name)
         self.signals.checkpoint = last_of(self.folder)
         monitor, mode = TASKS[self.task].module.monitor
         checkpoint = partial(
             RunCheckpoint, self.folder / "checkpoints", enable_version_counter=False
         )
         return [
-            BeginRun(self.folder, self.record, loggers),
+            BeginRun(self.folder, self._recorded(record), loggers),
             *others,
             self.signals,
             checkpoint("best", monitor=monitor, mode=mode, save_on_train_epoch_end=False),
@@ -272,9 +284,8 @@ class RunCLI(LightningCLI):
     def fit(self, **options) -> None:
         """Trains, holding the lock of the run's folder; Lightning calls it."""
         config, last = self.config_init["fit"], last_of(self.folder)
-        lock = locked(self.folder / ".lock")
         try:
-            with lock if self.trainer.is_global_zero else contextlib.nullcontext():
+            with self._locked() if self.trainer.is_global_zero else contextlib.nullcontext():
                 start = config.ckpt_path
                 if not config.resume:
                     check_free(self.folder)
@@ -293,6 +304,17 @@ class RunCLI(LightningCLI):
                 step = self.trainer.global_step
                 _say(f"stopped at step {step}: `{again}` goes on from the last checkpoint")
             raise
+
+    @contextlib.contextmanager
+    def _locked(self) -> Iterator[None]:
+        """Holds the lock of the run's folder, and removes a new folder if nothing else is in it."""
+        is_new = not self.folder.exists()
+        with locked(self.folder / ".lock"):
+            try:
+                yield
+            finally:
+                if is_new and [path.name for path in self.folder.iterdir()] == [".lock"]:
+                    shutil.rmtree(self.folder)
 
 
 class BeginRun(Callback):

@@ -10,7 +10,7 @@ import torch
 import yaml
 from lightning.pytorch import Trainer
 from runs import QUIET, error, fit
-from scenes import write_plain
+from scenes import CALIBRATIONS, write_plain
 
 from darswin.cli.fit import flag_of
 from darswin.cli.main import COMMANDS, main
@@ -41,6 +41,7 @@ def scenes(tmp_path_factory):
         ("--data.train_lenses low --data.lens {}", "--data.train_lenses warps pictures through"),
         ("--data.test_lenses=low --data.lens {}", "--data.test_lenses warps pictures through"),
         ("--xi 0.3 --data.lens {}", "--xi warps pictures through lenses, and --data.lens says"),
+        (f"--data.lens {CALIBRATIONS / 'kalibr_fov.yaml'}", "choose one as --data.camera: 'cam0'"),
         ("--model.learning_rate 0", "--model.learning_rate must be above 0, got 0"),
         ("--model.options {foo:1}", "--model.options "),
         ("--model.options {embed_dim:1099511627776}", "not enough memory: a smaller --data.batch"),
@@ -59,7 +60,7 @@ def test_wrong_options_are_named_in_one_line(capsys, tmp_path, options, message)
     given = ["fit", "--run", tmp_path / "r", *DIGITS, "--data.limit", "96", *options.split()]
     said = error(capsys, *(word.replace(":", ": ") if "{" in str(word) else word for word in given))
     assert message in said and re.match("darswin: |error: ", said.splitlines()[-1])
-    assert {p.name for p in (tmp_path / "r").glob("*")} <= {".lock"}
+    assert not (tmp_path / "r").exists()
 
 
 @pytest.mark.parametrize(
@@ -103,7 +104,10 @@ def test_a_run_is_not_overwritten(capsys, tmp_path, monkeypatch):
 def test_a_run_s_options_and_checkpoints_of_other_models(capsys, tmp_path):
     linear._measured.clear()
     backend = ["--model.matmul_backend", "autotune", "--model.grad_checkpointing", "true"]
-    fit(tmp_path, *DIGITS, "--trainer.max_steps", "1", "--data.limit", "48", *backend)
+    bar = ["--trainer.enable_progress_bar", "null", "--trainer.logger", "null"]  # the defaults
+    fit(tmp_path, *DIGITS, "--trainer.max_steps", "1", "--data.limit", "48", *backend, *bar)
+    shown = "".join(capsys.readouterr())
+    assert "train/loss=" in shown and "v_num" not in shown
     products = {shape.product for shape in linear.autotune_results()}
     assert products == {"forward", "input gradient", "weight gradient"}
     saved = yaml.safe_load((tmp_path / "config.yaml").read_text())["model"]
