@@ -172,6 +172,50 @@ def write_kitti360(folder: Path) -> Path:
     return folder
 
 
+def write_cityscapes(folder: Path) -> Path:
+    """Cityscapes' tree, three pictures of "train" and one of "val", with ids from 6 to 8."""
+    theta, azimuth = rays_of(load(WOODSCAPE).in_picture((121, 160)), (121, 160))
+    for split, city, count in (("train", "aachen", 3), ("val", "lindau", 1), ("test", "bonn", 1)):
+        for k in range(count):
+            name = f"{split}/{city}/{city}_{k:06d}_000019"
+            image = picture_of(theta, azimuth, CLASSES["colors"], k)
+            write(folder / "leftImg8bit" / f"{name}_leftImg8bit.png", image[..., ::-1])
+            ids = labels_of(theta, azimuth + 0.3 * k) + 6
+            for kind in ("labelIds", "instanceIds"):
+                write(folder / "gtFine" / f"{name}_gtFine_{kind}.png", ids)
+    return folder
+
+
+def write_coco(folder: Path) -> Path:
+    """COCO's panoptic tree, two pictures of each split, with segments of the categories 1, 17 and
+    200; nothing is known at the left side."""
+    theta, azimuth = rays_of(load(WOODSCAPE).in_picture((121, 160)), (121, 160))
+    categories = [
+        {"id": id_, "name": name, "color": color, "isthing": 0}
+        for id_, name, color in zip((1, 17, 200), *CLASSES.values(), strict=True)
+    ]
+    segments = (66051, 300, 7)
+    for split in ("train2017", "val2017"):
+        annotations = []
+        for k in range(2):
+            image = picture_of(theta, azimuth, CLASSES["colors"], k)
+            write(folder / split / f"{k:012d}.jpg", image[..., ::-1])
+            ids = np.array(segments)[labels_of(theta, azimuth + 0.3 * k)]
+            ids[:, :9] = 0
+            colors = np.stack([ids // 65536, ids // 256 % 256, ids % 256], -1)
+            name = f"{k:012d}.png"
+            png = folder / "annotations" / f"panoptic_{split}" / name
+            write(png, colors.astype(np.uint8))
+            infos = [
+                {"id": segment, "category_id": category["id"]}
+                for segment, category in zip(segments, categories, strict=True)
+            ]
+            annotations.append({"image_id": k, "file_name": name, "segments_info": infos})
+        content = {"images": [], "annotations": annotations, "categories": categories}
+        (folder / "annotations" / f"panoptic_{split}.json").write_text(json.dumps(content))
+    return folder
+
+
 def _woodscape_lens(folder: Path, number: int, view: str, size: tuple[int, int]) -> Lens:
     """Writes the calibration of a frame, whose offsets and numbers differ from the others', and
     gives its lens in a picture of a size."""

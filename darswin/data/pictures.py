@@ -3,15 +3,51 @@
 import gzip
 import math
 import os
+import statistics
 import zlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from darswin.data.folders import class_of, open_folder
 from darswin.data.splits import SPLITS, Limited, Split, check_split, hold_out, read_classes
-from darswin.utils.image import read_image, read_oriented, with_channels
+from darswin.utils.image import (
+    BrokenImageError,
+    read_form,
+    read_image,
+    read_oriented,
+    with_channels,
+)
+
+_LOOKED_AT = 32  # pictures whose headers tell the form of all
+
+
+class Form(NamedTuple):
+    """The form of a data set's pictures.
+
+    Attributes: channels: 1 if all are grey, else 3; side: px, the median of their shorter sides.
+    """
+
+    channels: int
+    side: int
+
+
+def form_of(file: Callable[[int], Path | None], count: int) -> Form:
+    """The form of `count` picture files, from the headers of some of them."""
+    forms: list[tuple[int, int]] = []
+    errors: list[BrokenImageError] = []
+    for index in range(0, count, -(-count // _LOOKED_AT)):
+        path = file(index)
+        assert path is not None
+        try:
+            forms.append(read_form(path))
+        except BrokenImageError as error:
+            errors.append(error)
+    if not forms:
+        raise errors[0]
+    return Form(max(form[0] for form in forms), statistics.median_low(form[1] for form in forms))
 
 
 class Source(Limited):
@@ -33,6 +69,10 @@ class Source(Limited):
     def file(self, index: int) -> Path | None:
         """The image's own file, if it has one."""
         return None
+
+    def form(self) -> Form:
+        """The form of the pictures as they are stored."""
+        return form_of(self.file, len(self))
 
 
 class ImageFiles(Source):
@@ -79,12 +119,16 @@ class Arrays(Source):
     def __getitem__(self, index: int) -> tuple[np.ndarray, int]:
         return with_channels(self.images[index], self.channels), int(self.labels[index])
 
+    def form(self) -> Form:
+        height, width, channels = self.images.shape[1:]
+        return Form(channels, min(height, width))
+
 
 def open_source(
     path: str | Path,
     split: Split,
     *,
-    channels: int = 3,
+    channels: int | None = 3,
     classes: str | Path | None = None,
     splits: str | Path | None = None,
     holdout: float = 0.1,
@@ -104,7 +148,8 @@ def open_source(
     Pictures that are in no split are named in `LeftOut` warnings.
 
     Args:
-        channels: 3 or 1, of the images that come out.
+        channels: 3 or 1, of the images that come out. None means 1 if all pictures are grey, else
+            3; the headers of some of the pictures tell.
         classes: a list of class names, as a text file with one a line or a JSON list: which
             folders to take and in which order. For IDX files and digits, the labels' names.
         splits: a JSON file `{"train": ["class/a.jpg", …], "val": …, "test": …}` with paths relative
@@ -126,17 +171,19 @@ def open_source(
         raise FileNotFoundError(f"no folder {root}")
     source: Source
     if str(path) == "digits":
-        source = _digits(split, channels, names, holdout)
+        source = _digits(split, channels or 3, names, holdout)
     elif in_memory:
-        source = _idx(root, split, channels, names, holdout)
+        source = _idx(root, split, channels or 3, names, holdout)
     else:
         (folder, paths), names = open_folder(root, split, names, splits, holdout)
         label = {name: k for k, name in enumerate(names)}
-        source = ImageFiles(folder, [(p, label[class_of(p)]) for p in paths], names, channels)
+        source = ImageFiles(folder, [(p, label[class_of(p)]) for p in paths], names, channels or 3)
     if not len(source):
         raise FileNotFoundError(
             f"no images for the {split!r} split of {path}: `holdout` {holdout:g} leaves none for it"
         )
+    if channels is None:
+        source.channels = source.form().channels
     return source
 
 

@@ -55,6 +55,11 @@ class ModelCard:
     colors: Sequence[Sequence[int]] = field(default_factory=list)
     quantized: Mapping[str, Sequence[float]] = field(default_factory=dict)
 
+    @property
+    def channels(self) -> int:
+        """The channels of the images: 1 for grey, 3 for colours."""
+        return self.options.get("in_chans", 3)
+
     def create(self) -> Any:
         """The model, with new weights."""
         model = create_model(self.model, **self.options)

@@ -127,14 +127,15 @@ class Classification(Task):
 
 
 class ClassMetrics(nn.Module):
-    """The shares that top-1 and top-5 get right, and the mean loss."""
+    """The top-1 accuracy, the mean loss and, for more than five classes, the top-5 accuracy."""
 
     def __init__(self, classes: int):
         super().__init__()
-        self.top1, self.top5 = (
-            MulticlassAccuracy(classes, top_k=min(k, classes), average="micro", validate_args=False)
+        self.accuracies = nn.ModuleDict({
+            f"top{k}": MulticlassAccuracy(classes, top_k=k, average="micro", validate_args=False)
             for k in (1, 5)
-        )
+            if k < classes
+        })  # fmt: skip
         self.loss = MeanLoss()
 
     def update(self, logits: Tensor, labels: Tensor) -> None:
@@ -143,12 +144,13 @@ class ClassMetrics(nn.Module):
         logits, labels = logits[known], labels[known]
         if len(labels) == 0:  # which torchmetrics does not take
             return
-        for metric in (self.top1, self.top5):
+        metric: Any
+        for metric in self.accuracies.values():
             metric.update(logits, labels)
         self.loss.update(F.cross_entropy(logits, labels, reduction="none"))
 
     def all(self) -> dict[str, Any]:
-        return dict(top1=self.top1, top5=self.top5, loss=self.loss)
+        return dict(self.accuracies) | dict(loss=self.loss)
 
 
 class MeanLoss(Metric):

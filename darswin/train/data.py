@@ -24,6 +24,8 @@ from darswin.train.runs import ignore_signals
 
 __all__ = ["RunData", "WideAngleData"]
 
+SMALLEST = 32  # px, the size of images of smaller pictures
+
 SamplesT = TypeVar("SamplesT", bound=Samples)
 
 
@@ -37,11 +39,13 @@ class RunData(LightningDataModule):
             which folder or picture (see `darswin.data.Calibrations`).
         camera: which, of a calibration of several cameras.
         coefficients: what they are, in a calibration of OpenCV or ROS that does not say it.
-        size: px, H = W of the images; null is that of model.weights, or the data's own default.
+        size: px, H = W of the images; null means the size of model.weights, or else the median of
+            the shorter sides of the pictures, at least 32 px and at most the default size.
         fit: how a picture becomes a square: crop cuts it, stretch squashes it; its lens, if it has
             one, follows.
-        channels: of the images, grey or colour; null is that of model.weights, or 3.
-        mean: of the pixels in [0, 1], per channel; null is that of model.weights, or
+        channels: 1 for grey images, 3 for colour images; null means the channels of model.weights,
+            or else 1 if all pictures are grey and 3 if not.
+        mean: of the pixels in [0, 1], per channel; null means the mean of model.weights, or else
             ImageNet's.
         std: of the pixels, likewise.
         classes: a file with the names of the classes.
@@ -59,7 +63,7 @@ class RunData(LightningDataModule):
         skip_broken: counts files that are no images, instead of stopping at the first.
     """
 
-    default_size: ClassVar[int] = 64
+    default_size: ClassVar[int] = 64  # of large pictures
     # What a model's card says of its pictures.
     fov: float
     frame_fit: Framing
@@ -96,23 +100,12 @@ class RunData(LightningDataModule):
                 "`batch_size` must be at least 1 and `workers` at least 0, got "
                 f"{batch_size} and {workers}"
             )
-        for name, value in (("camera", camera), ("coefficients", coefficients)):
-            if value is not None and lens is None:
-                raise ValueError(f"`{name}` {value} is one of a calibration: give `lens`")
         self.path, self._lens = path, lens
         self._camera, self._coefficients = camera, coefficients
-        self.size, self.channels = self.default_size if size is None else size, channels or 3
-        self.mean = list(mean or (IMAGENET_MEAN if self.channels == 3 else [0.449]))
-        self.std = list(std or (IMAGENET_STD if self.channels == 3 else [0.226]))
-        if not len(self.mean) == len(self.std) == self.channels:
-            raise ValueError(f"mean and std must have {self.channels} values, got {mean} and {std}")
-        self._opening: dict[str, Any] = dict(
-            channels=self.channels, classes=classes, splits=splits, holdout=holdout
-        )
-        self._form: dict[str, Any] = dict(
-            size=self.size, framing=fit, mean=self.mean, std=self.std, seed=seed,
-            skip_broken=skip_broken,
-        )  # fmt: skip
+        self._size, self._channels, self._mean, self._std = size, channels, mean, std
+        self._opening: dict[str, Any] = dict(classes=classes, splits=splits, holdout=holdout)
+        self._framing: Framing = fit
+        self._skip_broken = skip_broken
         self.limit, self.batch_size, self.workers = limit, batch_size, workers
         self.turns = RandomTurns(flip, rotate_deg) if flip or rotate_deg else None
         self.colour_changes = RandAugment() if randaugment else None
@@ -122,15 +115,54 @@ class RunData(LightningDataModule):
         self._loader: ResumableLoader | None = None
         self._progress: dict[str, Any] = {}
 
-    def _open(self, split: Split) -> Any:
-        """The pictures of a split."""
+    def _open(self, split: Split, channels: int | None) -> Any:
+        """The pictures of a split; None stands for the channels of the pictures."""
         raise NotImplementedError
 
     def source(self, split: Split) -> Any:
         """The pictures of a split, opened once."""
         if split not in self._sources:
-            self._sources[split] = self._open(split)
+            # All splits have the channels of the training split.
+            channels = self._channels if split == "train" else self.channels
+            self._sources[split] = self._open(split, channels)
         return self._sources[split]
+
+    @property
+    def channels(self) -> int:
+        """The channels of the images."""
+        return self._channels or self.source("train").channels
+
+    @cached_property
+    def size(self) -> int:
+        """The height and width of the images, px."""
+        if self._size is not None:
+            return self._size
+        return max(SMALLEST, min(self.source("train").form().side, self.default_size))
+
+    @property
+    def mean(self) -> list[float]:
+        """The mean that normalises the images, per channel."""
+        return self._per_channel("mean", self._mean, IMAGENET_MEAN, 0.449)
+
+    @property
+    def std(self) -> list[float]:
+        """The standard deviation that normalises the images, per channel."""
+        return self._per_channel("std", self._std, IMAGENET_STD, 0.226)
+
+    def _per_channel(
+        self, name: str, given: list[float] | None, colour: Sequence[float], grey: float
+    ) -> list[float]:
+        values = list(given or (colour if self.channels == 3 else [grey]))
+        if len(values) != self.channels:
+            raise ValueError(f"`{name}` must have {self.channels} values, got {values}")
+        return values
+
+    @property
+    def _form(self) -> dict[str, Any]:
+        return dict(
+            size=self.size, framing=self._framing, mean=self.mean, std=self.std, seed=self.seed,
+            skip_broken=self._skip_broken,
+        )  # fmt: skip
 
     @property
     def classes(self) -> list[str]:
@@ -253,7 +285,7 @@ class WideAngleData(RunData):
             through one lens. Without it, the mixed-in image is taken for one through the other's
             lens, as in the authors' code; or, without mixing, every image has a lens of its own.
             Calibrated pictures are paired by their cameras, and those left over stay unmixed.
-        common: as `RunData`; the default size is 64.
+        common: as `RunData`; the default size of large pictures is 64.
     """
 
     def __init__(
@@ -270,17 +302,20 @@ class WideAngleData(RunData):
         **common: Any,
     ):
         super().__init__(path, **common)
+        for name, value in (("camera", self._camera), ("coefficients", self._coefficients)):
+            if value is not None and self._lens is None:
+                raise ValueError(f"`{name}` {value} is one of a calibration: give `lens`")
         self.train_lenses = parse_lenses(train_lenses)
         self._test_lenses = parse_sweep(test_lenses)
         self._warping: dict[str, Any] = dict(
             render=render, fov=math.radians(fov_deg), picture_size=picture_size
         )
         self.fov = 0.0 if self._lens else math.radians(fov_deg)
-        self.frame_fit = self._form["framing"] if self._lens else "whole"
+        self.frame_fit = self._framing if self._lens else "whole"
         self.erasing, self.pair_lenses = erasing, pair_lenses
 
-    def _open(self, split: Split) -> Source:
-        return open_source(self.path, split, **self._opening)
+    def _open(self, split: Split, channels: int | None) -> Source:
+        return open_source(self.path, split, channels=channels, **self._opening)
 
     @property
     def test_names(self) -> list[str]:

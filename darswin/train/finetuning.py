@@ -84,7 +84,7 @@ def settle(
     found = {}
     theirs = {
         "size": card.size,
-        "channels": card.options.get("in_chans", 3),
+        "channels": card.channels,
         "mean": card.options.get("mean"),
         "std": card.options.get("std"),
     }

@@ -174,7 +174,7 @@ CHANGEABLE = {
     *("model.label_smoothing", "model.mixup", "model.cutmix", "model.mix_p"),
     *("model.loss", "model.class_weights", "model.solid_angle_weights", "model.zones"),
     *("model.matmul_backend", "model.grad_checkpointing"),
-    *("data.path", "data.classes", "data.splits", "data.skip_broken"),
+    *("data.path", "data.classes", "data.splits", "data.label_map", "data.skip_broken"),
     *("data.lens", "data.camera", "data.coefficients"),
     *("data.batch_size", "data.workers"),
     *("data.train_lenses", "data.test_lenses", "data.pair_lenses"),

@@ -34,7 +34,7 @@ class SceneData(RunData):
         lens_augmentation: shows pictures in training as other lenses would have seen them: a level
             of the paper ("very low", "low", "medium", "high"), one ξ ("0.4"), a range of it
             ("0.2..0.35"), or "polynomial"; null is none.
-        common: as `RunData`; the default size is 128.
+        common: as `RunData`; the default size of large pictures is 128.
     """
 
     target: ClassVar[Target]
@@ -53,15 +53,15 @@ class SceneData(RunData):
         **common: Any,
     ):
         super().__init__(path, lens=lens, batch_size=batch_size, **common)
-        self.frame_fit = self._form["framing"]
+        self.frame_fit = self._framing
         self.test_paths = test_paths or []
         self.crop = crop
         self.lenses = None if lens_augmentation is None else parse_lenses(lens_augmentation)
 
-    def _open(self, split: Split) -> Scenes:
+    def _open(self, split: Split, channels: int | None) -> Scenes:
         return open_scenes(
-            self.path, split, self.target, lens=self._lens, camera=self._camera,
-            coefficients=self._coefficients, **self._opening,
+            self.path, split, self.target, channels=channels, lens=self._lens,
+            camera=self._camera, coefficients=self._coefficients, **self._opening,
         )  # fmt: skip
 
     @property
@@ -82,7 +82,7 @@ class SceneData(RunData):
 
     def _test_scenes(self, path: str) -> Scenes:
         """The test set of another folder; all that it has, if it has no splits."""
-        opening = self._opening | dict(splits=None)
+        opening = self._opening | dict(splits=None, channels=self.channels)
         flat = (Path(path) / "images").is_dir()
         scenes = open_scenes(path, "all" if flat else "test", self.target, **opening)
         if scenes.classes != self.classes:
@@ -112,13 +112,16 @@ class LabelData(SceneData):
 
     Args:
         path: a folder of scenes: see `darswin.data.open_scenes`.
+        label_map: a JSON file that gives ids in the label files their classes, by name or by id,
+            such as {"7": "road", "8": 1, "9": null}; ids that it leaves out count as unlabelled.
         common: as `SceneData`.
     """
 
     target = "labels"
 
-    def __init__(self, path: str, **common: Any):  # without it the help has no texts
+    def __init__(self, path: str, *, label_map: str | None = None, **common: Any):
         super().__init__(path, **common)
+        self._opening["label_map"] = label_map
 
 
 class DistanceData(SceneData):

@@ -11,7 +11,7 @@ from PIL import ExifTags, Image, UnidentifiedImageError
 
 from darswin.utils.exif import TURNS
 
-__all__ = ["BrokenImageError", "read_image", "read_oriented"]
+__all__ = ["BrokenImageError", "read_form", "read_image", "read_oriented"]
 
 _PNG = b"\x89PNG\r\n\x1a\n"
 _SAYS_MORE = frozenset((b"eXIf", b"tEXt", b"zTXt", b"iTXt"))  # chunks that may hold an orientation
@@ -47,6 +47,22 @@ def read_oriented(path: str | Path, channels: int = 3) -> tuple[np.ndarray, int]
     image = image.swapaxes(0, 1) if swapped else image
     across, down = (slice(None, None, -1 if r else 1) for r in reversed_)
     return np.ascontiguousarray(image[down, across]), orientation
+
+
+def read_form(path: str | Path) -> tuple[int, int]:
+    """The channels of a picture file, 1 for grey and 3 for colours, and its shorter side, px.
+
+    Only the header of the file is read.
+
+    Raises:
+        BrokenImageError: a file that is missing, unreadable or no image; it names the file.
+    """
+    try:
+        with warnings.catch_warnings(action="ignore"), Image.open(path) as file:
+            is_grey = file.mode in ("1", "L", "LA", "F") or file.mode.startswith("I")
+            return 1 if is_grey else 3, min(file.size)
+    except Exception as error:  # a file that is no image fails in many ways
+        raise BrokenImageError(f"cannot read {path}: {error}") from error
 
 
 def file_content(path: str | Path) -> np.ndarray:

@@ -4,10 +4,12 @@ import gzip
 
 import numpy as np
 import pytest
+from scenes import write
 
 from darswin.data import open_source
-from darswin.data.pictures import Arrays, ImageFiles, read_idx
+from darswin.data.pictures import Arrays, Form, ImageFiles, form_of, read_idx
 from darswin.data.splits import SPLITS
+from darswin.utils.image import BrokenImageError
 
 
 def write_idx(path, array):
@@ -84,6 +86,38 @@ def test_a_cut_idx_file_is_named(tmp_path):
         with pytest.raises(ValueError, match=message):
             read_idx(tmp_path, name.removesuffix(".gz"))
         (tmp_path / name).unlink()
+
+
+@pytest.mark.parametrize(
+    ("pictures", "form"),
+    [
+        ([(30, 40)] * 3, Form(1, 30)),
+        ([(30, 40), (50, 20), (90, 60, 3)], Form(3, 30)),
+        ([(64, 48, 4), (64, 48, 4)], Form(3, 48)),
+    ],
+)
+def test_the_form_of_pictures(tmp_path, pictures, form):
+    for k, shape in enumerate(pictures):
+        write(tmp_path / "a" / f"{k}.png", np.zeros(shape, np.uint8))
+    (tmp_path / "a" / "9.png").write_bytes(b"no picture")
+    source = open_source(tmp_path, "train", channels=None, holdout=0)
+    assert source.form() == form and source.channels == form.channels == source[0][0].shape[2]
+    assert open_source(tmp_path, "train", channels=3, holdout=0)[0][0].shape[2] == 3
+    for k in range(len(pictures)):
+        (tmp_path / "a" / f"{k}.png").unlink()
+    with pytest.raises(BrokenImageError, match=r"cannot read .*9\.png"):
+        open_source(tmp_path, "train", channels=None, holdout=0)
+
+
+def test_the_form_of_many_pictures_is_that_of_some(tmp_path):
+    files = [write(tmp_path / f"{k}.png", np.zeros((k, 99), np.uint8)) for k in range(10, 75)]
+    assert form_of(files.__getitem__, len(files)).side == 40  # of every third: 10, 13, …, 73
+
+
+def test_the_form_of_arrays():
+    assert open_source("digits", "val", channels=None).form() == Form(1, 8)
+    colours = Arrays(np.zeros((2, 9, 7, 3), np.uint8), np.zeros(2), ["a"])
+    assert colours.form() == Form(3, 7)
 
 
 def test_wrong_options(tmp_path):

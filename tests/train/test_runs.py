@@ -137,6 +137,9 @@ def test_a_run_leaves_everything_in_its_folder(whole):
     state = checkpoint(whole)["state_dict"]
     assert all(torch.equal(t, state[f"net.{name}"]) for name, t in model.state_dict().items())
     assert card.classes == [str(k) for k in range(10)] and card.size == 32
+    assert card.channels == 1  # digits are grey
+    data = yaml.safe_load((whole / "config.yaml").read_text())["data"]
+    assert (data["size"], data["channels"]) == (32, 1)  # later runs on other pictures keep them
     lines = table(whole / "csv" / "version_0" / "metrics.csv")
     assert [line["step"] for line in lines if line["train/loss"]] == [*"012345"]
 

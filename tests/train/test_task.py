@@ -2,15 +2,19 @@
 
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
+import yaml
 from runs import DIGITS, error
+from scenes import write
 from torch import nn
 from torch.optim.lr_scheduler import CosineAnnealingLR, LinearLR
 from torchmetrics.classification import MulticlassAccuracy
 
 from darswin import create_model, lens
+from darswin.cli.options import PRESETS
 from darswin.models.saving import ModelCard
 from darswin.train.classification import Classification, ClassMetrics
 from darswin.train.data import WideAngleData
@@ -85,7 +89,33 @@ def test_metrics_are_those_of_torchmetrics_and_leave_broken_pictures_out():
         torch.testing.assert_close(measured.all()[name].compute(), expected)
     torch.testing.assert_close(measured.loss.compute(), F.cross_entropy(logits, labels))
     assert measured.loss.count == len(labels) < 60
-    assert ClassMetrics(3).top5.top_k == 3
+    # With up to five classes all answers are among the first five.
+    assert {*ClassMetrics(5).all()} == {"top1", "loss"} and "top5" in ClassMetrics(6).all()
+
+
+# -- data -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("side", "options", "size"),
+    [(200, {}, 64), (50, {}, 50), (20, {}, 32), (200, dict(size=96), 96), (50, dict(size=20), 20)],
+)
+def test_pictures_decide_on_size_and_channels(tmp_path, side, options, size):
+    for k in range(4):
+        write(tmp_path / "train" / "ab"[k % 2] / f"{k}.png", np.zeros((side, 300, 3), np.uint8))
+        write(tmp_path / "val" / "ab"[k % 2] / f"{k}.png", np.zeros((side, 300), np.uint8))
+    data = WideAngleData(str(tmp_path), **options)
+    assert (data.size, data.channels, len(data.mean), len(data.std)) == (size, 3, 3, 3)
+    assert data.dataset("val")[0][0].shape == (3, size, size)
+    grey = WideAngleData(str(tmp_path), channels=1, **options)
+    assert grey.mean == [0.449] and grey.dataset("val")[0][0].shape == (1, size, size)
+
+
+def test_presets_leave_size_and_channels_to_the_pictures():
+    data = yaml.safe_load((PRESETS / "minutes.yaml").read_text())["data"]
+    assert not {"size", "channels", "mean", "std"} & data.keys()
+    digits = WideAngleData("digits", **data)
+    assert (digits.size, digits.channels) == (32, 1)
 
 
 # -- devices ----------------------------------------------------------------------------------
@@ -222,7 +252,8 @@ def test_one_class_is_not_enough(kind):
         (lambda: WideAngleData("digits", workers=-1), "`workers` at least 0, got 128 and -1"),
         (lambda: WideAngleData("digits", camera="7"), "`camera` 7 is one of a calibration: give"),
         (lambda: WideAngleData("digits", coefficients="pinhole"), "`coefficients` pinhole is one"),
-        (lambda: WideAngleData("digits", mean=[0.5]), "mean and std must have 3 values"),
+        (lambda: WideAngleData("digits", mean=[0.5, 0.5]).mean, "`mean` must have 1 values"),
+        (lambda: WideAngleData("digits", channels=3, std=[0.5]).std, "`std` must have 3 values"),
     ],
 )  # fmt: skip
 def test_wrong_options_are_named(make, message):

@@ -3,6 +3,8 @@
 from pathlib import Path
 from typing import get_args
 
+from darswin.data.scenes.cityscapes import is_cityscapes, open_cityscapes
+from darswin.data.scenes.coco import is_coco, open_coco
 from darswin.data.scenes.files import Options, ScenesSplit
 from darswin.data.scenes.kitti360 import is_kitti360, open_kitti360
 from darswin.data.scenes.plain import FORM, is_plain, open_plain
@@ -21,6 +23,8 @@ READERS = (
     (is_kitti360, open_kitti360),
     (is_synwoodscape, open_synwoodscape),
     (is_woodscape, open_woodscape),
+    (is_cityscapes, open_cityscapes),
+    (is_coco, open_coco),
 )
 
 
@@ -29,12 +33,13 @@ def open_scenes(
     split: ScenesSplit,
     target: Target,
     *,
-    channels: int = 3,
+    channels: int | None = 3,
     lens: str | Path | None = None,
     camera: str | None = None,
     coefficients: str | None = None,
     classes: str | Path | None = None,
     splits: str | Path | None = None,
+    label_map: str | Path | None = None,
     holdout: float = 0.1,
 ) -> Scenes:
     """The scenes of one split of a data set.
@@ -46,9 +51,11 @@ def open_scenes(
       `distance/STEM.npy`, floating-point metres; 0 is not known. STEM may have folders. All that in
       ROOT, or in `ROOT/train`, `ROOT/val` and `ROOT/test`. The lens is in `lenses/STEM.json`, one
       for a picture, or in `lens.json` beside `images/` or in ROOT: a calibration, or what
-      `darswin.data.Calibrations` takes as a lenses.json, with paths relative to its folder.
-      `classes.json` beside `images/` or in ROOT names the classes;
-    - WoodScape, SynWoodScape or KITTI-360, as their authors publish them.
+      `darswin.data.Calibrations` takes as a lenses.json, with paths relative to its folder. Both
+      may also end in yaml, yml, xml, txt, bin or npz. `classes.json` beside `images/` or in ROOT
+      names the classes;
+    - WoodScape, SynWoodScape, KITTI-360, Cityscapes or COCO panoptic, as their authors publish
+      them; the last two need a lens, in `lens.json` in ROOT or as `lens`.
 
     Without a test set, "val" serves as one. What has neither, or no "val", gets `holdout` of
     "train" for each, chosen by a hash of their names; at least one is left to train on. Pictures
@@ -57,13 +64,18 @@ def open_scenes(
     Args:
         split: "all" is every scene of a folder without splits.
         target: what is known of each pixel: "labels" or "distance", along the ray.
-        channels: 3 or 1, of the images that come out.
+        channels: 3 or 1, of the images that come out. None means 1 if all pictures are grey, else
+            3; the headers of some of the pictures tell.
         lens, camera, coefficients: as `darswin.data.Calibrations`, in place of the data set's own.
+            Without `lens`, `camera` and `coefficients` are those of its `lens.json`.
         classes: the names of the classes, in place of the data set's own: a text file with one a
             line, a JSON list, or {"names": [...], "colors": [[r, g, b], ...]}.
         splits: a JSON file `{"train": [stems], "val": …, "test": …}`, or a folder of `train.txt`,
             `val.txt`, `test.txt` with one stem a line; with or without the pictures' suffix. A
             split without a list is held out. For WoodScape and SynWoodScape also "heal-swin".
+        label_map: a JSON object that gives ids in the label files their classes, by name or by
+            id, such as {"7": "road", "8": 1, "9": null}. Ids that it leaves out, or maps to null,
+            count as unlabelled. Without `classes`, its names are the classes, in their order.
         holdout: a share, in [0, 0.5).
 
     Raises:
@@ -73,16 +85,27 @@ def open_scenes(
     check_split(split, get_args(ScenesSplit), holdout)
     if target not in get_args(Target):
         raise ValueError(f"target must be one of {get_args(Target)}, got {target!r}")
-    if channels not in (1, 3):
-        raise ValueError(f"`channels` must be 1 or 3, got {channels}")
-    for name, value in (("camera", camera), ("coefficients", coefficients)):
-        if value is not None and lens is None:
-            raise ValueError(f"`{name}` {value} is one of a calibration: give `lens` too")
+    if channels not in (1, 3, None):
+        raise ValueError(f"`channels` must be 1, 3 or None, got {channels}")
     root = Path(path)
     if not root.is_dir():
         raise FileNotFoundError(f"no folder {root}")
-    options = Options(split, target, channels, lens, camera, coefficients, classes, splits, holdout)
+    options = Options(
+        split,
+        target,
+        channels or 3,
+        lens,
+        camera,
+        coefficients,
+        classes,
+        splits,
+        label_map,
+        holdout,
+    )
     for recognizes, open_split in READERS:
         if recognizes(root):
-            return open_split(root, options)
+            scenes = open_split(root, options)
+            if channels is None:
+                scenes.channels = scenes.form().channels
+            return scenes
     raise FileNotFoundError(f"no scenes in {root}: {FORM}")

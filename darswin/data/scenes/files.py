@@ -8,7 +8,7 @@ from typing import Literal
 
 from darswin.data.cameras import Calibrations
 from darswin.data.folders import OTHER_SUFFIXES, PICTURES, SUFFIXES, files_below
-from darswin.data.scenes.scene import Target
+from darswin.data.scenes.scene import Classes, Target, read_label_map, read_palette
 from darswin.data.splits import (
     Split,
     part_of_split,
@@ -22,6 +22,9 @@ Pairs = dict[str, tuple[str, str]]  # by their stems: (picture, target), relativ
 ScenesSplit = Literal["train", "val", "test", "all"]
 # Named splits: stems, sorted → those of each part.
 Named = Mapping[str, Callable[[list[str]], dict[Split, list[str]]]]
+Choose = Callable[[list[str]], list[str]]
+# The suffixes of calibration files.
+CALIBRATIONS = (".json", ".yaml", ".yml", ".xml", ".txt", ".bin", ".npz")
 
 
 @dataclass(frozen=True)
@@ -36,6 +39,7 @@ class Options:
     coefficients: str | None
     classes: str | Path | None
     splits: str | Path | None
+    label_map: str | Path | None
     holdout: float
 
     def given_lens(self, root: Path) -> Calibrations | None:
@@ -43,6 +47,51 @@ class Options:
         if self.lens is None:
             return None
         return Calibrations(self.lens, root, self.camera, self.coefficients)
+
+    def shared_lens(self, root: Path) -> Calibrations:
+        """The lens that the caller gave, or else that of a calibration file in `root`."""
+        lens = self.lens or calibration_in(root)
+        if lens is None:
+            raise FileNotFoundError(f"no lens.json in {root}: add the calibration, or give `lens`")
+        return Calibrations(lens, root, self.camera, self.coefficients)
+
+    def own_lenses(self, files: Mapping[Path, Path]) -> Calibrations:
+        """The lenses of pictures with a calibration each, for which the caller gave no lens."""
+        for name, value in (("camera", self.camera), ("coefficients", self.coefficients)):
+            if value is not None:
+                raise ValueError(f"`{name}` {value} is one of a calibration: give `lens` too")
+        return Calibrations(None, files=files)
+
+    def labels(
+        self, own: Callable[[], Classes], class_of: Mapping[int, int] | None = None
+    ) -> tuple[Mapping[int, int] | None, Classes]:
+        """The class of each id in the label files, None where they are the same; and the classes.
+        The arguments are the data set's own."""
+        given = self.classes
+        palette = own if given is None else lambda: read_palette(given)
+        if self.label_map is not None:
+            return read_label_map(self.label_map, palette, given is not None)
+        classes = palette()
+        if class_of and (count := max(class_of.values()) + 1) != len(classes.names):
+            raise ValueError(f"{given} must name {count} classes, but names {len(classes.names)}")
+        return class_of, classes
+
+    def choose_part(self, parts: Mapping[Split, Path], root: Path) -> tuple[Split, Choose]:
+        """Of a data set with a folder or list for each split, the part that the split is taken
+        from, and the function that chooses the split's stems."""
+        if self.splits is not None:
+            raise ValueError(f"{self.splits} lists splits, and {root} has a folder for each")
+        split = self.split
+        if split == "all":
+            raise ValueError(
+                f"{root} has a folder for each split: 'all' is of a folder without splits"
+            )
+        part, held_out = taken_from(split, parts)
+
+        def choose(found: list[str]) -> list[str]:
+            return part_of_split(found, split, held_out, self.holdout, parts[part])
+
+        return part, choose
 
     def choose(
         self,
@@ -96,7 +145,7 @@ def _stem(name: str) -> str:
 
 
 def lenses_beside(
-    root: Path, pairs: Pairs, calibration_of: Callable[[str], str | Path]
+    options: Options, root: Path, pairs: Pairs, calibration_of: Callable[[str], str | Path]
 ) -> Calibrations:
     """The lenses of pictures with a calibration each, by their stems."""
     files = {root / picture: Path(calibration_of(stem)) for stem, (picture, _) in pairs.items()}
@@ -104,7 +153,19 @@ def lenses_beside(
     for picture, file in files.items():
         if not there[file]:
             raise FileNotFoundError(f"no lens for {picture}: add {file}, or give `lens`")
-    return Calibrations(None, files=files)
+    return options.own_lenses(files)
+
+
+def calibration_in(*folders: Path) -> Path | None:
+    """The calibration lens.json, lens.yaml or the like in the first folder that has one."""
+    for folder in folders:
+        files = sorted(folder.glob("lens.*"))
+        found = [file for file in files if file.suffix.lower() in CALIBRATIONS]
+        if len(found) > 1:
+            raise ValueError(f"{found[0]} and {found[1]} may both be meant: keep one of them")
+        if found:
+            return found[0]
+    return None
 
 
 def stems(folder: Path, suffixes: Sequence[str] | frozenset[str]) -> dict[str, str]:
@@ -138,7 +199,7 @@ def pictures_in(folder: Path) -> dict[str, str]:
 def pair(
     pictures: dict[str, str],
     targets: dict[str, str],
-    choose: Callable[[list[str]], list[str]],
+    choose: Choose,
     *,
     root: Path,
     what: str,

@@ -41,7 +41,7 @@ def open_kitti360(root: Path, options: Options) -> Scenes:
     )
     views = {stem: stem.split("/")[1] for stem in pairs}
     lenses = options.given_lens(root) or lenses_beside(
-        root, pairs, lambda stem: root / "calibration" / f"{views[stem]}.yaml"
+        options, root, pairs, lambda stem: root / "calibration" / f"{views[stem]}.yaml"
     )
     return Scenes(
         root, list(pairs.values()), lenses, target="distance", channels=options.channels,

@@ -1,13 +1,29 @@
 """The plain form: `images/`, `labels/` or `distance/`, and a lens beside them."""
 
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
 from darswin.data.cameras import Calibrations
-from darswin.data.scenes.files import Options, Pairs, pair, pictures_in, stems
-from darswin.data.scenes.scene import NO_CLASSES, SUFFIXES, Scenes, read_palette
-from darswin.data.splits import Split, part_of_split, split_folders, taken_from
+from darswin.data.scenes.files import (
+    CALIBRATIONS,
+    Choose,
+    Options,
+    Pairs,
+    calibration_in,
+    pair,
+    pictures_in,
+    stems,
+)
+from darswin.data.scenes.scene import (
+    NO_CLASSES,
+    SUFFIXES,
+    Classes,
+    Scenes,
+    read_distance,
+    read_labels,
+    read_palette,
+)
+from darswin.data.splits import Split, split_folders
 
 FORM = (
     "darswin looks for images/STEM.png (or jpg, bmp, webp, tif, ppm) with labels/STEM.png or "
@@ -29,58 +45,51 @@ def open_plain(root: Path, options: Options) -> Scenes:
                 f"{root / 'images'} and {next(iter(folders.values()))} may both be meant: {FORM}"
             )
         return _scenes(root, root, options, partial(options.choose, root=root))
-    if options.splits is not None:
-        raise ValueError(f"{options.splits} lists splits, and {root} has a folder for each")
-    split = options.split
-    if split == "all":
-        raise ValueError(f"{root} has a folder for each split: 'all' is of a folder without splits")
-    part, held_out = taken_from(split, folders)
-    folder = folders[part]
-
-    def choose(found: list[str]) -> list[str]:
-        return part_of_split(found, split, held_out, options.holdout, folder)
-
-    return _scenes(root, folder, options, choose)
+    part, choose = options.choose_part(folders, root)
+    return _scenes(root, folders[part], options, choose)
 
 
-def _scenes(
-    root: Path, folder: Path, options: Options, choose: Callable[[list[str]], list[str]]
-) -> Scenes:
+def _scenes(root: Path, folder: Path, options: Options, choose: Choose) -> Scenes:
     """The scenes of a folder with `images/`, of the stems that `choose` takes."""
     target = options.target
     targets = stems(folder / target, SUFFIXES[target])
     pairs = pair(pictures_in(folder / "images"), targets, choose, root=folder, what=target)
-    classes = NO_CLASSES
+    classes, read = NO_CLASSES, read_distance
     if target == "labels":
-        classes = read_palette(options.classes or _beside("classes.json", folder, root))
-    lenses = options.given_lens(root) or _lenses(root, folder, pairs)
-    files = list(pairs.values())
-    return Scenes(folder, files, lenses, target=target, channels=options.channels, classes=classes)
+        class_of, classes = options.labels(partial(_classes, folder, root))
+        read = partial(read_labels, classes=len(classes.names), class_of=class_of)
+    lenses = options.given_lens(root) or _lenses(root, folder, pairs, options)
+    return Scenes(
+        folder, list(pairs.values()), lenses, target=target,
+        channels=options.channels, classes=classes, read=read,
+    )  # fmt: skip
 
 
-def _lenses(root: Path, folder: Path, pairs: Pairs) -> Calibrations:
+def _lenses(root: Path, folder: Path, pairs: Pairs, options: Options) -> Calibrations:
     """The lenses of the pictures themselves, else the folder's."""
-    own = stems(folder / "lenses", (".json",)) if (folder / "lenses").is_dir() else {}
+    own = stems(folder / "lenses", CALIBRATIONS) if (folder / "lenses").is_dir() else {}
     files = {folder / pairs[stem][0]: Path(own[stem]) for stem in pairs if stem in own}
     missing = [stem for stem in pairs if stem not in own]
     if not missing:
-        return Calibrations(None, files=files)
-    try:
-        shared = _beside("lens.json", folder, root)
-    except FileNotFoundError as error:
+        return options.own_lenses(files)
+    shared = calibration_in(folder, root)
+    if shared is None:
         has = f"{folder / 'lenses' / missing[0]}.json" if own else f"lens.json in {folder}"
         raise FileNotFoundError(
             f"no lens for {folder / pairs[missing[0]][0]}: add {has}, or give `lens`"
-        ) from error
-    return Calibrations(shared, shared.parent, files=files)
+        )
+    return Calibrations(shared, shared.parent, options.camera, options.coefficients, files=files)
 
 
-def _beside(name: str, folder: Path, root: Path) -> Path:
-    """A file in the split's folder, or else in the root."""
-    for place in (folder / name, root / name):
-        if place.is_file():
-            return place
-    raise FileNotFoundError(f"no {name} in {folder}" + (f" or {root}" if folder != root else ""))
+def _classes(folder: Path, root: Path) -> Classes:
+    """The classes of the split's folder, or else of the root."""
+    for place in dict.fromkeys((folder, root)):
+        if (place / "classes.json").is_file():
+            return read_palette(place / "classes.json")
+    raise FileNotFoundError(
+        f"no classes.json in {root}: name the classes of the ids 0, 1, … there, for example "
+        '{"names": ["road", "car"], "colors": [[128, 64, 128], [0, 0, 142]]}, or give `classes`'
+    )
 
 
 def _split_folders(root: Path) -> dict[Split, Path]:

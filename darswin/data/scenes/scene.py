@@ -2,7 +2,8 @@
 
 import os
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, Self
 
@@ -12,6 +13,7 @@ import torch
 from PIL import Image
 
 from darswin.data.cameras import Calibrations
+from darswin.data.pictures import Form, form_of
 from darswin.data.splits import Limited, read_classes, read_json, some
 from darswin.lens import Lens
 from darswin.utils.image import BrokenImageError, decoded, file_content, read_oriented
@@ -56,9 +58,9 @@ class Scenes(Limited):
         classes: names of the labels' ids, and their colours.
         views: of each picture, what `cameras` calls the camera that took it; None takes them from
             `lenses`.
+        read: reads a target file; None takes `read_labels` or `read_distance`.
         trim: (rows, height): so many rows are cut at the top and at the bottom of a picture that is
             so high, and as large a part of others; their lenses follow.
-        far: metres, from which on a distance is that of the sky, which is not known.
 
     Attributes:
         classes, colors: of the labels. cameras: names of what took the pictures.
@@ -78,12 +80,15 @@ class Scenes(Limited):
         channels: int = 3,
         classes: Classes = NO_CLASSES,
         views: Sequence[str] | None = None,
+        read: Callable[[Path], np.ndarray] | None = None,
         trim: tuple[int, int] = (0, 1),
-        far: float | None = None,
     ):
         self.root, self.lenses, self.target, self.channels = Path(root), lenses, target, channels
         self.classes, self.colors = list(classes.names), list(classes.colors)
-        self.trim, self.far = trim, far
+        if read is None:
+            labels = target == "labels"
+            read = partial(read_labels, classes=len(classes.names)) if labels else read_distance
+        self.read, self.trim = read, trim
         # As arrays, so that worker processes share them instead of copying every object.
         self._pictures = np.array([os.fsencode(picture) for picture, _ in files], np.bytes_)
         self._targets = np.array([os.fsencode(file) for _, file in files], np.bytes_)
@@ -107,10 +112,7 @@ class Scenes(Limited):
                 f"{self.file(index)} is stored turned, as its EXIF orientation {orientation} says, "
                 "and its labels or distances may be of either picture: store it upright"
             )
-        if self.target == "labels":
-            target = read_labels(self.target_file(index), len(self.classes))
-        else:
-            target = read_distance(self.target_file(index), self.far)
+        target = self.read(self.target_file(index))
         size = image.shape[0], image.shape[1]
         if target.shape != size:
             shapes = [f"{height}×{width}" for height, width in (target.shape, size)]
@@ -137,6 +139,10 @@ class Scenes(Limited):
     def target_file(self, index: int) -> Path:
         """The file of its labels or distances."""
         return self.root / os.fsdecode(self._targets[index])
+
+    def form(self) -> Form:
+        """The form of the pictures as they are stored."""
+        return form_of(self.file, len(self))
 
     def camera_of(self, index: int) -> int:
         """The camera that took a picture, as a number in `cameras`."""
@@ -168,8 +174,11 @@ def nothing_of(target: np.ndarray) -> int:
     return IGNORE if target.dtype == np.uint8 else 0
 
 
-def read_labels(path: Path, classes: int) -> np.ndarray:
-    """A label PNG, grey or with a palette, as (H, W) uint8: ids of so many classes, or `IGNORE`."""
+def read_labels(path: Path, classes: int, class_of: Mapping[int, int] | None = None) -> np.ndarray:
+    """A label PNG, grey or with a palette, as (H, W) uint8: ids of so many classes, or `IGNORE`.
+
+    `class_of` maps the ids in the file to classes; ids that it leaves out become `IGNORE`.
+    """
     try:
         with warnings.catch_warnings(action="ignore"), Image.open(path) as file:
             mode = file.mode
@@ -182,11 +191,17 @@ def read_labels(path: Path, classes: int) -> np.ndarray:
             f"{path} must hold an id of 8 bits for each pixel, grey or with a palette, but "
             f"holds {'16 bits' if mode.startswith('I') else f'colours ({mode})'}"
         )
+    if class_of is not None:
+        table = np.full(256, IGNORE, np.uint8)
+        for id_, class_ in class_of.items():
+            if id_ < len(table):
+                table[id_] = class_
+        return table[labels]
     ids = np.flatnonzero(np.bincount(labels.ravel(), minlength=256)).tolist()
     if wrong := [id_ for id_ in ids if classes <= id_ != IGNORE]:
         raise ValueError(
             f"{path} holds the ids {some(wrong)}, and there are {classes} classes, of the ids 0 to "
-            f"{classes - 1}; {IGNORE} is no class"
+            f"{classes - 1}; {IGNORE} is no class, and `label_map` maps other ids to classes"
         )
     return labels
 
@@ -235,6 +250,40 @@ def read_palette(path: str | Path) -> Classes:
     if isinstance(content, Mapping):
         return as_classes(content.get("names"), content.get("colors", []), path)
     return as_classes(read_classes(path), [], path)
+
+
+def read_label_map(
+    path: str | Path, own: Callable[[], Classes], is_given: bool
+) -> tuple[dict[int, int], Classes]:
+    """The class of each id in the label files, from a JSON object, and the classes.
+
+    The values are names, or ids of classes, or null for ids that are of no class. The classes are
+    `own()`; or, if these are not given by the caller, the names in the order of the file.
+    """
+    content = read_json(path)
+    form = (
+        f'{path} must be a JSON object of ids and their classes, such as {{"7": "road", "8": 1, '
+        '"9": null}'
+    )
+    if not isinstance(content, Mapping) or not content:
+        raise ValueError(f"{form}, got {content!r}")
+    names = [value for value in content.values() if isinstance(value, str)]
+    from_names = bool(names) and not is_given
+    classes = as_classes(list(dict.fromkeys(names)), [], path) if from_names else own()
+    found: dict[int, int] = {}
+    for key, value in content.items():
+        if not key.isdecimal():
+            raise ValueError(f"{form}, got the id {key!r}")
+        if value is None or value == IGNORE:
+            continue
+        class_ = classes.names.index(value) if value in classes.names else value
+        if type(class_) is not int or not 0 <= class_ < len(classes.names):
+            raise ValueError(
+                f"{path} maps the id {key} to {value!r}, but the classes are "
+                f"{some(classes.names)}, of the ids 0 to {len(classes.names) - 1}"
+            )
+        found[int(key)] = class_
+    return found, classes
 
 
 def as_classes(names: Any, colors: Any, path: str | Path) -> Classes:

@@ -16,13 +16,21 @@ SynWoodScape, RA-L 2022.
 """
 
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from darswin.data.cameras import Calibrations
 from darswin.data.scenes.files import Options, Pairs, lenses_beside, pair, pictures_in, stems
-from darswin.data.scenes.scene import NO_CLASSES, Classes, Scenes, as_classes, read_palette
+from darswin.data.scenes.scene import (
+    NO_CLASSES,
+    Classes,
+    Scenes,
+    as_classes,
+    read_distance,
+    read_labels,
+)
 from darswin.data.splits import Split, read_json
 
 NAMES = ["void", "road", "lanemarks", "curb", "person", "rider", "vehicles", "bicycle",
@@ -61,7 +69,7 @@ def open_woodscape(root: Path, options: Options) -> Scenes:
 
 def open_synwoodscape(root: Path, options: Options) -> Scenes:
     """A split; options and errors as `darswin.data.open_scenes`."""
-    return _scenes(root, options, SYN_NAMES, far=SKY if options.target == "distance" else None)
+    return _scenes(root, options, SYN_NAMES)
 
 
 def _scenes(
@@ -70,15 +78,15 @@ def _scenes(
     names: list[str],
     *,
     trim: tuple[int, int] = (0, 1),
-    far: float | None = None,
 ) -> Scenes:
     target = options.target
     if target == "labels":
         targets = stems(_unnested(root / "semantic_annotations") / "gtLabels", (".png",))
-        classes = _classes(root, options, names)
+        class_of, classes = options.labels(partial(_classes, root, names))
+        read = partial(read_labels, classes=len(classes.names), class_of=class_of)
     else:
         targets = stems(_unnested(root / "depth_maps") / "raw_data", (".npy",))
-        classes = NO_CLASSES
+        classes, read = NO_CLASSES, partial(read_distance, far=SKY)
     pairs = pair(
         pictures_in(_unnested(root / "rgb_images")),
         targets,
@@ -86,10 +94,13 @@ def _scenes(
         root=root,
         what=target,
     )
-    lenses, views = options.given_lens(root) or _lenses(root, pairs), [_view_of(s) for s in pairs]
+    lenses, views = (
+        options.given_lens(root) or _lenses(root, pairs, options),
+        [_view_of(s) for s in pairs],
+    )
     return Scenes(
         root, list(pairs.values()), lenses, target=target, channels=options.channels,
-        classes=classes, views=views, trim=trim, far=far,
+        classes=classes, views=views, read=read, trim=trim,
     )  # fmt: skip
 
 
@@ -117,10 +128,8 @@ def _unnested(folder: Path) -> Path:
     return inner if inner.is_dir() else folder
 
 
-def _classes(root: Path, options: Options, published: list[str]) -> Classes:
-    """Those given, of the data set's own file, or as published."""
-    if options.classes is not None:
-        return read_palette(options.classes)
+def _classes(root: Path, published: list[str]) -> Classes:
+    """The classes of the data set's own file, or as published."""
     folder = root / "semantic_annotations"
     for place in (folder, folder / folder.name, root):
         if (place / INFO).is_file():
@@ -144,7 +153,7 @@ def _info(file: Path) -> Classes:
     return Classes([classes.names[k] for k in order], colors)
 
 
-def _lenses(root: Path, pairs: Pairs) -> Calibrations:
+def _lenses(root: Path, pairs: Pairs, options: Options) -> Calibrations:
     """The calibrations of the pictures, by their names, or else by their cameras'."""
     places = _unnested(root / "calibration"), root / "calibration_data" / "calibration"
     folder = next((place for place in places if place.is_dir()), None)
@@ -155,4 +164,4 @@ def _lenses(root: Path, pairs: Pairs) -> Calibrations:
     def calibration_of(stem: str) -> str:
         return found.get(stem) or found.get(_view_of(stem)) or f"{folder / stem}.json"
 
-    return lenses_beside(root, pairs, calibration_of)
+    return lenses_beside(options, root, pairs, calibration_of)

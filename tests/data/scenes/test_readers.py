@@ -1,16 +1,21 @@
 """Trees written as the data sets' authors describe them: none of the three can be downloaded."""
 
 import json
+import shutil
 from itertools import chain
 
 import numpy as np
 import pytest
 from scenes import (
+    CLASSES,
     VIEWS,
+    WOODSCAPE,
     WOODSCAPE_INFO,
     distance_of,
     labels_of,
     rays_of,
+    write_cityscapes,
+    write_coco,
     write_kitti360,
     write_plain,
     write_synwoodscape,
@@ -18,9 +23,9 @@ from scenes import (
 )
 from torch.utils.data import DataLoader
 
-from darswin.data import LeftOut, SceneSamples, open_scenes
+from darswin.data import IGNORE, LeftOut, SceneSamples, open_scenes
 from darswin.data.scenes.woodscape import heal_swin
-from darswin.lens import Mei, load
+from darswin.lens import KannalaBrandt, Mei, load, save
 
 INFO = "semantic_annotations/seg_annotation_info.json"
 
@@ -150,6 +155,93 @@ def test_kitti360(tmp_path):
         open_scenes(tmp_path, "train", "distance")
 
 
+def test_cityscapes(tmp_path):
+    write_cityscapes(tmp_path)
+    with pytest.raises(FileNotFoundError, match=r"no lens\.json in .*, or give `lens`"):
+        open_scenes(tmp_path, "train", "labels")
+    shutil.copy(WOODSCAPE, tmp_path / "lens.json")
+    scenes = open_scenes(tmp_path, "train", "labels")
+    assert names(scenes) == [f"aachen_{k:06d}_000019_leftImg8bit" for k in range(3)]
+    assert len(scenes.classes) == len(scenes.colors) == 19 and scenes.classes[18] == "bicycle"
+    theta, azimuth = rays_of(scenes[0].lens, (121, 160))
+    ids = labels_of(theta, azimuth)  # 6 is no class, 7 the first and 8 the second
+    for k in range(2):
+        assert (scenes[0].target[ids == k + 1] == k).all()
+    assert (scenes[0].target[ids == 0] == IGNORE).all()
+    for split in ("val", "test"):  # the labels of "test" are withheld
+        assert names(open_scenes(tmp_path, split, "labels")) == ["lindau_000000_000019_leftImg8bit"]
+    with pytest.raises(ValueError, match="Cityscapes' form, which has labels, no distances"):
+        open_scenes(tmp_path, "train", "distance")
+    (tmp_path / "two.txt").write_text("road\nother\n")
+    with pytest.raises(ValueError, match=r"two\.txt must name 19 classes, but names 2"):
+        open_scenes(tmp_path, "train", "labels", classes=tmp_path / "two.txt")
+
+
+def test_coco_panoptic(tmp_path):
+    write_coco(tmp_path)
+    shutil.copy(WOODSCAPE, tmp_path / "lens.json")
+    scenes = open_scenes(tmp_path, "train", "labels")
+    assert scenes.classes == CLASSES["names"] and scenes.colors == CLASSES["colors"]
+    expected = labels_of(*rays_of(scenes[0].lens, (121, 160)))
+    expected[:, :9] = IGNORE
+    assert (scenes[0].target == expected).all() and len(scenes) == 2
+    assert names(open_scenes(tmp_path, "test", "labels")) == names(scenes)  # those of val2017
+    (tmp_path / "map.json").write_text(json.dumps({"200": "thing", "1": "thing"}))
+    mapped = open_scenes(tmp_path, "train", "labels", label_map=tmp_path / "map.json")
+    assert mapped.classes == ["thing"]
+    unlabelled = (expected == 1) | (expected == IGNORE)
+    assert (mapped[0].target == np.where(unlabelled, IGNORE, 0)).all()
+    file = tmp_path / "annotations" / "panoptic_train2017.json"
+    content = json.loads(file.read_text())
+    content["annotations"][0]["segments_info"].pop()
+    file.write_text(json.dumps(content))
+    with pytest.raises(ValueError, match=r"000\.png holds the segment 7, which its annotation"):
+        open_scenes(tmp_path, "train", "labels")[0]
+    file.write_text("{}")
+    with pytest.raises(ValueError, match=r"train2017\.json is not of COCO's panoptic form"):
+        open_scenes(tmp_path, "train", "labels")
+    with pytest.raises(ValueError, match="COCO's panoptic form, which has labels, no distances"):
+        open_scenes(tmp_path, "train", "distance")
+
+
+@pytest.mark.parametrize(
+    ("content", "classes", "expected"),
+    [
+        ({"0": "b", "2": "a"}, ["b", "a"], {0: 0, 1: IGNORE, 2: 1}),
+        ({"0": 2, "1": None, "2": 0}, CLASSES["names"], {0: 2, 1: IGNORE, 2: 0}),
+        ({"0": "x", "1": "x", "2": 255, "999": "x"}, ["x"], {0: 0, 1: 0, 2: IGNORE}),
+    ],
+)
+def test_label_maps(tmp_path, content, classes, expected):
+    write_plain(tmp_path, 1)
+    file = tmp_path / "map.json"
+    before = open_scenes(tmp_path, "all", "labels")[0].target
+    file.write_text(json.dumps(content))
+    scenes = open_scenes(tmp_path, "all", "labels", label_map=file)
+    assert scenes.classes == classes
+    for id_, class_ in expected.items():
+        assert (scenes[0].target[before == id_] == class_).all()
+
+
+def test_wrong_label_maps_are_named(tmp_path):
+    write_plain(tmp_path, 1)
+    file = tmp_path / "map.json"
+    for content, message in (
+        ([0], r"map\.json must be a JSON object of ids and their classes, such as"),
+        ({"x": 0}, "got the id 'x'"),
+        ({"0": 3}, "maps the id 0 to 3, but the classes are .*sky"),
+        ({"0": "sky", "1": 1}, r"maps the id 1 to 1, but the classes are \['sky'\]"),
+        ({"0": True}, "maps the id 0 to True"),
+    ):
+        file.write_text(json.dumps(content))
+        with pytest.raises(ValueError, match=message):
+            open_scenes(tmp_path, "all", "labels", label_map=file)
+    (tmp_path / "mine.txt").write_text("sky\nsea\n")
+    file.write_text(json.dumps({"0": "sky", "1": "land"}))
+    with pytest.raises(ValueError, match="maps the id 1 to 'land', but the classes are"):
+        open_scenes(tmp_path, "all", "labels", label_map=file, classes=tmp_path / "mine.txt")
+
+
 def test_what_woodscape_does_not_have(tmp_path):
     write_woodscape(tmp_path, 4)
     with pytest.raises(ValueError, match="WoodScape's form, which has labels, no distances"):
@@ -244,6 +336,35 @@ def test_lenses_of_pictures(tmp_path):
             open_scenes(tmp_path, "all", "labels")
 
 
+@pytest.mark.parametrize("name", ["lens.yaml", "lens.YML", "lens.xml", "lens.txt", "lens.json"])
+def test_a_calibration_beside_the_pictures(tmp_path, name):
+    lens = load(WOODSCAPE.parent / "opencv_fisheye.yaml").resized((121, 160))
+    write_plain(tmp_path, 2, lens=lens)
+    (tmp_path / "lens.json").unlink()
+    save(lens, tmp_path / name)
+    scenes = open_scenes(tmp_path, "all", "labels")
+    assert isinstance(scenes[1].lens, KannalaBrandt)
+    (tmp_path / "lenses").mkdir()
+    save(lens.replace(focal=lens.focal * 2), tmp_path / "lenses" / f"001{(tmp_path / name).suffix}")
+    scenes = open_scenes(tmp_path, "all", "labels")
+    assert scenes[1].lens.focal.item() == pytest.approx(2 * scenes[0].lens.focal.item())
+    (tmp_path / "lens.npz").touch()
+    with pytest.raises(ValueError, match="may both be meant: keep one"):
+        open_scenes(tmp_path, "all", "labels")
+
+
+def test_a_camera_of_the_calibration_beside_the_pictures(tmp_path):
+    write_plain(tmp_path, 2)
+    (tmp_path / "lens.json").unlink()
+    shutil.copy(WOODSCAPE.parent / "kalibr_fov.yaml", tmp_path / "lens.yaml")
+    with pytest.raises(
+        ValueError, match=r"lens\.yaml: it has several cameras, choose one as camera="
+    ):
+        open_scenes(tmp_path, "all", "labels")
+    lenses = [open_scenes(tmp_path, "all", "labels", camera=f"cam{k}").lenses for k in range(2)]
+    assert str(lenses[0].lens_alone(None)) != str(lenses[1].lens_alone(None))
+
+
 def test_missing_labels_and_pictures_are_named(tmp_path):
     write_plain(tmp_path, 4)
     (tmp_path / "labels" / "002.png").unlink()
@@ -271,5 +392,6 @@ def test_what_is_no_data_set(tmp_path):
     for wrong in (dict(split="x"), dict(target="x"), dict(channels=2), dict(holdout=0.5)):
         with pytest.raises(ValueError, match=f"{next(iter(wrong))}`? must be"):
             open_scenes(**dict(path=tmp_path, split="train", target="labels") | wrong)
+    write_plain(tmp_path, 1, own_lenses=True)
     with pytest.raises(ValueError, match="`camera` a is one of a calibration: give `lens` too"):
-        open_scenes(tmp_path, "train", "labels", camera="a")
+        open_scenes(tmp_path, "all", "labels", camera="a")

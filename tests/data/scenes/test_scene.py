@@ -152,7 +152,7 @@ def test_wrong_lenses_and_turned_pictures_are_named(tmp_path):
 @pytest.mark.parametrize(
     ("classes", "message"),
     [
-        (None, "no classes.json in"),
+        (None, 'no classes.json in .*, for example {"names":'),
         ([], "must name the classes"),
         ({"names": ["a", "a"]}, "must name each class once"),
         ({"names": ["a", 3]}, "must name the classes as a list of words"),

@@ -1,0 +1,72 @@
+"""Cityscapes and data sets of its form, with labels.
+
+Read: `leftImg8bit/SPLIT/CITY/STEM_leftImg8bit.png` and `gtFine/SPLIT/CITY/STEM_gtFine_labelIds.png`
+of the splits "train" and "val"; the labels of "test" are withheld. The ids become the 19 classes
+that the benchmark scores; all other ids count as unlabelled.
+
+Source: Cordts et al., Cityscapes, CVPR 2016, and github.com/mcordts/cityscapesScripts.
+"""
+
+from functools import partial
+from pathlib import Path
+
+from darswin.data.scenes.files import Options, pair, pictures_in, stems
+from darswin.data.scenes.scene import Classes, Scenes, read_labels
+from darswin.data.splits import SPLITS, Split
+
+# The id, the name and the colour of each class.
+CLASSES = (
+    (7, "road", [128, 64, 128]),
+    (8, "sidewalk", [244, 35, 232]),
+    (11, "building", [70, 70, 70]),
+    (12, "wall", [102, 102, 156]),
+    (13, "fence", [190, 153, 153]),
+    (17, "pole", [153, 153, 153]),
+    (19, "traffic light", [250, 170, 30]),
+    (20, "traffic sign", [220, 220, 0]),
+    (21, "vegetation", [107, 142, 35]),
+    (22, "terrain", [152, 251, 152]),
+    (23, "sky", [70, 130, 180]),
+    (24, "person", [220, 20, 60]),
+    (25, "rider", [255, 0, 0]),
+    (26, "car", [0, 0, 142]),
+    (27, "truck", [0, 0, 70]),
+    (28, "bus", [0, 60, 100]),
+    (31, "train", [0, 80, 100]),
+    (32, "motorcycle", [0, 0, 230]),
+    (33, "bicycle", [119, 11, 32]),
+)
+PICTURE, LABELS = "_leftImg8bit", "_gtFine_labelIds"
+
+
+def is_cityscapes(root: Path) -> bool:
+    return (root / "leftImg8bit").is_dir()
+
+
+def open_cityscapes(root: Path, options: Options) -> Scenes:
+    """A split; options and errors as `darswin.data.open_scenes`."""
+    if options.target != "labels":
+        raise ValueError(f"{root} is of Cityscapes' form, which has labels, no distances")
+    folders: dict[Split, Path] = {split: root / "leftImg8bit" / split for split in SPLITS[:2]}
+    part, choose = options.choose_part({s: f for s, f in folders.items() if f.is_dir()}, root)
+    pairs = pair(
+        _ending_in(PICTURE, pictures_in(folders[part])),
+        _ending_in(LABELS, stems(root / "gtFine" / part, (".png",))),
+        choose,
+        root=root,
+        what="labels",
+    )
+    class_of, classes = options.labels(
+        lambda: Classes([name for _, name, _ in CLASSES], [color for _, _, color in CLASSES]),
+        {id_: k for k, (id_, _, _) in enumerate(CLASSES)},
+    )
+    return Scenes(
+        root, list(pairs.values()), options.shared_lens(root), target="labels",
+        channels=options.channels, classes=classes,
+        read=partial(read_labels, classes=len(classes.names), class_of=class_of),
+    )  # fmt: skip
+
+
+def _ending_in(ending: str, files: dict[str, str]) -> dict[str, str]:
+    """The files whose stems have an ending, by their stems without it."""
+    return {stem.removesuffix(ending): f for stem, f in files.items() if stem.endswith(ending)}
