@@ -6,7 +6,7 @@ import torch
 from safetensors.torch import load_file
 
 from darswin import create_model
-from darswin.compat import OfficialPolynomial
+from darswin.compat import OfficialDarSwin, OfficialPolynomial
 from darswin.lens import Mei, Polynomial, Spherical
 from darswin.models.registry import has_image_size
 
@@ -53,10 +53,15 @@ def side_of(name):
 
 
 def network(name, **options):
-    """A nano in eval mode whose every parameter counts."""
-    if has_image_size(name):
-        options = dict(image_size=side_of(name)) | options
-    model = create_model(name, **(dict(num_classes=5) | options)).eval()
+    """A nano in eval mode whose every parameter counts; "official" is the released DarSwin-A."""
+    options = dict(num_classes=5) | options
+    if name == "official":
+        sizes = dict(embed_dim=24, depths=(1, 2, 1), num_heads=(1, 2, 4), samples=(4, 4))
+        model = OfficialDarSwin(**(sizes | options)).eval()
+    else:
+        if has_image_size(name):
+            options = dict(image_size=side_of(name)) | options
+        model = create_model(name, **options).eval()
     for key, parameter in model.named_parameters():
         mean = 1.0 if parameter.dim() == 1 and key.endswith("weight") else 0.0
         torch.nn.init.normal_(parameter, mean=mean, std=0.1)

@@ -1,4 +1,4 @@
-"""Other implementations of the models: their weights, and what they do otherwise."""
+"""Other implementations of the models: their weights and their differences from ours."""
 
 from darswin.compat.baselines import load_dat, load_timm_swin
 from darswin.compat.checkpoint import convert_checkpoint, read_state
@@ -13,5 +13,3 @@ __all__ = [
     "load_timm_swin",
     "read_state",
 ]
-
-FORMS = {"official": OfficialDarSwin}  # of `create_model(name, compat=…)`

@@ -1,4 +1,4 @@
-"""The weights of the baselines: Swin as timm has it, and DAT as its authors released it in 2022."""
+"""The weights of the baselines: timm's Swin, and the DAT that its authors released in 2022."""
 
 import math
 from collections.abc import Mapping
@@ -12,14 +12,15 @@ from darswin.models.swin import Swin
 
 
 def load_timm_swin(source: Source, **options) -> Swin:
-    """timm's `SwinTransformer` from its state dict, in eval mode: the same outputs.
+    """timm's `SwinTransformer` from its state dict, in eval mode and with the same outputs.
 
     Args:
-        source: a state dict or a file of one, as `darswin.compat.read_state`.
-        options: constructor arguments that no shape tells: `image_size` where it is not 64.
+        source: a state dict or the path of its file; see `read_state`.
+        options: constructor arguments that cannot be read from the state dict: `image_size`, if it
+            is not 64.
 
     Raises:
-        ValueError: keys or shapes that are not those of timm's Swin.
+        ValueError: the keys or shapes are not those of timm's Swin.
     """
 
     def convert(key: str, value: Tensor, model: Swin) -> tuple[str, Tensor]:
@@ -33,24 +34,24 @@ def load_timm_swin(source: Source, **options) -> Swin:
 
 
 def load_dat(source: Source, **options) -> DAT:
-    """The released DAT of CVPR 2022 from its state dict, in eval mode: the same outputs.
+    """The released DAT of CVPR 2022 from its state dict, in eval mode and with the same outputs.
 
-    The released code's later models, DAT++, have other layers and are refused.
+    The later models of the released code, DAT++, have other layers and are refused.
 
     Args:
-        source: a state dict or a file of one, as `darswin.compat.read_state`.
-        options: constructor arguments that no shape tells: `offset_range` where it is not 2, and
-            `image_size` where it is not 64 and no block is deformable.
+        source: a state dict or the path of its file; see `read_state`.
+        options: constructor arguments that cannot be read from the state dict: `offset_range`, if
+            it is not 2; and `image_size`, if it is not 64 and no block is deformable.
 
     Raises:
-        ValueError: keys or shapes that are not those of DAT.
+        ValueError: the keys or shapes are not those of DAT.
     """
     state = _joined(read_state(source))
     return load_as("DAT", state, lambda state: DAT(**(_dat(state) | options)), _convert_dat)
 
 
 def _table(rows: Tensor, name: str, model: Swin) -> Tensor:
-    """Swin's table ((2·M_r-1)·(2·M_φ-1), heads), as `RelativeTable` has it, if they fit."""
+    """A Swin table ((2·M_r-1)·(2·M_φ-1), heads) in the shape of `RelativeTable`, if it fits."""
     ours = model.state_dict().get(name)
     if ours is None or ours[0].numel() != rows.shape[0]:
         return rows
@@ -58,13 +59,13 @@ def _table(rows: Tensor, name: str, model: Swin) -> Tensor:
 
 
 def _window(rows: Tensor) -> tuple[int, int]:
-    """The square window of Swin's table."""
+    """The square window that a Swin table belongs to."""
     side = (math.isqrt(rows.shape[0]) + 1) // 2
     return side, side
 
 
 def _swin(state: Mapping[str, Tensor]) -> dict:
-    """Constructor arguments, from keys and shapes."""
+    """The constructor arguments, read from the keys and shapes."""
     depths = count_blocks(state, "layers.{}.blocks.{}.norm1.weight")
     tables = [
         state[f"layers.{stage}.blocks.0.attn.relative_position_bias_table"]
@@ -83,7 +84,7 @@ def _swin(state: Mapping[str, Tensor]) -> dict:
     )
 
 
-# Beginnings of keys, and parts of a block's keys.
+# New names for the first parts of keys, and for parts of the keys of a block.
 _RENAMED = {
     "patch_proj.0": "patch_embed.proj",
     "patch_proj.1.norm": "patch_embed.norm",
@@ -117,7 +118,7 @@ def _convert_dat(key: str, value: Tensor, model: DAT) -> tuple[str, Tensor]:
 
 
 def _joined(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """With the projections to keys and to values as one."""
+    """The state dict with the projections to keys and to values joined into one."""
     joined = {}
     for key, value in state.items():
         other = state.get(key.replace(".proj_k.", ".proj_v."))
@@ -134,7 +135,7 @@ def _renamed(key: str) -> str:
             return ours + key.removeprefix(theirs)
     parts = key.split(".")
     if parts[0] == "down_projs":
-        # Merging is a stage's end there and a stage's beginning here.
+        # Merging is the last layer of a stage there and the first layer here.
         layer = "proj" if parts[2] == "0" else "norm"
         return f"stages.{int(parts[1]) + 1}.downsample.{layer}.{parts[-1]}"
     if parts[0] != "stages" or len(parts) < 5:
@@ -152,7 +153,7 @@ def _renamed(key: str) -> str:
 
 
 def _dat(state: Mapping[str, Tensor]) -> dict:
-    """Constructor arguments, from keys and shapes."""
+    """The constructor arguments, read from the keys and shapes."""
     depths = count_blocks(state, "stages.{}.mlps.{}.chunk.linear1.weight")
     embed_dim, in_chans, patch_size, _ = state["patch_proj.0.weight"].shape
     heads, groups, blocks, found = [], [], [], {}

@@ -1,4 +1,4 @@
-"""State dicts and the files that hold them. Nothing in a file is ever executed."""
+"""State dicts and their files. Nothing in a file is ever executed."""
 
 import contextlib
 import json
@@ -20,15 +20,15 @@ Net = TypeVar("Net", bound=nn.Module)
 
 
 def read_state(source: Source) -> dict[str, Tensor]:
-    """A state dict, from itself or from a file; a checkpoint's "model" entry is found.
+    """The state dict from a file, or from the "model" entry of a checkpoint.
 
     Args:
-        source: safetensors, or what `torch.save` wrote, in its zip or its older format. A pickle
-            may hold tensors, plain values and containers, and the configuration of the authors'
-            checkpoints.
+        source: the path of a safetensors file or of a file that `torch.save` wrote, in the zip
+            format or the older one; or a state dict. A pickle may contain tensors, plain values,
+            containers, and the configuration in the authors' checkpoints.
 
     Raises:
-        ValueError: a file with something else in it, which is not executed, or without tensors.
+        ValueError: the file contains other objects, which are not executed, or no tensors.
     """
     if isinstance(source, Mapping):
         return _model(source)
@@ -42,20 +42,21 @@ def read_state(source: Source) -> dict[str, Tensor]:
 
 
 def convert_checkpoint(source: str | os.PathLike, target: str | os.PathLike) -> None:
-    """The weights of a pickled checkpoint, such as the authors publish, as a safetensors file.
+    """Writes the weights of a pickled checkpoint, such as the authors', to a safetensors file.
 
-    A "config" entry goes into the file's metadata as JSON, if it consists of what JSON has. Every
-    other entry, such as the optimizer's, is left out. The target appears complete or not at all.
+    A "config" entry becomes JSON in the metadata, if JSON can express it. All other entries, such
+    as the optimizer's state, are left out. A failure leaves no incomplete file.
 
     Args:
-        source: as `read_state`.
+        source: the path of the checkpoint; see `read_state`.
+        target: the path of the safetensors file.
 
     Raises:
-        ValueError: as `read_state`.
+        ValueError: the checkpoint contains other objects, which are not executed, or no tensors.
     """
     source = Path(source)
     checkpoint = read_pickle(source)
-    # Copies: safetensors takes no tensors that share memory.
+    # The tensors are copied, because safetensors does not accept tensors that share memory.
     state = {
         name: value.clone(memory_format=torch.contiguous_format)
         for name, value in _model(checkpoint, source).items()
@@ -70,7 +71,7 @@ def convert_checkpoint(source: str | os.PathLike, target: str | os.PathLike) -> 
 def _model(checkpoint: object, path: Path | None = None) -> dict[str, Tensor]:
     state = checkpoint.get("model", checkpoint) if isinstance(checkpoint, Mapping) else None
     if not isinstance(state, Mapping) or not all(isinstance(v, Tensor) for v in state.values()):
-        raise ValueError(f"{path or 'source'} holds no state dict, at the top or under 'model'")
+        raise ValueError(f"{path or 'source'} has no state dict at the top or under 'model'")
     return dict(state)
 
 
@@ -80,8 +81,11 @@ def load_as(
     make: Callable[[Mapping[str, Tensor]], Net],
     convert: Callable[[str, Tensor, Net], tuple[str, Tensor]],
 ) -> Net:
-    """The model of another implementation's state dict, in eval mode: `make` makes it, and
-    `convert` gives its own name and tensor for each. ValueError where they do not fit."""
+    """Our model with the weights of another implementation, in eval mode.
+
+    `make` creates the model from the state dict, and `convert` turns each key and tensor of the
+    state dict into ours. ValueError if the state dict does not fit.
+    """
     state = read_state(source)
     try:
         model = make(state)
@@ -96,7 +100,7 @@ def load_as(
 
 
 def count_blocks(state: Mapping[str, Tensor], form: str) -> list[int]:
-    """The stages' numbers of blocks, from `form`, a key of each with {} for stage and block."""
+    """The number of blocks per stage. `form` is a key of each block, {} for stage and block."""
     depths: list[int] = []
     while form.format(len(depths), 0) in state:
         depth = 1

@@ -1,21 +1,22 @@
-"""The authors' released DarSwin-A: all that it does otherwise than the paper, and its weights.
+"""The authors' released DarSwin-A: its weights and its differences from the paper.
 
-Rings and samples equal in tan θ with both borders sampled, azimuth 0 pointing down and running
-counterclockwise, radii scaled as align_corners=True does, the field of view of image 0 for the
-whole batch, tan θ_max as the angle of the bias, a seam in the azimuth, and other shifts.
+Rings and samples are equal in tan θ, and samples stand on both borders of a ring. Azimuth 0 points
+down, and azimuths run counterclockwise. Radii are scaled as with align_corners=True. The field of
+view of image 0 applies to the whole batch. The bias uses tan θ_max as its angle. The azimuth has a
+seam, and windows have other shifts.
 """
 
 import dataclasses
 import math
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from darswin.compat.checkpoint import Source, count_blocks, load_as
-from darswin.layers.polar import PolarGrid, PolarGridSpec, check_lens
+from darswin.layers.polar import PolarGrid, PolarGridSpec
 from darswin.layers.transformer import PolarWindowAttention
 from darswin.lens import Lens, Number, Spherical
 from darswin.lens.parameter import Parameter
@@ -26,14 +27,14 @@ from darswin.models.stages import Pair, StagePlan
 
 
 class OfficialPolynomial(Lens, register=False):
-    """The released code's polynomial lens, an angle as a function of the radius.
+    """The polynomial lens of the released code: the angle as a function of the radius.
 
-    θ(x) = x (d₁ + d₂ x + d₃ x² + d₄ x³) with x = r / radius in [0, 1], inverted on a table of 50
-    points, straight between them. θ(1) is θ_max, in units of its own: it need not be an angle.
+    θ(x) = x (d₁ + d₂ x + d₃ x² + d₄ x³) with x = r / radius in [0, 1]. The inverse is linear
+    between the 50 points of a table. θ(1) is θ_max; it has its own unit and need not be an angle.
 
     Args:
-        coefficients: (4,) or (N, 4): d₁ … d₄, such that θ rises.
-        radius: px, of the image circle: half the image's side.
+        coefficients: d₁ … d₄, (4,) or (N, 4); θ must rise with x.
+        radius: the radius of the image circle in pixels, which is half the side of the image.
     """
 
     coefficients = Parameter(shape=(4,))
@@ -54,7 +55,7 @@ class OfficialPolynomial(Lens, register=False):
         return sum(terms, torch.zeros_like(x))
 
     def _table(self) -> tuple[Tensor, Tensor]:
-        """x (50,) and its θ (N, 50)."""
+        """x (50,) and θ(x) (N, 50)."""
         like = self.coefficients
         x = torch.linspace(0, 1, 50, dtype=like.dtype, device=like.device)
         return x, self._angle(x[None])
@@ -77,33 +78,28 @@ class OfficialPolynomial(Lens, register=False):
 
 
 class OfficialDarSwin(DarSwin):
-    """The authors' released DarSwin-A; `create_model(name, compat="official")` makes it too.
+    """The authors' released DarSwin-A. `OfficialDarSwin(num_classes)` has the sizes of the paper.
 
-    Args: as `DarSwin`, but for spacing, sample_spacing, placement and jitter, which are given.
+    The arguments are those of `DarSwin`. spacing, sample_spacing, placement and jitter have fixed
+    values here.
 
     Raises:
-        ValueError: as `DarSwin`; variant "RA" or `merges`, which the released code does not have;
-            in forward, images that are not square, or lenses that are not radial.
+        ValueError: an option is wrong for `DarSwin`, or it is variant "RA" or `merges`, which the
+            released code does not have; in forward, the images are not square, or a lens is not
+            radial.
     """
 
     square_images = True
 
     def __init__(self, *arguments: Any, **options: Any):
         if options.get("variant", "A") != "A" or options.get("merges") is not None:
-            raise ValueError("the released DarSwin has variant 'A' and merges of its own")
+            raise ValueError("the released DarSwin has only variant 'A' and no option merges")
         grid = dict(spacing="tan", sample_spacing="tan", placement="edges", jitter=0.0)
+        self._window = options.get("window") or (1, 16)
         super().__init__(*arguments, **(options | grid))
 
-    def _plan(self, plan: StagePlan, window: Pair) -> StagePlan:
-        shift = (window[0], window[1] // 4)
-        if plan.map_size[1] < 4:
-            shift = shift[::-1]
-        # Rolling by whole windows of one token, or once around, moves nothing.
-        along_r, along_phi = (
-            s % size if w > 1 else 0
-            for s, size, w in zip(shift, plan.map_size, plan.window, strict=True)
-        )
-        return dataclasses.replace(plan, shift=(along_r, along_phi))
+    def _finish(self, plans: Sequence[StagePlan], patch: Pair) -> None:
+        super()._finish([_with_shift(plan, self._window) for plan in plans], patch)
 
     def attention(self, dim: int, heads: int, plan: StagePlan, block: int) -> nn.Module:
         return PolarWindowAttention(
@@ -113,33 +109,45 @@ class OfficialDarSwin(DarSwin):
             periodic=(False, False),
             position_bias=self.position_bias,
             harmonics=self.harmonics,
-            # It has M_φ rows of coefficients where one window is the map.
+            # The released code has M_φ rows of coefficients if the window is the whole map.
             periodic_bias=plan.window == plan.map_size,
         )
 
-    def prepare(self, lens: Lens | None, size: Pair) -> Prepared:
-        """As `DarSwin`; the angles of the bias are equal steps up to tan θ_max of image 0."""
-        lens = check_lens(lens, size)
+    def _prepare(self, lens: Lens, size: Pair) -> Prepared:
         grid = _grid(lens, size, self.spec)
+        # The angles of the bias are equal steps up to tan θ_max of image 0.
         last = _last_angle(lens[:1])[:, None]
         rings = [plan.map_size[0] for plan in self.plans]
         return Prepared(grid, [(last * _inclusive(count, lens.theta_max),) for count in rings])
 
     def embed(self, images: Tensor, points: PolarGrid) -> Tensor:
-        """As `DarSwin`, of the transposed images: x runs down there, and y to the right."""
+        # In the released code x points down and y to the right.
         return super().embed(images.transpose(2, 3), points)
 
 
-# It is a grid of the transposed image: azimuth 0 points down there. Near 90° the rounding of
-# float32 tangents moves samples by 1e-4 px, so the released steps are followed one by one, and the
-# samples still depend that much on the maths library (MKL's differs between CPUs).
+def _with_shift(plan: StagePlan, window: Pair) -> StagePlan:
+    """A stage's sizes with the shift of the released code."""
+    shift = (window[0], window[1] // 4)
+    if plan.map_size[1] < 4:
+        shift = shift[::-1]
+    # A shift by whole windows of one token, or once around the map, moves nothing.
+    along_r, along_phi = (
+        s % size if w > 1 else 0
+        for s, size, w in zip(shift, plan.map_size, plan.window, strict=True)
+    )
+    return dataclasses.replace(plan, shift=(along_r, along_phi))
+
+
+# The grid is that of the transposed image, because azimuth 0 points down. Near 90° the rounding of
+# float32 tangents moves samples by 1e-4 px. This code therefore follows the released code step by
+# step. Even so, the samples vary by as much with the maths library (MKL differs between CPUs).
 def _grid(lens: Lens, image_size: Pair, spec: PolarGridSpec) -> PolarGrid:
-    """The grid of the released code, in place of `PolarGridSpec.grid`."""
+    """The grid of the released code, instead of `PolarGridSpec.grid`."""
     height, width = image_size
     if height != width:
-        raise ValueError(f"compat='official' needs square images, got (H, W) = {image_size}")
+        raise ValueError(f"OfficialDarSwin needs square images, got (H, W) = {image_size}")
     if lens.affine is not None or not lens.is_radial:
-        raise ValueError("compat='official' needs radial lenses, with no affine, got " + repr(lens))
+        raise ValueError(f"OfficialDarSwin needs radial lenses without affine, got {lens!r}")
     like = lens.theta_max
     lens = lens.replace(theta_max=like[:1].expand(len(lens)))
     along_r, along_phi = (_inclusive(count - 1, like) for count in spec.samples)
@@ -154,7 +162,7 @@ def _grid(lens: Lens, image_size: Pair, spec: PolarGridSpec) -> PolarGrid:
         tangents = _between(_tangent(lens, inner), _tangent(lens, outer), along_r)
         radii = _radius(lens, tangents)
     step = (torch.tensor(2 * math.pi, dtype=like.dtype) / spec.sectors).item()
-    # Half a step less than once around: the end itself must not come in by rounding.
+    # The range ends half a step early, so that rounding cannot add one more azimuth.
     start = torch.arange(0, (spec.sectors - 0.5) * step, step, dtype=like.dtype, device=like.device)
     azimuths = _between(start, step + start, along_phi)
     scale = (height - 1) / 2 / (height // 2)
@@ -163,22 +171,22 @@ def _grid(lens: Lens, image_size: Pair, spec: PolarGridSpec) -> PolarGrid:
 
 
 def _inclusive(count: int, like: Tensor) -> Tensor:
-    """0 … 1 in `count` equal steps."""
+    """The ends of `count` equal steps from 0 to 1, (count + 1,)."""
     return torch.arange(count + 1, dtype=like.dtype, device=like.device) / count
 
 
 def _between(inner: Tensor, outer: Tensor, steps: Tensor) -> Tensor:
-    """Borders (..., R) and fractions (S,) → (..., R·S)."""
+    """Borders (..., R) and fractions (S,) → points between the borders, (..., R·S)."""
     return (inner[..., None] + steps * (outer - inner)[..., None]).flatten(-2)
 
 
 def _radius(lens: Lens, tangent: Tensor) -> Tensor:
-    """r at tan θ."""
+    """The radius for tan θ."""
     return lens.project(torch.atan(tangent))
 
 
 def _tangent(lens: Lens, radius: Tensor) -> Tensor:
-    """tan θ at r, in the released steps where the released code has the lens."""
+    """tan θ for a radius, in the steps of the released code if that code has the lens."""
     if not isinstance(lens, Spherical):
         return torch.tan(lens.unproject(radius))
     xi, rho = lens.xi[:, None], radius / lens.focal[:, None]
@@ -187,29 +195,30 @@ def _tangent(lens: Lens, radius: Tensor) -> Tensor:
 
 
 def _last_angle(lens: Lens) -> Tensor:
-    """(N,): what the released code splits into rings and takes for θ_max in the bias."""
+    """The largest angle, (N,): the released code splits it into rings and uses it in the bias."""
     if isinstance(lens, OfficialPolynomial):
         return lens.theta_max
     return torch.tan(lens.theta_max)
 
 
 def load_official(source: Source, **options) -> DarSwin:
-    """The authors' released DarSwin from its state dict, in eval mode, as `OfficialDarSwin`.
+    """The authors' released DarSwin from its state dict, an `OfficialDarSwin` in eval mode.
 
-    Angular and "polar" models give the released code's outputs; the latter's bias is the paper's
-    angular PE (Fourier in θ and φ), so it is called "angular" here. The released radial model
-    (DarSwin-RA) does not run; its weights load into our DarSwin-RA, with a warning.
+    The outputs of the released "angular" and "polar" models are reproduced. The position bias of
+    the released "polar" model is the paper's angular encoding (a Fourier series in θ and φ), so it
+    is called "angular" here. The released radial model (DarSwin-RA) does not run. Its weights are
+    loaded into our DarSwin-RA, with a warning.
 
-    Call it as any model, `model(images, lens)`, with `lens.Spherical(xi, focal, theta_max)` in
-    pixels of its input, or with `OfficialPolynomial(coefficients, radius)`.
+    The lens of `model(images, lens)` is `lens.Spherical(xi, focal, theta_max)` in pixels of the
+    images, or `OfficialPolynomial(coefficients, radius)`.
 
     Args:
-        source: a state dict or a file of one, as `darswin.compat.read_state`.
-        options: constructor arguments that no shape tells: `rings`, `sectors`, `samples` and
-            `in_chans` where they are not 16, 64, (10, 10) and 3.
+        source: a state dict or the path of its file; see `read_state`.
+        options: constructor arguments that cannot be read from the state dict: `rings`, `sectors`,
+            `samples` and `in_chans`, if they differ from 16, 64, (10, 10) and 3.
 
     Raises:
-        ValueError: keys or shapes that are not those of a released model.
+        ValueError: the keys or shapes are not those of a released model.
     """
 
     def make(state: Mapping[str, Tensor]) -> DarSwin:
@@ -228,7 +237,7 @@ def load_official(source: Source, **options) -> DarSwin:
 
 
 def _settings(state: Mapping[str, Tensor]) -> dict:
-    """Constructor arguments, from keys and shapes."""
+    """The constructor arguments, read from the keys and shapes."""
     depths = count_blocks(state, "layers.{}.blocks.{}.norm1.weight")
     heads = [state[f"layers.{stage}.blocks.0.attn.a_p"].shape[1] for stage in range(len(depths))]
     settings = dict(
@@ -244,8 +253,8 @@ def _settings(state: Mapping[str, Tensor]) -> dict:
     last_stage_masked = f"layers.{len(depths) - 1}.blocks.1.attn_mask" in state
     if depths[-1] > 1 and not last_stage_masked:
         warnings.warn(
-            "the released radial model does not run, so there are no outputs to match: its weights "
-            "are loaded into DarSwin-RA with the polar position bias",
+            "the released radial model does not run, so its outputs cannot be reproduced: its "
+            "weights are loaded into DarSwin-RA with the polar position bias",
             stacklevel=5,
         )
         grid = dict(spacing="tan", placement="edges", jitter=0.0)
@@ -257,10 +266,10 @@ def _renamed(key: str) -> str:
     key = key.replace("patch_embed.mlp.", "patch_embed.proj.")
     if key.startswith("layers."):
         _, index, rest = key.split(".", 2)
-        # Merging ends a stage there and begins one here.
+        # Merging is the last layer of a stage there and the first layer here.
         stage = int(index) + rest.startswith("downsample.")
         key = f"stages.{stage}.{rest}"
-    # There a goes with the cosine and b with the sine; r is the radius and p the azimuth.
+    # There, a is for the cosine, b for the sine, r for the radius, and p for the azimuth.
     for theirs, ours in (
         ("a_r", "b_theta"),
         ("b_r", "a_theta"),

@@ -1,4 +1,4 @@
-"""Images → the first map of tokens: polar patches of DarSwin, square ones of Swin and DAT."""
+"""Patch embedding: images → the first map, of polar patches (DarSwin) or squares (Swin, DAT)."""
 
 from typing import Any
 
@@ -11,18 +11,18 @@ from darswin.ops import polar_embed
 
 
 def check_dtype(images: Tensor, dtype: torch.dtype) -> None:
-    """TypeError unless the images are uint8 or of a model's dtype, or autocast makes them so."""
+    """TypeError unless the images are uint8, have the model's dtype, or autocast converts them."""
     if images.dtype in (torch.uint8, dtype):
         return
     autocast = torch.is_autocast_enabled(images.device.type)
     if not autocast or torch.float64 in (images.dtype, dtype):
         raise TypeError(
-            f"images must be uint8, or {dtype} as the model's weights are, got {images.dtype}"
+            f"images must be uint8 or {dtype}, the dtype of the weights, got {images.dtype}"
         )
 
 
 class PatchProjection(nn.Module):
-    """Joins p × p neighbours of a map into one: a convolution as wide as its step, a LayerNorm."""
+    """Joins p × p neighbours of a map into one token, by a p × p convolution and a LayerNorm."""
 
     def __init__(self, dim: int, out_dim: int, patch: int, *, bias: bool = True):
         super().__init__()
@@ -36,7 +36,7 @@ class PatchProjection(nn.Module):
 
 
 class PolarPatchEmbed(nn.Module):
-    """Images on a polar grid → polar map: samples of each patch, a linear layer, a LayerNorm."""
+    """Samples each patch of a polar grid, and maps the samples to a token."""
 
     def __init__(
         self, spec: PolarGridSpec, *, in_chans: int = 3, embed_dim: int = 96, **options: Any
@@ -47,10 +47,10 @@ class PolarPatchEmbed(nn.Module):
         self.norm = nn.LayerNorm(embed_dim)
 
     def forward(self, images: Tensor, grid: PolarGrid) -> Tensor:
-        """(B, C, H, W), uint8 or of the weights' dtype → (B, R, A, D)."""
+        """Images (B, C, H, W), uint8 or of the weights' dtype → (B, R, A, D)."""
         weight, bias = self.proj.weight, self.proj.bias
         check_dtype(images, weight.dtype)
         tokens = polar_embed(**self.sample.arguments(images, grid), weight=weight, bias=bias)
         if weight.dtype == torch.bfloat16:
-            tokens = tokens.bfloat16()  # of uint8 images they are float32
+            tokens = tokens.bfloat16()  # tokens of uint8 images are float32
         return self.norm(tokens)

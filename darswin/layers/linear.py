@@ -1,7 +1,7 @@
-"""A linear layer whose three products, the gradients' included, may be oneDNN's or torch's BLAS.
+"""A linear layer that computes its products with oneDNN or with torch's BLAS, gradients included.
 
-In float32 torch asks its BLAS, which is MKL in the wheels for x86-64 and half as fast as oneDNN on
-AMD's CPUs. oneDNN's products are those that torch's own library carries.
+In float32, torch uses its BLAS. In the wheels for x86-64 this is MKL, which is half as fast as
+oneDNN on AMD's CPUs. oneDNN is part of torch's own library.
 """
 
 import time
@@ -24,7 +24,7 @@ MATMUL_BACKENDS = get_args(MatmulBackend)
 
 
 def onednn_lack(dtype: torch.dtype) -> str | None:
-    """The reason why this torch has no products of oneDNN in `dtype` here; None where it has."""
+    """The reason why oneDNN cannot compute products in `dtype` here, or None if it can."""
     if dtype not in (torch.float32, torch.bfloat16, torch.int8):
         return f"oneDNN has no products in {dtype}"
     if not torch.backends.mkldnn.is_available():
@@ -46,7 +46,7 @@ def onednn_lack(dtype: torch.dtype) -> str | None:
 
 
 def _has_int8() -> bool:
-    # Such a CPU adds up products of 8 bits in 32 bits: others overflow in 16.
+    # With VNNI, products of 8 bits are added in 32 bits; without it, they overflow in 16 bits.
     if torch.cpu._is_vnni_supported():
         return True
     capabilities: Any = getattr(torch.cpu, "get_capabilities", dict)  # missing in older torch
@@ -55,7 +55,7 @@ def _has_int8() -> bool:
 
 @cache
 def _int8_is_exact() -> bool:
-    """Computes the largest product that there is. Without VNNI it comes out wrong."""
+    """True if the largest possible product is right; it is wrong without VNNI."""
     size, largest = 64, 127
     weight = torch.full((size, size), largest, dtype=torch.int8)
     packed = torch.ops.onednn.qlinear_prepack(weight, None)
@@ -74,7 +74,7 @@ def _onednn_product(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Te
 def _onednn_parameter_gradients(
     g: Tensor, x: Tensor, with_bias: bool
 ) -> tuple[Tensor, Tensor | None]:
-    # oneDNN's product wants one of the two transposed in memory; torch's own copy is a slow one.
+    # oneDNN needs one of the two matrices transposed in memory, and torch transposes slowly.
     transposed, grad_bias = transpose_sum(g.contiguous())
     return _onednn_product(transposed, x.t()), grad_bias if with_bias else None
 
@@ -83,20 +83,20 @@ def _parameter_gradients(g: Tensor, x: Tensor, with_bias: bool) -> tuple[Tensor,
     return g.t() @ x, g.sum(0) if with_bias else None
 
 
-# Of rows x (M, D), a weight w (D', D) and the gradient g (M, D') of the result.
+# The inputs: rows x (M, D), a weight w (D', D), and the gradient g (M, D') of the result.
 _PRODUCTS: dict[str, dict[str, Callable]] = {
     "forward": {"torch": F.linear, "onednn": _onednn_product},
     "input gradient": {
         "torch": lambda g, w: g @ w,
         "onednn": lambda g, w: _onednn_product(g, w.t()),
     },
-    # The bias's gradient comes along.
+    # It also computes the gradient of the bias.
     "weight gradient": {"torch": _parameter_gradients, "onednn": _onednn_parameter_gradients},
 }
 
 
 class Shape(NamedTuple):
-    """A product that is measured."""
+    """The key of an autotune measurement."""
 
     product: str  # "forward", "input gradient" or "weight gradient"
     rows: int  # of the input, rounded up to a power of two
@@ -109,7 +109,7 @@ _measured: dict[Shape, dict[str, float]] = {}
 
 
 def autotune_results() -> dict[Shape, dict[str, float]]:
-    """The seconds of each library for each shape measured so far, the one taken first."""
+    """The measured seconds of each library for each shape so far, with the fastest one first."""
     return {
         shape: dict(sorted(seconds.items(), key=lambda item: item[1]))
         for shape, seconds in _measured.items()
@@ -117,16 +117,16 @@ def autotune_results() -> dict[Shape, dict[str, float]]:
 
 
 class Linear(nn.Linear):
-    """`nn.Linear` with a choice of the library that computes its products.
+    """`nn.Linear` with a choice of the library that computes its matrix products.
 
-    `matmul_backend` is "torch", as `nn.Linear`; "onednn"; or "autotune", which measures both at the
-    first call with a shape, takes the faster from then on, and shows what it found in
-    `autotune_results`. Both compute in float32. They round differently, so a run that must repeat
-    bit for bit names one of the two. Second derivatives need "torch".
+    `matmul_backend` is "torch", "onednn" or "autotune". "autotune" measures both libraries at the
+    first call with a shape and uses the faster one from then on; `autotune_results` shows the
+    measurements. Both libraries compute in float32 but round differently, so choose one of them if
+    a run must repeat bit for bit. Second derivatives need "torch".
 
-    It concerns float32 on the CPU in eager mode. Elsewhere torch computes the product as ever: in
-    compiled graphs; under autocast and in bfloat16, where it asks oneDNN by itself; and where there
-    is no oneDNN.
+    The choice applies to float32 on the CPU in eager mode. In all other cases torch computes the
+    products: in compiled graphs, without oneDNN, and in bfloat16 or under autocast, where torch
+    uses oneDNN by itself.
     """
 
     matmul_backend: MatmulBackend = "torch"
@@ -182,7 +182,7 @@ class _Product(torch.autograd.Function):
 
 
 def _multiply(product: str, matmul_backend: MatmulBackend, weight: Tensor, rows: Tensor, *others):
-    """The product of a layer with `weight`, of (M, ...) rows and others, by the library to take."""
+    """A product of (M, ...) rows and other operands, by the chosen or the faster library."""
     libraries = _PRODUCTS[product]
     if matmul_backend == "onednn":
         return libraries["onednn"](rows, *others)
@@ -197,12 +197,12 @@ def _multiply(product: str, matmul_backend: MatmulBackend, weight: Tensor, rows:
 
 
 def best_seconds(runs: Mapping[Key, Callable[[], object]], turns: int) -> dict[Key, float]:
-    """The seconds of each run: the best of some, taken in turns."""
+    """The shortest time of each run in seconds. Runs take turns; the first turn does not count."""
     seconds = dict.fromkeys(runs, float("inf"))
     for turn in range(turns):
         for name, run in runs.items():
             start = time.perf_counter()
             run()
-            if turn:  # the first one makes what oneDNN keeps for the shape
+            if turn:  # in the first turn oneDNN prepares itself for the shape
                 seconds[name] = min(seconds[name], time.perf_counter() - start)
     return seconds

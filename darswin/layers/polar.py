@@ -1,13 +1,13 @@
-"""The polar grid: the rings and sectors that a lens's image is cut into, the samples in them, and
-the way from a polar map back to pixels.
+"""The polar grid: rings and sectors of a lens's image, the samples in them, and the way back from a
+polar map to pixels.
 
-Rings and samples are each split into equal steps of a *spacing*, see `darswin.lens.spacing`.
+Rings and samples are equal steps of a *spacing*; see `darswin.lens.spacing`.
 """
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, get_args
 
 import torch
 from torch import Tensor, nn
@@ -21,11 +21,11 @@ from darswin.ops.checks import as_int, channels_first, check_jitter, check_layou
 __all__ = ["PolarGrid", "PolarGridSpec", "PolarSample", "polar_grid"]
 
 Placement = Literal["centers", "edges"]
-PLACEMENTS = ("centers", "edges")
+PLACEMENTS = get_args(Placement)
 
 
 class PolarGrid(NamedTuple):
-    """The places that `polar_sample` reads in the images of N lenses, and the borders of the rings.
+    """The points at which `polar_sample` reads the images of N lenses, and the ring borders.
 
     Shapes: radii (N, R·S_r) px, azimuths (A·S_φ,) rad, center (N or 1, 2) px, borders (N, R+1) px;
     for general lenses also affine (N or 1, 2, 2) and offsets (N or 1, 2, R·S_r, A·S_φ) px.
@@ -40,10 +40,10 @@ class PolarGrid(NamedTuple):
 
 
 class PixelGrid(NamedTuple):
-    """The arguments of `polar_to_image` that bring back a polar map, by their names.
+    """The arguments of `polar_to_image` that resample a polar map to the pixels of the images.
 
-    Shapes: radii (N, R) px, of the rings' centres; r_max (N,) px; for radial lenses center
-    (N or 1, 2) px and affine (N, 2, 2), for general ones points (N, H, W, 2) px.
+    Shapes: radii of the ring centres (N, R) px; r_max (N,) px; for radial lenses center
+    (N or 1, 2) px and affine (N, 2, 2), for general lenses points (N, H, W, 2) px.
     """
 
     radii: Tensor
@@ -62,21 +62,23 @@ class PolarGridSpec:
         2π(a+1)/A; azimuth 0 points right, π/2 down.
 
     Args:
-        rings: R. sectors: A. samples: (S_r, S_φ).
-        spacing: the quantity that the ring borders split equally.
-        sample_spacing: the one that the samples inside a ring split equally; None means `spacing`.
-        placement: "centers" of equal cells, or "edges": from border to border, both included.
+        rings: R. sectors: A. samples: (S_r, S_φ). The defaults are those of the paper.
+        spacing: the quantity that increases equally from ring border to ring border.
+        sample_spacing: the quantity that increases equally from sample to sample inside a ring;
+            None means `spacing`.
+        placement: "centers" puts the samples at the centres of equal cells; "edges" puts them from
+            border to border, both included.
 
     Raises:
-        ValueError: an unknown name, a size below 1, or "edges" with one sample along an axis; in
-            the methods, "tan" with a lens of θ_max ≥ 90°.
+        ValueError: an option is unknown, a size is below 1, or "edges" has one sample along an
+            axis; in the methods, the spacing is "tan" and a lens has θ_max ≥ 90°.
 
     Source: DarSwin, ICCV 2023, sec. 4.2 and 4.3.
     """
 
-    rings: int
-    sectors: int
-    samples: tuple[int, int]
+    rings: int = 16
+    sectors: int = 64
+    samples: tuple[int, int] = (10, 10)
     spacing: Spacing = "theta"
     sample_spacing: Spacing | None = None
     placement: Placement = "centers"
@@ -97,15 +99,15 @@ class PolarGridSpec:
         if self.placement not in PLACEMENTS:
             raise ValueError(f"placement must be one of {PLACEMENTS}, got {self.placement!r}")
         if self.placement == "edges" and min(samples) < 2:
-            raise ValueError(f"placement='edges' needs at least 2 samples an axis, got {samples!r}")
+            raise ValueError(f"placement='edges' needs 2 or more samples per axis, got {samples!r}")
 
     @property
     def inner_spacing(self) -> Spacing:
-        """`sample_spacing`, or `spacing` where that is None."""
+        """`sample_spacing`, or `spacing` if that is None."""
         return self.spacing if self.sample_spacing is None else self.sample_spacing
 
     def grid(self, lens: Lens, image_size: tuple[int, int]) -> PolarGrid:
-        """The grid of N lenses; (H, W) is for the principal point of a lens that has none."""
+        """The grid of N lenses. A lens without principal point gets the centre of (H, W)."""
         steps_r, steps_phi = (_steps(s, self.placement, lens.theta_max) for s in self.samples)
         borders, points = self._rings(lens, self.inner_spacing, steps_r)
         sector = torch.arange(self.sectors, dtype=borders.dtype, device=borders.device)[:, None]
@@ -123,22 +125,22 @@ class PolarGridSpec:
         )
 
     def pixel_grid(self, lens: Lens, image_size: tuple[int, int], split: int = 1) -> PixelGrid:
-        """The way back to images of (H, W) from a map whose rings are these, each split in some."""
+        """The way back to images of (H, W) from a polar map with `split` rings per ring here."""
         steps = _steps(split, "centers", lens.theta_max)
         _, centers = self._rings(lens, self.inner_spacing, steps)
         radii = change_spacing(lens, centers, self.inner_spacing, "radius")
         if lens.is_radial:
             return PixelGrid(radii, lens.r_max, lens.center_in(image_size), lens.affine)
         theta, direction = pixel_rays(lens, image_size)
-        seen = ~theta.isnan()  # NaN must not meet the gradients
+        seen = ~theta.isnan()  # NaN would spread to the gradients
         flat = lens.project(torch.where(seen, theta, 0.0))[..., None] * direction
         return PixelGrid(radii, lens.r_max, points=torch.where(seen[..., None], flat, torch.nan))
 
     def token_rays(self, lens: Lens) -> Tensor:
-        """The directions in which the tokens of a map look: (N, R, A, 3), unit vectors (x, y, z).
+        """The viewing directions of the tokens of a map: unit vectors (x, y, z), (N, R, A, 3).
 
-        x to the right, y down, z forward; a token's ray is that of the middle of its ring and its
-        sector on the radial curve, whatever offsets the lens has.
+        x points right, y down and z forward. The ray of a token goes through the centre of its ring
+        and its sector on the radial curve; other distortions of the lens are ignored.
         """
         _, centers = self._rings(lens, self.spacing, _steps(1, "centers", lens.theta_max))
         theta = change_spacing(lens, centers, self.spacing, "theta")[..., None]
@@ -148,8 +150,8 @@ class PolarGridSpec:
         return torch.stack((aside * torch.cos(azimuth), aside * torch.sin(azimuth), forward), -1)
 
     def _rings(self, lens: Lens, inner: Spacing, steps: Tensor) -> tuple[Tensor, Tensor]:
-        """Ring borders (N, R+1) in units of `spacing`, and points in those of `inner`,
-        (N, R·len(steps)): `steps` are fractions of a ring."""
+        """The ring borders (N, R+1) in units of `spacing`, and points inside the rings,
+        (N, R·len(steps)) in units of `inner`. `steps` are fractions of a ring."""
         if "tan" in (self.spacing, inner):
             check_tan(lens)
         fractions = torch.linspace(0, 1, self.rings + 1, dtype=steps.dtype, device=steps.device)
@@ -164,23 +166,24 @@ def polar_grid(lens: Lens, image_size: tuple[int, int], **settings: Any) -> Pola
     """Cuts the image of each lens into rings × sectors and places samples in each.
 
     Args:
-        lens: N lenses. image_size: (H, W), only for the principal point of a lens that has none.
-        settings: `rings`, `sectors`, `samples` and the others of `PolarGridSpec`.
+        lens: N lenses.
+        image_size: (H, W); its centre is the principal point of a lens that has none.
+        settings: the arguments of `PolarGridSpec`.
 
     Raises:
-        ValueError: as `PolarGridSpec`, or spacing "tan" with a lens of θ_max ≥ 90°.
+        ValueError: a setting is wrong, or the spacing is "tan" and a lens has θ_max ≥ 90°.
     """
     return PolarGridSpec(**settings).grid(lens, image_size)
 
 
 def _steps(count: int, placement: Placement, like: Tensor) -> Tensor:
-    """Fractions of a cell at which its samples stand."""
+    """The positions of the samples of a cell, as fractions of the cell."""
     steps = torch.arange(count, dtype=like.dtype, device=like.device)
     return steps / (count - 1) if placement == "edges" else (steps + 0.5) / count
 
 
 def _offsets(lens: Lens, theta: Tensor, azimuths: Tensor) -> Tensor:
-    """(N, 2, N_r, N_a) px: how far from the radial curve the lens lets each point land."""
+    """The offset of each point from the radial curve of the lens, (N, 2, N_r, N_a) px."""
     theta = theta[:, :, None].expand(-1, -1, len(azimuths))
     direction = torch.stack((torch.cos(azimuths), torch.sin(azimuths)), -1)
     offsets = lens.offset(theta, direction.expand(*theta.shape, 2))
@@ -188,17 +191,18 @@ def _offsets(lens: Lens, theta: Tensor, azimuths: Tensor) -> Tensor:
 
 
 class PolarSample(nn.Module):
-    """Samples images on the polar grid of their lenses: `polar_sample` and the grid it needs.
+    """Samples images on the polar grid of their lenses, with the operator `polar_sample`.
 
     Args:
-        rings, sectors, samples: as `PolarGridSpec`. settings: others of it, by name.
-        jitter: in [0, 1], how far a sample may move, in cells; only in training. The seed of each
-            call comes from torch's generator.
-        layout: "tokens" gives (B, R, A, S_r·S_φ·C), "image" (B, C, R·S_r, A·S_φ).
-        mean, std: of uint8 images, which count as `(pixel/255 - mean) / std`; others ignore them.
+        rings, sectors, samples, settings: the arguments of `PolarGridSpec`.
+        jitter: how far a sample may move in training, in cells, in [0, 1]. The seed of each call
+            comes from torch's generator.
+        layout: "tokens" returns (B, R, A, S_r·S_φ·C), "image" returns (B, C, R·S_r, A·S_φ).
+        mean, std: normalization of uint8 images, `(pixel/255 - mean) / std`; images in floating
+            point are not normalized.
 
     Raises:
-        ValueError: settings that make no grid, here; images and lenses that do not fit, in forward.
+        ValueError: a setting is wrong; in forward, the images and the lenses do not fit.
 
     Source: DarSwin, ICCV 2023, sec. 4.2 and 4.3.
     """
@@ -222,17 +226,17 @@ class PolarSample(nn.Module):
         self.mean, self.std = mean, std
 
     def grid(self, lens: Lens, image_size: tuple[int, int]) -> PolarGrid:
-        """The grid of a lens in images of (H, W)."""
+        """The polar grid of N lenses in images of (H, W)."""
         return self.spec.grid(lens, image_size)
 
     def arguments(self, images: Tensor, grid: PolarGrid) -> dict[str, Any]:
-        """The operators' arguments that sample images (B, C, H, W) on a grid."""
+        """The arguments with which the operators sample images (B, C, H, W) on a grid."""
         dtype = torch.float64 if images.dtype == torch.float64 else torch.float32
         radii, azimuths, center, _, affine, offsets = (
             None if t is None else t.to(images.device, dtype) for t in grid
         )
         jitter = self.jitter if self.training else 0.0
-        # 62 bits, so that the seed is a tensor that compiled training does not specialise on.
+        # The seed is a tensor, so that compiled training does not specialise on its value.
         seed = torch.randint(2**62, ()) if jitter else 0
         return dict(
             image=images, radii=radii, azimuths=azimuths, center=center, affine=affine,
@@ -241,10 +245,12 @@ class PolarSample(nn.Module):
         )  # fmt: skip
 
     def forward(self, images: Tensor, lens: Lens, channels_last: bool | None = None) -> Tensor:
-        """Images and their lenses (B or 1) → the samples, in `layout`.
+        """Images and their lenses (B or 1) → the samples in `layout`.
 
-        The images are (B, C, H, W) or (B, H, W, C), as `polar_sample` takes them with
-        `channels_last`.
+        Args:
+            images: (B, C, H, W) or (B, H, W, C).
+            lens: B lenses or one.
+            channels_last: the layout of the images; see `polar_sample`.
         """
         images = check_images(images, channels_last)
         height, width = images.shape[2:]
@@ -260,7 +266,7 @@ class PolarSample(nn.Module):
 def check_images(
     images: Tensor, channels_last: bool | None = None, channels: int | None = None
 ) -> Tensor:
-    """The images as (B, C, H, W), else TypeError or ValueError: see `channels_first`."""
+    """The images as (B, C, H, W); TypeError or ValueError if that fails, see `channels_first`."""
     if not isinstance(images, Tensor):
         raise TypeError(f"images must be a tensor, got {type(images).__name__}")
     if images.dim() != 4:
@@ -269,7 +275,7 @@ def check_images(
 
 
 def check_lens(lens: Lens | None, size: tuple[int, int]) -> Lens:
-    """The lens, which must be one, for images of (H, W); sizes are checked where `readable`."""
+    """Returns the lens if it is one for images of (H, W); its size is checked if `readable`."""
     if not isinstance(lens, Lens):
         raise TypeError(f"lens must be a darswin.lens.Lens, got {type(lens).__name__}")
     if lens.image_size is None or not readable(lens.image_size):
@@ -278,12 +284,14 @@ def check_lens(lens: Lens | None, size: tuple[int, int]) -> Lens:
         if tuple(other) != size:
             raise ValueError(
                 f"the lens belongs to images of (H, W) = {tuple(round(s) for s in other)}, got "
-                f"images of {size}; lens.resized({size}) is the lens of a resized image"
+                f"images of {size}; if the image was resized, use lens.resized({size})"
             )
     return lens
 
 
 def check_count(lenses: int, images: Tensor) -> None:
-    """ValueError unless there is a lens for each image, or one for all."""
+    """ValueError unless there is one lens for each image or one for all."""
     if lenses not in (1, images.shape[0]):
-        raise ValueError(f"there must be one lens or one an image, {images.shape[0]}, got {lenses}")
+        raise ValueError(
+            f"there must be one lens, or one for each of the {images.shape[0]} images, got {lenses}"
+        )

@@ -1,4 +1,4 @@
-"""The position biases of window attention: of angles, Fourier series or a table."""
+"""The position biases of window attention: of angles, a Fourier series, or a table."""
 
 import math
 from collections.abc import Sequence
@@ -16,8 +16,11 @@ COEFFICIENTS = ("a_theta", "b_theta", "a_phi", "b_phi")
 
 
 class RelativeBias(nn.Module):
-    """B_θ + B_φ: a bias table from the angles between tokens, by coefficients a_θ, b_θ, a_φ and b_φ
-    of so many `rows` for each head. Subclasses define one axis."""
+    """The bias B_θ + B_φ, computed from the angles between tokens.
+
+    The coefficients a_θ, b_θ, a_φ and b_φ have `rows` rows each, and a column for each head.
+    Subclasses define the bias along one axis.
+    """
 
     def __init__(
         self, window: tuple[int, int], heads: int, sectors: int, rows: tuple[int, int, int, int]
@@ -30,18 +33,21 @@ class RelativeBias(nn.Module):
         )
 
     def _axis(self, angle: Tensor, a: Tensor, b: Tensor) -> Tensor:
-        """Angles (N, K) of Δ = -(K-1)/2 … (K-1)/2 → (N, K, heads)."""
+        """Angles (N, K) of Δ = -(K-1)/2 … (K-1)/2 → the bias along one axis, (N, K, heads)."""
         raise NotImplementedError
 
     def forward(self, ring_angles: Tensor) -> Tensor:
-        """The angles that 0, 1, … rings reach, (N, at least M_r) rad → (N, heads, 2·M_r-1,
-        2·M_φ-1), the `bias` of `window_attention`."""
+        """Angles → (N, heads, 2·M_r-1, 2·M_φ-1), the `bias` of `window_attention`.
+
+        Args:
+            ring_angles: the angles that 0, 1, 2 … rings span, (N, M_r or more) rad.
+        """
         return self.table(ring_angles, **joined_coefficients([self]))
 
     def table(
         self, ring_angles: Tensor, a_theta: Tensor, b_theta: Tensor, a_phi: Tensor, b_phi: Tensor
     ) -> Tensor:
-        """As `forward`, of these coefficients: each is (rows, heads)."""
+        """The result of `forward` for these coefficients, (rows, heads) each."""
         outward = ring_angles[:, : self.window[0]].to(a_theta)
         theta = torch.cat((-outward[:, 1:].flip(1), outward), 1)
         reach = self.window[1]
@@ -53,16 +59,16 @@ class RelativeBias(nn.Module):
 
 
 def joined_coefficients(biases: Sequence[RelativeBias]) -> dict[str, Tensor]:
-    """The coefficients of biases that differ in their heads only, as of one that has all heads."""
+    """The coefficients of several biases, concatenated along the heads."""
     return {name: torch.cat([getattr(bias, name) for bias in biases], 1) for name in COEFFICIENTS}
 
 
 class AngularRelativeBias(RelativeBias):
-    """B = a_Δ sin α + b_Δ cos α, α the angle between two tokens Δ apart.
+    """B = a_Δ sin α + b_Δ cos α, where α is the angle between two tokens with the offset Δ.
 
-    Coefficients are stored by Δ modulo their number: Δ = 0, 1, …, -2, -1. With `periodic`, where
-    the window spans the ring, those of φ are by Δφ modulo M_φ rather than modulo 2·M_φ-1, which
-    makes the bias periodic.
+    The rows of the coefficients are in the order Δ = 0, 1, …, -2, -1. `periodic` makes the bias
+    periodic in φ, if the window spans the ring: there are M_φ rows then, for Δφ modulo M_φ, instead
+    of 2·M_φ-1 rows.
 
     Source: DarSwin, ICCV 2023, eq. 9 to 11.
     """
@@ -75,16 +81,17 @@ class AngularRelativeBias(RelativeBias):
 
     def _axis(self, angle: Tensor, a: Tensor, b: Tensor) -> Tensor:
         reach, angle = angle.shape[1] // 2, angle[..., None]
-        # Rows Δ = -reach … reach. Slices: the gradient of an index would be a slow scatter.
+        # Rows Δ = -reach … reach. Indexing would give the same, but its gradient is slow.
         a, b = (torch.cat((rows[len(rows) - reach :], rows[: reach + 1])) for rows in (a, b))
         return a * torch.sin(angle) + b * torch.cos(angle)
 
 
 class FourierBias(RelativeBias):
-    """B = b_0 + (1/P) Σ_{p=1..P} (a_p sin pα + b_p cos pα), P harmonics.
+    """B = b_0 + (1/P) Σ_{p=1..P} (a_p sin pα + b_p cos pα), a series with P harmonics.
 
-    α is the angle between two tokens ("angular"), or along the radius their distance in the image,
-    the circle's radius being π ("polar"): `ring_angles` decides.
+    α is the angle between two tokens ("angular"). For "polar", α along the radius is the distance
+    of the tokens in the image, scaled so that the image circle has the radius π. `ring_angles`
+    computes either of them.
 
     Source: DarSwin, ICCV 2023, table 3, after Ning et al., IJCAI 2020.
     """
@@ -99,7 +106,7 @@ class FourierBias(RelativeBias):
 
 
 class RelativeTable(nn.Module):
-    """A learned bias for each offset between two tokens, which knows no angle, as Swin's."""
+    """A learned bias for each offset between two tokens, independent of angles, as in Swin."""
 
     def __init__(self, window: tuple[int, int], heads: int):
         super().__init__()
@@ -107,13 +114,13 @@ class RelativeTable(nn.Module):
         self.table = nn.Parameter(nn.init.trunc_normal_(table, std=0.02))
 
     def forward(self) -> Tensor:
-        """(1, heads, 2·M_r-1, 2·M_φ-1), the `bias` of `window_attention`."""
+        """The `bias` of `window_attention`, (1, heads, 2·M_r-1, 2·M_φ-1)."""
         return self.table[None]
 
 
 def ring_angles(lens: Lens, grid: PolarGrid, rings: int, kind: PositionBias) -> Tensor:
-    """(N, rings+1), rad: the θ of the borders of a map of `rings` rings; for "polar" their radius
-    in the image, the circle's radius being π."""
+    """The θ of the ring borders of a map with `rings` rings, (N, rings+1) rad. For "polar" it is
+    their radius in the image instead, scaled so that the image circle has the radius π."""
     if kind == "polar":
         step = (grid.borders.shape[1] - 1) // rings
         borders = grid.borders[:, ::step]

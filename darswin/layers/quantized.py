@@ -1,4 +1,4 @@
-"""A linear layer with weights of 8 bits, on activations of 8 bits."""
+"""A linear layer with 8-bit weights and 8-bit activations."""
 
 import copy
 from collections.abc import Mapping
@@ -14,38 +14,38 @@ __all__ = ["quantized_layers", "without_quantized_layers"]
 
 Net = TypeVar("Net", bound=nn.Module)
 
-_LARGEST = 127  # of a weight: -128 is left out, so that weights are symmetric
+_LARGEST = 127  # weights lie in -127 … 127, so that they are symmetric
 
 
 class Quantization(NamedTuple):
-    """The way of numbers to 8 bits: q = round(x / scale) + zero_point, kept in 0 … 255."""
+    """The mapping of numbers to 8 bits: q = round(x / scale) + zero_point, clipped to 0 … 255."""
 
-    scale: float  # of one step, positive
-    zero_point: int  # of 0, in 0 … 255
+    scale: float  # the size of one step, positive
+    zero_point: int  # the q of 0, in 0 … 255
 
 
 def quantize(x: Tensor, quantization: Quantization) -> Tensor:
-    """float32 → uint8 of the same shape; ties go to even, and NaN becomes what 0 does."""
+    """float32 → uint8 of the same shape. Ties go to even, and NaN counts as 0."""
     scale, zero_point = quantization
     steps = torch.round(x * (1 / scale)).nan_to_num(0.0)
     return (steps + zero_point).clamp(0, 255).to(torch.uint8)
 
 
 def dequantize(q: Tensor, quantization: Quantization) -> Tensor:
-    """uint8 → the float32 that stands for it."""
+    """uint8 → the float32 values that they represent."""
     scale, zero_point = quantization
     return (q.float() - zero_point) * scale
 
 
 class QuantizedLinear(nn.Module):
-    """A linear layer of symmetric int8 weights, each row with its scale, on activations quantized
-    to uint8, after Jacob et al., CVPR 2018. It has no gradients.
+    """A linear layer with int8 weights on uint8 activations, after Jacob et al., CVPR 2018.
 
-    It computes in float32 what integer products compute, so it runs everywhere and is exported.
+    The weights are symmetric, and each row has its own scale. The layer has no gradients. It
+    computes the integer products in float32, so it runs and can be exported everywhere.
     """
 
     weight: Tensor  # (D', D), int8
-    weight_scale: Tensor  # (D',), of one step of a row's weights
+    weight_scale: Tensor  # (D',), the size of one step of a row's weights
     bias: Tensor | None  # (D',)
     _zero_points: Tensor
 
@@ -68,14 +68,14 @@ class QuantizedLinear(nn.Module):
 
     @classmethod
     def of(cls, linear: nn.Linear, activation: Quantization) -> "QuantizedLinear":
-        """The quantized layer of a linear one; a row's largest weight becomes 127."""
+        """The quantized form of a linear layer; the largest weight of each row becomes 127."""
         layer = cls(
             linear.in_features, linear.out_features, bias=linear.bias is not None,
             activation=activation,
         )  # fmt: skip
         weight = linear.weight.detach().float()
         largest = weight.abs().amax(1) if linear.in_features else weight.new_zeros(len(weight))
-        # A row of zeros has any scale, but not 0.
+        # A row of zeros may have any scale but 0.
         layer.weight_scale = torch.where(largest > 0, largest / _LARGEST, 1.0)
         layer.weight = torch.round(weight / layer.weight_scale[:, None]).to(torch.int8)
         if linear.bias is not None:
@@ -88,20 +88,20 @@ class QuantizedLinear(nn.Module):
             return self._for_graphs(x.float())
         if torch.is_grad_enabled() and x.requires_grad:
             raise RuntimeError(
-                "a quantized layer has no gradient, but its input requires one: use the model that "
-                "was quantized, or `darswin.layers.quantized.without_quantized_layers`"
+                "a quantized layer has no gradient, but its input requires one: use the model from "
+                "before quantization, or `darswin.layers.quantized.without_quantized_layers`"
             )
         x = dequantize(quantize(x.float(), self.activation), self.activation)
         bias = None if self.bias is None else self.bias.float()
         return F.linear(x, self._dequantized(), bias)
 
     def _dequantized(self) -> Tensor:
-        """The weights that stand for those of 8 bits, (D', D), float32."""
+        """The float32 values of the weights, (D', D)."""
         steps = self.weight.float() - self._zero_points[:, None]
         return steps * self.weight_scale.float()[:, None]
 
     def _for_graphs(self, x: Tensor) -> Tensor:
-        """The same by torch's operators for graphs, which ONNX has by the same names."""
+        """The result of `forward`, by torch's graph operators, which ONNX has too."""
         import torch.ao.quantization.fx._decomposed  # registers them
 
         operators = torch.ops.quantized_decomposed
@@ -113,7 +113,7 @@ class QuantizedLinear(nn.Module):
         return F.linear(x, operators.dequantize_per_channel(self.weight, *rows), self.bias)
 
     def to_linear(self) -> Linear:
-        """A linear layer with the same weights, in float32; activations stay as they are."""
+        """A float32 linear layer with the same weights; it does not quantize its input."""
         linear = Linear(self.in_features, self.out_features, bias=self.bias is not None)
         linear.weight = nn.Parameter(self._dequantized())
         if self.bias is not None:
@@ -129,7 +129,7 @@ class QuantizedLinear(nn.Module):
 
 
 def quantized_layers(model: nn.Module) -> dict[str, Quantization]:
-    """The names of a model's quantized layers, and how their inputs become 8 bits."""
+    """The names of a model's quantized layers, and the quantization of their inputs."""
     named = model.named_modules()
     return {name: m.activation for name, m in named if isinstance(m, QuantizedLinear)}
 
@@ -137,8 +137,8 @@ def quantized_layers(model: nn.Module) -> dict[str, Quantization]:
 def with_quantized_layers(
     model: nn.Module, activations: Mapping[str, Quantization | tuple[float, int]]
 ) -> None:
-    """Puts quantized layers in place of the linear ones of these names; ValueError where no linear
-    layer has a name. The values say how their inputs become 8 bits."""
+    """Replaces the linear layers with these names by quantized ones; ValueError if there is no such
+    layer. The values are the quantizations of the inputs."""
     layers = dict(model.named_modules())
     for name, activation in activations.items():
         if not isinstance(linear := layers.get(name), nn.Linear):
@@ -147,9 +147,11 @@ def with_quantized_layers(
 
 
 def with_unsigned_weights(model: Net) -> Net:
-    """A copy of a model, for graphs, whose quantized layers have uint8 weights, with a zero point
-    of 128. ONNX Runtime multiplies uint8 with uint8 exactly on every CPU, but uint8 with int8 on
-    x86 CPUs with VNNI only: on others the sum of two products overflows in 16 bits."""
+    """A copy of a model for graphs, whose quantized layers have uint8 weights with zero point 128.
+
+    ONNX Runtime multiplies uint8 by uint8 exactly on every CPU. It multiplies uint8 by int8 exactly
+    only on x86 CPUs with VNNI; on others the sum of two products overflows in 16 bits.
+    """
     model = copy.deepcopy(model)
     for name in quantized_layers(model):
         layer = model.get_submodule(name)
@@ -160,7 +162,7 @@ def with_unsigned_weights(model: Net) -> Net:
 
 
 def without_quantized_layers(model: nn.Module) -> None:
-    """Puts float32 linear layers of the same weights in place of a model's quantized ones."""
+    """Replaces the quantized layers of a model by float32 linear layers with the same weights."""
     for name in quantized_layers(model):
         layer = model.get_submodule(name)
         assert isinstance(layer, QuantizedLinear)

@@ -1,7 +1,7 @@
-"""Transformer layers: attention in windows, the MLP, blocks, stages, and the merging of tokens.
+"""Transformer layers: window attention, the MLP, blocks, stages, and the merging of tokens.
 
-A polar map is (B, R, A, D) from the embedding to the head; the maps of Swin and DAT are
-(B, H, W, D), rows and columns.
+A polar map has the shape (B, R, A, D) from the embedding to the head. The maps of Swin and DAT have
+the shape (B, H, W, D).
 """
 
 import contextlib
@@ -27,7 +27,7 @@ from darswin.ops.checks import check_pair
 
 __all__ = ["PolarWindowAttention", "WindowAttention"]
 
-# A module, or what `darswin.optimize` puts in its place.
+# A module, or the function that `darswin.optimize` puts in its place.
 Layer = Callable[[Tensor], Tensor]
 _NOTHING = contextlib.nullcontext()
 
@@ -35,13 +35,16 @@ _NOTHING = contextlib.nullcontext()
 def recomputed(
     value: Tensor, function: Callable[..., Any], *inputs: Tensor, when: bool
 ) -> contextlib.AbstractContextManager:
-    """A context in which autograd does not keep `value`, the last result of `function(*inputs)`,
-    but recomputes it in backward, bit for bit: it keeps the inputs anyway, for the function."""
-    # Where a graph is compiled, the compiler decides what is kept.
+    """A context in which autograd recomputes `value` in backward, instead of keeping it in memory.
+
+    `value` is the last result of `function(*inputs)`, which gives the same bits again. Autograd
+    keeps the inputs in any case, for the gradient of the function.
+    """
+    # In a compiled graph, the compiler decides which values are kept.
     if not when or torch.compiler.is_compiling() or not torch.is_grad_enabled():
         return _NOTHING
-    # torch's selective checkpointing saves as much, but its Python mode sees every operator: a
-    # step takes 10 to 50 % longer.
+    # torch's selective checkpointing saves the same memory, but its Python mode intercepts every
+    # operator: a training step takes 10 to 50 % longer.
     place, size, dtype = value.data_ptr(), value.numel(), value.dtype
     inputs = tuple(t.detach() for t in inputs)
 
@@ -63,13 +66,16 @@ class WindowAttention(nn.Module):
     """Multi-head attention in the windows of a map, as in Swin.
 
     Args:
-        dim: D. num_heads: divides D. map_size: (R, A), or of a plain map (H, W).
-        window: (M_r, M_φ), which divides the map. shift: (s_r, s_φ).
-        periodic: whether the map wraps around along each axis.
-        position_bias: makes the bias from the window and the heads.
+        dim: D, the width of the tokens.
+        num_heads: the number of heads, which must divide D.
+        map_size: the size of the map, (R, A) or (H, W).
+        window: the size of the windows, (M_r, M_φ), which must divide the map.
+        shift: the shift of the windows, (s_r, s_φ).
+        periodic: for each axis, True if the map wraps around along it.
+        position_bias: a function that makes the position bias from the window and the heads.
 
     Raises:
-        ValueError: sizes that do not divide.
+        ValueError: sizes do not divide each other.
 
     Source: Swin Transformer, ICCV 2021, sec. 3.2.
     """
@@ -100,7 +106,7 @@ class WindowAttention(nn.Module):
         self.position_bias = position_bias(self.window, num_heads)
 
     def attend(self, qkv: Tensor, bias: Tensor) -> Tensor:
-        """(B, R, A, 3, heads, d) and the bias → (B, R, A, D)."""
+        """Queries, keys and values (B, R, A, 3, heads, d) and the bias → (B, R, A, D)."""
         return window_attention(
             qkv, bias, window=self.window, shift=self.shift, periodic=self.periodic
         )
@@ -109,8 +115,8 @@ class WindowAttention(nn.Module):
         """(B, R, A, D) → the same shape.
 
         Args:
-            positions: what the position bias is computed from. table: the bias itself, where the
-                stage has computed it.
+            positions: the inputs of the position bias.
+            table: the position bias itself, if it is computed already.
         """
         batch, rings, sectors, dim = x.shape
         if (rings, sectors) != self.map_size:
@@ -129,25 +135,25 @@ class WindowAttention(nn.Module):
 
 
 def check_heads(dim: int, num_heads: int) -> None:
-    """ValueError unless the heads divide the width."""
+    """ValueError unless the number of heads divides the width."""
     if dim % num_heads:
         raise ValueError(f"num_heads must divide dim = {dim}, got {num_heads}")
 
 
 class PolarWindowAttention(WindowAttention):
-    """Multi-head attention in the windows of a polar map, with a bias that knows the angles.
+    """Multi-head attention in the windows of a polar map, with a position bias of angles.
 
-    It is called `layer(x, ring_angles)`: x (B, R, A, D), and (B or 1, R+1) of
+    It is called `layer(x, ring_angles)` with x (B, R, A, D) and the angles (B or 1, R+1) from
     `darswin.layers.position_bias.ring_angles`.
 
     Args:
-        dim, num_heads, map_size, window, shift, periodic: as `WindowAttention`.
+        dim, num_heads, map_size, window, shift, periodic: the arguments of `WindowAttention`.
         position_bias: "angular_relative", "angular" or "polar".
-        harmonics: of the last two. periodic_bias: see `AngularRelativeBias`; it acts where the
-            window spans the ring.
+        harmonics: the number of harmonics of "angular" and "polar".
+        periodic_bias: makes "angular_relative" periodic in φ, if the window spans the ring.
 
     Raises:
-        ValueError: sizes that do not divide, or an unknown position bias.
+        ValueError: sizes do not divide each other, or the position bias is unknown.
 
     Source: DarSwin, ICCV 2023, sec. 4.4 and 4.5.
     """
@@ -180,7 +186,7 @@ class PolarWindowAttention(WindowAttention):
 
 
 class DropPath(nn.Module):
-    """Stochastic depth: in training, drops a branch for whole images with probability p."""
+    """Stochastic depth: in training, drops the branch of an image with probability p."""
 
     def __init__(self, p: float = 0.0):
         super().__init__()
@@ -189,7 +195,7 @@ class DropPath(nn.Module):
         self.p = p
 
     def forward(self, x: Tensor) -> Tensor:
-        """x, any shape → the same with each image's branch kept, and scaled, or zero."""
+        """x (B, ...) → the branch of each image, either scaled by 1/(1-p) or zero."""
         if self.p == 0 or not self.training:
             return x
         keep = 1 - self.p
@@ -201,10 +207,10 @@ class DropPath(nn.Module):
 
 
 class AddNorm(nn.LayerNorm):
-    """A residual and the layer norm behind it."""
+    """A residual connection and the layer norm after it."""
 
     def forward(self, x: Tensor, branch: Tensor | None = None) -> tuple[Tensor, Tensor]:  # type: ignore[override]
-        """The residual x and what is added to it, if anything → their sum, and its norm."""
+        """The residual x and a branch to add, or None → their sum, and the norm of the sum."""
         x = x if branch is None else x + branch
         return x, super().forward(x)
 
@@ -231,9 +237,10 @@ class Mlp(nn.Module):
 
 
 class Block(nn.Module):
-    """Pre-norm transformer block: attention, then an MLP, each behind a residual.
+    """A pre-norm transformer block: attention and an MLP, each with a residual connection.
 
-    What the MLP gives is not added to the residual here: the norm of the next block does that.
+    The result of the MLP is not added to the residual here. The first norm of the next block adds
+    it, because the sum and the norm are one operator in an optimized model.
     """
 
     grad_checkpointing = False  # see `Model.set_grad_checkpointing`
@@ -251,8 +258,16 @@ class Block(nn.Module):
     def forward(
         self, x: Tensor, branch: Tensor | None, table: Tensor | None
     ) -> tuple[Tensor, Tensor]:
-        """The residual x (B, R, A, D), what the block before adds to it, and the position bias →
-        the same two for the next block."""
+        """One block of a stage.
+
+        Args:
+            x: the residual, (B, R, A, D).
+            branch: the branch of the previous block, which is added to the residual here.
+            table: the position bias of the attention.
+
+        Returns:
+            The residual and the branch for the next block.
+        """
         x, y = self.norm1(x, branch)
         with recomputed(y, self.norm1, x, when=self.grad_checkpointing):
             y = self.attn(y) if table is None else self.attn(y, table=table)
@@ -263,7 +278,7 @@ class Block(nn.Module):
 
 
 class PatchMerging(nn.Module):
-    """Joins m_r × m_φ neighbouring tokens into one of twice the width."""
+    """Joins m_r × m_φ neighbouring tokens into one token of twice the width."""
 
     def __init__(self, dim: int, merge: tuple[int, int]):
         super().__init__()
@@ -278,7 +293,7 @@ class PatchMerging(nn.Module):
         mr, ma = self.merge
         if rings % mr or sectors % ma:
             raise ValueError(f"merge {self.merge} must divide (R, A) = {(rings, sectors)}")
-        # Inner order (φ, r, D): neighbours along the radius come first.
+        # Inner order (φ, r, D): neighbours along the radius are next to each other.
         x = x.reshape(batch, rings // mr, mr, sectors // ma, ma, dim).permute(0, 1, 3, 4, 2, 5)
         return self.reduction(self.norm(x.flatten(3)))
 
@@ -287,15 +302,16 @@ class PatchMerging(nn.Module):
 
 
 class Tables(tuple[Tensor | None, ...]):
-    """The position biases of a stage's blocks, (B or 1, heads, 2·M_r-1, 2·M_φ-1); None where the
-    attention is not in windows."""
+    """The position biases of a stage's blocks, (B or 1, heads, 2·M_r-1, 2·M_φ-1) each, or None for
+    a block without window attention."""
 
 
 class Stage(nn.Module):
-    """Merging, then blocks, whose position biases are all of one kind."""
+    """A stage: the merging of tokens, then blocks whose position biases are all of one kind."""
 
-    # In an optimized model: the joined coefficients of the blocks' position biases, and the numbers
-    # that a map may have. More images are computed in parts. The blocks change a map in place.
+    # An optimized model sets these. `coefficients` are the joined coefficients of the position
+    # biases. A map with more than `most_numbers` numbers is computed in parts, each of some images.
+    # `add` works in place.
     coefficients: dict[str, Tensor] | None = None
     most_numbers: int | None = None
     add: Callable[[Tensor, Tensor], Tensor] = torch.add
@@ -306,21 +322,21 @@ class Stage(nn.Module):
         self.blocks = nn.ModuleList(blocks)
 
     def tables(self, *positions: Any) -> Tables:
-        """The tables that `forward` computes from the positions, and accepts in their place."""
+        """The position biases of all blocks. `forward` accepts them in place of the positions."""
         if positions and isinstance(positions[0], Tables):
             return positions[0]
         attentions = [block.attn for block in self.blocks]
         biases = [a.position_bias if isinstance(a, WindowAttention) else None for a in attentions]
         relative = [bias for bias in biases if isinstance(bias, RelativeBias)]
         if relative:
-            # All at once: there are many steps, each of a few numbers.
+            # One computation for all blocks, because each step handles only a few numbers.
             coefficients = self.coefficients or joined_coefficients(relative)
             table = relative[0].table(*positions, **coefficients)
             return Tables(table.split([bias.heads for bias in relative], 1))
         return Tables(None if bias is None else bias(*positions) for bias in biases)
 
     def forward(self, x: Tensor, *positions: Any) -> Tensor:
-        """The map of the stage before → this stage's map."""
+        """The map of the previous stage → the map of this stage."""
         x, tables = self.downsample(x), self.tables(*positions)
         most = x.numel() if self.most_numbers is None else self.most_numbers
         if x.numel() <= most:
@@ -340,5 +356,5 @@ class Stage(nn.Module):
 
 
 def _split(table: Tensor | None, count: int) -> Sequence[Tensor | None]:
-    """The table of each part of the images: one for all of them is whole in each."""
+    """The table for each part of the images. A table for all images serves every part."""
     return [table] * count if table is None or len(table) == 1 else table.tensor_split(count)

@@ -1,4 +1,4 @@
-"""The base of all models: one way through them, and what they tell about themselves."""
+"""The base class of all models: how they are called, and how they describe themselves."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from darswin.layers.linear import MATMUL_BACKENDS, Linear, MatmulBackend
-from darswin.layers.polar import check_images
+from darswin.layers.polar import check_images, check_lens
 from darswin.layers.transformer import Block, Mlp, WindowAttention
 from darswin.lens import Lens
 from darswin.models.stages import Pair, StagePlan
@@ -15,56 +15,60 @@ from darswin.ops.reference import normalized
 
 
 class FeatureInfo(list[dict[str, Any]]):
-    """A dict for each stage, and timm's accessors.
+    """A list with one dict per stage, and timm's accessors.
 
     Keys:
-        num_chs: D of the stage's map.
-        reduction: how many px a token spans along its longer side. They are px of the image; of the
-            view where the model makes one; in DarSwin samples of the polar grid, as a token there
-            spans as many px of the image as its lens and its ring say.
+        num_chs: D, the width of the stage's map.
+        reduction: the number of pixels that a token spans along its longer side. They are pixels of
+            the image, or of the view if the model makes one. DarSwin counts samples of the polar
+            grid instead, because the number of pixels depends on the lens and the ring.
         module: the stage's name in the model.
-        map_size: (R, A) where the map is polar, else (H, W).
+        map_size: (R, A) of a polar map, (H, W) of any other map.
     """
 
     def get(self, key: str, idx: int | Sequence[int] | None = None) -> Any:
-        """The value of a key: of one stage, of several, or, without `idx`, of all."""
+        """The values of a key for one stage (an int), several stages, or all of them (None)."""
         if isinstance(idx, int):
             return self[idx][key]
         return [self[k][key] for k in (range(len(self)) if idx is None else idx)]
 
     def channels(self, idx: int | Sequence[int] | None = None) -> Any:
-        """D of the stages' maps."""
+        """The widths D of the stages' maps."""
         return self.get("num_chs", idx)
 
     def reduction(self, idx: int | Sequence[int] | None = None) -> Any:
-        """Pixels that a token spans; `FeatureInfo` says which pixels."""
+        """The number of pixels that a token of each stage spans; see `FeatureInfo`."""
         return self.get("reduction", idx)
 
     def module_name(self, idx: int | Sequence[int] | None = None) -> Any:
-        """The stages' names."""
+        """The stages' names in the model."""
         return self.get("module", idx)
 
 
 class Model(nn.Module):
-    """Base of all models, called `model(images, lens)`; the methods are those of timm's models.
+    """The base class of all models. They are called `model(images, lens)` and have timm's methods.
 
-    A call checks its images, computes `prepare(lens, size)`, and runs the network on both; a user
-    whose lens stays the same calls `prepare` once, and then `run(images, prepared)`, which gives
-    the same. A model defines `prepare` and `_run`.
+    A call checks the images, computes `prepare(lens, size)`, and runs the network on both. If your
+    lens stays the same, call `prepare` once and then `run(images, prepared)` for each batch: the
+    results are the same. A subclass defines `_prepare` and `_run`.
 
     Attributes:
-        in_chans: C of the images. num_classes: of the result.
-        image_size: (H, W) that all images must have; None means any size.
-        square_images: whether images must be square.
-        feature_info: sizes of the encoder's stages.
-        pretrained_cfg: timm's description of a model: "architecture" (of `create_model`),
-            "num_classes", "input_size" (C, H, W), "fixed_input_size", "mean" and "std" (of pixels
-            in [0, 1]), "interpolation", "crop_pct", "first_conv" (the layer that takes the pixels),
-            "classifier". A loaded model's agrees with its card, and has "label_names" and "file".
+        in_chans: C, the number of channels of the images.
+        num_classes: the number of classes of the result.
+        image_size: the size (H, W) that all images must have; None allows any size.
+        square_images: True if the images must be square.
+        uses_lens: False if the model ignores its lens, which may then be None.
+        feature_info: the sizes of the encoder's stages.
+        pretrained_cfg: timm's description of a model, a dict. Its keys are "architecture" (the
+            name for `create_model`), "num_classes", "input_size" (C, H, W), "fixed_input_size",
+            "mean" and "std" (for pixels in [0, 1]), "interpolation", "crop_pct", "first_conv" (the
+            layer that reads the pixels) and "classifier". A loaded model also has "label_names"
+            and "file", and its other values agree with its card.
     """
 
     image_size: Pair | None = None
     square_images = False
+    uses_lens = True
     in_chans: int
     num_classes: int
     mean: Sequence[float]
@@ -77,34 +81,42 @@ class Model(nn.Module):
         self.pretrained_cfg: dict[str, Any] = {}
 
     def prepare(self, lens: Lens | None, size: Pair) -> Any:
-        """All that the lenses alone decide about images of (H, W), for any number of calls of
-        `run`.
+        """Everything that depends on the lens but not on the pixels, for any number of `run` calls.
 
         Args:
-            lens: N lenses, or None for a model that ignores them. size: (H, W) of the images.
+            lens: N lenses, or None if the model ignores its lens.
+            size: (H, W) of the images.
 
         Raises:
-            TypeError: no lens, for a model that needs one.
-            ValueError: a lens of images of another size.
+            TypeError: the lens is missing, and the model uses one.
+            ValueError: the lens belongs to images of another size.
         """
+        if self.uses_lens:
+            check_lens(lens, size)
+        return self._prepare(lens, size)
+
+    def _prepare(self, lens: Any, size: Pair) -> Any:
+        """The result of `prepare`, from a lens that was checked."""
         raise NotImplementedError
 
     def _run(self, images: Tensor, prepared: Any) -> Any:
-        """Images that were checked, and what `prepare` gave → the result."""
+        """The result of `run`, from images that were checked."""
         raise NotImplementedError
 
     def forward(self, images: Tensor, lens: Lens | None = None) -> Any:
-        """Images (B, C, H, W) and their lenses (B or 1) → the result."""
+        """Images (B, C, H, W) and their lenses (B or 1) → the model's result."""
         return self._run(*self._checked_and_prepared(images, lens))
 
     def run(self, images: Tensor, prepared: Any) -> Any:
-        """As `forward`, with what `prepare` gave for the size of these images and B lenses or one.
+        """The result of `forward`, with the lens given as the result of `prepare`.
 
         Args:
-            images: (B, C, H, W); of uint8 also (B, H, W, C).
+            images: (B, C, H, W); images of uint8 may also be (B, H, W, C).
+            prepared: the result of `prepare` for B lenses or one, and for the size of the images.
 
         Raises:
-            TypeError, ValueError: images of another kind, or as many lenses as do not fit them.
+            TypeError: the images are no tensor, or have a dtype that the model cannot take.
+            ValueError: the images have a wrong shape, or the number of lenses is neither B nor 1.
         """
         return self._run(self._checked(images), prepared)
 
@@ -114,7 +126,7 @@ class Model(nn.Module):
         return images, self.prepare(lens, (height, width))
 
     def _checked(self, images: Tensor) -> Tensor:
-        """The images as (B, C, H, W), of the channels and the size that the model takes."""
+        """The images as (B, C, H, W), after a check of their channels and their size."""
         images = check_images(images, channels=self.in_chans)
         if images.shape[1] != self.in_chans:
             raise ValueError(f"images must have {self.in_chans} channels, got {images.shape[1]}")
@@ -126,7 +138,7 @@ class Model(nn.Module):
         return images
 
     def _floating(self, images: Tensor) -> Tensor:
-        """The images normalized, where they are uint8, in the dtype of the first layer."""
+        """The images in floating point: uint8 images are normalized, others stay as they are."""
         if images.dtype != torch.uint8:
             return images
         dtype = next(self.parameters()).dtype
@@ -134,15 +146,17 @@ class Model(nn.Module):
         return normalized(images, self.mean, self.std, exact).to(dtype)
 
     def no_weight_decay(self) -> set[str]:
-        """Names of the parameters, besides biases and norms, that a recipe should not decay."""
+        """Names of the parameters without weight decay, in addition to biases and norms."""
         return {name for name, _ in self.named_parameters() if ".position_bias." in name}
 
     def set_matmul_backend(self, matmul_backend: MatmulBackend) -> None:
-        """Chooses what computes the linear layers' products: "torch", "onednn" or "autotune"; see
-        `Linear`.
+        """Chooses the library that computes the matrix products of the linear layers.
+
+        Args:
+            matmul_backend: "torch", "onednn" or "autotune"; see `Linear`.
 
         Raises:
-            ValueError: an unknown choice.
+            ValueError: the backend is unknown.
         """
         if matmul_backend not in MATMUL_BACKENDS:
             raise ValueError(
@@ -153,8 +167,10 @@ class Model(nn.Module):
                 module.matmul_backend = matmul_backend
 
     def set_grad_checkpointing(self, enable: bool = True) -> None:
-        """Says whether training saves memory: norms, GELUs and attention in windows, a few percent
-        of the work, are recomputed in backward. The gradients are the same, bit for bit.
+        """Turns on training with less memory, or turns it off.
+
+        The backward pass then recomputes the norms, the GELUs and the window attention, which are a
+        few percent of the work. The gradients stay the same, bit for bit.
         """
         for module in self.modules():
             if isinstance(module, (Block, Mlp, WindowAttention)):
@@ -162,7 +178,7 @@ class Model(nn.Module):
 
 
 def init_weights(module: nn.Module) -> None:
-    """As the Swin Transformer's linear layers start; other layers stay as they are."""
+    """Initialises a linear layer as the Swin Transformer does, and leaves other layers alone."""
     if isinstance(module, nn.Linear):
         nn.init.trunc_normal_(module.weight, std=0.02)
         if module.bias is not None:
@@ -170,7 +186,7 @@ def init_weights(module: nn.Module) -> None:
 
 
 def feature_info(plans: Sequence[StagePlan], embed_dim: int, patch: Pair) -> FeatureInfo:
-    """The sizes of stages whose width doubles at each; a token of the first spans `patch`."""
+    """The sizes of stages. A token of the first one spans `patch`; the width doubles per stage."""
     infos = FeatureInfo()
     for plan in plans:
         merged = zip(patch, plans[0].map_size, plan.map_size, strict=True)
@@ -186,7 +202,7 @@ def feature_info(plans: Sequence[StagePlan], embed_dim: int, patch: Pair) -> Fea
 
 
 def take_indices(count: int, indices: int | Sequence[int] | None) -> list[int]:
-    """The stages that `indices` names, of `count`: the last so many for an int, all for None."""
+    """Numbers of the chosen ones of `count` stages: the last ones for an int, all for None."""
     if isinstance(indices, int):
         chosen: Sequence[int] = range(count)[-indices:] if 0 < indices <= count else ()
     else:

@@ -1,5 +1,6 @@
 """DarSwin: an image encoder in the polar coordinates of a calibrated lens."""
 
+import dataclasses
 from collections.abc import Sequence
 from typing import Any, Literal
 
@@ -7,16 +8,15 @@ import torch
 from torch import Tensor, nn
 
 from darswin.layers.embed import PolarPatchEmbed
-from darswin.layers.polar import Placement, PolarGrid, PolarGridSpec, check_count, check_lens
+from darswin.layers.polar import PolarGrid, PolarGridSpec, check_count
 from darswin.layers.position_bias import PositionBias, ring_angles
 from darswin.layers.transformer import PolarWindowAttention
 from darswin.lens import Lens
-from darswin.lens.spacing import Spacing
 from darswin.models.encoder import Encoder, Prepared
 from darswin.models.registry import Presets, register_model
 from darswin.models.stages import Pair, StagePlan, plan_stages
 
-# All models of a size have as many tokens.
+# Models of the same size have the same number of tokens.
 PRESETS: Presets = dict(micro=dict(samples=(6, 6)), nano=dict(rings=8, sectors=32, samples=(4, 4)))
 
 
@@ -25,35 +25,36 @@ PRESETS: Presets = dict(micro=dict(samples=(6, 6)), nano=dict(rings=8, sectors=3
 class DarSwin(Encoder):
     """The Distortion Aware Radial Swin Transformer.
 
-    The image is cut into R × A polar patches along the lens's projection curve, each sampled at
-    S_r × S_φ points and embedded; blocks of windowed attention on the polar map follow, with
-    merging in between. Any image size works; R and A are those of the model.
+    The image is cut into R × A polar patches along the lens's projection curve. Each patch is
+    sampled at S_r × S_φ points and becomes a token. Blocks of window attention on the polar map
+    follow, and neighbouring tokens are merged between the stages. The images may have any size,
+    because R and A belong to the model.
 
     Args:
-        arguments, options: num_classes, in_chans, embed_dim, depths, num_heads and others of
-            `Encoder`.
-        rings, sectors: R and A. samples: (S_r, S_φ).
-        spacing, sample_spacing, placement: as `PolarGridSpec`. "radius" for both spacings is a
-            model without lens knowledge, for the samples alone it samples uniformly.
-        jitter: in [0, 1], of the sample points in training; 0 is off.
+        arguments: num_classes, in_chans, embed_dim, depths and num_heads, as `Encoder` has them.
+        jitter: how far the sample points move at random in training, in [0, 1]; 0 turns it off.
         variant: "A" has windows and merging along azimuth, "RA" along radius and azimuth.
-        window: (M_r, M_φ) where the map is large enough; None means (1, 16) for A, (4, 4) for RA.
+        window: (M_r, M_φ) on maps that are large enough; None means (1, 16) for A, (4, 4) for RA.
         merges: (m_r, m_φ) before each stage but the first; None means (1, 4) for A, (2, 2) for RA.
-        position_bias: "angular_relative", or the ablations "angular" and "polar" with `harmonics`.
+        position_bias: "angular_relative", or one of the ablations "angular" and "polar".
+        harmonics: the number of harmonics of these two ablations.
         periodic_bias: see `AngularRelativeBias`.
+        options: the settings of `PolarGridSpec`, such as `rings`, `sectors`, `samples` and
+            `spacing`, and the other arguments of `Encoder`. With "radius" for both spacings the
+            model does not use the projection curve.
 
     Rotation:
-        In eval mode a turn of a square image about the principal point by 90° turns the maps by a
-        quarter of their sectors, exactly up to rounding, and leaves the logits as they are, where
-        in each stage that quarter is a whole number of windows; of tokens, if the window spans the
-        ring and its bias is periodic, as `periodic_bias` makes it (those of "angular" and "polar"
-        are). So it is for RA of every size; with half turns for "darswin_a_nano"; but not for the A
-        of four stages, whose last one has a single token in a ring. It is for
-        `merges=((1, 4), (1, 4), (4, 1))`, whose last map is 4×4, and for "darswin_a_nano" with
-        `merges=((1, 4), (4, 1)), window=(1, 8)`.
+        Turning a square image by 90° about the principal point turns the maps by a quarter of their
+        sectors and keeps the logits, up to rounding, in eval mode. The condition is that in every
+        stage a quarter of the sectors is a whole number of windows. A whole number of tokens is
+        enough if the window spans the ring and its position bias is periodic: `periodic_bias` makes
+        it so, and "angular" and "polar" always are. RA meets the condition in every size, and
+        "darswin_a_nano" meets it for 180°. A with four stages does not meet it, because a ring of
+        its last map is a single token. It does with `merges=((1, 4), (1, 4), (4, 1))`, which ends
+        on a 4×4 map, and so does "darswin_a_nano" with `merges=((1, 4), (4, 1)), window=(1, 8)`.
 
     Raises:
-        ValueError: sizes that windows or merging do not divide, or an unknown option.
+        ValueError: an unknown option, or a window or merging that does not divide its map.
 
     Source: DarSwin, ICCV 2023.
     """
@@ -63,12 +64,6 @@ class DarSwin(Encoder):
     def __init__(
         self,
         *arguments: Any,
-        rings: int = 16,
-        sectors: int = 64,
-        samples: Pair = (10, 10),
-        spacing: Spacing = "theta",
-        sample_spacing: Spacing | None = None,
-        placement: Placement = "centers",
         jitter: float = 1.0,
         variant: Literal["A", "RA"] = "A",
         window: Pair | None = None,
@@ -78,14 +73,16 @@ class DarSwin(Encoder):
         periodic_bias: bool = False,
         **options: Any,
     ):
+        names = [field.name for field in dataclasses.fields(PolarGridSpec)]
+        self.spec = PolarGridSpec(**{name: options.pop(name) for name in names if name in options})
         super().__init__(*arguments, **options)
         if variant not in ("A", "RA"):
             raise ValueError(f"variant must be 'A' or 'RA', got {variant!r}")
         window = window or ((1, 16) if variant == "A" else (4, 4))
+        rings, sectors = self.spec.rings, self.spec.sectors
         plans = plan_stages(rings, sectors, len(self.depths), variant, window, merges)
         self.position_bias, self.harmonics = position_bias, harmonics
         self.periodic_bias = periodic_bias
-        self.spec = PolarGridSpec(rings, sectors, samples, spacing, sample_spacing, placement)
         self.patch_embed = PolarPatchEmbed(
             self.spec,
             in_chans=self.in_chans,
@@ -94,14 +91,9 @@ class DarSwin(Encoder):
             mean=self.mean,
             std=self.std,
         )
-        self._finish([self._plan(plan, window) for plan in plans], samples)
-
-    def _plan(self, plan: StagePlan, window: Pair) -> StagePlan:
-        """A stage's sizes, which a subclass may change."""
-        return plan
+        self._finish(plans, self.spec.samples)
 
     def attention(self, dim: int, heads: int, plan: StagePlan, block: int) -> nn.Module:
-        """As `Encoder`."""
         return PolarWindowAttention(
             dim,
             heads,
@@ -111,15 +103,12 @@ class DarSwin(Encoder):
             periodic_bias=self.periodic_bias,
         )
 
-    def prepare(self, lens: Lens | None, size: Pair) -> Prepared:
-        """The grid of the samples, and for each stage its `ring_angles`; else as `Encoder`."""
-        lens = check_lens(lens, size)
+    def _prepare(self, lens: Lens, size: Pair) -> Prepared:
         grid = self.spec.grid(lens, size)
         rings = [plan.map_size[0] for plan in self.plans]
         return Prepared(grid, [(ring_angles(lens, grid, r, self.position_bias),) for r in rings])
 
     def embed(self, images: Tensor, points: PolarGrid) -> Tensor:
-        """Images (B, C, H, W) on a grid of `prepare` → the first map, (B, R, A, D)."""
         check_count(len(points.radii), images)
         if images.dtype == torch.uint8 and next(self.parameters()).dtype == torch.float64:
             images = self._floating(images)  # the operator would normalize in float32

@@ -1,4 +1,4 @@
-"""DAT, the Deformable Attention Transformer, in its CVPR 2022 form: a baseline of the paper."""
+"""DAT, the Deformable Attention Transformer of CVPR 2022: a baseline of the paper."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -18,10 +18,11 @@ from darswin.ops.checks import tensor_there
 
 
 class DeformableAttention(nn.Module):
-    """Multi-head attention (DAT, CVPR 2022, sec. 3.2) whose keys stand at the map's pixels, each
-    moved by at most `offset_range` half pixels, as a small network reads from the queries around.
+    """Multi-head attention with keys at learned positions (DAT, CVPR 2022, sec. 3.2).
 
-    The heads of a group share their keys. The bias of a query and a key is bilinear in a table.
+    Each key starts at a pixel of the map. A small network moves it, by at most `offset_range` half
+    pixels, from the queries around that pixel. The heads of a group share their keys. The position
+    bias of a query and a key is interpolated in a table.
     """
 
     def __init__(
@@ -59,10 +60,10 @@ class DeformableAttention(nn.Module):
         q = self.q(x)
         around = self.around(self._grouped(q)).permute(0, 2, 3, 1)
         offset = torch.tanh(self.offset(F.gelu(self.norm(around))))  # (B·G, H, W, 2): y, x
-        # Places in the map as parts of its half sides, -1 … 1 from edge to edge.
+        # Positions in the map, in units of its half sides: -1 … 1 from edge to edge.
         pixels = _pixel_centers(height, width, offset)
         places = pixels + offset * (self.offset_range / tensor_there((height, width), offset))
-        # The released code samples as if the outermost pixels' centres were at the edges.
+        # The released code samples as if the centres of the outermost pixels were at the edges.
         sampled = F.grid_sample(self._grouped(x), places.flip(-1), align_corners=True)
         sampled = sampled.reshape(batch, dim, tokens).transpose(1, 2)
         k, v = self.kv(sampled).chunk(2, 2)
@@ -83,7 +84,7 @@ class DeformableAttention(nn.Module):
 
 
 def _pixel_centers(height: int, width: int, like: Tensor) -> Tensor:
-    """(H, W, 2): y and x of each pixel's centre, where -1 and 1 are the map's edges."""
+    """y and x of the centre of each pixel, (H, W, 2); the edges of the map are at -1 and 1."""
     y, x = (
         (2 * torch.arange(side, dtype=like.dtype, device=like.device) + 1) / side - 1
         for side in (height, width)
@@ -100,19 +101,21 @@ def _pixel_centers(height: int, width: int, like: Tensor) -> Tensor:
     ),
 )
 class DAT(Swin):
-    """The Deformable Attention Transformer: Swin with other attention in some of its blocks.
+    """The Deformable Attention Transformer: Swin with deformable attention in some blocks.
 
     Args:
-        arguments, depths, options: as `Swin`.
-        blocks: of each stage the kinds of its blocks, repeated: "L" attends in windows, "S" in
-            shifted ones, "D" is deformable.
-        groups: of the heads of each stage's deformable blocks; others ignore it.
-        offset_range: as `DeformableAttention`.
+        arguments, depths, options: the arguments of `Swin`.
+        blocks: a string for each stage with the kinds of its blocks, which repeats: "L" has window
+            attention, "S" has shifted windows, "D" has deformable attention.
+        groups: for each stage, the number of groups of heads in deformable attention. The heads of
+            a group share their keys.
+        offset_range: the largest offset of a key, in half pixels of the map.
 
     Raises:
-        ValueError: sizes that do not divide; in forward, images of another size.
+        ValueError: an unknown option, or sizes that do not divide; in forward, images of another
+            size.
 
-    Source: DAT, CVPR 2022, which the paper compares with; not the later DAT++.
+    Source: DAT, CVPR 2022, the version that the paper compares with; not the later DAT++.
     """
 
     def __init__(
@@ -126,7 +129,7 @@ class DAT(Swin):
     ):
         if not len(blocks) == len(groups) == len(depths):
             raise ValueError(
-                f"blocks and groups must have one entry a stage, {len(depths)}, "
+                f"blocks and groups must have one entry for each stage, {len(depths)}, "
                 f"got {blocks} and {groups}"
             )
         if not all(blocks) or not set("".join(blocks)) <= set("LSD"):
@@ -135,11 +138,9 @@ class DAT(Swin):
         super().__init__(*arguments, depths=depths, **options)
 
     def downsample(self, dim: int, merge: Pair) -> nn.Module:
-        """As `Encoder`."""
         return PatchProjection(dim, 2 * dim, 2, bias=False)
 
     def attention(self, dim: int, heads: int, plan: StagePlan, block: int) -> nn.Module:
-        """As `Encoder`."""
         kinds = self.blocks[plan.index]
         kind = kinds[block % len(kinds)]
         if kind == "D":
@@ -148,7 +149,7 @@ class DAT(Swin):
                 heads,
                 map_size=plan.map_size,
                 groups=self.groups[plan.index],
-                kernel=2 * (len(self.blocks) - plan.index) + 1,  # 9, 7, 5, 3: smaller, as the maps
+                kernel=2 * (len(self.blocks) - plan.index) + 1,  # 9, 7, 5, 3
                 offset_range=self.offset_range,
             )
         rows, columns = plan.window

@@ -1,4 +1,4 @@
-"""The classifiers: lens and images → maps of stages, features and logits."""
+"""The base class of the classifiers: images and lenses → maps, features and logits."""
 
 from collections.abc import Callable, Sequence
 from itertools import chain
@@ -18,31 +18,36 @@ Format = Literal["NHWC", "NCHW"]
 
 
 class Prepared(NamedTuple):
-    """All that the lenses alone decide about images of one size."""
+    """The result of an encoder's `prepare`."""
 
-    # Where the images are read: on a polar grid, or at pixels (N, H, W, 2); None: as they are.
+    # The points at which the images are sampled: a polar grid, or pixels (N, H, W, 2). None means
+    # that the encoder takes the images as they are.
     points: PolarGrid | Tensor | None
-    # For each stage, the tensors that its position biases are computed from.
+    # For each stage, the tensors from which it computes its position biases.
     positions: Sequence[Sequence[Tensor | None]]
 
 
 class Encoder(Model):
-    """Base of the classifiers.
+    """The base class of the classifiers.
 
-    A model makes `patch_embed`, then calls `_finish`; it defines `attention`, `embed` and, if its
-    lens matters, `prepare`. Maps are channels last: (B, R, A, D) where they are polar, else
-    (B, H, W, D).
+    A subclass makes `patch_embed` and then calls `_finish`. It defines `attention`, `embed` and, if
+    it uses its lens, `_prepare`. Maps are channels last: polar maps have the shape (B, R, A, D),
+    other maps (B, H, W, D).
 
     Args:
-        num_classes: 0 leaves out the head. in_chans: C of the images.
-        embed_dim, depths, num_heads: of the stages; width doubles at each.
-        mlp_ratio: hidden width of the MLPs over D. drop_path_rate: of the last block; linear.
-        mean, std: of uint8 images, which count as `(pixel/255 - mean) / std`; others ignore them.
+        num_classes: the number of classes; 0 leaves out the head.
+        in_chans: C, the number of channels of the images.
+        embed_dim: D, the width of the first stage; it doubles with every stage.
+        depths: the number of blocks of each stage.
+        num_heads: the number of attention heads of each stage.
+        mlp_ratio: the hidden width of the MLPs, divided by D.
+        drop_path_rate: the drop path rate of the last block; it rises linearly from 0.
+        mean, std: normalization of uint8 images, `(pixel/255 - mean) / std`; images in floating
+            point are not normalized.
 
     Attributes:
-        num_features, head_hidden_size: D of the last map, and of what the head takes.
+        num_features, head_hidden_size: the width D of the last map.
         plans: the sizes of the stages.
-        feature_info, pretrained_cfg: as `Model`.
     """
 
     num_features: int
@@ -72,7 +77,7 @@ class Encoder(Model):
         self.mean, self.std = per_channel("mean", mean, in_chans), per_channel("std", std, in_chans)
 
     def _finish(self, plans: Sequence[StagePlan], patch: Pair) -> None:
-        """Makes what follows `patch_embed`, initialises all of it, and describes the model."""
+        """Makes the stages, the norm and the head; initialises all layers; describes the model."""
         self.plans = plans
         self.feature_info = feature_info(plans, self.embed_dim, patch)
         self.num_features = self.feature_info.channels(-1)
@@ -82,9 +87,9 @@ class Encoder(Model):
         self.apply(init_weights)
         self.pretrained_cfg = dict(
             num_classes=self.num_classes,
-            input_size=(self.in_chans, *(self.image_size or (64, 64))),  # else the paper's
+            input_size=(self.in_chans, *(self.image_size or (64, 64))),  # 64 as in the paper
             fixed_input_size=self.image_size is not None,
-            interpolation="box",  # as `darswin predict`
+            interpolation="box",  # as in `darswin predict`
             crop_pct=1.0,
             mean=self.mean,
             std=self.std,
@@ -95,8 +100,10 @@ class Encoder(Model):
     def make_stages(
         self, depths: Sequence[int], downsample: Callable[[int, Pair], nn.Module]
     ) -> nn.ModuleList:
-        """Stages of so many blocks, of the first of the plans: their width doubles, and stochastic
-        depth rises linearly from block to block."""
+        """The first `len(depths)` stages of the plans, with these numbers of blocks.
+
+        The width doubles with every stage, and stochastic depth rises linearly with every block.
+        """
         stages = nn.ModuleList()
         before, last = 0, max(sum(depths) - 1, 1)
         for plan, depth in zip(self.plans, depths, strict=False):
@@ -116,26 +123,26 @@ class Encoder(Model):
         return stages
 
     def attention(self, dim: int, heads: int, plan: StagePlan, block: int) -> nn.Module:
-        """The attention of a block of a stage, which a decoder's blocks have too."""
+        """A new attention layer for a block of a stage, in the encoder or in a Unet's decoder."""
         raise NotImplementedError
 
     def downsample(self, dim: int, merge: Pair) -> nn.Module:
-        """The layer that begins every stage but the first."""
+        """A new layer that merges tokens, the first layer of every stage after the first stage."""
         return PatchMerging(dim, merge)
 
     @property
     def head_hidden_size(self) -> int:
-        """D of what the head takes."""
+        """The number of features that the head reads, timm's name for `num_features`."""
         return self.num_features
 
     def get_classifier(self) -> nn.Module:
-        """The head; an identity where there is none."""
+        """The head, or an identity layer if the model has no head."""
         return self.head
 
     def reset_classifier(self, num_classes: int) -> None:
-        """A new head for `num_classes` classes; 0 leaves it out.
+        """Replaces the head by a new one for `num_classes` classes, or by none for 0.
 
-        It has the dtype, the device and the backend (see `set_matmul_backend`) of the model.
+        The new head has the dtype, the device and the matmul backend of the model.
         """
         self.num_classes = num_classes
         if num_classes:
@@ -147,16 +154,15 @@ class Encoder(Model):
         else:
             self.head = nn.Identity()
 
-    def prepare(self, lens: Lens | None, size: Pair) -> Prepared:
-        """As `Model`: where the images are read, and the input of the position biases."""
+    def _prepare(self, lens: Any, size: Pair) -> Prepared:
         return Prepared(None, [()] * len(self.stages))
 
     def embed(self, images: Tensor, points: Any) -> Tensor:
-        """Images (B, C, H, W) and the `points` of `prepare` → the first map."""
+        """Images (B, C, H, W), sampled at the `points` of `prepare` → the first map."""
         raise NotImplementedError
 
     def maps(self, images: Tensor, prepared: Prepared, count: int | None = None) -> list[Tensor]:
-        """The maps that the first `count` stages, or all, end with, of images that were checked."""
+        """The maps after each of the first `count` stages, or after all, for checked images."""
         x = self.embed(images, prepared.points)
         maps = []
         for stage, positions in zip(list(self.stages)[:count], prepared.positions, strict=False):
@@ -168,11 +174,11 @@ class Encoder(Model):
         return self.forward_head(self.norm(self.maps(images, prepared)[-1]))
 
     def forward_features(self, images: Tensor, lens: Lens | None = None) -> Tensor:
-        """Images (B, C, H, W) and their lenses (B or 1) → the last map, (B, R', A', D'), normed."""
+        """Images (B, C, H, W) and their lenses (B or 1) → the last map after the norm."""
         return self.norm(self.maps(*self._checked_and_prepared(images, lens))[-1])
 
     def forward_head(self, features: Tensor, pre_logits: bool = False) -> Tensor:
-        """Features (B, R', A', D') → logits (B, num_classes), or their mean (B, D')."""
+        """Features (B, R, A, D) → logits (B, num_classes), or the mean feature (B, D)."""
         pooled = features.mean((1, 2))
         return pooled if pre_logits else self.head(pooled)
 
@@ -187,21 +193,22 @@ class Encoder(Model):
         output_fmt: Format = "NHWC",
         intermediates_only: bool = False,
     ) -> list[Tensor] | tuple[Tensor, list[Tensor]]:
-        """The maps of some stages, in their order, and the last map.
+        """The maps of the chosen stages, in the order of the stages, and the last map.
 
         Args:
-            indices: which stages, from 0 or from the end; an int means the last so many, None all.
-            norm: the last stage's map is normed; the norm fits no other.
-            stop_early: no stage runs after the last of `indices`.
-            output_fmt: of the maps: "NHWC" as (B, R, A, D), "NCHW" as (B, D, R, A).
-            intermediates_only: leaves out the first result.
+            indices: numbers of stages, from 0, or from -1 backwards; an int N means the last N
+                stages, and None means all.
+            norm: applies the final norm to the last stage's map; it does not fit other maps.
+            stop_early: skips the stages after the last one of `indices`.
+            output_fmt: shape of the maps: "NHWC" is (B, R, A, D), "NCHW" is (B, D, R, A).
+            intermediates_only: returns the maps alone.
 
         Returns:
-            (features, maps); the features are `forward_features`, or, where stages were left out,
-            the last map that was made.
+            (features, maps). The features are those of `forward_features`, or the last computed map
+            if stages were skipped.
 
         Raises:
-            ValueError: stages that there are not, another format.
+            ValueError: a stage does not exist, or the format is unknown.
         """
         taken = take_indices(len(self.stages), indices)
         _check_format(output_fmt)
@@ -222,15 +229,17 @@ class Encoder(Model):
         prune_norm: bool = False,
         prune_head: bool = True,
     ) -> list[int]:
-        """Removes, in place, what comes after the last of some stages.
+        """Removes the stages after the last one of `indices`, in place.
+
+        If a stage is removed, the norm and the head go too, because they do not fit another stage.
 
         Args:
-            indices: as `forward_intermediates`.
-            prune_norm: removes the norm too; prune_head: and the head. Both go in any case where a
-                stage does, since they do not fit what is left.
+            indices: as in `forward_intermediates`.
+            prune_norm: always removes the norm.
+            prune_head: always removes the head.
 
         Returns:
-            The numbers of those stages.
+            The numbers of the chosen stages.
         """
         taken = take_indices(len(self.stages), indices)
         end = max(taken) + 1
@@ -246,18 +255,19 @@ class Encoder(Model):
 
 
 class FeatureMaps(Model):
-    """The maps of some stages of an encoder, which loses what they do not need.
+    """A backbone: the maps of the chosen stages of an encoder.
 
-    `create_model(name, features_only=True, out_indices=…)` makes it, as timm does. It is called
-    `model(images, lens)` and gives a list of maps (B, R, A, D), those of the stages in their order,
-    not normed.
+    `create_model(name, features_only=True, out_indices=…)` makes one, as in timm. A call
+    `model(images, lens)` returns a list of maps (B, R, A, D) in the order of the stages. The final
+    norm is not applied.
 
     Args:
-        encoder: it is pruned in place: of later stages, the norm and the head.
-        out_indices, output_fmt: `indices` and `output_fmt` of `Encoder.forward_intermediates`.
+        encoder: the encoder; it is pruned in place, as by `prune_intermediate_layers`.
+        out_indices: the stages, as `indices` in `Encoder.forward_intermediates`.
+        output_fmt: "NHWC" or "NCHW", as in `Encoder.forward_intermediates`.
 
     Raises:
-        ValueError: stages that there are not, another format.
+        ValueError: a stage does not exist, or the format is unknown.
     """
 
     def __init__(
@@ -272,6 +282,7 @@ class FeatureMaps(Model):
         encoder.prune_intermediate_layers(taken, prune_norm=True)
         self.encoder, self.out_indices, self.output_fmt = encoder, tuple(taken), output_fmt
         self.image_size, self.square_images = encoder.image_size, encoder.square_images
+        self.uses_lens = encoder.uses_lens
         self.in_chans, self.num_classes = encoder.in_chans, 0
         self.feature_info = FeatureInfo(
             dict(encoder.feature_info[i], module=f"encoder.{encoder.feature_info[i]['module']}")
@@ -281,9 +292,8 @@ class FeatureMaps(Model):
             num_classes=0, first_conv=f"encoder.{encoder.pretrained_cfg['first_conv']}"
         )
 
-    def prepare(self, lens: Lens | None, size: Pair) -> Prepared:
-        """As the encoder."""
-        return self.encoder.prepare(lens, size)
+    def _prepare(self, lens: Any, size: Pair) -> Prepared:
+        return self.encoder._prepare(lens, size)
 
     def _run(self, images: Tensor, prepared: Prepared) -> list[Tensor]:
         return _chosen(self.encoder.maps(images, prepared), self.out_indices, self.output_fmt)

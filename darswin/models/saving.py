@@ -1,4 +1,4 @@
-"""Models as files: safetensors, with what is needed to build the model in their metadata."""
+"""Model files: safetensors with a description of the model, its card, in their metadata."""
 
 import json
 import math
@@ -21,11 +21,11 @@ from darswin.utils.files import replace_file
 Task = Literal["classification", "segmentation", "distance"]
 Fit = Literal["crop", "stretch", "whole"]
 
-_ENTRY = "darswin"  # of the metadata
+_ENTRY = "darswin"  # the key of the card in the metadata
 
 
 class NoCardError(ValueError):
-    """A safetensors file that does not say what model its weights are of."""
+    """The error for a safetensors file without a model card."""
 
 
 @dataclass(frozen=True)
@@ -33,16 +33,17 @@ class ModelCard:
     """The description of a model in its file, beside the weights.
 
     Args:
-        model: a name of `create_model`. options: its options.
-        classes: names of the logits.
-        size: px, of the images it was trained on. fov: rad, the field of view of their lenses, 0
-            where calibrations say it.
-        fit: how a camera's pictures get that size, as `darswin.data.at_size` takes it:
-            "whole" where it was trained through the lenses of `darswin.data.WideAngle`.
-        task: a class for an image, or a class or a distance for each pixel.
-        colors: (r, g, b) in 0 … 255 of each class, where the data say them.
-        quantized: for each layer of int8 weights its name and how its input becomes 8 bits, (scale,
-            zero point): see `darswin.deploy.quantize.quantize_model`.
+        model: the name of the model, for `create_model`.
+        options: the options of the model, for `create_model`.
+        classes: the names of the classes, in the order of the logits.
+        size: the side of the training images, in pixels.
+        fov: the field of view of the training lenses, in rad; 0 if they came from calibrations.
+        fit: the way in which a camera's pictures get this size, as in `darswin.data.at_size`.
+            "whole" is for models trained through the lenses of `darswin.data.WideAngle`.
+        task: "classification" of images, or "segmentation" or "distance" for every pixel.
+        colors: the color (r, g, b) of each class, in 0 … 255, if the data have colors.
+        quantized: for each layer with int8 weights, the quantization (scale, zero point) of its
+            input; see `darswin.deploy.quantize.quantize_model`.
     """
 
     model: str
@@ -72,7 +73,7 @@ class ModelCard:
 
 
 def save_model(path: str | os.PathLike, weights: Mapping[str, Tensor], card: ModelCard) -> None:
-    """Writes a model's state dict and its card, replacing what stood there in one go."""
+    """Writes a model's state dict and its card to a file. An older file is replaced in one step."""
     contiguous = {name: tensor.detach().cpu().contiguous() for name, tensor in weights.items()}
     replace_file(
         path, save(contiguous, metadata={_ENTRY: json.dumps(asdict(card), allow_nan=False)})
@@ -80,7 +81,7 @@ def save_model(path: str | os.PathLike, weights: Mapping[str, Tensor], card: Mod
 
 
 def model_of_run(run: str | os.PathLike, suffix: str = ".safetensors") -> Path:
-    """The best model of a run of `darswin fit`, or, before there is one, the last."""
+    """The path of the best model of a `darswin fit` run, or of the last one if no best exists."""
     folder = Path(run) / "checkpoints"
     for name in ("best", "last"):
         if (path := folder / f"{name}{suffix}").exists():
@@ -89,20 +90,28 @@ def model_of_run(run: str | os.PathLike, suffix: str = ".safetensors") -> Path:
 
 
 def read_card(path: str | os.PathLike) -> ModelCard:
-    """The card of a model's file, or of a name in `list_pretrained()`, without its weights.
+    """The card of a model file, read without the weights.
+
+    Args:
+        path: the path of the file, or a name from `list_pretrained()`.
 
     Raises:
-        NoCardError: other weights. ValueError: no model file of darswin.
+        NoCardError: the file has no card.
+        ValueError: the file is no safetensors file, or its card is wrong.
     """
     return _read(path, with_weights=False)[1]
 
 
 def load_model(path: str | os.PathLike) -> tuple[Any, ModelCard]:
-    """The model of a file, or of a name in `list_pretrained()`, in eval mode, and its card.
+    """The model from a file, in eval mode, and its card.
+
+    Args:
+        path: the path of the file, or a name from `list_pretrained()`.
 
     Raises:
-        NoCardError: other weights. ValueError: no model file of darswin, or weights that are not
-            those of its model.
+        NoCardError: the file has no card.
+        ValueError: the file is no safetensors file, its card is wrong, or the weights do not fit
+            the model of the card.
     """
     path, card, weights = _read(path, with_weights=True)
     with _about(path):
@@ -118,7 +127,7 @@ def load_model(path: str | os.PathLike) -> tuple[Any, ModelCard]:
 def _read(
     path: str | os.PathLike, *, with_weights: bool
 ) -> tuple[str | os.PathLike, ModelCard, dict[str, Tensor]]:
-    """The path of a file, or of a trained model's name, and what the file holds."""
+    """The path of the file, its card, and its weights if they are wanted."""
     path = pretrained_file(str(path)) if path in list_pretrained() else path
     try:
         with safe_open(path, "pt") as file:
@@ -128,7 +137,7 @@ def _read(
     except SafetensorError as error:
         raise ValueError(f"{path} is no safetensors file: {error}") from error
     if entry is None:
-        raise NoCardError(f"{path} holds weights, but not the name of their model")
+        raise NoCardError(f"{path} has weights, but not the name of their model")
     with _about(path):
         return path, _card(entry), weights
 
@@ -137,9 +146,9 @@ def _card(entry: str) -> ModelCard:
     try:
         values = json.loads(entry)
     except ValueError as error:
-        raise ValueError(f"its description of the model is no JSON: {error}") from error
+        raise ValueError(f"its model card is no JSON: {error}") from error
     if not isinstance(values, dict) or "model" not in values:
-        raise ValueError(f'its description must name a "model", got {short(values)}')
+        raise ValueError(f'its model card must be an object with a "model", got {short(values)}')
     # Older files lack some fields.
     known = {name: values[name] for name in _FIELDS if name in values}
     for name, value in known.items():
@@ -150,12 +159,12 @@ def _card(entry: str) -> ModelCard:
 
 
 def _created(card: ModelCard, weights: Mapping[str, Tensor]) -> Any:
-    """The card's model with these weights; ValueError where they do not fit each other."""
+    """The card's model with these weights; ValueError if they do not fit."""
     try:
         model = card.create()
     except ValueError:
         raise
-    except Exception as error:  # a constructor's, for a value that it never expects
+    except Exception as error:  # of a constructor that got a wrong type
         options = json.dumps(card.options)
         raise ValueError(f"a {card.model} cannot be made with the options {options}") from error
     try:
@@ -186,7 +195,7 @@ def _is_quantization(value: Any) -> bool:
     return _are(_is_number, value) and len(value) == 2 and value[0] > 0
 
 
-# Of each field of a card as JSON: whether a value may stand there, and what must.
+# For each field of a card as JSON: a check of its value, and the expected value in words.
 _FIELDS: dict[str, tuple[Callable[[Any], bool], str]] = {
     "model": (lambda value: isinstance(value, str), "the name of a model"),
     "options": (lambda value: isinstance(value, dict), "an object"),
@@ -205,7 +214,7 @@ _FIELDS: dict[str, tuple[Callable[[Any], bool], str]] = {
 
 @contextmanager
 def _about(path: str | os.PathLike) -> Iterator[None]:
-    """Errors within name the file."""
+    """Adds the path of the file to the message of a ValueError."""
     try:
         yield
     except ValueError as error:

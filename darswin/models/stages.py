@@ -1,4 +1,4 @@
-"""The sizes of the stages."""
+"""The sizes of the stages: maps, windows, shifts and merging."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ Pair = tuple[int, int]
 
 @dataclass(frozen=True)
 class StagePlan:
-    """The sizes of a stage; the shift is that of its odd blocks, the merging leads to it."""
+    """The sizes of a stage. Its odd blocks have the shift; the merging is its first layer."""
 
     index: int
     map_size: Pair
@@ -20,7 +20,7 @@ class StagePlan:
     merge: Pair | None
 
     def windows(self, block: int) -> dict[str, Any]:
-        """The options of a block's attention: every second block has shifted windows."""
+        """The options of the attention of a block; every second block has shifted windows."""
         shift = self.shift if block % 2 else (0, 0)
         return dict(map_size=self.map_size, window=self.window, shift=shift)
 
@@ -33,12 +33,13 @@ def plan_stages(
     window: Pair,
     merges: Sequence[Pair] | None = None,
 ) -> list[StagePlan]:
-    """The stages' sizes; ValueError where a window or a merging does not divide its map.
+    """The sizes of all stages; ValueError if a window or a merging does not divide its map.
 
-    A window keeps its number of tokens when an axis runs out. DarSwin-A merges 4 along azimuth,
-    once the ring is used up along the radius; it shifts by a quarter window along azimuth, or,
-    where one window spans the ring, by half along the radius. DarSwin-RA, and so Swin, merges 2×2
-    and shifts by half the window along both axes, but not along an axis that one window spans.
+    If the map is shorter than the window along one axis, the window becomes longer along the other
+    axis and keeps its number of tokens. DarSwin-A merges 4 tokens along azimuth, or along the
+    radius if the ring has less than 4. It shifts by a quarter of the window along azimuth, or by
+    half the window along the radius if the window spans the ring. DarSwin-RA and Swin merge 2×2
+    tokens and shift by half the window, except along an axis that the window spans.
     """
     if merges is not None and len(merges) != count - 1:
         raise ValueError(
@@ -62,7 +63,7 @@ def plan_stages(
 
 
 def _merging(size: Pair, choices: Sequence[Pair], stage: int) -> Pair:
-    """The first merging of the choices that divides the map."""
+    """The first one of the choices that divides the map."""
     for merge in choices:
         merge = check_pair("merges", merge, lowest=1)
         if size[0] % merge[0] == 0 and size[1] % merge[1] == 0:

@@ -1,4 +1,4 @@
-"""The Unet: a label or a distance for each pixel, from polar maps or from views of the images."""
+"""The Unet: a class or a distance for every pixel, from polar maps or views of the images."""
 
 import math
 from collections.abc import Sequence
@@ -8,18 +8,17 @@ import torch
 from torch import Tensor, nn
 
 from darswin.layers.linear import Linear
-from darswin.lens import Lens
 from darswin.models.base import Model, init_weights
 from darswin.models.darswin import PRESETS, DarSwin
 from darswin.models.encoder import Prepared
 from darswin.models.registry import Presets, register_model
 from darswin.models.stages import Pair
 from darswin.models.swin import Swin
-from darswin.models.views import PlainView, PolarView, Way
+from darswin.models.views import PlainView, PolarView, make_view
 
 PixelTask = Literal["segmentation", "distance"]
-EXPANSION = 4  # how many tokens along each axis the decoder's last expansion makes of one
-# exp(±8): from a three-thousandth of the typical distance to three thousand times as far.
+EXPANSION = 4  # The decoder's last expansion splits each token into 4 × 4.
+# exp(±8): distances lie between 1/3000 of the typical distance and 3000 times that distance.
 LARGEST_EXPONENT = 8.0
 
 _NANO = dict(decoder_depths=1, skip_width=8)
@@ -28,7 +27,7 @@ _PLAIN: Presets = dict(nano=_NANO)
 
 
 class PatchExpand(nn.Module):
-    """Splits each token into m_r × m_φ, as Swin-Unet's sec. 3.4: the inverse of `PatchMerging`."""
+    """Splits each token into m_r × m_φ tokens, as Swin-Unet (sec. 3.4); undoes `PatchMerging`."""
 
     def __init__(self, dim: int, out_dim: int, split: Pair):
         super().__init__()
@@ -40,7 +39,7 @@ class PatchExpand(nn.Module):
         """(B, R, A, D) → (B, R·m_r, A·m_φ, D')."""
         batch, rings, sectors, _ = x.shape
         mr, ma = self.split
-        # Inner order (φ, r, D), as `PatchMerging` has it.
+        # Inner order (φ, r, D), as in `PatchMerging`.
         x = self.norm(self.expansion(x).reshape(batch, rings, sectors, ma, mr, self.out_dim))
         x = x.permute(0, 1, 4, 2, 3, 5)
         return x.reshape(batch, rings * mr, sectors * ma, self.out_dim)
@@ -50,7 +49,7 @@ class PatchExpand(nn.Module):
 
 
 class SkipJoin(nn.Module):
-    """Splits the tokens of a map, and joins them with the encoder's map of that resolution."""
+    """Splits the tokens of a map and joins them with the encoder's map of the same resolution."""
 
     def __init__(self, dim: int, split: Pair):
         super().__init__()
@@ -58,12 +57,12 @@ class SkipJoin(nn.Module):
         self.fuse = Linear(2 * dim, dim)
 
     def forward(self, x: Tensor, skip: Tensor) -> Tensor:
-        """(B, R, A, 2·D) and (B, R·m_r, A·m_φ, D) → the shape of the latter."""
+        """(B, R, A, 2·D) and (B, R·m_r, A·m_φ, D) → (B, R·m_r, A·m_φ, D)."""
         return self.fuse(torch.cat((self.expand(x), skip), -1))
 
 
 class Decoder(nn.Module):
-    """Mirrors an encoder: each stage is a `SkipJoin`, then blocks; at the end ×4 on both axes."""
+    """Mirrors an encoder: a `SkipJoin` and blocks per stage, then each token splits into 4×4."""
 
     def __init__(self, encoder: DarSwin | Swin, depths: int | Sequence[int]):
         super().__init__()
@@ -71,8 +70,8 @@ class Decoder(nn.Module):
         depths = [depths] * count if isinstance(depths, int) else list(depths)
         if len(depths) != count or min(depths, default=1) < 1:
             raise ValueError(
-                "decoder_depths must be an int of at least 1, or one for each stage but the last, "
-                f"{count}, got {depths}"
+                "decoder_depths must be an int of at least 1, or one int for each stage but the "
+                f"last, {count}, got {depths}"
             )
         self.joins = nn.ModuleList(
             SkipJoin(dim * 2 ** (plan.index - 1), plan.merge)
@@ -85,7 +84,7 @@ class Decoder(nn.Module):
     def forward(
         self, maps: Sequence[Tensor], positions: Sequence[Sequence[Tensor | None]]
     ) -> Tensor:
-        """The encoder's maps, and `positions` for all but the last → (B, 4·R, 4·A, D)."""
+        """The encoder's maps, and the positions of all stages but the last → (B, 4·R, 4·A, D)."""
         x = maps[-1]
         steps = zip(self.joins, self.stages, maps[:-1], positions, strict=True)
         for join, stage, skip, of_stage in reversed(list(steps)):
@@ -94,9 +93,9 @@ class Decoder(nn.Module):
 
 
 class PixelHead(nn.Module):
-    """The decoder's map → K logits of each pixel, refined by what the image shows there."""
+    """The decoder's map → K logits of each pixel, refined by the pixels of the image."""
 
-    # The map is projected before it is brought to the pixels: the same as after it, and cheaper.
+    # Projecting before resampling to the pixels gives the same as projecting after, at less cost.
 
     def __init__(self, dim: int, channels: int, in_chans: int, skip_width: int):
         super().__init__()
@@ -112,13 +111,13 @@ class PixelHead(nn.Module):
         """The projected map at the pixels, (B, K, H, W), and the images (B, C, H, W) → logits."""
         if not self.skip_width:
             return coarse
-        # Convolutions of few channels take half the time with channels last, as `coarse` comes.
+        # With channels last, as in `coarse`, convolutions of few channels take half the time.
         skip = self.stem(images.contiguous(memory_format=torch.channels_last)).relu()
         skip = self.mix(torch.cat((skip, coarse.to(skip.dtype)), 1)).relu()
         return coarse + self.out(skip).to(coarse.dtype)
 
     def finish(self, logits: Tensor) -> Tensor:
-        """The logits (B, K, H, W) → the model's result."""
+        """Logits (B, K, H, W) → the model's result."""
         return logits
 
     def extra_repr(self) -> str:
@@ -126,7 +125,7 @@ class PixelHead(nn.Module):
 
 
 class DistanceHead(PixelHead):
-    """Distances, m: `typical_distance` times e^x, with x bounded, so above 0 and finite."""
+    """Distances in m, `typical_distance` · e^x. x is bounded, so they are positive and finite."""
 
     def __init__(self, dim: int, in_chans: int, skip_width: int, typical_distance: float):
         super().__init__(dim, 1, in_chans, skip_width)
@@ -135,7 +134,7 @@ class DistanceHead(PixelHead):
         self.typical_distance = float(typical_distance)
 
     def finish(self, logits: Tensor) -> Tensor:
-        """x (B, 1, H, W) → distances (B, 1, H, W), m, in float32 at least."""
+        """x (B, 1, H, W) → distances (B, 1, H, W) in m, in float32 or float64."""
         x = logits.to(torch.promote_types(logits.dtype, torch.float32))
         x = LARGEST_EXPONENT * torch.tanh(x / LARGEST_EXPONENT)
         return self.typical_distance * torch.exp(x)
@@ -145,11 +144,12 @@ class DistanceHead(PixelHead):
 
 
 class UnetPrepared(NamedTuple):
-    """All that the lenses alone decide about images of one size."""
+    """The result of a Unet's `prepare`."""
 
     encoder: Prepared
     positions: Sequence[Sequence[Tensor | None]]  # of the decoder's stages
-    way: Way  # to the view of the images, and back
+    image_points: Tensor | None  # see `PlainView.image_points`
+    view_points: Any  # see `PlainView.view_points`
 
 
 @register_model("darswin_unet_a", variant="A", presets=_POLAR)
@@ -158,56 +158,61 @@ class UnetPrepared(NamedTuple):
 @register_model("swin_unet_undis", view="perspective", image_size=128, presets=_PLAIN)
 @register_model("swin_unet_adapted", view="square", image_size=128, presets=_PLAIN)
 class Unet(Model):
-    """DarSwin or Swin as the encoder, its mirror as the decoder, and the way back to the pixels.
+    """A class or a distance for every pixel: a DarSwin or Swin encoder and a mirrored decoder.
 
-    The result has the images' height and width: for "segmentation" logits (B, num_classes, H, W),
-    for "distance" metres along the ray, (B, 1, H, W), above 0. At pixels that no ray of the lens
-    reaches it has no meaning. The decoder ends on a map 4 times as fine along both axes as the
-    encoder's first; its projection to the classes is brought to the pixels, and refined by a few
-    convolutions that see the image too, since the map is coarser than the image.
+    The result has the height and the width of the images. For "segmentation" it is logits (B,
+    num_classes, H, W); for "distance" it is metres along the ray, (B, 1, H, W), and positive. At
+    pixels that no ray of the lens reaches, the result has no meaning.
 
-    The `view` is what the network looks at:
+    The decoder's last map is 4 times finer along both axes than the encoder's first map. It is
+    projected to the classes and resampled to the pixels. A few convolutions, which also read the
+    image, then add the details that the map is too coarse for.
 
-    - "polar", DarSwin-Unet: DarSwin reads images of any size through any lens;
-    - "none", Swin-Unet: Swin takes the images as they are and ignores the lens;
-    - "perspective", Swin-Unet on perspective views; pixels beyond them are 0: unknown;
-    - "square", Swin-Unet on the image disc as a square, as `LensAdapter` makes it.
+    The `view` is the form in which the network sees the images:
 
-    The encoder is a classifier without its head, whose weights it takes:
+    - "polar" is DarSwin-Unet. DarSwin takes images of any size through any lens.
+    - "none" is Swin-Unet. Swin takes the images as they are and ignores the lens.
+    - "perspective" is Swin-Unet on perspective views. Pixels outside the view get 0.
+    - "square" is Swin-Unet on the image disc, mapped to a square as in `LensAdapter`.
+
+    The encoder can start from the weights of a trained classifier:
     `classifier.reset_classifier(0)`, `model.encoder.load_state_dict(classifier.state_dict())`.
 
     Args:
-        num_classes: of "segmentation"; "distance" ignores it. in_chans: C of the images.
-        view: as above. task: "segmentation" or "distance".
-        decoder_depths: blocks of each stage of the decoder, one for each of the encoder but the
-            last; an int is for all.
-        skip_width: channels of the skip from the image; 0 leaves it out.
-        typical_distance: m, what "distance" starts from.
-        places: adds to each of the encoder's maps, before the decoder, a learned linear function of
-            where its tokens are: for "polar" the direction (x, y, z) in which they look, as without
-            it the network does not know which way is up; else x and y in the view, in [-1, 1].
-        options: of the encoder: of `DarSwin` for "polar"; else of `Swin`, where image_size is 128
-            and patch_size is 4 by default, with those of the view.
+        num_classes: the number of classes; "distance" ignores it.
+        in_chans: C, the number of channels of the images.
+        view: "polar", "none", "perspective" or "square".
+        task: "segmentation" or "distance".
+        decoder_depths: the number of blocks of each decoder stage. There is one decoder stage for
+            each encoder stage but the last. An int applies to all.
+        skip_width: the number of channels of these convolutions; 0 leaves them out.
+        typical_distance: the distance, in m, around which "distance" starts.
+        places: adds a learned linear function of each token's position to the encoder's maps before
+            the decoder. For "polar" the position is the viewing direction (x, y, z), which tells
+            the network which way is up. For other views it is x and y in the view, in [-1, 1].
+        options: the options of the encoder: of `DarSwin` for "polar", else of `Swin`, whose
+            defaults are here image_size=128 and patch_size=4.
 
     "darswin_unet_*_nano" has R×A = 16×64, unlike the classifier of that size.
 
     Rotation:
-        In eval mode, without `places` and the skip (skip_width=0), whose convolutions are not
-        symmetric, a turn of a square image about the principal point by 90° turns the result, up
-        to rounding, where it turns the maps of `DarSwin`: for "darswin_unet_ra_nano", and with
-        `periodic_bias` for RA of every size and "darswin_unet_a_nano".
+        Turning a square image by 90° about the principal point turns the result, up to rounding, in
+        eval mode, if it turns the maps of the `DarSwin` encoder. `places` must be False and
+        skip_width must be 0, because these parts are not symmetric. "darswin_unet_ra_nano" meets
+        the condition; RA of every size and "darswin_unet_a_nano" meet it with `periodic_bias`.
 
     Attributes:
-        encoder, decoder: of maps. segmentation_head or distance_head: from maps to pixels.
-        feature_info, pretrained_cfg: as `Model`, of the encoder.
+        encoder, decoder: the parts that make the maps.
+        segmentation_head or distance_head: the part that makes the result from the last map.
+        feature_info: the sizes of the encoder's stages.
 
     Raises:
-        ValueError: as `DarSwin` or `Swin`, or an option out of its range.
-        TypeError: in forward, no lens where the view needs one.
+        ValueError: an option of the encoder or of the Unet is wrong.
+        TypeError: in forward, the lens is missing and the view uses it.
 
-    Source: DarSwin-Unet, WACV 2025, with a differentiable interpolation in place of its nearest
-        neighbours, and skips from the end of each stage rather than its beginning. Swin-Unet, ECCV
-        2022 workshops; it has two blocks a stage.
+    Source: DarSwin-Unet, WACV 2025. Here the way back to the pixels is a differentiable
+        interpolation instead of the nearest neighbour, and the skips start at the end of each
+        stage, not at its beginning. Swin-Unet, ECCV 2022 workshops; it has two blocks per stage.
     """
 
     encoder: DarSwin | Swin
@@ -236,12 +241,13 @@ class Unet(Model):
             sizes = [plan.map_size for plan in self.encoder.plans] if places else []
             self.view = PolarView(self.encoder.spec, EXPANSION, sizes)
         else:
+            # The head needs the view too, so the Unet makes it, and the encoder gets it as images.
             options = dict(image_size=128, patch_size=4) | options
-            self.encoder = Swin(0, in_chans, view=view, **options)
+            self.view = make_view(view, options["image_size"], options)
+            self.encoder = Swin(0, in_chans, **options)
             self.image_size = self.encoder.image_size
             self.square_images = self.encoder.square_images
-            # The head sees the view too, so it is made here, and the encoder takes it as it is.
-            self.view, self.encoder.view = self.encoder.view, PlainView(self.image_size)
+        self.uses_lens = self.view.uses_lens
         self.task, self.in_chans = task, in_chans
         self.mean, self.std = self.encoder.mean, self.encoder.std
         self.feature_info = self.encoder.feature_info
@@ -266,16 +272,16 @@ class Unet(Model):
         return self.get_submodule(f"{self.task}_head")  # type: ignore[return-value]
 
     def get_classifier(self) -> nn.Module:
-        """The head."""
+        """The head, the same as `head`."""
         return self.head
 
     def reset_classifier(self, num_classes: int) -> None:
-        """A new head: for `num_classes` classes, or for distances, where that number is ignored.
+        """Replaces the head by a new one for `num_classes` classes; "distance" ignores the number.
 
-        It has the dtype, the device and the backend (see `set_matmul_backend`) of the model.
+        The new head has the dtype, the device and the matmul backend of the model.
 
         Raises:
-            ValueError: fewer than one class.
+            ValueError: there is less than one class.
         """
         dim = self.feature_info.channels(0)
         head: PixelHead
@@ -292,27 +298,31 @@ class Unet(Model):
         like = next(self.decoder.parameters())
         self.add_module(f"{self.task}_head", head.to(like).train(self.training))
 
-    def prepare(self, lens: Lens | None, size: Pair) -> UnetPrepared:
-        """As `Model`: what the encoder and the decoder take, and the way to the pixels."""
-        encoder = self.encoder.prepare(lens, size)
-        return UnetPrepared(encoder, encoder.positions[:-1], self.view.prepare(lens, size))
+    def _prepare(self, lens: Any, size: Pair) -> UnetPrepared:
+        encoder = self.encoder._prepare(lens, size)
+        return UnetPrepared(
+            encoder,
+            encoder.positions[:-1],
+            self.view.image_points(lens, size),
+            self.view.view_points(lens, size),
+        )
 
     def _run(self, images: Tensor, prepared: UnetPrepared) -> Tensor:
-        there, back = prepared.way
-        seen = self.view.to_view(self._floating(images), there)
+        seen = self.view.to_view(self._floating(images), prepared.image_points)
         maps = self.encoder.maps(seen, prepared.encoder)
         maps[-1] = self.encoder.norm(maps[-1])
         if self.places:
-            maps = self._with_places(maps, back)
+            maps = self._with_places(maps, prepared.view_points)
         head = self.head
         x = head.proj(self.decoder(maps, prepared.positions))
         height, width = seen.shape[2:]
-        logits = head.refine(self.view.to_pixels(x, back, (height, width)), seen)
-        return head.finish(self.view.back(logits, back))
+        coarse = self.view.to_pixels(x, prepared.view_points, (height, width))
+        logits = head.refine(coarse, seen)
+        return head.finish(self.view.to_images(logits, prepared.view_points))
 
-    def _with_places(self, maps: Sequence[Tensor], back: Any) -> list[Tensor]:
-        """The encoder's maps, plus a function of where their tokens are."""
+    def _with_places(self, maps: Sequence[Tensor], view_points: Any) -> list[Tensor]:
+        """The encoder's maps, plus a linear function of the positions of their tokens."""
         weight = next(self.places.parameters())
-        places = self.view.token_places(self.feature_info.get("map_size"), back, weight)
+        places = self.view.token_places(self.feature_info.get("map_size"), view_points, weight)
         steps = zip(maps, self.places, places, strict=True)
         return [x + layer(place.to(weight)).to(x.dtype) for x, layer, place in steps]

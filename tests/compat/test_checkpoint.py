@@ -114,7 +114,7 @@ def test_files_that_are_no_checkpoints(tmp_path):
     source, target = tmp_path / "checkpoint.pth", tmp_path / "model.safetensors"
     for content in ({"epoch": 3}, [torch.zeros(2)], {"model": [torch.zeros(2)]}):
         torch.save(content, source)
-        with pytest.raises(ValueError, match="holds no state dict"):
+        with pytest.raises(ValueError, match="has no state dict"):
             convert_checkpoint(source, target)
         assert not target.exists()
     for content in (b"", b"no checkpoint", b"PK\3\4" + bytes(100), b"\x80\2R."):

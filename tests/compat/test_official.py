@@ -140,3 +140,9 @@ def test_official_polynomial():
         OfficialPolynomial([1.0, -3.0, 0.5, 3.0], 32.0)
     with pytest.raises(ValueError, match="radius must be finite and above 0"):
         OfficialPolynomial([1.0, 0.0, 0.0, 0.0], 0.0)
+
+
+@pytest.mark.parametrize("option", [dict(variant="RA"), dict(merges=((1, 4), (4, 1)))])
+def test_options_that_the_released_code_does_not_have(option):
+    with pytest.raises(ValueError, match="only variant 'A' and no option merges"):
+        OfficialDarSwin(**option)

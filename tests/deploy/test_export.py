@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from darswin import create_model
+from darswin.compat import OfficialDarSwin
 from darswin.deploy.export import export_onnx, export_program
 from darswin.lens import Polynomial, Spherical, solve
 from darswin.ops import _module
@@ -21,6 +22,8 @@ ONE_BLOCK = dict(depths=(1,), num_heads=(1,))  # tracing takes as long as there 
 
 def short(name, **options):
     options = dict(num_classes=5, depths=(1, 1), num_heads=(1, 2)) | options
+    if name == "official":
+        return OfficialDarSwin(embed_dim=24, samples=(4, 4), **options).eval()
     return create_model(name, **options).eval()
 
 
@@ -41,7 +44,7 @@ def tensors_of(lens):
     [
         # A radius that only Newton's method takes back to an angle.
         ("darswin_ra_nano", dict(spacing="radius", sample_spacing="theta"), POLYNOMIAL),
-        ("darswin_a_nano", dict(compat="official", rings=16, sectors=64), SPHERICAL),
+        ("official", {}, SPHERICAL),
         ("swin_nano", {}, SPHERICAL),
         ("darswin_unet_a_nano", dict(skip_width=4), SPHERICAL),
         ("darswin_unet_ra_nano", dict(ONE_BLOCK, task="distance"), POLYNOMIAL),

@@ -153,7 +153,7 @@ def test_gradients_reach_the_lens(spacing, sample_spacing):
         (dict(spacing="log"), "spacing must be one of"),
         (dict(sample_spacing="log"), "sample_spacing must be one of"),
         (dict(placement="middle"), "placement must be one of"),
-        (dict(placement="edges", samples=(1, 4)), "at least 2 samples"),
+        (dict(placement="edges", samples=(1, 4)), "2 or more samples"),
         (dict(jitter=2.0), "jitter"),
         (dict(layout="rows"), "layout"),
     ],
@@ -306,7 +306,7 @@ def test_a_calibrated_camera_compiles(lens):
     ("images", "lens", "last", "error", "message"),
     [
         (torch.zeros(3, 32, 32), LENSES, None, ValueError, r"\(B, C, H, W\), got \(3, 32"),
-        (torch.zeros(3, 1, 32, 32), LENSES, None, ValueError, "one an image, 3, got 2"),
+        (torch.zeros(3, 1, 32, 32), LENSES, None, ValueError, "each of the 3 images, got 2"),
         (torch.zeros(2, 1, 32, 32), None, None, TypeError, "lens must be a darswin.lens"),
         ([1], LENSES, None, TypeError, "images must be a tensor, got list"),
         (torch.zeros(2, 1, 32, 3).byte(), LENSES, None, ValueError, "both .* pass channels_"),

@@ -97,7 +97,7 @@ def test_what_comes_with_a_model():
         assert config["num_classes"] == len(card.classes)
         count = sum(parameter.numel() for parameter in model.parameters())
         assert f"{count:,} parameters" in pretrained_file(name, "md").read_text()
-    with pytest.raises(ValueError, match="no model 'letters' comes with darswin; there are digits"):
+    with pytest.raises(ValueError, match="no model 'letters' comes with darswin; the models are d"):
         pretrained_file("letters")
 
 

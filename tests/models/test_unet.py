@@ -28,9 +28,9 @@ def test_projecting_first_is_projecting_on_the_pixels(lens):
     """A linear layer commutes with the interpolation, to rounding."""
     model = network("darswin_unet_a_nano", skip_width=0)
     x, size = torch.randn(2, 64, 256, 24), (64, 64)
-    back = model.view.prepare(lens, size).back
-    first = model.view.to_pixels(model.segmentation_head.proj(x), back, size)
-    pixels = model.view.to_pixels(x, back, size)
+    points = model.view.view_points(lens, size)
+    first = model.view.to_pixels(model.segmentation_head.proj(x), points, size)
+    pixels = model.view.to_pixels(x, points, size)
     proj = model.segmentation_head.proj
     after = F.linear(pixels.permute(0, 2, 3, 1), proj.weight, proj.bias).permute(0, 3, 1, 2)
     # Beyond θ_max a map is 0, and the bias alone is left of what is projected after.
@@ -44,11 +44,11 @@ def test_the_decoders_rings_are_those_of_the_grid(spacing):
     """Four to a ring: the samples of a grid of 4 × 4 samples a token stand at their centres."""
     lens = Spherical.from_fov([0.1, 0.9], 2.6, 32.0)
     model = create_model("darswin_unet_ra_nano", spacing=spacing, sample_spacing="radius")
-    way, _ = model.view.prepare(lens, (64, 64)).back
+    back, _ = model.view.view_points(lens, (64, 64))
     grid = polar_grid(lens, (64, 64), rings=16, sectors=64, samples=(4, 4), spacing=spacing,
                       sample_spacing="radius")  # fmt: skip
-    torch.testing.assert_close(way.radii, grid.radii)
-    assert torch.equal(way.center, grid.center) and torch.equal(way.r_max, lens.r_max)
+    torch.testing.assert_close(back.radii, grid.radii)
+    assert torch.equal(back.center, grid.center) and torch.equal(back.r_max, lens.r_max)
     # `polar_to_image` takes sector a to be where the samples of column a stand.
     assert torch.allclose(grid.azimuths, 2 * math.pi * (torch.arange(256) + 0.5) / 256)
 
@@ -59,15 +59,15 @@ def test_the_decoders_rings_are_those_of_the_grid(spacing):
 def test_what_the_rays_show_comes_back_to_their_pixels(lens, spacing):
     """A field of (θ, φ) on the rings and sectors, brought back, is that of each pixel's ray."""
     lens, size = lens.to(f64), (60, 66)
-    way = PolarGridSpec(32, 1, (1, 1), spacing).pixel_grid(lens, size, split=4)
-    theta = lens.unproject(way.radii)[0][:, None]
+    back = PolarGridSpec(32, 1, (1, 1), spacing).pixel_grid(lens, size, split=4)
+    theta = lens.unproject(back.radii)[0][:, None]
     azimuth = 2 * math.pi * (torch.arange(512, dtype=f64) + 0.5) / 512
 
     def field(theta, azimuth):
         across, down = theta * torch.cos(azimuth), theta * torch.sin(azimuth)
         return torch.stack(torch.broadcast_tensors(across, down, theta), -1)
 
-    got = polar_to_image(field(theta, azimuth)[None], size=size, layout="tokens", **way._asdict())
+    got = polar_to_image(field(theta, azimuth)[None], size=size, layout="tokens", **back._asdict())
     pixels = torch.stack(
         torch.meshgrid(torch.arange(66, dtype=f64), torch.arange(60, dtype=f64), indexing="xy"), -1
     )
@@ -136,8 +136,8 @@ def test_a_lens_is_learned_through_the_way_back(kind, values):
 
         def loss(*parameters, whole=whole):
             lens = made(*parameters)
-            way = prepared._replace(way=model.view.prepare(lens, size))
-            logits = model.run(images, model.prepare(lens, size) if whole else way)
+            back = prepared._replace(view_points=model.view.view_points(lens, size))
+            logits = model.run(images, model.prepare(lens, size) if whole else back)
             return (F.cross_entropy(logits, labels, reduction="none") * weights).mean() * 100
 
         assert all((g != 0).all() for g in torch.autograd.grad(loss(*leaves), leaves))
@@ -244,6 +244,6 @@ def test_its_encoder_starts_from_a_trained_classifier(classifier, unet, options)
     trained.reset_classifier(0)
     model.encoder.load_state_dict(trained.state_dict())
     if "undis" in classifier:  # the unet makes the view
-        x = model.view.to_view(x, model.view.prepare(lens, (32, 32)).there)
+        x = model.view.to_view(x, model.view.image_points(lens, (32, 32)))
     got = model.encoder.forward_intermediates(x, lens, intermediates_only=True)
     assert all(torch.equal(a, b) for a, b in zip(got, maps, strict=True))

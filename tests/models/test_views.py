@@ -127,7 +127,7 @@ def test_wrong_arguments_of_an_adapter():
         adapter(images, None)
     with pytest.raises(TypeError, match=r"images must be in floating point, got torch\.uint8"):
         adapter(images.byte(), LENSES[:1])
-    with pytest.raises(ValueError, match="one lens or one an image, 3, got 2"):
+    with pytest.raises(ValueError, match="each of the 3 images, got 2"):
         adapter(images, LENSES)
     with pytest.raises(ValueError, match=r"belongs to images of \(H, W\) = \(20, 20\)"):
         adapter(images, LENSES.replace(image_size=torch.tensor([[20.0, 20.0]] * 2)))
