@@ -6,7 +6,6 @@ which data, is the task's: `darswin.train.tasks`.
 """
 
 import contextlib
-import inspect
 import re
 import shlex
 import shutil
@@ -30,15 +29,13 @@ from darswin.cli.arguments import with_lists
 from darswin.cli.options import (
     ALL,
     FIRST_TASK,
-    RUN,
     check_free,
-    complete,
     format_help,
     last_of,
     presets,
 )
 from darswin.data.lens_distributions import parse_sweep
-from darswin.models.saving import Task, model_of_run, read_card
+from darswin.models.saving import model_of_run, read_card
 from darswin.train.finetuning import settle, weights_file
 from darswin.train.results import WriteResults
 from darswin.train.runs import (
@@ -50,21 +47,10 @@ from darswin.train.runs import (
 from darswin.train.tasks import TASKS
 from darswin.utils.files import locked, remove_partial_files, replace_file
 from darswin.utils.malloc import keep_freed_memory
+from darswin.utils.tasks import Task
 
 
-def flag_of(name: str) -> str:
-    """The flag of a parameter that an error of the library names."""
-    if name in RUN or "." in name:
-        return f"--{name}"
-    classes = [("data", part) for task in TASKS.values() for part in task.data.__mro__]
-    for group, part in (*classes, ("trainer", Trainer)):
-        ours = part.__module__.startswith(("darswin.", "lightning.pytorch.trainer"))
-        if ours and name in inspect.signature(part).parameters:
-            return f"--{group}.{name}"
-    return f"--model.{name}"
-
-
-def run(argv: list[str]) -> None:
+def run(argv: list[str], task: Task) -> None:
     """Runs `fit`, `validate` or `test`, the first of `argv`, with the others as its options."""
     if argv[0] == "fit":
         keep_freed_memory()
@@ -76,7 +62,7 @@ def run(argv: list[str]) -> None:
     warnings.filterwarnings("ignore", "Checkpoint directory .* exists and is not empty")
     warnings.filterwarnings("ignore", "The number of training batches .* is smaller than the log")
     parser = WholeHelpParser if ALL in argv else RunParser
-    argv, task = complete(["--help" if word == ALL else word for word in argv])
+    argv = ["--help" if word == ALL else word for word in argv]
     with StopOnSignals() as signals:
         try:
             RunCLI(

@@ -10,6 +10,7 @@ from collections.abc import Callable, Mapping
 from pkgutil import resolve_name
 from typing import NamedTuple
 
+from darswin.cli import options
 from darswin.cli.arguments import run_command
 from darswin.utils.extras import lack
 from darswin.utils.processes import die_with_first_process
@@ -85,8 +86,9 @@ def main(argv: list[str] | None = None) -> None:
     warnings.showwarning = _one_line(warnings.showwarning)
     try:
         if command.function == RUN:
+            argv, task = options.complete(argv)
             with die_with_first_process():  # which may end while this one still imports
-                resolve_name(RUN)(argv)
+                resolve_name(RUN)(argv, task)
         else:
             run_command(resolve_name(command.function), argv[1:], f"darswin {name}")
         sys.stdout.flush()
@@ -107,7 +109,7 @@ def main(argv: list[str] | None = None) -> None:
 def with_flags(message: str, command: Command) -> str:
     """An error's message with flags in place of parameters, which the library writes as `name`;
     darswin.lens as name=, and its `model` is the command's `coefficients`."""
-    flag_of = resolve_name("darswin.cli.fit:flag_of") if command.function == RUN else "--{}".format
+    flag_of = options.flag_of if command.function == RUN else "--{}".format
     names = {"camera": "camera", "model": "coefficients"}
     message = re.sub(
         r"\b(camera|model)=([\"']?)",

@@ -1,14 +1,15 @@
 """The options of `fit`, `validate` and `test`: their help, presets, and the run's own folder."""
 
 import argparse
+import inspect
 import textwrap
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from pathlib import Path
 from typing import Any, get_args
 
 import yaml
 
-from darswin.models.saving import Task
+from darswin.utils.tasks import Task
 
 PRESETS = Path(__file__).parent.parent / "train" / "presets"
 FIRST_TASK: Task = "classification"  # of runs that say none
@@ -16,14 +17,17 @@ FIRST_TASK: Task = "classification"  # of runs that say none
 
 def complete(argv: list[str]) -> tuple[list[str], Task]:
     """The arguments with presets' names as their files, and the task. `test`, `validate` and
-    `fit --resume` begin with the configuration of the run, so that they need no other option."""
+    `fit --resume` begin with the configuration of the run, so that they need no other option.
+
+    The errors here come at once; those of the parser only after imports that take seconds."""
     scan = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     scan.add_argument("-c", "--config", action="append", default=[])
     scan.add_argument("--run")
     scan.add_argument("--resume", action="store_true")
     scan.add_argument("--task")
+    scan.add_argument("--data.path", dest="path")
     given, others = scan.parse_known_args(argv[1:])
-    tasks = {file: _task_in(file) for file in map(_config_file, given.config)}
+    contents = {file: _content(file) for file in map(_config_file, given.config)}
     before = None
     if given.run:
         others += ["--run", given.run]
@@ -31,13 +35,13 @@ def complete(argv: list[str]) -> tuple[list[str], Task]:
         if argv[0] == "fit" and not given.resume:
             check_free(Path(given.run))
         elif own.exists():
-            before = _task_in(own) or FIRST_TASK
-            tasks = {own: before} | tasks
-        elif last_of(Path(given.run)).exists() if argv[0] == "fit" else not tasks:
+            contents = {own: _content(own)} | contents
+            before = contents[own].get("task") or FIRST_TASK
+        elif last_of(Path(given.run)).exists() if argv[0] == "fit" else not contents:
             raise FileNotFoundError(f"there is no run in {given.run}: it has no config.yaml")
     if given.resume:
         others.append("--resume=true")
-    said = [*tasks.values(), given.task]
+    said = [before, *(content.get("task") for content in contents.values()), given.task]
     task = next((task for task in reversed(said) if task is not None), FIRST_TASK)
     if task not in get_args(Task):
         raise ValueError(f"`task` must be one of {', '.join(get_args(Task))}, got {task!r}")
@@ -45,7 +49,13 @@ def complete(argv: list[str]) -> tuple[list[str], Task]:
         raise ValueError(f"{given.run} is a run of `task` {before}, not of {task}")
     if given.task:
         others += ["--task", given.task]
-    return [argv[0], *(f"--config={file}" for file in tasks), *others], task
+    if given.path:
+        others += ["--data.path", given.path]
+    else:
+        given.path = next((p for p in map(_path_in, reversed(contents.values())) if p), "digits")
+    if given.path != "digits" and not Path(given.path).exists():
+        raise FileNotFoundError(f"no folder {given.path}")
+    return [argv[0], *(f"--config={file}" for file in contents), *others], task
 
 
 def _config_file(name: str) -> Path:
@@ -57,12 +67,18 @@ def _config_file(name: str) -> Path:
     return preset
 
 
-def _task_in(config: Path) -> Any:
+def _content(config: Path) -> dict[str, Any]:
     try:
         content = yaml.safe_load(config.read_text())
     except (yaml.YAMLError, OSError):
-        return None  # the parser says what is wrong with it
-    return content.get("task") if isinstance(content, dict) else None
+        return {}  # the parser says what is wrong with it
+    return content if isinstance(content, dict) else {}
+
+
+def _path_in(content: dict[str, Any]) -> str | None:
+    data = content.get("data")
+    path = data.get("path") if isinstance(data, dict) else None
+    return path if isinstance(path, str) else None
 
 
 def presets() -> str:
@@ -81,6 +97,22 @@ def check_free(folder: Path) -> None:
         raise FileExistsError(
             f"{folder} holds a run already: go on with `resume`, or choose another one"
         )
+
+
+def flag_of(name: str) -> str:
+    """The flag of a parameter that an error of the library names."""
+    if name in RUN or "." in name:
+        return f"--{name}"
+    from lightning.pytorch import Trainer  # takes seconds
+
+    from darswin.train.tasks import TASKS
+
+    classes = [("data", part) for task in TASKS.values() for part in task.data.__mro__]
+    for group, part in (*classes, ("trainer", Trainer)):
+        ours = part.__module__.startswith(("darswin.", "lightning.pytorch.trainer"))
+        if ours and name in inspect.signature(part).parameters:
+            return f"--{group}.{name}"
+    return f"--model.{name}"
 
 
 # -- help: our options first, then the trainer's that people need -----------------------------
@@ -114,7 +146,8 @@ TRAINER = {
     "trainer.enable_progress_bar": "true or false",
 }
 GROUPS = {"data": "pictures and lenses", "model": "the model and its training"}
-REQUIRED = ("run", "data.path")
+# The other commands take the path from the run.
+REQUIRED = {"fit": ("run", "data.path"), "validate": ("run",), "test": ("run",)}
 WIDTH, COLUMN = 118, 34
 
 
@@ -129,13 +162,15 @@ def format_help(
     # An option that is linked to another one has no name that could be typed.
     typed = (a for a in actions if any(name.startswith("-") for name in a.option_strings))
     left = {action.dest: action for action in typed}
-    lines = [f"usage: darswin {command} --run RUN [-c PRESET] --data.path PATH [options]"]
+    required = REQUIRED[command]
+    usage = "--run RUN [-c PRESET] --data.path PATH" if "data.path" in required else "--run RUN"
+    lines = [f"usage: darswin {command} {usage} [options]"]
 
     def section(title: str, texts: dict[str, str]) -> None:
         lines.extend(("", f"{title}:"))
         for name, text in texts.items():
             if name in left:
-                lines.extend(_option(left.pop(name), text))
+                lines.extend(_option(left.pop(name), text, required))
 
     section("the run", RUN)
     for group, title in GROUPS.items():
@@ -151,12 +186,14 @@ def format_help(
     return "\n".join(lines) + "\n\n" + formatter.format_help()
 
 
-def _option(action: argparse.Action, text: str) -> list[str]:
+def _option(action: argparse.Action, text: str, required: Collection[str]) -> list[str]:
     """An option, its help, and in brackets its default."""
     names = ", ".join(name for name in action.option_strings if not name.endswith("+"))
     default = action.default
-    if action.dest in REQUIRED:
+    if action.dest in required:
         shown = "required"
+    elif action.dest == "data.path":
+        shown = "that of the run"
     elif isinstance(default, float):
         shown = f"{default:g}"
     else:

@@ -26,9 +26,10 @@ from darswin.data.samples import IMAGENET_MEAN, IMAGENET_STD
 from darswin.lens import Lens
 from darswin.lens.files.opencv import Coefficients
 from darswin.models.registry import list_pretrained, pretrained_file
-from darswin.models.saving import ModelCard, NoCardError, Task, load_model, model_of_run
+from darswin.models.saving import ModelCard, NoCardError, load_model, model_of_run
 from darswin.utils.files import replace_file
 from darswin.utils.image import BrokenImageError, read_oriented
+from darswin.utils.tasks import Task
 from darswin.utils.video import is_video, read_frames
 
 

@@ -17,8 +17,8 @@ from darswin.layers.quantized import Quantization, with_quantized_layers
 from darswin.lens.files.fields import short
 from darswin.models.registry import create_model, list_pretrained, pretrained_file
 from darswin.utils.files import replace_file
+from darswin.utils.tasks import Task
 
-Task = Literal["classification", "segmentation", "distance"]
 Fit = Literal["crop", "stretch", "whole"]
 
 _ENTRY = "darswin"  # the key of the card in the metadata

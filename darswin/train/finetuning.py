@@ -10,8 +10,9 @@ from darswin.layers.quantized import without_quantized_layers
 from darswin.models.base import Model
 from darswin.models.encoder import Encoder
 from darswin.models.registry import list_models, model_class
-from darswin.models.saving import ModelCard, Task, load_model, model_of_run
+from darswin.models.saving import ModelCard, load_model, model_of_run
 from darswin.models.unet import Unet
+from darswin.utils.tasks import Task
 
 # Options of a model that the data decide.
 OF_DATA = ("task", "num_classes", "in_chans", "mean", "std", "image_size")

@@ -20,7 +20,6 @@ from darswin.lens import Lens
 from darswin.models.encoder import Encoder
 from darswin.models.registry import has_image_size
 from darswin.models.saving import ModelCard, read_card
-from darswin.models.saving import Task as TaskName
 from darswin.models.unet import Unet
 from darswin.ops.checks import readable
 from darswin.train.finetuning import (
@@ -31,6 +30,7 @@ from darswin.train.finetuning import (
     start_from,
     weights_file,
 )
+from darswin.utils.tasks import Task as TaskName
 
 __all__ = ["Task"]
 

@@ -2,12 +2,12 @@
 
 from typing import NamedTuple
 
-from darswin.models.saving import Task as TaskName
 from darswin.train.classification import Classification
 from darswin.train.data import RunData, WideAngleData
 from darswin.train.scene_data import DistanceData, LabelData
 from darswin.train.segmentation import Distance, Segmentation
 from darswin.train.task import Task
+from darswin.utils.tasks import Task as TaskName
 
 __all__ = ["TASKS"]
 

@@ -2,6 +2,8 @@
 
 import inspect
 import re
+import subprocess
+import sys
 
 import cv2
 import numpy as np
@@ -12,9 +14,8 @@ from lightning.pytorch import Trainer
 from runs import QUIET, error, fit
 from scenes import CALIBRATIONS, write_plain
 
-from darswin.cli.fit import flag_of
 from darswin.cli.main import COMMANDS, main
-from darswin.cli.options import PRESETS, complete
+from darswin.cli.options import PRESETS, complete, flag_of
 from darswin.layers import linear
 from darswin.models import load_model
 from darswin.train.tasks import TASKS
@@ -84,6 +85,28 @@ def test_what_is_missing_is_named_as_people_type_it(capsys, tmp_path):
     assert f"no run in {tmp_path}" in error(capsys, "test", "--run", tmp_path)
     (tmp_path / "config.yaml").write_text("data: {path: digits}\n")
     assert f"no model in {tmp_path} yet" in error(capsys, "test", "--run", tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--data.path", "nowhere"], "no folder nowhere"),
+        (["--config", "c.yaml"], "no folder elsewhere"),
+        (["--config", "none"], "there is no file none and no such preset"),
+        (["--task", "depth"], "--task must be one of"),
+    ],
+)
+def test_errors_before_the_slow_imports(capsys, tmp_path, monkeypatch, options, message):
+    monkeypatch.setattr("darswin.cli.main.resolve_name", None)  # imports the command
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "c.yaml").write_text("data: {path: elsewhere}")
+    assert message in error(capsys, "fit", "--run", "r", *options)
+
+
+@pytest.mark.slow
+def test_the_command_line_starts_without_torch():
+    code = "import sys, darswin.cli.main; sys.exit('torch' in sys.modules)"
+    subprocess.run([sys.executable, "-c", code], check=True)
 
 
 def test_flags_of_parameters():
@@ -239,7 +262,10 @@ def test_our_options_come_first_and_none_is_missing(capsys, task):
 
 
 def test_all_has_everything(capsys):
-    few, every = (options_in(shown(capsys, "test", flag)) for flag in ("--help", "--help.all"))
+    texts = [shown(capsys, "test", flag) for flag in ("--help", "--help.all")]
+    few, every = map(options_in, texts)
+    assert texts[0].startswith("usage: darswin test --run RUN [options]")
+    assert re.search(r"--data\.path\s[^\[]*\[that of the run\]", texts[0])
     assert every[: len(few)] == few
     trainer = {f"trainer.{name}" for name in inspect.signature(Trainer).parameters}
     assert trainer - set(every) <= {"trainer.default_root_dir"}
