@@ -42,7 +42,7 @@ def disc(places):
     return radius[..., None] * direction
 
 
-@pytest.mark.parametrize("count", [40, 41])  # without and with the middle and the axes
+@pytest.mark.parametrize("count", [12, 13])  # without and with the middle and the axes
 def test_it_is_the_published_map_and_back(count):
     places = grid(count)
     r, phi = torch.tensor([published(*p) for p in places.view(-1, 2).tolist()], dtype=f64).unbind(1)
@@ -56,7 +56,7 @@ def test_it_is_the_published_map_and_back(count):
 
 
 def test_areas_keep_their_ratio_and_nothing_jumps_at_diagonals_and_axes():
-    areas = torch.linalg.det(torch.func.vmap(torch.func.jacrev(disc))(grid(24).view(-1, 2)))
+    areas = torch.linalg.det(torch.func.vmap(torch.func.jacrev(disc))(grid(12).view(-1, 2)))
     torch.testing.assert_close(areas, torch.full_like(areas, math.pi / 4))
     line = torch.linspace(-1, 1, 201, dtype=f64)[:, None]
     sides = torch.tensor([(1, 1), (1, -1), (1, 0), (0, 1)], dtype=f64)

@@ -97,10 +97,10 @@ def test_derivatives_of_both_directions_up_to_the_third(name):
     radius = lens.project(theta).detach().requires_grad_()
     for method, x in (("project", theta), ("unproject", radius)):
         run, values = in_parameters(lens, method)
-        assert torch.autograd.gradcheck(run, (x, *values))
+        assert torch.autograd.gradcheck(run, (x, *values), fast_mode=True)
         run, values = in_parameters(lens[0], method)
         x = x[0].detach().requires_grad_()
-        assert torch.autograd.gradgradcheck(run, (x, *values), atol=1e-6)
+        assert torch.autograd.gradgradcheck(run, (x, *values), atol=1e-6, fast_mode=True)
 
         def second(value, run=run, x=x, rest=values[1:]):
             slope = run(x, value, *rest)
@@ -120,9 +120,10 @@ def test_gradients_of_rays_and_pixels(name):
     theta = (lens.theta_max * double(0.1, 0.5, 0.9)).requires_grad_()
     azimuth = double(0.3, 2.5, -1.2).requires_grad_()
     run, values = in_parameters(lens, "project_rays")
-    assert torch.autograd.gradcheck(run, (theta, azimuth, *values))
+    assert torch.autograd.gradcheck(run, (theta, azimuth, *values), fast_mode=True)
     pixels = run(theta, azimuth, *values).detach().requires_grad_()
-    assert torch.autograd.gradcheck(in_parameters(lens, "unproject_pixels")[0], (pixels, *values))
+    back, _ = in_parameters(lens, "unproject_pixels")
+    assert torch.autograd.gradcheck(back, (pixels, *values), fast_mode=True)
 
 
 @pytest.mark.slow

@@ -34,14 +34,14 @@ OMNIDIR = Mei(double(1.72), 1040.0, double(-0.18, -0.5595), tangential=double(0.
 def test_unproject_undoes_project_and_finds_nothing_beyond(name):
     generator = torch.Generator().manual_seed(5)
     near = double(0, 1e-12, 1e-9, 1e-6, 1e-3)
-    fractions = torch.cat((near, torch.linspace(0.01, 1, 997, dtype=f64), 1 - near))
+    fractions = torch.cat((near, torch.linspace(0.01, 1, 297, dtype=f64), 1 - near))
     nowhere = double(-1e-3, -1, -1e9, math.inf, -math.inf, math.nan).expand(4, -1)
-    for _ in range(5):
+    for _ in range(2):
         lens = example(name, generator)
         assert torch.equal(lens.theta_max, lens.theta_limit)
         theta = (lens.theta_max[:, None] * fractions).sort(dim=1).values
         radius = lens.project(theta)
-        evenly = lens.theta_max[:, None] * torch.linspace(0, 0.999, 1000, dtype=f64)
+        evenly = lens.theta_max[:, None] * torch.linspace(0, 0.999, 300, dtype=f64)
         assert radius.isfinite().all() and (lens.project(evenly).diff(dim=1) > 0).all()
         found = lens.unproject(radius)
         if name == "OCamInverse":  # its polynomial need not be 0 at θ = 0
@@ -62,7 +62,7 @@ def test_unproject_undoes_project_and_finds_nothing_beyond(name):
 # -- rays and pixels ----------------------------------------------------------------------------
 
 
-def rays_of(lens, rings=40, spokes=72):
+def rays_of(lens, rings=16, spokes=24):
     """θ (N, rings, 1), up to θ_max itself, and φ (1, 1, spokes)."""
     near = 1 - double(1e-3, 1e-5, 1e-7)
     fractions = torch.cat((torch.linspace(0.01, 1, rings - 3, dtype=f64), near))
@@ -77,7 +77,7 @@ def rays_of(lens, rings=40, spokes=72):
 )  # fmt: skip
 def test_every_ray_is_found(name):
     if isinstance(name, tuple):
-        lens = random_lens(name[0], 0, name[1])
+        lens = random_lens(name[0], 0, name[1], 4)
     else:
         lens = ASIDE.get(name) or (OMNIDIR if name == "omnidir" else calibrated(name))
     lens = lens.with_theta_max(None)
@@ -108,7 +108,7 @@ def area(lens, theta, azimuth):
 def test_no_two_rays_share_a_pixel_up_to_the_limit_and_not_further(name):
     folds = 0
     for aside in (1, 10):
-        lens = random_lens(name, 3, aside)
+        lens = random_lens(name, 3, aside, 4)
         theta, azimuth = rays_of(lens, spokes=360)
         assert (area(lens, theta, azimuth) > 0).all()
         straight = lens.replace(tangential=None, prism=None).theta_limit
@@ -195,7 +195,7 @@ def test_points_that_are_not_seen_are_nan():
 
 EPS = torch.finfo(torch.float32).eps
 SIZE = (480, 640)
-ROWS, COLUMNS = (torch.arange(0, side, 24, dtype=f64) for side in SIZE)
+ROWS, COLUMNS = (torch.arange(0, side, 40, dtype=f64) for side in SIZE)
 PIXELS = torch.stack(torch.meshgrid(COLUMNS, ROWS, indexing="xy"), -1).flatten(0, 1)
 
 # A lens of the 90° of a pinhole: the powers of w overflow in float32 there.
@@ -234,8 +234,8 @@ def check(exact, lens):
 
 
 LENSES = {
-    **{f"random {n}": lambda n=n: random_lens(n, 1, 0.4, 6) for n in RANDOM},
-    **{n: lambda n=n: example(n, torch.Generator().manual_seed(1), (100, 600)) for n in MODELS},
+    **{f"random {n}": lambda n=n: random_lens(n, 1, 0.4, 2) for n in RANDOM},
+    **{n: lambda n=n: example(n, torch.Generator().manual_seed(1), (100, 600))[:2] for n in MODELS},
     **{f"aside {n}": lambda n=n: ASIDE[n] for n in ASIDE},
     **{name: lambda name=name, camera=camera: calibrated(name, camera)
        for name, camera in CALIBRATIONS},

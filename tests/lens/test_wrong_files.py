@@ -264,10 +264,9 @@ def frames(count, **shared):
     return json.dumps({"frames": entries} | shared)
 
 
-@pytest.fixture
-def frozen(threads):
+@pytest.fixture(scope="module")
+def frozen():
     """The garbage collector does not look through the memory of other tests meanwhile."""
-    threads(1)  # others, waiting, would count
     gc.collect()
     gc.freeze()
     yield
@@ -311,15 +310,19 @@ def soon():
         (frames(120_000), "1 to 10000 cameras, got 120000"),
     ],
 )  # fmt: skip
-def test_hostile_files_end_soon_and_run_nothing(text, message, tmp_path, monkeypatch, frozen):
+def test_hostile_files_end_soon_and_run_nothing(
+    text, message, tmp_path, monkeypatch, frozen, threads
+):
     monkeypatch.chdir(tmp_path)
+    threads(1)  # others, waiting, would count
     with soon(), pytest.raises(ValueError, match=message) as error:
         loads(text)
     assert len(str(error.value)) < 1000 and not list(tmp_path.iterdir())
 
 
 @pytest.mark.slow
-def test_large_files_are_read_soon(tmp_path, frozen):
+def test_large_files_are_read_soon(tmp_path, frozen, threads):
+    threads(1)
     with soon():
         assert loads(frames(9_000), camera="8888.png").focal.item() == 805
     with soon():
@@ -383,13 +386,13 @@ def test_binary_files_that_are_wrong(tmp_path):
             load_all(path)
         return str(error.value)
 
-    for length in range(8, len(whole), 7):
+    for length in range(8, len(whole), 31):
         assert "it must hold 17 cameras, but ends in number" in error_of(whole[:length])
     assert "it holds 3 bytes after its 17 cameras" in error_of(whole + b"abc")
     assert "cameras, got 4294967295" in error_of(b"\xff" * 4 + whole[4:])
     assert "to 16 (EUCM), got 17" in error_of(whole[:12] + bytes([17]) + whole[13:])
     random.seed(0)
-    for _ in range(30):  # any bytes give a lens or a sentence
+    for _ in range(12):  # any bytes give a lens or a sentence
         data = bytearray(whole)
         data[random.randrange(len(data))] = random.randrange(256)
         path.write_bytes(data)
@@ -401,7 +404,7 @@ def test_damaged_archives_are_refused_in_a_sentence(tmp_path):
     path, data = tmp_path / "calib.npz", io.BytesIO()
     np.savez(data, K=np.reshape(K, (3, 3)), D=D)
     rng = np.random.default_rng(0)
-    for _ in range(100):
+    for _ in range(30):
         broken = bytearray(data.getvalue())
         for place in rng.integers(4, len(broken), rng.integers(1, 4)):
             broken[place] = rng.integers(256)
