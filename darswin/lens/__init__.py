@@ -1,6 +1,6 @@
-"""Lenses: where a ray at incident angle θ and azimuth φ lands in the image, and back.
+"""Lens models. A lens maps rays, at incident angle θ and azimuth φ, to pixels, and pixels to rays.
 
-Every lens is a batch, differentiable in its parameters, and works beyond 90° where its model does.
+Every lens is a batch, is differentiable in its parameters, and works beyond 90° if its model does.
 """
 
 from darswin.lens.base import MODELS, Lens, from_dict, to_dict

@@ -1,4 +1,4 @@
-"""The base of all lens models: rays to pixels and pixels to rays, of a batch of lenses."""
+"""The base of all lens models: maps rays to pixels and pixels to rays, for a batch of lenses."""
 
 import functools
 import math
@@ -12,62 +12,63 @@ from darswin.lens.frame import ImageFrame
 from darswin.lens.parameter import Number
 from darswin.lens.solve import direction_of, inverse, length_of
 
-# A lens ends this far (rad) before the angle where r stops rising or becomes infinite: there θ
-# cannot be told from r.
+# A lens ends this far (rad) before the angle at which r stops rising or becomes infinite, where r
+# does not determine θ.
 MARGIN = 1e-6
 
-# All lens models by their names. A class enters it by being defined.
+# All lens models by name. Defining a class adds it.
 MODELS: dict[str, type["Lens"]] = {}
 
 
 class Lens(ImageFrame):
-    """Base of all lenses. A lens declares each `Parameter` and defines `theta_limit` and `project`.
+    """Base of all lenses. A class declares each `Parameter` and defines `theta_limit`, `project`.
 
     A ray at incident angle θ and azimuth φ lands at
 
         (x, y) = center + affine @ (r(θ) (cos φ, sin φ) + offset(θ, φ)).
 
-    Every lens is a batch: its parameters are tensors with one entry a lens, and a plain number
-    makes a batch of one. Parameters may require gradients; all methods are differentiable in them.
+    Every lens is a batch: its parameters are tensors with one entry per lens. A plain number makes
+    a batch of one. Parameters may require gradients; all methods are differentiable in them.
 
     Convention:
-        θ is the angle from the optical axis, in [0, θ_max], rad; r the distance from the principal
-        point before `affine`, px. φ = 0 points right, π/2 down. Pixel centres are integers, x to
-        the right and y down. The camera looks along z, with x to the right and y down.
+        θ is the angle from the optical axis, in [0, θ_max], rad; r is the distance from the
+        principal point before `affine`, px. φ = 0 points right, π/2 down. Pixel centres are
+        integers, x to the right and y down. The camera looks along z, with x right and y down.
 
-    Beside a model's own parameters every lens takes these.
+    Every lens takes these arguments after its model's own parameters.
 
     Args:
-        theta_max: in (0, theta_limit], the widest angle that the lens is used for: where the last
-            ring of a polar grid ends. None means theta_limit.
-        center: (x, y) or (N, 2) px, the principal point. None means the middle of whatever image
-            the lens is used with.
-        affine: (2, 2) or (N, 2, 2): pixels that are not square, or skewed. None means the identity.
-        image_size: (H, W) or (N, 2) of the images that the lens belongs to. None means any: methods
-            then take it where they need the principal point of a lens without a center.
+        theta_max: in (0, theta_limit], rad, the widest angle that the lens is used for, at which
+            the last ring of a polar grid ends. None means theta_limit.
+        center: (x, y) or (N, 2) px, the principal point. None means the middle of the image.
+        affine: (2, 2) or (N, 2, 2), for pixels that are skewed or not square. None means the
+            identity.
+        image_size: (H, W) or (N, 2), the size of the camera's images. None means any size: methods
+            that need the middle of the image then take the size as an argument.
 
     Raises:
-        ValueError: a parameter out of its range, by name. TypeError: one that is no number.
+        ValueError: a parameter is out of its range. TypeError: an argument is not a number.
+            Both messages name the parameter.
 
     Indexing gives lenses (`lens[3]` is a batch of one), `len` counts them, `cat` joins them, and
-    a DataLoader batches a dataset's lenses like its tensors. A class is a model of `MODELS`, by its
-    name, unless it is defined with `register=False`, as bases of several models are.
+    a DataLoader batches a dataset's lenses like its tensors. Each class is added to `MODELS` under
+    its name, unless it is defined with `register=False`, like the bases of several models.
     """
 
-    terms: ClassVar[int] = 4  # of its polynomial, that `fit` finds unless told otherwise
-    max_numbers: ClassVar[int] = 64  # that a calibration file may give for a parameter
+    terms: ClassVar[int] = 4  # the default number of polynomial terms for `fit`
+    max_numbers: ClassVar[int] = 64  # the most numbers per parameter in a calibration file
 
     def __init_subclass__(cls, register: bool = True) -> None:
         super().__init_subclass__()
         if register:
             if cls.__name__ in MODELS:
-                raise ValueError(f"there is a lens model {cls.__name__} already")
+                raise ValueError(f"a lens model {cls.__name__} exists already")
             MODELS[cls.__name__] = cls
 
     def __init__(self, *arguments: Number | None, **named: Number | None):
         super().__init__(*arguments, **named)
         for name in self._tensors():
-            if name != "theta_max":  # which is held against its limit below
+            if name != "theta_max":  # checked below, together with its limit
                 self._check(name)
         if self.affine is not None:
             self._require("affine", self.affine.detach().det() != 0, "invertible")
@@ -75,10 +76,10 @@ class Lens(ImageFrame):
         self._set_theta_max(self.theta_max)
 
     def _validate(self) -> None:
-        """Raises ValueError where parameters are wrong in another way than their range."""
+        """Raises ValueError for parameters that are in range but invalid together."""
 
     def _set_theta_max(self, wanted: Tensor | None) -> None:
-        """Checks and sets how far the lens is used; None means as far as its model goes."""
+        """Checks and sets θ_max; None means `theta_limit`."""
         limit = self.theta_limit
         if not bool((limit > 0).all()):
             names = " and ".join(self.parameters)
@@ -87,23 +88,23 @@ class Lens(ImageFrame):
         if wanted is None:
             return
         self._check("theta_max")
-        # A limit found in another dtype differs by a rounding, which MARGIN leaves room for.
+        # A limit computed in another dtype differs by rounding; MARGIN is larger than that.
         slack = 1 + 2 * torch.finfo(limit.dtype).eps
         beyond = ~(wanted <= limit * slack)
         if bool(beyond.any()):
-            # Beyond the range of its dtype a lens is cut off; beyond its model's it is wrong.
+            # A θ_max beyond this dtype's limit is reduced; one beyond the model's is an error.
             exact = self.detach().to(torch.float64).theta_limit
             beyond &= ~(wanted <= exact * slack)
         if bool(beyond.any()):
             last, got = (t.detach()[beyond][0].item() for t in (exact, wanted))
             raise ValueError(
-                f"theta_max must be at most {last:.6f} rad ({math.degrees(last):.2f}°), as far as "
-                f"this {type(self).__name__} lens's r rises, got {got:.6f}"
+                f"theta_max must be at most {last:.6f} rad ({math.degrees(last):.2f}°), where r of "
+                f"this {type(self).__name__} lens stops rising, got {got:.6f}"
             )
         self.theta_max = torch.where(wanted > limit, limit, wanted)
 
     def to(self, *args: Any, **kwargs: Any) -> Self:
-        """The same lens with another dtype or on another device, as `Tensor.to`."""
+        """The same lens with another dtype or on another device; arguments: see `Tensor.to`."""
         lens = super().to(*args, **kwargs)
         # High powers of w overflow earlier in float32.
         if self.theta_max.dtype == torch.float64 and lens.theta_max.dtype == torch.float32:
@@ -112,7 +113,7 @@ class Lens(ImageFrame):
         return lens
 
     def with_theta_max(self, theta_max: Number | None) -> Self:
-        """The same lens used up to another angle (rad); None means `theta_limit`."""
+        """The same lens with another θ_max, rad; None means `theta_limit`."""
         lens = self._map(lambda tensor: tensor)
         lens._set_theta_max(
             None if theta_max is None else self._aligned(theta_max)[0].expand(len(self))
@@ -122,54 +123,55 @@ class Lens(ImageFrame):
     # -- the radial curve ---------------------------------------------------------------------
 
     def project(self, theta: Number) -> Tensor:
-        """θ (rad) → r (px), the radial curve.
+        """Radius r (px) at incident angle θ (rad): the radial curve.
 
         Args:
-            theta: a number, or a tensor whose first dimension is that of the lenses or 1. For a
-                single lens, any shape.
+            theta: a number, or a tensor whose first dimension is the number of lenses or 1. For a
+                single lens, a tensor of any shape.
 
         Returns:
-            The shape of θ, its first dimension broadcast to the number of lenses.
+            The shape of θ, with its first dimension broadcast to the number of lenses.
         """
         raise NotImplementedError
 
     def unproject(self, radius: Number) -> Tensor:
-        """r (px) → θ (rad), the inverse of `project` on [0, θ_max]. Shapes as there.
+        """Incident angle θ (rad) at radius r (px): the inverse of `project`, with its shapes.
 
-        NaN where no ray of [0, θ_max] lands: below 0 and, but for rounding, beyond `r_max`.
+        NaN where no ray of [0, θ_max] lands: below 0, and beyond `r_max` by more than rounding.
         """
         (radius,) = self._aligned(radius)
         slack = 1 + 16 * torch.finfo(radius.dtype).eps
         with torch.no_grad():
             last, beyond = self.r_max, self.project(self.theta_max * slack)
-            # A little beyond θ_max a model may have no radius, or a smaller one.
+            # A little beyond θ_max, a model may have no radius or a smaller one.
             last = torch.where(beyond > last, beyond, last) * slack
             lands = (radius >= 0) & (radius <= self._row(last, radius.dim()))
-        # Radii without an angle become 0, as NaN would reach the gradients.
+        # Radii without an angle become 0: NaN would reach the gradients.
         return torch.where(lands, self._angle_at(torch.where(lands, radius, 0.0)), torch.nan)
 
     def _angle_at(self, radius: Tensor) -> Tensor:
-        """θ at radii where rays land. Lenses with a closed inverse override this."""
+        """θ at radii where rays land. Lenses with a closed-form inverse override this."""
         end = self._row(self.theta_max.detach(), radius.dim())
         return inverse(self.project, self._slope, radius, end)
 
     def _slope(self, theta: Tensor) -> Tensor:
-        """dr/dθ, of θ (N or 1, ...)."""
+        """dr/dθ at θ (N or 1, ...)."""
         return torch.func.jvp(self.project, (theta,), (torch.ones_like(theta),))[1]
 
     @property
     def theta_limit(self) -> Tensor:
-        """(N,) rad: the largest angle that the model is valid for, up to which r rises and no two
-        rays land on one pixel."""
+        """(N,) rad: the largest angle of the model. Up to it, r rises and no two rays land on one
+        pixel."""
         raise NotImplementedError
 
     @property
     def r_max(self) -> Tensor:
-        """(N,) px: where θ_max lands, the radius of the image circle."""
+        """(N,) px: the radius of the image circle, at which θ_max lands."""
         return self.project(self.theta_max)
 
     def sees(self, theta: Tensor) -> Tensor:
-        """True where θ (N or 1, ...), rad, is at most θ_max, but for rounding; False for NaN."""
+        """True where θ (N or 1, ...), rad, is at most θ_max or larger by rounding only; False for
+        NaN."""
         last = self.theta_max * (1 + 8 * torch.finfo(self.theta_max.dtype).eps)
         return theta <= self._row(last, theta.dim())
 
@@ -177,20 +179,20 @@ class Lens(ImageFrame):
 
     @property
     def is_radial(self) -> bool:
-        """True if a ray keeps its azimuth, but for `affine`: there is no `offset`."""
+        """True if rays keep their azimuth before `affine`: the lens has no `offset`."""
         return True
 
     def offset(self, theta: Tensor, direction: Tensor) -> Tensor:
-        """(..., 2) px: how far from its place on the radial curve a ray lands, before `affine`;
+        """(..., 2) px: the displacement of rays from the radial curve, before `affine`;
         direction: (N or 1, ..., 2), cos φ and sin φ."""
         return torch.zeros_like(theta)[..., None] * direction
 
     def project_rays(
         self, theta: Number, azimuth: Number, image_size: tuple[int, int] | None = None
     ) -> Tensor:
-        """Rays (θ, φ) → the pixels (x, y) where they land.
+        """Pixels (x, y), (..., 2) px, at which rays (θ, φ) land.
 
-        θ and φ, rad, broadcast; shapes as in `project`. image_size: (H, W). → (..., 2) px.
+        θ and φ, rad, broadcast; their shapes are those of `project`. image_size: (H, W).
         """
         (theta,), (azimuth,) = self._aligned(theta), self._aligned(azimuth)
         return self.pixels(theta, direction_of(azimuth), image_size)
@@ -198,29 +200,29 @@ class Lens(ImageFrame):
     def unproject_pixels(
         self, pixels: Tensor, image_size: tuple[int, int] | None = None
     ) -> tuple[Tensor, Tensor]:
-        """Pixels (x, y) → the rays (θ, φ) that land there, the inverse of `project_rays`.
+        """Rays (θ, φ) that land at pixels (x, y): the inverse of `project_rays`.
 
-        Pixels are (N or 1, ..., 2) px; for a single lens (..., 2). image_size: (H, W). → θ and φ,
-        (N, ...) rad. θ is NaN where no ray lands.
+        Pixels are (N or 1, ..., 2) px; for a single lens (..., 2). image_size: (H, W). Returns θ
+        and φ, (N, ...) rad. θ is NaN where no ray lands.
         """
         theta, direction = self.rays(pixels, image_size)
         return theta, torch.atan2(direction[..., 1], direction[..., 0])
 
     def project_points(self, points: Tensor, image_size: tuple[int, int] | None = None) -> Tensor:
-        """Points (x, y, z) of the camera's frame → the pixels where they are seen.
+        """Pixels at which points (x, y, z) of the camera's frame are seen.
 
         Args:
             points: (N or 1, ..., 3), for a single lens (..., 3), in any unit of length: x to the
-                right, y down, z forward. How far away a point is changes nothing.
+                right, y down, z forward. The distance of a point does not matter.
             image_size: (H, W).
 
         Returns:
-            (N, ..., 2) px; NaN for points beyond θ_max, and for (0, 0, 0).
+            (N, ..., 2) px; NaN for points beyond θ_max and for (0, 0, 0).
         """
         (points,) = self._aligned(points)
         square = points.square()
         length = square.sum(-1)
-        # As `length_of`, so that there is a gradient on the axis, whatever the unit of length.
+        # Like `length_of`, this has a gradient on the axis, for any unit of length.
         eps, tiny = torch.finfo(points.dtype).eps, torch.finfo(points.dtype).tiny
         least = (1e-12 * eps * length).clamp(min=tiny)
         aside = torch.maximum(square[..., :2].sum(-1), least).sqrt()
@@ -229,8 +231,8 @@ class Lens(ImageFrame):
         return self.seen_pixels(theta, points[..., :2] / aside[..., None], image_size)
 
     def unproject_points(self, pixels: Tensor, image_size: tuple[int, int] | None = None) -> Tensor:
-        """Pixels → unit vectors (x, y, z) that point at what is seen there, the inverse of
-        `project_points`: (N, ..., 3); NaN where no ray lands. Arguments: as `unproject_pixels`."""
+        """Unit vectors (x, y, z), (N, ..., 3), towards the points seen at pixels: the inverse of
+        `project_points`. NaN where no ray lands. Arguments: see `unproject_pixels`."""
         theta, direction = self.rays(pixels, image_size)
         aside = torch.sin(theta)[..., None] * direction
         return torch.cat((aside, torch.cos(theta)[..., None]), -1)
@@ -238,8 +240,8 @@ class Lens(ImageFrame):
     def rays(
         self, pixels: Tensor, image_size: tuple[int, int] | None = None
     ) -> tuple[Tensor, Tensor]:
-        """`unproject_pixels` with (cos φ, sin φ), (N, ..., 2), in place of φ. It has a gradient at
-        the principal point too; there it is (0, 0)."""
+        """`unproject_pixels` with (cos φ, sin φ), (N, ..., 2), in place of φ. At the principal
+        point this is (0, 0) and has a gradient."""
         flat = self.from_pixels(pixels, image_size)
         radius = length_of(flat)
         theta, direction = self.unproject(radius), flat / radius[..., None]
@@ -248,8 +250,8 @@ class Lens(ImageFrame):
         return self._find_rays(flat, theta, direction)
 
     def _find_rays(self, flat: Tensor, theta: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
-        """The rays that land at points (N, ..., 2), before `affine`, of a lens with an `offset`;
-        theta, direction: where they would come from without it."""
+        """The rays of a lens with an `offset` that land at points (N, ..., 2) before `affine`;
+        theta, direction: the rays that would land there without the offset."""
         raise NotImplementedError
 
     def pixels(
@@ -262,7 +264,7 @@ class Lens(ImageFrame):
     def seen_pixels(
         self, theta: Tensor, direction: Tensor, image_size: tuple[int, int] | None = None
     ) -> Tensor:
-        """`pixels`, and NaN where θ is NaN or the lens does not see it; gradients are finite."""
+        """`pixels`, but NaN where θ is NaN or beyond θ_max. Gradients are finite."""
         seen = self.sees(theta)
         inside = torch.where(seen, theta, self._row(self.theta_max, theta.dim()))
         return torch.where(seen[..., None], self.pixels(inside, direction, image_size), torch.nan)
@@ -272,10 +274,10 @@ class Lens(ImageFrame):
         return flat if self.is_radial else flat + self.offset(theta, direction)
 
     def side_angles(self, image_size: tuple[int, int] | None = None) -> Tensor:
-        """(N, 4) rad: θ where the image ends to the left, above, to the right and below.
+        """(N, 4) rad: θ at the image's left, upper, right and lower side.
 
-        On the row and the column of the principal point; `theta_limit` where the image reaches
-        further than the lens.
+        Each is taken on the row or column of the principal point. It is `theta_limit` where the
+        image extends beyond the lens.
         """
         cx, cy = self.center_in(image_size).expand(len(self), 2).unbind(1)
         height, width = self._size_in(image_size).unbind(1)
@@ -287,23 +289,23 @@ class Lens(ImageFrame):
         return torch.where(theta.isnan(), whole.theta_max[:, None], theta)
 
     def _rotated_terms(self, turn: Tensor) -> dict[str, Tensor]:
-        """The parameters that change when the image around the principal point is multiplied by
-        `turn`, (2, 2), orthogonal: a rotation or a mirror."""
+        """The parameters that change when the image is rotated or mirrored around the principal
+        point by `turn`, (2, 2) and orthogonal."""
         return {}
 
 
 def from_dict(description: Mapping[str, Any], image_size: tuple[int, int] | None = None) -> Lens:
-    """The lens that a JSON object describes.
+    """Makes the lens that a JSON object describes.
 
     Args:
-        description: {"model": "Spherical", "xi": 0.5, "focal": 300, "theta_max": 1.5}: a name of
+        description: {"model": "Spherical", "xi": 0.5, "focal": 300, "theta_max": 1.5}: a name in
             `MODELS` and the arguments of its constructor, rad and px. For models with a focal
-            length, "fov" may stand in place of it and of "theta_max": the full field of view, which
-            fills the circle inside the image.
-        image_size: (H, W) px of the lens's images, which "fov" needs.
+            length, "fov" may replace "focal" and "theta_max": the full field of view, rad, which
+            then fills the largest circle inside the image.
+        image_size: (H, W) px of the lens's images, which "fov" requires.
 
     Raises:
-        ValueError: an unknown model, or arguments that are not its own or out of range, by name.
+        ValueError: an unknown model, or arguments that the model lacks or that are out of range.
     """
     if not isinstance(description, Mapping):
         raise ValueError(f"a lens must be a JSON object, got {description!r}")
@@ -315,25 +317,25 @@ def from_dict(description: Mapping[str, Any], image_size: tuple[int, int] | None
     if "fov" in arguments and hasattr(make, "from_fov"):
         size = image_size or arguments.get("image_size")
         if size is None:
-            raise ValueError('a lens of a "fov" needs the image_size, (H, W)')
+            raise ValueError('a lens with "fov" needs the image_size, (H, W)')
         make = functools.partial(make.from_fov, radius=min(size) / 2)
     try:
         return make(**arguments)
     except TypeError as error:
-        raise ValueError(f"a {name} lens cannot be made of {arguments}: {error}") from error
+        raise ValueError(f"a {name} lens cannot be made from {arguments}: {error}") from error
 
 
 def to_dict(lens: Lens) -> dict[str, Any]:
-    """One lens as a JSON object, the inverse of `from_dict`.
+    """Describes one lens as a JSON object: the inverse of `from_dict`.
 
     Raises:
-        ValueError: several lenses, or a lens of a model that is not in `MODELS`.
+        ValueError: several lenses, or a lens whose model is not in `MODELS`.
     """
     if len(lens) != 1:
         raise ValueError(f"to_dict takes one lens, got {len(lens)}")
     name = type(lens).__name__
     if MODELS.get(name) is not type(lens):
-        raise ValueError(f"to_dict takes a lens of {sorted(MODELS)}, got {name}")
+        raise ValueError(f"to_dict takes a lens whose model is in {sorted(MODELS)}, got {name}")
     described = {name: value.detach()[0].tolist() for name, value in lens._tensors().items()}
     if "image_size" in described:
         described["image_size"] = [round(side) for side in described["image_size"]]

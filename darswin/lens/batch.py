@@ -1,4 +1,4 @@
-"""A batch of lenses as tensors: one entry a lens in each, all of one dtype, on one device."""
+"""A batch of lenses as tensors, with one entry per lens, all of one dtype and on one device."""
 
 import copy
 from collections.abc import Callable, Mapping, Sequence
@@ -16,23 +16,23 @@ NUMBER = Parameter()
 
 
 class LensBatch:
-    """The tensors of N lenses: how they are given, indexed, joined, moved and copied."""
+    """The tensors of N lenses: constructing, indexing, moving and copying them."""
 
-    # The parameters that all lenses have; those of a class that it needs; its others; all by their
-    # names, in the order of the constructor.
+    # The names of the parameters that all lenses have; of the required and the optional ones of a
+    # class; and of all together, in the order of the constructor.
     common: ClassVar[tuple[str, ...]] = ("theta_max", "center", "affine", "image_size")
     parameters: ClassVar[tuple[str, ...]]
     optional: ClassVar[tuple[str, ...]]
     declared: ClassVar[dict[str, Parameter]] = {}
     names: ClassVar[tuple[str, ...]]
     _arguments: ClassVar[Arguments]
-    __signature__: ClassVar[object]  # what `help` shows
+    __signature__: ClassVar[object]  # for `help`
     theta_max: Tensor
 
     def __init_subclass__(cls) -> None:
         own = {name: p for name, p in vars(cls).items() if isinstance(p, Parameter)}
         for name in own:
-            delattr(cls, name)  # attributes that only lenses have are read faster
+            delattr(cls, name)  # instance attributes without a class attribute are faster
         found = own | {name: p for name, p in cls.declared.items() if name not in own}
         cls.parameters = tuple(name for name, p in found.items() if not p.optional)
         cls.optional = tuple(
@@ -45,7 +45,7 @@ class LensBatch:
         by_name = [name for name in others if not found[name].by_place]
         cls._arguments = Arguments(cls.parameters, by_place, by_name)
         cls.__signature__ = cls._arguments.signature
-        # So that a lens crosses torch.compile, torch.export and torch.func as its tensors.
+        # torch.compile, torch.export and torch.func then see a lens as its tensors.
         pytree.register_pytree_node(
             cls,
             lambda lens: ([getattr(lens, name) for name in lens.names], None),
@@ -65,18 +65,18 @@ class LensBatch:
             setattr(self, name, rows.get(name))
 
     def __setattr__(self, name: str, value: object) -> None:
-        # What is compiled ahead of time may take memory in order, whatever the strides.
+        # Code compiled ahead of time may ignore strides.
         super().__setattr__(name, value.contiguous() if isinstance(value, Tensor) else value)
 
     @classmethod
     def _rows(cls, given: Mapping[str, Number]) -> dict[str, Tensor]:
-        """Values as tensors (N or 1, ...)."""
+        """The values as tensors (N or 1, ...)."""
         tensors = as_tensors(given).items()
         return {name: cls.declared.get(name, NUMBER).rows(name, value) for name, value in tensors}
 
     @classmethod
     def _expanded(cls, given: Mapping[str, Number]) -> dict[str, Tensor]:
-        """`_rows`, all of N lenses."""
+        """`_rows`, expanded to N lenses."""
         rows = cls._rows(given)
         sizes = {name: tensor.shape[0] for name, tensor in rows.items()}
         counts = {*sizes.values()} - {1} or {1}
@@ -87,14 +87,14 @@ class LensBatch:
 
     @classmethod
     def _from_tensors(cls, tensors: Mapping[str, Tensor | None]) -> Self:
-        """A lens of tensors (N, ...) that need no check: they come from a lens that was checked."""
+        """A lens made from tensors (N, ...) without checks."""
         lens = object.__new__(cls)
         for name in cls.names:
             setattr(lens, name, tensors.get(name))
         return lens
 
     def _tensors(self) -> dict[str, Tensor]:
-        """Its parameters by their names, but for those that are None."""
+        """The parameters that are not None, by name."""
         values = ((name, getattr(self, name)) for name in self.names)
         return {name: value for name, value in values if value is not None}
 
@@ -105,13 +105,13 @@ class LensBatch:
         return lens
 
     def _require(self, name: str, ok: Tensor, range_: str) -> None:
-        """ValueError unless a parameter is ok, (N,), of all lenses."""
+        """Raises ValueError with the first bad value unless `ok`, (N,), is true for all lenses."""
         if not bool(ok.all()):  # NaN is not ok
             bad = getattr(self, name).detach()[~ok][0].tolist()
             raise ValueError(f"{name} must be {range_}, got {bad}")
 
     def _check(self, name: str) -> None:
-        """ValueError where a parameter is out of its range."""
+        """Raises ValueError if a parameter is out of its range."""
         declared, value = self.declared[name], getattr(self, name)
         if not declared.holds(value):
             ok = torch.tensor([declared.holds(row) for row in value], device=value.device)
@@ -119,7 +119,7 @@ class LensBatch:
 
     @staticmethod
     def _row(tensor: Tensor, dims: int) -> Tensor:
-        """(N, ...) with ones after N, to broadcast along the first of `dims` dimensions."""
+        """(N, ...) with ones inserted after N, so that it has `dims` dimensions."""
         ones = (1,) * (dims - tensor.dim())
         return tensor.reshape(tensor.shape[0], *ones, *tensor.shape[1:])
 
@@ -148,11 +148,11 @@ class LensBatch:
         return self._map(lambda tensor: tensor[index])
 
     def to(self, *args: Any, **kwargs: Any) -> Self:
-        """The same lens with another dtype or on another device, as `Tensor.to`."""
+        """The same lens with another dtype or on another device; arguments: see `Tensor.to`."""
         return self._map(lambda tensor: tensor.to(*args, **kwargs))
 
     def pin_memory(self, device: torch.device | str | None = None) -> Self:
-        """For DataLoader(pin_memory=True)."""
+        """The same lens in pinned memory, for DataLoader(pin_memory=True)."""
         return self._map(lambda tensor: tensor.pin_memory(device))
 
     def detach(self) -> Self:
@@ -160,11 +160,11 @@ class LensBatch:
         return self._map(Tensor.detach)
 
     def replace(self, **tensors: Tensor | None) -> Self:
-        """The same lens with some of its tensors replaced, unchecked."""
+        """The same lens with some tensors replaced, without checks."""
         return self._from_tensors(self._tensors() | tensors)
 
     def same_as(self, other: object) -> bool:
-        """True if `other` is of the same class and has the same numbers, for as many lenses."""
+        """True if `other` has the same class and equal tensors."""
         if type(other) is not type(self):
             return False
         mine, others = self._tensors(), other._tensors()
@@ -174,9 +174,9 @@ class LensBatch:
         )
 
     def merged(self) -> Self:
-        """A single lens, where all of them have the same numbers; else all of them.
+        """A single lens if all lenses are equal, else all of them.
 
-        On a device, which would be waited for, they stay as many as they are.
+        On a device, all of them: comparing them would wait for the device.
         """
         if not readable(self.theta_max):
             return self
@@ -184,7 +184,7 @@ class LensBatch:
         return self[:1] if same else self
 
     def expand(self, count: int) -> Self:
-        """A single lens as a batch of `count` equal ones."""
+        """A single lens repeated `count` times, as a batch."""
         if len(self) not in (1, count):
             raise ValueError(f"cannot expand {len(self)} lenses to {count}")
         return self._map(lambda tensor: tensor.expand(count, *tensor.shape[1:]))

@@ -1,4 +1,4 @@
-"""The image that lenses belong to: principal point, shape of the pixels, size; resized or cut."""
+"""The image of a lens: principal point, shape of the pixels, size, resizing and cropping."""
 
 import math
 from collections.abc import Sequence
@@ -13,7 +13,7 @@ from darswin.ops.checks import tensor_there
 
 
 class ImageFrame(LensBatch):
-    """Lenses and where their images have them: from points around the principal point to pixels."""
+    """Lenses in their images: maps points around the principal point to pixels, and back."""
 
     theta_max = Parameter(low=0, open=True, optional=True, by_place=True)
     center = Parameter(shape=(2,), optional=True, by_place=True)
@@ -27,23 +27,21 @@ class ImageFrame(LensBatch):
         return (self._size_in(image_size).flip(1) - 1) / 2
 
     def _size_in(self, image_size: tuple[int, int] | None) -> Tensor:
-        """(N or 1, 2): the given size of the image, else the lens's own."""
+        """(N or 1, 2): the given image size, or else the lens's own."""
         if image_size is not None:
             return tensor_there(image_size, self.theta_max)[None]
         if self.image_size is None:
-            raise ValueError(
-                "this lens has no image_size of its own and needs the image_size, (H, W)"
-            )
+            raise ValueError("this lens has no image_size and needs the image_size, (H, W)")
         return self.image_size
 
     def to_pixels(self, flat: Tensor, image_size: tuple[int, int] | None = None) -> Tensor:
-        """Points (N, ..., 2) around the principal point, before `affine` → pixels."""
+        """Pixels of points (N, ..., 2) around the principal point, before `affine`."""
         return self.through_affine(flat) + self._row(self.center_in(image_size), flat.dim())
 
     def from_pixels(self, pixels: Tensor, image_size: tuple[int, int] | None = None) -> Tensor:
         """The inverse of `to_pixels`."""
         flat = self._aligned(pixels)[0] - self._row(self.center_in(image_size), pixels.dim())
-        # `torch.linalg.inv` reads on the host whether there is one; that was checked.
+        # `torch.linalg.inv` would wait for the device to check that an inverse exists.
         return flat if self.affine is None else _apply(torch.linalg.inv_ex(self.affine)[0], flat)
 
     def through_affine(self, flat: Tensor) -> Tensor:
@@ -51,15 +49,15 @@ class ImageFrame(LensBatch):
         return flat if self.affine is None else _apply(self.affine, flat)
 
     def resized(self, scale: float | Tensor | Sequence[int]) -> Self:
-        """The same lens in a resized image, as `cv2.resize` makes it.
+        """The same lens for an image resized like `cv2.resize` does.
 
         Args:
-            scale: how many times as large the image is, above 0; or its new (H, W), in whole
-                pixels, which is exact where a number is not, for a lens with an `image_size`.
+            scale: the factor, above 0; or, for a lens with an `image_size`, the new (H, W) in whole
+                pixels, which is exact where the factor would be rounded.
 
         Raises:
-            ValueError: a scale or a size that is no image's, or an (H, W) for a lens that does not
-                know its image_size. TypeError: neither a number nor two.
+            ValueError: a scale or side that is not positive, or an (H, W) for a lens without an
+                image_size. TypeError: neither a number nor (H, W).
         """
         number, size = _plain(scale), self.image_size
         if isinstance(number, float):
@@ -86,14 +84,14 @@ class ImageFrame(LensBatch):
         return torch.eye(2, dtype=self.theta_max.dtype, device=self.theta_max.device)
 
     def _sizes(self, size: tuple[int, int]) -> Tensor:
-        """(N, 2): one size for all lenses."""
+        """One size for all lenses, (N, 2)."""
         return self.theta_max.new_tensor([size]).expand(len(self), 2)
 
     def in_picture(self, size: tuple[int, int]) -> Self:
-        """The lens, if it has an `image_size`, in a picture of (H, W) of the same view.
+        """The lens resized to a picture of (H, W); without an `image_size`, the lens itself.
 
         Raises:
-            ValueError: a picture of another shape, by more than the rounding of its sides.
+            ValueError: the picture has another aspect ratio, by more than rounding of its sides.
         """
         if self.image_size is None:
             return self
@@ -101,24 +99,24 @@ class ImageFrame(LensBatch):
         off = abs(size[0] * width - size[1] * height)  # px times the other side
         if off > width and off > height:
             raise ValueError(
-                f"the lens is of pictures of {height}×{width} px, and {size[0]}×{size[1]} is not "
-                "of that shape"
+                f"the calibration is for {width}×{height} (W×H) but the picture is "
+                f"{size[1]}×{size[0]}: crop or resize the lens too"
             )
         return self if tuple(size) == (height, width) else self.resized(size)
 
     def _scaled(self, scale: Tensor) -> Self:
-        """The same lens with all its lengths `scale`, (N or 1,), times as long."""
+        """The same lens with all its lengths multiplied by `scale`, (N or 1,)."""
         lengths = {n: v for n, v in self._tensors().items() if self.declared[n].in_pixels}
         return self.replace(**{n: v * self._row(scale, v.dim()) for n, v in lengths.items()})
 
     def cropped(self, top: int, left: int, height: int, width: int) -> Self:
-        """The same lens in a part of the image: `image[..., top:top + height, left:left + width]`.
+        """The same lens for a crop: `image[..., top:top + height, left:left + width]`.
 
-        The part may reach beyond the image, as padding does: `cropped(-8, -8, H + 16, W + 16)`.
+        The crop may extend beyond the image, like padding: `cropped(-8, -8, H + 16, W + 16)`.
 
         Raises:
-            ValueError: a part of no pixels, or a lens with neither a center nor an image_size.
-            TypeError: what is not in whole pixels.
+            ValueError: an empty crop, or a lens with neither a center nor an image_size.
+            TypeError: a number that is not whole.
         """
         top, left = _whole((top, left))
         height, width = _image_size((height, width))
@@ -128,7 +126,7 @@ class ImageFrame(LensBatch):
 
 
 def _plain(value: Any) -> Any:
-    """A number as a float, several as a list: of Python, NumPy or torch."""
+    """A number as a float, or several numbers as a list, from Python, NumPy or torch."""
     try:
         return torch.as_tensor(value, dtype=torch.float64).tolist()
     except (TypeError, ValueError, RuntimeError) as error:
@@ -136,7 +134,7 @@ def _plain(value: Any) -> Any:
 
 
 def _whole(sides: Any) -> tuple[int, int]:
-    """Two numbers of pixels."""
+    """Two whole numbers of pixels."""
     numbers = _plain(sides)
     if not isinstance(numbers, list) or len(numbers) != 2:
         raise TypeError(f"an image's size must be (H, W), got {sides!r}")
@@ -146,7 +144,7 @@ def _whole(sides: Any) -> tuple[int, int]:
 
 
 def _image_size(size: Any) -> tuple[int, int]:
-    """(H, W) of an image of one pixel or more."""
+    """(H, W) of an image with one pixel or more."""
     height, width = _whole(size)
     if height < 1 or width < 1:
         raise ValueError(f"an image's (H, W) must be at least (1, 1), got {(height, width)}")

@@ -195,7 +195,7 @@ def test_a_picture_that_exif_turns_is_answered_as_the_upright_one(run, capsys):
     (expected,) = answers([run / "upright.png"], run, capsys, run / "turned.json")
     (found,) = answers([run / "exif.png"], run, capsys, SENSOR_LENS)
     assert close(found, expected)
-    with pytest.raises(SystemExit, match=r"exif\.png: .* not of that shape .*orientation is 6"):
+    with pytest.raises(SystemExit, match=r"exif\.png: the calibration is for .*orientation is 6"):
         answers([run / "exif.png"], run, capsys, SENSOR_LENS | {"image_size": [90, 90]})
 
 
@@ -291,5 +291,5 @@ def test_a_video_that_is_damaged(run, capsys):
     assert 5 < speed["frames"] < 35 and picture["image"] == str(run / "p.png")
     first, *lines = str(caught.value).splitlines()
     assert first == "darswin: no answer, or not for all frames, for 3 of 4 files:"
-    said = ("cut.avi is damaged or cut off", "none.mp4", "64×128 is not of that shape")
+    said = ("cut.avi is damaged or cut off", "none.mp4", "the picture is 128×64")
     assert all(text in line for text, line in zip(said, lines, strict=True))

@@ -389,7 +389,7 @@ def test_what_is_read(text, options, expected):
 
 
 def test_two_messages_are_no_file():
-    with pytest.raises(ValueError, match="it is no YAML: line"):
+    with pytest.raises(ValueError, match="it is not valid YAML: line"):
         loads(ROS2 + ROS2)
 
 
@@ -487,6 +487,7 @@ def test_several_cameras(tmp_path):
     pair = write(tmp_path / "s.yaml", M1=K, D1=[0.1, 0, 0, 0, 0], M2=K, D2=[0.2, 0, 0, 0, 0],
                  image_width=640, image_height=480)  # fmt: skip
     assert [lens.radial[0, 0].item() for lens in load_all(pair, dtype=f64).values()] == [0.1, 0.2]
+    assert load(FILES / "basalt.json", camera="cam4").image_size.tolist() == [[480, 640]]
     # Where names are numbers, a number is a name.
     colmap = "".join(f"{i} SIMPLE_FISHEYE 640 480 {100 * i} 320 240\n" for i in (1, 2, 5, 7))
     for name in (1, 2, 5, 7, "1", "2", "5", "7"):

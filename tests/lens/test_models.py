@@ -220,7 +220,7 @@ def test_where_nothing_lands_there_is_no_gradient_either(name):
         (lambda: Spherical.from_fov(0.5, 2.0, -1.0), "focal must be"),
         (lambda: Spherical(0.5, 10.0).with_theta_max(2.5), "theta_max must be at most 2.09"),
         (lambda: to_dict(Spherical([0.1, 0.2], 300.0)), "one lens, got 2"),
-        (lambda: type("Spherical", (Lens,), {}), "there is a lens model Spherical already"),
+        (lambda: type("Spherical", (Lens,), {}), "a lens model Spherical exists already"),
     ],
 )  # fmt: skip
 def test_a_value_out_of_range_is_named(make, said):

@@ -30,7 +30,7 @@ def triangle(a, b, c):
     return 2 * torch.atan2(above, below)
 
 
-def polygons(lens, x, y, parts=8):
+def polygons(lens, x, y, parts=4):
     """The solid angles of the pixels at (x, y), each cut into parts × parts."""
     step = torch.linspace(-0.5, 0.5, parts + 1, dtype=f64)
     corners = torch.stack(torch.meshgrid(step, step, indexing="xy"), -1)

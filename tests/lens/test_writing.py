@@ -56,7 +56,7 @@ def test_a_written_file_reads_back_to_the_same_lens_or_is_refused(name, data, tm
         try:
             assert save(lens, path, form) == form
         except ValueError as error:
-            assert f" has no exact place for this {name} lens; it holds " in str(error)
+            assert f" files cannot hold this {name} lens exactly. They hold " in str(error)
             continue
         found = load(path, theta_max=0.3, dtype=f64)
         expected = lens.project_rays(theta, azimuth)
@@ -186,12 +186,12 @@ def test_refusals(tmp_path):
     two = Spherical([0.5, 0.6], 300.0, image_size=(9, 9))
     for wrong, form, message in (
         (lens, "ros", "format must be darswin, opencv, colmap, kalibr or None"),
-        (lens.replace(image_size=None), "colmap", "have an image_size"),
-        (lens.replace(image_size=None), "kalibr", "have an image_size"),
+        (lens.replace(image_size=None), "colmap", "need the lens's image_size"),
+        (lens.replace(image_size=None), "kalibr", "need the lens's image_size"),
         (lens.replace(image_size=None, center=None), "opencv", "needs the image_size"),
         (two, "opencv", "one lens, got 2"),
         (two, "darswin", "one lens, got 2"),
-        (load(FILES / "kalibr_ds.yaml"), "opencv", "OpenCV has no exact place for this DoubleS"),
+        (load(FILES / "kalibr_ds.yaml"), "opencv", "OpenCV files cannot hold this DoubleS"),
     ):
         with pytest.raises(ValueError, match=message):
             save(wrong, tmp_path / "a", form)

@@ -1,1 +1,1 @@
-"""Calibration files: those of ten formats are read, those of four written."""
+"""Calibration files: ten formats are read, four are written."""

@@ -1,6 +1,5 @@
-"""basalt's JSON: `value0` with one entry of `intrinsics` and of `resolution` a camera."""
+"""basalt's JSON: `value0` holds `intrinsics` and `resolution`, each with one entry per camera."""
 
-from collections.abc import Sequence
 from functools import partial
 
 from darswin.lens.base import Lens
@@ -22,7 +21,7 @@ MODELS: dict[str, tuple[type[Lens], str]] = {
 
 
 class Basalt(Format):
-    """Cameras by the names cam0, cam1, …"""
+    """Its cameras are called cam0, cam1, …"""
 
     name = "basalt"
     keys = ("value0",)
@@ -30,7 +29,7 @@ class Basalt(Format):
     def cameras(self, file: Fields, model: str | None) -> Cameras:
         calibration = file.section("value0")
         entries = calibration.sections("intrinsics")
-        sizes: Sequence[Size] = [None] * len(entries)
+        sizes: list[Size] = [None] * len(entries)
         if calibration.entries.get("resolution"):
             expected = f"{len(entries)} pairs of a width and a height"
             pairs, where = calibration.get("resolution", expected), calibration.path("resolution")

@@ -1,4 +1,4 @@
-"""CamOdoCal's YAML, which KITTI-360 and VINS use, and OCamCalib's calib_results.txt."""
+"""CamOdoCal's YAML, also used by KITTI-360 and VINS, and OCamCalib's calib_results.txt."""
 
 import math
 from collections.abc import Mapping
@@ -14,7 +14,7 @@ from darswin.lens.files.fields import Fields, is_number, short, to_number
 from darswin.lens.files.format import Cameras, Description, Format, describe, in_image
 from darswin.lens.polynomial import OCam, OCamInverse
 
-# The class of each model and the values in each of its sections; SCARAMUZZA has polynomials.
+# The class of each model and the values in each of its sections. SCARAMUZZA has polynomials.
 DISTORTION = "k1 k2 p1 p2"
 MODELS: dict[str, tuple[type[Lens], dict[str, str]]] = {
     "MEI": (Mei, {"projection_parameters": "fx=gamma1 fy=gamma2 cx=u0 cy=v0",
@@ -29,14 +29,14 @@ BLOCKS = (
     "the direct polynomial", "the inverse polynomial", "the center (row and column)",
     "the affine parameters (c, d, e)", "the image size (height and width)",
 )  # fmt: skip
-MOST_APART = 1.0  # px, between the two polynomials; the toolbox fits to some hundredths
+MOST_APART = 1.0  # px, between the two polynomials; the toolbox reaches about 0.01 px
 MAX_COEFFICIENTS = 64
 
 Size = tuple[int, int]
 
 
 class CamOdoCal(Format):
-    """One camera, by its name if it has one."""
+    """One camera, called by its name in the file, or "camera"."""
 
     name = "KITTI-360 or CamOdoCal"
     keys = ("model_type", "mirror_parameters", "projection_parameters")
@@ -47,7 +47,7 @@ class CamOdoCal(Format):
 
 
 class OCamCalib(Format):
-    """Rows of numbers, of one camera."""
+    """Rows of numbers for one camera."""
 
     name = "OCamCalib"
 
@@ -71,13 +71,13 @@ def _camera(file: Fields) -> Description:
         values |= section.values(names)
         section.check_all_read(kind)
     description = describe(model, values, size) if sections else _scaramuzza(file, size)
-    # Other mappings are matrices: where the camera stands.
+    # Mappings with `data` are matrices: the camera's pose.
     file.check_all_read(kind, lambda _, value: isinstance(value, Mapping) and "data" not in value)
     return description
 
 
 def _scaramuzza(file: Fields, size: Size) -> Description:
-    """OCamCalib's polynomials, whose axis may point either way, as a₀ tells."""
+    """OCamCalib's polynomials. The sign of a₀ tells which way the optical axis points."""
     section = file.section("affine_parameters")
     affine = section.values("cx cy c=ac d=ad e=ae")
     section.check_all_read("SCARAMUZZA")
@@ -86,8 +86,6 @@ def _scaramuzza(file: Fields, size: Size) -> Description:
     inverse = []
     if "inv_poly_parameters" in file:
         inverse = _polynomial(file.section("inv_poly_parameters"))
-    if not any(inverse):
-        inverse = []
     if direct[0] > 0:
         direct = [-c for c in direct]
         inverse = [c * (-1) ** i for i, c in enumerate(inverse)]
@@ -95,7 +93,7 @@ def _scaramuzza(file: Fields, size: Size) -> Description:
 
 
 def _polynomial(fields: Fields) -> list[float]:
-    """p0, p1, … as far as they go."""
+    """p0, p1, … up to the first that is missing."""
     count = 1
     while count < MAX_COEFFICIENTS and f"p{count}" in fields:
         count += 1
@@ -116,17 +114,17 @@ def _camera_of_rows(rows: list[list[str]]) -> Description:
     row, column = file.numbers(BLOCKS[2], (2,))
     c, d, e = file.numbers(BLOCKS[3], (3,))
     height, width = file.sides(BLOCKS[4])
-    # Its x' is down and its y' to the right: row = c x' + d y' + …, column = e x' + y' + ….
+    # x' points down and y' to the right: row = c x' + d y' + …, column = e x' + y' + ….
     return _ocam(direct, inverse, (column, row), [[1.0, e], [d, c]], (height, width))
 
 
 def _counted(block: Mapping[str, list[str]], name: str) -> list[float]:
-    """The coefficients after their number."""
+    """The coefficients that follow their count."""
     count, *words = block[name]
     if count != str(len(words)) or len(words) > MAX_COEFFICIENTS:
         raise ValueError(
-            f"{name} must be the number of its coefficients, {MAX_COEFFICIENTS} at most, and "
-            f"these, got {short(count)} and {len(words)} of them"
+            f"{name} must begin with the number of its coefficients, at most {MAX_COEFFICIENTS}; "
+            f"got {short(count)} before {len(words)} coefficients"
         )
     return [to_number(word, name, "finite numbers") for word in words]
 
@@ -138,15 +136,15 @@ def _ocam(
     affine: list[list[float]],
     size: Size,
 ) -> Description:
-    """The lens of the inverse polynomial if there is one, else of the direct one."""
-    if not inverse:
+    """The lens of the inverse polynomial if it is given, else of the direct one."""
+    if not any(inverse):
         return in_image(OCam, center, affine, size, {"coefficients": direct})
     _check_inverse(direct, inverse, size)
     return in_image(OCamInverse, center, affine, size, {"coefficients": inverse})
 
 
 def _check_inverse(direct: list[float], inverse: list[float], size: Size) -> None:
-    """ValueError unless both polynomials are of one lens, up to half the image's diagonal."""
+    """Raises ValueError unless both polynomials agree up to half the image's diagonal."""
     last = -1.0
     for radius in np.linspace(0, math.hypot(*size) / 2, 257).tolist():
         theta = math.atan2(radius, -polyval(radius, direct))
@@ -156,7 +154,7 @@ def _check_inverse(direct: list[float], inverse: list[float], size: Size) -> Non
         found = polyval(theta - math.pi / 2, inverse)
         if not abs(found - radius) <= MOST_APART:
             raise ValueError(
-                f"the inverse polynomial must give back the direct one's radii to {MOST_APART:g} "
-                f"px, got {found:.6g} px for {radius:.6g} px; the file without the inverse "
-                "polynomial means the direct one"
+                f"the inverse polynomial must undo the direct one to within {MOST_APART:g} px, "
+                f"got {found:.6g} px for {radius:.6g} px; without the inverse polynomial, the "
+                "direct one is used"
             )

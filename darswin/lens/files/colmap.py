@@ -1,4 +1,4 @@
-"""COLMAP's cameras.txt and cameras.bin: cameras of any model but the spherical ones."""
+"""COLMAP's cameras.txt and cameras.bin, with all camera models but the spherical ones."""
 
 import struct
 from functools import partial
@@ -34,7 +34,8 @@ MODELS: dict[str, tuple[type[Lens], str]] = {
     "DIVISION": (EnhancedUnified, "fx fy cx cy division"),
 }  # fmt: skip
 
-# The models by their numbers in cameras.bin; BROWN_CONRADY has none yet. COLMAP 4.2, CameraModelId.
+# The models in the order of their numbers in cameras.bin. BROWN_CONRADY has no number yet.
+# Source: COLMAP 4.2, CameraModelId.
 NUMBERED = (
     "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE",
     "FULL_OPENCV", "FOV", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "THIN_PRISM_FISHEYE",
@@ -43,13 +44,13 @@ NUMBERED = (
 )  # fmt: skip
 _COUNT, _HEAD = struct.Struct("<Q"), struct.Struct("<IiQQ")  # id, model, width, height
 
-# A written camera has the first of its class that has a place for all its terms.
+# A camera is written with the first model of its class that holds all its terms.
 WRITTEN = ("PINHOLE", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE", "THIN_PRISM_FISHEYE",
            "RAD_TAN_THIN_PRISM_FISHEYE", "FOV", "EUCM", "DIVISION")  # fmt: skip
 
 
 class Colmap(Format):
-    """Rows whose second word is the name of a model: cameras by their ids."""
+    """Rows whose second word names a model. Cameras are called by their ids."""
 
     name = "COLMAP"
     origin = 0.5
@@ -66,7 +67,7 @@ class Colmap(Format):
         found: Cameras = {}
         for row in file:
             if row[0] in found:
-                raise ValueError(f"there must be one camera {short(row[0])}, got two")
+                raise ValueError(f"camera {short(row[0])} appears twice")
             found[row[0]] = partial(_camera, row)
         return found
 
@@ -91,7 +92,7 @@ class Colmap(Format):
 def _camera(row: list[str]) -> Description:
     where = f"camera {short(row[0])}, "
     if len(row) < 4:
-        raise ValueError(f"{where}must be an id, a model, a width, a height and parameters")
+        raise ValueError(f"{where}must have an id, a model, a width, a height and parameters")
     name = row[1]
     if name not in MODELS:
         raise ValueError(f"{where}model must be one of {', '.join(MODELS)}, got {short(name)}")
@@ -110,12 +111,12 @@ def _camera(row: list[str]) -> Description:
 
 
 def is_binary(data: bytes) -> bool:
-    """True for a cameras.bin: it begins with a number of cameras, of eight bytes."""
+    """True for a cameras.bin, which begins with the number of cameras in eight bytes."""
     return len(data) >= _COUNT.size and data[4:8] == bytes(4)
 
 
 def from_binary(data: bytes, most: int) -> str:
-    """A cameras.bin of at most so many cameras as the cameras.txt of the same ones."""
+    """A cameras.bin as the text of a cameras.txt; ValueError for more than `most` cameras."""
     (count,), place = _COUNT.unpack_from(data), _COUNT.size
     if count > most:
         raise ValueError(f"it must have 1 to {most} cameras, got {count}")
@@ -134,8 +135,7 @@ def from_binary(data: bytes, most: int) -> str:
             lines.append(f"{camera} {name} {width} {height} {' '.join(map(repr, numbers))}")
             place += _HEAD.size + values.size
     except struct.error as error:
-        ends = f"it must hold {count} cameras, but ends in number {len(lines)}"
-        raise ValueError(ends) from error
+        raise ValueError(f"it ends within camera {len(lines) + 1} of {count}") from error
     if place != len(data):
-        raise ValueError(f"it holds {len(data) - place} bytes after its {count} cameras")
+        raise ValueError(f"it has {len(data) - place} extra bytes after its {count} cameras")
     return "\n".join(lines)

@@ -1,4 +1,5 @@
-"""The content of a text file in any notation: nothing in it is run, and no size makes it hang."""
+"""The content of a YAML, JSON, XML, .npz or plain text file. Nothing in a file is executed, and
+large files end in an error instead of a long wait."""
 
 import contextlib
 import io
@@ -21,19 +22,19 @@ Content = Mapping | list[list[str]]
 
 MAX_BYTES = 16 << 20
 MAX_TABLE = 4 << 20
-MAX_YAML = 128 << 10  # it is parsed at some 100 KB a second
+MAX_YAML = 128 << 10  # the parser reads about 100 KB per second
 MAX_XML = 256 << 10
 MAX_DEPTH = 16
-MAX_OPEN = 100  # brackets that YAML opens and does not close
-MAX_ARRAY = 64 << 10  # of an .npz file's, which has a matrix and some coefficients
+MAX_OPEN = 100  # unclosed brackets in YAML
+MAX_ARRAY = 64 << 10  # bytes of an array in an .npz file: a matrix or coefficients
 MAX_ARRAYS = 256
 
-# The corner points of a calibration, in YAML and in XML: megabytes of numbers, and no lens's.
+# The corner points of a calibration, in YAML and in XML: megabytes of numbers that no lens needs.
 _POINTS = re.compile(r"\[[\s\d.,eE+-]{2048,}\]|(?<=>)[\s\d.eE+-]{2048,}(?=<)")
 
 
 def read_bytes(path: str | os.PathLike) -> bytes:
-    """A file whole; ValueError for what is no file, or too large."""
+    """The bytes of a file. Raises ValueError for a directory or device, and for a large file."""
     path = Path(path)
     if path.exists() and not path.is_file():
         raise ValueError("it must be a file")
@@ -55,7 +56,7 @@ def to_text(data: bytes) -> str:
 
 
 def _from_npz(data: bytes) -> str:
-    """But for large arrays and for objects, which are no lens's; nothing is unpickled."""
+    """Skips large arrays, and arrays of objects, which would have to be unpickled."""
     arrays: dict[str, Any] = {}
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
@@ -66,14 +67,12 @@ def _from_npz(data: bytes) -> str:
                     name = entry.filename.removesuffix(".npy")
                     arrays[name] = np.load(array, allow_pickle=False).tolist()
         return json.dumps(arrays)
-    except Exception as error:  # zipfile, zlib and NumPy have a dozen kinds for broken files
-        raise ValueError(
-            "it must be an undamaged file of np.savez, of arrays of numbers"
-        ) from error
+    except Exception as error:  # zipfile, zlib and NumPy raise a dozen kinds for broken files
+        raise ValueError("it must be an undamaged .npz file with arrays of numbers") from error
 
 
 def parse(text: str) -> Content:
-    """The mapping or table that a text is, in the notation that its beginning tells."""
+    """The mapping or table in a text. Its first characters tell the notation."""
     start = text.lstrip()
     if not start:
         raise ValueError("it must not be empty")
@@ -86,22 +85,22 @@ def parse(text: str) -> Content:
         first = next((line for line in lines if line and line[0] != "#"), "-")
         return _parse_table(text) if is_number(first.split()[0]) else _parse_yaml(text)
     except RecursionError as error:
-        raise ValueError("it must not be nested so deeply") from error
+        raise ValueError("its entries are nested too deeply") from error
 
 
 def _parse_json(text: str) -> Mapping:
     try:
         return json.loads(text, object_pairs_hook=_mapping)
     except ValueError as error:
-        raise ValueError(f"it is no JSON: {error}") from error
+        raise ValueError(f"it is not valid JSON: {error}") from error
 
 
 def _mapping(pairs: Iterable[tuple[Any, Any]]) -> dict[Any, Any]:
-    """A mapping; two entries of one name, of which a parser keeps the last, are an error."""
+    """A mapping. Raises ValueError for two entries with the same name: parsers keep the last."""
     mapping: dict[Any, Any] = {}
     for name, value in pairs:
         if name in mapping:
-            raise ValueError(f"{short(name)} stands there twice")
+            raise ValueError(f"{short(name)} appears twice in one mapping")
         mapping[name] = value
     return mapping
 
@@ -112,21 +111,21 @@ def _parse_table(text: str) -> list[list[str]]:
 
 
 def _parse_yaml(text: str) -> Mapping:
-    """YAML whose scalars stay text and whose tags, !!opencv-matrix or worse, mean nothing."""
-    # OpenCV begins its files with %YAML:1.0, which is no YAML.
+    """Parses YAML. Scalars stay text, and tags such as !!opencv-matrix are ignored."""
+    # OpenCV begins its files with %YAML:1.0, which is not valid YAML.
     text = re.sub(r"\A%YAML[^\n]*\n", "", _limited("YAML", text, MAX_YAML))
     lines = text.split("\n")
-    while lines and lines[-1].strip() in ("", "---", "..."):  # as `ros2 topic echo` ends
+    while lines and lines[-1].strip() in ("", "---", "..."):  # `ros2 topic echo` ends like this
         lines.pop()
     if text.count("[") + text.count("{") > text.count("]") + text.count("}") + MAX_OPEN:
-        raise RecursionError  # as the parser does, but only after a second
+        raise RecursionError  # the parser takes a second until it raises this
     try:
         content = yaml.load("\n".join(lines), _Loader)
     except (yaml.YAMLError, ValueError, OverflowError) as error:
         mark = getattr(error, "problem_mark", None)
         where = "" if mark is None else f"line {mark.line + 1}: "
         problem = str(getattr(error, "problem", error)).splitlines()[0]
-        raise ValueError(f"it is no YAML: {where}{problem}") from error
+        raise ValueError(f"it is not valid YAML: {where}{problem}") from error
     if not isinstance(content, Mapping):
         raise ValueError("it must be a mapping (YAML, JSON or XML) or a table of numbers")
     return content
@@ -134,7 +133,7 @@ def _parse_yaml(text: str) -> Mapping:
 
 class _Loader(yaml.BaseLoader):
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        super().construct_mapping(node, deep)  # which says what cannot be a name
+        super().construct_mapping(node, deep)  # raises for invalid names
         return _mapping(
             (self.construct_object(name), self.construct_object(value))
             for name, value in node.value
@@ -148,7 +147,7 @@ def _parse_xml(text: str) -> Mapping:
     try:
         root = ElementTree.fromstring(text)
     except ElementTree.ParseError as error:
-        raise ValueError(f"it is no XML: {error}") from error
+        raise ValueError(f"it is not valid XML: {error}") from error
     content = _element(root, MAX_DEPTH)
     if not isinstance(content, Mapping):
         raise ValueError("an XML file must have elements in its root")
@@ -156,7 +155,7 @@ def _parse_xml(text: str) -> Mapping:
 
 
 def _element(element: ElementTree.Element, depth: int) -> Mapping | list | str:
-    """As OpenCV writes them: a sequence's elements are named _, all others have names."""
+    """OpenCV's notation: the elements of a sequence are named _, all others have names."""
     if depth == 0:
         raise ValueError(f"XML must be at most {MAX_DEPTH} elements deep")
     children = [(child.tag, _element(child, depth - 1)) for child in element]
@@ -168,7 +167,7 @@ def _element(element: ElementTree.Element, depth: int) -> Mapping | list | str:
 
 
 def _limited(notation: str, text: str, most: int) -> str:
-    """Text that is parsed soon: where it is large, long lists of numbers become words."""
+    """Text of limited length. In a longer text, long lists of numbers are replaced first."""
     if len(text) > most:
         text = _POINTS.sub("many numbers", text)
     if len(text) > most:

@@ -1,4 +1,4 @@
-"""Reading entries of a file so that an error says which one, what it must be and what it is."""
+"""Entries of a file. Errors name the entry, the expected value and the value found."""
 
 import math
 import re
@@ -17,18 +17,18 @@ _short.maxlevel, _short.maxstring, _short.maxother = 2, 60, 60
 
 
 def short(value: Any) -> str:
-    """A value for a message, cut where it is long or deep."""
+    """A value for an error message; a long or deep one is cut."""
     return _short.repr(value)
 
 
 def listed(names: Iterable[str]) -> str:
-    """Names for a message, cut where there are many or where one is long."""
+    """Names for an error message; many or long names are cut."""
     names = [name if len(name) <= _MAX_WORD else short(name) for name in map(str, names)]
     return ", ".join(names[:20]) + (", …" if len(names) > 20 else "")
 
 
 def is_number(word: str) -> bool:
-    """True for a word that is written as a number; "nan" is not."""
+    """True if a word is a number in decimal notation; false for "nan"."""
     return len(word) <= _MAX_WORD and _NUMBER.fullmatch(word) is not None
 
 
@@ -38,7 +38,7 @@ def to_number(
     expected: str = "a finite number",
     holds: Callable[[float], bool] = math.isfinite,
 ) -> float:
-    """A finite number that is as expected, from a number or the text of one."""
+    """A finite number for which `holds` is true, from a number or its text."""
     number = math.nan
     if isinstance(value, str) and is_number(value.strip()):
         number = float(value)
@@ -53,7 +53,7 @@ def to_number(
 
 
 def to_side(value: Any, name: str, least: int = 1) -> int:
-    """A number of pixels."""
+    """A whole number of pixels."""
     expected = f"a whole number of pixels, {least} to {MAX_SIDE}"
 
     def is_side(number: float) -> bool:
@@ -63,7 +63,7 @@ def to_side(value: Any, name: str, least: int = 1) -> int:
 
 
 def to_sides(value: Any, name: str) -> tuple[int, int]:
-    """Two numbers of pixels, in the file's order; as text, they stand between spaces."""
+    """Two whole numbers of pixels, in the file's order, from a list or from text with spaces."""
     words = value.split() if isinstance(value, str) else value
     if not isinstance(words, list) or len(words) != 2:
         raise ValueError(f"{name} must be two whole numbers of pixels, got {short(value)}")
@@ -71,7 +71,7 @@ def to_sides(value: Any, name: str) -> tuple[int, int]:
 
 
 def holds_numbers(value: Any) -> bool:
-    """True for a number other than 0, or a value that may hold some."""
+    """True for a number other than 0, and for a list or mapping that may hold one."""
     if isinstance(value, str):
         words = value[:1000].replace(",", " ").split()
         return all(map(is_number, words)) and any(float(word) for word in words)
@@ -82,12 +82,13 @@ def holds_numbers(value: Any) -> bool:
 
 
 def plain_name(name: str) -> str:
-    """A name without what writers of files differ in."""
+    """A name in lower case without separators, in which programs spell names differently."""
     return name.lower().replace("_", "").replace("-", "").replace(" ", "")
 
 
 def like_coefficients(name: str, value: Any) -> bool:
-    """True for an entry that may be of coefficients, or be one; not for their deviations."""
+    """True if an entry may be a distortion coefficient or a list of them, judged by its name.
+    False for standard deviations of coefficients."""
     plain = plain_name(name)
     alone = not isinstance(value, (list, Mapping))
     found = _COEFFICIENTS.search(plain) or (alone and _COEFFICIENT.fullmatch(plain))
@@ -95,9 +96,9 @@ def like_coefficients(name: str, value: Any) -> bool:
 
 
 class Fields:
-    """A mapping of a file. Its methods read an entry by name, and it knows which ones were read.
+    """A mapping of a file. Its methods read entries by name and remember which ones were read.
 
-    They raise ValueError for an entry that is missing or of the wrong kind.
+    The methods raise ValueError for an entry that is missing or of the wrong kind.
     """
 
     def __init__(self, entries: Mapping[str, Any], where: str = ""):
@@ -108,13 +109,13 @@ class Fields:
         return name in self.entries
 
     def path(self, name: str) -> str:
-        """The entry's name with those of the mappings that it is in."""
+        """The entry's name after the names of the mappings around it, as in `cam0.intrinsics`."""
         return f"{self._where}{name if len(str(name)) <= _MAX_WORD else short(name)}"
 
     def get(self, name: str, expected: str) -> Any:
-        """The entry `name`; `expected` says what it must be, for the error."""
+        """The entry `name`; `expected` describes a valid value in the error."""
         if name not in self.entries:
-            raise ValueError(f"{self.path(name)} is missing, it must be {expected}")
+            raise ValueError(f"{self.path(name)} is missing: it must be {expected}")
         self._read.add(name)
         return self.entries[name]
 
@@ -124,15 +125,15 @@ class Fields:
         like: Callable[[str, Any], bool] = lambda name, value: True,
         known: Iterable[str] = (),
     ) -> None:
-        """ValueError if a number was left out, which might be a coefficient under another name:
-        an entry that is `like` one by its name and value, but for those that are `known`."""
+        """Raises ValueError if an entry that holds numbers was not read: it might be a coefficient
+        under another name. Only entries for which `like` is true and that are not `known` count."""
         left = [
             self.path(name) for name, value in self.entries.items()
             if name not in self._read and name not in known and like(str(name), value)
             and holds_numbers(value)
         ]  # fmt: skip
         if left:
-            raise ValueError(f"{camera} has no place for the numbers of {listed(left)}")
+            raise ValueError(f"{camera} does not use the numbers of {listed(left)}")
 
     def of_kind(self, name: str, kind: type, expected: str) -> Any:
         value = self.get(name, expected)
@@ -151,7 +152,7 @@ class Fields:
         return [Fields(entry, f"{self.path(name)}[{i}].") for i, entry in enumerate(entries)]
 
     def number(self, name: str, default: float | None = None) -> float:
-        """The entry as a finite number; `default`, if there is one, where it is missing."""
+        """The entry as a finite number; `default`, if given, for a missing entry."""
         if default is not None and name not in self.entries:
             return default
         return to_number(self.get(name, "a finite number"), self.path(name))
@@ -161,8 +162,8 @@ class Fields:
         return to_number(self.get(name, expected), self.path(name), expected, lambda n: n > 0)
 
     def values(self, names: str, default: float | None = None) -> dict[str, float]:
-        """Several numbers by our names, such as "fx fy k1": where the file has another name for
-        one, as "fx=gamma1". Focal lengths are above 0."""
+        """Several numbers by our names, such as "fx fy k1". "fx=gamma1" reads `fx` from the file's
+        entry `gamma1`. Focal lengths must be above 0."""
         found = {}
         for word in names.split():
             ours, _, theirs = word.partition("=")
@@ -172,10 +173,11 @@ class Fields:
         return found
 
     def side(self, name: str) -> int:
+        """One side of an image, px."""
         return to_side(self.get(name, "a whole number of pixels"), self.path(name))
 
     def sides(self, name: str) -> tuple[int, int]:
-        """Two sides of an image, in the file's order."""
+        """Two sides of an image, px, in the file's order."""
         return to_sides(self.get(name, "two whole numbers of pixels"), self.path(name))
 
     def text(self, name: str, expected: str = "text") -> str:
@@ -190,7 +192,8 @@ class Fields:
         return value
 
     def numbers(self, name: str, counts: tuple[int, ...]) -> list[float]:
-        """A list of as many numbers as one of `counts`; as text, they stand between spaces."""
+        """A list of numbers, from a list or from text with spaces; `counts` are the valid
+        lengths."""
         expected = f"{' or '.join(map(str, counts))} finite numbers"
         value = self.get(name, expected)
         words = value.split() if isinstance(value, str) else value

@@ -1,7 +1,7 @@
-"""A calibration format is an object that reads cameras, and writes those that it can hold.
+"""The base of all calibration formats. A format reads cameras, and may write lenses.
 
-Readers make a description as `darswin.lens.from_dict` takes, and writers get `Intrinsics`. Both
-have the principal point as the file has it: `origin` is the one place that moves it.
+Readers return descriptions for `darswin.lens.from_dict`; writers receive `Intrinsics`. In both,
+the principal point is in the file's pixel convention: only `Format.origin` changes it.
 """
 
 import re
@@ -14,19 +14,21 @@ from darswin.lens.files.content import Content
 
 Description = dict[str, Any]
 Size = tuple[int, int] | None  # (H, W)
-# A function for each camera of a file, by its name: nothing is read before it is asked for.
+# A function for each camera of a file, by the camera's name. It reads the camera when called.
 Cameras = dict[str, Callable[[], Description]]
 
 PLANE = ("fx", "fy", "cx", "cy", "skew")
-# Our names of coefficients have these letters and a number from 1: k1, d1 of the denominator, …
+# Our names of coefficients are a letter and a number from 1: k1; d1 for the denominator; …
 LETTERS = {"radial": "k", "denominator": "d", "tangential": "p", "prism": "s"}
 
 
 class Intrinsics(NamedTuple):
-    """A lens as files of other tools have it, the inverse of `describe`.
+    """A lens in the terms of other tools' files: the inverse of `describe`.
 
-    Attributes: model: its class, with terms: a Perspective lens is a BrownConrady without any.
-    values: of `PLANE`, the coefficients that are not 0, and the model's other numbers.
+    Attributes:
+        model: the lens class. A model without distortion has the class that adds distortion:
+            BrownConrady for a Perspective lens.
+        values: those of `PLANE`, the coefficients other than 0, and the model's other numbers.
     """
 
     model: type[Lens]
@@ -34,56 +36,59 @@ class Intrinsics(NamedTuple):
     size: Any  # (H, W), or None
 
     def fits(self, model: type[Lens], names: str) -> bool:
-        """True if it is of a model and has no other values than these, skew among them."""
+        """True if the model is the same and `names` include all values but focal lengths and
+        principal point; that is, skew too."""
         others = self.values.keys() - {"fx", "fy", "cx", "cy"}
         return self.model is model and others <= {*names.split()}
 
     def listed(self, names: str) -> list[float]:
-        """Values in an order, 0 where there are none."""
+        """The values in the order of `names`; 0 for a missing one."""
         return [self.values.get(name, 0.0) for name in names.split()]
 
 
 class Format:
-    """Base of the formats. A class sets `name` and `keys`, or `fits`, and defines `cameras`."""
+    """Base of the formats. A class sets `name`, sets `keys` or defines `fits`, and defines
+    `cameras`. Formats that are written also set `holds` and define `_text`."""
 
-    name: str  # in errors
-    origin = 0.0  # where it has the center of the upper left pixel, along both axes: ours is 0
-    keys: tuple[str, ...] = ()  # of the mappings that are of this format: any of them
-    takes_model = False  # whether `load`'s model may say what its coefficients are
-    holds = ""  # what `write` can write, in errors
-    needs_size = False  # whether a written camera must have an image_size
+    name: str  # for errors
+    origin = 0.0  # x and y of the upper left pixel's center in the file; we use 0
+    keys: tuple[str, ...] = ()  # a mapping with one of these keys is in this format
+    takes_model = False  # True if the argument `model` of `load` may name the coefficients' model
+    holds = ""  # the lenses that `write` supports, for errors
+    needs_size = False  # True if a written camera must have an image_size
 
     def fits(self, content: Content) -> bool:
-        """True for a file's content that is of this format."""
+        """True if a file's content is in this format."""
         return isinstance(content, Mapping) and any(key in content for key in self.keys)
 
     def cameras(self, file: Any, model: str | None) -> Cameras:
-        """The cameras of a file: its `Fields`, or the rows of a table."""
+        """The cameras of a file; `file` is its `Fields`, or the rows of a table."""
         raise NotImplementedError
 
     def write(self, lens: Lens, suffix: str) -> str:
-        """The text of a file with this suffix; ValueError for a lens that the format lacks."""
+        """The text of a file with this suffix; ValueError if the format cannot hold the lens."""
         camera = intrinsics_of(lens, self.origin)
         if camera is not None and camera.size is None and self.needs_size:
-            raise ValueError(f"{self.name}'s cameras have an image_size, and this lens has none")
+            raise ValueError(f"{self.name} files need the lens's image_size, but it has none")
         text = None if camera is None else self._text(camera, suffix)
         if text is None:
             raise ValueError(
-                f"{self.name} has no exact place for this {type(lens).__name__} lens; it holds "
-                f"{self.holds}. darswin.lens.fit, or --model, finds the closest lens of another "
-                "model"
+                f"{self.name} files cannot hold this {type(lens).__name__} lens exactly. They hold "
+                f"{self.holds}. Use darswin.lens.fit, or --model, to find the closest lens of "
+                "another model"
             )
         return text
 
     def _text(self, camera: Intrinsics, suffix: str) -> str | None:
+        """The text of a file, or None if the format cannot hold the camera."""
         raise NotImplementedError
 
 
 def describe(model: type[Lens], values: Mapping[str, float], size: Size) -> Description:
-    """A camera of two focal lengths: x = fx x' + skew y' + cx.
+    """The description of a camera with two focal lengths: x = fx x' + skew y' + cx.
 
-    `values` are those of `PLANE`, px, skew if there is any; k1, p2 and other coefficients, which
-    are left out where all are zero; and the model's other numbers.
+    `values` are those of `PLANE`, px, where skew is optional; coefficients such as k1 and p2; and
+    the model's other numbers. Coefficients of a kind that are all zero are left out.
     """
     coefficients = {}
     for name, letter in LETTERS.items():
@@ -107,7 +112,7 @@ def in_image(
     size: Size,
     parameters: Mapping[str, Any],
 ) -> Description:
-    """A camera of any model: its class, where it stands in the image, and its parameters."""
+    """The description of a camera from its class, its place in the image and its parameters."""
     frame: Description = {"center": list(center)}
     if affine is not None:
         frame["affine"] = affine
@@ -117,8 +122,8 @@ def in_image(
 
 
 def intrinsics_of(lens: Lens, origin: float) -> Intrinsics | None:
-    """One lens with the center of the upper left pixel at (origin, origin); None for a lens without
-    a focal length, or with columns that slant."""
+    """A lens's intrinsics, with the center of the upper left pixel at (origin, origin). None for a
+    lens without a focal length, or whose `affine` tilts the image's columns."""
     if len(lens) != 1:
         raise ValueError(f"save takes one lens, got {len(lens)}")
     cx, cy = lens.center_in()[0].tolist()
@@ -136,16 +141,13 @@ def intrinsics_of(lens: Lens, origin: float) -> Intrinsics | None:
             values |= {f"{LETTERS[name]}{i}": value for i, value in found if value != 0}
         elif name != "focal":
             values[name] = numbers[name]
-    size = None
-    if lens.image_size is not None:
-        height, width = (round(side) for side in numbers["image_size"])
-        size = height, width
+    size = None if lens.image_size is None else [round(side) for side in numbers["image_size"]]
     with_terms = {m.__dict__["plain"]: m for m in MODELS.values() if "plain" in m.__dict__}
     return Intrinsics(with_terms.get(type(lens), type(lens)), values, size)
 
 
 def _times(ratio: float, focal: float) -> float:
-    """A focal length that `describe` divides to the same ratio: of these, a short one."""
+    """ratio × focal, rounded to 15 digits if dividing by `focal` still gives the same ratio."""
     product = ratio * focal
     short = float(f"{product:.15g}")
     return short if short / focal == ratio else product

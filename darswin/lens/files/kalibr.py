@@ -1,6 +1,6 @@
 """Kalibr's camchain YAML: pinhole, omni, ds and eucm with radtan, equidistant, fov or none.
 
-Also EuRoC's sensor.yaml, which calls the coefficients and their model by other names.
+Also EuRoC's sensor.yaml, which has other names for the coefficients and their model.
 """
 
 from collections.abc import Mapping
@@ -12,12 +12,12 @@ from darswin.lens.base import Lens
 from darswin.lens.distorted import BrownConrady, KannalaBrandt, Mei
 from darswin.lens.files.content import Content
 from darswin.lens.files.fields import Fields, like_coefficients
-from darswin.lens.files.format import Cameras, Description, Format, Intrinsics, Size, describe
+from darswin.lens.files.format import Cameras, Description, Format, Intrinsics, describe
 from darswin.lens.ideal import FieldOfView
 from darswin.lens.sphere import DoubleSphere, EnhancedUnified
 
-# Of each model with each of its distortions: our class, the intrinsics before fx, fy, cx and cy,
-# and the coefficients. A written camera has the first that fits.
+# For each model and distortion: our class, the intrinsics before fx, fy, cx and cy, and the
+# coefficients. A camera is written with the first entry that fits.
 MODELS: dict[tuple[str, str], tuple[type[Lens], str, str]] = {
     ("pinhole", "radtan"): (BrownConrady, "", "k1 k2 p1 p2"),
     ("pinhole", "equidistant"): (KannalaBrandt, "", "k1 k2 k3 k4"),
@@ -34,7 +34,7 @@ RADTAN = ("radial-tangential", "radial_tangential")  # EuRoC's
 
 
 class Kalibr(Format):
-    """Cameras by their names, or one alone."""
+    """Several cameras with names, or one camera without a name."""
 
     name = "Kalibr"
     needs_size = True
@@ -53,7 +53,7 @@ class Kalibr(Format):
     def cameras(self, file: Fields, model: str | None) -> Cameras:
         if _is_alone(file.entries):
             return {"camera": partial(_camera, file)}
-        # Also one that lacks something, so that it is missed, and no other camera taken for it.
+        # An entry that lacks its model counts too: reading it must fail, not find another camera.
         names = [
             name for name, entry in file.entries.items()
             if isinstance(entry, Mapping) and ("camera_model" in entry or "intrinsics" in entry)
@@ -105,8 +105,5 @@ def _camera(fields: Fields) -> Description:
     fields.check_all_read(f"a {distortion} camera", like_coefficients)
     if values.get("omega") == 0:
         model = BrownConrady
-    size: Size = None
-    if "resolution" in fields:
-        width, height = fields.sides("resolution")
-        size = height, width
+    size = fields.sides("resolution")[::-1] if "resolution" in fields else None
     return describe(model, values, size)

@@ -1,4 +1,4 @@
-"""Reading and writing a calibration file of any format."""
+"""Reads and writes calibration files of all formats."""
 
 import math
 import os
@@ -24,18 +24,18 @@ from darswin.lens.files.own import Own
 from darswin.lens.files.woodscape import WoodScape
 from darswin.utils.files import replace_file
 
-# A curve that lands further out than this, px, is of no use: a pinhole's near 90°.
+# Rays must not land further out than this, px, as a pinhole's do near 90°.
 MAX_RADIUS = 1e6
-# A θ_max that was written in another precision may pass the limit by this, rad.
+# A θ_max that was rounded by another program may exceed the limit by this, rad.
 ROUNDING = 1e-4
 MAX_CAMERAS = 10_000
 
-# The first that fits is taken.
+# The first one that fits a file reads it.
 FORMATS: tuple[Format, ...] = (
     Own(), WoodScape(), Basalt(), Nerfstudio(), CamOdoCal(), Kalibr(), opencv.ByName(),
     opencv.Ros(), opencv.OpenCV(), OCamCalib(), colmap.Colmap(),
 )  # fmt: skip
-# Those that `save` writes.
+# The formats that `save` writes.
 WRITTEN: dict[str, Format] = {
     "darswin": Own(), "opencv": opencv.OpenCV(), "colmap": colmap.Colmap(), "kalibr": Kalibr()
 }  # fmt: skip
@@ -50,26 +50,28 @@ def load(
     model: str | None = None,
     dtype: torch.dtype | None = None,
 ) -> Lens:
-    """The lens of a calibration file, in our pixel origin.
+    """Reads the lens of a calibration file; its pixel centres are integers, whatever the file's.
 
-    Reads WoodScape, KITTI-360 and CamOdoCal, Kalibr, EuRoC, OpenCV (fisheye, omnidir and pinhole;
-    also `np.savez` of its arrays, or fx, fy, cx, cy, k1, … by name), ROS camera_info, OCamCalib,
-    COLMAP (cameras.txt, cameras.bin), nerfstudio, basalt, and what `save` writes; the format is
-    told from the content.
+    The formats are WoodScape, KITTI-360 and CamOdoCal, Kalibr, EuRoC, OpenCV (fisheye, omnidir and
+    pinhole; also its arrays in an .npz file, or fx, fy, cx, cy, k1, … by name), ROS camera_info,
+    OCamCalib, COLMAP (cameras.txt, cameras.bin), nerfstudio, basalt, and our own JSON. The content
+    of the file tells the format; its name does not matter.
 
     Args:
-        camera: of a file with several different cameras: a name, or a number from 0. Where names
-            are numbers, as COLMAP's are, a number is a name.
-        theta_max: rad. None means the file's, or the widest of the lens's `side_angles`: the
-            corners of the image may see more; or `theta_limit`, where no image size is known.
-        image_size: (H, W) px, for a file that does not say it.
-        model: "fisheye", "pinhole" or "omnidir": what the coefficients of an OpenCV or ROS file
-            are, if it does not say it.
+        camera: the camera, if the file has several different ones: its name, or its number from 0.
+            If the names are numbers, as in COLMAP's files, a number is a name.
+        theta_max: rad. None means the file's θ_max; else the largest of the lens's `side_angles`,
+            although the image's corners may see more; or `theta_limit` if the image size is
+            unknown.
+        image_size: (H, W) px, used if the file has no image size.
+        model: "fisheye", "pinhole" or "omnidir", the model of the coefficients in an OpenCV or ROS
+            file that does not name it.
         dtype: of the lens; None means torch's default.
 
     Raises:
-        ValueError: an unknown format, a field that is missing or wrong, several cameras and none
-            chosen, a theta_max beyond the limit; it names the file. OSError: as `open`.
+        ValueError: an unknown format, a missing or wrong entry, several cameras without a choice,
+            or a theta_max beyond the limit. The message names the file.
+        OSError: the file cannot be opened.
     """
     return Calibration.read(path, model).lens(camera, theta_max, image_size, dtype)
 
@@ -82,23 +84,23 @@ def load_all(
     model: str | None = None,
     dtype: torch.dtype | None = None,
 ) -> dict[str, Lens]:
-    """All cameras of a calibration file by their names. Arguments and errors: as `load`."""
+    """Reads all cameras of a calibration file, by name. Arguments and errors: see `load`."""
     return Calibration.read(path, model).lenses(theta_max, image_size, dtype)
 
 
 def save(lens: Lens, path: str | os.PathLike, format: str | None = None) -> str:
-    """Writes one lens as a file that `load` reads; returns the format.
+    """Writes one lens to a file that `load` reads, and returns the name of the format.
 
-    Our own JSON holds any lens. The other formats hold those of their own models, all but θ_max:
-    `load` finds it from the image's sides.
+    Our own JSON holds any lens. The other formats hold the lenses of their own models, without
+    θ_max: `load` finds it from the image's sides.
 
     Args:
-        format: "darswin", "opencv", "colmap" or "kalibr". None tells it from the path: OpenCV's for
-            .xml, .yaml and .yml, but Kalibr's where the name has "camchain" or "kalibr"; COLMAP's
-            for .txt; else ours.
+        format: "darswin", "opencv", "colmap" or "kalibr". None chooses by the path: OpenCV for
+            .xml, .yaml and .yml, but Kalibr if the name contains "camchain" or "kalibr"; COLMAP
+            for .txt; else our own JSON.
 
     Raises:
-        ValueError: several lenses, a lens of a model that is not in `MODELS`, or one that the
+        ValueError: several lenses, a lens of a model that is not in `MODELS`, or a lens that the
             format cannot hold exactly.
     """
     path = Path(path)
@@ -115,17 +117,17 @@ def save(lens: Lens, path: str | os.PathLike, format: str | None = None) -> str:
 
 
 class Calibration:
-    """The text of a calibration file: its format, and its cameras, described when asked for."""
+    """A parsed calibration file: its format and its cameras, which are read on demand."""
 
     def __init__(self, text: str, name: str, model: str | None = None):
-        self.what = f"calibration {name}"  # in errors
+        self.what = f"calibration {name}"  # for errors
         with self._about():
             content = parse(text)
             self.format = _format_of(content)
         self.what = f"{self.format.name} {self.what}"
         with self._about():
             if model is not None and not self.format.takes_model:
-                raise ValueError(f"its cameras say their model, but model={model!r} was given")
+                raise ValueError(f"the file names the models, but model={model!r} was given")
             if model not in (None, *opencv.MODELS):
                 raise ValueError(f"model must be one of {', '.join(opencv.MODELS)}, got {model!r}")
             fields = content if isinstance(content, list) else Fields(content)
@@ -136,7 +138,7 @@ class Calibration:
 
     @classmethod
     def read(cls, path: str | os.PathLike, model: str | None = None) -> Self:
-        """The file at a path; `model` as of `load`."""
+        """Reads the file at a path; `model` is that of `load`."""
         name = os.fspath(path)
         try:
             data = read_bytes(path)
@@ -147,7 +149,7 @@ class Calibration:
         return cls(text, name, model)
 
     def choose(self, camera: str | int | None) -> str:
-        """The name of a camera, as `load` chooses it."""
+        """The name of the camera that `load` would read."""
         names, shown = self.names, listed(map(short, self.names))
         with self._about():
             if camera is None:
@@ -157,7 +159,7 @@ class Calibration:
                 return names[0]
             if str(camera) in self._cameras:
                 return str(camera)
-            if any(name.isdecimal() for name in names):  # a number is a name, or a mistake
+            if any(name.isdecimal() for name in names):  # then a number is never an index
                 raise ValueError(f"camera must be one of {shown}, got {camera!r}")
             number = str(camera) if type(camera) in (str, int) else ""
             if number.isdecimal() and len(number) <= 9 and int(number) < len(names):
@@ -171,7 +173,7 @@ class Calibration:
         image_size: tuple[int, int] | None = None,
         dtype: torch.dtype | None = None,
     ) -> Lens:
-        """As `load`."""
+        """One camera; the arguments are those of `load`."""
         name = self.choose(camera)
         description = self._describe(name)
         with self._about(name):
@@ -183,23 +185,24 @@ class Calibration:
         image_size: tuple[int, int] | None = None,
         dtype: torch.dtype | None = None,
     ) -> dict[str, Lens]:
-        """As `load_all`."""
-        # By description, for frames often repeat one camera; those alike are computed together.
+        """All cameras; the arguments are those of `load_all`."""
+        # Frames often repeat one camera: each description becomes one lens, and descriptions of
+        # the same shape become one batch.
         keys: dict[str, str] = {}
-        firsts: dict[str, str] = {}
-        alike: dict[str, list[str]] = {}
+        batches: dict[str, dict[str, str]] = {}
         for name in self.names:
             description = self._describe(name)
             keys[name] = repr(description)
-            if firsts.setdefault(keys[name], name) == name:
-                alike.setdefault(_shape(description), []).append(name)
+            batches.setdefault(_shape(description), {}).setdefault(keys[name], name)
         found: dict[str, Lens] = {}
-        for names in alike.values():
-            found |= self._together(names, theta_max, image_size, dtype)
-        return {name: found[firsts[key]] for name, key in keys.items()}
+        for firsts in batches.values():
+            lenses = self._together([*firsts.values()], theta_max, image_size, dtype)
+            found |= {key: lenses[name] for key, name in firsts.items()}
+        return {name: found[key] for name, key in keys.items()}
 
     def _together(self, names: list[str], *arguments) -> dict[str, Lens]:
-        """The lenses of cameras that are alike; of the first bad one, its error."""
+        """The lenses of cameras whose descriptions have one shape. Raises the error of the first
+        camera that has one."""
         try:
             with self._about(names[0]):
                 lenses = _batch([self._describe(name) for name in names], *arguments)
@@ -212,7 +215,7 @@ class Calibration:
         return {name: lenses[i] for i, name in enumerate(names)}
 
     def _describe(self, name: str) -> Description:
-        """In our pixel origin."""
+        """A camera's description in our pixel convention."""
         with self._about(name):
             description = self._cameras[name]()
         if "center" in description:
@@ -221,7 +224,7 @@ class Calibration:
 
     @contextmanager
     def _about(self, camera: str | None = None) -> Iterator[None]:
-        """Errors within name the file, and the camera if there are several."""
+        """Adds the file to errors, and the camera if there are several."""
         try:
             yield
         except ValueError as error:
@@ -237,14 +240,14 @@ def _format_of(content: Content) -> Format:
         known = ", ".join(format.name for format in FORMATS)
         given = content.get("model") if isinstance(content, Mapping) else None
         raise ValueError(
-            f'it must be of one of the formats {known}; darswin\'s own "model" must be one of '
+            f'it must be in one of the formats {known}; in a darswin file, "model" must be one of '
             f"{', '.join(sorted(MODELS))}, got {short(given)}"
         )
     return found
 
 
 def _shape(value: object) -> str:
-    """The same for descriptions that differ in numbers only."""
+    """The structure of a description without its numbers."""
     if isinstance(value, dict):
         return f"{value['model']} " + " ".join(f"{k}{_shape(v)}" for k, v in value.items())
     return f"[{','.join(map(_shape, value))}]" if isinstance(value, list) else ""
@@ -256,7 +259,7 @@ def _batch(
     image_size: tuple[int, int] | None,
     dtype: torch.dtype | None,
 ) -> Lens:
-    """The lenses of descriptions of one `_shape`, used as far as `load` says."""
+    """The lenses of descriptions with one `_shape`, with the θ_max that `load` documents."""
     dtype = dtype or torch.get_default_dtype()
     first = descriptions[0]
     values: dict[str, Any] = {
@@ -281,15 +284,15 @@ def _batch(
 
 
 def reach(lens: Lens) -> Tensor:
-    """(N,) rad: how far a lens that is used up to its limit is, where no θ_max is given: to the
-    widest of the image's sides, if it has a size."""
+    """(N,) rad: θ_max for a lens whose file has none. `lens` is used up to its limit; its θ_max is
+    reduced to the largest of its `side_angles` if it has an image size."""
     if lens.image_size is None:
         return lens.theta_max
     return torch.minimum(lens.side_angles().amax(1), lens.theta_max)
 
 
 def _check(lens: Lens, most: float) -> None:
-    """ValueError unless rays land at finite places, within `most` px of the center."""
+    """Raises ValueError unless all rays land within `most` px of the principal point."""
     theta = lens.theta_max[:, None] * torch.linspace(0, 1, 33, dtype=lens.theta_max.dtype)
     azimuth = torch.linspace(0, 2 * math.pi, 5, dtype=theta.dtype)[:4]
     shape = (len(lens), 33, 4)

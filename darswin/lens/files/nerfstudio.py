@@ -1,4 +1,4 @@
-"""nerfstudio's transforms.json: one camera for all frames, or one a frame."""
+"""nerfstudio's transforms.json: one camera for all frames, or one for each frame."""
 
 from collections.abc import Iterable
 from functools import partial
@@ -14,11 +14,11 @@ MODELS = {
 }  # fmt: skip
 TERMS = ("k1", "k2", "k3", "k4", "p1", "p2")
 KEYS = ("camera_model", "is_fisheye", "fl_x", "fl_y", "cx", "cy", "w", "h", *TERMS)
-PAIRS = (("k1", "k2"), ("k3", "k4"), ("p1", "p2"))  # as its tools write them
+PAIRS = (("k1", "k2"), ("k3", "k4"), ("p1", "p2"))  # nerfstudio's tools write both or none
 
 
 class Nerfstudio(Format):
-    """The camera at the top, or each frame's, by the frame's file."""
+    """The camera at the top level, or the frames' cameras, called by the frames' file names."""
 
     name = "nerfstudio"
     origin = 0.5
@@ -28,8 +28,8 @@ class Nerfstudio(Format):
         frames = file.get("frames", "a list of mappings") if "frames" in file else []
         if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):
             raise ValueError(f"frames must be a list of mappings, got {short(frames)}")
-        # What stands at the top rules. Terms are of one place: one of them at the top hides
-        # those of the frames.
+        # Entries at the top level override those of the frames; one coefficient at the top level
+        # overrides all coefficients of the frames.
         shared = {key: file.entries[key] for key in _of_camera(file.entries)}
         hidden = {*shared, *(TERMS if any(key in shared for key in TERMS) else ())}
         own = _of_camera(set().union(*frames)) - hidden
@@ -40,9 +40,7 @@ class Nerfstudio(Format):
             name = frame.get("file_path")
             name = name if isinstance(name, str) else f"frame {index}"
             if name in found:
-                raise ValueError(
-                    f"frames[{index}].file_path is that of another frame: {short(name)}"
-                )
+                raise ValueError(f"frames[{index}].file_path appears twice: {short(name)}")
             found[name] = partial(_frame, shared, own, frame, f"frames[{index}].")
         return found
 
@@ -59,14 +57,12 @@ def _camera(fields: Fields) -> Description:
     model = fields.one_of("camera_model", MODELS) if "camera_model" in fields else "OPENCV"
     size = (fields.side("h"), fields.side("w")) if "w" in fields or "h" in fields else None
     if fields.entries.get("is_fisheye") in (True, "true") and model != "OPENCV_FISHEYE":
-        raise ValueError(f"is_fisheye is true, and camera_model must not be {model} then")
+        raise ValueError(f"is_fisheye is true, but camera_model is {model}")
     for pair in PAIRS:
         there = [name for name in pair if name in fields]
         if len(there) == 1:
             lacks = fields.path(*({*pair} - {*there}))
-            raise ValueError(
-                f"{lacks} is missing beside {fields.path(there[0])}; write 0 if there is none"
-            )
+            raise ValueError(f"{fields.path(there[0])} needs {lacks}: write 0 if there is none")
     values = fields.values("fx=fl_x fy=fl_y cx cy") | fields.values(" ".join(TERMS), 0.0)
     fields.check_all_read(f"nerfstudio's {model}", like_coefficients)
     return describe(MODELS[model], values, size)

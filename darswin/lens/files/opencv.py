@@ -1,7 +1,7 @@
 """Camera matrices and their coefficients: OpenCV's FileStorage and ROS's camera_info.
 
-YAML, XML and JSON; of one camera, or of several whose keys end with 1 and 2, or left and right.
-Also intrinsics by their names: fx, fy, cx, cy, and k1, k2, p1, … beside them.
+Files are YAML, XML or JSON. The keys of several cameras end with 1 and 2, or left and right.
+Intrinsics may also be single numbers: fx, fy, cx, cy, and k1, k2, p1, … beside them.
 """
 
 import math
@@ -28,7 +28,7 @@ from darswin.lens.files.format import Cameras, Description, Format, Intrinsics, 
 
 Coefficients = Literal["fisheye", "pinhole", "omnidir"]
 MODELS: tuple[Coefficients, ...] = get_args(Coefficients)
-# Of each model: our class, its coefficients in OpenCV's order, and how many there may be.
+# For each model: our class, its coefficients in OpenCV's order, and their possible numbers.
 ORDERS: dict[str, tuple[type[Lens], str, tuple[int, ...]]] = {
     "fisheye": (KannalaBrandt, "k1 k2 k3 k4", (4,)),
     "pinhole": (BrownConrady, "k1 k2 p1 p2 k3 d1 d2 d3 s1 s2 s3 s4 tilt1 tilt2",
@@ -43,7 +43,7 @@ WORDS = {
     "omnidir": ("omnidir", "omni", "mei", "omnidirectional"),
 }  # fmt: skip
 
-# Names of entries as `plain_name` leaves them.
+# Names of entries, after `plain_name`.
 PLANE = ("fx", "fy", "cx", "cy")
 MATRIX = ("k", "cameramatrix", "intrinsicmatrix", "mtx", "m")
 COEFFICIENTS = ("d", "coeffs", "coefficients", *(
@@ -58,7 +58,7 @@ SUFFIXES = ("0", "1", "2", "3", "left", "right")
 
 
 class OpenCV(Format):
-    """Cameras by what the keys of their matrices end with."""
+    """Cameras are called by the endings of their matrices' keys."""
 
     name = "OpenCV"
     takes_model = True
@@ -80,7 +80,7 @@ class OpenCV(Format):
         return {suffix or "camera": partial(reader.camera, suffix) for suffix in suffixes}
 
     def _text(self, camera: Intrinsics, suffix: str) -> str | None:
-        import cv2  # only here: reading does without
+        import cv2  # only writing needs it
 
         kind = next((kind for kind in MODELS if ORDERS[kind][0] is camera.model), "pinhole")
         order = ORDERS[kind][1].removesuffix(" tilt1 tilt2")
@@ -107,7 +107,7 @@ class OpenCV(Format):
 
 
 class Ros(OpenCV):
-    """A message or file of ROS, which names its distortion model."""
+    """A ROS message or file, which names its distortion model."""
 
     name = "ROS camera_info"
 
@@ -116,7 +116,7 @@ class Ros(OpenCV):
 
 
 class ByName(Format):
-    """Intrinsics of one camera by their names, without a matrix."""
+    """The intrinsics of one camera as single numbers, without a matrix."""
 
     name = "intrinsics by name"
     takes_model = True
@@ -134,29 +134,29 @@ class ByName(Format):
 
 
 class _Reader:
-    """A file whose entries go by several names, and the model that the user gave."""
+    """A file whose entries have various names, and the model that the user named."""
 
     def __init__(self, file: Fields, model: str | None):
         self.file, self.model = file, model
-        # Of two names that are one here, the first counts.
+        # Of two names that `plain_name` makes equal, the first counts.
         self.names = {plain_name(name): name for name in reversed(list(file.entries))}
 
     def find_all(self, names: tuple[str, ...], suffix: str) -> list[str]:
-        """The file's names of entries that go by several."""
+        """All names in the file that are among `names` with a suffix."""
         return [self.names[n + suffix] for n in names if n + suffix in self.names]
 
     def find(self, names: tuple[str, ...], suffix: str = "") -> str | None:
         return next(iter(self.find_all(names, suffix)), None)
 
     def coefficients(self, suffix: str) -> str | None:
-        """The file's name of a camera's coefficients, if it has any; ValueError for several."""
+        """The name of the entry with a camera's coefficients, if any; ValueError for several."""
         found = self.find_all(COEFFICIENTS, suffix)
         if len(found) > 1:
-            raise ValueError(f"coefficients must stand in one entry, got {listed(found)}")
+            raise ValueError(f"coefficients must be in one entry, got {listed(found)}")
         return found[0] if found else None
 
     def check_coefficients(self, suffixes: list[str]) -> None:
-        """ValueError if coefficients were left out because of their names."""
+        """Raises ValueError if an entry looks like coefficients but has an unknown name."""
         read = [self.coefficients(suffix) for suffix in suffixes]
         left = [
             name for name, value in self.file.entries.items()
@@ -164,16 +164,16 @@ class _Reader:
         ]  # fmt: skip
         if left or (None in read and any(read)):
             raise ValueError(
-                "each camera's coefficients must stand in one entry, such as "
+                "each camera's coefficients must be in one entry, such as "
                 f"distortion_coefficients or D, got {listed(left or filter(None, read))}"
             )
 
     def camera(self, suffix: str) -> Description:
-        """The camera whose entries end with `suffix`."""
+        """The camera whose entries' names end with `suffix`."""
         matrices = self.find_all(MATRIX, suffix)
         values = [self.matrix(name, (9,)) for name in matrices]
         if any(other != values[0] for other in values[1:]):
-            raise ValueError(f"{' and '.join(matrices)} must be the same, a camera's matrix")
+            raise ValueError(f"{' and '.join(matrices)} must be the same camera matrix")
         fx, skew, cx, zero, fy, cy, *last = values[0]
         if not (fx > 0 and fy > 0 and zero == 0 and last == [0, 0, 1]):
             form = "[fx, skew, cx, 0, fy, cy, 0, 0, 1] with fx and fy above 0"
@@ -187,18 +187,18 @@ class _Reader:
         if name is None and (says or self.model is None):
             raise ValueError(
                 "distortion_coefficients or D is missing; write D: [] if the camera has none. The "
-                f"file has {listed(self.file.entries)}"
+                f"file's entries are {listed(self.file.entries)}"
             )
         model, order, counts = ORDERS[kind]
         if coefficients and len(coefficients) not in counts:
             expected = f"{' or '.join(map(str, counts))} coefficients for the {kind} model"
             raise ValueError(f"{name} must have {expected}, got {len(coefficients)}")
         if tilt := [angle for angle in coefficients[12:] if angle]:
-            raise ValueError(f"{name} must end with 0, 0: a tilted sensor is not supported: {tilt}")
+            raise ValueError(f"{name} must end with 0, 0: no tilted sensor is supported: {tilt}")
         terms = dict(zip(order.split(), coefficients, strict=False))
         if kind == "omnidir":
             if xi is None:
-                raise ValueError("xi is missing, it must be a finite number")
+                raise ValueError("xi is missing: it must be a finite number")
             (terms["xi"],) = self.matrix(xi, (1,))
         size = self.image_size(suffix)
         if "distortion_model" in self.file:
@@ -206,7 +206,7 @@ class _Reader:
         return describe(model, plane | terms, size)
 
     def camera_by_name(self) -> Description:
-        """The camera of a file of single numbers."""
+        """The camera of a file with single numbers."""
         file, names = self.file, self.names
         plane = {name: file.positive(names[name]) for name in ("fx", "fy")}
         plane |= {name: file.number(names[name]) for name in ("cx", "cy")}
@@ -218,17 +218,17 @@ class _Reader:
             only = "fisheye"
         elif any(name[0] != "k" for name in found):
             only = "pinhole"
-        # Their number says nothing of the model, as it does in a list: there are names.
+        # The names of coefficients tell the model; their number, as in a list, does not.
         kind = self.kind(listed(terms), [*terms.values()][:1], xi, only)
         model, order, _ = ORDERS[kind]
-        # OpenCV calls the denominator's k4 to k6.
+        # OpenCV calls the denominator's coefficients k4 to k6.
         ours = {"k4": "d1", "k5": "d2", "k6": "d3"} if kind == "pinhole" else {}
         if left := [name for name in found if ours.get(name, name) not in order.split()]:
             raise ValueError(f"the {kind} model has no {listed(left)}")
         if 0 < len(ours.keys() & terms.keys()) < 3:
             raise ValueError(
-                "k4 of the pinhole model is of its denominator, 1 + k4 r² + k5 r⁴ + k6 r⁶: write "
-                f"k4, k5 and k6, got {listed(terms)}"
+                "the pinhole model's denominator is 1 + k4 r² + k5 r⁴ + k6 r⁶: write all of k4, k5 "
+                f"and k6, got {listed(terms)}"
             )
         terms = {ours.get(name, name): value for name, value in terms.items()}
         values = plane | dict.fromkeys(order.split(), 0.0) | terms
@@ -242,7 +242,7 @@ class _Reader:
     def kind(
         self, name: str | None, coefficients: list[float], xi: str | None, only: str | None = None
     ) -> str:
-        """One of `MODELS`: the user's, the file's, or the one that alone has such coefficients."""
+        """One of `MODELS`: the user's, the file's, or the only one with such coefficients."""
         if self.model is not None:
             return self.model
         flag = self.find(SAYS_FISHEYE)
@@ -260,7 +260,7 @@ class _Reader:
                 known = ", ".join(sorted(word for words in WORDS.values() for word in words))
                 given = short(self.file.entries[entry])
                 raise ValueError(
-                    f"{entry} must be one of {known}, got {given}; or give model=, one of "
+                    f"{entry} must be one of {known}, got {given}; else choose with model= one of "
                     f"{', '.join(MODELS)}"
                 )
             return found
@@ -270,13 +270,12 @@ class _Reader:
             return only or "pinhole"
         what = f"the coefficients of {name}" if coefficients else "a camera without coefficients"
         raise ValueError(
-            f"{what} may be cv2.fisheye's (k1 to k4) or a pinhole's (k1, k2, p1, p2), and "
-            'the file does not say which: give model="fisheye" or model="pinhole", or write '
-            "fisheye_model: 1 or 0 into it"
+            f"{what} may belong to cv2.fisheye (k1 to k4) or to a pinhole (k1, k2, p1, p2): give "
+            'model="fisheye" or model="pinhole", or write fisheye_model: 1 or 0 into the file'
         )
 
     def matrix(self, name: str, counts: tuple[int, ...]) -> list[float]:
-        """The numbers of a matrix: a mapping with `data`, a list, a list of rows, or a number."""
+        """The numbers of a matrix: a mapping with `data`, a list, a list of rows or a number."""
         value, where, shape = self.file.entries[name], name, None
         if isinstance(value, Mapping):
             section, where = self.file.section(name), f"{name}.data"
@@ -284,7 +283,7 @@ class _Reader:
             if "rows" in section and "cols" in section:
                 shape = section.number("rows"), section.number("cols")
         if value == "" and shape is None:
-            value = None  # an empty entry is an error, not a list of no numbers
+            value = None  # an empty entry is an error, not an empty list
         if isinstance(value, (int, float)):
             value = [value]
         if isinstance(value, list) and any(isinstance(row, list) for row in value[:3]):
@@ -297,8 +296,8 @@ class _Reader:
         return numbers
 
     def in_message(self, plane: dict[str, float], size: Size) -> Size:
-        """The size of a ROS message's image, whose `plane` is changed from that of the sensor: the
-        image shows the region `roi`, with `binning_x` by `binning_y` pixels as one."""
+        """The image size of a ROS message. Changes `plane` from the sensor's pixels to the image's:
+        the image shows the region `roi`, and joins `binning_x` × `binning_y` pixels to one."""
         roi = self.file.section("roi") if "roi" in self.file else Fields({})
         left, top, width, height = (
             _pixels(roi, name) for name in ("x_offset", "y_offset", "width", "height")
@@ -308,14 +307,14 @@ class _Reader:
             rows, columns = size or (math.inf, math.inf)
             if not (0 < width <= columns - left and 0 < height <= rows - top):
                 raise ValueError(
-                    "roi must be a region of the image of 1 pixel or more, or all 0, got "
+                    "roi must be a part of the image of 1 pixel or more, or all 0, got "
                     f"{width}×{height} px at ({left}, {top})"
                 )
             size = height, width
         if size is not None:
             size = size[0] // down, size[1] // across
             if 0 in size:
-                raise ValueError(f"binning must leave a pixel, got {across} by {down} as one")
+                raise ValueError(f"the binning of {across}×{down} pixels leaves none of the image")
         plane["cx"] = (plane["cx"] - left + 0.5) / across - 0.5
         plane["cy"] = (plane["cy"] - top + 0.5) / down - 0.5
         for name, count in (("fx", across), ("fy", down), ("skew", across)):
@@ -323,7 +322,7 @@ class _Reader:
         return size
 
     def image_size(self, suffix: str) -> Size:
-        """(H, W) of a camera's images, or of all cameras', if the file says it."""
+        """(H, W) of a camera's images, or of all cameras' images; None if the file has neither."""
         for end in (suffix, ""):
             pair = self.find(SIZE, end)
             if pair is not None:
@@ -337,7 +336,7 @@ class _Reader:
 
 
 def _pixels(fields: Fields, name: str) -> int:
-    """A number of pixels, 0 where it is missing."""
+    """A number of pixels; 0 if the entry is missing."""
     if name not in fields:
         return 0
     return to_side(fields.get(name, "a whole number of pixels"), fields.path(name), least=0)

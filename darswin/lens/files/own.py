@@ -1,4 +1,4 @@
-"""Our own JSON: a model's name and the arguments of its constructor."""
+"""Our own JSON: the name of a lens model and the arguments of its constructor."""
 
 import json
 from collections.abc import Mapping
@@ -12,7 +12,7 @@ from darswin.lens.ideal import FocalLens
 
 
 class Own(Format):
-    """One lens of any of `MODELS`."""
+    """One lens of any model in `MODELS`."""
 
     name = "darswin"
 
@@ -38,7 +38,7 @@ def _lens(file: Fields) -> Description:
     for key in file.entries:
         if key not in ("model", *required, *optional):
             known = ", ".join((*required, *optional))
-            raise ValueError(f"{file.path(key)} is not of a {name} lens, which has {known}")
+            raise ValueError(f"a {name} lens has no {file.path(key)}, only {known}")
     description: Description = {"model": name}
     for key in (*required, *(key for key in optional if key in file)):
         if key == "fov":
@@ -53,7 +53,7 @@ def _lens(file: Fields) -> Description:
 
 
 def _value(value: Any, name: str, dims: int, most: int) -> Any:
-    """A number, or lists of at most `most` numbers, `dims` deep."""
+    """A number, or nested lists: `dims` levels, each of at most `most` entries."""
     if dims == 0:
         return to_number(value, name)
     if not isinstance(value, list) or not value:
@@ -62,5 +62,5 @@ def _value(value: Any, name: str, dims: int, most: int) -> Any:
         raise ValueError(f"{name} must be a list of at most {most} numbers, got {len(value)}")
     rows = [_value(entry, f"{name}[{i}]", dims - 1, most) for i, entry in enumerate(value)]
     if dims > 1 and len({len(row) for row in rows}) > 1:
-        raise ValueError(f"{name} must have rows of one length, got {short(value)}")
+        raise ValueError(f"{name} must have rows of equal length, got {short(value)}")
     return rows

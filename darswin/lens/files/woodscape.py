@@ -1,16 +1,16 @@
-"""WoodScape's and SynWoodScape's JSON: `intrinsic`, a polynomial of the angle."""
+"""WoodScape's and SynWoodScape's JSON: `intrinsic` holds a polynomial of the angle."""
 
 from darswin.lens.files.fields import Fields
 from darswin.lens.files.format import Cameras, Description, Format, in_image
 from darswin.lens.polynomial import Polynomial
 
-# The least k₁, px per rad, of an image of a few dozen pixels.
+# k₁, px per rad, is at least this even for images of a few dozen pixels.
 LEAST_K1 = 10.0
 MAX_ORDER = 16
 
 
 class WoodScape(Format):
-    """One camera, by its name if it has one."""
+    """One camera, called by its name in the file, or "camera"."""
 
     name = "WoodScape"
     origin = 0.5
@@ -22,9 +22,7 @@ class WoodScape(Format):
 
 def _camera(file: Fields) -> Description:
     intrinsic = file.section("intrinsic")
-    model = intrinsic.text("model", '"radial_poly"')
-    if model != "radial_poly":
-        raise ValueError(f'intrinsic.model must be "radial_poly", got {model!r}')
+    intrinsic.one_of("model", ["radial_poly"])
     order = intrinsic.number("poly_order", 4.0)
     if order not in range(1, MAX_ORDER + 1):
         raise ValueError(f"intrinsic.poly_order must be 1 to {MAX_ORDER}, got {order:g}")
@@ -32,8 +30,8 @@ def _camera(file: Fields) -> Description:
     if coefficients[0] < LEAST_K1:
         raise ValueError(
             f"intrinsic.k1 must be in pixels per radian, at least {LEAST_K1:g}, got "
-            f"{coefficients[0]:g}: Kannala–Brandt coefficients (OpenCV's fisheye) are not "
-            "radial_poly's; write them into an OpenCV file or a KannalaBrandt lens"
+            f"{coefficients[0]:g}. Kannala–Brandt coefficients (OpenCV's fisheye) are of another "
+            "kind: write them into an OpenCV file or a KannalaBrandt lens"
         )
     width, height = intrinsic.side("width"), intrinsic.side("height")
     offset = intrinsic.values("x=cx_offset y=cy_offset")
