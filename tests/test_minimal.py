@@ -9,11 +9,21 @@ import torch
 from darswin import create_model, lens
 
 MINIMAL = runpy.run_path(str(Path(__file__).parents[1] / "examples" / "minimal.py"))
+MICRO = dict(dim=32, depths=(2, 2, 4, 2), heads=(1, 2, 4, 8), samples=6)
 NANO = dict(dim=24, depths=(1, 2, 1), heads=(1, 2, 4), rings=8, sectors=32, samples=4)
 
 
+def test_the_defaults_are_those_of_the_small_model():
+    with torch.device("meta"):
+        model, expected = MINIMAL["DarSwinA"](), create_model("darswin_a_small")
+    shapes = [{k: v.shape for k, v in m.state_dict().items()} for m in (model, expected)]
+    assert shapes[0] == shapes[1]
+    patches = model.patch_embed
+    assert (patches.rings, patches.sectors, patches.samples) == (16, 64, 10)
+
+
 @pytest.mark.parametrize("training", [False, True])
-@pytest.mark.parametrize("name, sizes", [("darswin_a_small", {}), ("darswin_a_nano", NANO)])
+@pytest.mark.parametrize("name, sizes", [("darswin_a_micro", MICRO), ("darswin_a_nano", NANO)])
 def test_the_logits_equal_the_packages(name, sizes, training):
     torch.manual_seed(0)
     # Drop path is the one part that the example leaves out.

@@ -9,7 +9,7 @@ import torch
 from launches import Launches, launches, with_kernels
 
 from darswin import lens
-from darswin.lens import cat
+from darswin.lens import cat, solve
 from darswin.models import create_model
 from darswin.train.classification import Classification
 from darswin.train.segmentation import Distance, Segmentation
@@ -34,12 +34,12 @@ MODELS = {
     "darswin_unet_a_nano": dict(task="distance"),
     "swin_unet_undis_nano": dict(task="distance", image_size=64),
 }
+VIEWS = ("darswin_a_nano", "darswin_unet_a_nano", "swin_unet_undis_nano")
 CALLS = [
-    (name, "spherical", dtype) for name in MODELS for dtype in (torch.float32, torch.uint8)
-] + [
-    (name, kind, torch.float32)
-    for name in ("darswin_a_nano", "darswin_unet_a_nano", "swin_unet_undis_nano")
-    for kind in ("of an image size", "curves", "tangential", "affine")
+    *((name, "spherical", torch.float32) for name in MODELS),
+    *((name, "spherical", torch.uint8) for name in (*VIEWS, "swin_nano")),
+    *((name, kind, torch.float32) for name in VIEWS for kind in ("curves", "tangential", "affine")),
+    ("darswin_a_nano", "of an image size", torch.float32),
 ]
 
 
@@ -52,7 +52,8 @@ def images(dtype=torch.float32, size=64):
 
 
 @pytest.mark.parametrize(("name", "kind", "dtype"), CALLS)
-def test_no_model_waits_in_a_step(name, kind, dtype):
+def test_no_model_waits_in_a_step(name, kind, dtype, monkeypatch):
+    monkeypatch.setattr(solve, "_STEPS", 3)  # Newton's steps are all alike
     model = network(name, mean=[0.4, 0.5, 0.6], std=0.2, **MODELS[name])
     lenses = LENSES[kind].to("meta")
     with Launches():
@@ -75,7 +76,7 @@ def attach(task, net, monkeypatch, **data):
 @pytest.mark.parametrize("pairs", [False, True])
 def test_a_classifiers_task_does_not_wait(pairs, monkeypatch):
     data = dict(calibrations=object() if pairs else None, pair_lenses=pairs)
-    net = network("darswin_a_nano", num_classes=3)
+    net = network("darswin_a_nano", num_classes=3, depths=(1,), num_heads=(1,))
     task = attach(Classification("darswin_a_nano"), net, monkeypatch, classes="abc", **data)
     task.card = SimpleNamespace(classes="abc")
     labels = torch.empty(2, device="meta", dtype=torch.int64)
@@ -95,7 +96,8 @@ def test_the_dense_tasks_do_not_wait_in_a_step(weighted, monkeypatch):
         (Distance("darswin_unet_a_nano", solid_angle_weights=weighted), dict(task="distance")),
     )  # fmt: skip
     for task, options in tasks:
-        attach(task, network("darswin_unet_a_nano", **options), monkeypatch)
+        shallow = dict(depths=(1, 1), num_heads=(1, 2))
+        attach(task, network("darswin_unet_a_nano", **options, **shallow), monkeypatch)
         target = labels if options["task"] == "segmentation" else labels.float()
         with Launches():
             task._loss((*batch, target), rng).backward()
