@@ -14,6 +14,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from tqdm import tqdm
 
 from darswin import lens
 from darswin.lens.pixels import pixel_rays
@@ -43,7 +44,7 @@ def write_rooms(folder: Path, count: int) -> None:
     shutil.copy(CALIBRATION, folder / "lens.json")
     (folder / "classes.json").write_text(json.dumps(CLASSES))
     fine, rays = camera_rays(FINER), camera_rays(1)
-    for k in range(count):
+    for k in tqdm(range(count), desc="rooms"):
         room = Room(np.random.default_rng(k))
         image = cv2.resize(room.colors(fine), SIZE[::-1], interpolation=cv2.INTER_AREA)
         labels, distance = room.trace(rays)[:2]

@@ -20,6 +20,7 @@ VIEW_SIDE = 800  # px, the longer one
 # More than a picture can show: rings, sectors, samples along each side of a patch, and in all.
 MOST = {"rings": 1024, "sectors": 4096, "samples": 256}
 MOST_SAMPLES = 2**22
+MOST_LISTED = 20  # cameras
 
 
 def show(
@@ -65,7 +66,8 @@ def show(
     picture, orientation = read_oriented(image)
     size = picture.shape[:2]
     stored = stored_size(size, orientation)
-    _, lens = _read(calib, camera, theta_max_deg, stored, coefficients)
+    file, theta_max = _calibration(calib, theta_max_deg, stored, coefficients)
+    lens = file.lens(camera, theta_max, stored, torch.float64)
     lens = in_upright_picture(lens, size, orientation)
     sampler = PolarSample(rings, sectors, samples, spacing=spacing)
     across, down = _fields_of_view(lens, size)
@@ -108,18 +110,39 @@ def info(
         coefficients: what they are, in an OpenCV or ROS file that does not say it.
     """
     _check_partition(rings, sectors)
-    file, lens = _read(calib, camera, theta_max_deg, image_size, coefficients)
-    if lens.image_size is None:
-        raise ValueError(
-            f"{calib} does not say how large its images are: give `image_size`, their height and "
-            "width, e.g. 960,1280"
-        )
+    file, theta_max = _calibration(calib, theta_max_deg, image_size, coefficients)
     origin = f"({file.format.origin:g}, {file.format.origin:g})"
-    print(f"{'format':<16}{file.format.name}, with the centre of the upper left pixel at {origin}")
-    if len(file.names) > 1:
-        names = ", ".join(file.names[:20]) + ", …" * (len(file.names) > 20)
-        print(f"{'camera':<16}{file.choose(camera)}, of {len(file.names)}: {names}")
-    print(describe(lens, rings=rings, sectors=sectors))
+    rows = [
+        f"{'format':<16}{file.format.name}, with the centre of the upper left pixel at {origin}"
+    ]
+    names = file.names[:MOST_LISTED]
+    more = len(file.names) - len(names)
+    if camera is None and file.has_several():
+        rows.append(f"{'cameras':<16}{len(file.names)}; to describe one, give its name as --camera")
+        rows += [
+            f"  {name:<14}{_in_short(file.lens(name, theta_max, image_size))}" for name in names
+        ]
+        rows += [f"  and {more} more"] if more else []
+    else:
+        lens = file.lens(camera, theta_max, image_size, torch.float64)
+        if lens.image_size is None:
+            raise ValueError(
+                f"{calib} does not say how large its images are: give `image_size`, their height "
+                "and width, e.g. 960,1280"
+            )
+        if len(file.names) > 1:
+            listed = ", ".join(names) + ", …" * bool(more)
+            rows.append(f"{'camera':<16}{file.choose(camera)}, of {len(file.names)}: {listed}")
+        rows.append(describe(lens, rings=rings, sectors=sectors))
+    print(*rows, sep="\n")
+
+
+def _in_short(lens: Lens) -> str:
+    size = ""
+    if lens.image_size is not None:
+        height, width = (round(side) for side in lens.image_size[0].tolist())
+        size = f", {width} × {height} px"
+    return f"{type(lens).__name__}{size}, up to {math.degrees(lens.theta_max.item()):.2f}°"
 
 
 def convert(
@@ -140,7 +163,8 @@ def convert(
         format: of the file; without it OpenCV for .xml, .yaml and .yml, but Kalibr where the name
             has "camchain" or "kalibr"; COLMAP for .txt; else darswin, whose JSON holds any lens.
     """
-    _, lens = _read(calib, camera, theta_max_deg, image_size, coefficients)
+    file, theta_max = _calibration(calib, theta_max_deg, image_size, coefficients)
+    lens = file.lens(camera, theta_max, image_size, torch.float64)
     note = ""
     if model is not None:
         lens, error = darswin.lens.fit(model, lens)
@@ -154,21 +178,20 @@ def convert(
     print(f"{out}: {written}, {type(lens).__name__} up to {degrees:.2f}°{note}")
 
 
-def _read(
+def _calibration(
     calib: str,
-    camera: str | None,
     theta_max_deg: float | None,
     image_size: tuple[int, int] | None,
     coefficients: str | None,
-) -> tuple[Calibration, Lens]:
+) -> tuple[Calibration, float | None]:
+    """The file, and θ_max in radians; ValueError for options out of their ranges."""
     for side in image_size or ():
         _check("image_size", side, 1 <= side <= 10**6, "from 1 to 1000000 px")
     if theta_max_deg is not None:
         in_range = 0 < theta_max_deg <= 180
         _check("theta_max_deg", theta_max_deg, in_range, "above 0° and at most 180°")
     file = Calibration.read(calib, coefficients)
-    theta_max = None if theta_max_deg is None else math.radians(theta_max_deg)
-    return file, file.lens(camera, theta_max, image_size, torch.float64)
+    return file, None if theta_max_deg is None else math.radians(theta_max_deg)
 
 
 def _check(name: str, value: float, ok: bool, range_: str) -> None:

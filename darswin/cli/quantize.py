@@ -1,6 +1,6 @@
 """`darswin quantize`: a run's model with weights and activations of 8 bits."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,7 @@ from darswin.models.base import Model
 from darswin.models.saving import load_model, model_of_run, save_model
 from darswin.train.data import RunData
 from darswin.train.tasks import TASKS
+from darswin.utils.progress import Progress
 
 BATCH = 16
 
@@ -46,7 +47,8 @@ def quantize(
     weights = model_of_run(run)
     model, card = load_model(weights)
     data = _data_of(Path(run))
-    seen = list(_batches(data, "train", pictures))
+    with Progress("reading training pictures"):
+        seen = list(_batches(data, "train", pictures))
     quantized = quantize_model(model, seen, keep=keep or (), tolerance=tolerance)
     layers = quantized_layers(quantized)
     path = Path(out) if out else weights.with_name(f"{weights.stem}.int8.safetensors")
@@ -56,8 +58,9 @@ def quantize(
     sizes = [file.stat().st_size / 2**20 for file in (weights, path)]
     print(f"{path}: {len(layers)} of {whole} linear layers have 8 bits")
     print(f"{sizes[0]:.1f} MiB → {sizes[1]:.1f} MiB")
-    for line in _comparison(model, quantized, card.task, list(_batches(data, "val", pictures))):
-        print(line)
+    with Progress("comparing both models on validation pictures"):
+        lines = list(_comparison(model, quantized, card.task, _batches(data, "val", pictures)))
+    print(*lines, sep="\n")
     return str(path)
 
 
@@ -77,7 +80,7 @@ def _batches(data: RunData, split: Any, count: int) -> Iterator[tuple[Tensor, Le
 
 
 def _comparison(
-    model: Model, quantized: Model, task: str, batches: list[tuple[Tensor, Lens, Tensor]]
+    model: Model, quantized: Model, task: str, batches: Iterable[tuple[Tensor, Lens, Tensor]]
 ) -> Iterator[str]:
     """Lines that compare the results of both models."""
     pictures = known = right = kept = same = pixels = 0

@@ -64,7 +64,7 @@ class OfficialPolynomial(Lens, register=False):
         theta, radius = self._aligned(theta, "radius")
         x, angles = self._table()
         angle, radius = torch.broadcast_tensors(theta, radius)
-        flat = angle.reshape(len(self), -1)
+        flat = angle.reshape(self.count, -1)
         above = torch.searchsorted(angles.contiguous(), flat.contiguous(), right=True)
         above = above.clamp(1, len(x) - 1)
         low, high = angles.gather(1, above - 1), angles.gather(1, above)
@@ -149,7 +149,7 @@ def _grid(lens: Lens, image_size: Pair, spec: PolarGridSpec) -> PolarGrid:
     if lens.affine is not None or not lens.is_radial:
         raise ValueError(f"OfficialDarSwin needs radial lenses without affine, got {lens!r}")
     like = lens.theta_max
-    lens = lens.replace(theta_max=like[:1].expand(len(lens)))
+    lens = lens.replace(theta_max=like[:1].expand(lens.count))
     along_r, along_phi = (_inclusive(count - 1, like) for count in spec.samples)
     ends = _last_angle(lens)[:, None] * _inclusive(spec.rings, like)
     if isinstance(lens, OfficialPolynomial):

@@ -19,6 +19,7 @@ from darswin.layers.quantized import (
 from darswin.layers.transformer import Block, PatchMerging, WindowAttention
 from darswin.lens import Lens
 from darswin.models.base import Model
+from darswin.utils.progress import Progress
 
 __all__ = ["quantize_model", "sensitivities"]
 
@@ -65,10 +66,11 @@ def quantize_model(
     error = found.error(result)
     if error > tolerance:
         chosen.sort(key=found.alone().__getitem__)
-    while error > tolerance and len(chosen) > 1:
-        chosen.pop()
-        result = found.quantized(chosen)
-        error = found.error(result)
+    with Progress("taking parts back to float32"):
+        while error > tolerance and len(chosen) > 1:
+            chosen.pop()
+            result = found.quantized(chosen)
+            error = found.error(result)
     if error > tolerance or not chosen:
         raise ValueError(f"no part of the model can have 8 bits within a tolerance of {tolerance}")
     return result
@@ -97,8 +99,7 @@ class _Calibration(Generic[Net]):
         self.batches = _batches(model, calibration)
         self.model, self.parts = model, _parts(model, keep)
         names = [name for names in self.parts.values() for name in names]
-        self._activations = _activations(model, self.batches, names)
-        self._expected = list(_results(model, self.batches))
+        self._activations, self._expected = _observed(model, self.batches, names)
 
     def quantized(self, parts: Iterable[str]) -> Net:
         """A copy of the model whose given parts have 8 bits."""
@@ -116,7 +117,12 @@ class _Calibration(Generic[Net]):
 
     def alone(self) -> dict[str, float]:
         """The error of each part, when it alone has 8 bits."""
-        return {part: self.error(self.quantized([part])) for part in self.parts}
+        errors = {}
+        with Progress("measuring the error of each part", len(self.parts)) as progress:
+            for part in self.parts:
+                errors[part] = self.error(self.quantized([part]))
+                progress.done += 1
+        return errors
 
 
 class Change:
@@ -199,8 +205,10 @@ def _results(model: Model, batches: Batches) -> Iterator[Tensor]:
             module.training = training
 
 
-def _activations(model: Model, batches: Batches, names: Collection[str]) -> dict[str, Quantization]:
-    """The quantization of the input of each named layer."""
+def _observed(
+    model: Model, batches: Batches, names: Collection[str]
+) -> tuple[dict[str, Quantization], list[Tensor]]:
+    """The quantization of the input of each named layer, and the model's result of each batch."""
     kept: dict[str, list[Tensor]] = defaultdict(list)
     ends: dict[str, list[Tensor]] = defaultdict(list)
     chance = torch.Generator().manual_seed(0)
@@ -218,15 +226,21 @@ def _activations(model: Model, batches: Batches, names: Collection[str]) -> dict
 
     layers = dict(model.named_modules())
     hooks = [layers[name].register_forward_pre_hook(keeper(name)) for name in names]
+    results = []
     try:
-        for _ in _results(model, batches):
-            pass
+        with Progress("running the model on the pictures", len(batches)) as progress:
+            for result in _results(model, batches):
+                results.append(result)
+                progress.done += 1
     finally:
         for hook in hooks:
             hook.remove()
-    return {
-        name: _best_range(name, torch.cat(kept[name]), torch.stack(ends[name])) for name in names
-    }
+    found = {}
+    with Progress("choosing the ranges of activations", len(names)) as progress:
+        for name in names:
+            found[name] = _best_range(name, torch.cat(kept[name]), torch.stack(ends[name]))
+            progress.done += 1
+    return found, results
 
 
 def _best_range(name: str, values: Tensor, ends: Tensor) -> Quantization:

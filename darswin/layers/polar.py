@@ -255,7 +255,7 @@ class PolarSample(nn.Module):
         images = check_images(images, channels_last)
         height, width = images.shape[2:]
         check_lens(lens, (height, width))
-        check_count(len(lens), images)
+        check_count(lens.count, images)
         grid = self.grid(lens, (height, width))
         return polar_sample(**self.arguments(images, grid), layout=self.layout)
 

@@ -116,7 +116,7 @@ class Lens(ImageFrame):
         """The same lens with another θ_max, rad; None means `theta_limit`."""
         lens = self._map(lambda tensor: tensor)
         lens._set_theta_max(
-            None if theta_max is None else self._aligned(theta_max)[0].expand(len(self))
+            None if theta_max is None else self._aligned(theta_max)[0].expand(self.count)
         )
         return lens
 
@@ -279,7 +279,7 @@ class Lens(ImageFrame):
         Each is taken on the row or column of the principal point. It is `theta_limit` where the
         image extends beyond the lens.
         """
-        cx, cy = self.center_in(image_size).expand(len(self), 2).unbind(1)
+        cx, cy = self.center_in(image_size).expand(self.count, 2).unbind(1)
         height, width = self._size_in(image_size).unbind(1)
         low = torch.full_like(cx, -0.5)
         right, below = (width - 0.5).expand_as(cx), (height - 0.5).expand_as(cy)

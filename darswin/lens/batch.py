@@ -128,15 +128,20 @@ class LensBatch:
         x = torch.as_tensor(value, dtype=self.theta_max.dtype, device=self.theta_max.device)
         if x.dim() == 0:
             x = x[None]
-        if len(self) != 1 and x.shape[0] not in (1, len(self)):
+        if self.count != 1 and x.shape[0] not in (1, self.count):
             raise ValueError(
-                f"the first dimension must be the number of lenses, {len(self)} or 1, "
+                f"the first dimension must be the number of lenses, {self.count} or 1, "
                 f"got shape {tuple(x.shape)}"
             )
         return x, *(self._row(getattr(self, name), x.dim()) for name in names)
 
-    def __len__(self) -> int:
+    @property
+    def count(self) -> int:
+        """The number of lenses. Unlike `len`, it stays variable in an exported graph."""
         return self.theta_max.shape[0]
+
+    def __len__(self) -> int:
+        return self.count
 
     def __getitem__(self, index: int | slice | Tensor | Sequence[int]) -> Self:
         if isinstance(index, Integral):

@@ -78,11 +78,11 @@ class Tabulated(Lens):
     def _pieces(self, x: Tensor, table: Tensor) -> tuple[Tensor, ...]:
         """The first θ and the width of the table's piece that each x is in; its first r, its rise,
         and its slopes at both ends, in units of the width."""
-        rows = max(len(self), x.shape[0])
+        rows = max(self.count, x.shape[0])
         flat = x.detach().expand(rows, *x.shape[1:]).reshape(rows, -1)
         table = table.detach().expand(rows, -1).contiguous()
         shape = (rows, *x.shape[1:])
-        if len(self) == 1:
+        if self.count == 1:
             flat = flat.reshape(1, -1)
             table = table[:1].contiguous()
         index = torch.searchsorted(table, flat.contiguous(), right=True) - 1
@@ -173,7 +173,7 @@ def _fractions(lens: Lens, count: int) -> Tensor:
     """(N, count), from 0 to 1: parts of θ_max, closer together where the slope of r changes."""
     like = lens.theta_max
     fractions = torch.linspace(0, 1, 2 * count, dtype=like.dtype, device=like.device)[None]
-    fractions = fractions.expand(len(lens), -1)
+    fractions = fractions.expand(lens.count, -1)
     # Each round places its points by the slopes at the last one's, which resolve a pole better.
     for points in (2 * count, 2 * count, count):
         slope = lens._slope(like[:, None] * fractions)

@@ -85,7 +85,7 @@ class ImageFrame(LensBatch):
 
     def _sizes(self, size: tuple[int, int]) -> Tensor:
         """One size for all lenses, (N, 2)."""
-        return self.theta_max.new_tensor([size]).expand(len(self), 2)
+        return self.theta_max.new_tensor([size]).expand(self.count, 2)
 
     def in_picture(self, size: tuple[int, int]) -> Self:
         """The lens resized to a picture of (H, W); without an `image_size`, the lens itself.
@@ -122,7 +122,7 @@ class ImageFrame(LensBatch):
         height, width = _image_size((height, width))
         center = self.center_in() - self.theta_max.new_tensor([left, top])
         size = self._sizes((height, width))
-        return self.replace(center=center.expand(len(self), 2), image_size=size)
+        return self.replace(center=center.expand(self.count, 2), image_size=size)
 
 
 def _plain(value: Any) -> Any:

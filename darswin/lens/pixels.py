@@ -102,8 +102,8 @@ def _cosines(values: Tensor, lens: Lens) -> Tensor:
         raise TypeError(f"a map must be a tensor, got {type(values).__name__}")
     if values.dim() not in (3, 4) or (values.dim() == 4 and values.shape[1] != 1):
         raise ValueError(f"a map must be (N, H, W) or (N, 1, H, W), got {tuple(values.shape)}")
-    if len(lens) not in (1, values.shape[0]):
-        raise ValueError(f"there are {len(lens)} lenses for {values.shape[0]} maps")
+    if lens.count not in (1, values.shape[0]):
+        raise ValueError(f"there are {lens.count} lenses for {values.shape[0]} maps")
     theta = pixel_angles(lens, (values.shape[-2], values.shape[-1]))
     cosine = torch.nan_to_num(torch.cos(theta)).to(values)
     return cosine[:, None] if values.dim() == 4 else cosine

@@ -109,7 +109,7 @@ class DarSwin(Encoder):
         return Prepared(grid, [(ring_angles(lens, grid, r, self.position_bias),) for r in rings])
 
     def embed(self, images: Tensor, points: PolarGrid) -> Tensor:
-        check_count(len(points.radii), images)
+        check_count(points.radii.shape[0], images)
         if images.dtype == torch.uint8 and next(self.parameters()).dtype == torch.float64:
             images = self._floating(images)  # the operator would normalize in float32
         return self.patch_embed(images, points)

@@ -48,7 +48,7 @@ class PlainView:
         """Images (B, C, H, W) in floating point → the view, (B, C, H', W')."""
         if image_points is None:
             return images
-        check_count(len(image_points), images)
+        check_count(image_points.shape[0], images)
         return sample_at(images, image_points)
 
     def token_places(self, sizes: Sequence[Pair], view_points: Any, like: Tensor) -> list[Tensor]:

@@ -181,7 +181,7 @@ def polar_to_image(
     if r_max is not None:
         known = known & (r <= r_max[:, None, None])
 
-    rows = 1 if len(r) == len(radii) == 1 else batch
+    rows = 1 if r.shape[0] == radii.shape[0] == 1 else batch
     r, azimuth = (t.expand(rows, *t.shape[1:]) for t in (r, azimuth))
     known, radii = known.expand(rows, *known.shape[1:]), radii.expand(rows, rings)
     # The ring centres on both sides. Inside the first one the inner side lies across the pole, at
@@ -249,8 +249,9 @@ def window_attention(
     q, k, v = x.permute(5, 0, 1, 3, 6, 2, 4, 7).flatten(5, 6)
     logits = q @ k.transpose(-1, -2) * scale
     logits = logits + pairwise_bias(bias, window)[:, None, None]
-    visible = visible_pairs(rings, sectors, window, shift, periodic, qkv.device)
-    logits = logits.masked_fill(~visible[:, :, None], -math.inf)
+    if (shift[0] and not periodic[0]) or (shift[1] and not periodic[1]):
+        visible = visible_pairs(rings, sectors, window, shift, periodic, qkv.device)
+        logits = logits.masked_fill(~visible[:, :, None], -math.inf)
     out = (logits.softmax(-1) @ v).unflatten(4, (mr, ma))
     out = out.permute(0, 1, 4, 2, 5, 3, 6).reshape(batch, rings, sectors, heads * head_dim)
     return out.roll(shift, (1, 2)).to(dtype)

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from lens_examples import FILES
 from lightning.pytorch import Trainer
 from runs import QUIET, error, fit
 from scenes import CALIBRATIONS, write_plain
@@ -41,6 +42,7 @@ def scenes(tmp_path_factory):
         ("--data.holdout 0", "none of its own; --trainer.limit_val_batches 0 trains without val"),
         ("--data.train_lenses low --data.lens {}", "--data.train_lenses warps pictures through"),
         ("--data.test_lenses=low --data.lens {}", "--data.test_lenses warps pictures through"),
+        (f"--data.lens {FILES / 'kalibr_tumvi.yaml'}", "choose one with --data.camera: 'cam0'"),
         ("--xi 0.3 --data.lens {}", "--xi warps pictures through lenses, and --data.lens says"),
         (f"--data.lens {CALIBRATIONS / 'kalibr_fov.yaml'}", "choose one as --data.camera: 'cam0'"),
         ("--model.learning_rate 0", "--model.learning_rate must be above 0, got 0"),

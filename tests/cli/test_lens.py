@@ -14,6 +14,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from lens_examples import FILES
 
 from darswin.cli import lens as cli
 from darswin.cli.main import main
@@ -116,6 +117,18 @@ def test_what_is_wrong_is_one_line(folder, capsys, monkeypatch, argv, said):
     (folder / "wrong.json").write_text('{"model": "Spherical"}')
     (folder / "bare.json").write_text(json.dumps(to_dict(Polynomial([300.0], 1.5))))
     assert re.search(said, refusal(capsys, "lens", *argv.split()))
+
+
+def test_cameras_of_a_file_are_listed(capsys):
+    calib = str(FILES / "kalibr_tumvi.yaml")
+    main(["lens", "info", calib])
+    printed = capsys.readouterr().out
+    assert "--camera" in printed
+    assert re.search(r"^  cam0 +KannalaBrandt, 512 × 512 px, up to \d", printed, re.M)
+    assert re.search(r"^  cam1 ", printed, re.M) and "principal point" not in printed
+    main(["lens", "info", calib, "--camera", "cam1"])
+    printed = capsys.readouterr().out
+    assert "cam1, of 2: cam0, cam1" in printed and "principal point" in printed
 
 
 @pytest.mark.parametrize("view", ["perspective", "cylindrical", "equirectangular"])

@@ -95,7 +95,7 @@ def test_the_most_probable_classes(run, capsys):
         ("p.png --run . --lens L --every 0", "--every must be at least 1, got 0"),
         ("p.png --run . --lens L --task distance", r"--task distance was asked of .*best\.safe"),
         ("checkpoints --run . --lens L", "no pictures or videos in checkpoints"),
-        ("p.png --run . --lens cameras.txt", "choose one as --camera: '1', '2'"),
+        ("p.png --run . --lens cameras.txt", "choose one with --camera: '1', '2'"),
         ("p.png --run . --lens kd.json", 'give --coefficients "fisheye" or --coefficients "pin'),
         ("p.png --run . --lens checkpoints", r"no calibration in .*: the first would be .*p\.json"),
         ("p.png --run . --lens checkpoints --camera 1", "--camera 1 is one of a calibration file"),

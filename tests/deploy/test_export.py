@@ -139,6 +139,7 @@ def test_onnx(name, options, lens, tmp_path):
         images, lenses, tensors = batch_of(lens, count)
         inputs = dict(images=images) | ({} if fixed else tensors)
         assert [i.name for i in session.get_inputs()] == list(inputs)
+        assert {i.shape[0] for i in session.get_inputs()} == {"batch"}
         (logits,) = session.run(["logits"], {name: t.numpy() for name, t in inputs.items()})
         with torch.no_grad():
             expected = model(images, lenses)

@@ -147,7 +147,7 @@ TEXTS = (
     ("a: [1, 2", "not valid YAML: line 1: expected"), ("a: 1\n---\nb: 1", "not valid YAML"),
     ("a: \x00", "it is not valid YAML"), ('a: "\\UFFFFFFFF"', "it is not valid YAML"),
     # Which camera.
-    (TUMVI, "several cameras, choose one as camera=: 'cam0', 'cam1'"),
+    (TUMVI, "several cameras, choose one with camera=: 'cam0', 'cam1'"),
     *((TUMVI, "one of 'cam0', 'cam1', or its number", dict(camera=camera))
       for camera in ("cam2", 2, "2", -1, 1.5)),
     *((COLMAP, "camera must be one of '1', '2', '5', '7', got", dict(camera=camera))

@@ -148,14 +148,18 @@ class Calibration:
             raise ValueError(f"calibration {name}: {error}") from error
         return cls(text, name, model)
 
+    def has_several(self) -> bool:
+        """True if its cameras are not all the same."""
+        first = self._describe(self.names[0]) if len(self.names) > 1 else None
+        return any(self._describe(name) != first for name in self.names[1:])
+
     def choose(self, camera: str | int | None) -> str:
         """The name of the camera that `load` would read."""
         names, shown = self.names, listed(map(short, self.names))
         with self._about():
             if camera is None:
-                first = self._describe(names[0]) if len(names) > 1 else None
-                if any(self._describe(name) != first for name in names[1:]):
-                    raise ValueError(f"it has several cameras, choose one as camera=: {shown}")
+                if self.has_several():
+                    raise ValueError(f"it has several cameras, choose one with camera=: {shown}")
                 return names[0]
             if str(camera) in self._cameras:
                 return str(camera)
