@@ -77,7 +77,7 @@ def polar_to_image(
         ("r_max", r_max, "(B or 1,) = ({} or 1,)"),
     ):
         if tensor is not None or name == "radii":
-            check_tensor(name, tensor, (real,), form, (len(x), *shape), (1, *shape), like=x)
+            check_tensor(name, tensor, (real,), form, (x.shape[0], *shape), (1, *shape), like=x)
     check_rising("radii", radii)
     check_layout(layout)
     return _library.run(

@@ -103,7 +103,7 @@ def test_misuse_is_refused_before_any_work(folder, capsys, monkeypatch, options,
 @pytest.mark.parametrize(
     ("argv", "said"),
     [
-        ("show front.json square.png", "pictures of 966×1280 px, and 400×400 is"),
+        ("show front.json square.png", r"for 1280×966 \(W×H\) but the picture is 400×400"),
         ("show front.json none.png", r"^darswin: cannot read none.png: No such file[^(]*$"),
         ("info wrong.json", "wrong.json"),
         ("info bare.json", "how large its images are: give --image_size, their height"),

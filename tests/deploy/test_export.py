@@ -9,7 +9,7 @@ import torch
 
 from darswin import create_model
 from darswin.compat import OfficialDarSwin
-from darswin.deploy.export import export_onnx, export_program
+from darswin.deploy.export import export_onnx, export_package, export_program
 from darswin.lens import Polynomial, Spherical, solve
 from darswin.ops import _module
 
@@ -91,8 +91,7 @@ def test_package_in_a_process_without_the_package(tmp_path):
     model = short("darswin_a_nano", mean=0.5, std=0.2, **ONE_BLOCK)
     lens = Spherical.from_fov([0.3, 0.6, 0.9], 2.6, 16.0)
     frames = torch.randint(256, (3, 32, 40, 3), dtype=torch.uint8)
-    program = export_program(model, frames, lens)
-    torch._inductor.aoti_compile_and_package(program, package_path=str(tmp_path / "model.pt2"))
+    export_package(model, tmp_path / "model.pt2", frames, lens)
     shared = {name: t[:1].expand(3) for name, t in tensors_of(lens).items()}
     columns = dict(
         zip(tensors_of(lens), torch.stack((*tensors_of(lens).values(),), 1).unbind(1), strict=True)
