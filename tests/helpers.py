@@ -1,4 +1,4 @@
-"""What several test files share."""
+"""Helpers for several test files."""
 
 from pathlib import Path
 
@@ -14,7 +14,7 @@ CALIBRATIONS = Path(__file__).parent / "lens" / "files"
 
 
 def changed(name: str, old: str, new: str) -> str:
-    """The text of an example calibration with something replaced, which must be there."""
+    """The text of an example calibration, with `old`, which it must have, replaced by `new`."""
     text = CALIBRATIONS.joinpath(name).read_text()
     assert old in text
     return text.replace(old, new)
@@ -24,7 +24,7 @@ FIXTURES = Path(__file__).parent / "fixtures"
 
 
 def fixture(name):
-    """A fixture of the released DarSwin: all its tensors, the state dict, and the lenses."""
+    """A fixture of the released DarSwin: all tensors, the state dict, and the lenses."""
     tensors = load_file(FIXTURES / f"official_{name}.safetensors")
     state = {k.removeprefix("state."): v for k, v in tensors.items() if k.startswith("state.")}
     dist = tensors["dist"]
@@ -34,7 +34,7 @@ def fixture(name):
     return tensors, state, Spherical(xi, focal, fov / 2)
 
 
-# Cameras that people have: beyond 90°, off centre, rectangular, not round.
+# Typical real cameras: beyond 90°, off centre, rectangular, not round.
 CAMERAS = [
     Polynomial(
         [350.4, -17.5, 27.5, -2.4], 1.658, [641.3, 486.1], affine=[[1.0, 0.0], [0.0, 1.0004]],
@@ -48,12 +48,12 @@ CAMERAS = [
 
 
 def side_of(name):
-    """The side of the images of a test: of `image_size`, where the model has one."""
+    """The side of the test images for a model, also its `image_size` if it has one."""
     return 64 if "unet" in name else 32
 
 
 def network(name, **options):
-    """A nano in eval mode whose every parameter counts; "official" is the released DarSwin-A."""
+    """A nano model in eval mode with random parameters; "official" is an OfficialDarSwin."""
     options = dict(num_classes=5) | options
     if name == "official":
         sizes = dict(embed_dim=24, depths=(1, 2, 1), num_heads=(1, 2, 4), samples=(4, 4))
@@ -69,5 +69,5 @@ def network(name, **options):
 
 
 def relative_error(got, expected):
-    """The norm of the difference, over the norm of what is expected."""
+    """The norm of the difference, divided by the norm of the expected values."""
     return ((got.float() - expected).norm() / expected.norm()).item()

@@ -1,4 +1,4 @@
-"""Kernel launches and waits of a device, counted without one: on tensors of the device "meta"."""
+"""Counts kernel launches and finds waits without a GPU, on tensors of the device "meta"."""
 
 import contextlib
 from collections import Counter
@@ -12,13 +12,13 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from darswin.ops import _library
 
-# What makes memory, or another tensor of the same memory, and launches nothing.
+# Operations that only allocate memory or make a view, and launch nothing.
 _FREE = {
     "aten::empty.memory_format", "aten::empty_like", "aten::empty_strided", "aten::new_empty",
     "aten::new_empty_strided", "aten::_unsafe_view", "aten::_reshape_alias", "aten::detach",
     "aten::lift_fresh",
 }  # fmt: skip
-# Of our operators with kernels, those of several launches: tests/gpu/test_launches.py counts them.
+# Our operators that launch several kernels; tests/gpu/test_launches.py counts the launches.
 _SEVERAL = {
     "darswin::polar_embed": 2, "darswin::polar_embed_backward": 3,
     "darswin::window_attention_backward": 3,
@@ -26,11 +26,11 @@ _SEVERAL = {
 
 
 class Launches(TorchDispatchMode):
-    """Within it, operations on the device are counted: `names`, and their number `total`.
+    """A context that counts the operations on the device by name, and in `total`.
 
-    Views and empty tensors are none. An operation that reads a value on the host, or whose shape
-    depends on one, fails on "meta" by itself; a copy between host and device is an AssertionError.
-    An operation of torch counts once, though it may take several kernels.
+    Views and empty tensors do not count. An operation fails on "meta" by itself if it reads a value
+    on the host or if its shape depends on a value. A copy between host and device raises an
+    AssertionError. An operation of torch counts once, even if it launches several kernels.
     """
 
     def __init__(self) -> None:
@@ -44,13 +44,13 @@ class Launches(TorchDispatchMode):
     def __torch_dispatch__(self, func, types, args=(), kwargs=None):
         out = func(*args, **(kwargs or {}))
         made = {t.device.type for t in _tensors(out)}
-        # A number on the CPU comes along with what is launched.
+        # A number on the CPU is passed with the launch and needs no copy.
         given = [t for t in _tensors((args, kwargs)) if t.dim() or "copy" in func.name()]
         mixed = made and {t.device.type for t in given} - made
         assert not mixed, f"{func} copies between host and device"
         if "meta" in made and not _is_view(func) and func.name() not in _FREE:
             self.names[func.name()] += _SEVERAL.get(func.name(), 1)
-            if func.namespace == "darswin":  # whose kernels read contiguous tensors
+            if func.namespace == "darswin":  # their kernels read contiguous tensors
                 self.names["aten::contiguous"] += sum(not t.is_contiguous() for t in given)
         return out
 
@@ -65,7 +65,7 @@ def _is_view(func: Any) -> bool:
 
 
 def launches(function: Callable[..., Any], *arguments: Any) -> Counter[str]:
-    """The names of what a call launches, and how often."""
+    """The names of the operations that a call launches, with their counts."""
     with Launches() as counted:
         function(*arguments)
     return counted.names
@@ -73,6 +73,6 @@ def launches(function: Callable[..., Any], *arguments: Any) -> Counter[str]:
 
 @contextlib.contextmanager
 def with_kernels() -> Iterator[None]:
-    """Within it the operators run as on a GPU that has their kernels, with Triton or without."""
+    """A context in which the operators take the path of a GPU with Triton kernels."""
     with mock.patch.object(_library, "has_kernels", lambda tensor: tensor.device.type == "meta"):
         yield

@@ -1,4 +1,4 @@
-"""The public names, those in the `__all__` of a module, have docstrings; all are plain."""
+"""Docstrings: all public names, those in `__all__`, have one, and each names its subject."""
 
 import ast
 import importlib
@@ -42,7 +42,7 @@ def public_members(of: type) -> Iterator[tuple[str, object]]:
 
 
 def inherits_docstring(of: type, name: str) -> bool:
-    """Whether a base class in darswin describes the method; torch describes `extra_repr`."""
+    """True if a base class in darswin describes the method, or torch does (`extra_repr`)."""
     bases = [base for base in of.__mro__[1:] if base.__module__.startswith("darswin")]
     described = any(inspect.getdoc(vars(base)[name]) for base in bases if name in vars(base))
     return described or name == "extra_repr"
@@ -53,7 +53,7 @@ def undocumented() -> Iterator[str]:
         if inspect.isfunction(value) and not value.__doc__:
             yield path
         if inspect.isclass(value):
-            # A dataclass without a docstring gets its signature as one.
+            # The default docstring of a dataclass is its signature.
             if not vars(value).get("__doc__") or value.__doc__.startswith(f"{value.__name__}("):
                 yield path
             for method, member in public_members(value):

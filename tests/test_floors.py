@@ -1,4 +1,4 @@
-"""The floors of the package: a room imports only from rooms below it, no modules in a circle."""
+"""The layering of the package: a folder imports only from lower folders, and never in a circle."""
 
 import graphlib
 from pathlib import Path
@@ -8,7 +8,7 @@ import pytest
 from grimp import Layer
 
 ROOT = Path(__file__).parent.parent
-# From the top down. Rooms of one floor do not import each other.
+# From the top down. Folders of one floor do not import each other.
 FLOORS = (
     ("cli",),
     ("bench",),

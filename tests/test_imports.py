@@ -1,4 +1,4 @@
-"""An import loads no more than it needs: what takes long is loaded where it is used."""
+"""Imports load only the modules they need; slow modules are imported where they are used."""
 
 import ast
 import json
@@ -12,7 +12,7 @@ import torch
 import darswin
 
 LENS = Path(__file__).parent.parent / "examples" / "front.json"
-# Each takes a part of a second or more.
+# Importing each of these takes a part of a second or more.
 HEAVY = {
     "PIL", "cv2", "jsonargparse", "lightning", "matplotlib", "onnx", "sklearn", "sympy",
     "torch._dynamo", "torch._inductor", "torch.utils.tensorboard", "torchmetrics",
@@ -25,7 +25,7 @@ command.load()({})
 
 
 def loaded(code: str) -> set[str]:
-    """The modules that a new Python has loaded after some code."""
+    """The names of the modules that a new Python process has loaded after running the code."""
     report = "import json, sys; print(); print(json.dumps([*sys.modules]))"
     done = subprocess.run(
         [sys.executable, "-c", f"{code}\n{report}"], capture_output=True, text=True, check=True

@@ -26,7 +26,7 @@ def test_the_defaults_are_those_of_the_small_model():
 @pytest.mark.parametrize("name, sizes", [("darswin_a_micro", MICRO), ("darswin_a_nano", NANO)])
 def test_the_logits_equal_the_packages(name, sizes, training):
     torch.manual_seed(0)
-    # Drop path is the one part that the example leaves out.
+    # Drop path is the only part that the example leaves out.
     expected = create_model(name, num_classes=7, drop_path_rate=0.0).train(training)
     model = MINIMAL["DarSwinA"](num_classes=7, **sizes).train(training)
     model.load_state_dict(expected.state_dict())

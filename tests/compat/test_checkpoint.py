@@ -1,4 +1,4 @@
-"""Files of weights: what is read from them, and what is refused."""
+"""Weight files: reading, converting, and refusing hostile ones."""
 
 import errno
 import json
@@ -18,7 +18,7 @@ from darswin.compat import convert_checkpoint, load_official, read_state
 
 
 class CfgNode(dict):
-    """As yacs has it, as far as a pickle goes."""
+    """A copy of yacs's class that is pickled in the same way."""
 
     def __init__(self, *given):
         super().__init__(*given)
@@ -27,8 +27,8 @@ class CfgNode(dict):
 
 @pytest.fixture(params=["zip", "legacy"])
 def checkpoint(request, tmp_path, monkeypatch):
-    """What the authors' code saves. yacs is not needed to read it, so a module of that name is
-    there only to write it."""
+    """A checkpoint like those of the authors' code. A fake yacs exists only while it is written,
+    because reading must not need yacs."""
     weight = torch.nn.Parameter(torch.zeros(3))
     optimizer = torch.optim.AdamW([weight])
     weight.sum().backward()
@@ -58,7 +58,7 @@ def checkpoint(request, tmp_path, monkeypatch):
 def test_converts_the_authors_checkpoints(checkpoint, tmp_path):
     assert "yacs" not in sys.modules
     with pytest.raises(pickle.UnpicklingError, match=r"yacs\.config\.CfgNode"):
-        torch.load(checkpoint, weights_only=True)  # torch alone does not
+        torch.load(checkpoint, weights_only=True)  # torch alone cannot read it
     target = tmp_path / "converted" / "model.safetensors"
     target.parent.mkdir()
     convert_checkpoint(checkpoint, target)
@@ -75,7 +75,7 @@ def test_converts_the_authors_checkpoints(checkpoint, tmp_path):
     os.umask(mask)
     assert list(target.parent.iterdir()) == [target]
     assert target.stat().st_mode & 0o777 == 0o666 & ~mask
-    for file in (target, checkpoint):  # loaders read the checkpoint as well
+    for file in (target, checkpoint):  # `load_official` also reads the checkpoint itself
         with torch.no_grad():
             logits = load_official(file)(tensors["images"], lens)
         assert (logits - tensors["logits"]).abs().max() <= 1e-5
@@ -106,7 +106,7 @@ def test_a_hostile_checkpoint_is_refused(entry, zipped, tmp_path):
             with pytest.raises(ValueError, match=f"is refused, .* it asks for {name}, which"):
                 read(source)
         assert list(tmp_path.iterdir()) == [source]
-        torch.load(source, weights_only=False)  # it would have been
+        torch.load(source, weights_only=False)  # without the refusal, the code runs
         executed.unlink()
 
 

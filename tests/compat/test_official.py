@@ -1,8 +1,8 @@
-"""The released DarSwin's outputs, from fixtures computed with it.
+"""The outputs of the released DarSwin, from fixtures computed with it.
 
 The fixtures were made on a CPU on which MKL takes its compatible path. Near 90° the float32
-tangents of the released sampling differ between MKL's paths enough to move the embedding by 3e-4,
-for the released code as for ours. So the comparison runs in a process with that path chosen.
+tangents of the released sampling differ between the paths of MKL. This moves the embedding by 3e-4,
+in the released code and in ours. So the comparison runs in a process that selects this path.
 """
 
 import json
@@ -23,7 +23,7 @@ NAMES = ("angular", "polar", "poly")
 
 
 def differences(name) -> dict[str, float]:
-    """Largest absolute difference from the released code, for each thing that a fixture holds."""
+    """The largest absolute difference from the released code, for each tensor of a fixture."""
     tensors, state, lens = fixture(name)
     model = load_official(state)
     found = {}
@@ -39,8 +39,7 @@ def differences(name) -> dict[str, float]:
     for key, value in found.items():
         expected = tensors[key if key == "logits" else f"out.{key}"]
         results[key] = (value.reshape(expected.shape) - expected).abs().max().item()
-    # Patches in the released order: (azimuth, ring), and of them every 37th; the grid is that of
-    # the transposed image.
+    # The fixture has every 37th patch, in the order (azimuth, ring), of the transposed image.
     grid = model.prepare(lens, (64, 64)).points
     r, a = grid.radii[:, :, None], grid.azimuths
     xy = torch.stack((r * torch.sin(a), r * torch.cos(a)), -1) / 31.5
@@ -74,7 +73,7 @@ def test_logits_equal_with_any_maths_library(name):
 
 
 def test_every_part_of_the_compatibility_matters():
-    # The same weights in the paper's model give other logits: the fixture can tell.
+    # The same weights in the paper's model give other logits, so the fixtures are sensitive.
     tensors, state, lens = fixture("angular")
     official = load_official(state)
     paper = DarSwin(10, 3, 8, (2, 2, 2, 2), (1, 2, 4, 8), spacing="tan", placement="edges")

@@ -12,7 +12,7 @@ PRODUCTS = linear._PRODUCTS
 
 @pytest.fixture(autouse=True)
 def forget():
-    """Every test measures for itself."""
+    """Every test starts without measurements."""
     linear._measured.clear()
 
 
@@ -27,7 +27,7 @@ def results(layer, x):
 
 
 def measure(monkeypatch, seconds):
-    """Makes the measuring find these seconds of each library; the shapes that are measured."""
+    """Replaces the measurement by these seconds; returns a list of the measured shapes."""
     shapes = []
 
     def found(runs, turns):

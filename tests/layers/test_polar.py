@@ -23,7 +23,7 @@ def spherical(xi=0.0, fov=3.0479112779, radius=32.0):
 
 @pytest.mark.parametrize(
     ("xi", "spacing", "radii"),
-    [  # of rings 1, 2, 4, 8, 12, 15 at 64 px
+    [  # the borders of rings 1, 2, 4, 8, 12 and 15 in a 64 px image
         (0.0, "tan", (2, 4, 8, 16, 24, 30)),
         (0.0, "theta", (0.14, 0.29, 0.60, 1.43, 3.29, 10.49)),
         (0.2, "tan", (7.9, 13.4, 20.2, 26.8, 30.1, 31.6)),
@@ -275,7 +275,7 @@ def test_uint8_images(shape, given, last):
 
 @pytest.mark.slow
 def test_rays_keep_their_place_in_the_polar_image():
-    """Two cameras that see the same scene give the same polar image, but for interpolation."""
+    """Two cameras that see the same scene give the same polar image, up to interpolation."""
     sample = PolarSample(8, 32, (4, 4), layout="image")
     views = []
     for lens in CAMERAS:
@@ -286,8 +286,8 @@ def test_rays_keep_their_place_in_the_polar_image():
         scene = torch.stack((torch.cos(3 * theta), torch.cos(2 * azimuth), torch.sin(azimuth)))
         views.append(sample(scene.nan_to_num(0)[None], lens))
     grid = polar_grid(lens, size, rings=8, sectors=32, samples=(4, 4))
-    apart = (views[0] - views[1])[..., 2:, :].abs().amax((0, 2, 3))  # azimuths have no centre
-    # Most beside the principal point, where the azimuth changes from pixel to pixel.
+    apart = (views[0] - views[1])[..., 2:, :].abs().amax((0, 2, 3))
+    # The centre, left out, has no azimuth. Errors are largest near it.
     assert apart[0] < 1e-3 and apart.max() < 2e-2, (apart, grid.radii[0, :3])
 
 

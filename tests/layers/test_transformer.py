@@ -44,7 +44,7 @@ def test_the_layer_is_two_products_around_the_operator(position_bias):
 
 
 def test_a_plain_swin_block_runs_on_the_layer():
-    # No axis wraps, windows are shifted along both, and the bias is any table.
+    # No axis wraps around, and windows are shifted along both.
     options = dict(map_size=(8, 8), window=(4, 4), shift=(2, 2), periodic=(False, False))
     for layer, angles in (
         (PolarWindowAttention(8, 2, **options), [torch.linspace(0, 1, 9)[None]]),
@@ -55,7 +55,7 @@ def test_a_plain_swin_block_runs_on_the_layer():
         with use_reference():
             torch.testing.assert_close(out, layer(x, *angles))
         (grad,) = torch.autograd.grad(out[0, 0, 0].sum(), x)
-        # The corner's window holds the four corners of the map; it sees only its own.
+        # The shifted window has all four corners of the map; a token attends to its own corner.
         assert grad[0, :2, :2].ne(0).any(-1).all()
         assert not grad[0, 2:].any() and not grad[0, :, 2:].any()
 

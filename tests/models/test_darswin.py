@@ -35,7 +35,7 @@ def images(batch=2, height=32, width=32):
             ((16, 64), (4, 4), (2, 2)), ((8, 32), (4, 4), (2, 2)),
             ((4, 16), (4, 4), (0, 2)), ((2, 8), (2, 8), (0, 0)),
         ]),
-        ((32, 32, 4, "RA", (4, 4)), 2, [  # Swin's
+        ((32, 32, 4, "RA", (4, 4)), 2, [  # the sizes of Swin
             ((8, 8), (4, 4), (2, 2)), ((4, 4), (4, 4), (0, 0)),
         ]),
         ((32, 128, 1, "A", (1, 64)), 0, [((32, 128), (1, 64), (0, 16))]),
@@ -73,7 +73,7 @@ SHORT = dict(embed_dim=16, depths=(2, 2, 2, 2), num_heads=(1, 2, 4, 8))
 
 @pytest.mark.parametrize(
     ("name", "options", "exact"),
-    [  # the turns, in quarters, that the features follow exactly
+    [  # the quarter turns that turn the features exactly
         ("darswin_ra_nano", EVEN, {1, 2, 3}),
         ("darswin_ra_micro", EVEN, {1, 2, 3}),
         ("darswin_ra_tiny", EVEN | SHORT, {1, 2, 3}),
@@ -96,7 +96,7 @@ def test_turning_the_image_turns_the_features(name, options, exact):
     with torch.no_grad():
         for parameter_name, parameter in model.named_parameters():
             if "position_bias" in parameter_name:
-                parameter.normal_()  # as small as they begin they hide what they break
+                parameter.normal_()  # new biases are too small to show an error
         x, lens = images(1, 48, 48), Spherical.from_fov(0.4, 2.6, 24.0)
         maps = model.forward_intermediates(x, lens, intermediates_only=True)
         logits = model(x, lens)
@@ -113,7 +113,7 @@ def test_turning_the_image_turns_the_features(name, options, exact):
 
 
 def test_another_lens_shows_the_same_tokens():
-    # What the network is for: a smooth scene through two lenses gives nearly the same tokens.
+    # The purpose of DarSwin: two lenses that see a smooth scene give nearly the same tokens.
     def scene(lens, size):
         y, x = torch.meshgrid(torch.arange(size) - (size - 1) / 2,
                               torch.arange(size) - (size - 1) / 2, indexing="ij")  # fmt: skip

@@ -1,5 +1,7 @@
-"""What models do on a device, on "meta": they launch no more than they must, and no forward and no
-step waits. A value that is read fails there; a copy between host and device, in `Launches`."""
+"""Models on the device "meta": they launch few kernels, and no forward pass and no step waits.
+
+Reading a value fails on "meta". A copy between host and device fails in `Launches`.
+"""
 
 from types import SimpleNamespace
 
@@ -53,7 +55,7 @@ def images(dtype=torch.float32, size=64):
 
 @pytest.mark.parametrize(("name", "kind", "dtype"), CALLS)
 def test_no_model_waits_in_a_step(name, kind, dtype, monkeypatch):
-    monkeypatch.setattr(solve, "_STEPS", 3)  # Newton's steps are all alike
+    monkeypatch.setattr(solve, "_STEPS", 3)  # all steps of Newton's method are alike
     model = network(name, mean=[0.4, 0.5, 0.6], std=0.2, **MODELS[name])
     lenses = LENSES[kind].to("meta")
     with Launches():
@@ -61,7 +63,7 @@ def test_no_model_waits_in_a_step(name, kind, dtype, monkeypatch):
 
 
 def attach(task, net, monkeypatch, **data):
-    """What Lightning and the data give a task."""
+    """Gives a task the attributes that Lightning and the data module set."""
     trainer = SimpleNamespace(
         global_step=0, log_every_n_steps=50,
         optimizers=[SimpleNamespace(param_groups=[dict(lr=0.1)])],
@@ -109,7 +111,7 @@ def test_a_loss_that_is_not_finite_is_told_where_lightning_logs(monkeypatch):
     monkeypatch.setattr(task, "_loss", lambda batch, rng: loss)
     with pytest.raises(FloatingPointError, match="the loss is nan in epoch 0, batch 3"):
         task.training_step(([0],), 3)
-    # As on a device, which is only waited for where Lightning waits too.
+    # On a device, the loss is read only when Lightning reads it too.
     monkeypatch.setattr("darswin.train.task.readable", lambda value: False)
     every = task.trainer.log_every_n_steps
     for step in range(2 * every):
@@ -128,7 +130,7 @@ def test_launches_of_darswin_a_small_with_kernels():
     with with_kernels():
         step = launches(lambda: model.train()(images(), lenses).sum().backward())
     assert forward.total() <= 415 and step.total() <= 1350, (forward.total(), step.total())
-    # The position biases of a stage are computed at once.
+    # A stage computes the position biases of all its blocks at once.
     assert forward["aten::sin"] <= 11 and forward["aten::cat"] <= 40, forward
     blocks = sum(len(stage.blocks) for stage in model.stages)
     assert forward["darswin::window_attention"] == blocks and forward["darswin::polar_embed"] == 2

@@ -1,4 +1,4 @@
-"""A lens inside a model: the gradient at its parameters, through the samples and the bias."""
+"""Learning a lens: the gradients of its parameters, through the samples and the bias."""
 
 import pytest
 import torch
@@ -10,7 +10,7 @@ from darswin.lens import KannalaBrandt, Mei, Spherical
 from darswin.models.encoder import Prepared
 
 f64 = torch.float64
-CIRCLE = 14.7  # px, the radius that the images are used up to
+CIRCLE = 14.7  # px, the radius of the image circle
 LENSES = {
     Spherical: dict(xi=[0.6], focal=[13.0], center=[[15.3, 16.1]]),
     Mei: dict(xi=[0.9], focal=[18.0], center=[[15.3, 16.1]], radial=[[0.03, -0.02]]),
@@ -20,7 +20,7 @@ LENSES = {
 
 @pytest.fixture
 def model():
-    # Position biases of training's size: at the start they are near 0.
+    # Position biases as large as after training; new ones are near 0.
     model = create_model("darswin_a_nano", num_classes=5, in_chans=2).to(f64).eval()
     with torch.no_grad():
         for name, parameter in model.named_parameters():
@@ -36,18 +36,18 @@ def leaves(values):
 
 
 def make_lens(kind, **values):
-    """θ_max is where the lens reaches the circle, and so a function of its parameters."""
+    """A lens whose θ_max depends on its parameters: the angle at the radius of the circle."""
     lens = kind(**values)
     return lens.with_theta_max(lens.unproject(CIRCLE))
 
 
 def without_sampling(points, positions):
-    """The lens's parameters reach the model through the bias alone."""
+    """The gradients of the lens come through the bias alone."""
     return Prepared(PolarGrid(*(None if t is None else t.detach() for t in points)), positions)
 
 
 def without_bias(points, positions):
-    """The lens's parameters reach the model through the samples alone."""
+    """The gradients of the lens come through the samples alone."""
     return Prepared(points, [[t.detach() for t in of_stage] for of_stage in positions])
 
 
@@ -71,16 +71,16 @@ def test_gradients_are_those_of_finite_differences_and_of_their_two_parts(model,
     for name, *gradients in zip(values, whole, samples, bias, strict=True):
         torch.testing.assert_close(gradients[1] + gradients[2], gradients[0], rtol=1e-9, atol=1e-12)
         assert (gradients[0] != 0).all() and (gradients[1] != 0).all(), name
-        # The bias knows angles only: it says nothing about the principal point.
+        # The bias depends on angles alone, so it has no gradient for the principal point.
         assert ((gradients[2] == 0) if name == "center" else (gradients[2] != 0)).all(), name
-    # With θ_max given and not a function of the parameters, the bias is a constant.
+    # With a fixed θ_max, the bias is a constant.
     known = Spherical.from_fov(values["focal"] / 20, torch.tensor([2.6], dtype=f64), CIRCLE)
     points, positions = model.prepare(known, (32, 32))
     assert points.radii.requires_grad and not any(t.requires_grad for (t,) in positions)
 
 
 def test_a_lens_is_found_by_descent_on_a_known_scene(model):
-    # What the true lens makes of a scene is the target; descent starts far from it.
+    # The target is the features of a scene through the true lens. Descent starts far from it.
     y, x = torch.meshgrid(*[torch.arange(32.0, dtype=f64)] * 2, indexing="ij")
     scene = torch.stack((torch.sin(x / 4 + y / 9), torch.cos(y / 5 - x / 12)))[None]
     with torch.no_grad():

@@ -1,7 +1,7 @@
-"""The contract of all models, over `list_models()`: how they are called, what comes out, what they
-refuse, and how they are described, optimized, saved and compiled.
+"""The contract of all models in `list_models()`: their inputs, results, errors and
+descriptions, and how they are optimized, saved and compiled.
 
-timm's own Swin (1.0.31) was run beside ours for what is expected of intermediates and pruning.
+The expectations for intermediates and pruning were compared with timm's own Swin (1.0.31).
 """
 
 import copy
@@ -62,24 +62,24 @@ def total(out):
 
 
 def assert_close(got, expected, tolerance=1e-4):
-    """Each of the tensors, to a part of the largest number."""
+    """Compares tensors. The tolerance is relative to the largest number of each."""
     for a, b in zip(tensors_of(got), tensors_of(expected), strict=True):
         torch.testing.assert_close(a, b, rtol=0, atol=tolerance * b.abs().max().item())
 
 
 def assert_equal(got, expected):
-    """Each of the tensors, bit for bit."""
+    """Compares tensors bit for bit."""
     assert all(
         torch.equal(a, b) for a, b in zip(tensors_of(got), tensors_of(expected), strict=True)
     )
 
 
 def assert_gradients_close(model, got, expected, tolerance=1e-4):
-    """Each parameter's gradient, to a part of the largest of its module.
+    """Compares the gradients of all parameters.
 
-    The parameters of a module have sums of the same numbers for gradients. Such a sum can be 0 but
-    for rounding, which depends on the order of adding: softmax ignores what it adds to all logits,
-    as the `b_theta` of a window of one ring does. So no gradient is a scale for itself.
+    The tolerance is relative to the largest gradient of the module. It is not relative to each
+    gradient itself, because some gradients are 0 except for rounding. An example is the `b_theta`
+    of a window of one ring: it adds the same number to all logits, which softmax ignores.
     """
     modules = [name.rpartition(".")[0] for name, _ in model.named_parameters()]
     scales = defaultdict[str, float](float)
@@ -103,7 +103,7 @@ def test_gradients_reach_all_parameters(case):
     loss.backward()
     for key, parameter in model.named_parameters():
         assert parameter.grad is not None and parameter.grad.isfinite().all(), key
-        # A window of one ring has no two rings apart: sin 0 is 0.
+        # In a window of one ring, Δθ is 0 and so is sin Δθ.
         alone = ".position_bias.a_theta" in key and len(parameter) == 1
         assert alone or parameter.grad.any(), key
 
@@ -170,7 +170,7 @@ def test_options_train_and_agree_with_the_reference(name, options):
 @cases
 def test_a_batch_is_one_image_after_the_other_and_may_be_empty(case):
     model, images, lenses = made(case)
-    if case == "official":  # the field of view of image 0 counts for all
+    if case == "official":  # it uses the field of view of image 0 for all images
         lenses = Spherical(lenses.xi, lenses.focal, 1.3)
     together = tensors_of(model(images, lenses))
     alone = [tensors_of(model(images[k : k + 1], lenses[k])) for k in range(2)]
@@ -213,7 +213,7 @@ def test_a_training_step_repeats_with_a_seed_with_checkpointing_and_other_produc
             with torch.autocast("cpu", torch.bfloat16, enabled=half):
                 out = model(images, lenses)
             gradients = torch.autograd.grad(total(out), parameters)
-            if backend == "autotune":  # which may choose anew for a shape: it rounds as one of both
+            if backend == "autotune":  # it may choose another library, which rounds differently
                 assert_gradients_close(model, gradients, found["torch"])
             else:
                 assert_equal(gradients, found.setdefault(backend, gradients))
@@ -232,7 +232,7 @@ def test_dtypes(name):
     frames = torch.randint(256, tuple(images.shape), dtype=torch.uint8)
     mean, std = torch.tensor([MEAN, STD], dtype=torch.float64)[..., None, None]
     expected = model(frames, lenses)
-    with torch.autocast("cpu", dtype=torch.bfloat16):  # makes images and weights equal
+    with torch.autocast("cpu", dtype=torch.bfloat16):  # converts images and weights to one dtype
         for dtype in (torch.float32, torch.bfloat16):
             half = model(images.to(dtype), lenses)
             assert half.dtype == torch.bfloat16 or "unet" in name
@@ -248,7 +248,7 @@ def test_dtypes(name):
     assert_close(model(frames, lenses), exact, 1e-10)
 
 
-# -- what they take -------------------------------------------------------------------------------
+# -- inputs -------------------------------------------------------------------------------
 
 
 @cases
@@ -364,7 +364,7 @@ def test_uint8_images_have_as_many_channels_as_the_model_takes(name, channels):
     for size in sizes:
         planes = torch.randint(256, (2, channels, *size), dtype=torch.uint8)
         expected = model((planes / 255 - 0.5) / 0.2, lenses)
-        if size != (1, 1) or channels == 1:  # 1 × 1 × C may be both
+        if size != (1, 1) or channels == 1:  # 1 × 1 × C is ambiguous
             assert_close(model(planes.permute(0, 2, 3, 1), lenses), expected, 1e-3)
         assert_close(model(planes, lenses), expected, 1e-3)
     for shape, message in (
@@ -378,7 +378,7 @@ def test_uint8_images_have_as_many_channels_as_the_model_takes(name, channels):
 
 # -- descriptions, heads, files -------------------------------------------------------------------
 
-# Of "small", with 200 and with 1000 classes.
+# The parameters of the "small" models with 200 and with 1000 classes.
 PARAMETERS = {
     "darswin_a_small": (48_977_864, 49_593_064),
     "swin_small": (48_953_762, 49_568_962),
@@ -389,7 +389,7 @@ PARAMETERS = {
 
 @cache
 def described(name):
-    """A model without numbers, and the count of its parameters."""
+    """A model on "meta", and its number of parameters."""
     with torch.device("meta"):
         model = create_model(name)
     return model, sum(p.numel() for p in model.parameters())
@@ -424,7 +424,8 @@ def test_a_model_is_registered_in_four_sizes(monkeypatch):
     assert registry.list_models() == names
     assert all(registry.model_class(name) is Ours for name in names)
     nano, small = (registry.create_model(f"ours_{size}").options for size in ("nano", "small"))
-    assert nano["embed_dim"] == 8 and small["embed_dim"] == 96  # a preset goes before its size's
+    # A preset overrides the option of its size.
+    assert nano["embed_dim"] == 8 and small["embed_dim"] == 96
     assert nano.keys() == small.keys() and nano["variant"] == small["variant"] == "A"
     assert registry.create_model("ours_nano", variant="B").options["variant"] == "B"
     with pytest.raises(ValueError, match="unknown model 'swin_nano'; the models are ours_micro, "):
@@ -497,7 +498,7 @@ def test_what_a_model_tells_of_its_stages_is_what_they_give(name):
     assert [m.shape[3] for m in maps] == info.channels()
     assert [tuple(m.shape[1:3]) for m in maps] == info.get("map_size")
     assert model.num_features == model.head_hidden_size == info.channels(-1)
-    # A map is as large as its images, or the samples of its grid, over the reduction.
+    # The size of a map is that of the images, or of the sampling grid, divided by the reduction.
     whole = model.image_size or [
         count * s for count, s in zip(info[0]["map_size"], model.spec.samples, strict=True)
     ]
@@ -569,7 +570,7 @@ def test_pruning_and_feature_maps(name):
     assert pruned(x, lens).shape == (2, 48) and pruned.num_features == 48
     pruned.reset_classifier(7)
     assert pruned(x, lens).shape == (2, 7)
-    whole = copy.deepcopy(model)  # nothing is cut: the norm stays, and the head if asked
+    whole = copy.deepcopy(model)  # no stage is removed, so the norm stays, and the head if wanted
     assert whole.prune_intermediate_layers(1, prune_head=False) == [2]
     assert torch.equal(whole(x, lens), model(x, lens))
     whole.prune_intermediate_layers(prune_norm=True)
@@ -635,7 +636,7 @@ def test_the_last_intermediate_of_timms_swin():
 
 @pytest.fixture
 def no_graphs_before_or_after():
-    """All models share a forward, of which torch.compile keeps eight graphs at most."""
+    """Clears torch.compile's cache, which keeps at most eight graphs of the shared forward."""
     torch._dynamo.reset()
     yield
     torch._dynamo.reset()
@@ -646,7 +647,7 @@ def no_graphs_before_or_after():
 @nanos
 def test_one_graph_at_any_batch_size_with_the_same_results(name):
     model, _, _ = made(name, drop_path_rate=0.1)
-    model.set_grad_checkpointing()  # in a graph the compiler decides what is kept
+    model.set_grad_checkpointing()  # without effect: in a graph the compiler decides this
     side, counter = side_of(name), CompileCounter()
     compiled = torch.compile(model.train(), fullgraph=True, dynamic=True, backend=counter)
     for batch in (2, 3, 5):
@@ -667,7 +668,7 @@ def test_one_graph_at_any_batch_size_with_the_same_results(name):
 @pytest.mark.parametrize("name", ["darswin_a_nano", "swin_undis_nano"])
 def test_a_compiled_training_step_with_the_default_backend(name):
     options = dict(jitter=0.0) if name.startswith("darswin") else {}
-    # Inductor's C++ of one block is built in seconds.
+    # Compiling a single block takes seconds.
     model, images, lenses = made(name, depths=(1,), num_heads=(1,), **options)
     parameters = [*model.train().parameters()]
     expected = torch.autograd.grad(model(images, lenses).square().sum(), parameters)
@@ -678,7 +679,8 @@ def test_a_compiled_training_step_with_the_default_backend(name):
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("no_graphs_before_or_after")
-def test_compiled_inference_with_the_default_backend():  # DarSwin's: the package in test_export.py
+def test_compiled_inference_with_the_default_backend():
+    # tests/deploy/test_export.py compiles a DarSwin.
     options = dict(depths=(1,), num_heads=(1,), blocks=("D",), groups=(1,))
     model, images, lenses = made("dat_nano", **options)
     with torch.no_grad():

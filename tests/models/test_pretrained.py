@@ -1,4 +1,4 @@
-"""The models that come with darswin do what their cards say."""
+"""The models that come with darswin: their accuracies are those of their cards."""
 
 import importlib.util
 import json
@@ -31,7 +31,7 @@ def demo():
 
 @pytest.fixture(scope="module")
 def unseen():
-    """The scans that the demo does not train on, in [0, 1], and their labels; and some others."""
+    """The test scans of the demo in [0, 1], their labels, and some training scans."""
     digits = load_digits()
     images = (digits.images / 16).astype(np.float32)
     places = np.arange(len(images))
@@ -45,7 +45,7 @@ def test_digits_reads_through_any_fisheye_as_its_card_says(demo, unseen):
     table = re.findall(r"^\|(.+)\|$", pretrained_file("digits", "md").read_text(), re.M)
     (_, *xi), _, (_, *said) = ([cell.strip() for cell in row.split("|")] for row in table)
     assert [float(x) for x in xi] == demo.XI
-    # Of 8 bits it reads as well. It is calibrated on scans, and through lenses, of the training.
+    # Quantized to 8 bits it is as accurate. Training scans and lenses calibrate it.
     seen = demo.through_lenses(unseen[2], np.random.default_rng(0).uniform(0, 0.05, 256))
     quantized = quantize_model(model, [seen])
     assert len(quantized_layers(quantized)) >= 15
@@ -54,7 +54,7 @@ def test_digits_reads_through_any_fisheye_as_its_card_says(demo, unseen):
         images, lenses = demo.through_lenses(unseen[0], np.full(500, x))
         found, after = (demo.accuracy(m, images, lenses, unseen[1]) for m in (model, quantized))
         assert found >= 92
-        # Another machine rounds otherwise: that may turn one close decision or two.
+        # Another machine rounds differently, which may change one or two close decisions.
         assert found == pytest.approx(float(percent), abs=0.41)
         lost.append(found - after)
     assert np.mean(lost) <= 0.3 and max(lost) <= 1.0
@@ -62,7 +62,7 @@ def test_digits_reads_through_any_fisheye_as_its_card_says(demo, unseen):
 
 @pytest.mark.slow
 def test_digits_in_picture_files(demo, unseen):
-    """8-bit pictures as `darswin predict` reads them, at the accuracies that the card says."""
+    """On 8-bit pictures, read as in `darswin predict`, the accuracies are those of the card."""
     model, card = load_model("digits")
     said = re.findall(r"([\d.]+) at (?:ξ = )?([\d.]+)", pretrained_file("digits", "md").read_text())
     assert [float(xi) for _, xi in said] == [0, 0.5, 1]
@@ -114,7 +114,7 @@ def test_the_demo_wrote_the_sample_and_the_card(demo, unseen, tmp_path):
         for path in (tmp_path / "digits.png", pretrained_file("digits", "png"))
     )
     assert ours.shape == theirs.shape == (256, 256)
-    # OpenCV before 5 reads between pixels at 32nds of one, which tells where the digit is steep.
+    # OpenCV before version 5 rounds positions to 1/32 px, which shows at the edges of the digit.
     assert np.abs(ours - theirs).mean() <= 1 and np.abs(ours - theirs).max() <= 16
     lens = load(pretrained_file("digits", "json"))
     assert lens.xi.item() == pytest.approx(0.5) and lens.image_size.tolist() == [[256, 256]]

@@ -22,7 +22,7 @@ def write(path, weights, **changes):
 
 
 def refusal(path):
-    """The error of `load_model` for a file, in one line."""
+    """The message of the error that `load_model` raises for a file; it must be one line."""
     with pytest.raises(ValueError, match="is no model that this darswin can build: ") as error:
         load_model(path)
     assert type(error.value) is ValueError and "\n" not in str(error.value)

@@ -35,7 +35,7 @@ def test_blocks_of_the_small_models():
 
 
 def bilinear(table, y, x):
-    """The entry (y, x) of (C, H, W), between its neighbours; 0 outside."""
+    """Bilinear interpolation of (C, H, W) at (y, x); 0 outside."""
     out = table.new_zeros(table.shape[0])
     rows, columns = ((math.floor(place), math.floor(place) + 1) for place in (y, x))
     for row, column in itertools.product(rows, columns):
@@ -45,7 +45,7 @@ def bilinear(table, y, x):
 
 
 def test_deformable_attention_as_written_out():
-    # Key after key and query after query, in pixels.
+    # One key and one query at a time, in units of pixels.
     height, width, heads, groups, dim = 3, 4, 4, 2, 8
     layer = DeformableAttention(dim, heads, map_size=(height, width), groups=groups, kernel=3)
     layer = layer.double()
@@ -54,14 +54,14 @@ def test_deformable_attention_as_written_out():
     x = torch.randn(1, height, width, dim, dtype=torch.float64)
 
     q = layer.q(x)[0]
-    places, sampled = [], []  # of each group's keys, from the map's upper left corner
+    places, sampled = [], []  # of the keys of each group, from the upper left corner of the map
     grid = list(itertools.product(range(height), range(width)))
     for group in range(groups):
         channels = slice(group * dim // groups, (group + 1) * dim // groups)
         around = layer.around(q[..., channels].permute(2, 0, 1)[None])[0].permute(1, 2, 0)
         moves = torch.tanh(layer.offset(F.gelu(layer.norm(around)))).tolist()  # up to one pixel
         places.append([(y + 0.5 + moves[y][x][0], x + 0.5 + moves[y][x][1]) for y, x in grid])
-        # Sampled as if the outermost pixels' centres were at the edges.
+        # The released code samples as if the centres of the outermost pixels were at the edges.
         pixels = x[0, ..., channels].permute(2, 0, 1)
         shrink = ((height - 1) / height, (width - 1) / width)
         samples = [bilinear(pixels, y * shrink[0], x * shrink[1]) for y, x in places[-1]]

@@ -1,4 +1,4 @@
-"""The Unet: from polar maps to the pixels, its parts, and a lens that is learned through it."""
+"""The Unet: the way from polar maps to pixels, the decoder and heads, and learning a lens."""
 
 import math
 
@@ -33,7 +33,7 @@ def test_projecting_first_is_projecting_on_the_pixels(lens):
     pixels = model.view.to_pixels(x, points, size)
     proj = model.segmentation_head.proj
     after = F.linear(pixels.permute(0, 2, 3, 1), proj.weight, proj.bias).permute(0, 3, 1, 2)
-    # Beyond θ_max a map is 0, and the bias alone is left of what is projected after.
+    # Beyond θ_max the pixels are 0, and projecting them gives the bias.
     beyond = (pixels == 0).all(1, keepdim=True).expand_as(after)
     assert 0.02 < beyond.float().mean() < 0.7 and (first[beyond] == 0).all()
     torch.testing.assert_close(first[~beyond], after[~beyond], rtol=1e-4, atol=1e-5)
@@ -41,7 +41,7 @@ def test_projecting_first_is_projecting_on_the_pixels(lens):
 
 @pytest.mark.parametrize("spacing", ["theta", "tan", "g", "radius"])
 def test_the_decoders_rings_are_those_of_the_grid(spacing):
-    """Four to a ring: the samples of a grid of 4 × 4 samples a token stand at their centres."""
+    """The decoder has 4 rings per ring of the grid: their centres are samples of a 4 × 4 grid."""
     lens = Spherical.from_fov([0.1, 0.9], 2.6, 32.0)
     model = create_model("darswin_unet_ra_nano", spacing=spacing, sample_spacing="radius")
     back, _ = model.view.view_points(lens, (64, 64))
@@ -49,7 +49,7 @@ def test_the_decoders_rings_are_those_of_the_grid(spacing):
                       sample_spacing="radius")  # fmt: skip
     torch.testing.assert_close(back.radii, grid.radii)
     assert torch.equal(back.center, grid.center) and torch.equal(back.r_max, lens.r_max)
-    # `polar_to_image` takes sector a to be where the samples of column a stand.
+    # In `polar_to_image`, the azimuth of sector a is that of the samples of column a.
     assert torch.allclose(grid.azimuths, 2 * math.pi * (torch.arange(256) + 0.5) / 256)
 
 
@@ -57,7 +57,7 @@ def test_the_decoders_rings_are_those_of_the_grid(spacing):
 @pytest.mark.parametrize("lens", [WIDE, GENERAL], ids=["wide", "general"])
 @pytest.mark.parametrize("spacing", ["theta", "g"])
 def test_what_the_rays_show_comes_back_to_their_pixels(lens, spacing):
-    """A field of (θ, φ) on the rings and sectors, brought back, is that of each pixel's ray."""
+    """A function of (θ, φ) on the polar map becomes the same function of each pixel's ray."""
     lens, size = lens.to(f64), (60, 66)
     back = PolarGridSpec(32, 1, (1, 1), spacing).pixel_grid(lens, size, split=4)
     theta = lens.unproject(back.radii)[0][:, None]
@@ -91,14 +91,15 @@ EVEN = dict(periodic_bias=True)
         ("darswin_unet_ra_nano", {}, {1, 2, 3}),
         ("darswin_unet_ra_micro", EVEN, {1, 2, 3}),
         ("darswin_unet_ra_nano", dict(skip_width=8), set()),
-        ("darswin_unet_ra_nano", dict(places=True), set()),  # it knows which way is up
+        ("darswin_unet_ra_nano", dict(places=True), set()),  # directions do not turn
         ("darswin_unet_a_nano", EVEN, {1, 2, 3}),
     ],
 )
 def test_a_turned_image_gives_turned_logits(name, options, turns):
     model = network(name, **(dict(skip_width=0, places=False, in_chans=1) | options)).to(f64)
     lens = Spherical.from_fov(0.6, 2.6, 31.0).to(f64)
-    image = torch.randn(1, 1, 64, 64, dtype=f64)  # a pixel at the very middle has no azimuth
+    # The size is even, because a pixel at the principal point would have no azimuth.
+    image = torch.randn(1, 1, 64, 64, dtype=f64)
     logits = model(image, lens)
     for quarters in (1, 2, 3):
         turned = model(image.rot90(quarters, (2, 3)), lens)
@@ -119,7 +120,7 @@ def test_a_turned_image_gives_turned_logits(name, options, turns):
     ],
 )
 def test_a_lens_is_learned_through_the_way_back(kind, values):
-    """Against central differences, with the encoder's part left out and in."""
+    """Gradients of the lens against finite differences, through the way back and the model."""
     model = network("darswin_unet_a_nano", in_chans=1).to(f64).requires_grad_(False)
     images, size = torch.randn(1, 1, 48, 64, dtype=f64), (48, 64)
     labels, weights = torch.randint(5, (1, *size)), torch.rand(1, *size, dtype=f64)
@@ -141,7 +142,7 @@ def test_a_lens_is_learned_through_the_way_back(kind, values):
             return (F.cross_entropy(logits, labels, reduction="none") * weights).mean() * 100
 
         assert all((g != 0).all() for g in torch.autograd.grad(loss(*leaves), leaves))
-        # Pixels change their cell somewhere in any step: no closer than a few percent.
+        # The interpolation has kinks: some pixels change their cell even in a small step.
         assert torch.autograd.gradcheck(loss, leaves, eps=1e-7, rtol=1e-3, atol=1e-3)
 
 
@@ -150,7 +151,7 @@ def test_a_lens_is_learned_through_the_way_back(kind, values):
 
 @pytest.mark.parametrize("split", [(1, 4), (2, 2), (4, 1), (4, 4)])
 def test_tokens_stand_where_merging_took_them_from(split):
-    """Behind a merging of the same tokens that keeps them all, an expansion puts each back."""
+    """An expansion after a merging, both without their layers, gives back the map."""
     dim = 3
     joined = dim * split[0] * split[1]
     merging, expand = PatchMerging(dim, split), PatchExpand(joined, dim, split)
@@ -190,7 +191,7 @@ def test_the_skip_adds_what_the_image_shows():
     out = head.refine(coarse, images)
     assert out.shape == coarse.shape and not torch.equal(out, coarse)
     changed = images.clone()
-    changed[0, :, 4, 3] += 1  # two convolutions of 3×3: it reaches two pixels far
+    changed[0, :, 4, 3] += 1  # two 3×3 convolutions reach two pixels far
     differs = (head.refine(coarse, changed) != out).any(1)
     assert differs[0, 2:7, 1:6].sum() == differs.sum() > 9
     torch.nn.init.zeros_(head.out.weight)
@@ -205,7 +206,7 @@ def test_distances_are_positive_and_finite():
     x = torch.tensor([-1e30, -math.inf, -3.0, 0.0, 1e-3, 3.0, 1e30, math.inf])
     meters = head.finish(x)
     assert meters.isfinite().all() and (meters > 0).all()
-    torch.testing.assert_close(meters[3:5], 4 * torch.exp(x[3:5]))  # near 0 it is e^x itself
+    torch.testing.assert_close(meters[3:5], 4 * torch.exp(x[3:5]))  # near 0 it equals e^x
     assert meters[0] == meters[1] < 2e-3 and meters[-1] > 10_000
     assert (meters.diff()[1:6] > 0).all()
     assert head.finish(x.bfloat16()).dtype == torch.float32

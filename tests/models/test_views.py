@@ -1,4 +1,4 @@
-"""Views of images and the ways back: perspective views, squares, and any network behind them."""
+"""Views of images and the ways back: perspective views, squares, and networks on them."""
 
 import math
 
@@ -29,7 +29,7 @@ WIDE = Spherical.from_fov([0.2, 0.9], 2.6, 32.0)
 
 
 class Network(nn.Module):
-    """Answers as segmentation_models_pytorch and timm do: masks of several sizes, a label."""
+    """A network with masks of several sizes and a label, as those of other libraries."""
 
     def __init__(self):
         super().__init__()
@@ -43,7 +43,7 @@ class Network(nn.Module):
 
 
 def pixels(height, width):
-    """The columns and rows x and y, (H, W) each, of all pixels."""
+    """x and y of all pixels, (H, W) each."""
     return torch.meshgrid(torch.arange(float(width)), torch.arange(float(height)), indexing="xy")
 
 
@@ -63,7 +63,7 @@ def test_what_is_taken_to_the_square_comes_back(lens, spacing):
     seen = lens.sees(theta).expand(2, -1, -1)[:, None].expand_as(out)
     inner = (theta < 0.9 * lens.theta_max[:, None, None]).expand(2, -1, -1)[:, None]
     inside = torch.zeros(48, 52, dtype=torch.bool)
-    inside[4:-4, 4:-4] = True  # the image ends there, its views do not
+    inside[4:-4, 4:-4] = True  # near the border of the image, its views are cut
     inner = (inner & inside).expand_as(out)
     assert (out[~seen] == 0).all() and inner.float().mean() > 0.3
     assert (out - images).abs()[inner].max() < 0.02
@@ -166,7 +166,7 @@ def test_the_perspective_image_comes_back(xi):
     inside = radius <= side / 2 - 2
     error = (back - picture)[0, 0][inside].abs().max()
     assert error < (1e-5 if xi == 0 else 0.02), error
-    if xi:  # the picture was indeed another one
+    if xi:  # the distorted picture differs from the original
         assert (distorted - picture)[0, 0][inside].abs().max() > 0.3
     assert not back[0, 0][radius > side / 2 + 1].any()
 
@@ -180,7 +180,7 @@ def test_a_view_keeps_the_lenss_field_of_view_up_to_the_limit():
         picture, narrow, Perspective.from_fov(math.radians(100), side / 2), (side, side)
     )
     torch.testing.assert_close(limited, expected, rtol=0, atol=1e-5)
-    assert (undistorted(picture, wide) - limited).abs().max() > 0.1  # 175° otherwise
+    assert (undistorted(picture, wide) - limited).abs().max() > 0.1  # the default is 175°
 
 
 def test_gradients_reach_the_lens_through_the_view():
@@ -215,7 +215,7 @@ def test_undistorted_it_predicts_in_the_view_and_brings_back():
     undis = network("swin_unet_undis_nano", max_fov=2.0)
     plain = of_the_same_weights(undis, "swin_unet_nano")
     images = torch.randn(2, 3, 64, 64)
-    half = torch.full((2,), 1.0)  # of 2.6 rad the view shows 2.0
+    half = torch.full((2,), 1.0)  # the view shows 2.0 rad of the 2.6 rad
     view = Perspective(32 / torch.tan(half), half)
     logits = plain(reproject(images, WIDE, view, (64, 64)))
     torch.testing.assert_close(undis(images, WIDE), reproject(logits, view, WIDE, (64, 64)))
