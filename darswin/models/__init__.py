@@ -1,4 +1,4 @@
-"""The models, by name, and their files."""
+"""The models: creating them by name, saving them, and loading them."""
 
 from darswin.models.base import FeatureInfo, Model
 from darswin.models.darswin import DarSwin

@@ -31,7 +31,7 @@ class DarSwin(Encoder):
     because R and A belong to the model.
 
     Args:
-        arguments: num_classes, in_chans, embed_dim, depths and num_heads, as `Encoder` has them.
+        arguments: num_classes, in_chans, embed_dim, depths and num_heads, as in `Encoder`.
         jitter: how far the sample points move at random in training, in [0, 1]; 0 turns it off.
         variant: "A" has windows and merging along azimuth, "RA" along radius and azimuth.
         window: (M_r, M_φ) on maps that are large enough; None means (1, 16) for A, (4, 4) for RA.

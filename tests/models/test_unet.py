@@ -22,23 +22,6 @@ GENERAL = Mei(
 )  # fmt: skip
 
 
-@torch.no_grad()
-@pytest.mark.parametrize("lens", [WIDE, GENERAL], ids=["wide", "general"])
-def test_projecting_first_is_projecting_on_the_pixels(lens):
-    """A linear layer commutes with the interpolation, to rounding."""
-    model = network("darswin_unet_a_nano", skip_width=0)
-    x, size = torch.randn(2, 64, 256, 24), (64, 64)
-    points = model.view.view_points(lens, size)
-    first = model.view.to_pixels(model.segmentation_head.proj(x), points, size)
-    pixels = model.view.to_pixels(x, points, size)
-    proj = model.segmentation_head.proj
-    after = F.linear(pixels.permute(0, 2, 3, 1), proj.weight, proj.bias).permute(0, 3, 1, 2)
-    # Beyond θ_max the pixels are 0, and projecting them gives the bias.
-    beyond = (pixels == 0).all(1, keepdim=True).expand_as(after)
-    assert 0.02 < beyond.float().mean() < 0.7 and (first[beyond] == 0).all()
-    torch.testing.assert_close(first[~beyond], after[~beyond], rtol=1e-4, atol=1e-5)
-
-
 @pytest.mark.parametrize("spacing", ["theta", "tan", "g", "radius"])
 def test_the_decoders_rings_are_those_of_the_grid(spacing):
     """The decoder has 4 rings per ring of the grid: their centres are samples of a 4 × 4 grid."""
