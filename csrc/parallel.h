@@ -15,6 +15,7 @@
 #include <exception>
 #include <memory>
 #include <new>
+#include <utility>
 
 namespace darswin {
 
@@ -76,12 +77,21 @@ class ThreadMemory {
   static inline thread_local size_t size = 0;
 };
 
+// The threads that are worth starting for so many microseconds of work. The second one takes about
+// two of them to begin, and more if it has fallen asleep.
+inline int64_t threads_for(double microseconds) {
+  constexpr double kLeast = 10;  // for each thread
+  const double most = std::max(microseconds / kLeast, 1.0);
+  const int64_t threads = torch::stable::get_num_threads();
+  return most < static_cast<double>(threads) ? static_cast<int64_t>(most) : threads;
+}
+
 // body(begin, end) on contiguous ranges that cover [0, count), each in a thread of its own. An
 // exception must not leave an OpenMP region: it is kept, and thrown again when all threads end.
 template <typename Body>
-void parallel_ranges(int64_t count, Body&& body) {
+void parallel_ranges(int64_t count, int64_t threads, Body&& body) {
   if (count <= 0) return;
-  const int64_t threads = std::min<int64_t>(count, torch::stable::get_num_threads());
+  threads = std::min(count, threads);
   std::exception_ptr failure;
 #pragma omp parallel num_threads(threads) if (threads > 1)
   {
@@ -97,6 +107,10 @@ void parallel_ranges(int64_t count, Body&& body) {
     }
   }
   if (failure != nullptr) std::rethrow_exception(failure);
+}
+template <typename Body>
+void parallel_ranges(int64_t count, Body&& body) {
+  parallel_ranges(count, torch::stable::get_num_threads(), std::forward<Body>(body));
 }
 
 // body(begin, end, scratch) in the same way, each thread with `bytes` of working memory.

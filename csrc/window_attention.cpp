@@ -1,73 +1,11 @@
 // window_attention and its backward on CPU: check, allocate, thread, call the kernel.
-#include "window_attention.h"
-
 #include <tuple>
 #include <vector>
 
-#include "checks.h"
-#include "dispatch.h"
-#include "parallel.h"
+#include "window_attention_call.h"
 
 namespace darswin {
 namespace {
-
-constexpr char kName[] = "window_attention";
-
-// The arguments of one call, contiguous as the kernels want them. Owns what `args` points into.
-template <typename T>
-struct AttentionCall {
-  Tensor qkv, bias;
-  WindowAttentionArgs<T> args{};
-
-  AttentionCall(const Tensor& qkv_, const Tensor& bias_, const Sizes& window, const Sizes& shift,
-                const Sizes& periodic, double scale)
-      : qkv(contiguous(qkv_)), bias(contiguous(bias_)) {
-    STD_TORCH_CHECK(qkv.dim() == 6 && qkv.size(3) == 3 && bias.dim() == 4 && window.size() == 2 &&
-                        shift.size() == 2 && periodic.size() == 2,
-                    kName, ": wrong number of dimensions");
-    STD_TORCH_CHECK(bias.scalar_type() == type_of<Arithmetic<T>>() && bias.is_cpu(), kName,
-                    ": bias must be on the CPU and have the type of qkv, float32 where that "
-                    "is bfloat16");
-    for (int axis = 0; axis < 2; ++axis) {
-      const int64_t size = qkv.size(1 + axis);
-      STD_TORCH_CHECK(window[axis] > 0 && size > 0 && size % window[axis] == 0 &&
-                          shift[axis] >= 0 && shift[axis] < size,
-                      kName, ": window must divide the map, shift must lie inside it");
-      const int64_t entries = bias.size(2 + axis);  // twice the window, less one
-      STD_TORCH_CHECK(entries % 2 == 1 && entries / 2 + 1 == window[axis], kName,
-                      ": bias does not fit the window");
-    }
-    const int64_t batch = qkv.size(0);
-    STD_TORCH_CHECK((bias.size(0) == 1 || bias.size(0) == batch) && bias.size(1) == qkv.size(4),
-                    kName, ": bias does not fit the batch or the heads");
-
-    args.qkv = pointer<T>(qkv);
-    args.bias = pointer<Arithmetic<T>>(bias);
-    args.bias_rows = bias.size(0);
-    args.rings = qkv.size(1);
-    args.sectors = qkv.size(2);
-    args.heads = qkv.size(4);
-    args.head_dim = qkv.size(5);
-    args.window_r = window[0];
-    args.window_a = window[1];
-    args.windows = batch * (args.rings / args.window_r) * (args.sectors / args.window_a);
-    args.shift_r = shift[0];
-    args.shift_a = shift[1];
-    args.periodic_r = periodic[0] != 0;
-    args.periodic_a = periodic[1] != 0;
-    args.scale = static_cast<Arithmetic<T>>(scale);
-  }
-
-  Sizes output_sizes() const {
-    return {qkv.size(0), args.rings, args.sectors, args.heads * args.head_dim};
-  }
-
-  template <typename Kernel>
-  void run(int64_t items, Kernel kernel) {
-    run_with_scratch(items, kernels<WindowAttentionKernels<T>>().scratch(args),
-                     [&](auto... range) { kernel(args, range...); });
-  }
-};
 
 // The output, or with a quantizer the same as 8 bits, which only float has.
 template <typename T>
@@ -99,7 +37,7 @@ int64_t chunk_size(const WindowAttentionArgs<T>& args) {
 template <typename T>
 std::tuple<Tensor, Tensor> backward(AttentionCall<T>&& call, Tensor grad_out) {
   auto& args = call.args;
-  grad_out = checked_gradient(grad_out, call.output_sizes(), call.qkv.scalar_type(), kName);
+  grad_out = checked_gradient(grad_out, call.output_sizes(), call.qkv.scalar_type(), kAttention);
   const Tensor grad_qkv = new_empty(call.qkv, call.qkv.sizes());
   if (grad_qkv.numel() == 0) return {grad_qkv, new_zeros(call.bias, call.bias.sizes())};
   ask_for_large_pages(grad_qkv);
@@ -120,7 +58,7 @@ std::tuple<Tensor, Tensor> backward(AttentionCall<T>&& call, Tensor grad_out) {
 
 Tensor window_attention(Tensor qkv, Tensor bias, Sizes window, Sizes shift, Sizes periodic,
                         double scale) {
-  return with_real_type(qkv, kName, [&]<typename T>() {
+  return with_real_type(qkv, kAttention, [&]<typename T>() {
     return forward(AttentionCall<T>(qkv, bias, window, shift, periodic, scale));
   });
 }
@@ -128,7 +66,7 @@ Tensor window_attention(Tensor qkv, Tensor bias, Sizes window, Sizes shift, Size
 Tensor window_attention_quantized(Tensor qkv, Tensor bias, Sizes window, Sizes shift,
                                   Sizes periodic, double scale, double out_scale,
                                   int64_t zero_point) {
-  STD_TORCH_CHECK(qkv.is_cpu() && qkv.scalar_type() == ScalarType::Float, kName,
+  STD_TORCH_CHECK(qkv.is_cpu() && qkv.scalar_type() == ScalarType::Float, kAttention,
                   "_quantized: qkv must be float32");
   const Quantizer to_bytes = quantizer(out_scale, zero_point);
   return forward(AttentionCall<float>(qkv, bias, window, shift, periodic, scale), &to_bytes);
@@ -136,7 +74,7 @@ Tensor window_attention_quantized(Tensor qkv, Tensor bias, Sizes window, Sizes s
 
 auto window_attention_backward(Tensor qkv, Tensor bias, Sizes window, Sizes shift, Sizes periodic,
                                double scale, Tensor grad_out) {
-  return with_real_type(qkv, kName, [&]<typename T>() {
+  return with_real_type(qkv, kAttention, [&]<typename T>() {
     return backward(AttentionCall<T>(qkv, bias, window, shift, periodic, scale), grad_out);
   });
 }

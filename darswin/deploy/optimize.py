@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from darswin.deploy.packed import (
+    PackedBlocks,
     PackedLinear,
     PackedNorm,
     PackedQuantizedLinear,
@@ -86,7 +87,7 @@ def optimize(
         model, dtype = _quantized(model, calibration), torch.float32
     elif calibration is not None or quantized_layers(model):
         raise ValueError(f"a quantized model and a calibration are for torch.int8, got {dtype}")
-    if (lack := onednn_lack(dtype)) is not None:
+    if dtype == torch.bfloat16 and (lack := onednn_lack(dtype)) is not None:
         warnings.warn(f"optimize goes on with torch's own products: {lack}", stacklevel=2)
     optimized = copy.deepcopy(model).eval().requires_grad_(False)
     for module in list(optimized.modules()):
@@ -110,7 +111,7 @@ def _quantized(model: Net, calibration: Iterable[Sequence] | None) -> Net:
 def _check(model: nn.Module, dtype: torch.dtype | str, lens: Lens | None) -> None:
     if not isinstance(model, (Encoder, Unet, FeatureMaps)):
         raise TypeError(f"model must be one of create_model, got {type(model).__name__}")
-    if any(isinstance(vars(block).get("norm1"), PackedNorm) for block in model.modules()):
+    if "prepare" in vars(model):
         raise TypeError("model must be one of create_model, got one that is optimized already")
     if lens is not None and (not isinstance(lens, Lens) or len(lens) != 1):
         raise ValueError(f"lens must be one lens, got {lens!r}")
@@ -150,31 +151,42 @@ def _pack(module: nn.Module, dtype: torch.dtype) -> None:
         module.norm.to(dtype)
         module.head.to(dtype)
     elif isinstance(module, Stage):
-        blocks: list[Any] = list(module.blocks)
-        fc1 = blocks[0].mlp.fc1
-        module.add = Tensor.add_
-        widest = fc1.out_features // fc1.in_features * dtype.itemsize
-        module.most_numbers = max(CACHED_BYTES // widest, 1)
-        if not isinstance(module.downsample, (PatchMerging, nn.Identity)):
-            module.downsample = InDtype(module.downsample, dtype)
-        attentions = [block.attn for block in blocks]
-        biases = [a.position_bias for a in attentions if isinstance(a, WindowAttention)]
-        relative = [bias for bias in biases if isinstance(bias, RelativeBias)]
-        if relative:
-            joined = joined_coefficients(relative)
-            module.coefficients = {name: rows.float() for name, rows in joined.items()}
+        _pack_stage(module, dtype)
     elif isinstance(module, PatchMerging):
         reduction = packed(module.reduction, dtype)
         norm = PackedNorm(module.norm, taken(reduction))
         _replace(module, reduction=reduction, norm=lambda x: norm(x)[1])
-    elif isinstance(module, Block):
-        _pack_block(module, dtype)
     elif isinstance(module, (PatchExpand, SkipJoin, PixelHead)):
         for name, layer in list(module.named_children()):
             if isinstance(layer, nn.LayerNorm):
                 layer.to(dtype)
             elif isinstance(layer, (nn.Linear, QuantizedLinear)):
                 _replace(module, **{name: PackedLinear(layer, dtype)})
+
+
+def _pack_stage(stage: Stage, dtype: torch.dtype) -> None:
+    blocks: list[Any] = list(stage.blocks)
+    attentions = [block.attn for block in blocks]
+    fc1 = blocks[0].mlp.fc1
+    widest = fc1.out_features // fc1.in_features * dtype.itemsize
+    stage.most_numbers = max(CACHED_BYTES // widest, 1)
+    if not isinstance(stage.downsample, (PatchMerging, nn.Identity)):
+        stage.downsample = InDtype(stage.downsample, dtype)
+    in_windows = all(isinstance(attn, WindowAttention) for attn in attentions)
+    if dtype == torch.float32 and in_windows and not quantized_layers(stage):
+        _replace(stage, _run=PackedBlocks(blocks))
+        for block in blocks:
+            _replace(block, norm1=None, norm2=None, mlp=None)
+            _replace(block.attn, qkv=None, proj=None)
+    else:
+        stage.add = Tensor.add_
+        for block in blocks:
+            _pack_block(block, dtype)
+    biases = [a.position_bias for a in attentions if isinstance(a, WindowAttention)]
+    relative = [bias for bias in biases if isinstance(bias, RelativeBias)]
+    if relative:
+        joined = joined_coefficients(relative)
+        stage.coefficients = {name: rows.float() for name, rows in joined.items()}
 
 
 def _pack_block(block: Block, dtype: torch.dtype) -> None:

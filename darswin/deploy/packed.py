@@ -4,7 +4,7 @@ that take along what stands between two products.
 They are no modules: these take a microsecond more for each call, and have weights to save or move.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cache, partial
 
 import torch
@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from darswin.layers.linear import best_seconds, onednn_lack
 from darswin.layers.quantized import Quantization, QuantizedLinear
-from darswin.layers.transformer import WindowAttention
+from darswin.layers.transformer import Block, WindowAttention
 
 __all__ = ["fastest_dtype"]
 
@@ -21,32 +21,74 @@ _OPS = torch.ops.darswin
 _ADD_NORM = _OPS._add_norm_.default
 _ADD_NORM_QUANTIZED = _OPS._add_norm_quantized_.default
 _CPU = torch._C.DispatchKeySet(torch._C.DispatchKey.CPU)
+# Not by way of autograd, which would look for gradients and count versions: there are none.
+_LINEAR = partial(_OPS._linear.default.redispatch, _CPU)
+_BLOCKS = partial(_OPS._blocks_.default.redispatch, _CPU)
+_PANEL, _UNIT = 48, 16  # as in csrc/linear.h
 
 
 class PackedLinear:
-    """A linear layer in `dtype`, with GELU if asked; torch's own product where oneDNN lacks it."""
+    """A linear layer in float32 or bfloat16, with GELU if asked."""
 
     def __init__(self, linear: object, dtype: torch.dtype, *, gelu: bool = False):
         if not isinstance(linear, nn.Linear):
             raise ValueError(f"this layer must be a linear one, got {type(linear).__name__}")
         self.in_features, self.out_features = linear.in_features, linear.out_features
-        self.packed, self.gelu = onednn_lack(dtype) is None, gelu
-        # Tensors that are no parameters: in this layout they can be neither moved nor saved.
-        weight, self.bias = (
+        self._product: Callable[[Tensor], Tensor]
+        if dtype == torch.float32:
+            weights = packed_weights(linear)
+            self._product = lambda x: _LINEAR(x, weights, self.out_features, gelu)
+            return
+        # Tensors that are no parameters: in oneDNN's layout they can be neither moved nor saved.
+        weight, bias = (
             None if t is None else t.detach().to(dtype, copy=True)
             for t in (linear.weight, linear.bias)
         )
-        self.weight = torch.ops.mkldnn._reorder_linear_weight(weight) if self.packed else weight
-        if self.packed:
-            self._product = torch.ops.mkldnn._linear_pointwise.default
-            self._after: tuple = ("gelu", [], "none") if gelu else ("none", [], "")
+        if onednn_lack(dtype) is None:
+            weight = torch.ops.mkldnn._reorder_linear_weight(weight)
+            product = torch.ops.mkldnn._linear_pointwise.default
+            after: tuple = ("gelu", [], "none") if gelu else ("none", [], "")
+            self._product = lambda x: product(x, weight, bias, *after)
+        elif gelu:
+            self._product = lambda x: F.gelu(F.linear(x, weight, bias))
+        else:
+            self._product = lambda x: F.linear(x, weight, bias)
 
     def __call__(self, x: Tensor) -> Tensor:
         """(..., D) → (..., D')."""
-        if self.packed:
-            return self._product(x, self.weight, self.bias, *self._after)
-        x = F.linear(x, self.weight, self.bias)
-        return F.gelu(x) if self.gelu else x
+        return self._product(x)
+
+
+def packed_weights(linear: nn.Linear) -> Tensor:
+    """The bias and the weight of a linear layer in the order of csrc/linear.h, (K,) float32."""
+    weight = linear.weight.detach().float()
+    bias = weight.new_zeros(len(weight)) if linear.bias is None else linear.bias.detach().float()
+    padding = -len(weight) % _UNIT
+    panels = F.pad(weight, (0, 0, 0, padding)).split(_PANEL)
+    return torch.cat([F.pad(bias, (0, padding)), *(panel.t().flatten() for panel in panels)])
+
+
+class PackedBlocks:
+    """The blocks of a stage in float32, as one operator: `Stage.run_blocks`."""
+
+    def __init__(self, blocks: Sequence[Block]):
+        self._parameters, self._windows = [], []
+        for block in blocks:
+            attn, mlp = block.attn, block.mlp
+            for part in (block.norm1, attn.qkv, attn.proj, block.norm2, mlp.fc1, mlp.fc2):
+                if isinstance(part, nn.LayerNorm):
+                    self._parameters.append(torch.stack((part.weight, part.bias)).detach().float())
+                else:
+                    self._parameters.append(packed_weights(part))
+            self._windows += [*attn.window, *attn.shift, *attn.periodic]
+        self._sizes = (blocks[0].attn.num_heads, blocks[0].mlp.fc1.out_features)
+        self._eps = blocks[0].norm1.eps
+
+    def __call__(self, x: Tensor, tables: Sequence[Tensor]) -> Tensor:
+        """The map of the stage, which changes in place, and the position biases of the blocks."""
+        x = x.contiguous()
+        _BLOCKS(x, self._parameters, tables, self._windows, *self._sizes, self._eps)
+        return x
 
 
 class PackedQuantizedLinear:

@@ -1,0 +1,132 @@
+// _linear and _blocks_ on CPU: the linear layers and the transformer blocks of optimized models.
+//
+// The Python calls that describe a small block take longer than its arithmetic. So all blocks of a
+// stage are one operator, which goes from kernel to kernel.
+#include <algorithm>
+#include <cmath>
+#include <vector>
+
+#include "add_norm.h"
+#include "linear.h"
+#include "window_attention_call.h"
+
+namespace darswin {
+namespace {
+
+constexpr char kName[] = "_blocks_";
+
+const float* floats(const Tensor& tensor, int64_t count) {
+  STD_TORCH_CHECK(tensor.is_cpu() && tensor.scalar_type() == ScalarType::Float &&
+                      tensor.is_contiguous() && tensor.numel() == count,
+                  kName, ": a parameter has a wrong type, layout or number of values");
+  return pointer<float>(tensor);
+}
+
+// out = the linear layer of x, or its GELU, or out and it. Threads share the rows of a long map,
+// and the columns of the result of a short one.
+void multiply(const float* x, int64_t rows, int64_t depth, const Tensor& packed, int64_t columns,
+              float* out, After after = After::nothing) {
+  LinearArgs args{x, nullptr, out, rows, depth, columns, after};
+  args.packed = floats(packed, args.packed_size());
+  const auto& kernel = kernels<LinearKernels>().rows;
+  constexpr int64_t kRows = 8;             // ranges begin at a multiple: no tile of rows is cut
+  constexpr double kPerMicrosecond = 5e4;  // multiply-adds, on a CPU with AVX2
+  const double work = static_cast<double>(rows) * depth * columns;
+  const int64_t threads = threads_for(work / kPerMicrosecond);
+  const int64_t tiles = (rows + kRows - 1) / kRows, panels = args.panels();
+  if (panels < threads || tiles >= 16 * threads) {
+    parallel_ranges(tiles, threads, [&](int64_t begin, int64_t end) {
+      kernel(args, begin * kRows, std::min(end * kRows, rows), 0, panels);
+    });
+  } else {
+    parallel_ranges(panels, threads,
+                    [&](int64_t begin, int64_t end) { kernel(args, 0, rows, begin, end); });
+  }
+}
+
+Tensor linear(Tensor x, Tensor packed, int64_t columns, bool gelu) {
+  STD_TORCH_CHECK(x.is_cpu() && x.scalar_type() == ScalarType::Float && x.dim() > 0 &&
+                      x.size(x.dim() - 1) > 0 && columns > 0,
+                  "_linear: x must be float32 (..., D) on the CPU");
+  x = contiguous(x);
+  Sizes sizes = x.sizes().vec();
+  const int64_t depth = sizes.back();
+  check_product({depth, columns});
+  sizes.back() = columns;
+  const Tensor out = new_empty(x, sizes);
+  ask_for_large_pages(out);
+  multiply(pointer<float>(x), x.numel() / depth, depth, packed, columns,
+           mutable_pointer<float>(out), gelu ? After::gelu : After::nothing);
+  return out;
+}
+
+// The blocks of a stage, which change the residual x.
+struct Blocks {
+  int64_t heads, mlp_dim;
+  float eps;
+  Tensor x;
+  int64_t dim = x.size(3), rows = x.numel() / dim;
+  Tensor normed = new_empty(x, x.sizes()), hidden = new_empty(x, Sizes{rows, mlp_dim});
+  Tensor qkv = new_empty(x, Sizes{x.size(0), x.size(1), x.size(2), 3, heads, dim / heads});
+
+  // parameters: the weight and the bias, (2, D)
+  void norm(const Tensor& parameters) {
+    AddNormArgs<float, float> args{.x = mutable_pointer<float>(x),
+                                   .out = mutable_pointer<float>(normed),
+                                   .weight = floats(parameters, 2 * dim),
+                                   .eps = eps,
+                                   .width = dim};
+    args.bias = args.weight + dim;
+    constexpr double kPerMicrosecond = 4000;  // numbers
+    const int64_t threads = threads_for(static_cast<double>(x.numel()) / kPerMicrosecond);
+    parallel_ranges(rows, threads, [&](int64_t begin, int64_t end) {
+      kernels<AddNormKernels<float, float>>().rows(args, begin, end);
+    });
+  }
+
+  // The six parameters of a block, and the window, the shift and the periodic axes of its
+  // attention.
+  void block(const Tensor* parameters, const Tensor& table, const int64_t* windows) {
+    const auto *tokens = pointer<float>(normed), *hidden_tokens = pointer<float>(hidden);
+    auto* residual = mutable_pointer<float>(x);
+    norm(parameters[0]);
+    multiply(tokens, rows, dim, parameters[1], 3 * dim, mutable_pointer<float>(qkv));
+    attend(table, windows);
+    multiply(tokens, rows, dim, parameters[2], dim, residual, After::add);
+    norm(parameters[3]);
+    multiply(tokens, rows, dim, parameters[4], mlp_dim, mutable_pointer<float>(hidden),
+             After::gelu);
+    multiply(hidden_tokens, rows, mlp_dim, parameters[5], dim, residual, After::add);
+  }
+
+  // From `qkv` to `normed`.
+  void attend(const Tensor& table, const int64_t* windows) {
+    const auto pair = [&](int k) { return Sizes(windows + k, windows + k + 2); };
+    const double scale = 1 / std::sqrt(static_cast<double>(dim / heads));
+    AttentionCall<float> call(qkv, table, pair(0), pair(2), pair(4), scale);
+    call.args.out = mutable_pointer<float>(normed);
+    call.run(call.args.windows * heads, kernels<WindowAttentionKernels<float>>().forward);
+  }
+};
+
+void blocks_(Tensor x, std::vector<Tensor> parameters, std::vector<Tensor> tables, Sizes windows,
+             int64_t heads, int64_t mlp_dim, double eps) {
+  const size_t count = tables.size();
+  STD_TORCH_CHECK(x.is_cpu() && x.scalar_type() == ScalarType::Float && x.dim() == 4 &&
+                      x.is_contiguous() && heads > 0 && x.size(3) > 0 && x.size(3) % heads == 0 &&
+                      mlp_dim > 0 && parameters.size() == 6 * count && windows.size() == 6 * count,
+                  kName, ": wrong arguments");
+  if (x.numel() == 0) return;
+  Blocks blocks{heads, mlp_dim, static_cast<float>(eps), x};
+  for (size_t k = 0; k < count; ++k) {
+    blocks.block(&parameters[6 * k], tables[k], &windows[6 * k]);
+  }
+}
+
+}  // namespace
+}  // namespace darswin
+
+STABLE_TORCH_LIBRARY_IMPL(darswin, CPU, m) {
+  m.impl("_linear", TORCH_BOX(&darswin::linear));
+  m.impl("_blocks_", TORCH_BOX(&darswin::blocks_));
+}

@@ -1,0 +1,40 @@
+// What the driver of linear layers and its kernels agree on.
+#pragma once
+
+#include <cstdint>
+
+#include "tier.h"
+
+namespace darswin {
+
+// A packed linear layer is one array of floats: the bias, then the weight in panels of kPanel
+// columns, each a matrix (depth, columns of the panel). The last panel has as many columns as are
+// left. The columns are padded with zeros to a multiple of kPanelUnit.
+constexpr int64_t kPanel = 48, kPanelUnit = 16;
+
+// The step that follows the product.
+enum class After {
+  nothing,
+  gelu,
+  add,  // to what `out` holds
+};
+
+// out = x * weight^T + bias
+struct LinearArgs {
+  const float* x;       // (rows, depth)
+  const float* packed;  // bias and weight
+  float* out;           // (rows, columns)
+  int64_t rows, depth, columns;
+  After after;
+
+  int64_t padded() const { return (columns + kPanelUnit - 1) / kPanelUnit * kPanelUnit; }
+  int64_t packed_size() const { return padded() * (1 + depth); }
+  int64_t panels() const { return (padded() + kPanel - 1) / kPanel; }
+};
+
+struct LinearKernels {
+  // The columns of panels [first, last) of rows [begin, end).
+  void (*rows)(const LinearArgs&, int64_t begin, int64_t end, int64_t first, int64_t last);
+};
+
+}  // namespace darswin
