@@ -1,4 +1,4 @@
-// _linear and _blocks_ on CPU: the linear layers and the transformer blocks of optimized models.
+// _norm, _linear and _blocks_ on CPU: the layers and the transformer blocks of optimized models.
 //
 // The Python calls that describe a small block take longer than its arithmetic. So all blocks of a
 // stage are one operator, which goes from kernel to kernel.
@@ -44,11 +44,42 @@ void multiply(const float* x, int64_t rows, int64_t depth, const Tensor& packed,
   }
 }
 
+// out = the layer norm of rows of x; the parameters are its weight and its bias, (2, D).
+void normalize(const float* x, int64_t rows, int64_t dim, const Tensor& parameters, double eps,
+               float* out) {
+  // Without a summand x is only read.
+  AddNormArgs<float, float> args{.x = const_cast<float*>(x),
+                                 .out = out,
+                                 .weight = floats(parameters, 2 * dim),
+                                 .eps = static_cast<float>(eps),
+                                 .width = dim};
+  args.bias = args.weight + dim;
+  constexpr double kPerMicrosecond = 4000;  // numbers
+  const int64_t threads = threads_for(static_cast<double>(rows) * dim / kPerMicrosecond);
+  parallel_ranges(rows, threads, [&](int64_t begin, int64_t end) {
+    kernels<AddNormKernels<float, float>>().rows(args, begin, end);
+  });
+}
+
+// float32 (..., D) on the CPU, contiguous.
+Tensor checked_tokens(const Tensor& x) {
+  STD_TORCH_CHECK(
+      x.is_cpu() && x.scalar_type() == ScalarType::Float && x.dim() > 0 && x.size(x.dim() - 1) > 0,
+      kName, ": x must be float32 (..., D) on the CPU");
+  return contiguous(x);
+}
+
+Tensor norm(Tensor x, Tensor parameters, double eps) {
+  x = checked_tokens(x);
+  const int64_t dim = x.size(x.dim() - 1);
+  const Tensor out = new_empty(x, x.sizes());
+  normalize(pointer<float>(x), x.numel() / dim, dim, parameters, eps, mutable_pointer<float>(out));
+  return out;
+}
+
 Tensor linear(Tensor x, Tensor packed, int64_t columns, bool gelu) {
-  STD_TORCH_CHECK(x.is_cpu() && x.scalar_type() == ScalarType::Float && x.dim() > 0 &&
-                      x.size(x.dim() - 1) > 0 && columns > 0,
-                  "_linear: x must be float32 (..., D) on the CPU");
-  x = contiguous(x);
+  x = checked_tokens(x);
+  STD_TORCH_CHECK(columns > 0, kName, ": no columns");
   Sizes sizes = x.sizes().vec();
   const int64_t depth = sizes.back();
   check_product({depth, columns});
@@ -63,37 +94,23 @@ Tensor linear(Tensor x, Tensor packed, int64_t columns, bool gelu) {
 // The blocks of a stage, which change the residual x.
 struct Blocks {
   int64_t heads, mlp_dim;
-  float eps;
+  double eps;
   Tensor x;
   int64_t dim = x.size(3), rows = x.numel() / dim;
   Tensor normed = new_empty(x, x.sizes()), hidden = new_empty(x, Sizes{rows, mlp_dim});
   Tensor qkv = new_empty(x, Sizes{x.size(0), x.size(1), x.size(2), 3, heads, dim / heads});
-
-  // parameters: the weight and the bias, (2, D)
-  void norm(const Tensor& parameters) {
-    AddNormArgs<float, float> args{.x = mutable_pointer<float>(x),
-                                   .out = mutable_pointer<float>(normed),
-                                   .weight = floats(parameters, 2 * dim),
-                                   .eps = eps,
-                                   .width = dim};
-    args.bias = args.weight + dim;
-    constexpr double kPerMicrosecond = 4000;  // numbers
-    const int64_t threads = threads_for(static_cast<double>(x.numel()) / kPerMicrosecond);
-    parallel_ranges(rows, threads, [&](int64_t begin, int64_t end) {
-      kernels<AddNormKernels<float, float>>().rows(args, begin, end);
-    });
-  }
 
   // The six parameters of a block, and the window, the shift and the periodic axes of its
   // attention.
   void block(const Tensor* parameters, const Tensor& table, const int64_t* windows) {
     const auto *tokens = pointer<float>(normed), *hidden_tokens = pointer<float>(hidden);
     auto* residual = mutable_pointer<float>(x);
-    norm(parameters[0]);
+    auto* to = mutable_pointer<float>(normed);
+    normalize(residual, rows, dim, parameters[0], eps, to);
     multiply(tokens, rows, dim, parameters[1], 3 * dim, mutable_pointer<float>(qkv));
     attend(table, windows);
     multiply(tokens, rows, dim, parameters[2], dim, residual, After::add);
-    norm(parameters[3]);
+    normalize(residual, rows, dim, parameters[3], eps, to);
     multiply(tokens, rows, dim, parameters[4], mlp_dim, mutable_pointer<float>(hidden),
              After::gelu);
     multiply(hidden_tokens, rows, mlp_dim, parameters[5], dim, residual, After::add);
@@ -117,7 +134,9 @@ void blocks_(Tensor x, std::vector<Tensor> parameters, std::vector<Tensor> table
                       mlp_dim > 0 && parameters.size() == 6 * count && windows.size() == 6 * count,
                   kName, ": wrong arguments");
   if (x.numel() == 0) return;
-  Blocks blocks{heads, mlp_dim, static_cast<float>(eps), x};
+  check_product({x.size(3), mlp_dim});
+  check_product({x.numel() / x.size(3), mlp_dim});
+  Blocks blocks{heads, mlp_dim, eps, x};
   for (size_t k = 0; k < count; ++k) {
     blocks.block(&parameters[6 * k], tables[k], &windows[6 * k]);
   }
@@ -127,6 +146,7 @@ void blocks_(Tensor x, std::vector<Tensor> parameters, std::vector<Tensor> table
 }  // namespace darswin
 
 STABLE_TORCH_LIBRARY_IMPL(darswin, CPU, m) {
+  m.impl("_norm", TORCH_BOX(&darswin::norm));
   m.impl("_linear", TORCH_BOX(&darswin::linear));
   m.impl("_blocks_", TORCH_BOX(&darswin::blocks_));
 }

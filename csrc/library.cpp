@@ -44,6 +44,7 @@ STABLE_TORCH_LIBRARY(darswin, m) {
   m.def(
       "_window_attention_quantized(Tensor qkv, Tensor bias, int[] window, int[] shift, "
       "int[] periodic, float scale, float out_scale, int zero_point) -> Tensor");
+  m.def("_norm(Tensor x, Tensor parameters, float eps) -> Tensor");
   m.def("_linear(Tensor x, Tensor packed, int columns, bool gelu) -> Tensor");
   m.def(
       "_blocks_(Tensor(a!) x, Tensor[] parameters, Tensor[] tables, int[] windows, int heads, "

@@ -1,6 +1,7 @@
 """Models for inference: weights packed for oneDNN, GELU inside of the products, each residual and
 the norm behind it in one."""
 
+import contextlib
 import copy
 import warnings
 from collections.abc import Callable, Iterable, Sequence
@@ -17,12 +18,19 @@ from darswin.deploy.packed import (
     fastest_dtype,
     packed,
     packed_attention,
+    packed_norm,
     taken,
 )
 from darswin.deploy.quantize import quantize_model
+from darswin.layers.embed import PolarPatchEmbed
 from darswin.layers.linear import onednn_lack
 from darswin.layers.position_bias import RelativeBias, joined_coefficients
-from darswin.layers.quantized import QuantizedLinear, quantized_layers, without_quantized_layers
+from darswin.layers.quantized import (
+    Quantization,
+    QuantizedLinear,
+    quantized_layers,
+    without_quantized_layers,
+)
 from darswin.layers.transformer import Block, PatchMerging, Stage, Tables, WindowAttention
 from darswin.lens import Lens
 from darswin.models.base import Model
@@ -127,35 +135,46 @@ def _check(model: nn.Module, dtype: torch.dtype | str, lens: Lens | None) -> Non
 
 
 class InDtype(nn.Module):
-    """A module as it is, in bfloat16 under autocast, and its result in `dtype`."""
+    """A module as it is, in bfloat16 under autocast, its result in `dtype`, and a norm of that."""
 
-    def __init__(self, module: nn.Module, dtype: torch.dtype):
+    def __init__(
+        self, module: nn.Module, dtype: torch.dtype, norm: Callable[[Tensor], Tensor] | None = None
+    ):
         super().__init__()
-        self.module, self.dtype = module, dtype
+        self.module, self.dtype, self.norm = module, dtype, norm
 
     def forward(self, *arguments, **options) -> Tensor:
-        with torch.autocast("cpu", torch.bfloat16, enabled=self.dtype == torch.bfloat16):
+        narrow = self.dtype == torch.bfloat16
+        autocast: Any = contextlib.nullcontext()
+        if narrow or torch.is_autocast_enabled("cpu"):
+            autocast = torch.autocast("cpu", torch.bfloat16, enabled=narrow)
+        with autocast:
             result = self.module(*arguments, **options).to(self.dtype)
         if torch.is_grad_enabled() and result.requires_grad:
             raise RuntimeError(
                 "an optimized model has no gradients, but its images or its lens require one: call "
                 "it under torch.no_grad(), or use the model it was made of"
             )
-        return result
+        return result if self.norm is None else self.norm(result)
 
 
 def _pack(module: nn.Module, dtype: torch.dtype) -> None:
     """Replaces the linear layers and the norms of a module, and what is computed in its dtype."""
     if isinstance(module, Encoder):
-        module.patch_embed = InDtype(module.patch_embed, dtype)
-        module.norm.to(dtype)
+        _pack_norm(module, dtype)
+        embed, norm = module.patch_embed, None
+        is_float = next(embed.parameters()).dtype == torch.float32
+        if dtype == torch.float32 and is_float and isinstance(embed, PolarPatchEmbed):
+            norm = packed_norm(embed.norm, dtype)
+            embed.norm = nn.Identity()
+        module.patch_embed = InDtype(embed, dtype, norm)
         module.head.to(dtype)
     elif isinstance(module, Stage):
         _pack_stage(module, dtype)
     elif isinstance(module, PatchMerging):
         reduction = packed(module.reduction, dtype)
-        norm = PackedNorm(module.norm, taken(reduction))
-        _replace(module, reduction=reduction, norm=lambda x: norm(x)[1])
+        _replace(module, reduction=reduction)
+        _pack_norm(module, dtype, taken(reduction))
     elif isinstance(module, (PatchExpand, SkipJoin, PixelHead)):
         for name, layer in list(module.named_children()):
             if isinstance(layer, nn.LayerNorm):
@@ -207,8 +226,14 @@ def _pack_block(block: Block, dtype: torch.dtype) -> None:
     else:
         fc1 = PackedLinear(mlp.fc1, dtype, gelu=True)
     _replace(mlp, fc1=fc1, fc2=fc2, activation=None)
-    norm1, norm2 = PackedNorm(block.norm1, quantization), PackedNorm(block.norm2, taken(fc1))
+    norm1 = PackedNorm(block.norm1, dtype, quantization)
+    norm2 = PackedNorm(block.norm2, dtype, taken(fc1))
     _replace(block, norm1=norm1, norm2=norm2, mlp=mlp.forward)
+
+
+def _pack_norm(module: Any, dtype: torch.dtype, quantization: Quantization | None = None) -> None:
+    if isinstance(module.norm, nn.LayerNorm):  # else an identity
+        _replace(module, norm=packed_norm(module.norm, dtype, quantization))
 
 
 def _replace(module: nn.Module, **layers: Any) -> None:

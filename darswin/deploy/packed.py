@@ -6,6 +6,7 @@ They are no modules: these take a microsecond more for each call, and have weigh
 
 from collections.abc import Callable, Sequence
 from functools import cache, partial
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -18,12 +19,19 @@ from darswin.layers.transformer import Block, WindowAttention
 __all__ = ["fastest_dtype"]
 
 _OPS = torch.ops.darswin
-_ADD_NORM = _OPS._add_norm_.default
-_ADD_NORM_QUANTIZED = _OPS._add_norm_quantized_.default
 _CPU = torch._C.DispatchKeySet(torch._C.DispatchKey.CPU)
-# Not by way of autograd, which would look for gradients and count versions: there are none.
-_LINEAR = partial(_OPS._linear.default.redispatch, _CPU)
-_BLOCKS = partial(_OPS._blocks_.default.redispatch, _CPU)
+
+
+def _operator(name: str) -> Callable[..., Any]:
+    # Not by way of autograd, which would look for gradients and count versions: there are none.
+    return partial(getattr(_OPS, name).default.redispatch, _CPU)
+
+
+_ADD_NORM = _operator("_add_norm_")
+_ADD_NORM_QUANTIZED = _operator("_add_norm_quantized_")
+_NORM = _operator("_norm")
+_LINEAR = _operator("_linear")
+_BLOCKS = _operator("_blocks_")
 _PANEL, _UNIT = 48, 16  # as in csrc/linear.h
 
 
@@ -68,6 +76,11 @@ def packed_weights(linear: nn.Linear) -> Tensor:
     return torch.cat([F.pad(bias, (0, padding)), *(panel.t().flatten() for panel in panels)])
 
 
+def norm_parameters(norm: nn.LayerNorm) -> Tensor:
+    """The weight and the bias of a norm, (2, D) float32."""
+    return torch.stack((norm.weight, norm.bias)).detach().float()
+
+
 class PackedBlocks:
     """The blocks of a stage in float32, as one operator: `Stage.run_blocks`."""
 
@@ -76,10 +89,8 @@ class PackedBlocks:
         for block in blocks:
             attn, mlp = block.attn, block.mlp
             for part in (block.norm1, attn.qkv, attn.proj, block.norm2, mlp.fc1, mlp.fc2):
-                if isinstance(part, nn.LayerNorm):
-                    self._parameters.append(torch.stack((part.weight, part.bias)).detach().float())
-                else:
-                    self._parameters.append(packed_weights(part))
+                pack = norm_parameters if isinstance(part, nn.LayerNorm) else packed_weights
+                self._parameters.append(pack(part))
             self._windows += [*attn.window, *attn.shift, *attn.periodic]
         self._sizes = (blocks[0].attn.num_heads, blocks[0].mlp.fc1.out_features)
         self._eps = blocks[0].norm1.eps
@@ -131,25 +142,39 @@ def taken(product: object) -> Quantization | None:
     return product.activation if isinstance(product, PackedQuantizedLinear) else None
 
 
+def packed_norm(
+    norm: nn.LayerNorm, dtype: torch.dtype, quantization: Quantization | None = None
+) -> Callable[[Tensor], Tensor]:
+    """A layer norm of `dtype`, of 8 bits where a quantization is given."""
+    if dtype == torch.float32 and quantization is None:
+        parameters = norm_parameters(norm)
+        return lambda x: _NORM(x, parameters, norm.eps)
+    weight, bias = norm_parameters(norm)
+    if quantization is not None:
+        given = (weight, bias, norm.eps, *quantization)
+        return lambda x: _ADD_NORM_QUANTIZED(x.contiguous(), None, *given)
+    return lambda x: torch.layer_norm(x, norm.normalized_shape, weight, bias, norm.eps)
+
+
 class PackedNorm:
     """`AddNorm` in one pass over memory. The norm is of 8 bits where a quantization is given."""
 
-    def __init__(self, norm: object, quantization: Quantization | None):
-        assert isinstance(norm, nn.LayerNorm)
-        self.shape, self.eps, self.quantization = norm.normalized_shape, norm.eps, quantization
-        self.weight, self.bias = (t.detach().float() for t in (norm.weight, norm.bias))
+    def __init__(
+        self, norm: nn.LayerNorm, dtype: torch.dtype, quantization: Quantization | None = None
+    ):
+        self.norm = packed_norm(norm, dtype, quantization)
+        self._given = (*norm_parameters(norm), norm.eps)
+        self.quantization = quantization
 
     def __call__(self, x: Tensor, branch: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """As `AddNorm`. The sum takes the place of x, and the norm may take that of `branch`."""
         x = x.contiguous()
-        # Not by way of autograd, which would look for gradients and count versions: there are none.
-        if self.quantization is not None:
-            given = (self.weight, self.bias, self.eps, *self.quantization)
-            return x, _ADD_NORM_QUANTIZED.redispatch(_CPU, x, branch, *given)
         if branch is None:
-            return x, torch.layer_norm(x, self.shape, self.weight, self.bias, self.eps)
+            return x, self.norm(x)
         branch = branch.contiguous()
-        _ADD_NORM.redispatch(_CPU, x, branch, self.weight, self.bias, self.eps)
+        if self.quantization is not None:
+            return x, _ADD_NORM_QUANTIZED(x, branch, *self._given, *self.quantization)
+        _ADD_NORM(x, branch, *self._given)
         return x, branch
 
 

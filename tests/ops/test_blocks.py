@@ -1,0 +1,185 @@
+"""The private operators of optimized models: norms, linear layers and the blocks of a stage."""
+
+import math
+
+import pytest
+import torch
+import torch.nn.functional as F
+from cases import assert_same_bits_on_any_number_of_threads
+from torch import nn
+
+from darswin.deploy.packed import PackedBlocks, norm_parameters, packed_weights
+from darswin.layers.transformer import Block, WindowAttention
+from darswin.ops import use_reference
+
+_norm, _linear = torch.ops.darswin._norm, torch.ops.darswin._linear
+# Rows, depth, columns: less than a tile, a tile and a rest, one panel and several, one part of the
+# depth and several, what the models have, and none.
+SIZES = [(1, 1, 1), (3, 5, 7), (9, 24, 72), (64, 48, 192), (33, 129, 50), (16, 384, 96),
+         (7, 300, 1), (300, 96, 10), (256, 96, 288), (20, 1536, 64), (0, 8, 8)]  # fmt: skip
+
+
+def layer(depth, columns, bias=True):
+    return nn.Linear(depth, columns, bias).requires_grad_(False)
+
+
+@pytest.mark.parametrize("gelu", [False, True])
+@pytest.mark.parametrize("size", SIZES, ids=str)
+def test_linear_is_as_accurate_as_torch(size, gelu):
+    rows, depth, columns = size
+    linear, x = layer(depth, columns, bias=depth % 2 == 0), torch.randn(rows, depth)
+    got = _linear(x, packed_weights(linear), columns, gelu)
+    bias = None if linear.bias is None else linear.bias.double()
+    want, own = F.linear(x.double(), linear.weight.double(), bias), linear(x)
+    if gelu:
+        want, own = F.gelu(want), F.gelu(own)
+    assert got.shape == want.shape and got.dtype == torch.float32
+    if rows:
+        floor = 4 * torch.finfo(torch.float32).eps * want.abs().max()
+        assert (got - want).abs().max() <= max(2 * (own - want).abs().max(), floor)
+
+
+def test_gelu_keeps_its_digits_far_from_zero_too():
+    x = torch.cat((torch.linspace(-13, 13, 10_001), torch.tensor([-0.0, 0.0, 1e30])))[:, None]
+    unit = nn.Linear(1, 1)
+    with torch.no_grad():
+        unit.weight.fill_(1.0), unit.bias.zero_()
+    got = _linear(x, packed_weights(unit), 1, True).double()
+    want = x.double() * torch.erfc(-x.double() / math.sqrt(2)) / 2
+    relative = ((got - want).abs() / want.abs().clamp(min=1e-30)).flatten()
+    near = x.flatten().abs() < 5
+    assert relative[near].max() < 1e-6  # torch's own loses all digits at -5
+    assert relative.max() < 1e-5 and (got - want).abs()[:-1].max() < 1e-6
+
+
+def test_linear_of_numbers_that_are_not_finite():
+    linear, x = layer(40, 60), torch.randn(12, 40)
+    clean = _linear(x, packed_weights(linear), 60, True)
+    x[3, 2], x[7, 39] = math.nan, math.inf
+    got = _linear(x, packed_weights(linear), 60, True)
+    assert got[3].isnan().all()
+    rising = linear.weight[:, 39] > 0
+    assert (got[7][rising] == math.inf).all() and not got[7][~rising].isfinite().any()
+    kept = [row for row in range(12) if row not in (3, 7)]
+    assert torch.equal(got[kept], clean[kept])
+    eye = nn.Linear(2, 2, bias=False)
+    with torch.no_grad():
+        eye.weight.copy_(torch.eye(2))
+    large = torch.tensor([[3e38, -3e38]])
+    assert torch.equal(_linear(large, packed_weights(eye), 2, True), torch.tensor([[3e38, -0.0]]))
+
+
+def test_rows_do_not_depend_on_each_other():
+    linear, x = layer(200, 100), torch.randn(2, 70, 200)
+    weights = packed_weights(linear)
+    whole = _linear(x, weights, 100, True)
+    for rows in (slice(0, 1), slice(3, 12), slice(5, 70)):
+        assert torch.equal(_linear(x[:, rows], weights, 100, True), whole[:, rows])
+    strided = x.transpose(0, 1)
+    assert torch.equal(_linear(strided, weights, 100, True), whole.transpose(0, 1))
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (3, 7), (2, 5, 37), (64, 384), (0, 8)], ids=str)
+def test_norm_is_as_accurate_as_torch(shape):
+    norm, x = nn.LayerNorm(shape[-1]).requires_grad_(False), 5 + torch.randn(shape)
+    nn.init.normal_(norm.weight), nn.init.normal_(norm.bias)
+    kept, got = x.clone(), _norm(x, norm_parameters(norm), norm.eps)
+    assert torch.equal(x, kept) and got.shape == x.shape
+    if x.numel():
+        want = norm.double()(x.double())
+        own = (norm.float()(x) - want).abs().max()
+        floor = 4 * torch.finfo(torch.float32).eps * want.abs().max()
+        assert (got - want).abs().max() <= max(2 * own, floor)
+
+
+def stage(dim=24, heads=3, map_size=(8, 16), window=(4, 8), depth=3):
+    torch.manual_seed(0)
+    blocks = []
+    for index in range(depth):
+        attn = WindowAttention(
+            dim,
+            heads,
+            map_size=map_size,
+            window=window,
+            shift=(window[0] // 2, window[1] // 2) if index % 2 else (0, 0),
+            periodic=(False, index > 0),
+        )
+        nn.init.normal_(attn.position_bias.table)
+        blocks.append(Block(dim, attn, mlp_ratio=2.5))
+        for norm in (blocks[-1].norm1, blocks[-1].norm2):
+            nn.init.normal_(norm.weight), nn.init.normal_(norm.bias)
+    return nn.ModuleList(blocks).requires_grad_(False).eval()
+
+
+def run(blocks, x):
+    branch = None
+    for block in blocks:
+        x, branch = block(x, branch, None)
+    return x + branch
+
+
+@pytest.mark.parametrize("batch", [0, 1, 3])
+@pytest.mark.parametrize(
+    "sizes",
+    [{}, dict(dim=10, heads=1, map_size=(1, 6), window=(1, 3)), dict(dim=64, heads=2, depth=1)],
+    ids=str,
+)
+def test_blocks_are_those_of_the_layers(batch, sizes):
+    blocks = stage(**sizes)
+    map_size, dim = blocks[0].attn.map_size, blocks[0].attn.dim
+    x = torch.randn(batch, *map_size, dim)
+    tables = [block.attn.position_bias().contiguous() for block in blocks]
+    own = run(blocks, x)
+    got = PackedBlocks(blocks)(x.clone(), tables)
+    with use_reference():
+        want = run(blocks.double(), x.double())
+    assert got.shape == want.shape
+    if batch:
+        floor = 4 * torch.finfo(torch.float32).eps * want.abs().max()
+        assert (got - want).abs().max() <= max(2 * (own - want).abs().max(), floor)
+
+
+def test_same_bits_on_any_number_of_threads():
+    blocks, linear = stage(dim=48, map_size=(16, 32)), layer(700, 500)
+    x, rows = torch.randn(4, 16, 32, 48), torch.randn(100, 700)
+    tables = [block.attn.position_bias().contiguous() for block in blocks]
+    packed, weights = PackedBlocks(blocks), packed_weights(linear)
+    assert_same_bits_on_any_number_of_threads(
+        lambda: dict(
+            blocks=packed(x.clone(), tables), linear=_linear(rows, weights, 500, True),
+            few=_linear(rows[:3], weights, 500, False),
+        ),
+        (1, 2, 5),
+    )  # fmt: skip
+
+
+def test_wrong_arguments():
+    weights, norm = packed_weights(layer(6, 4)), torch.ones(2, 6)
+    x = torch.zeros(3, 6)
+    for wrong in (x.double(), x[:, :5], x[:, :0], torch.zeros(())):
+        with pytest.raises(RuntimeError, match="_blocks_"):
+            _linear(wrong, weights, 4, False)
+        with pytest.raises(RuntimeError, match="_blocks_"):
+            _norm(wrong, norm, 1e-5)
+    for packed, columns in ((weights[1:], 4), (weights.double(), 4), (weights, 40), (weights, 0),
+                            (weights, -4), (weights, 2**62)):  # fmt: skip
+        with pytest.raises(RuntimeError, match=r"_blocks_|too large"):
+            _linear(x, packed, columns, False)
+
+    blocks = stage(depth=1)
+    packed, table = PackedBlocks(blocks), blocks[0].attn.position_bias().contiguous()
+    given = dict(
+        x=torch.zeros(1, 8, 16, 24), parameters=packed._parameters, tables=[table],
+        windows=packed._windows, heads=3, mlp_dim=60, eps=1e-5,
+    )  # fmt: skip
+    torch.ops.darswin._blocks_(*given.values())
+    for change in (
+        dict(x=torch.zeros(1, 8, 16, 20)), dict(x=torch.zeros(8, 16, 24)),
+        dict(x=torch.zeros(1, 16, 8, 24).transpose(1, 2)), dict(x=torch.zeros(1, 8, 12, 24)),
+        dict(parameters=packed._parameters[:5]), dict(tables=[]), dict(tables=[table[:, :2]]),
+        dict(windows=[4, 8, 0, 0, 0]), dict(windows=[4, 7, 0, 0, 0, 1]), dict(heads=0),
+        dict(windows=[4, 8, 0, 16, 0, 1]), dict(heads=5), dict(mlp_dim=2**61), dict(mlp_dim=59),
+        dict(mlp_dim=0),
+    ):  # fmt: skip
+        with pytest.raises(RuntimeError):
+            torch.ops.darswin._blocks_(*(given | change).values())
