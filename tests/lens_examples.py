@@ -1,4 +1,4 @@
-"""Examples of every lens model: a new model is added here, and all tests of all models run it."""
+"""Examples of every lens model. Tests of all models use them; add a new model here."""
 
 import math
 from pathlib import Path
@@ -34,12 +34,12 @@ FILES = Path(__file__).parent / "lens" / "files"
 
 
 def loads(text: str, model: str | None = None, **options) -> Lens:
-    """`load` for the text of a file."""
+    """The lens in the text of a calibration file."""
     return Calibration(text, "in a string", model).lens(**options)
 
 
 def file_text(name: str) -> str:
-    """The text of a calibration of the tests."""
+    """The text of a file in tests/lens/files."""
     return FILES.joinpath(name).read_text()
 
 
@@ -52,7 +52,7 @@ OCAM_INVERSE = (605.752533, 505.883847, 86.351154, 61.948168, 71.032826, 13.4869
 
 
 def example(name: str, generator: torch.Generator, focal: tuple[float, float] = (5, 2000)) -> Lens:
-    """Four lenses of a model with random parameters, used as far as the model goes."""
+    """Four lenses of a model with random parameters, used up to their limit."""
 
     def uniform(low: float, high: float, *shape: int):
         return low + (high - low) * torch.rand(4, *shape, generator=generator, dtype=f64)
@@ -102,8 +102,8 @@ ASIDE = {
                                affine=double(1.001, -8e-4, 2e-4, 1).view(2, 2)),
 }  # fmt: skip
 
-# Of calibrations of tests/lens/files, and their cameras: r in px at `DEGREES`, computed from the
-# models' formulas with 40 digits (mpmath). Only TUM-VI's is a real camera's.
+# r, px, at `DEGREES` for files of tests/lens/files and their cameras, computed from the models'
+# formulas with 40 digits (mpmath). Only TUM-VI's calibration is of a real camera.
 DEGREES = double(10, 30, 45, 60, 75, 85, 90, 95)
 TUMVI = (33.336, 100.093, 150.289, 200.445, 249.862, 281.623, 296.876, 311.559)
 EUCM = (34.619, 103.857, 155.807, 207.761, 259.431, 293.235, 309.708, 325.715)
@@ -133,7 +133,7 @@ CALIBRATIONS = {
 
 
 def calibrated(name: str, camera: str | None = None) -> Lens:
-    """The lens of a file of tests/lens/files, as far as its model goes."""
+    """The lens of a file in tests/lens/files, used up to its limit."""
     return load(FILES / name, camera=camera, dtype=f64).with_theta_max(None)
 
 
@@ -141,7 +141,7 @@ RANDOM = ("Mei", "KannalaBrandt", "Fisheye624", "BrownConrady", "rational")
 
 
 def random_lens(name: str, seed: int, aside: float = 1.0, count: int = 8) -> Lens:
-    """Lenses with terms as calibrations have them, times `aside`, used as far as they go."""
+    """Lenses with realistic terms, the offset's times `aside`, used up to their limit."""
     generator = torch.Generator().manual_seed(seed)
 
     def uniform(low: float, high: float, *shape: int):
@@ -163,7 +163,7 @@ def random_lens(name: str, seed: int, aside: float = 1.0, count: int = 8) -> Len
     return Fisheye624(focal, 3 * radial, **terms)
 
 
-# For hypothesis: parameters as calibrations have them, and further out.
+# The ranges of parameters for hypothesis: wider than in calibrations.
 RANGES = {
     "focal": (0.5, 5000), "xi": (0, 4), "alpha": (0, 1), "beta": (0.05, 5), "omega": (0.02, 3.1),
     "radial": (-0.3, 0.3), "denominator": (-0.2, 0.2), "tangential": (-0.02, 0.02),
@@ -172,7 +172,7 @@ RANGES = {
 
 
 def first_coefficients(name: str, size: float) -> tuple[list[float], float]:
-    """The largest coefficients of a polynomial lens of a size in px, and the unit of the others."""
+    """The leading coefficients of a polynomial lens with a size in px; the unit of the others."""
     first = {
         "OCam": [-size, 0.0],
         "OCamInverse": [size, size / math.pi * 2],
@@ -182,7 +182,7 @@ def first_coefficients(name: str, size: float) -> tuple[list[float], float]:
 
 
 def points_around(theta_max: float, count: int = 200) -> np.ndarray:
-    """Unit vectors (count, 3) up to θ_max from the axis, in the camera's frame."""
+    """Unit vectors (count, 3) in the camera's frame, at angles up to θ_max."""
     rng = np.random.default_rng(0)
     theta, phi = rng.uniform(0, theta_max, count), rng.uniform(-math.pi, math.pi, count)
     return np.stack((np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)), -1)
@@ -191,8 +191,8 @@ def points_around(theta_max: float, count: int = 200) -> np.ndarray:
 def assert_projects(
     lens: Lens, points: np.ndarray, pixels: np.ndarray | torch.Tensor, atol: float = 1e-9
 ) -> None:
-    """The lens takes points of the camera's frame to these pixels, as points and as rays, and the
-    pixels back to directions."""
+    """Checks that the lens projects points of the camera's frame, and their rays, to these pixels,
+    and the pixels back to directions."""
     lens = lens.with_theta_max(None)
     points, pixels = torch.as_tensor(points), torch.as_tensor(pixels)
     directions = points / points.norm(dim=-1, keepdim=True)

@@ -8,7 +8,7 @@ from typing import Any, ClassVar, Self
 import torch
 from torch import Tensor
 
-from darswin.lens.frame import ImageFrame
+from darswin.lens.frame import ImageFrame, Size
 from darswin.lens.parameter import Number
 from darswin.lens.solve import direction_of, inverse, length_of
 
@@ -187,9 +187,7 @@ class Lens(ImageFrame):
         direction: (N or 1, ..., 2), cos φ and sin φ."""
         return torch.zeros_like(theta)[..., None] * direction
 
-    def project_rays(
-        self, theta: Number, azimuth: Number, image_size: tuple[int, int] | None = None
-    ) -> Tensor:
+    def project_rays(self, theta: Number, azimuth: Number, image_size: Size = None) -> Tensor:
         """Pixels (x, y), (..., 2) px, at which rays (θ, φ) land.
 
         θ and φ, rad, broadcast; their shapes are those of `project`. image_size: (H, W).
@@ -197,9 +195,7 @@ class Lens(ImageFrame):
         (theta,), (azimuth,) = self._aligned(theta), self._aligned(azimuth)
         return self.pixels(theta, direction_of(azimuth), image_size)
 
-    def unproject_pixels(
-        self, pixels: Tensor, image_size: tuple[int, int] | None = None
-    ) -> tuple[Tensor, Tensor]:
+    def unproject_pixels(self, pixels: Tensor, image_size: Size = None) -> tuple[Tensor, Tensor]:
         """Rays (θ, φ) that land at pixels (x, y): the inverse of `project_rays`.
 
         Pixels are (N or 1, ..., 2) px; for a single lens (..., 2). image_size: (H, W). Returns θ
@@ -208,7 +204,7 @@ class Lens(ImageFrame):
         theta, direction = self.rays(pixels, image_size)
         return theta, torch.atan2(direction[..., 1], direction[..., 0])
 
-    def project_points(self, points: Tensor, image_size: tuple[int, int] | None = None) -> Tensor:
+    def project_points(self, points: Tensor, image_size: Size = None) -> Tensor:
         """Pixels at which points (x, y, z) of the camera's frame are seen.
 
         Args:
@@ -230,16 +226,14 @@ class Lens(ImageFrame):
         theta = torch.where(length > 0, theta, torch.nan)
         return self.seen_pixels(theta, points[..., :2] / aside[..., None], image_size)
 
-    def unproject_points(self, pixels: Tensor, image_size: tuple[int, int] | None = None) -> Tensor:
+    def unproject_points(self, pixels: Tensor, image_size: Size = None) -> Tensor:
         """Unit vectors (x, y, z), (N, ..., 3), towards the points seen at pixels: the inverse of
         `project_points`. NaN where no ray lands. Arguments: see `unproject_pixels`."""
         theta, direction = self.rays(pixels, image_size)
         aside = torch.sin(theta)[..., None] * direction
         return torch.cat((aside, torch.cos(theta)[..., None]), -1)
 
-    def rays(
-        self, pixels: Tensor, image_size: tuple[int, int] | None = None
-    ) -> tuple[Tensor, Tensor]:
+    def rays(self, pixels: Tensor, image_size: Size = None) -> tuple[Tensor, Tensor]:
         """`unproject_pixels` with (cos φ, sin φ), (N, ..., 2), in place of φ. At the principal
         point this is (0, 0) and has a gradient."""
         flat = self.from_pixels(pixels, image_size)
@@ -254,16 +248,12 @@ class Lens(ImageFrame):
         theta, direction: the rays that would land there without the offset."""
         raise NotImplementedError
 
-    def pixels(
-        self, theta: Tensor, direction: Tensor, image_size: tuple[int, int] | None = None
-    ) -> Tensor:
+    def pixels(self, theta: Tensor, direction: Tensor, image_size: Size = None) -> Tensor:
         """`project_rays` with (cos φ, sin φ), (N or 1, ..., 2), in place of φ: the inverse of
         `rays`."""
         return self.to_pixels(self._flat(theta, direction), image_size)
 
-    def seen_pixels(
-        self, theta: Tensor, direction: Tensor, image_size: tuple[int, int] | None = None
-    ) -> Tensor:
+    def seen_pixels(self, theta: Tensor, direction: Tensor, image_size: Size = None) -> Tensor:
         """`pixels`, but NaN where θ is NaN or beyond θ_max. Gradients are finite."""
         seen = self.sees(theta)
         inside = torch.where(seen, theta, self._row(self.theta_max, theta.dim()))
@@ -273,7 +263,7 @@ class Lens(ImageFrame):
         flat = self.project(theta)[..., None] * direction
         return flat if self.is_radial else flat + self.offset(theta, direction)
 
-    def side_angles(self, image_size: tuple[int, int] | None = None) -> Tensor:
+    def side_angles(self, image_size: Size = None) -> Tensor:
         """(N, 4) rad: θ at the image's left, upper, right and lower side.
 
         Each is taken on the row or column of the principal point. It is `theta_limit` where the
@@ -294,7 +284,7 @@ class Lens(ImageFrame):
         return {}
 
 
-def from_dict(description: Mapping[str, Any], image_size: tuple[int, int] | None = None) -> Lens:
+def from_dict(description: Mapping[str, Any], image_size: Size = None) -> Lens:
     """Makes the lens that a JSON object describes.
 
     Args:

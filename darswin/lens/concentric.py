@@ -1,7 +1,7 @@
-"""The image disc as a square: the concentric map, which keeps ratios of areas, under any lens.
+"""The concentric map from the image disc of any lens to a square. It keeps ratios of areas.
 
-Places in the square are (a, b) in [-1, 1]², a to the right and b down; its middle is the optical
-axis, its edge θ_max, and nested squares are circles of θ, equally spaced in a `Spacing`.
+Places in the square are (a, b) in [-1, 1]², a to the right and b down. The middle is the optical
+axis, the edge is θ_max, and nested squares are circles of equal θ, evenly spaced in a `Spacing`.
 
 Source: Shirley and Chiu, "A Low Distortion Map Between Disk and Square", JGT 1997.
 """
@@ -18,8 +18,8 @@ from darswin.ops.checks import tensor_there
 
 
 def square_to_disc(places: Tensor) -> tuple[Tensor, Tensor]:
-    """Places (..., 2) of the square → the disc's radius (...), in [0, 1], and (cos φ, sin φ), which
-    is (1, 0) in the middle."""
+    """The disc's radius (...), in [0, 1], and (cos φ, sin φ) at places (..., 2) of the square. The
+    direction is (1, 0) in the middle."""
     a, b = places.unbind(-1)
     wide = a.abs() >= b.abs()
     long, short = torch.where(wide, a, b), torch.where(wide, b, a)
@@ -43,7 +43,7 @@ def disc_to_square(radius: Tensor, direction: Tensor) -> Tensor:
 
 
 def square_view(lens: Lens, image_size: tuple[int, int], size: int, spacing: Spacing) -> Tensor:
-    """(N, S, S, 2) px: where in the images of (H, W) each pixel of the square of `size` S lies."""
+    """(N, S, S, 2) px: the places in images of (H, W) of the pixels of a square with `size` S."""
     if spacing == "tan":
         check_tan(lens)
     like = lens.theta_max
@@ -56,12 +56,12 @@ def square_view(lens: Lens, image_size: tuple[int, int], size: int, spacing: Spa
 
 
 def square_places(lens: Lens, image_size: tuple[int, int], spacing: Spacing) -> Tensor:
-    """(N, H, W, 2): where in the square each pixel of the images lies; `OUTSIDE` where no ray of
+    """(N, H, W, 2): the places in the square of the images' pixels; `OUTSIDE` where no ray of
     [0, θ_max] lands."""
     if spacing == "tan":
         check_tan(lens)
     theta, direction = pixel_rays(lens, image_size)
-    seen = ~theta.isnan()  # NaN must not meet the gradients
+    seen = ~theta.isnan()  # NaN must not reach the gradients
     first, last = (end[:, :, None] for end in span(lens, spacing))
     value = to_spacing(lens, torch.where(seen, theta, 0.0), spacing)
     radius = ((value - first) / (last - first)).clamp(max=1)
@@ -70,8 +70,10 @@ def square_places(lens: Lens, image_size: tuple[int, int], spacing: Spacing) -> 
 
 
 def read_square(square: Tensor, places: Tensor) -> Tensor:
-    """Squares (B, C, S, S) read at places (B or 1, H, W, 2), bilinear → (B, C, H, W). The outermost
-    half pixel counts up to the edge; `OUTSIDE` is 0."""
+    """Samples squares (B, C, S, S) at places (B or 1, H, W, 2), bilinearly: (B, C, H, W).
+
+    The outermost pixels extend to the square's edge. `OUTSIDE` gives 0.
+    """
     height, width = square.shape[2:]
     size = tensor_there((width, height), places)
     pixels = ((places + 1) * size - 1) / 2

@@ -1,4 +1,4 @@
-"""Lenses as curves: a table of radii at angles. Lenses of several models are one batch as these."""
+"""Tabulated lenses: radii at angles. Lenses of several models become one batch of them."""
 
 from collections.abc import Sequence
 
@@ -13,13 +13,13 @@ from darswin.ops.checks import readable
 
 
 class Tabulated(Lens):
-    """r at some angles, and between them the cubics that rise with the table.
+    """r at given angles, interpolated by cubics that rise. The lens ends at the last angle.
 
     Args:
-        angles: (K,) or (N, K) rad, rising from 0; K ≥ 2. radii: the same shape, px, rising from 0.
-            Others: as `Lens`; the lens ends where its table does.
-        slopes: the same shape, px/rad: dr/dθ at the angles, where it is known; a smooth curve is
-            then met to the fourth power of the steps. None finds them from the table (PCHIP).
+        angles: (K,) or (N, K) rad, rising from 0; K ≥ 2.
+        radii: the same shape, px, rising from 0. Others: see `Lens`.
+        slopes: the same shape, px/rad: dr/dθ at the angles. The error for a smooth curve is then of
+            the fourth power of the steps. None computes them from the table (PCHIP).
 
     Source: Fritsch and Carlson, SINUM 1980; Fritsch and Butland, SISSC 1984.
     """
@@ -32,7 +32,7 @@ class Tabulated(Lens):
     def _validate(self) -> None:
         if self.angles.shape != self.radii.shape or self.angles.shape[1] < 2:
             raise ValueError(
-                "angles and radii must have the same shape, at least 2 a lens, got "
+                "angles and radii must have the same shape, with at least 2 per lens, got "
                 f"{tuple(self.angles.shape)} and {tuple(self.radii.shape)}"
             )
         for name in ("angles", "radii"):
@@ -62,7 +62,7 @@ class Tabulated(Lens):
         secant = rise / width
         if secant.shape[1] == 1:
             return secant.expand(-1, 2)
-        # Inside, a weighted harmonic mean of two secants; at an end, a parabola through 3 points.
+        # Inside: a weighted harmonic mean of two secants. At the ends: a parabola through 3 points.
         before, after = width[:, :-1], width[:, 1:]
         w1, w2 = 2 * after + before, after + 2 * before
         inside = (w1 + w2) / (w1 / secant[:, :-1] + w2 / secant[:, 1:])
@@ -76,16 +76,11 @@ class Tabulated(Lens):
         return torch.cat((first, inside, last), 1)
 
     def _pieces(self, x: Tensor, table: Tensor) -> tuple[Tensor, ...]:
-        """The first θ and the width of the table's piece that each x is in; its first r, its rise,
-        and its slopes at both ends, in units of the width."""
-        rows = max(self.count, x.shape[0])
-        flat = x.detach().expand(rows, *x.shape[1:]).reshape(rows, -1)
-        table = table.detach().expand(rows, -1).contiguous()
-        shape = (rows, *x.shape[1:])
-        if self.count == 1:
-            flat = flat.reshape(1, -1)
-            table = table[:1].contiguous()
-        index = torch.searchsorted(table, flat.contiguous(), right=True) - 1
+        """Start, width, first radius, rise and end slopes of the interval that contains each x. The
+        slopes are in px per width."""
+        shape = (max(self.count, x.shape[0]), *x.shape[1:])
+        flat = x.detach().expand(shape).reshape(self.count, -1).contiguous()
+        index = torch.searchsorted(table.detach().contiguous(), flat, right=True) - 1
         index = index.clamp(0, self.angles.shape[1] - 2)
 
         def at(values: Tensor, place: Tensor) -> Tensor:
@@ -113,14 +108,14 @@ class Tabulated(Lens):
 
 
 def _steepest(angles: Tensor, radii: Tensor) -> Tensor:
-    """(N, K): three times the least secant beside each angle, up to which the cubics rise."""
+    """(N, K): the largest slopes with which cubics rise: 3 times the smaller adjacent secant."""
     secant = radii.detach().diff(dim=1) / angles.detach().diff(dim=1)
     return 3 * torch.minimum(torch.cat((secant[:, :1], secant), 1),
                              torch.cat((secant, secant[:, -1:]), 1))  # fmt: skip
 
 
 def _cubic(t: Tensor, rise: Tensor, first: Tensor, last: Tensor) -> Tensor:
-    """The cubic on [0, 1] from 0 to `rise`, with these slopes at its ends."""
+    """The cubic on [0, 1] from 0 to `rise` with the slopes `first` and `last` at its ends."""
     bend = first + last - 2 * rise
     return t * (first + t * (3 * rise - 2 * first - last + t * bend))
 
@@ -131,21 +126,20 @@ def _cubic_slope(t: Tensor, rise: Tensor, first: Tensor, last: Tensor) -> Tensor
 
 
 def as_curves(lens: Lens, count: int = 512) -> Tabulated:
-    """The lenses as tables of `count` angles with their slopes; differentiable in their parameters.
+    """The lenses as tables of `count` angles with slopes; differentiable in their parameters.
 
-    In float64, 512 angles are within 1e-7 of `r_max` of any formula here up to 0.99 of its
-    `theta_limit`; in float32, within rounding. Two things are lost: the kinks of a
-    `Tabulated` lens without slopes (to some 1e-4 of `r_max`), and an r(0) of `OCamInverse` that is
-    not quite 0, as of polynomials that were fitted.
+    In float64, 512 angles reproduce every model up to 0.99 of its `theta_limit` to 1e-7 of `r_max`;
+    in float32, to rounding. Two things are lost: the kinks of a `Tabulated` lens without slopes
+    (about 1e-4 of `r_max`), and the small r(0) of an `OCamInverse` lens with fitted coefficients.
 
     Raises:
         ValueError: a lens with tangential or thin-prism terms, or with an r(0) of more than
-            1/1000 of `r_max` or 1 px, which no curve has.
+            1/1000 of `r_max` or 1 px. Tables cannot represent these.
     """
     if not lens.is_radial:
         raise ValueError(
             "a lens with tangential or thin-prism terms is no curve; "
-            "lens.replace(tangential=None, prism=None) leaves them out"
+            "lens.replace(tangential=None, prism=None) removes them"
         )
     angles = lens.theta_max[:, None] * _fractions(lens, count)
     radii, slopes = lens.project(angles), lens._slope(angles)
@@ -157,24 +151,24 @@ def as_curves(lens: Lens, count: int = 512) -> Tabulated:
 
 
 def _check_start(radii: Tensor) -> None:
-    """ValueError unless tables (N, K) begin at 0, nearly, and rise."""
+    """Raises ValueError unless radii (N, K) begin near 0 and rise."""
     first, second, last = (radii.detach()[:, k] for k in (0, 1, -1))
     most = 1e-3 * last.clamp(max=1000)
     off = (first.abs() > most) | ~(second > 0)
     if readable(radii) and bool(off.any()):
         raise ValueError(
-            f"a lens is a curve only if r(0) is 0, to {most[off][0].item():.2g} px, and r rises "
-            f"from there; got r(0) = {first[off][0].item():.4g} px"
+            f"a lens is a curve only if r(0) is 0 to within {most[off][0].item():.2g} px and r "
+            f"rises from there; got r(0) = {first[off][0].item():.4g} px"
         )
 
 
 @torch.no_grad()
 def _fractions(lens: Lens, count: int) -> Tensor:
-    """(N, count), from 0 to 1: parts of θ_max, closer together where the slope of r changes."""
+    """(N, count): fractions of θ_max from 0 to 1, closer together where the slope of r changes."""
     like = lens.theta_max
     fractions = torch.linspace(0, 1, 2 * count, dtype=like.dtype, device=like.device)[None]
     fractions = fractions.expand(lens.count, -1)
-    # Each round places its points by the slopes at the last one's, which resolve a pole better.
+    # Each round uses the slopes at the last round's points, which resolve a pole better.
     for points in (2 * count, 2 * count, count):
         slope = lens._slope(like[:, None] * fractions)
         bends = slope.clamp(min=torch.finfo(like.dtype).tiny).log().diff(dim=1).abs()
@@ -190,11 +184,11 @@ def _fractions(lens: Lens, count: int) -> Tensor:
 
 
 def cat(lenses: Sequence[Lens]) -> Lens:
-    """One batch of all the lenses of a sequence; of several models as curves (`as_curves`).
+    """Joins lenses to one batch. Lenses of several models become curves (see `as_curves`).
 
     Raises:
-        ValueError: no lens, principal points or image sizes for only some, or several models of
-            which one is no curve.
+        ValueError: no lens; a principal point or an image size for only some lenses; or several
+            models of which one has no curve.
     """
     lenses = list(lenses)
     if not lenses:
@@ -205,18 +199,13 @@ def cat(lenses: Sequence[Lens]) -> Lens:
     if len({form_of(lens) for lens in lenses}) > 1:
         lenses = [as_curves(lens) for lens in lenses]
     if len({lens.affine is None for lens in lenses}) > 1:
-        lenses = [
-            lens.replace(affine=lens._eye().expand(len(lens), 2, 2))
-            if lens.affine is None
-            else lens
-            for lens in lenses
-        ]
+        lenses = [lens.replace(affine=lens._affine()) for lens in lenses]
     names = lenses[0]._tensors()
     return lenses[0]._from_tensors({n: torch.cat([getattr(x, n) for x in lenses]) for n in names})
 
 
 def form_of(lens: Lens) -> tuple:
-    """Lenses of the same form are joined as they are."""
+    """A key: lenses with equal forms are joined without becoming curves."""
     shapes = {n: v.shape[1:] for n, v in lens._tensors().items() if n not in lens.common}
     return type(lens), tuple(shapes.items())
 

@@ -1,8 +1,8 @@
-"""Lenses with distortion: radial, tangential and thin-prism terms.
+"""Lenses with radial, tangential and thin-prism distortion.
 
-A ray has a place in an ideal plane, w(θ) (cos φ, sin φ). Radial terms stretch it; tangential terms
-(elements of the lens that are off centre) and thin-prism terms (tilted ones) move it aside. The
-focal length turns the distorted plane into pixels.
+A ray has a place in an ideal plane, w(θ) (cos φ, sin φ). Radial terms scale its radius. Tangential
+terms (from decentred lens elements) and thin-prism terms (from tilted ones) shift it. The focal
+length turns the distorted plane into pixels.
 """
 
 import math
@@ -38,38 +38,38 @@ class DistortedLens(FocalLens, register=False):
            p₁ (w² + 2 y²) + 2 p₂ x y + s₃ w² + s₄ w⁴).
 
     Args:
-        focal: f > 0, px. radial: (n,) or (N, n): k₁, k₂, …, or None.
-        tangential: (2,) or (N, 2): p₁, p₂, or None. prism: (4,) or (N, 4): s₁ … s₄, or None.
-        Others: as `Lens`.
+        focal: f > 0, px.
+        radial: (n,) or (N, n): k₁, k₂, …, or None.
+        tangential: (2,) or (N, 2): p₁, p₂, or None.
+        prism: (4,) or (N, 4): s₁ … s₄, or None. Others: see `Lens`.
 
-    A class defines the plane: `_plane`, w(θ), its slope and its inverse, and `_plane_end`, rad, up
-    to where w rises.
+    A class defines w(θ), its slope and its inverse: `_plane`, `_plane_slope` and `_plane_angle`.
     """
 
     radial = Parameter(shape=(None,), optional=True, by_place=True)
     tangential = Parameter(shape=(2,), optional=True)
     prism = Parameter(shape=(4,), optional=True)
-    plain: ClassVar[type[Lens]]  # what is left of the model when all its terms are zero
-    aside_last: ClassVar[bool] = False  # the other terms are of the plane after the radial ones
+    plain: ClassVar[type[Lens]]  # the model without terms
+    aside_last: ClassVar[bool] = False  # True if the offset is computed after the radial terms
     _plane: ClassVar[Callable[..., Tensor]]
     _plane_slope: ClassVar[Callable[..., Tensor]]
     _plane_angle: ClassVar[Callable[..., Tensor]]
-    _plane_end = math.pi - MARGIN
 
     @classmethod
     def _rows(cls, given: Mapping[str, Number]) -> dict[str, Tensor]:
         rows = super()._rows(given)
         varied = [name for name, tensor in rows.items() if len(tensor) > 1]
-        if varied == ["radial"] and rows["radial"].shape[1] == 1:  # a column, as OpenCV has it
+        if varied == ["radial"] and rows["radial"].shape[1] == 1:  # a column, as in OpenCV
             count = len(rows["radial"])
             raise ValueError(
-                f"radial of shape ({count}, 1) is {count} lenses of one coefficient each: give "
-                f"({count},) for one lens, or another parameter with {count} numbers"
+                f"radial of shape ({count}, 1) means {count} lenses with one coefficient each: "
+                f"give shape ({count},) for one lens, or another parameter with {count} numbers"
             )
         return rows
 
     def _plane_limit(self) -> Tensor:
-        return torch.full_like(self.focal.detach(), self._plane_end)
+        """(N,) rad: the angle up to which w rises."""
+        return super().theta_limit
 
     def _stretch(self, w: Tensor) -> Tensor:
         """w with the radial terms."""
@@ -86,7 +86,7 @@ class DistortedLens(FocalLens, register=False):
 
     @property
     def theta_limit(self) -> Tensor:
-        # The lens also ends where the high powers of w overflow in its dtype.
+        # The lens also ends where high powers of w overflow in its dtype.
         end = self._plane_limit()
         limits = [rising_limit(self._slope, end)]
         if not self.is_radial:
@@ -108,7 +108,7 @@ class DistortedLens(FocalLens, register=False):
         return self._row(self.focal, w.dim() + 1) * self._aside(w[..., None] * direction)
 
     def _aside(self, point: Tensor) -> Tensor:
-        """(..., 2): the offset at a point of its plane, in units of the focal length."""
+        """(..., 2): the offset at a point of the plane, in focal lengths."""
         x, y = point.unbind(-1)
         square = x * x + y * y
         p1, p2, s1, s2, s3, s4 = self._terms(x.dim())
@@ -117,7 +117,7 @@ class DistortedLens(FocalLens, register=False):
         return torch.stack((dx, dy), -1)
 
     def _terms(self, dims: int) -> list[Tensor]:
-        """p₁, p₂, s₁ … s₄, to broadcast over `dims` dimensions."""
+        """p₁, p₂, s₁ … s₄, each with `dims` dimensions."""
         none = torch.zeros_like(self.focal)
         p = (none, none) if self.tangential is None else self.tangential.unbind(1)
         s = (none,) * 4 if self.prism is None else self.prism.unbind(1)
@@ -137,7 +137,7 @@ class DistortedLens(FocalLens, register=False):
         return torch.stack([torch.stack(row, -1) for row in rows], -2)
 
     def _distort(self, point: Tensor) -> Tensor:
-        """(..., 2): where a point w (cos φ, sin φ) of the ideal plane lands, in focal lengths."""
+        """(..., 2): the image of a point w (cos φ, sin φ) of the ideal plane, in focal lengths."""
         w = length_of(point)
         direction, stretched = point / w[..., None], self._stretch(w)
         plane = stretched if self.aside_last else w
@@ -153,15 +153,15 @@ class DistortedLens(FocalLens, register=False):
         return straight + self._aside_slopes(w[..., None] * direction)
 
     def _least_area(self, theta: Tensor) -> Tensor:
-        """(N, K): by how much the distortion enlarges an area at θ, at the azimuth of the least.
+        """(N, K): the factor by which the distortion enlarges an area at θ, at its smallest over φ.
 
-        It is a trigonometric polynomial of degree 3 in φ: 8 azimuths determine all others.
+        The factor is a trigonometric polynomial of degree 3 in φ: 8 azimuths determine it.
         """
         points = self._plane(theta)[..., None, None] * _circle(8, theta)
         area = determinant(self._distort_slopes(points))
         terms = torch.fft.rfft(area, norm="forward")[..., :4]
         area = torch.fft.irfft(terms, 256, norm="forward")
-        # The minimum between the samples, of the parabola through the smallest and its neighbours.
+        # The minimum of the parabola through the smallest sample and its neighbours.
         place = area.argmin(-1, keepdim=True)
         before, least, after = (area.gather(-1, (place + k) % 256) for k in (-1, 0, 1))
         bend = (before - 2 * least + after).clamp(min=torch.finfo(theta.dtype).tiny)
@@ -169,25 +169,25 @@ class DistortedLens(FocalLens, register=False):
 
     @staticmethod
     def _slack(goal: Tensor) -> Tensor:
-        """(...): how far from a point of the distorted plane rounding lets its ray land."""
+        """(...): the largest error by rounding at points of the distorted plane."""
         return 1e3 * torch.finfo(goal.dtype).eps * (1 + length_of(goal))
 
     def _find_points(self, goal: Tensor, start: Tensor, last: Tensor) -> Tensor:
-        """(N, ..., 2): points of the ideal plane that `_distort` takes to `goal`, if there are any
-        within `last`. The search begins half as far out as `start`, far from any fold."""
+        """(N, ..., 2): points of the ideal plane that `_distort` maps to `goal`, if there are any
+        within `last`. The search begins at half of `start`, far from any fold."""
         maps = self._distort, self._distort_slopes
         if not readable(goal):  # no shape depends on values
             return newton(*maps, goal, start / 2, 1.1 * last, rounds=30)
         circle = _circle(256, goal)
-        # One lens at a time: each has its own shape of selected pixels.
+        # One lens at a time: each selects another number of pixels.
         shape, start = goal.shape, start.expand_as(goal).reshape(len(self), -1, 2)
         goal, points = goal.reshape(len(self), -1, 2), start.clone()
         for k, end in enumerate(last.flatten()):
             lens = self[k]
-            # Most pixels that no ray reaches lie beyond the rim; they are skipped. A rim that
-            # overflows, as NaN, is beyond all pixels.
+            # Most pixels without a ray lie beyond the rim; they are skipped. A rim that overflows
+            # is NaN and beyond all pixels.
             near = ~(length_of(goal[k]) >= 1.01 * length_of(lens._distort(end * circle)).max())
-            for share in (0.5, 0.0):  # from the axis, where a fold blocked the first way
+            for share in (0.5, 0.0):  # the second time from the axis, as a fold may block the way
                 maps = lens._distort, lens._distort_slopes
                 points[k][near] = newton(*maps, goal[k][near], share * start[k][near], 1.1 * end)
                 near &= length_of(lens._distort(points[k]) - goal[k]) > self._slack(goal[k])
@@ -203,8 +203,8 @@ class DistortedLens(FocalLens, register=False):
         return changed
 
     def _find_rays(self, flat: Tensor, theta: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
-        """Newton's method in the ideal plane, from the place that a ray has on the radial curve
-        alone. The last steps carry the gradients, as in `inverse`."""
+        """Newton's method in the ideal plane, from the ray's place without the offset. As in
+        `inverse`, the last steps carry the gradients."""
         end = self._row(self.theta_max.detach(), theta.dim())
         goal = flat / self._row(self.focal, flat.dim())
         with torch.no_grad():
@@ -212,9 +212,9 @@ class DistortedLens(FocalLens, register=False):
             start = self._plane(torch.where(theta.isnan(), end, theta))[..., None] * direction
             point = self._find_points(goal, start, last)
             lands = length_of(self._distort(point) - goal) < self._slack(goal)
-            # Near a fold of the map, a rounding ε of a pixel moves its ray by √ε.
+            # Near a fold of the map, rounding a pixel by ε moves its ray by √ε.
             lands &= length_of(point) <= last * (1 + math.sqrt(torch.finfo(flat.dtype).eps))
-        # Pixels without a ray become the principal point, as NaN would reach the gradients.
+        # Pixels without a ray become the principal point: NaN would reach the gradients.
         goal, point = (torch.where(lands[..., None], x, 0.0) for x in (goal, point))
         for _ in range(2):
             point = point - solve(self._distort_slopes(point), self._distort(point) - goal)
@@ -224,7 +224,7 @@ class DistortedLens(FocalLens, register=False):
 
 
 def _circle(count: int, like: Tensor) -> Tensor:
-    """(count, 2): directions all around."""
+    """(count, 2): unit vectors at equal angles."""
     steps = torch.arange(count, dtype=like.dtype, device=like.device)
     return direction_of(steps * (2 * math.pi / count))
 
@@ -232,7 +232,7 @@ def _circle(count: int, like: Tensor) -> Tensor:
 class KannalaBrandt(DistortedLens):
     """r = f (θ + k₁ θ³ + k₂ θ⁵ + …): OpenCV's fisheye model, Kalibr's and ROS's "equidistant".
 
-    Args: `focal`, `radial`, then as `DistortedLens`, with w = θ.
+    Args: `focal`, `radial`, and those of `DistortedLens`, with w = θ.
 
     Source: Kannala and Brandt, PAMI 2006; OpenCV, cv::fisheye.
     """
@@ -244,10 +244,10 @@ class KannalaBrandt(DistortedLens):
 
 
 class Fisheye624(KannalaBrandt):
-    """`KannalaBrandt` whose tangential and thin-prism terms act after the radial ones.
+    """`KannalaBrandt` with tangential and thin-prism terms that act after the radial ones.
 
-    With six k, two p and four s it is Project Aria's camera and COLMAP's
-    RAD_TAN_THIN_PRISM_FISHEYE. Arguments: as `KannalaBrandt`; their p₀ and p₁ are our p₂ and p₁.
+    With six k, two p and four s, this is Project Aria's camera and COLMAP's
+    RAD_TAN_THIN_PRISM_FISHEYE. Arguments: see `KannalaBrandt`; Aria's p₀ and p₁ are our p₂ and p₁.
     """
 
     aside_last = True
@@ -256,9 +256,9 @@ class Fisheye624(KannalaBrandt):
 class Mei(DistortedLens):
     """The unified model with radial and tangential terms: w = sin θ / (ξ + cos θ).
 
-    OpenCV's omnidir, Kalibr's omni-radtan, KITTI-360's fisheyes; at ξ = 0 a pinhole with radtan.
+    OpenCV's omnidir, Kalibr's omni-radtan, KITTI-360's fisheyes. At ξ = 0, a pinhole with radtan.
 
-    Args: `xi`, ξ ≥ 0, `focal`, `radial`, then as `DistortedLens`.
+    Args: `xi`, ξ ≥ 0, `focal`, `radial`, and those of `DistortedLens`.
 
     Source: Mei and Rives, ICRA 2007.
     """
@@ -284,21 +284,21 @@ class Mei(DistortedLens):
 class BrownConrady(DistortedLens):
     """A pinhole camera with distortion: w = tan θ, θ < 90°. OpenCV's standard model.
 
-    Args: `focal`, `radial`, then as `DistortedLens`; and
-        denominator: (n,) or (N, n): k₄, k₅, … of OpenCV's rational model, by which r is divided:
-            1 + k₄ w² + k₅ w⁴ + …, or None.
+    Args: `focal`, `radial`, those of `DistortedLens`, and
+        denominator: (n,) or (N, n): k₄, k₅, … of OpenCV's rational model, or None. r is divided by
+            1 + k₄ w² + k₅ w⁴ + ….
 
     Source: Brown, 1966; OpenCV, calib3d.
     """
 
-    radial = DistortedLens.declared["radial"]  # its place is before the denominator
+    radial = DistortedLens.declared["radial"]  # placed before the denominator
     denominator = Parameter(shape=(None,), optional=True)
     terms = 3
     plain = Perspective
     _plane = staticmethod(torch.tan)
     _plane_slope = staticmethod(lambda theta: torch.cos(theta) ** -2)
     _plane_angle = staticmethod(torch.atan)
-    _plane_end = math.pi / 2 - MARGIN
+    _end = math.pi / 2
 
     def _stretch(self, w: Tensor) -> Tensor:
         stretched = super()._stretch(w)

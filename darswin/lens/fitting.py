@@ -1,4 +1,4 @@
-"""One lens model in terms of another: least squares on where rays land."""
+"""Fits one lens model to another by least squares on the pixels where rays land."""
 
 import itertools
 import math
@@ -13,35 +13,35 @@ from darswin.lens.curves import Tabulated, as_curves, cat
 from darswin.lens.polynomial import PolynomialLens
 from darswin.lens.solve import direction_of
 
-# How finely rays are compared.
+# The grid of rays that are compared.
 RINGS, SPOKES = 200, 16
 
 
 class Fit(NamedTuple):
-    """A fitted lens, and how far at most (px) it is from the one it was fitted to, (N,)."""
+    """A fitted lens, and its largest distance from the original lens, (N,) px."""
 
     lens: Lens
     error: Tensor
 
 
 def fit(model: str | type[Lens], lens: Lens, *, terms: int | None = None) -> Fit:
-    """The lens of another model that comes closest to a lens, for all rays up to its θ_max.
+    """Finds the lens of another model that is closest to a lens, for all rays up to its θ_max.
 
-    Principal point, affine and image size stay. Tangential and thin-prism terms are fitted where
-    the model has them, else left out, which the error tells.
+    Principal point, affine and image size stay the same. Tangential and thin-prism terms are fitted
+    if the model has them; if not, the error includes their effect.
 
     Args:
         model: a lens class, or its name in `darswin.lens.MODELS`.
         lens: N lenses.
-        terms: of the model's polynomial. None means the usual number: 2 of `Mei`, 3 of
-            `BrownConrady`, 4 of the others (their `terms`).
+        terms: the number of polynomial terms. None means the model's default: 2 for `Mei`, 3 for
+            `BrownConrady`, 4 for the others.
 
     Returns:
-        (lens, error): N lenses in the dtype of `lens`, and for each the largest distance in px, on
-        a grid of rays.
+        (lens, error): N lenses in the dtype of `lens`, and the largest distance of each, px, on a
+        grid of rays.
 
     Raises:
-        ValueError: an unknown model, or one that cannot reach θ_max.
+        ValueError: an unknown model, or a model that cannot reach θ_max.
     """
     if isinstance(model, str):
         if model not in MODELS:
@@ -60,14 +60,14 @@ def fit(model: str | type[Lens], lens: Lens, *, terms: int | None = None) -> Fit
 
 
 def largest_distance(lens: Lens, other: Lens) -> Tensor:
-    """(N,) px: how far apart two lenses with the same principal point let a ray land, at most."""
+    """(N,) px: the largest distance between the pixels of a ray in two lenses with one center."""
     theta, direction = _rays(other, 1024, 72)
     apart = lens._flat(theta, direction) - other._flat(theta, direction)
     return other.through_affine(apart).norm(dim=-1).flatten(1).amax(1)
 
 
 def _rays(lens: Lens, rings: int, spokes: int) -> tuple[Tensor, Tensor]:
-    """θ (N, rings, 1), above 0 up to θ_max, and cos φ and sin φ (1, 1, spokes, 2) all around."""
+    """θ (N, rings, 1), above 0 up to θ_max, and (cos φ, sin φ), (1, 1, spokes, 2), over a turn."""
     dtype = lens.theta_max.dtype
     theta = lens.theta_max[:, None] * (torch.arange(1, rings + 1, dtype=dtype) / rings)
     azimuth = torch.arange(spokes, dtype=dtype) * (2 * math.pi / spokes)
@@ -75,7 +75,7 @@ def _rays(lens: Lens, rings: int, spokes: int) -> tuple[Tensor, Tensor]:
 
 
 def _fit_one(model: type[Lens], lens: Lens, terms: int) -> Lens:
-    # A radial lens is the same along all azimuths.
+    # A radial lens needs one azimuth only.
     aside = not lens.is_radial and "tangential" in model.optional
     theta, direction = _rays(lens, RINGS, SPOKES if aside else 1)
     if issubclass(model, PolynomialLens):
@@ -96,7 +96,7 @@ def _fit_one(model: type[Lens], lens: Lens, terms: int) -> Lens:
 
 
 def _starts(model: type[Lens], lens: Lens, terms: int, aside: bool) -> Iterator[dict[str, Tensor]]:
-    """Parameters to start from, with the shapes that all shall have."""
+    """Initial parameters, in the shapes of the fitted ones."""
     slope = lens.project(1e-4 * lens.theta_max) / (1e-4 * lens.theta_max)
     starts = {name: p.starts for name, p in model.declared.items() if p.starts}
     for values in itertools.product(*starts.values()):
@@ -105,7 +105,7 @@ def _starts(model: type[Lens], lens: Lens, terms: int, aside: bool) -> Iterator[
             start["radial"] = slope.new_zeros(1, terms)
         if aside:
             start |= {"tangential": slope.new_zeros(1, 2), "prism": slope.new_zeros(1, 4)}
-        # The focal length with which the curve has the right slope at 0.
+        # This focal length gives the curve the right slope at 0.
         unit = start | {"focal": slope.new_ones(1), "theta_max": lens.theta_max}
         start["focal"] = slope * 1e-4 / model._from_tensors(unit).project(1e-4)
         yield start
@@ -119,8 +119,8 @@ def _least_squares(
     direction: Tensor,
     goal: Tensor,
 ) -> tuple[Lens, float]:
-    """The closest lens from a start by Levenberg and Marquardt's method, within bounds, and its
-    mean squared distance, infinite where none was found."""
+    """The closest lens within bounds by the Levenberg–Marquardt method, and its mean squared
+    distance, which is infinite if no lens was found."""
     names = list(start)
     shapes = [start[name].shape for name in names]
     sizes = [shape.numel() for shape in shapes]

@@ -11,6 +11,8 @@ from darswin.lens.batch import LensBatch
 from darswin.lens.parameter import Parameter
 from darswin.ops.checks import tensor_there
 
+Size = tuple[int, int] | None  # (H, W) px
+
 
 class ImageFrame(LensBatch):
     """Lenses in their images: maps points around the principal point to pixels, and back."""
@@ -20,13 +22,13 @@ class ImageFrame(LensBatch):
     affine = Parameter(shape=(2, 2), optional=True)
     image_size = Parameter(low=1, shape=(2,), optional=True)
 
-    def center_in(self, image_size: tuple[int, int] | None = None) -> Tensor:
+    def center_in(self, image_size: Size = None) -> Tensor:
         """(N or 1, 2) px: the principal point (x, y) in an image of (H, W)."""
         if self.center is not None:
             return self.center
         return (self._size_in(image_size).flip(1) - 1) / 2
 
-    def _size_in(self, image_size: tuple[int, int] | None) -> Tensor:
+    def _size_in(self, image_size: Size) -> Tensor:
         """(N or 1, 2): the given image size, or else the lens's own."""
         if image_size is not None:
             return tensor_there(image_size, self.theta_max)[None]
@@ -34,11 +36,11 @@ class ImageFrame(LensBatch):
             raise ValueError("this lens has no image_size and needs the image_size, (H, W)")
         return self.image_size
 
-    def to_pixels(self, flat: Tensor, image_size: tuple[int, int] | None = None) -> Tensor:
+    def to_pixels(self, flat: Tensor, image_size: Size = None) -> Tensor:
         """Pixels of points (N, ..., 2) around the principal point, before `affine`."""
         return self.through_affine(flat) + self._row(self.center_in(image_size), flat.dim())
 
-    def from_pixels(self, pixels: Tensor, image_size: tuple[int, int] | None = None) -> Tensor:
+    def from_pixels(self, pixels: Tensor, image_size: Size = None) -> Tensor:
         """The inverse of `to_pixels`."""
         flat = self._aligned(pixels)[0] - self._row(self.center_in(image_size), pixels.dim())
         # `torch.linalg.inv` would wait for the device to check that an inverse exists.
@@ -75,13 +77,16 @@ class ImageFrame(LensBatch):
         if self.center is not None:
             lens.center = (self.center + 0.5) * torch.stack((across, down), -1) - 0.5
         if down is not across and bool((down != across).any()):
-            affine = self._eye() if self.affine is None else self.affine
             rows = torch.stack((torch.ones_like(down), down / across), -1)
-            lens.affine = rows[..., None] * affine
+            lens.affine = rows[..., None] * self._affine()
         return lens
 
-    def _eye(self) -> Tensor:
-        return torch.eye(2, dtype=self.theta_max.dtype, device=self.theta_max.device)
+    def _affine(self) -> Tensor:
+        """(N, 2, 2): `affine`, or else the identity."""
+        if self.affine is not None:
+            return self.affine
+        eye = torch.eye(2, dtype=self.theta_max.dtype, device=self.theta_max.device)
+        return eye.expand(self.count, 2, 2)
 
     def _sizes(self, size: tuple[int, int]) -> Tensor:
         """One size for all lenses, (N, 2)."""

@@ -1,4 +1,4 @@
-"""Lenses of one focal length: the projections that a lens designer aims at."""
+"""Lenses with one focal length: the ideal projections of lens design."""
 
 import math
 from collections.abc import Callable
@@ -15,6 +15,7 @@ from darswin.lens.parameter import Arguments, Number, Parameter
 class FocalLens(Lens, register=False):
     """Base of the lenses whose only length is the focal length, f > 0, px: r = f u(θ)."""
 
+    _end = math.pi  # θ where u stops rising or becomes infinite
     focal = Parameter(low=0, open=True, in_pixels=True, bounds=(1e-9, math.inf))
 
     @classmethod
@@ -22,12 +23,11 @@ class FocalLens(Lens, register=False):
         """The lens whose full field of view fills a circle.
 
         Args:
-            arguments: the model's parameters but `focal`, in the order of its constructor, then
-                `fov`, rad, the full field of view, `radius`, px, of the circle, and `center`, as
-                `Lens` has it.
-            named: any of them by name, also `affine`, `image_size` and what is optional.
+            arguments: the model's parameters without `focal`, in the order of its constructor, then
+                `fov`, rad, the full field of view; `radius`, px, of the circle; and `center`.
+            named: any of them by name; also `affine`, `image_size` and the optional parameters.
 
-        Raises what the constructor does.
+        Raises the constructor's errors.
         """
         rows = cls._expanded(cls._of_fov().bind(f"{cls.__name__}.from_fov", arguments, named))
         theta_max, radius = rows.pop("fov") / 2, rows.pop("radius")
@@ -43,17 +43,20 @@ class FocalLens(Lens, register=False):
         return Arguments((*own, "fov", "radius"), ("center",), by_name)
 
     def _scale_to(self, radius: Tensor) -> Tensor:
-        """(N,): how many times larger the lens must be for θ_max to land at a radius."""
+        """(N,): the factor by which the lens must grow for θ_max to land at `radius`."""
         return radius / self.r_max
+
+    @property
+    def theta_limit(self) -> Tensor:
+        return torch.full_like(self.focal, self._end - MARGIN)
 
 
 class IdealLens(FocalLens, register=False):
-    """Base of the lenses r = f u(θ) that have no other parameter."""
+    """Base of the lenses r = f u(θ) without other parameters."""
 
     _rise: ClassVar[Callable[..., Tensor]]  # u(θ)
-    _fall: ClassVar[Callable[..., Tensor]]  # θ at which u takes a value
-    _end = math.pi  # θ where u stops rising, or becomes infinite
-    _top: float | None = None  # u there, if it is finite
+    _fall: ClassVar[Callable[..., Tensor]]  # the inverse of u
+    _top: float | None = None  # the largest u, if it is finite
 
     def project(self, theta: Number) -> Tensor:
         theta, focal = self._aligned(theta, "focal")
@@ -61,12 +64,8 @@ class IdealLens(FocalLens, register=False):
 
     def _angle_at(self, radius: Tensor) -> Tensor:
         rise = radius / self._row(self.focal, radius.dim())
-        # Rounding can take u above its largest value, which no angle has.
+        # Rounding can raise u above its largest value, which has no angle.
         return self._fall(rise if self._top is None else rise.clamp(max=self._top))
-
-    @property
-    def theta_limit(self) -> Tensor:
-        return torch.full_like(self.focal, self._end - MARGIN)
 
 
 class Perspective(IdealLens):
@@ -85,7 +84,7 @@ class Equidistant(IdealLens):
 
 
 class Equisolid(IdealLens):
-    """r = 2 f sin(θ/2): equal solid angles are equal areas. Arguments: `focal`, those of `Lens`."""
+    """r = 2 f sin(θ/2): equal solid angles have equal areas. Arguments: `focal`; see `Lens`."""
 
     _top = 2.0
     _rise = staticmethod(lambda theta: 2 * torch.sin(theta / 2))
@@ -93,7 +92,7 @@ class Equisolid(IdealLens):
 
 
 class Stereographic(IdealLens):
-    """r = 2 f tan(θ/2): keeps angles between lines. Arguments: `focal`, and those of `Lens`."""
+    """r = 2 f tan(θ/2): preserves angles. Arguments: `focal`, and those of `Lens`."""
 
     _rise = staticmethod(lambda theta: 2 * torch.tan(theta / 2))
     _fall = staticmethod(lambda rise: 2 * torch.atan(rise / 2))
@@ -109,10 +108,10 @@ class Orthographic(IdealLens):
 
 
 class FieldOfView(FocalLens):
-    """r = f atan(2 tan(ω/2) tan θ) / ω: the FOV model, here also beyond 90°.
+    """r = f atan(2 tan(ω/2) tan θ) / ω: the FOV model, extended beyond 90°.
 
     Args:
-        omega: ω in (0, π), rad. focal: f > 0, px. Others: as `Lens`.
+        omega: ω in (0, π), rad. focal: f > 0, px. Others: see `Lens`.
 
     Source: Devernay and Faugeras, MVA 2001, sec. 3.1.
     """
@@ -128,7 +127,3 @@ class FieldOfView(FocalLens):
         radius, omega, focal = self._aligned(radius, "omega", "focal")
         angle, tangent = radius * omega / focal, 2 * torch.tan(omega / 2)
         return torch.atan2(torch.sin(angle), tangent * torch.cos(angle))
-
-    @property
-    def theta_limit(self) -> Tensor:
-        return torch.full_like(self.focal, math.pi - MARGIN)

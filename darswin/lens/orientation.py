@@ -1,6 +1,6 @@
-"""The lens of a picture that was turned: upright, as its EXIF orientation says, or by any angle.
+"""The lens of a rotated picture: upright by its EXIF orientation, or by any angle.
 
-A calibration is of pixels as the camera stores them; pictures are read upright.
+A calibration describes pixels as the camera stores them, but pictures are read upright.
 """
 
 import math
@@ -13,15 +13,16 @@ from darswin.utils.exif import TURNS
 
 
 def stored_size(size: tuple[int, int], orientation: int) -> tuple[int, int]:
-    """(H, W) of a picture as stored, from that of the upright one."""
+    """(H, W) of a picture as stored, from the (H, W) of the upright picture."""
     return size[::-1] if TURNS[orientation][0] else size
 
 
 def in_upright_picture(lens: Lens, size: tuple[int, int], orientation: int) -> Lens:
-    """The lens, with an image_size, in an upright picture of (H, W) that shows all that it was
-    calibrated with. The calibration was made upright if only so it has the picture's shape.
+    """The lens in an upright picture of (H, W) that shows the whole calibrated image.
 
-    `orientation` is EXIF's, 1 to 8, before. ValueError for a picture of another shape.
+    If the stored picture has another shape than the calibration but the upright one has the same,
+    the calibration was made with upright pictures. `orientation` is the stored picture's EXIF
+    orientation, 1 to 8. Raises ValueError if neither shape matches.
     """
     try:
         return upright(lens.in_picture(stored_size(size, orientation)), orientation)
@@ -29,21 +30,22 @@ def in_upright_picture(lens: Lens, size: tuple[int, int], orientation: int) -> L
         try:
             return lens.in_picture(size)
         except ValueError:
-            turn = (
-                "" if orientation == 1 else f" (as stored; its EXIF orientation is {orientation})"
-            )
-            raise ValueError(f"{error}{turn}") from error
+            if orientation == 1:
+                raise error from None
+            stored = f"as stored; its EXIF orientation is {orientation}"
+            raise ValueError(f"{error} ({stored})") from error
 
 
 def upright(lens: Lens, orientation: int) -> Lens:
-    """The lens of the upright picture, from that of the picture as it is stored; exact.
+    """The exact lens of the upright picture, from the lens of the stored picture.
 
-    ValueError for another orientation than 1 to 8 (EXIF 2.3, tag 0x0112), or without image_size.
+    Raises ValueError for an orientation that is not 1 to 8 (EXIF 2.3, tag 0x0112), and for a lens
+    without image_size.
     """
     if orientation not in TURNS:
         raise ValueError(f"an EXIF orientation must be 1 to 8, got {orientation}")
     if lens.image_size is None:
-        raise ValueError("a lens that is turned with its picture needs an image_size")
+        raise ValueError("a lens needs an image_size to be rotated with its picture")
     swapped, *mirrored = TURNS[orientation]
     turn = lens.theta_max.new_tensor([[0, 1], [1, 0]] if swapped else [[1, 0], [0, 1]])
     turn = turn * turn.new_tensor([[-1.0 if axis else 1.0] for axis in mirrored])
@@ -56,17 +58,18 @@ def upright(lens: Lens, orientation: int) -> Lens:
 
 
 def rotated(lens: Lens, angle: float) -> tuple[Lens, Tensor]:
-    """The lens of a camera that was turned about its optical axis; exact for every model.
+    """The exact lens of a camera rotated about its optical axis, for every model.
 
-    A ray at (θ, φ) is then at (θ, φ + angle), and the picture moves by an affine map around the
-    principal point: a rotation, or where pixels are oblong what looks like one through the lens.
+    A ray at (θ, φ) moves to (θ, φ + angle). The picture moves by an affine map around the principal
+    point: a rotation, if the pixels are square.
 
     Args:
-        lens: one lens, with an image_size or a center. angle: rad, from x to y.
+        lens: one lens, with an image_size or a center.
+        angle: rad, from x to y.
 
     Returns:
-        The lens, which is the same unless it has tangential or thin-prism terms; and (2, 3)
-        float64: what takes a pixel (x, y, 1) to its new place, as of `cv2.warpAffine`.
+        The lens, which is the same unless it has tangential or thin-prism terms; and a (2, 3)
+        float64 matrix that maps a pixel (x, y, 1) to its new place, as for `cv2.warpAffine`.
     """
     if len(lens) != 1:
         raise ValueError(f"rotated takes one lens, got {len(lens)}")

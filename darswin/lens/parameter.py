@@ -18,11 +18,12 @@ class Parameter:
     """A parameter of a lens class: `xi = Parameter(low=0)` in the body of the class.
 
     Args:
-        low, high: its least and its largest value. open: these two are excluded.
+        low, high: the smallest and the largest value. open: True excludes these two.
         shape: of one lens's values, () for a number; None stands for any length.
-        optional: it may be None. by_place: it is given without its name, though it is optional.
-        in_pixels: it grows with the image.
-        starts: values that `fit` starts from. bounds: of `fit`; None means low and high.
+        optional: the parameter may be None.
+        by_place: an optional parameter may be given without its name.
+        in_pixels: the parameter scales with the image.
+        starts: initial values for `fit`. bounds: the range in `fit`; None means low and high.
     """
 
     low: float = -math.inf
@@ -36,14 +37,14 @@ class Parameter:
     starts: tuple[float, ...] = ()
     bounds: tuple[float, float] | None = None
 
-    if TYPE_CHECKING:  # a class's declaration is a lens's attribute, a tensor
+    if TYPE_CHECKING:  # declared on the class, but a tensor on a lens
 
         def __get__(self, lens: object, owner: type) -> Any: ...
 
         def __set__(self, lens: object, value: object) -> None: ...
 
     def rows(self, name: str, value: Tensor) -> Tensor:
-        """The value as (N or 1, ...); ValueError for another shape."""
+        """The value with shape (N or 1, ...); ValueError for a wrong shape."""
         rows = value[None] if value.dim() == len(self.shape) else value
         sides = rows.shape[1:]
         if rows.dim() != len(self.shape) + 1 or any(
@@ -60,7 +61,7 @@ class Parameter:
         if not value.numel():
             return True
         least, most = (end.item() for end in value.detach().aminmax())
-        if not (math.isfinite(least) and math.isfinite(most)):  # NaN is both, if there is one
+        if not (math.isfinite(least) and math.isfinite(most)):  # a NaN makes both NaN
             return False
         if self.open:
             return self.low < least and most < self.high
@@ -78,7 +79,7 @@ class Parameter:
 
 
 class Arguments:
-    """The arguments of a constructor: those that it needs, others by their place, and by name."""
+    """The arguments of a constructor: required, optional by place, and optional by name."""
 
     def __init__(self, required: Sequence[str], optional: Sequence[str], by_name: Sequence[str]):
         self.places, self.required = (*required, *optional), {*required}
@@ -95,19 +96,19 @@ class Arguments:
     def bind(
         self, function: str, arguments: Sequence[Any], named: dict[str, Any]
     ) -> dict[str, Any]:
-        """Values by their names, but for those that are None; TypeError for wrong arguments."""
+        """The values that are not None, by name; TypeError for wrong arguments."""
         given = dict(zip(self.places, arguments, strict=False)) | named
         all_bound = len(given) == len(arguments) + len(named)
         if not (all_bound and self.required <= given.keys() <= self.known):
             try:
-                self.signature.bind(*arguments, **named)  # it says what is wrong
+                self.signature.bind(*arguments, **named)  # its error describes the mistake
             except TypeError as error:
                 raise TypeError(f"{function}{self.signature}: {error}") from error
         return {name: value for name, value in given.items() if value is not None}
 
 
 def as_tensors(values: Mapping[str, Number]) -> dict[str, Tensor]:
-    """All values as tensors of one dtype and device: those of the tensors among them, if any."""
+    """All values as tensors of one dtype and device, which the tensors among them determine."""
     given = [v for v in values.values() if isinstance(v, Tensor) and v.is_floating_point()]
     dtypes = (tensor.dtype for tensor in given)
     dtype = reduce(torch.promote_types, dtypes) if given else torch.get_default_dtype()

@@ -1,7 +1,7 @@
-"""All pixels of an image: their rays and solid angles, z from distance, and what another lens sees.
+"""All pixels of an image: rays, solid angles, z from distance, and views of other lenses.
 
-A map tells for each pixel of a target where in the source's image its ray lands: (..., 2), x and y,
-and (`OUTSIDE`, `OUTSIDE`) where no ray does. Nothing here depends on what the image shows.
+A map holds, for each pixel of a target image, the place (x, y) in the source image where the
+pixel's ray lands, (..., 2), and (`OUTSIDE`, `OUTSIDE`) where no ray lands.
 """
 
 import torch
@@ -13,7 +13,7 @@ from darswin.lens.ideal import Perspective
 from darswin.lens.solve import determinant, length_of
 from darswin.ops.checks import tensor_there
 
-OUTSIDE = -10.0  # px: beyond any image, also for an interpolation of several pixels
+OUTSIDE = -10.0  # px: beyond any image, also for interpolation over several pixels
 
 
 def pixel_rays(lens: Lens, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
@@ -23,8 +23,7 @@ def pixel_rays(lens: Lens, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
         size: (H, W) of the image.
 
     Returns:
-        θ (N, H, W), rad, NaN where no ray lands or the lens does not see it; and (cos φ, sin φ),
-        (N, H, W, 2).
+        θ (N, H, W), rad, NaN where no ray lands or beyond θ_max; and (cos φ, sin φ), (N, H, W, 2).
     """
     like = lens.theta_max
     rows, columns = (torch.arange(side, dtype=like.dtype, device=like.device) for side in size)
@@ -39,11 +38,11 @@ def pixel_angles(lens: Lens, size: tuple[int, int]) -> Tensor:
 
 
 def solid_angles(lens: Lens, size: tuple[int, int]) -> Tensor:
-    """The solid angle of the sphere around the camera that each pixel shows, (N, H, W), sr.
+    """The solid angle that each pixel shows, (N, H, W), sr.
 
-    The area of a pixel times dΩ/dA at its centre, found in float64; 0 where θ is NaN. Those of an
-    image that the whole circle lies in sum up to 2π (1 − cos θ_max), but for the pixels that the
-    circle's rim cuts.
+    This is the area of a pixel times dΩ/dA at its centre, computed in float64; 0 where θ is NaN. In
+    an image that contains the whole image circle, the sum is 2π (1 − cos θ_max), except for the
+    pixels on the rim.
 
     Args:
         lens: N lenses. size: (H, W) of the image.
@@ -68,28 +67,28 @@ def solid_angles(lens: Lens, size: tuple[int, int]) -> Tensor:
 
 
 def distance_to_z(distance: Tensor, lens: Lens) -> Tensor:
-    """Distance along the ray → z, along the optical axis: what pinhole cameras call depth.
+    """Converts distance along the ray to z along the optical axis, a pinhole camera's depth.
 
     Args:
-        distance: (N, H, W) or (N, 1, H, W), metres or any other unit; 0 where it is not known.
+        distance: (N, H, W) or (N, 1, H, W), metres or any other unit; 0 where it is unknown.
         lens: N lenses, or one.
 
     Returns:
-        The shape of `distance`. Behind the camera, beyond 90°, z is below 0. It is 0 where the
-        distance is, where no ray lands, and beyond θ_max.
+        z, in the shape of `distance`. Behind the camera, beyond 90°, z is below 0. It is 0 where
+        the distance is 0, where no ray lands, and beyond θ_max.
     """
     return distance * _cosines(distance, lens)
 
 
 def z_to_distance(z: Tensor, lens: Lens) -> Tensor:
-    """z, along the optical axis → distance along the ray, the inverse of `distance_to_z`.
+    """Converts z along the optical axis to distance along the ray: the inverse of `distance_to_z`.
 
     Args:
-        z: (N, H, W) or (N, 1, H, W); 0 where it is not known. lens: N lenses, or one.
+        z: (N, H, W) or (N, 1, H, W); 0 where it is unknown. lens: N lenses, or one.
 
     Returns:
-        The shape of `z`; 0 where z is not known, where no ray lands, beyond θ_max, and where z has
-        another sign than the ray.
+        The distance, in the shape of `z`; 0 where z is unknown, where no ray lands, beyond θ_max,
+        and where z and the ray have different signs.
     """
     cosine = _cosines(z, lens)
     known = z * cosine > 0
@@ -113,16 +112,16 @@ def reprojection(
     source: Lens, source_size: tuple[int, int], target: Lens, size: tuple[int, int]
 ) -> Tensor:
     """The map (N, H, W, 2) of `target`'s pixels in `source`'s image; `OUTSIDE` where a ray is
-    beyond either θ_max. Differentiable in both lenses; the sizes are (H, W) of their images."""
+    beyond either θ_max. Differentiable in both lenses. The sizes are (H, W) of their images."""
     theta, direction = pixel_rays(target, size)
     return as_map(source.seen_pixels(theta, direction, source_size))
 
 
 def radial_reprojection(source: Lens, target: Lens, radii: Tensor) -> Tensor:
-    """`reprojection` of two radial lenses without `affine`, along one azimuth.
+    """`reprojection` along one azimuth, for radial lenses without `affine`.
 
-    For radii (1, K) px, above 0, in the image of `target`, one lens: how many times as far from
-    its own principal point `source` has the same ray; NaN where it is beyond either θ_max.
+    For radii (1, K) px, above 0, in the image of one lens `target`: the ratio of a ray's radius in
+    `source` to its radius in `target`; NaN where the ray is beyond either θ_max.
     """
     theta = target.unproject(radii)
     seen = target.sees(theta) & source.sees(theta)
@@ -135,7 +134,7 @@ def as_map(pixels: Tensor) -> Tensor:
 
 
 def reproject(images: Tensor, source: Lens, target: Lens, size: tuple[int, int]) -> Tensor:
-    """The view of `target` on what `source` saw, bilinear; 0 beyond either θ_max.
+    """Resamples images of `source` as `target` would see them, bilinearly; 0 beyond either θ_max.
 
     Runs on the images' device. Gradients go to the images and both lenses.
 
@@ -152,8 +151,8 @@ def reproject(images: Tensor, source: Lens, target: Lens, size: tuple[int, int])
 
 
 def sample_at(images: Tensor, pixels: Tensor) -> Tensor:
-    """Images (B, C, H, W) read at pixels (B or 1, H', W', 2), bilinear and 0 outside, on the
-    images' device and in their dtype → (B, C, H', W')."""
+    """Samples images (B, C, H, W) at pixels (B or 1, H', W', 2), bilinearly and with 0 outside:
+    (B, C, H', W') on the images' device and in their dtype."""
     height, width = images.shape[2:]
     exact = torch.promote_types(images.dtype, torch.float32)  # bfloat16 has no half pixels
     there = pixels.to(images.device, exact)
@@ -165,8 +164,8 @@ def sample_at(images: Tensor, pixels: Tensor) -> Tensor:
 
 
 def perspective_view(lens: Lens, size: tuple[int, int], max_fov: float) -> Perspective:
-    """The perspective lens that shows a lens's field of view in (H, W), with θ_max at half the
-    shorter side; of a wider lens than `max_fov` (rad, below π) it shows the middle."""
+    """The perspective lens with a lens's field of view, at most `max_fov` (rad, below π). θ_max
+    lands at half the shorter side of (H, W)."""
     theta_max = lens.theta_max.clamp(max=max_fov / 2)
     focal = min(size) / 2 / torch.tan(theta_max)
     return Perspective._from_tensors(dict(focal=focal, theta_max=theta_max, center=None))

@@ -1,4 +1,4 @@
-"""Lenses whose curve is a polynomial, of the angle or of the radius."""
+"""Lenses whose curve is a polynomial of the angle or of the radius."""
 
 import math
 
@@ -19,19 +19,19 @@ def horner(x: Tensor, coefficients: Tensor) -> Tensor:
 
 
 def slopes(coefficients: Tensor, first: int, step: int = 1) -> Tensor:
-    """(N, n): the factors of the powers first, first + step, … after deriving."""
+    """(N, n): coefficients of the powers first, first + step, …, times these powers."""
     powers = first + step * torch.arange(coefficients.shape[1], device=coefficients.device)
     return coefficients * powers
 
 
 class PolynomialLens(Lens, register=False):
-    """Base of the lenses that are all coefficients, (n,) or (N, n), lowest power first."""
+    """Base of the lenses with coefficients only, (n,) or (N, n), lowest power first."""
 
     coefficients = Parameter(shape=(None,), in_pixels=True)
 
     def _validate(self) -> None:
         if self.coefficients.shape[1] < 1:
-            raise ValueError("coefficients must be at least one a lens, got none")
+            raise ValueError("coefficients must be at least one per lens, got none")
 
     @property
     def theta_limit(self) -> Tensor:
@@ -40,18 +40,23 @@ class PolynomialLens(Lens, register=False):
 
     @classmethod
     def closest(cls, theta: Tensor, radius: Tensor, slope: Tensor, terms: int) -> Tensor:
-        """(1, n): the coefficients of the polynomial of so many terms that comes closest to radii
-        (K,) and their slopes at θ (K,)."""
+        """(1, n): the coefficients of the polynomial with `terms` terms that is closest to radii
+        (K,) with slopes (K,) at θ (K,)."""
+        return _least_squares(cls._powers(theta, terms), radius)
+
+    @staticmethod
+    def _powers(theta: Tensor, terms: int) -> Tensor:
+        """(K, n): the factors of the coefficients in r."""
         raise NotImplementedError
 
 
 class Polynomial(PolynomialLens):
-    """r = k₁ θ + k₂ θ² + … + k_n θⁿ, of any degree; WoodScape's `radial_poly` has four.
+    """r = k₁ θ + k₂ θ² + … + k_n θⁿ, of any degree; WoodScape's `radial_poly` has four terms.
 
-    OpenCV's fisheye coefficients are not these: they belong to a `KannalaBrandt`.
+    OpenCV's fisheye coefficients are of another kind: they belong to `KannalaBrandt`.
 
     Args:
-        coefficients: (n,) or (N, n): k₁ … k_n, in px. Others: as `Lens`.
+        coefficients: (n,) or (N, n): k₁ … k_n, in px. Others: see `Lens`.
 
     Source: DarSwin, ICCV 2023, eq. 4.
     """
@@ -63,17 +68,16 @@ class Polynomial(PolynomialLens):
         (theta,) = self._aligned(theta)
         return theta * horner(theta, self.coefficients)
 
-    @classmethod
-    def closest(cls, theta: Tensor, radius: Tensor, slope: Tensor, terms: int) -> Tensor:
-        powers = torch.arange(1, terms + 1, dtype=theta.dtype)
-        return _least_squares(theta[:, None] ** powers, radius)
+    @staticmethod
+    def _powers(theta: Tensor, terms: int) -> Tensor:
+        return theta[:, None] ** torch.arange(1, terms + 1, dtype=theta.dtype)
 
 
 class OCam(PolynomialLens):
-    """tan θ = -r / (a₀ + a₁ r + a₂ r² + …): Scaramuzza's model, whose inverse is the closed one.
+    """tan θ = -r / (a₀ + a₁ r + a₂ r² + …): Scaramuzza's model, with a closed-form inverse.
 
     Args:
-        coefficients: (n,) or (N, n): a₀ < 0, a₁, … in px, 1, px⁻¹, … Others: as `Lens`.
+        coefficients: (n,) or (N, n): a₀ < 0, a₁, … in px, 1, px⁻¹, … Others: see `Lens`.
 
     Source: Scaramuzza, Martinelli and Siegwart, ICVS 2006; the OCamCalib toolbox.
     """
@@ -95,7 +99,7 @@ class OCam(PolynomialLens):
 
     @property
     def _last_radius(self) -> Tensor:
-        """(N,) px: up to where θ rises, of 20 |a₀| at most."""
+        """(N,) px: the radius up to which θ rises, at most 20 |a₀|."""
         return rising_limit(self._angle_slope, -20 * self.coefficients[:, 0].detach())
 
     @property
@@ -113,8 +117,8 @@ class OCam(PolynomialLens):
 
     @classmethod
     def closest(cls, theta: Tensor, radius: Tensor, slope: Tensor, terms: int) -> Tensor:
-        # a₀ + a₂ r² + … = -r / tan θ; the toolbox has no a₁, which is a kink at the centre. Each
-        # row is weighted so that its error is, to first order, in pixels.
+        # a₀ + a₂ r² + … = -r / tan θ; a₁ would be a kink at the centre, so the toolbox omits it.
+        # The weights turn each row's error into pixels, to first order.
         powers = torch.arange(terms + 1, dtype=theta.dtype)
         used = powers != 1
         scale, weight = radius.max(), slope * torch.sin(theta) / radius
@@ -127,12 +131,12 @@ class OCam(PolynomialLens):
 
 
 class OCamInverse(PolynomialLens):
-    """r = b₀ + b₁ (θ - π/2) + b₂ (θ - π/2)² + …: the polynomial that OCamCalib projects with.
+    """r = b₀ + b₁ (θ - π/2) + b₂ (θ - π/2)² + …: OCamCalib's polynomial for projection.
 
-    The toolbox fits it to the inverse of an `OCam`, to some hundredths of a pixel.
+    The toolbox fits it to the inverse of an `OCam` lens, to about 0.01 px.
 
     Args:
-        coefficients: (n,) or (N, n): b₀, b₁, … in px. Others: as `Lens`.
+        coefficients: (n,) or (N, n): b₀, b₁, … in px. Others: see `Lens`.
 
     Source: the OCamCalib toolbox, world2cam.
     """
@@ -148,12 +152,11 @@ class OCamInverse(PolynomialLens):
         (theta,) = self._aligned(theta)
         return horner(theta - math.pi / 2, self.coefficients)
 
-    @classmethod
-    def closest(cls, theta: Tensor, radius: Tensor, slope: Tensor, terms: int) -> Tensor:
-        powers = torch.arange(terms + 1, dtype=theta.dtype)
-        return _least_squares((theta - math.pi / 2)[:, None] ** powers, radius)
+    @staticmethod
+    def _powers(theta: Tensor, terms: int) -> Tensor:
+        return (theta - math.pi / 2)[:, None] ** torch.arange(terms + 1, dtype=theta.dtype)
 
 
 def _least_squares(matrix: Tensor, value: Tensor) -> Tensor:
-    """(1, n): x of the least |matrix @ x - value|."""
+    """(1, n): x that minimizes |matrix @ x - value|."""
     return torch.linalg.lstsq(matrix, value[:, None]).solution.T

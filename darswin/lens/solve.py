@@ -1,4 +1,4 @@
-"""Rising functions and maps of the plane: how far they rise, and where they take a value."""
+"""Inverses of rising functions and of maps of the plane, and the limits up to which they rise."""
 
 from collections.abc import Callable
 
@@ -9,16 +9,16 @@ from darswin.ops.checks import readable
 
 Function = Callable[[Tensor], Tensor]
 
-_STEPS = 40  # of Newton's method or of halving the bracket
+_STEPS = 40  # Newton steps or bisections
 
 
 def inverse(function: Function, slope: Function, value: Tensor, end: Tensor) -> Tensor:
-    """The x in [0, end] at which a function that rises from 0 takes a value, elementwise.
+    """The x in [0, end] at which a function that rises from 0 has a value, elementwise.
 
-    Newton's method inside a bracket; a step that would leave it, or is more than half as long as
-    the one before, is replaced by the bracket's middle. Two more steps carry the gradients of the
-    inverse, to `value` and to whatever `function` and `slope` depend on: each step doubles the
-    order of the error, so that derivatives up to the third are exact.
+    Newton's method within a bracket. A step that leaves the bracket, or is more than half as long
+    as the step before, is replaced by a bisection. Two more steps carry the gradients of the
+    inverse, to `value` and to the tensors that `function` and `slope` use: each step doubles the
+    order of the error, so derivatives up to the third are exact.
     """
     with torch.no_grad():
         last = function(end)
@@ -39,8 +39,8 @@ def inverse(function: Function, slope: Function, value: Tensor, end: Tensor) -> 
 
 @torch.no_grad()
 def rising_limit(slope: Function, end: Tensor) -> Tensor:
-    """The first x, (N,), at which the slope of a function is not positive or overflows, or `end`,
-    (N,), up to which 1024 steps from 0 are looked at."""
+    """The first x, (N,), at which a slope is not positive or overflows; `end`, (N,), if there is
+    none among 1024 steps from 0 to `end`."""
 
     def rises(x: Tensor) -> Tensor:
         value = slope(x)
@@ -69,13 +69,13 @@ def newton(
 ) -> Tensor:
     """The points that a map of the plane takes to `goal`.
 
-    Newton's steps, each shortened until it comes nearer to the goal and stays where the map keeps
-    its orientation. From a point where it does, they end at the goal or at a fold of the map.
+    Each Newton step is shortened until it comes nearer to the goal, at a point where the map keeps
+    its orientation. From a start with that orientation, the steps end at the goal or at a fold.
 
     Args:
         function: (..., 2) → (..., 2). slopes: (..., 2) → (..., 2, 2), its derivatives.
-        goal, point: (n, 2), or any shape where it is not `readable`.
-        end: how far from the origin to look.
+        goal, point: (n, 2), or any shape if it is not `readable`.
+        end: the largest distance from the origin.
     """
     found, places = point.clone(), torch.arange(len(point), device=point.device)
     error = function(point) - goal
@@ -90,7 +90,7 @@ def newton(
         missed = torch.where(better, length_of(error), missed)
         part = torch.where(better, (2 * part).clamp(max=1), part / 4)
         if not readable(missed):
-            continue  # no shape depends on values
+            continue  # shapes must not depend on values
         found[places] = point
         going = missed > 16 * torch.finfo(goal.dtype).eps * (1 + length_of(goal))
         going &= part > 1e-6
@@ -104,7 +104,7 @@ def newton(
 
 
 def length_of(points: Tensor) -> Tensor:
-    """The length of (..., 2), never 0, where a root has no slope."""
+    """The length of (..., 2), never 0, where a square root has no slope."""
     return points.square().sum(-1).clamp(min=1e-12 * torch.finfo(points.dtype).eps).sqrt()
 
 
@@ -123,7 +123,7 @@ def solve(matrix: Tensor, vector: Tensor) -> Tensor:
 
 
 def radial_slopes(ratio: Tensor, slope: Tensor, direction: Tensor) -> Tensor:
-    """(..., 2, 2): the derivatives of a radial map, `ratio` across and `slope` along a radius."""
+    """(..., 2, 2): the derivatives of a radial map: `slope` along a radius, `ratio` across it."""
     along = direction[..., :, None] * direction[..., None, :]
     across = torch.eye(2, dtype=ratio.dtype, device=ratio.device) - along
     return ratio[..., None, None] * across + slope[..., None, None] * along

@@ -1,9 +1,9 @@
-"""Spacings: the functions of θ that rings, samples and the concentric square split equally.
+"""Spacings: functions of θ that rings, samples and the concentric square divide equally.
 
-- "theta": θ itself, the paper's text. Works beyond 90°.
-- "tan": tan θ, the authors' released code. Only for θ_max < 90°.
+- "theta": θ itself, as in the paper's text. Works beyond 90°.
+- "tan": tan θ, as in the authors' released code. Only for θ_max < 90°.
 - "g": DarSwin-Unet's compromise between the two.
-- "radius": r, equal steps in the image; knows nothing of the lens but its image circle.
+- "radius": r, equal steps in the image; it uses no more of the lens than its image circle.
 """
 
 import math
@@ -24,32 +24,32 @@ G_M, G_N, G_B, G_C = 2.288135593220339, 5, 8.31578947368421, 1 / 3
 
 
 def check_tan(lens: Lens) -> None:
-    """ValueError where tan θ ends before θ_max does, if θ_max is `readable`."""
+    """Raises ValueError if θ_max is `readable` and not below 90°, where tan θ ends."""
     if not readable(lens.theta_max):
         return
     largest = lens.theta_max.max().item() if len(lens) else 0.0
     if largest >= math.pi / 2:
         raise ValueError(
-            "spacing='tan' needs lenses with θ_max below 90°, since tan θ ends there; got "
+            "spacing='tan' needs lenses with θ_max below 90°, where tan θ ends; got "
             f"{math.degrees(largest):.1f}°. Use 'theta', 'g' or 'radius'."
         )
 
 
 def span(lens: Lens, spacing: Spacing) -> tuple[Tensor, Tensor]:
-    """(N, 1) each: θ = 0 and θ_max in units of a spacing."""
+    """The values of a spacing at θ = 0 and θ_max, (N, 1) each."""
     last = lens.theta_max[:, None]
     return to_spacing(lens, torch.zeros_like(last), spacing), to_spacing(lens, last, spacing)
 
 
 def change_spacing(lens: Lens, value: Tensor, source: Spacing, target: Spacing) -> Tensor:
-    """(N, ...) from units of one spacing to those of another."""
+    """Converts values (N, ...) of one spacing to another."""
     if source == target:
         return value
     return to_spacing(lens, to_theta(lens, value, source), target)
 
 
 def to_spacing(lens: Lens, theta: Tensor, spacing: Spacing) -> Tensor:
-    """θ (N, ...), rad, in [0, θ_max] → units of a spacing."""
+    """The values of a spacing at θ (N, ...), rad, in [0, θ_max]."""
     if spacing == "theta":
         return theta
     if spacing == "tan":
@@ -60,7 +60,7 @@ def to_spacing(lens: Lens, theta: Tensor, spacing: Spacing) -> Tensor:
 
 
 def to_theta(lens: Lens, value: Tensor, spacing: Spacing) -> Tensor:
-    """Units of a spacing (N, ...) → θ, rad: the inverse of `to_spacing`."""
+    """θ, rad, at values of a spacing (N, ...): the inverse of `to_spacing`."""
     if spacing == "theta":
         return value
     if spacing == "tan":
@@ -72,7 +72,7 @@ def to_theta(lens: Lens, value: Tensor, spacing: Spacing) -> Tensor:
 
 
 def _g(t: Tensor) -> Tensor:
-    """DarSwin-Unet's g of t = θ/θ_max in [0, 1]: rises from 0 to c b + 1 - c."""
+    """DarSwin-Unet's g(t) for t = θ/θ_max in [0, 1]; it rises from 0 to c b + 1 - c."""
     t = t.clamp(max=1)  # rounding must not take (1 - t) below 0
     return G_C * G_B * t**G_N + (1 - G_C) * (1 - (1 - t) ** G_M)
 

@@ -1,4 +1,4 @@
-"""Lenses that project by way of a sphere or an ellipsoid, with a closed inverse."""
+"""Lenses that project through a sphere or an ellipsoid, with closed-form inverses."""
 
 import math
 
@@ -9,7 +9,7 @@ from darswin.lens.base import MARGIN
 from darswin.lens.ideal import FocalLens
 from darswin.lens.parameter import Number, Parameter
 
-# Where `fit` starts from.
+# Initial values for `fit`.
 XI_STARTS = (1.0, -0.2, 0.5, 2.0)
 ALPHA_STARTS = (0.5, 0.7)
 
@@ -18,7 +18,7 @@ class Spherical(FocalLens):
     """r = f sin θ / (ξ + cos θ): the unified model, perspective at ξ = 0, stereographic at ξ = 1.
 
     Args:
-        xi: ξ ≥ 0. focal: f > 0, px. Others: as `Lens`; r rises while cos θ > -min(ξ, 1/ξ).
+        xi: ξ ≥ 0. focal: f > 0, px. Others: see `Lens`. r rises while cos θ > -min(ξ, 1/ξ).
 
     Source: DarSwin, ICCV 2023, eq. 5; Barreto, CVIU 2006.
     """
@@ -34,7 +34,7 @@ class Spherical(FocalLens):
         return focal * torch.sin(theta) / (xi + torch.cos(theta))
 
     def _scale_to(self, radius: Tensor) -> Tensor:
-        # Not radius / r_max, which rounds otherwise: data sets are the same to the bit.
+        # radius / r_max would round differently, but data sets must stay the same to the bit.
         return radius * (self.xi + torch.cos(self.theta_max)) / torch.sin(self.theta_max)
 
     def _angle_at(self, radius: Tensor) -> Tensor:
@@ -43,11 +43,11 @@ class Spherical(FocalLens):
 
 
 class EnhancedUnified(FocalLens):
-    """r = f sin θ / (α √(β sin² θ + cos² θ) + (1 - α) cos θ): EUCM, at β = 1 the unified model.
+    """r = f sin θ / (α √(β sin² θ + cos² θ) + (1 - α) cos θ): EUCM; β = 1 is the unified model.
 
     Args:
         alpha: α in [0, 1]. beta: β > 0; or β < 0, for θ up to atan(1 / √-β). focal: f > 0, px.
-        Others: as `Lens`.
+        Others: see `Lens`.
 
     Source: Khomutenko, Garcia and Martinet, RA-L 2016.
     """
@@ -60,10 +60,10 @@ class EnhancedUnified(FocalLens):
 
     @property
     def theta_limit(self) -> Tensor:
-        # Where cos θ = -w √(β sin² θ + cos² θ).
+        # The limit is where cos θ = -w √(β sin² θ + cos² θ).
         w, beta = _cone(self.alpha.detach()), self.beta.detach()
         last = torch.atan2(root(1 - w * w), -w * root(beta))
-        # Where β is below 0, the lens ends where the square root does.
+        # For β below 0, it is where the square root becomes 0.
         return torch.where(beta > 0, last, torch.atan(root(-beta).reciprocal())) - MARGIN
 
     def project(self, theta: Number) -> Tensor:
@@ -86,7 +86,7 @@ class DoubleSphere(FocalLens):
     """r = f sin θ / (α √(sin² θ + (ξ + cos θ)²) + (1 - α) (ξ + cos θ)).
 
     Args:
-        xi: ξ > -1. alpha: α in [0, 1]. focal: f > 0, px. Others: as `Lens`.
+        xi: ξ > -1. alpha: α in [0, 1]. focal: f > 0, px. Others: see `Lens`.
 
     Source: Usenko, Demmel and Cremers, 3DV 2018.
     """
@@ -96,11 +96,11 @@ class DoubleSphere(FocalLens):
 
     @property
     def theta_limit(self) -> Tensor:
-        # The angle ψ from the second sphere's center, tan ψ = sin θ / (ξ + cos θ), ends where
-        # cos ψ = -w; and, beyond ξ = 1, it stops to rise where cos θ = -1/ξ.
+        # The angle ψ from the second sphere's center, tan ψ = sin θ / (ξ + cos θ), ends at
+        # cos ψ = -w. For ξ above 1, it stops rising at cos θ = -1/ξ.
         w, xi = _cone(self.alpha.detach()), self.xi.detach()
         psi = torch.atan2(root(1 - w * w), -w)
-        # θ from ψ, as in a triangle of sides 1 and ξ.
+        # θ from ψ, in a triangle with sides 1 and ξ.
         theta = psi + torch.asin((xi * torch.sin(psi)).clamp(-1, 1))
         return torch.minimum(theta - MARGIN, sphere_limit(xi.clamp(min=1)))
 
@@ -121,24 +121,24 @@ class DoubleSphere(FocalLens):
 
 
 def sphere_angle(rho: Tensor, xi: Tensor) -> Tensor:
-    """θ at which sin θ / (ξ + cos θ) is ρ."""
-    # tan ψ = ρ, θ = ψ + asin(ξ sin ψ); as atan2, exact also where the sine nears 1.
+    """θ with sin θ / (ξ + cos θ) = ρ."""
+    # tan ψ = ρ, θ = ψ + asin(ξ sin ψ). atan2 is exact also where the sine is near 1.
     square = 1 + (1 - xi * xi) * rho * rho
     return torch.atan(rho) + torch.atan2(xi * rho, root(square))
 
 
 def sphere_limit(xi: Tensor) -> Tensor:
-    """Up to where sin θ / (ξ + cos θ) rises."""
+    """The θ up to which sin θ / (ξ + cos θ) rises."""
     with torch.no_grad():
         return torch.acos(-torch.where(xi <= 1, xi, 1 / xi.clamp(min=1))) - MARGIN
 
 
 def _cone(alpha: Tensor) -> Tensor:
-    """w: the cosine of the last angle of the unified model of α is -w."""
+    """w: the unified model with α ends at the angle with cosine -w."""
     return torch.where(alpha <= 0.5, alpha / (1 - alpha), (1 - alpha) / alpha.clamp(min=0.5))
 
 
 def root(square: Tensor) -> Tensor:
-    """√, and nearly 0 where rounding made a square negative, as at the last ray of a lens."""
+    """√square, but nearly 0 where rounding made the square negative, as at a lens's last ray."""
     eps = torch.finfo(square.dtype).eps
     return square.clamp(min=eps * eps).sqrt()

@@ -72,7 +72,7 @@ def test_strided_parameters_make_contiguous_lenses():
     lens = Spherical(*table.unbind(1), center=table[:, :2].detach().t().flip(0).t())
     assert all(t is None or t.is_contiguous() for t in pytree.tree_leaves(lens))
     lens.r_max.sum().backward()
-    assert (table.grad[:, 1] != 0).all()  # still the parameters that were given
+    assert (table.grad[:, 1] != 0).all()  # gradients reach the given tensors
 
 
 @pytest.mark.parametrize("name", MODELS)
@@ -86,9 +86,11 @@ def test_pickle_copy_and_pytree(name):
 
 
 def test_a_column_of_coefficients_is_not_many_lenses():
-    column = [[0.01], [0.002], [-0.001], [0.0003]]  # as OpenCV has its D
+    column = [[0.01], [0.002], [-0.001], [0.0003]]  # the shape of OpenCV's D
     for make in (lambda: KannalaBrandt(300.0, column), lambda: KannalaBrandt([300.0], column)):
-        with pytest.raises(ValueError, match=r"radial of shape \(4, 1\) is 4 lenses of one coef"):
+        with pytest.raises(
+            ValueError, match=r"radial of shape \(4, 1\) means 4 lenses with one coef"
+        ):
             make()
     assert len(KannalaBrandt([300.0] * 4, column)) == 4
     assert len(KannalaBrandt(300.0, [[0.01]])) == 1

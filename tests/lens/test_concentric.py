@@ -19,7 +19,7 @@ f64 = torch.float64
 
 
 def published(a, b):
-    """Shirley and Chiu's map of one place, by its four regions, as they print it."""
+    """Shirley and Chiu's map of one place, with the four regions of their paper."""
     if a > -b:
         if a > b:
             r, phi = a, math.pi / 4 * (b / a)
@@ -51,7 +51,7 @@ def test_it_is_the_published_map_and_back(count):
     radius, direction = square_to_disc(places)
     assert torch.allclose(direction.norm(dim=-1), torch.ones((), dtype=f64))
     torch.testing.assert_close(disc_to_square(radius, direction), places)
-    middle = disc_to_square(torch.zeros(1), torch.zeros(1, 2))  # as `rays` gives it
+    middle = disc_to_square(torch.zeros(1), torch.zeros(1, 2))  # the direction that `rays` returns
     assert torch.equal(middle, torch.zeros(1, 2))
 
 
@@ -110,7 +110,7 @@ def test_there_and_back(name, spacing):
                                    indexing="xy"), -1)[None], size)  # fmt: skip
     assert torch.equal(beyond, ~lens.sees(theta))
     assert (places[~beyond].abs() <= 1).all()
-    # The square's own pixels, read where the image's pixels lie in it, are the image's rays.
+    # The directions at the places of the image's pixels are those of the image's rays.
     radius, direction = square_to_disc(places)
     got = torch.atan2(direction[..., 1], direction[..., 0])[~beyond & (radius > 1e-3)]
     want = azimuth.expand_as(radius)[~beyond & (radius > 1e-3)]
@@ -129,7 +129,7 @@ def test_tan_ends_before_90_degrees():
 
 
 def test_reading_a_square_of_any_resolution():
-    """A field that is linear in the square's places is read exactly, up to the outermost pixels."""
+    """A linear function of the place is read exactly, up to the outermost pixels."""
     places = torch.rand(2, 7, 5, 2) * 1.6 - 0.8
     places[0, 0, 0] = OUTSIDE
     for size in (8, 13):
@@ -142,4 +142,4 @@ def test_reading_a_square_of_any_resolution():
         torch.testing.assert_close(read, expected)
     corners = torch.tensor([[-1.0, -1.0], [1.0, 1.0]]).reshape(1, 1, 2, 2)
     read = read_square(torch.arange(16.0).reshape(1, 1, 4, 4), corners)
-    assert read.flatten().tolist() == [0.0, 15.0]  # no fading at the rim
+    assert read.flatten().tolist() == [0.0, 15.0]  # the rim does not fade to 0

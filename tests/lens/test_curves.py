@@ -107,14 +107,14 @@ def test_a_lens_that_begins_beside_the_axis_is_no_curve(shift):
     lens = alone("ocamcalib.txt").with_theta_max(1.9)
     moved = lens.replace(coefficients=lens.coefficients + double(shift, *[0] * 12))
     other = Equidistant(double(300.0))
-    with pytest.raises(ValueError, match=r"only if r\(0\) is 0, .* got r\(0\) = -?[\d.]+ px"):
+    with pytest.raises(ValueError, match=r"only if r\(0\) is 0 to .* got r\(0\) = -?[\d.]+ px"):
         cat([moved, other])
     with pytest.raises(ValueError, match="only if"):
         cat([other, moved.with_theta_max(1.7).resized(0.01)])
     theta = 0.9 * moved.theta_max * torch.linspace(0, 1, 50, dtype=f64)
     same = cat([moved, moved])
     assert torch.equal(same.project(theta[None])[1], moved.project(theta))
-    # What a fitted polynomial leaves does not count.
+    # The small r(0) of a fitted polynomial is allowed.
     assert isinstance(cat([lens, other]), Tabulated)
 
 
@@ -149,7 +149,7 @@ def test_a_table_of_two_is_straight():
 
 
 def test_a_table_without_slopes_is_scipys_pchip():
-    """But for the first and the last piece, whose slopes at the ends scipy limits otherwise."""
+    """Except in the first and last interval, where scipy limits the slopes differently."""
     lens = example("Tabulated", torch.Generator().manual_seed(0))[0]
     exact = PchipInterpolator(lens.angles[0], lens.radii[0])
     theta = torch.linspace(lens.angles[0, 1], lens.angles[0, -2], 100, dtype=f64)

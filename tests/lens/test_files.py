@@ -1,4 +1,4 @@
-"""Calibration files against other implementations, and what a file may leave open."""
+"""Calibration files against other implementations, and files with missing information."""
 
 import json
 import math
@@ -27,7 +27,7 @@ K = [[421.3, 0.0, 643.1], [0.0, 420.9, 478.6], [0.0, 0.0, 1.0]]
 FISHEYE = [-0.021, 0.0043, -0.0012, 0.00008]
 PLUMB_BOB = [-0.22, 0.05, 0.001, -0.002, 0.003]
 RATIONAL = [0.2, 0.05, 0.001, -0.002, 0.003, 0.25, 0.04, 0.002]
-SIZE = dict(image_size=(960, 1280), dtype=f64)  # where a file does not say it
+SIZE = dict(image_size=(960, 1280), dtype=f64)  # for a file without an image size
 
 
 @pytest.mark.parametrize(("name", "camera"), CALIBRATIONS)
@@ -49,7 +49,7 @@ def test_radii_of_calibrations_to_a_thousandth_of_a_pixel(name, camera):
         ("ros_fisheye.yaml", "KannalaBrandt", (651.2074390184226, 355.4127760951834), (720, 1280)),
         ("opencv_fisheye.yaml", "KannalaBrandt", (643.12, 478.55), (960, 1280)),
         ("opencv_omnidir.xml", "Mei", (641.0, 478.0), (960, 1280)),
-        # The row stands first, and C indices.
+        # The row comes first, and indices begin at 0.
         ("ocamcalib.txt", "OCamInverse", (723.6, 715.2), (1440, 1440)),
         # The center of the upper left pixel is (0.5, 0.5).
         ("colmap.txt", "KannalaBrandt", (1504 - 0.5, 2048 - 0.5), (4096, 3008)),
@@ -70,7 +70,7 @@ def test_each_format_keeps_its_pixel_origin(name, model, center, size):
 
 
 def write(path, **entries):
-    """A file of OpenCV's own FileStorage; the notation is that of the suffix."""
+    """A file written by OpenCV's FileStorage, in the notation of its suffix."""
     storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
     for name, value in entries.items():
         storage.write(name, np.asarray(value, float) if isinstance(value, list) else value)
@@ -125,7 +125,7 @@ def test_opencv_pinhole(tmp_path, suffix, d):
 
 
 def distorted(u, v, plane, k=(), p=(0, 0), d=(), s=(0, 0, 0, 0), skew=0):
-    """The pixels of points of a plane, with the terms as users of OpenCV write them."""
+    """Pixels of points of a plane, by OpenCV's formula."""
     (fx, fy, cx, cy), r2 = plane, u * u + v * v
     radial = 1 + sum(c * r2**i for i, c in enumerate(k, 1))
     radial = radial / (1 + sum(c * r2**i for i, c in enumerate(d, 1)))
@@ -143,7 +143,7 @@ def mei(xi, plane, k, p, skew=0):
 
 
 def colmap_pixels(model, params, points):
-    """As COLMAP's ImgFromCam, without its 0.5."""
+    """COLMAP's ImgFromCam, in its pixel convention."""
     x, y, z = points.T
     single = model.startswith("SIMPLE") or model in ("RADIAL", "RADIAL_FISHEYE", "BROWN_CONRADY")
     params = params[:1] * 2 + params[1:] if single else params
@@ -198,14 +198,14 @@ NERFSTUDIO = dict(camera_model="OPENCV", fl_x=500, fl_y=510, cx=320, cy=240, w=6
 
 
 def unified_pixels(points):
-    """basalt's ucm."""
+    """Pixels by basalt's ucm formula."""
     x, y, z = points.T
     den = 0.6385 + (1 - 0.6385) * z
     return np.stack((204.6 * x / den + 258.3, 204.9 * y / den + 251.7), -1)
 
 
 def world2cam(points):
-    """OCamCalib's: x is down (row) and y to the right, the optical axis is -z."""
+    """OCamCalib's world2cam: x points down, y to the right, and the optical axis is -z."""
     right, down, forward = points.T
     x, y, z = down, right, -forward
     norm = np.hypot(x, y)
@@ -280,7 +280,7 @@ def test_woodscapes_aspect_ratio_stretches_the_rows():
 @pytest.mark.parametrize("beta", [-0.3, -50.0, -1e-3])
 @pytest.mark.parametrize("dtype", [torch.float32, f64])
 def test_enhanced_unified_with_a_beta_below_0(alpha, beta, dtype):
-    """COLMAP's division model is one of α = ½."""
+    """COLMAP's division model has such a β, and α = ½."""
     lens = EnhancedUnified(torch.tensor(alpha, dtype=dtype), beta, 300.0)
     assert lens.theta_limit.item() == pytest.approx(math.atan((-beta) ** -0.5), abs=2e-6)
     theta = lens.theta_limit * torch.linspace(0, 1, 200, dtype=dtype)
@@ -292,7 +292,7 @@ def test_enhanced_unified_with_a_beta_below_0(alpha, beta, dtype):
         assert lens.unproject(torch.tensor([1.01, 2.0, 100.0], dtype=dtype) * end).isnan().all()
 
 
-# -- as other tools and short scripts write them ------------------------------------------------
+# -- files of other tools and short scripts -----------------------------------------------------
 
 PLANE = {"fx": 421.3, "fy": 420.9, "cx": 643.1, "cy": 478.6, "width": 1280, "height": 960}
 RADTAN = dict(model="BrownConrady", radial=[-0.22, 0.05], tangential=[0.001, -0.002])
@@ -313,7 +313,7 @@ distortion_coefficients: [-0.22, 0.05, 0.001, -0.002]
 NAMES = ("D", "d", "distortion_coefficients", "distortion_coefs", "distCoeffs", "dist_coeff",
          "dist", "distortion", "coeffs", "coefficients", "Distortion_Parameters",
          "distortion_params", "camera_distortion", "cameraDistortionCoefficients")  # fmt: skip
-# What is no coefficient may stand beside them.
+# Entries that are not coefficients may be present too.
 BESIDE = dict(R=[1.0] * 9, P1=[1.0] * 12, R1=[1.0] * 9, board_distance=0.3, p=[1.0] * 12,
               undistorted_size=[9, 9], distortion_model="plumb_bob", dist_note="none", d2=[],
               avg_reprojection_error=0.3, D_std_dev=[0.1] * 5)  # fmt: skip
@@ -328,7 +328,7 @@ def flat(*names, **entries):
 
 
 def fisheye_or_pinhole(**entries):
-    """Four coefficients, which a word about their model decides on."""
+    """Four coefficients, whose model depends on the other entries."""
     return opencv(D=FISHEYE, **entries)
 
 
@@ -350,17 +350,17 @@ DIVIDED = dict(radial=[0.2, 0.05, 0.003], denominator=[0.25, 0.04, 0.002])
           for says in (dict(distortion_model="plumb_bob"), dict(fisheye=0))),
         *((opencv(D=layout), {}, PLUMB) for layout in ([PLUMB_BOB], [[d] for d in PLUMB_BOB])),
         (opencv(D=PLUMB_BOB, **BESIDE), {}, PLUMB),
-        # As people write it with NumPy, and as `rostopic echo` and `ros2 topic echo` print it.
+        # From NumPy scripts, and from the output of `rostopic echo` and `ros2 topic echo`.
         (json.dumps(dict(mtx=K, dist=[PLUMB_BOB], img_size=[1280, 960])), {}, PLUMB),
         (f"height: 960\nwidth: 1280\ndistortion_model: plumb_bob\nD: {PLUMB_BOB}\n"
          f"K: {K[0] + K[1] + K[2]}\n", {}, PLUMB),
         *((ROS2 + end, {}, ECHOED) for end in ("", "\n---\n---\n\n", "...\n", "\r\n---\r\n")),
         (file_text("kalibr_fov.yaml").replace("0.92", "0"), dict(camera="cam0"),
          dict(model="Perspective", center=[255.5, 254.5])),
-        # A θ_max that was rounded beyond the limit.
+        # A θ_max beyond the limit by rounding.
         ('{"model": "Equidistant", "focal": 300, "theta_max": 3.14159265}', {},
          dict(model="Equidistant", focal=300.0)),
-        # Which model.
+        # The choice of the model.
         (opencv(D=[], fisheye=0), {}, dict(model="Perspective")),
         (opencv(), dict(model="fisheye"), dict(model="Equidistant")),
         (fisheye_or_pinhole(), dict(model="fisheye"), KB),
@@ -396,7 +396,9 @@ def test_two_messages_are_no_file():
 @pytest.mark.parametrize("save", [np.savez, np.savez_compressed])
 def test_arrays_of_numpy(save, tmp_path):
     path = tmp_path / "calib.npz"
-    points = np.random.default_rng(0).normal(size=(20, 5000, 3))  # megabytes, and no lens's
+    points = np.random.default_rng(0).normal(
+        size=(20, 5000, 3)
+    )  # megabytes that do not belong to the lens
     rvecs = np.array([np.zeros(3), np.zeros(2)], dtype=object)  # never unpickled
     save(path, mtx=np.array(K), dist=np.array([PLUMB_BOB]), DIM=np.array([1280, 960]), ret=0.31,
          objpoints=points, rvecs=rvecs)  # fmt: skip
@@ -430,13 +432,13 @@ def test_binned_regions_show_what_the_sensor_sees(binning, roi):
     across, down = (max(side, 1) for side in binning)
     assert lens.image_size.tolist() == [[height // down, width // across]]
     points = torch.as_tensor(points_around(0.7))
-    # A pixel of the image is as many of the sensor's, whose middles it has in its own.
+    # A pixel of the image covers several of the sensor, and its center is their middle.
     sensor = whole.with_theta_max(None).project_points(points) - torch.tensor([left, top])
     expected = (sensor + 0.5) / torch.tensor([across, down], dtype=f64) - 0.5
     torch.testing.assert_close(lens.project_points(points), expected, rtol=0, atol=1e-9)
 
 
-# -- what a file may leave open -----------------------------------------------------------------
+# -- missing information ------------------------------------------------------------------------
 
 
 def test_theta_max_is_the_widest_side():
@@ -449,7 +451,7 @@ def test_theta_max_is_the_widest_side():
     with pytest.raises(ValueError, match=r"WoodScape calibration .*theta_max must be at most"):
         load(FILES / "woodscape.json", theta_max=3.2)
     assert load(FILES / "ours.json").theta_max.item() == pytest.approx(1.6)
-    # An image that sees more than the lens: the lens's limit.
+    # For an image larger than the image circle, θ_max is the limit.
     lens = load(FILES / "opencv_fisheye.yaml", dtype=f64)
     wide = loads(file_text("opencv_fisheye.yaml").replace("1280", "12800"), dtype=f64)
     assert wide.theta_max.item() == wide.theta_limit.item() > lens.theta_max.item()
@@ -467,7 +469,7 @@ def test_without_an_image_size(tmp_path):
         load(pinhole)
     assert load(pinhole, theta_max=1.0).theta_max.item() == pytest.approx(1.0)
     assert load(pinhole, image_size=(960, 1280)).r_max.item() == pytest.approx(643.6, abs=0.5)
-    # The file's own size wins.
+    # The file's own size takes precedence.
     assert load(FILES / "woodscape.json", image_size=(9, 9)).image_size.tolist() == [[966, 1280]]
 
 
@@ -488,11 +490,11 @@ def test_several_cameras(tmp_path):
                  image_width=640, image_height=480)  # fmt: skip
     assert [lens.radial[0, 0].item() for lens in load_all(pair, dtype=f64).values()] == [0.1, 0.2]
     assert load(FILES / "basalt.json", camera="cam4").image_size.tolist() == [[480, 640]]
-    # Where names are numbers, a number is a name.
+    # If the names are numbers, a number is a name.
     colmap = "".join(f"{i} SIMPLE_FISHEYE 640 480 {100 * i} 320 240\n" for i in (1, 2, 5, 7))
     for name in (1, 2, 5, 7, "1", "2", "5", "7"):
         assert loads(colmap, camera=name).focal.item() == 100 * int(name)
-    # One that lacks something is missed only where it is wanted.
+    # A camera with a missing entry is an error only if it is read.
     text = file_text("kalibr_tumvi.yaml").replace("camera_model", "model", 1)
     assert loads(text, camera="cam1").focal.item() == focal
 

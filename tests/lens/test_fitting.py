@@ -40,7 +40,7 @@ def test_every_model_finds_itself(lens):
         torch.testing.assert_close(getattr(found, name), getattr(lens, name), rtol=1e-6, atol=1e-6)
 
 
-# The largest error in px that each model leaves of the front camera (1280×966), to 95°.
+# The largest error of each model, px, for the front camera (1280×966) up to 95°.
 @pytest.mark.parametrize(
     ("model", "most"),
     [("KannalaBrandt", 0.26), ("Mei", 0.56), ("Spherical", 2.4), ("EnhancedUnified", 0.61),
@@ -51,7 +51,7 @@ def test_the_error_is_what_is_left(model, most):
     found, error = fit(model, FRONT)
     assert type(found) is MODELS[model] and error.item() < most
     theta = torch.linspace(0, 1, 700, dtype=f64) * FRONT.theta_max
-    azimuth = torch.full_like(theta, math.pi / 2)  # where the affine makes the most of it
+    azimuth = torch.full_like(theta, math.pi / 2)  # where the affine enlarges distances most
     apart = found.project_rays(theta, azimuth) - FRONT.project_rays(theta, azimuth)
     assert apart.norm(dim=-1).max().item() == pytest.approx(error.item(), rel=1e-2, abs=1e-6)
     assert torch.equal(found.center, FRONT.center)

@@ -31,7 +31,7 @@ from darswin.lens.ideal import FocalLens
 
 @pytest.mark.parametrize("name", MODELS)
 def test_the_limit_is_where_r_stops_rising(name):
-    """Just beyond it r falls, is infinite, or the angle is none."""
+    """Just beyond the limit, r falls or is infinite, or θ exceeds 180°."""
     lens = example(name, torch.Generator().manual_seed(6))
     limit = lens.theta_limit
     half_turn = limit > math.pi - 1e-5
@@ -78,7 +78,7 @@ def test_models_that_contain_each_other():
 
 
 def in_parameters(lens, method):
-    """`lens.method` as a function of its arguments and the lens's parameters; these."""
+    """`lens.method` as a function of its arguments and the parameters; the parameters."""
     tensors = {n: t.clone().requires_grad_() for n, t in lens._tensors().items()}
     tensors.pop("theta_max")
 
@@ -200,7 +200,7 @@ def test_where_nothing_lands_there_is_no_gradient_either(name):
         (lambda: OCam([100.0, 0.0]), "coefficients must be such that a₀ is below 0"),
         (lambda: Polynomial([1.0, -5.0], 1.0), "at most 0.09999"),
         (lambda: Polynomial([0.0, 1.0], 1.0), "coefficients must be such that r rises"),
-        (lambda: Polynomial([]), "coefficients must be at least one a lens"),
+        (lambda: Polynomial([]), "coefficients must be at least one per lens"),
         (lambda: Polynomial([1.0, math.nan], 1.0), "coefficients must be finite"),
         (lambda: Polynomial(1.0, 1.0), "coefficients must be (K) or (N, K)"),
         (lambda: Polynomial([1.0], 3.2), "theta_max must be at most 3.14159"),
@@ -272,7 +272,7 @@ def test_angles_at_the_sides_of_the_image():
     # The roots of r(θ) = 640 and r(θ) = 483, by bisection with 40 digits.
     assert left == pytest.approx(94.989, abs=1e-3) and right == pytest.approx(left, abs=1e-4)
     assert top == pytest.approx(74.957, abs=1e-3) and bottom == pytest.approx(top, abs=1e-4)
-    # An image that ends beyond the circle sees as far as the lens.
+    # For an image larger than the image circle, the angle is the limit.
     small = Spherical(2.0, 10.0, image_size=(100, 8))
     assert small.side_angles()[0].tolist()[1] == small.theta_limit.item()
 

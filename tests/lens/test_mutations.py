@@ -1,4 +1,4 @@
-"""Files that are wrong in one thing or several: each gives the lens that it says, or an error."""
+"""Calibration files with random changes: each gives the lens that it describes, or an error."""
 
 import math
 import random
@@ -14,7 +14,7 @@ from lens_examples import FILES
 
 from darswin.lens import load
 
-# A camera of each file, and where in the file its numbers stand.
+# A camera of each file, and the place of its numbers in the file.
 CAMERAS = [
     ("woodscape.json", None, r'"intrinsic": .*?}'),
     ("kitti360_02.yaml", None, r"mirror_parameters.*"),
@@ -49,13 +49,13 @@ NUMBER = re.compile(rb"(?<![\w.])[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?(?![\w.])"
 
 
 def tokens(data: bytes) -> list[re.Match]:
-    """The numbers of a text, but for its comments."""
+    """The numbers of a text, without its comments."""
     blank = re.sub(rb"(?m)(^|\s)#.*$|(?s:<!--.*?-->)", lambda m: b" " * len(m[0]), data)
     return list(NUMBER.finditer(blank))
 
 
 def of_camera(name: str, place: str) -> tuple[bytes, list[re.Match]]:
-    """A file, and the numbers of its camera that tell: no 0, and none of a digit or two."""
+    """A file, and its camera's distinctive numbers: not 0, and with at least two digits."""
     data = FILES.joinpath(name).read_bytes()
     found = []
     for block in re.finditer(place.encode(), data, re.DOTALL):
@@ -65,7 +65,7 @@ def of_camera(name: str, place: str) -> tuple[bytes, list[re.Match]]:
 
 
 def numbers_of(lens) -> torch.Tensor:
-    """All that a file may say of a lens, in its own terms and in the file's."""
+    """All numbers of a lens, in our convention and in those of the files."""
     values = lens._tensors()
     found = [value[0] for value in values.values()]
     center = lens.center_in((1, 1))[0]
@@ -80,7 +80,7 @@ def numbers_of(lens) -> torch.Tensor:
 
 
 def in_message(data: bytes) -> list[bytes]:
-    """The numbers of a ROS message that say which part of the sensor its image shows."""
+    """The numbers of a ROS message for binning and the region of interest."""
     return NUMBER.findall(data[data.find(b"binning_x") :]) if b"binning_x" in data else []
 
 
@@ -90,7 +90,7 @@ def missing(lens, expected: list[float]) -> list[float]:
 
 
 def read(path: Path, camera: str | None):
-    """The lens or None: then it said, in a line, why not. Never more than two seconds."""
+    """The lens, or None after an error in one line. Takes at most two seconds."""
     start = time.process_time()
     try:
         lens = load(path, camera=camera, dtype=torch.float64)
@@ -109,7 +109,7 @@ def test_every_number_of_a_camera_counts(name, camera, place, tmp_path):
     path.write_bytes(data)
     lens = read(path, camera)
     assert len(told) > 2 and not missing(lens, [float(m[0]) for m in told])
-    for matches in (told, *([match] for match in told)):  # together, or where it is wrong alone
+    for matches in (told, *([match] for match in told)):  # all at once, or else one by one
         wrong, others = data, [f"{float(match[0]) * 1.0137:.9g}".encode() for match in matches]
         for match, other in reversed([*zip(matches, others, strict=True)]):
             wrong = wrong[: match.start()] + other + wrong[match.end() :]
@@ -138,7 +138,7 @@ NOTATIONS = (
 
 
 def scaled(old, rng):
-    """Every number of a text times another."""
+    """The text with every number multiplied by one factor."""
     factor = rng.choice((-1, 0.1, 10, 1e3, 1e-3, 1e9)) * rng.uniform(0.9, 1.1)
     return NUMBER.sub(lambda match: f"{float(match[0]) * factor:.9g}".encode(), old)
 
@@ -158,13 +158,13 @@ def renamed(old, rng):
 
 
 def repeated(old, rng):
-    """Nothing, or twice the same, perhaps with other numbers."""
+    """Nothing, or the text twice, perhaps with other numbers."""
     return rng.choice((b"", old + old, old + b" " + scaled(old, rng)))
 
 
 NAME, LINE = rb"[A-Za-z_]\w*(?=\"?\s*[:>])", rb".*\n"
 ENTRY, PIECE = rb"[\"\w]+\s*:\s*" + NUMBER.pattern + rb",?", rb"(?s).{1,20}"
-# A pattern, and what one of its places becomes.
+# A pattern, and a function that changes one match of it.
 MUTATIONS = (
     (NUMBER, lambda old, rng: rng.choice(VALUES).encode()), (NUMBER, scaled), (NUMBER, scaled),
     (NUMBER, digit), (NUMBER, digit), (NUMBER, nested), (NAME, renamed), (NAME, renamed),
@@ -176,7 +176,7 @@ MUTATIONS = (
 
 
 def mutated(data: bytes, rng: random.Random) -> bytes:
-    """A file with one thing wrong, seldom several."""
+    """A file with one change, or sometimes several."""
     for _ in range(rng.choice((1, 1, 1, 2, 4))):
         pattern, new = rng.choice(MUTATIONS)
         if places := list(re.finditer(pattern, data)):
@@ -201,11 +201,11 @@ def test_a_mutated_file_gives_the_lens_that_it_says_or_a_clear_error(
     assert 0 < lens.theta_max.item() <= math.pi
     theta = lens.theta_max * torch.linspace(0, 1, 9, dtype=torch.float64)
     assert lens.project_rays(theta, torch.linspace(-3, 3, 9), (9, 9)).isfinite().all()
-    if in_message(wrong) != in_message(data):  # they move the others
+    if in_message(wrong) != in_message(data):  # they change the other numbers
         return
-    # The camera's numbers that the file still has, and one that it has in place of another.
+    # The camera's numbers that are still in the file, and the new one of a changed number.
     before, after = ([match[0] for match in tokens(text)] for text in (data, wrong))
-    if len(after) > len(before):  # one that is twice there may stand by a name that means nothing
+    if len(after) > len(before):  # a copied number may have a name without a meaning
         return
     expected = [m[0] for m in told if after.count(m[0]) >= before.count(m[0])]
     if len(before) == len(after):

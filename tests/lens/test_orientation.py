@@ -1,4 +1,4 @@
-"""Lenses that turn with their picture."""
+"""Lenses of rotated pictures."""
 
 import hypothesis.strategies as st
 import numpy as np
@@ -17,7 +17,7 @@ SIZE = (5, 7)
 
 
 def where_pixels_went(orientation: int) -> torch.Tensor:
-    """(H, W, 2): x and y, as stored, of the pixels of the picture that Pillow turns upright."""
+    """(H, W, 2): the stored x and y of each pixel of the picture that Pillow makes upright."""
     y, x = np.mgrid[: SIZE[0], : SIZE[1]].astype(np.uint8)
     image = Image.fromarray(np.stack((x, y, y), -1))
     image.getexif()[ExifTags.Base.Orientation] = orientation
@@ -25,7 +25,7 @@ def where_pixels_went(orientation: int) -> torch.Tensor:
 
 
 def from_stored(points: torch.Tensor, orientation: int) -> torch.Tensor:
-    """Upright places (..., 2) of places as stored: the affine map through Pillow's pixels."""
+    """Places (..., 2) in the upright picture of stored places, by Pillow's pixels."""
     went = where_pixels_went(orientation)
     height, width = went.shape[:2]
     corner, right, down = went[0, 0], went[0, 1] - went[0, 0], went[1, 0] - went[0, 0]
@@ -98,7 +98,7 @@ def test_a_ray_lands_where_its_pixel_was_turned_to(lens, angle, theta, azimuth):
     before = lens.project_rays(theta, azimuth)
     place = before @ matrix[:, :2].T + matrix[:, 2]
     torch.testing.assert_close(after.project_rays(theta, azimuth + angle), place)
-    if lens.affine is None:  # lengths are kept
+    if lens.affine is None:  # then lengths stay the same
         torch.testing.assert_close(matrix[:, :2] @ matrix[:, :2].T, torch.eye(2, dtype=f64))
 
 

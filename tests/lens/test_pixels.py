@@ -31,7 +31,7 @@ def triangle(a, b, c):
 
 
 def polygons(lens, x, y, parts=4):
-    """The solid angles of the pixels at (x, y), each cut into parts × parts."""
+    """The solid angles of the pixels at (x, y), each divided into parts × parts."""
     step = torch.linspace(-0.5, 0.5, parts + 1, dtype=f64)
     corners = torch.stack(torch.meshgrid(step, step, indexing="xy"), -1)
     pixels = torch.stack((x, y), -1)[:, None, None] + corners
@@ -57,7 +57,7 @@ def test_solid_angles_are_those_of_spherical_polygons(name):
     y, x = (~theta.isnan()).nonzero().unbind(1)
     points = lens.unproject_points(torch.stack((x, y), -1).to(f64))
     torch.testing.assert_close(theta[y, x], torch.acos(points[..., 2].clamp(-1, 1)))
-    # Not where a corner of the pixel is beyond what the model is valid for.
+    # Not at pixels with a corner beyond the model's limit.
     y, x = (theta < lens.theta_max - 0.1).nonzero().unbind(1)
     assert len(x) > 300
     expected = polygons(lens, x.to(f64), y.to(f64))
@@ -188,10 +188,7 @@ def test_perspective_view(size):
 
 
 def test_general_lenses():
-    source = Mei(
-        1.5, 40.0, (0.05, 0.2), 1.2, (30.0, 22.5), affine=[[1.0, 0.05], [0.0, 0.8]],
-        tangential=(0.02, -0.03),
-    ).to(f64)  # fmt: skip
+    source = LENSES["general"].with_theta_max(1.2)
     target = KannalaBrandt(20.0, [0.02], 1.7, affine=[[1.0, 0.0], [0.1, 1.1]]).to(f64)
     for a, b in ((source, target), (target, source)):
         there = reprojection(a, (46, 64), b, (40, 50))[0]

@@ -1,4 +1,4 @@
-"""Properties of any lens, of any model, with any parameters, and of any grid of one."""
+"""Properties of lenses of any model with any parameters, and of their grids."""
 
 import json
 import math
@@ -20,7 +20,7 @@ def rows(draw, low, high, count, width):
 
 @st.composite
 def lenses(draw, radial=False):
-    """One to three lenses of a model, with or without what is optional."""
+    """One to three lenses of a model, with or without optional parameters."""
     name, count = draw(st.sampled_from(sorted(MODELS))), draw(st.integers(1, 3))
     model, values = MODELS[name], {}
     for key in (*model.parameters, *model.optional):
@@ -50,7 +50,7 @@ def lenses(draw, radial=False):
     tensors = {key: torch.tensor(value, dtype=f64) for key, value in (values | frame).items()}
     try:
         lens = model(**tensors)
-    except ValueError as error:  # r that does not rise, which is said
+    except ValueError as error:  # r does not rise
         hypothesis.assume("such that r " not in str(error))
         raise
     share = draw(st.floats(0.3 if name == "OCamInverse" else 0.05, 1))
@@ -66,7 +66,7 @@ def test_radii_and_angles_undo_each_other_and_nothing_else_lands(lens, data):
     fractions = torch.tensor(data.draw(st.lists(st.floats(0, 1), min_size=1, max_size=9))).double()
     theta = lens.theta_max[:, None] * fractions.sort().values
     radius = lens.project(theta)
-    # Rounding of θ moves r by the slope; that of r moves θ by one over it.
+    # Rounding θ changes r by the slope; rounding r changes θ by its inverse.
     slope = lens._slope(theta).clamp(min=1e-12)
     rounding = 64 * torch.finfo(f64).eps
     off = (lens.unproject(radius.clamp(min=0)) - theta).abs()
@@ -109,7 +109,7 @@ def test_a_batch_is_its_lenses_and_json_is_the_lens(lens):
         assert (value is None) == (other is None) and (value is None or torch.equal(value, other))
     for k in range(len(lens)):
         described = json.loads(json.dumps(to_dict(lens[k])))
-        torch.set_default_dtype(f64)  # JSON has none
+        torch.set_default_dtype(f64)  # JSON has no dtype
         try:
             read = from_dict(described)
         finally:

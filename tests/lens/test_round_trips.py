@@ -23,7 +23,7 @@ from darswin.lens import MODELS, BrownConrady, Mei, Spherical, cat, from_dict, l
 from darswin.lens.base import MARGIN
 from darswin.lens.solve import direction_of
 
-# A camera of OpenCV's omnidir, whose curve turns shortly behind what it sees.
+# A camera of OpenCV's omnidir. Its curve turns shortly beyond the image.
 OMNIDIR = Mei(double(1.72), 1040.0, double(-0.18, -0.5595), tangential=double(0.0014, -0.0006))
 
 
@@ -52,7 +52,7 @@ def test_unproject_undoes_project_and_finds_nothing_beyond(name):
         assert (found - theta).abs().max() < 1e-9
         for end in (1.0, 0.5):
             used = lens.with_theta_max(end * lens.theta_limit)
-            # At the limit r may rise so steeply that it is known to 1e-9 only.
+            # At the limit, r may rise so steeply that it is exact to 1e-9 only.
             more = double(1.5, 1e6) if end == 1 else double(1 + 1e-9, 1.5, 1e6)
             beyond = torch.cat((nowhere, used.r_max[:, None] * more), 1)
             assert used.unproject(beyond).isnan().all()
@@ -63,7 +63,7 @@ def test_unproject_undoes_project_and_finds_nothing_beyond(name):
 
 
 def rays_of(lens, rings=16, spokes=24):
-    """θ (N, rings, 1), up to θ_max itself, and φ (1, 1, spokes)."""
+    """θ (N, rings, 1), almost up to θ_max, and φ (1, 1, spokes)."""
     near = 1 - double(1e-3, 1e-5, 1e-7)
     fractions = torch.cat((torch.linspace(0.01, 1, rings - 3, dtype=f64), near))
     azimuth = torch.arange(spokes, dtype=f64) * (2 * math.pi / spokes) - 3.1
@@ -83,14 +83,14 @@ def test_every_ray_is_found(name):
     lens = lens.with_theta_max(None)
     theta, azimuth = rays_of(lens)
     found, direction = lens.unproject_pixels(lens.project_rays(theta, azimuth, (1, 1)), (1, 1))
-    # Where a curve turns, an angle is known to the root of what the pixel is.
+    # Where a curve turns, the error of an angle is the square root of the pixel's error.
     assert (found - theta).abs().max() < 1e-8
     off = torch.remainder(direction - azimuth + math.pi, 2 * math.pi) - math.pi
     assert off.abs().max() < 1e-9
 
 
 def area(lens, theta, azimuth):
-    """By how much the lens makes an area larger, found from `project_rays` alone."""
+    """The factor by which the lens enlarges an area, computed from `project_rays` alone."""
 
     def place(point):  # in the plane θ (cos φ, sin φ)
         angle = torch.atan2(point[..., 1], point[..., 0])
@@ -170,7 +170,7 @@ def test_points_and_pixels_undo_each_other(name):
     pixels = lens.project_points(points)
     assert pixels.shape == (40, 5, 2)
     torch.testing.assert_close(lens.unproject_points(pixels), points, rtol=0, atol=1e-8)
-    for scale in (1e-30, 1e30):  # how far away changes nothing
+    for scale in (1e-30, 1e30):  # the distance does not matter
         torch.testing.assert_close(lens.project_points(scale * points), pixels)
 
 
@@ -183,7 +183,7 @@ def test_points_that_are_not_seen_are_nan():
     assert torch.equal(nan[..., 0], nan[..., 1])
     assert nan[0, :, 0].tolist() == [False, True, True, True, True]
     assert nan[1, :, 0].tolist() == [False, True, True, False, True]
-    # Beyond 90°, what is behind the plane of the camera may be seen.
+    # Beyond 90°, points behind the camera's plane may be seen.
     wide = calibrated("kalibr_tumvi.yaml", "cam0")
     behind = wide.project_points(double(1, 0, -0.2))
     torch.testing.assert_close(behind, wide.project_rays(math.pi / 2 + math.atan(0.2), 0.0))
@@ -198,7 +198,7 @@ SIZE = (480, 640)
 ROWS, COLUMNS = (torch.arange(0, side, 40, dtype=f64) for side in SIZE)
 PIXELS = torch.stack(torch.meshgrid(COLUMNS, ROWS, indexing="xy"), -1).flatten(0, 1)
 
-# A lens of the 90° of a pinhole: the powers of w overflow in float32 there.
+# A pinhole camera up to 90°, where the powers of w overflow in float32.
 PINHOLE = BrownConrady(
     double(500.0), double(-0.22, 0.13, 0.028), tangential=double(1e-3, 1e-3),
     center=double(320, 240), image_size=double(*SIZE),
@@ -212,17 +212,17 @@ def in_image(lens):
 
 
 def check(exact, lens):
-    """One lens in float64, and the same in float32."""
+    """Compares one lens in float64 with the same lens in float32."""
     assert lens.theta_max.dtype == torch.float32 and lens.r_max.isfinite()
     limit, eps = min(exact.theta_max.item(), lens.theta_max.item()), 64 * EPS
     theta, _ = exact.unproject_pixels(PIXELS)
     found, azimuth = lens.unproject_pixels(PIXELS.float())
-    # The rim may move by rounding, which near a fold becomes its root.
+    # Rounding may move the rim, near a fold by the square root of the rounding.
     inner = theta < (1 - 2 * EPS**0.5) * limit
     assert inner.any() and not found[inner].isnan().any()
     seen = ~theta.isnan() & ~found.isnan()
     assert (theta.isnan() & ~found.isnan()).sum() <= 0.01 * len(PIXELS)
-    # A ray is known to its last bits, and so is the pixel.
+    # Rays and pixels are exact to their last bits.
     again = exact.project_rays(found.double(), azimuth.double())
     slope = exact._slope(theta.nan_to_num().clamp(max=limit)).abs()
     off = (again - PIXELS).abs().amax(-1)
@@ -292,6 +292,6 @@ def test_theta_max_in_another_dtype():
     with pytest.raises(ValueError, match=r"theta_max must be at most 1\.57079"):
         from_dict(described | {"theta_max": 1.58})
     assert from_dict(described | {"theta_max": 1.5}).theta_max.item() == pytest.approx(1.5)
-    # Also where only the radial terms overflow.
+    # Also if only the radial terms overflow.
     assert PINHOLE.replace(tangential=None).to(torch.float32).r_max.isfinite()
     assert PINHOLE.to(f64).same_as(PINHOLE) and PINHOLE.to("cpu").same_as(PINHOLE)

@@ -1,4 +1,4 @@
-"""Files of OpenCV, COLMAP, Kalibr and our own that are written here hold the same lens."""
+"""Files written in the formats of OpenCV, COLMAP, Kalibr and our own hold the same lens."""
 
 from itertools import product
 
@@ -22,7 +22,7 @@ def small(count):
 
 
 def lens_of(draw, name):
-    """A lens of a model with a mild distortion, of an image that it sees the whole of."""
+    """A lens with mild distortion, which sees its whole image."""
     model = MODELS[name]
     values = dict(
         focal=draw(st.floats(200, 900)), omega=draw(st.floats(0.1, 1.5)),
@@ -84,7 +84,7 @@ def test_our_own_json_is_the_lens_to_the_bit(name, tmp_path):
         torch.testing.assert_close(found.theta_max, used.theta_max.to(other), rtol=0, atol=1e-4)
 
 
-# The formats that hold each; ours holds all.
+# The formats that hold each camera; ours holds all.
 HELD = {
     "basalt.json-cam0": "colmap kalibr", "basalt.json-cam1": "kalibr",
     "basalt.json-cam3": "opencv colmap kalibr", "basalt.json-cam4": "opencv colmap",
@@ -98,7 +98,7 @@ HELD = {
 
 
 def opencvs(path, points):
-    """Pixels as OpenCV projects with what it reads from a file."""
+    """Pixels of points, projected by OpenCV with a file that it reads."""
     storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
     matrix, d = (storage.getNode(n).mat() for n in ("camera_matrix", "distortion_coefficients"))
     zero = np.zeros(3)
@@ -107,12 +107,12 @@ def opencvs(path, points):
     return cv2.projectPoints(points, zero, zero, matrix, d)[0][:, 0]
 
 
-KALIBR = {"pinhole": 4, "omni": 5, "ds": 6, "eucm": 6}  # the numbers of its intrinsics
+KALIBR = {"pinhole": 4, "omni": 5, "ds": 6, "eucm": 6}  # how many intrinsics each model has
 COEFFICIENTS = {"radtan": 4, "equidistant": 4, "fov": 1, "none": 0}
 
 
 def check_kalibr(path, lens):
-    """As Kalibr's ConfigReader checks: the numbers of values, and where they stand."""
+    """Checks a file like Kalibr's ConfigReader: the numbers and places of its values."""
     camera = yaml.safe_load(path.read_text())["cam0"]
     intrinsics, coefficients = camera["intrinsics"], camera["distortion_coeffs"]
     assert len(intrinsics) == KALIBR[camera["camera_model"]]
@@ -176,7 +176,7 @@ def test_the_name_chooses_the_format(tmp_path):
         "1 RAD_TAN_THIN_PRISM_FISHEYE 640 480 300.0 310.0 320.0 240.0 0.01 -0.002 0.0003 -0.0001 "
         "2e-05 1e-05 0.001 -0.002 0.0005 -0.0004 0.0003 -0.0002"
     )
-    # A lens that has no center of its own has that of its image.
+    # The center of a lens without a center is the middle of its image.
     save(lens.replace(center=None), tmp_path / "a.yaml")
     assert load(tmp_path / "a.yaml").center.tolist() == [[255.5, 255.5]]
 

@@ -1,4 +1,4 @@
-"""Files that are wrong, hostile or large: errors in a sentence, soon."""
+"""Wrong, hostile and large files: an error in one sentence, in a short time."""
 
 import contextlib
 import gc
@@ -43,7 +43,7 @@ def message(binning=(0, 0), roi=(0, 0, 0, 0), **entries):
     )  # fmt: skip
 
 
-# Of each file: what is replaced, by what, and what the error then says.
+# For each file: the replaced text, its replacement, and the words of the error.
 CHANGED = {
     "woodscape.json": (
         ('"k2": -17.5', '"k2": "abc"', "intrinsic.k2 must be a finite number, got 'abc'"),
@@ -132,7 +132,7 @@ CHANGED = {
     ),
 }  # fmt: skip
 OPEN = "may belong to cv2.fisheye (k1 to k4) or to a pinhole (k1, k2, p1, p2)"
-# A text, what its error says, and of which camera or with which model.
+# A text, the words of its error, and options.
 TEXTS = (
     (changed("basalt.json", '"eucm"', '"eucn"'),
      "value0.intrinsics[0].camera_type must be one of ds, eucm", dict(camera=0)),
@@ -146,13 +146,13 @@ TEXTS = (
     ("word", "it must be a mapping"), ("", "it must not be empty"), (" \n\t\n", "be empty"),
     ("a: [1, 2", "not valid YAML: line 1: expected"), ("a: 1\n---\nb: 1", "not valid YAML"),
     ("a: \x00", "it is not valid YAML"), ('a: "\\UFFFFFFFF"', "it is not valid YAML"),
-    # Which camera.
+    # The choice of the camera.
     (TUMVI, "several cameras, choose one with camera=: 'cam0', 'cam1'"),
     *((TUMVI, "one of 'cam0', 'cam1', or its number", dict(camera=camera))
       for camera in ("cam2", 2, "2", -1, 1.5)),
     *((COLMAP, "camera must be one of '1', '2', '5', '7', got", dict(camera=camera))
       for camera in ("0", "3", 3, "-1", "4", True, 1.0)),
-    # Which model.
+    # The choice of the model.
     (opencv(D=D[:4]), "the coefficients of D " + OPEN),
     (opencv(D=D[:4]), "xi is missing", dict(model="omnidir")),
     (opencv(D=D[:4]), "model must be one of fisheye, pinhole, omnidir", dict(model="x")),
@@ -167,7 +167,7 @@ TEXTS = (
     (flat("k1", "k3", "k4", k2=None), "k2 must be a finite number, got None"),
     (flat("k1", "k2", model="magic"), "got 'magic'"),
     (flat("k1", "k2", xi="a"), "xi must be a finite number"),
-    # Which part of the sensor.
+    # The region of the sensor.
     (message((-1, 1)), "binning_x must be a whole number of pixels, 0 to"),
     (message((1, 1.5)), "binning_y must be a whole number of pixels, 0 to"),
     (message((1, 481)), "the binning of 1×481 pixels leaves none"),
@@ -175,7 +175,7 @@ TEXTS = (
     (message(roi=(0, 0, 641, 9)), "641×9 px at (0, 0)"),
     (message(roi=(-1, 0, 10, 9)), "roi.x_offset must be a whole number of pixels"),
     (message(roi=(0, 0, "a", 9)), "roi.width must be a whole number"),
-    # Coefficients that stand under no name, or under one that nobody reads: never left out.
+    # Coefficients that are missing or have an unknown name are never ignored.
     *((text, said, dict(model=model)) for model in (None, "pinhole") for text, said in (
         (opencv(distortion_model="plumb_bob", lens=D), "D is missing"),
         (opencv(fisheye_model=1), "write D: [] if the camera has none"),
@@ -188,7 +188,7 @@ TEXTS = (
         (opencv(distortion={"k1": 0.1, "k2": 0.2}, fisheye=0), "distortion.data is missing"),
         (opencv(fisheye=0, D="", ts=D), "D must be 0 or 4 or 5 or 8 or 12 or 14 finite numbers"),
         (opencv(fisheye=0, D={"data": ""}, ts=D), "D.data must be 0 or 4 or 5"),
-        (opencv(fisheye=0, D=[*D, 0, 0, 0, 0, 0, 0, 0, 0.1, 0]), "no tilted sensor"),
+        (opencv(fisheye=0, D=[*D, 0, 0, 0, 0, 0, 0, 0, 0.1, 0]), "tilted sensors"),
         (opencv(D={"rows": 1, "cols": 5, "data": D[:4]}, fisheye=0), "must be 1 × 5 numbers"),
         (opencv(D=D, camera_matrix=[501.0, *K[1:]]), "K and camera_matrix must be the same"),
     )),
@@ -227,7 +227,7 @@ def test_paths(tmp_path):
 # -- the two polynomials of OCamCalib -----------------------------------------------------------
 
 DIRECT = "-2.210000e+02 0 1.850000e-03 -3.600000e-06 1.420000e-08"
-# Fitted to the direct one by least squares, as the toolbox does; it misses by up to 0.01 px.
+# Fitted to the direct one by least squares, like in the toolbox, to 0.01 px.
 INVERSE = ("320.321696 164.783531 -14.771348 31.623465 8.044023 -1.452569 13.685554 -1.071077 "
            "-9.709705 2.309502 5.628928 1.507985")  # fmt: skip
 
@@ -241,7 +241,7 @@ def test_ocamcalibs_polynomials_are_held_against_each_other():
     assert loads(ocam(DIRECT, INVERSE), dtype=f64).project(0.0).abs().item() < 0.02
     assert type(loads(ocam(DIRECT, ""))).__name__ == "OCam"
     lower = changed("camodocal_scaramuzza.yaml", "SCARAMUZZA", "scaramuzza")
-    assert type(loads(lower)).__name__ == "OCamInverse"  # as LF-VIO's files write it
+    assert type(loads(lower)).__name__ == "OCamInverse"  # the spelling in LF-VIO's files
     for old, new in (("320.3", "3203"), ("320.3", "318.3"), ("164.7", "1647"), ("-1.45", "-14.5")):
         with pytest.raises(ValueError, match=r"must undo the direct one .* px for [\d.]+ px"):
             loads(ocam(DIRECT, INVERSE.replace(old, new)))
@@ -264,7 +264,7 @@ def frames(count, **shared):
 
 @pytest.fixture(scope="module")
 def frozen():
-    """The garbage collector does not look through the memory of other tests meanwhile."""
+    """Hides the memory of other tests from the garbage collector, which would take time."""
     gc.collect()
     gc.freeze()
     yield
@@ -312,7 +312,7 @@ def test_hostile_files_end_soon_and_run_nothing(
     text, message, tmp_path, monkeypatch, frozen, threads
 ):
     monkeypatch.chdir(tmp_path)
-    threads(1)  # others, waiting, would count
+    threads(1)  # the CPU time of waiting threads would count
     with soon(), pytest.raises(ValueError, match=message) as error:
         loads(text)
     assert len(str(error.value)) < 1000 and not list(tmp_path.iterdir())
@@ -331,7 +331,7 @@ def test_large_files_are_read_soon(tmp_path, frozen, threads):
     path.write_text("".join(rows))
     with soon():
         load_all(path)
-    # The first bad one is named, soon too.
+    # The first bad camera is named, also in a short time.
     rows[700] = rows[700].replace("310", "1e-300")
     path.write_text("".join(rows))
     with soon(), pytest.raises(ValueError, match=r"COLMAP calibration .*: camera '701': "):
@@ -369,7 +369,7 @@ def test_a_calibration_with_its_image_points(suffix, tmp_path):
     with soon():
         lens = load(path, image_size=(480, 640), dtype=f64)
     assert lens.radial.tolist() == [[-0.3, 0.1, 0.01]]
-    # As many numbers as coefficients are an error, not none.
+    # So many numbers as coefficients are an error.
     text = path.read_text().replace("image_points", "D").replace("distortion_coefficients", "x")
     with pytest.raises(ValueError, match="must be 0 or 4 or 5 or 8 or 12 or 14 finite numbers, go"):
         loads(text)
@@ -390,7 +390,7 @@ def test_binary_files_that_are_wrong(tmp_path):
     assert "cameras, got 4294967295" in error_of(b"\xff" * 4 + whole[4:])
     assert "to 16 (EUCM), got 17" in error_of(whole[:12] + bytes([17]) + whole[13:])
     random.seed(0)
-    for _ in range(12):  # any bytes give a lens or a sentence
+    for _ in range(12):  # any bytes give a lens or an error
         data = bytearray(whole)
         data[random.randrange(len(data))] = random.randrange(256)
         path.write_bytes(data)

@@ -5,7 +5,8 @@ from functools import partial
 from darswin.lens.base import Lens
 from darswin.lens.distorted import BrownConrady, KannalaBrandt
 from darswin.lens.files.fields import Fields, short, to_sides
-from darswin.lens.files.format import Cameras, Description, Format, Size, describe
+from darswin.lens.files.format import Cameras, Description, Format, describe
+from darswin.lens.frame import Size
 from darswin.lens.ideal import FieldOfView
 from darswin.lens.sphere import DoubleSphere, EnhancedUnified
 

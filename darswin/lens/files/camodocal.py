@@ -32,8 +32,6 @@ BLOCKS = (
 MOST_APART = 1.0  # px, between the two polynomials; the toolbox reaches about 0.01 px
 MAX_COEFFICIENTS = 64
 
-Size = tuple[int, int]
-
 
 class CamOdoCal(Format):
     """One camera, called by its name in the file, or "camera"."""
@@ -71,12 +69,12 @@ def _camera(file: Fields) -> Description:
         values |= section.values(names)
         section.check_all_read(kind)
     description = describe(model, values, size) if sections else _scaramuzza(file, size)
-    # Mappings with `data` are matrices: the camera's pose.
+    # Mappings with `data` are matrices of the camera's pose, which is not used.
     file.check_all_read(kind, lambda _, value: isinstance(value, Mapping) and "data" not in value)
     return description
 
 
-def _scaramuzza(file: Fields, size: Size) -> Description:
+def _scaramuzza(file: Fields, size: tuple[int, int]) -> Description:
     """OCamCalib's polynomials. The sign of a₀ tells which way the optical axis points."""
     section = file.section("affine_parameters")
     affine = section.values("cx cy c=ac d=ad e=ae")
@@ -134,7 +132,7 @@ def _ocam(
     inverse: list[float],
     center: tuple[float, float],
     affine: list[list[float]],
-    size: Size,
+    size: tuple[int, int],
 ) -> Description:
     """The lens of the inverse polynomial if it is given, else of the direct one."""
     if not any(inverse):
@@ -143,7 +141,7 @@ def _ocam(
     return in_image(OCamInverse, center, affine, size, {"coefficients": inverse})
 
 
-def _check_inverse(direct: list[float], inverse: list[float], size: Size) -> None:
+def _check_inverse(direct: list[float], inverse: list[float], size: tuple[int, int]) -> None:
     """Raises ValueError unless both polynomials agree up to half the image's diagonal."""
     last = -1.0
     for radius in np.linspace(0, math.hypot(*size) / 2, 257).tolist():

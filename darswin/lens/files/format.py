@@ -11,9 +11,9 @@ from typing import Any, NamedTuple
 from darswin.lens.base import MODELS, Lens
 from darswin.lens.distorted import DistortedLens
 from darswin.lens.files.content import Content
+from darswin.lens.frame import Size
 
 Description = dict[str, Any]
-Size = tuple[int, int] | None  # (H, W)
 # A function for each camera of a file, by the camera's name. It reads the camera when called.
 Cameras = dict[str, Callable[[], Description]]
 
@@ -74,8 +74,7 @@ class Format:
         if text is None:
             raise ValueError(
                 f"{self.name} files cannot hold this {type(lens).__name__} lens exactly. They hold "
-                f"{self.holds}. Use darswin.lens.fit, or --model, to find the closest lens of "
-                "another model"
+                f"{self.holds}. darswin.lens.fit finds the closest lens of another `model`"
             )
         return text
 

@@ -22,6 +22,7 @@ from darswin.lens.files.kalibr import Kalibr
 from darswin.lens.files.nerfstudio import Nerfstudio
 from darswin.lens.files.own import Own
 from darswin.lens.files.woodscape import WoodScape
+from darswin.lens.frame import Size
 from darswin.utils.files import replace_file
 
 # Rays must not land further out than this, px, as a pinhole's do near 90°.
@@ -46,7 +47,7 @@ def load(
     *,
     camera: str | int | None = None,
     theta_max: float | None = None,
-    image_size: tuple[int, int] | None = None,
+    image_size: Size = None,
     model: str | None = None,
     dtype: torch.dtype | None = None,
 ) -> Lens:
@@ -80,7 +81,7 @@ def load_all(
     path: str | os.PathLike,
     *,
     theta_max: float | None = None,
-    image_size: tuple[int, int] | None = None,
+    image_size: Size = None,
     model: str | None = None,
     dtype: torch.dtype | None = None,
 ) -> dict[str, Lens]:
@@ -174,7 +175,7 @@ class Calibration:
         self,
         camera: str | int | None = None,
         theta_max: float | None = None,
-        image_size: tuple[int, int] | None = None,
+        image_size: Size = None,
         dtype: torch.dtype | None = None,
     ) -> Lens:
         """One camera; the arguments are those of `load`."""
@@ -186,7 +187,7 @@ class Calibration:
     def lenses(
         self,
         theta_max: float | None = None,
-        image_size: tuple[int, int] | None = None,
+        image_size: Size = None,
         dtype: torch.dtype | None = None,
     ) -> dict[str, Lens]:
         """All cameras; the arguments are those of `load_all`."""
@@ -260,7 +261,7 @@ def _shape(value: object) -> str:
 def _batch(
     descriptions: list[Description],
     theta_max: float | None,
-    image_size: tuple[int, int] | None,
+    image_size: Size,
     dtype: torch.dtype | None,
 ) -> Lens:
     """The lenses of descriptions with one `_shape`, with the θ_max that `load` documents."""

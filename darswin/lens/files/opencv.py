@@ -24,7 +24,8 @@ from darswin.lens.files.fields import (
     short,
     to_side,
 )
-from darswin.lens.files.format import Cameras, Description, Format, Intrinsics, Size, describe
+from darswin.lens.files.format import Cameras, Description, Format, Intrinsics, describe
+from darswin.lens.frame import Size
 
 Coefficients = Literal["fisheye", "pinhole", "omnidir"]
 MODELS: tuple[Coefficients, ...] = get_args(Coefficients)
@@ -194,7 +195,9 @@ class _Reader:
             expected = f"{' or '.join(map(str, counts))} coefficients for the {kind} model"
             raise ValueError(f"{name} must have {expected}, got {len(coefficients)}")
         if tilt := [angle for angle in coefficients[12:] if angle]:
-            raise ValueError(f"{name} must end with 0, 0: no tilted sensor is supported: {tilt}")
+            raise ValueError(
+                f"{name} must end with 0, 0: tilted sensors are unsupported, got {tilt}"
+            )
         terms = dict(zip(order.split(), coefficients, strict=False))
         if kind == "omnidir":
             if xi is None:
