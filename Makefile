@@ -113,6 +113,7 @@ bench: build  ## time the operators against their peers, and training; nothing e
 	$(BIN)/python benchmarks/sampling.py --out benchmarks/results
 	$(BIN)/python benchmarks/attention.py --out benchmarks/results
 	$(BIN)/python benchmarks/to_image.py --out benchmarks/results
+	$(BIN)/python benchmarks/one_frame.py --out benchmarks/results
 	$(BIN)/python benchmarks/training.py --out benchmarks/results
 	$(BIN)/python -m darswin bench --out benchmarks/results
 

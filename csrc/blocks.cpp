@@ -122,7 +122,7 @@ struct Blocks {
     const double scale = 1 / std::sqrt(static_cast<double>(dim / heads));
     AttentionCall<float> call(qkv, table, pair(0), pair(2), pair(4), scale);
     call.args.out = mutable_pointer<float>(normed);
-    call.run(call.args.windows * heads, kernels<WindowAttentionKernels<float>>().forward);
+    call.run(call.args.windows * heads, 2, kernels<WindowAttentionKernels<float>>().forward);
   }
 };
 

@@ -115,11 +115,15 @@ void parallel_ranges(int64_t count, Body&& body) {
 
 // body(begin, end, scratch) in the same way, each thread with `bytes` of working memory.
 template <typename Body>
-void run_with_scratch(int64_t count, int64_t bytes, Body&& body) {
-  parallel_ranges(count, [&](int64_t begin, int64_t end) {
+void run_with_scratch(int64_t count, int64_t threads, int64_t bytes, Body&& body) {
+  parallel_ranges(count, threads, [&](int64_t begin, int64_t end) {
     const ThreadMemory scratch(bytes);
     body(begin, end, scratch.get());
   });
+}
+template <typename Body>
+void run_with_scratch(int64_t count, int64_t bytes, Body&& body) {
+  run_with_scratch(count, torch::stable::get_num_threads(), bytes, std::forward<Body>(body));
 }
 
 }  // namespace darswin

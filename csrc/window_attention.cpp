@@ -21,7 +21,7 @@ Tensor forward(AttentionCall<T>&& call, const Quantizer* quantizer = nullptr) {
     args.quantized = mutable_pointer<uint8_t>(out);
     args.quantizer = *quantizer;
   }
-  call.run(args.windows * args.heads, kernels<WindowAttentionKernels<T>>().forward);
+  call.run(args.windows * args.heads, 2, kernels<WindowAttentionKernels<T>>().forward);
   return out;
 }
 
@@ -48,7 +48,7 @@ std::tuple<Tensor, Tensor> backward(AttentionCall<T>&& call, Tensor grad_out) {
   args.grad_out = pointer<T>(grad_out);
   args.grad_qkv = mutable_pointer<T>(grad_qkv);
   args.grad_bias = rows.data();
-  call.run(chunks * args.bias_rows * args.heads, kernels<WindowAttentionKernels<T>>().backward);
+  call.run(chunks * args.bias_rows * args.heads, 5, kernels<WindowAttentionKernels<T>>().backward);
   for (int64_t chunk = 1; chunk < chunks; ++chunk) {
     for (int64_t k = 0; k < row; ++k) rows[k] += rows[chunk * row + k];
   }

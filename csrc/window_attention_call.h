@@ -59,9 +59,14 @@ struct AttentionCall {
     return {qkv.size(0), args.rings, args.sectors, args.heads * args.head_dim};
   }
 
+  // `steps`: the products of queries and keys and the like that the kernel computes of each pair.
   template <typename Kernel>
-  void run(int64_t items, Kernel kernel) {
-    run_with_scratch(items, kernels<WindowAttentionKernels<T>>().scratch(args),
+  void run(int64_t items, int64_t steps, Kernel kernel) {
+    constexpr double kPerMicrosecond = 2e4;  // multiply-adds, on a CPU with AVX2
+    const int64_t tokens = args.window_r * args.window_a;
+    const double work = static_cast<double>(args.windows) * args.heads * tokens * tokens;
+    run_with_scratch(items, threads_for(work * args.head_dim * steps / kPerMicrosecond),
+                     kernels<WindowAttentionKernels<T>>().scratch(args),
                      [&](auto... range) { kernel(args, range...); });
   }
 };

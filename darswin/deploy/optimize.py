@@ -1,5 +1,8 @@
-"""Models for inference: weights packed for oneDNN, GELU inside of the products, each residual and
-the norm behind it in one."""
+"""Fast copies of models for inference on CPUs.
+
+In float32 all blocks of a stage are one C++ operator. In bfloat16 and int8 oneDNN computes the
+products, and each residual is added by the norm that follows it.
+"""
 
 import contextlib
 import copy
@@ -42,8 +45,8 @@ __all__ = ["optimize"]
 
 Net = TypeVar("Net", bound=Model)
 DTYPES = (torch.float32, torch.bfloat16, torch.int8)
-# A stage runs on so many images at once that what lies between two products stays below this: it
-# is then in the caches, and in memory that the allocator has kept rather than in fresh pages.
+# A stage processes a large batch in parts. A part is so small that the tensors between two products
+# stay below this size: in the caches, and in memory that the allocator reuses.
 CACHED_BYTES = 16 * 2**20
 
 
@@ -54,32 +57,34 @@ def optimize(
     lens: Lens | None = None,
     calibration: Iterable[Sequence] | None = None,
 ) -> Net:
-    """A copy of a model that computes the same, faster: on CPU, in inference only.
+    """A copy of a model that computes the same results faster, for inference on CPUs.
 
-    Its products are oneDNN's, with weights laid out for them, and take bias and GELU along; a
-    residual and the norm behind it are one operator. It is called as the model is and has its
-    methods, but it is neither trained, saved, copied nor compiled, and has no gradients: the model,
-    which stays as it is, is there for that.
+    The copy has the model's signature and methods. It cannot be trained, saved, copied or compiled,
+    and it has no gradients. The model itself stays as it is.
 
     Args:
-        model: one of `create_model`, on the CPU; a GPU needs none of this.
-        dtype: float32 or bfloat16, of what flows between the layers and of the result; distances
-            are float32, and so is what refines the pixels of dense models. int8: products of 8
-            bits, of a model of `quantize_model`, and float32 between them; a picture with numbers
-            that are not finite gets a result that is finite and means nothing. "fastest": int8 of
-            a quantized model, where this CPU has it; else the one that `fastest_dtype` measured.
-        lens: one camera's, for all images; the result is then called `optimized(images)`, and
-            computes the grid and the position biases once for each image size.
-        calibration: batches (images, lens) of pictures like those to come: with int8, for a model
-            that is not quantized yet; it then goes through `quantize_model`.
+        model: a model of `create_model`, on the CPU.
+        dtype: torch.float32, torch.bfloat16 or torch.int8. With bfloat16, the maps between the
+            layers and the result are bfloat16; distances, and the layers that refine the pixels of
+            dense models, stay float32. With int8, the products of a quantized model (see
+            `quantize_model`) are computed with 8 bits, and the rest with float32; for a picture
+            with infinite or NaN pixels the result is finite but meaningless. "fastest": int8 for a
+            quantized model if this CPU supports it, otherwise float32 or bfloat16, whichever is
+            faster here.
+        lens: a single lens, if all images come from one camera. The copy is then called
+            `optimized(images)`. It computes the grid and the position biases once for each image
+            size.
+        calibration: batches (images, lens) of typical pictures. With int8, they quantize a model
+            that is not quantized yet.
 
-    Where torch lacks oneDNN's products it warns, and uses its own.
+    Warns if torch lacks oneDNN's bfloat16 products. The copy then uses torch's own, which are
+    slower.
 
     Raises:
         TypeError: another kind of model.
-        ValueError: another dtype or device, `lens` is not a single lens, or a calibration where
-            there is nothing to calibrate, or none where there is.
-        RuntimeError: int8 on a CPU that has no products of 8 bits.
+        ValueError: an unsupported dtype or device; a `lens` that is not a single lens; a
+            calibration without int8 or for a quantized model; int8 with neither.
+        RuntimeError: int8 on a CPU without 8-bit products.
     """
     _check(model, dtype, lens)
     if dtype == "fastest":
@@ -91,12 +96,12 @@ def optimize(
             without_quantized_layers(model)
     if dtype == torch.int8:
         if (lack := onednn_lack(dtype)) is not None:
-            raise RuntimeError(f'{lack}: optimize(model, "fastest") takes what runs here')
+            raise RuntimeError(f'{lack}: optimize(model, "fastest") chooses a type that works here')
         model, dtype = _quantized(model, calibration), torch.float32
     elif calibration is not None or quantized_layers(model):
-        raise ValueError(f"a quantized model and a calibration are for torch.int8, got {dtype}")
+        raise ValueError(f"a quantized model or a calibration needs dtype=torch.int8, got {dtype}")
     if dtype == torch.bfloat16 and (lack := onednn_lack(dtype)) is not None:
-        warnings.warn(f"optimize goes on with torch's own products: {lack}", stacklevel=2)
+        warnings.warn(f"optimize uses torch's own products, which are slower: {lack}", stacklevel=2)
     optimized = copy.deepcopy(model).eval().requires_grad_(False)
     for module in list(optimized.modules()):
         _pack(module, dtype)
@@ -110,17 +115,17 @@ def optimize(
 def _quantized(model: Net, calibration: Iterable[Sequence] | None) -> Net:
     if bool(quantized_layers(model)) == (calibration is not None):
         raise ValueError(
-            "int8 needs either a model of quantize_model or a calibration: batches (images, lens) "
-            "of pictures like those to come"
+            "int8 needs either a quantized model (see quantize_model) or a calibration: batches "
+            "(images, lens) of typical pictures"
         )
     return model if calibration is None else quantize_model(model, calibration)
 
 
 def _check(model: nn.Module, dtype: torch.dtype | str, lens: Lens | None) -> None:
     if not isinstance(model, (Encoder, Unet, FeatureMaps)):
-        raise TypeError(f"model must be one of create_model, got {type(model).__name__}")
+        raise TypeError(f"model must be a model of create_model, got {type(model).__name__}")
     if "prepare" in vars(model):
-        raise TypeError("model must be one of create_model, got one that is optimized already")
+        raise TypeError("model must be a model of create_model, got an optimized model")
     if lens is not None and (not isinstance(lens, Lens) or len(lens) != 1):
         raise ValueError(f"lens must be one lens, got {lens!r}")
     if dtype not in (*DTYPES, "fastest"):
@@ -129,13 +134,13 @@ def _check(model: nn.Module, dtype: torch.dtype | str, lens: Lens | None) -> Non
     devices = sorted({parameter.device.type for parameter in model.parameters()})
     if devices != ["cpu"]:
         raise ValueError(
-            f"model must be on the CPU, whose products it is packed for, got one on "
-            f"{' and '.join(devices)}: call that as it is, by torch.compile or as a CUDA graph"
+            f"optimize is for CPUs, got a model on {' and '.join(devices)}: there use the model "
+            "itself, torch.compile or a CUDA graph"
         )
 
 
 class InDtype(nn.Module):
-    """A module as it is, in bfloat16 under autocast, its result in `dtype`, and a norm of that."""
+    """Runs a module, under autocast for bfloat16, converts its result to `dtype` and norms it."""
 
     def __init__(
         self, module: nn.Module, dtype: torch.dtype, norm: Callable[[Tensor], Tensor] | None = None
@@ -153,20 +158,20 @@ class InDtype(nn.Module):
         if torch.is_grad_enabled() and result.requires_grad:
             raise RuntimeError(
                 "an optimized model has no gradients, but its images or its lens require one: call "
-                "it under torch.no_grad(), or use the model it was made of"
+                "it under torch.no_grad(), or use the original model"
             )
         return result if self.norm is None else self.norm(result)
 
 
 def _pack(module: nn.Module, dtype: torch.dtype) -> None:
-    """Replaces the linear layers and the norms of a module, and what is computed in its dtype."""
+    """Replaces the layers of one module by packed ones, or converts them to `dtype`."""
     if isinstance(module, Encoder):
         _pack_norm(module, dtype)
         embed, norm = module.patch_embed, None
         is_float = next(embed.parameters()).dtype == torch.float32
         if dtype == torch.float32 and is_float and isinstance(embed, PolarPatchEmbed):
             norm = packed_norm(embed.norm, dtype)
-            embed.norm = nn.Identity()
+            _replace(embed, norm=nn.Identity())
         module.patch_embed = InDtype(embed, dtype, norm)
         module.head.to(dtype)
     elif isinstance(module, Stage):
@@ -237,22 +242,22 @@ def _pack_norm(module: Any, dtype: torch.dtype, quantization: Quantization | Non
 
 
 def _replace(module: nn.Module, **layers: Any) -> None:
-    """Puts plain functions in place of submodules and methods."""
+    """Replaces submodules and methods by plain functions."""
     for name, layer in layers.items():
         module._modules.pop(name, None)
         setattr(module, name, layer)
 
 
 def _with_tables(model: Model, fixed_lens: Lens | None) -> Callable[[Lens | None, Pair], Any]:
-    """`model.prepare`, but with tables in place of what they are computed from; for a fixed lens,
-    it is called without one, and computes once for each size of the images."""
+    """A `prepare` that returns the position biases themselves. With a fixed lens it takes no lens,
+    and computes once for each image size."""
     prepare, known = model.prepare, dict[Pair, Any]()
 
     def with_tables(lens: Lens | None, size: Pair) -> Any:
         if fixed_lens is None:
             return _tables(model, prepare(lens, size))
         if lens is not None:
-            raise ValueError("this model is optimized for a fixed lens: call it without one")
+            raise ValueError("this model was optimized for a fixed lens: call it without a lens")
         if size not in known:
             known[size] = _tables(model, prepare(fixed_lens, size))
         return known[size]
@@ -274,21 +279,18 @@ def _tables(model: Any, prepared: Any) -> Any:
 
 
 def _restrict(model: Model) -> None:
-    """Makes a model refuse what its packed weights cannot do."""
+    """Replaces the methods that packed weights do not support by errors."""
 
     def refuse(message: str) -> Callable:
         def raise_error(*_arguments, **_options):
-            raise TypeError(f"an optimized model is {message}")
+            raise TypeError(f"an optimized model cannot be {message}")
 
         return raise_error
 
-    not_trained = refuse("not trained: train the model it was made of")
+    not_trained = refuse("trained: train the original model")
     model.__dict__.update(
         train=lambda mode=True: not_trained() if mode else model,
-        state_dict=refuse("not saved: save the model it was made of"),
-        prune_intermediate_layers=refuse("not pruned: prune it first, and optimize what is left"),
-        __reduce_ex__=refuse(
-            "neither copied nor pickled, since oneDNN's weights cannot be: copy the model it was "
-            "made of, and optimize that"
-        ),
+        state_dict=refuse("saved: save the original model"),
+        prune_intermediate_layers=refuse("pruned: prune the original model, then optimize it"),
+        __reduce_ex__=refuse("copied or pickled: copy the original model, then optimize the copy"),
     )

@@ -1,7 +1,6 @@
-"""Layers for inference on the CPU: weights laid out as oneDNN's products read them, and operators
-that take along what stands between two products.
+"""Layers with packed weights, which `darswin.optimize` uses in place of a model's layers.
 
-They are no modules: these take a microsecond more for each call, and have weights to save or move.
+They are plain callables: a module would take a microsecond more for each call.
 """
 
 from collections.abc import Callable, Sequence
@@ -14,7 +13,7 @@ from torch import Tensor, nn
 
 from darswin.layers.linear import best_seconds, onednn_lack
 from darswin.layers.quantized import Quantization, QuantizedLinear
-from darswin.layers.transformer import Block, WindowAttention
+from darswin.layers.transformer import WindowAttention
 
 __all__ = ["fastest_dtype"]
 
@@ -36,7 +35,7 @@ _PANEL, _UNIT = 48, 16  # as in csrc/linear.h
 
 
 class PackedLinear:
-    """A linear layer in float32 or bfloat16, with GELU if asked."""
+    """A linear layer in float32 or bfloat16, with a GELU after it if asked."""
 
     def __init__(self, linear: object, dtype: torch.dtype, *, gelu: bool = False):
         if not isinstance(linear, nn.Linear):
@@ -84,13 +83,19 @@ def norm_parameters(norm: nn.LayerNorm) -> Tensor:
 class PackedBlocks:
     """The blocks of a stage in float32, as one operator: `Stage.run_blocks`."""
 
-    def __init__(self, blocks: Sequence[Block]):
-        self._parameters, self._windows = [], []
+    def __init__(self, blocks: Sequence[Any]):
+        self._parameters: list[Tensor] = []
+        self._windows: list[int] = []
         for block in blocks:
             attn, mlp = block.attn, block.mlp
-            for part in (block.norm1, attn.qkv, attn.proj, block.norm2, mlp.fc1, mlp.fc2):
-                pack = norm_parameters if isinstance(part, nn.LayerNorm) else packed_weights
-                self._parameters.append(pack(part))
+            self._parameters += [
+                norm_parameters(block.norm1),
+                packed_weights(attn.qkv),
+                packed_weights(attn.proj),
+                norm_parameters(block.norm2),
+                packed_weights(mlp.fc1),
+                packed_weights(mlp.fc2),
+            ]
             self._windows += [*attn.window, *attn.shift, *attn.periodic]
         self._sizes = (blocks[0].attn.num_heads, blocks[0].mlp.fc1.out_features)
         self._eps = blocks[0].norm1.eps
@@ -103,9 +108,9 @@ class PackedBlocks:
 
 
 class PackedQuantizedLinear:
-    """A quantized layer as an integer product: (..., D), uint8 of `activation` → (..., D').
+    """A quantized linear layer: (..., D), uint8 of the quantization `activation` → (..., D').
 
-    The result is float32, or its GELU as uint8 of the quantization `gelu`.
+    The result is float32, or the GELU of it as uint8 of the quantization `gelu`.
     """
 
     def __init__(self, layer: QuantizedLinear, gelu: Quantization | None = None):
@@ -131,7 +136,7 @@ Product = PackedLinear | PackedQuantizedLinear
 
 
 def packed(layer: object, dtype: torch.dtype) -> Product:
-    """A linear layer, or a quantized one, as oneDNN's product."""
+    """The packed form of a linear layer, which may be quantized."""
     if isinstance(layer, QuantizedLinear):
         return PackedQuantizedLinear(layer)
     return PackedLinear(layer, dtype)
@@ -145,7 +150,7 @@ def taken(product: object) -> Quantization | None:
 def packed_norm(
     norm: nn.LayerNorm, dtype: torch.dtype, quantization: Quantization | None = None
 ) -> Callable[[Tensor], Tensor]:
-    """A layer norm of `dtype`, of 8 bits where a quantization is given."""
+    """A layer norm in `dtype`. Its result is uint8 if a quantization is given."""
     if dtype == torch.float32 and quantization is None:
         parameters = norm_parameters(norm)
         return lambda x: _NORM(x, parameters, norm.eps)
@@ -157,17 +162,16 @@ def packed_norm(
 
 
 class PackedNorm:
-    """`AddNorm` in one pass over memory. The norm is of 8 bits where a quantization is given."""
+    """`AddNorm` as one operator. Its norm is uint8 if a quantization is given."""
 
-    def __init__(
-        self, norm: nn.LayerNorm, dtype: torch.dtype, quantization: Quantization | None = None
-    ):
+    def __init__(self, norm: object, dtype: torch.dtype, quantization: Quantization | None = None):
+        assert isinstance(norm, nn.LayerNorm)
         self.norm = packed_norm(norm, dtype, quantization)
         self._given = (*norm_parameters(norm), norm.eps)
         self.quantization = quantization
 
     def __call__(self, x: Tensor, branch: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """As `AddNorm`. The sum takes the place of x, and the norm may take that of `branch`."""
+        """As `AddNorm`. The sum overwrites x, and the norm may overwrite `branch`."""
         x = x.contiguous()
         if branch is None:
             return x, self.norm(x)
@@ -181,7 +185,7 @@ class PackedNorm:
 def packed_attention(
     attn: WindowAttention, quantization: Quantization | None
 ) -> Callable[[Tensor, Tensor], Tensor]:
-    """`attn.attend` without the checks, as all is known to fit; 8 bits if quantized."""
+    """`attn.attend` without its checks, which cannot fail here. It returns uint8 if quantized."""
     head_dim = attn.dim // attn.num_heads
     settings = (attn.window, attn.shift, attn.periodic, head_dim**-0.5)
     if quantization is None:
@@ -192,11 +196,11 @@ def packed_attention(
 
 @cache
 def fastest_dtype() -> torch.dtype:
-    """float32 or bfloat16: in which this CPU computes a usual product sooner.
+    """The faster of float32 and bfloat16 on this CPU.
 
-    Measured once a process, in a tenth of a second: bfloat16 wins by far where the CPU has
-    instructions for it, and loses where oneDNN has to do without them. 8 bits, which need a
-    calibration, are not asked.
+    It times a typical product once per process, for a tenth of a second. bfloat16 is much faster on
+    CPUs with instructions for it, and slower on others. int8 needs a calibration, so it is not a
+    candidate.
     """
     dtypes = [d for d in (torch.float32, torch.bfloat16) if onednn_lack(d) is None]
     if len(dtypes) < 2:

@@ -1,4 +1,4 @@
-"""Models whose large products take 8 bits: ranges and what stays in float32 come from pictures."""
+"""Quantization of models to 8 bits, calibrated on pictures."""
 
 import copy
 import math
@@ -26,9 +26,9 @@ __all__ = ["quantize_model", "sensitivities"]
 Net = TypeVar("Net", bound=Model)
 Batches = Sequence[tuple[Tensor, Lens | None]]
 
-# Of an activation, so many numbers of each batch are kept, drawn at random, to choose its range by.
+# Numbers of an activation that are drawn at random from each batch to choose its range.
 _KEPT = 2**15
-# A range is the whole one, or ends at one of these shares of it.
+# A range covers one of these shares of the whole range.
 _SHARES = torch.linspace(0.1, 1.0, 46).tolist()
 
 
@@ -39,26 +39,28 @@ def quantize_model(
     keep: Collection[str] = (),
     tolerance: float = 0.01,
 ) -> Net:
-    """A copy of a model whose blocks and mergings compute with weights and activations of 8 bits.
+    """A copy of a model whose blocks and merging layers use 8-bit weights and activations.
 
-    The copy computes in float32 what integer products compute, so it can be evaluated, saved and
-    exported anywhere; `darswin.optimize` makes integer products of it. It has no gradients.
+    The copy simulates integer products in float32, so it can be evaluated, saved and exported on
+    any machine. `darswin.optimize` turns the simulated products into integer products. The copy has
+    no gradients.
 
-    Each activation gets the range that loses least, in squares, over the calibration. What disturbs
-    the result most stays in float32, one part after the other, until the copy's result is within
-    `tolerance` of the model's: parts are those of `sensitivities`.
+    The range of each activation minimises the mean squared error over the calibration. If the
+    copy's error is above `tolerance`, the parts of the model with the largest errors go back to
+    float32, one after the other. `sensitivities` lists the parts and their errors.
 
     Args:
-        model: one of `create_model`, in float32 on the CPU.
-        calibration: batches (images, lens), or a loader of them; what else a batch holds is
-            ignored. A few hundred pictures like those to come, through lenses like theirs.
-        keep: names of modules that stay in float32, with all that they hold.
-        tolerance: of the mean square of what changes, over the variance of the result.
+        model: a model of `create_model`, in float32 on the CPU.
+        calibration: batches (images, lens, ...) or a data loader. Use a few hundred typical
+            pictures with their lenses.
+        keep: names of modules that stay in float32, together with their submodules.
+        tolerance: largest error: the mean squared change of the result, divided by the variance of
+            the result.
 
     Raises:
         TypeError: another kind of model, or of batches.
-        ValueError: no pictures; a name that the model lacks; a model of another dtype, on another
-            device, or quantized already; or no part of it stays within the tolerance.
+        ValueError: no pictures; an unknown name; a model that is not float32, not on the CPU or
+            already quantized; or no part of the model stays within the tolerance.
     """
     found = _Calibration(model, calibration, keep)
     chosen = list(found.parts)
@@ -72,28 +74,29 @@ def quantize_model(
             result = found.quantized(chosen)
             error = found.error(result)
     if error > tolerance or not chosen:
-        raise ValueError(f"no part of the model can have 8 bits within a tolerance of {tolerance}")
+        raise ValueError(f"with 8 bits, every part of the model exceeds the tolerance {tolerance}")
     return result
 
 
 def sensitivities(model: Model, calibration: Iterable[Sequence]) -> dict[str, float]:
     """Error of the model's result for each part, if only that part computes with 8 bits.
 
-    Parts are a block's "attn.qkv", "attn.proj" and "mlp", and a merging's "reduction", by name.
+    The parts are "attn.qkv", "attn.proj" and "mlp" of each block, and "reduction" of each merging
+    layer.
 
     Args:
-        model, calibration: as `quantize_model`.
+        model, calibration: see `quantize_model`.
 
     Returns:
-        for each part the mean square of what changes over the variance of the result, the largest
-        first.
+        the error of each part by name, the largest first. The error is the mean squared change of
+        the result, divided by the variance of the result.
     """
     errors = _Calibration(model, calibration, ()).alone()
     return dict(sorted(errors.items(), key=lambda item: -item[1]))
 
 
 class _Calibration(Generic[Net]):
-    """A model, pictures, and the ranges of its activations on them."""
+    """A model, its calibration pictures, and the ranges of its activations."""
 
     def __init__(self, model: Net, calibration: Iterable[Sequence], keep: Collection[str]):
         self.batches = _batches(model, calibration)
@@ -102,21 +105,21 @@ class _Calibration(Generic[Net]):
         self._activations, self._expected = _observed(model, self.batches, names)
 
     def quantized(self, parts: Iterable[str]) -> Net:
-        """A copy of the model whose given parts have 8 bits."""
+        """A copy of the model with the given parts quantized."""
         copied = copy.deepcopy(self.model).eval().requires_grad_(False)
         names = [name for part in parts for name in self.parts[part]]
         with_quantized_layers(copied, {name: self._activations[name] for name in names})
         return copied
 
     def error(self, model: Net) -> float:
-        """The mean square of what a copy changes, over the variance of the result."""
+        """The error of a copy: its mean squared change, divided by the variance of the result."""
         change = Change()
         for expected, found in zip(self._expected, _results(model, self.batches), strict=True):
             change.add(expected, found)
         return change.share()
 
     def alone(self) -> dict[str, float]:
-        """The error of each part, when it alone has 8 bits."""
+        """The error of each part, if it alone is quantized."""
         errors = {}
         with Progress("measuring the error of each part", len(self.parts)) as progress:
             for part in self.parts:
@@ -126,20 +129,20 @@ class _Calibration(Generic[Net]):
 
 
 class Change:
-    """The mean square of the difference of results, over their variance."""
+    """The mean squared difference of two models' results, divided by their variance."""
 
     def __init__(self) -> None:
         self.count, self.sums = 0, torch.zeros(3, dtype=torch.float64)
 
     def add(self, expected: Tensor, found: Tensor) -> None:
-        """Counts the results of a batch."""
+        """Adds the results of one batch."""
         want, got = expected.double(), found.double()
         self.count += want.numel()
         squares = want.square().sum(), (got - want).square().sum()
         self.sums += torch.stack((want.sum(), *squares))
 
     def share(self) -> float:
-        """The change; infinite where something changed of what is constant."""
+        """The result so far. It is infinite if a constant result changed."""
         mean, square, changed = (self.sums / self.count).tolist()
         variance = square - mean**2
         if variance > 0:
@@ -149,7 +152,7 @@ class Change:
 
 def _batches(model: nn.Module, calibration: Iterable[Sequence]) -> Batches:
     if not isinstance(model, Model):
-        raise TypeError(f"model must be one of create_model, got {type(model).__name__}")
+        raise TypeError(f"model must be a model of create_model, got {type(model).__name__}")
     if quantized_layers(model):
         raise ValueError("the model is quantized already")
     kinds = {(p.dtype, p.device.type) for p in model.parameters()}
@@ -159,7 +162,7 @@ def _batches(model: nn.Module, calibration: Iterable[Sequence]) -> Batches:
     for batch in calibration:
         if isinstance(batch, Tensor) or len(batch) < 2 or not isinstance(batch[1], Lens | None):
             raise TypeError(
-                "calibration must be batches (images, lens), as [(images, lens)], got one of "
+                "calibration must give batches (images, lens), got a batch of type "
                 f"{type(batch).__name__}"
             )
         batches.append((batch[0], batch[1]))
@@ -169,10 +172,10 @@ def _batches(model: nn.Module, calibration: Iterable[Sequence]) -> Batches:
 
 
 def _parts(model: nn.Module, keep: Collection[str]) -> dict[str, list[str]]:
-    """The names of the linear layers of each part that may become 8 bits."""
+    """The linear layers of each part that may be quantized, by name."""
     keep = (keep,) if isinstance(keep, str) else keep
     if unknown := sorted(set(keep) - {name for name, _ in model.named_modules() if name}):
-        raise ValueError(f"the model has no {', '.join(unknown)} to keep in float32")
+        raise ValueError(f"keep: the model has no module named {', '.join(unknown)}")
     parts: dict[str, list[str]] = {}
     for name, module in model.named_modules():
         if isinstance(module, Block):
@@ -190,7 +193,7 @@ def _parts(model: nn.Module, keep: Collection[str]) -> dict[str, list[str]]:
 
 
 def _results(model: Model, batches: Batches) -> Iterator[Tensor]:
-    """The result of each batch, or the maps of a model of features, as (B, numbers)."""
+    """The result of each batch, flattened to (B, numbers)."""
     modes = [(module, module.training) for module in model.modules()]
     model.eval()
     try:
@@ -217,7 +220,7 @@ def _observed(
         def keep(module, arguments):
             values = arguments[0].detach().float().flatten()
             if values.numel():
-                # Not every so many: that would be the same few channels.
+                # Drawn at random: a fixed step would meet the same few channels.
                 drawn = torch.randint(values.numel(), (_KEPT,), generator=chance)
                 kept[name].append(values[drawn])
                 ends[name].extend(values.aminmax())
@@ -244,9 +247,9 @@ def _observed(
 
 
 def _best_range(name: str, values: Tensor, ends: Tensor) -> Quantization:
-    """The quantization of least squared error: its ends are shares of the whole range."""
+    """The quantization with the least mean squared error."""
     if not ends.isfinite().all():
-        raise ValueError(f"{name} takes numbers that are not finite: look at the calibration")
+        raise ValueError(f"the input of {name} is not finite: check the calibration pictures")
     lower, upper = min(ends.min().item(), 0.0), max(ends.max().item(), 0.0)
 
     def error(ends: tuple[float, float]) -> float:

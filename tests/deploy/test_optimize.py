@@ -61,7 +61,7 @@ def test_a_fixed_lens_is_prepared_once_for_each_size(name, monkeypatch):
             assert relative_error(fixed(images), expected) < 1e-5
         monkeypatch.setattr(RelativeBias, "table", None)
         monkeypatch.setattr(type(lens), "project", None)
-    with pytest.raises(ValueError, match="call it without one"):
+    with pytest.raises(ValueError, match="call it without a lens"):
         fixed(frames[0], lens)
 
 
@@ -104,12 +104,12 @@ def test_without_onednn_it_warns_and_goes_on(monkeypatch):
 def test_what_cannot_be_optimized():
     model = network("darswin_a_nano")
     for wrong, options, kind, message in (
-        (torch.nn.Linear(2, 2), {}, TypeError, "one of create_model, got Linear"),
-        ("model", dict(dtype="fastest"), TypeError, "one of create_model, got str"),
-        (optimize(model), {}, TypeError, "optimized already"),
+        (torch.nn.Linear(2, 2), {}, TypeError, "model of create_model, got Linear"),
+        ("model", dict(dtype="fastest"), TypeError, "model of create_model, got str"),
+        (optimize(model), {}, TypeError, "got an optimized model"),
         (model, dict(dtype=torch.float16), ValueError, "got torch.float16"),
         (model, dict(lens=LENSES), ValueError, "lens must be one lens"),
-        (network("darswin_a_nano").to("meta"), {}, ValueError, "got one on meta"),
+        (network("darswin_a_nano").to("meta"), {}, ValueError, "got a model on meta"),
     ):
         with pytest.raises(kind, match=message):
             optimize(wrong, **options)
@@ -122,12 +122,12 @@ def test_what_an_optimized_model_does_not_do(name):
     for fast, arguments in ((optimize(model), (lens,)), (optimize(model, lens=lens), ())):
         expected = fast(images, *arguments)
         for action, message in (
-            (copy.copy, "neither copied nor pickled"),
-            (copy.deepcopy, "neither copied nor pickled"),
-            (pickle.dumps, "neither copied nor pickled"),
-            (lambda model: model.state_dict(), "not saved: save the model it was made of"),
-            (lambda model: model.train(), "not trained: train the model it was made of"),
-            (lambda model: model.prune_intermediate_layers(), "prune it first"),
+            (copy.copy, "cannot be copied or pickled"),
+            (copy.deepcopy, "cannot be copied or pickled"),
+            (pickle.dumps, "cannot be copied or pickled"),
+            (lambda model: model.state_dict(), "save the original model"),
+            (lambda model: model.train(), "train the original model"),
+            (lambda model: model.prune_intermediate_layers(), "prune the original model"),
         ):
             with pytest.raises(TypeError, match=message):
                 action(fast)

@@ -117,7 +117,7 @@ def test_what_disturbs_most_stays_in_float32():
     all_of_it = quantized_layers(quantize_model(model, [seen], tolerance=math.inf))
     some = quantized_layers(quantize_model(model, [seen], tolerance=1e-2))
     assert "stages.1.blocks.0.attn.qkv" in all_of_it.keys() - some.keys()
-    with pytest.raises(ValueError, match=r"no part .* 8 bits within a tolerance of 0\.0"):
+    with pytest.raises(ValueError, match=r"exceeds the tolerance 0\.0"):
         quantize_model(model, [seen], tolerance=0.0)
 
 
@@ -170,7 +170,7 @@ def test_what_is_to_stay_stays():
     one = quantize_model(model, [seen], keep="stages.0", tolerance=math.inf)
     assert not any(name.startswith("stages.0") for name in quantized_layers(one))
     for wrong in ("stages.9", [""]):
-        with pytest.raises(ValueError, match=r"the model has no (stages\.9)? to keep in float32"):
+        with pytest.raises(ValueError, match=r"keep: the model has no module named (stages\.9)?"):
             quantize_model(model, [seen], keep=wrong)
     for keep in ("attn.qkv", "attn.proj", "mlp", "norm1") * HAS_INT8:
         names = [name for name, _ in model.named_modules() if name.endswith(keep)]
@@ -237,7 +237,7 @@ def test_wrong_arguments():
     images = seen[0].clone()
     images[0, 0, 16, 16] = math.nan
     for given, calibration, kind, message in (
-        (nn.Linear(2, 3), [seen], TypeError, "one of create_model, got Linear"),
+        (nn.Linear(2, 3), [seen], TypeError, "model of create_model, got Linear"),
         (quantized, [seen], ValueError, "quantized already"),
         *(
             (model, wrong, TypeError, r"batches \(images, lens\)")

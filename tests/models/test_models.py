@@ -575,7 +575,7 @@ def test_pruning_and_feature_maps(name):
     assert torch.equal(whole(x, lens), model(x, lens))
     whole.prune_intermediate_layers(prune_norm=True)
     assert torch.equal(whole.forward_features(x, lens), every[2]) and whole.num_classes == 0
-    with pytest.raises(TypeError, match="prune it first"):
+    with pytest.raises(TypeError, match="prune the original model"):
         optimize(model).prune_intermediate_layers()
     sized = dict(image_size=32) if has_image_size(name) else {}
     for out_indices, stages in ((None, [0, 1, 2]), ([0], [0]), ((1, 0), [0, 1]), (2, [1, 2])):
