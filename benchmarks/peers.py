@@ -146,6 +146,19 @@ def peers_table(timings: Sequence[Timing], subject: str, peers: Sequence[str] = 
     return markdown([f"`{subject}`", "ours (ms)", *peers], rows)
 
 
+def frames_table(timings: Sequence[Timing], peers: Sequence[str]) -> str:
+    """A row a model and batch in float32, a column a peer with its time over ours."""
+    rows = []
+    for subject in dict.fromkeys(t.subject for t in timings):
+        chosen = [t for t in timings if t.subject == subject and "float32" in t.mode]
+        for (setting, batch, _), found in by_case(chosen).items():
+            over = [ratios(found.get(peer, ()), 2) for peer in peers]
+            rows.append(
+                [f"`{subject}`, {setting}, batch {batch}", milliseconds(found[OURS]), *over]
+            )
+    return markdown(["", "ours (ms)", *peers], rows)
+
+
 def attention_table(timings: Sequence[Timing]) -> str:
     """A row a case; for each mode the peer that is the fastest, and eager attention."""
     columns = {

@@ -18,8 +18,10 @@ from darswin.bench import tables as bench  # noqa: E402
 from darswin.bench.record import Record  # noqa: E402
 from darswin.bench.timing import Timing  # noqa: E402
 
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 RESULTS = ROOT / "benchmarks" / "results"
+PAGES = [
+    ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md")), RESULTS / "missed_targets.md",
+]  # fmt: skip
 
 # The CPUs that there are records of, by the end of their names; the pages show the first one that
 # has a record of a suite.
@@ -28,9 +30,10 @@ CPUS = {
     "amd-epyc-25-17-avx512": "Zen 4",
     "amd-epyc-avx512": "Zen 5",
 }
-SUITES = ("sampling", "to_image", "attention", "model")
+SUITES = ("sampling", "to_image", "attention", "model", "one_frame")
 
 SAMPLING_PEERS = ("F.grid_sample", "F.grid_sample + permute", "cv2.remap")
+FRAME_PEERS = ("eager model", "ONNX Runtime", "OpenVINO", "AOTInductor package")
 IMAGE_PEERS = ("F.pad + F.grid_sample",)
 EMBED_PEERS = ("F.grid_sample + permute + F.linear", "F.linear alone")
 # The rows of the tables of speed, the README's first: subject, mode, setting, batch.
@@ -88,7 +91,9 @@ def tables() -> dict[str, str]:
 
     studies = ROOT / "studies" / "results"
     suites = {suite: records(suite) for suite in SUITES}
-    sampling, to_image, attention, model = (next(iter(suites[suite].values())) for suite in SUITES)
+    sampling, to_image, attention, model, frames = (
+        next(iter(suites[suite].values())) for suite in SUITES
+    )
     cpus = {
         cpu: [t for suite in SUITES if cpu in suites[suite] for t in suites[suite][cpu].timings]
         for cpu in CPUS.values()
@@ -106,6 +111,7 @@ def tables() -> dict[str, str]:
         "cpus": peers.best_table(cpus, SPEED),
         "missed": peers.missed_table([*sampling.timings, *to_image.timings, *attention.timings]),
         "model": bench.models_table(model.timings),
+        "one frame": peers.frames_table(frames.timings, FRAME_PEERS),
         "model int8": bench.quantized_table(model.timings),
         "model memory": bench.memory_table(model.memory),
         "sampling": peers.peers_table(sampling.timings, "polar_sample", SAMPLING_PEERS),

@@ -3,6 +3,7 @@
 import copy
 import math
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import torch
@@ -11,10 +12,10 @@ from torch import Tensor
 
 from darswin.bench import timing
 from darswin.deploy.optimize import optimize
-from darswin.deploy.packed import Product, packed
+from darswin.deploy.packed import packed
 from darswin.deploy.quantize import quantize_model
 from darswin.layers.embed import PolarPatchEmbed
-from darswin.layers.linear import Linear, onednn_lack
+from darswin.layers.linear import Linear, best_seconds, onednn_lack
 from darswin.layers.quantized import QuantizedLinear, quantize
 from darswin.lens import Lens, Spherical
 from darswin.models import create_model
@@ -45,9 +46,10 @@ def inference(
 ) -> dict[str, Run]:
     """The candidates for inference, by name: images (B, 3, size, size) → logits.
 
-    The matrix products alone are those of the linear layers, one after the other, by oneDNN and
-    with packed weights: the roofline of a model on this machine. A model of 8 bits takes turns with
-    itself in float32 and, where the CPU has it, bfloat16; its reference is one of float32.
+    The matrix products alone are those of the linear layers, one after the other, each by the
+    library that computes it fastest: the roofline of a model on this machine. A model of 8 bits
+    takes turns with itself in float32 and, where the CPU has it, bfloat16; its reference is one of
+    float32.
     """
     model, lens = network(name, size).eval(), lens_of(size)
     images = torch.randn(batch, 3, size, size)
@@ -78,7 +80,7 @@ def inference(
     return {name: torch.no_grad()(run) for name, run in runs.items()}
 
 
-def _all(products: list[tuple[Product, Tensor]]) -> Tensor:
+def _all(products: list[tuple[Callable[[Tensor], Tensor], Tensor]]) -> Tensor:
     # Only the last result is kept. The others' memory is freed at once, as it is within a model.
     for layer, x in products:
         result = layer(x)
@@ -103,16 +105,40 @@ def reference_run(model: Callable[..., Tensor], lens: Lens, images: Tensor) -> R
 
 def matmuls_of(
     model: Model, images: Tensor, lens: Lens, dtype: torch.dtype
-) -> list[tuple[Product, Tensor]]:
-    """The linear layers that a model runs, packed, and an input of each. With int8 those that are
-    not quantized are float32."""
+) -> list[tuple[Callable[[Tensor], Tensor], Tensor]]:
+    """The linear layers that a model runs, each with an input, computed by the fastest library.
+
+    With int8, the layers that are not quantized are float32.
+    """
     rest = torch.float32 if dtype == torch.int8 else dtype
-    found: list[tuple[Product, Tensor]] = []
+    found: list[tuple[Callable[[Tensor], Tensor], Tensor]] = []
+    fastest: dict[tuple[int, int, int], str] = {}
     for layer, rows in products_of(model, images, lens):
         x = torch.randn(rows, layer.in_features).to(rest)
-        is_quantized = isinstance(layer, QuantizedLinear)
-        found.append((packed(layer, rest), quantize(x, layer.activation) if is_quantized else x))
+        if isinstance(layer, QuantizedLinear):
+            found.append((packed(layer, rest), quantize(x, layer.activation)))
+            continue
+        libraries = _libraries(layer, rest)
+        shape = (rows, layer.in_features, layer.out_features)
+        if shape not in fastest:
+            with torch.inference_mode():
+                runs = {name: partial(run, x) for name, run in libraries.items()}
+                seconds = best_seconds(runs, turns=5)
+            fastest[shape] = min(seconds, key=seconds.__getitem__)
+        found.append((libraries[fastest[shape]], x))
     return found
+
+
+def _libraries(layer: Any, dtype: torch.dtype) -> dict[str, Callable[[Tensor], Tensor]]:
+    """One linear layer by each library that computes it in `dtype`."""
+    weight = layer.weight.detach().to(dtype)
+    bias = None if layer.bias is None else layer.bias.detach().to(dtype)
+    libraries = {"darswin": packed(layer, dtype), "torch": lambda x: F.linear(x, weight, bias)}
+    if onednn_lack(dtype) is None:
+        of_onednn = torch.ops.mkldnn._reorder_linear_weight(weight)
+        product = torch.ops.mkldnn._linear_pointwise.default
+        libraries["onednn"] = lambda x: product(x, of_onednn, bias, "none", [], "")
+    return libraries
 
 
 def products_of(model: Model, images: Tensor, lens: Lens) -> list[tuple[Any, int]]:
