@@ -128,7 +128,7 @@ RUN = {
     "xi": "",
     "devices": "",
     "ckpt_path": "a checkpoint to start from, in place of the run's own",
-    "seed_everything": "of shuffles, lenses, augmentation, weights, jitter, drop path and mixing",
+    "seed_everything": "the seed of shuffles, lenses, augmentation, weights, jitter and mixing",
 }
 TRAINER = {
     "trainer.max_epochs": "epochs to train",

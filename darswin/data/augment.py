@@ -1,6 +1,6 @@
 """Augmentation: RandAugment without its geometric operations, random erasing, mixup and CutMix.
 
-An image seen through a known lens may change its colours but not its geometry, or the lens would be
+Augmentation may change the colours of an image but not its geometry: otherwise its lens would be
 wrong.
 """
 
@@ -16,7 +16,7 @@ from torch import Tensor
 from darswin.lens import Lens
 from darswin.ops.checks import readable
 
-LARGEST = 10  # the magnitude that the strongest form of an operation has
+LARGEST = 10  # the largest magnitude
 # An operation takes a picture, a magnitude and a random generator.
 Operation = Callable[[Image.Image, float, np.random.Generator], Image.Image]
 
@@ -35,7 +35,7 @@ def _solarize_add(image: Image.Image, add: int) -> Image.Image:
     return image.point(table * len(image.getbands()))
 
 
-# The stronger the magnitude, the stronger the change ("increasing").
+# A larger magnitude makes a stronger change ("increasing").
 OPERATIONS: dict[str, Operation] = {
     "auto_contrast": lambda image, magnitude, rng: ImageOps.autocontrast(image),
     "equalize": lambda image, magnitude, rng: ImageOps.equalize(image),
@@ -59,9 +59,9 @@ OPERATIONS: dict[str, Operation] = {
 class RandAugment:
     """Applies a few random changes of colour, each with a random strength.
 
-    Each of `count` operations is drawn from `OPERATIONS` with replacement, applied with probability
-    `p`, at a magnitude of N(magnitude, deviation) clipped to [0, 10]: `rand-m9-mstd0.5-inc1` of
-    timm without Rotate, Shear and Translate.
+    It draws `count` operations from `OPERATIONS` with replacement. Each is applied with probability
+    `p` at a magnitude from N(magnitude, deviation), clipped to [0, 10]. This is timm's
+    `rand-m9-mstd0.5-inc1` without Rotate, Shear and Translate.
 
     Source: Cubuk et al., RandAugment, 2020; the recipe of DarSwin, ICCV 2023, sec. 5.2.
     """
@@ -72,7 +72,7 @@ class RandAugment:
         self.count, self.magnitude, self.deviation, self.p = count, magnitude, deviation, p
 
     def __call__(self, image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        """(H, W, 3 or 1) uint8 → the same shape."""
+        """The changed picture (H, W, 3 or 1) uint8."""
         picture = Image.fromarray(image[..., 0] if image.shape[2] == 1 else image)
         operations = list(OPERATIONS.values())
         for chosen in rng.integers(len(operations), size=self.count):
@@ -85,8 +85,8 @@ class RandAugment:
 class RandomErasing:
     """With probability p, replaces a random box of a normalised image by noise N(0, 1).
 
-    The box has a share of the area uniform in `area` and an aspect ratio log-uniform in `aspect`;
-    after ten that do not fit, the image stays as it is.
+    The share of the area is uniform in `area`, and the aspect ratio is log-uniform in `aspect`. If
+    ten boxes do not fit, the image stays as it is.
 
     Source: Zhong et al., Random Erasing, 2020, in timm's "pixel" mode.
     """
@@ -100,7 +100,7 @@ class RandomErasing:
         self.p, self.area, self.aspect = p, area, aspect
 
     def __call__(self, image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        """(C, H, W) float32, changed in place and returned."""
+        """The image (C, H, W) float32, changed in place."""
         if rng.random() >= self.p:
             return image
         channels, height, width = image.shape
@@ -120,14 +120,12 @@ class RandomErasing:
 class Mixing:
     """Mixup and CutMix of a batch of images and their labels.
 
-    Mixes each image of a batch with its partner, that of the reversed batch, by mixup or CutMix.
-
-    One λ for a whole batch: from Beta(α, α) of mixup's or CutMix's α. Mixup takes λ of the image
-    and 1 - λ of its partner, CutMix puts a box of the partner into it and corrects λ to the box's
-    area.
+    Each image is mixed with its partner, the image at its place in the reversed batch. λ is drawn
+    once for a batch, from Beta(α, α). Mixup adds λ of the image and 1 - λ of its partner. CutMix
+    puts a box of the partner into the image and sets λ to the remaining area.
 
     Args:
-        mixup, cutmix: α of each; 0 turns it off. With both, each has half of the batches.
+        mixup, cutmix: α of each method; 0 turns it off. With both, each gets half of the batches.
         p: the share of batches that are mixed.
 
     Source: Zhang et al., mixup, 2018; Yun et al., CutMix, 2019; timm's "batch" mode.
@@ -139,7 +137,7 @@ class Mixing:
 
     def __post_init__(self) -> None:
         if self.mixup < 0 or self.cutmix < 0 or not 0 <= self.p <= 1:
-            raise ValueError(f"mixing needs mixup, cutmix ≥ 0 and p in [0, 1], got {self}")
+            raise ValueError(f"mixing needs mixup ≥ 0, cutmix ≥ 0 and p in [0, 1], got {self}")
 
     def __call__(
         self,
@@ -148,9 +146,9 @@ class Mixing:
         rng: np.random.Generator,
         may_mix: Tensor | None = None,
     ) -> tuple[Tensor, Tensor]:
-        """Images (B, C, H, W) and class probabilities (B, K) → mixed, of the same shapes.
+        """Mixed images (B, C, H, W) and class probabilities (B, K).
 
-        Where `may_mix`, (B,) bool, is False, an image stays as it is; None is True for all.
+        Images for which `may_mix`, (B,) bool, is False stay as they are; None mixes all.
         """
         if not (self.mixup or self.cutmix) or rng.random() >= self.p:
             return images, targets
@@ -176,7 +174,7 @@ class Mixing:
 
 
 def partners_share(lens: Lens) -> Tensor:
-    """(B,) bool: True where an image of a batch and its partner have the same lens."""
+    """True for each image of a batch whose partner has the same lens, (B,) bool."""
     tensors = (getattr(lens, name) for name in lens.names)
     same = [(t == t.flip(0)).reshape(len(t), -1).all(1) for t in tensors if t is not None]
     return torch.stack(same).all(0)
@@ -185,7 +183,7 @@ def partners_share(lens: Lens) -> Tensor:
 def _box(
     height: int, width: int, share: float, rng: np.random.Generator
 ) -> tuple[int, int, int, int]:
-    """Top, bottom, left, right of a box of 1 - share of the area, cut off at the image's border."""
+    """The top, bottom, left and right of a box of 1 - share of the area, cut at the border."""
     side = math.sqrt(1 - share)
     h, w = int(height * side), int(width * side)
     y, x = int(rng.integers(height)), int(rng.integers(width))

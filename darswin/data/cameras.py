@@ -16,7 +16,7 @@ from darswin.lens.orientation import in_upright_picture, stored_size
 
 _ALL = PurePosixPath(".")
 _NOMINAL = (1024, 1024)  # px, for a calibration without a size where no picture has one
-# What names a lens model in any format; other words in a file say nothing of its lens's form.
+# The names of entries that name a lens model, in any format.
 _SAYS_MODEL = re.compile("model|distortion")
 _KEPT = 8192  # lenses in memory
 
@@ -24,8 +24,8 @@ _KEPT = 8192  # lenses in memory
 class PictureCamera(NamedTuple):
     """A camera that took pictures.
 
-    Attributes: calibration: a file, or a description as JSON; camera: which of the file's;
-    name: for errors; coefficients: as `Calibrations` has them.
+    Attributes: calibration: a file, or a lens as JSON; camera: the name of the camera in the file;
+    name: for errors; coefficients: as `Calibrations` takes them.
     """
 
     calibration: str
@@ -34,43 +34,43 @@ class PictureCamera(NamedTuple):
     coefficients: str | None = None
 
     def lens(self, size: tuple[int, int]) -> Lens:
-        """Its lens; `size` (H, W) is of pictures as stored, for a calibration without one."""
+        """The lens; `size` (H, W) of stored pictures is for calibrations without a size."""
         if is_json(self.calibration):
             calibration = Calibration(self.calibration, self.name, self.coefficients)
         else:
             calibration = Calibration.read(self.calibration, self.coefficients)
         lens = calibration.lens(self.camera, image_size=size)
-        # All lenses have a center, so that they can be joined.
+        # Lenses can only be joined if all have a center.
         return lens if lens.center is not None else lens.replace(center=lens.center_in())
 
 
 class Calibrations:
-    """The lenses of pictures, by their files.
+    """The lenses of pictures, found by the files of the pictures.
 
     Args:
-        lens: the cameras that took them:
+        lens: the cameras that took the pictures:
 
-            - a calibration file, of any format that `darswin.lens.load` reads: all pictures;
-            - a lens as JSON, as `darswin.lens.from_dict` takes it: all pictures;
-            - a `lenses.json`: a JSON object from folders and pictures, relative to `root`, to
-              their cameras; "." is all, and the most specific counts. A camera is a calibration
-              file's path, relative to the lenses.json, or {"file": path, "camera": name,
-              "coefficients": what they are}, of which the last two may be left out, or a lens as
-              above;
+            - a calibration file in any format that `darswin.lens.load` reads, for all pictures;
+            - a lens as JSON, as `darswin.lens.from_dict` takes it, for all pictures;
+            - a `lenses.json`: a JSON object that maps folders and pictures, relative to `root`, to
+              their cameras. "." means all pictures, and the most specific entry counts. A camera
+              is the path of a calibration file, relative to the lenses.json; or {"file": path,
+              "camera": name, "coefficients": model}, where the last two are optional; or a lens
+              as above;
             - None, if `files` has a calibration for every picture.
         root: the folder of the pictures.
-        camera: which, of one calibration of several cameras.
-        coefficients: "fisheye", "pinhole" or "omnidir": what they are, in a calibration that does
-            not say it; the `model` of `darswin.lens.load`.
-        files: pictures and their own calibration files, which count before `lens`. Each is read
-            when its picture is; in JSON where there are many.
+        camera: the name or number of the camera, if the calibration has several.
+        coefficients: "fisheye", "pinhole" or "omnidir", the model of the coefficients if the
+            calibration does not name it; the `model` of `darswin.lens.load`.
+        files: pictures and their own calibration files, which take precedence over `lens`. A file
+            is read together with its picture. Use JSON for many files.
 
     Attributes:
-        cameras: the different cameras, those of `files` first, then those of `lens`.
+        cameras: the different cameras, first those of `files`, then those of `lens`.
 
     Raises:
-        ValueError: what is no lens, or lenses that cannot be joined, by name. FileNotFoundError: a
-            file that is missing.
+        ValueError: an invalid lens, or lenses that cannot be joined; it names the lens.
+        FileNotFoundError: a missing file.
     """
 
     def __init__(
@@ -92,8 +92,8 @@ class Calibrations:
         self._places = {} if lens is None else _places(lens, Path(root), camera, coefficients)
         shared = dict.fromkeys(self._places.values())
         self.cameras = [*own.values(), *shared]
-        # Early, so that what is no lens is said before any work. Of the pictures' own files, one
-        # stands for all those that differ from it in numbers alone.
+        # Invalid lenses are refused here, before any work. Of the pictures' own files that differ
+        # only in numbers, one is checked.
         forms: dict[Hashable, PictureCamera] = {}
         for file, own_camera in own.items():
             forms.setdefault(_form_of(file), own_camera)
@@ -101,10 +101,10 @@ class Calibrations:
         self._lenses: dict[tuple, Lens] = {}
 
     def camera_of(self, picture: str | Path | None) -> PictureCamera:
-        """The camera that took a picture; None is a picture without a file of its own.
+        """The camera that took a picture; None means a picture without its own file.
 
         Raises:
-            ValueError: a picture that has no lens.
+            ValueError: the picture has no lens.
         """
         if (own := self._own.get(str(picture))) is not None:
             return own
@@ -116,28 +116,31 @@ class Calibrations:
                 return self._places[place]
         pictures = picture or "pictures without a file"
         if self._lens is None:
-            raise ValueError(f"{pictures} has no lens: no calibration file of its own")
-        raise ValueError(f'{self._lens} has no lens for {pictures}: an entry "." is of all')
+            raise ValueError(f"{pictures} has no lens: its own calibration file is missing")
+        raise ValueError(
+            f'{self._lens} has no lens for {pictures}: the entry "." would be for all pictures'
+        )
 
     def cameras_of(self, pictures: Sequence[str | Path | None]) -> np.ndarray:
-        """(N,): the number of each picture's camera in `cameras`; errors as `camera_of`."""
+        """The number of each picture's camera in `cameras`, (N,); errors as in `camera_of`."""
         number = {camera: k for k, camera in enumerate(self.cameras)}
         return np.array([number[self.camera_of(picture)] for picture in pictures], np.int64)
 
     def lens_of(
         self, picture: str | Path | None, size: tuple[int, int], orientation: int = 1
     ) -> Lens:
-        """The lens in an upright picture.
+        """The lens of an upright picture.
 
         Args:
-            picture: its file. size: (H, W), upright. orientation: the EXIF's that it was turned
-                from, 1 to 8.
+            picture: the file of the picture. size: (H, W) of the upright picture. orientation: the
+                EXIF orientation of the stored picture, 1 to 8.
 
         Returns:
             One lens with a center and this image_size.
 
         Raises:
-            ValueError: as `darswin.lens.load`; a picture of another shape than the calibration's.
+            ValueError: as `darswin.lens.load`; a picture with another aspect ratio than the
+                calibration.
         """
         camera = self.camera_of(picture)
         key = camera, tuple(size), orientation
@@ -154,7 +157,7 @@ class Calibrations:
         return self._lenses[key]
 
     def lens_alone(self, picture: str | Path | None) -> Lens:
-        """The lens of a picture that cannot be read: in one of the size that it was made for."""
+        """The lens of a picture that cannot be read, at the size of the calibration."""
         return self._form(self.camera_of(picture).lens(_NOMINAL))
 
     def _form(self, lens: Lens) -> Lens:
@@ -169,7 +172,7 @@ def is_json(lens: str | Path) -> bool:
 def _places(
     lens: str | Path, root: Path, camera: str | None, coefficients: str | None
 ) -> dict[PurePosixPath, PictureCamera]:
-    """The cameras of folders and pictures; the arguments are those of `Calibrations`."""
+    """The cameras of folders and pictures; arguments as for `Calibrations`."""
     name = "of the lens" if is_json(lens) else str(lens)
     entries = None if is_json(lens) else _entries(Path(lens))
     if entries is None:
@@ -177,27 +180,27 @@ def _places(
     options = {"camera": camera, "coefficients": coefficients}
     if given := {key: value for key, value in options.items() if value is not None}:
         raise ValueError(
-            f"`{next(iter(given))}` is of one calibration file, and {lens} lists several; write "
-            f'there {{"file": …, {json.dumps(given)[1:]}'
+            f"`{next(iter(given))}` is for one calibration file, but {lens} lists several: write "
+            f'{{"file": …, {json.dumps(given)[1:]} there'
         )
     if not entries:
-        raise ValueError(f"{lens} must give the lenses of the pictures, but is empty")
+        raise ValueError(f"{lens} must list the lenses of the pictures, but is empty")
     cameras: dict[PurePosixPath, PictureCamera] = {}
     for place, value in entries.items():
         key = PurePosixPath(place)
         about = f"{lens}: {json.dumps(place, ensure_ascii=False)}"
         if key.is_absolute() or ".." in key.parts or (key != _ALL and not (root / key).exists()):
             raise ValueError(
-                f"{about} must name a folder or a picture in {root}, and there is none"
+                f"{about} must name a folder or a picture in {root}, but it does not exist"
             )
         if key in cameras:
-            raise ValueError(f"{about} is there twice")
+            raise ValueError(f"{about} occurs twice")
         cameras[key] = _camera(Path(lens), about, value)
     return cameras
 
 
 def _entries(path: Path) -> Mapping[str, Any] | None:
-    """The entries of a lenses.json; None for a calibration file, and for what is no JSON object."""
+    """The entries of a lenses.json; None for a calibration file, or if it is no JSON object."""
     try:
         content = json.loads(path.read_bytes())
     except ValueError:
@@ -220,35 +223,35 @@ def _camera(file: Path, about: str, value: Any) -> PictureCamera:
         )
     calibration, camera = file.parent / given["file"], given.get("camera")
     if not calibration.is_file():
-        raise FileNotFoundError(f"{about} names the calibration {calibration}, which is no file")
+        raise FileNotFoundError(f"{about} names the calibration {calibration}, which is not a file")
     name = str(calibration) if camera is None else f"camera {camera} of {calibration}"
     camera, model = (None if x is None else str(x) for x in (camera, given.get("coefficients")))
     return PictureCamera(str(calibration), camera, name, model)
 
 
 def _are_curves(cameras: Sequence[PictureCamera]) -> bool:
-    """True if the cameras' lenses can be joined only as curves; ValueError if not even so."""
+    """True if the lenses can be joined only as curves; ValueError if they cannot be joined."""
     lenses = [camera.lens(_NOMINAL) for camera in cameras]
     if len({form_of(lens) for lens in lenses}) == 1:
         return False
     for camera, lens in zip(cameras, lenses, strict=True):
         if not lens.is_radial:
             raise ValueError(
-                f"{camera.name}: cameras of several lens models are joined as curves, and this "
-                "one's tangential or thin-prism terms have none; leave those terms out of it, or "
-                "take cameras of one model"
+                f"{camera.name}: cameras of several lens models are joined as curves, but this "
+                "camera has tangential or thin-prism terms, which curves cannot hold: leave out "
+                "these terms, or use cameras of one model"
             )
     return True
 
 
 def _form_of(file: str) -> Hashable:
-    """The content of a JSON calibration without its numbers; of another file, its name."""
+    """The content of a JSON calibration without its numbers; the name of any other file."""
     if not file.endswith(".json"):
         return file
     try:
         content = json.loads(Path(file).read_bytes())
     except ValueError as error:
-        raise ValueError(f"calibration {file}: it is no JSON: {error}") from error
+        raise ValueError(f"calibration {file}: it is not JSON: {error}") from error
     return _without_numbers(content)
 
 

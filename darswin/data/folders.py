@@ -1,7 +1,7 @@
-"""Reads which pictures a folder holds, and which of them are for each split.
+"""Finds the pictures of each split in a folder.
 
-Nothing is left out silently: a folder that can be read in two ways is refused, with its name, and
-pictures that no split takes are named in a `LeftOut` warning.
+Nothing is left out silently: an ambiguous folder is an error that names it, and a `LeftOut` warning
+names pictures that are in no split.
 """
 
 import os
@@ -26,20 +26,20 @@ SUFFIXES = frozenset((
     ".jpg", ".jpeg", ".jpe", ".jfif", ".png", ".bmp", ".dib", ".webp", ".tif", ".tiff", ".ppm",
     ".pgm", ".pbm", ".pnm",
 ))  # fmt: skip
-# Pictures that OpenCV reads only in some builds, or not at all.
+# Formats that OpenCV reads only in some builds, or not at all.
 OTHER_SUFFIXES = frozenset((
     ".gif", ".heic", ".heif", ".avif", ".jp2", ".j2k", ".jxl", ".psd", ".svg", ".tga", ".exr",
     ".hdr", ".dng", ".cr2", ".nef", ".arw",
 ))  # fmt: skip
 PICTURES = SUFFIXES | OTHER_SUFFIXES
 LOOKED_FOR = (
-    "darswin looks for ROOT/CLASS/*.jpg (and png, bmp, webp, tif, ppm), or for folders of that "
-    "kind in ROOT/train, ROOT/val and ROOT/test"
+    "darswin looks for ROOT/CLASS/*.jpg (also png, bmp, webp, tif, ppm), or for such folders in "
+    "ROOT/train, ROOT/val and ROOT/test"
 )
 
 
 class Pictures(NamedTuple):
-    """A folder, and paths "class/….jpg" in it."""
+    """A folder, and the paths "class/….jpg" of its pictures."""
 
     folder: Path
     paths: list[str]
@@ -48,17 +48,17 @@ class Pictures(NamedTuple):
 def open_folder(
     root: Path, split: Split, names: list[str] | None, lists: str | Path | None, holdout: float
 ) -> tuple[Pictures, list[str]]:
-    """The pictures of a split, and the names of all classes; errors as `open_source`."""
+    """The pictures of a split, and the names of all classes; errors as for `open_source`."""
     given = _found(root, names) if lists is None else _listed(root, Path(lists))
     if "train" not in given or (split == "train" and not given["train"].paths):
         raise FileNotFoundError(f"no images for the 'train' split in {root}: {LOOKED_FOR}")
     classes = names or _classes(given["train"].paths)
     for part, (folder, paths) in given.items():
         if unknown := sorted(set(_classes(paths)) - set(classes)):
-            reason = "the list of classes does not name" if names else "training has no pictures of"
+            reason = "the list of classes lacks" if names else "the training split lacks"
             raise ValueError(
-                f"{folder} holds pictures for the {part!r} split of the classes {some(unknown)}, "
-                f"which {reason}: move them away, or list the classes to take in `classes`"
+                f"the {part!r} split in {folder} holds pictures of the classes {some(unknown)}, "
+                f"but {reason} them: move them away, or list the classes to use in `classes`"
             )
     part, held_out = taken_from(split, given)
     folder, paths = given[part]
@@ -68,15 +68,15 @@ def open_folder(
     small = sorted(name for name in counts if counts[name] <= len(held_out))
     if small and holdout > 0:
         warn_left_out(
-            f"{folder}: too few pictures to hold any out of the classes {some(small)}: all of them "
-            f"are trained on, none is for {' or '.join(held_out)}"
+            f"{folder}: the classes {some(small)} have too few pictures to hold any out: all of "
+            f"them are for training, and none for {' or '.join(held_out)}"
         )
     paths = part_of_split(paths, split, held_out, holdout, folder, label=class_of)
     return Pictures(folder, paths), classes
 
 
 def pictures_and_videos_below(folder: Path) -> list[str]:
-    """The pictures and videos below a folder, sorted; FileNotFoundError where there are none."""
+    """The pictures and videos below a folder, sorted; FileNotFoundError if there are none."""
     files = sorted(files_below(folder), key=_parts)
     read = [file for file in files if _suffix(file) in SUFFIXES | VIDEOS]
     others = [file for file in files if _suffix(file) in OTHER_SUFFIXES]
@@ -88,7 +88,7 @@ def pictures_and_videos_below(folder: Path) -> list[str]:
 
 
 def files_below(folder: Path) -> list[str]:
-    """The files in a folder and in those below it; links are followed, hidden ones not."""
+    """The files below a folder, through links, without hidden files and folders."""
     return list(_below(folder))
 
 
@@ -101,8 +101,8 @@ def _classes(paths: Iterable[str]) -> list[str]:
 
 
 def _found(root: Path, names: list[str] | None) -> dict[Split, Pictures]:
-    """The pictures of each split that has a folder; of a folder without splits, "train" alone."""
-    # Folders by their real path: a link to one of them, or to one above, gives its pictures twice.
+    """The pictures of each split that has a folder; only "train" for a folder without splits."""
+    # The real paths of folders: a link to one of them, or to one above, would repeat its pictures.
     real = Path(os.path.realpath(root))
     seen = {str(folder): str(folder) for folder in (real, *real.parents)}
     folders = _split_folders(root, names) or {"train": root}
@@ -113,7 +113,7 @@ def _found(root: Path, names: list[str] | None) -> dict[Split, Pictures]:
 
 
 def _split_folders(root: Path, names: list[str] | None) -> dict[Split, Path] | None:
-    """The folders of the splits, or None where the folders in `root` are those of the classes."""
+    """The folders of the splits, or None if the folders in `root` are classes."""
     folders, loose = _entries(root)
     named = split_folders(folders, _has_pictures)
     if not named or {folder.name for folder in named.values()} & set(names or ()):
@@ -125,7 +125,7 @@ def _split_folders(root: Path, names: list[str] | None) -> dict[Split, Path] | N
     if has_classes and (len(named) > 1 or not others):
         for folder in others:
             warn_left_out(
-                f"{folder} holds pictures, but is no split beside {named['train']}: left out"
+                f"{folder} holds pictures, but is no split like {named['train']}: left out"
             )
         _warn_of_loose(root, loose)
         return named
@@ -135,13 +135,13 @@ def _split_folders(root: Path, names: list[str] | None) -> dict[Split, Path] | N
         return None
     shown = " and ".join(str(folder) for folder in named.values())
     raise ValueError(
-        f"{shown} may be meant as splits or as classes: {LOOKED_FOR}; if they are classes, list "
-        "all classes in `classes`"
+        f"{shown} may be splits or classes: {LOOKED_FOR}. If they are classes, list all classes in "
+        "`classes`"
     )
 
 
 def _pictures(folder: Path, names: list[str] | None, seen: dict[str, str], whole: bool) -> Pictures:
-    """The pictures in the folders of these classes, or of all; if `whole`, each must have some."""
+    """The pictures of the classes, None for all classes; if `whole`, no class may be empty."""
     folders, loose = _entries(folder)
     _warn_of_loose(folder, loose)
     by_name = {f.name: f for f in folders}
@@ -152,11 +152,11 @@ def _pictures(folder: Path, names: list[str] | None, seen: dict[str, str], whole
         unread = [file for file in files if _suffix(file) in OTHER_SUFFIXES]
         if unread and not read:
             raise ValueError(
-                f"{by_name[name]} holds no picture that darswin reads, but {_kinds(unread)}: "
-                "convert them, or list the classes to take in `classes`"
+                f"{by_name[name]} holds no picture that darswin can read, but {_kinds(unread)}: "
+                "convert them, or list the classes to use in `classes`"
             )
         if files and not read:
-            warn_left_out(f"{by_name[name]} holds files, but no pictures: it is no class")
+            warn_left_out(f"{by_name[name]} holds files, but no pictures: it is not a class")
         start = len(str(by_name[name])) - len(name)
         paths += sorted((file[start:] for file in read), key=_parts)
         others += unread
@@ -178,7 +178,7 @@ def _warn_of_unread(folder: Path, files: list[str]) -> None:
 def _warn_of_loose(folder: Path, files: list[Path]) -> None:
     if loose := [file for file in files if _is_picture(file)]:
         count = f"{len(loose)}, e.g. {loose[0]}"
-        warn_left_out(f"{folder} holds pictures in no class's folder ({count}): left out")
+        warn_left_out(f"{folder} holds pictures outside the folders of classes ({count}): left out")
 
 
 def _entries(folder: Path) -> tuple[list[Path], list[Path]]:
@@ -192,15 +192,15 @@ def _entries(folder: Path) -> tuple[list[Path], list[Path]]:
 
 
 def _below(folder: Path, seen: dict[str, str] | None = None) -> Iterator[str]:
-    """As `files_below`. A folder whose real path is in `seen` is refused; without it, each is read
-    once."""
+    """As `files_below`. With `seen`, a folder whose real path is in it is an error; without `seen`,
+    each folder is read once."""
     strict, seen = seen is not None, {} if seen is None else seen
     for here, folders, files in os.walk(folder, followlinks=True, onerror=_raise):
         real = os.path.realpath(here)
         if real in seen and strict:
             raise ValueError(
-                f"{here} and {seen[real]} are the same folder, by a link: its pictures would count "
-                "twice, remove one"
+                f"{here} and {seen[real]} are the same folder because of a link, so its pictures "
+                "would count twice: remove one of them"
             )
         if real in seen:
             folders.clear()
@@ -237,14 +237,14 @@ def _kinds(paths: Iterable[str]) -> str:
 
 
 def _listed(root: Path, lists: Path) -> dict[Split, Pictures]:
-    """The pictures of each split that the lists have."""
+    """The pictures of each split in the lists."""
     given: dict[Split, Pictures] = {}
     for split, paths in read_split_lists(lists).items():
         for path in paths:
             parts = Path(path).parts if isinstance(path, str) else ()
             if len(parts) < 2 or Path(path).is_absolute() or ".." in parts:
                 raise ValueError(
-                    f"{lists}: {split!r} must hold paths CLASS/… below {root}, got {path!r}"
+                    f"{lists}: {split!r} must list paths CLASS/… below {root}, got {path!r}"
                 )
         given[split] = Pictures(root, [os.path.normpath(path) for path in paths])
     return given

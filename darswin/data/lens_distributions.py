@@ -1,7 +1,7 @@
-"""Distributions of lenses, to warp images with.
+"""Distributions of random lenses, for warping images.
 
-Each draws a lens whose field of view fills a circle of a given radius, so that lenses differ in how
-they distribute the angles, not in what they see.
+The field of view of every lens fills a circle of a given radius. So all lenses see the same, and
+they differ only in how they spread the angles over the radius.
 """
 
 import math
@@ -25,13 +25,13 @@ class LensDistribution:
     """A distribution of lenses."""
 
     def draw(self, rng: np.random.Generator, fov: float, radius: float) -> Lens:
-        """A lens whose full field of view `fov` (rad) fills a circle of `radius` px."""
+        """A random lens whose full field of view `fov` (rad) fills a circle of `radius` px."""
         raise NotImplementedError
 
 
 @dataclass(frozen=True)
 class SphericalLenses(LensDistribution):
-    """ξ uniform in [low, high]."""
+    """Spherical lenses with ξ uniform in [low, high]."""
 
     low: float
     high: float
@@ -46,10 +46,10 @@ class SphericalLenses(LensDistribution):
 
 @dataclass(frozen=True)
 class PolynomialLenses(LensDistribution):
-    """r ∝ k₁ θ + … + k₄ θ⁴, (k₁, …, k₄) a random direction in which every component is positive.
+    """Polynomial lenses, r ∝ k₁ θ + … + k₄ θ⁴, where (k₁, …, k₄) is a random positive direction.
 
-    Source: the test set of DarSwin, ICCV 2023, table 5, whose coefficients are positive and of
-    random direction; their magnitude says nothing once the field of view fills the circle.
+    Source: the test set of DarSwin, ICCV 2023, table 5. Its coefficients are positive and have a
+    random direction; their magnitude follows from the field of view and the radius.
     """
 
     def draw(self, rng: np.random.Generator, fov: float, radius: float) -> Lens:
@@ -60,14 +60,14 @@ class PolynomialLenses(LensDistribution):
 
 
 def parse_lenses(text: str | float) -> LensDistribution:
-    """A distribution by its name, as configurations give it.
+    """A distribution by its name in configurations.
 
     Args:
-        text: a level of the paper ("very low", "low", "medium", "high"), a number (one ξ), a range
-            of ξ as "0.2..0.35", or "polynomial".
+        text: a level of the paper ("very low", "low", "medium", "high"), one ξ, a range of ξ such
+            as "0.2..0.35", or "polynomial".
 
     Raises:
-        ValueError: none of these.
+        ValueError: any other text.
     """
     text = str(text).strip()
     if text in LEVELS:
@@ -82,13 +82,13 @@ def parse_lenses(text: str | float) -> LensDistribution:
         if "ξ must" in str(error):
             raise
     raise ValueError(
-        f"lenses must be one of {list(LEVELS)}, 'polynomial', a number ξ, or a range 'low..high'; "
+        f"lenses must be one of {list(LEVELS)}, 'polynomial', a number ξ, or a range 'low..high', "
         f"got {text!r}"
     )
 
 
 def parse_sweep(text: str | float | list) -> list[str]:
-    """The names of several distributions; "start:stop:step" stands for equally spaced ξ."""
+    """The names of several distributions; "start:stop:step" means equally spaced ξ."""
     if isinstance(text, list):
         return [name for part in text for name in parse_sweep(part)]
     parts = str(text).split(":")

@@ -1,4 +1,4 @@
-"""The order of images in training, for any number of processes, which a checkpoint brings back."""
+"""The order of training images, for any number of processes; a checkpoint can restore it."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -10,16 +10,16 @@ from darswin.data.samples import Draw
 
 
 class TrainingOrder(Sampler[Draw]):
-    """A new shuffle each epoch, dealt out to the processes.
+    """A new shuffle for each epoch, divided among the processes.
 
-    The epoch's shuffle is cut into global batches of `batch × world`, what is left over is dropped.
-    In each, image i and image -1-i are partners for mixing. A process gets whole pairs, the first
-    of each in the first half of its batch and the second in the mirrored place, so that its batch,
-    too, mixes with its own reverse; and any number of processes trains on the same mixtures.
+    The shuffle is cut into global batches of `batch × world` images, and the rest is dropped. In a
+    global batch, the images i and -1-i are partners for mixing. A process gets whole pairs: the
+    first image in the first half of its batch, the second image in the mirrored place. So its
+    batch mixes with its own reverse, and any number of processes trains on the same mixtures.
 
-    With `pairs`, partners share their lens, so that a mixture is an image through one lens, and, if
-    `cameras` (count,) gives each image's, their camera, but for those that are left over. `batch`
-    is that of one process, and even unless `world` is 1.
+    With `pairs`, partners share their lens, so that a mixture is an image through one lens. With
+    `cameras`, the camera of each image, (count,), partners also share their camera, except for
+    images that are left over. `batch` is the batch of one process; it must be even if `world` > 1.
     """
 
     def __init__(
@@ -30,26 +30,26 @@ class TrainingOrder(Sampler[Draw]):
             raise ValueError(f"with several processes the batch of each must be even, got {batch}")
         if count < batch * world:
             raise ValueError(
-                f"a batch of {batch} on each of {world} processes needs more images than {count}"
+                f"a batch of {batch} on each of {world} processes needs more than {count} images"
             )
         self.count, self.batch, self.rank, self.world = count, batch, rank, world
         self.pairs, self.seed = pairs, seed
         several = cameras is not None and len(np.unique(cameras)) > 1
         self.cameras = cameras if pairs and several else None
         self.epoch = 0
-        self._resume = (-1, 0)  # an epoch, and how many of its batches are done
+        self._resume = (-1, 0)  # an epoch, and the number of its batches that are done
 
     def set_epoch(self, epoch: int) -> None:
         self.epoch = epoch
 
     def resume(self, epoch: int, done: int, shuffle: list[int]) -> None:
-        """Leaves out the first `done` batches of an epoch; ValueError if they are of another
-        shuffle, unless the epoch was whole."""
+        """Skips the first `done` batches of an epoch; ValueError if they belong to another shuffle
+        and the epoch is not complete."""
         count, size, _ = shuffle
         if shuffle != self.shuffle() and done < count // size:
             raise ValueError(
-                "in the middle of an epoch a run goes on with what it began with, "
-                f"(pictures, global batch, seed) = {tuple(shuffle)}; got {tuple(self.shuffle())}"
+                "in the middle of an epoch, a resumed run must keep (pictures, global batch, "
+                f"seed) = {tuple(shuffle)}, got {tuple(self.shuffle())}"
             )
         self._resume = (epoch, done)
 
@@ -85,11 +85,11 @@ class TrainingOrder(Sampler[Draw]):
 def _paired(
     order: np.ndarray, cameras: np.ndarray, batches: int, size: int, rng: np.random.Generator
 ) -> np.ndarray:
-    """(batches, size): a shuffle whose images i and -1-i of a batch are of one camera.
+    """A shuffle (batches, size) in which the images i and -1-i of a batch have the same camera.
 
-    The last image of a camera that took an odd number has a partner of another one.
+    If a camera took an odd number of images, its last image has a partner from another camera.
     """
-    alone = order[: batches * (size % 2)].reshape(batches, -1)  # amid a batch of odd size
+    alone = order[: batches * (size % 2)].reshape(batches, -1)  # in the middle of an odd batch
     order = order[alone.size :]
     order = order[np.argsort(cameras[order], kind="stable")]
     _, first, count = np.unique(cameras[order], return_index=True, return_counts=True)
@@ -101,7 +101,7 @@ def _paired(
 
 
 class ResumableLoader(DataLoader):
-    """A DataLoader over a `TrainingOrder` that goes on in the middle of an epoch."""
+    """A DataLoader over a `TrainingOrder` that can resume in the middle of an epoch."""
 
     def __init__(self, dataset: Dataset, order: TrainingOrder, **options: Any):
         super().__init__(dataset, order.batch, sampler=order, drop_last=True, **options)

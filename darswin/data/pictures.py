@@ -63,11 +63,11 @@ class Source(Limited):
         raise NotImplementedError
 
     def oriented(self, index: int) -> tuple[np.ndarray, int, int]:
-        """The image, its label, and the EXIF orientation that it was turned upright from."""
+        """The upright image, its label, and the EXIF orientation of the stored image."""
         return *self[index], 1
 
     def file(self, index: int) -> Path | None:
-        """The image's own file, if it has one."""
+        """The file of the image, if it has one."""
         return None
 
     def form(self) -> Form:
@@ -89,7 +89,7 @@ class ImageFiles(Source):
     ):
         super().__init__(np.array([label for _, label in files], np.int64), classes, channels)
         self.root = Path(root)
-        # As arrays, so that worker processes share them instead of copying a million objects.
+        # Worker processes share an array, but would copy a million strings.
         self.paths = np.array([os.fsencode(path) for path, _ in files], dtype=np.bytes_)
 
     def __getitem__(self, index: int) -> tuple[np.ndarray, int]:
@@ -138,35 +138,36 @@ def open_source(
     What `path` may be:
 
     - "digits": scikit-learn's 1797 scanned digits of 8×8 pixels;
-    - a folder of IDX files, the MNIST family: `train-images-idx3-ubyte[.gz]` and its three
-      companions. "test" is its test set, "val" the last `holdout` of its training set;
-    - a folder of images, one folder a class; or `train/`, `val/` (also `valid/`, `validation/`)
-      and `test/` folders of that kind. Links to folders are followed, hidden ones left out.
+    - a folder of IDX files, as MNIST has them: `train-images-idx3-ubyte[.gz]` and its three
+      companions. "val" is the last `holdout` of the training set;
+    - a folder with a folder of images for each class; or the folders `train/`, `val/` (also
+      `valid/`, `validation/`) and `test/`, each with folders of classes. Links to folders are
+      followed; hidden folders are ignored.
 
-    Without a test set, "val" serves as one. What has neither, or no "val", gets `holdout` of each
-    class of "train" for each, chosen by a hash of their names; at least one is left to train on.
-    Pictures that are in no split are named in `LeftOut` warnings.
+    Without a test set, "val" serves as one. Other missing splits get `holdout` of each class of
+    "train", chosen by a hash of the names; at least one picture of a class is left to train on.
+    `LeftOut` warnings name pictures that are in no split.
 
     Args:
-        channels: 3 or 1, of the images that come out. None means 1 if all pictures are grey, else
-            3; the headers of some of the pictures tell.
-        classes: a list of class names, as a text file with one a line or a JSON list: which
-            folders to take and in which order. For IDX files and digits, the labels' names.
+        channels: the channels of the images, 3 or 1. None means 1 if all pictures are grey,
+            otherwise 3; only the headers of some pictures are checked.
+        classes: a text file with a class name per line, or a JSON list. It selects and orders the
+            folders of classes. For IDX files and digits, it names the labels.
         splits: a JSON file `{"train": ["class/a.jpg", …], "val": …, "test": …}` with paths relative
-            to `path`, or a folder of `train.txt`, `val.txt`, `test.txt` with one path a line. The
+            to `path`, or a folder of `train.txt`, `val.txt`, `test.txt` with one path per line. The
             first folder of a path is its class. A split without a list is held out.
         holdout: a share, in [0, 0.5).
 
     Raises:
-        FileNotFoundError: no such folder, or nothing in it. ValueError: folders whose meaning is
-            not clear, and lists that do not fit them; it names them.
+        FileNotFoundError: a missing or empty folder. ValueError: ambiguous folders, or lists that
+            do not fit the folders; it names them.
     """
     check_split(split, SPLITS, holdout)
     names = None if classes is None else read_classes(classes)
     root = Path(path)
     in_memory = str(path) == "digits" or _idx_file(root, "train-images-idx3-ubyte") is not None
     if in_memory and splits is not None:
-        raise ValueError(f"`splits` is for folders of images, and {path} is none")
+        raise ValueError(f"`splits` is for folders of images, but {path} is none")
     if not in_memory and not root.is_dir():
         raise FileNotFoundError(f"no folder {root}")
     source: Source
@@ -217,7 +218,7 @@ def _idx(
         images, labels = images[part], labels[part]
     if (last := int(labels.max(initial=0))) >= len(names):
         raise ValueError(
-            f"{root} has labels up to {last} for the {split!r} split, but its classes are {names}"
+            f"{root} has labels up to {last} in the {split!r} split, but its classes are {names}"
         )
     return Arrays(images, labels, names, channels)
 
@@ -227,7 +228,7 @@ def _idx_file(root: Path, name: str) -> Path | None:
 
 
 def read_idx(root: Path, name: str) -> np.ndarray:
-    """A file of unsigned bytes in the IDX format, gzipped or not; ValueError where it is none."""
+    """A file of unsigned bytes in the IDX format, possibly gzipped; ValueError for other files."""
     path = _idx_file(root, name)
     if path is None:
         raise FileNotFoundError(f"no {name} or .gz in {root}")
@@ -235,11 +236,11 @@ def read_idx(root: Path, name: str) -> np.ndarray:
         with gzip.open(path) if path.suffix == ".gz" else path.open("rb") as file:
             head = file.read(4)
             if len(head) != 4 or head[:3] != b"\0\0\x08" or not 1 <= head[3] <= 4:
-                raise ValueError(f"{path} is no IDX file of unsigned bytes")
+                raise ValueError(f"{path} is not an IDX file of unsigned bytes")
             sizes = np.frombuffer(file.read(4 * head[3]), ">u4")
             data = np.frombuffer(file.read(), np.uint8)
     except (EOFError, gzip.BadGzipFile, zlib.error) as error:
-        raise ValueError(f"{path} is no whole gzip file: {error}") from error
+        raise ValueError(f"{path} is not a complete gzip file: {error}") from error
     if len(sizes) != head[3] or data.size != math.prod(sizes.tolist()):
-        raise ValueError(f"{path} says it holds {sizes.tolist()} bytes, but holds {data.size}")
+        raise ValueError(f"{path} must hold {sizes.tolist()} bytes, but holds {data.size}")
     return data.reshape(sizes)

@@ -1,10 +1,9 @@
-"""Scenes in another frame: image, target and lens move together.
+"""Resizes, rotates and warps scenes: image, target and lens move together.
 
-A scene becomes square, of a size, in one step from its picture: a part of it resized, turned about
-the optical axis, or as another lens would have seen it. The image is averaged over areas. A target
-is never mixed from several pixels: each new pixel takes the value of the nearest one. Where two are
-equally near, the side alternates from pixel to pixel, so that the target is not shifted relative to
-the image.
+A picture becomes a square image in one resampling step. The image is averaged over areas. Targets
+are never interpolated: each new pixel takes the value of the nearest one. If two pixels are equally
+near, the side alternates from pixel to pixel, so that the target is not shifted relative to the
+image.
 """
 
 from functools import lru_cache
@@ -20,18 +19,18 @@ from darswin.lens import Lens
 from darswin.lens.pixels import as_map, pixel_angles
 from darswin.lens.solve import length_of
 
-# An image is read at up to so many points a pixel and axis, an odd number, so that one of them is
-# the pixel's centre, and so close together, in pixels of the picture.
+# An image is read at up to this many points per pixel and axis, and at this distance, in pixels of
+# the picture. The number is odd so that one of the points is the centre of the pixel.
 _MOST_POINTS = 5
 _APART = 1.5
-_RADII = 4096  # of a table
+_RADII = 4096  # entries of a table
 _NUDGE = 1e-3  # px, more than the rounding of places in float32
 
 
 def resize_scene(
     scene: Scene, taken: tuple[int, int, int, int], size: int, mirrored: bool
 ) -> Scene:
-    """A part (top, left, height, width) of a scene, or of its mirror image, as (size, size)."""
+    """A part (top, left, height, width) of a scene or of its mirror image, at (size, size)."""
     image, target, lens = scene
     if mirrored:
         lens = turned_lens(lens, Turn(0.0, True))[0]
@@ -45,7 +44,7 @@ def resize_scene(
 
 
 def turn_scene(scene: Scene, turn: Turn, taken: tuple[int, int, int, int], size: int) -> Scene:
-    """A part of a scene turned about its lens's optical axis, as (size, size)."""
+    """A part of a scene after a turn about the optical axis, at (size, size)."""
     lens, matrix = turned_lens(scene.lens, turn)
     top, left, height, width = taken
     scale = np.array([width, height]) / size
@@ -58,13 +57,13 @@ def turn_scene(scene: Scene, turn: Turn, taken: tuple[int, int, int, int], size:
 
 
 def warp_scene(scene: Scene, lens: Lens, size: int, turn: Turn | None = None) -> Scene:
-    """A scene as another lens, radial and without `affine`, would have seen it, (size, size)."""
+    """A scene as another radial lens without `affine` would have seen it, at (size, size)."""
     exact, source = lens.to(torch.float64), scene.lens.to(torch.float64)
     last = exact.r_max.item()
     points = _points(source.r_max.item() / last)
     offset = _grid(size, points) - exact.center_in((size, size)).numpy()
     radius = np.sqrt(np.square(offset).sum(-1))
-    # A table of θ, because few lenses have a closed inverse and an image has many radii.
+    # A table of θ, because most lenses need an iteration to invert, and an image has many radii.
     radii = np.linspace(0, last, _RADII)
     angles = exact.unproject(torch.from_numpy(radii)).numpy()
     theta = torch.from_numpy(np.interp(radius, radii, angles, right=np.nan))
@@ -77,7 +76,7 @@ def warp_scene(scene: Scene, lens: Lens, size: int, turn: Turn | None = None) ->
 
 
 def _read(scene: Scene, places: np.ndarray, lens: Lens, size: int, points: int) -> Scene:
-    """A scene read at the places (points · size, points · size, 2) of a picture's pixels."""
+    """A scene at the places (points · size, points · size, 2) in a picture."""
     image = remap(scene.image, places)
     if points > 1:
         image = cv2.resize(image, (size, size), interpolation=cv2.INTER_AREA)
@@ -89,10 +88,10 @@ def _read(scene: Scene, places: np.ndarray, lens: Lens, size: int, points: int) 
 
 
 def _only_seen(scene: Scene) -> Scene:
-    """Nothing is known of pixels beyond the lens's θ_max."""
+    """The scene with unknown targets beyond θ_max."""
     height, width = scene.target.shape
     lens = scene.lens
-    if lens.is_radial:  # then radii tell, and no angle has to be found
+    if lens.is_radial:  # radii are enough, and no angle has to be computed
         places = torch.from_numpy(_grid(height, 1)).to(lens.theta_max)
         beyond = (length_of(lens.from_pixels(places[None])) > lens.r_max[:, None, None])[0]
     else:
@@ -102,7 +101,7 @@ def _only_seen(scene: Scene) -> Scene:
 
 
 class _ByValue:
-    """A lens, equal to others with the same numbers."""
+    """A lens that equals others with the same numbers."""
 
     def __init__(self, lens: Lens):
         self.lens = lens
@@ -114,37 +113,37 @@ class _ByValue:
         return hash((type(self.lens), self.lens.theta_max.item()))
 
 
-@lru_cache(maxsize=8)  # since pictures often have one camera, whose angles take long to find
+@lru_cache(maxsize=8)  # pictures often have one camera, and its angles take long to compute
 def _unseen(lens: _ByValue, size: tuple[int, int]) -> Tensor:
-    """The pixels (H, W) that no ray of the lens reaches, as bool."""
+    """True for pixels (H, W) that no ray of the lens reaches."""
     return pixel_angles(lens.lens, size)[0].isnan()
 
 
 def _nearest(side: int, size: int) -> np.ndarray:
-    """(size,): of a side of so many pixels, those nearest to the centres of `size` others."""
+    """The pixels of a side that are nearest to the centres of `size` new pixels, (size,)."""
     centres = (np.arange(size) + 0.5) * side / size - 0.5
     return np.rint(centres + _aside(size)).astype(np.int64)
 
 
 @lru_cache(maxsize=8)
 def _aside(size: int) -> np.ndarray:
-    """(size,): px by which the centre of a pixel is moved before the nearest one is taken.
+    """The offset of each centre, px, before the nearest pixel is chosen, (size,).
 
-    An even reduction puts every centre halfway between two pixels, and taking the upper one always
-    would shift the whole target. Neighbours are moved in opposite directions, and so are pixels
-    that mirror each other in the image's middle: the target of a mirrored picture is mirrored.
+    An even reduction puts every centre halfway between two pixels. If all took the upper one, the
+    whole target would be shifted. So neighbours move in opposite directions. Pixels at mirrored
+    places do so too, so that the target of a mirrored picture is mirrored.
     """
     sign = (-1.0) ** np.arange(size // 2)
     return _NUDGE * np.concatenate((-sign, np.zeros(size % 2), sign[::-1]))
 
 
 def _points(scale: float) -> int:
-    """Points along an axis at which a pixel is read that is as large as `scale` others."""
+    """The number of points along an axis for a pixel that covers `scale` pixels of the picture."""
     return min(_MOST_POINTS, 2 * int(np.ceil((scale / _APART - 1) / 2)) + 1) if scale > 1 else 1
 
 
 @lru_cache(maxsize=8)
 def _grid(size: int, points: int) -> np.ndarray:
-    """(points · size, points · size, 2): x and y of so many points in each pixel and axis."""
+    """The x and y of the points in each pixel, (points · size, points · size, 2)."""
     along = (np.arange(points * size) + 0.5) / points - 0.5
     return np.stack(np.meshgrid(along, along), -1)

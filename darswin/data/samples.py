@@ -1,4 +1,4 @@
-"""Data sets of images with lenses: their common base, and pictures that calibrated cameras took."""
+"""Data sets of images with lenses: their base, and pictures of calibrated cameras."""
 
 from collections.abc import Callable, Sequence, Sized
 from typing import NamedTuple
@@ -22,15 +22,15 @@ Augmentation = Callable[[np.ndarray, np.random.Generator], np.ndarray]
 
 
 class Draw(NamedTuple):
-    """The number of an image, and the keys of a sample's random numbers."""
+    """The number of a picture, and the keys of the sample's random numbers."""
 
     epoch: int
-    picture: int  # with the epoch, keys the augmentation
-    lens: int  # with the epoch, keys the lens and the turn
+    picture: int  # with the epoch, the key of the augmentation
+    lens: int  # with the epoch, the key of the lens and the turn
 
 
 class Samples(Dataset):
-    """Base of the data sets, which define `_seen` and `_lens_alone`; see `Calibrated`."""
+    """Base of the data sets, see `Calibrated`; subclasses define `_seen` and `_lens_alone`."""
 
     def __init__(
         self,
@@ -53,10 +53,10 @@ class Samples(Dataset):
         self.std = np.asarray(std, np.float32)[:, None, None]
         self.turns, self.augment, self.erase, self.seed = turns, augment, erase, seed
         self.skip_broken = skip_broken
-        # A DataLoader's workers are forks, and OpenCV's threads do not survive a fork: a worker
-        # that waits for them hangs. Images this small gain nothing from them.
+        # OpenCV's threads do not survive a fork, so the forked workers of a DataLoader would hang.
+        # Small images gain nothing from threads anyway.
         cv2.setNumThreads(1)
-        # Shared, so that what worker processes find is seen here.
+        # Shared with the worker processes.
         self._broken = torch.zeros(len(source), dtype=torch.bool).share_memory_()
 
     def __len__(self) -> int:
@@ -64,7 +64,7 @@ class Samples(Dataset):
 
     @property
     def broken(self) -> list[int]:
-        """Indices of the pictures that could not be read so far."""
+        """The indices of the pictures that could not be read so far."""
         return self._broken.nonzero().flatten().tolist()
 
     def __getitem__(self, draw: Draw | int) -> tuple[Tensor, Lens, int | Tensor]:
@@ -94,7 +94,7 @@ class Samples(Dataset):
         return self.turns.draw(self._random(draw.epoch, draw.lens, 2)) if self.turns else None
 
     def _seen(self, draw: Draw) -> tuple[np.ndarray, Lens, int | Tensor]:
-        """The image (size, size, C) uint8 of a draw before augmentation, its lens and its label."""
+        """The image (size, size, C) uint8 before augmentation, its lens and its label."""
         raise NotImplementedError
 
     def _lens_alone(self, draw: Draw) -> Lens:
@@ -107,32 +107,32 @@ class Samples(Dataset):
 
 
 class Calibrated(Samples):
-    """Pictures as they are, with the lenses that took them: `dataset[i]` is (image, lens, label).
+    """Pictures with the lenses that took them: `dataset[i]` is (image, lens, label).
 
-    A picture is reduced to `size` and its lens with it. Its EXIF turns both upright. A sample
-    depends on the seed and its `Draw` alone, not on what was read before: `dataset[i]` means
-    `dataset[Draw(0, i, i)]`. Making a data set sets OpenCV to one thread, in all of the process.
+    A picture is reduced to `size`, and its EXIF orientation is applied; its lens follows both. A
+    sample depends only on the seed and its `Draw`. `dataset[i]` means `dataset[Draw(0, i, i)]`.
+    Making a data set sets OpenCV to one thread in the whole process.
 
     Args:
-        source: the pictures. calibrations: which lens took which.
+        source: the pictures. calibrations: their lenses.
         size: px, H = W of the images.
-        framing: how a picture becomes a square: "crop" cuts its longer side, "stretch" squashes it;
-            the lens follows exactly.
-        mean, std: per channel, in [0, 1]; the image comes out as (pixel/255 - mean) / std.
-        turns: of the images with their lenses; None is none.
-        augment: changes the (H, W, C) uint8 image, given it and a random generator.
-        erase: changes the normalised (C, H, W) float32 image, likewise.
-        seed: of everything random.
-        skip_broken: makes a picture that cannot be read a black image with label -1 (or, where a
-            label is one of each pixel, that of none), and counts it in `broken`, instead of
-            raising.
+        framing: turns a picture into a square: "crop" cuts its longer side, "stretch" squashes it.
+            The lens follows exactly.
+        mean, std: per channel, in [0, 1]; the image is (pixel/255 - mean) / std.
+        turns: random turns of the images with their lenses; None turns nothing.
+        augment: a function that changes the (H, W, C) uint8 image; its arguments are the image and
+            a random generator.
+        erase: the same for the normalised (C, H, W) float32 image.
+        seed: seeds all random numbers.
+        skip_broken: replaces a picture that cannot be read by a black image with label -1 (for
+            dense targets, unknown pixels) and counts it in `broken`. Otherwise it is an error.
 
     Attributes:
         cameras: (N,), the number of each picture's camera.
 
     Raises:
-        ValueError: a picture without a lens, or of another shape than its calibration; named.
-        BrokenImageError: from `dataset[i]`, naming a file that cannot be read.
+        ValueError: a picture without a lens, or with another aspect ratio than its calibration.
+        BrokenImageError: from `dataset[i]`, for a file that cannot be read.
     """
 
     source: Source

@@ -1,4 +1,4 @@
-"""One rule for the parts of a data set: which pictures are for training, validation and testing."""
+"""The splits of a data set: the pictures for training, validation and testing."""
 
 import copy
 import hashlib
@@ -15,7 +15,7 @@ import numpy as np
 
 Split = Literal["train", "val", "test"]
 SPLITS: tuple[Split, ...] = get_args(Split)
-# What folders and lists of a split are called, in any case.
+# The names of folders and lists of splits, in lower case.
 SPLIT_NAMES: dict[str, Split] = {
     "train": "train", "training": "train",
     "val": "val", "valid": "val", "validation": "val",
@@ -24,7 +24,7 @@ SPLIT_NAMES: dict[str, Split] = {
 
 
 class LeftOut(UserWarning):
-    """Pictures that are in no split, or in fewer than they should be."""
+    """A warning of pictures that are in no split, or missing from a split."""
 
 
 def warn_left_out(text: str) -> None:
@@ -32,7 +32,7 @@ def warn_left_out(text: str) -> None:
 
 
 def check_split(split: str, allowed: tuple[str, ...], holdout: float) -> None:
-    """ValueError for an unknown split or a share that is out of range."""
+    """ValueError for an unknown split or a share out of range."""
     if split not in allowed:
         raise ValueError(f"`split` must be one of {allowed}, got {split!r}")
     if not 0 <= holdout < 0.5:
@@ -40,7 +40,7 @@ def check_split(split: str, allowed: tuple[str, ...], holdout: float) -> None:
 
 
 def taken_from(split: Split, given: Collection[Split]) -> tuple[Split, list[Split]]:
-    """The given part that a split is taken from, and the splits that are held out of that part."""
+    """The given part from which a split is taken, and the splits that are held out of that part."""
     missing: list[Split] = [part for part in ("test", "val") if part not in given]
     part: Split = split
     held_out: list[Split] = missing if split == "train" else []
@@ -49,7 +49,7 @@ def taken_from(split: Split, given: Collection[Split]) -> tuple[Split, list[Spli
     elif split in missing:
         part, held_out = "train", missing
     if part not in given:
-        raise FileNotFoundError(f"there are {sorted(given)} pictures, and none for {split!r}")
+        raise FileNotFoundError(f"there are {sorted(given)} pictures, but none for {split!r}")
     return part, held_out
 
 
@@ -63,8 +63,8 @@ def part_of_split(
     label: Callable[[str], str] = lambda path: "",
     group: Callable[[str], str] | None = None,
 ) -> list[str]:
-    """The paths of a split, where `held_out` and "train" share them: of each label the same share,
-    and paths of one group together."""
+    """The paths of a split, if `held_out` and "train" share `paths`. Each label is divided in the
+    same way, and the paths of a group stay together."""
     if not held_out:
         return paths
     groups = {path: group(path) if group else path for path in paths}
@@ -74,7 +74,7 @@ def part_of_split(
     if not kept:
         raise FileNotFoundError(
             f"no pictures for the {split!r} split in {where}: `holdout` {holdout:g} of "
-            f"{len(keys)} {'groups' if group else 'pictures'} leaves none for it"
+            f"{len(keys)} {'groups' if group else 'pictures'} leaves none"
         )
     return [path for path in paths if groups[path] in kept]
 
@@ -82,10 +82,10 @@ def part_of_split(
 def hold_out(
     labels: Sequence, keys: Sequence[str], share: float, parts: Sequence[Split]
 ) -> dict[Split, list[int]]:
-    """Indices of each split, where `parts` take a share of each class and "train" the rest.
+    """The indices of each split: `parts` get a share of each class, and "train" gets the rest.
 
-    Each class is shuffled by hashes of its keys, so that a picture more or less moves hardly any.
-    At least one of each class is left to train on.
+    Hashes of the keys shuffle each class, so that a new picture moves hardly any others. At least
+    one picture of each class is left to train on.
     """
     classes: dict[Any, list[int]] = {}
     for index in sorted(
@@ -102,12 +102,12 @@ def hold_out(
 
 
 class Limited:
-    """Pictures that a class keeps as arrays, one entry a picture, in its `PER_PICTURE`."""
+    """Base of collections of pictures; `PER_PICTURE` names arrays with an entry per picture."""
 
     PER_PICTURE: ClassVar[tuple[str, ...]]
 
     def limited(self, count: int) -> Self:
-        """At most `count` of the pictures, chosen by a fixed shuffle; ValueError below 1."""
+        """At most `count` pictures, chosen by a fixed shuffle; ValueError for a count below 1."""
         if count < 1:
             raise ValueError(f"`limit` must be at least 1, got {count}")
         arrays = {name: getattr(self, name) for name in self.PER_PICTURE}
@@ -119,7 +119,7 @@ class Limited:
 
 
 def split_folders(folders: Iterable[Path], holds: Callable[[Path], bool]) -> dict[Split, Path]:
-    """Those of the folders that have a split's name and for which `holds` is true."""
+    """The folders that have the name of a split and for which `holds` is true."""
     named: dict[Split, Path] = {}
     for folder in folders:
         split = SPLIT_NAMES.get(folder.name.lower())
@@ -127,7 +127,7 @@ def split_folders(folders: Iterable[Path], holds: Callable[[Path], bool]) -> dic
             continue
         if split in named and not folder.samefile(named[split]):
             raise ValueError(
-                f"{named[split]} and {folder} both have a name of the {split!r} split: keep one"
+                f"{named[split]} and {folder} are both named as the {split!r} split: keep one"
             )
         named[split] = folder
     return named
@@ -137,7 +137,7 @@ def split_folders(folders: Iterable[Path], holds: Callable[[Path], bool]) -> dic
 
 
 def read_split_lists(lists: Path) -> dict[Split, list]:
-    """The entries of each split, from a JSON file, or from a folder with a text file per split."""
+    """The entries of each split, from a JSON file or from a folder with a text file per split."""
     if lists.is_dir():
         content = {
             file.stem: read_list(file)
@@ -161,7 +161,7 @@ def read_split_lists(lists: Path) -> dict[Split, list]:
 
 
 def read_list(path: str | Path) -> list[str]:
-    """Names from a text file, one a line, or from a JSON list."""
+    """The names in a text file, one per line, or in a JSON list."""
     if Path(path).suffix != ".json":
         return [line.strip() for line in Path(path).read_text().splitlines() if line.strip()]
     names = read_json(path)
@@ -171,17 +171,17 @@ def read_list(path: str | Path) -> list[str]:
 
 
 def read_classes(path: str | Path) -> list[str]:
-    """Names of classes as `read_list`, each once."""
+    """The names of classes in a file, as for `read_list`; ValueError for repeated names."""
     names = read_list(path)
     if not names:
-        raise ValueError(f"{path} must name the classes, but is empty")
+        raise ValueError(f"{path} must list the classes, but is empty")
     if twice := [name for name, count in Counter(names).items() if count > 1]:
-        raise ValueError(f"{path} must name each class once, but repeats {some(twice)}")
+        raise ValueError(f"{path} must list each class once, but repeats {some(twice)}")
     return names
 
 
 def read_json(path: str | Path) -> Any:
-    """The content of a JSON file; ValueError names a file that is none."""
+    """The content of a JSON file; ValueError for other files."""
     try:
         return json.loads(Path(path).read_text())
     except ValueError as error:
@@ -189,6 +189,6 @@ def read_json(path: str | Path) -> Any:
 
 
 def some(names: Sequence) -> str:
-    """The first few of them, and how many more."""
+    """The first few names, and the number of others."""
     more = f" and {len(names) - 5} more" if len(names) > 5 else ""
     return f"{list(names[:5])}{more}"

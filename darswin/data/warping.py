@@ -1,4 +1,4 @@
-"""Pictures and their lenses in another frame: through another lens, turned, or at another size."""
+"""Warps, rotates and resizes pictures together with their lenses."""
 
 import math
 from dataclasses import dataclass
@@ -13,8 +13,8 @@ from darswin.lens import Lens
 from darswin.lens.orientation import rotated, upright
 from darswin.lens.pixels import pixel_angles, reprojection
 
-# How a picture gets a model's size: "crop" cuts the longer side, "stretch" squashes it; "whole"
-# keeps the picture's shape, and its shorter side gets the size.
+# Ways to give a picture the size of a model: "crop" cuts the longer side, "stretch" squashes it,
+# "whole" keeps the aspect ratio and resizes the shorter side.
 Framing = Literal["crop", "stretch", "whole"]
 _MIRRORED = 2  # the EXIF orientation of a picture whose left and right are swapped
 
@@ -25,10 +25,10 @@ _MIRRORED = 2  # the EXIF orientation of a picture whose left and right are swap
 def warp_map(
     source: Lens, source_size: tuple[int, int], target: Lens, size: tuple[int, int]
 ) -> np.ndarray:
-    """`darswin.lens.pixels.reprojection` in double precision, as maps of `cv2.remap`.
+    """Maps for `cv2.remap`: `darswin.lens.pixels.reprojection` in double precision.
 
     Returns:
-        (N, H, W, 2) float32, x and y; outside the image where a ray is beyond either θ_max.
+        (N, H, W, 2) float32, x and y; outside the image for rays beyond either θ_max.
     """
     source, target = source.detach().to(torch.float64), target.detach().to(torch.float64)
     return reprojection(source, source_size, target, size).to(torch.float32).numpy()
@@ -41,7 +41,7 @@ def remap(
     border: float = 0,
 ) -> np.ndarray:
     """An image (H, W) or (H, W, C) at the places (H', W', 2) of a map; `border` outside it."""
-    # None: x and y are in one array, which OpenCV's types do not know.
+    # With x and y in one array the second map is None, which OpenCV's types do not allow.
     return cv2.remap(image, places, None, interpolation, borderValue=border)  # type: ignore[call-overload]
 
 
@@ -53,15 +53,15 @@ def warp(
     *,
     interpolation: int = cv2.INTER_LINEAR,
 ) -> np.ndarray:
-    """The view of `target` on what `source` saw in `image`; black beyond either lens's θ_max.
+    """The image of `source` as `target` would have seen it; black beyond either lens's θ_max.
 
     Args:
         image: (H, W) or (H, W, C), uint8 or float32, taken with `source`.
         source, target: one lens each. size: (H, W) of the result.
-        interpolation: of `cv2.remap`.
+        interpolation: a constant of `cv2.remap`.
 
     Raises:
-        ValueError: more than one lens. See `warp_map` for many.
+        ValueError: more than one lens; use `warp_map` for many.
     """
     if len(source) != 1 or len(target) != 1:
         raise ValueError(f"warp takes one lens each, got {len(source)} and {len(target)}")
@@ -73,15 +73,15 @@ def warp(
 
 
 class Turn(NamedTuple):
-    """A turn by `angle` (rad, from x to y: clockwise as images are shown), then, if `mirrored`,
-    left and right swapped."""
+    """A rotation by `angle` (rad, from x to y, so clockwise on a screen), then a swap of left and
+    right if `mirrored`."""
 
     angle: float
     mirrored: bool
 
     @property
     def matrix(self) -> np.ndarray:
-        """(2, 2), applied to points around the principal point of a lens without affine."""
+        """The matrix (2, 2) for points relative to the principal point of a lens without affine."""
         cos, sin = math.cos(self.angle), math.sin(self.angle)
         across = -1.0 if self.mirrored else 1.0
         return np.array([[across * cos, -across * sin], [sin, cos]])
@@ -89,11 +89,11 @@ class Turn(NamedTuple):
 
 @dataclass(frozen=True)
 class RandomTurns:
-    """The turns of an augmentation.
+    """Random turns for augmentation.
 
     Args:
         flip: mirrors half of the images.
-        rotate_deg: degrees in [0, 180]: the angle is uniform in ± this.
+        rotate_deg: degrees in [0, 180]; the angle is uniform between minus and plus this value.
 
     Raises:
         ValueError: an angle out of range.
@@ -107,14 +107,14 @@ class RandomTurns:
             raise ValueError(f"`rotate_deg` must be in [0, 180], got {self.rotate_deg}")
 
     def draw(self, rng: np.random.Generator) -> Turn:
-        """A turn, drawn from `rng`."""
+        """A random turn."""
         angle = rng.uniform(-1, 1) * math.radians(self.rotate_deg)
         return Turn(angle, bool(rng.random() < 0.5) and self.flip)
 
 
 def turned_lens(lens: Lens, turn: Turn) -> tuple[Lens, np.ndarray]:
-    """The lens of a picture after a turn about its optical axis, and (2, 3), which takes a pixel
-    (x, y, 1) to its new place."""
+    """The lens of a picture after a turn about its optical axis, and the matrix (2, 3) that moves a
+    pixel (x, y, 1) to its new place."""
     lens, matrix = rotated(lens, turn.angle)
     moves = matrix.numpy()
     if turn.mirrored:
@@ -126,8 +126,8 @@ def turned_lens(lens: Lens, turn: Turn) -> tuple[Lens, np.ndarray]:
 
 
 def turned_picture(image: np.ndarray, lens: Lens, turn: Turn) -> tuple[np.ndarray, Lens]:
-    """A picture and its lens after a turn about the optical axis; the picture keeps its size, and
-    is sheared where pixels are oblong, so that it looks turned through that lens."""
+    """A picture and its lens after a turn about the optical axis. The picture keeps its size. It is
+    sheared if its pixels are oblong, so that it looks rotated through its lens."""
     if turn.angle:
         lens, matrix = rotated(lens, turn.angle)
         height, width = image.shape[:2]
@@ -142,15 +142,15 @@ def turned_picture(image: np.ndarray, lens: Lens, turn: Turn) -> tuple[np.ndarra
 
 
 def at_size(image: np.ndarray, lens: Lens, size: int, framing: Framing) -> tuple[np.ndarray, Lens]:
-    """A picture (H, W, C) uint8 and its lens as a model of `size` px sees them.
+    """A picture (H, W, C) uint8 and its lens at a model's `size`, px.
 
     Args:
-        lens: with the picture's image_size.
-        framing: "crop" cuts the longer side, "stretch" squashes it; "whole" keeps the picture's
-            shape, and its shorter side gets the size.
+        lens: the lens, with the image_size of the picture.
+        framing: "crop" cuts the longer side, "stretch" squashes it, and "whole" keeps the aspect
+            ratio and gives the shorter side the size.
 
     Returns:
-        (size, size, C) uint8, or as high and wide as "whole" makes it, and `lens_at_size`.
+        (size, size, C) uint8, or a longer side with "whole"; and `lens_at_size`.
 
     Raises:
         ValueError: an unknown `framing`.
@@ -162,10 +162,10 @@ def at_size(image: np.ndarray, lens: Lens, size: int, framing: Framing) -> tuple
 
 
 def area_resized(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """A picture (H, W, C) at another (H, W), each pixel the mean over its area."""
+    """A picture (H, W, C) at another size (H, W); each pixel is the mean over its area."""
     height, width = size
-    # An axis that becomes shorter is resized before one that becomes longer. OpenCV takes areas
-    # only if no axis becomes longer; otherwise it shifts an axis that becomes much shorter by up to
+    # An axis that becomes shorter is resized before one that becomes longer. OpenCV averages areas
+    # only if no axis becomes longer. Otherwise it shifts an axis that becomes much shorter by up to
     # a third of a new pixel.
     less = min(image.shape[1], width), min(image.shape[0], height)
     for sides in dict.fromkeys((less, (width, height))):
@@ -174,10 +174,10 @@ def area_resized(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
 
 
 def lens_at_size(lens: Lens, size: int, framing: Framing) -> Lens:
-    """The lens of a picture after `at_size`; exact, also where its pixels become oblong.
+    """The exact lens of a picture after `at_size`, even if its pixels become oblong.
 
     Args:
-        lens: one that has an image_size.
+        lens: the lens, with the image_size of the picture.
     """
     part = taken_part(picture_size(lens), framing)
     if framing == "crop":
@@ -193,7 +193,7 @@ def picture_size(lens: Lens) -> tuple[int, int]:
 
 
 class Crop(NamedTuple):
-    """A part of a picture: its side as a share of the whole, and its place, in [0, 1] of what is
+    """A part of a picture: the share of its sides, and its place, as shares of the space that is
     left across and down."""
 
     share: float
@@ -224,18 +224,17 @@ def _new_size(height: int, width: int, size: int, framing: Framing) -> tuple[int
 
 
 class FullSize:
-    """Undoes `at_size` for a network's answers for each pixel of pictures through one lens.
+    """Brings a network's answers for each pixel back to the size of the pictures of one lens.
 
-    Between the network's pixels it is bilinear, of those pixels alone that a ray reaches. Pixels of
-    the picture that the network did not see, since "crop" cut them off, and those beyond θ_max have
-    no label and no distance.
+    It undoes `at_size`, with bilinear interpolation between those pixels of the network that a ray
+    reaches. Pixels that "crop" cut off, and pixels beyond θ_max, have no label and no distance.
 
     Attributes:
-        seen: (H, W), the pixels that have an answer.
-        reached: (h, w), of the pixels that the network sees, those that a ray reaches.
+        seen: (H, W), True for pixels that have an answer.
+        reached: (h, w), True for pixels of the network that a ray reaches.
 
     Args:
-        lens: of the pictures, with their image_size. size, framing: as `at_size` had them.
+        lens: the lens, with the image_size of the pictures. size, framing: those of `at_size`.
 
     Raises:
         ValueError: a lens without an image_size, or several; an unknown `framing`.
@@ -257,10 +256,10 @@ class FullSize:
         """The classes with the largest logits.
 
         Args:
-            logits: (K, h, w) of the pictures as the network sees them, of at most 255 classes.
+            logits: (K, h, w), the output of the network, for at most 255 classes.
 
         Returns:
-            (H, W) uint8: ids, `IGNORE` where there is no answer.
+            (H, W) uint8: ids, or `IGNORE` without an answer.
         """
         best = self._weighted(logits[0])
         labels = np.zeros(best.shape, np.uint8)
@@ -272,20 +271,20 @@ class FullSize:
         return self._in_picture(labels, IGNORE)
 
     def distance(self, distance: np.ndarray) -> np.ndarray:
-        """Distances, whose logarithm is what is bilinear.
+        """Distances; their logarithms are interpolated.
 
         Args:
-            distance: (h, w), m, above 0 where a ray reaches.
+            distance: (h, w), m, above 0 for pixels that a ray reaches.
 
         Returns:
-            (H, W) float32, m: 0 where there is no answer.
+            (H, W) float32, m; 0 without an answer.
         """
         logarithm = np.log(np.where(self.reached, distance, 1))
         weight = np.where(self._weight > 0, self._weight, 1)
         return self._in_picture(np.exp(self._weighted(logarithm) / weight), 0.0)
 
     def _weighted(self, values: np.ndarray) -> np.ndarray:
-        """Values (h, w) at the pixels that `at_size` took, times how much of them a ray reaches."""
+        """Values (h, w) at the pixels that `at_size` kept, times the share that a ray reaches."""
         return self._enlarged(np.where(self.reached, values, 0))
 
     def _enlarged(self, values: np.ndarray) -> np.ndarray:
@@ -300,5 +299,5 @@ class FullSize:
 
 
 def _reached(lens: Lens) -> np.ndarray:
-    """The pixels of a lens's pictures that a ray reaches, (H, W)."""
+    """True for pixels that a ray of the lens reaches, (H, W)."""
     return ~pixel_angles(lens, picture_size(lens))[0].isnan().numpy()

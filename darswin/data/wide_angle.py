@@ -1,4 +1,4 @@
-"""A data set of wide-angle images, made from ordinary pictures as it is read."""
+"""A data set of wide-angle images that are made from ordinary pictures."""
 
 import math
 from functools import lru_cache
@@ -23,15 +23,15 @@ PAPER_FOV = 2 * math.atan(192 / 9)
 class WideAngle(Samples):
     """Pictures seen through random lenses: `dataset[i]` is (image, lens, label).
 
-    Each picture is taken for a perspective view whose width spans `fov`. It is warped through a
-    lens whose circle, of the same field of view, touches the image's sides, at `render` pixels, and
-    reduced to `size` by averaging areas. Beyond the field of view it is black.
+    Each picture is treated as a perspective view whose width spans `fov`. It is warped to `render`
+    pixels through a lens with the same field of view, whose circle touches the sides of the image.
+    The image is then reduced to `size` by averaging areas. It is black beyond the field of view.
 
     Args:
         source: the pictures. lenses: the distribution of lenses.
-        size: px, H = W of the images. render: px, what they are reduced from; at least `size`.
+        size: px, H = W of the images. render: px, their size before the reduction; at least `size`.
         fov: rad, the full field of view, below π.
-        picture_size: px, the width that larger pictures are reduced to before they are warped.
+        picture_size: px, the width to which larger pictures are reduced before the warp.
         options: framing ("stretch" in the authors' code), mean, std, turns, augment, erase, seed
             and skip_broken, as `Calibrated` takes them.
 
@@ -80,9 +80,9 @@ class WideAngle(Samples):
         return image.reshape(self.size, self.size, -1)
 
     def _map(self, lens: Lens, side: int, turn: Turn | None = None) -> np.ndarray:
-        """(render, render, 2): where in a picture of `side` px each pixel of the lens's image lies.
+        """The place of each pixel in a picture of `side` px, (render, render, 2).
 
-        An image has an eighth as many radii as pixels, and only radii need the lens's curve.
+        The curve of the lens is computed once for each radius; there are eight times more pixels.
         """
         radii, place, offset = _rays(self.render)
         large = lens.resized(self.render / self.size)
@@ -103,7 +103,7 @@ class WideAngle(Samples):
 
 @lru_cache(maxsize=256)
 def _view(fov: float, side: int) -> Perspective:
-    """The lens that a square picture is taken for."""
+    """The perspective lens of a square picture."""
     return Perspective.from_fov(fov, side / 2)
 
 

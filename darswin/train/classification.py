@@ -19,16 +19,16 @@ __all__ = ["Classification"]
 
 
 class Classification(Task):
-    """A classifier of wide-angle images, its loss, its optimiser and its accuracy.
+    """A classifier of wide-angle images, with its loss, its optimiser and its accuracy.
 
     Args:
-        name: of a model, one that `darswin models` lists; null is that of `weights`, or
-            darswin_a_micro.
-        options: of the model, e.g. {spacing: tan, jitter: 0}. With `weights` they are its own, and
-            only drop_path_rate and jitter may differ.
-        label_smoothing: in [0, 1).
-        mixup: α of Beta(α, α) that the shares of two images are drawn from; 0 is off.
-        cutmix: α of the share that a box of another image leaves; 0 is off.
+        name: the model, one of those that `darswin models` lists; null is the model of `weights`,
+            or darswin_a_micro.
+        options: options of the model, e.g. {spacing: tan, jitter: 0}. With `weights`, the model
+            keeps its own options; only drop_path_rate and jitter may differ.
+        label_smoothing: the share of each label that is spread over all classes, in [0, 1).
+        mixup: α of Beta(α, α), the distribution of the share of each image in a mixture; 0 is off.
+        cutmix: α for mixtures that replace a box of the image; 0 is off.
         mix_p: the share of batches that are mixed.
         common: as `Task`.
 
@@ -74,7 +74,7 @@ class Classification(Task):
         return F.cross_entropy(self.net(images, lens).float(), targets)
 
     def _targets(self, labels: Tensor, classes: int) -> Tensor:
-        """Labels (B,) → probabilities (B, K); all 0 for label -1, which then weighs nothing."""
+        """Labels (B,) → probabilities (B, K), all 0 for label -1, which does not count then."""
         names = torch.arange(classes, device=labels.device)
         hot = (labels[:, None] == names).float()
         smooth = hot * (1 - self.label_smoothing) + self.label_smoothing / classes
@@ -83,20 +83,20 @@ class Classification(Task):
     # -- evaluation ---------------------------------------------------------------------------
 
     def validation_step(self, batch: Batch, batch_idx: int) -> None:
-        """Counts a batch into the validation's loss and accuracy."""
+        """Adds a batch to the loss and accuracy of the validation."""
         images, lens, labels = batch
         self.val_metrics.update(self.net(images, lens).float(), labels)
         for name, metric in self.val_metrics.all().items():
             self.log(f"val/{name}", metric, prog_bar=name != "top5", on_step=False, on_epoch=True)
 
     def test_step(self, batch: Batch, batch_idx: int, dataloader_idx: int = 0) -> None:
-        """Counts a batch into the loss and accuracy of its lenses."""
+        """Adds a batch to the loss and accuracy of its test set."""
         images, lens, labels = batch
         metrics: Any = self.test_metrics[dataloader_idx]
         metrics.update(self.net(images, lens).float(), labels)
 
     def on_test_epoch_end(self) -> None:
-        """Collects `results`: a row for each distribution of lenses."""
+        """Collects `results`: a row for each test set."""
         self.results = []
         metrics: Any
         for name, metrics in zip(self.data.test_names, self.test_metrics, strict=True):
@@ -105,7 +105,7 @@ class Classification(Task):
             self.results.append({"lenses": name} | row | {"loss": loss})
 
     def results_figure(self) -> Figure:
-        """Accuracy against ξ where every distribution is one ξ, else bars."""
+        """Accuracy against ξ if each test set has a single ξ, otherwise bars."""
         figure = Figure(figsize=(7, 4.2), layout="constrained")
         axes = figure.subplots()
         name, rows = self.card.model, self.results
@@ -139,10 +139,10 @@ class ClassMetrics(nn.Module):
         self.loss = MeanLoss()
 
     def update(self, logits: Tensor, labels: Tensor) -> None:
-        """Counts images: their logits (B, K) and their labels (B,), -1 where none is known."""
+        """Adds images: their logits (B, K) and their labels (B,), -1 for unknown."""
         known = labels >= 0
         logits, labels = logits[known], labels[known]
-        if len(labels) == 0:  # which torchmetrics does not take
+        if len(labels) == 0:  # an error in torchmetrics
             return
         metric: Any
         for metric in self.accuracies.values():
@@ -154,7 +154,7 @@ class ClassMetrics(nn.Module):
 
 
 class MeanLoss(Metric):
-    """A mean of sums in float64; torchmetrics' own leaves NaN out."""
+    """A mean in float64 that keeps NaN; the one of torchmetrics drops NaN."""
 
     full_state_update = False
     total: Tensor
@@ -174,7 +174,7 @@ class MeanLoss(Metric):
 
 
 def _distribution(name: str) -> SphericalLenses | None:
-    """The lenses of a row; None where they are others, or those of a camera."""
+    """The spherical lenses that a row names, or None."""
     try:
         lenses = parse_lenses(name)
     except ValueError:

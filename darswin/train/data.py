@@ -1,4 +1,4 @@
-"""The data of runs: batches in the order of a training, and of every test set."""
+"""The data of runs: batches for training, in an order that can be resumed, and for tests."""
 
 import math
 from collections.abc import Sequence
@@ -30,45 +30,49 @@ SamplesT = TypeVar("SamplesT", bound=Samples)
 
 
 class RunData(LightningDataModule):
-    """Base of the data of a run. Such data define `_open`, `test_names`, `dataset`, `_training`.
+    """Base of the data of a run. Subclasses define `_open`, `test_names`, `dataset`, `_training`.
 
     Args:
-        path: what `open_source` or `open_scenes` opens.
-        lens: the lens of a camera that took the pictures: a calibration file of any format that
-            `darswin.lens.load` reads, a lens as JSON, or a lenses.json that says which camera took
-            which folder or picture (see `darswin.data.Calibrations`).
-        camera: which, of a calibration of several cameras.
-        coefficients: what they are, in a calibration of OpenCV or ROS that does not say it.
+        path: the data set that `open_source` or `open_scenes` opens.
+        lens: the lens of the camera that took the pictures, in place of the data set's own: a
+            calibration file of any format that `darswin.lens.load` reads, a lens as JSON, or a
+            lenses.json that assigns cameras to folders and pictures (see
+            `darswin.data.Calibrations`).
+        camera: the name or number of the camera, if the calibration has several.
+        coefficients: the model of the coefficients, for calibrations of OpenCV or ROS that do not
+            name it.
         size: px, H = W of the images; null means the size of model.weights, or else the median of
-            the shorter sides of the pictures, at least 32 px and at most the default size.
-        fit: how a picture becomes a square: crop cuts it, stretch squashes it; its lens, if it has
-            one, follows.
+            the shorter sides of the pictures, but at least 32 px and at most 64 px for
+            classification and 128 px for other tasks.
+        fit: turns a picture into a square: crop cuts its longer side, stretch squashes it. If the
+            picture has a lens, the lens follows.
         channels: 1 for grey images, 3 for colour images; null means the channels of model.weights,
             or else 1 if all pictures are grey and 3 if not.
-        mean: of the pixels in [0, 1], per channel; null means the mean of model.weights, or else
-            ImageNet's.
-        std: of the pixels, likewise.
+        mean: the mean of the pixels in [0, 1], per channel; null means the mean of model.weights,
+            or else of ImageNet.
+        std: the standard deviation of the pixels, in the same way.
         classes: a file with the names of the classes.
-        splits: a file or folder that says which picture is in which split.
-        holdout: the share for validation, and for testing, where nothing says so.
-        limit: at most so many pictures of each split.
-        batch_size: of one process.
-        workers: processes that read and warp; 0 does it in the training process.
-        flip: mirrors half of the images in training, and their lenses with them.
-        rotate_deg: turns images about the optical axis in training, and their lenses with them, by
-            an angle uniform in ± so many degrees; 180 is any. What turns in from beyond a picture
-            is black.
-        randaugment: changes colours in training.
-        seed: of the shuffles, lenses and augmentation, those of the test sets among them.
-        skip_broken: counts files that are no images, instead of stopping at the first.
+        splits: a file or folder that lists the pictures of each split.
+        holdout: the share of the pictures for validation, and for testing, if the data set does
+            not define these splits.
+        limit: the largest number of pictures in each split.
+        batch_size: images in a batch of one process.
+        workers: processes that read and warp pictures; 0 uses the training process.
+        flip: mirrors half of the training images, together with their lenses.
+        rotate_deg: rotates training images about the optical axis, together with their lenses, by
+            a random angle of at most this many degrees; 180 allows any angle. Pixels from outside
+            the picture are black.
+        randaugment: changes the colours of training images.
+        seed: seeds the shuffles, the lenses and the augmentation, also those of the test sets.
+        skip_broken: counts files that are not images, instead of stopping at the first one.
     """
 
     default_size: ClassVar[int] = 64  # of large pictures
-    # What a model's card says of its pictures.
+    # For the model's card.
     fov: float
     frame_fit: Framing
     colors: Sequence[Sequence[int]] = []
-    pair_lenses = False  # whether images that are mixed in training have one lens
+    pair_lenses = False  # True if the two images of a mixture share a lens
 
     def __init__(
         self,
@@ -116,7 +120,7 @@ class RunData(LightningDataModule):
         self._progress: dict[str, Any] = {}
 
     def _open(self, split: Split, channels: int | None) -> Any:
-        """The pictures of a split; None stands for the channels of the pictures."""
+        """The pictures of a split; with `channels` None they keep their own channels."""
         raise NotImplementedError
 
     def source(self, split: Split) -> Any:
@@ -166,24 +170,24 @@ class RunData(LightningDataModule):
 
     @property
     def classes(self) -> list[str]:
-        """The names behind the labels; none for distances."""
+        """The names of the classes; empty for distances."""
         return self.source("train").classes
 
     @property
     def test_names(self) -> list[str]:
-        """The names of the sets that a test measures, one after the other."""
+        """The names of the test sets, in order."""
         raise NotImplementedError
 
     def _limited(self, source: Any) -> Any:
         return source if self.limit is None else source.limited(self.limit)
 
     def _noted(self, dataset: SamplesT) -> SamplesT:
-        """A data set whose broken pictures are counted."""
+        """The data set, whose broken pictures `broken` will count."""
         self.datasets.append(dataset)
         return dataset
 
     def broken(self) -> int:
-        """Number of pictures that could not be read so far."""
+        """The number of pictures that could not be read so far."""
         return sum(len(dataset.broken) for dataset in self.datasets)
 
     @property
@@ -207,7 +211,7 @@ class RunData(LightningDataModule):
         raise NotImplementedError
 
     def train_dataloader(self) -> ResumableLoader:
-        """Batches of the training split, in an order that can be resumed."""
+        """The batches of the training split, in an order that can be resumed."""
         dataset = self._training()
         order = TrainingOrder(
             len(dataset), self.batch_size, pairs=self.pair_lenses, seed=self.seed,
@@ -219,24 +223,24 @@ class RunData(LightningDataModule):
             self._loader.load_state_dict(self._progress)
         return self._loader
 
-    # Lightning restores a loader's own state only if it was made after the optimiser, and the
-    # optimiser's schedule needs its length.
+    # Lightning restores the state of a loader only if the loader was made after the optimiser, but
+    # the optimiser's schedule needs the loader's length.
     def state_dict(self) -> dict[str, Any]:
-        """The place in the order of the training."""
+        """The place in the order of the training images."""
         return self._loader.state_dict() if self._loader else {}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Goes on from there: the next training loader starts at that place."""
+        """Makes the next training loader start at a saved place."""
         self._progress = state_dict
 
     def transfer_batch_to_device(
         self, batch: Sequence[Any], device: torch.device, dataloader_idx: int
     ) -> list[Any]:
-        """Images, lenses and targets on the device; a GPU is not waited for."""
+        """Images, lenses and targets on the device; copies to a GPU do not block."""
         return [part.to(device, non_blocking=device.type == "cuda") for part in batch]
 
     def dataset(self, split: Split, name: str | None = None) -> Samples:
-        """A split as it is evaluated; `name` is one of `test_names`."""
+        """A split without augmentation; `name` is one of `test_names`."""
         raise NotImplementedError
 
     def _evaluation(self, split: Split, name: str | None = None) -> DataLoader:
@@ -247,44 +251,42 @@ class RunData(LightningDataModule):
                 raise
             raise ValueError(
                 f"`holdout` 0 leaves no pictures for {split!r}, and {self.path} has none of its "
-                "own; `limit_val_batches` 0 trains without validation"
+                "own; set `limit_val_batches` 0 to train without validation"
             ) from error
         count, place = len(dataset), self._place
         part = range(place["rank"], count, place["world"])
         if not part:
             raise ValueError(
-                f"the {split!r} split has too few pictures for as many processes: {count}"
+                f"the {split!r} split has {count} pictures, too few for the processes of this run"
             )
         return DataLoader(dataset, self.batch_size, sampler=part, **self._options)
 
     def val_dataloader(self) -> DataLoader:
-        """Batches of the validation split, as in training but for what is augmented."""
+        """The batches of the validation split."""
         return self._evaluation("val")
 
     def test_dataloader(self) -> list[DataLoader]:
-        """Batches of what a test measures, one loader for each of `test_names`."""
+        """The batches of the test sets, one loader for each of `test_names`."""
         return [self._evaluation("test", name) for name in self.test_names]
 
 
 class WideAngleData(RunData):
-    """Pictures as wide-angle images, or wide-angle pictures with the lenses that took them.
+    """Pictures for classification, warped through random lenses or taken by calibrated cameras.
 
     Args:
         path: a folder of images, a folder of IDX files, or "digits": see
-            `darswin.data.open_source`. Pictures that `lens` took are not warped, and what is said
-            of train_lenses, test_lenses, fov_deg, render and picture_size has no effect on them.
-        train_lenses: what training and validation go through: a level of the paper ("very low",
+            `darswin.data.open_source`. If `lens` is given, pictures are not warped, and
+            train_lenses, test_lenses, fov_deg, render and picture_size have no effect.
+        train_lenses: the lenses of training and validation: a level of the paper ("very low",
             "low", "medium", "high"), one ξ ("0.4"), a range ("0.2..0.35"), or "polynomial".
-        test_lenses: what testing goes through, one after the other: such names, or a sweep
-            "0:1:0.1".
-        render: px, what images are reduced from.
-        fov_deg: degrees, the field of view that a picture's width spans, and that of every lens.
-        picture_size: px, the width that larger pictures are first reduced to.
-        erasing: how often a box of an image is erased in training.
+        test_lenses: the lenses of the tests, in order: a list of such names, or a sweep "0:1:0.1".
+        render: px, the size of the warped images before they are reduced to `size`.
+        fov_deg: degrees, the field of view of a picture's width and of every lens.
+        picture_size: px, the width to which larger pictures are reduced before the warp.
+        erasing: the probability that a box of a training image is erased.
         pair_lenses: gives both images of a mixture the same lens, so that the mixture is an image
-            through one lens. Without it, the mixed-in image is taken for one through the other's
-            lens, as in the authors' code; or, without mixing, every image has a lens of its own.
-            Calibrated pictures are paired by their cameras, and those left over stay unmixed.
+            through one lens. Otherwise a mixture has the lens of its first image, as in the
+            authors' code. Calibrated pictures are paired by camera; those left over are not mixed.
         common: as `RunData`; the default size of large pictures is 64.
     """
 
@@ -304,7 +306,7 @@ class WideAngleData(RunData):
         super().__init__(path, **common)
         for name, value in (("camera", self._camera), ("coefficients", self._coefficients)):
             if value is not None and self._lens is None:
-                raise ValueError(f"`{name}` {value} is one of a calibration: give `lens`")
+                raise ValueError(f"`{name}` {value} needs a calibration: give `lens`")
         self.train_lenses = parse_lenses(train_lenses)
         self._test_lenses = parse_sweep(test_lenses)
         self._warping: dict[str, Any] = dict(
@@ -319,21 +321,21 @@ class WideAngleData(RunData):
 
     @property
     def test_names(self) -> list[str]:
-        """The distributions of lenses of a test, or the calibration."""
+        """The names of the test's lens distributions, or the name of the calibration."""
         if self._lens is None:
             return self._test_lenses
         return ["lens" if is_json(self._lens) else Path(self._lens).name]
 
     @cached_property
     def calibrations(self) -> Calibrations | None:
-        """The lenses that the pictures were taken with, if `lens` says them."""
+        """The lenses that took the pictures, if `lens` is given."""
         if not self._lens:
             return None
         return Calibrations(self._lens, self.path, self._camera, self._coefficients)
 
     def dataset(self, split: Split, name: str | None = None, **options: Any) -> Samples:
-        """A split as it is, with its cameras' lenses; or through a distribution of lenses, where
-        None means that of training."""
+        """A split with the lenses of its cameras, or through the lens distribution `name`; None
+        is the distribution of training."""
         source = self._limited(self.source(split))
         if self.calibrations is not None:
             return self._noted(Calibrated(source, self.calibrations, **self._form, **options))

@@ -1,4 +1,4 @@
-"""Runs that start from a trained model: its options, its weights, its frozen stages."""
+"""Runs that start from a trained model: its options, weights and frozen stages."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -14,19 +14,19 @@ from darswin.models.saving import ModelCard, load_model, model_of_run
 from darswin.models.unet import Unet
 from darswin.utils.tasks import Task
 
-# Options of a model that the data decide.
+# Options of a model that follow from the data.
 OF_DATA = ("task", "num_classes", "in_chans", "mean", "std", "image_size")
-# Options that change nothing but how a model trains.
+# Options that only affect training.
 OF_TRAINING = ("drop_path_rate", "jitter")
 
 
 def weights_file(weights: str | Path) -> str | Path:
-    """The model of a run's folder; anything else as it is."""
+    """The model in a run's folder; other paths and names unchanged."""
     return model_of_run(weights) if Path(weights).is_dir() else weights
 
 
 def own_options(card: ModelCard) -> dict[str, Any]:
-    """The options of a model but for those that the data decide."""
+    """The options of a model without those that follow from the data."""
     return {name: value for name, value in card.options.items() if name not in OF_DATA}
 
 
@@ -37,21 +37,20 @@ def models_for(task: Task) -> list[str]:
 
 
 def name_from(card: ModelCard, task: Task) -> str:
-    """The model that starts from a trained one: the same, or a dense one with that encoder."""
+    """The name of the model for the task: the trained one, or the dense model with its encoder."""
     for name in models_for(task):
         if card.model in (name, name.replace("_unet_", "_")):
             return name
-    raise ValueError(
-        f"no model for {task} starts from a {card.model}, which is one for {card.task}"
-    )
+    raise ValueError(f"no model for {task} can start from a {card.model}, a model for {card.task}")
 
 
 def check_name(name: str, task: Task) -> None:
-    """ValueError for the name of no model, or of none for the task."""
+    """ValueError for an unknown model, or a model for another task."""
     model_class(name)
     if name not in models_for(task):
         raise ValueError(
-            f"`name` {name} is no model for `task` {task}; there are {', '.join(models_for(task))}"
+            f"`name` {name} is no model for `task` {task}; choose from "
+            f"{', '.join(models_for(task))}"
         )
 
 
@@ -62,13 +61,13 @@ def settle(
     model: Mapping[str, Any],
     data: Mapping[str, Any],
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """The options `name` and `options` of a run's model, and `size`, `channels`, `mean` and `std`
-    of its data: those not given, None, are the trained model's. ValueError where they disagree."""
+    """The `name` and `options` of a run's model, and four options of its data. The trained model
+    gives options that are None; ValueError if others disagree with it."""
 
     def refuse(option: str, value: Any, theirs: Any) -> ValueError:
         return ValueError(
-            f"`{option}` {value} disagrees with `weights` {weights}, whose model has {theirs}; "
-            "leave it out"
+            f"`{option}` {value} disagrees with `weights` {weights}, whose model has {theirs}: "
+            "leave the option out"
         )
 
     name = name_from(card, task)
@@ -77,7 +76,7 @@ def settle(
     own = own_options(card)
     options = dict(model["options"] or {})
     for option, value in options.items():
-        # A decoder that the model does not have yet has options of its own.
+        # A new decoder has its own options.
         if option not in own and name != card.model:
             continue
         if option not in OF_TRAINING and _plain(own.get(option)) != _plain(value):
@@ -91,7 +90,7 @@ def settle(
     }
     for option, value in theirs.items():
         found[option] = value if data[option] is None else data[option]
-        # A model that takes images of any size may go on with another one.
+        # Only a model without an image size may change the size.
         free = option == "size" and "image_size" not in card.options
         if not free and value is not None and _plain(found[option]) != _plain(value):
             raise refuse(option, found[option], value)
@@ -99,13 +98,13 @@ def settle(
 
 
 def _plain(value: Any) -> Any:
-    """Tuples as lists, as JSON has them."""
+    """The value with lists in place of tuples, as in JSON."""
     return [_plain(v) for v in value] if isinstance(value, (list, tuple)) else value
 
 
 def start_from(net: Model, classes: list[str], weights: str | Path) -> None:
-    """Copies a model's weights into a network: its head only if it is of the same classes, those of
-    a classifier into a dense model's encoder."""
+    """Copies the weights of a trained model into a network. The head is copied only for the same
+    classes. A classifier fills the encoder of a dense model."""
     trained, card = load_model(weights_file(weights))
     without_quantized_layers(trained)
     own, given = net.state_dict(), trained.state_dict()
@@ -113,7 +112,7 @@ def start_from(net: Model, classes: list[str], weights: str | Path) -> None:
         given = {f"encoder.{name}": t for name, t in given.items() if not _of_head(name)}
         new = {name for name in own if not name.startswith("encoder.")}
     else:
-        # A model for another task has another head.
+        # Models for different tasks have different heads.
         same = list(card.classes) == list(classes)
         given = {n: t for n, t in given.items() if not _of_head(n) or (same and n in own)}
         new = {name for name in own if _of_head(name)}
@@ -130,8 +129,8 @@ def _of_head(name: str) -> bool:
 
 
 def frozen_parts(net: Encoder | Unet, stages: int) -> list[nn.Module]:
-    """The modules of the encoder that are not trained: the embedding and the first stages; all but
-    the head, where these are all stages."""
+    """The frozen modules of the encoder: the embedding and the first `stages` stages, or all except
+    the head if these are all stages."""
     net = net.encoder if isinstance(net, Unet) else net
     if not 0 <= stages <= len(net.stages):
         raise ValueError(

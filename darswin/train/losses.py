@@ -1,4 +1,4 @@
-"""Losses of predictions for each pixel, finite for a batch without any known pixel: 0."""
+"""Losses of predictions for each pixel; they are 0 for a batch without any known pixel."""
 
 from typing import Literal
 
@@ -14,7 +14,7 @@ LabelLoss = Literal["ce", "dice", "ce+dice"]
 DistanceLoss = Literal["silog", "l1", "log_l1"]
 
 _LAMBDA, _SCALE = 0.85, 10.0  # of SILog
-_LEAST = 1e-6  # below the root, where it has no slope; also of a distance, m
+_LEAST = 1e-6  # added below the root, whose slope at 0 is infinite; also the least distance, m
 
 
 def label_loss(
@@ -26,13 +26,13 @@ def label_loss(
     label_smoothing: float = 0.0,
     weights: Tensor | None = None,
 ) -> Tensor:
-    """Cross-entropy, soft Dice, or the sum of both; pixels of label `IGNORE` have no part.
+    """Cross-entropy, soft Dice, or the sum of both; pixels with the label `IGNORE` do not count.
 
     Args:
         logits: (B, K, H, W). labels: (B, H, W), ids.
-        class_weights: (K,), how much a class counts; None is 1 of each.
-        label_smoothing: in [0, 1), of the cross-entropy.
-        weights: (B, H, W), how much a pixel counts; None is 1 of each.
+        class_weights: (K,), the weight of each class; None weights all by 1.
+        label_smoothing: for the cross-entropy, in [0, 1).
+        weights: (B, H, W), the weight of each pixel; None weights all by 1.
 
     Returns:
         A scalar.
@@ -58,8 +58,10 @@ def label_loss(
 def _dice(
     logits: Tensor, labels: Tensor, class_weights: Tensor | None, weights: Tensor | None
 ) -> Tensor:
-    """1 - Dice of the probabilities in all pixels of the batch, a mean over the classes that the
-    labels have: V-Net, 3DV 2016, with a sum in place of squares in the denominator."""
+    """1 - Dice over all pixels of the batch, a mean over the classes in the labels.
+
+    Source: V-Net, 3DV 2016, with a sum in place of squares in the denominator.
+    """
     known = labels != IGNORE
     share = known.to(logits.dtype) if weights is None else known * weights
     truth = F.one_hot(torch.where(known, labels, 0), logits.shape[1]).permute(0, 3, 1, 2)
@@ -79,14 +81,14 @@ def distance_loss(
     *,
     weights: Tensor | None = None,
 ) -> Tensor:
-    """SILog, or the mean difference of distances or of their logarithms.
+    """SILog, or the mean absolute error of distances or of their logarithms.
 
-    SILog is 10 √(mean g² - 0.85 (mean g)²) with g the difference of the logarithms, over all known
-    pixels of the batch.
+    SILog is 10 √(mean g² - 0.85 (mean g)²) over all known pixels of the batch, where g is the
+    difference of the logarithms.
 
     Args:
-        predicted: (B, 1, H, W), m. distance: (B, H, W), m, 0 where it is not known.
-        weights: (B, H, W), how much a pixel counts; None is 1 of each.
+        predicted: (B, 1, H, W), m. distance: (B, H, W), m, 0 where it is unknown.
+        weights: (B, H, W), the weight of each pixel; None weights all by 1.
 
     Returns:
         A scalar.
@@ -112,5 +114,5 @@ def distance_loss(
 
 
 def _or_one(whole: Tensor) -> Tensor:
-    """A divisor that is 1 where there is nothing."""
+    """The divisor, with 1 in place of 0."""
     return torch.where(whole > 0, whole, 1.0)

@@ -1,5 +1,7 @@
-"""Scores of predictions for each pixel: in all, and in zones of θ; as pixels count, and as their
-solid angles do. Sums are taken in integers and float64, over all processes.
+"""Scores of predictions for each pixel, overall and in zones of θ, with and without weights.
+
+The weights are the solid angles of the pixels. Sums are taken in integers and float64, over all
+processes.
 """
 
 import math
@@ -11,26 +13,28 @@ import torch
 from torch import Tensor
 from torchmetrics import Metric
 
-BY_AREA = "_sr"  # ends the names of what is weighted by solid angle, in steradians
-# δ1, δ2, δ3: the larger of two distances is less than so many times the other.
+BY_AREA = "_sr"  # the ending of scores that are weighted by solid angle, in steradians
+# δ1, δ2, δ3: the larger of two distances is less than this many times the other.
 _RATIOS = (1.25, 1.25**2, 1.25**3)
 DISTANCE_METRICS = ("abs_rel", "sq_rel", "rmse", "rmse_log", "silog", "delta1", "delta2", "delta3")
 
 
 class Zones:
-    """Zones of θ between the axis and whatever a lens sees; `borders` between them in degrees."""
+    """Zones of θ from the axis to the edge of the view; `borders` between them in degrees."""
 
     def __init__(self, borders: Sequence[float]):
         inner = [0.0, *map(float, borders), 180.0]
         if any(not a < b for a, b in pairwise(inner)):
-            raise ValueError(f"`zones` must rise, between 0 and 180 degrees, got {list(borders)}")
+            raise ValueError(
+                f"`zones` must be increasing angles between 0 and 180 degrees, got {list(borders)}"
+            )
         self.borders = inner[1:-1]
 
     def __len__(self) -> int:
         return len(self.borders) + 1
 
     def of(self, theta: Tensor) -> Tensor:
-        """The number of the zone at θ (rad), of any shape; the last one's for NaN."""
+        """The number of the zone at each θ (rad), of any shape; NaN is in the last zone."""
         borders = torch.tensor(self.borders, dtype=theta.dtype, device=theta.device)
         return torch.bucketize(theta.rad2deg(), borders, right=True)
 
@@ -54,30 +58,30 @@ class PixelSums(Metric):
         self.add_state("areas", torch.zeros(zones, *shape, dtype=torch.float64), "sum")
 
     def compute(self) -> tuple[Tensor, Tensor]:
-        """The sums (Z, …): as pixels count, and as solid angles do."""
+        """The sums (Z, …), unweighted and weighted by solid angle."""
         return self.counts, self.areas
 
     def pixels(self, counts: Tensor) -> int:
-        """Number of pixels in the sums of a zone."""
+        """The number of pixels in the sums of a zone."""
         raise NotImplementedError
 
     def scores(self, sums: Tensor) -> dict[str, float]:
-        """The scores of the sums of a zone; NaN where there are no pixels."""
+        """The scores of the sums of a zone; NaN without pixels."""
         raise NotImplementedError
 
 
 class LabelSums(PixelSums):
-    """Confusion counts (Z, K, K): pixels of class i that were predicted as class j. The class
-    `left_out` has no part in the mean IoU."""
+    """Confusion counts (Z, K, K): pixels of class i that were predicted as class j. The mean IoU
+    leaves out the class `left_out`."""
 
-    # torchmetrics counts confusions too, but not weighted ones.
+    # The confusion counts of torchmetrics have no weights.
 
     def __init__(self, classes: int, zones: int, left_out: int | None = None):
         super().__init__(zones, (classes, classes), torch.int64)
         self.classes, self.left_out = classes, left_out
 
     def update(self, predicted: Tensor, labels: Tensor, zone: Tensor, area: Tensor) -> None:
-        """Counts pixels (P,): their predictions, their labels, their zone, their sr."""
+        """Adds pixels (P,): predictions, labels, zones and solid angles (sr)."""
         cell = (zone * self.classes + labels) * self.classes + predicted
         cells = self.counts.numel()
         self.counts += torch.bincount(cell, minlength=cells).view_as(self.counts)
@@ -88,7 +92,7 @@ class LabelSums(PixelSums):
         return int(counts.sum())
 
     def scores(self, sums: Tensor) -> dict[str, float]:
-        """`miou`, over the classes that occur in the truth or the prediction, and `accuracy`."""
+        """`accuracy`, and `miou` over the classes in the truth or the prediction."""
         iou, _ = iou_and_recall(sums)
         if self.left_out is not None:
             iou[self.left_out] = torch.nan
@@ -97,21 +101,21 @@ class LabelSums(PixelSums):
 
 
 def iou_and_recall(confusion: Tensor) -> tuple[Tensor, Tensor]:
-    """IoU and recall of each class, (K,), of a confusion (K, K), from truth to prediction; NaN
-    where a class does not occur."""
+    """IoU and recall of each class, (K,), from confusion counts (K, K) of truth and prediction; NaN
+    for a class that does not occur."""
     confusion = confusion.double()
     right, present = confusion.diagonal(), confusion.sum(1)
     return _ratio(right, present + confusion.sum(0) - right), _ratio(right, present)
 
 
 class DistanceSums(PixelSums):
-    """Sums of the terms of distances' mean errors: (Z, 9), the first of which is the weight."""
+    """Sums of the terms of the distance errors, (Z, 9); the first term is the weight."""
 
     def __init__(self, zones: int):
         super().__init__(zones, (9,))
 
     def update(self, predicted: Tensor, distance: Tensor, zone: Tensor, area: Tensor) -> None:
-        """Counts pixels (P,): two distances above 0 (m), their zone, their solid angle (sr)."""
+        """Adds pixels (P,): two distances above 0 (m), zones and solid angles (sr)."""
         predicted, distance = predicted.double(), distance.double()
         off, log = predicted - distance, predicted.log() - distance.log()
         larger = torch.maximum(predicted / distance, distance / predicted)
@@ -142,10 +146,10 @@ class DistanceSums(PixelSums):
 
 
 def none_of_nan(value: float) -> float | None:
-    """The value; None, which JSON has, in place of NaN, which it has not."""
+    """The value, or None for NaN, because JSON has no NaN."""
     return None if math.isnan(value) else value
 
 
 def _ratio(part: Tensor, whole: Tensor) -> Tensor:
-    """part / whole, NaN where there is nothing."""
+    """part / whole, NaN where `whole` is 0."""
     return torch.where(whole > 0, part / torch.where(whole > 0, whole, 1), torch.nan)

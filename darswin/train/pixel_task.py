@@ -17,12 +17,12 @@ from darswin.viz.pixels import Row, draw_predictions
 
 __all__ = ["PixelTask"]
 
-_SHOWN = 4  # samples of a test's picture
-_EARLY = 100  # batches: a training does not go on for longer without any target
+_SHOWN = 4  # samples in the figure of a test
+_EARLY = 100  # batches after which a training without any target stops
 
 
 class Measured(nn.Module):
-    """The metrics of a set: sums over its pixels in each zone, and the mean loss."""
+    """The metrics of a data set: sums over the pixels of each zone, and the mean loss."""
 
     def __init__(self, sums: PixelSums):
         super().__init__()
@@ -30,27 +30,27 @@ class Measured(nn.Module):
 
 
 class PixelTask(Task):
-    """Base of the tasks for each pixel.
+    """Base of the tasks that predict each pixel.
 
-    A task defines `_criterion`, `_answer`, `_known`, `_check_targets`, `_sums`, `nothing`, which
-    stands for no answer, and `shown`, its scores that are logged after each epoch.
+    Subclasses define `_criterion`, `_answer`, `_known`, `_check_targets`, `_sums`, `nothing` (the
+    value for no answer) and `shown` (the scores that are logged after each epoch).
 
     Args:
-        name: of a model; None is that of `weights`, or the task's own default.
-        options: of the model. With `weights` they are its own.
-        learning_rate: its peak.
-        warmup_epochs: of linear warm-up; may be a fraction.
-        reference_batch: images that the rates are meant for.
-        zones: degrees from the axis, between the zones that a test measures one by one; null is
-            30, 60, 90.
-        solid_angle_weights: pixels count in the loss as their solid angles do, of which the mean is
-            1 in each image.
+        name: the model; None is the model of `weights`, or the task's default.
+        options: options of the model. With `weights`, the model keeps its own options.
+        learning_rate: the peak of the learning rate.
+        warmup_epochs: epochs of linear warm-up; may be a fraction.
+        reference_batch: images per step for which the learning rates are meant.
+        zones: degrees from the axis, the borders between the zones that a test measures
+            separately; null is 30, 60, 90.
+        solid_angle_weights: weights the pixels in the loss by their solid angles, with a mean of 1
+            in each image.
         common: as `Task`.
 
     Attributes:
-        results: after a test a row for each set: `data`, its name; the scores, and again with
-            solid angles as weights, named `…_sr`; `pixels`, how many were known; `per_class` and
-            `per_zone`. A score of nothing known is None.
+        results: after a test, a row for each test set: `data`, its name; the scores; the scores
+            weighted by solid angle, whose names end in `_sr`; `pixels`, the number of known
+            pixels; `per_class` and `per_zone`. A score without any known pixel is None.
         samples: some of the tested images, (H, W, C) uint8, with their targets and predictions,
             (H, W), ids or m.
     """
@@ -79,7 +79,7 @@ class PixelTask(Task):
         self.solid_angle_weights = solid_angle_weights
         self.samples: list[Row] = []
         self._rays = Rays()
-        # Which ids the targets of the first epoch hold, (256,), and of how many images.
+        # The ids in the targets of the first epoch, (256,) bool, and the number of their images.
         self._found: Tensor | None = None
         self._images = 0
 
@@ -88,7 +88,7 @@ class PixelTask(Task):
         count = len(self.zones)
         self.test_metrics = nn.ModuleList(Measured(self._sums(count)) for _ in self.data.test_names)
 
-    # -- what a task defines ------------------------------------------------------------------
+    # -- defined by each task -------------------------------------------------------------------
 
     def _sums(self, zones: int) -> PixelSums:
         raise NotImplementedError
@@ -98,7 +98,7 @@ class PixelTask(Task):
         raise NotImplementedError
 
     def _answer(self, predicted: Tensor) -> Tensor:
-        """The model's output (B, K, H, W) → ids or metres, (B, H, W)."""
+        """The ids or metres (B, H, W) in the model's output (B, K, H, W)."""
         raise NotImplementedError
 
     def _known(self, target: Tensor) -> Tensor:
@@ -106,8 +106,8 @@ class PixelTask(Task):
         raise NotImplementedError
 
     def _check_targets(self, found: list[bool], images: str, whole: bool) -> None:
-        """Raises ValueError, or warns, if something is missing in the training targets, of which
-        `found` says which ids they have, and `whole`, whether they are those of an epoch."""
+        """Raises ValueError, or warns, if the training targets lack something. `found` is True for
+        the ids that occur, and `whole` is True after a whole epoch."""
         raise NotImplementedError
 
     def _per_class(self, counts: Tensor, areas: Tensor) -> dict[str, Any]:
@@ -125,12 +125,12 @@ class PixelTask(Task):
         return self._criterion(self.net(images, lens).float(), target, weights)
 
     def on_train_batch_end(self, outputs: Any, batch: Batch, batch_idx: int) -> None:
-        """Notes which ids occur in the first whole epoch, and checks them at its end; earlier, if
-        the epoch is long. A device is waited for only then."""
+        """Collects the ids in the targets of the first epoch. They are checked after the epoch, or
+        earlier if it is long; only the check waits for a GPU."""
         target = batch[2]
         if batch_idx == 0 and self._images == 0:
             self._found = torch.zeros(IGNORE + 1, dtype=torch.bool, device=target.device)
-        if self._found is None:  # a resumed run is amid an epoch, or the first one is over
+        if self._found is None:  # in the middle of an epoch after a resume, or after the first one
             return
         ids = torch.zeros_like(target, dtype=torch.int64) if target.is_floating_point() else target
         self._found.scatter_(0, torch.where(self._known(target), ids, IGNORE).flatten(), True)
@@ -152,14 +152,14 @@ class PixelTask(Task):
         try:
             self._check_targets(ids, f"{self._images} training images", whole)
         except ValueError:
-            if self.global_rank:  # Lightning kills the first process, which says it, if this fails
+            if self.global_rank:  # an error here would make Lightning kill the first process
                 raise SystemExit from None
             raise
 
     # -- evaluation ---------------------------------------------------------------------------
 
     def _predict(self, batch: Batch, measured: Measured) -> tuple[Tensor, Tensor]:
-        """The answer for each pixel, and which of them are known; counts the loss of these."""
+        """The answer for each pixel and a mask of the known pixels; adds the loss of these."""
         images, lens, target = batch
         predicted = self.net(images, lens.merged()).float()
         known = self._known(target)
@@ -168,7 +168,7 @@ class PixelTask(Task):
         return self._answer(predicted), known
 
     def validation_step(self, batch: Batch, batch_idx: int) -> None:
-        """Counts a batch into the validation's loss and scores."""
+        """Adds a batch to the loss and scores of the validation."""
         answer, known = self._predict(batch, self.val_metrics)
         answer, truth = answer[known], batch[2][known]
         zone = torch.zeros_like(truth, dtype=torch.int64)
@@ -176,7 +176,7 @@ class PixelTask(Task):
         self.log("val/loss", self.val_metrics.loss, prog_bar=True, on_step=False, on_epoch=True)
 
     def on_validation_epoch_end(self) -> None:
-        """Logs the scores, which are the same in all processes."""
+        """Logs the scores; they are the same in all processes."""
         counts, _ = self.val_metrics.sums.compute()
         scores = self.val_metrics.sums.scores(counts[0])
         self.val_metrics.sums.reset()
@@ -184,11 +184,11 @@ class PixelTask(Task):
             self.log(f"val/{name}", scores[name], prog_bar=True)
 
     def on_test_start(self) -> None:
-        """Forgets the samples of a test before."""
+        """Removes the samples of an earlier test."""
         self.samples = []
 
     def test_step(self, batch: Batch, batch_idx: int, dataloader_idx: int = 0) -> None:
-        """Counts the pixels of a batch into the sums of its set."""
+        """Adds the pixels of a batch to the sums of its test set."""
         measured: Any = self.test_metrics[dataloader_idx]
         images, lens, target = batch
         answer, known = self._predict(batch, measured)
@@ -196,24 +196,24 @@ class PixelTask(Task):
         zone = self.zones.of(theta)
         measured.sums.update(answer[known], target[known], zone[known], area[known])
         if batch_idx == 0:
-            # An answer where the lens sees nothing has no meaning.
+            # Beyond the lens's view an answer has no meaning.
             seen = torch.where(theta.isnan(), self.nothing, answer)
             self._keep_samples(images, target, seen, known)
 
     def _keep_samples(self, images: Tensor, target: Tensor, answer: Tensor, known: Tensor) -> None:
-        """Adds the first images of a set to `samples`."""
+        """Adds the first images of a test set to `samples`."""
         mean, std = (images.new_tensor(v)[:, None, None] for v in (self.data.mean, self.data.std))
         count = max(_SHOWN // len(self.test_metrics), 1)
         for k in range(min(count, len(images), _SHOWN - len(self.samples))):
             if not known[k].any():
-                continue  # of a picture that could not be read
+                continue  # a picture that could not be read
             pixels = ((images[k] * std + mean) * 255).round().clamp(0, 255).to(torch.uint8)
             arrays = (pixels.permute(1, 2, 0), target[k], answer[k])
             image, truth, prediction = (array.cpu().numpy() for array in arrays)
             self.samples.append((image, truth, prediction))
 
     def on_test_epoch_end(self) -> None:
-        """Collects `results`: a row for each set."""
+        """Collects `results`: a row for each test set."""
         self.results = []
         measured: Any
         for name, measured in zip(self.data.test_names, self.test_metrics, strict=True):
@@ -230,14 +230,14 @@ class PixelTask(Task):
             self.results.append({"data": name} | scores | {"loss": loss} | nested)
 
     def results_figure(self) -> Figure | None:
-        """The samples: images, targets and predictions."""
+        """A figure of the samples: images, targets and predictions."""
         if not self.samples:
             return None
         return draw_predictions(self.samples, self.card.classes, self.card.colors)
 
 
 def _scores(sums: PixelSums, counts: Tensor, areas: Tensor) -> dict[str, Any]:
-    """The scores of sums over pixels: as pixels count, and as solid angles do."""
+    """The scores of sums over pixels, unweighted and weighted by solid angle."""
     found: dict[str, Any] = dict(pixels=sums.pixels(counts))
     for end, summed in (("", counts), (BY_AREA, areas)):
         scores = sums.scores(summed)
@@ -246,7 +246,7 @@ def _scores(sums: PixelSums, counts: Tensor, areas: Tensor) -> dict[str, Any]:
 
 
 class Rays:
-    """Angles and solid angles of pixels; kept for the next batch: a test set often has one lens."""
+    """Angles and solid angles of pixels, kept for the next batch if its lenses are the same."""
 
     def __init__(self) -> None:
         self._lens: Lens | None = None

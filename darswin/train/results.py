@@ -1,4 +1,4 @@
-"""The results of a test as tables, CSV, JSON and a picture."""
+"""Writes the results of a test as tables, CSV, JSON and a figure."""
 
 import csv
 import io
@@ -18,17 +18,17 @@ from darswin.viz.plot import save_figure
 Table = Sequence[dict[str, Any]]
 
 _IN_PERCENT = ("top1", "top5", "miou", "accuracy", "iou", "recall", "delta1", "delta2", "delta3")
-# They are in the files alone.
+# Scores that only the files have.
 _NOT_SHOWN = ("pixels", "sq_rel", "rmse_log", "delta2", "delta3", "to_deg")
 _NOT_SHOWN_BY_AREA = (*_NOT_SHOWN, "rmse", "silog", "recall")
 
 
 class WriteResults(Callback):
-    """After a test: prints the scores of each set, class and zone, and writes them to a folder.
+    """Prints the scores after a test and writes them to a folder.
 
-    Files: `test.csv` with a row for each set, `test_classes.csv` for each class of it,
-    `test_zones.csv` for each zone of θ, `test.json` with all of it, and `test.png`. Names that end
-    in `_sr` are of scores weighted by solid angle.
+    `test.csv` has a row for each test set, `test_classes.csv` a row for each class, and
+    `test_zones.csv` a row for each zone of θ. `test.json` has all scores, and `test.png` is a
+    figure. Names that end in `_sr` mark scores weighted by solid angle.
     """
 
     def __init__(self, folder: Path):
@@ -55,7 +55,7 @@ class WriteResults(Callback):
 
 
 def tables(rows: Table) -> dict[str, Table]:
-    """The rows of a test by the names of their files, with those of classes and zones apart."""
+    """The tables of a test by the names of their files: test sets, classes and zones."""
     nested = ("per_class", "per_zone")
     found: dict[str, Table] = {
         "test.csv": [{key: v for key, v in row.items() if key not in nested} for row in rows],
@@ -80,7 +80,7 @@ def _csv(rows: Table) -> str:
 
 
 def _text(rows: Table) -> str:
-    """Rows for people: in columns, of which those of words are flush left, shares in percent."""
+    """A readable table: columns of words are flush left, and shares are in percent."""
     hidden = {*_NOT_SHOWN, *(f"{key}{BY_AREA}" for key in _NOT_SHOWN_BY_AREA)}
     columns = []
     for key in rows[0]:

@@ -1,4 +1,4 @@
-"""A run's checkpoints, how it stops on a signal, and which options may change when it goes on."""
+"""Runs: their checkpoints, their stop on a signal, and the options that may change on resume."""
 
 import io
 import os
@@ -21,11 +21,11 @@ from darswin.utils.unpickle import read_pickle
 
 
 class RunCheckpoint(ModelCheckpoint):
-    """A checkpoint in a run's folder, wherever that folder has been moved.
+    """A checkpoint in the folder of a run, which may be moved.
 
-    At an epoch's last step nothing is written before the validation: a run that resumed from there
-    would take the epoch for finished and skip its validation. Between the batches of an accumulated
-    step nothing is written either, because a checkpoint does not hold gradients.
+    No checkpoint is written at the last step of an epoch before the validation, because a resumed
+    run would skip that validation. None is written between the batches of an accumulated step
+    either, because checkpoints do not hold gradients.
     """
 
     def on_train_batch_end(self, trainer: Trainer, *batch: Any) -> None:
@@ -46,14 +46,14 @@ class RunCheckpoint(ModelCheckpoint):
 
 
 def ends_step_amid_epoch(trainer: Trainer, batch_idx: int) -> bool:
-    """True if the optimizer stepped on this batch and the epoch goes on."""
+    """True if the optimiser stepped on this batch and the epoch goes on."""
     steps = (batch_idx + 1) % trainer.accumulate_grad_batches == 0
     return steps and not trainer.is_last_batch
 
 
 class SafeCheckpointIO(TorchCheckpointIO):
-    """Replaces a checkpoint in one go, with its weights as safetensors beside it, and reads
-    checkpoints without executing what they hold."""
+    """Replaces checkpoints atomically, writes the weights as safetensors beside them, and reads
+    checkpoints without executing code in them."""
 
     def save_checkpoint(
         self, checkpoint: dict[str, Any], path: str | Path, storage_options: Any = None
@@ -82,10 +82,10 @@ class SafeCheckpointIO(TorchCheckpointIO):
             checkpoint = read_pickle(path, map_location)
         except ValueError as error:
             others = sorted(set(Path(path).parent.glob("*.ckpt")) - {Path(path)})
-            hint = f"; `ckpt_path` {others[0]} goes on from that one" if others else ""
+            hint = f"; `ckpt_path` {others[0]} starts from the other one" if others else ""
             raise ValueError(f"{error}{hint}") from error
         if not isinstance(checkpoint, dict) or "darswin" not in checkpoint:
-            raise ValueError(f"{path} is no checkpoint of `darswin fit`: it names no model")
+            raise ValueError(f"{path} is not a checkpoint of `darswin fit`: it names no model")
         return checkpoint
 
 
@@ -95,13 +95,15 @@ _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 class StopOnSignals(Callback):
-    """Within it, Ctrl-C and SIGTERM raise KeyboardInterrupt. While a run trains, only the second
-    does: once any process gets the first, all stop after the same step, with a checkpoint.
+    """A context in which Ctrl-C and SIGTERM stop a run.
 
-    After an epoch's last step they validate first; the checkpoint is then the epoch's own.
+    While a run trains, the first signal to any process makes all processes stop after the same
+    step, with a checkpoint. A second signal, or a signal at another time, raises KeyboardInterrupt.
+    After the last step of an epoch, the run validates before it stops, and the checkpoint is that
+    of the epoch.
     """
 
-    checkpoint: Path  # the file that is written
+    checkpoint: Path  # the file to write
 
     def __init__(self) -> None:
         self.number: int | None = None
@@ -117,7 +119,7 @@ class StopOnSignals(Callback):
 
     def _handle(self, handlers: Mapping[Any, Any]) -> None:
         for number, handler in handlers.items():
-            # Python allows it in no other thread.
+            # Python allows handlers only in this thread.
             if threading.current_thread() is threading.main_thread():
                 signal.signal(number, handler)
 
@@ -129,7 +131,7 @@ class StopOnSignals(Callback):
         os.write(2, b"\nstopping at the end of this step; a second signal stops at once\n")
 
     def on_train_start(self, *run: Any) -> None:
-        # Lightning has just installed a handler of its own for SIGTERM.
+        # Lightning has just installed its own handler for SIGTERM.
         self._handle(dict.fromkeys(_SIGNALS, self._received))
         self._trains = True
 
@@ -139,7 +141,7 @@ class StopOnSignals(Callback):
             raise SystemExit
 
     def on_train_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        # The signal came in the last step of an epoch, whose checkpoint is there.
+        # The signal came in the last step of an epoch, and that epoch has its checkpoint.
         if trainer.global_step > 0 and self._any_signal(trainer):
             raise SystemExit
 
@@ -158,15 +160,15 @@ class StopOnSignals(Callback):
 
 
 def ignore_signals(worker: int) -> None:
-    """Called in the worker processes of a DataLoader: the training process ends them itself."""
+    """Makes a DataLoader's worker ignore signals, because the training process ends its workers."""
     for number in _SIGNALS:
         signal.signal(number, signal.SIG_IGN)
 
 
 # -- options that change when a run goes on ---------------------------------------------------
 
-# A change takes effect from the checkpoint on. Options of the trainer may change as well, except
-# for accumulate_grad_batches, which is part of a step's size.
+# A change takes effect at the checkpoint. Options of the trainer may change as well, except for
+# accumulate_grad_batches, which is part of the size of a step.
 CHANGEABLE = {
     *("checkpoint_steps", "weights_only"),
     *(f"model.{rate}_rate" for rate in ("learning", "warmup", "final")),
@@ -185,13 +187,12 @@ CHANGEABLE = {
 
 
 def check_changes(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
-    """Lines that name each option that differs between a run's configuration and the new one;
-    ValueError for an option that cannot change."""
+    """A line for each option that changes on resume; ValueError for options that cannot change."""
     before, now = _options(before), _options(now)
     changes = {
         name: f"`{name}` {now[name]!r} in place of {before.get(name)!r}"
         for name in now
-        # An option that is off is none that an older run lacks.
+        # An older run may lack an option; the option is no change if it is off now.
         if now[name] != before.get(name) and (name in before or now[name])
     }
     refused = [
@@ -201,16 +202,16 @@ def check_changes(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str
         and (not name.startswith("trainer.") or name == "trainer.accumulate_grad_batches")
     ]
     if refused:
-        raise ValueError(f"a run goes on with what it began with, not with {'; '.join(refused)}")
+        raise ValueError(f"a resumed run cannot change these options: {'; '.join(refused)}")
     return list(changes.values())
 
 
 def _options(config: Mapping[str, Any]) -> dict[str, Any]:
     """The options of a configuration by their qualified names."""
-    found: dict[str, Any] = {"task": "classification"}  # before there were others
+    found: dict[str, Any] = {"task": "classification"}  # the task of runs that name none
     for group, value in config.items():
         if group in ("model", "data", "trainer"):
             found |= {f"{group}.{name}": own for name, own in value.items()}
-        elif group != "run":  # it may have moved
+        elif group != "run":  # the folder may have moved
             found[group] = value
     return found

@@ -19,21 +19,18 @@ __all__ = ["DistanceData", "LabelData", "SceneData"]
 
 
 class SceneData(RunData):
-    """Scenes of calibrated cameras: images, their lenses, and what is known of each pixel.
+    """Scenes of calibrated cameras: images, their lenses, and a label or a distance for each pixel.
 
     Args:
         path: a folder of scenes: see `darswin.data.open_scenes`.
-        lens: of the pictures in `path`, in place of the data set's own: a calibration file of any
-            format that `darswin.lens.load` reads, a lens as JSON, or a lenses.json that says which
-            camera took which folder or picture (see `darswin.data.Calibrations`).
-        test_paths: folders of scenes to test on, one after the other, each with its own lenses, in
-            place of the test set of `path`.
-        batch_size: of one process.
-        crop: the least share of a picture's side that a random part of it has in training, in
-            (0, 1]; null takes no parts.
-        lens_augmentation: shows pictures in training as other lenses would have seen them: a level
-            of the paper ("very low", "low", "medium", "high"), one ξ ("0.4"), a range of it
-            ("0.2..0.35"), or "polynomial"; null is none.
+        test_paths: folders of scenes to test on, in order, each with its own lenses, in place of
+            the test set of `path`.
+        batch_size: images in a batch of one process.
+        crop: trains on random parts of the pictures; each side of a part has at least this share
+            of the picture's side, in (0, 1]. null uses whole pictures.
+        lens_augmentation: shows training pictures as other lenses would have seen them: a level of
+            the paper ("very low", "low", "medium", "high"), one ξ ("0.4"), a range of ξ
+            ("0.2..0.35"), or "polynomial". null turns it off.
         common: as `RunData`; the default size of large pictures is 128.
     """
 
@@ -45,14 +42,13 @@ class SceneData(RunData):
         self,
         path: str,
         *,
-        lens: str | None = None,
         test_paths: list[str] | None = None,
         batch_size: int = 16,
         crop: float | None = None,
         lens_augmentation: str | None = None,
         **common: Any,
     ):
-        super().__init__(path, lens=lens, batch_size=batch_size, **common)
+        super().__init__(path, batch_size=batch_size, **common)
         self.frame_fit = self._framing
         self.test_paths = test_paths or []
         self.crop = crop
@@ -66,13 +62,13 @@ class SceneData(RunData):
 
     @property
     def colors(self) -> list[list[int]]:  # type: ignore[override]  # as `classes`
-        """(r, g, b) of each class, where the data say them."""
+        """The colour (r, g, b) of each class, if the data set has colours."""
         return self.source("train").colors
 
     @property
     def test_names(self) -> list[str]:
-        """The names of the folders that are tested; where two have the same one, as much of their
-        paths as tells all apart."""
+        """The names of the tested folders, or their paths below a common folder if two have the
+        same name."""
         paths = [os.path.abspath(path) for path in self.test_paths or [self.path]]
         names = [os.path.basename(path) for path in paths]
         if len(set(names)) == len(names):
@@ -81,19 +77,19 @@ class SceneData(RunData):
         return [os.path.relpath(path, shared) for path in paths]
 
     def _test_scenes(self, path: str) -> Scenes:
-        """The test set of another folder; all that it has, if it has no splits."""
+        """The test set of another folder, or all of its scenes if it has no splits."""
         opening = self._opening | dict(splits=None, channels=self.channels)
         flat = (Path(path) / "images").is_dir()
         scenes = open_scenes(path, "all" if flat else "test", self.target, **opening)
         if scenes.classes != self.classes:
             raise ValueError(
-                f"the classes of {path} are {scenes.classes}, and those of {self.path} "
-                f"{self.classes}: a model is tested on the classes that it was trained on"
+                f"{path} has the classes {scenes.classes}, but {self.path} has {self.classes}: "
+                "test a model on the classes that it was trained on"
             )
         return scenes
 
     def dataset(self, split: Split, name: str | None = None, **options: Any) -> SceneSamples:
-        """A split with its cameras' lenses; `name` is one of `test_names`."""
+        """A split with the lenses of its cameras; `name` is one of `test_names`."""
         if split == "test" and self.test_paths and name is not None:
             scenes = self._test_scenes(self.test_paths[self.test_names.index(name)])
         else:
@@ -129,7 +125,7 @@ class DistanceData(SceneData):
 
     Args:
         path: a folder of scenes: see `darswin.data.open_scenes`.
-        max_distance: m, beyond which distances count as not known; null is none.
+        max_distance: m; larger distances count as unknown. null has no limit.
         common: as `SceneData`.
     """
 
@@ -142,7 +138,7 @@ class DistanceData(SceneData):
         self.max_distance = max_distance
 
     def on_after_batch_transfer(self, batch: Batch, dataloader_idx: int) -> Batch:
-        """The batch, in which what is too far away is not known."""
+        """The batch, with distances above `max_distance` as unknown."""
         if self.max_distance is None:
             return batch
         images, lens, distance = batch

@@ -1,4 +1,4 @@
-"""Segmentation, a class for each pixel, and distance, metres along the ray for each pixel."""
+"""Segmentation (a class for each pixel) and distance (metres along the ray for each pixel)."""
 
 import math
 import warnings
@@ -28,22 +28,22 @@ class AbsentClass(UserWarning):
 
 
 class Segmentation(PixelTask):
-    """A class for each pixel of wide-angle images: mIoU, accuracy, and IoU of each class.
+    """Predicts a class for each pixel of wide-angle images; measures mIoU, accuracy and IoU.
 
-    Pixels without a label, and those beyond θ_max, have no part in loss and scores. mIoU is the
-    mean over the classes that occur in the truth or in the prediction.
+    The loss and the scores ignore pixels without a label and pixels beyond θ_max. mIoU is the mean
+    over the classes that occur in the truth or in the prediction.
 
     Args:
-        name: of a model; null is that of `weights`, or darswin_unet_a_micro. From the weights of a
-            classifier it is the model with that encoder.
-        options: of the model, e.g. {spacing: tan, jitter: 0}. With `weights` they are its own, and
-            only drop_path_rate and jitter may differ.
-        loss: ce, the cross-entropy, dice, or the sum of both.
-        class_weights: how much each class counts in the loss, in the order of the classes; null
-            is 1 each.
-        ignore_index: the id of a class that is left out of loss and scores, besides 255, which
-            always is.
-        label_smoothing: of the cross-entropy, in [0, 1).
+        name: the model; null is the model of `weights`, or darswin_unet_a_micro. If `weights` is a
+            classifier, it is the dense model with that encoder.
+        options: options of the model, e.g. {spacing: tan, jitter: 0}. With `weights`, the model
+            keeps its own options; only drop_path_rate and jitter may differ.
+        loss: ce (cross-entropy), dice, or ce+dice, their sum.
+        class_weights: the weight of each class in the loss, in the order of the classes; null
+            weights all by 1.
+        ignore_index: the id of a class that loss and scores ignore, in addition to 255.
+        label_smoothing: the share of each label that the cross-entropy spreads over all classes,
+            in [0, 1).
         common: as `PixelTask`.
     """
 
@@ -81,12 +81,12 @@ class Segmentation(PixelTask):
         count = len(classes)
         if self.class_weights is not None and len(self.class_weights) != count:
             raise ValueError(
-                f"`class_weights` must be one for each of the {count} classes "
+                f"`class_weights` must have one value for each of the {count} classes "
                 f"{', '.join(classes)}, got {len(self.class_weights)}"
             )
         if self.ignore_index is not None and not 0 <= self.ignore_index < count:
             raise ValueError(
-                f"`ignore_index` must be a class, 0 to {count - 1}, or {IGNORE}, got "
+                f"`ignore_index` must be the id of a class, 0 to {count - 1}, or {IGNORE}, got "
                 f"{self.ignore_index}"
             )
         return dict(task="segmentation", num_classes=count)
@@ -116,7 +116,7 @@ class Segmentation(PixelTask):
         if not any(found):
             raise ValueError(
                 f"none of the pixels of {images} has a label: labels must hold the ids 0 to "
-                f"{len(classes) - 1}, and {IGNORE} means that a pixel is not labelled"
+                f"{len(classes) - 1}; {IGNORE} means unlabelled"
             )
         learned = [k for k in range(len(classes)) if k != self.ignore_index]
         absent = [classes[k] for k in learned if not found[k]]
@@ -125,8 +125,8 @@ class Segmentation(PixelTask):
         text = f"no pixel of {images} has a label of {some(absent)}"
         if len(learned) - len(absent) < 2:
             raise ValueError(
-                f"{text}, so that a single class is left to learn; {IGNORE} means that a pixel is "
-                "not labelled: a mask of 0 and 255 must be stored as the ids 0 and 1"
+                f"{text}, so only one class is left to learn. {IGNORE} means unlabelled: store a "
+                "mask of 0 and 255 as the ids 0 and 1"
             )
         if not self.global_rank:
             warnings.warn(f"{text}, which cannot be learned", AbsentClass, stacklevel=2)
@@ -147,17 +147,17 @@ class Segmentation(PixelTask):
 
 
 class Distance(PixelTask):
-    """The distance along the ray of each pixel of wide-angle images, and its errors.
+    """Predicts the distance along the ray for each pixel of wide-angle images.
 
-    Pixels whose distance is not known, and those beyond θ_max, have no part in loss and scores.
+    The loss and the scores ignore pixels of unknown distance and pixels beyond θ_max.
 
     Args:
-        name: of a model; null is that of `weights`, or darswin_unet_a_micro. From the weights of a
-            classifier it is the model with that encoder.
-        options: of the model, e.g. {typical_distance: 3}. With `weights` they are its own, and
-            only drop_path_rate and jitter may differ.
-        loss: silog, the scale-invariant error of logarithms with λ 0.85; l1, of metres; or log_l1,
-            of their logarithms.
+        name: the model; null is the model of `weights`, or darswin_unet_a_micro. If `weights` is a
+            classifier, it is the dense model with that encoder.
+        options: options of the model, e.g. {typical_distance: 3}. With `weights`, the model keeps
+            its own options; only drop_path_rate and jitter may differ.
+        loss: silog (the scale-invariant logarithmic error with λ = 0.85), l1 (the mean absolute
+            error in metres) or log_l1 (the mean absolute error of the logarithms).
         common: as `PixelTask`.
     """
 
@@ -198,5 +198,5 @@ class Distance(PixelTask):
             raise ValueError(
                 f"none of the pixels of {images} has a known distance: all are 0 or not finite"
                 + (f", or above `max_distance` {most:g} m" if most is not None else "")
-                + "; a PNG must hold metres × 256 in 16 bits, an NPY file metres"
+                + "; a PNG must hold metres × 256 in 16 bits, a .npy file metres"
             )

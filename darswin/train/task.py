@@ -1,4 +1,4 @@
-"""The base of the tasks: the model, its optimiser and learning rates, its weights, its steps."""
+"""The base of the tasks: the model, its weights, its optimiser and the training steps."""
 
 import math
 from collections.abc import Iterable
@@ -40,40 +40,45 @@ Batch = tuple[Tensor, Lens, Tensor]
 class Task(LightningModule):
     """Base of the tasks: a model of wide-angle images, its optimiser and its steps.
 
-    A task defines `_head_options`, `_make_metrics`, `_loss`, `results_figure` and the steps of
-    validation and test. A test leaves in `results` a row for each set that it was tested on.
+    Subclasses define `_head_options`, `_make_metrics`, `_loss`, `results_figure` and the steps of
+    validation and test. After a test, `results` has a row for each test set.
 
-    Learning rates are those of `reference_batch` images a step and grow in proportion to the batch.
+    The learning rates are for `reference_batch` images per step. They grow in proportion to the
+    batch.
 
     Args:
-        name: of a model; None is that of `weights`, or the task's own default.
-        options: of the model. With `weights` they are its own.
+        name: the model; None is the model of `weights`, or the task's default.
+        options: options of the model. With `weights`, the model keeps its own options.
         weights: a trained model to start from: the folder of a run, whose best model is taken, or a
-            safetensors file. Its name, options, channels, mean and std are the run's; so is its
-            size, unless data.size says another and the model takes it. Its head is kept for the
-            same classes in the same order, else a new one is made. A resumed run does not read it.
-        freeze_stages: keeps the patch embedding and so many first stages of `weights` as they are,
-            without drop path and jitter; all stages leave the head alone to be trained.
-        learning_rate: its peak.
-        warmup_rate: what it starts from.
-        final_rate: what it ends at.
-        warmup_epochs: of linear warm-up; may be a fraction.
-        weight_decay: AdamW's.
+            safetensors file. The new run takes its name, options, channels, mean and std from it,
+            and its size unless data.size gives another one that the model accepts. The head is
+            kept for the same classes in the same order; otherwise a new one is made. A resumed run
+            does not read the file again.
+        freeze_stages: keeps the patch embedding and this number of first stages of `weights` as
+            they are, without drop path and jitter. If all stages are frozen, only the head is
+            trained.
+        learning_rate: the peak of the learning rate.
+        warmup_rate: the learning rate at the start.
+        final_rate: the learning rate at the end.
+        warmup_epochs: epochs of linear warm-up; may be a fraction.
+        weight_decay: the weight decay of AdamW.
         decay_position_bias: decays position biases too, as the authors' code does.
-        reference_batch: images that the rates are meant for.
-        matmul_backend: of float32 products: torch, onednn, or autotune, which measures as it runs.
-            On AMD's CPUs onednn is twice as fast; which one it is decides how results are rounded.
-        grad_checkpointing: saves a third of the activations' memory for a few percent of the time.
-        seed: of the weights, jitter, drop path and mixing.
+        reference_batch: images per step for which the learning rates are meant.
+        matmul_backend: the library for float32 matrix products: torch, onednn, or autotune, which
+            measures both while it runs. onednn is twice as fast on AMD CPUs. The choice changes how
+            results are rounded.
+        grad_checkpointing: saves a third of the memory for activations and costs a few percent of
+            the time.
+        seed: seeds the weights, the jitter, drop path and mixing.
     """
 
     task: ClassVar[TaskName]
     default_model: ClassVar[str]
-    monitor: ClassVar[tuple[str, Literal["min", "max"]]]  # which decides on the best checkpoint
+    monitor: ClassVar[tuple[str, Literal["min", "max"]]]  # the score of the best checkpoint
     results: list[dict[str, Any]]
-    net: Encoder | Unet  # of `configure_model`, as is what describes it
+    net: Encoder | Unet  # made by `configure_model`, like `card`
     card: ModelCard
-    trained: ModelCard  # of the checkpoint that was read; else `card`
+    trained: ModelCard  # the card of the checkpoint that was read, or else `card`
 
     def __init__(
         self,
@@ -96,7 +101,7 @@ class Task(LightningModule):
         super().__init__()
         if freeze_stages and weights is None:
             raise ValueError(
-                f"`freeze_stages` {freeze_stages} keeps trained stages: give `weights`"
+                f"`freeze_stages` {freeze_stages} needs a trained model: give `weights`"
             )
         if name is None and weights is not None:
             card = read_card(weights_file(weights))
@@ -120,14 +125,14 @@ class Task(LightningModule):
         self.weight_decay, self.decay_position_bias = weight_decay, decay_position_bias
         self.seed = seed
         self.matmul_backend, self.grad_checkpointing = matmul_backend, grad_checkpointing
-        self._steps_there: int | None = None  # in an epoch of the run that a checkpoint is of
+        self._steps_there: int | None = None  # steps per epoch of the run in the checkpoint
 
     # -- building -----------------------------------------------------------------------------
 
     def configure_model(self) -> None:
         """Builds the network for the classes and channels of the data."""
-        # Lightning calls this with a GPU as the default device, but what the data make stays on the
-        # CPU, for the worker processes, and so does the draw of the weights, for any device.
+        # Lightning calls this with a GPU as the default device. The data must stay on the CPU for
+        # the worker processes, and weights are drawn there so that they are the same everywhere.
         with torch.device("cpu"):
             if not hasattr(self, "net"):
                 self._build()
@@ -139,7 +144,7 @@ class Task(LightningModule):
         if has_image_size(self.name):
             options["image_size"] = data.size
         if taken := sorted(options.keys() & self.options.keys()):
-            raise ValueError(f"`options` cannot set {', '.join(taken)}: the data decides on it")
+            raise ValueError(f"`options` cannot set {', '.join(taken)}: the data set it")
         options |= self.options
         self.card = ModelCard(
             self.name, options, data.classes, data.size, data.fov, data.frame_fit,
@@ -155,7 +160,7 @@ class Task(LightningModule):
             given = f"`size` {data.size}"
             if self.options:
                 given += f" and `options` {self.options}"
-            raise ValueError(f"no {self.name} with {given}: {error}") from error
+            raise ValueError(f"cannot make {self.name} with {given}: {error}") from error
         if self.weights is not None and self.trainer.training:
             start_from(self.net, data.classes, self.weights)
         self._freeze()
@@ -164,22 +169,22 @@ class Task(LightningModule):
         self._make_metrics()
 
     def _head_options(self) -> dict[str, Any]:
-        """The model's options that the task and the data's classes decide on."""
+        """The options of the model that follow from the task and the classes."""
         raise NotImplementedError
 
     def _two_classes(self) -> list[str]:
         if len(self.data.classes) < 2:
             raise ValueError(
-                f"{self.task} needs two classes, the data has only {self.data.classes}"
+                f"{self.task} needs at least two classes, but the data has {self.data.classes}"
             )
         return self.data.classes
 
     def _make_metrics(self) -> None:
-        """Makes the metrics of validation and test."""
+        """Makes the metrics for validation and tests."""
         raise NotImplementedError
 
     def results_figure(self) -> Figure | None:
-        """A picture of `results`."""
+        """A figure of `results`, or None."""
         raise NotImplementedError
 
     def _freeze(self) -> None:
@@ -189,7 +194,7 @@ class Task(LightningModule):
         self.train(self.training)
 
     def train(self, mode: bool = True) -> Self:
-        """As torch's; frozen stages stay as in evaluation, without drop path and jitter."""
+        """`torch.nn.Module.train`, but frozen stages stay in evaluation mode."""
         super().train(mode)
         for module in self._frozen:
             module.eval()
@@ -197,30 +202,32 @@ class Task(LightningModule):
 
     @property
     def data(self) -> Any:
-        """The run's data, a `RunData`."""
+        """The `RunData` of the run."""
         return self.trainer.datamodule  # type: ignore[attr-defined]  # Lightning attaches it
 
     def configure_optimizers(self) -> OptimizerLRSchedulerConfig:
-        """AdamW, and its learning rate over the run's steps."""
+        """AdamW and the schedule of its learning rate."""
         trainer = self.trainer
         batch = self.data.batch_size * trainer.world_size * trainer.accumulate_grad_batches
         scale = batch / self.reference_batch
         trainer.fit_loop.setup_data()  # with max_steps alone, Lightning has not yet
         steps = trainer.estimated_stepping_batches
         if not math.isfinite(steps):
-            raise ValueError("the cosine needs an end: set `max_epochs` or `max_steps`")
+            raise ValueError(
+                "the learning rate's cosine needs an end: set `max_epochs` or `max_steps`"
+            )
         if self._steps_there not in (None, self.steps_per_epoch):
             raise ValueError(
-                f"an epoch of this run has {self._steps_there} steps, and would now have "
-                f"{self.steps_per_epoch}, which its schedule cannot follow; the number of "
-                "pictures, `batch_size`, `devices` and `limit_train_batches` decide it"
+                f"this run began with {self._steps_there} steps per epoch and cannot go on with "
+                f"{self.steps_per_epoch}: keep the number of pictures, `batch_size`, `devices` and "
+                "`limit_train_batches`"
             )
         rates = {name: rate * scale for name, rate in self.rates.items()}
         warmup_steps = self.warmup_epochs * self.steps_per_epoch
         undecayed = () if self.decay_position_bias else self.net.no_weight_decay()
         optimizer = torch.optim.AdamW(
             parameter_groups(self.net, self.weight_decay, undecayed), lr=rates["peak"],
-            # One pass over each parameter. Lightning cannot clip its gradients under autocast.
+            # It visits each parameter once. With autocast, Lightning cannot clip its gradients.
             fused=not isinstance(trainer.precision_plugin, MixedPrecision),
         )  # fmt: skip
         schedule = Schedule(optimizer, warmup_steps=warmup_steps, steps=steps, **rates)
@@ -231,12 +238,12 @@ class Task(LightningModule):
 
     @property
     def steps_per_epoch(self) -> int:
-        """Steps of the optimizer, the last of which may be on fewer batches than the others."""
+        """Steps of the optimiser in an epoch; the last step may have fewer batches."""
         trainer = self.trainer
         return math.ceil(trainer.num_training_batches / trainer.accumulate_grad_batches)
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """FloatingPointError where the weights, or their moments, are no longer finite."""
+        """Adds the model's card; FloatingPointError if weights or moments are not finite."""
         optimizers = checkpoint.get("optimizer_states", ())
         moments = (state for one in optimizers for state in one["state"].values())
         for tensors in (checkpoint["state_dict"], *moments):
@@ -249,13 +256,13 @@ class Task(LightningModule):
         checkpoint["steps_per_epoch"] = self.steps_per_epoch
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """ValueError where the checkpoint is not one of this model."""
+        """ValueError if the checkpoint belongs to another model."""
         self._steps_there = checkpoint.get("steps_per_epoch")
         self.trained = ModelCard(**checkpoint["darswin"])
         theirs, ours = (
             {**card, **card.pop("options")} for card in (asdict(self.trained), asdict(self.card))
         )
-        # A model may be measured on pictures that come to it in another way.
+        # A model may be tested on pictures with another framing.
         ignored = {"fit", "colors"} | (set() if theirs["fov"] and ours["fov"] else {"fov"})
         other = [
             f"{key} {theirs.get(key)!r} there, {ours.get(key)!r} here"
@@ -263,19 +270,19 @@ class Task(LightningModule):
             if theirs.get(key) != ours.get(key)
         ]
         if other:
-            raise ValueError(f"the checkpoint is one of another model: {'; '.join(other)}")
+            raise ValueError(f"the checkpoint belongs to another model: {'; '.join(other)}")
 
     # -- training -----------------------------------------------------------------------------
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
-        """The loss of a batch, with a step's own random numbers."""
-        # A step's random numbers depend on its place alone, so that a resumed run repeats them.
+        """The loss of a batch."""
+        # The random numbers of a step depend only on its place, so a resumed run repeats them.
         step = (self.seed, self.current_epoch, batch_idx)
         rng = np.random.default_rng(step)  # the same in all processes
         torch.manual_seed(int(np.random.default_rng((*step, self.global_rank)).integers(2**63)))
         loss = self._loss(batch, rng)
-        # A device is only waited for as often as Lightning logs, which waits too: once weights are
-        # not finite, they and the loss stay so.
+        # Reading the loss waits for a GPU. So a GPU's loss is checked only when Lightning logs and
+        # waits anyway: once the loss is not finite, it stays so.
         every = self.trainer.log_every_n_steps  # type: ignore[attr-defined]  # Lightning adds it
         checked = readable(loss) or (self.trainer.global_step + 1) % max(every, 1) == 0
         if checked and not torch.isfinite(loss):
@@ -284,7 +291,7 @@ class Task(LightningModule):
                 f"{self._advice()}"
             )
         self.log("train/loss", loss, prog_bar=True, batch_size=len(batch[0]), sync_dist=True)
-        # As a tensor of the device: Lightning would copy a number to it.
+        # A tensor on the device, because Lightning would copy a number there.
         self.log("train/rate", loss.new_full((), self.trainer.optimizers[0].param_groups[0]["lr"]))
         return loss
 
@@ -295,7 +302,7 @@ class Task(LightningModule):
     def _advice(self) -> str:
         return (
             f"go on with `resume` and a `learning_rate` below {self.rates['peak']:g}; if the last "
-            "checkpoint has diverged too, add `ckpt_path` for best.ckpt, or begin anew"
+            "checkpoint has diverged too, add `ckpt_path` with best.ckpt, or start again"
         )
 
 
@@ -303,8 +310,8 @@ def finite_loss(loss: float, name: str) -> float:
     """The loss of a test set; FloatingPointError if it is not finite."""
     if not math.isfinite(loss):
         raise FloatingPointError(
-            f"the loss on {name} is {loss}: the weights are not finite, or have diverged; "
-            "`ckpt_path` takes another checkpoint"
+            f"the loss on {name} is {loss}: the weights are not finite, or training diverged; "
+            "try another checkpoint with `ckpt_path`"
         )
     return loss
 
@@ -313,8 +320,8 @@ def finite_loss(loss: float, name: str) -> float:
 
 
 def parameter_groups(model: nn.Module, weight_decay: float, undecayed: Iterable[str]) -> list[dict]:
-    """Two groups for an optimiser: weight decay for matrices, none for vectors, biases and those
-    named in `undecayed`."""
+    """Two groups for an optimiser: matrices with weight decay; vectors, biases and the parameters
+    named in `undecayed` without."""
     undecayed = set(undecayed)
     groups: dict[bool, list[nn.Parameter]] = {True: [], False: []}
     for name, parameter in model.named_parameters():
@@ -332,7 +339,7 @@ def learning_rate(
 ) -> float:
     """Linear from `warmup` to `peak` over `warmup_steps`, then a cosine down to `final` at `steps`.
 
-    The cosine counts from step 0, so that the rate falls a little where the two meet, as in the
+    The cosine starts at step 0, so the rate drops a little at the end of the warm-up, as in the
     recipe of Swin and DarSwin.
     """
     if step < warmup_steps:
@@ -341,10 +348,10 @@ def learning_rate(
 
 
 class Schedule(LambdaLR):
-    """AdamW's `learning_rate`, each step.
+    """The `learning_rate` of AdamW for each step.
 
-    A checkpoint brings back the step alone: rates and weight decay stay those that the optimizer
-    and the schedule were made with. The schedule is to be restored after the optimizer.
+    A checkpoint restores only the step. The rates and the weight decay stay those with which the
+    optimiser and the schedule were made. Restore the schedule after the optimiser.
     """
 
     def __init__(self, optimizer: Optimizer, **rates: Any):
@@ -356,7 +363,7 @@ class Schedule(LambdaLR):
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         self.last_epoch = state_dict["last_epoch"] - 1
-        self._step_count = 0  # else torch takes this for a step before the optimizer's first
+        self._step_count = 0  # otherwise torch warns of a step before the optimiser's first one
         self.step()
 
 

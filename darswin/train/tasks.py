@@ -1,4 +1,4 @@
-"""The tasks that a run may have, by their names on the command line."""
+"""The tasks of runs, by their names on the command line."""
 
 from typing import NamedTuple
 
@@ -13,7 +13,7 @@ __all__ = ["TASKS"]
 
 
 class Kind(NamedTuple):
-    """The module that Lightning trains, and its data."""
+    """The Lightning module of a task, and its data."""
 
     module: type[Task]
     data: type[RunData]

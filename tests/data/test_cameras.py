@@ -122,8 +122,8 @@ def test_lenses_of_several_models_are_curves(root):
         ({"nowhere": "woodscape.json"}, r'"nowhere" must name a folder or a picture in .*p'),
         ({"../p/a": "woodscape.json"}, "must name a folder or a picture"),
         ({"/": "woodscape.json"}, "must name a folder or a picture"),
-        ({"a": "woodscape.json", "a/": "woodscape.json"}, '"a/" is there twice'),
-        ({"a": "none.json"}, r'"a" .*none\.json, which is no file'),
+        ({"a": "woodscape.json", "a/": "woodscape.json"}, '"a/" occurs twice'),
+        ({"a": "none.json"}, r'"a" .*none\.json, which is not a file'),
         ({"a": {"file": "opencv_stereo.json", "camera": "x"}}, "camera must be one of"),
         ("[]", "it must be a mapping"),
         ("{", "calibration"),
@@ -147,5 +147,5 @@ def test_what_has_no_lens(root):
         Calibrations(root / "none.json", root)
     for options in ({"camera": "0"}, {"coefficients": "fisheye"}):
         (name,) = options
-        with pytest.raises(ValueError, match=rf'`{name}` is of one .*"file": …, "{name}"'):
+        with pytest.raises(ValueError, match=rf'`{name}` is for one .*"file": …, "{name}"'):
             Calibrations(listed(root, {"a": "woodscape.json"}), root, **options)

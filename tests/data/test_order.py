@@ -90,10 +90,10 @@ def test_a_loader_goes_on_where_it_was(cameras):
 def test_what_does_not_match():
     with pytest.raises(ValueError, match="must be even"):
         order_of(30, 5, world=2)
-    with pytest.raises(ValueError, match="needs more images than 7"):
+    with pytest.raises(ValueError, match="needs more than 7 images"):
         order_of(7, 4, world=2)
     order = order_of(40, 8)
-    with pytest.raises(ValueError, match=r"\(40, 4, 0\); got \(40, 8, 0\)"):
+    with pytest.raises(ValueError, match=r"\(40, 4, 0\), got \(40, 8, 0\)"):
         order.resume(0, 9, [40, 4, 0])
     order.resume(0, 10, [40, 4, 0])  # another shuffle between two epochs
     order_of(40, 4, 1, 2).resume(0, 3, [40, 8, 0])  # the same global batch

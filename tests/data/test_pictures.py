@@ -64,10 +64,10 @@ def test_the_classes_of_idx_files_are_those_of_training(tmp_path):
         write_idx(tmp_path / f"{part}-labels-idx1-ubyte", np.array(labels, np.uint8))
     assert all(open_source(tmp_path, split).classes == ["0", "1", "2"] for split in SPLITS)
     (tmp_path / "names.txt").write_text("zero\none\n")
-    with pytest.raises(ValueError, match=r"labels up to 2 for the 'train' split.*\['zero', 'one"):
+    with pytest.raises(ValueError, match=r"labels up to 2 in the 'train' split.*\['zero', 'one"):
         open_source(tmp_path, "train", classes=tmp_path / "names.txt")
     write_idx(tmp_path / "t10k-labels-idx1-ubyte", np.array([7, 0], np.uint8))
-    with pytest.raises(ValueError, match="labels up to 7 for the 'test' split"):
+    with pytest.raises(ValueError, match="labels up to 7 in the 'test' split"):
         open_source(tmp_path, "test")
     (tmp_path / "t10k-labels-idx1-ubyte").unlink()
     with pytest.raises(FileNotFoundError, match="no t10k-labels-idx1-ubyte"):
@@ -78,9 +78,9 @@ def test_a_cut_idx_file_is_named(tmp_path):
     write_idx(tmp_path / "a", np.zeros((4, 3, 3), np.uint8))
     whole = (tmp_path / "a").read_bytes()
     for name, content, message in (
-        ("a", whole[:-1], r"a says it holds \[4, 3, 3\] bytes, but holds 35"),
-        ("a.gz", gzip.compress(whole)[:-12], r"a\.gz is no whole gzip file"),
-        ("a", b"GIF89a", "a is no IDX file"),
+        ("a", whole[:-1], r"a must hold \[4, 3, 3\] bytes, but holds 35"),
+        ("a.gz", gzip.compress(whole)[:-12], r"a\.gz is not a complete gzip file"),
+        ("a", b"GIF89a", "a is not an IDX file"),
     ):
         (tmp_path / name).write_bytes(content)
         with pytest.raises(ValueError, match=message):

@@ -148,5 +148,5 @@ def test_zones():
     ]  # fmt: skip
     assert len(Zones([])) == 1 and not Zones([]).of(theta).any()
     for wrong in ([0], [60, 30], [30, 30], [200], [math.nan]):
-        with pytest.raises(ValueError, match="`zones` must rise"):
+        with pytest.raises(ValueError, match="`zones` must be increasing"):
             Zones(wrong)

@@ -212,11 +212,11 @@ def test_absent_classes_are_named_once(task, recwarn):
     with pytest.warns(AbsentClass, match=said) as warned:
         trained_on(task, [[labels(0), labels(2)], [labels(0), labels(0)]])
     assert len(warned) == 1
-    with pytest.raises(ValueError, match=r"\['ground', 'wall'\], so that a single class is left"):
+    with pytest.raises(ValueError, match=r"\['ground', 'wall'\], so only one class is left"):
         trained_on(attached(Segmentation(NAME), task.data), [[labels(0)]])
     without = Segmentation(NAME, ignore_index=1)
     trained_on(attached(without, task.data), [[labels(0), labels(2)]])
-    with pytest.raises(ValueError, match=r"has a label of .*'wall'.*, so that a single class"):
+    with pytest.raises(ValueError, match=r"has a label of .*'wall'.*, so only one class"):
         trained_on(attached(Segmentation(NAME, ignore_index=0), task.data), [[labels(0, 1)]])
     assert not recwarn.list
 
@@ -251,7 +251,7 @@ def test_the_order_of_the_data_is_that_of_the_seed(folder):
 def test_test_sets_have_the_classes_of_the_training(folder, tmp_path):
     other = write_plain(tmp_path / "other", 2, size=(45, 60), classes=["a", "b", "c"])
     data = LabelData(str(folder), test_paths=[str(other)])
-    with pytest.raises(ValueError, match="is tested on the classes that it was trained on"):
+    with pytest.raises(ValueError, match="test a model on the classes that it was trained on"):
         data.dataset("test", data.test_names[0])
     assert LabelData(str(folder), lens=str(WOODSCAPE), fit="stretch").frame_fit == "stretch"
 
@@ -272,11 +272,11 @@ def of_task(path, name=NAME, size=None, **options):
         (lambda _: Segmentation(NAME, label_smoothing=1), r"`label_smoothing` must be in \[0, 1\)"),
         (
             lambda path: of_task(path, class_weights=[1.0, 2.0])._head_options(),
-            "one for each of the 3 classes sky, ground, wall, got 2",
+            "one value for each of the 3 classes sky, ground, wall, got 2",
         ),
         (
             lambda path: of_task(path, ignore_index=3)._head_options(),
-            "`ignore_index` must be a class, 0 to 2, or 255",
+            "`ignore_index` must be the id of a class, 0 to 2, or 255",
         ),
         (
             lambda path: of_task(path, options=dict(num_classes=3)).configure_model(),
@@ -284,7 +284,7 @@ def of_task(path, name=NAME, size=None, **options):
         ),
         (
             lambda path: of_task(path, "swin_unet_nano", 33).configure_model(),
-            "no swin_unet_nano with `size` 33: ",
+            "cannot make swin_unet_nano with `size` 33: ",
         ),
     ],
 )

@@ -181,7 +181,7 @@ def test_a_second_signal_stops_at_once(tmp_path, monkeypatch):
         (["--data.size", "48", "--data.channels", "3"], "--data.size 48 in place of 32; --data.ch"),
         (["--seed_everything", "1"], "--seed_everything 1 in place of 0"),
         (["--data.batch_size", "4"], "global batch"),
-        (["--trainer.limit_train_batches", "4"], "--trainer.limit_train_batches decide"),
+        (["--trainer.limit_train_batches", "4"], "steps per epoch and cannot go on with 1: keep"),
         (["--trainer.max_epochs", "0"], "max_epochs=0"),
         (["--task", "distance"], "is a run of --task classification, not of distance"),
     ],
@@ -259,7 +259,7 @@ def test_one_fit_at_a_time(begun, capsys):
 
 
 def test_few_steps_are_logged_and_the_progress_bar_shows_no_folder(tmp_path, capsys):
-    shown = ["--trainer.log_every_n_steps", "50", "--trainer.enable_progress_bar", "true"]
+    shown = ["--trainer.log_every_n_steps", "50", "--trainer.enable_progress_bar", "null"]
     fit(tmp_path, *DIGITS, *shown, "--trainer.max_epochs", "1", "--devices", "1")
     assert yaml.safe_load((tmp_path / "config.yaml").read_text())["trainer"]["devices"] == 1
     lines = table(next(tmp_path.glob("csv/*/metrics.csv")))
@@ -277,7 +277,7 @@ def test_train_test_and_predict_see_the_same(frames, tmp_path, capsys):
     recorded = yaml.safe_load((run / "config.yaml").read_text())["data"]
     assert recorded["lens"] == str(WOODSCAPE)
     _, card = load_model(run / "checkpoints" / "best.safetensors")
-    assert card.fit == "stretch" and card.size == 32 and card.fov == 0
+    assert card.fit == "stretch" and card.size == 64 and card.fov == 0
     main(["validate", "--run", str(run), "--trainer.enable_progress_bar", "false"])
     (row,) = test(run)
     assert row["lenses"] == "woodscape.json" and (run / "test.png").exists()

@@ -188,7 +188,7 @@ def test_a_checkpoint_of_another_model_is_refused():
         ({"fov": 2.0}, "fov 2.0 there, 2.8 here"),
         ({"classes": list("abce")}, "classes"),
     ):
-        with pytest.raises(ValueError, match=f"is one of another model: {said}"):
+        with pytest.raises(ValueError, match=f"belongs to another model: {said}"):
             task.on_load_checkpoint({"darswin": ours | other})
 
 
@@ -206,7 +206,9 @@ def test_changes_are_named():
                         ("model.name", "b"), ("data.limit", 9)):  # fmt: skip
         group, _, option = name.partition(".")
         changed = now | {group: now.get(group, {}) | {option: value}}
-        with pytest.raises(ValueError, match=f"not with `{name}` {value!r} in place of [^;]*$"):
+        with pytest.raises(
+            ValueError, match=f"cannot change these options: `{name}` {value!r} in place of [^;]*$"
+        ):
             check_changes(before, changed)
     # Of before there were tasks.
     assert check_changes({}, {"task": "classification"}) == []
@@ -230,7 +232,7 @@ def test_what_may_change_is_an_option():
 def test_one_class_is_not_enough(kind):
     task = kind()
     task._trainer = SimpleNamespace(datamodule=SimpleNamespace(classes=["a"]))
-    with pytest.raises(ValueError, match=r"needs two classes, the data has only \['a'\]"):
+    with pytest.raises(ValueError, match=r"needs at least two classes, but the data has \['a'\]"):
         task._head_options()
     task.data.classes += ["b"]
     assert task._head_options()["num_classes"] == 2
@@ -250,8 +252,8 @@ def test_one_class_is_not_enough(kind):
         (lambda: Classification(freeze_stages=1), "`freeze_stages` 1 .*: give `weights`"),
         (lambda: WideAngleData("digits", batch_size=0), "`batch_size` must be at least 1"),
         (lambda: WideAngleData("digits", workers=-1), "`workers` at least 0, got 128 and -1"),
-        (lambda: WideAngleData("digits", camera="7"), "`camera` 7 is one of a calibration: give"),
-        (lambda: WideAngleData("digits", coefficients="pinhole"), "`coefficients` pinhole is one"),
+        (lambda: WideAngleData("digits", camera="7"), "`camera` 7 needs a calibration: give"),
+        (lambda: WideAngleData("digits", coefficients="pinhole"), "`coefficients` pinhole needs"),
         (lambda: WideAngleData("digits", mean=[0.5, 0.5]).mean, "`mean` must have 1 values"),
         (lambda: WideAngleData("digits", channels=3, std=[0.5]).std, "`std` must have 3 values"),
     ],

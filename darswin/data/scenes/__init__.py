@@ -1,4 +1,4 @@
-"""Scenes: pictures with a label or a distance for each pixel, and readers of data sets of them."""
+"""Scenes: pictures with a label or a distance for each pixel, and readers of their data sets."""
 
 from pathlib import Path
 from typing import get_args
@@ -17,7 +17,7 @@ from darswin.data.scenes.woodscape import (
 )
 from darswin.data.splits import check_split
 
-# The first that recognizes a path opens it.
+# The first reader that recognizes a path opens it.
 READERS = (
     (is_plain, open_plain),
     (is_kitti360, open_kitti360),
@@ -44,43 +44,43 @@ def open_scenes(
 ) -> Scenes:
     """The scenes of one split of a data set.
 
-    What `path` may be, told from its folders:
+    The folders in `path` tell its form:
 
-    - the plain form: `images/STEM.png` (also jpg, bmp, webp, tif, ppm), and for each
-      `labels/STEM.png`, ids of 8 bits, or `distance/STEM.png`, 16 bits of metres × 256, or
-      `distance/STEM.npy`, floating-point metres; 0 is not known. STEM may have folders. All that in
-      ROOT, or in `ROOT/train`, `ROOT/val` and `ROOT/test`. The lens is in `lenses/STEM.json`, one
-      for a picture, or in `lens.json` beside `images/` or in ROOT: a calibration, or what
-      `darswin.data.Calibrations` takes as a lenses.json, with paths relative to its folder. Both
-      may also end in yaml, yml, xml, txt, bin or npz. `classes.json` beside `images/` or in ROOT
-      names the classes;
-    - WoodScape, SynWoodScape, KITTI-360, Cityscapes or COCO panoptic, as their authors publish
-      them; the last two need a lens, in `lens.json` in ROOT or as `lens`.
+    - the plain form has `images/STEM.png` (also jpg, bmp, webp, tif, ppm) and, for each picture,
+      `labels/STEM.png` (8-bit ids), `distance/STEM.png` (16 bits, metres × 256; 0 is unknown) or
+      `distance/STEM.npy` (floating-point metres). STEM may contain folders. All of this is in ROOT,
+      or in `ROOT/train`, `ROOT/val` and `ROOT/test`. The lens of a picture is in
+      `lenses/STEM.json`, or the lens of all pictures in `lens.json` beside `images/` or in ROOT.
+      `lens.json` is a calibration, or a lenses.json for `darswin.data.Calibrations` with paths
+      relative to its folder. Calibrations may also end in yaml, yml, xml, txt, bin or npz.
+      `classes.json` beside `images/` or in ROOT names the classes;
+    - WoodScape, SynWoodScape, KITTI-360, Cityscapes and COCO panoptic have the form in which their
+      authors publish them. The last two need a lens, in `lens.json` in ROOT or as `lens`.
 
-    Without a test set, "val" serves as one. What has neither, or no "val", gets `holdout` of
-    "train" for each, chosen by a hash of their names; at least one is left to train on. Pictures
-    that are in no split are named in `LeftOut` warnings.
+    Without a test set, "val" serves as one. Other missing splits get `holdout` of "train", chosen
+    by a hash of the names; at least one scene is left to train on. `LeftOut` warnings name pictures
+    that are in no split.
 
     Args:
-        split: "all" is every scene of a folder without splits.
-        target: what is known of each pixel: "labels" or "distance", along the ray.
-        channels: 3 or 1, of the images that come out. None means 1 if all pictures are grey, else
-            3; the headers of some of the pictures tell.
-        lens, camera, coefficients: as `darswin.data.Calibrations`, in place of the data set's own.
-            Without `lens`, `camera` and `coefficients` are those of its `lens.json`.
-        classes: the names of the classes, in place of the data set's own: a text file with one a
-            line, a JSON list, or {"names": [...], "colors": [[r, g, b], ...]}.
+        split: "all" means all scenes of a folder without splits.
+        target: the target of each pixel: "labels", or "distance" along the ray.
+        channels: the channels of the images, 3 or 1. None means 1 if all pictures are grey,
+            otherwise 3; only the headers of some pictures are checked.
+        lens, camera, coefficients: as for `darswin.data.Calibrations`, in place of the data set's
+            lens. Without `lens`, `camera` and `coefficients` apply to its `lens.json`.
+        classes: the names of the classes, in place of the data set's own: a text file with a name
+            per line, a JSON list, or {"names": [...], "colors": [[r, g, b], ...]}.
         splits: a JSON file `{"train": [stems], "val": …, "test": …}`, or a folder of `train.txt`,
-            `val.txt`, `test.txt` with one stem a line; with or without the pictures' suffix. A
-            split without a list is held out. For WoodScape and SynWoodScape also "heal-swin".
-        label_map: a JSON object that gives ids in the label files their classes, by name or by
-            id, such as {"7": "road", "8": 1, "9": null}. Ids that it leaves out, or maps to null,
+            `val.txt`, `test.txt` with one stem per line. The stems may have the pictures' suffix.
+            A split without a list is held out. WoodScape and SynWoodScape also take "heal-swin".
+        label_map: a JSON object that maps ids in the label files to classes, by name or by id,
+            such as {"7": "road", "8": 1, "9": null}. Ids that it leaves out, or maps to null,
             count as unlabelled. Without `classes`, its names are the classes, in their order.
         holdout: a share, in [0, 0.5).
 
     Raises:
-        FileNotFoundError: a folder, lens, label or list that is missing, or a split without scenes.
-        ValueError: what can be read in two ways or does not fit. Both name it.
+        FileNotFoundError: a missing folder, lens, label or list, or a split without scenes.
+        ValueError: ambiguous or inconsistent files. Both errors name the file.
     """
     check_split(split, get_args(ScenesSplit), holdout)
     if target not in get_args(Target):

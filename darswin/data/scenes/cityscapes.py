@@ -1,8 +1,9 @@
-"""Cityscapes and data sets of its form, with labels.
+"""Cityscapes, and data sets of the same form.
 
-Read: `leftImg8bit/SPLIT/CITY/STEM_leftImg8bit.png` and `gtFine/SPLIT/CITY/STEM_gtFine_labelIds.png`
-of the splits "train" and "val"; the labels of "test" are withheld. The ids become the 19 classes
-that the benchmark scores; all other ids count as unlabelled.
+The reader uses `leftImg8bit/SPLIT/CITY/STEM_leftImg8bit.png` and
+`gtFine/SPLIT/CITY/STEM_gtFine_labelIds.png` of the splits "train" and "val", because the labels of
+"test" are not public. The ids become the 19 classes of the benchmark; all other ids count as
+unlabelled.
 
 Source: Cordts et al., Cityscapes, CVPR 2016, and github.com/mcordts/cityscapesScripts.
 """
@@ -46,7 +47,7 @@ def is_cityscapes(root: Path) -> bool:
 def open_cityscapes(root: Path, options: Options) -> Scenes:
     """A split; options and errors as `darswin.data.open_scenes`."""
     if options.target != "labels":
-        raise ValueError(f"{root} is of Cityscapes' form, which has labels, no distances")
+        raise ValueError(f"{root} looks like Cityscapes, which has labels but no distances")
     folders: dict[Split, Path] = {split: root / "leftImg8bit" / split for split in SPLITS[:2]}
     part, choose = options.choose_part({s: f for s, f in folders.items() if f.is_dir()}, root)
     pairs = pair(
@@ -68,5 +69,5 @@ def open_cityscapes(root: Path, options: Options) -> Scenes:
 
 
 def _ending_in(ending: str, files: dict[str, str]) -> dict[str, str]:
-    """The files whose stems have an ending, by their stems without it."""
+    """The files whose stems have an ending, by their stems without that ending."""
     return {stem.removesuffix(ending): f for stem, f in files.items() if stem.endswith(ending)}

@@ -1,8 +1,8 @@
-"""COCO's panoptic labels, and data sets of their form.
+"""COCO's panoptic labels, and data sets of the same form.
 
-Read: `annotations/panoptic_SPLIT….json`, such as `panoptic_train2017.json`; the PNGs of segments in
-the folder `annotations/panoptic_train2017/` or `panoptic_train2017/`; the pictures in `train2017/`
-or `images/train2017/`. The classes are the categories, in the order of the file.
+The reader uses `annotations/panoptic_SPLIT….json`, for example `panoptic_train2017.json`; the PNGs
+of segments in `annotations/panoptic_train2017/` or `panoptic_train2017/`; and the pictures in
+`train2017/` or `images/train2017/`. The classes are the categories, in the order of the file.
 
 Source: Kirillov et al., Panoptic Segmentation, CVPR 2019, and cocodataset.org/#format-data.
 """
@@ -20,7 +20,7 @@ from darswin.data.scenes.scene import IGNORE, Scenes, as_classes
 from darswin.data.splits import SPLITS, Split, read_json
 from darswin.utils.image import decoded, file_content
 
-# Of each PNG's name: the ids of its segments, sorted, and their classes.
+# The name of each PNG: the ids of its segments, sorted, and their classes.
 Segments = Mapping[str, tuple[np.ndarray, np.ndarray]]
 
 
@@ -31,7 +31,7 @@ def is_coco(root: Path) -> bool:
 def open_coco(root: Path, options: Options) -> Scenes:
     """A split; options and errors as `darswin.data.open_scenes`."""
     if options.target != "labels":
-        raise ValueError(f"{root} is of COCO's panoptic form, which has labels, no distances")
+        raise ValueError(f"{root} looks like COCO panoptic, which has labels but no distances")
     files = _files(root)
     part, choose = options.choose_part(files, root)
     file = files[part]
@@ -47,7 +47,7 @@ def open_coco(root: Path, options: Options) -> Scenes:
         assert class_of is not None
         segments = {a["file_name"]: _segments(a["segments_info"], class_of) for a in annotations}
     except (KeyError, TypeError) as error:
-        raise ValueError(f"{file} is not of COCO's panoptic form: it lacks {error}") from error
+        raise ValueError(f"{file} is not in COCO's panoptic format: it lacks {error}") from error
     name = file.stem.removeprefix("panoptic_")
     targets = stems(_first(root / "annotations" / file.stem, root / file.stem), (".png",))
     pairs = pair(
@@ -68,7 +68,7 @@ def _files(root: Path) -> dict[Split, Path]:
     """The annotations of each split."""
     found = {split: sorted(root.glob(f"annotations/panoptic_{split}*.json")) for split in SPLITS}
     if several := [files for files in found.values() if len(files) > 1]:
-        raise ValueError(f"{several[0][0]} and {several[0][1]} are of one split: keep one of them")
+        raise ValueError(f"{several[0][0]} and {several[0][1]} are for one split: keep one of them")
     return {split: files[0] for split, files in found.items() if files}
 
 
@@ -84,11 +84,11 @@ def _segments(infos: Any, class_of: Mapping[int, int]) -> tuple[np.ndarray, np.n
 
 
 def read_segments(path: Path, segments: Segments) -> np.ndarray:
-    """A PNG whose colours are ids of segments, R + 256 G + 256² B, as classes (H, W) uint8."""
+    """The classes (H, W) uint8 of a PNG whose colours are segments' ids, R + 256 G + 256² B."""
     colors = decoded(file_content(path), path, cv2.IMREAD_COLOR_RGB).astype(np.int32)
     ids = colors @ np.array([1, 256, 65536], np.int32)
     known, classes = segments[path.name]
     places = np.searchsorted(known, ids).clip(max=len(known) - 1)
     if (unknown := ids[known[places] != ids]).size:
-        raise ValueError(f"{path} holds the segment {unknown[0]}, which its annotation lacks")
+        raise ValueError(f"{path} holds the segment {unknown[0]}, but its annotation lacks it")
     return classes[places]

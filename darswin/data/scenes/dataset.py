@@ -13,30 +13,29 @@ from darswin.data.scenes.scene import IGNORE, Scene, Scenes
 from darswin.data.warping import Crop, picture_size, taken_part
 from darswin.lens import Lens
 
-# Of a drawn lens's own limit, where its curve may have no end: how far it is used.
+# The share of a random lens's largest angle that is used, because its curve may have no end there.
 _USED = 0.95
 
 
 class SceneSamples(Samples):
-    """Scenes at a size: `dataset[i]` is (image, lens, target), which move together.
+    """Scenes at a given size: `dataset[i]` is (image, lens, target), which move together.
 
-    The target is labels, (size, size) int64 with `IGNORE`, or distances along the ray, (size, size)
-    float32 metres with 0 where they are not known. Nothing is known beyond a lens's θ_max, nor of
-    what turns in from beyond the picture.
+    The target is (size, size): labels, int64 with `IGNORE`, or distances along the ray, float32
+    metres with 0 for unknown. Pixels beyond θ_max, or from outside the picture, are unknown.
 
     Args:
         scenes: the pictures, their targets and lenses.
-        crop: the least share of a picture's side that a random part of it has, in (0, 1]; the lens
-            follows, its principal point moves off the middle. None takes no parts.
-        lenses: a distribution of lenses. Each picture is shown as one drawn from it would have seen
-            it, of the same θ_max where that lens can have it, whose circle touches the image's
-            sides; `framing` then has no effect.
-        options: size, framing, mean, std, turns, augment, erase, seed and skip_broken, as
-            `Calibrated` takes them.
+        crop: the least share of a picture's side, in (0, 1], for random parts of the pictures. The
+            lens follows, and its principal point moves off the middle. None uses whole pictures.
+        lenses: a distribution of lenses. Each picture is shown as a random lens would have seen
+            it. The lens has the same θ_max, if it can, and its circle touches the sides of the
+            image. `framing` then has no effect.
+        options: size, framing, mean, std, turns, augment, erase, seed and skip_broken, as for
+            `Calibrated`.
 
     Raises:
-        ValueError: a share out of range; from `dataset[i]`, as `Scenes`.
-        BrokenImageError: from `dataset[i]`, naming a file that cannot be read.
+        ValueError: a share out of range; from `dataset[i]`, as for `Scenes`.
+        BrokenImageError: from `dataset[i]`, for a file that cannot be read.
     """
 
     def __init__(
@@ -54,7 +53,7 @@ class SceneSamples(Samples):
 
     @property
     def cameras(self) -> np.ndarray:
-        """(N,): the number of each picture's camera in `scenes.cameras`."""
+        """The number of each picture's camera in `scenes.cameras`, (N,)."""
         return np.array([self.scenes.camera_of(k) for k in range(len(self))], np.int64)
 
     def _seen(self, draw: Draw) -> tuple[np.ndarray, Lens, Tensor]:
@@ -79,7 +78,7 @@ class SceneSamples(Samples):
         return Crop(rng.uniform(self.crop, 1), rng.random(), rng.random())
 
     def _drawn(self, draw: Draw, own: Lens, crop: Crop | None) -> Lens:
-        """The lens that a scene is shown through, of which the image shows a part."""
+        """The random lens for a scene; the image may show a part of its view."""
         lenses = self.lenses
         assert lenses is not None
         size, share = self.size, 1.0 if crop is None else crop.share

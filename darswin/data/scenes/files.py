@@ -1,4 +1,4 @@
-"""Finds the files of scenes: pictures and the files of the same names beside them."""
+"""Finds the files of scenes: pictures, and targets and calibrations with the same stems."""
 
 import os
 from collections.abc import Callable, Mapping, Sequence
@@ -18,9 +18,9 @@ from darswin.data.splits import (
     warn_left_out,
 )
 
-Pairs = dict[str, tuple[str, str]]  # by their stems: (picture, target), relative to a folder
+Pairs = dict[str, tuple[str, str]]  # stem: (picture, target), relative to a folder
 ScenesSplit = Literal["train", "val", "test", "all"]
-# Named splits: stems, sorted → those of each part.
+# Splits with a name: functions of all stems, sorted, that return the stems of each part.
 Named = Mapping[str, Callable[[list[str]], dict[Split, list[str]]]]
 Choose = Callable[[list[str]], list[str]]
 # The suffixes of calibration files.
@@ -59,7 +59,7 @@ class Options:
         """The lenses of pictures with a calibration each, for which the caller gave no lens."""
         for name, value in (("camera", self.camera), ("coefficients", self.coefficients)):
             if value is not None:
-                raise ValueError(f"`{name}` {value} is one of a calibration: give `lens` too")
+                raise ValueError(f"`{name}` {value} needs a calibration: give `lens` too")
         return Calibrations(None, files=files)
 
     def labels(
@@ -80,11 +80,11 @@ class Options:
         """Of a data set with a folder or list for each split, the part that the split is taken
         from, and the function that chooses the split's stems."""
         if self.splits is not None:
-            raise ValueError(f"{self.splits} lists splits, and {root} has a folder for each")
+            raise ValueError(f"{self.splits} lists splits, but {root} has a folder for each")
         split = self.split
         if split == "all":
             raise ValueError(
-                f"{root} has a folder for each split: 'all' is of a folder without splits"
+                f"{root} has a folder for each split, but 'all' needs a folder without splits"
             )
         part, held_out = taken_from(split, parts)
 
@@ -101,8 +101,8 @@ class Options:
         group: Callable[[str], str] | None = None,
         named: Named | None = None,
     ) -> list[str]:
-        """The split's stems of all those found in a folder that has no folders of splits. Stems of
-        one group are held out together; `named` are splits that `splits` may name."""
+        """The stems of the split, from all stems in a folder without folders of splits. The stems
+        of a group are held out together; `named` are splits that `splits` may name."""
         if self.split == "all":
             return found
         given: dict[Split, list[str]] = {"train": found}
@@ -124,7 +124,7 @@ class Options:
 def _listed(path: Path, found: Sequence[str], named: Named | None) -> dict[Split, list[str]]:
     """The stems of each list; pictures are listed with or without their suffixes."""
     if named and not path.exists():
-        raise FileNotFoundError(f"no lists of splits {path}; splits with a name: {sorted(named)}")
+        raise FileNotFoundError(f"no lists of splits in {path}; named splits: {sorted(named)}")
     given: dict[Split, list[str]] = {}
     split_of: dict[str, Split] = {}
     for split, names in read_split_lists(path).items():
@@ -147,7 +147,7 @@ def _stem(name: str) -> str:
 def lenses_beside(
     options: Options, root: Path, pairs: Pairs, calibration_of: Callable[[str], str | Path]
 ) -> Calibrations:
-    """The lenses of pictures with a calibration each, by their stems."""
+    """The lenses of pictures that each have a calibration, found by their stems."""
     files = {root / picture: Path(calibration_of(stem)) for stem, (picture, _) in pairs.items()}
     there = {file: file.is_file() for file in set(files.values())}
     for picture, file in files.items():
@@ -162,14 +162,14 @@ def calibration_in(*folders: Path) -> Path | None:
         files = sorted(folder.glob("lens.*"))
         found = [file for file in files if file.suffix.lower() in CALIBRATIONS]
         if len(found) > 1:
-            raise ValueError(f"{found[0]} and {found[1]} may both be meant: keep one of them")
+            raise ValueError(f"{found[0]} and {found[1]} are both calibrations: keep one of them")
         if found:
             return found[0]
     return None
 
 
 def stems(folder: Path, suffixes: Sequence[str] | frozenset[str]) -> dict[str, str]:
-    """The files below a folder by their paths in it without a suffix, sorted."""
+    """The files below a folder, sorted, by their relative paths without suffix."""
     if not folder.is_dir():
         raise FileNotFoundError(f"no folder {folder}")
     found: dict[str, str] = {}
@@ -178,13 +178,13 @@ def stems(folder: Path, suffixes: Sequence[str] | frozenset[str]) -> dict[str, s
         if suffix.lower() not in suffixes:
             continue
         if stem in found:
-            raise ValueError(f"{found[stem]} and {file} have one stem: keep one of them")
+            raise ValueError(f"{found[stem]} and {file} have the same stem: keep one of them")
         found[stem] = file
     return found
 
 
 def pictures_in(folder: Path) -> dict[str, str]:
-    """The pictures below a folder, as `stems`; FileNotFoundError where there are none."""
+    """The pictures below a folder, as `stems`; FileNotFoundError if there are none."""
     found = stems(folder, SUFFIXES)
     others = list(stems(folder, OTHER_SUFFIXES))
     if not found:
@@ -205,9 +205,8 @@ def pair(
     what: str,
     strict: bool = True,
 ) -> Pairs:
-    """The pictures whose stems `choose` takes, and the targets of the same stems, with paths
-    relative to `root`. A chosen picture without a target is an error, or left out if not `strict`.
-    """
+    """The pictures whose stems `choose` takes, and their targets, with paths relative to `root`. A
+    picture without a target is an error, or is left out if not `strict`."""
     found = list(pictures)
     if not strict:
         found = [stem for stem in pictures if stem in targets]
@@ -221,7 +220,7 @@ def pair(
     if missing := [pictures[stem] for stem in chosen if stem not in targets]:
         raise FileNotFoundError(
             f"no {what} for {len(missing)} of {len(chosen)} pictures, {some(missing)}: add them, "
-            "move the pictures away, or list those to take as splits"
+            "move the pictures away, or list the other pictures in `splits`"
         )
     return {
         stem: (os.path.relpath(pictures[stem], root), os.path.relpath(targets[stem], root))

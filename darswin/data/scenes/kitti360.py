@@ -1,9 +1,9 @@
 """KITTI-360's two fisheye cameras, with distances.
 
-Read: `data_2d_raw/DRIVE/image_02/data_rgb/` and `image_03`, `calibration/image_02.yaml` and
-`image_03.yaml`. The data set itself has no distances for each pixel: they are looked for in
-`distance/DRIVE/image_02/STEM.png` (16 bits, metres × 256) or `STEM.npy` (metres) and `image_03`, as
-projected LiDAR gives them, along the ray. Frames without are left out.
+The reader uses `data_2d_raw/DRIVE/image_02/data_rgb/` with `calibration/image_02.yaml`, and the
+same for `image_03`. The data set has no distances for each pixel. Put distances along the ray, for
+example from projected LiDAR, into `distance/DRIVE/image_02/STEM.png` (16 bits, metres × 256) or
+`STEM.npy` (metres). Frames without distances are left out.
 
 A stem is "DRIVE/image_02/NNNNNNNNNN". Whole drives are held out.
 
@@ -23,7 +23,7 @@ def is_kitti360(root: Path) -> bool:
 def open_kitti360(root: Path, options: Options) -> Scenes:
     """A split; options and errors as `darswin.data.open_scenes`."""
     if options.target != "distance":
-        raise ValueError(f"{root} is of KITTI-360's form, whose fisheye pictures have no labels")
+        raise ValueError(f"{root} looks like KITTI-360, whose fisheye pictures have no labels")
     pictures: dict[str, str] = {}
     for folder in sorted((root / "data_2d_raw").glob("*/image_0[23]/data_rgb")):
         drive, camera = folder.parts[-3:-1]

@@ -1,4 +1,4 @@
-"""The plain form: `images/`, `labels/` or `distance/`, and a lens beside them."""
+"""The plain form of scenes: `images/`, `labels/` or `distance/`, and a lens beside them."""
 
 from functools import partial
 from pathlib import Path
@@ -26,7 +26,7 @@ from darswin.data.scenes.scene import (
 from darswin.data.splits import Split, split_folders
 
 FORM = (
-    "darswin looks for images/STEM.png (or jpg, bmp, webp, tif, ppm) with labels/STEM.png or "
+    "darswin looks for images/STEM.png (also jpg, bmp, webp, tif, ppm) with labels/STEM.png or "
     "distance/STEM.png or .npy, and for lens.json or lenses/STEM.json, in ROOT, or in ROOT/train, "
     "ROOT/val and ROOT/test"
 )
@@ -42,7 +42,7 @@ def open_plain(root: Path, options: Options) -> Scenes:
     if (root / "images").is_dir():
         if folders:
             raise ValueError(
-                f"{root / 'images'} and {next(iter(folders.values()))} may both be meant: {FORM}"
+                f"{root} has both {root / 'images'} and {next(iter(folders.values()))}: {FORM}"
             )
         return _scenes(root, root, options, partial(options.choose, root=root))
     part, choose = options.choose_part(folders, root)
@@ -66,7 +66,7 @@ def _scenes(root: Path, folder: Path, options: Options, choose: Choose) -> Scene
 
 
 def _lenses(root: Path, folder: Path, pairs: Pairs, options: Options) -> Calibrations:
-    """The lenses of the pictures themselves, else the folder's."""
+    """The lenses of the pictures, or else the lens of their folder."""
     own = stems(folder / "lenses", CALIBRATIONS) if (folder / "lenses").is_dir() else {}
     files = {folder / pairs[stem][0]: Path(own[stem]) for stem in pairs if stem in own}
     missing = [stem for stem in pairs if stem not in own]

@@ -18,10 +18,10 @@ from darswin.data.splits import Limited, read_classes, read_json, some
 from darswin.lens import Lens
 from darswin.utils.image import BrokenImageError, decoded, file_content, read_oriented
 
-IGNORE = 255  # the label of a pixel that is of no class
-PER_METRE = 256  # of a distance in a PNG of 16 bits
+IGNORE = 255  # the label of an unlabelled pixel
+PER_METRE = 256  # the scale of distances in a PNG of 16 bits
 Target = Literal["labels", "distance"]
-# Of the files with targets.
+# The suffixes of target files.
 SUFFIXES: dict[Target, tuple[str, ...]] = {"labels": (".png",), "distance": (".png", ".npy")}
 
 
@@ -29,7 +29,7 @@ class Scene(NamedTuple):
     """A picture with a label or a distance for each of its pixels.
 
     Attributes: image: (H, W, C) uint8; target: (H, W), uint8 ids with `IGNORE`, or float32 metres
-    along the ray with 0 where it is not known; lens: one lens, with a center and this image_size.
+    along the ray with 0 for unknown; lens: one lens, with a center and this image_size.
     """
 
     image: np.ndarray
@@ -38,7 +38,7 @@ class Scene(NamedTuple):
 
 
 class Classes(NamedTuple):
-    """Attributes: names: in the order of the ids; colors: (r, g, b) in 0 … 255 of each, or none."""
+    """Attributes: names: in the order of the ids; colors: (r, g, b) in 0 … 255, or empty."""
 
     names: list[str]
     colors: list[list[int]]
@@ -48,24 +48,22 @@ NO_CLASSES = Classes([], [])
 
 
 class Scenes(Limited):
-    """A sequence of scenes, read from their files when they are asked for.
+    """A sequence of scenes; a scene is read from its files when it is indexed.
 
     Args:
-        root: the folder that the files are relative to. files: (picture, target) pairs.
-        lenses: which lens took which picture. target: "labels" or "distance", the second file of a
-            pair.
-        channels: 3 or 1, of the images.
-        classes: names of the labels' ids, and their colours.
-        views: of each picture, what `cameras` calls the camera that took it; None takes them from
-            `lenses`.
-        read: reads a target file; None takes `read_labels` or `read_distance`.
-        trim: (rows, height): so many rows are cut at the top and at the bottom of a picture that is
-            so high, and as large a part of others; their lenses follow.
+        root: the folder of the files. files: (picture, target) pairs, relative to `root`.
+        lenses: the lenses of the pictures. target: "labels" or "distance", the kind of the targets.
+        channels: the channels of the images, 3 or 1.
+        classes: the names and colours of the ids in labels.
+        views: the name of each picture's camera in `cameras`; None takes the names from `lenses`.
+        read: the function that reads a target file; None means `read_labels` or `read_distance`.
+        trim: (rows, height): the number of rows that are cut at the top and at the bottom of a
+            picture of this height, and the same share of other pictures. The lenses follow.
 
     Attributes:
-        classes, colors: of the labels. cameras: names of what took the pictures.
-        unknown: (N,) int64, pixels of each target that say nothing: labels of `IGNORE`, distances
-            that are not finite or not above 0; -1 until it was read, in any process.
+        classes, colors: the names and colours of the classes. cameras: the names of the cameras.
+        unknown: (N,) int64, the number of pixels in each target without a label or a distance; -1
+            if no process has read the target yet.
     """
 
     PER_PICTURE = ("_pictures", "_targets", "_camera", "unknown")
@@ -89,7 +87,7 @@ class Scenes(Limited):
             labels = target == "labels"
             read = partial(read_labels, classes=len(classes.names)) if labels else read_distance
         self.read, self.trim = read, trim
-        # As arrays, so that worker processes share them instead of copying every object.
+        # Worker processes share arrays, but would copy a million strings.
         self._pictures = np.array([os.fsencode(picture) for picture, _ in files], np.bytes_)
         self._targets = np.array([os.fsencode(file) for _, file in files], np.bytes_)
         if views is None:
@@ -105,19 +103,19 @@ class Scenes(Limited):
         return len(self._pictures)
 
     def __getitem__(self, index: int) -> Scene:
-        """The scene; BrokenImageError or ValueError name a file that is broken or does not fit."""
+        """The scene; BrokenImageError or ValueError for files that are broken or do not fit."""
         image, orientation = read_oriented(self.file(index), self.channels)
         if orientation != 1:
             raise ValueError(
-                f"{self.file(index)} is stored turned, as its EXIF orientation {orientation} says, "
-                "and its labels or distances may be of either picture: store it upright"
+                f"{self.file(index)} has the EXIF orientation {orientation}, so its labels or "
+                "distances may fit the stored or the upright picture: store it upright"
             )
         target = self.read(self.target_file(index))
         size = image.shape[0], image.shape[1]
         if target.shape != size:
             shapes = [f"{height}×{width}" for height, width in (target.shape, size)]
             raise ValueError(
-                f"{self.target_file(index)} has {shapes[0]} px, and its picture "
+                f"{self.target_file(index)} has {shapes[0]} px, but its picture "
                 f"{self.file(index)} has {shapes[1]}"
             )
         lens = self.lenses.lens_of(self.file(index), size)
@@ -133,11 +131,11 @@ class Scenes(Limited):
         return part
 
     def file(self, index: int) -> Path:
-        """The picture's file."""
+        """The file of the picture."""
         return self.root / os.fsdecode(self._pictures[index])
 
     def target_file(self, index: int) -> Path:
-        """The file of its labels or distances."""
+        """The file of the labels or distances."""
         return self.root / os.fsdecode(self._targets[index])
 
     def form(self) -> Form:
@@ -145,16 +143,16 @@ class Scenes(Limited):
         return form_of(self.file, len(self))
 
     def camera_of(self, index: int) -> int:
-        """The camera that took a picture, as a number in `cameras`."""
+        """The number in `cameras` of the camera that took a picture."""
         return int(self._camera[index])
 
     def lens_alone(self, index: int) -> Lens:
-        """The lens of a picture that cannot be read: in one of the size that it was made for."""
+        """The lens of a picture that cannot be read, at the size of the calibration."""
         lens = self.lenses.lens_alone(self.file(index))
         return self._trimmed(lens)
 
     def _rows(self, height: int) -> int:
-        """The number of rows that are cut at the top of a picture."""
+        """The number of rows to cut at the top of a picture."""
         rows, of = self.trim
         return -(-rows * height // of)
 
@@ -175,7 +173,7 @@ def nothing_of(target: np.ndarray) -> int:
 
 
 def read_labels(path: Path, classes: int, class_of: Mapping[int, int] | None = None) -> np.ndarray:
-    """A label PNG, grey or with a palette, as (H, W) uint8: ids of so many classes, or `IGNORE`.
+    """The ids of classes, or `IGNORE`, in a PNG that is grey or has a palette, (H, W) uint8.
 
     `class_of` maps the ids in the file to classes; ids that it leaves out become `IGNORE`.
     """
@@ -184,7 +182,7 @@ def read_labels(path: Path, classes: int, class_of: Mapping[int, int] | None = N
             mode = file.mode
             if mode in ("L", "P", "1"):
                 labels = np.array(file, np.uint8)
-    except Exception as error:  # a file that is no PNG fails in many ways
+    except Exception as error:  # Pillow raises many exceptions for broken files
         raise BrokenImageError(f"cannot read {path}: {_reason(error)}") from error
     if mode not in ("L", "P", "1"):
         raise ValueError(
@@ -200,26 +198,26 @@ def read_labels(path: Path, classes: int, class_of: Mapping[int, int] | None = N
     ids = np.flatnonzero(np.bincount(labels.ravel(), minlength=256)).tolist()
     if wrong := [id_ for id_ in ids if classes <= id_ != IGNORE]:
         raise ValueError(
-            f"{path} holds the ids {some(wrong)}, and there are {classes} classes, of the ids 0 to "
-            f"{classes - 1}; {IGNORE} is no class, and `label_map` maps other ids to classes"
+            f"{path} holds the ids {some(wrong)}, but the {classes} classes have the ids 0 to "
+            f"{classes - 1}; {IGNORE} means unlabelled, and `label_map` maps other ids to classes"
         )
     return labels
 
 
 def read_distance(path: Path, far: float | None = None) -> np.ndarray:
-    """Distances (H, W) float32, metres, of a PNG of 16 bits or of a NumPy file; 0 where they are
-    not finite, not above 0, or at least `far`."""
+    """The distances (H, W) float32, metres, in a PNG of 16 bits or a NumPy file; 0 for values that
+    are not finite, not above 0, or at least `far`."""
     if path.suffix.lower() == ".npy":
         try:
             metres = np.load(path, allow_pickle=False)
-        except Exception as error:  # as above
+        except Exception as error:  # NumPy raises many exceptions for broken files
             raise BrokenImageError(f"cannot read {path}: {_reason(error)}") from error
         if not isinstance(metres, np.ndarray) or metres.ndim != 2 or metres.dtype.kind != "f":
             form = "an archive"
             if isinstance(metres, np.ndarray):
                 form = f"{metres.dtype} {metres.shape}"
             raise ValueError(f"{path} must hold floating-point metres (H, W), but holds {form}")
-        with np.errstate(over="ignore"):  # infinite is not known
+        with np.errstate(over="ignore"):  # infinite means unknown
             metres = metres.astype(np.float32)
     else:
         image = decoded(file_content(path), path, cv2.IMREAD_UNCHANGED)
@@ -245,7 +243,7 @@ def _reason(error: Exception) -> str:
 
 
 def read_palette(path: str | Path) -> Classes:
-    """Names of classes as `read_classes`, or a JSON object with "names" and perhaps "colors"."""
+    """The classes in a list, as for `read_classes`, or in a JSON object of "names" and "colors"."""
     content = read_json(path) if Path(path).suffix == ".json" else None
     if isinstance(content, Mapping):
         return as_classes(content.get("names"), content.get("colors", []), path)
@@ -255,14 +253,14 @@ def read_palette(path: str | Path) -> Classes:
 def read_label_map(
     path: str | Path, own: Callable[[], Classes], is_given: bool
 ) -> tuple[dict[int, int], Classes]:
-    """The class of each id in the label files, from a JSON object, and the classes.
+    """The class of each id in the label files, from a JSON object, and all classes.
 
-    The values are names, or ids of classes, or null for ids that are of no class. The classes are
-    `own()`; or, if these are not given by the caller, the names in the order of the file.
+    The values are names or ids of classes, or null for ids that mean unlabelled. The classes are
+    `own()`, or the names in the order of the file unless `is_given`.
     """
     content = read_json(path)
     form = (
-        f'{path} must be a JSON object of ids and their classes, such as {{"7": "road", "8": 1, '
+        f'{path} must be a JSON object that maps ids to classes, such as {{"7": "road", "8": 1, '
         '"9": null}'
     )
     if not isinstance(content, Mapping) or not content:
@@ -280,14 +278,14 @@ def read_label_map(
         if type(class_) is not int or not 0 <= class_ < len(classes.names):
             raise ValueError(
                 f"{path} maps the id {key} to {value!r}, but the classes are "
-                f"{some(classes.names)}, of the ids 0 to {len(classes.names) - 1}"
+                f"{some(classes.names)} with the ids 0 to {len(classes.names) - 1}"
             )
         found[int(key)] = class_
     return found, classes
 
 
 def as_classes(names: Any, colors: Any, path: str | Path) -> Classes:
-    """The classes of a file, checked."""
+    """The checked classes of a file."""
     is_list = isinstance(names, list) and names and all(isinstance(name, str) for name in names)
     if not is_list:
         raise ValueError(f"{path} must name the classes as a list of words, got {names!r}")
@@ -296,8 +294,8 @@ def as_classes(names: Any, colors: Any, path: str | Path) -> Classes:
     is_list = isinstance(colors, list) and len(colors) in (0, len(names))
     if not is_list or not all(_is_color(color) for color in colors):
         raise ValueError(
-            f"{path} must give each of {len(names)} classes a color [r, g, b] in 0 … 255, or none "
-            f"a color, got {colors!r}"
+            f"{path} must give all {len(names)} classes a color [r, g, b] in 0 … 255, or none, got "
+            f"{colors!r}"
         )
     return Classes(list(names), [list(color) for color in colors])
 

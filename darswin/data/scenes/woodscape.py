@@ -1,15 +1,14 @@
 """WoodScape and SynWoodScape, as their authors publish them: four cameras of a car.
 
-Of WoodScape, labels of ten classes are read: `rgb_images/`,
+WoodScape has labels of ten classes. The reader uses `rgb_images/`,
 `semantic_annotations/[semantic_annotations/]gtLabels/`, the classes of `seg_annotation_info.json`
-beside it, and `calibration/[calibration/]` or `calibration_data/calibration/`. All else is left
-alone: boxes, polygons, motion, soiling, previous images, and the test set, whose labels are
-withheld.
+beside it, and `calibration/[calibration/]` or `calibration_data/calibration/`. It does not read
+boxes, polygons, motion, soiling, previous images and the test set, whose labels are not public.
 
-Of SynWoodScape, the same four cameras in a simulator, labels of 25 classes and distances are read:
-`rgb_images/[rgb_images/]`, `semantic_annotations/[semantic_annotations/]gtLabels/`,
-`depth_maps/[depth_maps/]raw_data/` and `calibration/[calibration/]`. The depth maps are taken for
-metres along the ray; 1000 is the sky, whose distance is not known.
+SynWoodScape has the same four cameras in a simulator, with labels of 25 classes and distances. The
+reader uses `rgb_images/[rgb_images/]`, `semantic_annotations/[semantic_annotations/]gtLabels/`,
+`depth_maps/[depth_maps/]raw_data/` and `calibration/[calibration/]`. It treats the depth maps as
+metres along the ray; 1000 m marks the sky, whose distance is unknown.
 
 Source: Yogamani et al., WoodScape, ICCV 2019, and github.com/valeoai/WoodScape; Sekkat et al.,
 SynWoodScape, RA-L 2022.
@@ -42,7 +41,7 @@ SYN_NAMES = [
     "dynamic", "ego",
 ]  # fmt: skip
 INFO = "seg_annotation_info.json"
-# Rows at the top and at the bottom that are green, of a picture so high.
+# The number of green rows at the top and at the bottom, and the height of such a picture.
 GREEN = (3, 966)
 SKY = 1000.0  # m
 
@@ -63,7 +62,7 @@ def is_synwoodscape(root: Path) -> bool:
 def open_woodscape(root: Path, options: Options) -> Scenes:
     """A split; options and errors as `darswin.data.open_scenes`."""
     if options.target != "labels":
-        raise ValueError(f"{root} is of WoodScape's form, which has labels, no distances")
+        raise ValueError(f"{root} looks like WoodScape, which has labels but no distances")
     return _scenes(root, options, NAMES, trim=GREEN)
 
 
@@ -105,12 +104,12 @@ def _scenes(
 
 
 def heal_swin(stems: list[str]) -> dict[Split, list[str]]:
-    """HEAL-SWIN's split, of all stems: four fifths to train on, the others for "val".
+    """The split of HEAL-SWIN: four fifths of the stems for training, the others for "val".
 
-    Source: Carlsson et al., HEAL-SWIN, 2024: its loader takes the sorted stems in the order of a
-    permutation by NumPy's RandomState(42), the first ⌊0.8 N⌋ + 1 for training.
+    Source: Carlsson et al., HEAL-SWIN, 2024. Its loader permutes the sorted stems by NumPy's
+    RandomState(42) and uses the first ⌊0.8 N⌋ + 1 for training.
     """
-    # The generator of the source, whose permutations NumPy keeps.
+    # NumPy keeps the permutations of this generator.
     order = np.random.RandomState(42).permutation(len(stems))
     count = int(0.8 * len(stems)) + 1
     shuffled = [stems[k] for k in order]
@@ -118,18 +117,18 @@ def heal_swin(stems: list[str]) -> dict[Split, list[str]]:
 
 
 def _view_of(stem: str) -> str:
-    """The camera of NNNNN_VIEW: FV, RV, MVL or MVR."""
+    """The camera in NNNNN_VIEW: FV, RV, MVL or MVR."""
     return stem.rsplit("_", 1)[-1]
 
 
 def _unnested(folder: Path) -> Path:
-    """A folder; or the one of its name in it, as some archives unpack."""
+    """The folder, or a folder of the same name in it, because some archives unpack so."""
     inner = folder / folder.name
     return inner if inner.is_dir() else folder
 
 
 def _classes(root: Path, published: list[str]) -> Classes:
-    """The classes of the data set's own file, or as published."""
+    """The classes in the data set's file, or as published."""
     folder = root / "semantic_annotations"
     for place in (folder, folder / folder.name, root):
         if (place / INFO).is_file():
@@ -154,7 +153,7 @@ def _info(file: Path) -> Classes:
 
 
 def _lenses(root: Path, pairs: Pairs, options: Options) -> Calibrations:
-    """The calibrations of the pictures, by their names, or else by their cameras'."""
+    """The calibrations of the pictures, or else those of their cameras."""
     places = _unnested(root / "calibration"), root / "calibration_data" / "calibration"
     folder = next((place for place in places if place.is_dir()), None)
     if folder is None:

@@ -136,7 +136,7 @@ def test_wrong_lenses_and_turned_pictures_are_named(tmp_path):
     exif = Image.Exif()
     exif[ExifTags.Base.Orientation] = 6
     Image.open(picture).save(picture, exif=exif)
-    with pytest.raises(ValueError, match=r"001\.png is stored turned, as its EXIF orientation 6"):
+    with pytest.raises(ValueError, match=r"001\.png has the EXIF orientation 6"):
         scenes[1]
     lens = json.loads((tmp_path / "lens.json").read_text())
     (tmp_path / "lens.json").write_text(json.dumps(lens | {"image_size": [50, 50]}))
@@ -153,12 +153,12 @@ def test_wrong_lenses_and_turned_pictures_are_named(tmp_path):
     ("classes", "message"),
     [
         (None, 'no classes.json in .*, for example {"names":'),
-        ([], "must name the classes"),
+        ([], "must list the classes"),
         ({"names": ["a", "a"]}, "must name each class once"),
         ({"names": ["a", 3]}, "must name the classes as a list of words"),
-        ({"names": ["a", "b"], "colors": [[0, 0, 0]]}, "must give each of 2 classes a color"),
-        ({"names": ["a"], "colors": [[0, 0, 256]]}, "must give each of 1 classes a color"),
-        ({"names": ["a"], "colors": [[0, 0]]}, "must give each of 1 classes a color"),
+        ({"names": ["a", "b"], "colors": [[0, 0, 0]]}, "must give all 2 classes a color"),
+        ({"names": ["a"], "colors": [[0, 0, 256]]}, "must give all 1 classes a color"),
+        ({"names": ["a"], "colors": [[0, 0]]}, "must give all 1 classes a color"),
         ({"names": [str(k) for k in range(256)]}, "must name each class once, and at most 255"),
     ],
 )
