@@ -1,4 +1,4 @@
-"""The cells of the study: which model is trained on which lenses."""
+"""The cells of the study: a model and the lenses on which it is trained."""
 
 from dataclasses import dataclass, field
 
@@ -6,14 +6,14 @@ LEVELS = ("very low", "low", "medium", "high")
 SWEEP = [f"{k / 20:g}" for k in range(21)]  # ξ = 0, 0.05, …, 1
 POLYNOMIAL = "polynomial"
 
-# The released code spaces rings and samples by tan θ, and so the paper's numbers must; see
+# The released code spaces rings and samples by tan θ, so the paper's numbers need it too; see
 # docs/explanation/spacings.md.
 DARSWIN = dict(spacing="tan", samples=[10, 10])
 
 
 @dataclass(frozen=True)
 class Cell:
-    """A model, its options, and the lenses and the seed it is trained with."""
+    """A model, its options, and the lenses and the seed of its training."""
 
     label: str
     family: str
@@ -35,7 +35,7 @@ MODELS = {
     "Swin": ("swin", {}),
 }
 
-# Table 3 of the paper, and the spacings, in which it and its released code differ.
+# Table 3 of the paper, and the spacings, because the paper and its released code differ there.
 ABLATIONS = {
     "polar position bias": ("darswin_a", dict(position_bias="polar")),
     "angular position bias": ("darswin_a", dict(position_bias="angular")),
@@ -51,7 +51,7 @@ ABLATIONS = {
 
 
 def headline(seeds: int) -> list[Cell]:
-    """Each model on each level, seed by seed, so that the first seed is complete first."""
+    """Each model on each level; all cells of the first seed come first."""
     return [
         Cell(label, family, options, level, seed)
         for seed in range(seeds)
@@ -61,7 +61,7 @@ def headline(seeds: int) -> list[Cell]:
 
 
 def ablations() -> list[Cell]:
-    """DarSwin-A trained on "low", with one thing changed."""
+    """DarSwin-A trained on "low", with one change each."""
     return [
         Cell(label, family, DARSWIN | changes) for label, (family, changes) in ABLATIONS.items()
     ]

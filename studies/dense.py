@@ -1,14 +1,15 @@
-"""Runs the dense study: a label or a distance for each pixel, through lenses not trained on.
+"""Runs the dense study: labels or distances for each pixel, through lenses unseen in training.
 
-Each cell is `darswin fit` and `darswin test` on one core; its folder under `--out` keeps what it
-found, so that a study that was stopped goes on. The pictures are rendered first, once: see
-`dense_data.py`. `dense_tables.py` makes tables and pictures. Run it with `make study-dense`, which
-needs `apt-get install freedoom`.
+Each cell runs `darswin fit` and `darswin test` on one core. Its folder under `--out` keeps its
+results, so a study that was stopped can go on. The pictures are rendered once before: see
+`dense_data.py`. `dense_tables.py` makes the tables and figures. Run it with `make study-dense`,
+which needs `apt-get install freedoom`.
 
-What 3 hours on 2 cores allow: 69 cells (7 models × 3 seeds × [labels from two bands, distances from
-one], and 6 controls) of 6,000 pictures seen at 20 to 30 ms, 24 test sets of 75 pictures at 15 ms
-and 8 s of starting are 69 × (190 + 27 + 8) s, the pictures 600 s of 85 ms each: 16,100 s on one
-core, 2.3 hours on two. Distances from "wide" would be 21 cells more.
+The study fits into 3 hours on 2 cores. It has 69 cells: 7 models × 3 seeds × (labels from two bands
+and distances from one), and 6 controls. A cell trains on 6,000 pictures at 20 to 30 ms, tests on 24
+sets of 75 pictures at 15 ms, and needs 8 s to start. The cells take 69 × (190 + 27 + 8) s and the
+pictures 600 s, together 16,100 s on one core or 2.3 hours on two. Distances from "wide" would be 21
+more cells.
 """
 
 import argparse
@@ -30,7 +31,7 @@ from darswin.utils.files import replace_file
 
 HERE = Path(__file__).parent
 CONFIG = HERE / "dense.yaml"
-# What is kept of a test's row, in all and for each zone.
+# The scores that are kept, overall and for each zone.
 SCORES = {
     "segmentation": ("miou", "accuracy", "miou_sr"),
     "distance": ("delta1", "abs_rel", "rmse", "delta1_sr", "abs_rel_sr"),
@@ -38,14 +39,16 @@ SCORES = {
 
 
 def run_cell(cell: Cell, out: Path, size: str, options: list[str]) -> dict:
-    """Trains and tests one cell, or reads what an earlier run found."""
+    """Trains and tests one cell, or reads the results of an earlier run."""
     folder, data = out / size / cell.key, out / "data"
     found = folder / "cell.json"
     given = dict(config=CONFIG.read_text(), options=list(cell.options), arguments=options)
     if found.exists():
         result = json.loads(found.read_text())
         if result["given"] != given:
-            raise ValueError(f"{found} was made otherwise: remove it, or give the same options")
+            raise ValueError(
+                f"{found} was made with other options: remove it, or use these options"
+            )
         return result
     run = ["--task", cell.task, "--run", str(folder)]
     model = ["--model.name", f"{cell.family}_{size}", "--seed_everything", str(cell.seed)]
@@ -76,7 +79,7 @@ def run_cell(cell: Cell, out: Path, size: str, options: list[str]) -> dict:
 
 
 def summary(row: dict, task: str) -> dict:
-    """What is kept of a test set's row."""
+    """The results of a test set that are kept."""
 
     def scores(of: dict) -> dict:
         return {name: None if of[name] is None else round(of[name], 5) for name in SCORES[task]}
@@ -93,34 +96,38 @@ def summary(row: dict, task: str) -> dict:
 
 
 def known_cells(file: Path) -> dict[Cell, dict]:
-    """The cells of a record, which must be of the same configuration and cameras."""
+    """The cells of a record; ValueError for another configuration or other cameras."""
     record = json.loads(file.read_text())
     if record["config"] != CONFIG.read_text():
-        raise ValueError(f"{file} is of another configuration than {CONFIG}")
+        raise ValueError(f"{file} was made with another configuration than {CONFIG}")
     if record["cameras"] != (cameras := list(dense_data.CAMERAS)):
-        raise ValueError(f"{file} must be of the cameras {cameras}, got {record['cameras']}")
+        raise ValueError(f"{file} must have the cameras {cameras}, got {record['cameras']}")
     names = [field.name for field in fields(Cell)]
     return {Cell(**{name: cell[name] for name in names}): cell for cell in record["cells"]}
 
 
 def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--cell", help="only the cells whose key has this in it")
+    parser.add_argument("--cell", help="runs only cells whose key contains this text")
     parser.add_argument("--seeds", type=int, default=3)
-    parser.add_argument("--size", default="nano", help="of the models")
-    parser.add_argument("--pixels", type=int, default=dense_data.SIZE, help="of the pictures")
+    parser.add_argument("--size", default="nano", help="the size of the models")
+    parser.add_argument(
+        "--pixels", type=int, default=dense_data.SIZE, help="the size of the pictures, px"
+    )
     parser.add_argument(
         "--pictures", type=int, nargs=3, default=dense_data.PICTURES,
-        metavar=("TRAIN", "VAL", "TEST"), help="of each lens",
+        metavar=("TRAIN", "VAL", "TEST"), help="the number of pictures for each lens",
     )  # fmt: skip
     parser.add_argument("--processes", type=int, default=os.cpu_count())
     parser.add_argument(
-        "--known", type=Path, help="a record, dense.json, whose cells are not run again"
+        "--known", type=Path, help="a record (dense.json); its cells are not run again"
     )
-    parser.add_argument("--collect", action="store_true", help="runs nothing: what is there")
+    parser.add_argument(
+        "--collect", action="store_true", help="runs nothing and collects existing results"
+    )
     parser.add_argument("--out", type=Path, default=Path("out/dense"))
     parser.add_argument("--results", type=Path, default=HERE / "results")
-    args, options = parser.parse_known_args(arguments)  # the others are options of `darswin fit`
+    args, options = parser.parse_known_args(arguments)  # other options are for `darswin fit`
     cells = [cell for cell in all_cells(args.seeds) if (args.cell or "") in cell.key]
     start = time.perf_counter()
     dense_data.make(args.out / "data", args.processes, args.pixels, tuple(args.pictures))

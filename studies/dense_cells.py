@@ -1,10 +1,10 @@
-"""The cells of the dense study: which model is trained on which lenses, for which task."""
+"""The cells of the dense study: a model, its task and the lenses on which it is trained."""
 
 from dataclasses import dataclass
 
 from dense_data import SHUFFLED
 
-# Every picture as a lens of any ξ would have seen it.
+# Training shows every picture as a lens of any ξ would have seen it.
 THROUGH_ANY = ("--data.lens_augmentation", "0..1")
 
 MODELS: dict[str, tuple[str, tuple[str, ...]]] = {
@@ -16,7 +16,7 @@ MODELS: dict[str, tuple[str, tuple[str, ...]]] = {
     "LensAdapter, lens augmentation": ("swin_unet_adapted", THROUGH_ANY),
     "Swin-Unet, lens augmentation": ("swin_unet", THROUGH_ANY),
 }
-# What is trained, and on which of the bands. Distance is left out for "wide": see dense.py.
+# Each task and the band of its training. Distance is left out for "wide": see dense.py.
 STUDIED = (("segmentation", "wide"), ("segmentation", "low"), ("distance", "low"))
 TASKS = ("segmentation", "distance")
 CONTROLLED = ("DarSwin-Unet A", "LensAdapter(Swin-Unet)")
@@ -24,10 +24,9 @@ CONTROLLED = ("DarSwin-Unet A", "LensAdapter(Swin-Unet)")
 
 @dataclass(frozen=True)
 class Cell:
-    """A model, the lenses that it is trained on, its task and its seed.
+    """A model, the lenses of its training, its task and its seed.
 
-    Attributes: shuffled: a control, in which each training picture is said to have been taken with
-    another one's lens.
+    Attributes: shuffled: a control in which each training picture has the lens of another picture.
     """
 
     label: str
@@ -38,17 +37,17 @@ class Cell:
 
     @property
     def family(self) -> str:
-        """The model's name without its size."""
+        """The name of the model without its size."""
         return MODELS[self.label][0]
 
     @property
     def options(self) -> tuple[str, ...]:
-        """Of `darswin fit`."""
+        """The options of `darswin fit`."""
         return MODELS[self.label][1]
 
     @property
     def trained_on(self) -> str:
-        """The folder of its training pictures."""
+        """The folder of the training pictures."""
         return f"{SHUFFLED}-{self.band}" if self.shuffled else self.band
 
     @property
@@ -59,7 +58,7 @@ class Cell:
 
 
 def all_cells(seeds: int) -> list[Cell]:
-    """Seed by seed, so that what is stopped has whole tables; the controls after the first."""
+    """The cells, seed by seed, so that a stopped study has complete tables."""
     cells = []
     for seed in range(seeds):
         cells += [Cell(label, band, task, seed) for task, band in STUDIED for label in MODELS]

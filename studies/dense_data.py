@@ -1,6 +1,6 @@
-"""The pictures of the dense study: worlds through lenses to train on and to test through.
+"""The pictures of the dense study: worlds through the lenses of training and tests.
 
-All test sets show the same poses, in maps that no training picture is of.
+All test sets show the same poses, in maps that the training pictures do not show.
 """
 
 import json
@@ -14,16 +14,16 @@ from worlds.lenses import draw_lens
 
 from darswin.lens import save
 
-FOV = math.radians(165)  # full, of the lenses given by ξ
+FOV = math.radians(165)  # the full field of view of lenses given by ξ
 SIZE = 128  # px
-PICTURES = 2000, 16, 75  # to train on, of validation, and of each test set: 5 a map
+PICTURES = 2000, 16, 75  # for training, for validation, and in each test set (5 per map)
 
-# What is trained on: perspective lenses of 60° to 90°, and one band of ξ.
+# The lenses of training: perspective lenses of 60° to 90°, and one band of ξ.
 BANDS = {"wide": "wide", "low": "0.2..0.35"}
 SWEEP = [f"{k / 10:g}" for k in range(11)]  # ξ = 0, 0.1, …, 1
 
 FILES = Path(__file__).parent.parent / "tests" / "lens" / "files"
-# TUM-VI's is a real camera. The numbers of the others are our own: see the README of the folder.
+# TUM-VI is a real camera. We made up the numbers of the others: see the README of the folder.
 CAMERAS = {
     "front": "woodscape.json",
     "second front": "synwoodscape.json",
@@ -33,10 +33,10 @@ CAMERAS = {
     "OCamCalib": "ocamcalib.txt",
 }
 
-# The controls: what pictures are said to have been taken with is not true.
-TOLD = "0.275"  # the middle of "low"
-WRONG = ("0", "0.5", "1")  # the ξ of pictures that are said to be of TOLD
-SHUFFLED = "shuffled"  # each is said to be of another picture's lens
+# The controls: pictures with a lens that did not take them.
+TOLD = "0.275"  # the ξ that models are given, in the middle of "low"
+WRONG = ("0", "0.5", "1")  # the true ξ of pictures whose lens is given as TOLD
+SHUFFLED = "shuffled"  # each picture has the lens of another picture
 
 
 def xi_set(xi: str) -> str:
@@ -58,7 +58,7 @@ def test_sets() -> list[str]:
 
 
 def make(root: Path, processes: int, size: int, counts: tuple[int, int, int]) -> None:
-    """Renders what is missing of it into `root/train` and `root/test`, and the controls."""
+    """Renders missing data sets into `root/train` and `root/test`, and makes the controls."""
     train, val, test = counts
     to_train = [Target(str(root / "train" / b), lenses, FOV) for b, lenses in BANDS.items()]
     lenses = {xi_set(xi): xi for xi in SWEEP}
@@ -81,7 +81,7 @@ def make(root: Path, processes: int, size: int, counts: tuple[int, int, int]) ->
 
 
 def shuffle(source: Path, copy: Path, split: str) -> None:
-    """The same pictures, each with the lens of another one."""
+    """The same pictures, each with the lens of another picture."""
     folder = same_pictures(source, copy, split)
     (folder / "lenses").mkdir(exist_ok=True)
     files = sorted((source / split / "lenses").iterdir())
@@ -91,7 +91,7 @@ def shuffle(source: Path, copy: Path, split: str) -> None:
 
 
 def same_pictures(source: Path, copy: Path, split: str) -> Path:
-    """`copy/split` with the pictures, labels and distances of `source/split`, as links."""
+    """The folder `copy/split` with links to the pictures and targets in `source/split`."""
     folder = copy / split
     folder.mkdir(parents=True, exist_ok=True)
     for place, target in (

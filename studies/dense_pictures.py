@@ -1,4 +1,4 @@
-"""Pictures of the dense study: what models say of a few test pictures, beside the truth."""
+"""Figures of the dense study: predictions for a few test pictures, beside the truth."""
 
 from pathlib import Path
 
@@ -15,11 +15,11 @@ from darswin.viz.plot import save_figure
 # Test sets and the place of a picture in them; all sets have the same scenes in the same order.
 SHOWN = {"xi-0.3": 0, "xi-0": 1, "xi-1": 2, "front": 3, "left": 4}
 TARGETS = {"segmentation": "labels", "distance": "distance"}
-NEAR, FAR = 0.5, 40.0  # m, of the colours
+NEAR, FAR = 0.5, 40.0  # m, the range of the colours
 
 
 def predict(run: Path, data: Path, task: str) -> None:
-    """Writes what a run's last model says of `SHOWN` into its `shown.npz`."""
+    """Writes the predictions of a run's last model for `SHOWN` into its `shown.npz`."""
     model, card = load_model(model_of_run(run))
     model.eval()
     said = {}
@@ -35,7 +35,7 @@ def predict(run: Path, data: Path, task: str) -> None:
 
 
 def draw(runs: dict[str, Path], data: Path, task: str, path: Path) -> None:
-    """A figure: a row for each of `SHOWN`; the image, the truth and what each run says of it."""
+    """A figure with a row for each of `SHOWN`: the image, the truth and each run's prediction."""
     said = {label: np.load(run / "shown.npz") for label, run in runs.items()}
     figure = Figure(figsize=(1.6 * (2 + len(said)), 1.7 * len(SHOWN)), layout="constrained")
     panels = figure.subplots(len(SHOWN), 2 + len(said), squeeze=False)

@@ -1,4 +1,4 @@
-"""The tables and the pictures of the dense study, from what its cells found."""
+"""The tables and figures of the dense study, made from the results of its cells."""
 
 import statistics
 from collections import defaultdict
@@ -34,10 +34,10 @@ def collect(cells: list[dict], trivial: dict, config: str, size: str) -> dict:
 
 
 def publish(record: dict, out: Path, folder: Path) -> None:
-    """Writes a record, with the machine and versions, and draws its pictures.
+    """Writes a record, with the machine and versions, and draws its figures.
 
     Args:
-        out: the folder of the cells, whose predictions are drawn where they are there.
+        out: the folder of the cells; existing predictions in it are drawn.
     """
     write(folder / "dense.json", machine=machine(), **record)
     draw_curves(record["cells"], record["trivial"], folder / "dense.png")
@@ -50,7 +50,7 @@ def publish(record: dict, out: Path, folder: Path) -> None:
 
 
 def runs_of(cells: list[dict], task: str, shuffled: bool = False) -> dict[tuple, list[dict]]:
-    """What the test sets of every seed found, by label and band."""
+    """The results of the test sets of every seed, by label and band."""
     found = defaultdict(list)
     for cell in cells:
         if cell["task"] == task and cell["shuffled"] == shuffled:
@@ -69,8 +69,9 @@ def mean_of(sets: dict, names: Sequence[str], score: str) -> float:
 
 
 def draw_curves(cells: list[dict], trivial: dict, path: Path) -> None:
-    """mIoU and δ1 against ξ: a panel for each task and training band, which is shaded; lines are
-    means of the seeds, bands their span, dots what is said of a direction without looking."""
+    """Draws mIoU and δ1 against ξ, in a panel for each task and training band. The training band is
+    shaded. Lines are means over the seeds, bands are their span, and dots are the baseline that
+    ignores the image."""
     figure, xi = Figure(figsize=(13, 4.8), layout="constrained"), [float(name) for name in SWEEP]
     panels = figure.subplots(1, len(STUDIED), squeeze=False)[0]
     for axes, (task, band) in zip(panels, STUDIED, strict=True):
@@ -100,7 +101,7 @@ def draw_curves(cells: list[dict], trivial: dict, path: Path) -> None:
 
 
 def over_lenses(record: dict, task: str, band: str) -> str:
-    """A row a model, trained on a band: the score on its own lenses, on ξ and on the cameras."""
+    """A row for each model trained on a band: scores on its own lenses, on ξ and on the cameras."""
     found, score = runs_of(record["cells"], task), SCORE[task]
     columns = {
         "its own lenses": [f"band-{band}"],
@@ -122,14 +123,14 @@ def over_lenses(record: dict, task: str, band: str) -> str:
 
 
 def over_cameras(record: dict, task: str, band: str) -> str:
-    """A row a model, a column a camera."""
+    """A row for each model, and a column for each camera."""
     score, sets = SCORE[task], [[name] for name in camera_sets(record)]
     rows = _model_rows(runs_of(record["cells"], task), band, score, sets)
     return markdown([f"{NAMES[score]} (%)", *record["cameras"]], rows)
 
 
 def errors(record: dict, band: str) -> str:
-    """AbsRel, a row a model."""
+    """AbsRel, with a row for each model."""
     found, cameras = runs_of(record["cells"], "distance"), camera_sets(record)
     sets = {"its own lenses": [f"band-{band}"], "all ξ": ALL_XI, "cameras": cameras}
     rows = _model_rows(found, band, "abs_rel", list(sets.values()))
@@ -137,7 +138,7 @@ def errors(record: dict, band: str) -> str:
 
 
 def over_zones(record: dict, task: str, band: str) -> str:
-    """A row a model, a column a zone of θ; the mean over the cameras."""
+    """A row for each model, and a column for each zone of θ; means over the cameras."""
     found, score = runs_of(record["cells"], task), SCORE[task]
     cameras = camera_sets(record)
     zones = next(iter(found.values()))[0][cameras[0]]["zones"] if found else []
@@ -155,7 +156,7 @@ def over_zones(record: dict, task: str, band: str) -> str:
 
 
 def controls(record: dict, task: str, band: str) -> str:
-    """What happens where the lens is not the true one."""
+    """The scores with wrong lenses."""
     cells = record["cells"]
     true, shuffled = runs_of(cells, task), runs_of(cells, task, shuffled=True)
     score, own = SCORE[task], f"band-{band}"
@@ -198,7 +199,7 @@ def _spread(runs: list[dict] | None, value: Callable[[dict], float]) -> str:
 
 
 def times(cells: list[dict]) -> str:
-    """How long a cell took, in seconds on one core."""
+    """The duration of the cells, in seconds on one core."""
     rows = []
     for task in TASKS:
         of_task = [cell["seconds"] for cell in cells if cell["task"] == task]
@@ -209,7 +210,7 @@ def times(cells: list[dict]) -> str:
 
 
 def tables(record: dict | None, folder: Path) -> dict[str, str]:
-    """The tables and pictures, by the name of their place in a page; without a record, a line."""
+    """The tables and figures by the name of their place in a page, or a line without a record."""
     made: dict[str, str] = {}
     for task, band in STUDIED:
         made |= _of_band(record, task, band)

@@ -1,10 +1,11 @@
-"""What one would say without looking at the picture: the baselines that a model must beat.
+"""Baselines that ignore the picture; a model must beat them.
 
 - "zone": the most frequent class of a zone of θ, or its median distance;
-- "direction": the same of a direction in the camera's frame, of 9 zones of θ times 16 sectors of
-  azimuth. The cameras are nearly upright: below is floor, above is ceiling.
+- "direction": the same for a direction in the camera's frame, one of 9 zones of θ times 16 sectors
+  of azimuth. The cameras are nearly upright: the floor is below, and the ceiling is above.
 
-Both are found on a part of the training pictures of "low", with the true lens, and tested with it.
+Both are computed from some of the training pictures of "low", and training and tests use the true
+lens.
 """
 
 import itertools
@@ -22,15 +23,15 @@ from darswin.lens.pixels import pixel_rays
 from darswin.train.pixel_metrics import DistanceSums, LabelSums
 from darswin.utils.files import replace_file
 
-RINGS, SECTORS = 9, 16  # of 10° and 22.5°; what is further out is of the last ring
+RINGS, SECTORS = 9, 16  # of 10° and 22.5°; the last ring has all that is further out
 BASELINES = {"zone": 1, "direction": SECTORS}  # sectors
 TARGETS = {"segmentation": "labels", "distance": "distance"}
 TRAINED_ON = "low"
-LEARNED_FROM = 300  # pictures
+LEARNED_FROM = 300  # training pictures
 
 
 def trivial(out: Path) -> dict:
-    """The baselines' scores on all test sets, {task: {baseline: {set: scores}}}; kept in a file."""
+    """The scores of the baselines, {task: {baseline: {set: scores}}}; a file keeps them."""
     file = out / "trivial.json"
     if file.exists():
         return json.loads(file.read_text())
@@ -56,12 +57,12 @@ def _is_control(name: str) -> bool:
 def _pictures(
     path: Path, split: str, target: str, limit: int | None = None
 ) -> Iterator[tuple[np.ndarray, ...]]:
-    """The targets of known pixels, (P,), and the ring and the sector that they are in."""
+    """The targets of the known pixels, (P,), with their rings and sectors."""
     scenes = open_scenes(str(path), split, target)
     lens = None
     for k in range(min(len(scenes), limit or len(scenes))):
         scene = scenes[k]
-        if scene.lens is not lens:  # most sets have one
+        if scene.lens is not lens:  # most sets have only one lens
             lens = scene.lens
             theta, way = (rays[0].numpy() for rays in pixel_rays(lens, scene.target.shape))
             azimuth = np.arctan2(way[..., 1], way[..., 0])
@@ -77,7 +78,7 @@ def _cells(ring: np.ndarray, sector: np.ndarray, sectors: int) -> np.ndarray:
 
 
 def _table(pictures: list[tuple[np.ndarray, ...]], sectors: int, task: str) -> np.ndarray:
-    """What is said in each cell, (RINGS · sectors,): a class, or metres."""
+    """The answer for each cell, (RINGS · sectors,): a class, or metres."""
     target = np.concatenate([p[0] for p in pictures])
     cell = np.concatenate([_cells(*p[1:], sectors) for p in pictures])
     order = np.argsort(cell, kind="stable")
@@ -87,7 +88,7 @@ def _table(pictures: list[tuple[np.ndarray, ...]], sectors: int, task: str) -> n
     for k, (a, b) in enumerate(itertools.pairwise(ends)):
         if b > a:
             said[k] = usual(target[order[a:b]])
-        elif k >= sectors:  # further out than training: as the ring before
+        elif k >= sectors:  # further out than in training: as the ring before
             said[k] = said[k - sectors]
     return said
 

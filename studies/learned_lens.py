@@ -1,18 +1,18 @@
 """Learns lenses: finds an unknown lens's parameters by gradient descent on images taken with it.
 
-A classifier is trained on clothes seen through lenses of every ξ in [0, 1], and frozen. Then a
-camera takes pictures of other clothes, and some of its lens's parameters are not known:
+A classifier is trained on clothes seen through lenses of every ξ in [0, 1], and then frozen. A
+camera takes pictures of other clothes, and some parameters of its lens are unknown:
 
-- "xi": ξ. The circle that the field of view fills is known, as where a camera shows its border.
-- "place": the focal length and the principal point. ξ is known.
-- "all": ξ, the focal length and the principal point.
+- "xi": ξ is unknown. The circle of the field of view is known, as in cameras that show its border.
+- "place": the focal length and the principal point are unknown; ξ is known.
+- "all": ξ, the focal length and the principal point are unknown.
 
-Adam descends a loss of the classifier on the camera's images, from random values. Through every
-lens the model looks at the same field of view, 165°. The focal length is learned as the radius of
-the circle that this fills, whose border the images do not show: clothes stand on black.
+From random values, Adam descends a loss of the classifier on the camera's images. Every lens has
+the same field of view, 165°. The focal length is learned as the radius of the circle that this view
+fills. The images do not show the border of the circle, because the clothes are on black.
 
-Every camera's results are kept under `--out`, so that a study that was stopped goes on. Run it with
-`make learned-lens`.
+The results of every camera are kept under `--out`, so a study that was stopped can go on. Run it
+with `make learned-lens`.
 """
 
 import argparse
@@ -41,8 +41,12 @@ from darswin.models.saving import load_model, model_of_run
 from darswin.utils.files import replace_file
 
 HERE = Path(__file__).parent
-FOV, SIZE, RENDER = math.radians(165), 32, 96  # rad; px, of the images and what they come from
-STD = 0.5  # of the pixels; the mean is 0, so that black is what lies outside an image
+FOV, SIZE, RENDER = (
+    math.radians(165),
+    32,
+    96,
+)  # rad; px, the size of the images and before their reduction
+STD = 0.5  # of the pixels; the mean is 0, so that black pixels are like those outside an image
 CONFIG = [
     "--config", str(HERE / "fashion_mnist.yaml"), "--model.name", "darswin_a_nano",
     "--data.train_lenses", "0..1", "--data.fov_deg", "165", "--data.mean", "[0.0]",
@@ -72,12 +76,12 @@ def lens_of(values: dict[str, Tensor | float]) -> Spherical:
 
 
 def draw(rng: np.random.Generator, problem: str) -> dict[str, float]:
-    """Random values of what is unknown."""
+    """Random values of the unknown parameters."""
     return {name: float(rng.uniform(*RANGES[name])) for name in PROBLEMS[problem]}
 
 
 def photograph(pictures: np.ndarray, lens: Lens) -> Tensor:
-    """Pictures (N, H, W) uint8 through a lens, as `WideAngle` does → images (N, 1, SIZE, SIZE)."""
+    """Images (N, 1, SIZE, SIZE) of pictures (N, H, W) uint8 through a lens, as in `WideAngle`."""
     camera = Perspective.from_fov(FOV, pictures.shape[1] / 2)
     large = lens.resized(RENDER / SIZE)
     (places,) = warp_map(camera, pictures.shape[1:], large, (RENDER, RENDER))
@@ -89,7 +93,7 @@ def photograph(pictures: np.ndarray, lens: Lens) -> Tensor:
 
 @cache
 def pictures(data: str, split: str, count: int) -> tuple[np.ndarray, Tensor]:
-    """Pictures (N, H, W) of a split, shuffled, and their labels."""
+    """The shuffled pictures (N, H, W) of a split, and their labels."""
     source = open_source(data, split, channels=1)
     order = np.random.default_rng(0).permutation(len(source))[:count]
     images, labels = zip(*(source[int(k)] for k in order), strict=True)
@@ -97,7 +101,7 @@ def pictures(data: str, split: str, count: int) -> tuple[np.ndarray, Tensor]:
 
 
 def distance(found: Lens, true: Lens) -> float:
-    """px: how far apart two lenses put a ray, RMS over equal steps of θ and φ."""
+    """The distance between a ray's places in two lenses, px, RMS over equal steps of θ and φ."""
     theta = torch.linspace(0, FOV / 2, 33)[None, 1:, None]
     phi = torch.arange(16)[None, None] * (math.pi / 8)
     apart = found.project_rays(theta, phi) - true.project_rays(theta, phi)
@@ -111,7 +115,7 @@ Usual = tuple[Tensor, Tensor]
 
 @torch.no_grad()
 def usual_map(model: DarSwin, data: str) -> Usual:
-    """Mean and variance (R, A, D) of the first stage's map on training pictures."""
+    """The mean and variance (R, A, D) of the first stage's map on training pictures."""
     rng, maps = np.random.default_rng(0), []
     for picture in pictures(data, "train", USUAL)[0]:
         lens = lens_of(KNOWN | draw(rng, "xi"))
@@ -164,7 +168,7 @@ def descend(
     steps: int,
     seed: int,
 ) -> list[dict[str, float]]:
-    """The values of what is unknown, from `start`, after each step."""
+    """The values of the unknown parameters after each step from `start`."""
     torch.manual_seed(seed)
     unknown = {name: torch.tensor(value, requires_grad=True) for name, value in start.items()}
     optimizer = torch.optim.Adam(
@@ -176,7 +180,7 @@ def descend(
     )
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, steps)
     path = [start]
-    model.patch_embed.sample.train()  # jitters the samples, which smooths the loss
+    model.patch_embed.sample.train()  # jitter smooths the loss
     for _ in range(steps):
         batch = torch.randperm(len(images))[:BATCH]
         found = losses(model, images[batch], labels[batch], lens_of(values | unknown), usual)
@@ -193,7 +197,7 @@ def descend(
 
 
 def run_camera(problem: str, camera: int, out: Path, data: str) -> dict:
-    """Finds one camera's lens in every way, or reads what an earlier run found."""
+    """Finds one camera's lens with every method, or reads the results of an earlier run."""
     file = out / f"{problem}-{camera}.json"
     if file.exists():
         return json.loads(file.read_text())
@@ -225,7 +229,7 @@ def run_camera(problem: str, camera: int, out: Path, data: str) -> dict:
             accuracy=round(100 * right.float().mean().item(), 2),
         )
 
-    # As many guesses as descent takes steps; of ξ alone, a grid.
+    # As many guesses as the steps of a descent; a grid if only ξ is unknown.
     guesses = [draw(rng, problem) for _ in range(STEPS[problem])]
     if problem == "xi":
         guesses = [dict(xi=xi) for xi in GRID]
@@ -265,19 +269,21 @@ def run_camera(problem: str, camera: int, out: Path, data: str) -> dict:
 
 
 def pretrain(out: Path, options: list[str]) -> None:
-    """The classifier of all lenses, and what its first map usually is."""
+    """The classifier for all lenses, and the usual statistics of its first map."""
     with printing_to(out / "log.txt"):
         darswin(["fit", "--run", str(out / "model"), *CONFIG, *options, "--resume"])
 
 
 def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--cameras", type=int, default=8, help="for each problem")
+    parser.add_argument(
+        "--cameras", type=int, default=8, help="the number of cameras for each problem"
+    )
     parser.add_argument("--data", default="/usr/share/datasets/fashion-mnist")
     parser.add_argument("--processes", type=int, default=os.cpu_count())
     parser.add_argument("--out", type=Path, default=Path("out/learned-lens"))
     parser.add_argument("--results", type=Path, default=HERE / "results")
-    args, options = parser.parse_known_args(arguments)  # the others are options of `darswin fit`
+    args, options = parser.parse_known_args(arguments)  # other options are for `darswin fit`
     args.out.mkdir(parents=True, exist_ok=True)
     use_one_core()
     if not (args.out / "usual.pt").exists():

@@ -1,4 +1,4 @@
-"""The tables and the picture of the learned lenses, from what `learned_lens.py` found."""
+"""The tables and the figure of the learned lenses, from the results of `learned_lens.py`."""
 
 from pathlib import Path
 
@@ -12,7 +12,7 @@ from darswin.bench.record import write
 from darswin.bench.tables import markdown
 from darswin.viz.plot import save_figure
 
-CLOSE = 0.5  # px, a lens that is found
+CLOSE = 0.5  # px, the largest distance of a lens that counts as found
 CLOSE_XI = 0.05
 UNKNOWN = {
     "xi": "ξ",
@@ -22,14 +22,14 @@ UNKNOWN = {
 
 
 def collect(cameras: list[dict], folder: Path) -> None:
-    """Writes the results, with the machine and versions, and draws their picture."""
+    """Writes the results, with the machine and versions, and draws their figure."""
     cameras = sorted(cameras, key=lambda c: (list(PROBLEMS).index(c["problem"]), c["camera"]))
     write(folder / "learned_lens.json", machine=machine(), cameras=cameras)
     draw(cameras, folder / "learned_lens.png")
 
 
 def trials_of(cameras: list[dict], problem: str, loss: str, images: int) -> list[dict]:
-    """All descents of a kind, each with its camera's `true` lens and `search`."""
+    """All descents of a kind, with the `true` lens and the `search` of their cameras."""
     return [
         trial
         | dict(
@@ -53,7 +53,7 @@ def xi_errors(trials: list[dict], of: str = "found") -> np.ndarray:
 
 
 def better_starts(trials: list[dict]) -> list[dict]:
-    """Of each camera's descents the one that ended lowest."""
+    """The descent of each camera that ended with the lowest loss."""
     best = {}
     for trial in sorted(trials, key=lambda trial: -trial["least"]):
         best[trial["camera"]] = trial
@@ -65,8 +65,8 @@ def share(close: np.ndarray) -> str:
 
 
 def recovery_table(cameras: list[dict]) -> str:
-    """A row a problem and loss, on all images: how far descents end from the true lens, how often
-    near it, how often no higher than it, and the accuracy. A problem is named in its first row."""
+    """A row for each problem and loss, on all images: the distance of the found lenses from the
+    true lens, the share near it, the share with no higher loss, and the accuracy."""
     heads = [
         "unknown", "loss", "start (px)", "found (px): median, 90 %", f"below {CLOSE} px",
         f"lower of {STARTS} starts below {CLOSE} px", "loss ≤ the true lens's",
@@ -99,7 +99,7 @@ def recovery_table(cameras: list[dict]) -> str:
 
 
 def images_table(cameras: list[dict]) -> str:
-    """A row a loss, a column a number of images: how well ξ alone is found; last, by the grid."""
+    """The errors of ξ, with a row for each loss and a column for each number of images."""
     rows = []
     for loss in LOSSES:
         cells = [loss]
@@ -122,7 +122,7 @@ def images_table(cameras: list[dict]) -> str:
 
 
 def tables(cameras: list[dict]) -> dict[str, str]:
-    """The tables, by the name of their place in a page."""
+    """The tables by the name of their place in a page."""
     return {"learned-lens": recovery_table(cameras), "learned-xi": images_table(cameras)}
 
 
@@ -130,7 +130,7 @@ def tables(cameras: list[dict]) -> dict[str, str]:
 
 
 def draw(cameras: list[dict], path: Path) -> None:
-    """Landscapes of the losses over ξ, descents on them, and how far from the truth all end."""
+    """Draws the losses over ξ, descents on them, and their distances from the truth."""
     figure = Figure(figsize=(9, 8.5), layout="constrained")
     axes = figure.subplots(3, 4)
     known = [camera for camera in cameras if camera["problem"] == "xi"]
@@ -152,7 +152,7 @@ def draw(cameras: list[dict], path: Path) -> None:
 
 
 def draw_landscapes(axes: Axes, cameras: list[dict], loss: str) -> None:
-    """A curve a camera, from its lowest to its highest value; a dot where ξ is the true one."""
+    """Draws a curve for each camera, scaled to its range, with a dot at the true ξ."""
     for k, camera in enumerate(cameras):
         curve = np.array(camera["search"][loss]["curve"])
         low, high = curve.min(), curve.max()
@@ -165,7 +165,7 @@ def draw_landscapes(axes: Axes, cameras: list[dict], loss: str) -> None:
 
 
 def draw_paths(axes: Axes, cameras: list[dict], loss: str) -> None:
-    """ξ, step by step downwards, in the camera's colour; dashed the true one."""
+    """Draws ξ at each step downwards, and the true ξ as a dashed line."""
     for k, camera in enumerate(cameras):
         axes.axvline(camera["true"]["values"]["xi"], color=f"C{k}", ls="--", lw=0.8)
         for trial in trials_of([camera], "xi", loss, max(IMAGES["xi"])):
@@ -176,7 +176,7 @@ def draw_paths(axes: Axes, cameras: list[dict], loss: str) -> None:
 
 
 def draw_distances(axes: Axes, cameras: list[dict], problem: str) -> None:
-    """The share of descents that end within a distance of the true lens."""
+    """Draws the share of descents that end within a distance of the true lens."""
     for loss in LOSSES:
         trials = trials_of(cameras, problem, loss, max(IMAGES[problem]))
         axes.ecdf(distances(trials), label=loss)
@@ -188,7 +188,7 @@ def draw_distances(axes: Axes, cameras: list[dict], problem: str) -> None:
 
 
 def draw_images(axes: Axes, cameras: list[dict]) -> None:
-    """The median error of ξ by the number of images."""
+    """Draws the median error of ξ against the number of images."""
     counts = IMAGES["xi"]
     for loss in LOSSES:
         errors = [np.median(xi_errors(trials_of(cameras, "xi", loss, count))) for count in counts]

@@ -1,9 +1,9 @@
-"""What 8 bits cost the study's models: top-1 at each ξ, in float32 and with integer products.
+"""Compares the study's models in float32 and with 8-bit integer products: top-1 at each ξ.
 
-Each cell is one of `study.py`, trained there if it is not yet, then `darswin quantize`: ranges come
-from training pictures through the lenses of training. Both models are tested on the same pictures.
-A cell's folder keeps what was found, so that a study that was stopped goes on. Run it with `make
-study-int8`, on a CPU with VNNI.
+Each cell trains a model of `study.py`, unless that study has done so, and runs `darswin quantize`.
+The ranges come from training pictures through the lenses of training. Both models are tested on the
+same pictures. The folder of a cell keeps its results, so a study that was stopped can go on. Run it
+with `make study-int8`, on a CPU with VNNI.
 """
 
 import argparse
@@ -36,7 +36,7 @@ HERE = Path(__file__).parent
 def run_cell(
     cell: Cell, out: Path, size: str, test_images: int, pictures: int, options: list[str]
 ) -> dict:
-    """Trains, quantizes and tests one cell, or reads what an earlier run found."""
+    """Trains, quantizes and tests one cell, or reads the results of an earlier run."""
     trained = run_float(cell, out, size, test_images, options)
     folder = out / size / cell.key
     found = folder / "int8.json"

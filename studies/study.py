@@ -1,7 +1,7 @@
-"""Runs the paper's experiments, small: trains and tests every cell, and resumes where it stopped.
+"""Repeats the paper's experiments with small models: trains and tests every cell of the study.
 
-Each cell is `darswin fit` and `darswin test` on one core. Its folder under `--out` keeps what it
-found, so that a study that was stopped goes on; `tables.py` makes the tables and pictures. Run it
+Each cell runs `darswin fit` and `darswin test` on one core. Its folder under `--out` keeps its
+results, so a study that was stopped can go on. `tables.py` makes the tables and figures. Run it
 with `make study`.
 """
 
@@ -23,7 +23,7 @@ CONFIG = HERE / "fashion_mnist.yaml"
 
 
 def run_cell(cell: Cell, out: Path, size: str, test_images: int, options: list[str]) -> dict:
-    """Trains and tests one cell, or reads what an earlier run found."""
+    """Trains and tests one cell, or reads the results of an earlier run."""
     folder = out / size / cell.key
     found = folder / "cell.json"
     given = dict(options=cell.options, test_images=test_images, arguments=options)
@@ -59,19 +59,21 @@ def run_cell(cell: Cell, out: Path, size: str, test_images: int, options: list[s
 
 def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--only", choices=["headline", "ablations"], help="this part")
-    parser.add_argument("--cell", help="only the cells whose key has this in it")
-    parser.add_argument("--seeds", type=int, default=3, help="of the headline")
-    parser.add_argument("--size", default="nano", help="of the models")
-    parser.add_argument("--test-images", type=int, default=1000, help="through every lens")
+    parser.add_argument("--only", choices=["headline", "ablations"], help="runs only this part")
+    parser.add_argument("--cell", help="runs only cells whose key contains this text")
+    parser.add_argument("--seeds", type=int, default=3, help="the number of seeds of the headline")
+    parser.add_argument("--size", default="nano", help="the size of the models")
+    parser.add_argument(
+        "--test-images", type=int, default=1000, help="the number of test images for every lens"
+    )
     parser.add_argument("--processes", type=int, default=os.cpu_count())
     parser.add_argument("--out", type=Path, default=Path("out/study"))
     parser.add_argument("--results", type=Path, default=HERE / "results")
-    args, options = parser.parse_known_args(arguments)  # the others are options of `darswin fit`
+    args, options = parser.parse_known_args(arguments)  # other options are for `darswin fit`
     cells = [] if args.only == "ablations" else headline(args.seeds)
     cells += [] if args.only == "headline" else ablations()
     cells = [cell for cell in cells if (args.cell or "") in cell.key]
-    cells.sort(key=lambda cell: cell.seed)  # a study that is stopped has whole tables first
+    cells.sort(key=lambda cell: cell.seed)  # a stopped study has complete tables
     jobs = [(cell, args.out, args.size, args.test_images, options) for cell in cells]
     start = time.perf_counter()
     results = run_all(run_cell, jobs, args.processes, "cell")

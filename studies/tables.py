@@ -1,4 +1,4 @@
-"""The tables and the picture of the study, from what its cells found."""
+"""The tables and the figure of the study, made from the results of its cells."""
 
 import statistics
 from collections import defaultdict
@@ -41,7 +41,7 @@ PAPER_ABLATIONS = {
 
 
 def collect(cells: list[dict], folder: Path, size: str) -> None:
-    """Writes the results of a study, with the machine and versions, and draws its picture."""
+    """Writes the results of a study, with the machine and versions, and draws its figure."""
     cells = sorted(cells, key=lambda c: (c["label"], c["level"], c["seed"]))
     write(folder / f"study--{size}.json", machine=machine(), size=size, cells=cells)
     draw(cells, folder / f"study--{size}.png")
@@ -56,8 +56,8 @@ def by_model(cells: list[dict]) -> dict[tuple[str, str], list[dict]]:
 
 
 def draw(cells: list[dict], path: Path) -> None:
-    """Accuracy against ξ: a panel for each training level, its range shaded; lines are means of the
-    seeds, bands their span."""
+    """Draws accuracy against ξ, in a panel for each training level. The range of the level is
+    shaded. Lines are means over the seeds, and bands are their span."""
     found, xi = by_model(cells), [float(name) for name in SWEEP]
     figure = Figure(figsize=(9, 7), layout="constrained")
     for axes, level in zip(figure.subplots(2, 2, sharey=True).flat, LEVELS, strict=True):
@@ -79,13 +79,13 @@ def draw(cells: list[dict], path: Path) -> None:
 
 
 def spread(values: list[float]) -> str:
-    """Mean and, of several seeds, half the span."""
+    """The mean and, for several seeds, half of their span."""
     mean = f"{statistics.mean(values):.1f}"
     return mean if len(values) < 2 else f"{mean} ± {(max(values) - min(values)) / 2:.1f}"
 
 
 def level_table(cells: list[dict], lenses: str, paper: dict) -> str:
-    """A row a model, a column a training level: ours, and the paper's in brackets."""
+    """A row for each model, a column for each training level; the paper's values in brackets."""
     found = by_model(cells)
     rows = []
     for label in MODELS:
@@ -99,7 +99,7 @@ def level_table(cells: list[dict], lenses: str, paper: dict) -> str:
 
 
 def ablation_table(cells: list[dict]) -> str:
-    """A row a variant trained on "low" with the first seed, a column a test level."""
+    """A row for each variant trained on "low" with the first seed; a column for each test level."""
     first = {c["label"]: c["accuracy"] for c in cells if c["level"] == "low" and c["seed"] == 0}
     rows = []
     for label in ("DarSwin-A", *ABLATIONS):
@@ -113,13 +113,13 @@ def ablation_table(cells: list[dict]) -> str:
 
 
 def points_lost(cell: dict) -> list[float]:
-    """What 8 bits cost a cell of `quantized.py` at each ξ."""
+    """The loss of accuracy by 8 bits for a cell of `quantized.py`, at each ξ."""
     before, after = (cell["accuracy"][name] for name in ("float32", "int8"))
     return [before[xi] - after[xi] for xi in SWEEP]
 
 
 def int8_table(cells: list[dict]) -> str:
-    """A row a model: its layers of 8 bits, its accuracy over all ξ, and what it loses."""
+    """A row for each model: its layers of 8 bits, its accuracy over all ξ, and its loss."""
     rows = []
     for label in MODELS:
         runs = [cell for cell in cells if cell["label"] == label]
@@ -149,7 +149,7 @@ def int8_table(cells: list[dict]) -> str:
 
 
 def tables(cells: list[dict]) -> dict[str, str]:
-    """The tables, by the name of their place in a page."""
+    """The tables by the name of their place in a page."""
     return {
         "xi-0.4": level_table(cells, "0.4", PAPER_04),
         "polynomial": level_table(cells, POLYNOMIAL, PAPER_POLYNOMIAL),

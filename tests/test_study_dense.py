@@ -89,7 +89,7 @@ def test_cells_are_trained_and_tested_once(quick, here, capsys):
     assert len(results) == 2
     assert all(cell["sets"] == before[cell["model"], cell["task"]] for cell in results)
     # With other options it says so, and mixes nothing.
-    with pytest.raises(ValueError, match="was made otherwise"):
+    with pytest.raises(ValueError, match="was made with other options"):
         dense.main([*where, "--cell", "swin-unet-low-seg", *QUICK, "--data.flip", "false"])
 
 
@@ -126,8 +126,8 @@ def test_cells_of_a_record_are_not_run_again(quick, here, tmp_path):
     dense.main([*where, "--collect", *QUICK])
     assert len(json.loads((tmp_path / "dense.json").read_text())["cells"]) == 4
     for other, message in (
-        (dict(config="max_epochs: 9"), "of another configuration"),
-        (dict(cameras=["another"]), r"must be of the cameras .*, got \['another'\]"),
+        (dict(config="max_epochs: 9"), "was made with another configuration"),
+        (dict(cameras=["another"]), r"must have the cameras .*, got \['another'\]"),
     ):
         (tmp_path / "known.json").write_text(json.dumps(record | other))
         with pytest.raises(ValueError, match=message):

@@ -83,7 +83,7 @@ def pictures_and_videos_below(folder: Path) -> list[str]:
     if not read:
         found = f", but {_kinds(others)}, which darswin does not read" if others else ""
         raise FileNotFoundError(f"no pictures or videos in {folder}{found}")
-    _warn_of_unread(folder, others)
+    warn_of_unread(folder, others)
     return read
 
 
@@ -160,14 +160,14 @@ def _pictures(folder: Path, names: list[str] | None, seen: dict[str, str], whole
         start = len(str(by_name[name])) - len(name)
         paths += sorted((file[start:] for file in read), key=_parts)
         others += unread
-    _warn_of_unread(folder, others)
+    warn_of_unread(folder, others)
     found = set(_classes(paths))
     if whole and names and (missing := [name for name in names if name not in found]):
         raise FileNotFoundError(f"no pictures of the classes {some(missing)} in {folder}")
     return Pictures(folder, paths)
 
 
-def _warn_of_unread(folder: Path, files: list[str]) -> None:
+def warn_of_unread(folder: Path, files: list[str]) -> None:
     if files:
         warn_left_out(
             f"{folder} holds pictures that darswin does not read, {_kinds(files)}, e.g. "

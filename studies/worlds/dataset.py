@@ -1,4 +1,4 @@
-"""Writes what random poses see, through one lens or several, as folders that darswin reads."""
+"""Writes the views of random poses through one or more lenses, as folders that darswin reads."""
 
 import json
 import math
@@ -69,7 +69,7 @@ def write_map(name: str, split: str, targets: Sequence[Target], size: int, count
 
 
 def write_view(view: View, folder: Path, stem: str) -> None:
-    """`images/`, `labels/` and `distance/STEM.png`; further than 255 m is not known."""
+    """Writes `images/`, `labels/` and `distance/STEM.png`; distances above 255 m are unknown."""
     steps = np.round(view.distance * DISTANCE_UNIT)
     distance = np.where(steps < 2**16, steps, 0).astype(np.uint16)
     pictures = dict(images=view.image[..., ::-1], labels=view.labels, distance=distance)
@@ -81,8 +81,8 @@ def write_view(view: View, folder: Path, stem: str) -> None:
 def jobs_of(
     targets: Sequence[Target], split: str, pictures: int, size: int, seed: int
 ) -> list[tuple]:
-    """The arguments of `write_map` for as many pictures of a split, as evenly of its maps as can
-    be; also writes the targets' classes.json."""
+    """The arguments of `write_map` for the pictures of a split, spread evenly over its maps; also
+    writes the targets' classes.json."""
     for target in targets:
         Path(target.folder).mkdir(parents=True, exist_ok=True)
         classes = dict(names=CLASSES, colors=COLORS)

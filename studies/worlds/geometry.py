@@ -21,9 +21,9 @@ LABEL = {name: k for k, name in enumerate(CLASSES)}
 
 SKY_FLAT = "F_SKY1"
 LIQUIDS = ("NUKAGE", "FWATER", "SWATER", "LAVA", "BLOOD", *(f"SLIME0{k}" for k in range(1, 9)))
-STEP = 24  # map units: what the player climbs without jumping
+STEP = 24  # map units, the highest step that the player climbs without jumping
 
-# Textures that show a door; others with DOOR in their names are its frame.
+# Textures that show a door; other textures with DOOR in their names are door frames.
 DOORS = ("BIGDOOR", "DOOR1", "DOOR3", "EXITDOOR", "SPCDOOR", "WOODDOOR")
 
 # Flags of lines.
@@ -59,7 +59,7 @@ class Surfaces:
 
 @dataclass
 class Surface:
-    """One plane: points (T, 3, 3) of its triangles in map units, and the rest as `Surfaces`."""
+    """One plane: points (T, 3, 3) of its triangles in map units; other fields as in `Surfaces`."""
 
     triangles: np.ndarray
     normal: np.ndarray
@@ -72,7 +72,7 @@ class Surface:
 
 
 def join(found: Sequence[Surface]) -> Surfaces:
-    """Surfaces of single ones, in metres."""
+    """All surfaces together, in metres."""
     scale = np.array([METRE, METRE, METRE, 1])
     normal = np.array([s.normal for s in found])
     triangles = np.concatenate([s.triangles for s in found]) / METRE
@@ -87,7 +87,7 @@ def join(found: Sequence[Surface]) -> Surfaces:
 
 
 def surfaces_of(map: Map, textures: Textures) -> Surfaces:
-    """All that stands still in a map, its doors as they are at the start: closed."""
+    """All static surfaces of a map, with closed doors as at the start."""
     return join([*_flats(map, textures), *_walls(map, textures)])
 
 
@@ -118,7 +118,7 @@ def _flats(map: Map, textures: Textures) -> Iterator[Surface]:
 
 
 def outlines(map: Map) -> list[np.ndarray]:
-    """The borders of each sector, (N, 2, 2): lines that have it on one side only."""
+    """The borders of each sector, (N, 2, 2): lines with the sector on one side only."""
     front = map.sides["sector"][map.lines["front"]]
     has_back = map.lines["back"] != NOBODY
     back = np.where(has_back, map.sides["sector"][np.where(has_back, map.lines["back"], 0)], NOBODY)
@@ -155,7 +155,7 @@ def triangulate(outline: np.ndarray) -> np.ndarray:
 
 
 def door_sectors(map: Map) -> set[int]:
-    """The sectors that are doors and are closed."""
+    """The sectors that are closed doors."""
     lines, has_back = map.lines, map.lines["back"] != NOBODY
     own = lines["back"][has_back & np.isin(lines["special"], OWN_DOORS)]
     tags = set(lines["tag"][np.isin(lines["special"], TAGGED_DOORS)].tolist()) - {0}
@@ -180,12 +180,12 @@ def _walls(map: Map, textures: Textures) -> Iterator[Surface]:
         other = _Side(map, textures, line, end, start, back, front)
         yield from one.two_sided(doors)
         yield from other.two_sided(doors)
-        # One of the two, as both stand in the same place.
+        # Only one of the two, because both are at the same place.
         yield from (one if text(front["middle"]) != "-" else other).grating()
 
 
 class _Side:
-    """What is seen of a line from one side, from `start` on its left to `end` on its right."""
+    """One side of a line, from `start` on its left to `end` on its right."""
 
     def __init__(self, map: Map, textures: Textures, line, start, end, side, beyond=None):
         self.textures, self.line, self.side, self.beyond = textures, line, side, beyond
@@ -208,7 +208,7 @@ class _Side:
         yield from self._quad(self.floor, self.ceiling, top, material, label)
 
     def two_sided(self, doors: set[int]) -> Iterator[Surface]:
-        """Where the floor beyond is higher, or the ceiling lower."""
+        """The steps to a higher floor or a lower ceiling beyond the line."""
         flags = self.line["flags"]
         if self.other_floor > self.floor:
             top = self.ceiling if flags & LOWER_UNPEGGED else self.other_floor
@@ -241,7 +241,7 @@ class _Side:
         yield from self._quad(low, high, top, material, "wall", cut=True)
 
     def _material(self, part: str) -> tuple[int, int]:
-        """The material of a part and its height; where it has none, that of another part."""
+        """The material and the height of a part, or of another part if it has none."""
         parts = [self.side[name] for name in (part, "upper", "lower", "middle")]
         if self.beyond is not None:
             parts += [self.beyond[name] for name in ("lower", "upper")]
@@ -250,7 +250,7 @@ class _Side:
         return number, self.textures.size(number)[0]
 
     def _quad(self, low, high, top, material, label, cut=False) -> Iterator[Surface]:
-        """A wall from `low` to `high` whose texture begins at the height `top`."""
+        """A wall from `low` to `high`; its texture begins at the height `top`."""
         if high <= low:
             return
         a, b, c, d = (
@@ -258,7 +258,7 @@ class _Side:
             for end, z in ((self.start, low), (self.end, low), (self.end, high), (self.start, high))
         )
         along = (self.end - self.start) / self.length
-        # As the game has it: walls along x are a little darker, those along y a little lighter.
+        # As in the game, walls along x are a little darker and walls along y a little lighter.
         contrast = 16 * (float(along[0] == 0) - float(along[1] == 0))
         u0 = float(self.side["x"]) - float(along @ self.start)
         yield Surface(

@@ -1,4 +1,4 @@
-"""The lenses that worlds are seen through, by their names."""
+"""The lenses for views of the worlds, by their names."""
 
 import math
 from pathlib import Path
@@ -27,7 +27,7 @@ def draw_lens(name: str, size: int, fov: float, rng: np.random.Generator) -> Len
     if name == "wide":
         angle = math.radians(rng.uniform(*WIDE))
         lens: Lens = Perspective.from_fov(fov=angle, radius=size / 2).with_theta_max(None)
-        # Up to the corners.
+        # The lens sees up to the corners.
         lens = lens.with_theta_max(math.atan(math.sqrt(2) * math.tan(angle / 2)))
         return lens.replace(image_size=lens.theta_max.new_tensor([[size, size]]))
     file, _, camera = name.partition(":")
@@ -38,7 +38,7 @@ def draw_lens(name: str, size: int, fov: float, rng: np.random.Generator) -> Len
 
 
 def is_one(name: str) -> bool:
-    """Whether a name is always the same lens."""
+    """True if a name always means the same lens."""
     if Path(name.partition(":")[0]).is_file():
         return True
     try:
@@ -49,7 +49,7 @@ def is_one(name: str) -> bool:
 
 def _squared(lens: Lens, size: int, name: str) -> Lens:
     if lens.image_size is None:
-        raise ValueError(f"{name} must say the size of its images")
+        raise ValueError(f"{name} must give the size of its images")
     height, width = (round(side) for side in lens.image_size[0].tolist())
     side = min(height, width)
     square = lens.cropped((height - side) // 2, (width - side) // 2, side, side)

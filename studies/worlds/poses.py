@@ -1,4 +1,4 @@
-"""Random poses of a camera in a map, kept where there is something to see."""
+"""Random poses of a camera in a map, at places with enough to see."""
 
 import zlib
 from dataclasses import dataclass
@@ -9,12 +9,15 @@ from worlds.geometry import LABEL
 from worlds.scene import NOTHING, Scene
 from worlds.wad import METRE
 
-EYE, EYE_SPREAD = 41 / METRE, 8 / METRE  # m above the floor, the player's; uniform around it
-HEADROOM = 56 / METRE  # m that the player needs
-CLEARANCE = 0.4  # m to anything that is not floor, at the height of the eye
+EYE, EYE_SPREAD = (
+    41 / METRE,
+    8 / METRE,
+)  # m above the floor, as for the player, with a uniform spread
+HEADROOM = 56 / METRE  # m, the height that the player needs
+CLEARANCE = 0.4  # m to all surfaces except the floor, at the height of the eye
 PITCH, ROLL = 10.0, 5.0  # degrees, standard deviations
-NEAR, NEAR_SHARE = 0.75, 0.4  # m; no more of the view than this is nearer
-ONE_CLASS = 0.7  # no class is more of the view than this
+NEAR, NEAR_SHARE = 0.75, 0.4  # m; at most this share of the view is nearer
+ONE_CLASS = 0.7  # at most this share of the view is of one class
 TRIES = 10_000
 
 
@@ -28,8 +31,8 @@ class Pose:
 
 
 def look(yaw: float, pitch: float = 0.0, roll: float = 0.0) -> np.ndarray:
-    """The rotation of a camera that looks along yaw (from east to north), up by pitch, and is
-    turned clockwise by roll about its axis; all rad."""
+    """The rotation of a camera by yaw (from east to north), pitch (upwards) and roll (clockwise
+    about its axis), rad."""
     cos, sin = np.cos(yaw), np.sin(yaw)
     forward = np.array([cos * np.cos(pitch), sin * np.cos(pitch), np.sin(pitch)])
     right = np.array([sin, -cos, 0.0])
@@ -39,7 +42,7 @@ def look(yaw: float, pitch: float = 0.0, roll: float = 0.0) -> np.ndarray:
 
 
 def poses_of(scene: Scene, name: str, count: int, seed: int) -> list[Pose]:
-    """`count` poses in a map, decided by its name and the seed alone.
+    """`count` poses in a map; they depend only on its name and the seed.
 
     Raises:
         RuntimeError: a map in which too few places are fit.
@@ -58,11 +61,11 @@ def poses_of(scene: Scene, name: str, count: int, seed: int) -> list[Pose]:
         pose = Pose(position, look(*angles))
         if is_fit(scene, pose, sphere):
             found.append(pose)
-    raise RuntimeError(f"{name}: {len(found)} of {TRIES} random poses are fit, {count} are wanted")
+    raise RuntimeError(f"{name}: only {len(found)} of {TRIES} random poses are good, not {count}")
 
 
 def is_fit(scene: Scene, pose: Pose, sphere: np.ndarray) -> bool:
-    """Whether a pose has headroom, clearance and variety, whatever the lens.
+    """True if a pose has headroom, clearance and variety, for any lens.
 
     Args:
         sphere: (N, 3), unit vectors in all directions.
@@ -74,14 +77,14 @@ def is_fit(scene: Scene, pose: Pose, sphere: np.ndarray) -> bool:
     level = np.abs(sphere[:, 2]) < 0.5
     if distance[level].min() < CLEARANCE:
         return False
-    ahead = sphere @ pose.rotation[:, 2] > 0  # what a lens of 180° sees
+    ahead = sphere @ pose.rotation[:, 2] > 0  # the view of a lens of 180°
     counts = np.bincount(label[ahead], minlength=len(LABEL))
     near = (distance[ahead] < NEAR).mean()
     return counts.max() <= ONE_CLASS * counts.sum() and near <= NEAR_SHARE
 
 
 def _floors(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
-    """The triangles (T, 3, 3) that one can stand on, and how often each is to be drawn.
+    """The triangles (T, 3, 3) on which one can stand, and the probability of each.
 
     Large places are drawn by the root of their area: else most pictures would be of a few yards.
     """
@@ -96,7 +99,7 @@ def _floors(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _sphere(count: int) -> np.ndarray:
-    """(N, 3): directions that fill the sphere evenly, on a spiral."""
+    """Directions that fill the sphere evenly, on a spiral, (N, 3)."""
     k = np.arange(count) + 0.5
     z, turn = 1 - 2 * k / count, np.pi * (1 + 5**0.5) * k
     aside = np.sqrt(1 - z * z)

@@ -9,13 +9,13 @@ from darswin.lens import Lens
 from worlds.poses import Pose
 from worlds.scene import NOTHING, Scene
 
-SAMPLES = 3  # a side, in a pixel; odd, so that one of them is its centre
-GLOW, REACH = 0.35, 4.0  # of the player's lamp: how much light it adds, and m where that is half
+SAMPLES = 3  # per pixel and axis; odd, so that one sample is the centre
+GLOW, REACH = 0.35, 4.0  # the light of the player's lamp, and the distance, m, of half of it
 
 
 class View(NamedTuple):
-    """image: (H, W, 3) uint8, sRGB; labels: (H, W) uint8, 255 where there is none; distance: (H, W)
-    float32, m along the ray, 0 where it is not known: sky, and beyond θ_max."""
+    """Attributes: image: (H, W, 3) uint8, sRGB; labels: (H, W) uint8, 255 for none; distance:
+    (H, W) float32, m along the ray, 0 for unknown: sky, and beyond θ_max."""
 
     image: np.ndarray
     labels: np.ndarray
@@ -23,8 +23,8 @@ class View(NamedTuple):
 
 
 def rays_of(lens: Lens, samples: int = SAMPLES) -> np.ndarray:
-    """Unit vectors (H, W, samples², 3) of the camera's frame through parts of each pixel; NaN where
-    the lens has no ray. The one in the middle is that of the pixel's centre."""
+    """Unit vectors (H, W, samples², 3) in the camera's frame through the samples of each pixel; NaN
+    without a ray. The middle sample is the centre of the pixel."""
     height, width = (round(side) for side in lens.image_size[0].tolist())
     part = (np.arange(samples) + 0.5) / samples - 0.5
     y, x = np.meshgrid(np.arange(height), np.arange(width), indexing="ij")
@@ -35,7 +35,7 @@ def rays_of(lens: Lens, samples: int = SAMPLES) -> np.ndarray:
 
 
 def render(scene: Scene, pose: Pose, rays: np.ndarray) -> View:
-    """What a camera at a pose sees along `rays_of` a lens.
+    """The view of a camera at a pose along `rays_of` a lens.
 
     Label and distance are those of the ray through a pixel's centre. The colour is the mean of all
     rays of the pixel in linear light; what has no ray is black.

@@ -1,4 +1,4 @@
-"""Rays in a world: what each meets first, how far away that is, and its colour."""
+"""Rays in a world: the first surface on each ray, its distance and its colour."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -13,14 +13,15 @@ from worlds.things import MEDIUM, MULTIPLAYER, SPRITES
 from worlds.wad import METRE, Map
 
 NOTHING = 255  # the label of a ray that meets nothing
-LAYERS = 16  # gratings and sprites that a ray passes before it is given up
-PASSED = 1e-4  # m beyond a hole, where a ray goes on
+LAYERS = 16  # the number of gratings and sprites that a ray may pass
+PASSED = 1e-4  # m behind a hole, where a ray goes on
 SIGHT = 80.0  # m: things further away are not drawn
 
 
 class Hits(NamedTuple):
-    """Of N rays. label: (N,) uint8; distance: (N,) m, infinite for sky and nothing; colour: (N, 3)
-    uint8, sRGB, of the texel; light: (N,) in 0..1, of the place; normal: (N, 3), unit."""
+    """The ends of N rays. label: (N,) uint8; distance: (N,) m, infinite for sky and nothing;
+    colour: (N, 3) uint8, sRGB, of the texel; light: (N,) in 0..1, of the place; normal: (N, 3),
+    unit."""
 
     label: np.ndarray
     distance: np.ndarray
@@ -30,7 +31,7 @@ class Hits(NamedTuple):
 
 
 class Body:
-    """Surfaces that rays can meet. Embree finds which; how far is from the plane, in float64."""
+    """Surfaces for rays. Embree finds the surface; the plane gives the distance in float64."""
 
     def __init__(self, surfaces: Surfaces):
         self.surfaces = surfaces
@@ -48,7 +49,7 @@ class Body:
     def distance(
         self, surface: np.ndarray, origin: np.ndarray, direction: np.ndarray
     ) -> np.ndarray:
-        """(N,) m along rays (N, 3) from one origin (3,) to the planes of surfaces (N,)."""
+        """The distances (N,), m, along rays (N, 3) from a point (3,) to the surfaces' planes (N,)."""
         normal = self.surfaces.normal[surface]
         with np.errstate(divide="ignore", invalid="ignore"):
             found = (self.surfaces.offset[surface] - normal @ origin) / (normal * direction).sum(1)
@@ -57,7 +58,7 @@ class Body:
 
 @dataclass(frozen=True)
 class Things:
-    """What stands in a map. Attributes: foot: (K, 3) m; material: (K,), of sprites; size: (K, 2),
+    """The things in a map. Attributes: foot: (K, 3) m; material: (K,), of sprites; size: (K, 2),
     width and height in texels; left: (K,) texels from the left border to the foot; light: (K,)."""
 
     foot: np.ndarray
@@ -67,7 +68,7 @@ class Things:
     light: np.ndarray
 
     def facing(self, eye: np.ndarray) -> Surfaces | None:
-        """Upright pictures turned to the eye, of what is in sight."""
+        """Upright pictures of the visible things, facing the eye."""
         away = self.foot[:, :2] - eye[:2]
         range_ = np.hypot(*away.T)
         seen = (range_ > 0.2) & (range_ < SIGHT)
@@ -98,7 +99,7 @@ class Things:
 
 
 class Scene:
-    """A map that rays can be cast in, with the things that stand in it."""
+    """A map with its things, for casting rays."""
 
     def __init__(self, map: Map, textures: Textures):
         self._world = Body(surfaces_of(map, textures))
@@ -113,7 +114,7 @@ class Scene:
         return self._world.surfaces
 
     def cast(self, eye: np.ndarray, directions: np.ndarray) -> Hits:
-        """What rays from one point (3,), m, along unit vectors (N, 3) meet."""
+        """The hits of rays from a point (3,), m, along unit vectors (N, 3)."""
         count = len(directions)
         hits = Hits(
             np.full(count, NOTHING, np.uint8),
@@ -152,7 +153,7 @@ class Scene:
         return hits
 
     def _meet(self, hits, surfaces, rays, surface, distance, eye, way) -> np.ndarray:
-        """Notes what rays meet; returns which are not at a hole, (N,)."""
+        """Records the hits of rays; True for rays that are not at a hole, (N,)."""
         point = np.column_stack((eye + distance[:, None] * way, np.ones(len(rays))))
         u, v = ((point * axis[surface]).sum(1) for axis in (surfaces.u, surfaces.v))
         texel = self._look(surfaces.material[surface], u, v)
@@ -176,7 +177,7 @@ class Scene:
         return self._look(np.full(len(way), self._sky), -azimuth * 512 / np.pi, row)
 
     def _facing(self, eye: np.ndarray) -> list[Body]:
-        """The things as seen from an eye, kept for the next call."""
+        """The things as seen from an eye; the next call reuses them."""
         if self._eye is None or (self._eye != eye).any():
             found = self._things.facing(eye)
             self._eye, self._sprites = eye.copy(), [] if found is None else [Body(found)]
@@ -190,11 +191,11 @@ class Scene:
             flags = int(thing["flags"])
             if name is None or not flags & MEDIUM or flags & MULTIPLAYER:
                 continue
-            # The picture of something that has no sides, or of its front.
+            # The picture of a thing without sides, or the picture of its front.
             name = next((n for n in (f"{name}A0", f"{name}A1") if textures.has("sprite", n)), None)
             if name is None:
                 continue
-            # What is met first from below is the floor.
+            # The first hit from below is the floor.
             place = np.array([thing["x"] / METRE, thing["y"] / METRE, below])
             up = np.array([[0.0, 0.0, 1.0]])
             floor = self._world.first(place[None], up)

@@ -1,4 +1,4 @@
-"""Draws the worlds through a few lenses: picture, labels and distance beside each other."""
+"""Draws the worlds through a few lenses: picture, labels and distance side by side."""
 
 import math
 from pathlib import Path
@@ -19,8 +19,8 @@ from worlds.textures import Textures
 from worlds.wad import load_map
 
 FOV, SIZE = math.radians(165), 128
-NEAR, FAR = 0.5, 40.0  # m, of the colours
-# Maps, and which of their poses; names of `draw_lens` by what stands above them.
+NEAR, FAR = 0.5, 40.0  # m, the range of the colours
+# Maps with the number of a pose; names of `draw_lens` by their headings.
 PLACES = (
     ("freedoom2-MAP01", 1),
     ("freedoom2-MAP01", 3),

@@ -1,4 +1,4 @@
-"""The pictures on surfaces: all texels of the materials in use, in one array."""
+"""The pictures on surfaces: one array of the texels of all materials in use."""
 
 import itertools
 import struct
@@ -26,7 +26,7 @@ class Textures:
         self._pictures: list[np.ndarray] = []
 
     def number(self, kind: str, name: str) -> int:
-        """A material's number; that of plain grey where the WAD has no such material."""
+        """The number of a material, or of plain grey if the WAD lacks the material."""
         key = kind, name
         if key not in self._numbers:
             self._numbers[key] = len(self._pictures)
@@ -34,25 +34,25 @@ class Textures:
         return self._numbers[key]
 
     def size(self, number: int) -> tuple[int, int]:
-        """(H, W) texels."""
+        """The size (H, W) in texels."""
         return self._pictures[number].shape[:2]
 
     def picture(self, number: int) -> np.ndarray:
-        """(H, W, 4) uint8, sRGB and whether there is something, 0 or 255."""
+        """The picture (H, W, 4) uint8: sRGB, and opacity 0 or 255."""
         return self._pictures[number]
 
     def has(self, kind: str, name: str) -> bool:
-        """Whether the WAD has a material."""
+        """True if the WAD has a material."""
         groups = {"wall": self._definitions, "flat": self._wad.flats, "sprite": self._wad.sprites}
         return name in groups[kind]
 
     def sprite_offset(self, name: str) -> tuple[int, int]:
-        """Where a sprite's left and upper border are: texels left of, and above, its foot."""
+        """The left and upper border of a sprite: texels left of its foot and above it."""
         x, y = self._wad.sprites[name].offsets
         return x, y
 
     def sampler(self) -> "Sampler":
-        """All materials that have been asked for so far, to look texels up in."""
+        """A table of the texels of all materials requested so far."""
         return Sampler(self._pictures)
 
     def _make(self, kind: str, name: str) -> np.ndarray:
@@ -85,7 +85,7 @@ class Textures:
 
 
 class Sampler:
-    """Looks texels up: the nearest, repeated in both directions."""
+    """A table of texels; it returns the nearest one, repeated in both directions."""
 
     def __init__(self, pictures: list[np.ndarray]):
         sizes = np.array([picture.shape[:2] for picture in pictures], np.int32)
@@ -103,14 +103,14 @@ class Sampler:
 
 
 def _indices(lump: object) -> np.ndarray:
-    """A graphic's palette indices (H, W), -1 where there is nothing."""
+    """The palette indices of a graphic (H, W), -1 for transparent."""
     width, height = lump.dimensions
     pixels = [-1 if pixel is None else pixel for pixel in lump.to_pixels()]
     return np.array(pixels, np.int16).reshape(height, width)
 
 
 def _definitions(wad: WAD) -> dict[str, tuple[int, int, list[tuple[int, int, str]]]]:
-    """Walls' textures: width, height, and their patches, from x, y on."""
+    """The textures of walls: width, height, and patches with their x and y."""
     names = wad.txdefs["PNAMES"].data
     patches = [text(names[k : k + 8]) for k in range(4, len(names), 8)]
     found = {}

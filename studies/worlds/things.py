@@ -1,4 +1,4 @@
-"""What stands in maps, by the number that the editors of the game gave it: its sprite's name.
+"""The names of the sprites of things in maps, by the number of the thing in the game.
 
 Things that hang from the ceiling are left out. Source: https://doomwiki.org/wiki/Thing_types.
 """
@@ -22,5 +22,5 @@ _WORDS = f"{_MONSTERS} {_TO_TAKE} {_DECORATIONS}".split()
 
 SPRITES = dict(zip(map(int, _WORDS[::2]), _WORDS[1::2], strict=True))
 
-MEDIUM = 0x02  # the flag of what is there at the middle skill
-MULTIPLAYER = 0x10  # and of what is there only for several players
+MEDIUM = 0x02  # the flag of things at the middle skill
+MULTIPLAYER = 0x10  # the flag of things only for several players

@@ -11,7 +11,7 @@ from omg import WAD
 FOLDER = Path("/usr/share/games/doom")
 WADS = ("freedoom1", "freedoom2")
 METRE = 32.0  # map units; the player, 56 of them, is 1.75 m tall
-NOBODY = 0xFFFF  # the sidedef of a line that has none
+NOBODY = 0xFFFF  # the sidedef of a side without one
 
 _NAME = "S8"
 _LINES = [(n, "<u2") for n in ("start", "end", "flags", "special", "tag", "front", "back")]
@@ -35,13 +35,13 @@ class Map:
 
 
 def text(name: bytes) -> str:
-    """A name in a WAD: what stands before the first zero, in capitals."""
+    """A name in a WAD: the text before the first zero byte, in capitals."""
     return name.split(b"\0")[0].decode("ascii", "replace").upper()
 
 
 @cache
 def open_wad(path: Path) -> WAD:
-    """Raises SystemExit, with a sentence, where the game is not installed."""
+    """The WAD in a file; SystemExit with a message if the game is not installed."""
     if not path.is_file():
         raise SystemExit(f"{path} is missing: apt-get install freedoom")
     return WAD(str(path))
@@ -67,7 +67,7 @@ def read_map(wad: WAD, name: str, called: str) -> Map:
 
 
 def _sky(name: str) -> str:
-    """An episode's sky, E2M3, or that of a third of the second game, MAP14."""
+    """The sky of an episode (E2M3), or of a third of the second game (MAP14)."""
     if name.startswith("E"):
         return f"SKY{name[1]}"
     number = int(name[3:])

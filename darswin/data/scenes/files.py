@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Literal
 
 from darswin.data.cameras import Calibrations
-from darswin.data.folders import OTHER_SUFFIXES, PICTURES, SUFFIXES, files_below
+from darswin.data.folders import OTHER_SUFFIXES, PICTURES, SUFFIXES, files_below, warn_of_unread
 from darswin.data.scenes.scene import Classes, Target, read_label_map, read_palette
 from darswin.data.splits import (
     Split,
@@ -186,13 +186,9 @@ def stems(folder: Path, suffixes: Sequence[str] | frozenset[str]) -> dict[str, s
 def pictures_in(folder: Path) -> dict[str, str]:
     """The pictures below a folder, as `stems`; FileNotFoundError if there are none."""
     found = stems(folder, SUFFIXES)
-    others = list(stems(folder, OTHER_SUFFIXES))
     if not found:
         raise FileNotFoundError(f"no pictures in {folder}")
-    if others:
-        warn_left_out(
-            f"{folder} holds pictures that darswin does not read, {some(others)}: left out"
-        )
+    warn_of_unread(folder, list(stems(folder, OTHER_SUFFIXES).values()))
     return found
 
 

@@ -380,7 +380,7 @@ def test_missing_labels_and_pictures_are_named(tmp_path):
         assert len(open_scenes(tmp_path, "train", "labels", splits=file, holdout=0)) == 2
     text = "\n".join(str(warning.message) for warning in caught)
     assert "1 files of labels have no picture" in text
-    assert "pictures that darswin does not read, ['003']" in text
+    assert "pictures that darswin does not read, 1 .gif" in text
     (tmp_path / "distance" / "001.npy").write_bytes(b"")
     with pytest.raises(ValueError, match=r"001\.npy and .*001\.png have the same stem"):
         open_scenes(tmp_path, "all", "distance")
