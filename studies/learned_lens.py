@@ -128,7 +128,7 @@ def usual_map(model: DarSwin, data: str) -> Usual:
 def losses(
     model: DarSwin, images: Tensor, labels: Tensor, lens: Lens, usual: Usual
 ) -> dict[str, Tensor]:
-    """Of the model with a lens on its images.
+    """The losses of the model with a lens on its images.
 
     - "labels": cross-entropy.
     - "entropy": of the prediction for each image; no labels, and so in the next two.

@@ -49,7 +49,7 @@ class Body:
     def distance(
         self, surface: np.ndarray, origin: np.ndarray, direction: np.ndarray
     ) -> np.ndarray:
-        """The distances (N,), m, along rays (N, 3) from a point (3,) to the surfaces' planes (N,)."""
+        """The distances (N,), m, along rays (N, 3) from a point (3,) to the planes of surfaces."""
         normal = self.surfaces.normal[surface]
         with np.errstate(divide="ignore", invalid="ignore"):
             found = (self.surfaces.offset[surface] - normal @ origin) / (normal * direction).sum(1)

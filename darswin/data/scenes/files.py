@@ -77,8 +77,8 @@ class Options:
         return class_of, classes
 
     def choose_part(self, parts: Mapping[Split, Path], root: Path) -> tuple[Split, Choose]:
-        """Of a data set with a folder or list for each split, the part that the split is taken
-        from, and the function that chooses the split's stems."""
+        """The part of a divided data set from which the split is taken, and the function that
+        chooses the stems of the split."""
         if self.splits is not None:
             raise ValueError(f"{self.splits} lists splits, but {root} has a folder for each")
         split = self.split
