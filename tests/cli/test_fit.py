@@ -44,7 +44,10 @@ def scenes(tmp_path_factory):
         ("--data.test_lenses=low --data.lens {}", "--data.test_lenses warps pictures through"),
         (f"--data.lens {FILES / 'kalibr_tumvi.yaml'}", "choose one with --data.camera: 'cam0'"),
         ("--xi 0.3 --data.lens {}", "--xi warps pictures through lenses, and --data.lens says"),
-        (f"--data.lens {CALIBRATIONS / 'kalibr_fov.yaml'}", "choose one as --data.camera: 'cam0'"),
+        (
+            f"--data.lens {CALIBRATIONS / 'kalibr_fov.yaml'}",
+            "choose one with --data.camera: 'cam0'",
+        ),
         ("--model.learning_rate 0", "--model.learning_rate must be above 0, got 0"),
         ("--model.options {foo:1}", "--model.options "),
         ("--model.options {embed_dim:1099511627776}", "not enough memory: a smaller --data.batch"),

@@ -229,7 +229,7 @@ def test_wrong_label_maps_are_named(tmp_path):
     write_plain(tmp_path, 1)
     file = tmp_path / "map.json"
     for content, message in (
-        ([0], r"map\.json must be a JSON object of ids and their classes, such as"),
+        ([0], r"map\.json must be a JSON object that maps ids to classes"),
         ({"x": 0}, "got the id 'x'"),
         ({"0": 3}, "maps the id 0 to 3, but the classes are .*sky"),
         ({"0": "sky", "1": 1}, r"maps the id 1 to 1, but the classes are \['sky'\]"),
@@ -360,7 +360,7 @@ def test_a_camera_of_the_calibration_beside_the_pictures(tmp_path):
     (tmp_path / "lens.json").unlink()
     shutil.copy(WOODSCAPE.parent / "kalibr_fov.yaml", tmp_path / "lens.yaml")
     with pytest.raises(
-        ValueError, match=r"lens\.yaml: it has several cameras, choose one as camera="
+        ValueError, match=r"lens\.yaml: it has several cameras, choose one with camera="
     ):
         open_scenes(tmp_path, "all", "labels")
     lenses = [open_scenes(tmp_path, "all", "labels", camera=f"cam{k}").lenses for k in range(2)]
