@@ -53,7 +53,7 @@ def form_of(file: Callable[[int], Path | None], count: int) -> Form:
 class Source(Limited):
     """A sequence of pictures: `source[i]` is (image (H, W, C) uint8, label)."""
 
-    def __init__(self, labels: np.ndarray, classes: Sequence[str], channels: int):
+    def __init__(self, labels: np.ndarray, classes: Sequence[str], channels: int = 3):
         self.labels, self.classes, self.channels = labels, list(classes), channels
 
     def __len__(self) -> int:
@@ -80,14 +80,8 @@ class ImageFiles(Source):
 
     PER_PICTURE = ("labels", "paths")
 
-    def __init__(
-        self,
-        root: Path,
-        files: Sequence[tuple[str, int]],
-        classes: Sequence[str],
-        channels: int = 3,
-    ):
-        super().__init__(np.array([label for _, label in files], np.int64), classes, channels)
+    def __init__(self, root: Path, files: Sequence[tuple[str, int]], classes: Sequence[str]):
+        super().__init__(np.array([label for _, label in files], np.int64), classes)
         self.root = Path(root)
         # Worker processes share an array, but would copy a million strings.
         self.paths = np.array([os.fsencode(path) for path, _ in files], dtype=np.bytes_)
@@ -172,23 +166,22 @@ def open_source(
         raise FileNotFoundError(f"no folder {root}")
     source: Source
     if str(path) == "digits":
-        source = _digits(split, channels or 3, names, holdout)
+        source = _digits(split, names, holdout)
     elif in_memory:
-        source = _idx(root, split, channels or 3, names, holdout)
+        source = _idx(root, split, names, holdout)
     else:
         (folder, paths), names = open_folder(root, split, names, splits, holdout)
         label = {name: k for k, name in enumerate(names)}
-        source = ImageFiles(folder, [(p, label[class_of(p)]) for p in paths], names, channels or 3)
+        source = ImageFiles(folder, [(p, label[class_of(p)]) for p in paths], names)
     if not len(source):
         raise FileNotFoundError(
             f"no images for the {split!r} split of {path}: `holdout` {holdout:g} leaves none for it"
         )
-    if channels is None:
-        source.channels = source.form().channels
+    source.channels = channels or source.form().channels
     return source
 
 
-def _digits(split: Split, channels: int, names: list[str] | None, holdout: float) -> Arrays:
+def _digits(split: Split, names: list[str] | None, holdout: float) -> Arrays:
     """scikit-learn's 1797 scanned digits of 8×8 pixels."""
     from sklearn.datasets import load_digits
 
@@ -197,15 +190,13 @@ def _digits(split: Split, channels: int, names: list[str] | None, holdout: float
     keys = [str(k) for k in range(len(labels))]
     part = hold_out(labels, keys, holdout, ("test", "val"))[split]
     images = np.round(digits.images[part] * (255 / 16)).astype(np.uint8)
-    return Arrays(images, digits.target[part], names or [str(k) for k in range(10)], channels)
+    return Arrays(images, digits.target[part], names or [str(k) for k in range(10)])
 
 
 # -- IDX files, the MNIST family --------------------------------------------------------------
 
 
-def _idx(
-    root: Path, split: Split, channels: int, names: list[str] | None, holdout: float
-) -> Arrays:
+def _idx(root: Path, split: Split, names: list[str] | None, holdout: float) -> Arrays:
     labels = read_idx(root, "train-labels-idx1-ubyte")
     names = names or [str(k) for k in range(int(labels.max(initial=0)) + 1)]
     if split == "test":
@@ -220,7 +211,7 @@ def _idx(
         raise ValueError(
             f"{root} has labels up to {last} in the {split!r} split, but its classes are {names}"
         )
-    return Arrays(images, labels, names, channels)
+    return Arrays(images, labels, names)
 
 
 def _idx_file(root: Path, name: str) -> Path | None:

@@ -91,21 +91,11 @@ def open_scenes(
     if not root.is_dir():
         raise FileNotFoundError(f"no folder {root}")
     options = Options(
-        split,
-        target,
-        channels or 3,
-        lens,
-        camera,
-        coefficients,
-        classes,
-        splits,
-        label_map,
-        holdout,
+        split, target, lens, camera, coefficients, classes, splits, label_map, holdout
     )
     for recognizes, open_split in READERS:
         if recognizes(root):
             scenes = open_split(root, options)
-            if channels is None:
-                scenes.channels = scenes.form().channels
+            scenes.channels = channels or scenes.form().channels
             return scenes
     raise FileNotFoundError(f"no scenes in {root}: {FORM}")

@@ -61,11 +61,9 @@ def open_cityscapes(root: Path, options: Options) -> Scenes:
         lambda: Classes([name for _, name, _ in CLASSES], [color for _, _, color in CLASSES]),
         {id_: k for k, (id_, _, _) in enumerate(CLASSES)},
     )
-    return Scenes(
-        root, list(pairs.values()), options.shared_lens(root), target="labels",
-        channels=options.channels, classes=classes,
-        read=partial(read_labels, classes=len(classes.names), class_of=class_of),
-    )  # fmt: skip
+    files, lenses = list(pairs.values()), options.shared_lens(root)
+    read = partial(read_labels, classes=len(classes.names), class_of=class_of)
+    return Scenes(root, files, lenses, target="labels", classes=classes, read=read)
 
 
 def _ending_in(ending: str, files: dict[str, str]) -> dict[str, str]:

@@ -58,10 +58,9 @@ def open_coco(root: Path, options: Options) -> Scenes:
         what="labels",
         strict=False,
     )
-    return Scenes(
-        root, list(pairs.values()), options.shared_lens(root), target="labels",
-        channels=options.channels, classes=classes, read=partial(read_segments, segments=segments),
-    )  # fmt: skip
+    files, lenses = list(pairs.values()), options.shared_lens(root)
+    read = partial(read_segments, segments=segments)
+    return Scenes(root, files, lenses, target="labels", classes=classes, read=read)
 
 
 def _files(root: Path) -> dict[Split, Path]:

@@ -33,7 +33,6 @@ class Options:
 
     split: ScenesSplit
     target: Target
-    channels: int
     lens: str | Path | None
     camera: str | None
     coefficients: str | None

@@ -43,7 +43,5 @@ def open_kitti360(root: Path, options: Options) -> Scenes:
     lenses = options.given_lens(root) or lenses_beside(
         options, root, pairs, lambda stem: root / "calibration" / f"{views[stem]}.yaml"
     )
-    return Scenes(
-        root, list(pairs.values()), lenses, target="distance", channels=options.channels,
-        views=list(views.values()),
-    )  # fmt: skip
+    files = list(pairs.values())
+    return Scenes(root, files, lenses, target="distance", views=list(views.values()))

@@ -59,10 +59,8 @@ def _scenes(root: Path, folder: Path, options: Options, choose: Choose) -> Scene
         class_of, classes = options.labels(partial(_classes, folder, root))
         read = partial(read_labels, classes=len(classes.names), class_of=class_of)
     lenses = options.given_lens(root) or _lenses(root, folder, pairs, options)
-    return Scenes(
-        folder, list(pairs.values()), lenses, target=target,
-        channels=options.channels, classes=classes, read=read,
-    )  # fmt: skip
+    files = list(pairs.values())
+    return Scenes(folder, files, lenses, target=target, classes=classes, read=read)
 
 
 def _lenses(root: Path, folder: Path, pairs: Pairs, options: Options) -> Calibrations:

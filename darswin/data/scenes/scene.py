@@ -53,7 +53,6 @@ class Scenes(Limited):
     Args:
         root: the folder of the files. files: (picture, target) pairs, relative to `root`.
         lenses: the lenses of the pictures. target: "labels" or "distance", the kind of the targets.
-        channels: the channels of the images, 3 or 1.
         classes: the names and colours of the ids in labels.
         views: the name of each picture's camera in `cameras`; None takes the names from `lenses`.
         read: the function that reads a target file; None means `read_labels` or `read_distance`.
@@ -61,6 +60,7 @@ class Scenes(Limited):
             picture of this height, and the same share of other pictures. The lenses follow.
 
     Attributes:
+        channels: the channels of the images, 3 or 1.
         classes, colors: the names and colours of the classes. cameras: the names of the cameras.
         unknown: (N,) int64, the number of pixels in each target without a label or a distance; -1
             if no process has read the target yet.
@@ -75,13 +75,12 @@ class Scenes(Limited):
         lenses: Calibrations,
         *,
         target: Target,
-        channels: int = 3,
         classes: Classes = NO_CLASSES,
         views: Sequence[str] | None = None,
         read: Callable[[Path], np.ndarray] | None = None,
         trim: tuple[int, int] = (0, 1),
     ):
-        self.root, self.lenses, self.target, self.channels = Path(root), lenses, target, channels
+        self.root, self.lenses, self.target, self.channels = Path(root), lenses, target, 3
         self.classes, self.colors = list(classes.names), list(classes.colors)
         if read is None:
             labels = target == "labels"

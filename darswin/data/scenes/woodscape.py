@@ -98,8 +98,8 @@ def _scenes(
         [_view_of(s) for s in pairs],
     )
     return Scenes(
-        root, list(pairs.values()), lenses, target=target, channels=options.channels,
-        classes=classes, views=views, read=read, trim=trim,
+        root, list(pairs.values()), lenses, target=target, classes=classes, views=views, read=read,
+        trim=trim,
     )  # fmt: skip
 
 
