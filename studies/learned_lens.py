@@ -131,10 +131,11 @@ def losses(
     """The losses of the model with a lens on its images.
 
     - "labels": cross-entropy.
-    - "entropy": of the prediction for each image; no labels, and so in the next two.
-    - "information": the entropy less that of the mean prediction, so that not all become alike.
-    - "statistics": whether the first stage's map has, at each place, the mean and variance that it
-      had in training.
+    - "entropy": the entropy of the prediction for each image; no labels, as in the next two.
+    - "information": the entropy minus the entropy of the mean prediction, so that the predictions
+      do not all become equal.
+    - "statistics": the difference of the first stage's map from its mean and variance in training,
+      at each place.
 
     Source: entropy, Wang et al., ICLR 2021; information, Liang, Hu and Feng, ICML 2020;
     statistics, after Mirza et al., CVPR 2023.

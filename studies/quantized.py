@@ -87,16 +87,22 @@ def compared(models: dict, pictures, batch: int) -> dict[str, float]:
 
 def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--level", choices=LEVELS, default="low", help="of the training lenses")
-    parser.add_argument("--cell", help="only the cells whose key has this in it")
+    parser.add_argument(
+        "--level", choices=LEVELS, default="low", help="the level of the training lenses"
+    )
+    parser.add_argument("--cell", help="runs only cells whose key contains this text")
     parser.add_argument("--seeds", type=int, default=3)
-    parser.add_argument("--size", default="nano", help="of the models")
-    parser.add_argument("--test-images", type=int, default=1000, help="through every lens")
-    parser.add_argument("--pictures", type=int, default=256, help="of training, for the ranges")
+    parser.add_argument("--size", default="nano", help="the size of the models")
+    parser.add_argument(
+        "--test-images", type=int, default=1000, help="the number of test images for every lens"
+    )
+    parser.add_argument(
+        "--pictures", type=int, default=256, help="the number of training pictures for the ranges"
+    )
     parser.add_argument("--processes", type=int, default=os.cpu_count())
     parser.add_argument("--out", type=Path, default=Path("out/study"))
     parser.add_argument("--results", type=Path, default=HERE / "results")
-    args, options = parser.parse_known_args(arguments)  # the others are options of `darswin fit`
+    args, options = parser.parse_known_args(arguments)  # other options are for `darswin fit`
     cells = [
         cell
         for cell in headline(args.seeds)

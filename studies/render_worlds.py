@@ -1,9 +1,9 @@
 """Renders pictures, labels and distances of Freedoom's worlds through lenses.
 
-The textures are a game's, drawn by hand, under the BSD licence: `apt-get install freedoom`,
-https://freedoom.github.io. Training, validation and test pictures are of different maps. What is
-written is a data set for `darswin fit --task segmentation` and `--task distance`; a rendering that
-was stopped goes on. `make worlds` makes a small one.
+The textures of the game are drawn by hand and under the BSD licence: `apt-get install freedoom`,
+https://freedoom.github.io. Training, validation and test pictures show different maps. The result
+is a data set for `darswin fit --task segmentation` and `--task distance`. A rendering that was
+stopped goes on. `make worlds` makes a small data set.
 """
 
 import argparse
@@ -25,14 +25,18 @@ def main(arguments: list[str] | None = None) -> None:
         default="0..1",
         help='"wide", ξ as "0.4", a range as "0.2..0.35", "polynomial", or a FILE[:CAMERA]',
     )
-    parser.add_argument("--fov-deg", type=float, default=165, help="full, of lenses given by ξ")
-    parser.add_argument("--size", type=int, default=128, help="of the square pictures, px")
-    parser.add_argument("--train", type=int, default=1000, help="pictures")
-    parser.add_argument("--val", type=int, default=100, help="pictures")
-    parser.add_argument("--test", type=int, default=200, help="pictures")
+    parser.add_argument(
+        "--fov-deg", type=float, default=165, help="the full field of view of lenses given by ξ"
+    )
+    parser.add_argument("--size", type=int, default=128, help="the size of the square pictures, px")
+    parser.add_argument("--train", type=int, default=1000, help="the number of pictures")
+    parser.add_argument("--val", type=int, default=100, help="the number of pictures")
+    parser.add_argument("--test", type=int, default=200, help="the number of pictures")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--processes", type=int, default=os.cpu_count())
-    parser.add_argument("--sheet", type=Path, help="only draws a few pictures side by side, here")
+    parser.add_argument(
+        "--sheet", type=Path, help="only draws a few pictures side by side into this file"
+    )
     args = parser.parse_args(arguments)
     if args.sheet:
         draw_sheet(args.sheet)

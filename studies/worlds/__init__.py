@@ -1,7 +1,7 @@
 """Pictures, labels and distances of the worlds of a game, Freedoom, through any lens.
 
-`wad` reads maps, `geometry` makes surfaces of them, `textures` and `things` say how they look,
-`scene` casts rays, `render` makes pictures of a pose through a lens, `poses` finds poses, `dataset`
-writes them. Freedoom's textures are a game's, drawn by hand; they are under the BSD licence
+`wad` reads maps, `geometry` turns them into surfaces, and `textures` and `things` hold their
+pictures. `scene` casts rays, `poses` finds poses, `render` renders a pose through a lens, and
+`dataset` writes the results. Freedoom's textures are drawn by hand and under the BSD licence
 (https://freedoom.github.io).
 """

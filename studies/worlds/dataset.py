@@ -36,11 +36,10 @@ class Target:
 def write_map(name: str, split: str, targets: Sequence[Target], size: int, count: int, seed: int):
     """Writes the pictures of one map into `split` of each target; all see the same poses.
 
-    A map that is there already is left as it is: its `done/MAP.json` is written last and says how
-    it was made.
+    A finished map is left as it is. Its `done/MAP.json` is written last and records its options.
 
     Raises:
-        ValueError: what is there was made otherwise.
+        ValueError: the map was made with other options.
     """
     made = {t: dict(lenses=t.lenses, fov=t.fov, size=size, count=count, seed=seed) for t in targets}
     open_targets = [t for t in targets if not _is_done(_done(t, split, name), made[t])]

@@ -128,10 +128,10 @@ def outlines(map: Map) -> list[np.ndarray]:
 
 
 def triangulate(outline: np.ndarray) -> np.ndarray:
-    """The inside of closed polygons, holes and islands included, (N, 2, 2) → (T, 3, 2).
+    """The triangles (T, 3, 2) inside closed polygons (N, 2, 2), with holes and islands.
 
-    It is cut into trapezoids at the height of each corner, and what is inside alternates along
-    each slab. So an outline that is not closed, as some maps have, does harm in its own slabs only.
+    The inside is cut into trapezoids at the height of each corner; inside and outside alternate
+    along each slab. Some maps have open outlines: these spoil only their own slabs.
     """
     low_first = outline[:, 0, 1] <= outline[:, 1, 1]
     low = np.where(low_first[:, None], outline[:, 0], outline[:, 1])

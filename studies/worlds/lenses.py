@@ -15,11 +15,10 @@ def draw_lens(name: str, size: int, fov: float, rng: np.random.Generator) -> Len
     """One lens of square pictures of `size` px.
 
     Args:
-        name: "wide", perspective lenses of 60° to 90° that fill the square; what
-            `darswin.data.parse_lenses` takes: a ξ, a range of them, a level of the paper or
-            "polynomial", whose field of view `fov` (rad) fills the circle in the square; or a
-            calibration file, FILE or FILE:CAMERA, whose picture is cut to a square around its
-            middle.
+        name: one of three kinds. "wide" means perspective lenses of 60° to 90° that fill the
+            square. A name for `darswin.data.parse_lenses` (one ξ, a range, a level of the paper or
+            "polynomial") gives a lens whose field of view `fov` (rad) fills the circle in the
+            square. FILE or FILE:CAMERA is a calibration file; its picture is cut to a square.
 
     Raises:
         ValueError: a name of no lens, or a calibration of unknown image size.

@@ -37,8 +37,8 @@ def rays_of(lens: Lens, samples: int = SAMPLES) -> np.ndarray:
 def render(scene: Scene, pose: Pose, rays: np.ndarray) -> View:
     """The view of a camera at a pose along `rays_of` a lens.
 
-    Label and distance are those of the ray through a pixel's centre. The colour is the mean of all
-    rays of the pixel in linear light; what has no ray is black.
+    The ray through the centre of a pixel gives its label and distance. The colour is the mean of
+    all rays of the pixel in linear light. Pixels without a ray are black.
     """
     height, width, samples, _ = rays.shape
     flat = rays.reshape(-1, 3)

@@ -12,7 +12,7 @@ GREY = "(none)"  # for a surface whose texture is missing
 
 
 class Textures:
-    """The materials of one WAD, put together from its lumps as they are asked for.
+    """The materials of one WAD, made from its lumps when they are requested.
 
     A material is a wall's texture ("wall", NAME), a flat ("flat", NAME) or a sprite
     ("sprite", NAME); `number` gives its number.
