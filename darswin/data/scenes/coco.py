@@ -32,9 +32,9 @@ def open_coco(root: Path, options: Options) -> Scenes:
     """A split; options and errors as `darswin.data.open_scenes`."""
     if options.target != "labels":
         raise ValueError(f"{root} looks like COCO panoptic, which has labels but no distances")
-    files = _files(root)
-    part, choose = options.choose_part(files, root)
-    file = files[part]
+    parts = _files(root)
+    part, choose = options.choose_part(parts, root)
+    file = parts[part]
     content = read_json(file)
     try:
         categories, annotations = content["categories"], content["annotations"]
