@@ -13,7 +13,7 @@ from torch import Tensor
 
 from darswin.lens.base import Lens
 from darswin.lens.pixels import OUTSIDE, pixel_rays, sample_at
-from darswin.lens.spacing import Spacing, check_tan, span, to_spacing, to_theta
+from darswin.lens.spacing import Spacing, span, to_spacing, to_theta
 from darswin.ops.checks import tensor_there
 
 
@@ -44,8 +44,6 @@ def disc_to_square(radius: Tensor, direction: Tensor) -> Tensor:
 
 def square_view(lens: Lens, image_size: tuple[int, int], size: int, spacing: Spacing) -> Tensor:
     """(N, S, S, 2) px: the places in images of (H, W) of the pixels of a square with `size` S."""
-    if spacing == "tan":
-        check_tan(lens)
     like = lens.theta_max
     steps = (2 * torch.arange(size, dtype=like.dtype, device=like.device) + 1) / size - 1
     places = torch.stack(torch.meshgrid(steps, steps, indexing="xy"), -1)
@@ -58,8 +56,6 @@ def square_view(lens: Lens, image_size: tuple[int, int], size: int, spacing: Spa
 def square_places(lens: Lens, image_size: tuple[int, int], spacing: Spacing) -> Tensor:
     """(N, H, W, 2): the places in the square of the images' pixels; `OUTSIDE` where no ray of
     [0, θ_max] lands."""
-    if spacing == "tan":
-        check_tan(lens)
     theta, direction = pixel_rays(lens, image_size)
     seen = ~theta.isnan()  # NaN must not reach the gradients
     first, last = (end[:, :, None] for end in span(lens, spacing))

@@ -36,7 +36,9 @@ def check_tan(lens: Lens) -> None:
 
 
 def span(lens: Lens, spacing: Spacing) -> tuple[Tensor, Tensor]:
-    """The values of a spacing at θ = 0 and θ_max, (N, 1) each."""
+    """The values of a spacing at θ = 0 and θ_max, (N, 1) each. Raises the errors of `check_tan`."""
+    if spacing == "tan":
+        check_tan(lens)
     last = lens.theta_max[:, None]
     return to_spacing(lens, torch.zeros_like(last), spacing), to_spacing(lens, last, spacing)
 

@@ -154,3 +154,6 @@ def test_a_table_without_slopes_is_scipys_pchip():
     exact = PchipInterpolator(lens.angles[0], lens.radii[0])
     theta = torch.linspace(lens.angles[0, 1], lens.angles[0, -2], 100, dtype=f64)
     torch.testing.assert_close(lens.project(theta), torch.from_numpy(exact(theta)))
+    angles = double(0, 0.2, 0.5, 0.9)
+    parabola = Tabulated(angles, 100 * angles - 20 * angles**2)
+    torch.testing.assert_close(parabola._slope(angles[[0, -1]]), double(100, 100 - 40 * 0.9))

@@ -43,6 +43,8 @@ def test_unproject_undoes_project_and_finds_nothing_beyond(name):
         radius = lens.project(theta)
         evenly = lens.theta_max[:, None] * torch.linspace(0, 0.999, 300, dtype=f64)
         assert radius.isfinite().all() and (lens.project(evenly).diff(dim=1) > 0).all()
+        inner = evenly[:, :200]
+        torch.testing.assert_close(lens.resized(2).project(inner), 2 * lens.project(inner))
         found = lens.unproject(radius)
         if name == "OCamInverse":  # its polynomial need not be 0 at θ = 0
             theta, found = theta[:, 5:], found[:, 5:]

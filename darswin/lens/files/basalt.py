@@ -46,5 +46,5 @@ def _camera(entry: Fields, size: Size) -> Description:
     model, names = MODELS[kind]
     intrinsics = entry.section("intrinsics")
     values = intrinsics.values(f"fx fy cx cy {names}")
-    intrinsics.check_all_read(f"basalt's {kind}", known=("rpmax",))
+    intrinsics.check_all_read(f"basalt's {kind}", lambda name, _: name != "rpmax")
     return describe(model, {"beta": 1.0} | values, size)

@@ -120,17 +120,13 @@ class Fields:
         return self.entries[name]
 
     def check_all_read(
-        self,
-        camera: str,
-        like: Callable[[str, Any], bool] = lambda name, value: True,
-        known: Iterable[str] = (),
+        self, camera: str, like: Callable[[str, Any], bool] = lambda name, value: True
     ) -> None:
         """Raises ValueError if an entry that holds numbers was not read: it might be a coefficient
-        under another name. Only entries for which `like` is true and that are not `known` count."""
+        under another name. Only entries for which `like` is true count."""
         left = [
             self.path(name) for name, value in self.entries.items()
-            if name not in self._read and name not in known and like(str(name), value)
-            and holds_numbers(value)
+            if name not in self._read and like(str(name), value) and holds_numbers(value)
         ]  # fmt: skip
         if left:
             raise ValueError(f"{camera} does not use the numbers of {listed(left)}")
