@@ -143,6 +143,8 @@ def test_zones():
     zones = Zones([30, 60, 90])
     theta = torch.tensor([0.0, 29.9, 30.1, 89.9, 90.1, 140.0]).deg2rad()
     assert zones.of(theta).tolist() == [0, 0, 1, 2, 3, 3]
+    border = torch.tensor([math.pi / 2], dtype=torch.float64)  # is in the outer zone
+    assert zones.of(border).tolist() == [3]
     assert [(z["from_deg"], z["to_deg"]) for z in zones.ranges()] == [
         (0, 30), (30, 60), (60, 90), (90, None),
     ]  # fmt: skip

@@ -254,6 +254,9 @@ def test_test_sets_have_the_classes_of_the_training(folder, tmp_path):
     with pytest.raises(ValueError, match="test a model on the classes that it was trained on"):
         data.dataset("test", data.test_names[0])
     assert LabelData(str(folder), lens=str(WOODSCAPE), fit="stretch").frame_fit == "stretch"
+    label_map = tmp_path / "map.json"
+    label_map.write_text('{"0": "above", "1": "below", "2": "below"}')
+    assert LabelData(str(folder), label_map=str(label_map)).classes == ["above", "below"]
 
 
 def of_task(path, name=NAME, size=None, **options):

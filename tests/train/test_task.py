@@ -101,13 +101,16 @@ def test_metrics_are_those_of_torchmetrics_and_leave_broken_pictures_out():
     [(200, {}, 64), (50, {}, 50), (20, {}, 32), (200, dict(size=96), 96), (50, dict(size=20), 20)],
 )
 def test_pictures_decide_on_size_and_channels(tmp_path, side, options, size):
-    for k in range(4):
-        write(tmp_path / "train" / "ab"[k % 2] / f"{k}.png", np.zeros((side, 300, 3), np.uint8))
-        write(tmp_path / "val" / "ab"[k % 2] / f"{k}.png", np.zeros((side, 300), np.uint8))
-    data = WideAngleData(str(tmp_path), **options)
-    assert (data.size, data.channels, len(data.mean), len(data.std)) == (size, 3, 3, 3)
-    assert data.dataset("val")[0][0].shape == (3, size, size)
-    grey = WideAngleData(str(tmp_path), channels=1, **options)
+    for channels, split, others in ((3, "train", "val"), (1, "val", "train")):
+        picture = np.zeros((side, 300, channels), np.uint8)
+        for k in range(4):
+            write(tmp_path / "colour" / split / "ab"[k % 2] / f"{k}.png", picture)
+            write(tmp_path / "grey" / others / "ab"[k % 2] / f"{k}.png", picture)
+    for name, channels in (("colour", 3), ("grey", 1)):  # as the training pictures are
+        data = WideAngleData(str(tmp_path / name), **options)
+        assert (data.size, data.channels, len(data.mean)) == (size, channels, len(data.std))
+        assert data.dataset("val")[0][0].shape == (channels, size, size)
+    grey = WideAngleData(str(tmp_path / "colour"), channels=1, **options)
     assert grey.mean == [0.449] and grey.dataset("val")[0][0].shape == (1, size, size)
 
 

@@ -267,6 +267,12 @@ def test_plain_folders_of_splits(tmp_path):
     write_plain(tmp_path, 10, split="train")
     parts = [names(open_scenes(tmp_path, part, "labels")) for part in ("train", "val", "test")]
     assert [len(part) for part in parts] == [9, 1, 2] and not set(parts[0]) & set(parts[1])
+    # The files of a split count before those of the root.
+    (tmp_path / "lens.json").write_text('{"model": "Equidistant", "fov": 2.0}')
+    (tmp_path / "train" / "classes.json").write_text('["a", "b", "c"]')
+    scenes = open_scenes(tmp_path, "train", "labels")
+    assert scenes.cameras == [str(tmp_path / "train" / "lens.json")]
+    assert scenes.classes == ["a", "b", "c"]
     (tmp_path / "test").rename(tmp_path / "valid")
     test = open_scenes(tmp_path, "test", "labels")  # "val" serves as the test set
     assert names(test) == names(open_scenes(tmp_path, "val", "labels")) == ["000", "001"]
