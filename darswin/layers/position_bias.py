@@ -26,7 +26,7 @@ class RelativeBias(nn.Module):
         self, window: tuple[int, int], heads: int, sectors: int, rows: tuple[int, int, int, int]
     ):
         super().__init__()
-        self.window, self.turn, self.heads = window, 2 * math.pi / sectors, heads
+        self.window, self.sector_angle, self.heads = window, 2 * math.pi / sectors, heads
         self.a_theta, self.b_theta, self.a_phi, self.b_phi = (
             nn.Parameter(nn.init.trunc_normal_(torch.empty(count, heads), std=0.02))
             for count in rows
@@ -52,7 +52,7 @@ class RelativeBias(nn.Module):
         theta = torch.cat((-outward[:, 1:].flip(1), outward), 1)
         reach = self.window[1]
         steps = torch.arange(1 - reach, reach, dtype=outward.dtype, device=outward.device)
-        phi = self.turn * steps
+        phi = self.sector_angle * steps
         along_r = self._axis(theta, a_theta, b_theta).transpose(1, 2)
         along_phi = self._axis(phi[None], a_phi, b_phi).transpose(1, 2)
         return along_r[..., None] + along_phi[..., None, :]
