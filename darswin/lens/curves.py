@@ -17,9 +17,11 @@ class Tabulated(Lens):
 
     Args:
         angles: (K,) or (N, K) rad, rising from 0; K ≥ 2.
-        radii: the same shape, px, rising from 0. Others: see `Lens`.
+        radii: the same shape, px, rising from 0.
         slopes: the same shape, px/rad: dr/dθ at the angles. The error for a smooth curve is then of
             the fourth power of the steps. None computes them from the table (PCHIP).
+
+    `Lens` describes the other arguments.
 
     Source: Fritsch and Carlson, SINUM 1980; Fritsch and Butland, SISSC 1984.
     """

@@ -41,7 +41,9 @@ class DistortedLens(FocalLens, register=False):
         focal: f > 0, px.
         radial: (n,) or (N, n): k₁, k₂, …, or None.
         tangential: (2,) or (N, 2): p₁, p₂, or None.
-        prism: (4,) or (N, 4): s₁ … s₄, or None. Others: see `Lens`.
+        prism: (4,) or (N, 4): s₁ … s₄, or None.
+
+    `Lens` describes the other arguments.
 
     A class defines w(θ), its slope and its inverse: `_plane`, `_plane_slope` and `_plane_angle`.
     """
@@ -232,7 +234,7 @@ def _circle(count: int, like: Tensor) -> Tensor:
 class KannalaBrandt(DistortedLens):
     """r = f (θ + k₁ θ³ + k₂ θ⁵ + …): OpenCV's fisheye model, Kalibr's and ROS's "equidistant".
 
-    Args: `focal`, `radial`, and those of `DistortedLens`, with w = θ.
+    `DistortedLens` describes the arguments; here w = θ.
 
     Source: Kannala and Brandt, PAMI 2006; OpenCV, cv::fisheye.
     """
@@ -247,7 +249,8 @@ class Fisheye624(KannalaBrandt):
     """`KannalaBrandt` with tangential and thin-prism terms that act after the radial ones.
 
     With six k, two p and four s, this is Project Aria's camera and COLMAP's
-    RAD_TAN_THIN_PRISM_FISHEYE. Arguments: see `KannalaBrandt`; Aria's p₀ and p₁ are our p₂ and p₁.
+    RAD_TAN_THIN_PRISM_FISHEYE. Aria's p₀ and p₁ are our p₂ and p₁. The arguments are those of
+    `KannalaBrandt`.
     """
 
     aside_last = True
@@ -258,7 +261,10 @@ class Mei(DistortedLens):
 
     OpenCV's omnidir, Kalibr's omni-radtan, KITTI-360's fisheyes. At ξ = 0, a pinhole with radtan.
 
-    Args: `xi`, ξ ≥ 0, `focal`, `radial`, and those of `DistortedLens`.
+    Args:
+        xi: ξ ≥ 0.
+
+    `DistortedLens` describes the other arguments.
 
     Source: Mei and Rives, ICRA 2007.
     """
@@ -284,9 +290,11 @@ class Mei(DistortedLens):
 class BrownConrady(DistortedLens):
     """A pinhole camera with distortion: w = tan θ, θ < 90°. OpenCV's standard model.
 
-    Args: `focal`, `radial`, those of `DistortedLens`, and
+    Args:
         denominator: (n,) or (N, n): k₄, k₅, … of OpenCV's rational model, or None. r is divided by
             1 + k₄ w² + k₅ w⁴ + ….
+
+    `DistortedLens` describes the other arguments.
 
     Source: Brown, 1966; OpenCV, calib3d.
     """

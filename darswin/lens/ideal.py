@@ -84,7 +84,7 @@ class Equidistant(IdealLens):
 
 
 class Equisolid(IdealLens):
-    """r = 2 f sin(θ/2): equal solid angles have equal areas. Arguments: `focal`; see `Lens`."""
+    """r = 2 f sin(θ/2): preserves solid angles. Arguments: `focal`, and those of `Lens`."""
 
     _top = 2.0
     _rise = staticmethod(lambda theta: 2 * torch.sin(theta / 2))
@@ -111,7 +111,9 @@ class FieldOfView(FocalLens):
     """r = f atan(2 tan(ω/2) tan θ) / ω: the FOV model, extended beyond 90°.
 
     Args:
-        omega: ω in (0, π), rad. focal: f > 0, px. Others: see `Lens`.
+        omega: ω in (0, π), rad. focal: f > 0, px.
+
+    `Lens` describes the other arguments.
 
     Source: Devernay and Faugeras, MVA 2001, sec. 3.1.
     """

@@ -56,7 +56,9 @@ class Polynomial(PolynomialLens):
     OpenCV's fisheye coefficients are of another kind: they belong to `KannalaBrandt`.
 
     Args:
-        coefficients: (n,) or (N, n): k₁ … k_n, in px. Others: see `Lens`.
+        coefficients: (n,) or (N, n): k₁ … k_n, in px.
+
+    `Lens` describes the other arguments.
 
     Source: DarSwin, ICCV 2023, eq. 4.
     """
@@ -77,7 +79,9 @@ class OCam(PolynomialLens):
     """tan θ = -r / (a₀ + a₁ r + a₂ r² + …): Scaramuzza's model, with a closed-form inverse.
 
     Args:
-        coefficients: (n,) or (N, n): a₀ < 0, a₁, … in px, 1, px⁻¹, … Others: see `Lens`.
+        coefficients: (n,) or (N, n): a₀ < 0, a₁, … in px, 1, px⁻¹, …
+
+    `Lens` describes the other arguments.
 
     Source: Scaramuzza, Martinelli and Siegwart, ICVS 2006; the OCamCalib toolbox.
     """
@@ -136,7 +140,9 @@ class OCamInverse(PolynomialLens):
     The toolbox fits it to the inverse of an `OCam` lens, to about 0.01 px.
 
     Args:
-        coefficients: (n,) or (N, n): b₀, b₁, … in px. Others: see `Lens`.
+        coefficients: (n,) or (N, n): b₀, b₁, … in px.
+
+    `Lens` describes the other arguments.
 
     Source: the OCamCalib toolbox, world2cam.
     """

@@ -18,7 +18,9 @@ class Spherical(FocalLens):
     """r = f sin θ / (ξ + cos θ): the unified model, perspective at ξ = 0, stereographic at ξ = 1.
 
     Args:
-        xi: ξ ≥ 0. focal: f > 0, px. Others: see `Lens`. r rises while cos θ > -min(ξ, 1/ξ).
+        xi: ξ ≥ 0. focal: f > 0, px.
+
+    r rises while cos θ > -min(ξ, 1/ξ). `Lens` describes the other arguments.
 
     Source: DarSwin, ICCV 2023, eq. 5; Barreto, CVIU 2006.
     """
@@ -47,7 +49,8 @@ class EnhancedUnified(FocalLens):
 
     Args:
         alpha: α in [0, 1]. beta: β > 0; or β < 0, for θ up to atan(1 / √-β). focal: f > 0, px.
-        Others: see `Lens`.
+
+    `Lens` describes the other arguments.
 
     Source: Khomutenko, Garcia and Martinet, RA-L 2016.
     """
@@ -86,7 +89,9 @@ class DoubleSphere(FocalLens):
     """r = f sin θ / (α √(sin² θ + (ξ + cos θ)²) + (1 - α) (ξ + cos θ)).
 
     Args:
-        xi: ξ > -1. alpha: α in [0, 1]. focal: f > 0, px. Others: see `Lens`.
+        xi: ξ > -1. alpha: α in [0, 1]. focal: f > 0, px.
+
+    `Lens` describes the other arguments.
 
     Source: Usenko, Demmel and Cremers, 3DV 2018.
     """

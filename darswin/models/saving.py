@@ -58,7 +58,7 @@ class ModelCard:
 
     @property
     def channels(self) -> int:
-        """The channels of the images: 1 for grey, 3 for colours."""
+        """The number of channels of the images, 1 for grey and 3 for colours."""
         return self.options.get("in_chans", 3)
 
     def create(self) -> Any:
