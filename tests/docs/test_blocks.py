@@ -8,6 +8,7 @@ checked against what declares it: the Makefile, pyproject.toml, the programs' ow
 import ast
 import functools
 import importlib
+import json
 import re
 import runpy
 import shlex
@@ -52,7 +53,8 @@ def blocks(page: Path) -> list[Block]:
     return [Block(match[2], match[3]) for match in FENCE.finditer(page.read_text())]
 
 
-CODE = [page for page in PAGES if {block.language for block in blocks(page)} - DIRECTIVES - SHOWN]
+JSON = [(page, block) for page in PAGES for block in blocks(page) if block.language == "json"]
+CODE = [page for page in PAGES if {block.language for block in blocks(page)} & {"python", "sh"}]
 
 
 def page_name(page: Path) -> str:
@@ -63,12 +65,17 @@ def test_every_block_is_of_a_kind_that_is_checked():
     for page in PAGES:
         text, found = page.read_text(), blocks(page)
         for block in found:
-            assert block.language in {"python", "sh"} | DIRECTIVES | SHOWN, (page, block)
+            assert block.language in {"python", "sh", "json"} | DIRECTIVES | SHOWN, (page, block)
         assert len(re.findall(r"^(?:```|:::)", text, re.M)) == 2 * len(found), page
     assert len(CODE) > 12
     assert [page_name(p) for p in PAGES if any(b.language in SHOWN for b in blocks(p))] == [
         "README.md"
     ]
+
+
+@pytest.mark.parametrize("page, block", JSON, ids=[page_name(page) for page, _ in JSON])
+def test_json_can_be_parsed(page, block):
+    json.loads(block.text)
 
 
 @pytest.fixture(scope="module")
