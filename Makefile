@@ -1,5 +1,5 @@
-# Every target sets up what it needs: a virtual environment in .venv with pinned packages, and the
-# compiled module beside the Python sources.
+# Every target prepares its requirements: a virtual environment in .venv with pinned packages, and
+# the compiled module beside the Python sources.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
@@ -7,31 +7,34 @@ STAMP := $(VENV)/installed
 
 .PHONY: help build demo test test-all test-triton test-gpu test-lowest test-isa test-asan fuzz kills mutants lint format bench bench-gpu study study-int8 learned-lens worlds study-dense tables docs dist wheels repair published-wheels test-torch aarch64 clean
 
-help:  ## this list
+help:  ## print this list
 	@grep -E '^[a-z0-9-]+:.*##' Makefile | sed -E 's/:.*## /\t/' | expand -t 18
 
 $(STAMP): requirements.txt pyproject.toml setup.py
-	$(PYTHON) -m venv $(VENV)
-	$(BIN)/pip install -q -r requirements.txt
-	PATH=$(CURDIR)/$(BIN):$$PATH $(BIN)/pip install -q --no-build-isolation --no-deps -e .
+	@echo "1/3 creating the environment $(VENV)"
+	@$(PYTHON) -m venv $(VENV)
+	@echo "2/3 installing the packages of requirements.txt, among them torch: a few minutes"
+	@$(BIN)/pip install -q -r requirements.txt
+	@echo "3/3 compiling and installing darswin: a few minutes"
+	@PATH=$(CURDIR)/$(BIN):$$PATH $(BIN)/pip install -q --no-build-isolation --no-deps -e .
 	@touch $@
 
 build: $(STAMP)  ## (re)build darswin/libdarswin.so in place
 	@PATH=$(CURDIR)/$(BIN):$$PATH $(BIN)/python setup.py -q build_ext --inplace
 
-demo: build  ## train on nearly undistorted digits, test through any fisheye, draw it (2 minutes)
+demo: build  ## train on nearly undistorted digits, test through fisheye lenses, draw a figure (2 minutes)
 	$(BIN)/python examples/digits.py
 
 # As many processes as cores, four at most: a process takes more than a gigabyte.
 PYTEST := OMP_NUM_THREADS=1 $(CURDIR)/$(BIN)/python -m pytest -n auto --maxprocesses=4 --dist worksteal
 
-test: build  ## the tests that take no time: values, gradients, errors
+test: build  ## run the fast tests: values, gradients, errors
 	$(PYTEST) -m "not slow"
 
-test-all: build  ## all tests: compiled graphs, processes, training and the pages' code too
+test-all: build  ## run all tests, also those that compile graphs, start processes, train or run the docs
 	$(PYTEST)
 
-# Triton stands in a folder of its own, so that all else is tested without it.
+# Triton is installed in its own folder, so that all other tests run without it.
 TRITON := .triton
 TRITON_VERSION := 3.9.0
 
@@ -40,15 +43,15 @@ $(TRITON)/$(TRITON_VERSION): $(STAMP)
 	$(BIN)/pip install -q --no-deps --target $(TRITON) triton==$(TRITON_VERSION)
 	@touch $@
 
-test-triton: build $(TRITON)/$(TRITON_VERSION)  ## the kernels for GPUs without one: interpreted, and compiled
+test-triton: build $(TRITON)/$(TRITON_VERSION)  ## test the kernels for GPUs without a GPU: interpreted, and compiled
 	TRITON_INTERPRET=1 PYTHONPATH=$(CURDIR)/$(TRITON) $(PYTEST) -q tests/gpu
 	PYTHONPATH=$(CURDIR):$(CURDIR)/$(TRITON) $(BIN)/python tests/gpu/compile_kernels.py
 
-# torch's builds for CUDA bring Triton. Without a device the tests say so and are skipped.
-test-gpu: build  ## the kernels and models on a CUDA device
+# torch's builds for CUDA contain Triton. Without a device, the tests are skipped with a message.
+test-gpu: build  ## test the kernels and models on a CUDA device
 	$(BIN)/python -m pytest -q -rs tests/gpu
 
-# Everything that pyproject.toml declares, at its lowest version, but for torch.
+# All requirements in pyproject.toml except torch, at their lowest versions.
 LOWEST := .venv-lowest
 
 $(LOWEST)/installed: pyproject.toml requirements.txt tests/lowest.py
@@ -57,12 +60,12 @@ $(LOWEST)/installed: pyproject.toml requirements.txt tests/lowest.py
 	$(LOWEST)/bin/pip install -q --only-binary :all: -r $(LOWEST)/requirements.txt
 	@touch $@
 
-test-lowest: build $(LOWEST)/installed  ## the commands, files, pictures and ONNX with the oldest libraries allowed
+test-lowest: build $(LOWEST)/installed  ## test the commands, files, pictures and ONNX with the oldest supported libraries
 	PYTHONPATH=$(CURDIR) $(LOWEST)/bin/python -m pytest -q tests/data tests/models/test_saving.py \
 	  tests/cli tests/viz \
 	  tests/deploy/test_export.py -k "not program and not package"
 
-test-isa: build  ## the operators' tests on every instruction-set tier of this machine
+test-isa: build  ## test the operators on every instruction-set tier of this machine
 	@set -e; for tier in $$($(BIN)/python -c 'from darswin.ops import _module; print(*_module.tiers())'); do \
 	  echo "== $$tier"; \
 	  ATEN_CPU_CAPABILITY=$$(echo $$tier | sed s/generic/default/) \
@@ -70,12 +73,12 @@ test-isa: build  ## the operators' tests on every instruction-set tier of this m
 	      tests/test_build.py::test_the_tier_in_use_is_the_one_asked_for; \
 	done
 
-# The sanitized module stands with a copy of the sources in a folder of its own, and the tests run
-# from there. Python itself is not sanitized, so the sanitizers' libraries come first.
+# The sanitized module is built with a copy of the sources in its own folder, and the tests run
+# there. Python itself is not sanitized, so the sanitizers' libraries must be loaded first.
 SANITIZED := build/sanitized
 PRELOAD = $(shell g++ -print-file-name=libasan.so):$(shell g++ -print-file-name=libstdc++.so)
 
-test-asan: build  ## the operators' tests on every tier under AddressSanitizer and UBSan
+test-asan: build  ## test the operators on every tier with AddressSanitizer and UBSan
 	@rm -rf $(SANITIZED)/darswin
 	@PATH=$(CURDIR)/$(BIN):$$PATH DARSWIN_SANITIZE=address,undefined \
 	  $(BIN)/python setup.py -q build --build-lib $(SANITIZED)
@@ -88,28 +91,28 @@ test-asan: build  ## the operators' tests on every tier under AddressSanitizer a
 	      -m "not unsanitized" $(CURDIR)/tests/ops; \
 	done
 
-fuzz: build  ## random and hostile calls of the operators, 100,000 wrong calibrations (40 minutes)
+fuzz: build  ## call the operators with random and hostile arguments, and read 100,000 wrong calibrations (40 minutes)
 	$(BIN)/python -X faulthandler -m pytest -q --hypothesis-profile=fuzz \
 	  tests/ops/test_properties.py tests/ops/test_hostile.py tests/lens/test_mutations.py
 
-kills: build  ## kill runs at random, and see that they end as if nothing had been (10 minutes)
+kills: build  ## kill training runs at random, and check that they continue exactly (10 minutes)
 	$(BIN)/python tests/train/kills.py
 
-mutants: build  ## change one thing in the code at a time and count what the tests notice (hours); goes on where it was stopped
+mutants: build  ## change single places of the code and count the changes that tests notice (hours; can be interrupted)
 	PATH=$(CURDIR)/$(BIN):$$PATH $(BIN)/python tests/mutants.py
 
-lint: $(STAMP)  ## ruff, mypy and clang-format, without changing anything
+lint: $(STAMP)  ## check the code with ruff, mypy and clang-format
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/clang-format --dry-run --Werror $$(find csrc -name '*.h' -o -name '*.cpp')
 
-format: $(STAMP)  ## ruff and clang-format, in place
+format: $(STAMP)  ## format the code with ruff and clang-format
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 	$(BIN)/clang-format -i $$(find csrc -name '*.h' -o -name '*.cpp')
 
-bench: build  ## time the operators against their peers, and training; nothing else should be running
+bench: build  ## time the operators against alternatives, and training; run nothing else meanwhile
 	$(BIN)/python benchmarks/sampling.py --out benchmarks/results
 	$(BIN)/python benchmarks/attention.py --out benchmarks/results
 	$(BIN)/python benchmarks/to_image.py --out benchmarks/results
@@ -120,33 +123,33 @@ bench: build  ## time the operators against their peers, and training; nothing e
 bench-gpu: build  ## time the operators and a model on a CUDA device
 	$(BIN)/python benchmarks/gpu.py
 
-study: build  ## the paper's experiments, small: an hour; goes on where it was stopped
+study: build  ## run the paper's experiments on a small scale (one hour; can be interrupted)
 	$(BIN)/python studies/study.py
 
-study-int8: build  ## what 8 bits cost the study's models: half an hour more; goes on where it was stopped
+study-int8: build  ## measure how much accuracy the study's models lose with 8 bits (half an hour; can be interrupted)
 	$(BIN)/python studies/quantized.py
 
-learned-lens: build  ## find unknown lenses by gradient descent: ten minutes; goes on where it was stopped
+learned-lens: build  ## find unknown lenses by gradient descent (ten minutes; can be interrupted)
 	$(BIN)/python studies/learned_lens.py
 
-worlds: build  ## render pictures, labels and distances of a game's worlds: 3 minutes; needs `apt-get install freedoom`
+worlds: build  ## render pictures, labels and distances of a game's worlds (3 minutes; needs `apt-get install freedoom`)
 	$(BIN)/python studies/render_worlds.py --out out/worlds
 
-study-dense: build  ## labels and distances through unknown lenses: 3 hours; goes on where it was stopped
+study-dense: build  ## study labels and distances through unknown lenses (3 hours; can be interrupted)
 	$(BIN)/python studies/dense.py
 
-tables: $(STAMP)  ## fill the tables of README and docs from the results of bench and study
+tables: $(STAMP)  ## fill the tables of README and docs with the results of bench and study
 	$(BIN)/python docs/fill.py
 
-docs: build  ## the site of docs/, in build/docs; warnings are errors
+docs: build  ## build the site of docs/ in build/docs; warnings are errors
 	$(BIN)/python -m sphinx -q -n -W --keep-going docs build/docs
 
-dist: $(STAMP)  ## sdist and wheel in dist/
+dist: $(STAMP)  ## build the sdist and the wheel in dist/
 	PATH=$(CURDIR)/$(BIN):$$PATH $(BIN)/python -m build --no-isolation --outdir dist
 
-# One wheel of a platform serves every Python. It shares its libraries with torch, which is imported
-# first. What is published is made by cibuildwheel, which runs `repair` and tests/installed.py too.
-wheels: $(STAMP)  ## the manylinux_2_28 wheel in dist/, tested in a fresh environment
+# One wheel of a platform serves every Python. It uses the libraries of torch, which is imported
+# first. cibuildwheel makes the published wheels; it runs `repair` and tests/installed.py too.
+wheels: $(STAMP)  ## build the manylinux_2_28 wheel in dist/, and test it in a fresh environment
 	rm -rf build/wheel
 	PATH=$(CURDIR)/$(BIN):$$PATH $(BIN)/python -m build --no-isolation --wheel --outdir build/wheel
 	PATH=$(CURDIR)/$(BIN):$$PATH $(MAKE) repair WHEEL="$$(echo build/wheel/*.whl)"
@@ -157,14 +160,14 @@ repair:
 	auditwheel repair --plat manylinux_2_28_$$(uname -m) --only-plat --wheel-dir "$(DEST)" \
 	  --exclude 'libtorch*' --exclude 'libc10*' --exclude 'libgomp*' "$(WHEEL)"
 
-published-wheels: $(STAMP)  ## the same in the manylinux_2_28 container, by cibuildwheel: needs Docker
+published-wheels: $(STAMP)  ## build the same wheel with cibuildwheel in the manylinux_2_28 container; needs Docker
 	$(BIN)/cibuildwheel --output-dir dist
 
-# The versions of torch that the wheel of `make wheels` is tested under, a fresh environment each.
+# The versions of torch to test the wheel of `make wheels` with, each in a fresh environment.
 TORCH := $(shell sed -n 's/^torch==//p' requirements.txt)
 SCRATCH := build/scratch
 
-test-torch:  ## the wheel under TORCH="2.10.0 2.11.0 …", on PYTHON; gigabytes of downloads each
+test-torch:  ## test the wheel with TORCH="2.10.0 2.11.0 …" on PYTHON; downloads gigabytes for each version
 	@set -e; for version in $(TORCH); do \
 	  echo "== torch $$version on $(PYTHON)"; \
 	  $(PYTHON) -m venv --clear $(SCRATCH); \
@@ -173,12 +176,12 @@ test-torch:  ## the wheel under TORCH="2.10.0 2.11.0 …", on PYTHON; gigabytes 
 	  $(SCRATCH)/bin/python tests/installed.py; \
 	done
 
-# It links against the libraries of torch's wheel for aarch64, unpacked.
-aarch64: $(STAMP)  ## cross-compile for aarch64 with g++-aarch64-linux-gnu and TORCH_DIR=…/torch
+# Links against the libraries of torch's unpacked wheel for aarch64.
+aarch64: $(STAMP)  ## cross-compile for aarch64; needs g++-aarch64-linux-gnu and TORCH_DIR=…/torch
 	PATH=$(CURDIR)/$(BIN):$$PATH; cmake --log-level=NOTICE -S . -B build/cmake-aarch64 -G Ninja \
 	  -DCMAKE_SYSTEM_NAME=Linux -DCMAKE_SYSTEM_PROCESSOR=aarch64 \
 	  -DCMAKE_CXX_COMPILER=aarch64-linux-gnu-g++ -DTORCH_DIR="$(TORCH_DIR)" \
 	  -DDARSWIN_OUTPUT_DIR=$(CURDIR)/build/aarch64 && cmake --build build/cmake-aarch64
 
-clean:  ## remove what was built
+clean:  ## remove all build results
 	rm -rf build dist darswin.egg-info darswin/libdarswin.so

@@ -1,9 +1,9 @@
-"""Writes pictures of computed rooms through a calibrated camera, with a label and a distance for
-each pixel, in the plain form of `darswin.data.open_scenes`.
+"""Renders pictures of rooms through a calibrated camera, with a label and a distance for each
+pixel, as a plain folder of `darswin.data.open_scenes`.
 
     python examples/rooms.py rooms --count 60
 
-The rooms have a floor, walls, a ceiling and boxes, of random sizes and colours; the camera is that
+The rooms have a floor, walls, a ceiling and boxes of random sizes and colours. The camera is that
 of examples/front.json, at a quarter of its size.
 """
 
@@ -38,7 +38,7 @@ def main() -> None:
 
 
 def write_rooms(folder: Path, count: int) -> None:
-    """A folder of pictures, labels and distances (metres × 256) with their lens and classes."""
+    """Writes pictures, labels and distances (metres × 256) with their lens and classes."""
     for name in ("images", "labels", "distance"):
         (folder / name).mkdir(parents=True, exist_ok=True)
     shutil.copy(CALIBRATION, folder / "lens.json")
@@ -55,7 +55,7 @@ def write_rooms(folder: Path, count: int) -> None:
 
 
 def camera_rays(finer: int) -> np.ndarray:
-    """Unit rays (H, W, 3) of pixels, x to the right, y down; those of no pixel's ray are NaN."""
+    """The unit rays (H, W, 3) of pixels, x to the right, y down; NaN beyond the lens."""
     size = (finer * SIZE[0], finer * SIZE[1])
     theta, direction = (
         t[0].numpy() for t in pixel_rays(lens.load(CALIBRATION).resized(size), size)
@@ -64,8 +64,8 @@ def camera_rays(finer: int) -> np.ndarray:
 
 
 class Room:
-    """A room around the camera, which looks along z: boxes (low and high corners), the room's own
-    first, each with a colour for each axis of its sides."""
+    """A room around the camera, which looks along z. It consists of boxes, given by their low and
+    high corners; the first box is the room. Each box has a colour for each axis of its sides."""
 
     def __init__(self, rng: np.random.Generator):
         self.rng, turn = rng, rng.uniform(0, 2 * np.pi)
@@ -79,17 +79,17 @@ class Room:
         for _ in range(rng.integers(2, 6)):
             x, z = rng.uniform(-far[0], far[2]), rng.uniform(-far[1], far[3])
             side, top = rng.uniform(0.2, 0.7, 2)
-            if max(abs(x), abs(z)) > side + 0.3:  # the camera is in no box
+            if max(abs(x), abs(z)) > side + 0.3:  # no box contains the camera
                 corners.append(((x - side, eye - 2 * top, z - side), (x + side, eye, z + side)))
         self.low, self.high = np.array(corners, np.float32).swapaxes(0, 1)
-        # Floors are dark, ceilings bright, boxes of full colours; floors and walls are checkered.
+        # Floors are dark, ceilings bright, boxes of pure colours; floors and walls are checkered.
         self.paint = rng.uniform(60, 200, (len(corners), 3, 3))
         self.paint[1:] = rng.permuted(np.tile([30, 130, 250], (len(corners) - 1, 3, 1)), axis=-1)
         self.floor, self.ceiling = rng.uniform(30, 110, 3), rng.uniform(190, 250, 3)
         self.square = rng.uniform(0.3, 0.8)
 
     def trace(self, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Label and distance where each ray hits, which box, and the axis of its side."""
+        """Label, distance and box of the point that each ray hits, and the axis of the side."""
         rays = np.nan_to_num(rays, nan=1.0) @ self.turn.T
         slopes = 1 / np.where(np.abs(rays) < 1e-6, np.float32(1e-6), rays)
         ahead = np.maximum(self.high[0] * slopes, self.low[0] * slopes)
@@ -105,7 +105,7 @@ class Room:
         return np.where(which > 0, BOX, labels).astype(np.uint8), distance, which, axis
 
     def colors(self, rays: np.ndarray) -> np.ndarray:
-        """What the camera sees, (H, W, 3) uint8: checkered sides, darker far away."""
+        """The picture of the camera, (H, W, 3) uint8: checkered sides, darker far away."""
         labels, distance, which, axis = self.trace(rays)
         paint = self.paint[which, axis]
         paint[labels == FLOOR], paint[labels == CEILING] = self.floor, self.ceiling

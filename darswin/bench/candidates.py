@@ -1,4 +1,4 @@
-"""The candidates: our model, and the same on the operators' reference, as it is and compiled."""
+"""The candidates: our model, and the same model on the reference, eager and compiled."""
 
 import copy
 import math
@@ -34,7 +34,7 @@ def lens_of(size: int) -> Lens:
 
 
 def network(name: str, size: int) -> Model:
-    """A model of random weights, the same at every call."""
+    """A model with random weights, which are the same in every call."""
     torch.manual_seed(0)
     options: dict[str, Any] = dict(image_size=size) if has_image_size(name) else {}
     classes = PIXEL_CLASSES if issubclass(model_class(name), Unet) else CLASSES
@@ -93,8 +93,8 @@ def optimized_run(model: Model, lens: Lens, dtype: torch.dtype, images: Tensor) 
 
 
 def reference_run(model: Callable[..., Tensor], lens: Lens, images: Tensor) -> Run:
-    """Inference by the PyTorch reference. In bfloat16 it is fastest with the model's weights and
-    the images in bfloat16, not under autocast."""
+    """Inference with the PyTorch reference. In bfloat16, casting weights and images is faster than
+    autocast."""
 
     def run() -> Tensor:
         with use_reference():
@@ -142,11 +142,11 @@ def _libraries(layer: Any, dtype: torch.dtype) -> dict[str, Callable[[Tensor], T
 
 
 def products_of(model: Model, images: Tensor, lens: Lens) -> list[tuple[Any, int]]:
-    """The linear layers that a model runs, in turn, and the rows that each multiplies."""
+    """The linear layers that a model runs, in their order, and the number of rows of each input."""
     found: list[tuple[Any, int]] = []
 
     def hook(layer: Any, _inputs: tuple[Tensor], output: Tensor) -> None:
-        # A polar embedding's linear layer is not called: `polar_embed` takes its weight.
+        # The linear layer of a polar embedding is not called: `polar_embed` takes its weight.
         linear = layer.proj if isinstance(layer, PolarPatchEmbed) else layer
         found.append((linear, output.numel() // linear.out_features))
 
@@ -161,17 +161,17 @@ def products_of(model: Model, images: Tensor, lens: Lens) -> list[tuple[Any, int
 
 
 def operations_of(name: str, size: int) -> int:
-    """Floating-point operations of a model's matrix products for one image."""
+    """The floating-point operations of a model's matrix products for one image."""
     image, lens = torch.randn(1, 3, size, size), lens_of(size)
     products = products_of(network(name, size).eval(), image, lens)
     return sum(2 * rows * layer.in_features * layer.out_features for layer, rows in products)
 
 
 def training(name: str, size: int, dtype: torch.dtype, batch: int) -> dict[str, Run]:
-    """The candidates for a step of training, by name: forward, backward, AdamW; → the loss.
+    """The candidates for a training step, by name: forward, backward, AdamW; → the loss.
 
-    The matrix products alone are those of the linear layers, each with its backward, and with the
-    kinds of products that `autotune` chose.
+    The matrix products alone are those of the linear layers with their backward, by the backends
+    that `autotune` chooses.
     """
     return {
         timing.OURS: training_step(name, size, dtype, batch, reference=False),
@@ -181,13 +181,13 @@ def training(name: str, size: int, dtype: torch.dtype, batch: int) -> dict[str, 
 
 
 def training_products(name: str, size: int, dtype: torch.dtype, batch: int) -> Run:
-    """The matrix products of a step of training, forward and backward; → the last gradient."""
+    """The matrix products of a training step, forward and backward; → the last gradient."""
     model = network(name, size)
     model.set_matmul_backend("autotune")
     images = torch.randn(batch, 3, size, size)
     sides: list[tuple[Any, Tensor, list[Tensor], Tensor]] = []
     for layer, rows in products_of(model.eval(), images, lens_of(size)):
-        # The first product takes the images, whose gradient no training asks for.
+        # The first product takes the images, whose gradient is never needed.
         x = torch.randn(rows, layer.in_features, dtype=dtype, requires_grad=bool(sides))
         wanted = [t for t in (x, *layer.parameters()) if t.requires_grad]
         sides.append((layer, x, wanted, torch.randn(rows, layer.out_features, dtype=dtype)))
@@ -202,7 +202,7 @@ def training_products(name: str, size: int, dtype: torch.dtype, batch: int) -> R
 
 
 def training_step(name: str, size: int, dtype: torch.dtype, batch: int, *, reference: bool) -> Run:
-    """A step of one of the candidates; bfloat16 is autocast."""
+    """A training step of a candidate; bfloat16 means autocast."""
     model, lens = network(name, size).train(), lens_of(size)
     if not reference:
         model.set_matmul_backend("autotune")

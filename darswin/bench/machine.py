@@ -1,4 +1,4 @@
-"""The machine that is measured: CPU, instruction-set tiers, number of threads."""
+"""The machine of a measurement: CPU, instruction-set tiers, number of threads."""
 
 import contextlib
 import platform
@@ -14,11 +14,11 @@ import torch
 from darswin.ops import _module, cpu_capability
 
 T = TypeVar("T")
-THREADS = sorted({1, torch.get_num_threads()})  # to measure at: one and all
+THREADS = sorted({1, torch.get_num_threads()})  # the numbers of threads to measure with
 
 
 def machine() -> dict[str, str | int]:
-    """CPU, tier and versions, and in a checkout the commit: the head of a record."""
+    """The head of a record: CPU, tier, versions and, in a checkout, the commit."""
     return dict(
         cpu=_cpu(),
         cores=max(THREADS),
@@ -32,7 +32,7 @@ def machine() -> dict[str, str | int]:
 
 
 def on_other_tiers(run: Callable[[], T]) -> dict[str, Callable[[], T]]:
-    """`run` with our operators on each other instruction-set tier of this machine, by its name."""
+    """Functions that call `run` on each other instruction-set tier of this machine, by its name."""
     others = (tier for tier in _module.tiers() if tier != cpu_capability())
     return {tier: partial(_on_tier, tier, run) for tier in others}
 
@@ -48,7 +48,7 @@ def _on_tier(tier: str, run: Callable[[], T]) -> T:
 
 @contextlib.contextmanager
 def num_threads(count: int) -> Iterator[None]:
-    """Within it torch and our operators use so many threads, and inductor compiles for them."""
+    """A context in which torch, our operators and inductor use `count` threads."""
     before = torch.get_num_threads()
     torch.set_num_threads(count)
     try:
@@ -58,7 +58,7 @@ def num_threads(count: int) -> Iterator[None]:
 
 
 def _cpu() -> str:
-    # On x86 with family and model: a virtual machine may give its maker's name for years.
+    # Family and model are added on x86, because the name may stay the same for years.
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
     except OSError:

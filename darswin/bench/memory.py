@@ -1,4 +1,4 @@
-"""The peak memory of a batch, measured in a process of its own, which runs this file."""
+"""The peak memory of a batch, measured in its own process, which runs this file."""
 
 import json
 import subprocess
@@ -18,23 +18,23 @@ _STATUS, _RESET = Path("/proc/self/status"), Path("/proc/self/clear_refs")
 
 @dataclass
 class Memory:
-    """Resident memory of a process that does one thing, in bytes."""
+    """The resident memory of a process for one measurement, in bytes."""
 
     mode: str  # such as "training, float32"
     batch: int
     name: str
-    before: int  # of Python, torch and darswin, without a model
+    before: int  # with Python, torch and darswin, but without a model
     between: int  # between two batches
-    peak: int  # while one is computed
+    peak: int  # during a batch
 
     @property
     def whole(self) -> int:
-        """Bytes of the model, its optimizer and a batch."""
+        """The bytes for the model, its optimizer and a batch."""
         return self.peak - self.before
 
     @property
     def own(self) -> int:
-        """Bytes of a batch, over what is there between two."""
+        """The bytes for a batch alone."""
         return self.peak - self.between
 
 

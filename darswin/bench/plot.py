@@ -1,4 +1,4 @@
-"""Pictures of what was measured. Only drawing needs matplotlib."""
+"""Plots of measurements. Only drawing needs matplotlib."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -12,14 +12,14 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
 
-WIDTH = 9  # inches: text of 10 pt is still 8 pt in a page 740 px wide
+WIDTH = 9  # inches: on a page of 740 px, text of 10 pt still has 8 pt
 
 Rows = dict[str, dict[str, float]]  # by case, then by name
 Panels = list[list[tuple[str, Rows]]]  # line by line, with their titles
 
 
 def draw_models(record: Record, path: Path) -> None:
-    """Draws the images a second of all candidates at all threads: a panel a mode, a row a batch."""
+    """Draws the images per second of all candidates at all threads, by mode and batch size."""
     threads = max(t.threads for t in record.timings)
     panels: dict[str, Rows] = {}
     for t in record.timings:

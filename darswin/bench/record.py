@@ -1,4 +1,4 @@
-"""Records of what was measured, as JSON files."""
+"""Records of measurements, as JSON files."""
 
 import json
 import re
@@ -15,7 +15,7 @@ from darswin.utils.files import replace_file
 
 @dataclass
 class Record:
-    """All that one run of a benchmark found."""
+    """The results of one run of a benchmark."""
 
     machine: dict  # of `darswin.bench.machine`
     timings: list[Timing]
@@ -35,7 +35,7 @@ class Record:
         return cls(**content)
 
     def publish(self, folder: Path, suite: str, draw: Callable[["Record", Path], None]) -> None:
-        """Writes `SUITE--CPU-TIER.json` and, with matplotlib, its plot; prints their names."""
+        """Writes `SUITE--CPU-TIER.json` and, with matplotlib, its plot; prints the names."""
         cpu = f"{self.machine['cpu']} {self.machine['tier']}".lower()
         cpu = re.sub(r"\b(family|model|processor|cpu)\b", " ", cpu)
         path = folder / f"{suite}--{'-'.join(re.findall('[a-z0-9]+', cpu))}.json"
@@ -53,7 +53,7 @@ def _known(items: Iterable[tuple[str, object]]) -> dict[str, object]:
 
 
 def write(path: Path, **content: object) -> None:
-    """Writes a record of any content as JSON, a line for each row of its lists and objects."""
+    """Writes any content as JSON, with one line for each row of its lists and objects."""
     parts = [f" {json.dumps(key)}: {_lines(value)}" for key, value in content.items()]
     replace_file(path, "{\n" + ",\n".join(parts) + "\n}\n")
 

@@ -1,4 +1,4 @@
-"""Measurements as tables in Markdown; "a / b" is at one and at all threads."""
+"""Measurements as tables in Markdown; "a / b" means at one and at all threads."""
 
 from collections.abc import Iterable, Mapping, Sequence
 
@@ -26,7 +26,7 @@ def markdown(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 
 
 def by_case(timings: Iterable[Timing]) -> dict[tuple[str, int, str], dict[str, list[Timing]]]:
-    """By setting, batch and mode, then by name: the timings, fewest threads first."""
+    """Groups timings by setting, batch and mode, then by name; fewest threads first."""
     found: dict[tuple[str, int, str], dict[str, list[Timing]]] = {}
     for t in sorted(timings, key=lambda t: t.threads):
         found.setdefault((t.setting, t.batch, t.mode), {}).setdefault(t.name, []).append(t)
@@ -42,7 +42,7 @@ def ratios(timings: Iterable[Timing], digits: int = 1) -> str:
 
 
 def models_table(timings: Sequence[Timing]) -> str:
-    """A row a case of a model: images a second, the peers' times over ours, latency at batch 1."""
+    """Images per second, the peers' times over ours, and latency at batch 1, by case."""
     peers = (FIXED_LENS, REFERENCE, COMPILED)
     rows = []
     for (_, batch, mode), found in by_case(timings).items():
@@ -66,7 +66,7 @@ def models_table(timings: Sequence[Timing]) -> str:
 
 
 def quantized_table(timings: Sequence[Timing]) -> str:
-    """A row a batch: how much longer a model takes in other types than with 8 bits."""
+    """The times in other types over that with 8 bits: a row for each batch size."""
     peers = (OURS_FLOAT32, OURS_BFLOAT16, COMPILED, COMPILED_BFLOAT16)
     rows = [
         [f"batch {batch}", *(ratios(found.get(peer, ()), 2) for peer in peers)]
@@ -77,7 +77,7 @@ def quantized_table(timings: Sequence[Timing]) -> str:
 
 
 def memory_table(memory: Sequence[Memory]) -> str:
-    """Peaks of resident memory, ours and the reference's."""
+    """The peaks of resident memory, ours and the reference's."""
     found = compared(memory)
     rows = [[what, f"{a / 2**20:.0f}", f"{b / 2**20:.0f}", f"{a / b:.2f}"] for what, a, b in found]
     return markdown(["peak memory (MB)", OURS, REFERENCE, "ratio"], rows)

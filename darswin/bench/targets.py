@@ -1,4 +1,4 @@
-"""The ratios that we want to reach."""
+"""The targets of the measured ratios."""
 
 from collections.abc import Sequence
 
@@ -16,7 +16,7 @@ from darswin.bench.timing import (
 )
 
 MODEL, SETTING = "darswin_a_small", "64×64"
-# By mode and batch: the least that a peer's time over ours should be, at all threads.
+# By mode and batch: the smallest ratios of peers' times over ours, at all threads.
 MODEL_TARGETS = {
     ("inference, float32", 8): {REFERENCE: 2.6, COMPILED: 2.2, MATMULS: 0.8},
     ("inference, float32", 1): {REFERENCE: 2.2},
@@ -32,7 +32,7 @@ MODEL_TARGETS = {
     ("training, float32", 8): {REFERENCE: 2.0},
     ("training, bfloat16", 8): {REFERENCE: 1.15},
 }
-MEMORY_TARGET = 0.8  # the most that the peak of a training step should be of the reference's
+MEMORY_TARGET = 0.8  # the largest ratio of the peak of a training step over the reference's
 
 
 def of_model(case: Case) -> dict[str, float]:
@@ -43,7 +43,7 @@ def of_model(case: Case) -> dict[str, float]:
 
 
 def lines(timings: Sequence[Timing], avx2_share: float = 1.0) -> list[str]:
-    """Each ratio that has a target, against it; on the AVX2 tier the target is a share of it."""
+    """Compares ratios with their targets; on the AVX2 tier, the target is `avx2_share` of it."""
     avx2 = {t.label: t for t in timings if t.name == f"{OURS} (avx2)"}
     found = []
     for t in timings:
@@ -58,7 +58,7 @@ def lines(timings: Sequence[Timing], avx2_share: float = 1.0) -> list[str]:
 
 
 def memory_lines(memory: Sequence[Memory]) -> list[str]:
-    """The peaks of training steps of `MODEL`, against their target."""
+    """Compares the peaks of training steps of `MODEL` with their target."""
     return [
         f"peak memory, {what}: {_against(a / b, MEMORY_TARGET, a / b > MEMORY_TARGET)}"
         for what, a, b in compared(memory)

@@ -1,4 +1,4 @@
-"""Timing candidates in turns, so that a change of the clock rate meets all of them alike."""
+"""Timing candidates in turns, so that changes of the clock rate affect all of them equally."""
 
 import itertools
 import math
@@ -11,11 +11,11 @@ import torch
 
 OURS, FIXED_LENS, REFERENCE = "darswin", "darswin, fixed lens", "reference"
 COMPILED, MATMULS = "compiled reference", "matrix products alone"
-# A model of 8 bits is compared with the same model in other types.
+# A model with 8 bits is compared with the same model in other types.
 OURS_FLOAT32, OURS_BFLOAT16 = f"{OURS}, float32", f"{OURS}, bfloat16"
 COMPILED_BFLOAT16 = f"{COMPILED}, bfloat16"
-TURNS = 7  # or more, for as long as a candidate's calls are short
-LONGEST_TURN = 0.2  # seconds: long enough for the caches to hold what the candidate uses
+TURNS = 7  # at least; more if the calls of a candidate are short
+LONGEST_TURN = 0.2  # seconds: long enough to fill the caches with the data of the candidate
 
 Turns = dict[str, list[list[float]]]  # by candidate and turn, the seconds of each call
 
@@ -38,15 +38,15 @@ class Case:
 
 @dataclass
 class Timing(Case):
-    """One candidate in one case. Times are seconds a call."""
+    """One candidate in one case. Times are seconds per call."""
 
     name: str
     median: float
     iqr: float
-    ratio: float  # over our time in the same turn, the median of all turns
-    target: float | None = None  # the least that the ratio should be
-    runs: int | None = None  # None, as `p99`, where calls were not timed one by one
-    p99: float | None = None  # below a hundred runs the longest
+    ratio: float  # median over all turns of the time over ours
+    target: float | None = None  # the smallest acceptable ratio
+    runs: int | None = None  # None, like `p99`, if calls were not timed one by one
+    p99: float | None = None  # the longest time if there are less than a hundred runs
 
     @property
     def missed(self) -> bool:
@@ -61,7 +61,7 @@ def measure(
     least: int = TURNS,
     targets: Mapping[str, float] | None = None,
 ) -> list[Timing]:
-    """Times candidates, `OURS` among them; `targets` are the least ratios, by name."""
+    """Times candidates, including `OURS`; `targets` are the smallest acceptable ratios, by name."""
     turns = in_turns(candidates, seconds, least)
     return [summary(case, name, turns, (targets or {}).get(name)) for name in candidates]
 
@@ -69,7 +69,7 @@ def measure(
 def in_turns(
     candidates: Mapping[str, Callable[[], object]], seconds: float, least: int = TURNS
 ) -> Turns:
-    """Calls each candidate for about `seconds`, at least `least` times; all have as many turns."""
+    """Calls each candidate for about `seconds`, at least `least` times, in as many turns."""
     calls, turns = {}, 1
     for name, run in candidates.items():
         once = _time(run)

@@ -1,4 +1,4 @@
-"""Answers of a model to a stream of images: classes, or files with labels or distances."""
+"""Predictions for a stream of images: classes, or files with labels or distances."""
 
 import io
 import json
@@ -35,35 +35,35 @@ from darswin.viz.pixels import (
 
 Net = TypeVar("Net", bound=Model)
 
-BATCH = 8  # images at once take a half or a third of the time of one after the other
-LENSES = 16  # whose prepared values are kept: as many cameras may take turns in a folder
+BATCH = 8  # takes a half to a third of the time of single images
+LENSES = 16  # whose prepared values are kept, for folders whose pictures come from several cameras
 ANSWERS = "predictions.json"
 FARTHEST = 2**16 - 1  # the largest number of 16 bits
 
 
 class Request(NamedTuple):
-    entry: dict[str, Any]  # the part of the answer that is known before
+    entry: dict[str, Any]  # the file, and the frame of a video
     image: np.ndarray  # (H, W, C) uint8
     pixels: Tensor  # (1, C, h, w), the model's input
 
 
 class Answers:
-    """Collects a model's answers to images, in their order.
+    """Collects the predictions for images, in their order.
 
-    Images that follow each other and have the same lens go through the model together, and the
-    values that depend on the lens alone are computed once.
+    Consecutive images with the same lens form a batch. Values that depend only on the lens are
+    computed once.
     """
 
     def __init__(self, model: Encoder | Unet, card: ModelCard):
         self.model, self.card = model, card
         self.found: list[dict[str, Any]] = []
-        self.seconds = 0.0  # that the network took
+        self.seconds = 0.0  # spent in the network
         self._lens: Lens | None = None  # of the queue
         self._prepared: dict[int, tuple[Lens, Any, FullSize | None]] = {}  # by a lens's identity
         self._queue: list[Request] = []
 
     def add(self, entry: dict[str, Any], image: np.ndarray, lens: Lens) -> None:
-        """An image (H, W, C) uint8 and its lens; the same object is the same lens."""
+        """Adds an image (H, W, C) uint8 with its lens. Equal lenses should be the same object."""
         pixels, resized_lens = resized(self.model, self.card, image, lens)
         if lens is not self._lens:
             self.flush()
@@ -80,7 +80,7 @@ class Answers:
             self.flush()
 
     def flush(self) -> None:
-        """Answers the images in the queue; FloatingPointError where the model computes NaN."""
+        """Predicts the images in the queue; FloatingPointError if the model computes NaN."""
         queue, self._queue = self._queue, []
         if not queue:
             return
@@ -91,19 +91,20 @@ class Answers:
             outputs = self._run(images, prepared)
         self.seconds += time.perf_counter() - start
         for request, output in zip(queue, outputs, strict=True):
-            # Outside the pixels that a ray reaches it has no meaning.
+            # Only pixels that a ray reaches have a prediction.
             used = output if full is None else output[:, torch.from_numpy(full.reached)]
             if not used.isfinite().all():
                 entry = request.entry
-                name = f"frame {entry['frame']} of {entry['video']}" if "video" in entry else ""
+                video = entry.get("video")
+                name = f"frame {entry['frame']} of {video}" if video else entry["image"]
                 raise FloatingPointError(
-                    f"no answer for {name or entry['image']}: the model computes NaN or infinity; "
-                    "its weights may have diverged in training, take others"
+                    f"no prediction for {name}: the model computes NaN or infinity; its weights "
+                    "may have diverged in training"
                 )
             self.found.append(request.entry | self._answer(request, output, full))
 
     def _full_size(self, lens: Lens) -> FullSize | None:
-        """The way back to the pixels of a lens's pictures, if the answer needs it."""
+        """The mapping to the pixels of the lens's pictures, if the predictions need it."""
         return None
 
     def _run(self, images: Tensor, prepared: Any) -> Tensor:
@@ -115,7 +116,7 @@ class Answers:
 
 
 class ClassAnswers(Answers):
-    """The `top` most probable classes of images."""
+    """Predicts the `top` most probable classes."""
 
     model: Encoder
 
@@ -134,10 +135,12 @@ class ClassAnswers(Answers):
 
 
 class PixelAnswers(Answers):
-    """Writes a file of the answers for an image's pixels, and an overlay of the image, by the names
-    of `file_names`."""
+    """Writes two files for each image: the predictions for its pixels, and an overlay.
 
-    kind: str  # of the answers, and the name of their folder
+    `names` are those of `file_names`.
+    """
+
+    kind: str  # the name of the folder of the predictions
     model: Unet
 
     def __init__(self, model: Unet, card: ModelCard, out: Path, names: Mapping[str, str]):
@@ -167,20 +170,22 @@ class PixelAnswers(Answers):
     def _picture(
         self, request: Request, output: np.ndarray, full: FullSize
     ) -> tuple[bytes | memoryview, np.ndarray, np.ndarray, dict[str, Any]]:
-        """An output (K, h, w) → content of a PNG file, picture and mask of the overlay, and a
-        summary."""
+        """An output (K, h, w) → the content of a PNG file, the picture and the mask of the overlay,
+        and a summary."""
         raise NotImplementedError
 
 
 class LabelAnswers(PixelAnswers):
-    """A class for each pixel: PNGs whose pixels are the classes' ids, with a palette."""
+    """Predicts classes of pixels; writes PNGs of class ids with a palette."""
 
     kind = "labels"
 
     def __init__(self, model: Unet, card: ModelCard, out: Path, names: Mapping[str, str]):
         super().__init__(model, card, out, names)
         if model.num_classes > IGNORE:
-            raise ValueError(f"labels of 8 bits are for {IGNORE} classes, got {model.num_classes}")
+            raise ValueError(
+                f"PNGs of labels can hold at most {IGNORE} classes, got {model.num_classes}"
+            )
         self.classes = list(card.classes) or [str(k) for k in range(model.num_classes)]
         self.colors = list(card.colors) or palette(len(self.classes))
 
@@ -198,10 +203,11 @@ class LabelAnswers(PixelAnswers):
 
 
 class DistanceAnswers(PixelAnswers):
-    """A distance along the ray for each pixel: 16-bit PNGs, metres × 256, 0 for none."""
+    """Predicts distances along the rays of pixels; writes PNGs of 16 bits: metres × 256, 0 for
+    unknown."""
 
     kind = "distance"
-    _range: tuple[Any, tuple[float, float]] = (None, (1.0, 2.0))  # of a video's first frame
+    _range: tuple[Any, tuple[float, float]] = (None, (1.0, 2.0))  # from the first frame of a video
 
     def _picture(self, request, output, full):
         distance = full.distance(output[0])
@@ -210,7 +216,7 @@ class DistanceAnswers(PixelAnswers):
         unanswered = round(float(1 - known.mean()), 6)
         ends = np.quantile(values, (0, 0.5, 1)).tolist()
         metres = dict(zip(("min_m", "median_m", "max_m"), (round(v, 4) for v in ends), strict=True))
-        # Frames of a video have the colours of its first one.
+        # All frames of a video share the colours of its first frame.
         video = request.entry.get("video")
         if video is None or video != self._range[0]:
             self._range = video, distance_range(distance)
@@ -223,25 +229,24 @@ ANSWERS_OF = {"segmentation": LabelAnswers, "distance": DistanceAnswers}
 
 
 def fast(model: Net, card: ModelCard) -> Net:
-    """The optimized model: in float32, or as fast as it goes where it is quantized anyway."""
+    """The model optimized in float32; a quantized model in the fastest type."""
     return optimize(model, "fastest" if card.quantized else torch.float32)
 
 
 def resized(net: Model, card: ModelCard, image: np.ndarray, lens: Lens) -> tuple[Tensor, Lens]:
-    """A picture as the model saw them in training: (1, C, H, W) uint8 with its lens, in its
-    pixels."""
+    """A picture at the size of training, (1, C, H, W) uint8, with the lens of its pixels."""
     image, lens = at_size(image, lens, card.size, fit_of(net, card))
     return torch.from_numpy(image[None]).permute(0, 3, 1, 2).contiguous(), lens
 
 
 def fit_of(net: Model, card: ModelCard) -> Framing:
-    """The framing that brings pictures to the model's size; some models take only squares."""
+    """The framing of the model's training; models that take only squares crop."""
     return "crop" if net.square_images and card.fit == "whole" else card.fit
 
 
 def label_png(labels: np.ndarray, colors: Sequence[Sequence[int]]) -> bytes:
-    """Ids (H, W) uint8 as a PNG with a palette: its pixels are the ids, in their colours."""
-    image = Image.fromarray(labels)  # which a palette makes one of mode "P"
+    """Ids (H, W) uint8 as a PNG with a palette of the colours."""
+    image = Image.fromarray(labels)  # becomes mode "P" with a palette
     table = [*map(tuple, colors), *[UNKNOWN] * (256 - len(colors))]
     image.putpalette([int(value) for color in table for value in color])
     file = io.BytesIO()
@@ -250,8 +255,8 @@ def label_png(labels: np.ndarray, colors: Sequence[Sequence[int]]) -> bytes:
 
 
 def distance_png(distance: np.ndarray) -> memoryview:
-    """Distances (H, W) in metres as a PNG of 16 bits: metres × 256, 0 where they are not known, and
-    cut to 1 … 65535 where they are."""
+    """Distances (H, W) in metres as a PNG of 16 bits: metres × 256, clipped to 1 … 65535, or 0 for
+    unknown distances."""
     known = is_known(distance)
     steps = np.rint(np.where(known, distance, 0) * PER_METRE).clip(known, FARTHEST)
     _, png = cv2.imencode(".png", steps.astype(np.uint16))
@@ -259,8 +264,8 @@ def distance_png(distance: np.ndarray) -> memoryview:
 
 
 def file_names(paths: Sequence[str], files: Sequence[tuple[str, bool]]) -> dict[str, str]:
-    """Names for the files of pictures and videos: their paths in the folder that all arguments are
-    in, the one given or what several have in common, without endings if they still differ then."""
+    """The names of output files for pictures and videos: their paths relative to the common folder
+    of all arguments, without the endings of pictures unless two names would become equal."""
     places = [os.path.abspath(p if os.path.isdir(p) else os.path.dirname(p) or ".") for p in paths]
     root = os.path.commonpath(places)
     whole = {name: os.path.relpath(os.path.abspath(name), root) for name, _ in files}
@@ -270,16 +275,16 @@ def file_names(paths: Sequence[str], files: Sequence[tuple[str, bool]]) -> dict[
 
 
 def claim_folder(out: str | None) -> Path:
-    """The folder for the files of `PixelAnswers`, which must be new, empty, or an earlier one."""
+    """The folder for the files of `PixelAnswers`: new, empty, or from an earlier prediction."""
     if out is None:
-        raise ValueError("predict writes pictures for such a model: `out` must be their folder")
+        raise ValueError("missing `out`: this model writes pictures; give a folder for them")
     folder = Path(out)
     if folder.exists() and not folder.is_dir():
-        raise ValueError(f"`out` must be a folder for the pictures, and {out} is a file")
+        raise ValueError(f"`out` must be a folder for the pictures, but {out} is a file")
     if folder.is_dir() and not _is_ours(folder / ANSWERS) and any(folder.iterdir()):
         raise ValueError(
-            f"`out` {out} holds files that are none of predict's: give a new or an empty folder, "
-            "or one of an earlier predict, whose files are replaced"
+            f"`out` {out} holds other files: give a new or an empty folder, or one of an earlier "
+            "predict, whose files are replaced"
         )
     replace_file(folder / ANSWERS, "[]")
     return folder

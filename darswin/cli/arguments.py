@@ -1,4 +1,4 @@
-"""Command lines of functions: a sentence says what is wrong with the arguments of a command."""
+"""Functions as commands: their parameters are the arguments, their docstrings are the help."""
 
 import argparse
 import inspect
@@ -20,14 +20,14 @@ class Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         message = " ".join(message.split())
-        self.exit(2, f"{self.prog}: {message}; `{self.prog} --help` tells more\n")
+        self.exit(2, f"{self.prog}: {message}; see `{self.prog} --help`\n")
 
 
 def run_command(commands: Callable | dict[str, Callable], argv: list[str], prog: str) -> None:
-    """Calls a function, or the one of several that `argv` names first, with the arguments.
+    """Calls a function with the arguments in `argv`. Of several functions, `argv` names one first.
 
-    Its keyword-only parameters are options, its others are words that stand in their order. Their
-    types and the docstring's section `Args` say what may be typed, and the help.
+    Keyword-only parameters are options; the others are positional. The annotations define which
+    values are valid. The help consists of the docstring: its text and its section `Args`.
     """
     if isinstance(commands, dict):
         if argv and argv[0] in commands:
@@ -38,15 +38,15 @@ def run_command(commands: Callable | dict[str, Callable], argv: list[str], prog:
         parser.add_argument("command", choices=commands, help=" ".join(each))
         parser.parse_args(argv or ["--help"])
         return
-    parser = Parser(prog=prog, description=_summary(commands))
-    section = (inspect.getdoc(commands) or "").partition("\nArgs:\n")[2]
+    text, _, section = (inspect.getdoc(commands) or "").partition("\nArgs:\n")
+    parser = Parser(prog=prog, description=" ".join(text.split()).replace("%", "%%"))
     texts = dict(re.findall(r"^    (\w+): (.*(?:\n        .*)*)", section, re.M))
     kinds = {}
     for name, parameter in inspect.signature(commands).parameters.items():
         kinds[name] = kind = _without_none(parameter.annotation)
         words = [*texts.get(name, "").replace("%", "%%").split()]
         if _kind(kind).startswith("one of"):
-            words.append(_kind(kind))
+            words.append(f"{_kind(kind).capitalize()}.")
         settings: dict[str, Any] = dict(default=parameter.default)
         if parameter.kind is not parameter.KEYWORD_ONLY:
             settings |= dict(nargs="*") if _is_list(kind) else {}
@@ -54,7 +54,7 @@ def run_command(commands: Callable | dict[str, Callable], argv: list[str], prog:
             settings |= dict(required=True)
         else:
             settings |= dict(nargs="?", const="[]") if _is_list(kind) else {}
-            words.append(f"[{_typed(parameter.default)}]")
+            words += [] if parameter.default is None else [f"[{_typed(parameter.default)}]"]
         option = f"--{name}" if parameter.kind is parameter.KEYWORD_ONLY else name
         parser.add_argument(option, help=" ".join(words), **settings)
     lists = [name for name, kind in kinds.items() if _is_list(kind)]
@@ -76,7 +76,7 @@ def _summary(function: Callable) -> str:
 
 
 def _without_none(kind: Any) -> Any:
-    """The type of a value that is there; of several types the first."""
+    """The annotation without None; of several types, the first."""
     if typing.get_origin(kind) in (typing.Union, types.UnionType):
         return next(choice for choice in typing.get_args(kind) if choice is not types.NoneType)
     return kind
@@ -87,7 +87,7 @@ def _is_list(kind: Any) -> bool:
 
 
 def _value(text: str, kind: Any) -> Any:
-    """The text as a value of a type; ValueError or YAMLError where it is none."""
+    """Converts a text to a type; ValueError or YAMLError if that is impossible."""
     choices = typing.get_args(kind)
     if not _is_list(kind):
         if choices and text not in choices:
@@ -116,19 +116,19 @@ def _kind(kind: Any) -> str:
 
 
 def _typed(default: Any) -> str:
-    """A default as people type it."""
+    """A default in the form that users type."""
     if isinstance(default, Sequence) and not isinstance(default, str):
         return ",".join(map(str, default))
     if isinstance(default, float):
         return f"{default:g}"
-    return "null" if default is None else str(default)
+    return str(default)
 
 
 def with_lists(
     argv: Sequence[str], numbers: Collection[str], words: Collection[str] = ()
 ) -> list[str]:
-    """The arguments with what follows an option in one list: `--size 10,10`, `--size 10 10` and
-    `--size=[10, 10]` become `--size=[10,10]`; `--paths A B` becomes `--paths=["A", "B"]`."""
+    """Joins the values of list options: `--size 10,10`, `--size 10 10` and `--size=[10, 10]` become
+    `--size=[10,10]`, and `--paths A B` becomes `--paths=["A", "B"]`."""
     found, left = [], list(argv)
     while left:
         option, equals, value = left.pop(0).partition("=")

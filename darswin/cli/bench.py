@@ -17,8 +17,8 @@ from darswin.utils.malloc import keep_freed_memory
 DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16}
 INT8 = {"int8": torch.int8}  # inference, where the CPU has it
 MOST = 65536  # px, and images at once
-LATENCY_RUNS = 100  # at batch 1: what a 99th percentile takes
-# How far the results of two candidates may be apart, of their norm.
+LATENCY_RUNS = 100  # at batch 1, for a 99th percentile
+# The largest relative difference of two candidates' results.
 TOLERANCES = {"float32": 1e-4, "bfloat16": 5e-2, "int8": 1e-1}
 
 
@@ -31,25 +31,26 @@ def bench(
     seconds: float = 2.0,
     out: Path = Path(),
 ) -> Record:
-    """Measures inference and training of a model on this machine, and prints the results.
+    """Measures the speed of inference and training of a model on this machine.
 
-    With the default options it takes a quarter of an hour.
+    With the default options this takes a quarter of an hour. The command prints tables, and writes
+    a record and a plot.
 
     Args:
-        model: its name.
-        size: px, of the square images.
-        batches: images at once.
-        compiled: batches at which torch.compile is measured too, about a minute each, at all
-            threads; none: no value.
-        seconds: of each timing, about.
-        out: folder of the record, `model--<CPU>-<tier>.json`, and its plot.
+        model: the name of the model; `darswin models` lists them.
+        size: the side of the square images, px.
+        batches: the batch sizes.
+        compiled: the batch sizes at which torch.compile is measured too, which takes about a minute
+            each. Without a value, it is not measured.
+        seconds: the approximate time for each timing.
+        out: the folder for the record, `model--<CPU>-<tier>.json`, and its plot.
     """
-    model_class(model)  # all is checked before the work
+    model_class(model)  # check everything before the work
     for name, count in (("size", size), *(("batches", b) for b in (*batches, *compiled))):
         if not 1 <= count <= MOST:
             raise ValueError(f"`{name}` must be from 1 to {MOST}, got {count}")
     if not batches:
-        raise ValueError("`batches` must be one number at least")
+        raise ValueError("`batches` must have at least one number")
     if not 0 < seconds < float("inf"):
         raise ValueError(f"`seconds` must be above 0, got {seconds}")
     keep_freed_memory()
@@ -109,7 +110,7 @@ def _dtypes(mode: str) -> list[str]:
 
 
 def _check(runs: dict[str, candidates.Run], tolerance: float) -> None:
-    """RuntimeError unless all candidates, in training at their first step, find the same."""
+    """RuntimeError unless all candidates find the same; in training, at their first step."""
     results: dict[str, Tensor] = {}
     for name, run in runs.items():
         if name == MATMULS:
@@ -120,7 +121,7 @@ def _check(runs: dict[str, candidates.Run], tolerance: float) -> None:
     for name, got in results.items():
         error = ((got - want).norm() / want.norm()).item()
         if not error <= tolerance:
-            raise RuntimeError(f"{name} is off the reference's result by {error:.1e} of its norm")
+            raise RuntimeError(f"{name} differs from the reference by {error:.1e} of its norm")
 
 
 def _memory(model: str, size: int, batch: int) -> list[memory.Memory]:

@@ -6,6 +6,7 @@ which data, is the task's: `darswin.train.tasks`.
 """
 
 import contextlib
+import logging
 import re
 import shlex
 import shutil
@@ -58,6 +59,8 @@ def run(argv: list[str], task: Task) -> None:
     argv = with_lists(argv, numbers, words=("data.test_paths",))
     # Lightning warns of arguments that are not sys.argv: ours add the run's configuration.
     warnings.filterwarnings("ignore", "LightningCLI's args parameter")
+    logger = logging.getLogger("lightning.pytorch.utilities.rank_zero")
+    logger.addFilter(_is_no_advertisement)
     warnings.filterwarnings("ignore", r".*isinstance\(treespec, LeafSpec\)")  # Lightning's own
     warnings.filterwarnings("ignore", "Checkpoint directory .* exists and is not empty")
     warnings.filterwarnings("ignore", "The number of training batches .* is smaller than the log")
@@ -97,6 +100,10 @@ def run(argv: list[str], task: Task) -> None:
                 "not enough memory: a smaller `batch_size` or model, or `grad_checkpointing` true, "
                 f"needs less ({str(error).strip().splitlines()[-1]})"
             ) from error
+
+
+def _is_no_advertisement(record: logging.LogRecord) -> bool:
+    return "Tip:" not in record.getMessage()
 
 
 class RunParser(LightningArgumentParser):
@@ -144,16 +151,16 @@ class RunCLI(LightningCLI):
 
     def add_arguments_to_parser(self, parser: LightningArgumentParser) -> None:
         (config,) = (action for action in parser._actions if action.dest == "config")
-        config.help = f"a preset ({presets()}) or a YAML file of options; later ones win"
+        config.help = f"a preset ({presets()}) or a YAML file of options; the last one wins"
         parser.add_argument("--run", type=str, required=True, help="the folder of the run")
-        text = "fit: goes on from the run's last checkpoint"
+        text = "fit: continue from the last checkpoint of the run"
         parser.add_argument("--resume", type=bool, default=False, help=text)
-        text = "fit: steps between checkpoints"
+        text = "fit: the number of steps between checkpoints"
         parser.add_argument("--checkpoint_steps", type=int, default=200, help=text)
         text = f"one of {', '.join(get_args(Task))}; `--task TASK --help` lists its options"
         parser.add_argument("--task", type=Task, default=self.task, help=text)
         if self.task == FIRST_TASK:
-            text = "test: the same as --data.test_lenses, e.g. 0:1:0.1 for every ξ"
+            text = "test: the same as --data.test_lenses; 0:1:0.1 tests ξ = 0, 0.1, …, 1"
             parser.add_argument("--xi", type=str, help=text)
         parser.add_argument("--devices", type=int, help="the same as --trainer.devices")
         parser.link_arguments("seed_everything", "data.seed", compute_fn=int)
@@ -167,13 +174,8 @@ class RunCLI(LightningCLI):
         config = self.config[str(self.subcommand)]
         self.folder = Path(config.run)
         config.trainer.default_root_dir = str(self.folder)
-        for name in (
-            "path",
-            "classes",
-            "splits",
-            "lens",
-            "label_map",
-        ):  # so that the run works from anywhere
+        # Absolute paths let the run continue from any folder.
+        for name in ("path", "classes", "splits", "lens", "label_map"):
             if config.data.get(name) and Path(config.data[name]).exists():
                 config.data[name] = str(Path(config.data[name]).resolve())
         if self.task == FIRST_TASK:

@@ -15,14 +15,14 @@ EXTRAS = ("demo", "onnx", "train")
 
 
 def models() -> None:
-    """Lists the models."""
+    """Lists the names of all models, and of the trained ones for `darswin predict --model`."""
     print("\n".join(list_models()))
-    print("\ntrained, for --model of predict:")
+    print("\ntrained models, for `darswin predict --model NAME`:")
     print("\n".join(list_pretrained()))
 
 
 def info() -> None:
-    """Prints what a report of an issue needs to say about this installation and machine."""
+    """Prints the details of this installation and machine to include in a bug report."""
     for name, value in facts().items():
         print(f"{name:<10}{value}")
 
@@ -40,11 +40,11 @@ def facts() -> dict[str, str]:
     }
     for dtype in (torch.float32, torch.bfloat16, torch.int8):
         reason = onednn_lack(dtype)
-        other = "none" if dtype == torch.int8 else "torch's products"
-        lines[_name(dtype)] = "oneDNN's products" if reason is None else f"{other}: {reason}"
+        other = "none" if dtype == torch.int8 else "torch"
+        lines[_name(dtype)] = "oneDNN" if reason is None else f"{other}: {reason}"
     fastest = _name(fastest_dtype())
     quantized = onednn_lack(torch.int8) is None
-    lines["fastest"] = f"int8 of a quantized model, else {fastest}" if quantized else fastest
+    lines["fastest"] = f"int8 for quantized models, else {fastest}" if quantized else fastest
     for extra in EXTRAS:
         lines[f"[{extra}]"] = lack(extra) or "installed"
     return lines

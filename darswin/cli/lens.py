@@ -1,4 +1,4 @@
-"""`darswin lens`: draws, describes or converts a calibrated lens."""
+"""`darswin lens`: draws, describes or converts a camera calibration."""
 
 import math
 from typing import Literal
@@ -17,7 +17,7 @@ from darswin.viz.report import describe, sides
 Format = Literal["darswin", "opencv", "colmap", "kalibr"]
 View = Literal["perspective", "cylindrical", "equirectangular"]
 VIEW_SIDE = 800  # px, the longer one
-# More than a picture can show: rings, sectors, samples along each side of a patch, and in all.
+# The limits of rings, sectors, samples along each side of a patch, and samples in total.
 MOST = {"rings": 1024, "sectors": 4096, "samples": 256}
 MOST_SAMPLES = 2**22
 MOST_LISTED = 20  # cameras
@@ -30,26 +30,27 @@ def show(
     pitch_deg: float = 0.0, theta_max_deg: float | None = None, camera: str | None = None,
     coefficients: Coefficients | None = None,
 ) -> None:  # fmt: skip
-    """Draws what a lens does to a picture: partition, samples, polar image, an undistorted view.
+    """Draws a picture with its polar partition, its polar image, and an undistorted view.
 
     Args:
-        calib: a calibration file, of any format that darswin.lens.load reads.
-        image: a picture that the camera took.
-        out: the file to write: png, jpg, webp, tif, pdf or svg, as its name ends.
-        rings: of the partition.
-        sectors: of the partition.
-        samples: along radius and azimuth, in each patch, e.g. 10,10.
-        spacing: what the rings split equally.
-        view: the kind of the undistorted view.
-        fov_deg: its horizontal field of view; without it what the picture shows, in a perspective
-            view 110° at most.
-        yaw_deg: how far it looks to the right.
-        pitch_deg: how far it looks up.
-        theta_max_deg: where the last ring ends; without it as far as picture and lens reach.
-        camera: which one, in a file of several.
-        coefficients: what they are, in an OpenCV or ROS file that does not say it.
+        calib: the calibration file of the camera, in any format that darswin.lens.load reads.
+        image: a picture of this camera.
+        out: the file to write; its ending names the format: png, jpg, webp, tif, pdf or svg.
+        rings: the number of rings of the partition.
+        sectors: the number of sectors of the partition.
+        samples: the numbers of samples in each patch along radius and azimuth, e.g. 10,10.
+        spacing: the quantity that the rings divide into equal parts.
+        view: the projection of the undistorted view.
+        fov_deg: the horizontal field of view of the undistorted view, in degrees. The default is
+            all that the picture shows; for a perspective view, 110° at most.
+        yaw_deg: the angle that the undistorted view looks to the right, in degrees.
+        pitch_deg: the angle that the undistorted view looks up, in degrees.
+        theta_max_deg: the incident angle where the last ring ends, in degrees. The default is the
+            largest angle that the picture shows.
+        camera: the name or number of the camera, if the file has several.
+        coefficients: the distortion model of an OpenCV or ROS file that does not name it.
     """
-    # Only `show` needs OpenCV and matplotlib. To import them takes a second.
+    # Only `show` needs OpenCV and matplotlib, whose import takes a second.
     from darswin.utils.image import read_oriented
     from darswin.viz import views
     from darswin.viz.plot import draw_lens, figure_format, save_figure
@@ -62,7 +63,7 @@ def show(
         flat = view == "perspective"
         most = "below 180°" if flat else "at most 360°"
         in_range = 0 < fov_deg < 180 if flat else 0 < fov_deg <= 360
-        _check("fov_deg", fov_deg, in_range, f"above 0° and {most} in a view that is {view}")
+        _check("fov_deg", fov_deg, in_range, f"above 0° and {most} for a {view} view")
     picture, orientation = read_oriented(image)
     size = picture.shape[:2]
     stored = stored_size(size, orientation)
@@ -75,13 +76,13 @@ def show(
         fov_deg = min(across, 110) if view == "perspective" else across
         if not fov_deg > 0:
             raise ValueError(
-                "the picture shows nothing on the row of the lens's principal point: choose the "
+                "the picture shows nothing in the row of the lens's principal point: choose the "
                 "view with `fov_deg` and `yaw_deg`"
             )
     aspect = {
         "perspective": size[0] / size[1],
         "cylindrical": 1 / 2,
-        # As high as what the lens shows in the picture; a narrower view keeps that shape.
+        # The height of all that the picture shows; narrower views keep this shape.
         "equirectangular": down / max(fov_deg, across),
     }[view]
     fov, yaw, pitch = (math.radians(angle) for angle in (fov_deg, yaw_deg, pitch_deg))
@@ -98,16 +99,18 @@ def info(
     theta_max_deg: float | None = None, camera: str | None = None,
     coefficients: Coefficients | None = None,
 ) -> None:  # fmt: skip
-    """Prints what a lens shows: field of view, pixels per degree, and which spacing fits.
+    """Prints the field of view of a lens, its pixels per degree, and the best spacing.
 
     Args:
-        calib: a calibration file, of any format that darswin.lens.load reads.
-        image_size: height and width, px, e.g. 960,1280, where the file does not say it.
-        rings: of the partition.
-        sectors: of the partition.
-        theta_max_deg: where the last ring ends; without it as far as image and lens reach.
-        camera: which one, in a file of several.
-        coefficients: what they are, in an OpenCV or ROS file that does not say it.
+        calib: the calibration file of the camera, in any format that darswin.lens.load reads.
+        image_size: height and width of the images in px, e.g. 960,1280, if the file lacks them.
+        rings: the number of rings of the partition.
+        sectors: the number of sectors of the partition.
+        theta_max_deg: the incident angle where the last ring ends, in degrees. The default is the
+            largest angle that the images show.
+        camera: the name or number of the camera, if the file has several. Without it, all
+            cameras are listed.
+        coefficients: the distortion model of an OpenCV or ROS file that does not name it.
     """
     _check_partition(rings, sectors)
     file, theta_max = _calibration(calib, theta_max_deg, image_size, coefficients)
@@ -127,8 +130,8 @@ def info(
         lens = file.lens(camera, theta_max, image_size, torch.float64)
         if lens.image_size is None:
             raise ValueError(
-                f"{calib} does not say how large its images are: give `image_size`, their height "
-                "and width, e.g. 960,1280"
+                f"{calib} lacks the size of its images: give `image_size`, their height and width, "
+                "e.g. 960,1280"
             )
         if len(file.names) > 1:
             listed = ", ".join(names) + ", …" * bool(more)
@@ -150,18 +153,20 @@ def convert(
     image_size: tuple[int, int] | None = None, camera: str | None = None,
     coefficients: Coefficients | None = None, format: Format | None = None,
 ) -> None:  # fmt: skip
-    """Writes a calibration as a file of darswin, OpenCV, COLMAP or Kalibr, or another model's.
+    """Converts a calibration to another format, or to another lens model.
 
     Args:
-        calib: a calibration file, of any format that darswin.lens.load reads.
+        calib: the calibration file of the camera, in any format that darswin.lens.load reads.
         out: the file to write.
-        model: a name of darswin.lens.MODELS; without it the model stays.
-        theta_max_deg: how far the lens is used; without it as far as image and lens reach.
-        image_size: height and width, px, where the file does not say it.
-        camera: which one, in a file of several.
-        coefficients: what they are, in an OpenCV or ROS file that does not say it.
-        format: of the file; without it OpenCV for .xml, .yaml and .yml, but Kalibr where the name
-            has "camchain" or "kalibr"; COLMAP for .txt; else darswin, whose JSON holds any lens.
+        model: the lens model to fit, a name of darswin.lens.MODELS. The default keeps the model.
+        theta_max_deg: the largest incident angle of the lens, in degrees. The default is the
+            largest angle that the images show.
+        image_size: height and width of the images in px, e.g. 960,1280, if the file lacks them.
+        camera: the name or number of the camera, if the file has several.
+        coefficients: the distortion model of an OpenCV or ROS file that does not name it.
+        format: the format of the new file. The default is OpenCV for .xml, .yaml and .yml, but
+            Kalibr if the name contains "camchain" or "kalibr"; COLMAP for .txt; and else the JSON
+            of darswin, which can hold any lens.
     """
     file, theta_max = _calibration(calib, theta_max_deg, image_size, coefficients)
     lens = file.lens(camera, theta_max, image_size, torch.float64)
@@ -174,7 +179,7 @@ def convert(
     if written != "darswin" and bool(
         (lens.theta_max - reach(lens.with_theta_max(None))).abs() > 1e-6
     ):
-        note += f"; {written} files do not say how far: read it with --theta_max_deg {degrees:.2f}"
+        note += f"; {written} files have no θ_max: read it with --theta_max_deg {degrees:.2f}"
     print(f"{out}: {written}, {type(lens).__name__} up to {degrees:.2f}°{note}")
 
 
@@ -184,7 +189,7 @@ def _calibration(
     image_size: tuple[int, int] | None,
     coefficients: str | None,
 ) -> tuple[Calibration, float | None]:
-    """The file, and θ_max in radians; ValueError for options out of their ranges."""
+    """The file, and θ_max in radians; ValueError for an option out of its range."""
     for side in image_size or ():
         _check("image_size", side, 1 <= side <= 10**6, "from 1 to 1000000 px")
     if theta_max_deg is not None:
@@ -200,7 +205,7 @@ def _check(name: str, value: float, ok: bool, range_: str) -> None:
 
 
 def _check_partition(rings: int, sectors: int, samples: tuple[int, int] = (1, 1)) -> None:
-    """ValueError for more than a picture can show, before memory is asked for it."""
+    """ValueError for numbers beyond the limits, before memory is allocated."""
     given = (("rings", rings), ("sectors", sectors), *(("samples", count) for count in samples))
     for name, value in given:
         _check(name, value, 1 <= value <= MOST[name], f"from 1 to {MOST[name]}")

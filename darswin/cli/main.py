@@ -17,12 +17,11 @@ from darswin.utils.processes import die_with_first_process
 
 
 class Command(NamedTuple):
-    """A command: its help, the modules of the extra `train` that it imports, and its function, or
-    functions. It is imported when the command is called, which takes seconds."""
+    """A command of `darswin`."""
 
-    text: str
-    needs: tuple[str, ...]
-    function: str
+    text: str  # its help
+    needs: tuple[str, ...]  # modules of the extra `train`
+    function: str  # or a dict of functions; imported only when called, because that takes seconds
 
 
 TRAIN = (
@@ -32,54 +31,54 @@ TRAIN = (
 PICTURES = ("PIL", "cv2", "matplotlib")
 RUN = "darswin.cli.fit:run"
 COMMANDS = {
-    "fit": Command("trains a model", TRAIN, RUN),
-    "validate": Command("measures a trained model on the validation set", TRAIN, RUN),
-    "test": Command("measures a trained model through lenses, for one after the other", TRAIN, RUN),
+    "fit": Command("trains a model on a folder of pictures", TRAIN, RUN),
+    "validate": Command("evaluates a trained model on the validation set", TRAIN, RUN),
+    "test": Command("evaluates a trained model on the test set, for each lens", TRAIN, RUN),
     "predict": Command(
-        "says what is in pictures taken through a known lens, or in each of their pixels",
+        "predicts classes, or a class or a distance for every pixel",
         PICTURES,
         "darswin.cli.predict:predict",
     ),
     "quantize": Command(
-        "makes a file of a trained model that computes with 8 bits",
+        "converts a trained model to 8 bits, for faster inference on CPUs",
         TRAIN,
         "darswin.cli.quantize:quantize",
     ),
     "convert": Command(
-        "makes a safetensors file of a pickled checkpoint, without executing it",
+        "converts a pickled checkpoint to safetensors, without executing it",
         (),
         "darswin.compat:convert_checkpoint",
     ),
     "models": Command("lists the models", (), "darswin.cli.info:models"),
     "lens": Command(
-        "draws, describes or converts a calibrated lens", PICTURES, "darswin.cli.lens:COMMANDS"
+        "draws, describes or converts a camera calibration", PICTURES, "darswin.cli.lens:COMMANDS"
     ),
     "bench": Command(
-        "measures how fast a model is on this machine, in a quarter of an hour",
+        "measures the speed of a model on this machine (15 minutes)",
         (),
         "darswin.cli.bench:bench",
     ),
     "info": Command(
-        "says what an issue's report needs: versions, CPU, extras", (), "darswin.cli.info:info"
+        "prints versions, CPU and extras, for bug reports", (), "darswin.cli.info:info"
     ),
 }
-# For terminals that know no more than ASCII.
+# Replacements for terminals that can only show ASCII.
 PLAIN = {"°": "deg", "×": "x", "±": "+/-", "–": "-", "…": "...", "²": "^2", "θ": "theta",
          "φ": "phi", "ξ": "xi", "π": "pi", "α": "alpha"}  # fmt: skip
 
 
 def main(argv: list[str] | None = None) -> None:
-    """Runs a command; an error that a user can mend is one line, without a traceback."""
+    """Runs a command. Errors that users can fix are printed in one line, without a traceback."""
     argv = sys.argv[1:] if argv is None else argv
     name = argv[0] if argv else "--help"
-    print_anywhere({} if name == "predict" else PLAIN)  # which prints JSON, to be read again
+    print_anywhere({} if name == "predict" else PLAIN)  # predict prints JSON for programs
     if name in ("-h", "--help"):
         print("usage: darswin COMMAND [OPTIONS]\n")
         print("\n".join(f"  {name:<10}{command.text}" for name, command in COMMANDS.items()))
         print("\n`darswin COMMAND --help` lists its options.")
         return
     if name not in COMMANDS:
-        raise misuse(f"no command {name!r}; there are {', '.join(COMMANDS)}")
+        raise misuse(f"there is no command {name!r}; the commands are {', '.join(COMMANDS)}")
     command = COMMANDS[name]
     if (without := lack("train", command.needs)) is not None:
         raise SystemExit(f"darswin {name}: {without}")
@@ -87,19 +86,19 @@ def main(argv: list[str] | None = None) -> None:
     try:
         if command.function == RUN:
             argv, task = options.complete(argv)
-            with die_with_first_process():  # which may end while this one still imports
+            with die_with_first_process():  # it may end during the imports here
                 resolve_name(RUN)(argv, task)
         else:
             run_command(resolve_name(command.function), argv[1:], f"darswin {name}")
         sys.stdout.flush()
-    except BrokenPipeError:  # `darswin lens info … | head`: who reads has enough
+    except BrokenPipeError:  # `darswin lens info … | head` stops reading early
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except (OSError, ValueError, FloatingPointError, MemoryError) as error:
-        # A worker process puts its whole traceback into the message; the last line is the error's.
+        # A worker process puts its traceback into the message; only the last line is the error.
         message = str(error).strip().splitlines()[-1] if "Traceback" in str(error) else str(error)
         broken = "BrokenImageError" in f"{type(error).__name__}{message}"
         if broken and command.function == RUN:
-            message += " (`skip_broken` true leaves such files out)"
+            message += " (to leave such files out, set `skip_broken` true)"
         message = with_flags(message, command)
         if isinstance(error, FloatingPointError):
             raise SystemExit(f"darswin: {message}") from error
@@ -107,8 +106,11 @@ def main(argv: list[str] | None = None) -> None:
 
 
 def with_flags(message: str, command: Command) -> str:
-    """An error's message with flags in place of parameters, which the library writes as `name`;
-    darswin.lens as name=, and its `model` is the command's `coefficients`."""
+    """The message of an error with flags in place of the names of parameters.
+
+    The library writes a parameter as `name`, and darswin.lens as name=. The parameter `model` of
+    darswin.lens is called `coefficients` on the command line.
+    """
     flag_of = options.flag_of if command.function == RUN else "--{}".format
     names = {"camera": "camera", "model": "coefficients"}
     message = re.sub(
@@ -120,7 +122,7 @@ def with_flags(message: str, command: Command) -> str:
 
 
 def misuse(message: str) -> SystemExit:
-    """Prints an error, and gives the exception that ends the program with exit code 2."""
+    """Prints an error, and returns the exception that ends the program with exit code 2."""
     end = SystemExit(f"darswin: {message}")
     print(end, file=sys.stderr)
     end.code = 2
@@ -128,8 +130,8 @@ def misuse(message: str) -> SystemExit:
 
 
 def print_anywhere(words: Mapping[str, str]) -> None:
-    """Lets stdout and stderr replace characters that the terminal has no code for: by `words`,
-    others as JSON escapes them."""
+    """Lets stdout and stderr replace characters that the terminal cannot encode: by `words`, or by
+    their escapes in JSON."""
 
     def plain(error: UnicodeError) -> tuple[str, int]:
         if not isinstance(error, UnicodeEncodeError):
@@ -144,7 +146,7 @@ def print_anywhere(words: Mapping[str, str]) -> None:
 
 
 def _one_line(show: Callable[..., None]) -> Callable[..., None]:
-    """Shows our own warnings in one line, each once, as errors are; others as `show` does."""
+    """Shows warnings of darswin in one line and only once; `show` shows all other warnings."""
     shown = set()
 
     def show_once(message: Warning, category: type[Warning], *where, **options) -> None:

@@ -1,4 +1,4 @@
-"""The options of `fit`, `validate` and `test`: their help, presets, and the run's own folder."""
+"""The options of `fit`, `validate` and `test`: presets, the folder of the run, and the help."""
 
 import argparse
 import inspect
@@ -12,14 +12,15 @@ import yaml
 from darswin.utils.tasks import Task
 
 PRESETS = Path(__file__).parent.parent / "train" / "presets"
-FIRST_TASK: Task = "classification"  # of runs that say none
+FIRST_TASK: Task = "classification"  # unless a run names another one
 
 
 def complete(argv: list[str]) -> tuple[list[str], Task]:
-    """The arguments with presets' names as their files, and the task. `test`, `validate` and
-    `fit --resume` begin with the configuration of the run, so that they need no other option.
+    """Replaces presets by their files and finds the task.
 
-    The errors here come at once; those of the parser only after imports that take seconds."""
+    `test`, `validate` and `fit --resume` begin with the configuration of the run, so that they need
+    no other option. Errors that are found here come before the slow imports of the parser.
+    """
     scan = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     scan.add_argument("-c", "--config", action="append", default=[])
     scan.add_argument("--run")
@@ -63,7 +64,7 @@ def _config_file(name: str) -> Path:
     if Path(name).exists():
         return Path(name)
     if not preset.exists():
-        raise ValueError(f"there is no file {name} and no such preset; the presets are {presets()}")
+        raise ValueError(f"{name} is neither a file nor a preset; the presets are {presets()}")
     return preset
 
 
@@ -71,7 +72,7 @@ def _content(config: Path) -> dict[str, Any]:
     try:
         content = yaml.safe_load(config.read_text())
     except (yaml.YAMLError, OSError):
-        return {}  # the parser says what is wrong with it
+        return {}  # the parser will report the error
     return content if isinstance(content, dict) else {}
 
 
@@ -82,7 +83,7 @@ def _path_in(content: dict[str, Any]) -> str | None:
 
 
 def presets() -> str:
-    """The names of the presets, in words."""
+    """The names of the presets, joined by commas."""
     return ", ".join(sorted(path.stem for path in PRESETS.glob("*.yaml")))
 
 
@@ -95,12 +96,12 @@ def check_free(folder: Path) -> None:
     """FileExistsError for a folder that holds a run."""
     if last_of(folder).exists():
         raise FileExistsError(
-            f"{folder} holds a run already: go on with `resume`, or choose another one"
+            f"{folder} holds a run already: continue it with `resume`, or choose another folder"
         )
 
 
 def flag_of(name: str) -> str:
-    """The flag of a parameter that an error of the library names."""
+    """The flag of a parameter, whose name comes from an error of the library."""
     if name in RUN or "." in name:
         return f"--{name}"
     from lightning.pytorch import Trainer  # takes seconds
@@ -115,10 +116,10 @@ def flag_of(name: str) -> str:
     return f"--model.{name}"
 
 
-# -- help: our options first, then the trainer's that people need -----------------------------
+# -- help: our own options first, then the important ones of Lightning's trainer ---------------
 
-ALL = "--help.all"  # shows those of Lightning's trainer that are left, too
-# Options by what argparse calls them; a text stands in place of Lightning's own.
+ALL = "--help.all"  # shows all options of the trainer
+# The options by their names in argparse; a text replaces Lightning's own.
 RUN = {
     "config": "",
     "run": "",
@@ -127,23 +128,23 @@ RUN = {
     "checkpoint_steps": "",
     "xi": "",
     "devices": "",
-    "ckpt_path": "a checkpoint to start from, in place of the run's own",
+    "ckpt_path": "a checkpoint to use in place of the run's own",
     "seed_everything": "the seed of shuffles, lenses, augmentation, weights, jitter and mixing",
 }
 TRAINER = {
-    "trainer.max_epochs": "epochs to train",
-    "trainer.max_steps": "steps to train, in place of epochs; -1 is any number",
-    "trainer.max_time": "time to train, as DD:HH:MM:SS",
+    "trainer.max_epochs": "the number of epochs",
+    "trainer.max_steps": "the number of steps, in place of epochs; -1 sets no limit",
+    "trainer.max_time": "the time limit of the training, as DD:HH:MM:SS",
     "trainer.accelerator": "cpu, gpu or auto",
     "trainer.precision": "32-true, bf16-mixed or 16-mixed",
-    "trainer.accumulate_grad_batches": "batches of a step",
-    "trainer.gradient_clip_val": "the norm that gradients are cut to; null is none",
-    "trainer.limit_train_batches": "batches of an epoch, or the share of them",
-    "trainer.limit_val_batches": "batches of a validation, or the share of them; 0 is none",
-    "trainer.check_val_every_n_epoch": "epochs between validations",
-    "trainer.log_every_n_steps": "steps between lines of the logs",
-    "trainer.logger": "false writes no logs",
-    "trainer.enable_progress_bar": "true or false",
+    "trainer.accumulate_grad_batches": "the number of batches in one optimizer step",
+    "trainer.gradient_clip_val": "the largest norm of the gradients; null sets no limit",
+    "trainer.limit_train_batches": "the number of batches in an epoch, or a fraction of them",
+    "trainer.limit_val_batches": "the same for a validation; 0 skips it",
+    "trainer.check_val_every_n_epoch": "the number of epochs between validations",
+    "trainer.log_every_n_steps": "the number of steps between lines of the logs",
+    "trainer.logger": "false switches the logs off",
+    "trainer.enable_progress_bar": "true shows a progress bar",
 }
 GROUPS = {"data": "pictures and lenses", "model": "the model and its training"}
 # The other commands take the path from the run.
@@ -157,9 +158,9 @@ def format_help(
     command: str,
     whole: bool,
 ) -> str:
-    """The help of a command, in lines of at most `WIDTH`; `whole` shows the trainer's other options
-    too, by the `formatter`."""
-    # An option that is linked to another one has no name that could be typed.
+    """The help of a command, in lines of at most `WIDTH`. With `whole`, the `formatter` adds the
+    remaining options of the trainer."""
+    # Options that are linked to others cannot be typed.
     typed = (a for a in actions if any(name.startswith("-") for name in a.option_strings))
     left = {action.dest: action for action in typed}
     required = REQUIRED[command]
@@ -187,13 +188,13 @@ def format_help(
 
 
 def _option(action: argparse.Action, text: str, required: Collection[str]) -> list[str]:
-    """An option, its help, and in brackets its default."""
+    """The lines for an option: its name, its help, and its default in brackets."""
     names = ", ".join(name for name in action.option_strings if not name.endswith("+"))
     default = action.default
     if action.dest in required:
         shown = "required"
     elif action.dest == "data.path":
-        shown = "that of the run"
+        shown = "from the run"
     elif isinstance(default, float):
         shown = f"{default:g}"
     else:

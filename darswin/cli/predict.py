@@ -1,4 +1,4 @@
-"""`darswin predict`: what a trained model sees in pictures and videos, taken with known lenses."""
+"""`darswin predict`: predictions of a trained model for pictures and videos of known lenses."""
 
 import json
 import os
@@ -34,7 +34,7 @@ from darswin.utils.video import is_video, read_frames
 
 
 class File(NamedTuple):
-    """A picture or a video that has an answer coming."""
+    """A picture or a video to predict."""
 
     name: str
     is_video: bool
@@ -48,30 +48,30 @@ def predict(
 ) -> list[dict]:  # fmt: skip
     """Predicts classes, or a class or a distance for every pixel, of pictures and video frames.
 
-    Prints the most probable classes as JSON, or writes picture files. Pictures and videos that
-    their metadata turns are turned upright, with their lens. If some files cannot be predicted, the
-    command writes all other predictions first and then names these files. The speed in frames per
-    second follows the frames of each video.
+    Prints the most probable classes as JSON, or writes picture files. Pictures and videos are
+    turned upright by their metadata, and their lens with them. If some files cannot be read, the
+    command writes all other predictions first and then names these files. For each video, the last
+    entry gives the speed in frames per second.
 
     Args:
-        paths: image files, videos, and folders of them. A model that comes with darswin has a
-            picture and its lens, which are taken if no paths are given.
+        paths: image files, videos, and folders of them. A model that comes with darswin has an
+            example picture, which is used if no paths are given.
         lens: the camera's calibration file, in any format that `darswin.lens.load` reads. Or a lens
             as JSON, in pixels of the pictures: {"model": "Spherical", "xi": 0.5, "focal": 300,
             "theta_max": 1.5}; "fov" (rad) can replace the last two if the field of view fills the
             circle inside the picture. For several cameras, either a lenses.json, whose paths are
             relative to its own folder (see `darswin.data.Calibrations`), or a folder with one
             calibration, STEM.json, for each picture or video.
-        run: a run's folder; its best model predicts.
-        model: a model's safetensors file in place of `run`, or "digits", which comes with darswin.
-            `darswin convert` makes such files of the authors' released weights; their classes have
-            numbers.
+        run: the folder of a run of `darswin fit`, whose best model is used.
+        model: in place of a run, the safetensors file of a model, or "digits", which comes with
+            darswin. `darswin convert` makes such files from the authors' released weights; their
+            classes are numbers.
         camera: the name or number of the camera, if the calibration has several.
-        coefficients: the distortion model of a calibration of OpenCV or ROS that does not name it.
-        task: an error is raised if the model was trained for another task.
-        top: number of classes for each image.
-        every: the first frame of a video is predicted, and every so many frames after it.
-        out: a JSON file to write; without it the classes are printed. For segmentation and
+        coefficients: the distortion model of an OpenCV or ROS calibration that does not name it.
+        task: the task that the model must have. Another model is an error.
+        top: the number of classes to list for each image.
+        every: the step between the frames of a video that are predicted; 1 predicts all.
+        out: the JSON file to write; without it, classes are printed. For segmentation and
             distance, a folder that is new, empty, or from an earlier predict. It gets
             labels/NAME.png with class ids (255: unknown), or distance/NAME.png with metres × 256
             in 16 bits, up to 255.996 m (0: unknown); overlays/NAME.jpg; and predictions.json.
@@ -82,7 +82,7 @@ def predict(
         weights = model
     else:
         raise ValueError(
-            "predict needs either `run`, a run's folder, or `model`, a safetensors file or one of "
+            "give either `run`, the folder of a run, or `model`, a safetensors file or one of "
             + ", ".join(list_pretrained())
         )
     for name, value in (("top", top), ("every", every)):
@@ -90,11 +90,13 @@ def predict(
             raise ValueError(f"`{name}` must be at least 1, got {value}")
     if not paths and lens is None and model in list_pretrained():
         paths, lens = [str(pretrained_file(model, "png"))], str(pretrained_file(model, "json"))
-    if not paths or lens is None:
-        raise ValueError("predict needs pictures or videos, and `lens`, the camera's calibration")
+    if not paths:
+        raise ValueError("missing pictures or videos: give files or folders")
+    if lens is None:
+        raise ValueError("missing `lens`: give the camera's calibration file")
     net, card = trained_model(weights)
     if task not in (None, card.task):
-        raise ValueError(f"`task` {task} was asked of {weights}, a model for {card.task}")
+        raise ValueError(f"`task` is {task}, but {weights} is a model for {card.task}")
     files = pictures_and_videos(paths, leave_out=None if card.task == "classification" else out)
     calibrations = _calibrations(lens, camera, coefficients, files)
     if card.task == "classification":
@@ -115,7 +117,7 @@ def predict(
                     answers.add({"image": file.name}, image, taken_with)
             except BrokenImageError as error:
                 bad.append(str(error))
-    finally:  # what was found is not lost
+    finally:  # keep the predictions so far
         try:
             answers.flush()
         finally:
@@ -125,14 +127,14 @@ def predict(
                 print(text) if out is None else replace_file(out, text)
     if bad:
         videos = any(file.is_video for file in files)
-        what, kind = (", or not for all frames,", "files") if videos else ("", "pictures")
-        count = f"no answer{what} for {len(bad)} of {len(files)} {kind}:\n" if found else ""
+        what, kind = ("complete prediction", "files") if videos else ("prediction", "pictures")
+        count = f"no {what} for {len(bad)} of {len(files)} {kind}:\n" if found else ""
         raise BrokenImageError(count + "\n".join(bad))
     return found
 
 
 def pictures_and_videos(paths: Sequence[str], leave_out: str | None = None) -> list[File]:
-    """The files of paths, of which folders mean all pictures and videos in them."""
+    """The files at the paths; a folder stands for all pictures and videos in it."""
     files = []
     for path in paths:
         names = [str(path)]
@@ -152,7 +154,7 @@ def _is_below(path: str, folder: str) -> bool:
 
 
 def answer_video(name: str, every: int, calibrations: Calibrations, answers: Answers) -> None:
-    """Answers the frames of a video, and prints how fast that went."""
+    """Predicts the frames of a video, and prints the speed."""
     answers.flush()
     done, before, start = len(answers.found), answers.seconds, time.perf_counter()
     try:
@@ -171,8 +173,8 @@ def answer_video(name: str, every: int, calibrations: Calibrations, answers: Ans
             }
             answers.found.append({"video": name, **speed})
             print(
-                f"darswin: {name}: {frames} frames at {frames / seconds:.1f} a second, by the "
-                f"network alone {frames / network:.1f}",
+                f"darswin: {name}: {frames} frames at {frames / seconds:.1f} frames/s; "
+                f"the network alone: {frames / network:.1f} frames/s",
                 file=sys.stderr,
             )
 
@@ -185,18 +187,16 @@ def _calibrations(
         root = "." if is_json(lens) else Path(lens).parent
         return Calibrations(lens, root, camera, coefficients)
     if camera is not None:
-        raise ValueError(f"`camera` {camera} is one of a calibration file, and {lens} is a folder")
+        raise ValueError(f"`camera` {camera} chooses a camera of a file, but {lens} is a folder")
     own = {Path(file.name): Path(lens, f"{Path(file.name).stem}.json") for file in files}
     there = {file: calibration for file, calibration in own.items() if calibration.is_file()}
     if not there:
-        raise FileNotFoundError(
-            f"no calibration in {lens}: the first would be {next(iter(own.values()))}"
-        )
+        raise FileNotFoundError(f"no calibration in {lens}: {next(iter(own.values()))} is missing")
     return Calibrations(None, coefficients=coefficients, files=there)
 
 
 def _lens(calibrations: Calibrations, name: str, image: np.ndarray, orientation: int) -> Lens:
-    """The lens in an upright picture or frame; BrokenImageError where there is none that fits."""
+    """The lens of an upright picture or frame; BrokenImageError if none fits."""
     try:
         return calibrations.lens_of(Path(name), (image.shape[0], image.shape[1]), orientation)
     except ValueError as error:
@@ -204,9 +204,9 @@ def _lens(calibrations: Calibrations, name: str, image: np.ndarray, orientation:
 
 
 def trained_model(path: str | Path) -> tuple[Any, ModelCard]:
-    """The model of a file of ours, or of the released DarSwin's weights, and its card.
+    """The model of a safetensors file and its card. The file is ours, or has the released weights.
 
-    The released code normalises pixels as ImageNet's; a model's classes have numbers there.
+    The released code normalises pixels by the statistics of ImageNet, and its classes are numbers.
     """
     try:
         return load_model(path)
@@ -219,7 +219,7 @@ def trained_model(path: str | Path) -> tuple[Any, ModelCard]:
 
 
 def _released_size(path: str | Path) -> int:
-    """px of the images that released weights were trained on, as their configuration says."""
+    """The image size (px) in the configuration of released weights."""
     with safe_open(path, "pt") as file:
         config = (file.metadata() or {}).get("config", "{}")
     try:

@@ -1,4 +1,4 @@
-"""`darswin quantize`: a run's model with weights and activations of 8 bits."""
+"""`darswin quantize`: the model of a run with weights and activations of 8 bits."""
 
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
@@ -27,20 +27,24 @@ def quantize(
     *, run: str, pictures: int = 256, tolerance: float = 0.01, keep: list[str] | None = None,
     out: str | None = None,
 ) -> str:  # fmt: skip
-    """Makes a file of a run's best model whose large products take 8 bits: on CPUs with VNNI they
-    run two to three times as fast as in float32.
+    """Converts the best model of a run to 8 bits, which makes it faster on CPUs.
 
-    Ranges come from training pictures as they are, through the lenses of training, and what
-    disturbs the result most stays in float32. What changed is measured on validation pictures.
-    `darswin predict --model FILE` and `darswin.optimize(model, "fastest")` run it.
+    On CPUs with VNNI, the large matrix products run two to three times as fast as in float32. The
+    ranges of the activations are measured on training pictures, through the lenses of training. The
+    parts that change the result most stay in float32. The command prints how much the results
+    change on validation pictures. `darswin predict --model FILE` and
+    `darswin.optimize(model, "fastest")` run the file.
 
     Args:
         run: the folder of a run of `darswin fit`.
-        pictures: of training that are looked at, and of validation.
-        tolerance: of the mean square of what changes, over the variance of the result; parts stay
-            in float32 until it is kept.
-        keep: modules that stay in float32, by name, as ["stages.0", "stages.1.blocks.0.attn"].
-        out: the safetensors file; without it checkpoints/best.int8.safetensors of the run.
+        pictures: the number of training pictures for the calibration, and of validation pictures
+            for the comparison.
+        tolerance: the largest allowed change of the results, as mean square over their variance.
+            Parts return to float32 until the change is small enough.
+        keep: the names of modules that stay in float32, e.g. ["stages.0",
+            "stages.1.blocks.0.attn"].
+        out: the safetensors file to write. The default is checkpoints/best.int8.safetensors in the
+            folder of the run.
     """
     if pictures < 1:
         raise ValueError(f"`pictures` must be at least 1, got {pictures}")
@@ -65,14 +69,14 @@ def quantize(
 
 
 def _data_of(run: Path) -> RunData:
-    """The data of a run, as its configuration says them."""
+    """The data of a run, from its configuration."""
     config = yaml.safe_load((run / "config.yaml").read_text())
     options = config["data"] | dict(batch_size=BATCH, workers=0)
     return TASKS[config.get("task", FIRST_TASK)].data(**options)
 
 
 def _batches(data: RunData, split: Any, count: int) -> Iterator[tuple[Tensor, Lens, Tensor]]:
-    """So many pictures of a split, evenly spread, as they are evaluated."""
+    """Batches of `count` evenly spread pictures of a split, prepared for evaluation."""
     dataset = data.dataset(split)
     count = min(count, len(dataset))
     chosen = [k * len(dataset) // count for k in range(count)]
@@ -96,14 +100,14 @@ def _comparison(
             right += int((before == target)[valid].sum())
             kept += int((after == target)[valid].sum())
             same += int((before == after).sum())
-    share = f"mean square of what changed, of the variance: {results.share():.1e}"
+    share = f"mean square change / variance: {results.share():.1e}"
     yield f"{pictures} validation pictures: {share}"
     if task != "distance":
         yield (
-            f"right: {_percent(right, known)} before, {_percent(kept, known)} after; the same is "
-            f"said in {_percent(same, pixels)}"
+            f"correct: {_percent(right, known)} before, {_percent(kept, known)} after; same "
+            f"prediction: {_percent(same, pixels)}"
         )
 
 
 def _percent(count: int, whole: int) -> str:
-    return f"{100 * count / whole:.2f} %" if whole else "nothing known"
+    return f"{100 * count / whole:.2f} %" if whole else "no labels"

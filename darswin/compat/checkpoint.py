@@ -48,7 +48,7 @@ def convert_checkpoint(source: str | os.PathLike, target: str | os.PathLike) -> 
     as the optimizer's state, are left out. A failure leaves no incomplete file.
 
     Args:
-        source: the path of the checkpoint; see `read_state`.
+        source: the path of the checkpoint, a file of `torch.save`.
         target: the path of the safetensors file.
 
     Raises:

@@ -1,1 +1,1 @@
-"""Helpers without lenses: files, memory, processes, reading images and videos."""
+"""Helpers without lenses: files, memory, processes, progress, images and videos."""

@@ -1,4 +1,4 @@
-"""The packages that some of darswin needs beyond its own requirements."""
+"""Optional packages that some parts of darswin need."""
 
 import importlib.util
 import re
@@ -6,12 +6,12 @@ import shlex
 from collections.abc import Sequence
 from importlib.metadata import requires
 
-# Packages whose modules have other names.
+# The names of modules that differ from their packages.
 _MODULES = {"pillow": "PIL", "opencv-python-headless": "cv2", "scikit-learn": "sklearn"}
 
 
 def lack(extra: str, modules: Sequence[str] | None = None) -> str | None:
-    """A sentence that names those of an extra's modules, or of `modules`, that are missing."""
+    """A sentence that names the missing modules of an extra, or of `modules`; None if none is."""
     of_extra = re.compile(rf"extra == ['\"]{extra}['\"]")
     declared = {}
     for requirement in requires("darswin") or ():
@@ -24,4 +24,4 @@ def lack(extra: str, modules: Sequence[str] | None = None) -> str | None:
     if not missing:
         return None
     packages = shlex.join(declared[module] for module in missing)
-    return f"{', '.join(missing)} missing; to install what is needed: pip install {packages}"
+    return f"{', '.join(missing)} missing; to install: pip install {packages}"

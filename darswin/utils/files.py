@@ -1,4 +1,4 @@
-"""Writing files so that a crash, a kill or a full disk leaves the old one or the new one."""
+"""Writing files completely or not at all, also in a crash or on a full disk."""
 
 import contextlib
 import errno
@@ -12,8 +12,8 @@ _PARTIAL = ".partial"
 
 
 def replace_file(path: str | os.PathLike, content: bytes | memoryview | str) -> None:
-    """Writes a file whole, beside the old one and then in its place; makes its folder. An OSError
-    names `path`, which is then as it was."""
+    """Writes a new file beside the old one, then replaces the old one. Creates the folder. If an
+    OSError is raised, it names `path`, and the old file is unchanged."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     data = content.encode() if isinstance(content, str) else content
@@ -34,22 +34,22 @@ def replace_file(path: str | os.PathLike, content: bytes | memoryview | str) -> 
         if temporary is not None:
             temporary.unlink(missing_ok=True)
         raise OSError(
-            error.errno, f"cannot write it, it is as it was: {error.strerror}", str(path)
+            error.errno, f"cannot write the file, which is unchanged: {error.strerror}", str(path)
         ) from error
 
 
 def remove_partial_files(folder: str | os.PathLike) -> None:
-    """Removes the temporary files below a folder that killed calls of `replace_file` left there."""
+    """Removes the temporary files of killed calls of `replace_file` below a folder."""
     for path in Path(folder).rglob(f".*{_PARTIAL}"):
         path.unlink(missing_ok=True)
 
 
 @contextlib.contextmanager
 def locked(path: str | os.PathLike) -> Iterator[None]:
-    """A context in which no other process can lock the same file. The file is created, and stays.
+    """A context in which no other process can lock the same file. The file is created and kept.
 
-    The lock is the process's own: its forks do not hold it, and its end, even by a kill, frees it.
-    BlockingIOError: another process has locked it.
+    The lock belongs to the process: its forks do not hold it, and its end frees it, even by a kill.
+    BlockingIOError: another process holds the lock.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -58,6 +58,8 @@ def locked(path: str | os.PathLike) -> Iterator[None]:
             fcntl.lockf(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
             if error.errno in (errno.EACCES, errno.EAGAIN):
-                raise BlockingIOError(errno.EAGAIN, "another process holds it", str(path)) from None
-            # Some network file systems have no locks: go on without one there.
+                raise BlockingIOError(
+                    errno.EAGAIN, "another process holds the lock", str(path)
+                ) from None
+            # Some network file systems have no locks: continue without one.
         yield

@@ -1,4 +1,4 @@
-"""Reading picture files, upright as their EXIF orientation says."""
+"""Reading picture files, turned upright by their EXIF orientation."""
 
 import io
 import warnings
@@ -18,23 +18,23 @@ _SAYS_MORE = frozenset((b"eXIf", b"tEXt", b"zTXt", b"iTXt"))  # chunks that may 
 
 
 class BrokenImageError(OSError):
-    """A file that is no readable image or video."""
+    """Raised for files that are no readable image or video."""
 
 
 def read_image(path: str | Path, channels: int = 3) -> np.ndarray:
-    """A picture file as (H, W, C) uint8, C = 3 (RGB) or 1 (grey), turned upright as its EXIF says.
+    """A picture file as (H, W, C) uint8, C = 3 (RGB) or 1 (grey), turned upright by its EXIF.
 
     Raises:
-        BrokenImageError: a file that is missing, unreadable or no image; it names the file.
+        BrokenImageError: the file is missing, unreadable or no image. The error names the file.
     """
     return _picture(file_content(path), path, channels)
 
 
 def read_oriented(path: str | Path, channels: int = 3) -> tuple[np.ndarray, int]:
-    """`read_image`, and the EXIF orientation, 1 to 8, that it was turned from; its lens needs it.
+    """`read_image`, and the EXIF orientation of the file, 1 to 8, which the lens needs.
 
     Raises:
-        BrokenImageError: as `read_image`; an orientation that cannot be read.
+        BrokenImageError: see `read_image`; or the orientation cannot be read.
     """
     data = file_content(path)
     upright = _picture(data, path, channels)
@@ -55,7 +55,7 @@ def read_form(path: str | Path) -> tuple[int, int]:
     Only the header of the file is read.
 
     Raises:
-        BrokenImageError: a file that is missing, unreadable or no image; it names the file.
+        BrokenImageError: the file is missing, unreadable or no image. The error names the file.
     """
     try:
         with warnings.catch_warnings(action="ignore"), Image.open(path) as file:
@@ -66,7 +66,7 @@ def read_form(path: str | Path) -> tuple[int, int]:
 
 
 def file_content(path: str | Path) -> np.ndarray:
-    """The bytes of a file; BrokenImageError where it cannot be read."""
+    """The bytes of a file; BrokenImageError if it cannot be read."""
     try:
         return np.fromfile(path, np.uint8)
     except OSError as error:
@@ -80,7 +80,7 @@ def _picture(data: np.ndarray, path: str | Path, channels: int, flags: int = 0) 
 
 
 def decoded(data: np.ndarray, path: str | Path, flags: int) -> np.ndarray:
-    """A file's content as OpenCV decodes it; BrokenImageError where it cannot."""
+    """Decodes the content of a file; BrokenImageError if OpenCV cannot."""
     try:
         image = cv2.imdecode(data, flags) if data.size else None
     except (cv2.error, MemoryError) as error:  # too many pixels for OpenCV, or for the memory
@@ -94,18 +94,18 @@ def decoded(data: np.ndarray, path: str | Path, flags: int) -> np.ndarray:
 
 
 def _exif(data: np.ndarray, path: str | Path) -> tuple[int, str | None]:
-    """The EXIF orientation, 1 where there is none, and Pillow's name of the file's format."""
+    """The EXIF orientation, 1 by default, and Pillow's name of the file's format."""
     if data[:8].tobytes() == _PNG and _SAYS_MORE.isdisjoint(_png_chunks(data)):
         return 1, "PNG"  # Pillow would decode all of it to look for more
     try:
         with warnings.catch_warnings(action="ignore"), Image.open(io.BytesIO(data.data)) as file:
             orientation = file.getexif().get(ExifTags.Base.Orientation, 1)
             return orientation if orientation in TURNS else 1, file.format
-    except UnidentifiedImageError:  # none of the formats that have EXIF
+    except UnidentifiedImageError:  # a format without EXIF
         return 1, None
-    except Exception as error:  # EXIF that is no EXIF fails in many ways
+    except Exception as error:  # damaged EXIF fails in many ways
         raise BrokenImageError(
-            f"cannot read {path}: its EXIF orientation cannot be told, {error}"
+            f"cannot read {path}: its EXIF orientation is unreadable, {error}"
         ) from error
 
 

@@ -1,4 +1,4 @@
-"""The processes of one run on one machine: if the first one dies, the others die with it."""
+"""The processes of a run on one machine: if the first one dies, the others die too."""
 
 import ctypes
 import os
@@ -6,16 +6,16 @@ import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-_FIRST = "DARSWIN_FIRST_PROCESS"  # the variable that tells other processes its number
-_PR_SET_PDEATHSIG = 1  # of Linux's prctl: the signal that a process gets when its parent dies
+_FIRST = "DARSWIN_FIRST_PROCESS"  # the environment variable with its process number
+_PR_SET_PDEATHSIG = 1  # option of Linux's prctl: the signal for a process whose parent dies
 
 
 @contextmanager
 def die_with_first_process() -> Iterator[None]:
-    """Within it, the processes that Lightning starts for a run die as soon as the first one does.
+    """A context in which Lightning's other processes of a run die together with the first one.
 
-    Without it they would wait for the first one for minutes. Processes that torchrun, SLURM or a
-    user starts have other parents, and stay as they are. SystemExit: the first one has died before.
+    Otherwise they would wait for the first one for minutes. Processes that torchrun, SLURM or a
+    user starts have other parents, and are not affected. SystemExit: the first one is dead already.
     """
     first = os.environ.get(_FIRST)
     if first is not None and os.environ.get("LOCAL_RANK", "0") != "0":

@@ -1,4 +1,4 @@
-"""Reads files of `torch.save` without executing anything in them."""
+"""Reading files of `torch.save` without executing code in them."""
 
 import os
 import pickle
@@ -8,24 +8,26 @@ from typing import Any
 
 import torch
 
-# The authors' checkpoints hold their configuration, pickled as a dict subclass of the package yacs.
-# An OrderedDict takes its place: torch's restricted unpickler can fill that one.
+# The authors' checkpoints contain a configuration of the class CfgNode, a dict of the package yacs.
+# It is replaced by an OrderedDict, which torch's restricted unpickler can fill.
 _STAND_INS: list[Any] = [(OrderedDict, "yacs.config.CfgNode")]
 
 
 def read_pickle(path: str | os.PathLike, map_location: Any = "cpu") -> object:
-    """A file of `torch.save`; ValueError where it holds more than tensors and plain values."""
+    """Reads a file of `torch.save`; ValueError if it holds more than tensors and plain values."""
     try:
         with torch.serialization.safe_globals(_STAND_INS):
             return torch.load(path, map_location=map_location, weights_only=True)
-    except Exception as error:  # a file that is no checkpoint may fail in any way
-        if isinstance(error, OSError) and error.filename:  # cut-off archives name none
+    except Exception as error:  # other files fail in many ways
+        if (
+            isinstance(error, OSError) and error.filename
+        ):  # errors of cut-off archives have no file name
             raise
         found = re.search(r"GLOBAL (\S+)", str(error))
         if not isinstance(error, pickle.UnpicklingError) or not found:
             raise ValueError(f"{path} cannot be read as a checkpoint") from error
-        # Torch's own message would advise to load the file with weights_only=False.
+        # Torch's own message would advise weights_only=False, which executes code.
         raise ValueError(
-            f"{path} is refused, and nothing in it was executed: it asks for {found[1]}, which no "
+            f"{path} is refused, and nothing in it was executed: it refers to {found[1]}, which no "
             "state dict needs"
         ) from None

@@ -1,4 +1,4 @@
-"""Reading the frames of video files, upright as their metadata says."""
+"""Reading the frames of video files, turned upright by their metadata."""
 
 import os
 from collections.abc import Iterator
@@ -14,11 +14,10 @@ SUFFIXES = frozenset((
     ".3gp", ".asf", ".avi", ".flv", ".h264", ".h265", ".hevc", ".m2ts", ".m4v", ".mjpeg", ".mjpg",
     ".mkv", ".mov", ".mp4", ".mpeg", ".mpg", ".mts", ".ogv", ".ts", ".webm", ".wmv", ".y4m",
 ))  # fmt: skip
-# The EXIF orientations of pictures that are turned upright as a video's metadata says, in degrees
-# clockwise.
+# The EXIF orientations for the turns in a video's metadata, in degrees clockwise.
 _ORIENTATIONS = {0: 1, 90: 6, 180: 3, 270: 8}
-# A video may end so much before the end that its header names, as where its sound is longer: s, but
-# no larger a part of the video.
+# A video may end earlier than its header claims, e.g. if its sound is longer: by these seconds, and
+# at most by this part of its length.
 _TOLERANCE = 0.5
 _PART = 0.05
 
@@ -27,22 +26,22 @@ class Frame(NamedTuple):
     number: int  # from 0
     time: float  # s
     image: np.ndarray  # (H, W, C) uint8, upright
-    orientation: int  # EXIF's, that it was turned upright from
+    orientation: int  # of EXIF, before the frame was turned upright
 
 
 def is_video(path: str | Path) -> bool:
-    """True for a file with a video's name, or that OpenCV opens as a video and as no image."""
+    """True for a file with the ending of a video, or that OpenCV can only open as a video."""
     if os.path.splitext(path)[1].lower() in SUFFIXES:
         return True
     return os.path.isfile(path) and not cv2.haveImageReader(str(path)) and _opened(path) is not None
 
 
 def read_frames(path: str | Path, channels: int = 3, every: int = 1) -> Iterator[Frame]:
-    """Every so many frames of a video file, from the first on; C = 3 (RGB) or 1 (grey).
+    """Reads the first frame of a video file and every `every`-th after it; C = 3 (RGB) or 1 (grey).
 
     Raises:
-        BrokenImageError: a file that is missing or no video; after its last frame, a video that
-            ends before the end that its header names, by half a second or a twentieth.
+        BrokenImageError: the file is missing or no video. Or, after its last frame, the video ends
+            earlier than its header claims, by half a second or a twentieth.
     """
     capture = _opened(path)
     if capture is None:
@@ -67,15 +66,15 @@ def read_frames(path: str | Path, channels: int = 3, every: int = 1) -> Iterator
 
 
 def _opened(path: str | Path) -> cv2.VideoCapture | None:
-    """None for a file that is no video."""
-    # FFmpeg would describe damage on stderr, line after line.
+    """The opened video; None for other files."""
+    # FFmpeg would print many lines about damage to stderr.
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
     capture = cv2.VideoCapture(str(path)) if os.path.isfile(path) else None
     return capture if capture is not None and capture.isOpened() else None
 
 
 def _check_end(path: str | Path, capture: cv2.VideoCapture, count: int, time: float) -> None:
-    """BrokenImageError where a video of so many frames, the last at `time`, is not whole."""
+    """BrokenImageError if a video of `count` frames, the last at `time`, is incomplete."""
     if count == 0:
         raise BrokenImageError(f"cannot read {path}: no frame that OpenCV can decode")
     rate, named = capture.get(cv2.CAP_PROP_FPS), capture.get(cv2.CAP_PROP_FRAME_COUNT)
@@ -85,6 +84,6 @@ def _check_end(path: str | Path, capture: cv2.VideoCapture, count: int, time: fl
     length, end = named / rate, time + 1 / rate
     if length - end > min(_TOLERANCE, _PART * length):
         raise BrokenImageError(
-            f"{path} is damaged or cut off: it ends after {count} frames, at {end:.1f} s of the "
-            f"{length:.1f} s that its header names"
+            f"{path} is damaged or cut off: it ends after {count} frames, at {end:.1f} s; its "
+            f"header claims {length:.1f} s"
         )

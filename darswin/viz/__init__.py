@@ -1,1 +1,1 @@
-"""Pictures of lenses, grids and results."""
+"""Figures of lenses, grids and results."""

@@ -1,7 +1,7 @@
-"""Pictures of labels and distances of each pixel: colours, overlays, predictions beside the truth.
+"""Pictures of labels and distances: colours, overlays, and predictions beside the truth.
 
-Labels are ids (H, W) of integers; an id without a colour, as that of pixels without a label, is
-grey. Distances are (H, W) in metres, and grey where they are 0 or not finite: not known.
+Labels are integer ids (H, W). Ids without a colour are grey, such as that of unlabelled pixels.
+Distances are (H, W) in metres. They are unknown, and grey, if they are 0 or not finite.
 """
 
 from collections.abc import Callable, Sequence
@@ -22,14 +22,14 @@ __all__ = ["distance_image", "distance_range", "label_image", "overlay", "palett
 UNKNOWN = (128, 128, 128)  # the colour of pixels without a label or distance
 MOST_CLASSES = 255  # 8 bits of a label picture, of which 255 means none
 
-# Near is bright. Equal steps look equal, also to those who see few colours.
+# Near is bright. Equal steps look equal, also to colour-blind people.
 _DISTANCES = "viridis_r"
 _ERRORS, _WORST = "magma", Normalize(0, 0.5, clip=True)
 _WRONG, _RIGHT = (213, 0, 50), (222, 222, 222)
 # Okabe and Ito's colours without black.
 _FIRST = ((0, 114, 178), (230, 159, 0), (0, 158, 115), (204, 121, 167), (86, 180, 233),
           (213, 94, 0), (240, 228, 66))  # fmt: skip
-# How those without red or green cones see linear RGB: Machado, Oliveira and Fernandes (2009).
+# The linear RGB that people without red or green cones see: Machado, Oliveira and Fernandes (2009).
 _SEEN = np.array([
     [[1, 0, 0], [0, 1, 0], [0, 0, 1]],
     [[0.152286, 1.052583, -0.204868], [0.114503, 0.786281, 0.099216],
@@ -44,13 +44,14 @@ Painted = tuple[np.ndarray, np.ndarray, np.ndarray, str]
 
 
 def palette(count: int) -> list[list[int]]:
-    """So many colours (r, g, b) in 0 … 255, unlike each other and the grey of unknown pixels.
+    """Colours (r, g, b) in 0 … 255 that differ from each other and from the grey of unknown pixels.
 
-    The first seven are Okabe and Ito's; each that follows is the one that is least like those
-    before it, to those who see no red or no green too. More colours begin with the same.
+    The first seven are by Okabe and Ito. Each following colour differs as much as possible from
+    those before it, also for people who cannot see red or green. A longer palette begins with the
+    colours of a shorter one.
 
     Raises:
-        ValueError: less than 0 or more than 255.
+        ValueError: `count` is below 0 or above 255.
     """
     if not 0 <= count <= MOST_CLASSES:
         raise ValueError(f"a palette has 0 to {MOST_CLASSES} colours, got {count}")
@@ -63,7 +64,7 @@ def _palette() -> tuple[tuple[int, ...], ...]:
     candidates = np.stack(np.meshgrid(levels, levels, levels, indexing="ij"), -1).reshape(-1, 3)
     seen = _as_seen(candidates)
     chosen = [tuple(color) for color in _FIRST]
-    # Black is kept for those who draw on the colours.
+    # Black stays free for lines and text on the colours.
     unlike = np.full(len(candidates), np.inf)
     for color in (UNKNOWN, (0, 0, 0), *chosen):
         unlike = np.minimum(unlike, _difference(seen, _as_seen(np.array([color]))))
@@ -75,7 +76,7 @@ def _palette() -> tuple[tuple[int, ...], ...]:
 
 
 def _as_seen(colors: np.ndarray) -> np.ndarray:
-    """sRGB (N, 3) in CIELAB, to each kind of eye: (3, N, 3)."""
+    """Converts sRGB (N, 3) to CIELAB for each kind of colour vision: (3, N, 3)."""
     part = colors / 255
     linear = np.where(part <= 0.04045, part / 12.92, ((part + 0.055) / 1.055) ** 2.4)
     seen = (linear @ _SEEN.transpose(0, 2, 1)).clip(0, 1).astype(np.float32)
@@ -83,7 +84,7 @@ def _as_seen(colors: np.ndarray) -> np.ndarray:
 
 
 def _difference(colors: np.ndarray, color: np.ndarray) -> np.ndarray:
-    """The least ΔE*76 to any eye, (N,)."""
+    """The smallest ΔE*76 over all kinds of colour vision, (N,)."""
     return np.linalg.norm(colors - color, axis=-1).min(0)
 
 
@@ -91,7 +92,7 @@ def label_image(labels: np.ndarray, colors: Sequence[Sequence[int]]) -> np.ndarr
     """Labels (H, W) in the colours (r, g, b) of their ids: (H, W, 3) uint8.
 
     Raises:
-        TypeError: labels that are no integers. ValueError: labels of another shape.
+        TypeError: the labels are not integers. ValueError: the labels have another shape.
     """
     if not np.issubdtype(labels.dtype, np.integer):
         raise TypeError(f"labels must be integers, got {labels.dtype}")
@@ -105,11 +106,11 @@ def distance_image(distance: np.ndarray, near: float, far: float) -> np.ndarray:
     """Distances (H, W) in metres as colours of their logarithm: (H, W, 3) uint8.
 
     Args:
-        near, far: m, of the brightest and of the darkest colour; what is nearer or farther has
-            these colours too. `distance_range` proposes them.
+        near, far: the distances (m) of the brightest and the darkest colour, which nearer or
+            farther distances have too. `distance_range` computes suitable values.
 
     Raises:
-        ValueError: distances of another shape; `near` that is not above 0, `far` not above it.
+        ValueError: the distances have another shape, or 0 < near < far does not hold.
     """
     _check_map("distance", distance)
     if not 0 < near < far < np.inf:
@@ -122,7 +123,7 @@ def distance_image(distance: np.ndarray, near: float, far: float) -> np.ndarray:
 
 
 def distance_range(distance: np.ndarray) -> tuple[float, float]:
-    """(near, far) in metres for `distance_image`: all but the nearest and farthest fiftieth."""
+    """Computes (near, far) in metres for `distance_image`, without the nearest and farthest 2 %."""
     known = distance[is_known(distance)]
     if not known.size:
         return 1.0, 10.0
@@ -131,21 +132,21 @@ def distance_range(distance: np.ndarray) -> tuple[float, float]:
 
 
 def is_known(distance: np.ndarray) -> np.ndarray:
-    """Distances (H, W) that are finite and above 0."""
+    """True for distances (H, W) that are finite and above 0."""
     return np.isfinite(distance) & (distance > 0)
 
 
 def overlay(
     image: np.ndarray, picture: np.ndarray, alpha: float = 0.5, where: np.ndarray | None = None
 ) -> np.ndarray:
-    """A picture (H, W, 3) laid over an image (H, W, 1 or 3), uint8 both: (H, W, 3) uint8.
+    """Blends a picture (H, W, 3) over an image (H, W, 1 or 3), both uint8: (H, W, 3) uint8.
 
     Args:
-        alpha: how much of the picture is seen, 0 to 1. where: (H, W), its pixels that are laid over
-            the image; None means all.
+        alpha: the opacity of the picture, 0 to 1.
+        where: (H, W), True for pixels to blend; None means all.
 
     Raises:
-        ValueError: pictures of other shapes, `alpha` out of its range.
+        ValueError: the pictures have other shapes, or `alpha` is out of its range.
     """
     image = image[..., None] if image.ndim == 2 else image
     if picture.shape != (*image.shape[:2], 3) or image.shape[2] not in (1, 3):
@@ -167,17 +168,17 @@ def draw_predictions(
     *,
     titles: Sequence[str] = (),
 ) -> Figure:
-    """Draws image, truth, prediction and error, a row a sample.
+    """Draws image, truth, prediction and error, in one row for each sample.
 
-    Truth and prediction are labels of integers, with the names and colours of their classes, or
-    distances of floats in metres. The error is shown where the truth is known: wrong pixels are
-    red, or the distance's relative error. The titles stand left of the rows.
+    Truth and prediction are integer labels, with the names and colours of their classes, or
+    distances as floats in metres. Where the truth is known, the error shows wrong labels in red, or
+    the relative error of the distance. The titles are placed left of the rows.
     """
     if not rows:
         raise ValueError("there are no predictions to draw")
     are_labels = np.issubdtype(rows[0][1].dtype, np.integer)
     if are_labels and not classes:
-        raise ValueError("predictions of labels are drawn with the names of their classes")
+        raise ValueError("labels need the names of their classes")
     height, width = rows[0][1].shape
     tall = len(rows) * (2.5 * height / width + 0.25) + (0.9 if are_labels else 1.5)
     figure = Figure(figsize=(10.4, tall), layout="constrained")
@@ -235,7 +236,7 @@ def _distance_pictures(
 
 
 def _draw_bars(figure: Figure, panels: np.ndarray, near: float, far: float) -> None:
-    """The scales of distances and of their errors, below the panels."""
+    """Draws the scales of distances and of their errors below the panels."""
     distances = ScalarMappable(LogNorm(near, far), matplotlib.colormaps[_DISTANCES])
     bar = figure.colorbar(
         distances, ax=panels[:3], location="bottom", shrink=0.5, aspect=40, extend="both"

@@ -1,4 +1,4 @@
-"""Pictures with matplotlib: what a lens does to an image, and accuracy over distortion.
+"""Figures with matplotlib: a lens, its polar image, and accuracy over distortion.
 
 Each function draws on `axes`, or on a new figure that pyplot knows nothing of, and returns the
 figure; `save_figure` writes it. Images are (H, W) or (H, W, 3), uint8 or floats in [0, 1].
@@ -36,22 +36,22 @@ SPACING_SYMBOLS = {"theta": "θ", "tan": "tan θ", "g": "g(θ)", "radius": "r"}
 # The formats that matplotlib writes without another program, by their endings.
 FORMATS = {".png": "png", ".jpg": "jpeg", ".jpeg": "jpeg", ".webp": "webp", ".tif": "tiff",
            ".tiff": "tiff", ".pdf": "pdf", ".svg": "svg"}  # fmt: skip
-# Where an image has nothing to show.
+# The style of areas without an image.
 HATCH = dict(facecolor="0.9", hatch="///", edgecolor="0.6", linewidth=0)
 
 
 def figure_format(path: str | os.PathLike) -> str:
-    """The format that a file's ending names; ValueError where it is none of `FORMATS`."""
+    """The format for the ending of a file name; ValueError if it is not in `FORMATS`."""
     ending = Path(path).suffix.lower()
     if ending not in FORMATS:
         raise ValueError(
-            f"a picture's name must end in one of {', '.join(FORMATS)}, got {os.fspath(path)!r}"
+            f"the name of a figure must end in {', '.join(FORMATS)}, got {os.fspath(path)!r}"
         )
     return FORMATS[ending]
 
 
 def save_figure(figure: Figure, path: str | os.PathLike) -> None:
-    """Writes a figure as the file that its ending names, whole or not at all.
+    """Writes a figure; the ending of the path names the format. A failure leaves no partial file.
 
     Raises:
         ValueError: another ending. OSError: as `darswin.utils.files.replace_file`.
@@ -69,10 +69,10 @@ def draw_grid(
     samples: bool = True,
     axes: Axes | None = None,
 ) -> Figure:
-    """An image with the borders of its polar patches and, over them, the sample points.
+    """Draws an image with the borders of its polar patches and the sample points.
 
-    All follow the lens: with affine, tangential or thin-prism terms they are on no circles. The
-    sampler is that of a model, `model.patch_embed.sample`.
+    Affine, tangential and thin-prism terms of the lens deform the rings. The sampler of a model is
+    `model.patch_embed.sample`.
     """
     axes = axes or _new_axes()
     lens, grid = _grid(lens, sampler, image)
@@ -87,8 +87,8 @@ def draw_grid(
 def draw_samples(
     image: np.ndarray, lens: Lens, sampler: PolarSample, *, axes: Axes | None = None
 ) -> Figure:
-    """`draw_grid` of a tenth of the image, enlarged: half way out, to the right and upwards, or as
-    near to it as the image reaches."""
+    """Draws the grid on a tenth of the image, enlarged. The part lies half way between the centre
+    and the upper right end of the lens, if the image reaches there."""
     axes = axes or _new_axes()
     lens, grid = _grid(lens, sampler, image)
     left, top, width, height = _enlarged(image, lens)
@@ -109,7 +109,7 @@ def _draw_borders(
     size: tuple[int, int],
     widths: tuple[float, float],
 ) -> None:
-    """Rings and sectors, of these line widths; outlined, so that they show on bright walls."""
+    """Draws rings and sectors with an outline, which keeps them visible on bright pictures."""
     rings = lens.unproject(grid.borders[0])[:, None]
     around = torch.linspace(0, 2 * math.pi, 361)
     outwards = torch.linspace(rings.min(), rings.max(), 65)
@@ -122,24 +122,24 @@ def _draw_borders(
 
 
 def _sample_places(lens: Lens, grid: PolarGrid, size: tuple[int, int]) -> Tensor:
-    """x and y of the sample points, (2, n) px."""
+    """The x and y of the sample points, (2, n) px."""
     theta = lens.unproject(grid.radii[0])[:, None]
     return lens.project_rays(theta, grid.azimuths, size).flatten(0, 1).T
 
 
 def _outline(width: float, colour: str) -> list[AbstractPathEffect]:
-    """A line of this width with a thin outline."""
+    """The path effects for a line of this width with a thin outline."""
     return [Stroke(linewidth=width + 0.8, foreground=colour, alpha=0.6), Normal()]
 
 
 def draw_polar(
     image: np.ndarray, lens: Lens, sampler: PolarSample, *, axes: Axes | None = None
 ) -> Figure:
-    """The polar image that a network gets: a row a radius, a column an azimuth, without jitter."""
+    """Draws the polar image, without jitter: rows are radii, columns are azimuths."""
     axes = axes or _new_axes(9, 3)
     lens, grid = _grid(lens, sampler, image)
     pixels = torch.from_numpy(np.atleast_3d(image)).permute(2, 0, 1)[None].float()
-    # With a channel that says how much of a sample is of the image.
+    # The last channel is the fraction of a sample that lies in the image.
     pixels = torch.cat((pixels, torch.ones_like(pixels[:, :1])), 1)
     arguments = sampler.arguments(pixels, grid) | dict(jitter=0.0)
     *colours, share = polar_sample(**arguments, layout="image")[0].numpy()
@@ -157,8 +157,8 @@ def draw_polar(
 
 
 def draw_view(image: np.ndarray, lens: Lens, rays: Tensor, *, axes: Axes | None = None) -> Figure:
-    """The image along rays (H, W, 3) of `darswin.viz.views`. Ticks are angles from the ray in the
-    middle, along the view's middle row and column, to the right and upwards."""
+    """Draws the view along rays (H, W, 3) of `darswin.viz.views`. The ticks are the angles from the
+    central ray, in the middle row and column of the view; they rise to the right and upwards."""
     axes = axes or _new_axes()
     x, y = np.moveaxis(view_map(lens, rays, image.shape[:2]), -1, 0)
     height, width = image.shape[:2]
@@ -174,15 +174,15 @@ def draw_view(image: np.ndarray, lens: Lens, rays: Tensor, *, axes: Axes | None 
 
 
 def _middle(rays: Tensor) -> Tensor:
-    """The middle row of rays (H, W, 3), of unit length: (W, 3), float64."""
+    """The middle row of rays (H, W, 3) as unit vectors, (W, 3) float64."""
     rays = torch.nn.functional.normalize(rays.detach().to("cpu", torch.float64), dim=-1)
     rows = rays[(len(rays) - 1) // 2], rays[len(rays) // 2]
     return torch.nn.functional.normalize(rows[0] + rows[1], dim=-1)
 
 
 def _angle_ticks(line: Tensor, most: int) -> tuple[np.ndarray, np.ndarray]:
-    """Places on a line of rays (n, 3) and what they are, round degrees from its middle: at most
-    `most` steps."""
+    """The places of ticks on a line of rays (n, 3), and their round angles from the middle in
+    degrees; at most `most` steps."""
     seen = line.any(-1).numpy()
     half = (len(line) - 1) / 2
     middle = torch.nn.functional.normalize(line[math.floor(half)] + line[math.ceil(half)], dim=0)
@@ -191,14 +191,14 @@ def _angle_ticks(line: Tensor, most: int) -> tuple[np.ndarray, np.ndarray]:
     degrees = torch.rad2deg(torch.atan2(apart, line @ middle)).numpy() * np.sign(places - half)
     places, degrees = places[seen], degrees[seen]
     if len(degrees) < 2 or not (np.diff(degrees) > 0).all():
-        return places[:0], degrees[:0]  # of rays that are no picture of directions in a row
+        return places[:0], degrees[:0]  # the directions along the line do not rise
     ticks = MaxNLocator(most, steps=[1, 1.5, 2, 3, 5, 6, 10]).tick_values(*degrees[[0, -1]])
     ticks = ticks[(ticks >= degrees[0]) & (ticks <= degrees[-1])]
     return np.interp(ticks, degrees, places), ticks
 
 
 def _label(text: str, outside: np.ndarray, beyond: np.ndarray | None = None) -> str:
-    """An axis's label and, where anything is hatched, what that means."""
+    """The label of an axis, with an explanation of hatched areas if there are any."""
     reasons = ["outside the sensor"] if outside.any() else []
     reasons += ["beyond θ_max"] if beyond is not None and beyond.any() else []
     return f"{text}\nhatched: {' or '.join(reasons)}" if reasons else text
@@ -221,7 +221,7 @@ def draw_curve(
     density.plot(degrees, along, "C0-", label="px/° along r")
     density.plot(degrees, around, "C1-", label="px/° around")
     density.set(ylabel="pixels per degree")
-    # Room for the legend above the curves.
+    # Leave room for the legend above the curves.
     axes.set_ylim(0, 1.15 * radius.max().item())
     density.set_ylim(0, 1.15 * torch.cat((along, around)).max().item())
     if image_size is not None:
@@ -231,10 +231,10 @@ def draw_curve(
 
 
 def _draw_sides(axes: Axes, lens: Lens, image_size: tuple[int, int]) -> None:
-    """A line where the image ends to each side, but for sides that are beyond θ_max."""
+    """Draws a line at the angle of each side of the image that lies within θ_max."""
     angles = torch.rad2deg(lens.side_angles(image_size)[0]).tolist()
     ends = beyond_lens(lens, image_size).tolist()
-    # Each name at a height of its own: opposite sides are often at nearly the same angle.
+    # The names have different heights, because opposite sides often have similar angles.
     looks = zip(SIDES, ("--", ":", "--", ":"), (0.02, 0.21, 0.4, 0.6), strict=True)
     for (side, style, height), angle, beyond in zip(looks, angles, ends, strict=True):
         if beyond or angle > axes.get_xlim()[1] + 1e-6:
@@ -289,8 +289,8 @@ def draw_accuracy(
     *,
     axes: Axes | None = None,
 ) -> Figure:
-    """Accuracy (%) against ξ, a line a model, with the range of training, if any, shaded. Of
-    several seeds, a list each, the mean is the line and the span is a band."""
+    """Draws accuracy (%) over ξ, with one line for each model and the range of training shaded. If
+    there are lists for several seeds, the line is their mean and a band their range."""
     axes = axes or _new_axes(7, 4.2)
     if trained is not None:
         axes.axvspan(*trained, color="tab:pink", alpha=0.3, lw=0, label="seen in training")
@@ -307,7 +307,7 @@ def draw_accuracy(
 
 
 def _figure_of(axes: Axes) -> Figure:
-    """The whole figure, that of axes in a subfigure too."""
+    """The figure of the axes, which may be in a subfigure."""
     figure = axes.figure
     return figure if isinstance(figure, Figure) else figure.figure
 
@@ -333,7 +333,7 @@ def _show(axes: Axes, image: np.ndarray, outside: np.ndarray | None = None, **op
 def _one(lens: Lens) -> Lens:
     """The lens in double precision, without gradients; ValueError unless it is one."""
     if len(lens) != 1:
-        raise ValueError(f"a picture is of one lens, got {len(lens)}")
+        raise ValueError(f"a figure shows one lens, got {len(lens)}")
     return lens.detach().to("cpu", torch.float64)
 
 
@@ -343,7 +343,7 @@ def _grid(lens: Lens, sampler: PolarSample, image: np.ndarray) -> tuple[Lens, Po
 
 
 def _enlarged(image: np.ndarray, lens: Lens) -> tuple[float, float, float, float]:
-    """Left, top, width and height of the part that `draw_samples` shows, inside the image."""
+    """Left, top, width and height of the part of the image that `draw_samples` shows."""
     height, width = image.shape[:2]
     place = _one(lens).project_rays(lens.theta_max.item() / 2, -math.pi / 4, (height, width))[0]
     x, y = (

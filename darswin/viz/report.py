@@ -1,4 +1,4 @@
-"""A lens in words: field of view, pixels per degree, and the spacing that fits."""
+"""Descriptions of lenses: field of view, pixels per degree, and the best spacing."""
 
 import math
 from typing import NamedTuple
@@ -16,8 +16,8 @@ SIDES = ("left", "top", "right", "bottom")
 
 
 def pixels_per_degree(lens: Lens, theta: Tensor) -> tuple[Tensor, Tensor]:
-    """dr/dθ and r / sin θ of one lens at θ, rad: the pixels of a degree along the radius and around
-    the axis, before `affine`."""
+    """The pixels per degree of one lens at θ (rad), before `affine`: along the radius, dr/dθ, and
+    around the axis, r / sin θ."""
     theta = theta.detach().clone().requires_grad_()
     lens = lens.detach()
     with torch.enable_grad():
@@ -29,7 +29,7 @@ def pixels_per_degree(lens: Lens, theta: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def largest_offset(lens: Lens) -> float:
-    """The longest way in px that tangential and thin-prism terms move a ray up to θ_max."""
+    """The largest offset (px) by tangential and thin-prism terms up to θ_max."""
     theta = lens.theta_max * torch.linspace(0, 1, 129).to(lens.theta_max)[:, None]
     azimuth = torch.linspace(0, 2 * math.pi, 181).to(theta)
     direction = torch.stack((torch.cos(azimuth), torch.sin(azimuth)), -1)
@@ -37,12 +37,12 @@ def largest_offset(lens: Lens) -> float:
 
 
 def beyond_lens(lens: Lens, image_size: tuple[int, int]) -> Tensor:
-    """(4,), in the order of SIDES: True where the image reaches further than the lens."""
+    """True for each side of the image that lies beyond the lens: (4,), in the order of SIDES."""
     return lens.side_angles(image_size)[0] >= lens.with_theta_max(None).theta_max
 
 
 def sides(lens: Lens, image_size: tuple[int, int]) -> Tensor:
-    """(4,) rad: `side_angles`, below 0 where the principal point is past that side."""
+    """The `side_angles`, (4,) rad; negative if the principal point lies beyond that side."""
     cx, cy = lens.center_in(image_size)[0].tolist()
     height, width = image_size
     past = (cx < -0.5, cy < -0.5, cx > width - 0.5, cy > height - 0.5)
@@ -51,7 +51,7 @@ def sides(lens: Lens, image_size: tuple[int, int]) -> Tensor:
 
 
 def outside_share(lens: Lens, image_size: tuple[int, int]) -> float:
-    """The share of rays up to θ_max, in equal steps of θ and φ, that land outside the image."""
+    """The fraction of rays up to θ_max, in equal steps of θ and φ, that miss the image."""
     steps = (torch.arange(128, dtype=torch.float64) + 0.5) / 128
     pixels = lens.project_rays(lens.theta_max * steps[:, None], 2 * math.pi * steps, image_size)
     last = pixels.new_tensor(image_size).flip(0) - 0.5
@@ -59,11 +59,11 @@ def outside_share(lens: Lens, image_size: tuple[int, int]) -> float:
 
 
 class Patches(NamedTuple):
-    """Ring widths (px) and areas of a ring's patches (px), the smallest and the largest."""
+    """The smallest and largest ring width (px), and area of a patch (px²)."""
 
     width: tuple[float, float]
     area: tuple[float, float]
-    ratio: float  # of the largest patch to the smallest
+    ratio: float  # the area of the largest patch over the smallest
 
 
 def patches(lens: Lens, spacing: Spacing, rings: int, sectors: int) -> Patches:
@@ -71,7 +71,7 @@ def patches(lens: Lens, spacing: Spacing, rings: int, sectors: int) -> Patches:
     grid = polar_grid(lens, (1, 1), rings=rings, sectors=sectors, samples=(1, 1), spacing=spacing)
     borders = grid.borders[0]
     stretch = 1.0 if lens.affine is None else lens.affine[0].det().abs().item()
-    # Of a circle of radius 1: the square of a length in pixels may be beyond what a float holds.
+    # Relative to a circle of radius 1: the squares of lengths in pixels may overflow.
     shares = ((borders / borders[-1]) ** 2).diff() * (math.pi / sectors * stretch)
     areas = shares * borders[-1] ** 2
     width, area, share = ((v.min().item(), v.max().item()) for v in (borders.diff(), areas, shares))
@@ -79,7 +79,7 @@ def patches(lens: Lens, spacing: Spacing, rings: int, sectors: int) -> Patches:
 
 
 def best_spacing(lens: Lens, rings: int, sectors: int) -> Spacing:
-    """The spacing that knows the lens and has the most even patches, in pixels, of one lens."""
+    """The spacing, "radius" excluded, whose patches have the most equal areas in pixels."""
     usable = [s for s in SPACINGS if s != "radius" and _usable(lens, s)]
     return min(usable, key=lambda spacing: patches(lens, spacing, rings, sectors).ratio)
 
@@ -87,7 +87,7 @@ def best_spacing(lens: Lens, rings: int, sectors: int) -> Spacing:
 def describe(
     lens: Lens, image_size: tuple[int, int] | None = None, *, rings: int = 16, sectors: int = 64
 ) -> str:
-    """Describes a lens in some twenty lines of text.
+    """Describes a lens in about twenty lines of text.
 
     Args:
         lens: one lens. image_size: (H, W); None means the lens's own.
@@ -101,7 +101,7 @@ def describe(
     lens = lens.detach().to("cpu", torch.float64)
     if image_size is None:
         if lens.image_size is None:
-            raise ValueError("this lens needs the image_size, (H, W)")
+            raise ValueError("the lens has no image size: give image_size, (H, W)")
         height, width = (round(side) for side in lens.image_size[0].tolist())
         image_size = height, width
     rows = _model(lens, image_size) + _view(lens, image_size)
@@ -151,9 +151,9 @@ def _view(lens: Lens, image_size: tuple[int, int]) -> list[tuple[str, str]]:
         ("θ at the sides", ", ".join(
             f"{side}: the lens ends before" if beyond else f"{side} {_degrees(angle)}"
             for side, angle, beyond in ends)),
-        ("θ limit", f"{_both(lens.theta_limit)}: up to where r rises"),
-        ("θ_max", f"{_both(lens.theta_max)}: as far as it is used, r = {lens.r_max.item():.1f} px"),
-        ("outside sensor", f"{share:.1%} of the samples up to θ_max, in equal steps of θ"),
+        ("θ limit", f"{_both(lens.theta_limit)}: r rises up to here"),
+        ("θ_max", f"{_both(lens.theta_max)}: the rings end here, r = {lens.r_max.item():.1f} px"),
+        ("outside sensor", f"{share:.1%} of the samples up to θ_max, with equal steps of θ"),
     ]  # fmt: skip
 
 
@@ -181,16 +181,19 @@ def _density(lens: Lens) -> list[tuple[str, str]]:
 
 
 def _spacings(lens: Lens, rings: int, sectors: int) -> list[tuple[str, str]]:
-    rows = [("", ""), ("spacing", f"ring width (px)   px a token   of {rings} × {sectors} tokens")]
+    rows = [
+        ("", ""),
+        ("spacing", f"ring width (px)   px per token   for {rings} × {sectors} tokens"),
+    ]
     best = best_spacing(lens, rings, sectors)
     for spacing in SPACINGS:
         if not _usable(lens, spacing):
-            rows.append((f"  {spacing}", "not for this θ_max: tan θ ends at 90°"))
+            rows.append((f"  {spacing}", "impossible for this θ_max: tan θ ends at 90°"))
             continue
         found = patches(lens, spacing, rings, sectors)
         width, area = (f"{low:.1f} to {high:.1f}" for low, high in found[:2])
-        note = "  knows nothing of the lens" if spacing == "radius" else ""
-        note += "  <- the most even that knows it" if spacing == best else ""
+        note = "  ignores the lens" if spacing == "radius" else ""
+        note += "  <- most equal" if spacing == best else ""
         rows.append((f"  {spacing}", f"{width:<18}{area:<18}1 : {found.ratio:.0f}{note}"))
     return rows
 

@@ -1,8 +1,8 @@
-"""Undistorted views: a camera's image as another, ideal camera would show it, through OpenCV.
+"""Undistorted views: the image that an ideal camera would take in place of a calibrated one.
 
-A view is the rays that its pixels look along, (H, W, 3), of any length and anywhere on the sphere:
-`perspective`, `cylindrical` and `equirectangular` make them, `undistort` looks an image up along
-them. A lens of 190° shows more than one perspective view holds; `yaw` and `pitch` look aside.
+A view consists of the rays of its pixels, (H, W, 3), of any length and direction. `perspective`,
+`cylindrical` and `equirectangular` compute them, and `undistort` samples an image along them with
+OpenCV. One perspective view cannot hold a lens of 190°; `yaw` and `pitch` turn the view.
 
 Convention:
     Camera frame: x to the right, y down, z forward along the optical axis. A ray (x, y, z) has
@@ -31,9 +31,9 @@ __all__ = ["cylindrical", "equirectangular", "perspective", "undistort"]
 def perspective(
     size: tuple[int, int], fov: float, *, yaw: float = 0.0, pitch: float = 0.0
 ) -> Tensor:
-    """The rays of a pinhole camera, in whose view straight lines are straight.
+    """The rays of a pinhole camera, which shows straight lines straight: (H, W, 3), float64.
 
-    Of a view of (H, W), with a `fov` in (0, π) rad; yaw and pitch are in rad → (H, W, 3), float64.
+    `size` is (H, W), `fov` lies in (0, π) rad, and yaw and pitch are in rad.
     """
     _check_fov(fov, math.pi, "below π")
     x, y = _plane(size, 2 * math.tan(fov / 2))
@@ -45,7 +45,7 @@ def cylindrical(
 ) -> Tensor:
     """The rays of a panorama on an upright cylinder: columns are equal angles, verticals straight.
 
-    As `perspective`, but with a `fov` in (0, 2π] rad.
+    The arguments are those of `perspective`, but `fov` lies in (0, 2π] rad.
     """
     _check_fov(fov, 2 * math.pi, "at most 2π", closed=True)
     longitude, y = _plane(size, fov)
@@ -57,8 +57,9 @@ def equirectangular(
 ) -> Tensor:
     """The rays of a map of the sphere: columns are equal longitudes, rows equal latitudes.
 
-    As `perspective`, but with a `fov` in (0, 2π] rad: with 2π and H = W/2 it is the whole sphere,
-    its middle the optical axis. Rows beyond the poles are zeros, which see nothing.
+    The arguments are those of `perspective`, but `fov` lies in (0, 2π] rad. With 2π and H = W/2 the
+    map shows the whole sphere, with the optical axis in its middle. Rows beyond the poles are
+    zeros, which show nothing.
     """
     _check_fov(fov, 2 * math.pi, "at most 2π", closed=True)
     longitude, latitude = _plane(size, fov)
@@ -80,10 +81,10 @@ def rotated(rays: Tensor, yaw: float, pitch: float) -> Tensor:
 
 
 def view_map(lens: Lens, rays: Tensor, image_size: tuple[int, int] | None = None) -> np.ndarray:
-    """The places in the image of a lens where rays (H, W, 3) land, as a map of `cv2.remap`:
-    (H, W, 2) float32, x and y; `OUTSIDE` beyond θ_max."""
+    """The pixels of rays (H, W, 3) in the image of a lens, as a map for `cv2.remap`: (H, W, 2)
+    float32, x and y; `OUTSIDE` beyond θ_max."""
     if len(lens) != 1:
-        raise ValueError(f"a view is of one lens, got {len(lens)}")
+        raise ValueError(f"a view needs one lens, got {len(lens)}")
     if rays.dim() != 3 or rays.shape[2] != 3:
         raise ValueError(f"rays must have shape (H, W, 3), got {tuple(rays.shape)}")
     lens, rays = lens.detach().to("cpu", torch.float64), rays.detach().to("cpu", torch.float64)
@@ -93,7 +94,7 @@ def view_map(lens: Lens, rays: Tensor, image_size: tuple[int, int] | None = None
 def undistort(
     image: np.ndarray, lens: Lens, rays: Tensor, *, interpolation: int = cv2.INTER_LINEAR
 ) -> np.ndarray:
-    """The image that a camera sees along rays; black beyond its θ_max and outside of its image.
+    """Samples an image along rays; pixels beyond θ_max or outside of the image are black.
 
     Args:
         image: (H, W) or (H, W, C), uint8 or float32, taken with `lens`.
@@ -103,14 +104,14 @@ def undistort(
         (H', W') or (H', W', C), of the image's type.
 
     Raises:
-        ValueError: more than one lens, or rays of another shape.
+        ValueError: there are several lenses, or the rays have another shape.
     """
     height, width = image.shape[:2]
     return remap(image, view_map(lens, rays, (height, width)), interpolation)
 
 
 def _plane(size: tuple[int, int], width: float) -> tuple[Tensor, Tensor]:
-    """The coordinates of the pixels of (H, W) from their middle, where W of them are `width`."""
+    """The x and y of the pixels of (H, W), from the middle; W pixels have the length `width`."""
     step = width / size[1]
     y, x = ((torch.arange(side, dtype=torch.float64) - (side - 1) / 2) * step for side in size)
     y, x = torch.meshgrid(y, x, indexing="ij")

@@ -204,7 +204,7 @@ def test_an_answer_that_is_not_finite_is_none(stub, monkeypatch, tmp_path, task,
 
     monkeypatch.setattr(net, "run", broken)
     pictures = [write(tmp_path / f"{k}.png", np.full((48, 64, 3), 50, np.uint8)) for k in (0, 1)]
-    with pytest.raises(SystemExit, match=f"darswin: no answer for {pictures[1]}: .* NaN or"):
+    with pytest.raises(SystemExit, match=f"darswin: no prediction for {pictures[1]}: .* NaN or"):
         predict(*pictures, out=tmp_path / "out")
     found = json.loads((tmp_path / "out" / "predictions.json").read_text())
     assert [answer["image"] for answer in found] == pictures[:1]  # what was found is not lost
@@ -273,8 +273,8 @@ def test_nothing_but_its_own_is_replaced(tmp_path):
     (tmp_path / "in/p.png").touch()
     (tmp_path / "list").mkdir()
     (tmp_path / "list/predictions.json").write_text('{"mine": 1}')
-    for out, said in ((None, "must be their folder"), ("in", "none of predict's"),
-                      ("in/p.png", "is a file"), ("list", "none of predict's")):  # fmt: skip
+    for out, said in ((None, "missing `out`"), ("in", "holds other files"),
+                      ("in/p.png", "is a file"), ("list", "holds other files")):  # fmt: skip
         with pytest.raises(ValueError, match=said):
             claim_folder(out and str(tmp_path / out))
     assert [path.name for path in (tmp_path / "in").iterdir()] == ["p.png"]
@@ -290,7 +290,7 @@ def test_wrong_arguments_are_named(stub, labels, tmp_path, capsys):
     picture = write(tmp_path / "p.png", picture_of(labels))
     net = stub("segmentation")
     argv = ["predict", picture, "--model", "m", "--lens", json.dumps(LENS)]
-    with pytest.raises(SystemExit, match="--out must be their folder"):
+    with pytest.raises(SystemExit, match="missing --out"):
         main(argv)
     with pytest.raises(SystemExit, match="--task distance was asked of m, a model for segm"):
         main([*argv, "--out", str(tmp_path / "o"), "--task", "distance"])

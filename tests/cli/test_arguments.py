@@ -1,5 +1,7 @@
 """Command lines but for `darswin lens`, `fit`, `test` and `predict`, which have their own tests."""
 
+import inspect
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
@@ -9,8 +11,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from darswin.cli import bench as command
+from darswin.cli import lens, predict, quantize
 from darswin.cli.arguments import run_command, with_lists
 from darswin.cli.main import main
+from darswin.compat import convert_checkpoint
 
 
 @pytest.mark.parametrize(
@@ -69,7 +73,7 @@ def test_a_function_gets_its_arguments(capsys):
         command_of("--help")
     text = " ".join(capsys.readouterr().out.split())
     assert end.value.code == 0 and "Does nothing." in text and "of 100% of things." in text
-    assert "of it. one of a, b [null]" in text and "[1,2]" in text and "[0.5]" in text
+    assert "of it. One of a, b." in text and "[1,2]" in text and "[0.5]" in text
 
 
 @pytest.mark.parametrize(
@@ -95,7 +99,7 @@ def test_wrong_arguments_are_one_sentence(capsys, typed, said):
         command_of(*typed.split())
     assert end.value.code == 2
     (line,) = capsys.readouterr().err.splitlines()
-    assert line.startswith(f"prog: {said}") and line.endswith("; `prog --help` tells more")
+    assert line.startswith(f"prog: {said}") and line.endswith("; see `prog --help`")
 
 
 @pytest.mark.parametrize(
@@ -108,11 +112,11 @@ def test_wrong_arguments_are_one_sentence(capsys, typed, said):
         (["bench", "--size", "0"], "--size must be from 1 to 65536, got 0"),
         (["bench", "--size=-1"], "--size must be from 1 to 65536, got -1"),
         (["bench", "--batches", "1,x"], "--batches must be whole numbers, such as 1,8, got 1,x"),
-        (["bench", "--batches"], "--batches must be one number at least"),
+        (["bench", "--batches"], "--batches must have at least one number"),
         (["bench", "--seconds", "nan"], "--seconds must be above 0, got nan"),
         (["bench", "--model", "swan"], "unknown model 'swan'"),
         (["bench", "--out", __file__], "File exists"),
-        (["train"], "no command 'train'; there are fit, "),
+        (["train"], "no command 'train'; the commands are fit, "),
     ],
 )
 def test_misuse_ends_with_a_sentence_before_any_work(capsys, monkeypatch, argv, said):
@@ -142,3 +146,25 @@ def test_any_arguments_end_with_an_answer_or_a_sentence(tmp_path_factory, name, 
             main([name, *words])
         except SystemExit as end:
             assert end.code in (0, 2)
+
+
+HELPED = {
+    "predict": predict.predict,
+    "quantize": quantize.quantize,
+    "convert": convert_checkpoint,
+    "bench": command.bench,
+    **{f"lens {name}": function for name, function in lens.COMMANDS.items()},
+}
+
+
+@pytest.mark.parametrize("name", HELPED)
+def test_help_describes_every_argument_in_sentences(capsys, monkeypatch, name):
+    monkeypatch.setenv("COLUMNS", "2000")  # no text is broken into lines
+    with pytest.raises(SystemExit):
+        main([*name.split(), "--help"])
+    text = capsys.readouterr().out
+    assert text.splitlines()[2].endswith(".")
+    for argument in inspect.signature(HELPED[name]).parameters:
+        (described,) = re.findall(rf"^  (?:--)?{argument}\b(?: [A-Z_[\]]+)?\s+(.+)", text, re.M)
+        assert re.search(r"\S\.( \[[^\]]*\])?$", described), described
+        assert "read_state" not in described

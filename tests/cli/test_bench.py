@@ -91,7 +91,7 @@ def test_the_matrix_products_are_all_of_the_model(name):
 def test_candidates_that_disagree_are_not_timed():
     runs = {OURS: lambda: torch.ones(3), REFERENCE: lambda: torch.ones(3) + 1e-3}
     command._check(runs | {MATMULS: lambda: torch.zeros(1)}, 1e-2)
-    with pytest.raises(RuntimeError, match="darswin is off the reference's result"):
+    with pytest.raises(RuntimeError, match="darswin differs from the reference"):
         command._check(runs, 1e-4)
 
 

@@ -79,9 +79,12 @@ def refusal(capsys, *arguments):
 @pytest.mark.parametrize(
     "options, said",
     [
-        (["--fov_deg", "0"], "--fov_deg must be above 0° and below 180° in .* perspective, got 0"),
+        (
+            ["--fov_deg", "0"],
+            "--fov_deg must be above 0° and below 180° for a perspective view",
+        ),
         (["--fov_deg=180"], "--fov_deg must be above 0° and below 180° .*, got 180"),
-        (["--view=cylindrical", "--fov_deg=361"], "at most 360° in a view that is cylindrical"),
+        (["--view=cylindrical", "--fov_deg=361"], "at most 360° for a cylindrical view"),
         (["--yaw_deg=inf"], "--yaw_deg must be a finite number of degrees, got inf"),
         (["--theta_max_deg=0"], "--theta_max_deg must be above 0° and at most 180°, got 0"),
         (["--rings=100000000"], "--rings must be from 1 to 1024, got 100000000"),
@@ -106,7 +109,7 @@ def test_misuse_is_refused_before_any_work(folder, capsys, monkeypatch, options,
         ("show front.json square.png", r"for 1280×966 \(W×H\) but the picture is 400×400"),
         ("show front.json none.png", r"^darswin: cannot read none.png: No such file[^(]*$"),
         ("info wrong.json", "wrong.json"),
-        ("info bare.json", "how large its images are: give --image_size, their height"),
+        ("info bare.json", "lacks the size of its images: give --image_size, their height"),
         ("draw front.json", "invalid choice: 'draw'"),
         ("show", "arguments are required: calib, image"),
     ],

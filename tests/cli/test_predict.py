@@ -85,20 +85,20 @@ def test_the_most_probable_classes(run, capsys):
     ("argv", "said"),
     [
         ("none.png --run . --lens L", r"cannot read .*none\.png"),
-        ("none.png --lens L", "either --run, a run's folder, or --model, a safetensors file or on"),
+        ("none.png --lens L", "give either --run, .* or --model, a safetensors file or one of"),
         ("p.png --model digits --run .", "or --model, a safetensors file or one of digits"),
         ("p.png --run . --lens {}", '"model" must be one of'),
         ("p.png --run . --lens none.json", r"none\.json"),
-        ("p.png --run .", "needs pictures or videos, and --lens"),
-        ("--lens L --run .", "needs pictures or videos, and --lens"),
-        ("p.png --model digits", "needs pictures or videos, and --lens"),
+        ("p.png --run .", "missing --lens: give the camera"),
+        ("--lens L --run .", "missing pictures or videos"),
+        ("p.png --model digits", "missing --lens: give the camera"),
         ("p.png --run . --lens L --every 0", "--every must be at least 1, got 0"),
-        ("p.png --run . --lens L --task distance", r"--task distance was asked of .*best\.safe"),
+        ("p.png --run . --lens L --task distance", r"--task is distance, but .*best\.safe"),
         ("checkpoints --run . --lens L", "no pictures or videos in checkpoints"),
         ("p.png --run . --lens cameras.txt", "choose one with --camera: '1', '2'"),
         ("p.png --run . --lens kd.json", 'give --coefficients "fisheye" or --coefficients "pin'),
-        ("p.png --run . --lens checkpoints", r"no calibration in .*: the first would be .*p\.json"),
-        ("p.png --run . --lens checkpoints --camera 1", "--camera 1 is one of a calibration file"),
+        ("p.png --run . --lens checkpoints", r"no calibration in .*: checkpoints/p\.json"),
+        ("p.png --run . --lens checkpoints --camera 1", "--camera 1 chooses a camera of a file"),
     ],
 )
 def test_what_is_wrong_is_named(run, monkeypatch, argv, said):
@@ -168,7 +168,7 @@ def test_every_picture_is_answered_or_named(mixed, pictures, top):
         with pytest.raises(SystemExit) as caught:
             main(["predict", *argv])
         bad = len(pictures) - len(good)
-        first = f"darswin: no answer for {bad} of {len(pictures)} pictures:"
+        first = f"darswin: no prediction for {bad} of {len(pictures)} pictures:"
         assert not good or str(caught.value).splitlines()[0] == first
         named = all(name in str(caught.value) for name in pictures if name in BAD)
         assert named if top > 0 else "--top must be at least 1" in str(caught.value)
@@ -261,8 +261,8 @@ def test_each_frame_of_a_video(run, capsys):
     assert speed["video"] == str(run / "v.mp4") and speed["frames"] == 5
     overall, network = speed["frames_per_second"], speed["network_frames_per_second"]
     assert 0 < overall < network
-    line = f"darswin: {run}/v.mp4: 5 frames at {overall} a second, by the network alone"
-    assert f"{line} {network}" in said.err
+    line = f"darswin: {run}/v.mp4: 5 frames at {overall} frames/s; the network alone:"
+    assert f"{line} {network} frames/s" in said.err
 
 
 def test_a_video_that_its_metadata_turns(run, capsys):
@@ -290,6 +290,6 @@ def test_a_video_that_is_damaged(run, capsys):
     assert [answer["frame"] for answer in frames] == list(range(speed["frames"]))
     assert 5 < speed["frames"] < 35 and picture["image"] == str(run / "p.png")
     first, *lines = str(caught.value).splitlines()
-    assert first == "darswin: no answer, or not for all frames, for 3 of 4 files:"
+    assert first == "darswin: no complete prediction for 3 of 4 files:"
     said = ("cut.avi is damaged or cut off", "none.mp4", "the picture is 128×64")
     assert all(text in line for text, line in zip(said, lines, strict=True))

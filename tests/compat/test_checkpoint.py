@@ -103,7 +103,7 @@ def test_a_hostile_checkpoint_is_refused(entry, zipped, tmp_path):
         hostile = {"model": {"a": torch.zeros(3)}, entry: Hostile(function, *arguments)}
         torch.save(hostile, source, _use_new_zipfile_serialization=zipped)
         for read in (read_state, load_official, lambda path: convert_checkpoint(path, target)):
-            with pytest.raises(ValueError, match=f"is refused, .* it asks for {name}, which"):
+            with pytest.raises(ValueError, match=f"is refused, .* it refers to {name}, which"):
                 read(source)
         assert list(tmp_path.iterdir()) == [source]
         torch.load(source, weights_only=False)  # without the refusal, the code runs

@@ -22,6 +22,9 @@ def test_the_site_has_every_public_name(tmp_path):
     entries = {name for kind in inventory.values() for name in kind}
     found = {entry.rpartition(".")[2] for entry in entries}
     assert {path.rpartition(".")[2] for path in public_names()} <= found | {"__version__"}
+    pages = "".join(page.read_text() for page in (tmp_path / "reference").glob("*.html"))
+    assert "BrownConrady" in pages
+    assert "Args:" not in pages and "<strong>Others" not in pages  # a section or name left raw
 
 
 def test_the_pages_name_the_modules_with_public_names():

@@ -62,7 +62,7 @@ def test_exif_that_is_none(tmp_path, exif):
         image, orientation = read_oriented(tmp_path / "x.jpg")
         assert image.shape == (6, 8, 3) and orientation == 1
     except BrokenImageError as error:
-        assert "x.jpg: its EXIF orientation cannot be told" in str(error)
+        assert "x.jpg: its EXIF orientation is unreadable" in str(error)
 
 
 def test_grey_and_colour_files(tmp_path):

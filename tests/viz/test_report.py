@@ -48,7 +48,7 @@ def test_field_of_view_and_sides():
         assert f"{side} {angle:.2f}°" in text
     assert "between the corners" in text
     assert "the lens ends before the corners" in describe(MEI)
-    with pytest.raises(ValueError, match="needs the image_size"):
+    with pytest.raises(ValueError, match="give image_size"):
         describe(Spherical(0.5, 100.0))
     assert "640 × 480 px" in describe(Spherical(0.5, 100.0), (480, 640))
 
