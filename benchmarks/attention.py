@@ -1,8 +1,8 @@
-"""window_attention, forward and forward+backward, against what a user would write without it.
+"""window_attention, forward and forward+backward, compared with code that users write without it.
 
 `make bench`, or `python benchmarks/attention.py [--quick] [--only "A stage 1"] [--out FOLDER]`.
-Prints tables, each ratio against its target, and our rates against the machine's peaks; with a
-folder, writes a record and a plot there.
+Prints tables, the ratios with their targets, and our rates with the peaks of the machine. With a
+folder, it writes a record and a plot there.
 """
 
 import argparse
@@ -39,7 +39,7 @@ ATTENTION = {
 def targets(
     mode: str, dtype: torch.dtype, batch: int, megabytes: float
 ) -> tuple[float, float | None]:
-    """How much longer the best of the peers must at least take, and eager attention."""
+    """The smallest ratios of the best peer's time over ours, and of eager attention's."""
     if dtype == torch.bfloat16:
         return 3.0, None
     if mode == "forward":
@@ -50,8 +50,8 @@ def targets(
 class Peers:
     """Attention in windows as users write it: roll, partition, attend, reverse, roll back.
 
-    The bias of all pairs is an index into the table, as in Swin, or with `slices` made of slices:
-    torch 2.13's inductor miscompiles the gradient of that index (pytorch#191837).
+    As in Swin, the bias of all pairs is indexed from the table. With `slices` it is made of slices,
+    because torch 2.13's inductor miscompiles the gradient of that index (pytorch#191837).
     """
 
     def __init__(self, case: str, batch: int, slices: bool):
@@ -77,8 +77,8 @@ class Peers:
         return out.roll(self.shift, (1, 2)) if self.rolls else out
 
     def mask(self, bias: Tensor, dtype: torch.dtype) -> Tensor:
-        """The bias of all pairs, hidden ones at minus infinity; 1 and 1 for n_r and n_a if all the
-        windows share it."""
+        """The bias of all pairs, minus infinity for hidden pairs; n_r and n_a are 1 if all windows
+        share it."""
         pairs = self.pairs(bias, self.window)[:, None, None]
         return (pairs if self.hidden is None else pairs + self.hidden).to(dtype)
 
@@ -134,7 +134,7 @@ def attention(name: str, batch: int, mode: str, dtype: torch.dtype, seconds: flo
 
 
 def rates(timings: list[Timing]) -> str:
-    """Our arithmetic and our traffic a second, against the machine's peaks."""
+    """Our operations and memory traffic per second, compared with the peaks of the machine."""
     limits = {threads: peaks.measure(threads) for threads in sorted({t.threads for t in timings})}
     lines = [str(limit) for limit in limits.values()]
     for t in timings:
@@ -142,8 +142,8 @@ def rates(timings: list[Timing]) -> str:
             continue
         (rings, sectors, heads), window, *_ = ATTENTION[t.setting]
         numbers = t.batch * rings * sectors * heads * HEAD_DIM
-        # Two products forward, five backward; a map of qkv read and one written, then two and a
-        # gradient read and the gradient of qkv written.
+        # Two products forward and five backward. Forward reads qkv and writes a map; backward reads
+        # qkv, the map and its gradient, and writes the gradient of qkv.
         products, maps = (2, 4) if t.mode == "forward" else (7, 11)
         gflops = 2e-9 * products * numbers * window[0] * window[1] / t.median
         gbytes = 1e-9 * maps * numbers * (2 if "bfloat16" in t.subject else 4) / t.median

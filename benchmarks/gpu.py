@@ -1,8 +1,8 @@
-"""The operators and darswin_a_small on a CUDA device, against what a user would write without them.
+"""The operators and darswin_a_small on a CUDA device, compared with code that users write instead.
 
 `make bench-gpu`, or `python benchmarks/gpu.py [--batch 128]`. Times are medians by CUDA events, in
-milliseconds, the second-level cache flushed before each call. Outputs are compared before anything
-is timed; each ratio stands against its target. Without a CUDA device it says so and ends.
+milliseconds. The second-level cache is flushed before each call. Outputs are compared before the
+timing, and ratios are printed with their targets. Without a CUDA device, it ends with a message.
 """
 
 import argparse
@@ -59,7 +59,7 @@ def attention_runs(case: str, batch: int, device: torch.device) -> tuple[Runs, t
 
 
 def medians(runs: Mapping[str, Callable[[], object]]) -> dict[str, float]:
-    """Milliseconds of a call, by candidate."""
+    """Milliseconds per call, by candidate."""
     from triton.testing import do_bench
 
     return {name: do_bench(run, return_mode="median") for name, run in runs.items()}
@@ -76,8 +76,8 @@ def check(results: Mapping[str, list[Tensor]], tolerance: float) -> None:
 
 
 def report(label: str, times: Mapping[str, float], targets: Mapping[str, float]) -> None:
-    """Prints a case: ours, and by what factor the others take longer. "best" is a target for the
-    fastest of those that have none of their own."""
+    """Prints our time in a case, and the ratios of the others. The target "best" is for the fastest
+    of the peers without their own target."""
     ours = times[OURS]
     rest = {name: time / ours for name, time in times.items() if name != OURS}
     best = min((name for name in rest if name not in targets), key=rest.__getitem__, default="")
@@ -90,7 +90,7 @@ def report(label: str, times: Mapping[str, float], targets: Mapping[str, float])
 
 
 def with_gradients(run: Callable[..., Tensor], inputs: Sequence[Tensor]) -> Step:
-    """A function that runs, and backpropagates ones; returns output and gradients."""
+    """A function that runs, backpropagates ones, and returns output and gradients."""
     leaves = [t.detach().requires_grad_() for t in inputs]
     ones = torch.ones_like(run(*leaves))
 
@@ -131,7 +131,7 @@ def bench_attention(batch: int, device: torch.device) -> None:
 
 
 def bench_sampling(batch: int, device: torch.device) -> None:
-    """Sampling, against F.grid_sample on a mesh that is there, and the permute to tokens."""
+    """Sampling, compared with F.grid_sample on a prepared mesh and the permute to tokens."""
     for size in (64, 256):
         runs, embeds, inputs = sampling_runs(size, batch, device)
         peer, case = {"F.grid_sample + permute": 4}, f"{size}×{size}, batch {batch}"
@@ -140,8 +140,8 @@ def bench_sampling(batch: int, device: torch.device) -> None:
 
 
 def sampling_runs(size: int, batch: int, device: torch.device) -> tuple[Runs, Runs, list[Tensor]]:
-    """The candidates for polar_sample, functions of images; those for polar_embed, of images,
-    weight and bias; and these."""
+    """The candidates for polar_sample, functions of images; those for polar_embed, functions of
+    images, weight and bias; and the inputs."""
     images, grid, mesh, _ = sampling.sampling_case(size, batch)
     arguments = [t.to(device) for t in (grid.radii, grid.azimuths, grid.center)]
     mesh = mesh.to(device)
@@ -168,7 +168,7 @@ def sampling_runs(size: int, batch: int, device: torch.device) -> tuple[Runs, Ru
 
 
 def bench_to_image(device: torch.device) -> None:
-    """A map as an image, against a padded F.grid_sample on a mesh that is there."""
+    """A map as an image, compared with a padded F.grid_sample on a prepared mesh."""
     for sizes in to_image.CASES:
         batch, rings, sectors, channels, size = sizes
         runs, maps = to_image_runs(sizes, device)
@@ -189,7 +189,7 @@ def to_image_runs(
 
 
 def bench_model(batch: int, device: torch.device) -> None:
-    """darswin_a_small in bfloat16: inference, as a CUDA graph too, and a step of training."""
+    """darswin_a_small in bfloat16: inference, also as a CUDA graph, and a training step."""
     model, view = network("darswin_a_small", 64).to(device).eval(), lens_of(64).to(device)
     images = torch.randn(batch, 3, 64, 64, device=device)
 

@@ -1,6 +1,6 @@
-"""What this machine can do at most: the rate of a matrix product and of a copy in memory.
+"""The peak rates of this machine: of a matrix product and of a copy in memory.
 
-The operators' GFLOP/s and GB/s are read against these.
+The GFLOP/s and GB/s of the operators are compared with these.
 """
 
 import itertools
@@ -16,12 +16,12 @@ from darswin.bench.timing import in_turns
 
 @dataclass
 class Peaks:
-    """Of `threads` threads together."""
+    """The rates of `threads` threads together."""
 
     threads: int
-    gflops: float  # of a product whose matrices lie in the second cache
-    cached_gbytes: float  # a second, read and written, of a copy that lies in the caches
-    memory_gbytes: float  # of one that does not
+    gflops: float  # of a product whose matrices fit the second-level cache
+    cached_gbytes: float  # per second, read and written, of a copy in the caches
+    memory_gbytes: float  # of a copy in memory
 
     def __str__(self) -> str:
         return (
@@ -32,8 +32,8 @@ class Peaks:
 
 
 def measure(threads: int) -> Peaks:
-    """Measures them. The product is oneDNN's where torch has it, else that of torch's BLAS."""
-    size = 384  # 0.6 MB a matrix
+    """Measures the rates, with the faster of oneDNN's product and torch's own."""
+    size = 384  # 0.6 MB per matrix
     a, b = torch.randn(size * threads, size), torch.randn(size, size)
     products: list[Callable[[], object]] = [lambda: torch.mm(a, b)]
     if torch.backends.mkldnn.is_available():
@@ -44,7 +44,7 @@ def measure(threads: int) -> Peaks:
 
 
 def _copied(size: int) -> float:
-    """GB/s of copying `size` bytes, read and written."""
+    """The GB/s of copying `size` bytes, read and written."""
     source, copy = torch.ones(size // 4), torch.ones(size // 4)
     return 2e-9 * size / _seconds(lambda: copy.copy_(source))
 

@@ -1,7 +1,7 @@
-"""Operators against their peers: called alike, checked to be equal, timed on every tier.
+"""Operators compared with their peers, on every instruction-set tier.
 
-Ours and every peer run in the same process, in turns. Outputs are checked equal before anything is
-timed. Every result is published, losses too.
+Ours and all peers run in the same process, in turns. Their outputs are compared before the timing.
+All results are published, also those where a peer is faster.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -21,11 +21,11 @@ from darswin.bench.timing import MATMULS, OURS, REFERENCE, Case, Timing, measure
 
 Step = Callable[[], list[Tensor]]
 View = Callable[[Tensor], Tensor]
-COLUMNS = 3  # panels of a plot beside each other, at most
+COLUMNS = 3  # at most so many panels in a row of a plot
 
 
 def forward(run: Callable[..., Tensor], inputs: Sequence[Tensor]) -> Step:
-    """A function that runs without recording gradients; returns the output."""
+    """A function that runs without recording gradients, and returns the output."""
 
     def step() -> list[Tensor]:
         with torch.no_grad():
@@ -35,9 +35,9 @@ def forward(run: Callable[..., Tensor], inputs: Sequence[Tensor]) -> Step:
 
 
 def forward_backward(run: Callable[..., Tensor], inputs: Sequence[Tensor], view: View) -> Step:
-    """A function that runs and backpropagates; returns output and gradients.
+    """A function that runs and backpropagates, and returns output and gradients.
 
-    The output's gradient is the same for all candidates whose outputs are equal in `view`.
+    Candidates whose outputs are equal in `view` get the same gradient of the output.
     """
     leaves = [t.detach().requires_grad_() for t in inputs]
     out = run(*leaves)
@@ -61,7 +61,7 @@ def check(
 ) -> None:
     """Calls all candidates; AssertionError unless they agree with `OURS` in `view`.
 
-    The tolerance is of each value and of the largest one; None lets them differ.
+    The tolerance is relative to each value and to the largest one; None allows any difference.
     """
     expected = [view(result) for result in steps[OURS]()]
     for name, step in steps.items():
@@ -87,8 +87,8 @@ def compare(
     tolerance: float | None = 1e-4,
     view: View = lambda result: result,
 ) -> list[Timing]:
-    """Checks that all candidates agree, then times them, as `case.mode` says with their gradients,
-    and ours on every instruction-set tier: "darswin (avx2)" and so on."""
+    """Checks that all candidates agree, then times them, with gradients if `case.mode` names them.
+    Ours is timed on every instruction-set tier: "darswin (avx2)" and so on."""
     if case.mode.startswith("forward+backward"):
         steps = {name: forward_backward(run, inputs, view) for name, run in candidates.items()}
     else:
@@ -102,8 +102,8 @@ def compare(
 def run_suite(
     suite: str, jobs: Sequence[Callable[[], list[Timing]]], avx2_share: float, out: Path | None
 ) -> list[Timing]:
-    """Runs jobs at one and at all threads, prints tables and targets, of which the AVX2 tier is to
-    reach a share, and writes the record and its plot to the folder `out`."""
+    """Runs jobs at one and at all threads, prints tables and targets, and writes the record and its
+    plot to the folder `out`. On the AVX2 tier, the targets are `avx2_share` of the others."""
     head = machine()
     print(" ".join(f"{k}={v}" for k, v in head.items()))
     timings: list[Timing] = []
@@ -120,8 +120,8 @@ def run_suite(
 
 
 def draw_peers(record: Record, path: Path) -> None:
-    """Draws the peers' times over ours at one thread: lines of panels for each operator, a panel a
-    mode, in it a row a case."""
+    """Draws the peers' times over ours at one thread: a panel for each operator and mode, with a
+    row for each case."""
     found: dict[str, dict[str, Rows]] = {}
     for t in record.timings:
         if t.threads == 1 and not t.name.startswith(OURS):
@@ -135,7 +135,7 @@ def draw_peers(record: Record, path: Path) -> None:
 
 
 def peers_table(timings: Sequence[Timing], subject: str, peers: Sequence[str] = ()) -> str:
-    """A row a case of an operator, a column a peer, all by default, with its time over ours."""
+    """The peers' times over ours: a row for each case of an operator, a column for each peer."""
     chosen = [t for t in timings if t.subject == subject]
     peers = peers or [name for name in dict.fromkeys(t.name for t in chosen) if name != OURS]
     rows = []
@@ -160,7 +160,7 @@ def frames_table(timings: Sequence[Timing], peers: Sequence[str]) -> str:
 
 
 def attention_table(timings: Sequence[Timing]) -> str:
-    """A row a case; for each mode the peer that is the fastest, and eager attention."""
+    """The fastest peer and eager attention in each mode: a row for each case."""
     columns = {
         "forward": ("window_attention", "forward"),
         "forward+backward": ("window_attention", "forward+backward"),
@@ -184,8 +184,8 @@ def attention_table(timings: Sequence[Timing]) -> str:
 def best_table(
     records: Mapping[str, Sequence[Timing]], rows: Iterable[tuple[str, str, str, int]]
 ) -> str:
-    """A row for each (subject, mode, setting, batch), at all threads, and for each CPU its own
-    columns: our time, and how much longer the fastest peer takes."""
+    """Our time and the ratio of the fastest peer at all threads: a row for each (subject, mode,
+    setting, batch), two columns for each CPU."""
     lines = [[f"`{name}`, {mode}, {setting}, batch {batch}"] for name, mode, setting, batch in rows]
     heads = [""]
     for cpu, timings in records.items():
@@ -196,7 +196,7 @@ def best_table(
 
 
 def _best(timings: Sequence[Timing], case: tuple[str, str, str, int]) -> list[str]:
-    parts = (MATMULS, "F.linear alone")  # less work than ours: bounds, no peers
+    parts = (MATMULS, "F.linear alone")  # they do less work than ours: bounds, not peers
     chosen = [t for t in timings if (t.subject, t.mode, t.setting, t.batch) == case]
     if not chosen:
         return ["", ""]
@@ -216,7 +216,7 @@ def missed_table(timings: Iterable[Timing]) -> str:
 
 
 def training_table(models: Mapping[str, Mapping]) -> str:
-    """A row a model: images a second in training and testing, and over the reference operators."""
+    """Images per second in training and testing, and ratios over the reference: a row per model."""
     rows = []
     for name, modes in models.items():
         cells = [f"`{name}`"]

@@ -1,7 +1,7 @@
-"""polar_sample and polar_embed, forward and backward, against what one would write without them.
+"""polar_sample and polar_embed, compared with code that users write without them.
 
-`make bench`, or `python benchmarks/sampling.py [--quick] [--out FOLDER]`. Prints tables and each
-ratio against its target; with a folder, writes a record and a plot there.
+`make bench`, or `python benchmarks/sampling.py [--quick] [--out FOLDER]`. Prints tables and
+the ratios with their targets. With a folder, it writes a record and a plot there.
 """
 
 import argparse
@@ -23,7 +23,7 @@ from darswin.ops import polar_embed, polar_sample
 
 
 def sampling_case(size: int, batch: int):
-    """Images, lenses' grid, and the mesh that grid_sample and remap read."""
+    """Images, the grid of the lenses, and the mesh for grid_sample and remap."""
     images = torch.randn(batch, 3, size, size)
     lens = Spherical.from_fov(torch.linspace(0.1, 0.9, batch), math.radians(170), size / 2)
     grid = polar_grid(lens, (size, size), rings=16, sectors=64, samples=(10, 10))
@@ -34,14 +34,14 @@ def sampling_case(size: int, batch: int):
 
 
 def to_tokens(planes: Tensor) -> Tensor:
-    """(B, C, 160, 640) → (B, 16, 64, 100·C), as the embedding wants them."""
+    """Samples (B, C, 160, 640) → tokens (B, 16, 64, 100·C) for the embedding."""
     batch, channels = planes.shape[:2]
     patches = planes.reshape(batch, channels, 16, 10, 64, 10).permute(0, 2, 4, 3, 5, 1)
     return patches.reshape(batch, 16, 64, 100 * channels)
 
 
 def as_tokens(result: Tensor) -> Tensor:
-    """Planes as tokens; other results as they are."""
+    """Converts planes to tokens; leaves other results unchanged."""
     return to_tokens(result) if result.shape[-2:] == (160, 640) else result
 
 
@@ -82,11 +82,11 @@ def sampling(size: int, batch: int, seconds: float) -> list[Timing]:
     peer, peer_tokens, remaps = "F.grid_sample", "F.grid_sample + permute", "cv2.remap"
     runs = {OURS: ours, peer: planes, peer_tokens: tokens}
     runs[f"compiled {peer_tokens}"] = torch.compile(tokens, dynamic=False)
-    # grid_sample's coordinates are float32: at 1000 px they are off by 1e-4 px.
+    # The coordinates of grid_sample are float32: at 1000 px, their error is 1e-4 px.
     tolerance = 1e-4 if small else 1e-3
     targets = {peer: 5.0, peer_tokens: 10.0} if small else {peer: 2.5}
     timings = compare(case("forward"), runs, [images], seconds, targets=targets, view=as_tokens)
-    # cv2.remap rounds coordinates to 1/32 px: checked to that, then timed without the permute.
+    # cv2.remap rounds coordinates to 1/32 px, which the check allows. It is timed without permute.
     step, targets = forward(ours, [images]), {remaps: 2.4 if small else 1.4}
     check(case("forward"), {OURS: step, remaps: remapped}, 0.05)
     timings += measure(case("forward"), {OURS: step, remaps: remap}, seconds, targets=targets)[1:]
@@ -117,7 +117,7 @@ def sampling(size: int, batch: int, seconds: float) -> list[Timing]:
 
 
 def large(case, images: Tensor, ours, tokens, remap, seconds: float) -> list[Timing]:
-    """Large images with a pixel's channels together, and gray ones; peers in their best layout."""
+    """Large images, channels last or gray; the peers get their best layout."""
     together = images.contiguous(memory_format=torch.channels_last)
     peer = "F.grid_sample + permute"
     step = forward(ours, [together])

@@ -1,7 +1,7 @@
-"""polar_to_image, forward and backward, against a padded F.grid_sample.
+"""polar_to_image, forward and backward, compared with a padded F.grid_sample.
 
-`make bench`, or `python benchmarks/to_image.py [--quick] [--out FOLDER]`. Prints tables and each
-ratio against its target; with a folder, writes a record and a plot there.
+`make bench`, or `python benchmarks/to_image.py [--quick] [--out FOLDER]`. Prints tables and
+the ratios with their targets. With a folder, it writes a record and a plot there.
 """
 
 import argparse
@@ -18,14 +18,14 @@ from darswin.bench.timing import OURS, Case, Timing
 from darswin.ops import polar_to_image
 
 PEER = "F.pad + F.grid_sample"
-# Batch, rings, sectors, channels and side of the image: the least that forward must be ahead, in
-# tokens and as an image.
+# Batch, rings, sectors, channels and side of the image: the smallest ratios for forward, in tokens
+# and as an image.
 CASES = {(4, 16, 64, 96, 128): (4.0, 2.5), (2, 64, 256, 96, 256): (5.0, 3.0)}
 
 
 def mesh(rings: int, sectors: int, size: int) -> Tensor:
-    """(size, size, 2): where grid_sample reads a map that is padded: by a sector on both sides, and
-    by the ring across the pole."""
+    """The mesh (size, size, 2) for grid_sample on a map that is padded by a sector on both sides
+    and by the ring across the pole."""
     offset = torch.arange(size) - (size - 1) / 2
     y, x = torch.meshgrid(offset, offset, indexing="ij")
     ring = (torch.hypot(x, y) * (2 * rings / size) - 0.5).clamp(max=rings - 1) + 1
@@ -34,7 +34,7 @@ def mesh(rings: int, sectors: int, size: int) -> Tensor:
 
 
 def inputs(batch: int, rings: int, sectors: int, channels: int, size: int) -> tuple[Tensor, ...]:
-    """Maps, the radii of their rings, their centre, and the mesh of each."""
+    """Maps, the radii of their rings, their centre, and their mesh."""
     radii = ((torch.arange(rings) + 0.5) * (size / 2 / rings))[None]
     places = mesh(rings, sectors, size).expand(batch, -1, -1, -1)
     maps = torch.randn(batch, rings, sectors, channels)
@@ -52,7 +52,7 @@ def padded(maps: Tensor, places: Tensor) -> Tensor:
 def to_image(
     sizes: tuple[int, int, int, int, int], mode: str, layout: str, seconds: float
 ) -> list[Timing]:
-    """Times one case; `layout` is that of the operator, and the peer permutes for "tokens"."""
+    """Times one case. `layout` is that of the operator; for "tokens", the peer permutes."""
     batch, rings, sectors, _, size = sizes
     maps, radii, center, places = inputs(*sizes)
 
@@ -68,7 +68,7 @@ def to_image(
         torch.get_num_threads(), mode if layout == "image" else f"{mode}, layout {layout}",
     )  # fmt: skip
     target = CASES[sizes][layout == "image"] if mode == "forward" else 8.0
-    # grid_sample's coordinates are float32, in units of the whole map.
+    # The coordinates of grid_sample are float32, in units of the whole map.
     return compare(
         case, {OURS: ours, PEER: peer}, [maps], seconds, targets={PEER: target}, tolerance=1e-4
     )

@@ -1,7 +1,7 @@
-"""How many images a second training and testing handle, and what they spend outside the model.
+"""Images per second in training and testing, and the share of time outside the model.
 
-Runs `Classification` and `WideAngleData` as `darswin fit` does, on a folder of JPEG files, for each
-of the five models: with our operators and with their PyTorch reference. Then the loader alone.
+Runs `Classification` and `WideAngleData` like `darswin fit`, on a folder of JPEG files, for each of
+the five models: with our operators and with their PyTorch reference. Then it measures the loader.
 """
 
 import argparse
@@ -25,11 +25,11 @@ from darswin.train.classification import Classification
 from darswin.train.data import WideAngleData
 
 FAMILIES = ("darswin_a", "darswin_ra", "swin", "swin_undis", "dat")
-WARM_UP = 3  # steps that are not counted
+WARM_UP = 3  # steps before the measurement
 
 
 def write_pictures(root: Path, count: int) -> None:
-    """Two classes of JPEG files of 500×375 pixels, with detail at every scale."""
+    """Writes two classes of JPEG files of 500×375 pixels, with detail at every scale."""
     rng = np.random.default_rng(0)
     for k in range(count):
         picture = np.zeros((375, 500, 3), np.float32)
@@ -42,7 +42,7 @@ def write_pictures(root: Path, count: int) -> None:
 
 
 class Stopwatch(Callback):
-    """The time of the steps, and of all there is between them, after a warm-up."""
+    """Measures the time in steps and between steps, after a warm-up."""
 
     def __init__(self):
         self.inside, self.start, self.end, self.steps = 0.0, 0.0, 0.0, 0
@@ -61,13 +61,13 @@ class Stopwatch(Callback):
     on_test_batch_start, on_test_batch_end = on_train_batch_start, on_train_batch_end
 
     def result(self, batch: int) -> dict[str, float]:
-        """Images a second, and the share of the time that was not spent in steps."""
+        """Images per second, and the share of the time outside of steps."""
         wall = self.end - self.start
         return dict(images_per_second=self.steps * batch / wall, outside=1 - self.inside / wall)
 
 
 def run(mode: str, name: str, data: dict, steps: int, reference: bool) -> dict[str, float]:
-    """One model, trained or tested for some steps."""
+    """Trains or tests one model for some steps."""
     watch = Stopwatch()
     trainer = Trainer(
         accelerator="cpu", max_epochs=1, limit_train_batches=steps, limit_test_batches=steps,
@@ -81,7 +81,7 @@ def run(mode: str, name: str, data: dict, steps: int, reference: bool) -> dict[s
 
 
 def loader_rates(data: dict) -> dict[str, float]:
-    """Images a second that one core makes, all told and of each part of the work alone."""
+    """Images per second of the loader on one core: in total, and for each part of the work."""
     module = WideAngleData(**data)
     dataset = module.dataset("train", augment=RandAugment(), erase=RandomErasing())
     rng = np.random.default_rng(0)
@@ -135,7 +135,7 @@ def main() -> None:
         cases = [(f, mode, ref) for f in families for mode in ("train", "test") for ref in (0, 1)]
         for family, mode, reference in tqdm(cases, unit="run"):
             name = f"{family}_{args.size}"
-            # Half of the folder is enough to test on.
+            # Half of the folder is enough for testing.
             given = dict(data, holdout=0.49 if mode == "test" else 0.1)
             found = run(mode, name, given, steps, bool(reference))
             entry = models.setdefault(name, {}).setdefault(mode, {})
