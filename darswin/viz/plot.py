@@ -45,7 +45,7 @@ def figure_format(path: str | os.PathLike) -> str:
     ending = Path(path).suffix.lower()
     if ending not in FORMATS:
         raise ValueError(
-            f"the name of a figure must end in {', '.join(FORMATS)}, got {os.fspath(path)!r}"
+            f"the name of a figure must end in one of {', '.join(FORMATS)}, got {os.fspath(path)!r}"
         )
     return FORMATS[ending]
 

@@ -37,7 +37,7 @@ def test_a_run_s_model(digits, tmp_path, capsys):
     assert card.quantized.keys() == layers.keys() and card.task == "classification"
     changed = float(re.search(r"40 validation pictures: .* variance: (\S+)", said)[1])
     assert 0 < changed < 0.02
-    same = float(re.search(r"the same is said in (\S+) %", said)[1])
+    same = float(re.search(r"same prediction: (\S+) %", said)[1])
     assert same >= 90
     Image.fromarray(np.zeros((40, 40), np.uint8)).save(tmp_path / "p.png")
     answers = []
@@ -69,7 +69,7 @@ def test_models_of_pixels(tmp_path, task, capsys):
     fit(run, "--task", task, "--data.path", data, *PIXELS, *FAST, "--trainer.max_epochs", "2")
     main(["quantize", "--run", str(run), "--pictures", "4"])
     said = capsys.readouterr().out
-    assert "2 validation pictures" in said and ("the same is said" in said) == (task != "distance")
+    assert "2 validation pictures" in said and ("same prediction" in said) == (task != "distance")
     file, lens = run / "checkpoints" / "best.int8.safetensors", data / "lens.json"
     main(["predict", str(data / "images"), "--model", str(file), "--lens", str(lens),
           "--out", str(tmp_path / "out")])  # fmt: skip

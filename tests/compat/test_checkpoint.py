@@ -136,7 +136,7 @@ def test_a_failed_conversion_leaves_the_target_as_it_was(tmp_path, monkeypatch):
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(os, "fsync", full)
-    with pytest.raises(OSError, match=r"cannot write it.*No space left.*model\.safetensors"):
+    with pytest.raises(OSError, match=r"cannot write the file.*No space left.*model\.safetensors"):
         convert_checkpoint(source, target)
     assert target.read_bytes() == b"before" and len(list(tmp_path.iterdir())) == 2
 

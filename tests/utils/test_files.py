@@ -25,7 +25,7 @@ def test_the_new_file_takes_the_place_of_the_old(tmp_path):
     assert os.listdir(path.parent) == ["a.txt"]
     (tmp_path / "plain").write_text("")
     assert path.stat().st_mode == (tmp_path / "plain").stat().st_mode
-    with pytest.raises(OSError, match=r"cannot write it.*new"):
+    with pytest.raises(OSError, match=r"cannot write the file.*new"):
         replace_file(tmp_path / "new", b"x")
     assert sorted(os.listdir(tmp_path)) == ["new", "plain"]
 
