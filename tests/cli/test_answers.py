@@ -292,10 +292,10 @@ def test_wrong_arguments_are_named(stub, labels, tmp_path, capsys):
     argv = ["predict", picture, "--model", "m", "--lens", json.dumps(LENS)]
     with pytest.raises(SystemExit, match="missing --out"):
         main(argv)
-    with pytest.raises(SystemExit, match="--task distance was asked of m, a model for segm"):
+    with pytest.raises(SystemExit, match="--task is distance, but m is a model for segm"):
         main([*argv, "--out", str(tmp_path / "o"), "--task", "distance"])
     net.num_classes = 256
-    with pytest.raises(SystemExit, match="for 255 classes, got 256"):
+    with pytest.raises(SystemExit, match="at most 255 classes, got 256"):
         main([*argv, "--out", str(tmp_path / "o")])
 
 

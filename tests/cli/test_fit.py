@@ -282,7 +282,7 @@ def test_all_has_everything(capsys):
     texts = [shown(capsys, "test", flag) for flag in ("--help", "--help.all")]
     few, every = map(options_in, texts)
     assert texts[0].startswith("usage: darswin test --run RUN [options]")
-    assert "have no effect [that of the run]" in " ".join(texts[0].split())
+    assert "have no effect [from the run]" in " ".join(texts[0].split())
     assert every[: len(few)] == few
     trainer = {f"trainer.{name}" for name in inspect.signature(Trainer).parameters}
     assert trainer - set(every) <= {"trainer.default_root_dir"}

@@ -50,7 +50,7 @@ def test_info_prints_what_the_lens_is(folder, capsys):
     assert "1280 × 966 px" in printed and "350.4, -17.5" in printed
     main(["lens", "info", str(folder / "front.json"), "--theta_max_deg=60", "--rings=8"])
     printed = capsys.readouterr().out
-    assert "60.00° (1.04720 rad)" in printed and "of 8 × 64 tokens" in printed
+    assert "60.00° (1.04720 rad)" in printed and "for 8 × 64 tokens" in printed
 
 
 def test_convert_fits_and_writes(folder, capsys):

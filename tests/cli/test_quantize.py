@@ -56,7 +56,7 @@ def test_what_is_kept_and_where_it_goes(digits, tmp_path, capsys):
     assert read_card(out).quantized
     assert all(name.startswith("stages.2") for name in read_card(out).quantized)
     for more, message in (
-        (["--keep", '["stages.7"]'], "the model has no stages.7"),
+        (["--keep", '["stages.7"]'], "the model has no module named stages.7"),
         (["--pictures", "0"], "--pictures must be at least 1, got 0"),
         (["--run", str(tmp_path)], f"no model in {tmp_path}"),
     ):
