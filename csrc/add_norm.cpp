@@ -76,7 +76,7 @@ Tensor add_norm_quantized_(Tensor x, MaybeTensor y, Tensor weight, Tensor bias, 
       "add_norm_quantized_: x must be float32 and contiguous");
   if (y) check_alike(x, *y);
   check_parameters(x, weight, bias);
-  const Tensor out = new_empty(x, x.sizes(), ScalarType::Byte);
+  const Tensor out = new_tensor(x.sizes(), ScalarType::Byte);
   run(AddNormArgs<float, uint8_t>{.y = y ? pointer<float>(*y) : nullptr,
                                   .out = mutable_pointer<uint8_t>(out),
                                   .quantizer = quantizer(scale, zero_point)},

@@ -66,7 +66,7 @@ Tensor checked_tokens(const Tensor& x) {
   STD_TORCH_CHECK(
       x.is_cpu() && x.scalar_type() == ScalarType::Float && x.dim() > 0 && x.size(x.dim() - 1) > 0,
       kName, ": x must be float32 (..., D) on the CPU");
-  return contiguous(x);
+  return as_contiguous(x);
 }
 
 Tensor norm(Tensor x, Tensor parameters, double eps) {

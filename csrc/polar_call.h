@@ -3,6 +3,7 @@
 
 #include <numeric>
 #include <tuple>
+#include <utility>
 #include <vector>
 
 #include "checks.h"
@@ -77,11 +78,11 @@ struct PolarCall {
 
   explicit PolarCall(const Sampling& given)
       : image(given.image),
-        radii(contiguous(given.radii)),
-        center(contiguous(given.center)),
-        affine(contiguous(given.affine)),
-        offsets(contiguous(given.offsets)) {
-    const Tensor azimuths = contiguous(given.azimuths);
+        radii(as_contiguous(given.radii)),
+        center(as_contiguous(given.center)),
+        affine(as_contiguous(given.affine)),
+        offsets(as_contiguous(given.offsets)) {
+    const Tensor azimuths = as_contiguous(given.azimuths);
     const Sizes& samples = given.samples;
     STD_TORCH_CHECK(
         image.dim() == 4 && radii.dim() == 2 && azimuths.dim() == 1 && samples.size() == 2,
@@ -136,8 +137,8 @@ struct PolarCall {
   }
 
   PolarGradients no_gradients() const {
-    return {nothing_like(image), nothing_like(radii), nothing_like(radii), nothing_like(radii),
-            nothing_like(radii)};
+    const Tensor of_lens = no_gradient(type_of<T>());
+    return {no_gradient(image.scalar_type()), of_lens, of_lens, of_lens, of_lens};
   }
 
   // The image's gradient, for backward kernels to fill.
@@ -148,7 +149,8 @@ struct PolarCall {
                     "polar_sample_backward: too large an image for a bfloat16 gradient");
     // Where there are points the kernels write every pixel.
     const Tensor grad =
-        points() ? new_empty(image, image.sizes()) : new_zeros(image, image.sizes());
+        points() ? new_tensor(image.sizes(), image.scalar_type())
+                 : new_zeros(image, image.sizes());
     ask_for_large_pages(grad);
     args.grad_image = grad.mutable_data_ptr();
     return grad;
@@ -309,9 +311,11 @@ struct Listed<in_float, in_double> {
                      MaybeTensor offsets, MaybeTensor jitter, MaybeTensor seed, Sizes samples,
                      std::vector<double> mean, std::vector<double> std, bool bfloat16,
                      Others... others) {
-    const Sampling given{image,  radii, azimuths, center, affine, offsets,
-                         jitter, seed,  samples,  mean,   std,    bfloat16};
-    if (image.scalar_type() == ScalarType::Double) {
+    const Sampling given{std::move(image),   std::move(radii),  std::move(azimuths),
+                         std::move(center),  std::move(affine), std::move(offsets),
+                         std::move(jitter),  std::move(seed),   std::move(samples),
+                         std::move(mean),    std::move(std),    bfloat16};
+    if (given.image.scalar_type() == ScalarType::Double) {
       PolarCall<double> call(given);
       return in_double(call, others...);
     }

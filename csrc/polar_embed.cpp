@@ -13,8 +13,12 @@ int64_t padded(int64_t n) { return (n + kRowUnit - 1) / kRowUnit * kRowUnit; }
 // A weight (D, S_r * S_phi * C) or a bias (D,), contiguous and in the type that is computed in.
 template <typename T>
 Tensor parameter(const Tensor& value) {
-  STD_TORCH_CHECK(value.is_cpu(), "polar_embed: weight and bias must be on the CPU");
-  return contiguous(torch::stable::to(value, type_of<T>()));
+  const ScalarType type = value.scalar_type();
+  const bool same = type == type_of<T>();
+  const bool narrow = type == ScalarType::BFloat16 && sizeof(T) == sizeof(float);
+  STD_TORCH_CHECK(value.is_cpu() && (same || narrow),
+                  "polar_embed: wrong type or device of weight or bias");
+  return as_contiguous(same ? value : torch::stable::to(value, type_of<T>()));
 }
 
 template <typename T>
@@ -61,7 +65,7 @@ Tensor forward(PolarCall<T>& call, Tensor weight, MaybeTensor bias) {
                     "polar_embed: bias does not fit the weight");
     embed.bias = pointer<T>(*bias);
   }
-  const Tensor out = new_empty(call.radii, output_sizes(call, embed.features), call.output_type());
+  const Tensor out = new_tensor(output_sizes(call, embed.features), call.output_type());
   if (out.numel() == 0) return out;
   args.out = out.mutable_data_ptr();
   const int64_t depth = call.token_size(), wide = padded(embed.features);
@@ -106,8 +110,8 @@ std::tuple<Tensor, Tensor> weight_gradients(const PolarCall<T>& call,
     }
   };
   run_with_scratch(chunks, kernel.scratch(call.args, embed, PolarPass::forward), add_chunks);
-  const Tensor weight = new_empty(call.radii, Sizes{features, depth});
-  const Tensor bias = new_empty(call.radii, Sizes{features});
+  const Tensor weight = new_tensor(Sizes{features, depth}, type_of<T>());
+  const Tensor bias = new_tensor(Sizes{features}, type_of<T>());
   T *to_weight = mutable_pointer<T>(weight), *to_bias = mutable_pointer<T>(bias);
   parallel_ranges(features, [&](int64_t begin, int64_t end) {
     for (int64_t f = begin; f < end; ++f) {
@@ -142,7 +146,7 @@ PolarGradients sampling_gradients(PolarCall<T>& call, PolarEmbedArgs<T>& embed,
     }
     return grads;
   }
-  const Tensor grad_samples = new_empty(call.radii, output_sizes(call, depth));
+  const Tensor grad_samples = new_tensor(output_sizes(call, depth), type_of<T>());
   embed.grad_samples = mutable_pointer<T>(grad_samples);
   run_with_scratch(images * call.rings(),
                    kernel.scratch(call.args, embed, PolarPass::backward_samples),
@@ -162,7 +166,7 @@ auto backward(PolarCall<T>& call, Tensor weight, Tensor grad, bool image_grad, b
   call.args.tokens = true;
   call.args.bands = 1;
   call.args.grad_out = grad.const_data_ptr();
-  Tensor grad_weight = nothing_like(weight), grad_bias = nothing_like(weight);
+  Tensor grad_weight = no_gradient(type_of<T>()), grad_bias = no_gradient(type_of<T>());
   if (weight_grad) std::tie(grad_weight, grad_bias) = weight_gradients(call, embed);
   const PolarWanted wanted{image_grad, lens_grad, offsets_grad};
   const bool sampling = image_grad || lens_grad || offsets_grad;

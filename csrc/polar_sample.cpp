@@ -35,7 +35,7 @@ template <typename T>
 Tensor forward(PolarCall<T>& call, bool tokens) {
   PolarSampleArgs<T>& args = call.args;
   choose_layout(args, tokens);
-  const Tensor out = new_empty(call.radii, output_sizes(call), call.output_type());
+  const Tensor out = new_tensor(output_sizes(call), call.output_type());
   if (out.numel() == 0) return out;
   ask_for_large_pages(out);
   args.out = out.mutable_data_ptr();

@@ -1,6 +1,7 @@
 // polar_to_image and its backward on CPU: check, allocate, thread, call the kernel.
 #include "polar_to_image.h"
 
+#include <limits>
 #include <tuple>
 #include <vector>
 
@@ -26,12 +27,12 @@ struct ToImageCall {
   ToImageCall(const Tensor& x_, const Tensor& radii_, const MaybeTensor& center_,
               const MaybeTensor& affine_, const MaybeTensor& points_, const MaybeTensor& r_max_,
               const Sizes& size, bool tokens)
-      : x(contiguous(x_)),
-        radii(contiguous(radii_)),
-        center(contiguous(center_)),
-        affine(contiguous(affine_)),
-        points(contiguous(points_)),
-        r_max(contiguous(r_max_)) {
+      : x(as_contiguous(x_)),
+        radii(as_contiguous(radii_)),
+        center(as_contiguous(center_)),
+        affine(as_contiguous(affine_)),
+        points(as_contiguous(points_)),
+        r_max(as_contiguous(r_max_)) {
     STD_TORCH_CHECK(x.dim() == 4 && x.size(1) > 0 && x.size(2) > 0 && size.size() == 2 &&
                         size[0] >= 0 && size[1] >= 0,
                     kName, ": x must be (B, R, A, D) and size (H, W)");
@@ -48,6 +49,7 @@ struct ToImageCall {
     args.r_max_rows = r_max ? rows(*r_max, {}) : 1;
     args.x = pointer<T>(x);
     args.radii = pointer<Real>(radii);
+    check_rising();
     args.r_max = r_max ? pointer<Real>(*r_max) : nullptr;
     args.points = points ? pointer<Real>(*points) : nullptr;
     if (center) find_plane();
@@ -58,6 +60,15 @@ struct ToImageCall {
 
   int64_t rows(const Tensor& tensor, const Sizes& sizes) const {
     return count_rows<Real>(tensor, args.batch, sizes, "radii, center, affine, points or r_max");
+  }
+
+  void check_rising() const {
+    for (int64_t k = 0; k < args.radii_rows * args.rings; ++k) {
+      const Real r = args.radii[k];
+      const bool rises = k % args.rings == 0 || r > args.radii[k - 1];
+      STD_TORCH_CHECK(r >= 0 && r < std::numeric_limits<Real>::infinity() && rises, kName,
+                      ": radii must be finite, at least 0, and rise from ring to ring");
+    }
   }
 
   // The centres, and the matrices undone; a singular one leaves nothing that is finite.
@@ -94,7 +105,7 @@ struct ToImageCall {
 template <typename T>
 Tensor forward(ToImageCall<T>&& call) {
   auto& args = call.args;
-  const Tensor out = new_empty(call.x, call.output_sizes());
+  const Tensor out = new_tensor(call.output_sizes(), call.x.scalar_type());
   if (out.numel() == 0) return out;
   ask_for_large_pages(out);
   args.out = mutable_pointer<T>(out);
@@ -118,7 +129,7 @@ Tensor map_gradient(ToImageCall<T>& call) {
   const auto& kernel = kernels<PolarToImageKernels<T>>();
   const int64_t pixels = args.height * args.width;
   if (call.x.numel() == 0 || pixels == 0) return new_zeros(call.x, call.x.sizes());
-  const Tensor grad = new_empty(call.x, call.x.sizes());
+  const Tensor grad = new_tensor(call.x.sizes(), call.x.scalar_type());
   ask_for_large_pages(grad);
   args.grad_x = mutable_pointer<T>(grad);
   args.bands = count_bands(args);
@@ -150,7 +161,7 @@ std::vector<Tensor> lens_gradients(ToImageCall<T>& call) {
   }
   // The gradient of a tensor, for which add(lens, its values) adds up what a lens gives.
   const auto summed = [&](const MaybeTensor& of, auto add) {
-    if (!of) return nothing_like(call.radii);
+    if (!of) return no_gradient(type_of<Arithmetic<T>>());
     const int64_t values = of->size(0) == 0 ? 0 : of->numel() / of->size(0);
     std::vector<double> total(of->numel(), 0.0);
     for (int64_t n = 0; n < args.lenses && of->size(0) > 0; ++n) {
@@ -193,9 +204,9 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> backward(ToImageCall<T>&& cal
                                                             bool x_grad, bool lens_grad) {
   grad = checked_gradient(grad, call.output_sizes(), call.x.scalar_type(), kName);
   call.args.grad_out = pointer<T>(grad);
-  std::vector<Tensor> lens(4, nothing_like(call.radii));
+  std::vector<Tensor> lens(4, no_gradient(type_of<Arithmetic<T>>()));
   if (lens_grad) lens = lens_gradients(call);
-  const Tensor x = x_grad ? map_gradient(call) : nothing_like(call.x);
+  const Tensor x = x_grad ? map_gradient(call) : no_gradient(call.x.scalar_type());
   return {x, lens[0], lens[1], lens[2], lens[3]};
 }
 

@@ -15,7 +15,7 @@ std::tuple<Tensor, Tensor> transpose_sum(const Tensor& x) {
       x.is_cpu() && x.scalar_type() == ScalarType::Float && x.dim() == 2 && x.is_contiguous(),
       "transpose_sum: x must be a contiguous float32 matrix");
   const int64_t rows = x.size(0), columns = x.size(1);
-  const Tensor transposed = new_empty(x, Sizes{columns, rows});
+  const Tensor transposed = new_tensor(Sizes{columns, rows}, ScalarType::Float);
   const Tensor sum = new_zeros(x, Sizes{columns});
   if (x.numel() == 0) return {transposed, sum};
   const int64_t groups = (rows + kGroupRows - 1) / kGroupRows;

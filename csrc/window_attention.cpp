@@ -12,7 +12,7 @@ template <typename T>
 Tensor forward(AttentionCall<T>&& call, const Quantizer* quantizer = nullptr) {
   auto& args = call.args;
   const ScalarType type = quantizer == nullptr ? call.qkv.scalar_type() : ScalarType::Byte;
-  const Tensor out = new_empty(call.qkv, call.output_sizes(), type);
+  const Tensor out = new_tensor(call.output_sizes(), type);
   if (out.numel() == 0) return out;
   ask_for_large_pages(out);
   if (quantizer == nullptr) {
@@ -38,7 +38,7 @@ template <typename T>
 std::tuple<Tensor, Tensor> backward(AttentionCall<T>&& call, Tensor grad_out) {
   auto& args = call.args;
   grad_out = checked_gradient(grad_out, call.output_sizes(), call.qkv.scalar_type(), kAttention);
-  const Tensor grad_qkv = new_empty(call.qkv, call.qkv.sizes());
+  const Tensor grad_qkv = new_tensor(call.qkv.sizes(), call.qkv.scalar_type());
   if (grad_qkv.numel() == 0) return {grad_qkv, new_zeros(call.bias, call.bias.sizes())};
   ask_for_large_pages(grad_qkv);
   args.chunk = chunk_size(args);

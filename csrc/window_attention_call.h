@@ -18,7 +18,7 @@ struct AttentionCall {
 
   AttentionCall(const Tensor& qkv_, const Tensor& bias_, const Sizes& window, const Sizes& shift,
                 const Sizes& periodic, double scale)
-      : qkv(contiguous(qkv_)), bias(contiguous(bias_)) {
+      : qkv(as_contiguous(qkv_)), bias(as_contiguous(bias_)) {
     STD_TORCH_CHECK(qkv.dim() == 6 && qkv.size(3) == 3 && bias.dim() == 4 && window.size() == 2 &&
                         shift.size() == 2 && periodic.size() == 2,
                     kAttention, ": wrong number of dimensions");

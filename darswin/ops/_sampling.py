@@ -117,6 +117,45 @@ def checked_sampling(
     )  # fmt: skip
 
 
+def unchecked_sampling(
+    image: Tensor,
+    radii: Tensor,
+    azimuths: Tensor,
+    center: Tensor,
+    affine: Tensor | None,
+    offsets: Tensor | None,
+    jitter: float,
+    seed: int | Tensor,
+    samples: tuple[int, int],
+    mean: float | Sequence[float],
+    std: float | Sequence[float],
+    channels_last: bool | None,
+) -> Sampling | None:
+    """The arguments for `_library.attempt`, which leaves the check of the tensors to the operator.
+    None in the rare cases where it would not see what `checked_sampling` sees."""
+    if not (
+        _library.may_attempt()
+        and _library.plain(image, radii, azimuths, center)
+        and (affine is None or _library.plain(affine))
+        and (offsets is None or _library.plain(offsets))
+        and image.dim() == 4
+        and not (azimuths.requires_grad and torch.is_grad_enabled())
+    ):
+        return None
+    dtype = image.dtype
+    if channels_last is not None or dtype == torch.uint8:
+        image = channels_first("image", image, channels_last)
+    if dtype == torch.uint8:
+        channels = image.shape[1]
+        mean, std = per_channel("mean", mean, channels), per_channel("std", std, channels)
+    else:
+        mean = std = ()
+    return Sampling(
+        image, radii, azimuths, center, affine, offsets, *_jitter_tensors(jitter, seed),
+        check_pair("samples", samples, lowest=1), mean, std, dtype == torch.bfloat16,
+    )  # fmt: skip
+
+
 def _jitter_tensors(jitter: float, seed: int | Tensor) -> tuple[Tensor | None, Tensor | None]:
     """Jitter and seed as the operators take them; None and None without jitter."""
     jitter = check_jitter(jitter)

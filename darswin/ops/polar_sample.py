@@ -8,8 +8,11 @@ import torch
 from torch import Tensor
 
 from darswin.ops import _library, reference
-from darswin.ops._sampling import GRADIENTS, Sampling, checked_sampling
+from darswin.ops._sampling import GRADIENTS, Sampling, checked_sampling, unchecked_sampling
 from darswin.ops.checks import check_layout, check_tensor
+
+_SAMPLE = torch.ops.darswin.polar_sample.default
+_EMBED = torch.ops.darswin.polar_embed.default
 
 
 def polar_sample(
@@ -84,15 +87,19 @@ def polar_sample(
 
     Source: DarSwin, ICCV 2023, sec. 4.3.
     """
-    sampling = checked_sampling(
+    given = (
         image, radii, azimuths, center, affine, offsets, jitter, seed, samples, mean, std,
         channels_last,
     )  # fmt: skip
     check_layout(layout)
+    sampling, tokens = unchecked_sampling(*given), layout == "tokens"
+    if sampling is not None:
+        out = _library.attempt(_SAMPLE, (*sampling, tokens))
+        if out is not None:
+            return out
     return _library.run(
-        torch.ops.darswin.polar_sample.default, reference.polar_sample, Sampling.kernel_takes,
-        sampling, layout == "tokens",
-    )  # fmt: skip
+        _SAMPLE, reference.polar_sample, Sampling.kernel_takes, checked_sampling(*given), tokens
+    )
 
 
 @torch.library.register_fake("darswin::polar_sample")
@@ -148,10 +155,16 @@ def polar_embed(
 
     Source: DarSwin, ICCV 2023, sec. 4.3.
     """
-    sampling = checked_sampling(
+    given = (
         image, radii, azimuths, center, affine, offsets, jitter, seed, samples, mean, std,
         channels_last,
     )  # fmt: skip
+    sampling = unchecked_sampling(*given)
+    if sampling is not None and _library.plain(weight) and (bias is None or _library.plain(bias)):
+        out = _library.attempt(_EMBED, (*sampling, weight, bias))
+        if out is not None:
+            return out
+    sampling = checked_sampling(*given)
     image, size = sampling.image, sampling.token_size()
     double = image.dtype == torch.float64
     dtypes = (torch.float64,) if double else (torch.float32, torch.bfloat16)
@@ -160,9 +173,8 @@ def polar_embed(
     if bias is not None:
         check_tensor("bias", bias, dtypes, "(D,) = ({},)", (weight.shape[0],), like=image)
     return _library.run(
-        torch.ops.darswin.polar_embed.default, reference.polar_embed, Sampling.kernel_takes,
-        sampling, weight, bias,
-    )  # fmt: skip
+        _EMBED, reference.polar_embed, Sampling.kernel_takes, sampling, weight, bias
+    )
 
 
 @torch.library.register_fake("darswin::polar_embed")

@@ -8,6 +8,8 @@ from torch import Tensor
 from darswin.ops import _library, reference
 from darswin.ops.checks import DTYPES, check_layout, check_pair, check_rising, check_tensor
 
+_TO_IMAGE = torch.ops.darswin.polar_to_image.default
+
 
 def polar_to_image(
     x: Tensor,
@@ -57,6 +59,18 @@ def polar_to_image(
         ValueError: a shape, device or range that does not fit, or radii that do not rise.
         NotImplementedError: forward-mode derivatives, those of torch.func, and second ones.
     """
+    height, width = check_pair("size", size, lowest=0)
+    check_layout(layout)
+    tokens = layout == "tokens"
+    if isinstance(r_max, (int, float)):
+        r_max = radii.new_full((1,), float(r_max)) if isinstance(radii, Tensor) else None
+    if _library.may_attempt() and _library.plain(
+        x, radii, *(t for t in (center, affine, points, r_max) if t is not None)
+    ):
+        given = (x, radii, center, affine, points, r_max, (height, width), tokens)
+        out = _library.attempt(_TO_IMAGE, given)
+        if out is not None:
+            return out
     narrow = _library.narrow_types(x)
     x = x if torch.float16 in narrow else _library.without_float16(x)
     check_tensor("x", x, (*DTYPES, *narrow), "(B, R, A, D)", (None,) * 4)
@@ -64,11 +78,8 @@ def polar_to_image(
     if rings == 0 or sectors == 0:
         raise ValueError(f"x must have rings and sectors, got {tuple(x.shape)}")
     real = torch.float64 if x.dtype == torch.float64 else torch.float32
-    height, width = check_pair("size", size, lowest=0)
     if (center is None) == (points is None) or (points is not None and affine is not None):
         raise ValueError("polar_to_image takes center, and affine if need be, or else points")
-    if isinstance(r_max, (int, float)):
-        r_max = radii.new_full((1,), float(r_max)) if isinstance(radii, Tensor) else None
     for name, tensor, form, *shape in (
         ("radii", radii, "(B or 1, R) = ({} or 1, {})", rings),
         ("center", center, "(B or 1, 2) = ({} or 1, {})", 2),
@@ -79,10 +90,9 @@ def polar_to_image(
         if tensor is not None or name == "radii":
             check_tensor(name, tensor, (real,), form, (x.shape[0], *shape), (1, *shape), like=x)
     check_rising("radii", radii)
-    check_layout(layout)
     return _library.run(
-        torch.ops.darswin.polar_to_image.default, reference.polar_to_image, _kernel_takes,
-        x, radii, center, affine, points, r_max, (height, width), layout == "tokens",
+        _TO_IMAGE, reference.polar_to_image, _kernel_takes,
+        x, radii, center, affine, points, r_max, (height, width), tokens,
     )  # fmt: skip
 
 

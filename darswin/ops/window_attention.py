@@ -8,6 +8,8 @@ from torch import Tensor
 from darswin.ops import _library, reference
 from darswin.ops.checks import DTYPES, check_pair, check_tensor
 
+_ATTENTION = torch.ops.darswin.window_attention.default
+
 
 def window_attention(
     qkv: Tensor,
@@ -49,6 +51,18 @@ def window_attention(
 
     Source: DarSwin, ICCV 2023, sec. 4.4; Swin Transformer, ICCV 2021, sec. 3.2.
     """
+    window = check_pair("window", window, lowest=1)
+    shift = check_pair("shift", shift, lowest=0)
+    if not isinstance(periodic, (tuple, list)) or len(periodic) != 2:
+        raise TypeError(f"periodic must be a pair of bools, got {periodic!r}")
+    wrap = tuple(int(bool(p)) for p in periodic)  # torch.jit.trace takes no list of bools
+    if _library.may_attempt() and _library.plain(qkv, bias) and bias.dtype != torch.bfloat16:
+        shape = qkv.shape
+        if len(shape) == 6 and shape[5] > 0:
+            scaled = shape[5] ** -0.5 if scale is None else float(scale)
+            out = _library.attempt(_ATTENTION, (qkv, bias, window, shift, wrap, scaled))
+            if out is not None:
+                return out
     narrow = _library.narrow_types(qkv)
     if torch.float16 not in narrow:
         qkv, bias = _library.without_float16(qkv), _library.without_float16(bias)
@@ -57,14 +71,10 @@ def window_attention(
     batch, rings, sectors, _, heads, head_dim = qkv.shape
     if rings == 0 or sectors == 0 or head_dim == 0:
         raise ValueError(f"qkv must have rings, sectors and a head dim, got {tuple(qkv.shape)}")
-    window = check_pair("window", window, lowest=1)
     if rings % window[0] or sectors % window[1]:
         raise ValueError(f"window must divide (R, A) = ({rings}, {sectors}), got {window}")
-    shift = check_pair("shift", shift, lowest=0)
     if shift[0] >= rings or shift[1] >= sectors:
         raise ValueError(f"shift must lie inside (R, A) = ({rings}, {sectors}), got {shift}")
-    if not isinstance(periodic, (tuple, list)) or len(periodic) != 2:
-        raise TypeError(f"periodic must be a pair of bools, got {periodic!r}")
     # The bias of a qkv in 16 bits is float32; autocast may have made it narrow.
     half = qkv.dtype in narrow
     if isinstance(bias, Tensor) and bias.dtype in narrow:
@@ -74,9 +84,8 @@ def window_attention(
     form = "(B or 1, heads, 2·M_r-1, 2·M_φ-1) = ({} or 1, {}, {}, {})"
     check_tensor("bias", bias, (real,), form, (batch, *table), (1, *table), like=qkv)
     scale = head_dim**-0.5 if scale is None else float(scale)
-    wrap = tuple(int(bool(p)) for p in periodic)  # torch.jit.trace takes no list of bools
     return _library.run(
-        torch.ops.darswin.window_attention.default, reference.window_attention, _kernel_takes,
+        _ATTENTION, reference.window_attention, _kernel_takes,
         qkv, bias, window, shift, wrap, scale,
     )  # fmt: skip
 
