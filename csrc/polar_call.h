@@ -149,8 +149,7 @@ struct PolarCall {
                     "polar_sample_backward: too large an image for a bfloat16 gradient");
     // Where there are points the kernels write every pixel.
     const Tensor grad =
-        points() ? new_tensor(image.sizes(), image.scalar_type())
-                 : new_zeros(image, image.sizes());
+        points() ? new_tensor(image.sizes(), image.scalar_type()) : new_zeros(image, image.sizes());
     ask_for_large_pages(grad);
     args.grad_image = grad.mutable_data_ptr();
     return grad;
@@ -311,10 +310,10 @@ struct Listed<in_float, in_double> {
                      MaybeTensor offsets, MaybeTensor jitter, MaybeTensor seed, Sizes samples,
                      std::vector<double> mean, std::vector<double> std, bool bfloat16,
                      Others... others) {
-    const Sampling given{std::move(image),   std::move(radii),  std::move(azimuths),
-                         std::move(center),  std::move(affine), std::move(offsets),
-                         std::move(jitter),  std::move(seed),   std::move(samples),
-                         std::move(mean),    std::move(std),    bfloat16};
+    const Sampling given{std::move(image),  std::move(radii),  std::move(azimuths),
+                         std::move(center), std::move(affine), std::move(offsets),
+                         std::move(jitter), std::move(seed),   std::move(samples),
+                         std::move(mean),   std::move(std),    bfloat16};
     if (given.image.scalar_type() == ScalarType::Double) {
       PolarCall<double> call(given);
       return in_double(call, others...);

@@ -109,7 +109,12 @@ Tensor forward(ToImageCall<T>&& call) {
   if (out.numel() == 0) return out;
   ask_for_large_pages(out);
   args.out = mutable_pointer<T>(out);
-  call.run(args.batch * args.height, kernels<PolarToImageKernels<T>>().forward);
+  // Images of one lens take turns, band by band, so that one plan of a band serves all of them.
+  constexpr int64_t kBandRows = 8, kItems = 16;
+  const int64_t rows =
+      std::clamp<int64_t>(args.height * args.batch / kItems, 1, args.batch > 1 ? kBandRows : 1);
+  args.bands = (args.height + rows - 1) / rows;
+  call.run(args.batch * args.bands, kernels<PolarToImageKernels<T>>().forward);
   return out;
 }
 
@@ -133,8 +138,9 @@ Tensor map_gradient(ToImageCall<T>& call) {
   ask_for_large_pages(grad);
   args.grad_x = mutable_pointer<T>(grad);
   args.bands = count_bands(args);
-  std::vector<Arithmetic<T>> partial(args.bands > 1 ? args.bands * grad.numel() : 0);
-  args.partial = partial.data();
+  const Tensor partial =
+      new_tensor(Sizes{args.bands > 1 ? args.bands * grad.numel() : 0}, type_of<Arithmetic<T>>());
+  args.partial = mutable_pointer<Arithmetic<T>>(partial);
   const int64_t blocks = (args.channels + kChannelBlock - 1) / kChannelBlock;
   call.run(args.batch * args.bands * blocks, kernel.backward_map);
   if (args.bands > 1) {

@@ -26,11 +26,12 @@ struct PolarToImageArgs {
   int64_t batch, rings, sectors, channels, height, width;
   bool tokens;  // (B, H, W, D), else (B, D, H, W)
 
+  int64_t bands;  // into how many bands of rows an image is cut
+
   T* out;  // forward
 
   const T* grad_out;  // backward
   T* grad_x;          // like x
-  int64_t bands;      // into how many bands of rows an image is cut
   Real* partial;      // with several bands: (bands, B, R, A, D), to be summed over the bands
   int64_t lenses;     // 1 if all images share one lens, else B
   double* grad_rows;  // (lenses, H, R + kSums), to be summed over the rows; zero on entry
@@ -46,7 +47,7 @@ struct PolarToImageKernels {
   using Args = PolarToImageArgs<T>;
   // bytes of scratch that each thread needs in the functions below
   int64_t (*scratch)(const Args&);
-  // item: (image, row of pixels)
+  // item: (band of rows, image)
   void (*forward)(const Args&, int64_t begin, int64_t end, void* scratch);
   // item: (band of rows, image, block of channels) -> grad_x or partial
   void (*backward_map)(const Args&, int64_t begin, int64_t end, void* scratch);

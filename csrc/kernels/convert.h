@@ -28,10 +28,18 @@ inline V load(const uint8_t* from) {
 }
 
 template <typename V>
-using BitsOf = std::conditional_t<is_same_v<V, float>, uint32_t, Vector<uint32_t, kLanes<float>>>;
+struct BitsOfFloats {
+  using type = Vector<uint32_t, kCount<V>>;
+};
+template <>
+struct BitsOfFloats<float> {
+  using type = uint32_t;
+};
+template <typename V>
+using BitsOf = typename BitsOfFloats<V>::type;
 
-// The bits of a float or of Floats, rounded to those that bfloat16 has, which are the upper ones:
-// to nearest, ties to even. NaN stays NaN, even if its payload lies in the lower half.
+// The bits of a float or of a vector of floats, rounded to those that bfloat16 has, which are the
+// upper ones: to nearest, ties to even. NaN stays NaN, even if its payload lies in the lower half.
 template <typename V>
 inline BitsOf<V> rounded(V x) {
   const auto bits = __builtin_bit_cast(BitsOf<V>, x);
@@ -39,8 +47,9 @@ inline BitsOf<V> rounded(V x) {
 }
 
 inline void store(bfloat16* to, float x) { to->bits = static_cast<uint16_t>(rounded(x) >> 16); }
-inline void store(bfloat16* to, Floats x) {
-  store_bits(to, __builtin_convertvector(rounded(x) >> 16, Vector<uint16_t, kLanes<float>>));
+template <typename V>
+inline void store(bfloat16* to, V x) {
+  store_bits(to, __builtin_convertvector(rounded(x) >> 16, Vector<uint16_t, kCount<V>>));
 }
 
 // Copies short runs: whole registers, the last of them over the one before.

@@ -46,7 +46,8 @@ class Planner {
   using Index = IndexOf<Real>;
   using I = Vector<Index, kLanes<Real>>;
 
-  explicit Planner(const Args& args) : a(args) {}
+  // `steps` is room for 2 * (rings + 1) values.
+  Planner(const Args& args, Real* steps) : a(args), from(steps) {}
 
   // Plans `count` pixels of a row of image b, from pixel `first` on.
   void plan(int64_t b, int64_t row, int64_t first, int64_t count, Mix<Real>& tile,
@@ -57,11 +58,13 @@ class Planner {
     for (int64_t k = 0; k < whole; ++k) {
       plan.radius[k] = root(plan.across[k] * plan.across[k] + plan.down[k] * plan.down[k]);
     }
-    if (first == 0) above = 0;  // what a pixel gets does not depend on who computes it
-    find_rings(a.radii + (a.radii_rows == 1 ? 0 : b) * a.rings, whole, plan);
+    take_radii(a.radii_rows == 1 ? 0 : b);
     const Real infinity = static_cast<Real>(__builtin_inf());
     const Real limit = a.r_max == nullptr ? infinity : a.r_max[a.r_max_rows == 1 ? 0 : b];
-    for (int64_t k = 0; k < whole; k += kLanes<Real>) mix(k, limit, infinity, tile, plan);
+    for (int64_t k = 0; k < whole; k += kLanes<Real>) {
+      find_rings(k, plan);
+      mix(k, limit, infinity, tile, plan);
+    }
   }
 
  private:
@@ -75,31 +78,65 @@ class Planner {
       return;
     }
     const double* m = a.plane + n * kPlane;
-    const double y = static_cast<double>(row) - m[1];
-    for (int64_t k = 0; k < count; ++k) {
-      const double x = static_cast<double>(first + k) - m[0];
+    const double y = static_cast<double>(row) - m[1], start = static_cast<double>(first);
+    for (int32_t k = 0; k < static_cast<int32_t>(count); ++k) {  // int64 has no fast conversion
+      const double x = start + k - m[0];
       plan.across[k] = static_cast<Real>(m[2] * x + m[3] * y);
       plan.down[k] = static_cast<Real>(m[4] * x + m[5] * y);
     }
   }
 
-  // The rings on both sides of each pixel. Radii change little from pixel to pixel, so the search
-  // begins where it ended. NaN stays where it is.
-  void find_rings(const Real* radii, int64_t count, Origin<Real>& plan) {
+  // Makes the steps from ring to ring of lens n. Between the centres of rings k - 1 and k lies step
+  // k: where it starts, and how long it is. Step 0 crosses the pole, the last one has no end.
+  void take_radii(int64_t n) {
+    if (n == lens) return;
+    lens = n;
+    above = 0;
+    radii = a.radii + n * a.rings;
+    span = from + a.rings + 1;
+    from[0] = -radii[0];
+    for (int64_t k = 1; k <= a.rings; ++k) from[k] = radii[k - 1];
+    for (int64_t k = 0; k < a.rings; ++k) span[k] = radii[k] - from[k];
+    span[a.rings] = static_cast<Real>(__builtin_inf());
+  }
+
+  // The largest lane, in every lane.
+  template <int distance>
+  static V largest(V v) {
+    if constexpr (distance == 0) {
+      return v;
+    } else {
+      const V other = shuffle<[](int lane) { return lane ^ distance; }>(v, v);
+      return largest<distance / 2>(v > other ? v : other);
+    }
+  }
+
+  // The step that each pixel of a register lies in, which is the number of ring centres at most as
+  // far out. Radii change little from pixel to pixel, so the search begins where it ended, and the
+  // pixels of a register lie in few steps. A pixel at NaN gets any of them.
+  void find_rings(int64_t k, Origin<Real>& plan) {
+    const V r = load<V>(plan.radius + k);
+    const V infinity = splat<V>(static_cast<Real>(__builtin_inf()));
+    const Real lowest = largest<kLanes<Real> / 2>(r == r ? -r : -infinity)[0] * -1;
+    const Real highest = largest<kLanes<Real> / 2>(r == r ? r : -infinity)[0];
+    while (above < a.rings && radii[above] <= lowest) ++above;
+    while (above > 0 && radii[above - 1] > lowest) --above;
+    I within = I{} + static_cast<Index>(above);
+    V begin = splat<V>(from[above]), length = splat<V>(span[above]);
+    for (int64_t ring = above; ring < a.rings && radii[ring] <= highest; ++ring) {
+      const I outside = r >= radii[ring];
+      within -= outside;  // true is -1
+      begin = select(outside, splat<V>(from[ring + 1]), begin);
+      length = select(outside, splat<V>(span[ring + 1]), length);
+    }
     const auto last = static_cast<Index>(a.rings - 1);
     const Real half = static_cast<Real>(0.5) * static_cast<Real>(a.sectors);
-    for (int64_t k = 0; k < count; ++k) {
-      const Real r = plan.radius[k];
-      while (above <= last && radii[above] <= r) ++above;
-      while (above > 0 && radii[above - 1] > r) --above;
-      const bool pole = above == 0, beyond = above > last;
-      const Index inner = pole ? 0 : above - 1, outer = beyond ? last : above;
-      const Real from = pole ? -radii[0] : radii[inner];
-      plan.inner[k] = inner, plan.outer[k] = outer;
-      plan.from[k] = from;
-      plan.span[k] = beyond ? static_cast<Real>(__builtin_inf()) : radii[outer] - from;
-      plan.turn[k] = pole ? half : 0;
-    }
+    const I pole = within == 0;
+    store(plan.inner + k, within - 1 - pole);
+    store(plan.outer + k, select(within > last, I{} + last, within));
+    store(plan.turn + k, select(pole, splat<V>(half), V{}));
+    store(plan.from + k, begin);
+    store(plan.span + k, length);
   }
 
   // Tokens and weights of a register of pixels.
@@ -135,18 +172,31 @@ class Planner {
   }
 
   const Args& a;
-  Index above = 0;  // how many ring centres the last pixel was not inside of
+  const Real* radii = nullptr;
+  Real *from, *span = nullptr;
+  int64_t lens = -1, above = 0;
 };
 
+// The rows of pixels that one item of forward or of backward_map takes.
 template <typename T>
 int64_t rows_of_band(const PolarToImageArgs<T>& a) {
   return (a.height + a.bands - 1) / a.bands;
+}
+
+// A pixel's channels are taken in registers of this many lanes: of few if there are few.
+constexpr int64_t kFew = 4;
+template <typename T>
+int64_t lanes(const PolarToImageArgs<T>& a) {
+  constexpr int64_t most = kLanes<Arithmetic<T>>;
+  return a.channels <= kFew ? smaller(kFew, most) : most;
 }
 
 // The working memory of a thread. It keeps the mixes of whole rows of pixels for the images and the
 // channels that come next: row y has its place at y % rows.
 template <typename T>
 class Workspace {
+  Arena arena;
+
  public:
   using Real = Arithmetic<T>;
 
@@ -157,7 +207,8 @@ class Workspace {
   int64_t bytes;
 
   Workspace(const PolarToImageArgs<T>& args, void* memory)
-      : planner(args),
+      : arena{static_cast<char*>(memory)},
+        planner(args, arena.take<Real>(2 * (args.rings + 1))),
         a(args),
         shared(a.radii_rows == 1 && a.place_rows == 1 && a.r_max_rows == 1),
         tiles(round_up(a.width, kTile) / kTile) {
@@ -168,15 +219,14 @@ class Workspace {
     const int64_t row_bytes = tiles * static_cast<int64_t>(sizeof(Mix<Real>));
     rows = again && rows_of_band(a) * row_bytes <= kMost ? rows_of_band(a) : 1;
 
-    Arena arena{static_cast<char*>(memory)};
     kept = arena.take<int64_t>(rows);
     mixes = arena.take<Mix<Real>>(rows * tiles);
     tile = arena.take<Mix<Real>>(1);
     origin = arena.take<Origin<Real>>(1);
-    const int64_t row = round_up(a.channels, kLanes<Real>);
+    const int64_t row = round_up(a.channels, lanes(a));
     gradients =
         arena.take<Real>(backward ? kTile * (row > kChannelBlock ? row : kChannelBlock) : 0);
-    sums = arena.take<Real>(backward ? a.rings * a.sectors * kChannelBlock : 0);
+    sums = arena.take<Real>(backward ? a.rings * a.sectors * smaller(row, kChannelBlock) : 0);
     bytes = arena.used;
     for (int64_t k = 0; memory != nullptr && k < rows; ++k) kept[k] = -1;
   }

@@ -18,13 +18,13 @@
 namespace darswin {
 namespace {
 
-template <typename T>
+// kL channels of a pixel at a time.
+template <typename T, int64_t kL>
 class Forward {
  public:
   using Args = PolarToImageArgs<T>;
   using Real = Arithmetic<T>;
-  using V = Vector<Real, kLanes<Real>>;
-  static constexpr int64_t kL = kLanes<Real>;
+  using V = Vector<Real, kL>;
 
   Forward(const Args& args, Workspace<T>& work) : a(args), work(work) {}
 
@@ -34,6 +34,7 @@ class Forward {
     for (int64_t first = 0; first < a.width; first += kTile, ++tile) {
       const int64_t count = smaller(kTile, a.width - first), place = y * a.width + first;
       const T* map = a.x + b * a.rings * a.sectors * a.channels;
+      find_end(count);
       if (a.tokens) {
         tokens(map, count, a.out + (b * pixels + place) * a.channels);
       } else {
@@ -43,6 +44,18 @@ class Forward {
   }
 
  private:
+  // How many channels may be read from the first one of each token of the tile.
+  void find_end(int64_t count) {
+    IndexOf<Real> last = 0;
+    for (int corner = 0; corner < 4; ++corner) {
+      for (int64_t k = 0; k < count; ++k) {
+        const IndexOf<Real> token = tile->token[corner][k];
+        last = token > last ? token : last;
+      }
+    }
+    readable = a.channels * (a.rings * a.sectors - last);
+  }
+
   // Channel c of pixel k or, where W is a register, the channels from c on.
   template <typename W>
   W mix(const T* map, int64_t k, int64_t c) const {
@@ -54,16 +67,11 @@ class Forward {
     return inner + outer;
   }
 
-  // The channels from c on, fewer than a register: whole registers where they lie in the map.
+  // The channels from c on, maybe fewer than a register: whole registers where they lie in the map.
   V mix_last(const T* map, int64_t k, int64_t c) const {
-    const int64_t end = a.rings * a.sectors * a.channels - c - kL;
-    bool inside = true;
-    for (int corner = 0; corner < 4; ++corner) {
-      inside &= a.channels * tile->token[corner][k] <= end;
-    }
-    if (inside) return mix<V>(map, k, c);
+    if (c + kL <= readable) return mix<V>(map, k, c);
     V v{};
-    for (int64_t e = c; e < a.channels; ++e) v[e - c] = mix<Real>(map, k, e);
+    for (int64_t e = c; e < smaller(c + kL, a.channels); ++e) v[e - c] = mix<Real>(map, k, e);
     return v;
   }
 
@@ -90,7 +98,7 @@ class Forward {
         for (; k + kL <= count; k += kL) square(map, k, c, channels, to + c * stride + k, stride);
       }
       for (; k < count; ++k) {
-        const V v = channels == kL ? mix<V>(map, k, c) : mix_last(map, k, c);
+        const V v = mix_last(map, k, c);
         for (int64_t e = 0; e < channels; ++e) store(to + (c + e) * stride + k, v[e]);
       }
     }
@@ -98,7 +106,7 @@ class Forward {
 
   // Up to kL channels of kL pixels, from pixel k and channel c on.
   void square(const T* map, int64_t k, int64_t c, int64_t channels, T* to, int64_t stride) const {
-    Floats rows[kL];
+    V rows[kL];
     if (channels == kL) {
 #pragma GCC unroll 16
       for (int i = 0; i < kL; ++i) {
@@ -108,23 +116,26 @@ class Forward {
       }
       if constexpr (is_same_v<T, float>) return transpose_square(rows, to, stride);
     } else {
+#pragma GCC unroll 16
       for (int i = 0; i < kL; ++i) rows[i] = mix_last(map, k + i, c);
     }
     float turned[kL * kL];
     transpose_square(rows, turned, kL);
-    for (int64_t i = 0; i < channels; ++i) store(to + i * stride, load<Floats>(turned + i * kL));
+    for (int64_t i = 0; i < channels; ++i) store(to + i * stride, load<V>(turned + i * kL));
   }
 
   const Args& a;
   Workspace<T>& work;
   const Mix<Real>* tile = nullptr;
+  int64_t readable = 0;
 };
 
 // Gradients of a tile's pixels, of channels [c, c + width), as rows of `row` values, zeros behind.
-template <typename T, typename Real = Arithmetic<T>>
+// `row` is a multiple of kL.
+template <int64_t kL, typename T, typename Real = Arithmetic<T>>
 void gather(const PolarToImageArgs<T>& a, int64_t b, int64_t place, int64_t count, int64_t c,
             int64_t width, int64_t row, Real* to) {
-  using V = Vector<Real, kLanes<Real>>;
+  using V = Vector<Real, kL>;
   constexpr int64_t kAhead = 16, kBytes = sizeof(T);
   const int64_t pixels = a.height * a.width;
   if (a.tokens) {
@@ -134,38 +145,37 @@ void gather(const PolarToImageArgs<T>& a, int64_t b, int64_t place, int64_t coun
       const char* ahead = reinterpret_cast<const char*>(from + kAhead * a.channels);
       for (int64_t byte = 0; byte < width * kBytes; byte += 64) __builtin_prefetch(ahead + byte);
       int64_t e = 0;
-      for (; e + kLanes<Real> <= width; e += kLanes<Real>) store(to + e, load<V>(from + e));
+      for (; e + kL <= width; e += kL) store(to + e, load<V>(from + e));
       for (; e < width; ++e) to[e] = load<Real>(from + e);
       for (; e < row; ++e) to[e] = 0;
     }
     return;
   }
   const T* from = a.grad_out + (b * a.channels + c) * pixels + place;
-  int64_t e = 0;
-  if constexpr (is_same_v<Real, float>) {
-    constexpr int64_t kL = kLanes<float>;
-    for (; e + kL <= width; e += kL) {
-      int64_t k = 0;
+  for (int64_t e = 0; e < row; e += kL) {
+    const int64_t planes = smaller(kL, width - e);
+    int64_t k = 0;
+    if constexpr (is_same_v<Real, float>) {
       for (; k + kL <= count; k += kL) {
-        Floats rows[kL];
+        V rows[kL]{};
+        if (planes == kL) {
 #pragma GCC unroll 16
-        for (int i = 0; i < kL; ++i) {
-          const T* plane = from + (e + i) * pixels + k;
-          __builtin_prefetch(plane + kTile);
-          rows[i] = load<Floats>(plane);
+          for (int i = 0; i < kL; ++i) {
+            const T* plane = from + (e + i) * pixels + k;
+            __builtin_prefetch(plane + kTile);
+            rows[i] = load<V>(plane);
+          }
+        } else {
+          for (int i = 0; i < planes; ++i) rows[i] = load<V>(from + (e + i) * pixels + k);
         }
         transpose_square(rows, to + k * row + e, row);
       }
-      for (; k < count; ++k) {
-        for (int64_t i = e; i < e + kL; ++i) to[k * row + i] = load<Real>(from + i * pixels + k);
+    }
+    for (; k < count; ++k) {
+      for (int64_t i = e; i < e + kL; ++i) {
+        to[k * row + i] = i < width ? load<Real>(from + i * pixels + k) : 0;
       }
     }
-  }
-  for (; e < width; ++e) {
-    for (int64_t k = 0; k < count; ++k) to[k * row + e] = load<Real>(from + e * pixels + k);
-  }
-  for (; e < row; ++e) {
-    for (int64_t k = 0; k < count; ++k) to[k * row + e] = 0;
   }
 }
 
@@ -174,19 +184,24 @@ int64_t scratch(const PolarToImageArgs<T>& a) {
   return Workspace<T>(a, nullptr).bytes;
 }
 
-template <typename T>
-void forward(const PolarToImageArgs<T>& a, int64_t begin, int64_t end, void* memory) {
+template <typename T, int64_t kL>
+void forward_items(const PolarToImageArgs<T>& a, int64_t begin, int64_t end, void* memory) {
   Workspace<T> work(a, memory);
-  Forward<T> forward(a, work);
-  for (int64_t item = begin; item < end; ++item) forward.row(item / a.height, item % a.height);
+  Forward<T, kL> forward(a, work);
+  const int64_t rows = rows_of_band(a);
+  for (int64_t item = begin; item < end; ++item) {
+    const int64_t band = item / a.batch;
+    for (int64_t y = band * rows; y < smaller((band + 1) * rows, a.height); ++y) {
+      forward.row(item % a.batch, y);
+    }
+  }
 }
 
 // Adds the gradients of a tile's pixels, rows of `row_` values, to those of their tokens. `fixed`
 // is the length of a row, or 0 where it is known only now.
-template <typename Real, int64_t fixed>
+template <int64_t kL, int64_t fixed, typename Real>
 void add(const Mix<Real>& tile, int64_t count, int64_t row_, const Real* gradients, Real* sums) {
-  using V = Vector<Real, kLanes<Real>>;
-  constexpr int64_t kL = kLanes<Real>;
+  using V = Vector<Real, kL>;
   const int64_t row = fixed > 0 ? fixed : row_;
   for (int64_t k = 0; k < count; ++k, gradients += row) {
     if (!tile.known[k]) continue;
@@ -202,10 +217,20 @@ void add(const Mix<Real>& tile, int64_t count, int64_t row_, const Real* gradien
   }
 }
 
-template <typename T>
-void backward_map(const PolarToImageArgs<T>& a, int64_t begin, int64_t end, void* memory) {
+// Rows of `row` values, of which the first `width` count, to places `stride` apart.
+template <int64_t kL, typename From, typename To>
+void copy_rows(const From* from, int64_t rows, int64_t row, int64_t width, To* to, int64_t stride) {
+  if (row == kL && width == stride) {
+    using V = Vector<From, kL>;
+    // The next row overwrites what is too much.
+    for (; rows * stride >= kL; --rows, from += row, to += stride) store(to, load<V>(from));
+  }
+  for (; rows > 0; --rows, from += row, to += stride) copy(from, width, to);
+}
+
+template <typename T, int64_t kL>
+void backward_map_items(const PolarToImageArgs<T>& a, int64_t begin, int64_t end, void* memory) {
   using Real = Arithmetic<T>;
-  constexpr int64_t kL = kLanes<Real>;
   Workspace<T> work(a, memory);
   const int64_t blocks = (a.channels + kChannelBlock - 1) / kChannelBlock;
   const int64_t map = a.rings * a.sectors;
@@ -219,34 +244,53 @@ void backward_map(const PolarToImageArgs<T>& a, int64_t begin, int64_t end, void
       const Mix<Real>* tile = work.row(b, y);
       for (int64_t first = 0; first < a.width; first += kTile, ++tile) {
         const int64_t count = smaller(kTile, a.width - first);
-        gather(a, b, y * a.width + first, count, c, width, row, work.gradients);
+        gather<kL>(a, b, y * a.width + first, count, c, width, row, work.gradients);
         if (row == kChannelBlock) {
-          add<Real, kChannelBlock>(*tile, count, row, work.gradients, work.sums);
+          add<kL, kChannelBlock>(*tile, count, row, work.gradients, work.sums);
+        } else if (row == kL) {
+          add<kL, kL>(*tile, count, row, work.gradients, work.sums);
         } else {
-          add<Real, 0>(*tile, count, row, work.gradients, work.sums);
+          add<kL, 0>(*tile, count, row, work.gradients, work.sums);
         }
       }
     }
-    for (int64_t token = 0; token < map; ++token) {
-      const int64_t to = (b * map + token) * a.channels + c;
-      const Real* from = work.sums + token * row;
-      if (a.bands > 1) {
-        copy(from, width, a.partial + band * a.batch * map * a.channels + to);
-      } else {
-        copy(from, width, a.grad_x + to);
-      }
+    const int64_t to = b * map * a.channels + c;
+    if (a.bands > 1) {
+      Real* partial = a.partial + band * a.batch * map * a.channels;
+      copy_rows<kL>(work.sums, map, row, width, partial + to, a.channels);
+    } else {
+      copy_rows<kL>(work.sums, map, row, width, a.grad_x + to, a.channels);
     }
   }
 }
 
+// Calls one of the functions above for the lanes that suit the channels.
+template <typename T>
+void forward(const PolarToImageArgs<T>& a, int64_t begin, int64_t end, void* memory) {
+  constexpr int64_t most = kLanes<Arithmetic<T>>, few = most < kFew ? most : kFew;
+  (lanes(a) == few ? forward_items<T, few> : forward_items<T, most>)(a, begin, end, memory);
+}
+template <typename T>
+void backward_map(const PolarToImageArgs<T>& a, int64_t begin, int64_t end, void* memory) {
+  constexpr int64_t most = kLanes<Arithmetic<T>>, few = most < kFew ? most : kFew;
+  (lanes(a) == few ? backward_map_items<T, few> : backward_map_items<T, most>)(a, begin, end,
+                                                                               memory);
+}
+
 template <typename T>
 void sum_bands(const PolarToImageArgs<T>& a, int64_t begin, int64_t end) {
+  using V = Vector<Arithmetic<T>, kLanes<Arithmetic<T>>>;
   const int64_t values = a.batch * a.rings * a.sectors * a.channels;
-  for (int64_t k = begin; k < end; ++k) {
-    Arithmetic<T> sum = a.partial[k];
-    for (int64_t band = 1; band < a.bands; ++band) sum += a.partial[band * values + k];
-    store(a.grad_x + k, sum);
-  }
+  const auto sum = [&]<typename W>(int64_t k, W total) {
+    for (int64_t band = 0; band < a.bands; ++band) {
+      const W part = load<W>(a.partial + band * values + k);
+      total = band == 0 ? part : total + part;
+    }
+    store(a.grad_x + k, total);
+  };
+  int64_t k = begin;
+  for (; k + kLanes<Arithmetic<T>> <= end; k += kLanes<Arithmetic<T>>) sum(k, V{});
+  for (; k < end; ++k) sum(k, Arithmetic<T>{});
 }
 
 // sum over channels of g times a token's values
@@ -280,7 +324,8 @@ void backward_lens(const PolarToImageArgs<T>& a, int64_t begin, int64_t end, voi
       for (int64_t first = 0; first < a.width; first += kTile) {
         const int64_t count = smaller(kTile, a.width - first);
         work.planner.plan(b, y, first, count, tile, plan);
-        gather(a, b, y * a.width + first, count, int64_t{0}, a.channels, row, work.gradients);
+        gather<kLanes<Real>>(a, b, y * a.width + first, count, int64_t{0}, a.channels, row,
+                             work.gradients);
         for (int64_t k = 0; k < count; ++k) {
           if (!tile.known[k]) continue;
           double s[4];  // how the loss changes with each corner's weight

@@ -95,6 +95,10 @@ inline void transpose_square(Floats* rows, float* to, int64_t stride) {
 #pragma GCC unroll 16
   for (int i = 0; i < kL; ++i) store(to + i * stride, rows[i]);
 }
+template <typename V>  // of four lanes, where registers have more
+inline void transpose_square(V* rows, float* to, int64_t stride) {
+  transpose4(rows[0], rows[1], rows[2], rows[3], to, stride);
+}
 
 }  // namespace
 }  // namespace darswin
