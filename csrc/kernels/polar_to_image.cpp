@@ -18,8 +18,9 @@
 namespace darswin {
 namespace {
 
-// kL channels of a pixel at a time.
-template <typename T, int64_t kL>
+// kL channels of a pixel at a time. `fixed` is the number of channels, or 0 where it is known only
+// now: four products of it take longer than the rest of a pixel of few channels.
+template <typename T, int64_t kL, int64_t fixed>
 class Forward {
  public:
   using Args = PolarToImageArgs<T>;
@@ -28,17 +29,19 @@ class Forward {
 
   Forward(const Args& args, Workspace<T>& work) : a(args), work(work) {}
 
+  int64_t channels() const { return fixed > 0 ? fixed : a.channels; }
+
   void row(int64_t b, int64_t y) {
     const int64_t pixels = a.height * a.width;
     tile = work.row(b, y);
     for (int64_t first = 0; first < a.width; first += kTile, ++tile) {
       const int64_t count = smaller(kTile, a.width - first), place = y * a.width + first;
-      const T* map = a.x + b * a.rings * a.sectors * a.channels;
+      const T* map = a.x + b * a.rings * a.sectors * channels();
       find_end(count);
       if (a.tokens) {
-        tokens(map, count, a.out + (b * pixels + place) * a.channels);
+        tokens(map, count, a.out + (b * pixels + place) * channels());
       } else {
-        planes(map, count, a.out + b * a.channels * pixels + place, pixels);
+        planes(map, count, a.out + b * channels() * pixels + place, pixels);
       }
     }
   }
@@ -53,17 +56,17 @@ class Forward {
         last = token > last ? token : last;
       }
     }
-    readable = a.channels * (a.rings * a.sectors - last);
+    readable = channels() * (a.rings * a.sectors - last);
   }
 
   // Channel c of pixel k or, where W is a register, the channels from c on.
   template <typename W>
   W mix(const T* map, int64_t k, int64_t c) const {
     if (!tile->known[k]) return W{};
-    const W inner = tile->weight[0][k] * load<W>(map + a.channels * tile->token[0][k] + c) +
-                    tile->weight[1][k] * load<W>(map + a.channels * tile->token[1][k] + c);
-    const W outer = tile->weight[2][k] * load<W>(map + a.channels * tile->token[2][k] + c) +
-                    tile->weight[3][k] * load<W>(map + a.channels * tile->token[3][k] + c);
+    const W inner = tile->weight[0][k] * load<W>(map + channels() * tile->token[0][k] + c) +
+                    tile->weight[1][k] * load<W>(map + channels() * tile->token[1][k] + c);
+    const W outer = tile->weight[2][k] * load<W>(map + channels() * tile->token[2][k] + c) +
+                    tile->weight[3][k] * load<W>(map + channels() * tile->token[3][k] + c);
     return inner + outer;
   }
 
@@ -71,43 +74,43 @@ class Forward {
   V mix_last(const T* map, int64_t k, int64_t c) const {
     if (c + kL <= readable) return mix<V>(map, k, c);
     V v{};
-    for (int64_t e = c; e < smaller(c + kL, a.channels); ++e) v[e - c] = mix<Real>(map, k, e);
+    for (int64_t e = c; e < smaller(c + kL, channels()); ++e) v[e - c] = mix<Real>(map, k, e);
     return v;
   }
 
   void tokens(const T* map, int64_t count, T* to) const {
-    const T* end = to + count * a.channels;
-    for (int64_t k = 0; k < count; ++k, to += a.channels) {
+    const T* end = to + count * channels();
+    for (int64_t k = 0; k < count; ++k, to += channels()) {
       int64_t c = 0;
-      for (; c + kL <= a.channels; c += kL) store(to + c, mix<V>(map, k, c));
-      if (c == a.channels) continue;
+      for (; c + kL <= channels(); c += kL) store(to + c, mix<V>(map, k, c));
+      if (c == channels()) continue;
       const V last = mix_last(map, k, c);
       if (end - (to + c) >= kL) {
         store(to + c, last);  // the next pixel overwrites what is too much
       } else {
-        for (; c < a.channels; ++c) store(to + c, last[c % kL]);
+        for (; c < channels(); ++c) store(to + c, last[c % kL]);
       }
     }
   }
 
   void planes(const T* map, int64_t count, T* to, int64_t stride) const {
-    for (int64_t c = 0; c < a.channels; c += kL) {
-      const int64_t channels = smaller(kL, a.channels - c);
+    for (int64_t c = 0; c < channels(); c += kL) {
+      const int64_t width = smaller(kL, channels() - c);
       int64_t k = 0;
       if constexpr (is_same_v<Real, float>) {
-        for (; k + kL <= count; k += kL) square(map, k, c, channels, to + c * stride + k, stride);
+        for (; k + kL <= count; k += kL) square(map, k, c, width, to + c * stride + k, stride);
       }
       for (; k < count; ++k) {
         const V v = mix_last(map, k, c);
-        for (int64_t e = 0; e < channels; ++e) store(to + (c + e) * stride + k, v[e]);
+        for (int64_t e = 0; e < width; ++e) store(to + (c + e) * stride + k, v[e]);
       }
     }
   }
 
   // Up to kL channels of kL pixels, from pixel k and channel c on.
-  void square(const T* map, int64_t k, int64_t c, int64_t channels, T* to, int64_t stride) const {
+  void square(const T* map, int64_t k, int64_t c, int64_t width, T* to, int64_t stride) const {
     V rows[kL];
-    if (channels == kL) {
+    if (width == kL) {
 #pragma GCC unroll 16
       for (int i = 0; i < kL; ++i) {
         // The planes lie apart, which the hardware does not foresee.
@@ -121,7 +124,7 @@ class Forward {
     }
     float turned[kL * kL];
     transpose_square(rows, turned, kL);
-    for (int64_t i = 0; i < channels; ++i) store(to + i * stride, load<V>(turned + i * kL));
+    for (int64_t i = 0; i < width; ++i) store(to + i * stride, load<V>(turned + i * kL));
   }
 
   const Args& a;
@@ -184,10 +187,10 @@ int64_t scratch(const PolarToImageArgs<T>& a) {
   return Workspace<T>(a, nullptr).bytes;
 }
 
-template <typename T, int64_t kL>
+template <typename T, int64_t kL, int64_t fixed>
 void forward_items(const PolarToImageArgs<T>& a, int64_t begin, int64_t end, void* memory) {
   Workspace<T> work(a, memory);
-  Forward<T, kL> forward(a, work);
+  Forward<T, kL, fixed> forward(a, work);
   const int64_t rows = rows_of_band(a);
   for (int64_t item = begin; item < end; ++item) {
     const int64_t band = item / a.batch;
@@ -268,7 +271,10 @@ void backward_map_items(const PolarToImageArgs<T>& a, int64_t begin, int64_t end
 template <typename T>
 void forward(const PolarToImageArgs<T>& a, int64_t begin, int64_t end, void* memory) {
   constexpr int64_t most = kLanes<Arithmetic<T>>, few = most < kFew ? most : kFew;
-  (lanes(a) == few ? forward_items<T, few> : forward_items<T, most>)(a, begin, end, memory);
+  auto* items = lanes(a) == few ? forward_items<T, few, 0> : forward_items<T, most, 0>;
+  if (a.channels == 1) items = forward_items<T, few, 1>;
+  if (a.channels == 3) items = forward_items<T, few, 3>;
+  items(a, begin, end, memory);
 }
 template <typename T>
 void backward_map(const PolarToImageArgs<T>& a, int64_t begin, int64_t end, void* memory) {

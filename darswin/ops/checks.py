@@ -57,8 +57,8 @@ def _fits(shape: Sequence[int], sizes: Sequence[int | None]) -> bool:
 
 
 def check_rising(name: str, value: Tensor) -> None:
-    """ValueError unless each row of (N, R) is finite, at least 0, and rises, where it is `readable`
-    and no transform of torch.func is under way."""
+    """ValueError unless each row of (N, R) is finite, at least 0, and rises. Only a plain tensor
+    that is `readable` is checked, and only outside the transforms of torch.func."""
     if not readable(value) or transformed() or type(value) not in (Tensor, torch.nn.Parameter):
         return
     rows = value.detach().numpy()
@@ -67,7 +67,7 @@ def check_rising(name: str, value: Tensor) -> None:
 
 
 def readable(value: Tensor) -> bool:
-    """True if reading `value` is free: eager mode on the CPU. The host would wait for a device."""
+    """True if reading `value` is free: eager mode on the CPU."""
     return not torch.compiler.is_compiling() and value.device.type == "cpu"
 
 
@@ -145,7 +145,7 @@ def per_channel(name: str, value: float | Sequence[float], channels: int) -> tup
 
 
 def check_layout(layout: str) -> None:
-    """ValueError unless the layout is one that there is."""
+    """ValueError unless the layout is one of `LAYOUTS`."""
     if layout not in LAYOUTS:
         raise ValueError(f"layout must be one of {LAYOUTS}, got {layout!r}")
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from cases import SMALL, raw_calls
+from torch._subclasses import FakeTensorMode
 
 from darswin.ops import (
     polar_embed,
@@ -138,6 +139,20 @@ def test_errors_name_what_was_expected(name, reference):
                 operator(**(valid | change))
 
 
+@pytest.mark.parametrize("name", WRONG)
+def test_fake_tensors_are_checked_too(name):
+    """Their operators compute nothing, so they would not notice wrong arguments."""
+    operator, valid = VALID[name]
+    change, error, message = next(w for w in WRONG[name] if "must have shape" in w[2])
+    with FakeTensorMode(allow_non_fake_inputs=True) as mode:
+        fake = {
+            k: mode.from_tensor(v) if isinstance(v, torch.Tensor) else v
+            for k, v in (valid | change).items()
+        }
+        with pytest.raises(error, match=message):
+            operator(**fake)
+
+
 def test_a_radius_of_zero_is_allowed():
     operator, valid = VALID["polar_to_image"]
     operator(**(valid | dict(radii=torch.tensor([[0.0, 1.0]]))))
@@ -160,7 +175,7 @@ SAMPLING_RAW = {
 RAW = {
     "polar_sample": SAMPLING_RAW,
     "polar_embed": SAMPLING_RAW | {
-        "weight": [zeros(3, 17), zeros(18)],
+        "weight": [zeros(3, 17), zeros(18), zeros(3, 18).double()],
         "bias": [zeros(2)],
     },
     "window_attention": {
@@ -168,7 +183,9 @@ RAW = {
         "window": [(3, 4), (2,)], "shift": [(0, 4), (-1, 0)], "periodic": [(True,)],
     },
     "polar_to_image": {
-        "x": [zeros(3)], "radii": [zeros(2, 2), zeros(3, 3)], "center": [None, zeros(2, 3)],
+        "x": [zeros(3)],
+        "radii": [zeros(2, 2), zeros(3, 3), -torch.arange(3.0)[None], torch.full((1, 3), math.nan)],
+        "center": [None, zeros(2, 3)],
         "affine": [zeros(2, 2)], "r_max": [zeros(3)], "size": [(5,), (-1, 4)],
     },
 }  # fmt: skip

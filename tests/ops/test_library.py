@@ -291,6 +291,39 @@ def test_a_compiled_function_refuses_azimuths_that_require_a_gradient(embed):
         compiled(azimuths.clone().requires_grad_())
 
 
+# -- small calls -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("recording", [False, True])
+@operators
+def test_a_call_takes_few_python_calls(name, recording):
+    """The checks that explain wrong arguments run only if the operator refuses them."""
+    run, x = CALLS[name]
+    x = x.clone().requires_grad_(recording)
+    calls = []
+
+    def count(frame, event, argument):
+        if event == "call":
+            calls.append(frame.f_code.co_name)
+
+    run(x)
+    sys.setprofile(count)
+    try:
+        run(x)
+    finally:
+        sys.setprofile(None)
+    assert len(calls) < (50 if recording else 30), calls
+    assert not any(called.startswith("check_tensor") for called in calls)
+
+
+@pytest.mark.filterwarnings("ignore")  # torch.jit is deprecated, and warns of every shape
+@operators
+def test_the_gradient_is_recorded_by_the_operator_itself_in_a_trace(name):
+    run, x = CALLS[name]
+    graph = torch.jit.trace(run, x.clone().requires_grad_(), check_trace=False).graph
+    assert f"darswin::{name}" in str(graph) and "PythonOp" not in str(graph)
+
+
 # -- graphs, and numbers of NumPy ------------------------------------------------------------------
 
 
