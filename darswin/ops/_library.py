@@ -135,7 +135,7 @@ def may_attempt() -> bool:
     )
 
 
-def plain(*tensors: object) -> bool:
+def plain(*tensors: Any) -> bool:
     """True if all are tensors on the CPU, and none is of a subclass with behaviour of its own."""
     for tensor in tensors:  # all() with a generator takes twice as long
         if type(tensor) not in _PLAIN:

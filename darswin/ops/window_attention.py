@@ -57,9 +57,9 @@ def window_attention(
         raise TypeError(f"periodic must be a pair of bools, got {periodic!r}")
     wrap = tuple(int(bool(p)) for p in periodic)  # torch.jit.trace takes no list of bools
     if _library.may_attempt() and _library.plain(qkv, bias) and bias.dtype != torch.bfloat16:
-        shape = qkv.shape
-        if len(shape) == 6 and shape[5] > 0:
-            scaled = shape[5] ** -0.5 if scale is None else float(scale)
+        sizes = qkv.shape
+        if len(sizes) == 6 and sizes[5] > 0:
+            scaled = sizes[5] ** -0.5 if scale is None else float(scale)
             out = _library.attempt(_ATTENTION, (qkv, bias, window, shift, wrap, scaled))
             if out is not None:
                 return out
