@@ -30,7 +30,8 @@ class TrainingOrder(Sampler[Draw]):
             raise ValueError(f"with several processes the batch of each must be even, got {batch}")
         if count < batch * world:
             raise ValueError(
-                f"a batch of {batch} on each of {world} processes needs more than {count} images"
+                f"{count} images are too few for a batch of {batch} on each of {world} "
+                "processes: choose a smaller batch_size"
             )
         self.count, self.batch, self.rank, self.world = count, batch, rank, world
         self.pairs, self.seed = pairs, seed

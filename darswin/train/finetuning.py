@@ -67,7 +67,7 @@ def settle(
     def refuse(option: str, value: Any, theirs: Any) -> ValueError:
         return ValueError(
             f"`{option}` {value} disagrees with `weights` {weights}, whose model has {theirs}: "
-            "leave the option out"
+            "leave the option out, or set it to null if a preset sets it"
         )
 
     name = name_from(card, task)
