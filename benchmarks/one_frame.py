@@ -1,9 +1,9 @@
 """Whole models on one camera's frames, against ONNX Runtime, OpenVINO and AOTInductor.
 
-`make bench`, or `python benchmarks/one_frame.py [--quick] [--out FOLDER]`. Each runtime gets the
-same model with the same fixed lens and the same number of threads. OpenVINO takes part where it is
-installed. Prints a table and each ratio against its target; with a folder, writes a record and a
-plot there.
+`make bench`, or `python benchmarks/one_frame.py [--quick] [--models FOLDER] [--out FOLDER]`. Each
+runtime gets the same model with the same fixed lens and the same number of threads. OpenVINO takes
+part where it is installed. Prints a table and each ratio against its target; with a folder, writes
+a record and a plot there.
 """
 
 import argparse
@@ -43,13 +43,13 @@ def model_of(name: str, size: int) -> Model:
     return network(name, size).eval()
 
 
-@cache
-def exported(kind: str, name: str, size: int, batch: int) -> str:
-    """The path of the model's file of a kind, "onnx" or "pt2"."""
-    path = Path(tempfile.mkdtemp()) / f"{name}.{kind}"
-    export = export_onnx if kind == "onnx" else export_package
-    images = torch.randn(batch, 3, size, size)
-    export(model_of(name, size), path, images, lens_of(size), fixed_lens=True)
+def exported(folder: Path, kind: str, name: str, size: int) -> str:
+    """The path of the model's file of a kind, "onnx" or "pt2"; it is written if missing."""
+    path = folder / f"{name}.{kind}"
+    if not path.exists():
+        export = export_onnx if kind == "onnx" else export_package
+        images = torch.randn(1, 3, size, size)
+        export(model_of(name, size), path, images, lens_of(size), fixed_lens=True)
     return str(path)
 
 
@@ -77,19 +77,19 @@ def openvino(path: str) -> Run:
     return lambda images: torch.from_numpy(compiled([images.numpy()])[0])
 
 
-def one_frame(name: str, batch: int, seconds: float) -> list[Timing]:
+def one_frame(name: str, batch: int, folder: Path, seconds: float) -> list[Timing]:
     """Times a model on batches of one size."""
     size, least = MODELS[name]
     model, lens = model_of(name, size), lens_of(size)
     images = torch.randn(batch, 3, size, size)
     any_lens = optimize(model)
-    onnx = exported("onnx", name, size, batch)
+    onnx = exported(folder, "onnx", name, size)
     candidates: dict[str, Run] = {
         OURS: optimize(model, lens=lens),
         ANY_LENS: lambda images: any_lens(images, lens),
         EAGER: lambda images: model(images, lens),
         ONNX_RUNTIME: onnx_runtime(onnx),
-        AOTI: torch._inductor.aoti_load_package(exported("pt2", name, size, batch)),
+        AOTI: torch._inductor.aoti_load_package(exported(folder, "pt2", name, size)),
     }
     if importlib.util.find_spec("openvino"):
         candidates[OPENVINO] = openvino(onnx)
@@ -109,12 +109,15 @@ def one_frame(name: str, batch: int, seconds: float) -> list[Timing]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--quick", action="store_true", help="the smallest model, short runs")
+    parser.add_argument("--models", type=Path, help="folder that keeps the exported models")
     parser.add_argument("--out", type=Path, help="folder of the record and the plot")
     args = parser.parse_args()
     torch.manual_seed(0)
-    seconds = 0.05 if args.quick else 2.0
+    seconds = 0.05 if args.quick else 1.0
+    folder = args.models or Path(tempfile.mkdtemp())
+    folder.mkdir(parents=True, exist_ok=True)
     jobs = [
-        partial(one_frame, name, batch, seconds)
+        partial(one_frame, name, batch, folder, seconds)
         for name in list(MODELS)[: 1 if args.quick else None]
         for batch in ((1,) if args.quick else (1, 8))
     ]
