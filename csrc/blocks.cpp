@@ -72,22 +72,27 @@ Tensor checked_tokens(const Tensor& x) {
 Tensor norm(Tensor x, Tensor parameters, double eps) {
   x = checked_tokens(x);
   const int64_t dim = x.size(x.dim() - 1);
-  const Tensor out = new_empty(x, x.sizes());
+  const Tensor out = new_tensor(x.sizes(), ScalarType::Float);
   normalize(pointer<float>(x), x.numel() / dim, dim, parameters, eps, mutable_pointer<float>(out));
   return out;
 }
 
-Tensor linear(Tensor x, Tensor packed, int64_t columns, bool gelu) {
+Tensor linear(Tensor x, Tensor packed, int64_t columns, bool gelu, MaybeTensor norm, double eps) {
   x = checked_tokens(x);
   STD_TORCH_CHECK(columns > 0, kName, ": no columns");
   Sizes sizes = x.sizes().vec();
-  const int64_t depth = sizes.back();
+  const int64_t depth = sizes.back(), rows = x.numel() / depth;
   check_product({depth, columns});
+  if (norm) {
+    const Tensor normed = new_tensor(x.sizes(), ScalarType::Float);
+    normalize(pointer<float>(x), rows, depth, *norm, eps, mutable_pointer<float>(normed));
+    x = normed;
+  }
   sizes.back() = columns;
-  const Tensor out = new_empty(x, sizes);
+  const Tensor out = new_tensor(sizes, ScalarType::Float);
   ask_for_large_pages(out);
-  multiply(pointer<float>(x), x.numel() / depth, depth, packed, columns,
-           mutable_pointer<float>(out), gelu ? After::gelu : After::nothing);
+  multiply(pointer<float>(x), rows, depth, packed, columns, mutable_pointer<float>(out),
+           gelu ? After::gelu : After::nothing);
   return out;
 }
 
@@ -97,8 +102,10 @@ struct Blocks {
   double eps;
   Tensor x;
   int64_t dim = x.size(3), rows = x.numel() / dim;
-  Tensor normed = new_empty(x, x.sizes()), hidden = new_empty(x, Sizes{rows, mlp_dim});
-  Tensor qkv = new_empty(x, Sizes{x.size(0), x.size(1), x.size(2), 3, heads, dim / heads});
+  Tensor normed = new_tensor(x.sizes(), ScalarType::Float),
+         hidden = new_tensor(Sizes{rows, mlp_dim}, ScalarType::Float);
+  Tensor qkv =
+      new_tensor(Sizes{x.size(0), x.size(1), x.size(2), 3, heads, dim / heads}, ScalarType::Float);
 
   // The six parameters of a block, and the window, the shift and the periodic axes of its
   // attention.

@@ -45,7 +45,9 @@ STABLE_TORCH_LIBRARY(darswin, m) {
       "_window_attention_quantized(Tensor qkv, Tensor bias, int[] window, int[] shift, "
       "int[] periodic, float scale, float out_scale, int zero_point) -> Tensor");
   m.def("_norm(Tensor x, Tensor parameters, float eps) -> Tensor");
-  m.def("_linear(Tensor x, Tensor packed, int columns, bool gelu) -> Tensor");
+  m.def(
+      "_linear(Tensor x, Tensor packed, int columns, bool gelu, Tensor? norm=None, "
+      "float eps=1e-05) -> Tensor");
   m.def(
       "_blocks_(Tensor(a!) x, Tensor[] parameters, Tensor[] tables, int[] windows, int heads, "
       "int mlp_dim, float eps) -> ()");

@@ -21,6 +21,7 @@ from darswin.deploy.packed import (
     fastest_dtype,
     packed,
     packed_attention,
+    packed_merging,
     packed_norm,
     taken,
 )
@@ -173,10 +174,14 @@ def _pack(module: nn.Module, dtype: torch.dtype) -> None:
             norm = packed_norm(embed.norm, dtype)
             _replace(embed, norm=nn.Identity())
         module.patch_embed = InDtype(embed, dtype, norm)
-        module.head.to(dtype)
+        if isinstance(module.head, nn.Linear):  # else an identity
+            _replace(module, head=PackedLinear(module.head, dtype))
     elif isinstance(module, Stage):
         _pack_stage(module, dtype)
     elif isinstance(module, PatchMerging):
+        if dtype == torch.float32 and isinstance(module.reduction, nn.Linear):
+            reduction = packed_merging(module.norm, module.reduction)
+            return _replace(module, reduction=reduction, norm=lambda x: x)
         reduction = packed(module.reduction, dtype)
         _replace(module, reduction=reduction)
         _pack_norm(module, dtype, taken(reduction))

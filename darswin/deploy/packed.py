@@ -80,6 +80,13 @@ def norm_parameters(norm: nn.LayerNorm) -> Tensor:
     return torch.stack((norm.weight, norm.bias)).detach().float()
 
 
+def packed_merging(norm: Any, reduction: nn.Linear) -> Callable[[Tensor], Tensor]:
+    """The norm and the linear layer of a merging in float32, as one operator."""
+    weights, columns = packed_weights(reduction), reduction.out_features
+    parameters = norm_parameters(norm)
+    return lambda x: _LINEAR(x, weights, columns, False, parameters, norm.eps)
+
+
 class PackedBlocks:
     """The blocks of a stage in float32, as one operator: `Stage.run_blocks`."""
 

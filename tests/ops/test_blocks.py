@@ -92,6 +92,16 @@ def test_norm_is_as_accurate_as_torch(shape):
         assert (got - want).abs().max() <= max(2 * own, floor)
 
 
+def test_linear_behind_a_norm():
+    norm, linear, x = nn.LayerNorm(37), layer(37, 50), torch.randn(3, 9, 37)
+    nn.init.normal_(norm.weight), nn.init.normal_(norm.bias)
+    parameters, weights = norm_parameters(norm), packed_weights(linear)
+    got = _linear(x, weights, 50, False, parameters, norm.eps)
+    assert torch.equal(got, _linear(_norm(x, parameters, norm.eps), weights, 50, False))
+    with pytest.raises(RuntimeError, match="_blocks_"):
+        _linear(x, weights, 50, False, parameters[:, :36])
+
+
 def stage(dim=24, heads=3, map_size=(8, 16), window=(4, 8), depth=3):
     torch.manual_seed(0)
     blocks = []
