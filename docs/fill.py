@@ -73,6 +73,18 @@ def drop_in_line(timings: Sequence[Timing]) -> str:
     return f"This call is {low:.1f} to {high:.1f} times as fast as `F.grid_sample` ({cases})."
 
 
+def frame_line(timings: Sequence[Timing]) -> str:
+    """A sentence on the peers' times for one frame, on one thread."""
+    chosen = [t for t in timings if t.batch == 1 and t.threads == 1 and "float32" in t.mode]
+    parts = []
+    for peer in FRAME_PEERS[1:]:
+        found = [t.ratio for t in chosen if t.name == peer]
+        parts.append(f"{min(found):.1f} to {max(found):.1f} times as fast as the {peer}")
+    parts[:2] = [part.replace("the ", "") for part in parts[:2]]
+    first, *others = parts
+    return f"For one frame on one core, these models are {first}.\nThey are {' and '.join(others)}."
+
+
 def demo_table(record: dict) -> str:
     """A row a model, a column a lens: the mean of the seeds."""
     rows = [
@@ -111,6 +123,7 @@ def tables() -> dict[str, str]:
         "cpus": peers.best_table(cpus, SPEED),
         "missed": peers.missed_table([*sampling.timings, *to_image.timings, *attention.timings]),
         "model": bench.models_table(model.timings),
+        "frame line": frame_line(frames.timings),
         "one frame": peers.frames_table(frames.timings, FRAME_PEERS),
         "model int8": bench.quantized_table(model.timings),
         "model memory": bench.memory_table(model.memory),
