@@ -207,7 +207,7 @@ def test_commands(tmp_path, capsys):
     main(["lens", "convert", calib, str(out), "--camera=cam1", "--format=kalibr",
           "--theta_max_deg=60"])  # fmt: skip
     printed = capsys.readouterr().out
-    assert "kalibr, KannalaBrandt up to 60.00°; kalibr files do not say how far" in printed
+    assert "kalibr, KannalaBrandt up to 60.00°; kalibr files have no θ_max" in printed
     woodscape = str(FILES / "woodscape.json")
     main(["lens", "convert", woodscape, str(tmp_path / "w.xml"), "--model", "KannalaBrandt"])
     assert "opencv, KannalaBrandt up to 95.21°, at most" in capsys.readouterr().out
