@@ -27,13 +27,13 @@ const float* floats(const Tensor& tensor, int64_t count) {
 void multiply(const float* x, int64_t rows, int64_t depth, const Tensor& packed, int64_t columns,
               float* out, After after = After::nothing) {
   LinearArgs args{x, nullptr, out, rows, depth, columns, after};
-  args.packed = floats(packed, args.packed_size());
+  args.packed = floats(packed, packed_size(args));
   const auto& kernel = kernels<LinearKernels>().rows;
   constexpr int64_t kRows = 8;             // ranges begin at a multiple: no tile of rows is cut
   constexpr double kPerMicrosecond = 5e4;  // multiply-adds, on a CPU with AVX2
   const double work = static_cast<double>(rows) * depth * columns;
   const int64_t threads = threads_for(work / kPerMicrosecond);
-  const int64_t tiles = (rows + kRows - 1) / kRows, panels = args.panels();
+  const int64_t tiles = (rows + kRows - 1) / kRows, panels = panel_count(args);
   if (panels < threads || tiles >= 16 * threads) {
     parallel_ranges(tiles, threads, [&](int64_t begin, int64_t end) {
       kernel(args, begin * kRows, std::min(end * kRows, rows), 0, panels);

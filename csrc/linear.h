@@ -26,11 +26,19 @@ struct LinearArgs {
   float* out;           // (rows, columns)
   int64_t rows, depth, columns;
   After after;
-
-  int64_t padded() const { return (columns + kPanelUnit - 1) / kPanelUnit * kPanelUnit; }
-  int64_t packed_size() const { return padded() * (1 + depth); }
-  int64_t panels() const { return (padded() + kPanel - 1) / kPanel; }
 };
+
+namespace {
+
+inline int64_t padded_columns(const LinearArgs& a) {
+  return (a.columns + kPanelUnit - 1) / kPanelUnit * kPanelUnit;
+}
+inline int64_t packed_size(const LinearArgs& a) { return padded_columns(a) * (1 + a.depth); }
+inline int64_t panel_count(const LinearArgs& a) {
+  return (padded_columns(a) + kPanel - 1) / kPanel;
+}
+
+}  // namespace
 
 struct LinearKernels {
   // The columns of panels [first, last) of rows [begin, end).

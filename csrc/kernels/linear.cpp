@@ -132,11 +132,12 @@ void linear_rows(const LinearArgs& a, int64_t begin, int64_t end, int64_t first,
   float sums[kMostRows * kPanel];
   // The tokens of a block stay in the second-level cache.
   const int64_t most = smaller(kMostRows, round_up(1 + kBlockNumbers / a.depth, kTileRows));
-  const float* weight = a.packed + a.padded();
+  const int64_t padded = padded_columns(a);
+  const float* weight = a.packed + padded;
   for (int64_t row = begin; row < end; row += most) {
-    for (int64_t column = first * kPanel; column < smaller(last * kPanel, a.padded());
+    for (int64_t column = first * kPanel; column < smaller(last * kPanel, padded);
          column += kPanel) {
-      const int64_t width = smaller(kPanel, a.padded() - column);
+      const int64_t width = smaller(kPanel, padded - column);
       const Panel panel{a, column, width, weight + column * a.depth, sums};
       panel.rows(row, smaller(row + most, end));
     }
