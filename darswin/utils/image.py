@@ -61,7 +61,9 @@ def read_form(path: str | Path) -> tuple[int, int]:
         with warnings.catch_warnings(action="ignore"), Image.open(path) as file:
             is_grey = file.mode in ("1", "L", "LA", "F") or file.mode.startswith("I")
             return 1 if is_grey else 3, min(file.size)
-    except Exception as error:  # a file that is no image fails in many ways
+    except UnidentifiedImageError as error:  # its own message repeats the path
+        raise BrokenImageError(f"cannot read {path}: no image that Pillow knows") from error
+    except Exception as error:  # a damaged file fails in many ways
         raise BrokenImageError(f"cannot read {path}: {error}") from error
 
 
