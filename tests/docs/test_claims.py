@@ -6,6 +6,7 @@ import statistics
 import sys
 from pathlib import Path
 
+import pytest
 import torch
 
 from darswin import create_model, list_models
@@ -69,6 +70,21 @@ def test_the_drop_in_call_is_faster_than_what_it_replaces():
             if t.mode == "forward, layout image" and t.name == "F.grid_sample"
         ]
         assert len(calls) == 6 and min(t.ratio for t in calls) > 1
+
+
+def test_one_frame_is_faster_than_in_other_runtimes():
+    (record,) = fill.records("one_frame").values()
+    for peer, least in (("eager model", 1.05), ("ONNX Runtime", 1.1), ("OpenVINO", 1.1)):
+        found = [t.ratio for t in record.timings if t.name == peer and t.batch == 1]
+        assert len(found) == 8 and min(found) > least
+    # int8 beside float32, as the page says
+    found = {
+        (t.subject, t.threads): t.ratio
+        for t in record.timings
+        if (t.name, t.batch, t.mode[:13]) == ("float32", 1, "forward, int8")
+    }
+    assert 1 / found["darswin_a_small", 1] == pytest.approx(0.44, abs=0.005)
+    assert found["darswin_a_micro", 1] < 1
 
 
 def parameters(name: str, **options) -> int:
