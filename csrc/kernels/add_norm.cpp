@@ -1,11 +1,14 @@
-// Residual and layer norm in one pass over memory.
+// Adds a residual and normalizes the layer, in one pass over memory.
 //
-// A row holds a token's features. It is small enough for the first cache, so memory sees it once,
-// while three loops go over it: they make the sum and its mean; the differences from the mean and
-// their squares; the normalized row. Taking the mean off before squaring keeps the digits that a
-// large mean would cost. The differences have a small mean of their own, the rounding of the first
-// one, and that is taken off as well. Where rows are bfloat16, it is the rounded sum that is
-// normalized. The norm may come out as 8 bits, as an integer product reads it.
+// A row holds the features of one token. It fits the first-level cache, so memory is read only once
+// although three loops go over the row. The first loop adds x and y and computes the mean. The
+// second loop subtracts the mean and sums the differences and their squares. The third loop writes
+// the normalized row.
+//
+// Subtracting the mean before squaring keeps digits that a large mean would cost. The mean is
+// rounded, so the differences have a small mean of their own, which is subtracted too. If rows are
+// bfloat16, the rounded sum is normalized. The result may be 8-bit integers, which an integer
+// product can read.
 #include "../add_norm.h"
 
 #include "quantize.h"
@@ -15,7 +18,7 @@ namespace {
 
 constexpr int64_t kL = kLanes<float>;
 
-// Stores v, and returns what is stored: v, or its bfloat16.
+// Stores v and returns the stored value, which is rounded if S is bfloat16.
 template <typename S, typename V>
 inline V write(S* to, V v) {
   store(to, v);
@@ -23,8 +26,9 @@ inline V write(S* to, V v) {
   return v;
 }
 
-// body<V>(column, turn) on whole registers of a row, and on the columns that are left. Turns go 0,
-// 1, 0, 1: a sum for each, and neither waits for the addition before.
+// Calls body<V>(column, turn) for each whole register of a row, then for each remaining column. The
+// turns alternate between 0 and 1. With one sum for each turn, an addition does not wait for the
+// one before.
 template <typename Body>
 inline void along(int64_t width, Body body) {
   int64_t c = 0;
@@ -36,7 +40,7 @@ inline void along(int64_t width, Body body) {
   for (; c < width; ++c) body.template operator()<float>(c, 0);
 }
 
-// The lanes' sum, by halves.
+// Sums the lanes, half by half.
 template <int kWide>
 inline float total(Vector<float, kWide> v) {
   if constexpr (kWide == 2) {
@@ -50,7 +54,7 @@ inline float total(Vector<float, kWide> v) {
   }
 }
 
-// A sum along a row: of the lanes of each turn, and of what is left.
+// A sum along a row: one register of sums for each turn, and the sum of the remaining columns.
 struct Sum {
   Floats lanes[2]{};
   float rest = 0;

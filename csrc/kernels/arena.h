@@ -1,5 +1,5 @@
-// Pieces of a thread's working memory. Under AddressSanitizer a gap that must not be touched
-// follows each, so that it sees a step from one piece into the next.
+// Pieces of a thread's working memory. Under AddressSanitizer, a forbidden gap follows each piece,
+// so that the sanitizer reports every access beyond the end of a piece.
 #pragma once
 
 #include <cstdint>
@@ -10,7 +10,7 @@
 namespace darswin {
 namespace {
 
-// Hands out pieces of a block of memory and counts their bytes; without a block it only counts.
+// Hands out pieces of a block of memory and counts their bytes. Without a block it only counts.
 struct Arena {
   char* memory;
   int64_t used = 0;

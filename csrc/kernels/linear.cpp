@@ -1,11 +1,13 @@
-// The product of a linear layer, for tokens that are in cache.
+// The product of a linear layer, for tokens that are in the cache.
 //
-// A tile of the result, kTileRows tokens by three registers of columns, stays in registers while a
-// loop runs over the depth: each step multiplies three registers of the weight with one number of
-// each token. The weight is packed into panels, so that a tile reads it from front to back. The
-// depth goes by parts whose weights fit the nearest cache: all tokens meet one part before the next
-// one comes. Every sum is taken in the same order wherever its tile lies, so results depend neither
-// on the number of tokens nor on that of threads.
+// A tile of the result has kTileRows tokens and three registers of columns. It stays in registers
+// while a loop runs over the depth. Each step multiplies three registers of the weight with one
+// number of each token. The weight is packed into panels, so that a tile reads it from front to
+// back.
+//
+// The depth is cut into parts whose weights fit the first-level cache. All tokens use one part
+// before the next part starts. Every sum is taken in the same order wherever its tile lies. So the
+// results do not depend on the number of tokens or threads.
 #include "../linear.h"
 
 #include "math.h"
@@ -14,11 +16,11 @@ namespace darswin {
 namespace {
 
 constexpr int64_t kL = kLanes<float>;
-constexpr int64_t kPart = 128;  // of the depth: a panel's part has 24 KB
+constexpr int64_t kPart = 128;  // of the depth; this part of a panel has 24 KB
 constexpr int64_t kMostRows = 128, kBlockNumbers = 1 << 16;  // of a block of tokens
 
-// x Phi(x), Phi the normal distribution: 1 - Phi(|x|) is e^(-x^2 / 2) times a polynomial of
-// 1 / (1 + p |x|), fitted for the least relative error.
+// Computes x Phi(x), where Phi is the normal distribution. 1 - Phi(|x|) equals e^(-x^2 / 2) times a
+// polynomial of 1 / (1 + p |x|), which is fitted for the least relative error.
 inline Floats gelu(Floats x) {
   const Floats size = x < 0 ? -x : x;
   const Floats t = 1 / (1 + 0.35f * size);
@@ -29,10 +31,11 @@ inline Floats gelu(Floats x) {
 #pragma GCC unroll 16
   for (size_t k = 1; k < sizeof(terms) / sizeof(float); ++k) tail = tail * t + terms[k];
   tail = tail * t * exponential_of_negative(size * size * -0.5f);
-  return x < 0 ? x * tail : x * (1 - tail);  // at infinity too
+  return x < 0 ? x * tail : x * (1 - tail);  // also right at infinity
 }
 
-// body(i, v) for each register of a tile. Unrolled, since only then does a tile stay in registers.
+// Calls body(i, v) for each register of a tile. The loops are unrolled, because a tile stays in
+// registers only then.
 template <int kRows, int kWide, typename Body>
 [[gnu::always_inline]] inline void each_register(Body body) {
 #pragma GCC unroll 8
@@ -42,14 +45,14 @@ template <int kRows, int kWide, typename Body>
   }
 }
 
-// One panel of columns, for a block of rows.
+// One panel of columns, for one block of rows.
 struct Panel {
   const LinearArgs& a;
   int64_t first, width;  // of its columns
   const float* weight;   // (depth, width)
-  float* sums;           // (rows of the block, kPanel): the sums over the parts so far
+  float* sums;           // (rows of the block, kPanel): the sums over the earlier parts
 
-  // kRows rows and kWide registers of columns, for the depths [begin, end).
+  // Computes kRows rows and kWide registers of columns, for the depths [begin, end).
   template <int kRows, int kWide>
   [[gnu::noinline]] void tile(int64_t row, int64_t n, int64_t begin, int64_t end,
                               float* so_far) const {
@@ -74,7 +77,7 @@ struct Panel {
     const int64_t left = a.columns - first - n;
     float* out = a.out + row * a.columns + first + n;
     if (a.after == After::gelu || left < kWide * kL) {
-      Floats copy[kRows][kWide];  // so that the sums themselves need no place in memory
+      Floats copy[kRows][kWide];  // lets the sums themselves stay in registers
       each_register<kRows, kWide>([&](int i, int v) { copy[i][v] = sum[i][v]; });
       finish<kRows, kWide>(copy, out, left);
     } else if (a.after == After::add) {
@@ -88,7 +91,7 @@ struct Panel {
     }
   }
 
-  // The step after the product on a tile in memory, of which the first `left` columns are written.
+  // Applies the step after the product to a tile in memory, and writes its first `left` columns.
   template <int kRows, int kWide>
   [[gnu::noinline]] void finish(const Floats (&tile)[kRows][kWide], float* out,
                                 int64_t left) const {
@@ -130,7 +133,7 @@ struct Panel {
 
 void linear_rows(const LinearArgs& a, int64_t begin, int64_t end, int64_t first, int64_t last) {
   float sums[kMostRows * kPanel];
-  // The tokens of a block stay in the second-level cache.
+  // The block is small enough for its tokens to stay in the second-level cache.
   const int64_t most = smaller(kMostRows, round_up(1 + kBlockNumbers / a.depth, kTileRows));
   const int64_t padded = padded_columns(a);
   const float* weight = a.packed + padded;

@@ -1,9 +1,9 @@
-// The patch embedding: polar sampling and the linear layer behind it, a ring of tokens at a time.
+// The patch embedding: polar sampling followed by a linear layer, one ring of tokens at a time.
 //
-// The samples of a ring are a matrix (A, S_r * S_phi * C) that fits the second-level cache. They
-// are made, multiplied with the weight and dropped, so that they are never written to memory;
-// backward recomputes them. The gradient of the samples goes the same way, from the product
-// straight to the pixels.
+// The samples of a ring form a matrix (A, S_r * S_phi * C) that fits the second-level cache. The
+// kernel makes the samples, multiplies them with the weight and drops them, so they never go to
+// memory. Backward computes them again. The gradients of the samples do not go to memory either:
+// the product hands them straight to the pixels.
 #include "arena.h"
 #include "polar_rows.h"
 #include "polar_sampler.h"
@@ -12,14 +12,14 @@
 namespace darswin {
 namespace {
 
-// The products are of matrices that are in cache.
+// Products of matrices that are in the cache.
 //
-// A tile of the result stays in registers while a loop runs over the depth: each step multiplies a
+// A tile of the result stays in registers while a loop runs over the depth. Each step multiplies a
 // few whole registers of b with a few single values of a. The tile is as large as the registers
-// allow, so that every value is used often once it is loaded.
+// allow, so that every loaded value is used often.
 
-// c[i * c_row + n] += sum over k < depth of a[i * a_row + k * a_column] * b[k * b_row + n] for rows
-// i < kRows and kWide registers of n.
+// Computes c[i * c_row + n] += sum over k < depth of a[i * a_row + k * a_column] * b[k * b_row + n]
+// for rows i < kRows and for kWide registers of n.
 template <int kRows, int kWide, typename T>
 [[gnu::noinline]] void add_tile(int64_t depth, const T* a, int64_t a_row, int64_t a_column,
                                 const T* b, int64_t b_row, T* c, int64_t c_row) {
@@ -54,13 +54,13 @@ void add_columns(int64_t rows, int64_t depth, const T* a, int64_t a_row, int64_t
   }
 }
 
-// c (rows, columns) += a (rows, depth) * b (depth, columns). Rows of b and c are contiguous,
-// columns a multiple of the lanes; a may be transposed.
+// Computes c (rows, columns) += a (rows, depth) * b (depth, columns). The rows of b and c are
+// contiguous, and the number of columns is a multiple of the lanes. a may be transposed.
 template <typename T>
 void add_product(int64_t rows, int64_t columns, int64_t depth, const T* a, int64_t a_row,
                  int64_t a_column, const T* b, int64_t b_row, T* c, int64_t c_row) {
   constexpr int64_t lanes = kLanes<T>;
-  constexpr int64_t most = 128;  // depth of a panel of b that stays in the nearest cache
+  constexpr int64_t most = 128;  // rows of a panel of b that stay in the first-level cache
   for (int64_t k = 0; k < depth; k += most) {
     const int64_t part = smaller(depth - k, most);
     const T *from = a + k * a_column, *panel = b + k * b_row;
@@ -74,11 +74,11 @@ void add_product(int64_t rows, int64_t columns, int64_t depth, const T* a, int64
   }
 }
 
-// Scratch of one thread, part after part.
+// The scratch memory of one thread.
 template <typename T>
 struct EmbedScratch {
   int64_t rings, sectors;
-  int64_t depth, row, wide;  // samples of a token, and padded; padded features
+  int64_t depth, row, wide;  // samples of a token; the same, padded; padded features
   char *sampler, *scatter;
   T* samples;   // (A, row)
   T* products;  // (A, wide)
@@ -107,8 +107,8 @@ void embed(const PolarSampleArgs<T>& a, const PolarEmbedArgs<T>& e, int64_t begi
            void* scratch) {
   const EmbedScratch<T> s(a, e, PolarPass::forward, scratch);
   Sampler<T> sampler(a, s.row, a.samples_a * a.channels, s.sampler);
-  // The product is written straight into the output if rows there are whole registers of the type
-  // that is computed in.
+  // The product goes straight into the output if rows of the output are whole registers of the type
+  // used for computing.
   const bool in_place = !a.narrow && e.features == s.wide;
   for (int64_t item = begin; item < end; ++item) {
     const int64_t first = item * s.sectors * e.features;
@@ -129,7 +129,7 @@ void embed(const PolarSampleArgs<T>& a, const PolarEmbedArgs<T>& e, int64_t begi
   }
 }
 
-// The gradients (A, D) of a ring's tokens, in the type that is computed in.
+// Returns the gradients (A, D) of a ring's tokens, in the type used for computing.
 template <typename T>
 const T* ring_grads(const PolarSampleArgs<T>& a, const PolarEmbedArgs<T>& e, int64_t item,
                     const EmbedScratch<T>& s) {
@@ -158,7 +158,7 @@ void backward_weight(const PolarSampleArgs<T>& a, const PolarEmbedArgs<T>& e, in
   }
 }
 
-// The gradients of a ring's samples, (A, row) in s.samples.
+// Computes the gradients of a ring's samples, (A, row), in s.samples.
 template <typename T>
 void sample_grads(const PolarSampleArgs<T>& a, const PolarEmbedArgs<T>& e, int64_t item,
                   const EmbedScratch<T>& s) {
@@ -184,7 +184,7 @@ void backward_image(const PolarSampleArgs<T>& args, const PolarEmbedArgs<T>& e, 
                     int64_t end, void* scratch) {
   const EmbedScratch<T> s(args, e, PolarPass::backward_image, scratch);
   PolarSampleArgs<T> a = args;
-  a.narrow = false;  // the gradients of the samples are not
+  a.narrow = false;  // the gradients of the samples are of type T
   const int64_t piece = a.samples_a * a.channels;
   for (int64_t b = begin; b < end; ++b) {
     Scatter<T> scatter(a, b, 0, s.scatter);

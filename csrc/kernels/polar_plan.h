@@ -1,4 +1,4 @@
-// Where the pixels of an image lie in a polar map: four tokens each, and their weights.
+// Computes which four tokens of a polar map each pixel of an image needs, and their weights.
 #pragma once
 
 #include "../polar_to_image.h"
@@ -14,7 +14,7 @@ constexpr int64_t kTile = 64;  // pixels that are planned together; a multiple o
 template <typename Real>
 using IndexOf = std::conditional_t<is_same_v<Real, double>, int64_t, int32_t>;
 
-// What a tile of pixels is mixed from.
+// The tokens and weights for a tile of pixels.
 template <typename Real>
 struct Mix {
   using Index = IndexOf<Real>;
@@ -24,16 +24,16 @@ struct Mix {
   Index known[kTile];  // all ones, or 0 where the pixel is zero
 };
 
-// How that came about.
+// The intermediate results behind a Mix, which backward needs.
 template <typename Real>
 struct Origin {
   using Index = IndexOf<Real>;
 
   Real across[kTile], down[kTile], radius[kTile];  // the place on the polar plane
   Index inner[kTile], outer[kTile];                // the rings on both sides
-  Real from[kTile], span[kTile];                   // the inner ring's radius, and how far the outer
+  Real from[kTile], span[kTile];                   // the inner ring's radius; distance from it to the outer ring
   Real turn[kTile];                                // sectors to the other side of the pole, or 0
-  Real t[kTile], left[kTile], right[kTile];        // shares: of the outer ring, of the right sector
+  Real t[kTile], left[kTile], right[kTile];        // shares of the outer ring, and of the right sector
                                                    // in the inner ring and in the outer one
 };
 
@@ -46,10 +46,10 @@ class Planner {
   using Index = IndexOf<Real>;
   using I = Vector<Index, kLanes<Real>>;
 
-  // `steps` is room for 2 * (rings + 1) values.
+  // `steps` has room for 2 * (rings + 1) values.
   Planner(const Args& args, Real* steps) : a(args), from(steps) {}
 
-  // Plans `count` pixels of a row of image b, from pixel `first` on.
+  // Plans `count` pixels of a row of image b, starting at pixel `first`.
   void plan(int64_t b, int64_t row, int64_t first, int64_t count, Mix<Real>& tile,
             Origin<Real>& plan) {
     const int64_t whole = round_up(count, kLanes<Real>);
@@ -68,7 +68,7 @@ class Planner {
   }
 
  private:
-  // The pixels on the polar plane.
+  // Computes the places of the pixels on the polar plane.
   void place(int64_t n, int64_t row, int64_t first, int64_t count, Origin<Real>& plan) const {
     if (a.points != nullptr) {
       const Real* from = a.points + ((n * a.height + row) * a.width + first) * 2;
@@ -86,8 +86,8 @@ class Planner {
     }
   }
 
-  // Makes the steps from ring to ring of lens n. Between the centres of rings k - 1 and k lies step
-  // k: where it starts, and how long it is. Step 0 crosses the pole, the last one has no end.
+  // Computes the steps from ring to ring of lens n. Step k lies between the centres of rings k - 1
+  // and k. It has a start and a length. Step 0 crosses the pole, and the last step has no end.
   void take_radii(int64_t n) {
     if (n == lens) return;
     lens = n;
@@ -100,7 +100,7 @@ class Planner {
     span[a.rings] = static_cast<Real>(__builtin_inf());
   }
 
-  // The largest lane, in every lane.
+  // Returns the largest lane, in every lane.
   template <int distance>
   static V largest(V v) {
     if constexpr (distance == 0) {
@@ -111,9 +111,10 @@ class Planner {
     }
   }
 
-  // The step that each pixel of a register lies in, which is the number of ring centres at most as
-  // far out. Radii change little from pixel to pixel, so the search begins where it ended, and the
-  // pixels of a register lie in few steps. A pixel at NaN gets any of them.
+  // Finds the step that each pixel of a register lies in. The number of the step is the number of
+  // ring centres that are at most as far out as the pixel. Radii change little from pixel to pixel,
+  // so the search begins at the last result, and the pixels of a register lie in few steps. A pixel
+  // at NaN gets an arbitrary step.
   void find_rings(int64_t k, Origin<Real>& plan) {
     const V r = load<V>(plan.radius + k);
     const V infinity = splat<V>(static_cast<Real>(__builtin_inf()));
@@ -139,10 +140,10 @@ class Planner {
     store(plan.span + k, length);
   }
 
-  // Tokens and weights of a register of pixels.
+  // Computes the tokens and the weights of a register of pixels.
   void mix(int64_t k, Real limit, Real infinity, Mix<Real>& tile, Origin<Real>& plan) const {
     const V x = load<V>(plan.across + k), y = load<V>(plan.down + k), r = load<V>(plan.radius + k);
-    // Infinity less itself is NaN, which nothing equals.
+    // Infinity minus infinity is NaN, which is not equal to anything.
     const I known = (x - x == 0) & (y - y == 0) & (r <= limit) & (r < infinity);
     const V t = (r - load<V>(plan.from + k)) / load<V>(plan.span + k);
     const V column =
@@ -151,10 +152,10 @@ class Planner {
     const I none{};
     const auto side = [&](int ring, const Index* of, V at, V weight, Real* share_to) {
       I left = __builtin_convertvector(at, I);
-      left += __builtin_convertvector(left, V) > at;  // towards minus infinity: true is -1
+      left += __builtin_convertvector(left, V) > at;  // rounds towards minus infinity: true is -1
       const V share = at - __builtin_convertvector(left, V);
       left += (left < 0) & sectors;
-      left += (left < 0) & sectors;  // a ring of one sector, rounded beyond its end
+      left += (left < 0) & sectors;  // a ring of one sector can be rounded beyond its end
       left -= (left >= sectors) & sectors;
       I right = left + 1;
       right -= (right >= sectors) & sectors;
@@ -177,13 +178,13 @@ class Planner {
   int64_t lens = -1, above = 0;
 };
 
-// The rows of pixels that one item of forward or of backward_map takes.
+// Returns how many rows of pixels one item of forward or of backward_map takes.
 template <typename T>
 int64_t rows_of_band(const PolarToImageArgs<T>& a) {
   return (a.height + a.bands - 1) / a.bands;
 }
 
-// A pixel's channels are taken in registers of this many lanes: of few if there are few.
+// The channels of a pixel are taken in registers of this many lanes if there are few channels.
 constexpr int64_t kFew = 4;
 template <typename T>
 int64_t lanes(const PolarToImageArgs<T>& a) {
@@ -191,8 +192,8 @@ int64_t lanes(const PolarToImageArgs<T>& a) {
   return a.channels <= kFew ? smaller(kFew, most) : most;
 }
 
-// The working memory of a thread. It keeps the mixes of whole rows of pixels for the images and the
-// channels that come next: row y has its place at y % rows.
+// The working memory of a thread. It keeps the mixes of whole rows of pixels for the next images
+// and channels. Row y is kept at place y % rows.
 template <typename T>
 class Workspace {
   Arena arena;
@@ -201,7 +202,7 @@ class Workspace {
   using Real = Arithmetic<T>;
 
   Planner<T> planner;
-  Mix<Real>* tile;  // of backward through the lens
+  Mix<Real>* tile;  // for backward through the lens
   Origin<Real>* origin;
   Real *gradients, *sums;
   int64_t bytes;
@@ -212,9 +213,9 @@ class Workspace {
         a(args),
         shared(a.radii_rows == 1 && a.place_rows == 1 && a.r_max_rows == 1),
         tiles(round_up(a.width, kTile) / kTile) {
-    // Rows are kept where they come again and need no more memory than this.
+    // Rows are kept if they are needed again and take no more memory than this.
     constexpr int64_t kMost = int64_t{16} << 20;
-    const bool backward = a.grad_out != nullptr;  // or there are no channels
+    const bool backward = a.grad_out != nullptr;  // otherwise there are no channels
     const bool again = backward || (a.batch > 1 && shared);
     const int64_t row_bytes = tiles * static_cast<int64_t>(sizeof(Mix<Real>));
     rows = again && rows_of_band(a) * row_bytes <= kMost ? rows_of_band(a) : 1;
@@ -231,7 +232,7 @@ class Workspace {
     for (int64_t k = 0; memory != nullptr && k < rows; ++k) kept[k] = -1;
   }
 
-  // The tiles of row y of image b. Images of one lens share them.
+  // Returns the tiles of row y of image b. Images with the same lens share them.
   const Mix<Real>* row(int64_t b, int64_t y) {
     const int64_t at = y % rows, key = (shared ? 0 : b) * a.height + y;
     Mix<Real>* to = mixes + at * tiles;
@@ -249,7 +250,7 @@ class Workspace {
   const bool shared;
   const int64_t tiles;
   int64_t rows;
-  int64_t* kept;  // the row whose mixes are there, or -1
+  int64_t* kept;  // the row whose mixes are kept at each place, or -1
   Mix<Real>* mixes;
 };
 

@@ -1,12 +1,16 @@
 // Polar bilinear sampling.
 //
-// Forward walks the radii of an image (polar_points.h says where their points stand) and samples
-// the image in cache or, if it is large, in place (polar_image.h). Backward has two halves. The
-// image's gradient scatters every point into four pixels that other points share: each thread owns
-// a band of rows of an image and adds to them in the order of the points, so that no sum depends on
-// how many bands there are. The lens's gradient is a sum over each radius; only the offsets have a
-// gradient for each point. A point outside the image, or whose place is NaN or infinite, samples
-// zeros and has no gradient.
+// Forward goes through the radii of an image and samples the points of each radius. polar_points.h
+// computes the positions of the points. A small image is sampled from a packed copy in the cache, a
+// large image in place (polar_image.h).
+//
+// Backward has two halves. The gradient of the image adds every point to four pixels, which other
+// points share. So each thread owns a band of rows of an image and adds to them in the order of the
+// points. The sums therefore do not depend on the number of bands. The gradient of the lens is a
+// sum over each radius. Only the offsets have a gradient for each point.
+//
+// A point outside the image samples zeros and has no gradient. The same holds if its position is
+// NaN or infinite.
 #include "polar_rows.h"
 #include "polar_sampler.h"
 #include "polar_scatter.h"
@@ -18,7 +22,7 @@ template <typename T>
 void sample(const PolarSampleArgs<T>& a, int64_t begin, int64_t end, void* scratch) {
   T* samples = reinterpret_cast<T*>(static_cast<char*>(scratch) + Sampler<T>::bytes(a));
   const int64_t rings = a.num_radii / a.samples_r, piece = a.samples_a * a.channels;
-  const int64_t values = a.num_azimuths * a.channels + 3;  // of a radius, as Sampler wants it
+  const int64_t values = a.num_azimuths * a.channels + 3;  // of a radius, with three spare
   const bool in_place = a.tokens && !a.narrow;
   Sampler<T> sampler(a, in_place ? a.samples_r * piece : piece, in_place ? piece : values, scratch);
   for (int64_t item = begin; item < end; ++item) {
@@ -48,7 +52,7 @@ void backward_image(const PolarSampleArgs<T>& a, int64_t begin, int64_t end, voi
   }
 }
 
-// d(loss)/d(x, y) of a point, over its channels.
+// Computes d(loss)/d(x, y) of a point, summed over its channels.
 template <typename T, typename E>
 void slope(const Corners<T, E>& corners, const T* grad, T right, T lower, T* gx, T* gy) {
   Vector<T, 4> sums{};  // of the corners, over the channels
@@ -61,7 +65,7 @@ template <typename T>
 struct LensScratch {
   RandomWords random;
   double across[kPlaces], down[kPlaces], shift[kPlaces];
-  double x[kPlaces], y[kPlaces];  // of points before the matrix, from the center
+  double x[kPlaces], y[kPlaces];  // of points relative to the center, before the matrix
   FarPlaces<T> places;
 };
 

@@ -1,15 +1,17 @@
-// A polar map as an image.
+// Turns a polar map into an image.
 //
-// polar_sample knows where its points lie in the image; here each pixel asks where it lies in the
-// map. Its radius and azimuth follow from its place, for a register of pixels at once, and the ring
-// below it from its neighbour's, since radii change little from pixel to pixel. What is left of a
-// pixel is four tokens and their weights; its channels are then four products a register.
+// polar_sample computes where its points lie in the image. This kernel goes the other way: it
+// computes where each pixel lies in the map. The position of a pixel gives its radius and its
+// azimuth, for one register of pixels at a time. The next step finds the two rings on both sides of
+// the pixel. The search starts at the ring of the previous pixels, because radii change little from
+// pixel to pixel. A pixel is then a weighted sum of four tokens, and each register of its channels
+// takes four products.
 //
-// Inside the centre of the first ring the inner neighbour lies across the pole, half a turn away:
-// the map goes on there at negative radii.
+// Inside the centre of the first ring, the inner neighbour lies on the other side of the pole, half
+// a turn away. There the map continues at negative radii.
 //
-// Backward adds each pixel's gradient to its four tokens. An item is all pixels of some rows, and a
-// few channels, whose sums stay in the cache: no two items write the same place.
+// Backward adds the gradient of each pixel to its four tokens. A work item covers a band of rows
+// and a few channels, so that its sums stay in the cache. No two items write to the same place.
 #include "../polar_to_image.h"
 
 #include "convert.h"
@@ -18,8 +20,9 @@
 namespace darswin {
 namespace {
 
-// kL channels of a pixel at a time. `fixed` is the number of channels, or 0 where it is known only
-// now: four products of it take longer than the rest of a pixel of few channels.
+// Mixes kL channels of a pixel at a time. `fixed` is the number of channels, or 0 if only the call
+// knows it. Multiplying by a variable number four times would take longer than the rest of the work
+// on a pixel with few channels.
 template <typename T, int64_t kL, int64_t fixed>
 class Forward {
  public:
@@ -47,7 +50,7 @@ class Forward {
   }
 
  private:
-  // How many channels may be read from the first one of each token of the tile.
+  // Finds how many channels can be read, counted from the first channel of any token of the tile.
   void find_end(int64_t count) {
     IndexOf<Real> last = 0;
     for (int corner = 0; corner < 4; ++corner) {
@@ -59,7 +62,7 @@ class Forward {
     readable = channels() * (a.rings * a.sectors - last);
   }
 
-  // Channel c of pixel k or, where W is a register, the channels from c on.
+  // Mixes channel c of pixel k. If W is a register, it mixes the channels from c on.
   template <typename W>
   W mix(const T* map, int64_t k, int64_t c) const {
     if (!tile->known[k]) return W{};
@@ -70,7 +73,8 @@ class Forward {
     return inner + outer;
   }
 
-  // The channels from c on, maybe fewer than a register: whole registers where they lie in the map.
+  // Mixes the channels from c on, which may be fewer than a register. It reads whole registers as
+  // long as they lie inside the map.
   V mix_last(const T* map, int64_t k, int64_t c) const {
     if (c + kL <= readable) return mix<V>(map, k, c);
     V v{};
@@ -86,7 +90,7 @@ class Forward {
       if (c == channels()) continue;
       const V last = mix_last(map, k, c);
       if (end - (to + c) >= kL) {
-        store(to + c, last);  // the next pixel overwrites what is too much
+        store(to + c, last);  // the next pixel overwrites the excess values
       } else {
         for (; c < channels(); ++c) store(to + c, last[c % kL]);
       }
@@ -107,13 +111,13 @@ class Forward {
     }
   }
 
-  // Up to kL channels of kL pixels, from pixel k and channel c on.
+  // Mixes up to kL channels of kL pixels, starting at pixel k and channel c.
   void square(const T* map, int64_t k, int64_t c, int64_t width, T* to, int64_t stride) const {
     V rows[kL];
     if (width == kL) {
 #pragma GCC unroll 16
       for (int i = 0; i < kL; ++i) {
-        // The planes lie apart, which the hardware does not foresee.
+        // The planes lie far apart, so the hardware does not prefetch them.
         __builtin_prefetch(to + i * stride + kL, 1);
         rows[i] = mix<V>(map, k + i, c);
       }
@@ -133,8 +137,8 @@ class Forward {
   int64_t readable = 0;
 };
 
-// Gradients of a tile's pixels, of channels [c, c + width), as rows of `row` values, zeros behind.
-// `row` is a multiple of kL.
+// Reads the gradients of a tile's pixels for channels [c, c + width). Each pixel gets a row of
+// `row` values, padded with zeros. `row` is a multiple of kL.
 template <int64_t kL, typename T, typename Real = Arithmetic<T>>
 void gather(const PolarToImageArgs<T>& a, int64_t b, int64_t place, int64_t count, int64_t c,
             int64_t width, int64_t row, Real* to) {
@@ -144,7 +148,7 @@ void gather(const PolarToImageArgs<T>& a, int64_t b, int64_t place, int64_t coun
   if (a.tokens) {
     const T* from = a.grad_out + (b * pixels + place) * a.channels + c;
     for (int64_t k = 0; k < count; ++k, from += a.channels, to += row) {
-      // The pieces lie apart, which the hardware does not foresee.
+      // The pieces lie far apart, so the hardware does not prefetch them.
       const char* ahead = reinterpret_cast<const char*>(from + kAhead * a.channels);
       for (int64_t byte = 0; byte < width * kBytes; byte += 64) __builtin_prefetch(ahead + byte);
       int64_t e = 0;
@@ -200,8 +204,8 @@ void forward_items(const PolarToImageArgs<T>& a, int64_t begin, int64_t end, voi
   }
 }
 
-// Adds the gradients of a tile's pixels, rows of `row_` values, to those of their tokens. `fixed`
-// is the length of a row, or 0 where it is known only now.
+// Adds the gradients of a tile's pixels, in rows of `row_` values, to the gradients of their
+// tokens. `fixed` is the length of a row, or 0 if only the call knows it.
 template <int64_t kL, int64_t fixed, typename Real>
 void add(const Mix<Real>& tile, int64_t count, int64_t row_, const Real* gradients, Real* sums) {
   using V = Vector<Real, kL>;
@@ -220,12 +224,13 @@ void add(const Mix<Real>& tile, int64_t count, int64_t row_, const Real* gradien
   }
 }
 
-// Rows of `row` values, of which the first `width` count, to places `stride` apart.
+// Copies rows of `row` values to places `stride` apart. Only the first `width` values of a row
+// matter.
 template <int64_t kL, typename From, typename To>
 void copy_rows(const From* from, int64_t rows, int64_t row, int64_t width, To* to, int64_t stride) {
   if (row == kL && width == stride) {
     using V = Vector<From, kL>;
-    // The next row overwrites what is too much.
+    // The next row overwrites the excess values.
     for (; rows * stride >= kL; --rows, from += row, to += stride) store(to, load<V>(from));
   }
   for (; rows > 0; --rows, from += row, to += stride) copy(from, width, to);
@@ -267,7 +272,7 @@ void backward_map_items(const PolarToImageArgs<T>& a, int64_t begin, int64_t end
   }
 }
 
-// Calls one of the functions above for the lanes that suit the channels.
+// Calls one of the functions above, with the number of lanes that suits the channels.
 template <typename T>
 void forward(const PolarToImageArgs<T>& a, int64_t begin, int64_t end, void* memory) {
   constexpr int64_t most = kLanes<Arithmetic<T>>, few = most < kFew ? most : kFew;
@@ -299,7 +304,7 @@ void sum_bands(const PolarToImageArgs<T>& a, int64_t begin, int64_t end) {
   for (; k < end; ++k) sum(k, Arithmetic<T>{});
 }
 
-// sum over channels of g times a token's values
+// Returns the sum over the channels of g times the values of a token.
 template <typename T, typename Real = Arithmetic<T>>
 double product(const Real* g, const T* token, int64_t channels) {
   using V = Vector<Real, kLanes<Real>>;
@@ -334,7 +339,7 @@ void backward_lens(const PolarToImageArgs<T>& a, int64_t begin, int64_t end, voi
                              work.gradients);
         for (int64_t k = 0; k < count; ++k) {
           if (!tile.known[k]) continue;
-          double s[4];  // how the loss changes with each corner's weight
+          double s[4];  // the derivatives of the loss by the weights of the corners
           for (int corner = 0; corner < 4; ++corner) {
             s[corner] = product(work.gradients + k * row,
                                 a.x + b * map + a.channels * tile.token[corner][k], a.channels);

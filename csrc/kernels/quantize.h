@@ -1,8 +1,8 @@
-// Numbers as 8 bits, as oneDNN's integer products read them.
+// Rounds numbers to 8 bits, in the form that oneDNN's integer products read.
 //
-// Adding 1.5 * 2^23 to a float leaves no bits behind its point, which rounds it to the nearest
-// integer, ties to even, and that integer stands in the lowest bits. What does not fit is cut
-// before, so no conversion overflows; NaN becomes what 0 does.
+// After adding 1.5 * 2^23, a float has no bits left for a fraction. So the sum is rounded to the
+// nearest integer, ties to even, and this integer is in the lowest bits. Values out of range are
+// clamped before, so that no conversion overflows. NaN gets the same result as 0.
 #pragma once
 
 #include "convert.h"
@@ -10,7 +10,7 @@
 namespace darswin {
 namespace {
 
-// V is float or Floats.
+// Works on one float or on a register, Floats.
 class Quantize {
  public:
   explicit Quantize(Quantizer q)

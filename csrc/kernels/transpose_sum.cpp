@@ -1,8 +1,8 @@
-// The transpose of a matrix and the sums of its columns, in one pass over memory.
+// Transposes a matrix and sums its columns, in one pass over memory.
 //
-// Backward of a linear layer needs both of the output's gradient: its transpose times the input is
-// the weight's gradient, the sums of its columns are the bias's. Rows are read in groups, so that
-// what is written of a column is whole cache lines.
+// Backward of a linear layer needs both results for the gradient of its output. The transpose times
+// the input is the gradient of the weight. The sums of the columns are the gradient of the bias.
+// Rows are read in groups, so that the kernel writes whole cache lines of each column.
 #include "../transpose_sum.h"
 
 #include "simd.h"
@@ -12,7 +12,8 @@ namespace {
 
 constexpr int64_t kL = kLanes<float>;
 
-// to[c * to_stride + r] = from[r * columns + c] for r < kL, c < kL; -> the sums over r.
+// Writes to[c * to_stride + r] = from[r * columns + c] for r < kL, c < kL, and returns the sums
+// over r.
 inline Floats square(const float* from, int64_t columns, float* to, int64_t to_stride) {
   Floats rows[kL];
   Floats sums[4] = {};
@@ -39,7 +40,8 @@ void transpose_groups(const TransposeSumArgs& a, int64_t begin, int64_t end) {
       }
       store(sums + c, sum);
     }
-    // The rest: the last rows of all columns, if any, and all rows of the last columns.
+    // The remaining numbers: the last rows of all columns, if any, and all rows of the last
+    // columns.
     for (int64_t c = whole_rows < rows ? 0 : whole_columns; c < a.columns; ++c) {
       const bool whole = c < whole_columns;
       float sum = whole ? sums[c] : 0;

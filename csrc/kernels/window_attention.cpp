@@ -1,13 +1,17 @@
 // Windowed attention on a polar map.
 //
-// A window is never cut out of the map: index arithmetic that includes the shift and the wrap
-// around the border finds the rows of its tokens, and the tiles of window_attention_tiles.h read
-// them where they are. One head attends to one window at a time; with 16 tokens all that this needs
-// stays in registers and the first cache. Logits stand as (key, query), queries in the SIMD lanes.
-// Along an axis that is not periodic, tokens that the shift brought together across the border
-// carry different `side` marks and do not see each other. Backward recomputes the probabilities
-// just as forward computed them, so forward saves nothing. Every token lies in one window, so each
-// qkv gradient has one writer; bias gradients are summed over a chunk of windows, in order.
+// The kernel never copies a window out of the map. Index arithmetic finds the rows of the window's
+// tokens, including the shift and the wrap around the border. The functions in
+// window_attention_tiles.h read these rows in place. One head attends to one window at a time. With
+// 16 tokens, all numbers of this step stay in registers and in the first-level cache. Logits are
+// stored as (key, query), with the queries in the SIMD lanes.
+//
+// Along an axis that is not periodic, the shift can put tokens from opposite borders into one
+// window. Such tokens have different `side` marks and do not attend to each other.
+//
+// Backward computes the probabilities again, exactly as forward did, so forward saves nothing.
+// Every token lies in one window, so each gradient of qkv is written by one thread. The gradients
+// of the bias are summed over a chunk of windows, in a fixed order.
 #include "../window_attention.h"
 
 #include "math.h"
@@ -18,7 +22,7 @@
 namespace darswin {
 namespace {
 
-// One thread's work on a call.
+// The state of one thread during one call.
 template <typename S, int64_t kTokens, int64_t kDim>
 struct Attention {
   using T = Arithmetic<S>;
@@ -29,9 +33,9 @@ struct Attention {
   Shape<kTokens, kDim> shape;
   Arena arena;
   AttentionScratch<S> s;
-  int64_t part;            // from a token's queries to its keys, and on to its values
+  int64_t part;            // distance from a token's queries to its keys, and from its keys to its values
   int64_t bias_row, head;  // the current ones
-  Rows<const T> q, k, v;   // of the head
+  Rows<const T> q, k, v;   // of the current head
 
   Attention(const WindowAttentionArgs<S>& args, void* memory)
       : a(args),
@@ -43,10 +47,11 @@ struct Attention {
     for (int64_t t = 0; t < shape.padded; ++t) s.copy[t] = (t < shape.n ? t : 0) * shape.d;
   }
 
-  // Queries of the group that begins with this one.
+  // Returns the number of queries in the group that begins at query `group`.
   int64_t group_size(int64_t group) const { return smaller(shape.n - group, kGroup); }
 
-  // Makes `window` the current one, and finds the next, whose rows are prefetched meanwhile.
+  // Makes `window` the current window. Also finds the next window, whose rows are prefetched while
+  // this one is computed.
   void enter(int64_t window) {
     s.next.find(a, shape, window);
     const Tokens<T> last = s.window;
@@ -56,12 +61,13 @@ struct Attention {
     bias_row = a.bias_rows == 1 ? 0 : window / shape.map_windows;
   }
 
-  // Prefetches the same rows of the next window, a group at a time, two cache lines a step.
-  // Inlined, since the compiler takes a function that only prefetches for one without effect.
+  // Prefetches the same rows of the next window, one group at a time, two cache lines a step. The
+  // function must be inlined: the compiler would drop calls to a function that only prefetches,
+  // because it seems to have no effect.
   __attribute__((always_inline)) void fetch(const S* map, const int64_t* offset,
                                             int64_t group) const {
     if (!shape.far) return;
-    // Not unrolled: thirty-two prefetches in a row took much longer than none at all.
+    // The loop is not unrolled: thirty-two prefetches in a row took much longer than none at all.
     const int64_t end = group + group_size(group), row = shape.d * static_cast<int64_t>(sizeof(S));
 #pragma GCC unroll 1
     for (int64_t t = group; t < end; ++t) {
@@ -73,7 +79,7 @@ struct Attention {
     }
   }
 
-  // Where to read a window's rows as T: in the map, or in a widened copy.
+  // Returns the place to read a window's rows of type T: the map, or a widened copy.
   Rows<const T> read(const S* map, const int64_t* offset, T* copy) const {
     if constexpr (sizeof(S) == sizeof(T)) {
       return {map, offset};
@@ -82,7 +88,7 @@ struct Attention {
       return {copy, s.copy};
     }
   }
-  // Where to write them; `finish` rounds those of a copy into the map.
+  // Returns the place to write the rows. `finish` rounds the rows of a copy into the map.
   Rows<T> write(S* map, const int64_t* offset, T* copy) const {
     if constexpr (sizeof(S) == sizeof(T)) {
       return {map, offset};
@@ -110,7 +116,7 @@ struct Attention {
     }
   }
 
-  // to[key * stride + query - begin] = the bias of (query, key)
+  // Writes to[key * stride + query - begin] = the bias of (query, key).
   void spread_bias(int64_t begin, int64_t end, T* to, int64_t stride) const {
     const T* table = a.bias + (bias_row * shape.heads + head) * shape.table;
     shape.for_pairs(begin, end, [&](int64_t key, int64_t query, int64_t count, int64_t index) {
@@ -130,8 +136,8 @@ struct Attention {
     s.window.parted ? logits<true>(biases, stride, group) : logits<false>(biases, stride, group);
   }
 
-  // s.p = the logits, s.largest = the largest of each query. Keys that pad the last eight
-  // have minus infinity, as those across a border do.
+  // Writes the logits to s.p and the largest logit of each query to s.largest. Keys that pad the
+  // last eight get minus infinity, and so do keys across a border.
   template <bool kParted>
   __attribute__((noinline)) void logits(const T* biases, int64_t stride, int64_t group) const {
     const V scale = splat<V>(a.scale), nothing = splat<V>(static_cast<T>(-__builtin_inf()));
@@ -150,7 +156,7 @@ struct Attention {
     for (int v = 0; v < kVectors; ++v) store(s.largest + v * kLanes<T>, largest[v]);
   }
 
-  // s.p = e^(logit - the largest one), s.inverse = 1 / their sum.
+  // Replaces s.p by e^(logit - largest logit), and writes 1 / their sum to s.inverse.
   __attribute__((noinline)) void exponentials() const {
     for (int lane = 0; lane < kGroup; lane += kLanes<T>) {
       T* p = s.p + lane;
@@ -168,7 +174,7 @@ struct Attention {
     }
   }
 
-  // s.dp = the gradients of the probabilities.
+  // Writes the gradients of the probabilities to s.dp.
   __attribute__((noinline)) void probability_gradients() const {
     T* dp = s.dp;
     products(s.columns, v, shape.eights, shape.d, [&](int64_t key, int v, V product) {
@@ -176,8 +182,8 @@ struct Attention {
     });
   }
 
-  // s.p = the probabilities p; s.dp, from their gradients to those of the logits, which are
-  // the biases' as well: p (dp - sum p dp).
+  // Replaces s.p by the probabilities p, and s.dp by the gradients of the logits, p (dp - sum p
+  // dp). These are the gradients of the biases too.
   void softmax_backward(int64_t group, double* grad_bias) const {
     if (shape.pairs) {
       softmax_backward<true>(group);
@@ -210,7 +216,7 @@ struct Attention {
     }
   }
 
-  // Adds gradients of pairs, pair_grad[key * stride + query], to a table.
+  // Adds the gradients of pairs, pair_grad[key * stride + query], to a bias table.
   void fold_pairs(const T* pair_grad, int64_t stride, int64_t begin, int64_t end,
                   double* table) const {
     shape.for_pairs(begin, end, [&](int64_t key, int64_t query, int64_t count, int64_t index) {
@@ -219,8 +225,8 @@ struct Attention {
     });
   }
 
-  // The steps from queries and keys to the exponentials, for the queries of one group. In between,
-  // a few at a time, rows of the next window are prefetched.
+  // Takes the steps from queries and keys to the exponentials, for the queries of one group.
+  // Between the steps, it prefetches a few rows of the next window.
   void weights(int64_t group) const {
     fetch(queries(), s.next.in, group);
     transpose(q.from(group), shape.d, s.columns);
@@ -230,7 +236,8 @@ struct Attention {
     exponentials();
   }
 
-  // One head of the current window. Results of 8 bits are made of a copy.
+  // Computes one head of the current window. Results of 8 bits are computed as floats in a copy
+  // first.
   void forward(int64_t index) {
     begin(index);
     S* to = a.quantized == nullptr ? a.out + head * shape.d : nullptr;
@@ -250,7 +257,7 @@ struct Attention {
     }
   }
 
-  // The same backward; grad_bias is the head's row of bias gradients.
+  // Computes backward of one head. grad_bias is the head's row of bias gradients.
   void backward(int64_t index, double* grad_bias) {
     begin(index);
     const S* from = a.grad_out + head * shape.d;
@@ -285,8 +292,8 @@ struct Attention {
     finish(to + 2 * part, s.window.in, s.dv_copy);
   }
 
-  // Items are windows outside and heads inside, since a token's heads stand side by side in memory:
-  // calls body(outer, head, end) for the heads [head, end) of each `outer` of [begin, end).
+  // Calls body(outer, head, end) for the heads [head, end) of each `outer`, over the items [begin,
+  // end). Heads are the inner loop because the heads of a token are neighbours in memory.
   template <typename Body>
   void for_heads(int64_t begin, int64_t end, Body body) const {
     for (int64_t item = begin, next; item < end; item = next) {
@@ -312,7 +319,8 @@ struct Attention {
     });
   }
 
-  // Windows [begin, end), heads [first, last); grad_bias has a row for each of these heads.
+  // Takes windows [begin, end) and heads [first, last). grad_bias has one row for each of these
+  // heads.
   void backward_chunk(int64_t begin, int64_t end, int64_t first, int64_t last, double* grad_bias) {
     const int64_t table = shape.pairs ? shape.n * shape.padded : 0;
     for (int64_t i = first * table; i < last * table; ++i) s.pair_grad[i] = 0;
@@ -328,9 +336,9 @@ struct Attention {
   }
 };
 
-// run(attention) for a call. Nearly every call has windows of 16 tokens and heads of 32 channels:
-// loops of known lengths make it 5 to 20 % faster. Not so where rows are read in place from a map
-// larger than the caches: those were up to 20 % slower with them.
+// Calls run(attention). Nearly every call has windows of 16 tokens and heads of 32 channels. Loops
+// of known lengths make such calls 5 to 20 % faster. But where rows are read in place from a map
+// larger than the caches, known lengths were up to 20 % slower.
 template <typename S, typename Run>
 void with_attention(const WindowAttentionArgs<S>& args, void* scratch, Run run) {
   const bool usual = args.window_r * args.window_a == 16 && args.head_dim == 32;

@@ -1,4 +1,4 @@
-// AVX2: registers of 256 bits, and fused multiply-add. generic.h says what each of these does.
+// AVX2: registers of 256 bits, and fused multiply-add. generic.h explains each name.
 #pragma once
 
 #include <immintrin.h>

@@ -1,5 +1,5 @@
-// AVX-512 (F, BW, VL, DQ): registers of 512 bits, and fused multiply-add. generic.h says what each
-// of these does.
+// AVX-512 (F, BW, VL, DQ): registers of 512 bits, and fused multiply-add. generic.h explains each
+// name.
 #pragma once
 
 #include <immintrin.h>
@@ -22,7 +22,7 @@ inline Floats repeat(Vector<float, 4> v) {
   return (Floats)_mm512_maskz_broadcast_f32x4(0xFFFF, (__m128)v);
 }
 
-// The compiler's own conversions go by halves of a register.
+// The compiler's own conversions work on half a register at a time.
 inline Doubles to_doubles(Vector<int32_t, 8> x) {
   return (Doubles)_mm512_maskz_cvtepi32_pd(0xFF, (__m256i)x);
 }
@@ -41,15 +41,15 @@ inline Words lower_product(Words a, uint32_t b) {
   return (Words)_mm512_maskz_mul_epu32(0xFF, (__m512i)a, (__m512i)factor);
 }
 
-// What follows is for registers of 512 bits alone, which hold four pixels of four channels.
+// The rest is only for registers of 512 bits, which hold four pixels of four channels.
 
-// Eight floats from here and eight from there: a masked load, which needs no shuffle.
+// Joins eight floats at `here` and eight floats at `there`. The masked load needs no shuffle.
 inline Floats two_eights(const float* here, const float* there) {
   const __m512 first = _mm512_castps256_ps512(_mm256_loadu_ps(here));
   return (Floats)_mm512_mask_broadcast_f32x8(first, 0xFF00, _mm256_loadu_ps(there));
 }
 
-// Two floats from each of eight places.
+// Loads two floats from each of eight places.
 inline Floats gather_pairs(const float* from, Vector<int64_t, 8> offset) {
   return (Floats)_mm512_mask_i64gather_pd(_mm512_setzero_pd(), 0xFF, (__m512i)offset, from,
                                           sizeof(float));
@@ -61,19 +61,19 @@ inline Floats permuted(Floats v, Vector<int32_t, 16> index) {
   return (Floats)_mm512_maskz_permutexvar_ps(0xFFFF, (__m512i)index, (__m512)v);
 }
 
-// The lanes of v that `index` names.
+// Returns the lanes of v that `index` lists.
 inline Floats pick(Vector<float, 4> v, Vector<int32_t, 16> index) {
   return permuted((Floats)_mm512_castps128_ps512((__m128)v), index);
 }
 
-// The first `lanes` of each quarter of v, one quarter behind the other.
+// Stores the first `lanes` lanes of each quarter of v, one quarter after the other.
 inline void store_quarters(float* to, Floats v, int64_t lanes) {
   const auto fronts = static_cast<__mmask16>(0x1111 * ((1 << lanes) - 1));
   const auto joined = static_cast<__mmask16>((1 << 4 * lanes) - 1);
   _mm512_mask_storeu_ps(to, joined, _mm512_maskz_compress_ps(fronts, (__m512)v));
 }
 
-// The first `lanes` of each quarter of v to to[place[0]], to[place[1]], ...
+// Stores the first `lanes` lanes of each quarter of v at to[place[0]], to[place[1]], ...
 inline void scatter_quarters(float* to, Floats v, const int32_t* place, int64_t lanes) {
   const auto fronts = static_cast<__mmask8>((1 << lanes) - 1);
   _mm_mask_storeu_ps(to + place[0], fronts, _mm512_maskz_extractf32x4_ps(0xF, (__m512)v, 0));

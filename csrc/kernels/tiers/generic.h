@@ -1,8 +1,8 @@
-// The generic tier: registers of 128 bits and no fused multiply-add. On x86 that is SSE2, which
-// every such CPU has; elsewhere the compiler's own choice.
+// The generic tier: registers of 128 bits and no fused multiply-add. On x86 this is SSE2, which
+// every such CPU has. On other CPUs the compiler chooses the instructions.
 //
-// A tier's header holds all that differs between tiers: the registers, and a few functions that the
-// compiler does not make well out of plain vector code.
+// The header of a tier holds everything that differs between tiers: the sizes of the registers, and
+// a few functions for which the compiler makes slow code from plain vector code.
 #pragma once
 
 #if defined(__SSE2__)
@@ -23,24 +23,24 @@ using Floats = Vector<float, 4>;
 using Doubles = Vector<double, 2>;
 using Words = Vector<uint64_t, 2>;
 
-// Four lanes, in every 128 bits of a register.
+// Repeats four lanes in every 128 bits of a register.
 inline Floats repeat(Vector<float, 4> v) { return v; }
 
 inline Doubles to_doubles(Vector<int32_t, 2> x) { return __builtin_convertvector(x, Doubles); }
 
-// The whole part of numbers below 2^63.
+// Returns the whole part of numbers below 2^63.
 inline Doubles whole_part(Doubles x) {
   return __builtin_convertvector(__builtin_convertvector(x, Vector<int64_t, 2>), Doubles);
 }
 
-// bfloat16 as the floats that have these upper halves.
+// Widens bfloat16 to float32: the bits become the upper half of each float.
 inline Floats widen_lanes(const bfloat16* from) {
   using Bits = Vector<uint32_t, 4>;
   const auto bits = __builtin_convertvector(load_bits<Vector<uint16_t, 4>>(from), Bits);
   return (Floats)(bits << 16);
 }
 
-// Products of the lower halves of the lanes.
+// Returns the products of the lower halves of the lanes.
 inline Words lower_product(Words a, uint32_t b) {
   const Words factor = splat<Words>(static_cast<uint64_t>(b));
 #if defined(__SSE2__)
