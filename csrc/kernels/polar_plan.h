@@ -31,9 +31,9 @@ struct Origin {
 
   Real across[kTile], down[kTile], radius[kTile];  // the place on the polar plane
   Index inner[kTile], outer[kTile];                // the rings on both sides
-  Real from[kTile], span[kTile];                   // the inner ring's radius; distance from it to the outer ring
+  Real from[kTile], span[kTile];                   // inner ring's radius; gap to the outer ring
   Real turn[kTile];                                // sectors to the other side of the pole, or 0
-  Real t[kTile], left[kTile], right[kTile];        // shares of the outer ring, and of the right sector
+  Real t[kTile], left[kTile], right[kTile];        // share of the outer ring; of the right sector
                                                    // in the inner ring and in the outer one
 };
 
@@ -215,7 +215,7 @@ class Workspace {
         tiles(round_up(a.width, kTile) / kTile) {
     // Rows are kept if they are needed again and take no more memory than this.
     constexpr int64_t kMost = int64_t{16} << 20;
-    const bool backward = a.grad_out != nullptr;  // otherwise there are no channels
+    const bool backward = a.grad_out != nullptr;  // null without channels too
     const bool again = backward || (a.batch > 1 && shared);
     const int64_t row_bytes = tiles * static_cast<int64_t>(sizeof(Mix<Real>));
     rows = again && rows_of_band(a) * row_bytes <= kMost ? rows_of_band(a) : 1;

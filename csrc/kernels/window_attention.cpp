@@ -33,7 +33,7 @@ struct Attention {
   Shape<kTokens, kDim> shape;
   Arena arena;
   AttentionScratch<S> s;
-  int64_t part;            // distance from a token's queries to its keys, and from its keys to its values
+  int64_t part;            // distance from queries to keys, and from keys to values
   int64_t bias_row, head;  // the current ones
   Rows<const T> q, k, v;   // of the current head
 
