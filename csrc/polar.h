@@ -1,4 +1,4 @@
-// What the drivers of polar_sample and polar_embed and their kernels agree on.
+// The interface between the drivers of polar_sample and polar_embed and their kernels.
 #pragma once
 
 #include <cstdint>
@@ -9,24 +9,24 @@ namespace darswin {
 
 enum class Pixel { f32, f64, bf16, u8 };
 
-// Point (i, j) of image b stands at
+// Point (i, j) of image b lies at
 // center[b] + affine[b] @ (radii[b, i] * (cos, sin)(azimuths[j])) + offsets[b, :, i, j].
-// T is the type that is computed in: double for double pixels, else float.
+// T is the type used for computing: double for double pixels, else float.
 template <typename T>
 struct PolarSampleArgs {
   const void* image;  // (B, C, H, W), any strides
   Pixel pixel;
   int64_t channels, height, width;
   int64_t image_stride[4];
-  bool packed;            // whether images are sampled from a packed copy in cache
-  bool gathers;           // whether they are read by gathers
-  const T* pixel_scale;   // (C,): a pixel p of type u8 counts as p * scale + offset
+  bool packed;            // samples come from a packed copy of the image in the cache
+  bool gathers;           // pixels are read by gathers
+  const T* pixel_scale;   // (C,): a pixel p of type u8 has the value p * scale + offset
   const T* pixel_offset;  // (C,)
   const T* radii;         // (B or 1, num_radii) px
   int64_t radii_stride, num_radii;
-  const double* cosines;   // (num_azimuths,), readable for one register more
+  const double* cosines;   // (num_azimuths,), followed by one readable register
   const double* sines;     // the same
-  bool directions_finite;  // whether all cosines and sines are numbers
+  bool directions_finite;  // all cosines and sines are numbers
   int64_t num_azimuths;
   const T* center;  // (B or 1, 2) px, x then y
   int64_t center_stride;
@@ -44,29 +44,31 @@ struct PolarSampleArgs {
   void* out;  // forward
 
   const void* grad_out;  // backward
-  int64_t bands;         // into how many parts the rows of an image are cut
-  void* grad_image;      // (B, C, H, W) contiguous, of the pixel's type; all of it is written
+  int64_t bands;         // the number of parts into which the rows of an image are cut
+  void* grad_image;      // (B, C, H, W) contiguous, of the pixel's type; fully written
   double* grad_lens;     // (B, num_radii, kLensSums)
-  T* grad_offsets;       // like offsets, to be added to; or null
+  T* grad_offsets;       // like offsets; gradients are added to it; or null
 };
 
-// What PolarSampleKernels::backward_lens sums over the points of one radius: d(loss)/dr, the same
-// times the shift of the points that jitter moved inward and of those it moved outward,
-// d(loss)/d(x, y) and, where there is a matrix, d(loss)/d(affine) from kAffine on.
+// The sums of PolarSampleKernels::backward_lens over the points of one radius: d(loss)/dr, then
+// d(loss)/dr times the shift of the points that jitter moved inward, and the same for those it
+// moved outward, then d(loss)/d(x, y). If there is a matrix, d(loss)/d(affine) follows, starting at
+// kAffine.
 enum LensSum { kAlong, kInward, kOutward, kAcross, kDown, kAffine, kLensSums = kAffine + 4 };
 
-// What a kernel needs scratch for: to make samples (forward, and the gradient of polar_embed's
-// weight), or to bring their gradients to the image, to the lens or, in polar_embed, to memory.
+// The purpose of a kernel's scratch memory. `forward` makes samples, also for the gradient of
+// polar_embed's weight. The others bring the gradients of the samples to the image, to the lens or,
+// in polar_embed, to memory.
 enum class PolarPass { forward, backward_image, backward_lens, backward_samples };
 
-// Kernels work serially through the items [begin, end); the drivers own the threads.
+// Kernels process the items [begin, end) on one thread. The drivers own the threads.
 template <typename T>
 struct PolarSampleKernels {
   using Args = PolarSampleArgs<T>;
 
-  // (n,) angles -> their cosines and sines, n a multiple of the lanes
+  // (n,) angles -> their cosines and sines; n is a multiple of the lanes
   void (*directions)(const double* angles, int64_t n, double* cosines, double* sines);
-  // bytes of scratch that each thread needs in one of the functions below
+  // bytes of scratch for each thread that runs one of the functions below
   int64_t (*scratch)(const Args&, PolarPass);
   // item: (image, ring)
   void (*forward)(const Args&, int64_t begin, int64_t end, void* scratch);
@@ -76,10 +78,10 @@ struct PolarSampleKernels {
   void (*backward_lens)(const Args&, int64_t begin, int64_t end, void* scratch);
 };
 
-// Sampling and the linear layer behind it: out = samples of the token * weight^T + bias. These are
-// the arguments beside those of the sampling, whose layout is tokens and whose out and grad_out are
-// (B, R, A, D). "Padded" sizes are multiples of kRowUnit, so that rows are whole registers on every
-// tier.
+// Sampling followed by a linear layer: out = samples of the token * weight^T + bias. The struct has
+// the arguments in addition to those of the sampling, whose layout is tokens and whose out and
+// grad_out are (B, R, A, D). "Padded" sizes are multiples of kRowUnit, so that rows are whole
+// registers on every tier.
 constexpr int64_t kRowUnit = 16;
 template <typename T>
 struct PolarEmbedArgs {
@@ -95,7 +97,7 @@ struct PolarEmbedKernels {
   using Args = PolarSampleArgs<T>;
   using Embed = PolarEmbedArgs<T>;
 
-  // bytes of scratch that each thread needs in one of the functions below
+  // bytes of scratch for each thread that runs one of the functions below
   int64_t (*scratch)(const Args&, const Embed&, PolarPass);
   // item: (image, ring)
   void (*forward)(const Args&, const Embed&, int64_t begin, int64_t end, void* scratch);
@@ -104,15 +106,15 @@ struct PolarEmbedKernels {
                           double* bias, void* scratch);
   // item: (image, ring); writes grad_samples
   void (*backward_samples)(const Args&, const Embed&, int64_t begin, int64_t end, void* scratch);
-  // item: image, as one band; the gradients of the samples go to the image at once
+  // item: image, as one band; the gradients of the samples go straight to the image
   void (*backward_image)(const Args&, const Embed&, int64_t begin, int64_t end, void* scratch);
 };
 
 namespace {
 
-// The steps by which jitter moves a point from radius i: the radius becomes
-// radii[i] + shift * (radii[above] - radii[below]), with entry 0 of both for a negative shift and 1
-// for another. At both ends of the row there is only one step.
+// The steps by which jitter moves a point from radius i. The radius becomes radii[i] + shift *
+// (radii[above] - radii[below]). A negative shift uses entry 0 of both arrays, other shifts use
+// entry 1. At each end of the row there is only one step.
 struct Steps {
   int64_t below[2], above[2];
 

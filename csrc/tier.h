@@ -1,21 +1,21 @@
-// The instruction-set tiers, and where the kernels of each are found.
+// The instruction-set tiers, and the tables of the kernels of each tier.
 //
-// csrc/kernels is compiled once per tier, with that tier's instructions. An inline function with
-// external linkage would come out of every tier's objects, and the linker would keep any one copy:
-// perhaps AVX-512 code that all CPUs then run. So whatever kernels/ compiles, this header and those
-// of the operators included, stands in an unnamed namespace; only the tables of kernels have
-// external linkage, and their names contain the tier.
+// csrc/kernels is compiled once per tier, with the instructions of that tier. An inline function
+// with external linkage would be in the objects of every tier, and the linker would keep any one
+// copy. This could be AVX-512 code, which all CPUs would then run. So everything that kernels/
+// compiles is in an unnamed namespace, including this header and those of the operators. Only the
+// tables of kernels have external linkage, and their names contain the tier.
 #pragma once
 
 namespace darswin {
 
-// From low to high. A build has the first few: those that CMakeLists.txt lists in DARSWIN_TIERS,
-// which is generic alone where the CPU is not an x86.
+// From low to high. A build has the first few tiers: those that CMakeLists.txt lists in
+// DARSWIN_TIERS. If the CPU is not an x86, this is only `generic`.
 enum class Tier { generic, avx2, avx512 };
 
 // The kernels of one operator on one tier. `Table` is a struct of function pointers, which the
-// operator's header declares; kernels/OPERATOR.cpp defines `table`, on the tier that is compiled,
-// as TIER_TABLE(Table) = {...};
+// operator's header declares. kernels/OPERATOR.cpp defines `table`, on the tier that is being
+// compiled, as TIER_TABLE(Table) = {...};
 template <typename Table, Tier tier>
 struct Kernels {
   static const Table table;

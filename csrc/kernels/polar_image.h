@@ -1,10 +1,12 @@
-// Reading pixels, of near and of far images.
+// Reads pixels, of near and of far images.
 //
-// A near image fits the second-level cache. It is first copied into a packed image: channels last
-// and padded to four, so that one load takes a pixel and its right neighbour, and with a border of
-// zeros, so that the inner loop needs no bounds test. A point outside the image reads the zeros at
-// the lower right, where the border is two pixels wide. A far image is larger, or few points look
-// at it: it is read where it lies, with whatever strides and type it has.
+// A near image fits the second-level cache, and its pixels are first copied into a packed image.
+// There the channels come last and are padded to four, so that one load takes a pixel and its right
+// neighbour. A border of zeros surrounds the image, so that the inner loop needs no bounds test. A
+// point outside the image reads the zeros at the lower right, where the border is two pixels wide.
+//
+// A far image is larger, or has too few points to be worth a copy. It is read in place, with any
+// strides and any type of pixel.
 #pragma once
 
 #include "convert.h"
@@ -13,8 +15,9 @@
 namespace darswin {
 namespace {
 
-// The layout of a packed image. Pixel (x, y) of the image is its pixel (x + 1, y + 1). Only for
-// images that are packed, or whose gradient is: the sizes of others may not fit 64 bits.
+// The layout of a packed image. Pixel (x, y) of the image is pixel (x + 1, y + 1) of the packed
+// image. The layout is only computed for images that are packed, or whose gradient is packed: the
+// sizes of other images may not fit 64 bits.
 struct Packed {
   int64_t pixel = 0, row = 0, size = 0;  // values of a pixel, of a row, of the image
 
@@ -26,9 +29,9 @@ struct Packed {
         size((a.height + 3) * row) {}
 };
 
-// Where a block of points lies among the pixels. `right` and `lower` say how far a point is on the
-// way to the right and to the lower neighbour, from 0 to 1. The last register of a row may reach
-// beyond the row.
+// The positions of a block of points among the pixels. `right` and `lower` are the point's
+// distances from the upper left pixel to the right and downwards, from 0 to 1. The last register of
+// a row may reach beyond the row.
 constexpr int kPlaces = kBlock + kDoubles;
 template <typename T>
 struct Places {
@@ -41,11 +44,12 @@ struct PackedPlaces : Places<T> {
 template <typename T>
 struct FarPlaces : Places<T> {
   int64_t column[kPlaces], row[kPlaces];  // of the upper left pixel
-  int64_t offset[kPlaces];                // its offset, or -1 where not all four are inside
+  int64_t offset[kPlaces];                // its offset, or -1 if not all four are inside
 };
 
-// Whole and fractional parts of coordinates, moved by one pixel as in a packed image. Coordinates
-// that touch no pixel, and NaN, become `outside`, unless all are known to be `inside`.
+// Splits coordinates into whole and fractional parts, moved by one pixel as in a packed image.
+// Coordinates that touch no pixel become `outside`, and so does NaN. This test is skipped if all
+// coordinates are known to be `inside`.
 template <bool inside, typename T>
 inline Doubles split(Doubles x, double size, double outside, T* fraction) {
   Doubles moved = x + 1;
@@ -66,9 +70,9 @@ inline void place(const PolarSampleArgs<T>& a, const Packed& packed, const Point
   store(places.offset + k, __builtin_convertvector(offset, Vector<int32_t, kDoubles>));
 }
 
-// In a far image a point that touches no pixel is put at column or row -3. `strides` are those of
-// the rows and columns of what is read or written. If all four pixels of every point are known to
-// be `inside`, columns and rows stay unknown.
+// Places points in a far image. A point that touches no pixel gets column or row -3. `strides` are
+// the strides of the rows and the columns that are read or written. If all four pixels of every
+// point are known to be `inside`, the columns and rows are not computed.
 template <bool inside, typename T>
 inline void place(const PolarSampleArgs<T>& a, const int64_t strides[2], const Points& p, int64_t k,
                   FarPlaces<T>& places) {
@@ -76,7 +80,7 @@ inline void place(const PolarSampleArgs<T>& a, const int64_t strides[2], const P
   const double width = static_cast<double>(a.width), height = static_cast<double>(a.height);
   const Doubles column = split<inside>(p.x, width, -2, places.right + k) - 1;
   const Doubles row = split<inside>(p.y, height, -2, places.lower + k) - 1;
-  // Exact in double below 2^53.
+  // This is exact in double below 2^53.
   Doubles offset = row * static_cast<double>(strides[0]) + column * static_cast<double>(strides[1]);
   if constexpr (!inside) {
     const auto whole = (column >= 0) & (row >= 0) & (column < width - 1) & (row < height - 1);
@@ -87,7 +91,7 @@ inline void place(const PolarSampleArgs<T>& a, const int64_t strides[2], const P
   store(places.offset + k, __builtin_convertvector(offset, Ints));
 }
 
-// A block of points, in the packed image or in the far one.
+// The positions of a block of points, in a packed image or in a far one.
 template <typename T>
 struct PlacedPoints {
   union {
@@ -96,7 +100,7 @@ struct PlacedPoints {
   };
   RandomWords random;
 
-  // Finds points j to j + count of radius i of image b, and stores them from place `first` on.
+  // Finds points j to j + count of radius i of image b, and stores them starting at place `first`.
   void find(const PolarSampleArgs<T>& a, const Packed& packed, int64_t b, int64_t i, int64_t j,
             int64_t count, int64_t first) {
     const auto put = [&]<bool inside>() {
@@ -106,11 +110,11 @@ struct PlacedPoints {
     within(a, b, i, -1) ? put.template operator()<true>() : put.template operator()<false>();
   }
 
-  // The same in the far image, with or without the columns and rows of points that lie inside.
+  // Does the same in the far image, with or without the columns and rows of points inside it.
   template <bool columns>
   void find_far(const PolarSampleArgs<T>& a, const int64_t strides[2], int64_t b, int64_t i,
                 int64_t j, int64_t count, int64_t first) {
-    constexpr double kSpare = 0.001;  // of a pixel, for what rounding does to a place
+    constexpr double kSpare = 0.001;  // of a pixel, because positions are rounded
     const auto put = [&]<bool inside>() {
       locate(a, b, i, j, count, random,
              [&](int64_t k, const Points& p) { place<inside>(a, strides, p, first + k, far); });
@@ -120,8 +124,8 @@ struct PlacedPoints {
   }
 
  private:
-  // Whether all points of a radius are known to lie further than `margin` inside the outermost
-  // pixels' centers.
+  // Returns whether all points of a radius are known to lie inside the image, at least `margin`
+  // away from the centers of the outermost pixels.
   static bool within(const PolarSampleArgs<T>& a, int64_t b, int64_t i, double margin) {
     if (a.offsets != nullptr || !a.directions_finite) return false;
     const Reach most = reach(a, b, i);
@@ -132,19 +136,21 @@ struct PlacedPoints {
   }
 };
 
-// Points of a far image that are visited in turn, by their places in a block: place, place + step
+// Points of a far image that are visited in turn. Their places in a block are place, place + step
 // and so on.
 struct Line {
-  bool flat;                   // along the azimuth, else along the radius
+  bool flat;                   // true: along the azimuth, false: along the radius
   int64_t row, token, sample;  // of the first point: its radius in the block, its place in a token
   int64_t place, step, count;
 };
 
-// The lines of a block of a far image: `rows` radii, and of each the points j to j + columns. They
-// go token by token, `token_width` points of each radius, and inside a token along the azimuth. An
-// image that is read in several planes fills a set of the cache with few points; there they go
-// along the rows of the image, whose lines of memory the point before has touched: to the left and
-// right of the center that is along the radius.
+// Cuts a block of a far image into lines. The block has `rows` radii with points j to j + columns
+// each. Lines go token by token, with `token_width` points of each radius. Inside a token they go
+// along the azimuth.
+//
+// An image of several planes is different: few of its points fill a set of the cache. There, lines
+// follow the rows of the image, so that a point finds cache lines that the point before has
+// touched. To the left and right of the center, this direction is along the radius.
 template <typename T>
 class Lines {
  public:
@@ -178,13 +184,13 @@ class Lines {
   const PolarSampleArgs<T>& a;
   const int64_t j, rows, columns, width;
   const bool planes;
-  // The token at hand, its first column, which of its lines comes next, and whether these go along
+  // The current token, its first column, the index of its next line, and whether its lines go along
   // the azimuth.
   int64_t token = 0, column = 0, index = 0;
   bool flat = true;
 };
 
-// Calls visit(line) for the lines of a block, and fetch(line) some points before.
+// Calls visit(line) for the lines of a block, and fetch(line) some points earlier.
 template <typename T, typename Fetch, typename Visit>
 void visit_lines(const Lines<T>& all, Fetch fetch, Visit visit) {
   constexpr int64_t kAhead = 80;  // points
@@ -201,7 +207,8 @@ void visit_lines(const Lines<T>& all, Fetch fetch, Visit visit) {
   }
 }
 
-// Fetches the pixels around the points of a line, of `planes` planes, with rows `below` apart.
+// Prefetches the pixels around the points of a line, in `planes` planes whose rows are `below`
+// apart.
 template <typename T, typename E>
 void fetch_pixels(const FarPlaces<T>& places, const Line& line, const E* pixels, int64_t planes,
                   int64_t plane, int64_t below) {
@@ -214,7 +221,7 @@ void fetch_pixels(const FarPlaces<T>& places, const Line& line, const E* pixels,
   }
 }
 
-// Calls visit<E>() with the type of the pixels.
+// Calls visit<E>(), where E is the type of the pixels.
 template <typename T, typename Visit>
 void with_pixel_type(Pixel pixel, Visit visit) {
   if constexpr (sizeof(T) == sizeof(double)) {
@@ -228,8 +235,8 @@ void with_pixel_type(Pixel pixel, Visit visit) {
   }
 }
 
-// The value of a pixel: one of type uint8 has a scale and an offset for each channel, others count
-// as they are. Interpolation between pixels may come before or after this.
+// Returns the value of a pixel. Pixels of type uint8 have a scale and an offset for each channel;
+// other pixels are used as they are. Interpolation may come before or after this step.
 template <typename E, typename T>
 inline T normalized(const PolarSampleArgs<T>& a, T pixel, int64_t channel) {
   return is_same_v<E, uint8_t> ? pixel * a.pixel_scale[channel] + a.pixel_offset[channel] : pixel;
@@ -239,7 +246,7 @@ inline T value(const PolarSampleArgs<T>& a, const E* pixel, int64_t channel) {
   return normalized<E>(a, load<T>(pixel), channel);
 }
 
-// Interleaves planes of four channels: (4, width) -> (width, 4).
+// Interleaves four planes: (4, width) -> (width, 4).
 template <typename T>
 void interleave(const T* const plane[4], int64_t width, T* to) {
   using V = Vector<T, 4>;
@@ -264,8 +271,8 @@ void pack(const PolarSampleArgs<T>& a, const Packed& packed, int64_t b, T* plane
     for (int64_t e = 0; e < packed.pixel; ++e) row[e] = 0;
     row += packed.pixel;
     for (int64_t first = 0; first < a.channels; first += 4) {
-      // Four channels as planes: the image's own where they can be read as they are, else a
-      // converted copy.
+      // Four channels as planes. A plane points into the image if it can be read as it is, and to a
+      // converted copy otherwise.
       const T* plane[4];
       for (int64_t c = 0; c < 4; ++c) {
         T* copy = planes + c * a.width;
@@ -300,8 +307,8 @@ void pack(const PolarSampleArgs<T>& a, const Packed& packed, int64_t b, T* plane
   for (int64_t e = (a.height + 1) * packed.row; e < packed.size; ++e) to[e] = 0;
 }
 
-// The four pixels around a point of a far image, any of which may lie outside, one channel at a
-// time.
+// The four pixels around a point of a far image, read one channel at a time. Any of them may lie
+// outside.
 template <typename T, typename E>
 struct Corners {
   const PolarSampleArgs<T>& args;
@@ -320,7 +327,8 @@ struct Corners {
 
   bool outside() const { return !(left || right) || !(upper || lower); }
 
-  // Upper left, upper right, lower left, lower right. Those outside count as 0.
+  // Returns the upper left, upper right, lower left and lower right pixel. Pixels outside count as
+  // 0.
   Vector<T, 4> read(int64_t channel) const {
     const E* p = image + first + channel * args.image_stride[1];
     const int64_t row = args.image_stride[2], column = args.image_stride[3];

@@ -1,11 +1,14 @@
-// The image's gradient: each point adds its gradient, weighted, to the four pixels around it.
+// Computes the gradient of the image: each point adds its weighted gradient to the four pixels
+// around it.
 //
-// For a small image the sums are kept in cells. A cell holds what points at one place add to the
-// four pixels around them, four channels each: one cache line, added to as a whole. At the end each
-// pixel collects its share of four cells. For a larger image the sums are kept packed
-// (polar_image.h), a pixel a register; for a still larger one they are added up in place.
-// Neighbouring points often meet in one pixel, and an addition must wait for the one before; so
-// points are taken from several places of the circle in turn.
+// For a small image the sums are kept in cells. A cell collects what the points between four pixels
+// add to these pixels, four channels each. It is one cache line, and one step adds to the whole
+// line. At the end each pixel collects its share of four cells. For a larger image the sums are
+// kept in packed form (polar_image.h), one register for each pixel. For a still larger image the
+// sums are added in place.
+//
+// Neighbouring points often add to the same pixel, and an addition must wait for the one before. So
+// the points are taken from several places of the circle in turn.
 #pragma once
 
 #include "polar_rows.h"
@@ -24,7 +27,7 @@ class Scatter {
            kept_rows * sums_layout(a).row * static_cast<int64_t>(sizeof(T));
   }
 
-  // Band `band` of image b.
+  // Adds to band `band` of image b.
   Scatter(const PolarSampleArgs<T>& args, int64_t b, int64_t band, void* scratch)
       : a(args),
         keep(keeping(args)),
@@ -47,7 +50,8 @@ class Scatter {
     for (int64_t e = first_kept() * layout.row; e < end_kept() * layout.row; ++e) sums[e] = 0;
   }
 
-  // Adds the gradients of a ring, whose radius n read(n, to) writes as (num_azimuths, C).
+  // Adds the gradients of a ring. read(n, to) writes the gradients of its radius n as
+  // (num_azimuths, C).
   template <typename Read>
   void ring(int64_t ring, Read read) {
     const int64_t first = ring * a.samples_r;
@@ -75,7 +79,7 @@ class Scatter {
     }
   }
 
-  // Writes the sums to the image's gradient.
+  // Writes the sums to the gradient of the image.
   void finish() const {
     if (keep == kInPlace) return;
     with_pixel_type<T>(a.pixel, [&]<typename E>() {
@@ -96,7 +100,7 @@ class Scatter {
  private:
   enum Keeping { kCells, kPacked, kInPlace };
 
-  // bfloat16 gradients are never added up in place, since their sums are float32.
+  // bfloat16 gradients are never added in place, because their sums are float32.
   static Keeping keeping(const PolarSampleArgs<T>& a) {
     if (!a.packed && a.pixel != Pixel::bf16) return kInPlace;
     const bool cells =
@@ -108,13 +112,13 @@ class Scatter {
     return keeping(a) == kInPlace ? Packed() : Packed(a, keeping(a) == kCells ? 4 : 1);
   }
 
-  // The rows of sums that the band keeps: those of its pixels and, in the outermost bands, of the
-  // border. Cells need the row above as well, so two neighbouring bands each keep one of their own.
+  // The band keeps the sums of its rows of pixels. The outermost bands also keep the border. Cells
+  // need the row above too, so two neighbouring bands each keep their own copy of this row.
   int64_t band_row(int64_t band) const { return a.height * band / a.bands; }
   int64_t first_kept() const { return first_row == 0 ? 0 : first_row + (keep == kCells ? 0 : 1); }
   int64_t end_kept() const { return end_row == a.height ? a.height + 3 : end_row + 1; }
 
-  // Calls visit(k) for all k < count, from several places in turn.
+  // Calls visit(k) for all k < count, taking several places in turn.
   template <typename Visit>
   static void in_turn(int64_t count, Visit visit) {
     constexpr int64_t places = 8;
@@ -126,7 +130,7 @@ class Scatter {
     for (int64_t k = each * places; k < count; ++k) visit(k);
   }
 
-  // A cell is (upper left, upper right, lower left, lower right) of four channels each.
+  // A cell holds (upper left, upper right, lower left, lower right), with four channels each.
   [[gnu::noinline]] void add_to_cells(int64_t count, const T* block) const {
     const int64_t channels = a.channels;
     const PackedPlaces<T>& places = points.near;
@@ -143,7 +147,7 @@ class Scatter {
   static void add_cell(float* cell, const float* grad, float right, float lower) {
     constexpr int lanes = kLanes<float>;
     using V = Vector<float, lanes>;
-    // Weights are 1 - right, right, ... and 1 - lower, ..., lower, ...
+    // The weights are 1 - right, right, ... and 1 - lower, ..., lower, ...
     constexpr float one_x[] = {1, 1, 1, 1, 0, 0, 0, 0, 1, 1, 1, 1, 0, 0, 0, 0};
     constexpr float sign_x[] = {-1, -1, -1, -1, 1, 1, 1, 1, -1, -1, -1, -1, 1, 1, 1, 1};
     constexpr float one_y[] = {1, 1, 1, 1, 1, 1, 1, 1, 0, 0, 0, 0, 0, 0, 0, 0};
@@ -157,13 +161,14 @@ class Scatter {
   }
   static void add_cell(double*, const double*, double, double) {}  // doubles are never in cells
 
-  // Adds up the pixels of a row from the cells around each; the sum replaces its own cell's front.
+  // Adds up the pixels of a row from the cells around each pixel. The sum replaces the front of the
+  // pixel's own cell.
   void collect(const T* row) const {
     using V = Vector<T, 4>;
     T* cell = const_cast<T*>(row);
     for (int64_t x = 0; x < a.width; ++x, cell += layout.pixel) {
       const T *left = cell - layout.pixel, *above = cell - layout.row;
-      // The front of the cell to the left is a sum by now; the part for this pixel is still there.
+      // The front of the left cell already holds a sum. Its part for this pixel is still unchanged.
       store(cell, load<V>(cell) + load<V>(left + 4) +
                       (load<V>(above + 8) + load<V>(above - layout.pixel + 12)));
     }
@@ -177,7 +182,7 @@ class Scatter {
     }
   }
 
-  // A point adds to the rows that are in the band.
+  // Adds a point to those of its rows that are in the band.
   template <bool kBanded>
   void add_pixels(int64_t k, const T* block) const {
     using V = Vector<T, 4>;
@@ -202,12 +207,12 @@ class Scatter {
     }
   }
 
-  // Whether a place in the packed image is in a row of the band.
+  // Returns whether a place in the packed image is in a row of the band.
   bool in_band(int64_t offset) const {
     return offset >= first_kept() * layout.row && offset < end_kept() * layout.row;
   }
 
-  // Blocks of points as in Sampler.
+  // Takes the same blocks of points as Sampler.
   void add_in_place(int64_t first, int64_t line_size) {
     const int64_t strides[2] = {a.width, 1};
     const int64_t token = a.samples_r * a.samples_a;
@@ -260,12 +265,12 @@ class Scatter {
     }
   }
 
-  // Whether points of radius i may touch the band.
+  // Returns whether points of radius i may touch the band.
   bool touches(int64_t i) const {
     if (a.bands == 1) return true;
     const double y = a.center[image * a.center_stride + 1];
     const double most = reach(a, image, i).y + largest_offset(a, image, i) + 2;
-    // NaN compares false, so that it counts as touching.
+    // Comparisons with NaN are false, so NaN counts as touching.
     return !(y + most < first_row || y - most > end_row);
   }
 
@@ -275,7 +280,7 @@ class Scatter {
   const int64_t image, first_row, end_row;
   PlacedPoints<T>& points;
   T* grads;  // one row of gradients
-  T* sums;   // cells or packed image, of which the band's rows are there
+  T* sums;   // cells or packed image; only the band's rows are there
 };
 
 }  // namespace
