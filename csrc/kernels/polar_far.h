@@ -1,7 +1,9 @@
-// Bilinear interpolation in a far image, where it lies: four points at a time where the channels
-// are planes, sixteen by gathers where the CPU is fast at them, a point with all its channels at a
-// time where a pixel's channels lie together, and value by value in other layouts and for points
-// that are not inside.
+// Bilinear interpolation in a far image, in place.
+//
+// There are four ways to read the pixels. If the channels are planes, it takes four points at a
+// time, or sixteen by gathers on CPUs with fast gathers. If the channels of a pixel are neighbours
+// in memory, it takes one point with all its channels. In other layouts, and for points that are
+// not inside, it takes single values.
 #pragma once
 
 #include "polar_image.h"
@@ -9,7 +11,7 @@
 namespace darswin {
 namespace {
 
-// Two values from here and two from there, as floats.
+// Joins two values at `here` and two values at `there`, as floats.
 template <typename E>
 inline Vector<float, 4> two_pairs(const E* here, const E* there) {
   if constexpr (is_same_v<E, float>) {
@@ -26,9 +28,9 @@ inline Vector<float, 4> two_pairs(const E* here, const E* there) {
   }
 }
 
-// The pixels around sixteen points, for registers of 512 bits. Gathers bring a pixel and its right
-// neighbour as one value of 64 bits. A template, since only tiers with such registers have
-// gather_pairs and permuted.
+// The pixels around sixteen points, for registers of 512 bits. Gathers read a pixel and its right
+// neighbour as one value of 64 bits. The struct is a template, because only tiers with such
+// registers have gather_pairs and permuted.
 template <typename T>
 struct FarSixteen {
   using V = Vector<T, 16>;
@@ -52,7 +54,7 @@ struct FarSixteen {
 
   bool inside() const { return !any_negative(offset | offset2); }
 
-  // Bilinear samples of a plane whose rows are `below` apart.
+  // Returns bilinear samples of a plane whose rows are `below` apart.
   V sample(const T* plane, int64_t below) const {
     const T* bottom = plane + below;
     const V pairs = between(gather_pairs(plane, offset), gather_pairs(bottom, offset), up, down);
@@ -62,7 +64,7 @@ struct FarSixteen {
   }
 };
 
-// Sixteen samples of three channels, one behind the other: value n is of channel n % 3.
+// Stores sixteen samples of three channels, one after the other: value n belongs to channel n % 3.
 template <typename T, int kFirst, typename V>
 inline void store_third(const V& x, const V& y, const V& z, T* to) {
   constexpr auto of_two = [](int i) { return (kFirst + i) % 3 * 16 % 32 + (kFirst + i) / 3; };
@@ -76,8 +78,9 @@ inline void store_sixteen(const V& x, const V& y, const V& z, T* to) {
   store_third<T, 32>(x, y, z, to);
 }
 
-// Where the samples of a line go: sample k to to[k * step]. A store of four values may reach beyond
-// a sample that has fewer, where the next sample of the line follows or, if `spare`, anywhere.
+// The output places of a line: sample k goes to to[k * step]. A sample may have fewer than four
+// values. A store of four values may reach beyond it if the next sample of the line follows there,
+// or anywhere if `spare` is true.
 template <typename T>
 struct FarOutput {
   T* to;
@@ -85,7 +88,7 @@ struct FarOutput {
   bool spare;
 };
 
-// An image whose pixels are of type E, read at the places of a block of points.
+// An image with pixels of type E, read at the places of a block of points.
 template <typename T, typename E>
 class FarImage {
  public:
@@ -100,17 +103,17 @@ class FarImage {
         next(args.image_stride[3]),
         layout(layout_of(args)) {}
 
-  // How many reads, far apart, the channels of a pixel take.
+  // Returns how many separate places in memory the channels of a pixel are read from.
   int64_t planes() const { return layout == kTogether ? 1 : channels; }
 
-  // Fetches the pixels of a line to come.
+  // Prefetches the pixels of a later line.
   void fetch(const Line& line) const {
     fetch_pixels(places, line, pixels, planes(), channel, below);
   }
 
-  // Samples the first `count` points of the block by gathers, one behind the other: gray images and
-  // those of three planes. The last sixteen points may have been sampled in part by those before.
-  // There is no prefetching: gathers wait for many pixels at once.
+  // Samples the first `count` points of the block by gathers, one after the other. The images are
+  // gray or have three planes. The last sixteen points may include some that the step before has
+  // already sampled. There is no prefetching, because gathers wait for many pixels at once.
   void block(int64_t count, T* to) const {
     if constexpr (kRegister == 64 && is_same_v<E, float>) {
       const Line all{true, 0, 0, 0, 0, 1, count};
@@ -167,8 +170,9 @@ class FarImage {
     return together && a.channels > 1 && a.channels <= 4 ? kTogether : kAny;
   }
 
-  // The last four points may have been sampled in part by those before. `kRow` says that the points
-  // and their samples follow each other.
+  // Samples a line, four points at a time. The last four may include points that the step before
+  // has already sampled. `kRow` means that the points and their samples follow each other in
+  // memory.
   template <int kChannels, bool kRow>
   void fours(const Line& line, const FarOutput<T>& out) const {
     if (line.count < 4) return points(line, 0, line.count, out);
@@ -208,8 +212,8 @@ class FarImage {
       if constexpr (is_same_v<E, uint8_t>) return v * a.pixel_scale[c] + a.pixel_offset[c];
       return v;
     };
-    // Nothing is computed in two branches: the compiler would take what they share out of both and,
-    // with it, one half of what it fuses elsewhere.
+    // No computation is written in two branches. The compiler would move the common part out of
+    // both branches. It would then no longer fuse one half of what it fuses elsewhere.
     if constexpr (kChannels == 3) {
       store_three<kRow>(plane(0), plane(1), plane(2), out);
       return;
@@ -224,7 +228,7 @@ class FarImage {
     }
   }
 
-  // Four samples of three channels.
+  // Stores four samples of three channels.
   template <bool kRow>
   static void store_three(V x, V y, V z, const FarOutput<T>& out) {
     if constexpr (kRow) {
@@ -259,7 +263,7 @@ class FarImage {
         points(line, k, k + 1, out);
         continue;
       }
-      // The load of the right neighbour ends with its last channel, so that all stay in the image.
+      // The load of the right neighbour ends with its last channel, so that it stays in the image.
       const E *pixel = pixels + places.offset[place], *neighbour = pixel + next - kSkip;
       const V down = splat<V>(places.lower[place]), right = splat<V>(places.right[place]);
       const V up = 1 - down;
@@ -277,7 +281,7 @@ class FarImage {
     }
   }
 
-  // Points [begin, end) of a line, which may lie on the border or outside.
+  // Samples points [begin, end) of a line, which may lie on the border or outside.
   void points(const Line& line, int64_t begin, int64_t end, const FarOutput<T>& out) const {
     for (int64_t k = begin; k < end; ++k) {
       const int64_t place = line.place + k * line.step, offset = places.offset[place];
@@ -307,7 +311,7 @@ class FarImage {
   const int64_t b;
   const FarPlaces<T>& places;
   const E* pixels;
-  const int64_t channels, channel, below, next;  // strides: to the next channel, row, column
+  const int64_t channels, channel, below, next;  // strides to the next channel, row, column
   const Layout layout;
 };
 

@@ -1,15 +1,18 @@
-// Where the points of a polar grid stand, a register of points at a time.
+// Computes the positions of the points of a polar grid, one register of points at a time.
 //
-// A polar grid is separable: point (i, j) needs radius i and azimuth j, so two short vectors stand
-// for the whole (N_r, N_a, 2) mesh that grid_sample would read. Places are computed in double: in
-// float a coordinate of 100 px is only good to 1e-5 px, the largest error of the whole operation.
-// Jitter moves a point by a fraction of a cell along both vectors. Its numbers come from a
-// counter-based generator, one word a point, so that backward finds the same places again.
+// A polar grid is separable: point (i, j) needs only radius i and azimuth j. So two short vectors
+// replace the whole (N_r, N_a, 2) mesh that grid_sample would read. Positions are computed in
+// double. In float, a coordinate of 100 px is only accurate to 1e-5 px, which would be the largest
+// error of the whole operation.
 //
-// In a circular lens a point stands at its radius and azimuth. A general lens has a matrix, which
-// stretches circles to ellipses, or offsets, which move each point on its own. The loops over
-// points are compiled for both (structs Circular and General), so circular lenses pay nothing for
-// general ones.
+// Jitter moves a point by a fraction of a cell along both vectors. Its random numbers come from a
+// counter-based generator, one word for each point, so that backward finds the same positions
+// again.
+//
+// With a circular lens, a point lies at its radius and azimuth. A general lens has a matrix, which
+// stretches circles to ellipses, or offsets, which move each point separately. The loops over
+// points are compiled for both kinds (structs Circular and General), so circular lenses pay nothing
+// for general ones.
 #pragma once
 
 #include "../polar.h"
@@ -18,17 +21,17 @@
 namespace darswin {
 namespace {
 
-constexpr int kBlock = 1024;  // points that are worked on at a time
+constexpr int kBlock = 1024;  // points that are processed at a time
 
 using Masks = Vector<int64_t, kDoubles>;
 
-// Philox4x32-10, a counter-based generator: the words of (key, counter) depend on nothing else, so
-// any thread can make the jitter of any point, forward and again in backward.
-// Salmon, Moraes, Dror, Shaw: "Parallel random numbers: as easy as 1, 2, 3", SC 2011.
+// Philox4x32-10, a counter-based generator. Its words depend only on (key, counter). So any thread
+// can make the jitter of any point, in forward and again in backward. Source: Salmon, Moraes, Dror,
+// Shaw: "Parallel random numbers: as easy as 1, 2, 3", SC 2011.
 //
-// A register of counters runs at once, each 32-bit word in the lower half of a 64-bit lane. The
-// upper halves hold whatever the last product left there: the next product does not read them.
-// The four words for each counter, 128 bits in two parts, in the lower halves of word[0..3].
+// A register of counters runs at once. Each 32-bit word is in the lower half of a 64-bit lane. The
+// upper half holds what the last product left there, and the next product does not read it. A
+// counter has 128 bits, in two parts. Its four words come out in the lower halves of word[0..3].
 inline void philox(uint64_t key, Words counter, uint64_t counter_upper, Words word[4]) {
   uint32_t k0 = static_cast<uint32_t>(key), k1 = static_cast<uint32_t>(key >> 32);
   Words c0 = counter, c1 = counter >> 32;
@@ -49,10 +52,10 @@ inline void philox(uint64_t key, Words counter, uint64_t counter_upper, Words wo
   word[3] = c3;
 }
 
-// The random words of a block of points: word p % 4 of counter p / 4 for point p of the image.
+// The random words of a block of points. Point p of the image gets word p % 4 of counter p / 4.
 struct RandomWords {
   uint32_t word[kBlock + 8 * kLanes<uint64_t>];
-  int64_t first;  // place of the block's first point
+  int64_t first;  // place of the block's first point in `word`
 
   void draw(uint64_t seed, uint64_t image, uint64_t point, int64_t count) {
     constexpr int lanes = kLanes<uint64_t>;
@@ -81,10 +84,10 @@ struct Points {
   Doubles radius;        // px
   Doubles across, down;  // d(x, y) / d(radius)
   Doubles shift;         // how far jitter moved them along the radius, in cells
-  Masks clamped;         // whether their radius would have been negative
+  Masks clamped;         // lanes whose radius would have been negative
 };
 
-// A circular lens: puts points at their radius and azimuth around the center of image b.
+// A circular lens places points at their radius and azimuth around the center of image b.
 template <typename T>
 struct Circular {
   double x, y;
@@ -100,8 +103,8 @@ struct Circular {
   }
 };
 
-// A general lens: the same through the matrix and with the offsets of points j to j + count of
-// radius i.
+// A general lens also applies the matrix, and adds the offsets of points j to j + count of radius
+// i.
 template <typename T>
 struct General {
   const Circular<T> center;
@@ -129,8 +132,8 @@ struct General {
     p.y += read(y_offsets + k);
   }
 
-  // A register of offsets; the last one of all may not be whole. Those of the next block are
-  // `count` further on, where the hardware's own prefetching does not look.
+  // Reads a register of offsets. The last register of all may not be whole. The offsets of the next
+  // block are `count` further on. The hardware does not prefetch so far, so this function does.
   Doubles read(const T* from) const {
     using V = Vector<T, kDoubles>;
     __builtin_prefetch(from + count);
@@ -141,11 +144,12 @@ struct General {
   }
 };
 
-// x, or NaN where it is infinite: a radius of minus infinity, moved and clamped, would become 0.
+// Returns x, or NaN if x is infinite. Otherwise a radius of minus infinity would become 0 after it
+// is moved and clamped.
 inline double finite(double x) { return x - x == 0 ? x : __builtin_nan(""); }
 
-// How far from the center the points of a radius may stand without their offsets; NaN if the radius
-// or the matrix is.
+// The largest distance of the points of a radius from the center, without their offsets. It is NaN
+// if the radius or the matrix is NaN.
 struct Reach {
   double x, y;
 };
@@ -166,7 +170,7 @@ Reach reach(const PolarSampleArgs<T>& a, int64_t b, int64_t i) {
           most * (__builtin_fabs(matrix[2]) + __builtin_fabs(matrix[3]))};
 }
 
-// The largest offset along y of the points of radius i. NaN does not count.
+// Returns the largest offset along y of the points of radius i. NaN does not count.
 template <typename T>
 double largest_offset(const PolarSampleArgs<T>& a, int64_t b, int64_t i) {
   if (a.offsets == nullptr) return 0;
@@ -180,7 +184,8 @@ double largest_offset(const PolarSampleArgs<T>& a, int64_t b, int64_t i) {
   return most;
 }
 
-// locate_through() with jitter. `tiny` turns are small enough for short sums to give their sines.
+// Does the work of locate_through() with jitter. `tiny` means that turns are so small that short
+// sums give their sines.
 template <bool tiny, typename T, typename Lens, typename Visit>
 void locate_moved(const PolarSampleArgs<T>& a, const Lens& lens, int64_t b, int64_t i, int64_t j,
                   int64_t count, const RandomWords& random, const Visit& visit) {
@@ -197,7 +202,7 @@ void locate_moved(const PolarSampleArgs<T>& a, const Lens& lens, int64_t b, int6
   const double *cosines = a.cosines + j, *sines = a.sines + j;
   const uint32_t* words = random.word + random.first;
   for (int64_t k = 0; k < count; k += kDoubles) {
-    // u and v in [-1/2, 1/2) are the halves of a word.
+    // u and v in [-1/2, 1/2) come from the two halves of a word.
     const auto word = load<Vector<uint32_t, kDoubles>>(words + k);
     const Doubles u = to_doubles((Ints)(word >> 16));
     const Doubles v = to_doubles((Ints)(word & 0xFFFF));
@@ -221,7 +226,7 @@ void locate_moved(const PolarSampleArgs<T>& a, const Lens& lens, int64_t b, int6
   }
 }
 
-// locate() for one kind of lens, Circular or General.
+// Does the work of locate() for one kind of lens, Circular or General.
 template <typename T, typename Lens, typename Visit>
 void locate_through(const PolarSampleArgs<T>& a, const Lens& lens, int64_t b, int64_t i, int64_t j,
                     int64_t count, RandomWords& random, const Visit& visit) {
@@ -247,8 +252,8 @@ void locate_through(const PolarSampleArgs<T>& a, const Lens& lens, int64_t b, in
   }
 }
 
-// Calls visit(k, points) for points j + k, j + k + 1, ... of radius i of image b; k < count. The
-// last register may reach beyond count.
+// Calls visit(k, points) for points j + k, j + k + 1, ... of radius i of image b, with k < count.
+// The last register may reach beyond count.
 template <typename T, typename Visit>
 void locate(const PolarSampleArgs<T>& a, int64_t b, int64_t i, int64_t j, int64_t count,
             RandomWords& random, const Visit& visit) {

@@ -1,4 +1,5 @@
-// Rows of samples, which are all points of one radius, in the operator's output or its gradient.
+// Reads and writes rows of samples in the operator's output or its gradient. A row holds all points
+// of one radius.
 #pragma once
 
 #include "polar_image.h"
@@ -6,8 +7,8 @@
 namespace darswin {
 namespace {
 
-// Point (sector, s), channel c, of a row lies at
-// first + sector * sector_stride + s * sample_stride + c * channel_stride.
+// The layout of a row. Channel c of point (sector, s) is at first + sector * sector_stride + s *
+// sample_stride + c * channel_stride.
 struct Row {
   int64_t first, sector_stride, sample_stride, channel_stride;
 };
@@ -24,13 +25,13 @@ Row output_row(const PolarSampleArgs<T>& a, int64_t b, int64_t i) {
   return {ring * sectors * token + i % a.samples_r * piece, token, a.channels, 1};
 }
 
-// Room for one row, of pixels padded to four channels.
+// Returns the bytes of one row, with pixels padded to four channels.
 template <typename T>
 int64_t row_bytes(const PolarSampleArgs<T>& a) {
   return round_up((a.num_azimuths * round_up(a.channels, 4) + 16) * sizeof(T), 64);
 }
 
-// Calls use<E>() with the type of the output, or of its gradient.
+// Calls use<E>(), where E is the type of the output or of its gradient.
 template <typename T, typename Use>
 void with_output_type(const PolarSampleArgs<T>& a, Use use) {
   if constexpr (is_same_v<T, float>) {

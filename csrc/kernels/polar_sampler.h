@@ -1,4 +1,6 @@
-// Forward: samples one token after another, from the packed image or, if it is far, where it lies.
+// Forward of polar sampling: samples one token after another, from the packed image or, if the
+// image is far, in place.
+//
 // Interpolation in a packed image goes first downwards, then to the right, four channels at a time.
 #pragma once
 
@@ -8,10 +10,10 @@ namespace darswin {
 namespace {
 
 // Interpolation uses weights, (1 - t) * a + t * b, or differences, a + t * (b - a). Differences
-// overflow between huge values and give NaN between infinite ones. Weights cost more, but not for
-// registers of 512 bits, which hold four points. The other tiers try differences first and, where a
-// sample is not finite, take the whole block of points again with weights; its other samples may
-// then differ in their last bit.
+// overflow between huge values and give NaN between infinite values. Weights cost more, except in
+// registers of 512 bits, which hold four points. So the other tiers try differences first. If a
+// sample is not finite, they compute the whole block of points again with weights. The other
+// samples of the block may then differ in their last bit.
 template <typename T>
 constexpr bool kTryDifferences = is_same_v<T, float> && kRegister < 64;
 
@@ -24,12 +26,13 @@ inline V between(V a, V b, V t) {
   }
 }
 
-// Four channels, or as many as a register holds.
+// Four channels, or as many channels as a register holds.
 template <typename T>
 using Piece = Vector<T, (kLanes<T> < 4 ? kLanes<T> : 4)>;
 
-// Writes four channels of a sample, given the upper left and the lower left pixel; their right
-// neighbours follow them in memory. With differences, also adds what it writes to *sum.
+// Writes four channels of a sample. The arguments are the upper left and the lower left pixel;
+// their right neighbours follow them in memory. With differences, the function also adds the sample
+// to *sum.
 template <bool kWeights, typename T>
 inline void interpolate(const T* pixel, const T* below, T right, T lower, T* to, Piece<T>* sum) {
   using V = Piece<T>;
@@ -54,10 +57,11 @@ inline void interpolate(const T* pixel, const T* below, T right, T lower, T* to,
   }
 }
 
-// Four points in a register of 512 bits: two pairs of pixels and the two pairs below, then four
-// pixels and their right neighbours. Loads and stores are what limits a single point; here one load
-// each brings the weights of four, and points that follow each other are written by one store. A
-// template, since only tiers with such registers have two_eights and pick.
+// Interpolates four points in a register of 512 bits. It first takes two pairs of pixels and the
+// two pairs below them, then four pixels and their right neighbours. Loads and stores limit the
+// speed of a single point. Here one load brings the weights of four points, and one store writes
+// points that follow each other. The function is a template, because only tiers with such registers
+// have two_eights and pick.
 template <typename T>
 inline Vector<T, 16> interpolate_four(const T* pixels, const T* below, const int32_t* offset,
                                       const T* right, const T* lower) {
@@ -76,7 +80,7 @@ inline Vector<T, 16> interpolate_four(const T* pixels, const T* below, const int
   return between<true>(l, r, pick(along, all));
 }
 
-// Whether all lanes are finite.
+// Returns whether all lanes are finite.
 template <typename V>
 inline bool all_finite(const V& v) {
   bool finite = true;
@@ -84,19 +88,22 @@ inline bool all_finite(const V& v) {
   return finite;
 }
 
-// Where the points of a block go: point k to to[place[k]]. room[k] is how many values follow from
-// there to the end of a token's row; more than kRoom count as that.
+// The output places of a block of points: point k goes to to[place[k]]. room[k] is the number of
+// values from there to the end of the row of a token, but at most kRoom.
 constexpr int64_t kRoom = 16;
 struct Targets {
   int32_t place[kBlock], room[kBlock];
 };
 
-// Samples `count` points of a packed image. A point stores four values even if it has fewer
-// channels: the point that belongs behind it comes later and overwrites the rest. But behind a
-// token may be what is written already, or what another thread writes. So the last points of a
-// token's last row, which begins at point `last_row`, store only their own values. Returns false if
-// it used differences and a sample is not finite, which the sum of all samples shows. A function of
-// its own, so that all it needs stays in registers.
+// Samples `count` points of a packed image.
+//
+// A point stores four values even if it has fewer channels. The next point of the row comes later
+// and overwrites the excess. But the memory after a token may hold finished values, or another
+// thread may write there. So the last points of a token's last row, which begins at point
+// `last_row`, store only their own values.
+//
+// Returns false if it used differences and a sample is not finite. The sum of all samples shows
+// this. This is a separate function, so that all its values stay in registers.
 template <bool kWeights, typename T>
 [[gnu::noinline]] bool sample_points(const T* pixels, int64_t row, const PackedPlaces<T>& places,
                                      int64_t last_row, int64_t count, const Targets& targets,
@@ -147,8 +154,8 @@ class Sampler {
   }
 
   // Channel c of sample (row, s) of a sector's token goes to to[sector * sector_stride + row *
-  // row_stride + s * C + c]. Either each token is contiguous, or each row, one radius of all
-  // tokens, is and has room for three values behind it.
+  // row_stride + s * C + c]. There are two layouts. Either each token is contiguous, or each row
+  // (one radius of all tokens) is contiguous and has room for three values behind it.
   Sampler(const PolarSampleArgs<T>& args, int64_t sector_stride, int64_t row_stride, void* scratch)
       : a(args),
         packed(args.packed ? Packed(args) : Packed()),
@@ -183,7 +190,7 @@ class Sampler {
     }
     const int64_t columns = block_columns(), rows = smaller(kBlock / columns, a.samples_r);
     for (int64_t j = 0, count; j < a.num_azimuths; j += count) {
-      // Where a token has more points than a block, no block reaches beyond its token.
+      // If a token has more points than a block, a block ends at the end of its token.
       const int64_t left =
           columns < a.samples_a ? a.samples_a - j % a.samples_a : a.num_azimuths - j;
       count = smaller(columns, left);
@@ -200,15 +207,15 @@ class Sampler {
     T samples[4 * kBlock];
   };
 
-  // No point of a block is stored further than this from the block's first.
+  // Returns a bound of the distance from the block's first point in the output to any other.
   int64_t reach_of_block() const {
     return smaller(kBlock, a.samples_r) * row_stride +
            block_columns() / a.samples_a * sector_stride;
   }
 
-  // A block is a few whole tokens, so that their pixels and their output stay in the nearest cache.
-  // Blocks are of equal size if that does not make them small. A token of more points than a block
-  // holds is cut into several blocks.
+  // Returns the number of columns of a block. A block is a few whole tokens, so that their pixels
+  // and their output stay in the first-level cache. Blocks are of equal size if this does not make
+  // them small. If a token has more points than a block holds, it is cut into several blocks.
   int64_t block_columns() const {
     const int64_t sectors = a.num_azimuths / a.samples_a;
     const int64_t most = kBlock / (a.samples_r * a.samples_a);
@@ -218,7 +225,7 @@ class Sampler {
     return tokens * a.samples_a;
   }
 
-  // Points j to j + count of `rows` radii of a ring, from its radius `row` on.
+  // Samples points j to j + count of `rows` radii of a ring, starting at its radius `row`.
   void block(int64_t b, int64_t ring, int64_t j, int64_t count, int64_t row, int64_t rows, T* to) {
     const int64_t first = ring * a.samples_r + row;
     T* out = to + j / a.samples_a * sector_stride + j % a.samples_a * a.channels + row * row_stride;
@@ -232,18 +239,18 @@ class Sampler {
     for (int64_t n = 0; n < rows; ++n) {
       points.find(a, packed, b, first + n, j, count, n * count);
       if (row_stride == a.samples_a * a.channels && rows == a.samples_r) {
-        // The tokens of the next block come behind these: prefetches where they will be written.
+        // The tokens of the next block follow these in memory, so this prefetches their place.
         const char* next =
             reinterpret_cast<const char*>(to + (j + count) / a.samples_a * sector_stride);
         const int64_t bytes = count * row_stride / a.samples_a * sizeof(T);
         for (int64_t e = n * bytes; e < (n + 1) * bytes; e += 64) __builtin_prefetch(next + e, 1);
       }
     }
-    // The targets are those of a whole block. They hold for a smaller block only if its points are
-    // of one radius.
+    // The targets are computed for a whole block. They suit a smaller block only if all its points
+    // have the same radius.
     if (in_line && (rows == 1 || count == smaller(block_columns(), a.num_azimuths))) {
-      // Behind the last row of tokens of several rows is what is written already. All else comes
-      // later, but for what lies behind the block's last three points.
+      // If tokens have several rows, the memory behind their last row is already written. All other
+      // memory is written later, except behind the last three points of the block.
       const bool last = row + rows == a.samples_r && a.samples_r > 1;
       const int64_t all = rows * count, last_row = last ? all - count : all - 3;
       const auto sample = [&]<bool kWeights>() {
@@ -261,7 +268,8 @@ class Sampler {
     }
   }
 
-  // Samples points j to j + count of a radius, of any number of channels, from place `place` on.
+  // Samples points j to j + count of a radius, with any number of channels, starting at place
+  // `place`.
   void near_row(int64_t j, int64_t count, int64_t place, T* row) const {
     for (int64_t k = 0; k < count; ++k) {
       T* to = row + (j + k) / a.samples_a * sector_stride + (j + k) % a.samples_a * a.channels;
@@ -278,8 +286,9 @@ class Sampler {
     }
   }
 
-  // Samples a block in the far image. What lies behind a line of samples may be overwritten where
-  // the token has more of them, which come later: all but the lines that end a row of it.
+  // Samples a block in the far image. The values behind a line of samples may be overwritten if the
+  // token has more samples there, which come later. This holds for all lines except those that end
+  // a row of the token.
   template <typename E>
   [[gnu::noinline]] void far_lines(int64_t b, int64_t j, int64_t rows, int64_t count, T* to) const {
     const FarImage<T, E> far(a, b, points.far);
@@ -315,7 +324,7 @@ class Sampler {
   const bool in_line;
   State& state;
   PlacedPoints<T>& points;
-  T* image;  // packed, and after it the rows that pack() converts
+  T* image;  // packed image, then the rows that pack() converts
   int64_t image_in_hand = -1;
 };
 
