@@ -1,5 +1,6 @@
-// Loads that widen, stores that round: a kernel computes in float or double, whatever its numbers
-// are stored as. bfloat16 is the upper half of a float32. Here V is a float or a vector of floats.
+// Loads that widen numbers and stores that round them. A kernel computes in float or double,
+// whatever the storage type is. bfloat16 is the upper half of a float32. In this file, V is a float
+// or a vector of floats.
 #pragma once
 
 #include "simd.h"
@@ -38,8 +39,8 @@ struct BitsOfFloats<float> {
 template <typename V>
 using BitsOf = typename BitsOfFloats<V>::type;
 
-// The bits of a float or of a vector of floats, rounded to those that bfloat16 has, which are the
-// upper ones: to nearest, ties to even. NaN stays NaN, even if its payload lies in the lower half.
+// Returns bits whose upper half is the float, or each float of a vector, as a bfloat16. It rounds
+// to nearest, ties to even. NaN stays NaN, even if its payload is only in the lower half.
 template <typename V>
 inline BitsOf<V> rounded(V x) {
   const auto bits = __builtin_bit_cast(BitsOf<V>, x);
@@ -52,7 +53,7 @@ inline void store(bfloat16* to, V x) {
   store_bits(to, __builtin_convertvector(rounded(x) >> 16, Vector<uint16_t, kCount<V>>));
 }
 
-// Copies short runs: whole registers, the last of them over the one before.
+// Copies short runs in whole registers. The last register overlaps the one before.
 template <typename T>
 inline void copy(const T* from, int64_t count, T* to) {
   constexpr int64_t lanes = kLanes<T>;
@@ -70,7 +71,7 @@ inline void copy(const T* from, int64_t count, T* to) {
     for (; e < count; ++e) to[e] = from[e];
   }
 }
-template <typename From, typename To>  // one of them bfloat16, the other one float
+template <typename From, typename To>  // one of them is bfloat16, the other is float
 inline void copy(const From* from, int64_t count, To* to) {
   constexpr int64_t lanes = kLanes<float>;
   int64_t e = 0;

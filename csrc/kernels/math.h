@@ -1,11 +1,11 @@
-// Maths for both types. Built-ins rather than <cmath>: an inline function of the standard library
-// would come out of every tier (see tier.h).
+// Mathematical functions for float and double. They use compiler built-ins instead of <cmath>,
+// because an inline function of the standard library would be compiled in every tier (see tier.h).
 #pragma once
 
 #include "simd.h"
 
-// The exp that glibc has had from the start: the one of 2.29 computes the same and reports errors
-// in another way, and manylinux_2_28 lacks it (see portable.cpp).
+// Selects the old version of exp, which every glibc has. The version of glibc 2.29 computes the
+// same and only reports errors differently, and manylinux_2_28 lacks it (see portable.cpp).
 #if defined(__GLIBC__) && defined(__x86_64__)
 __asm__(".symver exp, exp@GLIBC_2.2.5");
 #elif defined(__GLIBC__) && defined(__aarch64__)
@@ -15,7 +15,7 @@ __asm__(".symver exp, exp@GLIBC_2.17");
 namespace darswin {
 namespace {
 
-// The larger one in each lane; NaN where b is NaN.
+// Returns the larger value in each lane, or NaN if b is NaN.
 template <typename V>
 inline V larger(V a, V b) {
   return a > b ? a : b;
@@ -24,20 +24,21 @@ inline V larger(V a, V b) {
 inline float root(float x) { return __builtin_sqrtf(x); }
 inline double root(double x) { return __builtin_sqrt(x); }
 
-// e^x for x <= 0, within 1 unit in the last place; below 2^-126 it becomes 0. NaN stays NaN.
+// Returns e^x for x <= 0, within 1 unit in the last place. Results below 2^-126 become 0. NaN stays
+// NaN.
 inline Floats exponential_of_negative(Floats x) {
   using V = Floats;
   using Bits = Vector<uint32_t, kLanes<float>>;
-  // x = n ln 2 + r. Adding 1.5 * 2^23 rounds to the nearest integer n and leaves it in the lower
-  // bits; at the lowest x it is -127, which makes the power of two below a zero.
+  // x = n ln 2 + r. Adding 1.5 * 2^23 rounds to the nearest integer n and leaves n in the lower
+  // bits. At the lowest x, n is -127, and the power of two computed below becomes zero.
   const float shift = 12582912.0f;
   const V bounded = larger(splat<V>(-88.02969f), x);
   const V shifted = bounded * 1.44269504f + shift;
   const V n = shifted - shift;
   const V r = (bounded - n * 0.693359375f) + n * 2.12194440e-4f;
   const V power = (V)(((Bits)shifted + 127) << 23);
-  // e^r = 1 + r + r^2 q(r), with q fitted for the least relative error; a tree, since a chain of
-  // products would keep the next ones waiting.
+  // e^r = 1 + r + r^2 q(r), where q is fitted for the least relative error. q is computed as a
+  // tree: in a chain, each product would wait for the one before.
   const V r2 = r * r;
   const V tail = r2 * 1.3814536e-3f + (r * 8.368745e-3f + 4.1668393e-2f);
   const V q = r2 * tail + (r * 0.16666521f + 0.49999994f);
@@ -50,9 +51,9 @@ inline Doubles exponential_of_negative(Doubles x) {
 
 constexpr double kPi = 3.14159265358979323846;
 
-// Both to an ulp or two, at any angle. NaN and infinity give NaN.
+// Computes both to one or two units in the last place, at any angle. NaN and infinity give NaN.
 inline void sin_cos(Doubles angle, Doubles* sin, Doubles* cos) {
-  // Beyond this the three parts of pi/2 below are too few.
+  // For larger angles, the three parts of pi/2 below are not accurate enough.
   constexpr double limit = 1e5;
   const auto beyond = (angle > limit) | (angle < -limit);
   int64_t large = 0;
@@ -65,8 +66,8 @@ inline void sin_cos(Doubles angle, Doubles* sin, Doubles* cos) {
     return;
   }
   // angle = quarter * pi/2 + t with |t| <= pi/4. The first two parts of pi/2 have 33 bits each, so
-  // that their products with `quarter` are exact. Adding 1.5 * 2^52 rounds to an integer, which
-  // then stands in the lowest bits.
+  // that their products with `quarter` are exact. Adding 1.5 * 2^52 rounds to an integer, which is
+  // then in the lowest bits.
   const Doubles shifted = angle * (2 / kPi) + 0x1.8p52;
   const Words quarter = (Words)shifted;
   const Doubles n = shifted - 0x1.8p52;
@@ -92,7 +93,7 @@ inline void sin_cos(Doubles angle, Doubles* sin, Doubles* cos) {
   *cos = (Doubles)((Words)select(swap, s, c) ^ minus_cos);
 }
 
-// Both to 3e-11, for angles of at most kTiny.
+// Computes both to 3e-11, for angles of at most kTiny.
 constexpr double kTiny = 0.02;
 inline void tiny_sin_cos(Doubles t, Doubles* sin, Doubles* cos) {
   const Doubles z = t * t;
@@ -100,15 +101,15 @@ inline void tiny_sin_cos(Doubles t, Doubles* sin, Doubles* cos) {
   *cos = 1 + z * (-1 / 2.0 + z * (1 / 24.0));
 }
 
-// The azimuth of (x, y), in [-pi, pi], to two units in the last place; 0 at (0, 0). Where a lane is
-// not `known`, its x and y may be anything, and the azimuth is some number.
+// Returns the azimuth of (x, y), in [-pi, pi], to two units in the last place. At (0, 0) it is 0.
+// In lanes that are not `known`, x and y may be anything, and the azimuth is an arbitrary number.
 template <typename Mask>
 inline Floats arc_tangent(Floats y, Floats x, Mask known) {
   const Floats across = x < 0 ? -x : x, down = y < 0 ? -y : y;
   const auto steep = down > across;
   const Floats most = steep ? down : across, least = steep ? across : down;
   const Floats ratio = select(known & (most > 0), least / most, Floats{});
-  // atan(q) / q as a polynomial of q^2, at the nodes of Chebyshev's on [0, 1].
+  // atan(q) / q as a polynomial of q^2, which interpolates at the Chebyshev nodes on [0, 1].
   constexpr float terms[] = {1.0487650e-2f, -3.0351866e-2f, 5.7089556e-2f, -8.3497249e-2f,
                              1.0932341e-1f, -1.4260016e-1f, 1.9998075e-1f, -3.3333278e-1f};
   const Floats z = ratio * ratio;

@@ -1,39 +1,40 @@
-// Vector code that is the same on every tier: written once for registers of kRegister bytes, it
-// becomes SSE, AVX2 or AVX-512 code, whatever the tier's flags allow; a*b + c becomes one fused
-// instruction where the tier has it.
+// Vector code for all tiers. It is written once, for registers of kRegister bytes. The flags of the
+// tier turn it into SSE, AVX2 or AVX-512 code. a*b + c becomes one fused instruction if the tier
+// has it.
 #pragma once
 
 #include <cstdint>
 
 #include "../numbers.h"
 #include "vector.h"
-#include TIER_HEADER  // tiers/*.h, as CMakeLists.txt says
+#include TIER_HEADER  // tiers/*.h; CMakeLists.txt names it
 
 namespace darswin {
 namespace {
 
-// Lanes of T in one register.
+// The number of lanes of T in one register.
 template <typename T>
 constexpr int kLanes = kRegister / static_cast<int>(sizeof(T));
 constexpr int kDoubles = kLanes<double>;
 
-// n, or the next multiple of `unit`.
+// Rounds n up to a multiple of `unit`.
 constexpr int64_t round_up(int64_t n, int64_t unit) { return (n + unit - 1) / unit * unit; }
 
 inline int64_t smaller(int64_t x, int64_t y) { return x < y ? x : y; }
 
-// Brings what will be read into the second-level cache: in the first, rows of an image whose width
-// is a power of two share few sets. The empty assembly makes it count as doing something; functions
-// that only prefetch are else called never.
+// Prefetches into the second-level cache. The first-level cache would not do: rows of an image
+// whose width is a power of two share few of its sets. The empty assembly gives the function a
+// visible effect; otherwise the compiler drops calls to functions that only prefetch.
 inline void fetch(const void* what) {
   __builtin_prefetch(what, 0, 2);
   asm volatile("");
 }
 
-// (1 - t) * a + t * b, given both weights. Weights rather than a + t * (b - a), since the
-// difference of huge values overflows, and infinity less anything but itself would become NaN later
-// on. Which of the two products is fused into the sum is fixed, so that every copy of the code
-// gives the same; for single values in a form that loops over them can be made vectors of.
+// Returns (1 - t) * a + t * b, given both weights. The form a + t * (b - a) would not do: the
+// difference of huge values overflows, and infinity minus anything but itself would become NaN
+// later on. The code fixes which of the two products is fused into the sum, so that every copy of
+// the code gives the same result. Single values use a form that the compiler can turn into vector
+// code.
 template <typename V, typename Weight>
 inline V between(V a, V b, Weight one_less_t, Weight t) {
   if constexpr (kFused && is_same_v<V, float>) {
@@ -49,15 +50,16 @@ inline Vector<float, 4> lower_half(Vector<float, 8> v) {
   return __builtin_shufflevector(v, v, 0, 1, 2, 3);
 }
 inline Vector<float, 4> upper_half(Vector<float, 8> v) {
-#if defined(__AVX__)  // the compiler's own shuffle is a slow one
+#if defined(__AVX__)  // the compiler's own shuffle is slow here
   return (Vector<float, 4>)_mm256_extractf128_ps((__m256)v, 1);
 #else
   return __builtin_shufflevector(v, v, 4, 5, 6, 7);
 #endif
 }
 
-// One step of the square transpose of N vectors: pairs are split into their even and odd parts,
-// these go to the lower and the upper half. After log2(N) steps row i of lane j is row j of lane i.
+// One step of the square transpose of N vectors. It splits pairs into their even and odd parts, and
+// moves these to the lower and the upper half. After log2(N) steps, row i of lane j is row j of
+// lane i.
 template <int N, typename V, typename Even, typename Odd>
 inline void split_pairs(V* rows, int stride, Even even, Odd odd) {
   V next[N];
@@ -70,11 +72,12 @@ inline void split_pairs(V* rows, int stride, Even even, Odd odd) {
   for (int i = 0; i < N; ++i) rows[i * stride] = next[i];
 }
 
-// Writes the transpose of a square of kLanes x kLanes, its rows `stride` apart: of each 4 x 4
-// inside its 128 bits, then of the 128 bits among themselves.
+// Writes the transpose of a square of kLanes x kLanes. The rows of `to` are `stride` apart. The
+// first part transposes each 4 x 4 square within 128 bits. The second part transposes the blocks of
+// 128 bits among themselves.
 inline void transpose_square(Floats* rows, float* to, int64_t stride) {
   constexpr int kL = kLanes<float>, kQuads = kL / 4;
-  // As evens and odds, within each 128 bits.
+  // The even and odd parts, within each 128 bits.
   const auto even = [](Floats a, Floats b) {
     return shuffle<[](int i) { return i / 4 * 4 + i % 2 * 2 + i / 2 % 2 * kL; }>(a, b);
   };
@@ -95,7 +98,7 @@ inline void transpose_square(Floats* rows, float* to, int64_t stride) {
 #pragma GCC unroll 16
   for (int i = 0; i < kL; ++i) store(to + i * stride, rows[i]);
 }
-template <typename V>  // of four lanes, where registers have more
+template <typename V>  // V has four lanes, a register has more
 inline void transpose_square(V* rows, float* to, int64_t stride) {
   transpose4(rows[0], rows[1], rows[2], rows[3], to, stride);
 }

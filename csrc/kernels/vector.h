@@ -1,5 +1,5 @@
-// Short vectors of any length by the compiler's vector extension. An operation works on every lane;
-// a vector wider than the registers is split by the compiler.
+// Short vectors of any length, made with the compiler's vector extension. An operation works on
+// every lane. The compiler splits a vector that is wider than the registers.
 #pragma once
 
 #include <cstdint>
@@ -18,8 +18,8 @@ struct VectorOf {
 template <typename T, int N>
 using Vector = typename VectorOf<T, N>::type;
 
-// Unaligned load and store of lanes, or of one value, that have the type of what is pointed to, so
-// that the compiler may assume that nothing else is touched.
+// Unaligned load and store of lanes, or of one value. The lanes have the same type as the memory,
+// so the compiler may assume that nothing else is touched.
 template <typename V>
 struct UnalignedOf {
   typedef V type __attribute__((aligned(1)));
@@ -43,7 +43,7 @@ inline void store(T* to, const V& v) {
   *reinterpret_cast<typename UnalignedOf<V>::type*>(to) = v;
 }
 
-// The same for lanes of another type than what is pointed to.
+// The same for lanes of another type than the memory.
 template <typename V, typename T>
 inline V load_bits(const T* from) {
   V v;
@@ -57,17 +57,18 @@ inline void store_bits(T* to, const V& v) {
 
 template <typename V, typename T>
 inline V splat(T value) {
-  return value - V{};  // x - 0 is x for every x, -0 included
+  return value - V{};  // x - 0 is x for every x, also for -0
 }
 
-// a where the mask's lane is all ones, else b.
+// Returns a where the mask's lane is all ones, else b.
 template <typename M, typename V>
 inline V select(M mask, V a, V b) {
   return mask ? a : b;
 }
 
-// A value that is rounded as it stands. The compiler may else fuse the product in it into a sum in
-// one copy of the code and not in another, and results would depend on which copy runs.
+// Returns the value, rounded, and prevents fusing. Otherwise the compiler may fuse the product
+// behind it into a sum in one copy of the code and not in another. The results would then depend on
+// which copy runs.
 template <typename V>
 inline V unfused(V value) {
 #if defined(__AVX__)
@@ -78,7 +79,7 @@ inline V unfused(V value) {
   return value;
 }
 
-// Lanes index(0), index(1), ... of a and, behind them, b.
+// Returns lanes index(0), index(1), ... of the lanes of a followed by those of b.
 template <auto index, typename V, int... lane>
 inline V shuffle(V a, V b, std::integer_sequence<int, lane...>) {
   return __builtin_shufflevector(a, b, index(lane)...);
@@ -88,7 +89,8 @@ inline V shuffle(V a, V b) {
   return shuffle<index>(a, b, std::make_integer_sequence<int, kCount<V>>());
 }
 
-// a0 a2 ... b0 b2 ... and a1 a3 ... b1 b3 ..., of lanes and of fours of lanes.
+// Return a0 a2 ... b0 b2 ... and a1 a3 ... b1 b3 ..., for single lanes and for groups of four
+// lanes.
 template <typename V>
 inline V evens(V a, V b) {
   return shuffle<[](int i) { return 2 * i; }>(a, b);
@@ -106,7 +108,7 @@ inline V odd_quads(V a, V b) {
   return shuffle<[](int i) { return i / 4 * 8 + 4 + i % 4; }>(a, b);
 }
 
-// Writes the transpose of four rows of four, its rows `stride` apart.
+// Writes the transpose of four rows of four. The rows of `to` are `stride` apart.
 template <typename V, typename T>
 inline void transpose4(V a, V b, V c, V d, T* to, int64_t stride) {
   const V ab = __builtin_shufflevector(a, b, 0, 4, 1, 5);

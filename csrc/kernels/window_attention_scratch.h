@@ -1,4 +1,5 @@
-// Sizes, places and working memory of window attention: everything but the arithmetic.
+// The sizes, the positions of tokens and the working memory of window attention: everything except
+// the arithmetic.
 #pragma once
 
 #include "../window_attention.h"
@@ -8,33 +9,34 @@
 namespace darswin {
 namespace {
 
-// Up to this many tokens a window, tables of all pairs of tokens are kept for each head.
+// If a window has at most this many tokens, each head keeps tables of all pairs of tokens.
 constexpr int64_t kPairTokens = 64;
-// From this many bytes of qkv on, prefetching pays.
+// Prefetching is worth its cost from this many bytes of qkv on.
 constexpr int64_t kCache = int64_t{4} << 20;
 
-// A size that the compiler knows, or 0 where only the call does.
+// A size that the compiler knows, or 0 if only the call knows it.
 template <int64_t kKnown>
 struct Size {
   int64_t size;
   operator int64_t() const { return kKnown > 0 ? kKnown : size; }
 };
 
-// The sizes of one call; kTokens and kDim are what the compiler knows of n and d. A window of one
-// sector counts as one of one ring: the same tokens in the same order, but in one long run.
+// The sizes of one call. kTokens and kDim are n and d if the compiler knows them. A window of one
+// sector is treated as a window of one ring: it has the same tokens in the same order, but in one
+// long run.
 template <int64_t kTokens, int64_t kDim>
 struct Shape {
   Size<kTokens> n;                         // tokens of a window
-  Size<round_up(kTokens, kGroup)> padded;  // rounded up to whole groups
-  Size<round_up(kTokens, 8)> eights;       // and to eights
+  Size<round_up(kTokens, kGroup)> padded;  // n, rounded up to whole groups
+  Size<round_up(kTokens, 8)> eights;       // n, rounded up to a multiple of 8
   Size<kDim> d;
   int64_t heads;
-  int64_t windows_r, windows_a, map_windows;  // windows along the axes, and of one image
-  int64_t runs, run;       // a window is `runs` times `run` tokens that follow each other
+  int64_t windows_r, windows_a, map_windows;  // windows along the axes; of one image
+  int64_t runs, run;       // a window is `runs` runs of `run` neighbouring tokens each
   int64_t table_a, table;  // width and size of one head's bias table
-  bool pairs;              // whether there are tables of all pairs
-  bool far;                // whether the map is too large for the caches
-  bool quantized;          // whether results are 8 bits
+  bool pairs;              // there are tables of all pairs
+  bool far;                // the map is too large for the caches
+  bool quantized;          // results are 8 bits
 
   template <typename S>
   explicit Shape(const WindowAttentionArgs<S>& a)
@@ -54,8 +56,9 @@ struct Shape {
         far(a.windows * n * 3 * heads * d * static_cast<int64_t>(sizeof(S)) > kCache),
         quantized(a.quantized != nullptr) {}
 
-  // body(key, query, count, index) for all keys and the queries of [begin, end), in runs of queries
-  // whose biases follow each other too: that of the first one stands at `index` of the table.
+  // Calls body(key, query, count, index) for all keys and the queries of [begin, end). A call
+  // covers a run of queries whose biases are neighbours too. The first of these biases is at
+  // `index` of the table.
   template <typename Body>
   void for_pairs(int64_t begin, int64_t end, Body body) const {
     const int64_t first_run = begin / run;
@@ -73,13 +76,13 @@ struct Shape {
   }
 };
 
-// The tokens of one window; (padded,) and so on are shapes.
+// The tokens of one window. The comments give shapes, such as (padded,).
 template <typename T>
 struct Tokens {
   int64_t index = -1;  // of the window
   int64_t *in, *out;   // (padded,): offsets of a token's row in qkv and in the output
-  T* side;             // (padded,): its side of the borders
-  bool parted;         // whether they are on different sides
+  T* side;             // (padded,): mark of the token's side of the borders
+  bool parted;         // some tokens have different sides
 
   void take(Arena& arena, int64_t padded) {
     in = arena.take<int64_t>(padded);
@@ -87,8 +90,9 @@ struct Tokens {
     side = arena.take<T>(padded);
   }
 
-  // Finds the rows of a window's tokens, and their sides of the borders: 1 beyond that of the
-  // radius and 2 beyond that of the azimuth where these do not wrap. Token 0 pads the last group.
+  // Finds the rows of a window's tokens, and their marks of sides. Where an axis does not wrap,
+  // tokens beyond the border of the radius add 1 to the mark, and tokens beyond that of the azimuth
+  // add 2. Token 0 pads the last group.
   template <typename S, typename Sizes>
   void find(const WindowAttentionArgs<S>& a, const Sizes& shape, int64_t window) {
     if (window == index) return;
@@ -119,12 +123,12 @@ struct Tokens {
   }
 };
 
-// Working memory of one thread.
+// The working memory of one thread.
 template <typename S>
 struct AttentionScratch {
   using T = Arithmetic<S>;
 
-  Tokens<T> window, next;    // the current window, and the one after it
+  Tokens<T> window, next;    // the current window and the next one
   int64_t* copy;             // (padded,): offsets of a token's row in a copy
   T* columns;                // (d, group): queries or gradients of a group, transposed
   T *largest, *inverse;      // (group,): of each query, the largest logit; 1 / sum of exponentials
@@ -139,8 +143,7 @@ struct AttentionScratch {
   AttentionScratch(Arena& arena, const Sizes& shape) {
     const int64_t n = shape.n, padded = shape.padded;
     const int64_t pairs = shape.pairs ? shape.heads * n * padded : 0;
-    const int64_t past =
-        (shape.eights - n) * padded;  // keys are read in eights, here past the last
+    const int64_t past = (shape.eights - n) * padded;  // keys are read in eights, past the last key
     const int64_t rows = sizeof(S) == sizeof(T) ? 0 : padded * shape.d;
     const int64_t results = shape.quantized ? padded * shape.d : rows;
     window.take(arena, padded);

@@ -1,10 +1,12 @@
-// The three steps that attention is made of, each one tile of numbers in registers at a time.
+// The three steps of attention. Each works on one tile of numbers in registers at a time.
 //
-// A group is 16 queries, one a SIMD lane: 1, 2 or 4 registers. `products` finds the products of a
-// group with every key as vectors over the queries, so that a softmax needs no horizontal
-// operation. It wants the queries transposed, channel by channel, which `transpose` does. The
-// probabilities then weight whole rows of values in `weighted_sums`, with channels in the lanes,
-// which needs no transpose back. Backward is made of the same three.
+// A group is 16 queries, one in each SIMD lane. It fills 1, 2 or 4 registers.
+//
+// Step one, `transpose`, turns the queries of a group so that each channel is one vector over the
+// queries. Step two, `products`, multiplies the group with every key. Its results are vectors over
+// the queries too, so that a softmax needs no sum across lanes. Step three, `weighted_sums`,
+// multiplies whole rows of values with the probabilities. Here the channels are in the lanes, so
+// nothing has to be transposed back. Backward uses the same three steps.
 #pragma once
 
 #include "convert.h"
@@ -14,7 +16,7 @@ namespace {
 
 constexpr int kGroup = 16;
 
-// Rows of d numbers anywhere in memory.
+// Rows of d numbers, anywhere in memory.
 template <typename T>
 struct Rows {
   T* base;
@@ -24,7 +26,7 @@ struct Rows {
   Rows from(int64_t row) const { return {base, offset + row}; }
 };
 
-// columns[c * kGroup + i] = rows[i][c] for the rows of a group.
+// Writes columns[c * kGroup + i] = rows[i][c] for the rows of a group.
 template <typename T, typename Dim>
 __attribute__((noinline)) void transpose(Rows<const T> rows, Dim d, T* columns) {
   constexpr int kL = kLanes<float>;
@@ -44,9 +46,9 @@ __attribute__((noinline)) void transpose(Rows<const T> rows, Dim d, T* columns) 
   }
 }
 
-// use(k, v, sum) for each key k < n, n a multiple of 8, and each register v of the group: the sums
-// over c of columns[c * kGroup + i] * rows[k][c]. Enough sums are under way to hide the latency of
-// the multiply-add.
+// Calls use(k, v, sum) for each key k < n, where n is a multiple of 8, and for each register v of
+// the group. `sum` is the sum over c of columns[c * kGroup + i] * rows[k][c]. Several sums are
+// computed at once to hide the latency of the multiply-add.
 template <typename T, typename Count, typename Dim, typename Use>
 inline void products(const T* columns, Rows<const T> rows, Count n, Dim d, Use use) {
   using V = Vector<T, kLanes<T>>;
@@ -78,7 +80,7 @@ inline void products(const T* columns, Rows<const T> rows, Count n, Dim d, Use u
   }
 }
 
-// Row i's weight of summand j is weight[i * kRow + j * kSummand].
+// The weight of row i for summand j is weight[i * kRow + j * kSummand].
 template <int kRow, int kSummand, typename T>
 struct Weights {
   const T* weight;
@@ -86,7 +88,7 @@ struct Weights {
   Weights from(int64_t i, int64_t j) const { return {weight + i * kRow + j * kSummand}; }
 };
 
-// Row i's factor is factor[i * step].
+// The factor of row i is factor[i * step].
 template <typename T>
 struct Factors {
   const T* factor;
@@ -95,7 +97,7 @@ struct Factors {
   Factors from(int64_t i) const { return {factor + i * step, step}; }
 };
 
-// Channels [0, kColumns vectors) of the first kRows rows of `weighted_sums`.
+// Computes channels [0, kColumns vectors) of the first kRows rows of `weighted_sums`.
 template <typename V, int kRows, int kColumns, typename W, typename T>
 inline void weighted_tile(W weights, Rows<const T> from, int64_t summands, Rows<T> to, int64_t rows,
                           Factors<T> factors, bool add) {
@@ -125,9 +127,9 @@ inline void weighted_tile(W weights, Rows<const T> from, int64_t summands, Rows<
   }
 }
 
-// to[i][c] = factors(i) * sum_j weights(i, j) * from[j][c] for i < rows, added to what is there
-// where `add`. Weights are read up to the next multiple of 8 rows. Long sums are cut into pieces,
-// since the rounding of a sum grows with its length.
+// Computes to[i][c] = factors(i) * sum_j weights(i, j) * from[j][c] for i < rows. If `add` is true,
+// adds this to the old values. Weights are read up to the next multiple of 8 rows. Long sums are
+// cut into pieces, because the rounding error of a sum grows with its length.
 template <typename W, typename T, typename Summands, typename Count, typename Dim>
 __attribute__((noinline)) void weighted_sums(W weights, Rows<const T> from, Summands summands,
                                              Rows<T> to, Count rows, Dim d, Factors<T> factors,
@@ -150,8 +152,9 @@ __attribute__((noinline)) void weighted_sums(W weights, Rows<const T> from, Summ
   }
 }
 
-// Rows of bfloat16 as float32, and back. Of two registers of channels the even ones come first,
-// then the odd ones: that needs no shuffle, and the order of channels matters to no step above.
+// Converts rows of bfloat16 to float32, and back. Of two registers of channels, the even channels
+// come first and the odd ones second. This needs no shuffle, and no step above depends on the order
+// of the channels.
 inline void widen(const bfloat16* from, int64_t d, float* to) {
   constexpr int kL = kLanes<float>;
   using Bits = Vector<uint32_t, kL>;
