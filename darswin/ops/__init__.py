@@ -1,8 +1,10 @@
-"""The operators: compiled on CPU, in Triton on CUDA devices where it is installed, the PyTorch
-reference elsewhere and within `use_reference`.
+"""The operators.
 
-They run on torch's number of threads. A process that is forked after such a call must not make
-another one on several: use `spawn`, or `torch.set_num_threads(1)` in the child.
+On the CPU they run compiled code, and on CUDA devices Triton kernels if triton is installed. On
+other devices, and within `use_reference`, they run the PyTorch reference.
+
+They use as many threads as torch. A process that is forked after such a call must not call them
+with several threads: use `spawn`, or `torch.set_num_threads(1)` in the child.
 """
 
 from darswin.ops import triton

@@ -19,11 +19,11 @@ _recorders: dict[OpOverload, type[torch.autograd.Function]] = {}
 
 @contextlib.contextmanager
 def use_reference(enabled: bool = True) -> Iterator[None]:
-    """Within this context the operators run their PyTorch reference on every device, CPU included.
+    """Makes the operators run their PyTorch reference on every device within this context.
 
-    It is the definition in plain steps, with all derivatives; other devices do without it.
+    The reference defines each operator in plain steps and has all derivatives.
 
-    The switch is one for the process, not one a thread.
+    The switch holds for the whole process, not for one thread.
     """
     global _reference
     before, _reference = _reference, enabled
@@ -39,33 +39,33 @@ def reference_in_use() -> bool:
 
 
 def has_kernels(tensor: Tensor) -> bool:
-    """True if operators on `tensor` run the kernels for GPUs, where these take the arguments."""
-    # A graph that is exported consists of torch's own operations: it runs without this package.
+    """True if operators on `tensor` run the GPU kernels, provided these support the arguments."""
+    # An exported graph consists of torch's own operations, so that it runs without this package.
     usable = triton.INSTALLED and not _reference and not torch.compiler.is_exporting()
     return usable and tensor.device.type == "cuda" and _is_known_gpu(tensor.device.index)
 
 
 def _constant(function: Callable[..., bool]) -> Callable[..., bool]:
     """Lets Dynamo call a function while it traces and build the result into the graph."""
-    # torch.compiler.assume_constant_result sets the same mark, but it imports Dynamo: that takes as
-    # long as torch itself.
+    # torch.compiler.assume_constant_result sets the same mark, but it imports Dynamo, which takes
+    # as long as importing torch.
     function._dynamo_marked_constant = True  # type: ignore[attr-defined]
     return function
 
 
 @_constant
 def _is_known_gpu(index: int) -> bool:
-    """True for NVIDIA's devices from the A100 on. AMD's devices are called "cuda" too."""
+    """True for NVIDIA GPUs from the A100 on. AMD GPUs also have the device type "cuda"."""
     return torch.version.hip is None and torch.cuda.get_device_capability(index) >= (8, 0)
 
 
-@_constant  # before torch 2.12 Dynamo cannot trace what it calls
+@_constant  # before torch 2.12 Dynamo cannot trace the call inside
 def _has_autocast(device: str) -> bool:
     return torch.amp.is_autocast_available(device)
 
 
 def autocast_dtype(tensor: Tensor) -> torch.dtype | None:
-    """The type that autocast computes in, where it is on for the tensor's device."""
+    """The dtype of autocast on the tensor's device, or None if autocast is off."""
     device = tensor.device.type
     if not _has_autocast(device) or not torch.is_autocast_enabled(device):
         return None
@@ -73,26 +73,26 @@ def autocast_dtype(tensor: Tensor) -> torch.dtype | None:
 
 
 def without_float16(tensor: Tensor) -> Tensor:
-    """Under autocast, a float16 tensor as float32: the operators have no float16."""
+    """Converts a float16 tensor to float32 under autocast: the operators lack float16."""
     half = isinstance(tensor, Tensor) and tensor.dtype == torch.float16
     return tensor.float() if half and autocast_dtype(tensor) is not None else tensor
 
 
 def narrow_types(tensor: Tensor) -> tuple[torch.dtype, ...]:
-    """The types of 16 bits that an operator with kernels for float16 takes."""
+    """The 16-bit dtypes that an operator with float16 kernels accepts for this tensor."""
     kernels = isinstance(tensor, Tensor) and has_kernels(tensor)
     return (torch.bfloat16, torch.float16) if kernels else (torch.bfloat16,)
 
 
 def output_bfloat16(image: Tensor) -> bool:
-    """True if an operator on `image` returns bfloat16, by the image's dtype or by autocast."""
+    """True if an operator on `image` returns bfloat16, due to the image's dtype or autocast."""
     if image.dtype == torch.float64:
         return False
     return image.dtype == torch.bfloat16 or autocast_dtype(image) == torch.bfloat16
 
 
 def autocast_off(device: str) -> contextlib.AbstractContextManager:
-    """A context in which autocast does not touch the arithmetic of a reference."""
+    """A context in which autocast does not change the arithmetic of a reference."""
     if not _has_autocast(device):
         return contextlib.nullcontext()
     return torch.autocast(device, enabled=False)
@@ -104,8 +104,8 @@ def run(
     kernel_takes: Callable[..., bool],
     *arguments: Any,
 ) -> Tensor:
-    """An operator on the checked arguments of its reference: compiled on CPU, by a kernel on GPUs
-    if `kernel_takes` them, otherwise by the reference. The fields of a `Sampling` go one by one."""
+    """Runs an operator on checked arguments: compiled code on the CPU, a kernel on a GPU if
+    `kernel_takes` accepts them, otherwise the reference. A `Sampling` is passed field by field."""
     first, *others = arguments
     flat = [*first, *others] if isinstance(first, tuple) else arguments
     first = flat[0]
@@ -118,7 +118,7 @@ def run(
 
 
 def attempt(operator: OpOverload, arguments: Sequence[Any]) -> Any:
-    """The operator's result, or None if it refuses the arguments: it does not explain why."""
+    """The operator's result, or None if it refuses the arguments. It does not explain why."""
     try:
         return call(operator, arguments)
     except RuntimeError:
@@ -126,7 +126,7 @@ def attempt(operator: OpOverload, arguments: Sequence[Any]) -> Any:
 
 
 def may_attempt() -> bool:
-    """True if an operator may get plain tensors unchecked: it is compiled, and no mode matters."""
+    """True if plain tensors may go to the compiled operator unchecked: no special mode is on."""
     return not (
         _reference
         or not eager()
@@ -136,7 +136,7 @@ def may_attempt() -> bool:
 
 
 def plain(*tensors: Any) -> bool:
-    """True if all are tensors on the CPU, and none is of a subclass with behaviour of its own."""
+    """True if all are tensors on the CPU and none is of a subclass of Tensor or Parameter."""
     for tensor in tensors:  # all() with a generator takes twice as long
         if type(tensor) not in _PLAIN:
             return False
@@ -146,7 +146,7 @@ def plain(*tensors: Any) -> bool:
 
 
 def call(operator: OpOverload, arguments: Sequence[Any]) -> Any:
-    """The operator, past the autograd that torch.library gives it where that is not needed: it
+    """Calls the operator and skips the autograd of torch.library where it is not needed: that
     takes 9 µs without a gradient and 100 µs to record one."""
     if not eager():
         return operator(*arguments)
@@ -162,8 +162,8 @@ def call(operator: OpOverload, arguments: Sequence[Any]) -> Any:
 
 
 def eager() -> bool:
-    """True if operations run one by one: not while a graph is compiled, exported or traced, nor
-    within a transform of torch.func."""
+    """True in eager mode: no graph is being compiled, exported or traced, and no transform of
+    torch.func is active."""
     return not (torch.compiler.is_compiling() or transformed() or torch._C._is_tracing())
 
 
@@ -173,11 +173,12 @@ def transformed() -> bool:
 
 
 def refuse_other_derivatives(operator: object, tensors: Iterable[object]) -> None:
-    """NotImplementedError where forward-mode AD or torch.func differentiates one of the tensors.
+    """Raises NotImplementedError if forward-mode AD or torch.func differentiates a tensor.
 
-    The first would silently give zeros, the second an error about the internals of autograd.
+    Otherwise forward-mode AD would silently give zeros, and torch.func would raise an error about
+    the internals of autograd.
     """
-    # While a graph is compiled torch.func.grad fails by itself.
+    # While a graph is compiled, torch.func.grad fails by itself.
     forward = forward_ad._current_level >= 0
     functional = not torch.compiler.is_compiling() and transformed()
     if not forward and not functional:
@@ -187,7 +188,7 @@ def refuse_other_derivatives(operator: object, tensors: Iterable[object]) -> Non
             continue
         tracked, tensor = _unwrapped(tensor) if functional else (False, tensor)
         if tracked:
-            mode = "torch.func's derivatives"
+            mode = "torch.func derivatives"
         elif forward and forward_ad.unpack_dual(tensor).tangent is not None:
             mode = "forward-mode derivatives"
         else:
@@ -204,7 +205,7 @@ def refuse_other_derivatives(operator: object, tensors: Iterable[object]) -> Non
 
 
 def _unwrapped(tensor: Tensor) -> tuple[bool, Tensor]:
-    """True if torch.func differentiates by the tensor; and the tensor that it wraps."""
+    """True if torch.func differentiates with respect to the tensor; and the wrapped tensor."""
     functorch, tracked = torch._C._functorch, False
     while functorch.is_functorch_wrapped_tensor(tensor):
         tracked |= functorch.is_gradtrackingtensor(tensor)
@@ -215,11 +216,12 @@ def _unwrapped(tensor: Tensor) -> tuple[bool, Tensor]:
 def empty_gradients(
     arguments: Sequence[Any], groups: dict[int, int], wanted: Sequence[bool]
 ) -> tuple[Tensor, ...]:
-    """Empty gradients as backward gives them: of size (0,) for None and where not wanted."""
+    """Empty gradients shaped like those of backward: (0,) for arguments that are None and for
+    gradients that are not wanted."""
     gradients = []
     for index, group in groups.items():
         value = arguments[index]
-        like = arguments[1] if value is None else value  # the radii: all of a lens have their type
+        like = arguments[1] if value is None else value  # all arguments of a lens share a dtype
         shape = (0,) if value is None or not (wanted[group] if wanted else True) else value.shape
         gradients.append(like.new_empty(shape))
     return tuple(gradients)
@@ -228,11 +230,12 @@ def empty_gradients(
 def register_gradients(
     name: str, groups: dict[int, int], fake: Callable[..., tuple[Tensor, ...]] | None = None
 ) -> None:
-    """Registers the autograd of an operator, and the fake of its backward, which may be given.
+    """Registers the autograd of an operator, and `fake` or a default as the fake of its backward.
 
-    `groups` are the arguments that have gradients, in the order of backward, and the group of each.
-    The backward operator takes the operator's first arguments, the gradient of the output and, for
-    each group, whether one of it is wanted; without these bools it gives all gradients.
+    `groups` maps the index of each argument that has a gradient to its group, in the order of the
+    results of backward. The backward operator takes the operator's first arguments, the gradient
+    of the output, and a bool for each group: whether a gradient of this group is wanted. A
+    backward operator without these bools computes all gradients.
     """
     backward = getattr(torch.ops.darswin, f"{name}_backward").default
     names = [argument.name for argument in backward._schema.arguments]

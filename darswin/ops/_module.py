@@ -1,6 +1,6 @@
-"""The compiled module, `libdarswin.so`: loads its operators into torch, and asks for its facts.
+"""Loads the operators of the compiled module `libdarswin.so` into torch and wraps its C functions.
 
-It holds nothing of Python, so that one file serves every version; its facts are C functions.
+The module does not use Python's C API, so that one file works with every Python version.
 """
 
 import ctypes
@@ -13,7 +13,7 @@ FILE = Path(__file__).parent.parent / "libdarswin.so"
 
 
 def load() -> ctypes.CDLL:
-    """Loads `FILE`; its ImportError says what was tried and how to rebuild."""
+    """Loads `FILE`. The ImportError on failure explains the reason and how to rebuild."""
     checkout = FILE.parent.parent
     if not FILE.exists() and (checkout / "setup.py").exists():
         raise ImportError(
@@ -44,19 +44,19 @@ def load() -> ctypes.CDLL:
 def cpu_capability() -> str:
     """The instruction-set tier that the operators run on: "generic", "avx2" or "avx512".
 
-    It is the best one of this CPU; ATEN_CPU_CAPABILITY (default, avx2, avx512) lowers it, as it
-    does in torch.
+    By default it is the best tier of this CPU. The environment variable ATEN_CPU_CAPABILITY
+    (default, avx2, avx512) lowers it, as in torch.
     """
     return _loaded.darswin_tier().decode()
 
 
 def tiers() -> list[str]:
-    """The tiers that this CPU and this build offer, from low to high."""
+    """The tiers that this CPU and this build support, from low to high."""
     return _loaded.darswin_tiers().decode().split()
 
 
 def set_tier(tier: str) -> None:
-    """Runs the operators on another tier from now on. Raises ValueError if the CPU lacks it."""
+    """Switches the operators to another tier. Raises ValueError if the CPU lacks it."""
     if not _loaded.darswin_set_tier(tier.encode()):
         raise ValueError(
             f"tier must be one that this CPU and build offer (best: {tiers()[-1]!r}), got {tier!r}"
@@ -64,15 +64,16 @@ def set_tier(tier: str) -> None:
 
 
 def set_gathers(way: bool | None) -> None:
-    """Reads large gray or RGB images with gathers or without; None: as is faster on this CPU.
+    """Reads large grey or RGB images with or without gather instructions.
 
-    None is the default. The results are the same. Only the AVX-512 tier has gathers.
+    None, the default, picks the faster way on this CPU. The results are the same. Only the AVX-512
+    tier has gathers.
     """
     _loaded.darswin_set_gathers(2 if way is None else int(way))
 
 
 def build_info() -> dict[str, str | int]:
-    """Facts of the module's build: compiler, cxx_standard, openmp, torch_abi."""
+    """Facts about the module's build: compiler, cxx_standard, openmp, torch_abi."""
     return json.loads(_loaded.darswin_build_info())
 
 

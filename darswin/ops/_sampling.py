@@ -17,12 +17,12 @@ from darswin.ops.checks import (
     per_channel,
 )
 
-# The fields of `Sampling` that have gradients: of the image, of the lens, of the offsets.
+# Index of each field of `Sampling` that has a gradient → its group: image, lens or offsets.
 GRADIENTS = {0: 0, 1: 1, 3: 1, 4: 1, 5: 2}
 
 
 class Sampling(NamedTuple):
-    """The arguments of a sampling as the operators take them, in the order of their schemas."""
+    """The arguments of a sampling in the form and order of the operators' schemas."""
 
     image: Tensor
     radii: Tensor
@@ -30,18 +30,18 @@ class Sampling(NamedTuple):
     center: Tensor
     affine: Tensor | None
     offsets: Tensor | None
-    # Tensors, so that a graph which is compiled does not keep their values. None without jitter.
+    # Tensors, so that compiled graphs do not keep their values. None without jitter.
     jitter: Tensor | None
     seed: Tensor | None
     samples: tuple[int, int]
-    # Of uint8 images, one number a channel; of others empty.
+    # One number per channel for uint8 images, empty for other dtypes.
     mean: Sequence[float]
     std: Sequence[float]
-    bfloat16: bool  # whether the output is
+    bfloat16: bool  # True if the output is bfloat16
 
     # Methods, not properties: Dynamo of torch 2.10 cannot trace a NamedTuple's properties.
     def token_size(self) -> int:
-        """Values of a token: S_r·S_φ·C."""
+        """Number of values in a token: S_r·S_φ·C."""
         return self.samples[0] * self.samples[1] * self.image.shape[1]
 
     def map_size(self) -> tuple[int, int, int]:
@@ -50,15 +50,15 @@ class Sampling(NamedTuple):
         return self.image.shape[0], rings, self.azimuths.shape[0] // self.samples[1]
 
     def kernel_takes(self, *others: object) -> bool:
-        """True if the kernels for GPUs compute it: not float64, nor uint8 images of many channels,
-        whose mean and std are numbers in the kernel, nor 2³¹ samples or pixels of an image."""
+        """True if the GPU kernels support it. They do not support float64, uint8 images of more
+        than 16 channels, or about 2³¹ samples or pixels per image."""
         image = self.image
         frames = image.dtype == torch.uint8 and image.shape[1] > 16
         counts = self.radii.shape[1] * self.azimuths.shape[0], image.shape[2] * image.shape[3]
         return image.dtype != torch.float64 and not frames and max(counts) < 2**31 - 2**16
 
     def new_output(self, shape: tuple[int, ...]) -> Tensor:
-        """An empty tensor of the output's type."""
+        """An empty tensor of the output's dtype."""
         return self.radii.new_empty(shape, dtype=torch.bfloat16 if self.bfloat16 else None)
 
 
@@ -76,7 +76,7 @@ def checked_sampling(
     std: float | Sequence[float],
     channels_last: bool | None,
 ) -> Sampling:
-    """The arguments of the public functions, else TypeError or ValueError."""
+    """Checks the arguments of the public functions. Raises TypeError or ValueError."""
     image = _library.without_float16(image)
     pixels = (*DTYPES, torch.bfloat16, torch.uint8)
     check_tensor("image", image, pixels, "(B, C, H, W)", (None,) * 4)
@@ -131,8 +131,8 @@ def unchecked_sampling(
     std: float | Sequence[float],
     channels_last: bool | None,
 ) -> Sampling | None:
-    """The arguments for `_library.attempt`, which leaves the check of the tensors to the operator.
-    None in the rare cases where it would not see what `checked_sampling` sees."""
+    """The arguments for `_library.attempt`: the operator itself checks the tensors. None in the
+    rare cases that only `checked_sampling` can check."""
     if not (
         _library.may_attempt()
         and _library.plain(image, radii, azimuths, center)
@@ -157,7 +157,7 @@ def unchecked_sampling(
 
 
 def _jitter_tensors(jitter: float, seed: int | Tensor) -> tuple[Tensor | None, Tensor | None]:
-    """Jitter and seed as the operators take them; None and None without jitter."""
+    """Jitter and seed as tensors for the operators; None and None without jitter."""
     jitter = check_jitter(jitter)
     if jitter == 0:
         return None, None

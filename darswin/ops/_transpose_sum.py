@@ -1,4 +1,4 @@
-"""transpose_sum, for the gradients of a linear layer: private, without a reference."""
+"""transpose_sum, a private operator without a reference for the gradients of a linear layer."""
 
 import torch
 from torch import Tensor
@@ -7,8 +7,9 @@ from darswin.ops import _library
 
 
 def transpose_sum(x: Tensor) -> tuple[Tensor, Tensor]:
-    """The transpose of a contiguous float32 matrix (M, N) and the sums of its columns, for the
-    gradients of a linear layer: (N, M) and (N,). Its own gradient is torch's transpose and sum."""
+    """The transpose (N, M) of a contiguous float32 matrix (M, N), and its column sums (N,).
+
+    The gradients of a linear layer use it. Its own gradient is torch's transpose and sum."""
     _library.refuse_other_derivatives("transpose_sum", (x,))
     return torch.ops.darswin._transpose_sum.default(x)
 

@@ -1,6 +1,7 @@
-"""The argument checks that the operators and their layers share; and how not to wait for a device.
+"""Argument checks that the operators and their layers share, and functions that avoid waiting for a
+device.
 
-A message says what was expected and what came.
+Each message states the expected and the actual value.
 """
 
 import math
@@ -16,7 +17,7 @@ from darswin.ops._library import transformed
 
 DTYPES = (torch.float32, torch.float64)
 LAYOUTS = ("tokens", "image")
-FRAME_CHANNELS = (1, 3, 4)  # the numbers of channels that a camera frame can have
+FRAME_CHANNELS = (1, 3, 4)  # possible numbers of channels of a camera frame
 
 
 def check_tensor(
@@ -27,9 +28,9 @@ def check_tensor(
     *shapes: Sequence[int | None],
     like: Tensor | None = None,
 ) -> None:
-    """TypeError or ValueError unless `value` is a tensor of one of the dtypes and shapes (None: any
-    size), on the device of `like`. `form` is the shape in words; its fields, {}, are the known
-    sizes of the first of `shapes`."""
+    """Raises TypeError or ValueError unless `value` is a tensor with one of the dtypes and shapes
+    (None: any size), on the device of `like`. `form` is the shape for the message; the known sizes
+    of the first shape replace its fields {}."""
     if not isinstance(value, Tensor):
         raise TypeError(f"{name} must be a tensor, got {type(value).__name__}")
     if value.dtype not in dtypes:
@@ -42,7 +43,7 @@ def check_tensor(
     for sizes in shapes:
         if shape == sizes or _fits(shape, sizes):
             return
-    # Filled in here alone: an f-string would tie a graph that is being compiled to these sizes.
+    # Formatted only here: an f-string in the caller would tie a compiled graph to these sizes.
     expected = form.format(*(size for size in shapes[0] if size is not None))
     raise ValueError(f"{name} must have shape {expected}, got {shape}")
 
@@ -57,8 +58,8 @@ def _fits(shape: Sequence[int], sizes: Sequence[int | None]) -> bool:
 
 
 def check_rising(name: str, value: Tensor) -> None:
-    """ValueError unless each row of (N, R) is finite, at least 0, and rises. Only a plain tensor
-    that is `readable` is checked, and only outside the transforms of torch.func."""
+    """Raises ValueError unless each row of (N, R) is finite, at least 0, and rises. It checks only
+    plain, `readable` tensors, and nothing within the transforms of torch.func."""
     if not readable(value) or transformed() or type(value) not in (Tensor, torch.nn.Parameter):
         return
     rows = value.detach().numpy()
@@ -67,15 +68,15 @@ def check_rising(name: str, value: Tensor) -> None:
 
 
 def readable(value: Tensor) -> bool:
-    """True if reading `value` is free: eager mode on the CPU."""
+    """True if the host can read `value` without waiting: in eager mode, on the CPU."""
     return not torch.compiler.is_compiling() and value.device.type == "cpu"
 
 
 def tensor_there(
     numbers: Sequence[float], like: Tensor, dtype: torch.dtype | None = None
 ) -> Tensor:
-    """Numbers as a tensor (K,) beside `like`. On a device they are made there, not copied from the
-    host, which would wait."""
+    """A tensor (K,) of the numbers on the device of `like`. On a GPU the numbers are created
+    there, since the host would have to wait for a copy."""
     if like.device.type == "cpu":
         return like.new_tensor(numbers, dtype=dtype)
     made = [like.new_full((1,), number, dtype=dtype) for number in numbers]
@@ -83,7 +84,7 @@ def tensor_there(
 
 
 def as_int(value: Any) -> int | None:
-    """An int, also of NumPy, as Python's; None where it is not one. bool and floats are not."""
+    """A Python int for an int of Python or NumPy, else None. Bools and floats are no ints here."""
     if isinstance(value, (bool, Tensor)):
         return None
     known = isinstance(value, (int, torch.SymInt))
@@ -94,7 +95,7 @@ def as_int(value: Any) -> int | None:
 
 
 def check_pair(name: str, value: Sequence[int], lowest: int) -> tuple[int, int]:
-    """Two ints of at least `lowest`, else TypeError or ValueError."""
+    """The pair, checked: raises TypeError or ValueError unless it is two ints ≥ `lowest`."""
     if not isinstance(value, (tuple, list, torch.Size)) or len(value) != 2:
         raise TypeError(f"{name} must be a pair of ints, got {value!r}")
     first, second = as_int(value[0]), as_int(value[1])
@@ -108,14 +109,14 @@ def check_pair(name: str, value: Sequence[int], lowest: int) -> tuple[int, int]:
 def channels_first(
     name: str, image: Tensor, channels_last: bool | None = None, channels: int | None = None
 ) -> Tensor:
-    """A view (B, C, H, W) of an image. With channels_last None, the channels of a uint8 image are
-    the axis, second or last, whose size is `channels`, or one of `FRAME_CHANNELS`."""
+    """A view (B, C, H, W) of an image. If channels_last is None, the channel axis of a uint8 image
+    is its second or last axis, depending on which has `channels` or one of `FRAME_CHANNELS`."""
     if channels_last is None:
         if image.dtype != torch.uint8:
             return image
         shape, sizes = image.shape, FRAME_CHANNELS if channels is None else (channels,)
         first, last = shape[1] in sizes, shape[3] in sizes
-        # Where all three sizes are 1, both readings are the same image.
+        # If all three sizes are 1, both layouts give the same image.
         if (first and last and shape[1:] != (1, 1, 1)) or not (first or last):
             known: object = channels
             hint = ""
@@ -135,23 +136,25 @@ def channels_first(
 
 
 def per_channel(name: str, value: float | Sequence[float], channels: int) -> tuple[float, ...]:
-    """`mean` or `std` as one number a channel; ValueError where they are not."""
+    """`mean` or `std` as one number per channel. Raises ValueError if the count does not fit."""
     values = tuple(value) if isinstance(value, Iterable) else (value,) * channels
     if len(values) != channels:
-        raise ValueError(f"{name} must be one number or one a channel, {channels}, got {value!r}")
+        raise ValueError(
+            f"{name} must be one number or one per channel ({channels}), got {value!r}"
+        )
     if name == "std" and not all(v > 0 for v in values):
         raise ValueError(f"std must be positive, got {value!r}")
     return tuple(float(v) for v in values)
 
 
 def check_layout(layout: str) -> None:
-    """ValueError unless the layout is one of `LAYOUTS`."""
+    """Raises ValueError unless the layout is one of `LAYOUTS`."""
     if layout not in LAYOUTS:
         raise ValueError(f"layout must be one of {LAYOUTS}, got {layout!r}")
 
 
 def check_jitter(jitter: float) -> float:
-    """Jitter as a Python float, also of NumPy's; TypeError or ValueError unless it is in [0, 1]."""
+    """Jitter as a Python float. Raises TypeError or ValueError unless it is in [0, 1]."""
     if not isinstance(jitter, (float, torch.SymFloat)):
         if isinstance(jitter, Tensor) or not isinstance(jitter, numbers.Real):
             raise TypeError(f"jitter must be a float, got {type(jitter).__name__}")

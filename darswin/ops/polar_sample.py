@@ -1,5 +1,5 @@
-"""polar_sample, an image on a polar grid, and polar_embed, its patches as tokens by a linear layer.
-Public functions, fakes, autograd."""
+"""polar_sample samples an image on a polar grid; polar_embed also maps its patches to tokens with a
+linear layer. Public functions, fakes and autograd."""
 
 from collections.abc import Sequence
 from typing import Literal
@@ -31,59 +31,59 @@ def polar_sample(
     std: float | Sequence[float] = 1.0,
     channels_last: bool | None = None,
 ) -> Tensor:
-    """Samples an image bilinearly on a polar grid, zeros outside.
+    """Samples an image bilinearly on a polar grid, with zeros outside the image.
 
-    Point (i, j) of image b stands at `(x, y) = center + affine @ (r cos a, r sin a) +
+    Point (i, j) of image b lies at `(x, y) = center + affine @ (r cos a, r sin a) +
     offsets[b, :, i, j]` with `r = radii[b, i]` and `a = azimuths[j]`. A circular lens needs
-    neither affine nor offsets. `polar_embed` takes the linear layer of a patch embedding along.
+    neither affine nor offsets. `polar_embed` includes the linear layer of a patch embedding.
 
     Convention:
         Pixel centres are integers, x to the right in [0, W-1] and y down in [0, H-1]; azimuth 0
-        points right, π/2 down. Points at NaN or infinity sample nothing; pixels that are NaN or
-        infinite count with their weights, as in `F.grid_sample`.
+        points right, π/2 down. Points at NaN or infinity give zeros. Pixels that are NaN or
+        infinite enter the weighted sum, as in `F.grid_sample`.
 
     Args:
-        image: (B, C, H, W) or (B, H, W, C), as channels_last says, of any strides: float32,
+        image: (B, C, H, W) or (B, H, W, C), depending on channels_last, with any strides: float32,
             float64, bfloat16, or uint8 camera frames.
-        radii: (B or 1, R·S_r) px. Like azimuths, center, affine and offsets float64 if the image
-            is, else float32.
-        azimuths: (A·S_φ,) rad. They have a gradient only within `use_reference()`; use affine to
-            turn the grid, or offsets to move its points, where a gradient is wanted.
+        radii: (B or 1, R·S_r) px. radii, azimuths, center, affine and offsets are float64 if the
+            image is float64, else float32.
+        azimuths: (A·S_φ,) rad. They have a gradient only within `use_reference()`. For a gradient,
+            turn the grid with affine, or move its points with offsets.
         center: (B or 1, 2) px, x then y.
-        affine: (B or 1, 2, 2), of rows x and y: aspect ratio and skew. None is the identity.
-        offsets: (B or 1, 2, R·S_r, A·S_φ) px, x then y: what else moves the points of a
-            general lens, such as its tangential distortion. None is zero.
-        samples: (S_r, S_φ), the samples of a patch along radius and azimuth.
+        affine: (B or 1, 2, 2), rows x and y: aspect ratio and skew. None is the identity.
+        offsets: (B or 1, 2, R·S_r, A·S_φ) px, x then y: further shifts of the points of a general
+            lens, such as its tangential distortion. None is zero.
+        samples: (S_r, S_φ), the number of samples of a patch along radius and azimuth.
         jitter: in [0, 1]. Moves each point by `u·jitter` cells along its row of radii (linear
             between neighbours, extrapolated at both ends, never below 0) and by
-            `v·jitter·2π/(A·S_φ)` in azimuth, before the matrix; its offset stays that of the
-            unmoved point. u and v, in [-½, ½), are the upper and the lower half of one 32-bit word
-            of Philox4x32-10: for point p = i·A·S_φ + j of image b word p mod 4 of key `seed`,
-            counter (⌊p/4⌋, b).
-        seed: int or 0-dim int64 tensor on the CPU. Without jitter it is not used.
+            `v·jitter·2π/(A·S_φ)` in azimuth, before the matrix is applied. The point keeps the
+            offset of its original place. u and v, in [-½, ½), are the upper and lower halves of a
+            32-bit word of Philox4x32-10. Point p = i·A·S_φ + j of image b uses word p mod 4 for
+            key `seed` and counter (⌊p/4⌋, b).
+        seed: int or 0-dim int64 tensor on the CPU. It is not used without jitter.
         layout: "tokens" or "image".
-        mean, std: one number, or one a channel. Pixels of type uint8 count as
-            `(pixel/255 - mean) / std`, zero outside the image; those of other types count as they
-            are, whatever mean and std say.
-        channels_last: True for an image (B, H, W, C), False for (B, C, H, W). With None an image in
-            floating point is (B, C, H, W), and the channels of a uint8 image are its second or its
-            last axis, the one that has the size 1, 3 or 4.
+        mean, std: one number, or one number per channel. A uint8 pixel is read as
+            `(pixel/255 - mean) / std`, with zeros outside the image. For other dtypes mean and std
+            are ignored.
+        channels_last: True for an image (B, H, W, C), False for (B, C, H, W). With None, a
+            floating-point image is (B, C, H, W), and the channel axis of a uint8 image is its
+            second or last axis, depending on which has size 1, 3 or 4.
 
     Returns:
         "tokens": (B, R, A, S_r·S_φ·C), inner order (S_r, S_φ, C).
-        "image": (B, C, R·S_r, A·S_φ), what `F.grid_sample` gives on such a grid.
-        bfloat16 where the image is, or under bfloat16 autocast; float64 where the image is; else
-        float32. bfloat16 is computed in float32 and rounded once.
+        "image": (B, C, R·S_r, A·S_φ), like the result of `F.grid_sample` on such a grid.
+        The dtype is bfloat16 for a bfloat16 image or under bfloat16 autocast, float64 for a float64
+        image, else float32. bfloat16 results are computed in float32 and rounded once.
 
-    Gradients go to image (unless uint8), radii, center, affine and offsets, by backward() alone;
-    results and gradients do not depend on the number of threads.
+    backward() gives gradients for image (unless uint8), radii, center, affine and offsets. Results
+    and gradients do not depend on the number of threads.
 
     Raises:
-        TypeError: a tensor of another dtype, or an argument of another type.
-        ValueError: a shape, device or range that does not fit; without channels_last, a uint8 image
-            of which both axes can be that of the channels, or neither.
-        NotImplementedError: forward-mode derivatives, those of torch.func, second ones, and
-            azimuths that require a gradient.
+        TypeError: a tensor has an unsupported dtype, or an argument has the wrong type.
+        ValueError: a shape, device or range does not fit; or channels_last is None, and the channel
+            axis of a uint8 image is ambiguous or missing.
+        NotImplementedError: forward-mode, torch.func or second derivatives are requested, or the
+            azimuths require a gradient.
 
     Source: DarSwin, ICCV 2023, sec. 4.3.
     """
@@ -137,21 +137,22 @@ def polar_embed(
     The samples are never written to memory; backward recomputes them.
 
     Args:
-        image, radii, azimuths, center, affine, offsets, samples: as `polar_sample`.
-        jitter, seed, mean, std, channels_last: as `polar_sample`.
-        weight: (D, S_r·S_φ·C), float64 if the image is, else float32 or bfloat16.
-        bias: (D,) or None, as weight.
+        image, radii, azimuths, center, affine, offsets, samples: see `polar_sample`.
+        jitter, seed, mean, std, channels_last: see `polar_sample`.
+        weight: (D, S_r·S_φ·C), float64 if the image is float64, else float32 or bfloat16.
+        bias: (D,) or None, with the dtypes of weight.
 
     Returns:
-        (B, R, A, D). bfloat16 where the image is, or under bfloat16 autocast; float64 where the
-        image is; else float32. bfloat16 is computed in float32 and rounded once.
+        (B, R, A, D). The dtype is bfloat16 for a bfloat16 image or under bfloat16 autocast, float64
+        for a float64 image, else float32. bfloat16 results are computed in float32 and rounded
+        once.
 
-    Gradients go to weight, bias, image (unless uint8), radii, center, affine and offsets; results
-    and gradients do not depend on the number of threads.
+    backward() gives gradients for weight, bias, image (unless uint8), radii, center, affine and
+    offsets. Results and gradients do not depend on the number of threads.
 
     Raises:
-        TypeError, ValueError: as `polar_sample`, and for a weight or bias that does not fit.
-        NotImplementedError: as `polar_sample`.
+        TypeError, ValueError: see `polar_sample`; or a weight or bias does not fit.
+        NotImplementedError: see `polar_sample`.
 
     Source: DarSwin, ICCV 2023, sec. 4.3.
     """

@@ -1,4 +1,4 @@
-"""polar_to_image: a polar map as an image. Public function, fakes, autograd."""
+"""polar_to_image resamples a polar map to an image. Public function, fakes and autograd."""
 
 from typing import Literal
 
@@ -22,42 +22,43 @@ def polar_to_image(
     r_max: Tensor | float | None = None,
     layout: Literal["tokens", "image"] = "image",
 ) -> Tensor:
-    """Brings a polar map back to pixels: what `polar_sample` does to an image, the other way.
+    """Resamples a polar map to the pixels of an image, the reverse of `polar_sample`.
 
-    The value of a pixel is bilinear between the two rings and the two sectors around it. Azimuth
-    is periodic. Inside the centre of ring 0 the neighbour is the sector half a turn away, across
-    the pole; from the last ring's centre to `r_max` the last ring counts alone; beyond is zero.
-    The pixels' radii and azimuths are computed from their places: there is no mesh.
+    Each pixel is interpolated bilinearly between the two rings and the two sectors around it.
+    Azimuth is periodic. Inside the centre of ring 0, the inner neighbour is the sector across the
+    pole, half a turn away. From the centre of the last ring to `r_max`, only the last ring counts.
+    Pixels beyond `r_max` are zero. Radii and azimuths of the pixels are computed on the fly, so
+    there is no sampling grid in memory.
 
     Convention:
         Pixel centres are integers, x to the right in [0, W-1] and y down in [0, H-1]; azimuth 0
         points right, π/2 down. Sector a has its middle at 2π(a + ½)/A, as in `polar_grid`.
 
     Args:
-        x: (B, R, A, D), float32, float64 or bfloat16. float16 is taken like bfloat16 where
-            `darswin.ops.triton` has kernels, elsewhere as float32 under autocast.
-        radii: (B or 1, R) px, of the rings' centres: finite, at least 0, rising. Like all tensors
-            that follow float64 if x is, else float32.
-        center: (B or 1, 2) px, x then y; None where there are `points`.
+        x: (B, R, A, D), float32, float64 or bfloat16. float16 is supported where
+            `darswin.ops.triton` has kernels; elsewhere only under autocast, as float32.
+        radii: (B or 1, R) px, of the rings' centres: finite, at least 0, rising. All tensors from
+            here on are float64 if x is float64, else float32.
+        center: (B or 1, 2) px, x then y; None if `points` are given.
         size: (H, W) of the image.
-        affine: (B or 1, 2, 2), of rows x and y: aspect ratio and skew, as `polar_sample` takes it.
-        points: (B or 1, H, W, 2) px, for a lens that is not circular: where each pixel's ray lies
-            on the plane of radius and azimuth, as (r cos φ, r sin φ). It takes the place of center
-            and affine. Pixels at NaN or infinity are zero.
-        r_max: px, where the image ends: a number, or (B or 1,); None means nowhere.
+        affine: (B or 1, 2, 2), rows x and y: aspect ratio and skew, as in `polar_sample`.
+        points: (B or 1, H, W, 2) px, for a lens that is not circular: the place (r cos φ, r sin φ)
+            of each pixel's ray on the plane of radius and azimuth. It replaces center and affine.
+            Pixels whose place is NaN or infinite are zero.
+        r_max: px, the radius at which the image ends: a number, or (B or 1,). None means no limit.
         layout: "image" or "tokens".
 
     Returns:
-        "image": (B, D, H, W). "tokens": (B, H, W, D). Of the type of x; 16 bits are computed in
-        float32 and rounded once.
+        "image": (B, D, H, W). "tokens": (B, H, W, D). The dtype is that of x; 16-bit results are
+        computed in float32 and rounded once.
 
-    Gradients go to x, radii, center, affine and points; results and gradients do not depend on the
-    number of threads. At the centre itself radius and azimuth have none.
+    backward() gives gradients for x, radii, center, affine and points. Results and gradients do not
+    depend on the number of threads. At the centre itself, radius and azimuth have no gradient.
 
     Raises:
-        TypeError: a tensor of another dtype, or an argument of another type.
-        ValueError: a shape, device or range that does not fit, or radii that do not rise.
-        NotImplementedError: forward-mode derivatives, those of torch.func, and second ones.
+        TypeError: a tensor has an unsupported dtype, or an argument has the wrong type.
+        ValueError: a shape, device or range does not fit, or the radii do not rise.
+        NotImplementedError: forward-mode, torch.func or second derivatives are requested.
     """
     height, width = check_pair("size", size, lowest=0)
     check_layout(layout)
@@ -97,7 +98,7 @@ def polar_to_image(
 
 
 def _kernel_takes(x, radii, center, affine, points, r_max, size, tokens) -> bool:
-    """True if the kernel for GPUs computes it: not float64, nor 2³¹ pixels or tokens an image."""
+    """True if the GPU kernel supports it: neither float64 nor 2³¹ pixels or tokens per image."""
     most = max(size[0] * size[1], x.shape[1] * x.shape[2])
     return x.dtype != torch.float64 and most < 2**31 - 2**16
 
@@ -110,5 +111,5 @@ def _fake(x, radii, center, affine, points, r_max, size, tokens):
     )
 
 
-GRADIENTS = {0: 0, 1: 1, 2: 1, 3: 1, 4: 1}  # of x, and of the lens
+GRADIENTS = {0: 0, 1: 1, 2: 1, 3: 1, 4: 1}  # group 0: x; group 1: the lens
 _library.register_gradients("polar_to_image", GRADIENTS)

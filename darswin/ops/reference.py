@@ -1,8 +1,8 @@
-"""The operators in plain PyTorch: their definition, the oracle of the tests, and the code that
-runs within `use_reference` and on devices without a kernel.
+"""The operators in plain PyTorch.
 
-An operator and its twin have the same name and the same parameters, which come checked; those of a
-sampling come as one.
+These functions define the operators, and the tests compare with them. They run within
+`use_reference` and on devices without kernels. Each has the name and the parameters of its
+operator. The arguments are already checked, and those of a sampling are one `Sampling`.
 """
 
 import math
@@ -37,7 +37,7 @@ def philox(seed: Tensor, low: Tensor, high: Tensor) -> list[Tensor]:
 
 
 def _multiply(a: int, b: Tensor) -> tuple[Tensor, Tensor]:
-    """Upper and lower word of a 32x32-bit product, in halves that int64 can hold."""
+    """Upper and lower word of a 32x32-bit product, without an overflow of int64."""
     upper, lower = a * (b >> 16), a * (b & 0xFFFF)
     total = ((upper & 0xFFFF) << 16) + lower
     return (upper >> 16) + (total >> 32), total & _WORD
@@ -56,9 +56,9 @@ def _jittered(
     u, v = (
         (half.to(radii.dtype) * 2.0**-16 - 0.5) * jitter for half in (word >> 16, word & 0xFFFF)
     )
-    # Infinite radii are as good as NaN: clamped, minus infinity would become 0.
+    # Infinite radii become NaN, since clamping would turn minus infinity into 0.
     radii = torch.where(radii.isfinite(), radii, math.nan)
-    # The step to the outer neighbour and from the inner one; at both ends the only one there is.
+    # The steps to the outer and to the inner neighbour; the ends have only one of the two.
     steps = radii.diff(dim=1) if rows > 1 else torch.zeros_like(radii)
     outer = torch.cat((steps, steps[:, -1:]), 1)[:, :rows, None]
     inner = torch.cat((steps[:, :1], steps), 1)[:, :rows, None]
@@ -72,9 +72,9 @@ def normalized(
     std: Sequence[float],
     dtype: torch.dtype = torch.float32,
 ) -> Tensor:
-    """`(pixel/255 - mean) / std` of a uint8 image (B, C, H, W), in `dtype`; a value a channel."""
+    """`(pixel/255 - mean) / std` of a uint8 image (B, C, H, W), in `dtype`, for each channel."""
     m, s = (
-        # One number for all channels where they are the same.
+        # One number is enough if all channels share it.
         tensor_there(values if len(set(values)) > 1 else values[:1], image, dtype)[:, None, None]
         for values in (mean, std)
     )
@@ -92,7 +92,7 @@ def polar_sample(sampling: Sampling, tokens: bool) -> Tensor:
     jitter, seed = sampling.jitter, sampling.seed
     if jitter is not None and seed is not None and rows > 0 and columns > 0:
         r, a = _jittered(radii, azimuths, batch, jitter, seed)
-    # Gradients must not meet what is not a number: it stays one when it is multiplied with 0.
+    # Keep NaN and infinity out of the gradients: they do not vanish when multiplied by 0.
     known = r.isfinite() & a.isfinite()
     r, a = torch.where(r.isfinite(), r, 0), torch.where(a.isfinite(), a, 0)
     x, y = r * torch.cos(a), r * torch.sin(a)  # (B or 1, N_r, N_a)
@@ -107,8 +107,8 @@ def polar_sample(sampling: Sampling, tokens: bool) -> Tensor:
     x, y = torch.where(touches, x, -1), torch.where(touches, y, -1)
     left, top = x.detach().floor(), y.detach().floor()
     right, lower = x - left, y - top
-    # Values are counted in the order in which they lie in memory, a camera frame's channels side by
-    # side: an exported graph would copy the whole image to change it.
+    # Index the values in their order in memory, where the channels of a camera frame lie side by
+    # side. Otherwise an exported graph would copy the whole image to change the order.
     if image.stride(1) == 1:
         values, pixel_step, channel_step = image.permute(0, 2, 3, 1).flatten(1), channels, 1
     else:
@@ -125,14 +125,14 @@ def polar_sample(sampling: Sampling, tokens: bool) -> Tensor:
             corner = corner.unflatten(1, (channels, rows, columns))
             if corner.dtype == torch.uint8:
                 corner = normalized(corner, sampling.mean, sampling.std)
-            # A pixel that is not there must not count, were it NaN.
+            # A pixel outside the image must not count, even if the gathered value is NaN.
             corner = torch.where(inside[:, None], corner, 0)
             out = out + (wx * wy)[:, None] * corner
     return laid_out(out, sampling, tokens)
 
 
 def laid_out(out: Tensor, sampling: Sampling, tokens: bool) -> Tensor:
-    """The samples (B, C, R·S_r, A·S_φ) in the type of the output, as tokens or as they are."""
+    """The samples (B, C, R·S_r, A·S_φ) in the dtype and the layout of the output."""
     out = out.bfloat16() if sampling.bfloat16 else out
     if not tokens:
         return out
@@ -147,7 +147,7 @@ def polar_embed(sampling: Sampling, weight: Tensor, bias: Tensor | None) -> Tens
 
 
 def embedded(samples: Tensor, sampling: Sampling, weight: Tensor, bias: Tensor | None) -> Tensor:
-    """The linear layer behind the samples (B, R, A, S_r·S_φ·C)."""
+    """Applies the linear layer to the samples (B, R, A, S_r·S_φ·C)."""
     weight = weight.to(samples.dtype)
     bias = None if bias is None else bias.to(samples.dtype)
     out = F.linear(samples, weight, bias)
@@ -172,7 +172,7 @@ def polar_to_image(
     across, down = points.unbind(-1)  # (N, H, W)
     known = across.isfinite() & down.isfinite()
     across, down = torch.where(known, across, 1), torch.where(known, down, 0)
-    # At the centre itself neither the radius nor the azimuth has a derivative.
+    # Neither the radius nor the azimuth has a derivative at the centre itself.
     middle = (across == 0) & (down == 0)
     across = torch.where(middle, 1, across)
     r = torch.where(middle, 0, (across.square() + down.square()).sqrt())
@@ -184,8 +184,8 @@ def polar_to_image(
     rows = 1 if r.shape[0] == radii.shape[0] == 1 else batch
     r, azimuth = (t.expand(rows, *t.shape[1:]) for t in (r, azimuth))
     known, radii = known.expand(rows, *known.shape[1:]), radii.expand(rows, rings)
-    # The ring centres on both sides. Inside the first one the inner side lies across the pole, at
-    # a negative radius; beyond the last one both sides are the last ring.
+    # The ring centres on both sides of each pixel. Inside the first ring, the inner centre lies
+    # across the pole, at a negative radius. Beyond the last ring, both are the last centre.
     above = _rings_within(radii.detach(), r.detach().flatten(1)).reshape(r.shape)
     pole, beyond = above == 0, above == rings
     inner, outer = (above - 1).clamp(min=0), above.clamp(max=rings - 1)
@@ -212,14 +212,14 @@ def polar_to_image(
 
 
 def _rings_within(radii: Tensor, r: Tensor) -> Tensor:
-    """Counts the rising radii (N, R) that are at most r (N, K): (N, K)."""
+    """Counts (N, K): for each r (N, K), the number of rising radii (N, R) that are at most r."""
     if torch.compiler.is_compiling():  # ONNX has no searchsorted; this takes R times the memory
         return (radii[:, :, None] <= r[:, None]).sum(1)
     return torch.searchsorted(radii.contiguous(), r.contiguous(), right=True)
 
 
 def _on_polar_plane(size: Sequence[int], center: Tensor, affine: Tensor | None) -> Tensor:
-    """(N, H, W, 2): each pixel's place from the centre, with the matrix undone."""
+    """(N, H, W, 2): each pixel's position relative to the centre, with the matrix inverted."""
     height, width = size
     y, x = (torch.arange(n, dtype=center.dtype, device=center.device) for n in (height, width))
     pixels = torch.stack(torch.meshgrid(x, y, indexing="xy"), -1)
@@ -242,7 +242,7 @@ def window_attention(
 ) -> Tensor:
     """See `darswin.ops.window_attention`."""
     batch, rings, sectors, _, heads, head_dim = qkv.shape
-    dtype, qkv = qkv.dtype, qkv.to(bias.dtype)  # bfloat16 as float32, rounded once at the end
+    dtype, qkv = qkv.dtype, qkv.to(bias.dtype)  # computes bfloat16 in float32, rounds at the end
     (mr, ma), (nr, na) = window, (rings // window[0], sectors // window[1])
     x = qkv.roll((-shift[0], -shift[1]), (1, 2)).reshape(batch, nr, mr, na, ma, 3, heads, head_dim)
     # (B, n_r, n_a, heads, M_r·M_φ, d)
@@ -258,7 +258,7 @@ def window_attention(
 
 
 def pairwise_bias(bias: Tensor, window: tuple[int, int]) -> Tensor:
-    """(B or 1, heads, N, N) for the N = M_r·M_φ tokens of a window."""
+    """The bias of each pair (query, key): (B or 1, heads, N, N) for N = M_r·M_φ tokens."""
     r = torch.arange(window[0], device=bias.device)
     a = torch.arange(window[1], device=bias.device)
     delta_r = (r[:, None] - r[None, :] + window[0] - 1)[:, None, :, None]
@@ -267,7 +267,7 @@ def pairwise_bias(bias: Tensor, window: tuple[int, int]) -> Tensor:
 
 
 def visible_pairs(rings, sectors, window, shift, periodic, device) -> Tensor:
-    """(n_r, n_a, N, N): which pairs of a window's tokens the border does not part."""
+    """(n_r, n_a, N, N): True for pairs of a window's tokens on the same side of the border."""
     side = torch.zeros(rings, sectors, dtype=torch.long, device=device)
     if not periodic[0]:
         side[rings - shift[0] :] += 1

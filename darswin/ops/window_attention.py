@@ -1,4 +1,4 @@
-"""window_attention: attention in the windows of a polar map. Public function, fakes, autograd."""
+"""window_attention: attention in the windows of a polar map. Public function, fake and autograd."""
 
 import math
 
@@ -22,32 +22,32 @@ def window_attention(
 ) -> Tensor:
     """Attends inside each window of a polar map: `softmax(q·k·scale + bias)·v`.
 
-    The windows tile the map rolled by `-shift`. Along an axis that is not periodic, tokens that the
-    roll brought together across the border do not see each other. Windows, shift and wrap are index
-    arithmetic: nothing is rolled, partitioned or masked in memory.
+    The windows tile the map after a roll by `-shift`. Along an axis that is not periodic, tokens do
+    not attend to tokens that the roll brought in from the opposite border. The operator computes
+    indices instead of rolling, partitioning or masking tensors in memory.
 
     Args:
-        qkv: (B, R, A, 3, heads, d), float32, float64 or bfloat16. With bfloat16 the arithmetic is
-            float32, and the result and the gradient of qkv are rounded once. float16 is taken like
-            bfloat16 where `darswin.ops.triton` has kernels, elsewhere as float32 under autocast.
-        bias: (B or 1, heads, 2·M_r-1, 2·M_φ-1): entry [Δr+M_r-1, Δφ+M_φ-1], Δ = query - key. Of
-            the type of qkv; with one of 16 bits it may as well be float32, and is used as such.
+        qkv: (B, R, A, 3, heads, d), float32, float64 or bfloat16. bfloat16 is computed in float32,
+            and the result and the gradient of qkv are rounded once. float16 is supported where
+            `darswin.ops.triton` has kernels; elsewhere only under autocast, as float32.
+        bias: (B or 1, heads, 2·M_r-1, 2·M_φ-1): entry [Δr+M_r-1, Δφ+M_φ-1], Δ = query - key. It has
+            the dtype of qkv. For a 16-bit qkv it may be float32, and is used in float32.
         window: (M_r, M_φ), which divides (R, A).
         shift: (s_r, s_φ), 0 ≤ s_r < R and 0 ≤ s_φ < A.
-        periodic: whether the map wraps around along (radius, azimuth). A plain Swin map is
-            (False, False).
-        scale: of the logits; None means d^-½.
+        periodic: two bools, True if the map wraps around along (radius, azimuth). A plain Swin map
+            is (False, False).
+        scale: the factor of the logits; None means d^-½.
 
     Returns:
         (B, R, A, heads·d).
 
-    Gradients go to qkv and bias; backward recomputes the probabilities, nothing but the arguments
-    is kept. Results and gradients do not depend on the number of threads.
+    backward() gives gradients for qkv and bias. It recomputes the probabilities, so only the
+    arguments are kept. Results and gradients do not depend on the number of threads.
 
     Raises:
-        TypeError: a tensor of another dtype, or an argument of another type.
-        ValueError: a shape, device or range that does not fit.
-        NotImplementedError: forward-mode derivatives, those of torch.func, and second ones.
+        TypeError: a tensor has an unsupported dtype, or an argument has the wrong type.
+        ValueError: a shape, device or range does not fit.
+        NotImplementedError: forward-mode, torch.func or second derivatives are requested.
 
     Source: DarSwin, ICCV 2023, sec. 4.4; Swin Transformer, ICCV 2021, sec. 3.2.
     """
@@ -55,7 +55,7 @@ def window_attention(
     shift = check_pair("shift", shift, lowest=0)
     if not isinstance(periodic, (tuple, list)) or len(periodic) != 2:
         raise TypeError(f"periodic must be a pair of bools, got {periodic!r}")
-    wrap = tuple(int(bool(p)) for p in periodic)  # torch.jit.trace takes no list of bools
+    wrap = tuple(int(bool(p)) for p in periodic)  # torch.jit.trace rejects lists of bools
     if _library.may_attempt() and _library.plain(qkv, bias) and bias.dtype != torch.bfloat16:
         sizes = qkv.shape
         if len(sizes) == 6 and sizes[5] > 0:
@@ -75,7 +75,7 @@ def window_attention(
         raise ValueError(f"window must divide (R, A) = ({rings}, {sectors}), got {window}")
     if shift[0] >= rings or shift[1] >= sectors:
         raise ValueError(f"shift must lie inside (R, A) = ({rings}, {sectors}), got {shift}")
-    # The bias of a qkv in 16 bits is float32; autocast may have made it narrow.
+    # The bias of a 16-bit qkv is used in float32; autocast may have narrowed it.
     half = qkv.dtype in narrow
     if isinstance(bias, Tensor) and bias.dtype in narrow:
         bias = bias.float() if half or _library.autocast_dtype(qkv) is not None else bias
@@ -91,8 +91,8 @@ def window_attention(
 
 
 def _kernel_takes(qkv: Tensor, bias: Tensor, window: tuple[int, int], *others: object) -> bool:
-    """True if the kernel for GPUs computes it: a program holds the pairs of a window's tokens, and
-    their queries, keys and values, in registers."""
+    """True if the GPU kernel supports it: the pairs of a window's tokens, and their queries, keys
+    and values, must fit in the registers of one program."""
     tokens, head_dim = math.prod(window), qkv.shape[5]
     dims = 64 if tokens <= 32 else 32
     return bias.dtype == torch.float32 and tokens <= 64 and head_dim <= dims

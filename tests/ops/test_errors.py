@@ -73,7 +73,7 @@ SAMPLING = [
     (dict(image=zeros(2, 12, 17, 23).byte()), ValueError, r"neither .* \(2, 12, 17, 23"),
     (dict(channels_last=1), TypeError, "channels_last must be True, False or None, got 1"),
     (dict(image=zeros(2, 3, 17, 23).byte(), mean=(0.1, 0.2)), ValueError,
-     r"mean must be one number or one a channel, 3, got \(0.1, 0.2\)"),
+     r"mean must be one number or one per channel \(3\), got \(0.1, 0.2\)"),
     (dict(image=zeros(2, 3, 17, 23).byte(), std=0.0), ValueError, "std must be positive, got 0.0"),
 ]  # fmt: skip
 WRONG = {
