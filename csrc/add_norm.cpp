@@ -11,7 +11,7 @@
 namespace darswin {
 namespace {
 
-// Values that are worth a thread of their own.
+// A thread should have at least this many values.
 constexpr int64_t kGrain = 8192;
 
 template <typename S, typename Out>
@@ -29,7 +29,7 @@ void run(AddNormArgs<S, Out> args, const Tensor& x, const Tensor& weight, const 
   });
 }
 
-// Bytes that a tensor's numbers lie in.
+// The bytes of a tensor's numbers.
 struct Bytes {
   const char *begin, *end;
   explicit Bytes(const Tensor& t)

@@ -1,4 +1,4 @@
-// What the drivers of _add_norm_ and _add_norm_quantized_ and their kernels agree on.
+// The interface between the drivers of _add_norm_ and _add_norm_quantized_ and their kernels.
 #pragma once
 
 #include <cstdint>
@@ -8,8 +8,8 @@
 
 namespace darswin {
 
-// x += y, then out = x normalized over its last axis * weight + bias. S is float or bfloat16, the
-// Out of `out` S, which may be y, or uint8_t.
+// x += y, then out = x normalized over its last axis * weight + bias. S, the type of x and y, is
+// float or bfloat16. Out, the type of `out`, is S or uint8_t. If it is S, `out` may be y.
 template <typename S, typename Out>
 struct AddNormArgs {
   S* x = nullptr;                                  // (rows, width)
@@ -18,7 +18,7 @@ struct AddNormArgs {
   const float *weight = nullptr, *bias = nullptr;  // (width,)
   float eps = 0;
   int64_t width = 0;
-  Quantizer quantizer = {};  // of uint8_t
+  Quantizer quantizer = {};  // for uint8_t
 };
 
 template <typename S, typename Out>

@@ -1,7 +1,7 @@
 // _norm, _linear and _blocks_ on CPU: the layers and the transformer blocks of optimized models.
 //
-// The Python calls that describe a small block take longer than its arithmetic. So all blocks of a
-// stage are one operator, which goes from kernel to kernel.
+// For a small block, the Python calls take longer than its arithmetic. So all blocks of a stage are
+// one operator, which calls kernel after kernel.
 #include <algorithm>
 #include <cmath>
 #include <vector>
@@ -22,8 +22,8 @@ const float* floats(const Tensor& tensor, int64_t count) {
   return pointer<float>(tensor);
 }
 
-// out = the linear layer of x, or its GELU, or out and it. Threads share the rows of a long map,
-// and the columns of the result of a short one.
+// Writes the linear layer of x to `out`, or its GELU, or adds it to `out`. The threads share the
+// rows of a long map, or the columns of the result of a short map.
 void multiply(const float* x, int64_t rows, int64_t depth, const Tensor& packed, int64_t columns,
               float* out, After after = After::nothing) {
   LinearArgs args{x, nullptr, out, rows, depth, columns, after};
@@ -44,10 +44,11 @@ void multiply(const float* x, int64_t rows, int64_t depth, const Tensor& packed,
   }
 }
 
-// out = the layer norm of rows of x; the parameters are its weight and its bias, (2, D).
+// Writes the layer norm of the rows of x to `out`. The parameters are its weight and its bias, (2,
+// D).
 void normalize(const float* x, int64_t rows, int64_t dim, const Tensor& parameters, double eps,
                float* out) {
-  // Without a summand x is only read.
+  // Without a second summand, the kernel only reads x.
   AddNormArgs<float, float> args{.x = const_cast<float*>(x),
                                  .out = out,
                                  .weight = floats(parameters, 2 * dim),
@@ -61,7 +62,7 @@ void normalize(const float* x, int64_t rows, int64_t dim, const Tensor& paramete
   });
 }
 
-// float32 (..., D) on the CPU, contiguous.
+// Checks for float32 (..., D) on the CPU, and returns it contiguous.
 Tensor checked_tokens(const Tensor& x) {
   STD_TORCH_CHECK(
       x.is_cpu() && x.scalar_type() == ScalarType::Float && x.dim() > 0 && x.size(x.dim() - 1) > 0,
@@ -96,7 +97,7 @@ Tensor linear(Tensor x, Tensor packed, int64_t columns, bool gelu, MaybeTensor n
   return out;
 }
 
-// The blocks of a stage, which change the residual x.
+// The blocks of a stage. They change the residual x in place.
 struct Blocks {
   int64_t heads, mlp_dim;
   double eps;
@@ -107,8 +108,8 @@ struct Blocks {
   Tensor qkv =
       new_tensor(Sizes{x.size(0), x.size(1), x.size(2), 3, heads, dim / heads}, ScalarType::Float);
 
-  // The six parameters of a block, and the window, the shift and the periodic axes of its
-  // attention.
+  // Runs one block, given its six parameters, and the window, the shift and the periodic axes of
+  // its attention.
   void block(const Tensor* parameters, const Tensor& table, const int64_t* windows) {
     const auto *tokens = pointer<float>(normed), *hidden_tokens = pointer<float>(hidden);
     auto* residual = mutable_pointer<float>(x);
@@ -123,7 +124,7 @@ struct Blocks {
     multiply(hidden_tokens, rows, mlp_dim, parameters[5], dim, residual, After::add);
   }
 
-  // From `qkv` to `normed`.
+  // Reads `qkv` and writes `normed`.
   void attend(const Tensor& table, const int64_t* windows) {
     const auto pair = [&](int k) { return Sizes(windows + k, windows + k + 2); };
     const double scale = 1 / std::sqrt(static_cast<double>(dim / heads));

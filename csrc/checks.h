@@ -1,5 +1,5 @@
-// What the drivers ask of their arguments. The checks only keep memory safe; darswin/ops explains
-// wrong arguments. `name` is the operator's, for messages.
+// The drivers' checks of their arguments. They only keep memory safe; darswin/ops explains wrong
+// arguments. `name` is the name of the operator, for messages.
 #pragma once
 
 #include <torch/csrc/stable/library.h>
@@ -25,7 +25,7 @@ using Sizes = std::vector<int64_t>;
 // A call through torch's dispatcher costs about 1 µs, as much as a small kernel. The next three
 // functions avoid it in the usual case.
 
-// The tensor if it is contiguous, else a contiguous copy.
+// Returns the tensor if it is contiguous, else a contiguous copy.
 inline Tensor as_contiguous(const Tensor& tensor) {
   return tensor.is_contiguous() ? tensor : torch::stable::contiguous(tensor);
 }
@@ -33,7 +33,7 @@ inline MaybeTensor as_contiguous(const MaybeTensor& tensor) {
   return tensor ? MaybeTensor(as_contiguous(*tensor)) : tensor;
 }
 
-// A contiguous tensor on the CPU whose values are not initialized.
+// Returns a contiguous tensor on the CPU whose values are not initialized.
 inline Tensor new_tensor(IntHeaderOnlyArrayRef sizes, ScalarType type) {
   Sizes strides(sizes.size(), 1);
   for (size_t axis = sizes.size(); axis > 1; --axis) {
@@ -49,10 +49,10 @@ inline Tensor new_tensor(IntHeaderOnlyArrayRef sizes, ScalarType type) {
   return Tensor(made);
 }
 
-// An empty tensor stands for a gradient that is not wanted.
+// Stands for a gradient that is not wanted: an empty tensor.
 inline Tensor no_gradient(ScalarType type) { return new_tensor(Sizes{0}, type); }
 
-// The type of tensors of T, float or double.
+// The type of tensors whose numbers are T, float or double.
 template <typename T>
 constexpr ScalarType type_of() {
   return sizeof(T) == sizeof(float) ? ScalarType::Float : ScalarType::Double;
@@ -67,7 +67,8 @@ T* mutable_pointer(const Tensor& tensor) {
   return static_cast<T*>(tensor.mutable_data_ptr());
 }
 
-// RuntimeError unless 64 times the product of the sizes above 0 fits 64 bits. None is negative.
+// Raises a RuntimeError unless 64 times the product of all positive sizes fits 64 bits. No size is
+// negative.
 inline void check_product(std::initializer_list<int64_t> sizes) {
   int64_t result = 64;
   for (const int64_t size : sizes) {
@@ -76,8 +77,8 @@ inline void check_product(std::initializer_list<int64_t> sizes) {
   }
 }
 
-// How many rows a tensor has that must be (B or 1, sizes...), on the CPU and of T. `names` says
-// which tensors it is one of.
+// Returns the number of rows of a tensor, which must have shape (B or 1, sizes...) and type T, and
+// be on the CPU. `names` lists the tensors of its kind, for the message.
 template <typename T>
 int64_t count_rows(const Tensor& tensor, int64_t batch, const Sizes& sizes, const char* names) {
   const Sizes given = tensor.sizes().vec();
@@ -88,8 +89,8 @@ int64_t count_rows(const Tensor& tensor, int64_t batch, const Sizes& sizes, cons
   return given[0];
 }
 
-// An output's gradient, contiguous: gradients arrive expanded or strided, `.sum().backward()` gives
-// stride 0.
+// Returns the gradient of an output as a contiguous tensor. Gradients may arrive expanded or
+// strided: `.sum().backward()` gives stride 0.
 inline Tensor checked_gradient(const Tensor& grad, const Sizes& sizes, ScalarType type,
                                const char* name) {
   STD_TORCH_CHECK(grad.is_cpu() && grad.scalar_type() == type && grad.sizes().vec() == sizes, name,
@@ -104,7 +105,7 @@ inline Quantizer quantizer(double scale, int64_t zero_point) {
   return {static_cast<float>(steps), static_cast<int32_t>(zero_point)};
 }
 
-// The gradient of `like`, from doubles that were added up in a fixed order.
+// Returns the gradient of `like`, rounded from doubles that were added in a fixed order.
 template <typename T>
 Tensor rounded_like(const Tensor& like, const std::vector<double>& sums) {
   const Tensor grad = new_tensor(like.sizes(), type_of<T>());
@@ -112,7 +113,7 @@ Tensor rounded_like(const Tensor& like, const std::vector<double>& sums) {
   return grad;
 }
 
-// use<T>() with T the type of x's numbers: float, double or bfloat16.
+// Calls use<T>(), where T is the type of x's numbers: float, double or bfloat16.
 template <typename Use>
 auto with_real_type(const Tensor& x, const char* name, Use use) {
   STD_TORCH_CHECK(x.is_cpu(), name, ": the tensors must be on the CPU");

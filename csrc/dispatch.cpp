@@ -1,5 +1,5 @@
-// Picks one tier of kernels at load, as ATen does: ATEN_CPU_CAPABILITY may lower it, never raise it
-// above what the CPU has.
+// Picks one tier of kernels at load, as ATen does. ATEN_CPU_CAPABILITY may lower the tier, but
+// never raise it above the CPU's best.
 #include "dispatch.h"
 
 #include <cstdlib>
@@ -34,7 +34,8 @@ Tier initial() {
   const char* wanted = std::getenv("ATEN_CPU_CAPABILITY");
   if (wanted == nullptr) return best;
   if (std::strcmp(wanted, "default") == 0) return Tier::generic;
-  // A tier above the CPU's, or a name that torch itself warns about, leaves the best one.
+  // If the CPU lacks the tier, or the name is one that torch itself warns about, the best tier
+  // stays.
   return find(wanted).value_or(best);
 }
 

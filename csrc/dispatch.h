@@ -1,4 +1,4 @@
-// Which tier of kernels runs. For drivers only: kernels/ must not include it (see tier.h).
+// Selects the tier of kernels that runs. Only drivers may include this, not kernels/ (see tier.h).
 #pragma once
 
 #include <atomic>
@@ -8,14 +8,16 @@
 
 namespace darswin {
 
-// The tier in use: the best one the CPU has, or what ATEN_CPU_CAPABILITY or set_tier asked for.
+// The tier in use: the best tier of the CPU, or the one that ATEN_CPU_CAPABILITY or set_tier asked
+// for.
 Tier current_tier();
 
 const char* tier_name(Tier tier);
-std::vector<Tier> available_tiers();  // those of this build that the CPU has, from low to high
-bool set_tier(const char* name);      // false where the CPU or the build lacks that tier
+std::vector<Tier> available_tiers();  // this build's tiers that the CPU has, low to high
+bool set_tier(const char* name);      // false if the CPU or the build lacks that tier
 
-// Whether far images are read by gathers where that is possible, or as is faster on this CPU.
+// The use of gathers to read far images: never, always where possible, or wherever they are faster
+// on this CPU.
 enum class Gathers { never, always, by_cpu };
 inline std::atomic<Gathers> gathers{Gathers::by_cpu};
 bool cpu_is_intel();
@@ -27,7 +29,7 @@ const Table* find_table(Tier tier) {
   return found;
 }
 
-// The kernels of the operator that `Table` belongs to, for the tier in use.
+// Returns the kernels of the operator that `Table` belongs to, for the tier in use.
 template <typename Table>
 const Table& kernels() {
   using enum Tier;

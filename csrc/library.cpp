@@ -1,5 +1,5 @@
-// Table of contents of libdarswin.so: the operators' schemas, and the module's build facts.
-// The CPU implementations are registered in their drivers; fake kernels and autograd are in
+// The table of contents of libdarswin.so: the schemas of the operators, and facts about the build
+// of the module. The drivers register the CPU implementations. Fake kernels and autograd are in
 // darswin/ops.
 #include <torch/csrc/stable/library.h>
 
@@ -7,8 +7,8 @@
 
 #include "dispatch.h"
 
-// The arguments that polar_sample and polar_embed share, in the order of the fields of struct
-// Sampling (polar_call.h) and of darswin.ops._sampling.Sampling.
+// The arguments that polar_sample and polar_embed share. Their order is that of the fields of
+// struct Sampling (polar_call.h) and of darswin.ops._sampling.Sampling.
 #define SAMPLING                                                                                  \
   "Tensor image, Tensor radii, Tensor azimuths, Tensor center, Tensor? affine, Tensor? offsets, " \
   "Tensor? jitter, Tensor? seed, int[] samples, float[] mean, float[] std, bool bfloat16"
@@ -17,7 +17,7 @@
   "Tensor x, Tensor radii, Tensor? center, Tensor? affine, Tensor? points, Tensor? r_max, " \
   "int[] size, bool tokens"
 
-// A backward takes what its operator takes, then the gradient of the output.
+// A backward takes the arguments of its operator, then the gradient of the output.
 STABLE_TORCH_LIBRARY(darswin, m) {
   m.def("polar_sample(" SAMPLING ", bool tokens) -> Tensor");
   m.def("polar_sample_backward(" SAMPLING
@@ -54,13 +54,13 @@ STABLE_TORCH_LIBRARY(darswin, m) {
   m.def("_transpose_sum(Tensor x) -> (Tensor, Tensor)");
 }
 
-// The module's facts, which darswin/ops/_module.py reads.
+// Facts about the module, which darswin/ops/_module.py reads.
 #define FACT extern "C" __attribute__((visibility("default")))
 
 // The instruction-set tier in use.
 FACT const char* darswin_tier() { return darswin::tier_name(darswin::current_tier()); }
 
-// The tiers that this CPU and this build offer, from low to high, each with a space behind it.
+// The tiers that this CPU and this build offer, from low to high. A space follows each name.
 FACT const char* darswin_tiers() {
   static const std::string names = [] {
     std::string joined;
@@ -72,13 +72,14 @@ FACT const char* darswin_tiers() {
   return names.c_str();
 }
 
-// Runs the operators on another tier from now on; false where it is not offered.
+// Runs the operators on another tier from now on. Returns false if that tier is not offered.
 FACT bool darswin_set_tier(const char* name) { return darswin::set_tier(name); }
 
-// Reads far images without gathers (0), with them (1), or as is faster on this CPU (2).
+// Reads far images without gathers (0), with them (1), or in the way that is faster on this CPU
+// (2).
 FACT void darswin_set_gathers(int way) { darswin::gathers = static_cast<darswin::Gathers>(way); }
 
-// What this module was built with, as JSON.
+// The compiler, the C++ standard, the OpenMP version and the torch ABI of this build, as JSON.
 FACT const char* darswin_build_info() {
   static const std::string info =
       R"({"compiler": "g++ )" __VERSION__ R"(", "cxx_standard": )" + std::to_string(__cplusplus) +

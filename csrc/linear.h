@@ -1,4 +1,4 @@
-// What the driver of linear layers and its kernels agree on.
+// The interface between the driver of linear layers and its kernels.
 #pragma once
 
 #include <cstdint>
@@ -7,16 +7,16 @@
 
 namespace darswin {
 
-// A packed linear layer is one array of floats: the bias, then the weight in panels of kPanel
-// columns, each a matrix (depth, columns of the panel). The last panel has as many columns as are
-// left. The columns are padded with zeros to a multiple of kPanelUnit.
+// A packed linear layer is one array of floats. First comes the bias, then the weight in panels of
+// kPanel columns. Each panel is a matrix (depth, columns of the panel). The last panel has the
+// remaining columns. The columns are padded with zeros to a multiple of kPanelUnit.
 constexpr int64_t kPanel = 48, kPanelUnit = 16;
 
 // The step that follows the product.
 enum class After {
   nothing,
   gelu,
-  add,  // to what `out` holds
+  add,  // added to the values in `out`
 };
 
 // out = x * weight^T + bias
@@ -41,7 +41,7 @@ inline int64_t panel_count(const LinearArgs& a) {
 }  // namespace
 
 struct LinearKernels {
-  // The columns of panels [first, last) of rows [begin, end).
+  // Computes the columns of panels [first, last) of rows [begin, end).
   void (*rows)(const LinearArgs&, int64_t begin, int64_t end, int64_t first, int64_t last);
 };
 

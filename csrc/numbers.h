@@ -1,4 +1,4 @@
-// Numbers as drivers and kernels hand them to each other.
+// The types of numbers that drivers and kernels share.
 #pragma once
 
 #include <cstdint>
@@ -11,11 +11,11 @@ struct bfloat16 {
   uint16_t bits;
 };
 
-// The type in which a storage type is computed.
+// The type used to compute with numbers of a storage type.
 template <typename T>
 using Arithmetic = std::conditional_t<std::is_same_v<T, bfloat16>, float, T>;
 
-// How numbers become 8 bits: round(x / scale) + zero_point, kept in 0 ... 255.
+// Converts numbers to 8 bits: round(x / scale) + zero_point, clamped to 0 ... 255.
 struct Quantizer {
   float steps = 1;  // 1 / scale
   int32_t zero_point = 0;

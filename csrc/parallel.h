@@ -1,5 +1,5 @@
-// What every driver needs to be fast and still give the same bits for any number of threads: OpenMP
-// over contiguous ranges, and working memory for each thread.
+// OpenMP over contiguous ranges, and working memory for each thread. With these, every driver is
+// fast and still gives the same bits for any number of threads.
 #pragma once
 
 #include <omp.h>
@@ -19,8 +19,9 @@
 
 namespace darswin {
 
-// It takes longer to map memory that is new from the system, page by page, than to write it. Large
-// pages make it faster. Below 32 MB glibc hands out memory that it has kept, already mapped.
+// Asks the system for large pages. Mapping new memory page by page takes longer than writing it,
+// and large pages make the mapping faster. Below 32 MB, glibc hands out memory that it has kept and
+// that is already mapped.
 inline void ask_for_large_pages(void* memory, size_t bytes) {
 #if defined(__linux__) && defined(MADV_HUGEPAGE)
   constexpr uintptr_t kPage = 4096, kLeast = uintptr_t{32} << 20;
@@ -36,10 +37,10 @@ inline void ask_for_large_pages(const torch::stable::Tensor& tensor) {
   ask_for_large_pages(tensor.mutable_data_ptr(), tensor.numel() * tensor.element_size());
 }
 
-// Working memory of the calling thread for as long as this lives: at least `bytes`, aligned to
-// cache lines, contents undefined. Up to kKept bytes stay with the thread from use to use, since
-// fresh pages cost more than what the kernels do with them; so a thread has one of these at a time.
-// Throws std::bad_alloc.
+// Working memory of the calling thread, for the lifetime of this object. It has at least `bytes`
+// bytes, is aligned to cache lines and is not initialized. Up to kKept bytes stay with the thread
+// between uses, because fresh pages cost more than the work of the kernels in them. So a thread can
+// have only one of these objects at a time. Throws std::bad_alloc.
 class ThreadMemory {
  public:
   explicit ThreadMemory(size_t bytes) {
@@ -59,7 +60,7 @@ class ThreadMemory {
   void* get() const { return memory.get(); }
 
  private:
-#if defined(__SANITIZE_ADDRESS__)  // so that it sees every step beyond the end
+#if defined(__SANITIZE_ADDRESS__)  // so that it sees every access beyond the end
   static constexpr size_t kKept = 0, kUnit = 64;
 #else
   static constexpr size_t kKept = size_t{32} << 20, kUnit = 4096;
@@ -77,17 +78,18 @@ class ThreadMemory {
   static inline thread_local size_t size = 0;
 };
 
-// The threads that are worth starting for so many microseconds of work. The second one takes about
-// two of them to begin, and more if it has fallen asleep.
+// Returns the number of threads that is worth starting for so many microseconds of work. The second
+// thread takes about two microseconds to begin, and more if it has fallen asleep.
 inline int64_t threads_for(double microseconds) {
-  constexpr double kLeast = 10;  // for each thread
+  constexpr double kLeast = 10;  // microseconds for each thread
   const double most = std::max(microseconds / kLeast, 1.0);
   const int64_t threads = torch::stable::get_num_threads();
   return most < static_cast<double>(threads) ? static_cast<int64_t>(most) : threads;
 }
 
-// body(begin, end) on contiguous ranges that cover [0, count), each in a thread of its own. An
-// exception must not leave an OpenMP region: it is kept, and thrown again when all threads end.
+// Calls body(begin, end) on contiguous ranges that cover [0, count), each in its own thread. An
+// exception must not leave an OpenMP region. So it is stored, and thrown again when all threads
+// have ended.
 template <typename Body>
 void parallel_ranges(int64_t count, int64_t threads, Body&& body) {
   if (count <= 0) return;
@@ -113,7 +115,7 @@ void parallel_ranges(int64_t count, Body&& body) {
   parallel_ranges(count, torch::stable::get_num_threads(), std::forward<Body>(body));
 }
 
-// body(begin, end, scratch) in the same way, each thread with `bytes` of working memory.
+// Calls body(begin, end, scratch) in the same way. Each thread gets `bytes` of working memory.
 template <typename Body>
 void run_with_scratch(int64_t count, int64_t threads, int64_t bytes, Body&& body) {
   parallel_ranges(count, threads, [&](int64_t begin, int64_t end) {

@@ -1,4 +1,4 @@
-// A call of polar_sample or polar_embed, checked and laid out as the kernels take it.
+// One call of polar_sample or polar_embed: checks its arguments and lays them out for the kernels.
 #pragma once
 
 #include <numeric>
@@ -23,12 +23,13 @@ struct Sampling {
 };
 
 // An image is packed if its copy takes at most this many bytes, which stay in the second-level
-// cache, and if it has at most this many pixels a point.
+// cache, and if it has at most this many pixels for each point.
 constexpr int64_t kPackedBytes = 3 << 19;
 constexpr int64_t kPackedPixelsPerPoint = 4;
-// Up to this size, 1 MB of float32, CPUs not of Intel read gray images faster by gathers.
+// Up to this size (1 MB of float32), CPUs that are not from Intel read gray images faster by
+// gathers.
 constexpr int64_t kGatheredPixels = 1 << 18;
-// Sums of bfloat16 pixels are float32, of four channels: no thread keeps more of them than this.
+// bfloat16 pixels have float32 sums of four channels. No thread keeps more bytes of sums than this.
 constexpr int64_t kSumsBytes = 24 << 20;
 
 inline Pixel pixel_type(const Tensor& image) {
@@ -46,7 +47,7 @@ inline Pixel pixel_type(const Tensor& image) {
   }
 }
 
-// The value of a tensor of one number.
+// Returns the number in a tensor of one number.
 template <typename T>
 T single(const Tensor& tensor, ScalarType type, const char* what) {
   STD_TORCH_CHECK(tensor.is_cpu() && tensor.numel() == 1 && tensor.scalar_type() == type,
@@ -54,19 +55,20 @@ T single(const Tensor& tensor, ScalarType type, const char* what) {
   return *pointer<T>(tensor);
 }
 
-// Which gradients backward is asked for. Those of radii, center and affine come together.
+// The gradients that backward should compute. Radii, center and affine share one flag.
 struct PolarWanted {
   bool image, lens, offsets;
 };
 
-// Gradients of the sampling: empty tensors where they are not wanted.
+// The gradients of the sampling. Unwanted gradients are empty tensors.
 struct PolarGradients {
   Tensor image, radii, center, affine, offsets;
 
   auto tuple() const { return std::tuple(image, radii, center, affine, offsets); }
 };
 
-// One call's arguments as the kernels take them. Owns what `args` points into.
+// The arguments of one call, as the kernels take them. This object owns the memory that `args`
+// points into.
 template <typename T>
 struct PolarCall {
   Tensor image, radii, center;
@@ -98,14 +100,14 @@ struct PolarCall {
     args.pixel = pixel_type(image);
     args.image = image.const_data_ptr();
     args.channels = image.size(1), args.height = image.size(2), args.width = image.size(3);
-    // The stride of a single row or column may be any number, and is never used.
+    // The stride of an axis of size 1 may be any number, and is never used.
     for (int axis = 0; axis < 4; ++axis) {
       args.image_stride[axis] = image.size(axis) > 1 ? image.stride(axis) : 0;
     }
     args.num_radii = radii.size(1), args.num_azimuths = azimuths.size(0);
     args.samples_r = samples[0], args.samples_a = samples[1];
     args.narrow = given.bfloat16;
-    // What is counted below: points, values of samples, sums of a lens.
+    // Later code counts these: points, values of samples, sums of a lens.
     check_product({batch, args.num_radii, args.num_azimuths, args.channels});
     check_product({args.samples_r, args.samples_a, args.channels});
     take_lens();
@@ -119,12 +121,13 @@ struct PolarCall {
   int64_t sectors() const { return args.num_azimuths / args.samples_a; }
   int64_t token_size() const { return args.samples_r * args.samples_a * args.channels; }
   ScalarType output_type() const { return args.narrow ? ScalarType::BFloat16 : type_of<T>(); }
-  // Images that samples are taken of: none if there is no point or no channel.
+  // The number of images that are sampled: none if there is no point or no channel.
   int64_t sampled_images() const { return points() && args.channels > 0 ? batch : 0; }
   bool points() const { return batch > 0 && args.num_radii > 0 && args.num_azimuths > 0; }
 
-  // Into how many bands of rows backward cuts an image, so that a small batch of large images uses
-  // all threads, and a thread never needs much memory for the sums of bfloat16 pixels.
+  // Returns the number of bands of rows into which backward cuts an image. Bands let a small batch
+  // of large images use all threads. They also limit the memory that a thread needs for the sums of
+  // bfloat16 pixels.
   int64_t count_bands() const {
     const int64_t threads = torch::stable::get_num_threads();
     int64_t bands = 1;
@@ -141,13 +144,13 @@ struct PolarCall {
     return {no_gradient(image.scalar_type()), of_lens, of_lens, of_lens, of_lens};
   }
 
-  // The image's gradient, for backward kernels to fill.
+  // Returns a new gradient of the image, which the backward kernels fill.
   Tensor new_image_gradient() {
     STD_TORCH_CHECK(args.pixel != Pixel::u8, "polar_sample: uint8 pixels have no gradient");
-    // Sums of bfloat16 pixels are kept packed whatever the size, and indexed with 32 bits.
+    // Sums of bfloat16 pixels are kept in packed form for every size, with 32-bit indices.
     STD_TORCH_CHECK(args.pixel != Pixel::bf16 || packed_values() < 2147483648.0,
                     "polar_sample_backward: too large an image for a bfloat16 gradient");
-    // Where there are points the kernels write every pixel.
+    // If there are points, the kernels write every pixel.
     const Tensor grad =
         points() ? new_tensor(image.sizes(), image.scalar_type()) : new_zeros(image, image.sizes());
     ask_for_large_pages(grad);
@@ -155,7 +158,7 @@ struct PolarCall {
     return grad;
   }
 
-  // The gradients that are wanted, from args.grad_out.
+  // Computes the wanted gradients from args.grad_out.
   PolarGradients backward(const PolarWanted& wanted) {
     const int64_t images = sampled_images();
     const auto& kernel = kernels<PolarSampleKernels<T>>();
@@ -174,7 +177,8 @@ struct PolarCall {
       grads.offsets = new_zeros(*offsets, offsets->sizes());
       args.grad_offsets = mutable_pointer<T>(grads.offsets);
     }
-    // Images that share offsets add to one gradient: one thread takes a ring of all, in turn.
+    // Images that share offsets add to one gradient. So one thread takes the same ring of all
+    // images, one after the other.
     const int64_t sharing =
         to_offsets && args.offsets_stride == 0 ? std::max<int64_t>(batch, 1) : 1;
     std::vector<double> sums(images * args.num_radii * kLensSums);
@@ -221,7 +225,7 @@ struct PolarCall {
     }
   }
 
-  // uint8 pixels p count as (p / 255 - mean) / std.
+  // A uint8 pixel p has the value (p / 255 - mean) / std.
   void take_normalization(const Sampling& given) {
     if (args.pixel != Pixel::u8) return;
     const size_t channels = static_cast<size_t>(args.channels);
@@ -235,7 +239,7 @@ struct PolarCall {
     args.pixel_offset = offset.data();
   }
 
-  // Angles, cosines, sines, each padded for whole registers.
+  // Stores angles, cosines and sines, each padded to whole registers.
   void take_directions(const Tensor& azimuths) {
     const int64_t padded = (args.num_azimuths + 15) / 8 * 8;
     directions.assign(3 * padded, 0.0);
@@ -249,8 +253,9 @@ struct PolarCall {
         std::all_of(cosines, cosines + args.num_azimuths, [](double x) { return x == x; });
   }
 
-  // Whether the image is packed, or else read by gathers: where docs/performance.md shows them to
-  // be faster than loads. They take up to twice as long for other images.
+  // Chooses whether the image is packed. If it is not, chooses whether it is read by gathers.
+  // docs/performance.md shows the cases in which gathers are faster than loads. For other images
+  // they take up to twice as long.
   void choose_reading() {
     const double pixels = static_cast<double>(args.height) * static_cast<double>(args.width);
     const double points =
@@ -265,13 +270,14 @@ struct PolarCall {
     args.gathers = possible && (gathers == Gathers::by_cpu ? faster : gathers == Gathers::always);
   }
 
-  // Values of the packed image of the kernels; in double, since it may not fit 64 bits.
+  // Returns the number of values in the kernels' packed image. It is a double, because it may not
+  // fit 64 bits.
   double packed_values() const {
     return static_cast<double>(args.height + 3) * static_cast<double>(args.width + 3) *
            static_cast<double>((args.channels + 3) / 4 * 4);
   }
 
-  // From the sums of each row of points to the gradients of radii, center and affine.
+  // Adds up the sums of each row of points into the gradients of radii, center and affine.
   void fold_lens(const std::vector<double>& sums, PolarGradients& grads) const {
     const int64_t count = args.num_radii;
     std::vector<double> of_radii(radii.numel()), of_center(center.numel());
@@ -299,8 +305,8 @@ struct PolarCall {
   }
 };
 
-// Listed<run<float>, run<double>>::call is run(PolarCall, others...) as the dispatcher calls it,
-// argument by argument, for the type of the image.
+// Makes a function with the dispatcher's list of arguments: Listed<run<float>, run<double>>::call.
+// It calls run(PolarCall, others...) for the type of the image.
 template <auto in_float, auto in_double>
 struct Listed;
 template <typename Result, typename... Others, Result (*in_float)(PolarCall<float>&, Others...),

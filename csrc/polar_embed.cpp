@@ -10,7 +10,8 @@ namespace {
 
 int64_t padded(int64_t n) { return (n + kRowUnit - 1) / kRowUnit * kRowUnit; }
 
-// A weight (D, S_r * S_phi * C) or a bias (D,), contiguous and in the type that is computed in.
+// Returns a weight (D, S_r * S_phi * C) or a bias (D,), contiguous and in the type used for
+// computing.
 template <typename T>
 Tensor parameter(const Tensor& value) {
   const ScalarType type = value.scalar_type();
@@ -33,7 +34,7 @@ Sizes output_sizes(const PolarCall<T>& call, int64_t features) {
   return {call.batch, call.rings(), call.sectors(), features};
 }
 
-// (rows, columns) -> (columns, to_stride), four by four in registers.
+// Transposes (rows, columns) -> (columns, to_stride), in squares of four by four in registers.
 template <typename T>
 void transpose(const T* from, int64_t rows, int64_t columns, T* to, int64_t to_stride) {
   using V = Vector<T, 4>;
@@ -77,12 +78,13 @@ Tensor forward(PolarCall<T>& call, Tensor weight, MaybeTensor bias) {
   return out;
 }
 
-// How many tokens are summed one by one. Longer sums add up such partial sums, since the rounding
-// of a sum grows with its length.
+// Up to this many tokens are summed one by one. Longer sums add up such partial sums, because the
+// rounding error of a sum grows with its length.
 constexpr int64_t kRunTokens = 1024;
 
-// Gradients of weight and bias. Each chunk of items has sums of its own, which are added up in
-// order. The number of chunks does not depend on that of the threads, nor does the result.
+// Returns the gradients of weight and bias. Each chunk of items has its own sums, which are added
+// in order. The number of chunks does not depend on the number of threads, so the result does not
+// either.
 template <typename T>
 std::tuple<Tensor, Tensor> weight_gradients(const PolarCall<T>& call,
                                             const PolarEmbedArgs<T>& embed) {
@@ -128,7 +130,7 @@ std::tuple<Tensor, Tensor> weight_gradients(const PolarCall<T>& call,
   return {weight, bias};
 }
 
-// Gradients of image and lens, through those of the samples.
+// Returns the gradients of image and lens, computed from the gradients of the samples.
 template <typename T>
 PolarGradients sampling_gradients(PolarCall<T>& call, PolarEmbedArgs<T>& embed,
                                   const Tensor& weight, const PolarWanted& wanted) {

@@ -17,9 +17,9 @@ int64_t largest_divisor(int64_t number, int64_t most) {
   return divisor;
 }
 
-// An image has no tokens, so the driver chooses what the kernels take for one: near, one radius,
-// whose samples stay in the nearest cache; far, pieces that are about square, whose points share
-// pixels.
+// An image has no tokens, so the driver chooses the pieces that the kernels treat as tokens. For a
+// near image, a piece is one radius, whose samples stay in the first-level cache. For a far image,
+// pieces are about square, so that their points share pixels.
 template <typename T>
 void choose_layout(PolarSampleArgs<T>& args, bool tokens) {
   constexpr int64_t kSide = 16;

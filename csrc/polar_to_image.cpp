@@ -14,7 +14,8 @@ namespace {
 
 constexpr char kName[] = "polar_to_image";
 
-// One call's arguments as the kernels take them. Owns what `args` points into.
+// The arguments of one call, as the kernels take them. This object owns the memory that `args`
+// points into.
 template <typename T>
 struct ToImageCall {
   using Real = Arithmetic<T>;
@@ -71,7 +72,8 @@ struct ToImageCall {
     }
   }
 
-  // The centres, and the matrices undone; a singular one leaves nothing that is finite.
+  // Stores the centres and the inverse matrices. The inverse of a singular matrix has no finite
+  // values.
   void find_plane() {
     const int64_t matrices = affine ? rows(*affine, {2, 2}) : 1;
     const Real *c = pointer<Real>(*center), *m = affine ? pointer<Real>(*affine) : nullptr;
@@ -109,7 +111,7 @@ Tensor forward(ToImageCall<T>&& call) {
   if (out.numel() == 0) return out;
   ask_for_large_pages(out);
   args.out = mutable_pointer<T>(out);
-  // Images of one lens take turns, band by band, so that one plan of a band serves all of them.
+  // Images with the same lens take turns, band by band, so that all of them use one plan of a band.
   constexpr int64_t kBandRows = 8, kItems = 16;
   const int64_t rows =
       std::clamp<int64_t>(args.height * args.batch / kItems, 1, args.batch > 1 ? kBandRows : 1);
@@ -118,8 +120,9 @@ Tensor forward(ToImageCall<T>&& call) {
   return out;
 }
 
-// Into how many bands an image is cut, so that few channels of few images use all threads, too.
-// It must not depend on the number of threads, or the sums would.
+// Returns the number of bands into which an image is cut. Bands let few channels of few images use
+// all threads too. The number must not depend on the number of threads, because the sums would then
+// depend on it.
 template <typename T>
 int64_t count_bands(const PolarToImageArgs<T>& args) {
   constexpr int64_t kItems = 16;
@@ -149,7 +152,7 @@ Tensor map_gradient(ToImageCall<T>& call) {
   return grad;
 }
 
-// The gradients of radii, center, affine and points, in this order.
+// Returns the gradients of radii, center, affine and points, in this order.
 template <typename T>
 std::vector<Tensor> lens_gradients(ToImageCall<T>& call) {
   auto& args = call.args;
@@ -165,7 +168,7 @@ std::vector<Tensor> lens_gradients(ToImageCall<T>& call) {
   for (int64_t item = 0; item < args.lenses * args.height; ++item) {
     for (int64_t k = 0; k < row; ++k) lens[item / args.height * row + k] += sums[item * row + k];
   }
-  // The gradient of a tensor, for which add(lens, its values) adds up what a lens gives.
+  // Returns the gradient of a tensor. add(lens, its values) adds the part of one lens.
   const auto summed = [&](const MaybeTensor& of, auto add) {
     if (!of) return no_gradient(type_of<Arithmetic<T>>());
     const int64_t values = of->size(0) == 0 ? 0 : of->numel() / of->size(0);
@@ -183,14 +186,15 @@ std::vector<Tensor> lens_gradients(ToImageCall<T>& call) {
                  [&](int64_t n, double* to) {
                    for (int64_t k = 0; k < args.rings; ++k) to[k] += lens[n * row + k];
                  }),
-          // d = M (p - center), so the center's is -M^T times that of d.
+          // d = M (p - center), so the gradient of the center is -M^T times the gradient of d.
           summed(call.center,
                  [&](int64_t n, double* to) {
                    const double *m = on_plane(n) + 2, *g = of_d(n);
                    to[0] -= m[0] * g[0] + m[2] * g[1];
                    to[1] -= m[1] * g[0] + m[3] * g[1];
                  }),
-          // M is the matrix's inverse: dA = -M^T (sum of the gradient of d times p - center) M^T.
+          // M is the inverse of the matrix, so dA = -M^T (sum of the gradient of d times p -
+          // center) M^T.
           summed(call.affine,
                  [&](int64_t n, double* to) {
                    const double *m = on_plane(n) + 2, *g = of_d(n) + 2;

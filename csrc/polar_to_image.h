@@ -1,4 +1,4 @@
-// What the driver of polar_to_image and its kernels agree on.
+// The interface between the driver of polar_to_image and its kernels.
 #pragma once
 
 #include <cstdint>
@@ -8,9 +8,10 @@
 
 namespace darswin {
 
-// The six numbers that take a pixel to the polar plane: d = inverse (p - center).
+// The six numbers that map a pixel to the polar plane: d = inverse (p - center).
 constexpr int64_t kPlane = 6;  // center x, y; inverse xx, xy, yx, yy
-// What backward sums over pixels besides the radii's gradients: of d, and of d times p - center.
+// The sums over pixels that backward needs in addition to the gradients of the radii: the gradient
+// of d, and the gradient of d times p - center.
 constexpr int64_t kSums = 6;
 
 template <typename T>
@@ -19,14 +20,14 @@ struct PolarToImageArgs {
 
   const T* x;           // (B, R, A, D)
   const Real* radii;    // (B or 1, R), rising
-  const double* plane;  // (B or 1, kPlane), or null where there are points
+  const double* plane;  // (B or 1, kPlane), or null if there are points
   const Real* points;   // (B or 1, H, W, 2), or null
   const Real* r_max;    // (B or 1), or null
   int64_t radii_rows, place_rows, r_max_rows;
   int64_t batch, rings, sectors, channels, height, width;
   bool tokens;  // (B, H, W, D), else (B, D, H, W)
 
-  int64_t bands;  // into how many bands of rows an image is cut
+  int64_t bands;  // the number of bands of rows into which an image is cut
 
   T* out;  // forward
 
@@ -38,20 +39,20 @@ struct PolarToImageArgs {
   Real* grad_points;  // (lenses, H, W, 2), or null
 };
 
-// Channels that one item of backward takes.
+// The channels of one item of backward.
 constexpr int64_t kChannelBlock = 32;
 
-// A kernel works serially through the items [begin, end); the driver owns the threads.
+// Kernels process the items [begin, end) on one thread. The driver owns the threads.
 template <typename T>
 struct PolarToImageKernels {
   using Args = PolarToImageArgs<T>;
-  // bytes of scratch that each thread needs in the functions below
+  // bytes of scratch for each thread that runs one of the functions below
   int64_t (*scratch)(const Args&);
   // item: (band of rows, image)
   void (*forward)(const Args&, int64_t begin, int64_t end, void* scratch);
   // item: (band of rows, image, block of channels) -> grad_x or partial
   void (*backward_map)(const Args&, int64_t begin, int64_t end, void* scratch);
-  // item: value of grad_x, as the sum over the bands of partial
+  // item: value of grad_x, the sum of partial over the bands
   void (*sum_bands)(const Args&, int64_t begin, int64_t end);
   // item: (lens, row of pixels) -> grad_rows and grad_points
   void (*backward_lens)(const Args&, int64_t begin, int64_t end, void* scratch);

@@ -28,8 +28,9 @@ std::tuple<Tensor, Tensor> transpose_sum(const Tensor& x) {
                               .columns = columns};
   parallel_ranges(groups,
                   [&](auto... range) { kernels<TransposeSumKernels>().groups(args, range...); });
-  // Adds up the groups in order, whichever thread made them; in double, since there may be many
-  // thousands. Some columns at a time, whose totals stay in the nearest cache.
+  // Adds up the groups in order, so that the result does not depend on the threads. The totals are
+  // double, because there may be many thousands of groups. Only some columns are added at a time,
+  // so that their totals stay in the first-level cache.
   constexpr int64_t kColumns = 128;
   auto* to = mutable_pointer<float>(sum);
   for (int64_t first = 0; first < columns; first += kColumns) {

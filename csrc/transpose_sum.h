@@ -1,4 +1,4 @@
-// What the driver of _transpose_sum and its kernel agree on.
+// The interface between the driver of _transpose_sum and its kernel.
 #pragma once
 
 #include <cstdint>
@@ -7,10 +7,10 @@
 
 namespace darswin {
 
-// Rows are taken in groups of this many; each group has its own sums of columns.
+// Rows are processed in groups of this many. Each group has its own sums of columns.
 constexpr int64_t kGroupRows = 64;
 
-// to = the transpose of `from`.
+// Writes the transpose of `from` to `to`, and the sums of the columns of each group to `sums`.
 struct TransposeSumArgs {
   const float* from;  // (rows, columns)
   float* to;          // (columns, rows)

@@ -7,7 +7,7 @@
 namespace darswin {
 namespace {
 
-// The output, or with a quantizer the same as 8 bits, which only float has.
+// Returns the output. With a quantizer, which only float has, it returns the output as 8 bits.
 template <typename T>
 Tensor forward(AttentionCall<T>&& call, const Quantizer* quantizer = nullptr) {
   auto& args = call.args;
@@ -25,8 +25,9 @@ Tensor forward(AttentionCall<T>&& call, const Quantizer* quantizer = nullptr) {
   return out;
 }
 
-// How many windows share one row of bias gradients: many, so that few rows are left to add up, but
-// not so many that threads get unequal work. If it depended on the threads, the sums would.
+// Returns how many windows share one row of bias gradients. Many windows leave few rows to add up,
+// but too many would give threads unequal work. The number must not depend on the threads, because
+// the sums would then depend on them.
 template <typename T>
 int64_t chunk_size(const WindowAttentionArgs<T>& args) {
   const int64_t most = std::clamp<int64_t>(args.windows * args.heads / 32, 1, 16);

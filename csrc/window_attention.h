@@ -1,4 +1,4 @@
-// What the driver of window_attention and its kernels agree on.
+// The interface between the driver of window_attention and its kernels.
 #pragma once
 
 #include <cstdint>
@@ -8,8 +8,9 @@
 
 namespace darswin {
 
-// Windows of a polar map; token (r, a) of the rolled map is token (r + shift_r, a + shift_a) of it.
-// Windows are counted over all images: window w lies in image w / (windows of an image).
+// Windows of a polar map. Token (r, a) of the rolled map is token (r + shift_r, a + shift_a) of the
+// original map. Windows are counted over all images: window w lies in image w / (windows of an
+// image).
 template <typename T>
 struct WindowAttentionArgs {
   using Real = Arithmetic<T>;
@@ -23,7 +24,7 @@ struct WindowAttentionArgs {
   Real scale;
 
   T* out;              // forward: (B, R, A, heads, d)
-  uint8_t* quantized;  // the same as 8 bits, in place of `out`; null but for float
+  uint8_t* quantized;  // the same as 8 bits, instead of `out`; only for float, else null
   Quantizer quantizer;
 
   const T* grad_out;  // backward
@@ -33,10 +34,10 @@ struct WindowAttentionArgs {
   int64_t chunk;      // windows that share one row of bias gradients
 };
 
-// A kernel works serially through the items [begin, end); the driver owns the threads.
+// Kernels process the items [begin, end) on one thread. The driver owns the threads.
 template <typename T>
 struct WindowAttentionKernels {
-  // bytes of scratch that each thread needs in the two functions below
+  // bytes of scratch for each thread that runs one of the two functions below
   int64_t (*scratch)(const WindowAttentionArgs<T>&);
   // item: (window, head)
   void (*forward)(const WindowAttentionArgs<T>&, int64_t begin, int64_t end, void* scratch);

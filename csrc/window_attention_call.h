@@ -1,4 +1,4 @@
-// A call of windowed attention, as drivers prepare it.
+// One call of windowed attention, as drivers prepare it.
 #pragma once
 
 #include "checks.h"
@@ -10,7 +10,8 @@ namespace darswin {
 
 inline constexpr char kAttention[] = "window_attention";
 
-// The arguments of one call, contiguous as the kernels want them. Owns what `args` points into.
+// The arguments of one call, contiguous for the kernels. This object owns the memory that `args`
+// points into.
 template <typename T>
 struct AttentionCall {
   Tensor qkv, bias;
@@ -30,7 +31,7 @@ struct AttentionCall {
       STD_TORCH_CHECK(window[axis] > 0 && size > 0 && size % window[axis] == 0 &&
                           shift[axis] >= 0 && shift[axis] < size,
                       kAttention, ": window must divide the map, shift must lie inside it");
-      const int64_t entries = bias.size(2 + axis);  // twice the window, less one
+      const int64_t entries = bias.size(2 + axis);  // twice the window, minus one
       STD_TORCH_CHECK(entries % 2 == 1 && entries / 2 + 1 == window[axis], kAttention,
                       ": bias does not fit the window");
     }
@@ -59,7 +60,7 @@ struct AttentionCall {
     return {qkv.size(0), args.rings, args.sectors, args.heads * args.head_dim};
   }
 
-  // `steps`: the products of queries and keys and the like that the kernel computes of each pair.
+  // `steps` counts the products that the kernel computes for each pair, such as query times key.
   template <typename Kernel>
   void run(int64_t items, int64_t steps, Kernel kernel) {
     constexpr double kPerMicrosecond = 2e4;  // multiply-adds, on a CPU with AVX2
