@@ -78,10 +78,10 @@ struct PolarSampleKernels {
   void (*backward_lens)(const Args&, int64_t begin, int64_t end, void* scratch);
 };
 
-// Sampling followed by a linear layer: out = samples of the token * weight^T + bias. The struct has
-// the arguments in addition to those of the sampling, whose layout is tokens and whose out and
-// grad_out are (B, R, A, D). "Padded" sizes are multiples of kRowUnit, so that rows are whole
-// registers on every tier.
+// Sampling followed by a linear layer: out = samples of the token * weight^T + bias. PolarEmbedArgs
+// holds the arguments that PolarSampleArgs lacks. The layout of the sampling is then tokens, and
+// its out and grad_out are (B, R, A, D). "Padded" sizes are multiples of kRowUnit, so that rows are
+// whole registers on every tier.
 constexpr int64_t kRowUnit = 16;
 template <typename T>
 struct PolarEmbedArgs {

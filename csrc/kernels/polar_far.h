@@ -213,7 +213,7 @@ class FarImage {
       return v;
     };
     // No computation is written in two branches. The compiler would move the common part out of
-    // both branches. It would then no longer fuse one half of what it fuses elsewhere.
+    // both branches. Half of the operations that it fuses elsewhere would then stay unfused.
     if constexpr (kChannels == 3) {
       store_three<kRow>(plane(0), plane(1), plane(2), out);
       return;

@@ -29,9 +29,9 @@ struct Packed {
         size((a.height + 3) * row) {}
 };
 
-// The positions of a block of points among the pixels. `right` and `lower` are the point's
-// distances from the upper left pixel to the right and downwards, from 0 to 1. The last register of
-// a row may reach beyond the row.
+// The positions of a block of points among the pixels. `right` and `lower` are the distances of a
+// point from its upper left pixel, to the right and downwards, from 0 to 1. The last register of a
+// row may reach beyond the row.
 constexpr int kPlaces = kBlock + kDoubles;
 template <typename T>
 struct Places {

@@ -1,11 +1,11 @@
 // Computes the gradient of the image: each point adds its weighted gradient to the four pixels
 // around it.
 //
-// For a small image the sums are kept in cells. A cell collects what the points between four pixels
-// add to these pixels, four channels each. It is one cache line, and one step adds to the whole
-// line. At the end each pixel collects its share of four cells. For a larger image the sums are
-// kept in packed form (polar_image.h), one register for each pixel. For a still larger image the
-// sums are added in place.
+// For a small image the sums are kept in cells. All points between the same four pixels add to one
+// cell, which has four channels for each of these pixels. A cell is one cache line, and one step
+// adds to the whole line. At the end each pixel adds up its share of four cells. For a larger image
+// the sums are kept in packed form (polar_image.h), one register for each pixel. For a still larger
+// image the gradient itself holds the sums.
 //
 // Neighbouring points often add to the same pixel, and an addition must wait for the one before. So
 // the points are taken from several places of the circle in turn.

@@ -66,9 +66,9 @@ inline V select(M mask, V a, V b) {
   return mask ? a : b;
 }
 
-// Returns the value, rounded, and prevents fusing. Otherwise the compiler may fuse the product
-// behind it into a sum in one copy of the code and not in another. The results would then depend on
-// which copy runs.
+// Returns the value unchanged, and stops the compiler from fusing the product in it into a sum. The
+// compiler may otherwise fuse in one copy of the code and not in another, and the results would
+// depend on which copy runs.
 template <typename V>
 inline V unfused(V value) {
 #if defined(__AVX__)
