@@ -1,12 +1,13 @@
 """Trains three networks on nearly undistorted digits, and tests them through any fisheye.
 
-The digits are scikit-learn's bundled scans. Each is taken for a perspective picture with a field of
-view of 165° and warped through a Spherical lens. All networks are trained on ξ in [0, 0.05], the
-paper's "very low" distortion, with which pictures look as ordinary ones do: DarSwin-A, the same
-network without lens knowledge, whose rings are equal in pixels, and Swin. All are then tested on
-ξ = 0, 0.1, …, 1. Run it with `make demo`.
+The digits are the scans bundled with scikit-learn. Each scan is treated as a perspective picture
+with a field of view of 165° and warped through a Spherical lens. The three networks are DarSwin-A;
+the same network without lens knowledge, with rings of equal width in pixels; and Swin. All are
+trained on ξ in [0, 0.05], the paper's "very low" distortion, where pictures look like ordinary
+pictures. All are then tested on ξ = 0, 0.1, …, 1. Run it with `make demo`.
 
-`--save darswin/models/weights/digits.safetensors` made the model "digits" that comes with darswin.
+The model "digits" that comes with darswin was saved by
+`--save darswin/models/weights/digits.safetensors`.
 """
 
 import argparse
@@ -35,10 +36,10 @@ from darswin.utils.files import replace_file
 from darswin.viz.plot import draw_accuracy, draw_grid, save_figure
 
 FOV = math.radians(165)
-SIZE = 32  # px, of the wide-angle images
+SIZE = 32  # px, side of the wide-angle images
 XI = [k / 10 for k in range(11)]
 LEVEL = "very low"
-# Equal steps in tan θ: the pictures were perspective, so their pixels are equal in tan θ.
+# Rings at equal steps in tan θ, because the pixels of perspective pictures have equal steps in it.
 MODELS = {
     "DarSwin-A": ("darswin_a_nano", dict(spacing="tan")),
     "without lens knowledge": ("darswin_a_nano", dict(spacing="radius")),
@@ -47,9 +48,9 @@ MODELS = {
 
 
 def through_lenses(scans: np.ndarray, xi: np.ndarray, size: int = SIZE) -> tuple[Tensor, lens.Lens]:
-    """Scans (N, 8, 8) and their ξ (N,) → images (N, 1, size, size) and lenses."""
+    """Warps scans (N, 8, 8) with ξ (N,). Returns images (N, 1, size, size) and their lenses."""
     camera = lens.Perspective.from_fov(FOV, scans.shape[2] / 2)
-    # The field of view fills the circle inside the image, whatever ξ is.
+    # The field of view fills the inscribed circle of the image for every ξ.
     lenses = lens.Spherical.from_fov(torch.from_numpy(xi).float(), FOV, size / 2)
     maps = warp_map(camera, scans.shape[1:], lenses, (size, size))
     images = [
@@ -61,7 +62,7 @@ def through_lenses(scans: np.ndarray, xi: np.ndarray, size: int = SIZE) -> tuple
 def train(
     model: Encoder, scans: np.ndarray, labels: Tensor, epochs: int, batch: int, seed: int, name: str
 ) -> None:
-    """Trains in place, every image through a new lens of `LEVEL` in every epoch."""
+    """Trains the model in place. Each epoch warps every image with a new lens of `LEVEL`."""
     rng = np.random.default_rng(seed)
     steps = epochs * (len(scans) // batch)
     optimizer = torch.optim.AdamW(model.parameters(), lr=3e-3, weight_decay=0.05)
@@ -86,7 +87,7 @@ def train(
 
 @torch.inference_mode()
 def accuracy(model: Encoder, images: Tensor, lenses: lens.Lens, labels: Tensor) -> float:
-    """Percent of the images whose largest logit is the label's."""
+    """The top-1 accuracy in percent."""
     model.eval()
     right = sum(
         (model(images[k], lenses[k]).argmax(1) == labels[k]).sum().item()
@@ -96,7 +97,7 @@ def accuracy(model: Encoder, images: Tensor, lenses: lens.Lens, labels: Tensor) 
 
 
 def save(path: Path, model: Encoder, scan: np.ndarray) -> None:
-    """Writes a DarSwin-A with its card and, beside it, a sample picture and its lens."""
+    """Writes a DarSwin-A with its model card, and a sample picture with its lens beside it."""
     model_name, options = MODELS["DarSwin-A"]
     card = ModelCard(
         model_name, dict(num_classes=10, in_chans=1, **options), [*"0123456789"], SIZE, FOV
@@ -111,7 +112,7 @@ def save(path: Path, model: Encoder, scan: np.ndarray) -> None:
 
 
 def draw(table: dict[str, list[list[float]]], scan: np.ndarray, sampler: PolarSample) -> Figure:
-    """Accuracy against ξ; beside it a digit through two lenses, with the patches of both."""
+    """Plots accuracy against ξ, and beside it a digit through two lenses with their patches."""
     figure = Figure(figsize=(12, 6), layout="constrained")
     panels = figure.subplot_mosaic("ab;ac", width_ratios=(2.4, 1))
     draw_accuracy(XI, table, LEVELS[LEVEL], axes=panels["a"])

@@ -1,15 +1,18 @@
-"""The operators' kernels for CUDA devices, in Triton: one launch where torch takes many.
+"""The operators' Triton kernels for CUDA devices. One launch replaces many launches of torch.
 
-A function of the operator's name takes the arguments of the schema, makes the outputs and launches.
-The public function has checked the arguments; the reference runs those that the kernel does not
-take. Triton is no dependency, and no kernel is imported before the first call on a CUDA device.
-docs/explanation/gpu.md describes the kernels. Their rules:
+Each launcher has the name of its operator. It takes the arguments of the schema, allocates the
+outputs and launches the kernels. The public function has already checked the arguments, and runs
+the reference for arguments that the kernel does not support. Triton is optional, and no kernel is
+imported before the first call on a CUDA device. docs/explanation/gpu.md describes the kernels.
+Their rules:
 
-- A program owns what it writes, or adds integers to it (`fixed_point`), in any order: two runs give
-  the same bits. Such a gradient is NaN all over where a number that arrives is not finite.
-- Numbers are widened to float32 as they are read, and rounded once as they are written. Each
-  product names its `input_precision`, each launch whether multiplications and additions are fused.
-- Places in tensors are int64: a batch may have more than 2³¹ numbers.
+- Programs either write to separate places or add integers (`fixed_point`) in any order, so two runs
+  give the same bits. A gradient summed as integers is NaN everywhere if an incoming number is not
+  finite.
+- Numbers are widened to float32 when they are read, and rounded once when they are written. Each
+  product states its `input_precision`, and each launch states whether multiplications and
+  additions are fused.
+- Offsets into tensors are int64, since a batch may have more than 2³¹ numbers.
 """
 
 import functools
@@ -45,7 +48,7 @@ def register() -> None:
     for operator in LAUNCHERS:
 
         def launch(*arguments: Any, operator: str = operator) -> Any:
-            with torch.cuda.device_of(arguments[0]):  # Triton launches on the current one
+            with torch.cuda.device_of(arguments[0]):  # Triton launches on the current device
                 return launcher(operator)(*arguments)
 
         torch.library.register_kernel(f"darswin::{operator}", "cuda", launch)

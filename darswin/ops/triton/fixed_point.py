@@ -1,8 +1,8 @@
-"""Sums of float32 numbers whose order does not matter: they are added as integers.
+"""Sums of float32 numbers that do not depend on the order, because integers are added.
 
-A number is counted in units: 2⁻ᵇⁱᵗˢ of a power of two beside the largest number there is. As many
-bits are taken as the count of summands leaves, so no sum overflows, and a unit is less than the
-rounding of the largest summand.
+Each number becomes an integer count of units. A unit is 2⁻ᵇⁱᵗˢ times a power of two close to the
+largest number. The number of bits depends on the count of summands, so that no sum overflows. A
+unit is smaller than the rounding error of the largest summand.
 """
 
 import math
@@ -16,12 +16,12 @@ BLOCK = 1024
 
 
 def bits(summands: int) -> int:
-    """Bits that a number below 4 may have so that the sum of `summands` of them fits 63 bits."""
+    """The number of fraction bits with which the sum of `summands` numbers below 4 fits 63 bits."""
     return 60 - math.ceil(math.log2(max(summands, 1)))
 
 
 def sums(of: Tensor) -> Tensor:
-    """Zeros for the units of a gradient of a tensor, contiguous. One launch."""
+    """Contiguous int64 zeros, to which the gradient of a tensor is added in units. One launch."""
     return torch.zeros(of.shape, dtype=torch.int64, device=of.device)
 
 
@@ -38,7 +38,7 @@ def _exponent(largest):
 
 @triton.jit
 def near_one(largest):
-    """The power of two that brings numbers up to `largest` below 4."""
+    """A power of two. Numbers up to `largest` are below 4 when multiplied by it."""
     return (tl.maximum(255 - _exponent(largest), 1) << 23).to(tl.float32, bitcast=True)
 
 
@@ -48,13 +48,13 @@ def _finish(sums, largest, out, count, each, BITS: tl.constexpr, BLOCK: tl.const
     mask = k < count
     exponent = _exponent(tl.load(largest + k // each, mask=mask, other=0.0))
     value = tl.load(sums + k, mask=mask, other=0).to(tl.float32) * (0.5 / (1 << BITS))
-    # An exponent of 255 is that of infinity and NaN.
+    # Infinity and NaN have the exponent 255.
     power = tl.where(exponent == 255, 0x7FC00000, exponent << 23).to(tl.float32, bitcast=True)
     tl.store(out + k, (value * power).to(out.dtype.element_ty), mask=mask)
 
 
 def finish(sums: Tensor, largest: Tensor, out: Tensor, bits: int) -> None:
-    """Writes sums of units as numbers. One launch."""
+    """Converts sums in units to numbers and writes them to `out`. One launch."""
     if out.numel() > 0:
         _finish[(triton.cdiv(out.numel(), BLOCK),)](
             sums, largest, out, out.numel(), out[0].numel(), BITS=bits, BLOCK=BLOCK, num_warps=4,
@@ -63,7 +63,7 @@ def finish(sums: Tensor, largest: Tensor, out: Tensor, bits: int) -> None:
 
 
 def like(gradients: Tensor, tensor: Tensor) -> Tensor:
-    """Gradients of each image as that of a tensor, added up if the images share it."""
+    """Converts gradients per image to the shape and dtype of a tensor that images may share."""
     if len(tensor) < len(gradients):
         gradients = gradients.sum(0, keepdim=True)
     return gradients.to(tensor.dtype).contiguous()

@@ -1,7 +1,8 @@
-"""Places of the points of a polar grid, and the pixels around them, for kernels.
+"""Kernel functions for the positions of a polar grid's points and the pixels around them.
 
-Angles are brought near 0 in float64, and all the rest is float32: cosine and sine are right to a
-rounding, whatever the angle. Jitter draws the random words of the reference.
+Angles are reduced to values near 0 in float64, and the rest is computed in float32. Cosine and sine
+are accurate to about one rounding for any angle. Jitter uses the same random words as the
+reference.
 """
 
 import triton
@@ -12,7 +13,7 @@ _PI = tl.constexpr(3.141592653589793)
 
 @triton.jit
 def sin_cos(angle):
-    """Sine and cosine, float32, of float64 angles. Source: Cephes, sinf.c."""
+    """Sine and cosine of float64 angles, in float32. Source: Cephes, sinf.c."""
     quarters = tl.floor(angle * (2 / _PI) + 0.5)
     near = (angle - quarters * (_PI / 2)).to(tl.float32)
     quarter = tl.where(tl.abs(quarters) < 2147483648.0, quarters, 0.0).to(tl.int32)
@@ -30,7 +31,7 @@ def sin_cos(angle):
 
 @triton.jit
 def random_shift(jitter, seed, image, point):
-    """u and v times jitter, of points of an image: the halves of a word of Philox4x32-10."""
+    """u·jitter and v·jitter for points of an image, from the halves of a Philox4x32-10 word."""
     key = tl.load(seed) if seed.dtype.is_ptr() else seed
     image = image.to(tl.int32)
     first, second, third, fourth = tl.philox(key.to(tl.int64), point // 4, 0, image, 0)
@@ -51,13 +52,13 @@ def _known(x):
 @triton.jit
 def locate(radii, azimuths, center, affine, offsets, jitter, seed, steps, b, i, j, mask, rows,
            COLUMNS: tl.constexpr):  # fmt: skip
-    """Points (i, j) of image b, where mask holds.
+    """Positions of the points (i, j) of image b where mask is True.
 
-    affine and offsets, and jitter and seed, may be None. steps: how far from one image's radii,
-    center, affine and offsets to the next one's, 0 where images share them.
+    affine, offsets, and jitter with seed may be None. steps are the strides from one image to the
+    next of radii, center, affine and offsets, and 0 where images share them.
 
-    Returns x and y; their derivatives by the radius; the radius times cosine and times sine; the
-    shift by jitter in cells along the radius, and whether it would have made the radius negative.
+    Returns x and y; their derivatives with respect to the radius; the radius times cosine and times
+    sine; the shift by jitter in cells along the radius; and whether a negative radius was clamped.
     """
     radii_step, center_step, affine_step, offsets_step = steps
     point = i * COLUMNS + j
@@ -67,7 +68,7 @@ def locate(radii, azimuths, center, affine, offsets, jitter, seed, steps, b, i, 
     clamped = shift > 0.0
     if seed is not None:
         shift, turn = random_shift(jitter, seed, b, point)
-        # The step to the outer neighbour or from the inner one; at both ends the only one there is.
+        # The step to the outer or to the inner neighbour; the ends have only one of the two.
         inward = shift < 0.0
         below = tl.where(inward, tl.maximum(i - 1, 0),
                          tl.minimum(i, tl.maximum(rows - 2, 0)))  # fmt: skip
@@ -75,7 +76,7 @@ def locate(radii, azimuths, center, affine, offsets, jitter, seed, steps, b, i, 
         row = radii + b * radii_step
         outer = tl.load(row + above, mask=mask, other=0.0)
         inner = tl.load(row + below, mask=mask, other=0.0)
-        # Infinite radii are as good as NaN: clamped, minus infinity would become 0.
+        # Infinite radii become NaN, since clamping would turn minus infinity into 0.
         radius = _known(radius) + shift * (_known(outer) - _known(inner))
         clamped = radius < 0.0
         radius = tl.where(clamped, 0.0, radius)
@@ -97,8 +98,8 @@ def locate(radii, azimuths, center, affine, offsets, jitter, seed, steps, b, i, 
 
 @triton.jit
 def cell(x, y, mask, height, width):
-    """The pixel above and to the left of each point, how far beyond it the point is, and whether
-    the point touches the image; what is NaN touches nothing."""
+    """The column and row of the pixel above and to the left of each point, the distances from it to
+    the point, and whether the point touches the image. A point at NaN touches nothing."""
     touches = mask & (x > -1.0) & (x < width) & (y > -1.0) & (y < height)
     x, y = tl.where(touches, x, 0.0), tl.where(touches, y, 0.0)
     left, top = tl.floor(x), tl.floor(y)
@@ -107,20 +108,20 @@ def cell(x, y, mask, height, width):
 
 @triton.jit
 def inside(column, row, touches, height, width):
-    """True for pixels in the image, among those of points that touch it."""
+    """True for pixels that lie in the image and whose point touches the image."""
     return touches & (column >= 0) & (column < width) & (row >= 0) & (row < height)
 
 
 @triton.jit
 def token_order(i, j, COLUMNS: tl.constexpr, S_R: tl.constexpr, S_A: tl.constexpr):
-    """Index of points (i, j) among the samples of all tokens."""
+    """The index of points (i, j) among the samples of all tokens."""
     token = i // S_R * (COLUMNS // S_A) + j // S_A
     return token * (S_R * S_A) + i % S_R * S_A + j % S_A
 
 
 @triton.jit
 def point_of(place, COLUMNS: tl.constexpr, S_R: tl.constexpr, S_A: tl.constexpr):
-    """The points (i, j) at places of `token_order`."""
+    """The points (i, j) at the given indices: the inverse of `token_order`."""
     token, sample = place // (S_R * S_A), place % (S_R * S_A)
     i = token // (COLUMNS // S_A) * S_R + sample // S_A
     return i, token % (COLUMNS // S_A) * S_A + sample % S_A
@@ -128,7 +129,7 @@ def point_of(place, COLUMNS: tl.constexpr, S_R: tl.constexpr, S_A: tl.constexpr)
 
 @triton.jit
 def of_channel(values, c):
-    """The number of channel c of a tuple."""
+    """Element c of a tuple that holds one number per channel."""
     value = values[0]
     for k in tl.static_range(1, len(values)):
         value = tl.where(c == k, values[k], value)
@@ -137,9 +138,9 @@ def of_channel(values, c):
 
 @triton.jit
 def four_pixels(image, strides, scale, shift, column, row, touches, height, width, c):
-    """Channel c of the pixels around points, in float32 and 0 outside: upper left, upper right,
-    lower left, lower right. With scale and shift, a number a channel each, a pixel counts as
-    pixel * scale + shift."""
+    """Channel c of the four pixels around each point, in float32: upper left, upper right, lower
+    left, lower right. Pixels outside the image are 0. scale and shift, if given, hold one number
+    per channel, and each pixel becomes pixel * scale + shift."""
     _, channel_stride, row_stride, column_stride = strides
     upper = image + tl.cast(c, tl.int64) * channel_stride + row.to(tl.int64) * row_stride
     left = column.to(tl.int64) * column_stride

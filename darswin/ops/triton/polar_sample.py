@@ -1,8 +1,9 @@
 """polar_sample and polar_embed on CUDA devices: forward and backward.
 
-Forward is one launch: a program takes a block of samples in the order of the output. In backward a
-program takes one radius of one image; the image's gradient is a sum of integers (`fixed_point`).
-The linear layer of polar_embed is torch's product, of samples in float32 that backward makes again.
+Forward is one launch, in which each program computes a block of samples in the order of the output.
+In backward, each program handles one radius of one image, and the image's gradient is a sum of
+integers (`fixed_point`). The linear layer of polar_embed is a matrix product of torch with float32
+samples, which backward computes again.
 """
 
 from typing import Any
@@ -20,16 +21,18 @@ from darswin.ops.triton import fixed_point
 from darswin.ops.triton.fixed_point import like, near_one
 from darswin.ops.triton.points import cell, four_pixels, inside, locate, point_of, token_order
 
-BLOCK = 256  # samples of a program
-_LENS_SUMS = 9  # along the radius, of those jitter moved inward and outward, of x, y and the matrix
+BLOCK = 256  # samples per program
+# Sums per radius: of the radius, of its steps inward and outward by jitter, of x and y, and of the
+# matrix (four).
+_LENS_SUMS = 9
 
-# Numbers that change, or of which a 1 would be no number in the kernel but a constant.
+# Sizes that vary, or that Triton would turn into constants of the kernel if they are 1.
 _SIZES = ["seed", "height", "width", "rows"]
 
 
 @triton.jit
 def _mix(image, strides, scale, shift, cells, height, width, c, CHANNELS: tl.constexpr):
-    """Channel c of points in cells: four pixels, weighted; 0 where there is no such channel."""
+    """Channel c of points: the weighted sum of four pixels, or 0 if there is no channel c."""
     column, row, right, lower, touches = cells
     upper_left, upper_right, lower_left, lower_right = four_pixels(
         image, strides, scale, shift, column, row, touches & (c < CHANNELS), height, width, c
@@ -159,7 +162,7 @@ def _arguments(sampling: Sampling) -> tuple[Any, ...]:
     )
     lens = (radii, center, affine, offsets)
     steps = tuple(0 if t is None or len(t) == 1 else t.stride(0) for t in lens)
-    # Numbers that are on the CPU come along with the launch.
+    # Numbers on the CPU are passed as arguments of the launch.
     jitter = None if sampling.jitter is None else sampling.jitter.item()
     seed = sampling.seed if sampling.jitter is not None else None
     key = seed.item() if seed is not None and seed.device.type == "cpu" else seed
@@ -174,7 +177,7 @@ def _arguments(sampling: Sampling) -> tuple[Any, ...]:
 
 
 def _options(sampling: Sampling, tokens: bool) -> dict[str, Any]:
-    """The constants of both kernels, and how they are compiled."""
+    """The constants and the compile options of both kernels."""
     along, around = sampling.samples
     return dict(
         COLUMNS=len(sampling.azimuths), S_R=along, S_A=around, CHANNELS=sampling.image.shape[1],
@@ -201,7 +204,7 @@ def polar_sample(*arguments: Any) -> Tensor:
 
 
 def polar_sample_backward(*arguments: Any) -> tuple[Tensor, ...]:
-    """`darswin::polar_sample_backward`, of a gradient in the order of the output and any shape."""
+    """`darswin::polar_sample_backward`. grad_out has the output's order and any shape."""
     *fields, tokens, grad_out, image_grad, lens_grad, offsets_grad = arguments
     sampling = Sampling(*fields)
     gradients = empty_gradients(sampling, GRADIENTS, (image_grad, lens_grad, offsets_grad))
@@ -235,11 +238,11 @@ def polar_sample_backward(*arguments: Any) -> tuple[Tensor, ...]:
 
 
 def _fold(sampling: Sampling, sums: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """The gradients of radii, center and affine from the sums of each radius."""
+    """Computes the gradients of radii, center and affine from the sums of each radius."""
     sums = sums.double()
     of_radii = sums[..., 0]
     if sampling.seed is not None and of_radii.shape[1] > 1:
-        # By the steps between radii; at both ends of the row there is one for both sides.
+        # Jitter moves points by steps between radii. At the ends, both sides share one step.
         inward, outward = sums[..., 1], sums[..., 2]
         steps = inward[:, 1:] + outward[:, :-1]
         steps[:, 0] += inward[:, 0]
@@ -257,7 +260,7 @@ def _fold(sampling: Sampling, sums: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _samples(sampling: Sampling) -> Tensor:
-    """(B·R·A, S_r·S_φ·C): torch adds the bias within the product of a matrix."""
+    """The samples as a matrix (B·R·A, S_r·S_φ·C), so that torch fuses the bias into the product."""
     return polar_sample(*sampling._replace(bfloat16=False), True).flatten(0, 2)
 
 

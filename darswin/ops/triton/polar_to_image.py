@@ -1,8 +1,9 @@
 """polar_to_image on CUDA devices: forward and backward.
 
-A program takes a block of an image's pixels. It finds their two rings and two sectors once, and
-mixes the four tokens some channels at a time. In backward a token's gradient is a sum of integers
-(`fixed_point`), and each program writes its own sums for the lens, which torch adds up.
+Each program handles a block of an image's pixels. It finds their two rings and two sectors once,
+and then interpolates the four tokens in chunks of channels. In backward, a token's gradient is a
+sum of integers (`fixed_point`). Each program writes its own sums for the lens, and torch adds these
+up.
 """
 
 from collections.abc import Sequence
@@ -18,18 +19,19 @@ from darswin.ops.polar_to_image import GRADIENTS
 from darswin.ops.triton import fixed_point
 from darswin.ops.triton.fixed_point import like, near_one
 
-# Pixels of a program, and how many channels it takes at a time at most.
+# The pixels of a program, and the largest number of channels in a chunk.
 BLOCK, CHUNK = 64, 32
 BACKWARD_BLOCK, BACKWARD_CHUNK = 32, 8
-_PLANE_SUMS = 6  # of x and y, and of their products with the way from the centre
+# Sums of the gradients of x and y, and of their products with the vector from the centre.
+_PLANE_SUMS = 6
 
-# A 1 among them would be no number in the kernel but a constant.
+# Sizes that Triton would turn into constants of the kernel if they are 1.
 _SIZES = ["rings", "height", "width"]
 
 
 @triton.jit
 def _columns(x, y, SECTORS: tl.constexpr):
-    """The azimuth atan2(y, x) in sectors, float32. Source: Cephes, atanf.c."""
+    """The azimuth atan2(y, x) in units of a sector, float32. Source: Cephes, atanf.c."""
     wide, high = tl.abs(x), tl.abs(y)
     least, most = tl.minimum(wide, high), tl.maximum(wide, high)
     beyond = least > 0.4142135623730950 * most  # π/8
@@ -39,7 +41,7 @@ def _columns(x, y, SECTORS: tl.constexpr):
     z = tangent * tangent
     angle = (8.05374449538e-2 * z - 1.38776856032e-1) * z + 1.99777106478e-1
     angle = (angle * z - 3.33329491539e-1) * z * tangent + tangent
-    # The eighths of a turn are added in sectors, where they are exact.
+    # Eighths of a turn are added in units of a sector, in which they are exact.
     columns = angle * (SECTORS / 6.283185307179586)
     columns = tl.where(beyond, SECTORS / 8 + columns, columns)
     columns = tl.where(high > wide, SECTORS / 4 - columns, columns)
@@ -49,7 +51,7 @@ def _columns(x, y, SECTORS: tl.constexpr):
 
 @triton.jit
 def _split(column, SECTORS: tl.constexpr):
-    """The sector before a place, the one after it, and the share of the latter."""
+    """The sectors before and after a position, and the weight of the second one."""
     left = tl.floor(column)
     sector = (left.to(tl.int32) + SECTORS) % SECTORS
     return sector, (sector + 1) % SECTORS, column - left
@@ -57,8 +59,8 @@ def _split(column, SECTORS: tl.constexpr):
 
 @triton.jit
 def _plane(center, affine, points, steps, b, k, mask, width):
-    """Places of pixels k on the plane of radius and azimuth, their distances from the centre, and
-    the inverse matrix. Takes points, or else center, with affine or None."""
+    """Positions of pixels k on the plane of radius and azimuth, their vectors from the centre, and
+    the inverse matrix. Either points is given, or center with an optional affine."""
     _, center_step, affine_step, points_step, _ = steps
     if points is not None:
         place = points + b * points_step + 2 * k.to(tl.int64)
@@ -82,9 +84,9 @@ def _plane(center, affine, points, steps, b, k, mask, width):
 @triton.jit
 def _place(radii, r_max, steps, x, y, b, mask, rings, SECTORS: tl.constexpr,
            RING_BITS: tl.constexpr):  # fmt: skip
-    """For places on the plane: whether they are on the map, the radius, the inner and outer ring
-    and the share of the outer, both rings' radii, how many rings are within, and the four tokens
-    with the shares of the second of each ring."""
+    """For positions on the plane: whether they are on the map, the radius, the inner ring, the
+    outer ring and its weight, both rings' radii, whether the position lies inside the first or
+    beyond the last ring, the four tokens, and the weight of the second token of each ring."""
     radii_step, _, _, _, r_max_step = steps
     known = mask & (tl.abs(x) < float("inf")) & (tl.abs(y) < float("inf"))
     x, y = tl.where(known, x, 1.0), tl.where(known, y, 0.0)
@@ -103,7 +105,7 @@ def _place(radii, r_max, steps, x, y, b, mask, rings, SECTORS: tl.constexpr,
     pole, beyond = within == 0, within == rings
     first = tl.where(pole, -first, first)
     t = tl.where(beyond, 0.0, tl.math.div_rn(r - first, tl.where(beyond, 1.0, second - first)))
-    # At the centre itself the azimuth is 0.
+    # The azimuth at the centre itself is 0.
     column = _columns(tl.where(r == 0.0, 1.0, x), tl.where(r == 0.0, 0.0, y), SECTORS) - 0.5
     before, after, share = _split(tl.where(pole, column + SECTORS / 2, column), SECTORS)
     before_2, after_2, share_2 = _split(column, SECTORS)
@@ -114,14 +116,14 @@ def _place(radii, r_max, steps, x, y, b, mask, rings, SECTORS: tl.constexpr,
 
 @triton.jit
 def _tile(place, token, channel, CHANNELS: tl.constexpr, mask):
-    """Channels of tokens, float32."""
+    """Channels of tokens, in float32."""
     at = token.to(tl.int64)[:, None] * CHANNELS + channel
     return tl.load(place + at, mask=mask, other=0.0).to(tl.float32)
 
 
 @triton.jit
 def _in_image(k, channel, pixels, CHANNELS: tl.constexpr, TOKENS: tl.constexpr):
-    """Index of the channels of pixels k in an image."""
+    """The index of the channels of pixels k in an image."""
     if TOKENS:
         return k.to(tl.int64)[:, None] * CHANNELS + channel
     else:
@@ -150,7 +152,7 @@ def _forward(x, radii, center, affine, points, r_max, steps, rings, height, widt
         mixed = weights[0][:, None] * _tile(x, tokens[0], channel, CHANNELS, there)
         for n in tl.static_range(1, 4):
             mixed += weights[n][:, None] * _tile(x, tokens[n], channel, CHANNELS, there)
-        # The weights of what is not on the map may be NaN.
+        # The weights of pixels outside the map may be NaN.
         mixed = tl.where(there, mixed, 0.0)
         place = _in_image(k, channel, pixels, CHANNELS, TOKENS)
         tl.store(out + place, mixed.to(out.dtype.element_ty),
@@ -208,7 +210,7 @@ def _backward(x, radii, center, affine, points, r_max, steps, rings, height, wid
             change = tl.where(inner == ring, (1.0 - t) * tl.where(pole, -1.0, 1.0), 0.0)
             change += tl.where(outer == ring, t, 0.0)
             tl.store(ring_sums + ring, -tl.sum(tl.where(on_slope, slope * change, 0.0)))
-        # At the centre itself radius and azimuth have no derivative.
+        # Radius and azimuth have no derivative at the centre itself.
         moves = known & (r > 0.0)
         near = tl.where(moves, r, 1.0)
         along = tl.where(moves, tl.math.div_rn(slope, near), 0.0)
@@ -236,7 +238,7 @@ def _arguments(x: Tensor, lens: Sequence[Tensor | None], size: Sequence[int]) ->
 
 
 def _options(x: Tensor, tokens: bool, most_channels: int) -> dict[str, Any]:
-    """The constants of both kernels, and how they are compiled."""
+    """The constants and the compile options of both kernels."""
     _, rings, sectors, channels = x.shape
     return dict(
         SECTORS=sectors, CHANNELS=channels, RING_BITS=rings.bit_length(), TOKENS=tokens,
@@ -259,7 +261,7 @@ def polar_to_image(x: Tensor, *arguments: Any) -> Tensor:
 
 
 def polar_to_image_backward(x: Tensor, *arguments: Any) -> tuple[Tensor, ...]:
-    """`darswin::polar_to_image_backward`: of x, radii, center, affine and points."""
+    """`darswin::polar_to_image_backward`: gradients of x, radii, center, affine and points."""
     *lens, size, tokens, grad_out, x_grad, lens_grad = arguments
     radii, center, affine, points, _ = lens
     gradients = empty_gradients((x, *lens), GRADIENTS, (x_grad, lens_grad))
@@ -298,12 +300,12 @@ def polar_to_image_backward(x: Tensor, *arguments: Any) -> tuple[Tensor, ...]:
 
 
 def _of_lens(sums: Tensor, center: Tensor, affine: Tensor | None) -> tuple[Tensor, Tensor]:
-    """The gradients of center and affine from the sums over pixels: of the gradient of their place
-    on the plane, and of its products with their way from the centre."""
+    """Computes the gradients of center and affine from sums over pixels: the gradient of a pixel's
+    position on the plane, and the products of this gradient with the vector from the centre."""
     of_place, products = sums[:, :2], sums[:, 2:].view(-1, 2, 2)
     if affine is None:
         return like(-of_place, center), center.new_empty((0,))
-    # The place is M (pixel - center), M the inverse of the matrix A: dA = -Mᵀ products Mᵀ.
+    # The position is M (pixel - center) with M the inverse of the matrix A: dA = -Mᵀ products Mᵀ.
     (xx, xy), (yx, yy) = affine.double().permute(1, 2, 0)
     inverse = torch.stack((yy, -yx, -xy, xx), -1) / (xx * yy - xy * yx)[:, None]
     transposed = inverse.view(-1, 2, 2)

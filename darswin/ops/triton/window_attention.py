@@ -1,11 +1,11 @@
 """window_attention on CUDA devices: forward and backward.
 
-A program attends in some windows of one image, one after the other, for one head. The pairs of a
-window's tokens are a square in registers. Tokens and head dim are filled up to powers of two, at
-least 16, which is what tensor cores multiply; the filling is neither read nor written.
+Each program handles one head in several windows of one image, one window after the other. The pairs
+of a window's tokens are a square matrix in registers. Tokens and head dim are padded to powers of
+two of at least 16, the sizes that tensor cores multiply. The padding is neither read nor written.
 
-In a window that a seam parts, a NaN or an infinity among the values, or among the gradients, of one
-side reaches the other, since 0 times NaN is NaN; one among queries and keys does not.
+A seam may divide a window. Then a NaN or an infinity among the values or the gradients of one side
+reaches the other side, since 0 times NaN is NaN. A NaN among queries and keys does not.
 """
 
 from collections.abc import Sequence
@@ -16,9 +16,9 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-# More programs than this fill a large GPU: then each gets several windows.
+# This many programs fill a large GPU. With more windows, each program handles several.
 PROGRAMS = 8192
-_ENTRIES = 64  # of the table, a program
+_ENTRIES = 64  # entries of the table per program
 
 
 class _Map(NamedTuple):
@@ -28,20 +28,20 @@ class _Map(NamedTuple):
     sectors: int
     shift_r: int
     shift_a: int
-    # The first ring and sector of the rolled map beyond what the roll brought from the other end;
-    # the size of an axis that wraps around.
+    # The first ring and sector of the rolled map that came from the other end. For a periodic axis,
+    # the size of the axis.
     seam_r: int
     seam_a: int
     heads: int
-    tables: int  # 1, or one an image
-    chunks: int  # of an image's windows, a program for each
-    chunk: int  # windows
+    tables: int  # 1, or one per image
+    chunks: int  # chunks of windows in an image, each for one program
+    chunk: int  # windows in a chunk
 
 
 @triton.jit
 def _share(of, M_R: tl.constexpr, M_A: tl.constexpr):
-    """The program's head, image, first window, the one behind its last, and table of the bias."""
-    # Neighbours take the heads of one window, which lie beside each other.
+    """The program's head, image, first window, end of its windows, and offset of its bias table."""
+    # Neighbouring programs handle the heads of one window, which are neighbours in memory.
     program = tl.program_id(0)
     head, image = program % of.heads, program // of.heads // of.chunks
     first = program // of.heads % of.chunks * of.chunk
@@ -52,7 +52,7 @@ def _share(of, M_R: tl.constexpr, M_A: tl.constexpr):
 
 @triton.jit
 def _pairs(M_R: tl.constexpr, M_A: tl.constexpr, TOKENS: tl.constexpr):
-    """Entry of the table for each pair (query, key) of a window, and whether the pair exists."""
+    """The table entry of each pair (query, key) of a window, and whether the pair exists."""
     token = tl.arange(0, TOKENS)
     r, a, there = token // M_A, token % M_A, token < M_R * M_A
     along, across = r[:, None] - r[None, :] + M_R - 1, a[:, None] - a[None, :] + M_A - 1
@@ -61,7 +61,7 @@ def _pairs(M_R: tl.constexpr, M_A: tl.constexpr, TOKENS: tl.constexpr):
 
 @triton.jit
 def _places(image, window, of, M_R: tl.constexpr, M_A: tl.constexpr, TOKENS: tl.constexpr):
-    """Index of each token of a window in the map, and its side of the seams."""
+    """The index in the map of each token of a window, and the token's side of the seams."""
     token, across = tl.arange(0, TOKENS), of.sectors // M_A
     r, a = window // across * M_R + token // M_A, window % across * M_A + token % M_A
     side = (r >= of.seam_r).to(tl.int32) * 2 + (a >= of.seam_a).to(tl.int32)
@@ -76,7 +76,7 @@ def _probabilities(q, k, scale, bias, seen, EXACT: tl.constexpr):
     logits = tl.where(seen, logits, -float("inf"))
     powers = tl.where(seen, tl.exp(logits - tl.max(logits, 1)[:, None]), 0.0)
     total = tl.sum(powers, 1)
-    # Only a query that is not there sees nothing.
+    # Only a query in the padding has a total of 0.
     return powers / tl.where(total == 0, 1.0, total)[:, None]
 
 
@@ -134,7 +134,7 @@ def _backward(
         grad_v = tl.dot(tl.trans(p), grad, input_precision=SPLIT)
         tl.store(grad_qkv + at + 2 * row, grad_v.to(grad_qkv.dtype.element_ty), mask=there)
         total += grad_logits
-        if SPLIT != "ieee":  # read again rather than kept: there are not enough registers
+        if SPLIT != "ieee":  # read again, because there are too few registers to keep it
             q = tl.load(qkv + at, mask=there, other=0.0).to(tl.float32)
         grad_k = tl.dot(tl.trans(grad_logits), q, input_precision=SPLIT) * scale
         tl.store(grad_qkv + at + row, grad_k.to(grad_qkv.dtype.element_ty), mask=there)
@@ -150,7 +150,7 @@ def _backward(
 
 @triton.jit
 def _fold(grad_pairs, grad_bias, M_R: tl.constexpr, M_A: tl.constexpr, ENTRIES: tl.constexpr):
-    """The gradient of a table's entry is the sum of its pairs', query by query."""
+    """Adds up the gradients of the pairs that share a table entry, query by query."""
     WIDTH: tl.constexpr = 2 * M_A - 1
     SIZE: tl.constexpr = (2 * M_R - 1) * WIDTH
     COUNT: tl.constexpr = M_R * M_A
@@ -184,8 +184,8 @@ def _map(qkv: Tensor, bias: Tensor, window: Pair, shift: Pair, periodic: Pair) -
 def _constants(qkv: Tensor, window: Pair) -> dict[str, Any]:
     """The constants that a kernel is compiled for."""
     tokens, head_dim = window[0] * window[1], qkv.shape[5]
-    # The tensor cores multiply numbers that came in 16 bits exactly, and float32 probabilities in
-    # two parts of 8 bits, right to 2⁻¹⁶. Products of float32 are left to the other cores.
+    # Tensor cores multiply 16-bit inputs exactly. They multiply float32 probabilities in two parts
+    # of 8 bits, accurate to 2⁻¹⁶. Products of float32 inputs run on the other cores.
     exact, split = ("ieee", "ieee") if qkv.dtype == torch.float32 else ("tf32", "bf16x3")
     # A warp has the registers for 16 tokens.
     warps = 1 if tokens <= 16 else 4 if split == "bf16x3" else 8
@@ -213,8 +213,9 @@ def window_attention_backward(
     qkv: Tensor, bias: Tensor, window: Pair, shift: Pair, periodic: Pair, scale: float,
     grad_out: Tensor,
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
-    """`darswin::window_attention_backward`: of qkv and bias. Each sum has one order: a program adds
-    up the pairs of its windows, torch adds up programs, `_fold` gathers an entry's pairs."""
+    """`darswin::window_attention_backward`: gradients of qkv and bias. Each sum has a fixed order:
+    a program adds the pairs of its windows, torch adds over programs, and `_fold` adds the pairs of
+    each table entry."""
     qkv, bias, grad_out = qkv.contiguous(), bias.contiguous(), grad_out.contiguous()
     grad_qkv, grad_bias = torch.empty_like(qkv), torch.empty_like(bias)
     if qkv.numel() == 0:
