@@ -1,5 +1,5 @@
-"""Calls of the operators: named ones at the sizes that the kernels tell apart, and how results are
-compared. test_contract.py and tests/gpu take them; strategies.py draws random ones."""
+"""Named calls of the operators, at sizes for which the kernels take different paths, and functions
+that compare results. test_contract.py and tests/gpu use them; strategies.py draws random calls."""
 
 import functools
 import math
@@ -29,7 +29,7 @@ class Case:
 
     run: Callable[..., Tensor]
     inputs: dict[str, Tensor]
-    # float64 inputs -> what the gradient of the output is multiplied with: 0 where it has a jump.
+    # float64 inputs → a factor for the gradient of the output: 0 where the gradient jumps.
     mask: Callable[..., Tensor] | None = None
     settings: dict = field(default_factory=dict)
 
@@ -50,11 +50,11 @@ class Case:
         return self.replace(**{name: t[:1] for name, t in self.inputs.items() if name not in layer})
 
     def smooth(self) -> Tensor:
-        """The mask of these inputs."""
+        """The mask for the inputs of this call."""
         return self.mask(**{name: t.detach().double() for name, t in self.inputs.items()})
 
 
-# -- results, and how they compare -----------------------------------------------------------------
+# -- comparing results -----------------------------------------------------------------------------
 
 
 def results(
@@ -65,10 +65,10 @@ def results(
     absolute: Sequence[str] = (),
     only: Sequence[str] = (),
 ) -> dict[str, Tensor]:
-    """The output, a random gradient of it, and the gradients of the inputs, or of `only` some.
+    """The output, a random gradient of it, and the gradients of all inputs or of those in `only`.
 
-    `absolute` inputs are taken without their signs, and then so is the gradient: nothing cancels,
-    and each result is as large as the numbers that are added up for it.
+    The inputs in `absolute` are replaced by their absolute values, and then the gradient is too.
+    Then no terms cancel, and each result bounds the numbers that are added up for it.
     """
     leaves = {
         name: (t.abs() if name in absolute else t.detach()) for name, t in case.inputs.items()
@@ -85,7 +85,7 @@ def results(
 
 
 def assert_equal_results(ours: dict[str, Tensor], others: dict[str, Tensor], tolerance: float = 0):
-    """Each result of `others` is that of ours; with a tolerance, within as much of the largest."""
+    """Asserts that ours equal `others`, up to a tolerance relative to the largest value."""
     for name, want in others.items():
         size = want.nan_to_num(0, 0, 0).abs().max().item() if want.numel() else 0.0
         torch.testing.assert_close(
@@ -111,12 +111,12 @@ def assert_same_bits_on_any_number_of_threads(
 def assert_accurate(
     make: Callable[[], Case], on: torch.device | str = "cpu", draws: int = 3, times: float = 2.0
 ) -> None:
-    """The accuracy rule: the float32 operator's error against the float64 reference is at most
-    twice the float32 reference's own, for the output and for each gradient.
+    """The accuracy rule: against the float64 reference, the error of the float32 operator is at
+    most twice the error of the float32 reference, for the output and for each gradient.
 
-    Errors are largest absolute differences over all draws of `make`: a tensor of four numbers is
-    too few to measure rounding with. Below four roundings of the largest value, a reference that
-    happens to be exact sets no bar.
+    An error is the largest absolute difference over all draws of `make`, since a single small
+    tensor has too few numbers to measure rounding. An error of up to four roundings of the largest
+    value is always allowed, because the reference may be exact by chance.
     """
     errors: dict[str, list[float]] = {}
     for _ in range(draws):
@@ -142,8 +142,9 @@ def assert_accurate(
 def assert_rounded_once(
     case: Case, same_order: bool = True
 ) -> tuple[Case, dict[str, Tensor], dict[str, Tensor]]:
-    """With the first input in bfloat16, the output is that of float32 rounded once, to the bit if
-    sums run in the same order. Returns the call in bfloat16, its results and those of float32."""
+    """Asserts that with the first input in bfloat16, the output is the float32 output rounded once,
+    bit for bit if the order of sums is the same. Returns the bfloat16 call, its results and the
+    float32 results."""
     first, values = next(iter(case.inputs.items()))
     narrow, wide = (case.replace(**{first: t}) for t in (values.to(bf16), values.to(bf16).float()))
     ours, expected = results(narrow), results(wide)
@@ -155,7 +156,7 @@ def assert_rounded_once(
 
 
 def elsewhere(tensor: Tensor, kind: str) -> Tensor:
-    """The same values with gaps, or in another order in memory."""
+    """The same values with gaps in memory, or in another order."""
     if kind == "gaps":
         return torch.stack((tensor, tensor), -1)[..., 0]
     back = list(range(tensor.dim() - 1, -1, -1))
@@ -163,7 +164,7 @@ def elsewhere(tensor: Tensor, kind: str) -> Tensor:
 
 
 def raw_calls(case: Case) -> list[tuple[torch._ops.OpOverload, list]]:
-    """The compiled operator and its backward, each with the arguments that the case gives them."""
+    """The compiled operator and its backward, each with its arguments in this case."""
     calls, call = [], _library.call
 
     def spy(operator, arguments):
@@ -203,7 +204,7 @@ def places(radii, azimuths, center, affine, offsets, batch, jitter, seed) -> tup
 
 
 def to_tokens(planes: Tensor, samples: tuple[int, int]) -> Tensor:
-    """(B, C, R·S_r, A·S_φ) → (B, R, A, S_r·S_φ·C), by torch alone."""
+    """(B, C, R·S_r, A·S_φ) → (B, R, A, S_r·S_φ·C), with torch only."""
     batch, channels, rows, columns = planes.shape
     rings, sectors = rows // samples[0], columns // samples[1]
     parts = planes.reshape(batch, channels, rings, samples[0], sectors, samples[1])
@@ -230,14 +231,14 @@ def sampling_call(
         return polar_sample(*grid, **general, **options, **others)
 
     def mask(image, radii, center, weight=None, bias=None, affine=None, offsets=None):
-        """Bilinear gradients jump at borders of pixels, and where jitter meets the radius 0."""
+        """0 where gradients jump: at borders of pixels, and where jitter clamps the radius to 0."""
         grid = (radii, settings["azimuths"], center, affine, offsets)
         lens = (t if t is None else t.cpu() for t in grid)
         x, y, r = places(*lens, len(image), jitter, seed)
         smooth = ((x - x.round()).abs() > 1e-3) & ((y - y.round()).abs() > 1e-3)
         if jitter > 0:
             smooth &= r > 1e-3
-        if embed:  # a token has a gradient if all of its samples may have one
+        if embed:  # a token gets a gradient only if all its samples are smooth
             return to_tokens(smooth[:, None].to(f64), samples).amin(-1, keepdim=True)
         planes = smooth[:, None].expand(-1, channels, -1, -1).to(f64)
         return planes if layout == "image" else to_tokens(planes, samples)
@@ -249,9 +250,9 @@ def sampling(
     batch=2, channels=3, size=(17, 23), rows=6, columns=8, samples=(3, 4), shared=False,
     affine=False, offsets=False, far=1.0, features=None, bias=True, dtype=f32, **options,
 ) -> Case:  # fmt: skip
-    """polar_sample, or with `features` polar_embed: points inside, on the border and outside. The
-    matrix more than doubles some lengths; offsets are of `far` px, now and then of the image's
-    size."""
+    """polar_sample, or polar_embed if `features` is given, with points inside, on the border and
+    outside. The matrix more than doubles some lengths. Offsets are about `far` px, and one in ten
+    is about the image's size times larger."""
     lenses, reach = 1 if shared else batch, max(size)
     center = torch.tensor([(size[1] - 1) / 2, (size[0] - 1) / 2], dtype=dtype)
     inputs = dict(
@@ -309,7 +310,7 @@ def map_call(inputs: dict[str, Tensor], size: tuple[int, int], layout="image", *
         return polar_to_image(x, radii, center, size, layout=layout, **lens, **options)
 
     def mask(x, radii, **lens):
-        """Gradients of the lens jump at ring centres, at the middles of sectors and at the pole."""
+        """0 where gradients of the lens jump: at ring centres, middles of sectors and the pole."""
         r, azimuth = on_polar_plane(size, **{name: t.cpu() for name, t in lens.items()})
         column = azimuth * (sectors / (2 * math.pi)) - 0.5
         columns = torch.stack((column, column + sectors / 2))
@@ -325,7 +326,7 @@ def polar_map(
     batch=2, rings=4, sectors=8, channels=3, size=(19, 23), lenses=1, general=None, reach=9.0,
     dtype=f32, **options,
 ) -> Case:  # fmt: skip
-    """polar_to_image through a circular lens, with `affine`, or of `points`."""
+    """polar_to_image with a circular lens, with `affine`, or with `points`."""
     rising = (torch.rand(lenses, rings, dtype=f64) + 0.3).cumsum(1) * reach / rings
     inputs = dict(x=torch.randn(batch, rings, sectors, channels, dtype=dtype))
     inputs["radii"] = rising.to(f32 if dtype == bf16 else dtype)
@@ -344,7 +345,7 @@ def polar_map(
 # -- named cases -----------------------------------------------------------------------------------
 
 NEAR = dict(size=(31, 33), rows=40, columns=64)
-# More tokens a block than their first rows had room for, and tokens of a single row.
+# For many tokens per block, and for tokens of a single row.
 FEW = dict(size=(40, 42), rows=8, batch=1)
 SAMPLING = {
     "plain": dict(),
@@ -360,7 +361,7 @@ SAMPLING = {
     "no lenses": dict(batch=0),
     "no points": dict(rows=0),
     "no channels": dict(channels=0),
-    # What csrc/kernels tells apart.
+    # Cases for which csrc/kernels takes different paths.
     "cells": NEAR | dict(samples=(10, 8)),
     "cells, one channel": NEAR | dict(columns=63, channels=1, samples=(8, 3)),
     "cells, two channels": NEAR | dict(channels=2, samples=(4, 4)),
@@ -462,7 +463,7 @@ for name, sizes in ATTENTION.items():
 for name, sizes in MAPS.items():
     CASES["polar_to_image", name] = functools.partial(polar_map, **sizes)
 
-# A small case of each operator with every input that it has, and one without the optional ones.
+# A small case of each operator with all its inputs, and one without the optional inputs.
 GRID = dict(size=(7, 8), rows=4, columns=6, samples=(2, 3))
 MAP = dict(rings=3, sectors=5, channels=2, size=(5, 4), reach=3.0)
 WINDOWS = dict(rings=4, sectors=4, head_dim=3, shift=(1, 2))

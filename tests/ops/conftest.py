@@ -4,5 +4,5 @@ import torch
 
 @pytest.fixture
 def device():
-    """Where the operators run: tests/gpu runs some of these tests on a CUDA device."""
+    """The device of the operators. tests/gpu runs some of these tests on a CUDA device."""
     return torch.device("cpu")

@@ -1,7 +1,8 @@
-"""Random arguments of every operator, for hypothesis: sizes 0 and 1 in every place, every layout,
-dtype, stride and storage offset, and sizes around what the kernels' blocks and registers hold.
+"""Random arguments of every operator, for hypothesis. They cover the sizes 0 and 1 on every axis,
+every layout, dtype, stride and storage offset, and sizes near those of the kernels' blocks and
+registers.
 
-Hypothesis draws shapes and a seed, but not every number: those come from torch's own generator."""
+Hypothesis draws shapes and a seed; the numbers in the tensors come from torch's own generator."""
 
 import math
 
@@ -17,13 +18,13 @@ def sizes(*values: int):
 
 
 def one_in(count: int):
-    """True in one of so many draws."""
+    """True in one of `count` draws."""
     return st.integers(1, count).map(lambda drawn: drawn == count)
 
 
 @st.composite
 def strided(draw, tensor: Tensor) -> Tensor:
-    """The same values elsewhere in memory: behind others, with gaps, or in other orders."""
+    """The same values in another memory layout: with an offset, with gaps, or in another order."""
     kind = draw(st.sampled_from(["plain", "plain", "offset", "gaps", "turned", "expanded"]))
     if kind == "offset":
         room = tensor.new_empty(tensor.numel() + 3)
@@ -37,30 +38,30 @@ def strided(draw, tensor: Tensor) -> Tensor:
         back = [order.index(axis) for axis in range(tensor.dim())]
         return tensor.permute(order).contiguous().permute(back)
     if kind == "expanded" and tensor.dim() and tensor.shape[0] > 1:
-        return tensor[:1].expand_as(tensor)  # other values, but of stride 0
+        return tensor[:1].expand_as(tensor)  # other values, with stride 0
     return tensor
 
 
 @st.composite
 def of_lens(draw, tensor: Tensor) -> Tensor:
-    """A tensor with a row for each image, or with one for all."""
+    """A tensor with one row for each image, or with one row for all images."""
     return draw(strided(tensor[:1] if draw(st.booleans()) else tensor))
 
 
 @st.composite
 def grids(draw):
-    """Rings, sectors and samples of a patch, no more than 4,000 points in all."""
+    """Rings, sectors and samples of a patch, with at most 4,000 points in all."""
     rings, sectors = draw(sizes(0, 1, 2, 3, 5)), draw(sizes(0, 1, 2, 3, 8, 17, 64, 257, 300))
     across = sizes(1, 2, 3, 4, 5, 10, 33)
     if draw(one_in(7)):
-        across = sizes(341, 512, 1023, 1024, 1025, 1026, 1030)  # a block of the kernels is 1024
+        across = sizes(341, 512, 1023, 1024, 1025, 1026, 1030)  # the kernels have blocks of 1024
     samples = draw(sizes(1, 2, 3, 4, 7, 10)), draw(across)
     while rings * samples[0] * sectors * samples[1] > 4000:
         if sectors > 2:
             sectors = (sectors + 1) // 2
         elif rings > 1:
             rings -= 1
-        else:  # two sectors of one radius fit in any case
+        else:  # two sectors with one radius always fit
             samples = samples[0] // 2, samples[1]
     return rings, sectors, samples
 
@@ -86,7 +87,7 @@ def sampling(draw, dtypes=(f32, f64), embed: bool = False) -> Case:
     )  # fmt: skip
     inputs, settings = case.inputs, case.settings
     inputs["radii"] = inputs["radii"] * draw(sizes(0.5, 1.0, 2.0, 0.0, -1.0))
-    if draw(st.booleans()):  # in no order
+    if draw(st.booleans()):  # unsorted
         inputs["radii"] = inputs["radii"][:, torch.randperm(inputs["radii"].shape[1])]
     inputs["center"] += draw(sizes(0.3, 3.0)) * torch.randn_like(inputs["center"])
     if draw(one_in(4)):
@@ -130,13 +131,13 @@ def polar_maps(draw, dtypes=(f32, f64)) -> Case:
     )  # fmt: skip
     inputs = case.inputs
     if draw(one_in(5)):
-        inputs["radii"] = inputs["radii"] - inputs["radii"][:, :1]  # a ring at the pole itself
+        inputs["radii"] = inputs["radii"] - inputs["radii"][:, :1]  # first ring at the pole
     if "center" in inputs:
         inputs["center"] += draw(sizes(0.3, 3.0)) * torch.randn_like(inputs["center"])
     r, _ = on_polar_plane(size, **{name: t.double() for name, t in inputs.items() if name != "x"})
     r_max = None
     if draw(st.booleans()) and r.numel() > 1:
-        # Between two pixels, since what lies on the border may count as inside or outside.
+        # Between two pixels, since a pixel on the border may count as inside or outside.
         radius = r.flatten().sort().values
         gap = radius.diff().argmax()
         r_max = (radius[gap] + radius[gap + 1]).item() / 2
@@ -164,7 +165,7 @@ def norms(draw, dtypes=(f32,)) -> tuple[Tensor, Tensor, Tensor, Tensor]:
 
 @st.composite
 def matrices(draw) -> Tensor:
-    """x of transpose_sum."""
+    """The argument x of transpose_sum."""
     torch.manual_seed(draw(st.integers(0, 2**31)))
     counts = sizes(0, 1, 2, 3, 15, 16, 17, 33, 63, 64, 65, 130, 700)
     rows, columns, room = draw(counts), draw(counts), draw(sizes(0, 1, 5))

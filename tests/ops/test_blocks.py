@@ -13,8 +13,8 @@ from darswin.layers.transformer import Block, WindowAttention
 from darswin.ops import use_reference
 
 _norm, _linear = torch.ops.darswin._norm, torch.ops.darswin._linear
-# Rows, depth, columns: less than a tile, a tile and a rest, one panel and several, one part of the
-# depth and several, what the models have, and none.
+# Rows, depth, columns: less than a tile, a tile and a remainder, one and several panels, one and
+# several parts of the depth, the sizes of the models, and no rows.
 SIZES = [(1, 1, 1), (3, 5, 7), (9, 24, 72), (64, 48, 192), (33, 129, 50), (16, 384, 96),
          (7, 300, 1), (300, 96, 10), (256, 96, 288), (20, 1536, 64), (0, 8, 8)]  # fmt: skip
 
@@ -48,7 +48,7 @@ def test_gelu_keeps_its_digits_far_from_zero_too():
     want = x.double() * torch.erfc(-x.double() / math.sqrt(2)) / 2
     relative = ((got - want).abs() / want.abs().clamp(min=1e-30)).flatten()
     near = x.flatten().abs() < 5
-    assert relative[near].max() < 1e-6  # torch's own loses all digits at -5
+    assert relative[near].max() < 1e-6  # torch's GELU has no correct digits at -5
     assert relative.max() < 1e-5 and (got - want).abs()[:-1].max() < 1e-6
 
 

@@ -1,7 +1,7 @@
-"""The contract of the public operators: each property holds for each of them.
+"""The contract of the public operators: properties that hold for every operator.
 
-Random arguments are in test_properties.py, derivatives that the operators lack in test_library.py,
-wrong arguments in test_errors.py."""
+test_properties.py has random arguments, test_library.py the derivatives that the operators lack,
+and test_errors.py wrong arguments."""
 
 import pytest
 import torch
@@ -40,8 +40,8 @@ def test_equals_the_reference_in_float64(case):
 
 @every_case
 def test_accuracy_rule(case):
-    # Few numbers need more draws to measure rounding with: of 900 sums of 576 products the largest
-    # error of three draws varies by a third.
+    # With few numbers, more draws are needed to measure rounding. For 900 sums of 576 products, the
+    # largest error in three draws varies by a third.
     draws = 30 if case[1].startswith("deep") else 10 if "general" in case[1] else 3
     assert_accurate(CASES[case], draws=draws)
 
@@ -50,18 +50,18 @@ def test_accuracy_rule(case):
 def test_same_bits_for_any_number_of_threads(case):
     every, counts = CASES[case](), (1, 2, 3, 7)
     first = next(iter(every.inputs))
-    # One image is cut into bands, one a thread.
+    # One image is cut into bands, one per thread.
     for made in (every, every.first_image())[: 1 + (len(every.inputs[first]) > 1)]:
         assert_same_bits_on_any_number_of_threads(lambda c=made: results(c), counts)
-        # The gradient of the first input alone takes another way through the kernels.
+        # The gradient of only the first input takes another path through the kernels.
         assert_same_bits_on_any_number_of_threads(lambda c=made: results(c, only=[first]), counts)
 
 
 @every_case
 def test_bfloat16_is_float32_rounded_once(case):
-    # Attention's sums may run in another order.
+    # The sums in attention may run in another order.
     narrow, ours, expected = assert_rounded_once(CASES[case](), case[0] != "window_attention")
-    # The gradient that arrives is rounded to bfloat16 as well.
+    # The incoming gradient is rounded to bfloat16 as well.
     for name, tensor in narrow.inputs.items():
         want = expected[name]
         size = want.abs().max().item() if want.numel() else 0.0
@@ -78,7 +78,7 @@ def test_accuracy_rule_at_extreme_values(case, scale):
     def scaled():
         made = CASES[case]()
         name, values = next(iter(made.inputs.items()))
-        # Logits of 1e60 are infinite: attention's softmax is sharp with far less.
+        # Logits of 1e60 would be infinite. A scale of 30 is enough for a sharp softmax.
         return made.replace(**{name: values * (min(scale, 30.0) if name == "qkv" else scale)})
 
     assert_accurate(scaled)
@@ -103,7 +103,8 @@ def test_strides_do_not_matter(name, kind):
 def test_gradients_may_arrive_expanded(name, device):
     made = SMALL[name]().to(device)
     leaves = {name: t.requires_grad_() for name, t in made.inputs.items()}
-    from_sum = torch.autograd.grad(made.run(**leaves).sum(), leaves.values())  # stride 0 arrives
+    # The gradient of a sum arrives with stride 0.
+    from_sum = torch.autograd.grad(made.run(**leaves).sum(), leaves.values())
     out = made.run(**leaves)
     from_ones = torch.autograd.grad(out, leaves.values(), torch.ones_like(out))
     assert all(torch.equal(a, b) for a, b in zip(from_sum, from_ones, strict=True))
@@ -146,12 +147,12 @@ def test_opcheck(name, dtype):
         torch.library.opcheck(operator, given)
     names = [argument.name for argument in backward._schema.arguments]
     bools = range(names.index("grad_out") + 1, len(names))
-    for one in (None, *bools):  # all gradients, then each group of them alone
+    for one in (None, *bools):  # all gradients, then each group alone
         given = [one in (None, k) if k in bools else a for k, a in enumerate(of_backward)]
         found = backward(*given)
         fake = backward(*(a.to("meta") if isinstance(a, torch.Tensor) else a for a in given))
         assert [(t.shape, t.dtype) for t in found] == [(t.shape, t.dtype) for t in fake]
-        if sum(t.numel() == 0 for t in found) < 2:  # to opcheck, two empty tensors are one
+        if sum(t.numel() == 0 for t in found) < 2:  # opcheck takes two empty tensors for one
             checks = ("test_schema", "test_faketensor")
             torch.library.opcheck(backward, given, test_utils=checks)
 
@@ -290,7 +291,7 @@ def test_a_bias_and_weights_may_be_bfloat16(reference):
 
 @references
 def test_the_reference_rounds_bfloat16_once(reference):
-    """As the operators do, and so do the operators under autocast that has narrowed a bias."""
+    """Also compares with the operators under an autocast that has narrowed a bias."""
     for name in ("window_attention", "polar_to_image", "polar_sample", "polar_embed, circular"):
         made = SMALL[name]()
         first = next(iter(made.inputs))

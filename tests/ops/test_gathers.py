@@ -1,4 +1,4 @@
-"""Large images are read with gathers or without: the bits are the same."""
+"""Reading large images with or without gather instructions gives the same bits."""
 
 import math
 
@@ -24,7 +24,7 @@ def avx512():
 
 
 def assert_same_bits(case: Case) -> None:
-    """Without gathers, with them, and by the rule for this CPU."""
+    """Compares runs without gathers, with gathers, and with the default for this CPU."""
     found = []
     for way in (False, True, None):
         _module.set_gathers(way)
@@ -41,7 +41,7 @@ def test_random_arguments(embed):
 @pytest.mark.parametrize("samples", [(10, 10), (4, 7), (1, 1), (40, 128), (2, 2000)], ids=str)
 @pytest.mark.parametrize("layout", ["tokens", "image"])
 def test_large_images(channels, samples, layout):
-    # Some points lie on the border of the image, and some outside.
+    # Some points lie on the border of the image, and some lie outside.
     rows, columns = max(40 // samples[0], 1) * samples[0], max(130 // samples[1], 1) * samples[1]
     case = sampling(2, channels, (300, 523), rows, columns, samples, layout=layout)
     want = results(case, is_reference=True)["out"]
@@ -52,7 +52,7 @@ def test_large_images(channels, samples, layout):
 
 @pytest.mark.parametrize("features", [None, 5])
 def test_nothing_beyond_the_image_is_read_at_its_end(features):
-    """The last pixels of an image lie at the end of its memory: the sanitizers watch."""
+    """The sanitizers detect reads after the last pixels, which lie at the end of the memory."""
     side = 200
     case = sampling(1, 1, (side, side), 3, 64, (1, 64), features=features)
     radii = torch.tensor([[0.0, (side - 1) / 2, (side - 1) / math.sqrt(2)]])

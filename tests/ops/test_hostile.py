@@ -1,5 +1,5 @@
-"""Operators called past the public functions, with arguments that nobody checked: each call returns
-or raises. It never reads or writes where it should not; `make test-asan` and `make fuzz` look."""
+"""Calls of the operators with unchecked arguments, without the public functions. Each call returns
+or raises, and never accesses foreign memory; `make test-asan` and `make fuzz` detect accesses."""
 
 import contextlib
 import math
@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 ops = torch.ops.darswin
-# A crash leaves nothing but this: the call that is under way.
+# The call that is running. After a crash, this file is the only trace of it.
 LAST_CALL = Path(tempfile.gettempdir()) / "darswin_last_hostile_call.txt"
 
 HUGE = (2**31, 2**53, 2**62, 2**63 - 1)
@@ -45,7 +45,7 @@ NAMES = [*PUBLIC, *(f"{name}_backward" for name in PUBLIC), "_add_norm_", "_tran
 
 @st.composite
 def tensors(draw, like: Tensor) -> Tensor | None:
-    """What may come in place of a tensor."""
+    """A replacement for a tensor, often an invalid one."""
     if like.numel() > 10**6:
         return like
     kind = draw(st.sampled_from(
@@ -60,7 +60,7 @@ def tensors(draw, like: Tensor) -> Tensor | None:
         axis = draw(st.integers(0, like.dim() - 1))
         return like.narrow(axis, 0, draw(st.integers(0, like.shape[axis])))
     if kind == "huge" and like.dim():
-        # One number that counts as very many.
+        # One number in memory, expanded to a huge size.
         axis, size = draw(st.integers(0, like.dim() - 1)), draw(st.sampled_from([2**53, 2**62]))
         shape = [size if a == axis else min(n, 3) for a, n in enumerate(like.shape)]
         if draw(st.booleans()):
@@ -93,7 +93,7 @@ def hostile(draw, name: str) -> list:
         index = draw(st.integers(0, len(arguments) - 1))
         value = arguments[index]
         if isinstance(value, Tensor):
-            with contextlib.suppress(RuntimeError):  # a tensor that torch itself does not make
+            with contextlib.suppress(RuntimeError):  # torch itself refuses to create some tensors
                 arguments[index] = draw(tensors(value))
         elif isinstance(value, bool):
             arguments[index] = not value
@@ -131,4 +131,4 @@ def test_a_hostile_call_returns_or_raises(name, data):
         return
     for tensor in result if isinstance(result, (tuple, list)) else [result]:
         if tensor is not None and tensor.device.type == "cpu":
-            tensor.double().sum().item()  # all of it is there
+            tensor.double().sum().item()  # reads all of the memory

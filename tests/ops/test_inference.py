@@ -1,4 +1,4 @@
-"""The private operators: a residual with its norm, results of 8 bits, a transpose with sums."""
+"""The private operators: residual with norm, 8-bit results, and transpose with column sums."""
 
 import math
 
@@ -13,10 +13,10 @@ from darswin.layers.quantized import Quantization, dequantize, quantize
 from darswin.ops._transpose_sum import transpose_sum
 
 EPS, STEPS = 1e-5, Quantization(0.03, 117)
-# add_norm_ of float32 that returns the norm in 8 bits, and attention that does.
+# The variants of float32 add_norm_ and of attention that return an 8-bit result.
 add_norm_quantized_ = torch.ops.darswin._add_norm_quantized_
 window_attention_quantized = torch.ops.darswin._window_attention_quantized
-# Less than a register, registers and a rest, what the models have, and enough for many threads.
+# Less than a register, registers and a remainder, the models' sizes, and enough for many threads.
 SHAPES = [(1, 1), (3, 7), (2, 5, 37), (4, 16, 96), (8, 16, 64, 96), (128, 768), (64, 384),
           (9, 1500), (0, 8), (4, 0)]  # fmt: skip
 every_shape = pytest.mark.parametrize("shape", SHAPES, ids=str)
@@ -48,7 +48,7 @@ def test_add_norm_is_as_accurate_as_torch(shape, mean):
     want = F.layer_norm(total.double(), shape[-1:], weight.double(), bias.double(), EPS)
     own = (F.layer_norm(total, shape[-1:], weight, bias, EPS) - want).abs().max()
     floor = 4 * torch.finfo(torch.float32).eps * want.abs().max()
-    large = mean > 0 and shape[-1] >= 384  # a large mean costs no digits
+    large = mean > 0 and shape[-1] >= 384  # unlike torch, add_norm_ loses no digits to a large mean
     assert (got - want).abs().max() <= (own if large else max(2 * own, floor))
 
 
@@ -99,7 +99,7 @@ def test_memory_is_not_shared():
 def test_quantize_is_that_of_torch(scale, zero_point, values):
     x = torch.tensor(values, dtype=torch.float32)
     own = quantize(x, Quantization(scale, zero_point))
-    # torch's own is undefined for what is not finite or does not fit an int.
+    # torch's function is undefined for values that are not finite or do not fit an int.
     fits = x.isfinite() & ((x / scale).abs() < 1e6)
     theirs = torch.quantize_per_tensor(x[fits], scale, zero_point, torch.quint8)
     assert torch.equal(own[fits], theirs.int_repr())
@@ -112,7 +112,7 @@ def test_quantize_is_that_of_torch(scale, zero_point, values):
 @every_shape
 def test_add_norm_quantized_is_that_of_floats(shape, adds):
     x, y, weight, bias = rows(shape)
-    if len(x) > 8:  # the norm of rows that are not finite is NaN, and that of a huge weight huge
+    if len(x) > 8:  # the norm is NaN in rows that are not finite, and huge where the weight is huge
         x[1, 3], x[2, 0], weight[5], weight[6] = math.nan, math.inf, 1e30, -1e30
     total, norm = x.clone(), y.clone() if adds else torch.zeros(shape)
     add_norm_(total, norm, weight, bias)

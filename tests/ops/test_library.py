@@ -1,4 +1,4 @@
-"""Which code an operator runs, the derivatives that it lacks, and numbers of NumPy."""
+"""The choice of an operator's code, the derivatives that it lacks, and NumPy's numbers."""
 
 import contextlib
 import functools
@@ -33,7 +33,7 @@ azimuths, samples = torch.linspace(0, 6, 6), (2, 3)
 qkv, bias = attention().inputs.values()
 ring_centers, middle = radii[:1], center[:1]
 
-# A function of one tensor for each operator, and the tensor.
+# For each operator, a function of one tensor and this tensor.
 CALLS = {
     "polar_sample": (lambda x: polar_sample(x, radii, azimuths, center, samples=samples), image),
     "polar_embed": (
@@ -48,7 +48,7 @@ operators = pytest.mark.parametrize("name", CALLS)
 
 
 def compiles(test):
-    """The mark of a test that compiles graphs; it starts without any."""
+    """Marks a test that compiles graphs. The test starts without compiled graphs."""
     test = pytest.mark.slow(pytest.mark.unsanitized(test))
     return pytest.mark.usefixtures("no_graphs")(test)
 
@@ -87,7 +87,7 @@ def test_use_reference_reaches_every_public_operator(name, monkeypatch):
 
 
 def on_kernels(make, dtype=f32, installed=True, capability=(8, 0), **options):
-    """Whether a call on a CUDA device runs a kernel, on fake tensors."""
+    """True if a call with fake tensors on a CUDA device runs a kernel."""
     with (
         mock.patch.object(triton, "INSTALLED", installed),
         mock.patch.object(torch.cuda, "get_device_capability", return_value=capability),
@@ -259,7 +259,7 @@ def test_transpose_sum_refuses_them_too(kind):
         DERIVATIVES[kind](lambda x: transpose_sum(x)[1], torch.rand(3, 4))
 
 
-# -- azimuths have a gradient in the reference alone -----------------------------------------------
+# -- only the reference has a gradient for azimuths ------------------------------------------------
 
 
 def of_azimuths(embed, jitter, dtype=f32):
@@ -297,7 +297,7 @@ def test_a_compiled_function_refuses_azimuths_that_require_a_gradient(embed):
 @pytest.mark.parametrize("recording", [False, True])
 @operators
 def test_a_call_takes_few_python_calls(name, recording):
-    """The checks that explain wrong arguments run only if the operator refuses them."""
+    """The checks that explain wrong arguments run only after the operator has refused them."""
     run, x = CALLS[name]
     x = x.clone().requires_grad_(recording)
     calls = []
@@ -316,7 +316,7 @@ def test_a_call_takes_few_python_calls(name, recording):
     assert not any(called.startswith("check_tensor") for called in calls)
 
 
-@pytest.mark.filterwarnings("ignore")  # torch.jit is deprecated, and warns of every shape
+@pytest.mark.filterwarnings("ignore")  # torch.jit is deprecated, and warns about every shape
 @operators
 def test_the_gradient_is_recorded_by_the_operator_itself_in_a_trace(name):
     run, x = CALLS[name]
@@ -324,11 +324,11 @@ def test_the_gradient_is_recorded_by_the_operator_itself_in_a_trace(name):
     assert f"darswin::{name}" in str(graph) and "PythonOp" not in str(graph)
 
 
-# -- graphs, and numbers of NumPy ------------------------------------------------------------------
+# -- graphs, and NumPy numbers ---------------------------------------------------------------------
 
 
 @compiles
-@pytest.mark.filterwarnings("ignore")  # torch.jit is deprecated, and warns of every shape
+@pytest.mark.filterwarnings("ignore")  # torch.jit is deprecated, and warns about every shape
 @operators
 def test_jit_trace(name):
     run, x = CALLS[name]

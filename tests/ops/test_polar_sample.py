@@ -1,5 +1,5 @@
-"""Places of polar_sample's points and values of its pixels, beyond the contract; and polar_embed as
-the two steps that it takes at once."""
+"""Tests beyond the contract: positions of polar_sample's points, values of its pixels, and
+polar_embed compared with its two steps."""
 
 import math
 
@@ -75,7 +75,7 @@ def test_bands_get_what_offsets_bring_them(threads, far):
 
 
 def test_accuracy_rule_where_all_points_meet():
-    # Every point of the innermost rings falls into one pixel: the longest sums of all.
+    # All points of the innermost rings fall into one pixel, which gives the longest sums.
     def make():
         case = sampling(1, rows=64, columns=512, samples=(8, 8))
         center = case.inputs["center"].round() + 0.5
@@ -85,7 +85,7 @@ def test_accuracy_rule_where_all_points_meet():
 
 
 def test_indices_beyond_two_to_the_31():
-    # The pages of a fresh tensor are not there before they are written: this costs little memory.
+    # This needs little memory: the pages of a new tensor are allocated when they are written.
     side = 46400
     image = torch.empty(1, 1, side, side)
     assert image.numel() > 2**31
@@ -110,7 +110,7 @@ def test_sizes_beyond_two_to_the_31():
 @pytest.mark.parametrize("rows", [1, 3])  # a far image, and a near one, which is packed
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
 def test_points_at_nan_or_infinity_sample_nothing(bad, rows, jitter, device):
-    # In each image something else is bad, and one azimuth in all.
+    # Another input is bad in each image, and one azimuth is bad in all images.
     case = sampling(4, 1, rows=rows, columns=40, samples=(1, 1), jitter=jitter, seed=4,
                     layout="image", **GENERAL)  # fmt: skip
     for b, tensor in enumerate(list(case.inputs.values())[1:]):
@@ -134,7 +134,7 @@ def test_pixels_that_are_nan_or_infinite_count_where_they_are_touched(bad, devic
     found = case.run(image.to(device), radii, center)
     assert not found[:, 0::2].any() and not found[0, 1, 1].any()
     assert not found[0, 1, 0].isfinite().any()
-    # Points just outside of an image touch none of its pixels.
+    # Points just outside an image touch none of its pixels.
     spoilt = torch.full_like(image, bad).to(device)
     assert not case.run(spoilt, radii * 0, 0 * center - 1).any()
 
@@ -143,7 +143,7 @@ def test_pixels_that_are_nan_or_infinite_count_where_they_are_touched(bad, devic
 
 
 def jittered(radii, azimuths, jitter, seed, size=64, **general):
-    """x and y from the centre at which the points of one image stand, (2, N_r, N_a)."""
+    """Positions (x, y) relative to the centre of the points of one image, (2, N_r, N_a)."""
     x = torch.arange(size, dtype=f64).expand(size, size)
     middle = torch.full((1, 2), (size - 1) / 2, dtype=f64)
     # The channels of the image are x and y.
@@ -177,8 +177,8 @@ def test_seeds():
     for seed in (0, 7, 2**62, -(2**63), 2**63 - 1):
         assert torch.equal(run(seed), run(torch.tensor(seed)))
     assert not torch.equal(run(7), run(8))
-    assert not torch.equal(run(7)[0], run(7)[1])  # each image has its own numbers
-    assert torch.equal(run(7)[:1], run(7, image[:1]))  # whatever else is in the batch
+    assert not torch.equal(run(7)[0], run(7)[1])  # each image has its own random numbers
+    assert torch.equal(run(7)[:1], run(7, image[:1]))  # independent of the rest of the batch
     assert torch.equal(run(7, jitter=0.0), run(8, jitter=0.0))
 
 
@@ -209,7 +209,7 @@ def test_a_compiled_function_keeps_neither_jitter_nor_seed():
     for seed, jitter in enumerate((0.1, 0.2, 0.3, 0.4, 0.5)):
         expected = run(jitter, torch.tensor(seed))
         assert torch.equal(compiled(jitter, torch.tensor(seed)), expected)
-    assert counter.frame_count == 2  # the first one keeps its jitter, as Dynamo does with any float
+    assert counter.frame_count == 2  # Dynamo compiles the first float as a constant
 
 
 # -- types of pixels -------------------------------------------------------------------------------
@@ -217,7 +217,7 @@ def test_a_compiled_function_keeps_neither_jitter_nor_seed():
 
 def test_bfloat16_rounds_to_nearest_even_and_keeps_nan():
     values = torch.tensor([1.0, 1.00390625, 1.01171875, 3.4e38, math.inf, math.nan, -1e-40, -0.0])
-    for columns in (8, 3):  # whole registers and less
+    for columns in (8, 3):  # a whole register, and less
         arguments = values.reshape(1, 1, 1, -1), torch.arange(float(columns))[None], torch.zeros(1)
         with torch.autocast("cpu", dtype=torch.bfloat16):
             out = polar_sample(*arguments, torch.zeros(1, 2), samples=(1, 1))
@@ -240,7 +240,7 @@ def test_uint8_pixels_are_what_they_stand_for(form, features, columns, device):
     normalized = (planes / 255 - mean[:, None, None]) / std[:, None, None]
     normalized = normalized.permute(0, 2, 3, 1) if form == "frames" else normalized
     expected = results(case.replace(image=normalized), is_reference=True, only=lens)
-    # The reference normalizes the pixels that it has gathered, by the same operations.
+    # The reference normalizes the gathered pixels with the same operations.
     assert torch.equal(results(raw, is_reference=True, only=lens)["out"], expected["out"])
     raw = raw.to(device)
     found = results(raw, only=lens)
@@ -261,7 +261,8 @@ def test_images_that_are_not_uint8_count_as_they_are(dtype, reference):
     torch.testing.assert_close(out, plain)
 
 
-READINGS = {  # channels_last as it is given: shapes that are read as if it were False, and True
+# Value of channels_last → shapes that are read as (B, C, H, W), and shapes read as (B, H, W, C).
+READINGS = {
     None: (
         [(2, 1, 17, 23), (2, 3, 17, 23), (2, 4, 17, 23), (2, 3, 23, 12), (2, 1, 1, 1)],
         [(2, 17, 23, 1), (2, 17, 23, 3), (2, 17, 23, 4), (2, 12, 23, 3)],
@@ -279,7 +280,7 @@ def test_the_axis_of_the_channels(given, reference):
             planes = frames.permute(0, 3, 1, 2) if last else frames
             _, *lens = grid(planes.shape[2:])
             expected = polar_sample(planes / 255, *lens, samples=(3, 4))
-            # What is given holds for images of any type; without it others have channels first.
+            # A given channels_last holds for every dtype. Without it, floats have channels first.
             images = (frames, planes / 255 if given is None else frames / 255)
             with use_reference(reference):
                 for image in images:
@@ -313,7 +314,7 @@ def test_one_graph_for_uint8_images_of_any_size(last):
     [(9, 6, 12), (40, 8, 1031), (40, 1, 2500), (700, 12, 90), (9, 7, 1)],
 )
 def test_the_patch_does_not_matter_to_an_image(size, rows, columns):
-    """Near and far images, rows longer than a block, and rows of no other divisor than 1."""
+    """Covers near and far images, rows longer than a block, and rows of prime length."""
     arguments = grid((size, size), rows, columns)
     options = dict(layout="image", jitter=1.0, seed=3)
     sampled = [
@@ -323,7 +324,7 @@ def test_the_patch_does_not_matter_to_an_image(size, rows, columns):
     assert all(torch.equal(sampled[0], other) for other in sampled[1:])
     with use_reference():
         expected = polar_sample(*arguments, samples=(1, 1), **options)
-    # The reference computes places in float32.
+    # The reference computes positions in float32.
     torch.testing.assert_close(sampled[0], expected, rtol=0, atol=2e-6 * (10 + size))
 
 
@@ -331,7 +332,7 @@ def test_the_patch_does_not_matter_to_an_image(size, rows, columns):
 @pytest.mark.parametrize("dtype", [f32, f64])
 @pytest.mark.parametrize("channels", [1, 2, 3])
 def test_a_token_longer_than_a_block_ends_where_it_ends(channels, dtype, columns, threads):
-    """What is left of it behind a block may be less than the block's last store writes."""
+    """The rest of a token after a block may be shorter than the width of the block's last store."""
     image, *lens = grid((30, 30), 3, columns, dtype)
     image = image[:, :channels]
     threads(1)
@@ -348,8 +349,8 @@ def test_a_token_longer_than_a_block_ends_where_it_ends(channels, dtype, columns
 @pytest.mark.parametrize("samples", [(4, 5), (3, 2), (1, 1), (6, 40)])
 @pytest.mark.parametrize("channels", [1, 2, 3, 4, 5])
 def test_the_layout_of_a_far_image_does_not_matter(channels, samples, dtype):
-    """Planes, pixels whose channels lie together, both with gaps, and one value after another."""
-    size = 150  # far: more than four pixels for each of the 24 x 120 points
+    """Compares planes, pixels with adjacent channels, both with gaps, and transposed planes."""
+    size = 150  # a far image has more than four pixels for each of the 24 x 120 points
     image = (torch.rand(2, channels, size, size) * 255).to(dtype)
     radii = torch.stack((torch.linspace(0, 75, 24), torch.linspace(10, 90, 24)))
     lens = (radii, torch.linspace(0, 6.2, 120), torch.full((1, 2), 74.5))
@@ -375,7 +376,7 @@ def test_the_layout_of_a_far_image_does_not_matter(channels, samples, dtype):
 
 
 def test_gradients_of_very_many_tokens_are_as_accurate_as_torch():
-    # 131,072 tokens: sums of float32 one by one had 12 times torch's error.
+    # For 131,072 tokens, plain float32 sums had 12 times the error of torch.
     radii, azimuths = torch.linspace(1, 6, 64)[None], torch.linspace(0, 6.2, 512)
     image, center = torch.randn(4, 1, 12, 12), torch.full((1, 2), 5.5)
     grad = torch.randn(4, 64, 512, 3) + 0.5

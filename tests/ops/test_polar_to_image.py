@@ -1,4 +1,4 @@
-"""polar_to_image by its definition, beyond the contract."""
+"""Tests of polar_to_image beyond the contract, against its definition."""
 
 import math
 
@@ -31,7 +31,7 @@ def test_a_matrix_is_undone(reference):
     ids=str,
 )
 def test_places_that_are_no_numbers_are_zero(place, dtype):
-    # Their azimuths may come out infinite, which no integer holds: `make test-asan` would tell.
+    # Their azimuths may be infinite and fit no integer, which `make test-asan` would detect.
     real = torch.promote_types(dtype, torch.float32)
     points = torch.tensor(place, dtype=real).expand(1, 1, 35, 2).clone().requires_grad_()
     radii = torch.tensor([[1.0, 2.0]], dtype=real)
@@ -42,9 +42,9 @@ def test_places_that_are_no_numbers_are_zero(place, dtype):
 
 
 def test_equals_scipy():
-    ndimage = pytest.importorskip("scipy.ndimage")  # not where a wheel alone is tested
-    # Rings at equal steps, half a step from the pole: the map, mirrored across the pole and
-    # repeated around, is what scipy interpolates.
+    ndimage = pytest.importorskip("scipy.ndimage")  # missing where only a wheel is tested
+    # The rings have equal steps and start half a step from the pole. Then scipy can interpolate the
+    # map, mirrored across the pole and repeated around.
     rings, sectors, size, step = 6, 10, 41, 2.5
     x = torch.randn(1, rings, sectors, 2, dtype=torch.float64)
     radii = (torch.arange(rings, dtype=torch.float64)[None] + 0.5) * step
@@ -81,7 +81,7 @@ def test_undoes_polar_sample_on_a_smooth_image():
 
 
 def test_the_pole_and_the_axes(device):
-    # Pixels at the pole, on the axes and the diagonals, where the pieces of the arctangent meet.
+    # Pixels at the pole, on the axes and on the diagonals, where the arctangent's pieces meet.
     case = polar_map(1, 3, 8, 2, (7, 7))
     case = case.replace(radii=torch.tensor([[0.5, 1.5, 3.0]]), center=torch.full((1, 2), 3.0))
     expected = results(case.to(torch.float64), is_reference=True, masked=False)

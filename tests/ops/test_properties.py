@@ -1,6 +1,7 @@
-"""Properties that hold for all arguments of the operators, on arguments that hypothesis draws.
+"""Properties of the operators for all arguments, tested on arguments that hypothesis draws.
 
-A few dozen of each in `make test`, always the same; `make fuzz` draws 2,000 others of each.
+`make test` draws a few dozen arguments for each test, always the same. `make fuzz` draws 2,000
+other ones.
 """
 
 import functools
@@ -32,8 +33,8 @@ pytestmark = pytest.mark.filterwarnings("error")
 
 
 def assert_accurate(ours: Tensor, base: Tensor, exact: Tensor, size: float) -> None:
-    """The accuracy rule: an error of at most twice the reference's own in the same type. A few
-    numbers may be exact there by chance: up to 16 roundings of `size` are always allowed."""
+    """The accuracy rule: the error is at most twice that of the reference in the same dtype. Up to
+    16 roundings of `size` are always allowed, because the reference may be exact by chance."""
     assert ours.shape == exact.shape and ours.dtype == base.dtype
     if exact.numel() == 0:
         return
@@ -47,21 +48,22 @@ def largest(tensor: Tensor) -> float:
     return tensor.abs().max().item() if tensor.numel() else 0.0
 
 
-# How large the numbers are that are added up for a result, by its name.
+# Functions that map the name of a result to the size of the numbers that are added up for it.
 
 
 def sampling_size(case: Case) -> Callable[[str], float]:
     exact = case.to(f64)
     linear = [name for name in ("image", "weight", "bias") if name in case.inputs]
     sizes = results(exact, is_reference=True, absolute=linear)
-    grads = sizes["grad"]  # of the samples, and the same with the linear layer behind them
+    grads = sizes["grad"]  # of the output; converted to the samples below
     if "weight" in linear:
         grads = grads @ exact.inputs["weight"].abs()
-    # Of the lens: all samples, each by the difference of two pixels, at the longest radius.
+    # For the lens: the sum over all samples, each times the difference of two pixels, times the
+    # longest radius.
     lens = grads.sum().item() * 2 * largest(exact.inputs["image"])
     lens *= max(1.0, largest(exact.inputs["radii"]))
-    # Places are computed in float64. In a float64 call their rounding counts, of as many pixels as
-    # they may be away from 0; the reference itself has no more digits.
+    # Positions are computed in float64. In a float64 call their rounding matters, in proportion to
+    # their distance from 0 in pixels. The reference itself has no more digits.
     places = 1.0
     if case.inputs["image"].dtype == f64:
         stretch = largest(exact.inputs["affine"]) if "affine" in exact.inputs else 1.0
@@ -84,18 +86,19 @@ def map_size(case: Case) -> Callable[[str], float]:
     exact = case.to(f64)
     sizes = results(exact, is_reference=True, absolute=["x"])
     x, radii = exact.inputs["x"], exact.inputs["radii"]
-    # Of the lens: all pixels, each by the difference of two tokens, at the narrowest ring or, half
-    # a pixel from the pole, by the azimuth; a matrix has as long a lever as the image is wide.
+    # For the lens: the sum over all pixels, each times the difference of two tokens. The narrowest
+    # ring is the worst case, or the azimuth half a pixel from the pole. The lever of the matrix is
+    # as long as the image is wide.
     steps = torch.cat((2 * radii[:, :1], radii.diff(dim=1)), 1)
     narrow = steps[steps > 0].min().item() if (steps > 0).any() else 1.0
-    # A weight is right to the rounding of a place, in units of a ring or of a sector.
+    # A weight is as accurate as the rounding of a position, in units of a ring or of a sector.
     weights = (1 + max(case.settings["size"])) * (1 / narrow + x.shape[2])
     lens = sizes["grad"].sum().item() * 2 * largest(x) * weights
     known = ("out", "grad", "x")
     return lambda name: weights * (largest(sizes[name]) if name in known else lens)
 
 
-# Operator → its calls, a function of the types, and the sizes of their results.
+# Operator → the strategy that draws its calls, and the function for the sizes of their results.
 CALLS = {
     "polar_sample": (strategies.sampling, sampling_size),
     "polar_embed": (functools.partial(strategies.sampling, embed=True), sampling_size),
@@ -183,11 +186,11 @@ def test_transpose_sum_equals_torch(x):
     assert_accurate(sums, x.sum(0), x.double().sum(0), largest(x.double().abs().sum(0)) / 4)
 
 
-# -- what is not finite, and what nearly is not ----------------------------------------------------
+# -- values that are not finite, or nearly overflow ------------------------------------------------
 
 
 def spoiled(tensor: Tensor, value: float, share: float) -> Tensor:
-    """A copy in which about a `share` of the numbers, and one at least, are `value`."""
+    """A copy in which about a `share` of the numbers, but at least one, is `value`."""
     hit = torch.rand(tensor.shape) < share
     if tensor.numel():
         hit.view(-1)[torch.randint(tensor.numel(), ())] = True
@@ -195,7 +198,7 @@ def spoiled(tensor: Tensor, value: float, share: float) -> Tensor:
 
 
 def assert_same_kinds(ours: Tensor, exact: Tensor, atol: float) -> None:
-    """Numbers where the reference has numbers, and NaN and each infinity where it has that."""
+    """Asserts equal numbers, with NaN and the infinities in the same places."""
     torch.testing.assert_close(ours.double(), exact.double(), rtol=1e-4, atol=atol, equal_nan=True)
 
 
@@ -229,8 +232,8 @@ def test_pixels_and_tokens_that_are_not_finite_spoil_what_touches_them(name, dat
         ours = case.run(**case.inputs)
         with use_reference():
             exact = case.run(**case.to(f64).inputs)
-    # Right on the border of a pixel or the middle of a token its weight is 0 or a rounding: NaN and
-    # infinity may differ.
+    # On the border of a pixel or in the middle of a token, the weight is 0 or a rounding error.
+    # There NaN and infinity may differ.
     atol = 1e-3 if name == "polar_sample" else 1e-2
     assert_same_kinds(torch.where(smooth, ours, 0), torch.where(smooth, exact, 0), atol=atol)
 
@@ -283,7 +286,7 @@ def test_a_token_that_is_not_finite_spoils_its_window_alone(case, bad):
     note(repr(case))
     qkv = spoiled(case.inputs["qkv"], bad, 0.01)
     settings = case.settings
-    # Windows that hold one, as the tokens of the map.
+    # Marks all tokens of the map whose window contains such a token.
     hit = (~qkv.isfinite()).flatten(3).any(3).roll([-s for s in settings["shift"]], (1, 2))
     (mr, ma), (batch, rings, sectors) = settings["window"], hit.shape
     windows = hit.view(batch, rings // mr, mr, sectors // ma, ma).amax((2, 4), keepdim=True)

@@ -1,4 +1,4 @@
-"""What once read or wrote outside, ended the process or hung it: each in its own small test."""
+"""Small tests for past bugs: out-of-bounds reads and writes, crashes and hangs."""
 
 import os
 import subprocess
@@ -10,7 +10,7 @@ import torch
 
 
 def run(code: str) -> subprocess.CompletedProcess:
-    """A process of its own, which may die."""
+    """Runs code in a separate process, which may crash."""
     return subprocess.run(
         [sys.executable, "-c", textwrap.dedent(code)], capture_output=True, text=True, timeout=120
     )
@@ -71,8 +71,8 @@ def test_out_of_memory_is_an_error_and_large_working_memory_is_given_back():
     assert done.returncode == 0, done.stderr
     *errors, sampled, kept = done.stdout.split()
     assert len(errors) == 3 and set(errors) <= {"MemoryError", "RuntimeError"}
-    assert int(sampled) < 300  # MB of addresses; the sums of a gradient would take 576
-    assert int(kept) < 80  # MB, of two threads, which once kept 512
+    assert int(sampled) < 300  # MB of addresses; the sums of a gradient would take 576 MB
+    assert int(kept) < 80  # MB for two threads, which once kept 512 MB
 
 
 # -- sizes that are too large ----------------------------------------------------------------------
@@ -81,7 +81,7 @@ SAMPLE = torch.ops.darswin.polar_sample
 
 
 def plain(samples):
-    """The rest of a raw call of polar_sample, without jitter."""
+    """The remaining arguments of a raw polar_sample call, without jitter."""
     return (None, None, samples, [], [], False, True)
 
 
@@ -100,8 +100,8 @@ def test_sizes_that_no_number_holds_are_refused(shape, samples):
 
 
 def test_gradients_of_nothing_take_no_time_and_no_memory():
-    # Sizes that count for nothing, since there is no point: a lens of many images, a weight of
-    # many features.
+    # There are no points, so the huge sizes must not matter: here many images that share a lens,
+    # and below many features of a weight.
     many = torch.ones(1, 1, 1, 1).expand(2**40, 1, 4, 4)
     grads = torch.ops.darswin.polar_sample_backward(
         many, torch.ones(1, 4), torch.zeros(0), torch.ones(1, 2), None, None, *plain((2, 1)),

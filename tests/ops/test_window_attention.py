@@ -1,4 +1,4 @@
-"""window_attention by its definition, beyond the contract."""
+"""Tests of window_attention beyond the contract, against its definition."""
 
 import math
 
@@ -12,20 +12,20 @@ references = pytest.mark.parametrize("reference", [False, True])
 
 
 def arguments(*sizes, dtype=torch.float32):
-    """qkv and bias, of batch, rings, sectors, heads, head dim, window and rows of the bias."""
+    """qkv and bias for a batch size, rings, sectors, heads, head dim, window and bias rows."""
     return attention(*sizes, dtype=dtype).inputs.values()
 
 
 @references
 def test_equals_a_loop_over_tokens(reference):
-    # The definition, token by token: nothing here is shared with the operators.
+    # The definition, token by token. It shares no code with the operators.
     (rings, sectors), window, shift, periodic = (4, 6), (2, 3), (1, 2), (False, True)
     qkv, bias = arguments(1, rings, sectors, 1, 4, window, dtype=torch.float64)
     q, k, v = qkv[0, :, :, :, 0].unbind(2)
     expected = torch.zeros(rings, sectors, 4, dtype=torch.float64)
 
     def place(r, a):
-        """Window, position in it, and whether the roll carried the token over the inner border."""
+        """The window, the position in it, and whether the roll moved the token across a border."""
         rolled_r, rolled_a = (r - shift[0]) % rings, (a - shift[1]) % sectors
         at = (rolled_r // window[0], rolled_a // window[1])
         return at, (rolled_r % window[0], rolled_a % window[1]), r < shift[0]
@@ -58,8 +58,8 @@ def test_minus_infinity_in_the_bias_hides_a_pair(reference, device):
 
 @pytest.mark.slow  # it writes 3 GB
 def test_indices_beyond_two_to_the_31():
-    # The pages of a fresh tensor are not there before they are written, and reading them is free:
-    # only the output (3 GB) takes memory.
+    # Only the output (3 GB) needs memory: the pages of a new tensor are allocated when they are
+    # written, not when they are read.
     dim = 1024
     tokens = 2**31 // (3 * dim) + 2
     qkv = torch.empty(1, 1, tokens, 3, 1, dim)
