@@ -1,7 +1,8 @@
-"""Compiles the kernels for GPUs, without one, as the launchers ask for them.
+"""Compiles the GPU kernels of the launchers on a machine without a GPU.
 
-Prints what each takes, and fails where a kernel has too few registers for its numbers, or more
-shared memory than a GPU has. `make test-triton` runs it; triton must be there, and not interpret.
+It prints the resources of each kernel. It fails if a kernel spills registers to the stack or needs
+more shared memory than a GPU has. `make test-triton` runs it. It needs triton with the interpreter
+turned off.
 """
 
 import re
@@ -29,7 +30,7 @@ CUOBJDUMP = Path(triton.__file__).parent / "backends/nvidia/bin/cuobjdump"
 
 
 class _NoDevice:
-    """In the place of Triton's driver: a GPU of some capability, which is only compiled for."""
+    """Replaces Triton's driver by a GPU of the given capability that can only be compiled for."""
 
     def __init__(self, capability: int):
         self.target = GPUTarget("cuda", capability, 32)
@@ -45,9 +46,9 @@ class _NoDevice:
 
 
 def compiled(capability: int, call: Callable[[], object]) -> Iterator[dict[str, Any]]:
-    """Of each kernel that a call launches, compiled instead: its name, threads, registers of a
-    thread, stack in bytes, which is used for want of registers, and shared memory of a program.
-    The call's tensors are on the device "meta"."""
+    """Compiles each kernel that a call would launch, with the call's tensors on the device "meta".
+    Yields the kernel's name, its threads, registers per thread, stack for spilled registers in
+    bytes, and shared memory per program in bytes."""
     kernels, run = [], JITFunction.run
 
     def compile_only(self, *arguments, grid, warmup, **options):
@@ -70,10 +71,10 @@ def compiled(capability: int, call: Callable[[], object]) -> Iterator[dict[str, 
         )  # fmt: skip
 
 
-# ------------------------------------------------------------------------- what the models ask for
+# -- calls of the models ---------------------------------------------------------------------------
 
 DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16, "float16": torch.float16}
-# (R, A), heads and window of the stages of DarSwin-A and -RA, and windows of Swin.
+# (R, A), heads and window of the stages of DarSwin-A, DarSwin-RA and Swin.
 ATTENTION = {
     "A, stages 1, 2: 1×16": ((16, 64), 3, (1, 16)),
     "A, stage 3; RA, 1 to 3: 4×4": ((16, 64), 3, (4, 4)),
@@ -84,7 +85,7 @@ ATTENTION = {
 }  # the head dim is 32
 
 
-# (R, A) and samples of the presets' patches, of three channels.
+# (R, A) and samples of the presets' patches, which have three channels.
 PATCHES = {
     "small, tiny: 10×10": ((16, 64), (10, 10)),
     "micro: 6×6": ((16, 64), (6, 6)),
@@ -97,7 +98,7 @@ def meta(*shape: int, dtype: torch.dtype = torch.float32) -> torch.Tensor:
     return torch.empty(shape, dtype=dtype, device="meta")
 
 
-# Each of these calls a forward and a backward.
+# Each of these functions calls a forward and a backward.
 
 
 def attend(case: str, dtype: torch.dtype) -> None:
@@ -158,7 +159,7 @@ CALLS = {
 
 
 def main() -> None:
-    """Prints the table; what breaks a limit is the exit status."""
+    """Prints the table, and exits with the kernels that break a limit."""
     broken = []
     print(
         "| call | kernel | threads | registers, sm_80 | sm_90 | shared memory (kB), sm_80 | sm_90 |"

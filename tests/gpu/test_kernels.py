@@ -1,5 +1,6 @@
-"""The kernels for GPUs under the operators' contract, with its cases and some of its tests; then
-what only they do. Few and small cases, since a program takes 20 ms in the interpreter."""
+"""Tests of the GPU kernels: first the operators' contract, with its cases and some of its tests,
+then properties of the kernels alone. Cases are few and small, since a program takes 20 ms in the
+interpreter."""
 
 import functools
 import math
@@ -35,7 +36,7 @@ from test_window_attention import test_minus_infinity_in_the_bias_hides_a_pair  
 
 from darswin.ops import _library, polar_sample, triton, use_reference
 
-# NumPy, which the interpreter computes with, tells of every NaN and infinity.
+# The interpreter computes with NumPy, which warns about every NaN and infinity.
 pytestmark = pytest.mark.filterwarnings("ignore:(invalid value|overflow|divide):RuntimeWarning")
 
 f64 = torch.float64
@@ -72,7 +73,7 @@ small_cases = pytest.mark.parametrize("name", SMALL)
 
 @pytest.mark.parametrize("name", KERNELS)
 def test_accuracy_rule(name, device):
-    # The more numbers there are, the fewer draws measure their rounding.
+    # With more numbers, fewer draws are needed to measure rounding.
     few = ("one point", "one pixel", "one token,", "many points")
     draws = 8 if any(kind in name for kind in few) else 2
     assert_accurate(KERNELS[name], device, draws)
@@ -88,7 +89,7 @@ def test_two_runs_give_the_same_bits(name, device):
 def test_strides_do_not_matter(name, device):
     made = SMALL[name]().to(device)
     turned = {name: elsewhere(t, "turned") for name, t in made.inputs.items()}
-    tolerance = 1e-6 if "weight" in turned else 0  # torch's products depend on strides
+    tolerance = 1e-6 if "weight" in turned else 0  # torch's matrix products depend on strides
     assert_equal_results(results(made.replace(**turned)), results(made), tolerance)
 
 
@@ -116,10 +117,10 @@ def test_types_of_16_bits_are_float32_rounded_once(name, dtype, device):
     first = next(iter(wide.inputs))
     narrow = wide.replace(**{first: wide.inputs[first].to(dtype)})
     wide = wide.replace(**{first: narrow.inputs[first].float()})
-    with mock.patch.object(_library, "has_kernels", return_value=True):  # the interpreter's, too
+    with mock.patch.object(_library, "has_kernels", return_value=True):  # also in the interpreter
         ours, expected = results(narrow), results(wide)
     assert ours["out"].dtype == ours[first].dtype == dtype
-    # The interpreter cuts off the digits of bfloat16 that hardware rounds.
+    # The interpreter truncates to bfloat16, where hardware rounds.
     for key, want in expected.items():
         eps = torch.finfo(dtype).eps if key == "out" else 0.02
         size = want.abs().max().item()
@@ -130,7 +131,7 @@ def test_types_of_16_bits_are_float32_rounded_once(name, dtype, device):
 
 
 def wide_range(*shape):
-    """Numbers that cover 40 binary digits."""
+    """Random numbers over 40 powers of two."""
     return torch.randn(shape) * 2.0 ** torch.randint(-40, 0, shape)
 
 
@@ -160,7 +161,7 @@ def test_gradients_do_not_depend_on_any_order(name, device):
 
 @pytest.fixture
 def sampled(device):
-    """An image of a batch of two, samples of it, and a random gradient of them."""
+    """A batch of two images, their samples, a random gradient of the samples, and the case."""
     case = sampling(rows=2, samples=(2, 4), shared=True).to(device)
     leaf = case.inputs["image"].requires_grad_()
     out = case.run(**case.inputs)
@@ -176,13 +177,13 @@ def test_gradients_of_any_size(size, sampled):
     with use_reference():
         wide = exact.run(**exact.inputs)
     (want,) = torch.autograd.grad(wide, exact.inputs["image"], (grad * size).cpu().double())
-    # The smallest numbers of all have few digits.
+    # Subnormal numbers have few digits.
     atol = 1e-6 * size + 1.5e-45
     torch.testing.assert_close(found.cpu(), want.float(), rtol=1e-5, atol=atol)
 
 
 def test_images_of_a_batch_do_not_matter_to_each_other(sampled):
-    """A gradient that is tiny beside another image's, or NaN there, is as exact as alone."""
+    """A gradient stays exact if another image's gradient is far larger or is not finite."""
     leaf, out, grad, _ = sampled
     (both,) = torch.autograd.grad(out, leaf, grad, retain_graph=True)
     for factor in (1e-15, math.nan, math.inf):
@@ -191,7 +192,7 @@ def test_images_of_a_batch_do_not_matter_to_each_other(sampled):
         assert torch.equal(found[1], both[1])
         if math.isfinite(factor):
             torch.testing.assert_close(found[0], both[0] * factor, rtol=1e-5, atol=1e-21)
-        else:  # it is not hidden
+        else:  # the bad image's own gradient shows it
             assert found[0].isnan().all()
 
 
@@ -239,9 +240,9 @@ def test_attention_at_extreme_values(size, device):
         case = attention(2, 8, 4, 1, 32, (4, 4), 2, shift=(2, 0))
         qkv = case.inputs["qkv"]
         if size > 1:
-            # Pairs of keys between which a query's logits differ by about 1. Else almost every
-            # probability is exactly 0 or 1, and the largest error is that of the few queries whose
-            # two largest logits happen to be close: it depends on the draw and on the CPU.
+            # Make pairs of keys for which a query's logits differ by about 1. Otherwise almost
+            # every probability is exactly 0 or 1. Then the largest error comes from the few queries
+            # whose two largest logits happen to be close, and depends on the draw and on the CPU.
             keys = qkv[:, ::2, :, 1]
             qkv[:, 1::2, :, 1] = keys + torch.randn_like(keys) / size**2
         return case.replace(qkv=qkv * size)
@@ -251,7 +252,7 @@ def test_attention_at_extreme_values(size, device):
 
 @pytest.mark.parametrize("bias_rows", [1, 2])
 def test_several_windows_a_program(bias_rows, device, monkeypatch):
-    # As in large batches: here three of four windows.
+    # With fewer programs, each handles several windows as in large batches, here three of four.
     monkeypatch.setitem(triton.launcher("window_attention").__globals__, "PROGRAMS", 2)
     assert_accurate(lambda: attention(2, 2, 6, 1, 4, (1, 3), bias_rows, shift=(0, 1)), device)
 
@@ -270,6 +271,6 @@ def test_a_bad_token_spoils_only_its_window(bad, window, device):
 @pytest.mark.parametrize("bad", [math.nan, math.inf])
 def test_a_bad_query_and_key_spoil_nothing_beyond_the_seam(bad, device):
     case = attention(1, 4, 4, 1, 4, (2, 4), shift=(1, 0))
-    case.inputs["qkv"][0, 0, 1, :2] = bad  # in the window of the rings 3 and 0, apart by the seam
+    case.inputs["qkv"][0, 0, 1, :2] = bad  # the seam divides this window, between rings 3 and 0
     out = case.run(**case.to(device).inputs)
     assert out[0, 1:].isfinite().all() and not out[0, 0].isfinite().all()

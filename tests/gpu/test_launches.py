@@ -1,4 +1,4 @@
-"""How many kernels the operators launch with Triton: counted on "meta", where none runs."""
+"""The number of kernels that the operators launch, counted on "meta", where no kernel runs."""
 
 from unittest import mock
 
@@ -16,7 +16,7 @@ def meta(*shape, dtype=torch.float32):
 
 
 def sampling(dtype=torch.float32, **options):
-    """The arguments of darswin_a_small's sampling: 64×64, S = 10."""
+    """The arguments of darswin_a_small's sampling, for 64×64 px and S = 10."""
     given = dict(
         image=meta(2, 3, 64, 64, dtype=dtype), radii=meta(2, 160), azimuths=meta(640),
         center=meta(2, 2), affine=None, offsets=None, jitter=0.0, seed=0, samples=(10, 10),
@@ -43,7 +43,7 @@ LAUNCHES = {
                   ["_forward", "aten::mm"]),
     "embedding with bias": ("polar_embed", (*sampling(**GENERAL), meta(96, 300), meta(96)),
                             ["_forward", "aten::addmm"]),
-    "the layer's gradient": (  # of samples made again
+    "the layer's gradient": (  # backward computes the samples again
         "polar_embed_backward", (*sampling(), meta(96, 300), TOKENS, False, False, False, True),
         ["_forward", "aten::mm", "aten::sum.dim_IntList"],
     ),

@@ -1,4 +1,4 @@
-"""Whole models on a CUDA device, as they are, compiled and as CUDA graphs. `make test-gpu`."""
+"""Whole models on a CUDA device: eager, compiled and as CUDA graphs. `make test-gpu` runs them."""
 
 import copy
 
@@ -18,7 +18,7 @@ def cuda(device):
 
 
 def make(name, device):
-    """A model in eval mode, pictures and their lens, on the device."""
+    """A model in eval mode, pictures and their lens, all on the device."""
     model = create_model(name, num_classes=7).to(device).eval()
     images = torch.randn(3, 3, 64, 64, device=device)
     return model, images, lens.Spherical.from_fov(xi=0.5, fov=2.9, radius=32).to(device)
@@ -53,7 +53,7 @@ def test_compiled(mode, cuda):
     compiled = torch.compile(model, mode=mode, dynamic=False)
     with torch.no_grad():
         expected = model(images, view)
-        for _ in range(3):  # a graph is recorded at the second call, and runs from the third on
+        for _ in range(3):  # the second call records the graph, and the third call replays it
             torch.testing.assert_close(compiled(images, view), expected, rtol=1e-3, atol=1e-4)
 
 
