@@ -88,9 +88,9 @@ def checked_sampling(
     check_tensor("azimuths", azimuths, real, "(A·S_φ,)", (None,), like=image)
     if azimuths.requires_grad and torch.is_grad_enabled() and not _library.reference_in_use():
         raise NotImplementedError(
-            "azimuths require a gradient, which only the reference has: turn the grid with affine "
-            "or move its points with offsets, which have gradients, or run within "
-            "darswin.ops.use_reference()"
+            "azimuths require a gradient, which only the reference computes: run within "
+            "darswin.ops.use_reference(), or turn the grid with affine or move its points with "
+            "offsets, which have gradients"
         )
     form = "(B or 1, 2) = ({} or 1, 2)"
     check_tensor("center", center, real, form, (batch, 2), (1, 2), like=image)

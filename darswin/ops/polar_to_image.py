@@ -80,7 +80,7 @@ def polar_to_image(
         raise ValueError(f"x must have rings and sectors, got {tuple(x.shape)}")
     real = torch.float64 if x.dtype == torch.float64 else torch.float32
     if (center is None) == (points is None) or (points is not None and affine is not None):
-        raise ValueError("polar_to_image takes center, and affine if need be, or else points")
+        raise ValueError("polar_to_image needs either center (with an optional affine) or points")
     for name, tensor, form, *shape in (
         ("radii", radii, "(B or 1, R) = ({} or 1, {})", rings),
         ("center", center, "(B or 1, 2) = ({} or 1, {})", 2),

@@ -117,7 +117,7 @@ WRONG = {
         (dict(radii=torch.tensor([[0.5, math.nan]])), ValueError, "finite"),
         (dict(radii=torch.tensor([[0.5, math.inf]])), ValueError, "finite"),
         (dict(center=None), ValueError, "takes center"),
-        (dict(points=ones(1, 4, 5, 2)), ValueError, "or else points"),
+        (dict(points=ones(1, 4, 5, 2)), ValueError, "either center"),
         (dict(center=None, affine=ones(1, 2, 2), points=ones(1, 4, 5, 2)), ValueError, "or else"),
         (dict(center=None, points=ones(1, 4, 4, 2)), ValueError, r"\(1 or 1, 4, 5, 2\)"),
         (dict(affine=ones(1, 2, 3)), ValueError, "affine must have shape"),
