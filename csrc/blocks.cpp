@@ -44,8 +44,7 @@ void multiply(const float* x, int64_t rows, int64_t depth, const Tensor& packed,
   }
 }
 
-// Writes the layer norm of the rows of x to `out`. The parameters are its weight and its bias, (2,
-// D).
+// Writes the layer norm of the rows of x to `out`. `parameters` is its weight and its bias, (2, D).
 void normalize(const float* x, int64_t rows, int64_t dim, const Tensor& parameters, double eps,
                float* out) {
   // Without a second summand, the kernel only reads x.

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from darswin.bench import timing
 from darswin.deploy.optimize import optimize
-from darswin.deploy.packed import packed
+from darswin.deploy.packed import onednn_linear, packed
 from darswin.deploy.quantize import quantize_model
 from darswin.layers.embed import PolarPatchEmbed
 from darswin.layers.linear import Linear, best_seconds, onednn_lack
@@ -135,9 +135,7 @@ def _libraries(layer: Any, dtype: torch.dtype) -> dict[str, Callable[[Tensor], T
     bias = None if layer.bias is None else layer.bias.detach().to(dtype)
     libraries = {"darswin": packed(layer, dtype), "torch": lambda x: F.linear(x, weight, bias)}
     if onednn_lack(dtype) is None:
-        of_onednn = torch.ops.mkldnn._reorder_linear_weight(weight)
-        product = torch.ops.mkldnn._linear_pointwise.default
-        libraries["onednn"] = lambda x: product(x, of_onednn, bias, "none", [], "")
+        libraries["onednn"] = onednn_linear(weight, bias)
     return libraries
 
 

@@ -40,11 +40,10 @@ class PackedLinear:
     def __init__(self, linear: object, dtype: torch.dtype, *, gelu: bool = False):
         if not isinstance(linear, nn.Linear):
             raise ValueError(f"this layer must be a linear one, got {type(linear).__name__}")
-        self.in_features, self.out_features = linear.in_features, linear.out_features
         self._product: Callable[[Tensor], Tensor]
         if dtype == torch.float32:
-            weights = packed_weights(linear)
-            self._product = lambda x: _LINEAR(x, weights, self.out_features, gelu)
+            weights, columns = packed_weights(linear), linear.out_features
+            self._product = lambda x: _LINEAR(x, weights, columns, gelu)
             return
         # Tensors that are no parameters: in oneDNN's layout they can be neither moved nor saved.
         weight, bias = (
@@ -52,10 +51,7 @@ class PackedLinear:
             for t in (linear.weight, linear.bias)
         )
         if onednn_lack(dtype) is None:
-            weight = torch.ops.mkldnn._reorder_linear_weight(weight)
-            product = torch.ops.mkldnn._linear_pointwise.default
-            after: tuple = ("gelu", [], "none") if gelu else ("none", [], "")
-            self._product = lambda x: product(x, weight, bias, *after)
+            self._product = onednn_linear(weight, bias, gelu=gelu)
         elif gelu:
             self._product = lambda x: F.gelu(F.linear(x, weight, bias))
         else:
@@ -64,6 +60,16 @@ class PackedLinear:
     def __call__(self, x: Tensor) -> Tensor:
         """(..., D) → (..., D')."""
         return self._product(x)
+
+
+def onednn_linear(
+    weight: Tensor | None, bias: Tensor | None, *, gelu: bool = False
+) -> Callable[[Tensor], Tensor]:
+    """A linear layer by oneDNN, which keeps the weight in its own layout."""
+    packed = torch.ops.mkldnn._reorder_linear_weight(weight)
+    product = torch.ops.mkldnn._linear_pointwise.default
+    after: tuple = ("gelu", [], "none") if gelu else ("none", [], "")
+    return lambda x: product(x, packed, bias, *after)
 
 
 def packed_weights(linear: nn.Linear) -> Tensor:
@@ -88,7 +94,7 @@ def packed_merging(norm: Any, reduction: nn.Linear) -> Callable[[Tensor], Tensor
 
 
 class PackedBlocks:
-    """The blocks of a stage in float32, as one operator: `Stage.run_blocks`."""
+    """The blocks of a stage in float32, as one operator. It replaces `Stage._run`."""
 
     def __init__(self, blocks: Sequence[Any]):
         self._parameters: list[Tensor] = []
@@ -121,7 +127,7 @@ class PackedQuantizedLinear:
     """
 
     def __init__(self, layer: QuantizedLinear, gelu: Quantization | None = None):
-        self.in_features, self.out_features = layer.in_features, layer.out_features
+        self.out_features = layer.out_features
         self.activation = layer.activation
         weight = torch.ops.onednn.qlinear_prepack(layer.weight.cpu(), None)
         zero_points = torch.zeros(self.out_features, dtype=torch.int64)
