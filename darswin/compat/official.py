@@ -120,9 +120,13 @@ class OfficialDarSwin(DarSwin):
         rings = [plan.map_size[0] for plan in self.plans]
         return Prepared(grid, [(last * _inclusive(count, lens.theta_max),) for count in rings])
 
-    def embed(self, images: Tensor, points: PolarGrid) -> Tensor:
-        # In the released code x points down and y to the right.
-        return super().embed(images.transpose(2, 3), points)
+    # In the released code x points down and y to the right.
+
+    def embed(self, images: Tensor, points: PolarGrid | None) -> Tensor:
+        return super().embed(images if points is None else images.transpose(2, 3), points)
+
+    def _sample(self, images: Tensor, prepared: Prepared) -> Tensor:
+        return super()._sample(images.transpose(2, 3), prepared)
 
 
 def _with_shift(plan: StagePlan, window: Pair) -> StagePlan:

@@ -174,6 +174,8 @@ def _pack(module: nn.Module, dtype: torch.dtype) -> None:
             norm = packed_norm(embed.norm, dtype)
             _replace(embed, norm=nn.Identity())
         module.patch_embed = InDtype(embed, dtype, norm)
+        if isinstance(embed, PolarPatchEmbed):
+            module.patch_embed.sample = embed.sample  # for `Model.sample`
         if isinstance(module.head, nn.Linear):  # else an identity
             _replace(module, head=PackedLinear(module.head, dtype))
     elif isinstance(module, Stage):

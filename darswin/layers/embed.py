@@ -46,9 +46,14 @@ class PolarPatchEmbed(nn.Module):
         self.proj = Linear(spec.samples[0] * spec.samples[1] * in_chans, embed_dim)
         self.norm = nn.LayerNorm(embed_dim)
 
-    def forward(self, images: Tensor, grid: PolarGrid) -> Tensor:
-        """Images (B, C, H, W), uint8 or of the weights' dtype → (B, R, A, D)."""
+    def forward(self, images: Tensor, grid: PolarGrid | None) -> Tensor:
+        """Images (B, C, H, W), uint8 or of the weights' dtype → (B, R, A, D).
+
+        Without a grid, the images are samples (B, R, A, S_r·S_φ·C) of any floating-point dtype.
+        """
         weight, bias = self.proj.weight, self.proj.bias
+        if grid is None:
+            return self.norm(self.proj(images.to(weight.dtype)))
         check_dtype(images, weight.dtype)
         tokens = polar_embed(**self.sample.arguments(images, grid), weight=weight, bias=bias)
         if weight.dtype == torch.bfloat16:

@@ -50,7 +50,9 @@ class Model(nn.Module):
 
     A call checks the images, computes `prepare(lens, size)`, and runs the network on both. If your
     lens stays the same, call `prepare` once and then `run(images, prepared)` for each batch: the
-    results are the same. A subclass defines `_prepare` and `_run`.
+    results are the same. `run_sampled` starts later, at the result of `sample`: pixels that were
+    sampled elsewhere, such as on a camera. A subclass defines `_prepare`, `_run`, `_sample` and
+    `_run_sampled`.
 
     Attributes:
         in_chans: C, the number of channels of the images.
@@ -103,6 +105,14 @@ class Model(nn.Module):
         """The result of `run`, from images that were checked."""
         raise NotImplementedError
 
+    def _sample(self, images: Tensor, prepared: Any) -> Tensor:
+        """The result of `sample`, from images that were checked."""
+        raise NotImplementedError
+
+    def _run_sampled(self, sampled: Tensor, prepared: Any, images: Tensor | None) -> Any:
+        """The result of `run_sampled`, from pixels and images that were checked."""
+        raise NotImplementedError
+
     def forward(self, images: Tensor, lens: Lens | None = None) -> Any:
         """Images (B, C, H, W) and their lenses (B or 1) → the model's result."""
         return self._run(*self._checked_and_prepared(images, lens))
@@ -120,6 +130,37 @@ class Model(nn.Module):
         """
         return self._run(self._checked(images), prepared)
 
+    def sample(self, images: Tensor, prepared: Any) -> Tensor:
+        """The pixels that the network reads, in floating point; uint8 images are normalized.
+
+        They are polar samples (B, R, A, S_r·S_φ·C) in the inner order (S_r, S_φ, C) for a DarSwin
+        encoder. For other models they are the view (B, C, H', W'), or the images themselves.
+
+        Args:
+            images, prepared: as in `run`.
+
+        Raises:
+            TypeError, ValueError: as in `run`.
+        """
+        return self._sample(self._checked(images), prepared)
+
+    def run_sampled(self, sampled: Tensor, prepared: Any, images: Tensor | None = None) -> Any:
+        """The result of `run`, up to rounding, from pixels that were sampled already.
+
+        Args:
+            sampled: the result of `sample`, in eval mode.
+            prepared: as in `run`.
+            images: as in `run`. Only a `Unet` with the view "polar" and a skip_width above 0 reads
+                them.
+
+        Raises:
+            TypeError: an argument is no tensor, has an unsupported dtype, or is missing.
+            ValueError: an argument has a wrong shape, or the number of lenses is neither B nor 1.
+        """
+        sampled = self._checked_sampled(sampled, prepared)
+        images = None if images is None else self._checked(images)
+        return self._run_sampled(sampled, prepared, images)
+
     def _checked_and_prepared(self, images: Tensor, lens: Lens | None) -> tuple[Tensor, Any]:
         images = self._checked(images)
         height, width = images.shape[2:]
@@ -136,6 +177,10 @@ class Model(nn.Module):
                 f"got {tuple(images.shape[2:])}"
             )
         return images
+
+    def _checked_sampled(self, sampled: Tensor, prepared: Any) -> Tensor:
+        """The pixels of `run_sampled`, after a check of their shape."""
+        return self._checked(sampled)
 
     def _floating(self, images: Tensor) -> Tensor:
         """The images in floating point: uint8 images are normalized, others stay as they are."""

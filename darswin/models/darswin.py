@@ -15,6 +15,8 @@ from darswin.lens import Lens
 from darswin.models.encoder import Encoder, Prepared
 from darswin.models.registry import Presets, register_model
 from darswin.models.stages import Pair, StagePlan, plan_stages
+from darswin.ops import polar_sample
+from darswin.ops.checks import check_tensor
 
 # Models of the same size have the same number of tokens.
 PRESETS: Presets = dict(micro=dict(samples=(6, 6)), nano=dict(rings=8, sectors=32, samples=(4, 4)))
@@ -108,8 +110,24 @@ class DarSwin(Encoder):
         rings = [plan.map_size[0] for plan in self.plans]
         return Prepared(grid, [(ring_angles(lens, grid, r, self.position_bias),) for r in rings])
 
-    def embed(self, images: Tensor, points: PolarGrid) -> Tensor:
+    def embed(self, images: Tensor, points: PolarGrid | None) -> Tensor:
+        if points is None:
+            return self.patch_embed(images, None)
         check_count(points.radii.shape[0], images)
         if images.dtype == torch.uint8 and next(self.parameters()).dtype == torch.float64:
             images = self._floating(images)  # the operator would normalize in float32
         return self.patch_embed(images, points)
+
+    def _sample(self, images: Tensor, prepared: Prepared) -> Tensor:
+        check_count(prepared.points.radii.shape[0], images)
+        return polar_sample(**self.patch_embed.sample.arguments(images, prepared.points))
+
+    def _checked_sampled(self, sampled: Tensor, prepared: Prepared) -> Tensor:
+        values = self.spec.samples[0] * self.spec.samples[1] * self.in_chans
+        shape = (None, self.spec.rings, self.spec.sectors, values)
+        check_tensor(
+            "sampled", sampled, (torch.float32, torch.float64, torch.bfloat16),
+            "(B, R, A, S_r·S_φ·C) = (any, {}, {}, {})", shape,
+        )  # fmt: skip
+        check_count(prepared.points.radii.shape[0], sampled)
+        return sampled

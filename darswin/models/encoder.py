@@ -7,7 +7,6 @@ from typing import Any, Literal, NamedTuple
 from torch import Tensor, nn
 
 from darswin.layers.linear import Linear
-from darswin.layers.polar import PolarGrid
 from darswin.layers.transformer import Block, PatchMerging, Stage
 from darswin.lens import Lens
 from darswin.models.base import FeatureInfo, Model, feature_info, init_weights, take_indices
@@ -20,9 +19,9 @@ Format = Literal["NHWC", "NCHW"]
 class Prepared(NamedTuple):
     """The result of an encoder's `prepare`."""
 
-    # The points at which the images are sampled: a polar grid, or pixels (N, H, W, 2). None means
-    # that the encoder takes the images as they are.
-    points: PolarGrid | Tensor | None
+    # The points at which the images are sampled: a `PolarGrid`, or pixels (N, H, W, 2). None means
+    # that the encoder takes the images as they are, or that they are sampled already.
+    points: Any
     # For each stage, the tensors from which it computes its position biases.
     positions: Sequence[Sequence[Tensor | None]]
 
@@ -30,9 +29,9 @@ class Prepared(NamedTuple):
 class Encoder(Model):
     """The base class of the classifiers.
 
-    A subclass makes `patch_embed` and then calls `_finish`. It defines `attention`, `embed` and, if
-    it uses its lens, `_prepare`. Maps are channels last: polar maps have the shape (B, R, A, D),
-    other maps (B, H, W, D).
+    A subclass makes `patch_embed` and then calls `_finish`. It defines `attention`, `embed`,
+    `_sample` and, if it uses its lens, `_prepare`. Maps are channels last: polar maps have the
+    shape (B, R, A, D), other maps (B, H, W, D).
 
     Args:
         num_classes: the number of classes; 0 leaves out the head.
@@ -158,7 +157,10 @@ class Encoder(Model):
         return Prepared(None, [()] * len(self.stages))
 
     def embed(self, images: Tensor, points: Any) -> Tensor:
-        """Images (B, C, H, W), sampled at the `points` of `prepare` → the first map."""
+        """Images (B, C, H, W), sampled at the `points` of `prepare` → the first map.
+
+        Without points, the images are the result of `sample`.
+        """
         raise NotImplementedError
 
     def maps(self, images: Tensor, prepared: Prepared, count: int | None = None) -> list[Tensor]:
@@ -172,6 +174,9 @@ class Encoder(Model):
 
     def _run(self, images: Tensor, prepared: Prepared) -> Tensor:
         return self.forward_head(self.norm(self.maps(images, prepared)[-1]))
+
+    def _run_sampled(self, sampled: Tensor, prepared: Prepared, images: Tensor | None) -> Any:
+        return self._run(sampled, prepared._replace(points=None))
 
     def forward_features(self, images: Tensor, lens: Lens | None = None) -> Tensor:
         """Images (B, C, H, W) and their lenses (B or 1) → the last map after the norm."""
@@ -297,6 +302,15 @@ class FeatureMaps(Model):
 
     def _run(self, images: Tensor, prepared: Prepared) -> list[Tensor]:
         return _chosen(self.encoder.maps(images, prepared), self.out_indices, self.output_fmt)
+
+    def _sample(self, images: Tensor, prepared: Prepared) -> Tensor:
+        return self.encoder._sample(images, prepared)
+
+    def _run_sampled(self, sampled: Tensor, prepared: Prepared, images: Tensor | None) -> Any:
+        return self._run(sampled, prepared._replace(points=None))
+
+    def _checked_sampled(self, sampled: Tensor, prepared: Prepared) -> Tensor:
+        return self.encoder._checked_sampled(sampled, prepared)
 
 
 def _check_format(output_fmt: str) -> None:

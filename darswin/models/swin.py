@@ -69,5 +69,10 @@ class Swin(Encoder):
         return super()._prepare(lens, size)._replace(points=self.view.image_points(lens, size))
 
     def embed(self, images: Tensor, points: Tensor | None) -> Tensor:
-        seen = self.view.to_view(self._floating(images), points)
-        return self.patch_embed(seen.permute(0, 2, 3, 1))
+        return self.patch_embed(self._to_view(images, points).permute(0, 2, 3, 1))
+
+    def _sample(self, images: Tensor, prepared: Prepared) -> Tensor:
+        return self._to_view(images, prepared.points)
+
+    def _to_view(self, images: Tensor, points: Tensor | None) -> Tensor:
+        return self.view.to_view(self._floating(images), points)

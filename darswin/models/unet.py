@@ -107,10 +107,11 @@ class PixelHead(nn.Module):
             self.out = nn.Conv2d(skip_width, channels, 1, bias=False)
             nn.init.trunc_normal_(self.out.weight, std=0.02)
 
-    def refine(self, coarse: Tensor, images: Tensor) -> Tensor:
+    def refine(self, coarse: Tensor, images: Tensor | None) -> Tensor:
         """The projected map at the pixels, (B, K, H, W), and the images (B, C, H, W) → logits."""
         if not self.skip_width:
             return coarse
+        assert images is not None
         # With channels last, as in `coarse`, convolutions of few channels take half the time.
         skip = self.stem(images.contiguous(memory_format=torch.channels_last)).relu()
         skip = self.mix(torch.cat((skip, coarse.to(skip.dtype)), 1)).relu()
@@ -150,6 +151,7 @@ class UnetPrepared(NamedTuple):
     positions: Sequence[Sequence[Tensor | None]]  # of the decoder's stages
     image_points: Tensor | None  # see `PlainView.image_points`
     view_points: Any  # see `PlainView.view_points`
+    size: Pair  # (H, W) of the images
 
 
 @register_model("darswin_unet_a", variant="A", presets=_POLAR)
@@ -305,18 +307,40 @@ class Unet(Model):
             encoder.positions[:-1],
             self.view.image_points(lens, size),
             self.view.view_points(lens, size),
+            size,
         )
 
     def _run(self, images: Tensor, prepared: UnetPrepared) -> Tensor:
         seen = self.view.to_view(self._floating(images), prepared.image_points)
-        maps = self.encoder.maps(seen, prepared.encoder)
+        return self._decode(self.encoder.maps(seen, prepared.encoder), seen, prepared)
+
+    def _sample(self, images: Tensor, prepared: UnetPrepared) -> Tensor:
+        if isinstance(self.encoder, DarSwin):
+            return self.encoder._sample(images, prepared.encoder)
+        return self.view.to_view(self._floating(images), prepared.image_points)
+
+    def _run_sampled(
+        self, sampled: Tensor, prepared: UnetPrepared, images: Tensor | None
+    ) -> Tensor:
+        seen: Tensor | None = sampled
+        if isinstance(self.encoder, DarSwin):
+            seen = None if images is None else self._floating(images)
+            if seen is None and self.head.skip_width:
+                raise TypeError("images are missing: a skip_width above 0 reads their pixels")
+        maps = self.encoder.maps(sampled, prepared.encoder._replace(points=None))
+        return self._decode(maps, seen, prepared)
+
+    def _checked_sampled(self, sampled: Tensor, prepared: UnetPrepared) -> Tensor:
+        return self.encoder._checked_sampled(sampled, prepared.encoder)
+
+    def _decode(self, maps: list[Tensor], seen: Tensor | None, prepared: UnetPrepared) -> Tensor:
+        """The maps of the encoder and the view → the result."""
         maps[-1] = self.encoder.norm(maps[-1])
         if self.places:
             maps = self._with_places(maps, prepared.view_points)
         head = self.head
         x = head.proj(self.decoder(maps, prepared.positions))
-        height, width = seen.shape[2:]
-        coarse = self.view.to_pixels(x, prepared.view_points, (height, width))
+        coarse = self.view.to_pixels(x, prepared.view_points, prepared.size)
         logits = head.refine(coarse, seen)
         return head.finish(self.view.to_images(logits, prepared.view_points))
 

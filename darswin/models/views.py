@@ -213,7 +213,15 @@ class LensAdapter(Model):
             raise TypeError(f"images must be in floating point, got {images.dtype}")
         return check_images(images)
 
-    def _run(self, images: Tensor, prepared: tuple[Tensor, Tensor]) -> Any:
+    def _sample(self, images: Tensor, prepared: tuple[Tensor, Tensor]) -> Tensor:
+        return self.view.to_view(images, prepared[0])
+
+    def _run_sampled(
+        self, sampled: Tensor, prepared: tuple[Tensor, Tensor], images: Tensor | None
+    ) -> Any:
+        return self._run(sampled, (None, prepared[1]))
+
+    def _run(self, images: Tensor, prepared: tuple[Tensor | None, Tensor]) -> Any:
         image_points, view_points = prepared
 
         def to_images(out: Any) -> Any:

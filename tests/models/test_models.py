@@ -132,6 +132,42 @@ def test_one_preparation_serves_many_runs_and_the_reference_agrees(case):
             assert_close(out, model(planes, lens), 1e-3)
 
 
+@torch.no_grad()
+@cases
+def test_pixels_that_were_sampled_already_give_the_same_results(case):
+    model, images, lenses = made(case, mean=MEAN, std=STD)
+    size = tuple(images.shape[2:])
+    frames = torch.randint(256, (2, *size, 3), dtype=torch.uint8)
+    for net in (model, optimize(model)):
+        for lens in (lenses, lenses[:1]):
+            prepared = net.prepare(lens, size)
+            for pixels in (images, frames):
+                sampled = net.sample(pixels, prepared)
+                assert sampled.dtype == torch.float32
+                assert_close(net.run_sampled(sampled, prepared, pixels), net.run(pixels, prepared))
+    if "darswin" in case and "unet" not in case:
+        assert sampled.shape == (2, 8, 32, 4 * 4 * 3)
+        expected, double = model.run_sampled(sampled, prepared), copy.deepcopy(model).double()
+        got = double.run_sampled(sampled, double.prepare(lens.to(torch.float64), size))
+        assert_close(tensors_of(got), [t.double() for t in tensors_of(expected)])
+
+
+def test_errors_of_pixels_that_were_sampled_already():
+    model, images, lenses = made("darswin_a_nano")
+    prepared = model.prepare(lenses, (32, 32))
+    sampled = model.sample(images, prepared)
+    with pytest.raises(ValueError, match=r"sampled must have shape .* = \(any, 8, 32, 48\), got"):
+        model.run_sampled(sampled[..., :-1], prepared)
+    with pytest.raises(TypeError, match=r"sampled must be .*, got torch.uint8"):
+        model.run_sampled(sampled.byte(), prepared)
+    with pytest.raises(ValueError, match="one for each of the 1 images, got 2"):
+        model.run_sampled(sampled[:1], prepared)
+    dense, images, lenses = made("darswin_unet_a_nano")
+    prepared = dense.prepare(lenses, (images.shape[2:]))
+    with pytest.raises(TypeError, match="images are missing"):
+        dense.run_sampled(dense.sample(images, prepared), prepared)
+
+
 OPTIONS = [
     ("darswin_a_nano", dict(variant="RA", rings=8, sectors=16)),
     ("darswin_a_nano", dict(position_bias="angular")),

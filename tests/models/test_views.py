@@ -87,6 +87,10 @@ def test_outputs_of_any_resolution_come_back_and_others_pass_through():
     out = adapter.run(images, prepared)
     assert [m.shape for m in out["masks"]] == [(2, 5, 48, 40), (2, 6, 48, 40)]
     assert out["label"].shape == (2, 6)
+    sampled = adapter.sample(images, prepared)
+    assert sampled.shape == (2, 3, 32, 32)
+    again = adapter.run_sampled(sampled, prepared)
+    assert all(torch.equal(a, b) for a, b in zip(again["masks"], out["masks"], strict=True))
     again = adapter(images, LENSES)
     assert all(torch.equal(a, b) for a, b in zip(again["masks"], out["masks"], strict=True))
     one = adapter(images, LENSES[:1])
