@@ -184,4 +184,4 @@ aarch64: $(STAMP)  ## cross-compile for aarch64; needs g++-aarch64-linux-gnu and
 	  -DDARSWIN_OUTPUT_DIR=$(CURDIR)/build/aarch64 && cmake --build build/cmake-aarch64
 
 clean:  ## remove all build results
-	rm -rf build dist darswin.egg-info darswin/libdarswin.so
+	rm -rf build dist darswin.egg-info darswin/libdarswin.so darswin/_frames.*.so

@@ -1,11 +1,13 @@
-"""Builds libdarswin.so by calling CMake, which alone knows the sources and the flags."""
+"""Builds the compiled modules by calling CMake, which alone knows the sources and the flags."""
 
 import importlib.util
 import os
 import shutil
 import subprocess
+import sys
 from pathlib import Path
 
+import pybind11
 from setuptools import Extension, setup
 from setuptools.command.bdist_wheel import bdist_wheel
 from setuptools.command.build_ext import build_ext
@@ -13,24 +15,39 @@ from setuptools.command.build_ext import build_ext
 ROOT = Path(__file__).resolve().parent
 
 
+def pythons() -> str:
+    """CMake's list DARSWIN_PYTHONS: this Python, and the others that DARSWIN_PYTHONS names."""
+    code = (
+        "import sysconfig; print(sysconfig.get_config_var('EXT_SUFFIX'), "
+        "sysconfig.get_path('include'), sep=':')"
+    )
+    commands = [sys.executable, *os.environ.get("DARSWIN_PYTHONS", "").split()]
+    found = [subprocess.check_output([python, "-c", code], text=True) for python in commands]
+    return ";".join(dict.fromkeys(line.strip() for line in found))
+
+
 class CMakeBuild(build_ext):
     def get_ext_filename(self, fullname):
-        return fullname.replace(".", "/") + ".so"
+        if fullname.endswith("libdarswin"):
+            return fullname.replace(".", "/") + ".so"
+        return super().get_ext_filename(fullname)
 
-    def build_extension(self, ext):
+    def build_extensions(self):
         torch = importlib.util.find_spec("torch")
         if torch is None:
             raise SystemExit(
                 "darswin builds against an installed torch>=2.10: install torch first, "
                 "then run pip with --no-build-isolation"
             )
-        output = Path(self.get_ext_fullpath(ext.name)).resolve().parent
+        output = Path(self.get_ext_fullpath("darswin.libdarswin")).resolve().parent
         sanitize = os.environ.get("DARSWIN_SANITIZE", "")
         build = ROOT / "build" / ("cmake-sanitized" if sanitize else "cmake")
         subprocess.check_call(
             ["cmake", "--log-level=NOTICE", "-S", ROOT, "-B", build, "-G", "Ninja",
              f"-DCMAKE_MAKE_PROGRAM={shutil.which('ninja')}",
              f"-DTORCH_DIR={Path(torch.origin).parent}",
+             f"-DPYBIND11_DIR={pybind11.get_include()}",
+             f"-DDARSWIN_PYTHONS={pythons()}",
              f"-DDARSWIN_OUTPUT_DIR={output}",
              f"-DDARSWIN_SANITIZE={sanitize}",
              f"-DDARSWIN_ONLY_TIER={os.environ.get('DARSWIN_ONLY_TIER', '')}"]
@@ -39,13 +56,14 @@ class CMakeBuild(build_ext):
 
 
 class PlatformWheel(bdist_wheel):
-    """The module holds nothing of Python: one wheel of a platform serves every version."""
+    """One wheel of a platform serves every Python: libdarswin.so does not depend on Python, and the
+    wheel has a module darswin._frames for each Python it was built for."""
 
     def get_tag(self):
         return "py3", "none", super().get_tag()[2]
 
 
 setup(
-    ext_modules=[Extension("darswin.libdarswin", sources=[])],
+    ext_modules=[Extension("darswin.libdarswin", []), Extension("darswin._frames", [])],
     cmdclass={"build_ext": CMakeBuild, "bdist_wheel": PlatformWheel},
 )

@@ -13,6 +13,7 @@
 #include <vector>
 
 #include "numbers.h"
+#include "parallel.h"
 
 namespace darswin {
 
@@ -47,6 +48,10 @@ inline Tensor new_tensor(IntHeaderOnlyArrayRef sizes, ScalarType type) {
       torch::stable::detail::to<int32_t>(torch::stable::detail::from(type)),
       aoti_torch_device_type_cpu(), 0, &made));
   return Tensor(made);
+}
+
+inline void ask_for_large_pages(const Tensor& tensor) {
+  ask_for_large_pages(tensor.mutable_data_ptr(), tensor.numel() * tensor.element_size());
 }
 
 // Stands for a gradient that is not wanted: an empty tensor.

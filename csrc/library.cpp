@@ -2,10 +2,12 @@
 // of the module. The drivers register the CPU implementations. Fake kernels and autograd are in
 // darswin/ops.
 #include <torch/csrc/stable/library.h>
+#include <torch/csrc/stable/ops.h>
 
 #include <string>
 
 #include "dispatch.h"
+#include "parallel.h"
 
 // The arguments that polar_sample and polar_embed share. Their order is that of the fields of
 // struct Sampling (polar_call.h) and of darswin.ops._sampling.Sampling.
@@ -53,6 +55,8 @@ STABLE_TORCH_LIBRARY(darswin, m) {
       "int mlp_dim, float eps) -> ()");
   m.def("_transpose_sum(Tensor x) -> (Tensor, Tensor)");
 }
+
+int64_t darswin::num_threads() { return torch::stable::get_num_threads(); }
 
 // Facts about the module, which darswin/ops/_module.py reads.
 #define FACT extern "C" __attribute__((visibility("default")))

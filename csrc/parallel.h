@@ -6,8 +6,6 @@
 #if defined(__linux__)
 #  include <sys/mman.h>
 #endif
-#include <torch/csrc/stable/ops.h>
-#include <torch/csrc/stable/tensor.h>
 
 #include <algorithm>
 #include <cstdint>
@@ -32,9 +30,6 @@ inline void ask_for_large_pages(void* memory, size_t bytes) {
 #else
   (void)memory, (void)bytes;
 #endif
-}
-inline void ask_for_large_pages(const torch::stable::Tensor& tensor) {
-  ask_for_large_pages(tensor.mutable_data_ptr(), tensor.numel() * tensor.element_size());
 }
 
 // Working memory of the calling thread, for the lifetime of this object. It has at least `bytes`
@@ -78,12 +73,15 @@ class ThreadMemory {
   static inline thread_local size_t size = 0;
 };
 
+// The number of threads that torch's settings allow. library.cpp asks torch.
+int64_t num_threads();
+
 // Returns the number of threads that is worth starting for so many microseconds of work. The second
 // thread takes about two microseconds to begin, and more if it has fallen asleep.
 inline int64_t threads_for(double microseconds) {
   constexpr double kLeast = 10;  // microseconds for each thread
   const double most = std::max(microseconds / kLeast, 1.0);
-  const int64_t threads = torch::stable::get_num_threads();
+  const int64_t threads = num_threads();
   return most < static_cast<double>(threads) ? static_cast<int64_t>(most) : threads;
 }
 
@@ -112,7 +110,7 @@ void parallel_ranges(int64_t count, int64_t threads, Body&& body) {
 }
 template <typename Body>
 void parallel_ranges(int64_t count, Body&& body) {
-  parallel_ranges(count, torch::stable::get_num_threads(), std::forward<Body>(body));
+  parallel_ranges(count, num_threads(), std::forward<Body>(body));
 }
 
 // Calls body(begin, end, scratch) in the same way. Each thread gets `bytes` of working memory.
@@ -125,7 +123,7 @@ void run_with_scratch(int64_t count, int64_t threads, int64_t bytes, Body&& body
 }
 template <typename Body>
 void run_with_scratch(int64_t count, int64_t bytes, Body&& body) {
-  run_with_scratch(count, torch::stable::get_num_threads(), bytes, std::forward<Body>(body));
+  run_with_scratch(count, num_threads(), bytes, std::forward<Body>(body));
 }
 
 }  // namespace darswin

@@ -112,6 +112,19 @@ struct PolarEmbedKernels {
 
 namespace {
 
+// Returns the number of values in the kernels' packed image. It is a double, because it may not fit
+// 64 bits.
+inline double packed_values(int64_t height, int64_t width, int64_t channels) {
+  return static_cast<double>(height + 3) * static_cast<double>(width + 3) *
+         static_cast<double>((channels + 3) / 4 * 4);
+}
+
+// Returns whether an image is packed: if its copy takes so few bytes that it stays in the
+// second-level cache, and if it has few pixels for each point.
+inline bool worth_packing(double bytes, double pixels, double points) {
+  return bytes <= 3 << 19 && pixels <= 4 * points;
+}
+
 // The steps by which jitter moves a point from radius i. The radius becomes radii[i] + shift *
 // (radii[above] - radii[below]). A negative shift uses entry 0 of both arrays, other shifts use
 // entry 1. At each end of the row there is only one step.

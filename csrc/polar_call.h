@@ -22,10 +22,6 @@ struct Sampling {
   bool bfloat16;  // the type of the output
 };
 
-// An image is packed if its copy takes at most this many bytes, which stay in the second-level
-// cache, and if it has at most this many pixels for each point.
-constexpr int64_t kPackedBytes = 3 << 19;
-constexpr int64_t kPackedPixelsPerPoint = 4;
 // Up to this size (1 MB of float32), CPUs that are not from Intel read gray images faster by
 // gathers.
 constexpr int64_t kGatheredPixels = 1 << 18;
@@ -129,7 +125,7 @@ struct PolarCall {
   // of large images use all threads. They also limit the memory that a thread needs for the sums of
   // bfloat16 pixels.
   int64_t count_bands() const {
-    const int64_t threads = torch::stable::get_num_threads();
+    const int64_t threads = num_threads();
     int64_t bands = 1;
     if (batch > 0 && batch < 4 * threads) bands = threads / std::gcd(batch, threads);
     if (args.pixel == Pixel::bf16) {
@@ -260,8 +256,7 @@ struct PolarCall {
     const double pixels = static_cast<double>(args.height) * static_cast<double>(args.width);
     const double points =
         static_cast<double>(args.num_radii) * static_cast<double>(args.num_azimuths);
-    args.packed = packed_values() * sizeof(T) <= static_cast<double>(kPackedBytes) &&
-                  pixels <= kPackedPixelsPerPoint * points;
+    args.packed = worth_packing(packed_values() * sizeof(T), pixels, points);
     const bool gray = args.channels == 1;
     const bool possible = current_tier() == Tier::avx512 && !args.packed &&
                           args.pixel == Pixel::f32 && args.image_stride[3] == 1 &&
@@ -270,11 +265,8 @@ struct PolarCall {
     args.gathers = possible && (gathers == Gathers::by_cpu ? faster : gathers == Gathers::always);
   }
 
-  // Returns the number of values in the kernels' packed image. It is a double, because it may not
-  // fit 64 bits.
   double packed_values() const {
-    return static_cast<double>(args.height + 3) * static_cast<double>(args.width + 3) *
-           static_cast<double>((args.channels + 3) / 4 * 4);
+    return darswin::packed_values(args.height, args.width, args.channels);
   }
 
   // Adds up the sums of each row of points into the gradients of radii, center and affine.

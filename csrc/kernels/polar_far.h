@@ -78,6 +78,16 @@ inline void store_sixteen(const V& x, const V& y, const V& z, T* to) {
   store_third<T, 32>(x, y, z, to);
 }
 
+// The same for four samples.
+inline void store_fours(Vector<float, 4> x, Vector<float, 4> y, Vector<float, 4> z, float* to) {
+  const auto xy = __builtin_shufflevector(x, y, 0, 4, 2, 6);
+  const auto yz = __builtin_shufflevector(y, z, 1, 5, 3, 7);
+  const auto zx = __builtin_shufflevector(z, x, 0, 5, 2, 7);
+  store(to, __builtin_shufflevector(xy, zx, 0, 1, 4, 5));
+  store(to + 4, __builtin_shufflevector(yz, xy, 0, 1, 6, 7));
+  store(to + 8, __builtin_shufflevector(zx, yz, 2, 3, 6, 7));
+}
+
 // The output places of a line: sample k goes to to[k * step]. A sample may have fewer than four
 // values. A store of four values may reach beyond it if the next sample of the line follows there,
 // or anywhere if `spare` is true.
@@ -232,12 +242,7 @@ class FarImage {
   template <bool kRow>
   static void store_three(V x, V y, V z, const FarOutput<T>& out) {
     if constexpr (kRow) {
-      const V xy = __builtin_shufflevector(x, y, 0, 4, 2, 6);
-      const V yz = __builtin_shufflevector(y, z, 1, 5, 3, 7);
-      const V zx = __builtin_shufflevector(z, x, 0, 5, 2, 7);
-      store(out.to, __builtin_shufflevector(xy, zx, 0, 1, 4, 5));
-      store(out.to + 4, __builtin_shufflevector(yz, xy, 0, 1, 6, 7));
-      store(out.to + 8, __builtin_shufflevector(zx, yz, 2, 3, 6, 7));
+      store_fours(x, y, z, out.to);
     } else if (out.spare) {
       transpose4(x, y, z, z, out.to, out.step);
     } else {

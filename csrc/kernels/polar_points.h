@@ -25,6 +25,16 @@ constexpr int kBlock = 1024;  // points that are processed at a time
 
 using Masks = Vector<int64_t, kDoubles>;
 
+// Computes the cosines and sines of n angles; n is a multiple of the lanes.
+[[maybe_unused]] void directions(const double* angles, int64_t n, double* cosines, double* sines) {
+  for (int64_t j = 0; j < n; j += kDoubles) {
+    Doubles sin, cos;
+    sin_cos(load<Doubles>(angles + j), &sin, &cos);
+    store(cosines + j, cos);
+    store(sines + j, sin);
+  }
+}
+
 // Philox4x32-10, a counter-based generator. Its words depend only on (key, counter). So any thread
 // can make the jitter of any point, in forward and again in backward. Source: Salmon, Moraes, Dror,
 // Shaw: "Parallel random numbers: as easy as 1, 2, 3", SC 2011.

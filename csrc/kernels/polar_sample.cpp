@@ -132,15 +132,6 @@ int64_t scratch_bytes(const PolarSampleArgs<T>& a, PolarPass pass) {
   return lens_bytes<T>() + row_bytes(a);
 }
 
-void directions(const double* angles, int64_t n, double* cosines, double* sines) {
-  for (int64_t j = 0; j < n; j += kDoubles) {
-    Doubles sin, cos;
-    sin_cos(load<Doubles>(angles + j), &sin, &cos);
-    store(cosines + j, cos);
-    store(sines + j, sin);
-  }
-}
-
 template <typename T>
 constexpr PolarSampleKernels<T> kTable = {.directions = directions,
                                           .scratch = scratch_bytes<T>,

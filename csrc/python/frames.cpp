@@ -1,0 +1,237 @@
+// The Python module darswin._frames: NumPy arrays in, NumPy arrays out. It does not use torch, and
+// OpenMP neither, whose library a system without torch may lack.
+#include "../frames.h"
+
+#include <pybind11/numpy.h>
+#include <pybind11/pybind11.h>
+#include <pybind11/stl.h>
+
+#include <algorithm>
+#include <optional>
+#include <string>
+#include <thread>
+#include <vector>
+
+#include "../dispatch.h"
+
+// glibc 2.34 gave the same function a new version (see portable.cpp).
+#if defined(__GLIBC__) && defined(__x86_64__)
+__asm__(".symver pthread_once, pthread_once@GLIBC_2.2.5");
+#elif defined(__GLIBC__) && defined(__aarch64__)
+__asm__(".symver pthread_once, pthread_once@GLIBC_2.17");
+#endif
+
+namespace py = pybind11;
+
+namespace darswin {
+namespace {
+
+template <typename T>
+using Array = py::array_t<T, py::array::c_style | py::array::forcecast>;
+using Shape = std::vector<py::ssize_t>;
+
+std::string shown(const Shape& shape) {
+  std::string text = "(";
+  for (const py::ssize_t size : shape) text += std::to_string(size) + ", ";
+  return text.substr(0, std::max<size_t>(text.size(), 3) - 2) + ")";
+}
+
+template <typename T>
+std::vector<T> padded(const Array<T>& array) {
+  std::vector<T> values(array.data(), array.data() + array.size());
+  values.resize(values.size() + kFrameSpare);
+  return values;
+}
+
+// Samples frames of one size at the places of one plan. A call changes nothing in the object, so
+// several threads may call it at once.
+class Sampler {
+ public:
+  Sampler(const Array<int16_t>& columns, const Array<int16_t>& rows, const Array<float>& right,
+          const Array<float>& lower, std::pair<int64_t, int64_t> size, std::vector<float> scale,
+          std::vector<float> offset, bool normalize_first, const std::string& output)
+      : shape(columns.shape(), columns.shape() + columns.ndim()),
+        columns(padded(columns)),
+        rows(padded(rows)),
+        right(padded(right)),
+        lower(padded(lower)),
+        height(size.first),
+        width(size.second),
+        scale(std::move(scale)),
+        offset(std::move(offset)),
+        normalize_first(normalize_first) {
+    const int64_t points = columns.size();
+    const bool tokens = output == "tokens", known = tokens || output == "image" || output == "uint8";
+    const bool sizes = height > 0 && width > 0 && height <= INT16_MAX && width <= INT16_MAX;
+    const bool channels = this->scale.size() == 1 || this->scale.size() == 3;
+    if (!known || !sizes || !channels || this->scale.size() != this->offset.size() ||
+        shape.size() != (tokens ? 4 : 2) || rows.size() != points || right.size() != points ||
+        lower.size() != points) {
+      throw py::value_error("the arrays of the plan do not fit together");
+    }
+    kind = tokens             ? FrameOutput::tokens
+           : output == "image" ? FrameOutput::planes
+                               : FrameOutput::bytes;
+    for (int64_t k = 0; k < points; ++k) {
+      const float x = this->right[k], y = this->lower[k];
+      if (!(x >= 0 && x <= 1 && y >= 0 && y <= 1)) {
+        throw py::value_error("the plan has distances outside of [0, 1]");
+      }
+      int16_t &column = this->columns[k], &row = this->rows[k];
+      if (column >= 0 && row >= 0 && column < width - 1 && row < height - 1) continue;
+      border.push_back({k, column, row, x, y});
+      column = row = 0;
+    }
+  }
+
+  py::array operator()(const py::object& given, const std::optional<py::array>& out,
+                       int64_t threads) const {
+    if (!py::isinstance<py::array_t<uint8_t>>(given)) {
+      throw py::type_error(
+          "frame must be a NumPy array of uint8, got " +
+          std::string(py::isinstance<py::array>(given) ? py::str(given.attr("dtype"))
+                                                       : py::str(py::type::of(given))));
+    }
+    const auto frame = py::reinterpret_borrow<py::array>(given);
+    if (threads < 1) throw py::value_error("threads must be at least 1");
+    const Shape sizes(frame.shape(), frame.shape() + frame.ndim());
+    const bool colors = sizes.size() == 3;
+    FrameArgs a{};
+    a.channels = colors ? sizes[2] : 1;
+    if ((sizes.size() != 2 && !colors) || (a.channels != 1 && a.channels != 3)) {
+      throw py::value_error("frame must have shape (H, W), (H, W, 1) or (H, W, 3), got " +
+                            shown(sizes));
+    }
+    if (sizes[0] != height || sizes[1] != width) {
+      throw py::value_error("frame must be of the plan's size, (H, W) = " + shown({height, width}) +
+                            ", got " + shown({sizes[0], sizes[1]}));
+    }
+    if (scale.size() > 1 && a.channels != static_cast<int64_t>(scale.size())) {
+      throw py::value_error("frame must have the plan's " + std::to_string(scale.size()) +
+                            " channels, got " + std::to_string(a.channels));
+    }
+    a.pixels = static_cast<const uint8_t*>(frame.data());
+    a.height = height, a.width = width;
+    // The stride of an axis of size 1 may be any number, and is never used.
+    const auto stride = [&](int axis) { return sizes[axis] > 1 ? frame.strides(axis) : 0; };
+    a.row_stride = stride(0), a.column_stride = stride(1), a.channel_stride = colors ? stride(2) : 0;
+    if ((height - 1) * std::abs(static_cast<double>(a.row_stride)) +
+            (width - 1) * std::abs(static_cast<double>(a.column_stride)) >=
+        INT32_MAX) {
+      throw py::value_error("frame must span less than 2 GB of memory");
+    }
+    float factors[3], shifts[3];
+    for (int c = 0; c < 3; ++c) {
+      factors[c] = scale[scale.size() > 1 ? c : 0], shifts[c] = offset[scale.size() > 1 ? c : 0];
+    }
+    a.scale = factors, a.offset = shifts;
+    a.columns = columns.data(), a.rows = rows.data();
+    a.right = right.data(), a.lower = lower.data();
+    a.points = static_cast<int64_t>(columns.size()) - kFrameSpare;
+    a.border = border.data(), a.border_points = static_cast<int64_t>(border.size());
+    a.output = kind;
+    // The operator's choice: see Sampler::block in kernels/polar_sampler.h.
+    a.blend = kind == FrameOutput::bytes       ? Blend::raw
+              : !normalize_first                ? Blend::far
+              : shape.back() * a.channels >= 4 ? Blend::near_rows
+                                                : Blend::near;
+    py::array result = output_array(out, output_shape(a.channels, colors));
+    a.out = result.mutable_data();
+    {
+      const py::gil_scoped_release free;
+      run(a, threads);
+    }
+    return result;
+  }
+
+ private:
+  Shape output_shape(int64_t channels, bool colors) const {
+    if (kind == FrameOutput::tokens) {
+      return {shape[0], shape[1], shape[2] * shape[3] * channels};
+    }
+    if (kind == FrameOutput::planes) return {channels, shape[0], shape[1]};
+    return colors ? Shape{shape[0], shape[1], channels} : shape;
+  }
+
+  py::array output_array(const std::optional<py::array>& out, const Shape& sizes) const {
+    const bool bytes = kind == FrameOutput::bytes;
+    const py::dtype type = bytes ? py::dtype::of<uint8_t>() : py::dtype::of<float>();
+    if (!out) return py::array(type, sizes);
+    const bool same = bytes ? py::isinstance<py::array_t<uint8_t>>(*out)
+                            : py::isinstance<py::array_t<float>>(*out);
+    if (!same || !(out->flags() & py::array::c_style) || !out->writeable() ||
+        Shape(out->shape(), out->shape() + out->ndim()) != sizes) {
+      throw py::value_error("out must be a writeable, C-contiguous array of " +
+                            std::string(bytes ? "uint8" : "float32") + " with shape " +
+                            shown(sizes));
+    }
+    return *out;
+  }
+
+  static void run(const FrameArgs& a, int64_t threads) {
+    // A new thread takes about 20 µs to start, as long as 10,000 points take.
+    constexpr int64_t kLeast = 10'000;
+    const auto& kernel = kernels<FrameKernels>();
+    threads = std::clamp<int64_t>(a.points / kLeast, 1, threads);
+    std::vector<std::jthread> others;
+    for (int64_t t = 1; t < threads; ++t) {
+      others.emplace_back(kernel.sample, std::cref(a), a.points * t / threads,
+                          a.points * (t + 1) / threads);
+    }
+    kernel.sample(a, 0, a.points / threads);
+  }
+
+  const Shape shape;
+  std::vector<int16_t> columns, rows;
+  const std::vector<float> right, lower;
+  const int64_t height, width;
+  const std::vector<float> scale, offset;
+  const bool normalize_first;
+  FrameOutput kind;
+  std::vector<BorderPoint> border;
+};
+
+// Places the points of one polar grid among the pixels of images of one size. The last result tells
+// whether the operator would pack such an image, and so normalize its pixels first.
+py::tuple polar_places(const Array<float>& radii, const Array<float>& azimuths,
+                       const Array<float>& center, const std::optional<Array<float>>& affine,
+                       const std::optional<Array<float>>& offsets,
+                       std::pair<int64_t, int64_t> size) {
+  const py::ssize_t count = radii.size(), around = azimuths.size();
+  if (center.size() != 2 || (affine && affine->size() != 4) ||
+      (offsets && offsets->size() != 2 * count * around)) {
+    throw py::value_error("the arrays of the grid do not fit together");
+  }
+  PolarSampleArgs<float> a{};
+  a.height = size.first, a.width = size.second;
+  a.radii = radii.data(), a.num_radii = count, a.num_azimuths = around;
+  a.center = center.data();
+  if (affine) a.affine = affine->data();
+  if (offsets) a.offsets = offsets->data(), a.offsets_end = a.offsets + offsets->size();
+  const int64_t padded = (around + 15) / 8 * 8;
+  std::vector<double> angles(3 * padded);
+  std::copy_n(azimuths.data(), around, angles.begin());
+  py::array_t<int16_t> columns({count, around}), rows({count, around});
+  py::array_t<float> right({count, around}), lower({count, around});
+  kernels<FrameKernels>().places(a, angles.data(), padded, columns.mutable_data(),
+                                 rows.mutable_data(), right.mutable_data(), lower.mutable_data());
+  const double bytes = packed_values(a.height, a.width, 3) * sizeof(float);
+  const bool packed = worth_packing(bytes, static_cast<double>(a.height * a.width),
+                                    static_cast<double>(count * around));
+  return py::make_tuple(columns, rows, right, lower, packed);
+}
+
+}  // namespace
+}  // namespace darswin
+
+PYBIND11_MODULE(_frames, m) {
+  using darswin::Sampler;
+  py::class_<Sampler>(m, "Sampler")
+      .def(py::init<const darswin::Array<int16_t>&, const darswin::Array<int16_t>&,
+                    const darswin::Array<float>&, const darswin::Array<float>&,
+                    std::pair<int64_t, int64_t>, std::vector<float>, std::vector<float>, bool,
+                    const std::string&>())
+      .def("__call__", &Sampler::operator(), py::arg("frame"), py::arg("out") = py::none(),
+           py::arg("threads") = 1);
+  m.def("polar_places", &darswin::polar_places);
+}

@@ -1,0 +1,194 @@
+"""Frames of a camera as NumPy arrays, sampled for a network without torch.
+
+`plan` finds once, with torch, where a network or a view reads the frames of one calibrated camera.
+`Sampler` reads them there, and its imports are NumPy alone:
+
+    darswin.frames.plan(model, lens, (1080, 1920)).save("camera.npz")   # once
+    sampler = darswin.frames.Sampler("camera.npz")                      # in the program of the camera
+    tokens = sampler(frame)
+
+A graph that `export_onnx(..., input="tokens")` wrote takes the tokens, with a batch axis in front.
+"""
+
+import os
+import zipfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, get_args
+
+import numpy as np
+
+from darswin.utils.files import replace_file
+
+try:
+    from darswin import _frames
+except ImportError as error:
+    raise ImportError(
+        f"cannot load darswin's compiled module for frames: {error}. The package has one for each "
+        "Python it was built with. Build it for this Python with `pip install "
+        "--no-build-isolation --no-binary darswin darswin`, or in a checkout with `make build`."
+    ) from error
+
+if TYPE_CHECKING:
+    from torch import Tensor, nn
+
+    from darswin.lens import Lens
+
+__all__ = ["Plan", "Sampler", "plan"]
+
+Output = Literal["tokens", "image", "uint8"]
+_VERSION = 1
+_LARGEST_SIDE = 2**15 - 1  # places are stored in 16 bits
+
+
+@dataclass(frozen=True)
+class Plan:
+    """The places at which the frames of one camera are read, and the form of the result.
+
+    Attributes:
+        columns, rows: the upper left one of the four pixels around each point, int16; -3 if a point
+            lies outside of the frame. Their shape is (R, A, S_r, S_φ) for tokens, and (H', W') for
+            an image; a polar image has H' = R·S_r and W' = A·S_φ.
+        right, lower: the distances of each point from the centre of that pixel, in [0, 1], float32.
+        size: (H, W) of the frames.
+        output: "tokens" is float32 (R, A, S_r·S_φ·C), "image" is float32 (C, H', W'), and "uint8"
+            is (H', W', C), as OpenCV has it.
+        mean, std: normalization `(pixel/255 - mean) / std`, one number for each channel, or one for
+            all; "uint8" is not normalized.
+        normalize_first: normalizes the pixels before the interpolation, as the operators do for
+            small images; the results differ in rounding only.
+    """
+
+    columns: np.ndarray
+    rows: np.ndarray
+    right: np.ndarray
+    lower: np.ndarray
+    size: tuple[int, int]
+    output: Output
+    mean: tuple[float, ...] = (0.0,)
+    std: tuple[float, ...] = (1.0,)
+    normalize_first: bool = False
+
+    def save(self, path: str | os.PathLike) -> None:
+        """Writes the plan to a file, which `Plan.load` and `Sampler` read. Its name ends in ".npz".
+
+        Raises:
+            ValueError: the name has another ending.
+            OSError: the file cannot be written.
+        """
+        if Path(path).suffix != ".npz":
+            raise ValueError(f"the name of a plan's file must end in .npz, got {os.fspath(path)!r}")
+        from io import BytesIO
+
+        buffer = BytesIO()
+        np.savez(buffer, darswin_plan=_VERSION, **vars(self))
+        replace_file(path, buffer.getbuffer())
+
+    @classmethod
+    def load(cls, path: str | os.PathLike) -> "Plan":
+        """Reads a plan from a file.
+
+        Raises:
+            ValueError: the file is no plan, is damaged, or comes from a newer version of darswin.
+            OSError: the file cannot be read.
+        """
+        name = os.fspath(path)
+        try:
+            with np.load(path, allow_pickle=False) as file:
+                content = dict(file)
+            version = int(content.pop("darswin_plan"))
+        except (ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
+            raise ValueError(f"{name} is no plan of darswin.frames, or it is damaged") from error
+        if version > _VERSION:
+            raise ValueError(f"{name} comes from a newer version of darswin: update darswin")
+        try:
+            height, width = content["size"].tolist()
+            return cls(
+                *(content[key] for key in ("columns", "rows", "right", "lower")),
+                size=(height, width),
+                output=content["output"].item(),
+                mean=tuple(content["mean"].tolist()),
+                std=tuple(content["std"].tolist()),
+                normalize_first=bool(content["normalize_first"]),
+            )
+        except (ValueError, KeyError, TypeError) as error:
+            raise ValueError(f"{name} is a damaged plan of darswin.frames") from error
+
+
+class Sampler(_frames.Sampler):
+    """Samples frames at the places of a plan: `sampler(frame, out=None, threads=1)`.
+
+    A call takes a frame of uint8, (H, W, 3) or (H, W), in any memory layout, so that
+    `frame[..., ::-1]` turns OpenCV's BGR into RGB at no cost. It returns the plan's `output`. It
+    runs without Python's lock, and several threads may call one sampler.
+
+    `out` is an array for the result: C-contiguous, with its shape and type. `threads` is the largest
+    number of threads; small plans use fewer. The tokens and the polar image are those of
+    `darswin.ops.polar_sample`, bit for bit.
+
+    Args:
+        plan: a `Plan`, or its file.
+
+    Raises:
+        TypeError: in a call, the frame is no array of uint8.
+        ValueError: the plan is damaged; in a call, the frame or `out` does not fit the plan.
+        OSError: the file cannot be read.
+    """
+
+    def __init__(self, plan: Plan | str | os.PathLike):
+        if not isinstance(plan, Plan):
+            plan = Plan.load(plan)
+        mean, std = np.asarray(plan.mean, np.float64), np.asarray(plan.std, np.float64)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            scale, offset = 1 / (255 * std), -mean / std
+        try:
+            super().__init__(
+                plan.columns, plan.rows, plan.right, plan.lower, plan.size, scale.tolist(),
+                offset.tolist(), plan.normalize_first, plan.output,
+            )  # fmt: skip
+        except TypeError as error:
+            raise ValueError("the arrays of the plan do not fit together") from error
+        self.plan = plan
+
+
+def plan(
+    sample: "nn.Module | Tensor",
+    lens: "Lens",
+    size: tuple[int, int],
+    *,
+    output: Output | None = None,
+    mean: float | Sequence[float] | None = None,
+    std: float | Sequence[float] | None = None,
+) -> Plan:
+    """Finds the places at which a network or a view reads the frames of a camera. Needs torch.
+
+    Args:
+        sample: a model, which reads a polar grid or a view of its own; a `PolarSample` layer; or
+            the rays (H', W', 3) of a view, see `darswin.viz.views`.
+        lens: the lens of the camera.
+        size: (H, W) of the frames.
+        output: the form of the result, see `Plan`. By default it is the input of the model's or the
+            layer's sampling, "tokens" or "image", and "uint8" for rays. Only a polar grid has
+            tokens.
+        mean, std: the normalization of the frames; by default the model's, or none for rays.
+
+    Raises:
+        TypeError: `sample` is none of these.
+        ValueError: there is more than one lens, the lens belongs to another size, the model takes
+            the images as they are, a side is longer than 32,767 pixels, or the output is unknown.
+    """
+    from darswin.deploy.frame_plan import places
+
+    if output is not None and output not in get_args(Output):
+        raise ValueError(f"output must be one of {get_args(Output)}, got {output!r}")
+    height, width = size
+    if not (0 < height <= _LARGEST_SIDE and 0 < width <= _LARGEST_SIDE):
+        raise ValueError(f"size must be (H, W) of at most {_LARGEST_SIDE} pixels, got {size}")
+    found: dict[str, Any] = places(sample, lens, (int(height), int(width)), output)
+    chosen = {"mean": mean, "std": std}
+    for name, value in chosen.items():
+        if value is not None:
+            found[name] = value
+        found[name] = tuple(np.atleast_1d(np.asarray(found[name], np.float64)).tolist())
+    return Plan(**found, size=(int(height), int(width)))
