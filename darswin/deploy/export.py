@@ -4,7 +4,7 @@ import os
 from collections.abc import Iterable
 from functools import partial
 from inspect import Parameter, Signature
-from typing import Any
+from typing import Any, Literal, get_args
 
 import torch
 from torch import Tensor, nn
@@ -14,34 +14,53 @@ from torch.utils import _pytree as pytree
 
 from darswin.layers.quantized import quantized_layers, with_unsigned_weights
 from darswin.lens import Lens
+from darswin.models.base import Model
+from darswin.models.stages import Pair
 from darswin.ops import use_reference
 from darswin.utils.extras import lack
 from darswin.utils.progress import Progress
 
 __all__ = ["export_onnx", "export_package", "export_program"]
 
+Input = Literal["images", "tokens"]
+
 
 class _OfTensors(nn.Module):
-    """A model that takes its lens as tensors, by name; those that are not given are the lens's own.
-    With `any_strides` it reads its inputs by the strides they come with."""
+    """A model that takes pixels and the tensors of its lens, by name; tensors that are not given
+    are the lens's own.
+
+    With a `size` of the images, the first pixels are the result of `Model.sample`. With
+    `any_strides` it reads its inputs by the strides they come with.
+    """
 
     def __init__(
-        self, model: nn.Module, lens: Lens | None, names: Iterable[str], any_strides: bool
+        self,
+        model: nn.Module,
+        lens: Lens | None,
+        size: Pair | None,
+        pixels: Iterable[str],
+        tensors: Iterable[str],
+        any_strides: bool,
     ):
         super().__init__()
-        self.model, self.lens, self.any_strides = model, lens, any_strides
+        self.model, self.lens, self.size, self.any_strides = model, lens, size, any_strides
         # torch.export finds the names of the inputs in the signature of `forward`.
-        images = Parameter("images", Parameter.POSITIONAL_OR_KEYWORD)
-        tensors = [Parameter(name, Parameter.KEYWORD_ONLY) for name in names]
+        inputs = [Parameter(name, Parameter.POSITIONAL_OR_KEYWORD) for name in pixels]
+        inputs += [Parameter(name, Parameter.KEYWORD_ONLY) for name in tensors]
         forward: Any = partial(self._run)
-        forward.__signature__ = Signature([images, *tensors])
+        forward.__signature__ = Signature(inputs)
         self.forward = forward
 
-    def _run(self, images: Tensor, **tensors: Tensor) -> Tensor:
+    def _run(self, *pixels: Tensor, **tensors: Tensor) -> Tensor:
         if self.any_strides:
-            images = _in_order(images)
+            pixels = tuple(map(_in_order, pixels))
             tensors = {name: _in_order(tensor) for name, tensor in tensors.items()}
-        return self.model(images, None if self.lens is None else self.lens.replace(**tensors))
+        lens = None if self.lens is None else self.lens.replace(**tensors)
+        if self.size is None:
+            return self.model(*pixels, lens)
+        sampled, *images = pixels
+        model: Any = self.model
+        return model.run_sampled(sampled, model.prepare(lens, self.size), *images)
 
 
 def _in_order(tensor: Tensor) -> Tensor:
@@ -53,7 +72,12 @@ def _in_order(tensor: Tensor) -> Tensor:
 
 
 def export_program(
-    model: nn.Module, images: Tensor, lens: Lens | None = None, *, fixed_lens: bool = False
+    model: nn.Module,
+    images: Tensor,
+    lens: Lens | None = None,
+    *,
+    fixed_lens: bool = False,
+    input: Input = "images",
 ) -> ExportedProgram:
     """The graph of `model(images, lens)` for any batch size, with plain tensors as its inputs.
 
@@ -65,16 +89,28 @@ def export_program(
         model: in eval mode.
         images, lens: an example. The graph keeps its types and sizes, all but the batch size.
         fixed_lens: the graph keeps the lens too, which must be a single one; `images` is its input.
+        input: "images", or "tokens" for a graph that starts later: its input `tokens` is the result
+            of `model.sample`, which `darswin.frames` also computes. `images` is a second input
+            only for a model that `refines_with_images`.
 
     Raises:
-        ValueError: a model in training mode, or not one lens where it is to be fixed.
+        ValueError: a model in training mode, not one lens where it is to be fixed, or an unknown
+            `input`.
+        TypeError: "tokens" with a model that is no `darswin.models.base.Model`.
     """
-    return _program(model, images, lens, fixed_lens, any_strides=True)
+    return _program(model, images, lens, fixed_lens, input, any_strides=True)
 
 
 def _program(
-    model: nn.Module, images: Tensor, lens: Lens | None, fixed_lens: bool, any_strides: bool
+    model: nn.Module,
+    images: Tensor,
+    lens: Lens | None,
+    fixed_lens: bool,
+    input: Input,
+    any_strides: bool,
 ) -> ExportedProgram:
+    if input not in get_args(Input):
+        raise ValueError(f"input must be one of {get_args(Input)}, got {input!r}")
     if model.training:
         raise ValueError("model must be in eval mode, got one in training mode: call model.eval()")
     if fixed_lens and (lens is None or len(lens) != 1):
@@ -87,16 +123,31 @@ def _program(
             for (key,), leaf in leaves
             if isinstance(key, pytree.GetAttrKey) and leaf is not None
         }
-    module = _OfTensors(model, lens, tensors, any_strides)
+    pixels, size = {"images": images}, None
+    if input == "tokens":
+        pixels, size = _sampled(model, images, lens)
+    module = _OfTensors(model, lens, size, pixels, tensors, any_strides)
     batch = {0: torch.export.Dim("batch")}
     with torch.no_grad(), Progress("tracing the model"):
         return torch.export.export(
             module,
-            (images,),
+            tuple(pixels.values()),
             tensors,
-            dynamic_shapes=dict.fromkeys(("images", *tensors), batch),
+            dynamic_shapes=dict.fromkeys((*pixels, *tensors), batch),
             strict=False,  # it takes half of the time of a strict export
         )
+
+
+def _sampled(model: nn.Module, images: Tensor, lens: Lens | None) -> tuple[dict[str, Tensor], Pair]:
+    """The inputs of `model.run_sampled` for images, by name, and the size (H, W) of the images."""
+    if not isinstance(model, Model):
+        raise TypeError(f'input="tokens" needs a model of darswin, got {type(model).__name__}')
+    height, width = model._checked(images).shape[2:]
+    lens = None if lens is None else lens[[0] * len(images)]
+    with torch.no_grad():
+        tokens = model.sample(images, model.prepare(lens, (height, width)))
+    others = {"images": images} if model.refines_with_images else {}
+    return {"tokens": tokens} | others, (height, width)
 
 
 def export_package(
@@ -106,6 +157,7 @@ def export_package(
     lens: Lens | None = None,
     *,
     fixed_lens: bool = False,
+    input: Input = "images",
 ) -> None:
     """Compiles the graph of `export_program` with AOTInductor, and writes it as a package.
 
@@ -116,7 +168,7 @@ def export_package(
 
     The other arguments and the errors are those of `export_program`.
     """
-    program = export_program(model, images, lens, fixed_lens=fixed_lens)
+    program = export_program(model, images, lens, fixed_lens=fixed_lens, input=input)
     with Progress("compiling the graph"):
         torch._inductor.aoti_compile_and_package(program, package_path=os.fspath(path))
 
@@ -128,6 +180,7 @@ def export_onnx(
     lens: Lens | None = None,
     *,
     fixed_lens: bool = False,
+    input: Input = "images",
     vnni_only: bool = False,
 ) -> None:
     """Writes the graph of `export_program` as one ONNX file, by the operators' reference.
@@ -150,15 +203,15 @@ def export_onnx(
         model = with_unsigned_weights(model)
     # MATH, as other attention kernels of torch lay out their result unlike their decomposition.
     with use_reference(), sdpa_kernel(SDPBackend.MATH):
-        program = _program(model, images, lens, fixed_lens, any_strides=False)
+        program = _program(model, images, lens, fixed_lens, input, any_strides=False)
         inputs = program.graph_signature.user_inputs
         with Progress("translating the graph to ONNX"):
             torch.onnx.export(
                 program,
                 f=path,
                 output_names=["logits"],
-                # Of the images alone: the lens has as many rows.
-                dynamic_shapes=dict.fromkeys(inputs[1:]) | {"images": {0: "batch"}},
+                # Of the first input alone: the others have as many rows.
+                dynamic_shapes=dict.fromkeys(inputs[1:]) | {inputs[0]: {0: "batch"}},
                 external_data=False,
                 verbose=False,
             )

@@ -60,6 +60,7 @@ class Model(nn.Module):
         image_size: the size (H, W) that all images must have; None allows any size.
         square_images: True if the images must be square.
         uses_lens: False if the model ignores its lens, which may then be None.
+        refines_with_images: True if `run_sampled` needs the images too.
         feature_info: the sizes of the encoder's stages.
         pretrained_cfg: timm's description of a model, a dict. Its keys are "architecture" (the
             name for `create_model`), "num_classes", "input_size" (C, H, W), "fixed_input_size",
@@ -71,6 +72,7 @@ class Model(nn.Module):
     image_size: Pair | None = None
     square_images = False
     uses_lens = True
+    refines_with_images = False
     in_chans: int
     num_classes: int
     mean: Sequence[float]
@@ -150,15 +152,20 @@ class Model(nn.Module):
         Args:
             sampled: the result of `sample`, in eval mode.
             prepared: as in `run`.
-            images: as in `run`. Only a `Unet` with the view "polar" and a skip_width above 0 reads
-                them.
+            images: as in `run`, if the model `refines_with_images`. This is a `Unet` with the view
+                "polar" and a skip_width above 0.
 
         Raises:
             TypeError: an argument is no tensor, has an unsupported dtype, or is missing.
             ValueError: an argument has a wrong shape, or the number of lenses is neither B nor 1.
         """
         sampled = self._checked_sampled(sampled, prepared)
-        images = None if images is None else self._checked(images)
+        if not self.refines_with_images:
+            images = None
+        elif images is None:
+            raise TypeError("images are missing: this model refines its result with their pixels")
+        else:
+            images = self._checked(images)
         return self._run_sampled(sampled, prepared, images)
 
     def _checked_and_prepared(self, images: Tensor, lens: Lens | None) -> tuple[Tensor, Any]:

@@ -269,6 +269,11 @@ class Unet(Model):
         )
 
     @property
+    def refines_with_images(self) -> bool:  # type: ignore[override]
+        """True for the view "polar" with a skip_width above 0."""
+        return isinstance(self.encoder, DarSwin) and self.head.skip_width > 0
+
+    @property
     def head(self) -> PixelHead:
         """`segmentation_head` or `distance_head`."""
         return self.get_submodule(f"{self.task}_head")  # type: ignore[return-value]
@@ -325,8 +330,6 @@ class Unet(Model):
         seen: Tensor | None = sampled
         if isinstance(self.encoder, DarSwin):
             seen = None if images is None else self._floating(images)
-            if seen is None and self.head.skip_width:
-                raise TypeError("images are missing: a skip_width above 0 reads their pixels")
         maps = self.encoder.maps(sampled, prepared.encoder._replace(points=None))
         return self._decode(maps, seen, prepared)
 

@@ -170,6 +170,61 @@ def test_onnx_gathers_from_a_frame_before_all_else(shape, tmp_path):
         )
 
 
+def sampled(model, images, lens):
+    """The inputs of a graph that starts at the tokens, but for the lens, as tensors by name."""
+    prepared = model.prepare(lens, model._checked(images).shape[2:])
+    inputs = dict(tokens=model.sample(images, prepared))
+    return inputs | (dict(images=images) if model.refines_with_images else {})
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "options", "lens"),
+    [
+        ("darswin_ra_nano", ONE_BLOCK, POLYNOMIAL),
+        ("darswin_unet_a_nano", ONE_BLOCK, SPHERICAL[0]),
+        ("darswin_unet_ra_nano", dict(ONE_BLOCK, skip_width=0), POLYNOMIAL),
+        ("swin_undis_nano", ONE_BLOCK, SPHERICAL[0]),
+    ],
+)
+def test_graphs_that_start_at_the_tokens(name, options, lens, tmp_path):
+    onnxruntime = pytest.importorskip("onnxruntime")
+    model, fixed, path = short(name, **options), len(lens) == 1, tmp_path / "model.onnx"
+    settings = dict(fixed_lens=fixed, input="tokens")
+    export_onnx(model, path, *batch_of(lens, 1)[:2], **settings)
+    program = export_program(model, *batch_of(lens, 1)[:2], **settings).module()
+    session = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
+    with torch.no_grad():
+        for count in (1, 5):
+            images, lenses, tensors = batch_of(lens, count)
+            inputs, expected = sampled(model, images, lenses), model(images, lenses)
+            named = {} if fixed else tensors
+            assert [i.name for i in session.get_inputs()] == [*inputs, *named]
+            feed = {key: tensor.numpy() for key, tensor in (inputs | named).items()}
+            (logits,) = session.run(["logits"], feed)
+            for got in (torch.from_numpy(logits), program(*inputs.values(), **named)):
+                assert (got - expected).abs().max() <= 1e-4 * expected.abs().max()
+
+
+@pytest.mark.slow
+def test_a_graph_of_tokens_gives_the_classes_of_the_graph_of_frames(tmp_path):
+    onnxruntime = pytest.importorskip("onnxruntime")
+    model, lens = short("darswin_a_nano", mean=0.5, std=0.2), SPHERICAL[1]
+    frames = torch.randint(256, (20, 40, 48, 3), dtype=torch.uint8)
+    with torch.no_grad():
+        inputs = dict(images=frames, **sampled(model, frames, lens))
+    logits = []
+    for name, tensor in inputs.items():
+        path = tmp_path / f"{name}.onnx"
+        export_onnx(model, path, frames[:1], lens, fixed_lens=True, input=name)
+        session = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
+        (out,) = session.run(["logits"], {name: tensor.numpy()})
+        logits.append(torch.from_numpy(out))
+    whole, rest = logits
+    assert torch.equal(whole.argmax(1), rest.argmax(1)) and len(whole.argmax(1).unique()) > 1
+    assert (whole - rest).abs().max() <= 1e-5 * whole.abs().max()
+
+
 def test_what_is_missing_is_named_with_packages_that_exist(monkeypatch):
     found = importlib.util.find_spec
     monkeypatch.setattr(
@@ -186,5 +241,9 @@ def test_errors():
         export_program(model, images, lens, fixed_lens=True)
     with pytest.raises(ValueError, match="fixed_lens needs a single lens, got None"):
         export_program(model, images, fixed_lens=True)
+    with pytest.raises(ValueError, match=r"input must be one of .*, got 'logits'"):
+        export_program(model, images, lens, input="logits")
+    with pytest.raises(TypeError, match="needs a model of darswin, got Identity"):
+        export_program(torch.nn.Identity().eval(), images, input="tokens")
     with pytest.raises(ValueError, match="model must be in eval mode"):
         export_program(model.train(), images, lens)
