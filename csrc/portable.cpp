@@ -14,8 +14,8 @@ template class std::__cxx11::basic_stringstream<char>;
 // Called if std::allocator is asked for more bytes than there are addresses.
 void std::__throw_bad_array_new_length() { throw std::bad_array_new_length(); }
 
-// From GCC 11: the two halves of copying an exception_ptr. Older libraries have the whole copy, which
-// adds a reference, and the destructor, which removes one.
+// From GCC 11: the two halves of copying an exception_ptr. Older libraries have the whole copy,
+// which adds a reference, and the destructor, which removes one.
 extern "C" {
 void copy_exception(void**, void* const*) __asm__("_ZNSt15__exception_ptr13exception_ptrC1ERKS0_");
 void destroy_exception(void**) __asm__("_ZNSt15__exception_ptr13exception_ptrD1Ev");

@@ -8,7 +8,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from darswin import compat, lens, models, ops
+    from darswin import compat, frames, lens, models, ops
     from darswin.deploy.optimize import optimize
     from darswin.layers.polar import PolarGrid, PolarSample, polar_grid
     from darswin.layers.transformer import PolarWindowAttention
@@ -23,6 +23,7 @@ __all__ = [
     "PolarWindowAttention",
     "compat",
     "create_model",
+    "frames",
     "lens",
     "list_models",
     "models",

@@ -14,6 +14,7 @@ import os
 import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass
+from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
@@ -79,8 +80,6 @@ class Plan:
         """
         if Path(path).suffix != ".npz":
             raise ValueError(f"the name of a plan's file must end in .npz, got {os.fspath(path)!r}")
-        from io import BytesIO
-
         buffer = BytesIO()
         np.savez(buffer, darswin_plan=_VERSION, **vars(self))
         replace_file(path, buffer.getbuffer())
@@ -139,16 +138,17 @@ class Sampler(_frames.Sampler):
     def __init__(self, plan: Plan | str | os.PathLike):
         if not isinstance(plan, Plan):
             plan = Plan.load(plan)
-        mean, std = np.asarray(plan.mean, np.float64), np.asarray(plan.std, np.float64)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            scale, offset = 1 / (255 * std), -mean / std
         try:
+            if len(plan.mean) != len(plan.std):
+                raise TypeError("one mean for each std")
             super().__init__(
-                plan.columns, plan.rows, plan.right, plan.lower, plan.size, scale.tolist(),
-                offset.tolist(), plan.normalize_first, plan.output,
+                plan.columns, plan.rows, plan.right, plan.lower, plan.size,
+                [1 / (255 * std) for std in plan.std],
+                [-mean / std for mean, std in zip(plan.mean, plan.std, strict=False)],
+                plan.normalize_first, plan.output,
             )  # fmt: skip
-        except TypeError as error:
-            raise ValueError("the arrays of the plan do not fit together") from error
+        except (TypeError, ZeroDivisionError) as error:
+            raise ValueError("the parts of the plan do not fit together") from error
         self.plan = plan
 
 

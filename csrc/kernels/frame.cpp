@@ -58,8 +58,9 @@ void blend_channel(const FrameArgs& a, int64_t first, int64_t count, const Corne
     return v;
   };
   for (int64_t k = 0; k < count; k += kLanes<float>) {
-    Floats v = bilinear<blend>(corner(0, k), corner(1, k), corner(2, k), corner(3, k),
-                               load<Floats>(a.right + first + k), load<Floats>(a.lower + first + k));
+    Floats v =
+        bilinear<blend>(corner(0, k), corner(1, k), corner(2, k), corner(3, k),
+                        load<Floats>(a.right + first + k), load<Floats>(a.lower + first + k));
     if constexpr (blend == Blend::far) v = v * scale + offset;
     store(to + k, v);
   }
@@ -181,10 +182,13 @@ void sample_border(const FrameArgs& a, const BorderPoint& point) {
     const float v = a.pixels[y * a.row_stride + x * a.column_stride + c * a.channel_stride];
     return blend == Blend::raw ? v : v * a.scale[c] + a.offset[c];
   };
+  const bool outside = column < -1 || column >= a.width || row < -1 || row >= a.height;
   for (int64_t c = 0; c < a.channels; ++c) {
-    const float v = bilinear<blend>(value(row, column, c), value(row, column + 1, c),
-                                    value(row + 1, column, c), value(row + 1, column + 1, c),
-                                    point.right, point.lower);
+    const float v = outside
+                        ? 0
+                        : bilinear<blend>(value(row, column, c), value(row, column + 1, c),
+                                          value(row + 1, column, c), value(row + 1, column + 1, c),
+                                          point.right, point.lower);
     if (a.output == FrameOutput::planes) {
       static_cast<float*>(a.out)[c * a.points + k] = v;
     } else if (a.output == FrameOutput::tokens) {

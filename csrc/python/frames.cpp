@@ -61,15 +61,16 @@ class Sampler {
         offset(std::move(offset)),
         normalize_first(normalize_first) {
     const int64_t points = columns.size();
-    const bool tokens = output == "tokens", known = tokens || output == "image" || output == "uint8";
+    const bool tokens = output == "tokens",
+               known = tokens || output == "image" || output == "uint8";
     const bool sizes = height > 0 && width > 0 && height <= INT16_MAX && width <= INT16_MAX;
     const bool channels = this->scale.size() == 1 || this->scale.size() == 3;
     if (!known || !sizes || !channels || this->scale.size() != this->offset.size() ||
         shape.size() != (tokens ? 4 : 2) || rows.size() != points || right.size() != points ||
         lower.size() != points) {
-      throw py::value_error("the arrays of the plan do not fit together");
+      throw py::value_error("the parts of the plan do not fit together");
     }
-    kind = tokens             ? FrameOutput::tokens
+    kind = tokens              ? FrameOutput::tokens
            : output == "image" ? FrameOutput::planes
                                : FrameOutput::bytes;
     for (int64_t k = 0; k < points; ++k) {
@@ -87,10 +88,10 @@ class Sampler {
   py::array operator()(const py::object& given, const std::optional<py::array>& out,
                        int64_t threads) const {
     if (!py::isinstance<py::array_t<uint8_t>>(given)) {
-      throw py::type_error(
-          "frame must be a NumPy array of uint8, got " +
-          std::string(py::isinstance<py::array>(given) ? py::str(given.attr("dtype"))
-                                                       : py::str(py::type::of(given))));
+      throw py::type_error("frame must be a NumPy array of uint8, got " +
+                           std::string(py::isinstance<py::array>(given)
+                                           ? py::str(given.attr("dtype"))
+                                           : py::str(py::type::of(given))));
     }
     const auto frame = py::reinterpret_borrow<py::array>(given);
     if (threads < 1) throw py::value_error("threads must be at least 1");
@@ -114,7 +115,8 @@ class Sampler {
     a.height = height, a.width = width;
     // The stride of an axis of size 1 may be any number, and is never used.
     const auto stride = [&](int axis) { return sizes[axis] > 1 ? frame.strides(axis) : 0; };
-    a.row_stride = stride(0), a.column_stride = stride(1), a.channel_stride = colors ? stride(2) : 0;
+    a.row_stride = stride(0), a.column_stride = stride(1),
+    a.channel_stride = colors ? stride(2) : 0;
     if ((height - 1) * std::abs(static_cast<double>(a.row_stride)) +
             (width - 1) * std::abs(static_cast<double>(a.column_stride)) >=
         INT32_MAX) {
@@ -132,9 +134,9 @@ class Sampler {
     a.output = kind;
     // The operator's choice: see Sampler::block in kernels/polar_sampler.h.
     a.blend = kind == FrameOutput::bytes       ? Blend::raw
-              : !normalize_first                ? Blend::far
+              : !normalize_first               ? Blend::far
               : shape.back() * a.channels >= 4 ? Blend::near_rows
-                                                : Blend::near;
+                                               : Blend::near;
     py::array result = output_array(out, output_shape(a.channels, colors));
     a.out = result.mutable_data();
     {

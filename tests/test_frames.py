@@ -1,0 +1,393 @@
+"""darswin.frames: the same bits as the operator, views, plans in files, and wrong input."""
+
+import io
+import math
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from helpers import CAMERAS
+from hypothesis import given
+from hypothesis import strategies as st
+from lens_examples import RANDOM, random_lens
+
+from darswin import _frames, create_model, frames
+from darswin.compat import OfficialDarSwin
+from darswin.layers.polar import PolarSample
+from darswin.lens import Equidistant, Polynomial
+from darswin.models import LensAdapter
+from darswin.models.encoder import FeatureMaps
+from darswin.viz.views import equirectangular, perspective, undistort
+
+MEAN, STD = (0.4, 0.5, 0.6), (0.2, 0.25, 0.3)
+ROUND = Equidistant.from_fov(3.0, 24.0)
+
+
+def random_frame(height, width, *channels, seed=0):
+    rng = np.random.default_rng(seed)
+    return rng.integers(0, 256, (height, width, *channels), dtype=np.uint8)
+
+
+def layer(rings=4, sectors=8, samples=(2, 3), layout="tokens", mean=MEAN, std=STD, **options):
+    return PolarSample(rings, sectors, samples, layout=layout, mean=mean, std=std, **options).eval()
+
+
+def in_layout(frame, kind):
+    """The same frame in another memory layout."""
+    if kind == "flipped":
+        return np.ascontiguousarray(frame[::-1, ::-1])[::-1, ::-1]
+    if kind == "gaps":
+        room = np.zeros((frame.shape[0] * 2, frame.shape[1] + 5, *frame.shape[2:]), np.uint8)
+        room[1::2, 3:-2] = frame
+        return room[1::2, 3:-2]
+    if kind == "bgr" and frame.ndim == 3:
+        return np.ascontiguousarray(frame[..., ::-1])[..., ::-1]
+    if kind == "planes" and frame.ndim == 3:
+        return np.ascontiguousarray(frame.transpose(2, 0, 1)).transpose(1, 2, 0)
+    return np.asfortranarray(frame) if kind == "turned" else frame
+
+
+LAYOUTS = ("plain", "flipped", "gaps", "bgr", "planes", "turned")
+
+
+@st.composite
+def calls(draw):
+    """A frame, a lens and a layer, with points inside, at the border and outside of the frame."""
+    side = st.sampled_from((1, 2, 3, 7, 16, 33, 90, 300))
+    height, width = draw(side), draw(side)
+    radius = draw(st.sampled_from((0.1, 0.5, 0.8, 3.0))) * max(height, width)
+    center = draw(st.sampled_from((None, (0.0, 0.0), (width - 1.0, height / 3), (-500.0, 2.0))))
+    if draw(st.booleans()):
+        lens = Equidistant.from_fov(3.0, radius, center)
+    else:
+        lens = random_lens(draw(st.sampled_from(RANDOM)), draw(st.integers(0, 99)), count=1)
+        lens = lens.replace(focal=lens.focal * (radius / 1000), center=None)
+    channels = draw(st.sampled_from(((), (1,), (3,))))
+    sampling = layer(
+        draw(st.sampled_from((1, 2, 5))),
+        draw(st.sampled_from((1, 3, 16, 65))),
+        (draw(st.sampled_from((1, 2, 5))), draw(st.sampled_from((1, 2, 3, 10)))),
+        draw(st.sampled_from(("tokens", "image"))),
+        *((MEAN, STD) if channels == (3,) else (0.3, 0.7)),
+    )
+    frame = random_frame(height, width, *channels, seed=draw(st.integers(0, 99)))
+    return lens, sampling, in_layout(frame, draw(st.sampled_from(LAYOUTS)))
+
+
+def by_operator(sampling, lens, frame):
+    image = torch.from_numpy(np.ascontiguousarray(frame))
+    image = image[None, None] if frame.ndim == 2 else image.permute(2, 0, 1)[None]
+    return sampling(image, lens, channels_last=False)[0].numpy()
+
+
+@given(calls(), st.integers(1, 3))
+def test_samples_are_those_of_the_operator_bit_for_bit(call, threads):
+    lens, sampling, frame = call
+    sampler = frames.Sampler(frames.plan(sampling, lens, frame.shape[:2]))
+    found = sampler(frame, threads=threads)
+    np.testing.assert_array_equal(found, by_operator(sampling, lens, frame))
+
+
+@pytest.mark.parametrize("size", [(96, 128), (540, 960)])  # packed by the operator, and not
+@pytest.mark.parametrize("lens", CAMERAS, ids=["polynomial", "mei"])
+@pytest.mark.parametrize("layout", ["tokens", "image"])
+def test_real_cameras_and_many_points_give_the_same_bits(size, lens, layout):
+    frame, sampling = random_frame(*size, 3), layer(32, 64, (3, 5), layout)
+    lens = lens.in_picture(size) if size[0] / size[1] == 966 / 1280 else Equidistant.from_fov(
+        3.2, 0.6 * size[0], (0.4 * size[1], 0.5 * size[0]), affine=[[1.0, 0.01], [0.0, 0.9]]
+    )  # fmt: skip
+    found = frames.Sampler(frames.plan(sampling, lens, size))
+    expected = by_operator(sampling, lens, frame)
+    for threads in (1, 2, 5):
+        np.testing.assert_array_equal(found(frame, threads=threads), expected)
+
+
+def reference(image, x, y):
+    """Bilinear samples of (H, W, C) in float64, with 0 outside."""
+    padded = np.pad(image.astype(np.float64), ((2, 2), (2, 2), (0, 0)))
+    x, y = np.clip(x, -2, image.shape[1]) + 2, np.clip(y, -2, image.shape[0]) + 2
+    column, row = np.floor(x).astype(int), np.floor(y).astype(int)
+    column, row = np.minimum(column, padded.shape[1] - 2), np.minimum(row, padded.shape[0] - 2)
+    right, lower = (x - column)[..., None], (y - row)[..., None]
+    top = padded[row, column] * (1 - right) + padded[row, column + 1] * right
+    bottom = padded[row + 1, column] * (1 - right) + padded[row + 1, column + 1] * right
+    return top * (1 - lower) + bottom * lower
+
+
+@pytest.mark.parametrize("channels", [(), (3,)])
+@pytest.mark.parametrize("view", [perspective((40, 50), 1.4), equirectangular((30, 60))])
+def test_views_of_rays_are_exact_pictures(view, channels):
+    lens, frame = ROUND.with_theta_max(1.5), random_frame(64, 70, *channels)
+    found = frames.Sampler(frames.plan(view, lens, (64, 70)))(frame)
+    assert found.dtype == np.uint8 and found.shape == (*view.shape[:2], *channels)
+    x, y = lens.to(torch.float64).project_points(view[None], (64, 70))[0].numpy().transpose(2, 0, 1)
+    x, y = np.where(np.isnan(x), -9, x), np.where(np.isnan(y), -9, y)
+    expected = reference(frame.reshape(64, 70, -1), x, y).reshape(found.shape)
+    assert np.abs(found - expected).max() <= 0.5 + 1 / 512
+    assert (found == 0).mean() > 0.1 or view.shape[0] == 40  # the lens sees only a part
+
+
+def test_views_agree_with_opencv():
+    smooth = cv2.GaussianBlur(random_frame(90, 120, 3), (0, 0), 3)
+    lens, view = Equidistant.from_fov(2.6, 44.0), perspective((60, 80), 1.5, yaw=0.2)
+    found = frames.Sampler(frames.plan(view, lens, (90, 120)))(smooth)
+    expected = undistort(smooth, lens, view)
+    assert np.abs(found.astype(int) - expected).max() <= 2  # OpenCV's weights have 5 bits
+
+
+def test_rays_can_become_normalized_images_for_any_network():
+    frame, view = random_frame(64, 64, 3), perspective((20, 30), 1.0)
+    plan = frames.plan(view, ROUND, (64, 64), output="image", mean=MEAN, std=STD)
+    picture = frames.Sampler(replace(plan, output="uint8"))(frame)
+    found = frames.Sampler(plan)(frame)
+    expected = (picture / 255 - MEAN) / STD
+    assert found.dtype == np.float32 and found.shape == (3, 20, 30)
+    assert np.abs(found - expected.transpose(2, 0, 1)).max() <= 0.51 / 255 / min(STD)
+
+
+def test_a_polar_picture():
+    frame, sampling = random_frame(64, 64, 3), layer()
+    picture = frames.Sampler(frames.plan(sampling, ROUND, (64, 64), output="uint8"))(frame)
+    plain = frames.Sampler(frames.plan(layer(layout="image", mean=0.0, std=1.0), ROUND, (64, 64)))
+    assert picture.shape == (8, 24, 3)
+    assert np.abs(picture - 255 * plain(frame).transpose(1, 2, 0)).max() <= 0.5 + 1e-3
+
+
+MODELS = ["darswin_a_nano", "darswin_ra_nano", "swin_undis_nano", "darswin_unet_a_nano",
+          "swin_unet_undis_nano", "swin_unet_adapted_nano"]  # fmt: skip
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_a_model_gets_what_it_samples_itself(name):
+    model = create_model(name, mean=MEAN, std=STD, num_classes=5).eval()
+    size = model.image_size or (70, 80)
+    lens = Equidistant.from_fov(2.8, 30.0)
+    frame = random_frame(*size, 3)
+    images = torch.from_numpy(frame).permute(2, 0, 1)[None]
+    with torch.inference_mode():
+        prepared = model.prepare(lens, size)
+        sampled = frames.Sampler(frames.plan(model, lens, size))(frame)[None]
+        expected = model.sample(images, prepared)
+        np.testing.assert_allclose(sampled, expected.numpy(), rtol=1e-4, atol=1e-4)
+        pixels = images if "darswin_unet" in name else None
+        result = model.run_sampled(torch.from_numpy(sampled), prepared, pixels)
+        torch.testing.assert_close(result, model.run(images, prepared), rtol=1e-3, atol=1e-3)
+
+
+def test_wrapped_models_have_plans():
+    encoder = create_model("darswin_a_nano", num_classes=0).eval()
+    plan = frames.plan(FeatureMaps(encoder), ROUND, (64, 64))
+    np.testing.assert_array_equal(plan.right, frames.plan(encoder, ROUND, (64, 64)).right)
+    adapter = LensAdapter(torch.nn.Identity(), 32)
+    view = frames.Sampler(frames.plan(adapter, ROUND, (64, 64)))(random_frame(64, 64, 3))
+    assert view.shape == (3, 32, 32) and 0 <= view.min() and view.max() <= 1
+
+
+def test_a_file_holds_the_plan(tmp_path):
+    plan, frame = frames.plan(layer(), ROUND, (50, 60)), random_frame(50, 60, 3)
+    path = tmp_path / "camera.npz"
+    plan.save(path)
+    loaded = frames.Plan.load(path)
+    for name, value in vars(plan).items():
+        found = getattr(loaded, name)
+        assert type(found) is type(value)
+        np.testing.assert_array_equal(found, value)
+    np.testing.assert_array_equal(frames.Sampler(path)(frame), frames.Sampler(plan)(frame))
+    with pytest.raises(ValueError, match=r"must end in \.npz"):
+        plan.save(tmp_path / "camera.npy")
+
+
+def test_out_takes_the_result():
+    sampler, frame = frames.Sampler(frames.plan(layer(), ROUND, (50, 60))), random_frame(50, 60, 3)
+    expected = sampler(frame)
+    out = np.full_like(expected, np.nan)
+    assert sampler(frame, out) is out and sampler(frame, out=out, threads=2) is out
+    np.testing.assert_array_equal(out, expected)
+    read_only = expected.copy()
+    read_only.flags.writeable = False
+    for wrong in (expected.astype(np.float64), expected[:-1], read_only, expected.transpose(),
+                  np.empty((*expected.shape, 2), np.float32)[..., 0]):  # fmt: skip
+        with pytest.raises(ValueError, match="out must be .* of float32 with shape"):
+            sampler(frame, wrong)
+
+
+def test_threads_of_python_may_share_a_sampler():
+    sampler = frames.Sampler(frames.plan(layer(32, 64, (4, 4)), ROUND, (200, 200)))
+    pictures = [random_frame(200, 200, 3, seed=seed) for seed in range(8)]
+    expected = [sampler(picture) for picture in pictures]
+    with ThreadPoolExecutor(4) as pool:
+        for _ in range(5):
+            for found, right in zip(
+                pool.map(lambda p: sampler(p, threads=2), pictures), expected, strict=True
+            ):
+                np.testing.assert_array_equal(found, right)
+
+
+@pytest.mark.parametrize(
+    ("frame", "error", "words"),
+    [
+        (random_frame(60, 50, 3), ValueError, r"\(H, W\) = \(50, 60\), got \(60, 50\)"),
+        (random_frame(50, 60, 4), ValueError, r"shape \(H, W\).*got \(50, 60, 4\)"),
+        (random_frame(50, 60)[0], ValueError, r"shape \(H, W\).*got \(60\)"),
+        (random_frame(50, 60), ValueError, "plan's 3 channels, got 1"),
+        (random_frame(50, 60, 3).astype(np.float32), TypeError, "array of uint8, got float32"),
+        (random_frame(50, 60, 3).astype(np.int8), TypeError, "array of uint8, got int8"),
+        (random_frame(50, 60, 3).tolist(), TypeError, "array of uint8, got .*list"),
+        (torch.zeros(50, 60, 3, dtype=torch.uint8), TypeError, "array of uint8, got .*Tensor"),
+    ],
+)
+def test_wrong_frames_are_explained(frame, error, words):
+    sampler = frames.Sampler(frames.plan(layer(), ROUND, (50, 60)))
+    with pytest.raises(error, match=words) as caught:
+        sampler(frame)
+    assert "\n" not in str(caught.value)
+    with pytest.raises(ValueError, match="threads must be at least 1"):
+        sampler(random_frame(50, 60, 3), threads=0)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "options", "error", "words"),
+    [
+        ((layer(), CAMERAS[0], (50, 60)), {}, ValueError, "lens belongs to images of"),
+        ((layer(), Equidistant([9.0, 8.0]), (50, 60)), {}, ValueError, "one lens, got 2"),
+        ((layer(), ROUND, (50, 40_000)), {}, ValueError, "at most 32767 pixels"),
+        ((layer(), ROUND, (0, 60)), {}, ValueError, "size must be"),
+        ((layer(), ROUND, (50, 60)), dict(output="jpeg"), ValueError, "output must be one of"),
+        ((perspective((4, 5), 1.0), ROUND, (50, 60)), dict(output="tokens"), ValueError,
+         "only a polar grid has tokens"),
+        ((perspective((4, 5), 1.0)[0], ROUND, (50, 60)), {}, ValueError, r"shape \(H, W, 3\)"),
+        ((torch.nn.Linear(1, 1), ROUND, (50, 60)), {}, TypeError, "got Linear"),
+        ((create_model("swin_nano"), ROUND, (32, 32)), {}, ValueError, "needs no plan"),
+        ((layer(), None, (50, 60)), {}, TypeError, "lens must be"),
+    ],
+)  # fmt: skip
+def test_wrong_plans_are_explained(arguments, options, error, words):
+    with pytest.raises(error, match=words):
+        frames.plan(*arguments, **options)
+
+
+def test_the_released_model_has_no_plan():
+    model = OfficialDarSwin(embed_dim=24, depths=(1, 1), num_heads=(1, 2), samples=(4, 4))
+    lens = Polynomial([10.0], 1.5)
+    with pytest.raises(ValueError, match="transposed"):
+        frames.plan(model, lens, (64, 64))
+
+
+def file_of(plan) -> bytes:
+    file = io.BytesIO()
+    np.savez(file, darswin_plan=1, **vars(plan))
+    return file.getvalue()
+
+
+PLAN = frames.plan(layer(), ROUND, (50, 60))
+
+
+@given(st.integers(0, len(file_of(PLAN)) - 1), st.binary(max_size=3))
+def test_damaged_files_are_refused_or_harmless(tmp_path_factory, place, noise):
+    path = tmp_path_factory.mktemp("plans") / "camera.npz"
+    content = file_of(PLAN)
+    # Without noise the file is cut.
+    path.write_bytes(content[:place] + noise + content[place + len(noise) :] * bool(noise))
+    try:
+        sampler = frames.Sampler(path)
+    except ValueError as error:
+        assert "plan" in str(error)
+        return
+    height, width = sampler.plan.size
+    assert sampler(random_frame(height, width, 3)).dtype == np.float32
+
+
+@given(st.integers(0, 2**31), st.sampled_from(LAYOUTS))
+def test_plans_with_any_places_stay_inside_the_frame(seed, layout):
+    rng = np.random.default_rng(seed)
+    shape = PLAN.right.shape
+    columns, rows = rng.integers(-(2**15), 2**15, (2, *shape)).astype(np.int16)
+    near = rng.random(shape) < 0.7
+    columns, rows = np.where(near, columns % 64 - 2, columns), np.where(near, rows % 54 - 2, rows)
+    right, lower = rng.random((2, *shape), np.float32)
+    plan = replace(PLAN, columns=columns.astype(np.int16), rows=rows.astype(np.int16),
+                   right=right, lower=lower, mean=(0.0,), std=(1 / 255,))  # fmt: skip
+    frame = random_frame(50, 60, 3, seed=seed)
+    found = frames.Sampler(plan)(in_layout(frame, layout))
+    expected = reference(frame, columns + right.astype(np.float64), rows + lower)
+    np.testing.assert_allclose(found, expected.reshape(found.shape), atol=1e-2)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        dict(columns=PLAN.columns[:-1]),
+        dict(rows=PLAN.rows[..., :1]),
+        dict(right=PLAN.right + 1.5),
+        dict(lower=PLAN.lower * np.nan),
+        dict(output="image"),
+        dict(output="picture"),
+        dict(size=(0, 60)),
+        dict(size=(50, 2**40)),
+        dict(size=(50.5, 60)),
+        dict(mean=(0.0, 1.0)),
+        dict(std=(0.0, 1.0, 1.0)),
+        dict(mean=(0.0,) * 2, std=(1.0,) * 2),
+        dict(columns=np.array(["a"])),
+    ],
+    ids=str,
+)
+def test_plans_that_do_not_fit_together_are_refused(changes, tmp_path):
+    with pytest.raises(ValueError, match="plan"):
+        frames.Sampler(replace(PLAN, **changes))
+
+
+def test_files_of_other_kinds_are_refused(tmp_path):
+    path = tmp_path / "camera.npz"
+    with pytest.raises(FileNotFoundError):
+        frames.Sampler(path)
+    for content in (b"", b"not a plan", b"PK\x03\x04"):
+        path.write_bytes(content)
+        with pytest.raises(ValueError, match=r"camera\.npz is no plan"):
+            frames.Sampler(path)
+    np.savez(path, other=1)
+    with pytest.raises(ValueError, match="is no plan"):
+        frames.Sampler(path)
+    np.savez(path, darswin_plan=2, something=1)
+    with pytest.raises(ValueError, match="newer version of darswin"):
+        frames.Sampler(path)
+    np.savez(path, darswin_plan=1, size=(1, 2))
+    with pytest.raises(ValueError, match="damaged plan"):
+        frames.Sampler(path)
+
+
+def test_raw_calls_are_checked():
+    radii, azimuths = np.ones(4, np.float32), np.ones(6, np.float32)
+    for center, affine, offsets in [
+        (np.ones(3), None, None), (np.ones(2), np.ones(3), None), (np.ones(2), None, np.ones(5)),
+    ]:  # fmt: skip
+        with pytest.raises(ValueError, match="do not fit together"):
+            _frames.polar_places(radii, azimuths, center, affine, offsets, (9, 9))
+    for nothing in (radii[:0], radii):
+        columns, *_ = _frames.polar_places(
+            nothing, azimuths[: len(nothing)], np.full(2, math.nan), None, None, (9, 9)
+        )
+        assert columns.shape == (len(nothing), len(nothing)) and (columns == -3).all()
+
+
+@pytest.mark.slow
+def test_frames_are_sampled_without_torch(tmp_path):
+    plan, frame = frames.plan(layer(), ROUND, (50, 60)), random_frame(50, 60, 3)
+    plan.save(tmp_path / "camera.npz")
+    np.save(tmp_path / "frame.npy", frame)
+    code = """if True:
+        import sys
+        import numpy as np
+        import darswin.frames
+        sampler = darswin.frames.Sampler("camera.npz")
+        np.save("tokens.npy", sampler(np.load("frame.npy")))
+        assert not {"torch", "cv2"} & set(sys.modules)
+    """
+    subprocess.run([sys.executable, "-c", code], cwd=tmp_path, check=True)
+    found = np.load(tmp_path / "tokens.npy")
+    np.testing.assert_array_equal(found, by_operator(layer(), ROUND, frame))
