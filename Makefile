@@ -105,12 +105,12 @@ lint: $(STAMP)  ## check the code with ruff, mypy and clang-format
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
-	$(BIN)/clang-format --dry-run --Werror $$(find csrc -name '*.h' -o -name '*.cpp')
+	$(BIN)/clang-format --dry-run --Werror $$(find csrc examples -name '*.h' -o -name '*.cpp')
 
 format: $(STAMP)  ## format the code with ruff and clang-format
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
-	$(BIN)/clang-format -i $$(find csrc -name '*.h' -o -name '*.cpp')
+	$(BIN)/clang-format -i $$(find csrc examples -name '*.h' -o -name '*.cpp')
 
 bench: build  ## time the operators against alternatives, and training; run nothing else meanwhile
 	$(BIN)/python benchmarks/sampling.py --out benchmarks/results

@@ -161,7 +161,9 @@ def export_package(
 ) -> None:
     """Compiles the graph of `export_program` with AOTInductor, and writes it as a package.
 
-    A package for CPUs takes expanded, cropped or transposed tensors too.
+    A package for CPUs takes expanded, cropped or transposed tensors too. It does not check its
+    inputs. Its metadata contains the dtype and the size of one row of each input, by name: for
+    example "uint8 [480, 640, 3]" for "images".
 
     Args:
         path: of the file, which must end in ".pt2".
@@ -169,8 +171,20 @@ def export_package(
     The other arguments and the errors are those of `export_program`.
     """
     program = export_program(model, images, lens, fixed_lens=fixed_lens, input=input)
+    positional, named = program.example_inputs or ((), {})
+    tensors = dict(
+        zip(program.graph_signature.user_inputs, (*positional, *named.values()), strict=True)
+    )
+    rows = {
+        name: f"{str(tensor.dtype).removeprefix('torch.')} {list(tensor.shape[1:])}"
+        for name, tensor in tensors.items()
+    }
     with Progress("compiling the graph"):
-        torch._inductor.aoti_compile_and_package(program, package_path=os.fspath(path))
+        torch._inductor.aoti_compile_and_package(
+            program,
+            package_path=os.fspath(path),
+            inductor_configs={"aot_inductor.metadata": rows},
+        )
 
 
 def export_onnx(

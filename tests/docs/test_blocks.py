@@ -180,6 +180,22 @@ def check_study(arguments: list[str], monkeypatch) -> None:
     assert end.value.code in (0, None)
 
 
+def check_cmake(arguments: list[str], monkeypatch) -> None:
+    """Tests of the deployment build what this block builds."""
+    if arguments[0] == "-S":
+        assert (ROOT / arguments[1] / "CMakeLists.txt").is_file() and arguments[2] == "-B"
+
+
+def check_classify(arguments: list[str], monkeypatch) -> None:
+    """The files were written by the page, and the answer is the one it prints."""
+    assert all(Path(file).is_file() for file in arguments)
+    package, picture = arguments
+    pixels = torch.from_numpy(cv2.imread(picture, cv2.IMREAD_GRAYSCALE))[None, ..., None]
+    probability, label = torch._inductor.aoti_load_package(package)(pixels).softmax(1).max(1)
+    shown = f"class {label.item()}, probability {probability.item():.3f}"
+    assert shown in (ROOT / "docs/tutorials/deploy.md").read_text()
+
+
 def write_rooms(arguments: list[str], monkeypatch) -> None:
     """Runs the program that the page names, for a few pictures."""
     monkeypatch.setattr(sys, "argv", [*arguments, "--count", "12"])
@@ -193,6 +209,8 @@ def run_program(arguments: list[str], monkeypatch) -> None:
 
 
 PROGRAMS: dict[str, Callable] = {
+    "build/classify/classify": check_classify,
+    "cmake": check_cmake,
     "darswin": run_darswin,
     "make": check_make,
     "pip": check_pip,
