@@ -117,6 +117,7 @@ bench: build  ## time the operators against alternatives, and training; run noth
 	$(BIN)/python benchmarks/attention.py --out benchmarks/results
 	$(BIN)/python benchmarks/to_image.py --out benchmarks/results
 	$(BIN)/python benchmarks/one_frame.py --out benchmarks/results
+	$(BIN)/python benchmarks/frames.py --out benchmarks/results
 	$(BIN)/python benchmarks/training.py --out benchmarks/results
 	$(BIN)/python -m darswin bench --out benchmarks/results
 

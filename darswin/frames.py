@@ -3,8 +3,9 @@
 `plan` finds once, with torch, where a network or a view reads the frames of one calibrated camera.
 `Sampler` reads them there, and its imports are NumPy alone:
 
-    darswin.frames.plan(model, lens, (1080, 1920)).save("camera.npz")   # once
-    sampler = darswin.frames.Sampler("camera.npz")                      # in the program of the camera
+    darswin.frames.plan(model, lens, (1080, 1920)).save("camera.npz")  # once
+
+    sampler = darswin.frames.Sampler("camera.npz")  # in the camera's program
     tokens = sampler(frame)
 
 A graph that `export_onnx(..., input="tokens")` wrote takes the tokens, with a batch axis in front.
@@ -104,7 +105,10 @@ class Plan:
         try:
             height, width = content["size"].tolist()
             return cls(
-                *(content[key] for key in ("columns", "rows", "right", "lower")),
+                columns=content["columns"],
+                rows=content["rows"],
+                right=content["right"],
+                lower=content["lower"],
                 size=(height, width),
                 output=content["output"].item(),
                 mean=tuple(content["mean"].tolist()),
@@ -122,8 +126,8 @@ class Sampler(_frames.Sampler):
     `frame[..., ::-1]` turns OpenCV's BGR into RGB at no cost. It returns the plan's `output`. It
     runs without Python's lock, and several threads may call one sampler.
 
-    `out` is an array for the result: C-contiguous, with its shape and type. `threads` is the largest
-    number of threads; small plans use fewer. The tokens and the polar image are those of
+    `out` is an array for the result: C-contiguous, with its shape and type. `threads` is the most
+    threads to use; small plans use fewer. The tokens and the polar image are those of
     `darswin.ops.polar_sample`, bit for bit.
 
     Args:

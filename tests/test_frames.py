@@ -185,7 +185,7 @@ def test_wrapped_models_have_plans():
     np.testing.assert_array_equal(plan.right, frames.plan(encoder, ROUND, (64, 64)).right)
     adapter = LensAdapter(torch.nn.Identity(), 32)
     view = frames.Sampler(frames.plan(adapter, ROUND, (64, 64)))(random_frame(64, 64, 3))
-    assert view.shape == (3, 32, 32) and 0 <= view.min() and view.max() <= 1
+    assert view.shape == (3, 32, 32) and view.min() >= 0 and view.max() <= 1
 
 
 def test_a_file_holds_the_plan(tmp_path):
@@ -212,7 +212,7 @@ def test_out_takes_the_result():
     read_only.flags.writeable = False
     for wrong in (expected.astype(np.float64), expected[:-1], read_only, expected.transpose(),
                   np.empty((*expected.shape, 2), np.float32)[..., 0]):  # fmt: skip
-        with pytest.raises(ValueError, match="out must be .* of float32 with shape"):
+        with pytest.raises(ValueError, match=r"out must be .* of float32 with shape"):
             sampler(frame, wrong)
 
 

@@ -69,9 +69,10 @@ def _spec(model: Any) -> Any:
 
 def _on_grid(grid: PolarGrid, samples: Pair, size: Pair, output: str) -> dict[str, Any]:
     """The places of a polar grid of one lens."""
-    radii, azimuths, center, _, affine, offsets = (
-        None if tensor is None else tensor.float().numpy() for tensor in grid
+    affine, offsets = (
+        None if x is None else x.float().numpy() for x in (grid.affine, grid.offsets)
     )
+    radii, azimuths, center = (x.float().numpy() for x in (grid.radii, grid.azimuths, grid.center))
     *arrays, packed = _frames.polar_places(radii, azimuths, center, affine, offsets, size)
     if output == "tokens":
         (rows, columns), (sr, sa) = arrays[0].shape, samples

@@ -1,0 +1,31 @@
+from collections.abc import Sequence
+
+import numpy as np
+
+class Sampler:
+    def __init__(
+        self,
+        columns: np.ndarray,
+        rows: np.ndarray,
+        right: np.ndarray,
+        lower: np.ndarray,
+        size: tuple[int, int],
+        scale: Sequence[float],
+        offset: Sequence[float],
+        normalize_first: bool,
+        output: str,
+        /,
+    ) -> None: ...
+    def __call__(
+        self, frame: np.ndarray, out: np.ndarray | None = None, threads: int = 1
+    ) -> np.ndarray: ...
+
+def polar_places(
+    radii: np.ndarray,
+    azimuths: np.ndarray,
+    center: np.ndarray,
+    affine: np.ndarray | None,
+    offsets: np.ndarray | None,
+    size: tuple[int, int],
+    /,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, bool]: ...
