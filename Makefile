@@ -19,7 +19,7 @@ $(STAMP): requirements.txt pyproject.toml setup.py
 	@PATH=$(CURDIR)/$(BIN):$$PATH $(BIN)/pip install -q --no-build-isolation --no-deps -e .
 	@touch $@
 
-build: $(STAMP)  ## (re)build darswin/libdarswin.so in place
+build: $(STAMP)  ## (re)build the compiled modules in place
 	@PATH=$(CURDIR)/$(BIN):$$PATH $(BIN)/python setup.py -q build_ext --inplace
 
 demo: build  ## train on nearly undistorted digits, test through fisheye lenses, draw a figure (2 minutes)
@@ -69,7 +69,7 @@ test-isa: build  ## test the operators on every instruction-set tier of this mac
 	@set -e; for tier in $$($(BIN)/python -c 'from darswin.ops import _module; print(*_module.tiers())'); do \
 	  echo "== $$tier"; \
 	  ATEN_CPU_CAPABILITY=$$(echo $$tier | sed s/generic/default/) \
-	    $(PYTEST) -q tests/ops \
+	    $(PYTEST) -q tests/ops tests/test_frames.py \
 	      tests/test_build.py::test_the_tier_in_use_is_the_one_asked_for; \
 	done
 
@@ -88,7 +88,7 @@ test-asan: build  ## test the operators on every tier with AddressSanitizer and 
 	  LD_PRELOAD="$(PRELOAD)" ASAN_OPTIONS=detect_leaks=0:allocator_may_return_null=1 \
 	  UBSAN_OPTIONS=print_stacktrace=1 ATEN_CPU_CAPABILITY=$$(echo $$tier | sed s/generic/default/) \
 	    $(PYTEST) -q -c $(CURDIR)/pyproject.toml --rootdir $(CURDIR) \
-	      -m "not unsanitized" $(CURDIR)/tests/ops; \
+	      -m "not unsanitized" $(CURDIR)/tests/ops $(CURDIR)/tests/test_frames.py; \
 	done
 
 fuzz: build  ## call the operators with random and hostile arguments, and read 100,000 wrong calibrations (40 minutes)
@@ -148,11 +148,13 @@ docs: build  ## build the site of docs/ in build/docs; warnings are errors
 dist: $(STAMP)  ## build the sdist and the wheel in dist/
 	PATH=$(CURDIR)/$(BIN):$$PATH $(BIN)/python -m build --no-isolation --outdir dist
 
-# One wheel of a platform serves every Python. It uses the libraries of torch, which is imported
-# first. cibuildwheel makes the published wheels; it runs `repair` and tests/installed.py too.
+# One wheel of a platform serves every Python; darswin.frames works with those that are found here.
+# The wheel uses the libraries of torch, which is imported first. cibuildwheel makes the published wheels; it runs `repair` and tests/installed.py too.
+PYTHONS = $(foreach minor,11 12 13 14,$(shell command -v python3.$(minor)))
 wheels: $(STAMP)  ## build the manylinux_2_28 wheel in dist/, and test it in a fresh environment
 	rm -rf build/wheel
-	PATH=$(CURDIR)/$(BIN):$$PATH $(BIN)/python -m build --no-isolation --wheel --outdir build/wheel
+	PATH=$(CURDIR)/$(BIN):$$PATH DARSWIN_PYTHONS="$(PYTHONS)" \
+	  $(BIN)/python -m build --no-isolation --wheel --outdir build/wheel
 	PATH=$(CURDIR)/$(BIN):$$PATH $(MAKE) repair WHEEL="$$(echo build/wheel/*.whl)"
 	$(MAKE) test-torch
 
@@ -161,7 +163,8 @@ repair:
 	auditwheel repair --plat manylinux_2_28_$$(uname -m) --only-plat --wheel-dir "$(DEST)" \
 	  --exclude 'libtorch*' --exclude 'libc10*' --exclude 'libgomp*' "$(WHEEL)"
 
-published-wheels: $(STAMP)  ## build the same wheel with cibuildwheel in the manylinux_2_28 container; needs Docker
+published-PYTHONS = $(foreach minor,11 12 13 14,$(shell command -v python3.$(minor)))
+wheels: $(STAMP)  ## build the same wheel with cibuildwheel in the manylinux_2_28 container; needs Docker
 	$(BIN)/cibuildwheel --output-dir dist
 
 # The versions of torch to test the wheel of `make wheels` with, each in a fresh environment.

@@ -16,14 +16,18 @@ ROOT = Path(__file__).resolve().parent
 
 
 def pythons() -> str:
-    """CMake's list DARSWIN_PYTHONS: this Python, and the others that DARSWIN_PYTHONS names."""
+    """CMake's list DARSWIN_PYTHONS: this Python, and the others that the environment names."""
     code = (
         "import sysconfig; print(sysconfig.get_config_var('EXT_SUFFIX'), "
         "sysconfig.get_path('include'), sep=':')"
     )
-    commands = [sys.executable, *os.environ.get("DARSWIN_PYTHONS", "").split()]
-    found = [subprocess.check_output([python, "-c", code], text=True) for python in commands]
-    return ";".join(dict.fromkeys(line.strip() for line in found))
+    found = {}
+    for python in (sys.executable, *os.environ.get("DARSWIN_PYTHONS", "").split()):
+        entry = subprocess.check_output([python, "-c", code], text=True).strip()
+        suffix, _, include = entry.partition(":")
+        if Path(include, "Python.h").exists():
+            found.setdefault(suffix, entry)
+    return ";".join(found.values())
 
 
 class CMakeBuild(build_ext):

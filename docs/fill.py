@@ -30,7 +30,7 @@ CPUS = {
     "amd-epyc-25-17-avx512": "Zen 4",
     "amd-epyc-avx512": "Zen 5",
 }
-SUITES = ("sampling", "to_image", "attention", "model", "one_frame")
+SUITES = ("sampling", "to_image", "attention", "model", "one_frame", "frames")
 
 SAMPLING_PEERS = ("F.grid_sample", "F.grid_sample + permute", "cv2.remap")
 FRAME_PEERS = ("eager model", "ONNX Runtime", "OpenVINO", "AOTInductor package")
@@ -85,6 +85,16 @@ def frame_line(timings: Sequence[Timing]) -> str:
     return f"For one frame on one core, these models are {first}.\nThey are {' and '.join(others)}."
 
 
+def frames_table(timings: Sequence[Timing]) -> str:
+    """A row for each size of frames and samples, with the peers' times over those of the sampler."""
+    peers = [name for name in dict.fromkeys(t.name for t in timings) if name != OURS]
+    rows = []
+    for (setting, *_), found in bench.by_case(timings).items():
+        ours = " / ".join(f"{1e6 * t.median:.3g}" for t in found[OURS])
+        rows.append([setting, ours, *(bench.ratios(found[peer]) for peer in peers)])
+    return bench.markdown(["frame → samples", "ours (µs)", *peers], rows)
+
+
 def demo_table(record: dict) -> str:
     """A row a model, a column a lens: the mean of the seeds."""
     rows = [
@@ -103,7 +113,7 @@ def tables() -> dict[str, str]:
 
     studies = ROOT / "studies" / "results"
     suites = {suite: records(suite) for suite in SUITES}
-    sampling, to_image, attention, model, frames = (
+    sampling, to_image, attention, model, one_frame, frames = (
         next(iter(suites[suite].values())) for suite in SUITES
     )
     cpus = {
@@ -123,8 +133,9 @@ def tables() -> dict[str, str]:
         "cpus": peers.best_table(cpus, SPEED),
         "missed": peers.missed_table([*sampling.timings, *to_image.timings, *attention.timings]),
         "model": bench.models_table(model.timings),
-        "frame line": frame_line(frames.timings),
-        "one frame": peers.frames_table(frames.timings, FRAME_PEERS),
+        "frame line": frame_line(one_frame.timings),
+        "one frame": peers.frames_table(one_frame.timings, FRAME_PEERS),
+        "frames": frames_table(frames.timings),
         "model int8": bench.quantized_table(model.timings),
         "model memory": bench.memory_table(model.memory),
         "sampling": peers.peers_table(sampling.timings, "polar_sample", SAMPLING_PEERS),

@@ -1,4 +1,5 @@
-"""Runs the operators' tests on the darswin that this Python has installed, not on the checkout's.
+"""Runs tests on the darswin that this Python has installed, not on the checkout's: the tests of the
+operators and of darswin.frames.
 
     python tests/installed.py [options of pytest]
 
@@ -13,6 +14,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
+TESTS = [ROOT / "tests" / "ops", ROOT / "tests" / "test_frames.py"]
 
 
 def main(options: list[str]) -> int:
@@ -23,7 +25,7 @@ def main(options: list[str]) -> int:
     settings = ["-c", str(ROOT / "pyproject.toml"), "--rootdir", str(ROOT)]
     with tempfile.TemporaryDirectory() as elsewhere:
         os.chdir(elsewhere)
-        return pytest.main(["-q", *settings, *options, str(ROOT / "tests" / "ops")])
+        return pytest.main(["-q", *settings, *options, *map(str, TESTS)])
 
 
 if __name__ == "__main__":

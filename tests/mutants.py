@@ -179,7 +179,11 @@ class Worker:
             target = self.root / path
             target.parent.mkdir(parents=True, exist_ok=True)
             shutil.copy2(ROOT / path, target)
-        shutil.copy2(ROOT / "darswin" / "libdarswin.so", self.root / "darswin")
+        self.copy_modules()
+
+    def copy_modules(self) -> None:
+        for module in (ROOT / "darswin").glob("*.so"):
+            shutil.copy2(module, self.root / "darswin")
 
     def test(self, mutant: Mutant) -> str:
         """ "survived", or the reason why not: the first test that fails, "build" or "time"."""
@@ -196,7 +200,7 @@ class Worker:
         finally:
             file.write_text(before)
             if mutant.path.startswith("csrc"):
-                shutil.copy2(ROOT / "darswin" / "libdarswin.so", self.root / "darswin")
+                self.copy_modules()
 
     def check(self, path: str) -> str:
         """The result for a file without a change: "survived" if its tests pass."""

@@ -5,6 +5,7 @@ import os
 import re
 import subprocess
 import sys
+import sysconfig
 import tarfile
 import zipfile
 from pathlib import Path
@@ -13,6 +14,7 @@ import pytest
 import torch
 from torch_abi_audit import inspect_extension
 
+from darswin import _frames
 from darswin.ops import _module, cpu_capability, polar_sample
 
 ROOT = Path(__file__).parent.parent
@@ -88,7 +90,13 @@ def unpacked(tmp_path_factory) -> Path:
     with tarfile.open(sdist) as archive:
         archive.extractall(folder, filter="data")
     root = folder / sdist.name.removesuffix(".tar.gz")
-    output(*build, "--wheel", root, env={"CMAKE_BUILD_TYPE": "None"})
+    # Stands for a Python beside this one: the same headers, and another name of the module.
+    include = sysconfig.get_path("include")
+    another = folder / "another-python"
+    another.write_text(f"#!/bin/sh\necho .another-python.so:{include}\n")
+    another.chmod(0o755)
+    environment = {"CMAKE_BUILD_TYPE": "None", "DARSWIN_PYTHONS": str(another)}
+    output(*build, "--wheel", root, env=environment)
     return root
 
 
@@ -126,32 +134,42 @@ def test_the_module_keeps_to_the_stable_abi_of_torch_2_10():
     assert torch_abi.min_torch_version == "2.10.0" and not torch_abi.unknown_shim_symbols
 
 
-def test_the_module_holds_no_path_of_the_build_machine():
-    module = _module.FILE.read_bytes()
+FRAMES = Path(_frames.__file__)
+BOTH = pytest.mark.parametrize("path", [_module.FILE, FRAMES], ids=["libdarswin", "frames"])
+
+
+@BOTH
+def test_the_modules_hold_no_path_of_the_build_machine(path):
+    module = path.read_bytes()
     sources = re.findall(rb"[\w./+-]+\.(?:h|hpp|cpp)\b", module)
-    assert sources and not [name for name in sources if name.startswith(b"/")]
+    assert not [name for name in sources if name.startswith(b"/")]
     for folder in (ROOT, Path(torch.__file__).parent, sys.prefix, sys.base_prefix):
         assert str(folder).encode() not in module
-    dynamic = output("readelf", "-d", _module.FILE)
+    dynamic = output("readelf", "-d", path)
     assert "RPATH" not in dynamic and "RUNPATH" not in dynamic
     needed = [line for line in dynamic.splitlines() if "NEEDED" in line]
-    assert any("libtorch_cpu.so" in line for line in needed)
+    assert any("libtorch_cpu.so" in line for line in needed) == (path != FRAMES)
+    assert any("libgomp" in line for line in needed) == (path != FRAMES)
     assert not any("/" in line.split("[")[1] for line in needed)
 
 
-def test_the_module_exports_its_facts_only():
-    shown = output("nm", "-D", "--defined-only", _module.FILE)
-    exported = {line.split()[-1] for line in shown.splitlines()}
+def test_the_modules_export_no_more_than_needed():
     facts = {"tier", "tiers", "set_tier", "set_gathers", "build_info"}
-    assert exported == {f"darswin_{fact}" for fact in facts}
+    for path, names in [
+        (_module.FILE, {f"darswin_{fact}" for fact in facts}),
+        (FRAMES, {"PyInit__frames"}),
+    ]:
+        shown = output("nm", "-D", "--defined-only", path)
+        assert {line.split()[-1] for line in shown.splitlines()} == names
 
 
-def test_the_module_asks_for_nothing_newer_than_manylinux_2_28():
+@BOTH
+def test_the_modules_ask_for_nothing_newer_than_manylinux_2_28(path):
     major = int(re.search(r"g\+\+ (\d+)", _module.build_info()["compiler"])[1])
     if major > 12:
         pytest.skip("headers of a newer compiler may ask for more: use the container")
     newest = {"GLIBC": (2, 28), "GLIBCXX": (3, 4, 24), "CXXABI": (1, 3, 11)}
-    shown = output("readelf", "-V", _module.FILE)
+    shown = output("readelf", "-V", path)
     found = re.findall(r"Name: (GLIBC|GLIBCXX|CXXABI)_([\d.]+)", shown)
     assert {library for library, _ in found} == set(newest)
     for library, version in found:
@@ -193,7 +211,8 @@ def test_a_broken_module_names_its_file(tmp_path):
 def test_the_sdist_builds_a_wheel_that_runs_from_another_folder(unpacked, tmp_path):
     (wheel,) = (unpacked / "dist").glob("darswin-*-py3-none-linux_*.whl")
     names = zipfile.ZipFile(wheel).namelist()
-    assert [name for name in names if name.endswith(".so")] == ["darswin/libdarswin.so"]
+    modules = {name.removeprefix("darswin/") for name in names if name.endswith(".so")}
+    assert modules == {"libdarswin.so", FRAMES.name, "_frames.another-python.so"}
     assert all(name.startswith(("darswin/", "darswin-")) for name in names)
     elsewhere = tmp_path / "site"
     output(sys.executable, "-m", "pip", "install", "-q", "--no-deps", "--target", elsewhere, wheel)

@@ -228,6 +228,7 @@ py::tuple polar_places(const Array<float>& radii, const Array<float>& azimuths,
 
 PYBIND11_MODULE(_frames, m) {
   using darswin::Sampler;
+  m.doc() = "The compiled part of darswin.frames.";
   py::class_<Sampler>(m, "Sampler")
       .def(py::init<const darswin::Array<int16_t>&, const darswin::Array<int16_t>&,
                     const darswin::Array<float>&, const darswin::Array<float>&,

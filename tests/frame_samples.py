@@ -1,0 +1,25 @@
+"""Random frames for tests of darswin.frames, and their bilinear samples by NumPy."""
+
+import numpy as np
+
+from darswin.lens import Equidistant
+
+MEAN, STD = (0.4, 0.5, 0.6), (0.2, 0.25, 0.3)
+ROUND = Equidistant.from_fov(3.0, 24.0)
+
+
+def random_frame(height, width, *channels, seed=0):
+    rng = np.random.default_rng(seed)
+    return rng.integers(0, 256, (height, width, *channels), dtype=np.uint8)
+
+
+def bilinear(image, x, y):
+    """Bilinear samples of (H, W, C) in float64, with 0 outside."""
+    padded = np.pad(image.astype(np.float64), ((2, 2), (2, 2), (0, 0)))
+    x, y = np.clip(x, -2, image.shape[1]) + 2, np.clip(y, -2, image.shape[0]) + 2
+    column, row = np.floor(x).astype(int), np.floor(y).astype(int)
+    column, row = np.minimum(column, padded.shape[1] - 2), np.minimum(row, padded.shape[0] - 2)
+    right, lower = (x - column)[..., None], (y - row)[..., None]
+    top = padded[row, column] * (1 - right) + padded[row, column + 1] * right
+    bottom = padded[row + 1, column] * (1 - right) + padded[row + 1, column + 1] * right
+    return top * (1 - lower) + bottom * lower
