@@ -16,7 +16,7 @@ sys.path[:0] = [str(ROOT), str(ROOT / "studies"), str(ROOT / "benchmarks")]
 
 from darswin.bench import tables as bench  # noqa: E402
 from darswin.bench.record import Record  # noqa: E402
-from darswin.bench.timing import Timing  # noqa: E402
+from darswin.bench.timing import OURS, Timing  # noqa: E402
 
 RESULTS = ROOT / "benchmarks" / "results"
 PAGES = [
@@ -86,7 +86,7 @@ def frame_line(timings: Sequence[Timing]) -> str:
 
 
 def frames_table(timings: Sequence[Timing]) -> str:
-    """A row for each size of frames and samples, with the peers' times over those of the sampler."""
+    """A row for each size of frames and samples: the sampler, and the peers' times over its time."""
     peers = [name for name in dict.fromkeys(t.name for t in timings) if name != OURS]
     rows = []
     for (setting, *_), found in bench.by_case(timings).items():
