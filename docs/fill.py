@@ -86,7 +86,7 @@ def frame_line(timings: Sequence[Timing]) -> str:
 
 
 def frames_table(timings: Sequence[Timing]) -> str:
-    """A row for each size of frames and samples: the sampler, and the peers' times over its time."""
+    """A row for each size of frames and samples: our time, and the peers' times over it."""
     peers = [name for name in dict.fromkeys(t.name for t in timings) if name != OURS]
     rows = []
     for (setting, *_), found in bench.by_case(timings).items():

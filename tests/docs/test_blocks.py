@@ -25,6 +25,7 @@ import pytest
 import torch
 from helpers import fixture
 from scenes import write_plain, write_woodscape
+from videos import write_video
 
 from darswin.cli.bench import bench
 from darswin.cli.main import main
@@ -202,9 +203,18 @@ def write_rooms(arguments: list[str], monkeypatch) -> None:
     runpy.run_path(arguments[0], run_name="__main__")
 
 
+def classify_video(arguments: list[str], monkeypatch) -> None:
+    """Runs the program with a video of the camera, and the files that the page wrote."""
+    write_video(Path(arguments[1]), count=3, size=(966, 1280))
+    monkeypatch.setattr(sys, "argv", arguments)
+    runpy.run_path(arguments[0], run_name="__main__")
+
+
 def run_program(arguments: list[str], monkeypatch) -> None:
     studies = dict.fromkeys(("studies/study.py", "studies/dense.py"), check_study)
-    known = studies | {"examples/rooms.py": write_rooms}
+    known = studies | {
+        "examples/camera.py": classify_video, "examples/rooms.py": write_rooms
+    }  # fmt: skip
     known[arguments[0]](arguments, monkeypatch)
 
 
