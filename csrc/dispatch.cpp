@@ -9,7 +9,7 @@
 namespace darswin {
 namespace {
 
-bool has(Tier tier) {
+bool has([[maybe_unused]] Tier tier) {
 #if defined(__x86_64__)
   __builtin_cpu_init();
   const bool avx2 = __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma");
@@ -19,7 +19,7 @@ bool has(Tier tier) {
            __builtin_cpu_supports("avx512vl") && __builtin_cpu_supports("avx512dq");
   }
 #endif
-  return tier == Tier::generic;
+  return true;
 }
 
 std::optional<Tier> find(const char* name) {
@@ -33,7 +33,7 @@ Tier initial() {
   const Tier best = available_tiers().back();
   const char* wanted = std::getenv("ATEN_CPU_CAPABILITY");
   if (wanted == nullptr) return best;
-  if (std::strcmp(wanted, "default") == 0) return Tier::generic;
+  if (std::strcmp(wanted, "default") == 0) return available_tiers().front();
   // If the CPU lacks the tier, or the name is one that torch itself warns about, the best tier
   // stays.
   return find(wanted).value_or(best);
@@ -54,7 +54,7 @@ bool cpu_is_intel() {
 Tier current_tier() { return current.load(std::memory_order_relaxed); }
 
 const char* tier_name(Tier tier) {
-  constexpr const char* names[] = {"generic", "avx2", "avx512"};
+  constexpr const char* names[] = {"generic", "neon", "avx2", "avx512"};
   return names[static_cast<int>(tier)];
 }
 

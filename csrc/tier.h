@@ -9,9 +9,9 @@
 
 namespace darswin {
 
-// From low to high. A build has the first few tiers: those that CMakeLists.txt lists in
-// DARSWIN_TIERS. If the CPU is not an x86, this is only `generic`.
-enum class Tier { generic, avx2, avx512 };
+// From low to high. A build has those that CMakeLists.txt lists in DARSWIN_TIERS: `neon` alone for
+// ARM, all others for x86, and `generic` alone for other CPUs.
+enum class Tier { generic, neon, avx2, avx512 };
 
 // The kernels of one operator on one tier. `Table` is a struct of function pointers, which the
 // operator's header declares. kernels/OPERATOR.cpp defines `table`, on the tier that is being

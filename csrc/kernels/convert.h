@@ -19,12 +19,16 @@ inline V load(const bfloat16* from) {
     return (V)(__builtin_convertvector(bits, Vector<uint32_t, kCount<V>>) << 16);
   }
 }
+// Four bytes are widened with zeros. The compiler's own conversion takes one byte at a time.
 template <typename V>
 inline V load(const uint8_t* from) {
   if constexpr (is_same_v<V, float>) {
     return *from;
   } else {
-    return __builtin_convertvector(load_bits<Vector<uint8_t, kCount<V>>>(from), V);
+    static_assert(kCount<V> == 4);
+    const auto bytes = (Vector<uint8_t, 16>)Vector<uint32_t, 4>{load_bits<uint32_t>(from)};
+    const auto halves = (Vector<uint16_t, 8>)zipped(bytes, Vector<uint8_t, 16>{});
+    return __builtin_convertvector((Vector<int32_t, 4>)zipped(halves, Vector<uint16_t, 8>{}), V);
   }
 }
 

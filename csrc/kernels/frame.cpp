@@ -167,7 +167,7 @@ void write_block(const FrameArgs& a, int64_t first, int64_t count, const Block& 
   }
   uint8_t* to = static_cast<uint8_t*>(a.out) + first * a.channels;
   if (a.channels == 1) {
-    __builtin_memcpy(to, bytes[0], static_cast<size_t>(count));
+    __builtin_memcpy(to, bytes[0], count);
   } else {
     interleave_three(bytes[0], bytes[1], bytes[2], count, to);
   }

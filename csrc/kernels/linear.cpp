@@ -29,7 +29,7 @@ inline Floats gelu(Floats x) {
                              1.19833056e-1f,  1.39861846e-1f,  1.39621406e-1f};
   Floats tail = splat<Floats>(terms[0]);
 #pragma GCC unroll 16
-  for (size_t k = 1; k < sizeof(terms) / sizeof(float); ++k) tail = tail * t + terms[k];
+  for (std::size_t k = 1; k < sizeof(terms) / sizeof(float); ++k) tail = tail * t + terms[k];
   tail = tail * t * exponential_of_negative(size * size * -0.5f);
   return x < 0 ? x * tail : x * (1 - tail);  // also right at infinity
 }

@@ -15,6 +15,10 @@
 namespace darswin {
 namespace {
 
+// Four channels, or as many channels as a register holds.
+template <typename T>
+using Piece = Vector<T, (kLanes<T> < 4 ? kLanes<T> : 4)>;
+
 // The layout of a packed image. Pixel (x, y) of the image is pixel (x + 1, y + 1) of the packed
 // image. The layout is only computed for images that are packed, or whose gradient is packed: the
 // sizes of other images may not fit 64 bits.
@@ -67,7 +71,7 @@ inline void place(const PolarSampleArgs<T>& a, const Packed& packed, const Point
   const Doubles row = split<inside>(p.y, height, height + 1, places.lower + k);
   const Doubles offset =
       row * static_cast<double>(packed.row) + column * static_cast<double>(packed.pixel);
-  store(places.offset + k, __builtin_convertvector(offset, Vector<int32_t, kDoubles>));
+  store(places.offset + k, to_ints(offset));
 }
 
 // Places points in a far image. A point that touches no pixel gets column or row -3. `strides` are

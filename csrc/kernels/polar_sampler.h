@@ -26,10 +26,6 @@ inline V between(V a, V b, V t) {
   }
 }
 
-// Four channels, or as many channels as a register holds.
-template <typename T>
-using Piece = Vector<T, (kLanes<T> < 4 ? kLanes<T> : 4)>;
-
 // Writes four channels of a sample. The arguments are the upper left and the lower left pixel;
 // their right neighbours follow them in memory. With differences, the function also adds the sample
 // to *sum.

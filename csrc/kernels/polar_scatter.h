@@ -185,7 +185,7 @@ class Scatter {
   // Adds a point to those of its rows that are in the band.
   template <bool kBanded>
   void add_pixels(int64_t k, const T* block) const {
-    using V = Vector<T, 4>;
+    using V = Piece<T>;
     const V down = splat<V>(points.near.lower[k]), right = splat<V>(points.near.right[k]);
     const V up = 1 - down, left = 1 - right;
     const int64_t offset = points.near.offset[k], pixel = layout.pixel;
@@ -194,7 +194,7 @@ class Scatter {
     T* top = sums + offset;
     T* bottom = top + layout.row;
     const T* grad = block + k * a.channels;
-    for (int64_t c = 0; c < pixel; c += 4) {
+    for (int64_t c = 0; c < pixel; c += kCount<V>) {
       const V g = load<V>(grad + c), above = unfused(g * up), below = unfused(g * down);
       if (upper) {
         store(top + c, load<V>(top + c) + unfused(above * left));

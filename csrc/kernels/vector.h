@@ -73,6 +73,8 @@ template <typename V>
 inline V unfused(V value) {
 #if defined(__AVX__)
   asm("" : "+x"(value));
+#elif defined(__aarch64__)
+  asm("" : "+w"(value));
 #elif !defined(__SSE2__)
   asm("" : "+m"(value));
 #endif
@@ -106,6 +108,12 @@ inline V even_quads(V a, V b) {
 template <typename V>
 inline V odd_quads(V a, V b) {
   return shuffle<[](int i) { return i / 4 * 8 + 4 + i % 4; }>(a, b);
+}
+
+// Returns a0 b0 a1 b1 ..., from the first half of each vector.
+template <typename V>
+inline V zipped(V a, V b) {
+  return shuffle<[](int i) { return i / 2 + i % 2 * kCount<V>; }>(a, b);
 }
 
 // Writes the transpose of four rows of four. The rows of `to` are `stride` apart.

@@ -21,6 +21,10 @@ inline Floats repeat(Vector<float, 4> v) { return (Floats)_mm256_set_m128((__m12
 
 inline Doubles to_doubles(Vector<int32_t, 4> x) { return __builtin_convertvector(x, Doubles); }
 
+inline Vector<int32_t, 4> to_ints(Doubles x) {
+  return __builtin_convertvector(x, Vector<int32_t, 4>);
+}
+
 inline Doubles whole_part(Doubles x) {
   return (Doubles)_mm256_round_pd((__m256d)x, _MM_FROUND_TO_ZERO | _MM_FROUND_NO_EXC);
 }

@@ -27,6 +27,10 @@ inline Doubles to_doubles(Vector<int32_t, 8> x) {
   return (Doubles)_mm512_maskz_cvtepi32_pd(0xFF, (__m256i)x);
 }
 
+inline Vector<int32_t, 8> to_ints(Doubles x) {
+  return __builtin_convertvector(x, Vector<int32_t, 8>);
+}
+
 inline Doubles whole_part(Doubles x) {
   return (Doubles)_mm512_maskz_roundscale_pd(0xFF, (__m512d)x, _MM_FROUND_TO_ZERO);
 }

@@ -28,6 +28,11 @@ inline Floats repeat(Vector<float, 4> v) { return v; }
 
 inline Doubles to_doubles(Vector<int32_t, 2> x) { return __builtin_convertvector(x, Doubles); }
 
+// Returns the whole part of numbers below 2^31.
+inline Vector<int32_t, 2> to_ints(Doubles x) {
+  return __builtin_convertvector(x, Vector<int32_t, 2>);
+}
+
 // Returns the whole part of numbers below 2^63.
 inline Doubles whole_part(Doubles x) {
   return __builtin_convertvector(__builtin_convertvector(x, Vector<int64_t, 2>), Doubles);
