@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/installed
 
-.PHONY: help build demo test test-all test-triton test-gpu test-lowest test-isa test-asan fuzz kills mutants lint format bench bench-gpu study study-int8 learned-lens worlds study-dense tables docs dist wheels repair published-wheels test-torch aarch64 clean
+.PHONY: help build demo test test-all test-triton test-gpu test-lowest test-isa test-asan fuzz kills mutants lint format bench bench-gpu study study-int8 learned-lens worlds study-dense tables docs dist wheels repair published-wheels test-torch aarch64 test-aarch64 clean
 
 help:  ## print this list
 	@grep -E '^[a-z0-9-]+:.*##' Makefile | sed -E 's/:.*## /\t/' | expand -t 18
@@ -180,12 +180,37 @@ test-torch:  ## test the wheel with TORCH="2.10.0 2.11.0 …" on PYTHON; downloa
 	  $(SCRATCH)/bin/python tests/installed.py; \
 	done
 
-# Links against the libraries of torch's unpacked wheel for aarch64.
-aarch64: $(STAMP)  ## cross-compile for aarch64; needs g++-aarch64-linux-gnu and TORCH_DIR=…/torch
+# Debian's Python for aarch64, and torch with the other packages of the tests. An emulated pip
+# installs them. Later wheels of torch for aarch64 need CUDA's libraries.
+AARCH64 := build/aarch64
+AARCH64_PYTHON = $(CURDIR)/$(AARCH64)/root/usr/include/python3.11
+EMULATED = PYTHONPATH=$(CURDIR)/$(AARCH64):$(CURDIR)/$(AARCH64)/site qemu-aarch64 -cpu max \
+  -L $(CURDIR)/$(AARCH64)/root $(CURDIR)/$(AARCH64)/root/usr/bin/python3
+
+$(AARCH64)/installed: requirements.txt
+	rm -rf $(AARCH64)
+	mmdebstrap --quiet --variant=extract --arch=arm64 --skip=check/qemu \
+	  --include=libstdc++6,python3-dev,python3-pip bookworm $(AARCH64)/root
+	cp $(AARCH64)/root/usr/include/aarch64-linux-gnu/python3.11/pyconfig.h $(AARCH64_PYTHON)
+	$(EMULATED) -m pip install -q --target $(AARCH64)/site torch==2.10.0 \
+	  $$(grep -E '^(hypothesis|numpy|opencv-python-headless|pytest|pyyaml|safetensors|scikit-learn)==' \
+	    requirements.txt)
+	@touch $@
+
+# Needs `apt-get install g++-aarch64-linux-gnu mmdebstrap qemu-user`, and outside Debian also
+# debian-archive-keyring.
+aarch64: $(STAMP) $(AARCH64)/installed  ## cross-compile for ARM (aarch64); the Makefile lists the packages it needs
+	cp -r darswin $(AARCH64)
 	PATH=$(CURDIR)/$(BIN):$$PATH; cmake --log-level=NOTICE -S . -B build/cmake-aarch64 -G Ninja \
 	  -DCMAKE_SYSTEM_NAME=Linux -DCMAKE_SYSTEM_PROCESSOR=aarch64 \
-	  -DCMAKE_CXX_COMPILER=aarch64-linux-gnu-g++ -DTORCH_DIR="$(TORCH_DIR)" \
-	  -DDARSWIN_OUTPUT_DIR=$(CURDIR)/build/aarch64 && cmake --build build/cmake-aarch64
+	  -DCMAKE_CXX_COMPILER=aarch64-linux-gnu-g++ -DTORCH_DIR=$(CURDIR)/$(AARCH64)/site/torch \
+	  -DPYBIND11_DIR=$$(python -c 'import pybind11; print(pybind11.get_include())') \
+	  -DDARSWIN_PYTHONS=.cpython-311-aarch64-linux-gnu.so:$(AARCH64_PYTHON) \
+	  -DDARSWIN_OUTPUT_DIR=$(CURDIR)/$(AARCH64)/darswin && cmake --build build/cmake-aarch64
+
+test-aarch64: aarch64  ## test the operators on an emulated ARM CPU (20 minutes)
+	cd $(AARCH64) && OMP_NUM_THREADS=1 $(EMULATED) -m pytest -q -c $(CURDIR)/pyproject.toml \
+	  --rootdir $(CURDIR) -m "not slow" $(CURDIR)/tests/ops $(CURDIR)/tests/test_frames.py
 
 clean:  ## remove all build results
 	rm -rf build dist darswin.egg-info darswin/libdarswin.so darswin/_frames.*.so

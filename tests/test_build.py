@@ -30,8 +30,9 @@ def output(*command, **options) -> str:
 
 
 def test_the_tier_in_use_is_the_one_asked_for():
-    asked = os.environ.get("ATEN_CPU_CAPABILITY", _module.tiers()[-1])
-    assert cpu_capability() == {"default": "generic"}.get(asked, asked)
+    tiers = _module.tiers()
+    asked = os.environ.get("ATEN_CPU_CAPABILITY", tiers[-1])
+    assert cpu_capability() == {"default": tiers[0]}.get(asked, asked)
 
 
 def test_tiers_of_this_machine():
@@ -53,6 +54,24 @@ def test_environment_chooses_the_tier_at_load(asked, expected):
     found = output(sys.executable, "-c", code, env=dict(ATEN_CPU_CAPABILITY=asked))
     best = _module.tiers()[-1]
     assert found.strip() == (expected if expected in _module.tiers() else best)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("processor", "tiers"),
+    [("x86_64", "generic,avx2,avx512"), ("aarch64", "neon"), ("riscv64", "generic")],
+)
+def test_tiers_of_each_processor(processor, tiers, tmp_path):
+    settings = dict(
+        CMAKE_SYSTEM_NAME="Linux",
+        CMAKE_SYSTEM_PROCESSOR=processor,
+        TORCH_DIR=Path(torch.__file__).parent,
+    )
+    defined = [f"-D{name}={value}" for name, value in settings.items()]
+    output("cmake", "-G", "Ninja", "-S", ROOT, "-B", tmp_path, *defined)
+    commands = (tmp_path / "compile_commands.json").read_text()
+    assert f"-DDARSWIN_TIERS={tiers} " in commands
+    assert set(re.findall(r"-DTIER=(\w+)", commands)) == set(tiers.split(","))
 
 
 def test_tiers_can_be_forced_and_agree():

@@ -1,6 +1,6 @@
 // Vector code for all tiers. It is written once, for registers of kRegister bytes. The flags of the
-// tier turn it into SSE, AVX2 or AVX-512 code. a*b + c becomes one fused instruction if the tier
-// has it.
+// tier turn it into SSE, AVX2, AVX-512 or NEON code. a*b + c becomes one fused instruction if the
+// tier has it.
 #pragma once
 
 #include <cstdint>

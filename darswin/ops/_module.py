@@ -42,10 +42,10 @@ def load() -> ctypes.CDLL:
 
 
 def cpu_capability() -> str:
-    """The instruction-set tier that the operators run on: "generic", "avx2" or "avx512".
+    """The instruction-set tier that the operators run on: "generic", "avx2", "avx512" or "neon".
 
     By default it is the best tier of this CPU. The environment variable ATEN_CPU_CAPABILITY
-    (default, avx2, avx512) lowers it, as in torch.
+    (default, avx2, avx512) lowers it, as in torch. ARM CPUs have only "neon".
     """
     return _loaded.darswin_tier().decode()
 

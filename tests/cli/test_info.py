@@ -7,7 +7,7 @@ import torch
 import darswin
 from darswin.cli.info import EXTRAS, facts
 from darswin.cli.main import main
-from darswin.ops import cpu_capability
+from darswin.ops import _module, cpu_capability
 
 ROOT = Path(__file__).parent.parent.parent
 
@@ -17,7 +17,7 @@ def test_facts_of_this_machine(capsys):
     lines = dict(line.split(maxsplit=1) for line in capsys.readouterr().out.splitlines())
     assert lines["darswin"].startswith(darswin.__version__)
     assert lines["torch"] == torch.__version__
-    assert lines["tier"].startswith(f"{cpu_capability()}, of generic")
+    assert lines["tier"].startswith(f"{cpu_capability()}, of {_module.tiers()[0]}")
     assert all(lines[f"[{extra}]"] == "installed" for extra in EXTRAS)
 
 
