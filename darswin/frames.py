@@ -98,7 +98,14 @@ class Plan:
             with np.load(path, allow_pickle=False) as file:
                 content = dict(file)
             version = int(content.pop("darswin_plan"))
-        except (ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
+        except (
+            ValueError,
+            KeyError,
+            TypeError,
+            EOFError,
+            RuntimeError,
+            zipfile.BadZipFile,
+        ) as error:
             raise ValueError(f"{name} is no plan of darswin.frames, or it is damaged") from error
         if version > _VERSION:
             raise ValueError(f"{name} comes from a newer version of darswin: update darswin")
