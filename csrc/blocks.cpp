@@ -3,6 +3,7 @@
 // For a small block, the Python calls take longer than its arithmetic. So all blocks of a stage are
 // one operator, which calls kernel after kernel.
 #include <algorithm>
+#include <bit>
 #include <cmath>
 #include <vector>
 
@@ -15,25 +16,61 @@ namespace {
 
 constexpr char kName[] = "_blocks_";
 
-const float* floats(const Tensor& tensor, int64_t count) {
-  STD_TORCH_CHECK(tensor.is_cpu() && tensor.scalar_type() == ScalarType::Float &&
-                      tensor.is_contiguous() && tensor.numel() == count,
+void check_parameter(const Tensor& tensor, ScalarType type, int64_t count) {
+  STD_TORCH_CHECK(tensor.is_cpu() && tensor.scalar_type() == type && tensor.is_contiguous() &&
+                      tensor.numel() == count,
                   kName, ": a parameter has a wrong type, layout or number of values");
-  return pointer<float>(tensor);
 }
 
-// Writes the linear layer of x to `out`, or its GELU, or adds it to `out`. The threads share the
-// rows of a long map, or the columns of the result of a short map.
-void multiply(const float* x, int64_t rows, int64_t depth, const Tensor& packed, int64_t columns,
-              float* out, After after = After::nothing) {
-  LinearArgs args{x, nullptr, out, rows, depth, columns, after};
-  args.packed = floats(packed, packed_size(args));
-  const auto& kernel = kernels<LinearKernels>().rows;
-  constexpr int64_t kRows = 8;             // ranges begin at a multiple: no tile of rows is cut
-  constexpr double kPerMicrosecond = 5e4;  // multiply-adds, on a CPU with AVX2
+// A packed linear layer. If its words are int32, it is quantized and reads tokens of 8 bits.
+struct Layer {
+  const Tensor& packed;
+  int64_t depth, columns;
+  bool is_quantized = packed.scalar_type() == ScalarType::Int;
+  float scale = 1;           // of a step of its tokens
+  Quantizer quantizer = {};  // of its tokens
+
+  Layer(const Tensor& packed_, int64_t depth_, int64_t columns_)
+      : packed(packed_), depth(depth_), columns(columns_) {
+    if (!is_quantized) {
+      check_parameter(packed, ScalarType::Float, layer_words<float>(depth, columns));
+      return;
+    }
+    STD_TORCH_CHECK(kernels<LinearKernels<uint8_t>>().rows != nullptr && cpu_has_vnni(), kName,
+                    ": this tier or this CPU has no products of 8 bits");
+    STD_TORCH_CHECK(depth <= kMostDepth, kName, ": sums of so many products do not fit 32 bits");
+    const int64_t count = layer_words<uint8_t>(depth, columns);
+    check_parameter(packed, ScalarType::Int, count + 3);
+    const auto* last = pointer<int32_t>(packed) + count;
+    scale = std::bit_cast<float>(last[0]);
+    quantizer = {std::bit_cast<float>(last[1]), last[2]};
+  }
+};
+
+template <typename X>
+void multiply(const X* x, int64_t rows, const Layer& layer, void* out, After after,
+              const Layer* next) {
+  const int64_t depth = layer.depth, columns = layer.columns;
+  LinearArgs<X> args{.x = x,
+                     .packed = layer.packed.const_data_ptr(),
+                     .rows = rows,
+                     .depth = depth,
+                     .columns = columns,
+                     .scale = layer.scale,
+                     .after = after};
+  if (next != nullptr && next->is_quantized) {
+    args.quantized = static_cast<uint8_t*>(out);
+    args.quantizer = next->quantizer;
+  } else {
+    args.out = static_cast<float*>(out);
+  }
+  const auto& kernel = kernels<LinearKernels<X>>().rows;
+  constexpr int64_t kRows = 8;  // ranges begin at a multiple: no tile of rows is cut
+  // multiply-adds, on a CPU with AVX2, and on a CPU with VNNI
+  constexpr double kPerMicrosecond = std::is_same_v<X, float> ? 5e4 : 1e5;
   const double work = static_cast<double>(rows) * depth * columns;
   const int64_t threads = threads_for(work / kPerMicrosecond);
-  const int64_t tiles = (rows + kRows - 1) / kRows, panels = panel_count(args);
+  const int64_t tiles = (rows + kRows - 1) / kRows, panels = panel_count(columns);
   if (panels < threads || tiles >= 16 * threads) {
     parallel_ranges(tiles, threads, [&](int64_t begin, int64_t end) {
       kernel(args, begin * kRows, std::min(end * kRows, rows), 0, panels);
@@ -44,33 +81,57 @@ void multiply(const float* x, int64_t rows, int64_t depth, const Tensor& packed,
   }
 }
 
-// Writes the layer norm of the rows of x to `out`. `parameters` is its weight and its bias, (2, D).
+// Writes the linear layer of x to `out`, or its GELU, or adds it to `out`. The numbers of x are
+// what the layer reads, and the result is what `next` reads; without `next`, it is float. The
+// threads share the rows of a long map, or the columns of the result of a short map.
+void multiply(const void* x, int64_t rows, const Layer& layer, void* out,
+              After after = After::nothing, const Layer* next = nullptr) {
+  if (layer.is_quantized) {
+    multiply(static_cast<const uint8_t*>(x), rows, layer, out, after, next);
+  } else {
+    multiply(static_cast<const float*>(x), rows, layer, out, after, next);
+  }
+}
+
+template <typename Out>
 void normalize(const float* x, int64_t rows, int64_t dim, const Tensor& parameters, double eps,
-               float* out) {
+               Out* out, Quantizer quantizer = {}) {
+  check_parameter(parameters, ScalarType::Float, 2 * dim);
   // Without a second summand, the kernel only reads x.
-  AddNormArgs<float, float> args{.x = const_cast<float*>(x),
-                                 .out = out,
-                                 .weight = floats(parameters, 2 * dim),
-                                 .eps = static_cast<float>(eps),
-                                 .width = dim};
+  AddNormArgs<float, Out> args{.x = const_cast<float*>(x),
+                               .out = out,
+                               .weight = pointer<float>(parameters),
+                               .eps = static_cast<float>(eps),
+                               .width = dim,
+                               .quantizer = quantizer};
   args.bias = args.weight + dim;
   constexpr double kPerMicrosecond = 4000;  // numbers
   const int64_t threads = threads_for(static_cast<double>(rows) * dim / kPerMicrosecond);
   parallel_ranges(rows, threads, [&](int64_t begin, int64_t end) {
-    kernels<AddNormKernels<float, float>>().rows(args, begin, end);
+    kernels<AddNormKernels<float, Out>>().rows(args, begin, end);
   });
 }
 
-// Checks for float32 (..., D) on the CPU, and returns it contiguous.
-Tensor checked_tokens(const Tensor& x) {
-  STD_TORCH_CHECK(
-      x.is_cpu() && x.scalar_type() == ScalarType::Float && x.dim() > 0 && x.size(x.dim() - 1) > 0,
-      kName, ": x must be float32 (..., D) on the CPU");
+// Writes the layer norm of the rows of x to `out`, as the layer `next` reads it. `parameters` is
+// the norm's weight and its bias, (2, D).
+void normalize(const float* x, int64_t rows, const Tensor& parameters, double eps, void* out,
+               const Layer& next) {
+  if (next.is_quantized) {
+    normalize(x, rows, next.depth, parameters, eps, static_cast<uint8_t*>(out), next.quantizer);
+  } else {
+    normalize(x, rows, next.depth, parameters, eps, static_cast<float*>(out));
+  }
+}
+
+// Checks for tokens (..., D) of a type on the CPU, and returns them contiguous.
+Tensor checked_tokens(const Tensor& x, ScalarType type) {
+  STD_TORCH_CHECK(x.is_cpu() && x.scalar_type() == type && x.dim() > 0 && x.size(x.dim() - 1) > 0,
+                  kName, ": x has a wrong type, or is not (..., D) on the CPU");
   return as_contiguous(x);
 }
 
 Tensor norm(Tensor x, Tensor parameters, double eps) {
-  x = checked_tokens(x);
+  x = checked_tokens(x, ScalarType::Float);
   const int64_t dim = x.size(x.dim() - 1);
   const Tensor out = new_tensor(x.sizes(), ScalarType::Float);
   normalize(pointer<float>(x), x.numel() / dim, dim, parameters, eps, mutable_pointer<float>(out));
@@ -78,25 +139,32 @@ Tensor norm(Tensor x, Tensor parameters, double eps) {
 }
 
 Tensor linear(Tensor x, Tensor packed, int64_t columns, bool gelu, MaybeTensor norm, double eps) {
-  x = checked_tokens(x);
-  STD_TORCH_CHECK(columns > 0, kName, ": no columns");
+  STD_TORCH_CHECK(columns > 0 && x.dim() > 0 && x.size(x.dim() - 1) > 0, kName, ": no columns");
   Sizes sizes = x.sizes().vec();
   const int64_t depth = sizes.back(), rows = x.numel() / depth;
   check_product({depth, columns});
-  if (norm) {
-    const Tensor normed = new_tensor(x.sizes(), ScalarType::Float);
-    normalize(pointer<float>(x), rows, depth, *norm, eps, mutable_pointer<float>(normed));
-    x = normed;
+  const Layer layer(packed, depth, columns);
+  const ScalarType type = layer.is_quantized ? ScalarType::Byte : ScalarType::Float;
+  x = checked_tokens(x, norm ? ScalarType::Float : type);
+  if (norm || layer.is_quantized) {
+    const Tensor tokens = new_tensor(Sizes{x.numel() + kSpare}, type);
+    if (norm) {
+      normalize(pointer<float>(x), rows, *norm, eps, tokens.mutable_data_ptr(), layer);
+    } else {
+      std::copy_n(pointer<uint8_t>(x), x.numel(), mutable_pointer<uint8_t>(tokens));
+    }
+    x = tokens;
   }
   sizes.back() = columns;
   const Tensor out = new_tensor(sizes, ScalarType::Float);
   ask_for_large_pages(out);
-  multiply(pointer<float>(x), rows, depth, packed, columns, mutable_pointer<float>(out),
+  multiply(x.const_data_ptr(), rows, layer, out.mutable_data_ptr(),
            gelu ? After::gelu : After::nothing);
   return out;
 }
 
-// The blocks of a stage. They change the residual x in place.
+// The blocks of a stage. They change the residual x in place. The tokens between two layers are
+// float, or have 8 bits in the same memory.
 struct Blocks {
   int64_t heads, mlp_dim;
   double eps;
@@ -110,25 +178,30 @@ struct Blocks {
   // Runs one block, given its six parameters, and the window, the shift and the periodic axes of
   // its attention.
   void block(const Tensor* parameters, const Tensor& table, const int64_t* windows) {
-    const auto *tokens = pointer<float>(normed), *hidden_tokens = pointer<float>(hidden);
+    const Layer to_qkv(parameters[1], dim, 3 * dim), proj(parameters[2], dim, dim);
+    const Layer fc1(parameters[4], dim, mlp_dim), fc2(parameters[5], mlp_dim, dim);
     auto* residual = mutable_pointer<float>(x);
-    auto* to = mutable_pointer<float>(normed);
-    normalize(residual, rows, dim, parameters[0], eps, to);
-    multiply(tokens, rows, dim, parameters[1], 3 * dim, mutable_pointer<float>(qkv));
-    attend(table, windows);
-    multiply(tokens, rows, dim, parameters[2], dim, residual, After::add);
-    normalize(residual, rows, dim, parameters[3], eps, to);
-    multiply(tokens, rows, dim, parameters[4], mlp_dim, mutable_pointer<float>(hidden),
-             After::gelu);
-    multiply(hidden_tokens, rows, mlp_dim, parameters[5], dim, residual, After::add);
+    void *tokens = normed.mutable_data_ptr(), *hidden_tokens = hidden.mutable_data_ptr();
+    normalize(residual, rows, parameters[0], eps, tokens, to_qkv);
+    multiply(tokens, rows, to_qkv, qkv.mutable_data_ptr());
+    attend(table, windows, proj);
+    multiply(tokens, rows, proj, residual, After::add);
+    normalize(residual, rows, parameters[3], eps, tokens, fc1);
+    multiply(tokens, rows, fc1, hidden_tokens, After::gelu, &fc2);
+    multiply(hidden_tokens, rows, fc2, residual, After::add);
   }
 
-  // Reads `qkv` and writes `normed`.
-  void attend(const Tensor& table, const int64_t* windows) {
+  // Reads `qkv` and writes `normed`, as the layer `next` reads it.
+  void attend(const Tensor& table, const int64_t* windows, const Layer& next) {
     const auto pair = [&](int k) { return Sizes(windows + k, windows + k + 2); };
     const double scale = 1 / std::sqrt(static_cast<double>(dim / heads));
     AttentionCall<float> call(qkv, table, pair(0), pair(2), pair(4), scale);
-    call.args.out = mutable_pointer<float>(normed);
+    if (next.is_quantized) {
+      call.args.quantized = mutable_pointer<uint8_t>(normed);
+      call.args.quantizer = next.quantizer;
+    } else {
+      call.args.out = mutable_pointer<float>(normed);
+    }
     call.run(call.args.windows * heads, 2, kernels<WindowAttentionKernels<float>>().forward);
   }
 };

@@ -51,6 +51,14 @@ bool cpu_is_intel() {
 #endif
 }
 
+bool cpu_has_vnni() {
+#if defined(__x86_64__)
+  return __builtin_cpu_supports("avx512vnni");
+#else
+  return false;
+#endif
+}
+
 Tier current_tier() { return current.load(std::memory_order_relaxed); }
 
 const char* tier_name(Tier tier) {

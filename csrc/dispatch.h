@@ -21,6 +21,7 @@ bool set_tier(const char* name);      // false if the CPU or the build lacks tha
 enum class Gathers { never, always, by_cpu };
 inline std::atomic<Gathers> gathers{Gathers::by_cpu};
 bool cpu_is_intel();
+bool cpu_has_vnni();  // of AVX-512
 
 template <typename Table, Tier... tiers>
 const Table* find_table(Tier tier) {

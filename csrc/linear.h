@@ -3,14 +3,51 @@
 
 #include <cstdint>
 
+#include "numbers.h"
 #include "tier.h"
 
 namespace darswin {
 
-// A packed linear layer is one array of floats. First comes the bias, then the weight in panels of
-// kPanel columns. Each panel is a matrix (depth, columns of the panel). The last panel has the
-// remaining columns. The columns are padded with zeros to a multiple of kPanelUnit.
+// A packed linear layer is one array of words of 32 bits. First come the parameters of the columns,
+// then the weight in panels of kPanel columns. Each panel is a matrix (words of the depth, columns
+// of the panel). The last panel has the remaining columns. The columns are padded with zeros to a
+// multiple of kPanelUnit.
+//
+// X is the type of the tokens. If X is float, a word is one float, and the only parameter of a
+// column is its bias. If X is uint8_t, a word holds the weights of four depths as signed 8 bits.
+// The parameters are then the bias, the size of a step of the weights, and the int32 that is added
+// to the sum to undo the zero point of the tokens. Three words follow the panels: the size of a
+// step of the tokens, and their Quantizer.
 constexpr int64_t kPanel = 48, kPanelUnit = 16;
+// Kernels read whole words, so they may read this many bytes beyond the last token.
+constexpr int64_t kSpare = 3;
+// The greatest depth of 8 bits: no sum overflows.
+constexpr int64_t kMostDepth = 1 << 16;
+
+namespace {
+
+template <typename X>
+constexpr int64_t kDepths = sizeof(float) / sizeof(X);  // of a word
+template <typename X>
+constexpr int64_t kParameters = std::is_same_v<X, float> ? 1 : 3;  // of a column
+
+inline int64_t padded_columns(int64_t columns) {
+  return (columns + kPanelUnit - 1) / kPanelUnit * kPanelUnit;
+}
+inline int64_t panel_count(int64_t columns) {
+  return (padded_columns(columns) + kPanel - 1) / kPanel;
+}
+template <typename X>
+inline int64_t depth_words(int64_t depth) {
+  return (depth + kDepths<X> - 1) / kDepths<X>;
+}
+// Returns the words of the parameters and the panels.
+template <typename X>
+inline int64_t layer_words(int64_t depth, int64_t columns) {
+  return padded_columns(columns) * (kParameters<X> + depth_words<X>(depth));
+}
+
+}  // namespace
 
 // The step that follows the product.
 enum class After {
@@ -20,29 +57,23 @@ enum class After {
 };
 
 // out = x * weight^T + bias
+template <typename X>
 struct LinearArgs {
-  const float* x;       // (rows, depth)
-  const float* packed;  // bias and weight
-  float* out;           // (rows, columns)
-  int64_t rows, depth, columns;
-  After after;
+  const X* x = nullptr;          // (rows, depth), then kSpare bytes of any value
+  const void* packed = nullptr;  // the layer
+  int64_t rows = 0, depth = 0, columns = 0;
+  float scale = 1;  // the size of a step of x, if it has 8 bits
+  After after = After::nothing;
+  float* out = nullptr;          // (rows, columns)
+  uint8_t* quantized = nullptr;  // the result as 8 bits, instead of `out`; not for After::add
+  Quantizer quantizer = {};      // of `quantized`
 };
 
-namespace {
-
-inline int64_t padded_columns(const LinearArgs& a) {
-  return (a.columns + kPanelUnit - 1) / kPanelUnit * kPanelUnit;
-}
-inline int64_t packed_size(const LinearArgs& a) { return padded_columns(a) * (1 + a.depth); }
-inline int64_t panel_count(const LinearArgs& a) {
-  return (padded_columns(a) + kPanel - 1) / kPanel;
-}
-
-}  // namespace
-
+template <typename X>
 struct LinearKernels {
-  // Computes the columns of panels [first, last) of rows [begin, end).
-  void (*rows)(const LinearArgs&, int64_t begin, int64_t end, int64_t first, int64_t last);
+  // Computes the columns of panels [first, last) of rows [begin, end). For uint8_t, this is null on
+  // tiers below avx512, and needs a CPU with VNNI.
+  void (*rows)(const LinearArgs<X>&, int64_t begin, int64_t end, int64_t first, int64_t last);
 };
 
 }  // namespace darswin

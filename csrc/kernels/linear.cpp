@@ -8,16 +8,31 @@
 // The depth is cut into parts whose weights fit the first-level cache. All tokens use one part
 // before the next part starts. Every sum is taken in the same order wherever its tile lies. So the
 // results do not depend on the number of tokens or threads.
+//
+// With 8 bits, a number of a token is a word of four depths. The sums are integers, so they are
+// exact.
 #include "../linear.h"
 
 #include "math.h"
+#include "quantize.h"
 
 namespace darswin {
 namespace {
 
 constexpr int64_t kL = kLanes<float>;
-constexpr int64_t kPart = 128;  // of the depth; this part of a panel has 24 KB
-constexpr int64_t kMostRows = 128, kBlockNumbers = 1 << 16;  // of a block of tokens
+constexpr int64_t kPart = 128;  // words of the depth; this part of a panel has 24 KB
+constexpr int64_t kMostRows = 128, kBlockBytes = 1 << 18;  // of a block of tokens
+
+// By the type of the tokens: the type of a word of the weights, and a register of sums.
+template <typename X>
+using Word = std::conditional_t<is_same_v<X, float>, float, uint32_t>;
+template <typename X>
+using Sums = Vector<std::conditional_t<is_same_v<X, float>, float, int32_t>, kL>;
+
+inline float word(const float* token, int64_t k) { return token[k]; }
+inline uint32_t word(const uint8_t* token, int64_t k) { return load_bits<uint32_t>(token + 4 * k); }
+
+inline Floats add_product(Floats sums, Floats x, Floats weights) { return sums + x * weights; }
 
 // Computes x Phi(x), where Phi is the normal distribution. 1 - Phi(|x|) equals e^(-x^2 / 2) times a
 // polynomial of 1 / (1 + p |x|), which is fitted for the least relative error.
@@ -46,73 +61,99 @@ template <int kRows, int kWide, typename Body>
 }
 
 // One panel of columns, for one block of rows.
+template <typename X>
 struct Panel {
-  const LinearArgs& a;
-  int64_t first, width;  // of its columns
-  const float* weight;   // (depth, width)
-  float* sums;           // (rows of the block, kPanel): the sums over the earlier parts
+  const LinearArgs<X>& a;
+  int64_t padded, words;  // columns of the layer, and words of the depth
+  int64_t first, width;   // of its columns
+  const Word<X>* weight;  // (words, width)
+  Sums<X>* sums;          // (rows of the block, kPanel): the sums over the earlier parts
 
-  // Computes kRows rows and kWide registers of columns, for the depths [begin, end).
+  // Computes kRows rows and kWide registers of columns, for the words [begin, end).
   template <int kRows, int kWide>
   [[gnu::noinline]] void tile(int64_t row, int64_t n, int64_t begin, int64_t end,
-                              float* so_far) const {
-    const float *x = a.x + row * a.depth, *w = weight + n;
-    Floats sum[kRows][kWide] = {};
+                              Sums<X>* so_far) const {
+    using Weights = Vector<Word<X>, kL>;
+    const X* x = a.x + row * a.depth;
+    const Word<X>* w = weight + n;
+    Sums<X> sum[kRows][kWide] = {};
     for (int64_t k = begin; k < end; ++k) {
-      Floats weights[kWide];
-      for (int v = 0; v < kWide; ++v) weights[v] = load<Floats>(w + k * width + v * kL);
-      each_register<kRows, kWide>(
-          [&](int i, int v) { sum[i][v] += x[i * a.depth + k] * weights[v]; });
+      Weights weights[kWide];
+      for (int v = 0; v < kWide; ++v) weights[v] = load<Weights>(w + k * width + v * kL);
+      each_register<kRows, kWide>([&](int i, int v) {
+        sum[i][v] = add_product(sum[i][v], splat<Weights>(word(x + i * a.depth, k)), weights[v]);
+      });
     }
-    const auto earlier = [&](int i, int v) { return so_far + i * kPanel + n + v * kL; };
+    const auto earlier = [&](int i, int v) -> Sums<X>& {
+      return so_far[i * kPanel / kL + n / kL + v];
+    };
     if (begin > 0) {
-      each_register<kRows, kWide>([&](int i, int v) { sum[i][v] += load<Floats>(earlier(i, v)); });
+      each_register<kRows, kWide>([&](int i, int v) { sum[i][v] += earlier(i, v); });
     }
-    if (end < a.depth) {
-      each_register<kRows, kWide>([&](int i, int v) { store(earlier(i, v), sum[i][v]); });
+    if (end < words) {
+      each_register<kRows, kWide>([&](int i, int v) { earlier(i, v) = sum[i][v]; });
       return;
     }
-    const float* bias = a.packed + first + n;
-    each_register<kRows, kWide>([&](int i, int v) { sum[i][v] += load<Floats>(bias + v * kL); });
-    const int64_t left = a.columns - first - n;
-    float* out = a.out + row * a.columns + first + n;
-    if (a.after == After::gelu || left < kWide * kL) {
-      Floats copy[kRows][kWide];  // lets the sums themselves stay in registers
-      each_register<kRows, kWide>([&](int i, int v) { copy[i][v] = sum[i][v]; });
-      finish<kRows, kWide>(copy, out, left);
+    Floats result[kRows][kWide];
+    each_register<kRows, kWide>(
+        [&](int i, int v) { result[i][v] = value(sum[i][v], first + n + v * kL); });
+    const int64_t left = a.columns - first - n, place = row * a.columns + first + n;
+    if (a.quantized != nullptr || a.after == After::gelu || left < kWide * kL) {
+      Floats copy[kRows][kWide];  // lets the result itself stay in registers
+      each_register<kRows, kWide>([&](int i, int v) { copy[i][v] = result[i][v]; });
+      finish<kRows, kWide>(copy, place, left);
     } else if (a.after == After::add) {
       each_register<kRows, kWide>([&](int i, int v) {
-        float* to = out + i * a.columns + v * kL;
-        store(to, load<Floats>(to) + sum[i][v]);
+        float* to = a.out + place + i * a.columns + v * kL;
+        store(to, load<Floats>(to) + result[i][v]);
       });
     } else {
       each_register<kRows, kWide>(
-          [&](int i, int v) { store(out + i * a.columns + v * kL, sum[i][v]); });
+          [&](int i, int v) { store(a.out + place + i * a.columns + v * kL, result[i][v]); });
     }
   }
 
-  // Applies the step after the product to a tile in memory, and writes its first `left` columns.
+  // Returns the values of the sums of columns `column`, `column` + 1, ...
+  Floats value(Sums<X> sum, int64_t column) const {
+    const auto* bias = static_cast<const float*>(a.packed) + column;
+    if constexpr (is_same_v<X, float>) {
+      return sum + load<Floats>(bias);
+    } else {
+      sum += load_bits<Sums<X>>(bias + 2 * padded);
+      // In the order of oneDNN's products, so that the bits are the same.
+      const Floats scaled = __builtin_convertvector(sum, Floats) * a.scale;
+      return unfused(scaled * load<Floats>(bias + padded)) + load<Floats>(bias);
+    }
+  }
+
+  // Applies the step after the product to a tile in memory, and writes its first `left` columns to
+  // `place` and the following numbers of the result.
   template <int kRows, int kWide>
-  [[gnu::noinline]] void finish(const Floats (&tile)[kRows][kWide], float* out,
+  [[gnu::noinline]] void finish(const Floats (&tile)[kRows][kWide], int64_t place,
                                 int64_t left) const {
+    const Quantize quantize(a.quantizer);
     for (int i = 0; i < kRows; ++i) {
       for (int v = 0; v < kWide; ++v) {
-        float* to = out + i * a.columns + v * kL;
-        const int64_t count = smaller(kL, left - v * kL);
+        const int64_t to = place + i * a.columns + v * kL, count = smaller(kL, left - v * kL);
         const Floats result = a.after == After::gelu ? gelu(tile[i][v]) : tile[i][v];
-        if (a.after != After::add && count == kL) {
-          store(to, result);
-          continue;
-        }
-        for (int64_t lane = 0; lane < count; ++lane) {
-          to[lane] = a.after == After::add ? to[lane] + result[lane] : result[lane];
+        float lanes[kL];
+        store(lanes, result);
+        if (a.quantized != nullptr) {
+          quantize(a.quantized + to, lanes, count);
+        } else if (a.after != After::add && count == kL) {
+          store(a.out + to, result);
+        } else {
+          for (int64_t lane = 0; lane < count; ++lane) {
+            float& number = a.out[to + lane];
+            number = a.after == After::add ? number + lanes[lane] : lanes[lane];
+          }
         }
       }
     }
   }
 
   template <int kRows>
-  void columns(int64_t row, int64_t begin, int64_t end, float* so_far) const {
+  void columns(int64_t row, int64_t begin, int64_t end, Sums<X>* so_far) const {
     int64_t n = 0;
     for (; n + 3 * kL <= width; n += 3 * kL) tile<kRows, 3>(row, n, begin, end, so_far);
     for (; n + 2 * kL <= width; n += 2 * kL) tile<kRows, 2>(row, n, begin, end, so_far);
@@ -120,28 +161,31 @@ struct Panel {
   }
 
   void rows(int64_t first_row, int64_t last_row) const {
-    for (int64_t begin = 0; begin < a.depth; begin += kPart) {
-      const int64_t end = smaller(begin + kPart, a.depth);
+    for (int64_t begin = 0; begin < words; begin += kPart) {
+      const int64_t end = smaller(begin + kPart, words);
+      const auto so_far = [&](int64_t row) { return sums + (row - first_row) * kPanel / kL; };
       int64_t row = first_row;
       for (; row + kTileRows <= last_row; row += kTileRows) {
-        columns<kTileRows>(row, begin, end, sums + (row - first_row) * kPanel);
+        columns<kTileRows>(row, begin, end, so_far(row));
       }
-      for (; row < last_row; ++row) columns<1>(row, begin, end, sums + (row - first_row) * kPanel);
+      for (; row < last_row; ++row) columns<1>(row, begin, end, so_far(row));
     }
   }
 };
 
-void linear_rows(const LinearArgs& a, int64_t begin, int64_t end, int64_t first, int64_t last) {
-  float sums[kMostRows * kPanel];
+template <typename X>
+void linear_rows(const LinearArgs<X>& a, int64_t begin, int64_t end, int64_t first, int64_t last) {
+  Sums<X> sums[kMostRows * kPanel / kL];
   // The block is small enough for its tokens to stay in the second-level cache.
-  const int64_t most = smaller(kMostRows, round_up(1 + kBlockNumbers / a.depth, kTileRows));
-  const int64_t padded = padded_columns(a);
-  const float* weight = a.packed + padded;
+  const int64_t fitting = kBlockBytes / (a.depth * static_cast<int64_t>(sizeof(X)));
+  const int64_t most = smaller(kMostRows, round_up(1 + fitting, kTileRows));
+  const int64_t padded = padded_columns(a.columns), words = depth_words<X>(a.depth);
+  const auto* weight = static_cast<const Word<X>*>(a.packed) + kParameters<X> * padded;
   for (int64_t row = begin; row < end; row += most) {
     for (int64_t column = first * kPanel; column < smaller(last * kPanel, padded);
          column += kPanel) {
       const int64_t width = smaller(kPanel, padded - column);
-      const Panel panel{a, column, width, weight + column * a.depth, sums};
+      const Panel<X> panel{a, padded, words, column, width, weight + column * words, sums};
       panel.rows(row, smaller(row + most, end));
     }
   }
@@ -149,6 +193,11 @@ void linear_rows(const LinearArgs& a, int64_t begin, int64_t end, int64_t first,
 
 }  // namespace
 
-TIER_TABLE(LinearKernels) = {.rows = linear_rows};
+TIER_TABLE(LinearKernels<float>) = {.rows = linear_rows<float>};
+#if defined(__AVX512F__)
+TIER_TABLE(LinearKernels<uint8_t>) = {.rows = linear_rows<uint8_t>};
+#else
+TIER_TABLE(LinearKernels<uint8_t>) = {.rows = nullptr};
+#endif
 
 }  // namespace darswin

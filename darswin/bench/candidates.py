@@ -12,7 +12,7 @@ from torch import Tensor
 
 from darswin.bench import timing
 from darswin.deploy.optimize import optimize
-from darswin.deploy.packed import onednn_linear, packed
+from darswin.deploy.packed import has_own_int8, onednn_linear, packed, packed_weights
 from darswin.deploy.quantize import quantize_model
 from darswin.layers.embed import PolarPatchEmbed
 from darswin.layers.linear import Linear, best_seconds, onednn_lack
@@ -112,14 +112,13 @@ def matmuls_of(
     """
     rest = torch.float32 if dtype == torch.int8 else dtype
     found: list[tuple[Callable[[Tensor], Tensor], Tensor]] = []
-    fastest: dict[tuple[int, int, int], str] = {}
+    fastest: dict[tuple[type, int, int, int], str] = {}
     for layer, rows in products_of(model, images, lens):
         x = torch.randn(rows, layer.in_features).to(rest)
         if isinstance(layer, QuantizedLinear):
-            found.append((packed(layer, rest), quantize(x, layer.activation)))
-            continue
+            x = quantize(x, layer.activation)
         libraries = _libraries(layer, rest)
-        shape = (rows, layer.in_features, layer.out_features)
+        shape = (type(layer), rows, layer.in_features, layer.out_features)
         if shape not in fastest:
             with torch.inference_mode():
                 runs = {name: partial(run, x) for name, run in libraries.items()}
@@ -130,7 +129,14 @@ def matmuls_of(
 
 
 def _libraries(layer: Any, dtype: torch.dtype) -> dict[str, Callable[[Tensor], Tensor]]:
-    """One linear layer by each library that computes it in `dtype`."""
+    """One linear layer by each library that computes it, in `dtype` or as it is quantized."""
+    libraries: dict[str, Callable[[Tensor], Tensor]]
+    if isinstance(layer, QuantizedLinear):
+        libraries = {"onednn": packed(layer, dtype)}
+        if has_own_int8():
+            weights, columns = packed_weights(layer), layer.out_features
+            libraries["darswin"] = lambda q: torch.ops.darswin._linear(q, weights, columns, False)
+        return libraries
     weight = layer.weight.detach().to(dtype)
     bias = None if layer.bias is None else layer.bias.detach().to(dtype)
     libraries = {"darswin": packed(layer, dtype), "torch": lambda x: F.linear(x, weight, bias)}

@@ -1,7 +1,7 @@
 """Fast copies of models for inference on CPUs.
 
-In float32 all blocks of a stage are one C++ operator. In bfloat16 and int8 oneDNN computes the
-products, and each residual is added by the norm that follows it.
+In float32 all blocks of a stage are one C++ operator, and in int8 too, if the CPU has AVX-512 VNNI.
+Otherwise oneDNN computes the products, and each residual is added by the norm that follows it.
 """
 
 import contextlib
@@ -19,6 +19,7 @@ from darswin.deploy.packed import (
     PackedNorm,
     PackedQuantizedLinear,
     fastest_dtype,
+    has_own_int8,
     packed,
     packed_attention,
     packed_merging,
@@ -181,9 +182,9 @@ def _pack(module: nn.Module, dtype: torch.dtype) -> None:
     elif isinstance(module, Stage):
         _pack_stage(module, dtype)
     elif isinstance(module, PatchMerging):
-        if dtype == torch.float32 and isinstance(module.reduction, nn.Linear):
-            reduction = packed_merging(module.norm, module.reduction)
-            return _replace(module, reduction=reduction, norm=lambda x: x)
+        if _has_kernels(module, dtype):
+            merging = packed_merging(module.norm, module.reduction)
+            return _replace(module, reduction=merging, norm=lambda x: x)
         reduction = packed(module.reduction, dtype)
         _replace(module, reduction=reduction)
         _pack_norm(module, dtype, taken(reduction))
@@ -195,6 +196,11 @@ def _pack(module: nn.Module, dtype: torch.dtype) -> None:
                 _replace(module, **{name: PackedLinear(layer, dtype)})
 
 
+def _has_kernels(module: nn.Module, dtype: torch.dtype) -> bool:
+    """True if our own kernels compute the products of a module."""
+    return dtype == torch.float32 and (not quantized_layers(module) or has_own_int8())
+
+
 def _pack_stage(stage: Stage, dtype: torch.dtype) -> None:
     blocks: list[Any] = list(stage.blocks)
     attentions = [block.attn for block in blocks]
@@ -204,7 +210,10 @@ def _pack_stage(stage: Stage, dtype: torch.dtype) -> None:
     if not isinstance(stage.downsample, (PatchMerging, nn.Identity)):
         stage.downsample = InDtype(stage.downsample, dtype)
     in_windows = all(isinstance(attn, WindowAttention) for attn in attentions)
-    if dtype == torch.float32 and in_windows and not quantized_layers(stage):
+    for mlp in (block.mlp for block in blocks):
+        if isinstance(mlp.fc1, QuantizedLinear) != isinstance(mlp.fc2, QuantizedLinear):
+            raise ValueError("both products of an MLP must be quantized, or none")
+    if in_windows and _has_kernels(stage.blocks, dtype):
         _replace(stage, _run=PackedBlocks(blocks))
         for block in blocks:
             _replace(block, norm1=None, norm2=None, mlp=None)
@@ -231,8 +240,6 @@ def _pack_block(block: Block, dtype: torch.dtype) -> None:
         block.attn = InDtype(attn, dtype)
     fc1: PackedLinear | PackedQuantizedLinear
     fc2 = packed(mlp.fc2, dtype)
-    if isinstance(mlp.fc1, QuantizedLinear) != isinstance(fc2, PackedQuantizedLinear):
-        raise ValueError("both products of an MLP must be quantized, or none")
     if isinstance(mlp.fc1, QuantizedLinear):
         fc1 = PackedQuantizedLinear(mlp.fc1, gelu=taken(fc2))
     else:

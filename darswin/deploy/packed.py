@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from darswin.layers.linear import best_seconds, onednn_lack
 from darswin.layers.quantized import Quantization, QuantizedLinear
 from darswin.layers.transformer import WindowAttention
+from darswin.ops import cpu_capability
 
 __all__ = ["fastest_dtype"]
 
@@ -72,13 +73,33 @@ def onednn_linear(
     return lambda x: product(x, packed, bias, *after)
 
 
-def packed_weights(linear: nn.Linear) -> Tensor:
-    """The bias and the weight of a linear layer in the order of csrc/linear.h, (K,) float32."""
-    weight = linear.weight.detach().float()
-    bias = weight.new_zeros(len(weight)) if linear.bias is None else linear.bias.detach().float()
+def has_own_int8() -> bool:
+    """True if our own kernels compute 8-bit products here. On CPUs with AMX, oneDNN uses AMX."""
+    has_vnni = torch.cpu._is_vnni_supported() and not torch.cpu._is_amx_tile_supported()
+    return has_vnni and cpu_capability() == "avx512"
+
+
+def packed_weights(linear: nn.Linear | QuantizedLinear) -> Tensor:
+    """A linear layer in the order of csrc/linear.h, (K,): float32, or int32 if it is quantized."""
+    weight = linear.weight.detach()
+    bias = torch.zeros(len(weight)) if linear.bias is None else linear.bias.detach().float()
+    if isinstance(linear, QuantizedLinear):
+        scale, zero_point = linear.activation
+        offset = -zero_point * weight.sum(1, dtype=torch.int32)
+        parameters = [_bits(bias), _bits(linear.weight_scale.float()), offset]
+        weight = _bits(F.pad(weight, (0, -weight.shape[1] % 4)))
+        last = [_bits(torch.tensor([scale, 1 / scale])), offset.new_tensor([zero_point])]
+    else:
+        parameters, weight, last = [bias], weight.float(), []
     padding = -len(weight) % _UNIT
+    columns = [F.pad(parameter, (0, padding)) for parameter in parameters]
     panels = F.pad(weight, (0, 0, 0, padding)).split(_PANEL)
-    return torch.cat([F.pad(bias, (0, padding)), *(panel.t().flatten() for panel in panels)])
+    return torch.cat([*columns, *(panel.t().flatten() for panel in panels), *last])
+
+
+def _bits(t: Tensor) -> Tensor:
+    """The bits of a tensor as int32, which joins four numbers of 8 bits."""
+    return t.contiguous().view(torch.int32)
 
 
 def norm_parameters(norm: nn.LayerNorm) -> Tensor:
@@ -86,15 +107,16 @@ def norm_parameters(norm: nn.LayerNorm) -> Tensor:
     return torch.stack((norm.weight, norm.bias)).detach().float()
 
 
-def packed_merging(norm: Any, reduction: nn.Linear) -> Callable[[Tensor], Tensor]:
-    """The norm and the linear layer of a merging in float32, as one operator."""
+def packed_merging(norm: Any, reduction: Any) -> Callable[[Tensor], Tensor]:
+    """The norm and the linear layer of a merging, as one operator."""
     weights, columns = packed_weights(reduction), reduction.out_features
     parameters = norm_parameters(norm)
     return lambda x: _LINEAR(x, weights, columns, False, parameters, norm.eps)
 
 
 class PackedBlocks:
-    """The blocks of a stage in float32, as one operator. It replaces `Stage._run`."""
+    """The blocks of a stage as one operator, in float32 or with 8-bit products. It replaces
+    `Stage._run`."""
 
     def __init__(self, blocks: Sequence[Any]):
         self._parameters: list[Tensor] = []

@@ -90,6 +90,16 @@ def test_calibration_and_quantized_models_come_to_the_same():
     assert relative_error(direct(images[:1], lens[:1]), direct(images, lens)[:1]) < 1e-5
 
 
+@needs_int8
+@torch.no_grad()
+def test_without_own_kernels_onednn_computes_the_same(monkeypatch):
+    quantized, seen = quantize_model(network(), [batch()]), batch()
+    want = optimize(quantized, torch.int8)(*seen)
+    monkeypatch.setattr("darswin.deploy.optimize.has_own_int8", lambda: False)
+    monkeypatch.setattr("darswin.deploy.optimize.PackedBlocks", None)
+    assert relative_error(optimize(quantized, torch.int8)(*seen), want) < 0.005
+
+
 @torch.no_grad()
 def test_layers_of_8_bits():
     linear = nn.Linear(40, 6)
