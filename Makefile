@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/installed
 
-.PHONY: help build demo test test-all test-triton test-gpu test-lowest test-isa test-asan fuzz kills mutants lint format bench bench-gpu study study-int8 learned-lens worlds study-dense tables docs dist wheels repair published-wheels test-torch aarch64 test-aarch64 clean
+.PHONY: help build demo test test-all test-triton test-gpu test-lowest test-isa test-asan fuzz kills mutants lint format bench bench-gpu study study-int8 learned-lens worlds study-dense tables docs sdist wheels repair published-wheels test-torch aarch64 test-aarch64 clean
 
 help:  ## print this list
 	@grep -E '^[a-z0-9-]+:.*##' Makefile | sed -E 's/:.*## /\t/' | expand -t 18
@@ -145,11 +145,17 @@ tables: $(STAMP)  ## fill the tables of README and docs with the results of benc
 docs: build  ## build the site of docs/ in build/docs; warnings are errors
 	$(BIN)/python -m sphinx -q -n -W --keep-going docs build/docs
 
-dist: $(STAMP)  ## build the sdist and the wheel in dist/
-	PATH=$(CURDIR)/$(BIN):$$PATH $(BIN)/python -m build --no-isolation --outdir dist
+sdist: $(STAMP)  ## build the sdist in dist/, and test it in a fresh environment
+	rm -f dist/darswin-*.tar.gz
+	$(BIN)/python -m build --no-isolation --sdist --outdir dist
+	$(PYTHON) -m venv --clear $(SCRATCH)
+	$(SCRATCH)/bin/pip install -q $$(grep -E '^(cmake|hypothesis|ninja|pybind11|pytest|setuptools|torch)==' requirements.txt)
+	PATH=$(CURDIR)/$(SCRATCH)/bin:$$PATH $(SCRATCH)/bin/pip install -q --no-build-isolation dist/darswin-*.tar.gz
+	$(SCRATCH)/bin/python tests/installed.py
 
 # One wheel of a platform serves every Python; darswin.frames works with those that are found here.
-# The wheel uses the libraries of torch, which is imported first. cibuildwheel makes the published wheels; it runs `repair` and tests/installed.py too.
+# The wheel uses the libraries of torch, which is imported first. cibuildwheel makes the published
+# wheels; it runs `repair` and tests/installed.py too.
 PYTHONS = $(foreach minor,11 12 13 14,$(shell command -v python3.$(minor)))
 wheels: $(STAMP)  ## build the manylinux_2_28 wheel in dist/, and test it in a fresh environment
 	rm -rf build/wheel
@@ -163,8 +169,7 @@ repair:
 	auditwheel repair --plat manylinux_2_28_$$(uname -m) --only-plat --wheel-dir "$(DEST)" \
 	  --exclude 'libtorch*' --exclude 'libc10*' --exclude 'libgomp*' "$(WHEEL)"
 
-published-PYTHONS = $(foreach minor,11 12 13 14,$(shell command -v python3.$(minor)))
-wheels: $(STAMP)  ## build the same wheel with cibuildwheel in the manylinux_2_28 container; needs Docker
+published-wheels: $(STAMP)  ## build the same wheel with cibuildwheel in the manylinux_2_28 container; needs Docker
 	$(BIN)/cibuildwheel --output-dir dist
 
 # The versions of torch to test the wheel of `make wheels` with, each in a fresh environment.

@@ -43,13 +43,15 @@ def model_of(name: str, size: int) -> Model:
     return network(name, size).eval()
 
 
-def exported(folder: Path, kind: str, name: str, size: int) -> str:
-    """The path of the model's file of a kind, "onnx" or "pt2"; it is written if missing."""
+def exported(folder: Path, kind: str, name: str, size: int, model: Model) -> str:
+    """The path of a model's file of a kind, "onnx" or "pt2"; it is written if missing."""
     path = folder / f"{name}.{kind}"
     if not path.exists():
-        export = export_onnx if kind == "onnx" else export_package
-        images = torch.randn(1, 3, size, size)
-        export(model_of(name, size), path, images, lens_of(size), fixed_lens=True)
+        images, lens = torch.randn(1, 3, size, size), lens_of(size)
+        if kind == "onnx":
+            export_onnx(model, path, images, lens, fixed_lens=True, vnni_only=True)
+        else:
+            export_package(model, path, images, lens, fixed_lens=True)
     return str(path)
 
 
@@ -83,13 +85,13 @@ def one_frame(name: str, batch: int, folder: Path, seconds: float) -> list[Timin
     model, lens = model_of(name, size), lens_of(size)
     images = torch.randn(batch, 3, size, size)
     any_lens = optimize(model)
-    onnx = exported(folder, "onnx", name, size)
+    onnx = exported(folder, "onnx", name, size, model)
     candidates: dict[str, Run] = {
         OURS: optimize(model, lens=lens),
         ANY_LENS: lambda images: any_lens(images, lens),
         EAGER: lambda images: model(images, lens),
         ONNX_RUNTIME: onnx_runtime(onnx),
-        AOTI: torch._inductor.aoti_load_package(exported(folder, "pt2", name, size)),
+        AOTI: torch._inductor.aoti_load_package(exported(folder, "pt2", name, size, model)),
     }
     if importlib.util.find_spec("openvino"):
         candidates[OPENVINO] = openvino(onnx)
@@ -100,7 +102,14 @@ def one_frame(name: str, batch: int, folder: Path, seconds: float) -> list[Timin
     timings = compare(case, candidates, [images], seconds, targets=targets, tolerance=1e-3)
     if onednn_lack(torch.int8) is None and name in ("darswin_a_small", "darswin_a_micro"):
         quantized = quantize_model(model, [(images, lens)])
-        runs = {OURS: optimize(quantized, torch.int8, lens=lens), "float32": candidates[OURS]}
+        onnx = exported(folder, "onnx", f"{name}_int8", size, quantized)
+        runs = {
+            OURS: optimize(quantized, torch.int8, lens=lens),
+            "float32": candidates[OURS],
+            ONNX_RUNTIME: onnx_runtime(onnx),
+        }
+        if OPENVINO in candidates:
+            runs[OPENVINO] = openvino(onnx)
         case.mode = "forward, int8, fixed lens"
         timings += compare(case, runs, [images], seconds, targets={"float32": 1.5}, tolerance=None)
     return timings

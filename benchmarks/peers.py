@@ -159,6 +159,18 @@ def frames_table(timings: Sequence[Timing], peers: Sequence[str]) -> str:
     return markdown(["", "ours (ms)", *peers], rows)
 
 
+def latency_table(timings: Sequence[Timing], peers: Sequence[str]) -> str:
+    """The milliseconds of one frame: a row for each model and dtype, a column for each runtime."""
+    rows = []
+    for subject in dict.fromkeys(t.subject for t in timings):
+        chosen = [t for t in timings if t.subject == subject and t.batch == 1]
+        for (setting, _, mode), found in by_case(chosen).items():
+            _, dtype, _ = mode.split(", ")
+            times = [milliseconds(found.get(name, ())) for name in (OURS, *peers)]
+            rows.append([f"`{subject}`, {setting}, {dtype}", *times])
+    return markdown(["", "`optimize`", *peers], rows)
+
+
 def attention_table(timings: Sequence[Timing]) -> str:
     """The fastest peer and eager attention in each mode: a row for each case."""
     columns = {

@@ -134,6 +134,7 @@ def tables() -> dict[str, str]:
         "missed": peers.missed_table([*sampling.timings, *to_image.timings, *attention.timings]),
         "model": bench.models_table(model.timings),
         "frame line": frame_line(one_frame.timings),
+        "latency": peers.latency_table(one_frame.timings, FRAME_PEERS[1:]),
         "one frame": peers.frames_table(one_frame.timings, FRAME_PEERS),
         "frames": frames_table(frames.timings),
         "model int8": bench.quantized_table(model.timings),

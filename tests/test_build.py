@@ -229,6 +229,7 @@ def test_a_broken_module_names_its_file(tmp_path):
 @pytest.mark.slow
 def test_the_sdist_builds_a_wheel_that_runs_from_another_folder(unpacked, tmp_path):
     (wheel,) = (unpacked / "dist").glob("darswin-*-py3-none-linux_*.whl")
+    assert not (unpacked / "tests").exists()  # setuptools would add a few, without their helpers
     names = zipfile.ZipFile(wheel).namelist()
     modules = {name.removeprefix("darswin/") for name in names if name.endswith(".so")}
     assert modules == {"libdarswin.so", FRAMES.name, "_frames.another-python.so"}

@@ -25,3 +25,33 @@ def test_a_readme_names_the_source_of_each_data_file(folder):
     suffixes = {Path(name).suffix for name in files}
     named = re.findall(r"`([\w.]+)`", (ROOT / folder / "README.md").read_text())
     assert files == {name for name in named if Path(name).suffix in suffixes}
+
+
+def test_the_conda_recipe_is_of_this_version():
+    recipe = yaml.safe_load((ROOT / "conda-recipe" / "recipe.yaml").read_text())
+    project = PROJECT["project"]
+    assert recipe["context"]["version"] == project["version"]
+    assert recipe["about"]["license"] == project["license"]
+    (command,) = recipe["build"]["python"]["entry_points"]
+    assert command == " = ".join(["darswin", project["scripts"]["darswin"]])
+
+    def in_conda(requirements):
+        return {re.sub("^torch", "pytorch", r).replace(">=", " >=") for r in requirements}
+
+    needed = recipe["requirements"]
+    assert {*needed["run"]} == {"python", *in_conda(project["dependencies"])}
+    assert {*needed["build"], *needed["host"]} >= in_conda(PROJECT["build-system"]["requires"])
+
+
+def test_a_tag_publishes_what_make_builds():
+    release = yaml.safe_load((ROOT / ".github" / "workflows" / "release.yml").read_text())
+    assert release[True]["push"] == {"tags": ["v*"]}  # YAML reads `on` as True
+    assert release["permissions"] == {"contents": "read"}
+    build, publish = release["jobs"]["build"], release["jobs"]["publish"]
+    targets = {row["target"] for row in build["strategy"]["matrix"]["include"]}
+    declared = re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.M)
+    assert targets == {"sdist", "published-wheels"} and targets <= {*declared}
+    assert publish["needs"] == "build" and publish["if"] == "github.ref_type == 'tag'"
+    assert publish["permissions"] == {"id-token": "write"}
+    *_, last = publish["steps"]
+    assert last == {"uses": "pypa/gh-action-pypi-publish@release/v1"}  # without a password

@@ -183,7 +183,8 @@ def export_package(
         torch._inductor.aoti_compile_and_package(
             program,
             package_path=os.fspath(path),
-            inductor_configs={"aot_inductor.metadata": rows},
+            # By default, a kernel uses as many threads as the process that compiles it.
+            inductor_configs={"aot_inductor.metadata": rows, "cpp.dynamic_threads": True},
         )
 
 

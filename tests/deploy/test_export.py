@@ -3,6 +3,8 @@
 import importlib.util
 import subprocess
 import sys
+import time
+import zipfile
 
 import pytest
 import torch
@@ -11,6 +13,7 @@ from darswin import create_model
 from darswin.compat import OfficialDarSwin
 from darswin.deploy.export import export_onnx, export_package, export_program
 from darswin.lens import Polynomial, Spherical, solve
+from darswin.models.unet import Unet
 from darswin.ops import _module
 
 SPHERICAL = Spherical.from_fov([0.2, 0.9], 2.6, 16.0)
@@ -92,6 +95,10 @@ def test_package_in_a_process_without_the_package(tmp_path):
     lens = Spherical.from_fov([0.3, 0.6, 0.9], 2.6, 16.0)
     frames = torch.randint(256, (3, 32, 40, 3), dtype=torch.uint8)
     export_package(model, tmp_path / "model.pt2", frames, lens)
+    with zipfile.ZipFile(tmp_path / "model.pt2") as package:
+        sources = [package.read(name) for name in package.namelist() if name.endswith(".cpp")]
+    assert any(b"#pragma omp parallel\n" in source for source in sources)
+    assert not any(b"num_threads(" in source for source in sources)
     shared = {name: t[:1].expand(3) for name, t in tensors_of(lens).items()}
     columns = dict(
         zip(tensors_of(lens), torch.stack((*tensors_of(lens).values(),), 1).unbind(1), strict=True)
@@ -115,35 +122,69 @@ def test_package_in_a_process_without_the_package(tmp_path):
     assert run.returncode == 0, run.stderr
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("name", "options", "lens"),
-    [
-        ("darswin_a_nano", {}, POLYNOMIAL),
-        ("darswin_ra_nano", ONE_BLOCK, POLYNOMIAL[0]),
-        ("swin_undis_nano", ONE_BLOCK, SPHERICAL),
-        ("dat_nano", dict(ONE_BLOCK, blocks=("D",), groups=(1,)), SPHERICAL),
-        ("darswin_unet_a_nano", ONE_BLOCK, SPHERICAL),
-        ("swin_unet_adapted_nano", dict(ONE_BLOCK, image_size=32, task="distance"), SPHERICAL[0]),
-    ],
-)
-def test_onnx(name, options, lens, tmp_path):
-    onnxruntime = pytest.importorskip("onnxruntime")
-    model, fixed = short(name, **options), len(lens) == 1
-    path = tmp_path / "model.onnx"
-    export_onnx(model, path, *batch_of(lens, 1)[:2], fixed_lens=fixed)
-    assert [file.name for file in tmp_path.iterdir()] == ["model.onnx"]
-    session = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
+ONNX_MODELS = {
+    "darswin_a_nano": ({}, POLYNOMIAL),
+    "darswin_ra_nano": (ONE_BLOCK, POLYNOMIAL[0]),
+    "swin_undis_nano": (ONE_BLOCK, SPHERICAL),
+    "dat_nano": (dict(ONE_BLOCK, blocks=("D",), groups=(1,)), SPHERICAL),
+    "darswin_unet_a_nano": (ONE_BLOCK, SPHERICAL),
+    "swin_unet_adapted_nano": (dict(ONE_BLOCK, image_size=32, task="distance"), SPHERICAL[0]),
+}
+
+
+@pytest.fixture(scope="module", params=ONNX_MODELS)
+def onnx_file(request, tmp_path_factory):
+    """A model, its ONNX file, and its lens."""
+    pytest.importorskip("onnxscript")
+    options, lens = ONNX_MODELS[request.param]
+    model, folder = short(request.param, **options), tmp_path_factory.mktemp("onnx")
+    export_onnx(model, folder / "model.onnx", *batch_of(lens, 1)[:2], fixed_lens=len(lens) == 1)
+    assert [file.name for file in folder.iterdir()] == ["model.onnx"]
+    return model, folder / "model.onnx", lens
+
+
+def check_runtime(run, model, lens, tolerance):
+    """Compares `run`, which takes arrays by name, with the model, for two batch sizes."""
     for count in (1, 5):
         images, lenses, tensors = batch_of(lens, count)
-        inputs = dict(images=images) | ({} if fixed else tensors)
-        assert [i.name for i in session.get_inputs()] == list(inputs)
-        assert {i.shape[0] for i in session.get_inputs()} == {"batch"}
-        (logits,) = session.run(["logits"], {name: t.numpy() for name, t in inputs.items()})
+        inputs = dict(images=images) | ({} if len(lens) == 1 else tensors)
+        logits = torch.from_numpy(run({name: t.numpy() for name, t in inputs.items()}))
         with torch.no_grad():
             expected = model(images, lenses)
-        error = (torch.from_numpy(logits) - expected).abs().max()
-        assert error <= 1e-4 * expected.abs().max()
+        assert (logits - expected).abs().max() <= tolerance * expected.abs().max()
+    wrong = {name: t[..., 1:].numpy() if t.dim() == 4 else t.numpy() for name, t in inputs.items()}
+    with pytest.raises(Exception, match=r"images|shape"):  # each runtime has its own error
+        run(wrong)
+
+
+@pytest.mark.slow
+def test_onnx_runtime(onnx_file):
+    onnxruntime = pytest.importorskip("onnxruntime")
+    model, path, lens = onnx_file
+    session = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
+    named = [] if len(lens) == 1 else [*tensors_of(lens)]
+    assert [i.name for i in session.get_inputs()] == ["images", *named]
+    assert {i.shape[0] for i in session.get_inputs()} == {"batch"}
+    check_runtime(lambda arrays: session.run(["logits"], arrays)[0], model, lens, 1e-4)
+
+
+@pytest.mark.slow
+def test_openvino(onnx_file):
+    openvino = pytest.importorskip("openvino")
+    model, path, lens = onnx_file
+    settings = {"INFERENCE_PRECISION_HINT": "f32"}
+    compiled = openvino.Core().compile_model(path, "CPU", settings)
+    tolerance = 1e-4 if isinstance(model, Unet) else 1e-5
+    check_runtime(lambda arrays: compiled(arrays)["logits"], model, lens, tolerance)
+
+
+@pytest.mark.slow
+def test_exporting_a_nano_takes_20_seconds_at_most(tmp_path):
+    pytest.importorskip("onnxscript")
+    model, images = create_model("darswin_a_nano").eval(), torch.zeros(1, 3, 64, 64)
+    start = time.process_time()
+    export_onnx(model, tmp_path / "model.onnx", images, SPHERICAL[0])
+    assert time.process_time() - start <= 20
 
 
 @pytest.mark.slow
@@ -154,7 +195,9 @@ def test_onnx_gathers_from_a_frame_before_all_else(shape, tmp_path):
     frames, lens = torch.randint(256, (2, *shape), dtype=torch.uint8), SPHERICAL[1]
     export_onnx(model, path, frames, lens, fixed_lens=True)
     whole, takers = {"images"}, []
-    for node in onnx.load(path).graph.node:
+    nodes = onnx.load(path).graph.node
+    assert not {node.op_type for node in nodes} & {"Sin", "Cos"}  # the grid is finished
+    for node in nodes:
         if whole & {*node.input}:
             takers.append(node.op_type)
             if node.op_type == "Reshape":

@@ -340,3 +340,39 @@ def test_onnx_runtime_says_the_same(vnni_only, tmp_path):
         want = quantized(*seen)
     assert (torch.from_numpy(logits).argmax(1) == want.argmax(1)).all()
     assert relative_error(torch.from_numpy(logits), want) < 0.05
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("vnni_only", [False, True])
+def test_openvino_multiplies_with_8_bits_in_files_for_vnni(vnni_only, tmp_path):
+    openvino = pytest.importorskip("openvino")
+    from darswin.deploy.export import export_onnx
+
+    model, seen = network(depths=(1, 1), num_heads=(1, 2)), batch(6)
+    quantized, path, lens = quantize_model(model, [seen]), tmp_path / "q.onnx", seen[1]
+    export_onnx(quantized, path, *seen, vnni_only=vnni_only)
+    settings = {"INFERENCE_PRECISION_HINT": "f32"}
+    compiled = openvino.Core().compile_model(path, "CPU", settings)
+    nodes = [op.get_rt_info() for op in compiled.get_runtime_model().get_ordered_ops()]
+    products = [n["primitiveType"].value for n in nodes if n["layerType"].value == "FullyConnected"]
+    in_8_bits = [product for product in products if product.endswith("I8")]
+    expected = len(quantized_layers(quantized)) if vnni_only and HAS_INT8 else 0
+    assert len(in_8_bits) == expected
+    given = dict(images=seen[0], xi=lens.xi, focal=lens.focal, theta_max=lens.theta_max)
+    logits = torch.from_numpy(compiled({k: v.numpy() for k, v in given.items()})["logits"])
+    with torch.no_grad():
+        want = quantized(*seen)
+    assert (logits - want).abs().max() < 0.05 * want.abs().max()
+
+
+@pytest.mark.slow
+def test_a_package_computes_as_the_quantized_model(tmp_path):
+    from darswin.deploy.export import export_package
+
+    model, (images, lenses) = network(depths=(1,), num_heads=(1,)), batch(6)
+    quantized = quantize_model(model, [(images, lenses)])
+    export_package(quantized, tmp_path / "q.pt2", images, lenses[0], fixed_lens=True)
+    packed = torch._inductor.aoti_load_package(tmp_path / "q.pt2")
+    with torch.no_grad():
+        want = quantized(images, lenses[0])
+    assert relative_error(packed(images), want) < 0.01
