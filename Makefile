@@ -156,7 +156,7 @@ sdist: $(STAMP)  ## build the sdist in dist/, and test it in a fresh environment
 # One wheel of a platform serves every Python; darswin.frames works with those that are found here.
 # The wheel uses the libraries of torch, which is imported first. cibuildwheel makes the published
 # wheels; it runs `repair` and tests/installed.py too.
-PYTHONS = $(foreach minor,11 12 13 14,$(shell command -v python3.$(minor)))
+PYTHONS = $(foreach minor,11 12 13 14,$(shell python3.$(minor) -c 'import sys; print(sys.executable)' 2>/dev/null))
 wheels: $(STAMP)  ## build the manylinux_2_28 wheel in dist/, and test it in a fresh environment
 	rm -rf build/wheel
 	PATH=$(CURDIR)/$(BIN):$$PATH DARSWIN_PYTHONS="$(PYTHONS)" \
