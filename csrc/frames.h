@@ -6,16 +6,23 @@
 
 namespace darswin {
 
-// The rule by which bilinear samples are computed. Each is the operator's rule for some images, so
-// that both give the same bits.
+// The rule by which bilinear samples of 8-bit pixels are computed. Each but the first is the rule
+// of the operator for some images.
 //   raw: interpolate, and do not normalize
 //   far: interpolate, then normalize; at the border, normalize first
 //   near: normalize, then interpolate with weights
-//   near_rows: the same, with differences on tiers without registers of 512 bits
+//   near_rows: the same, but with differences where kTryDifferences (kernels/polar_bytes.h) says so
 enum class Blend { raw, far, near, near_rows };
 
 // The memory of the samples: (points, C) or (C, points) float32, or (points, C) uint8.
 enum class FrameOutput { tokens, planes, bytes };
+
+struct ByteImage {
+  const uint8_t* pixels;  // (H, W, C), with C = 1 or 3
+  int64_t height, width, channels;
+  int64_t row_stride, column_stride, channel_stride;  // no offset exceeds 31 bits
+  const float *scale, *offset;  // (C,): a pixel p has the value p * scale + offset
+};
 
 // A point whose four pixels are not all inside the frame.
 struct BorderPoint {
@@ -25,9 +32,7 @@ struct BorderPoint {
 };
 
 struct FrameArgs {
-  const uint8_t* pixels;  // (H, W, C)
-  int64_t height, width, channels;
-  int64_t row_stride, column_stride, channel_stride;  // bytes; no offset exceeds 31 bits
+  ByteImage image;
   // The upper left pixels of the points; 0, 0 for points of `border`. kFrameSpare more are readable
   // behind these arrays.
   const int16_t *columns, *rows;
@@ -35,7 +40,6 @@ struct FrameArgs {
   int64_t points;
   const BorderPoint* border;
   int64_t border_points;
-  const float *scale, *offset;  // (C,): a pixel p has the value p * scale + offset
   Blend blend;
   FrameOutput output;
   void* out;

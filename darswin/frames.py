@@ -135,7 +135,8 @@ class Sampler(_frames.Sampler):
 
     `out` is an array for the result: C-contiguous, with its shape and type. `threads` is the most
     threads to use; small plans use fewer. The tokens and the polar image are those of
-    `darswin.ops.polar_sample`, bit for bit.
+    `darswin.ops.polar_sample`, bit for bit. On CPUs without AVX-512, single samples of small frames
+    may differ in the last bit.
 
     Args:
         plan: a `Plan`, or its file.

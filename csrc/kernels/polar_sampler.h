@@ -4,18 +4,10 @@
 // Interpolation in a packed image goes first downwards, then to the right, four channels at a time.
 #pragma once
 
-#include "polar_far.h"
+#include "polar_bytes.h"
 
 namespace darswin {
 namespace {
-
-// Interpolation uses weights, (1 - t) * a + t * b, or differences, a + t * (b - a). Differences
-// overflow between huge values and give NaN between infinite values. Weights cost more, except in
-// registers of 512 bits, which hold four points. So the other tiers try differences first. If a
-// sample is not finite, they compute the whole block of points again with weights. The other
-// samples of the block may then differ in their last bit.
-template <typename T>
-constexpr bool kTryDifferences = is_same_v<T, float> && kRegister < 64;
 
 template <bool kWeights, typename V>
 inline V between(V a, V b, V t) {
@@ -200,8 +192,18 @@ class Sampler {
   struct State {
     PlacedPoints<T> points;
     Targets targets;
+    ByteBlock bytes;
     T samples[4 * kBlock];
   };
+
+  // Returns whether polar_bytes.h samples the far image.
+  static bool reads_bytes(const PolarSampleArgs<T>& a) {
+    const double last =
+        (static_cast<double>(a.height) - 1) * static_cast<double>(a.image_stride[2]) +
+        (static_cast<double>(a.width) - 1) * static_cast<double>(a.image_stride[3]);
+    return is_same_v<T, float> && a.pixel == Pixel::u8 && (a.channels == 1 || a.channels == 3) &&
+           last < INT32_MAX;
+  }
 
   // Returns a bound of the distance from the block's first point in the output to any other.
   int64_t reach_of_block() const {
@@ -228,6 +230,10 @@ class Sampler {
     if (!a.packed) {
       for (int64_t n = 0; n < rows; ++n) {
         points.template find_far<false>(a, a.image_stride + 2, b, first + n, j, count, n * count);
+      }
+      if (reads_bytes(a)) {
+        sample_bytes(b, rows * count);
+        return spread(rows, count, out);
       }
       with_pixel_type<T>(a.pixel, [&]<typename E>() { far_lines<E>(b, j, rows, count, out); });
       return;
@@ -282,6 +288,53 @@ class Sampler {
     }
   }
 
+  // Samples the first `count` points of a block of bytes, one after the other.
+  void sample_bytes(int64_t b, int64_t count) const {
+    if constexpr (is_same_v<T, float>) {
+      const int64_t* stride = a.image_stride;
+      const ByteImage bytes{static_cast<const uint8_t*>(a.image) + b * stride[0],
+                            a.height,
+                            a.width,
+                            a.channels,
+                            stride[2],
+                            stride[3],
+                            stride[1],
+                            a.pixel_scale,
+                            a.pixel_offset};
+      const FarPlaces<T>& at = points.far;
+      for (int64_t k = 0; k < count; k += kByteBlock) {
+        const int64_t part = smaller(kByteBlock, count - k);
+        T* to = state.samples + k * a.channels;
+        if (a.height > 1 && a.width > 1) {
+          for (int64_t e = 0; e < part; ++e) {
+            const int64_t offset = at.offset[k + e];
+            state.bytes.offset[e] = offset < 0 ? 0 : static_cast<int32_t>(offset);
+          }
+          state.bytes.template sample<Blend::far>(bytes, at.right + k, at.lower + k, part);
+          state.bytes.write(a.channels, part, to);
+        }
+        for (int64_t e = k; e < k + part; ++e, to += a.channels) {
+          for (int64_t c = 0; c < a.channels && at.offset[e] < 0; ++c) {
+            to[c] = border_sample<Blend::far>(bytes, at.column[e], at.row[e], at.right[e],
+                                              at.lower[e], c);
+          }
+        }
+      }
+    }
+  }
+
+  // Copies the samples of a block, `rows` times `count` points, to their places in the output.
+  void spread(int64_t rows, int64_t count, T* to) const {
+    const int64_t part = smaller(a.samples_a, count), piece = part * a.channels;
+    const T* from = state.samples;
+    for (int64_t row = 0; row < rows; ++row) {
+      T* out = to + row * row_stride;
+      for (int64_t k = 0; k < count; k += part, from += piece, out += sector_stride) {
+        copy(from, piece, out);
+      }
+    }
+  }
+
   // Samples a block in the far image. The values behind a line of samples may be overwritten if the
   // token has more samples there, which come later. This holds for all lines except those that end
   // a row of the token.
@@ -290,15 +343,7 @@ class Sampler {
     const FarImage<T, E> far(a, b, points.far);
     if (a.gathers) {
       far.block(rows * count, state.samples);
-      const int64_t part = smaller(a.samples_a, count), piece = part * a.channels;
-      const T* from = state.samples;
-      for (int64_t row = 0; row < rows; ++row) {
-        T* out = to + row * row_stride;
-        for (int64_t k = 0; k < count; k += part, from += piece, out += sector_stride) {
-          copy(from, piece, out);
-        }
-      }
-      return;
+      return spread(rows, count, to);
     }
     const bool joined = rows == 1 && sector_stride == a.samples_a * a.channels;
     const Lines<T> lines(a, j, rows, count, joined ? count : a.samples_a, far.planes() > 1);

@@ -98,8 +98,9 @@ class Sampler {
     const Shape sizes(frame.shape(), frame.shape() + frame.ndim());
     const bool colors = sizes.size() == 3;
     FrameArgs a{};
-    a.channels = colors ? sizes[2] : 1;
-    if ((sizes.size() != 2 && !colors) || (a.channels != 1 && a.channels != 3)) {
+    ByteImage& image = a.image;
+    image.channels = colors ? sizes[2] : 1;
+    if ((sizes.size() != 2 && !colors) || (image.channels != 1 && image.channels != 3)) {
       throw py::value_error("frame must have shape (H, W), (H, W, 1) or (H, W, 3), got " +
                             shown(sizes));
     }
@@ -107,18 +108,18 @@ class Sampler {
       throw py::value_error("frame must be of the plan's size, (H, W) = " + shown({height, width}) +
                             ", got " + shown({sizes[0], sizes[1]}));
     }
-    if (scale.size() > 1 && a.channels != static_cast<int64_t>(scale.size())) {
+    if (scale.size() > 1 && image.channels != static_cast<int64_t>(scale.size())) {
       throw py::value_error("frame must have the plan's " + std::to_string(scale.size()) +
-                            " channels, got " + std::to_string(a.channels));
+                            " channels, got " + std::to_string(image.channels));
     }
-    a.pixels = static_cast<const uint8_t*>(frame.data());
-    a.height = height, a.width = width;
+    image.pixels = static_cast<const uint8_t*>(frame.data());
+    image.height = height, image.width = width;
     // The stride of an axis of size 1 may be any number, and is never used.
     const auto stride = [&](int axis) { return sizes[axis] > 1 ? frame.strides(axis) : 0; };
-    a.row_stride = stride(0), a.column_stride = stride(1),
-    a.channel_stride = colors ? stride(2) : 0;
-    if ((height - 1) * std::abs(static_cast<double>(a.row_stride)) +
-            (width - 1) * std::abs(static_cast<double>(a.column_stride)) >=
+    image.row_stride = stride(0), image.column_stride = stride(1),
+    image.channel_stride = colors ? stride(2) : 0;
+    if ((height - 1) * std::abs(static_cast<double>(image.row_stride)) +
+            (width - 1) * std::abs(static_cast<double>(image.column_stride)) >=
         INT32_MAX) {
       throw py::value_error("frame must span less than 2 GB of memory");
     }
@@ -126,18 +127,18 @@ class Sampler {
     for (int c = 0; c < 3; ++c) {
       factors[c] = scale[scale.size() > 1 ? c : 0], shifts[c] = offset[scale.size() > 1 ? c : 0];
     }
-    a.scale = factors, a.offset = shifts;
+    image.scale = factors, image.offset = shifts;
     a.columns = columns.data(), a.rows = rows.data();
     a.right = right.data(), a.lower = lower.data();
     a.points = static_cast<int64_t>(columns.size()) - kFrameSpare;
     a.border = border.data(), a.border_points = static_cast<int64_t>(border.size());
     a.output = kind;
-    // The operator's choice: see Sampler::block in kernels/polar_sampler.h.
-    a.blend = kind == FrameOutput::bytes       ? Blend::raw
-              : !normalize_first               ? Blend::far
-              : shape.back() * a.channels >= 4 ? Blend::near_rows
-                                               : Blend::near;
-    py::array result = output_array(out, output_shape(a.channels, colors));
+    // See Sampler::block in kernels/polar_sampler.h.
+    a.blend = kind == FrameOutput::bytes           ? Blend::raw
+              : !normalize_first                   ? Blend::far
+              : shape.back() * image.channels >= 4 ? Blend::near_rows
+                                                   : Blend::near;
+    py::array result = output_array(out, output_shape(image.channels, colors));
     a.out = result.mutable_data();
     {
       const py::gil_scoped_release free;
