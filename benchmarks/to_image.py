@@ -15,12 +15,14 @@ from peers import compare, run_suite
 from torch import Tensor
 
 from darswin.bench.timing import OURS, Case, Timing
-from darswin.ops import polar_to_image
+from darswin.ops import polar_to_image, polar_to_image_plan
 
 PEER = "F.pad + F.grid_sample"
 # Batch, rings, sectors, channels and side of the image: the smallest ratios for forward, in tokens
 # and as an image.
 CASES = {(4, 16, 64, 96, 128): (4.0, 2.5), (2, 64, 256, 96, 256): (5.0, 3.0)}
+# The same for images of few channels, with a plan: for forward, and for forward and backward.
+FEW_CHANNELS = {(2, 64, 256, 1, 256): (1.0, 1.5), (2, 64, 256, 3, 256): (1.5, 1.5)}
 
 
 def mesh(rings: int, sectors: int, size: int) -> Tensor:
@@ -50,28 +52,34 @@ def padded(maps: Tensor, places: Tensor) -> Tensor:
 
 
 def to_image(
-    sizes: tuple[int, int, int, int, int], mode: str, layout: str, seconds: float
+    sizes: tuple[int, int, int, int, int],
+    mode: str,
+    layout: str,
+    seconds: float,
+    planned: bool = False,
 ) -> list[Timing]:
     """Times one case. `layout` is that of the operator; for "tokens", the peer permutes."""
-    batch, rings, sectors, _, size = sizes
+    batch, rings, sectors, channels, size = sizes
     maps, radii, center, places = inputs(*sizes)
+    plan = polar_to_image_plan(maps, radii, center, (size, size)) if planned else None
 
     def ours(maps: Tensor) -> Tensor:
-        return polar_to_image(maps, radii, center, (size, size), layout=layout)
+        return polar_to_image(maps, radii, center, (size, size), plan=plan, layout=layout)
 
     def peer(maps: Tensor) -> Tensor:
         image = padded(maps, places)
         return image.permute(0, 2, 3, 1).contiguous() if layout == "tokens" else image
 
-    case = Case(
-        "polar_to_image", f"{rings}×{sectors} → {size}×{size}", batch,
-        torch.get_num_threads(), mode if layout == "image" else f"{mode}, layout {layout}",
-    )  # fmt: skip
-    target = CASES[sizes][layout == "image"] if mode == "forward" else 8.0
+    setting = f"{rings}×{sectors} → {size}×{size}"
+    if sizes in FEW_CHANNELS:
+        setting += f", channels: {channels}"
+        targets = {PEER: FEW_CHANNELS[sizes][mode != "forward"]} if planned else {}
+    else:
+        targets = {PEER: CASES[sizes][layout == "image"] if mode == "forward" else 8.0}
+    mode += f", layout {layout}" * (layout != "image") + ", plan kept" * planned
+    case = Case("polar_to_image", setting, batch, torch.get_num_threads(), mode)
     # The coordinates of grid_sample are float32, in units of the whole map.
-    return compare(
-        case, {OURS: ours, PEER: peer}, [maps], seconds, targets={PEER: target}, tolerance=1e-4
-    )
+    return compare(case, {OURS: ours, PEER: peer}, [maps], seconds, targets=targets, tolerance=1e-4)
 
 
 def main() -> None:
@@ -87,6 +95,13 @@ def main() -> None:
         for mode in ("forward", "forward+backward")
         for layout in ("tokens", "image")
     ]
+    if not args.quick:
+        jobs += [
+            partial(to_image, sizes, mode, "image", seconds, planned)
+            for sizes in FEW_CHANNELS
+            for mode in ("forward", "forward+backward")
+            for planned in (False, True)
+        ]
     run_suite("to_image", jobs, avx2_share=0.6, out=args.out)
 
 

@@ -17,7 +17,7 @@
 
 #define POLAR_TO_IMAGE                                                                      \
   "Tensor x, Tensor radii, Tensor? center, Tensor? affine, Tensor? points, Tensor? r_max, " \
-  "int[] size, bool tokens"
+  "int[] size"
 
 // A backward takes the arguments of its operator, then the gradient of the output.
 STABLE_TORCH_LIBRARY(darswin, m) {
@@ -35,9 +35,10 @@ STABLE_TORCH_LIBRARY(darswin, m) {
   m.def(
       "window_attention_backward(Tensor qkv, Tensor bias, int[] window, int[] shift, "
       "int[] periodic, float scale, Tensor grad_out) -> (Tensor, Tensor)");
-  m.def("polar_to_image(" POLAR_TO_IMAGE ") -> Tensor");
+  m.def("_polar_to_image_plan(" POLAR_TO_IMAGE ") -> Tensor");
+  m.def("polar_to_image(" POLAR_TO_IMAGE ", bool tokens, Tensor? plan) -> Tensor");
   m.def("polar_to_image_backward(" POLAR_TO_IMAGE
-        ", Tensor grad_out, bool x_grad, bool lens_grad) -> "
+        ", bool tokens, Tensor? plan, Tensor grad_out, bool x_grad, bool lens_grad) -> "
         "(Tensor, Tensor, Tensor, Tensor, Tensor)");
   m.def("_add_norm_(Tensor(a!) x, Tensor(b!) y, Tensor weight, Tensor bias, float eps) -> ()");
   m.def(

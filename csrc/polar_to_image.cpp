@@ -21,19 +21,20 @@ struct ToImageCall {
   using Real = Arithmetic<T>;
 
   Tensor x, radii;
-  MaybeTensor center, affine, points, r_max;
+  MaybeTensor center, affine, points, r_max, plan;
   std::vector<double> plane;
   PolarToImageArgs<T> args{};
 
   ToImageCall(const Tensor& x_, const Tensor& radii_, const MaybeTensor& center_,
               const MaybeTensor& affine_, const MaybeTensor& points_, const MaybeTensor& r_max_,
-              const Sizes& size, bool tokens)
+              const Sizes& size, bool tokens, const MaybeTensor& plan_)
       : x(as_contiguous(x_)),
         radii(as_contiguous(radii_)),
         center(as_contiguous(center_)),
         affine(as_contiguous(affine_)),
         points(as_contiguous(points_)),
-        r_max(as_contiguous(r_max_)) {
+        r_max(as_contiguous(r_max_)),
+        plan(as_contiguous(plan_)) {
     STD_TORCH_CHECK(x.dim() == 4 && x.size(1) > 0 && x.size(2) > 0 && size.size() == 2 &&
                         size[0] >= 0 && size[1] >= 0,
                     kName, ": x must be (B, R, A, D) and size (H, W)");
@@ -41,7 +42,10 @@ struct ToImageCall {
     args.channels = x.size(3), args.height = size[0], args.width = size[1], args.tokens = tokens;
     check_product({args.batch, args.height, args.width, args.channels});
     check_product({args.batch, args.height, args.rings + kSums});
-    STD_TORCH_CHECK(args.rings <= INT32_MAX / args.sectors, kName, ": too many tokens");
+    check_product({args.batch, args.height, args.width, kPosition});
+    constexpr int64_t kMostRings = 1 << 24;  // float32 holds the numbers of so many rings
+    STD_TORCH_CHECK(args.rings <= std::min(INT32_MAX / args.sectors, kMostRings), kName,
+                    ": too many tokens");
     check_product({args.rings, args.sectors, std::max(args.channels, kChannelBlock)});
     STD_TORCH_CHECK(center.has_value() != points.has_value() && !(points && affine), kName,
                     ": takes center, and affine if need be, or else points");
@@ -53,14 +57,18 @@ struct ToImageCall {
     check_rising();
     args.r_max = r_max ? pointer<Real>(*r_max) : nullptr;
     args.points = points ? pointer<Real>(*points) : nullptr;
+    args.plan = plan ? pointer<Real>(*plan) : nullptr;
     if (center) find_plane();
     args.bands = 1;
     const bool shared = args.radii_rows == 1 && args.place_rows == 1;
     args.lenses = shared ? 1 : args.batch;
+    const int64_t plans = shared && args.r_max_rows == 1 ? 1 : args.batch;
+    args.plans = plan ? rows(*plan, {size[0], kPosition, size[1]}) : plans;
   }
 
   int64_t rows(const Tensor& tensor, const Sizes& sizes) const {
-    return count_rows<Real>(tensor, args.batch, sizes, "radii, center, affine, points or r_max");
+    return count_rows<Real>(tensor, args.batch, sizes,
+                            "radii, center, affine, points, r_max or plan");
   }
 
   void check_rising() const {
@@ -103,6 +111,16 @@ struct ToImageCall {
                      [&](auto... range) { kernel(args, range...); });
   }
 };
+
+template <typename T>
+Tensor make_plan(ToImageCall<T>&& call) {
+  auto& args = call.args;
+  const Sizes sizes{args.plans, args.height, kPosition, args.width};
+  const Tensor positions = new_tensor(sizes, type_of<Arithmetic<T>>());
+  args.positions = mutable_pointer<Arithmetic<T>>(positions);
+  call.run(args.plans * args.height, kernels<PolarToImageKernels<T>>().make_plan);
+  return positions;
+}
 
 template <typename T>
 Tensor forward(ToImageCall<T>&& call) {
@@ -220,19 +238,27 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> backward(ToImageCall<T>&& cal
   return {x, lens[0], lens[1], lens[2], lens[3]};
 }
 
-Tensor polar_to_image(Tensor x, Tensor radii, MaybeTensor center, MaybeTensor affine,
-                      MaybeTensor points, MaybeTensor r_max, Sizes size, bool tokens) {
+Tensor polar_to_image_plan(Tensor x, Tensor radii, MaybeTensor center, MaybeTensor affine,
+                           MaybeTensor points, MaybeTensor r_max, Sizes size) {
   return with_real_type(x, kName, [&]<typename T>() {
-    return forward(ToImageCall<T>(x, radii, center, affine, points, r_max, size, tokens));
+    return make_plan(ToImageCall<T>(x, radii, center, affine, points, r_max, size, false, {}));
+  });
+}
+
+Tensor polar_to_image(Tensor x, Tensor radii, MaybeTensor center, MaybeTensor affine,
+                      MaybeTensor points, MaybeTensor r_max, Sizes size, bool tokens,
+                      MaybeTensor plan) {
+  return with_real_type(x, kName, [&]<typename T>() {
+    return forward(ToImageCall<T>(x, radii, center, affine, points, r_max, size, tokens, plan));
   });
 }
 
 auto polar_to_image_backward(Tensor x, Tensor radii, MaybeTensor center, MaybeTensor affine,
                              MaybeTensor points, MaybeTensor r_max, Sizes size, bool tokens,
-                             Tensor grad, bool x_grad, bool lens_grad) {
+                             MaybeTensor plan, Tensor grad, bool x_grad, bool lens_grad) {
   return with_real_type(x, kName, [&]<typename T>() {
-    return backward(ToImageCall<T>(x, radii, center, affine, points, r_max, size, tokens), grad,
-                    x_grad, lens_grad);
+    return backward(ToImageCall<T>(x, radii, center, affine, points, r_max, size, tokens, plan),
+                    grad, x_grad, lens_grad);
   });
 }
 
@@ -241,5 +267,6 @@ auto polar_to_image_backward(Tensor x, Tensor radii, MaybeTensor center, MaybeTe
 
 STABLE_TORCH_LIBRARY_IMPL(darswin, CPU, m) {
   m.impl("polar_to_image", TORCH_BOX(&darswin::polar_to_image));
+  m.impl("_polar_to_image_plan", TORCH_BOX(&darswin::polar_to_image_plan));
   m.impl("polar_to_image_backward", TORCH_BOX(&darswin::polar_to_image_backward));
 }

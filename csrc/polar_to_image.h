@@ -13,6 +13,9 @@ constexpr int64_t kPlane = 6;  // center x, y; inverse xx, xy, yx, yy
 // The sums over pixels that backward needs in addition to the gradients of the radii: the gradient
 // of d, and the gradient of d times p - center.
 constexpr int64_t kSums = 6;
+// The numbers that a plan keeps of each pixel: how many ring centres lie inside it, or -1 if it is
+// zero; its place between two of them; its azimuth in sectors.
+constexpr int64_t kPosition = 3;
 
 template <typename T>
 struct PolarToImageArgs {
@@ -23,13 +26,16 @@ struct PolarToImageArgs {
   const double* plane;  // (B or 1, kPlane), or null if there are points
   const Real* points;   // (B or 1, H, W, 2), or null
   const Real* r_max;    // (B or 1), or null
+  const Real* plan;     // (B or 1, H, kPosition, W), or null
   int64_t radii_rows, place_rows, r_max_rows;
+  int64_t plans;  // 1 if all images share their positions, else B
   int64_t batch, rings, sectors, channels, height, width;
   bool tokens;  // (B, H, W, D), else (B, D, H, W)
 
   int64_t bands;  // the number of bands of rows into which an image is cut
 
-  T* out;  // forward
+  T* out;           // forward
+  Real* positions;  // make_plan: (plans, H, kPosition, W)
 
   const T* grad_out;  // backward
   T* grad_x;          // like x
@@ -48,6 +54,8 @@ struct PolarToImageKernels {
   using Args = PolarToImageArgs<T>;
   // bytes of scratch for each thread that runs one of the functions below
   int64_t (*scratch)(const Args&);
+  // item: (plan, row of pixels) -> positions
+  void (*make_plan)(const Args&, int64_t begin, int64_t end, void* scratch);
   // item: (band of rows, image)
   void (*forward)(const Args&, int64_t begin, int64_t end, void* scratch);
   // item: (band of rows, image, block of channels) -> grad_x or partial

@@ -24,17 +24,15 @@ struct Mix {
   Index known[kTile];  // all ones, or 0 where the pixel is zero
 };
 
-// The intermediate results behind a Mix, which backward needs.
+// The intermediate results behind a Mix, which backward needs. Step, t and column are the position
+// of a pixel in the map: a plan keeps these three.
 template <typename Real>
 struct Origin {
-  using Index = IndexOf<Real>;
-
   Real across[kTile], down[kTile], radius[kTile];  // the place on the polar plane
-  Index inner[kTile], outer[kTile];                // the rings on both sides
-  Real from[kTile], span[kTile];                   // inner ring's radius; gap to the outer ring
-  Real turn[kTile];                                // sectors to the other side of the pole, or 0
-  Real t[kTile], left[kTile], right[kTile];        // share of the outer ring; of the right sector
-                                                   // in the inner ring and in the outer one
+  Real step[kTile];                // how many ring centres lie inside; -1 where the pixel is zero
+  Real t[kTile];                   // share of the outer ring
+  Real column[kTile];              // the azimuth in sectors
+  Real left[kTile], right[kTile];  // share of the right sector in the inner and the outer ring
 };
 
 template <typename T>
@@ -49,9 +47,8 @@ class Planner {
   // `steps` has room for 2 * (rings + 1) values.
   Planner(const Args& args, Real* steps) : a(args), from(steps) {}
 
-  // Plans `count` pixels of a row of image b, starting at pixel `first`.
-  void plan(int64_t b, int64_t row, int64_t first, int64_t count, Mix<Real>& tile,
-            Origin<Real>& plan) {
+  // Computes the positions of `count` pixels of a row of image b, starting at pixel `first`.
+  void locate(int64_t b, int64_t row, int64_t first, int64_t count, Origin<Real>& plan) {
     const int64_t whole = round_up(count, kLanes<Real>);
     place(a.place_rows == 1 ? 0 : b, row, first, count, plan);
     for (int64_t k = count; k < whole; ++k) plan.across[k] = plan.down[k] = 0;
@@ -61,10 +58,30 @@ class Planner {
     take_radii(a.radii_rows == 1 ? 0 : b);
     const Real infinity = static_cast<Real>(__builtin_inf());
     const Real limit = a.r_max == nullptr ? infinity : a.r_max[a.r_max_rows == 1 ? 0 : b];
-    for (int64_t k = 0; k < whole; k += kLanes<Real>) {
-      find_rings(k, plan);
-      mix(k, limit, infinity, tile, plan);
+    for (int64_t k = 0; k < whole; k += kLanes<Real>) locate_register(k, limit, plan);
+  }
+
+  // Reads the positions from the plan. Wrong numbers give a wrong position inside the map.
+  void read(int64_t b, int64_t row, int64_t first, int64_t count, Origin<Real>& plan) const {
+    const int64_t n = a.plans == 1 ? 0 : b;
+    const Real* from = a.plan + (n * a.height + row) * kPosition * a.width + first;
+    const auto rings = static_cast<Real>(a.rings), turn = static_cast<Real>(a.sectors) / 2;
+    const auto within = [](Real least, Real x, Real most) {
+      return x >= least ? (x < most ? x : most) : least;
+    };
+    for (int64_t k = 0; k < count; ++k) {
+      plan.step[k] = within(-1, from[k], rings);
+      plan.t[k] = from[a.width + k];
+      plan.column[k] = within(-turn - 1, from[2 * a.width + k], turn);
     }
+    for (int64_t k = count; k < round_up(count, kLanes<Real>); ++k) {
+      plan.step[k] = -1, plan.t[k] = plan.column[k] = 0;
+    }
+  }
+
+  // Computes the tokens and the weights of pixels from their positions.
+  void mix(int64_t count, Mix<Real>& tile, Origin<Real>& plan) const {
+    for (int64_t k = 0; k < count; k += kLanes<Real>) mix_register(k, tile, plan);
   }
 
  private:
@@ -113,10 +130,9 @@ class Planner {
 
   // Finds the step that each pixel of a register lies in. The number of the step is the number of
   // ring centres that are at most as far out as the pixel. Radii change little from pixel to pixel,
-  // so the search begins at the last result, and the pixels of a register lie in few steps. A pixel
-  // at NaN gets an arbitrary step.
-  void find_rings(int64_t k, Origin<Real>& plan) {
-    const V r = load<V>(plan.radius + k);
+  // so the search begins at the last result, and the pixels of a register lie in few steps.
+  void locate_register(int64_t k, Real limit, Origin<Real>& plan) {
+    const V x = load<V>(plan.across + k), y = load<V>(plan.down + k), r = load<V>(plan.radius + k);
     const V infinity = splat<V>(static_cast<Real>(__builtin_inf()));
     const Real lowest = largest<kLanes<Real> / 2>(r == r ? -r : -infinity)[0] * -1;
     const Real highest = largest<kLanes<Real> / 2>(r == r ? r : -infinity)[0];
@@ -130,27 +146,22 @@ class Planner {
       begin = select(outside, splat<V>(from[ring + 1]), begin);
       length = select(outside, splat<V>(span[ring + 1]), length);
     }
-    const auto last = static_cast<Index>(a.rings - 1);
-    const Real half = static_cast<Real>(0.5) * static_cast<Real>(a.sectors);
-    const I pole = within == 0;
-    store(plan.inner + k, within - 1 - pole);
-    store(plan.outer + k, select(within > last, I{} + last, within));
-    store(plan.turn + k, select(pole, splat<V>(half), V{}));
-    store(plan.from + k, begin);
-    store(plan.span + k, length);
+    // Infinity minus infinity is NaN, which is not equal to anything.
+    const I known = (x - x == 0) & (y - y == 0) & (r <= limit) & (r < infinity);
+    store(plan.step + k, select(known, __builtin_convertvector(within, V), V{} - 1));
+    store(plan.t + k, (r - begin) / length);
+    store(plan.column + k,
+          arc_tangent(y, x, known) * static_cast<Real>(a.sectors / (2 * kPi)) - Real{0.5});
   }
 
   // Computes the tokens and the weights of a register of pixels.
-  void mix(int64_t k, Real limit, Real infinity, Mix<Real>& tile, Origin<Real>& plan) const {
-    const V x = load<V>(plan.across + k), y = load<V>(plan.down + k), r = load<V>(plan.radius + k);
-    // Infinity minus infinity is NaN, which is not equal to anything.
-    const I known = (x - x == 0) & (y - y == 0) & (r <= limit) & (r < infinity);
-    const V t = (r - load<V>(plan.from + k)) / load<V>(plan.span + k);
-    const V column =
-        arc_tangent(y, x, known) * static_cast<Real>(a.sectors / (2 * kPi)) - Real{0.5};
-    const auto sectors = static_cast<Index>(a.sectors);
-    const I none{};
-    const auto side = [&](int ring, const Index* of, V at, V weight, Real* share_to) {
+  void mix_register(int64_t k, Mix<Real>& tile, Origin<Real>& plan) const {
+    const V t = load<V>(plan.t + k), column = load<V>(plan.column + k);
+    const I step = __builtin_convertvector(load<V>(plan.step + k), I);
+    const I known = step >= 0, pole = step == 0, none{};
+    const auto sectors = static_cast<Index>(a.sectors), last = static_cast<Index>(a.rings - 1);
+    const V turn = splat<V>(static_cast<Real>(0.5) * static_cast<Real>(a.sectors));
+    const auto side = [&](int ring, I of, V at, V weight, Real* share_to) {
       I left = __builtin_convertvector(at, I);
       left += __builtin_convertvector(left, V) > at;  // rounds towards minus infinity: true is -1
       const V share = at - __builtin_convertvector(left, V);
@@ -159,17 +170,16 @@ class Planner {
       left -= (left >= sectors) & sectors;
       I right = left + 1;
       right -= (right >= sectors) & sectors;
-      const I base = load<I>(of + k) * sectors;
+      const I base = of * sectors;
       store(tile.token[2 * ring] + k, select(known, base + left, none));
       store(tile.token[2 * ring + 1] + k, select(known, base + right, none));
       store(tile.weight[2 * ring] + k, weight * (1 - share));
       store(tile.weight[2 * ring + 1] + k, weight * share);
       store(share_to + k, share);
     };
-    side(0, plan.inner, column + load<V>(plan.turn + k), 1 - t, plan.left);
-    side(1, plan.outer, column, t, plan.right);
+    side(0, step - 1 - pole, column + select(pole, turn, V{}), 1 - t, plan.left);
+    side(1, select(step > last, I{} + last, step), column, t, plan.right);
     store(tile.known + k, known);
-    store(plan.t + k, t);
   }
 
   const Args& a;
@@ -184,11 +194,13 @@ int64_t rows_of_band(const PolarToImageArgs<T>& a) {
   return (a.height + a.bands - 1) / a.bands;
 }
 
-// The channels of a pixel are taken in registers of this many lanes if there are few channels.
+// The channels of a pixel are taken in registers of this many lanes if there are few channels. A
+// single channel is taken as it is.
 constexpr int64_t kFew = 4;
 template <typename T>
 int64_t lanes(const PolarToImageArgs<T>& a) {
   constexpr int64_t most = kLanes<Arithmetic<T>>;
+  if (a.channels == 1) return 1;
   return a.channels <= kFew ? smaller(kFew, most) : most;
 }
 
@@ -211,7 +223,7 @@ class Workspace {
       : arena{static_cast<char*>(memory)},
         planner(args, arena.take<Real>(2 * (args.rings + 1))),
         a(args),
-        shared(a.radii_rows == 1 && a.place_rows == 1 && a.r_max_rows == 1),
+        shared(a.plans == 1),
         tiles(round_up(a.width, kTile) / kTile) {
     // Rows are kept if they are needed again and take no more memory than this.
     constexpr int64_t kMost = int64_t{16} << 20;
@@ -240,7 +252,13 @@ class Workspace {
     kept[at] = key;
     for (int64_t tile = 0; tile < tiles; ++tile) {
       const int64_t first = tile * kTile;
-      planner.plan(b, y, first, smaller(kTile, a.width - first), to[tile], *origin);
+      const int64_t count = smaller(kTile, a.width - first);
+      if (a.plan == nullptr) {
+        planner.locate(b, y, first, count, *origin);
+      } else {
+        planner.read(b, y, first, count, *origin);
+      }
+      planner.mix(count, to[tile], *origin);
     }
     return to;
   }

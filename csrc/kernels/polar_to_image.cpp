@@ -14,128 +14,10 @@
 // and a few channels, so that its sums stay in the cache. No two items write to the same place.
 #include "../polar_to_image.h"
 
-#include "convert.h"
-#include "polar_plan.h"
+#include "polar_mix.h"
 
 namespace darswin {
 namespace {
-
-// Mixes kL channels of a pixel at a time. `fixed` is the number of channels, or 0 if only the call
-// knows it. Multiplying by a variable number four times would take longer than the rest of the work
-// on a pixel with few channels.
-template <typename T, int64_t kL, int64_t fixed>
-class Forward {
- public:
-  using Args = PolarToImageArgs<T>;
-  using Real = Arithmetic<T>;
-  using V = Vector<Real, kL>;
-
-  Forward(const Args& args, Workspace<T>& work) : a(args), work(work) {}
-
-  int64_t channels() const { return fixed > 0 ? fixed : a.channels; }
-
-  void row(int64_t b, int64_t y) {
-    const int64_t pixels = a.height * a.width;
-    tile = work.row(b, y);
-    for (int64_t first = 0; first < a.width; first += kTile, ++tile) {
-      const int64_t count = smaller(kTile, a.width - first), place = y * a.width + first;
-      const T* map = a.x + b * a.rings * a.sectors * channels();
-      find_end(count);
-      if (a.tokens) {
-        tokens(map, count, a.out + (b * pixels + place) * channels());
-      } else {
-        planes(map, count, a.out + b * channels() * pixels + place, pixels);
-      }
-    }
-  }
-
- private:
-  // Finds how many channels can be read, counted from the first channel of any token of the tile.
-  void find_end(int64_t count) {
-    IndexOf<Real> last = 0;
-    for (int corner = 0; corner < 4; ++corner) {
-      for (int64_t k = 0; k < count; ++k) {
-        const IndexOf<Real> token = tile->token[corner][k];
-        last = token > last ? token : last;
-      }
-    }
-    readable = channels() * (a.rings * a.sectors - last);
-  }
-
-  // Mixes channel c of pixel k. If W is a register, it mixes the channels from c on.
-  template <typename W>
-  W mix(const T* map, int64_t k, int64_t c) const {
-    if (!tile->known[k]) return W{};
-    const W inner = tile->weight[0][k] * load<W>(map + channels() * tile->token[0][k] + c) +
-                    tile->weight[1][k] * load<W>(map + channels() * tile->token[1][k] + c);
-    const W outer = tile->weight[2][k] * load<W>(map + channels() * tile->token[2][k] + c) +
-                    tile->weight[3][k] * load<W>(map + channels() * tile->token[3][k] + c);
-    return inner + outer;
-  }
-
-  // Mixes the channels from c on, which may be fewer than a register. It reads whole registers as
-  // long as they lie inside the map.
-  V mix_last(const T* map, int64_t k, int64_t c) const {
-    if (c + kL <= readable) return mix<V>(map, k, c);
-    V v{};
-    for (int64_t e = c; e < smaller(c + kL, channels()); ++e) v[e - c] = mix<Real>(map, k, e);
-    return v;
-  }
-
-  void tokens(const T* map, int64_t count, T* to) const {
-    const T* end = to + count * channels();
-    for (int64_t k = 0; k < count; ++k, to += channels()) {
-      int64_t c = 0;
-      for (; c + kL <= channels(); c += kL) store(to + c, mix<V>(map, k, c));
-      if (c == channels()) continue;
-      const V last = mix_last(map, k, c);
-      if (end - (to + c) >= kL) {
-        store(to + c, last);  // the next pixel overwrites the excess values
-      } else {
-        for (; c < channels(); ++c) store(to + c, last[c % kL]);
-      }
-    }
-  }
-
-  void planes(const T* map, int64_t count, T* to, int64_t stride) const {
-    for (int64_t c = 0; c < channels(); c += kL) {
-      const int64_t width = smaller(kL, channels() - c);
-      int64_t k = 0;
-      if constexpr (is_same_v<Real, float>) {
-        for (; k + kL <= count; k += kL) square(map, k, c, width, to + c * stride + k, stride);
-      }
-      for (; k < count; ++k) {
-        const V v = mix_last(map, k, c);
-        for (int64_t e = 0; e < width; ++e) store(to + (c + e) * stride + k, v[e]);
-      }
-    }
-  }
-
-  // Mixes up to kL channels of kL pixels, starting at pixel k and channel c.
-  void square(const T* map, int64_t k, int64_t c, int64_t width, T* to, int64_t stride) const {
-    V rows[kL];
-    if (width == kL) {
-#pragma GCC unroll 16
-      for (int i = 0; i < kL; ++i) {
-        // The planes lie far apart, so the hardware does not prefetch them.
-        __builtin_prefetch(to + i * stride + kL, 1);
-        rows[i] = mix<V>(map, k + i, c);
-      }
-      if constexpr (is_same_v<T, float>) return transpose_square(rows, to, stride);
-    } else {
-#pragma GCC unroll 16
-      for (int i = 0; i < kL; ++i) rows[i] = mix_last(map, k + i, c);
-    }
-    float turned[kL * kL];
-    transpose_square(rows, turned, kL);
-    for (int64_t i = 0; i < width; ++i) store(to + i * stride, load<V>(turned + i * kL));
-  }
-
-  const Args& a;
-  Workspace<T>& work;
-  const Mix<Real>* tile = nullptr;
-  int64_t readable = 0;
-};
 
 // Reads the gradients of a tile's pixels for channels [c, c + width). Each pixel gets a row of
 // `row` values, padded with zeros. `row` is a multiple of kL.
@@ -145,7 +27,7 @@ void gather(const PolarToImageArgs<T>& a, int64_t b, int64_t place, int64_t coun
   using V = Vector<Real, kL>;
   constexpr int64_t kAhead = 16, kBytes = sizeof(T);
   const int64_t pixels = a.height * a.width;
-  if (a.tokens) {
+  if (kL > 1 && a.tokens) {
     const T* from = a.grad_out + (b * pixels + place) * a.channels + c;
     for (int64_t k = 0; k < count; ++k, from += a.channels, to += row) {
       // The pieces lie far apart, so the hardware does not prefetch them.
@@ -162,7 +44,7 @@ void gather(const PolarToImageArgs<T>& a, int64_t b, int64_t place, int64_t coun
   for (int64_t e = 0; e < row; e += kL) {
     const int64_t planes = smaller(kL, width - e);
     int64_t k = 0;
-    if constexpr (is_same_v<Real, float>) {
+    if constexpr (is_same_v<Real, float> && kL > 1) {
       for (; k + kL <= count; k += kL) {
         V rows[kL]{};
         if (planes == kL) {
@@ -191,15 +73,19 @@ int64_t scratch(const PolarToImageArgs<T>& a) {
   return Workspace<T>(a, nullptr).bytes;
 }
 
-template <typename T, int64_t kL, int64_t fixed>
-void forward_items(const PolarToImageArgs<T>& a, int64_t begin, int64_t end, void* memory) {
+template <typename T>
+void make_plan(const PolarToImageArgs<T>& a, int64_t begin, int64_t end, void* memory) {
   Workspace<T> work(a, memory);
-  Forward<T, kL, fixed> forward(a, work);
-  const int64_t rows = rows_of_band(a);
+  const auto& origin = *work.origin;
   for (int64_t item = begin; item < end; ++item) {
-    const int64_t band = item / a.batch;
-    for (int64_t y = band * rows; y < smaller((band + 1) * rows, a.height); ++y) {
-      forward.row(item % a.batch, y);
+    for (int64_t first = 0; first < a.width; first += kTile) {
+      const int64_t count = smaller(kTile, a.width - first);
+      work.planner.locate(item / a.height, item % a.height, first, count, *work.origin);
+      auto* to = a.positions + item * kPosition * a.width + first;
+      for (const auto* values : {origin.step, origin.t, origin.column}) {
+        copy(values, count, to);
+        to += a.width;
+      }
     }
   }
 }
@@ -228,6 +114,7 @@ void add(const Mix<Real>& tile, int64_t count, int64_t row_, const Real* gradien
 // matter.
 template <int64_t kL, typename From, typename To>
 void copy_rows(const From* from, int64_t rows, int64_t row, int64_t width, To* to, int64_t stride) {
+  if (width == row && width == stride) return copy(from, rows * row, to);
   if (row == kL && width == stride) {
     using V = Vector<From, kL>;
     // The next row overwrites the excess values.
@@ -277,15 +164,16 @@ template <typename T>
 void forward(const PolarToImageArgs<T>& a, int64_t begin, int64_t end, void* memory) {
   constexpr int64_t most = kLanes<Arithmetic<T>>, few = most < kFew ? most : kFew;
   auto* items = lanes(a) == few ? forward_items<T, few, 0> : forward_items<T, most, 0>;
-  if (a.channels == 1) items = forward_items<T, few, 1>;
+  if (a.channels == 1) items = forward_items<T, 1, 1>;
   if (a.channels == 3) items = forward_items<T, few, 3>;
   items(a, begin, end, memory);
 }
 template <typename T>
 void backward_map(const PolarToImageArgs<T>& a, int64_t begin, int64_t end, void* memory) {
   constexpr int64_t most = kLanes<Arithmetic<T>>, few = most < kFew ? most : kFew;
-  (lanes(a) == few ? backward_map_items<T, few> : backward_map_items<T, most>)(a, begin, end,
-                                                                               memory);
+  auto* items = lanes(a) == few ? backward_map_items<T, few> : backward_map_items<T, most>;
+  if (a.channels == 1) items = backward_map_items<T, 1>;
+  items(a, begin, end, memory);
 }
 
 template <typename T>
@@ -334,7 +222,8 @@ void backward_lens(const PolarToImageArgs<T>& a, int64_t begin, int64_t end, voi
       const double* m = a.plane == nullptr ? nullptr : a.plane + (a.place_rows == 1 ? 0 : b) * 6;
       for (int64_t first = 0; first < a.width; first += kTile) {
         const int64_t count = smaller(kTile, a.width - first);
-        work.planner.plan(b, y, first, count, tile, plan);
+        work.planner.locate(b, y, first, count, plan);
+        work.planner.mix(count, tile, plan);
         gather<kLanes<Real>>(a, b, y * a.width + first, count, int64_t{0}, a.channels, row,
                              work.gradients);
         for (int64_t k = 0; k < count; ++k) {
@@ -349,9 +238,10 @@ void backward_lens(const PolarToImageArgs<T>& a, int64_t begin, int64_t end, voi
           const double by_column = (1 - t) * (s[1] - s[0]) + t * (s[3] - s[2]);
           const double r = plan.radius[k], dx = plan.across[k], dy = plan.down[k];
           const Real* radii = a.radii + (a.radii_rows == 1 ? 0 : b) * a.rings;
-          const int64_t inner = plan.inner[k], outer = plan.outer[k];
+          const auto outer = smaller(static_cast<int64_t>(plan.step[k]), a.rings - 1);
+          const auto inner = static_cast<int64_t>(plan.step[k]) - 1;
           double by_r = 0;
-          if (plan.turn[k] != 0) {  // t = (r + r_0) / (2 r_0)
+          if (inner < 0) {  // t = (r + r_0) / (2 r_0)
             const double first_radius = radii[0];
             by_r = by_t / (2 * first_radius);
             grad_radii[0] -= by_t * r / (2 * first_radius * first_radius);
@@ -380,6 +270,7 @@ void backward_lens(const PolarToImageArgs<T>& a, int64_t begin, int64_t end, voi
 
 template <typename T>
 constexpr PolarToImageKernels<T> kKernels = {.scratch = scratch<T>,
+                                             .make_plan = make_plan<T>,
                                              .forward = forward<T>,
                                              .backward_map = backward_map<T>,
                                              .sum_bands = sum_bands<T>,

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from darswin.lens import Lens
 from darswin.lens.pixels import pixel_rays
 from darswin.lens.spacing import SPACINGS, Spacing, change_spacing, check_tan, span, to_theta
-from darswin.ops import polar_sample
+from darswin.ops import polar_sample, polar_to_image_plan
 from darswin.ops.checks import as_int, channels_first, check_jitter, check_layout, readable
 
 __all__ = ["PolarGrid", "PolarGridSpec", "PolarSample", "polar_grid"]
@@ -43,7 +43,8 @@ class PixelGrid(NamedTuple):
     """The arguments of `polar_to_image` that resample a polar map to the pixels of the images.
 
     Shapes: radii of the ring centres (N, R) px; r_max (N,) px; for radial lenses center
-    (N or 1, 2) px and affine (N, 2, 2), for general lenses points (N, H, W, 2) px.
+    (N or 1, 2) px and affine (N, 2, 2), for general lenses points (N, H, W, 2) px; for a single
+    lens also plan (1, H, 3, W).
     """
 
     radii: Tensor
@@ -51,6 +52,7 @@ class PixelGrid(NamedTuple):
     center: Tensor | None = None
     affine: Tensor | None = None
     points: Tensor | None = None
+    plan: Tensor | None = None
 
 
 @dataclass(frozen=True)
@@ -130,11 +132,23 @@ class PolarGridSpec:
         _, centers = self._rings(lens, self.inner_spacing, steps)
         radii = change_spacing(lens, centers, self.inner_spacing, "radius")
         if lens.is_radial:
-            return PixelGrid(radii, lens.r_max, lens.center_in(image_size), lens.affine)
-        theta, direction = pixel_rays(lens, image_size)
-        seen = ~theta.isnan()  # NaN would spread to the gradients
-        flat = lens.project(torch.where(seen, theta, 0.0))[..., None] * direction
-        return PixelGrid(radii, lens.r_max, points=torch.where(seen[..., None], flat, torch.nan))
+            grid = PixelGrid(radii, lens.r_max, lens.center_in(image_size), lens.affine)
+        else:
+            theta, direction = pixel_rays(lens, image_size)
+            seen = ~theta.isnan()  # NaN would spread to the gradients
+            flat = lens.project(torch.where(seen, theta, 0.0))[..., None] * direction
+            points = torch.where(seen[..., None], flat, torch.nan)
+            grid = PixelGrid(radii, lens.r_max, points=points)
+        # Plans of many lenses would take much memory. A graph has no plan, and must not ask for the
+        # number of lenses, which may vary.
+        if torch.compiler.is_compiling() or len(lens) != 1:
+            return grid
+        of_map = radii.new_empty((1, radii.shape[1], self.sectors * split, 0))
+        plan = polar_to_image_plan(
+            of_map, radii, grid.center, image_size,
+            affine=grid.affine, points=grid.points, r_max=grid.r_max,
+        )  # fmt: skip
+        return grid._replace(plan=plan)
 
     def token_rays(self, lens: Lens) -> Tensor:
         """The viewing directions of the tokens of a map: unit vectors (x, y, z), (N, R, A, 3).

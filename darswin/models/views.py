@@ -150,13 +150,17 @@ class PolarView(PlainView):
     def to_pixels(self, x: Tensor, view_points: Any, size: Pair) -> Tensor:
         """A map (B, R, A, K) → the pixels of the images, (B, K, H, W); 0 beyond θ_max."""
         dtype = torch.float64 if x.dtype == torch.float64 else torch.float32
+        *lens, plan = view_points[0]
         radii, r_max, center, affine, points = (
-            None if tensor is None else tensor.to(x.device, dtype) for tensor in view_points[0]
+            None if tensor is None else tensor.to(x.device, dtype) for tensor in lens
         )
+        if plan is not None and (plan.device, plan.dtype) != (x.device, dtype):
+            plan = None
         assert radii is not None
         pixels = polar_to_image(
-            x, radii, center, size, affine=affine, points=points, r_max=r_max, layout="tokens"
-        )
+            x, radii, center, size,
+            affine=affine, points=points, r_max=r_max, plan=plan, layout="tokens",
+        )  # fmt: skip
         return pixels.permute(0, 3, 1, 2)
 
 

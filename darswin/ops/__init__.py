@@ -11,7 +11,7 @@ from darswin.ops import triton
 from darswin.ops._library import reference_in_use, use_reference
 from darswin.ops._module import cpu_capability
 from darswin.ops.polar_sample import polar_embed, polar_sample
-from darswin.ops.polar_to_image import polar_to_image
+from darswin.ops.polar_to_image import polar_to_image, polar_to_image_plan
 from darswin.ops.window_attention import window_attention
 
 triton.register()
@@ -21,6 +21,7 @@ __all__ = [
     "polar_embed",
     "polar_sample",
     "polar_to_image",
+    "polar_to_image_plan",
     "reference_in_use",
     "use_reference",
     "window_attention",

@@ -9,6 +9,7 @@ from darswin.ops import _library, reference
 from darswin.ops.checks import DTYPES, check_layout, check_pair, check_rising, check_tensor
 
 _TO_IMAGE = torch.ops.darswin.polar_to_image.default
+_PLAN = torch.ops.darswin._polar_to_image_plan.default
 
 
 def polar_to_image(
@@ -20,6 +21,7 @@ def polar_to_image(
     affine: Tensor | None = None,
     points: Tensor | None = None,
     r_max: Tensor | float | None = None,
+    plan: Tensor | None = None,
     layout: Literal["tokens", "image"] = "image",
 ) -> Tensor:
     """Resamples a polar map to the pixels of an image, the reverse of `polar_sample`.
@@ -46,6 +48,8 @@ def polar_to_image(
             of each pixel's ray on the plane of radius and azimuth. It replaces center and affine.
             Pixels whose place is NaN or infinite are zero.
         r_max: px, the radius at which the image ends: a number, or (B or 1,). None means no limit.
+        plan: the result of `polar_to_image_plan` for the same lens and sizes. It saves time and
+            leaves the result as it is. The result has no meaning if the plan is of another lens.
         layout: "image" or "tokens".
 
     Returns:
@@ -60,18 +64,70 @@ def polar_to_image(
         ValueError: a shape, device or range does not fit, or the radii do not rise.
         NotImplementedError: forward-mode, torch.func or second derivatives are requested.
     """
-    height, width = check_pair("size", size, lowest=0)
+    size = check_pair("size", size, lowest=0)
     check_layout(layout)
     tokens = layout == "tokens"
-    if isinstance(r_max, (int, float)):
-        r_max = radii.new_full((1,), float(r_max)) if isinstance(radii, Tensor) else None
+    r_max = _as_tensor(r_max, radii)
     if _library.may_attempt() and _library.plain(
-        x, radii, *(t for t in (center, affine, points, r_max) if t is not None)
+        x, radii, *(t for t in (center, affine, points, r_max, plan) if t is not None)
     ):
-        given = (x, radii, center, affine, points, r_max, (height, width), tokens)
+        given = (x, radii, center, affine, points, r_max, size, tokens, plan)
         out = _library.attempt(_TO_IMAGE, given)
         if out is not None:
             return out
+    x = _checked(x, radii, center, affine, points, r_max, plan, size)
+    return _library.run(
+        _TO_IMAGE, reference.polar_to_image, _kernel_takes,
+        x, radii, center, affine, points, r_max, size, tokens, plan,
+    )  # fmt: skip
+
+
+def polar_to_image_plan(
+    x: Tensor,
+    radii: Tensor,
+    center: Tensor | None,
+    size: tuple[int, int],
+    *,
+    affine: Tensor | None = None,
+    points: Tensor | None = None,
+    r_max: Tensor | float | None = None,
+) -> Tensor | None:
+    """The positions of an image's pixels in a polar map, for `polar_to_image(..., plan=)`.
+
+    With few channels, finding these positions takes a large part of the time of `polar_to_image`.
+    If your lens stays the same, make a plan once and give it to each call. It takes 12 bytes per
+    pixel, or 24 for float64. It has no gradient, and the gradients of the lens do not depend on it.
+
+    Args:
+        x: a map with the dtype, the rings and the sectors of the later maps. Its values are
+            ignored, and D may be 0.
+
+    The other arguments and the errors are those of `polar_to_image`.
+
+    Returns:
+        (B or 1, H, 3, W), or None where `polar_to_image` uses no plan: on devices other than the
+        CPU, within `use_reference`, and while a graph is compiled, exported or traced.
+    """
+    if _library.reference_in_use() or not _library.eager():
+        return None
+    size = check_pair("size", size, lowest=0)
+    r_max = _as_tensor(r_max, radii)
+    x = _checked(x, radii, center, affine, points, r_max, None, size)
+    if x.device.type != "cpu":
+        return None
+    with torch.no_grad():
+        return _library.call(_PLAN, (x, radii, center, affine, points, r_max, size))
+
+
+def _as_tensor(r_max: Tensor | float | None, radii: Tensor) -> Tensor | None:
+    if not isinstance(r_max, (int, float)):
+        return r_max
+    return radii.new_full((1,), float(r_max)) if isinstance(radii, Tensor) else None
+
+
+def _checked(x, radii, center, affine, points, r_max, plan, size) -> Tensor:
+    """x in a type that the operators take, after a check of all arguments."""
+    height, width = size
     narrow = _library.narrow_types(x)
     x = x if torch.float16 in narrow else _library.without_float16(x)
     check_tensor("x", x, (*DTYPES, *narrow), "(B, R, A, D)", (None,) * 4)
@@ -87,28 +143,33 @@ def polar_to_image(
         ("affine", affine, "(B or 1, 2, 2) = ({} or 1, {}, {})", 2, 2),
         ("points", points, "(B or 1, H, W, 2) = ({} or 1, {}, {}, {})", height, width, 2),
         ("r_max", r_max, "(B or 1,) = ({} or 1,)"),
+        ("plan", plan, "(B or 1, H, 3, W) = ({} or 1, {}, {}, {})", height, 3, width),
     ):
         if tensor is not None or name == "radii":
             check_tensor(name, tensor, (real,), form, (x.shape[0], *shape), (1, *shape), like=x)
     check_rising("radii", radii)
-    return _library.run(
-        _TO_IMAGE, reference.polar_to_image, _kernel_takes,
-        x, radii, center, affine, points, r_max, (height, width), tokens,
-    )  # fmt: skip
+    return x
 
 
-def _kernel_takes(x, radii, center, affine, points, r_max, size, tokens) -> bool:
+def _kernel_takes(x, radii, center, affine, points, r_max, size, tokens, plan) -> bool:
     """True if the GPU kernel supports it: neither float64 nor 2³¹ pixels or tokens per image."""
     most = max(size[0] * size[1], x.shape[1] * x.shape[2])
     return x.dtype != torch.float64 and most < 2**31 - 2**16
 
 
 @torch.library.register_fake("darswin::polar_to_image")
-def _fake(x, radii, center, affine, points, r_max, size, tokens):
+def _fake(x, radii, center, affine, points, r_max, size, tokens, plan):
     (batch, _, _, channels), (height, width) = x.shape, size
     return x.new_empty(
         (batch, height, width, channels) if tokens else (batch, channels, height, width)
     )
+
+
+@torch.library.register_fake("darswin::_polar_to_image_plan")
+def _fake_plan(x, radii, center, affine, points, r_max, size):
+    lens = (radii, center, affine, points, r_max)
+    shared = all(t is None or t.shape[0] == 1 for t in lens)
+    return radii.new_empty((1 if shared else x.shape[0], size[0], 3, size[1]))
 
 
 GRADIENTS = {0: 0, 1: 1, 2: 1, 3: 1, 4: 1}  # group 0: x; group 1: the lens

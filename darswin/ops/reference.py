@@ -163,8 +163,9 @@ def polar_to_image(
     r_max: Tensor | None,
     size: Sequence[int],
     tokens: bool,
+    plan: Tensor | None = None,
 ) -> Tensor:
-    """See `darswin.ops.polar_to_image`."""
+    """See `darswin.ops.polar_to_image`. It computes the positions itself and ignores the plan."""
     batch, rings, sectors, channels = x.shape
     if points is None and center is not None:
         points = _on_polar_plane(size, center, affine)

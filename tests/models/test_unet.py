@@ -37,12 +37,26 @@ def test_the_decoders_rings_are_those_of_the_grid(spacing):
 
 
 @torch.no_grad()
+@pytest.mark.parametrize("dtype", [torch.float32, f64])
+def test_prepare_keeps_a_plan_for_a_single_lens(dtype):
+    # A plan in float32 is not for a model in float64.
+    model, size = network("darswin_unet_a_nano").to(dtype), (32, 32)
+    assert model.prepare(WIDE[[0, 0]], size).view_points[0].plan is None
+    prepared = model.prepare(WIDE, size)
+    grid, rays = prepared.view_points
+    assert grid.plan.shape == (1, 32, 3, 32)
+    without = prepared._replace(view_points=(grid._replace(plan=None), rays))
+    images = torch.rand(2, 3, 32, 32, dtype=dtype)
+    assert torch.equal(model.run(images, prepared), model.run(images, without))
+
+
+@torch.no_grad()
 @pytest.mark.parametrize("lens", [WIDE, GENERAL], ids=["wide", "general"])
 @pytest.mark.parametrize("spacing", ["theta", "g"])
 def test_what_the_rays_show_comes_back_to_their_pixels(lens, spacing):
     """A function of (θ, φ) on the polar map becomes the same function of each pixel's ray."""
     lens, size = lens.to(f64), (60, 66)
-    back = PolarGridSpec(32, 1, (1, 1), spacing).pixel_grid(lens, size, split=4)
+    back = PolarGridSpec(32, 128, (1, 1), spacing).pixel_grid(lens, size, split=4)
     theta = lens.unproject(back.radii)[0][:, None]
     azimuth = 2 * math.pi * (torch.arange(512, dtype=f64) + 0.5) / 512
 

@@ -123,6 +123,8 @@ WRONG = {
         (dict(affine=ones(1, 2, 3)), ValueError, "affine must have shape"),
         (dict(size=(4, -1)), ValueError, "size must be at least 0"),
         (dict(r_max=ones(3)), ValueError, r"r_max must have shape \(B or 1,\)"),
+        (dict(plan=ones(1, 4, 5, 3)), ValueError, r"plan must have shape .* 4, 3, 5\)"),
+        (dict(plan=ones(1, 4, 3, 5).double()), TypeError, "plan must be float32"),
         (dict(layout="map"), ValueError, "layout must be one of"),
     ],
 }
@@ -187,6 +189,7 @@ RAW = {
         "radii": [zeros(2, 2), zeros(3, 3), -torch.arange(3.0)[None], torch.full((1, 3), math.nan)],
         "center": [None, zeros(2, 3)],
         "affine": [zeros(2, 2)], "r_max": [zeros(3)], "size": [(5,), (-1, 4)],
+        "plan": [zeros(2, 5, 4, 3), zeros(3, 5, 3, 4), zeros(2, 5, 3, 4).double()],
     },
 }  # fmt: skip
 

@@ -32,6 +32,8 @@ def valid(name: str) -> list:
         return [*(torch.rand(shape) for shape in ((3, 4), (3, 4), (4,), (4,))), 1e-5]
     if name == "_transpose_sum":
         return [torch.rand(5, 7)]
+    if name == "_polar_to_image_plan":
+        return valid("polar_to_image")[:7]
     public = name.removesuffix("_backward")
     case = "polar_to_image, points" if name == "polar_to_image_backward" else public
     _, arguments = raw_calls(SMALL[case]())[public != name]
@@ -40,7 +42,8 @@ def valid(name: str) -> list:
 
 
 PUBLIC = ("polar_sample", "polar_embed", "window_attention", "polar_to_image")
-NAMES = [*PUBLIC, *(f"{name}_backward" for name in PUBLIC), "_add_norm_", "_transpose_sum"]
+PRIVATE = ("_add_norm_", "_polar_to_image_plan", "_transpose_sum")
+NAMES = [*PUBLIC, *(f"{name}_backward" for name in PUBLIC), *PRIVATE]
 
 
 @st.composite

@@ -9,7 +9,7 @@ from cases import assert_equal_results, polar_map, results
 
 from darswin.layers.polar import polar_grid
 from darswin.lens import Equidistant
-from darswin.ops import polar_sample, polar_to_image, use_reference
+from darswin.ops import polar_sample, polar_to_image, polar_to_image_plan, use_reference
 
 
 @pytest.mark.parametrize("reference", [False, True])
@@ -39,6 +39,36 @@ def test_places_that_are_no_numbers_are_zero(place, dtype):
     out = polar_to_image(x, radii, None, (1, 35), points=points)
     assert not out.any()
     assert not any(grad.any() for grad in torch.autograd.grad(out.sum(), (x, points)))
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.bfloat16])
+@pytest.mark.parametrize(
+    "lens", [dict(), dict(lenses=2, r_max=7.0), dict(general="points")], ids=str
+)
+def test_a_plan_changes_no_bit(lens, dtype):
+    for sizes in (dict(), dict(channels=1, size=(9, 70)), dict(rings=1, sectors=1)):
+        made = []
+        for planned in (False, True):
+            torch.manual_seed(0)
+            made.append(polar_map(dtype=dtype, planned=planned, **lens, **sizes))
+        plain, planned = map(results, made)
+        assert_equal_results(planned, plain)
+
+
+def test_both_directions_read_the_plan():
+    x, radii, center = polar_map().inputs.values()
+    x.requires_grad_()
+    plan = polar_to_image_plan(x, radii, center, (19, 23))
+    of_two = polar_to_image_plan(x, radii.expand(2, -1), center, (19, 23))
+    assert torch.equal(plan.expand(2, -1, -1, -1), of_two)
+    expected = polar_to_image(x, radii, center, (19, 23))
+    found = polar_to_image(x, radii + 1, center - 1, (19, 23), plan=plan)
+    assert torch.equal(found, expected)
+    grad = torch.randn_like(found)
+    assert torch.equal(*(torch.autograd.grad(out, x, grad)[0] for out in (found, expected)))
+    with use_reference():
+        assert polar_to_image_plan(x, radii, center, (19, 23)) is None
+        assert not torch.equal(polar_to_image(x, radii + 1, center, (19, 23), plan=plan), expected)
 
 
 def test_equals_scipy():

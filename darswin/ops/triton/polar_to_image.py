@@ -249,7 +249,7 @@ def _options(x: Tensor, tokens: bool, most_channels: int) -> dict[str, Any]:
 
 def polar_to_image(x: Tensor, *arguments: Any) -> Tensor:
     """`darswin::polar_to_image`, one launch."""
-    *lens, size, tokens = arguments
+    *lens, size, tokens, _plan = arguments
     (batch, _, _, channels), (height, width) = x.shape, size
     shape = (batch, height, width, channels) if tokens else (batch, channels, height, width)
     out = x.new_empty(shape)
@@ -262,7 +262,7 @@ def polar_to_image(x: Tensor, *arguments: Any) -> Tensor:
 
 def polar_to_image_backward(x: Tensor, *arguments: Any) -> tuple[Tensor, ...]:
     """`darswin::polar_to_image_backward`: gradients of x, radii, center, affine and points."""
-    *lens, size, tokens, grad_out, x_grad, lens_grad = arguments
+    *lens, size, tokens, _plan, grad_out, x_grad, lens_grad = arguments
     radii, center, affine, points, _ = lens
     gradients = empty_gradients((x, *lens), GRADIENTS, (x_grad, lens_grad))
     if grad_out.numel() == 0:
