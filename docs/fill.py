@@ -74,15 +74,20 @@ def drop_in_line(timings: Sequence[Timing]) -> str:
 
 
 def frame_line(timings: Sequence[Timing]) -> str:
-    """A sentence on the peers' times for one frame, on one thread."""
-    chosen = [t for t in timings if t.batch == 1 and t.threads == 1 and "float32" in t.mode]
+    """Sentences on the times of peers and of float32 for one frame, on one thread."""
+    frames = [t for t in timings if t.batch == 1 and t.threads == 1]
+    chosen = [t for t in frames if "float32" in t.mode]
     parts = []
     for peer in FRAME_PEERS[1:]:
         found = [t.ratio for t in chosen if t.name == peer]
         parts.append(f"{min(found):.1f} to {max(found):.1f} times as fast as the {peer}")
     parts[:2] = [part.replace("the ", "") for part in parts[:2]]
     first, *others = parts
-    return f"For one frame on one core, these models are {first}.\nThey are {' and '.join(others)}."
+    int8 = [f"`{t.subject}` is {t.ratio:.1f} times" for t in frames if t.name == "float32"]
+    return (
+        f"For one frame on one core, these models are {first}.\nThey are {' and '.join(others)}.\n"
+        f"In int8, {' and '.join(int8)} as fast as in float32."
+    )
 
 
 def frames_table(timings: Sequence[Timing]) -> str:
