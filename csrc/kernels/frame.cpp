@@ -6,14 +6,11 @@ namespace {
 
 // Finds the offsets of points [first, first + count).
 void find_offsets(const FrameArgs& a, int64_t first, int64_t count, int32_t* offset) {
-  using Shorts = Vector<int16_t, kLanes<float>>;
-  using Ints = Vector<int32_t, kLanes<float>>;
   const auto row_stride = static_cast<int32_t>(a.image.row_stride),
              column_stride = static_cast<int32_t>(a.image.column_stride);
-  for (int64_t k = 0; k < count; k += kLanes<float>) {
-    const Ints column = __builtin_convertvector(load<Shorts>(a.columns + first + k), Ints);
-    const Ints row = __builtin_convertvector(load<Shorts>(a.rows + first + k), Ints);
-    store(offset + k, row * row_stride + column * column_stride);
+#pragma omp simd
+  for (int64_t k = 0; k < count; ++k) {
+    offset[k] = a.rows[first + k] * row_stride + a.columns[first + k] * column_stride;
   }
 }
 
