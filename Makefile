@@ -194,6 +194,7 @@ EMULATED = PYTHONPATH=$(CURDIR)/$(AARCH64):$(CURDIR)/$(AARCH64)/site qemu-aarch6
 
 $(AARCH64)/installed: requirements.txt
 	rm -rf $(AARCH64)
+	mkdir -p $(AARCH64)
 	mmdebstrap --quiet --variant=extract --arch=arm64 --skip=check/qemu \
 	  --include=libstdc++6,python3-dev,python3-pip bookworm $(AARCH64)/root
 	cp $(AARCH64)/root/usr/include/aarch64-linux-gnu/python3.11/pyconfig.h $(AARCH64_PYTHON)
@@ -205,13 +206,15 @@ $(AARCH64)/installed: requirements.txt
 # Needs `apt-get install g++-aarch64-linux-gnu mmdebstrap qemu-user`, and outside Debian also
 # debian-archive-keyring.
 aarch64: $(STAMP) $(AARCH64)/installed  ## cross-compile for ARM (aarch64); the Makefile lists the packages it needs
-	cp -r darswin $(AARCH64)
 	PATH=$(CURDIR)/$(BIN):$$PATH; cmake --log-level=NOTICE -S . -B build/cmake-aarch64 -G Ninja \
 	  -DCMAKE_SYSTEM_NAME=Linux -DCMAKE_SYSTEM_PROCESSOR=aarch64 \
 	  -DCMAKE_CXX_COMPILER=aarch64-linux-gnu-g++ -DTORCH_DIR=$(CURDIR)/$(AARCH64)/site/torch \
 	  -DPYBIND11_DIR=$$(python -c 'import pybind11; print(pybind11.get_include())') \
 	  -DDARSWIN_PYTHONS=.cpython-311-aarch64-linux-gnu.so:$(AARCH64_PYTHON) \
-	  -DDARSWIN_OUTPUT_DIR=$(CURDIR)/$(AARCH64)/darswin && cmake --build build/cmake-aarch64
+	  -DDARSWIN_OUTPUT_DIR=$(CURDIR)/build/cmake-aarch64/modules && cmake --build build/cmake-aarch64
+	rm -rf $(AARCH64)/darswin
+	cp -r darswin $(AARCH64)
+	cp build/cmake-aarch64/modules/*.so $(AARCH64)/darswin
 
 test-aarch64: aarch64  ## test the operators on an emulated ARM CPU (20 minutes)
 	cd $(AARCH64) && OMP_NUM_THREADS=1 $(EMULATED) -m pytest -q -c $(CURDIR)/pyproject.toml \
