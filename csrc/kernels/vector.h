@@ -2,6 +2,7 @@
 // every lane. The compiler splits a vector that is wider than the registers.
 #pragma once
 
+#include <cstddef>
 #include <cstdint>
 #include <type_traits>
 #include <utility>
