@@ -221,4 +221,4 @@ test-aarch64: aarch64  ## test the operators on an emulated ARM CPU (20 minutes)
 	  --rootdir $(CURDIR) -m "not slow" $(CURDIR)/tests/ops $(CURDIR)/tests/test_frames.py
 
 clean:  ## remove all build results
-	rm -rf build dist darswin.egg-info darswin/libdarswin.so darswin/_frames.*.so
+	rm -rf build dist darswin.egg-info darswin/libdarswin.so darswin/frames/*.so

@@ -61,13 +61,13 @@ class CMakeBuild(build_ext):
 
 class PlatformWheel(bdist_wheel):
     """One wheel of a platform serves every Python: libdarswin.so does not depend on Python, and the
-    wheel has a module darswin._frames for each Python it was built for."""
+    wheel has a module darswin.frames._frames for each Python it was built for."""
 
     def get_tag(self):
         return "py3", "none", super().get_tag()[2]
 
 
 setup(
-    ext_modules=[Extension("darswin.libdarswin", []), Extension("darswin._frames", [])],
+    ext_modules=[Extension("darswin.libdarswin", []), Extension("darswin.frames._frames", [])],
     cmdclass={"build_ext": CMakeBuild, "bdist_wheel": PlatformWheel},
 )

@@ -182,8 +182,8 @@ class Worker:
         self.copy_modules()
 
     def copy_modules(self) -> None:
-        for module in (ROOT / "darswin").glob("*.so"):
-            shutil.copy2(module, self.root / "darswin")
+        for module in (ROOT / "darswin").rglob("*.so"):
+            shutil.copy2(module, self.root / module.relative_to(ROOT))
 
     def test(self, mutant: Mutant) -> str:
         """ "survived", or the reason why not: the first test that fails, "build" or "time"."""

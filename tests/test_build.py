@@ -14,7 +14,7 @@ import pytest
 import torch
 from torch_abi_audit import inspect_extension
 
-from darswin import _frames
+from darswin.frames import _frames
 from darswin.ops import _module, cpu_capability, polar_sample
 
 ROOT = Path(__file__).parent.parent
@@ -231,7 +231,11 @@ def test_the_sdist_builds_a_wheel_that_runs_from_another_folder(unpacked, tmp_pa
     (wheel,) = (unpacked / "dist").glob("darswin-*-py3-none-linux_*.whl")
     assert not (unpacked / "tests").exists()  # setuptools would add a few, without their helpers
     names = zipfile.ZipFile(wheel).namelist()
-    modules = {name.removeprefix("darswin/") for name in names if name.endswith(".so")}
+    modules = {
+        name.removeprefix("darswin/frames/").removeprefix("darswin/")
+        for name in names
+        if name.endswith(".so")
+    }
     assert modules == {"libdarswin.so", FRAMES.name, "_frames.another-python.so"}
     assert all(name.startswith(("darswin/", "darswin-")) for name in names)
     elsewhere = tmp_path / "site"

@@ -13,6 +13,7 @@ FLOORS = (
     ("cli",),
     ("bench",),
     ("train",),
+    ("frames",),
     ("compat", "deploy"),
     ("models", "viz"),
     ("data", "layers"),
@@ -43,7 +44,10 @@ def test_no_room_imports_the_whole_package(imports):
 
 
 def test_modules_import_each_other_in_no_circle(imports):
-    graph = {name: imports.find_modules_directly_imported_by(name) for name in imports.modules}
+    # A package that imports its compiled module seems to import itself.
+    graph = {
+        name: imports.find_modules_directly_imported_by(name) - {name} for name in imports.modules
+    }
     graphlib.TopologicalSorter(graph).prepare()  # raises CycleError, which names the circle
 
 

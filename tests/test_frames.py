@@ -16,8 +16,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from lens_examples import RANDOM, random_lens
 
-from darswin import _frames, create_model, frames
+from darswin import create_model, frames
 from darswin.compat import OfficialDarSwin
+from darswin.frames import _frames
 from darswin.layers.polar import PolarSample
 from darswin.lens import Equidistant, Polynomial
 from darswin.models import LensAdapter

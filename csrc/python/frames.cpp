@@ -1,4 +1,4 @@
-// The Python module darswin._frames: NumPy arrays in, NumPy arrays out. It does not use torch, and
+// The Python module darswin.frames._frames: NumPy arrays in, NumPy arrays out. It does not use torch, and
 // OpenMP neither, whose library a system without torch may lack.
 #include "../frames.h"
 

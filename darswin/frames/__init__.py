@@ -24,7 +24,7 @@ import numpy as np
 from darswin.utils.files import replace_file
 
 try:
-    from darswin import _frames
+    from darswin.frames import _frames
 except ImportError as error:
     raise ImportError(
         f"cannot load darswin's compiled module for frames: {error}. The package has one for each "
@@ -35,6 +35,7 @@ except ImportError as error:
 if TYPE_CHECKING:
     from torch import Tensor, nn
 
+    from darswin.layers.polar import PolarGrid
     from darswin.lens import Lens
 
 __all__ = ["Plan", "Sampler", "plan"]
@@ -42,6 +43,7 @@ __all__ = ["Plan", "Sampler", "plan"]
 Output = Literal["tokens", "image", "uint8"]
 _VERSION = 1
 _LARGEST_SIDE = 2**15 - 1  # places are stored in 16 bits
+_OUTSIDE = -3  # the column and row of a point outside of the frame
 
 
 @dataclass(frozen=True)
@@ -190,17 +192,65 @@ def plan(
         ValueError: there is more than one lens, the lens belongs to another size, the model takes
             the images as they are, a side is longer than 32,767 pixels, or the output is unknown.
     """
-    from darswin.deploy.frame_plan import places
+    from darswin.frames.places import reading
 
     if output is not None and output not in get_args(Output):
         raise ValueError(f"output must be one of {get_args(Output)}, got {output!r}")
     height, width = size
     if not (0 < height <= _LARGEST_SIDE and 0 < width <= _LARGEST_SIDE):
         raise ValueError(f"size must be (H, W) of at most {_LARGEST_SIDE} pixels, got {size}")
-    found: dict[str, Any] = places(sample, lens, (int(height), int(width)), output)
-    chosen = {"mean": mean, "std": std}
-    for name, value in chosen.items():
-        if value is not None:
-            found[name] = value
-        found[name] = tuple(np.atleast_1d(np.asarray(found[name], np.float64)).tolist())
-    return Plan(**found, size=(int(height), int(width)))
+    size = int(height), int(width)
+    found: Any = reading(sample, lens, size)
+    output = output or found.output
+    if found.samples is None:
+        arrays = _at_pixels(found.points.double().numpy(), size, output)
+    else:
+        arrays = _on_grid(found.points, found.samples, size, output)
+    return Plan(
+        **arrays,
+        size=size,
+        output=output,
+        mean=_numbers(found.mean if mean is None else mean),
+        std=_numbers(found.std if std is None else std),
+    )
+
+
+def _numbers(value: float | Sequence[float]) -> tuple[float, ...]:
+    return tuple(np.atleast_1d(np.asarray(value, np.float64)).tolist())
+
+
+def _on_grid(
+    grid: "PolarGrid", samples: tuple[int, int], size: tuple[int, int], output: Output
+) -> dict[str, Any]:
+    """The places of a polar grid of one lens."""
+    affine, offsets = (
+        None if x is None else x.float().numpy() for x in (grid.affine, grid.offsets)
+    )
+    radii, azimuths, center = (x.float().numpy() for x in (grid.radii, grid.azimuths, grid.center))
+    *arrays, packed = _frames.polar_places(radii, azimuths, center, affine, offsets, size)
+    if output == "tokens":
+        (rows, columns), (sr, sa) = arrays[0].shape, samples
+        arrays = [
+            np.ascontiguousarray(
+                array.reshape(rows // sr, sr, columns // sa, sa).transpose(0, 2, 1, 3)
+            )
+            for array in arrays
+        ]
+    names = ("columns", "rows", "right", "lower")
+    return dict(zip(names, arrays, strict=True), normalize_first=packed)
+
+
+def _at_pixels(points: np.ndarray, size: tuple[int, int], output: Output) -> dict[str, Any]:
+    """The places of single points (H', W', 2), x and y in px."""
+    if output == "tokens":
+        raise ValueError("only a polar grid has tokens: choose the output 'image' or 'uint8'")
+    x, y = points.transpose(2, 0, 1)
+    inside = (x > -1) & (x < size[1]) & (y > -1) & (y < size[0])
+    x, y = np.where(inside, x, _OUTSIDE), np.where(inside, y, _OUTSIDE)
+    columns, rows = np.floor(x), np.floor(y)
+    return dict(
+        columns=columns.astype(np.int16),
+        rows=rows.astype(np.int16),
+        right=(x - columns).astype(np.float32),
+        lower=(y - rows).astype(np.float32),
+    )

@@ -1,0 +1,72 @@
+"""The points at which models, layers and views read an image."""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from darswin.compat.official import OfficialDarSwin
+from darswin.layers.polar import PolarGrid, PolarSample, check_lens
+from darswin.lens import Lens
+from darswin.lens.pixels import as_map
+from darswin.models.base import Model
+from darswin.models.encoder import FeatureMaps
+from darswin.models.stages import Pair
+from darswin.models.unet import Unet
+from darswin.models.views import LensAdapter
+
+
+class Reading(NamedTuple):
+    """The points at which images of one size are read, and the usual form of the result."""
+
+    points: PolarGrid | Tensor  # the polar grid of one lens, or pixels (H', W', 2)
+    output: str  # of `Plan`
+    samples: Pair | None = None  # (S_r, S_φ) of a token of the grid
+    mean: float | Sequence[float] = 0.0
+    std: float | Sequence[float] = 1.0
+
+
+@torch.no_grad()
+def reading(sample: nn.Module | Tensor, lens: Lens, size: Pair) -> Reading:
+    """The points at which a model, a layer or the rays of a view read images of (H, W)."""
+    if len(check_lens(lens, size)) != 1:
+        raise ValueError(f"a plan needs one lens, got {len(lens)}")
+    lens = lens.to("cpu")
+    if isinstance(sample, Tensor):
+        if sample.dim() != 3 or sample.shape[2] != 3:
+            raise ValueError(f"rays must have shape (H, W, 3), got {tuple(sample.shape)}")
+        exact = lens.to(torch.float64).project_points(sample[None].double().cpu(), size)
+        return Reading(as_map(exact)[0], "uint8")
+    normalization = getattr(sample, "mean", 0.0), getattr(sample, "std", 1.0)
+    if isinstance(sample, PolarSample):
+        grid = sample.grid(lens, size)
+        return Reading(grid, sample.layout, sample.spec.samples, *normalization)
+    if not isinstance(sample, Model):
+        raise TypeError(
+            "sample must be a model of darswin, a PolarSample or rays (H, W, 3), "
+            f"got {type(sample).__name__}"
+        )
+    points = _points(sample, sample.prepare(lens, size))
+    if points is None:
+        raise ValueError("the model takes images as they are: it needs no plan")
+    if isinstance(points, PolarGrid):
+        return Reading(points, "tokens", _spec(sample).samples, *normalization)
+    return Reading(points[0], "image", None, *normalization)
+
+
+def _points(model: Model, prepared: Any) -> PolarGrid | Tensor | None:
+    if isinstance(model, OfficialDarSwin):
+        raise ValueError("OfficialDarSwin samples the transposed image, which no plan does")
+    if isinstance(model, FeatureMaps):
+        return _points(model.encoder, prepared)
+    if isinstance(model, LensAdapter):
+        return prepared[0]
+    if isinstance(model, Unet):
+        grid = prepared.encoder.points
+        return prepared.image_points if grid is None else grid
+    return prepared.points
+
+
+def _spec(model: Any) -> Any:
+    return model.spec if hasattr(model, "spec") else _spec(model.encoder)
