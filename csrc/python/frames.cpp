@@ -1,5 +1,5 @@
-// The Python module darswin.frames._frames: NumPy arrays in, NumPy arrays out. It does not use torch, and
-// OpenMP neither, whose library a system without torch may lack.
+// The Python module darswin.frames._frames: NumPy arrays in, NumPy arrays out. It does not use
+// torch, and OpenMP neither, whose library a system without torch may lack.
 #include "../frames.h"
 
 #include <pybind11/numpy.h>
