@@ -130,9 +130,11 @@ Tensor forward(ToImageCall<T>&& call) {
   ask_for_large_pages(out);
   args.out = mutable_pointer<T>(out);
   // Images with the same lens take turns, band by band, so that all of them use one plan of a band.
-  constexpr int64_t kBandRows = 8, kItems = 16;
-  const int64_t rows =
-      std::clamp<int64_t>(args.height * args.batch / kItems, 1, args.batch > 1 ? kBandRows : 1);
+  // With few channels, low bands are faster, because their plan stays in the cache. With more, high
+  // bands are up to 12 % faster, because the map and the pages of the image stay there instead.
+  const int64_t each_thread = 4 * static_cast<int64_t>(torch::stable::get_num_threads());
+  const int64_t most = args.batch == 1 ? 1 : args.channels <= 4 ? 64 : args.height;
+  const int64_t rows = std::clamp<int64_t>(args.height * args.batch / each_thread, 1, most);
   args.bands = (args.height + rows - 1) / rows;
   call.run(args.batch * args.bands, kernels<PolarToImageKernels<T>>().forward);
   return out;

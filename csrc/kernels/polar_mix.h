@@ -43,6 +43,8 @@ class Forward {
  private:
   // Finds how many channels can be read, counted from the first channel of any token of the tile.
   void find_end(int64_t count) {
+    readable = channels();
+    if (channels() % kL == 0) return;  // every register lies inside its token
     IndexOf<Real> last = 0;
     for (int corner = 0; corner < 4; ++corner) {
       for (int64_t k = 0; k < count; ++k) {

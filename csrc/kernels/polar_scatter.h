@@ -88,9 +88,8 @@ class Scatter {
         for (int64_t y = first_row; y < end_row; ++y) {
           const T* from = sums + (y + 1) * layout.row + layout.pixel;
           if (keep == kCells) collect(from);
-          for (int64_t c = 0; c < a.channels; ++c) {
-            E* line = to + (c * a.height + y) * a.width;
-            for (int64_t x = 0; x < a.width; ++x) store(line + x, from[x * layout.pixel + c]);
+          for (int64_t c = 0; c < a.channels; c += 4) {
+            write_row(from + c, smaller(4, a.channels - c), to + (c * a.height + y) * a.width);
           }
         }
       }
@@ -171,6 +170,23 @@ class Scatter {
       // The front of the left cell already holds a sum. Its part for this pixel is still unchanged.
       store(cell, load<V>(cell) + load<V>(left + 4) +
                       (load<V>(above + 8) + load<V>(above - layout.pixel + 12)));
+    }
+  }
+
+  // Writes up to four channels of a row of packed pixels to the planes of the image.
+  template <typename E>
+  void write_row(const T* from, int64_t channels, E* to) const {
+    using V = Vector<T, 4>;
+    const int64_t plane = a.height * a.width;
+    int64_t x = 0;
+    for (; x + 4 <= a.width; x += 4) {
+      T turned[16];
+      const auto pixel = [&](int64_t k) { return load<V>(from + (x + k) * layout.pixel); };
+      transpose4(pixel(0), pixel(1), pixel(2), pixel(3), turned, 4);
+      for (int64_t c = 0; c < channels; ++c) store(to + c * plane + x, load<V>(turned + 4 * c));
+    }
+    for (; x < a.width; ++x) {
+      for (int64_t c = 0; c < channels; ++c) store(to + c * plane + x, from[x * layout.pixel + c]);
     }
   }
 
