@@ -85,6 +85,14 @@ inline int64_t threads_for(double microseconds) {
   return most < static_cast<double>(threads) ? static_cast<int64_t>(most) : threads;
 }
 
+// Returns an estimate of the microseconds that it takes to sample so many points or pixels. On a
+// Zen 4, two threads are 5 % slower than one for 512 points with 3 channels, and 10 to 16 % faster
+// for 2048. For 1024 pixels with 8 channels they are 18 % slower, and 16 % faster for 4096.
+inline double sampling_microseconds(double count, int64_t channels) {
+  constexpr double kPerMicrosecond = 700;
+  return count * static_cast<double>(channels + 4) / kPerMicrosecond;
+}
+
 // Calls body(begin, end) on contiguous ranges that cover [0, count), each in its own thread. An
 // exception must not leave an OpenMP region. So it is stored, and thrown again when all threads
 // have ended.

@@ -121,11 +121,17 @@ struct PolarCall {
   int64_t sampled_images() const { return points() && args.channels > 0 ? batch : 0; }
   bool points() const { return batch > 0 && args.num_radii > 0 && args.num_azimuths > 0; }
 
+  // The estimated time of sampling, which decides how many threads are started.
+  double microseconds() const {
+    const double points = static_cast<double>(args.num_radii) * args.num_azimuths;
+    return sampling_microseconds(batch * points, args.channels);
+  }
+
   // Returns the number of bands of rows into which backward cuts an image. Bands let a small batch
   // of large images use all threads. They also limit the memory that a thread needs for the sums of
   // bfloat16 pixels.
   int64_t count_bands() const {
-    const int64_t threads = num_threads();
+    const int64_t threads = threads_for(microseconds());
     int64_t bands = 1;
     if (batch > 0 && batch < 4 * threads) bands = threads / std::gcd(batch, threads);
     if (args.pixel == Pixel::bf16) {
@@ -163,7 +169,8 @@ struct PolarCall {
       grads.image = new_image_gradient();
       args.bands = count_bands();
       if (images > 0 && grads.image.numel() > 0) {
-        run_with_scratch(images * args.bands, kernel.scratch(args, PolarPass::backward_image),
+        run_with_scratch(images * args.bands, threads_for(microseconds()),
+                         kernel.scratch(args, PolarPass::backward_image),
                          [&](auto... range) { kernel.backward_image(args, range...); });
       }
     }

@@ -53,6 +53,15 @@ void transpose(const T* from, int64_t rows, int64_t columns, T* to, int64_t to_s
   }
 }
 
+// Returns the number of threads that the work of forward is worth.
+template <typename T>
+int64_t count_threads(const PolarCall<T>& call, int64_t features) {
+  constexpr double kPerMicrosecond = 5e4;  // multiply-adds, on a CPU with AVX2
+  const double tokens = static_cast<double>(call.batch) * call.rings() * call.sectors();
+  const double products = tokens * call.token_size() * features;
+  return threads_for(call.microseconds() + products / kPerMicrosecond);
+}
+
 template <typename T>
 Tensor forward(PolarCall<T>& call, Tensor weight, MaybeTensor bias) {
   const auto& kernel = kernels<PolarEmbedKernels<T>>();
@@ -73,7 +82,8 @@ Tensor forward(PolarCall<T>& call, Tensor weight, MaybeTensor bias) {
   std::vector<T> transposed(depth * wide);
   transpose(pointer<T>(weight), embed.features, depth, transposed.data(), wide);
   embed.transposed = transposed.data();
-  run_with_scratch(call.batch * call.rings(), kernel.scratch(args, embed, PolarPass::forward),
+  run_with_scratch(call.batch * call.rings(), count_threads(call, embed.features),
+                   kernel.scratch(args, embed, PolarPass::forward),
                    [&](auto... range) { kernel.forward(args, embed, range...); });
   return out;
 }
@@ -111,11 +121,13 @@ std::tuple<Tensor, Tensor> weight_gradients(const PolarCall<T>& call,
       }
     }
   };
-  run_with_scratch(chunks, kernel.scratch(call.args, embed, PolarPass::forward), add_chunks);
+  const int64_t threads = count_threads(call, features);
+  run_with_scratch(chunks, threads, kernel.scratch(call.args, embed, PolarPass::forward),
+                   add_chunks);
   const Tensor weight = new_tensor(Sizes{features, depth}, type_of<T>());
   const Tensor bias = new_tensor(Sizes{features}, type_of<T>());
   T *to_weight = mutable_pointer<T>(weight), *to_bias = mutable_pointer<T>(bias);
-  parallel_ranges(features, [&](int64_t begin, int64_t end) {
+  parallel_ranges(features, threads, [&](int64_t begin, int64_t end) {
     for (int64_t f = begin; f < end; ++f) {
       double sum = 0;
       for (int64_t k = 0; k < depth; ++k) to_weight[f * depth + k] = 0;
@@ -138,19 +150,20 @@ PolarGradients sampling_gradients(PolarCall<T>& call, PolarEmbedArgs<T>& embed,
   const int64_t depth = call.token_size(), images = call.sampled_images();
   const Tensor rows = torch::stable::pad(weight, Sizes{0, padded(depth) - depth});
   embed.weight = pointer<T>(rows);
+  const int64_t threads = count_threads(call, embed.features);
   if (!wanted.lens && !wanted.offsets && call.count_bands() == 1) {
     PolarGradients grads = call.no_gradients();
     grads.image = call.new_image_gradient();
     call.args.bands = 1;
     if (images > 0 && grads.image.numel() > 0) {
-      run_with_scratch(images, kernel.scratch(call.args, embed, PolarPass::backward_image),
+      run_with_scratch(images, threads, kernel.scratch(call.args, embed, PolarPass::backward_image),
                        [&](auto... range) { kernel.backward_image(call.args, embed, range...); });
     }
     return grads;
   }
   const Tensor grad_samples = new_tensor(output_sizes(call, depth), type_of<T>());
   embed.grad_samples = mutable_pointer<T>(grad_samples);
-  run_with_scratch(images * call.rings(),
+  run_with_scratch(images * call.rings(), threads,
                    kernel.scratch(call.args, embed, PolarPass::backward_samples),
                    [&](auto... range) { kernel.backward_samples(call.args, embed, range...); });
   call.args.grad_out = embed.grad_samples;

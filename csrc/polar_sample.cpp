@@ -40,7 +40,8 @@ Tensor forward(PolarCall<T>& call, bool tokens) {
   ask_for_large_pages(out);
   args.out = out.mutable_data_ptr();
   const auto& kernel = kernels<PolarSampleKernels<T>>();
-  run_with_scratch(call.batch * call.rings(), kernel.scratch(args, PolarPass::forward),
+  run_with_scratch(call.batch * call.rings(), threads_for(call.microseconds()),
+                   kernel.scratch(args, PolarPass::forward),
                    [&](auto... range) { kernel.forward(args, range...); });
   return out;
 }
