@@ -82,10 +82,9 @@ void make_plan(const PolarToImageArgs<T>& a, int64_t begin, int64_t end, void* m
       const int64_t count = smaller(kTile, a.width - first);
       work.planner.locate(item / a.height, item % a.height, first, count, *work.origin);
       auto* to = a.positions + item * kPosition * a.width + first;
-      for (const auto* values : {origin.step, origin.t, origin.column}) {
-        copy(values, count, to);
-        to += a.width;
-      }
+      copy(origin.step, count, to);
+      copy(origin.t, count, to + a.width);
+      copy(origin.column, count, to + 2 * a.width);
     }
   }
 }

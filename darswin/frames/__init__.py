@@ -32,7 +32,7 @@ except ImportError as error:
     ) from error
 
 if TYPE_CHECKING:
-    from torch import Tensor, nn
+    import torch
 
     from darswin.layers.polar import PolarGrid
     from darswin.lens import Lens
@@ -161,7 +161,7 @@ class Sampler(_frames.Sampler):
 
 
 def plan(
-    sample: "nn.Module | Tensor",
+    sample: "torch.nn.Module | torch.Tensor",
     lens: "Lens",
     size: tuple[int, int],
     *,
