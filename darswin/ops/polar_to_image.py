@@ -113,7 +113,7 @@ def polar_to_image_plan(
     size = check_pair("size", size, lowest=0)
     r_max = _as_tensor(r_max, radii)
     x = _checked(x, radii, center, affine, points, r_max, None, size)
-    if x.device.type != "cpu":
+    if x.device.type != "cpu" or x.dtype == torch.float16:
         return None
     with torch.no_grad():
         return _library.call(_PLAN, (x, radii, center, affine, points, r_max, size))

@@ -133,7 +133,7 @@ def bring_back(
     affine = meta(32, 2, 2) if lens == "affine" else None
     center = None if lens == "points" else meta(32, 2)
     plane = center, affine, points, meta(32)
-    call = (meta(32, 64, 256, channels, dtype=dtype), meta(32, 64), *plane, (64, 64), tokens)
+    call = (meta(32, 64, 256, channels, dtype=dtype), meta(32, 64), *plane, (64, 64), tokens, None)
     out = launcher("polar_to_image")(*call)
     launcher("polar_to_image_backward")(*call, out, True, True)
 

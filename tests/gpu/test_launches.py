@@ -54,7 +54,7 @@ LAUNCHES = {
     ),
     "attention's gradient": ("window_attention_backward", (*STAGE, meta(2, 16, 4, 96)),
                              ["_backward", "_fold", "aten::sum.dim_IntList"]),
-    "map to image": ("polar_to_image", (*MAP, True), ["_forward"]),
+    "map to image": ("polar_to_image", (*MAP, True, None), ["_forward"]),
 }  # fmt: skip
 
 
