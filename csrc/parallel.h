@@ -129,9 +129,5 @@ void run_with_scratch(int64_t count, int64_t threads, int64_t bytes, Body&& body
     body(begin, end, scratch.get());
   });
 }
-template <typename Body>
-void run_with_scratch(int64_t count, int64_t bytes, Body&& body) {
-  run_with_scratch(count, num_threads(), bytes, std::forward<Body>(body));
-}
 
 }  // namespace darswin

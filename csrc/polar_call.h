@@ -194,8 +194,8 @@ struct PolarCall {
         }
       }
     };
-    run_with_scratch(images * rings() / sharing, kernel.scratch(args, PolarPass::backward_lens),
-                     rings_of_images);
+    run_with_scratch(images * rings() / sharing, threads_for(microseconds()),
+                     kernel.scratch(args, PolarPass::backward_lens), rings_of_images);
     if (wanted.lens) fold_lens(sums, grads);
     return grads;
   }
