@@ -58,7 +58,23 @@ def turn_scene(scene: Scene, turn: Turn, taken: tuple[int, int, int, int], size:
 
 def warp_scene(scene: Scene, lens: Lens, size: int, turn: Turn | None = None) -> Scene:
     """A scene as another radial lens without `affine` would have seen it, at (size, size)."""
-    exact, source = lens.to(torch.float64), scene.lens.to(torch.float64)
+    places, points = _warped(scene.target.shape, scene.lens, lens, size, turn)
+    return _read(scene, places, lens, size, points)
+
+
+def warp_picture(
+    image: np.ndarray, source: Lens, lens: Lens, size: int, turn: Turn | None = None
+) -> np.ndarray:
+    """The image (H, W, C) of `source` as `warp_scene` warps the image of a scene."""
+    places, points = _warped(image.shape[:2], source, lens, size, turn)
+    return _read_image(image, places, size, points)
+
+
+def _warped(
+    shape: tuple[int, ...], own: Lens, lens: Lens, size: int, turn: Turn | None
+) -> tuple[np.ndarray, int]:
+    """The places in a picture (H, W) of `own` that `lens` sees, and the points in each pixel."""
+    exact, source = lens.to(torch.float64), own.to(torch.float64)
     last = exact.r_max.item()
     points = _points(source.r_max.item() / last)
     offset = _grid(size, points) - exact.center_in((size, size)).numpy()
@@ -70,21 +86,26 @@ def warp_scene(scene: Scene, lens: Lens, size: int, turn: Turn | None = None) ->
     direction = torch.from_numpy(offset / np.maximum(radius, np.finfo(float).tiny)[..., None])
     if turn is not None:
         direction = direction @ torch.from_numpy(turn.matrix)
-    height, width = scene.target.shape
+    height, width = shape
     places = as_map(source.seen_pixels(theta[None], direction[None], (height, width)))[0]
-    return _read(scene, places.to(torch.float32).numpy(), lens, size, points)
+    return places.to(torch.float32).numpy(), points
 
 
 def _read(scene: Scene, places: np.ndarray, lens: Lens, size: int, points: int) -> Scene:
     """A scene at the places (points · size, points · size, 2) in a picture."""
-    image = remap(scene.image, places)
-    if points > 1:
-        image = cv2.resize(image, (size, size), interpolation=cv2.INTER_AREA)
     aside = _aside(size).astype(np.float32)
     centres = places[points // 2 :: points, points // 2 :: points].copy()
     centres += np.stack(np.meshgrid(aside, aside), -1)
     target = remap(scene.target, centres, cv2.INTER_NEAREST, nothing_of(scene.target))
-    return Scene(image.reshape(size, size, -1), target, lens)
+    return Scene(_read_image(scene.image, places, size, points), target, lens)
+
+
+def _read_image(image: np.ndarray, places: np.ndarray, size: int, points: int) -> np.ndarray:
+    """The mean over the points of each pixel, (size, size, C)."""
+    image = remap(image, places)
+    if points > 1:
+        image = cv2.resize(image, (size, size), interpolation=cv2.INTER_AREA)
+    return image.reshape(size, size, -1)
 
 
 def _only_seen(scene: Scene) -> Scene:

@@ -10,13 +10,26 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 from darswin.data.cameras import Calibrations
+from darswin.data.lens_distributions import LensDistribution
 from darswin.data.pictures import Source
-from darswin.data.warping import Framing, RandomTurns, Turn, at_size, lens_at_size, turned_picture
+from darswin.data.reframing import warp_picture
+from darswin.data.warping import (
+    Crop,
+    Framing,
+    RandomTurns,
+    Turn,
+    at_size,
+    lens_at_size,
+    turned_picture,
+)
 from darswin.lens import Lens
 from darswin.utils.image import BrokenImageError
 
 # Per-channel statistics of ImageNet, in [0, 1].
 IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
+
+# The share of a random lens's largest angle that is used, because its curve may have no end there.
+_USED = 0.95
 
 Augmentation = Callable[[np.ndarray, np.random.Generator], np.ndarray]
 
@@ -41,6 +54,7 @@ class Samples(Dataset):
         mean: Sequence[float] = IMAGENET_MEAN,
         std: Sequence[float] = IMAGENET_STD,
         turns: RandomTurns | None = None,
+        lens_augmentation: LensDistribution | None = None,
         augment: Augmentation | None = None,
         erase: Augmentation | None = None,
         seed: int = 0,
@@ -51,7 +65,8 @@ class Samples(Dataset):
         self.source, self.size, self.framing = source, size, framing
         self.mean = np.asarray(mean, np.float32)[:, None, None]
         self.std = np.asarray(std, np.float32)[:, None, None]
-        self.turns, self.augment, self.erase, self.seed = turns, augment, erase, seed
+        self.turns, self.lens_augmentation = turns, lens_augmentation
+        self.augment, self.erase, self.seed = augment, erase, seed
         self.skip_broken = skip_broken
         # OpenCV's threads do not survive a fork, so the forked workers of a DataLoader would hang.
         # Small images gain nothing from threads anyway.
@@ -93,6 +108,25 @@ class Samples(Dataset):
     def _turn(self, draw: Draw) -> Turn | None:
         return self.turns.draw(self._random(draw.epoch, draw.lens, 2)) if self.turns else None
 
+    def _other_lens(
+        self, draw: Draw, own: Lens, crop: Crop | None = None, purpose: int = 1
+    ) -> Lens:
+        """A random lens of `lens_augmentation` for a picture of the lens `own`, or for a part."""
+        lenses = self.lens_augmentation
+        assert lenses is not None
+        size, share = self.size, 1.0 if crop is None else crop.share
+        radius, theta_max = size / share / 2, own.theta_max.item()
+
+        def of_fov(fov: float) -> Lens:
+            return lenses.draw(self._random(draw.epoch, draw.lens, purpose), fov, radius)
+
+        limit = _USED * of_fov(1.0).theta_limit.item()
+        lens = of_fov(2 * min(theta_max, limit))
+        middle, left = (size / share - 1) / 2, size / share - size
+        across, down = (0.0, 0.0) if crop is None else (crop.across, crop.down)
+        center = lens.theta_max.new_tensor([[middle - across * left, middle - down * left]])
+        return lens.replace(center=center, image_size=center.new_tensor([[size, size]]))
+
     def _seen(self, draw: Draw) -> tuple[np.ndarray, Lens, int | Tensor]:
         """The image (size, size, C) uint8 before augmentation, its lens and its label."""
         raise NotImplementedError
@@ -120,6 +154,9 @@ class Calibrated(Samples):
             The lens follows exactly.
         mean, std: per channel, in [0, 1]; the image is (pixel/255 - mean) / std.
         turns: random turns of the images with their lenses; None turns nothing.
+        lens_augmentation: a distribution of lenses. Each picture is shown as a random lens would
+            have seen it. The lens has the same θ_max, if it can, and its circle touches the sides
+            of the image. `framing` then has no effect on calibrated pictures.
         augment: a function that changes the (H, W, C) uint8 image; its arguments are the image and
             a random generator.
         erase: the same for the normalised (C, H, W) float32 image.
@@ -146,11 +183,17 @@ class Calibrated(Samples):
         picture, label, orientation = self.source.oriented(draw.picture)
         file, size = self.source.file(draw.picture), (picture.shape[0], picture.shape[1])
         lens = self.calibrations.lens_of(file, size, orientation)
-        if (turn := self._turn(draw)) is not None:
+        turn = self._turn(draw)
+        if self.lens_augmentation is not None:
+            other = self._other_lens(draw, lens)
+            return warp_picture(picture, lens, other, self.size, turn), other, label
+        if turn is not None:
             picture, lens = turned_picture(picture, lens, turn)
         image, lens = at_size(picture, lens, self.size, self.framing)
         return image, lens, label
 
     def _lens_alone(self, draw: Draw) -> Lens:
         lens = self.calibrations.lens_alone(self.source.file(draw.picture))
+        if self.lens_augmentation is not None:
+            return self._other_lens(draw, lens)
         return lens_at_size(lens, self.size, self.framing)

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from darswin.data.lens_distributions import LensDistribution
 from darswin.data.pictures import Source
+from darswin.data.reframing import warp_picture
 from darswin.data.samples import Draw, Samples
 from darswin.data.warping import Turn, area_resized, remap, taken_part
 from darswin.lens import Lens, Perspective
@@ -32,8 +33,10 @@ class WideAngle(Samples):
         size: px, H = W of the images. render: px, their size before the reduction; at least `size`.
         fov: rad, the full field of view, below π.
         picture_size: px, the width to which larger pictures are reduced before the warp.
-        options: framing ("stretch" in the authors' code), mean, std, turns, augment, erase, seed
-            and skip_broken, as `Calibrated` takes them.
+        options: framing ("stretch" in the authors' code), mean, std, turns, lens_augmentation,
+            augment, erase, seed and skip_broken, as `Calibrated` takes them. With
+            lens_augmentation, an image of `render` px through a lens of `lenses` is warped again,
+            as another camera would have seen it.
 
     Raises:
         ValueError: sizes or angles out of range.
@@ -64,20 +67,37 @@ class WideAngle(Samples):
 
     def _seen(self, draw: Draw) -> tuple[np.ndarray, Lens, int]:
         picture, label = self.source[draw.picture]
-        lens = self._lens_alone(draw)
-        # The lens is round and in the middle: a turn leaves it as it is.
-        return self.through(lens, picture, self._turn(draw)), lens, label
+        lens = self._first_lens(draw)
+        turn = self._turn(draw)  # leaves the lens as it is, which is round and in the middle
+        if self.lens_augmentation is None:
+            return self.through(lens, picture, turn), lens, label
+        image, other = self._rendered(lens, picture, turn), self._second_lens(draw, lens)
+        return warp_picture(image, self._large(lens), other, self.size), other, label
 
     def _lens_alone(self, draw: Draw) -> Lens:
+        lens = self._first_lens(draw)
+        return lens if self.lens_augmentation is None else self._second_lens(draw, lens)
+
+    def _first_lens(self, draw: Draw) -> Lens:
         return self.lenses.draw(self._random(draw.epoch, draw.lens, 1), self.fov, self.size / 2)
+
+    def _second_lens(self, draw: Draw, first: Lens) -> Lens:
+        return self._other_lens(draw, first, purpose=4)
 
     def through(self, lens: Lens, picture: np.ndarray, turn: Turn | None = None) -> np.ndarray:
         """The picture (H, W, C) uint8 through a lens → (size, size, C) uint8."""
-        picture = self._square(picture)
-        image = remap(picture, self._map(lens, picture.shape[0], turn))
+        image = self._rendered(lens, picture, turn)
         if self.render != self.size:
             image = cv2.resize(image, (self.size, self.size), interpolation=cv2.INTER_AREA)
         return image.reshape(self.size, self.size, -1)
+
+    def _rendered(self, lens: Lens, picture: np.ndarray, turn: Turn | None) -> np.ndarray:
+        picture = self._square(picture)
+        return remap(picture, self._map(lens, picture.shape[0], turn))
+
+    def _large(self, lens: Lens) -> Lens:
+        """The lens at `render` px."""
+        return lens.resized(self.render / self.size)
 
     def _map(self, lens: Lens, side: int, turn: Turn | None = None) -> np.ndarray:
         """The place of each pixel in a picture of `side` px, (render, render, 2).
@@ -85,8 +105,8 @@ class WideAngle(Samples):
         The curve of the lens is computed once for each radius; there are eight times more pixels.
         """
         radii, place, offset = _rays(self.render)
-        large = lens.resized(self.render / self.size)
-        ratio = radial_reprojection(_view(self.fov, side), large, radii)[0].numpy()[place]
+        view = _view(self.fov, side)
+        ratio = radial_reprojection(view, self._large(lens), radii)[0].numpy()[place]
         if turn is not None:
             offset = offset @ turn.matrix.astype(np.float32)
         places = offset * ratio[..., None] + np.float32((side - 1) / 2)

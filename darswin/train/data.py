@@ -62,6 +62,9 @@ class RunData(LightningDataModule):
         rotate_deg: rotates training images about the optical axis, together with their lenses, by
             a random angle of at most this many degrees; 180 allows any angle. Pixels from outside
             the picture are black.
+        lens_augmentation: shows training pictures as other lenses would have seen them: a level of
+            the paper ("very low", "low", "medium", "high"), one ξ ("0.4"), a range of ξ
+            ("0.2..0.35"), or "polynomial". null turns it off.
         randaugment: changes the colours of training images.
         seed: seeds the shuffles, the lenses and the augmentation, also those of the test sets.
         skip_broken: counts files that are not images, instead of stopping at the first one.
@@ -94,6 +97,7 @@ class RunData(LightningDataModule):
         workers: int = 1,
         flip: bool = False,
         rotate_deg: float = 0.0,
+        lens_augmentation: str | None = None,
         randaugment: bool = True,
         seed: int = 0,
         skip_broken: bool = False,
@@ -112,6 +116,9 @@ class RunData(LightningDataModule):
         self._skip_broken = skip_broken
         self.limit, self.batch_size, self.workers = limit, batch_size, workers
         self.turns = RandomTurns(flip, rotate_deg) if flip or rotate_deg else None
+        self.lens_augmentation = (
+            None if lens_augmentation is None else parse_lenses(lens_augmentation)
+        )
         self.colour_changes = RandAugment() if randaugment else None
         self.seed = seed
         self._sources: dict[Split, Any] = {}
@@ -344,4 +351,7 @@ class WideAngleData(RunData):
 
     def _training(self) -> Samples:
         erase = RandomErasing(self.erasing) if self.erasing else None
-        return self.dataset("train", turns=self.turns, augment=self.colour_changes, erase=erase)
+        return self.dataset(
+            "train", turns=self.turns, lens_augmentation=self.lens_augmentation,
+            augment=self.colour_changes, erase=erase,
+        )  # fmt: skip

@@ -9,6 +9,7 @@ from torch import nn
 from darswin.layers.quantized import without_quantized_layers
 from darswin.models.base import Model
 from darswin.models.encoder import Encoder
+from darswin.models.pixel import PixelModel
 from darswin.models.registry import list_models, model_class
 from darswin.models.saving import ModelCard, load_model, model_of_run
 from darswin.models.unet import Unet
@@ -32,7 +33,7 @@ def own_options(card: ModelCard) -> dict[str, Any]:
 
 def models_for(task: Task) -> list[str]:
     """The names of the models that a task trains."""
-    base = Encoder if task == "classification" else Unet
+    base = Encoder if task == "classification" else PixelModel
     return [name for name in list_models() if issubclass(model_class(name), base)]
 
 
@@ -128,16 +129,17 @@ def _of_head(name: str) -> bool:
     return name.startswith(("head.", "segmentation_head.", "distance_head."))
 
 
-def frozen_parts(net: Encoder | Unet, stages: int) -> list[nn.Module]:
+def frozen_parts(net: Encoder | PixelModel, stages: int) -> list[nn.Module]:
     """The frozen modules of the encoder: the embedding and the first `stages` stages, or all except
     the head if these are all stages."""
     net = net.encoder if isinstance(net, Unet) else net
-    if not 0 <= stages <= len(net.stages):
+    of_encoder = getattr(net, "stages", ())
+    if not 0 <= stages <= len(of_encoder):
         raise ValueError(
-            f"`freeze_stages` must be from 0 to the model's {len(net.stages)} stages, got {stages}"
+            f"`freeze_stages` must be from 0 to the model's {len(of_encoder)} stages, got {stages}"
         )
     if not stages:
         return []
-    trained = {"head", "stages"} | ({"norm"} if stages < len(net.stages) else set())
+    trained = {"head", "stages"} | ({"norm"} if stages < len(of_encoder) else set())
     rest = [module for name, module in net.named_children() if name not in trained]
-    return [*rest, *net.stages[:stages]]
+    return [*rest, *of_encoder[:stages]]

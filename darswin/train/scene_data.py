@@ -7,7 +7,6 @@ from typing import Any, ClassVar
 
 import torch
 
-from darswin.data.lens_distributions import parse_lenses
 from darswin.data.scenes import open_scenes
 from darswin.data.scenes.dataset import SceneSamples
 from darswin.data.scenes.scene import Scenes, Target
@@ -28,9 +27,6 @@ class SceneData(RunData):
         batch_size: images in a batch of one process.
         crop: trains on random parts of the pictures; each side of a part has at least this share
             of the picture's side, in (0, 1]. null uses whole pictures.
-        lens_augmentation: shows training pictures as other lenses would have seen them: a level of
-            the paper ("very low", "low", "medium", "high"), one ξ ("0.4"), a range of ξ
-            ("0.2..0.35"), or "polynomial". null turns it off.
         common: as `RunData`; the default size of large pictures is 128.
     """
 
@@ -45,14 +41,12 @@ class SceneData(RunData):
         test_paths: list[str] | None = None,
         batch_size: int = 16,
         crop: float | None = None,
-        lens_augmentation: str | None = None,
         **common: Any,
     ):
         super().__init__(path, batch_size=batch_size, **common)
         self.frame_fit = self._framing
         self.test_paths = test_paths or []
         self.crop = crop
-        self.lenses = None if lens_augmentation is None else parse_lenses(lens_augmentation)
 
     def _open(self, split: Split, channels: int | None) -> Scenes:
         return open_scenes(
@@ -98,7 +92,7 @@ class SceneData(RunData):
 
     def _training(self) -> SceneSamples:
         return self.dataset(
-            "train", turns=self.turns, crop=self.crop, lenses=self.lenses,
+            "train", turns=self.turns, crop=self.crop, lens_augmentation=self.lens_augmentation,
             augment=self.colour_changes,
         )  # fmt: skip
 

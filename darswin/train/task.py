@@ -18,9 +18,9 @@ from torch.optim.lr_scheduler import LambdaLR
 from darswin.layers.linear import MatmulBackend
 from darswin.lens import Lens
 from darswin.models.encoder import Encoder
+from darswin.models.pixel import PixelModel
 from darswin.models.registry import has_image_size
 from darswin.models.saving import ModelCard, read_card
-from darswin.models.unet import Unet
 from darswin.ops.checks import readable
 from darswin.train.finetuning import (
     check_name,
@@ -76,7 +76,7 @@ class Task(LightningModule):
     default_model: ClassVar[str]
     monitor: ClassVar[tuple[str, Literal["min", "max"]]]  # the score of the best checkpoint
     results: list[dict[str, Any]]
-    net: Encoder | Unet  # made by `configure_model`, like `card`
+    net: Encoder | PixelModel  # made by `configure_model`, like `card`
     card: ModelCard
     trained: ModelCard  # the card of the checkpoint that was read, or else `card`
 

@@ -23,16 +23,18 @@ from darswin.data import (
     at_size,
     open_scenes,
     open_source,
+    warp,
 )
 from darswin.data.order import TrainingOrder
 from darswin.data.pictures import Arrays
 from darswin.data.samples import Draw
-from darswin.lens import Tabulated, load
+from darswin.lens import Equidistant, Spherical, Tabulated, load
 from darswin.lens.orientation import in_upright_picture
 from darswin.utils.image import BrokenImageError, read_oriented
 
 GREY = dict(size=24, mean=[0], std=[1])
 LENSES = SphericalLenses(0.2, 1)
+OTHERS = GREY | dict(lens_augmentation=LENSES)
 EQUIDISTANT = {"model": "Equidistant", "focal": 30.0, "theta_max": 1.5}
 
 
@@ -65,9 +67,11 @@ DATASETS = {
     "distance": lambda root, **o: SceneSamples(
         open_scenes(root / "scenes", "all", "distance", channels=1), crop=0.5, **GREY | o
     ),
-    "other lenses": lambda root, **o: SceneSamples(
-        open_scenes(root / "scenes", "all", "labels", channels=1), lenses=LENSES, **GREY | o
+    "labels, other lenses": lambda root, **o: SceneSamples(
+        open_scenes(root / "scenes", "all", "labels", channels=1), **OTHERS | o
     ),
+    "wide, other lenses": lambda root, **o: DATASETS["wide"](root, **OTHERS | o),
+    "calibrated, other lenses": lambda root, **o: DATASETS["calibrated"](root, **OTHERS | o),
 }
 RANDOM = dict(turns=RandomTurns(True, 180), augment=RandAugment())
 
@@ -93,7 +97,8 @@ def test_a_sample_depends_on_its_draw_alone(folders, name):
         assert not torch.equal(first[0], other[0])
     still = DATASETS[name](folders)[draw]
     assert same(DATASETS[name](folders, turns=RandomTurns())[draw], still)  # off
-    if name in ("wide", "other lenses"):  # its own key draws the lens, whatever the picture
+    # Its own key draws the lens, whatever the picture.
+    if name in ("wide", "wide, other lenses", "labels, other lenses"):
         assert str(dataset[Draw(3, 1, 5)][1]) == str(first[1])
         assert str(dataset[Draw(4, 2, 5)][1]) != str(first[1]) != str(dataset[Draw(3, 2, 4)][1])
 
@@ -105,7 +110,7 @@ def test_samples_are_the_same_for_any_number_of_workers(folders, name, threads):
         threads(count)
         dataset = DATASETS[name](folders, **RANDOM)
         order = TrainingOrder(
-            8, 4, rank=0, world=1, cameras=None if name == "wide" else dataset.cameras
+            8, 4, rank=0, world=1, cameras=None if name.startswith("wide") else dataset.cameras
         )
         batches.append(list(DataLoader(dataset, 4, sampler=order, num_workers=workers)))
     assert len(batches[0]) == 2 and len(batches[0][0][1]) == 4
@@ -149,7 +154,7 @@ def test_a_picture_that_cannot_be_read(folders, name):
             assert (images[1] == np.float32(-0.4) / np.float32(0.2)).all() and len(lenses) == 8
             assert not (images[0] == images[1]).all()
         assert dataset.broken == [1]  # counted once, though a worker saw it twice
-        nothing = {"wide": -1, "calibrated": -1, "distance": 0}.get(name, IGNORE)
+        nothing = {"labels": IGNORE, "distance": 0}.get(name.split(",")[0], -1)
         assert (labels[1] == nothing).all() and not (labels[0] == nothing).all()
     finally:
         broken.write_bytes(content)
@@ -175,6 +180,33 @@ def test_a_sample_is_the_picture_at_the_size_with_its_lens(folders, framing):
     np.testing.assert_allclose(255 * image[0].numpy(), expected[..., 0], atol=1e-3)
     assert str(lens) == str(there) and label == int(dataset.source.file(3).parent.name)
     assert same(dataset[3], dataset[Draw(4, 3, 7)])  # nothing is random
+
+
+def test_a_large_picture_is_reduced_by_area(tmp_path):
+    noise = np.random.default_rng(0).integers(256, size=(960, 960, 1), dtype=np.uint8)
+    own = Equidistant.from_fov(2.8, 480.0)
+    write_plain(tmp_path, 1, lens=own, size=(960, 960))
+    cv2.imwrite(str(tmp_path / "images" / "000.png"), noise)
+    calibrations = Calibrations(tmp_path / "lens.json")
+    means = noise.reshape(24, 40, 24, 40).mean((1, 3))  # 40 × 40 px become one
+    for dataset in (
+        Calibrated(Arrays(noise[None, ..., 0], np.array([0]), ["a"], 1), calibrations, **GREY),
+        SceneSamples(open_scenes(tmp_path, "all", "labels", channels=1), **GREY),
+    ):
+        np.testing.assert_allclose(255 * dataset[0][0][0].numpy(), means, atol=0.51)
+
+
+def test_a_picture_as_another_lens_had_seen_it(folders):
+    own = load(WOODSCAPE)
+    dataset = Calibrated(frames(folders), Calibrations(WOODSCAPE), **OTHERS)
+    image, lens, label = dataset[3]
+    picture = dataset.source[3][0]
+    assert label == dataset.source[3][1] and isinstance(lens, Spherical)
+    assert lens.theta_max.item() == pytest.approx(own.theta_max.item(), rel=1e-5)
+    large = warp(picture, own.in_picture(picture.shape[:2]), lens.resized((192, 192)), (192, 192))
+    expected = cv2.resize(large, (24, 24), interpolation=cv2.INTER_AREA)
+    assert np.abs(255 * image[0].numpy() - expected).mean() < 3
+    assert str(dataset[Draw(1, 3, 3)][1]) != str(lens)  # another lens in each epoch
 
 
 def test_exif_turns_picture_and_lens(tmp_path):

@@ -8,7 +8,7 @@ from frames import blob, centroid
 
 from darswin.data import PolynomialLenses, SphericalLenses, WideAngle, warp
 from darswin.data.pictures import Arrays
-from darswin.data.samples import IMAGENET_MEAN, IMAGENET_STD
+from darswin.data.samples import IMAGENET_MEAN, IMAGENET_STD, Draw
 from darswin.data.warping import Turn
 from darswin.data.wide_angle import PAPER_FOV
 from darswin.lens import Perspective, Spherical
@@ -73,6 +73,26 @@ def test_a_picture_turns_in_its_map(turn):
     # No second interpolation: a mirrored image has the same pixels, up to the map's rounding.
     if turn.angle == 0:
         np.testing.assert_allclose(after[:, ::-1].astype(int), before, atol=1)
+
+
+def test_an_image_is_warped_again_as_another_lens_had_seen_it():
+    same = dict(fov=2.8, mean=[0] * 3, std=[1] * 3)
+    other = SphericalLenses(0.8, 0.8)
+    image, lens, _ = of(smooth(), SphericalLenses(0, 0.05), lens_augmentation=other, **same)[0]
+    expected, there, _ = of(smooth(), other, **same)[0]
+    assert lens.same_as(there.replace(center=lens.center, image_size=lens.image_size))
+    y, x = np.mgrid[:64, :64] - 31.5
+    inside = torch.from_numpy(np.hypot(x, y) < 30)
+    error = 255 * (image - expected)[:, inside].abs()
+    assert error.mean() < 1 and error.max() < 6
+
+
+def test_both_lenses_of_an_image_are_drawn_independently():
+    dataset = of(smooth(40), SphericalLenses(0, 1), lens_augmentation=SphericalLenses(0, 1))
+    draws = [Draw(0, 0, k) for k in range(40)]
+    own = [dataset._first_lens(draw).xi.item() for draw in draws]
+    other = [dataset._lens_alone(draw).xi.item() for draw in draws]
+    assert abs(np.corrcoef(own, other)[0, 1]) < 0.5 and np.ptp(own) > 0.8 < np.ptp(other)
 
 
 @pytest.mark.parametrize(("framing", "left_is_black"), [("crop", True), ("stretch", False)])

@@ -112,6 +112,23 @@ for words in json.loads(sys.argv[1]):
 """
 
 
+def with_gradients(weights: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+    """The weights without those whose exact gradient is 0.
+
+    The softmax cancels a number that is equal for all keys: the bias of the keys, and b_theta in
+    windows of one ring, as in the first stage. Adam scales the rounding errors of these gradients
+    up to whole steps, so they differ between runs that add in another order.
+    """
+    kept = {}
+    for name, tensor in weights.items():
+        if name.endswith("qkv.bias"):
+            queries, _, values = tensor.chunk(3)
+            tensor = torch.cat((queries, values))
+        if not name.endswith("stages.0.blocks.0.attn.position_bias.b_theta"):
+            kept[name] = tensor
+    return kept
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("task", ["classification", "segmentation"])
 def test_two_processes_train_and_test_as_one(scenes, tmp_path, task):
@@ -139,9 +156,8 @@ def test_two_processes_train_and_test_as_one(scenes, tmp_path, task):
         capture_output=True, text=True, env=os.environ | {"OMP_NUM_THREADS": "1"}, timeout=300,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr[-3000:]
-    for name, tensor in checkpoint(one)["state_dict"].items():
-        found = checkpoint(two)["state_dict"][name]
-        torch.testing.assert_close(found, tensor, rtol=1e-3, atol=1e-4)
+    found, expected = (with_gradients(checkpoint(run)["state_dict"]) for run in (two, one))
+    torch.testing.assert_close(found, expected, rtol=1e-3, atol=1e-4)
     for a, b in zip(json.loads((one / "test.json").read_text())["results"], before, strict=True):
         numbers = {name: value for name, value in b.items() if isinstance(value, float | int)}
         assert {name: a[name] for name in numbers} == pytest.approx(numbers, abs=2e-3)

@@ -114,6 +114,13 @@ def test_pictures_decide_on_size_and_channels(tmp_path, side, options, size):
     assert grey.mean == [0.449] and grey.dataset("val")[0][0].shape == (1, size, size)
 
 
+def test_lens_augmentation_is_for_training():
+    data = WideAngleData("digits", train_lenses="0", lens_augmentation="0.5..1", workers=0)
+    _, lenses, _ = next(iter(data.train_dataloader()))
+    assert lenses.xi.min() >= 0.5 and lenses.xi.max() - lenses.xi.min() > 0.3
+    assert data.dataset("val")[0][1].xi == 0
+
+
 def test_presets_leave_size_and_channels_to_the_pictures():
     data = yaml.safe_load((PRESETS / "minutes.yaml").read_text())["data"]
     assert not {"size", "channels", "mean", "std"} & data.keys()

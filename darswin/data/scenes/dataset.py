@@ -6,15 +6,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from darswin.data.lens_distributions import LensDistribution
 from darswin.data.reframing import resize_scene, turn_scene, warp_scene
 from darswin.data.samples import Draw, Samples
 from darswin.data.scenes.scene import IGNORE, Scene, Scenes
 from darswin.data.warping import Crop, picture_size, taken_part
 from darswin.lens import Lens
-
-# The share of a random lens's largest angle that is used, because its curve may have no end there.
-_USED = 0.95
 
 
 class SceneSamples(Samples):
@@ -27,11 +23,8 @@ class SceneSamples(Samples):
         scenes: the pictures, their targets and lenses.
         crop: the least share of a picture's side, in (0, 1], for random parts of the pictures. The
             lens follows, and its principal point moves off the middle. None uses whole pictures.
-        lenses: a distribution of lenses. Each picture is shown as a random lens would have seen
-            it. The lens has the same θ_max, if it can, and its circle touches the sides of the
-            image. `framing` then has no effect.
-        options: size, framing, mean, std, turns, augment, erase, seed and skip_broken, as for
-            `Calibrated`.
+        options: size, framing, mean, std, turns, lens_augmentation, augment, erase, seed and
+            skip_broken, as for `Calibrated`.
 
     Raises:
         ValueError: a share out of range; from `dataset[i]`, as for `Scenes`.
@@ -43,13 +36,12 @@ class SceneSamples(Samples):
         scenes: Scenes,
         *,
         crop: float | None = None,
-        lenses: LensDistribution | None = None,
         **options: Any,
     ):
         if crop is not None and not 0 < crop <= 1:
             raise ValueError(f"`crop` must be a share in (0, 1], got {crop}")
         super().__init__(scenes, **options)
-        self.scenes, self.crop, self.lenses = scenes, crop, lenses
+        self.scenes, self.crop = scenes, crop
 
     @property
     def cameras(self) -> np.ndarray:
@@ -63,8 +55,9 @@ class SceneSamples(Samples):
 
     def _reframed(self, scene: Scene, draw: Draw) -> Scene:
         turn, crop = self._turn(draw), self._crop(draw)
-        if self.lenses is not None:
-            return warp_scene(scene, self._drawn(draw, scene.lens, crop), self.size, turn)
+        if self.lens_augmentation is not None:
+            lens = self._other_lens(draw, scene.lens, crop)
+            return warp_scene(scene, lens, self.size, turn)
         height, width = scene.target.shape
         taken = taken_part((height, width), self.framing, crop)
         if turn is not None and turn.angle:
@@ -77,27 +70,10 @@ class SceneSamples(Samples):
         rng = self._random(draw.epoch, draw.lens, 3)
         return Crop(rng.uniform(self.crop, 1), rng.random(), rng.random())
 
-    def _drawn(self, draw: Draw, own: Lens, crop: Crop | None) -> Lens:
-        """The random lens for a scene; the image may show a part of its view."""
-        lenses = self.lenses
-        assert lenses is not None
-        size, share = self.size, 1.0 if crop is None else crop.share
-        radius, theta_max = size / share / 2, own.theta_max.item()
-
-        def lens(fov: float) -> Lens:
-            return lenses.draw(self._random(draw.epoch, draw.lens, 1), fov, radius)
-
-        limit = _USED * lens(1.0).theta_limit.item()
-        drawn = lens(2 * min(theta_max, limit))
-        middle, left = (size / share - 1) / 2, size / share - size
-        across, down = (0.0, 0.0) if crop is None else (crop.across, crop.down)
-        center = drawn.theta_max.new_tensor([[middle - across * left, middle - down * left]])
-        return drawn.replace(center=center, image_size=center.new_tensor([[size, size]]))
-
     def _lens_alone(self, draw: Draw) -> Lens:
         own = self.scenes.lens_alone(draw.picture)
-        if self.lenses is not None:
-            return self._drawn(draw, own, self._crop(draw))
+        if self.lens_augmentation is not None:
+            return self._other_lens(draw, own, self._crop(draw))
         taken = taken_part(picture_size(own), self.framing)
         return own.cropped(*taken).resized((self.size, self.size))
 

@@ -59,19 +59,19 @@ def test_unknown_pixels_that_a_worker_reads_are_counted_here(folder):
 def test_a_drawn_lens_sees_as_far_where_it_can(folder):
     own = open_scenes(folder, "all", "labels")[0].lens.theta_max.item()
     assert own > math.pi / 2
-    dataset = of(folder, lenses=SphericalLenses(0.4, 1))
+    dataset = of(folder, lens_augmentation=SphericalLenses(0.4, 1))
     for k in range(4):
         lens = dataset[k][1]
         assert lens.theta_max.item() == pytest.approx(own) and 0.4 <= lens.xi.item() <= 1
         assert lens.r_max.item() == pytest.approx(24) and lens.center.tolist() == [[23.5, 23.5]]
-    perspective = of(folder, lenses=SphericalLenses(0, 0))[0]
+    perspective = of(folder, lens_augmentation=SphericalLenses(0, 0))[0]
     assert perspective[1].theta_max.item() == pytest.approx(0.95 * math.pi / 2, abs=1e-4)
     assert (perspective[2] != IGNORE).float().mean() > 0.5
-    polynomial = of(folder, lenses=PolynomialLenses())[0][1]
+    polynomial = of(folder, lens_augmentation=PolynomialLenses())[0][1]
     assert isinstance(polynomial, Polynomial) and polynomial.theta_max.item() == pytest.approx(own)
 
 
-@pytest.mark.parametrize("options", [{}, {"lenses": SphericalLenses(0.5, 0.5)}])
+@pytest.mark.parametrize("options", [{}, {"lens_augmentation": SphericalLenses(0.5, 0.5)}])
 def test_parts_have_their_principal_point_off_the_middle(folder, options):
     lenses = [of(folder, crop=0.4, **options)[Draw(e, 0, 0)][1] for e in range(40)]
     centers = torch.cat([lens.center for lens in lenses])
