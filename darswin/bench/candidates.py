@@ -20,8 +20,8 @@ from darswin.layers.quantized import QuantizedLinear, quantize
 from darswin.lens import Lens, Spherical
 from darswin.models import create_model
 from darswin.models.base import Model
+from darswin.models.pixel import PixelModel
 from darswin.models.registry import has_image_size, model_class
-from darswin.models.unet import Unet
 from darswin.ops import use_reference
 
 Run = Callable[[], Tensor]
@@ -37,7 +37,7 @@ def network(name: str, size: int) -> Model:
     """A model with random weights, which are the same in every call."""
     torch.manual_seed(0)
     options: dict[str, Any] = dict(image_size=size) if has_image_size(name) else {}
-    classes = PIXEL_CLASSES if issubclass(model_class(name), Unet) else CLASSES
+    classes = PIXEL_CLASSES if issubclass(model_class(name), PixelModel) else CLASSES
     return create_model(name, num_classes=classes, **options)
 
 
@@ -213,7 +213,7 @@ def training_step(name: str, size: int, dtype: torch.dtype, batch: int, *, refer
         model.set_grad_checkpointing(True)
     optimizer = torch.optim.AdamW(model.parameters(), lr=1e-4, fused=True)
     images = torch.randn(batch, 3, size, size)
-    pixels = (size, size) if isinstance(model, Unet) else ()
+    pixels = (size, size) if isinstance(model, PixelModel) else ()
     labels = torch.randint(model.num_classes, (batch, *pixels))
     half = dtype == torch.bfloat16
 

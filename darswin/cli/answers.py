@@ -20,8 +20,8 @@ from darswin.deploy.optimize import optimize
 from darswin.lens import Lens
 from darswin.models.base import Model
 from darswin.models.encoder import Encoder
+from darswin.models.pixel import PixelModel
 from darswin.models.saving import ModelCard
-from darswin.models.unet import Unet
 from darswin.utils.files import replace_file
 from darswin.viz.pixels import (
     UNKNOWN,
@@ -54,7 +54,7 @@ class Answers:
     computed once.
     """
 
-    def __init__(self, model: Encoder | Unet, card: ModelCard):
+    def __init__(self, model: Encoder | PixelModel, card: ModelCard):
         self.model, self.card = model, card
         self.found: list[dict[str, Any]] = []
         self.seconds = 0.0  # spent in the network
@@ -141,9 +141,9 @@ class PixelAnswers(Answers):
     """
 
     kind: str  # the name of the folder of the predictions
-    model: Unet
+    model: PixelModel
 
-    def __init__(self, model: Unet, card: ModelCard, out: Path, names: Mapping[str, str]):
+    def __init__(self, model: PixelModel, card: ModelCard, out: Path, names: Mapping[str, str]):
         super().__init__(fast(model, card), card)
         self.out, self.names = out, names
 
@@ -180,7 +180,7 @@ class LabelAnswers(PixelAnswers):
 
     kind = "labels"
 
-    def __init__(self, model: Unet, card: ModelCard, out: Path, names: Mapping[str, str]):
+    def __init__(self, model: PixelModel, card: ModelCard, out: Path, names: Mapping[str, str]):
         super().__init__(model, card, out, names)
         if model.num_classes > IGNORE:
             raise ValueError(

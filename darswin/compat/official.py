@@ -128,6 +128,9 @@ class OfficialDarSwin(DarSwin):
     def _sample(self, images: Tensor, prepared: Prepared) -> Tensor:
         return super()._sample(images.transpose(2, 3), prepared)
 
+    def _points(self, prepared: Prepared) -> Any:
+        raise ValueError("OfficialDarSwin samples the transposed image, which no plan does")
+
 
 def _with_shift(plan: StagePlan, window: Pair) -> StagePlan:
     """A stage's sizes with the shift of the released code."""

@@ -12,6 +12,7 @@ from typing import Any, Literal, TypeVar
 
 import torch
 from torch import Tensor, nn
+from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from darswin.deploy.packed import (
     PackedBlocks,
@@ -39,9 +40,11 @@ from darswin.layers.quantized import (
 from darswin.layers.transformer import Block, PatchMerging, Stage, Tables, WindowAttention
 from darswin.lens import Lens
 from darswin.models.base import Model
+from darswin.models.conv_unet import ConvBlock, ConvUnet
 from darswin.models.encoder import Encoder, FeatureMaps
+from darswin.models.pixel import PixelHead, PixelModel
 from darswin.models.stages import Pair
-from darswin.models.unet import PatchExpand, PixelHead, SkipJoin, Unet
+from darswin.models.unet import PatchExpand, SkipJoin, Unet
 
 __all__ = ["optimize"]
 
@@ -124,7 +127,7 @@ def _quantized(model: Net, calibration: Iterable[Sequence] | None) -> Net:
 
 
 def _check(model: nn.Module, dtype: torch.dtype | str, lens: Lens | None) -> None:
-    if not isinstance(model, (Encoder, Unet, FeatureMaps)):
+    if not isinstance(model, (Encoder, PixelModel, FeatureMaps)):
         raise TypeError(f"model must be a model of create_model, got {type(model).__name__}")
     if "prepare" in vars(model):
         raise TypeError("model must be a model of create_model, got an optimized model")
@@ -188,12 +191,19 @@ def _pack(module: nn.Module, dtype: torch.dtype) -> None:
         reduction = packed(module.reduction, dtype)
         _replace(module, reduction=reduction)
         _pack_norm(module, dtype, taken(reduction))
+    elif isinstance(module, ConvBlock):
+        layers: Any = module
+        for conv in (0, 3):
+            fused = fuse_conv_bn_eval(layers[conv], layers[conv + 1])
+            layers[conv], layers[conv + 1] = InDtype(fused, dtype), nn.Identity()
     elif isinstance(module, (PatchExpand, SkipJoin, PixelHead)):
         for name, layer in list(module.named_children()):
             if isinstance(layer, nn.LayerNorm):
                 layer.to(dtype)
             elif isinstance(layer, (nn.Linear, QuantizedLinear)):
                 _replace(module, **{name: PackedLinear(layer, dtype)})
+            elif isinstance(layer, nn.Conv2d):
+                module.add_module(name, InDtype(layer, dtype))
 
 
 def _has_kernels(module: nn.Module, dtype: torch.dtype) -> bool:
@@ -282,6 +292,8 @@ def _with_tables(model: Model, fixed_lens: Lens | None) -> Callable[[Lens | None
 def _tables(model: Any, prepared: Any) -> Any:
     if isinstance(model, FeatureMaps):
         return _tables(model.encoder, prepared)
+    if isinstance(model, ConvUnet):
+        return prepared
     if isinstance(model, Unet):
         prepared = prepared._replace(encoder=_tables(model.encoder, prepared.encoder))
         model = model.decoder

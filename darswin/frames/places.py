@@ -6,15 +6,11 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from darswin.compat.official import OfficialDarSwin
 from darswin.layers.polar import PolarGrid, PolarSample, check_lens
 from darswin.lens import Lens
 from darswin.lens.pixels import as_map
 from darswin.models.base import Model
-from darswin.models.encoder import FeatureMaps
 from darswin.models.stages import Pair
-from darswin.models.unet import Unet
-from darswin.models.views import LensAdapter
 
 
 class Reading(NamedTuple):
@@ -47,25 +43,12 @@ def reading(sample: nn.Module | Tensor, lens: Lens, size: Pair) -> Reading:
             "sample must be a model of darswin, a PolarSample or rays (H, W, 3), "
             f"got {type(sample).__name__}"
         )
-    points = _points(sample, sample.prepare(lens, size))
+    points = sample._points(sample.prepare(lens, size))
     if points is None:
         raise ValueError("the model takes images as they are: it needs no plan")
     if isinstance(points, PolarGrid):
         return Reading(points, "tokens", _spec(sample).samples, *normalization)
     return Reading(points[0], "image", None, *normalization)
-
-
-def _points(model: Model, prepared: Any) -> PolarGrid | Tensor | None:
-    if isinstance(model, OfficialDarSwin):
-        raise ValueError("OfficialDarSwin samples the transposed image, which no plan does")
-    if isinstance(model, FeatureMaps):
-        return _points(model.encoder, prepared)
-    if isinstance(model, LensAdapter):
-        return prepared[0]
-    if isinstance(model, Unet):
-        grid = prepared.encoder.points
-        return prepared.image_points if grid is None else grid
-    return prepared.points
 
 
 def _spec(model: Any) -> Any:

@@ -2,6 +2,7 @@
 
 Places in the square are (a, b) in [-1, 1]², a to the right and b down. The middle is the optical
 axis, the edge is θ_max, and nested squares are circles of equal θ, evenly spaced in a `Spacing`.
+With a fixed `theta_max`, the edge is at this angle for every lens, in equal steps of θ.
 
 Source: Shirley and Chiu, "A Low Distortion Map Between Disk and Square", JGT 1997.
 """
@@ -12,7 +13,7 @@ import torch
 from torch import Tensor
 
 from darswin.lens.base import Lens
-from darswin.lens.pixels import OUTSIDE, pixel_rays, sample_at
+from darswin.lens.pixels import OUTSIDE, as_map, pixel_rays, sample_at
 from darswin.lens.spacing import Spacing, span, to_spacing, to_theta
 from darswin.ops.checks import tensor_there
 
@@ -42,22 +43,40 @@ def disc_to_square(radius: Tensor, direction: Tensor) -> Tensor:
     return torch.stack(places, -1)
 
 
-def square_view(lens: Lens, image_size: tuple[int, int], size: int, spacing: Spacing) -> Tensor:
-    """(N, S, S, 2) px: the places in images of (H, W) of the pixels of a square with `size` S."""
+def square_view(
+    lens: Lens,
+    image_size: tuple[int, int],
+    size: int,
+    spacing: Spacing,
+    theta_max: float | None = None,
+) -> Tensor:
+    """(N, S, S, 2) px: the places in images of (H, W) of the pixels of a square with `size` S.
+
+    With a fixed `theta_max`, they are `OUTSIDE` beyond θ_max of the lens.
+    """
     like = lens.theta_max
     steps = (2 * torch.arange(size, dtype=like.dtype, device=like.device) + 1) / size - 1
     places = torch.stack(torch.meshgrid(steps, steps, indexing="xy"), -1)
     radius, direction = square_to_disc(places)
+    if theta_max is not None:
+        theta = (theta_max * radius).expand(len(lens), -1, -1)
+        return as_map(lens.seen_pixels(theta, direction[None], image_size))
     first, last = (end[:, :, None] for end in span(lens, spacing))
     theta = to_theta(lens, first + (last - first) * radius, spacing)
     return lens.pixels(theta, direction[None], image_size)
 
 
-def square_places(lens: Lens, image_size: tuple[int, int], spacing: Spacing) -> Tensor:
+def square_places(
+    lens: Lens, image_size: tuple[int, int], spacing: Spacing, theta_max: float | None = None
+) -> Tensor:
     """(N, H, W, 2): the places in the square of the images' pixels; `OUTSIDE` where no ray of
-    [0, θ_max] lands."""
+    [0, θ_max] lands, also of a fixed `theta_max`."""
     theta, direction = pixel_rays(lens, image_size)
     seen = ~theta.isnan()  # NaN must not reach the gradients
+    if theta_max is not None:
+        seen = seen & (theta <= theta_max)
+        places = disc_to_square(torch.where(seen, theta / theta_max, 0.0), direction)
+        return torch.where(seen[..., None], places, OUTSIDE)
     first, last = (end[:, :, None] for end in span(lens, spacing))
     value = to_spacing(lens, torch.where(seen, theta, 0.0), spacing)
     radius = ((value - first) / (last - first)).clamp(max=1)

@@ -1,6 +1,7 @@
 """The models: creating them by name, saving them, and loading them."""
 
 from darswin.models.base import FeatureInfo, Model
+from darswin.models.conv_unet import ConvUnet
 from darswin.models.darswin import DarSwin
 from darswin.models.dat import DAT
 from darswin.models.encoder import Encoder, FeatureMaps
@@ -12,6 +13,7 @@ from darswin.models.views import LensAdapter
 
 __all__ = [
     "DAT",
+    "ConvUnet",
     "DarSwin",
     "Encoder",
     "FeatureInfo",

@@ -156,6 +156,9 @@ class Encoder(Model):
     def _prepare(self, lens: Any, size: Pair) -> Prepared:
         return Prepared(None, [()] * len(self.stages))
 
+    def _points(self, prepared: Prepared) -> Any:
+        return prepared.points
+
     def embed(self, images: Tensor, points: Any) -> Tensor:
         """Images (B, C, H, W), sampled at the `points` of `prepare` → the first map.
 
@@ -305,6 +308,9 @@ class FeatureMaps(Model):
 
     def _sample(self, images: Tensor, prepared: Prepared) -> Tensor:
         return self.encoder._sample(images, prepared)
+
+    def _points(self, prepared: Prepared) -> Any:
+        return prepared.points
 
     def _run_sampled(self, sampled: Tensor, prepared: Prepared, images: Tensor | None) -> Any:
         return self._run(sampled, prepared._replace(points=None))

@@ -23,17 +23,20 @@ Presets = Mapping[str, Mapping[str, Any]]
 _Class = TypeVar("_Class", bound=type[Model])
 
 
-def register_model(family: str, *, presets: Presets, **options: Any) -> Callable[[_Class], _Class]:
+def register_model(
+    family: str, *, presets: Presets, sizes: Presets = _SIZES, **options: Any
+) -> Callable[[_Class], _Class]:
     """Registers the decorated class in four sizes: `FAMILY_small`, `FAMILY_tiny` and so on.
 
     Args:
         presets: options for single sizes.
+        sizes: the four sizes, if they are not those of the transformers.
         options: options for all sizes. They include `image_size` if the model takes images of a
             single size.
     """
 
     def register(model: _Class) -> _Class:
-        for size, common in _SIZES.items():
+        for size, common in sizes.items():
             _MODELS[f"{family}_{size}"] = model, {**common, **options, **presets.get(size, {})}
         return model
 

@@ -25,8 +25,8 @@ class Swin(Encoder):
         patch_size: the side of a patch, in pixels.
         window: (rows, columns) on maps that are large enough.
         view: "none" takes the images as they are and ignores the lens. "perspective" (with the
-            option `max_fov`) and "square" (with the option `spacing`) resample the images to a view
-            of this size through the lens; see `PerspectiveView` and `SquareView`.
+            option `max_fov`) and "square" (with `spacing` and `theta_max`) resample the images to a
+            view of this size through the lens; see `PerspectiveView` and `SquareView`.
 
     Raises:
         ValueError: an unknown option, or sizes that do not divide; in forward, images of another

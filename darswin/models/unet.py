@@ -1,27 +1,24 @@
 """The Unet: a class or a distance for every pixel, from polar maps or views of the images."""
 
-import math
 from collections.abc import Sequence
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
 from darswin.layers.linear import Linear
-from darswin.models.base import Model, init_weights
+from darswin.models.base import init_by_width
 from darswin.models.darswin import PRESETS, DarSwin
 from darswin.models.encoder import Prepared
+from darswin.models.pixel import PixelModel, PixelTask
 from darswin.models.registry import Presets, register_model
 from darswin.models.stages import Pair
 from darswin.models.swin import Swin
 from darswin.models.views import PlainView, PolarView, make_view
 
-PixelTask = Literal["segmentation", "distance"]
 EXPANSION = 4  # The decoder's last expansion splits each token into 4 × 4.
-# exp(±8): distances lie between 1/3000 of the typical distance and 3000 times that distance.
-LARGEST_EXPONENT = 8.0
 
-_NANO = dict(decoder_depths=1, skip_width=8)
+_NANO = dict(decoder_depths=1)
 _POLAR: Presets = dict(micro=PRESETS["micro"], nano=dict(_NANO, samples=(4, 4)))
 _PLAIN: Presets = dict(nano=_NANO)
 
@@ -92,58 +89,6 @@ class Decoder(nn.Module):
         return self.expand(x)
 
 
-class PixelHead(nn.Module):
-    """The decoder's map → K logits of each pixel, refined by the pixels of the image."""
-
-    # Projecting before resampling to the pixels gives the same as projecting after, at less cost.
-
-    def __init__(self, dim: int, channels: int, in_chans: int, skip_width: int):
-        super().__init__()
-        self.skip_width = skip_width
-        self.proj = Linear(dim, channels)
-        if skip_width:
-            self.stem = nn.Conv2d(in_chans, skip_width, 3, padding=1)
-            self.mix = nn.Conv2d(skip_width + channels, skip_width, 3, padding=1)
-            self.out = nn.Conv2d(skip_width, channels, 1, bias=False)
-            nn.init.trunc_normal_(self.out.weight, std=0.02)
-
-    def refine(self, coarse: Tensor, images: Tensor | None) -> Tensor:
-        """The projected map at the pixels, (B, K, H, W), and the images (B, C, H, W) → logits."""
-        if not self.skip_width:
-            return coarse
-        assert images is not None
-        # With channels last, as in `coarse`, convolutions of few channels take half the time.
-        skip = self.stem(images.contiguous(memory_format=torch.channels_last)).relu()
-        skip = self.mix(torch.cat((skip, coarse.to(skip.dtype)), 1)).relu()
-        return coarse + self.out(skip).to(coarse.dtype)
-
-    def finish(self, logits: Tensor) -> Tensor:
-        """Logits (B, K, H, W) → the model's result."""
-        return logits
-
-    def extra_repr(self) -> str:
-        return f"skip_width={self.skip_width}"
-
-
-class DistanceHead(PixelHead):
-    """Distances in m, `typical_distance` · e^x. x is bounded, so they are positive and finite."""
-
-    def __init__(self, dim: int, in_chans: int, skip_width: int, typical_distance: float):
-        super().__init__(dim, 1, in_chans, skip_width)
-        if not 0 < typical_distance < math.inf:
-            raise ValueError(f"typical_distance must be above 0 m, got {typical_distance}")
-        self.typical_distance = float(typical_distance)
-
-    def finish(self, logits: Tensor) -> Tensor:
-        """x (B, 1, H, W) → distances (B, 1, H, W) in m, in float32 or float64."""
-        x = logits.to(torch.promote_types(logits.dtype, torch.float32))
-        x = LARGEST_EXPONENT * torch.tanh(x / LARGEST_EXPONENT)
-        return self.typical_distance * torch.exp(x)
-
-    def extra_repr(self) -> str:
-        return f"{super().extra_repr()}, typical_distance={self.typical_distance}"
-
-
 class UnetPrepared(NamedTuple):
     """The result of a Unet's `prepare`."""
 
@@ -159,7 +104,7 @@ class UnetPrepared(NamedTuple):
 @register_model("swin_unet", view="none", image_size=128, presets=_PLAIN)
 @register_model("swin_unet_undis", view="perspective", image_size=128, presets=_PLAIN)
 @register_model("swin_unet_adapted", view="square", image_size=128, presets=_PLAIN)
-class Unet(Model):
+class Unet(PixelModel):
     """A class or a distance for every pixel: a DarSwin or Swin encoder and a mirrored decoder.
 
     The result has the height and the width of the images. For "segmentation" it is logits (B,
@@ -167,8 +112,8 @@ class Unet(Model):
     pixels that no ray of the lens reaches, the result has no meaning.
 
     The decoder's last map is 4 times finer along both axes than the encoder's first map. It is
-    projected to the classes and resampled to the pixels. A few convolutions, which also read the
-    image, then add the details that the map is too coarse for.
+    projected to `skip_width` channels and resampled to the pixels. A few convolutions, which also
+    read the image, then add the details that the map is too coarse for, and predict.
 
     The `view` is the form in which the network sees the images:
 
@@ -228,16 +173,12 @@ class Unet(Model):
         view: Literal["polar", "none", "perspective", "square"] = "polar",
         task: PixelTask = "segmentation",
         decoder_depths: int | Sequence[int] = 2,
-        skip_width: int = 16,
+        skip_width: int = 32,
         typical_distance: float = 10.0,
         places: bool = True,
         **options: Any,
     ):
-        super().__init__()
-        if task not in get_args(PixelTask):
-            raise ValueError(f"task must be one of {get_args(PixelTask)}, got {task!r}")
-        if skip_width < 0:
-            raise ValueError(f"skip_width must be at least 0, got {skip_width}")
+        super().__init__(task, typical_distance)
         if view == "polar":
             self.encoder = DarSwin(0, in_chans, **options)
             sizes = [plan.map_size for plan in self.encoder.plans] if places else []
@@ -250,17 +191,16 @@ class Unet(Model):
             self.image_size = self.encoder.image_size
             self.square_images = self.encoder.square_images
         self.uses_lens = self.view.uses_lens
-        self.task, self.in_chans = task, in_chans
+        self.in_chans = in_chans
         self.mean, self.std = self.encoder.mean, self.encoder.std
         self.feature_info = self.encoder.feature_info
-        self._head_options = dict(in_chans=in_chans, skip_width=skip_width)
-        self._typical_distance = typical_distance
-        self.decoder = Decoder(self.encoder, decoder_depths).apply(init_weights)
+        self.decoder = Decoder(self.encoder, decoder_depths)
         self.places = nn.ModuleList(
             Linear(self.view.coordinates, channels, bias=False)
             for channels in (self.feature_info.channels() if places else ())
-        ).apply(init_weights)
-        self.reset_classifier(num_classes)
+        )
+        self.apply(init_by_width)
+        self._make_head(num_classes, self.feature_info.channels(0), skip_width)
         self.pretrained_cfg = self.encoder.pretrained_cfg | dict(
             num_classes=self.num_classes,
             input_size=(in_chans, *(self.image_size or (128, 128))),
@@ -272,38 +212,6 @@ class Unet(Model):
     def refines_with_images(self) -> bool:  # type: ignore[override]
         """True for the view "polar" with a skip_width above 0."""
         return isinstance(self.encoder, DarSwin) and self.head.skip_width > 0
-
-    @property
-    def head(self) -> PixelHead:
-        """`segmentation_head` or `distance_head`."""
-        return self.get_submodule(f"{self.task}_head")  # type: ignore[return-value]
-
-    def get_classifier(self) -> nn.Module:
-        """The head, the same as `head`."""
-        return self.head
-
-    def reset_classifier(self, num_classes: int) -> None:
-        """Replaces the head by a new one for `num_classes` classes; "distance" ignores the number.
-
-        The new head has the dtype, the device and the matmul backend of the model.
-
-        Raises:
-            ValueError: there is less than one class.
-        """
-        dim = self.feature_info.channels(0)
-        head: PixelHead
-        if self.task == "distance":
-            self.num_classes = 1
-            head = DistanceHead(dim, typical_distance=self._typical_distance, **self._head_options)
-        elif num_classes < 1:
-            raise ValueError(f"num_classes must be at least 1, got {num_classes}")
-        else:
-            self.num_classes = num_classes
-            head = PixelHead(dim, num_classes, **self._head_options)
-        init_weights(head.proj)
-        head.proj.matmul_backend = self.matmul_backend
-        like = next(self.decoder.parameters())
-        self.add_module(f"{self.task}_head", head.to(like).train(self.training))
 
     def _prepare(self, lens: Any, size: Pair) -> UnetPrepared:
         encoder = self.encoder._prepare(lens, size)
@@ -324,6 +232,10 @@ class Unet(Model):
             return self.encoder._sample(images, prepared.encoder)
         return self.view.to_view(self._floating(images), prepared.image_points)
 
+    def _points(self, prepared: UnetPrepared) -> Any:
+        grid = prepared.encoder.points
+        return prepared.image_points if grid is None else grid
+
     def _run_sampled(
         self, sampled: Tensor, prepared: UnetPrepared, images: Tensor | None
     ) -> Tensor:
@@ -342,9 +254,9 @@ class Unet(Model):
         if self.places:
             maps = self._with_places(maps, prepared.view_points)
         head = self.head
-        x = head.proj(self.decoder(maps, prepared.positions))
-        coarse = self.view.to_pixels(x, prepared.view_points, prepared.size)
-        logits = head.refine(coarse, seen)
+        x = head.carried(self.decoder(maps, prepared.positions))
+        x = self.view.to_pixels(x, prepared.view_points, prepared.size)
+        logits = head.refine(x, seen)
         return head.finish(self.view.to_images(logits, prepared.view_points))
 
     def _with_places(self, maps: Sequence[Tensor], view_points: Any) -> list[Tensor]:

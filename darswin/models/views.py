@@ -103,23 +103,29 @@ class SquareView(PlainView):
     """The image disc as a square, by the concentric map of Shirley and Chiu (JGT 1997).
 
     Equal steps of `spacing` become equal distances in the square. Pixels that no ray reaches get 0.
+    The edge of the square is θ_max of each lens, or the fixed angle `theta_max` (rad).
     """
 
     uses_lens = True
 
-    def __init__(self, size: Pair, spacing: Spacing = "theta"):
+    def __init__(self, size: Pair, spacing: Spacing = "theta", theta_max: float | None = None):
         super().__init__(size)
         if spacing not in SPACINGS:
             raise ValueError(f"spacing must be one of {SPACINGS}, got {spacing!r}")
         if size[0] != size[1]:
             raise ValueError(f"image_size must be square, got {size}")
-        self.spacing = spacing
+        if theta_max is not None:
+            if not 0 < theta_max < math.pi:
+                raise ValueError(f"theta_max must be in (0, π), got {theta_max}")
+            if spacing != "theta":
+                raise ValueError(f"a fixed theta_max needs spacing='theta', got {spacing!r}")
+        self.spacing, self.theta_max = spacing, theta_max
 
     def image_points(self, lens: Lens, size: Pair) -> Tensor:
-        return square_view(lens, size, self.size[0], self.spacing)
+        return square_view(lens, size, self.size[0], self.spacing, self.theta_max)
 
     def view_points(self, lens: Lens, size: Pair) -> Tensor:
-        return square_places(lens, size, self.spacing)
+        return square_places(lens, size, self.spacing, self.theta_max)
 
     def to_images(self, x: Tensor, view_points: Tensor) -> Tensor:
         return read_square(x, view_points)
@@ -167,7 +173,7 @@ class PolarView(PlainView):
 _VIEWS: dict[str, tuple[type[PlainView], Sequence[str]]] = {
     "none": (PlainView, ()),
     "perspective": (PerspectiveView, ("max_fov",)),
-    "square": (SquareView, ("spacing",)),
+    "square": (SquareView, ("spacing", "theta_max")),
 }
 
 
@@ -196,18 +202,30 @@ class LensAdapter(Model):
         network: a module that takes images (B, C, S, S).
         size: S, in pixels.
         spacing: the spacing from the centre of the square to its edge; see `darswin.lens.spacing`.
+        theta_max: θ at the edge of the square, rad. None means θ_max of each lens. The size of a
+            thing in the square then depends on the lens, and the network is not told. If sizes
+            matter, as for distances, give the widest θ_max of your lenses. The square is 0 beyond
+            θ_max of a lens.
 
     Raises:
-        ValueError: the size is below 1, or the spacing is unknown.
+        ValueError: the size is below 1, the spacing is unknown, or theta_max is not in (0, π) or
+            has another spacing than "theta".
 
     Source: the concentric map of Shirley and Chiu, JGT 1997.
     """
 
-    def __init__(self, network: nn.Module, size: int, spacing: Spacing = "theta"):
+    def __init__(
+        self,
+        network: nn.Module,
+        size: int,
+        spacing: Spacing = "theta",
+        theta_max: float | None = None,
+    ):
         super().__init__()
         if (as_int(size) or 0) < 1:
             raise ValueError(f"size must be an int of at least 1, got {size!r}")
-        self.network, self.view = network, SquareView((int(size), int(size)), spacing)
+        self.network = network
+        self.view = SquareView((int(size), int(size)), spacing, theta_max)
 
     def _prepare(self, lens: Any, size: Pair) -> tuple[Tensor, Tensor]:
         return self.view.image_points(lens, size), self.view.view_points(lens, size)
@@ -219,6 +237,9 @@ class LensAdapter(Model):
 
     def _sample(self, images: Tensor, prepared: tuple[Tensor, Tensor]) -> Tensor:
         return self.view.to_view(images, prepared[0])
+
+    def _points(self, prepared: tuple[Tensor, Tensor]) -> Tensor:
+        return prepared[0]
 
     def _run_sampled(
         self, sampled: Tensor, prepared: tuple[Tensor, Tensor], images: Tensor | None
@@ -235,4 +256,5 @@ class LensAdapter(Model):
         return pytree.tree_map(to_images, self.network(self.view.to_view(images, image_points)))
 
     def extra_repr(self) -> str:
-        return f"size={self.view.size[0]}, spacing={self.view.spacing!r}"
+        edge = "" if self.view.theta_max is None else f", theta_max={self.view.theta_max:g}"
+        return f"size={self.view.size[0]}, spacing={self.view.spacing!r}{edge}"

@@ -11,7 +11,8 @@ from darswin import create_model, polar_grid
 from darswin.layers.polar import PolarGridSpec
 from darswin.layers.transformer import PatchMerging
 from darswin.lens import KannalaBrandt, Mei, Polynomial, Spherical
-from darswin.models.unet import DistanceHead, PatchExpand, PixelHead, SkipJoin
+from darswin.models.pixel import DistanceHead, PixelHead
+from darswin.models.unet import PatchExpand, SkipJoin
 from darswin.ops import polar_to_image
 
 f64 = torch.float64
@@ -118,7 +119,7 @@ def test_a_turned_image_gives_turned_logits(name, options, turns):
 )
 def test_a_lens_is_learned_through_the_way_back(kind, values):
     """Gradients of the lens against finite differences, through the way back and the model."""
-    model = network("darswin_unet_a_nano", in_chans=1).to(f64).requires_grad_(False)
+    model = network("darswin_unet_a_nano", in_chans=1, skip_width=8).to(f64).requires_grad_(False)
     images, size = torch.randn(1, 1, 48, 64, dtype=f64), (48, 64)
     labels, weights = torch.randint(5, (1, *size)), torch.rand(1, *size, dtype=f64)
     aside = dict(tangential=[[0.02, 0.01]]) if kind is KannalaBrandt else {}
@@ -184,17 +185,23 @@ def test_joining():
 
 def test_the_skip_adds_what_the_image_shows():
     head = PixelHead(6, 4, in_chans=3, skip_width=8)
-    coarse, images = torch.randn(2, 4, 9, 7), torch.randn(2, 3, 9, 7)
-    out = head.refine(coarse, images)
-    assert out.shape == coarse.shape and not torch.equal(out, coarse)
-    changed = images.clone()
-    changed[0, :, 4, 3] += 1  # two 3×3 convolutions reach two pixels far
-    differs = (head.refine(coarse, changed) != out).any(1)
-    assert differs[0, 2:7, 1:6].sum() == differs.sum() > 9
-    torch.nn.init.zeros_(head.out.weight)
-    assert torch.equal(head.refine(coarse, images), coarse)
+    assert head.carried(torch.randn(2, 5, 7, 6)).shape == (2, 5, 7, 8)
+    carried, images = torch.randn(2, 8, 9, 7), torch.randn(2, 3, 9, 7)
+    out = head.refine(carried, images)
+    assert out.shape == (2, 4, 9, 7)
+    for index, inputs in enumerate(((carried, images), (images, carried))):
+        changed = inputs[0].clone()
+        changed[0, :, 4, 3] += 1  # 3×3 convolutions: one after the map, two after the image
+        given = (changed, images) if index == 0 else (carried, changed)
+        differs = (head.refine(*given) != out).any(1)
+        reach = 1 + index
+        near = differs[0, 4 - reach : 5 + reach, 3 - reach : 4 + reach]
+        assert near.sum() == differs.sum() > 1 + 8 * index
+    torch.nn.init.zeros_(head.stem.weight)
+    assert torch.equal(head.refine(carried, images), head.refine(carried, 2 * images))
     without = PixelHead(6, 4, in_chans=3, skip_width=0)
-    assert torch.equal(without.refine(coarse, images), coarse)
+    logits = without.carried(torch.randn(2, 9, 7, 6)).permute(0, 3, 1, 2)
+    assert logits.shape == out.shape and without.refine(logits, images) is logits
     assert [name for name, _ in without.named_parameters()] == ["proj.weight", "proj.bias"]
 
 

@@ -71,6 +71,30 @@ def test_what_is_taken_to_the_square_comes_back(lens, spacing):
     assert coarse.shape == images.shape and (coarse - images).abs()[inner].mean() < 0.02
 
 
+def test_a_fixed_theta_max_gives_things_one_size_in_the_square():
+    edge, seen = 1.2, []
+
+    class Network(nn.Module):
+        def forward(self, x):
+            seen.append(x)
+            return x
+
+    wide = Equidistant(40.0, 1.5)
+    for lens in (wide, wide.with_theta_max(0.8)):
+        adapter, images = LensAdapter(Network(), 32, theta_max=edge), 2 + smooth(130, 130)
+        out = adapter(images, lens)
+        theta, _ = lens.unproject_pixels(torch.stack(pixels(130, 130), -1)[None], (130, 130))
+        inside = (theta <= min(edge, lens.theta_max.item()))[:, None].expand_as(out)
+        assert (out[~inside] == 0).all() and (out[inside] > 0.9).float().mean() > 0.97
+    both, common = seen, seen[1] > 0.9
+    assert common.float().mean() == pytest.approx((0.8 / edge) ** 2, abs=0.05)
+    torch.testing.assert_close(both[0][common], both[1][common])
+    # A lens with θ_max at the edge sees the same without a fixed angle.
+    lens = wide.with_theta_max(edge)
+    same = (LensAdapter(nn.Identity(), 32, theta_max=end)(images, lens) for end in (None, edge))
+    torch.testing.assert_close(*same, atol=1e-4, rtol=1e-4)
+
+
 def test_a_lens_in_float32_sees_as_much_as_in_float64():
     focal = torch.tensor([40.0], dtype=torch.float64)
     exact = BrownConrady(focal, [-0.22, 0.13, 0.028], tangential=[1e-3, 1e-3], center=[25.0, 24.0])
@@ -126,6 +150,10 @@ def test_wrong_arguments_of_an_adapter():
             LensAdapter(nn.Identity(), size)
     with pytest.raises(ValueError, match=r"spacing must be one of .*, got 'r'"):
         LensAdapter(nn.Identity(), 8, "r")
+    with pytest.raises(ValueError, match=r"theta_max must be in \(0, π\), got 4"):
+        LensAdapter(nn.Identity(), 8, theta_max=4)
+    with pytest.raises(ValueError, match="needs spacing='theta', got 'g'"):
+        LensAdapter(nn.Identity(), 8, "g", theta_max=1.0)
     adapter, images = LensAdapter(nn.Identity(), 8), torch.zeros(3, 3, 40, 40)
     with pytest.raises(TypeError, match=r"lens must be a darswin\.lens\.Lens, got NoneType"):
         adapter(images, None)

@@ -1,0 +1,128 @@
+"""A convolutional U-Net that reads the ray of each pixel: a baseline for the dense models."""
+
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from darswin.layers.embed import check_dtype
+from darswin.layers.polar import check_count
+from darswin.lens.pixels import pixel_rays
+from darswin.models.base import FeatureInfo
+from darswin.models.pixel import PixelModel, PixelTask
+from darswin.models.registry import Presets, register_model
+from darswin.models.stages import Pair
+from darswin.ops.checks import per_channel
+
+# About as many parameters as "darswin_unet_a" of the same size.
+_SIZES: Presets = dict(
+    small=dict(widths=(88, 176, 352, 704, 1408)),
+    tiny=dict(widths=(64, 128, 256, 512, 1024)),
+    micro=dict(widths=(40, 80, 160, 320)),
+    nano=dict(widths=(12, 24, 48, 96)),
+)
+
+
+class ConvBlock(nn.Sequential):
+    """Two 3×3 convolutions, each followed by a batch norm and a ReLU."""
+
+    def __init__(self, in_chans: int, width: int):
+        layers: list[nn.Module] = []
+        for channels in (in_chans, width):
+            conv = nn.Conv2d(channels, width, 3, padding=1, bias=False)
+            layers += [conv, nn.BatchNorm2d(width), nn.ReLU(inplace=True)]
+        super().__init__(*layers)
+
+
+@register_model("conv_unet", presets={}, sizes=_SIZES)
+class ConvUnet(PixelModel):
+    """A class or a distance for every pixel: a convolutional U-Net on the images as they are.
+
+    The result is that of a `Unet`. Each level halves the resolution. Beside the colours, the first
+    level reads the viewing direction (x, y, z) of each pixel, or zeros where no ray lands. That is
+    the simplest way to tell a network about its lens, so it is a baseline for the other models.
+
+    Args:
+        num_classes: the number of classes; "distance" ignores it.
+        in_chans: C, the number of channels of the images.
+        task: "segmentation" or "distance".
+        widths: the number of channels of each level.
+        rays: False leaves the viewing directions out; the model then ignores its lens.
+        typical_distance: the distance, in m, around which "distance" starts.
+        mean, std: normalization of uint8 images, `(pixel/255 - mean) / std`; images in floating
+            point are not normalized.
+
+    Raises:
+        ValueError: a width or another option is wrong.
+
+    Source: Ronneberger et al., MICCAI 2015; with padding, batch norm and bilinear upsampling. The
+        rays as channels are those of CAM-Convs, CVPR 2019, in another parametrization.
+    """
+
+    def __init__(
+        self,
+        num_classes: int = 10,
+        in_chans: int = 3,
+        *,
+        task: PixelTask = "segmentation",
+        widths: Sequence[int] = (12, 24, 48, 96),
+        rays: bool = True,
+        typical_distance: float = 10.0,
+        mean: float | Sequence[float] = 0.0,
+        std: float | Sequence[float] = 1.0,
+    ):
+        super().__init__(task, typical_distance)
+        if min(widths, default=0) < 1:
+            raise ValueError(f"widths must be at least 1, for at least one level, got {widths}")
+        self.in_chans, self.uses_lens = in_chans, rays
+        self.mean, self.std = per_channel("mean", mean, in_chans), per_channel("std", std, in_chans)
+        self.feature_info = FeatureInfo(
+            dict(num_chs=width, reduction=2**level, module=f"down.{level}", map_size=None)
+            for level, width in enumerate(widths)
+        )
+        self.down = nn.ModuleList(
+            ConvBlock(before, width)
+            for before, width in pairwise((in_chans + (3 if rays else 0), *widths))
+        )
+        self.up = nn.ModuleList(ConvBlock(fine + coarse, fine) for fine, coarse in pairwise(widths))
+        self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        self._make_head(num_classes, widths[0], 0)
+        self.pretrained_cfg = dict(
+            num_classes=self.num_classes, input_size=(in_chans, 128, 128), fixed_input_size=False,
+            mean=self.mean, std=self.std, interpolation="bilinear", crop_pct=1.0,
+            first_conv="down.0.0", classifier=f"{task}_head.proj",
+        )  # fmt: skip
+
+    def _prepare(self, lens: Any, size: Pair) -> Tensor | None:
+        """The viewing directions of the pixels, (N, 3, H, W)."""
+        if not self.uses_lens:
+            return None
+        theta, direction = (rays.float() for rays in pixel_rays(lens, size))
+        rays = torch.cat((theta.sin()[..., None] * direction, theta.cos()[..., None]), -1)
+        return torch.where(theta.isnan()[..., None], 0.0, rays).permute(0, 3, 1, 2)
+
+    def _sample(self, images: Tensor, prepared: Tensor | None) -> Tensor:
+        return self._floating(images)
+
+    def _run_sampled(self, sampled: Tensor, prepared: Tensor | None, images: Tensor | None) -> Any:
+        return self._run(sampled, prepared)
+
+    def _run(self, images: Tensor, prepared: Tensor | None) -> Tensor:
+        check_dtype(images, next(self.parameters()).dtype)
+        x = self._floating(images)
+        if prepared is not None:
+            check_count(prepared.shape[0], images)
+            x = torch.cat((x, prepared.to(x).expand(len(x), -1, -1, -1)), 1)
+        x = x.contiguous(memory_format=torch.channels_last)
+        maps: list[Tensor] = []
+        for level, block in enumerate(self.down):
+            x = block(F.max_pool2d(x, 2, ceil_mode=True) if level else x)
+            maps.append(x)
+        for skip, block in zip(maps[-2::-1], reversed(self.up), strict=True):
+            x = F.interpolate(x, skip.shape[2:], mode="bilinear", align_corners=False)
+            x = block(torch.cat((x, skip), 1))
+        logits = self.head.proj(x.permute(0, 2, 3, 1)).permute(0, 3, 1, 2)
+        return self.head.finish(logits)

@@ -1,0 +1,134 @@
+"""The base of the models that predict a class or a distance for every pixel, and their heads."""
+
+import math
+from typing import Any, Literal, get_args
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from darswin.layers.linear import Linear
+from darswin.models.base import Model, init_by_width
+
+PixelTask = Literal["segmentation", "distance"]
+# exp(±8): distances lie between 1/3000 of the typical distance and 3000 times that distance.
+LARGEST_EXPONENT = 8.0
+
+
+class PixelHead(nn.Module):
+    """The last map of a network → K logits of each pixel, refined by the pixels of the image.
+
+    With a `skip_width`, that many channels of the map are resampled to the pixels, and convolutions
+    join them with the image. Without it, only the logits are resampled.
+    """
+
+    # A linear layer before the resampling gives the same as one after it, at less cost.
+
+    def __init__(self, dim: int, channels: int, in_chans: int, skip_width: int):
+        super().__init__()
+        self.skip_width = skip_width
+        if skip_width:
+            self.carry = Linear(dim, skip_width)
+            self.stem = nn.Conv2d(in_chans, skip_width, 3, padding=1)
+            self.mix = nn.Conv2d(skip_width, skip_width, 3, padding=1)
+        self.proj = Linear(skip_width or dim, channels)
+
+    def carried(self, x: Tensor) -> Tensor:
+        """The last map → the channels that are resampled to the pixels, channels last."""
+        return self.carry(x) if self.skip_width else self.proj(x)
+
+    def refine(self, carried: Tensor, images: Tensor | None) -> Tensor:
+        """The carried channels at the pixels and the images (B, C, H, W) → logits (B, K, H, W)."""
+        if not self.skip_width:
+            return carried
+        assert images is not None
+        # With channels last, as in `carried`, convolutions of few channels take half the time.
+        skip = self.stem(images.contiguous(memory_format=torch.channels_last))
+        x = F.gelu(skip + carried.to(skip.dtype))
+        x = x + F.gelu(self.mix(x))
+        return self.proj(x.permute(0, 2, 3, 1)).permute(0, 3, 1, 2)
+
+    def finish(self, logits: Tensor) -> Tensor:
+        """Logits (B, K, H, W) → the model's result."""
+        return logits
+
+    def extra_repr(self) -> str:
+        return f"skip_width={self.skip_width}"
+
+
+class DistanceHead(PixelHead):
+    """Distances in m, `typical_distance` · e^x. x is bounded, so they are positive and finite."""
+
+    def __init__(self, dim: int, in_chans: int, skip_width: int, typical_distance: float):
+        super().__init__(dim, 1, in_chans, skip_width)
+        if not 0 < typical_distance < math.inf:
+            raise ValueError(f"typical_distance must be above 0 m, got {typical_distance}")
+        self.typical_distance = float(typical_distance)
+
+    def finish(self, logits: Tensor) -> Tensor:
+        """x (B, 1, H, W) → distances (B, 1, H, W) in m, in float32 or float64."""
+        x = logits.to(torch.promote_types(logits.dtype, torch.float32))
+        x = LARGEST_EXPONENT * torch.tanh(x / LARGEST_EXPONENT)
+        return self.typical_distance * torch.exp(x)
+
+    def extra_repr(self) -> str:
+        return f"{super().extra_repr()}, typical_distance={self.typical_distance}"
+
+
+class PixelModel(Model):
+    """The base of `Unet` and `ConvUnet`: a model whose head predicts every pixel.
+
+    A subclass makes the rest of the network and then calls `_make_head`.
+
+    Attributes:
+        task: "segmentation" or "distance".
+        segmentation_head or distance_head: the part that makes the result from the last map.
+    """
+
+    task: PixelTask
+
+    def __init__(self, task: PixelTask, typical_distance: float):
+        super().__init__()
+        if task not in get_args(PixelTask):
+            raise ValueError(f"task must be one of {get_args(PixelTask)}, got {task!r}")
+        self.task, self._typical_distance = task, typical_distance
+
+    def _make_head(self, num_classes: int, dim: int, skip_width: int) -> None:
+        if skip_width < 0:
+            raise ValueError(f"skip_width must be at least 0, got {skip_width}")
+        self._head_options = dict(dim=dim, in_chans=self.in_chans, skip_width=skip_width)
+        self.reset_classifier(num_classes)
+
+    @property
+    def head(self) -> PixelHead:
+        """`segmentation_head` or `distance_head`."""
+        return self.get_submodule(f"{self.task}_head")  # type: ignore[return-value]
+
+    def get_classifier(self) -> nn.Module:
+        """The head, the same as `head`."""
+        return self.head
+
+    def reset_classifier(self, num_classes: int) -> None:
+        """Replaces the head by a new one for `num_classes` classes; "distance" ignores the number.
+
+        The new head has the dtype, the device and the matmul backend of the model.
+
+        Raises:
+            ValueError: there is less than one class.
+        """
+        options: dict[str, Any] = self._head_options
+        like = next(self.parameters())
+        head: PixelHead
+        if self.task == "distance":
+            self.num_classes = 1
+            head = DistanceHead(typical_distance=self._typical_distance, **options)
+        elif num_classes < 1:
+            raise ValueError(f"num_classes must be at least 1, got {num_classes}")
+        else:
+            self.num_classes = num_classes
+            head = PixelHead(channels=num_classes, **options)
+        head.apply(init_by_width)
+        for layer in head.children():
+            if isinstance(layer, Linear):
+                layer.matmul_backend = self.matmul_backend
+        self.add_module(f"{self.task}_head", head.to(like).train(self.training))
