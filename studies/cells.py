@@ -13,13 +13,19 @@ DARSWIN = dict(spacing="tan", samples=[10, 10])
 
 @dataclass(frozen=True)
 class Cell:
-    """A model, its options, and the lenses and the seed of its training."""
+    """A model, its options, the lenses and the seed of its training, and arguments of `fit`."""
 
     label: str
     family: str
     options: dict = field(default_factory=dict)
     level: str = "low"
     seed: int = 0
+    arguments: tuple[str, ...] = ()
+
+    @property
+    def identity(self) -> tuple[str, str, int]:
+        """The values that tell it from other cells."""
+        return self.label, self.level, self.seed
 
     @property
     def key(self) -> str:
@@ -49,6 +55,10 @@ ABLATIONS = {
     "spacing g": ("darswin_a", dict(spacing="g")),
 }
 
+# Training shows every picture as a lens of any ξ would have seen it.
+THROUGH_ANY = ("--data.lens_augmentation", "0..1")
+AUGMENTED = ("DarSwin-A", "Swin (undis)", "Swin")
+
 
 def headline(seeds: int) -> list[Cell]:
     """Each model on each level; all cells of the first seed come first."""
@@ -57,6 +67,19 @@ def headline(seeds: int) -> list[Cell]:
         for seed in range(seeds)
         for level in LEVELS
         for label, (family, options) in MODELS.items()
+    ]
+
+
+def augmented_label(label: str) -> str:
+    return f"{label}, lens augmentation"
+
+
+def augmented(seeds: int) -> list[Cell]:
+    """Three models trained on "very low" with lens augmentation."""
+    return [
+        Cell(augmented_label(label), *MODELS[label], "very low", seed, THROUGH_ANY)
+        for seed in range(seeds)
+        for label in AUGMENTED
     ]
 
 

@@ -5,6 +5,7 @@ All test sets show the same poses, in maps that the training pictures do not sho
 
 import json
 import math
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -16,10 +17,11 @@ from darswin.lens import save
 
 FOV = math.radians(165)  # the full field of view of lenses given by ξ
 SIZE = 128  # px
-PICTURES = 2000, 16, 75  # for training, for validation, and in each test set (5 per map)
+PICTURES = 8000, 16, 75  # for training, for validation, and in each test set (5 per map)
 
 # The lenses of training: perspective lenses of 60° to 90°, and one band of ξ.
 BANDS = {"wide": "wide", "low": "0.2..0.35"}
+TRAINED_ON = "low"  # the band of the baselines that ignore the picture
 SWEEP = [f"{k / 10:g}" for k in range(11)]  # ξ = 0, 0.1, …, 1
 
 FILES = Path(__file__).parent.parent / "tests" / "lens" / "files"
@@ -57,10 +59,17 @@ def test_sets() -> list[str]:
     return sets
 
 
-def make(root: Path, processes: int, size: int, counts: tuple[int, int, int]) -> None:
-    """Renders missing data sets into `root/train` and `root/test`, and makes the controls."""
+def make(
+    root: Path, processes: int, size: int, counts: tuple[int, int, int], bands: Iterable[str]
+) -> None:
+    """Renders missing data sets into `root/train` and `root/test`, and makes the controls.
+
+    Args:
+        bands: the bands of the training pictures.
+    """
     train, val, test = counts
-    to_train = [Target(str(root / "train" / b), lenses, FOV) for b, lenses in BANDS.items()]
+    bands = {TRAINED_ON, *bands}
+    to_train = [Target(str(root / "train" / b), BANDS[b], FOV) for b in bands]
     lenses = {xi_set(xi): xi for xi in SWEEP}
     lenses |= {f"band-{band}": name for band, name in BANDS.items()}
     lenses |= {camera_set(name): str(FILES / file) for name, file in CAMERAS.items()}
@@ -75,6 +84,7 @@ def make(root: Path, processes: int, size: int, counts: tuple[int, int, int]) ->
     for band in BANDS:
         name = f"band-{band}"
         shuffle(root / "test" / name, root / "test" / f"{SHUFFLED}-{name}", "test")
+    for band in bands:
         shuffled = root / "train" / f"{SHUFFLED}-{band}"
         shuffle(root / "train" / band, shuffled, "train")
         shuffle(root / "train" / band, shuffled, "val")

@@ -1,5 +1,6 @@
 """The tables and figures of the dense study, made from the results of its cells."""
 
+import os
 import statistics
 from collections import defaultdict
 from collections.abc import Callable, Sequence
@@ -20,17 +21,21 @@ SCORE = {"segmentation": "miou", "distance": "delta1"}
 NAMES = {"miou": "mIoU", "delta1": "δ1"}
 SHADED = {"wide": (0.0, 0.0), "low": (0.2, 0.35)}  # ξ of the training lenses
 ALL_XI = [xi_set(xi) for xi in SWEEP]
+BOUNDS = {"gravity": "gravity", "labels": "+ classes", "heights": "+ heights"}
+DOCS = Path(__file__).parent.parent / "docs"  # the folder of the pages
 NOT_RUN = "Not run yet: `make study-dense`."
 
 
-def collect(cells: list[dict], trivial: dict, config: str, size: str) -> dict:
+def collect(cells: list[dict], trivial: dict, bounds: dict, config: str, size: str) -> dict:
     """The record of a study."""
     cells = sorted(
         cells, key=lambda c: (c["task"], c["band"], c["label"], c["shuffled"], c["seed"])
     )
     kept = [{k: v for k, v in cell.items() if k != "given"} for cell in cells]
     cameras = list(CAMERAS)
-    return dict(size=size, config=config, cameras=cameras, trivial=trivial, cells=kept)
+    return dict(
+        size=size, config=config, cameras=cameras, trivial=trivial, bounds=bounds, cells=kept
+    )
 
 
 def publish(record: dict, out: Path, folder: Path) -> None:
@@ -73,8 +78,9 @@ def draw_curves(cells: list[dict], trivial: dict, path: Path) -> None:
     shaded. Lines are means over the seeds, bands are their span, and dots are the baseline that
     ignores the image."""
     figure, xi = Figure(figsize=(13, 4.8), layout="constrained"), [float(name) for name in SWEEP]
-    panels = figure.subplots(1, len(STUDIED), squeeze=False)[0]
-    for axes, (task, band) in zip(panels, STUDIED, strict=True):
+    pairs = studied(cells)
+    panels = figure.subplots(1, len(pairs), squeeze=False)[0]
+    for axes, (task, band) in zip(panels, pairs, strict=True):
         found, score, (low, high) = runs_of(cells, task), SCORE[task], SHADED[band]
         if high > low:
             axes.axvspan(low, high, color="tab:pink", alpha=0.3, lw=0)
@@ -102,7 +108,7 @@ def draw_curves(cells: list[dict], trivial: dict, path: Path) -> None:
 
 def over_lenses(record: dict, task: str, band: str) -> str:
     """A row for each model trained on a band: scores on its own lenses, on ξ and on the cameras."""
-    found, score = runs_of(record["cells"], task), SCORE[task]
+    score = SCORE[task]
     columns = {
         "its own lenses": [f"band-{band}"],
         "ξ = 0": [xi_set("0")],
@@ -111,30 +117,47 @@ def over_lenses(record: dict, task: str, band: str) -> str:
         "all ξ": ALL_XI,
         "cameras": camera_sets(record),
     }
-    rows = _model_rows(found, band, score, list(columns.values()))
-    for name, sets in record["trivial"][task].items():
-        rows.append(
-            [
-                f"by {name} alone",
-                *(f"{100 * mean_of(sets, s, score):.1f}" for s in columns.values()),
-            ]
-        )
+    rows = _model_rows(record, task, band, score, list(columns.values()))
+    others = {f"by {name} alone": sets for name, sets in record["trivial"][task].items()}
+    if task == "distance":
+        bounds = record.get("bounds", {})  # older records have none
+        others |= {f"{BOUNDS[name]}, known exactly": sets for name, sets in bounds.items()}
+    for name, sets in others.items():
+        rows.append([name, *(f"{100 * mean_of(sets, s, score):.1f}" for s in columns.values())])
     return markdown([f"{NAMES[score]} (%)", *columns], rows)
 
 
 def over_cameras(record: dict, task: str, band: str) -> str:
     """A row for each model, and a column for each camera."""
     score, sets = SCORE[task], [[name] for name in camera_sets(record)]
-    rows = _model_rows(runs_of(record["cells"], task), band, score, sets)
+    rows = _model_rows(record, task, band, score, sets)
     return markdown([f"{NAMES[score]} (%)", *record["cameras"]], rows)
 
 
 def errors(record: dict, band: str) -> str:
     """AbsRel, with a row for each model."""
-    found, cameras = runs_of(record["cells"], "distance"), camera_sets(record)
+    cameras = camera_sets(record)
     sets = {"its own lenses": [f"band-{band}"], "all ξ": ALL_XI, "cameras": cameras}
-    rows = _model_rows(found, band, "abs_rel", list(sets.values()))
+    rows = _model_rows(record, "distance", band, "abs_rel", list(sets.values()))
     return markdown(["AbsRel (%)", *sets], rows)
+
+
+def over_classes(record: dict, band: str) -> str:
+    """The IoU of each class on the lenses of training, with a row for each model."""
+    found, own = runs_of(record["cells"], "segmentation"), f"band-{band}"
+    of_band = [runs for (_, trained_on), runs in found.items() if trained_on == band]
+    classes = list(of_band[0][0][own]["iou"]) if of_band else []
+    rows = [
+        [
+            label,
+            *(
+                _spread(found.get((label, band)), lambda run, c=name: run[own]["iou"][c] or 0)
+                for name in classes
+            ),
+        ]
+        for label in labels_of(record)
+    ]
+    return markdown(["IoU (%)", *classes], rows)
 
 
 def over_zones(record: dict, task: str, band: str) -> str:
@@ -150,7 +173,7 @@ def over_zones(record: dict, task: str, band: str) -> str:
 
     rows = [
         [label, *(_spread(found.get((label, band)), of_zone(k)) for k in range(len(zones)))]
-        for label in MODELS
+        for label in labels_of(record)
     ]
     return markdown([f"{NAMES[score]} (%)", *heads], rows)
 
@@ -162,7 +185,7 @@ def controls(record: dict, task: str, band: str) -> str:
     score, own = SCORE[task], f"band-{band}"
     told, tests = [xi_set(xi) for xi in WRONG], [f"wrong-{xi}" for xi in WRONG]
     rows = []
-    for label in MODELS:
+    for label in labels_of(record):
         runs = true.get((label, band))
         row = [label]
         for names in (told, tests, [own], [f"{SHUFFLED}-{own}"]):
@@ -180,8 +203,9 @@ def controls(record: dict, task: str, band: str) -> str:
 
 
 def _model_rows(
-    found: dict[tuple, list[dict]], band: str, score: str, columns: Sequence[Sequence[str]]
+    record: dict, task: str, band: str, score: str, columns: Sequence[Sequence[str]]
 ) -> list[list[str]]:
+    found = runs_of(record["cells"], task)
     return [
         [
             label,
@@ -190,8 +214,20 @@ def _model_rows(
                 for sets in columns
             ),
         ]
-        for label in MODELS
+        for label in labels_of(record)
     ]
+
+
+def studied(cells: list[dict]) -> list[tuple[str, str]]:
+    """The tasks and bands with at least one cell."""
+    there = {(cell["task"], cell["band"]) for cell in cells}
+    return [pair for pair in STUDIED if pair in there]
+
+
+def labels_of(record: dict) -> list[str]:
+    """The models with at least one cell in a record."""
+    there = {cell["label"] for cell in record["cells"]}
+    return [label for label in MODELS if label in there]
 
 
 def _spread(runs: list[dict] | None, value: Callable[[dict], float]) -> str:
@@ -209,23 +245,40 @@ def times(cells: list[dict]) -> str:
     return markdown(["task", "cells", "training, s", "testing, s"], rows)
 
 
-def tables(record: dict | None, folder: Path) -> dict[str, str]:
-    """The tables and figures by the name of their place in a page, or a line without a record."""
+def trials(rows: list[dict], task: str) -> str:
+    """Single trainings with other losses, heads and initial weights, tested on their own lenses."""
+    found = [row for row in rows if row["task"] == task]
+    classes = [*found[0].get("iou", ())]
+    scores = dict(miou="mIoU", accuracy="accuracy", delta1="δ1", abs_rel="AbsRel")
+    kept = {key: name for key, name in scores.items() if key in found[0]}
+    cells = [
+        [row["model"], row["loss"], f"{row['views']:,}"]
+        + [f"{100 * row[key]:.1f}" for key in kept]
+        + [f"{100 * row['iou'][name]:.0f}" for name in classes]
+        for row in found
+    ]
+    return markdown(
+        ["model", "loss", "pictures", *(f"{name} (%)" for name in kept.values()), *classes], cells
+    )
+
+
+def tables(record: dict, folder: Path) -> dict[str, str]:
+    """The tables and figures by the name of their place in a page."""
     made: dict[str, str] = {}
-    for task, band in STUDIED:
+    for task, band in studied(record["cells"]):
         made |= _of_band(record, task, band)
-    for name, file, title in (
+    for name, file, text in (
         ("curves", "dense", "Scores over ξ"),
         *((f"pictures {task}", f"dense_{task}", "Predictions") for task in TASKS),
     ):
-        there = (folder / f"{file}.png").exists()
-        made[f"dense {name}"] = f"![{title}](../studies/results/{file}.png)" if there else NOT_RUN
-    cells = record["cells"] if record else []
-    made["dense times"] = times(cells) if cells else NOT_RUN
+        path = folder / f"{file}.png"
+        place = os.path.relpath(path, DOCS)
+        made[f"dense {name}"] = f"![{text}]({place})" if path.exists() else NOT_RUN
+    made["dense times"] = times(record["cells"])
     return made
 
 
-def _of_band(record: dict | None, task: str, band: str) -> dict[str, str]:
+def _of_band(record: dict, task: str, band: str) -> dict[str, str]:
     name = f"dense {task} {band}"
     kinds = {
         name: lambda record: over_lenses(record, task, band),
@@ -235,6 +288,6 @@ def _of_band(record: dict | None, task: str, band: str) -> dict[str, str]:
     }
     if task == "distance":
         kinds[f"{name} errors"] = lambda record: errors(record, band)
-    if record is None:
-        return dict.fromkeys(kinds, NOT_RUN)
+    else:
+        kinds[f"{name} classes"] = lambda record: over_classes(record, band)
     return {name: made(record) for name, made in kinds.items()}

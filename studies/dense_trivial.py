@@ -26,7 +26,6 @@ from darswin.utils.files import replace_file
 RINGS, SECTORS = 9, 16  # of 10° and 22.5°; the last ring has all that is further out
 BASELINES = {"zone": 1, "direction": SECTORS}  # sectors
 TARGETS = {"segmentation": "labels", "distance": "distance"}
-TRAINED_ON = "low"
 LEARNED_FROM = 300  # training pictures
 
 
@@ -36,10 +35,11 @@ def trivial(out: Path) -> dict:
     if file.exists():
         return json.loads(file.read_text())
     data = out / "data"
-    sets = [name for name in dense_data.test_sets() if not _is_control(name)]
+    sets = [name for name in dense_data.test_sets() if not is_control(name)]
     found: dict[str, dict] = {}
     for task, target in TARGETS.items():
-        seen = list(_pictures(data / "train" / TRAINED_ON, "train", target, LEARNED_FROM))
+        trained = data / "train" / dense_data.TRAINED_ON
+        seen = list(_pictures(trained, "train", target, LEARNED_FROM))
         said = {name: _table(seen, sectors, task) for name, sectors in BASELINES.items()}
         found[task] = {name: {} for name in BASELINES}
         for folder in sets:
@@ -50,7 +50,7 @@ def trivial(out: Path) -> dict:
     return found
 
 
-def _is_control(name: str) -> bool:
+def is_control(name: str) -> bool:
     return name.startswith(("wrong", dense_data.SHUFFLED))
 
 
@@ -60,7 +60,8 @@ def _pictures(
     """The targets of the known pixels, (P,), with their rings and sectors."""
     scenes = open_scenes(str(path), split, target)
     lens = None
-    for k in range(min(len(scenes), limit or len(scenes))):
+    count = min(len(scenes), limit or len(scenes))
+    for k in np.arange(count) * len(scenes) // count:  # spread over all maps
         scene = scenes[k]
         if scene.lens is not lens:  # most sets have only one lens
             lens = scene.lens

@@ -24,6 +24,12 @@ def run_all(
         return [job.result() for job in ended]
 
 
+def check_given(result: dict, given: dict, name: object) -> None:
+    """Checks that earlier results come from the same settings; `name` says where they are."""
+    if result["given"] != given:
+        raise ValueError(f"{name} was made with {result['given']}, not {given}: remove it")
+
+
 def use_one_core() -> None:
     """Makes the process use one core; two jobs side by side are faster than one on two cores."""
     torch.set_num_threads(1)

@@ -16,7 +16,7 @@ from pathlib import Path
 import torch
 import yaml
 from cells import LEVELS, MODELS, SWEEP, Cell, headline
-from jobs import printing_to, run_all
+from jobs import check_given, printing_to, run_all
 from study import run_cell as run_float
 from tables import int8_table
 from torch.utils.data import DataLoader
@@ -43,8 +43,7 @@ def run_cell(
     given = trained["given"] | dict(pictures=pictures)
     if found.exists():
         result = json.loads(found.read_text())
-        if result["given"] != given:
-            raise ValueError(f"{found} was made with {result['given']}, not {given}: remove it")
+        check_given(result, given, found)
         return result
     start = time.perf_counter()
     model, _ = load_model(model_of_run(folder))

@@ -4,7 +4,7 @@ import statistics
 from collections import defaultdict
 from pathlib import Path
 
-from cells import ABLATIONS, LEVELS, MODELS, POLYNOMIAL, SWEEP
+from cells import ABLATIONS, AUGMENTED, LEVELS, MODELS, POLYNOMIAL, SWEEP, augmented_label
 from matplotlib.figure import Figure
 
 from darswin.bench.machine import machine
@@ -12,6 +12,8 @@ from darswin.bench.record import write
 from darswin.bench.tables import markdown
 from darswin.data.lens_distributions import LEVELS as RANGES
 from darswin.viz.plot import save_figure
+
+SHOWN = ("0", "0.2", "0.4", "0.6", "0.8", "1")  # some ξ of the sweep, in a table
 
 # The paper's tables (DarSwin, ICCV 2023), by the training level.
 PAPER_04 = {
@@ -98,6 +100,22 @@ def level_table(cells: list[dict], lenses: str, paper: dict) -> str:
     return markdown(["trained on", *(f'"{level}"' for level in LEVELS)], rows)
 
 
+def augmented_table(cells: list[dict]) -> str:
+    """A row for each model without and with lens augmentation, a column for some of the lenses."""
+    found = by_model(cells)
+    rows = []
+    for label in [*AUGMENTED, *map(augmented_label, AUGMENTED)]:
+        runs = found.get((label, "very low"))
+        if not runs:
+            rows.append([label, *["not run"] * (len(SHOWN) + 2)])
+            continue
+        shown = [spread([run[name] for run in runs]) for name in (*SHOWN, POLYNOMIAL)]
+        over_all = spread([statistics.mean(run[name] for name in SWEEP) for run in runs])
+        rows.append([label, *shown, over_all])
+    columns = [*(f"ξ = {name}" for name in SHOWN), POLYNOMIAL, "mean over ξ"]
+    return markdown(["tested on", *columns], rows)
+
+
 def ablation_table(cells: list[dict]) -> str:
     """A row for each variant trained on "low" with the first seed; a column for each test level."""
     first = {c["label"]: c["accuracy"] for c in cells if c["level"] == "low" and c["seed"] == 0}
@@ -153,5 +171,6 @@ def tables(cells: list[dict]) -> dict[str, str]:
     return {
         "xi-0.4": level_table(cells, "0.4", PAPER_04),
         "polynomial": level_table(cells, POLYNOMIAL, PAPER_POLYNOMIAL),
+        "augmented": augmented_table(cells),
         "ablations": ablation_table(cells),
     }

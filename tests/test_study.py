@@ -9,7 +9,7 @@ import quantized
 import study
 import tables
 import torch
-from cells import LEVELS, POLYNOMIAL, SWEEP, ablations, headline
+from cells import LEVELS, POLYNOMIAL, SWEEP, ablations, augmented, headline
 
 from darswin import create_model
 from darswin.layers.linear import onednn_lack
@@ -21,22 +21,24 @@ QUICK = """
 
 
 def test_cells_have_folders_of_their_own_and_make_models():
-    cells = headline(3) + ablations()
+    cells = headline(3) + ablations() + augmented(3)
     assert cells[0].key == "darswin-a-very-low-0"
-    assert len({cell.key for cell in cells}) == len(cells)
+    assert len({cell.key for cell in cells}) == len({cell.identity for cell in cells}) == len(cells)
     for cell in ablations():
         create_model(f"{cell.family}_nano", num_classes=10, in_chans=1, **cell.options)
 
 
 @pytest.fixture(scope="module")
 def quick(tmp_path_factory) -> Path:
-    """One cell of each model and an ablation, in the processes that `make study` uses."""
+    """One cell of each model, an ablation and a cell with lens augmentation, in the processes that
+    `make study` uses."""
     folder = tmp_path_factory.mktemp("study")
     where = ["--out", str(folder / "out"), "--results", str(folder)]
     cells = [cell for cell in headline(1) if cell.level == "low"]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(study, "headline", lambda seeds: cells)
         patch.setattr(study, "ablations", lambda: ablations()[-1:])
+        patch.setattr(study, "augmented", lambda seeds: augmented(1)[-1:])
         study.main([*where, "--seeds", "1", "--test-images", "20", *QUICK])
     return folder
 
@@ -53,6 +55,7 @@ def here(monkeypatch, threads):
 def test_cells_are_trained_and_tested_once(quick, here, capsys):
     cells = {p.parent.name: json.loads(p.read_text()) for p in quick.glob("out/nano/*/cell.json")}
     names = {"darswin-a", "dat", "swin", "swin--undis-", "spacing-g"}
+    names.add("swin--lens-augmentation-very")
     assert cells.keys() == {f"{name}-low-0" for name in names}
     for cell in cells.values():
         assert cell["accuracy"].keys() == {*SWEEP, POLYNOMIAL, *LEVELS}
@@ -66,13 +69,43 @@ def test_cells_are_trained_and_tested_once(quick, here, capsys):
     assert again["accuracy"] == cells["swin-low-0"]["accuracy"]
 
 
+def test_cells_of_a_record_are_not_run_again(here, tmp_path, monkeypatch):
+    ran = []
+
+    def run_cell(cell, out, size, test_images, options):
+        ran.append(cell)
+        given = study.given_to(cell, test_images, options)
+        accuracy = dict.fromkeys([*SWEEP, POLYNOMIAL, *LEVELS], 50.0)
+        return dict(
+            label=cell.label, level=cell.level, seed=cell.seed, given=given, accuracy=accuracy
+        )
+
+    monkeypatch.setattr(study, "run_cell", run_cell)
+    record = tmp_path / "study--nano.json"
+    where = ["--results", str(tmp_path), "--known", str(record)]
+    study.main(["--results", str(tmp_path), "--seeds", "1", "--only", "ablations"])
+    old = json.loads(record.read_text())["cells"]
+    assert len(ran) == len(old) == len(ablations())
+    study.main([*where, "--seeds", "2", "--only", "augmented"])
+    assert ran[len(old) :] == sorted(augmented(2), key=lambda cell: cell.seed)
+    cells = json.loads(record.read_text())["cells"]
+    assert len(cells) == len(ran) and all(cell in cells for cell in old)
+    study.main([*where, "--seeds", "2", "--only", "augmented"])
+    assert len(cells) == len(ran)  # nothing is missing
+    with pytest.raises(ValueError, match="was made with"):
+        study.main([*where, "--test-images", "7", "--only", "augmented"])
+    with pytest.raises(ValueError, match="has models of the size nano, not tiny"):
+        study.main([*where, "--size", "tiny", "--only", "augmented"])
+
+
 @pytest.mark.slow
 def test_tables_and_picture(quick):
     cells = json.loads((quick / "study--nano.json").read_text())["cells"]
-    assert len(cells) == 5 and (quick / "study--nano.png").read_bytes().startswith(b"\x89PNG")
+    assert len(cells) == 6 and (quick / "study--nano.png").read_bytes().startswith(b"\x89PNG")
     made = tables.tables(cells)
     assert "| Swin | not run (33.9) |" in made["xi-0.4"] and "(87.9)" in made["xi-0.4"]
     assert made["ablations"].count("not run") == 4 * (len(ablations()) - 1)
+    assert made["augmented"].count("not run") == 5 * 8
     others = [cells[0] | dict(label=cell.label) for cell in ablations()[:-1]]
     assert "not run" not in tables.tables(cells + others)["ablations"]
 

@@ -12,6 +12,7 @@ from hypothesis import given
 from PIL import ExifTags, Image, ImageOps
 from videos import turn_video, write_video
 
+from darswin.cli.answers import ClassAnswers
 from darswin.cli.main import main
 from darswin.cli.predict import File, _calibrations
 from darswin.compat import load_official
@@ -197,6 +198,19 @@ def test_a_picture_that_exif_turns_is_answered_as_the_upright_one(run, capsys):
     assert close(found, expected)
     with pytest.raises(SystemExit, match=r"exif\.png: the calibration is for .*orientation is 6"):
         answers([run / "exif.png"], run, capsys, SENSOR_LENS | {"image_size": [90, 90]})
+
+
+def test_a_large_picture_is_reduced_by_area(run, monkeypatch):
+    noise = np.random.default_rng(0).integers(256, size=(1024, 1024, 3), dtype=np.uint8)
+    cv2.imwrite(str(run / "noise.png"), noise[..., ::-1])
+    read, predict = [], ClassAnswers._run
+    monkeypatch.setattr(
+        ClassAnswers, "_run", lambda self, *inputs: read.append(inputs) or predict(self, *inputs)
+    )
+    main(["predict", str(run / "noise.png"), "--lens", json.dumps(LENS), "--run", str(run)])
+    ((images, _),) = read
+    means = noise.reshape(32, 32, 32, 32, 3).mean((1, 3))  # 32 × 32 px become one
+    np.testing.assert_allclose(images[0].permute(1, 2, 0), means, atol=0.51)
 
 
 def test_weights_of_the_released_model(tmp_path, capsys):

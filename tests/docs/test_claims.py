@@ -6,6 +6,7 @@ import statistics
 import sys
 from pathlib import Path
 
+import pytest
 import torch
 
 from darswin import create_model, list_models
@@ -15,8 +16,10 @@ sys.path[:0] = [str(ROOT / "docs"), str(ROOT / "studies")]
 
 import dense_tables  # noqa: E402
 import fill  # noqa: E402
+import pixels_read  # noqa: E402
 import resampling  # noqa: E402
-from cells import MODELS, SWEEP  # noqa: E402
+import sizes_tables  # noqa: E402
+from cells import AUGMENTED, MODELS, POLYNOMIAL, SWEEP, augmented_label  # noqa: E402
 from dense_tables import SCORE  # noqa: E402
 from tables import points_lost  # noqa: E402
 
@@ -122,6 +125,21 @@ def test_the_study_shows_its_point():
     assert max(ahead) <= 2
 
 
+def test_lens_knowledge_helps_those_who_augment():
+    cells = json.loads((ROOT / "studies/results/study--nano.json").read_text())["cells"]
+    runs = {
+        label: [cell["accuracy"] for cell in cells if cell["label"] == augmented_label(label)]
+        for label in AUGMENTED
+    }
+    ahead: dict[str, list] = {"Swin (undis)": [], "Swin": []}
+    for xi in (*SWEEP, POLYNOMIAL):
+        mean = {label: statistics.mean(run[xi] for run in of) for label, of in runs.items()}
+        for other in ahead:
+            ahead[other].append(mean["DarSwin-A"] - mean[other])
+    assert min(map(min, ahead.values())) > 0.4  # everywhere
+    assert ahead["Swin"][0] > 25 and max(x for of in ahead.values() for x in of[4:]) < 2.25
+
+
 def test_8_bits_lose_little():
     record = json.loads((ROOT / "studies/results/int8.json").read_text())
     runs: dict[str, list] = {}
@@ -142,9 +160,27 @@ def test_the_dense_study_shows_its_point():
             if (cell["task"], cell["band"], cell["label"], cell["shuffled"])
             == ("segmentation", "wide", label, False)
         )
-        for label in dense_tables.MODELS
+        for label in dense_tables.labels_of(record)
     }
     assert max(miou, key=miou.__getitem__) == "DarSwin-Unet A"
+
+
+def test_the_sizes_study_shows_its_point():
+    record = json.loads((ROOT / "studies/results/sizes.json").read_text())
+    runs = sizes_tables.runs_of(record["cells"])
+
+    def score(label: str, name: str) -> float:
+        return statistics.mean(100 * run[name]["delta1"] for run in runs[label])
+
+    adapter, absolute = "LensAdapter", "LensAdapter, absolute θ"
+    assert score("raw", "own") > 85 and score("raw", "100°") < 15
+    assert score(adapter, "own") - score(adapter, "100°") > 70
+    assert score(absolute, "100°") - score(adapter, "100°") > 70
+    assert score(absolute, "own") - score(absolute, "100°") < 2.5
+    for wrong in sizes_tables.WRONG:
+        assert score(absolute, "own") - score(absolute, wrong) > 25
+        assert abs(score(adapter, "own") - score(adapter, wrong)) < 0.1
+        assert score("DarSwin-Unet A", "own") - score("DarSwin-Unet A", wrong) < 1
 
 
 def test_the_demo_shows_its_point():
@@ -166,3 +202,30 @@ def test_the_table_of_resampling_is_computed():
             for samples in (1, 4)
         ]
         assert scores.split(" | ") == found, (rings, sectors)
+
+
+def rows_of(text: str) -> list[list[str]]:
+    """The rows of the tables in a page, without their heads."""
+    rows = [line.strip("| ").split(" | ") for line in text.splitlines() if line.startswith("|")]
+    return [row for row in rows if row[0][0].isdigit()]
+
+
+def test_the_pixels_that_a_grid_reads_are_computed():
+    large = (ROOT / "docs/explanation/large.md").read_text()
+    rows, sizes = rows_of(large), pixels_read.SIZES
+    shares, errors = rows[: len(sizes)], rows[len(sizes) : 2 * len(sizes)]
+    assert [row[0] for row in shares] == [row[0] for row in errors]
+    for size, share, error in zip(sizes, shares, errors, strict=True):
+        assert share == pixels_read.share_row(size) and error == pixels_read.noise_row(size)
+
+
+@pytest.mark.slow
+def test_large_noisy_pictures_are_better_reduced():
+    rows = rows_of((ROOT / "docs/explanation/large.md").read_text())[-len(pixels_read.DEVIATIONS) :]
+    for noise, row in zip(pixels_read.DEVIATIONS, rows, strict=True):
+        assert float(row[0]) == noise
+        told = [float(share.removesuffix(" %")) for share in row[1:]]
+        # Another CPU rounds in another way.
+        assert pixels_read.accuracy(noise) == pytest.approx(told, abs=2)
+    direct, reduced = told
+    assert reduced - direct > 20

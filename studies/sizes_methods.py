@@ -1,0 +1,147 @@
+"""The methods of the sizes study: what a network sees of a picture and of its lens."""
+
+import math
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from sizes_scene import SIZE
+from torch import Tensor, nn
+
+from darswin import create_model
+from darswin.lens import Lens, Tabulated
+from darswin.lens.curves import as_curves
+from darswin.lens.pixels import as_map, sample_at
+from darswin.models.views import LensAdapter, PerspectiveView, PlainView, SquareView
+
+WIDEST = math.radians(96)  # the θ_max of grids with absolute θ, more than that of every test lens
+BEYOND = 1000.0  # px/rad: the slope of a lens's curve beyond θ_max, so that nothing is read there
+MEAN, STD = 0.5, 0.25  # of the pixels, for the networks
+TYPICAL = 2.5  # m, the distance around which networks start
+
+
+@dataclass(frozen=True)
+class Method:
+    """A method.
+
+    Attributes:
+        model, options: the name and the options for `create_model`.
+        view: the view that the model sees, in `VIEWS`; None means that it takes the pictures.
+        scale: the side of the view, in sides of the pictures.
+        rays: the viewing direction of each pixel is the input of three more channels.
+        absolute: the grid ends at `WIDEST` for every lens, not at θ_max of the lens.
+        uses_lens: False if the results do not depend on the lens.
+    """
+
+    model: str
+    options: dict[str, Any] = field(default_factory=dict)
+    view: str | None = None
+    scale: float = 1.0
+    rays: bool = False
+    absolute: bool = False
+    uses_lens: bool = True
+
+
+_CONV = "conv_unet_nano"
+_PLAIN: dict[str, Any] = dict(options=dict(rays=False))
+_UNET: dict[str, Any] = dict(options=dict(skip_width=16))
+METHODS = {
+    "raw": Method(_CONV, **_PLAIN, uses_lens=False),
+    "raw + rays": Method(_CONV),
+    "undistorted": Method(_CONV, **_PLAIN, view="perspective"),
+    "equirectangular": Method(_CONV, **_PLAIN, view="equirectangular"),
+    "LensAdapter": Method(_CONV, **_PLAIN, view="square"),
+    "LensAdapter + rays": Method(_CONV, **_PLAIN, view="square", rays=True),
+    "LensAdapter, absolute θ": Method(_CONV, **_PLAIN, view="square", absolute=True),
+    "LensAdapter, absolute θ, 1.5 times larger": Method(
+        _CONV, **_PLAIN, view="square", absolute=True, scale=1.5
+    ),
+    "DarSwin-Unet A": Method("darswin_unet_a_nano", **_UNET),
+    "DarSwin-Unet A, absolute θ": Method("darswin_unet_a_nano", **_UNET, absolute=True),
+    "DarSwin-Unet RA": Method("darswin_unet_ra_nano", **_UNET),
+}
+
+
+def continued(lens: Lens) -> Tabulated:
+    """The lenses with θ_max = `WIDEST`: rays beyond their own θ_max land far outside pictures."""
+    curves = as_curves(lens, 128)
+    last = curves.angles[:, -1:]
+    end = torch.maximum(last + 0.01, torch.full_like(last, WIDEST))
+    slope = torch.full_like(last, BEYOND)
+    curves = curves.replace(
+        angles=torch.cat((curves.angles, end), 1),
+        radii=torch.cat((curves.radii, curves.radii[:, -1:] + BEYOND * (end - last)), 1),
+        slopes=torch.cat((curves.slopes, slope), 1),
+    )
+    return curves.with_theta_max(WIDEST)
+
+
+class Equirectangular(PlainView):
+    """Azimuth and elevation about the optical axis, up to ±`WIDEST`, in equal steps.
+
+    The resolution is the same for all lenses, as in Depth Any Camera (CVPR 2025). The view is 0
+    where a lens sees nothing.
+    """
+
+    uses_lens = True
+
+    def image_points(self, lens: Lens, size: tuple[int, int]) -> Tensor:
+        like = lens.theta_max
+        rows, columns = (torch.arange(s, dtype=like.dtype) for s in self.size)
+        elevation, azimuth = (
+            WIDEST * ((2 * side + 1) / count - 1)
+            for side, count in zip((rows, columns), self.size, strict=True)
+        )
+        elevation, azimuth = torch.meshgrid(elevation, azimuth, indexing="ij")
+        flat = torch.cos(elevation)
+        rays = torch.stack(
+            (flat * torch.sin(azimuth), torch.sin(elevation), flat * torch.cos(azimuth)), -1
+        )
+        points = lens.project_points(rays[None], size)
+        return as_map(torch.where((elevation.abs() > math.pi / 2)[..., None], torch.nan, points))
+
+    def view_points(self, lens: Lens, size: tuple[int, int]) -> Tensor:
+        x, y, z = pixel_directions(lens, size).unbind(-1)
+        angles = torch.stack((torch.atan2(x, z), torch.asin(y.clamp(-1, 1))), -1)
+        sides = torch.tensor(self.size[::-1], dtype=angles.dtype)
+        return as_map(((angles / WIDEST + 1) * sides - 1) / 2)
+
+    def to_images(self, x: Tensor, view_points: Tensor) -> Tensor:
+        return sample_at(x, view_points)
+
+
+def pixel_directions(lens: Lens, size: tuple[int, int]) -> Tensor:
+    """The viewing directions (x, y, z) of the pixels, (N, H, W, 3); NaN where no ray lands."""
+    rows, columns = (torch.arange(side, dtype=lens.theta_max.dtype) for side in size)
+    pixels = torch.stack(torch.meshgrid(columns, rows, indexing="xy"), -1)
+    return lens.unproject_points(pixels[None], size)
+
+
+VIEWS: dict[str, type[PlainView]] = {
+    "square": SquareView,
+    "perspective": PerspectiveView,
+    "equirectangular": Equirectangular,
+}
+
+
+class Measurer(nn.Module):
+    """A method's network: images uint8 (B, H, W, 3) and B lenses → distances (B, 1, H, W), m."""
+
+    def __init__(self, method: Method):
+        super().__init__()
+        self.method = method
+        self.network: nn.Module = create_model(
+            method.model, task="distance", in_chans=6 if method.rays else 3,
+            typical_distance=TYPICAL, **method.options,
+        )  # fmt: skip
+        if method.view:
+            side = round(method.scale * SIZE)
+            self.network = LensAdapter(self.network, side)
+            self.network.view = VIEWS[method.view]((side, side))
+
+    def forward(self, images: Tensor, lens: Lens) -> Tensor:
+        x = (images.permute(0, 3, 1, 2) / 255 - MEAN) / STD
+        if self.method.rays:
+            rays = pixel_directions(lens, x.shape[2:]).nan_to_num().movedim(-1, 1)
+            x = torch.cat((x, rays.expand(len(x), -1, -1, -1)), 1)
+        return self.network(x, continued(lens) if self.method.absolute else lens)
