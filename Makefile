@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/installed
 
-.PHONY: help build demo test test-all test-triton test-gpu test-lowest test-isa test-asan fuzz kills mutants lint format bench bench-gpu study study-int8 learned-lens worlds study-dense tables docs sdist wheels repair published-wheels test-torch aarch64 test-aarch64 clean
+.PHONY: help build demo test test-all test-triton test-gpu test-lowest test-isa test-asan fuzz kills mutants lint format bench bench-gpu study study-int8 learned-lens worlds study-dense study-sizes tables docs sdist wheels repair published-wheels test-torch aarch64 test-aarch64 clean
 
 help:  ## print this list
 	@grep -E '^[a-z0-9-]+:.*##' Makefile | sed -E 's/:.*## /\t/' | expand -t 18
@@ -136,8 +136,11 @@ learned-lens: build  ## find unknown lenses by gradient descent (ten minutes; ca
 worlds: build  ## render pictures, labels and distances of a game's worlds (3 minutes; needs `apt-get install freedoom`)
 	$(BIN)/python studies/render_worlds.py --out out/worlds
 
-study-dense: build  ## study labels and distances through unknown lenses (3 hours; can be interrupted)
+study-dense: build  ## study labels and distances through unknown lenses (6 hours; can be interrupted)
 	$(BIN)/python studies/dense.py
+
+study-sizes: build  ## study distances that only the lens and the size of balls reveal (half an hour; can be interrupted)
+	$(BIN)/python studies/sizes.py
 
 tables: $(STAMP)  ## fill the tables of README and docs with the results of bench and study
 	$(BIN)/python docs/fill.py

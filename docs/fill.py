@@ -114,6 +114,7 @@ def tables() -> dict[str, str]:
     import dense_tables
     import learned_tables
     import peers
+    import sizes_tables
     import tables as study
 
     studies = ROOT / "studies" / "results"
@@ -129,8 +130,9 @@ def tables() -> dict[str, str]:
     cells = json.loads((studies / "study--nano.json").read_text())["cells"]
     quantized = json.loads((studies / "int8.json").read_text())["cells"]
     cameras = json.loads((studies / "learned_lens.json").read_text())["cameras"]
-    dense = studies / "dense.json"  # there once `make study-dense` has run
-    found = json.loads(dense.read_text()) if dense.exists() else None
+    dense = json.loads((studies / "dense.json").read_text())
+    tried = json.loads((studies / "dense_trials.json").read_text())["rows"]
+    sizes = json.loads((studies / "sizes.json").read_text())
     return {
         "demo": demo_table(json.loads((ROOT / "docs" / "accuracy.json").read_text())),
         "drop-in": drop_in_line(sampling.timings),
@@ -154,7 +156,9 @@ def tables() -> dict[str, str]:
         **study.tables(cells),
         "int8": study.int8_table(quantized),
         **learned_tables.tables(cameras),
-        **(dense_tables.tables(found, studies) if found else {}),
+        **dense_tables.tables(dense, studies),
+        **{f"trials {task}": dense_tables.trials(tried, task) for task in dense_tables.TASKS},
+        **sizes_tables.tables(sizes),
     }
 
 
