@@ -18,7 +18,13 @@ MODELS: dict[str, tuple[str, tuple[str, ...]]] = {
     "Swin-Unet, lens augmentation": ("swin_unet", THROUGH_ANY),
 }
 # The models of a new study; the others are in an older record.
-STUDIED_MODELS = ("DarSwin-Unet A", "Swin-Unet", "LensAdapter(Swin-Unet)", "U-Net with rays")
+STUDIED_MODELS = (
+    "DarSwin-Unet RA",
+    "U-Net with rays",
+    "LensAdapter(Swin-Unet)",
+    "Swin-Unet",
+    "DarSwin-Unet A",
+)
 # Each task and the band of its training.
 STUDIED = (
     ("distance", "low"),

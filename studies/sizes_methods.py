@@ -9,13 +9,11 @@ from sizes_scene import SIZE
 from torch import Tensor, nn
 
 from darswin import create_model
-from darswin.lens import Lens, Tabulated
-from darswin.lens.curves import as_curves
+from darswin.lens import Lens
 from darswin.lens.pixels import as_map, sample_at
 from darswin.models.views import LensAdapter, PerspectiveView, PlainView, SquareView
 
 WIDEST = math.radians(96)  # the θ_max of grids with absolute θ, more than that of every test lens
-BEYOND = 1000.0  # px/rad: the slope of a lens's curve beyond θ_max, so that nothing is read there
 MEAN, STD = 0.5, 0.25  # of the pixels, for the networks
 TYPICAL = 2.5  # m, the distance around which networks start
 
@@ -29,7 +27,7 @@ class Method:
         view: the view that the model sees, in `VIEWS`; None means that it takes the pictures.
         scale: the side of the view, in sides of the pictures.
         rays: the viewing direction of each pixel is the input of three more channels.
-        absolute: the grid ends at `WIDEST` for every lens, not at θ_max of the lens.
+        absolute: the square or the grid ends at `WIDEST` for every lens, not at θ_max of the lens.
         uses_lens: False if the results do not depend on the lens.
     """
 
@@ -44,7 +42,6 @@ class Method:
 
 _CONV = "conv_unet_nano"
 _PLAIN: dict[str, Any] = dict(options=dict(rays=False))
-_UNET: dict[str, Any] = dict(options=dict(skip_width=16))
 METHODS = {
     "raw": Method(_CONV, **_PLAIN, uses_lens=False),
     "raw + rays": Method(_CONV),
@@ -56,24 +53,10 @@ METHODS = {
     "LensAdapter, absolute θ, 1.5 times larger": Method(
         _CONV, **_PLAIN, view="square", absolute=True, scale=1.5
     ),
-    "DarSwin-Unet A": Method("darswin_unet_a_nano", **_UNET),
-    "DarSwin-Unet A, absolute θ": Method("darswin_unet_a_nano", **_UNET, absolute=True),
-    "DarSwin-Unet RA": Method("darswin_unet_ra_nano", **_UNET),
+    "DarSwin-Unet A": Method("darswin_unet_a_nano"),
+    "DarSwin-Unet RA": Method("darswin_unet_ra_nano"),
+    "DarSwin-Unet RA, absolute θ": Method("darswin_unet_ra_nano", absolute=True),
 }
-
-
-def continued(lens: Lens) -> Tabulated:
-    """The lenses with θ_max = `WIDEST`: rays beyond their own θ_max land far outside pictures."""
-    curves = as_curves(lens, 128)
-    last = curves.angles[:, -1:]
-    end = torch.maximum(last + 0.01, torch.full_like(last, WIDEST))
-    slope = torch.full_like(last, BEYOND)
-    curves = curves.replace(
-        angles=torch.cat((curves.angles, end), 1),
-        radii=torch.cat((curves.radii, curves.radii[:, -1:] + BEYOND * (end - last)), 1),
-        slopes=torch.cat((curves.slopes, slope), 1),
-    )
-    return curves.with_theta_max(WIDEST)
 
 
 class Equirectangular(PlainView):
@@ -130,18 +113,19 @@ class Measurer(nn.Module):
     def __init__(self, method: Method):
         super().__init__()
         self.method = method
+        edge = dict(theta_max=WIDEST) if method.absolute else {}
         self.network: nn.Module = create_model(
             method.model, task="distance", in_chans=6 if method.rays else 3,
-            typical_distance=TYPICAL, **method.options,
+            typical_distance=TYPICAL, **method.options, **({} if method.view else edge),
         )  # fmt: skip
         if method.view:
             side = round(method.scale * SIZE)
             self.network = LensAdapter(self.network, side)
-            self.network.view = VIEWS[method.view]((side, side))
+            self.network.view = VIEWS[method.view]((side, side), **edge)
 
     def forward(self, images: Tensor, lens: Lens) -> Tensor:
         x = (images.permute(0, 3, 1, 2) / 255 - MEAN) / STD
         if self.method.rays:
             rays = pixel_directions(lens, x.shape[2:]).nan_to_num().movedim(-1, 1)
             x = torch.cat((x, rays.expand(len(x), -1, -1, -1)), 1)
-        return self.network(x, continued(lens) if self.method.absolute else lens)
+        return self.network(x, lens)

@@ -8,7 +8,7 @@ import pytest
 import sizes
 import sizes_tables
 import torch
-from sizes_methods import METHODS, WIDEST, Measurer, continued
+from sizes_methods import METHODS, Measurer
 from sizes_scene import (
     BALL,
     LEAST_PIXELS,
@@ -57,16 +57,6 @@ def test_wrong_lenses_scale_the_angle_of_each_pixel():
         wrong = with_angles_scaled(lens, factor)
         torch.testing.assert_close(
             wrong.unproject(radii), factor * lens.unproject(radii), atol=2e-4, rtol=1e-3
-        )
-
-
-def test_a_continued_lens_is_the_lens_and_reads_nothing_beyond_it():
-    for lens in (lenses_of(OWN, 2), *(made() for made in LENSES.values())):
-        same, theta = continued(lens), torch.linspace(0, 1, 9)[None] * lens.theta_max[:, None]
-        torch.testing.assert_close(same.project(theta), lens.project(theta), atol=1e-2, rtol=1e-3)
-        assert same.theta_max.allclose(torch.tensor(WIDEST))
-        assert (same.project(lens.theta_max[:, None] + 0.1) > SIZE / 2).all() or (
-            lens.theta_max.max() + 0.1 > WIDEST
         )
 
 

@@ -14,7 +14,15 @@ from torch import Tensor, nn
 
 from darswin.lens import Lens
 from darswin.lens.pixels import pixel_rays
-from darswin.lens.spacing import SPACINGS, Spacing, change_spacing, check_tan, span, to_theta
+from darswin.lens.spacing import (
+    SPACINGS,
+    Spacing,
+    change_spacing,
+    check_fixed_theta_max,
+    check_tan,
+    span,
+    to_theta,
+)
 from darswin.ops import polar_sample, polar_to_image_plan
 from darswin.ops.checks import as_int, channels_first, check_jitter, check_layout, readable
 
@@ -70,10 +78,15 @@ class PolarGridSpec:
             None means `spacing`.
         placement: "centers" puts the samples at the centres of equal cells; "edges" puts them from
             border to border, both included.
+        theta_max: θ at the end of the last ring, rad, in (0, π), for every lens; None means θ_max
+            of each lens. With a fixed angle, things of one angular size have one size on the map,
+            whatever the lens. Samples beyond θ_max of a lens are zero. The spacings must be
+            "theta".
 
     Raises:
-        ValueError: an option is unknown, a size is below 1, or "edges" has one sample along an
-            axis; in the methods, the spacing is "tan" and a lens has θ_max ≥ 90°.
+        ValueError: an option is unknown or out of range, a size is below 1, "edges" has one sample
+            along an axis, or theta_max has another spacing than "theta"; in the methods, the
+            spacing is "tan" and a lens has θ_max ≥ 90°.
 
     Source: DarSwin, ICCV 2023, sec. 4.2 and 4.3.
     """
@@ -84,6 +97,7 @@ class PolarGridSpec:
     spacing: Spacing = "theta"
     sample_spacing: Spacing | None = None
     placement: Placement = "centers"
+    theta_max: float | None = None
 
     def __post_init__(self) -> None:
         for name in ("rings", "sectors"):
@@ -102,6 +116,8 @@ class PolarGridSpec:
             raise ValueError(f"placement must be one of {PLACEMENTS}, got {self.placement!r}")
         if self.placement == "edges" and min(samples) < 2:
             raise ValueError(f"placement='edges' needs 2 or more samples per axis, got {samples!r}")
+        if self.theta_max is not None:
+            check_fixed_theta_max(self.theta_max, self.spacing, self.inner_spacing)
 
     @property
     def inner_spacing(self) -> Spacing:
@@ -114,14 +130,19 @@ class PolarGridSpec:
         borders, points = self._rings(lens, self.inner_spacing, steps_r)
         sector = torch.arange(self.sectors, dtype=borders.dtype, device=borders.device)[:, None]
         azimuths = (sector + steps_phi).flatten() * (2 * math.pi / self.sectors)
-        offsets = None
+        radii, offsets = self._radii(lens, points, self.inner_spacing), None
         if not lens.is_radial:
-            offsets = _offsets(lens, to_theta(lens, points, self.inner_spacing), azimuths)
+            theta = to_theta(lens, points, self.inner_spacing)
+            if self.theta_max is not None:
+                theta = torch.minimum(theta, lens.theta_max[:, None])
+            offsets = _offsets(lens, theta, azimuths)
+        if self.theta_max is not None:
+            radii = torch.where(points > lens.theta_max[:, None], torch.nan, radii)
         return PolarGrid(
-            change_spacing(lens, points, self.inner_spacing, "radius"),
+            radii,
             azimuths,
             lens.center_in(image_size),
-            change_spacing(lens, borders, self.spacing, "radius"),
+            self._radii(lens, borders, self.spacing),
             lens.affine,
             offsets,
         )
@@ -130,15 +151,18 @@ class PolarGridSpec:
         """The way back to images of (H, W) from a polar map with `split` rings per ring here."""
         steps = _steps(split, "centers", lens.theta_max)
         _, centers = self._rings(lens, self.inner_spacing, steps)
-        radii = change_spacing(lens, centers, self.inner_spacing, "radius")
+        radii, r_max = self._radii(lens, centers, self.inner_spacing), lens.r_max
+        if self.theta_max is not None:
+            end = lens.theta_max.clamp(max=self.theta_max)
+            r_max = lens.project(end[:, None])[:, 0]
         if lens.is_radial:
-            grid = PixelGrid(radii, lens.r_max, lens.center_in(image_size), lens.affine)
+            grid = PixelGrid(radii, r_max, lens.center_in(image_size), lens.affine)
         else:
             theta, direction = pixel_rays(lens, image_size)
             seen = ~theta.isnan()  # NaN would spread to the gradients
             flat = lens.project(torch.where(seen, theta, 0.0))[..., None] * direction
             points = torch.where(seen[..., None], flat, torch.nan)
-            grid = PixelGrid(radii, lens.r_max, points=points)
+            grid = PixelGrid(radii, r_max, points=points)
         # Plans of many lenses would take much memory. A graph has no plan, and must not ask for the
         # number of lenses, which may vary.
         if torch.compiler.is_compiling() or len(lens) != 1:
@@ -163,6 +187,19 @@ class PolarGridSpec:
         aside, forward = torch.sin(theta), torch.cos(theta).expand(-1, -1, self.sectors)
         return torch.stack((aside * torch.cos(azimuth), aside * torch.sin(azimuth), forward), -1)
 
+    def last_angle(self, lens: Lens) -> Tensor:
+        """θ at the end of the last ring, (N,) rad."""
+        last = lens.theta_max
+        return last if self.theta_max is None else torch.full_like(last, self.theta_max)
+
+    def _radii(self, lens: Lens, values: Tensor, spacing: Spacing) -> Tensor:
+        """r at values of a spacing, px. Beyond θ_max of a lens, r rises in proportion to θ."""
+        if self.theta_max is None:
+            return change_spacing(lens, values, spacing, "radius")
+        last = lens.theta_max[:, None]
+        beyond = (values - last).clamp(min=0) * (lens.r_max[:, None] / last)
+        return lens.project(torch.minimum(values, last)) + beyond
+
     def _rings(self, lens: Lens, inner: Spacing, steps: Tensor) -> tuple[Tensor, Tensor]:
         """The ring borders (N, R+1) in units of `spacing`, and points inside the rings,
         (N, R·len(steps)) in units of `inner`. `steps` are fractions of a ring."""
@@ -170,6 +207,8 @@ class PolarGridSpec:
             check_tan(lens)
         fractions = torch.linspace(0, 1, self.rings + 1, dtype=steps.dtype, device=steps.device)
         first, last = span(lens, self.spacing)
+        if self.theta_max is not None:
+            last = self.last_angle(lens)[:, None]
         borders = first + (last - first) * fractions
         edges = change_spacing(lens, borders, self.spacing, inner)
         begin, end = edges[:, :-1, None], edges[:, 1:, None]

@@ -8,7 +8,6 @@ import torch
 from torch import Tensor, nn
 
 from darswin.layers.polar import PolarGrid
-from darswin.lens import Lens
 
 PositionBias = Literal["angular_relative", "angular", "polar"]
 
@@ -118,12 +117,11 @@ class RelativeTable(nn.Module):
         return self.table[None]
 
 
-def ring_angles(lens: Lens, grid: PolarGrid, rings: int, kind: PositionBias) -> Tensor:
-    """The θ of the ring borders of a map with `rings` rings, (N, rings+1) rad. For "polar" it is
-    their radius in the image instead, scaled so that the image circle has the radius π."""
+def ring_angles(last: Tensor, grid: PolarGrid, rings: int, kind: PositionBias) -> Tensor:
+    """The θ of the ring borders of a map with `rings` rings, (N, rings+1) rad, up to `last` (N,).
+    For "polar" it is their radius in the image instead, scaled so that the last one is π."""
     if kind == "polar":
         step = (grid.borders.shape[1] - 1) // rings
         borders = grid.borders[:, ::step]
         return borders * (math.pi / borders[:, -1:])
-    fractions = torch.linspace(0, 1, rings + 1, device=lens.theta_max.device)
-    return lens.theta_max[:, None] * fractions
+    return last[:, None] * torch.linspace(0, 1, rings + 1, device=last.device)

@@ -35,6 +35,15 @@ def check_tan(lens: Lens) -> None:
         )
 
 
+def check_fixed_theta_max(theta_max: float, *spacings: Spacing) -> None:
+    """Raises ValueError unless a fixed θ_max is in (0, π) and the spacings are "theta"."""
+    if not 0 < theta_max < math.pi:
+        raise ValueError(f"theta_max must be in (0, π), got {theta_max}")
+    for spacing in spacings:
+        if spacing != "theta":
+            raise ValueError(f"a fixed theta_max needs spacing='theta', got {spacing!r}")
+
+
 def span(lens: Lens, spacing: Spacing) -> tuple[Tensor, Tensor]:
     """The values of a spacing at θ = 0 and θ_max, (N, 1) each. Raises the errors of `check_tan`."""
     if spacing == "tan":

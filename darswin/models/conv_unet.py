@@ -22,7 +22,7 @@ _SIZES: Presets = dict(
     small=dict(widths=(88, 176, 352, 704, 1408)),
     tiny=dict(widths=(64, 128, 256, 512, 1024)),
     micro=dict(widths=(40, 80, 160, 320)),
-    nano=dict(widths=(12, 24, 48, 96)),
+    nano=dict(widths=(15, 30, 60, 120)),
 )
 
 
@@ -68,7 +68,7 @@ class ConvUnet(PixelModel):
         in_chans: int = 3,
         *,
         task: PixelTask = "segmentation",
-        widths: Sequence[int] = (12, 24, 48, 96),
+        widths: Sequence[int] = (15, 30, 60, 120),
         rays: bool = True,
         typical_distance: float = 10.0,
         mean: float | Sequence[float] = 0.0,

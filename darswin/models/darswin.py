@@ -41,9 +41,9 @@ class DarSwin(Encoder):
         position_bias: "angular_relative", or one of the ablations "angular" and "polar".
         harmonics: the number of harmonics of these two ablations.
         periodic_bias: see `AngularRelativeBias`.
-        options: the settings of `PolarGridSpec`, such as `rings`, `sectors`, `samples` and
-            `spacing`, and the other arguments of `Encoder`. With "radius" for both spacings the
-            model does not use the projection curve.
+        options: the settings of `PolarGridSpec`, such as `rings`, `sectors`, `samples`, `spacing`
+            and `theta_max`, and the other arguments of `Encoder`. With "radius" for both spacings
+            the model does not use the projection curve.
 
     Rotation:
         Turning a square image by 90° about the principal point turns the maps by a quarter of their
@@ -106,9 +106,9 @@ class DarSwin(Encoder):
         )
 
     def _prepare(self, lens: Lens, size: Pair) -> Prepared:
-        grid = self.spec.grid(lens, size)
+        grid, last = self.spec.grid(lens, size), self.spec.last_angle(lens)
         rings = [plan.map_size[0] for plan in self.plans]
-        return Prepared(grid, [(ring_angles(lens, grid, r, self.position_bias),) for r in rings])
+        return Prepared(grid, [(ring_angles(last, grid, r, self.position_bias),) for r in rings])
 
     def embed(self, images: Tensor, points: PolarGrid | None) -> Tensor:
         if points is None:

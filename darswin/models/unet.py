@@ -18,7 +18,8 @@ from darswin.models.views import PlainView, PolarView, make_view
 
 EXPANSION = 4  # The decoder's last expansion splits each token into 4 × 4.
 
-_NANO = dict(decoder_depths=1)
+# Two blocks per stage, as in all other sizes: without shifted windows, windows do not overlap.
+_NANO = dict(depths=(2, 2, 2))
 _POLAR: Presets = dict(micro=PRESETS["micro"], nano=dict(_NANO, samples=(4, 4)))
 _PLAIN: Presets = dict(nano=_NANO)
 

@@ -15,7 +15,7 @@ from darswin.layers.polar import PixelGrid, PolarGridSpec, check_count, check_im
 from darswin.lens import Lens
 from darswin.lens.concentric import read_square, square_places, square_view
 from darswin.lens.pixels import perspective_view, reprojection, sample_at
-from darswin.lens.spacing import SPACINGS, Spacing
+from darswin.lens.spacing import SPACINGS, Spacing, check_fixed_theta_max
 from darswin.models.base import Model
 from darswin.models.stages import Pair
 from darswin.ops import polar_to_image
@@ -115,10 +115,7 @@ class SquareView(PlainView):
         if size[0] != size[1]:
             raise ValueError(f"image_size must be square, got {size}")
         if theta_max is not None:
-            if not 0 < theta_max < math.pi:
-                raise ValueError(f"theta_max must be in (0, π), got {theta_max}")
-            if spacing != "theta":
-                raise ValueError(f"a fixed theta_max needs spacing='theta', got {spacing!r}")
+            check_fixed_theta_max(theta_max, spacing)
         self.spacing, self.theta_max = spacing, theta_max
 
     def image_points(self, lens: Lens, size: Pair) -> Tensor:

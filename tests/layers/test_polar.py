@@ -10,8 +10,9 @@ from helpers import CAMERAS
 from darswin.layers.embed import PolarPatchEmbed
 from darswin.layers.polar import PLACEMENTS, PolarGridSpec, PolarSample, polar_grid
 from darswin.lens import Mei, Perspective, Polynomial, Spherical, cat
+from darswin.lens.pixels import pixel_rays
 from darswin.lens.spacing import SPACINGS
-from darswin.ops import polar_embed, polar_sample
+from darswin.ops import polar_embed, polar_sample, polar_to_image
 
 f64 = torch.float64
 SIZES = dict(rings=16, sectors=64, samples=(10, 10))
@@ -154,6 +155,9 @@ def test_gradients_reach_the_lens(spacing, sample_spacing):
         (dict(sample_spacing="log"), "sample_spacing must be one of"),
         (dict(placement="middle"), "placement must be one of"),
         (dict(placement="edges", samples=(1, 4)), "2 or more samples"),
+        (dict(theta_max=4), r"theta_max must be in \(0, π\), got 4"),
+        (dict(theta_max=1.0, spacing="g"), "a fixed theta_max needs spacing='theta', got 'g'"),
+        (dict(theta_max=1.0, sample_spacing="tan"), "needs spacing='theta', got 'tan'"),
         (dict(jitter=2.0), "jitter"),
         (dict(layout="rows"), "layout"),
     ],
@@ -195,6 +199,42 @@ def test_points_are_where_the_lens_projects_their_rays(spacing, aside):
     assert (grid.offsets is None) == (not {"tangential", "prism"} & aside.keys())
     if grid.offsets is not None:
         assert grid.offsets.shape == (1, 2, 160, 640) and 0.5 < grid.offsets.abs().max() < 10
+
+
+@pytest.mark.parametrize("lens", [spherical(0.4), *(c.to(f64).resized(0.05) for c in CAMERAS)])
+def test_a_fixed_theta_max_is_the_end_of_the_grid_for_every_lens(lens):
+    end, size = lens.theta_max.item(), (64, 64)
+    if lens.image_size is not None:
+        size = tuple(int(side) for side in lens.image_size[0])
+    sizes = dict(rings=8, sectors=12, samples=(3, 2))
+    # A lens that sees more.
+    spec, usual = (PolarGridSpec(**sizes, theta_max=t) for t in (0.7 * end, None))
+    cut = lens.with_theta_max(0.7 * end)
+    for made in ("grid", "pixel_grid"):
+        found, expected = (getattr(s, made)(a, size) for s, a in ((spec, lens), (usual, cut)))
+        for a, b in zip(found[:-1], expected[:-1], strict=True):
+            if b is None:
+                assert a is None
+            else:  # `cut` has no points beyond its θ_max
+                torch.testing.assert_close(a[~b.isnan()], b[~b.isnan()])
+    # A lens that sees less: no points beyond its θ_max, and the ring of a pixel is that of its θ.
+    spec = PolarGridSpec(**sizes, theta_max=1.5 * end)
+    theta = (torch.arange(24, dtype=f64) + 0.5) / 24 * 1.5 * end
+    grid = spec.grid(lens, size)
+    assert torch.equal(grid.radii.isnan()[0], theta > end)
+    seen = theta[theta <= end][None]
+    torch.testing.assert_close(grid.radii[:, : seen.shape[1]], lens.project(seen))
+    assert (grid.borders.diff() > 0).all() and grid.borders.isfinite().all()
+    *pixels, _ = spec.pixel_grid(lens, size)
+    names = ("r_max", "center", "affine", "points")
+    angles = (torch.arange(8, dtype=f64) + 0.5) / 8 * 1.5 * end
+    of_ring = angles[None, :, None, None].expand(1, 8, 12, 1)
+    given = dict(zip(names, pixels[1:], strict=True))
+    found = polar_to_image(of_ring, pixels[0], given.pop("center"), size, **given)[0, 0]
+    exact = pixel_rays(lens, size)[0][0]
+    inner = (exact > angles[0]) & (exact < end)
+    assert inner.any() and (found[inner] - exact[inner]).abs().max() < 0.1 * end
+    assert not found[exact.isnan()].any()
 
 
 @pytest.mark.parametrize("spacing", ["theta", "g", "radius"])

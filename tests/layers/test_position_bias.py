@@ -53,7 +53,7 @@ def test_periodic_bias_joins_at_the_seam():
 
 def test_radial_positions():
     grid = polar_grid(LENS, (32, 32), rings=8, sectors=4, samples=(2, 2))
-    angles = ring_angles(LENS, grid, 4, "angular_relative")
+    angles = ring_angles(LENS.theta_max, grid, 4, "angular_relative")
     torch.testing.assert_close(angles[0], torch.linspace(0, 1.3, 5))
-    radii = ring_angles(LENS, grid, 4, "polar")
+    radii = ring_angles(LENS.theta_max, grid, 4, "polar")
     torch.testing.assert_close(radii, grid.borders[:, ::2] * math.pi / 16)

@@ -95,6 +95,24 @@ def test_a_fixed_theta_max_gives_things_one_size_in_the_square():
     torch.testing.assert_close(*same, atol=1e-4, rtol=1e-4)
 
 
+@torch.no_grad()
+@pytest.mark.parametrize("name", ["darswin_a_nano", "darswin_unet_ra_nano"])
+def test_with_a_fixed_theta_max_a_wider_lens_sees_the_same_and_more(name):
+    model, size = network(name, theta_max=1.2), (81, 81)
+    wide = Equidistant(40.0, 1.5)
+    narrow = wide.with_theta_max(0.8)
+    theta, _ = wide.unproject_pixels(torch.stack(pixels(*size), -1)[None], size)
+    images = torch.rand(1, 3, *size)
+    images[:, :, theta[0] > 0.7] = 0
+    # The head's convolutions read two pixels around.
+    inside = (theta[0] < 0.7) if "unet" in name else ...
+    found, expected = (model(images, lens)[..., inside] for lens in (wide, narrow))
+    torch.testing.assert_close(found, expected)
+    # Without the fixed angle, the tokens of the narrow lens are smaller.
+    found, expected = (network(name)(images, lens)[..., inside] for lens in (wide, narrow))
+    assert not torch.allclose(found, expected, atol=1e-3)
+
+
 def test_a_lens_in_float32_sees_as_much_as_in_float64():
     focal = torch.tensor([40.0], dtype=torch.float64)
     exact = BrownConrady(focal, [-0.22, 0.13, 0.028], tangential=[1e-3, 1e-3], center=[25.0, 24.0])
