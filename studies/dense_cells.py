@@ -27,9 +27,9 @@ STUDIED_MODELS = (
 )
 # Each task and the band of its training.
 STUDIED = (
+    ("segmentation", "wide"),
     ("distance", "low"),
     ("segmentation", "low"),
-    ("segmentation", "wide"),
     ("distance", "wide"),
 )
 # The losses. Steps, doors and objects are rare; silog leaves the scale of distances loose.
@@ -41,7 +41,7 @@ LOSSES = {
     "distance": ("--model.loss", "log_l1"),
 }
 TASKS = tuple(LOSSES)
-CONTROLLED = ("DarSwin-Unet A", "LensAdapter(Swin-Unet)")
+CONTROLLED = ("DarSwin-Unet RA", "LensAdapter(Swin-Unet)")
 
 
 @dataclass(frozen=True)

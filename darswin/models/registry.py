@@ -85,10 +85,15 @@ def model_class(name: str) -> type[Model]:
     return _MODELS[name][0]
 
 
+def preset(name: str) -> dict[str, Any]:
+    """The options that the name of a model stands for; ValueError for an unknown name."""
+    model_class(name)
+    return dict(_MODELS[name][1])
+
+
 def has_image_size(name: str) -> bool:
     """True if the model with this name takes images of a single size, its option `image_size`."""
-    model_class(name)
-    return "image_size" in _MODELS[name][1]
+    return "image_size" in preset(name)
 
 
 def list_pretrained() -> list[str]:

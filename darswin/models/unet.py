@@ -141,7 +141,8 @@ class Unet(PixelModel):
         options: the options of the encoder: of `DarSwin` for "polar", else of `Swin`, whose
             defaults are here image_size=128 and patch_size=4.
 
-    "darswin_unet_*_nano" has R×A = 16×64, unlike the classifier of that size.
+    Unlike the classifiers of that size, a Unet of size "nano" has two blocks per stage, and
+    "darswin_unet_*_nano" has R×A = 16×64.
 
     Rotation:
         Turning a square image by 90° about the principal point turns the result, up to rounding, in

@@ -10,7 +10,7 @@ from darswin.layers.quantized import without_quantized_layers
 from darswin.models.base import Model
 from darswin.models.encoder import Encoder
 from darswin.models.pixel import PixelModel
-from darswin.models.registry import list_models, model_class
+from darswin.models.registry import list_models, model_class, preset
 from darswin.models.saving import ModelCard, load_model, model_of_run
 from darswin.models.unet import Unet
 from darswin.utils.tasks import Task
@@ -26,9 +26,12 @@ def weights_file(weights: str | Path) -> str | Path:
     return model_of_run(weights) if Path(weights).is_dir() else weights
 
 
-def own_options(card: ModelCard) -> dict[str, Any]:
-    """The options of a model without those that follow from the data."""
-    return {name: value for name, value in card.options.items() if name not in OF_DATA}
+def own_options(card: ModelCard, name: str) -> dict[str, Any]:
+    """The options that the model `name` takes from a trained one; others follow from the data."""
+    own = {option: value for option, value in card.options.items() if option not in OF_DATA}
+    if name != card.model:  # a Unet of size "nano" has other depths than the classifier
+        own = {"depths": preset(card.model)["depths"]} | own
+    return own
 
 
 def models_for(task: Task) -> list[str]:
@@ -74,7 +77,7 @@ def settle(
     name = name_from(card, task)
     if model["name"] not in (None, name):
         raise refuse("name", model["name"], card.model)
-    own = own_options(card)
+    own = own_options(card, name)
     options = dict(model["options"] or {})
     for option, value in options.items():
         # A new decoder has its own options.

@@ -106,7 +106,7 @@ class Task(LightningModule):
         if name is None and weights is not None:
             card = read_card(weights_file(weights))
             name = name_from(card, self.task)
-            options = own_options(card) | (options or {})
+            options = own_options(card, name) | (options or {})
         self.name, self.options = name or self.default_model, options or {}
         check_name(self.name, self.task)
         self.weights, self.freeze_stages = weights, freeze_stages

@@ -16,6 +16,7 @@ from darswin.models.unet import PatchExpand, SkipJoin
 from darswin.ops import polar_to_image
 
 f64 = torch.float64
+NANO = dict(depths=(1, 2, 1))  # of the classifiers of that size
 WIDE = Polynomial([16.0, 0.4, -0.1, 0.05], 2.0, [30.0, 35.0])  # θ_max = 115°, off centre
 GENERAL = Mei(
     1.5, 60.0, [0.02, 0.01], 1.4, [30.0, 35.0], tangential=[0.02, -0.01],
@@ -234,9 +235,9 @@ def test_heads_and_depths_are_options():
     ("classifier", "unet", "options"),
     [
         ("darswin_a_micro", "darswin_unet_a_micro", {}),
-        ("darswin_ra_nano", "darswin_unet_ra_nano", dict(rings=8, sectors=32)),
-        ("swin_nano", "swin_unet_nano", dict(image_size=32, patch_size=2)),
-        ("swin_undis_nano", "swin_unet_undis_nano", dict(image_size=32, patch_size=2)),
+        ("darswin_ra_nano", "darswin_unet_ra_nano", dict(NANO, rings=8, sectors=32)),
+        ("swin_nano", "swin_unet_nano", dict(NANO, image_size=32, patch_size=2)),
+        ("swin_undis_nano", "swin_unet_undis_nano", dict(NANO, image_size=32, patch_size=2)),
     ],
 )
 def test_its_encoder_starts_from_a_trained_classifier(classifier, unet, options):

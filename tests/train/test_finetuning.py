@@ -8,6 +8,7 @@ from frames import WOODSCAPE, write_frames
 from runs import DIGITS, QUIET, assert_same, checkpoint, error, fit, killed_fit, test
 from safetensors.torch import load_file
 
+from darswin import create_model
 from darswin.models.saving import ModelCard, load_model, save_model
 from darswin.train.classification import Classification
 from darswin.train.finetuning import (
@@ -173,7 +174,13 @@ def test_options_not_given_are_the_model_s():
     own = dict(name=None, options={"typical_distance": 3.0})
     model, data = settle(CARD, "w", "distance", own, NONE)
     assert model["name"] == "darswin_unet_a_nano" and data["channels"] == 1
-    assert model["options"] == {"spacing": "tan", "typical_distance": 3.0}
+    # The Unet of this size has other depths.
+    assert model["options"] == {"depths": (1, 2, 1), "spacing": "tan", "typical_distance": 3.0}
+    net = create_model(model["name"], task="distance", **model["options"])
+    assert (
+        net.encoder.state_dict().keys()
+        == create_model(CARD.model, num_classes=0).state_dict().keys()
+    )
 
 
 SQUARE = replace(CARD, options={**CARD.options, "image_size": 32})
