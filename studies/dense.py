@@ -5,10 +5,10 @@ results, so a study that was stopped can go on. The pictures are rendered once b
 `dense_data.py`. `dense_tables.py` makes the tables and figures. Run it with `make study-dense`,
 which needs `apt-get install freedoom`.
 
-The study has 48 cells: 5 models × 2 seeds × (2 tasks × 2 bands), and 8 controls. A cell trains on
+The study has 40 cells: 4 models × 2 seeds × (2 tasks × 2 bands), and 8 controls. A cell trains on
 8,000 pictures at 30 to 45 ms, tests on 24 sets of 75 pictures at 15 ms, and needs 8 s to start. The
-cells take 48 × (300 + 27 + 8) s and the pictures 1,900 s, together 5 hours on one core or 2.5 hours
-on two. With `--known RECORD` a later run goes on from a record.
+cells take 40 × (300 + 27 + 8) s and the pictures 1,900 s, together 4.2 hours on one core. With
+`--known RECORD` a later run goes on from a record.
 """
 
 import argparse

@@ -18,13 +18,7 @@ MODELS: dict[str, tuple[str, tuple[str, ...]]] = {
     "Swin-Unet, lens augmentation": ("swin_unet", THROUGH_ANY),
 }
 # The models of a new study; the others are in an older record.
-STUDIED_MODELS = (
-    "DarSwin-Unet RA",
-    "U-Net with rays",
-    "LensAdapter(Swin-Unet)",
-    "Swin-Unet",
-    "DarSwin-Unet A",
-)
+STUDIED_MODELS = ("DarSwin-Unet RA", "U-Net with rays", "LensAdapter(Swin-Unet)", "Swin-Unet")
 # Each task and the band of its training.
 STUDIED = (
     ("segmentation", "wide"),

@@ -6,7 +6,7 @@ from collections import defaultdict
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from dense_cells import CONTROLLED, MODELS, STUDIED, TASKS, Cell
+from dense_cells import MODELS, STUDIED, TASKS, Cell
 from dense_data import CAMERAS, SHUFFLED, SWEEP, WRONG, camera_set, xi_set
 from dense_pictures import draw
 from matplotlib.figure import Figure
@@ -191,9 +191,7 @@ def controls(record: dict, task: str, band: str) -> str:
         for names in (told, tests, [own], [f"{SHUFFLED}-{own}"]):
             row.append(_spread(runs, lambda run, names=names: mean_of(run, names, score)))
         control = shuffled.get((label, band))
-        row.append(
-            _spread(control, lambda run: mean_of(run, [own], score)) if label in CONTROLLED else "–"
-        )
+        row.append(_spread(control, lambda run: mean_of(run, [own], score)) if control else "–")
         rows.append(row)
     heads = [
         "ξ 0, 0.5, 1, true", "said to be 0.275", "own lenses, true", "shuffled in testing",
