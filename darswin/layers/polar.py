@@ -187,6 +187,11 @@ class PolarGridSpec:
         aside, forward = torch.sin(theta), torch.cos(theta).expand(-1, -1, self.sectors)
         return torch.stack((aside * torch.cos(azimuth), aside * torch.sin(azimuth), forward), -1)
 
+    def border_angles(self, lens: Lens) -> Tensor:
+        """θ of the ring borders, (N, R+1) rad."""
+        borders, _ = self._rings(lens, self.spacing, lens.theta_max.new_zeros(1))
+        return to_theta(lens, borders, self.spacing)
+
     def last_angle(self, lens: Lens) -> Tensor:
         """θ at the end of the last ring, (N,) rad."""
         last = lens.theta_max

@@ -77,7 +77,7 @@ def draw_grid(
     axes = axes or _new_axes()
     lens, grid = _grid(lens, sampler, image)
     _show(axes, image)
-    _draw_borders(axes, lens, grid, sampler, image.shape[:2], (0.6, 0.3))
+    _draw_borders(axes, lens, sampler, image.shape[:2], (0.6, 0.3))
     if samples:
         axes.plot(*_sample_places(lens, grid, image.shape[:2]), "r.", ms=0.6, alpha=0.5)
     axes.set(xlim=(-0.5, image.shape[1] - 0.5), ylim=(image.shape[0] - 0.5, -0.5))
@@ -93,7 +93,7 @@ def draw_samples(
     lens, grid = _grid(lens, sampler, image)
     left, top, width, height = _enlarged(image, lens)
     _show(axes, image)
-    _draw_borders(axes, lens, grid, sampler, image.shape[:2], (1.2, 1.2))
+    _draw_borders(axes, lens, sampler, image.shape[:2], (1.2, 1.2))
     x, y = _sample_places(lens, grid, image.shape[:2])
     inside = (x > left) & (x < left + width) & (y > top) & (y < top + height)
     axes.plot(x[inside], y[inside], "r.", ms=2.5, path_effects=_outline(0.5, "white"))
@@ -104,13 +104,13 @@ def draw_samples(
 def _draw_borders(
     axes: Axes,
     lens: Lens,
-    grid: PolarGrid,
     sampler: PolarSample,
     size: tuple[int, int],
     widths: tuple[float, float],
 ) -> None:
     """Draws rings and sectors with an outline, which keeps them visible on bright pictures."""
-    rings = lens.unproject(grid.borders[0])[:, None]
+    # Rings beyond θ_max of the lens, of a fixed theta_max, are drawn at its rim.
+    rings = sampler.spec.border_angles(lens)[0].clamp(max=lens.theta_max)[:, None]
     around = torch.linspace(0, 2 * math.pi, 361)
     outwards = torch.linspace(rings.min(), rings.max(), 65)
     sectors = torch.arange(sampler.spec.sectors)[:, None] * (2 * math.pi / sampler.spec.sectors)
@@ -149,7 +149,7 @@ def draw_polar(
     sides = ("right", "below", "left", "above", "right")
     axes.set_xticks(range(0, 361, 90), [f"{90 * k}°\n{side}" for k, side in enumerate(sides)])
     step = -(-sampler.spec.rings // 8)  # at most nine labels
-    angles = torch.rad2deg(lens.unproject(grid.borders[0]))[::step].tolist()
+    angles = torch.rad2deg(sampler.spec.border_angles(lens)[0])[::step].tolist()
     axes.set_yticks([k * step * sampler.spec.samples[0] for k in range(len(angles))],
                     [f"{angle:.0f}°" for angle in angles])  # fmt: skip
     axes.set(xlabel=_label("azimuth φ", outside), ylabel="incident angle θ")
