@@ -131,7 +131,7 @@ def tables() -> dict[str, str]:
     quantized = json.loads((studies / "int8.json").read_text())["cells"]
     cameras = json.loads((studies / "learned_lens.json").read_text())["cameras"]
     dense = json.loads((studies / "dense.json").read_text())
-    tried = json.loads((studies / "dense_trials.json").read_text())["rows"]
+    tried = json.loads((studies / "trials.json").read_text())["rows"]
     sizes = json.loads((studies / "sizes.json").read_text())
     return {
         "demo": demo_table(json.loads((ROOT / "docs" / "accuracy.json").read_text())),
@@ -157,7 +157,7 @@ def tables() -> dict[str, str]:
         "int8": study.int8_table(quantized),
         **learned_tables.tables(cameras),
         **dense_tables.tables(dense, studies),
-        **{f"trials {task}": dense_tables.trials(tried, task) for task in dense_tables.TASKS},
+        **{f"trials {of}": dense_tables.trials(tried, of) for of in dense_tables.TRIED},
         **sizes_tables.tables(sizes),
     }
 

@@ -23,6 +23,7 @@ SHADED = {"wide": (0.0, 0.0), "low": (0.2, 0.35)}  # ξ of the training lenses
 ALL_XI = [xi_set(xi) for xi in SWEEP]
 BOUNDS = {"gravity": "gravity", "labels": "+ classes", "heights": "+ heights"}
 DOCS = Path(__file__).parent.parent / "docs"  # the folder of the pages
+TRIED = (*TASKS, "parts", "sizes")  # the groups of single trainings
 NOT_RUN = "Not run yet: `make study-dense`."
 
 
@@ -244,7 +245,7 @@ def times(cells: list[dict]) -> str:
 
 
 def trials(rows: list[dict], task: str) -> str:
-    """Single trainings with other losses, heads and initial weights, tested on their own lenses."""
+    """Single trainings with other losses, parts and initial weights, tested on their own lenses."""
     found = [row for row in rows if row["task"] == task]
     classes = [*found[0].get("iou", ())]
     scores = dict(miou="mIoU", accuracy="accuracy", delta1="δ1", abs_rel="AbsRel")
