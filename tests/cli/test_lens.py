@@ -79,10 +79,7 @@ def refusal(capsys, *arguments):
 @pytest.mark.parametrize(
     "options, said",
     [
-        (
-            ["--fov_deg", "0"],
-            "--fov_deg must be above 0° and below 180° for a perspective view",
-        ),
+        (["--fov_deg", "0"], "--fov_deg must be above 0° and below 180° for a perspective view"),
         (["--fov_deg=180"], "--fov_deg must be above 0° and below 180° .*, got 180"),
         (["--view=cylindrical", "--fov_deg=361"], "at most 360° for a cylindrical view"),
         (["--yaw_deg=inf"], "--yaw_deg must be a finite number of degrees, got inf"),

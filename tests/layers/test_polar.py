@@ -8,7 +8,7 @@ import torch.nn.functional as F
 from helpers import CAMERAS
 
 from darswin.layers.embed import PolarPatchEmbed
-from darswin.layers.polar import PLACEMENTS, PolarGridSpec, PolarSample, polar_grid
+from darswin.layers.polar import PolarGridSpec, PolarSample, polar_grid
 from darswin.lens import Mei, Perspective, Polynomial, Spherical, cat
 from darswin.lens.spacing import SPACINGS
 from darswin.ops import polar_embed, polar_sample
@@ -57,28 +57,6 @@ def test_ring_borders_in_degrees(spacing, degrees):
     borders = polar_grid(lens, (64, 64), **SIZES, spacing=spacing).borders
     got = torch.rad2deg(lens.unproject(borders))[0, : len(degrees)]
     torch.testing.assert_close(got, torch.tensor(degrees, dtype=f64), rtol=0, atol=0.06)
-
-
-@pytest.mark.parametrize("placement", PLACEMENTS)
-@pytest.mark.parametrize("sample_spacing", [None, *SPACINGS])
-@pytest.mark.parametrize("spacing", SPACINGS)
-def test_samples_lie_in_their_patches(spacing, sample_spacing, placement):
-    lens = Spherical.from_fov(torch.tensor([0.0, 0.4, 1.0], dtype=f64), 2.8, 30.0)
-    grid = polar_grid(
-        lens, (64, 64), rings=5, sectors=7, samples=(4, 3), spacing=spacing,
-        sample_spacing=sample_spacing, placement=placement,
-    )  # fmt: skip
-    radii = grid.radii.unflatten(1, (5, 4))
-    inner, outer = grid.borders[:, :-1, None], grid.borders[:, 1:, None]
-    assert grid.radii.shape == (3, 20) and grid.borders.shape == (3, 6)
-    assert (radii >= inner - 1e-9).all() and (radii <= outer + 1e-9).all()
-    assert (grid.borders.diff(dim=1) > 0).all() and (radii.diff(dim=2) > 0).all()
-    turns = (grid.azimuths * 7 / (2 * math.pi)).unflatten(0, (7, 3))
-    if placement == "edges":
-        torch.testing.assert_close(radii[:, :, ::3], torch.cat((inner, outer), 2))
-        torch.testing.assert_close(turns[2], torch.tensor([2.0, 2.5, 3.0], dtype=f64))
-    else:
-        torch.testing.assert_close(turns[2], 2 + torch.tensor([1, 3, 5], dtype=f64) / 6)
 
 
 @pytest.mark.parametrize("sample_spacing", SPACINGS)
