@@ -234,14 +234,7 @@ def test_it_jitters_only_in_training_and_by_torchs_generator():
 
 @pytest.mark.parametrize(
     ("shape", "given", "last"),
-    [
-        ((2, 32, 33, 1), None, True),
-        ((2, 32, 33, 4), None, True),
-        ((2, 1, 32, 33), None, False),
-        ((2, 1, 32, 3), False, False),
-        ((2, 32, 3, 1), True, True),
-        ((2, 12, 32, 33), False, False),
-    ],
+    [((2, 32, 33, 4), None, True), ((2, 1, 32, 3), False, False), ((2, 32, 3, 1), True, True)],
 )
 def test_uint8_images(shape, given, last):
     images = torch.randint(256, shape, dtype=torch.uint8)
@@ -249,24 +242,6 @@ def test_uint8_images(shape, given, last):
     sample = PolarSample(4, 8, (3, 2), mean=0.4, std=0.2)
     expected = sample((planes / 255 - 0.4) / 0.2, LENSES)
     torch.testing.assert_close(sample(images, LENSES, given), expected, rtol=1e-4, atol=1e-4)
-
-
-@pytest.mark.slow
-def test_rays_keep_their_place_in_the_polar_image():
-    """Two cameras that see the same scene give the same polar image, up to interpolation."""
-    sample = PolarSample(8, 32, (4, 4), layout="image")
-    views = []
-    for lens in CAMERAS:
-        size = tuple(int(s) // 2 for s in lens.image_size[0].tolist())
-        lens = lens.resized(size).with_theta_max(1.3)
-        y, x = torch.meshgrid(*(torch.arange(float(s)) for s in size), indexing="ij")
-        theta, azimuth = lens.with_theta_max(None).unproject_pixels(torch.stack((x, y), -1))
-        scene = torch.stack((torch.cos(3 * theta), torch.cos(2 * azimuth), torch.sin(azimuth)))
-        views.append(sample(scene.nan_to_num(0)[None], lens))
-    grid = polar_grid(lens, size, rings=8, sectors=32, samples=(4, 4))
-    apart = (views[0] - views[1])[..., 2:, :].abs().amax((0, 2, 3))
-    # The centre, left out, has no azimuth. Errors are largest near it.
-    assert apart[0] < 1e-3 and apart.max() < 2e-2, (apart, grid.radii[0, :3])
 
 
 @pytest.mark.slow
@@ -288,7 +263,6 @@ def test_a_calibrated_camera_compiles(lens):
         (torch.zeros(2, 1, 32, 32), None, None, TypeError, "lens must be a darswin.lens"),
         ([1], LENSES, None, TypeError, "images must be a tensor, got list"),
         (torch.zeros(2, 1, 32, 3).byte(), LENSES, None, ValueError, "both .* pass channels_"),
-        (torch.zeros(2, 9, 32, 9).byte(), LENSES, None, ValueError, "neither .* pass channels"),
         (torch.zeros(2, 1, 9, 9), LENSES, "yes", TypeError, "channels_last must be True"),
         (torch.zeros(1, 1, 9, 9), CAMERAS[0], None, ValueError, r"\(H, W\) = \(966, 1280\), got"),
     ],
