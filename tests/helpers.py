@@ -23,10 +23,17 @@ def changed(name: str, old: str, new: str) -> str:
 FIXTURES = Path(__file__).parent / "fixtures"
 
 
+def stored(name):
+    """All tensors of a fixture, and the state dict among them."""
+    tensors = load_file(FIXTURES / f"{name}.safetensors")
+    return tensors, {
+        k.removeprefix("state."): v for k, v in tensors.items() if k.startswith("state.")
+    }
+
+
 def fixture(name):
     """A fixture of the released DarSwin: all tensors, the state dict, and the lenses."""
-    tensors = load_file(FIXTURES / f"official_{name}.safetensors")
-    state = {k.removeprefix("state."): v for k, v in tensors.items() if k.startswith("state.")}
+    tensors, state = stored(f"official_{name}")
     dist = tensors["dist"]
     if name == "poly":
         return tensors, state, OfficialPolynomial(dist, 32.0)

@@ -1,10 +1,13 @@
 """Examples of every lens model. Tests of all models use them; add a new model here."""
 
+import itertools
+import json
 import math
 from pathlib import Path
 
 import numpy as np
 import torch
+import yaml
 
 from darswin.lens import (
     BrownConrady,
@@ -46,6 +49,36 @@ def file_text(name: str) -> str:
 def double(*values):
     return torch.tensor(values, dtype=f64)
 
+
+# A camera of 1280 × 960 px, and its calibration in the forms of other tools.
+K = [[421.3, 0.0, 643.1], [0.0, 420.9, 478.6], [0.0, 0.0, 1.0]]
+FISHEYE = [-0.021, 0.0043, -0.0012, 0.00008]
+PLUMB_BOB = [-0.22, 0.05, 0.001, -0.002, 0.003]
+
+
+def opencv(**entries):
+    return json.dumps(dict(width=1280, height=960, K=K) | entries)
+
+
+def flat(*names, **entries):
+    """Single numbers. The names are those of coefficients."""
+    plane = {"fx": 421.3, "fy": 420.9, "cx": 643.1, "cy": 478.6, "width": 1280, "height": 960}
+    return json.dumps(plane | dict(zip(names, itertools.cycle(FISHEYE), strict=False)) | entries)
+
+
+def message(binning=(0, 0), roi=(0, 0, 0, 0)):
+    """A message of ROS."""
+    sides = zip(("x_offset", "y_offset", "width", "height"), roi, strict=True)
+    return yaml.safe_dump(
+        dict(height=960, width=1280, distortion_model="plumb_bob", d=PLUMB_BOB,
+             k=np.ravel(K).tolist(), binning_x=binning[0], binning_y=binning[1],
+             roi=dict(sides, do_rectify=False))
+    )  # fmt: skip
+
+
+FRONT = Polynomial(
+    [350.4, -17.5, 27.5, -2.4], math.radians(95), [641.3, 486.1], image_size=(966, 1280)
+)
 
 OCAM_INVERSE = (605.752533, 505.883847, 86.351154, 61.948168, 71.032826, 13.486967, 10.437652,
                 26.947608, 4.280596, -7.524929, 1.280191, 3.803522, 0.992970)  # fmt: skip

@@ -65,11 +65,6 @@ def test_a_description_of_a_lens_loads_nothing_heavy(with_torch):
     assert not (modules - with_torch) & HEAVY
 
 
-@pytest.mark.slow
-def test_importing_the_operators_registers_them():
-    loaded("import darswin.ops, torch; torch.ops.darswin.polar_sample")
-
-
 def test_every_public_name_is_found():
     names: dict[str, object] = {}
     exec("from darswin import *", names)

@@ -43,10 +43,7 @@ def scenes(tmp_path_factory):
         ("--data.train_lenses low --data.lens {}", "--data.train_lenses warps pictures through"),
         ("--data.test_lenses=low --data.lens {}", "--data.test_lenses warps pictures through"),
         ("--xi 0.3 --data.lens {}", "--xi warps pictures through lenses, and --data.lens says"),
-        (
-            f"--data.lens {CALIBRATIONS / 'kalibr_fov.yaml'}",
-            "choose one with --data.camera: ",
-        ),
+        (f"--data.lens {CALIBRATIONS / 'kalibr_fov.yaml'}", "choose one with --data.camera: "),
         ("--model.learning_rate 0", "--model.learning_rate must be above 0, got 0"),
         ("--model.options {foo:1}", "--model.options "),
         ("--model.options {embed_dim:1099511627776}", "not enough memory: a smaller --data.batch"),

@@ -14,17 +14,12 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from lens_examples import FILES
+from lens_examples import FILES, FRONT
 
 from darswin.cli import lens as cli
 from darswin.cli.main import main
 from darswin.lens import Perspective, Polynomial, from_dict, to_dict
 from darswin.viz import plot
-
-FRONT = Polynomial(
-    [350.4, -17.5, 27.5, -2.4], math.radians(95), [641.3, 486.1],
-    image_size=(966, 1280),
-)  # fmt: skip
 
 
 @pytest.fixture
@@ -79,10 +74,7 @@ def refusal(capsys, *arguments):
 @pytest.mark.parametrize(
     "options, said",
     [
-        (
-            ["--fov_deg", "0"],
-            "--fov_deg must be above 0° and below 180° for a perspective view",
-        ),
+        (["--fov_deg", "0"], "--fov_deg must be above 0° and below 180° for a perspective view"),
         (["--fov_deg=180"], "--fov_deg must be above 0° and below 180° .*, got 180"),
         (["--view=cylindrical", "--fov_deg=361"], "at most 360° for a cylindrical view"),
         (["--yaw_deg=inf"], "--yaw_deg must be a finite number of degrees, got inf"),

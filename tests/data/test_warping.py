@@ -11,14 +11,7 @@ from hypothesis import given
 
 from darswin.data import IGNORE, FullSize, RandomTurns, at_size, lens_at_size, warp, warp_map
 from darswin.data.warping import Turn, area_resized, turned_picture
-from darswin.lens import (
-    BrownConrady,
-    Equidistant,
-    KannalaBrandt,
-    Perspective,
-    Spherical,
-    load,
-)
+from darswin.lens import BrownConrady, Equidistant, KannalaBrandt, Perspective, Spherical, load
 from darswin.lens.orientation import upright
 
 # -- through another lens ---------------------------------------------------------------------

@@ -8,7 +8,7 @@ import torch.nn.functional as F
 from helpers import CAMERAS
 
 from darswin.layers.embed import PolarPatchEmbed
-from darswin.layers.polar import PLACEMENTS, PolarGridSpec, PolarSample, polar_grid
+from darswin.layers.polar import PolarGridSpec, PolarSample, polar_grid
 from darswin.lens import Mei, Perspective, Polynomial, Spherical, cat
 from darswin.lens.pixels import pixel_rays
 from darswin.lens.spacing import SPACINGS
@@ -58,28 +58,6 @@ def test_ring_borders_in_degrees(spacing, degrees):
     borders = polar_grid(lens, (64, 64), **SIZES, spacing=spacing).borders
     got = torch.rad2deg(lens.unproject(borders))[0, : len(degrees)]
     torch.testing.assert_close(got, torch.tensor(degrees, dtype=f64), rtol=0, atol=0.06)
-
-
-@pytest.mark.parametrize("placement", PLACEMENTS)
-@pytest.mark.parametrize("sample_spacing", [None, *SPACINGS])
-@pytest.mark.parametrize("spacing", SPACINGS)
-def test_samples_lie_in_their_patches(spacing, sample_spacing, placement):
-    lens = Spherical.from_fov(torch.tensor([0.0, 0.4, 1.0], dtype=f64), 2.8, 30.0)
-    grid = polar_grid(
-        lens, (64, 64), rings=5, sectors=7, samples=(4, 3), spacing=spacing,
-        sample_spacing=sample_spacing, placement=placement,
-    )  # fmt: skip
-    radii = grid.radii.unflatten(1, (5, 4))
-    inner, outer = grid.borders[:, :-1, None], grid.borders[:, 1:, None]
-    assert grid.radii.shape == (3, 20) and grid.borders.shape == (3, 6)
-    assert (radii >= inner - 1e-9).all() and (radii <= outer + 1e-9).all()
-    assert (grid.borders.diff(dim=1) > 0).all() and (radii.diff(dim=2) > 0).all()
-    turns = (grid.azimuths * 7 / (2 * math.pi)).unflatten(0, (7, 3))
-    if placement == "edges":
-        torch.testing.assert_close(radii[:, :, ::3], torch.cat((inner, outer), 2))
-        torch.testing.assert_close(turns[2], torch.tensor([2.0, 2.5, 3.0], dtype=f64))
-    else:
-        torch.testing.assert_close(turns[2], 2 + torch.tensor([1, 3, 5], dtype=f64) / 6)
 
 
 @pytest.mark.parametrize("sample_spacing", SPACINGS)
@@ -296,14 +274,7 @@ def test_it_jitters_only_in_training_and_by_torchs_generator():
 
 @pytest.mark.parametrize(
     ("shape", "given", "last"),
-    [
-        ((2, 32, 33, 1), None, True),
-        ((2, 32, 33, 4), None, True),
-        ((2, 1, 32, 33), None, False),
-        ((2, 1, 32, 3), False, False),
-        ((2, 32, 3, 1), True, True),
-        ((2, 12, 32, 33), False, False),
-    ],
+    [((2, 32, 33, 4), None, True), ((2, 1, 32, 3), False, False), ((2, 32, 3, 1), True, True)],
 )
 def test_uint8_images(shape, given, last):
     images = torch.randint(256, shape, dtype=torch.uint8)
@@ -311,24 +282,6 @@ def test_uint8_images(shape, given, last):
     sample = PolarSample(4, 8, (3, 2), mean=0.4, std=0.2)
     expected = sample((planes / 255 - 0.4) / 0.2, LENSES)
     torch.testing.assert_close(sample(images, LENSES, given), expected, rtol=1e-4, atol=1e-4)
-
-
-@pytest.mark.slow
-def test_rays_keep_their_place_in_the_polar_image():
-    """Two cameras that see the same scene give the same polar image, up to interpolation."""
-    sample = PolarSample(8, 32, (4, 4), layout="image")
-    views = []
-    for lens in CAMERAS:
-        size = tuple(int(s) // 2 for s in lens.image_size[0].tolist())
-        lens = lens.resized(size).with_theta_max(1.3)
-        y, x = torch.meshgrid(*(torch.arange(float(s)) for s in size), indexing="ij")
-        theta, azimuth = lens.with_theta_max(None).unproject_pixels(torch.stack((x, y), -1))
-        scene = torch.stack((torch.cos(3 * theta), torch.cos(2 * azimuth), torch.sin(azimuth)))
-        views.append(sample(scene.nan_to_num(0)[None], lens))
-    grid = polar_grid(lens, size, rings=8, sectors=32, samples=(4, 4))
-    apart = (views[0] - views[1])[..., 2:, :].abs().amax((0, 2, 3))
-    # The centre, left out, has no azimuth. Errors are largest near it.
-    assert apart[0] < 1e-3 and apart.max() < 2e-2, (apart, grid.radii[0, :3])
 
 
 @pytest.mark.slow
@@ -350,7 +303,6 @@ def test_a_calibrated_camera_compiles(lens):
         (torch.zeros(2, 1, 32, 32), None, None, TypeError, "lens must be a darswin.lens"),
         ([1], LENSES, None, TypeError, "images must be a tensor, got list"),
         (torch.zeros(2, 1, 32, 3).byte(), LENSES, None, ValueError, "both .* pass channels_"),
-        (torch.zeros(2, 9, 32, 9).byte(), LENSES, None, ValueError, "neither .* pass channels"),
         (torch.zeros(2, 1, 9, 9), LENSES, "yes", TypeError, "channels_last must be True"),
         (torch.zeros(1, 1, 9, 9), CAMERAS[0], None, ValueError, r"\(H, W\) = \(966, 1280\), got"),
     ],

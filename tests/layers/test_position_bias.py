@@ -3,11 +3,7 @@ import math
 import torch
 
 from darswin import polar_grid
-from darswin.layers.position_bias import (
-    AngularRelativeBias,
-    FourierBias,
-    ring_angles,
-)
+from darswin.layers.position_bias import AngularRelativeBias, FourierBias, ring_angles
 from darswin.lens import Spherical
 
 LENS = Spherical.from_fov([0.2, 0.9], 2.6, 16.0)

@@ -4,7 +4,6 @@ import pytest
 import torch
 from lens_examples import ASIDE, calibrated, double, example, f64
 from scipy.interpolate import PchipInterpolator
-from torch.utils.data import DataLoader, Dataset
 
 from darswin.lens import (
     MODELS,
@@ -23,20 +22,6 @@ from darswin.lens import (
 def alone(name, camera=None):
     """A calibrated lens without its image."""
     return calibrated(name, camera).replace(center=None, affine=None, image_size=None)
-
-
-class Lenses(Dataset):
-    def __len__(self):
-        return 5
-
-    def __getitem__(self, index):
-        return {"image": torch.zeros(1), "lens": Spherical.from_fov(index / 5, 2.6, 16.0)}
-
-
-def test_a_dataloader_batches_lenses():
-    batches = list(DataLoader(Lenses(), batch_size=3))
-    assert [len(b["lens"]) for b in batches] == [3, 2]
-    assert batches[1]["lens"].xi.tolist() == pytest.approx([0.6, 0.8])
 
 
 def test_stacking_needs_the_same_frame():

@@ -13,19 +13,22 @@ from lens_examples import (
     CALIBRATIONS,
     DEGREES,
     FILES,
+    FISHEYE,
+    PLUMB_BOB,
+    K,
     assert_projects,
     double,
     f64,
     file_text,
+    flat,
     loads,
+    message,
+    opencv,
     points_around,
 )
 
 from darswin.lens import EnhancedUnified, load, load_all, to_dict
 
-K = [[421.3, 0.0, 643.1], [0.0, 420.9, 478.6], [0.0, 0.0, 1.0]]
-FISHEYE = [-0.021, 0.0043, -0.0012, 0.00008]
-PLUMB_BOB = [-0.22, 0.05, 0.001, -0.002, 0.003]
 RATIONAL = [0.2, 0.05, 0.001, -0.002, 0.003, 0.25, 0.04, 0.002]
 SIZE = dict(image_size=(960, 1280), dtype=f64)  # for a file without an image size
 
@@ -294,7 +297,6 @@ def test_enhanced_unified_with_a_beta_below_0(alpha, beta, dtype):
 
 # -- files of other tools and short scripts -----------------------------------------------------
 
-PLANE = {"fx": 421.3, "fy": 420.9, "cx": 643.1, "cy": 478.6, "width": 1280, "height": 960}
 RADTAN = dict(model="BrownConrady", radial=[-0.22, 0.05], tangential=[0.001, -0.002])
 PLUMB = dict(RADTAN, radial=[-0.22, 0.05, 0.003], image_size=[960, 1280], center=[643.1, 478.6])
 KB = dict(model="KannalaBrandt", radial=FISHEYE, image_size=[960, 1280])
@@ -317,14 +319,6 @@ NAMES = ("D", "d", "distortion_coefficients", "distortion_coefs", "distCoeffs", 
 BESIDE = dict(R=[1.0] * 9, P1=[1.0] * 12, R1=[1.0] * 9, board_distance=0.3, p=[1.0] * 12,
               undistorted_size=[9, 9], distortion_model="plumb_bob", dist_note="none", d2=[],
               avg_reprojection_error=0.3, D_std_dev=[0.1] * 5)  # fmt: skip
-
-
-def opencv(**entries):
-    return json.dumps(dict(width=1280, height=960, K=K) | entries)
-
-
-def flat(*names, **entries):
-    return json.dumps(PLANE | dict(zip(names, FISHEYE)) | entries)  # noqa: B905
 
 
 def fisheye_or_pinhole(**entries):
@@ -409,15 +403,6 @@ def test_arrays_of_numpy(save, tmp_path):
     save(path, K=K, D=np.array(PLUMB_BOB, dtype=object))
     with pytest.raises(ValueError, match="a camera without coefficients"):
         load(path)
-
-
-def message(binning=(0, 0), roi=(0, 0, 0, 0), **entries):
-    names = ("x_offset", "y_offset", "width", "height")
-    return yaml.safe_dump(
-        dict(height=960, width=1280, distortion_model="plumb_bob", d=PLUMB_BOB,
-             k=np.ravel(K).tolist(), binning_x=binning[0], binning_y=binning[1],
-             roi=dict(zip(names, roi, strict=True)) | {"do_rectify": False}) | entries
-    )  # fmt: skip
 
 
 @pytest.mark.parametrize(

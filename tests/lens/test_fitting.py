@@ -1,7 +1,9 @@
 import math
 
+import lens_examples
 import pytest
 import torch
+from lens_examples import double, f64
 
 from darswin.lens import (
     MODELS,
@@ -9,17 +11,12 @@ from darswin.lens import (
     EnhancedUnified,
     KannalaBrandt,
     Mei,
-    Polynomial,
     Spherical,
     cat,
     fit,
 )
 
-f64 = torch.float64
-FRONT = Polynomial(
-    torch.tensor([350.4, -17.5, 27.5, -2.4], dtype=f64), math.radians(95), [641.3, 486.1],
-    affine=[[1.0, 0.0], [0.0, 1.1]], image_size=(966, 1280),
-)  # fmt: skip
+FRONT = lens_examples.FRONT.to(f64).replace(affine=double(1, 0, 0, 1.1).view(1, 2, 2))
 
 
 @pytest.mark.parametrize(

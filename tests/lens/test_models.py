@@ -1,6 +1,5 @@
 """The lens models: their curves, their limits, derivatives, constructors and errors."""
 
-import json
 import math
 
 import pytest
@@ -23,7 +22,6 @@ from darswin.lens import (
     Spherical,
     Stereographic,
     Tabulated,
-    from_dict,
     to_dict,
 )
 from darswin.lens.ideal import FocalLens
@@ -258,13 +256,6 @@ def test_a_class_is_a_model_unless_it_says_otherwise():
     assert "OfNoName" not in MODELS and len(OfNoName(0.5, 10.0)) == 1
 
 
-def test_another_theta_max():
-    lens = Spherical([0.5, 2.0], 10.0, 1.0)
-    assert torch.equal(lens.with_theta_max(None).theta_max, lens.theta_limit)
-    assert lens.with_theta_max(1.5).theta_max.tolist() == [1.5, 1.5]
-    assert lens.theta_max.tolist() == [1.0, 1.0]
-
-
 def test_angles_at_the_sides_of_the_image():
     lens = Polynomial([350.4, -17.5, 27.5, -2.4], None, [639.5, 482.5],
                       image_size=(966, 1280))  # fmt: skip
@@ -304,14 +295,3 @@ def test_arguments_by_place_and_by_name():
     made = Mei(0.5, 300.0, [0.1, 0.2], 1.2, [3.0, 4.0])
     named = Mei(xi=0.5, focal=300.0, radial=[0.1, 0.2], theta_max=1.2, center=[3.0, 4.0])
     assert made.same_as(named) and not hasattr(Polynomial, "from_fov")
-
-
-def test_as_json_and_back():
-    lens = Spherical(double(0.1), 300.0, 1.3, [3.0, 4.0], image_size=(480, 640))
-    described = to_dict(lens)
-    assert described == {
-        "model": "Spherical", "xi": 0.1, "focal": 300.0, "theta_max": 1.3, "center": [3.0, 4.0],
-        "image_size": [480, 640],
-    }  # fmt: skip
-    again = from_dict(json.loads(json.dumps(described)))
-    assert to_dict(again) == to_dict(lens.to(torch.float32))

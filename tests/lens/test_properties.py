@@ -143,8 +143,12 @@ def test_samples_of_any_grid_stand_in_their_patches(lens, rings, sectors, data):
     assert (points.diff(dim=2) >= -slack).all() and (high - low > -slack).all()
     torch.testing.assert_close(grid.borders[:, -1], lens.r_max, rtol=1e-6, atol=1e-6)
     azimuths = grid.azimuths.unflatten(0, (sectors, samples[1])) * (sectors / (2 * math.pi))
-    ends = azimuths - torch.arange(sectors, dtype=f64)[:, None]
-    assert (ends >= -1e-9).all() and (ends <= 1 + 1e-9).all()
+    places = (torch.arange(samples[1], dtype=f64) + 0.5) / samples[1]  # in a sector
+    if placement == "edges":
+        assert ((points[..., [0, -1]] - torch.cat((low, high), 2)).abs() <= slack).all()
+        places = torch.linspace(0, 1, samples[1], dtype=f64)
+    expected = torch.arange(sectors, dtype=f64)[:, None] + places
+    torch.testing.assert_close(azimuths, expected, rtol=0, atol=1e-9)
     if spacing == "theta":
         steps = lens.project(lens.theta_max[:, None] * torch.linspace(0, 1, rings + 1, dtype=f64))
         torch.testing.assert_close(grid.borders, steps, rtol=1e-9, atol=1e-9)

@@ -215,5 +215,3 @@ def test_commands(tmp_path, capsys):
     main(["lens", "info", woodscape])
     origin = "WoodScape, with the centre of the upper left pixel at (0.5, 0.5)\n"
     assert f"format          {origin}" in capsys.readouterr().out
-    main(["lens", "info", calib, "--camera=1"])
-    assert "camera          cam1, of 2: cam0, cam1\n" in capsys.readouterr().out

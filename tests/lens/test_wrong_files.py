@@ -13,9 +13,8 @@ import cv2
 import numpy as np
 import pytest
 import torch
-import yaml
 from helpers import changed
-from lens_examples import FILES, f64, file_text, loads
+from lens_examples import FILES, f64, file_text, flat, loads, message, opencv
 
 from darswin.lens import load, load_all
 
@@ -24,23 +23,6 @@ D = [-0.3, 0.1, 0.001, -0.002, 0.01]
 FRAME = {"fl_x": 800.0, "fl_y": 800.0, "cx": 320.0, "cy": 240.0, "w": 640, "h": 480}
 COLMAP = "".join(f"{i} SIMPLE_FISHEYE 640 480 {100 * i} 320 240\n" for i in (1, 2, 5, 7))
 TUMVI = file_text("kalibr_tumvi.yaml")
-
-
-def opencv(**entries):
-    return json.dumps(dict(width=640, height=480, K=K) | entries)
-
-
-def flat(*names, **entries):
-    plane = {"fx": 421.3, "fy": 420.9, "cx": 643.1, "cy": 478.6, "width": 1280, "height": 960}
-    return json.dumps(plane | dict.fromkeys(names, 0.01) | entries)
-
-
-def message(binning=(0, 0), roi=(0, 0, 0, 0), **entries):
-    names = ("x_offset", "y_offset", "width", "height")
-    return yaml.safe_dump(
-        dict(height=480, width=640, distortion_model="plumb_bob", d=D, k=K, binning_x=binning[0],
-             binning_y=binning[1], roi=dict(zip(names, roi, strict=True))) | entries
-    )  # fmt: skip
 
 
 # For each file: the replaced text, its replacement, and the words of the error.
@@ -170,9 +152,9 @@ TEXTS = (
     # The region of the sensor.
     (message((-1, 1)), "binning_x must be a whole number of pixels, 0 to"),
     (message((1, 1.5)), "binning_y must be a whole number of pixels, 0 to"),
-    (message((1, 481)), "the binning of 1×481 pixels leaves none"),
+    (message((1, 961)), "the binning of 1×961 pixels leaves none"),
     (message(roi=(5, 0, 0, 0)), "roi must be a part of the image of 1 pixel or more"),
-    (message(roi=(0, 0, 641, 9)), "641×9 px at (0, 0)"),
+    (message(roi=(0, 0, 1281, 9)), "1281×9 px at (0, 0)"),
     (message(roi=(-1, 0, 10, 9)), "roi.x_offset must be a whole number of pixels"),
     (message(roi=(0, 0, "a", 9)), "roi.width must be a whole number"),
     # Coefficients that are missing or have an unknown name are never ignored.

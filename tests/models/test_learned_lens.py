@@ -77,28 +77,3 @@ def test_gradients_are_those_of_finite_differences_and_of_their_two_parts(model,
     known = Spherical.from_fov(values["focal"] / 20, torch.tensor([2.6], dtype=f64), CIRCLE)
     points, positions = model.prepare(known, (32, 32))
     assert points.radii.requires_grad and not any(t.requires_grad for (t,) in positions)
-
-
-def test_a_lens_is_found_by_descent_on_a_known_scene(model):
-    # The target is the features of a scene through the true lens. Descent starts far from it.
-    y, x = torch.meshgrid(*[torch.arange(32.0, dtype=f64)] * 2, indexing="ij")
-    scene = torch.stack((torch.sin(x / 4 + y / 9), torch.cos(y / 5 - x / 12)))[None]
-    with torch.no_grad():
-        truth = Spherical(torch.tensor([0.8], dtype=f64), 17.0, 1.2, center=[15.2, 16.4])
-        target = model.forward_features(scene, truth)
-    parameters = leaves(dict(xi=[0.3], focal=[12.0], center=[[17.0, 14.5]]))
-    optimizer = torch.optim.LBFGS(list(parameters.values()), max_iter=60, tolerance_change=1e-12,
-                                  line_search_fn="strong_wolfe")  # fmt: skip
-
-    def closure():
-        optimizer.zero_grad()
-        found = model.forward_features(scene, Spherical(theta_max=1.2, **parameters))
-        error = (found - target).square().mean()
-        error.backward()
-        return error
-
-    optimizer.step(closure)
-    theta = torch.linspace(0, 1.2, 20, dtype=f64)[None]
-    found = Spherical(theta_max=1.2, **parameters)
-    torch.testing.assert_close(found.center, truth.center, rtol=0, atol=1e-3)
-    torch.testing.assert_close(found.project(theta), truth.project(theta), rtol=0, atol=1e-3)

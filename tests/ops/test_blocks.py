@@ -121,6 +121,13 @@ def stage(dim=24, heads=3, map_size=(8, 16), window=(4, 8), depth=3):
     return nn.ModuleList(blocks).requires_grad_(False).eval()
 
 
+every_stage = pytest.mark.parametrize(
+    "sizes",
+    [{}, dict(dim=10, heads=1, map_size=(1, 6), window=(1, 3)), dict(dim=64, heads=2, depth=1)],
+    ids=str,
+)
+
+
 def run(blocks, x):
     branch = None
     for block in blocks:
@@ -129,11 +136,7 @@ def run(blocks, x):
 
 
 @pytest.mark.parametrize("batch", [0, 1, 3])
-@pytest.mark.parametrize(
-    "sizes",
-    [{}, dict(dim=10, heads=1, map_size=(1, 6), window=(1, 3)), dict(dim=64, heads=2, depth=1)],
-    ids=str,
-)
+@every_stage
 def test_blocks_are_those_of_the_layers(batch, sizes):
     blocks = stage(**sizes)
     map_size, dim = blocks[0].attn.map_size, blocks[0].attn.dim

@@ -8,13 +8,7 @@ import torch
 from cases import SMALL, raw_calls
 from torch._subclasses import FakeTensorMode
 
-from darswin.ops import (
-    polar_embed,
-    polar_sample,
-    polar_to_image,
-    use_reference,
-    window_attention,
-)
+from darswin.ops import polar_embed, polar_sample, polar_to_image, use_reference, window_attention
 
 zeros, ones = torch.zeros, torch.ones
 GRID = dict(

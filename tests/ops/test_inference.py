@@ -137,16 +137,11 @@ def test_attention_quantized_is_that_of_floats(sizes):
 # -- transpose_sum ---------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    "shape", [(1, 1), (37, 5), (1024, 96), (131_072, 5), (1_000_000, 5), (0, 8), (8, 0)], ids=str
-)
-def test_transpose_and_sums(shape):
+@pytest.mark.parametrize("shape", [(1024, 96), (131_072, 5), (1_000_000, 5)], ids=str)
+def test_transpose_and_long_sums(shape):
     x = torch.randn(shape) + 1
     transposed, sums = transpose_sum(x)
     assert torch.equal(transposed, x.t()) and transposed.is_contiguous()
-    if x.numel() == 0:
-        assert torch.equal(sums, torch.zeros(shape[1]))
-        return
     exact, own = x.double().sum(0), x.sum(0)
     rounding = torch.finfo(torch.float32).eps * x.abs().sum(0).max()
     rounding *= 4 if len(x) < 10**5 else 1

@@ -64,16 +64,6 @@ def test_points_thrown_far_outside_are_zero():
         assert case.run(**away).isfinite().all()
 
 
-@pytest.mark.parametrize("far", [0.5, 40.0, 1e4])
-def test_bands_get_what_offsets_bring_them(threads, far):
-    case = sampling(1, size=(200, 180), rows=80, columns=160, samples=(8, 8), far=far, dtype=f64,
-                    **GENERAL)  # fmt: skip
-    threads(1)
-    expected = results(case, is_reference=True)
-    threads(7)
-    assert_equal_results(results(case), expected, 1e-9)
-
-
 def test_accuracy_rule_where_all_points_meet():
     # All points of the innermost rings fall into one pixel, which gives the longest sums.
     def make():

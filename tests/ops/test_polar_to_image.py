@@ -7,9 +7,7 @@ import pytest
 import torch
 from cases import assert_equal_results, polar_map, results
 
-from darswin.layers.polar import polar_grid
-from darswin.lens import Equidistant
-from darswin.ops import polar_sample, polar_to_image, polar_to_image_plan, use_reference
+from darswin.ops import polar_to_image, polar_to_image_plan, use_reference
 
 
 @pytest.mark.parametrize("reference", [False, True])
@@ -95,19 +93,6 @@ def test_equals_scipy():
         with use_reference(reference):
             image = polar_to_image(x, radii, center, (size, size), r_max=rings * step)
         np.testing.assert_allclose(image[0].numpy(), expected, atol=1e-12)
-
-
-def test_undoes_polar_sample_on_a_smooth_image():
-    size = 64
-    wide = Equidistant.from_fov(3.0, size / 2)
-    y, x = torch.meshgrid(*(torch.arange(size) / size,) * 2, indexing="ij")
-    image = torch.stack((torch.sin(5 * x + 2 * y), torch.cos(4 * y - x)))[None]
-    grid = polar_grid(wide, (size, size), rings=32, sectors=128, samples=(1, 1))
-    polar = polar_sample(image, grid.radii, grid.azimuths, grid.center, samples=(1, 1))
-    found = polar_to_image(polar, grid.radii, grid.center, (size, size), r_max=size / 2)
-    r = torch.hypot(x * size - 31.5, y * size - 31.5)
-    assert (found - image).abs().amax(1)[0][r <= grid.radii[0, -1]].max() < 0.015
-    assert found[0, :, r > size / 2].count_nonzero() == 0
 
 
 def test_the_pole_and_the_axes(device):

@@ -7,7 +7,7 @@ import torch
 from cases import assert_same_bits_on_any_number_of_threads
 from hypothesis import example, given
 from hypothesis import strategies as st
-from test_blocks import stage
+from test_blocks import every_stage, stage
 
 from darswin.deploy.packed import (
     PackedBlocks,
@@ -117,11 +117,7 @@ def step_by_step(blocks, tables, x):
 @needs_kernel
 @pytest.mark.parametrize("batch", [0, 1, 3])
 @pytest.mark.parametrize("names", [LAYERS, LAYERS[:1], LAYERS[1:2], LAYERS[2:], ("mlp.fc2",)])
-@pytest.mark.parametrize(
-    "sizes",
-    [{}, dict(dim=10, heads=1, map_size=(1, 6), window=(1, 3)), dict(dim=64, heads=2, depth=1)],
-    ids=str,
-)
+@every_stage
 def test_blocks_are_those_of_the_layers(batch, names, sizes):
     blocks, tables = quantized_stage(names, **sizes)
     x = torch.randn(batch, *blocks[0].attn.map_size, blocks[0].attn.dim)

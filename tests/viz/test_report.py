@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from lens_examples import FRONT
 
 from darswin.lens import Mei, Perspective, Polynomial, Spherical
 from darswin.viz.report import (
@@ -15,10 +16,6 @@ from darswin.viz.report import (
     pixels_per_degree,
 )
 
-FRONT = Polynomial(
-    [350.4, -17.5, 27.5, -2.4], math.radians(95), [641.3, 486.1],
-    image_size=(966, 1280),
-)  # fmt: skip
 MEI = Mei(
     2.35, 1390.0, (0.032, 2.4),
     math.radians(102), (708.5, 697.0), image_size=(1400, 1400),

@@ -3,8 +3,9 @@ import math
 import numpy as np
 import pytest
 import torch
+from lens_examples import FRONT
 
-from darswin.lens import KannalaBrandt, Mei, Perspective, Polynomial
+from darswin.lens import KannalaBrandt, Mei, Perspective
 from darswin.lens.pixels import OUTSIDE
 from darswin.viz.views import (
     cylindrical,
@@ -24,10 +25,7 @@ VIEWS = {
 
 
 def front():
-    return Polynomial(
-        [350.4, -17.5, 27.5, -2.4], math.radians(110), [641.3, 486.1],
-        image_size=(966, 1280),
-    ).to(torch.float64)  # fmt: skip
+    return FRONT.with_theta_max(math.radians(110)).to(torch.float64)
 
 
 def mei():
