@@ -11,12 +11,10 @@ from functools import cache
 
 import pytest
 import torch
-from helpers import CAMERAS, FIXTURES, network, relative_error, side_of
-from safetensors.torch import load_file
+from helpers import CAMERAS, network, relative_error, side_of
 from torch._dynamo.testing import CompileCounter
 
 from darswin import create_model, list_models, optimize
-from darswin.compat import load_timm_swin
 from darswin.layers.linear import autotune_results
 from darswin.lens import KannalaBrandt, Polynomial, Spherical, cat
 from darswin.models import ModelCard, load_model, registry, save_model
@@ -661,16 +659,6 @@ def test_wrong_arguments_of_intermediates():
     with pytest.raises(ValueError, match="features_only is for encoders, but swin_unet_nano is"):
         create_model("swin_unet_nano", features_only=True)
     assert take_indices(4, 2) == [2, 3] and take_indices(4, (-1, 0)) == [3, 0]
-
-
-@torch.no_grad()
-def test_the_last_intermediate_of_timms_swin():
-    tensors = load_file(FIXTURES / "timm_swin.safetensors")
-    state = {k.removeprefix("state."): v for k, v in tensors.items() if k.startswith("state.")}
-    (last,) = load_timm_swin(state).forward_intermediates(
-        tensors["images"], indices=1, norm=True, intermediates_only=True
-    )
-    assert (last - tensors["out.features"]).abs().max() <= 1e-5
 
 
 # -- graphs ---------------------------------------------------------------------------------------
