@@ -24,7 +24,7 @@ void run(AddNormArgs<S, Out> args, const Tensor& x, const Tensor& weight, const 
   args.width = weight.numel();
   if (x.numel() == 0) return;
   const int64_t rows = x.numel() / args.width, each = std::max<int64_t>(kGrain / args.width, 1);
-  parallel_ranges((rows + each - 1) / each, [&](int64_t begin, int64_t end) {
+  parallel_ranges(units(rows, each), [&](int64_t begin, int64_t end) {
     kernels<AddNormKernels<S, Out>>().rows(args, begin * each, std::min(end * each, rows));
   });
 }

@@ -70,7 +70,7 @@ void multiply(const X* x, int64_t rows, const Layer& layer, void* out, After aft
   constexpr double kPerMicrosecond = std::is_same_v<X, float> ? 5e4 : 1e5;
   const double work = static_cast<double>(rows) * depth * columns;
   const int64_t threads = threads_for(work / kPerMicrosecond);
-  const int64_t tiles = (rows + kRows - 1) / kRows, panels = panel_count(columns);
+  const int64_t tiles = units(rows, kRows), panels = panel_count(columns);
   if (panels < threads || tiles >= 16 * threads) {
     parallel_ranges(tiles, threads, [&](int64_t begin, int64_t end) {
       kernel(args, begin * kRows, std::min(end * kRows, rows), 0, panels);

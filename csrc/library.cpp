@@ -54,7 +54,6 @@ STABLE_TORCH_LIBRARY(darswin, m) {
   m.def(
       "_blocks_(Tensor(a!) x, Tensor[] parameters, Tensor[] tables, int[] windows, int heads, "
       "int mlp_dim, float eps) -> ()");
-  m.def("_transpose_sum(Tensor x) -> (Tensor, Tensor)");
 }
 
 int64_t darswin::num_threads() { return torch::stable::get_num_threads(); }

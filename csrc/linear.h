@@ -31,15 +31,11 @@ constexpr int64_t kDepths = sizeof(float) / sizeof(X);  // of a word
 template <typename X>
 constexpr int64_t kParameters = std::is_same_v<X, float> ? 1 : 3;  // of a column
 
-inline int64_t padded_columns(int64_t columns) {
-  return (columns + kPanelUnit - 1) / kPanelUnit * kPanelUnit;
-}
-inline int64_t panel_count(int64_t columns) {
-  return (padded_columns(columns) + kPanel - 1) / kPanel;
-}
+inline int64_t padded_columns(int64_t columns) { return round_up(columns, kPanelUnit); }
+inline int64_t panel_count(int64_t columns) { return units(padded_columns(columns), kPanel); }
 template <typename X>
 inline int64_t depth_words(int64_t depth) {
-  return (depth + kDepths<X> - 1) / kDepths<X>;
+  return units(depth, kDepths<X>);
 }
 // Returns the words of the parameters and the panels.
 template <typename X>

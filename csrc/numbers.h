@@ -5,6 +5,14 @@
 #include <type_traits>
 
 namespace darswin {
+namespace {
+
+// Returns how many units n takes up.
+constexpr int64_t units(int64_t n, int64_t unit) { return (n + unit - 1) / unit; }
+// Rounds n up to a multiple of `unit`.
+constexpr int64_t round_up(int64_t n, int64_t unit) { return units(n, unit) * unit; }
+
+}  // namespace
 
 // The upper half of a float32.
 struct bfloat16 {

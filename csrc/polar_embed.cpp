@@ -8,8 +8,6 @@
 namespace darswin {
 namespace {
 
-int64_t padded(int64_t n) { return (n + kRowUnit - 1) / kRowUnit * kRowUnit; }
-
 // Returns a weight (D, S_r * S_phi * C) or a bias (D,), contiguous and in the type used for
 // computing.
 template <typename T>
@@ -78,7 +76,7 @@ Tensor forward(PolarCall<T>& call, Tensor weight, MaybeTensor bias) {
   const Tensor out = new_tensor(output_sizes(call, embed.features), call.output_type());
   if (out.numel() == 0) return out;
   args.out = out.mutable_data_ptr();
-  const int64_t depth = call.token_size(), wide = padded(embed.features);
+  const int64_t depth = call.token_size(), wide = round_up(embed.features, kRowUnit);
   std::vector<T> transposed(depth * wide);
   transpose(pointer<T>(weight), embed.features, depth, transposed.data(), wide);
   embed.transposed = transposed.data();
@@ -99,7 +97,8 @@ template <typename T>
 std::tuple<Tensor, Tensor> weight_gradients(const PolarCall<T>& call,
                                             const PolarEmbedArgs<T>& embed) {
   const auto& kernel = kernels<PolarEmbedKernels<T>>();
-  const int64_t depth = call.token_size(), row = padded(depth), features = embed.features;
+  const int64_t depth = call.token_size(), row = round_up(depth, kRowUnit),
+                features = embed.features;
   const int64_t items = call.points() ? call.batch * call.rings() : 0;
   const int64_t chunks = std::min<int64_t>(items, 16);
   std::vector<T> weights(chunks * features * row);
@@ -148,7 +147,7 @@ PolarGradients sampling_gradients(PolarCall<T>& call, PolarEmbedArgs<T>& embed,
                                   const Tensor& weight, const PolarWanted& wanted) {
   const auto& kernel = kernels<PolarEmbedKernels<T>>();
   const int64_t depth = call.token_size(), images = call.sampled_images();
-  const Tensor rows = torch::stable::pad(weight, Sizes{0, padded(depth) - depth});
+  const Tensor rows = torch::stable::pad(weight, Sizes{0, round_up(depth, kRowUnit) - depth});
   embed.weight = pointer<T>(rows);
   const int64_t threads = count_threads(call, embed.features);
   if (!wanted.lens && !wanted.offsets && call.count_bands() == 1) {

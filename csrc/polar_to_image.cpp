@@ -140,7 +140,7 @@ Tensor forward(ToImageCall<T>&& call) {
   const int64_t items = 4 * call.threads();
   const int64_t most = args.batch == 1 ? 1 : args.channels <= 4 ? 64 : args.height;
   const int64_t rows = std::clamp<int64_t>(args.height * args.batch / items, 1, most);
-  args.bands = (args.height + rows - 1) / rows;
+  args.bands = units(args.height, rows);
   call.run(args.batch * args.bands, kernels<PolarToImageKernels<T>>().forward);
   return out;
 }
@@ -151,7 +151,7 @@ Tensor forward(ToImageCall<T>&& call) {
 template <typename T>
 int64_t count_bands(const PolarToImageArgs<T>& args) {
   constexpr int64_t kItems = 16;
-  const int64_t blocks = (args.channels + kChannelBlock - 1) / kChannelBlock;
+  const int64_t blocks = units(args.channels, kChannelBlock);
   const int64_t most = args.height * args.width / (4 * args.rings * args.sectors);
   return std::clamp<int64_t>(kItems / (args.batch * blocks), 1, std::max<int64_t>(most, 1));
 }
@@ -169,7 +169,7 @@ Tensor map_gradient(ToImageCall<T>& call) {
   const Tensor partial =
       new_tensor(Sizes{args.bands > 1 ? args.bands * grad.numel() : 0}, type_of<Arithmetic<T>>());
   args.partial = mutable_pointer<Arithmetic<T>>(partial);
-  const int64_t blocks = (args.channels + kChannelBlock - 1) / kChannelBlock;
+  const int64_t blocks = units(args.channels, kChannelBlock);
   call.run(args.batch * args.bands * blocks, kernel.backward_map);
   if (args.bands > 1) {
     parallel_ranges(grad.numel(), call.threads(),

@@ -31,8 +31,8 @@ Tensor forward(AttentionCall<T>&& call, const Quantizer* quantizer = nullptr) {
 template <typename T>
 int64_t chunk_size(const WindowAttentionArgs<T>& args) {
   const int64_t most = std::clamp<int64_t>(args.windows * args.heads / 32, 1, 16);
-  const int64_t windows = args.windows / args.bias_rows, chunks = (windows + most - 1) / most;
-  return (windows + chunks - 1) / chunks;
+  const int64_t windows = args.windows / args.bias_rows, chunks = units(windows, most);
+  return units(windows, chunks);
 }
 
 template <typename T>
@@ -43,7 +43,7 @@ std::tuple<Tensor, Tensor> backward(AttentionCall<T>&& call, Tensor grad_out) {
   if (grad_qkv.numel() == 0) return {grad_qkv, new_zeros(call.bias, call.bias.sizes())};
   ask_for_large_pages(grad_qkv);
   args.chunk = chunk_size(args);
-  const int64_t chunks = (args.windows / args.bias_rows + args.chunk - 1) / args.chunk;
+  const int64_t chunks = units(args.windows / args.bias_rows, args.chunk);
   const int64_t row = call.bias.numel();
   std::vector<double> rows(chunks * row);
   args.grad_out = pointer<T>(grad_out);

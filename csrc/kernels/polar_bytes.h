@@ -22,15 +22,21 @@ constexpr bool kTryDifferences = is_same_v<T, float> && kRegister < 64;
 
 constexpr int64_t kByteBlock = 256;  // points; their words stay in the first-level cache
 
-// Interpolates from a to b. See `between` and kTryDifferences for the two forms. Values of 8-bit
-// pixels are finite, so differences always do.
+// Interpolates from a to b, in one of these two forms.
+template <bool kWeights, typename V>
+inline V between(V a, V b, V t) {
+  if constexpr (kWeights) {
+    return between(a, b, 1 - t, t);
+  } else {
+    return a + t * (b - a);
+  }
+}
+
+// The same by the rule of `blend`. 8-bit pixels are finite, so differences always do.
 template <Blend blend, typename V>
 inline V along(V a, V b, V t) {
-  if constexpr (blend == Blend::near_rows && kTryDifferences<float>) {
-    return a + t * (b - a);
-  } else {
-    return between(a, b, 1 - t, t);
-  }
+  constexpr bool differences = blend == Blend::near_rows && kTryDifferences<float>;
+  return between<!differences>(a, b, t);
 }
 
 template <Blend blend, typename V>
@@ -53,17 +59,6 @@ struct Corner {
   }
 };
 
-inline uint32_t load_word(const uint8_t* from) {
-  uint32_t word;
-  __builtin_memcpy(&word, from, 4);
-  return word;
-}
-inline uint32_t load_half_word(const uint8_t* from) {
-  uint16_t word;
-  __builtin_memcpy(&word, from, 2);
-  return word;
-}
-
 struct ByteBlock {
   int32_t offset[kByteBlock];
   uint32_t words[4][kByteBlock];
@@ -81,8 +76,9 @@ struct ByteBlock {
       const uint8_t* pixels = plane == 1 ? image.pixels : image.pixels - 2;
       for (int64_t k = 0; k < count; ++k) {
         const uint8_t *top = pixels + offset[k], *bottom = top + below;
-        words[0][k] = load_word(top), words[1][k] = load_word(top + next - 1);
-        words[2][k] = load_word(bottom), words[3][k] = load_word(bottom + next - 1);
+        words[0][k] = load_bits<uint32_t>(top), words[1][k] = load_bits<uint32_t>(top + next - 1);
+        words[2][k] = load_bits<uint32_t>(bottom);
+        words[3][k] = load_bits<uint32_t>(bottom + next - 1);
       }
       for (int c = 0; c < 3; ++c) {
         const int shift = 8 * (plane == 1 ? c : 2 - c);
@@ -96,7 +92,7 @@ struct ByteBlock {
       for (int64_t k = 0; k < count; ++k) {
         const uint8_t *top = pixels + offset[k], *bottom = top + below;
         if (next == 1) {
-          words[0][k] = load_half_word(top), words[2][k] = load_half_word(bottom);
+          words[0][k] = load_bits<uint16_t>(top), words[2][k] = load_bits<uint16_t>(bottom);
         } else {
           words[0][k] = top[0] | top[next] << 8, words[2][k] = bottom[0] | bottom[next] << 8;
         }

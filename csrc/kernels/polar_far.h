@@ -15,11 +15,7 @@ namespace {
 template <typename E>
 inline Vector<float, 4> two_pairs(const E* here, const E* there) {
   if constexpr (is_same_v<E, float>) {
-    using Pairs = Vector<double, 2>;
-    double first, second;
-    __builtin_memcpy(&first, here, 8);
-    __builtin_memcpy(&second, there, 8);
-    return (Vector<float, 4>)Pairs{first, second};
+    return (Vector<float, 4>)Vector<double, 2>{load_bits<double>(here), load_bits<double>(there)};
   } else {
     E both[4];
     __builtin_memcpy(both, here, 2 * sizeof(E));

@@ -9,15 +9,6 @@
 namespace darswin {
 namespace {
 
-template <bool kWeights, typename V>
-inline V between(V a, V b, V t) {
-  if constexpr (kWeights) {
-    return between(a, b, 1 - t, t);
-  } else {
-    return a + t * (b - a);
-  }
-}
-
 // Writes four channels of a sample. The arguments are the upper left and the lower left pixel;
 // their right neighbours follow them in memory. With differences, the function also adds the sample
 // to *sum.

@@ -22,7 +22,7 @@ template <typename T>
 class Scatter {
  public:
   static int64_t bytes(const PolarSampleArgs<T>& a) {
-    const int64_t kept_rows = (a.height + a.bands - 1) / a.bands + 3;  // at most
+    const int64_t kept_rows = units(a.height, a.bands) + 3;  // at most
     return round_up(sizeof(PlacedPoints<T>), 64) + a.samples_r * row_bytes(a) +
            kept_rows * sums_layout(a).row * static_cast<int64_t>(sizeof(T));
   }

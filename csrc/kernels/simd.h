@@ -17,9 +17,6 @@ template <typename T>
 constexpr int kLanes = kRegister / static_cast<int>(sizeof(T));
 constexpr int kDoubles = kLanes<double>;
 
-// Rounds n up to a multiple of `unit`.
-constexpr int64_t round_up(int64_t n, int64_t unit) { return (n + unit - 1) / unit * unit; }
-
 inline int64_t smaller(int64_t x, int64_t y) { return x < y ? x : y; }
 
 // Prefetches into the second-level cache. The first-level cache would not do: rows of an image

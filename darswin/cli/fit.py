@@ -27,24 +27,12 @@ from lightning.pytorch.utilities import rank_zero_only
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
 from darswin.cli.arguments import with_lists
-from darswin.cli.options import (
-    ALL,
-    FIRST_TASK,
-    check_free,
-    format_help,
-    last_of,
-    presets,
-)
+from darswin.cli.options import ALL, FIRST_TASK, check_free, format_help, last_of, presets
 from darswin.data.lens_distributions import parse_sweep
 from darswin.models.saving import model_of_run, read_card
 from darswin.train.finetuning import settle, weights_file
 from darswin.train.results import WriteResults
-from darswin.train.runs import (
-    RunCheckpoint,
-    SafeCheckpointIO,
-    StopOnSignals,
-    check_changes,
-)
+from darswin.train.runs import RunCheckpoint, SafeCheckpointIO, StopOnSignals, check_changes
 from darswin.train.tasks import TASKS
 from darswin.utils.files import locked, remove_partial_files, replace_file
 from darswin.utils.malloc import keep_freed_memory

@@ -153,10 +153,7 @@ WIDTH, COLUMN = 118, 34
 
 
 def format_help(
-    actions: Iterable[argparse.Action],
-    formatter: argparse.HelpFormatter,
-    command: str,
-    whole: bool,
+    actions: Iterable[argparse.Action], formatter: argparse.HelpFormatter, command: str, whole: bool
 ) -> str:
     """The help of a command, in lines of at most `WIDTH`. With `whole`, the `formatter` adds the
     remaining options of the trainer."""

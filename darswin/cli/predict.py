@@ -11,14 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from safetensors import safe_open
 
-from darswin.cli.answers import (
-    ANSWERS,
-    ANSWERS_OF,
-    Answers,
-    ClassAnswers,
-    claim_folder,
-    file_names,
-)
+from darswin.cli.answers import ANSWERS, ANSWERS_OF, Answers, ClassAnswers, claim_folder, file_names
 from darswin.compat import load_official
 from darswin.data.cameras import Calibrations, is_json
 from darswin.data.folders import PICTURES, pictures_and_videos_below

@@ -2,12 +2,7 @@
 
 from darswin.data.augment import Mixing, RandAugment, RandomErasing
 from darswin.data.cameras import Calibrations
-from darswin.data.lens_distributions import (
-    LEVELS,
-    PolynomialLenses,
-    SphericalLenses,
-    parse_lenses,
-)
+from darswin.data.lens_distributions import LEVELS, PolynomialLenses, SphericalLenses, parse_lenses
 from darswin.data.pictures import open_source
 from darswin.data.samples import Calibrated
 from darswin.data.scenes import open_scenes

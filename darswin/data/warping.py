@@ -35,10 +35,7 @@ def warp_map(
 
 
 def remap(
-    image: np.ndarray,
-    places: np.ndarray,
-    interpolation: int = cv2.INTER_LINEAR,
-    border: float = 0,
+    image: np.ndarray, places: np.ndarray, interpolation: int = cv2.INTER_LINEAR, border: float = 0
 ) -> np.ndarray:
     """An image (H, W) or (H, W, C) at the places (H', W', 2) of a map; `border` outside it."""
     # With x and y in one array the second map is None, which OpenCV's types do not allow.

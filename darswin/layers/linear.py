@@ -14,8 +14,6 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
-from darswin.ops._transpose_sum import transpose_sum
-
 __all__ = ["Linear", "autotune_results"]
 
 Key = TypeVar("Key")
@@ -71,18 +69,6 @@ def _onednn_product(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Te
     return torch.ops.mkldnn._linear_pointwise.default(x, weight, bias, "none", [], "")
 
 
-def _onednn_parameter_gradients(
-    g: Tensor, x: Tensor, with_bias: bool
-) -> tuple[Tensor, Tensor | None]:
-    # oneDNN needs one of the two matrices transposed in memory, and torch transposes slowly.
-    transposed, grad_bias = transpose_sum(g.contiguous())
-    return _onednn_product(transposed, x.t()), grad_bias if with_bias else None
-
-
-def _parameter_gradients(g: Tensor, x: Tensor, with_bias: bool) -> tuple[Tensor, Tensor | None]:
-    return g.t() @ x, g.sum(0) if with_bias else None
-
-
 # The inputs: rows x (M, D), a weight w (D', D), and the gradient g (M, D') of the result.
 _PRODUCTS: dict[str, dict[str, Callable]] = {
     "forward": {"torch": F.linear, "onednn": _onednn_product},
@@ -90,8 +76,11 @@ _PRODUCTS: dict[str, dict[str, Callable]] = {
         "torch": lambda g, w: g @ w,
         "onednn": lambda g, w: _onednn_product(g, w.t()),
     },
-    # It also computes the gradient of the bias.
-    "weight gradient": {"torch": _parameter_gradients, "onednn": _onednn_parameter_gradients},
+    "weight gradient": {
+        "torch": lambda g, x: g.t() @ x,
+        # oneDNN needs one of the two matrices transposed in memory.
+        "onednn": lambda g, x: _onednn_product(g.t().contiguous(), x.t()),
+    },
 }
 
 
@@ -172,11 +161,8 @@ class _Product(torch.autograd.Function):
             grad_x = _multiply("input gradient", ctx.matmul_backend, weight, grad_rows, weight)
             grad_x = grad_x.view(x.shape)
         if wants_weight:
-            arguments = (grad_rows, rows, wants_bias)
-            grad_weight, grad_bias = _multiply(
-                "weight gradient", ctx.matmul_backend, weight, *arguments
-            )
-        elif wants_bias:
+            grad_weight = _multiply("weight gradient", ctx.matmul_backend, weight, grad_rows, rows)
+        if wants_bias:
             grad_bias = grad_rows.sum(0)
         return grad_x, grad_weight, grad_bias, None
 

@@ -60,12 +60,7 @@ def rising_limit(slope: Function, end: Tensor) -> Tensor:
 
 
 def newton(
-    function: Function,
-    slopes: Function,
-    goal: Tensor,
-    point: Tensor,
-    end: Tensor,
-    rounds: int = 60,
+    function: Function, slopes: Function, goal: Tensor, point: Tensor, end: Tensor, rounds: int = 60
 ) -> Tensor:
     """The points that a map of the plane takes to `goal`.
 

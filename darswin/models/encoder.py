@@ -231,11 +231,7 @@ class Encoder(Model):
         return intermediates if intermediates_only else (final, intermediates)
 
     def prune_intermediate_layers(
-        self,
-        indices: int | Sequence[int] = 1,
-        *,
-        prune_norm: bool = False,
-        prune_head: bool = True,
+        self, indices: int | Sequence[int] = 1, *, prune_norm: bool = False, prune_head: bool = True
     ) -> list[int]:
         """Removes the stages after the last one of `indices`, in place.
 

@@ -1,7 +1,7 @@
 """The arguments that polar_sample and polar_embed share, and their checks."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -81,7 +81,7 @@ def checked_sampling(
     pixels = (*DTYPES, torch.bfloat16, torch.uint8)
     check_tensor("image", image, pixels, "(B, C, H, W)", (None,) * 4)
     image = channels_first("image", image, channels_last)
-    batch, channels = image.shape[:2]
+    batch = image.shape[0]
     real = (torch.float64 if image.dtype == torch.float64 else torch.float32,)
     form = "(B or 1, R·S_r) = ({} or 1, any)"
     check_tensor("radii", radii, real, form, (batch, None), (1, None), like=image)
@@ -107,32 +107,17 @@ def checked_sampling(
             f"samples = (S_r, S_φ) must divide (R·S_r, A·S_φ) = "
             f"({radii.shape[1]}, {azimuths.shape[0]}), got {samples}"
         )
-    if image.dtype == torch.uint8:
-        mean, std = per_channel("mean", mean, channels), per_channel("std", std, channels)
-    else:
-        mean = std = ()
     return Sampling(
         image, radii, azimuths, center, affine, offsets, *_jitter_tensors(jitter, seed),
-        samples, mean, std, _library.output_bfloat16(image),
+        samples, *_statistics(image, mean, std), _library.output_bfloat16(image),
     )  # fmt: skip
 
 
-def unchecked_sampling(
-    image: Tensor,
-    radii: Tensor,
-    azimuths: Tensor,
-    center: Tensor,
-    affine: Tensor | None,
-    offsets: Tensor | None,
-    jitter: float,
-    seed: int | Tensor,
-    samples: tuple[int, int],
-    mean: float | Sequence[float],
-    std: float | Sequence[float],
-    channels_last: bool | None,
-) -> Sampling | None:
-    """The arguments for `_library.attempt`: the operator itself checks the tensors. None in the
-    rare cases that only `checked_sampling` can check."""
+def unchecked_sampling(*given: Any) -> Sampling | None:
+    """The arguments of `checked_sampling` for `_library.attempt`: the operator itself checks the
+    tensors. None in the rare cases that only `checked_sampling` can check."""
+    image, radii, azimuths, center, affine, offsets, *others = given
+    jitter, seed, samples, mean, std, channels_last = others
     if not (
         _library.may_attempt()
         and _library.plain(image, radii, azimuths, center)
@@ -145,15 +130,21 @@ def unchecked_sampling(
     dtype = image.dtype
     if channels_last is not None or dtype == torch.uint8:
         image = channels_first("image", image, channels_last)
-    if dtype == torch.uint8:
-        channels = image.shape[1]
-        mean, std = per_channel("mean", mean, channels), per_channel("std", std, channels)
-    else:
-        mean = std = ()
     return Sampling(
         image, radii, azimuths, center, affine, offsets, *_jitter_tensors(jitter, seed),
-        check_pair("samples", samples, lowest=1), mean, std, dtype == torch.bfloat16,
+        check_pair("samples", samples, lowest=1), *_statistics(image, mean, std),
+        dtype == torch.bfloat16,
     )  # fmt: skip
+
+
+def _statistics(
+    image: Tensor, mean: float | Sequence[float], std: float | Sequence[float]
+) -> tuple[Sequence[float], Sequence[float]]:
+    """mean and std with one number per channel; empty if the image is not uint8."""
+    if image.dtype != torch.uint8:
+        return (), ()
+    channels = image.shape[1]
+    return per_channel("mean", mean, channels), per_channel("std", std, channels)
 
 
 def _jitter_tensors(jitter: float, seed: int | Tensor) -> tuple[Tensor | None, Tensor | None]:

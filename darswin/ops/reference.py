@@ -67,10 +67,7 @@ def _jittered(
 
 
 def normalized(
-    image: Tensor,
-    mean: Sequence[float],
-    std: Sequence[float],
-    dtype: torch.dtype = torch.float32,
+    image: Tensor, mean: Sequence[float], std: Sequence[float], dtype: torch.dtype = torch.float32
 ) -> Tensor:
     """`(pixel/255 - mean) / std` of a uint8 image (B, C, H, W), in `dtype`, for each channel."""
     m, s = (

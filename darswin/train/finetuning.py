@@ -59,11 +59,7 @@ def check_name(name: str, task: Task) -> None:
 
 
 def settle(
-    card: ModelCard,
-    weights: str,
-    task: Task,
-    model: Mapping[str, Any],
-    data: Mapping[str, Any],
+    card: ModelCard, weights: str, task: Task, model: Mapping[str, Any], data: Mapping[str, Any]
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """The `name` and `options` of a run's model, and four options of its data. The trained model
     gives options that are None; ValueError if others disagree with it."""

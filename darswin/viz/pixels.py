@@ -17,6 +17,8 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from matplotlib.ticker import LogLocator, PercentFormatter, StrMethodFormatter
 
+from darswin.utils.image import with_channels
+
 __all__ = ["distance_image", "distance_range", "label_image", "overlay", "palette"]
 
 UNKNOWN = (128, 128, 128)  # the colour of pixels without a label or distance
@@ -156,23 +158,19 @@ def overlay(
         )
     if not 0 <= alpha <= 1:
         raise ValueError(f"alpha must be in 0 … 1, got {alpha}")
-    below = np.repeat(image, 3, 2) if image.shape[2] == 1 else image
+    below = with_channels(image, 3)
     laid = cv2.addWeighted(below, 1 - alpha, picture, alpha, 0)
     return laid if where is None else cv2.copyTo(laid, where.astype(np.uint8), below.copy())
 
 
 def draw_predictions(
-    rows: Sequence[Row],
-    classes: Sequence[str] = (),
-    colors: Sequence[Sequence[int]] = (),
-    *,
-    titles: Sequence[str] = (),
+    rows: Sequence[Row], classes: Sequence[str] = (), colors: Sequence[Sequence[int]] = ()
 ) -> Figure:
     """Draws image, truth, prediction and error, in one row for each sample.
 
     Truth and prediction are integer labels, with the names and colours of their classes, or
     distances as floats in metres. Where the truth is known, the error shows wrong labels in red, or
-    the relative error of the distance. The titles are placed left of the rows.
+    the relative error of the distance.
     """
     if not rows:
         raise ValueError("there are no predictions to draw")
@@ -199,8 +197,6 @@ def draw_predictions(
         axes[3].set_xlabel(text, fontsize=9)
     for axes, title in zip(panels[0], ("image", "truth", "prediction", "error"), strict=True):
         axes.set_title(title, fontsize=11)
-    for axes, title in zip(panels[:, 0], titles, strict=False):
-        axes.set_ylabel(title, fontsize=9)
     return figure
 
 
@@ -254,8 +250,7 @@ def _draw_bars(figure: Figure, panels: np.ndarray, near: float, far: float) -> N
 
 
 def _show(axes: Axes, picture: np.ndarray) -> None:
-    picture = np.atleast_3d(picture)
-    picture = np.repeat(picture, 3, 2) if picture.shape[2] == 1 else picture
+    picture = with_channels(np.atleast_3d(picture), 3)
     axes.imshow(picture, interpolation="nearest" if max(picture.shape) <= 160 else "antialiased")
     axes.set(xticks=[], yticks=[])
 

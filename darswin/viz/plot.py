@@ -1,7 +1,7 @@
 """Figures with matplotlib: a lens, its polar image, and accuracy over distortion.
 
-Each function draws on `axes`, or on a new figure that pyplot knows nothing of, and returns the
-figure; `save_figure` writes it. Images are (H, W) or (H, W, 3), uint8 or floats in [0, 1].
+Most functions draw on `axes`. `draw_lens` returns a figure that pyplot knows nothing of, and
+`save_figure` writes it. Images are (H, W) or (H, W, 3), uint8 or floats in [0, 1].
 """
 
 import io
@@ -62,34 +62,24 @@ def save_figure(figure: Figure, path: str | os.PathLike) -> None:
 
 
 def draw_grid(
-    image: np.ndarray,
-    lens: Lens,
-    sampler: PolarSample,
-    *,
-    samples: bool = True,
-    axes: Axes | None = None,
-) -> Figure:
+    image: np.ndarray, lens: Lens, sampler: PolarSample, *, samples: bool = True, axes: Axes
+) -> None:
     """Draws an image with the borders of its polar patches and the sample points.
 
     Affine, tangential and thin-prism terms of the lens deform the rings. The sampler of a model is
     `model.patch_embed.sample`.
     """
-    axes = axes or _new_axes()
     lens, grid = _grid(lens, sampler, image)
     _show(axes, image)
     _draw_borders(axes, lens, sampler, image.shape[:2], (0.6, 0.3))
     if samples:
         axes.plot(*_sample_places(lens, grid, image.shape[:2]), "r.", ms=0.6, alpha=0.5)
     axes.set(xlim=(-0.5, image.shape[1] - 0.5), ylim=(image.shape[0] - 0.5, -0.5))
-    return _figure_of(axes)
 
 
-def draw_samples(
-    image: np.ndarray, lens: Lens, sampler: PolarSample, *, axes: Axes | None = None
-) -> Figure:
+def draw_samples(image: np.ndarray, lens: Lens, sampler: PolarSample, *, axes: Axes) -> None:
     """Draws the grid on a tenth of the image, enlarged. The part lies half way between the centre
     and the upper right end of the lens, if the image reaches there."""
-    axes = axes or _new_axes()
     lens, grid = _grid(lens, sampler, image)
     left, top, width, height = _enlarged(image, lens)
     _show(axes, image)
@@ -98,7 +88,6 @@ def draw_samples(
     inside = (x > left) & (x < left + width) & (y > top) & (y < top + height)
     axes.plot(x[inside], y[inside], "r.", ms=2.5, path_effects=_outline(0.5, "white"))
     axes.set(xlim=(left, left + width), ylim=(top + height, top))
-    return _figure_of(axes)
 
 
 def _draw_borders(
@@ -132,11 +121,8 @@ def _outline(width: float, colour: str) -> list[AbstractPathEffect]:
     return [Stroke(linewidth=width + 0.8, foreground=colour, alpha=0.6), Normal()]
 
 
-def draw_polar(
-    image: np.ndarray, lens: Lens, sampler: PolarSample, *, axes: Axes | None = None
-) -> Figure:
+def draw_polar(image: np.ndarray, lens: Lens, sampler: PolarSample, *, axes: Axes) -> None:
     """Draws the polar image, without jitter: rows are radii, columns are azimuths."""
-    axes = axes or _new_axes(9, 3)
     lens, grid = _grid(lens, sampler, image)
     pixels = torch.from_numpy(np.atleast_3d(image)).permute(2, 0, 1)[None].float()
     # The last channel is the fraction of a sample that lies in the image.
@@ -153,13 +139,11 @@ def draw_polar(
     axes.set_yticks([k * step * sampler.spec.samples[0] for k in range(len(angles))],
                     [f"{angle:.0f}°" for angle in angles])  # fmt: skip
     axes.set(xlabel=_label("azimuth φ", outside), ylabel="incident angle θ")
-    return _figure_of(axes)
 
 
-def draw_view(image: np.ndarray, lens: Lens, rays: Tensor, *, axes: Axes | None = None) -> Figure:
+def draw_view(image: np.ndarray, lens: Lens, rays: Tensor, *, axes: Axes) -> None:
     """Draws the view along rays (H, W, 3) of `darswin.viz.views`. The ticks are the angles from the
     central ray, in the middle row and column of the view; they rise to the right and upwards."""
-    axes = axes or _new_axes()
     x, y = np.moveaxis(view_map(lens, rays, image.shape[:2]), -1, 0)
     height, width = image.shape[:2]
     beyond = (x == OUTSIDE) & (y == OUTSIDE)
@@ -170,7 +154,6 @@ def draw_view(image: np.ndarray, lens: Lens, rays: Tensor, *, axes: Axes | None 
         places, degrees = _angle_ticks(line, max(2, 7 * len(line) // max(rays.shape[:2])))
         axis.set_ticks(places, [f"{sign * angle + 0:g}°" for angle in degrees])
     axes.set(xlabel=_label("degrees from the view's middle", outside, beyond))
-    return _figure_of(axes)
 
 
 def _middle(rays: Tensor) -> Tensor:
@@ -204,13 +187,10 @@ def _label(text: str, outside: np.ndarray, beyond: np.ndarray | None = None) -> 
     return f"{text}\nhatched: {' or '.join(reasons)}" if reasons else text
 
 
-def draw_curve(
-    lens: Lens, image_size: tuple[int, int] | None = None, *, axes: Axes | None = None
-) -> Figure:
+def draw_curve(lens: Lens, image_size: tuple[int, int] | None = None, *, axes: Axes) -> None:
     """The projection curve r(θ) up to θ_max, and the pixels of a degree along the radius and around
     the axis; the ends of the image (H, W), if given, are dashed at the left and right and dotted
     above and below."""
-    axes = axes or _new_axes()
     lens = _one(lens)
     theta = torch.linspace(0, lens.theta_max.item(), 257, dtype=torch.float64)
     degrees, radius = torch.rad2deg(theta), lens.project(theta)
@@ -227,7 +207,6 @@ def draw_curve(
     if image_size is not None:
         _draw_sides(axes, lens, image_size)
     axes.legend(handles=[*axes.lines[:1], *density.lines], loc="upper center", ncols=3)
-    return _figure_of(axes)
 
 
 def _draw_sides(axes: Axes, lens: Lens, image_size: tuple[int, int]) -> None:
@@ -287,11 +266,10 @@ def draw_accuracy(
     accuracy: Mapping[str, Sequence[float] | Sequence[Sequence[float]]],
     trained: tuple[float, float] | None,
     *,
-    axes: Axes | None = None,
-) -> Figure:
+    axes: Axes,
+) -> None:
     """Draws accuracy (%) over ξ, with one line for each model and the range of training shaded. If
     there are lists for several seeds, the line is their mean and a band their range."""
-    axes = axes or _new_axes(7, 4.2)
     if trained is not None:
         axes.axvspan(*trained, color="tab:pink", alpha=0.3, lw=0, label="seen in training")
     for name, values in accuracy.items():
@@ -303,17 +281,6 @@ def draw_accuracy(
     axes.set(xlabel="distortion ξ", ylabel="accuracy (%)", xlim=(min(xi), max(xi)))
     axes.grid(alpha=0.3)
     axes.legend()
-    return _figure_of(axes)
-
-
-def _figure_of(axes: Axes) -> Figure:
-    """The figure of the axes, which may be in a subfigure."""
-    figure = axes.figure
-    return figure if isinstance(figure, Figure) else figure.figure
-
-
-def _new_axes(width: float = 6, height: float = 6) -> Axes:
-    return Figure(figsize=(width, height), layout="constrained").subplots()
 
 
 def _show(axes: Axes, image: np.ndarray, outside: np.ndarray | None = None, **options) -> None:

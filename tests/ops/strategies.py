@@ -161,13 +161,3 @@ def norms(draw, dtypes=(f32,)) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         (torch.randn(math.prod(shape) + room) + m).to(dtype)[room:].view(shape) for m in (mean, 0.0)
     )
     return x, y, torch.randn(shape[-1]), torch.randn(shape[-1])
-
-
-@st.composite
-def matrices(draw) -> Tensor:
-    """The argument x of transpose_sum."""
-    torch.manual_seed(draw(st.integers(0, 2**31)))
-    counts = sizes(0, 1, 2, 3, 15, 16, 17, 33, 63, 64, 65, 130, 700)
-    rows, columns, room = draw(counts), draw(counts), draw(sizes(0, 1, 5))
-    values = torch.randn(rows * columns + room) + draw(sizes(0.0, 1.0, 1e4))
-    return values[room:].view(rows, columns)

@@ -30,8 +30,6 @@ def valid(name: str) -> list:
     """The arguments of a valid call of an operator."""
     if name == "_add_norm_":
         return [*(torch.rand(shape) for shape in ((3, 4), (3, 4), (4,), (4,))), 1e-5]
-    if name == "_transpose_sum":
-        return [torch.rand(5, 7)]
     if name == "_polar_to_image_plan":
         return valid("polar_to_image")[:7]
     public = name.removesuffix("_backward")
@@ -42,7 +40,7 @@ def valid(name: str) -> list:
 
 
 PUBLIC = ("polar_sample", "polar_embed", "window_attention", "polar_to_image")
-PRIVATE = ("_add_norm_", "_polar_to_image_plan", "_transpose_sum")
+PRIVATE = ("_add_norm_", "_polar_to_image_plan")
 NAMES = [*PUBLIC, *(f"{name}_backward" for name in PUBLIC), *PRIVATE]
 
 

@@ -1,4 +1,4 @@
-"""The private operators: residual with norm, 8-bit results, and transpose with column sums."""
+"""The private operators: residual with norm, and 8-bit results."""
 
 import math
 
@@ -10,7 +10,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from darswin.layers.quantized import Quantization, dequantize, quantize
-from darswin.ops._transpose_sum import transpose_sum
 
 EPS, STEPS = 1e-5, Quantization(0.03, 117)
 # The variants of float32 add_norm_ and of attention that return an 8-bit result.
@@ -134,38 +133,6 @@ def test_attention_quantized_is_that_of_floats(sizes):
     assert got.dtype == torch.uint8 and torch.equal(got, quantize(out, STEPS))
 
 
-# -- transpose_sum ---------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("shape", [(1024, 96), (131_072, 5), (1_000_000, 5)], ids=str)
-def test_transpose_and_long_sums(shape):
-    x = torch.randn(shape) + 1
-    transposed, sums = transpose_sum(x)
-    assert torch.equal(transposed, x.t()) and transposed.is_contiguous()
-    exact, own = x.double().sum(0), x.sum(0)
-    rounding = torch.finfo(torch.float32).eps * x.abs().sum(0).max()
-    rounding *= 4 if len(x) < 10**5 else 1
-    assert (sums - exact).abs().max() <= max(2 * (own - exact).abs().max(), rounding)
-
-
-def test_values_that_are_not_finite_stay_in_their_columns():
-    x = torch.ones(70, 40)
-    x[3, 2], x[69, 39], x[68, 20] = math.nan, math.nan, math.inf
-    transposed, sums = transpose_sum(x)
-    torch.testing.assert_close(transposed, x.t(), rtol=0, atol=0, equal_nan=True)
-    assert sums.isnan().nonzero().flatten().tolist() == [2, 39]
-    assert sums[20] == math.inf and (sums == 70).sum() == 37
-
-
-def test_the_gradient_of_transpose_sum_is_that_of_torch():
-    x, grads = torch.randn(20, 7), (torch.randn(7, 20), torch.randn(7))
-    results = []
-    for run in (transpose_sum, lambda x: (x.t(), x.sum(0))):
-        leaf = x.clone().requires_grad_()
-        results.append(torch.autograd.grad(run(leaf), leaf, grads)[0])
-    torch.testing.assert_close(*results)
-
-
 # -- all of them -----------------------------------------------------------------------------------
 
 
@@ -178,10 +145,6 @@ def test_same_bits_of_8_bits_for_any_number_of_threads():
         ),
         (1, 2, 5),
     )
-
-
-def test_opcheck():
-    torch.library.opcheck(torch.ops.darswin._transpose_sum.default, (torch.randn(20, 24),))
 
 
 WRONG = [
@@ -210,7 +173,3 @@ def test_other_wrong_arguments():
     qkv, bias, *others = table()
     with pytest.raises(RuntimeError, match="qkv must be float32"):
         window_attention_quantized(qkv.double(), bias.double(), *others, *STEPS)
-    x = torch.zeros(4, 6)
-    for wrong in (x.t(), x.double(), x[None], x[0]):
-        with pytest.raises(RuntimeError, match="transpose_sum"):
-            transpose_sum(wrong)

@@ -26,7 +26,6 @@ from darswin.ops import (
     use_reference,
     window_attention,
 )
-from darswin.ops._transpose_sum import transpose_sum
 
 image, radii, center, weight = SMALL["polar_embed, circular"]().inputs.values()
 azimuths, samples = torch.linspace(0, 6, 6), (2, 3)
@@ -252,12 +251,6 @@ def test_backward_has_none_of_them_either(name):
     out = run(x.clone().requires_grad_())
     with forward_ad.dual_level(), pytest.raises(NotImplementedError, match=f"{name}'s backward"):
         out.backward(forward_ad.make_dual(torch.ones_like(out), torch.ones_like(out)))
-
-
-@pytest.mark.parametrize("kind", ["forward mode", "jvp", "grad"])
-def test_transpose_sum_refuses_them_too(kind):
-    with pytest.raises(NotImplementedError, match="transpose_sum has no"):
-        DERIVATIVES[kind](lambda x: transpose_sum(x)[1], torch.rand(3, 4))
 
 
 # -- only the reference has a gradient for azimuths ------------------------------------------------

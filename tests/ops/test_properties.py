@@ -27,7 +27,6 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from darswin.ops import use_reference
-from darswin.ops._transpose_sum import transpose_sum
 
 pytestmark = pytest.mark.filterwarnings("error")
 
@@ -175,15 +174,6 @@ def test_add_norm_is_the_norm_of_the_sum_as_it_is_rounded(dtype, data):
         return
     exact = torch.layer_norm(total.double(), weight.shape, weight.double(), bias.double(), 1e-5)
     assert_accurate(norm, base, exact, largest(exact) + largest(bias))
-
-
-@given(strategies.matrices())
-def test_transpose_sum_equals_torch(x):
-    note(f"{x.shape} {x.storage_offset()}")
-    assert_same_bits_on_any_number_of_threads(lambda: dict(enumerate(transpose_sum(x))))
-    transposed, sums = transpose_sum(x)
-    assert torch.equal(transposed, x.t()) and transposed.is_contiguous()
-    assert_accurate(sums, x.sum(0), x.double().sum(0), largest(x.double().abs().sum(0)) / 4)
 
 
 # -- values that are not finite, or nearly overflow ------------------------------------------------

@@ -106,7 +106,7 @@ def test_predictions_of_labels_stand_beside_the_truth(tmp_path):
     image = np.full((2, 2, 1), 7, np.uint8)
     colors = palette(2)
     rows = [(image, truth, prediction)] * 2
-    figure = draw_predictions(rows, ["road", "sky"], colors, titles=["front", "rear"])
+    figure = draw_predictions(rows, ["road", "sky"], colors)
     assert len(figure.axes) == 8
     for row in (0, 1):
         picture, of_truth, of_prediction, error = shown(figure, row)

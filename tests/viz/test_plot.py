@@ -3,6 +3,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from darswin import PolarSample
@@ -28,10 +29,17 @@ BENT = Mei(
 )  # fmt: skip
 
 
+def drawn(draw, *arguments, **options) -> list[Axes]:
+    """The axes of a figure after `draw`."""
+    figure = Figure()
+    draw(*arguments, axes=figure.subplots(), **options)
+    return figure.axes
+
+
 @pytest.mark.parametrize("lens", [ROUND, BENT], ids=["round", "bent"])
 def test_draw_grid_shows_borders_and_samples(lens):
     size = (60, 80)
-    (axes,) = draw_grid(np.zeros(size), lens, SAMPLER).axes
+    (axes,) = drawn(draw_grid, np.zeros(size), lens, SAMPLER)
     rings, sectors = ([np.array(s) for s in c.get_segments()] for c in axes.collections)
     exact = lens.to(torch.float64)
     for k, ring in enumerate(rings):  # equal steps of θ
@@ -48,21 +56,20 @@ def test_draw_grid_shows_borders_and_samples(lens):
     np.testing.assert_allclose(np.sort(theta), np.repeat(expected, 16), atol=1e-6)
     turns = azimuth.numpy() % (2 * math.pi) / (2 * math.pi) * 16
     np.testing.assert_allclose(np.sort(turns), np.repeat(np.arange(16) + 0.5, 12), atol=1e-6)
-    own = Figure().subplots()
-    assert draw_grid(np.zeros(size), lens, SAMPLER, samples=False, axes=own) is own.figure
+    (own,) = drawn(draw_grid, np.zeros(size), lens, SAMPLER, samples=False)
     assert not own.lines
     with pytest.raises(ValueError, match="one lens, got 2"):
-        draw_grid(np.zeros(size), lens.expand(1)[[0, 0]], SAMPLER)
+        drawn(draw_grid, np.zeros(size), lens.expand(1)[[0, 0]], SAMPLER)
 
 
 def test_draw_samples_is_a_part_of_the_grid():
-    (axes,) = draw_samples(np.zeros((60, 80)), BENT, SAMPLER).axes
+    (axes,) = drawn(draw_samples, np.zeros((60, 80)), BENT, SAMPLER)
     assert np.diff(axes.get_xlim()) == pytest.approx(8) and np.diff(axes.get_ylim()) == [-6]
     x, y = BENT.project_rays(0.85, -math.pi / 4, (60, 80))[0].tolist()
     assert np.mean(axes.get_xlim()) == pytest.approx(x, abs=1e-3)
     assert np.mean(axes.get_ylim()) == pytest.approx(y, abs=1e-3)
     lens = ROUND.replace(center=torch.tensor([[-40.0, 300.0]]))  # outside the image
-    (axes,) = draw_samples(np.zeros((60, 80)), lens, SAMPLER).axes
+    (axes,) = drawn(draw_samples, np.zeros((60, 80)), lens, SAMPLER)
     assert axes.get_xlim() == (-0.5, 7.5) and axes.get_ylim() == (59.5, 53.5)
 
 
@@ -70,7 +77,7 @@ def test_draw_samples_is_a_part_of_the_grid():
 def test_draw_polar_is_what_the_layer_samples(shape):
     image = np.random.default_rng(0).integers(256, size=shape, dtype=np.uint8)
     for sampler in (SAMPLER, PolarSample(4, 8, (3, 2), jitter=1.0, mean=0.5)):
-        (axes,) = draw_polar(image, ROUND, sampler).axes
+        (axes,) = drawn(draw_polar, image, ROUND, sampler)
         channels = torch.from_numpy(np.atleast_3d(image)).permute(2, 0, 1)[None]
         expected = SAMPLER(channels, ROUND)[0].permute(1, 2, 0).expand(-1, -1, 3)
         np.testing.assert_allclose(axes.images[0].get_array()[..., :3], expected, atol=1e-5)
@@ -79,16 +86,16 @@ def test_draw_polar_is_what_the_layer_samples(shape):
 def test_it_is_hatched_where_there_is_no_picture():
     image = np.full((20, 60, 3), 200, np.uint8)
     lens = ROUND  # its circle is 32 px wide
-    (axes,) = draw_polar(image, lens, SAMPLER).axes
+    (axes,) = drawn(draw_polar, image, lens, SAMPLER)
     alpha = axes.images[0].get_array()[..., 3]
     grid = SAMPLER.grid(lens.to(torch.float64), (20, 60))
     down = np.abs(grid.radii[0].numpy()[:, None] * np.sin(grid.azimuths.numpy()))
     np.testing.assert_array_equal(alpha == 0, down > 10)  # the sensor ends 10 px from the middle
     assert axes.patch.get_hatch()
-    (axes,) = draw_polar(np.zeros((40, 40)), lens, SAMPLER).axes
+    (axes,) = drawn(draw_polar, np.zeros((40, 40)), lens, SAMPLER)
     assert (axes.images[0].get_array()[..., 3] == 1).all()
     rays = equirectangular((45, 90))
-    (axes,) = draw_view(image, lens, rays).axes
+    (axes,) = drawn(draw_view, image, lens, rays)
     theta = torch.atan2(rays[..., :2].norm(dim=-1), rays[..., 2])
     place = lens.to(torch.float64).project_rays(theta, torch.atan2(rays[..., 1], rays[..., 0]),
                                                 (20, 60))  # fmt: skip
@@ -98,20 +105,20 @@ def test_it_is_hatched_where_there_is_no_picture():
 
 def test_draw_curve_shows_radius_density_and_the_ends_of_the_image():
     lens = Polynomial([20.0, 1.0, 0.5], 1.7, [45.0, 22.0])
-    left, right = draw_curve(lens, (48, 80)).axes
+    left, right = drawn(draw_curve, lens, (48, 80))
     degrees, radius = (np.array(values) for values in left.lines[0].get_data())
     theta = torch.deg2rad(torch.from_numpy(degrees)).float()
     np.testing.assert_allclose(radius, lens.project(theta), rtol=1e-5)
     along = right.lines[0].get_ydata()
     np.testing.assert_allclose(np.gradient(radius, degrees)[1:-1], along[1:-1], rtol=1e-3)
     angles = lens.side_angles((48, 80))[0].rad2deg().tolist()
-    drawn = [line.get_xdata()[0] for line in left.lines[1:]]
-    assert angles[0] > math.degrees(1.7) and drawn == pytest.approx(angles[1:])
+    places = [line.get_xdata()[0] for line in left.lines[1:]]
+    assert angles[0] > math.degrees(1.7) and places == pytest.approx(angles[1:])
     assert [line.get_linestyle() for line in left.lines[1:]] == [":", "--", ":"]
-    assert len(draw_curve(lens).axes[0].lines) == 1
+    assert len(drawn(draw_curve, lens)[0].lines) == 1
     lens = Polynomial([30.0, 0.0, -3.0])  # r rises up to 105°, 36 px
-    assert not draw_curve(lens, (400, 400)).axes[0].texts
-    assert len(draw_curve(lens, (40, 40)).axes[0].texts) == 4
+    assert not drawn(draw_curve, lens, (400, 400))[0].texts
+    assert len(drawn(draw_curve, lens, (40, 40))[0].texts) == 4
 
 
 def test_draw_lens_has_all_panels(tmp_path):
@@ -135,11 +142,11 @@ def test_other_endings_are_refused(name):
 
 
 def test_accuracy_of_each_model():
-    figure = draw_accuracy([0.0, 0.5, 1.0], {"a": [1, 2, 3], "b": [3, 2, 1]}, (0.2, 0.35))
-    (axes,) = figure.axes
+    models = {"a": [1, 2, 3], "b": [3, 2, 1]}
+    (axes,) = drawn(draw_accuracy, [0.0, 0.5, 1.0], models, (0.2, 0.35))
     assert [list(line.get_ydata()) for line in axes.lines] == [[1, 2, 3], [3, 2, 1]]
     # Of several seeds it shows the mean and the span.
-    (axes,) = draw_accuracy([0.0, 1.0], {"a": [[1, 2], [3, 8]]}, None).axes
+    (axes,) = drawn(draw_accuracy, [0.0, 1.0], {"a": [[1, 2], [3, 8]]}, None)
     assert list(axes.lines[0].get_ydata()) == [2, 5]
     (band,) = axes.collections
     assert band.get_datalim(axes.transData).get_points().tolist() == [[0, 1], [1, 8]]

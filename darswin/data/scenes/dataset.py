@@ -31,13 +31,7 @@ class SceneSamples(Samples):
         BrokenImageError: from `dataset[i]`, for a file that cannot be read.
     """
 
-    def __init__(
-        self,
-        scenes: Scenes,
-        *,
-        crop: float | None = None,
-        **options: Any,
-    ):
+    def __init__(self, scenes: Scenes, *, crop: float | None = None, **options: Any):
         if crop is not None and not 0 < crop <= 1:
             raise ValueError(f"`crop` must be a share in (0, 1], got {crop}")
         super().__init__(scenes, **options)

@@ -72,11 +72,7 @@ def open_synwoodscape(root: Path, options: Options) -> Scenes:
 
 
 def _scenes(
-    root: Path,
-    options: Options,
-    names: list[str],
-    *,
-    trim: tuple[int, int] = (0, 1),
+    root: Path, options: Options, names: list[str], *, trim: tuple[int, int] = (0, 1)
 ) -> Scenes:
     target = options.target
     if target == "labels":
@@ -93,13 +89,10 @@ def _scenes(
         root=root,
         what=target,
     )
-    lenses, views = (
-        options.given_lens(root) or _lenses(root, pairs, options),
-        [_view_of(s) for s in pairs],
-    )
+    lenses = options.given_lens(root) or _lenses(root, pairs, options)
     return Scenes(
-        root, list(pairs.values()), lenses, target=target, classes=classes, views=views, read=read,
-        trim=trim,
+        root, list(pairs.values()), lenses, target=target, classes=classes,
+        views=[_view_of(stem) for stem in pairs], read=read, trim=trim,
     )  # fmt: skip
 
 

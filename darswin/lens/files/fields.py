@@ -55,11 +55,8 @@ def to_number(
 def to_side(value: Any, name: str, least: int = 1) -> int:
     """A whole number of pixels."""
     expected = f"a whole number of pixels, {least} to {MAX_SIDE}"
-
-    def is_side(number: float) -> bool:
-        return least <= number <= MAX_SIDE and number.is_integer()
-
-    return int(to_number(value, name, expected, is_side))
+    number = to_number(value, name, expected, lambda n: least <= n <= MAX_SIDE and n.is_integer())
+    return int(number)
 
 
 def to_sides(value: Any, name: str) -> tuple[int, int]:
