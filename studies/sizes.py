@@ -4,7 +4,7 @@ Each cell trains and tests one method with one seed on one core. Its file under 
 results, so a study that was stopped can go on. The pictures are rendered once before: see
 `sizes_scene.py`. `sizes_tables.py` makes the tables and figures. Run it with `make study-sizes`.
 
-The study has 33 cells, 11 methods with 3 seeds. A cell takes 60 to 100 s on a core of its own, and
+The study has 33 cells, 11 methods with 3 seeds. A cell takes 60 to 110 s on a core of its own, and
 rendering takes 40 s, so the study takes about half an hour on two cores.
 """
 

@@ -56,7 +56,8 @@ def draw_scores(cells: list[dict], path: Path) -> None:
         means = [statistics.mean(of) for of in values]
         ends = [[m - min(of), max(of) - m] for m, of in zip(means, values, strict=True)]
         places = np.arange(len(names)) + 0.8 * ((number + 0.5) / len(labels) - 0.5)
-        axes.errorbar(places, means, np.transpose(ends), fmt="o", ms=5, lw=1, label=label)
+        shape = "o" if number < 10 else "s"  # there are ten colours
+        axes.errorbar(places, means, np.transpose(ends), fmt=shape, ms=5, lw=1, label=label)
     axes.set_xticks(range(len(names)), ["its own lenses", *LENSES])
     axes.set(ylabel="δ1 (%)", xlim=(-0.5, len(names) - 0.5))
     for border in np.arange(len(names) - 1) + 0.5:
