@@ -124,7 +124,7 @@ def with_gradients(weights: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
         if name.endswith("qkv.bias"):
             queries, _, values = tensor.chunk(3)
             tensor = torch.cat((queries, values))
-        if not name.endswith("stages.0.blocks.0.attn.position_bias.b_theta"):
+        if not (".stages.0." in name and name.endswith("b_theta")):
             kept[name] = tensor
     return kept
 
