@@ -13,7 +13,6 @@ cells take 40 × (300 + 27 + 8) s and the pictures 1,900 s, together 4.2 hours o
 
 import argparse
 import json
-import os
 import time
 from dataclasses import fields
 from pathlib import Path
@@ -24,7 +23,7 @@ from dense_cells import Cell, all_cells
 from dense_pictures import predict
 from dense_tables import collect, publish
 from dense_trivial import trivial
-from jobs import printing_to, run_all
+from jobs import add_options, printing_to, run_all
 
 from darswin.cli.main import main as darswin
 from darswin.utils.files import replace_file
@@ -108,7 +107,7 @@ def known_cells(file: Path) -> dict[Cell, dict]:
 
 def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--cell", help="runs only cells whose key contains this text")
+    add_options(parser, "dense")
     parser.add_argument("--seeds", type=int, default=2)
     parser.add_argument("--size", default="nano", help="the size of the models")
     parser.add_argument(
@@ -118,15 +117,6 @@ def main(arguments: list[str] | None = None) -> None:
         "--pictures", type=int, nargs=3, default=dense_data.PICTURES,
         metavar=("TRAIN", "VAL", "TEST"), help="the number of pictures for each lens",
     )  # fmt: skip
-    parser.add_argument("--processes", type=int, default=os.cpu_count())
-    parser.add_argument(
-        "--known", type=Path, help="a record (dense.json); its cells are not run again"
-    )
-    parser.add_argument(
-        "--collect", action="store_true", help="runs nothing and collects existing results"
-    )
-    parser.add_argument("--out", type=Path, default=Path("out/dense"))
-    parser.add_argument("--results", type=Path, default=HERE / "results")
     args, options = parser.parse_known_args(arguments)  # other options are for `darswin fit`
     cells = [cell for cell in all_cells(args.seeds) if (args.cell or "") in cell.key]
     start = time.perf_counter()

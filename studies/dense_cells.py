@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 from dense_data import SHUFFLED
+from jobs import key_of
 
 # Training shows every picture as a lens of any ξ would have seen it.
 THROUGH_ANY = ("--data.lens_augmentation", "0..1")
@@ -69,8 +70,7 @@ class Cell:
     @property
     def key(self) -> str:
         """The name of its folder."""
-        words = f"{self.label} {self.trained_on} {self.task} {self.seed}".lower()
-        return "-".join("".join(c if c.isalnum() else " " for c in words).split())
+        return key_of(f"{self.label} {self.trained_on} {self.task} {self.seed}")
 
 
 def all_cells(seeds: int) -> list[Cell]:

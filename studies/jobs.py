@@ -1,5 +1,6 @@
 """Runs the jobs of a study side by side, one on each core."""
 
+import argparse
 import contextlib
 import multiprocessing
 import os
@@ -22,6 +23,25 @@ def run_all(
         started = [pool.submit(work, *job) for job in jobs]
         ended = tqdm(as_completed(started), total=len(started), unit=unit)
         return [job.result() for job in ended]
+
+
+def add_options(parser: argparse.ArgumentParser, study: str) -> None:
+    """Adds the options that say which cells of a study run, and where their files are."""
+    parser.add_argument("--cell", help="runs only cells whose key contains this text")
+    parser.add_argument("--processes", type=int, default=os.cpu_count())
+    parser.add_argument(
+        "--known", type=Path, help=f"a record ({study}.json); its cells are not run again"
+    )
+    parser.add_argument(
+        "--collect", action="store_true", help="runs nothing and collects existing results"
+    )
+    parser.add_argument("--out", type=Path, default=Path("out") / study)
+    parser.add_argument("--results", type=Path, default=Path(__file__).parent / "results")
+
+
+def key_of(text: str) -> str:
+    """The name of a file for a cell with this description."""
+    return "-".join("".join(c if c.isalnum() else " " for c in text.lower()).split())
 
 
 def check_given(result: dict, given: dict, name: object) -> None:

@@ -10,14 +10,13 @@ rendering takes 40 s, so the study takes about half an hour on two cores.
 
 import argparse
 import json
-import os
 import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
-from jobs import run_all
+from jobs import add_options, key_of, run_all
 from sizes_methods import METHODS, Measurer
 from sizes_scene import LENSES, OWN, SIZE, TRAIN, lenses_of, pictures, with_angles_scaled
 from sizes_tables import SHUFFLED, WRONG, collect, publish
@@ -28,7 +27,6 @@ from darswin.train.losses import distance_loss
 from darswin.train.pixel_metrics import DistanceSums
 from darswin.utils.files import replace_file
 
-HERE = Path(__file__).parent
 CHUNK = 600  # pictures in a file
 
 Pictures = tuple[Tensor, Tensor]  # images (N, H, W, 3) uint8 and distances (N, H, W)
@@ -59,8 +57,7 @@ class Cell:
     @property
     def key(self) -> str:
         """The name of its file."""
-        words = f"{self.label} {self.seed}".lower().replace("+", "and")
-        return "-".join("".join(c if c.isalnum() else " " for c in words).split())
+        return key_of(f"{self.label} {self.seed}".replace("+", "and"))
 
 
 def all_cells(seeds: int) -> list[Cell]:
@@ -199,21 +196,12 @@ def known_cells(file: Path, settings: Settings) -> dict[Cell, dict]:
 def main(arguments: list[str] | None = None) -> None:
     default = Settings()
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--cell", help="runs only cells whose key contains this text")
+    add_options(parser, "sizes")
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument(
         "--pictures", type=int, nargs=2, default=(default.train, default.test),
         metavar=("TRAIN", "TEST"), help="the number of pictures for training and in each test set",
     )  # fmt: skip
-    parser.add_argument("--processes", type=int, default=os.cpu_count())
-    parser.add_argument(
-        "--known", type=Path, help="a record (sizes.json); its cells are not run again"
-    )
-    parser.add_argument(
-        "--collect", action="store_true", help="runs nothing and collects existing results"
-    )
-    parser.add_argument("--out", type=Path, default=Path("out/sizes"))
-    parser.add_argument("--results", type=Path, default=HERE / "results")
     args = parser.parse_args(arguments)
     train_count, test_count = args.pictures
     settings = Settings(train=train_count, test=test_count)
