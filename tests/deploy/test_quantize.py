@@ -37,9 +37,8 @@ def network(name="darswin_a_nano", **options):
     torch.manual_seed(0)
     if name.startswith("swin_unet"):
         options["image_size"] = 32
-    if "unet" in name:
-        # Few blocks: each one lets single steps of rounding grow, up to the error of 8 bits itself.
-        options |= dict(depths=(1, 2, 1), decoder_depths=1)
+    if name.startswith("darswin_unet"):
+        options |= dict(rings=8, sectors=16)
     model = create_model(name, **(dict(num_classes=10) | options)).eval()
     for layer in model.modules():
         if isinstance(layer, nn.Linear):
@@ -69,14 +68,15 @@ def test_a_quantized_model_is_close_and_its_fast_one_the_same(name):
     layers = quantized_layers(quantized)
     assert len(layers) >= 8 and not quantized_layers(model)
     assert all(quantized.get_submodule(name).weight.dtype == torch.int8 for name in layers)
-    images, lens = batch()
+    images, lens = batch(8)
     want, got = flat(model(images, lens)), flat(quantized(images, lens))
     assert 0 < relative_error(got, want) < 0.15
     if HAS_INT8:
         fast = optimize(quantized, torch.int8)
-        # A rounding in float32 may move an activation by one step.
-        limit = 0.2 * relative_error(got, want) + 1e-3
-        assert relative_error(flat(fast(images, lens)), got) < limit
+        # A rounding in float32 may move an activation by one step, and the layers after it let the
+        # difference grow, up to the error of 8 bits itself. An image without such a step is equal.
+        errors = (flat(fast(images, lens)) - got).norm(dim=1) / got.norm(dim=1)
+        assert errors.min() < 1e-5 and errors.max() < relative_error(got, want)
         one = optimize(quantized, torch.int8, lens=lens[:1])
         assert torch.equal(flat(one(images[:1])), flat(fast(images[:1], lens[:1])))
 
