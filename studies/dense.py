@@ -23,7 +23,7 @@ from dense_cells import Cell, all_cells
 from dense_pictures import predict
 from dense_tables import collect, publish
 from dense_trivial import trivial
-from jobs import add_options, printing_to, run_all
+from jobs import add_options, check_given, printing_to, run_all
 
 from darswin.cli.main import main as darswin
 from darswin.utils.files import replace_file
@@ -44,10 +44,7 @@ def run_cell(cell: Cell, out: Path, size: str, options: list[str]) -> dict:
     given = dict(config=CONFIG.read_text(), options=list(cell.options), arguments=options)
     if found.exists():
         result = json.loads(found.read_text())
-        if result["given"] != given:
-            raise ValueError(
-                f"{found} was made with other options: remove it, or use these options"
-            )
+        check_given(result["given"], given, found)
         return result
     run = ["--task", cell.task, "--run", str(folder)]
     model = ["--model.name", f"{cell.family}_{size}", "--seed_everything", str(cell.seed)]

@@ -44,10 +44,13 @@ def key_of(text: str) -> str:
     return "-".join("".join(c if c.isalnum() else " " for c in text.lower()).split())
 
 
-def check_given(result: dict, given: dict, name: object) -> None:
-    """Checks that earlier results come from the same settings; `name` says where they are."""
-    if result["given"] != given:
-        raise ValueError(f"{name} was made with {result['given']}, not {given}: remove it")
+def check_given(earlier: dict, given: dict, name: object) -> None:
+    """Checks that the results in `name` come from the same settings."""
+    others = [key for key in earlier | given if earlier.get(key) != given.get(key)]
+    if others:
+        raise ValueError(
+            f"{name} was made with other settings ({', '.join(others)}): remove it, or use its own"
+        )
 
 
 def use_one_core() -> None:

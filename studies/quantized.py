@@ -43,7 +43,7 @@ def run_cell(
     given = trained["given"] | dict(pictures=pictures)
     if found.exists():
         result = json.loads(found.read_text())
-        check_given(result, given, found)
+        check_given(result["given"], given, found)
         return result
     start = time.perf_counter()
     model, _ = load_model(model_of_run(folder))

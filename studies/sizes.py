@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jobs import add_options, key_of, run_all
+from jobs import add_options, check_given, key_of, run_all
 from sizes_methods import METHODS, Measurer
 from sizes_scene import LENSES, OWN, SIZE, TRAIN, lenses_of, pictures, with_angles_scaled
 from sizes_tables import SHUFFLED, WRONG, collect, publish
@@ -153,10 +153,7 @@ def run_cell(cell: Cell, out: Path, settings: Settings) -> dict:
     file, data = out / "cells" / f"{cell.key}.json", out / "data"
     if file.exists():
         result = json.loads(file.read_text())
-        if result["settings"] != asdict(settings):
-            raise ValueError(
-                f"{file} was made with other settings: remove it, or use these settings"
-            )
+        check_given(result["settings"], asdict(settings), file)
         return result
     start = time.perf_counter()
     lenses = lenses_of(TRAIN, settings.train)
@@ -188,8 +185,7 @@ def run_cell(cell: Cell, out: Path, settings: Settings) -> dict:
 def known_cells(file: Path, settings: Settings) -> dict[Cell, dict]:
     """The cells of a record; ValueError if it was made with other settings."""
     record = json.loads(file.read_text())
-    if record["settings"] != asdict(settings):
-        raise ValueError(f"{file} was made with other settings: {record['settings']}")
+    check_given(record["settings"], asdict(settings), file)
     return {Cell(cell["label"], cell["seed"]): cell for cell in record["cells"]}
 
 

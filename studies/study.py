@@ -30,7 +30,7 @@ def run_cell(cell: Cell, out: Path, size: str, test_images: int, options: list[s
     given = given_to(cell, test_images, options)
     if found.exists():
         result = json.loads(found.read_text())
-        check_given(result, given, found)
+        check_given(result["given"], given, found)
         return result
     run = ["--run", str(folder)]
     name = f"{cell.family}_{size}"
@@ -100,7 +100,7 @@ def main(arguments: list[str] | None = None) -> None:
     for cell in cells:
         if cell.identity in known:
             given = given_to(cell, args.test_images, options)
-            check_given(known[cell.identity], given, f"{cell.key} in {args.known}")
+            check_given(known[cell.identity]["given"], given, f"{cell.key} in {args.known}")
     missing = [cell for cell in cells if cell.identity not in known]
     jobs = [(cell, args.out, args.size, args.test_images, options) for cell in missing]
     start = time.perf_counter()

@@ -41,7 +41,11 @@ def write_map(name: str, split: str, targets: Sequence[Target], size: int, count
     Raises:
         ValueError: the map was made with other options.
     """
-    made = {t: dict(lenses=t.lenses, fov=t.fov, size=size, count=count, seed=seed) for t in targets}
+    made = {
+        # Only a file's name, so that a data set stays valid if the file's folder moves.
+        t: dict(lenses=Path(t.lenses).name, fov=t.fov, size=size, count=count, seed=seed)
+        for t in targets
+    }
     open_targets = [t for t in targets if not _is_done(_done(t, split, name), made[t])]
     if not open_targets:
         return {}
