@@ -28,6 +28,7 @@ from worlds.wad import load_map, map_names
 
 from darswin.data import open_scenes
 from darswin.lens.pixels import pixel_rays
+from darswin.lens.solve import vector_of
 from darswin.train.pixel_metrics import DistanceSums
 from darswin.utils.files import replace_file
 
@@ -109,12 +110,12 @@ def _pictures(
             continue
         for k, eye in zip(mine, eyes(name, len(mine)), strict=True):
             scene = scenes[k]
-            theta, way = (rays[0].numpy() for rays in pixel_rays(scene.lens, scene.target.shape))
+            theta, direction = pixel_rays(scene.lens, scene.target.shape)
+            rays = vector_of(theta, direction)[0].numpy()
             label = cv2.imread(str(folder / split / "labels" / files[k].name), cv2.IMREAD_GRAYSCALE)
-            known = (scene.target > 0) & ~np.isnan(theta) & (label < len(LABEL))
-            theta, way, label = theta[known], way[known], label[known].astype(int)
-            rays = np.concatenate((np.sin(theta)[:, None] * way, np.cos(theta)[:, None]), 1)
-            up = (rays @ eye.rotation.T)[:, 2].clip(-1, 1)
+            known = (scene.target > 0) & ~np.isnan(rays[..., 2]) & (label < len(LABEL))
+            label = label[known].astype(int)
+            up = (rays[known] @ eye.rotation.T)[:, 2].clip(-1, 1)
             height = np.full(len(up), math.inf)
             height[(label == LABEL["floor"]) & (up < 0)] = eye.above
             height[(label == LABEL["ceiling"]) & (up > 0)] = eye.below

@@ -14,6 +14,7 @@ from torch import Tensor, nn
 
 from darswin.lens import Lens
 from darswin.lens.pixels import pixel_rays
+from darswin.lens.solve import direction_of, vector_of
 from darswin.lens.spacing import (
     SPACINGS,
     Spacing,
@@ -184,8 +185,7 @@ class PolarGridSpec:
         theta = change_spacing(lens, centers, self.spacing, "theta")[..., None]
         sector = torch.arange(self.sectors, dtype=theta.dtype, device=theta.device)
         azimuth = (sector + 0.5) * (2 * math.pi / self.sectors)
-        aside, forward = torch.sin(theta), torch.cos(theta).expand(-1, -1, self.sectors)
-        return torch.stack((aside * torch.cos(azimuth), aside * torch.sin(azimuth), forward), -1)
+        return vector_of(theta.expand(-1, -1, self.sectors), direction_of(azimuth))
 
     def border_angles(self, lens: Lens) -> Tensor:
         """θ of the ring borders, (N, R+1) rad."""
@@ -243,7 +243,7 @@ def _steps(count: int, placement: Placement, like: Tensor) -> Tensor:
 def _offsets(lens: Lens, theta: Tensor, azimuths: Tensor) -> Tensor:
     """The offset of each point from the radial curve of the lens, (N, 2, N_r, N_a) px."""
     theta = theta[:, :, None].expand(-1, -1, len(azimuths))
-    direction = torch.stack((torch.cos(azimuths), torch.sin(azimuths)), -1)
+    direction = direction_of(azimuths)
     offsets = lens.offset(theta, direction.expand(*theta.shape, 2))
     return lens.through_affine(offsets).permute(0, 3, 1, 2)
 

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from darswin.lens.frame import ImageFrame, Size
 from darswin.lens.parameter import Number
-from darswin.lens.solve import direction_of, inverse, length_of
+from darswin.lens.solve import direction_of, inverse, length_of, vector_of
 
 # A lens ends this far (rad) before the angle at which r stops rising or becomes infinite, where r
 # does not determine θ.
@@ -229,9 +229,7 @@ class Lens(ImageFrame):
     def unproject_points(self, pixels: Tensor, image_size: Size = None) -> Tensor:
         """Unit vectors (x, y, z), (N, ..., 3), towards the points seen at pixels: the inverse of
         `project_points`. NaN where no ray lands. Arguments: see `unproject_pixels`."""
-        theta, direction = self.rays(pixels, image_size)
-        aside = torch.sin(theta)[..., None] * direction
-        return torch.cat((aside, torch.cos(theta)[..., None]), -1)
+        return vector_of(*self.rays(pixels, image_size))
 
     def rays(self, pixels: Tensor, image_size: Size = None) -> tuple[Tensor, Tensor]:
         """`unproject_pixels` with (cos φ, sin φ), (N, ..., 2), in place of φ. At the principal

@@ -127,3 +127,8 @@ def radial_slopes(ratio: Tensor, slope: Tensor, direction: Tensor) -> Tensor:
 def direction_of(azimuth: Tensor) -> Tensor:
     """(..., 2): cos φ and sin φ."""
     return torch.stack((torch.cos(azimuth), torch.sin(azimuth)), -1)
+
+
+def vector_of(theta: Tensor, direction: Tensor) -> Tensor:
+    """(..., 3): the unit vectors (x, y, z) of rays at θ in directions (cos φ, sin φ)."""
+    return torch.cat((torch.sin(theta)[..., None] * direction, torch.cos(theta)[..., None]), -1)

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from darswin.layers.embed import check_dtype
 from darswin.layers.polar import check_count
 from darswin.lens.pixels import pixel_rays
+from darswin.lens.solve import vector_of
 from darswin.models.base import FeatureInfo
 from darswin.models.pixel import PixelModel, PixelTask
 from darswin.models.registry import Presets, register_model
@@ -101,7 +102,7 @@ class ConvUnet(PixelModel):
         if not self.uses_lens:
             return None
         theta, direction = (rays.float() for rays in pixel_rays(lens, size))
-        rays = torch.cat((theta.sin()[..., None] * direction, theta.cos()[..., None]), -1)
+        rays = vector_of(theta, direction)
         return torch.where(theta.isnan()[..., None], 0.0, rays).permute(0, 3, 1, 2)
 
     def _sample(self, images: Tensor, prepared: Tensor | None) -> Tensor:

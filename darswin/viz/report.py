@@ -8,6 +8,7 @@ from torch import Tensor
 
 from darswin.layers.polar import polar_grid
 from darswin.lens.base import Lens
+from darswin.lens.solve import direction_of
 from darswin.lens.spacing import SPACINGS, Spacing
 
 __all__ = ["describe"]
@@ -32,7 +33,7 @@ def largest_offset(lens: Lens) -> float:
     """The largest offset (px) by tangential and thin-prism terms up to θ_max."""
     theta = lens.theta_max * torch.linspace(0, 1, 129).to(lens.theta_max)[:, None]
     azimuth = torch.linspace(0, 2 * math.pi, 181).to(theta)
-    direction = torch.stack((torch.cos(azimuth), torch.sin(azimuth)), -1)
+    direction = direction_of(azimuth)
     return lens.through_affine(lens.offset(theta, direction)).norm(dim=-1).max().item()
 
 
