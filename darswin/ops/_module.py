@@ -63,13 +63,13 @@ def set_tier(tier: str) -> None:
         )
 
 
-def set_gathers(way: bool | None) -> None:
+def set_gathers(use: bool | None) -> None:
     """Reads large grey or RGB images with or without gather instructions.
 
-    None, the default, picks the faster way on this CPU. The results are the same. Only the AVX-512
+    None, the default, does what is faster on this CPU. The results are the same. Only the AVX-512
     tier has gathers.
     """
-    _loaded.darswin_set_gathers(2 if way is None else int(way))
+    _loaded.darswin_set_gathers(2 if use is None else int(use))
 
 
 def build_info() -> dict[str, str | int]:

@@ -126,7 +126,7 @@ class Segmentation(PixelTask):
         if len(learned) - len(absent) < 2:
             raise ValueError(
                 f"{text}, so only one class is left to learn. {IGNORE} means unlabelled: store a "
-                "mask of 0 and 255 as the ids 0 and 1, or give --data.label_map"
+                "mask of 0 and 255 as the ids 0 and 1, or give a `label_map`"
             )
         if not self.global_rank:
             warnings.warn(f"{text}, which cannot be learned", AbsentClass, stacklevel=2)

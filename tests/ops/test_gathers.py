@@ -26,8 +26,8 @@ def avx512():
 def assert_same_bits(case: Case) -> None:
     """Compares runs without gathers, with gathers, and with the default for this CPU."""
     found = []
-    for way in (False, True, None):
-        _module.set_gathers(way)
+    for use in (False, True, None):
+        _module.set_gathers(use)
         found.append(case.run(**case.inputs).view(torch.int32))
     assert all(torch.equal(found[0], other) for other in found[1:])
 
