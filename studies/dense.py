@@ -6,8 +6,8 @@ results, so a study that was stopped can go on. The pictures are rendered once b
 which needs `apt-get install freedoom`.
 
 The study has 40 cells: 4 models × 2 seeds × (2 tasks × 2 bands), and 8 controls. A cell trains on
-8,000 pictures at 30 to 45 ms, tests on 24 sets of 75 pictures at 15 ms, and needs 8 s to start. The
-cells take 40 × (300 + 27 + 8) s and the pictures 1,900 s, together 4.2 hours on one core. With
+8,000 pictures and tests on 24 sets of 75 pictures. It takes 6 to 9 minutes on a core, with another
+cell on the other core. The pictures take 1,900 s, so two cores need 3 hours in total. With
 `--known RECORD` a later run goes on from a record.
 """
 
