@@ -291,6 +291,14 @@ def test_plans_that_do_not_fit_together_are_refused(changes, tmp_path):
         frames.Sampler(replace(PLAN, **changes))
 
 
+def test_distances_of_0_and_1_are_pixel_centres():
+    on, before = np.zeros_like(PLAN.right), np.ones_like(PLAN.right)
+    inside = replace(PLAN, columns=PLAN.columns.clip(1, 40), rows=PLAN.rows.clip(1, 40), right=on)
+    shifted = replace(inside, columns=inside.columns - 1, right=before)
+    frame = random_frame(50, 60, 3)
+    np.testing.assert_array_equal(frames.Sampler(shifted)(frame), frames.Sampler(inside)(frame))
+
+
 def test_files_of_other_kinds_are_refused(tmp_path):
     path = tmp_path / "camera.npz"
     with pytest.raises(FileNotFoundError):

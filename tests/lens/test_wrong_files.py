@@ -94,6 +94,7 @@ CHANGED = {
     "nerfstudio.json": (
         ("OPENCV_FISHEYE", "EQUI", "camera_model must be one of"),
         ('"fl_y": 852.9,', "", "fl_y is missing"),
+        ('"h": 1920, ', "", "h is missing"),
         ('"k4": -0.0001', '"k_4": 0.1', "k3 needs k4"),
         ('"camera_m', '"k5": 0.1, "camera_m', "numbers of k5"),
         ('"camera_m', '"distortion_params": [0.1], "camera_m', "numbers of distortion_params"),
