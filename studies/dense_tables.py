@@ -248,8 +248,10 @@ def trials(rows: list[dict], task: str) -> str:
     """Single trainings with other losses, parts and initial weights, tested on their own lenses."""
     found = [row for row in rows if row["task"] == task]
     classes = [*found[0].get("iou", ())]
-    scores = dict(miou="mIoU", accuracy="accuracy", delta1="δ1", abs_rel="AbsRel")
-    scores |= dict(xi_half="δ1, ξ = 0.5", inside="up to 82.5°", beyond="beyond 82.5°")
+    scores = dict(
+        miou="mIoU", accuracy="accuracy", delta1="δ1", abs_rel="AbsRel",
+        xi_half="δ1, ξ = 0.5", inside="up to 82.5°", beyond="beyond 82.5°",
+    )  # fmt: skip
     kept = {key: name for key, name in scores.items() if key in found[0]}
     cells = [
         [row["model"], row["loss"], f"{row['views']:,}"]
