@@ -10,7 +10,7 @@ from torch import Tensor
 
 from darswin.lens.base import Lens
 from darswin.lens.ideal import Perspective
-from darswin.lens.solve import determinant, length_of
+from darswin.lens.solve import determinant, length_of, vector_of
 from darswin.ops.checks import tensor_there
 
 OUTSIDE = -10.0  # px: beyond any image, also for interpolation over several pixels
@@ -25,11 +25,32 @@ def pixel_rays(lens: Lens, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
     Returns:
         θ (N, H, W), rad, NaN where no ray lands or beyond θ_max; and (cos φ, sin φ), (N, H, W, 2).
     """
+    theta, direction = lens.rays(_centers(lens, size), size)
+    return torch.where(lens.sees(theta), theta, torch.nan), direction
+
+
+def _centers(lens: Lens, size: tuple[int, int]) -> Tensor:
+    """The centres of the pixels of images of (H, W), (1, H, W, 2)."""
     like = lens.theta_max
     rows, columns = (torch.arange(side, dtype=like.dtype, device=like.device) for side in size)
-    pixels = torch.stack(torch.meshgrid(columns, rows, indexing="xy"), -1)
-    theta, direction = lens.rays(pixels[None], size)
-    return torch.where(lens.sees(theta), theta, torch.nan), direction
+    return torch.stack(torch.meshgrid(columns, rows, indexing="xy"), -1)[None]
+
+
+def ray_channels(lens: Lens, size: tuple[int, int], points: Tensor | None = None) -> Tensor:
+    """The viewing directions of pixels as channels. Differentiable in the lens.
+
+    Args:
+        size: (H, W) of the image.
+        points: a map (N, H', W', 2) in the image; None means the image's own pixels.
+
+    Returns:
+        The unit vectors (x, y, z), (N, 3, H', W'); 0 where no ray lands or beyond θ_max.
+    """
+    points = _centers(lens, size) if points is None else points
+    theta, direction = lens.rays(points, size)
+    seen = lens.sees(theta) & (points != OUTSIDE).any(-1)
+    rays = vector_of(torch.where(seen, theta, 0.0), direction)  # NaN must not reach the gradients
+    return torch.where(seen[..., None], rays, 0.0).permute(0, 3, 1, 2)
 
 
 def pixel_angles(lens: Lens, size: tuple[int, int]) -> Tensor:

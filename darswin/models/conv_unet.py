@@ -10,10 +10,9 @@ from torch import Tensor, nn
 
 from darswin.layers.embed import check_dtype
 from darswin.layers.polar import check_count
-from darswin.lens.pixels import pixel_rays
-from darswin.lens.solve import vector_of
+from darswin.lens.pixels import ray_channels
 from darswin.models.base import FeatureInfo
-from darswin.models.pixel import PixelModel, PixelTask
+from darswin.models.pixel import RAYS, PixelModel, PixelTask, with_rays
 from darswin.models.registry import Presets, register_model
 from darswin.models.stages import Pair
 from darswin.ops.checks import per_channel
@@ -86,11 +85,11 @@ class ConvUnet(PixelModel):
         )
         self.down = nn.ModuleList(
             ConvBlock(before, width)
-            for before, width in pairwise((in_chans + (3 if rays else 0), *widths))
+            for before, width in pairwise((in_chans + (RAYS if rays else 0), *widths))
         )
         self.up = nn.ModuleList(ConvBlock(fine + coarse, fine) for fine, coarse in pairwise(widths))
         self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-        self._make_head(num_classes, widths[0], 0)
+        self._make_head(num_classes, dim=widths[0])
         self.pretrained_cfg = dict(
             num_classes=self.num_classes, input_size=(in_chans, 128, 128), fixed_input_size=False,
             mean=self.mean, std=self.std, interpolation="bilinear", crop_pct=1.0,
@@ -99,11 +98,7 @@ class ConvUnet(PixelModel):
 
     def _prepare(self, lens: Any, size: Pair) -> Tensor | None:
         """The viewing directions of the pixels, (N, 3, H, W)."""
-        if not self.uses_lens:
-            return None
-        theta, direction = (rays.float() for rays in pixel_rays(lens, size))
-        rays = vector_of(theta, direction)
-        return torch.where(theta.isnan()[..., None], 0.0, rays).permute(0, 3, 1, 2)
+        return ray_channels(lens, size) if self.uses_lens else None
 
     def _sample(self, images: Tensor, prepared: Tensor | None) -> Tensor:
         return self._floating(images)
@@ -113,10 +108,9 @@ class ConvUnet(PixelModel):
 
     def _run(self, images: Tensor, prepared: Tensor | None) -> Tensor:
         check_dtype(images, next(self.parameters()).dtype)
-        x = self._floating(images)
         if prepared is not None:
             check_count(prepared.shape[0], images)
-            x = torch.cat((x, prepared.to(x).expand(len(x), -1, -1, -1)), 1)
+        x = with_rays(self._floating(images), prepared)
         x = x.contiguous(memory_format=torch.channels_last)
         maps: list[Tensor] = []
         for level, block in enumerate(self.down):

@@ -13,13 +13,23 @@ from darswin.models.base import Model, init_by_width
 PixelTask = Literal["segmentation", "distance"]
 # exp(±8): distances lie between 1/3000 of the typical distance and 3000 times that distance.
 LARGEST_EXPONENT = 8.0
+RAYS = 3  # the channels of viewing directions
+
+
+def with_rays(images: Tensor, rays: Tensor | None) -> Tensor:
+    """Images (B, C, H, W) and the viewing directions of their pixels, (B or 1, 3, H, W), joined."""
+    if rays is None:
+        return images
+    rays = rays.to(images).expand(images.shape[0], -1, -1, -1)
+    return torch.cat((images, rays), 1)
 
 
 class PixelHead(nn.Module):
     """The last map of a network → K logits of each pixel, refined by the pixels of the image.
 
     With a `skip_width`, that many channels of the map are resampled to the pixels, and convolutions
-    join them with the image. Without it, only the logits are resampled.
+    join them with the image, which may have rays as more channels. Without it, only the logits are
+    resampled.
     """
 
     # A linear layer before the resampling gives the same as one after it, at less cost.
@@ -93,10 +103,12 @@ class PixelModel(Model):
             raise ValueError(f"task must be one of {get_args(PixelTask)}, got {task!r}")
         self.task, self._typical_distance = task, typical_distance
 
-    def _make_head(self, num_classes: int, dim: int, skip_width: int) -> None:
+    def _make_head(
+        self, num_classes: int, dim: int, in_chans: int = 0, skip_width: int = 0
+    ) -> None:
         if skip_width < 0:
             raise ValueError(f"skip_width must be at least 0, got {skip_width}")
-        self._head_options = dict(dim=dim, in_chans=self.in_chans, skip_width=skip_width)
+        self._head_options = dict(dim=dim, in_chans=in_chans, skip_width=skip_width)
         self.reset_classifier(num_classes)
 
     @property

@@ -10,7 +10,7 @@ from darswin.layers.linear import Linear
 from darswin.models.base import init_by_width
 from darswin.models.darswin import PRESETS, DarSwin
 from darswin.models.encoder import Prepared
-from darswin.models.pixel import PixelModel, PixelTask
+from darswin.models.pixel import RAYS, PixelModel, PixelTask, with_rays
 from darswin.models.registry import Presets, register_model
 from darswin.models.stages import Pair
 from darswin.models.swin import Swin
@@ -97,6 +97,7 @@ class UnetPrepared(NamedTuple):
     positions: Sequence[Sequence[Tensor | None]]  # of the decoder's stages
     image_points: Tensor | None  # see `PlainView.image_points`
     view_points: Any  # see `PlainView.view_points`
+    rays: Tensor | None  # see `PlainView.rays`
     size: Pair  # (H, W) of the images
 
 
@@ -114,7 +115,8 @@ class Unet(PixelModel):
 
     The decoder's last map is 4 times finer along both axes than the encoder's first map. It is
     projected to `skip_width` channels and resampled to the pixels. A few convolutions, which also
-    read the image, then add the details that the map is too coarse for, and predict.
+    read the image and the viewing direction of each pixel, then add the details that the map is too
+    coarse for, and predict.
 
     The `view` is the form in which the network sees the images:
 
@@ -134,6 +136,8 @@ class Unet(PixelModel):
         decoder_depths: the number of blocks of each decoder stage. There is one decoder stage for
             each encoder stage but the last. An int applies to all.
         skip_width: the number of channels of these convolutions; 0 leaves them out.
+        rays: False leaves the viewing directions out of these convolutions. The view "none" never
+            has them.
         typical_distance: the distance, in m, around which "distance" starts.
         places: adds a learned linear function of each token's position to the encoder's maps before
             the decoder. For "polar" the position is the viewing direction (x, y, z), which tells
@@ -176,6 +180,7 @@ class Unet(PixelModel):
         task: PixelTask = "segmentation",
         decoder_depths: int | Sequence[int] = 2,
         skip_width: int = 32,
+        rays: bool = True,
         typical_distance: float = 10.0,
         places: bool = True,
         **options: Any,
@@ -202,7 +207,9 @@ class Unet(PixelModel):
             for channels in (self.feature_info.channels() if places else ())
         )
         self.apply(init_by_width)
-        self._make_head(num_classes, self.feature_info.channels(0), skip_width)
+        self.rays = rays and self.uses_lens and skip_width > 0
+        head_chans = in_chans + (RAYS if self.rays else 0)
+        self._make_head(num_classes, self.feature_info.channels(0), head_chans, skip_width)
         self.pretrained_cfg = self.encoder.pretrained_cfg | dict(
             num_classes=self.num_classes,
             input_size=(in_chans, *(self.image_size or (128, 128))),
@@ -217,11 +224,13 @@ class Unet(PixelModel):
 
     def _prepare(self, lens: Any, size: Pair) -> UnetPrepared:
         encoder = self.encoder._prepare(lens, size)
+        image_points = self.view.image_points(lens, size)
         return UnetPrepared(
             encoder,
             encoder.positions[:-1],
-            self.view.image_points(lens, size),
+            image_points,
             self.view.view_points(lens, size),
+            self.view.rays(lens, size, image_points) if self.rays else None,
             size,
         )
 
@@ -258,7 +267,7 @@ class Unet(PixelModel):
         head = self.head
         x = head.carried(self.decoder(maps, prepared.positions))
         x = self.view.to_pixels(x, prepared.view_points, prepared.size)
-        logits = head.refine(x, seen)
+        logits = head.refine(x, None if seen is None else with_rays(seen, prepared.rays))
         return head.finish(self.view.to_images(logits, prepared.view_points))
 
     def _with_places(self, maps: Sequence[Tensor], view_points: Any) -> list[Tensor]:

@@ -14,7 +14,7 @@ from torch.utils import _pytree as pytree
 from darswin.layers.polar import PixelGrid, PolarGridSpec, check_count, check_images
 from darswin.lens import Lens
 from darswin.lens.concentric import read_square, square_places, square_view
-from darswin.lens.pixels import perspective_view, reprojection, sample_at
+from darswin.lens.pixels import perspective_view, ray_channels, reprojection, sample_at
 from darswin.lens.spacing import SPACINGS, Spacing, check_fixed_theta_max
 from darswin.models.base import Model
 from darswin.models.stages import Pair
@@ -43,6 +43,10 @@ class PlainView:
     def view_points(self, lens: Any, size: Pair) -> Any:
         """The points of the view that the pixels of images of (H, W) show."""
         return None
+
+    def rays(self, lens: Any, size: Pair, image_points: Tensor | None) -> Tensor | None:
+        """The viewing directions of the pixels of the view, (N, 3, H', W'); None without a lens."""
+        return ray_channels(lens, size, image_points) if self.uses_lens else None
 
     def to_view(self, images: Tensor, image_points: Tensor | None) -> Tensor:
         """Images (B, C, H, W) in floating point → the view, (B, C, H', W')."""

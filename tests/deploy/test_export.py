@@ -24,7 +24,9 @@ ONE_BLOCK = dict(depths=(1,), num_heads=(1,))  # tracing takes as long as there 
 
 
 def short(name, **options):
-    options = dict(num_classes=5, depths=(1, 1), num_heads=(1, 2)) | options
+    if name != "conv_unet_nano":  # it has no blocks
+        options = dict(depths=(1, 1), num_heads=(1, 2)) | options
+    options = dict(num_classes=5) | options
     if name == "official":
         return OfficialDarSwin(embed_dim=24, samples=(4, 4), **options).eval()
     return create_model(name, **options).eval()
@@ -52,6 +54,7 @@ def tensors_of(lens):
         ("darswin_unet_a_nano", dict(skip_width=4), SPHERICAL),
         ("darswin_unet_ra_nano", dict(ONE_BLOCK, task="distance"), POLYNOMIAL),
         ("swin_unet_undis_nano", dict(ONE_BLOCK, image_size=32), SPHERICAL),
+        ("conv_unet_nano", {}, SPHERICAL),
         ("swin_unet_adapted_nano", dict(ONE_BLOCK, image_size=32), SPHERICAL),
     ],
 )

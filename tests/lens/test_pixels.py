@@ -18,7 +18,13 @@ from darswin.lens import (
     solid_angles,
     z_to_distance,
 )
-from darswin.lens.pixels import OUTSIDE, perspective_view, pixel_angles, reprojection
+from darswin.lens.pixels import (
+    OUTSIDE,
+    perspective_view,
+    pixel_angles,
+    ray_channels,
+    reprojection,
+)
 
 f64 = torch.float64
 
@@ -95,6 +101,27 @@ def test_z_is_that_of_points_in_space(name):
     torch.testing.assert_close(z[seen], points[..., 2][seen])
     assert not z[~seen].any()
     torch.testing.assert_close(z_to_distance(z, lens), torch.where(seen, distance, 0.0))
+
+
+@pytest.mark.parametrize("name", LENSES)
+def test_rays_as_channels(name):
+    lens, size = LENSES[name].with_theta_max(0.9), (46, 64)
+    center = lens.center.clone().requires_grad_()
+    rays = ray_channels(lens.replace(center=center), size)
+    theta = pixel_angles(lens, size)
+    seen = ~theta.isnan()
+    assert rays.shape == (1, 3, *size) and seen.any() and not seen.all()
+    torch.testing.assert_close(rays.norm(dim=1), seen.to(f64))
+    torch.testing.assert_close(rays[:, 2][seen], theta[seen].cos())
+    landed = lens.project_points(rays.movedim(1, -1)[seen][None], size)[0]
+    y, x = seen[0].nonzero().T
+    torch.testing.assert_close(landed, torch.stack((x, y), -1).to(f64))
+    # Points of other images, and none.
+    points = torch.tensor([[[[OUTSIDE, OUTSIDE], [20.0, 21.0]]]], dtype=f64)
+    expected = torch.stack((torch.zeros(3, dtype=f64), rays[0, :, 21, 20]), -1)
+    torch.testing.assert_close(ray_channels(lens, size, points)[0, :, 0], expected)
+    rays.square().mul(torch.rand_like(rays)).sum().backward()
+    assert center.grad.isfinite().all() and center.grad.all()
 
 
 def test_maps_with_a_channel_have_a_lens_each():

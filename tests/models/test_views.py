@@ -17,6 +17,7 @@ from darswin.lens import (
     Polynomial,
     Spherical,
 )
+from darswin.lens.concentric import square_to_disc
 from darswin.lens.pixels import reproject
 from darswin.models import LensAdapter
 from darswin.models.views import PlainView
@@ -262,7 +263,7 @@ def test_a_map_coarser_than_the_image_is_resized():
 
 @torch.no_grad()
 def test_undistorted_it_predicts_in_the_view_and_brings_back():
-    undis = network("swin_unet_undis_nano", max_fov=2.0)
+    undis = network("swin_unet_undis_nano", max_fov=2.0, rays=False)
     plain = of_the_same_weights(undis, "swin_unet_nano")
     images = torch.randn(2, 3, 64, 64)
     half = torch.full((2,), 1.0)  # the view shows 2.0 rad of the 2.6 rad
@@ -276,12 +277,59 @@ def test_undistorted_it_predicts_in_the_view_and_brings_back():
 @torch.no_grad()
 @pytest.mark.parametrize("spacing", ["theta", "g", "radius"])
 def test_adapted_it_is_a_lens_adapter_around_it(spacing):
-    adapted = network("swin_unet_adapted_nano", spacing=spacing)
+    adapted = network("swin_unet_adapted_nano", spacing=spacing, rays=False)
     plain = of_the_same_weights(adapted, "swin_unet_nano")
     images = torch.randn(2, 3, 64, 64)
     got = adapted(images, WIDE)
     assert torch.equal(got, LensAdapter(plain, 64, spacing)(images, WIDE))
     assert (got[:, :, 0, 0] == 0).all() and (got[:, :, 32, 1] != 0).all()
+
+
+def rays_of_the_image(lens, size):
+    points = torch.stack(pixels(size, size), -1)
+    return lens.unproject_points(points[None], (size, size))
+
+
+def rays_of_the_perspective_view(lens, size):
+    return rays_of_the_image(Perspective(size / 2 / torch.tan(lens.theta_max), 1.5), size)
+
+
+def rays_of_the_square(lens, size):
+    step = (torch.arange(size) + 0.5) * 2 / size - 1
+    radius, direction = square_to_disc(torch.stack(torch.meshgrid(step, step, indexing="xy"), -1))
+    theta = lens.theta_max[:, None, None, None] * radius[..., None]
+    return torch.cat((theta.sin() * direction, theta.cos()), -1)
+
+
+@torch.no_grad()
+@pytest.mark.parametrize(
+    ("name", "rays_of"),
+    [
+        ("darswin_unet_a_nano", rays_of_the_image),
+        ("swin_unet_undis_nano", rays_of_the_perspective_view),
+        ("swin_unet_adapted_nano", rays_of_the_square),
+    ],
+)
+def test_the_head_reads_the_rays_of_its_pixels(name, rays_of):
+    model, blind = (network(name, rays=rays) for rays in (True, False))
+    rays, expected = model.prepare(WIDE, (64, 64)).rays, rays_of(WIDE, 64).movedim(-1, 1)
+    seen = expected[:, 2:] >= WIDE.theta_max.cos()[:, None, None, None] - 1e-6
+    assert seen.any() and seen.all() == (name == "swin_unet_adapted_nano")
+    torch.testing.assert_close(rays, torch.where(seen, expected, 0.0), rtol=0, atol=1e-5)
+    # They are the last three channels of the head's first convolution.
+    state, key = model.state_dict(), "segmentation_head.stem.weight"
+    state[key] = state[key][:, :3]
+    blind.load_state_dict(state)
+    images = torch.rand(2, 3, 64, 64)
+    assert not torch.allclose(blind(images, WIDE), model(images, WIDE))
+    model.head.stem.weight[:, 3:] = 0
+    torch.testing.assert_close(blind(images, WIDE), model(images, WIDE))
+
+
+def test_without_a_lens_or_convolutions_there_are_no_rays():
+    for name, skip_width in (("swin_unet_nano", 32), ("darswin_unet_a_nano", 0)):
+        model = network(name, skip_width=skip_width)
+        assert not model.rays and model.prepare(WIDE, (64, 64)).rays is None
 
 
 def test_tokens_of_a_picture_are_at_the_middles_of_equal_parts():
