@@ -59,7 +59,7 @@ def square_view(
     places = torch.stack(torch.meshgrid(steps, steps, indexing="xy"), -1)
     radius, direction = square_to_disc(places)
     if theta_max is not None:
-        theta = (theta_max * radius).expand(len(lens), -1, -1)
+        theta = (theta_max * radius)[None]
         return as_map(lens.seen_pixels(theta, direction[None], image_size))
     first, last = (end[:, :, None] for end in span(lens, spacing))
     theta = to_theta(lens, first + (last - first) * radius, spacing)

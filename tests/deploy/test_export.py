@@ -54,6 +54,7 @@ def tensors_of(lens):
         ("darswin_unet_a_nano", dict(skip_width=4), SPHERICAL),
         ("darswin_unet_ra_nano", dict(ONE_BLOCK, task="distance"), POLYNOMIAL),
         ("swin_unet_undis_nano", dict(ONE_BLOCK, image_size=32), SPHERICAL),
+        ("swin_unet_adapted_nano", dict(ONE_BLOCK, image_size=32, theta_max=1.5), SPHERICAL),
         ("conv_unet_nano", {}, SPHERICAL),
         ("swin_unet_adapted_nano", dict(ONE_BLOCK, image_size=32), SPHERICAL),
     ],
