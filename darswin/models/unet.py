@@ -115,8 +115,8 @@ class Unet(PixelModel):
 
     The decoder's last map is 4 times finer along both axes than the encoder's first map. It is
     projected to `skip_width` channels and resampled to the pixels. A few convolutions, which also
-    read the image and the viewing direction of each pixel, then add the details that the map is too
-    coarse for, and predict.
+    read the image, then add the details that the map is too coarse for, and predict. For "distance"
+    they also read the viewing direction of each pixel.
 
     The `view` is the form in which the network sees the images:
 
@@ -136,8 +136,9 @@ class Unet(PixelModel):
         decoder_depths: the number of blocks of each decoder stage. There is one decoder stage for
             each encoder stage but the last. An int applies to all.
         skip_width: the number of channels of these convolutions; 0 leaves them out.
-        rays: False leaves the viewing directions out of these convolutions. The view "none" never
-            has them.
+        rays: whether these convolutions read the viewing direction of each pixel. None means for
+            "distance" only: classes did worse with them on lenses unlike those of training. The
+            view "none" has no viewing directions.
         typical_distance: the distance, in m, around which "distance" starts.
         places: adds a learned linear function of each token's position to the encoder's maps before
             the decoder. For "polar" the position is the viewing direction (x, y, z), which tells
@@ -180,7 +181,7 @@ class Unet(PixelModel):
         task: PixelTask = "segmentation",
         decoder_depths: int | Sequence[int] = 2,
         skip_width: int = 32,
-        rays: bool = True,
+        rays: bool | None = None,
         typical_distance: float = 10.0,
         places: bool = True,
         **options: Any,
@@ -207,6 +208,8 @@ class Unet(PixelModel):
             for channels in (self.feature_info.channels() if places else ())
         )
         self.apply(init_by_width)
+        if rays is None:
+            rays = task == "distance"
         self.rays = rays and self.uses_lens and skip_width > 0
         head_chans = in_chans + (RAYS if self.rays else 0)
         self._make_head(num_classes, self.feature_info.channels(0), head_chans, skip_width)

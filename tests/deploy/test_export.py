@@ -229,7 +229,7 @@ def sampled(model, images, lens):
     ("name", "options", "lens"),
     [
         ("darswin_ra_nano", ONE_BLOCK, POLYNOMIAL),
-        ("darswin_unet_a_nano", ONE_BLOCK, SPHERICAL[0]),
+        ("darswin_unet_a_nano", dict(ONE_BLOCK, task="distance"), SPHERICAL[0]),
         ("darswin_unet_ra_nano", dict(ONE_BLOCK, skip_width=0), POLYNOMIAL),
         ("swin_undis_nano", ONE_BLOCK, SPHERICAL[0]),
     ],

@@ -263,7 +263,7 @@ def test_a_map_coarser_than_the_image_is_resized():
 
 @torch.no_grad()
 def test_undistorted_it_predicts_in_the_view_and_brings_back():
-    undis = network("swin_unet_undis_nano", max_fov=2.0, rays=False)
+    undis = network("swin_unet_undis_nano", max_fov=2.0)
     plain = of_the_same_weights(undis, "swin_unet_nano")
     images = torch.randn(2, 3, 64, 64)
     half = torch.full((2,), 1.0)  # the view shows 2.0 rad of the 2.6 rad
@@ -277,7 +277,7 @@ def test_undistorted_it_predicts_in_the_view_and_brings_back():
 @torch.no_grad()
 @pytest.mark.parametrize("spacing", ["theta", "g", "radius"])
 def test_adapted_it_is_a_lens_adapter_around_it(spacing):
-    adapted = network("swin_unet_adapted_nano", spacing=spacing, rays=False)
+    adapted = network("swin_unet_adapted_nano", spacing=spacing)
     plain = of_the_same_weights(adapted, "swin_unet_nano")
     images = torch.randn(2, 3, 64, 64)
     got = adapted(images, WIDE)
@@ -312,7 +312,8 @@ def rays_of_the_square(lens, size):
 )
 def test_the_head_reads_the_rays_of_its_pixels(name, rays_of):
     model, blind = (network(name, rays=rays) for rays in (True, False))
-    rays, expected = model.prepare(WIDE, (64, 64)).rays, rays_of(WIDE, 64).movedim(-1, 1)
+    prepared = model.prepare(WIDE, (64, 64))
+    rays, expected = prepared.rays, rays_of(WIDE, 64).movedim(-1, 1)
     seen = expected[:, 2:] >= WIDE.theta_max.cos()[:, None, None, None] - 1e-6
     assert seen.any() and seen.all() == (name == "swin_unet_adapted_nano")
     torch.testing.assert_close(rays, torch.where(seen, expected, 0.0), rtol=0, atol=1e-5)
@@ -321,15 +322,28 @@ def test_the_head_reads_the_rays_of_its_pixels(name, rays_of):
     state[key] = state[key][:, :3]
     blind.load_state_dict(state)
     images = torch.rand(2, 3, 64, 64)
-    assert not torch.allclose(blind(images, WIDE), model(images, WIDE))
+    result, sampled = model(images, WIDE), model.sample(images, prepared)
+    torch.testing.assert_close(model.run_sampled(sampled, prepared, images), result)
+    assert not torch.allclose(blind(images, WIDE), result)
     model.head.stem.weight[:, 3:] = 0
     torch.testing.assert_close(blind(images, WIDE), model(images, WIDE))
 
 
-def test_without_a_lens_or_convolutions_there_are_no_rays():
-    for name, skip_width in (("swin_unet_nano", 32), ("darswin_unet_a_nano", 0)):
-        model = network(name, skip_width=skip_width)
-        assert not model.rays and model.prepare(WIDE, (64, 64)).rays is None
+@pytest.mark.parametrize(
+    ("name", "options", "rays"),
+    [
+        ("darswin_unet_a_nano", dict(task="distance"), True),
+        ("darswin_unet_a_nano", {}, False),
+        ("darswin_unet_a_nano", dict(task="distance", rays=False), False),
+        ("darswin_unet_a_nano", dict(rays=True, skip_width=0), False),
+        ("swin_unet_nano", dict(task="distance", rays=True), False),
+    ],
+)
+def test_distances_read_rays_where_there_are_a_lens_and_convolutions(name, options, rays):
+    model = network(name, **options)
+    assert model.rays == rays == (model.prepare(WIDE, (64, 64)).rays is not None)
+    if model.head.skip_width:
+        assert model.head.stem.in_channels == (6 if rays else 3)
 
 
 def test_tokens_of_a_picture_are_at_the_middles_of_equal_parts():
