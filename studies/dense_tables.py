@@ -23,7 +23,15 @@ SHADED = {"wide": (0.0, 0.0), "low": (0.2, 0.35)}  # ξ of the training lenses
 ALL_XI = [xi_set(xi) for xi in SWEEP]
 BOUNDS = {"gravity": "gravity", "labels": "+ classes", "heights": "+ heights"}
 DOCS = Path(__file__).parent.parent / "docs"  # the folder of the pages
-TRIED = (*TASKS, "parts", "rays", "sizes", "rim")  # the groups of single trainings
+TRIED = (
+    *TASKS,
+    "parts",
+    "rays",
+    "labels",
+    "details",
+    "sizes",
+    "rim",
+)  # the groups of single trainings
 NOT_RUN = "Not run yet: `make study-dense`."
 
 
@@ -250,7 +258,8 @@ def trials(rows: list[dict], task: str) -> str:
     classes = [*found[0].get("iou", ())]
     scores = dict(
         miou="mIoU", accuracy="accuracy", delta1="δ1", abs_rel="AbsRel",
-        xi_half="δ1, ξ = 0.5", inside="up to 82.5°", beyond="beyond 82.5°",
+        xi_half="δ1, ξ = 0.5", all_xi="mIoU, all ξ", cameras="mIoU, cameras",
+        inside="up to 82.5°", beyond="beyond 82.5°",
     )  # fmt: skip
     kept = {key: name for key, name in scores.items() if key in found[0]}
     cells = [

@@ -137,8 +137,8 @@ class Unet(PixelModel):
             each encoder stage but the last. An int applies to all.
         skip_width: the number of channels of these convolutions; 0 leaves them out.
         rays: whether these convolutions read the viewing direction of each pixel. None means for
-            "distance" only: classes did worse with them on lenses unlike those of training. The
-            view "none" has no viewing directions.
+            "distance" only, because classes did worse with them. The view "none" has no viewing
+            directions.
         typical_distance: the distance, in m, around which "distance" starts.
         places: adds a learned linear function of each token's position to the encoder's maps before
             the decoder. For "polar" the position is the viewing direction (x, y, z), which tells
