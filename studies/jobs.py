@@ -4,6 +4,7 @@ import argparse
 import contextlib
 import multiprocessing
 import os
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
@@ -16,10 +17,13 @@ from tqdm import tqdm
 def run_all(
     work: Callable[..., dict], jobs: Sequence[tuple], processes: int, unit: str
 ) -> list[dict]:
-    """The results of `work` for the arguments of each job, in the order in which they end."""
+    """The results of `work` for the arguments of each job, in the order in which they end.
+
+    If this process is killed, its jobs end too: they must not write beside those of a later run.
+    """
     os.environ["OMP_NUM_THREADS"] = "1"  # the new processes read it when they start
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(processes, context, use_one_core) as pool:
+    with ProcessPoolExecutor(processes, context, _start) as pool:
         started = [pool.submit(work, *job) for job in jobs]
         ended = tqdm(as_completed(started), total=len(started), unit=unit)
         return [job.result() for job in ended]
@@ -57,6 +61,18 @@ def use_one_core() -> None:
     """Makes the process use one core; two jobs side by side are faster than one on two cores."""
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
+
+
+def _start() -> None:
+    use_one_core()
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+
+    def end_with_it() -> None:
+        parent.join()
+        os._exit(1)
+
+    threading.Thread(target=end_with_it, daemon=True).start()
 
 
 @contextlib.contextmanager

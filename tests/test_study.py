@@ -1,7 +1,11 @@
 """The study's own code, on digits: a minute's version of `make study`."""
 
 import json
+import os
 import shutil
+import subprocess
+import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -26,6 +30,43 @@ def test_cells_have_folders_of_their_own_and_make_models():
     assert len({cell.key for cell in cells}) == len({cell.identity for cell in cells}) == len(cells)
     for cell in ablations():
         create_model(f"{cell.family}_nano", num_classes=10, in_chans=1, **cell.options)
+
+
+JOBS = """
+import os, sys, time
+from pathlib import Path
+from jobs import run_all
+
+def work(file):
+    Path(file).write_text(str(os.getpid()))
+    time.sleep(300)
+
+if __name__ == "__main__":
+    run_all(work, [("first",), ("second",)], 1, "cell")
+"""
+
+
+@pytest.mark.slow
+def test_the_jobs_of_a_killed_study_end(tmp_path):
+    (tmp_path / "program.py").write_text(JOBS)
+    path = os.pathsep.join(sys.path)
+    program = subprocess.Popen(
+        [sys.executable, "program.py"], cwd=tmp_path, env=os.environ | dict(PYTHONPATH=path)
+    )
+    first = tmp_path / "first"
+    wait_until(lambda: first.exists() and first.read_text())
+    program.kill()
+    program.wait()
+    job = Path(f"/proc/{first.read_text()}/status")
+    wait_until(lambda: not job.exists() or "State:\tZ" in job.read_text())
+    assert not (tmp_path / "second").exists()
+
+
+def wait_until(happened, seconds=60):
+    end = time.monotonic() + seconds
+    while not happened():
+        assert time.monotonic() < end
+        time.sleep(0.05)
 
 
 @pytest.fixture(scope="module")
