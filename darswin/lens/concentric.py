@@ -43,6 +43,22 @@ def disc_to_square(radius: Tensor, direction: Tensor) -> Tensor:
     return torch.stack(places, -1)
 
 
+def square_rays(
+    lens: Lens, size: int, spacing: Spacing, theta_max: float | None = None
+) -> tuple[Tensor, Tensor]:
+    """The rays of the pixels of a square with `size` S: θ (N, S, S), rad, and (cos φ, sin φ),
+    (1, S, S, 2). With a fixed `theta_max`, θ is NaN beyond θ_max of the lens."""
+    like = lens.theta_max
+    steps = (2 * torch.arange(size, dtype=like.dtype, device=like.device) + 1) / size - 1
+    places = torch.stack(torch.meshgrid(steps, steps, indexing="xy"), -1)
+    radius, direction = square_to_disc(places)
+    if theta_max is not None:
+        theta = (theta_max * radius)[None]
+        return torch.where(lens.sees(theta), theta, torch.nan), direction[None]
+    first, last = (end[:, :, None] for end in span(lens, spacing))
+    return to_theta(lens, first + (last - first) * radius, spacing), direction[None]
+
+
 def square_view(
     lens: Lens,
     image_size: tuple[int, int],
@@ -54,16 +70,10 @@ def square_view(
 
     With a fixed `theta_max`, they are `OUTSIDE` beyond θ_max of the lens.
     """
-    like = lens.theta_max
-    steps = (2 * torch.arange(size, dtype=like.dtype, device=like.device) + 1) / size - 1
-    places = torch.stack(torch.meshgrid(steps, steps, indexing="xy"), -1)
-    radius, direction = square_to_disc(places)
+    theta, direction = square_rays(lens, size, spacing, theta_max)
     if theta_max is not None:
-        theta = (theta_max * radius)[None]
-        return as_map(lens.seen_pixels(theta, direction[None], image_size))
-    first, last = (end[:, :, None] for end in span(lens, spacing))
-    theta = to_theta(lens, first + (last - first) * radius, spacing)
-    return lens.pixels(theta, direction[None], image_size)
+        return as_map(lens.seen_pixels(theta, direction, image_size))
+    return lens.pixels(theta, direction, image_size)
 
 
 def square_places(

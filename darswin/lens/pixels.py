@@ -25,30 +25,23 @@ def pixel_rays(lens: Lens, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
     Returns:
         θ (N, H, W), rad, NaN where no ray lands or beyond θ_max; and (cos φ, sin φ), (N, H, W, 2).
     """
-    theta, direction = lens.rays(_centers(lens, size), size)
+    like = lens.theta_max
+    rows, columns = (torch.arange(side, dtype=like.dtype, device=like.device) for side in size)
+    pixels = torch.stack(torch.meshgrid(columns, rows, indexing="xy"), -1)
+    theta, direction = lens.rays(pixels[None], size)
     return torch.where(lens.sees(theta), theta, torch.nan), direction
 
 
-def _centers(lens: Lens, size: tuple[int, int]) -> Tensor:
-    """The centres of the pixels of images of (H, W), (1, H, W, 2)."""
-    like = lens.theta_max
-    rows, columns = (torch.arange(side, dtype=like.dtype, device=like.device) for side in size)
-    return torch.stack(torch.meshgrid(columns, rows, indexing="xy"), -1)[None]
-
-
-def ray_channels(lens: Lens, size: tuple[int, int], points: Tensor | None = None) -> Tensor:
-    """The viewing directions of pixels as channels. Differentiable in the lens.
+def ray_channels(theta: Tensor, direction: Tensor) -> Tensor:
+    """The viewing directions of pixels as channels. Differentiable.
 
     Args:
-        size: (H, W) of the image.
-        points: a map (N, H', W', 2) in the image; None means the image's own pixels.
+        theta, direction: as `pixel_rays` returns them.
 
     Returns:
-        The unit vectors (x, y, z), (N, 3, H', W'); 0 where no ray lands or beyond θ_max.
+        The unit vectors (x, y, z), (N, 3, H, W); 0 where θ is NaN.
     """
-    points = _centers(lens, size) if points is None else points
-    theta, direction = lens.rays(points, size)
-    seen = lens.sees(theta) & (points != OUTSIDE).any(-1)
+    seen = ~theta.isnan()
     rays = vector_of(torch.where(seen, theta, 0.0), direction)  # NaN must not reach the gradients
     return torch.where(seen[..., None], rays, 0.0).permute(0, 3, 1, 2)
 

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from darswin.layers.embed import check_dtype
 from darswin.layers.polar import check_count
-from darswin.lens.pixels import ray_channels
+from darswin.lens.pixels import pixel_rays, ray_channels
 from darswin.models.base import FeatureInfo
 from darswin.models.pixel import RAYS, PixelModel, PixelTask, with_rays
 from darswin.models.registry import Presets, register_model
@@ -98,7 +98,7 @@ class ConvUnet(PixelModel):
 
     def _prepare(self, lens: Any, size: Pair) -> Tensor | None:
         """The viewing directions of the pixels, (N, 3, H, W)."""
-        return ray_channels(lens, size) if self.uses_lens else None
+        return ray_channels(*pixel_rays(lens, size)) if self.uses_lens else None
 
     def _sample(self, images: Tensor, prepared: Tensor | None) -> Tensor:
         return self._floating(images)

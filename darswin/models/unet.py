@@ -7,6 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from darswin.layers.linear import Linear
+from darswin.lens.pixels import ray_channels
 from darswin.models.base import init_by_width
 from darswin.models.darswin import PRESETS, DarSwin
 from darswin.models.encoder import Prepared
@@ -97,7 +98,7 @@ class UnetPrepared(NamedTuple):
     positions: Sequence[Sequence[Tensor | None]]  # of the decoder's stages
     image_points: Tensor | None  # see `PlainView.image_points`
     view_points: Any  # see `PlainView.view_points`
-    rays: Tensor | None  # see `PlainView.rays`
+    rays: Tensor | None  # `PlainView.rays` as channels
     size: Pair  # (H, W) of the images
 
 
@@ -227,13 +228,12 @@ class Unet(PixelModel):
 
     def _prepare(self, lens: Any, size: Pair) -> UnetPrepared:
         encoder = self.encoder._prepare(lens, size)
-        image_points = self.view.image_points(lens, size)
         return UnetPrepared(
             encoder,
             encoder.positions[:-1],
-            image_points,
+            self.view.image_points(lens, size),
             self.view.view_points(lens, size),
-            self.view.rays(lens, size, image_points) if self.rays else None,
+            ray_channels(*self.view.rays(lens, size)) if self.rays else None,
             size,
         )
 

@@ -13,8 +13,8 @@ from torch.utils import _pytree as pytree
 
 from darswin.layers.polar import PixelGrid, PolarGridSpec, check_count, check_images
 from darswin.lens import Lens
-from darswin.lens.concentric import read_square, square_places, square_view
-from darswin.lens.pixels import perspective_view, ray_channels, reprojection, sample_at
+from darswin.lens.concentric import read_square, square_places, square_rays, square_view
+from darswin.lens.pixels import perspective_view, pixel_rays, reprojection, sample_at
 from darswin.lens.spacing import SPACINGS, Spacing, check_fixed_theta_max
 from darswin.models.base import Model
 from darswin.models.stages import Pair
@@ -44,9 +44,9 @@ class PlainView:
         """The points of the view that the pixels of images of (H, W) show."""
         return None
 
-    def rays(self, lens: Any, size: Pair, image_points: Tensor | None) -> Tensor | None:
-        """The viewing directions of the pixels of the view, (N, 3, H', W'); None without a lens."""
-        return ray_channels(lens, size, image_points) if self.uses_lens else None
+    def rays(self, lens: Any, size: Pair) -> tuple[Tensor, Tensor]:
+        """The rays of the pixels of the view, as `pixel_rays` returns them, if it uses the lens."""
+        raise NotImplementedError
 
     def to_view(self, images: Tensor, image_points: Tensor | None) -> Tensor:
         """Images (B, C, H, W) in floating point → the view, (B, C, H', W')."""
@@ -99,6 +99,9 @@ class PerspectiveView(PlainView):
         view = perspective_view(lens, self.size, self.max_fov)
         return reprojection(view, self.size, lens, size)
 
+    def rays(self, lens: Lens, size: Pair) -> tuple[Tensor, Tensor]:
+        return pixel_rays(perspective_view(lens, self.size, self.max_fov), self.size)
+
     def to_images(self, x: Tensor, view_points: Tensor) -> Tensor:
         return sample_at(x, view_points)
 
@@ -128,6 +131,9 @@ class SquareView(PlainView):
     def view_points(self, lens: Lens, size: Pair) -> Tensor:
         return square_places(lens, size, self.spacing, self.theta_max)
 
+    def rays(self, lens: Lens, size: Pair) -> tuple[Tensor, Tensor]:
+        return square_rays(lens, self.size[0], self.spacing, self.theta_max)
+
     def to_images(self, x: Tensor, view_points: Tensor) -> Tensor:
         return read_square(x, view_points)
 
@@ -150,6 +156,9 @@ class PolarView(PlainView):
         """The grid of `to_pixels`, and the viewing directions of the tokens of each map."""
         grid = self.spec.pixel_grid(lens, size, self.split)
         return grid, [spec.token_rays(lens) for spec in self.specs]
+
+    def rays(self, lens: Lens, size: Pair) -> tuple[Tensor, Tensor]:
+        return pixel_rays(lens, size)
 
     def token_places(self, sizes: Sequence[Pair], view_points: Any, like: Tensor) -> list[Tensor]:
         return view_points[1]

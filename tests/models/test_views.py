@@ -294,28 +294,34 @@ def rays_of_the_perspective_view(lens, size):
     return rays_of_the_image(Perspective(size / 2 / torch.tan(lens.theta_max), 1.5), size)
 
 
-def rays_of_the_square(lens, size):
+def rays_of_the_square(lens, size, edge=None):
     step = (torch.arange(size) + 0.5) * 2 / size - 1
     radius, direction = square_to_disc(torch.stack(torch.meshgrid(step, step, indexing="xy"), -1))
-    theta = lens.theta_max[:, None, None, None] * radius[..., None]
+    edge = lens.theta_max if edge is None else torch.full((2,), edge)
+    theta = edge[:, None, None, None] * radius[..., None]
     return torch.cat((theta.sin() * direction, theta.cos()), -1)
+
+
+def rays_of_the_fixed_square(lens, size):
+    return rays_of_the_square(lens, size, 1.5)
 
 
 @torch.no_grad()
 @pytest.mark.parametrize(
-    ("name", "rays_of"),
+    ("name", "options", "rays_of"),
     [
-        ("darswin_unet_a_nano", rays_of_the_image),
-        ("swin_unet_undis_nano", rays_of_the_perspective_view),
-        ("swin_unet_adapted_nano", rays_of_the_square),
+        ("darswin_unet_a_nano", {}, rays_of_the_image),
+        ("swin_unet_undis_nano", {}, rays_of_the_perspective_view),
+        ("swin_unet_adapted_nano", {}, rays_of_the_square),
+        ("swin_unet_adapted_nano", dict(theta_max=1.5), rays_of_the_fixed_square),
     ],
 )
-def test_the_head_reads_the_rays_of_its_pixels(name, rays_of):
-    model, blind = (network(name, rays=rays) for rays in (True, False))
+def test_the_head_reads_the_rays_of_its_pixels(name, options, rays_of):
+    model, blind = (network(name, rays=rays, **options) for rays in (True, False))
     prepared = model.prepare(WIDE, (64, 64))
     rays, expected = prepared.rays, rays_of(WIDE, 64).movedim(-1, 1)
     seen = expected[:, 2:] >= WIDE.theta_max.cos()[:, None, None, None] - 1e-6
-    assert seen.any() and seen.all() == (name == "swin_unet_adapted_nano")
+    assert seen.any() and seen.all() == (rays_of is rays_of_the_square)
     torch.testing.assert_close(rays, torch.where(seen, expected, 0.0), rtol=0, atol=1e-5)
     # They are the last three channels of the head's first convolution.
     state, key = model.state_dict(), "segmentation_head.stem.weight"
