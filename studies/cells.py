@@ -83,8 +83,10 @@ def augmented(seeds: int) -> list[Cell]:
     ]
 
 
-def ablations() -> list[Cell]:
+def ablations(seeds: int) -> list[Cell]:
     """DarSwin-A trained on "low", with one change each."""
     return [
-        Cell(label, family, DARSWIN | changes) for label, (family, changes) in ABLATIONS.items()
+        Cell(label, family, DARSWIN | changes, seed=seed)
+        for seed in range(seeds)
+        for label, (family, changes) in ABLATIONS.items()
     ]

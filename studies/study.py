@@ -79,7 +79,7 @@ def main(arguments: list[str] | None = None) -> None:
         "--only", choices=["headline", "ablations", "augmented"], help="runs only this part"
     )
     parser.add_argument("--cell", help="runs only cells whose key contains this text")
-    parser.add_argument("--seeds", type=int, default=3, help="the number of seeds of the headline")
+    parser.add_argument("--seeds", type=int, default=3, help="the number of seeds of every cell")
     parser.add_argument("--size", default="nano", help="the size of the models")
     parser.add_argument(
         "--test-images", type=int, default=1000, help="the number of test images for every lens"
@@ -92,7 +92,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--results", type=Path, default=HERE / "results")
     args, options = parser.parse_known_args(arguments)  # other options are for `darswin fit`
     seeds = args.seeds
-    parts = dict(headline=headline(seeds), ablations=ablations(), augmented=augmented(seeds))
+    parts = dict(headline=headline(seeds), ablations=ablations(seeds), augmented=augmented(seeds))
     chosen = [parts[args.only]] if args.only else parts.values()
     cells = [cell for part in chosen for cell in part if (args.cell or "") in cell.key]
     cells.sort(key=lambda cell: cell.seed)  # a stopped study has complete tables

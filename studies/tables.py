@@ -117,14 +117,15 @@ def augmented_table(cells: list[dict]) -> str:
 
 
 def ablation_table(cells: list[dict]) -> str:
-    """A row for each variant trained on "low" with the first seed; a column for each test level."""
-    first = {c["label"]: c["accuracy"] for c in cells if c["level"] == "low" and c["seed"] == 0}
+    """A row for each variant trained on "low"; a column for each test level."""
+    found = by_model(cells)
     rows = []
     for label in ("DarSwin-A", *ABLATIONS):
         published = PAPER_ABLATIONS.get(label)
         row = [label]
         for k, level in enumerate(LEVELS):
-            ours = f"{first[label][level]:.1f}" if label in first else "not run"
+            runs = found.get((label, "low"))
+            ours = spread([run[level] for run in runs]) if runs else "not run"
             row.append(ours + (f" ({published[k]:.1f})" if published else ""))
         rows.append(row)
     return markdown(["tested on", *(f'"{level}"' for level in LEVELS)], rows)

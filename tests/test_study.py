@@ -25,10 +25,10 @@ QUICK = """
 
 
 def test_cells_have_folders_of_their_own_and_make_models():
-    cells = headline(3) + ablations() + augmented(3)
+    cells = headline(3) + ablations(3) + augmented(3)
     assert cells[0].key == "darswin-a-very-low-0"
     assert len({cell.key for cell in cells}) == len({cell.identity for cell in cells}) == len(cells)
-    for cell in ablations():
+    for cell in ablations(1):
         create_model(f"{cell.family}_nano", num_classes=10, in_chans=1, **cell.options)
 
 
@@ -78,7 +78,7 @@ def quick(tmp_path_factory) -> Path:
     cells = [cell for cell in headline(1) if cell.level == "low"]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(study, "headline", lambda seeds: cells)
-        patch.setattr(study, "ablations", lambda: ablations()[-1:])
+        patch.setattr(study, "ablations", lambda seeds: ablations(seeds)[-1:])
         patch.setattr(study, "augmented", lambda seeds: augmented(1)[-1:])
         study.main([*where, "--seeds", "1", "--test-images", "20", *QUICK])
     return folder
@@ -126,7 +126,7 @@ def test_cells_of_a_record_are_not_run_again(here, tmp_path, monkeypatch):
     where = ["--results", str(tmp_path), "--known", str(record)]
     study.main(["--results", str(tmp_path), "--seeds", "1", "--only", "ablations"])
     old = json.loads(record.read_text())["cells"]
-    assert len(ran) == len(old) == len(ablations())
+    assert len(ran) == len(old) == len(ablations(1))
     study.main([*where, "--seeds", "2", "--only", "augmented"])
     assert ran[len(old) :] == sorted(augmented(2), key=lambda cell: cell.seed)
     cells = json.loads(record.read_text())["cells"]
@@ -145,9 +145,9 @@ def test_tables_and_picture(quick):
     assert len(cells) == 6 and (quick / "study--nano.png").read_bytes().startswith(b"\x89PNG")
     made = tables.tables(cells)
     assert "| Swin | not run (33.9) |" in made["xi-0.4"] and "(87.9)" in made["xi-0.4"]
-    assert made["ablations"].count("not run") == 4 * (len(ablations()) - 1)
+    assert made["ablations"].count("not run") == 4 * (len(ablations(1)) - 1)
     assert made["augmented"].count("not run") == 5 * 8
-    others = [cells[0] | dict(label=cell.label) for cell in ablations()[:-1]]
+    others = [cells[0] | dict(label=cell.label) for cell in ablations(1)[:-1]]
     assert "not run" not in tables.tables(cells + others)["ablations"]
 
 
