@@ -10,6 +10,7 @@ from typing import Any, get_args
 import yaml
 
 from darswin.utils.tasks import Task
+from darswin.utils.text import read_text
 
 PRESETS = Path(__file__).parent.parent / "train" / "presets"
 FIRST_TASK: Task = "classification"  # unless a run names another one
@@ -70,8 +71,8 @@ def _config_file(name: str) -> Path:
 
 def _content(config: Path) -> dict[str, Any]:
     try:
-        content = yaml.safe_load(config.read_text())
-    except (yaml.YAMLError, OSError):
+        content = yaml.safe_load(read_text(config))
+    except (yaml.YAMLError, ValueError, OSError):
         return {}  # the parser will report the error
     return content if isinstance(content, dict) else {}
 

@@ -13,6 +13,8 @@ from typing import Any, ClassVar, Literal, Self, get_args
 
 import numpy as np
 
+from darswin.utils.text import read_text
+
 Split = Literal["train", "val", "test"]
 SPLITS: tuple[Split, ...] = get_args(Split)
 # The names of folders and lists of splits, in lower case.
@@ -163,7 +165,7 @@ def read_split_lists(lists: Path) -> dict[Split, list]:
 def read_list(path: str | Path) -> list[str]:
     """The names in a text file, one per line, or in a JSON list."""
     if Path(path).suffix != ".json":
-        return [line.strip() for line in Path(path).read_text().splitlines() if line.strip()]
+        return [line.strip() for line in read_text(path).splitlines() if line.strip()]
     names = read_json(path)
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
         raise ValueError(f"{path} must hold a JSON list of names")
@@ -183,7 +185,7 @@ def read_classes(path: str | Path) -> list[str]:
 def read_json(path: str | Path) -> Any:
     """The content of a JSON file; ValueError for other files."""
     try:
-        return json.loads(Path(path).read_text())
+        return json.loads(read_text(path))
     except ValueError as error:
         raise ValueError(f"{path} must be JSON: {error}") from error
 

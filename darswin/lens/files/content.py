@@ -16,6 +16,7 @@ import numpy as np
 import yaml
 
 from darswin.lens.files.fields import is_number, short
+from darswin.utils.text import to_text
 
 # A mapping from YAML, JSON or XML; or rows of words, from a plain table.
 Content = Mapping | list[list[str]]
@@ -45,14 +46,9 @@ def read_bytes(path: str | os.PathLike) -> bytes:
     return data
 
 
-def to_text(data: bytes) -> str:
-    """The text of a file in UTF-8, or the arrays of `np.savez`'s zip archive as JSON."""
-    if data.startswith(b"PK\x03\x04"):
-        return _from_npz(data)
-    try:
-        return data.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise ValueError(f"it must be text in UTF-8: {error}") from error
+def decoded(data: bytes) -> str:
+    """The text of a file, or the arrays of `np.savez`'s zip archive as JSON."""
+    return _from_npz(data) if data.startswith(b"PK\x03\x04") else to_text(data)
 
 
 def _from_npz(data: bytes) -> str:

@@ -15,7 +15,7 @@ from darswin.lens.base import MODELS, Lens, from_dict
 from darswin.lens.files import colmap, opencv
 from darswin.lens.files.basalt import Basalt
 from darswin.lens.files.camodocal import CamOdoCal, OCamCalib
-from darswin.lens.files.content import Content, parse, read_bytes, to_text
+from darswin.lens.files.content import Content, decoded, parse, read_bytes
 from darswin.lens.files.fields import Fields, listed, short
 from darswin.lens.files.format import Description, Format
 from darswin.lens.files.kalibr import Kalibr
@@ -144,7 +144,7 @@ class Calibration:
         try:
             data = read_bytes(path)
             is_binary = colmap.is_binary(data)
-            text = colmap.from_binary(data, MAX_CAMERAS) if is_binary else to_text(data)
+            text = colmap.from_binary(data, MAX_CAMERAS) if is_binary else decoded(data)
         except ValueError as error:
             raise ValueError(f"calibration {name}: {error}") from error
         return cls(text, name, model)
