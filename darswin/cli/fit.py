@@ -13,7 +13,6 @@ import shutil
 import sys
 import warnings
 from collections.abc import Iterator
-from functools import partial
 from pathlib import Path
 from typing import Any, NoReturn, get_args
 
@@ -32,7 +31,13 @@ from darswin.data.lens_distributions import parse_sweep
 from darswin.models.saving import model_of_run, read_card
 from darswin.train.finetuning import settle, weights_file
 from darswin.train.results import WriteResults
-from darswin.train.runs import RunCheckpoint, SafeCheckpointIO, StopOnSignals, check_changes
+from darswin.train.runs import (
+    BestCheckpoint,
+    LastCheckpoint,
+    SafeCheckpointIO,
+    StopOnSignals,
+    check_changes,
+)
 from darswin.train.tasks import TASKS
 from darswin.utils.files import locked, remove_partial_files, replace_file
 from darswin.utils.malloc import keep_freed_memory
@@ -238,19 +243,18 @@ class RunCLI(LightningCLI):
         record = self.config["fit"].clone()
         for name in ("size", "channels"):  # where the pictures decide on them
             record.data[name] = getattr(self.datamodule, name)
-        self.signals.checkpoint = last_of(self.folder)
+        last = last_of(self.folder)
         monitor, mode = TASKS[self.task].module.monitor
-        checkpoint = partial(
-            RunCheckpoint, self.folder / "checkpoints", enable_version_counter=False
-        )
         return [
             BeginRun(self.folder, self._recorded(record), loggers),
             *others,
             self.signals,
-            checkpoint("best", monitor=monitor, mode=mode, save_on_train_epoch_end=False),
-            checkpoint("last", every_n_train_steps=config.checkpoint_steps),
-            checkpoint("last", save_on_train_epoch_end=True),
-        ]
+            BestCheckpoint(
+                last.parent, "best", monitor=monitor, mode=mode, save_on_train_epoch_end=False,
+                enable_version_counter=False,
+            ),
+            LastCheckpoint(last, config.checkpoint_steps),  # after all that may stop the run
+        ]  # fmt: skip
 
     def _run_subcommand(self, subcommand: str) -> None:
         super()._run_subcommand(subcommand)
@@ -276,10 +280,17 @@ class RunCLI(LightningCLI):
             raise FileExistsError(f"another `darswin fit` is at work in {self.folder}") from None
         except (KeyboardInterrupt, SystemExit):
             if (self.folder / "config.yaml").exists():
-                again = f"darswin fit --run {shlex.quote(str(self.folder))} --resume"
-                step = self.trainer.global_step
-                _say(f"stopped at step {step}: `{again}` goes on from the last checkpoint")
+                self._say_how_to_resume()
             raise
+        if self.trainer.global_step < self.model.steps:
+            self._say_how_to_resume()
+            if self.signals.number is not None:
+                raise SystemExit
+
+    def _say_how_to_resume(self) -> None:
+        again = f"darswin fit --run {shlex.quote(str(self.folder))} --resume"
+        step = self.trainer.global_step
+        _say(f"stopped at step {step}: `{again}` goes on from the last checkpoint")
 
     @contextlib.contextmanager
     def _locked(self) -> Iterator[None]:

@@ -10,7 +10,7 @@ from typing import Any
 
 import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
-from lightning.pytorch.callbacks import ModelCheckpoint
+from lightning.pytorch.callbacks import Checkpoint, ModelCheckpoint
 from lightning.pytorch.plugins.io import TorchCheckpointIO
 
 from darswin.models.saving import ModelCard, save_model
@@ -20,17 +20,8 @@ from darswin.utils.unpickle import read_pickle
 # -- checkpoints ------------------------------------------------------------------------------
 
 
-class RunCheckpoint(ModelCheckpoint):
-    """A checkpoint in the folder of a run, which may be moved.
-
-    No checkpoint is written at the last step of an epoch before the validation, because a resumed
-    run would skip that validation. None is written between the batches of an accumulated step
-    either, because checkpoints do not hold gradients.
-    """
-
-    def on_train_batch_end(self, trainer: Trainer, *batch: Any) -> None:
-        if ends_step_amid_epoch(trainer, batch[-1]):
-            super().on_train_batch_end(trainer, *batch)
+class BestCheckpoint(ModelCheckpoint):
+    """The checkpoint with the best score, in the folder of a run, which may be moved."""
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         folder = Path(self.dirpath or "")
@@ -45,10 +36,76 @@ class RunCheckpoint(ModelCheckpoint):
         super().load_state_dict(state)
 
 
+class LastCheckpoint(Checkpoint):
+    """Writes the last checkpoint: every `every` steps, after each epoch, and where a run stops.
+
+    A resumed run goes on from it as an uninterrupted one does. So a run stops only after a whole
+    step, because checkpoints do not hold gradients between the batches of an accumulated step. The
+    checkpoint comes after the validation that belongs to its step, if there is one, because a
+    resumed run does not make up for it. A stop amid an epoch adds no validation, and its checkpoint
+    does not count the epoch as done.
+
+    A stop by steps, by a time limit, by a signal or by early stopping is the same here: it ends
+    the steps of the run.
+    """
+
+    def __init__(self, file: Path, every: int):
+        self.file, self.every = file, every
+        self._stop = False  # wanted by another callback, after the next whole step
+
+    def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        # If Lightning restores a checkpoint while it knows a limit of steps, it takes the epoch
+        # that follows for one that it has trained.
+        self._max_steps, trainer.fit_loop.epoch_loop.max_steps = trainer.max_steps, -1
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        trainer.fit_loop.epoch_loop.max_steps = self._max_steps
+
+    def on_train_batch_end(self, trainer: Trainer, *batch: Any) -> None:
+        # Lightning would stop amid an accumulated step, and validate before that.
+        self._stop, trainer.should_stop = self._stop or trainer.should_stop, False
+        loop = trainer.fit_loop
+        if not loop.epoch_loop._should_check_val_fx(loop._data_fetcher):  # type: ignore[arg-type]
+            self._end_batch(trainer, batch[-1])
+
+    def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        if not (trainer.is_last_batch or trainer.sanity_checking):
+            self._stop, trainer.should_stop = self._stop or trainer.should_stop, False
+            self._end_batch(trainer, trainer.fit_loop.batch_idx)
+
+    def _end_batch(self, trainer: Trainer, batch_idx: int) -> None:
+        if ends_step_amid_epoch(trainer, batch_idx):
+            if self._stop and _reached_least(trainer):
+                stop_after_step(trainer)
+            stops = trainer.global_step >= trainer.max_steps > -1
+            if stops or trainer.global_step % self.every == 0:
+                self._save(trainer)
+
+    def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        if trainer.is_last_batch:  # otherwise the run stops amid the epoch
+            trainer.should_stop = trainer.should_stop or self._stop
+            self._save(trainer)
+
+    def _save(self, trainer: Trainer) -> None:
+        if not trainer.fast_dev_run:  # type: ignore[attr-defined]  # Lightning adds it as it runs
+            trainer.save_checkpoint(self.file)
+
+
 def ends_step_amid_epoch(trainer: Trainer, batch_idx: int) -> bool:
     """True if the optimiser stepped on this batch and the epoch goes on."""
     steps = (batch_idx + 1) % trainer.accumulate_grad_batches == 0
     return steps and not trainer.is_last_batch
+
+
+def stop_after_step(trainer: Trainer) -> None:
+    """Makes the step that has just ended the last one of this call."""
+    trainer.fit_loop.epoch_loop.max_steps = trainer.global_step
+
+
+def _reached_least(trainer: Trainer) -> bool:
+    """True amid an epoch if `min_steps` and `min_epochs` allow a stop."""
+    steps, epochs = trainer.min_steps or 0, trainer.min_epochs or 0
+    return trainer.global_step >= steps and trainer.current_epoch >= epochs
 
 
 class SafeCheckpointIO(TorchCheckpointIO):
@@ -98,12 +155,9 @@ class StopOnSignals(Callback):
     """A context in which Ctrl-C and SIGTERM stop a run.
 
     While a run trains, the first signal to any process makes all processes stop after the same
-    step, with a checkpoint. A second signal, or a signal at another time, raises KeyboardInterrupt.
-    After the last step of an epoch, the run validates before it stops, and the checkpoint is that
-    of the epoch.
+    step. A second signal, or a signal at another time, raises KeyboardInterrupt. After the last
+    step of an epoch, the run validates before it stops.
     """
-
-    checkpoint: Path  # the file to write
 
     def __init__(self) -> None:
         self.number: int | None = None
@@ -137,13 +191,11 @@ class StopOnSignals(Callback):
 
     def on_train_batch_end(self, trainer: Trainer, *batch: Any) -> None:
         if ends_step_amid_epoch(trainer, batch[-1]) and self._any_signal(trainer):
-            trainer.save_checkpoint(self.checkpoint)
-            raise SystemExit
+            stop_after_step(trainer)
 
-    def on_train_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        # The signal came in the last step of an epoch, and that epoch has its checkpoint.
-        if trainer.global_step > 0 and self._any_signal(trainer):
-            raise SystemExit
+    def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        if self._any_signal(trainer):
+            stop_after_step(trainer)
 
     def on_train_end(self, *run: Any) -> None:
         self._trains = False

@@ -77,6 +77,7 @@ class Task(LightningModule):
     monitor: ClassVar[tuple[str, Literal["min", "max"]]]  # the score of the best checkpoint
     results: list[dict[str, Any]]
     net: Encoder | PixelModel  # made by `configure_model`, like `card`
+    steps: int  # of the whole training, made by `configure_optimizers`
     card: ModelCard
     trained: ModelCard  # the card of the checkpoint that was read, or else `card`
 
@@ -222,6 +223,7 @@ class Task(LightningModule):
                 f"{self.steps_per_epoch}: keep the number of pictures, `batch_size`, `devices` and "
                 "`limit_train_batches`"
             )
+        self.steps = int(steps)
         rates = {name: rate * scale for name, rate in self.rates.items()}
         warmup_steps = self.warmup_epochs * self.steps_per_epoch
         undecayed = () if self.decay_position_bias else self.net.no_weight_decay()
@@ -230,7 +232,7 @@ class Task(LightningModule):
             # It visits each parameter once. With autocast, Lightning cannot clip its gradients.
             fused=not isinstance(trainer.precision_plugin, MixedPrecision),
         )  # fmt: skip
-        schedule = Schedule(optimizer, warmup_steps=warmup_steps, steps=steps, **rates)
+        schedule = Schedule(optimizer, warmup_steps=warmup_steps, steps=self.steps, **rates)
         return {
             "optimizer": optimizer,
             "lr_scheduler": {"scheduler": schedule, "interval": "step"},
