@@ -8,10 +8,7 @@ which data, is the task's: `darswin.train.tasks`.
 import contextlib
 import logging
 import re
-import shlex
 import shutil
-import sys
-import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NoReturn, get_args
@@ -25,6 +22,7 @@ from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
 from lightning.pytorch.utilities import rank_zero_only
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
+from darswin.cli.announce import Announce, say, say_stopped, say_the_end
 from darswin.cli.arguments import with_lists
 from darswin.cli.options import ALL, FIRST_TASK, check_free, format_help, last_of, presets
 from darswin.data.lens_distributions import parse_sweep
@@ -50,13 +48,8 @@ def run(argv: list[str], task: Task) -> None:
         keep_freed_memory()
     numbers = ("data.mean", "data.std", "model.class_weights", "model.zones")
     argv = with_lists(argv, numbers, words=("data.test_paths",))
-    # Lightning warns of arguments that are not sys.argv: ours add the run's configuration.
-    warnings.filterwarnings("ignore", "LightningCLI's args parameter")
-    logger = logging.getLogger("lightning.pytorch.utilities.rank_zero")
-    logger.addFilter(_is_no_advertisement)
-    warnings.filterwarnings("ignore", r".*isinstance\(treespec, LeafSpec\)")  # Lightning's own
-    warnings.filterwarnings("ignore", "Checkpoint directory .* exists and is not empty")
-    warnings.filterwarnings("ignore", "The number of training batches .* is smaller than the log")
+    for name in ("lightning.pytorch", "lightning.fabric"):  # we say ourselves what a run does
+        logging.getLogger(name).setLevel(logging.WARNING)
     parser = WholeHelpParser if ALL in argv else RunParser
     argv = ["--help" if word == ALL else word for word in argv]
     with StopOnSignals() as signals:
@@ -71,7 +64,10 @@ def run(argv: list[str], task: Task) -> None:
                 auto_configure_optimizers=False,
                 save_config_callback=None,
                 trainer_defaults=dict(
-                    accelerator="auto", use_distributed_sampler=False, num_sanity_val_steps=0
+                    accelerator="auto",
+                    use_distributed_sampler=False,
+                    num_sanity_val_steps=0,
+                    enable_model_summary=False,
                 ),
                 parser_class=parser,
                 parser_kwargs=dict(prog="darswin"),
@@ -93,10 +89,6 @@ def run(argv: list[str], task: Task) -> None:
                 "not enough memory: a smaller `batch_size` or model, or `grad_checkpointing` true, "
                 f"needs less ({str(error).strip().splitlines()[-1]})"
             ) from error
-
-
-def _is_no_advertisement(record: logging.LogRecord) -> bool:
-    return "Tip:" not in record.getMessage()
 
 
 class RunParser(LightningArgumentParser):
@@ -198,7 +190,7 @@ class RunCLI(LightningCLI):
         if config.resume and last_of(self.folder).exists():
             before = yaml.safe_load((self.folder / "config.yaml").read_text())
             for change in check_changes(before, yaml.safe_load(self._recorded(config))):
-                _say(re.sub("`(.*?)`", r"--\1", change))
+                say(re.sub("`(.*?)`", r"--\1", change))
 
     def _check_lenses(self, config) -> None:
         """ValueError for lenses to warp to, typed beside those that took the pictures."""
@@ -247,6 +239,7 @@ class RunCLI(LightningCLI):
         monitor, mode = TASKS[self.task].module.monitor
         return [
             BeginRun(self.folder, self._recorded(record), loggers),
+            Announce(),
             *others,
             self.signals,
             BestCheckpoint(
@@ -272,7 +265,7 @@ class RunCLI(LightningCLI):
                 elif last.exists():
                     start = start or str(last)
                 else:
-                    _say(f"{last} is not there yet: starting from the beginning")
+                    say(f"{last} is not there yet: starting from the beginning")
                 if start is not None:
                     self.model.weights = None  # the checkpoint has its own
                 self.trainer.fit(**options | {"ckpt_path": start})
@@ -280,17 +273,14 @@ class RunCLI(LightningCLI):
             raise FileExistsError(f"another `darswin fit` is at work in {self.folder}") from None
         except (KeyboardInterrupt, SystemExit):
             if (self.folder / "config.yaml").exists():
-                self._say_how_to_resume()
+                say_stopped(self.trainer, self.folder)
             raise
         if self.trainer.global_step < self.model.steps:
-            self._say_how_to_resume()
+            say_stopped(self.trainer, self.folder)
             if self.signals.number is not None:
                 raise SystemExit
-
-    def _say_how_to_resume(self) -> None:
-        again = f"darswin fit --run {shlex.quote(str(self.folder))} --resume"
-        step = self.trainer.global_step
-        _say(f"stopped at step {step}: `{again}` goes on from the last checkpoint")
+        elif not self.trainer.fast_dev_run:
+            say_the_end(self.trainer, self.folder)
 
     @contextlib.contextmanager
     def _locked(self) -> Iterator[None]:
@@ -332,8 +322,3 @@ class RunProgressBar(TQDMProgressBar):
         shown = super().get_metrics(trainer, pl_module)
         shown.pop("v_num", None)
         return shown
-
-
-@rank_zero_only
-def _say(text: str) -> None:
-    print(text, file=sys.stderr)

@@ -7,6 +7,7 @@ import re
 import sys
 import warnings
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from pkgutil import resolve_name
 from typing import NamedTuple
 
@@ -14,6 +15,8 @@ from darswin.cli import options
 from darswin.cli.arguments import run_command
 from darswin.utils.extras import lack
 from darswin.utils.processes import die_with_first_process
+
+PACKAGE = Path(__file__).parents[1]
 
 
 class Command(NamedTuple):
@@ -146,12 +149,15 @@ def print_anywhere(words: Mapping[str, str]) -> None:
 
 
 def _one_line(show: Callable[..., None]) -> Callable[..., None]:
-    """Shows warnings of darswin in one line and only once; `show` shows all other warnings."""
+    """Shows warnings of darswin in one line and only once. Those that other packages give are shown
+    by `show`, if Python was asked for warnings, and otherwise not."""
     shown = set()
 
-    def show_once(message: Warning, category: type[Warning], *where, **options) -> None:
-        if not category.__module__.startswith("darswin."):
-            show(message, category, *where, **options)
+    def show_once(message: Warning, category: type[Warning], file: str, *where, **options) -> None:
+        ours = category.__module__.startswith("darswin.") or Path(file).is_relative_to(PACKAGE)
+        if not ours:
+            if sys.warnoptions:
+                show(message, category, file, *where, **options)
         elif str(message) not in shown:
             shown.add(str(message))
             print(f"darswin: {message}", file=sys.stderr)

@@ -1,5 +1,6 @@
 """Image classification."""
 
+import math
 from typing import Any
 
 import numpy as np
@@ -20,6 +21,11 @@ __all__ = ["Classification"]
 
 class Classification(Task):
     """A classifier of wide-angle images, with its loss, its optimiser and its accuracy.
+
+    After a test, a row of `results` has `lenses`, the name of the test set; `n`, its number of
+    pictures; `top1` and `top5`, the accuracy in [0, 1]; `top1_low` and `top1_high`, its interval
+    (see `wilson`); `most_frequent`, the accuracy of always answering the most frequent class; and
+    `loss`. A value that needs pictures is None if there are none.
 
     Args:
         name: the model, one of those that `darswin models` lists; null is the model of `weights`,
@@ -100,30 +106,63 @@ class Classification(Task):
         self.results = []
         metrics: Any
         for name, metrics in zip(self.data.test_names, self.test_metrics, strict=True):
-            row = {key: metric.compute().item() for key, metric in metrics.all().items()}
-            loss = finite_loss(row["loss"], name) if metrics.loss.count > 0 else None
-            self.results.append({"lenses": name} | row | {"loss": loss})
+            counts = metrics.labels.compute()
+            n = int(counts.sum())
+            row = {"lenses": name, "n": n} | dict.fromkeys(("top1", "top1_low", "top1_high"))
+            row |= {key: metric.compute().item() for key, metric in metrics.all().items()}
+            row |= {"loss": None, "most_frequent": None}
+            if n:
+                row["top1_low"], row["top1_high"] = wilson(row["top1"], n)
+                row["loss"] = finite_loss(metrics.loss.compute().item(), name)
+                row["most_frequent"] = counts.max().item() / n
+            self.results.append(row)
 
     def results_figure(self) -> Figure:
-        """Accuracy against ξ if each test set has a single ξ, otherwise bars."""
+        """Accuracy against ξ if each test set has a single ξ, otherwise bars; with the intervals
+        and the accuracy of always answering the most frequent class."""
         figure = Figure(figsize=(7, 4.2), layout="constrained")
         axes = figure.subplots()
         name, rows = self.card.model, self.results
-        accuracy = [100 * row["top1"] for row in rows]
+        accuracy, low, high = (
+            np.array([100 * (row[key] or 0) for row in rows])
+            for key in ("top1", "top1_low", "top1_high")
+        )
         lenses = [_distribution(row["lenses"]) for row in rows]
         xi = [lens.low for lens in lenses if lens is not None and lens.low == lens.high]
-        if len(xi) == len(rows):
+        is_line = len(xi) == len(rows)
+        if is_line:
             trained_on, warped = self.data.train_lenses, self.trained.fit == "whole"
             is_range = warped and isinstance(trained_on, SphericalLenses)
             band = (trained_on.low, trained_on.high) if is_range else None
             draw_accuracy(xi, {name: accuracy}, band, axes=axes)
-            axes.set_ylim(0, 100)
         else:
             axes.bar([row["lenses"] for row in rows], accuracy, label=name)
-            axes.set(ylabel="accuracy (%)", ylim=(0, 100))
+            axes.set(ylabel="accuracy (%)")
             axes.tick_params(axis="x", rotation=90)
-            axes.legend()
+        axes.errorbar(
+            xi if is_line else np.arange(len(rows)), accuracy, fmt="none", ecolor="0.4", capsize=3,
+            yerr=np.clip((accuracy - low, high - accuracy), 0, None), label="95 % interval",
+            clip_on=False,
+        )  # fmt: skip
+        if most := [row["most_frequent"] for row in rows if row["n"]]:
+            axes.axhline(100 * max(most), ls="--", color="0.5", label="most frequent class")
+        counts = sorted({row["n"] for row in rows})
+        ends = counts if len(counts) == 1 else (counts[0], counts[-1])
+        axes.set(ylim=(0, 100), title=f"n = {'–'.join(map(str, ends))}")
+        axes.legend()
         return figure
+
+
+def wilson(share: float, n: int) -> tuple[float, float]:
+    """The 95 % interval of a share in [0, 1] that was measured on n > 0 independent cases.
+
+    Source: Wilson, Journal of the American Statistical Association 22, 1927. Unlike ± 1.96 standard
+    errors, it is right for few cases and for shares near 0 and 1.
+    """
+    z = 1.959963984540054
+    middle = (share + z**2 / (2 * n)) / (1 + z**2 / n)
+    half = z / (1 + z**2 / n) * math.sqrt(share * (1 - share) / n + (z / (2 * n)) ** 2)
+    return max(middle - half, 0.0), min(middle + half, 1.0)
 
 
 class ClassMetrics(nn.Module):
@@ -137,6 +176,7 @@ class ClassMetrics(nn.Module):
             if k < classes
         })  # fmt: skip
         self.loss = MeanLoss()
+        self.labels = LabelCounts(classes)
 
     def update(self, logits: Tensor, labels: Tensor) -> None:
         """Adds images: their logits (B, K) and their labels (B,), -1 for unknown."""
@@ -148,6 +188,7 @@ class ClassMetrics(nn.Module):
         for metric in self.accuracies.values():
             metric.update(logits, labels)
         self.loss.update(F.cross_entropy(logits, labels, reduction="none"))
+        self.labels.update(labels)
 
     def all(self) -> dict[str, Any]:
         return dict(self.accuracies) | dict(loss=self.loss)
@@ -171,6 +212,23 @@ class MeanLoss(Metric):
 
     def compute(self) -> Tensor:
         return (self.total / self.count).float()
+
+
+class LabelCounts(Metric):
+    """The number of pictures of each class, (K,)."""
+
+    full_state_update = False
+    counts: Tensor
+
+    def __init__(self, classes: int) -> None:
+        super().__init__()
+        self.add_state("counts", torch.zeros(classes, dtype=torch.int64), "sum")
+
+    def update(self, labels: Tensor) -> None:
+        self.counts += torch.bincount(labels, minlength=len(self.counts))
+
+    def compute(self) -> Tensor:
+        return self.counts
 
 
 def _distribution(name: str) -> SphericalLenses | None:

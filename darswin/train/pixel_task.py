@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from matplotlib.figure import Figure
 from torch import Tensor, nn
-from torchmetrics import MeanMetric
+from torchmetrics import MeanMetric, SumMetric
 
 from darswin.data.scenes.scene import IGNORE
 from darswin.lens import Lens
@@ -22,11 +22,12 @@ _EARLY = 100  # batches after which a training without any target stops
 
 
 class Measured(nn.Module):
-    """The metrics of a data set: sums over the pixels of each zone, and the mean loss."""
+    """The metrics of a data set: sums over the pixels of each zone, the mean loss, and the number
+    of images with a known pixel."""
 
     def __init__(self, sums: PixelSums):
         super().__init__()
-        self.sums, self.loss = sums, MeanMetric()
+        self.sums, self.loss, self.images = sums, MeanMetric(), SumMetric()
 
 
 class PixelTask(Task):
@@ -48,9 +49,10 @@ class PixelTask(Task):
         common: as `Task`.
 
     Attributes:
-        results: after a test, a row for each test set: `data`, its name; the scores; the scores
-            weighted by solid angle, whose names end in `_sr`; `pixels`, the number of known
-            pixels; `per_class` and `per_zone`. A score without any known pixel is None.
+        results: after a test, a row for each test set: `data`, its name; `n`, the number of images
+            with a known pixel; the scores; the scores weighted by solid angle, whose names end in
+            `_sr`; `pixels`, the number of known pixels; `per_class` and `per_zone`. A score
+            without any known pixel is None.
         samples: some of the tested images, (H, W, C) uint8, with their targets and predictions,
             (H, W), ids or m.
     """
@@ -194,6 +196,7 @@ class PixelTask(Task):
         answer, known = self._predict(batch, measured)
         theta, area = self._rays.of(lens, images)
         zone = self.zones.of(theta)
+        measured.images.update(known.flatten(1).any(1).sum())
         measured.sums.update(answer[known], target[known], zone[known], area[known])
         if batch_idx == 0:
             # Beyond the lens's view an answer has no meaning.
@@ -227,7 +230,8 @@ class PixelTask(Task):
             ]
             per_class = self._per_class(counts.sum(0), areas.sum(0))
             nested = dict(per_class=per_class, per_zone=per_zone)
-            self.results.append({"data": name} | scores | {"loss": loss} | nested)
+            row = {"data": name, "n": int(measured.images.compute())}
+            self.results.append(row | scores | {"loss": loss} | nested)
 
     def results_figure(self) -> Figure | None:
         """A figure of the samples: images, targets and predictions."""

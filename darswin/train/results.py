@@ -17,10 +17,29 @@ from darswin.viz.plot import save_figure
 
 Table = Sequence[dict[str, Any]]
 
-_IN_PERCENT = ("top1", "top5", "miou", "accuracy", "iou", "recall", "delta1", "delta2", "delta3")
+_IN_PERCENT = (
+    "top1",
+    "top1_low",
+    "most_frequent",
+    "top5",
+    "miou",
+    "accuracy",
+    "iou",
+    "recall",
+    "delta1",
+    "delta2",
+    "delta3",
+)
 # Scores that only the files have.
-_NOT_SHOWN = ("pixels", "sq_rel", "rmse_log", "delta2", "delta3", "to_deg")
+_NOT_SHOWN = ("pixels", "sq_rel", "rmse_log", "delta2", "delta3", "to_deg", "top1_high")
 _NOT_SHOWN_BY_AREA = (*_NOT_SHOWN, "rmse", "silog", "recall")
+
+
+_TITLES = {
+    "from_deg": "zone",
+    "top1_low": "95 % interval",
+    "most_frequent": "most frequent class (%)",
+}
 
 
 class WriteResults(Callback):
@@ -28,7 +47,8 @@ class WriteResults(Callback):
 
     `test.csv` has a row for each test set, `test_classes.csv` a row for each class, and
     `test_zones.csv` a row for each zone of θ. `test.json` has all scores, and `test.png` is a
-    figure. Names that end in `_sr` mark scores weighted by solid angle.
+    figure. Names that end in `_sr` mark scores weighted by solid angle. `n` is the number of
+    pictures.
     """
 
     def __init__(self, folder: Path):
@@ -43,6 +63,8 @@ class WriteResults(Callback):
             replace_file(self.folder / name, _csv(table))
             print(f"\n{_text(table)}")
             names.append(name)
+        if no_better := _no_better(pl_module.results):
+            print(f"\n{no_better}")
         report = dict(model=pl_module.card.model, results=pl_module.results)
         content = json.dumps(report, indent=1, ensure_ascii=False, allow_nan=False)
         replace_file(self.folder / "test.json", content)
@@ -92,9 +114,25 @@ def _text(rows: Table) -> str:
     return "\n".join("  ".join(line).rstrip() for line in zip(*columns, strict=True))
 
 
+def _no_better(rows: Table) -> str | None:
+    """A sentence on the test sets whose interval does not exclude always giving one answer."""
+    found = [row["lenses"] for row in rows if row.get("n") and _is_no_better(row)]
+    if not found:
+        return None
+    where = "any test set" if len(found) == len(rows) else ", ".join(found)
+    return (
+        f"On {where}, the accuracy is not certainly above that of always answering the most "
+        "frequent class."
+    )
+
+
+def _is_no_better(row: dict[str, Any]) -> bool:
+    return "most_frequent" in row and row["top1_low"] <= row["most_frequent"]
+
+
 def _title(key: str) -> str:
-    if key == "from_deg":
-        return "zone"
+    if key in _TITLES:
+        return _TITLES[key]
     return f"{key} (%)" if key.removesuffix(BY_AREA) in _IN_PERCENT else key
 
 
@@ -105,6 +143,8 @@ def _cell(key: str, row: dict[str, Any]) -> str:
         return f"≥ {value:g}°" if end is None else f"{value:g}–{end:g}°"
     if value is None:
         return "–"
+    if key == "top1_low":
+        return f"{100 * value:.1f}–{100 * row['top1_high']:.1f}"
     if not isinstance(value, float):
         return str(value)
     return f"{100 * value:.2f}" if key.removesuffix(BY_AREA) in _IN_PERCENT else f"{value:.4g}"

@@ -1,7 +1,6 @@
 """`fit`, `validate` and `test`: their options, their help, and errors in one line."""
 
 import inspect
-import logging
 import re
 
 import cv2
@@ -50,7 +49,7 @@ def scenes(tmp_path_factory):
         ("--trainer.max_epochs -1", "cosine needs an end: set --trainer.max_epochs or"),
         ("--checkpoint_steps 0", "--checkpoint_steps must be at least 1, got 0"),
         ("--devices many", "error: --devices: "),
-        ("--config minute", "the presets are iccv2023, minutes, scenes_minutes, two_cores"),
+        ("--config minute", "the presets are few, iccv2023, iccv2023_paper, minutes, scenes_min"),
     ],
 )
 def test_wrong_options_are_named_in_one_line(capsys, tmp_path, options, message):
@@ -103,19 +102,6 @@ def test_flags_of_parameters():
     flags = dict(limit="data.limit", xi="xi", name="model.name", max_epochs="trainer.max_epochs",
                  crop="data.crop", zones="model.zones", task="task")  # fmt: skip
     assert {name: flag_of(name).removeprefix("--") for name in flags} == flags
-
-
-def test_no_advertisement_precedes_an_error(capsys, tmp_path):
-    said: list[str] = []
-    handler = logging.Handler()
-    handler.emit = lambda record: said.append(record.getMessage())
-    logger = logging.getLogger("lightning.pytorch.utilities.rank_zero")
-    logger.addHandler(handler)
-    try:
-        error(capsys, "fit", "--run", tmp_path, *DIGITS, "--data.holdout", "0")
-    finally:
-        logger.removeHandler(handler)
-    assert said and not any("Tip" in text for text in said)
 
 
 def test_a_run_is_not_overwritten(capsys, tmp_path, monkeypatch):
@@ -202,7 +188,20 @@ def test_the_paper_s_preset_holds_the_recipe():
     assert (data["batch_size"], data["erasing"], data["size"]) == (128, 0.25, 64)
 
 
-@pytest.mark.parametrize("preset", ["iccv2023", "minutes", "two_cores", "scenes_minutes"])
+def test_the_paper_s_own_rate_is_the_only_difference_of_its_preset():
+    code, paper = (
+        yaml.safe_load((PRESETS / f"{name}.yaml").read_text())
+        for name in ("iccv2023", "iccv2023_paper")
+    )
+    rates = ("learning_rate", "warmup_rate", "final_rate")
+    code_at_128 = {rate: code["model"].pop(rate) * 128 / 512 for rate in rates}
+    at_128 = {rate: paper["model"].pop(rate) for rate in rates}
+    assert paper["model"].pop("reference_batch") == paper["data"]["batch_size"] == 128
+    assert paper == code
+    assert at_128 == code_at_128 | {"learning_rate": 1e-3}
+
+
+@pytest.mark.parametrize("preset", sorted(path.stem for path in PRESETS.glob("*.yaml")))
 def test_every_preset_trains(preset, tmp_path, scenes):
     few = ["--trainer.max_steps", "1", "--data.batch_size", "4", "--trainer.logger", "false"]
     dense = preset == "scenes_minutes"
@@ -216,9 +215,6 @@ def test_every_preset_trains(preset, tmp_path, scenes):
         assert model.task == card.task == "distance"
     else:
         assert card.model == "darswin_a_nano" and model.num_classes == 10
-    assert {path.stem for path in PRESETS.glob("*.yaml")} == {
-        "iccv2023", "minutes", "two_cores", "scenes_minutes",
-    }  # fmt: skip
 
 
 # -- help -------------------------------------------------------------------------------------
@@ -259,7 +255,7 @@ def test_our_options_come_first_and_none_is_missing(capsys, task):
     assert " None [" not in text and "SUPPRESS" not in text.upper()  # each option has a text
     text = " ".join(text.split())
     assert "the folder of the run [required]" in text
-    assert "a preset (iccv2023, minutes, scenes_minutes, two_cores)" in text
+    assert "a preset (few, iccv2023, iccv2023_paper, minutes, scenes_minutes, two_cores)" in text
     count = 128 if task == "classification" else 16
     assert f"--data.batch_size images in a batch of one process [{count}]" in text
 

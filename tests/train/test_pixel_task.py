@@ -84,13 +84,15 @@ def test_answers_for_pixels_that_do_not_count_change_nothing(folder, kind, made,
         loss.backward()
         assert not task.net.output.grad[unknown[:, None].expand(shape)].any()
         measured = task.test_metrics[0]
-        measured.sums.reset(), measured.loss.reset()
+        for metric in (measured.sums, measured.loss, measured.images):
+            metric.reset()
         with torch.no_grad():
             task.test_step(batch, 1)
             task.on_test_epoch_end()
         found.append((loss.item(), task.results))
     assert found[0] == found[1]
     (row,) = task.results
+    assert row["n"] == 4
     assert row["pixels"] == (~unknown).sum() == sum(zone["pixels"] for zone in row["per_zone"])
     if kind is Segmentation:
         left = {"sky", "ground", "wall"} - ({"ground"} if options.get("ignore_index") else set())
