@@ -9,6 +9,7 @@ import contextlib
 import logging
 import re
 import shutil
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NoReturn, get_args
@@ -19,10 +20,11 @@ from lightning.pytorch import Callback, LightningModule, Trainer
 from lightning.pytorch.callbacks import ProgressBar, TQDMProgressBar
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
 from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
+from lightning.pytorch.strategies.launchers import _SubprocessScriptLauncher
 from lightning.pytorch.utilities import rank_zero_only
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
-from darswin.cli.announce import Announce, say, say_stopped, say_the_end
+from darswin.cli.announce import Announce, how_to_resume, say, say_stopped, say_the_end
 from darswin.cli.arguments import with_lists
 from darswin.cli.options import ALL, FIRST_TASK, check_free, format_help, last_of, presets
 from darswin.data.lens_distributions import parse_sweep
@@ -39,7 +41,11 @@ from darswin.train.runs import (
 from darswin.train.tasks import TASKS
 from darswin.utils.files import locked, remove_partial_files, replace_file
 from darswin.utils.malloc import keep_freed_memory
+from darswin.utils.processes import end_with_killed_process
 from darswin.utils.tasks import Task
+
+# What the libraries of several processes say if one of them has gone.
+_LOST = r"Connection (closed|reset) by|gloo|NCCL|TCPStore|Broken pipe"
 
 
 def run(argv: list[str], task: Task) -> None:
@@ -81,6 +87,11 @@ def run(argv: list[str], task: Task) -> None:
             other = rank_zero_only.rank  # type: ignore[attr-defined]  # Lightning adds it as it runs
             raise SystemExit(0 if other else 128 + signals.number) from None
         except (MemoryError, RuntimeError) as error:
+            if re.search(_LOST, str(error)):
+                time.sleep(1)  # `end_with_killed_process` may know which one it was
+                if rank_zero_only.rank:  # type: ignore[attr-defined]
+                    raise SystemExit(1) from error
+                raise SystemExit("darswin: another process of this run has ended") from error
             # Torch's own exception class is for GPUs. On Linux, the system kills a worker instead.
             lack = re.search("can't allocate memory|DataLoader worker .*: Killed", str(error))
             if not (lack or isinstance(error, MemoryError | torch.OutOfMemoryError)):
@@ -215,7 +226,8 @@ class RunCLI(LightningCLI):
         kwargs["plugins"] = [SafeCheckpointIO(), *(given.plugins or [])]
         if given.logger is None:
             kwargs["logger"] = False  # BeginRun adds the run's own loggers
-        callbacks = list(given.callbacks or [])
+        again = f": `{how_to_resume(self.folder)}` goes on" if self.subcommand == "fit" else ""
+        callbacks = [WatchProcesses(again), *(given.callbacks or [])]
         if given.enable_progress_bar is not False and not any(
             isinstance(c, ProgressBar) for c in callbacks
         ):
@@ -313,6 +325,17 @@ class BeginRun(Callback):
             remove_partial_files(self.folder)
             replace_file(self.folder / "config.yaml", self.config)
         trainer.loggers = trainer.loggers or self.loggers
+
+
+class WatchProcesses(Callback):
+    """Ends the run with one line if one of the processes that Lightning started is killed."""
+
+    def __init__(self, hint: str):
+        self.hint = hint
+
+    def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+        if isinstance(launcher := trainer.strategy.launcher, _SubprocessScriptLauncher):
+            end_with_killed_process(launcher.procs, self.hint)
 
 
 class RunProgressBar(TQDMProgressBar):

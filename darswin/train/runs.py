@@ -212,9 +212,16 @@ class StopOnSignals(Callback):
 
 
 def ignore_signals(worker: int) -> None:
-    """Makes a DataLoader's worker ignore signals, because the training process ends its workers."""
+    """Makes a DataLoader's worker ignore signals, because the training process ends its workers.
+    If that process is killed, the worker says nothing of the lost connection."""
     for number in _SIGNALS:
         signal.signal(number, signal.SIG_IGN)
+    threading.excepthook = _say_no_lost_connection
+
+
+def _say_no_lost_connection(error: Any) -> None:
+    if not issubclass(error.exc_type, ConnectionError | EOFError):
+        threading.__excepthook__(error)
 
 
 # -- options that change when a run goes on ---------------------------------------------------

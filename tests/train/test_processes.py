@@ -73,6 +73,12 @@ def test_when_a_process_is_killed_all_end(tmp_path, victim, moment):
             time.sleep(0.1)
         assert of_session(first.pid) == {}
         assert first.wait() != 0
+        said = Path(f"{run}.log").read_text()
+        assert "Traceback" not in said
+        if victim == "second":
+            goes_on = f": `darswin fit --run {run} --resume` goes on"
+            ended = f"darswin: process 2 of 2 (number {second[0]}) was ended by SIGKILL{goes_on}"
+            assert said.splitlines()[-1] == ended
     finally:
         for process in of_session(first.pid):
             os.kill(process, signal.SIGKILL)
