@@ -12,7 +12,7 @@ import shutil
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NoReturn, get_args
+from typing import NoReturn, get_args
 
 import torch
 import yaml
@@ -26,7 +26,15 @@ from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
 from darswin.cli.announce import Announce, how_to_resume, say, say_stopped, say_the_end
 from darswin.cli.arguments import with_lists
-from darswin.cli.options import ALL, FIRST_TASK, check_free, format_help, last_of, presets
+from darswin.cli.options import (
+    ALL,
+    FIRST_TASK,
+    check_free,
+    format_help,
+    last_of,
+    presets,
+    with_nearest,
+)
 from darswin.data.lens_distributions import parse_sweep
 from darswin.models.saving import model_of_run, read_card
 from darswin.train.finetuning import settle, weights_file
@@ -114,17 +122,23 @@ class RunParser(LightningArgumentParser):
         formatter = self._get_formatter()
         return format_help(self._actions, formatter, command, self.whole_help)
 
-    def error(self, message: str, *rest: Any) -> NoReturn:
+    def error(self, message: str, ex: Exception | None = None) -> NoReturn:
         message = re.sub(r'Parser key "([\w.]+)":', r"--\1:", message)
         message = re.sub(
             r"Subcommand '\w+' does not accept option '", "there is no option '--", message
         )
+        parser = getattr(ex, "subcommand_parser", None) or self
+        command = parser.prog.replace(" [options]", "")
         if "arguments are required" in message:
+            if required := re.search(r"\b(fit|validate|test)\.", message):
+                command = f"darswin {required[1]}"
             message = re.sub(r"\b(fit|validate|test)\.", "--", message)
-        super().error(" ".join(message.split()), *rest)
-
-    def print_usage(self, *arguments) -> None:
-        """Nothing before an error: the usage would have 150 options, see `--help`."""
+        message = " ".join(message.split())
+        if not self.exit_on_error:
+            super().error(message, ex)
+        names = [name for action in parser._actions for name in action.option_strings]
+        message = with_nearest(message, names)
+        self.exit(2, f"error: {message}; `{command} --help` lists the options\n")
 
 
 class WholeHelpParser(RunParser):

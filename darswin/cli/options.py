@@ -1,7 +1,9 @@
 """The options of `fit`, `validate` and `test`: presets, the folder of the run, and the help."""
 
 import argparse
+import difflib
 import inspect
+import re
 import textwrap
 from collections.abc import Collection, Iterable
 from pathlib import Path
@@ -32,6 +34,7 @@ def complete(argv: list[str]) -> tuple[list[str], Task]:
     contents = {file: _content(file) for file in map(_config_file, given.config)}
     before = None
     if given.run:
+        check_folder(Path(given.run))
         others += ["--run", given.run]
         own = Path(given.run) / "config.yaml"
         if argv[0] == "fit" and not given.resume:
@@ -49,6 +52,13 @@ def complete(argv: list[str]) -> tuple[list[str], Task]:
         raise ValueError(f"`task` must be one of {', '.join(get_args(Task))}, got {task!r}")
     if before not in (None, task):
         raise ValueError(f"{given.run} is a run of `task` {before}, not of {task}")
+    for file in contents:
+        if file.parent == PRESETS and task not in (fitting := _tasks_of(contents[file])):
+            others_fit = [p.stem for p in _presets() if task in _tasks_of(_content(p))]
+            raise ValueError(
+                f"the preset {file.stem} is for `task` {' or '.join(fitting)}, not for {task}, "
+                f"which has {', '.join(others_fit)}"
+            )
     if given.task:
         others += ["--task", given.task]
     if given.path:
@@ -69,6 +79,16 @@ def _config_file(name: str) -> Path:
     return preset
 
 
+def _presets() -> list[Path]:
+    return sorted(PRESETS.glob("*.yaml"))
+
+
+def _tasks_of(preset: dict[str, Any]) -> list[str]:
+    """The tasks that a preset fits. One for pixels fits both, which have the same options."""
+    dense = preset.get("task", FIRST_TASK) != FIRST_TASK
+    return [task for task in get_args(Task) if (task != FIRST_TASK) == dense]
+
+
 def _content(config: Path) -> dict[str, Any]:
     try:
         content = yaml.safe_load(read_text(config))
@@ -85,12 +105,28 @@ def _path_in(content: dict[str, Any]) -> str | None:
 
 def presets() -> str:
     """The names of the presets, joined by commas."""
-    return ", ".join(sorted(path.stem for path in PRESETS.glob("*.yaml")))
+    return ", ".join(path.stem for path in _presets())
 
 
 def last_of(folder: Path) -> Path:
     """The last checkpoint of a run."""
     return folder / "checkpoints" / "last.ckpt"
+
+
+def check_folder(run: Path) -> None:
+    """ValueError for a file in place of the folder of a run."""
+    if not run.is_file():
+        return
+    if run.suffix == ".ckpt":
+        use = "`ckpt_path` takes a checkpoint"
+    else:
+        use = "`model.weights` takes a model to start from, `darswin predict --model` one to use"
+    above = run.parent.parent
+    hint = f"; this one belongs to the run {above}" if (above / "config.yaml").exists() else ""
+    raise ValueError(
+        f"`run` names the folder in which `darswin fit` keeps all of a training, but {run} is a "
+        f"file{hint}. {use}"
+    )
 
 
 def check_free(folder: Path) -> None:
@@ -115,6 +151,30 @@ def flag_of(name: str) -> str:
         if ours and name in inspect.signature(part).parameters:
             return f"--{group}.{name}"
     return f"--model.{name}"
+
+
+_FIRST = {"data": "data.path", "model": "model.name"}
+
+
+def with_nearest(message: str, names: Collection[str]) -> str:
+    """The parser's message, with the option of `names` that was probably meant."""
+    group = re.match(r"--(data|model|trainer): Unable to load config '(.*?)'", message)
+    if group:
+        start, value = group.groups()
+        meant = f"; type --{_FIRST[start]} {value}" if start in _FIRST else ""
+        return f"--{start} takes a file of options, and {value} is none{meant}"
+    if not message.startswith("unrecognized arguments"):
+        return message
+    found = []
+    for word in re.findall(r"(?<!\S)--([\w.]+)", message):
+        group_of_word, _, last = word.rpartition(".")
+        shown = [n for n in names if not n.startswith("--trainer.") or n[2:] in TRAINER]
+        for part in ([n for n in names if n.startswith(f"--{group_of_word}.")], shown, names):
+            by_last = {n.rpartition(".")[2].lstrip("-"): n for n in part}
+            if near := difflib.get_close_matches(last, by_last, 1, 0.7):
+                found.append(by_last[near[0]])
+                break
+    return f"{message}; the nearest option is {', '.join(found)}" if found else message
 
 
 # -- help: our own options first, then the important ones of Lightning's trainer ---------------

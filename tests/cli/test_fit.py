@@ -49,6 +49,22 @@ def scenes(tmp_path_factory):
         ("--trainer.max_epochs -1", "cosine needs an end: set --trainer.max_epochs or"),
         ("--checkpoint_steps 0", "--checkpoint_steps must be at least 1, got 0"),
         ("--devices many", "error: --devices: "),
+        # The option or the preset that was probably meant.
+        (
+            "--data.pth x",
+            "error: unrecognized arguments: --data.pth x; the nearest option is --data.p",
+        ),
+        ("--data.lmit 3 --batch_size 2", "the nearest option is --data.limit, --data.batch_size; "),
+        ("--epochs 3", "the nearest option is --trainer.max_epochs; `darswin fit --help`"),
+        ("--data.xi 0.3", "the nearest option is --xi; "),
+        ("--zzzzzz 3", "unrecognized arguments: --zzzzzz 3; `darswin fit --help` lists the opt"),
+        ("--model darswin_a_small", "darswin_a_small is none; type --model.name darswin_a_small; "),
+        (
+            "--model=darswin_a_small",
+            "error: --model takes a file of options, and darswin_a_small is",
+        ),
+        ("--data photos", "type --data.path photos; `darswin fit --help` lists the options"),
+        ("--trainer 3", "--trainer takes a file of options, and 3 is none; `darswin fit"),
         ("--config minute", "the presets are few, iccv2023, iccv2023_paper, minutes, scenes_min"),
     ],
 )
@@ -89,6 +105,18 @@ def test_what_is_missing_is_named_as_people_type_it(capsys, tmp_path):
         (["--config", "c.yaml"], "no folder elsewhere"),
         (["--config", "none"], "none is neither a file nor a preset"),
         (["--task", "depth"], "--task must be one of classification, segmentation, distance, got"),
+        *(
+            (
+                ["--config", preset, "--task", task],
+                f"{preset} is for --task {fits}, not for {task},",
+            )
+            for preset, task, fits in (
+                ("two_cores", "segmentation", "classification"),
+                ("few", "distance", "classification"),
+                ("scenes_minutes", "classification", "segmentation or distance"),
+            )
+        ),
+        (["--config", "two_cores", "--task", "distance"], "distance, which has scenes_minutes"),
     ],
 )
 def test_errors_before_the_slow_imports(capsys, tmp_path, monkeypatch, options, message):
@@ -96,6 +124,22 @@ def test_errors_before_the_slow_imports(capsys, tmp_path, monkeypatch, options, 
     monkeypatch.chdir(tmp_path)
     (tmp_path / "c.yaml").write_text("data: {path: elsewhere}")
     assert message in error(capsys, "fit", "--run", "r", *options)
+
+
+@pytest.mark.parametrize("command", ["fit", "validate", "test"])
+def test_a_file_is_no_run(capsys, tmp_path, command):
+    folder = tmp_path / "checkpoints"
+    folder.mkdir()
+    for ending, use in (
+        ("safetensors", "--model.weights takes a mo"),
+        ("ckpt", "--ckpt_path takes"),
+    ):
+        (file := folder / f"best.{ending}").write_bytes(b"")
+        said = error(capsys, command, "--run", file)
+        assert "--run names the folder in which `darswin fit` keeps" in said and use in said
+        assert f"{file} is a file. " in said
+    (tmp_path / "config.yaml").touch()
+    assert f"belongs to the run {tmp_path}. " in error(capsys, command, "--run", file)
 
 
 def test_flags_of_parameters():
