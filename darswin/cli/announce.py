@@ -3,6 +3,7 @@
 import shlex
 import sys
 from pathlib import Path
+from typing import Any
 
 from lightning.pytorch import Callback, LightningModule, Trainer
 from lightning.pytorch.callbacks import Timer
@@ -30,8 +31,9 @@ class Announce(Callback):
         parameters = sum(p.numel() for p in pl_module.net.parameters())
         name, loaders = pl_module.card.model, trainer.val_dataloaders
         held = f" and {len(loaders.dataset)} validation" if loaders else ""
+        pictures: Any = trainer.train_dataloader
         say(
-            f"{name} with {parameters:,} parameters; {len(trainer.train_dataloader.dataset):,} "
+            f"{name} with {parameters:,} parameters; {len(pictures.dataset):,} "
             f"training{held} pictures; {pl_module.steps_per_epoch:,} steps an epoch, "
             f"{pl_module.steps:,} in all"
         )

@@ -305,7 +305,7 @@ class RunCLI(LightningCLI):
             say_stopped(self.trainer, self.folder)
             if self.signals.number is not None:
                 raise SystemExit
-        elif not self.trainer.fast_dev_run:
+        elif not self.trainer.fast_dev_run:  # type: ignore[attr-defined]
             say_the_end(self.trainer, self.folder)
 
     @contextlib.contextmanager

@@ -134,7 +134,7 @@ class Classification(Task):
             trained_on, warped = self.data.train_lenses, self.trained.fit == "whole"
             is_range = warped and isinstance(trained_on, SphericalLenses)
             band = (trained_on.low, trained_on.high) if is_range else None
-            draw_accuracy(xi, {name: accuracy}, band, axes=axes)
+            draw_accuracy(xi, {name: accuracy.tolist()}, band, axes=axes)
         else:
             axes.bar([row["lenses"] for row in rows], accuracy, label=name)
             axes.set(ylabel="accuracy (%)")
