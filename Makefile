@@ -95,7 +95,7 @@ fuzz: build  ## call the operators with random and hostile arguments, and read 1
 	$(BIN)/python -X faulthandler -m pytest -q --hypothesis-profile=fuzz \
 	  tests/ops/test_properties.py tests/ops/test_hostile.py tests/lens/test_mutations.py
 
-kills: build  ## kill training runs at random, and check that they continue exactly (10 minutes)
+kills: build  ## kill and stop training runs at random, and check that they continue exactly (20 minutes)
 	$(BIN)/python tests/train/kills.py
 
 mutants: build  ## change single places of the code and count the changes that tests notice (hours; can be interrupted)

@@ -19,6 +19,7 @@ from darswin.models.stages import Pair
 from darswin.ops import use_reference
 from darswin.utils.extras import lack
 from darswin.utils.progress import Progress
+from darswin.utils.quiet import quiet_export
 
 __all__ = ["export_onnx", "export_package", "export_program"]
 
@@ -101,6 +102,7 @@ def export_program(
     return _program(model, images, lens, fixed_lens, input, any_strides=True)
 
 
+@quiet_export()
 def _program(
     model: nn.Module,
     images: Tensor,
@@ -188,6 +190,7 @@ def export_package(
         )
 
 
+@quiet_export()
 def export_onnx(
     model: nn.Module,
     path: str | os.PathLike,
