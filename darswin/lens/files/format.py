@@ -13,6 +13,8 @@ from darswin.lens.distorted import DistortedLens
 from darswin.lens.files.content import Content
 from darswin.lens.frame import Size
 
+# For `from_dict`. A cropped image's may have "sensor" besides: the crop's x and y in the image of
+# the whole sensor, and the height and width of that image, px.
 Description = dict[str, Any]
 # A function for each camera of a file, by the camera's name. It reads the camera when called.
 Cameras = dict[str, Callable[[], Description]]

@@ -3,6 +3,7 @@
 import math
 import os
 import re
+import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -23,6 +24,7 @@ from darswin.lens.files.nerfstudio import Nerfstudio
 from darswin.lens.files.own import Own
 from darswin.lens.files.woodscape import WoodScape
 from darswin.lens.frame import Size
+from darswin.lens.plausible import ImplausibleLens, doubts
 from darswin.utils.files import replace_file
 
 # Rays must not land further out than this, px, as a pinhole's do near 90°.
@@ -69,6 +71,9 @@ def load(
             file that does not name it.
         dtype: of the lens; None means torch's default.
 
+    Warns:
+        ImplausibleLens: the lens does not fit its image, as if its lengths were in another unit.
+
     Raises:
         ValueError: an unknown format, a missing or wrong entry, several cameras without a choice,
             or a theta_max beyond the limit. The message names the file.
@@ -85,7 +90,7 @@ def load_all(
     model: str | None = None,
     dtype: torch.dtype | None = None,
 ) -> dict[str, Lens]:
-    """Reads all cameras of a calibration file, by name. Arguments and errors: see `load`."""
+    """Reads all cameras of a calibration file, by name. Arguments, warnings, errors: see `load`."""
     return Calibration.read(path, model).lenses(theta_max, image_size, dtype)
 
 
@@ -177,12 +182,34 @@ class Calibration:
         theta_max: float | None = None,
         image_size: Size = None,
         dtype: torch.dtype | None = None,
+        *,
+        nominal: bool = False,
     ) -> Lens:
-        """One camera; the arguments are those of `load`."""
+        """One camera; arguments and warnings are those of `load`.
+
+        nominal: True if `image_size` stands in for a size that is not known, and the lens shall not
+        be held against it.
+        """
+        name = self.choose(camera)
+        lens, doubt = self.judged(name, theta_max, image_size, dtype, nominal=nominal)
+        self._warn({name: doubt})
+        return lens
+
+    def judged(
+        self,
+        camera: str | int | None = None,
+        theta_max: float | None = None,
+        image_size: Size = None,
+        dtype: torch.dtype | None = None,
+        *,
+        nominal: bool = False,
+    ) -> tuple[Lens, str]:
+        """One camera, and its `doubts` in place of a warning; arguments as for `lens`."""
         name = self.choose(camera)
         description = self._describe(name)
         with self._about(name):
-            return _batch([description], theta_max, image_size, dtype)
+            lens, (doubt,) = _batch([description], theta_max, image_size, dtype)
+        return lens, "" if nominal and "image_size" not in description else doubt
 
     def lenses(
         self,
@@ -190,7 +217,7 @@ class Calibration:
         image_size: Size = None,
         dtype: torch.dtype | None = None,
     ) -> dict[str, Lens]:
-        """All cameras; the arguments are those of `load_all`."""
+        """All cameras; arguments and warnings are those of `load_all`."""
         # Frames often repeat one camera: each description becomes one lens, and descriptions of
         # the same shape become one batch.
         keys: dict[str, str] = {}
@@ -199,25 +226,35 @@ class Calibration:
             description = self._describe(name)
             keys[name] = repr(description)
             batches.setdefault(_shape(description), {}).setdefault(keys[name], name)
-        found: dict[str, Lens] = {}
+        found: dict[str, tuple[Lens, str]] = {}
         for firsts in batches.values():
             lenses = self._together([*firsts.values()], theta_max, image_size, dtype)
             found |= {key: lenses[name] for key, name in firsts.items()}
-        return {name: found[key] for name, key in keys.items()}
+        self._warn({name: found[key][1] for name, key in keys.items()})
+        return {name: found[key][0] for name, key in keys.items()}
 
-    def _together(self, names: list[str], *arguments) -> dict[str, Lens]:
-        """The lenses of cameras whose descriptions have one shape. Raises the error of the first
-        camera that has one."""
+    def _warn(self, doubts: Mapping[str, str]) -> None:
+        """Warns once of the cameras that are in doubt."""
+        names = [name for name, doubt in doubts.items() if doubt]
+        if names:
+            which = f"camera {short(names[0])}: " if len(self.names) > 1 else ""
+            more = f" (and {len(names) - 1} more cameras)" if len(names) > 1 else ""
+            text = f"{self.what}: {which}it describes {doubts[names[0]]}{more}"
+            warnings.warn(text, ImplausibleLens, stacklevel=2)
+
+    def _together(self, names: list[str], *arguments) -> dict[str, tuple[Lens, str]]:
+        """The lenses of cameras whose descriptions have one shape, and their doubts. Raises the
+        error of the first camera that has one."""
         try:
             with self._about(names[0]):
-                lenses = _batch([self._describe(name) for name in names], *arguments)
+                lenses, said = _batch([self._describe(name) for name in names], *arguments)
         except ValueError:
             if len(names) == 1:
                 raise
             half = len(names) // 2
             first = self._together(names[:half], *arguments)
             return first | self._together(names[half:], *arguments)
-        return {name: lenses[i] for i, name in enumerate(names)}
+        return {name: (lenses[i], said[i]) for i, name in enumerate(names)}
 
     def _describe(self, name: str) -> Description:
         """A camera's description in our pixel convention."""
@@ -263,8 +300,9 @@ def _batch(
     theta_max: float | None,
     image_size: Size,
     dtype: torch.dtype | None,
-) -> Lens:
-    """The lenses of descriptions with one `_shape`, with the θ_max that `load` documents."""
+) -> tuple[Lens, list[str]]:
+    """The lenses of descriptions with one `_shape`, with the θ_max that `load` documents, and their
+    doubts, which are about the file's θ_max, not the caller's."""
     dtype = dtype or torch.get_default_dtype()
     first = descriptions[0]
     values: dict[str, Any] = {
@@ -274,18 +312,22 @@ def _batch(
     }
     if image_size is not None:
         values.setdefault("image_size", torch.tensor([image_size], dtype=dtype))
-    wanted = values.pop("theta_max", None)
+    sensor, wanted = values.pop("sensor", None), values.pop("theta_max", None)
     if theta_max is not None:
         wanted = torch.tensor([theta_max], dtype=dtype)
     lens = from_dict({"model": first["model"], **values}, first.get("image_size", image_size))
-    limit = lens.theta_max
+    whole, limit = lens, lens.theta_max
     if wanted is not None:
         rounded = (limit < wanted) & (wanted <= limit + ROUNDING)
         lens = lens.with_theta_max(torch.where(rounded, limit, wanted))
     elif "image_size" in values and "fov" not in values:
         lens = lens.with_theta_max(reach(lens))
     _check(lens, math.inf if wanted is not None else MAX_RADIUS)
-    return lens
+    judged = lens if theta_max is None else whole.with_theta_max(reach(whole))
+    if sensor is not None:
+        left_top, size = sensor.split(2, 1)
+        judged = judged.replace(center=judged.center_in() + left_top, image_size=size)
+    return lens, doubts(judged)
 
 
 def reach(lens: Lens) -> Tensor:

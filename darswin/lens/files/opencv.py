@@ -204,9 +204,10 @@ class _Reader:
                 raise ValueError("xi is missing: it must be a finite number")
             (terms["xi"],) = self.matrix(xi, (1,))
         size = self.image_size(suffix)
+        sensor: dict[str, list[float]] = {}
         if "distortion_model" in self.file:
-            size = self.in_message(plane, size)
-        return describe(model, plane | terms, size)
+            size, sensor = self.in_message(plane, size)
+        return describe(model, plane | terms, size) | sensor
 
     def camera_by_name(self) -> Description:
         """The camera of a file with single numbers."""
@@ -298,14 +299,18 @@ class _Reader:
             raise ValueError(f"{where} must be {height:g} × {width:g} numbers, got {len(numbers)}")
         return numbers
 
-    def in_message(self, plane: dict[str, float], size: Size) -> Size:
-        """The image size of a ROS message. Changes `plane` from the sensor's pixels to the image's:
-        the image shows the region `roi`, and joins `binning_x` × `binning_y` pixels to one."""
+    def in_message(
+        self, plane: dict[str, float], size: Size
+    ) -> tuple[Size, dict[str, list[float]]]:
+        """The image size of a ROS message, and the place of its region on the sensor, if any.
+        Changes `plane` from the sensor's pixels to the image's: the image shows the region `roi`,
+        and joins `binning_x` × `binning_y` pixels to one."""
         roi = self.file.section("roi") if "roi" in self.file else Fields({})
         left, top, width, height = (
             _pixels(roi, name) for name in ("x_offset", "y_offset", "width", "height")
         )
         across, down = (max(_pixels(self.file, f"binning_{axis}"), 1) for axis in "xy")
+        sensor: dict[str, list[float]] = {}
         if width or height or left or top:
             rows, columns = size or (math.inf, math.inf)
             if not (0 < width <= columns - left and 0 < height <= rows - top):
@@ -313,6 +318,9 @@ class _Reader:
                     "roi must be a part of the image of 1 pixel or more, or all 0, got "
                     f"{width}×{height} px at ({left}, {top})"
                 )
+            if size is not None:
+                sides = size[0] / down, size[1] / across
+                sensor = {"sensor": [left / across, top / down, *sides]}
             size = height, width
         if size is not None:
             size = size[0] // down, size[1] // across
@@ -322,7 +330,7 @@ class _Reader:
         plane["cy"] = (plane["cy"] - top + 0.5) / down - 0.5
         for name, count in (("fx", across), ("fy", down), ("skew", across)):
             plane[name] /= count
-        return size
+        return size, sensor
 
     def image_size(self, suffix: str) -> Size:
         """(H, W) of a camera's images, or of all cameras' images; None if the file has neither."""
