@@ -63,8 +63,8 @@ def _doubt(
         found.append(f"{scale * math.pi / 180:.3g} px per degree and a θ_max of {degrees:.4g}°")
     elif half < SMALLEST_SPAN * scale or radius > LARGEST_RADIUS * half:
         found.append(f"an image circle of {2 * radius:.6g} px up to θ_max = {degrees:.3g}°")
-    off = [abs((x + 0.5) / width - 0.5), abs((y + 0.5) / height - 0.5)]
-    swapped = _in_middle(x, y, height, width) and min(off) > NEAR
+    off = _off_axes(x, y, width, height)
+    swapped = min(off) > NEAR > off_middle(x, y, height, width)
     if min(off) > FAR_ON_BOTH or max(off) > FAR_ON_ONE or swapped:
         found.append(f"the principal point at ({x:.4g}, {y:.4g}), far from the middle")
     if not found:
@@ -73,17 +73,22 @@ def _doubt(
     return f"a picture of {width:.0f} × {height:.0f} px with {' and '.join(found)}{guess}"
 
 
-def _in_middle(x: float, y: float, width: float, height: float, near: float = NEAR) -> bool:
-    return abs((x + 0.5) / width - 0.5) < near and abs((y + 0.5) / height - 0.5) < near
+def off_middle(x: float, y: float, width: float, height: float) -> float:
+    """How far a pixel is from the middle of an image, as the larger part of its sides."""
+    return max(_off_axes(x, y, width, height))
+
+
+def _off_axes(x: float, y: float, width: float, height: float) -> tuple[float, float]:
+    return abs((x + 0.5) / width - 0.5), abs((y + 0.5) / height - 0.5)
 
 
 def _guess(x: float, y: float, width: float, height: float, scale: float) -> str:
     """What would fit the picture, in words that follow the doubt; "" without an idea."""
     half = math.hypot(width, height) / 2
     fits_in_px = TYPICAL_SPANS[0] < half / scale < TYPICAL_SPANS[1]
-    if _in_middle(x, y, height, width) and not _in_middle(x, y, width, height):
+    if off_middle(x, y, height, width) < NEAR < off_middle(x, y, width, height):
         return "; width and height seem to be swapped"
-    if _in_middle(x, y, width, height, FAR_ON_BOTH):  # then the principal point is in px
+    if off_middle(x, y, width, height) < FAR_ON_BOTH:  # then the principal point is in px
         sides = {"normalised by the width": width, "normalised by the height": height}
         if fits_in_px:
             return "; θ_max may be in another unit"
@@ -94,7 +99,8 @@ def _guess(x: float, y: float, width: float, height: float, scale: float) -> str
     }.items():  # fmt: skip
         focal_fits = TYPICAL_SPANS[0] < half / scale / math.sqrt(across * down) < TYPICAL_SPANS[1]
         for origin in (0.0, 0.5):  # formats with the upper left pixel at ½ have subtracted it
-            if focal_fits and _in_middle((x + origin) * across, (y + origin) * down, width, height):
+            pixel = (x + origin) * across, (y + origin) * down
+            if focal_fits and off_middle(*pixel, width, height) < NEAR:
                 return f"; the lengths would fit normalised by the {name}"
     if fits_in_px and max(abs(x) / width, abs(y) / height) < NEAR / 2:
         return "; it may be measured from the middle"

@@ -12,7 +12,7 @@ from typing import Any, Self
 import torch
 from torch import Tensor
 
-from darswin.lens.base import MODELS, Lens, from_dict
+from darswin.lens.base import Lens, from_dict
 from darswin.lens.files import colmap, opencv
 from darswin.lens.files.basalt import Basalt
 from darswin.lens.files.camodocal import CamOdoCal, OCamCalib
@@ -21,7 +21,8 @@ from darswin.lens.files.fields import Fields, listed, short
 from darswin.lens.files.format import Description, Format
 from darswin.lens.files.kalibr import Kalibr
 from darswin.lens.files.nerfstudio import Nerfstudio
-from darswin.lens.files.own import Own
+from darswin.lens.files.own import ROUNDING, Own
+from darswin.lens.files.unknown import unknown
 from darswin.lens.files.woodscape import WoodScape
 from darswin.lens.frame import Size
 from darswin.lens.plausible import ImplausibleLens, doubts
@@ -29,8 +30,6 @@ from darswin.utils.files import replace_file
 
 # Rays must not land further out than this, px, as a pinhole's do near 90°.
 MAX_RADIUS = 1e6
-# A θ_max that was rounded by another program may exceed the limit by this, rad.
-ROUNDING = 1e-4
 MAX_CAMERAS = 10_000
 
 # The first one that fits a file reads it.
@@ -150,6 +149,8 @@ class Calibration:
             data = read_bytes(path)
             is_binary = colmap.is_binary(data)
             text = colmap.from_binary(data, MAX_CAMERAS) if is_binary else decoded(data)
+        except FileNotFoundError as error:
+            raise FileNotFoundError(f"calibration {name}: there is no such file") from error
         except ValueError as error:
             raise ValueError(f"calibration {name}: {error}") from error
         return cls(text, name, model)
@@ -280,11 +281,8 @@ def _format_of(content: Content) -> Format:
     found = next((format for format in FORMATS if format.fits(content)), None)
     if found is None:
         known = ", ".join(format.name for format in FORMATS)
-        given = content.get("model") if isinstance(content, Mapping) else None
-        raise ValueError(
-            f'it must be in one of the formats {known}; in a darswin file, "model" must be one of '
-            f"{', '.join(sorted(MODELS))}, got {short(given)}"
-        )
+        reason = unknown(content, FORMATS)
+        raise ValueError(f"unknown format: it must be in one of the formats {known}; {reason}")
     return found
 
 
