@@ -11,7 +11,7 @@ from numpy.polynomial.polynomial import polyval
 from darswin.lens.base import Lens
 from darswin.lens.distorted import BrownConrady, KannalaBrandt, Mei
 from darswin.lens.files.content import Content
-from darswin.lens.files.fields import Fields, short, to_number
+from darswin.lens.files.fields import Fields, is_number, short, to_number
 from darswin.lens.files.format import Cameras, Description, Format, describe, in_image
 from darswin.lens.polynomial import OCam, OCamInverse
 
@@ -62,10 +62,11 @@ class OCamCalib(Format):
     is_table = True
 
     def fits(self, content: Content) -> bool:
-        """Its first line counts its numbers, and its last three have 2, 3 and 2 numbers."""
+        """True if the first of several lines counts its numbers, or the last three have 2, 3, 2."""
         if not isinstance(content, list):
             return False
-        counts = content[0][0] == str(len(content[0]) - 1) and len(content) > 3
+        count, *words = content[0]
+        counts = count == str(len(words)) and is_number(words[0]) and len(content) > 3
         return counts or [len(row) for row in content[-3:]] == [2, 3, 2]
 
     def cameras(self, file: list[list[str]], model: str | None) -> Cameras:

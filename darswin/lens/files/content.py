@@ -37,20 +37,20 @@ _POINTS = re.compile(r"\[[\s\d.,eE+-]{2048,}\]|(?<=>)[\s\d.eE+-]{2048,}(?=<)")
 # The first bytes of files that are given in place of a calibration. None begins a cameras.bin.
 _OTHERS = {
     "a picture": (
-        rb"\x89PNG|\xff\xd8\xff|GIF8|BM.{4}\0{4}|II[*+]\0|MM\0[*+]|RIFF.{4}WEBP|8BPS|v/1\1"
-        rb"|\0.{3}(jP  |JXL |ftyp(avif|hei|mif|msf|crx))|P[1-7]\s+\d+\s+\d+\s|\0\0\1\0"
+        rb"\x89PNG|\xff\xd8\xff|GIF8|BM.{4}\0{4}|II[*+]\0|MM\0[*+]|RIFF.{4}WEBP|8BPS|v/1\x01"
+        rb"|\0.{3}(jP  |JXL |ftyp(avif|hei|mif|msf|crx))|P[1-7]\s+\d+\s+\d+\s|\0\0\x01\0"
     ),
     "a video": (
-        rb"\0.{3}(ftyp|moov|mdat|free|wide|skip)|RIFF.{4}AVI |\x1a\x45\xdf\xa3|FLV\1|OggS"
-        rb"|\0\0\1[\xb3\xba]|0&\xb2u"
+        rb"\0.{3}(ftyp|moov|mdat|free|wide|skip)|RIFF.{4}AVI |\x1a\x45\xdf\xa3|FLV\x01|OggS"
+        rb"|\0\0\x01[\xb3\xba]|0&\xb2u"
     ),
     "an archive": (
-        rb"\x1f\x8b|BZh\d|\xfd7zXZ|7z\xbc\xaf|Rar!|\(\xb5/\xfd|.{257}ustar|PK(?!\3\4)"
+        rb"\x1f\x8b|BZh\d|\xfd7zXZ|7z\xbc\xaf|Rar!|\(\xb5/\xfd|.{257}ustar|PK(?!\x03\x04)"
     ),
     "a PDF document": rb"%PDF",
     "a file of MATLAB or HDF5": rb"MATLAB 5|\x89HDF",
     "one array of NumPy (np.savez writes several with their names)": rb"\x93NUMPY",
-    "a pickle, which may run code": rb"\x80[\2-\5][^\0]",
+    "a pickle, which may run code": rb"\x80[\x02-\x05][^\0]",
 }  # fmt: skip
 _WANTED = "but must be a calibration: text in YAML, JSON or XML, a table, or np.savez's .npz"
 
