@@ -12,6 +12,7 @@ import yaml
 from lens_examples import FILES, FISHEYE, PLUMB_BOB, K, f64, file_text, flat, loads, message, opencv
 
 from darswin.lens import load, load_all, to_dict
+from darswin.lens.files.load import Calibration
 
 KB = dict(model="KannalaBrandt", radial=FISHEYE)
 
@@ -199,19 +200,13 @@ def test_is_fisheye_alone_names_the_model():
     frame = content["frames"][0]
     inside = {name: value for name, value in content.items() if name != "frames"}
     frames = dict(frames=[frame | inside, frame | inside | {"file_path": "2", "fl_x": 400.0}])
-    first, second = load_all_of(frames)
+    first, second = Calibration(json.dumps(frames), "in a string").lenses(dtype=f64).values()
     assert to_dict(first) == to_dict(lens) and second.focal.item() == 400
     assert type(loads(json.dumps(content | dict(is_fisheye=False)))).__name__ == "BrownConrady"
     with pytest.raises(ValueError, match="does not use the numbers of p1"):
         loads(json.dumps(content | dict(p1=0.1)))
     with pytest.raises(ValueError, match="is_fisheye is true, but camera_model is OPENCV"):
         loads(json.dumps(content | dict(camera_model="OPENCV")))
-
-
-def load_all_of(content):
-    from darswin.lens.files.load import Calibration
-
-    return Calibration(json.dumps(content), "in a string").lenses(dtype=f64).values()
 
 
 # -- degrees in our own JSON ----------------------------------------------------------------------

@@ -77,13 +77,17 @@ class OpenCV(Format):
     def fits(self, content: Content) -> bool:
         if not isinstance(content, Mapping):
             return False
-        # One entry called K or M is no calibration, unless it has the form of a matrix.
+        # Many files have a K or M. It counts if it is a matrix, or a list beside other entries.
         names = {plain_name(name): value for name, value in content.items()}
         return any(
-            _is_matrix(names[matrix + end])
-            or any(name + e in names for name in BESIDE for e in {end, ""})
-            for matrix in MATRIX for end in ("", *SUFFIXES) if matrix + end in names
-        )  # fmt: skip
+            _is_matrix(value := names.get(matrix + end))
+            or (
+                (isinstance(value, (list, Mapping)) or " " in str(value or ""))
+                and any(name + e in names for name in BESIDE for e in {end, ""})
+            )
+            for matrix in MATRIX
+            for end in ("", *SUFFIXES)
+        )
 
     def cameras(self, file: Fields, model: str | None) -> Cameras:
         reader = _Reader(file, model)

@@ -19,7 +19,7 @@ def unknown(content: Content, formats: Sequence[Format]) -> str:
         tables = " or ".join(format.keys for format in formats if format.is_table)
         return f"it is a table of {len(content)} lines, but a table must have {tables}"
     given = content.get("model")
-    found = f"its entries are {listed(content)}"
+    found = f"its entries are {listed(content) or 'none'}"
     if isinstance(given, str):
         nearest = _nearest(given, MODELS)
         return (
