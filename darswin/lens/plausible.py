@@ -23,7 +23,7 @@ UNITS = {"in mm": 1e3 / 3, "in cm": 1e4 / 3, "in m": 1e6 / 3, "in inches": 25.4e
 MOST_OFF = 2.5
 TYPICAL_SPANS = (0.15, 6.0)  # rad
 MOST_APART = 1.2  # ratio of the factors along x and y
-LEAST_SIDE = 64  # px; a smaller "picture" is a sensor in a unit of length
+LEAST_SIDE, MOST_SIDE = 64, 1e6  # px; a smaller "picture" is a sensor in a unit of length
 
 
 class ImplausibleLens(UserWarning):
@@ -69,7 +69,7 @@ def _doubt(
         found.append(f"the principal point at ({x:.4g}, {y:.4g}), far from the middle")
     if not found:
         return ""
-    guess = _guess(x, y, width, height, scale)
+    guess = _guess(x, y, width, height, min(max(scale, 1e-99), 1e99))
     return f"a picture of {width:.0f} × {height:.0f} px with {' and '.join(found)}{guess}"
 
 
@@ -106,7 +106,7 @@ def _guess(x: float, y: float, width: float, height: float, scale: float) -> str
         return "; it may be measured from the middle"
     if x > 0 and y > 0 and MOST_APART > (ratio := width * y / height / x) > 1 / MOST_APART:
         factor = width / x / 2 / math.sqrt(ratio)  # from these lengths to px
-        if min(width, height) > LEAST_SIDE * factor:
+        if LEAST_SIDE * factor < min(width, height) < MOST_SIDE * factor:
             fit = f"the lengths would fit {width / factor:.0f} × {height / factor:.0f} px"
             return f"; {fit}, or the picture is a crop"
         if units := _nearest(UNITS, factor):

@@ -1,5 +1,6 @@
 """Lenses that do not fit their pictures are doubted; real ones and crops are not."""
 
+import itertools
 import json
 import re
 import warnings
@@ -131,6 +132,17 @@ def test_real_lenses_and_their_crops_are_not_doubted():
         ):
             found = doubts(lens.cropped(top, left, rows, columns))
             assert found == [""] or name in ("small circle", "two circles"), (name, found)
+
+
+def test_any_numbers_get_a_doubt_of_one_line():
+    extremes = (1e-300, 1e-30, 1e-3, 1.0, 1e30, 1e300)
+    for focal, x, y, stretch in itertools.product(extremes, extremes, (-1.0, *extremes), extremes):
+        lens = Equidistant(
+            torch.tensor(focal, dtype=f64), 1.0, [x, y], affine=[[stretch, 0.0], [0.0, 1.0]],
+            image_size=(480, 640),
+        )  # fmt: skip
+        (doubt,) = doubts(lens)
+        assert doubt.startswith("a picture of 640 × 480 px with ") and len(doubt) < 300, doubt
 
 
 def test_a_batch_is_doubted_lens_by_lens():

@@ -13,7 +13,7 @@ MODELS = {
     "SIMPLE_PINHOLE": BrownConrady, "PINHOLE": BrownConrady, "SIMPLE_RADIAL": BrownConrady,
     "RADIAL": BrownConrady, "OPENCV": BrownConrady, "OPENCV_FISHEYE": KannalaBrandt,
 }  # fmt: skip
-TERMS = ("k1", "k2", "k3", "k4", "p1", "p2")
+TERMS: tuple[str, ...] = ("k1", "k2", "k3", "k4", "p1", "p2")
 MARKS = ("frames", "fl_x", "fl_y", "transform_matrix", "camera_angle_x")
 KEYS = ("camera_model", "is_fisheye", "fl_x", "fl_y", "cx", "cy", "w", "h", *TERMS)
 PAIRS = (("k1", "k2"), ("k3", "k4"), ("p1", "p2"))  # nerfstudio's tools write both or none

@@ -28,7 +28,9 @@ class Own(Format):
     keys = "model"
 
     def fits(self, content: Content) -> bool:
-        name = content.get("model") if isinstance(content, Mapping) else None
+        if not isinstance(content, Mapping):
+            return False
+        name = content.get("model")
         if not isinstance(name, str) or name not in MODELS:
             return False
         # Others name models too, such as Perspective, beside fx and fy.
