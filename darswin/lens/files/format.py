@@ -49,24 +49,21 @@ class Intrinsics(NamedTuple):
 
 
 class Format:
-    """Base of the formats. A class sets `name` and `keys`, sets `marks` or defines `fits`, and
-    defines `cameras`. Formats that are written also set `holds` and define `_text`.
-
-    One common name, such as "frames", does not make a format: `fits` asks for several marks.
-    """
+    """Base of the formats. A class sets `name` and `keys`, and defines `fits` and `cameras`.
+    Formats that are written also set `holds` and define `_text`."""
 
     name: str  # for errors
     origin = 0.0  # x and y of the upper left pixel's center in the file; we use 0
     keys: str  # what its files hold, for errors
-    marks: tuple[str, ...] = ()  # a mapping with two of these entries is in this format
     is_table = False  # True if its files are lines of words
     takes_model = False  # True if the argument `model` of `load` may name the coefficients' model
     holds = ""  # the lenses that `write` supports, for errors
     needs_size = False  # True if a written camera must have an image_size
 
     def fits(self, content: Content) -> bool:
-        """True if a file's content is in this format."""
-        return isinstance(content, Mapping) and has_several(content, self.marks)
+        """True if a file's content is in this format. One common entry, such as "frames", does not
+        make a format: it needs several, as in `has_several`."""
+        raise NotImplementedError
 
     def cameras(self, file: Any, model: str | None) -> Cameras:
         """The cameras of a file; `file` is its `Fields`, or the rows of a table."""

@@ -34,7 +34,7 @@ def unknown(content: Content, formats: Sequence[Format]) -> str:
         return sum(_nearest(name, words) is not None for name in names)
 
     best = max(keys, key=score)
-    expected = keys[best if score(best) else "OpenCV"]
+    expected = keys[best] if score(best) else f'{keys["OpenCV"]}, or a "model" of darswin'
     return f"{found}, but expected are, for example, {expected}"
 
 
