@@ -31,9 +31,12 @@ class FocalLens(Lens, register=False):
         """
         rows = cls._expanded(cls._of_fov().bind(f"{cls.__name__}.from_fov", arguments, named))
         theta_max, radius = rows.pop("fov") / 2, rows.pop("radius")
-        unit = rows | {"focal": torch.ones_like(radius), "theta_max": theta_max}
-        focal = cls._from_tensors(unit)._scale_to(radius)
-        return cls(**rows, focal=focal, theta_max=theta_max)
+        lens = cls(**rows, focal=torch.ones_like(radius))
+        lens._require("radius", (radius > 0) & radius.isfinite(), "finite and above 0", radius)
+        lens._set_theta_max(theta_max, "fov")
+        lens.focal = lens._scale_to(radius)
+        lens._set_theta_max(theta_max, "fov")  # a limit by rounding depends on the focal length
+        return lens
 
     @classmethod
     @cache
@@ -118,7 +121,9 @@ class FieldOfView(FocalLens):
     Source: Devernay and Faugeras, MVA 2001, sec. 3.1.
     """
 
-    omega = Parameter(low=0, high=math.pi, open=True, starts=(1.0,), bounds=(1e-3, 3.14))
+    omega = Parameter(
+        low=0, high=math.pi, open=True, angle=True, starts=(1.0,), bounds=(1e-3, 3.14)
+    )
 
     def project(self, theta: Number) -> Tensor:
         theta, omega, focal = self._aligned(theta, "omega", "focal")

@@ -20,6 +20,7 @@ from darswin.models.base import Model
 from darswin.models.stages import Pair
 from darswin.ops import polar_to_image
 from darswin.ops.checks import as_int
+from darswin.utils.angles import degrees_hint
 
 ViewName = Literal["none", "perspective", "square"]
 
@@ -88,7 +89,8 @@ class PerspectiveView(PlainView):
     def __init__(self, size: Pair, max_fov: float = math.radians(175)):
         super().__init__(size)
         if not 0 < max_fov < math.pi:
-            raise ValueError(f"max_fov must be in (0, π), got {max_fov}")
+            hint = degrees_hint(max_fov)
+            raise ValueError(f"max_fov must be in (0, π), got {max_fov}{hint}")
         self.max_fov = float(max_fov)
 
     def image_points(self, lens: Lens, size: Pair) -> Tensor:

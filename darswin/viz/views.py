@@ -24,6 +24,7 @@ from torch import Tensor
 from darswin.data.warping import remap
 from darswin.lens import Lens
 from darswin.lens.pixels import as_map
+from darswin.utils.angles import check_turn, degrees_hint
 
 __all__ = ["cylindrical", "equirectangular", "perspective", "undistort"]
 
@@ -33,7 +34,7 @@ def perspective(
 ) -> Tensor:
     """The rays of a pinhole camera, which shows straight lines straight: (H, W, 3), float64.
 
-    `size` is (H, W), `fov` lies in (0, π) rad, and yaw and pitch are in rad.
+    `size` is (H, W), `fov` lies in (0, π) rad, and yaw and pitch in [-2π, 2π] rad.
     """
     _check_fov(fov, math.pi, "below π")
     x, y = _plane(size, 2 * math.tan(fov / 2))
@@ -73,6 +74,8 @@ def equirectangular(
 
 def rotated(rays: Tensor, yaw: float, pitch: float) -> Tensor:
     """Rays (..., 3) of a camera that looks `yaw` to the right and `pitch` up, rad."""
+    check_turn("yaw", yaw)
+    check_turn("pitch", pitch)
     cos, sin = math.cos(pitch), math.sin(pitch)
     pitched = rays.new_tensor([[1, 0, 0], [0, cos, -sin], [0, sin, cos]])
     cos, sin = math.cos(yaw), math.sin(yaw)
@@ -120,4 +123,4 @@ def _plane(size: tuple[int, int], width: float) -> tuple[Tensor, Tensor]:
 
 def _check_fov(fov: float, end: float, range_: str, closed: bool = False) -> None:
     if not (0 < fov < end or (closed and fov == end)):
-        raise ValueError(f"fov must be above 0 and {range_} rad, got {fov}")
+        raise ValueError(f"fov must be above 0 and {range_} rad, got {fov}{degrees_hint(fov)}")
