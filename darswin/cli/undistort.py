@@ -80,13 +80,13 @@ def undistort(
         check_option("size", size, view != "square" or size[0] == size[1], "square for this view")
     if not paths:
         raise ValueError("missing pictures or videos: give files or folders")
+    if inside := [path for path in paths if _is_below(path, out)]:
+        raise ValueError(f"`out` must be a folder without the originals, but has {inside[0]}")
     root = "." if is_json(calib) else Path(calib).parent
     calibrations = Calibrations(calib, root, camera, coefficients)
     files = pictures_and_videos(paths, leave_out=out)
     if not files:
         raise ValueError(f"no pictures or videos in {', '.join(paths)}, apart from those of `out`")
-    if inside := [f.name for f in files if _is_below(f.name, out)]:
-        raise ValueError(f"`out` must be another folder than that of {inside[0]}")
     folder = claim_folder(out, RECORD)
     (folder / LENS).unlink(missing_ok=True)
     views = _Views(calibrations, view, fov_deg, size, yaw_deg, pitch_deg, theta_max_deg)
