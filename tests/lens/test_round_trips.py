@@ -92,7 +92,7 @@ def test_every_ray_is_found(name):
 
 
 def area(lens, theta, azimuth):
-    """The factor by which the lens enlarges an area, computed from `pixels` alone, which do not end at θ_max."""
+    """The factor by which the lens enlarges an area, from `pixels` alone, which go beyond θ_max."""
 
     def place(point):  # in the plane θ (cos φ, sin φ)
         angle = torch.atan2(point[..., 1], point[..., 0])
