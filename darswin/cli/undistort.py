@@ -46,16 +46,17 @@ def undistort(
             lenses.json for several cameras.
         paths: pictures, videos, and folders of them, whose subfolders are kept.
         out: the folder to write to: new, empty, or from an earlier undistort, whose files are
-            replaced. Pictures have 8 bits per channel, videos have no sound. Endings that cannot be
-            written get .png or .mp4 in addition.
+            replaced. Pictures have 8 bits per channel and no transparency, videos have no sound.
+            Endings that cannot be written get .png or .mp4 in addition.
         view: the projection. A perspective view shows straight lines straight, but its sides become
             coarse above 110°. A cylindrical view shows verticals straight. An equirectangular view
             is a part of a map of the sphere. A square shows the whole image disc, in equal steps of
             the incident angle.
         fov_deg: the horizontal field of view, in degrees. The default is all that the picture
             shows; for a perspective view, 110° at most.
-        size: height and width of the views in px, e.g. 480,640. The default is the width of the
-            picture, and the height that fits the view; videos have even sides.
+        size: height and width of the views in px, e.g. 480,640. The default is a shape that fits
+            the view, with the longer side of the picture; a square has the shorter one. Videos have
+            even sides.
         yaw_deg: the angle that the view looks to the right, in degrees.
         pitch_deg: the angle that the view looks up, in degrees.
         theta_max_deg: the incident angle beyond which the view is black, in degrees. The default is
@@ -130,7 +131,13 @@ class _Views:
         self._calibrations, self._view, self._fov_deg = calibrations, view, fov_deg
         self._size, self._turn, self._theta_max_deg = size, (yaw_deg, pitch_deg), theta_max_deg
         self._plans: dict[tuple[int, bool], _Viewed] = {}
-        self.said = f"{view} view"  # and the field of view and the size of the last one
+        self._said: set[str] = set()
+
+    @property
+    def said(self) -> str:
+        """The view in words."""
+        (shape,) = self._said if len(self._said) == 1 else ("in several sizes",)
+        return f"{self._view} view, {shape}"
 
     def of(self, name: str, size: tuple[int, int], orientation: int, even: bool) -> _Viewed:
         """The view of an upright picture of (H, W); `even` makes its sides even."""
@@ -158,7 +165,7 @@ class _Views:
         # Without a θ_max in the file, the lens ends at the picture's sides, and corners see more.
         if self._theta_max_deg is None and bool((exact.theta_max - reach(whole)).abs() < 1e-5):
             exact = whole
-        self.said = f"{self._view} view, {fov_deg:.4g}° across, {width} × {height} px"
+        self._said.add(f"{fov_deg:.4g}° across, {width} × {height} px")
         camera = None
         if self._view == "perspective":
             fov = torch.tensor(math.radians(fov_deg), dtype=torch.float64)

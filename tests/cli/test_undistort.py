@@ -169,7 +169,7 @@ def test_folders_are_undistorted_and_what_is_broken_is_named(mixed, capsys):
         run(mixed)
     assert end.value.code == 2
     out, printed = mixed / "out", capsys.readouterr()
-    assert "8 of 11 files" in printed.out
+    assert "8 of 11 files, perspective view, in several sizes; their cal" in printed.out
     for name in ("broken.png", "empty.mp4", "wide.png"):
         assert name in printed.err
     assert "the calibration is for 128×96 (W×H) but the picture is 200×96" in printed.err
