@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from safetensors import safe_open
 
 from darswin.cli.answers import ANSWERS, ANSWERS_OF, Answers, ClassAnswers, claim_folder, file_names
 from darswin.compat import load_official
@@ -23,6 +22,7 @@ from darswin.models.saving import ModelCard, NoCardError, load_model, model_of_r
 from darswin.utils.files import replace_file
 from darswin.utils.image import BrokenImageError, read_oriented
 from darswin.utils.tasks import Task
+from darswin.utils.tensor_files import read_metadata
 from darswin.utils.video import is_video, read_frames
 
 
@@ -213,8 +213,7 @@ def trained_model(path: str | Path) -> tuple[Any, ModelCard]:
 
 def _released_size(path: str | Path) -> int:
     """The image size (px) in the configuration of released weights."""
-    with safe_open(path, "pt") as file:
-        config = (file.metadata() or {}).get("config", "{}")
+    config = read_metadata(path).get("config", "{}")
     try:
         return int(json.loads(config)["DATA"]["IMG_SIZE"])
     except (KeyError, TypeError, ValueError):
