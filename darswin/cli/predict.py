@@ -204,11 +204,12 @@ def trained_model(path: str | Path) -> tuple[Any, ModelCard]:
     try:
         return load_model(path)
     except NoCardError as error:
+        normalization = dict(mean=IMAGENET_MEAN, std=IMAGENET_STD)
         try:
-            net = load_official(path, mean=IMAGENET_MEAN, std=IMAGENET_STD)
+            net = load_official(path, **normalization)
         except ValueError as other:
             raise ValueError(f"{error}, and are {other}") from error
-        return net, ModelCard("", size=_released_size(path))
+        return net, ModelCard("", normalization, size=_released_size(path))
 
 
 def _released_size(path: str | Path) -> int:

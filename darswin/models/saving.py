@@ -5,7 +5,7 @@ import math
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -58,6 +58,21 @@ class ModelCard:
     def channels(self) -> int:
         """The number of channels of the images, 1 for grey and 3 for colours."""
         return self.options.get("in_chans", 3)
+
+    @property
+    def mean(self) -> float | Sequence[float]:
+        """The mean of the normalization, for pixels in [0, 1]; see `Model.normalize`."""
+        return self.options.get("mean", 0.0)
+
+    @property
+    def std(self) -> float | Sequence[float]:
+        """The standard deviation of the normalization, for pixels in [0, 1]."""
+        return self.options.get("std", 1.0)
+
+    def __repr__(self) -> str:
+        shown = {field.name: getattr(self, field.name) for field in fields(self)}
+        shown |= dict(channels=self.channels, mean=self.mean, std=self.std)
+        return f"ModelCard({', '.join(f'{name}={value!r}' for name, value in shown.items())})"
 
     def create(self) -> Any:
         """The model, with new weights."""
