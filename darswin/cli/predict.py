@@ -18,7 +18,7 @@ from darswin.data.samples import IMAGENET_MEAN, IMAGENET_STD
 from darswin.lens import Lens
 from darswin.lens.files.opencv import Coefficients
 from darswin.models.registry import list_pretrained, pretrained_file
-from darswin.models.saving import ModelCard, NoCardError, load_model, model_of_run
+from darswin.models.saving import ModelCard, NoCardError, load_model, model_file, model_of_run
 from darswin.utils.files import replace_file
 from darswin.utils.image import BrokenImageError, read_oriented
 from darswin.utils.tasks import Task
@@ -72,7 +72,7 @@ def predict(
     if run is not None and model is None:
         weights: str | Path = model_of_run(run)
     elif model is not None and run is None:
-        weights = model
+        weights = Path(model_file(model))
     else:
         raise ValueError(
             "give either `run`, the folder of a run, or `model`, a safetensors file or one of "

@@ -7,13 +7,17 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal, get_args, overload
 
 from torch import Tensor
 
 from darswin.layers.quantized import Quantization, with_quantized_layers
 from darswin.lens.files.fields import short
-from darswin.models.registry import create_model, list_pretrained, pretrained_file
+from darswin.models.create import create_model
+from darswin.models.darswin import DarSwin
+from darswin.models.encoder import Encoder
+from darswin.models.pixel import PixelModel
+from darswin.models.registry import list_pretrained, pretrained_file
 from darswin.utils.tasks import Task
 from darswin.utils.tensor_files import read_metadata, read_tensors, write_tensors
 
@@ -74,7 +78,7 @@ class ModelCard:
         shown |= dict(channels=self.channels, mean=self.mean, std=self.std)
         return f"ModelCard({', '.join(f'{name}={value!r}' for name, value in shown.items())})"
 
-    def create(self) -> Any:
+    def create(self) -> Encoder | PixelModel:
         """The model, with new weights."""
         model = create_model(self.model, **self.options)
         activations = {
@@ -110,8 +114,14 @@ def read_card(path: str | os.PathLike) -> ModelCard:
         NoCardError: the file has no card.
         ValueError: the file is no safetensors file, or its card is wrong.
     """
-    path = _file(path)
+    path = model_file(path)
     return _card(path, read_metadata(path))
+
+
+@overload
+def load_model(path: Literal["digits"]) -> tuple[DarSwin, ModelCard]: ...
+@overload
+def load_model(path: str | os.PathLike) -> tuple[Encoder | PixelModel, ModelCard]: ...
 
 
 def load_model(path: str | os.PathLike) -> tuple[Any, ModelCard]:
@@ -125,7 +135,7 @@ def load_model(path: str | os.PathLike) -> tuple[Any, ModelCard]:
         ValueError: the file is no safetensors file or is damaged, its card is wrong, or the weights
             do not fit the model of the card.
     """
-    path = _file(path)
+    path = model_file(path)
     weights, metadata = read_tensors(path)
     card = _card(path, metadata)
     with _about(path):
@@ -138,9 +148,11 @@ def load_model(path: str | os.PathLike) -> tuple[Any, ModelCard]:
     return model.eval(), card
 
 
-def _file(path: str | os.PathLike) -> str | os.PathLike:
-    """The path, or that of the trained model with this name."""
-    return pretrained_file(str(path)) if path in list_pretrained() else path
+def model_file(path: str | os.PathLike) -> str | os.PathLike:
+    """The path, or that of the trained model with this name; ValueError for a name without one."""
+    name = os.fspath(path)
+    is_name = not (os.path.dirname(name) or os.path.splitext(name)[1] or os.path.exists(name))
+    return pretrained_file(name) if is_name or name in list_pretrained() else path
 
 
 def _card(path: str | os.PathLike, metadata: Mapping[str, str]) -> ModelCard:
@@ -167,7 +179,7 @@ def _parsed(entry: str) -> ModelCard:
     return ModelCard(**known)
 
 
-def _created(card: ModelCard, weights: Mapping[str, Tensor]) -> Any:
+def _created(card: ModelCard, weights: Mapping[str, Tensor]) -> Encoder | PixelModel:
     """The card's model with these weights; ValueError if they do not fit."""
     try:
         model = card.create()
