@@ -70,7 +70,12 @@ def create_model(
 ) -> Encoder | PixelModel: ...
 @overload
 def create_model(
-    name: str, *, features_only: bool, **options: Any
+    name: str,
+    *,
+    features_only: bool,
+    out_indices: int | Sequence[int] | None = ...,
+    output_fmt: Format | None = ...,
+    **options: Any,
 ) -> Encoder | PixelModel | FeatureMaps: ...
 
 
