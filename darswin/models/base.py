@@ -220,9 +220,9 @@ class Model(nn.Module):
         return self._normalized(images)
 
     def _checked(self, images: Tensor) -> Tensor:
-        """The images as (B, C, H, W), after a check of their channels, size and device."""
+        """The result of `_with_shape`. Warns once if the values cannot be normalized ones."""
         images = self._with_shape(images)
-        if images.is_floating_point() and not torch.compiler.is_compiling() and self._looks:
+        if not torch.compiler.is_compiling() and self._looks and images.is_floating_point():
             self._looks -= 1
             largest = _largest(images)
             if largest > LARGEST_NORMALIZED:

@@ -17,7 +17,7 @@ from darswin.models.create import create_model
 from darswin.models.darswin import DarSwin
 from darswin.models.encoder import Encoder
 from darswin.models.pixel import PixelModel
-from darswin.models.registry import list_pretrained, pretrained_file
+from darswin.models.registry import list_models, list_pretrained, no_weights, pretrained_file
 from darswin.utils.tasks import Task
 from darswin.utils.tensor_files import read_metadata, read_tensors, write_tensors
 
@@ -149,9 +149,16 @@ def load_model(path: str | os.PathLike) -> tuple[Any, ModelCard]:
 
 
 def model_file(path: str | os.PathLike) -> str | os.PathLike:
-    """The path, or that of the trained model with this name; ValueError for a name without one."""
+    """The path, or that of the trained model with this name.
+
+    Raises:
+        ValueError: the name is that of a model without trained weights.
+        FileNotFoundError: there is neither a file nor a model of this name.
+    """
     name = os.fspath(path)
     is_name = not (os.path.dirname(name) or os.path.splitext(name)[1] or os.path.exists(name))
+    if is_name and name not in (*list_pretrained(), *list_models()):
+        raise FileNotFoundError(f"there is no file {name}, and {no_weights(name)}")
     return pretrained_file(name) if is_name or name in list_pretrained() else path
 
 
