@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable
 from functools import cache
-from typing import ClassVar, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import torch
 from torch import Tensor
@@ -19,7 +19,7 @@ class FocalLens(Lens, register=False):
     focal = Parameter(low=0, open=True, in_pixels=True, bounds=(1e-9, math.inf))
 
     @classmethod
-    def from_fov(cls, *arguments: Number | None, **named: Number | None) -> Self:
+    def from_fov(cls, *arguments: Any, **named: Any) -> Self:
         """The lens whose full field of view fills a circle.
 
         Args:
@@ -69,6 +69,14 @@ class IdealLens(FocalLens, register=False):
         rise = radius / self._row(self.focal, radius.dim())
         # Rounding can raise u above its largest value, which has no angle.
         return self._fall(rise if self._top is None else rise.clamp(max=self._top))
+
+    if TYPE_CHECKING:
+
+        @classmethod
+        def from_fov(
+            cls, fov: Number, radius: Number, center: Number | None = None, *,
+            affine: Number | None = None, image_size: Number | None = None,
+        ) -> Self: ...  # fmt: skip
 
 
 class Perspective(IdealLens):
@@ -134,3 +142,11 @@ class FieldOfView(FocalLens):
         radius, omega, focal = self._aligned(radius, "omega", "focal")
         angle, tangent = radius * omega / focal, 2 * torch.tan(omega / 2)
         return torch.atan2(torch.sin(angle), tangent * torch.cos(angle))
+
+    if TYPE_CHECKING:
+
+        @classmethod
+        def from_fov(
+            cls, omega: Number, fov: Number, radius: Number, center: Number | None = None, *,
+            affine: Number | None = None, image_size: Number | None = None,
+        ) -> Self: ...  # fmt: skip

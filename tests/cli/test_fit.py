@@ -280,4 +280,7 @@ def test_help_names_every_command(capsys):
     text = capsys.readouterr().out
     assert all(re.search(rf"^  {name} ", text, re.M) for name in COMMANDS)
     main(["models"])
-    assert "darswin_a_small" in capsys.readouterr().out.split()
+    text = capsys.readouterr().out
+    assert "darswin_a_small" in text.split()
+    assert "digits: darswin_a_nano for classification, 10 classes, images of 32×32 with 1 " in text
+    assert "mean 0.0, std 1.0" in text
