@@ -13,6 +13,7 @@ from darswin.lens import Lens
 from darswin.lens.curves import as_curves, form_of
 from darswin.lens.files.load import FORMATS, Calibration
 from darswin.lens.orientation import in_upright_picture, stored_size
+from darswin.utils.text import parse_json, read_json, to_text
 
 _ALL = PurePosixPath(".")
 _NOMINAL = (1024, 1024)  # px, for a calibration without a size where no picture has one
@@ -202,8 +203,8 @@ def _places(
 def _entries(path: Path) -> Mapping[str, Any] | None:
     """The entries of a lenses.json; None for a calibration file, or if it is no JSON object."""
     try:
-        content = json.loads(path.read_bytes())
-    except ValueError:
+        content = read_json(path)
+    except ValueError:  # the reader of calibrations says what is wrong
         return None
     if not isinstance(content, dict) or any(f.fits(content) for f in FORMATS):
         return None
@@ -249,10 +250,9 @@ def _form_of(file: str) -> Hashable:
     if not file.endswith(".json"):
         return file
     try:
-        content = json.loads(Path(file).read_bytes())
+        return _without_numbers(parse_json(to_text(Path(file).read_bytes())))
     except ValueError as error:
         raise ValueError(f"calibration {file}: it is not JSON: {error}") from error
-    return _without_numbers(content)
 
 
 def _without_numbers(value: Any, name: str = "") -> Hashable:

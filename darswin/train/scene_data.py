@@ -103,7 +103,8 @@ class LabelData(SceneData):
     Args:
         path: a folder of scenes: see `darswin.data.open_scenes`.
         label_map: a JSON file that gives ids in the label files their classes, by name or by id,
-            such as {"7": "road", "8": 1, "9": null}; ids that it leaves out count as unlabelled.
+            such as {"7": "road", "8": 1, "9": null}; null means unlabelled. It must have all ids
+            that are not the data set's own.
         common: as `SceneData`.
     """
 

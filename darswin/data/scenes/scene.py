@@ -3,20 +3,21 @@
 import os
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, Self
 
 import cv2
 import numpy as np
 import torch
-from PIL import Image
+from PIL import Image, UnidentifiedImageError
 
 from darswin.data.cameras import Calibrations
 from darswin.data.pictures import Form, form_of
-from darswin.data.splits import Limited, read_classes, read_json, some
+from darswin.data.splits import Limited, read_classes, some
 from darswin.lens import Lens
 from darswin.utils.image import BrokenImageError, decoded, file_content, read_oriented
+from darswin.utils.text import read_json
 
 IGNORE = 255  # the label of an unlabelled pixel
 PER_METRE = 256  # the scale of distances in a PNG of 16 bits
@@ -45,6 +46,10 @@ class Classes(NamedTuple):
 
 
 NO_CLASSES = Classes([], [])
+
+
+class GreyPalette(UserWarning):
+    """A warning of label PNGs whose ids are the greys of their palettes."""
 
 
 class Scenes(Limited):
@@ -174,33 +179,74 @@ def nothing_of(target: np.ndarray) -> int:
 def read_labels(path: Path, classes: int, class_of: Mapping[int, int] | None = None) -> np.ndarray:
     """The ids of classes, or `IGNORE`, in a PNG that is grey or has a palette, (H, W) uint8.
 
-    `class_of` maps the ids in the file to classes; ids that it leaves out become `IGNORE`.
+    `class_of` maps every id that the file may hold to its class or to `IGNORE`; without it, the ids
+    are those of the classes.
+    """
+    labels = _read_ids(path)
+    known = {k: k for k in range(classes)} if class_of is None else class_of
+    table = np.full(256, IGNORE, np.uint8)
+    table[[id_ for id_ in known if id_ < 256]] = [known[id_] for id_ in known if id_ < 256]
+    ids = np.flatnonzero(np.bincount(labels.ravel(), minlength=256)).tolist()
+    if wrong := [id_ for id_ in ids if id_ not in known and id_ != IGNORE]:
+        told = f"the {classes} classes have the ids 0 to {classes - 1}"
+        if class_of is not None:
+            told = f"the known ids are {some(sorted(known))}"
+        raise ValueError(
+            f"{path} holds the ids {some(wrong)}, but {told}; {IGNORE} means unlabelled, and "
+            "`label_map` maps other ids to classes or to null"
+        )
+    return table[labels]
+
+
+def _read_ids(path: Path) -> np.ndarray:
+    """The ids in a PNG of 1 to 8 bits, grey or with a palette, (H, W) uint8.
+
+    They are the numbers that the file stores. A palette of different greys alone is an exception:
+    optimisers write a grey picture so, and its greys were the ids.
     """
     try:
-        with warnings.catch_warnings(action="ignore"), Image.open(path) as file:
-            mode = file.mode
+        with warnings.catch_warnings(action="ignore"), Image.open(path, formats=["PNG"]) as file:
+            mode, stored = file.mode, str(file.tile[0].args)
             if mode in ("L", "P", "1"):
                 labels = np.array(file, np.uint8)
+                colors = np.reshape(file.getpalette() or [], (-1, 3))
+    except UnidentifiedImageError as error:  # its own message repeats the path
+        raise BrokenImageError(f"cannot read {path}: no PNG") from error
     except Exception as error:  # Pillow raises many exceptions for broken files
         raise BrokenImageError(f"cannot read {path}: {_reason(error)}") from error
     if mode not in ("L", "P", "1"):
+        kinds = {"I": "16 bits", "LA": "grey with transparency (LA)"}
         raise ValueError(
-            f"{path} must hold an id of 8 bits for each pixel, grey or with a palette, but "
-            f"holds {'16 bits' if mode.startswith('I') else f'colours ({mode})'}"
+            f"{path} must hold an id of 8 bits for each pixel, grey or with a palette, but holds "
+            f"{kinds.get(mode.partition(';')[0], f'colours ({mode})')}"
         )
-    if class_of is not None:
-        table = np.full(256, IGNORE, np.uint8)
-        for id_, class_ in class_of.items():
-            if id_ < len(table):
-                table[id_] = class_
-        return table[labels]
-    ids = np.flatnonzero(np.bincount(labels.ravel(), minlength=256)).tolist()
-    if wrong := [id_ for id_ in ids if classes <= id_ != IGNORE]:
-        raise ValueError(
-            f"{path} holds the ids {some(wrong)}, but the {classes} classes have the ids 0 to "
-            f"{classes - 1}; {IGNORE} means unlabelled, and `label_map` maps other ids to classes"
-        )
+    labels //= _SCALES.get(stored, 1)
+    if mode == "P" and _are_different_greys(colors):
+        greys = np.full(256, IGNORE, np.uint8)
+        greys[: len(colors)] = colors[:, 0]
+        if not np.array_equal(labels, greys[labels]):
+            _tell_of_greys(path.parent)
+        return greys[labels]
     return labels
+
+
+# Pillow stretches grey values of few bits to 0 … 255.
+_SCALES = {"L;2": 85, "L;4": 17}
+
+
+def _are_different_greys(colors: np.ndarray) -> bool:
+    return bool((colors == colors[:, :1]).all()) and len(set(colors[:, 0])) == len(colors)
+
+
+@cache
+def _tell_of_greys(folder: Path) -> None:
+    """Warns once of each folder."""
+    warnings.warn(
+        f"{folder} holds label PNGs whose palette has only greys, as programs that shrink PNGs "
+        "write them: their ids are these greys, not the numbers of the palette's entries",
+        GreyPalette,
+        stacklevel=2,
+    )
 
 
 def read_distance(path: Path, far: float | None = None) -> np.ndarray:
@@ -252,7 +298,7 @@ def read_palette(path: str | Path) -> Classes:
 def read_label_map(
     path: str | Path, own: Callable[[], Classes], is_given: bool
 ) -> tuple[dict[int, int], Classes]:
-    """The class of each id in the label files, from a JSON object, and all classes.
+    """The class of each id in the label files, or `IGNORE`, from a JSON object, and all classes.
 
     The values are names or ids of classes, or null for ids that mean unlabelled. The classes are
     `own()`, or the names in the order of the file unless `is_given`.
@@ -271,7 +317,10 @@ def read_label_map(
     for key, value in content.items():
         if not key.isdecimal():
             raise ValueError(f"{form}, got the id {key!r}")
+        if int(key) in found:
+            raise ValueError(f"{path} maps the id {int(key)} twice")
         if value is None or value == IGNORE:
+            found[int(key)] = IGNORE
             continue
         class_ = classes.names.index(value) if value in classes.names else value
         if type(class_) is not int or not 0 <= class_ < len(classes.names):
