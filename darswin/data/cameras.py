@@ -145,7 +145,8 @@ class Calibrations:
         """
         camera = self.camera_of(picture)
         key = camera, tuple(size), orientation
-        if key not in self._lenses:
+        found = self._lenses.get(key)
+        if found is None:
             stored = stored_size(size, orientation)
             try:
                 lens = in_upright_picture(camera.lens(stored), size, orientation)
@@ -154,8 +155,15 @@ class Calibrations:
                 raise ValueError(f"{of}{error} ({camera.name})") from error
             if len(self._lenses) >= _KEPT:
                 self._lenses.clear()
-            self._lenses[key] = self._form(lens)
-        return self._lenses[key]
+            found = self._lenses[key] = self._form(lens)
+        return found
+
+    def check(
+        self, picture: str | Path | None, size: tuple[int, int], orientation: int = 1
+    ) -> None:
+        """Raises the errors of `lens_of`, while lenses are few enough to be kept for it."""
+        if len(self._lenses) < _KEPT:
+            self.lens_of(picture, size, orientation)
 
     def lens_alone(self, picture: str | Path | None) -> Lens:
         """The lens of a picture that cannot be read, at the size of the calibration."""

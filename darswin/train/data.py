@@ -12,11 +12,12 @@ from torch.utils.data import DataLoader
 
 from darswin.data.augment import RandAugment, RandomErasing
 from darswin.data.cameras import Calibrations, is_json
+from darswin.data.headers import check_files
 from darswin.data.lens_distributions import parse_lenses, parse_sweep
 from darswin.data.order import ResumableLoader, TrainingOrder
 from darswin.data.pictures import Source, open_source
 from darswin.data.samples import IMAGENET_MEAN, IMAGENET_STD, Calibrated, Samples
-from darswin.data.splits import Split
+from darswin.data.splits import SPLITS, Split
 from darswin.data.warping import Framing, RandomTurns
 from darswin.data.wide_angle import PAPER_FOV, WideAngle
 from darswin.lens.files.opencv import Coefficients
@@ -135,7 +136,15 @@ class RunData(LightningDataModule):
         if split not in self._sources:
             # All splits have the channels of the training split.
             channels = self._channels if split == "train" else self.channels
-            self._sources[split] = self._open(split, channels)
+            try:
+                self._sources[split] = self._open(split, channels)
+            except FileNotFoundError as error:
+                if split == "train" or self._opening["holdout"]:
+                    raise
+                raise ValueError(
+                    f"`holdout` 0 leaves no pictures for {split!r}, and {self.path} has none of "
+                    "its own; set `limit_val_batches` 0 to train without validation"
+                ) from error
         return self._sources[split]
 
     @property
@@ -217,6 +226,15 @@ class RunData(LightningDataModule):
         """The training split, augmented."""
         raise NotImplementedError
 
+    def prepare_data(self) -> None:
+        """Finds the pictures that a training could not use, before it begins. On each machine, one
+        process does so while the others wait."""
+        trainer = self.trainer
+        if trainer is None or trainer.state.fn != "fit":
+            return
+        for split in SPLITS[:2] if trainer.limit_val_batches else SPLITS[:1]:
+            check_files(self.dataset(split), f"the pictures of {split!r}")
+
     def train_dataloader(self) -> ResumableLoader:
         """The batches of the training split, in an order that can be resumed."""
         dataset = self._training()
@@ -251,15 +269,7 @@ class RunData(LightningDataModule):
         raise NotImplementedError
 
     def _evaluation(self, split: Split, name: str | None = None) -> DataLoader:
-        try:
-            dataset = self.dataset(split, name)
-        except FileNotFoundError as error:
-            if self._opening["holdout"]:
-                raise
-            raise ValueError(
-                f"`holdout` 0 leaves no pictures for {split!r}, and {self.path} has none of its "
-                "own; set `limit_val_batches` 0 to train without validation"
-            ) from error
+        dataset = self.dataset(split, name)
         count, place = len(dataset), self._place
         part = range(place["rank"], count, place["world"])
         if not part:

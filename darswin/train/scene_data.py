@@ -49,10 +49,11 @@ class SceneData(RunData):
         self.crop = crop
 
     def _open(self, split: Split, channels: int | None) -> Scenes:
-        return open_scenes(
+        scenes = open_scenes(
             self.path, split, self.target, channels=channels, lens=self._lens,
             camera=self._camera, coefficients=self._coefficients, **self._opening,
         )  # fmt: skip
+        return scenes if split == "train" else self._of_same_classes(scenes, f"its {split!r} split")
 
     @property
     def colors(self) -> list[list[int]]:  # type: ignore[override]  # as `classes`
@@ -75,9 +76,12 @@ class SceneData(RunData):
         opening = self._opening | dict(splits=None, channels=self.channels)
         flat = (Path(path) / "images").is_dir()
         scenes = open_scenes(path, "all" if flat else "test", self.target, **opening)
+        return self._of_same_classes(scenes, path)
+
+    def _of_same_classes(self, scenes: Scenes, what: str) -> Scenes:
         if scenes.classes != self.classes:
             raise ValueError(
-                f"{path} has the classes {scenes.classes}, but {self.path} has {self.classes}: "
+                f"{what} has the classes {scenes.classes}, but {self.path} has {self.classes}: "
                 "test a model on the classes that it was trained on"
             )
         return scenes

@@ -16,7 +16,14 @@ from darswin.data.cameras import Calibrations
 from darswin.data.pictures import Form, form_of
 from darswin.data.splits import Limited, read_classes, some
 from darswin.lens import Lens
-from darswin.utils.image import BrokenImageError, decoded, file_content, read_oriented
+from darswin.utils.image import (
+    BrokenImageError,
+    Header,
+    decoded,
+    file_content,
+    read_header,
+    read_oriented,
+)
 from darswin.utils.text import read_json
 
 IGNORE = 255  # the label of an unlabelled pixel
@@ -109,25 +116,39 @@ class Scenes(Limited):
     def __getitem__(self, index: int) -> Scene:
         """The scene; BrokenImageError or ValueError for files that are broken or do not fit."""
         image, orientation = read_oriented(self.file(index), self.channels)
-        if orientation != 1:
-            raise ValueError(
-                f"{self.file(index)} has the EXIF orientation {orientation}, so its labels or "
-                "distances may fit the stored or the upright picture: store it upright"
-            )
         target = self.read(self.target_file(index))
         size = image.shape[0], image.shape[1]
-        if target.shape != size:
-            shapes = [f"{height}×{width}" for height, width in (target.shape, size)]
-            raise ValueError(
-                f"{self.target_file(index)} has {shapes[0]} px, but its picture "
-                f"{self.file(index)} has {shapes[1]}"
-            )
+        self._check(index, size, orientation, target.shape)
         lens = self.lenses.lens_of(self.file(index), size)
         rows = self._rows(size[0])
         kept = slice(rows, size[0] - rows)
         image, target = image[kept], target[kept]
         self.unknown[index] = int(np.count_nonzero(target == nothing_of(target)))
         return Scene(image, target, self._trimmed(lens))
+
+    def headers(self, index: int) -> list[Header]:
+        """The headers of the picture and of its target."""
+        return [read_header(self.file(index)), _target_header(self.target_file(index))]
+
+    def check(self, index: int, picture: Header, target: Header) -> None:
+        """Raises the ValueErrors of `self[index]` that the headers of its files tell."""
+        self._check(index, picture.upright, picture.orientation, target.size)
+        self.lenses.check(self.file(index), picture.size)
+
+    def _check(
+        self, index: int, size: tuple[int, int], orientation: int, target: tuple[int, ...]
+    ) -> None:
+        if orientation != 1:
+            raise ValueError(
+                f"{self.file(index)} has the EXIF orientation {orientation}, so its labels or "
+                "distances may fit the stored or the upright picture: store it upright"
+            )
+        if target != size:
+            shapes = [f"{height}×{width}" for height, width in (target, size)]
+            raise ValueError(
+                f"{self.target_file(index)} has {shapes[0]} px, but its picture "
+                f"{self.file(index)} has {shapes[1]}"
+            )
 
     def limited(self, count: int) -> Self:
         part = super().limited(count)
@@ -253,15 +274,7 @@ def read_distance(path: Path, far: float | None = None) -> np.ndarray:
     """The distances (H, W) float32, metres, in a PNG of 16 bits or a NumPy file; 0 for values that
     are not finite, not above 0, or at least `far`."""
     if path.suffix.lower() == ".npy":
-        try:
-            metres = np.load(path, allow_pickle=False)
-        except Exception as error:  # NumPy raises many exceptions for broken files
-            raise BrokenImageError(f"cannot read {path}: {_reason(error)}") from error
-        if not isinstance(metres, np.ndarray) or metres.ndim != 2 or metres.dtype.kind != "f":
-            form = "an archive"
-            if isinstance(metres, np.ndarray):
-                form = f"{metres.dtype} {metres.shape}"
-            raise ValueError(f"{path} must hold floating-point metres (H, W), but holds {form}")
+        metres = _open_metres(path)
         with np.errstate(over="ignore"):  # infinite means unknown
             metres = metres.astype(np.float32)
     else:
@@ -278,6 +291,28 @@ def read_distance(path: Path, far: float | None = None) -> np.ndarray:
         if far is not None:
             known &= metres < far
     return np.where(known, metres, np.float32(0))
+
+
+def _open_metres(path: Path) -> np.ndarray:
+    """The metres (H, W) in a NumPy file, which are read from the file when they are needed."""
+    try:
+        metres = np.load(path, mmap_mode="r", allow_pickle=False)
+    except Exception as error:  # NumPy raises many exceptions for broken files
+        raise BrokenImageError(f"cannot read {path}: {_reason(error)}") from error
+    if not isinstance(metres, np.ndarray) or metres.ndim != 2 or metres.dtype.kind != "f":
+        form = "an archive"
+        if isinstance(metres, np.ndarray):
+            form = f"{metres.dtype} {metres.shape}"
+        raise ValueError(f"{path} must hold floating-point metres (H, W), but holds {form}")
+    return metres
+
+
+def _target_header(path: Path) -> Header:
+    """The header of a file of labels or distances."""
+    if path.suffix.lower() == ".npy":
+        height, width = _open_metres(path).shape
+        return Header((height, width))
+    return read_header(path)
 
 
 def _reason(error: Exception) -> str:
