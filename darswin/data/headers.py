@@ -16,7 +16,7 @@ def check_files(samples: Samples, what: str) -> None:
     """Raises one error for all pictures, targets and lenses that `samples[i]` would refuse, as far
     as the headers of the files tell.
 
-    A file whose header or end is unusual is read whole. Broken files are no fault if
+    A file whose header or end may be damaged is read whole. Broken files are no fault if
     `skip_broken`. `what` names the samples in signs of life.
 
     Raises:
@@ -58,4 +58,4 @@ def _headers(samples: Samples, index: int) -> Sequence[Header] | None:
         found = samples.headers(index)
     except BrokenImageError:
         return None
-    return found if all(header.is_whole for header in found) else None
+    return found if all(header.is_sound for header in found) else None

@@ -16,7 +16,7 @@ from darswin.utils.exif import TURNS
 __all__ = ["BrokenImageError", "read_header", "read_image", "read_oriented"]
 
 _PNG = b"\x89PNG\r\n\x1a\n"
-_LAST = {"PNG": b"IEND", "JPEG": b"\xff\xd9"}  # what complete files have at their ends
+_LAST = {"PNG": b"IEND\xaeB`\x82", "JPEG": b"\xff\xd9"}  # what complete files have at their ends
 _END = 1024  # bytes, because some programs write more behind it
 _SAYS_MORE = frozenset((b"eXIf", b"tEXt", b"zTXt", b"iTXt"))  # chunks that may hold an orientation
 
@@ -57,13 +57,13 @@ class Header(NamedTuple):
     """What the header of a picture file says.
 
     Attributes: size: (H, W) as stored; orientation: of EXIF, 1 to 8; channels: 1 for grey, 3 for
-    colours; is_whole: False if the file does not end like a complete one of its format.
+    colours; is_sound: False if the EXIF data are damaged, or if the file does not end as usual.
     """
 
     size: tuple[int, int]
     orientation: int = 1
     channels: int = 1
-    is_whole: bool = True
+    is_sound: bool = True
 
     @property
     def upright(self) -> tuple[int, int]:
@@ -80,16 +80,18 @@ def read_header(path: str | Path) -> Header:
     try:
         with Path(path).open("rb") as stream, Image.open(stream) as file:
             is_grey = file.mode in ("1", "L", "LA", "F") or file.mode.startswith("I")
-            # A PNG's own method decodes its pixels to look behind them.
-            orientation = Image.Image.getexif(file).get(ExifTags.Base.Orientation, 1)
+            header = Header(file.size[::-1], channels=1 if is_grey else 3)
+            try:  # a PNG's own method decodes its pixels to look behind them
+                exif = Image.Image.getexif(file)
+            except Exception:  # damaged EXIF fails in many ways
+                return header._replace(is_sound=False)
+            if file.format == "TIFF":  # whose size is that of the upright picture
+                size = exif[ExifTags.Base.ImageLength], exif[ExifTags.Base.ImageWidth]
+                header = header._replace(size=size)
+            if (orientation := exif.get(ExifTags.Base.Orientation)) in TURNS:
+                header = header._replace(orientation=orientation)
             stream.seek(max(0, stream.seek(0, os.SEEK_END) - _END))
-            is_whole = _LAST.get(file.format or "", b"") in stream.read()
-            return Header(
-                file.size[::-1],
-                orientation if orientation in TURNS else 1,
-                1 if is_grey else 3,
-                is_whole,
-            )
+            return header._replace(is_sound=_LAST.get(file.format or "", b"") in stream.read())
     except UnidentifiedImageError as error:  # its own message repeats the path
         raise BrokenImageError(f"cannot read {path}: no image that Pillow knows") from error
     except Exception as error:  # a damaged file fails in many ways
