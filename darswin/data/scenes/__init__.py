@@ -5,7 +5,7 @@ from typing import get_args
 
 from darswin.data.scenes.cityscapes import is_cityscapes, open_cityscapes
 from darswin.data.scenes.coco import is_coco, open_coco
-from darswin.data.scenes.files import Options, ScenesSplit
+from darswin.data.scenes.files import Options, ScenesSplit, refuse_outlines
 from darswin.data.scenes.kitti360 import is_kitti360, open_kitti360
 from darswin.data.scenes.plain import FORM, is_plain, open_plain
 from darswin.data.scenes.scene import Scenes, Target
@@ -101,4 +101,5 @@ def open_scenes(
             scenes = open_split(root, options)
             scenes.channels = channels or scenes.form().channels
             return scenes
+    refuse_outlines(root)
     raise FileNotFoundError(f"no scenes in {root}: {FORM}")

@@ -167,6 +167,17 @@ def lenses_beside(
     return options.own_lenses(files)
 
 
+def refuse_outlines(root: Path) -> None:
+    """FileNotFoundError if a JSON file of a data set has outlines of objects in COCO's form."""
+    for file in (*sorted(root.glob("*.json")), *sorted(root.glob("*/*.json"))):
+        text = file.read_bytes()
+        if b'"annotations"' in text and b'"segmentation"' in text:
+            raise FileNotFoundError(
+                f"{file} has outlines of objects, but darswin reads masks, a PNG for each picture: "
+                "docs/howto/scenes.md has the lines that make masks of outlines"
+            )
+
+
 def calibration_in(*folders: Path) -> Path | None:
     """The calibration lens.json, lens.yaml or the like in the first folder that has one."""
     for folder in folders:

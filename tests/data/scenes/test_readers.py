@@ -19,6 +19,7 @@ from scenes import (
     write_cityscapes,
     write_coco,
     write_kitti360,
+    write_outlines,
     write_plain,
     write_synwoodscape,
     write_woodscape,
@@ -179,6 +180,46 @@ def test_cityscapes(tmp_path):
     (tmp_path / "two.txt").write_text("road\nother\n")
     with pytest.raises(ValueError, match=r"two\.txt must name 19 classes, but names 2"):
         open_scenes(tmp_path, "train", "labels", classes=tmp_path / "two.txt")
+
+
+@pytest.mark.parametrize(
+    ("ending", "message"),
+    [
+        ("_gtFine_labelTrainIds", r"but they end in \['_gtFine_labelTrainIds'\]"),
+        ("_gtFine_color", r"\['_gtFine_color'\]"),
+        ("_gtFine_instanceIds", r"\['_gtFine_instanceIds'\]"),
+        ("_gtCoarse_labelIds", r"\['_gtCoarse_labelIds'\]"),
+        ("_labelIds", r"\['_labelIds'\]"),
+        ("", r"\[''\]"),
+    ],
+)
+def test_other_endings_of_cityscapes_are_named(tmp_path, ending, message):
+    write_cityscapes(tmp_path)
+    shutil.copy(WOODSCAPE, tmp_path / "lens.json")
+    for file in (tmp_path / "gtFine").rglob("*.png"):
+        if file.stem.endswith("instanceIds"):
+            file.unlink()
+        else:
+            file.rename(file.with_name(file.name.replace("_gtFine_labelIds", ending)))
+    with pytest.raises(
+        FileNotFoundError, match=rf"gtFine/train must hold .* end in _gtFine_labelIds, .*{message}"
+    ):
+        open_scenes(tmp_path, "train", "labels")
+
+
+def test_cityscapes_without_labels_or_pictures(tmp_path):
+    write_cityscapes(tmp_path)
+    shutil.copy(WOODSCAPE, tmp_path / "lens.json")
+    (tmp_path / "gtFine").rename(tmp_path / "gtCoarse")
+    with pytest.raises(FileNotFoundError, match=r"no folder .*gtFine/train: .*leftImg8bit/train"):
+        open_scenes(tmp_path, "train", "labels")
+    (tmp_path / "gtCoarse").rename(tmp_path / "gtFine")
+    for file in (tmp_path / "leftImg8bit").rglob("*.png"):
+        file.rename(file.with_name(file.name.replace("leftImg8bit", "rightImg8bit")))
+    with pytest.raises(
+        FileNotFoundError, match=r"leftImg8bit/train must hold .*_leftImg8bit, .*_rightImg8bit"
+    ):
+        open_scenes(tmp_path, "train", "labels")
 
 
 def test_coco_panoptic(tmp_path):
@@ -390,6 +431,23 @@ def test_what_woodscape_does_not_have(tmp_path):
     (tmp_path / INFO).write_text(json.dumps(WOODSCAPE_INFO | {"class_indexes": [1] * 10}))
     with pytest.raises(ValueError, match=r"seg_annotation_info\.json: class_indexes must be"):
         open_scenes(tmp_path, "all", "labels", lens=lens)
+
+
+@pytest.mark.parametrize(
+    "place", ["annotations/instances_train.json", "_annotations.coco.json", "train/result.json"]
+)
+@pytest.mark.parametrize("pictures", ["images", "train", "train/images", "photos"])
+def test_outlines_of_objects_are_no_labels(tmp_path, place, pictures):
+    """The error names the file and the page with the lines that make masks."""
+    write_outlines(tmp_path)
+    file = tmp_path / place
+    if pictures != "images":
+        (tmp_path / pictures).parent.mkdir(exist_ok=True)
+        (tmp_path / "images").rename(tmp_path / pictures)
+    file.parent.mkdir(exist_ok=True)
+    (tmp_path / "annotations" / "instances_train.json").rename(file)
+    with pytest.raises(FileNotFoundError, match=rf"{file.name} has outlines .* docs/howto/scenes"):
+        open_scenes(tmp_path, "train", "labels")
 
 
 # -- the plain form ---------------------------------------------------------------------------
