@@ -6,11 +6,13 @@ import cv2
 import numpy as np
 import pytest
 from PIL import ExifTags, Image
+from pngs import PALETTE, png
 from scenes import write, write_plain
 
 from darswin.data import Calibrated, Calibrations, SceneSamples, open_scenes, open_source
 from darswin.data.headers import check_files
 from darswin.data.lens_distributions import parse_lenses
+from darswin.data.scenes.scene import GreyPalette
 from darswin.data.wide_angle import WideAngle
 from darswin.utils import image
 from darswin.utils.image import BrokenImageError
@@ -63,7 +65,7 @@ CHANGES = {
 }
 
 
-def write_photos(folder, suffix, count=4):
+def write_photos(folder, suffix, count=10):
     for k in range(count):
         file = folder / "ab"[k % 2] / f"{k}.{suffix}"
         file.parent.mkdir(parents=True, exist_ok=True)
@@ -130,28 +132,32 @@ def test_all_faults_are_listed_at_once(tmp_path):
 
 
 def test_headers_alone_are_read(tmp_path, monkeypatch):
-    """And each once; a picture whose header or end is unusual is read whole."""
+    """And each once. A picture whose header or end may be damaged is read whole, and so are
+    eight others at most."""
     decoded, headers = [], []
 
     def counted(known, calls):
-        return lambda *arguments: calls.append(arguments) or known(*arguments)
+        return lambda *given, **options: calls.append(given) or known(*given, **options)
 
     monkeypatch.setattr(image, "decoded", counted(image.decoded, decoded))
     monkeypatch.setattr(image.Image, "open", counted(image.Image.open, headers))
-    source = write_photos(tmp_path / "photos", "png", 12)
+    source = write_photos(tmp_path / "photos", "png", 20)
     headers.clear()  # some were read to find the channels
     for samples in of_photos(source):
         check_files(samples, "photos")
-    assert len(headers) == 2 * 12 and not decoded
-    write_plain(tmp_path / "scenes", 6)
+    assert len(headers) == 2 * 20 and len(decoded) == 2 * 7
+    write_plain(tmp_path / "scenes", 9)
     for target in ("labels", "distance"):
         scenes = open_scenes(tmp_path / "scenes", "all", target)
         headers.clear()
+        decoded.clear()
         check_files(SceneSamples(scenes, size=16), "scenes")
-        assert len(headers) == 2 * 6 and not decoded
-    CHANGES["cut in the middle"](source.file(3))
+        pictures = [path for _, path, *_ in decoded if "images" in str(path)]
+        assert len(pictures) == 5 and len(headers) == 2 * 9 + 5 * (target == "labels")
+    CHANGES["cut in the middle"](source.file(4))
+    decoded.clear()
     assert told(next(of_photos(source))) is not None
-    assert len(decoded) == 1
+    assert len(decoded) == 8
 
 
 @pytest.mark.parametrize(
@@ -175,7 +181,7 @@ def test_headers_alone_are_read(tmp_path, monkeypatch):
     ],
 )
 def test_scenes(tmp_path, target, name, change):
-    write_plain(tmp_path, 4, own_lenses="lenses" in name)
+    write_plain(tmp_path, 10, own_lenses="lenses" in name)
     if name.endswith("npy"):
         (tmp_path / "distance" / "001.png").unlink()
         np.save(tmp_path / name, np.ones((121, 160), np.float32))
@@ -189,6 +195,21 @@ def test_scenes(tmp_path, target, name, change):
     assert str(expected) in str(found) and samples.broken == []
     skipping = SceneSamples(samples.scenes, size=16, skip_broken=True)
     assert (told(skipping) is None) == isinstance(expected, BrokenImageError)
+
+
+def test_some_labels_are_read(tmp_path):
+    """An id that no class has, and what is told once, come before the training."""
+    write_plain(tmp_path, 20)
+    for k, file in enumerate(sorted((tmp_path / "labels").iterdir())):
+        palette = [[2, 2, 2], [1, 1, 1], [9, 9, 9]]
+        file.write_bytes(png(np.full((121, 160), k == 6, np.uint8) * 2, 2, PALETTE, palette))
+    samples = SceneSamples(open_scenes(tmp_path, "all", "labels"), size=16)
+    with (
+        pytest.warns(GreyPalette) as warned,
+        pytest.raises(ValueError, match=r"006\.png holds the ids \[9\], but the 3 classes"),
+    ):
+        check_files(samples, "scenes")
+    assert len(warned) == 1
 
 
 def test_pictures_in_memory_have_no_files():
