@@ -12,7 +12,7 @@ from scenes import write, write_plain
 from darswin.data import Calibrated, Calibrations, SceneSamples, open_scenes, open_source
 from darswin.data.headers import check_files
 from darswin.data.lens_distributions import parse_lenses
-from darswin.data.scenes.scene import GreyPalette
+from darswin.data.scenes.scene import OddLabels
 from darswin.data.wide_angle import WideAngle
 from darswin.utils import image
 from darswin.utils.image import BrokenImageError
@@ -205,7 +205,7 @@ def test_some_labels_are_read(tmp_path):
         file.write_bytes(png(np.full((121, 160), k == 6, np.uint8) * 2, 2, PALETTE, palette))
     samples = SceneSamples(open_scenes(tmp_path, "all", "labels"), size=16)
     with (
-        pytest.warns(GreyPalette) as warned,
+        pytest.warns(OddLabels) as warned,
         pytest.raises(ValueError, match=r"006\.png holds the ids \[9\], but the 3 classes"),
     ):
         check_files(samples, "scenes")

@@ -55,8 +55,8 @@ class Classes(NamedTuple):
 NO_CLASSES = Classes([], [])
 
 
-class GreyPalette(UserWarning):
-    """A warning of label PNGs whose ids are the greys of their palettes."""
+class OddLabels(UserWarning):
+    """A warning of label PNGs whose ids may not be those that were meant."""
 
 
 class Scenes(Limited):
@@ -216,6 +216,11 @@ def read_labels(path: Path, classes: int, class_of: Mapping[int, int] | None = N
             f"{path} holds the ids {some(wrong)}, but {told}; {IGNORE} means unlabelled, and "
             "`label_map` maps other ids to classes or to null"
         )
+    if classes == 2 and class_of is None and set(ids) in ({0, IGNORE}, {IGNORE}):
+        _tell_once(
+            f"{path.parent} holds masks of 0 and {IGNORE}, but {IGNORE} means unlabelled: if it is "
+            f'a class here, give a `label_map`, {{"0": 0, "{IGNORE}": 1}}'
+        )
     return table[labels]
 
 
@@ -246,7 +251,11 @@ def _read_ids(path: Path) -> np.ndarray:
         greys = np.full(256, IGNORE, np.uint8)
         greys[: len(colors)] = colors[:, 0]
         if not np.array_equal(labels, greys[labels]):
-            _tell_of_greys(path.parent)
+            _tell_once(
+                f"{path.parent} holds label PNGs whose palette has only greys, as programs that "
+                "shrink PNGs write them: their ids are these greys, not the numbers of the "
+                "palette's entries"
+            )
         return greys[labels]
     return labels
 
@@ -260,14 +269,8 @@ def _are_different_greys(colors: np.ndarray) -> bool:
 
 
 @cache
-def _tell_of_greys(folder: Path) -> None:
-    """Warns once of each folder."""
-    warnings.warn(
-        f"{folder} holds label PNGs whose palette has only greys, as programs that shrink PNGs "
-        "write them: their ids are these greys, not the numbers of the palette's entries",
-        GreyPalette,
-        stacklevel=2,
-    )
+def _tell_once(text: str) -> None:
+    warnings.warn(text, OddLabels, stacklevel=3)
 
 
 def read_distance(path: Path, far: float | None = None) -> np.ndarray:

@@ -8,7 +8,7 @@ import pytest
 from pngs import COLOUR, COLOUR_ALPHA, GREY, GREY_ALPHA, PALETTE, png
 
 from darswin.data import IGNORE
-from darswin.data.scenes.scene import GreyPalette, read_labels
+from darswin.data.scenes.scene import OddLabels, read_labels
 from darswin.utils.image import BrokenImageError
 
 RANDOM = np.random.default_rng(0)
@@ -44,7 +44,23 @@ def test_masks(tmp_path):
         ("colours", png(mask, 1, PALETTE, [[0, 0, 0], [255, 0, 0]]), mask),
     ):
         (tmp_path / f"{name}.png").write_bytes(content)
-        assert (read_labels(tmp_path / f"{name}.png", 2) == expected).all(), name
+        with warnings.catch_warnings(record=True, action="always") as warned:
+            assert (read_labels(tmp_path / f"{name}.png", 2) == expected).all(), name
+            read_labels(tmp_path / f"{name}.png", 2)
+        told = [str(warning.message) for warning in warned]
+        assert len(told) == (name == "0 and 255"), name  # once
+        assert all(
+            'if it is a class here, give a `label_map`, {"0": 0, "255": 1}' in t for t in told
+        )
+    for content, options in (
+        (png(mask * np.uint8(255)), dict(classes=3)),
+        (png(mask * np.uint8(255)), dict(classes=2, class_of={0: 0, 255: 1})),
+        (png(mask + np.where(np.eye(9, 17), 255 - mask, 0).astype(np.uint8)), dict(classes=2)),
+    ):
+        (tmp_path / "other").mkdir(exist_ok=True)
+        (tmp_path / "other" / "x.png").write_bytes(content)
+        with warnings.catch_warnings(action="error"):
+            read_labels(tmp_path / "other" / "x.png", **options)
 
 
 @pytest.mark.parametrize(
@@ -80,7 +96,7 @@ def test_a_palette_of_greys_is_a_grey_picture(tmp_path, greys, bits):
     for name in ("a", "b"):
         content = png(stored, bits, PALETTE, [[grey] * 3 for grey in greys])
         (tmp_path / f"{name}.png").write_bytes(content)
-    with pytest.warns(GreyPalette, match=rf"{tmp_path} holds label PNGs whose palette has only"):
+    with pytest.warns(OddLabels, match=rf"{tmp_path} holds label PNGs whose palette has only"):
         assert (read_labels(tmp_path / "a.png", 256) == original).all()
     with warnings.catch_warnings(action="error"):  # it is said once
         assert (read_labels(tmp_path / "b.png", 256) == original).all()
