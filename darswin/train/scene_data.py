@@ -9,7 +9,8 @@ import torch
 
 from darswin.data.scenes import open_scenes
 from darswin.data.scenes.dataset import SceneSamples
-from darswin.data.scenes.scene import Scenes, Target
+from darswin.data.scenes.scene import Scenes
+from darswin.data.scenes.targets import Target
 from darswin.data.splits import Split
 from darswin.train.data import RunData
 from darswin.train.task import Batch

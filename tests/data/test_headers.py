@@ -12,7 +12,7 @@ from scenes import write, write_plain
 from darswin.data import Calibrated, Calibrations, SceneSamples, open_scenes, open_source
 from darswin.data.headers import check_files
 from darswin.data.lens_distributions import parse_lenses
-from darswin.data.scenes.scene import OddLabels
+from darswin.data.scenes.targets import OddLabels
 from darswin.data.wide_angle import WideAngle
 from darswin.utils import image
 from darswin.utils.image import BrokenImageError

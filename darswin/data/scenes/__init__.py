@@ -8,7 +8,8 @@ from darswin.data.scenes.coco import is_coco, open_coco
 from darswin.data.scenes.files import Options, ScenesSplit, refuse_outlines
 from darswin.data.scenes.kitti360 import is_kitti360, open_kitti360
 from darswin.data.scenes.plain import FORM, is_plain, open_plain
-from darswin.data.scenes.scene import Scenes, Target
+from darswin.data.scenes.scene import Scenes
+from darswin.data.scenes.targets import Target
 from darswin.data.scenes.woodscape import (
     is_synwoodscape,
     is_woodscape,

@@ -13,7 +13,8 @@ from functools import partial
 from pathlib import Path
 
 from darswin.data.scenes.files import Options, pair, pictures_in, stems
-from darswin.data.scenes.scene import Classes, Scenes, read_labels
+from darswin.data.scenes.scene import Classes, Scenes
+from darswin.data.scenes.targets import read_labels
 from darswin.data.splits import SPLITS, Split, some
 
 # The id, the name and the colour of each class.

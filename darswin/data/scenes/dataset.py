@@ -9,7 +9,8 @@ from torch import Tensor
 
 from darswin.data.reframing import resize_scene, turn_scene, warp_scene
 from darswin.data.samples import Draw, Samples
-from darswin.data.scenes.scene import IGNORE, Scene, Scenes
+from darswin.data.scenes.scene import Scene, Scenes
+from darswin.data.scenes.targets import IGNORE
 from darswin.data.warping import Crop, picture_size, taken_part
 from darswin.lens import Lens
 from darswin.utils.image import Header

@@ -8,7 +8,8 @@ from typing import Literal
 
 from darswin.data.cameras import Calibrations
 from darswin.data.folders import OTHER_SUFFIXES, PICTURES, SUFFIXES, files_below, warn_of_unread
-from darswin.data.scenes.scene import IGNORE, Classes, Target, read_label_map, read_palette
+from darswin.data.scenes.scene import Classes, read_label_map, read_palette
+from darswin.data.scenes.targets import IGNORE, Target
 from darswin.data.splits import (
     Split,
     part_of_split,

@@ -15,15 +15,8 @@ from darswin.data.scenes.files import (
     refuse_outlines,
     stems,
 )
-from darswin.data.scenes.scene import (
-    NO_CLASSES,
-    SUFFIXES,
-    Classes,
-    Scenes,
-    read_distance,
-    read_labels,
-    read_palette,
-)
+from darswin.data.scenes.scene import NO_CLASSES, Classes, Scenes, read_palette
+from darswin.data.scenes.targets import SUFFIXES, read_distance, read_labels
 from darswin.data.splits import Split, split_folders
 
 FORM = (

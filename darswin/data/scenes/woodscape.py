@@ -22,14 +22,8 @@ import numpy as np
 
 from darswin.data.cameras import Calibrations
 from darswin.data.scenes.files import Options, Pairs, lenses_beside, pair, pictures_in, stems
-from darswin.data.scenes.scene import (
-    NO_CLASSES,
-    Classes,
-    Scenes,
-    as_classes,
-    read_distance,
-    read_labels,
-)
+from darswin.data.scenes.scene import NO_CLASSES, Classes, Scenes, as_classes
+from darswin.data.scenes.targets import read_distance, read_labels
 from darswin.data.splits import Split
 from darswin.utils.text import read_json
 

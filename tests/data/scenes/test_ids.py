@@ -8,7 +8,7 @@ import pytest
 from pngs import COLOUR, COLOUR_ALPHA, GREY, GREY_ALPHA, PALETTE, png
 
 from darswin.data import IGNORE
-from darswin.data.scenes.scene import OddLabels, read_labels
+from darswin.data.scenes.targets import OddLabels, read_labels
 from darswin.utils.image import BrokenImageError
 
 RANDOM = np.random.default_rng(0)
