@@ -18,8 +18,8 @@ def check_files(samples: Samples, what: str) -> None:
     as the headers of the files tell.
 
     A file whose header or end may be damaged is read whole, and so are a few others, because
-    headers do not tell the ids of labels. Broken files are no fault if
-    `skip_broken`. `what` names the samples in signs of life.
+    headers do not tell the ids of labels. Broken files are no fault if `skip_broken`. `what` names
+    the samples in signs of life.
 
     Raises:
         BrokenImageError: only broken files. ValueError: also files that do not fit each other.

@@ -17,7 +17,7 @@ from darswin.data.lens_distributions import parse_lenses, parse_sweep
 from darswin.data.order import ResumableLoader, TrainingOrder
 from darswin.data.pictures import Source, open_source
 from darswin.data.samples import IMAGENET_MEAN, IMAGENET_STD, Calibrated, Samples
-from darswin.data.splits import SPLITS, Split
+from darswin.data.splits import Split
 from darswin.data.warping import Framing, RandomTurns
 from darswin.data.wide_angle import PAPER_FOV, WideAngle
 from darswin.lens.files.opencv import Coefficients
@@ -226,13 +226,9 @@ class RunData(LightningDataModule):
         """The training split, augmented."""
         raise NotImplementedError
 
-    def prepare_data(self) -> None:
-        """Finds the pictures that a training could not use, before it begins. On each machine, one
-        process does so while the others wait."""
-        trainer = self.trainer
-        if trainer is None or trainer.state.fn != "fit":
-            return
-        for split in SPLITS[:2] if trainer.limit_val_batches else SPLITS[:1]:
+    def check(self, splits: Sequence[Split]) -> None:
+        """Raises one error for all files of these splits that a training could not use."""
+        for split in splits:
             check_files(self.dataset(split), f"the pictures of {split!r}")
 
     def train_dataloader(self) -> ResumableLoader:

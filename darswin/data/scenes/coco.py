@@ -3,8 +3,8 @@
 The reader uses `annotations/panoptic_SPLIT….json`, for example `panoptic_train2017.json`; the PNGs
 of segments in `annotations/panoptic_train2017/` or `panoptic_train2017/`; and the pictures in
 `train2017/` or `images/train2017/`. The classes are the categories, in the order of the file.
-Both may lie in folders there, as `file_name` says. 0 is no segment. Ids of 2²⁴ or more count modulo
-2²⁴, because the colour of a pixel holds no more.
+Pictures and PNGs may lie in folders there, as `file_name` says. The id 0 means no segment. Ids of
+2²⁴ or more count modulo 2²⁴, because the colour of a pixel holds no more.
 
 Source: Kirillov et al., Panoptic Segmentation, CVPR 2019, and cocodataset.org/#format-data.
 """
