@@ -21,11 +21,7 @@ from darswin.data.scenes.targets import (
 )
 from darswin.data.splits import Limited, read_classes, some
 from darswin.lens import Lens
-from darswin.utils.image import (
-    Header,
-    read_header,
-    read_oriented,
-)
+from darswin.utils.image import Header, read_header, read_oriented
 from darswin.utils.text import read_json
 
 

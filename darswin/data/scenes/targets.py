@@ -48,7 +48,7 @@ def read_labels(path: Path, classes: int, class_of: Mapping[int, int] | None = N
             f"{path} holds the ids {some(wrong)}, but {told}; {IGNORE} means unlabelled, and "
             "`label_map` maps other ids to classes or to null"
         )
-    if classes == 2 and class_of is None and set(ids) in ({0, IGNORE}, {IGNORE}):
+    if classes == 2 and class_of is None and ids == [0, IGNORE]:
         _tell_once(
             f"{path.parent} holds masks of 0 and {IGNORE}, but {IGNORE} means unlabelled: if it is "
             f'a class here, give a `label_map`, {{"0": 0, "{IGNORE}": 1}}'
@@ -80,7 +80,7 @@ def _read_ids(path: Path) -> np.ndarray:
         )
     labels //= _SCALES.get(stored, 1)
     if mode == "P" and _are_different_greys(colors):
-        greys = np.full(256, IGNORE, np.uint8)
+        greys = np.arange(256, dtype=np.uint8)  # also of numbers without an entry
         greys[: len(colors)] = colors[:, 0]
         if not np.array_equal(labels, greys[labels]):
             _tell_once(

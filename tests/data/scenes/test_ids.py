@@ -117,6 +117,14 @@ def test_other_palettes_count_their_entries(tmp_path, palette):
     assert (read_labels(tmp_path / "x.png", 256) == ids).all()
 
 
+@pytest.mark.filterwarnings("ignore::darswin.data.scenes.targets.OddLabels")
+def test_a_number_without_an_entry_in_the_palette_is_an_unknown_id(tmp_path):
+    stored = np.array([[0, 1, 2, 200]], np.uint8)
+    (tmp_path / "x.png").write_bytes(png(stored, 8, PALETTE, [[1] * 3, [0] * 3, [2] * 3]))
+    with pytest.raises(ValueError, match=r"x\.png holds the ids \[200\]"):
+        read_labels(tmp_path / "x.png", 3)
+
+
 @pytest.mark.parametrize(
     ("class_of", "message"),
     [
