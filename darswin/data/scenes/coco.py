@@ -105,7 +105,7 @@ def _named(file_name: str, targets: Mapping[str, str]) -> str | None:
 
 def _segments(infos: Sequence[Mapping], class_of: Mapping[int, int], where: str) -> Segments:
     """The segments of a PNG, and 0 for no segment."""
-    found = {0: IGNORE}
+    found = {-1: IGNORE, 0: IGNORE}  # no colour is -1, so that the table is never empty
     for info in infos:
         try:
             id_, category = info["id"], info["category_id"]
@@ -116,11 +116,14 @@ def _segments(infos: Sequence[Mapping], class_of: Mapping[int, int], where: str)
                 f"{where}: the segment {id_} has the category {category!r}, but the known "
                 f"categories are {some(list(class_of))}"
             )
-        if type(id_) is not int or id_ < 0 or id_ % COLORS == 0:
+        if type(id_) is not int or id_ < 1:
             raise ValueError(
-                f"{where}: the id of a segment must be a whole number whose colour is not black, "
-                f"got {id_!r}; black means no segment"
+                f"{where}: the id of a segment must be a whole number above 0, which means no "
+                f"segment, got {id_!r}"
             )
+        if id_ % COLORS == 0:
+            found.pop(0, None)  # black pixels, if there are any, may be its own
+            continue
         class_ = class_of[category]
         if found.setdefault(id_ % COLORS, class_) != class_:
             raise ValueError(f"{where}: two segments have the colour of the id {id_}")

@@ -303,10 +303,8 @@ def with_segment(number, **entries):
         (with_segment(1, category_id=69), r"000\.png: the segment 300 has the category 69, but"),
         (with_segment(1, category_id="17"), r"has the category '17', but .* are \[1, 17, 200\]"),
         (with_segment(1, category_id=None), "has the category None"),
-        (with_segment(1, id=-300), "a whole number whose colour is not black, got -300"),
-        (with_segment(1, id=0), "not black, got 0; black means no segment"),
-        (with_segment(1, id=2**24), "got 16777216"),
-        (with_segment(1, id=2**31), "got 2147483648"),
+        (with_segment(1, id=-300), "a whole number above 0, .*, got -300"),
+        (with_segment(1, id=0), "above 0, which means no segment, got 0"),
         (with_segment(1, id=300.5), r"got 300\.5"),
         (with_segment(1, id="300"), "got '300'"),
         (with_segment(1, id=7), r"000\.png: two segments have the colour of the id 7"),
@@ -348,6 +346,24 @@ def test_ids_of_coco_segments(tmp_path, id_, color):
     picture[(picture == (300 % 256, 1, 0)).all(-1)] = color
     write(file, picture[..., ::-1])
     assert (scenes[0].target == expected).all()
+
+
+@pytest.mark.parametrize("id_", [2**24, 2**31])
+def test_a_coco_segment_that_has_the_colour_of_no_segment(tmp_path, id_):
+    """It names no pixel, and black pixels might be its own."""
+    annotated(tmp_path, lambda first, content: None)
+    more = {"id": id_, "category_id": 17}
+    scenes = annotated(tmp_path, lambda first, content: first["segments_info"].append(more))
+    with pytest.raises(ValueError, match=r"000\.png holds the segment 0, but its annotation lacks"):
+        scenes[0]
+    file = scenes.target_file(0)
+    picture = cv2.imread(str(file), cv2.IMREAD_COLOR_RGB)
+    picture[:, :9] = picture[:, 9:10]
+    write(file, picture[..., ::-1])
+    assert (scenes[0].target < 3).all()
+    scenes = annotated(tmp_path, lambda first, content: first.update(segments_info=[more]))
+    with pytest.raises(ValueError, match=r"000\.png holds the segment \d+, but its annotation"):
+        scenes[0]
 
 
 @pytest.mark.parametrize(
