@@ -14,7 +14,7 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from darswin.data.scenes.scene import IGNORE, PER_METRE
+from darswin.data.scenes.targets import IGNORE, PER_METRE
 from darswin.data.warping import Framing, FullSize, at_size
 from darswin.deploy.optimize import optimize
 from darswin.lens import Lens

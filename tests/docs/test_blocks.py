@@ -24,7 +24,7 @@ import numpy as np
 import pytest
 import torch
 from helpers import fixture
-from scenes import write_plain, write_woodscape
+from scenes import write_outlines, write_plain, write_woodscape
 from videos import write_video
 
 from darswin.cli.bench import bench
@@ -97,6 +97,7 @@ def granted(tmp_path_factory):
     write_plain(folder / "garage", 20, split="train")
     write_plain(folder / "garage", 4, split="val")
     write_woodscape(folder / "woodscape", 20)
+    write_outlines(folder / "objects")
     torch.save(fixture("polar")[1], folder / "checkpoint.pth")
     return folder
 
