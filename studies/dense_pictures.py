@@ -1,5 +1,6 @@
 """Figures of the dense study: predictions for a few test pictures, beside the truth."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -36,23 +37,30 @@ def predict(run: Path, data: Path, task: str) -> None:
 def draw(runs: dict[str, Path], data: Path, task: str, path: Path) -> None:
     """A figure with a column for each of `SHOWN`: image, truth and each run's prediction."""
     said = {label: np.load(run / "shown.npz") for label, run in runs.items()}
-    figure = page_figure(1.2 * (2 + len(said)))
-    panels = figure.subplots(2 + len(said), len(SHOWN), squeeze=False)
-    for column, (name, place) in zip(panels.T, SHOWN.items(), strict=True):
+    columns = {}
+    for name, place in SHOWN.items():
         scenes = open_scenes(str(data / "test" / name), "test", TARGETS[task])
         scene = scenes[min(place, len(scenes) - 1)]
         seen = scene.target != 255 if task == "segmentation" else scene.target > 0
-        pictures = [scene.image, _coloured(scene.target, scenes.colors, task)]
-        pictures += [
+        columns[name] = [scene.image, _coloured(scene.target, scenes.colors, task)]
+        columns[name] += [
             np.where(seen[..., None], _coloured(found[name], scenes.colors, task), 255)
             for found in said.values()
         ]
+    draw_columns(columns, ["picture", "truth", *said], path)
+
+
+def draw_columns(columns: dict[str, list[np.ndarray]], rows: Sequence[str], path: Path) -> None:
+    """Writes a figure of pictures by the names of their columns and rows."""
+    figure = page_figure(1.2 * len(rows))
+    panels = figure.subplots(len(rows), len(columns), squeeze=False)
+    for column, (name, pictures) in zip(panels.T, columns.items(), strict=True):
         for axes, picture in zip(column, pictures, strict=True):
             axes.imshow(picture)
             axes.set(xticks=[], yticks=[])
         column[0].set_title(name, fontsize=TEXT)
-    for axes, title in zip(panels[:, 0], ("picture", "truth", *said), strict=True):
-        axes.set_ylabel(title.replace(", ", ",\n").replace("(", "\n(").replace("-U", "-\nU"))
+    for axes, name in zip(panels[:, 0], rows, strict=True):
+        axes.set_ylabel(name.replace(", ", ",\n").replace("(", "\n(").replace("-U", "-\nU"))
     save_figure(figure, path, colors=256)
 
 
