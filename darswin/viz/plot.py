@@ -247,16 +247,17 @@ def _draw_sides(axes: Axes, lens: Lens, image_size: tuple[int, int]) -> None:
     close to each other share a label."""
     angles = torch.rad2deg(lens.side_angles(image_size)[0]).tolist()
     ends, last = beyond_lens(lens, image_size).tolist(), axes.get_xlim()[1]
-    labels: dict[float, list[str]] = {}  # by the angle of the first line
+    labels: dict[float, dict[str, list[str]]] = {}  # sides by the place of a label and their angle
     for side, style, angle, beyond in zip(SIDES, ("--", ":", "--", ":"), angles, ends, strict=True):
         if beyond or angle > last + 1e-6:
             continue
         axes.axvline(angle, color="0.4", ls=style, lw=1)
         place = next((at for at in labels if abs(at - angle) < 0.06 * last), angle)
-        labels.setdefault(place, []).append(f"{side} {angle:.0f}°")
-    for angle, names in labels.items():
+        labels.setdefault(place, {}).setdefault(f"{angle:.0f}°", []).append(side)
+    for place, sides in labels.items():
+        text = ", ".join(f"{', '.join(names)} {angle}" for angle, names in sides.items())
         axes.text(
-            angle, 0.02, ", ".join(names), transform=axes.get_xaxis_transform(), rotation=90,
+            place, 0.02, text, transform=axes.get_xaxis_transform(), rotation=90,
             ha="right", va="bottom", color="0.3", path_effects=_outline(1.2, "white"),
         )  # fmt: skip
 

@@ -118,7 +118,15 @@ def test_draw_curve_shows_radius_density_and_the_ends_of_the_image():
     assert len(drawn(draw_curve, lens)[0].lines) == 1
     lens = Polynomial([30.0, 0.0, -3.0])  # r rises up to 105°, 36 px
     assert not drawn(draw_curve, lens, (400, 400))[0].texts
-    assert len(drawn(draw_curve, lens, (40, 40))[0].texts) == 4
+    (label,) = drawn(draw_curve, lens, (40, 40))[0].texts  # lines at one place share a label
+    assert (
+        label.get_text()
+        == f"left, top, right, bottom {lens.side_angles((40, 40))[0, 0].rad2deg():.0f}°"
+    )
+    labels = [text.get_text() for text in left.texts]
+    assert labels == [
+        f"{side} {a:.0f}°" for side, a in zip(("top", "right", "bottom"), angles[1:], strict=True)
+    ]
 
 
 def test_draw_lens_has_all_panels(tmp_path):
