@@ -11,6 +11,7 @@ import math
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import torch
@@ -64,7 +65,10 @@ def page_figure(height: float) -> Figure:
 
 
 def add_legend(
-    figure: Figure, handles: Sequence[Artist], *, loc: str = "outside lower center"
+    figure: Figure,
+    handles: Sequence[Artist],
+    *,
+    loc: Literal["outside lower center", "outside upper center"] = "outside lower center",
 ) -> None:
     """Adds the legend of a figure, with as many columns as fit beside each other."""
     for columns in range(len(handles), 0, -1):
@@ -276,8 +280,13 @@ def draw_lens(
         ValueError: more than one lens.
     """
     figure = page_figure(8.4)
-    above, below = ["partition"] * 3 + ["view"] * 3, ["samples"] * 2 + ["curve"] * 4
-    panels = figure.subplot_mosaic([above, ["polar"] * 6, below])
+    panels = figure.subplot_mosaic(
+        [
+            [*["partition"] * 3, *["view"] * 3],
+            ["polar"] * 6,
+            [*["samples"] * 2, *["curve"] * 4],
+        ]
+    )
     draw_grid(image, lens, sampler, samples=False, axes=panels["partition"])
     draw_samples(image, lens, sampler, axes=panels["samples"])
     left, top, width, height = _enlarged(image, lens)
