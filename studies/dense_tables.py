@@ -87,7 +87,7 @@ def draw_curves(cells: list[dict], trivial: dict, path: Path) -> None:
     ignores the image."""
     pairs, xi = sorted(studied(cells), reverse=True), [float(name) for name in SWEEP]
     lines = -(-len(pairs) // 2)
-    figure = page_figure(0.9 + 2.7 * lines)
+    figure = page_figure(2.7 * lines)
     panels = figure.subplots(lines, 2, squeeze=False).flat[: len(pairs)]
     for axes, (task, band) in zip(panels, pairs, strict=True):
         found, score, (low, high) = runs_of(cells, task), SCORE[task], SHADED[band]

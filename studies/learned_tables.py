@@ -130,7 +130,7 @@ def tables(cameras: list[dict]) -> dict[str, str]:
 
 def draw(cameras: list[dict], path: Path) -> None:
     """Draws the losses over ξ, descents on them, and their distances from the truth."""
-    figure = page_figure(13)
+    figure = page_figure(12.7)
     axes = figure.subplots(len(LOSSES) + 2, 2)
     known = [camera for camera in cameras if camera["problem"] == "xi"]
     for (left, right), loss in zip(axes[:-2], LOSSES, strict=True):

@@ -47,7 +47,7 @@ def draw_scores(cells: list[dict], path: Path) -> None:
     """Draws δ1 of each method on each set of true lenses. Dots are means of the seeds, and bars
     are their span."""
     found, names = runs_of(cells), [OWN, *LENSES]
-    figure = page_figure(9.5)
+    figure = page_figure(8)
     axes = figure.subplots()
     labels = [label for label in METHODS if label in found]
     for number, label in enumerate(labels):

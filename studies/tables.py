@@ -60,7 +60,7 @@ def draw(cells: list[dict], path: Path) -> None:
     """Draws accuracy against ξ, in a panel for each training level. The range of the level is
     shaded. Lines are means over the seeds, and bands are their span."""
     found, xi = by_model(cells), [float(name) for name in SWEEP]
-    figure = page_figure(6)
+    figure = page_figure(5.4)
     for axes, level in zip(figure.subplots(2, 2, sharey=True).flat, LEVELS, strict=True):
         axes.axvspan(*RANGES[level], color="tab:pink", alpha=0.3, lw=0, label="seen in training")
         for label in MODELS:

@@ -49,7 +49,7 @@ def draw_panels(
     from darswin.viz.plot import add_legend, page_figure, save_figure
 
     heights = [max(len(rows) for _, rows in line) for line in lines]
-    figure = page_figure(1.2 + sum(0.75 + 0.25 * height for height in heights))
+    figure = page_figure(0.6 + sum(0.75 + 0.25 * height for height in heights))
     grid = figure.subplots(
         len(lines), max(map(len, lines)), squeeze=False, sharex=True, height_ratios=heights
     )
@@ -68,7 +68,7 @@ def draw_panels(
     if is_ratio:
         grid[0, 0].set_xscale("log", base=2)
         for axes in grid.flat:
-            axes.xaxis.set_major_locator(LogLocator(2, numticks=8))
+            axes.xaxis.set_major_locator(LogLocator(2, numticks=5))
             axes.xaxis.set_major_formatter("{x:g}×")
     else:
         grid[0, 0].set_xlim(left=0)

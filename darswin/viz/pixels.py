@@ -179,7 +179,7 @@ def draw_predictions(
     if are_labels and not classes:
         raise ValueError("labels need the names of their classes")
     height, width = rows[0][1].shape
-    tall = len(rows) * (1.4 * height / width + 0.3) + (1.0 if are_labels else 1.5)
+    tall = len(rows) * (1.4 * height / width + 0.3) + (0.3 if are_labels else 1.5)
     figure = page_figure(tall)
     panels = figure.subplots(len(rows), 4, squeeze=False)
     paint: Callable[[np.ndarray, np.ndarray], Painted]

@@ -70,10 +70,13 @@ def add_legend(
     *,
     loc: Literal["outside lower center", "outside upper center"] = "outside lower center",
 ) -> None:
-    """Adds the legend of a figure, with as many columns as fit beside each other."""
+    """Adds the legend of a figure, with as many columns as fit beside each other. The figure grows
+    by the height of the legend."""
     for columns in range(len(handles), 0, -1):
         legend = figure.legend(handles=handles, loc=loc, ncols=columns)
-        if columns == 1 or legend.get_window_extent().width <= figure.bbox.width:
+        box = legend.get_window_extent()
+        if columns == 1 or box.width <= figure.bbox.width:
+            figure.set_figheight(figure.get_figheight() + box.height / figure.dpi)
             return
         legend.remove()
 
@@ -85,10 +88,13 @@ def save_figure(figure: Figure, path: str | os.PathLike, *, colors: int | None =
         colors: of the palette of a small PNG, at most 256; None means all colours.
 
     Raises:
-        ValueError: another ending. OSError: as `darswin.utils.files.replace_file`.
+        ValueError: another ending, or one other than ".png" with `colors`.
+        OSError: as `darswin.utils.files.replace_file`.
     """
-    picture = io.BytesIO()
-    figure.savefig(picture, format=figure_format(path), dpi=DPI)
+    picture, format_ = io.BytesIO(), figure_format(path)
+    if colors is not None and format_ != "png":
+        raise ValueError(f"only a .png has a palette of colors, got {os.fspath(path)!r}")
+    figure.savefig(picture, format=format_, dpi=DPI)
     if colors is not None:
         drawn, picture = Image.open(picture), io.BytesIO()
         drawn.convert("RGB").quantize(colors).save(picture, "png", optimize=True, dpi=(DPI, DPI))

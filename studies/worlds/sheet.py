@@ -32,7 +32,7 @@ LENSES = {"perspective": "wide", "spherical, ξ = 0.3, 165°": "0.3", "a fisheye
 def draw_sheet(path: Path) -> None:
     """Writes a PNG: a row for each of `PLACES`, three columns for each of `LENSES`."""
     across = 3 * len(LENSES)
-    figure = page_figure(0.7 * len(PLACES) + 0.9)
+    figure = page_figure(0.7 * len(PLACES) + 0.3)
     panels = figure.subplots(len(PLACES), across, squeeze=False)
     for row, (name, number) in zip(panels, PLACES, strict=True):
         wad, world = load_map(name)

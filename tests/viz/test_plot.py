@@ -5,6 +5,7 @@ import pytest
 import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from PIL import Image
 
 from darswin import PolarSample
 from darswin.lens import KannalaBrandt, Mei, Polynomial, Spherical
@@ -141,6 +142,18 @@ def test_draw_lens_has_all_panels(tmp_path):
         path = tmp_path / f"lens{ending.upper()}"
         save_figure(figure if ending == ".png" else small, path)
         assert path.read_bytes().startswith(heads[format_])
+
+
+def test_a_palette_makes_a_png_small_and_keeps_its_size(tmp_path):
+    figure = Figure(figsize=(2, 1))
+    figure.subplots().imshow(np.random.default_rng(0).random((9, 9)))
+    for name, colors in (("all.png", None), ("few.png", 16)):
+        save_figure(figure, tmp_path / name, colors=colors)
+    large, small = (Image.open(tmp_path / name) for name in ("all.png", "few.png"))
+    assert small.mode == "P" and len(small.getcolors()) <= 16
+    assert small.size == large.size and small.info["dpi"] == large.info["dpi"]
+    with pytest.raises(ValueError, match=r"only a .png has a palette of colors, got '.*few.jpg'"):
+        save_figure(figure, tmp_path / "few.jpg", colors=16)
 
 
 @pytest.mark.parametrize("name", ["lens.gif", "lens", "lens.", "png", "a.png/b"])
