@@ -36,7 +36,7 @@ def test_show_writes_a_figure(folder, capsys):
     main(["lens", "show", calib, picture, "--out", str(out), "--rings=4", "--sectors=8",
           "--samples=[3,2]", "--view=cylindrical", "--yaw_deg=20", "--spacing=g"])  # fmt: skip
     assert capsys.readouterr().out == f"{out}\n"
-    assert cv2.imread(str(out)).shape == (1080, 1800, 3)
+    assert cv2.imread(str(out)).shape == (1680, 1200, 3)
 
 
 def test_info_prints_what_the_lens_is(folder, capsys):
