@@ -36,6 +36,7 @@ from darswin.cli.options import (
     with_nearest,
 )
 from darswin.data.lens_distributions import parse_sweep
+from darswin.data.splits import SPLITS
 from darswin.models.saving import model_of_run, read_card
 from darswin.train.finetuning import settle, weights_file
 from darswin.train.results import WriteResults
@@ -292,6 +293,9 @@ class RunCLI(LightningCLI):
                     start = start or str(last)
                 else:
                     say(f"{last} is not there yet: starting from the beginning")
+                if self.trainer.is_global_zero:  # before it starts other processes
+                    validates = self.trainer.limit_val_batches
+                    self.datamodule.check(SPLITS[: 2 if validates else 1])
                 if start is not None:
                     self.model.weights = None  # the checkpoint has its own
                 self.trainer.fit(**options | {"ckpt_path": start})

@@ -14,7 +14,7 @@ from torchmetrics.classification import MulticlassAccuracy
 from darswin.data.augment import Mixing, partners_share
 from darswin.data.lens_distributions import SphericalLenses, parse_lenses
 from darswin.train.task import Batch, Task, finite_loss
-from darswin.viz.plot import draw_accuracy
+from darswin.viz.plot import draw_accuracy, page_figure
 
 __all__ = ["Classification"]
 
@@ -120,7 +120,7 @@ class Classification(Task):
     def results_figure(self) -> Figure:
         """Accuracy against ξ if each test set has a single ξ, otherwise bars; with the intervals
         and the accuracy of always answering the most frequent class."""
-        figure = Figure(figsize=(7, 4.2), layout="constrained")
+        figure = page_figure(4)
         axes = figure.subplots()
         name, rows = self.card.model, self.results
         accuracy, low, high = (

@@ -88,7 +88,7 @@ def test_the_most_probable_classes(run, capsys):
         ("none.png --run . --lens L", r"cannot read .*none\.png"),
         ("none.png --lens L", "give either --run, .* or --model, a safetensors file or one of"),
         ("p.png --model digits --run .", "or --model, a safetensors file or one of digits"),
-        ("p.png --run . --lens {}", '"model" must be one of'),
+        ("p.png --run . --lens {}", 'or a "model" of darswin'),
         ("p.png --run . --lens none.json", r"none\.json"),
         ("p.png --run .", "missing --lens: give the camera"),
         ("--lens L --run .", "missing pictures or videos"),

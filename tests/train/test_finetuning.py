@@ -216,7 +216,7 @@ def test_which_model_starts_from_which():
         with pytest.raises(ValueError, match=rf"no model for {task} can start from a {card.model}"):
             name_from(card, task)
     check_name("swin_unet_nano", "distance")
-    with pytest.raises(ValueError, match="no model for `task` classification; choose from dar"):
+    with pytest.raises(ValueError, match="no model for `task` classification; did you mean "):
         check_name("swin_unet_nano", "classification")
 
 
