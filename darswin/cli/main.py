@@ -82,7 +82,7 @@ def main(argv: list[str] | None = None) -> None:
     command = COMMANDS[name]
     if (without := lack("train", command.needs)) is not None:
         raise SystemExit(f"darswin {name}: {without}")
-    warnings.showwarning = _one_line(warnings.showwarning)
+    warnings.showwarning = _one_line(warnings.showwarning, command)
     try:
         if command.function == RUN:
             argv, task = options.complete(argv)
@@ -145,7 +145,7 @@ def print_anywhere(words: Mapping[str, str]) -> None:
             stream.reconfigure(errors="darswin.plain")
 
 
-def _one_line(show: Callable[..., None]) -> Callable[..., None]:
+def _one_line(show: Callable[..., None], command: Command) -> Callable[..., None]:
     """Shows warnings of darswin in one line and only once; `show` shows all other warnings."""
     shown = set()
 
@@ -154,6 +154,6 @@ def _one_line(show: Callable[..., None]) -> Callable[..., None]:
             show(message, category, *where, **options)
         elif str(message) not in shown:
             shown.add(str(message))
-            print(f"darswin: {message}", file=sys.stderr)
+            print(f"darswin: {with_flags(str(message), command)}", file=sys.stderr)
 
     return show_once
