@@ -273,7 +273,7 @@ def test_few_steps_are_logged_and_the_progress_bar_shows_no_folder(tmp_path, cap
 
 def test_train_test_and_predict_see_the_same(frames, tmp_path, capsys):
     run = tmp_path / "run"
-    fit(run, *DIGITS, "--data.path", frames, "--data.lens", WOODSCAPE, "--data.fit", "stretch")
+    fit(run, *DIGITS, "--data.path", frames, "--data.lens", WOODSCAPE)
     recorded = yaml.safe_load((run / "config.yaml").read_text())["data"]
     assert recorded["lens"] == str(WOODSCAPE)
     _, card = load_model(run / "checkpoints" / "best.safetensors")
@@ -308,7 +308,7 @@ def test_labels_are_learned_and_what_a_test_writes(labelled, capsys):
     assert recorded["task"] == "segmentation" and recorded["model"]["loss"] == "ce+dice"
     net, card = load_model(labelled / "checkpoints" / "best.safetensors")
     assert (card.task, card.classes, card.colors) == ("segmentation", *CLASSES.values())
-    assert card.fit == "crop" and card.fov == 0 and net.num_classes == 3
+    assert card.fit == "stretch" and card.fov == 0 and net.num_classes == 3
     (row,) = test(labelled)
     assert row["data"] == "scenes" and row["miou"] > 0.75 and row["accuracy"] > 0.85
     assert 0 < row["miou_sr"] < 1 and row["miou_sr"] != row["miou"] and row["loss"] > 0
