@@ -336,14 +336,14 @@ def test_a_test_on_other_folders(labelled, scenes, tmp_path, monkeypatch):
     other = write_plain(tmp_path / "a" / "scenes", 3, lens=lens, size=(45, 60))
     rows = test(labelled, "--data.test_paths", other, scenes, "--model.zones", "45")
     _, truth, answer = shown[0]
-    assert (answer[0, 0], answer[-1, -1]) == (255, 255) and (answer == 255).mean() < 0.3
+    assert (answer[0, 0], answer[-1, -1]) == (255, 255) and (answer == 255).mean() < 0.35
     assert (truth[answer == 255] == 255).all()  # beyond θ_max nothing is known, nor answered
     names = [row["data"] for row in rows]
     assert [name.split("/")[-1] for name in names] == ["scenes", "scenes"] and len({*names}) == 2
     zones = [line["data"] for line in table(labelled / "test_zones.csv")]
     assert zones == [names[0], names[0], names[1], names[1]]
-    # All 3 scenes of a folder that has no splits; the corners are beyond θ_max.
-    assert 3 * 800 < rows[0]["pixels"] < 3 * 32 * 32 and rows[0]["miou"] > 0.5
+    # All 3 scenes of a folder that has no splits; a third of each is beyond θ_max.
+    assert 3 * 650 < rows[0]["pixels"] < 3 * 32 * 32 and rows[0]["miou"] > 0.5
 
 
 @pytest.mark.slow
