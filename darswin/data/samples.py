@@ -95,7 +95,7 @@ class Samples(Dataset):
         for index in range(0, len(self), max(1, len(self) // _LOOKED_AT)):
             try:
                 lost = cut_off(*self._taken(index), "crop")
-            except BrokenImageError:
+            except (OSError, ValueError):  # who reads the picture says what is wrong
                 continue
             if lost is not None:
                 return lost

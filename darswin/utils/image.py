@@ -10,6 +10,7 @@ import numpy as np
 from PIL import ExifTags, Image, UnidentifiedImageError
 
 from darswin.utils.exif import TURNS
+from darswin.utils.files import check_is_file
 
 __all__ = ["BrokenImageError", "read_form", "read_image", "read_oriented"]
 
@@ -58,6 +59,7 @@ def read_form(path: str | Path) -> tuple[int, int]:
         BrokenImageError: the file is missing, unreadable or no image. The error names the file.
     """
     try:
+        check_is_file(path)
         with warnings.catch_warnings(action="ignore"), Image.open(path) as file:
             is_grey = file.mode in ("1", "L", "LA", "F") or file.mode.startswith("I")
             return 1 if is_grey else 3, min(file.size)
@@ -70,9 +72,11 @@ def read_form(path: str | Path) -> tuple[int, int]:
 def file_content(path: str | Path) -> np.ndarray:
     """The bytes of a file; BrokenImageError if it cannot be read."""
     try:
+        check_is_file(path)
         return np.fromfile(path, np.uint8)
-    except OSError as error:
-        raise BrokenImageError(f"cannot read {path}: {error.strerror}") from error
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise BrokenImageError(f"cannot read {path}: {reason}") from error
 
 
 def _picture(data: np.ndarray, path: str | Path, channels: int, flags: int = 0) -> np.ndarray:

@@ -8,6 +8,8 @@ from typing import Any
 
 import torch
 
+from darswin.utils.files import check_is_file
+
 # The authors' checkpoints contain a configuration of the class CfgNode, a dict of the package yacs.
 # It is replaced by an OrderedDict, which torch's restricted unpickler can fill.
 _STAND_INS: list[Any] = [(OrderedDict, "yacs.config.CfgNode")]
@@ -15,6 +17,7 @@ _STAND_INS: list[Any] = [(OrderedDict, "yacs.config.CfgNode")]
 
 def read_pickle(path: str | os.PathLike, map_location: Any = "cpu") -> object:
     """Reads a file of `torch.save`; ValueError if it holds more than tensors and plain values."""
+    check_is_file(path)
     try:
         with torch.serialization.safe_globals(_STAND_INS):
             return torch.load(path, map_location=map_location, weights_only=True)
