@@ -212,7 +212,10 @@ def trained_model(path: str | Path) -> tuple[Any, ModelCard]:
         try:
             net = load_official(path, mean=IMAGENET_MEAN, std=IMAGENET_STD)
         except ValueError as other:
-            raise ValueError(f"{error}, and are {other}") from error
+            raise ValueError(
+                f"{error}, and are {other}; commands run models of `darswin fit`, and a network of "
+                "your own, such as one in a LensAdapter, runs in Python"
+            ) from error
         return net, ModelCard("", size=_released_size(path))
 
 
