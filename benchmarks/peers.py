@@ -21,7 +21,6 @@ from darswin.bench.timing import MATMULS, OURS, REFERENCE, Case, Timing, measure
 
 Step = Callable[[], list[Tensor]]
 View = Callable[[Tensor], Tensor]
-COLUMNS = 3  # at most so many panels in a row of a plot
 
 
 def forward(run: Callable[..., Tensor], inputs: Sequence[Tensor]) -> Step:
@@ -126,9 +125,9 @@ def draw_peers(record: Record, path: Path) -> None:
     for t in record.timings:
         if t.threads == 1 and not t.name.startswith(OURS):
             operator = t.subject.partition(",")[0]
-            rows = found.setdefault(operator, {}).setdefault(f"{t.subject}\n{fill(t.mode, 26)}", {})
+            rows = found.setdefault(operator, {}).setdefault(f"{t.subject}\n{fill(t.mode, 20)}", {})
             rows.setdefault(f"{t.setting}, batch {t.batch}", {})[t.name] = t.ratio
-    lines = [line for panels in found.values() for line in in_lines(panels, COLUMNS)]
+    lines = [line for panels in found.values() for line in in_lines(panels)]
     names = dict.fromkeys(t.name for t in record.timings if not t.name.startswith(OURS))
     unit = "time of the peer / time of darswin, 1 thread"
     draw_panels(lines, list(names), unit, path, is_ratio=True)

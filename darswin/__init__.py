@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from darswin.deploy.optimize import optimize
     from darswin.layers.polar import PolarGrid, PolarSample, polar_grid
     from darswin.layers.transformer import PolarWindowAttention
-    from darswin.models import DarSwin, create_model, list_models
+    from darswin.models import DarSwin, create_model, list_models, load_model
 
     __version__: str
 
@@ -26,6 +26,7 @@ __all__ = [
     "frames",
     "lens",
     "list_models",
+    "load_model",
     "models",
     "ops",
     "optimize",
@@ -40,6 +41,7 @@ _MODULES = {
     "PolarWindowAttention": "darswin.layers.transformer",
     "create_model": "darswin.models",
     "list_models": "darswin.models",
+    "load_model": "darswin.models",
     "optimize": "darswin.deploy.optimize",
     "polar_grid": "darswin.layers.polar",
 }

@@ -19,10 +19,11 @@ from PIL import Image
 from darswin import PolarSample
 from darswin.lens import Polynomial
 from darswin.utils.files import replace_file
-from darswin.viz.plot import draw_grid, draw_lens, draw_polar
+from darswin.viz.plot import TEXT, draw_grid, draw_lens, draw_polar, page_figure, save_figure
 from darswin.viz.views import perspective
 
-EXAMPLES = Path(__file__).parents[1] / "examples"
+DOCS = Path(__file__).parent
+EXAMPLES = DOCS.parent / "examples"
 SIZE = (966, 1280)
 # They belong to no camera: they are chosen such that the image's sides are 190° apart.
 COEFFICIENTS = [350.4, -17.5, 27.5, -2.4]
@@ -73,21 +74,13 @@ def row(lens: Polynomial, y: int, width: int) -> np.ndarray:
 def draw_polar_image(image: np.ndarray, lens: Polynomial) -> Figure:
     """The first picture of the README: the rings of the lens, and the polar image."""
     sampler = PolarSample(rings=8, sectors=32, samples=(20, 20))
-    figure = Figure(figsize=(12, 4.4), layout="constrained")
-    left, right = figure.subplots(1, 2, width_ratios=(1, 1.3))
+    figure = page_figure(2.9)
+    left, right = figure.subplots(1, 2, width_ratios=(1, 1.1))
     draw_grid(image, lens, sampler, samples=False, axes=left)
-    left.set_title("fisheye picture, cut into polar patches that follow the lens")
+    left.set_title("fisheye picture, cut into polar\npatches that follow the lens", fontsize=TEXT)
     draw_polar(image, lens, sampler, axes=right)
-    right.set_title("polar image: what the network sees")
+    right.set_title("polar image:\nwhat the network sees", fontsize=TEXT)
     return figure
-
-
-def save(figure: Figure, name: str) -> None:
-    """Writes a figure to this folder as a small PNG."""
-    drawn, small = io.BytesIO(), io.BytesIO()
-    figure.savefig(drawn, format="png", dpi=80)
-    Image.open(drawn).convert("RGB").quantize(256).save(small, format="png", optimize=True)
-    replace_file(Path(__file__).parent / name, small.getvalue())
 
 
 def main() -> None:
@@ -101,8 +94,8 @@ def main() -> None:
     view = perspective((604, 800), math.radians(110))
     sampler = PolarSample(rings=16, sectors=64, samples=(10, 10))
     figure = draw_lens(image, front_lens(), sampler, view, "perspective view, 110° across")
-    save(figure, "lens.png")
-    save(draw_polar_image(image, front_lens()), "polar.png")
+    save_figure(figure, DOCS / "lens.png", colors=256)
+    save_figure(draw_polar_image(image, front_lens()), DOCS / "polar.png", colors=256)
 
 
 if __name__ == "__main__":

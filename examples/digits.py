@@ -33,7 +33,7 @@ from darswin.layers.polar import PolarSample
 from darswin.models import ModelCard, save_model
 from darswin.models.encoder import Encoder
 from darswin.utils.files import replace_file
-from darswin.viz.plot import draw_accuracy, draw_grid, save_figure
+from darswin.viz.plot import TEXT, draw_accuracy, draw_grid, page_figure, save_figure
 
 FOV = math.radians(165)
 SIZE = 32  # px, side of the wide-angle images
@@ -113,14 +113,14 @@ def save(path: Path, model: Encoder, scan: np.ndarray) -> None:
 
 def draw(table: dict[str, list[list[float]]], scan: np.ndarray, sampler: PolarSample) -> Figure:
     """Plots accuracy against ξ, and beside it a digit through two lenses with their patches."""
-    figure = Figure(figsize=(12, 6), layout="constrained")
-    panels = figure.subplot_mosaic("ab;ac", width_ratios=(2.4, 1))
+    figure = page_figure(4.2)
+    panels = figure.subplot_mosaic("ab;ac", width_ratios=(2.7, 1))
     draw_accuracy(XI, table, LEVELS[LEVEL], axes=panels["a"])
-    panels["a"].set(ylim=(0, 100), title="Trained on ordinary pictures, works on any fisheye")
+    panels["a"].set(ylim=(0, 100), title="scanned digits, trained with\nalmost no distortion")
     for name, xi in (("b", 0.0), ("c", 0.4)):
         image, lenses = through_lenses(scan[None], np.array([xi]), 512)
         draw_grid(image[0, 0].numpy(), lenses, sampler, axes=panels[name])
-        panels[name].set_title(f"patches and samples, ξ = {xi:g}")
+        panels[name].set_title(f"patches, ξ = {xi:g}", fontsize=TEXT)
         panels[name].axis("off")
     return figure
 
@@ -167,7 +167,7 @@ def main() -> None:
     model_name, options = MODELS["DarSwin-A"]
     sampler = create_model(model_name, **options).patch_embed.sample
     three = unseen[digits.target[unseen] == 3][0]
-    save_figure(draw(table, scans[three], sampler), args.out / "accuracy.png")
+    save_figure(draw(table, scans[three], sampler), args.out / "accuracy.png", colors=256)
     record = json.dumps(dict(xi=XI, accuracy=table), indent=1)
     replace_file(args.out / "accuracy.json", record)
     print(f"\n{args.out}/accuracy.png, after {time.perf_counter() - start:.0f} s")

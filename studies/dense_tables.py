@@ -9,13 +9,12 @@ from pathlib import Path
 from dense_cells import MODELS, STUDIED, TASKS, Cell
 from dense_data import CAMERAS, SHUFFLED, SWEEP, WRONG, camera_set, xi_set
 from dense_pictures import draw
-from matplotlib.figure import Figure
 from tables import spread
 
 from darswin.bench.machine import machine
 from darswin.bench.record import write
 from darswin.bench.tables import markdown
-from darswin.viz.plot import save_figure
+from darswin.viz.plot import TEXT, add_legend, page_figure, save_figure
 
 SCORE = {"segmentation": "miou", "distance": "delta1"}
 NAMES = {"miou": "mIoU", "delta1": "δ1"}
@@ -86,9 +85,10 @@ def draw_curves(cells: list[dict], trivial: dict, path: Path) -> None:
     """Draws mIoU and δ1 against ξ, in a panel for each task and training band. The training band is
     shaded. Lines are means over the seeds, bands are their span, and dots are the baseline that
     ignores the image."""
-    figure, xi = Figure(figsize=(13, 4.8), layout="constrained"), [float(name) for name in SWEEP]
-    pairs = studied(cells)
-    panels = figure.subplots(1, len(pairs), squeeze=False)[0]
+    pairs, xi = sorted(studied(cells), reverse=True), [float(name) for name in SWEEP]
+    lines = -(-len(pairs) // 2)
+    figure = page_figure(2.7 * lines)
+    panels = figure.subplots(lines, 2, squeeze=False).flat[: len(pairs)]
     for axes, (task, band) in zip(panels, pairs, strict=True):
         found, score, (low, high) = runs_of(cells, task), SCORE[task], SHADED[band]
         if high > low:
@@ -102,14 +102,12 @@ def draw_curves(cells: list[dict], trivial: dict, path: Path) -> None:
                 axes.fill_between(xi, *ends, color=line.get_color(), alpha=0.2, lw=0)
         blind = [100 * trivial[task]["direction"][name][score] for name in ALL_XI]
         axes.plot(xi, blind, color="black", ls=":", label="by direction alone")
-        axes.set(title=f'{task}, trained on "{band}"', ylabel=f"{NAMES[score]} (%)")
+        axes.set_title(f'{task}, trained on "{band}"', fontsize=TEXT)
+        axes.set_ylabel(f"{NAMES[score]} (%)")
         axes.set(xlim=(0, 1), xlabel="distortion ξ")
         axes.grid(alpha=0.3)
-    legends = [axes.get_legend_handles_labels() for axes in panels]
-    figure.legend(
-        *max(legends, key=lambda legend: len(legend[1])), loc="outside lower center", ncols=4
-    )
-    save_figure(figure, path)
+    add_legend(figure, max((axes.get_legend_handles_labels()[0] for axes in panels), key=len))
+    save_figure(figure, path, colors=256)
 
 
 # -- tables -----------------------------------------------------------------------------------

@@ -5,12 +5,11 @@ from pathlib import Path
 import numpy as np
 from learned_problems import GRID, IMAGES, LOSSES, PROBLEMS, STARTS
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from darswin.bench.machine import machine
 from darswin.bench.record import write
 from darswin.bench.tables import markdown
-from darswin.viz.plot import save_figure
+from darswin.viz.plot import add_legend, page_figure, save_figure
 
 CLOSE = 0.5  # px, the largest distance of a lens that counts as found
 CLOSE_XI = 0.05
@@ -131,24 +130,18 @@ def tables(cameras: list[dict]) -> dict[str, str]:
 
 def draw(cameras: list[dict], path: Path) -> None:
     """Draws the losses over ξ, descents on them, and their distances from the truth."""
-    figure = Figure(figsize=(9, 8.5), layout="constrained")
-    axes = figure.subplots(3, 4)
+    figure = page_figure(12.7)
+    axes = figure.subplots(len(LOSSES) + 2, 2)
     known = [camera for camera in cameras if camera["problem"] == "xi"]
-    for above, below, loss in zip(axes[0], axes[1], LOSSES, strict=True):
-        draw_landscapes(above, known, loss)
-        draw_paths(below, known, loss)
-        above.sharex(below)
-        above.label_outer()
-        if below is not axes[1, 0]:
-            below.set_ylabel("")
-            below.tick_params(labelleft=False)
-    for panel, problem in zip(axes[2], PROBLEMS, strict=False):
+    for (left, right), loss in zip(axes[:-2], LOSSES, strict=True):
+        draw_landscapes(left, known, loss)
+        draw_paths(right, known, loss)
+    *distances_of, last = axes[-2:].flat
+    for panel, problem in zip(distances_of, PROBLEMS, strict=True):
         draw_distances(panel, cameras, problem)
-        panel.label_outer()
-    draw_images(axes[2, 3], known)
-    names = axes[2, 0].get_legend_handles_labels()
-    figure.legend(*names, loc="outside lower center", ncols=len(names[1]))
-    save_figure(figure, path)
+    draw_images(last, known)
+    add_legend(figure, distances_of[0].get_legend_handles_labels()[0])
+    save_figure(figure, path, colors=256)
 
 
 def draw_landscapes(axes: Axes, cameras: list[dict], loss: str) -> None:
@@ -160,7 +153,7 @@ def draw_landscapes(axes: Axes, cameras: list[dict], loss: str) -> None:
         true = camera["true"]["values"]["xi"]
         height = (camera["losses"][loss] - low) / (high - low)
         axes.plot(true, height, "o", color=f"C{k}", ms=5, mec="k", mew=0.6)
-    axes.set(title=f'"{loss}"', ylabel="loss, from lowest to highest")
+    axes.set(title=f'"{loss}"', xlabel="ξ", ylabel="loss", xlim=(0, 1.2))
     axes.grid(alpha=0.3)
 
 
@@ -170,7 +163,7 @@ def draw_paths(axes: Axes, cameras: list[dict], loss: str) -> None:
         axes.axvline(camera["true"]["values"]["xi"], color=f"C{k}", ls="--", lw=0.8)
         for trial in trials_of([camera], "xi", loss, max(IMAGES["xi"])):
             axes.plot(trial["path"], range(len(trial["path"])), color=f"C{k}", lw=1.2)
-    axes.set(xlabel="ξ", ylabel="step of descent", xlim=(0, 1.2))
+    axes.set(title=f'"{loss}"', xlabel="ξ", ylabel="step of descent", xlim=(0, 1.2))
     axes.invert_yaxis()
     axes.grid(alpha=0.3)
 
@@ -184,6 +177,7 @@ def draw_distances(axes: Axes, cameras: list[dict], problem: str) -> None:
     axes.axvline(CLOSE, color="k", lw=0.6)
     axes.set_title("unknown: " + ",\n".join(UNKNOWN[problem].rsplit(", ", 1)), fontsize="medium")
     axes.set(xlabel="distance (px)", ylabel="share of descents", xscale="log")
+    axes.xaxis.set_major_formatter("{x:g}")
     axes.grid(alpha=0.3)
 
 

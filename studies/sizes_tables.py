@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
-from matplotlib.figure import Figure
 from sizes_methods import METHODS
 from sizes_scene import DISTANCES, LENSES, OWN, pictures
 from tables import spread
@@ -14,7 +13,7 @@ from tables import spread
 from darswin.bench.machine import machine
 from darswin.bench.record import write
 from darswin.bench.tables import markdown
-from darswin.viz.plot import save_figure
+from darswin.viz.plot import TEXT, add_legend, page_figure, save_figure
 
 WRONG = {"angles × 0.8": 0.8, "angles × 1.25": 1.25}
 SHUFFLED = "lenses shuffled"
@@ -48,7 +47,7 @@ def draw_scores(cells: list[dict], path: Path) -> None:
     """Draws δ1 of each method on each set of true lenses. Dots are means of the seeds, and bars
     are their span."""
     found, names = runs_of(cells), [OWN, *LENSES]
-    figure = Figure(figsize=(11, 5), layout="constrained")
+    figure = page_figure(8)
     axes = figure.subplots()
     labels = [label for label in METHODS if label in found]
     for number, label in enumerate(labels):
@@ -57,24 +56,29 @@ def draw_scores(cells: list[dict], path: Path) -> None:
         ends = [[m - min(of), max(of) - m] for m, of in zip(means, values, strict=True)]
         places = np.arange(len(names)) + 0.8 * ((number + 0.5) / len(labels) - 0.5)
         shape = "o" if number < 10 else "s"  # there are ten colours
-        axes.errorbar(places, means, np.transpose(ends), fmt=shape, ms=5, lw=1, label=label)
-    axes.set_xticks(range(len(names)), ["its own lenses", *LENSES])
-    axes.set(ylabel="δ1 (%)", xlim=(-0.5, len(names) - 0.5))
+        axes.errorbar(
+            means, places, xerr=np.transpose(ends), fmt=shape, ms=5, lw=1, label=label
+        )  # fmt: skip
+    axes.set_yticks(
+        range(len(names)), ["its own\nlenses", *(n.replace("-", "-\n") for n in LENSES)]
+    )
+    axes.set(xlabel="δ1 (%)", ylim=(len(names) - 0.5, -0.5))
     for border in np.arange(len(names) - 1) + 0.5:
-        axes.axvline(border, color="lightgray", lw=0.8)
-    axes.grid(axis="y", alpha=0.3)
-    figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=4)
-    save_figure(figure, path)
+        axes.axhline(border, color="lightgray", lw=0.8)
+    axes.grid(axis="x", alpha=0.3)
+    add_legend(figure, axes.get_legend_handles_labels()[0])
+    save_figure(figure, path, colors=256)
 
 
 def draw_pictures(path: Path) -> None:
     """Draws a picture and its distances through each test lens."""
     names = [OWN, *LENSES]
-    figure = Figure(figsize=(1.6 * len(names), 3.4), layout="constrained")
-    for name, (upper, lower) in zip(names, figure.subplots(2, len(names)).T, strict=True):
+    figure = page_figure(6)
+    panels = figure.subplots(4, len(names) // 2).reshape(2, 2, -1)  # two lines of two rows
+    for name, (upper, lower) in zip(names, panels.swapaxes(1, 2).reshape(-1, 2), strict=True):
         (image,), (distance,) = pictures(name, 1, 0, 1)
         upper.imshow(image)
-        upper.set_title(f"{name}", fontsize=9)
+        upper.set_title(name, fontsize=TEXT)
         shown = lower.imshow(
             np.where(distance > 0, distance.astype(float), np.nan), cmap="viridis",
             vmin=DISTANCES[0] - 0.5, vmax=DISTANCES[1],
@@ -82,7 +86,7 @@ def draw_pictures(path: Path) -> None:
         for axes in (upper, lower):
             axes.set(xticks=[], yticks=[])
     figure.colorbar(shown, ax=figure.axes, label="distance, m", shrink=0.8)
-    save_figure(figure, path)
+    save_figure(figure, path, colors=256)
 
 
 # -- tables -----------------------------------------------------------------------------------

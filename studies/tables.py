@@ -5,13 +5,12 @@ from collections import defaultdict
 from pathlib import Path
 
 from cells import ABLATIONS, AUGMENTED, LEVELS, MODELS, POLYNOMIAL, SWEEP, augmented_label
-from matplotlib.figure import Figure
 
 from darswin.bench.machine import machine
 from darswin.bench.record import write
 from darswin.bench.tables import markdown
 from darswin.data.lens_distributions import LEVELS as RANGES
-from darswin.viz.plot import save_figure
+from darswin.viz.plot import add_legend, page_figure, save_figure
 
 SHOWN = ("0", "0.2", "0.4", "0.6", "0.8", "1")  # some ξ of the sweep, in a table
 
@@ -61,7 +60,7 @@ def draw(cells: list[dict], path: Path) -> None:
     """Draws accuracy against ξ, in a panel for each training level. The range of the level is
     shaded. Lines are means over the seeds, and bands are their span."""
     found, xi = by_model(cells), [float(name) for name in SWEEP]
-    figure = Figure(figsize=(9, 7), layout="constrained")
+    figure = page_figure(5.4)
     for axes, level in zip(figure.subplots(2, 2, sharey=True).flat, LEVELS, strict=True):
         axes.axvspan(*RANGES[level], color="tab:pink", alpha=0.3, lw=0, label="seen in training")
         for label in MODELS:
@@ -76,8 +75,8 @@ def draw(cells: list[dict], path: Path) -> None:
         )
         axes.label_outer()
         axes.grid(alpha=0.3)
-    figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=5)
-    save_figure(figure, path)
+    add_legend(figure, axes.get_legend_handles_labels()[0])
+    save_figure(figure, path, colors=256)
 
 
 def spread(values: list[float]) -> str:

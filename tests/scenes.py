@@ -216,6 +216,32 @@ def write_coco(folder: Path) -> Path:
     return folder
 
 
+def write_outlines(folder: Path) -> Path:
+    """Pictures in the plain form whose labels are COCO's outlines of objects: a large box of the
+    category 7, a small one of the category 3 in it, and a crowd in the first column."""
+    write_plain(folder, 10, classes=None)
+    shutil.rmtree(folder / "labels")
+    annotations = []
+    for k in range(10):
+        for category, box in ((3, (40, 50, 60, 80)), (7, (20, 30, 100, 90))):
+            left, top, right, bottom = box
+            outline = [left, top, right, top, right, bottom, left, bottom]
+            area = (right - left) * (bottom - top)
+            item = {"image_id": k, "category_id": category, "segmentation": [outline]}
+            annotations.append(item | {"area": area, "iscrowd": 0})
+        crowd = {"counts": [0, 121, 159 * 121], "size": [121, 160]}
+        item = {"image_id": k, "category_id": 3, "segmentation": crowd}
+        annotations.append(item | {"area": 121, "iscrowd": 1})
+    images = [
+        {"id": k, "file_name": f"{k:03d}.png", "height": 121, "width": 160} for k in range(10)
+    ]
+    categories = [{"id": 3, "name": "cat"}, {"id": 7, "name": "sofa"}]
+    content = {"images": images, "annotations": annotations, "categories": categories}
+    (folder / "annotations").mkdir()
+    (folder / "annotations" / "instances_train.json").write_text(json.dumps(content))
+    return folder
+
+
 def _woodscape_lens(folder: Path, number: int, view: str, size: tuple[int, int]) -> Lens:
     """Writes the calibration of a frame, whose offsets and numbers differ from the others', and
     gives its lens in a picture of a size."""

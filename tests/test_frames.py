@@ -1,11 +1,12 @@
 """darswin.frames: the same bits as the operator, views, plans in files, and wrong input."""
 
-import io
 import math
 import subprocess
 import sys
+import tempfile
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,13 +17,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from lens_examples import RANDOM, random_lens
 
-from darswin import create_model, frames
+from darswin import create_model, frames, list_models
 from darswin.compat import OfficialDarSwin
 from darswin.frames import _frames
 from darswin.layers.polar import PolarSample
 from darswin.lens import Equidistant, Polynomial
 from darswin.models import LensAdapter
-from darswin.models.encoder import FeatureMaps
+from darswin.models.encoder import Encoder
+from darswin.models.registry import model_class
+from darswin.viz.views import perspective
 
 
 def layer(rings=4, sectors=8, samples=(2, 3), layout="tokens", mean=MEAN, std=STD, **options):
@@ -107,34 +110,122 @@ def test_a_polar_picture():
     assert np.abs(picture - 255 * plain(frame).transpose(1, 2, 0)).max() <= 0.5 + 1e-3
 
 
-MODELS = ["darswin_a_nano", "darswin_ra_nano", "swin_undis_nano", "darswin_unet_a_nano",
-          "swin_unet_undis_nano", "swin_unet_adapted_nano"]  # fmt: skip
+def without_size(names):
+    return sorted({name.rpartition("_")[0] for name in names})
 
 
-@pytest.mark.parametrize("name", MODELS)
-def test_a_model_gets_what_it_samples_itself(name):
-    model = create_model(name, mean=MEAN, std=STD, num_classes=5).eval()
+FAMILIES = without_size(list_models())
+ENCODERS = [f for f in FAMILIES if issubclass(model_class(f"{f}_nano"), Encoder)]
+AS_THEY_ARE = {"swin", "dat", "swin_unet", "conv_unet"}  # these take images as they are
+SAMPLING = [
+    *((family, {}) for family in FAMILIES if family not in AS_THEY_ARE),
+    *((family, dict(features_only=True)) for family in ENCODERS if family not in AS_THEY_ARE),
+    ("darswin_unet_a", dict(task="distance")),
+    ("swin_unet_undis", dict(task="distance")),
+]
+
+
+@pytest.mark.parametrize(("family", "options"), SAMPLING, ids=str)
+@pytest.mark.parametrize("channels", [3, 1])
+def test_a_model_gets_what_it_samples_itself(family, options, channels):
+    mean, std = (MEAN, STD) if channels == 3 else (0.4, 0.2)
+    model = create_model(f"{family}_nano", mean=mean, std=std, in_chans=channels, **options).eval()
     size = model.image_size or (70, 80)
     lens = Equidistant.from_fov(2.8, 30.0)
-    frame = random_frame(*size, 3)
+    frame = random_frame(*size, channels)
     images = torch.from_numpy(frame).permute(2, 0, 1)[None]
     with torch.inference_mode():
         prepared = model.prepare(lens, size)
         sampled = frames.Sampler(frames.plan(model, lens, size))(frame)[None]
         expected = model.sample(images, prepared)
         np.testing.assert_allclose(sampled, expected.numpy(), rtol=1e-4, atol=1e-4)
-        pixels = images if "darswin_unet" in name else None
+        pixels = images if model.refines_with_images else None
         result = model.run_sampled(torch.from_numpy(sampled), prepared, pixels)
         torch.testing.assert_close(result, model.run(images, prepared), rtol=1e-3, atol=1e-3)
 
 
-def test_wrapped_models_have_plans():
-    encoder = create_model("darswin_a_nano", num_classes=0).eval()
-    plan = frames.plan(FeatureMaps(encoder), ROUND, (64, 64))
-    np.testing.assert_array_equal(plan.right, frames.plan(encoder, ROUND, (64, 64)).right)
+@pytest.mark.parametrize("features_only", [False, True])
+@pytest.mark.parametrize("family", sorted(AS_THEY_ARE))
+def test_models_that_take_images_as_they_are_need_no_plan(family, features_only):
+    if features_only and family not in ENCODERS:
+        return
+    options = dict(features_only=True) if features_only else {}
+    model = create_model(f"{family}_nano", **options)
+    with pytest.raises(ValueError, match="needs no plan"):
+        frames.plan(model, ROUND, model.image_size or (64, 64))
+
+
+def test_an_adapter_gets_what_it_samples_itself():
+    class Network(torch.nn.Module):
+        def forward(self, images):
+            self.read = images
+            return images.mean((2, 3))
+
+    adapter, frame = LensAdapter(Network(), 32), random_frame(64, 64, 3)
+    plan = frames.plan(adapter, ROUND, (64, 64), mean=MEAN, std=STD)
+    mean, std = (torch.tensor(x)[:, None, None] for x in (MEAN, STD))
+    adapter((torch.from_numpy(frame).permute(2, 0, 1)[None] / 255 - mean) / std, ROUND)
+    sampled = frames.Sampler(plan)(frame)
+    np.testing.assert_allclose(sampled, adapter.network.read[0].numpy(), rtol=1e-4, atol=1e-4)
+
+
+def test_no_default_stands_in_for_a_missing_normalization():
     adapter = LensAdapter(torch.nn.Identity(), 32)
-    view = frames.Sampler(frames.plan(adapter, ROUND, (64, 64)))(random_frame(64, 64, 3))
-    assert view.shape == (3, 32, 32) and view.min() >= 0 and view.max() <= 1
+    adapter.mean = adapter.std = None  # it says nothing about its network
+    for known in ({}, dict(mean=MEAN), dict(std=STD)):
+        with pytest.raises(ValueError, match="does not say how frames are normalised"):
+            frames.plan(adapter, ROUND, (64, 64), **known)
+    picture = frames.plan(adapter, ROUND, (64, 64), output="uint8")  # is not normalised
+    assert frames.Sampler(picture)(random_frame(64, 64, 3)).shape == (32, 32, 3)
+
+
+@pytest.mark.parametrize(
+    ("sample", "given", "words"),
+    [
+        (layer(), dict(mean=(0.4, 0.5)), "one per channel"),
+        (layer(), dict(mean=(0.4,), std=STD), "one per channel"),
+        (layer(), dict(std=(0.2,) * 4), "one per channel"),
+        (layer(), dict(mean=(0.4, 0.5), std=(0.2, 0.3)), "1 mean, or 3 for RGB, got 2"),
+        (layer(), dict(std=0.0), "std must be positive"),
+        (layer(), dict(std=(0.2, math.nan, 0.2)), "std must be positive"),
+        (layer(), dict(std=math.inf), "std of a plan must be finite and above 0"),
+        (layer(), dict(mean=(0.2, math.nan, 0.2)), "mean of a plan must be finite"),
+        (
+            torch.ones(4, 5, 3),
+            dict(mean=-math.inf, output="image"),
+            "mean of a plan must be finite",
+        ),
+        (create_model("darswin_a_nano", in_chans=1), dict(mean=MEAN, std=STD), "per channel"),
+        (create_model("darswin_a_nano"), dict(mean=(0.4,), std=(0.2,)), "per channel"),
+        (create_model("darswin_a_nano", in_chans=4), {}, "1 mean, or 3 for RGB, got 4"),
+    ],
+)
+def test_a_normalization_that_does_not_fit_is_refused(sample, given, words):
+    with pytest.raises(ValueError, match=words):
+        frames.plan(sample, ROUND, (50, 60), **given)
+
+
+def test_one_number_of_a_normalization_is_for_all_channels():
+    plan = frames.plan(layer(), ROUND, (50, 60), mean=0.25)
+    assert (plan.mean, plan.std) == ((0.25,) * 3, STD)
+    same = frames.plan(layer(mean=0.25), ROUND, (50, 60))
+    assert plan == same
+
+
+def test_plans_are_equal_if_their_attributes_are():
+    one, same = (frames.plan(layer(), ROUND, (50, 60)) for _ in range(2))
+    assert one == same and hash(one) == hash(same) and len({one, same}) == 1
+    assert one == replace(one, mean=list(MEAN)) and one != "plan"
+    moved = one.right.copy()
+    moved.flat[-1] = 0.5 - moved.flat[-1]
+    others = [
+        replace(one, right=np.abs(moved)), replace(one, columns=one.columns + np.int16(1)),
+        replace(one, lower=one.lower[:1]), replace(one, size=(50, 61)),
+        replace(one, output="image"),
+        replace(one, mean=(0.4, 0.5, 0.7)), replace(one, std=(0.2, 0.2, 0.2)),
+        replace(one, normalize_first=not one.normalize_first),
+    ]  # fmt: skip
+    assert one not in others
 
 
 def test_a_file_holds_the_plan(tmp_path):
@@ -163,6 +254,55 @@ def test_out_takes_the_result():
                   np.empty((*expected.shape, 2), np.float32)[..., 0]):  # fmt: skip
         with pytest.raises(ValueError, match=r"out must be .* of float32 with shape"):
             sampler(frame, wrong)
+
+
+@pytest.mark.parametrize("at", [0, 4, 8996, 9500])
+@pytest.mark.parametrize("turned", [False, True])
+def test_out_in_the_memory_of_the_frame_is_refused(at, turned):
+    memory = np.zeros(40_000, np.uint8)
+    frame = memory[: 50 * 60 * 3 + 500][-9000:].reshape(50, 60, 3)
+    frame[:] = random_frame(50, 60, 3)
+    if turned:
+        frame = frame[::-1, :, ::-1]
+    sampler = frames.Sampler(frames.plan(layer(), ROUND, (50, 60)))
+    expected = sampler(frame)
+    out = memory[at : at + expected.nbytes].view(np.float32).reshape(expected.shape)
+    if at == 9500:  # just behind the frame
+        np.testing.assert_array_equal(sampler(frame, out), expected)
+    else:
+        before = memory.copy()
+        with pytest.raises(ValueError, match="out must not share memory with the frame"):
+            sampler(frame, out, threads=2)
+        np.testing.assert_array_equal(memory, before)
+
+
+def test_a_view_cannot_be_written_over_its_own_frame():
+    rays = perspective((50, 60), 1.0)
+    sampler, frame = frames.Sampler(frames.plan(rays, ROUND, (50, 60))), random_frame(50, 60, 3)
+    with pytest.raises(ValueError, match="out must not share memory with the frame"):
+        sampler(frame, out=frame)
+    sampler(frame, out=frame.copy())
+
+
+def test_out_may_lie_in_the_gaps_of_a_frame():
+    """Between the rows of a frame there may be room for the result."""
+    room = np.zeros((50, 4096), np.uint8)
+    frame = room[:, : 60 * 3].reshape(50, 60, 3)
+    assert np.shares_memory(frame, room)
+    frame[:] = random_frame(50, 60, 3)
+    sampler = frames.Sampler(frames.plan(layer(2, 4), ROUND, (50, 60)))
+    expected = sampler(frame)
+    out = room[7, 256 : 256 + expected.nbytes].view(np.float32).reshape(expected.shape)
+    assert np.may_share_memory(frame, out)
+    np.testing.assert_array_equal(sampler(frame, out), expected)
+
+
+def test_a_sampler_that_was_not_made_reads_nothing():
+    sampler = frames.Sampler.__new__(frames.Sampler)
+    with pytest.raises(AttributeError):
+        sampler(random_frame(50, 60, 3))
+    classes = [name for name, value in vars(_frames).items() if isinstance(value, type)]
+    assert not classes  # pybind11's classes could be made without a constructor
 
 
 def test_threads_of_python_may_share_a_sampler():
@@ -206,12 +346,15 @@ def test_wrong_frames_are_explained(frame, error, words):
         ((layer(), Equidistant([9.0, 8.0]), (50, 60)), {}, ValueError, "one lens, got 2"),
         ((layer(), ROUND, (50, 40_000)), {}, ValueError, "at most 32767 pixels"),
         ((layer(), ROUND, (0, 60)), {}, ValueError, "size must be"),
+        ((layer(), ROUND, (64.9, 80.2)), {}, TypeError, "size must be a pair of ints"),
+        ((layer(), ROUND, (50, 60, 3)), {}, TypeError, "size must be a pair of ints"),
+        ((layer(), ROUND, 60), {}, TypeError, "size must be a pair of ints"),
+        ((layer(), ROUND, (True, 60)), {}, TypeError, "size must be a pair of ints"),
         ((layer(), ROUND, (50, 60)), dict(output="jpeg"), ValueError, "output must be one of"),
         ((torch.ones(4, 5, 3), ROUND, (50, 60)), dict(output="tokens"), ValueError,
          "only a polar grid has tokens"),
         ((torch.ones(4, 3), ROUND, (50, 60)), {}, ValueError, r"shape \(H, W, 3\)"),
         ((torch.nn.Linear(1, 1), ROUND, (50, 60)), {}, TypeError, "got Linear"),
-        ((create_model("swin_nano"), ROUND, (32, 32)), {}, ValueError, "needs no plan"),
         ((layer(), None, (50, 60)), {}, TypeError, "lens must be"),
     ],
 )  # fmt: skip
@@ -227,28 +370,53 @@ def test_the_released_model_has_no_plan():
         frames.plan(model, lens, (64, 64))
 
 
-def file_of(plan) -> bytes:
-    file = io.BytesIO()
-    np.savez(file, darswin_plan=1, **vars(plan))
-    return file.getvalue()
-
-
 PLAN = frames.plan(layer(), ROUND, (50, 60))
 
 
-@given(st.integers(0, len(file_of(PLAN)) - 1), st.binary(max_size=3))
+def file_of(plan) -> bytes:
+    with tempfile.TemporaryDirectory() as folder:
+        plan.save(Path(folder, "camera.npz"))
+        return Path(folder, "camera.npz").read_bytes()
+
+
+CONTENT = file_of(PLAN)
+
+
+@given(st.integers(0, len(CONTENT) - 1), st.binary(max_size=3))
 def test_damaged_files_are_refused_or_harmless(tmp_path_factory, place, noise):
     path = tmp_path_factory.mktemp("plans") / "camera.npz"
-    content = file_of(PLAN)
     # Without noise the file is cut.
-    path.write_bytes(content[:place] + noise + content[place + len(noise) :] * bool(noise))
+    path.write_bytes(CONTENT[:place] + noise + CONTENT[place + len(noise) :] * bool(noise))
     try:
         sampler = frames.Sampler(path)
     except ValueError as error:
         assert "plan" in str(error)
         return
-    height, width = sampler.plan.size
-    assert sampler(random_frame(height, width, 3)).dtype == np.float32
+    assert sampler.plan == PLAN  # the damage is in a date, or in room that nothing uses
+
+
+@pytest.mark.parametrize("name", ["columns", "rows", "right", "lower", "size", "mean", "std"])
+def test_values_that_were_not_written_are_refused(name, tmp_path):
+    """Even if the archive around them is whole."""
+    PLAN.save(tmp_path / "camera.npz")
+    content = dict(np.load(tmp_path / "camera.npz"))
+    flipped = content[name].copy()
+    flipped.reshape(-1).view(np.uint8)[0] ^= 1
+    np.savez(tmp_path / "camera.npz", **content | {name: flipped})
+    with pytest.raises(ValueError, match="is a damaged plan"):
+        frames.Plan.load(tmp_path / "camera.npz")
+
+
+def test_a_file_without_a_digest_is_read(tmp_path):
+    """Files of older versions; the archive's own sums are checked."""
+    path = tmp_path / "camera.npz"
+    np.savez(path, darswin_plan=1, **vars(PLAN))
+    assert frames.Plan.load(path) == PLAN
+    content = bytearray(path.read_bytes())
+    content[content.index(PLAN.right.tobytes()) + 2] ^= 1
+    path.write_bytes(content)
+    with pytest.raises(ValueError, match="damaged"):
+        frames.Plan.load(path)
 
 
 @given(st.integers(0, 2**31), st.sampled_from(LAYOUTS))

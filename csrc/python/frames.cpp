@@ -7,6 +7,7 @@
 #include <pybind11/stl.h>
 
 #include <algorithm>
+#include <memory>
 #include <optional>
 #include <string>
 #include <thread>
@@ -34,6 +35,19 @@ std::string shown(const Shape& shape) {
   std::string text = "(";
   for (const py::ssize_t size : shape) text += std::to_string(size) + ", ";
   return text.substr(0, std::max<size_t>(text.size(), 3) - 2) + ")";
+}
+
+// NumPy's answer is exact. Where it would take more than milliseconds, which needs strange strides,
+// NumPy gives up, and the arrays count as sharing memory.
+bool share_memory(const py::array& one, const py::array& other) {
+  constexpr int64_t kMostWork = 100'000;
+  try {
+    const py::object shares = py::module_::import("numpy").attr("shares_memory");
+    return shares(one, other, py::arg("max_work") = kMostWork).cast<bool>();
+  } catch (const py::error_already_set& error) {
+    if (!error.matches(PyExc_RuntimeError)) throw;  // the base of NumPy's TooHardError
+    return true;
+  }
 }
 
 template <typename T>
@@ -139,6 +153,9 @@ class Sampler {
               : shape.back() * image.channels >= 4 ? Blend::near_rows
                                                    : Blend::near;
     py::array result = output_array(out, output_shape(image.channels, colors));
+    if (out && share_memory(frame, result)) {
+      throw py::value_error("out must not share memory with the frame");
+    }
     a.out = result.mutable_data();
     {
       const py::gil_scoped_release free;
@@ -228,14 +245,20 @@ py::tuple polar_places(const Array<float>& radii, const Array<float>& azimuths,
 }  // namespace darswin
 
 PYBIND11_MODULE(_frames, m) {
-  using darswin::Sampler;
+  using namespace darswin;
   m.doc() = "The compiled part of darswin.frames.";
-  py::class_<Sampler>(m, "Sampler")
-      .def(py::init<const darswin::Array<int16_t>&, const darswin::Array<int16_t>&,
-                    const darswin::Array<float>&, const darswin::Array<float>&,
-                    std::pair<int64_t, int64_t>, std::vector<float>, std::vector<float>, bool,
-                    const std::string&>())
-      .def("__call__", &Sampler::operator(), py::arg("frame"), py::arg("out") = py::none(),
-           py::arg("threads") = 1);
-  m.def("polar_places", &darswin::polar_places);
+  // A function: of a class, __new__ would make objects whose memory nothing has filled.
+  m.def("sampler", [](const Array<int16_t>& columns, const Array<int16_t>& rows,
+                      const Array<float>& right, const Array<float>& lower,
+                      std::pair<int64_t, int64_t> size, std::vector<float> scale,
+                      std::vector<float> offset, bool normalize_first, const std::string& output) {
+    const auto sampler =
+        std::make_shared<const Sampler>(columns, rows, right, lower, size, std::move(scale),
+                                        std::move(offset), normalize_first, output);
+    return py::cpp_function([sampler](const py::object& frame, const std::optional<py::array>& out,
+                                      int64_t threads) { return (*sampler)(frame, out, threads); },
+                            py::name("sample"), py::arg("frame"), py::arg("out") = py::none(),
+                            py::arg("threads") = 1);
+  });
+  m.def("polar_places", &polar_places);
 }

@@ -9,10 +9,7 @@ from darswin.bench.timing import COMPILED, FIXED_LENS, MATMULS, OURS, REFERENCE
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
-
-WIDTH = 9  # inches: on a page of 740 px, text of 10 pt still has 8 pt
 
 Rows = dict[str, dict[str, float]]  # by case, then by name
 Panels = list[list[tuple[str, Rows]]]  # line by line, with their titles
@@ -29,26 +26,30 @@ def draw_models(record: Record, path: Path) -> None:
     found = dict.fromkeys(t.name for t in record.timings)
     order = [OURS, FIXED_LENS, REFERENCE, COMPILED, MATMULS, *found]
     unit = f"images a second, {record.timings[0].subject}, {threads} threads"
-    draw_panels(in_lines(panels, 2), sorted(found, key=order.index), unit, path)
+    draw_panels(in_lines(panels), sorted(found, key=order.index), unit, path)
 
 
-def in_lines(panels: dict[str, Rows], count: int) -> Panels:
-    items = list(panels.items())
-    return [items[k : k + count] for k in range(0, len(items), count)]
+def in_lines(panels: dict[str, Rows]) -> Panels:
+    """Two panels in a line if they have the same rows, so that one list of names serves both."""
+    lines: Panels = []
+    for title, rows in panels.items():
+        if lines and len(lines[-1]) == 1 and list(lines[-1][0][1]) == list(rows):
+            lines[-1].append((title, rows))
+        else:
+            lines.append([(title, rows)])
+    return lines
 
 
 def draw_panels(
     lines: Panels, names: Sequence[str], unit: str, path: Path, is_ratio: bool = False
 ) -> None:
     """Panels on one scale, which for ratios is logarithmic, with a line at 1."""
-    from matplotlib.figure import Figure
     from matplotlib.ticker import LogLocator
 
-    from darswin.viz.plot import save_figure
+    from darswin.viz.plot import add_legend, page_figure, save_figure
 
     heights = [max(len(rows) for _, rows in line) for line in lines]
-    size = (WIDTH, 1.2 + sum(0.75 + 0.25 * height for height in heights))
-    figure = Figure(figsize=size, layout="constrained")
+    figure = page_figure(0.6 + sum(0.75 + 0.25 * height for height in heights))
     grid = figure.subplots(
         len(lines), max(map(len, lines)), squeeze=False, sharex=True, height_ratios=heights
     )
@@ -58,7 +59,7 @@ def draw_panels(
             legend |= _draw_rows(axes, rows, names)
             axes.set_title(title, fontsize="medium")
             axes.tick_params(labelbottom=True)
-            if axes is not beside[0] and list(rows) == list(line[0][1]):
+            if axes is not beside[0]:
                 axes.set_yticklabels([])
             if is_ratio:
                 axes.axvline(1, color="black", lw=1)
@@ -67,22 +68,13 @@ def draw_panels(
     if is_ratio:
         grid[0, 0].set_xscale("log", base=2)
         for axes in grid.flat:
-            axes.xaxis.set_major_locator(LogLocator(2, numticks=8))
+            axes.xaxis.set_major_locator(LogLocator(2, numticks=5))
             axes.xaxis.set_major_formatter("{x:g}×")
     else:
         grid[0, 0].set_xlim(left=0)
     figure.supxlabel(unit, fontsize="medium")
-    _draw_legend([legend[name] for name in names if name in legend], figure)
+    add_legend(figure, [legend[n] for n in names if n in legend], loc="outside upper center")
     save_figure(figure, path)
-
-
-def _draw_legend(handles: "list[Line2D]", figure: "Figure") -> None:
-    """As many columns as fit beside each other, three at most where there are many names."""
-    for columns in range(len(handles) if len(handles) < 5 else 3, 0, -1):
-        legend = figure.legend(handles=handles, loc="outside upper center", ncols=columns)
-        if columns == 1 or legend.get_window_extent().width <= figure.bbox.width:
-            return
-        legend.remove()
 
 
 def _draw_rows(axes: "Axes", rows: Rows, names: Sequence[str]) -> "dict[str, Line2D]":

@@ -15,7 +15,7 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from darswin.data.scenes.scene import IGNORE, PER_METRE
+from darswin.data.scenes.targets import IGNORE, PER_METRE
 from darswin.data.warping import CutOff, Framing, FullSize, at_size, cut_off, picture_size
 from darswin.deploy.optimize import optimize
 from darswin.lens import Lens
@@ -285,27 +285,33 @@ def distance_png(distance: np.ndarray) -> memoryview:
 def file_names(paths: Sequence[str], files: Sequence[tuple[str, bool]]) -> dict[str, str]:
     """The names of output files for pictures and videos: their paths relative to the common folder
     of all arguments, without the endings of pictures unless two names would become equal."""
-    places = [os.path.abspath(p if os.path.isdir(p) else os.path.dirname(p) or ".") for p in paths]
-    root = os.path.commonpath(places)
-    whole = {name: os.path.relpath(os.path.abspath(name), root) for name, _ in files}
+    whole = relative_names(paths, files)
     videos = {name for name, is_video in files if is_video}
     short = {n: w if n in videos else os.path.splitext(w)[0] for n, w in whole.items()}
     return short if len(set(short.values())) == len(set(whole.values())) else whole
 
 
-def claim_folder(out: str | None) -> Path:
-    """The folder for the files of `PixelAnswers`: new, empty, or from an earlier prediction."""
+def relative_names(paths: Sequence[str], files: Sequence[tuple[str, bool]]) -> dict[str, str]:
+    """The paths of pictures and videos relative to the common folder of all arguments."""
+    places = [os.path.abspath(p if os.path.isdir(p) else os.path.dirname(p) or ".") for p in paths]
+    root = os.path.commonpath(places)
+    return {name: os.path.relpath(os.path.abspath(name), root) for name, _ in files}
+
+
+def claim_folder(out: str | None, record: str = ANSWERS) -> Path:
+    """The folder for the pictures of a command: new, empty, or from an earlier run of the command,
+    which left the file `record` there."""
     if out is None:
         raise ValueError("missing `out`: this model writes pictures; give a folder for them")
     folder = Path(out)
     if folder.exists() and not folder.is_dir():
         raise ValueError(f"`out` must be a folder for the pictures, but {out} is a file")
-    if folder.is_dir() and not _is_ours(folder / ANSWERS) and any(folder.iterdir()):
+    if folder.is_dir() and not _is_ours(folder / record) and any(folder.iterdir()):
         raise ValueError(
             f"`out` {out} holds other files: give a new or an empty folder, or one of an earlier "
-            "predict, whose files are replaced"
+            "run of this command, whose files are replaced"
         )
-    replace_file(folder / ANSWERS, "[]")
+    replace_file(folder / record, "[]")
     return folder
 
 

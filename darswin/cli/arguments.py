@@ -58,7 +58,7 @@ def run_command(commands: Callable | dict[str, Callable], argv: list[str], prog:
         option = f"--{name}" if parameter.kind is parameter.KEYWORD_ONLY else name
         parser.add_argument(option, help=" ".join(words), **settings)
     lists = [name for name, kind in kinds.items() if _is_list(kind)]
-    given = vars(parser.parse_args(with_lists(argv, lists)))
+    given = vars(parser.parse_intermixed_args(with_lists(argv, lists)))
     for name, text in given.items():
         if text == "null" and parser.get_default(name) is None:
             given[name] = None
@@ -68,6 +68,12 @@ def run_command(commands: Callable | dict[str, Callable], argv: list[str], prog:
             except (ValueError, yaml.YAMLError):
                 parser.error(f"--{name} must be {_kind(kinds[name])}, got {text or 'nothing'}")
     commands(**given)
+
+
+def check_option(name: str, value: object, ok: bool, range_: str) -> None:
+    """Raises ValueError, which names the option, its range and its value, unless `ok`."""
+    if not ok:
+        raise ValueError(f"`{name}` must be {range_}, got {str(value)[:40]}")
 
 
 def _summary(function: Callable) -> str:

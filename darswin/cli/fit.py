@@ -29,6 +29,7 @@ from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from darswin.cli.arguments import with_lists
 from darswin.cli.options import ALL, FIRST_TASK, check_free, format_help, last_of, presets
 from darswin.data.lens_distributions import parse_sweep
+from darswin.data.splits import SPLITS
 from darswin.models.saving import model_of_run, read_card
 from darswin.train.finetuning import settle, weights_file
 from darswin.train.results import WriteResults
@@ -269,6 +270,9 @@ class RunCLI(LightningCLI):
                     start = start or str(last)
                 else:
                     _say(f"{last} is not there yet: starting from the beginning")
+                if self.trainer.is_global_zero:  # before it starts other processes
+                    validates = self.trainer.limit_val_batches
+                    self.datamodule.check(SPLITS[: 2 if validates else 1])
                 if start is not None:
                     self.model.weights = None  # the checkpoint has its own
                 self.trainer.fit(**options | {"ckpt_path": start})

@@ -7,7 +7,7 @@ import torch
 from darswin.bench.machine import machine
 from darswin.deploy.packed import fastest_dtype
 from darswin.layers.linear import onednn_lack
-from darswin.models import list_models, list_pretrained
+from darswin.models import list_models, list_pretrained, read_card
 from darswin.ops import _module
 from darswin.utils.extras import lack
 
@@ -18,7 +18,13 @@ def models() -> None:
     """Lists the names of all models, and of the trained ones for `darswin predict --model`."""
     print("\n".join(list_models()))
     print("\ntrained models, for `darswin predict --model NAME`:")
-    print("\n".join(list_pretrained()))
+    for name in list_pretrained():
+        card = read_card(name)
+        print(
+            f"{name}: {card.model} for {card.task}, {len(card.classes)} classes, "
+            f"images of {card.size}×{card.size} with {card.channels} channels, mean {card.mean}, "
+            f"std {card.std}"
+        )
 
 
 def info() -> None:

@@ -1,4 +1,4 @@
-"""`darswin lens`: draws, describes or converts a camera calibration."""
+"""`darswin lens`: draws, describes, converts and crops a camera calibration."""
 
 import math
 from typing import Literal
@@ -6,21 +6,24 @@ from typing import Literal
 import torch
 
 import darswin.lens
+from darswin.cli.arguments import check_option
+from darswin.cli.undistort import undistort
+from darswin.cli.views import View, check_view, view_of, view_rays
 from darswin.layers.polar import PolarSample
 from darswin.lens.base import Lens
 from darswin.lens.files.load import Calibration, reach
 from darswin.lens.files.opencv import Coefficients
 from darswin.lens.orientation import in_upright_picture, stored_size
 from darswin.lens.spacing import Spacing
-from darswin.viz.report import describe, sides
+from darswin.viz.report import describe
 
 Format = Literal["darswin", "opencv", "colmap", "kalibr"]
-View = Literal["perspective", "cylindrical", "equirectangular"]
 VIEW_SIDE = 800  # px, the longer one
 # The limits of rings, sectors, samples along each side of a patch, and samples in total.
 MOST = {"rings": 1024, "sectors": 4096, "samples": 256}
 MOST_SAMPLES = 2**22
 MOST_LISTED = 20  # cameras
+_SIDES = "from 1 to 1000000 px"
 
 
 def show(
@@ -52,18 +55,11 @@ def show(
     """
     # Only `show` needs OpenCV and matplotlib, whose import takes a second.
     from darswin.utils.image import read_oriented
-    from darswin.viz import views
     from darswin.viz.plot import draw_lens, figure_format, save_figure
 
     figure_format(out)
     _check_partition(rings, sectors, samples)
-    for name, angle in (("yaw_deg", yaw_deg), ("pitch_deg", pitch_deg)):
-        _check(name, angle, math.isfinite(angle), "a finite number of degrees")
-    if fov_deg is not None:
-        flat = view == "perspective"
-        most = "below 180°" if flat else "at most 360°"
-        in_range = 0 < fov_deg < 180 if flat else 0 < fov_deg <= 360
-        _check("fov_deg", fov_deg, in_range, f"above 0° and {most} for a {view} view")
+    check_view(view, fov_deg, yaw_deg, pitch_deg)
     picture, orientation = read_oriented(image)
     size = picture.shape[:2]
     stored = stored_size(size, orientation)
@@ -71,24 +67,8 @@ def show(
     lens = file.lens(camera, theta_max, stored, torch.float64)
     lens = in_upright_picture(lens, size, orientation)
     sampler = PolarSample(rings, sectors, samples, spacing=spacing)
-    across, down = _fields_of_view(lens, size)
-    if fov_deg is None:
-        fov_deg = min(across, 110) if view == "perspective" else across
-        if not fov_deg > 0:
-            raise ValueError(
-                "the picture shows nothing in the row of the lens's principal point: choose the "
-                "view with `fov_deg` and `yaw_deg`"
-            )
-    aspect = {
-        "perspective": size[0] / size[1],
-        "cylindrical": 1 / 2,
-        # The height of all that the picture shows; narrower views keep this shape.
-        "equirectangular": down / max(fov_deg, across),
-    }[view]
-    fov, yaw, pitch = (math.radians(angle) for angle in (fov_deg, yaw_deg, pitch_deg))
-    longer = max(aspect, 1.0)
-    view_size = (max(1, round(VIEW_SIDE * aspect / longer)), max(1, round(VIEW_SIDE / longer)))
-    rays = getattr(views, view)(view_size, fov, yaw=yaw, pitch=pitch)
+    fov_deg, view_size = view_of(lens, size, view, fov_deg, VIEW_SIDE)
+    rays = view_rays(view, view_size, fov_deg, yaw_deg, pitch_deg)
     title = f"{view} view, {fov_deg:.4g}° across\nyaw {yaw_deg:.4g}°, pitch {pitch_deg:.4g}°"
     save_figure(draw_lens(picture, lens, sampler, rays, title), out)
     print(out)
@@ -174,6 +154,57 @@ def convert(
     if model is not None:
         lens, error = darswin.lens.fit(model, lens)
         note = f", at most {error.item():.2g} px from {calib}"
+    _write(lens, out, format, note)
+
+
+def crop(
+    calib: str, out: str, *, box: tuple[int, int, int, int] | None = None,
+    size: tuple[int, int] | None = None, theta_max_deg: float | None = None,
+    image_size: tuple[int, int] | None = None, camera: str | None = None,
+    coefficients: Coefficients | None = None, format: Format | None = None,
+) -> None:  # fmt: skip
+    """Writes the calibration of cropped or resized pictures. The pictures themselves are not read.
+
+    Args:
+        calib: the calibration file of the camera, in any format that darswin.lens.load reads.
+        out: the file to write.
+        box: the part of the picture that is kept, as top, left, height and width in px, e.g.
+            0,160,960,960. A box beyond the picture means padding.
+        size: the height and width in px to which the picture, or its part, is then resized.
+        theta_max_deg: the largest incident angle of the lens, in degrees. The default is the
+            largest angle that the whole images show.
+        image_size: height and width of the whole images in px, e.g. 960,1280, if the file lacks
+            them.
+        camera: the name or number of the camera, if the file has several.
+        coefficients: the distortion model of an OpenCV or ROS file that does not name it.
+        format: the format of the new file, as for `darswin lens convert`.
+    """
+    if box is None and size is None:
+        raise ValueError("missing `box` or `size`: give the part to keep, or the new size, or both")
+    for side in (*(box or ())[2:], *(size or ())):
+        check_option("size" if box is None else "box", side, 1 <= side <= 10**6, _SIDES)
+    file, theta_max = _calibration(calib, theta_max_deg, image_size, coefficients)
+    lens = file.lens(camera, theta_max, image_size, torch.float64)
+    if box is not None:
+        _check_box(box, lens)
+        lens = lens.cropped(*box)
+    if size is not None:
+        lens = lens.resized(size)
+    _write(lens, out, format)
+
+
+def _check_box(box: tuple[int, int, int, int], lens: Lens) -> None:
+    """ValueError for a box beside the pictures of a lens."""
+    if lens.image_size is None:
+        return
+    top, left, height, width = box
+    rows, columns = (round(side) for side in lens.image_size[0].tolist())
+    meets = -height < top < rows and -width < left < columns
+    check_option("box", box, meets, f"a part of the picture of {columns} × {rows} px (W × H)")
+
+
+def _write(lens: Lens, out: str, format: Format | None, note: str = "") -> None:
+    """Writes the lens and prints what was written."""
     written = darswin.lens.save(lens, out, format)
     degrees = math.degrees(lens.theta_max.item())
     if written != "darswin" and bool(
@@ -191,35 +222,25 @@ def _calibration(
 ) -> tuple[Calibration, float | None]:
     """The file, and θ_max in radians; ValueError for an option out of its range."""
     for side in image_size or ():
-        _check("image_size", side, 1 <= side <= 10**6, "from 1 to 1000000 px")
+        check_option("image_size", side, 1 <= side <= 10**6, _SIDES)
     if theta_max_deg is not None:
         in_range = 0 < theta_max_deg <= 180
-        _check("theta_max_deg", theta_max_deg, in_range, "above 0° and at most 180°")
+        check_option("theta_max_deg", theta_max_deg, in_range, "above 0° and at most 180°")
     file = Calibration.read(calib, coefficients)
     return file, None if theta_max_deg is None else math.radians(theta_max_deg)
-
-
-def _check(name: str, value: float, ok: bool, range_: str) -> None:
-    if not ok:
-        raise ValueError(f"`{name}` must be {range_}, got {str(value)[:40]}")
 
 
 def _check_partition(rings: int, sectors: int, samples: tuple[int, int] = (1, 1)) -> None:
     """ValueError for numbers beyond the limits, before memory is allocated."""
     given = (("rings", rings), ("sectors", sectors), *(("samples", count) for count in samples))
     for name, value in given:
-        _check(name, value, 1 <= value <= MOST[name], f"from 1 to {MOST[name]}")
+        check_option(name, value, 1 <= value <= MOST[name], f"from 1 to {MOST[name]}")
     if (total := rings * sectors * math.prod(samples)) > MOST_SAMPLES:
         raise ValueError(
             f"`rings` × `sectors` × `samples` must be at most {MOST_SAMPLES} samples, got {total}"
         )
 
 
-def _fields_of_view(lens: Lens, size: tuple[int, int]) -> tuple[float, float]:
-    """Horizontal and vertical field of view up to θ_max in a picture (H, W), in degrees."""
-    end = lens.theta_max.item()
-    angles = torch.rad2deg(sides(lens, size).clamp(-end, end))
-    return min(angles[::2].sum().item(), 360.0), angles[1::2].sum().clamp(max=180).item()
-
-
-COMMANDS = {"show": show, "info": info, "convert": convert}
+COMMANDS = {
+    "show": show, "info": info, "convert": convert, "crop": crop, "undistort": undistort
+}  # fmt: skip

@@ -52,7 +52,9 @@ COMMANDS = {
     ),
     "models": Command("lists the models", (), "darswin.cli.info:models"),
     "lens": Command(
-        "draws, describes or converts a camera calibration", PICTURES, "darswin.cli.lens:COMMANDS"
+        "draws, describes, converts or crops a calibration, or undistorts pictures and videos",
+        PICTURES,
+        "darswin.cli.lens:COMMANDS",
     ),
     "bench": Command(
         "measures the speed of a model on this machine (15 minutes)",

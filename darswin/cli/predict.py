@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from safetensors import safe_open
 
 from darswin.cli.answers import ANSWERS, ANSWERS_OF, Answers, ClassAnswers, claim_folder, file_names
 from darswin.cli.lenses import Lenses, given_lenses, lenses_of_run
@@ -19,10 +18,11 @@ from darswin.data.samples import IMAGENET_MEAN, IMAGENET_STD
 from darswin.lens import Lens
 from darswin.lens.files.opencv import Coefficients
 from darswin.models.registry import list_pretrained, pretrained_file
-from darswin.models.saving import ModelCard, NoCardError, load_model, model_of_run
+from darswin.models.saving import ModelCard, NoCardError, load_model, model_file, model_of_run
 from darswin.utils.files import check_is_file, replace_file
 from darswin.utils.image import BrokenImageError, read_oriented
 from darswin.utils.tasks import Task
+from darswin.utils.tensor_files import read_metadata
 from darswin.utils.video import is_video, read_frames
 
 
@@ -74,7 +74,7 @@ def predict(
     if run is not None and model is None:
         weights: str | Path = model_of_run(run)
     elif model is not None and run is None:
-        weights = model
+        weights = Path(model_file(model))
     else:
         raise ValueError(
             "give either `run`, the folder of a run, or `model`, a safetensors file or one of "
@@ -209,20 +209,20 @@ def trained_model(path: str | Path) -> tuple[Any, ModelCard]:
     try:
         return load_model(path)
     except NoCardError as error:
+        normalization = dict(mean=IMAGENET_MEAN, std=IMAGENET_STD)
         try:
-            net = load_official(path, mean=IMAGENET_MEAN, std=IMAGENET_STD)
+            net = load_official(path, **normalization)
         except ValueError as other:
             raise ValueError(
                 f"{error}, and are {other}; commands run models of `darswin fit`, and a network of "
                 "your own, such as one in a LensAdapter, runs in Python"
             ) from error
-        return net, ModelCard("", size=_released_size(path))
+        return net, ModelCard("", normalization, size=_released_size(path))
 
 
 def _released_size(path: str | Path) -> int:
     """The image size (px) in the configuration of released weights."""
-    with safe_open(path, "pt") as file:
-        config = (file.metadata() or {}).get("config", "{}")
+    config = read_metadata(path).get("config", "{}")
     try:
         return int(json.loads(config)["DATA"]["IMG_SIZE"])
     except (KeyError, TypeError, ValueError):

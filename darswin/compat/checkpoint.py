@@ -8,11 +8,9 @@ from pathlib import Path
 from typing import TypeVar
 
 import torch
-from safetensors import SafetensorError
-from safetensors.torch import load_file, save
 from torch import Tensor, nn
 
-from darswin.utils.files import replace_file
+from darswin.utils.tensor_files import read_tensors, write_tensors
 from darswin.utils.unpickle import read_pickle
 
 Source = str | os.PathLike | Mapping[str, Tensor]
@@ -28,16 +26,14 @@ def read_state(source: Source) -> dict[str, Tensor]:
             containers, and the configuration in the authors' checkpoints.
 
     Raises:
-        ValueError: the file contains other objects, which are not executed, or no tensors.
+        ValueError: the file is damaged, or contains other objects, which are not executed, or no
+            tensors. Pickles in the older format have no checksum.
     """
     if isinstance(source, Mapping):
         return _model(source)
     path = Path(source)
     if path.suffix == ".safetensors":
-        try:
-            return load_file(path)
-        except SafetensorError as error:
-            raise ValueError(f"{path} cannot be read as safetensors: {error}") from error
+        return read_tensors(path)[0]
     return _model(read_pickle(path), path)
 
 
@@ -52,7 +48,8 @@ def convert_checkpoint(source: str | os.PathLike, target: str | os.PathLike) -> 
         target: the path of the safetensors file.
 
     Raises:
-        ValueError: the checkpoint contains other objects, which are not executed, or no tensors.
+        ValueError: the checkpoint is damaged, or contains other objects, which are not executed,
+            or no tensors.
     """
     source = Path(source)
     checkpoint = read_pickle(source)
@@ -65,7 +62,7 @@ def convert_checkpoint(source: str | os.PathLike, target: str | os.PathLike) -> 
     if isinstance(checkpoint, Mapping):
         with contextlib.suppress(TypeError, ValueError, KeyError):
             metadata["config"] = json.dumps(checkpoint["config"])
-    replace_file(target, save(state, metadata))
+    write_tensors(target, state, metadata)
 
 
 def _model(checkpoint: object, path: Path | None = None) -> dict[str, Tensor]:

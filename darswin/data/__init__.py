@@ -7,7 +7,8 @@ from darswin.data.pictures import open_source
 from darswin.data.samples import Calibrated
 from darswin.data.scenes import open_scenes
 from darswin.data.scenes.dataset import SceneSamples
-from darswin.data.scenes.scene import IGNORE, Scene, Scenes
+from darswin.data.scenes.scene import Scene, Scenes
+from darswin.data.scenes.targets import IGNORE
 from darswin.data.splits import LeftOut
 from darswin.data.warping import FullSize, RandomTurns, at_size, lens_at_size, warp, warp_map
 from darswin.data.wide_angle import WideAngle

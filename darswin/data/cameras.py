@@ -14,6 +14,7 @@ from darswin.lens.curves import as_curves, form_of
 from darswin.lens.files.load import FORMATS, Calibration
 from darswin.lens.orientation import in_upright_picture, stored_size
 from darswin.utils.files import check_is_file
+from darswin.utils.text import parse_json, read_json, to_text
 
 _ALL = PurePosixPath(".")
 _NOMINAL = (1024, 1024)  # px, for a calibration without a size where no picture has one
@@ -146,7 +147,8 @@ class Calibrations:
         """
         camera = self.camera_of(picture)
         key = camera, tuple(size), orientation
-        if key not in self._lenses:
+        found = self._lenses.get(key)
+        if found is None:
             stored = stored_size(size, orientation)
             try:
                 lens = in_upright_picture(camera.lens(stored), size, orientation)
@@ -155,8 +157,15 @@ class Calibrations:
                 raise ValueError(f"{of}{error} ({camera.name})") from error
             if len(self._lenses) >= _KEPT:
                 self._lenses.clear()
-            self._lenses[key] = self._form(lens)
-        return self._lenses[key]
+            found = self._lenses[key] = self._form(lens)
+        return found
+
+    def check(
+        self, picture: str | Path | None, size: tuple[int, int], orientation: int = 1
+    ) -> None:
+        """Raises the errors of `lens_of`, while lenses are few enough to be kept for it."""
+        if len(self._lenses) < _KEPT:
+            self.lens_of(picture, size, orientation)
 
     def lens_alone(self, picture: str | Path | None) -> Lens:
         """The lens of a picture that cannot be read, at the size of the calibration."""
@@ -213,8 +222,8 @@ def _entries(path: Path, root: Path) -> Mapping[str, Any] | None:
         raise FileNotFoundError(f"there is no calibration file {path}")
     check_is_file(path)
     try:
-        content = json.loads(path.read_bytes())
-    except ValueError:
+        content = read_json(path)
+    except ValueError:  # the reader of calibrations says what is wrong
         return None
     if not isinstance(content, dict) or any(f.fits(content) for f in FORMATS):
         return None
@@ -276,10 +285,9 @@ def _form_of(file: str) -> Hashable:
     if not file.endswith(".json"):
         return file
     try:
-        content = json.loads(Path(file).read_bytes())
+        return _without_numbers(parse_json(to_text(Path(file).read_bytes())))
     except ValueError as error:
         raise ValueError(f"calibration {file}: it is not JSON: {error}") from error
-    return _without_numbers(content)
 
 
 def _without_numbers(value: Any, name: str = "") -> Hashable:

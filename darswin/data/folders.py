@@ -127,6 +127,9 @@ def _split_folders(root: Path, names: list[str] | None) -> dict[Split, Path] | N
             warn_left_out(
                 f"{folder} holds pictures, but is no split like {named['train']}: left out"
             )
+        for folder in folders:
+            if folder.name.lower() in SPLIT_NAMES and not _has_pictures(folder):
+                warn_left_out(f"{folder} holds no pictures: it is not a split")
         _warn_of_loose(root, loose)
         return named
     if names and all((root / name).is_dir() for name in names):
@@ -155,8 +158,10 @@ def _pictures(folder: Path, names: list[str] | None, seen: dict[str, str], whole
                 f"{by_name[name]} holds no picture that darswin can read, but {_kinds(unread)}: "
                 "convert them, or list the classes to use in `classes`"
             )
-        if files and not read:
-            warn_left_out(f"{by_name[name]} holds files, but no pictures: it is not a class")
+        if not read and not (whole and names):  # a listed class must have pictures
+            kind = "files, but no pictures" if files else "no pictures"
+            end = "it is not a class" if whole else "left out"
+            warn_left_out(f"{by_name[name]} holds {kind}: {end}")
         start = len(str(by_name[name])) - len(name)
         paths += sorted((file[start:] for file in read), key=_parts)
         others += unread

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 
 from darswin.lens import Lens, Polynomial, Spherical
+from darswin.utils.angles import degrees_hint
 
 # The paper's four levels of distortion, as ranges of ξ of the Spherical lens (sec. 5.1).
 LEVELS = {
@@ -25,7 +26,10 @@ class LensDistribution:
     """A distribution of lenses."""
 
     def draw(self, rng: np.random.Generator, fov: float, radius: float) -> Lens:
-        """A random lens whose full field of view `fov` (rad) fills a circle of `radius` px."""
+        """A random lens whose full field of view `fov` (rad) fills a circle of `radius` px.
+
+        Raises ValueError for a field of view that no such lens has.
+        """
         raise NotImplementedError
 
 
@@ -53,6 +57,8 @@ class PolynomialLenses(LensDistribution):
     """
 
     def draw(self, rng: np.random.Generator, fov: float, radius: float) -> Lens:
+        if not 0 < fov < 2 * math.pi:
+            raise ValueError(f"fov must be in (0, 2π) rad, got {fov}{degrees_hint(fov)}")
         direction = np.abs(rng.standard_normal(4))
         theta_max = fov / 2
         scale = radius / sum(k * theta_max**power for power, k in enumerate(direction, start=1))

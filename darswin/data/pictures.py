@@ -4,6 +4,7 @@ import gzip
 import math
 import os
 import statistics
+import warnings
 import zlib
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -15,7 +16,8 @@ from darswin.data.folders import class_of, open_folder
 from darswin.data.splits import SPLITS, Limited, Split, check_split, hold_out, read_classes
 from darswin.utils.image import (
     BrokenImageError,
-    read_form,
+    Header,
+    read_header,
     read_image,
     read_oriented,
     with_channels,
@@ -36,18 +38,20 @@ class Form(NamedTuple):
 
 def form_of(file: Callable[[int], Path | None], count: int) -> Form:
     """The form of `count` picture files, from the headers of some of them."""
-    forms: list[tuple[int, int]] = []
+    headers: list[Header] = []
     errors: list[BrokenImageError] = []
     for index in range(0, count, -(-count // _LOOKED_AT)):
         path = file(index)
         assert path is not None
         try:
-            forms.append(read_form(path))
+            with warnings.catch_warnings(action="ignore"):
+                headers.append(read_header(path))
         except BrokenImageError as error:
             errors.append(error)
-    if not forms:
+    if not headers:
         raise errors[0]
-    return Form(max(form[0] for form in forms), statistics.median_low(form[1] for form in forms))
+    sides = [min(header.size) for header in headers]
+    return Form(max(header.channels for header in headers), statistics.median_low(sides))
 
 
 class Source(Limited):

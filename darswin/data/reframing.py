@@ -13,7 +13,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from darswin.data.scenes.scene import Scene, nothing_of
+from darswin.data.scenes.scene import Scene
+from darswin.data.scenes.targets import nothing_of
 from darswin.data.warping import Turn, area_resized, remap, turned_lens
 from darswin.lens import Lens
 from darswin.lens.pixels import as_map, pixel_angles

@@ -1,6 +1,6 @@
 """Data sets of images with lenses: their base, and pictures of calibrated cameras."""
 
-from collections.abc import Callable, Sequence, Sized
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import cv2
@@ -13,6 +13,7 @@ from darswin.data.cameras import Calibrations
 from darswin.data.lens_distributions import LensDistribution
 from darswin.data.pictures import Source
 from darswin.data.reframing import warp_picture
+from darswin.data.scenes.scene import Scenes
 from darswin.data.warping import (
     Crop,
     Framing,
@@ -25,7 +26,7 @@ from darswin.data.warping import (
     turned_picture,
 )
 from darswin.lens import Lens
-from darswin.utils.image import BrokenImageError
+from darswin.utils.image import BrokenImageError, Header, read_header
 
 # Per-channel statistics of ImageNet, in [0, 1].
 IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
@@ -50,7 +51,7 @@ class Samples(Dataset):
 
     def __init__(
         self,
-        source: Sized,
+        source: Source | Scenes,
         *,
         size: int = 64,
         framing: Framing = "stretch",
@@ -120,6 +121,22 @@ class Samples(Dataset):
         if self.erase:
             image = self.erase(image, rng)
         return torch.from_numpy(np.ascontiguousarray(image)), lens, label
+
+    def headers(self, index: int) -> Sequence[Header]:
+        """The headers of a picture's files; none for pictures in memory."""
+        file = self.source.file(index)
+        return [] if file is None else [read_header(file)]
+
+    def check(self, index: int, headers: Sequence[Header] | None) -> None:
+        """Raises what `self[index]` would raise, as far as its headers tell; for None, the files
+        are read. `skip_broken` has no effect."""
+        if headers is None:
+            self._seen(Draw(0, index, index))
+        elif headers:
+            self._check(index, headers)
+
+    def _check(self, index: int, headers: Sequence[Header]) -> None:
+        """Raises ValueError for files that do not fit each other or their lens."""
 
     def _random(self, epoch: int, key: int, purpose: int) -> np.random.Generator:
         return np.random.default_rng((self.seed, epoch, key, purpose))
@@ -221,6 +238,10 @@ class Calibrated(Samples):
     def _taken(self, index: int) -> tuple[tuple[int, int], Lens]:
         lens = self._with_lens(index)[1]
         return picture_size(lens), lens
+
+    def _check(self, index: int, headers: Sequence[Header]) -> None:
+        (picture,) = headers
+        self.calibrations.check(self.source.file(index), picture.upright, picture.orientation)
 
     def _lens_alone(self, draw: Draw) -> Lens:
         lens = self.calibrations.lens_alone(self.source.file(draw.picture))

@@ -2,7 +2,6 @@
 
 import copy
 import hashlib
-import json
 import math
 import os
 import warnings
@@ -13,7 +12,7 @@ from typing import Any, ClassVar, Literal, Self, get_args
 
 import numpy as np
 
-from darswin.utils.text import read_text
+from darswin.utils.text import read_json, read_text
 
 Split = Literal["train", "val", "test"]
 SPLITS: tuple[Split, ...] = get_args(Split)
@@ -180,14 +179,6 @@ def read_classes(path: str | Path) -> list[str]:
     if twice := [name for name, count in Counter(names).items() if count > 1]:
         raise ValueError(f"{path} must list each class once, but repeats {some(twice)}")
     return names
-
-
-def read_json(path: str | Path) -> Any:
-    """The content of a JSON file; ValueError for other files."""
-    try:
-        return json.loads(read_text(path))
-    except ValueError as error:
-        raise ValueError(f"{path} must be JSON: {error}") from error
 
 
 def some(names: Sequence) -> str:

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import torch
 
-from darswin.data.scenes.scene import IGNORE
+from darswin.data.scenes.targets import IGNORE
 from darswin.lens import Lens
 from darswin.lens.orientation import rotated, upright
 from darswin.lens.pixels import pixel_angles, reprojection

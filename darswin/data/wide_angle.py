@@ -16,6 +16,7 @@ from darswin.data.samples import Draw, Samples
 from darswin.data.warping import Framing, Turn, area_resized, remap, taken_part
 from darswin.lens import Lens, Perspective
 from darswin.lens.pixels import OUTSIDE, radial_reprojection
+from darswin.utils.angles import degrees_hint
 
 # The paper's pictures, 384 px wide, have a focal length of 9 px.
 PAPER_FOV = 2 * math.atan(192 / 9)
@@ -61,7 +62,7 @@ class WideAngle(Samples):
         if not 0 < size <= render:
             raise ValueError(f"sizes must be 0 < size ≤ render, got {size} and {render}")
         if not 0 < fov < math.pi:
-            raise ValueError(f"fov must be in (0, π), got {fov}")
+            raise ValueError(f"fov must be in (0, π), got {fov}{degrees_hint(fov)}")
         super().__init__(source, size=size, framing=framing, **options)
         self.lenses, self.fov = lenses, fov
         self.render, self.picture_size = render, picture_size

@@ -11,8 +11,10 @@
 A graph that `export_onnx(..., input="tokens")` wrote takes the tokens, with a batch axis in front.
 """
 
+import hashlib
+import math
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
@@ -45,9 +47,11 @@ _LARGEST_SIDE = 2**15 - 1  # places are stored in 16 bits
 _OUTSIDE = -3  # the column and row of a point outside of the frame
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Plan:
     """The places at which the frames of one camera are read, and the form of the result.
+
+    Plans are equal if all of their attributes are.
 
     Attributes:
         columns, rows: the upper left one of the four pixels around each point, int16; -3 if a point
@@ -61,6 +65,9 @@ class Plan:
             all; "uint8" is not normalized.
         normalize_first: normalizes the pixels before the interpolation, as the operators do for
             small images; the results differ in rounding only.
+
+    Raises:
+        ValueError: mean and std are not 1 or 3 finite numbers each, or a std is not above 0.
     """
 
     columns: np.ndarray
@@ -73,6 +80,28 @@ class Plan:
     std: tuple[float, ...] = (1.0,)
     normalize_first: bool = False
 
+    def __post_init__(self) -> None:
+        for name, least in (("mean", -math.inf), ("std", 0.0)):
+            values = tuple(map(float, getattr(self, name)))
+            if len(values) not in (1, 3):
+                raise ValueError(f"a plan needs 1 {name}, or 3 for RGB, got {len(values)}")
+            if not all(least < value < math.inf for value in values):
+                above = " and above 0" * (least == 0)
+                raise ValueError(f"{name} of a plan must be finite{above}, got {values}")
+            object.__setattr__(self, name, values)
+        if len(self.mean) != len(self.std):
+            raise ValueError(f"a plan needs as many means as stds, got {self.mean} and {self.std}")
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, Plan):
+            return NotImplemented
+        return all(
+            np.array_equal(value, getattr(other, name)) for name, value in vars(self).items()
+        )
+
+    def __hash__(self) -> int:
+        return hash((self.size, self.output, self.mean, self.std, self.columns.shape))
+
     def save(self, path: str | os.PathLike) -> None:
         """Writes the plan to a file, which `Plan.load` and `Sampler` read. Its name ends in ".npz".
 
@@ -82,8 +111,8 @@ class Plan:
         """
         if Path(path).suffix != ".npz":
             raise ValueError(f"the name of a plan's file must end in .npz, got {os.fspath(path)!r}")
-        buffer = BytesIO()
-        np.savez(buffer, darswin_plan=_VERSION, **vars(self))
+        buffer, content = BytesIO(), dict(vars(self), darswin_plan=_VERSION)
+        np.savez(buffer, **content, digest=_digest(content))
         replace_file(path, buffer.getbuffer())
 
     @classmethod
@@ -97,8 +126,9 @@ class Plan:
         name = os.fspath(path)
         try:
             with np.load(path, allow_pickle=False) as file:
+                damaged = file.zip.testzip()
                 content = dict(file)
-            version = int(content.pop("darswin_plan"))
+            version = int(content["darswin_plan"])
         except Exception as error:  # zipfile and NumPy raise many kinds for a damaged file
             if isinstance(error, OSError) and error.filename is not None:
                 raise  # the file cannot be read
@@ -106,6 +136,9 @@ class Plan:
         if version > _VERSION:
             raise ValueError(f"{name} comes from a newer version of darswin: update darswin")
         try:
+            digest = content.pop("digest", None)  # older files have none
+            if damaged or (digest is not None and digest.item() != _digest(content)):
+                raise ValueError("other values than those that were written")
             height, width = content["size"].tolist()
             return cls(
                 columns=content["columns"],
@@ -122,24 +155,34 @@ class Plan:
             raise ValueError(f"{name} is a damaged plan of darswin.frames") from error
 
 
-class Sampler(_frames.Sampler):
+def _digest(content: Mapping[str, Any]) -> str:
+    """The SHA-256 of arrays and their names."""
+    total = hashlib.sha256()
+    for name in sorted(content):
+        array = np.asarray(content[name])
+        total.update(f"{name} {array.dtype.str} {array.shape} ".encode() + array.tobytes())
+    return total.hexdigest()
+
+
+class Sampler:
     """Samples frames at the places of a plan: `sampler(frame, out=None, threads=1)`.
 
     A call takes a frame of uint8, (H, W, 3) or (H, W), in any memory layout, so that
     `frame[..., ::-1]` turns OpenCV's BGR into RGB at no cost. It returns the plan's `output`. It
     runs without Python's lock, and several threads may call one sampler.
 
-    `out` is an array for the result: C-contiguous, with its shape and type. `threads` is the most
-    threads to use; small plans use fewer. The tokens and the polar image are those of
-    `darswin.ops.polar_sample`, bit for bit. On CPUs without AVX-512, single samples of small frames
-    may differ in the last bit.
+    `out` is an array for the result: C-contiguous, with its shape and type, and in other memory
+    than the frame. `threads` is the most threads to use; small plans use fewer. The tokens and the
+    polar image are those of `darswin.ops.polar_sample`, bit for bit. On CPUs without AVX-512,
+    single samples of small frames may differ in the last bit.
 
     Args:
         plan: a `Plan`, or its file.
 
     Raises:
         TypeError: in a call, the frame is no array of uint8.
-        ValueError: the plan is damaged; in a call, the frame or `out` does not fit the plan.
+        ValueError: the plan is damaged; in a call, the frame or `out` does not fit the plan, or
+            they share memory.
         OSError: the file cannot be read.
     """
 
@@ -147,17 +190,20 @@ class Sampler(_frames.Sampler):
         if not isinstance(plan, Plan):
             plan = Plan.load(plan)
         try:
-            if len(plan.mean) != len(plan.std):
-                raise TypeError("one mean for each std")
-            super().__init__(
+            self._sample = _frames.sampler(
                 plan.columns, plan.rows, plan.right, plan.lower, plan.size,
                 [1 / (255 * std) for std in plan.std],
-                [-mean / std for mean, std in zip(plan.mean, plan.std, strict=False)],
+                [-mean / std for mean, std in zip(plan.mean, plan.std, strict=True)],
                 plan.normalize_first, plan.output,
             )  # fmt: skip
-        except (TypeError, ZeroDivisionError) as error:
+        except TypeError as error:
             raise ValueError("the parts of the plan do not fit together") from error
         self.plan = plan
+
+    def __call__(
+        self, frame: np.ndarray, out: np.ndarray | None = None, threads: int = 1
+    ) -> np.ndarray:
+        return self._sample(frame, out, threads)
 
 
 def plan(
@@ -179,23 +225,34 @@ def plan(
         output: the form of the result, see `Plan`. By default it is the input of the model's or the
             layer's sampling, "tokens" or "image", and "uint8" for rays. Only a polar grid has
             tokens.
-        mean, std: the normalization of the frames; by default the model's, or none for rays.
+        mean, std: the normalization of the frames, a number for all channels or one for each; by
+            default the model's, or none for rays.
 
     Raises:
-        TypeError: `sample` is none of these.
+        TypeError: `sample` is none of these, or the size is not whole.
         ValueError: there is more than one lens, the lens belongs to another size, the model takes
-            the images as they are, a side is longer than 32,767 pixels, or the output is unknown.
+            the images as they are, a side is longer than 32,767 pixels, the output is unknown, mean
+            or std do not fit the channels, or they are missing and the model has none.
     """
     from darswin.frames.places import reading
+    from darswin.ops.checks import check_pair, per_channel
 
     if output is not None and output not in get_args(Output):
         raise ValueError(f"output must be one of {get_args(Output)}, got {output!r}")
-    height, width = size
-    if not (0 < height <= _LARGEST_SIDE and 0 < width <= _LARGEST_SIDE):
+    size = check_pair("size", size, 1)
+    if max(size) > _LARGEST_SIDE:
         raise ValueError(f"size must be (H, W) of at most {_LARGEST_SIDE} pixels, got {size}")
-    size = int(height), int(width)
     found: Any = reading(sample, lens, size)
     output = output or found.output
+    if output == "uint8":
+        found = found._replace(mean=0.0, std=1.0)
+    mean, std = found.mean if mean is None else mean, found.std if std is None else std
+    if mean is None or std is None:
+        raise ValueError(
+            f"this {type(sample).__name__} does not say how frames are normalised: give the mean "
+            "and the std of its network"
+        )
+    channels = found.channels or max(np.size(mean), np.size(std))
     if found.samples is None:
         arrays = _at_pixels(found.points.double().numpy(), size, output)
     else:
@@ -204,13 +261,9 @@ def plan(
         **arrays,
         size=size,
         output=output,
-        mean=_numbers(found.mean if mean is None else mean),
-        std=_numbers(found.std if std is None else std),
+        mean=per_channel("mean", mean, channels),
+        std=per_channel("std", std, channels),
     )
-
-
-def _numbers(value: float | Sequence[float]) -> tuple[float, ...]:
-    return tuple(np.atleast_1d(np.asarray(value, np.float64)).tolist())
 
 
 def _on_grid(

@@ -1,25 +1,25 @@
 from collections.abc import Sequence
+from typing import Protocol
 
 import numpy as np
 
-class Sampler:
-    def __init__(
-        self,
-        columns: np.ndarray,
-        rows: np.ndarray,
-        right: np.ndarray,
-        lower: np.ndarray,
-        size: tuple[int, int],
-        scale: Sequence[float],
-        offset: Sequence[float],
-        normalize_first: bool,
-        output: str,
-        /,
-    ) -> None: ...
+class _Sample(Protocol):
     def __call__(
         self, frame: np.ndarray, out: np.ndarray | None = None, threads: int = 1
     ) -> np.ndarray: ...
 
+def sampler(
+    columns: np.ndarray,
+    rows: np.ndarray,
+    right: np.ndarray,
+    lower: np.ndarray,
+    size: tuple[int, int],
+    scale: Sequence[float],
+    offset: Sequence[float],
+    normalize_first: bool,
+    output: str,
+    /,
+) -> _Sample: ...
 def polar_places(
     radii: np.ndarray,
     azimuths: np.ndarray,

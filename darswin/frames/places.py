@@ -18,9 +18,11 @@ class Reading(NamedTuple):
 
     points: PolarGrid | Tensor  # the polar grid of one lens, or pixels (H', W', 2)
     output: str  # of `Plan`
-    samples: Pair | None = None  # (S_r, S_φ) of a token of the grid
-    mean: float | Sequence[float] = 0.0
-    std: float | Sequence[float] = 1.0
+    samples: Pair | None  # (S_r, S_φ) of a token of the grid
+    channels: int | None  # of the frames, if the sampling says it
+    # The normalization of frames; None if the sampling has none of its own.
+    mean: float | Sequence[float] | None
+    std: float | Sequence[float] | None
 
 
 @torch.no_grad()
@@ -33,11 +35,10 @@ def reading(sample: nn.Module | Tensor, lens: Lens, size: Pair) -> Reading:
         if sample.dim() != 3 or sample.shape[2] != 3:
             raise ValueError(f"rays must have shape (H, W, 3), got {tuple(sample.shape)}")
         exact = lens.to(torch.float64).project_points(sample[None].double().cpu(), size)
-        return Reading(as_map(exact)[0], "uint8")
-    normalization = getattr(sample, "mean", 0.0), getattr(sample, "std", 1.0)
+        return Reading(as_map(exact)[0], "uint8", None, None, 0.0, 1.0)
     if isinstance(sample, PolarSample):
-        grid = sample.grid(lens, size)
-        return Reading(grid, sample.layout, sample.spec.samples, *normalization)
+        grid, samples = sample.grid(lens, size), sample.spec.samples
+        return Reading(grid, sample.layout, samples, None, sample.mean, sample.std)
     if not isinstance(sample, Model):
         raise TypeError(
             "sample must be a model of darswin, a PolarSample or rays (H, W, 3), "
@@ -46,9 +47,11 @@ def reading(sample: nn.Module | Tensor, lens: Lens, size: Pair) -> Reading:
     points = sample._points(sample.prepare(lens, size))
     if points is None:
         raise ValueError("the model takes images as they are: it needs no plan")
+    # An adapter may know neither the channels nor the normalization of its network.
+    frames = (getattr(sample, name, None) for name in ("in_chans", "mean", "std"))
     if isinstance(points, PolarGrid):
-        return Reading(points, "tokens", _spec(sample).samples, *normalization)
-    return Reading(points[0], "image", None, *normalization)
+        return Reading(points, "tokens", _spec(sample).samples, *frames)
+    return Reading(points[0], "image", None, *frames)
 
 
 def _spec(model: Any) -> Any:

@@ -25,7 +25,15 @@ from darswin.lens.spacing import (
     to_theta,
 )
 from darswin.ops import polar_sample, polar_to_image_plan
-from darswin.ops.checks import as_int, channels_first, check_jitter, check_layout, readable
+from darswin.ops.checks import (
+    FRAME_CHANNELS,
+    as_int,
+    channels_first,
+    check_has_batch,
+    check_jitter,
+    check_layout,
+    readable,
+)
 
 __all__ = ["PolarGrid", "PolarGridSpec", "PolarSample", "polar_grid"]
 
@@ -327,8 +335,7 @@ def check_images(
     """The images as (B, C, H, W); TypeError or ValueError if that fails, see `channels_first`."""
     if not isinstance(images, Tensor):
         raise TypeError(f"images must be a tensor, got {type(images).__name__}")
-    if images.dim() != 4:
-        raise ValueError(f"images must have shape (B, C, H, W), got {tuple(images.shape)}")
+    check_has_batch("images", images, channels_last, channels)
     return channels_first("images", images, channels_last, channels)
 
 
@@ -340,9 +347,12 @@ def check_lens(lens: Lens | None, size: tuple[int, int]) -> Lens:
         return lens
     for other in lens.image_size.unique(dim=0).tolist():
         if tuple(other) != size:
+            advice = f"if the image was resized, use lens.resized({size})"
+            if size[0] == other[1] and size[1] in FRAME_CHANNELS:
+                advice = "the channels come first: pass images.permute(0, 3, 1, 2)"
             raise ValueError(
                 f"the lens belongs to images of (H, W) = {tuple(round(s) for s in other)}, got "
-                f"images of {size}; if the image was resized, use lens.resized({size})"
+                f"images of {size}; {advice}"
             )
     return lens
 

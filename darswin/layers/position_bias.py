@@ -118,8 +118,9 @@ class RelativeTable(nn.Module):
 
 
 def ring_angles(last: Tensor, grid: PolarGrid, rings: int, kind: PositionBias) -> Tensor:
-    """The θ of the ring borders of a map with `rings` rings, (N, rings+1) rad, up to `last` (N,).
-    For "polar" it is their radius in the image instead, scaled so that the last one is π."""
+    """The θ of the ring borders of a map with `rings` rings, (N, rings+1) rad, up to `last` (N,),
+    in equal steps: for spacings other than "theta" they are nominal. For "polar" it is their radius
+    in the image instead, scaled so that the last one is π."""
     if kind == "polar":
         step = (grid.borders.shape[1] - 1) // rings
         borders = grid.borders[:, ::step]

@@ -78,8 +78,9 @@ class Lens(ImageFrame):
     def _validate(self) -> None:
         """Raises ValueError for parameters that are in range but invalid together."""
 
-    def _set_theta_max(self, wanted: Tensor | None) -> None:
-        """Checks and sets θ_max; None means `theta_limit`."""
+    def _set_theta_max(self, wanted: Tensor | None, given: str = "theta_max") -> None:
+        """Checks and sets θ_max; None means `theta_limit`. Errors name what was given: "theta_max",
+        or "fov", which is twice as large."""
         limit = self.theta_limit
         if not bool((limit > 0).all()):
             names = " and ".join(self.parameters)
@@ -87,7 +88,9 @@ class Lens(ImageFrame):
         self.theta_max = limit if wanted is None else wanted
         if wanted is None:
             return
-        self._check("theta_max")
+        times, kind = (2 if given == "fov" else 1), self.declared["theta_max"]
+        if not kind.holds(wanted):
+            self._require(given, (wanted > 0) & wanted.isfinite(), kind.range, times * wanted)
         # A limit computed in another dtype differs by rounding; MARGIN is larger than that.
         slack = 1 + 2 * torch.finfo(limit.dtype).eps
         beyond = ~(wanted <= limit * slack)
@@ -96,11 +99,10 @@ class Lens(ImageFrame):
             exact = self.detach().to(torch.float64).theta_limit
             beyond &= ~(wanted <= exact * slack)
         if bool(beyond.any()):
-            last, got = (t.detach()[beyond][0].item() for t in (exact, wanted))
-            raise ValueError(
-                f"theta_max must be at most {last:.6f} rad ({math.degrees(last):.2f}°), where r of "
-                f"this {type(self).__name__} lens stops rising, got {got:.6f}"
-            )
+            last = times * exact.detach()[beyond][0].item()
+            end = f"where r of this {type(self).__name__} lens stops rising"
+            range_ = f"at most {last:.6f} rad ({math.degrees(last):.2f}°), {end}"
+            self._require(given, ~beyond, range_, times * wanted)
         self.theta_max = torch.where(wanted > limit, limit, wanted)
 
     def to(self, *args: Any, **kwargs: Any) -> Self:
@@ -123,7 +125,7 @@ class Lens(ImageFrame):
     # -- the radial curve ---------------------------------------------------------------------
 
     def project(self, theta: Number) -> Tensor:
-        """Radius r (px) at incident angle θ (rad): the radial curve.
+        """Radius r (px) at incident angle θ (rad): the radial curve, with a meaning up to θ_max.
 
         Args:
             theta: a number, or a tensor whose first dimension is the number of lenses or 1. For a
@@ -188,12 +190,12 @@ class Lens(ImageFrame):
         return torch.zeros_like(theta)[..., None] * direction
 
     def project_rays(self, theta: Number, azimuth: Number, image_size: Size = None) -> Tensor:
-        """Pixels (x, y), (..., 2) px, at which rays (θ, φ) land.
+        """Pixels (x, y), (..., 2) px, at which rays (θ, φ) land; NaN beyond θ_max.
 
         θ and φ, rad, broadcast; their shapes are those of `project`. image_size: (H, W).
         """
         (theta,), (azimuth,) = self._aligned(theta), self._aligned(azimuth)
-        return self.pixels(theta, direction_of(azimuth), image_size)
+        return self.seen_pixels(theta, direction_of(azimuth), image_size)
 
     def unproject_pixels(self, pixels: Tensor, image_size: Size = None) -> tuple[Tensor, Tensor]:
         """Rays (θ, φ) that land at pixels (x, y): the inverse of `project_rays`.
@@ -248,7 +250,7 @@ class Lens(ImageFrame):
 
     def pixels(self, theta: Tensor, direction: Tensor, image_size: Size = None) -> Tensor:
         """`project_rays` with (cos φ, sin φ), (N or 1, ..., 2), in place of φ: the inverse of
-        `rays`."""
+        `rays`. θ must be at most θ_max; `seen_pixels` takes any θ."""
         return self.to_pixels(self._flat(theta, direction), image_size)
 
     def seen_pixels(self, theta: Tensor, direction: Tensor, image_size: Size = None) -> Tensor:

@@ -11,6 +11,7 @@ from torch.utils import _pytree as pytree
 
 from darswin.lens.parameter import Arguments, Number, Parameter, as_tensors
 from darswin.ops.checks import readable
+from darswin.utils.angles import degrees_hint
 
 NUMBER = Parameter()
 
@@ -104,11 +105,14 @@ class LensBatch:
             setattr(lens, name, function(value))
         return lens
 
-    def _require(self, name: str, ok: Tensor, range_: str) -> None:
-        """Raises ValueError with the first bad value unless `ok`, (N,), is true for all lenses."""
+    def _require(self, name: str, ok: Tensor, range_: str, value: Tensor | None = None) -> None:
+        """Raises ValueError with the first bad value unless `ok`, (N,), is true for all lenses. The
+        value, (N, ...), is that of the parameter, unless it is given."""
         if not bool(ok.all()):  # NaN is not ok
-            bad = getattr(self, name).detach()[~ok][0].tolist()
-            raise ValueError(f"{name} must be {range_}, got {bad}")
+            bad = (getattr(self, name) if value is None else value).detach()[~ok][0]
+            is_angle = name == "fov" or self.declared.get(name, NUMBER).angle
+            hint = degrees_hint(bad.abs().max().item()) if is_angle else ""
+            raise ValueError(f"{name} must be {range_}, got {bad.tolist()}{hint}")
 
     def _check(self, name: str) -> None:
         """Raises ValueError if a parameter is out of its range."""

@@ -1,5 +1,6 @@
 """Tabulated lenses: radii at angles. Lenses of several models become one batch of them."""
 
+import math
 from collections.abc import Sequence
 
 import torch
@@ -16,7 +17,7 @@ class Tabulated(Lens):
     """r at given angles, interpolated by cubics that rise. The lens ends at the last angle.
 
     Args:
-        angles: (K,) or (N, K) rad, rising from 0; K ≥ 2.
+        angles: (K,) or (N, K) rad, rising from 0 to π at most; K ≥ 2.
         radii: the same shape, px, rising from 0.
         slopes: the same shape, px/rad: dr/dθ at the angles. The error for a smooth curve is then of
             the fourth power of the steps. None computes them from the table (PCHIP).
@@ -26,7 +27,7 @@ class Tabulated(Lens):
     Source: Fritsch and Carlson, SINUM 1980; Fritsch and Butland, SISSC 1984.
     """
 
-    angles = Parameter(shape=(None,))
+    angles = Parameter(shape=(None,), angle=True)
     radii = Parameter(shape=(None,), in_pixels=True)
     slopes = Parameter(shape=(None,), optional=True, in_pixels=True)
     max_numbers = 65536
@@ -41,6 +42,8 @@ class Tabulated(Lens):
             value = getattr(self, name).detach()
             rises = (value[:, 0] == 0) & (value.diff(dim=1) > 0).all(1) & value.isfinite().all(1)
             self._require(name, rises, "finite and rising from 0")
+        ends = self.angles[:, -1] <= math.pi * (1 + 2 * torch.finfo(self.angles.dtype).eps)
+        self._require("angles", ends, "at most π rad")
         if self.slopes is None:
             return
         if self.slopes.shape != self.angles.shape:

@@ -7,7 +7,7 @@ length turns the distorted plane into pixels.
 
 import math
 from collections.abc import Callable, Mapping
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar, Self
 
 import torch
 from torch import Tensor
@@ -224,6 +224,16 @@ class DistortedLens(FocalLens, register=False):
         theta = torch.where(lands, self._plane_angle(w), torch.nan)
         return theta, torch.where(lands[..., None], point / w[..., None], direction)
 
+    if TYPE_CHECKING:
+
+        @classmethod
+        def from_fov(
+            cls, fov: Number, radius: Number, center: Number | None = None, *,
+            radial: Number | None = None, tangential: Number | None = None,
+            prism: Number | None = None, affine: Number | None = None,
+            image_size: Number | None = None,
+        ) -> Self: ...  # fmt: skip
+
 
 def _circle(count: int, like: Tensor) -> Tensor:
     """(count, 2): unit vectors at equal angles."""
@@ -286,6 +296,16 @@ class Mei(DistortedLens):
     def _plane_limit(self) -> Tensor:
         return sphere_limit(self.xi)
 
+    if TYPE_CHECKING:
+
+        @classmethod
+        def from_fov(  # type: ignore[override]
+            cls, xi: Number, fov: Number, radius: Number, center: Number | None = None, *,
+            radial: Number | None = None, tangential: Number | None = None,
+            prism: Number | None = None, affine: Number | None = None,
+            image_size: Number | None = None,
+        ) -> Self: ...  # fmt: skip
+
 
 class BrownConrady(DistortedLens):
     """A pinhole camera with distortion: w = tan θ, θ < 90°. OpenCV's standard model.
@@ -322,3 +342,13 @@ class BrownConrady(DistortedLens):
         grows = w * horner(w * w, slopes(self.denominator, 2, 2))
         slope = (slope * divisor - super()._stretch(w) * grows) / divisor**2
         return torch.where(divisor > 0, slope, -1)  # beyond a pole nothing lands
+
+    if TYPE_CHECKING:
+
+        @classmethod
+        def from_fov(
+            cls, fov: Number, radius: Number, center: Number | None = None, *,
+            radial: Number | None = None, denominator: Number | None = None,
+            tangential: Number | None = None, prism: Number | None = None,
+            affine: Number | None = None, image_size: Number | None = None,
+        ) -> Self: ...  # fmt: skip

@@ -17,7 +17,7 @@ Size = tuple[int, int] | None  # (H, W) px
 class ImageFrame(LensBatch):
     """Lenses in their images: maps points around the principal point to pixels, and back."""
 
-    theta_max = Parameter(low=0, open=True, optional=True, by_place=True)
+    theta_max = Parameter(low=0, open=True, optional=True, by_place=True, angle=True)
     center = Parameter(shape=(2,), optional=True, by_place=True)
     affine = Parameter(shape=(2, 2), optional=True)
     image_size = Parameter(low=1, shape=(2,), optional=True)

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable
 from functools import cache
-from typing import ClassVar, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import torch
 from torch import Tensor
@@ -19,7 +19,7 @@ class FocalLens(Lens, register=False):
     focal = Parameter(low=0, open=True, in_pixels=True, bounds=(1e-9, math.inf))
 
     @classmethod
-    def from_fov(cls, *arguments: Number | None, **named: Number | None) -> Self:
+    def from_fov(cls, *arguments: Any, **named: Any) -> Self:
         """The lens whose full field of view fills a circle.
 
         Args:
@@ -31,9 +31,12 @@ class FocalLens(Lens, register=False):
         """
         rows = cls._expanded(cls._of_fov().bind(f"{cls.__name__}.from_fov", arguments, named))
         theta_max, radius = rows.pop("fov") / 2, rows.pop("radius")
-        unit = rows | {"focal": torch.ones_like(radius), "theta_max": theta_max}
-        focal = cls._from_tensors(unit)._scale_to(radius)
-        return cls(**rows, focal=focal, theta_max=theta_max)
+        lens = cls(**rows, focal=torch.ones_like(radius))
+        lens._require("radius", (radius > 0) & radius.isfinite(), "finite and above 0", radius)
+        lens._set_theta_max(theta_max, "fov")
+        lens.focal = lens._scale_to(radius)
+        lens._set_theta_max(theta_max, "fov")  # a limit by rounding depends on the focal length
+        return lens
 
     @classmethod
     @cache
@@ -66,6 +69,14 @@ class IdealLens(FocalLens, register=False):
         rise = radius / self._row(self.focal, radius.dim())
         # Rounding can raise u above its largest value, which has no angle.
         return self._fall(rise if self._top is None else rise.clamp(max=self._top))
+
+    if TYPE_CHECKING:
+
+        @classmethod
+        def from_fov(
+            cls, fov: Number, radius: Number, center: Number | None = None, *,
+            affine: Number | None = None, image_size: Number | None = None,
+        ) -> Self: ...  # fmt: skip
 
 
 class Perspective(IdealLens):
@@ -118,7 +129,9 @@ class FieldOfView(FocalLens):
     Source: Devernay and Faugeras, MVA 2001, sec. 3.1.
     """
 
-    omega = Parameter(low=0, high=math.pi, open=True, starts=(1.0,), bounds=(1e-3, 3.14))
+    omega = Parameter(
+        low=0, high=math.pi, open=True, angle=True, starts=(1.0,), bounds=(1e-3, 3.14)
+    )
 
     def project(self, theta: Number) -> Tensor:
         theta, omega, focal = self._aligned(theta, "omega", "focal")
@@ -129,3 +142,11 @@ class FieldOfView(FocalLens):
         radius, omega, focal = self._aligned(radius, "omega", "focal")
         angle, tangent = radius * omega / focal, 2 * torch.tan(omega / 2)
         return torch.atan2(torch.sin(angle), tangent * torch.cos(angle))
+
+    if TYPE_CHECKING:
+
+        @classmethod
+        def from_fov(
+            cls, omega: Number, fov: Number, radius: Number, center: Number | None = None, *,
+            affine: Number | None = None, image_size: Number | None = None,
+        ) -> Self: ...  # fmt: skip

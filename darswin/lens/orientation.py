@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from darswin.lens.base import Lens
+from darswin.utils.angles import check_turn
 from darswin.utils.exif import TURNS
 
 
@@ -65,7 +66,7 @@ def rotated(lens: Lens, angle: float) -> tuple[Lens, Tensor]:
 
     Args:
         lens: one lens, with an image_size or a center.
-        angle: rad, from x to y.
+        angle: rad, in [-2π, 2π], from x to y.
 
     Returns:
         The lens, which is the same unless it has tangential or thin-prism terms; and a (2, 3)
@@ -73,6 +74,7 @@ def rotated(lens: Lens, angle: float) -> tuple[Lens, Tensor]:
     """
     if len(lens) != 1:
         raise ValueError(f"rotated takes one lens, got {len(lens)}")
+    check_turn("angle", angle)
     cos, sin = math.cos(angle), math.sin(angle)
     turn = torch.tensor([[cos, -sin], [sin, cos]], dtype=torch.float64)
     center, moves = lens.center_in()[0].detach().double(), turn

@@ -23,6 +23,7 @@ class Parameter:
         optional: the parameter may be None.
         by_place: an optional parameter may be given without its name.
         in_pixels: the parameter scales with the image.
+        angle: the parameter is in radians.
         starts: initial values for `fit`. bounds: the range in `fit`; None means low and high.
     """
 
@@ -34,6 +35,7 @@ class Parameter:
     optional: bool = False
     by_place: bool = False
     in_pixels: bool = False
+    angle: bool = False
     starts: tuple[float, ...] = ()
     bounds: tuple[float, float] | None = None
 

@@ -147,8 +147,8 @@ class OCamInverse(PolynomialLens):
     Source: the OCamCalib toolbox, world2cam.
     """
 
-    def _set_theta_max(self, wanted: Tensor | None) -> None:
-        super()._set_theta_max(wanted)
+    def _set_theta_max(self, wanted: Tensor | None, given: str = "theta_max") -> None:
+        super()._set_theta_max(wanted, given)
         self._require("coefficients", self.r_max > 0, "such that r at theta_max is above 0")
 
     def _slope(self, theta: Tensor) -> Tensor:

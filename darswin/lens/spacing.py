@@ -15,6 +15,7 @@ from torch import Tensor
 from darswin.lens.base import Lens
 from darswin.lens.solve import inverse
 from darswin.ops.checks import readable
+from darswin.utils.angles import degrees_hint
 
 Spacing = Literal["theta", "tan", "g", "radius"]
 SPACINGS: tuple[Spacing, ...] = ("theta", "tan", "g", "radius")
@@ -38,7 +39,8 @@ def check_tan(lens: Lens) -> None:
 def check_fixed_theta_max(theta_max: float, *spacings: Spacing) -> None:
     """Raises ValueError unless a fixed θ_max is in (0, π) and the spacings are "theta"."""
     if not 0 < theta_max < math.pi:
-        raise ValueError(f"theta_max must be in (0, π), got {theta_max}")
+        hint = degrees_hint(theta_max)
+        raise ValueError(f"theta_max must be in (0, π), got {theta_max}{hint}")
     for spacing in spacings:
         if spacing != "theta":
             raise ValueError(f"a fixed theta_max needs spacing='theta', got {spacing!r}")

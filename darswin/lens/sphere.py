@@ -1,6 +1,7 @@
 """Lenses that project through a sphere or an ellipsoid, with closed-form inverses."""
 
 import math
+from typing import TYPE_CHECKING, Self
 
 import torch
 from torch import Tensor
@@ -43,6 +44,14 @@ class Spherical(FocalLens):
         radius, xi, focal = self._aligned(radius, "xi", "focal")
         return sphere_angle(radius / focal, xi)
 
+    if TYPE_CHECKING:
+
+        @classmethod
+        def from_fov(
+            cls, xi: Number, fov: Number, radius: Number, center: Number | None = None, *,
+            affine: Number | None = None, image_size: Number | None = None,
+        ) -> Self: ...  # fmt: skip
+
 
 class EnhancedUnified(FocalLens):
     """r = f sin θ / (α √(β sin² θ + cos² θ) + (1 - α) cos θ): EUCM; β = 1 is the unified model.
@@ -84,6 +93,15 @@ class EnhancedUnified(FocalLens):
         z = (1 - alpha * alpha * square) / (alpha * root(rest) + (1 - alpha))
         return torch.atan2(rho, z)
 
+    if TYPE_CHECKING:
+
+        @classmethod
+        def from_fov(
+            cls, alpha: Number, beta: Number, fov: Number, radius: Number,
+            center: Number | None = None, *, affine: Number | None = None,
+            image_size: Number | None = None,
+        ) -> Self: ...  # fmt: skip
+
 
 class DoubleSphere(FocalLens):
     """r = f sin θ / (α √(sin² θ + (ξ + cos θ)²) + (1 - α) (ξ + cos θ)).
@@ -123,6 +141,15 @@ class DoubleSphere(FocalLens):
         second = z * z + (1 - xi * xi) * square
         scale = (z * xi + root(second)) / (z * z + square)
         return torch.atan2(scale * rho, scale * z - xi)
+
+    if TYPE_CHECKING:
+
+        @classmethod
+        def from_fov(
+            cls, xi: Number, alpha: Number, fov: Number, radius: Number,
+            center: Number | None = None, *, affine: Number | None = None,
+            image_size: Number | None = None,
+        ) -> Self: ...  # fmt: skip
 
 
 def sphere_angle(rho: Tensor, xi: Tensor) -> Tensor:

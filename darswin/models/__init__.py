@@ -2,10 +2,11 @@
 
 from darswin.models.base import FeatureInfo, Model
 from darswin.models.conv_unet import ConvUnet
+from darswin.models.create import create_model
 from darswin.models.darswin import DarSwin
 from darswin.models.dat import DAT
 from darswin.models.encoder import Encoder, FeatureMaps
-from darswin.models.registry import create_model, list_models, list_pretrained, pretrained_file
+from darswin.models.registry import list_models, list_pretrained, pretrained_file
 from darswin.models.saving import ModelCard, NoCardError, load_model, read_card, save_model
 from darswin.models.swin import Swin
 from darswin.models.unet import Unet

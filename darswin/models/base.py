@@ -1,5 +1,6 @@
 """The base class of all models: how they are called, and how they describe themselves."""
 
+import warnings
 from collections.abc import Sequence
 from typing import Any
 
@@ -11,7 +12,13 @@ from darswin.layers.polar import check_images, check_lens
 from darswin.layers.transformer import Block, Mlp, WindowAttention
 from darswin.lens import Lens
 from darswin.models.stages import Pair, StagePlan
+from darswin.ops._library import transformed
+from darswin.ops.checks import per_channel, readable
 from darswin.ops.reference import normalized
+
+# Images in floating point with larger values have not been normalized: with ImageNet's statistics,
+# normalized images end at 2.7.
+LARGEST_NORMALIZED = 20
 
 
 class FeatureInfo(list[dict[str, Any]]):
@@ -57,6 +64,7 @@ class Model(nn.Module):
     Attributes:
         in_chans: C, the number of channels of the images.
         num_classes: the number of classes of the result.
+        mean, std: the normalization of `normalize`, for each channel.
         image_size: the size (H, W) that all images must have; None allows any size.
         square_images: True if the images must be square.
         uses_lens: False if the model ignores its lens, which may then be None.
@@ -75,9 +83,10 @@ class Model(nn.Module):
     refines_with_images = False
     in_chans: int
     num_classes: int
-    mean: Sequence[float]
-    std: Sequence[float]
+    mean: float | Sequence[float] | None
+    std: float | Sequence[float] | None
     matmul_backend: MatmulBackend = "torch"  # see `set_matmul_backend`
+    _looks = 3  # the number of calls that still look at the values of their images
 
     def __init__(self) -> None:
         super().__init__()
@@ -127,12 +136,14 @@ class Model(nn.Module):
         """The result of `forward`, with the lens given as the result of `prepare`.
 
         Args:
-            images: (B, C, H, W); images of uint8 may also be (B, H, W, C).
+            images: (B, C, H, W), in floating point and normalized; or of uint8, also (B, H, W, C),
+                which the model normalizes itself.
             prepared: the result of `prepare` for B lenses or one, and for the size of the images.
 
         Raises:
             TypeError: the images are no tensor, or have a dtype that the model cannot take.
-            ValueError: the images have a wrong shape, or the number of lenses is neither B nor 1.
+            ValueError: the images have a wrong shape or are on another device than the model, or
+                the number of lenses is neither B nor 1.
         """
         return self._run(self._checked(images), prepared)
 
@@ -164,6 +175,7 @@ class Model(nn.Module):
             ValueError: an argument has a wrong shape, or the number of lenses is neither B nor 1.
         """
         sampled = self._checked_sampled(sampled, prepared)
+        self._check_device("sampled", sampled)
         if not self.refines_with_images:
             images = None
         elif images is None:
@@ -177,17 +189,75 @@ class Model(nn.Module):
         height, width = images.shape[2:]
         return images, self.prepare(lens, (height, width))
 
+    def normalize(self, images: Tensor) -> Tensor:
+        """`(image - mean) / std` for each channel: floating point as the model takes it.
+
+        Images of uint8 need no call: the model normalizes them. It takes images in floating point
+        as they are.
+
+        Args:
+            images: (B, C, H, W), in floating point in [0, 1]; or of uint8 in [0, 255], also
+                (B, H, W, C).
+
+        Returns:
+            (B, C, H, W) in the dtype of the weights.
+
+        Raises:
+            TypeError: the images are no tensor, or neither in floating point nor of uint8.
+            ValueError: the images have a wrong shape or are on another device than the model; or
+                their values, which are looked at on the CPU, are far beyond 1.
+        """
+        images = self._with_shape(images)
+        if images.dtype != torch.uint8:
+            if not images.is_floating_point():
+                raise TypeError(f"images must be in floating point or uint8, got {images.dtype}")
+            largest = _largest(images)
+            if largest > LARGEST_NORMALIZED:
+                raise ValueError(
+                    f"images in floating point must be in [0, 1], got values up to {largest:g}: "
+                    "divide them by 255, or pass uint8"
+                )
+        return self._normalized(images)
+
     def _checked(self, images: Tensor) -> Tensor:
-        """The images as (B, C, H, W), after a check of their channels and their size."""
+        """The result of `_with_shape`. Warns once if the values cannot be normalized ones."""
+        images = self._with_shape(images)
+        if not torch.compiler.is_compiling() and self._looks and images.is_floating_point():
+            self._looks -= 1
+            largest = _largest(images)
+            if largest > LARGEST_NORMALIZED:
+                self._looks = 0
+                warnings.warn(
+                    "images in floating point are taken as they are, but these have values up to "
+                    f"{largest:g}: pass uint8, or model.normalize(images / 255)",
+                    stacklevel=2,
+                )
+        return images
+
+    def _with_shape(self, images: Tensor) -> Tensor:
+        """The images as (B, C, H, W), after a check of their channels, size and device."""
         images = check_images(images, channels=self.in_chans)
         if images.shape[1] != self.in_chans:
-            raise ValueError(f"images must have {self.in_chans} channels, got {images.shape[1]}")
+            last = images.shape[3] == self.in_chans
+            advice = "; the channels come first: pass images.permute(0, 3, 1, 2)" if last else ""
+            raise ValueError(
+                f"images must have {self.in_chans} channels, got {images.shape[1]}{advice}"
+            )
         if self.image_size is not None and images.shape[2:] != self.image_size:
             raise ValueError(
                 f"images must have the model's image_size, (H, W) = {self.image_size}, "
                 f"got {tuple(images.shape[2:])}"
             )
+        self._check_device("images", images)
         return images
+
+    def _check_device(self, name: str, images: Tensor) -> None:
+        weight = next(self.parameters(), None)
+        if weight is not None and weight.device != images.device:
+            raise ValueError(
+                f"{name} must be on the device of the model, {weight.device}, got {images.device}: "
+                f'pass {name}.to("{weight.device}")'
+            )
 
     def _checked_sampled(self, sampled: Tensor, prepared: Any) -> Tensor:
         """The pixels of `run_sampled`, after a check of their shape."""
@@ -195,11 +265,16 @@ class Model(nn.Module):
 
     def _floating(self, images: Tensor) -> Tensor:
         """The images in floating point: uint8 images are normalized, others stay as they are."""
-        if images.dtype != torch.uint8:
-            return images
-        dtype = next(self.parameters()).dtype
+        return images if images.dtype != torch.uint8 else self._normalized(images)
+
+    def _normalized(self, images: Tensor) -> Tensor:
+        weight = next(self.parameters(), None)
+        dtype = torch.float32 if weight is None else weight.dtype
         exact = torch.promote_types(dtype, torch.float32)
-        return normalized(images, self.mean, self.std, exact).to(dtype)
+        assert self.mean is not None and self.std is not None
+        mean = per_channel("mean", self.mean, images.shape[1])
+        std = per_channel("std", self.std, images.shape[1])
+        return normalized(images, mean, std, exact).to(dtype)
 
     def no_weight_decay(self) -> set[str]:
         """Names of the parameters without weight decay, in addition to biases and norms."""
@@ -231,6 +306,15 @@ class Model(nn.Module):
         for module in self.modules():
             if isinstance(module, (Block, Mlp, WindowAttention)):
                 module.grad_checkpointing = enable
+
+
+def _largest(images: Tensor) -> float:
+    """The largest value of plain images on the CPU. Others are not looked at, since that could
+    wait for a device or end up in a graph: 0."""
+    plain = type(images) in (Tensor, nn.Parameter) and readable(images) and not transformed()
+    if not plain or torch.jit.is_tracing() or not images.numel():
+        return 0.0
+    return float(images.detach().float().numpy().max())  # NumPy's work is in no graph
 
 
 def init_weights(module: nn.Module) -> None:

@@ -43,7 +43,9 @@ class DarSwin(Encoder):
         periodic_bias: see `AngularRelativeBias`.
         options: the settings of `PolarGridSpec`, such as `rings`, `sectors`, `samples`, `spacing`
             and `theta_max`, and the other arguments of `Encoder`. With "radius" for both spacings
-            the model does not use the projection curve.
+            the model does not use the projection curve. The biases "angular_relative" and
+            "angular" count θ_max/R from ring to ring for every spacing; with a spacing other than
+            "theta" these angles are nominal.
 
     Rotation:
         Turning a square image by 90° about the principal point turns the maps by a quarter of their

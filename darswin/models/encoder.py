@@ -288,6 +288,7 @@ class FeatureMaps(Model):
         self.image_size, self.square_images = encoder.image_size, encoder.square_images
         self.uses_lens = encoder.uses_lens
         self.in_chans, self.num_classes = encoder.in_chans, 0
+        self.mean, self.std = encoder.mean, encoder.std
         self.feature_info = FeatureInfo(
             dict(encoder.feature_info[i], module=f"encoder.{encoder.feature_info[i]['module']}")
             for i in taken

@@ -1,12 +1,12 @@
 """Models by name. Each model's file registers its class in four sizes. The folder `weights` has the
 trained models that come with darswin."""
 
+import difflib
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 from darswin.models.base import Model
-from darswin.models.encoder import Encoder, FeatureMaps
 
 _SMALL = dict(embed_dim=96, depths=(2, 2, 18, 2), num_heads=(3, 6, 12, 24), drop_path_rate=0.2)
 _SIZES: dict[str, dict[str, Any]] = dict(
@@ -48,41 +48,19 @@ def list_models() -> list[str]:
     return sorted(_MODELS)
 
 
-def create_model(
-    name: str,
-    *,
-    features_only: bool = False,
-    out_indices: int | Sequence[int] | None = None,
-    output_fmt: Literal["NHWC", "NCHW"] | None = None,
-    **options: Any,
-) -> Any:
-    """A new model: an `Encoder`, which classifies images, or a `Unet`, which predicts per pixel.
-
-    Args:
-        name: one of `list_models()`.
-        features_only: makes a `FeatureMaps`, which returns the maps of an encoder's stages.
-        out_indices, output_fmt: the options of `FeatureMaps`.
-        options: arguments of the model's class, in place of the defaults for this name.
-
-    Raises:
-        ValueError: the name is unknown, or the options do not fit together.
-    """
-    if not features_only and (out_indices is not None or output_fmt is not None):
-        raise ValueError("out_indices and output_fmt need features_only=True")
-    model = model_class(name)(**(_MODELS[name][1] | options))
-    model.pretrained_cfg["architecture"] = name
-    if not features_only:
-        return model
-    if not isinstance(model, Encoder):
-        raise ValueError(f"features_only is for encoders, but {name} is a Unet")
-    return FeatureMaps(model, out_indices, output_fmt or "NHWC")
-
-
 def model_class(name: str) -> type[Model]:
     """The class of the model with this name; ValueError for an unknown name."""
+    if name in list_pretrained():
+        raise ValueError(f"{name!r} is a trained model: load_model({name!r}) loads it")
     if name not in _MODELS:
-        raise ValueError(f"unknown model {name!r}; the models are {', '.join(list_models())}")
+        raise ValueError(f"unknown model {name!r}; {nearest(name, list_models())}")
     return _MODELS[name][0]
+
+
+def nearest(name: str, names: Sequence[str]) -> str:
+    """A sentence that suggests the two names that are most like the given one."""
+    alike = difflib.get_close_matches(name.lower(), names, 2, 0)
+    return f"did you mean {' or '.join(alike)}? `darswin models` lists all names"
 
 
 def preset(name: str) -> dict[str, Any]:
@@ -101,6 +79,17 @@ def list_pretrained() -> list[str]:
     return sorted(file.stem for file in _WEIGHTS.glob("*.safetensors"))
 
 
+def no_weights(name: str) -> ValueError:
+    """The error for a name that is none of `list_pretrained()`."""
+    known = ", ".join(list_pretrained())
+    if name in _MODELS:
+        return ValueError(
+            f"no trained {name} comes with darswin; load_model and `darswin predict --model` know "
+            f"{known}, and `darswin fit` trains other models"
+        )
+    return ValueError(f"no model {name!r} comes with darswin; the models are {known}")
+
+
 def pretrained_file(
     name: str, kind: Literal["safetensors", "md", "png", "json"] = "safetensors"
 ) -> Path:
@@ -115,7 +104,5 @@ def pretrained_file(
         ValueError: the name is unknown.
     """
     if name not in list_pretrained():
-        raise ValueError(
-            f"no model {name!r} comes with darswin; the models are {', '.join(list_pretrained())}"
-        )
+        raise no_weights(name)
     return _WEIGHTS / f"{name}.{kind}"

@@ -5,19 +5,21 @@ import math
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal, get_args, overload
 
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save
 from torch import Tensor
 
 from darswin.layers.quantized import Quantization, with_quantized_layers
 from darswin.lens.files.fields import short
-from darswin.models.registry import create_model, list_pretrained, pretrained_file
-from darswin.utils.files import replace_file
+from darswin.models.create import create_model
+from darswin.models.darswin import DarSwin
+from darswin.models.encoder import Encoder
+from darswin.models.pixel import PixelModel
+from darswin.models.registry import list_models, list_pretrained, no_weights, pretrained_file
 from darswin.utils.tasks import Task
+from darswin.utils.tensor_files import read_metadata, read_tensors, write_tensors
 
 Fit = Literal["crop", "stretch", "whole"]
 
@@ -61,7 +63,22 @@ class ModelCard:
         """The number of channels of the images, 1 for grey and 3 for colours."""
         return self.options.get("in_chans", 3)
 
-    def create(self) -> Any:
+    @property
+    def mean(self) -> float | Sequence[float]:
+        """The mean of the normalization, for pixels in [0, 1]; see `Model.normalize`."""
+        return self.options.get("mean", 0.0)
+
+    @property
+    def std(self) -> float | Sequence[float]:
+        """The standard deviation of the normalization, for pixels in [0, 1]."""
+        return self.options.get("std", 1.0)
+
+    def __repr__(self) -> str:
+        shown = {field.name: getattr(self, field.name) for field in fields(self)}
+        shown |= dict(channels=self.channels, mean=self.mean, std=self.std)
+        return f"ModelCard({', '.join(f'{name}={value!r}' for name, value in shown.items())})"
+
+    def create(self) -> Encoder | PixelModel:
         """The model, with new weights."""
         model = create_model(self.model, **self.options)
         activations = {
@@ -75,9 +92,7 @@ class ModelCard:
 def save_model(path: str | os.PathLike, weights: Mapping[str, Tensor], card: ModelCard) -> None:
     """Writes a model's state dict and its card to a file. An older file is replaced in one step."""
     contiguous = {name: tensor.detach().cpu().contiguous() for name, tensor in weights.items()}
-    replace_file(
-        path, save(contiguous, metadata={_ENTRY: json.dumps(asdict(card), allow_nan=False)})
-    )
+    write_tensors(path, contiguous, {_ENTRY: json.dumps(asdict(card), allow_nan=False)})
 
 
 def model_of_run(run: str | os.PathLike, suffix: str = ".safetensors") -> Path:
@@ -99,7 +114,14 @@ def read_card(path: str | os.PathLike) -> ModelCard:
         NoCardError: the file has no card.
         ValueError: the file is no safetensors file, or its card is wrong.
     """
-    return _read(path, with_weights=False)[1]
+    path = model_file(path)
+    return _card(path, read_metadata(path))
+
+
+@overload
+def load_model(path: Literal["digits"]) -> tuple[DarSwin, ModelCard]: ...
+@overload
+def load_model(path: str | os.PathLike) -> tuple[Encoder | PixelModel, ModelCard]: ...
 
 
 def load_model(path: str | os.PathLike) -> tuple[Any, ModelCard]:
@@ -110,10 +132,12 @@ def load_model(path: str | os.PathLike) -> tuple[Any, ModelCard]:
 
     Raises:
         NoCardError: the file has no card.
-        ValueError: the file is no safetensors file, its card is wrong, or the weights do not fit
-            the model of the card.
+        ValueError: the file is no safetensors file or is damaged, its card is wrong, or the weights
+            do not fit the model of the card.
     """
-    path, card, weights = _read(path, with_weights=True)
+    path = model_file(path)
+    weights, metadata = read_tensors(path)
+    card = _card(path, metadata)
     with _about(path):
         model = _created(card, weights)
     model.pretrained_cfg |= dict(label_names=tuple(card.classes), file=str(path))
@@ -124,25 +148,29 @@ def load_model(path: str | os.PathLike) -> tuple[Any, ModelCard]:
     return model.eval(), card
 
 
-def _read(
-    path: str | os.PathLike, *, with_weights: bool
-) -> tuple[str | os.PathLike, ModelCard, dict[str, Tensor]]:
-    """The path of the file, its card, and its weights if they are wanted."""
-    path = pretrained_file(str(path)) if path in list_pretrained() else path
-    try:
-        with safe_open(path, "pt") as file:
-            entry = (file.metadata() or {}).get(_ENTRY)
-            names = file.keys() if with_weights else ()
-            weights = {name: file.get_tensor(name) for name in names}
-    except SafetensorError as error:
-        raise ValueError(f"{path} is no safetensors file: {error}") from error
-    if entry is None:
+def model_file(path: str | os.PathLike) -> str | os.PathLike:
+    """The path, or that of the trained model with this name.
+
+    Raises:
+        ValueError: the name is that of a model without trained weights.
+        FileNotFoundError: there is neither a file nor a model of this name.
+    """
+    name = os.fspath(path)
+    is_name = not (os.path.dirname(name) or os.path.splitext(name)[1] or os.path.exists(name))
+    if is_name and name not in (*list_pretrained(), *list_models()):
+        raise FileNotFoundError(f"there is no file {name}, and {no_weights(name)}")
+    return pretrained_file(name) if is_name or name in list_pretrained() else path
+
+
+def _card(path: str | os.PathLike, metadata: Mapping[str, str]) -> ModelCard:
+    """The card in the metadata of a file."""
+    if _ENTRY not in metadata:
         raise NoCardError(f"{path} has weights, but not the name of their model")
     with _about(path):
-        return path, _card(entry), weights
+        return _parsed(metadata[_ENTRY])
 
 
-def _card(entry: str) -> ModelCard:
+def _parsed(entry: str) -> ModelCard:
     try:
         values = json.loads(entry)
     except ValueError as error:
@@ -158,7 +186,7 @@ def _card(entry: str) -> ModelCard:
     return ModelCard(**known)
 
 
-def _created(card: ModelCard, weights: Mapping[str, Tensor]) -> Any:
+def _created(card: ModelCard, weights: Mapping[str, Tensor]) -> Encoder | PixelModel:
     """The card's model with these weights; ValueError if they do not fit."""
     try:
         model = card.create()

@@ -2,7 +2,7 @@
 maps. A view also resamples the results of a network back to the pixels of the images."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import Any, Literal
 
@@ -19,7 +19,8 @@ from darswin.lens.spacing import SPACINGS, Spacing, check_fixed_theta_max
 from darswin.models.base import Model
 from darswin.models.stages import Pair
 from darswin.ops import polar_to_image
-from darswin.ops.checks import as_int
+from darswin.ops.checks import as_int, per_channel
+from darswin.utils.angles import degrees_hint
 
 ViewName = Literal["none", "perspective", "square"]
 
@@ -88,7 +89,8 @@ class PerspectiveView(PlainView):
     def __init__(self, size: Pair, max_fov: float = math.radians(175)):
         super().__init__(size)
         if not 0 < max_fov < math.pi:
-            raise ValueError(f"max_fov must be in (0, π), got {max_fov}")
+            hint = degrees_hint(max_fov)
+            raise ValueError(f"max_fov must be in (0, π), got {max_fov}{hint}")
         self.max_fov = float(max_fov)
 
     def image_points(self, lens: Lens, size: Pair) -> Tensor:
@@ -206,7 +208,7 @@ class LensAdapter(Model):
 
     The network sees equal steps of θ at equal distances from the centre, whatever the lens is. It
     may come from timm, from segmentation_models_pytorch or from you, trained or not. The adapter is
-    called `adapter(images, lens)`, with images in floating point.
+    called `adapter(images, lens)`. It gives images in floating point to the network as they are.
 
     Args:
         network: a module that takes images (B, C, S, S).
@@ -216,10 +218,15 @@ class LensAdapter(Model):
             thing in the square then depends on the lens, and the network is not told. If sizes
             matter, as for distances, give the widest θ_max of your lenses. The square is 0 beyond
             θ_max of a lens.
+        mean, std: the normalization of uint8 images that the network expects, `(pixel/255 - mean) /
+            std`, one number or one for each channel. None refuses uint8 images.
+        output: "pixels" resamples results with 4 dimensions as described; "view" returns all
+            results as the network made them, in the square.
 
     Raises:
-        ValueError: the size is below 1, the spacing is unknown, or theta_max is not in (0, π) or
-            has another spacing than "theta".
+        ValueError: the size is below 1, the spacing or the output is unknown, theta_max is not in
+            (0, π) or has another spacing than "theta", or mean and std do not fit together.
+        TypeError: in forward, images of uint8 without mean and std.
 
     Source: the concentric map of Shirley and Chiu, JGT 1997.
     """
@@ -230,41 +237,68 @@ class LensAdapter(Model):
         size: int,
         spacing: Spacing = "theta",
         theta_max: float | None = None,
+        *,
+        mean: float | Sequence[float] | None = None,
+        std: float | Sequence[float] | None = None,
+        output: Literal["pixels", "view"] = "pixels",
     ):
         super().__init__()
         if (as_int(size) or 0) < 1:
             raise ValueError(f"size must be an int of at least 1, got {size!r}")
-        self.network = network
+        if output not in ("pixels", "view"):
+            raise ValueError(f"output must be 'pixels' or 'view', got {output!r}")
+        self.network, self.output = network, output
         self.view = SquareView((int(size), int(size)), spacing, theta_max)
+        if (mean is None) != (std is None):
+            raise ValueError(f"mean and std must be given together, got {mean} and {std}")
+        if mean is None or std is None:
+            self._looks = 0  # the network may expect any values
+        else:
+            channels = max(len(tuple(v)) if isinstance(v, Iterable) else 1 for v in (mean, std))
+            per_channel("mean", mean, channels), per_channel("std", std, channels)
+        self.mean, self.std = mean, std
 
-    def _prepare(self, lens: Any, size: Pair) -> tuple[Tensor, Tensor]:
-        return self.view.image_points(lens, size), self.view.view_points(lens, size)
+    def _prepare(self, lens: Any, size: Pair) -> tuple[Tensor, Tensor | None]:
+        back = self.view.view_points(lens, size) if self.output == "pixels" else None
+        return self.view.image_points(lens, size), back
 
-    def _checked(self, images: Tensor) -> Tensor:
-        if isinstance(images, Tensor) and not images.is_floating_point():
-            raise TypeError(f"images must be in floating point, got {images.dtype}")
+    def normalize(self, images: Tensor) -> Tensor:
+        if self.mean is None:
+            raise ValueError("normalize needs an adapter with mean and std")
+        return super().normalize(images)
+
+    def _with_shape(self, images: Tensor) -> Tensor:
+        taken = (torch.uint8,) if self.mean is not None else ()
+        if isinstance(images, Tensor) and not (images.is_floating_point() or images.dtype in taken):
+            hint = "" if taken else "; with mean and std, an adapter takes uint8 too"
+            raise TypeError(f"images must be in floating point, got {images.dtype}{hint}")
         return check_images(images)
 
-    def _sample(self, images: Tensor, prepared: tuple[Tensor, Tensor]) -> Tensor:
-        return self.view.to_view(images, prepared[0])
+    def _check_device(self, name: str, images: Tensor) -> None:
+        """No check: the network may move its images itself."""
 
-    def _points(self, prepared: tuple[Tensor, Tensor]) -> Tensor:
+    def _sample(self, images: Tensor, prepared: tuple[Tensor, Any]) -> Tensor:
+        return self.view.to_view(self._floating(images), prepared[0])
+
+    def _points(self, prepared: tuple[Tensor, Any]) -> Tensor:
         return prepared[0]
 
-    def _run_sampled(
-        self, sampled: Tensor, prepared: tuple[Tensor, Tensor], images: Tensor | None
-    ) -> Any:
+    def _run_sampled(self, sampled: Tensor, prepared: Any, images: Tensor | None) -> Any:
         return self._run(sampled, (None, prepared[1]))
 
-    def _run(self, images: Tensor, prepared: tuple[Tensor | None, Tensor]) -> Any:
+    def _run(self, images: Tensor, prepared: tuple[Any, Tensor | None]) -> Any:
         image_points, view_points = prepared
+        results = self.network(self.view.to_view(self._floating(images), image_points))
+        if view_points is None:
+            return results
 
         def to_images(out: Any) -> Any:
             has_pixels = isinstance(out, Tensor) and out.dim() == 4
             return self.view.to_images(out, view_points) if has_pixels else out
 
-        return pytree.tree_map(to_images, self.network(self.view.to_view(images, image_points)))
+        return pytree.tree_map(to_images, results)
 
     def extra_repr(self) -> str:
         edge = "" if self.view.theta_max is None else f", theta_max={self.view.theta_max:g}"
-        return f"size={self.view.size[0]}, spacing={self.view.spacing!r}{edge}"
+        size, spacing = self.view.size[0], self.view.spacing
+        return f"size={size}, spacing={spacing!r}{edge}, output={self.output!r}"

@@ -11,6 +11,7 @@ from darswin.ops.checks import (
     DTYPES,
     as_int,
     channels_first,
+    check_has_batch,
     check_jitter,
     check_pair,
     check_tensor,
@@ -79,6 +80,8 @@ def checked_sampling(
     """Checks the arguments of the public functions. Raises TypeError or ValueError."""
     image = _library.without_float16(image)
     pixels = (*DTYPES, torch.bfloat16, torch.uint8)
+    if isinstance(image, Tensor):
+        check_has_batch("image", image, channels_last)
     check_tensor("image", image, pixels, "(B, C, H, W)", (None,) * 4)
     image = channels_first("image", image, channels_last)
     batch = image.shape[0]

@@ -106,6 +106,24 @@ def check_pair(name: str, value: Sequence[int], lowest: int) -> tuple[int, int]:
     return first, second
 
 
+def check_has_batch(
+    name: str, image: Tensor, channels_last: bool | None = None, channels: int | None = None
+) -> None:
+    """Raises ValueError, with advice, unless an image has four dimensions."""
+    if image.dim() == 4:
+        return
+    shape = tuple(image.shape)
+    sizes = FRAME_CHANNELS if channels is None else (channels,)
+    advice = {2: f"; for one gray image, pass {name}[None, None]"}.get(len(shape), "")
+    if len(shape) == 3:
+        last = not channels_last and shape[2] in sizes and shape[0] not in sizes
+        turned = last and (image.dtype != torch.uint8 or channels_last is False)
+        order = ".permute(2, 0, 1)" if turned else ""
+        first = ", with the channels first" if turned else ""
+        advice = f"; for one image, pass {name}{order}[None]{first}"
+    raise ValueError(f"{name} must have shape (B, C, H, W), got {shape}{advice}")
+
+
 def channels_first(
     name: str, image: Tensor, channels_last: bool | None = None, channels: int | None = None
 ) -> Tensor:

@@ -69,13 +69,15 @@ def _jittered(
 def normalized(
     image: Tensor, mean: Sequence[float], std: Sequence[float], dtype: torch.dtype = torch.float32
 ) -> Tensor:
-    """`(pixel/255 - mean) / std` of a uint8 image (B, C, H, W), in `dtype`, for each channel."""
+    """`(pixel - mean) / std` of an image (B, C, H, W) in [0, 1], in `dtype`, for each channel. A
+    uint8 image is divided by 255 first."""
     m, s = (
         # One number is enough if all channels share it.
         tensor_there(values if len(set(values)) > 1 else values[:1], image, dtype)[:, None, None]
         for values in (mean, std)
     )
-    return (image.to(dtype) / 255 - m) / s
+    pixels = image.to(dtype) / 255 if image.dtype == torch.uint8 else image.to(dtype)
+    return (pixels - m) / s
 
 
 def polar_sample(sampling: Sampling, tokens: bool) -> Tensor:

@@ -13,7 +13,7 @@ from torchmetrics.classification import MulticlassAccuracy
 from darswin.data.augment import Mixing, partners_share
 from darswin.data.lens_distributions import SphericalLenses, parse_lenses
 from darswin.train.task import Batch, Task, finite_loss
-from darswin.viz.plot import draw_accuracy
+from darswin.viz.plot import draw_accuracy, page_figure
 
 __all__ = ["Classification"]
 
@@ -106,7 +106,7 @@ class Classification(Task):
 
     def results_figure(self) -> Figure:
         """Accuracy against ξ if each test set has a single ξ, otherwise bars."""
-        figure = Figure(figsize=(7, 4.2), layout="constrained")
+        figure = page_figure(4)
         axes = figure.subplots()
         name, rows = self.card.model, self.results
         accuracy = [100 * row["top1"] for row in rows]

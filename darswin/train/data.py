@@ -13,6 +13,7 @@ from torch.utils.data import DataLoader
 
 from darswin.data.augment import RandAugment, RandomErasing
 from darswin.data.cameras import Calibrations, is_json
+from darswin.data.headers import check_files
 from darswin.data.lens_distributions import parse_lenses, parse_sweep
 from darswin.data.order import ResumableLoader, TrainingOrder
 from darswin.data.pictures import Source, open_source
@@ -143,7 +144,15 @@ class RunData(LightningDataModule):
         if split not in self._sources:
             # All splits have the channels of the training split.
             channels = self._channels if split == "train" else self.channels
-            self._sources[split] = self._open(split, channels)
+            try:
+                self._sources[split] = self._open(split, channels)
+            except FileNotFoundError as error:
+                if split == "train" or self._opening["holdout"]:
+                    raise
+                raise ValueError(
+                    f"`holdout` 0 leaves no pictures for {split!r}, and {self.path} has none of "
+                    "its own; set `limit_val_batches` 0 to train without validation"
+                ) from error
         return self._sources[split]
 
     @property
@@ -231,6 +240,11 @@ class RunData(LightningDataModule):
         """The training split, augmented."""
         raise NotImplementedError
 
+    def check(self, splits: Sequence[Split]) -> None:
+        """Raises one error for all files of these splits that a training could not use."""
+        for split in splits:
+            check_files(self.dataset(split), f"the pictures of {split!r}")
+
     def train_dataloader(self) -> ResumableLoader:
         """The batches of the training split, in an order that can be resumed."""
         dataset = self._training()
@@ -265,15 +279,7 @@ class RunData(LightningDataModule):
         raise NotImplementedError
 
     def _evaluation(self, split: Split, name: str | None = None) -> DataLoader:
-        try:
-            dataset = self.dataset(split, name)
-        except FileNotFoundError as error:
-            if self._opening["holdout"]:
-                raise
-            raise ValueError(
-                f"`holdout` 0 leaves no pictures for {split!r}, and {self.path} has none of its "
-                "own; set `limit_val_batches` 0 to train without validation"
-            ) from error
+        dataset = self.dataset(split, name)
         count, place = len(dataset), self._place
         part = range(place["rank"], count, place["world"])
         if not part:

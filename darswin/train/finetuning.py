@@ -10,7 +10,7 @@ from darswin.layers.quantized import without_quantized_layers
 from darswin.models.base import Model
 from darswin.models.encoder import Encoder
 from darswin.models.pixel import PixelModel
-from darswin.models.registry import list_models, model_class, preset
+from darswin.models.registry import list_models, model_class, nearest, preset
 from darswin.models.saving import ModelCard, load_model, model_of_run
 from darswin.models.unet import Unet
 from darswin.utils.files import check_is_file
@@ -55,8 +55,7 @@ def check_name(name: str, task: Task) -> None:
     model_class(name)
     if name not in models_for(task):
         raise ValueError(
-            f"`name` {name} is no model for `task` {task}; choose from "
-            f"{', '.join(models_for(task))}"
+            f"`name` {name} is no model for `task` {task}; {nearest(name, models_for(task))}"
         )
 
 

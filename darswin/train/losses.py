@@ -6,7 +6,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from darswin.data.scenes.scene import IGNORE
+from darswin.data.scenes.targets import IGNORE
 
 __all__ = ["distance_loss", "label_loss"]
 

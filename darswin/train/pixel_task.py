@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from torch import Tensor, nn
 from torchmetrics import MeanMetric
 
-from darswin.data.scenes.scene import IGNORE
+from darswin.data.scenes.targets import IGNORE
 from darswin.lens import Lens
 from darswin.lens.pixels import pixel_angles, solid_angles
 from darswin.train.pixel_metrics import BY_AREA, PixelSums, Zones, none_of_nan

@@ -9,7 +9,8 @@ import torch
 
 from darswin.data.scenes import open_scenes
 from darswin.data.scenes.dataset import SceneSamples
-from darswin.data.scenes.scene import Scenes, Target
+from darswin.data.scenes.scene import Scenes
+from darswin.data.scenes.targets import Target
 from darswin.data.splits import Split
 from darswin.train.data import RunData
 from darswin.train.task import Batch
@@ -49,10 +50,11 @@ class SceneData(RunData):
         self.crop = crop
 
     def _open(self, split: Split, channels: int | None) -> Scenes:
-        return open_scenes(
+        scenes = open_scenes(
             self.path, split, self.target, channels=channels, lens=self._lens,
             camera=self._camera, coefficients=self._coefficients, **self._opening,
         )  # fmt: skip
+        return scenes if split == "train" else self._of_same_classes(scenes, f"its {split!r} split")
 
     @property
     def colors(self) -> list[list[int]]:  # type: ignore[override]  # as `classes`
@@ -75,9 +77,12 @@ class SceneData(RunData):
         opening = self._opening | dict(splits=None, channels=self.channels)
         flat = (Path(path) / "images").is_dir()
         scenes = open_scenes(path, "all" if flat else "test", self.target, **opening)
+        return self._of_same_classes(scenes, path)
+
+    def _of_same_classes(self, scenes: Scenes, what: str) -> Scenes:
         if scenes.classes != self.classes:
             raise ValueError(
-                f"{path} has the classes {scenes.classes}, but {self.path} has {self.classes}: "
+                f"{what} has the classes {scenes.classes}, but {self.path} has {self.classes}: "
                 "test a model on the classes that it was trained on"
             )
         return scenes
@@ -103,7 +108,8 @@ class LabelData(SceneData):
     Args:
         path: a folder of scenes: see `darswin.data.open_scenes`.
         label_map: a JSON file that gives ids in the label files their classes, by name or by id,
-            such as {"7": "road", "8": 1, "9": null}; ids that it leaves out count as unlabelled.
+            such as {"7": "road", "8": 1, "9": null}; null means unlabelled. It must have all ids
+            that are not the data set's own.
         common: as `SceneData`.
     """
 

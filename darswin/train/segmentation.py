@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from darswin.data.scenes.scene import IGNORE
+from darswin.data.scenes.targets import IGNORE
 from darswin.data.splits import some
 from darswin.ops.checks import tensor_there
 from darswin.train.losses import DistanceLoss, LabelLoss, distance_loss, label_loss

@@ -1,9 +1,11 @@
 """Reading picture files, turned upright by their EXIF orientation."""
 
 import io
+import os
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -12,9 +14,11 @@ from PIL import ExifTags, Image, UnidentifiedImageError
 from darswin.utils.exif import TURNS
 from darswin.utils.files import check_is_file
 
-__all__ = ["BrokenImageError", "read_form", "read_image", "read_oriented"]
+__all__ = ["BrokenImageError", "read_header", "read_image", "read_oriented"]
 
 _PNG = b"\x89PNG\r\n\x1a\n"
+_LAST = {"PNG": b"IEND\xaeB`\x82", "JPEG": b"\xff\xd9"}  # what complete files have at their ends
+_END = 1024  # bytes, because some programs write more behind it
 _SAYS_MORE = frozenset((b"eXIf", b"tEXt", b"zTXt", b"iTXt"))  # chunks that may hold an orientation
 
 
@@ -50,19 +54,46 @@ def read_oriented(path: str | Path, channels: int = 3) -> tuple[np.ndarray, int]
     return np.ascontiguousarray(image[down, across]), orientation
 
 
-def read_form(path: str | Path) -> tuple[int, int]:
-    """The channels of a picture file, 1 for grey and 3 for colours, and its shorter side, px.
+class Header(NamedTuple):
+    """What the header of a picture file says.
 
-    Only the header of the file is read.
+    Attributes: size: (H, W) as stored; orientation: of EXIF, 1 to 8; channels: 1 for grey, 3 for
+    colours; is_sound: False if the EXIF data are damaged, or if the file does not end as usual.
+    """
+
+    size: tuple[int, int]
+    orientation: int = 1
+    channels: int = 1
+    is_sound: bool = True
+
+    @property
+    def upright(self) -> tuple[int, int]:
+        """(H, W) of the upright picture."""
+        return self.size[::-1] if TURNS[self.orientation][0] else self.size
+
+
+def read_header(path: str | Path) -> Header:
+    """The header of a picture file, without the orientation that a PNG may name behind its pixels.
 
     Raises:
         BrokenImageError: the file is missing, unreadable or no image. The error names the file.
     """
     try:
         check_is_file(path)
-        with warnings.catch_warnings(action="ignore"), Image.open(path) as file:
+        with Path(path).open("rb") as stream, Image.open(stream) as file:
             is_grey = file.mode in ("1", "L", "LA", "F") or file.mode.startswith("I")
-            return 1 if is_grey else 3, min(file.size)
+            header = Header(file.size[::-1], channels=1 if is_grey else 3)
+            try:  # a PNG's own method decodes its pixels to look behind them
+                exif = Image.Image.getexif(file)
+            except Exception:  # damaged EXIF fails in many ways
+                return header._replace(is_sound=False)
+            if file.format == "TIFF":  # whose size is that of the upright picture
+                size = exif[ExifTags.Base.ImageLength], exif[ExifTags.Base.ImageWidth]
+                header = header._replace(size=size)
+            if (orientation := exif.get(ExifTags.Base.Orientation)) in TURNS:
+                header = header._replace(orientation=orientation)
+            stream.seek(max(0, stream.seek(0, os.SEEK_END) - _END))
+            return header._replace(is_sound=_LAST.get(file.format or "", b"") in stream.read())
     except UnidentifiedImageError as error:  # its own message repeats the path
         raise BrokenImageError(f"cannot read {path}: no image that Pillow knows") from error
     except Exception as error:  # a damaged file fails in many ways

@@ -1,7 +1,12 @@
-"""Reading text files, with the byte order marks that editors of other systems write."""
+"""Reading text and JSON files, with the byte order marks that editors of other systems write."""
 
 import codecs
+import json
+import reprlib
+from collections import Counter
+from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 _MARKS = {
     codecs.BOM_UTF8: "utf-8-sig",
@@ -30,3 +35,28 @@ def read_text(path: str | Path) -> str:
         return to_text(Path(path).read_bytes())
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
+
+
+def parse_json(text: str) -> Any:
+    """The content of JSON; ValueError if it is invalid, or if an object has a name twice."""
+    return json.loads(text, object_pairs_hook=mapping)
+
+
+def read_json(path: str | Path) -> Any:
+    """The content of a JSON file, as `read_text` and `parse_json` read it; the ValueError names the
+    file."""
+    try:
+        return parse_json(to_text(Path(path).read_bytes()))
+    except ValueError as error:
+        raise ValueError(f"{path} must be JSON: {error}") from error
+
+
+def mapping(pairs: Iterable[tuple[Any, Any]]) -> dict[Any, Any]:
+    """A mapping. Raises ValueError for two entries with the same name: parsers keep the last."""
+    pairs = list(pairs)
+    entries = dict(pairs)
+    if len(entries) < len(pairs):
+        counts = Counter(name for name, _ in pairs)
+        twice = next(name for name, count in counts.items() if count > 1)
+        raise ValueError(f"{reprlib.repr(twice)} appears twice in one mapping")
+    return entries

@@ -1,7 +1,9 @@
-"""Reading the frames of video files, turned upright by their metadata."""
+"""Reading the frames of video files, turned upright by their metadata, and writing frames."""
 
+import errno
+import math
 import os
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -14,6 +16,7 @@ SUFFIXES = frozenset((
     ".3gp", ".asf", ".avi", ".flv", ".h264", ".h265", ".hevc", ".m2ts", ".m4v", ".mjpeg", ".mjpg",
     ".mkv", ".mov", ".mp4", ".mpeg", ".mpg", ".mts", ".ogv", ".ts", ".webm", ".wmv", ".y4m",
 ))  # fmt: skip
+WRITTEN = frozenset((".avi", ".m4v", ".mkv", ".mov", ".mp4"))
 # The EXIF orientations for the turns in a video's metadata, in degrees clockwise.
 _ORIENTATIONS = {0: 1, 90: 6, 180: 3, 270: 8}
 # A video may end earlier than its header claims, e.g. if its sound is longer: by these seconds, and
@@ -63,6 +66,43 @@ def read_frames(path: str | Path, channels: int = 3, every: int = 1) -> Iterator
         _check_end(path, capture, count, time)
     finally:
         capture.release()
+
+
+def frame_rate(path: str | Path) -> float:
+    """The frames per second that a video file names; 25 if it names none, as a raw stream."""
+    capture = _opened(path)
+    rate = 0.0 if capture is None else capture.get(cv2.CAP_PROP_FPS)
+    return rate if 0 < rate < math.inf else 25.0
+
+
+def write_frames(path: str | Path, frames: Iterable[np.ndarray], rate: float) -> None:
+    """Writes frames (H, W, 3) uint8, RGB, as a video (MPEG-4, no sound); without frames, nothing.
+
+    Args:
+        path: its ending, one of `WRITTEN`, names the container. An old file is replaced once the
+            new one is complete.
+        frames: all of one size; H and W are even.
+        rate: in frames per second.
+
+    Raises:
+        OSError: the video cannot be written.
+    """
+    path = Path(path)
+    partial, writer = path.with_name(f".{path.stem}.partial{path.suffix}"), None
+    path.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        for frame in frames:
+            if writer is None:
+                code = cv2.VideoWriter.fourcc(*"mp4v")
+                writer = cv2.VideoWriter(str(partial), code, rate, frame.shape[1::-1])
+            writer.write(np.ascontiguousarray(frame[..., ::-1]))
+        if writer is not None:
+            writer.release()
+            if _opened(partial) is None:  # OpenCV does not say that the disk is full
+                raise OSError(errno.EIO, "OpenCV cannot write the video", str(path))
+            partial.replace(path)
+    finally:
+        partial.unlink(missing_ok=True)
 
 
 def _opened(path: str | Path) -> cv2.VideoCapture | None:

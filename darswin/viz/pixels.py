@@ -18,6 +18,7 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import LogLocator, PercentFormatter, StrMethodFormatter
 
 from darswin.utils.image import with_channels
+from darswin.viz.plot import TEXT, add_legend, page_figure
 
 __all__ = ["distance_image", "distance_range", "label_image", "overlay", "palette"]
 
@@ -178,8 +179,8 @@ def draw_predictions(
     if are_labels and not classes:
         raise ValueError("labels need the names of their classes")
     height, width = rows[0][1].shape
-    tall = len(rows) * (2.5 * height / width + 0.25) + (0.9 if are_labels else 1.5)
-    figure = Figure(figsize=(10.4, tall), layout="constrained")
+    tall = len(rows) * (1.4 * height / width + 0.3) + (0.3 if are_labels else 1.5)
+    figure = page_figure(tall)
     panels = figure.subplots(len(rows), 4, squeeze=False)
     paint: Callable[[np.ndarray, np.ndarray], Painted]
     if are_labels:
@@ -194,9 +195,9 @@ def draw_predictions(
         *pictures, text = paint(truth, prediction)
         for panel, picture in zip(axes, (image, *pictures), strict=True):
             _show(panel, picture)
-        axes[3].set_xlabel(text, fontsize=9)
+        axes[3].set_xlabel(text)
     for axes, title in zip(panels[0], ("image", "truth", "prediction", "error"), strict=True):
-        axes.set_title(title, fontsize=11)
+        axes.set_title(title, fontsize=TEXT)
     return figure
 
 
@@ -216,7 +217,7 @@ def _draw_legend(figure: Figure, classes: Sequence[str], colors: Sequence[Sequen
         Patch(color=(red / 255, green / 255, blue / 255), label=name)
         for name, (red, green, blue) in meanings
     ]
-    figure.legend(handles=entries, loc="outside lower center", ncols=8, fontsize=9)
+    add_legend(figure, entries)
 
 
 def _distance_pictures(
@@ -237,16 +238,15 @@ def _draw_bars(figure: Figure, panels: np.ndarray, near: float, far: float) -> N
     bar = figure.colorbar(
         distances, ax=panels[:3], location="bottom", shrink=0.5, aspect=40, extend="both"
     )
-    bar.set_label("distance (m), log scale; grey: not known", fontsize=9)
+    bar.set_label("distance (m), log scale; grey: not known")
     bar.ax.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
     bar.ax.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
     bar.ax.minorticks_off()
-    bar.ax.tick_params(labelsize=9)
     errors = ScalarMappable(_WORST, matplotlib.colormaps[_ERRORS])
     bar = figure.colorbar(errors, ax=panels[3], location="bottom", aspect=15, extend="max")
-    bar.set_label("error of the true distance", fontsize=9)
+    bar.set_label("error of the\ntrue distance")
+    bar.set_ticks([0, 0.25, 0.5])
     bar.ax.xaxis.set_major_formatter(PercentFormatter(1, 0))
-    bar.ax.tick_params(labelsize=9)
 
 
 def _show(axes: Axes, picture: np.ndarray) -> None:

@@ -2,6 +2,8 @@
 
 Most functions draw on `axes`. `draw_lens` returns a figure that pyplot knows nothing of, and
 `save_figure` writes it. Images are (H, W) or (H, W, 3), uint8 or floats in [0, 1].
+
+All figures have one width, `WIDTH`, and text of `TEXT` pt or more.
 """
 
 import io
@@ -9,15 +11,18 @@ import math
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import torch
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from matplotlib.patheffects import AbstractPathEffect, Normal, Stroke
 from matplotlib.ticker import MaxNLocator
+from PIL import Image
 from torch import Tensor
 
 from darswin.layers.polar import PolarGrid, PolarSample
@@ -29,6 +34,10 @@ from darswin.viz.report import SIDES, beyond_lens, pixels_per_degree
 from darswin.viz.views import undistort, view_map
 
 __all__ = ["draw_lens", "save_figure"]
+
+# On a phone, where a figure is 390 px wide, this text is 9 px high.
+WIDTH, TEXT = 6.0, 10.0  # inches, pt
+DPI = 200
 
 SPACING_SYMBOLS = {"theta": "θ", "tan": "tan θ", "g": "g(θ)", "radius": "r"}
 
@@ -50,14 +59,45 @@ def figure_format(path: str | os.PathLike) -> str:
     return FORMATS[ending]
 
 
-def save_figure(figure: Figure, path: str | os.PathLike) -> None:
+def page_figure(height: float) -> Figure:
+    """An empty figure of `WIDTH` by `height` inches, whose parts do not overlap."""
+    return Figure(figsize=(WIDTH, height), layout="constrained")
+
+
+def add_legend(
+    figure: Figure,
+    handles: Sequence[Artist],
+    *,
+    loc: Literal["outside lower center", "outside upper center"] = "outside lower center",
+) -> None:
+    """Adds the legend of a figure, with as many columns as fit beside each other. The figure grows
+    by the height of the legend."""
+    for columns in range(len(handles), 0, -1):
+        legend = figure.legend(handles=handles, loc=loc, ncols=columns)
+        box = legend.get_window_extent()
+        if columns == 1 or box.width <= figure.bbox.width:
+            figure.set_figheight(figure.get_figheight() + box.height / figure.dpi)
+            return
+        legend.remove()
+
+
+def save_figure(figure: Figure, path: str | os.PathLike, *, colors: int | None = None) -> None:
     """Writes a figure; the ending of the path names the format. A failure leaves no partial file.
 
+    Args:
+        colors: of the palette of a small PNG, at most 256; None means all colours.
+
     Raises:
-        ValueError: another ending. OSError: as `darswin.utils.files.replace_file`.
+        ValueError: another ending, or one other than ".png" with `colors`.
+        OSError: as `darswin.utils.files.replace_file`.
     """
-    picture = io.BytesIO()
-    figure.savefig(picture, format=figure_format(path), dpi=120)
+    picture, format_ = io.BytesIO(), figure_format(path)
+    if colors is not None and format_ != "png":
+        raise ValueError(f"only a .png has a palette of colors, got {os.fspath(path)!r}")
+    figure.savefig(picture, format=format_, dpi=DPI)
+    if colors is not None:
+        drawn, picture = Image.open(picture), io.BytesIO()
+        drawn.convert("RGB").quantize(colors).save(picture, "png", optimize=True, dpi=(DPI, DPI))
     replace_file(path, picture.getvalue())
 
 
@@ -86,7 +126,7 @@ def draw_samples(image: np.ndarray, lens: Lens, sampler: PolarSample, *, axes: A
     _draw_borders(axes, lens, sampler, image.shape[:2], (1.2, 1.2))
     x, y = _sample_places(lens, grid, image.shape[:2])
     inside = (x > left) & (x < left + width) & (y > top) & (y < top + height)
-    axes.plot(x[inside], y[inside], "r.", ms=2.5, path_effects=_outline(0.5, "white"))
+    axes.plot(x[inside], y[inside], "r.", ms=1.5, path_effects=_outline(0.3, "white"))
     axes.set(xlim=(left, left + width), ylim=(top + height, top))
 
 
@@ -151,7 +191,7 @@ def draw_view(image: np.ndarray, lens: Lens, rays: Tensor, *, axes: Axes) -> Non
     _show(axes, undistort(image, lens, rays), beyond | outside)
     lines = ((axes.xaxis, _middle(rays), 1), (axes.yaxis, _middle(rays.transpose(0, 1)), -1))
     for axis, line, sign in lines:
-        places, degrees = _angle_ticks(line, max(2, 7 * len(line) // max(rays.shape[:2])))
+        places, degrees = _angle_ticks(line, max(2, 5 * len(line) // max(rays.shape[:2])))
         axis.set_ticks(places, [f"{sign * angle + 0:g}°" for angle in degrees])
     axes.set(xlabel=_label("degrees from the view's middle", outside, beyond))
 
@@ -184,7 +224,7 @@ def _label(text: str, outside: np.ndarray, beyond: np.ndarray | None = None) -> 
     """The label of an axis, with an explanation of hatched areas if there are any."""
     reasons = ["outside the sensor"] if outside.any() else []
     reasons += ["beyond θ_max"] if beyond is not None and beyond.any() else []
-    return f"{text}\nhatched: {' or '.join(reasons)}" if reasons else text
+    return "\nhatched: ".join((text, " or\n".join(reasons))) if reasons else text
 
 
 def draw_curve(lens: Lens, image_size: tuple[int, int] | None = None, *, axes: Axes) -> None:
@@ -206,23 +246,29 @@ def draw_curve(lens: Lens, image_size: tuple[int, int] | None = None, *, axes: A
     density.set_ylim(0, 1.15 * torch.cat((along, around)).max().item())
     if image_size is not None:
         _draw_sides(axes, lens, image_size)
-    axes.legend(handles=[*axes.lines[:1], *density.lines], loc="upper center", ncols=3)
+    axes.legend(
+        handles=[*axes.lines[:1], *density.lines], loc="upper center", ncols=3, handlelength=1,
+        columnspacing=1,
+    )  # fmt: skip
 
 
 def _draw_sides(axes: Axes, lens: Lens, image_size: tuple[int, int]) -> None:
-    """Draws a line at the angle of each side of the image that lies within θ_max."""
+    """Draws a line at the angle of each side of the image that lies within θ_max. Lines that are
+    close to each other share a label."""
     angles = torch.rad2deg(lens.side_angles(image_size)[0]).tolist()
-    ends = beyond_lens(lens, image_size).tolist()
-    # The names have different heights, because opposite sides often have similar angles.
-    looks = zip(SIDES, ("--", ":", "--", ":"), (0.02, 0.21, 0.4, 0.6), strict=True)
-    for (side, style, height), angle, beyond in zip(looks, angles, ends, strict=True):
-        if beyond or angle > axes.get_xlim()[1] + 1e-6:
+    ends, last = beyond_lens(lens, image_size).tolist(), axes.get_xlim()[1]
+    labels: dict[float, dict[str, list[str]]] = {}  # sides by the place of a label and their angle
+    for side, style, angle, beyond in zip(SIDES, ("--", ":", "--", ":"), angles, ends, strict=True):
+        if beyond or angle > last + 1e-6:
             continue
         axes.axvline(angle, color="0.4", ls=style, lw=1)
+        place = next((at for at in labels if abs(at - angle) < 0.06 * last), angle)
+        labels.setdefault(place, {}).setdefault(f"{angle:.0f}°", []).append(side)
+    for place, sides in labels.items():
+        text = ", ".join(f"{', '.join(names)} {angle}" for angle, names in sides.items())
         axes.text(
-            angle, height, f"{side} {angle:.1f}°", transform=axes.get_xaxis_transform(),
-            rotation=90, ha="right", va="bottom", color="0.3", fontsize="small",
-            path_effects=_outline(1.2, "white"),
+            place, 0.02, text, transform=axes.get_xaxis_transform(), rotation=90,
+            ha="right", va="bottom", color="0.3", path_effects=_outline(1.2, "white"),
         )  # fmt: skip
 
 
@@ -239,8 +285,14 @@ def draw_lens(
     Raises:
         ValueError: more than one lens.
     """
-    figure = Figure(figsize=(15, 9), layout="constrained")
-    panels = figure.subplot_mosaic([["partition", "samples", "view"], ["polar", "polar", "curve"]])
+    figure = page_figure(8.4)
+    panels = figure.subplot_mosaic(
+        [
+            [*["partition"] * 3, *["view"] * 3],
+            ["polar"] * 6,
+            [*["samples"] * 2, *["curve"] * 4],
+        ]
+    )
     draw_grid(image, lens, sampler, samples=False, axes=panels["partition"])
     draw_samples(image, lens, sampler, axes=panels["samples"])
     left, top, width, height = _enlarged(image, lens)
@@ -253,11 +305,15 @@ def draw_lens(
     draw_curve(lens, image.shape[:2], axes=panels["curve"])
     (rows, columns), rings, sectors = sampler.spec.samples, sampler.spec.rings, sampler.spec.sectors
     equal = SPACING_SYMBOLS[sampler.spec.spacing]
-    panels["partition"].set_title(f"{rings} rings × {sectors} sectors, equal steps of {equal}")
-    panels["samples"].set_title(f"{rows} × {columns} samples in each, enlarged")
-    panels["view"].set_title(title)
-    panels["polar"].set_title(f"polar image, {rows * rings} × {columns * sectors} samples")
-    panels["curve"].set_title(f"projection: {type(lens).__name__}")
+    titles = {
+        "partition": f"{rings} rings × {sectors} sectors,\nequal steps of {equal}",
+        "samples": f"{rows} × {columns} samples\nin each, enlarged",
+        "view": title,
+        "polar": f"polar image, {rows * rings} × {columns * sectors} samples",
+        "curve": f"projection: {type(lens).__name__}",
+    }
+    for name, text in titles.items():
+        panels[name].set_title(text, fontsize=TEXT)
     return figure
 
 

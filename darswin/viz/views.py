@@ -1,8 +1,8 @@
 """Undistorted views: the image that an ideal camera would take in place of a calibrated one.
 
 A view consists of the rays of its pixels, (H, W, 3), of any length and direction. `perspective`,
-`cylindrical` and `equirectangular` compute them, and `undistort` samples an image along them with
-OpenCV. One perspective view cannot hold a lens of 190°; `yaw` and `pitch` turn the view.
+`cylindrical`, `equirectangular` and `square` compute them, and `undistort` samples an image along
+them with OpenCV. One perspective view cannot hold a lens of 190°; `yaw` and `pitch` turn the view.
 
 Convention:
     Camera frame: x to the right, y down, z forward along the optical axis. A ray (x, y, z) has
@@ -23,9 +23,12 @@ from torch import Tensor
 
 from darswin.data.warping import remap
 from darswin.lens import Lens
+from darswin.lens.concentric import square_to_disc
 from darswin.lens.pixels import as_map
+from darswin.lens.solve import vector_of
+from darswin.utils.angles import check_turn, degrees_hint
 
-__all__ = ["cylindrical", "equirectangular", "perspective", "undistort"]
+__all__ = ["cylindrical", "equirectangular", "perspective", "square", "undistort"]
 
 
 def perspective(
@@ -33,7 +36,7 @@ def perspective(
 ) -> Tensor:
     """The rays of a pinhole camera, which shows straight lines straight: (H, W, 3), float64.
 
-    `size` is (H, W), `fov` lies in (0, π) rad, and yaw and pitch are in rad.
+    `size` is (H, W), `fov` lies in (0, π) rad, and yaw and pitch in [-2π, 2π] rad.
     """
     _check_fov(fov, math.pi, "below π")
     x, y = _plane(size, 2 * math.tan(fov / 2))
@@ -71,8 +74,24 @@ def equirectangular(
     return rotated(rays, yaw, pitch)
 
 
+def square(size: tuple[int, int], fov: float, *, yaw: float = 0.0, pitch: float = 0.0) -> Tensor:
+    """The rays of the concentric square, which a `LensAdapter` sees: squares around the middle are
+    circles around the axis, and equal steps are equal angles.
+
+    The arguments are those of `perspective`, but H = W, and `fov` lies in (0, 2π] rad: the edge is
+    at fov/2 from the axis.
+    """
+    _check_fov(fov, 2 * math.pi, "at most 2π", closed=True)
+    if size[0] != size[1]:
+        raise ValueError(f"size must be square for this view, got {size}")
+    radius, direction = square_to_disc(torch.stack(_plane(size, 2.0), -1))
+    return rotated(vector_of(fov / 2 * radius, direction), yaw, pitch)
+
+
 def rotated(rays: Tensor, yaw: float, pitch: float) -> Tensor:
     """Rays (..., 3) of a camera that looks `yaw` to the right and `pitch` up, rad."""
+    check_turn("yaw", yaw)
+    check_turn("pitch", pitch)
     cos, sin = math.cos(pitch), math.sin(pitch)
     pitched = rays.new_tensor([[1, 0, 0], [0, cos, -sin], [0, sin, cos]])
     cos, sin = math.cos(yaw), math.sin(yaw)
@@ -120,4 +139,4 @@ def _plane(size: tuple[int, int], width: float) -> tuple[Tensor, Tensor]:
 
 def _check_fov(fov: float, end: float, range_: str, closed: bool = False) -> None:
     if not (0 < fov < end or (closed and fov == end)):
-        raise ValueError(f"fov must be above 0 and {range_} rad, got {fov}")
+        raise ValueError(f"fov must be above 0 and {range_} rad, got {fov}{degrees_hint(fov)}")

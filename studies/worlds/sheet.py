@@ -4,12 +4,10 @@ import math
 from pathlib import Path
 
 import numpy as np
-from matplotlib.figure import Figure
 from matplotlib.patches import Patch
-from PIL import Image
 
 from darswin.viz.pixels import distance_image, label_image
-from darswin.viz.plot import save_figure
+from darswin.viz.plot import TEXT, add_legend, page_figure, save_figure
 from worlds.geometry import CLASSES, COLORS
 from worlds.lenses import draw_lens
 from worlds.poses import poses_of
@@ -34,7 +32,7 @@ LENSES = {"perspective": "wide", "spherical, ξ = 0.3, 165°": "0.3", "a fisheye
 def draw_sheet(path: Path) -> None:
     """Writes a PNG: a row for each of `PLACES`, three columns for each of `LENSES`."""
     across = 3 * len(LENSES)
-    figure = Figure(figsize=(across, 1.04 * len(PLACES) + 0.5), layout="constrained")
+    figure = page_figure(0.7 * len(PLACES) + 0.3)
     panels = figure.subplots(len(PLACES), across, squeeze=False)
     for row, (name, number) in zip(panels, PLACES, strict=True):
         wad, world = load_map(name)
@@ -52,11 +50,9 @@ def draw_sheet(path: Path) -> None:
                 axes.imshow(picture)
                 axes.axis("off")
     for k, title in enumerate(LENSES):
-        panels[0][3 * k + 1].set_title(title, fontsize=9)
+        panels[0][3 * k + 1].set_title(title, fontsize=TEXT)
     entries = [
         Patch(color=np.array(c) / 255, label=n) for n, c in zip(CLASSES, COLORS, strict=True)
     ]
-    figure.legend(handles=entries, loc="outside lower center", ncols=len(CLASSES), fontsize=8)
-    save_figure(figure, path)
-    # 256 colours make a third of the size.
-    Image.open(path).convert("RGB").quantize(256).save(path, optimize=True)
+    add_legend(figure, entries)
+    save_figure(figure, path, colors=256)  # a third of the size

@@ -2,7 +2,7 @@ from pathlib import Path
 
 import peers
 import pytest
-from matplotlib.text import Text
+from figures import on_a_phone
 
 from darswin.bench import plot
 from darswin.bench.record import Record
@@ -49,19 +49,28 @@ def test_peers(operators, drawn, tmp_path):
     }
 
 
-@pytest.mark.parametrize("suite", ["attention", "model"])
-def test_the_pictures_of_the_records_can_be_read(suite, tmp_path, monkeypatch):
-    """At the width of a page, 740 px, text is at least 8 pt high, the page is not endless, and the
-    legend lies inside."""
-    record = Record.load(next(RESULTS.glob(f"{suite}--*-avx512.json")))
-    figures = []
-    monkeypatch.setattr("darswin.viz.plot.save_figure", lambda figure, path: figures.append(figure))
-    (plot.draw_models if suite == "model" else peers.draw_peers)(record, tmp_path / "a.png")
+@pytest.mark.parametrize("picture", sorted(RESULTS.glob("*.png")), ids=lambda path: path.stem)
+def test_the_pictures_of_the_records_can_be_read(picture, monkeypatch):
+    """The text is large enough, the page is not endless, and the text lies inside."""
+    record, figures = Record.load(picture.with_suffix(".json")), []
+    monkeypatch.setattr("darswin.viz.plot.save_figure", lambda figure, _: figures.append(figure))
+    (plot.draw_models if picture.stem.startswith("model") else peers.draw_peers)(record, picture)
     (figure,) = figures
-    width, height = figure.get_size_inches() * 120
-    assert height <= 1200
-    figure.draw_without_rendering()
-    legend = figure.legends[0].get_window_extent()
-    assert legend.x0 >= 0 and legend.x1 <= figure.bbox.width
-    texts = [text for text in figure.findobj(Text) if text.get_text()]
-    assert min(text.get_fontsize() for text in texts) * 120 / 72 * 740 / width * 72 / 96 >= 8
+    assert on_a_phone(figure) >= 9
+    width, height = figure.get_size_inches()
+    assert height <= 2.5 * width
+    names = [name for axes in figure.axes for name in (axes.title, *axes.get_yticklabels())]
+    for part in [*names, *figure.legends]:
+        box = part.get_window_extent()
+        assert box.x0 >= -2 and box.x1 <= figure.bbox.width + 2, part
+
+
+def test_panels_beside_each_other_have_the_same_rows():
+    same, other = {"a": {}, "b": {}}, {"a": {}}
+    lines = plot.in_lines({"1": same, "2": other, "3": other, "4": other, "5": same, "6": same})
+    assert [[title for title, _ in line] for line in lines] == [
+        ["1"],
+        ["2", "3"],
+        ["4"],
+        ["5", "6"],
+    ]

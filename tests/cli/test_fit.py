@@ -17,6 +17,7 @@ from darswin.cli.main import COMMANDS, main
 from darswin.cli.options import PRESETS, complete, flag_of
 from darswin.layers import linear
 from darswin.models import load_model
+from darswin.train import data
 from darswin.train.tasks import TASKS
 
 DIGITS = ["--config", "minutes", "--data.path", "digits", "--trainer.logger", "false", *QUIET]
@@ -156,6 +157,34 @@ def test_a_broken_picture_is_named_in_one_line(capsys, tmp_path):
     assert re.search(r"cannot read .*\.jpg: no image .*--data\.skip_broken true", message)
 
 
+def test_all_broken_files_are_named_before_the_training(capsys, tmp_path):
+    for k in range(24):
+        file = tmp_path / "photos" / "ab"[k % 2] / f"{k}.jpg"
+        file.parent.mkdir(parents=True, exist_ok=True)
+        cv2.imwrite(str(file), np.full((16, 16), 10 * k, np.uint8))
+        if k < 16:
+            file.write_bytes(file.read_bytes()[:300])
+    options = [*DIGITS, "--data.path", tmp_path / "photos", "--data.holdout", "0"]
+    options += ["--trainer.limit_val_batches", "0"]
+    message = error(capsys, "fit", "--run", tmp_path / "run", *options)
+    assert "16 of 24 pictures cannot be used:" in message and "and 6 more" in message
+    assert message.count("cannot read ") == 10 and "set --data.skip_broken true" in message
+    assert not (tmp_path / "run").exists()
+
+
+def test_each_split_is_checked_once(tmp_path, monkeypatch):
+    checked = []
+    monkeypatch.setattr(data, "check_files", lambda samples, what: checked.append(what))
+    options = [*DIGITS, "--trainer.max_steps", "1", "--data.limit", "48"]
+    fit(tmp_path / "a", *options, "--trainer.limit_val_batches", "1")
+    assert checked == ["the pictures of 'train'", "the pictures of 'val'"]
+    checked.clear()
+    main(["test", "--run", str(tmp_path / "a"), "--xi", "0", "--trainer.limit_test_batches", "1"])
+    assert not checked
+    fit(tmp_path / "b", *options, "--trainer.limit_val_batches", "0")
+    assert checked == ["the pictures of 'train'"]
+
+
 def test_our_warnings_are_one_line_once(capsys, tmp_path):
     for name in ("a", "b", "."):
         (tmp_path / name).mkdir(exist_ok=True)
@@ -280,4 +309,7 @@ def test_help_names_every_command(capsys):
     text = capsys.readouterr().out
     assert all(re.search(rf"^  {name} ", text, re.M) for name in COMMANDS)
     main(["models"])
-    assert "darswin_a_small" in capsys.readouterr().out.split()
+    text = capsys.readouterr().out
+    assert "darswin_a_small" in text.split()
+    assert "digits: darswin_a_nano for classification, 10 classes, images of 32×32 with 1 " in text
+    assert "mean 0.0, std 1.0" in text

@@ -36,7 +36,7 @@ def test_show_writes_a_figure(folder, capsys):
     main(["lens", "show", calib, picture, "--out", str(out), "--rings=4", "--sectors=8",
           "--samples=[3,2]", "--view=cylindrical", "--yaw_deg=20", "--spacing=g"])  # fmt: skip
     assert capsys.readouterr().out == f"{out}\n"
-    assert cv2.imread(str(out)).shape == (1080, 1800, 3)
+    assert cv2.imread(str(out)).shape == (1680, 1200, 3)
 
 
 def test_info_prints_what_the_lens_is(folder, capsys):
@@ -77,7 +77,7 @@ def refusal(capsys, *arguments):
         (["--fov_deg", "0"], "--fov_deg must be above 0° and below 180° for a perspective view"),
         (["--fov_deg=180"], "--fov_deg must be above 0° and below 180° .*, got 180"),
         (["--view=cylindrical", "--fov_deg=361"], "at most 360° for a cylindrical view"),
-        (["--yaw_deg=inf"], "--yaw_deg must be a finite number of degrees, got inf"),
+        (["--yaw_deg=inf"], "--yaw_deg must be from -360° to 360°, got inf"),
         (["--theta_max_deg=0"], "--theta_max_deg must be above 0° and at most 180°, got 0"),
         (["--rings=100000000"], "--rings must be from 1 to 1024, got 100000000"),
         (["--sectors=0"], "--sectors must be from 1 to 4096, got 0"),
@@ -179,7 +179,8 @@ OPTIONS = st.one_of(
     st.tuples(st.sampled_from(["rings", "sectors", "fov_deg", "yaw_deg", "pitch_deg", "foo",
                                "theta_max_deg", "camera"]), NUMBERS),
     st.tuples(st.sampled_from(["samples", "image_size"]), LISTS),
-    st.tuples(st.just("view"), st.sampled_from(["perspective", "cylindrical", "equirectangular"])),
+    st.tuples(st.just("view"), st.sampled_from(["perspective", "cylindrical", "equirectangular",
+                                                "square"])),
     st.tuples(st.just("spacing"), st.sampled_from(["theta", "tan", "g", "radius", "r"])),
     st.tuples(st.just("out"), st.sampled_from(["a.png", "a.foo", "a", "", "."])),
     st.tuples(st.just("coefficients"), st.sampled_from(["fisheye", "x"])),

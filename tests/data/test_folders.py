@@ -65,8 +65,8 @@ def test_class_lists_choose_and_order(tmp_path):
     pictures(tmp_path, "bus", "car", "train", "test", ".hidden")
     touch(tmp_path, "bus/._0.jpg")
     (tmp_path / "car" / "folder.png").mkdir()
-    (tmp_path / "empty").mkdir()
     assert open_source(tmp_path, "train").classes == ["bus", "car", "test", "train"]
+    (tmp_path / "empty").mkdir()  # no class of the list
     (tmp_path / "names.txt").write_text("test\ncar\n")
     (tmp_path / "names.json").write_text('["test", "car"]')
     for name in ("names.txt", "names.json"):
@@ -119,17 +119,41 @@ def test_what_is_refused(tmp_path, there, classes, error, message):
         (["stray.png"], r"holds pictures outside the folders of classes \(1, e\.g\. .*stray\.png"),
         (["a/x.gif", "b/y.gif"], r"does not read, 2 \.gif, e\.g\. .*a/x\.gif: left out"),
         (["labels/x.txt"], "labels holds files, but no pictures: it is not a class"),
+        (["bird/"], "bird holds no pictures: it is not a class"),
+        (["bird/.DS_Store"], "bird holds no pictures: it is not a class"),
+        (["bird/large/", "bird/small/"], "bird holds no pictures: it is not a class"),
+        (["val/"], "val holds no pictures: it is not a class"),
         (["few/1.jpg"], r"the classes \['few'\] have too few .*none for test or val"),
         (["few/1.jpg", "few/2.jpg"], r"the classes \['few'\] have too few pictures"),
     ],
 )
 def test_what_is_left_out_is_named(tmp_path, there, message):
     pictures(tmp_path, "a", "b")
-    touch(tmp_path, *there)
+    for name in there:
+        (tmp_path / name).mkdir(parents=True) if name.endswith("/") else touch(tmp_path, name)
     with pytest.warns(LeftOut, match=message):
         parts = opened(tmp_path)
     few = [file for file in files(parts["train"]) if "few" in file]
     assert len(few) == sum("few" in name for name in there)
+
+
+@pytest.mark.parametrize(
+    ("empty", "message"),
+    [
+        ("train/c", r"train/c holds no pictures: it is not a class"),
+        ("val/b", r"val/b holds no pictures: left out"),
+        ("val/c", r"val/c holds no pictures: left out"),
+        ("test", r"test holds no pictures: it is not a split"),
+        ("testing/a", r"testing holds no pictures: it is not a split"),
+    ],
+)
+def test_empty_folders_of_splits_are_named(tmp_path, empty, message):
+    pictures(tmp_path, "train/a", "train/b", "val/a")
+    (tmp_path / empty).mkdir(parents=True)
+    with pytest.warns(LeftOut, match=message):
+        parts = opened(tmp_path)
+    assert [len(part) for part in parts.values()] == [20, 10, 10]
+    assert all(part.classes == ["a", "b"] for part in parts.values())
 
 
 @pytest.mark.filterwarnings("error")

@@ -1,8 +1,9 @@
 """Every block of code on README and the pages runs as it stands there.
 
-Python runs, a page's blocks in order and in one namespace, the README's each in its own; so do
-commands of `darswin`, on few pictures for one epoch. What would install something or take hours is
-checked against what declares it: the Makefile, pyproject.toml, the programs' own parsers.
+Python runs, a page's blocks in order and in one namespace, those of README and answers.md each in
+its own; so do commands of `darswin`, on few pictures for one epoch. What would install something or
+take hours is checked against what declares it: the Makefile, pyproject.toml, the programs' own
+parsers.
 """
 
 import ast
@@ -24,17 +25,20 @@ import numpy as np
 import pytest
 import torch
 from helpers import fixture
-from scenes import write_plain, write_woodscape
+from scenes import write_outlines, write_plain, write_woodscape
 from videos import write_video
 
+from darswin import lens
 from darswin.cli.bench import bench
 from darswin.cli.main import main
+from darswin.viz.report import largest_offset
 
 ROOT = Path(__file__).parents[2]
 sys.path.insert(0, str(ROOT / "studies"))
 
 
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+ALONE = ("README.md", "answers.md")  # each of their blocks runs without the ones before it
 FENCE = re.compile(r"^(`{3,}|:{3,})(\S*)[^\n]*\n(.*?)^\1$", re.M | re.S)
 DIRECTIVES = {"{toctree}", "{eval-rst}", "{include}", "{warning}"}  # Sphinx builds these
 SHOWN = {"bibtex"}
@@ -97,6 +101,7 @@ def granted(tmp_path_factory):
     write_plain(folder / "garage", 20, split="train")
     write_plain(folder / "garage", 4, split="val")
     write_woodscape(folder / "woodscape", 20)
+    write_outlines(folder / "objects")
     torch.save(fixture("polar")[1], folder / "checkpoint.pth")
     return folder
 
@@ -117,7 +122,7 @@ def test_code_runs_as_it_stands(page, scratch, monkeypatch):
         if "import openvino" in block.text and importlib.util.find_spec("openvino") is None:
             continue  # it is in no extra
         if block.language == "python":
-            scope = {} if page.name == "README.md" else scope
+            scope = {} if page.name in ALONE else scope
             run_python(block.text, scope)
         elif block.language == "sh":
             for command in commands(block.text):
@@ -237,3 +242,38 @@ def test_the_drop_in_gives_the_values_of_what_it_replaces(scratch):
         if block.language == "python" and "PolarSample" not in block.text:
             run_python(block.text, scope)
     torch.testing.assert_close(scope["polar"], scope["by_mesh"], rtol=0, atol=1e-4)
+
+
+@pytest.mark.slow
+def test_the_answers_have_the_numbers_that_their_comments_tell(scratch):
+    found = []
+    for block in blocks(ROOT / "docs/answers.md"):
+        found.append({})
+        run_python(block.text, found[-1])
+    opencv, kitti, remap, woodscape, depth, grid, own = found
+    assert opencv["wrong"].flat[0] == pytest.approx(82, abs=0.5)
+    assert opencv["right"][0, 0] == pytest.approx(1282, abs=0.5)
+    assert opencv["view"].any((0, 2)).all()  # no column is black: 190° are all there
+    assert kitti["error"].item() == pytest.approx(0.09, abs=0.005)
+    exact = kitti["mei"]
+    left_out = largest_offset(exact)
+    assert left_out == pytest.approx(0.6, abs=0.05)
+    for file, most in (("omnidir.yaml", 1e-3), ("fisheye.yaml", left_out + kitti["error"].item())):
+        written = lens.load(file, theta_max=exact.theta_max.item())
+        assert isinstance(written, lens.Mei if most < 0.01 else lens.KannalaBrandt)
+        pixels = 1400 * torch.rand(1, 1000, 2)
+        there = written.project_rays(*exact.unproject_pixels(pixels))
+        assert (there - pixels).norm(dim=-1).nan_to_num().max() < most
+    wrong = np.abs(remap["exact"].astype(int) - remap["rounded"]).max(-1)
+    assert remap["worst"] == wrong.max() == 4 and 1 / 7 < (wrong > 0).mean() < 1 / 5
+    assert woodscape["error"].item() == pytest.approx(0.22, abs=0.005)
+    y, x, z = depth["y"], depth["x"], depth["z"][0]
+    assert z[486, 641] == pytest.approx(2) and z[y, x] == pytest.approx(-0.35, abs=0.005)
+    seen = lens.pixel_rays(depth["wide"], z.shape)[0].isfinite()
+    torch.testing.assert_close(depth["back"][seen], torch.full((seen.sum(),), 2.0))
+    torch.testing.assert_close(grid["polar"], grid["same"], rtol=0, atol=1e-5)
+    with pytest.raises(NotImplementedError, match="not implemented for 'Byte'"):
+        torch.nn.functional.grid_sample(
+            grid["picture"].movedim(-1, 1), torch.zeros(1, 2, 2, 2), align_corners=False
+        )
+    assert len(own["lenses"]) == len(own["images"]) and own["images"].shape[1:] == (3, 32, 32)

@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from darswin import create_model, list_models
+from darswin.data import LEVELS
 
 ROOT = Path(__file__).parents[2]
 sys.path[:0] = [str(ROOT / "docs"), str(ROOT / "studies")]
@@ -31,7 +32,7 @@ def page(name: str) -> str:
 
 
 def test_the_readme_is_short_and_lines_fit():
-    assert README.count("\n") <= 140 and max(map(len, README.splitlines())) < 120
+    assert README.count("\n") <= 160 and max(map(len, README.splitlines())) < 120
     for path in fill.PAGES:
         for line in path.read_text().splitlines():
             assert len(line) < 120 or line.startswith("|"), (path, line)
@@ -104,14 +105,74 @@ def test_parameter_counts_are_those_of_the_models():
     assert told == set(list_models())
 
 
-def test_the_study_shows_its_point():
-    cells = json.loads((ROOT / "studies/results/study--nano.json").read_text())["cells"]
+def study_runs() -> dict[tuple[str, str], list[dict[str, float]]]:
+    """The accuracies of all seeds, by label and level."""
     runs: dict[tuple[str, str], list] = {}
-    for cell in cells:
+    for cell in json.loads((ROOT / "studies/results/study--nano.json").read_text())["cells"]:
         runs.setdefault((cell["label"], cell["level"]), []).append(cell["accuracy"])
+    return runs
+
+
+def mean_accuracy(runs: dict, label: str, level: str, xi: str) -> float:
+    return statistics.mean(run[xi] for run in runs[label, level])
+
+
+def test_the_front_page_tells_what_the_studies_measured():
+    """Its sentences on Fashion-MNIST, on dense tasks, and on when not to use darswin."""
+    runs, text = study_runs(), " ".join(README.split())
+
+    def percent(label: str, xi: str) -> str:
+        return f"{mean_accuracy(runs, label, 'very low', xi):.0f} %"
+
+    ours, swin = ([percent(label, xi) for xi in "01"] for label in ("DarSwin-A", "Swin"))
+    assert f"it falls from {ours[0]} to {ours[1]}, and Swin from {swin[0]} to {swin[1]}." in text
+    swin, both = (percent(augmented_label(label), "1") for label in ("Swin", "DarSwin-A"))
+    assert f"a Swin reaches {swin} at ξ = 1 on Fashion-MNIST." in text
+    assert f"DarSwin reaches {ours[1]} without that, and {both} with it." in text
+
+    for level, (low, high) in LEVELS.items():  # "within 1 point of DarSwin"
+        seen = [xi for xi in SWEEP if low <= float(xi) <= high]
+        scores = [
+            statistics.mean(mean_accuracy(runs, label, level, xi) for xi in seen)
+            for label in ("DarSwin-A", "Swin", "DAT", "Swin (undis)")
+        ]
+        assert len(seen) > 1 and abs(scores[0] - max(scores[1:])) < 1
+
+    dense = json.loads((ROOT / "studies/results/dense.json").read_text())["cells"]
+    labelled = dense_tables.runs_of(dense, "segmentation")
+    scores = [
+        statistics.mean(
+            100 * dense_tables.mean_of(run, dense_tables.ALL_XI, SCORE["segmentation"])
+            for run in labelled[label, "low"]
+        )
+        for label in ("U-Net with rays", "DarSwin-Unet RA")
+    ]
+    assert "it reaches {:.0f} % mIoU, and DarSwin-Unet {:.0f} %.".format(*scores) in text
+
+    sizes = json.loads((ROOT / "studies/results/sizes.json").read_text())["cells"]
+    measured = sizes_tables.runs_of(sizes)
+    stretched, fixed, view = (
+        f"{statistics.mean(100 * run['100°']['delta1'] for run in measured[label]):.0f} %"
+        for label in ("DarSwin-Unet RA", "DarSwin-Unet RA, absolute θ", "equirectangular")
+    )
+    assert f"it measures {stretched} of the distances through 100°" in text
+    assert f"raises this to {fixed}. A" in text and f"view has [{view}]" in text
+
+    found = [
+        t.ratio
+        for t in next(iter(fill.records("sampling").values())).timings
+        if (t.name, t.setting) == ("F.grid_sample", "1024×1024")
+        and t.mode in ("forward", "forward, layout image")
+    ]
+    least, most = min(found), max(found)
+    assert f"`polar_sample` is just {least:.1f} to {most:.1f} times as fast" in text
+
+
+def test_the_study_shows_its_point():
+    runs = study_runs()
 
     def mean(label: str, level: str, xi: str) -> float:
-        return statistics.mean(run[xi] for run in runs[label, level])
+        return mean_accuracy(runs, label, level, xi)
 
     for other in ("Swin", "DAT"):
         for level, points in (("very low", 30), ("high", 5)):

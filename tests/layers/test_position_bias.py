@@ -1,10 +1,14 @@
 import math
+from typing import get_args
 
+import pytest
 import torch
 
 from darswin import polar_grid
+from darswin.layers.polar import PolarGridSpec
 from darswin.layers.position_bias import AngularRelativeBias, FourierBias, ring_angles
 from darswin.lens import Spherical
+from darswin.lens.spacing import Spacing
 
 LENS = Spherical.from_fov([0.2, 0.9], 2.6, 16.0)
 
@@ -53,3 +57,14 @@ def test_radial_positions():
     torch.testing.assert_close(angles[0], torch.linspace(0, 1.3, 5))
     radii = ring_angles(LENS.theta_max, grid, 4, "polar")
     torch.testing.assert_close(radii, grid.borders[:, ::2] * math.pi / 16)
+
+
+@pytest.mark.parametrize("spacing", get_args(Spacing))
+def test_the_angles_of_the_bias_do_not_follow_the_spacing(spacing):
+    """docs/explanation/spacings.md tells that they are nominal."""
+    options = dict(rings=8, sectors=4, samples=(2, 2), spacing=spacing)
+    grid = polar_grid(LENS, (32, 32), **options)
+    angles = ring_angles(LENS.theta_max, grid, 8, "angular")
+    torch.testing.assert_close(angles, LENS.theta_max[:, None] * torch.linspace(0, 1, 9))
+    borders = PolarGridSpec(**options).border_angles(LENS)
+    assert torch.allclose(angles, borders, atol=1e-4) == (spacing == "theta")

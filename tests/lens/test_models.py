@@ -17,14 +17,18 @@ from darswin.lens import (
     Lens,
     Mei,
     OCam,
+    OCamInverse,
     Perspective,
     Polynomial,
     Spherical,
     Stereographic,
     Tabulated,
+    from_dict,
     to_dict,
 )
 from darswin.lens.ideal import FocalLens
+from darswin.lens.orientation import rotated
+from darswin.lens.solve import direction_of
 
 
 @pytest.mark.parametrize("name", MODELS)
@@ -214,8 +218,8 @@ def test_where_nothing_lands_there_is_no_gradient_either(name):
         (lambda: Equidistant(1.0, affine=[[1.0, 0.0], [0.0, 0.0]]), "affine must be invertible"),
         (lambda: Equidistant(1.0, affine=[1.0, 2.0]), "affine must be (2, 2) or (N, 2, 2)"),
         (lambda: Equidistant(1.0, image_size=(0, 5)), "image_size must be finite and at least 1"),
-        (lambda: Perspective.from_fov(3.2, 10.0), "focal must be"),  # tan(θ_max) < 0
-        (lambda: Spherical.from_fov(0.5, 2.0, -1.0), "focal must be"),
+        (lambda: Perspective.from_fov(3.2, 10.0), "fov must be at most 3.14159"),  # tan(θ_max) < 0
+        (lambda: Spherical.from_fov(0.5, 2.0, -1.0), "radius must be finite and above 0"),
         (lambda: Spherical(0.5, 10.0).with_theta_max(2.5), "theta_max must be at most 2.09"),
         (lambda: to_dict(Spherical([0.1, 0.2], 300.0)), "one lens, got 2"),
         (lambda: type("Spherical", (Lens,), {}), "a lens model Spherical exists already"),
@@ -225,6 +229,52 @@ def test_a_value_out_of_range_is_named(make, said):
     with pytest.raises(ValueError) as error:
         make()
     assert said in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("make", "name", "degrees"),
+    [
+        (lambda: Equidistant.from_fov(170, 100), "fov", 170),
+        (lambda: Perspective.from_fov(fov=170, radius=100), "fov", 170),
+        (lambda: Spherical.from_fov(0.5, torch.tensor([1.0, 170.0]), 100), "fov", 170),
+        (lambda: from_dict({"model": "Stereographic", "fov": 170}, (480, 640)), "fov", 170),
+        (lambda: from_dict({"model": "Equidistant", "focal": 9, "theta_max": 85}), "theta_max", 85),
+        (lambda: KannalaBrandt(100, [0.1], theta_max=85), "theta_max", 85),
+        (lambda: OCamInverse([150.0, 90.0], 85), "theta_max", 85),
+        (lambda: Polynomial([1.0], [0.5, 85.0]), "theta_max", 85),
+        (lambda: Equidistant(100).with_theta_max(85), "theta_max", 85),
+        (lambda: FieldOfView(57, 100), "omega", 57),
+        (lambda: Tabulated([0.0, 45.0, 90.0], [0.0, 100.0, 190.0]), "angles", 90),
+        (lambda: rotated(Equidistant(100, center=(5, 5)), -90), "angle", -90),
+    ],
+)  # fmt: skip
+def test_an_angle_in_degrees_is_named_and_converted(make, name, degrees):
+    with pytest.raises(ValueError) as error:
+        make()
+    assert str(error.value).startswith(f"{name} must be")
+    assert f"{degrees}° is {math.radians(degrees):.4g}" in str(error.value)
+
+
+def test_an_angle_that_is_only_too_wide_is_not_taken_for_degrees():
+    with pytest.raises(ValueError, match=r"theta_max must be at most 1\.57") as error:
+        Perspective(100, 1.6)
+    assert "angles are" not in str(error.value)
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_rays_beyond_the_limit_land_nowhere(name):
+    """As `project_points`; 45 is an angle in degrees by mistake."""
+    lens = example(name, torch.Generator().manual_seed(6))
+    lens = lens.with_theta_max(lens.theta_max * 0.7)
+    theta = lens.theta_max[:, None] * double(0.2, 1.0, 1.001, 1.3)
+    theta = torch.cat((theta, torch.full_like(theta[:, :2], 45.0)), 1).requires_grad_()
+    azimuth = double(0.3).requires_grad_()
+    pixels = lens.project_rays(theta, azimuth, (480, 640))
+    assert pixels[:, :2].isfinite().all() and pixels[:, 2:].isnan().all()
+    inside = lens.pixels(theta[:, :2], direction_of(azimuth), (480, 640))
+    assert torch.equal(pixels[:, :2], inside)
+    pixels[:, :2].sum().backward()
+    assert theta.grad.isfinite().all() and azimuth.grad.isfinite().all()
 
 
 @pytest.mark.parametrize(

@@ -92,11 +92,11 @@ def test_every_ray_is_found(name):
 
 
 def area(lens, theta, azimuth):
-    """The factor by which the lens enlarges an area, computed from `project_rays` alone."""
+    """The factor by which the lens enlarges an area, from `pixels` alone, which go beyond θ_max."""
 
     def place(point):  # in the plane θ (cos φ, sin φ)
         angle = torch.atan2(point[..., 1], point[..., 0])
-        return lens.project_rays(point.norm(dim=-1), angle, (1, 1))
+        return lens.pixels(point.norm(dim=-1), direction_of(angle), (1, 1))
 
     point = theta[..., None] * direction_of(azimuth)
     columns = [

@@ -461,12 +461,12 @@ def test_a_model_is_registered_in_four_sizes(monkeypatch):
     names = [f"ours_{size}" for size in ("micro", "nano", "small", "tiny")]
     assert registry.list_models() == names
     assert all(registry.model_class(name) is Ours for name in names)
-    nano, small = (registry.create_model(f"ours_{size}").options for size in ("nano", "small"))
+    nano, small = (create_model(f"ours_{size}").options for size in ("nano", "small"))
     # A preset overrides the option of its size.
     assert nano["embed_dim"] == 8 and small["embed_dim"] == 96
     assert nano.keys() == small.keys() and nano["variant"] == small["variant"] == "A"
-    assert registry.create_model("ours_nano", variant="B").options["variant"] == "B"
-    with pytest.raises(ValueError, match="unknown model 'swin_nano'; the models are ours_micro, "):
+    assert create_model("ours_nano", variant="B").options["variant"] == "B"
+    with pytest.raises(ValueError, match="unknown model 'swin_nano'; did you mean ours_nano or "):
         registry.model_class("swin_nano")
 
 

@@ -12,11 +12,22 @@ import torch
 from sklearn.datasets import load_digits
 from sklearn.model_selection import train_test_split
 
+from darswin.cli.predict import predict
 from darswin.data.warping import at_size, remap, warp_map
 from darswin.deploy.quantize import quantize_model
 from darswin.layers.quantized import quantized_layers
 from darswin.lens import Perspective, Spherical, load
-from darswin.models import ModelCard, list_pretrained, load_model, pretrained_file
+from darswin.models import (
+    ModelCard,
+    create_model,
+    list_models,
+    list_pretrained,
+    load_model,
+    pretrained_file,
+    read_card,
+)
+from darswin.models.registry import model_class, preset
+from darswin.train.classification import Classification
 
 ROOT = Path(__file__).parents[2]
 
@@ -99,6 +110,62 @@ def test_what_comes_with_a_model():
         assert f"{count:,} parameters" in pretrained_file(name, "md").read_text()
     with pytest.raises(ValueError, match="no model 'letters' comes with darswin; the models are d"):
         pretrained_file("letters")
+    missing = "there is no file letters, and no model 'letters' comes with darswin; the models are"
+    with pytest.raises(FileNotFoundError, match=missing):
+        load_model("letters")
+    with pytest.raises(FileNotFoundError, match=r"letters\.safetensors"):
+        load_model("letters.safetensors")
+
+
+NO_WEIGHTS = "no trained darswin_a_small comes with darswin; load_model and .* know digits, and"
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: create_model("darswin_a_small", pretrained=True), NO_WEIGHTS),
+        (lambda: create_model("darswin_a_small", features_only=True, pretrained=True), NO_WEIGHTS),
+        (lambda: load_model("darswin_a_small"), NO_WEIGHTS),
+        (lambda: read_card("darswin_a_small"), NO_WEIGHTS),
+        (lambda: Classification(weights="darswin_a_small"), NO_WEIGHTS),
+        (lambda: predict(["x.png"], model="darswin_a_small"), NO_WEIGHTS),
+        (lambda: predict(["x.png"], model="digit"), "no model 'digit' .* the models are digits"),
+        (lambda: create_model("digits"), r"'digits' is a trained model: load_model\('digits'\)"),
+    ],
+)
+def test_who_asks_for_weights_learns_which_there_are(make, message):
+    with pytest.raises((ValueError, FileNotFoundError), match=message):
+        make()
+
+
+def test_pretrained_may_be_false():
+    assert create_model("darswin_a_nano", pretrained=False).num_classes == 1000
+
+
+MISSPELT = {
+    "darswin_a_smal": ("darswin_a_small", "darswin_ra_small"),
+    "DarSwin_A_Nano": ("darswin_a_nano",),
+    "darswin-ra-tiny": ("darswin_ra_tiny",),
+    "convunet_nano": ("conv_unet_nano",),
+    "swin_unet": ("swin_unet_tiny", "swin_unet_nano"),
+    "": (),
+}
+
+
+@pytest.mark.parametrize("name", MISSPELT)
+def test_a_misspelt_name_gets_two_suggestions(name):
+    makers = [create_model, model_class, preset, lambda name: Classification(name or "x")]
+    for make in makers:
+        with pytest.raises(ValueError, match=r"unknown model .*; did you mean") as error:
+            make(name)
+        suggested = {
+            other for other in list_models() if re.search(rf"\b{other}\b", str(error.value))
+        }
+        assert len(suggested) == 2 and suggested >= {*MISSPELT[name]}
+    with pytest.raises(ValueError, match="no model for `task` classification") as error:
+        Classification("darswin_unet_a_nano")
+    others = str(error.value).partition("did you mean")[2]
+    assert sum(bool(re.search(rf"\b{other}\b", others)) for other in list_models()) == 2
 
 
 def test_the_demo_wrote_the_sample_and_the_card(demo, unseen, tmp_path):

@@ -34,7 +34,7 @@ def test_files_that_are_no_model_of_ours(weights, tmp_path):
     with pytest.raises(FileNotFoundError):
         load_model(path)
     path.write_bytes(b"no model")
-    with pytest.raises(ValueError, match=r"m\.safetensors is no safetensors file"):
+    with pytest.raises(ValueError, match=r"m\.safetensors cannot be read as safetensors"):
         load_model(path)
     save_file(weights, path)
     with pytest.raises(ValueError, match="not the name of their model"):
@@ -90,3 +90,13 @@ def test_an_older_file_lacks_what_came_later(weights, tmp_path):
     del older["fit"]
     save_file(weights, path, metadata={"darswin": json.dumps(older)})
     assert load_model(path)[1] == CARD and CARD.fit == "whole"
+
+
+def test_a_card_shows_the_normalization():
+    assert (CARD.mean, CARD.std) == (0.0, 1.0)
+    assert repr(CARD).endswith("channels=1, mean=0.0, std=1.0)") and "spacing" in repr(CARD)
+    card = ModelCard("swin_nano", dict(mean=[0.4, 0.5, 0.6], std=0.2))
+    assert (card.mean, card.std, card.channels) == ([0.4, 0.5, 0.6], 0.2, 3)
+    assert str(card).endswith("mean=[0.4, 0.5, 0.6], std=0.2)")
+    model = card.create()
+    assert list(model.mean) == card.mean and set(model.std) == {card.std}

@@ -259,6 +259,19 @@ def test_test_sets_have_the_classes_of_the_training(folder, tmp_path):
     assert LabelData(str(folder), label_map=str(label_map)).classes == ["above", "below"]
 
 
+@pytest.mark.parametrize("names", [["ground", "sky", "wall"], ["sky", "ground", "wall", "car"]])
+def test_a_validation_set_has_the_classes_of_the_training(tmp_path, names):
+    """In their order, because labels are ids: each folder may have its own classes.json."""
+    for split in ("train", "val"):
+        write_plain(tmp_path, 2, size=(45, 60), split=split)
+    data = LabelData(str(tmp_path))
+    assert data.source("val").classes == data.classes
+    (tmp_path / "val" / "classes.json").write_text(json.dumps(names))
+    for split in ("val", "test"):
+        with pytest.raises(ValueError, match=f"its '{split}' split has the classes .*{names[0]}"):
+            LabelData(str(tmp_path)).source(split)
+
+
 def of_task(path, name=NAME, size=None, **options):
     return attached(Segmentation(name, **options), LabelData(path, size=size))
 

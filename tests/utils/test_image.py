@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from PIL import ExifTags, Image, ImageOps
 
-from darswin.utils.image import BrokenImageError, read_image, read_oriented
+from darswin.utils.image import BrokenImageError, read_header, read_image, read_oriented
 
 
 def chunk(kind, data):
@@ -50,6 +50,9 @@ def test_pictures_are_upright_whoever_reads_them(tmp_path, suffix, channels):
         image, found = read_oriented(path, channels)
         assert found == orientation and image.flags.c_contiguous
         assert np.array_equal(image, read_image(path, channels))
+        header = read_header(path)
+        assert header.orientation == orientation and header.upright == image.shape[:2]
+        assert header.size == (32, 48) and header.channels == 3 and header.is_sound
         assert np.abs(image.astype(int) - upright[..., None]).max() < 6
 
 

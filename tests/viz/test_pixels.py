@@ -119,6 +119,20 @@ def test_predictions_of_labels_stand_beside_the_truth(tmp_path):
     assert cv2.imread(str(tmp_path / "labels.png")).std() > 20
 
 
+def test_many_classes_leave_the_pictures_their_size():
+    truth, image = np.zeros((20, 20), np.int64), np.zeros((20, 20, 3), np.uint8)
+    widths = []
+    for count in (2, 40):
+        figure = draw_predictions(
+            [(image, truth, truth)], [f"a long name {k}" for k in range(count)]
+        )
+        figure.draw_without_rendering()
+        widths.append(figure.axes[0].get_window_extent().width)
+        legend = figure.legends[0].get_window_extent()
+        assert legend.x0 >= 0 and legend.x1 <= figure.bbox.width and legend.y0 >= 0
+    assert widths[1] == pytest.approx(widths[0], rel=0.05) and widths[0] > 130  # px
+
+
 def test_predictions_of_distances_have_their_error(tmp_path):
     truth = np.linspace(1, 50, 600, dtype=np.float32).reshape(20, 30)
     prediction = truth * 1.25

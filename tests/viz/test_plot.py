@@ -5,6 +5,7 @@ import pytest
 import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from PIL import Image
 
 from darswin import PolarSample
 from darswin.lens import KannalaBrandt, Mei, Polynomial, Spherical
@@ -118,7 +119,15 @@ def test_draw_curve_shows_radius_density_and_the_ends_of_the_image():
     assert len(drawn(draw_curve, lens)[0].lines) == 1
     lens = Polynomial([30.0, 0.0, -3.0])  # r rises up to 105°, 36 px
     assert not drawn(draw_curve, lens, (400, 400))[0].texts
-    assert len(drawn(draw_curve, lens, (40, 40))[0].texts) == 4
+    (label,) = drawn(draw_curve, lens, (40, 40))[0].texts  # lines at one place share a label
+    assert (
+        label.get_text()
+        == f"left, top, right, bottom {lens.side_angles((40, 40))[0, 0].rad2deg():.0f}°"
+    )
+    labels = [text.get_text() for text in left.texts]
+    assert labels == [
+        f"{side} {a:.0f}°" for side, a in zip(("top", "right", "bottom"), angles[1:], strict=True)
+    ]
 
 
 def test_draw_lens_has_all_panels(tmp_path):
@@ -133,6 +142,18 @@ def test_draw_lens_has_all_panels(tmp_path):
         path = tmp_path / f"lens{ending.upper()}"
         save_figure(figure if ending == ".png" else small, path)
         assert path.read_bytes().startswith(heads[format_])
+
+
+def test_a_palette_makes_a_png_small_and_keeps_its_size(tmp_path):
+    figure = Figure(figsize=(2, 1))
+    figure.subplots().imshow(np.random.default_rng(0).random((9, 9)))
+    for name, colors in (("all.png", None), ("few.png", 16)):
+        save_figure(figure, tmp_path / name, colors=colors)
+    large, small = (Image.open(tmp_path / name) for name in ("all.png", "few.png"))
+    assert small.mode == "P" and len(small.getcolors()) <= 16
+    assert small.size == large.size and small.info["dpi"] == large.info["dpi"]
+    with pytest.raises(ValueError, match=r"only a .png has a palette of colors, got '.*few.jpg'"):
+        save_figure(figure, tmp_path / "few.jpg", colors=16)
 
 
 @pytest.mark.parametrize("name", ["lens.gif", "lens", "lens.", "png", "a.png/b"])

@@ -5,10 +5,11 @@ from typing import get_args
 
 from darswin.data.scenes.cityscapes import is_cityscapes, open_cityscapes
 from darswin.data.scenes.coco import is_coco, open_coco
-from darswin.data.scenes.files import Options, ScenesSplit
+from darswin.data.scenes.files import Options, ScenesSplit, refuse_outlines
 from darswin.data.scenes.kitti360 import is_kitti360, open_kitti360
 from darswin.data.scenes.plain import FORM, is_plain, open_plain
-from darswin.data.scenes.scene import Scenes, Target
+from darswin.data.scenes.scene import Scenes
+from darswin.data.scenes.targets import Target
 from darswin.data.scenes.woodscape import (
     is_synwoodscape,
     is_woodscape,
@@ -47,9 +48,9 @@ def open_scenes(
     The folders in `path` tell its form:
 
     - the plain form has `images/STEM.png` (also jpg, bmp, webp, tif, ppm) and, for each picture,
-      `labels/STEM.png` (8-bit ids), `distance/STEM.png` (16 bits, metres × 256; 0 is unknown) or
-      `distance/STEM.npy` (floating-point metres). STEM may contain folders. All of this is in ROOT,
-      or in `ROOT/train`, `ROOT/val` and `ROOT/test`. The lens of a picture is in
+      `labels/STEM.png` (ids of 1 to 8 bits), `distance/STEM.png` (16 bits, metres × 256; 0 is
+      unknown) or `distance/STEM.npy` (floating-point metres). STEM may contain folders. All of this
+      is in ROOT, or in `ROOT/train`, `ROOT/val` and `ROOT/test`. The lens of a picture is in
       `lenses/STEM.json`, or the lens of all pictures in `lens.json` beside `images/` or in ROOT.
       `lens.json` is a calibration, or a lenses.json for `darswin.data.Calibrations` with paths
       relative to its folder. Calibrations may also end in yaml, yml, xml, txt, bin or npz.
@@ -74,13 +75,16 @@ def open_scenes(
             `val.txt`, `test.txt` with one stem per line. The stems may have the pictures' suffix.
             A split without a list is held out. WoodScape and SynWoodScape also take "heal-swin".
         label_map: a JSON object that maps ids in the label files to classes, by name or by id,
-            such as {"7": "road", "8": 1, "9": null}. Ids that it leaves out, or maps to null,
-            count as unlabelled. Without `classes`, its names are the classes, in their order.
+            such as {"7": "road", "8": 1, "9": null}; null means unlabelled. The ids that WoodScape,
+            SynWoodScape, Cityscapes or a COCO file define count as unlabelled if it leaves them
+            out; any other id must be in it. Without `classes`, its names are the classes, in their
+            order.
         holdout: a share, in [0, 0.5).
 
     Raises:
         FileNotFoundError: a missing folder, lens, label or list, or a split without scenes.
-        ValueError: ambiguous or inconsistent files. Both errors name the file.
+        ValueError: ambiguous or inconsistent files, and, also from `scenes[i]`, ids that no list of
+            classes, label map or annotation knows. Both errors name the file.
     """
     check_split(split, get_args(ScenesSplit), holdout)
     if target not in get_args(Target):
@@ -98,4 +102,5 @@ def open_scenes(
             scenes = open_split(root, options)
             scenes.channels = channels or scenes.form().channels
             return scenes
+    refuse_outlines(root)
     raise FileNotFoundError(f"no scenes in {root}: {FORM}")

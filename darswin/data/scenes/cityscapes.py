@@ -2,18 +2,20 @@
 
 The reader uses `leftImg8bit/SPLIT/CITY/STEM_leftImg8bit.png` and
 `gtFine/SPLIT/CITY/STEM_gtFine_labelIds.png` of the splits "train" and "val", because the labels of
-"test" are not public. The ids become the 19 classes of the benchmark; all other ids count as
-unlabelled.
+"test" are not public. The ids become the 19 classes of the benchmark; the authors' other ids count
+as unlabelled.
 
 Source: Cordts et al., Cityscapes, CVPR 2016, and github.com/mcordts/cityscapesScripts.
 """
 
+import re
 from functools import partial
 from pathlib import Path
 
 from darswin.data.scenes.files import Options, pair, pictures_in, stems
-from darswin.data.scenes.scene import Classes, Scenes, read_labels
-from darswin.data.splits import SPLITS, Split
+from darswin.data.scenes.scene import Classes, Scenes
+from darswin.data.scenes.targets import read_labels
+from darswin.data.splits import SPLITS, Split, some
 
 # The id, the name and the colour of each class.
 CLASSES = (
@@ -37,6 +39,7 @@ CLASSES = (
     (32, "motorcycle", [0, 0, 230]),
     (33, "bicycle", [119, 11, 32]),
 )
+IDS = range(34)  # of all classes, also those that the benchmark leaves out
 PICTURE, LABELS = "_leftImg8bit", "_gtFine_labelIds"
 
 
@@ -50,9 +53,12 @@ def open_cityscapes(root: Path, options: Options) -> Scenes:
         raise ValueError(f"{root} looks like Cityscapes, which has labels but no distances")
     folders: dict[Split, Path] = {split: root / "leftImg8bit" / split for split in SPLITS[:2]}
     part, choose = options.choose_part({s: f for s, f in folders.items() if f.is_dir()}, root)
+    targets = root / "gtFine" / part
+    if not targets.is_dir():
+        raise FileNotFoundError(f"no folder {targets}: {folders[part]} needs its labels there")
     pairs = pair(
-        _ending_in(PICTURE, pictures_in(folders[part])),
-        _ending_in(LABELS, stems(root / "gtFine" / part, (".png",))),
+        _ending_in(PICTURE, pictures_in(folders[part]), folders[part]),
+        _ending_in(LABELS, stems(targets, (".png",)), targets),
         choose,
         root=root,
         what="labels",
@@ -60,12 +66,20 @@ def open_cityscapes(root: Path, options: Options) -> Scenes:
     class_of, classes = options.labels(
         lambda: Classes([name for _, name, _ in CLASSES], [color for _, _, color in CLASSES]),
         {id_: k for k, (id_, _, _) in enumerate(CLASSES)},
+        IDS,
     )
     files, lenses = list(pairs.values()), options.shared_lens(root)
     read = partial(read_labels, classes=len(classes.names), class_of=class_of)
     return Scenes(root, files, lenses, target="labels", classes=classes, read=read)
 
 
-def _ending_in(ending: str, files: dict[str, str]) -> dict[str, str]:
+def _ending_in(ending: str, files: dict[str, str], folder: Path) -> dict[str, str]:
     """The files whose stems have an ending, by their stems without that ending."""
-    return {stem.removesuffix(ending): f for stem, f in files.items() if stem.endswith(ending)}
+    found = {stem.removesuffix(ending): f for stem, f in files.items() if stem.endswith(ending)}
+    if not found:
+        # The names begin with a city, a sequence and a frame.
+        others = sorted({re.sub(r".*_\d{6}_\d{6}", "", Path(stem).name) for stem in files})
+        raise FileNotFoundError(
+            f"{folder} must hold names that end in {ending}, but they end in {some(others)}"
+        )
+    return found

@@ -1,5 +1,6 @@
 """A data set of scenes: images with their lenses, and a label or a distance for each pixel."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -8,9 +9,11 @@ from torch import Tensor
 
 from darswin.data.reframing import resize_scene, turn_scene, warp_scene
 from darswin.data.samples import Draw, Samples
-from darswin.data.scenes.scene import IGNORE, Scene, Scenes
+from darswin.data.scenes.scene import Scene, Scenes
+from darswin.data.scenes.targets import IGNORE
 from darswin.data.warping import Crop, picture_size, taken_part
 from darswin.lens import Lens
+from darswin.utils.image import Header
 
 
 class SceneSamples(Samples):
@@ -41,6 +44,12 @@ class SceneSamples(Samples):
     def cameras(self) -> np.ndarray:
         """The number of each picture's camera in `scenes.cameras`, (N,)."""
         return np.array([self.scenes.camera_of(k) for k in range(len(self))], np.int64)
+
+    def headers(self, index: int) -> list[Header]:
+        return self.scenes.headers(index)
+
+    def _check(self, index: int, headers: Sequence[Header]) -> None:
+        self.scenes.check(index, *headers)
 
     def _seen(self, draw: Draw) -> tuple[np.ndarray, Lens, Tensor]:
         image, target, lens = self._reframed(self.scenes[draw.picture], draw)

@@ -1,14 +1,15 @@
 """Finds the files of scenes: pictures, and targets and calibrations with the same stems."""
 
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 from darswin.data.cameras import Calibrations
 from darswin.data.folders import OTHER_SUFFIXES, PICTURES, SUFFIXES, files_below, warn_of_unread
-from darswin.data.scenes.scene import Classes, Target, read_label_map, read_palette
+from darswin.data.scenes.scene import Classes, read_label_map, read_palette
+from darswin.data.scenes.targets import IGNORE, Target
 from darswin.data.splits import (
     Split,
     part_of_split,
@@ -62,18 +63,29 @@ class Options:
         return Calibrations(None, files=files)
 
     def labels(
-        self, own: Callable[[], Classes], class_of: Mapping[int, int] | None = None
+        self,
+        own: Callable[[], Classes],
+        class_of: Mapping[int, int] | None = None,
+        ids: Iterable[int] = (),
     ) -> tuple[Mapping[int, int] | None, Classes]:
         """The class of each id in the label files, None where they are the same; and the classes.
-        The arguments are the data set's own."""
+
+        `own` and `class_of` are the data set's. `ids` are all ids that its authors defined: they
+        count as unlabelled without a class, also if a label map leaves them out.
+        """
         given = self.classes
         palette = own if given is None else lambda: read_palette(given)
         if self.label_map is not None:
-            return read_label_map(self.label_map, palette, given is not None)
-        classes = palette()
-        if class_of and (count := max(class_of.values()) + 1) != len(classes.names):
-            raise ValueError(f"{given} must name {count} classes, but names {len(classes.names)}")
-        return class_of, classes
+            class_of, classes = read_label_map(self.label_map, palette, given is not None)
+        else:
+            classes = palette()
+            if class_of is None:
+                return None, classes
+            if (count := max(class_of.values(), default=-1) + 1) != len(classes.names):
+                raise ValueError(
+                    f"{given} must name {count} classes, but names {len(classes.names)}"
+                )
+        return {**dict.fromkeys(ids, IGNORE), **class_of}, classes
 
     def choose_part(self, parts: Mapping[Split, Path], root: Path) -> tuple[Split, Choose]:
         """The part of a divided data set from which the split is taken, and the function that
@@ -129,7 +141,7 @@ def _listed(path: Path, found: Sequence[str], named: Named | None) -> dict[Split
     for split, names in read_split_lists(path).items():
         if wrong := [name for name in names if not isinstance(name, str)]:
             raise ValueError(f"{path} must list names for {split!r}, got {wrong[0]!r}")
-        given[split] = list(dict.fromkeys(map(_stem, names)))
+        given[split] = list(dict.fromkeys(map(stem_of, names)))
         for stem in given[split]:
             if split_of.setdefault(stem, split) != split and "train" in (split_of[stem], split):
                 raise ValueError(f"{path} lists {stem} for {split_of[stem]!r} and for {split!r}")
@@ -138,7 +150,8 @@ def _listed(path: Path, found: Sequence[str], named: Named | None) -> dict[Split
     return given
 
 
-def _stem(name: str) -> str:
+def stem_of(name: str) -> str:
+    """The stem of a picture or a PNG that a list names."""
     stem, suffix = os.path.splitext(name)
     return os.path.normpath(stem if suffix.lower() in PICTURES else name)
 
@@ -153,6 +166,17 @@ def lenses_beside(
         if not there[file]:
             raise FileNotFoundError(f"no lens for {picture}: add {file}, or give `lens`")
     return options.own_lenses(files)
+
+
+def refuse_outlines(root: Path) -> None:
+    """FileNotFoundError if a JSON file of a data set has outlines of objects in COCO's form."""
+    for file in (*sorted(root.glob("*.json")), *sorted(root.glob("*/*.json"))):
+        text = file.read_bytes()
+        if b'"annotations"' in text and b'"segmentation"' in text:
+            raise FileNotFoundError(
+                f"{file} has outlines of objects, but darswin reads masks, a PNG for each picture: "
+                "docs/howto/scenes.md has the lines that make masks of outlines"
+            )
 
 
 def calibration_in(*folders: Path) -> Path | None:
@@ -209,6 +233,8 @@ def pair(
             warn_left_out(
                 f"{without} of {len(pictures)} pictures in {root} have no {what}: left out"
             )
+        if not found:
+            raise FileNotFoundError(f"none of {len(pictures)} pictures in {root} has {what}")
     if alone := [targets[stem] for stem in targets if stem not in pictures]:
         warn_left_out(f"{len(alone)} files of {what} have no picture, {some(alone)}: left out")
     chosen = choose(found)

@@ -13,7 +13,8 @@ Source: Liao et al., KITTI-360, PAMI 2022.
 from pathlib import Path
 
 from darswin.data.scenes.files import Options, lenses_beside, pair, stems
-from darswin.data.scenes.scene import SUFFIXES, Scenes
+from darswin.data.scenes.scene import Scenes
+from darswin.data.scenes.targets import SUFFIXES
 
 
 def is_kitti360(root: Path) -> bool:

@@ -12,17 +12,11 @@ from darswin.data.scenes.files import (
     calibration_in,
     pair,
     pictures_in,
+    refuse_outlines,
     stems,
 )
-from darswin.data.scenes.scene import (
-    NO_CLASSES,
-    SUFFIXES,
-    Classes,
-    Scenes,
-    read_distance,
-    read_labels,
-    read_palette,
-)
+from darswin.data.scenes.scene import NO_CLASSES, Classes, Scenes, read_palette
+from darswin.data.scenes.targets import SUFFIXES, read_distance, read_labels
 from darswin.data.splits import Split, split_folders
 
 FORM = (
@@ -52,6 +46,8 @@ def open_plain(root: Path, options: Options) -> Scenes:
 def _scenes(root: Path, folder: Path, options: Options, choose: Choose) -> Scenes:
     """The scenes of a folder with `images/`, of the stems that `choose` takes."""
     target = options.target
+    if target == "labels" and not (folder / target).is_dir():
+        refuse_outlines(root)
     targets = stems(folder / target, SUFFIXES[target])
     pairs = pair(pictures_in(folder / "images"), targets, choose, root=folder, what=target)
     classes, read = NO_CLASSES, read_distance

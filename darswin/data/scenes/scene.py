@@ -1,28 +1,28 @@
 """Scenes: pictures with a label or a distance for each pixel, and the lenses that took them."""
 
 import os
-import warnings
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, Self
+from typing import Any, NamedTuple, Self
 
-import cv2
 import numpy as np
 import torch
-from PIL import Image
 
 from darswin.data.cameras import Calibrations
 from darswin.data.pictures import Form, form_of
-from darswin.data.splits import Limited, read_classes, read_json, some
+from darswin.data.scenes.targets import (
+    IGNORE,
+    Target,
+    nothing_of,
+    read_distance,
+    read_labels,
+    target_header,
+)
+from darswin.data.splits import Limited, read_classes, some
 from darswin.lens import Lens
-from darswin.utils.image import BrokenImageError, decoded, file_content, read_oriented
-
-IGNORE = 255  # the label of an unlabelled pixel
-PER_METRE = 256  # the scale of distances in a PNG of 16 bits
-Target = Literal["labels", "distance"]
-# The suffixes of target files.
-SUFFIXES: dict[Target, tuple[str, ...]] = {"labels": (".png",), "distance": (".png", ".npy")}
+from darswin.utils.image import Header, read_header, read_oriented
+from darswin.utils.text import read_json
 
 
 class Scene(NamedTuple):
@@ -104,25 +104,39 @@ class Scenes(Limited):
     def __getitem__(self, index: int) -> Scene:
         """The scene; BrokenImageError or ValueError for files that are broken or do not fit."""
         image, orientation = read_oriented(self.file(index), self.channels)
-        if orientation != 1:
-            raise ValueError(
-                f"{self.file(index)} has the EXIF orientation {orientation}, so its labels or "
-                "distances may fit the stored or the upright picture: store it upright"
-            )
         target = self.read(self.target_file(index))
         size = image.shape[0], image.shape[1]
-        if target.shape != size:
-            shapes = [f"{height}×{width}" for height, width in (target.shape, size)]
-            raise ValueError(
-                f"{self.target_file(index)} has {shapes[0]} px, but its picture "
-                f"{self.file(index)} has {shapes[1]}"
-            )
+        self._check(index, size, orientation, target.shape)
         lens = self.lenses.lens_of(self.file(index), size)
         rows = self._rows(size[0])
         kept = slice(rows, size[0] - rows)
         image, target = image[kept], target[kept]
         self.unknown[index] = int(np.count_nonzero(target == nothing_of(target)))
         return Scene(image, target, self._trimmed(lens))
+
+    def headers(self, index: int) -> list[Header]:
+        """The headers of the picture and of its target."""
+        return [read_header(self.file(index)), target_header(self.target_file(index))]
+
+    def check(self, index: int, picture: Header, target: Header) -> None:
+        """Raises the ValueErrors of `self[index]` that the headers of its files tell."""
+        self._check(index, picture.upright, picture.orientation, target.size)
+        self.lenses.check(self.file(index), picture.size)
+
+    def _check(
+        self, index: int, size: tuple[int, int], orientation: int, target: tuple[int, ...]
+    ) -> None:
+        if orientation != 1:
+            raise ValueError(
+                f"{self.file(index)} has the EXIF orientation {orientation}, so its labels or "
+                "distances may fit the stored or the upright picture: store it upright"
+            )
+        if target != size:
+            shapes = [f"{height}×{width}" for height, width in (target, size)]
+            raise ValueError(
+                f"{self.target_file(index)} has {shapes[0]} px, but its picture "
+                f"{self.file(index)} has {shapes[1]}"
+            )
 
     def limited(self, count: int) -> Self:
         part = super().limited(count)
@@ -163,81 +177,6 @@ class Scenes(Limited):
         return lens.cropped(rows, 0, height - 2 * rows, width)
 
 
-# -- targets ----------------------------------------------------------------------------------
-
-
-def nothing_of(target: np.ndarray) -> int:
-    """The target of unknown pixels: `IGNORE` in labels (uint8), 0 in distances."""
-    return IGNORE if target.dtype == np.uint8 else 0
-
-
-def read_labels(path: Path, classes: int, class_of: Mapping[int, int] | None = None) -> np.ndarray:
-    """The ids of classes, or `IGNORE`, in a PNG that is grey or has a palette, (H, W) uint8.
-
-    `class_of` maps the ids in the file to classes; ids that it leaves out become `IGNORE`.
-    """
-    try:
-        with warnings.catch_warnings(action="ignore"), Image.open(path) as file:
-            mode = file.mode
-            if mode in ("L", "P", "1"):
-                labels = np.array(file, np.uint8)
-    except Exception as error:  # Pillow raises many exceptions for broken files
-        raise BrokenImageError(f"cannot read {path}: {_reason(error)}") from error
-    if mode not in ("L", "P", "1"):
-        raise ValueError(
-            f"{path} must hold an id of 8 bits for each pixel, grey or with a palette, but "
-            f"holds {'16 bits' if mode.startswith('I') else f'colours ({mode})'}"
-        )
-    if class_of is not None:
-        table = np.full(256, IGNORE, np.uint8)
-        for id_, class_ in class_of.items():
-            if id_ < len(table):
-                table[id_] = class_
-        return table[labels]
-    ids = np.flatnonzero(np.bincount(labels.ravel(), minlength=256)).tolist()
-    if wrong := [id_ for id_ in ids if classes <= id_ != IGNORE]:
-        raise ValueError(
-            f"{path} holds the ids {some(wrong)}, but the {classes} classes have the ids 0 to "
-            f"{classes - 1}; {IGNORE} means unlabelled, and `label_map` maps other ids to classes"
-        )
-    return labels
-
-
-def read_distance(path: Path, far: float | None = None) -> np.ndarray:
-    """The distances (H, W) float32, metres, in a PNG of 16 bits or a NumPy file; 0 for values that
-    are not finite, not above 0, or at least `far`."""
-    if path.suffix.lower() == ".npy":
-        try:
-            metres = np.load(path, allow_pickle=False)
-        except Exception as error:  # NumPy raises many exceptions for broken files
-            raise BrokenImageError(f"cannot read {path}: {_reason(error)}") from error
-        if not isinstance(metres, np.ndarray) or metres.ndim != 2 or metres.dtype.kind != "f":
-            form = "an archive"
-            if isinstance(metres, np.ndarray):
-                form = f"{metres.dtype} {metres.shape}"
-            raise ValueError(f"{path} must hold floating-point metres (H, W), but holds {form}")
-        with np.errstate(over="ignore"):  # infinite means unknown
-            metres = metres.astype(np.float32)
-    else:
-        image = decoded(file_content(path), path, cv2.IMREAD_UNCHANGED)
-        if image.dtype != np.uint16 or image.ndim != 2:
-            colours = 1 if image.ndim == 2 else image.shape[2]
-            raise ValueError(
-                f"{path} must hold a distance of 16 bits for each pixel, metres × {PER_METRE}, but "
-                f"holds {colours} × {8 * image.dtype.itemsize} bits"
-            )
-        metres = image.astype(np.float32) / np.float32(PER_METRE)
-    with np.errstate(invalid="ignore"):
-        known = np.isfinite(metres) & (metres > 0)
-        if far is not None:
-            known &= metres < far
-    return np.where(known, metres, np.float32(0))
-
-
-def _reason(error: Exception) -> str:
-    return getattr(error, "strerror", None) or str(error) or type(error).__name__
-
-
 # -- classes ----------------------------------------------------------------------------------
 
 
@@ -252,7 +191,7 @@ def read_palette(path: str | Path) -> Classes:
 def read_label_map(
     path: str | Path, own: Callable[[], Classes], is_given: bool
 ) -> tuple[dict[int, int], Classes]:
-    """The class of each id in the label files, from a JSON object, and all classes.
+    """The class of each id in the label files, or `IGNORE`, from a JSON object, and all classes.
 
     The values are names or ids of classes, or null for ids that mean unlabelled. The classes are
     `own()`, or the names in the order of the file unless `is_given`.
@@ -271,7 +210,10 @@ def read_label_map(
     for key, value in content.items():
         if not key.isdecimal():
             raise ValueError(f"{form}, got the id {key!r}")
+        if int(key) in found:
+            raise ValueError(f"{path} maps the id {int(key)} twice")
         if value is None or value == IGNORE:
+            found[int(key)] = IGNORE
             continue
         class_ = classes.names.index(value) if value in classes.names else value
         if type(class_) is not int or not 0 <= class_ < len(classes.names):

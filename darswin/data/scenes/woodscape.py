@@ -22,15 +22,10 @@ import numpy as np
 
 from darswin.data.cameras import Calibrations
 from darswin.data.scenes.files import Options, Pairs, lenses_beside, pair, pictures_in, stems
-from darswin.data.scenes.scene import (
-    NO_CLASSES,
-    Classes,
-    Scenes,
-    as_classes,
-    read_distance,
-    read_labels,
-)
-from darswin.data.splits import Split, read_json
+from darswin.data.scenes.scene import NO_CLASSES, Classes, Scenes, as_classes
+from darswin.data.scenes.targets import read_distance, read_labels
+from darswin.data.splits import Split
+from darswin.utils.text import read_json
 
 NAMES = ["void", "road", "lanemarks", "curb", "person", "rider", "vehicles", "bicycle",
          "motorcycle", "traffic_sign"]  # fmt: skip
@@ -77,7 +72,7 @@ def _scenes(
     target = options.target
     if target == "labels":
         targets = stems(_unnested(root / "semantic_annotations") / "gtLabels", (".png",))
-        class_of, classes = options.labels(partial(_classes, root, names))
+        class_of, classes = options.labels(partial(_classes, root, names), ids=range(len(names)))
         read = partial(read_labels, classes=len(classes.names), class_of=class_of)
     else:
         targets = stems(_unnested(root / "depth_maps") / "raw_data", (".npy",))

@@ -7,7 +7,7 @@ import json
 import os
 import re
 import zipfile
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -15,8 +15,8 @@ from xml.etree import ElementTree
 import numpy as np
 import yaml
 
-from darswin.lens.files.fields import is_number, short
-from darswin.utils.text import to_text
+from darswin.lens.files.fields import is_number
+from darswin.utils.text import mapping, parse_json, to_text
 
 # A mapping from YAML, JSON or XML; or rows of words, from a plain table.
 Content = Mapping | list[list[str]]
@@ -86,19 +86,9 @@ def parse(text: str) -> Content:
 
 def _parse_json(text: str) -> Mapping:
     try:
-        return json.loads(text, object_pairs_hook=_mapping)
+        return parse_json(text)
     except ValueError as error:
         raise ValueError(f"it is not valid JSON: {error}") from error
-
-
-def _mapping(pairs: Iterable[tuple[Any, Any]]) -> dict[Any, Any]:
-    """A mapping. Raises ValueError for two entries with the same name: parsers keep the last."""
-    mapping: dict[Any, Any] = {}
-    for name, value in pairs:
-        if name in mapping:
-            raise ValueError(f"{short(name)} appears twice in one mapping")
-        mapping[name] = value
-    return mapping
 
 
 def _parse_table(text: str) -> list[list[str]]:
@@ -130,7 +120,7 @@ def _parse_yaml(text: str) -> Mapping:
 class _Loader(yaml.BaseLoader):
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         super().construct_mapping(node, deep)  # raises for invalid names
-        return _mapping(
+        return mapping(
             (self.construct_object(name), self.construct_object(value))
             for name, value in node.value
         )
@@ -159,7 +149,7 @@ def _element(element: ElementTree.Element, depth: int) -> Mapping | list | str:
         return (element.text or "").strip().strip('"')
     if all(tag == "_" for tag, _ in children):
         return [value for _, value in children]
-    return _mapping(children)
+    return mapping(children)
 
 
 def _limited(notation: str, text: str, most: int) -> str:

@@ -4,6 +4,7 @@ import json
 import shutil
 from itertools import chain
 
+import cv2
 import numpy as np
 import pytest
 from scenes import (
@@ -14,9 +15,11 @@ from scenes import (
     distance_of,
     labels_of,
     rays_of,
+    write,
     write_cityscapes,
     write_coco,
     write_kitti360,
+    write_outlines,
     write_plain,
     write_synwoodscape,
     write_woodscape,
@@ -179,6 +182,46 @@ def test_cityscapes(tmp_path):
         open_scenes(tmp_path, "train", "labels", classes=tmp_path / "two.txt")
 
 
+@pytest.mark.parametrize(
+    ("ending", "message"),
+    [
+        ("_gtFine_labelTrainIds", r"but they end in \['_gtFine_labelTrainIds'\]"),
+        ("_gtFine_color", r"\['_gtFine_color'\]"),
+        ("_gtFine_instanceIds", r"\['_gtFine_instanceIds'\]"),
+        ("_gtCoarse_labelIds", r"\['_gtCoarse_labelIds'\]"),
+        ("_labelIds", r"\['_labelIds'\]"),
+        ("", r"\[''\]"),
+    ],
+)
+def test_other_endings_of_cityscapes_are_named(tmp_path, ending, message):
+    write_cityscapes(tmp_path)
+    shutil.copy(WOODSCAPE, tmp_path / "lens.json")
+    for file in (tmp_path / "gtFine").rglob("*.png"):
+        if file.stem.endswith("instanceIds"):
+            file.unlink()
+        else:
+            file.rename(file.with_name(file.name.replace("_gtFine_labelIds", ending)))
+    with pytest.raises(
+        FileNotFoundError, match=rf"gtFine/train must hold .* end in _gtFine_labelIds, .*{message}"
+    ):
+        open_scenes(tmp_path, "train", "labels")
+
+
+def test_cityscapes_without_labels_or_pictures(tmp_path):
+    write_cityscapes(tmp_path)
+    shutil.copy(WOODSCAPE, tmp_path / "lens.json")
+    (tmp_path / "gtFine").rename(tmp_path / "gtCoarse")
+    with pytest.raises(FileNotFoundError, match=r"no folder .*gtFine/train: .*leftImg8bit/train"):
+        open_scenes(tmp_path, "train", "labels")
+    (tmp_path / "gtCoarse").rename(tmp_path / "gtFine")
+    for file in (tmp_path / "leftImg8bit").rglob("*.png"):
+        file.rename(file.with_name(file.name.replace("leftImg8bit", "rightImg8bit")))
+    with pytest.raises(
+        FileNotFoundError, match=r"leftImg8bit/train must hold .*_leftImg8bit, .*_rightImg8bit"
+    ):
+        open_scenes(tmp_path, "train", "labels")
+
+
 def test_coco_panoptic(tmp_path):
     write_coco(tmp_path)
     shutil.copy(WOODSCAPE, tmp_path / "lens.json")
@@ -194,11 +237,6 @@ def test_coco_panoptic(tmp_path):
     unlabelled = (expected == 1) | (expected == IGNORE)
     assert (mapped[0].target == np.where(unlabelled, IGNORE, 0)).all()
     file = tmp_path / "annotations" / "panoptic_train2017.json"
-    content = json.loads(file.read_text())
-    content["annotations"][0]["segments_info"].pop()
-    file.write_text(json.dumps(content))
-    with pytest.raises(ValueError, match=r"000\.png holds the segment 7, but its annotation"):
-        open_scenes(tmp_path, "train", "labels")[0]
     file.write_text("{}")
     with pytest.raises(ValueError, match=r"train2017\.json is not in COCO's panoptic format"):
         open_scenes(tmp_path, "train", "labels")
@@ -206,10 +244,132 @@ def test_coco_panoptic(tmp_path):
         open_scenes(tmp_path, "train", "distance")
 
 
+def annotated(folder, change):
+    """The scenes of COCO's tree after a change of the first annotation, or of the content."""
+    file = folder / "annotations" / "panoptic_train2017.json"
+    if not (folder / "lens.json").exists():
+        write_coco(folder)
+        shutil.copy(WOODSCAPE, folder / "lens.json")
+        shutil.copy(file, folder / "before.json")
+    content = json.loads((folder / "before.json").read_text())
+    change(content["annotations"][0], content)
+    file.write_text(json.dumps(content))
+    return open_scenes(folder, "train", "labels")
+
+
+@pytest.mark.filterwarnings("ignore::darswin.data.splits.LeftOut")
+@pytest.mark.parametrize(
+    ("place", "file_name", "is_found"),
+    [
+        ("a/b", "a/b/{}", True),
+        ("a/b", "./a//b/{}", True),
+        ("a/b", r"a\b\{}", True),
+        ("a/b", "panoptic_train2017/a/b/{}", True),
+        ("b", "a/b/{}", True),
+        (".", "a/b/{}", True),
+        (".", "{}", True),
+        ("a/b", "b/{}", False),
+        ("a/b", "{}", False),
+        ("a/b", "a/c/{}", False),
+    ],
+)
+def test_folders_in_coco(tmp_path, place, file_name, is_found):
+    expected = annotated(tmp_path, lambda first, content: None)[0].target
+    for folder in ("train2017", "annotations/panoptic_train2017"):
+        files = [file for file in (tmp_path / folder).iterdir() if file.is_file()]
+        (tmp_path / folder / place).mkdir(exist_ok=True, parents=True)
+        for file in files:
+            file.rename(tmp_path / folder / place / file.name)
+
+    def named(first, content):
+        for annotation in content["annotations"]:
+            annotation["file_name"] = file_name.format(annotation["file_name"])
+
+    if not is_found:
+        with pytest.raises(FileNotFoundError, match=r"none of 2 pictures in .* has labels"):
+            annotated(tmp_path, named)
+        return
+    scenes = annotated(tmp_path, named)
+    assert len(scenes) == 2 and (scenes[0].target == expected).all()
+
+
+def with_segment(number, **entries):
+    return lambda first, content: first["segments_info"][number].update(entries)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (with_segment(1, category_id=69), r"000\.png: the segment 300 has the category 69, but"),
+        (with_segment(1, category_id="17"), r"has the category '17', but .* are \[1, 17, 200\]"),
+        (with_segment(1, category_id=None), "has the category None"),
+        (with_segment(1, id=-300), "a whole number above 0, .*, got -300"),
+        (with_segment(1, id=0), "above 0, which means no segment, got 0"),
+        (with_segment(1, id=300.5), r"got 300\.5"),
+        (with_segment(1, id="300"), "got '300'"),
+        (with_segment(1, id=7), r"000\.png: two segments have the colour of the id 7"),
+        (with_segment(1, id=7 + 2**24), "two segments have the colour"),
+        (lambda first, content: first["segments_info"][1].pop("id"), "a segment has no 'id'"),
+        (lambda first, content: content["annotations"].append(first), "two annotations for .*000"),
+        (
+            lambda first, content: content["categories"][2].update(id=1),
+            r"train2017\.json defines the category 1 twice",
+        ),
+        (lambda first, content: first.pop("segments_info"), "panoptic format: it lacks 'segments"),
+    ],
+)
+def test_wrong_annotations_of_coco_are_named(tmp_path, change, message):
+    with pytest.raises(ValueError, match=rf"panoptic_train2017\.json.*{message}|{message}"):
+        annotated(tmp_path, change)
+
+
+@pytest.mark.parametrize(
+    ("id_", "color"),
+    [
+        (1, (1, 0, 0)),
+        (2**24 - 1, (255, 255, 255)),
+        (2**16, (0, 0, 1)),
+        # Larger ids are written without their higher digits.
+        (2**24 + 301, (45, 1, 0)),
+        (2**31 + 5, (5, 0, 0)),
+        (2**32 - 1, (255, 255, 255)),
+        (2**63 + 256, (0, 1, 0)),
+    ],
+)
+def test_ids_of_coco_segments(tmp_path, id_, color):
+    expected = annotated(tmp_path, lambda first, content: None)[0].target
+    scenes = annotated(tmp_path, with_segment(1, id=id_))
+    file = scenes.target_file(0)
+    with pytest.raises(ValueError, match=r"000\.png holds the segment 300, but its annotation"):
+        scenes[0]
+    picture = cv2.imread(str(file), cv2.IMREAD_COLOR_RGB)
+    picture[(picture == (300 % 256, 1, 0)).all(-1)] = color
+    write(file, picture[..., ::-1])
+    assert (scenes[0].target == expected).all()
+
+
+@pytest.mark.parametrize("id_", [2**24, 2**31])
+def test_a_coco_segment_that_has_the_colour_of_no_segment(tmp_path, id_):
+    """It names no pixel, and black pixels might be its own."""
+    annotated(tmp_path, lambda first, content: None)
+    more = {"id": id_, "category_id": 17}
+    scenes = annotated(tmp_path, lambda first, content: first["segments_info"].append(more))
+    with pytest.raises(ValueError, match=r"000\.png holds the segment 0, but its annotation lacks"):
+        scenes[0]
+    file = scenes.target_file(0)
+    picture = cv2.imread(str(file), cv2.IMREAD_COLOR_RGB)
+    picture[:, :9] = picture[:, 9:10]
+    write(file, picture[..., ::-1])
+    assert (scenes[0].target < 3).all()
+    scenes = annotated(tmp_path, lambda first, content: first.update(segments_info=[more]))
+    with pytest.raises(ValueError, match=r"000\.png holds the segment \d+, but its annotation"):
+        scenes[0]
+
+
 @pytest.mark.parametrize(
     ("content", "classes", "expected"),
     [
-        ({"0": "b", "2": "a"}, ["b", "a"], {0: 0, 1: IGNORE, 2: 1}),
+        ({"0": "b", "1": None, "2": "a"}, ["b", "a"], {0: 0, 1: IGNORE, 2: 1}),
         ({"0": 2, "1": None, "2": 0}, CLASSES["names"], {0: 2, 1: IGNORE, 2: 0}),
         ({"0": "x", "1": "x", "2": 255, "999": "x"}, ["x"], {0: 0, 1: 0, 2: IGNORE}),
     ],
@@ -225,6 +385,37 @@ def test_label_maps(tmp_path, content, classes, expected):
         assert (scenes[0].target[before == id_] == class_).all()
 
 
+def test_ids_that_no_table_knows_are_named(tmp_path):
+    """In every reader; ids that the authors defined are known, with a class or without."""
+    write_cityscapes(tmp_path / "cityscapes")
+    write_woodscape(tmp_path / "woodscape", 8)
+    write_synwoodscape(tmp_path / "synwoodscape")
+    write_plain(tmp_path / "plain", 8)
+    (tmp_path / "map.json").write_text('{"1": "thing"}')
+    lens, mapped = dict(lens=WOODSCAPE), dict(label_map=tmp_path / "map.json")
+    for name, options, known, unknown in (
+        ("cityscapes", lens, {0: IGNORE, 6: IGNORE, 7: 0, 33: 18}, [34, 100, 254]),
+        ("cityscapes", lens | mapped, {0: IGNORE, 1: 0, 33: IGNORE}, [34, 254]),
+        ("woodscape", {}, {0: 0, 9: 9}, [10, 254]),
+        ("woodscape", mapped, {0: IGNORE, 1: 0, 9: IGNORE}, [10, 254]),
+        ("synwoodscape", {}, {0: 0, 24: 24}, [25, 254]),
+        ("synwoodscape", mapped, {0: IGNORE, 1: 0, 24: IGNORE}, [25, 254]),
+        ("plain", {}, {0: 0, 2: 2}, [3, 254]),
+        ("plain", mapped, {1: 0}, [0, 2, 254]),
+    ):
+        scenes = open_scenes(tmp_path / name, "train", "labels", **options)
+        file = scenes.target_file(0)
+        for id_, class_ in (known | {IGNORE: IGNORE}).items():
+            write(file, np.full((121, 160), id_, np.uint8))
+            assert (scenes[0].target == class_).all(), (name, id_)
+        labels = np.full((121, 160), next(iter(known)), np.uint8)
+        for id_ in unknown:
+            labels[60, 80] = id_
+            write(file, labels)
+            with pytest.raises(ValueError, match=rf"{file} holds the ids \[{id_}\], but"):
+                scenes[0]
+
+
 def test_wrong_label_maps_are_named(tmp_path):
     write_plain(tmp_path, 1)
     file = tmp_path / "map.json"
@@ -234,6 +425,7 @@ def test_wrong_label_maps_are_named(tmp_path):
         ({"0": 3}, "maps the id 0 to 3, but the classes are .*sky"),
         ({"0": "sky", "1": 1}, r"maps the id 1 to 1, but the classes are \['sky'\]"),
         ({"0": True}, "maps the id 0 to True"),
+        ({"0": "sky", "00": "sea"}, "maps the id 0 twice"),
     ):
         file.write_text(json.dumps(content))
         with pytest.raises(ValueError, match=message):
@@ -255,6 +447,23 @@ def test_what_woodscape_does_not_have(tmp_path):
     (tmp_path / INFO).write_text(json.dumps(WOODSCAPE_INFO | {"class_indexes": [1] * 10}))
     with pytest.raises(ValueError, match=r"seg_annotation_info\.json: class_indexes must be"):
         open_scenes(tmp_path, "all", "labels", lens=lens)
+
+
+@pytest.mark.parametrize(
+    "place", ["annotations/instances_train.json", "_annotations.coco.json", "train/result.json"]
+)
+@pytest.mark.parametrize("pictures", ["images", "train", "train/images", "photos"])
+def test_outlines_of_objects_are_no_labels(tmp_path, place, pictures):
+    """The error names the file and the page with the lines that make masks."""
+    write_outlines(tmp_path)
+    file = tmp_path / place
+    if pictures != "images":
+        (tmp_path / pictures).parent.mkdir(exist_ok=True)
+        (tmp_path / "images").rename(tmp_path / pictures)
+    file.parent.mkdir(exist_ok=True)
+    (tmp_path / "annotations" / "instances_train.json").rename(file)
+    with pytest.raises(FileNotFoundError, match=rf"{file.name} has outlines .* docs/howto/scenes"):
+        open_scenes(tmp_path, "train", "labels")
 
 
 # -- the plain form ---------------------------------------------------------------------------

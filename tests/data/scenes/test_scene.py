@@ -13,7 +13,7 @@ from PIL import ExifTags, Image
 from scenes import write, write_plain
 
 from darswin.data import IGNORE, SceneSamples, open_scenes
-from darswin.data.scenes.scene import read_distance, read_labels
+from darswin.data.scenes.targets import read_distance, read_labels
 from darswin.utils.image import BrokenImageError
 
 LABELS = np.random.default_rng(0).integers(0, 4, size=(9, 13), dtype=np.uint8)

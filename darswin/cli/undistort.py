@@ -1,0 +1,228 @@
+"""`darswin lens undistort`: pictures and videos as an ideal camera would have taken them."""
+
+import json
+import math
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import torch
+
+import darswin.lens
+from darswin.cli.arguments import check_option
+from darswin.cli.views import View, check_view, view_of, view_rays
+from darswin.lens import Lens, Perspective
+from darswin.lens.files.load import reach
+from darswin.lens.files.opencv import Coefficients
+from darswin.utils.files import replace_file
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from darswin.data.cameras import Calibrations
+    from darswin.frames import Sampler
+
+MOST_PIXELS = 2**26  # of a view
+WRITTEN = frozenset((".bmp", ".dib", ".jpe", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp"))
+RECORD, LENS = "undistorted.json", "lens.json"
+_KEPT = 8  # plans in memory, for pictures of several sizes or cameras
+
+
+def undistort(
+    calib: str, paths: Sequence[str] = (), *, out: str, view: View = "perspective",
+    fov_deg: float | None = None, size: tuple[int, int] | None = None, yaw_deg: float = 0.0,
+    pitch_deg: float = 0.0, theta_max_deg: float | None = None, camera: str | None = None,
+    coefficients: Coefficients | None = None,
+) -> None:  # fmt: skip
+    """Undistorts pictures and videos of a fisheye or wide-angle camera.
+
+    Writes pictures and videos of the same names into a new folder, and, for perspective views,
+    their calibration, lens.json. Pictures and videos are turned upright by their metadata, and
+    their lens with them. Pictures may have another size than those of the calibration, but not
+    another shape. Files that cannot be read are named at the end; all others are written.
+
+    Args:
+        calib: the calibration file of the camera, in any format that darswin.lens.load reads; or a
+            lenses.json for several cameras.
+        paths: pictures, videos, and folders of them, whose subfolders are kept.
+        out: the folder to write to: new, empty, or from an earlier undistort, whose files are
+            replaced. Pictures have 8 bits per channel and no transparency, videos have no sound.
+            Endings that cannot be written get .png or .mp4 in addition.
+        view: the projection. A perspective view shows straight lines straight, but its sides become
+            coarse above 110°. A cylindrical view shows verticals straight. An equirectangular view
+            is a part of a map of the sphere. A square shows the whole image disc, in equal steps of
+            the incident angle.
+        fov_deg: the horizontal field of view, in degrees. The default is all that the picture
+            shows; for a perspective view, 110° at most.
+        size: height and width of the views in px, e.g. 480,640. The default is a shape that fits
+            the view, with the longer side of the picture; a square has the shorter one. Videos have
+            even sides.
+        yaw_deg: the angle that the view looks to the right, in degrees.
+        pitch_deg: the angle that the view looks up, in degrees.
+        theta_max_deg: the incident angle beyond which the view is black, in degrees. The default is
+            that of the calibration file; if it has none, all of the picture is shown.
+        camera: the name or number of the camera, if the file has several.
+        coefficients: the distortion model of an OpenCV or ROS file that does not name it.
+    """
+    # These import OpenCV, Pillow and the models; other commands of `lens` do not need them.
+    from darswin.cli.answers import claim_folder, relative_names
+    from darswin.cli.predict import _is_below, pictures_and_videos
+    from darswin.data.cameras import Calibrations, is_json
+    from darswin.utils.image import BrokenImageError
+    from darswin.utils.progress import Progress
+
+    check_view(view, fov_deg, yaw_deg, pitch_deg)
+    if theta_max_deg is not None:
+        in_range = 0 < theta_max_deg <= 180
+        check_option("theta_max_deg", theta_max_deg, in_range, "above 0° and at most 180°")
+    if size is not None:
+        fits = min(size) >= 2 and math.prod(size) <= MOST_PIXELS
+        check_option("size", size, fits, f"at least 2,2 and at most {MOST_PIXELS} px in all")
+        check_option("size", size, view != "square" or size[0] == size[1], "square for this view")
+    if not paths:
+        raise ValueError("missing pictures or videos: give files or folders")
+    if inside := [path for path in paths if _is_below(path, out)]:
+        raise ValueError(f"`out` must be a folder without the originals, but has {inside[0]}")
+    root = "." if is_json(calib) else Path(calib).parent
+    calibrations = Calibrations(calib, root, camera, coefficients)
+    files = pictures_and_videos(paths, leave_out=out)
+    if not files:
+        raise ValueError(f"no pictures or videos in {', '.join(paths)}, apart from those of `out`")
+    folder = claim_folder(out, RECORD)
+    (folder / LENS).unlink(missing_ok=True)
+    views = _Views(calibrations, view, fov_deg, size, yaw_deg, pitch_deg, theta_max_deg)
+    names = relative_names(paths, files)
+    bad: list[str] = []
+    written: dict[str, Lens | None] = {}
+    try:
+        with Progress("undistort", len(files)) as progress:
+            for file in files:
+                undistort_file = _video if file.is_video else _picture
+                try:
+                    target, lens = undistort_file(file.name, folder / names[file.name], views, bad)
+                    written[target.relative_to(folder).as_posix()] = lens
+                except (BrokenImageError, ValueError) as error:
+                    bad.append(str(error))
+                progress.done += 1
+    finally:
+        replace_file(folder / RECORD, json.dumps([*written], indent=1, ensure_ascii=False))
+        _write_lens(folder, written)
+    if written:
+        with_lens = f"; their calibration is {folder / LENS}" * (folder / LENS).exists()
+        print(f"{folder}: {len(written)} of {len(files)} files, {views.said}{with_lens}")
+    if bad:
+        raise BrokenImageError("\n".join(bad))
+
+
+class _Viewed(NamedTuple):
+    sampler: "Sampler"
+    lens: Lens  # of the picture; it keeps the identity by which the plan is found
+    camera: Lens | None  # the perspective camera of the view
+
+
+class _Views:
+    """The views of pictures, planned once for each lens."""
+
+    def __init__(
+        self, calibrations: "Calibrations", view: View, fov_deg: float | None,
+        size: tuple[int, int] | None, yaw_deg: float, pitch_deg: float,
+        theta_max_deg: float | None,
+    ):  # fmt: skip
+        self._calibrations, self._view, self._fov_deg = calibrations, view, fov_deg
+        self._size, self._turn, self._theta_max_deg = size, (yaw_deg, pitch_deg), theta_max_deg
+        self._plans: dict[tuple[int, bool], _Viewed] = {}
+        self._said: set[str] = set()
+
+    @property
+    def said(self) -> str:
+        """The view in words."""
+        (shape,) = self._said if len(self._said) == 1 else ("in several sizes",)
+        return f"{self._view} view, {shape}"
+
+    def of(self, name: str, size: tuple[int, int], orientation: int, even: bool) -> _Viewed:
+        """The view of an upright picture of (H, W); `even` makes its sides even."""
+        lens = self._calibrations.lens_of(Path(name), size, orientation)
+        key = id(lens), even
+        if key not in self._plans:
+            if len(self._plans) == _KEPT:
+                del self._plans[next(iter(self._plans))]
+            self._plans[key] = self._planned(lens, size, even)
+        return self._plans[key]
+
+    def _planned(self, lens: Lens, size: tuple[int, int], even: bool) -> _Viewed:
+        from darswin.frames import Sampler, plan
+
+        exact = lens.to(torch.float64)
+        side = min(size) if self._view == "square" else max(size)
+        if self._theta_max_deg is not None:
+            exact = exact.with_theta_max(math.radians(self._theta_max_deg))
+        fov_deg, view_size = view_of(exact, size, self._view, self._fov_deg, side)
+        height, width = self._size or view_size
+        if even:
+            height, width = (max(2, n - n % 2) for n in (height, width))
+        rays = view_rays(self._view, (height, width), fov_deg, *self._turn)
+        whole = exact.with_theta_max(None)
+        # Without a θ_max in the file, the lens ends at the picture's sides, and corners see more.
+        if self._theta_max_deg is None and bool((exact.theta_max - reach(whole)).abs() < 1e-5):
+            exact = whole
+        self._said.add(f"{fov_deg:.4g}° across, {width} × {height} px")
+        camera = None
+        if self._view == "perspective":
+            fov = torch.tensor(math.radians(fov_deg), dtype=torch.float64)
+            camera = Perspective.from_fov(fov, width / 2, image_size=(height, width))
+            camera = camera.with_theta_max(reach(camera.with_theta_max(None)))
+        return _Viewed(Sampler(plan(rays, exact, size)), lens, camera)
+
+
+def _picture(name: str, target: Path, views: _Views, _: list[str]) -> tuple[Path, Lens | None]:
+    """Undistorts a picture; returns its new path and the camera of the view."""
+    import cv2
+
+    from darswin.utils.image import read_form, read_oriented
+
+    image, orientation = read_oriented(name, read_form(name)[0])
+    viewed = views.of(name, (image.shape[0], image.shape[1]), orientation, even=False)
+    picture = viewed.sampler(image)
+    if target.suffix.lower() not in WRITTEN:
+        target = target.with_name(f"{target.name}.png")
+    done, content = cv2.imencode(target.suffix, picture[..., ::-1])
+    if not done:
+        raise OSError(f"OpenCV cannot write {target}")
+    replace_file(target, content.data)
+    return target, viewed.camera
+
+
+def _video(name: str, target: Path, views: _Views, bad: list[str]) -> tuple[Path, Lens | None]:
+    """`_picture` for a video. If it is cut off, the frames before are written."""
+    from darswin.utils import video
+    from darswin.utils.image import BrokenImageError
+
+    cameras: list[Lens | None] = []
+
+    def undistorted() -> "Iterator[np.ndarray]":
+        try:
+            for frame in video.read_frames(name):
+                size = frame.image.shape[0], frame.image.shape[1]
+                viewed = views.of(name, size, frame.orientation, even=True)
+                cameras[:] = [viewed.camera]
+                yield viewed.sampler(frame.image)
+        except BrokenImageError as error:
+            if not cameras:
+                raise
+            bad.append(str(error))
+
+    if target.suffix.lower() not in video.WRITTEN:
+        target = target.with_name(f"{target.name}.mp4")
+    video.write_frames(target, undistorted(), video.frame_rate(name))
+    return target, cameras[0]
+
+
+def _write_lens(folder: Path, written: dict[str, Lens | None]) -> None:
+    """Writes the calibration of the new pictures: one for all, or a table of their cameras."""
+    cameras: dict[str, Any] = {
+        name: darswin.lens.to_dict(lens) for name, lens in written.items() if lens is not None
+    }
+    if cameras:
+        first, *others = cameras.values()
+        same = all(other == first for other in others)
+        replace_file(folder / LENS, json.dumps(first if same else cameras, indent=1))

@@ -1,0 +1,73 @@
+"""The undistorted views of `darswin lens`: their options, and what they show by default."""
+
+import math
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from darswin.cli.arguments import check_option
+from darswin.lens.base import Lens
+from darswin.viz.report import sides
+
+View = Literal["perspective", "cylindrical", "equirectangular", "square"]
+
+
+def check_view(view: View, fov_deg: float | None, yaw_deg: float, pitch_deg: float) -> None:
+    """ValueError for an option of a view that is out of its range."""
+    for name, angle in (("yaw_deg", yaw_deg), ("pitch_deg", pitch_deg)):
+        check_option(name, angle, -360 <= angle <= 360, "from -360° to 360°")
+    if fov_deg is not None:
+        flat = view == "perspective"
+        most = "below 180°" if flat else "at most 360°"
+        in_range = 0 < fov_deg < 180 if flat else 0 < fov_deg <= 360
+        check_option("fov_deg", fov_deg, in_range, f"above 0° and {most} for a {view} view")
+
+
+def view_of(
+    lens: Lens, size: tuple[int, int], view: View, fov_deg: float | None, side: int
+) -> tuple[float, tuple[int, int]]:
+    """The field of view, in degrees, and (H, W) of a view whose longer side has `side` px.
+
+    By default the view shows all that pictures of (H, W) show in the row of the principal point; a
+    perspective view 110° at most, and a square all up to θ_max.
+    """
+    across, down = _fields_of_view(lens, size)
+    if fov_deg is None:
+        fov_deg = {
+            "perspective": min(across, 110.0),
+            "cylindrical": across,
+            "equirectangular": across,
+            "square": 2 * math.degrees(lens.theta_max.item()),
+        }[view]
+        if not fov_deg > 0:
+            raise ValueError(
+                "the picture shows nothing in the row of the lens's principal point: choose the "
+                "view with `fov_deg` and `yaw_deg`"
+            )
+    aspect = {
+        "perspective": size[0] / size[1],
+        "cylindrical": 1 / 2,
+        # The height of all that the picture shows; narrower views keep this shape.
+        "equirectangular": down / max(fov_deg, across),
+        "square": 1.0,
+    }[view]
+    longer = max(aspect, 1.0)
+    return fov_deg, (max(1, round(side * aspect / longer)), max(1, round(side / longer)))
+
+
+def view_rays(
+    view: View, size: tuple[int, int], fov_deg: float, yaw_deg: float, pitch_deg: float
+) -> Tensor:
+    """The rays (H, W, 3) of a view of (H, W)."""
+    from darswin.viz import views  # imports OpenCV
+
+    fov, yaw, pitch = (math.radians(angle) for angle in (fov_deg, yaw_deg, pitch_deg))
+    return getattr(views, view)(size, fov, yaw=yaw, pitch=pitch)
+
+
+def _fields_of_view(lens: Lens, size: tuple[int, int]) -> tuple[float, float]:
+    """Horizontal and vertical field of view up to θ_max in a picture (H, W), in degrees."""
+    end = lens.theta_max.item()
+    angles = torch.rad2deg(sides(lens, size).clamp(-end, end))
+    return min(angles[::2].sum().item(), 360.0), angles[1::2].sum().clamp(max=180).item()

@@ -1,0 +1,17 @@
+"""Angles are in radians. An error about one that looks like degrees shows the conversion."""
+
+import math
+
+
+def degrees_hint(angle: float) -> str:
+    """The end of an error about an angle out of its range: what it is in radians, if it looks like
+    degrees, else nothing."""
+    if not math.pi < abs(angle) <= 360:
+        return ""
+    return f"; angles are in radians, and {angle:g}° is {math.radians(angle):.4g}"
+
+
+def check_turn(name: str, angle: float) -> None:
+    """Raises ValueError unless an angle by which something turns is in [-2π, 2π]."""
+    if not abs(angle) <= 2 * math.pi:
+        raise ValueError(f"{name} must be in [-2π, 2π] rad, got {angle}{degrees_hint(angle)}")

@@ -1,0 +1,66 @@
+"""Safetensors files with a digest of their content, which is checked when they are read."""
+
+import hashlib
+import json
+import os
+from collections.abc import Mapping
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+from torch import Tensor
+
+from darswin.utils.files import replace_file
+
+_DIGEST = "sha256"  # the key of the digest in the metadata
+
+
+def write_tensors(
+    path: str | os.PathLike, tensors: Mapping[str, Tensor], metadata: Mapping[str, str]
+) -> None:
+    """Writes tensors of the CPU and texts to a file. An older file is replaced in one step."""
+    digest = _digest(tensors, metadata)
+    replace_file(path, save(dict(tensors), {**metadata, _DIGEST: digest}))
+
+
+def read_tensors(path: str | os.PathLike) -> tuple[dict[str, Tensor], dict[str, str]]:
+    """The tensors of a file and its metadata.
+
+    Files of other programs have no digest, and neither have our older ones. They are not checked.
+
+    Raises:
+        ValueError: the file is no safetensors file, or its content is not what was written.
+    """
+    try:
+        with safe_open(path, "pt") as file:
+            metadata = file.metadata() or {}
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    except SafetensorError as error:
+        raise _unreadable(path, error) from error
+    digest = metadata.pop(_DIGEST, None)
+    if digest is not None and digest != _digest(tensors, metadata):
+        raise ValueError(f"{path} is damaged: its content has another SHA-256 than when written")
+    return tensors, metadata
+
+
+def read_metadata(path: str | os.PathLike) -> dict[str, str]:
+    """The metadata of a file. The tensors are neither read nor checked."""
+    try:
+        with safe_open(path, "pt") as file:
+            return file.metadata() or {}
+    except SafetensorError as error:
+        raise _unreadable(path, error) from error
+
+
+def _unreadable(path: str | os.PathLike, error: SafetensorError) -> ValueError:
+    return ValueError(f"{path} cannot be read as safetensors: {error}")
+
+
+def _digest(tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> str:
+    """The SHA-256 of the texts, and of the name, type, shape and bytes of each tensor."""
+    content = hashlib.sha256(json.dumps(sorted(metadata.items())).encode())
+    for name, tensor in sorted(tensors.items()):
+        kind = [name, str(tensor.dtype), list(tensor.shape)]
+        content.update(json.dumps(kind).encode())
+        content.update(tensor.detach().reshape(-1).view(torch.uint8).numpy().data)
+    return content.hexdigest()

@@ -1,0 +1,218 @@
+"""Before training, the headers of the files tell what `samples[i]` would refuse."""
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+from PIL import ExifTags, Image
+from pngs import PALETTE, png
+from scenes import write, write_plain
+
+from darswin.data import Calibrated, Calibrations, SceneSamples, open_scenes, open_source
+from darswin.data.headers import check_files
+from darswin.data.lens_distributions import parse_lenses
+from darswin.data.scenes.targets import OddLabels
+from darswin.data.wide_angle import WideAngle
+from darswin.utils import image
+from darswin.utils.image import BrokenImageError
+
+LENS = json.dumps({"model": "Equidistant", "focal": 12.0, "theta_max": 1.2, "image_size": [30, 40]})
+PICTURE = np.random.default_rng(0).integers(256, size=(30, 40, 3), dtype=np.uint8)
+SUFFIXES = ("jpg", "png", "bmp", "webp", "tif", "ppm")
+
+
+def cut(share):
+    return lambda file: file.write_bytes(file.read_bytes()[: int(share * file.stat().st_size)])
+
+
+def append(data):
+    return lambda file: file.write_bytes(file.read_bytes() + data)
+
+
+def resized(height, width):
+    return lambda file: cv2.imwrite(str(file), PICTURE[:height, :width])
+
+
+def turned(file):
+    exif = Image.Exif()
+    exif[ExifTags.Base.Orientation] = 6
+    Image.fromarray(PICTURE).save(file, exif=exif)
+
+
+def with_damaged_exif(file):
+    """In every format that Pillow gives EXIF data."""
+    known = {"jpg": "JPEG", "png": "PNG", "webp": "WEBP"}.get(file.suffix[1:])
+    if known:
+        Image.fromarray(PICTURE).save(file, known, exif=b"Exif\0\0nothing that is known")
+
+
+# What happens to a file.
+CHANGES = {
+    "nothing": lambda file: None,
+    "empty": lambda file: file.write_bytes(b""),
+    "text": lambda file: file.write_text("no picture"),
+    "missing": lambda file: file.unlink(),
+    "cut in the header": cut(0.004),
+    "cut in the middle": cut(0.5),
+    "cut at the end": lambda file: file.write_bytes(file.read_bytes()[:-1]),
+    "more at the end": append(b"\0" * 100),
+    "much more at the end": append(b"\0" * 5000),
+    "another shape": resized(30, 30),
+    "another size": resized(15, 20),
+    "upright, but stored on its side": turned,
+    "damaged EXIF": with_damaged_exif,
+}
+
+
+def write_photos(folder, suffix, count=10):
+    for k in range(count):
+        file = folder / "ab"[k % 2] / f"{k}.{suffix}"
+        file.parent.mkdir(parents=True, exist_ok=True)
+        cv2.imwrite(str(file), PICTURE)
+    return open_source(folder, "train", holdout=0)
+
+
+def of_photos(source, **options):
+    yield WideAngle(source, parse_lenses("low"), size=16, render=32, **options)
+    yield Calibrated(source, Calibrations(LENS, source.root), size=16, **options)
+
+
+def refused(samples, index):
+    try:
+        samples[index]
+    except (BrokenImageError, ValueError) as error:
+        return error
+    return None
+
+
+def told(samples):
+    try:
+        check_files(samples, "photos")
+    except (BrokenImageError, ValueError) as error:
+        return error
+    return None
+
+
+@pytest.mark.parametrize("change", CHANGES)
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_what_the_check_refuses_is_what_reading_refuses(tmp_path, suffix, change):
+    """Only headers are read, so that a file may be broken later in a format without an end."""
+    source = write_photos(tmp_path, suffix)
+    CHANGES[change](source.file(1))
+    for samples in of_photos(source):
+        expected, found = refused(samples, 1), told(samples)
+        if expected is None or found is not None:
+            assert type(found) is type(expected) and str(found) == str(expected)
+        else:
+            assert suffix not in ("jpg", "png") and change.startswith("cut"), expected
+    for samples in of_photos(source, skip_broken=True):
+        assert told(samples) is None or type(told(samples)) is ValueError
+        assert samples.broken == []
+
+
+def test_all_faults_are_listed_at_once(tmp_path):
+    source = write_photos(tmp_path, "png", 20)
+    kinds = ["empty", "text", "missing", "cut in the middle", "another shape"]
+    for k in range(13):
+        CHANGES[kinds[k % 5]](source.file(k))
+    of_lenses, calibrated = of_photos(source)
+    with pytest.raises(BrokenImageError) as error:
+        check_files(of_lenses, "photos")
+    first, *lines = str(error.value).splitlines()
+    assert first == "11 of 20 pictures cannot be used:" and len(lines) == 11
+    assert all(str(source.file(k)) in "".join(lines) for k in (0, 1, 2, 3, 5, 6, 7, 8, 10, 11))
+    assert lines[-1] == "  and 1 more"
+    with pytest.raises(ValueError, match=r"13 of 20 .*\n(.*\n){10}  and 3 more$") as error:
+        check_files(calibrated, "photos")
+    assert "the calibration is for 40×30" in str(error.value)
+    *_, calibrated = of_photos(source, skip_broken=True)
+    with pytest.raises(ValueError, match="2 of 20 pictures cannot be used"):
+        check_files(calibrated, "photos")
+
+
+def test_headers_alone_are_read(tmp_path, monkeypatch):
+    """And each once. A picture whose header or end may be damaged is read whole, and so are
+    eight others at most."""
+    decoded, headers = [], []
+
+    def counted(known, calls):
+        return lambda *given, **options: calls.append(given) or known(*given, **options)
+
+    monkeypatch.setattr(image, "decoded", counted(image.decoded, decoded))
+    monkeypatch.setattr(image.Image, "open", counted(image.Image.open, headers))
+    source = write_photos(tmp_path / "photos", "png", 20)
+    headers.clear()  # some were read to find the channels
+    for samples in of_photos(source):
+        check_files(samples, "photos")
+    assert len(headers) == 2 * 20 and len(decoded) == 2 * 7
+    write_plain(tmp_path / "scenes", 9)
+    for target in ("labels", "distance"):
+        scenes = open_scenes(tmp_path / "scenes", "all", target)
+        headers.clear()
+        decoded.clear()
+        check_files(SceneSamples(scenes, size=16), "scenes")
+        pictures = [path for _, path, *_ in decoded if "images" in str(path)]
+        assert len(pictures) == 5 and len(headers) == 2 * 9 + 5 * (target == "labels")
+    CHANGES["cut in the middle"](source.file(4))
+    decoded.clear()
+    assert told(next(of_photos(source))) is not None
+    assert len(decoded) == 8
+
+
+@pytest.mark.parametrize(
+    ("target", "name", "change"),
+    [
+        ("labels", "images/001.png", CHANGES["empty"]),
+        ("labels", "images/001.png", CHANGES["another shape"]),
+        ("labels", "images/001.png", turned),
+        ("labels", "labels/001.png", lambda f: write(f, np.ones((9, 9), np.uint8))),
+        ("labels", "labels/001.png", CHANGES["cut in the middle"]),
+        ("labels", "labels/001.png", CHANGES["missing"]),
+        ("distance", "distance/001.png", lambda f: write(f, np.ones((9, 9), np.uint16))),
+        ("distance", "distance/001.png", CHANGES["cut at the end"]),
+        ("distance", "distance/001.npy", lambda f: np.save(f, np.ones((9, 9), np.float32))),
+        ("distance", "distance/001.npy", lambda f: np.save(f, np.ones((121, 160), int))),
+        ("distance", "distance/001.npy", lambda f: np.savez(f.open("wb"), np.ones((121, 160)))),
+        ("distance", "distance/001.npy", CHANGES["empty"]),
+        ("distance", "distance/001.npy", cut(0.5)),
+        ("labels", "lens.json", lambda f: f.write_text(LENS.replace("30", "50"))),
+        ("labels", "lenses/001.json", lambda f: f.write_text(LENS.replace("30", "50"))),
+    ],
+)
+def test_scenes(tmp_path, target, name, change):
+    write_plain(tmp_path, 10, own_lenses="lenses" in name)
+    if name.endswith("npy"):
+        (tmp_path / "distance" / "001.png").unlink()
+        np.save(tmp_path / name, np.ones((121, 160), np.float32))
+    samples = SceneSamples(open_scenes(tmp_path, "all", target), size=16)
+    check_files(samples, "scenes")
+    change(tmp_path / name)
+    if name.startswith("lens"):  # lenses are read once
+        samples = SceneSamples(open_scenes(tmp_path, "all", target), size=16)
+    expected, found = refused(samples, 1), told(samples)
+    assert expected is not None and type(found) is type(expected)
+    assert str(expected) in str(found) and samples.broken == []
+    skipping = SceneSamples(samples.scenes, size=16, skip_broken=True)
+    assert (told(skipping) is None) == isinstance(expected, BrokenImageError)
+
+
+def test_some_labels_are_read(tmp_path):
+    """An id that no class has, and what is told once, come before the training."""
+    write_plain(tmp_path, 20)
+    for k, file in enumerate(sorted((tmp_path / "labels").iterdir())):
+        palette = [[2, 2, 2], [1, 1, 1], [9, 9, 9]]
+        file.write_bytes(png(np.full((121, 160), k == 6, np.uint8) * 2, 2, PALETTE, palette))
+    samples = SceneSamples(open_scenes(tmp_path, "all", "labels"), size=16)
+    with (
+        pytest.warns(OddLabels) as warned,
+        pytest.raises(ValueError, match=r"006\.png holds the ids \[9\], but the 3 classes"),
+    ):
+        check_files(samples, "scenes")
+    assert len(warned) == 1
+
+
+def test_pictures_in_memory_have_no_files():
+    source = open_source("digits", "train", channels=1)
+    options = dict(size=16, render=32, mean=[0.4], std=[0.2])
+    check_files(WideAngle(source, parse_lenses("low"), **options), "digits")

@@ -1,0 +1,117 @@
+"""The text of all figures on README and the pages can be read on a phone."""
+
+import json
+import re
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from figures import on_a_phone
+from matplotlib.figure import Figure
+from PIL import Image
+
+from darswin import PolarSample, create_model
+from darswin.lens import Equidistant
+from darswin.viz import plot
+from darswin.viz.pixels import draw_predictions
+from darswin.viz.views import perspective
+
+ROOT = Path(__file__).parents[2]
+sys.path[:0] = [str(ROOT / part) for part in ("docs", "examples", "studies")]
+
+import dense_pictures  # noqa: E402
+import dense_tables  # noqa: E402
+import digits  # noqa: E402
+import fill  # noqa: E402
+import learned_tables  # noqa: E402
+import lens  # noqa: E402
+import levels  # noqa: E402
+import sizes_tables  # noqa: E402
+import tables  # noqa: E402
+
+SHOWN = sorted(
+    {
+        (page.parent / name).resolve()
+        for page in fill.PAGES
+        for name in re.findall(r"!\[[^]]*\]\(([^)]+\.png)\)", page.read_text())
+    }
+)
+PICTURE, LABELS = np.zeros((96, 128, 3), np.uint8), np.zeros((96, 128), np.int64)
+METRES = np.geomspace(0.5, 40, LABELS.size).reshape(LABELS.shape)
+WIDE = Equidistant(40.0, theta_max=1.6, image_size=LABELS.shape)
+STUDIED = ("DarSwin-Unet RA", "Swin-Unet", "LensAdapter(Swin-Unet)", "U-Net with rays")
+
+
+def record(path: str) -> dict:
+    return json.loads((ROOT / path).read_text())
+
+
+def draw_lens() -> Figure:
+    sampler = PolarSample(rings=16, sectors=64, samples=(10, 10))
+    return plot.draw_lens(PICTURE, WIDE, sampler, perspective((60, 80), 1.9), "a view")
+
+
+def draw_demo() -> Figure:
+    sampler = create_model("darswin_a_nano", spacing="tan").patch_embed.sample
+    accuracy = record("docs/accuracy.json")["accuracy"]
+    return digits.draw(accuracy, np.zeros((8, 8), np.float32), sampler)
+
+
+def draw_dense_curves(path: Path) -> None:
+    found = record("studies/results/dense.json")
+    dense_tables.draw_curves(found["cells"], found["trivial"], path)
+
+
+def draw_dense_pictures(path: Path) -> None:
+    rows = ["picture", "truth", *STUDIED]
+    dense_pictures.draw_columns({n: [PICTURE] * 6 for n in dense_pictures.SHOWN}, rows, path)
+
+
+RETURNED: dict[str, Callable[[], Figure]] = {
+    "demo": draw_demo,
+    "labels": lambda: draw_predictions(
+        [(PICTURE, LABELS, LABELS)], [f"class {k}" for k in "abcdef"]
+    ),
+    "lens": draw_lens,
+    "levels": levels.draw_levels,
+    "metres": lambda: draw_predictions([(PICTURE, METRES, METRES)]),
+    "polar": lambda: lens.draw_polar_image(PICTURE, WIDE),
+}
+WRITTEN: dict[str, Callable[[Path], None]] = {
+    "dense curves": draw_dense_curves,
+    "dense pictures": draw_dense_pictures,
+    "learned lens": lambda path: learned_tables.draw(
+        record("studies/results/learned_lens.json")["cameras"], path
+    ),
+    "sizes": lambda path: sizes_tables.draw_scores(
+        record("studies/results/sizes.json")["cells"], path
+    ),
+    "sizes pictures": sizes_tables.draw_pictures,
+    "study": lambda path: tables.draw(record("studies/results/study--nano.json")["cells"], path),
+}
+
+
+@pytest.mark.parametrize("name", [*RETURNED, *WRITTEN])
+def test_the_text_of_a_figure_is_large_enough(name, monkeypatch, tmp_path):
+    figures = []
+    for module in (dense_pictures, dense_tables, learned_tables, sizes_tables, tables):
+        monkeypatch.setattr(module, "save_figure", lambda figure, *_, **__: figures.append(figure))
+    if name in RETURNED:
+        figures.append(RETURNED[name]())
+    else:
+        WRITTEN[name](tmp_path / "figure.png")
+    (figure,) = figures
+    assert on_a_phone(figure) >= 9
+
+
+@pytest.mark.parametrize("picture", SHOWN, ids=lambda path: path.stem)
+def test_the_figures_of_the_pages_have_the_width_that_their_text_is_made_for(picture):
+    """Text of `plot.TEXT` pt is 9 px high on a phone in figures of this width."""
+    with Image.open(picture) as drawn:
+        assert drawn.width / drawn.info["dpi"][0] <= plot.WIDTH + 0.01
+
+
+def test_every_kind_of_figure_is_shown():
+    assert len(SHOWN) > 12 and {"accuracy", "lens", "levels", "polar"} <= {p.stem for p in SHOWN}
