@@ -90,9 +90,6 @@ def predict(
     if lens is None and run is None:
         raise ValueError("missing `lens`: give the camera's calibration file")
     _check_paths(paths)
-    for path in (weights, lens):
-        if path is not None:
-            check_is_file(path)
     net, card = trained_model(weights)
     if task not in (None, card.task):
         raise ValueError(f"`task` is {task}, but {weights} is a model for {card.task}")

@@ -178,9 +178,9 @@ def _picture(name: str, target: Path, views: _Views, _: list[str]) -> tuple[Path
     """Undistorts a picture; returns its new path and the camera of the view."""
     import cv2
 
-    from darswin.utils.image import read_form, read_oriented
+    from darswin.utils.image import read_header, read_oriented
 
-    image, orientation = read_oriented(name, read_form(name)[0])
+    image, orientation = read_oriented(name, read_header(name).channels)
     viewed = views.of(name, (image.shape[0], image.shape[1]), orientation, even=False)
     picture = viewed.sampler(image)
     if target.suffix.lower() not in WRITTEN:

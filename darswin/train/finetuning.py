@@ -13,7 +13,6 @@ from darswin.models.pixel import PixelModel
 from darswin.models.registry import list_models, model_class, nearest, preset
 from darswin.models.saving import ModelCard, load_model, model_of_run
 from darswin.models.unet import Unet
-from darswin.utils.files import check_is_file
 from darswin.utils.tasks import Task
 
 # Options of a model that follow from the data.
@@ -24,7 +23,6 @@ OF_TRAINING = ("drop_path_rate", "jitter")
 
 def weights_file(weights: str | Path) -> str | Path:
     """The model in a run's folder; other paths and names unchanged."""
-    check_is_file(weights)
     return model_of_run(weights) if Path(weights).is_dir() else weights
 
 

@@ -132,7 +132,9 @@ def labels():
 
 def predict(*argv, out, lens=LENS):
     lens = json.dumps(lens) if isinstance(lens, dict) else str(lens)
-    main(["predict", *map(str, argv), "--model", "m", "--lens", lens, "--out", str(out)])
+    main(
+        ["predict", *map(str, argv), "--model", "m.safetensors", "--lens", lens, "--out", str(out)]
+    )
     return json.loads((Path(out) / "predictions.json").read_text())
 
 
@@ -300,10 +302,10 @@ def test_nothing_but_its_own_is_replaced(tmp_path):
 def test_wrong_arguments_are_named(stub, labels, tmp_path, capsys):
     picture = write(tmp_path / "p.png", picture_of(labels))
     net = stub("segmentation")
-    argv = ["predict", picture, "--model", "m", "--lens", json.dumps(LENS)]
+    argv = ["predict", picture, "--model", "m.safetensors", "--lens", json.dumps(LENS)]
     with pytest.raises(SystemExit, match="missing --out"):
         main(argv)
-    with pytest.raises(SystemExit, match="--task is distance, but m is a model for segm"):
+    with pytest.raises(SystemExit, match=r"--task is distance, but m\.safetensors is a model"):
         main([*argv, "--out", str(tmp_path / "o"), "--task", "distance"])
     net.num_classes = 256
     with pytest.raises(SystemExit, match="at most 255 classes, got 256"):
