@@ -81,6 +81,8 @@ def info(
 ) -> None:  # fmt: skip
     """Prints the field of view of a lens, its pixels per degree, and the best spacing.
 
+    A line says what looks wrong, such as lengths in another unit than pixels, and what would fit.
+
     Args:
         calib: the calibration file of the camera, in any format that darswin.lens.load reads.
         image_size: height and width of the images in px, e.g. 960,1280, if the file lacks them.
@@ -103,11 +105,11 @@ def info(
     if camera is None and file.has_several():
         rows.append(f"{'cameras':<16}{len(file.names)}; to describe one, give its name as --camera")
         rows += [
-            f"  {name:<14}{_in_short(file.lens(name, theta_max, image_size))}" for name in names
+            f"  {name:<14}{_in_short(*file.judged(name, theta_max, image_size))}" for name in names
         ]
         rows += [f"  and {more} more"] if more else []
     else:
-        lens = file.lens(camera, theta_max, image_size, torch.float64)
+        lens, doubt = file.judged(camera, theta_max, image_size, torch.float64)
         if lens.image_size is None:
             raise ValueError(
                 f"{calib} lacks the size of its images: give `image_size`, their height and width, "
@@ -116,16 +118,18 @@ def info(
         if len(file.names) > 1:
             listed = ", ".join(names) + ", …" * bool(more)
             rows.append(f"{'camera':<16}{file.choose(camera)}, of {len(file.names)}: {listed}")
+        rows += [f"{'looks wrong':<16}{doubt}"] if doubt else []
         rows.append(describe(lens, rings=rings, sectors=sectors))
     print(*rows, sep="\n")
 
 
-def _in_short(lens: Lens) -> str:
+def _in_short(lens: Lens, doubt: str) -> str:
     size = ""
     if lens.image_size is not None:
         height, width = (round(side) for side in lens.image_size[0].tolist())
         size = f", {width} × {height} px"
-    return f"{type(lens).__name__}{size}, up to {math.degrees(lens.theta_max.item()):.2f}°"
+    wrong = f"; looks wrong: {doubt}" if doubt else ""
+    return f"{type(lens).__name__}{size}, up to {math.degrees(lens.theta_max.item()):.2f}°{wrong}"
 
 
 def convert(

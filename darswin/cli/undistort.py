@@ -2,6 +2,7 @@
 
 import json
 import math
+import warnings
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -180,7 +181,9 @@ def _picture(name: str, target: Path, views: _Views, _: list[str]) -> tuple[Path
 
     from darswin.utils.image import read_header, read_oriented
 
-    image, orientation = read_oriented(name, read_header(name).channels)
+    with warnings.catch_warnings(action="ignore"):  # Pillow's, about what it skips
+        channels = read_header(name).channels
+    image, orientation = read_oriented(name, channels)
     viewed = views.of(name, (image.shape[0], image.shape[1]), orientation, even=False)
     picture = viewed.sampler(image)
     if target.suffix.lower() not in WRITTEN:

@@ -42,7 +42,7 @@ class PictureCamera(NamedTuple):
             calibration = Calibration(self.calibration, self.name, self.coefficients)
         else:
             calibration = Calibration.read(self.calibration, self.coefficients)
-        lens = calibration.lens(self.camera, image_size=size)
+        lens = calibration.lens(self.camera, image_size=size, nominal=size is _NOMINAL)
         # Lenses can only be joined if all have a center.
         return lens if lens.center is not None else lens.replace(center=lens.center_in())
 

@@ -18,13 +18,14 @@ from darswin.lens.ideal import (
 )
 from darswin.lens.parameter import Number
 from darswin.lens.pixels import distance_to_z, pixel_rays, reproject, solid_angles, z_to_distance
+from darswin.lens.plausible import ImplausibleLens
 from darswin.lens.polynomial import OCam, OCamInverse, Polynomial
 from darswin.lens.sphere import DoubleSphere, EnhancedUnified, Spherical
 
 __all__ = [
     "MODELS", "BrownConrady", "DoubleSphere", "EnhancedUnified", "Equidistant", "Equisolid",
-    "FieldOfView", "Fisheye624", "Fit", "KannalaBrandt", "Lens", "Mei", "Number", "OCam",
-    "OCamInverse", "Orthographic", "Perspective", "Polynomial", "Spherical", "Stereographic",
-    "Tabulated", "as_curves", "cat", "distance_to_z", "fit", "from_dict", "load", "load_all",
-    "pixel_rays", "reproject", "save", "solid_angles", "to_dict", "z_to_distance",
+    "FieldOfView", "Fisheye624", "Fit", "ImplausibleLens", "KannalaBrandt", "Lens", "Mei", "Number",
+    "OCam", "OCamInverse", "Orthographic", "Perspective", "Polynomial", "Spherical",
+    "Stereographic", "Tabulated", "as_curves", "cat", "distance_to_z", "fit", "from_dict", "load",
+    "load_all", "pixel_rays", "reproject", "save", "solid_angles", "to_dict", "z_to_distance",
 ]  # fmt: skip

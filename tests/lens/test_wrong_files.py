@@ -270,7 +270,8 @@ def soon():
         ("<a>" * 30_000 + "</a>" * 30_000, "XML must be at most 16 elements deep"),
         ("a: " + "1" * 300_000, "YAML must be at most 128 KiB"),
         (BOMB, "must be in one of the formats"),
-        (BOMB + "model_type: MEI\nimage_height: *j\n", "image_height must be a whole number"),
+        (BOMB + "model_type: MEI\nmirror_parameters: {xi: 1}\nimage_height: *j\n",
+         "image_height must be a whole number"),
         (BOMB + "K: *j\n", "K must be 9 finite numbers"),
         (BOMB + "camera_model: pinhole\ndistortion_model: none\nintrinsics: *j\n", "must be 4 fin"),
         ("a: &a [*a]\n", "it is not valid YAML"),
@@ -278,13 +279,17 @@ def soon():
         ('<?xml version="1.0"?><!DOCTYPE l [<!ENTITY a "b">]><l><K>&a;</K></l>', "DOCTYPE"),
         ('<!DOCTYPE l SYSTEM "file:///etc/passwd"><l/>', "DOCTYPE"),
         ('{"K": ' + "9" * 5000 + "}", "it is not valid JSON"),
-        ('{"intrinsic": {"model": "radial_poly", "k1": 1' + "0" * 400 + "}}", "k1 must be a fin"),
-        ("K: !!python/object/apply:os.system ['touch pwned']\n", "K must be 9 finite numbers"),
+        ('{"intrinsic": {"model": "radial_poly", "poly_order": 1, "k1": 1' + "0" * 400 + "}}",
+         "k1 must be a fin"),
+        ("K: !!python/object/apply:os.system ['touch pwned']\n", "its entries are K, but expected"),
+        ("K: !!python/object/apply:os.system ['touch pwned']\nD: []", "K must be 9 finite numbers"),
         ("!!python/object/apply:os.system ['touch pwned']\n", "must be a mapping"),
-        ("1 " * 1_000_000, "it must have 5 lines"),
+        ("1 " * 1_000_000, "it is a table of 1 lines, but a table must have 5 lines of numbers"),
+        ("2 1 1\n" * 500_000, "it must have 5 lines"),
+        ("".join(f"{i} A 9 9\n" for i in range(9_000)), "camera '0', model must be one of"),
         ("1 A\n" * 2_000_000, "a table must be at most 4096 KiB"),
-        ("".join(f"{i} A\n" for i in range(9_000)), "camera '0', must have an id"),
-        ("1 A\n" * 100_000, "camera '1' appears twice"),
+        ("".join(f"{i} FOV\n" for i in range(9_000)), "camera '0', must have an id"),
+        ("1 FOV\n" * 100_000, "camera '1' appears twice"),
         ("".join(f"{i} SIMPLE_PINHOLE 9 9 9 4 4\n" for i in range(20_000)), "to 10000 cameras"),
         (json.dumps({"model": "Polynomial", "coefficients": [1.0] * 20_000}), "at most 64 numbers"),
         (frames(9_000), "several cameras"),
@@ -396,5 +401,5 @@ def test_damaged_archives_are_refused_in_a_sentence(tmp_path):
             assert str(path) in str(error) and "\n" not in str(error)
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr("readme.txt", "no array")
-    with pytest.raises(ValueError, match="it must be in one of the formats"):
+    with pytest.raises(ValueError, match=r"calib\.npz: it is a zip archive, but must be a cal"):
         load(path)

@@ -1,9 +1,11 @@
 """basalt's JSON: `value0` holds `intrinsics` and `resolution`, each with one entry per camera."""
 
+from collections.abc import Mapping
 from functools import partial
 
 from darswin.lens.base import Lens
 from darswin.lens.distorted import BrownConrady, KannalaBrandt
+from darswin.lens.files.content import Content
 from darswin.lens.files.fields import Fields, short, to_sides
 from darswin.lens.files.format import Cameras, Description, Format, describe
 from darswin.lens.frame import Size
@@ -25,7 +27,11 @@ class Basalt(Format):
     """Its cameras are called cam0, cam1, …"""
 
     name = "basalt"
-    keys = ("value0",)
+    keys = "value0 with intrinsics and resolution"
+
+    def fits(self, content: Content) -> bool:
+        calibration = content.get("value0") if isinstance(content, Mapping) else None
+        return isinstance(calibration, Mapping) and "intrinsics" in calibration
 
     def cameras(self, file: Fields, model: str | None) -> Cameras:
         calibration = file.section("value0")

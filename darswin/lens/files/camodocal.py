@@ -3,6 +3,7 @@
 import math
 from collections.abc import Mapping
 from functools import partial
+from typing import Any
 
 import numpy as np
 from numpy.polynomial.polynomial import polyval
@@ -25,6 +26,8 @@ MODELS: dict[str, tuple[type[Lens], dict[str, str]]] = {
                                "distortion_parameters": DISTORTION}),
     "SCARAMUZZA": (OCam, {}),
 }  # fmt: skip
+SECTIONS = ("mirror_parameters", "projection_parameters", "distortion_parameters",
+            "poly_parameters", "inv_poly_parameters", "affine_parameters")  # fmt: skip
 BLOCKS = (
     "the direct polynomial", "the inverse polynomial", "the center (row and column)",
     "the affine parameters (c, d, e)", "the image size (height and width)",
@@ -37,7 +40,14 @@ class CamOdoCal(Format):
     """One camera, called by its name in the file, or "camera"."""
 
     name = "KITTI-360 or CamOdoCal"
-    keys = ("model_type", "mirror_parameters", "projection_parameters")
+    keys = "model_type and projection_parameters"
+
+    def fits(self, content: Content) -> bool:
+        if not isinstance(content, Mapping):
+            return False
+        # OpenCV's files may have a model_type, and distortion_parameters that are a matrix.
+        sections = [key for key in SECTIONS if _is_section(content.get(key))]
+        return len(sections) + ("model_type" in content) > 1
 
     def cameras(self, file: Fields, model: str | None) -> Cameras:
         name = file.text("camera_name") if "camera_name" in file else "camera"
@@ -48,12 +58,23 @@ class OCamCalib(Format):
     """Rows of numbers for one camera."""
 
     name = "OCamCalib"
+    keys = "5 lines of numbers, as calib_results.txt"
+    is_table = True
 
     def fits(self, content: Content) -> bool:
-        return isinstance(content, list) and (len(content[0]) < 2 or is_number(content[0][1]))
+        """True if the first of several lines counts its numbers, or the last three have 2, 3, 2."""
+        if not isinstance(content, list):
+            return False
+        count, *words = content[0]
+        counts = count == str(len(words)) and is_number(words[0]) and len(content) > 3
+        return counts or [len(row) for row in content[-3:]] == [2, 3, 2]
 
     def cameras(self, file: list[list[str]], model: str | None) -> Cameras:
         return {"camera": partial(_camera_of_rows, file)}
+
+
+def _is_section(value: Any) -> bool:
+    return isinstance(value, Mapping) and "data" not in value
 
 
 def _camera(file: Fields) -> Description:
@@ -70,7 +91,7 @@ def _camera(file: Fields) -> Description:
         section.check_all_read(kind)
     description = describe(model, values, size) if sections else _scaramuzza(file, size)
     # Mappings with `data` are matrices of the camera's pose, which is not used.
-    file.check_all_read(kind, lambda _, value: isinstance(value, Mapping) and "data" not in value)
+    file.check_all_read(kind, lambda _, value: _is_section(value))
     return description
 
 

@@ -53,6 +53,8 @@ class Colmap(Format):
     """Rows whose second word names a model. Cameras are called by their ids."""
 
     name = "COLMAP"
+    keys = "lines of an id, a model, width, height and parameters"
+    is_table = True
     origin = 0.5
     needs_size = True
     holds = (
@@ -61,7 +63,11 @@ class Colmap(Format):
     )
 
     def fits(self, content: Content) -> bool:
-        return isinstance(content, list) and len(content[0]) > 1 and not is_number(content[0][1])
+        row = content[0] if isinstance(content, list) else []
+        return len(row) > 1 and (
+            row[1] in MODELS
+            or (row[1].isupper() and len(row) > 3 and all(map(is_number, row[2:4])))
+        )
 
     def cameras(self, file: list[list[str]], model: str | None) -> Cameras:
         found: Cameras = {}

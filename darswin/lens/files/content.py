@@ -34,13 +34,42 @@ MAX_ARRAYS = 256
 _POINTS = re.compile(r"\[[\s\d.,eE+-]{2048,}\]|(?<=>)[\s\d.eE+-]{2048,}(?=<)")
 
 
+# The first bytes of files that are given in place of a calibration. None begins a cameras.bin.
+_OTHERS = {
+    "a picture": (
+        rb"\x89PNG|\xff\xd8\xff|GIF8|BM.{4}\0{4}|II[*+]\0|MM\0[*+]|RIFF.{4}WEBP|8BPS|v/1\x01"
+        rb"|\0.{3}(jP  |JXL |ftyp(avif|hei|mif|msf|crx))|P[1-7]\s+\d+\s+\d+\s|\0\0\x01\0"
+    ),
+    "a video": (
+        rb"\0.{3}(ftyp|moov|mdat|free|wide|skip)|RIFF.{4}AVI |\x1a\x45\xdf\xa3|FLV\x01|OggS"
+        rb"|\0\0\x01[\xb3\xba]|0&\xb2u"
+    ),
+    "an archive": (
+        rb"\x1f\x8b|BZh\d|\xfd7zXZ|7z\xbc\xaf|Rar!|\(\xb5/\xfd|.{257}ustar|PK(?!\x03\x04)"
+    ),
+    "a PDF document": rb"%PDF",
+    "a file of MATLAB or HDF5": rb"MATLAB 5|\x89HDF",
+    "one array of NumPy (np.savez writes several with their names)": rb"\x93NUMPY",
+    "a pickle, which may run code": rb"\x80[\x02-\x05][^\0]",
+}  # fmt: skip
+_WANTED = "but must be a calibration: text in YAML, JSON or XML, a table, or np.savez's .npz"
+
+
+class _NoArraysError(Exception):
+    """A zip archive that np.savez did not write."""
+
+
 def read_bytes(path: str | os.PathLike) -> bytes:
-    """The bytes of a file. Raises ValueError for a directory or device, and for a large file."""
+    """The bytes of a file. Raises ValueError for a directory or device, for a large file, and for
+    a picture, a video, an archive and the like."""
     path = Path(path)
     if path.exists() and not path.is_file():
         raise ValueError("it must be a file")
     with path.open("rb") as file:
         data = file.read(MAX_BYTES + 1)
+    for kind, mark in _OTHERS.items():
+        if re.match(mark, data, re.DOTALL):
+            raise ValueError(f"it is {kind}, {_WANTED}")
     if len(data) > MAX_BYTES:
         raise ValueError(f"it must be at most {MAX_BYTES >> 20} MiB large")
     return data
@@ -48,7 +77,9 @@ def read_bytes(path: str | os.PathLike) -> bytes:
 
 def decoded(data: bytes) -> str:
     """The text of a file, or the arrays of `np.savez`'s zip archive as JSON."""
-    return _from_npz(data) if data.startswith(b"PK\x03\x04") else to_text(data)
+    if data.startswith(b"PK\x03\x04"):
+        return _from_npz(data)
+    return to_text(data)
 
 
 def _from_npz(data: bytes) -> str:
@@ -56,6 +87,8 @@ def _from_npz(data: bytes) -> str:
     arrays: dict[str, Any] = {}
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            if not any(entry.filename.endswith(".npy") for entry in archive.infolist()):
+                raise _NoArraysError
             small = [entry for entry in archive.infolist() if entry.file_size <= MAX_ARRAY]
             for entry in small[:MAX_ARRAYS]:
                 array = io.BytesIO(archive.read(entry))
@@ -63,6 +96,8 @@ def _from_npz(data: bytes) -> str:
                     name = entry.filename.removesuffix(".npy")
                     arrays[name] = np.load(array, allow_pickle=False).tolist()
         return json.dumps(arrays)
+    except _NoArraysError as error:
+        raise ValueError(f"it is a zip archive, {_WANTED}") from error
     except Exception as error:  # zipfile, zlib and NumPy raise a dozen kinds for broken files
         raise ValueError("it must be an undamaged .npz file with arrays of numbers") from error
 
@@ -134,22 +169,28 @@ def _parse_xml(text: str) -> Mapping:
         root = ElementTree.fromstring(text)
     except ElementTree.ParseError as error:
         raise ValueError(f"it is not valid XML: {error}") from error
-    content = _element(root, MAX_DEPTH)
+    content = _element(root, MAX_DEPTH, root.tag == "opencv_storage")
     if not isinstance(content, Mapping):
         raise ValueError("an XML file must have elements in its root")
     return content
 
 
-def _element(element: ElementTree.Element, depth: int) -> Mapping | list | str:
-    """OpenCV's notation: the elements of a sequence are named _, all others have names."""
+def _element(element: ElementTree.Element, depth: int, is_opencv: bool) -> Mapping | list | str:
+    """OpenCV's notation: the elements of a sequence are named _, all others have names. In files
+    of other programs, elements with the same name make a sequence."""
     if depth == 0:
         raise ValueError(f"XML must be at most {MAX_DEPTH} elements deep")
-    children = [(child.tag, _element(child, depth - 1)) for child in element]
+    children = [(child.tag, _element(child, depth - 1, is_opencv)) for child in element]
     if not children:
         return (element.text or "").strip().strip('"')
     if all(tag == "_" for tag, _ in children):
         return [value for _, value in children]
-    return mapping(children)
+    if is_opencv:
+        return mapping(children)
+    found: dict[str, list] = {}
+    for tag, value in children:
+        found.setdefault(tag, []).append(value)
+    return {tag: values[0] if len(values) == 1 else values for tag, values in found.items()}
 
 
 def _limited(notation: str, text: str, most: int) -> str:

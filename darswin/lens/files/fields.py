@@ -78,6 +78,10 @@ def holds_numbers(value: Any) -> bool:
     return isinstance(value, (int, float)) and not isinstance(value, bool) and value != 0
 
 
+def _is_zero(value: Any) -> bool:
+    return str(value) != "False" and is_number(str(value)) and float(value) == 0
+
+
 def plain_name(name: str) -> str:
     """A name in lower case without separators, in which programs spell names differently."""
     return name.lower().replace("_", "").replace("-", "").replace(" ", "")
@@ -184,12 +188,20 @@ class Fields:
             raise ValueError(f"{self.path(name)} must be {expected}, got {short(value)}")
         return value
 
-    def numbers(self, name: str, counts: tuple[int, ...]) -> list[float]:
-        """A list of numbers, from a list or from text with spaces; `counts` are the valid
-        lengths."""
+    def numbers(self, name: str, counts: tuple[int, ...], least: int | None = None) -> list[float]:
+        """A list of numbers, from a list or from text with spaces; `counts` are the valid lengths.
+
+        Zeros at the end of a list of another length, but not its first `least` numbers, are left
+        out: some programs fill up shorter lists of coefficients.
+        """
         expected = f"{' or '.join(map(str, counts))} finite numbers"
         value = self.get(name, expected)
         words = value.split() if isinstance(value, str) else value
+        if isinstance(words, list) and least is not None:
+            count = len(words)
+            while count > least and count not in counts and _is_zero(words[count - 1]):
+                count -= 1
+            words = words[:count]
         if not isinstance(words, list) or len(words) not in counts:
             raise ValueError(f"{self.path(name)} must be {expected}, got {short(value)}")
         return [to_number(word, f"{self.path(name)}[{i}]") for i, word in enumerate(words)]

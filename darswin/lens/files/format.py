@@ -5,7 +5,7 @@ the principal point is in the file's pixel convention: only `Format.origin` chan
 """
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, NamedTuple
 
 from darswin.lens.base import MODELS, Lens
@@ -13,6 +13,8 @@ from darswin.lens.distorted import DistortedLens
 from darswin.lens.files.content import Content
 from darswin.lens.frame import Size
 
+# For `from_dict`. A cropped image's may have "sensor" besides: the crop's x and y in the image of
+# the whole sensor, and the height and width of that image, px.
 Description = dict[str, Any]
 # A function for each camera of a file, by the camera's name. It reads the camera when called.
 Cameras = dict[str, Callable[[], Description]]
@@ -47,19 +49,21 @@ class Intrinsics(NamedTuple):
 
 
 class Format:
-    """Base of the formats. A class sets `name`, sets `keys` or defines `fits`, and defines
-    `cameras`. Formats that are written also set `holds` and define `_text`."""
+    """Base of the formats. A class sets `name` and `keys`, and defines `fits` and `cameras`.
+    Formats that are written also set `holds` and define `_text`."""
 
     name: str  # for errors
     origin = 0.0  # x and y of the upper left pixel's center in the file; we use 0
-    keys: tuple[str, ...] = ()  # a mapping with one of these keys is in this format
+    keys: str  # what its files hold, for errors
+    is_table = False  # True if its files are lines of words
     takes_model = False  # True if the argument `model` of `load` may name the coefficients' model
     holds = ""  # the lenses that `write` supports, for errors
     needs_size = False  # True if a written camera must have an image_size
 
     def fits(self, content: Content) -> bool:
-        """True if a file's content is in this format."""
-        return isinstance(content, Mapping) and any(key in content for key in self.keys)
+        """True if a file's content is in this format. One common entry, such as "frames", does not
+        make a format: it needs several, as in `has_several`."""
+        raise NotImplementedError
 
     def cameras(self, file: Any, model: str | None) -> Cameras:
         """The cameras of a file; `file` is its `Fields`, or the rows of a table."""
@@ -81,6 +85,11 @@ class Format:
     def _text(self, camera: Intrinsics, suffix: str) -> str | None:
         """The text of a file, or None if the format cannot hold the camera."""
         raise NotImplementedError
+
+
+def has_several(entries: Iterable[str], marks: Iterable[str]) -> bool:
+    """True if two of the marks are among the entries."""
+    return len({*entries} & {*marks}) > 1
 
 
 def describe(model: type[Lens], values: Mapping[str, float], size: Size) -> Description:

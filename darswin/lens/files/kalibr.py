@@ -12,7 +12,14 @@ from darswin.lens.base import Lens
 from darswin.lens.distorted import BrownConrady, KannalaBrandt, Mei
 from darswin.lens.files.content import Content
 from darswin.lens.files.fields import Fields, like_coefficients
-from darswin.lens.files.format import Cameras, Description, Format, Intrinsics, describe
+from darswin.lens.files.format import (
+    Cameras,
+    Description,
+    Format,
+    Intrinsics,
+    describe,
+    has_several,
+)
 from darswin.lens.ideal import FieldOfView
 from darswin.lens.sphere import DoubleSphere, EnhancedUnified
 
@@ -29,6 +36,7 @@ MODELS: dict[tuple[str, str], tuple[type[Lens], str, str]] = {
     ("eucm", "none"): (EnhancedUnified, "alpha beta", ""),
 }
 PLANE = "fx fy cx cy"
+MARKS = ("camera_model", "intrinsics", "distortion_model", "distortion_coeffs", "resolution")
 NAMES = ("distortion_coeffs", "distortion_coefficients")  # Kalibr's and EuRoC's
 RADTAN = ("radial-tangential", "radial_tangential")  # EuRoC's
 
@@ -37,6 +45,7 @@ class Kalibr(Format):
     """Several cameras with names, or one camera without a name."""
 
     name = "Kalibr"
+    keys = "cam0 with camera_model, intrinsics and distortion_coeffs"
     needs_size = True
     holds = (
         "without skew, Perspective and BrownConrady (2 radial, tangential), Equidistant and "
@@ -47,7 +56,10 @@ class Kalibr(Format):
     def fits(self, content: Content) -> bool:
         return isinstance(content, Mapping) and (
             _is_alone(content)
-            or any(isinstance(e, Mapping) and "camera_model" in e for e in content.values())
+            or any(
+                isinstance(entry, Mapping) and "camera_model" in entry and has_several(entry, MARKS)
+                for entry in content.values()
+            )
         )
 
     def cameras(self, file: Fields, model: str | None) -> Cameras:
@@ -100,7 +112,8 @@ def _camera(fields: Fields) -> Description:
             raise ValueError(f"{where} must be a focal length above 0, got {values[name]:g}")
     if coefficients:
         listed = next((name for name in NAMES if name in fields), NAMES[0])
-        found = fields.numbers(listed, (len(coefficients),))
+        least = len(coefficients) if model is KannalaBrandt else None
+        found = fields.numbers(listed, (len(coefficients),), least)
         values |= dict(zip(coefficients, found, strict=True))
     fields.check_all_read(f"a {distortion} camera", like_coefficients)
     if values.get("omega") == 0:

@@ -3,6 +3,7 @@
 import math
 import os
 import re
+import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -11,7 +12,7 @@ from typing import Any, Self
 import torch
 from torch import Tensor
 
-from darswin.lens.base import MODELS, Lens, from_dict
+from darswin.lens.base import Lens, from_dict
 from darswin.lens.files import colmap, opencv
 from darswin.lens.files.basalt import Basalt
 from darswin.lens.files.camodocal import CamOdoCal, OCamCalib
@@ -20,15 +21,15 @@ from darswin.lens.files.fields import Fields, listed, short
 from darswin.lens.files.format import Description, Format
 from darswin.lens.files.kalibr import Kalibr
 from darswin.lens.files.nerfstudio import Nerfstudio
-from darswin.lens.files.own import Own
+from darswin.lens.files.own import ROUNDING, Own
+from darswin.lens.files.unknown import unknown
 from darswin.lens.files.woodscape import WoodScape
 from darswin.lens.frame import Size
+from darswin.lens.plausible import ImplausibleLens, doubts
 from darswin.utils.files import replace_file
 
 # Rays must not land further out than this, px, as a pinhole's do near 90°.
 MAX_RADIUS = 1e6
-# A θ_max that was rounded by another program may exceed the limit by this, rad.
-ROUNDING = 1e-4
 MAX_CAMERAS = 10_000
 
 # The first one that fits a file reads it.
@@ -55,8 +56,8 @@ def load(
 
     The formats are WoodScape, KITTI-360 and CamOdoCal, Kalibr, EuRoC, OpenCV (fisheye, omnidir and
     pinhole; also its arrays in an .npz file, or fx, fy, cx, cy, k1, … by name), ROS camera_info,
-    OCamCalib, COLMAP (cameras.txt, cameras.bin), nerfstudio, basalt, and our own JSON. The content
-    of the file tells the format; its name does not matter.
+    OCamCalib, COLMAP (cameras.txt, cameras.bin), nerfstudio, instant-ngp, basalt, and our own JSON.
+    The content of the file tells the format; its name does not matter.
 
     Args:
         camera: the camera, if the file has several different ones: its name, or its number from 0.
@@ -68,6 +69,9 @@ def load(
         model: "fisheye", "pinhole" or "omnidir", the model of the coefficients in an OpenCV or ROS
             file that does not name it.
         dtype: of the lens; None means torch's default.
+
+    Warns:
+        ImplausibleLens: the lens does not fit its image, as if its lengths were in another unit.
 
     Raises:
         ValueError: an unknown format, a missing or wrong entry, several cameras without a choice,
@@ -85,7 +89,7 @@ def load_all(
     model: str | None = None,
     dtype: torch.dtype | None = None,
 ) -> dict[str, Lens]:
-    """Reads all cameras of a calibration file, by name. Arguments and errors: see `load`."""
+    """Reads all cameras of a calibration file, by name. Arguments, warnings, errors: see `load`."""
     return Calibration.read(path, model).lenses(theta_max, image_size, dtype)
 
 
@@ -145,6 +149,8 @@ class Calibration:
             data = read_bytes(path)
             is_binary = colmap.is_binary(data)
             text = colmap.from_binary(data, MAX_CAMERAS) if is_binary else decoded(data)
+        except FileNotFoundError as error:
+            raise FileNotFoundError(f"calibration {name}: there is no such file") from error
         except ValueError as error:
             raise ValueError(f"calibration {name}: {error}") from error
         return cls(text, name, model)
@@ -177,12 +183,34 @@ class Calibration:
         theta_max: float | None = None,
         image_size: Size = None,
         dtype: torch.dtype | None = None,
+        *,
+        nominal: bool = False,
     ) -> Lens:
-        """One camera; the arguments are those of `load`."""
+        """One camera; arguments and warnings are those of `load`.
+
+        nominal: True if `image_size` stands in for a size that is not known, and the lens shall not
+        be held against it.
+        """
+        name = self.choose(camera)
+        lens, doubt = self.judged(name, theta_max, image_size, dtype, nominal=nominal)
+        self._warn({name: doubt})
+        return lens
+
+    def judged(
+        self,
+        camera: str | int | None = None,
+        theta_max: float | None = None,
+        image_size: Size = None,
+        dtype: torch.dtype | None = None,
+        *,
+        nominal: bool = False,
+    ) -> tuple[Lens, str]:
+        """One camera, and its `doubts` in place of a warning; arguments as for `lens`."""
         name = self.choose(camera)
         description = self._describe(name)
         with self._about(name):
-            return _batch([description], theta_max, image_size, dtype)
+            lens, (doubt,) = _batch([description], theta_max, image_size, dtype)
+        return lens, "" if nominal and "image_size" not in description else doubt
 
     def lenses(
         self,
@@ -190,7 +218,7 @@ class Calibration:
         image_size: Size = None,
         dtype: torch.dtype | None = None,
     ) -> dict[str, Lens]:
-        """All cameras; the arguments are those of `load_all`."""
+        """All cameras; arguments and warnings are those of `load_all`."""
         # Frames often repeat one camera: each description becomes one lens, and descriptions of
         # the same shape become one batch.
         keys: dict[str, str] = {}
@@ -199,25 +227,35 @@ class Calibration:
             description = self._describe(name)
             keys[name] = repr(description)
             batches.setdefault(_shape(description), {}).setdefault(keys[name], name)
-        found: dict[str, Lens] = {}
+        found: dict[str, tuple[Lens, str]] = {}
         for firsts in batches.values():
             lenses = self._together([*firsts.values()], theta_max, image_size, dtype)
             found |= {key: lenses[name] for key, name in firsts.items()}
-        return {name: found[key] for name, key in keys.items()}
+        self._warn({name: found[key][1] for name, key in keys.items()})
+        return {name: found[key][0] for name, key in keys.items()}
 
-    def _together(self, names: list[str], *arguments) -> dict[str, Lens]:
-        """The lenses of cameras whose descriptions have one shape. Raises the error of the first
-        camera that has one."""
+    def _warn(self, doubts: Mapping[str, str]) -> None:
+        """Warns once of the cameras that are in doubt."""
+        names = [name for name, doubt in doubts.items() if doubt]
+        if names:
+            which = f"camera {short(names[0])}: " if len(self.names) > 1 else ""
+            more = f" (and {len(names) - 1} more cameras)" if len(names) > 1 else ""
+            text = f"{self.what}: {which}it describes {doubts[names[0]]}{more}"
+            warnings.warn(text, ImplausibleLens, stacklevel=2)
+
+    def _together(self, names: list[str], *arguments) -> dict[str, tuple[Lens, str]]:
+        """The lenses of cameras whose descriptions have one shape, and their doubts. Raises the
+        error of the first camera that has one."""
         try:
             with self._about(names[0]):
-                lenses = _batch([self._describe(name) for name in names], *arguments)
+                lenses, said = _batch([self._describe(name) for name in names], *arguments)
         except ValueError:
             if len(names) == 1:
                 raise
             half = len(names) // 2
             first = self._together(names[:half], *arguments)
             return first | self._together(names[half:], *arguments)
-        return {name: lenses[i] for i, name in enumerate(names)}
+        return {name: (lenses[i], said[i]) for i, name in enumerate(names)}
 
     def _describe(self, name: str) -> Description:
         """A camera's description in our pixel convention."""
@@ -243,11 +281,8 @@ def _format_of(content: Content) -> Format:
     found = next((format for format in FORMATS if format.fits(content)), None)
     if found is None:
         known = ", ".join(format.name for format in FORMATS)
-        given = content.get("model") if isinstance(content, Mapping) else None
-        raise ValueError(
-            f'it must be in one of the formats {known}; in a darswin file, "model" must be one of '
-            f"{', '.join(sorted(MODELS))}, got {short(given)}"
-        )
+        reason = unknown(content, FORMATS)
+        raise ValueError(f"unknown format: it must be in one of the formats {known}; {reason}")
     return found
 
 
@@ -263,8 +298,9 @@ def _batch(
     theta_max: float | None,
     image_size: Size,
     dtype: torch.dtype | None,
-) -> Lens:
-    """The lenses of descriptions with one `_shape`, with the θ_max that `load` documents."""
+) -> tuple[Lens, list[str]]:
+    """The lenses of descriptions with one `_shape`, with the θ_max that `load` documents, and their
+    doubts, which are about the file's θ_max, not the caller's."""
     dtype = dtype or torch.get_default_dtype()
     first = descriptions[0]
     values: dict[str, Any] = {
@@ -274,18 +310,22 @@ def _batch(
     }
     if image_size is not None:
         values.setdefault("image_size", torch.tensor([image_size], dtype=dtype))
-    wanted = values.pop("theta_max", None)
+    sensor, wanted = values.pop("sensor", None), values.pop("theta_max", None)
     if theta_max is not None:
         wanted = torch.tensor([theta_max], dtype=dtype)
     lens = from_dict({"model": first["model"], **values}, first.get("image_size", image_size))
-    limit = lens.theta_max
+    whole, limit = lens, lens.theta_max
     if wanted is not None:
         rounded = (limit < wanted) & (wanted <= limit + ROUNDING)
         lens = lens.with_theta_max(torch.where(rounded, limit, wanted))
     elif "image_size" in values and "fov" not in values:
         lens = lens.with_theta_max(reach(lens))
     _check(lens, math.inf if wanted is not None else MAX_RADIUS)
-    return lens
+    judged = lens if theta_max is None else whole.with_theta_max(reach(whole))
+    if sensor is not None:
+        left_top, size = sensor.split(2, 1)
+        judged = judged.replace(center=judged.center_in() + left_top, image_size=size)
+    return lens, doubts(judged)
 
 
 def reach(lens: Lens) -> Tensor:

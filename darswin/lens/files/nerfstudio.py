@@ -1,18 +1,20 @@
-"""nerfstudio's transforms.json: one camera for all frames, or one for each frame."""
+"""transforms.json of nerfstudio and instant-ngp: one camera for all frames, or one for each."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from functools import partial
 from typing import Any
 
 from darswin.lens.distorted import BrownConrady, KannalaBrandt
+from darswin.lens.files.content import Content
 from darswin.lens.files.fields import Fields, like_coefficients, short
-from darswin.lens.files.format import Cameras, Description, Format, describe
+from darswin.lens.files.format import Cameras, Description, Format, describe, has_several
 
 MODELS = {
     "SIMPLE_PINHOLE": BrownConrady, "PINHOLE": BrownConrady, "SIMPLE_RADIAL": BrownConrady,
     "RADIAL": BrownConrady, "OPENCV": BrownConrady, "OPENCV_FISHEYE": KannalaBrandt,
 }  # fmt: skip
-TERMS = ("k1", "k2", "k3", "k4", "p1", "p2")
+TERMS: tuple[str, ...] = ("k1", "k2", "k3", "k4", "p1", "p2")
+MARKS = ("frames", "fl_x", "fl_y", "transform_matrix", "camera_angle_x")
 KEYS = ("camera_model", "is_fisheye", "fl_x", "fl_y", "cx", "cy", "w", "h", *TERMS)
 PAIRS = (("k1", "k2"), ("k3", "k4"), ("p1", "p2"))  # nerfstudio's tools write both or none
 
@@ -22,7 +24,14 @@ class Nerfstudio(Format):
 
     name = "nerfstudio"
     origin = 0.5
-    keys = ("frames", "fl_x", "fl_y", "transform_matrix")
+    keys = "fl_x, fl_y, cx, cy and frames"
+
+    def fits(self, content: Content) -> bool:
+        if not isinstance(content, Mapping):
+            return False
+        frames = content.get("frames")
+        first = frames[0] if isinstance(frames, list) and frames else None
+        return has_several([*content, *(first if isinstance(first, Mapping) else ())], MARKS)
 
     def cameras(self, file: Fields, model: str | None) -> Cameras:
         frames = file.get("frames", "a list of mappings") if "frames" in file else []
@@ -54,15 +63,21 @@ def _frame(shared: dict[str, Any], own: set[str], frame: dict, where: str) -> De
 
 
 def _camera(fields: Fields) -> Description:
-    model = fields.one_of("camera_model", MODELS) if "camera_model" in fields else "OPENCV"
+    terms, is_fisheye = TERMS, fields.entries.get("is_fisheye") in (True, "true")
+    if "camera_model" in fields:
+        model = fields.one_of("camera_model", MODELS)
+    elif is_fisheye:  # instant-ngp's files, where p1 and p2 belong to other cameras
+        model, terms = "OPENCV_FISHEYE", TERMS[:4]
+    else:
+        model = "OPENCV"
     size = (fields.side("h"), fields.side("w")) if "w" in fields or "h" in fields else None
-    if fields.entries.get("is_fisheye") in (True, "true") and model != "OPENCV_FISHEYE":
+    if is_fisheye and model != "OPENCV_FISHEYE":
         raise ValueError(f"is_fisheye is true, but camera_model is {model}")
     for pair in PAIRS:
         there = [name for name in pair if name in fields]
         if len(there) == 1:
             lacks = fields.path(*({*pair} - {*there}))
             raise ValueError(f"{fields.path(there[0])} needs {lacks}: write 0 if there is none")
-    values = fields.values("fx=fl_x fy=fl_y cx cy") | fields.values(" ".join(TERMS), 0.0)
+    values = fields.values("fx=fl_x fy=fl_y cx cy") | fields.values(" ".join(terms), 0.0)
     fields.check_all_read(f"nerfstudio's {model}", like_coefficients)
     return describe(MODELS[model], values, size)

@@ -8,7 +8,7 @@ import math
 import re
 from collections.abc import Mapping
 from functools import partial
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 
@@ -22,10 +22,13 @@ from darswin.lens.files.fields import (
     listed,
     plain_name,
     short,
+    to_number,
     to_side,
 )
 from darswin.lens.files.format import Cameras, Description, Format, Intrinsics, describe
+from darswin.lens.files.message import in_message
 from darswin.lens.frame import Size
+from darswin.lens.plausible import NEAR, off_middle
 
 Coefficients = Literal["fisheye", "pinhole", "omnidir"]
 MODELS: tuple[Coefficients, ...] = get_args(Coefficients)
@@ -51,10 +54,12 @@ COEFFICIENTS = ("d", "coeffs", "coefficients", *(
     name + kind for name in ("dist", "distortion", "cameradistortion")
     for kind in ("", "coef", "coefs", "coeff", "coeffs", "coefficients", "params", "parameters")
 ))  # fmt: skip
-SIZE = ("imagesize", "imgsize", "size", "dim", "resolution", "cameraresolution")
+SIZE = ("imagesize", "imgsize", "size", "dim", "resolution", "cameraresolution")  # (W, H)
+SHAPE = ("shape", "imageshape", "imgshape", "frameshape")  # (H, W) or (H, W, C) of an array
 WIDTH, HEIGHT = ("imagewidth", "width", "w"), ("imageheight", "height", "h")
 SAYS_FISHEYE = ("fisheyemodel", "fisheye", "isfisheye")
 SAYS_MODEL = ("distortionmodel", "model", "cameramodel", "modeltype", "calibrationmodel")
+BESIDE = (*COEFFICIENTS, *SIZE, *SHAPE, *WIDTH, *HEIGHT, *SAYS_FISHEYE, *SAYS_MODEL, "xi")
 SUFFIXES = ("0", "1", "2", "3", "left", "right")
 
 
@@ -62,6 +67,7 @@ class OpenCV(Format):
     """Cameras are called by the endings of their matrices' keys."""
 
     name = "OpenCV"
+    keys = "camera_matrix and distortion_coefficients"
     takes_model = True
     holds = (
         "Perspective and BrownConrady (3 radial, no skew), Equidistant and KannalaBrandt (4 radial "
@@ -69,8 +75,19 @@ class OpenCV(Format):
     )
 
     def fits(self, content: Content) -> bool:
-        names = {plain_name(name) for name in content} if isinstance(content, Mapping) else ()
-        return any(m + suffix in names for m in MATRIX for suffix in ("", *SUFFIXES))
+        if not isinstance(content, Mapping):
+            return False
+        # Many files have a K or M. It counts if it is a matrix, or a list beside other entries.
+        names = {plain_name(name): value for name, value in content.items()}
+        return any(
+            _is_matrix(value := names.get(matrix + end))
+            or (
+                (isinstance(value, (list, Mapping)) or " " in str(value or ""))
+                and any(name + e in names for name in BESIDE for e in {end, ""})
+            )
+            for matrix in MATRIX
+            for end in ("", *SUFFIXES)
+        )
 
     def cameras(self, file: Fields, model: str | None) -> Cameras:
         reader = _Reader(file, model)
@@ -111,6 +128,7 @@ class Ros(OpenCV):
     """A ROS message or file, which names its distortion model."""
 
     name = "ROS camera_info"
+    keys = "k, d and distortion_model"
 
     def fits(self, content: Content) -> bool:
         return super().fits(content) and "distortion_model" in content
@@ -120,6 +138,7 @@ class ByName(Format):
     """The intrinsics of one camera as single numbers, without a matrix."""
 
     name = "intrinsics by name"
+    keys = "fx, fy, cx, cy, k1, …"
     takes_model = True
 
     def fits(self, content: Content) -> bool:
@@ -181,7 +200,7 @@ class _Reader:
             raise ValueError(f"{matrices[0]} must be {form}, got {values[0]}")
         plane = {"fx": fx, "fy": fy, "cx": cx, "cy": cy, "skew": skew}
         name = self.coefficients(suffix)
-        coefficients = [] if name is None else self.matrix(name, (0, 4, 5, 8, 12, 14))
+        coefficients = [] if name is None else self.matrix(name, (0, 4, 5, 8, 12, 14), 4)
         xi = self.find(("xi",), suffix)
         kind = self.kind(name, coefficients, xi)
         says = xi is not None or self.find(SAYS_FISHEYE + SAYS_MODEL) is not None
@@ -191,6 +210,8 @@ class _Reader:
                 f"file's entries are {listed(self.file.entries)}"
             )
         model, order, counts = ORDERS[kind]
+        while kind != "pinhole" and len(coefficients) > 4 and coefficients[-1] == 0:
+            coefficients.pop()  # of T265 and MYNT
         if coefficients and len(coefficients) not in counts:
             expected = f"{' or '.join(map(str, counts))} coefficients for the {kind} model"
             raise ValueError(f"{name} must have {expected}, got {len(coefficients)}")
@@ -203,10 +224,11 @@ class _Reader:
             if xi is None:
                 raise ValueError("xi is missing: it must be a finite number")
             (terms["xi"],) = self.matrix(xi, (1,))
-        size = self.image_size(suffix)
+        size = self.image_size(suffix, (cx, cy))
+        sensor: dict[str, list[float]] = {}
         if "distortion_model" in self.file:
-            size = self.in_message(plane, size)
-        return describe(model, plane | terms, size)
+            size, sensor = in_message(self.file, plane, size)
+        return describe(model, plane | terms, size) | sensor
 
     def camera_by_name(self) -> Description:
         """The camera of a file with single numbers."""
@@ -226,21 +248,22 @@ class _Reader:
         model, order, _ = ORDERS[kind]
         # OpenCV calls the denominator's coefficients k4 to k6.
         ours = {"k4": "d1", "k5": "d2", "k6": "d3"} if kind == "pinhole" else {}
-        if left := [name for name in found if ours.get(name, name) not in order.split()]:
+        known = {name for name in found if ours.get(name, name) in order.split()}
+        if left := [name for name in found if terms[name] != 0 and name not in known]:
             raise ValueError(f"the {kind} model has no {listed(left)}")
         if 0 < len(ours.keys() & terms.keys()) < 3:
             raise ValueError(
                 "the pinhole model's denominator is 1 + k4 r² + k5 r⁴ + k6 r⁶: write all of k4, k5 "
                 f"and k6, got {listed(terms)}"
             )
-        terms = {ours.get(name, name): value for name, value in terms.items()}
+        terms = {ours.get(name, name): terms[name] for name in found if name in known}
         values = plane | dict.fromkeys(order.split(), 0.0) | terms
         if kind == "omnidir":
             values["xi"] = file.number(xi or "xi")
         if skew is not None:
             values["skew"] = file.number(skew)
         file.check_all_read(f"the {kind} model", like_coefficients)
-        return describe(model, values, self.image_size(""))
+        return describe(model, values, self.image_size("", (plane["cx"], plane["cy"])))
 
     def kind(
         self, name: str | None, coefficients: list[float], xi: str | None, only: str | None = None
@@ -277,8 +300,9 @@ class _Reader:
             'model="fisheye" or model="pinhole", or write fisheye_model: 1 or 0 into the file'
         )
 
-    def matrix(self, name: str, counts: tuple[int, ...]) -> list[float]:
-        """The numbers of a matrix: a mapping with `data`, a list, a list of rows or a number."""
+    def matrix(self, name: str, counts: tuple[int, ...], least: int | None = None) -> list[float]:
+        """The numbers of a matrix: a mapping with `data`, a list, a list of rows or a number. The
+        other arguments are those of `Fields.numbers`."""
         value, where, shape = self.file.entries[name], name, None
         if isinstance(value, Mapping):
             section, where = self.file.section(name), f"{name}.data"
@@ -292,54 +316,53 @@ class _Reader:
         if isinstance(value, list) and any(isinstance(row, list) for row in value[:3]):
             rows = [row[:32] if isinstance(row, list) else [row] for row in value[:32]]
             value = [entry for row in rows for entry in row]
-        numbers = Fields({where: value}).numbers(where, counts)
-        if shape is not None and math.prod(shape) != len(numbers):
+        if isinstance(value, str):
+            value = value.split()
+        numbers = Fields({where: value}).numbers(where, counts, least)
+        if shape is not None and math.prod(shape) != len(value):
             height, width = shape
-            raise ValueError(f"{where} must be {height:g} × {width:g} numbers, got {len(numbers)}")
+            raise ValueError(f"{where} must be {height:g} × {width:g} numbers, got {len(value)}")
         return numbers
 
-    def in_message(self, plane: dict[str, float], size: Size) -> Size:
-        """The image size of a ROS message. Changes `plane` from the sensor's pixels to the image's:
-        the image shows the region `roi`, and joins `binning_x` × `binning_y` pixels to one."""
-        roi = self.file.section("roi") if "roi" in self.file else Fields({})
-        left, top, width, height = (
-            _pixels(roi, name) for name in ("x_offset", "y_offset", "width", "height")
-        )
-        across, down = (max(_pixels(self.file, f"binning_{axis}"), 1) for axis in "xy")
-        if width or height or left or top:
-            rows, columns = size or (math.inf, math.inf)
-            if not (0 < width <= columns - left and 0 < height <= rows - top):
-                raise ValueError(
-                    "roi must be a part of the image of 1 pixel or more, or all 0, got "
-                    f"{width}×{height} px at ({left}, {top})"
-                )
-            size = height, width
-        if size is not None:
-            size = size[0] // down, size[1] // across
-            if 0 in size:
-                raise ValueError(f"the binning of {across}×{down} pixels leaves none of the image")
-        plane["cx"] = (plane["cx"] - left + 0.5) / across - 0.5
-        plane["cy"] = (plane["cy"] - top + 0.5) / down - 0.5
-        for name, count in (("fx", across), ("fy", down), ("skew", across)):
-            plane[name] /= count
-        return size
-
-    def image_size(self, suffix: str) -> Size:
+    def image_size(self, suffix: str, center: tuple[float, float]) -> Size:
         """(H, W) of a camera's images, or of all cameras' images; None if the file has neither."""
         for end in (suffix, ""):
-            pair = self.find(SIZE, end)
-            if pair is not None:
-                width, height = self.file.sides(pair)
-                return height, width
+            for names, is_shape in ((SIZE, False), (SHAPE, True)):
+                if (pair := self.find(names, end)) is not None:
+                    return self.pair(pair, is_shape, center)
             across, down = self.find(WIDTH, end), self.find(HEIGHT, end)
             if across is not None or down is not None:
-                return (self.file.side(down or "image_height"),
-                        self.file.side(across or "image_width"))  # fmt: skip
+                return self.side(down or "image_height"), self.side(across or "image_width")
         return None
 
+    def pair(self, name: str, is_shape: bool, center: tuple[float, float]) -> tuple[int, int]:
+        """(H, W) of an entry with both sides. Scripts write both orders under any name: the name
+        tells the order, unless only the other one has the center near the image's middle."""
+        value = self.file.entries[name]
+        if isinstance(value, Mapping) and "data" not in value:
+            both = _Reader(self.file.section(name), None)
+            return both.side(both.find(HEIGHT) or "height"), both.side(both.find(WIDTH) or "width")
+        sides = self.matrix(name, (2, 3))
+        first, second = (to_side(side, f"{name}[{i}]") for i, side in enumerate(sides[:2]))
+        if len(sides) == 3:
+            to_number(sides[2], f"{name}[2]", "1, 3 or 4 channels", lambda n: n in (1, 3, 4))
+            return first, second
+        size, other = (first, second), (second, first)
+        if not is_shape:
+            size, other = other, size
+        off, other_off = (off_middle(*center, w, h) for h, w in (size, other))
+        return other if off > NEAR / 2 and other_off < min(off / 2, NEAR) else size
 
-def _pixels(fields: Fields, name: str) -> int:
-    """A number of pixels; 0 if the entry is missing."""
-    if name not in fields:
-        return 0
-    return to_side(fields.get(name, "a whole number of pixels"), fields.path(name), least=0)
+    def side(self, name: str) -> int:
+        """One side of an image, px, from a number or from a matrix of one."""
+        if isinstance(self.file.entries.get(name), (list, Mapping)):
+            return to_side(self.matrix(name, (1,))[0], self.file.path(name))
+        return self.file.side(name)
+
+
+def _is_matrix(value: Any) -> bool:
+    return (
+        "data" in value
+        if isinstance(value, Mapping)
+        else (isinstance(value, list) and len(value) in (3, 9))
+    )

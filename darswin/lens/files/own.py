@@ -1,6 +1,10 @@
-"""Our own JSON: the name of a lens model and the arguments of its constructor."""
+"""Our own JSON: the name of a lens model and the arguments of its constructor.
+
+Angles may be in degrees: `theta_max_deg`, and `fov_deg` in place of `fov`.
+"""
 
 import json
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -10,15 +14,29 @@ from darswin.lens.files.fields import Fields, short, to_number
 from darswin.lens.files.format import Cameras, Description, Format
 from darswin.lens.ideal import FocalLens
 
+# The largest value of each angle, rad, and the entries that give it in degrees.
+ANGLES = {"fov": 2 * math.pi, "theta_max": math.pi}
+IN_DEGREES = {"fov_deg": "fov", "theta_max_deg": "theta_max"}
+# A θ_max that was rounded by another program may exceed the limit by this, rad.
+ROUNDING = 1e-4
+
 
 class Own(Format):
     """One lens of any model in `MODELS`."""
 
     name = "darswin"
+    keys = "model"
 
     def fits(self, content: Content) -> bool:
-        model = content.get("model") if isinstance(content, Mapping) else None
-        return isinstance(model, str) and model in MODELS
+        if not isinstance(content, Mapping):
+            return False
+        name = content.get("model")
+        if not isinstance(name, str) or name not in MODELS:
+            return False
+        # Others name models too, such as Perspective, beside fx and fy.
+        model, others = MODELS[name], content.keys() - {"model"}
+        known = (*model.parameters, *model.optional, *model.common, *ANGLES, *IN_DEGREES)
+        return not others or not others.isdisjoint(known)
 
     def cameras(self, file: Fields, model: str | None) -> Cameras:
         return {"lens": lambda: _lens(file)}
@@ -31,25 +49,44 @@ def _lens(file: Fields) -> Description:
     name = file.text("model")
     model = MODELS[name]
     required, optional = list(model.parameters), [*model.optional, *model.common]
-    if "fov" in file and issubclass(model, FocalLens):
-        required.remove("focal")
-        required.append("fov")
+    if ("fov" in file or "fov_deg" in file) and issubclass(model, FocalLens):
+        required[required.index("focal")] = "fov"
         optional.remove("theta_max")
+    known = [*required, *optional]
+    known += [key for key, angle in IN_DEGREES.items() if angle in known]
     for key in file.entries:
-        if key not in ("model", *required, *optional):
-            known = ", ".join((*required, *optional))
-            raise ValueError(f"a {name} lens has no {file.path(key)}, only {known}")
+        if key not in ("model", *known):
+            raise ValueError(f"a {name} lens has no {file.path(key)}, only {', '.join(known)}")
+    angles = {
+        angle: _angle(file, angle, key) for key, angle in IN_DEGREES.items() if angle in known
+    }
     description: Description = {"model": name}
     for key in (*required, *(key for key in optional if key in file)):
-        if key == "fov":
-            description[key] = file.positive(key)
-            continue
-        dims = len(model.declared[key].shape)
-        value = file.get(key, "a list of numbers" if dims else "a finite number")
-        description[key] = _value(value, file.path(key), dims, model.max_numbers)
+        if key not in angles:
+            dims = len(model.declared[key].shape)
+            value = file.get(key, "a list of numbers" if dims else "a finite number")
+            description[key] = _value(value, file.path(key), dims, model.max_numbers)
     if "image_size" in file:
         description["image_size"] = list(file.sides("image_size"))
-    return description
+    return description | {key: value for key, value in angles.items() if value is not None}
+
+
+def _angle(file: Fields, key: str, in_degrees: str) -> float | None:
+    """An angle in rad, which the file may give in degrees; None if it gives neither."""
+    if key in file and in_degrees in file:
+        raise ValueError(f"{file.path(key)} and {file.path(in_degrees)} must not both be given")
+    if in_degrees in file:
+        most = math.degrees(ANGLES[key])
+        expected = f"above 0 and at most {most:g} degrees"
+        value = file.get(in_degrees, expected)
+        return math.radians(
+            to_number(value, file.path(in_degrees), expected, lambda x: 0 < x <= most)
+        )
+    if key not in file:
+        return None
+    expected = f"at most {ANGLES[key]:.4g} rad and above 0 ({in_degrees} takes degrees)"
+    most = ANGLES[key] + ROUNDING
+    return to_number(file.get(key, expected), file.path(key), expected, lambda x: 0 < x <= most)
 
 
 def _value(value: Any, name: str, dims: int, most: int) -> Any:

@@ -1,12 +1,16 @@
 """WoodScape's and SynWoodScape's JSON: `intrinsic` holds a polynomial of the angle."""
 
+from collections.abc import Mapping
+
+from darswin.lens.files.content import Content
 from darswin.lens.files.fields import Fields
-from darswin.lens.files.format import Cameras, Description, Format, in_image
+from darswin.lens.files.format import Cameras, Description, Format, has_several, in_image
 from darswin.lens.polynomial import Polynomial
 
 # k₁, px per rad, is at least this even for images of a few dozen pixels.
 LEAST_K1 = 10.0
 MAX_ORDER = 16
+MARKS = ("poly_order", "cx_offset", "cy_offset", "aspect_ratio", "k1")
 
 
 class WoodScape(Format):
@@ -14,7 +18,11 @@ class WoodScape(Format):
 
     name = "WoodScape"
     origin = 0.5
-    keys = ("intrinsic",)
+    keys = "intrinsic with poly_order, k1, k2, …"
+
+    def fits(self, content: Content) -> bool:
+        intrinsic = content.get("intrinsic") if isinstance(content, Mapping) else None
+        return isinstance(intrinsic, Mapping) and has_several(intrinsic, MARKS)
 
     def cameras(self, file: Fields, model: str | None) -> Cameras:
         return {file.text("name") if "name" in file else "camera": lambda: _camera(file)}

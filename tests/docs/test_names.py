@@ -1,0 +1,23 @@
+"""Names in code font on the page of lenses exist."""
+
+import re
+from pathlib import Path
+
+from darswin import lens
+
+PAGE = Path(__file__).parents[2] / "docs" / "lenses.md"
+# Of other programs.
+THEIRS = {"cam2world", "world2cam", "radial_poly"}
+
+
+def test_every_name_on_the_page_of_lenses_exists():
+    text = re.sub(r"^```.*?^```$", "", PAGE.read_text(), flags=re.M | re.S)  # blocks are run
+    text = re.sub(r"^    .*$", "", text, flags=re.M)
+    known = {*lens.__all__, *dir(lens.Lens), "from_fov", "lens"}
+    known |= {name for model in lens.MODELS.values() for name in (*model.declared, *model.common)}
+    found = [
+        re.match(r"(?:(?:darswin\.)?lens\.)?(\w+)", code) for code in re.findall("`(.+?)`", text)
+    ]
+    names = {match[1] for match in found if match} - {"darswin"}
+    assert len(names) > 40 and not names - known - THEIRS
+    assert names >= THEIRS  # remove what the page no longer has

@@ -1,0 +1,249 @@
+"""Formats are told apart by several entries, and files that are no calibrations are named."""
+
+import bz2
+import gzip
+import io
+import json
+import lzma
+import tarfile
+import zipfile
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+from lens_examples import FILES, K, file_text, flat, loads, opencv
+from PIL import Image
+from videos import write_video
+
+from darswin.cli.main import main
+from darswin.lens import MODELS, load
+from darswin.lens.files.content import parse
+from darswin.lens.files.load import FORMATS, Calibration
+
+UNKNOWN = "^calibration in a string: unknown format: it must be in one of the formats darswin, Wood"
+MATRIX_OF_4 = "1 0 0 0.5\n0 1 0 0\n0 0 1 2\n0 0 0 1\n"
+# Files of other programs, which have an entry or the notation of a known format.
+OTHERS = {
+    "rig": "intrinsic:\n  left: {model_type: POLYFISHEYE, camera_name: left, image_width: 350}\n",
+    "Open3D": json.dumps(dict(intrinsic=dict(width=640, height=480, intrinsic_matrix=[525.0] * 9))),
+    "RealSense": json.dumps(dict(intrinsic=dict(width=640, height=480, fx=380.0, k1=0.1))),
+    "cereal": json.dumps(dict(value0=dict(cereal_class_version=0, poses=[1, 2]))),
+    "frames": json.dumps(dict(frames=[dict(time=0.1, file="a.png")], fps=30)),
+    "no frames": json.dumps(dict(frames=[])),
+    "Hugging Face": json.dumps(dict(model_type="swin", image_size=224, depths=[2, 2, 6, 2])),
+    "options": yaml.safe_dump(dict(k=5, m=3, size=9, width=64, model="darswin", lr=0.1)),
+    "list": json.dumps(dict(K=[1, 2, 3, 4])),
+    "anchors": yaml.safe_dump(dict(camera=dict(camera_model="x"), sensor=dict(rate=20))),
+    "Metashape": (
+        '<document version="2.0.0"><chunk><sensor><calibration class="initial"><f>14</f>'
+        '</calibration><calibration class="adjusted"><f>15</f></calibration></sensor></chunk>'
+        "</document>"),
+    "URDF": "<robot><link><k>1</k></link><link><k>2</k></link></robot>",
+    "camera matrix": "8.12e+02 0 6.402e+02\n0 8.114e+02 3.617e+02\n0 0 1\n",
+    "small matrix": "2 0 1\n0 2 1\n0 0 1\n",
+    "coefficients": "-0.22 0.05 0.001 -0.002 0.003\n",
+    "one number": "5\n",
+    "pose": MATRIX_OF_4,
+    "trajectory": "1305031102.17 1.34 0.63 1.66 0.66 0.62 -0.29 -0.33\n" * 9,
+    "images.txt": "1 0.8 0.1 0.2 0.5 1.0 2.0 3.0 1 a.png\n2362.3 248.4 58396\n",
+    "classes": "0 cat\n1 dog\n2 bird\n",
+    "capitals": "0 CAT\n1 DOG\n",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", OTHERS)
+def test_one_entry_is_no_format(name):
+    with pytest.raises(ValueError, match=UNKNOWN) as error:
+        loads(OTHERS[name])
+    said = str(error.value)
+    assert "; its entries are " in said or "; it is a table of " in said
+    assert '"model" must be' not in said or name == "options"
+    assert len(said) < 900 and "appears twice" not in said
+
+
+# A file of each format. What it lacks is said in the words of its format.
+ONE_LACKING = {
+    "darswin": ("ours.json", '"focal": 300.0,', "focal is missing"),
+    "WoodScape": ("woodscape.json", '"model": "radial_poly",', "intrinsic.model is missing"),
+    "basalt": ("basalt.json", '"camera_type": "eucm",', "camera_type is missing"),
+    "nerfstudio": ("nerfstudio.json", '"fl_x": 851.2, ', "fl_x is missing"),
+    "KITTI-360 or CamOdoCal": ("kitti360_02.yaml", "model_type: MEI", "model_type is missing"),
+    "Kalibr": ("kalibr_ds.yaml", "  distortion_model: none\n", "distortion_model is missing"),
+    "ROS camera_info": ("ros_fisheye.yaml", "image_width: 1280", "image_width is missing"),
+    "OpenCV": ("opencv_fisheye.yaml", "image_width: 1280", "image_width is missing"),
+    "OCamCalib": ("ocamcalib.txt", "0.998700 0.000420", "the affine parameters"),
+    "COLMAP": ("colmap.txt", " -0.00021", "OPENCV_FISHEYE must have 8 parameters"),
+}
+
+
+@pytest.mark.parametrize("name", ONE_LACKING)
+def test_a_file_that_lacks_one_entry_is_still_of_its_format(name):
+    file, removed, said = ONE_LACKING[name]
+    text = file_text(file)
+    assert removed in text
+    with pytest.raises(ValueError, match=f"{name} calibration in a string: .*{said}"):
+        loads(text.replace(removed, "", 1), camera=0 if name == "basalt" else None)
+
+
+@pytest.mark.parametrize("path", sorted(FILES.iterdir()), ids=lambda path: path.name)
+def test_the_order_of_entries_does_not_change_the_format(path):
+    if path.suffix not in (".json", ".yaml"):
+        assert path.suffix in (".md", ".txt", ".bin", ".xml", ".npz")
+        return
+    content = parse(path.read_text())
+    first = next(format for format in FORMATS if format.fits(content))
+    reverse = dict(reversed(content.items()))
+    assert next(format for format in FORMATS if format.fits(reverse)) is first
+    fitting = {format.name for format in FORMATS if format.fits(content)} - {first.name}
+    assert fitting <= {"OpenCV"}  # which reads messages of ROS too
+
+
+def test_entries_that_others_have_too_do_not_change_the_format():
+    matrix = dict(camera_matrix=K, width=1280, height=960)
+    for text in (
+        json.dumps(matrix | dict(model_type="pinhole", distortion_parameters=[-0.2, 0, 0, 0, 0])),
+        opencv(D=[-0.2, 0, 0, 0, 0], frames=[1, 2], value0={}, intrinsic={}),
+        flat("k1", "k2", "p1", "p2", model="Perspective"),
+        flat("k1", "k2", "k3", "k4", frames=12, model_type="fisheye"),
+    ):
+        assert loads(text).image_size.tolist() == [[960, 1280]]
+
+
+# -- what an unknown file has, and what is expected ---------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("text", "found", "expected"),
+    [
+        (json.dumps(dict(camera_mat=K, dist_coefs=[0.1] * 5)), "camera_mat, dist_coefs",
+         "camera_matrix and distortion_coefficients"),
+        (json.dumps(dict(foo=1, bar=2)), "foo, bar", "camera_matrix and distortion_coefficients"),
+        (json.dumps(dict(f_x=1, f_y=2, c_x=1, k_1=3)), "f_x, f_y, c_x, k_1", "fx, fy, cx, cy"),
+        (json.dumps(dict(flx=1, fly=2, cx=1, cy=3)), "flx, fly, cx, cy", "fl_x, fl_y, cx, cy"),
+        ("cam_0: {model: ds}\ncamera_modell: ds", "cam_0, camera_modell", "cam0 with camera_model"),
+        ("projection_params: {a: 1}\nmodel_types: MEI\n", "projection_params, model_types",
+         "model_type and projection_parameters"),
+        ("{}", "none", "camera_matrix and distortion_coefficients"),
+    ],
+)  # fmt: skip
+def test_names_of_entries_that_are_unknown(text, found, expected):
+    with pytest.raises(ValueError) as error:
+        loads(text)
+    said = str(error.value)
+    assert f"its entries are {found}, but expected are, for example, {expected}" in said, said
+    assert '"model" must be' not in said
+
+
+@pytest.mark.parametrize(
+    ("given", "nearest"),
+    [("KanalaBrandt", "KannalaBrandt"), ("equidistant", "Equidistant"), ("Sperical", "Spherical"),
+     ("brown_conrady", "BrownConrady"), ("EQUISOLID", "Equisolid"), ("zzz", None), ("Kb", None)],
+)  # fmt: skip
+def test_an_unknown_model_gets_the_nearest_name(given, nearest):
+    with pytest.raises(ValueError, match=UNKNOWN) as error:
+        loads(json.dumps(dict(model=given, focal=300)))
+    said = str(error.value)
+    assert all(name in said for name in MODELS)
+    assert said.endswith(f"got '{given}': is it {nearest}?" if nearest else f"got '{given}'")
+
+
+# -- files that are no calibrations ---------------------------------------------------------------
+
+
+def picture(form):
+    data = io.BytesIO()
+    Image.fromarray(np.zeros((8, 8, 3), np.uint8)).save(data, form)
+    return data.getvalue()
+
+
+def zipped(names):
+    data = io.BytesIO()
+    with zipfile.ZipFile(data, "w") as archive:
+        for name in names:
+            archive.writestr(name, "text")
+    return data.getvalue()
+
+
+def tarred():
+    data = io.BytesIO()
+    with tarfile.open(fileobj=data, mode="w") as archive:
+        archive.add(FILES / "ours.json", "ours.json")
+    return data.getvalue()
+
+
+def array():
+    data = io.BytesIO()
+    np.save(data, np.eye(3))
+    return data.getvalue()
+
+
+def encoded(suffix):
+    return cv2.imencode(suffix, np.zeros((8, 8, 3), np.uint8))[1].tobytes()
+
+
+TEXT = file_text("woodscape.json").encode()
+KINDS = {
+    **{form: (lambda form=form: picture(form), "a picture")
+       for form in ("PNG", "JPEG", "GIF", "BMP", "TIFF", "WEBP", "PPM", "ICO", "JPEG2000")},
+    "small BMP": (lambda: encoded(".bmp"), "a picture"),
+    "EXR": (lambda: b"v/1\x01\x02\0\0\0", "a picture"),
+    "AVIF": (lambda: b"\0\0\0 ftypavif", "a picture"),
+    "HEIC": (lambda: b"\0\0\0 ftypheic", "a picture"),
+    "MP4": (lambda: b"\0\0\0 ftypisom\0\0\2\0isomiso2avc1mp41", "a video"),
+    "QuickTime": (lambda: b"\0\0\0\x14ftypqt  ", "a video"),
+    "Matroska": (lambda: b"\x1a\x45\xdf\xa3\x01\0\0\0", "a video"),
+    "large video": (lambda: b"\0\0\0 ftypisom" + bytes(17 << 20), "a video"),
+    "gzip": (lambda: gzip.compress(TEXT, mtime=0), "an archive"),
+    "bzip2": (lambda: bz2.compress(TEXT), "an archive"),
+    "xz": (lambda: lzma.compress(TEXT), "an archive"),
+    "7z": (lambda: b"7z\xbc\xaf\x27\x1c\0\4", "an archive"),
+    "RAR": (lambda: b"Rar!\x1a\7\1\0", "an archive"),
+    "tar": (tarred, "an archive"),
+    "zip": (lambda: zipped(["a.txt"]), "a zip archive"),
+    "empty zip": (lambda: zipped([]), "an archive"),
+    "PDF": (lambda: b"%PDF-1.7\n", "a PDF document"),
+    "MATLAB": (lambda: b"MATLAB 5.0 MAT-file, Platform: GLNXA64", "a file of MATLAB"),
+    "HDF5": (lambda: b"\x89HDF\r\n\x1a\n", "a file of MATLAB or HDF5"),
+    "npy": (array, "one array of NumPy"),
+    "pickle": (lambda: b"\x80\4\x95\x10\0\0\0\0", "a pickle"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_a_file_of_another_kind_is_named(name, tmp_path, capsys):
+    make, kind = KINDS[name]
+    path = tmp_path / "file.yaml"  # the name of a file does not matter
+    path.write_bytes(make())
+    said = f"calibration {path}: it is {kind}"
+    with pytest.raises(ValueError, match="but must be a calibration: text in YAML") as error:
+        load(path)
+    assert str(error.value).startswith(said)
+    with pytest.raises(SystemExit):
+        main(["lens", "info", str(path)])
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith(f"darswin: {said}") and "UTF-8" not in line
+
+
+def test_a_recorded_video_is_named(tmp_path):
+    for name, codec in (("a.mp4", "mp4v"), ("a.avi", "MJPG")):
+        write_video(tmp_path / name, 3, codec=codec)
+        with pytest.raises(ValueError, match="it is a video, but must be a calibration"):
+            load(tmp_path / name)
+
+
+def test_calibrations_do_not_look_like_other_kinds():
+    for path in FILES.iterdir():
+        if path.name != "README.md":
+            assert Calibration.read(path).names
+
+
+def test_a_file_that_is_missing(tmp_path, capsys):
+    with pytest.raises(
+        FileNotFoundError, match=r"^calibration .*none\.json: there is no such file$"
+    ):
+        load(tmp_path / "none.json")
+    with pytest.raises(SystemExit) as end:
+        main(["lens", "info", "nofile"])
+    assert end.value.code == 2
+    assert capsys.readouterr().err == "darswin: calibration nofile: there is no such file\n"
