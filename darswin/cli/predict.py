@@ -51,7 +51,7 @@ def predict(
             example picture, which is used if no paths are given.
         lens: the camera's calibration file, in any format that `darswin.lens.load` reads. Or a lens
             as JSON, in pixels of the pictures: {"model": "Spherical", "xi": 0.5, "focal": 300,
-            "theta_max": 1.5}; "fov" (rad) can replace the last two if the field of view fills the
+            "theta_max": 1.5}; "fov_deg" can replace the last two if the field of view fills the
             circle inside the picture. For several cameras, either a lenses.json, whose paths are
             relative to its own folder (see `darswin.data.Calibrations`), or a folder with one
             calibration, STEM.json, for each picture or video. The default is the lens of the run:

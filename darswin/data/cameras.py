@@ -188,8 +188,8 @@ def _places(
     if _NUMBER.fullmatch(str(lens)) and not Path(lens).exists():
         raise ValueError(
             f"`lens` {lens} is a number, but must be a calibration file, or a lens as JSON: for an "
-            'ordinary picture with a field of view of 60° {"model": "Perspective", "fov": 1.047}, '
-            'in radians; for a fisheye of 170° {"model": "Equidistant", "fov": 2.967}'
+            'ordinary picture {"model": "Perspective", "fov_deg": 60}, for a fisheye '
+            '{"model": "Equidistant", "fov_deg": 170}, each with its own field of view'
         )
     entries = None if is_json(lens) else _entries(Path(lens), root)
     if entries is None:

@@ -96,7 +96,7 @@ def test_the_most_probable_classes(run, capsys):
         ("p.png --model digits --run .", "or --model, a safetensors file or one of digits"),
         ("p.png --run . --lens {}", 'or a "model" of darswin'),
         ("p.png --run . --lens none.json", r"there is no calibration file none\.json"),
-        ("p.png --run . --lens 170", '--lens 170 is a number, but must be a calib.*"fov": 2.967'),
+        ("p.png --run . --lens 170", '--lens 170 is a number, but must be a calib.*"fov_deg": 170'),
         (
             "p.png --run . --lens other.json",
             r"other\.json: (?!.*must name).*its entries are '?name",
