@@ -6,13 +6,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import yaml
-
-from darswin.cli.options import FIRST_TASK
+from darswin.cli.options import FIRST_TASK, content_of
 from darswin.data.cameras import Calibrations, is_json
 from darswin.data.scenes import Scenes, Target, open_scenes
 from darswin.data.splits import some
-from darswin.utils.text import read_text
 
 # The lenses of files, by the files' names.
 Lenses = Mapping[str, Calibrations]
@@ -53,28 +50,26 @@ def lenses_of_run(
     config = Path(run) / "config.yaml"
     if not config.is_file():
         raise ValueError(f"{missing}, because {run} has no config.yaml, which would name one")
-    content = yaml.safe_load(read_text(config))
-    data, task = content["data"], content.get("task", FIRST_TASK)
+    content = content_of(config)
+    data, task = content.get("data", {}), content.get("task", FIRST_TASK)
     camera = camera or data.get("camera")
     coefficients = coefficients or data.get("coefficients")
-    name = data.get("lens") or data["path"]
-    if data.get("lens") is None and task not in _TARGETS:
+    lens, path = data.get("lens"), data.get("path", ".")
+    if lens is None and task not in _TARGETS:
         raise ValueError(f"{missing}, because {run} was trained on pictures without a lens")
     try:
-        if data.get("lens") is not None:
-            found: Lenses = dict.fromkeys(
-                files, Calibrations(name, data["path"], camera, coefficients)
-            )
+        if lens is not None:
+            found: Lenses = dict.fromkeys(files, Calibrations(lens, path, camera, coefficients))
         else:
             opening = {"camera": camera, "coefficients": coefficients}
             opening |= {option: data[option] for option in _OPENING if option in data}
-            found = _of_scenes(_scenes(data["path"], _TARGETS[task], opening), files)
+            found = _of_scenes(_scenes(path, _TARGETS[task], opening), files)
         for file in files:
             found[file].camera_of(file)
     except (ValueError, OSError) as error:
         raise ValueError(f"{missing}, because that of {run} cannot be used: {error}") from error
-    what = "lens of the run" if data.get("lens") else "lenses of the run's data set"
-    print(f"darswin: {what}: {name}", file=sys.stderr)
+    what = f"lenses of the run's data set: {path}" if lens is None else f"lens of the run: {lens}"
+    print(f"darswin: {what}", file=sys.stderr)
     return found
 
 

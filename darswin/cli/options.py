@@ -29,7 +29,7 @@ def complete(argv: list[str]) -> tuple[list[str], Task]:
     scan.add_argument("--task")
     scan.add_argument("--data.path", dest="path")
     given, others = scan.parse_known_args(argv[1:])
-    contents = {file: _content(file) for file in map(_config_file, given.config)}
+    contents = {file: content_of(file) for file in map(_config_file, given.config)}
     before = None
     if given.run:
         others += ["--run", given.run]
@@ -37,7 +37,7 @@ def complete(argv: list[str]) -> tuple[list[str], Task]:
         if argv[0] == "fit" and not given.resume:
             check_free(Path(given.run))
         elif own.exists():
-            contents = {own: _content(own)} | contents
+            contents = {own: content_of(own)} | contents
             before = contents[own].get("task") or FIRST_TASK
         elif last_of(Path(given.run)).exists() if argv[0] == "fit" else not contents:
             raise FileNotFoundError(f"there is no run in {given.run}: it has no config.yaml")
@@ -69,7 +69,8 @@ def _config_file(name: str) -> Path:
     return preset
 
 
-def _content(config: Path) -> dict[str, Any]:
+def content_of(config: Path) -> dict[str, Any]:
+    """The options in a YAML file; none if it cannot be read."""
     try:
         content = yaml.safe_load(read_text(config))
     except (yaml.YAMLError, ValueError, OSError):

@@ -185,7 +185,7 @@ def _places(
 ) -> dict[PurePosixPath, PictureCamera]:
     """The cameras of folders and pictures; arguments as for `Calibrations`."""
     name = "of the lens" if is_json(lens) else str(lens)
-    if _NUMBER.fullmatch(str(lens)) and not Path(lens).exists():
+    if _NUMBER.fullmatch(str(lens)) and not os.path.exists(str(lens)):
         raise ValueError(
             f"`lens` {lens} is a number, but must be a calibration file, or a lens as JSON: for an "
             'ordinary picture {"model": "Perspective", "fov_deg": 60}, for a fisheye '
@@ -218,7 +218,7 @@ def _places(
 
 def _entries(path: Path, root: Path) -> Mapping[str, Any] | None:
     """The entries of a lenses.json; None for a calibration file, or a file of another program."""
-    if not path.exists():
+    if not os.path.exists(path):
         raise FileNotFoundError(f"there is no calibration file {path}")
     check_is_file(path)
     try:
@@ -237,11 +237,11 @@ def _are_cameras(content: Mapping[str, Any], path: Path, root: Path) -> bool:
     def is_calibration(value: Any) -> bool:
         named = value.get("file") if isinstance(value, dict) else value
         if isinstance(named, str):
-            return (path.parent / named).is_file()
+            return os.path.isfile(path.parent / named)
         return isinstance(value, dict) and value.get("model") in MODELS
 
     return any(
-        isinstance(value, str | dict) and (place == "." or (root / place).exists())
+        isinstance(value, str | dict) and (place == "." or os.path.exists(root / place))
         for place, value in content.items()
     ) or all(map(is_calibration, content.values()))
 

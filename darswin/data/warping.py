@@ -225,6 +225,8 @@ def cut_off(size: tuple[int, int], lens: Lens | None, framing: Framing) -> str |
             are lost, and pixels that no ray reaches do not count. None means that it is unknown.
     """
     top, left, height, width = taken_part(size, framing)
+    if (height, width) == size:
+        return None
     theta = np.zeros(size) if lens is None else _angles(lens)
     cut = np.ones(size, bool)
     cut[top : top + height, left : left + width] = False
