@@ -4,6 +4,7 @@ import io
 import json
 import os
 import time
+import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
@@ -15,7 +16,7 @@ from PIL import Image
 from torch import Tensor
 
 from darswin.data.scenes.targets import IGNORE, PER_METRE
-from darswin.data.warping import Framing, FullSize, at_size
+from darswin.data.warping import CutOff, Framing, FullSize, at_size, cut_off, picture_size
 from darswin.deploy.optimize import optimize
 from darswin.lens import Lens
 from darswin.models.base import Model
@@ -61,6 +62,7 @@ class Answers:
         self._lens: Lens | None = None  # of the queue
         self._prepared: dict[int, tuple[Lens, Any, FullSize | None]] = {}  # by a lens's identity
         self._queue: list[Request] = []
+        self._warned = False
 
     def add(self, entry: dict[str, Any], image: np.ndarray, lens: Lens) -> None:
         """Adds an image (H, W, C) uint8 with its lens. Equal lenses should be the same object."""
@@ -75,9 +77,26 @@ class Answers:
                     size = (pixels.shape[2], pixels.shape[3])
                     prepared = self.model.prepare(resized_lens, size)
                 self._prepared[id(lens)] = lens, prepared, self._full_size(lens)
+                self._warn_of_cut_off(lens)
         self._queue.append(Request(entry, image, pixels))
         if len(self._queue) == BATCH:
             self.flush()
+
+    def _warn_of_cut_off(self, lens: Lens) -> None:
+        """Warns once if the model does not see whole pictures."""
+        if self._warned:
+            return
+        lost = cut_off(picture_size(lens), lens, fit_of(self.model, self.card))
+        if lost is None:
+            return
+        self._warned = True
+        reason = "takes only square pictures"
+        if self.card.fit == "crop":
+            reason = (
+                "was trained on cropped pictures; `darswin fit --data.fit stretch` trains one that "
+                "sees all of them"
+            )
+        warnings.warn(f"the model does not see {lost}, because it {reason}", CutOff, stacklevel=2)
 
     def flush(self) -> None:
         """Predicts the images in the queue; FloatingPointError if the model computes NaN."""

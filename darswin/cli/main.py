@@ -1,6 +1,7 @@
 """The command line: `darswin COMMAND`, or `python -m darswin COMMAND`."""
 
 import codecs
+import contextlib
 import json
 import os
 import re
@@ -67,6 +68,7 @@ COMMANDS = {
         "prints versions, CPU and extras, for bug reports", (), "darswin.cli.info:info"
     ),
 }
+HELP = Command("", (), "darswin.cli.main:print_help")
 # Replacements for terminals that can only show ASCII.
 PLAIN = {"°": "deg", "×": "x", "±": "+/-", "–": "-", "…": "...", "²": "^2", "θ": "theta",
          "φ": "phi", "ξ": "xi", "π": "pi", "α": "alpha"}  # fmt: skip
@@ -74,20 +76,19 @@ PLAIN = {"°": "deg", "×": "x", "±": "+/-", "–": "-", "…": "...", "²": "^
 
 def main(argv: list[str] | None = None) -> None:
     """Runs a command. Errors that users can fix are printed in one line, without a traceback."""
+    open_closed_streams()
     argv = sys.argv[1:] if argv is None else argv
     name = argv[0] if argv else "--help"
     print_anywhere({} if name == "predict" else PLAIN)  # predict prints JSON for programs
     if name in ("-h", "--help"):
-        print("usage: darswin COMMAND [OPTIONS]\n")
-        print("\n".join(f"  {name:<10}{command.text}" for name, command in COMMANDS.items()))
-        print("\n`darswin COMMAND --help` lists its options.")
-        return
-    if name not in COMMANDS:
+        command, argv = HELP, []
+    elif name in COMMANDS:
+        command = COMMANDS[name]
+    else:
         raise misuse(f"there is no command {name!r}; the commands are {', '.join(COMMANDS)}")
-    command = COMMANDS[name]
     if (without := lack("train", command.needs)) is not None:
         raise SystemExit(f"darswin {name}: {without}")
-    warnings.showwarning = _one_line(warnings.showwarning)
+    warnings.showwarning = _one_line(warnings.showwarning, command)
     try:
         if command.function == RUN:
             argv, task = options.complete(argv)
@@ -110,6 +111,13 @@ def main(argv: list[str] | None = None) -> None:
         raise misuse(message) from error
 
 
+def print_help() -> None:
+    """Prints the commands."""
+    print("usage: darswin COMMAND [OPTIONS]\n")
+    print("\n".join(f"  {name:<10}{command.text}" for name, command in COMMANDS.items()))
+    print("\n`darswin COMMAND --help` lists its options.")
+
+
 def with_flags(message: str, command: Command) -> str:
     """The message of an error with flags in place of the names of parameters.
 
@@ -129,9 +137,22 @@ def with_flags(message: str, command: Command) -> str:
 def misuse(message: str) -> SystemExit:
     """Prints an error, and returns the exception that ends the program with exit code 2."""
     end = SystemExit(f"darswin: {message}")
-    print(end, file=sys.stderr)
+    with contextlib.suppress(OSError):  # the code says it too
+        print(end, file=sys.stderr)
     end.code = 2
     return end
+
+
+def open_closed_streams() -> None:
+    """Opens the standard streams that are closed, as in `darswin models >&-`, on the null device.
+    Otherwise prints would fail, and a file that is opened later would get all that C libraries
+    print."""
+    while (number := os.open(os.devnull, os.O_RDWR)) <= 2:
+        os.set_inheritable(number, True)
+    os.close(number)
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115
 
 
 def print_anywhere(words: Mapping[str, str]) -> None:
@@ -150,7 +171,7 @@ def print_anywhere(words: Mapping[str, str]) -> None:
             stream.reconfigure(errors="darswin.plain")
 
 
-def _one_line(show: Callable[..., None]) -> Callable[..., None]:
+def _one_line(show: Callable[..., None], command: Command) -> Callable[..., None]:
     """Shows warnings of darswin in one line and only once. Those that other packages give are shown
     by `show`, if Python was asked for warnings, and otherwise not."""
     shown = set()
@@ -162,6 +183,6 @@ def _one_line(show: Callable[..., None]) -> Callable[..., None]:
                 show(message, category, file, *where, **options)
         elif str(message) not in shown:
             shown.add(str(message))
-            print(f"darswin: {message}", file=sys.stderr)
+            print(f"darswin: {with_flags(str(message), command)}", file=sys.stderr)
 
     return show_once

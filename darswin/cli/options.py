@@ -31,7 +31,7 @@ def complete(argv: list[str]) -> tuple[list[str], Task]:
     scan.add_argument("--task")
     scan.add_argument("--data.path", dest="path")
     given, others = scan.parse_known_args(argv[1:])
-    contents = {file: _content(file) for file in map(_config_file, given.config)}
+    contents = {file: content_of(file) for file in map(_config_file, given.config)}
     before = None
     if given.run:
         check_folder(Path(given.run))
@@ -40,7 +40,7 @@ def complete(argv: list[str]) -> tuple[list[str], Task]:
         if argv[0] == "fit" and not given.resume:
             check_free(Path(given.run))
         elif own.exists():
-            contents = {own: _content(own)} | contents
+            contents = {own: content_of(own)} | contents
             before = contents[own].get("task") or FIRST_TASK
         elif last_of(Path(given.run)).exists() if argv[0] == "fit" else not contents:
             raise FileNotFoundError(f"there is no run in {given.run}: it has no config.yaml")
@@ -54,7 +54,7 @@ def complete(argv: list[str]) -> tuple[list[str], Task]:
         raise ValueError(f"{given.run} is a run of `task` {before}, not of {task}")
     for file in contents:
         if file.parent == PRESETS and task not in (fitting := _tasks_of(contents[file])):
-            others_fit = [p.stem for p in _presets() if task in _tasks_of(_content(p))]
+            others_fit = [p.stem for p in _presets() if task in _tasks_of(content_of(p))]
             raise ValueError(
                 f"the preset {file.stem} is for `task` {' or '.join(fitting)}, not for {task}, "
                 f"which has {', '.join(others_fit)}"
@@ -89,7 +89,8 @@ def _tasks_of(preset: dict[str, Any]) -> list[str]:
     return [task for task in get_args(Task) if (task != FIRST_TASK) == dense]
 
 
-def _content(config: Path) -> dict[str, Any]:
+def content_of(config: Path) -> dict[str, Any]:
+    """The options in a YAML file; none if it cannot be read."""
     try:
         content = yaml.safe_load(read_text(config))
     except (yaml.YAMLError, ValueError, OSError):

@@ -11,15 +11,15 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from darswin.cli.answers import ANSWERS, ANSWERS_OF, Answers, ClassAnswers, claim_folder, file_names
+from darswin.cli.lenses import Lenses, given_lenses, lenses_of_run
 from darswin.compat import load_official
-from darswin.data.cameras import Calibrations, is_json
 from darswin.data.folders import PICTURES, pictures_and_videos_below
 from darswin.data.samples import IMAGENET_MEAN, IMAGENET_STD
 from darswin.lens import Lens
 from darswin.lens.files.opencv import Coefficients
 from darswin.models.registry import list_pretrained, pretrained_file
 from darswin.models.saving import ModelCard, NoCardError, load_model, model_file, model_of_run
-from darswin.utils.files import replace_file
+from darswin.utils.files import check_is_file, replace_file
 from darswin.utils.image import BrokenImageError, read_oriented
 from darswin.utils.tasks import Task
 from darswin.utils.tensor_files import read_metadata
@@ -51,11 +51,13 @@ def predict(
             example picture, which is used if no paths are given.
         lens: the camera's calibration file, in any format that `darswin.lens.load` reads. Or a lens
             as JSON, in pixels of the pictures: {"model": "Spherical", "xi": 0.5, "focal": 300,
-            "theta_max": 1.5}; "fov" (rad) can replace the last two if the field of view fills the
+            "theta_max": 1.5}; "fov_deg" can replace the last two if the field of view fills the
             circle inside the picture. For several cameras, either a lenses.json, whose paths are
             relative to its own folder (see `darswin.data.Calibrations`), or a folder with one
-            calibration, STEM.json, for each picture or video.
-        run: the folder of a run of `darswin fit`, whose best model is used.
+            calibration, STEM.json, for each picture or video. The default is the lens of the run:
+            its data.lens, or its data set's own.
+        run: the folder of a run of `darswin fit`, whose best model is used, and whose lens if
+            `lens` is not given.
         model: in place of a run, the safetensors file of a model, or "digits", which comes with
             darswin. `darswin convert` makes such files from the authors' released weights; their
             classes are numbers.
@@ -85,13 +87,19 @@ def predict(
         paths, lens = [str(pretrained_file(model, "png"))], str(pretrained_file(model, "json"))
     if not paths:
         raise ValueError("missing pictures or videos: give files or folders")
-    if lens is None:
+    if lens is None and run is None:
         raise ValueError("missing `lens`: give the camera's calibration file")
+    _check_paths(paths)
     net, card = trained_model(weights)
     if task not in (None, card.task):
         raise ValueError(f"`task` is {task}, but {weights} is a model for {card.task}")
     files = pictures_and_videos(paths, leave_out=None if card.task == "classification" else out)
-    calibrations = _calibrations(lens, camera, coefficients, files)
+    names = [file.name for file in files]
+    if lens is not None:
+        lenses = given_lenses(lens, camera, coefficients, names)
+    else:
+        assert run is not None
+        lenses = lenses_of_run(run, camera, coefficients, names)
     if card.task == "classification":
         answers: Answers = ClassAnswers(net, card, top)
     else:
@@ -103,10 +111,10 @@ def predict(
         for file in files:
             try:
                 if file.is_video:
-                    answer_video(file.name, every, calibrations, answers)
+                    answer_video(file.name, every, lenses, answers)
                 else:
                     image, orientation = read_oriented(file.name, net.in_chans)
-                    taken_with = _lens(calibrations, file.name, image, orientation)
+                    taken_with = _lens(lenses, file.name, image, orientation)
                     answers.add({"image": file.name}, image, taken_with)
             except BrokenImageError as error:
                 bad.append(str(error))
@@ -134,8 +142,18 @@ def pictures_and_videos(paths: Sequence[str], leave_out: str | None = None) -> l
         if os.path.isdir(path) and not _is_picture(path):
             below = pictures_and_videos_below(Path(path))
             names = [n for n in below if leave_out is None or not _is_below(n, leave_out)]
+            for name in names:
+                check_is_file(name)
         files += [File(name, not _is_picture(name) and is_video(name)) for name in names]
     return files
+
+
+def _check_paths(paths: Sequence[str]) -> None:
+    """FileNotFoundError that lists all missing files; ValueError for pipes, devices and sockets."""
+    if missing := [path for path in paths if not os.path.exists(path)]:
+        raise FileNotFoundError(f"there is no file or folder {', '.join(missing)}")
+    for path in paths:
+        check_is_file(path)
 
 
 def _is_picture(path: str) -> bool:
@@ -146,13 +164,13 @@ def _is_below(path: str, folder: str) -> bool:
     return Path(os.path.realpath(path)).is_relative_to(os.path.realpath(folder))
 
 
-def answer_video(name: str, every: int, calibrations: Calibrations, answers: Answers) -> None:
+def answer_video(name: str, every: int, lenses: Lenses, answers: Answers) -> None:
     """Predicts the frames of a video, and prints the speed."""
     answers.flush()
     done, before, start = len(answers.found), answers.seconds, time.perf_counter()
     try:
         for frame in read_frames(name, answers.model.in_chans, every):
-            taken_with = _lens(calibrations, name, frame.image, frame.orientation)
+            taken_with = _lens(lenses, name, frame.image, frame.orientation)
             entry = {"video": name, "frame": frame.number, "time": round(frame.time, 6)}
             answers.add(entry, frame.image, taken_with)
     finally:
@@ -172,26 +190,10 @@ def answer_video(name: str, every: int, calibrations: Calibrations, answers: Ans
             )
 
 
-def _calibrations(
-    lens: str, camera: str | None, coefficients: str | None, files: Sequence[File]
-) -> Calibrations:
-    """The lenses that took the files."""
-    if is_json(lens) or not os.path.isdir(lens):
-        root = "." if is_json(lens) else Path(lens).parent
-        return Calibrations(lens, root, camera, coefficients)
-    if camera is not None:
-        raise ValueError(f"`camera` {camera} chooses a camera of a file, but {lens} is a folder")
-    own = {Path(file.name): Path(lens, f"{Path(file.name).stem}.json") for file in files}
-    there = {file: calibration for file, calibration in own.items() if calibration.is_file()}
-    if not there:
-        raise FileNotFoundError(f"no calibration in {lens}: {next(iter(own.values()))} is missing")
-    return Calibrations(None, coefficients=coefficients, files=there)
-
-
-def _lens(calibrations: Calibrations, name: str, image: np.ndarray, orientation: int) -> Lens:
+def _lens(lenses: Lenses, name: str, image: np.ndarray, orientation: int) -> Lens:
     """The lens of an upright picture or frame; BrokenImageError if none fits."""
     try:
-        return calibrations.lens_of(Path(name), (image.shape[0], image.shape[1]), orientation)
+        return lenses[name].lens_of(name, (image.shape[0], image.shape[1]), orientation)
     except ValueError as error:
         raise BrokenImageError(str(error)) from error
 
@@ -208,7 +210,10 @@ def trained_model(path: str | Path) -> tuple[Any, ModelCard]:
         try:
             net = load_official(path, **normalization)
         except ValueError as other:
-            raise ValueError(f"{error}, and are {other}") from error
+            raise ValueError(
+                f"{error}, and are {other}; commands run models of `darswin fit`, and a network of "
+                "your own, such as one in a LensAdapter, runs in Python"
+            ) from error
         return net, ModelCard("", normalization, size=_released_size(path))
 
 

@@ -9,16 +9,18 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from darswin.lens import Lens
+from darswin.lens import MODELS, Lens
 from darswin.lens.curves import as_curves, form_of
 from darswin.lens.files.load import FORMATS, Calibration
 from darswin.lens.orientation import in_upright_picture, stored_size
+from darswin.utils.files import check_is_file
 from darswin.utils.text import parse_json, read_json, to_text
 
 _ALL = PurePosixPath(".")
 _NOMINAL = (1024, 1024)  # px, for a calibration without a size where no picture has one
 # The names of entries that name a lens model, in any format.
 _SAYS_MODEL = re.compile("model|distortion")
+_NUMBER = re.compile(r"[-+]?[\d.,]+ *(°|deg|degrees)?")
 _KEPT = 8192  # lenses in memory
 
 
@@ -84,7 +86,7 @@ class Calibrations:
         files: Mapping[Path, Path] | None = None,
     ):
         self._root, self._lens = os.path.abspath(root), lens
-        paths = {str(picture): str(file) for picture, file in (files or {}).items()}
+        paths = {os.path.abspath(picture): str(file) for picture, file in (files or {}).items()}
         own = {
             file: PictureCamera(file, None, file, coefficients)
             for file in dict.fromkeys(paths.values())
@@ -107,9 +109,9 @@ class Calibrations:
         Raises:
             ValueError: the picture has no lens.
         """
-        if (own := self._own.get(str(picture))) is not None:
-            return own
         key, file = _ALL, Path(os.path.abspath(picture or self._root))
+        if (own := self._own.get(str(file))) is not None:
+            return own
         if file.is_relative_to(self._root):
             key = PurePosixPath(file.relative_to(self._root).as_posix())
         for place in (key, *key.parents):
@@ -183,7 +185,13 @@ def _places(
 ) -> dict[PurePosixPath, PictureCamera]:
     """The cameras of folders and pictures; arguments as for `Calibrations`."""
     name = "of the lens" if is_json(lens) else str(lens)
-    entries = None if is_json(lens) else _entries(Path(lens))
+    if _NUMBER.fullmatch(str(lens)) and not os.path.exists(str(lens)):
+        raise ValueError(
+            f"`lens` {lens} is a number, but must be a calibration file, or a lens as JSON: for an "
+            'ordinary picture {"model": "Perspective", "fov_deg": 60}, for a fisheye '
+            '{"model": "Equidistant", "fov_deg": 170}, each with its own field of view'
+        )
+    entries = None if is_json(lens) else _entries(Path(lens), root)
     if entries is None:
         return {_ALL: PictureCamera(str(lens), camera, name, coefficients)}
     options = {"camera": camera, "coefficients": coefficients}
@@ -208,15 +216,34 @@ def _places(
     return cameras
 
 
-def _entries(path: Path) -> Mapping[str, Any] | None:
-    """The entries of a lenses.json; None for a calibration file, or if it is no JSON object."""
+def _entries(path: Path, root: Path) -> Mapping[str, Any] | None:
+    """The entries of a lenses.json; None for a calibration file, or a file of another program."""
+    if not os.path.exists(path):
+        raise FileNotFoundError(f"there is no calibration file {path}")
+    check_is_file(path)
     try:
         content = read_json(path)
     except ValueError:  # the reader of calibrations says what is wrong
         return None
     if not isinstance(content, dict) or any(f.fits(content) for f in FORMATS):
         return None
-    return content
+    return content if path.name == "lenses.json" or _are_cameras(content, path, root) else None
+
+
+def _are_cameras(content: Mapping[str, Any], path: Path, root: Path) -> bool:
+    """True if an entry of a JSON object gives a picture or a folder in `root` a camera, or if all
+    entries name calibrations that exist, or lenses."""
+
+    def is_calibration(value: Any) -> bool:
+        named = value.get("file") if isinstance(value, dict) else value
+        if isinstance(named, str):
+            return os.path.isfile(path.parent / named)
+        return isinstance(value, dict) and value.get("model") in MODELS
+
+    return any(
+        isinstance(value, str | dict) and (place == "." or os.path.exists(root / place))
+        for place, value in content.items()
+    ) or all(map(is_calibration, content.values()))
 
 
 def _camera(file: Path, about: str, value: Any) -> PictureCamera:

@@ -20,7 +20,9 @@ from darswin.data.warping import (
     RandomTurns,
     Turn,
     at_size,
+    cut_off,
     lens_at_size,
+    picture_size,
     turned_picture,
 )
 from darswin.lens import Lens
@@ -31,6 +33,7 @@ IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 
 # The share of a random lens's largest angle that is used, because its curve may have no end there.
 _USED = 0.95
+_LOOKED_AT = 32  # pictures of which a framing may cut something off
 
 Augmentation = Callable[[np.ndarray, np.random.Generator], np.ndarray]
 
@@ -51,7 +54,7 @@ class Samples(Dataset):
         source: Source | Scenes,
         *,
         size: int = 64,
-        framing: Framing = "crop",
+        framing: Framing = "stretch",
         mean: Sequence[float] = IMAGENET_MEAN,
         std: Sequence[float] = IMAGENET_STD,
         turns: RandomTurns | None = None,
@@ -82,6 +85,22 @@ class Samples(Dataset):
     def broken(self) -> list[int]:
         """The indices of the pictures that could not be read so far."""
         return self._broken.nonzero().flatten().tolist()
+
+    def cut_off(self) -> str | None:
+        """What the framing cuts off the pictures, in words; None if nothing is lost.
+
+        It looks at 32 pictures or a few more, and describes the first that loses something.
+        """
+        if self.framing != "crop":
+            return None
+        for index in range(0, len(self), max(1, len(self) // _LOOKED_AT)):
+            try:
+                lost = cut_off(*self._taken(index), "crop")
+            except (OSError, ValueError):  # who reads the picture says what is wrong
+                continue
+            if lost is not None:
+                return lost
+        return None
 
     def __getitem__(self, draw: Draw | int) -> tuple[Tensor, Lens, int | Tensor]:
         if not isinstance(draw, Draw):
@@ -152,6 +171,10 @@ class Samples(Dataset):
         """A lens for a picture that cannot be read."""
         raise NotImplementedError
 
+    def _taken(self, index: int) -> tuple[tuple[int, int], Lens | None]:
+        """(H, W) of a picture, and the lens that took it, if it is known."""
+        raise NotImplementedError
+
     def _unknown(self) -> int | Tensor:
         """The label of a picture that cannot be read."""
         return -1
@@ -167,8 +190,8 @@ class Calibrated(Samples):
     Args:
         source: the pictures. calibrations: their lenses.
         size: px, H = W of the images.
-        framing: turns a picture into a square: "crop" cuts its longer side, "stretch" squashes it.
-            The lens follows exactly.
+        framing: turns a picture into a square: "stretch" squashes it and keeps all that the lens
+            sees, "crop" cuts its longer side. The lens follows exactly.
         mean, std: per channel, in [0, 1]; the image is (pixel/255 - mean) / std.
         turns: random turns of the images with their lenses; None turns nothing.
         lens_augmentation: a distribution of lenses. Each picture is shown as a random lens would
@@ -197,9 +220,7 @@ class Calibrated(Samples):
         self.cameras = calibrations.cameras_of([source.file(k) for k in range(len(source))])
 
     def _seen(self, draw: Draw) -> tuple[np.ndarray, Lens, int]:
-        picture, label, orientation = self.source.oriented(draw.picture)
-        file, size = self.source.file(draw.picture), (picture.shape[0], picture.shape[1])
-        lens = self.calibrations.lens_of(file, size, orientation)
+        picture, lens, label = self._with_lens(draw.picture)
         turn = self._turn(draw)
         if self.lens_augmentation is not None:
             other = self._other_lens(draw, lens)
@@ -208,6 +229,15 @@ class Calibrated(Samples):
             picture, lens = turned_picture(picture, lens, turn)
         image, lens = at_size(picture, lens, self.size, self.framing)
         return image, lens, label
+
+    def _with_lens(self, index: int) -> tuple[np.ndarray, Lens, int]:
+        picture, label, orientation = self.source.oriented(index)
+        size = picture.shape[0], picture.shape[1]
+        return picture, self.calibrations.lens_of(self.source.file(index), size, orientation), label
+
+    def _taken(self, index: int) -> tuple[tuple[int, int], Lens]:
+        lens = self._with_lens(index)[1]
+        return picture_size(lens), lens
 
     def _check(self, index: int, headers: Sequence[Header]) -> None:
         (picture,) = headers

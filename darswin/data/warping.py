@@ -213,6 +213,39 @@ def taken_part(
     return top, left, height, width
 
 
+class CutOff(UserWarning):
+    """A warning of parts of pictures that a model does not see."""
+
+
+def cut_off(size: tuple[int, int], lens: Lens | None, framing: Framing) -> str | None:
+    """What a framing cuts off pictures of (H, W), in words; None if nothing is lost.
+
+    Args:
+        lens: the lens of the pictures, with this image_size. The text then names the angles that
+            are lost, and pixels that no ray reaches do not count. None means that it is unknown.
+    """
+    top, left, height, width = taken_part(size, framing)
+    if (height, width) == size:
+        return None
+    theta = np.zeros(size) if lens is None else _angles(lens)
+    cut = np.ones(size, bool)
+    cut[top : top + height, left : left + width] = False
+    lost = theta[cut & np.isfinite(theta)]
+    if not lost.size:
+        return None
+    ends = (("left", left, "right", size[1] - width - left),
+            ("top", top, "bottom", size[0] - height - top))  # fmt: skip
+    parts = [
+        f"{a} px at the {one} and {b} px at the {other}" for one, a, other, b in ends if a or b
+    ]
+    share = 100 * lost.size / np.isfinite(theta).sum()
+    text = f"{' and '.join(parts)} of pictures of {size[1]}×{size[0]} px"
+    if lens is None:
+        return f"{text} ({share:.2g} % of their pixels)"
+    first, last = (f"{math.degrees(angle):.0f}°" for angle in (lost.min(), lost.max()))
+    return f"{text} ({share:.2g} % of what their lens sees, from {first} to {last} off its axis)"
+
+
 def _new_size(height: int, width: int, size: int, framing: Framing) -> tuple[int, int]:
     if framing != "whole":
         return size, size
@@ -240,7 +273,6 @@ class FullSize:
     def __init__(self, lens: Lens, size: int, framing: Framing):
         if lens.image_size is None or len(lens) != 1:
             raise ValueError("FullSize takes one lens, with the image_size of its pictures")
-        lens = lens.detach().to("cpu")
         top, left, self._height, self._width = taken_part(picture_size(lens), framing)
         self._part = np.s_[top : top + self._height, left : left + self._width]
         self.reached = _reached(lens_at_size(lens, size, framing))
@@ -297,4 +329,9 @@ class FullSize:
 
 def _reached(lens: Lens) -> np.ndarray:
     """True for pixels that a ray of the lens reaches, (H, W)."""
-    return ~pixel_angles(lens, picture_size(lens))[0].isnan().numpy()
+    return ~np.isnan(_angles(lens))
+
+
+def _angles(lens: Lens) -> np.ndarray:
+    """θ of the pixels of one lens, (H, W), rad; NaN where no ray lands."""
+    return pixel_angles(lens.detach().to("cpu"), picture_size(lens))[0].numpy()

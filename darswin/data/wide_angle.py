@@ -13,7 +13,7 @@ from darswin.data.lens_distributions import LensDistribution
 from darswin.data.pictures import Source
 from darswin.data.reframing import warp_picture
 from darswin.data.samples import Draw, Samples
-from darswin.data.warping import Turn, area_resized, remap, taken_part
+from darswin.data.warping import Framing, Turn, area_resized, remap, taken_part
 from darswin.lens import Lens, Perspective
 from darswin.lens.pixels import OUTSIDE, radial_reprojection
 from darswin.utils.angles import degrees_hint
@@ -34,10 +34,10 @@ class WideAngle(Samples):
         size: px, H = W of the images. render: px, their size before the reduction; at least `size`.
         fov: rad, the full field of view, below π.
         picture_size: px, the width to which larger pictures are reduced before the warp.
-        options: framing ("stretch" in the authors' code), mean, std, turns, lens_augmentation,
-            augment, erase, seed and skip_broken, as `Calibrated` takes them. With
-            lens_augmentation, an image of `render` px through a lens of `lenses` is warped again,
-            as another camera would have seen it.
+        framing: "crop", or "stretch" as in the authors' code.
+        options: mean, std, turns, lens_augmentation, augment, erase, seed and skip_broken, as
+            `Calibrated` takes them. With lens_augmentation, an image of `render` px through a lens
+            of `lenses` is warped again, as another camera would have seen it.
 
     Raises:
         ValueError: sizes or angles out of range.
@@ -56,13 +56,14 @@ class WideAngle(Samples):
         render: int = 224,
         fov: float = PAPER_FOV,
         picture_size: int = 384,
+        framing: Framing = "crop",
         **options: Any,
     ):
         if not 0 < size <= render:
             raise ValueError(f"sizes must be 0 < size ≤ render, got {size} and {render}")
         if not 0 < fov < math.pi:
             raise ValueError(f"fov must be in (0, π), got {fov}{degrees_hint(fov)}")
-        super().__init__(source, size=size, **options)
+        super().__init__(source, size=size, framing=framing, **options)
         self.lenses, self.fov = lenses, fov
         self.render, self.picture_size = render, picture_size
 
@@ -74,6 +75,10 @@ class WideAngle(Samples):
             return self.through(lens, picture, turn), lens, label
         image, other = self._rendered(lens, picture, turn), self._second_lens(draw, lens)
         return warp_picture(image, self._large(lens), other, self.size), other, label
+
+    def _taken(self, index: int) -> tuple[tuple[int, int], None]:
+        height, width = self.source[index][0].shape[:2]
+        return (height, width), None
 
     def _lens_alone(self, draw: Draw) -> Lens:
         lens = self._first_lens(draw)

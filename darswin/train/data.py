@@ -1,6 +1,7 @@
 """The data of runs: batches for training, in an order that can be resumed, and for tests."""
 
 import math
+import warnings
 from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
@@ -18,7 +19,7 @@ from darswin.data.order import ResumableLoader, TrainingOrder
 from darswin.data.pictures import Source, open_source
 from darswin.data.samples import IMAGENET_MEAN, IMAGENET_STD, Calibrated, Samples
 from darswin.data.splits import Split
-from darswin.data.warping import Framing, RandomTurns
+from darswin.data.warping import CutOff, Framing, RandomTurns
 from darswin.data.wide_angle import PAPER_FOV, WideAngle
 from darswin.lens.files.opencv import Coefficients
 from darswin.train.runs import ignore_signals
@@ -45,8 +46,9 @@ class RunData(LightningDataModule):
         size: px, H = W of the images; null means the size of model.weights, or else the median of
             the shorter sides of the pictures, but at least 32 px and at most 64 px for
             classification and 128 px for other tasks.
-        fit: turns a picture into a square: crop cuts its longer side, stretch squashes it. If the
-            picture has a lens, the lens follows.
+        fit: turns a picture into a square: stretch squashes it and keeps all of it, crop cuts its
+            longer side. If the picture has a lens, the lens follows, and null means stretch;
+            otherwise null means crop.
         channels: 1 for grey images, 3 for colour images; null means the channels of model.weights,
             or else 1 if all pictures are grey and 3 if not.
         mean: the mean of the pixels in [0, 1], per channel; null means the mean of model.weights,
@@ -86,7 +88,7 @@ class RunData(LightningDataModule):
         camera: str | None = None,
         coefficients: Coefficients | None = None,
         size: int | None = None,
-        fit: Literal["crop", "stretch"] = "crop",
+        fit: Literal["crop", "stretch"] | None = None,
         channels: Literal[1, 3] | None = None,
         mean: list[float] | None = None,
         std: list[float] | None = None,
@@ -113,7 +115,7 @@ class RunData(LightningDataModule):
         self._camera, self._coefficients = camera, coefficients
         self._size, self._channels, self._mean, self._std = size, channels, mean, std
         self._opening: dict[str, Any] = dict(classes=classes, splits=splits, holdout=holdout)
-        self._framing: Framing = fit
+        self._fit = fit
         self._skip_broken = skip_broken
         self.limit, self.batch_size, self.workers = limit, batch_size, workers
         self.turns = RandomTurns(flip, rotate_deg) if flip or rotate_deg else None
@@ -126,6 +128,12 @@ class RunData(LightningDataModule):
         self.datasets: list[Samples] = []
         self._loader: ResumableLoader | None = None
         self._progress: dict[str, Any] = {}
+        self._said_cut_off = False
+
+    @property
+    def framing(self) -> Framing:
+        """How pictures become squares."""
+        return self._fit or "stretch"
 
     def _open(self, split: Split, channels: int | None) -> Any:
         """The pictures of a split; with `channels` None they keep their own channels."""
@@ -180,7 +188,7 @@ class RunData(LightningDataModule):
     @property
     def _form(self) -> dict[str, Any]:
         return dict(
-            size=self.size, framing=self._framing, mean=self.mean, std=self.std, seed=self.seed,
+            size=self.size, framing=self.framing, mean=self.mean, std=self.std, seed=self.seed,
             skip_broken=self._skip_broken,
         )  # fmt: skip
 
@@ -198,8 +206,14 @@ class RunData(LightningDataModule):
         return source if self.limit is None else source.limited(self.limit)
 
     def _noted(self, dataset: SamplesT) -> SamplesT:
-        """The data set, whose broken pictures `broken` will count."""
+        """The data set, whose broken pictures `broken` will count. The first one that the framing
+        cuts something off brings a warning."""
         self.datasets.append(dataset)
+        if not self._said_cut_off and not self._place["rank"] and (lost := dataset.cut_off()):
+            self._said_cut_off = True
+            warnings.warn(
+                f"`fit` crop cuts off {lost}; `fit` stretch keeps it", CutOff, stacklevel=2
+            )
         return dataset
 
     def broken(self) -> int:
@@ -326,8 +340,13 @@ class WideAngleData(RunData):
             render=render, fov=math.radians(fov_deg), picture_size=picture_size
         )
         self.fov = 0.0 if self._lens else math.radians(fov_deg)
-        self.frame_fit = self._framing if self._lens else "whole"
+        self.frame_fit = self.framing if self._lens else "whole"
         self.erasing, self.pair_lenses = erasing, pair_lenses
+
+    @property
+    def framing(self) -> Framing:
+        """How pictures become squares."""
+        return self._fit or ("stretch" if self._lens else "crop")
 
     def _open(self, split: Split, channels: int | None) -> Source:
         return open_source(self.path, split, channels=channels, **self._opening)

@@ -45,7 +45,7 @@ class SceneData(RunData):
         **common: Any,
     ):
         super().__init__(path, batch_size=batch_size, **common)
-        self.frame_fit = self._framing
+        self.frame_fit = self.framing
         self.test_paths = test_paths or []
         self.crop = crop
 

@@ -1,14 +1,32 @@
-"""Writing files completely or not at all, also in a crash or on a full disk."""
+"""Writing files completely or not at all, also in a crash or on a full disk; what is no file."""
 
 import contextlib
 import errno
 import fcntl
 import os
+import stat
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
 _PARTIAL = ".partial"
+_NO_FILES = {
+    stat.S_IFIFO: "a pipe",
+    stat.S_IFSOCK: "a socket",
+    stat.S_IFCHR: "a device",
+    stat.S_IFBLK: "a device",
+}
+
+
+def check_is_file(path: str | os.PathLike) -> None:
+    """ValueError for a pipe, a socket or a device, which might be read without end. Missing files
+    and folders pass: whoever opens them says what is wrong."""
+    try:
+        kind = _NO_FILES.get(stat.S_IFMT(os.stat(path).st_mode))
+    except (OSError, ValueError):
+        return
+    if kind is not None:
+        raise ValueError(f"{os.fspath(path)} must be a file, but is {kind}")
 
 
 def replace_file(path: str | os.PathLike, content: bytes | memoryview | str) -> None:

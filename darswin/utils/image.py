@@ -12,6 +12,7 @@ import numpy as np
 from PIL import ExifTags, Image, UnidentifiedImageError
 
 from darswin.utils.exif import TURNS
+from darswin.utils.files import check_is_file
 
 __all__ = ["BrokenImageError", "read_header", "read_image", "read_oriented"]
 
@@ -78,6 +79,7 @@ def read_header(path: str | Path) -> Header:
         BrokenImageError: the file is missing, unreadable or no image. The error names the file.
     """
     try:
+        check_is_file(path)
         with Path(path).open("rb") as stream, Image.open(stream) as file:
             is_grey = file.mode in ("1", "L", "LA", "F") or file.mode.startswith("I")
             header = Header(file.size[::-1], channels=1 if is_grey else 3)
@@ -101,9 +103,11 @@ def read_header(path: str | Path) -> Header:
 def file_content(path: str | Path) -> np.ndarray:
     """The bytes of a file; BrokenImageError if it cannot be read."""
     try:
+        check_is_file(path)
         return np.fromfile(path, np.uint8)
-    except OSError as error:
-        raise BrokenImageError(f"cannot read {path}: {error.strerror}") from error
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise BrokenImageError(f"cannot read {path}: {reason}") from error
 
 
 def _picture(data: np.ndarray, path: str | Path, channels: int, flags: int = 0) -> np.ndarray:

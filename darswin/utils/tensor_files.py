@@ -10,7 +10,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
 
-from darswin.utils.files import replace_file
+from darswin.utils.files import check_is_file, replace_file
 
 _DIGEST = "sha256"  # the key of the digest in the metadata
 
@@ -31,6 +31,7 @@ def read_tensors(path: str | os.PathLike) -> tuple[dict[str, Tensor], dict[str, 
     Raises:
         ValueError: the file is no safetensors file, or its content is not what was written.
     """
+    check_is_file(path)
     try:
         with safe_open(path, "pt") as file:
             metadata = file.metadata() or {}
@@ -45,6 +46,7 @@ def read_tensors(path: str | os.PathLike) -> tuple[dict[str, Tensor], dict[str, 
 
 def read_metadata(path: str | os.PathLike) -> dict[str, str]:
     """The metadata of a file. The tensors are neither read nor checked."""
+    check_is_file(path)
     try:
         with safe_open(path, "pt") as file:
             return file.metadata() or {}

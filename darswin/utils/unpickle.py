@@ -9,6 +9,8 @@ from zipfile import BadZipFile, ZipFile
 
 import torch
 
+from darswin.utils.files import check_is_file
+
 # The authors' checkpoints contain a configuration of the class CfgNode, a dict of the package yacs.
 # It is replaced by an OrderedDict, which torch's restricted unpickler can fill.
 _STAND_INS: list[Any] = [(OrderedDict, "yacs.config.CfgNode")]
@@ -24,6 +26,7 @@ def read_pickle(path: str | os.PathLike, map_location: Any = "cpu") -> object:
         ValueError: the file holds more than tensors and plain values, or a checksum in it is wrong.
             Files in the format before torch 1.6 have no checksums.
     """
+    check_is_file(path)
     try:
         _check_sums(path)
         with torch.serialization.safe_globals(_STAND_INS):

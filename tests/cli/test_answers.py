@@ -13,12 +13,23 @@ from videos import write_video
 from darswin import create_model
 from darswin.cli import answers as module
 from darswin.cli import predict as predict_module
-from darswin.cli.answers import ClassAnswers, claim_folder, distance_png, file_names, label_png
+from darswin.cli.answers import (
+    ClassAnswers,
+    DistanceAnswers,
+    LabelAnswers,
+    claim_folder,
+    distance_png,
+    file_names,
+    label_png,
+)
 from darswin.cli.main import main
-from darswin.data.warping import FullSize, at_size
-from darswin.lens import from_dict
+from darswin.data.warping import CutOff, FullSize, at_size
+from darswin.lens import Equidistant, KannalaBrandt, from_dict
+from darswin.lens.pixels import pixel_angles
 from darswin.models.encoder import Encoder, Prepared
+from darswin.models.registry import has_image_size
 from darswin.models.saving import ModelCard, save_model
+from darswin.train.finetuning import models_for
 from darswin.viz.pixels import UNKNOWN, palette
 
 # A circle inside of pictures of 48×64, of whose middle square it leaves the corners out.
@@ -121,7 +132,9 @@ def labels():
 
 def predict(*argv, out, lens=LENS):
     lens = json.dumps(lens) if isinstance(lens, dict) else str(lens)
-    main(["predict", *map(str, argv), "--model", "m", "--lens", lens, "--out", str(out)])
+    main(
+        ["predict", *map(str, argv), "--model", "m.safetensors", "--lens", lens, "--out", str(out)]
+    )
     return json.loads((Path(out) / "predictions.json").read_text())
 
 
@@ -289,10 +302,10 @@ def test_nothing_but_its_own_is_replaced(tmp_path):
 def test_wrong_arguments_are_named(stub, labels, tmp_path, capsys):
     picture = write(tmp_path / "p.png", picture_of(labels))
     net = stub("segmentation")
-    argv = ["predict", picture, "--model", "m", "--lens", json.dumps(LENS)]
+    argv = ["predict", picture, "--model", "m.safetensors", "--lens", json.dumps(LENS)]
     with pytest.raises(SystemExit, match="missing --out"):
         main(argv)
-    with pytest.raises(SystemExit, match="--task is distance, but m is a model for segm"):
+    with pytest.raises(SystemExit, match=r"--task is distance, but m\.safetensors is a model"):
         main([*argv, "--out", str(tmp_path / "o"), "--task", "distance"])
     net.num_classes = 256
     with pytest.raises(SystemExit, match="at most 255 classes, got 256"):
@@ -317,3 +330,70 @@ def test_a_real_model_answers_as_in_python(tmp_path):
         output = model(torch.from_numpy(small)[None], small_lens)[0].numpy()
     expected = FullSize(from_dict(lens), size, "crop").labels(output)
     assert (ids(out / "labels/p.png") == expected).mean() > 0.998
+
+
+KINDS = [name for name in models_for("segmentation") if name.endswith("nano")]
+GENERAL = dict(tangential=[0.02, -0.01], affine=[[1.0, 0.05], [0.0, 0.9]])
+
+
+@pytest.mark.parametrize("name", KINDS)
+@pytest.mark.parametrize(
+    ("task", "answers_of"), [("segmentation", LabelAnswers), ("distance", DistanceAnswers)]
+)
+def test_every_pixel_that_a_ray_reaches_has_an_answer(name, task, answers_of, tmp_path, recwarn):
+    """Of square, wide and tall pictures, of lenses whose circle is cut, shifted or sheared."""
+    options = dict(task=task, num_classes=3, mean=[0.5] * 3, std=[0.25] * 3)
+    if has_image_size(name):
+        options["image_size"] = 64
+    sizes = {"square": (60, 60), "wide": (60, 84), "tall": (84, 60)}
+    rng = np.random.default_rng(0)
+    for fit in ("stretch", "crop"):
+        card = ModelCard(name, options, NAMES if task == "segmentation" else (), 64, 0.0, fit, task)
+        answers = answers_of(card.create().eval(), card, tmp_path, {p: p for p in sizes})
+        recwarn.clear()
+        for picture, (height, width) in sizes.items():
+            image = rng.integers(256, size=(height, width, 3), dtype=np.uint8)
+            for lens in (
+                Equidistant(26.0, 1.5, image_size=(height, width)),
+                KannalaBrandt(
+                    24.0, [0.02], 1.5, [31.0, 35.0], image_size=(height, width), **GENERAL
+                ),
+            ):
+                answers.add({"image": picture}, image, lens)
+                answers.flush()
+                seen = ~pixel_angles(lens, (height, width))[0].isnan().numpy()
+                if fit == "crop":
+                    top, left, side = (height - 60) // 2, (width - 60) // 2, 60
+                    cut = np.ones_like(seen)
+                    cut[top : top + side, left : left + side] = False
+                    assert picture == "square" or (seen & cut).any()
+                    seen &= ~cut
+                file = str(tmp_path / answers.found[-1][answers.kind])
+                answered = cv2.imread(file, cv2.IMREAD_UNCHANGED)
+                if task == "segmentation":
+                    answered = ids(file) != 255
+                assert np.array_equal(answered > 0, seen)
+        said = [str(one.message) for one in recwarn if one.category is CutOff]
+        assert len(said) == (fit == "crop")
+        assert all("right of pictures of 84×60 px (" in text and "°" in text for text in said)
+
+
+def test_a_model_that_takes_squares_says_what_it_does_not_see(stub, labels, tmp_path, capsys):
+    """Once, whatever it was trained on; only the old file's card asks for a new training."""
+    pictures = [write(tmp_path / f"{k}.png", picture_of(labels)) for k in range(3)]
+    lens = {"model": "Equidistant", "focal": 30, "theta_max": 1.5, "image_size": [48, 64]}
+    for fit, reason in (
+        ("crop", "it was trained on cropped pictures; `darswin fit --data.fit stretch` trains one"),
+        ("whole", "it takes only square pictures"),
+        ("stretch", None),
+    ):
+        net = stub("segmentation", fit=fit)
+        assert net.square_images
+        predict(*pictures, out=tmp_path / "out", lens=lens)
+        said = [line for line in capsys.readouterr().err.splitlines() if "does not see" in line]
+        assert len(said) == (reason is not None)
+        for line in said:
+            assert line.startswith("darswin: the model does not see 8 px at the left and 8 px at")
+            assert reason in line
+    predict(*pictures, out=tmp_path / "out")  # a circle inside the square
+    assert "does not see" not in capsys.readouterr().err

@@ -1,7 +1,10 @@
 import importlib.util
+import subprocess
+import sys
 import tomllib
 from pathlib import Path
 
+import pytest
 import torch
 
 import darswin
@@ -30,3 +33,27 @@ def test_what_is_missing_and_why_onednn_is_not_used(monkeypatch):
     assert "is built without oneDNN" in found["float32"]
     for extra, packages in declared["optional-dependencies"].items():
         assert all(package.partition(">")[0] in found[f"[{extra}]"] for package in packages)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("closed", [">&-", "2>&-", "<&- >&- 2>&-", ">/dev/full", "2>/dev/full"])
+def test_standard_streams_may_be_closed_or_full(closed):
+    """Without a traceback. Words that are lost make exit code 2, unless nobody wants them."""
+    full = closed == ">/dev/full"
+    for words, code in (("--help", 2 * full), ("nothing", 2), ("models", 2 * full)):
+        line = f'"{sys.executable}" -m darswin {words} {closed}'
+        done = subprocess.run(["sh", "-c", line], capture_output=True, text=True)
+        assert done.returncode == code, (words, done.stderr)
+        assert all(text.startswith("darswin: ") for text in done.stderr.splitlines())
+        assert "there is no command" not in done.stdout
+
+
+@pytest.mark.slow
+def test_closed_streams_are_no_place_for_files(tmp_path):
+    """A file that is opened after a closed stream would get its number, and what C code prints."""
+    script = (
+        "import sys; from darswin.cli.main import main; main(['info']); "
+        "assert open(sys.argv[1], 'w').fileno() > 2"
+    )
+    line = f'"{sys.executable}" -c "{script}" {tmp_path / "a"} <&- >&- 2>&-'
+    assert subprocess.run(["sh", "-c", line]).returncode == 0

@@ -1,20 +1,24 @@
 """`darswin predict`: its arguments, the lenses of files, and classes of pictures and videos."""
 
 import json
+import os
+import socket
 
 import cv2
 import hypothesis.strategies as st
 import numpy as np
 import pytest
 import torch
+import yaml
 from helpers import fixture
 from hypothesis import given
 from PIL import ExifTags, Image, ImageOps
+from scenes import write_plain
 from videos import turn_video, write_video
 
 from darswin.cli.answers import ClassAnswers
+from darswin.cli.lenses import given_lenses, lenses_of_run
 from darswin.cli.main import main
-from darswin.cli.predict import File, _calibrations
 from darswin.compat import load_official
 from darswin.data.samples import IMAGENET_MEAN, IMAGENET_STD
 from darswin.lens import Spherical, from_dict, load, save
@@ -46,6 +50,7 @@ def write_run(folder):
     cv2.imwrite(str(folder / "p.png"), picture)
     (folder / "cameras.txt").write_text(COLMAP)
     (folder / "kd.json").write_text(json.dumps(UNNAMED))
+    (folder / "other.json").write_text(json.dumps({"name": "A camera", "focal_mm": 2.1}))
     return folder
 
 
@@ -85,11 +90,17 @@ def test_the_most_probable_classes(run, capsys):
 @pytest.mark.parametrize(
     ("argv", "said"),
     [
-        ("none.png --run . --lens L", r"cannot read .*none\.png"),
+        ("none.png p.png a.mp4 --run . --lens L", r"no file or folder none\.png, a\.mp4$"),
+        ("p.png --model m.safetensors --lens L", r"No such file .*m\.safetensors"),
         ("none.png --lens L", "give either --run, .* or --model, a safetensors file or one of"),
         ("p.png --model digits --run .", "or --model, a safetensors file or one of digits"),
         ("p.png --run . --lens {}", 'or a "model" of darswin'),
-        ("p.png --run . --lens none.json", r"none\.json"),
+        ("p.png --run . --lens none.json", r"there is no calibration file none\.json"),
+        ("p.png --run . --lens 170", '--lens 170 is a number, but must be a calib.*"fov_deg": 170'),
+        (
+            "p.png --run . --lens other.json",
+            r"other\.json: (?!.*must name).*its entries are '?name",
+        ),
         ("p.png --run .", "missing --lens: give the camera"),
         ("--lens L --run .", "missing pictures or videos"),
         ("p.png --model digits", "missing --lens: give the camera"),
@@ -129,16 +140,15 @@ def test_the_lenses_of_files(run, monkeypatch):
         ((str(run / "own"), None, "pinhole"), [pinhole, None]),
         ((str(run / "all"), None, "pinhole"), [None, pinhole]),
     ):
-        files = [File("2.png", False), File("../p.png", False)]
-        lenses = _calibrations(*options, files)
+        files = ["2.png", "../p.png"]
+        lenses = given_lenses(*options, files)
         for file, lens in zip(files, expected, strict=True):
             if lens is None:
-                with pytest.raises(ValueError, match=f"{file.name} has no lens"):
-                    lenses.lens_of(file.name, SIZE)
+                with pytest.raises(ValueError, match=f"{file} has no lens"):
+                    lenses[file].lens_of(file, SIZE)
             else:
-                assert str(lenses.lens_of(file.name, SIZE)) == str(
-                    in_upright_picture(lens, SIZE, 1)
-                )
+                found = lenses[file].lens_of(file, SIZE)
+                assert str(found) == str(in_upright_picture(lens, SIZE, 1))
 
 
 @pytest.fixture(scope="module")
@@ -153,7 +163,7 @@ def mixed(tmp_path_factory):
     return folder
 
 
-GOOD, BAD = ("p.png", "q.png"), ("broken.png", "folder.png", "square.png", "none.png")
+GOOD, BAD = ("p.png", "q.png"), ("broken.png", "folder.png", "square.png")
 
 
 @given(st.lists(st.sampled_from(GOOD + BAD), min_size=1, max_size=6), st.integers(-3, 9))
@@ -237,7 +247,8 @@ def test_weights_of_the_released_model(tmp_path, capsys):
     assert close(found, json.loads(capsys.readouterr().out)[0])
     torch.save({"model": {"a": torch.ones(2)}}, tmp_path / "other.pth")
     main(["convert", str(tmp_path / "other.pth"), str(tmp_path / "other.safetensors")])
-    with pytest.raises(SystemExit, match="not the name of their model, and are not a state dict"):
+    said = "not the name of their model, and are not a state dict.*LensAdapter, runs in Python"
+    with pytest.raises(SystemExit, match=said):
         main([*argv, "--model", str(tmp_path / "other.safetensors")])
 
 
@@ -250,6 +261,126 @@ def test_the_first_prediction(capsys):
     assert found["top"][0]["probability"] > 0.8
     main(["predict", sample, "--model", "digits", "--lens", lens])
     assert json.loads(capsys.readouterr().out) == [found]
+
+
+@pytest.mark.parametrize("kind", ["a pipe", "a socket", "a device"])
+def test_what_is_no_file_is_refused_at_once(run, capsys, kind, monkeypatch):
+    """As a picture, a video, a calibration, a model, and in a folder."""
+    monkeypatch.chdir(run)  # paths of sockets must be short
+    (run / "in").mkdir()
+    for name in ("f.png", "f.mp4", "f", "in/f.png", "f.safetensors", "f.json"):
+        if kind == "a pipe":
+            os.mkfifo(name)
+        elif kind == "a socket":
+            with socket.socket(socket.AF_UNIX) as made:
+                made.bind(name)
+        else:
+            (run / name).symlink_to("/dev/zero")
+    lens, known = ["--lens", json.dumps(LENS)], ["--run", "."]
+    for words, name in (
+        (["f.png", *known, *lens], "f.png"),
+        (["p.png", "f.mp4", *known, *lens], "f.mp4"),
+        (["f", *known, *lens], "f"),
+        (["in", *known, *lens], "in/f.png"),
+        (["p.png", *known, "--lens", "f.json"], "f.json"),
+        (["p.png", "--model", "f.safetensors", *lens], "f.safetensors"),
+    ):
+        with pytest.raises(SystemExit) as caught:
+            main(["predict", *words])
+        assert str(caught.value) == f"darswin: {name} must be a file, but is {kind}"
+        assert caught.value.code == 2 and not capsys.readouterr().out
+    with pytest.raises(SystemExit, match=f"must be a file, but is {kind}"):
+        main(["fit", "--run", "r", "--data.path", "digits", "--data.lens", "f.json"])
+
+
+# -- the lens of the run ----------------------------------------------------------------------
+
+
+def begun(run, task="classification", **data):
+    """A run's folder with a configuration."""
+    data = {"path": str(run), "lens": None, "camera": None, "coefficients": None} | data
+    (run / "config.yaml").write_text(yaml.safe_dump({"task": task, "data": data}))
+    return run
+
+
+def test_a_run_brings_its_own_lens(run, capsys, tmp_path):
+    """Of each form that `fit` takes; a lens that is given wins."""
+    far = LENS | {"xi": 1.0}
+    (run / "one.json").write_text(json.dumps(far))
+    (run / "sub").mkdir()
+    (run / "sub" / "p.png").write_bytes((run / "p.png").read_bytes())
+    entries = {"sub": "one.json", ".": LENS}
+    (run / "lenses.json").write_text(json.dumps(entries))
+    argv = ["predict", str(run / "p.png"), str(run / "sub" / "p.png"), "--run", str(run)]
+    argv += ["--top", "6"]
+
+    def printed(*more):
+        main([*argv, *more])
+        said = capsys.readouterr()
+        return json.loads(said.out), said.err
+
+    one, near = (printed("--lens", json.dumps(lens))[0] for lens in (far, LENS))
+    assert not close(one[0], near[0])
+    unnamed = printed("--lens", str(run / "kd.json"), "--coefficients", "pinhole")[0]
+    second = printed("--lens", str(run / "cameras.txt"), "--camera", "2")[0]
+    for data, more, expected in (
+        (dict(lens=str(run / "one.json")), (), one),
+        (dict(lens=json.dumps(LENS)), (), near),
+        (dict(lens=str(run / "lenses.json")), (), [near[0], one[1]]),
+        (dict(lens=str(run / "cameras.txt"), camera="2"), (), second),
+        (dict(lens=str(run / "cameras.txt"), camera="1"), ("--camera", "2"), second),
+        (dict(lens=str(run / "kd.json"), coefficients="pinhole"), (), unnamed),
+        (dict(lens=str(run / "kd.json")), ("--coefficients", "pinhole"), unnamed),
+    ):
+        begun(run, **data)
+        found, said = printed(*more)
+        assert all(close(a, b) for a, b in zip(found, expected, strict=True))
+        assert said == f"darswin: lens of the run: {data['lens']}\n"
+    given, said = printed("--lens", json.dumps(LENS))
+    assert given == near and "lens of the run" not in said
+
+
+@pytest.mark.parametrize("task", ["segmentation", "distance"])
+@pytest.mark.parametrize("kind", ["one", "each", "splits"])
+def test_a_run_brings_the_lenses_of_its_scenes(tmp_path, monkeypatch, capsys, kind, task):
+    scenes = tmp_path / "scenes"
+    first, second = (from_dict(LENS | {"xi": xi, "image_size": [121, 160]}) for xi in (0.2, 0.9))
+    if kind == "splits":
+        for split, lens in (("train", first), ("test", second)):
+            write_plain(scenes, 4, lens=lens, split=split)
+    else:
+        write_plain(scenes, 4, lens=first, own_lenses=kind == "each")
+    begun(tmp_path, task, path=str(scenes), holdout=0.1)
+    monkeypatch.chdir(tmp_path)
+    folder = "scenes/test/images" if kind == "splits" else "scenes/images"
+    files = [f"{folder}/{k:03}.png" for k in range(4)]
+    found = lenses_of_run(".", None, None, files)
+    assert capsys.readouterr().err == f"darswin: lenses of the run's data set: {scenes}\n"
+    expected = second if kind == "splits" else first
+    for file in files:
+        got = found[file].lens_of(file, (121, 160))
+        assert got.same_as(expected.replace(center=got.center))
+    if kind == "one":
+        assert lenses_of_run(".", None, None, ["elsewhere.png"])["elsewhere.png"].camera_of("x")
+        return
+    with pytest.raises(ValueError, match=r"several lenses, but not these files: \['elsewhere"):
+        lenses_of_run(".", None, None, [*files, "elsewhere.png"])
+
+
+def test_a_run_without_a_lens_for_the_pictures_is_named(run, tmp_path):
+    (run / "sub").mkdir()
+    (run / "lenses.json").write_text(json.dumps({"sub": CIRCLE}))
+    for data, said in (
+        (dict(lens=str(run / "lenses.json")), r"lenses\.json has no lens for .*p\.png"),
+        (dict(lens=str(run / "gone.json")), r"there is no calibration file .*gone\.json"),
+        (dict(lens=str(run / "cameras.txt")), "several cameras, choose one with --camera"),
+        ({}, "was trained on pictures without a lens"),
+        (dict(task="segmentation", path=str(run / "gone")), "no folder .*gone"),
+        (dict(task="distance"), "no scenes in "),
+    ):
+        begun(run, **data)
+        with pytest.raises(SystemExit, match=f"missing --lens: give the camera's .*{said}"):
+            main(["predict", str(run / "p.png"), "--run", str(run)])
 
 
 def as_pictures(video, folder, **options):

@@ -149,3 +149,44 @@ def test_what_has_no_lens(root):
         (name,) = options
         with pytest.raises(ValueError, match=rf'`{name}` is for one .*"file": …, "{name}"'):
             Calibrations(listed(root, {"a": "woodscape.json"}), root, **options)
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        {"name": "A camera", "lens": "wide", "calibration": {"width": 3840}},
+        {"camera": {"model": "GoPro", "focal_mm": 2.1}},
+        {"camera": "none.json"},
+        {"a": 3, "b": [1, 2]},
+        {"x" * 5000: "y" * 5000, "\0": "\0"},
+        {"images": [], "annotations": []},
+    ],
+)
+def test_a_json_file_of_another_program_is_no_list_of_cameras(root, content):
+    file = root.parent / "profile.json"
+    file.write_text(json.dumps(content))
+    with pytest.raises(ValueError, match=r"calibration .*profile\.json: (?!.*must name a folder)"):
+        Calibrations(file, root)
+
+
+def test_a_list_of_cameras_may_have_any_name(root):
+    """If a place or all calibrations exist; then its mistakes are named."""
+    file = root.parent / "my cameras.json"
+    for entries in ({"a": "woodscape.json"}, {".": SPHERICAL}, {"a": SPHERICAL, "b": SPHERICAL}):
+        file.write_text(json.dumps(entries))
+        assert Calibrations(file, root).camera_of(root / "a/0.png")
+    for entries, said in (
+        ({"a": "none.json"}, r"none\.json, which is not a file"),
+        ({"typo": "woodscape.json"}, '"typo" must name a folder'),
+        ({"typo": SPHERICAL, "b": SPHERICAL}, '"typo" must name a folder'),
+        ({".": "woodscape.json", "b": 3}, '"b" must be a calibration file'),
+    ):
+        file.write_text(json.dumps(entries))
+        with pytest.raises((ValueError, OSError), match=said):
+            Calibrations(file, root)
+
+
+def test_a_number_is_no_lens(root):
+    for lens in ("170", "-1.5", "60°", "90 deg", 170):
+        with pytest.raises(ValueError, match=f'`lens` {lens} is a number, .*"fov_deg": 170'):
+            Calibrations(lens, root)

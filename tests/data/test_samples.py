@@ -167,6 +167,18 @@ def test_unknown_framings(folders):
         DATASETS["wide"](folders, framing="whole")
 
 
+@pytest.mark.parametrize("name", DATASETS)
+def test_by_default_pictures_with_a_lens_are_kept_whole(folders, name):
+    dataset, cropped = DATASETS[name](folders), DATASETS[name](folders, framing="crop")
+    calibrated = "wide" not in name
+    assert dataset.framing == ("stretch" if calibrated else "crop")
+    assert DATASETS[name](folders, framing="stretch").cut_off() is None
+    lost = cropped.cut_off()
+    assert (dataset.cut_off() is None) == calibrated
+    assert lost.startswith("19 px at the left and 20 px at the right of pictures of 160×121 px")
+    assert ("off its axis" in lost) == calibrated
+
+
 # -- calibrated pictures ----------------------------------------------------------------------
 
 
@@ -221,7 +233,7 @@ def test_exif_turns_picture_and_lens(tmp_path):
     picture, orientation = read_oriented(file.with_suffix(".jpg"), 1)
     assert orientation == 6 and picture.shape == (160, 121, 1)
     turned = in_upright_picture(load(WOODSCAPE), (160, 121), 6)
-    expected, lens = at_size(picture, turned, 24, "crop")
+    expected, lens = at_size(picture, turned, 24, "stretch")
     image, got, _ = dataset[number]
     np.testing.assert_allclose(255 * image[0].numpy(), expected[..., 0], atol=1e-3)
     assert str(got) == str(lens)

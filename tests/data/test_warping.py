@@ -10,9 +10,10 @@ from frames import WOODSCAPE, blob, centroid
 from hypothesis import given
 
 from darswin.data import IGNORE, FullSize, RandomTurns, at_size, lens_at_size, warp, warp_map
-from darswin.data.warping import Turn, area_resized, turned_picture
+from darswin.data.warping import Turn, area_resized, cut_off, turned_picture
 from darswin.lens import BrownConrady, Equidistant, KannalaBrandt, Perspective, Spherical, load
 from darswin.lens.orientation import upright
+from darswin.lens.pixels import pixel_angles
 
 # -- through another lens ---------------------------------------------------------------------
 
@@ -171,6 +172,43 @@ def test_a_picture_of_the_size_stays_and_wrong_arguments_are_named():
     for lens in (Equidistant(20.0, math.pi / 2), two):
         with pytest.raises(ValueError, match="one lens, with the image_size"):
             FullSize(lens, 9, "crop")
+
+
+WIDE = load(WOODSCAPE)  # its circle is cut by the top and the bottom of 966 × 1280 px
+SHIFTED = KannalaBrandt(
+    30.0, [0.02, -0.01], 1.6, [62.0, 45.0], tangential=[0.02, -0.01], image_size=(96, 128)
+)
+
+
+@pytest.mark.parametrize(
+    ("lens", "sides"),
+    [
+        (WIDE, "157 px at the left and 157 px at the right of pictures of 1280×966 px"),
+        (upright(WIDE, 6), "157 px at the top and 157 px at the bottom of pictures of 966×1280 px"),
+        (SHIFTED, "16 px at the left and 16 px at the right of pictures of 128×96 px"),
+        (WIDE.cropped(0, 0, 966, 967), "0 px at the left and 1 px at the right of"),
+    ],
+)  # fmt: skip
+def test_what_a_crop_cuts_off_is_told_in_pixels_and_degrees(lens, sides):
+    size = tuple(int(side) for side in lens.image_size[0])
+    theta = np.degrees(pixel_angles(lens, size)[0].numpy())
+    theta[part(size, "crop")], seen = np.nan, np.isfinite(theta).sum()
+    share, first, last = np.isfinite(theta).sum() / seen, np.nanmin(theta), np.nanmax(theta)
+    said = cut_off(size, lens, "crop")
+    assert said.startswith(sides)
+    assert said.endswith(
+        f"({100 * share:.2g} % of what their lens sees, from {first:.0f}° to {last:.0f}° off its "
+        "axis)"
+    )
+    assert all(cut_off(size, lens, framing) is None for framing in ("stretch", "whole"))
+
+
+def test_a_crop_of_what_no_ray_reaches_loses_nothing():
+    circle = Equidistant(30.0, theta_max=1.5, image_size=(96, 128))  # 90 px wide
+    assert cut_off((96, 128), circle, "crop") is None
+    assert cut_off((96, 96), SHIFTED.cropped(0, 0, 96, 96), "crop") is None
+    whole = "16 px at the top and 16 px at the bottom of pictures of 96×128 px (25 % of their "
+    assert cut_off((128, 96), None, "crop").startswith(whole)  # of an unknown lens all counts
 
 
 def all_seen(size):

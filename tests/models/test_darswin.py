@@ -1,10 +1,13 @@
 import math
 
+import cv2
+import numpy as np
 import pytest
 import torch
 
 from darswin import create_model
-from darswin.lens import Spherical
+from darswin.data import at_size
+from darswin.lens import Equidistant, KannalaBrandt, Spherical
 from darswin.models.stages import plan_stages
 
 LENS = Spherical.from_fov([0.2, 0.9], 2.6, 16.0)
@@ -131,3 +134,26 @@ def test_another_lens_shows_the_same_tokens():
             a, b = (model.forward_features(scene(lens, 200), lens) for lens in lenses)
         errors[spacing] = ((a - b).norm() / a.norm()).item()
     assert errors["theta"] < 0.02 < 0.1 < errors["radius"], errors
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("name", ["darswin_a_nano", "darswin_ra_nano"])
+@pytest.mark.parametrize("size", [(64, 128), (128, 64)])
+def test_a_squashed_picture_gives_the_same_as_the_picture(name, size):
+    model = create_model(name, num_classes=10).eval()
+    rng = np.random.default_rng(0)
+    picture = cv2.resize(rng.integers(256, size=(6, 6, 3), dtype=np.uint8), size[::-1])
+    aside = dict(tangential=[0.02, 0.01], affine=[[1.0, 0.05], [0.0, 0.9]])
+    for lens in (
+        Equidistant(30.0, 1.5, image_size=size),
+        KannalaBrandt(28.0, [0.01], 1.5, [60.0, 61.0], image_size=size, **aside),
+    ):
+        squashed, there = at_size(picture, lens, 64, "stretch")
+        logits, same, other = (
+            model(torch.from_numpy(image).permute(2, 0, 1)[None], seen_by)
+            for image, seen_by in (
+                (picture, lens), (squashed, there), (squashed, there.replace(affine=None)),
+            )
+        )  # fmt: skip
+        off, without = ((x - logits).norm() / logits.norm() for x in (same, other))
+        assert off < 0.01 and without > 5 * off

@@ -275,7 +275,7 @@ def test_few_steps_are_logged_and_the_progress_bar_shows_no_folder(tmp_path, cap
 
 def test_train_test_and_predict_see_the_same(frames, tmp_path, capsys):
     run = tmp_path / "run"
-    fit(run, *DIGITS, "--data.path", frames, "--data.lens", WOODSCAPE, "--data.fit", "stretch")
+    fit(run, *DIGITS, "--data.path", frames, "--data.lens", WOODSCAPE)
     recorded = yaml.safe_load((run / "config.yaml").read_text())["data"]
     assert recorded["lens"] == str(WOODSCAPE)
     _, card = load_model(run / "checkpoints" / "best.safetensors")
@@ -310,7 +310,7 @@ def test_labels_are_learned_and_what_a_test_writes(labelled, capsys):
     assert recorded["task"] == "segmentation" and recorded["model"]["loss"] == "ce+dice"
     net, card = load_model(labelled / "checkpoints" / "best.safetensors")
     assert (card.task, card.classes, card.colors) == ("segmentation", *CLASSES.values())
-    assert card.fit == "crop" and card.fov == 0 and net.num_classes == 3
+    assert card.fit == "stretch" and card.fov == 0 and net.num_classes == 3
     (row,) = test(labelled)
     assert row["data"] == "scenes" and row["miou"] > 0.75 and row["accuracy"] > 0.85
     assert 0 < row["miou_sr"] < 1 and row["miou_sr"] != row["miou"] and row["loss"] > 0
@@ -338,14 +338,14 @@ def test_a_test_on_other_folders(labelled, scenes, tmp_path, monkeypatch):
     other = write_plain(tmp_path / "a" / "scenes", 3, lens=lens, size=(45, 60))
     rows = test(labelled, "--data.test_paths", other, scenes, "--model.zones", "45")
     _, truth, answer = shown[0]
-    assert (answer[0, 0], answer[-1, -1]) == (255, 255) and (answer == 255).mean() < 0.3
+    assert (answer[0, 0], answer[-1, -1]) == (255, 255) and (answer == 255).mean() < 0.35
     assert (truth[answer == 255] == 255).all()  # beyond θ_max nothing is known, nor answered
     names = [row["data"] for row in rows]
     assert [name.split("/")[-1] for name in names] == ["scenes", "scenes"] and len({*names}) == 2
     zones = [line["data"] for line in table(labelled / "test_zones.csv")]
     assert zones == [names[0], names[0], names[1], names[1]]
-    # All 3 scenes of a folder that has no splits; the corners are beyond θ_max.
-    assert 3 * 800 < rows[0]["pixels"] < 3 * 32 * 32 and rows[0]["miou"] > 0.5
+    # All 3 scenes of a folder that has no splits; a third of each is beyond θ_max.
+    assert 3 * 650 < rows[0]["pixels"] < 3 * 32 * 32 and rows[0]["miou"] > 0.5
 
 
 @pytest.mark.slow

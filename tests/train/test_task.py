@@ -7,18 +7,21 @@ import pytest
 import torch
 import torch.nn.functional as F
 import yaml
+from frames import WOODSCAPE, write_frames
 from runs import DIGITS, error
-from scenes import write
+from scenes import write, write_plain
 from torch import nn
 from torch.optim.lr_scheduler import CosineAnnealingLR, LinearLR
 from torchmetrics.classification import MulticlassAccuracy
 
 from darswin import create_model, lens
 from darswin.cli.options import PRESETS
+from darswin.data.warping import CutOff
 from darswin.models.saving import ModelCard
 from darswin.train.classification import Classification, ClassMetrics
 from darswin.train.data import WideAngleData
 from darswin.train.runs import CHANGEABLE, BestCheckpoint, check_changes
+from darswin.train.scene_data import DistanceData, LabelData
 from darswin.train.segmentation import Segmentation
 from darswin.train.task import Schedule, parameter_groups
 from darswin.train.tasks import TASKS
@@ -119,6 +122,30 @@ def test_lens_augmentation_is_for_training():
     _, lenses, _ = next(iter(data.train_dataloader()))
     assert lenses.xi.min() >= 0.5 and lenses.xi.max() - lenses.xi.min() > 0.3
     assert data.dataset("val")[0][1].xi == 0
+
+
+def test_a_crop_is_told_once(tmp_path, recwarn):
+    """For pictures of a camera if it is asked for, and for others by default."""
+    write_plain(tmp_path / "scenes", 6)
+    write_frames(tmp_path / "frames", count=40, classes="01")
+    frames, lens = str(tmp_path / "frames"), str(WOODSCAPE)
+    for make, framing in (
+        (lambda **o: LabelData(str(tmp_path / "scenes"), workers=0, **o), "stretch"),
+        (lambda **o: DistanceData(str(tmp_path / "scenes"), workers=0, **o), "stretch"),
+        (lambda **o: WideAngleData(frames, lens=lens, workers=0, **o), "stretch"),
+        (lambda **o: WideAngleData(frames, test_lenses="0", workers=0, **o), "crop"),
+    ):
+        for options in ({}, {"fit": "crop"}, {"fit": "stretch"}):
+            data = make(batch_size=1, **options)
+            assert data.framing == options.get("fit", framing)
+            recwarn.clear()
+            for loader in (data.train_dataloader(), data.val_dataloader(), *data.test_dataloader()):
+                next(iter(loader))
+            said = [str(one.message) for one in recwarn if one.category is CutOff]
+            assert len(said) == (data.framing == "crop")
+            for text in said:
+                assert text.startswith("`fit` crop cuts off 19 px at the left and 20 px at the rig")
+                assert text.endswith("; `fit` stretch keeps it")
 
 
 def test_presets_leave_size_and_channels_to_the_pictures():

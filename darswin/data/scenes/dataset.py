@@ -73,6 +73,10 @@ class SceneSamples(Samples):
         rng = self._random(draw.epoch, draw.lens, 3)
         return Crop(rng.uniform(self.crop, 1), rng.random(), rng.random())
 
+    def _taken(self, index: int) -> tuple[tuple[int, int], Lens]:
+        lens = self.scenes[index].lens
+        return picture_size(lens), lens
+
     def _lens_alone(self, draw: Draw) -> Lens:
         own = self.scenes.lens_alone(draw.picture)
         if self.lens_augmentation is not None:
