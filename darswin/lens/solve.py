@@ -72,10 +72,12 @@ def newton(
         goal, point: (n, 2), or any shape if it is not `readable`.
         end: the largest distance from the origin.
     """
-    found, places = point.clone(), torch.arange(len(point), device=point.device)
     error = function(point) - goal
     step, missed = solve(slopes(point), error), length_of(error)
     part = torch.ones_like(missed)
+    shrinks = readable(point)  # otherwise shapes must not depend on values
+    if shrinks:
+        found, places = point.clone(), torch.arange(len(point))
     for _ in range(rounds):
         trial = point - part[..., None] * step
         error, slope = function(trial) - goal, slopes(trial)
@@ -84,8 +86,8 @@ def newton(
         step = torch.where(better[..., None], solve(slope, error), step)
         missed = torch.where(better, length_of(error), missed)
         part = torch.where(better, (2 * part).clamp(max=1), part / 4)
-        if not readable(missed):
-            continue  # shapes must not depend on values
+        if not shrinks:
+            continue
         found[places] = point
         going = missed > 16 * torch.finfo(goal.dtype).eps * (1 + length_of(goal))
         going &= part > 1e-6
@@ -94,8 +96,7 @@ def newton(
         places, goal, point, step, missed, part = (
             x[going] for x in (places, goal, point, step, missed, part)
         )
-    found[places] = point
-    return found
+    return found if shrinks else point
 
 
 def length_of(points: Tensor) -> Tensor:

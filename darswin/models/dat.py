@@ -37,7 +37,7 @@ class DeformableAttention(nn.Module):
     ):
         super().__init__()
         check_heads(dim, num_heads)
-        if num_heads % groups:
+        if groups < 1 or num_heads % groups:
             raise ValueError(f"groups must divide num_heads = {num_heads}, got {groups}")
         self.num_heads, self.groups, self.offset_range = num_heads, groups, offset_range
         channels = dim // groups
