@@ -101,7 +101,8 @@ def newton(
 
 def length_of(points: Tensor) -> Tensor:
     """The length of (..., 2), never 0, where a square root has no slope."""
-    return points.square().sum(-1).clamp(min=1e-12 * torch.finfo(points.dtype).eps).sqrt()
+    x, y = points.square().unbind(-1)  # ONNX Runtime cannot sum an empty tensor along one axis
+    return (x + y).clamp(min=1e-12 * torch.finfo(points.dtype).eps).sqrt()
 
 
 def determinant(matrix: Tensor) -> Tensor:

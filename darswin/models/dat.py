@@ -65,7 +65,8 @@ class DeformableAttention(nn.Module):
         places = pixels + offset * (self.offset_range / tensor_there((height, width), offset))
         # The released code samples as if the centres of the outermost pixels were at the edges.
         sampled = F.grid_sample(self._grouped(x), places.flip(-1), align_corners=True)
-        sampled = sampled.reshape(batch, dim, tokens).transpose(1, 2)
+        sampled = sampled.unflatten(0, (batch, self.groups)).permute(0, 3, 4, 1, 2)
+        sampled = sampled.reshape(batch, tokens, dim)
         k, v = self.kv(sampled).chunk(2, 2)
 
         reach = (pixels.flatten(0, 1)[:, None] - places.flatten(1, 2)[:, None]) / 2
