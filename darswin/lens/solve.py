@@ -1,5 +1,6 @@
 """Inverses of rising functions and of maps of the plane, and the limits up to which they rise."""
 
+import math
 from collections.abc import Callable
 
 import torch
@@ -25,7 +26,8 @@ def inverse(function: Function, slope: Function, value: Tensor, end: Tensor) -> 
         high = torch.broadcast_tensors(end, value)[0]
         low, x = torch.zeros_like(high), high * (value / last).clamp(0, 1)
         moved = high
-        for _ in range(_STEPS):
+        halvings = 1 - round(math.log2(torch.finfo(x.dtype).eps))  # more change nothing
+        for _ in range(min(_STEPS, halvings)):
             error = function(x) - value
             low, high = torch.where(error < 0, x, low), torch.where(error > 0, x, high)
             newton = x - error / slope(x)

@@ -220,6 +220,13 @@ def test_a_fixed_lens_is_solved_before_the_graph_begins(translated):
 
 
 @pytest.mark.slow
+def test_the_nodes_that_solve_for_the_rays_of_pixels():
+    # Each of Newton's steps is 60 to 90 nodes.
+    model, images = short("conv_unet_nano", widths=(4,)), torch.zeros(1, 3, 32, 32)
+    assert len(export_program(model, images, POLYNOMIAL[:1]).graph.nodes) <= 2000
+
+
+@pytest.mark.slow
 def test_onnx_exports_say_nothing_about_themselves(tmp_path, caplog, recwarn):
     pytest.importorskip("onnxscript")
     model = short("darswin_a_nano", **ONE_BLOCK)
