@@ -1,5 +1,7 @@
 """Helpers for several test files."""
 
+import contextlib
+import sys
 from pathlib import Path
 
 import torch
@@ -52,6 +54,25 @@ CAMERAS = [
         affine=[[1.0, 0.0], [0.0, 1389.2 / 1390.0]], image_size=(1400, 1400),
     ),
 ]  # fmt: skip
+
+
+@contextlib.contextmanager
+def few_calls(most):
+    """Fails as soon as the block calls more functions than this, also those written in C: a limit
+    of work that is the same on every machine."""
+    calls = 0
+
+    def count(_frame, event, _function):
+        nonlocal calls
+        calls += event in ("call", "c_call")
+        assert calls <= most
+
+    sys.setprofile(count)
+    try:
+        yield
+    finally:
+        sys.setprofile(None)
+    assert calls <= most
 
 
 def side_of(name):

@@ -24,6 +24,7 @@ from darswin.lens.spacing import check_tan
 from darswin.models.darswin import DarSwin
 from darswin.models.encoder import Prepared
 from darswin.models.stages import Pair, StagePlan
+from darswin.ops.reference import ranks
 
 
 class OfficialPolynomial(Lens, register=False):
@@ -64,9 +65,8 @@ class OfficialPolynomial(Lens, register=False):
         theta, radius = self._aligned(theta, "radius")
         x, angles = self._table()
         angle, radius = torch.broadcast_tensors(theta, radius)
-        flat = angle.reshape(self.count, -1)
-        above = torch.searchsorted(angles.contiguous(), flat.contiguous(), right=True)
-        above = above.clamp(1, len(x) - 1)
+        flat = self._by_lens(angle)
+        above = ranks(angles, flat).clamp(1, len(x) - 1)
         low, high = angles.gather(1, above - 1), angles.gather(1, above)
         fraction = (flat - low) / (high - low)
         rho = x[above - 1] + fraction * (x[above] - x[above - 1])

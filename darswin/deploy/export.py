@@ -1,7 +1,10 @@
 """Models as graphs of tensors, lens included: for AOTInductor, ONNX, and processes without us."""
 
+import contextlib
+import logging
 import os
-from collections.abc import Iterable
+import warnings
+from collections.abc import Iterable, Iterator, Mapping
 from functools import partial
 from inspect import Parameter, Signature
 from typing import Any, Literal, get_args
@@ -25,13 +28,20 @@ __all__ = ["export_onnx", "export_package", "export_program"]
 
 Input = Literal["images", "tokens"]
 
+# Log lines of torch.onnx and onnxscript, by their loggers, that say nothing about the file: which
+# operators exist only with torchvision, and which constants stay nodes.
+_REMARKS = {
+    "torch.onnx._internal.exporter._registration": ("torchvision is not installed",),
+    "onnxscript.optimizer._constant_folding": ("Skipping constant folding", "Evaluation failed"),
+}
+
 
 class _OfTensors(nn.Module):
-    """A model that takes pixels and the tensors of its lens, by name; tensors that are not given
-    are the lens's own.
+    """A model that takes pixels and the tensors of its lens, by name.
 
-    With a `size` of the images, the first pixels are the result of `Model.sample`. With
-    `any_strides` it reads its inputs by the strides they come with.
+    Without `tensors`, all that depends on the lens is computed here, before the graph begins. With
+    `sampled`, the first pixels are the result of `Model.sample`. With `any_strides` the model reads
+    its inputs by the strides they come with.
     """
 
     def __init__(
@@ -41,10 +51,14 @@ class _OfTensors(nn.Module):
         size: Pair | None,
         pixels: Iterable[str],
         tensors: Iterable[str],
+        *,
+        sampled: bool,
         any_strides: bool,
     ):
         super().__init__()
-        self.model, self.lens, self.size, self.any_strides = model, lens, size, any_strides
+        self.model, self.lens, self.size = model, lens, size
+        self.sampled, self.any_strides = sampled, any_strides
+        self.prepared = self._prepare({}) if not tensors else None
         # torch.export finds the names of the inputs in the signature of `forward`.
         inputs = [Parameter(name, Parameter.POSITIONAL_OR_KEYWORD) for name in pixels]
         inputs += [Parameter(name, Parameter.KEYWORD_ONLY) for name in tensors]
@@ -52,16 +66,24 @@ class _OfTensors(nn.Module):
         forward.__signature__ = Signature(inputs)
         self.forward = forward
 
-    def _run(self, *pixels: Tensor, **tensors: Tensor) -> Tensor:
+    def _prepare(self, tensors: Mapping[str, Tensor]) -> Any:
+        """The lens for `forward`, or for the methods of a model the result of its `prepare`."""
+        lens = None if self.lens is None else self.lens.replace(**tensors)
+        if not isinstance(self.model, Model):
+            return lens
+        assert self.size is not None
+        return self.model.prepare(lens, self.size)
+
+    def _run(self, *pixels: Tensor, **tensors: Tensor) -> Any:
         if self.any_strides:
             pixels = tuple(map(_in_order, pixels))
             tensors = {name: _in_order(tensor) for name, tensor in tensors.items()}
-        lens = None if self.lens is None else self.lens.replace(**tensors)
-        if self.size is None:
-            return self.model(*pixels, lens)
-        sampled, *images = pixels
-        model: Any = self.model
-        return model.run_sampled(sampled, model.prepare(lens, self.size), *images)
+        prepared = self._prepare(tensors) if tensors else self.prepared
+        first, *others = pixels
+        if not isinstance(self.model, Model):
+            return self.model(first, prepared)
+        run = self.model.run_sampled if self.sampled else self.model.run
+        return run(first, prepared, *others)
 
 
 def _in_order(tensor: Tensor) -> Tensor:
@@ -125,12 +147,20 @@ def _program(
             for (key,), leaf in leaves
             if isinstance(key, pytree.GetAttrKey) and leaf is not None
         }
-    pixels, size = {"images": images}, None
-    if input == "tokens":
-        pixels, size = _sampled(model, images, lens)
-    module = _OfTensors(model, lens, size, pixels, tensors, any_strides)
-    batch = {0: torch.export.Dim("batch")}
+    sampled, size = input == "tokens", None
+    if sampled and not isinstance(model, Model):
+        raise TypeError(f'input="tokens" needs a model of darswin, got {type(model).__name__}')
+    pixels = {"images": images}
     with torch.no_grad(), Progress("tracing the model"):
+        if isinstance(model, Model):
+            height, width = model._checked(images).shape[2:]
+            size = height, width
+            if sampled:
+                pixels = _sampled(model, images, lens, size)
+        module = _OfTensors(
+            model, lens, size, pixels, tensors, sampled=sampled, any_strides=any_strides
+        )
+        batch = {0: torch.export.Dim("batch")}
         return torch.export.export(
             module,
             tuple(pixels.values()),
@@ -140,16 +170,11 @@ def _program(
         )
 
 
-def _sampled(model: nn.Module, images: Tensor, lens: Lens | None) -> tuple[dict[str, Tensor], Pair]:
-    """The inputs of `model.run_sampled` for images, by name, and the size (H, W) of the images."""
-    if not isinstance(model, Model):
-        raise TypeError(f'input="tokens" needs a model of darswin, got {type(model).__name__}')
-    height, width = model._checked(images).shape[2:]
+def _sampled(model: Model, images: Tensor, lens: Lens | None, size: Pair) -> dict[str, Tensor]:
+    """The inputs of `model.run_sampled` for images of (H, W), by name."""
     lens = None if lens is None else lens[[0] * len(images)]
-    with torch.no_grad():
-        tokens = model.sample(images, model.prepare(lens, (height, width)))
-    others = {"images": images} if model.refines_with_images else {}
-    return {"tokens": tokens} | others, (height, width)
+    tokens = model.sample(images, model.prepare(lens, size))
+    return {"tokens": tokens} | ({"images": images} if model.refines_with_images else {})
 
 
 def export_package(
@@ -220,7 +245,7 @@ def export_onnx(
     if quantized_layers(model) and not vnni_only:
         model = with_unsigned_weights(model)
     # MATH, as other attention kernels of torch lay out their result unlike their decomposition.
-    with use_reference(), sdpa_kernel(SDPBackend.MATH):
+    with use_reference(), sdpa_kernel(SDPBackend.MATH), _without_remarks():
         program = _program(model, images, lens, fixed_lens, input, any_strides=False)
         inputs = program.graph_signature.user_inputs
         with Progress("translating the graph to ONNX"):
@@ -233,3 +258,23 @@ def export_onnx(
                 external_data=False,
                 verbose=False,
             )
+
+
+@contextlib.contextmanager
+def _without_remarks() -> Iterator[None]:
+    """Leaves out `_REMARKS`, and torch's warning about its own use of a class."""
+    filters = {
+        logging.getLogger(name): lambda record, starts=starts: (
+            not record.getMessage().startswith(starts)
+        )
+        for name, starts in _REMARKS.items()
+    }
+    for logger, tells in filters.items():
+        logger.addFilter(tells)
+    try:
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", r".*isinstance\(treespec, LeafSpec\)", FutureWarning)
+            yield
+    finally:
+        for logger, tells in filters.items():
+            logger.removeFilter(tells)

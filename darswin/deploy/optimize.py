@@ -212,13 +212,15 @@ def _has_kernels(module: nn.Module, dtype: torch.dtype) -> bool:
 
 
 def _pack_stage(stage: Stage, dtype: torch.dtype) -> None:
-    blocks: list[Any] = list(stage.blocks)
-    attentions = [block.attn for block in blocks]
-    fc1 = blocks[0].mlp.fc1
-    widest = fc1.out_features // fc1.in_features * dtype.itemsize
-    stage.most_numbers = max(CACHED_BYTES // widest, 1)
     if not isinstance(stage.downsample, (PatchMerging, nn.Identity)):
         stage.downsample = InDtype(stage.downsample, dtype)
+    blocks: list[Any] = list(stage.blocks)
+    if not blocks:
+        return
+    attentions = [block.attn for block in blocks]
+    fc1 = blocks[0].mlp.fc1
+    widest = max(3, -(-fc1.out_features // fc1.in_features))  # queries, keys, values; or the MLP
+    stage.most_numbers = max(CACHED_BYTES // (widest * dtype.itemsize), 1)
     in_windows = all(isinstance(attn, WindowAttention) for attn in attentions)
     for mlp in (block.mlp for block in blocks):
         if isinstance(mlp.fc1, QuantizedLinear) != isinstance(mlp.fc2, QuantizedLinear):

@@ -73,7 +73,7 @@ def quantize_model(
             chosen.pop()
             result = found.quantized(chosen)
             error = found.error(result)
-    if error > tolerance or not chosen:
+    if error > tolerance:
         raise ValueError(f"with 8 bits, every part of the model exceeds the tolerance {tolerance}")
     return result
 
@@ -101,6 +101,8 @@ class _Calibration(Generic[Net]):
     def __init__(self, model: Net, calibration: Iterable[Sequence], keep: Collection[str]):
         self.batches = _batches(model, calibration)
         self.model, self.parts = model, _parts(model, keep)
+        if not self.parts:
+            raise ValueError("the model has no part that could be quantized: no block, or all kept")
         names = [name for names in self.parts.values() for name in names]
         self._activations, self._expected = _observed(model, self.batches, names)
 

@@ -96,6 +96,8 @@ class FourierBias(RelativeBias):
     """
 
     def __init__(self, window: tuple[int, int], heads: int, sectors: int, harmonics: int = 16):
+        if harmonics < 1:
+            raise ValueError(f"harmonics must be at least 1, got {harmonics}")
         super().__init__(window, heads, sectors, (harmonics, harmonics + 1) * 2)
 
     def _axis(self, angle: Tensor, a: Tensor, b: Tensor) -> Tensor:

@@ -136,7 +136,7 @@ class WindowAttention(nn.Module):
 
 def check_heads(dim: int, num_heads: int) -> None:
     """ValueError unless the number of heads divides the width."""
-    if dim % num_heads:
+    if num_heads < 1 or dim % num_heads:
         raise ValueError(f"num_heads must divide dim = {dim}, got {num_heads}")
 
 

@@ -139,6 +139,10 @@ class LensBatch:
             )
         return x, *(self._row(getattr(self, name), x.dim()) for name in names)
 
+    def _by_lens(self, x: Tensor) -> Tensor:
+        """(N, ...) as (N, K); of a single lens, any shape as (1, K)."""
+        return x.reshape(self.count, x.numel() // max(self.count, 1))
+
     @property
     def count(self) -> int:
         """The number of lenses. Unlike `len`, it stays variable in an exported graph."""

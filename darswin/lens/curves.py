@@ -11,6 +11,7 @@ from darswin.lens.base import Lens
 from darswin.lens.parameter import Number, Parameter
 from darswin.lens.solve import inverse
 from darswin.ops.checks import readable
+from darswin.ops.reference import ranks
 
 
 class Tabulated(Lens):
@@ -83,10 +84,9 @@ class Tabulated(Lens):
     def _pieces(self, x: Tensor, table: Tensor) -> tuple[Tensor, ...]:
         """Start, width, first radius, rise and end slopes of the interval that contains each x. The
         slopes are in px per width."""
-        shape = (max(self.count, x.shape[0]), *x.shape[1:])
-        flat = x.detach().expand(shape).reshape(self.count, -1).contiguous()
-        index = torch.searchsorted(table.detach().contiguous(), flat, right=True) - 1
-        index = index.clamp(0, self.angles.shape[1] - 2)
+        x = torch.broadcast_tensors(x, self._row(self.theta_max, x.dim()))[0]
+        shape, flat = x.shape, self._by_lens(x.detach())
+        index = (ranks(table.detach(), flat) - 1).clamp(0, self.angles.shape[1] - 2)
 
         def at(values: Tensor, place: Tensor) -> Tensor:
             return values.gather(1, place).reshape(shape)

@@ -182,8 +182,8 @@ class DistortedLens(FocalLens, register=False):
             return newton(*maps, goal, start / 2, 1.1 * last, rounds=30)
         circle = _circle(256, goal)
         # One lens at a time: each selects another number of pixels.
-        shape, start = goal.shape, start.expand_as(goal).reshape(len(self), -1, 2)
-        goal, points = goal.reshape(len(self), -1, 2), start.clone()
+        shape, start = goal.shape, self._by_lens(start.expand_as(goal)).unflatten(1, (-1, 2))
+        goal, points = self._by_lens(goal).unflatten(1, (-1, 2)), start.clone()
         for k, end in enumerate(last.flatten()):
             lens = self[k]
             # Most pixels without a ray lie beyond the rim; they are skipped. A rim that overflows

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from darswin.lens.batch import LensBatch
 from darswin.lens.parameter import Parameter
+from darswin.lens.solve import solve
 from darswin.ops.checks import tensor_there
 
 Size = tuple[int, int] | None  # (H, W) px
@@ -43,8 +44,8 @@ class ImageFrame(LensBatch):
     def from_pixels(self, pixels: Tensor, image_size: Size = None) -> Tensor:
         """The inverse of `to_pixels`."""
         flat = self._aligned(pixels)[0] - self._row(self.center_in(image_size), pixels.dim())
-        # `torch.linalg.inv` would wait for the device to check that an inverse exists.
-        return flat if self.affine is None else _apply(torch.linalg.inv_ex(self.affine)[0], flat)
+        # `torch.linalg.inv` would wait for the device, and ONNX has none.
+        return flat if self.affine is None else solve(self._row(self.affine, flat.dim() + 1), flat)
 
     def through_affine(self, flat: Tensor) -> Tensor:
         """`affine` @ points or offsets (N or 1, ..., 2)."""

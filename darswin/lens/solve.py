@@ -1,5 +1,6 @@
 """Inverses of rising functions and of maps of the plane, and the limits up to which they rise."""
 
+import math
 from collections.abc import Callable
 
 import torch
@@ -25,7 +26,8 @@ def inverse(function: Function, slope: Function, value: Tensor, end: Tensor) -> 
         high = torch.broadcast_tensors(end, value)[0]
         low, x = torch.zeros_like(high), high * (value / last).clamp(0, 1)
         moved = high
-        for _ in range(_STEPS):
+        halvings = 1 - round(math.log2(torch.finfo(x.dtype).eps))  # more change nothing
+        for _ in range(min(_STEPS, halvings)):
             error = function(x) - value
             low, high = torch.where(error < 0, x, low), torch.where(error > 0, x, high)
             newton = x - error / slope(x)
@@ -72,10 +74,12 @@ def newton(
         goal, point: (n, 2), or any shape if it is not `readable`.
         end: the largest distance from the origin.
     """
-    found, places = point.clone(), torch.arange(len(point), device=point.device)
     error = function(point) - goal
     step, missed = solve(slopes(point), error), length_of(error)
     part = torch.ones_like(missed)
+    shrinks = readable(point)  # otherwise shapes must not depend on values
+    if shrinks:
+        found, places = point.clone(), torch.arange(len(point))
     for _ in range(rounds):
         trial = point - part[..., None] * step
         error, slope = function(trial) - goal, slopes(trial)
@@ -84,8 +88,8 @@ def newton(
         step = torch.where(better[..., None], solve(slope, error), step)
         missed = torch.where(better, length_of(error), missed)
         part = torch.where(better, (2 * part).clamp(max=1), part / 4)
-        if not readable(missed):
-            continue  # shapes must not depend on values
+        if not shrinks:
+            continue
         found[places] = point
         going = missed > 16 * torch.finfo(goal.dtype).eps * (1 + length_of(goal))
         going &= part > 1e-6
@@ -94,13 +98,13 @@ def newton(
         places, goal, point, step, missed, part = (
             x[going] for x in (places, goal, point, step, missed, part)
         )
-    found[places] = point
-    return found
+    return found if shrinks else point
 
 
 def length_of(points: Tensor) -> Tensor:
     """The length of (..., 2), never 0, where a square root has no slope."""
-    return points.square().sum(-1).clamp(min=1e-12 * torch.finfo(points.dtype).eps).sqrt()
+    x, y = points.square().unbind(-1)  # ONNX Runtime cannot sum an empty tensor along one axis
+    return (x + y).clamp(min=1e-12 * torch.finfo(points.dtype).eps).sqrt()
 
 
 def determinant(matrix: Tensor) -> Tensor:

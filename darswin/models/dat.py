@@ -37,7 +37,7 @@ class DeformableAttention(nn.Module):
     ):
         super().__init__()
         check_heads(dim, num_heads)
-        if num_heads % groups:
+        if groups < 1 or num_heads % groups:
             raise ValueError(f"groups must divide num_heads = {num_heads}, got {groups}")
         self.num_heads, self.groups, self.offset_range = num_heads, groups, offset_range
         channels = dim // groups
@@ -65,7 +65,8 @@ class DeformableAttention(nn.Module):
         places = pixels + offset * (self.offset_range / tensor_there((height, width), offset))
         # The released code samples as if the centres of the outermost pixels were at the edges.
         sampled = F.grid_sample(self._grouped(x), places.flip(-1), align_corners=True)
-        sampled = sampled.reshape(batch, dim, tokens).transpose(1, 2)
+        sampled = sampled.unflatten(0, (batch, self.groups)).permute(0, 3, 4, 1, 2)
+        sampled = sampled.reshape(batch, tokens, dim)
         k, v = self.kv(sampled).chunk(2, 2)
 
         reach = (pixels.flatten(0, 1)[:, None] - places.flatten(1, 2)[:, None]) / 2

@@ -70,6 +70,16 @@ class Encoder(Model):
         super().__init__()
         if len(depths) != len(num_heads) or not depths:
             raise ValueError(f"depths and num_heads must pair up, got {depths} and {num_heads}")
+        for name, least, *values in (
+            ("num_classes", 0, num_classes),
+            ("in_chans", 1, in_chans),
+            ("embed_dim", 1, embed_dim),
+            ("embed_dim · mlp_ratio", 1, embed_dim * mlp_ratio),
+            ("depths", 0, *depths),
+            ("num_heads", 1, *num_heads),
+        ):
+            if not min(values) >= least:
+                raise ValueError(f"{name} must be at least {least}, got {min(values)}")
         self.num_classes, self.in_chans, self.embed_dim = num_classes, in_chans, embed_dim
         self.depths, self.num_heads = depths, num_heads
         self.mlp_ratio, self.drop_path_rate = mlp_ratio, drop_path_rate

@@ -41,6 +41,7 @@ def plan_stages(
     half the window along the radius if the window spans the ring. DarSwin-RA and Swin merge 2×2
     tokens and shift by half the window, except along an axis that the window spans.
     """
+    window = check_pair("window", window, lowest=1)
     if merges is not None and len(merges) != count - 1:
         raise ValueError(
             f"merges must have one entry for each stage but the first, {count - 1}, got {merges}"

@@ -53,7 +53,7 @@ class Swin(Encoder):
         self.view, self.image_size, self.uses_lens = made, made.size, made.uses_lens
         height, width = made.size
         self.square_images = height == width
-        if any(side < 1 or side % patch_size for side in (height, width)):
+        if patch_size < 1 or any(side < 1 or side % patch_size for side in (height, width)):
             raise ValueError(
                 f"patch_size must divide image_size = {self.image_size}, got {patch_size}"
             )

@@ -93,7 +93,8 @@ def output_bfloat16(image: Tensor) -> bool:
 
 def autocast_off(device: str) -> contextlib.AbstractContextManager:
     """A context in which autocast does not change the arithmetic of a reference."""
-    if not _has_autocast(device):
+    # Where autocast is off, no context: in an exported graph it would become a graph of its own.
+    if not _has_autocast(device) or not torch.is_autocast_enabled(device):
         return contextlib.nullcontext()
     return torch.autocast(device, enabled=False)
 

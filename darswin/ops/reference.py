@@ -186,7 +186,7 @@ def polar_to_image(
     known, radii = known.expand(rows, *known.shape[1:]), radii.expand(rows, rings)
     # The ring centres on both sides of each pixel. Inside the first ring, the inner centre lies
     # across the pole, at a negative radius. Beyond the last ring, both are the last centre.
-    above = _rings_within(radii.detach(), r.detach().flatten(1)).reshape(r.shape)
+    above = ranks(radii.detach(), r.detach().flatten(1)).reshape(r.shape)
     pole, beyond = above == 0, above == rings
     inner, outer = (above - 1).clamp(min=0), above.clamp(max=rings - 1)
     first, second = (radii.gather(1, k.flatten(1)).reshape(r.shape) for k in (inner, outer))
@@ -211,11 +211,19 @@ def polar_to_image(
     return out if tokens else out.permute(0, 3, 1, 2).contiguous()
 
 
-def _rings_within(radii: Tensor, r: Tensor) -> Tensor:
-    """Counts (N, K): for each r (N, K), the number of rising radii (N, R) that are at most r."""
-    if torch.compiler.is_compiling():  # ONNX has no searchsorted; this takes R times the memory
-        return (radii[:, :, None] <= r[:, None]).sum(1)
-    return torch.searchsorted(radii.contiguous(), r.contiguous(), right=True)
+def ranks(rising: Tensor, values: Tensor) -> Tensor:
+    """Counts (N, K): for each of the values (N, K), how many of the `rising` (N, R) are at most
+    the value."""
+    if not torch.compiler.is_compiling():
+        return torch.searchsorted(rising.contiguous(), values.contiguous(), right=True)
+    # ONNX has no searchsorted: a binary search, from the highest bit of the count to the lowest.
+    most = rising.shape[1]
+    count = torch.zeros_like(values, dtype=torch.long)
+    for bit in reversed(range(most.bit_length())):
+        more = count + (1 << bit)
+        last = rising.gather(1, more.clamp(max=most) - 1)
+        count = torch.where((more <= most) & (last <= values), more, count)
+    return count
 
 
 def _on_polar_plane(size: Sequence[int], center: Tensor, affine: Tensor | None) -> Tensor:

@@ -121,7 +121,7 @@ def test_samples_are_the_same_for_any_number_of_workers(folders, name, threads):
 def test_workers_do_not_hang_after_opencv_ran_on_several_threads(folders):
     cv2.setNumThreads(4)
     cv2.GaussianBlur(np.zeros((2000, 2000, 3), np.uint8), (31, 31), 5)  # starts its threads
-    batches = DataLoader(DATASETS["wide"](folders), 5, num_workers=1, timeout=30)
+    batches = DataLoader(DATASETS["wide"](folders), 5, num_workers=1, timeout=300)
     assert len(next(iter(batches))[0]) == 5 and cv2.getNumThreads() == 1
 
 

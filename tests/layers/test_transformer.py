@@ -101,6 +101,7 @@ def test_compiled_gradients_of_the_bias(position_bias, periodic_bias):
     ("options", "message"),
     [
         (dict(num_heads=5), "num_heads must divide dim = 12, got 5"),
+        (dict(num_heads=0), "num_heads must divide dim = 12, got 0"),
         (dict(window=(3, 8)), r"window must divide .* \(4, 8\), got \(3, 8\)"),
         (dict(window=(2, 3)), r"window must divide .* \(4, 8\), got \(2, 3\)"),
         (dict(window=(0, 8)), "window"),

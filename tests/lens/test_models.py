@@ -24,6 +24,7 @@ from darswin.lens import (
     Stereographic,
     Tabulated,
     from_dict,
+    solve,
     to_dict,
 )
 from darswin.lens.ideal import FocalLens
@@ -345,3 +346,16 @@ def test_arguments_by_place_and_by_name():
     made = Mei(0.5, 300.0, [0.1, 0.2], 1.2, [3.0, 4.0])
     named = Mei(xi=0.5, focal=300.0, radial=[0.1, 0.2], theta_max=1.2, center=[3.0, 4.0])
     assert made.same_as(named) and not hasattr(Polynomial, "from_fov")
+
+
+@pytest.mark.parametrize(("dtype", "steps"), [(torch.float32, 24), (f64, 40)])
+def test_an_inverse_has_no_more_steps_than_its_numbers_have_bits(dtype, steps):
+    calls, value = [], torch.linspace(0, 1, 9, dtype=dtype)
+
+    def cube(x):
+        calls.append(x)
+        return x**3
+
+    found = solve.inverse(cube, lambda x: 3 * x**2, value, torch.ones((), dtype=dtype))
+    assert len(calls) == 1 + steps + 2
+    torch.testing.assert_close(found[1:], value[1:] ** (1 / 3))

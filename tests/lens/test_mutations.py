@@ -3,12 +3,12 @@
 import math
 import random
 import re
-import time
 from pathlib import Path
 
 import hypothesis
 import pytest
 import torch
+from helpers import few_calls
 from hypothesis import strategies as st
 from lens_examples import FILES
 
@@ -95,16 +95,14 @@ def missing(lens, expected: list[float]) -> list[float]:
 
 
 def read(path: Path, camera: str | None):
-    """The lens, or None after an error in one line. Takes at most two seconds."""
-    start = time.process_time()
+    """The lens, or None after an error in one line; with little work."""
     try:
-        lens = load(path, camera=camera, dtype=torch.float64)
+        with few_calls(1_000_000):
+            return load(path, camera=camera, dtype=torch.float64)
     except ValueError as error:
         message = str(error)
         assert f"calibration {path}: " in message and len(message) < 1200 and "\n" not in message
-        lens = None
-    assert time.process_time() - start < 2
-    return lens
+        return None
 
 
 @pytest.mark.parametrize(("name", "camera", "place"), CAMERAS, ids=IDS)

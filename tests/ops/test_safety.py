@@ -136,7 +136,7 @@ FORKED = """
     expected = polar_sample(*arguments, samples=(4, 4))
     child = os.fork()
     if child == 0:
-        signal.alarm(20)
+        signal.alarm(100)
         torch.set_num_threads(1)
         os._exit(0 if torch.equal(polar_sample(*arguments, samples=(4, 4)), expected) else 1)
     sys.exit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
