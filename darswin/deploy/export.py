@@ -111,6 +111,7 @@ def export_program(
         model: in eval mode.
         images, lens: an example. The graph keeps its types and sizes, all but the batch size.
         fixed_lens: the graph keeps the lens too, which must be a single one; `images` is its input.
+            What depends on the lens alone is computed before the graph begins.
         input: "images", or "tokens" for a graph that starts later: its input `tokens` is the result
             of `model.sample`, which `darswin.frames` also computes. `images` is a second input
             only for a model that `refines_with_images`.
