@@ -7,10 +7,12 @@ import warnings
 from collections.abc import Iterable, Iterator, Mapping
 from functools import partial
 from inspect import Parameter, Signature
+from types import BuiltinFunctionType
 from typing import Any, Literal, get_args
 
 import torch
 from torch import Tensor, nn
+from torch._ops import OpOverload
 from torch.export import ExportedProgram
 from torch.nn.attention import SDPBackend, sdpa_kernel
 from torch.utils import _pytree as pytree
@@ -112,6 +114,7 @@ def export_program(
         model: in eval mode.
         images, lens: an example. The graph keeps its types and sizes, all but the batch size.
         fixed_lens: the graph keeps the lens too, which must be a single one; `images` is its input.
+            What depends on the lens alone is computed before the graph begins.
         input: "images", or "tokens" for a graph that starts later: its input `tokens` is the result
             of `model.sample`, which `darswin.frames` also computes. `images` is a second input
             only for a model that `refines_with_images`.
@@ -161,13 +164,52 @@ def _program(
             model, lens, size, pixels, tensors, sampled=sampled, any_strides=any_strides
         )
         batch = {0: torch.export.Dim("batch")}
-        return torch.export.export(
+        program = torch.export.export(
             module,
             tuple(pixels.values()),
             tensors,
             dynamic_shapes=dict.fromkeys((*pixels, *tensors), batch),
             strict=False,  # it takes half of the time of a strict export
         )
+        _join_equal_nodes(program.graph)
+        program.graph_module.recompile()
+    return program
+
+
+def _join_equal_nodes(graph: torch.fx.Graph) -> None:
+    """Computes once what a graph computes several times, such as the powers of an angle in each of
+    Newton's steps. All that follows takes time for every node: decompositions, rules, compilers."""
+    nodes, apart = list(graph.nodes), set[torch.fx.Node]()
+    for node in reversed(nodes):
+        # What is changed in place must not be the result of another node too.
+        changes = isinstance(node.target, OpOverload) and _has_effects(node.target)
+        if changes or (node in apart and _may_share_memory(node.target)):
+            apart.update((node, *node.all_input_nodes))
+    apart.update(graph.output_node().all_input_nodes)  # their names are those of the outputs
+    known: dict[tuple, torch.fx.Node] = {}
+    for node in nodes:
+        if node in apart or not isinstance(node.target, OpOverload | BuiltinFunctionType):
+            continue
+        # A node within the arguments is shown by its name.
+        key = node.target, repr(node.args), repr(node.kwargs)
+        if (first := known.setdefault(key, node)) is not node:
+            node.replace_all_uses_with(first)
+            graph.erase_node(node)
+
+
+def _has_effects(operator: OpOverload) -> bool:
+    """True if an operator changes a tensor in place, or draws random numbers."""
+    return operator._schema.is_mutable or torch.Tag.nondeterministic_seeded in operator.tags
+
+
+def _may_share_memory(target: object) -> bool:
+    """True if the result of a node may be a view of an input."""
+    if not isinstance(target, OpOverload):
+        return True
+    is_view = any(result.alias_info is not None for result in target._schema.returns)
+    # An operator that is made of others may end with a view.
+    key = "CompositeImplicitAutograd"
+    return is_view or torch._C._dispatch_has_kernel_for_dispatch_key(target.name(), key)
 
 
 def _sampled(model: Model, images: Tensor, lens: Lens | None, size: Pair) -> dict[str, Tensor]:

@@ -70,16 +70,16 @@ class Encoder(Model):
         super().__init__()
         if len(depths) != len(num_heads) or not depths:
             raise ValueError(f"depths and num_heads must pair up, got {depths} and {num_heads}")
-        for name, least, *values in (
-            ("num_classes", 0, num_classes),
-            ("in_chans", 1, in_chans),
-            ("embed_dim", 1, embed_dim),
-            ("embed_dim · mlp_ratio", 1, embed_dim * mlp_ratio),
-            ("depths", 0, *depths),
-            ("num_heads", 1, *num_heads),
+        for name, value, least in (
+            ("num_classes", num_classes, 0),
+            ("in_chans", in_chans, 1),
+            ("embed_dim", embed_dim, 1),
+            ("embed_dim · mlp_ratio", embed_dim * mlp_ratio, 1),
+            ("depths", min(depths), 0),
+            ("num_heads", min(num_heads), 1),
         ):
-            if not min(values) >= least:
-                raise ValueError(f"{name} must be at least {least}, got {min(values)}")
+            if not value >= least:
+                raise ValueError(f"{name} must be at least {least}, got {value}")
         self.num_classes, self.in_chans, self.embed_dim = num_classes, in_chans, embed_dim
         self.depths, self.num_heads = depths, num_heads
         self.mlp_ratio, self.drop_path_rate = mlp_ratio, drop_path_rate

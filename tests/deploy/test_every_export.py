@@ -71,7 +71,7 @@ THREE = ("Spherical", "Polynomial", "KannalaBrandt, general")
 
 @pytest.fixture(autouse=True)
 def few_steps(monkeypatch):
-    # Each of Newton's steps is 60 nodes, or 190 in the plane; these lenses need few of them.
+    # Each of Newton's steps is 40 nodes, or 120 in the plane; these lenses need few of them.
     monkeypatch.setattr(solve, "_STEPS", 4)
     newton = solve.newton
     monkeypatch.setattr(
