@@ -156,7 +156,7 @@ def _program(
     pixels = {"images": images}
     with torch.no_grad(), Progress("tracing the model"):
         if isinstance(model, Model):
-            height, width = model._checked(images).shape[2:]
+            height, width = model._with_shape(images).shape[2:]
             size = height, width
             if sampled:
                 pixels = _sampled(model, images, lens, size)
