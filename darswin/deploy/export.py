@@ -1,10 +1,7 @@
 """Models as graphs of tensors, lens included: for AOTInductor, ONNX, and processes without us."""
 
-import contextlib
-import logging
 import os
-import warnings
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from functools import partial
 from inspect import Parameter, Signature
 from types import BuiltinFunctionType
@@ -29,13 +26,6 @@ from darswin.utils.quiet import quiet_export
 __all__ = ["export_onnx", "export_package", "export_program"]
 
 Input = Literal["images", "tokens"]
-
-# Log lines of torch.onnx and onnxscript, by their loggers, that say nothing about the file: which
-# operators exist only with torchvision, and which constants stay nodes.
-_REMARKS = {
-    "torch.onnx._internal.exporter._registration": ("torchvision is not installed",),
-    "onnxscript.optimizer._constant_folding": ("Skipping constant folding", "Evaluation failed"),
-}
 
 
 class _OfTensors(nn.Module):
@@ -287,7 +277,7 @@ def export_onnx(
     if quantized_layers(model) and not vnni_only:
         model = with_unsigned_weights(model)
     # MATH, as other attention kernels of torch lay out their result unlike their decomposition.
-    with use_reference(), sdpa_kernel(SDPBackend.MATH), _without_remarks():
+    with use_reference(), sdpa_kernel(SDPBackend.MATH):
         program = _program(model, images, lens, fixed_lens, input, any_strides=False)
         inputs = program.graph_signature.user_inputs
         with Progress("translating the graph to ONNX"):
@@ -300,23 +290,3 @@ def export_onnx(
                 external_data=False,
                 verbose=False,
             )
-
-
-@contextlib.contextmanager
-def _without_remarks() -> Iterator[None]:
-    """Leaves out `_REMARKS`, and torch's warning about its own use of a class."""
-    filters = {
-        logging.getLogger(name): lambda record, starts=starts: (
-            not record.getMessage().startswith(starts)
-        )
-        for name, starts in _REMARKS.items()
-    }
-    for logger, tells in filters.items():
-        logger.addFilter(tells)
-    try:
-        with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", r".*isinstance\(treespec, LeafSpec\)", FutureWarning)
-            yield
-    finally:
-        for logger, tells in filters.items():
-            logger.removeFilter(tells)
