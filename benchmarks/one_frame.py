@@ -9,6 +9,7 @@ a record and a plot there.
 import argparse
 import importlib.util
 import tempfile
+import time
 from collections.abc import Callable
 from functools import cache, partial
 from pathlib import Path
@@ -48,10 +49,12 @@ def exported(folder: Path, kind: str, name: str, size: int, model: Model) -> str
     path = folder / f"{name}.{kind}"
     if not path.exists():
         images, lens = torch.randn(1, 3, size, size), lens_of(size)
+        start = time.perf_counter()
         if kind == "onnx":
             export_onnx(model, path, images, lens, fixed_lens=True, vnni_only=True)
         else:
             export_package(model, path, images, lens, fixed_lens=True)
+        print(f"{path.name}: exported in {time.perf_counter() - start:.1f} s")
     return str(path)
 
 
