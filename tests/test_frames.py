@@ -276,6 +276,13 @@ def test_out_in_the_memory_of_the_frame_is_refused(at, turned):
         np.testing.assert_array_equal(memory, before)
 
 
+@pytest.mark.parametrize("out", [[1], 1, "out"])
+def test_an_out_that_is_no_array_is_named(out):
+    sampler = frames.Sampler(frames.plan(layer(), ROUND, (50, 60)))
+    with pytest.raises(TypeError, match=f"^out must be a NumPy array, got .*{type(out).__name__}"):
+        sampler(random_frame(50, 60, 3), out)
+
+
 def test_a_view_cannot_be_written_over_its_own_frame():
     rays = perspective((50, 60), 1.0)
     sampler, frame = frames.Sampler(frames.plan(rays, ROUND, (50, 60))), random_frame(50, 60, 3)

@@ -99,8 +99,7 @@ class Sampler {
     }
   }
 
-  py::array operator()(const py::object& given, const std::optional<py::array>& out,
-                       int64_t threads) const {
+  py::array operator()(const py::object& given, const py::object& out, int64_t threads) const {
     if (!py::isinstance<py::array_t<uint8_t>>(given)) {
       throw py::type_error("frame must be a NumPy array of uint8, got " +
                            std::string(py::isinstance<py::array>(given)
@@ -153,7 +152,7 @@ class Sampler {
               : shape.back() * image.channels >= 4 ? Blend::near_rows
                                                    : Blend::near;
     py::array result = output_array(out, output_shape(image.channels, colors));
-    if (out && share_memory(frame, result)) {
+    if (!out.is_none() && share_memory(frame, result)) {
       throw py::value_error("out must not share memory with the frame");
     }
     a.out = result.mutable_data();
@@ -173,19 +172,24 @@ class Sampler {
     return colors ? Shape{shape[0], shape[1], channels} : shape;
   }
 
-  py::array output_array(const std::optional<py::array>& out, const Shape& sizes) const {
+  py::array output_array(const py::object& given, const Shape& sizes) const {
     const bool bytes = kind == FrameOutput::bytes;
     const py::dtype type = bytes ? py::dtype::of<uint8_t>() : py::dtype::of<float>();
-    if (!out) return py::array(type, sizes);
-    const bool same = bytes ? py::isinstance<py::array_t<uint8_t>>(*out)
-                            : py::isinstance<py::array_t<float>>(*out);
-    if (!same || !(out->flags() & py::array::c_style) || !out->writeable() ||
-        Shape(out->shape(), out->shape() + out->ndim()) != sizes) {
+    if (given.is_none()) return py::array(type, sizes);
+    if (!py::isinstance<py::array>(given)) {
+      throw py::type_error("out must be a NumPy array, got " +
+                           std::string(py::str(py::type::of(given))));
+    }
+    const auto out = py::reinterpret_borrow<py::array>(given);
+    const bool same =
+        bytes ? py::isinstance<py::array_t<uint8_t>>(out) : py::isinstance<py::array_t<float>>(out);
+    if (!same || !(out.flags() & py::array::c_style) || !out.writeable() ||
+        Shape(out.shape(), out.shape() + out.ndim()) != sizes) {
       throw py::value_error("out must be a writeable, C-contiguous array of " +
                             std::string(bytes ? "uint8" : "float32") + " with shape " +
                             shown(sizes));
     }
-    return *out;
+    return out;
   }
 
   static void run(const FrameArgs& a, int64_t threads) {
@@ -255,7 +259,7 @@ PYBIND11_MODULE(_frames, m) {
     const auto sampler =
         std::make_shared<const Sampler>(columns, rows, right, lower, size, std::move(scale),
                                         std::move(offset), normalize_first, output);
-    return py::cpp_function([sampler](const py::object& frame, const std::optional<py::array>& out,
+    return py::cpp_function([sampler](const py::object& frame, const py::object& out,
                                       int64_t threads) { return (*sampler)(frame, out, threads); },
                             py::name("sample"), py::arg("frame"), py::arg("out") = py::none(),
                             py::arg("threads") = 1);

@@ -3,10 +3,11 @@
 import argparse
 import inspect
 import json
+import os
 import re
 import types
 import typing
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from typing import Any, Literal, NoReturn
 
 import yaml
@@ -74,6 +75,15 @@ def check_option(name: str, value: object, ok: bool, range_: str) -> None:
     """Raises ValueError, which names the option, its range and its value, unless `ok`."""
     if not ok:
         raise ValueError(f"`{name}` must be {range_}, got {str(value)[:40]}")
+
+
+def check_out(out: str | None, inputs: Iterable[str]) -> None:
+    """Raises ValueError if writing `out` would replace one of the files that a command reads."""
+    if out is None or not os.path.exists(out):
+        return
+    for name in inputs:
+        if os.path.exists(name) and os.path.samefile(name, out) and os.path.isfile(out):
+            raise ValueError(f"`out` {out} would replace {name}, which this command reads")
 
 
 def _summary(function: Callable) -> str:

@@ -6,7 +6,7 @@ from typing import Literal
 import torch
 
 import darswin.lens
-from darswin.cli.arguments import check_option
+from darswin.cli.arguments import check_option, check_out
 from darswin.cli.undistort import undistort
 from darswin.cli.views import View, check_view, view_of, view_rays
 from darswin.layers.polar import PolarSample
@@ -58,6 +58,7 @@ def show(
     from darswin.viz.plot import draw_lens, figure_format, save_figure
 
     figure_format(out)
+    check_out(out, (calib, image))
     _check_partition(rings, sectors, samples)
     check_view(view, fov_deg, yaw_deg, pitch_deg)
     picture, orientation = read_oriented(image)
@@ -152,6 +153,7 @@ def convert(
             Kalibr if the name contains "camchain" or "kalibr"; COLMAP for .txt; and else the JSON
             of darswin, which can hold any lens.
     """
+    check_out(out, (calib,))
     file, theta_max = _calibration(calib, theta_max_deg, image_size, coefficients)
     lens = file.lens(camera, theta_max, image_size, torch.float64)
     note = ""
@@ -187,6 +189,7 @@ def crop(
         raise ValueError("missing `box` or `size`: give the part to keep, or the new size, or both")
     for side in (*(box or ())[2:], *(size or ())):
         check_option("size" if box is None else "box", side, 1 <= side <= 10**6, _SIDES)
+    check_out(out, (calib,))
     file, theta_max = _calibration(calib, theta_max_deg, image_size, coefficients)
     lens = file.lens(camera, theta_max, image_size, torch.float64)
     if box is not None:

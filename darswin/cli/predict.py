@@ -11,7 +11,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from darswin.cli.answers import ANSWERS, ANSWERS_OF, Answers, ClassAnswers, claim_folder, file_names
+from darswin.cli.arguments import check_out
 from darswin.cli.lenses import Lenses, given_lenses, lenses_of_run
+from darswin.cli.options import check_folder
 from darswin.compat import load_official
 from darswin.data.folders import PICTURES, pictures_and_videos_below
 from darswin.data.samples import IMAGENET_MEAN, IMAGENET_STD
@@ -72,6 +74,7 @@ def predict(
             in 16 bits, up to 255.996 m (0: unknown); overlays/NAME.jpg; and predictions.json.
     """
     if run is not None and model is None:
+        check_folder(Path(run))
         weights: str | Path = model_of_run(run)
     elif model is not None and run is None:
         weights = Path(model_file(model))
@@ -95,6 +98,7 @@ def predict(
         raise ValueError(f"`task` is {task}, but {weights} is a model for {card.task}")
     files = pictures_and_videos(paths, leave_out=None if card.task == "classification" else out)
     names = [file.name for file in files]
+    check_out(out, [*names, str(weights), *([] if lens is None else [lens])])
     if lens is not None:
         lenses = given_lenses(lens, camera, coefficients, names)
     else:

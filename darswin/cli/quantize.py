@@ -10,7 +10,8 @@ import yaml
 from torch import Tensor
 from torch.utils.data import DataLoader, Subset
 
-from darswin.cli.options import FIRST_TASK
+from darswin.cli.arguments import check_out
+from darswin.cli.options import FIRST_TASK, check_folder
 from darswin.deploy.quantize import Change, quantize_model
 from darswin.layers.quantized import quantized_layers
 from darswin.lens import Lens
@@ -48,7 +49,9 @@ def quantize(
     """
     if pictures < 1:
         raise ValueError(f"`pictures` must be at least 1, got {pictures}")
+    check_folder(Path(run))
     weights = model_of_run(run)
+    check_out(out, [str(weights)])
     model, card = load_model(weights)
     data = _data_of(Path(run))
     with Progress("reading training pictures"):

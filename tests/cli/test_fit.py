@@ -127,7 +127,7 @@ def test_errors_before_the_slow_imports(capsys, tmp_path, monkeypatch, options, 
     assert message in error(capsys, "fit", "--run", "r", *options)
 
 
-@pytest.mark.parametrize("command", ["fit", "validate", "test"])
+@pytest.mark.parametrize("command", ["fit", "validate", "test", "quantize"])
 def test_a_file_is_no_run(capsys, tmp_path, command):
     folder = tmp_path / "checkpoints"
     folder.mkdir()

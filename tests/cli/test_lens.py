@@ -100,6 +100,12 @@ def test_misuse_is_refused_before_any_work(folder, capsys, monkeypatch, options,
     [
         ("show front.json square.png", r"for 1280×966 \(W×H\) but the picture is 400×400"),
         ("show front.json none.png", r"^darswin: cannot read none.png: No such file[^(]*$"),
+        ("show front.json front.png --out front.png", "--out front.png would replace front.png"),
+        ("convert front.json front.json --model Mei", "--out front.json would replace front.json"),
+        (
+            "crop front.json ./front.json --box 0,0,9,9",
+            "--out ./front.json would replace",
+        ),
         ("info wrong.json", "wrong.json"),
         ("info bare.json", "lacks the size of its images: give --image_size, their height"),
         ("draw front.json", "invalid choice: 'draw'"),

@@ -104,6 +104,15 @@ def test_the_most_probable_classes(run, capsys):
         ("p.png --run .", "missing --lens: give the camera"),
         ("--lens L --run .", "missing pictures or videos"),
         ("p.png --model digits", "missing --lens: give the camera"),
+        (
+            "p.png --run checkpoints/best.safetensors --lens L",
+            "--run names the folder .* a file",
+        ),
+        (
+            "p.png --run . --lens L --out p.png",
+            r"--out p\.png would replace p\.png, which this",
+        ),
+        ("p.png --run . --lens lens.json --out ./lens.json", r"would replace lens\.json"),
         ("p.png --run . --lens L --every 0", "--every must be at least 1, got 0"),
         ("p.png --run . --lens L --task distance", r"--task is distance, but .*best\.safe"),
         ("checkpoints --run . --lens L", "no pictures or videos in checkpoints"),
@@ -115,6 +124,7 @@ def test_the_most_probable_classes(run, capsys):
 )
 def test_what_is_wrong_is_named(run, monkeypatch, argv, said):
     monkeypatch.chdir(run)
+    (run / "lens.json").write_text(json.dumps(CIRCLE))
     words = [json.dumps(LENS) if word == "L" else word for word in argv.split()]
     with pytest.raises(SystemExit, match=said):
         main(["predict", *words])
