@@ -48,8 +48,8 @@ def shortfalls(task: Task) -> list[str]:
     if steps < FEW_STEPS:
         found.append(
             f"{steps} steps are too few to learn from scratch, which takes {FEW_STEPS} at least: "
-            "take a smaller --data.batch_size, more --trainer.max_epochs, --model.weights of a "
-            "trained model, or for classification --config few"
+            "take a smaller --data.batch_size, more --trainer.max_epochs, or --model.weights of a "
+            "trained model; for classification, --config few has small batches and 40 epochs"
         )
     warmup = task.warmup_epochs * task.steps_per_epoch
     if 2 * warmup > steps:

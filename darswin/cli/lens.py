@@ -191,23 +191,26 @@ def crop(
         check_option("size" if box is None else "box", side, 1 <= side <= 10**6, _SIDES)
     check_out(out, (calib,))
     file, theta_max = _calibration(calib, theta_max_deg, image_size, coefficients)
-    lens = file.lens(camera, theta_max, image_size, torch.float64)
+    lens, note = file.lens(camera, theta_max, image_size, torch.float64), ""
     if box is not None:
-        _check_box(box, lens)
+        note = _check_box(box, lens)
         lens = lens.cropped(*box)
     if size is not None:
         lens = lens.resized(size)
-    _write(lens, out, format)
+    _write(lens, out, format, note)
 
 
-def _check_box(box: tuple[int, int, int, int], lens: Lens) -> None:
-    """ValueError for a box beside the pictures of a lens."""
+def _check_box(box: tuple[int, int, int, int], lens: Lens) -> str:
+    """A note on a box beyond the pictures of a lens; ValueError for a box beside them."""
     if lens.image_size is None:
-        return
+        return ""
     top, left, height, width = box
     rows, columns = (round(side) for side in lens.image_size[0].tolist())
     meets = -height < top < rows and -width < left < columns
-    check_option("box", box, meets, f"a part of the picture of {columns} × {rows} px (W × H)")
+    picture = f"the picture of {columns} × {rows} px (W × H)"
+    check_option("box", box, meets, f"a part of {picture}")
+    inside = min(top, left) >= 0 and top + height <= rows and left + width <= columns
+    return "" if inside else f"; the box extends beyond {picture}, which means padding"
 
 
 def _write(lens: Lens, out: str, format: Format | None, note: str = "") -> None:

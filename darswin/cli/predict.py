@@ -92,7 +92,7 @@ def predict(
         raise ValueError("missing pictures or videos: give files or folders")
     if lens is None and run is None:
         raise ValueError("missing `lens`: give the camera's calibration file")
-    _check_paths(paths)
+    check_paths(paths)
     net, card = trained_model(weights)
     if task not in (None, card.task):
         raise ValueError(f"`task` is {task}, but {weights} is a model for {card.task}")
@@ -145,14 +145,14 @@ def pictures_and_videos(paths: Sequence[str], leave_out: str | None = None) -> l
         names = [str(path)]
         if os.path.isdir(path) and not _is_picture(path):
             below = pictures_and_videos_below(Path(path))
-            names = [n for n in below if leave_out is None or not _is_below(n, leave_out)]
+            names = [n for n in below if leave_out is None or not is_below(n, leave_out)]
             for name in names:
                 check_is_file(name)
         files += [File(name, not _is_picture(name) and is_video(name)) for name in names]
     return files
 
 
-def _check_paths(paths: Sequence[str]) -> None:
+def check_paths(paths: Sequence[str]) -> None:
     """FileNotFoundError that lists all missing files; ValueError for pipes, devices and sockets."""
     if missing := [path for path in paths if not os.path.exists(path)]:
         raise FileNotFoundError(f"there is no file or folder {', '.join(missing)}")
@@ -164,7 +164,7 @@ def _is_picture(path: str) -> bool:
     return os.path.splitext(path)[1].lower() in PICTURES
 
 
-def _is_below(path: str, folder: str) -> bool:
+def is_below(path: str, folder: str) -> bool:
     return Path(os.path.realpath(path)).is_relative_to(os.path.realpath(folder))
 
 

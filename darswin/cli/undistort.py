@@ -67,7 +67,7 @@ def undistort(
     """
     # These import OpenCV, Pillow and the models; other commands of `lens` do not need them.
     from darswin.cli.answers import claim_folder, relative_names
-    from darswin.cli.predict import _is_below, pictures_and_videos
+    from darswin.cli.predict import check_paths, is_below, pictures_and_videos
     from darswin.data.cameras import Calibrations, is_json
     from darswin.utils.image import BrokenImageError
     from darswin.utils.progress import Progress
@@ -82,7 +82,8 @@ def undistort(
         check_option("size", size, view != "square" or size[0] == size[1], "square for this view")
     if not paths:
         raise ValueError("missing pictures or videos: give files or folders")
-    if inside := [path for path in paths if _is_below(path, out)]:
+    check_paths(paths)
+    if inside := [path for path in paths if is_below(path, out)]:
         raise ValueError(f"`out` must be a folder without the originals, but has {inside[0]}")
     root = "." if is_json(calib) else Path(calib).parent
     calibrations = Calibrations(calib, root, camera, coefficients)

@@ -1,6 +1,7 @@
 """The undistorted views of `darswin lens`: their options, and what they show by default."""
 
 import math
+import warnings
 from typing import Literal
 
 import torch
@@ -13,6 +14,10 @@ from darswin.viz.report import sides
 View = Literal["perspective", "cylindrical", "equirectangular", "square"]
 
 
+class NarrowView(UserWarning):
+    """The warning of a field of view that looks like radians in place of degrees."""
+
+
 def check_view(view: View, fov_deg: float | None, yaw_deg: float, pitch_deg: float) -> None:
     """ValueError for an option of a view that is out of its range."""
     for name, angle in (("yaw_deg", yaw_deg), ("pitch_deg", pitch_deg)):
@@ -22,6 +27,9 @@ def check_view(view: View, fov_deg: float | None, yaw_deg: float, pitch_deg: flo
         most = "below 180°" if flat else "at most 360°"
         in_range = 0 < fov_deg < 180 if flat else 0 < fov_deg <= 360
         check_option("fov_deg", fov_deg, in_range, f"above 0° and {most} for a {view} view")
+        if fov_deg <= 2 * math.pi:
+            text = f"`fov_deg` {fov_deg:g} is a narrow view; {fov_deg:g} rad would be "
+            warnings.warn(f"{text}{math.degrees(fov_deg):.4g}°", NarrowView, stacklevel=2)
 
 
 def view_of(

@@ -220,6 +220,8 @@ def _entries(path: Path, root: Path) -> Mapping[str, Any] | None:
     """The entries of a lenses.json; None for a calibration file, or a file of another program."""
     if not os.path.exists(path):
         raise FileNotFoundError(f"there is no calibration file {path}")
+    if path.is_dir():
+        raise ValueError(f"{path} is a folder, but must be a calibration file")
     check_is_file(path)
     try:
         content = read_json(path)

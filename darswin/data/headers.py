@@ -1,7 +1,7 @@
 """Finds the files that a training could not use, before it begins."""
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 
 from darswin.data.samples import Samples
@@ -13,17 +13,37 @@ _READ = 8  # pictures that are read whole
 _AT_ONCE = 1024  # files that wait for a thread
 
 
-def check_files(samples: Samples, what: str) -> None:
+def check_files(parts: Mapping[str, Samples]) -> None:
     """Raises one error for all pictures, targets and lenses that `samples[i]` would refuse, as far
     as the headers of the files tell.
 
-    A file whose header or end may be damaged is read whole, and so are a few others, because
-    headers do not tell the ids of labels. Broken files are no fault if `skip_broken`. `what` names
-    the samples in signs of life.
+    A file whose header or end may be damaged is read whole. Headers do not tell the ids of labels,
+    so a few other files are read whole too, and all of them if these have a fault. Broken files are
+    no fault if `skip_broken`.
+
+    Args:
+        parts: the samples by names for the signs of life.
 
     Raises:
         BrokenImageError: only broken files. ValueError: also files that do not fit each other.
     """
+    faults = [fault for what, samples in parts.items() for fault in _faults(samples, what)]
+    if len(faults) == 1:
+        raise faults[0]
+    if faults:
+        count = sum(map(len, parts.values()))
+        lines = [
+            f"{len(faults)} of {count} pictures cannot be used:",
+            *map(str, faults[:SHOWN]),
+        ]
+        if len(faults) > SHOWN:
+            lines.append(f"and {len(faults) - SHOWN} more")
+        broken = all(isinstance(fault, BrokenImageError) for fault in faults)
+        raise (BrokenImageError if broken else ValueError)("\n  ".join(lines))
+
+
+def _faults(samples: Samples, what: str) -> list[Exception]:
+    """The errors of samples that cannot be used."""
     count = len(samples)
     faults: list[Exception] = []
     with (
@@ -32,28 +52,30 @@ def check_files(samples: Samples, what: str) -> None:
         Progress(f"reading the headers of {what}", count) as progress,
     ):
         warnings.filterwarnings("ignore", module=r"PIL\.")
+        some = range(0, count, -(-count // _READ) or 1)
+        read = {k: _fault(samples, k, None) for k in some}
+        hidden = any(read[k] and not _fault(samples, k, _headers(samples, k)) for k in some)
         for start in range(0, count, _AT_ONCE):
             part = range(start, min(start + _AT_ONCE, count))
-            found = pool.map(lambda k: _headers(samples, k), part)
+            found = pool.map(lambda k: None if hidden else _headers(samples, k), part)
             for index, headers in zip(part, found, strict=True):
-                if index % -(-count // _READ) == 0:
-                    headers = None
-                try:
-                    samples.check(index, headers)
-                except BrokenImageError as error:
-                    if not samples.skip_broken:
-                        faults.append(error)
-                except ValueError as error:
-                    faults.append(error)
+                fault = read[index] if index in read else _fault(samples, index, headers)
+                faults += [] if fault is None else [fault]
                 progress.done += 1
-    if len(faults) == 1:
-        raise faults[0]
-    if faults:
-        lines = [f"{len(faults)} of {count} pictures cannot be used:", *map(str, faults[:SHOWN])]
-        if len(faults) > SHOWN:
-            lines.append(f"and {len(faults) - SHOWN} more")
-        broken = all(isinstance(fault, BrokenImageError) for fault in faults)
-        raise (BrokenImageError if broken else ValueError)("\n  ".join(lines))
+    return faults
+
+
+def _fault(
+    samples: Samples, index: int, headers: Sequence[Header] | None
+) -> BrokenImageError | ValueError | None:
+    """The error of a sample that cannot be used; None for `headers` reads its files whole."""
+    try:
+        samples.check(index, headers)
+    except BrokenImageError as error:
+        return None if samples.skip_broken else error
+    except ValueError as error:
+        return error
+    return None
 
 
 def _headers(samples: Samples, index: int) -> Sequence[Header] | None:

@@ -242,8 +242,7 @@ class RunData(LightningDataModule):
 
     def check(self, splits: Sequence[Split]) -> None:
         """Raises one error for all files of these splits that a training could not use."""
-        for split in splits:
-            check_files(self.dataset(split), f"the pictures of {split!r}")
+        check_files({f"the pictures of {split!r}": self.dataset(split) for split in splits})
 
     def train_dataloader(self) -> ResumableLoader:
         """The batches of the training split, in an order that can be resumed."""

@@ -95,9 +95,26 @@ def test_misuse_is_refused_before_any_work(folder, capsys, monkeypatch, options,
     assert line.startswith("darswin") and re.search(said, line)
 
 
+def test_a_box_beyond_the_picture_is_told(folder, capsys, monkeypatch):
+    monkeypatch.chdir(folder)
+    for box, told in (("0,160,966,966", False), ("100,200,900,900", True), ("-1,0,9,9", True)):
+        main(["lens", "crop", "front.json", "out.json", f"--box={box}"])
+        assert ("beyond the picture of 1280 × 966 px" in capsys.readouterr().out) == told
+
+
+def test_radians_in_place_of_degrees_are_told(folder, capsys, monkeypatch):
+    monkeypatch.chdir(folder)
+    main(
+        ["lens", "show", "front.json", "front.png", "--fov_deg", "1.5", "--rings=2", "--sectors=4"]
+    )
+    assert "--fov_deg 1.5 is a narrow view; 1.5 rad would be 85.94°" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("argv", "said"),
     [
+        ("undistort . front.json --out new", ". is a folder, but must be a calibration file"),
+        ("undistort front.json fotos --out new", "there is no file or folder fotos$"),
         ("show front.json square.png", r"for 1280×966 \(W×H\) but the picture is 400×400"),
         ("show front.json none.png", r"^darswin: cannot read none.png: No such file[^(]*$"),
         ("show front.json front.png --out front.png", "--out front.png would replace front.png"),

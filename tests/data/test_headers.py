@@ -88,7 +88,7 @@ def refused(samples, index):
 
 def told(samples):
     try:
-        check_files(samples, "photos")
+        check_files({"photos": samples})
     except (BrokenImageError, ValueError) as error:
         return error
     return None
@@ -118,17 +118,17 @@ def test_all_faults_are_listed_at_once(tmp_path):
         CHANGES[kinds[k % 5]](source.file(k))
     of_lenses, calibrated = of_photos(source)
     with pytest.raises(BrokenImageError) as error:
-        check_files(of_lenses, "photos")
+        check_files({"photos": of_lenses})
     first, *lines = str(error.value).splitlines()
     assert first == "11 of 20 pictures cannot be used:" and len(lines) == 11
     assert all(str(source.file(k)) in "".join(lines) for k in (0, 1, 2, 3, 5, 6, 7, 8, 10, 11))
     assert lines[-1] == "  and 1 more"
     with pytest.raises(ValueError, match=r"13 of 20 .*\n(.*\n){10}  and 3 more$") as error:
-        check_files(calibrated, "photos")
+        check_files({"photos": calibrated})
     assert "the calibration is for 40×30" in str(error.value)
     *_, calibrated = of_photos(source, skip_broken=True)
     with pytest.raises(ValueError, match="2 of 20 pictures cannot be used"):
-        check_files(calibrated, "photos")
+        check_files({"photos": calibrated})
 
 
 def test_headers_alone_are_read(tmp_path, monkeypatch):
@@ -144,14 +144,14 @@ def test_headers_alone_are_read(tmp_path, monkeypatch):
     source = write_photos(tmp_path / "photos", "png", 20)
     headers.clear()  # some were read to find the channels
     for samples in of_photos(source):
-        check_files(samples, "photos")
+        check_files({"photos": samples})
     assert len(headers) == 2 * 20 and len(decoded) == 2 * 7
     write_plain(tmp_path / "scenes", 9)
     for target in ("labels", "distance"):
         scenes = open_scenes(tmp_path / "scenes", "all", target)
         headers.clear()
         decoded.clear()
-        check_files(SceneSamples(scenes, size=16), "scenes")
+        check_files({"scenes": SceneSamples(scenes, size=16)})
         pictures = [path for _, path, *_ in decoded if "images" in str(path)]
         assert len(pictures) == 5 and len(headers) == 2 * 9 + 5 * (target == "labels")
     CHANGES["cut in the middle"](source.file(4))
@@ -186,7 +186,7 @@ def test_scenes(tmp_path, target, name, change):
         (tmp_path / "distance" / "001.png").unlink()
         np.save(tmp_path / name, np.ones((121, 160), np.float32))
     samples = SceneSamples(open_scenes(tmp_path, "all", target), size=16)
-    check_files(samples, "scenes")
+    check_files({"scenes": samples})
     change(tmp_path / name)
     if name.startswith("lens"):  # lenses are read once
         samples = SceneSamples(open_scenes(tmp_path, "all", target), size=16)
@@ -208,11 +208,25 @@ def test_some_labels_are_read(tmp_path):
         pytest.warns(OddLabels) as warned,
         pytest.raises(ValueError, match=r"006\.png holds the ids \[9\], but the 3 classes"),
     ):
-        check_files(samples, "scenes")
+        check_files({"scenes": samples})
     assert len(warned) == 1
+
+
+def test_a_fault_that_headers_hide_makes_all_files_be_read(tmp_path):
+    """The error counts the faults of all splits, not those of the few files that are read first."""
+    for name, count in (("a", 20), ("b", 12)):
+        write_plain(tmp_path / name, count)
+        for file in (tmp_path / name / "labels").iterdir():
+            if int(file.stem) % 2 == 0:
+                file.write_bytes(png(np.full((121, 160), 7, np.uint8)))
+    parts = {
+        name: SceneSamples(open_scenes(tmp_path / name, "all", "labels"), size=16) for name in "ab"
+    }
+    with pytest.raises(ValueError, match=r"^16 of 32 pictures cannot be used:(?s:.*)and 6 more$"):
+        check_files(parts)
 
 
 def test_pictures_in_memory_have_no_files():
     source = open_source("digits", "train", channels=1)
     options = dict(size=16, render=32, mean=[0.4], std=[0.2])
-    check_files(WideAngle(source, parse_lenses("low"), **options), "digits")
+    check_files({"digits": WideAngle(source, parse_lenses("low"), **options)})

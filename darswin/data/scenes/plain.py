@@ -82,7 +82,8 @@ def _classes(folder: Path, root: Path) -> Classes:
             return read_palette(place / "classes.json")
     raise FileNotFoundError(
         f"no classes.json in {root}: name the classes of the ids 0, 1, … there, for example "
-        '{"names": ["road", "car"], "colors": [[128, 64, 128], [0, 0, 142]]}, or give `classes`'
+        '{"names": ["road", "car"], "colors": [[128, 64, 128], [0, 0, 142]]}, or give `classes`. '
+        'A `label_map` names them too, for example {"0": "background", "255": "car"} for masks'
     )
 
 
