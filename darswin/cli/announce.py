@@ -42,6 +42,15 @@ class Announce(Callback):
                 say(f"darswin: {line}")
 
 
+class EpochLines(Callback):
+    """Prints a line with the scores of each epoch, for logs, where a progress bar fills pages."""
+
+    def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        scores = trainer.progress_bar_metrics.items()
+        shown = ", ".join(f"{name} {value:.4g}" for name, value in scores)
+        say(f"epoch {trainer.current_epoch + 1}, step {trainer.global_step}: {shown}")
+
+
 def shortfalls(task: Task) -> list[str]:
     """What is wrong with the number of steps: fewer than `FEW_STEPS`, or half of them warm-up."""
     steps, found = task.steps, []

@@ -9,6 +9,7 @@ import contextlib
 import logging
 import re
 import shutil
+import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -24,7 +25,14 @@ from lightning.pytorch.strategies.launchers import _SubprocessScriptLauncher
 from lightning.pytorch.utilities import rank_zero_only
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
-from darswin.cli.announce import Announce, how_to_resume, say, say_stopped, say_the_end
+from darswin.cli.announce import (
+    Announce,
+    EpochLines,
+    how_to_resume,
+    say,
+    say_stopped,
+    say_the_end,
+)
 from darswin.cli.arguments import with_lists
 from darswin.cli.options import (
     ALL,
@@ -246,7 +254,9 @@ class RunCLI(LightningCLI):
         if given.enable_progress_bar is not False and not any(
             isinstance(c, ProgressBar) for c in callbacks
         ):
-            callbacks.append(RunProgressBar())
+            terminal = sys.stdout.isatty() or given.enable_progress_bar
+            callbacks.append(RunProgressBar() if terminal else EpochLines())
+            kwargs["enable_progress_bar"] = bool(terminal)
         if self.subcommand == "fit":
             callbacks = self._fit_callbacks(callbacks, config)
         elif self.subcommand == "test":

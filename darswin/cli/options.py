@@ -206,7 +206,7 @@ TRAINER = {
     "trainer.check_val_every_n_epoch": "the number of epochs between validations",
     "trainer.log_every_n_steps": "the number of steps between lines of the logs",
     "trainer.logger": "false switches the logs off",
-    "trainer.enable_progress_bar": "true shows a progress bar",
+    "trainer.enable_progress_bar": "true shows a progress bar, null only on a terminal",
 }
 GROUPS = {"data": "pictures and lenses", "model": "the model and its training"}
 # The other commands take the path from the run.

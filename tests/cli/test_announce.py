@@ -98,6 +98,7 @@ for words in json.loads(sys.argv[1]):
 """
 NUMBER = r"[\d.,–-]+"
 OURS = [
+    r"epoch \d+, step \d+: train/loss ",
     rf"darswin_a_nano with {NUMBER} parameters; {NUMBER} training and {NUMBER} validation pictures",
     r"darswin: \d+ steps are too few to learn from scratch",
     r"darswin: the learning rate rises during 2 of the 2 steps: ",
@@ -114,9 +115,9 @@ OURS = [
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("bar", [False, True])
+@pytest.mark.parametrize("bar", [False, None, True])
 def test_fit_validate_and_test_print_only_our_own_lines(tmp_path, bar):
-    shown = ["--trainer.enable_progress_bar", str(bar).lower()]
+    shown = ["--trainer.enable_progress_bar", json.dumps(bar)]
     start = ["fit", "--run", "run", "--config", "minutes", "--data.path", "digits"]
     start += ["--data.limit", "96", "--trainer.max_epochs", "2", *shown]
     commands = [
@@ -131,6 +132,7 @@ def test_fit_validate_and_test_print_only_our_own_lines(tmp_path, bar):
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     lines = [line.strip() for line in (done.stdout + done.stderr).splitlines()]
+    assert any(line.startswith("epoch 2, step 4: train/loss ") for line in lines) == (bar is None)
     if bar:
         ends = r"(Training|Epoch \d+|Validation|Validation DataLoader \d|Testing|Testing DataLoader"
         lines = [re.split(r"(?<=.)\r", line)[-1] for line in lines]

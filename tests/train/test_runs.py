@@ -261,7 +261,7 @@ def test_one_fit_at_a_time(begun, capsys):
 
 
 def test_few_steps_are_logged_and_the_progress_bar_shows_no_folder(tmp_path, capsys):
-    shown = ["--trainer.log_every_n_steps", "50", "--trainer.enable_progress_bar", "null"]
+    shown = ["--trainer.log_every_n_steps", "50", "--trainer.enable_progress_bar", "true"]
     fit(tmp_path, *DIGITS, *shown, "--trainer.max_epochs", "1", "--devices", "1")
     assert yaml.safe_load((tmp_path / "config.yaml").read_text())["trainer"]["devices"] == 1
     lines = table(next(tmp_path.glob("csv/*/metrics.csv")))
