@@ -46,6 +46,11 @@ def read_text(path: str | Path) -> str:
         raise ValueError(f"{path}: {error}") from error
 
 
+def is_json_file(path: str | Path) -> bool:
+    """Whether the suffix of a file is that of JSON, in any case."""
+    return Path(path).suffix.lower() == ".json"
+
+
 def parse_json(text: str) -> Any:
     """The content of JSON; ValueError if it is invalid, or if an object has a name twice."""
     return json.loads(text, object_pairs_hook=mapping)

@@ -41,7 +41,7 @@ def photos(tmp_path):
     return tmp_path / "photos"
 
 
-@pytest.mark.parametrize("name", ["classes.txt", "classes.json"])
+@pytest.mark.parametrize("name", ["classes.txt", "classes.json", "classes.JSON"])
 def test_classes(tmp_path, photos, encode, name):
     content = "Käfer\ndog\n" if name.endswith("txt") else ["Käfer", "dog"]
     source = open_source(photos, "train", classes=encode(tmp_path / name, content))
