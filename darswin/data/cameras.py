@@ -14,7 +14,7 @@ from darswin.lens.curves import as_curves, form_of
 from darswin.lens.files.load import FORMATS, Calibration
 from darswin.lens.orientation import in_upright_picture, stored_size
 from darswin.utils.files import check_is_file
-from darswin.utils.text import parse_json, read_json, to_text
+from darswin.utils.text import is_json_file, parse_json, read_json, to_text
 
 _ALL = PurePosixPath(".")
 _NOMINAL = (1024, 1024)  # px, for a calibration without a size where no picture has one
@@ -284,7 +284,7 @@ def _are_curves(cameras: Sequence[PictureCamera]) -> bool:
 
 def _form_of(file: str) -> Hashable:
     """The content of a JSON calibration without its numbers; the name of any other file."""
-    if not file.endswith(".json"):
+    if not is_json_file(file):
         return file
     try:
         return _without_numbers(parse_json(to_text(Path(file).read_bytes())))

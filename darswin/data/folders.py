@@ -17,6 +17,7 @@ from darswin.data.splits import (
     read_split_lists,
     some,
     split_folders,
+    split_of_each,
     taken_from,
     warn_left_out,
 )
@@ -243,7 +244,7 @@ def _kinds(paths: Iterable[str]) -> str:
 
 def _listed(root: Path, lists: Path) -> dict[Split, Pictures]:
     """The pictures of each split in the lists."""
-    given: dict[Split, Pictures] = {}
+    given: dict[Split, list[str]] = {}
     for split, paths in read_split_lists(lists).items():
         for path in paths:
             parts = Path(path).parts if isinstance(path, str) else ()
@@ -251,5 +252,25 @@ def _listed(root: Path, lists: Path) -> dict[Split, Pictures]:
                 raise ValueError(
                     f"{lists}: {split!r} must list paths CLASS/… below {root}, got {path!r}"
                 )
-        given[split] = Pictures(root, [os.path.normpath(path) for path in paths])
-    return given
+        given[split] = list(dict.fromkeys(map(os.path.normpath, paths)))
+    split_of = split_of_each(given, lists)
+    if missing := _missing(root, split_of):
+        raise FileNotFoundError(
+            f"{lists} lists {len(missing)} pictures that are not in {root}: {some(missing)}"
+        )
+    return {split: Pictures(root, paths) for split, paths in given.items()}
+
+
+def _missing(root: Path, paths: Iterable[str]) -> list[str]:
+    """The paths that are no files in `root`. Reading folders is faster than to look for each."""
+    there: dict[str, set[str]] = {}
+    missing: list[str] = []
+    for path in paths:
+        folder, name = os.path.split(path)
+        if folder not in there:
+            place = root / folder
+            there[folder] = set(os.listdir(place)) if place.is_dir() else set()
+        # Some systems give names in another case or form of Unicode.
+        if name not in there[folder] and not (root / path).is_file():
+            missing.append(path)
+    return missing

@@ -157,8 +157,9 @@ def open_source(
         holdout: a share, in [0, 0.5).
 
     Raises:
-        FileNotFoundError: a missing or empty folder. ValueError: ambiguous folders, or lists that
-            do not fit the folders; it names them.
+        FileNotFoundError: a missing or empty folder, or a listed picture that is missing.
+        ValueError: ambiguous folders, lists that do not fit the folders, or a picture that is
+            listed to train with and also for another split; it names them.
     """
     check_split(split, SPLITS, holdout)
     names = None if classes is None else read_classes(classes)

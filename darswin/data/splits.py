@@ -6,13 +6,13 @@ import math
 import os
 import warnings
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, Literal, Self, get_args
 
 import numpy as np
 
-from darswin.utils.text import read_json, read_text
+from darswin.utils.text import is_json_file, read_json, read_text
 
 Split = Literal["train", "val", "test"]
 SPLITS: tuple[Split, ...] = get_args(Split)
@@ -139,31 +139,42 @@ def split_folders(folders: Iterable[Path], holds: Callable[[Path], bool]) -> dic
 
 def read_split_lists(lists: Path) -> dict[Split, list]:
     """The entries of each split, from a JSON file or from a folder with a text file per split."""
+    form = f'{lists} must hold {{"train": [paths], "val": [paths], "test": [paths]}}'
     if lists.is_dir():
-        content = {
-            file.stem: read_list(file)
-            for file in sorted(lists.glob("*.txt"))
-            if file.stem.lower() in SPLIT_NAMES
-        }
+        entries: list[tuple[str, Any]] = [
+            (file.stem, read_list(file))
+            for file in sorted(lists.iterdir())
+            if file.suffix.lower() == ".txt" and file.stem.lower() in SPLIT_NAMES
+        ]
     else:
         content = read_json(lists)
-    form = f'{lists} must hold {{"train": [paths], "val": [paths], "test": [paths]}}'
-    if not isinstance(content, dict):
-        raise ValueError(form)
+        if not isinstance(content, dict):
+            raise ValueError(form)
+        entries = list(content.items())
     given: dict[Split, list] = {}
-    for name, paths in content.items():
+    for name, paths in entries:
         split = SPLIT_NAMES.get(name.lower())
         if split is None or split in given:
-            raise ValueError(f"{form}, got {list(content)}")
+            raise ValueError(f"{form}, got {[name for name, _ in entries]}")
         if not isinstance(paths, list):
             raise ValueError(f"{form}, got {paths!r} for {name!r}")
         given[split] = paths
     return given
 
 
+def split_of_each(given: Mapping[Split, Iterable[str]], lists: Path) -> dict[str, Split]:
+    """The split of each path in lists; ValueError for one to train with and also in another."""
+    split_of: dict[str, Split] = {}
+    for split, paths in given.items():
+        for path in paths:
+            if split_of.setdefault(path, split) != split and "train" in (split_of[path], split):
+                raise ValueError(f"{lists} lists {path} for {split_of[path]!r} and for {split!r}")
+    return split_of
+
+
 def read_list(path: str | Path) -> list[str]:
     """The names in a text file, one per line, or in a JSON list."""
-    if Path(path).suffix != ".json":
+    if not is_json_file(path):
         return [line.strip() for line in read_text(path).splitlines() if line.strip()]
     names = read_json(path)
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
@@ -172,8 +183,9 @@ def read_list(path: str | Path) -> list[str]:
 
 
 def read_classes(path: str | Path) -> list[str]:
-    """The names of classes in a file, as for `read_list`; ValueError for repeated names."""
-    names = read_list(path)
+    """The names of classes in a file, as for `read_list`, without a slash at the end, as shells
+    write the names of folders; ValueError for repeated names."""
+    names = [name.rstrip("/") for name in read_list(path)]
     if not names:
         raise ValueError(f"{path} must list the classes, but is empty")
     if twice := [name for name, count in Counter(names).items() if count > 1]:

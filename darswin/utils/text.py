@@ -9,14 +9,17 @@ from pathlib import Path
 from typing import Any
 
 _MARKS = {
-    codecs.BOM_UTF8: "utf-8-sig",
+    codecs.BOM_UTF8: "utf-8",
+    codecs.BOM_UTF32_LE: "utf-32",  # begins with the mark of UTF-16
+    codecs.BOM_UTF32_BE: "utf-32",
     codecs.BOM_UTF16_LE: "utf-16",
     codecs.BOM_UTF16_BE: "utf-16",
 }
 
 
 def to_text(data: bytes) -> str:
-    """The text of a file in UTF-8, or in UTF-16 with a byte order mark; line ends become "\\n".
+    """The text of a file in UTF-8, or in UTF-16 or UTF-32 with a byte order mark, without marks;
+    line ends become "\\n".
 
     Raises:
         ValueError: the bytes are no such text.
@@ -26,6 +29,12 @@ def to_text(data: bytes) -> str:
         text = data.decode(encoding)
     except UnicodeDecodeError as error:
         raise ValueError(f"it must be text in UTF-8: {error}") from error
+    if "\0" in text:
+        raise ValueError(
+            "it must be text in UTF-8, or in UTF-16 or UTF-32 with a byte order mark, but has NUL "
+            "characters, as UTF-16 without a byte order mark"
+        )
+    text = text.lstrip("\ufeff")  # some programs add a mark to the one that is there
     return text.replace("\r\n", "\n").replace("\r", "\n")
 
 
@@ -35,6 +44,11 @@ def read_text(path: str | Path) -> str:
         return to_text(Path(path).read_bytes())
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
+
+
+def is_json_file(path: str | Path) -> bool:
+    """Whether the suffix of a file is that of JSON, in any case."""
+    return Path(path).suffix.lower() == ".json"
 
 
 def parse_json(text: str) -> Any:

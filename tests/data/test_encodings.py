@@ -15,6 +15,8 @@ ENCODINGS = {
     "UTF-8 with a mark": lambda text: text.encode("utf-8-sig"),
     "UTF-16, little endian": lambda text: codecs.BOM_UTF16_LE + text.encode("utf-16-le"),
     "UTF-16, big endian": lambda text: codecs.BOM_UTF16_BE + text.encode("utf-16-be"),
+    "UTF-32, little endian": lambda text: codecs.BOM_UTF32_LE + text.encode("utf-32-le"),
+    "UTF-8 with two marks": lambda text: codecs.BOM_UTF8 + text.encode("utf-8-sig"),
     "line ends of Windows": lambda text: text.replace("\n", "\r\n").encode(),
 }
 
@@ -39,7 +41,7 @@ def photos(tmp_path):
     return tmp_path / "photos"
 
 
-@pytest.mark.parametrize("name", ["classes.txt", "classes.json"])
+@pytest.mark.parametrize("name", ["classes.txt", "classes.json", "classes.JSON"])
 def test_classes(tmp_path, photos, encode, name):
     content = "Käfer\ndog\n" if name.endswith("txt") else ["Käfer", "dog"]
     source = open_source(photos, "train", classes=encode(tmp_path / name, content))

@@ -68,8 +68,10 @@ def test_class_lists_choose_and_order(tmp_path):
     assert open_source(tmp_path, "train").classes == ["bus", "car", "test", "train"]
     (tmp_path / "empty").mkdir()  # no class of the list
     (tmp_path / "names.txt").write_text("test\ncar\n")
-    (tmp_path / "names.json").write_text('["test", "car"]')
-    for name in ("names.txt", "names.json"):
+    (tmp_path / "folders.txt").write_text("test/\ncar/\n")
+    for name in ("names.json", "names.JSON"):
+        (tmp_path / name).write_text('["test", "car"]')
+    for name in ("names.txt", "folders.txt", "names.json", "names.JSON"):
         source = open_source(tmp_path, "train", classes=tmp_path / name)
         assert source.classes == ["test", "car"] and len(source) == 16
         assert source.paths[0].startswith(b"test/") and source.labels[0] == 0
@@ -202,13 +204,18 @@ def test_pictures_and_videos_below_a_folder(tmp_path):
         ({"train": ["1.jpg"]}, r"must list paths CLASS/… .*, got '1\.jpg'"),
         ({"train": ["/a/1.jpg"]}, "must list paths CLASS/…"),
         ({"train": ["../a/1.jpg"]}, "must list paths CLASS/…"),
+        ({"train": ["a/1.jpg"], "val": ["./a/1.jpg"]}, r"lists a/1\.jpg for 'train' and for 'val'"),
+        ({"test": ["a//2.jpg"], "train": ["a/2.jpg"]}, "lists a/2.jpg for 'test' and for 'train'"),
+        ({"train": ["a/1.jpg", "a/7.jpg"]}, r"lists 1 pictures that are not in .*: \['a/7\.jpg'\]"),
+        ({"train": ["a/1.jpg"], "val": ["c/1.jpg"]}, r"lists 1 pictures .*: \['c/1\.jpg'\]"),
         ({"train": ["a/1.jpg"], "valid": ["b/1.jpg"]}, r"\['b'\], but the training split lacks"),
     ],
 )
 def test_lists_that_are_wrong(tmp_path, lists, message):
     file = tmp_path / "splits.json"
     file.write_text(lists if isinstance(lists, str) else json.dumps(lists))
-    with pytest.raises(ValueError, match=message):
+    touch(tmp_path, "a/1.jpg", "a/2.jpg", "b/1.jpg")
+    with pytest.raises((ValueError, FileNotFoundError), match=message):
         open_source(tmp_path, "train", splits=file)
     with pytest.raises(ValueError, match="`splits` is for folders"):
         open_source("digits", "train", splits=file)
@@ -217,6 +224,7 @@ def test_lists_that_are_wrong(tmp_path, lists, message):
 def test_lists_of_splits(tmp_path):
     lists = {"train": ["dog/01.png", "cat/02.png"], "val": ["cat/03.png"], "test": []}
     (tmp_path / "splits.json").write_text(json.dumps(lists))
+    touch(tmp_path, *lists["train"], *lists["val"])
     (tmp_path / "lists").mkdir()
     for name, paths in lists.items():
         (tmp_path / "lists" / f"{name}.txt").write_text("\n".join(paths))
@@ -227,7 +235,8 @@ def test_lists_of_splits(tmp_path):
         with pytest.raises(FileNotFoundError, match="no images for the 'test' split"):
             open_source(tmp_path, "test", splits=splits)
     paths = [f"{name}/{k}.jpg" for name in "ab" for k in range(10)]
-    (tmp_path / "train.txt").write_text("\n".join(paths))
+    touch(tmp_path, *paths, "a/x.jpg")
+    (tmp_path / "TRAIN.TXT").write_text("\n".join([*paths, paths[0], f"./{paths[1]}"]))  # once
     assert counts(tmp_path, splits=tmp_path) == [16, 2, 2]  # a split without a list is held out
     (tmp_path / "validation.txt").write_text("a/x.jpg")
     assert counts(tmp_path, splits=tmp_path) == [20, 1, 1]

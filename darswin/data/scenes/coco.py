@@ -10,11 +10,12 @@ Source: Kirillov et al., Panoptic Segmentation, CVPR 2019, and cocodataset.org/#
 """
 
 import os
+import reprlib
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import cv2
 import numpy as np
@@ -27,6 +28,9 @@ from darswin.utils.image import decoded, file_content
 from darswin.utils.text import read_json
 
 COLORS = 1 << 24
+T = TypeVar("T")
+_KINDS: dict[type, str] = {int: "a whole number", str: "a text", list: "a list"}
+_FORM = "is not in COCO's panoptic format"
 
 
 class Segments(NamedTuple):
@@ -48,14 +52,16 @@ def open_coco(root: Path, options: Options) -> Scenes:
     part, choose = options.choose_part(parts, root)
     file = parts[part]
     content = read_json(file)
-    try:
-        categories, annotations = content["categories"], content["annotations"]
-        own = [category["name"] for category in categories]
-        colors = [category["color"] for category in categories if "color" in category]
-        ids = {category["id"]: k for k, category in enumerate(categories)}
-        named = [(str(a["file_name"]), list(a["segments_info"])) for a in annotations]
-    except (KeyError, TypeError) as error:
-        raise ValueError(f"{file} is not in COCO's panoptic format: it lacks {error}") from error
+    if not isinstance(content, dict):
+        raise ValueError(f"{file} {_FORM}: it must be a JSON object, got {reprlib.repr(content)}")
+    categories = _objects(content, "categories", file)
+    own = [_entry(category, "name", str, file) for category in categories]
+    colors = [category["color"] for category in categories if "color" in category]
+    ids = {_entry(category, "id", int, file): k for k, category in enumerate(categories)}
+    named = [
+        (_entry(annotation, "file_name", str, file), _objects(annotation, "segments_info", file))
+        for annotation in _objects(content, "annotations", file)
+    ]
     if len(ids) < len(own):
         counts = Counter(category["id"] for category in categories)
         raise ValueError(f"{file} defines the category {counts.most_common(1)[0][0]} twice")
@@ -92,6 +98,27 @@ def _files(root: Path) -> dict[Split, Path]:
     return {split: files[0] for split, files in found.items() if files}
 
 
+def _objects(parent: Mapping, name: str, file: Path) -> list[Mapping]:
+    """The list of objects that `parent` has under a name."""
+    entries = _entry(parent, name, list, file)
+    if wrong := [entry for entry in entries if not isinstance(entry, dict)]:
+        raise ValueError(
+            f"{file} {_FORM}: {name!r} must list objects, got {reprlib.repr(wrong[0])}"
+        )
+    return entries
+
+
+def _entry(parent: Mapping, name: str, kind: type[T], file: Path) -> T:
+    if name not in parent:
+        raise ValueError(f"{file} {_FORM}: it lacks {name!r} in {reprlib.repr(parent)}")
+    value = parent[name]
+    if type(value) is not kind:
+        raise ValueError(
+            f"{file} {_FORM}: {name!r} must be {_KINDS[kind]}, got {reprlib.repr(value)}"
+        )
+    return value
+
+
 def _first(folder: Path, other: Path) -> Path:
     return folder if folder.is_dir() else other
 
@@ -107,14 +134,13 @@ def _segments(infos: Sequence[Mapping], class_of: Mapping[int, int], where: str)
     """The segments of a PNG, and 0 for no segment."""
     found = {-1: IGNORE, 0: IGNORE}  # no colour is -1, so that the table is never empty
     for info in infos:
-        try:
-            id_, category = info["id"], info["category_id"]
-        except (KeyError, TypeError) as error:
-            raise ValueError(f"{where}: a segment has no {error}") from error
-        if category not in class_of:
+        if missing := [name for name in ("id", "category_id") if name not in info]:
+            raise ValueError(f"{where}: a segment has no {missing[0]!r}")
+        id_, category = info["id"], info["category_id"]
+        if type(category) is not int or category not in class_of:
             raise ValueError(
-                f"{where}: the segment {id_} has the category {category!r}, but the known "
-                f"categories are {some(list(class_of))}"
+                f"{where}: the segment {id_} has the category {reprlib.repr(category)}, but "
+                f"the known categories are {some(list(class_of))}"
             )
         if type(id_) is not int or id_ < 1:
             raise ValueError(

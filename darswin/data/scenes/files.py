@@ -15,6 +15,7 @@ from darswin.data.splits import (
     part_of_split,
     read_split_lists,
     some,
+    split_of_each,
     taken_from,
     warn_left_out,
 )
@@ -137,14 +138,11 @@ def _listed(path: Path, found: Sequence[str], named: Named | None) -> dict[Split
     if named and not path.exists():
         raise FileNotFoundError(f"no lists of splits in {path}; named splits: {sorted(named)}")
     given: dict[Split, list[str]] = {}
-    split_of: dict[str, Split] = {}
     for split, names in read_split_lists(path).items():
         if wrong := [name for name in names if not isinstance(name, str)]:
             raise ValueError(f"{path} must list names for {split!r}, got {wrong[0]!r}")
         given[split] = list(dict.fromkeys(map(stem_of, names)))
-        for stem in given[split]:
-            if split_of.setdefault(stem, split) != split and "train" in (split_of[stem], split):
-                raise ValueError(f"{path} lists {stem} for {split_of[stem]!r} and for {split!r}")
+    split_of = split_of_each(given, path)
     if left := [stem for stem in found if stem not in split_of]:
         warn_left_out(f"{path} lists {len(left)} pictures for no split, {some(left)}: left out")
     return given

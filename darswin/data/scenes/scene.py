@@ -22,7 +22,7 @@ from darswin.data.scenes.targets import (
 from darswin.data.splits import Limited, read_classes, some
 from darswin.lens import Lens
 from darswin.utils.image import Header, read_header, read_oriented
-from darswin.utils.text import read_json
+from darswin.utils.text import is_json_file, read_json
 
 
 class Scene(NamedTuple):
@@ -182,7 +182,7 @@ class Scenes(Limited):
 
 def read_palette(path: str | Path) -> Classes:
     """The classes in a list, as for `read_classes`, or in a JSON object of "names" and "colors"."""
-    content = read_json(path) if Path(path).suffix == ".json" else None
+    content = read_json(path) if is_json_file(path) else None
     if isinstance(content, Mapping):
         return as_classes(content.get("names"), content.get("colors", []), path)
     return as_classes(read_classes(path), [], path)

@@ -60,7 +60,7 @@ def _read_ids(path: Path) -> np.ndarray:
     """The ids in a PNG of 1 to 8 bits, grey or with a palette, (H, W) uint8.
 
     They are the numbers that the file stores. A palette of different greys alone is an exception:
-    optimisers write a grey picture so, and its greys were the ids.
+    optimisers write a grey picture so, and its greys were the ids. Some pad it with black.
     """
     try:
         with warnings.catch_warnings(action="ignore"), Image.open(path, formats=["PNG"]) as file:
@@ -79,16 +79,8 @@ def _read_ids(path: Path) -> np.ndarray:
             f"{kinds.get(mode.partition(';')[0], f'colours ({mode})')}"
         )
     labels //= _SCALES.get(stored, 1)
-    if mode == "P" and _are_different_greys(colors):
-        greys = np.arange(256, dtype=np.uint8)  # also of numbers without an entry
-        greys[: len(colors)] = colors[:, 0]
-        if not np.array_equal(labels, greys[labels]):
-            _tell_once(
-                f"{path.parent} holds label PNGs whose palette has only greys, as programs that "
-                "shrink PNGs write them: their ids are these greys, not the numbers of the "
-                "palette's entries"
-            )
-        return greys[labels]
+    if mode == "P" and bool((colors == colors[:, :1]).all()):
+        return _greys_or_numbers(labels, colors[:, 0], path)
     return labels
 
 
@@ -96,8 +88,29 @@ def _read_ids(path: Path) -> np.ndarray:
 _SCALES = {"L;2": 85, "L;4": 17}
 
 
-def _are_different_greys(colors: np.ndarray) -> bool:
-    return bool((colors == colors[:, :1]).all()) and len(set(colors[:, 0])) == len(colors)
+def _greys_or_numbers(labels: np.ndarray, palette: np.ndarray, path: Path) -> np.ndarray:
+    """The ids in a PNG whose palette has only greys: its greys if they differ, apart from a padding
+    of black at the end, else the numbers of its entries."""
+    greys = np.arange(256, dtype=np.uint8)  # also of numbers without an entry
+    greys[: len(palette)] = palette
+    used = np.unique(labels)
+    if np.array_equal(greys[used], used):
+        return labels
+    known = used[used < len(palette)]
+    meant = max(known.max(initial=0), np.flatnonzero(palette).max(initial=0)) + 1
+    kind = f"{path.parent} holds label PNGs whose palette has only greys"
+    if len(set(palette[:meant])) == meant:
+        _tell_once(
+            f"{kind}, as programs that shrink PNGs write them: their ids are these greys, not the "
+            "numbers of the palette's entries"
+        )
+        return greys[labels]
+    if len(set(greys[known])) == len(known):  # else the greys cannot be ids
+        _tell_once(
+            f"{kind}, and repeats one of them: their ids are the numbers of the palette's entries; "
+            "if the greys are the ids, convert the PNGs to grey ones"
+        )
+    return labels
 
 
 @cache

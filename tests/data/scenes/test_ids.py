@@ -86,15 +86,19 @@ def test_labels_are_no_jpeg(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("greys", "bits"),
-    [([0, 2, 3], 2), ([3, 0, 2], 2), ([0, IGNORE], 1), ([7], 1), ([*range(5, 21)], 4), ([1, 0], 8)],
-)
-def test_a_palette_of_greys_is_a_grey_picture(tmp_path, greys, bits):
+    ("greys", "bits", "padding"),
+    [
+        ([0, 2, 3], 2, 0), ([3, 0, 2], 2, 0), ([0, IGNORE], 1, 0), ([7], 1, 0),
+        ([*range(5, 21)], 4, 0), ([1, 0], 8, 0), ([0, 2, 3], 2, 1), ([0, 2, 3], 8, 253),
+        ([3, 0], 2, 2), ([7], 1, 1),
+    ],
+)  # fmt: skip
+def test_a_palette_of_greys_is_a_grey_picture(tmp_path, greys, bits, padding):
     """As programs that shrink PNGs write the same picture; they sort the entries as they like."""
     stored = RANDOM.integers(len(greys), size=(9, 17), dtype=np.uint8)
     original = np.array(greys, np.uint8)[stored]
     for name in ("a", "b"):
-        content = png(stored, bits, PALETTE, [[grey] * 3 for grey in greys])
+        content = png(stored, bits, PALETTE, [[grey] * 3 for grey in greys + [0] * padding])
         (tmp_path / f"{name}.png").write_bytes(content)
     with pytest.warns(OddLabels, match=rf"{tmp_path} holds label PNGs whose palette has only"):
         assert (read_labels(tmp_path / "a.png", 256) == original).all()
@@ -107,7 +111,7 @@ def test_a_palette_of_greys_is_a_grey_picture(tmp_path, greys, bits):
     "palette",
     [
         [[0, 0, 0], [128, 0, 0], [9, 9, 9], [128, 128, 128]],  # greys among colours, as in VOC
-        [[0, 0, 0], [50, 50, 50], [128, 128, 128], [128, 128, 128]],  # no optimiser repeats one
+        [[0, 0, 0], [50, 50, 50], [128, 128, 128], [0, 0, 0]],  # no optimiser uses one twice
         [[k, k, k] for k in range(256)],  # the greys are the numbers of the entries
     ],
 )
@@ -115,6 +119,17 @@ def test_other_palettes_count_their_entries(tmp_path, palette):
     ids = RANDOM.choice(np.array([0, 3], np.uint8), size=(9, 17))
     (tmp_path / "x.png").write_bytes(png(ids, 8, PALETTE, palette))
     assert (read_labels(tmp_path / "x.png", 256) == ids).all()
+
+
+@pytest.mark.parametrize("used", [[0, 3], [0, 2], [1]])
+def test_a_grey_that_is_repeated_is_ambiguous(tmp_path, used):
+    """Predictions of `darswin` have one colour for all numbers without a class: it may be grey, and
+    the classes too."""
+    ids = RANDOM.choice(np.array(used, np.uint8), size=(9, 17))
+    palette = [[grey] * 3 for grey in (0, 50, 128, 200, 200)]
+    (tmp_path / "x.png").write_bytes(png(ids, 8, PALETTE, palette))
+    with pytest.warns(OddLabels, match="has only greys, and repeats one .* are the numbers of"):
+        assert (read_labels(tmp_path / "x.png", 256) == ids).all()
 
 
 @pytest.mark.filterwarnings("ignore::darswin.data.scenes.targets.OddLabels")

@@ -237,9 +237,15 @@ def test_coco_panoptic(tmp_path):
     unlabelled = (expected == 1) | (expected == IGNORE)
     assert (mapped[0].target == np.where(unlabelled, IGNORE, 0)).all()
     file = tmp_path / "annotations" / "panoptic_train2017.json"
-    file.write_text("{}")
-    with pytest.raises(ValueError, match=r"train2017\.json is not in COCO's panoptic format"):
-        open_scenes(tmp_path, "train", "labels")
+    for text, message in (
+        ("{}", "it lacks 'categories'"),
+        ("[]", r"must be a JSON object, got \["),
+    ):
+        file.write_text(text)
+        with pytest.raises(
+            ValueError, match=rf"json is not in COCO's panoptic format: .*{message}"
+        ):
+            open_scenes(tmp_path, "train", "labels")
     with pytest.raises(ValueError, match="looks like COCO panoptic, which has labels but no"):
         open_scenes(tmp_path, "train", "distance")
 
@@ -297,6 +303,14 @@ def with_segment(number, **entries):
     return lambda first, content: first["segments_info"][number].update(entries)
 
 
+def with_entry(name, value):
+    return lambda first, content: content.update({name: value})
+
+
+def with_first(list_, **entries):
+    return lambda first, content: content[list_][0].update(entries)
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -316,6 +330,23 @@ def with_segment(number, **entries):
             r"train2017\.json defines the category 1 twice",
         ),
         (lambda first, content: first.pop("segments_info"), "panoptic format: it lacks 'segments"),
+        (
+            with_segment(1, category_id=[1]),
+            r"the segment 300 has the category \[1\], but the known",
+        ),
+        (with_segment(1, category_id=True), "has the category True, but the known"),
+        (with_segment(1, id=[300]), r"a whole number above 0, .*, got \[300\]"),
+        (with_entry("categories", None), "format: 'categories' must be a list, got None"),
+        (with_entry("categories", {}), r"format: 'categories' must be a list, got \{\}"),
+        (with_entry("categories", ["sky"]), "format: 'categories' must list objects, got 'sky'"),
+        (with_entry("annotations", None), "format: 'annotations' must be a list, got None"),
+        (with_entry("annotations", [7]), "format: 'annotations' must list objects, got 7"),
+        (with_first("annotations", segments_info=None), "'segments_info' must be a list, got None"),
+        (with_first("annotations", segments_info=[3]), "'segments_info' must list objects, got 3"),
+        (with_first("annotations", file_name=["a"]), r"'file_name' must be a text, got \['a'\]"),
+        (with_first("categories", id=[1]), r"format: 'id' must be a whole number, got \[1\]"),
+        (with_first("categories", name=None), "format: 'name' must be a text, got None"),
+        (lambda first, content: content["categories"][0].pop("name"), "it lacks 'name' in {'"),
     ],
 )
 def test_wrong_annotations_of_coco_are_named(tmp_path, change, message):
