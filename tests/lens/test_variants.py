@@ -11,7 +11,7 @@ import torch
 import yaml
 from lens_examples import FILES, FISHEYE, PLUMB_BOB, K, f64, file_text, flat, loads, message, opencv
 
-from darswin.lens import load, load_all, to_dict
+from darswin.lens import ImplausibleLens, load, load_all, to_dict
 from darswin.lens.files.load import Calibration
 
 KB = dict(model="KannalaBrandt", radial=FISHEYE)
@@ -176,6 +176,15 @@ def test_arrays_of_numpy_in_either_order(ratio, turned, shift, tmp_path):
         assert load(path, model="fisheye").image_size.tolist() == [[height, width]], entry
 
 
+@pytest.mark.parametrize("size", [(2160, 3840), (3840, 2160)])
+@pytest.mark.parametrize("name", ["img_size", "shape"])
+def test_the_order_of_a_size_beside_the_matrix_of_a_smaller_image(name, size):
+    k = [[421.3, 0, 960.0], [0, 421.3, 540.0], [0, 0, 1]]
+    with pytest.warns(ImplausibleLens, match="of 3840 × 2160 px .* would fit 19.. × 10.. px"):
+        lens = loads(sized(K=k, **{name: size}))
+    assert lens.image_size.tolist() == [[2160, 3840]]
+
+
 def test_the_name_decides_where_the_principal_point_does_not():
     for cx, cy in ((643.1, 643.1), (200.0, 800.0), (1100.0, 100.0)):
         k = [[421.3, 0, cx], [0, 421.3, cy], [0, 0, 1]]
@@ -207,6 +216,53 @@ def test_is_fisheye_alone_names_the_model():
         loads(json.dumps(content | dict(p1=0.1)))
     with pytest.raises(ValueError, match="is_fisheye is true, but camera_model is OPENCV"):
         loads(json.dumps(content | dict(camera_model="OPENCV")))
+
+
+@pytest.mark.parametrize("inside", [False, True])
+@pytest.mark.parametrize("is_fisheye", [None, True, False])
+@pytest.mark.parametrize(
+    "other",
+    [dict(ftheta_p0=0.0, ftheta_p1=0.001, ftheta_p2=0), dict(ftheta_p4="1e-9"), dict(latlong=True),
+     dict(equirectangular=1), dict(is_orthographic="True"), dict(isLatLong="yes")],
+    ids=str,
+)  # fmt: skip
+def test_other_cameras_of_instant_ngp_are_refused(other, is_fisheye, inside):
+    content = json.loads(file_text("instant_ngp.json")) | dict(is_fisheye=is_fisheye)
+    if is_fisheye is None:
+        del content["is_fisheye"]
+    off = dict.fromkeys(other, 0)
+    name = next(name for name, value in other.items() if value)
+    if inside:
+        frame = content["frames"][0]
+        content["frames"] = [frame | off, frame | other | {"file_path": "2"}]
+        with pytest.raises(ValueError, match=rf"frames\[1\]\.{name} names another camera than"):
+            loads(json.dumps(content), camera="2")
+    else:
+        with pytest.raises(ValueError, match=f": {name} names another camera than SIMPLE_PINHOLE"):
+            loads(json.dumps(content | other))
+    content["frames"] = content["frames"][:1]
+    assert type(loads(json.dumps(content | off))).__name__ == (
+        "KannalaBrandt" if is_fisheye else "BrownConrady")  # fmt: skip
+
+
+@pytest.mark.parametrize("name", ["is_fisheye", "isFisheye", "fisheye"])
+@pytest.mark.parametrize(
+    ("value", "model"),
+    [("True", "KannalaBrandt"), ("yes", "KannalaBrandt"), (1, "KannalaBrandt"), ("1", "KannalaBr"),
+     ("TRUE", "KannalaBrandt"), ("no", "BrownConrady"), ("False", "BrownConrady"), (0, "Brown"),
+     ("maybe", None), (2, None), (None, None), ([1], None)],
+)  # fmt: skip
+def test_is_fisheye_in_any_word(name, value, model):
+    content = json.loads(file_text("instant_ngp.json"))
+    del content["is_fisheye"]
+    text, matrix = json.dumps(content | {name: value}), opencv(D=FISHEYE, **{name: value})
+    if model is None:
+        for wrong in (text, matrix):
+            with pytest.raises(ValueError, match=f"{name} must be 0 or 1, or true or false, got "):
+                loads(wrong)
+    else:
+        assert type(loads(text)).__name__.startswith(model)
+        assert type(loads(matrix)).__name__.startswith(model)
 
 
 # -- degrees in our own JSON ----------------------------------------------------------------------

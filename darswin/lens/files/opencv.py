@@ -22,13 +22,14 @@ from darswin.lens.files.fields import (
     listed,
     plain_name,
     short,
+    to_flag,
     to_number,
     to_side,
 )
 from darswin.lens.files.format import Cameras, Description, Format, Intrinsics, describe
 from darswin.lens.files.message import in_message
 from darswin.lens.frame import Size
-from darswin.lens.plausible import NEAR, off_middle
+from darswin.lens.plausible import NEAR, off_middle, swap_fits
 
 Coefficients = Literal["fisheye", "pinhole", "omnidir"]
 MODELS: tuple[Coefficients, ...] = get_args(Coefficients)
@@ -273,11 +274,7 @@ class _Reader:
             return self.model
         flag = self.find(SAYS_FISHEYE)
         if flag is not None:
-            value = self.file.entries[flag]
-            word = plain_name(str(value)) if isinstance(value, (str, int)) else ""
-            if word not in ("0", "1", "true", "false"):
-                raise ValueError(f"{flag} must be 0 or 1, got {short(value)}")
-            return "fisheye" if word in ("1", "true") else "pinhole"
+            return "fisheye" if to_flag(self.file.entries[flag], flag) else "pinhole"
         entry = self.find(SAYS_MODEL)
         if entry is not None:
             word = plain_name(self.file.text(entry))
@@ -337,7 +334,8 @@ class _Reader:
 
     def pair(self, name: str, is_shape: bool, center: tuple[float, float]) -> tuple[int, int]:
         """(H, W) of an entry with both sides. Scripts write both orders under any name: the name
-        tells the order, unless only the other one has the center near the image's middle."""
+        tells the order, unless only the other one has the center near the image's middle, or has
+        the center's ratio of x to y, as beside the matrix of a smaller image."""
         value = self.file.entries[name]
         if isinstance(value, Mapping) and "data" not in value:
             both = _Reader(self.file.section(name), None)
@@ -350,14 +348,21 @@ class _Reader:
         size, other = (first, second), (second, first)
         if not is_shape:
             size, other = other, size
-        off, other_off = (off_middle(*center, w, h) for h, w in (size, other))
-        return other if off > NEAR / 2 and other_off < min(off / 2, NEAR) else size
+        return other if swap_fits(*center, *size[::-1]) or _looks_turned(*center, *size) else size
 
     def side(self, name: str) -> int:
         """One side of an image, px, from a number or from a matrix of one."""
         if isinstance(self.file.entries.get(name), (list, Mapping)):
             return to_side(self.matrix(name, (1,))[0], self.file.path(name))
         return self.file.side(name)
+
+
+def _looks_turned(x: float, y: float, height: float, width: float) -> bool:
+    """True if x / y is far from width / height, but that of the other order, height / width."""
+    if min(x, y) <= 0 or off_middle(x, y, width, height) < NEAR:
+        return False
+    given, other = (abs(math.log(x / y / ratio)) for ratio in (width / height, height / width))
+    return given > 4 * other and other < NEAR / 2
 
 
 def _is_matrix(value: Any) -> bool:
