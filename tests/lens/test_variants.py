@@ -11,7 +11,7 @@ import torch
 import yaml
 from lens_examples import FILES, FISHEYE, PLUMB_BOB, K, f64, file_text, flat, loads, message, opencv
 
-from darswin.lens import ImplausibleLens, load, load_all, to_dict
+from darswin.lens import ImplausibleLens, Orthographic, from_dict, load, load_all, to_dict
 from darswin.lens.files.load import Calibration
 
 KB = dict(model="KannalaBrandt", radial=FISHEYE)
@@ -299,13 +299,51 @@ def test_our_json_takes_degrees(entries, radians):
         (SPHERICAL | dict(fov_deg=0), "fov_deg must be above 0 and at most 360 degrees, got 0"),
         (SPHERICAL | dict(fov_deg="wide"), "fov_deg must be above 0 .* got 'wide'"),
         (SPHERICAL | dict(fov_deg=170, theta_max_deg=80), "a Spherical lens has no theta_max_deg"),
-        (SPHERICAL | dict(fov_deg=170, focal=80), "a Spherical lens has no focal, only xi, fov,"),
+        (SPHERICAL | dict(fov_deg=170, focal=80), "fov_deg takes the place of focal, .* theta_max"),
+        (EQUIDISTANT | dict(fov=1.7), "fov takes the place of focal, .* theta_max is half of fov"),
+        (dict(model="Orthographic", fov_deg=200, image_size=[64, 64]),
+         r"fov_deg is 200, but fov must be at most 3.14\d+ rad \((180.00|179.99)°\)"),
+        (dict(model="Orthographic", focal=9, theta_max_deg=100),
+         r"theta_max_deg is 100, but theta_max must be at most 1.57\d+ rad"),
         (POLYNOMIAL | dict(fov_deg=170), "a Polynomial lens has no fov_deg, only coefficients"),
     ],
 )  # fmt: skip
 def test_wrong_angles_of_our_json(entries, said):
     with pytest.raises(ValueError, match=said):
         loads(json.dumps(entries))
+
+
+@pytest.mark.parametrize(("model", "degrees"), [("Equidistant", 360), ("Orthographic", 180)])
+@pytest.mark.parametrize("dtype", [torch.float32, f64])
+def test_the_largest_angle_is_allowed_however_it_is_given(model, degrees, dtype):
+    size = dict(model=model, image_size=[100, 100])
+    half = dict(focal=9.0, theta_max_deg=degrees / 2)
+    for entries in (dict(fov_deg=degrees), dict(fov=math.radians(degrees)), half):
+        for lens in (loads(json.dumps(size | entries), dtype=dtype), from_dict(size | entries)):
+            assert lens.theta_max.item() == pytest.approx(math.radians(degrees / 2), abs=1e-4)
+
+
+def test_a_dict_takes_degrees_like_a_file():
+    lens = from_dict(dict(model="Equidistant", fov_deg=170), (100, 100))
+    assert math.degrees(lens.theta_max.item()) == pytest.approx(85)
+    assert lens.r_max.item() == pytest.approx(50)
+    for entries, said in (
+        (dict(fov_deg=170, fov=2.9), "fov and fov_deg must not both be given"),
+        (dict(fov_deg="wide"), "fov_deg must be a number of degrees, got 'wide'"),
+        (dict(fov_deg=400), "fov_deg is 400, but fov must be"),
+        (dict(focal=9, theta_max_deg=190), "theta_max_deg is 190, but theta_max must be"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            from_dict(dict(model="Equidistant") | entries, (100, 100))
+
+
+@pytest.mark.parametrize("fov", [3.2, 2 * math.pi, 6.5])
+def test_angles_near_the_limit_are_not_taken_for_degrees(fov):
+    with pytest.raises(ValueError, match="fov must be at most") as error:
+        Orthographic.from_fov(fov, 50.0)
+    assert "radians" not in str(error.value)
+    with pytest.raises(ValueError, match=r"170° is 2\.967"):
+        Orthographic.from_fov(170.0, 50.0)
 
 
 # -- encodings ------------------------------------------------------------------------------------

@@ -55,7 +55,19 @@ COEFFICIENTS = ("d", "coeffs", "coefficients", *(
     name + kind for name in ("dist", "distortion", "cameradistortion")
     for kind in ("", "coef", "coefs", "coeff", "coeffs", "coefficients", "params", "parameters")
 ))  # fmt: skip
-SIZE = ("imagesize", "imgsize", "size", "dim", "resolution", "cameraresolution")  # (W, H)
+SIZE = (
+    "imagesize",
+    "imgsize",
+    "size",
+    "dim",
+    "resolution",
+    "cameraresolution",
+    "framesize",
+    "imgdim",
+    "imagedim",
+    "calibdimension",
+    "calibdim",
+)  # (W, H)
 SHAPE = ("shape", "imageshape", "imgshape", "frameshape")  # (H, W) or (H, W, C) of an array
 WIDTH, HEIGHT = ("imagewidth", "width", "w"), ("imageheight", "height", "h")
 SAYS_FISHEYE = ("fisheyemodel", "fisheye", "isfisheye")
