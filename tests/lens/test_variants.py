@@ -110,11 +110,13 @@ def test_other_models_keep_their_numbers_of_coefficients():
 
 SIZES = [
     *(dict([entry]) for entry in product(
-        ("image_size", "imageSize", "img_size", "size", "DIM", "resolution"),
+        ("image_size", "imageSize", "img_size", "size", "DIM", "resolution", "frame_size",
+         "frameSize", "img_dim"),
         ([1280, 960], [[1280, 960]], [[1280], [960]], [1280.0, 960.0], "1280 960",
          {"rows": 1, "cols": 2, "dt": "i", "data": [1280, 960]},
          {"rows": 2, "cols": 1, "data": "1280. 960."}, {"width": 1280, "height": 960}))),
     dict(image_width=[[1280]], image_height=[960]),
+    dict(calib_dimension=dict(w=1280, h=960)),
     dict(width={"rows": 1, "cols": 1, "data": [1280]}, height=960),
     dict(shape=[960, 1280]), dict(image_shape=[960, 1280, 3]), dict(img_shape=[960, 1280, 1]),
     # Another order than the name's, which the principal point contradicts.
@@ -174,6 +176,21 @@ def test_arrays_of_numpy_in_either_order(ratio, turned, shift, tmp_path):
     ):  # fmt: skip
         np.savez(path, K=k, D=np.array(FISHEYE), **entry)
         assert load(path, model="fisheye").image_size.tolist() == [[height, width]], entry
+
+
+@pytest.mark.parametrize(
+    ("entries", "said"),
+    [(dict(image_width=848, imageWidth=640, height=480), "image_width and imageWidth must be the"),
+     (dict(img_size=[640, 480], image_size=[848, 480]), "img_size and image_size must be the same"),
+     (dict(frame_size=[640, 480], frameSize=[848, 480]), "frame_size and frameSize must be the s")],
+)  # fmt: skip
+def test_two_entries_of_one_meaning_must_agree(entries, said):
+    with pytest.raises(ValueError, match=said):
+        loads(sized(**entries))
+    with pytest.raises(ValueError, match="fx and Fx must be the same"):
+        loads(flat("k1", "k2", "k3", "k4", Fx=300))
+    both = dict(img_size=[960, 1280], image_size=[1280, 960], imageSize=[1280, 960])
+    assert loads(sized(**both)).image_size.tolist() == [[960, 1280]]
 
 
 @pytest.mark.parametrize("size", [(2160, 3840), (3840, 2160)])

@@ -55,19 +55,8 @@ COEFFICIENTS = ("d", "coeffs", "coefficients", *(
     name + kind for name in ("dist", "distortion", "cameradistortion")
     for kind in ("", "coef", "coefs", "coeff", "coeffs", "coefficients", "params", "parameters")
 ))  # fmt: skip
-SIZE = (
-    "imagesize",
-    "imgsize",
-    "size",
-    "dim",
-    "resolution",
-    "cameraresolution",
-    "framesize",
-    "imgdim",
-    "imagedim",
-    "calibdimension",
-    "calibdim",
-)  # (W, H)
+SIZE = ("imagesize", "imgsize", "size", "dim", "resolution", "cameraresolution", "framesize",
+        "imgdim", "imagedim", "calibdimension", "calibdim")  # fmt: skip  # (W, H)
 SHAPE = ("shape", "imageshape", "imgshape", "frameshape")  # (H, W) or (H, W, C) of an array
 WIDTH, HEIGHT = ("imagewidth", "width", "w"), ("imageheight", "height", "h")
 SAYS_FISHEYE = ("fisheyemodel", "fisheye", "isfisheye")
@@ -171,7 +160,13 @@ class _Reader:
 
     def __init__(self, file: Fields, model: str | None):
         self.file, self.model = file, model
-        # Of two names that `plain_name` makes equal, the first counts.
+        # Of two names that `plain_name` makes equal, the first counts if they agree.
+        seen: dict[str, str] = {}
+        for name, value in file.entries.items():
+            plain = plain_name(name).replace("imgsize", "imagesize")
+            first = seen.setdefault(plain, name)
+            if _plain_value(file.entries[first]) != _plain_value(value) and _is_once(plain):
+                raise ValueError(f"{file.path(first)} and {file.path(name)} must be the same")
         self.names = {plain_name(name): name for name in reversed(list(file.entries))}
 
     def find_all(self, names: tuple[str, ...], suffix: str) -> list[str]:
@@ -367,6 +362,19 @@ class _Reader:
         if isinstance(self.file.entries.get(name), (list, Mapping)):
             return to_side(self.matrix(name, (1,))[0], self.file.path(name))
         return self.file.side(name)
+
+
+def _is_once(plain: str) -> bool:
+    """True for the names of one number or size, of which two values cannot both be right."""
+    once = "|".join((*PLANE, *SIZE, *SHAPE, *WIDTH, *HEIGHT, "[kps]\\d"))
+    return re.fullmatch(rf"({once})({'|'.join(SUFFIXES)})?", plain) is not None
+
+
+def _plain_value(value: Any) -> Any:
+    """For comparisons. The sides of an image may be in any order."""
+    if isinstance(value, list) and all(isinstance(side, (int, float)) for side in value):
+        return sorted(value)
+    return value
 
 
 def _looks_turned(x: float, y: float, height: float, width: float) -> bool:
