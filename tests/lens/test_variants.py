@@ -105,6 +105,17 @@ def test_other_models_keep_their_numbers_of_coefficients():
     assert loads(opencv(D=[*PLUMB_BOB, 0, 0])).radial.shape == (1, 3)
 
 
+@pytest.mark.parametrize("name", ["coeffs", "D", "distortion_coefficients"])
+def test_numbers_by_name_beside_a_list_of_coefficients(name):
+    """As RealSense's tools write them."""
+    expected = to_dict(loads(flat(**dict(zip(("k1", "k2", "k3", "k4"), FISHEYE, strict=True)),
+                                  model="fisheye"), dtype=f64))  # fmt: skip
+    text = flat(model="kannala_brandt4", **{name: [*FISHEYE, 0]})
+    assert to_dict(loads(text, dtype=f64)) == expected
+    with pytest.raises(ValueError, match=f"{name} must have 4 coefficients for the fisheye model"):
+        loads(flat(model="kannala_brandt4", **{name: [*FISHEYE, 0.1]}))
+
+
 # -- the size of the image ------------------------------------------------------------------------
 
 
@@ -275,7 +286,7 @@ def test_is_fisheye_in_any_word(name, value, model):
     text, matrix = json.dumps(content | {name: value}), opencv(D=FISHEYE, **{name: value})
     if model is None:
         for wrong in (text, matrix):
-            with pytest.raises(ValueError, match=f"{name} must be 0 or 1, or true or false, got "):
+            with pytest.raises(ValueError, match=f"{name} must be 0 or 1, got "):
                 loads(wrong)
     else:
         assert type(loads(text)).__name__.startswith(model)

@@ -87,7 +87,7 @@ def to_flag(value: Any, name: str) -> bool:
     """Yes or no, in the words of JSON, YAML, Python and OpenCV."""
     word = plain_name(str(value)) if isinstance(value, (str, int)) else ""
     if word not in (*_YES, *_NO):
-        raise ValueError(f"{name} must be 0 or 1, or true or false, got {short(value)}")
+        raise ValueError(f"{name} must be 0 or 1, got {short(value)}")
     return word in _YES
 
 

@@ -152,7 +152,14 @@ class ByName(Format):
         )
 
     def cameras(self, file: Fields, model: str | None) -> Cameras:
-        return {"camera": _Reader(file, model).camera_by_name}
+        reader = _Reader(file, model)
+        if reader.coefficients("") is None or any(
+            re.fullmatch(r"[kps]\d|skew", n) for n in reader.names
+        ):
+            return {"camera": reader.camera_by_name}
+        fx, fy, cx, cy = (file.number(reader.names[name]) for name in PLANE)
+        matrix = {"camera_matrix": [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]}
+        return {"camera": partial(_Reader(Fields({**file.entries, **matrix}), model).camera, "")}
 
 
 class _Reader:
