@@ -2,7 +2,8 @@
 
 import functools
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any, ClassVar, Self
 
 import torch
@@ -15,6 +16,9 @@ from darswin.lens.solve import direction_of, inverse, length_of, vector_of
 # A lens ends this far (rad) before the angle at which r stops rising or becomes infinite, where r
 # does not determine θ.
 MARGIN = 1e-6
+# A field of view, or a θ_max from a file, that was rounded may exceed the limit by this, rad.
+ROUNDING = 1e-4
+IN_DEGREES = {"fov_deg": "fov", "theta_max_deg": "theta_max"}
 
 # All lens models by name. Defining a class adds it.
 MODELS: dict[str, type["Lens"]] = {}
@@ -91,6 +95,8 @@ class Lens(ImageFrame):
         times, kind = (2 if given == "fov" else 1), self.declared["theta_max"]
         if not kind.holds(wanted):
             self._require(given, (wanted > 0) & wanted.isfinite(), kind.range, times * wanted)
+        if given == "fov":
+            wanted = self.theta_max = _without_rounding(wanted, limit)
         # A limit computed in another dtype differs by rounding; MARGIN is larger than that.
         slack = 1 + 2 * torch.finfo(limit.dtype).eps
         beyond = ~(wanted <= limit * slack)
@@ -291,7 +297,8 @@ def from_dict(description: Mapping[str, Any], image_size: Size = None) -> Lens:
         description: {"model": "Spherical", "xi": 0.5, "focal": 300, "theta_max": 1.5}: a name in
             `MODELS` and the arguments of its constructor, rad and px. For models with a focal
             length, "fov" may replace "focal" and "theta_max": the full field of view, rad, which
-            then fills the largest circle inside the image.
+            then fills the largest circle inside the image. "fov_deg" and "theta_max_deg" take
+            degrees.
         image_size: (H, W) px of the lens's images, which "fov" requires.
 
     Raises:
@@ -300,6 +307,9 @@ def from_dict(description: Mapping[str, Any], image_size: Size = None) -> Lens:
     if not isinstance(description, Mapping):
         raise ValueError(f"a lens must be a JSON object, got {description!r}")
     arguments = dict(description)
+    for in_degrees, angle in IN_DEGREES.items():
+        if in_degrees in arguments:
+            return _from_degrees(arguments, in_degrees, angle, image_size)
     name = arguments.pop("model", None)
     if not isinstance(name, str) or name not in MODELS:
         raise ValueError(f'a lens\'s "model" must be one of {sorted(MODELS)}, got {name!r}')
@@ -313,6 +323,43 @@ def from_dict(description: Mapping[str, Any], image_size: Size = None) -> Lens:
         return make(**arguments)
     except TypeError as error:
         raise ValueError(f"a {name} lens cannot be made from {arguments}: {error}") from error
+
+
+def _from_degrees(arguments: dict[str, Any], in_degrees: str, angle: str, image_size: Size) -> Lens:
+    """`from_dict` of a description with an angle in degrees, which its errors name."""
+    if angle in arguments:
+        raise ValueError(f"{angle} and {in_degrees} must not both be given")
+    value = arguments.pop(in_degrees)
+    if isinstance(value, bool) or not isinstance(value, (int, float, Tensor)):
+        raise ValueError(f"{in_degrees} must be a number of degrees, got {value!r}")
+    radians = torch.deg2rad(value) if isinstance(value, Tensor) else math.radians(value)
+    with naming_degrees(angle, value):
+        if angle == "fov":
+            return from_dict(arguments | {"fov": radians}, image_size)
+        return with_rounded_theta_max(from_dict(arguments, image_size), radians)
+
+
+@contextmanager
+def naming_degrees(angle: str, degrees: Any) -> Iterator[None]:
+    """Lets errors about an angle name the entry that gave it in degrees."""
+    try:
+        yield
+    except ValueError as error:
+        if not str(error).startswith(f"{angle} "):
+            raise
+        if isinstance(degrees, Tensor):
+            degrees = degrees.flatten()[0].item()
+        raise ValueError(f"{angle}_deg is {degrees:g}, but {error}") from error
+
+
+def with_rounded_theta_max(lens: Lens, theta_max: Number) -> Lens:
+    """A lens with another θ_max, rad, which may exceed the limit by rounding."""
+    wanted = torch.as_tensor(theta_max, dtype=lens.theta_max.dtype)
+    return lens.with_theta_max(_without_rounding(wanted, lens.theta_limit))
+
+
+def _without_rounding(wanted: Tensor, limit: Tensor) -> Tensor:
+    return torch.where((limit < wanted) & (wanted <= limit + ROUNDING), limit, wanted)
 
 
 def to_dict(lens: Lens) -> dict[str, Any]:

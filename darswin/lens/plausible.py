@@ -9,14 +9,16 @@ from darswin.lens.base import Lens
 
 # The thresholds lie far from real lenses. Their image circles are as large as the picture's shorter
 # side or larger, and half the diagonal spans 0.4 to 4 rad in pixels of the axis. Small circles in
-# large pictures, telephoto lenses and crops shall pass.
+# large pictures, telescopes, shifted lenses and crops shall pass.
 SMALLEST_CIRCLE = 0.2  # of the shorter side
 LARGEST_RADIUS = 20.0  # halves of the diagonal
-SMALLEST_SPAN, LARGEST_SPAN = 0.01, 20.0  # rad
-WIDEST_PINHOLE = math.radians(80)
+SMALLEST_SPAN, LARGEST_SPAN = 1e-4, 40.0  # rad
+WIDEST_PINHOLE = math.radians(86)
 # The distance of the principal point from the middle, in parts of the picture. A crop along one
-# side moves it along one axis; another unit moves it along both.
-FAR_ON_BOTH, FAR_ON_ONE, NEAR = 0.2, 0.45, 0.1
+# side and a shifted lens move it along one axis; another unit moves it along both.
+FAR_ON_BOTH, FAR_ON_ONE, NEAR = 0.2, 1.0, 0.1
+LEAST_CIRCULAR = math.radians(70)  # θ_max of a fisheye whose picture shows its circle
+SHOWN = 0.75  # its circle may lie anywhere if the picture shows this part of its width and height
 # For guesses. px per unit of length are those of pixels of 3 µm, MOST_OFF times more or less.
 UNITS = {"in mm": 1e3 / 3, "in cm": 1e4 / 3, "in m": 1e6 / 3, "in inches": 25.4e3 / 3,
          "in µm": 1 / 3}  # fmt: skip
@@ -64,8 +66,12 @@ def _doubt(
     elif half < SMALLEST_SPAN * scale or radius > LARGEST_RADIUS * half:
         found.append(f"an image circle of {2 * radius:.6g} px up to θ_max = {degrees:.3g}°")
     off = _off_axes(x, y, width, height)
-    swapped = min(off) > NEAR > off_middle(x, y, height, width)
-    if min(off) > FAR_ON_BOTH or max(off) > FAR_ON_ONE or swapped:
+    swapped = min(off) > NEAR / 2 and swap_fits(x, y, width, height)
+    far = min(off) > FAR_ON_BOTH and (
+        bool(found) or theta_max < LEAST_CIRCULAR
+        or min(_shown(x, radius, width), _shown(y, radius, height)) < SHOWN
+    )  # fmt: skip
+    if far or max(off) > FAR_ON_ONE or swapped:
         found.append(f"the principal point at ({x:.4g}, {y:.4g}), far from the middle")
     if not found:
         return ""
@@ -78,6 +84,17 @@ def off_middle(x: float, y: float, width: float, height: float) -> float:
     return max(_off_axes(x, y, width, height))
 
 
+def swap_fits(x: float, y: float, width: float, height: float) -> bool:
+    """True if a pixel is far from the middle, but near that of an image with swapped sides."""
+    off, other = off_middle(x, y, width, height), off_middle(x, y, height, width)
+    return off > NEAR / 2 and other < min(off / 2, NEAR)
+
+
+def _shown(middle: float, radius: float, side: float) -> float:
+    """The part of a circle's diameter along one axis that lies within the picture."""
+    return (min(middle + radius, side) - max(middle - radius, 0.0)) / (2 * radius)
+
+
 def _off_axes(x: float, y: float, width: float, height: float) -> tuple[float, float]:
     return abs((x + 0.5) / width - 0.5), abs((y + 0.5) / height - 0.5)
 
@@ -86,7 +103,7 @@ def _guess(x: float, y: float, width: float, height: float, scale: float) -> str
     """What would fit the picture, in words that follow the doubt; "" without an idea."""
     half = math.hypot(width, height) / 2
     fits_in_px = TYPICAL_SPANS[0] < half / scale < TYPICAL_SPANS[1]
-    if off_middle(x, y, height, width) < NEAR < off_middle(x, y, width, height):
+    if swap_fits(x, y, width, height):
         return "; width and height seem to be swapped"
     if off_middle(x, y, width, height) < FAR_ON_BOTH:  # then the principal point is in px
         sides = {"normalised by the width": width, "normalised by the height": height}
@@ -94,16 +111,19 @@ def _guess(x: float, y: float, width: float, height: float, scale: float) -> str
             return "; θ_max may be in another unit"
         units = _nearest(UNITS | sides, half / 1.2 / scale)
         return f"; the focal length would fit {units}" if units else ""
+    may_be = []
     for name, (across, down) in {
         "width and height": (width, height), "width": (width,) * 2, "height": (height,) * 2,
     }.items():  # fmt: skip
         focal_fits = TYPICAL_SPANS[0] < half / scale / math.sqrt(across * down) < TYPICAL_SPANS[1]
         for origin in (0.0, 0.5):  # formats with the upper left pixel at ½ have subtracted it
             pixel = (x + origin) * across, (y + origin) * down
-            if focal_fits and off_middle(*pixel, width, height) < NEAR:
-                return f"; the lengths would fit normalised by the {name}"
+            if off_middle(*pixel, width, height) < NEAR:
+                if focal_fits:
+                    return f"; the lengths would fit normalised by the {name}"
+                may_be = [f"normalised by the {name}"]
     if fits_in_px and max(abs(x) / width, abs(y) / height) < NEAR / 2:
-        return "; it may be measured from the middle"
+        return f"; it may be {' or '.join([*may_be, 'measured from the middle'])}"
     if x > 0 and y > 0 and MOST_APART > (ratio := width * y / height / x) > 1 / MOST_APART:
         factor = width / x / 2 / math.sqrt(ratio)  # from these lengths to px
         if LEAST_SIDE * factor < min(width, height) < MOST_SIDE * factor:

@@ -6,7 +6,10 @@ import math
 def degrees_hint(angle: float) -> str:
     """The end of an error about an angle out of its range: what it is in radians, if it looks like
     degrees, else nothing."""
-    if not math.pi < abs(angle) <= 360:
+    half_turns = abs(angle) / math.pi
+    # π and 2π are angles in radians, and so is what exceeds them by a little.
+    near = any(abs(half_turns - n) < 0.05 * n for n in (1, 2))
+    if near or not 1 < half_turns <= 360 / math.pi:
         return ""
     return f"; angles are in radians, and {angle:g}° is {math.radians(angle):.4g}"
 

@@ -2,6 +2,7 @@
 
 import itertools
 import json
+import math
 import re
 import warnings
 
@@ -68,9 +69,12 @@ WRONG = [
     (scaled(1 / 4), r"far from the middle; .* would fit 47\d × 2\d\d px, or the picture is a crop"),
     ((F, CX, CY, F, (W, H)), "; width and height seem to be swapped"),
     ((F, 640, 480, F, (1280, 960)), "; width and height seem to be swapped"),
-    ((F, 50, 533), r"far from the middle, unless the picture is a crop"),
+    ((F, 640, 512, F, (1280, 1024)), "; width and height seem to be swapped"),
+    ((F, 655, 500, F, (1280, 1024)), "; width and height seem to be swapped"),
+    ((F, 0.503, 0.494), "; it may be normalised by the width and height or measured from the mid"),
+    ((F, 0.503, 0.278), "; it may be normalised by the width or measured from the middle$"),
     ((F, 965, -2000), r"far from the middle, unless the picture is a crop"),
-    ((1e6,), r"an image circle of 19\d+ px up to θ_max = 0.05"),
+    ((1e8,), r"an image circle of 19\d+ px up to θ_max = 0.0005"),
 ]  # fmt: skip
 
 
@@ -132,6 +136,32 @@ def test_real_lenses_and_their_crops_are_not_doubted():
         ):
             found = doubts(lens.cropped(top, left, rows, columns))
             assert found == [""] or name in ("small circle", "two circles"), (name, found)
+
+
+RARE = {
+    **{f"circle of {r} px beside the middle": Equidistant(
+        r / 1.66, 1.66, [540, 300], image_size=(H, W)) for r in (500, 250)},
+    **{f"one of four circles, {x} {y}": Equidistant(
+        480 / 1.6, 1.6, [x, y], image_size=(2000, 2000))
+       for x in (499.5, 1499.5) for y in (499.5, 1499.5)},
+    "circle cut below": fisheye(700.0, 960, 1050),
+    "circle cut at the left": fisheye(700.0, 60, 540),
+    "shifted lens": pinhole(1500.0, 960, -20),
+    "lens shifted to the right": pinhole(1500.0, 2000, 540),
+    "wide pinhole": pinhole(150.0, 959.5, 539.5),
+    "small circle in a large picture": fisheye(110.0, 1919.5, 1079.5, size=(2160, 3840)),
+    **{f"telescope of {degrees}°": Perspective(
+        W / math.radians(degrees), math.radians(degrees) / 2, image_size=(H, W))
+       for degrees in (1, 0.5, 0.1, 0.03)},
+    "almost square": fisheye(400.0, 530, 520, size=(1040, 1000)),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", RARE)
+def test_rare_but_real_lenses_are_not_doubted(name):
+    lens = RARE[name]
+    assert doubts(lens) == [""]
+    assert doubts(lens.with_theta_max(torch.minimum(lens.side_angles().amax(1), lens.theta_max)))
 
 
 def test_any_numbers_get_a_doubt_of_one_line():

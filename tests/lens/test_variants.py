@@ -11,7 +11,7 @@ import torch
 import yaml
 from lens_examples import FILES, FISHEYE, PLUMB_BOB, K, f64, file_text, flat, loads, message, opencv
 
-from darswin.lens import load, load_all, to_dict
+from darswin.lens import ImplausibleLens, Orthographic, from_dict, load, load_all, to_dict
 from darswin.lens.files.load import Calibration
 
 KB = dict(model="KannalaBrandt", radial=FISHEYE)
@@ -105,16 +105,29 @@ def test_other_models_keep_their_numbers_of_coefficients():
     assert loads(opencv(D=[*PLUMB_BOB, 0, 0])).radial.shape == (1, 3)
 
 
+@pytest.mark.parametrize("name", ["coeffs", "D", "distortion_coefficients"])
+def test_numbers_by_name_beside_a_list_of_coefficients(name):
+    """As RealSense's tools write them."""
+    expected = to_dict(loads(flat(**dict(zip(("k1", "k2", "k3", "k4"), FISHEYE, strict=True)),
+                                  model="fisheye"), dtype=f64))  # fmt: skip
+    text = flat(model="kannala_brandt4", **{name: [*FISHEYE, 0]})
+    assert to_dict(loads(text, dtype=f64)) == expected
+    with pytest.raises(ValueError, match=f"{name} must have 4 coefficients for the fisheye model"):
+        loads(flat(model="kannala_brandt4", **{name: [*FISHEYE, 0.1]}))
+
+
 # -- the size of the image ------------------------------------------------------------------------
 
 
 SIZES = [
     *(dict([entry]) for entry in product(
-        ("image_size", "imageSize", "img_size", "size", "DIM", "resolution"),
+        ("image_size", "imageSize", "img_size", "size", "DIM", "resolution", "frame_size",
+         "frameSize", "img_dim"),
         ([1280, 960], [[1280, 960]], [[1280], [960]], [1280.0, 960.0], "1280 960",
          {"rows": 1, "cols": 2, "dt": "i", "data": [1280, 960]},
          {"rows": 2, "cols": 1, "data": "1280. 960."}, {"width": 1280, "height": 960}))),
     dict(image_width=[[1280]], image_height=[960]),
+    dict(calib_dimension=dict(w=1280, h=960)),
     dict(width={"rows": 1, "cols": 1, "data": [1280]}, height=960),
     dict(shape=[960, 1280]), dict(image_shape=[960, 1280, 3]), dict(img_shape=[960, 1280, 1]),
     # Another order than the name's, which the principal point contradicts.
@@ -176,6 +189,30 @@ def test_arrays_of_numpy_in_either_order(ratio, turned, shift, tmp_path):
         assert load(path, model="fisheye").image_size.tolist() == [[height, width]], entry
 
 
+@pytest.mark.parametrize(
+    ("entries", "said"),
+    [(dict(image_width=848, imageWidth=640, height=480), "image_width and imageWidth must be the"),
+     (dict(img_size=[640, 480], image_size=[848, 480]), "img_size and image_size must be the same"),
+     (dict(frame_size=[640, 480], frameSize=[848, 480]), "frame_size and frameSize must be the s")],
+)  # fmt: skip
+def test_two_entries_of_one_meaning_must_agree(entries, said):
+    with pytest.raises(ValueError, match=said):
+        loads(sized(**entries))
+    with pytest.raises(ValueError, match="fx and Fx must be the same"):
+        loads(flat("k1", "k2", "k3", "k4", Fx=300))
+    both = dict(img_size=[960, 1280], image_size=[1280, 960], imageSize=[1280, 960])
+    assert loads(sized(**both)).image_size.tolist() == [[960, 1280]]
+
+
+@pytest.mark.parametrize("size", [(2160, 3840), (3840, 2160)])
+@pytest.mark.parametrize("name", ["img_size", "shape"])
+def test_the_order_of_a_size_beside_the_matrix_of_a_smaller_image(name, size):
+    k = [[421.3, 0, 960.0], [0, 421.3, 540.0], [0, 0, 1]]
+    with pytest.warns(ImplausibleLens, match="of 3840 × 2160 px .* would fit 19.. × 10.. px"):
+        lens = loads(sized(K=k, **{name: size}))
+    assert lens.image_size.tolist() == [[2160, 3840]]
+
+
 def test_the_name_decides_where_the_principal_point_does_not():
     for cx, cy in ((643.1, 643.1), (200.0, 800.0), (1100.0, 100.0)):
         k = [[421.3, 0, cx], [0, 421.3, cy], [0, 0, 1]]
@@ -207,6 +244,53 @@ def test_is_fisheye_alone_names_the_model():
         loads(json.dumps(content | dict(p1=0.1)))
     with pytest.raises(ValueError, match="is_fisheye is true, but camera_model is OPENCV"):
         loads(json.dumps(content | dict(camera_model="OPENCV")))
+
+
+@pytest.mark.parametrize("inside", [False, True])
+@pytest.mark.parametrize("is_fisheye", [None, True, False])
+@pytest.mark.parametrize(
+    "other",
+    [dict(ftheta_p0=0.0, ftheta_p1=0.001, ftheta_p2=0), dict(ftheta_p4="1e-9"), dict(latlong=True),
+     dict(equirectangular=1), dict(is_orthographic="True"), dict(isLatLong="yes")],
+    ids=str,
+)  # fmt: skip
+def test_other_cameras_of_instant_ngp_are_refused(other, is_fisheye, inside):
+    content = json.loads(file_text("instant_ngp.json")) | dict(is_fisheye=is_fisheye)
+    if is_fisheye is None:
+        del content["is_fisheye"]
+    off = dict.fromkeys(other, 0)
+    name = next(name for name, value in other.items() if value)
+    if inside:
+        frame = content["frames"][0]
+        content["frames"] = [frame | off, frame | other | {"file_path": "2"}]
+        with pytest.raises(ValueError, match=rf"frames\[1\]\.{name} names another camera than"):
+            loads(json.dumps(content), camera="2")
+    else:
+        with pytest.raises(ValueError, match=f": {name} names another camera than SIMPLE_PINHOLE"):
+            loads(json.dumps(content | other))
+    content["frames"] = content["frames"][:1]
+    assert type(loads(json.dumps(content | off))).__name__ == (
+        "KannalaBrandt" if is_fisheye else "BrownConrady")  # fmt: skip
+
+
+@pytest.mark.parametrize("name", ["is_fisheye", "isFisheye", "fisheye"])
+@pytest.mark.parametrize(
+    ("value", "model"),
+    [("True", "KannalaBrandt"), ("yes", "KannalaBrandt"), (1, "KannalaBrandt"), ("1", "KannalaBr"),
+     ("TRUE", "KannalaBrandt"), ("no", "BrownConrady"), ("False", "BrownConrady"), (0, "Brown"),
+     ("maybe", None), (2, None), (None, None), ([1], None)],
+)  # fmt: skip
+def test_is_fisheye_in_any_word(name, value, model):
+    content = json.loads(file_text("instant_ngp.json"))
+    del content["is_fisheye"]
+    text, matrix = json.dumps(content | {name: value}), opencv(D=FISHEYE, **{name: value})
+    if model is None:
+        for wrong in (text, matrix):
+            with pytest.raises(ValueError, match=f"{name} must be 0 or 1, got "):
+                loads(wrong)
+    else:
+        assert type(loads(text)).__name__.startswith(model)
+        assert type(loads(matrix)).__name__.startswith(model)
 
 
 # -- degrees in our own JSON ----------------------------------------------------------------------
@@ -243,13 +327,51 @@ def test_our_json_takes_degrees(entries, radians):
         (SPHERICAL | dict(fov_deg=0), "fov_deg must be above 0 and at most 360 degrees, got 0"),
         (SPHERICAL | dict(fov_deg="wide"), "fov_deg must be above 0 .* got 'wide'"),
         (SPHERICAL | dict(fov_deg=170, theta_max_deg=80), "a Spherical lens has no theta_max_deg"),
-        (SPHERICAL | dict(fov_deg=170, focal=80), "a Spherical lens has no focal, only xi, fov,"),
+        (SPHERICAL | dict(fov_deg=170, focal=80), "fov_deg takes the place of focal, .* theta_max"),
+        (EQUIDISTANT | dict(fov=1.7), "fov takes the place of focal, .* theta_max is half of fov"),
+        (dict(model="Orthographic", fov_deg=200, image_size=[64, 64]),
+         r"fov_deg is 200, but fov must be at most 3.14\d+ rad \((180.00|179.99)°\)"),
+        (dict(model="Orthographic", focal=9, theta_max_deg=100),
+         r"theta_max_deg is 100, but theta_max must be at most 1.57\d+ rad"),
         (POLYNOMIAL | dict(fov_deg=170), "a Polynomial lens has no fov_deg, only coefficients"),
     ],
 )  # fmt: skip
 def test_wrong_angles_of_our_json(entries, said):
     with pytest.raises(ValueError, match=said):
         loads(json.dumps(entries))
+
+
+@pytest.mark.parametrize(("model", "degrees"), [("Equidistant", 360), ("Orthographic", 180)])
+@pytest.mark.parametrize("dtype", [torch.float32, f64])
+def test_the_largest_angle_is_allowed_however_it_is_given(model, degrees, dtype):
+    size = dict(model=model, image_size=[100, 100])
+    half = dict(focal=9.0, theta_max_deg=degrees / 2)
+    for entries in (dict(fov_deg=degrees), dict(fov=math.radians(degrees)), half):
+        for lens in (loads(json.dumps(size | entries), dtype=dtype), from_dict(size | entries)):
+            assert lens.theta_max.item() == pytest.approx(math.radians(degrees / 2), abs=1e-4)
+
+
+def test_a_dict_takes_degrees_like_a_file():
+    lens = from_dict(dict(model="Equidistant", fov_deg=170), (100, 100))
+    assert math.degrees(lens.theta_max.item()) == pytest.approx(85)
+    assert lens.r_max.item() == pytest.approx(50)
+    for entries, said in (
+        (dict(fov_deg=170, fov=2.9), "fov and fov_deg must not both be given"),
+        (dict(fov_deg="wide"), "fov_deg must be a number of degrees, got 'wide'"),
+        (dict(fov_deg=400), "fov_deg is 400, but fov must be"),
+        (dict(focal=9, theta_max_deg=190), "theta_max_deg is 190, but theta_max must be"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            from_dict(dict(model="Equidistant") | entries, (100, 100))
+
+
+@pytest.mark.parametrize("fov", [3.2, 2 * math.pi, 6.5])
+def test_angles_near_the_limit_are_not_taken_for_degrees(fov):
+    with pytest.raises(ValueError, match="fov must be at most") as error:
+        Orthographic.from_fov(fov, 50.0)
+    assert "radians" not in str(error.value)
+    with pytest.raises(ValueError, match=r"170° is 2\.967"):
+        Orthographic.from_fov(170.0, 50.0)
 
 
 # -- encodings ------------------------------------------------------------------------------------

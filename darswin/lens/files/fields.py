@@ -9,6 +9,7 @@ from typing import Any
 _NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", re.ASCII)
 _COEFFICIENTS = re.compile(r"^d(\d*|left|right)$|coef|(?<!un)dist(?!an[ct])")
 _COEFFICIENT = re.compile(r"[kps]\d+")
+_YES, _NO = ("1", "true", "yes", "on"), ("0", "false", "no", "off")
 _MAX_WORD = 64
 MAX_SIDE = 1_000_000
 
@@ -80,6 +81,14 @@ def holds_numbers(value: Any) -> bool:
 
 def _is_zero(value: Any) -> bool:
     return str(value) != "False" and is_number(str(value)) and float(value) == 0
+
+
+def to_flag(value: Any, name: str) -> bool:
+    """Yes or no, in the words of JSON, YAML, Python and OpenCV."""
+    word = plain_name(str(value)) if isinstance(value, (str, int)) else ""
+    if word not in (*_YES, *_NO):
+        raise ValueError(f"{name} must be 0 or 1, got {short(value)}")
+    return word in _YES
 
 
 def plain_name(name: str) -> str:

@@ -5,14 +5,14 @@ import os
 import re
 import warnings
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Any, Self
 
 import torch
 from torch import Tensor
 
-from darswin.lens.base import Lens, from_dict
+from darswin.lens.base import Lens, from_dict, naming_degrees, with_rounded_theta_max
 from darswin.lens.files import colmap, opencv
 from darswin.lens.files.basalt import Basalt
 from darswin.lens.files.camodocal import CamOdoCal, OCamCalib
@@ -21,7 +21,7 @@ from darswin.lens.files.fields import Fields, listed, short
 from darswin.lens.files.format import Description, Format
 from darswin.lens.files.kalibr import Kalibr
 from darswin.lens.files.nerfstudio import Nerfstudio
-from darswin.lens.files.own import ROUNDING, Own
+from darswin.lens.files.own import Own
 from darswin.lens.files.unknown import unknown
 from darswin.lens.files.woodscape import WoodScape
 from darswin.lens.frame import Size
@@ -311,14 +311,17 @@ def _batch(
     if image_size is not None:
         values.setdefault("image_size", torch.tensor([image_size], dtype=dtype))
     sensor, wanted = values.pop("sensor", None), values.pop("theta_max", None)
+    degrees = values.pop("theta_max_deg", None)
+    if degrees is not None:
+        wanted = degrees.deg2rad()
     if theta_max is not None:
-        wanted = torch.tensor([theta_max], dtype=dtype)
+        degrees, wanted = None, torch.tensor([theta_max], dtype=dtype)
     lens = from_dict({"model": first["model"], **values}, first.get("image_size", image_size))
-    whole, limit = lens, lens.theta_max
+    whole = lens
     if wanted is not None:
-        rounded = (limit < wanted) & (wanted <= limit + ROUNDING)
-        lens = lens.with_theta_max(torch.where(rounded, limit, wanted))
-    elif "image_size" in values and "fov" not in values:
+        with naming_degrees("theta_max", degrees) if degrees is not None else nullcontext():
+            lens = with_rounded_theta_max(lens, wanted)
+    elif "image_size" in values and values.keys().isdisjoint(("fov", "fov_deg")):
         lens = lens.with_theta_max(reach(lens))
     _check(lens, math.inf if wanted is not None else MAX_RADIUS)
     judged = lens if theta_max is None else whole.with_theta_max(reach(whole))

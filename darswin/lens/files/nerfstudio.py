@@ -1,13 +1,22 @@
 """transforms.json of nerfstudio and instant-ngp: one camera for all frames, or one for each."""
 
+import re
 from collections.abc import Iterable, Mapping
 from functools import partial
 from typing import Any
 
 from darswin.lens.distorted import BrownConrady, KannalaBrandt
 from darswin.lens.files.content import Content
-from darswin.lens.files.fields import Fields, like_coefficients, short
+from darswin.lens.files.fields import (
+    Fields,
+    holds_numbers,
+    like_coefficients,
+    plain_name,
+    short,
+    to_flag,
+)
 from darswin.lens.files.format import Cameras, Description, Format, describe, has_several
+from darswin.lens.files.opencv import SAYS_FISHEYE
 
 MODELS = {
     "SIMPLE_PINHOLE": BrownConrady, "PINHOLE": BrownConrady, "SIMPLE_RADIAL": BrownConrady,
@@ -15,7 +24,9 @@ MODELS = {
 }  # fmt: skip
 TERMS: tuple[str, ...] = ("k1", "k2", "k3", "k4", "p1", "p2")
 MARKS = ("frames", "fl_x", "fl_y", "transform_matrix", "camera_angle_x")
-KEYS = ("camera_model", "is_fisheye", "fl_x", "fl_y", "cx", "cy", "w", "h", *TERMS)
+KEYS = ("camera_model", "fl_x", "fl_y", "cx", "cy", "w", "h", *TERMS)
+# Entries of instant-ngp, after `plain_name`, that name cameras which we do not read.
+OTHERS = re.compile(r"ftheta.*|(is)?(latlong|equirectangular|orthographic|spherical|panorama)")
 PAIRS = (("k1", "k2"), ("k3", "k4"), ("p1", "p2"))  # nerfstudio's tools write both or none
 
 
@@ -55,7 +66,11 @@ class Nerfstudio(Format):
 
 
 def _of_camera(keys: Iterable[str]) -> set[str]:
-    return {key for key in keys if key in KEYS or like_coefficients(key, None)}
+    return {
+        key for key in keys
+        if key in KEYS or plain_name(key) in SAYS_FISHEYE or OTHERS.fullmatch(plain_name(key))
+        or like_coefficients(key, None)
+    }  # fmt: skip
 
 
 def _frame(shared: dict[str, Any], own: set[str], frame: dict, where: str) -> Description:
@@ -63,7 +78,20 @@ def _frame(shared: dict[str, Any], own: set[str], frame: dict, where: str) -> De
 
 
 def _camera(fields: Fields) -> Description:
-    terms, is_fisheye = TERMS, fields.entries.get("is_fisheye") in (True, "true")
+    terms, flags = TERMS, []
+    for key, value in fields.entries.items():
+        name = plain_name(key)
+        if name in SAYS_FISHEYE:
+            flags.append(to_flag(value, fields.path(key)))
+        elif OTHERS.fullmatch(name) and (
+            holds_numbers(value) if name.startswith("ftheta") else to_flag(value, fields.path(key))
+        ):
+            known = ", ".join(MODELS)
+            raise ValueError(
+                f"{fields.path(key)} names another camera than {known}, which are those of "
+                f"nerfstudio that can be read; got {short(value)}"
+            )
+    is_fisheye = any(flags)
     if "camera_model" in fields:
         model = fields.one_of("camera_model", MODELS)
     elif is_fisheye:  # instant-ngp's files, where p1 and p2 belong to other cameras

@@ -22,13 +22,14 @@ from darswin.lens.files.fields import (
     listed,
     plain_name,
     short,
+    to_flag,
     to_number,
     to_side,
 )
 from darswin.lens.files.format import Cameras, Description, Format, Intrinsics, describe
 from darswin.lens.files.message import in_message
 from darswin.lens.frame import Size
-from darswin.lens.plausible import NEAR, off_middle
+from darswin.lens.plausible import NEAR, off_middle, swap_fits
 
 Coefficients = Literal["fisheye", "pinhole", "omnidir"]
 MODELS: tuple[Coefficients, ...] = get_args(Coefficients)
@@ -54,7 +55,8 @@ COEFFICIENTS = ("d", "coeffs", "coefficients", *(
     name + kind for name in ("dist", "distortion", "cameradistortion")
     for kind in ("", "coef", "coefs", "coeff", "coeffs", "coefficients", "params", "parameters")
 ))  # fmt: skip
-SIZE = ("imagesize", "imgsize", "size", "dim", "resolution", "cameraresolution")  # (W, H)
+SIZE = ("imagesize", "imgsize", "size", "dim", "resolution", "cameraresolution", "framesize",
+        "imgdim", "imagedim", "calibdimension", "calibdim")  # fmt: skip  # (W, H)
 SHAPE = ("shape", "imageshape", "imgshape", "frameshape")  # (H, W) or (H, W, C) of an array
 WIDTH, HEIGHT = ("imagewidth", "width", "w"), ("imageheight", "height", "h")
 SAYS_FISHEYE = ("fisheyemodel", "fisheye", "isfisheye")
@@ -150,7 +152,14 @@ class ByName(Format):
         )
 
     def cameras(self, file: Fields, model: str | None) -> Cameras:
-        return {"camera": _Reader(file, model).camera_by_name}
+        reader = _Reader(file, model)
+        if reader.coefficients("") is None or any(
+            re.fullmatch(r"[kps]\d|skew", n) for n in reader.names
+        ):
+            return {"camera": reader.camera_by_name}
+        fx, fy, cx, cy = (file.number(reader.names[name]) for name in PLANE)
+        matrix = {"camera_matrix": [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]}
+        return {"camera": partial(_Reader(Fields({**file.entries, **matrix}), model).camera, "")}
 
 
 class _Reader:
@@ -158,7 +167,13 @@ class _Reader:
 
     def __init__(self, file: Fields, model: str | None):
         self.file, self.model = file, model
-        # Of two names that `plain_name` makes equal, the first counts.
+        # Of two names that `plain_name` makes equal, the first counts if they agree.
+        seen: dict[str, str] = {}
+        for name, value in file.entries.items():
+            plain = plain_name(name).replace("imgsize", "imagesize")
+            first = seen.setdefault(plain, name)
+            if _plain_value(file.entries[first]) != _plain_value(value) and _is_once(plain):
+                raise ValueError(f"{file.path(first)} and {file.path(name)} must be the same")
         self.names = {plain_name(name): name for name in reversed(list(file.entries))}
 
     def find_all(self, names: tuple[str, ...], suffix: str) -> list[str]:
@@ -273,11 +288,7 @@ class _Reader:
             return self.model
         flag = self.find(SAYS_FISHEYE)
         if flag is not None:
-            value = self.file.entries[flag]
-            word = plain_name(str(value)) if isinstance(value, (str, int)) else ""
-            if word not in ("0", "1", "true", "false"):
-                raise ValueError(f"{flag} must be 0 or 1, got {short(value)}")
-            return "fisheye" if word in ("1", "true") else "pinhole"
+            return "fisheye" if to_flag(self.file.entries[flag], flag) else "pinhole"
         entry = self.find(SAYS_MODEL)
         if entry is not None:
             word = plain_name(self.file.text(entry))
@@ -337,7 +348,8 @@ class _Reader:
 
     def pair(self, name: str, is_shape: bool, center: tuple[float, float]) -> tuple[int, int]:
         """(H, W) of an entry with both sides. Scripts write both orders under any name: the name
-        tells the order, unless only the other one has the center near the image's middle."""
+        tells the order, unless only the other one has the center near the image's middle, or has
+        the center's ratio of x to y, as beside the matrix of a smaller image."""
         value = self.file.entries[name]
         if isinstance(value, Mapping) and "data" not in value:
             both = _Reader(self.file.section(name), None)
@@ -350,14 +362,34 @@ class _Reader:
         size, other = (first, second), (second, first)
         if not is_shape:
             size, other = other, size
-        off, other_off = (off_middle(*center, w, h) for h, w in (size, other))
-        return other if off > NEAR / 2 and other_off < min(off / 2, NEAR) else size
+        return other if swap_fits(*center, *size[::-1]) or _looks_turned(*center, *size) else size
 
     def side(self, name: str) -> int:
         """One side of an image, px, from a number or from a matrix of one."""
         if isinstance(self.file.entries.get(name), (list, Mapping)):
             return to_side(self.matrix(name, (1,))[0], self.file.path(name))
         return self.file.side(name)
+
+
+def _is_once(plain: str) -> bool:
+    """True for the names of one number or size, of which two values cannot both be right."""
+    once = "|".join((*PLANE, *SIZE, *SHAPE, *WIDTH, *HEIGHT, "[kps]\\d"))
+    return re.fullmatch(rf"({once})({'|'.join(SUFFIXES)})?", plain) is not None
+
+
+def _plain_value(value: Any) -> Any:
+    """For comparisons. The sides of an image may be in any order."""
+    if isinstance(value, list) and all(isinstance(side, (int, float)) for side in value):
+        return sorted(value)
+    return value
+
+
+def _looks_turned(x: float, y: float, height: float, width: float) -> bool:
+    """True if x / y is far from width / height, but that of the other order, height / width."""
+    if min(x, y) <= 0 or off_middle(x, y, width, height) < NEAR:
+        return False
+    given, other = (abs(math.log(x / y / ratio)) for ratio in (width / height, height / width))
+    return given > 4 * other and other < NEAR / 2
 
 
 def _is_matrix(value: Any) -> bool:

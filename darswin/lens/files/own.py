@@ -8,17 +8,14 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from darswin.lens.base import MODELS, Lens, to_dict
+from darswin.lens.base import IN_DEGREES, MODELS, ROUNDING, Lens, to_dict
 from darswin.lens.files.content import Content
 from darswin.lens.files.fields import Fields, short, to_number
 from darswin.lens.files.format import Cameras, Description, Format
 from darswin.lens.ideal import FocalLens
 
-# The largest value of each angle, rad, and the entries that give it in degrees.
+# The largest value of each angle, rad.
 ANGLES = {"fov": 2 * math.pi, "theta_max": math.pi}
-IN_DEGREES = {"fov_deg": "fov", "theta_max_deg": "theta_max"}
-# A θ_max that was rounded by another program may exceed the limit by this, rad.
-ROUNDING = 1e-4
 
 
 class Own(Format):
@@ -50,6 +47,12 @@ def _lens(file: Fields) -> Description:
     model = MODELS[name]
     required, optional = list(model.parameters), [*model.optional, *model.common]
     if ("fov" in file or "fov_deg" in file) and issubclass(model, FocalLens):
+        fov = "fov" if "fov" in file else "fov_deg"
+        if "focal" in file:
+            raise ValueError(
+                f"{fov} takes the place of focal, they must not both be given: beside focal, "
+                f"{fov.replace('fov', 'theta_max')} is half of {fov}"
+            )
         required[required.index("focal")] = "fov"
         optional.remove("theta_max")
     known = [*required, *optional]
@@ -57,36 +60,37 @@ def _lens(file: Fields) -> Description:
     for key in file.entries:
         if key not in ("model", *known):
             raise ValueError(f"a {name} lens has no {file.path(key)}, only {', '.join(known)}")
-    angles = {
-        angle: _angle(file, angle, key) for key, angle in IN_DEGREES.items() if angle in known
-    }
+    angles: dict[str, float] = {}
+    for in_degrees, angle in IN_DEGREES.items():
+        if angle in known:
+            angles |= _angle(file, angle, in_degrees)
     description: Description = {"model": name}
     for key in (*required, *(key for key in optional if key in file)):
-        if key not in angles:
+        if key not in ANGLES:
             dims = len(model.declared[key].shape)
             value = file.get(key, "a list of numbers" if dims else "a finite number")
             description[key] = _value(value, file.path(key), dims, model.max_numbers)
     if "image_size" in file:
         description["image_size"] = list(file.sides("image_size"))
-    return description | {key: value for key, value in angles.items() if value is not None}
+    return description | angles
 
 
-def _angle(file: Fields, key: str, in_degrees: str) -> float | None:
-    """An angle in rad, which the file may give in degrees; None if it gives neither."""
+def _angle(file: Fields, key: str, in_degrees: str) -> dict[str, float]:
+    """An angle under the name that the file gives it, with or without "_deg"; {} for none."""
     if key in file and in_degrees in file:
         raise ValueError(f"{file.path(key)} and {file.path(in_degrees)} must not both be given")
     if in_degrees in file:
         most = math.degrees(ANGLES[key])
         expected = f"above 0 and at most {most:g} degrees"
         value = file.get(in_degrees, expected)
-        return math.radians(
-            to_number(value, file.path(in_degrees), expected, lambda x: 0 < x <= most)
-        )
+        number = to_number(value, file.path(in_degrees), expected, lambda x: 0 < x <= most)
+        return {in_degrees: number}
     if key not in file:
-        return None
+        return {}
     expected = f"at most {ANGLES[key]:.4g} rad and above 0 ({in_degrees} takes degrees)"
     most = ANGLES[key] + ROUNDING
-    return to_number(file.get(key, expected), file.path(key), expected, lambda x: 0 < x <= most)
+    value = file.get(key, expected)
+    return {key: to_number(value, file.path(key), expected, lambda x: 0 < x <= most)}
 
 
 def _value(value: Any, name: str, dims: int, most: int) -> Any:
