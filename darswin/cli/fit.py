@@ -10,6 +10,7 @@ import logging
 import re
 import shutil
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,6 +18,7 @@ from typing import NoReturn, get_args
 
 import torch
 import yaml
+from lightning.fabric.strategies.launchers.subprocess_script import _ChildProcessObserver
 from lightning.pytorch import Callback, LightningModule, Trainer
 from lightning.pytorch.callbacks import ProgressBar, TQDMProgressBar
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
@@ -58,7 +60,7 @@ from darswin.train.runs import (
 from darswin.train.tasks import TASKS
 from darswin.utils.files import locked, remove_partial_files, replace_file
 from darswin.utils.malloc import keep_freed_memory
-from darswin.utils.processes import end_with_killed_process
+from darswin.utils.processes import end_with_failed_process
 from darswin.utils.tasks import Task
 
 # What the libraries of several processes say if one of them has gone.
@@ -105,7 +107,7 @@ def run(argv: list[str], task: Task) -> None:
             raise SystemExit(0 if other else 128 + signals.number) from None
         except (MemoryError, RuntimeError) as error:
             if re.search(_LOST, str(error)):
-                time.sleep(1)  # `end_with_killed_process` may know which one it was
+                time.sleep(1)  # `end_with_failed_process` may know which one it was
                 if rank_zero_only.rank:  # type: ignore[attr-defined]
                     raise SystemExit(1) from error
                 raise SystemExit("darswin: another process of this run has ended") from error
@@ -356,14 +358,17 @@ class BeginRun(Callback):
 
 
 class WatchProcesses(Callback):
-    """Ends the run with one line if one of the processes that Lightning started is killed."""
+    """Ends the run with one line if one of the processes that Lightning started fails."""
 
     def __init__(self, hint: str):
         self.hint = hint
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
         if isinstance(launcher := trainer.strategy.launcher, _SubprocessScriptLauncher):
-            end_with_killed_process(launcher.procs, self.hint)
+            for thread in threading.enumerate():
+                if isinstance(thread, _ChildProcessObserver):
+                    thread._child_processes = []  # it would kill this process without a word
+            end_with_failed_process(launcher.procs, self.hint)
 
 
 class RunProgressBar(TQDMProgressBar):

@@ -11,6 +11,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
 _FIRST = "DARSWIN_FIRST_PROCESS"  # the environment variable with its process number
+_OWN_WORDS = 5  # seconds in which the first process may tell its own error, often the same one
 _PR_SET_PDEATHSIG = 1  # option of Linux's prctl: the signal for a process whose parent dies
 
 
@@ -35,27 +36,29 @@ def die_with_first_process() -> Iterator[None]:
         os.environ.pop(_FIRST, None)
 
 
-def end_with_killed_process(others: Sequence[subprocess.Popen], hint: str) -> None:
-    """Starts a thread of the first process. Once a signal has ended one of the `others`, it prints
-    which one, and `hint`, and ends the first process with exit code 1.
+def end_with_failed_process(others: Sequence[subprocess.Popen], hint: str) -> None:
+    """Starts a thread of the first process. Once one of the `others` has failed, it prints which
+    one, and `hint`, and ends the first process with exit code 1.
 
-    Otherwise the first process would fail in the network library, with a traceback.
+    Otherwise the first process would fail in the network library, with a traceback, or wait there
+    for minutes.
     """
 
     def watch() -> None:
-        alive = True
-        while alive:
-            alive = any(other.poll() is None for other in others)
-            for place, other in enumerate(others, 2):
-                if (code := other.poll()) is not None and code < 0:
-                    name = signal.Signals(-code).name
-                    sys.stdout.flush()
-                    sys.stderr.write(
-                        f"darswin: process {place} of {len(others) + 1} (number {other.pid}) was "
-                        f"ended by {name}{hint}\n"
-                    )
-                    sys.stderr.flush()
-                    os._exit(1)
+        while set(codes := [other.poll() for other in others]) != {0}:
+            for place, (other, code) in enumerate(zip(others, codes, strict=True), 2):
+                if not code:
+                    continue
+                if code > 0:
+                    time.sleep(_OWN_WORDS)
+                    how = f"ended with exit code {code}"
+                else:
+                    how = f"was ended by {signal.Signals(-code).name}"
+                sys.stdout.flush()
+                number = f"process {place} of {len(others) + 1} (number {other.pid})"
+                sys.stderr.write(f"darswin: {number} {how}{hint}\n")
+                sys.stderr.flush()
+                os._exit(1)
             time.sleep(0.05)
 
     threading.Thread(target=watch, daemon=True).start()
