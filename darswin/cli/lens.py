@@ -187,8 +187,9 @@ def crop(
     """
     if box is None and size is None:
         raise ValueError("missing `box` or `size`: give the part to keep, or the new size, or both")
-    for side in (*(box or ())[2:], *(size or ())):
-        check_option("size" if box is None else "box", side, 1 <= side <= 10**6, _SIDES)
+    for name, sides in (("box", (box or ())[2:]), ("size", size or ())):
+        for side in sides:
+            check_option(name, side, 1 <= side <= 10**6, _SIDES)
     check_out(out, (calib,))
     file, theta_max = _calibration(calib, theta_max_deg, image_size, coefficients)
     lens, note = file.lens(camera, theta_max, image_size, torch.float64), ""

@@ -123,6 +123,8 @@ def test_radians_in_place_of_degrees_are_told(folder, capsys, monkeypatch):
             "crop front.json ./front.json --box 0,0,9,9",
             "--out ./front.json would replace",
         ),
+        ("crop front.json new.json --box 0,0,9,9 --size 0,9", "--size must be from 1 to .*, got 0"),
+        ("crop front.json new.json --box 0,0,0,9 --size 9,9", "--box must be from 1 to .*, got 0"),
         ("info wrong.json", "wrong.json"),
         ("info bare.json", "lacks the size of its images: give --image_size, their height"),
         ("draw front.json", "invalid choice: 'draw'"),
