@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from darswin import compat, frames, lens, models, ops
     from darswin.deploy.optimize import optimize
-    from darswin.layers.polar import PolarGrid, PolarSample, polar_grid
-    from darswin.layers.transformer import PolarWindowAttention
+    from darswin.views import PolarGrid, PolarSample, polar_grid
+    from darswin.layers.attention import PolarWindowAttention
     from darswin.models import DarSwin, create_model, list_models, load_model
 
     __version__: str
@@ -36,14 +36,14 @@ __all__ = [
 # The module of each public name that is no module.
 _MODULES = {
     "DarSwin": "darswin.models",
-    "PolarGrid": "darswin.layers.polar",
-    "PolarSample": "darswin.layers.polar",
-    "PolarWindowAttention": "darswin.layers.transformer",
+    "PolarGrid": "darswin.views",
+    "PolarSample": "darswin.views",
+    "PolarWindowAttention": "darswin.layers.attention",
     "create_model": "darswin.models",
     "list_models": "darswin.models",
     "load_model": "darswin.models",
     "optimize": "darswin.deploy.optimize",
-    "polar_grid": "darswin.layers.polar",
+    "polar_grid": "darswin.views",
 }
 
 

@@ -1,24 +1,8 @@
-"""Patch embedding: images → the first map, of polar patches (DarSwin) or squares (Swin, DAT)."""
+"""Patch embedding: what a view shows → the first map, of polar patches (DarSwin) or squares."""
 
-from typing import Any
-
-import torch
 from torch import Tensor, nn
 
 from darswin.layers.linear import Linear
-from darswin.layers.polar import PolarGrid, PolarGridSpec, PolarSample
-from darswin.ops import polar_embed
-
-
-def check_dtype(images: Tensor, dtype: torch.dtype) -> None:
-    """TypeError unless the images are uint8, have the model's dtype, or autocast converts them."""
-    if images.dtype in (torch.uint8, dtype):
-        return
-    autocast = torch.is_autocast_enabled(images.device.type)
-    if not autocast or torch.float64 in (images.dtype, dtype):
-        raise TypeError(
-            f"images must be uint8 or {dtype}, the dtype of the weights, got {images.dtype}"
-        )
 
 
 class PatchProjection(nn.Module):
@@ -31,31 +15,25 @@ class PatchProjection(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """(B, H, W, D) → (B, H/p, W/p, D')."""
-        check_dtype(x, self.proj.weight.dtype)
         return self.norm(self.proj(x.permute(0, 3, 1, 2)).permute(0, 2, 3, 1))
 
 
-class PolarPatchEmbed(nn.Module):
-    """Samples each patch of a polar grid, and maps the samples to a token."""
+class PatchEmbed(PatchProjection):
+    """Maps each p × p patch of an image to a token."""
 
-    def __init__(
-        self, spec: PolarGridSpec, *, in_chans: int = 3, embed_dim: int = 96, **options: Any
-    ):
+    def forward(self, x: Tensor) -> Tensor:
+        """(B, C, H, W) → (B, H/p, W/p, D)."""
+        return super().forward(x.permute(0, 2, 3, 1))
+
+
+class PolarPatchEmbed(nn.Module):
+    """Maps the samples of each patch of a polar grid to a token."""
+
+    def __init__(self, values: int, embed_dim: int):
         super().__init__()
-        self.sample = PolarSample(**vars(spec), **options)
-        self.proj = Linear(spec.samples[0] * spec.samples[1] * in_chans, embed_dim)
+        self.proj = Linear(values, embed_dim)
         self.norm = nn.LayerNorm(embed_dim)
 
-    def forward(self, images: Tensor, grid: PolarGrid | None) -> Tensor:
-        """Images (B, C, H, W), uint8 or of the weights' dtype → (B, R, A, D).
-
-        Without a grid, the images are samples (B, R, A, S_r·S_φ·C) of any floating-point dtype.
-        """
-        weight, bias = self.proj.weight, self.proj.bias
-        if grid is None:
-            return self.norm(self.proj(images.to(weight.dtype)))
-        check_dtype(images, weight.dtype)
-        tokens = polar_embed(**self.sample.arguments(images, grid), weight=weight, bias=bias)
-        if weight.dtype == torch.bfloat16:
-            tokens = tokens.bfloat16()  # tokens of uint8 images are float32
-        return self.norm(tokens)
+    def forward(self, x: Tensor) -> Tensor:
+        """Samples (B, R, A, S_r·S_φ·C) of any floating-point dtype → (B, R, A, D)."""
+        return self.norm(self.proj(x.to(self.proj.weight.dtype)))

@@ -7,7 +7,7 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
-from darswin.layers.polar import PolarGrid
+from darswin.views import PolarGrid
 
 PositionBias = Literal["angular_relative", "angular", "polar"]
 

@@ -1,16 +1,17 @@
 """The models: creating them by name, saving them, and loading them."""
 
-from darswin.models.base import FeatureInfo, Model
+from darswin.models.adapter import LensAdapter
+from darswin.models.base import Model
 from darswin.models.conv_unet import ConvUnet
 from darswin.models.create import create_model
 from darswin.models.darswin import DarSwin
 from darswin.models.dat import DAT
 from darswin.models.encoder import Encoder, FeatureMaps
+from darswin.models.features import FeatureInfo
 from darswin.models.registry import list_models, list_pretrained, pretrained_file
 from darswin.models.saving import ModelCard, NoCardError, load_model, read_card, save_model
 from darswin.models.swin import Swin
 from darswin.models.unet import Unet
-from darswin.models.views import LensAdapter
 
 __all__ = [
     "DAT",

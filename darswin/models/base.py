@@ -1,73 +1,46 @@
 """The base class of all models: how they are called, and how they describe themselves."""
 
 import warnings
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Iterable, Sequence
+from typing import Any, Generic, TypeVar
 
 import torch
 from torch import Tensor, nn
 
 from darswin.layers.linear import MATMUL_BACKENDS, Linear, MatmulBackend
-from darswin.layers.polar import check_images, check_lens
-from darswin.layers.transformer import Block, Mlp, WindowAttention
+from darswin.layers.transformer import Block, Stage
 from darswin.lens import Lens
-from darswin.models.stages import Pair, StagePlan
+from darswin.models.features import FeatureInfo
 from darswin.ops._library import transformed
-from darswin.ops.checks import per_channel, readable
-from darswin.ops.reference import normalized
+from darswin.ops.checks import readable
+from darswin.views import Pair, Prepared, View
+from darswin.views.base import PerChannel, check_images, check_lens
+
+Result = TypeVar("Result", covariant=True)
 
 # Images in floating point with larger values have not been normalized: with ImageNet's statistics,
 # normalized images end at 2.7.
 LARGEST_NORMALIZED = 20
 
 
-class FeatureInfo(list[dict[str, Any]]):
-    """A list with one dict per stage, and timm's accessors.
+class Model(nn.Module, Generic[Result]):
+    """The base class of all models: a view and a network.
 
-    Keys:
-        num_chs: D, the width of the stage's map.
-        reduction: the number of pixels that a token spans along its longer side. They are pixels of
-            the image, or of the view if the model makes one. DarSwin counts samples of the polar
-            grid instead, because the number of pixels depends on the lens and the ring.
-        module: the stage's name in the model.
-        map_size: (R, A) of a polar map, (H, W) of any other map.
-    """
-
-    def get(self, key: str, idx: int | Sequence[int] | None = None) -> Any:
-        """The values of a key for one stage (an int), several stages, or all of them (None)."""
-        if isinstance(idx, int):
-            return self[idx][key]
-        return [self[k][key] for k in (range(len(self)) if idx is None else idx)]
-
-    def channels(self, idx: int | Sequence[int] | None = None) -> Any:
-        """The widths D of the stages' maps."""
-        return self.get("num_chs", idx)
-
-    def reduction(self, idx: int | Sequence[int] | None = None) -> Any:
-        """The number of pixels that a token of each stage spans; see `FeatureInfo`."""
-        return self.get("reduction", idx)
-
-    def module_name(self, idx: int | Sequence[int] | None = None) -> Any:
-        """The stages' names in the model."""
-        return self.get("module", idx)
-
-
-class Model(nn.Module):
-    """The base class of all models. They are called `model(images, lens)` and have timm's methods.
-
-    A call checks the images, computes `prepare(lens, size)`, and runs the network on both. If your
-    lens stays the same, call `prepare` once and then `run(images, prepared)` for each batch: the
-    results are the same. `run_sampled` starts later, at the result of `sample`: pixels that were
-    sampled elsewhere, such as on a camera. A subclass defines `_prepare`, `_run`, `_sample`,
-    `_points` and `_run_sampled`.
+    They are called `model(images, lens)` and have timm's methods. A call checks the images, computes
+    `prepare(lens, size)`, and runs the network on what the view sees. If your lens stays the same,
+    call `prepare` once and then `run(images, prepared)` for each batch: the results are the same.
+    `run_sampled` starts later, at the result of `sample`: pixels that were sampled elsewhere, such
+    as on a camera. A subclass makes a `view`, and defines `forward_network`.
 
     Attributes:
-        in_chans: C, the number of channels of the images.
+        view: what the network sees of the images through their lenses.
+        stages: the stages of the network; `prepare` computes the position biases of their blocks.
+        in_chans: C, the number of channels of the images; None allows any number.
         num_classes: the number of classes of the result.
-        mean, std: the normalization of `normalize`, for each channel.
         image_size: the size (H, W) that all images must have; None allows any size.
-        square_images: True if the images must be square.
-        uses_lens: False if the model ignores its lens, which may then be None.
+        goes_back: the size of the maps that go back to the pixels of the images, or False.
+        reads_rays: True if the network reads the viewing directions of pixels.
+        token_maps: the sizes of the maps of whose tokens the network reads the positions.
         refines_with_images: True if `run_sampled` needs the images too.
         feature_info: the sizes of the encoder's stages.
         pretrained_cfg: timm's description of a model, a dict. Its keys are "architecture" (the
@@ -77,14 +50,15 @@ class Model(nn.Module):
             and "file", and its other values agree with its card.
     """
 
-    image_size: Pair | None = None
-    square_images = False
-    uses_lens = True
-    refines_with_images = False
-    in_chans: int
+    view: View
+    stages: Iterable[Stage]
+    in_chans: int | None
     num_classes: int
-    mean: float | Sequence[float] | None
-    std: float | Sequence[float] | None
+    image_size: Pair | None = None
+    goes_back: bool | Pair = False
+    reads_rays = False
+    token_maps: Sequence[Pair] = ()
+    refines_with_images = False
     matmul_backend: MatmulBackend = "torch"  # see `set_matmul_backend`
     _looks = 3  # the number of calls that still look at the values of their images
 
@@ -93,8 +67,24 @@ class Model(nn.Module):
         self.feature_info = FeatureInfo()
         self.pretrained_cfg: dict[str, Any] = {}
 
-    def prepare(self, lens: Lens | None, size: Pair) -> Any:
+    def forward_network(self, x: Tensor, prepared: Prepared, images: Tensor | None) -> Result:
+        """The network's part of `forward`.
+
+        Args:
+            x: what the view sees, in floating point.
+            prepared: the result of `prepare`.
+            images: the images, checked; None only unless the model `refines_with_images`.
+        """
+        raise NotImplementedError
+
+    def forward(self, images: Tensor, lens: Lens | None = None) -> Result:
+        """Images (B, C, H, W) and their lenses (B or 1) → the model's result."""
+        return self._run(*self._checked_and_prepared(images, lens))
+
+    def prepare(self, lens: Lens | None, size: Pair) -> Prepared:
         """Everything that depends on the lens but not on the pixels, for any number of `run` calls.
+
+        It includes the position biases, so call it again after the weights have changed.
 
         Args:
             lens: N lenses, or None if the model ignores its lens.
@@ -106,33 +96,13 @@ class Model(nn.Module):
         """
         if self.uses_lens:
             check_lens(lens, size)
-        return self._prepare(lens, size)
+        prepared = self.view.prepare(
+            lens, size, back=self.goes_back, rays=self.reads_rays, maps=self.token_maps
+        )
+        tables = [stage.tables(prepared.points) for stage in self.stages]
+        return prepared._replace(tables=tables)
 
-    def _prepare(self, lens: Any, size: Pair) -> Any:
-        """The result of `prepare`, from a lens that was checked."""
-        raise NotImplementedError
-
-    def _run(self, images: Tensor, prepared: Any) -> Any:
-        """The result of `run`, from images that were checked."""
-        raise NotImplementedError
-
-    def _sample(self, images: Tensor, prepared: Any) -> Tensor:
-        """The result of `sample`, from images that were checked."""
-        raise NotImplementedError
-
-    def _points(self, prepared: Any) -> Any:
-        """The points at which `_sample` reads the images; None if it takes them as they are."""
-        return None
-
-    def _run_sampled(self, sampled: Tensor, prepared: Any, images: Tensor | None) -> Any:
-        """The result of `run_sampled`, from pixels and images that were checked."""
-        raise NotImplementedError
-
-    def forward(self, images: Tensor, lens: Lens | None = None) -> Any:
-        """Images (B, C, H, W) and their lenses (B or 1) → the model's result."""
-        return self._run(*self._checked_and_prepared(images, lens))
-
-    def run(self, images: Tensor, prepared: Any) -> Any:
+    def run(self, images: Tensor, prepared: Prepared) -> Result:
         """The result of `forward`, with the lens given as the result of `prepare`.
 
         Args:
@@ -147,7 +117,11 @@ class Model(nn.Module):
         """
         return self._run(self._checked(images), prepared)
 
-    def sample(self, images: Tensor, prepared: Any) -> Tensor:
+    def _run(self, images: Tensor, prepared: Prepared) -> Result:
+        x = self.view.see(images, prepared, self.dtype)
+        return self.forward_network(x, prepared, images)
+
+    def sample(self, images: Tensor, prepared: Prepared) -> Tensor:
         """The pixels that the network reads, in floating point; uint8 images are normalized.
 
         They are polar samples (B, R, A, S_r·S_φ·C) in the inner order (S_r, S_φ, C) for a DarSwin
@@ -159,9 +133,11 @@ class Model(nn.Module):
         Raises:
             TypeError, ValueError: as in `run`.
         """
-        return self._sample(self._checked(images), prepared)
+        return self.view.see(self._checked(images), prepared, self.dtype)
 
-    def run_sampled(self, sampled: Tensor, prepared: Any, images: Tensor | None = None) -> Any:
+    def run_sampled(
+        self, sampled: Tensor, prepared: Prepared, images: Tensor | None = None
+    ) -> Result:
         """The result of `run`, up to rounding, from pixels that were sampled already.
 
         Args:
@@ -174,7 +150,7 @@ class Model(nn.Module):
             TypeError: an argument is no tensor, has an unsupported dtype, or is missing.
             ValueError: an argument has a wrong shape, or the number of lenses is neither B nor 1.
         """
-        sampled = self._checked_sampled(sampled, prepared)
+        sampled = self.view.check_seen(sampled, prepared, self.in_chans)
         self._check_device("sampled", sampled)
         if not self.refines_with_images:
             images = None
@@ -182,12 +158,33 @@ class Model(nn.Module):
             raise TypeError("images are missing: this model refines its result with their pixels")
         else:
             images = self._checked(images)
-        return self._run_sampled(sampled, prepared, images)
+        return self.forward_network(sampled, prepared, images)
 
-    def _checked_and_prepared(self, images: Tensor, lens: Lens | None) -> tuple[Tensor, Any]:
-        images = self._checked(images)
-        height, width = images.shape[2:]
-        return images, self.prepare(lens, (height, width))
+    @property
+    def uses_lens(self) -> bool:
+        """False if the model ignores its lens, which may then be None."""
+        return self.view.uses_lens or self.reads_rays
+
+    @property
+    def mean(self) -> PerChannel | None:
+        """The mean of the normalization of `normalize`, for each channel."""
+        return self.view.mean
+
+    @property
+    def std(self) -> PerChannel | None:
+        """The standard deviation of the normalization of `normalize`, for each channel."""
+        return self.view.std
+
+    @property
+    def square_images(self) -> bool:
+        """True if the images must be square."""
+        return self.image_size is not None and self.image_size[0] == self.image_size[1]
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """The dtype of the weights."""
+        weight = next(self.parameters(), None)
+        return torch.float32 if weight is None else weight.dtype
 
     def normalize(self, images: Tensor) -> Tensor:
         """`(image - mean) / std` for each channel: floating point as the model takes it.
@@ -205,8 +202,11 @@ class Model(nn.Module):
         Raises:
             TypeError: the images are no tensor, or neither in floating point nor of uint8.
             ValueError: the images have a wrong shape or are on another device than the model; or
-                their values, which are looked at on the CPU, are far beyond 1.
+                their values, which are looked at on the CPU, are far beyond 1; or the model has no
+                mean and std.
         """
+        if self.mean is None:
+            raise ValueError("normalize needs a model with mean and std")
         images = self._with_shape(images)
         if images.dtype != torch.uint8:
             if not images.is_floating_point():
@@ -217,11 +217,20 @@ class Model(nn.Module):
                     f"images in floating point must be in [0, 1], got values up to {largest:g}: "
                     "divide them by 255, or pass uint8"
                 )
-        return self._normalized(images)
+        return self.view.normalized(images, self.dtype)
+
+    def _checked_and_prepared(self, images: Tensor, lens: Lens | None) -> tuple[Tensor, Prepared]:
+        images = self._checked(images)
+        height, width = images.shape[2:]
+        return images, self.prepare(lens, (height, width))
 
     def _checked(self, images: Tensor) -> Tensor:
-        """The result of `_with_shape`. Warns once if the values cannot be normalized ones."""
+        """The images as (B, C, H, W), after a check of their channels, size, device and dtype.
+
+        Warns once if their values cannot be normalized ones.
+        """
         images = self._with_shape(images)
+        self._check_dtype(images)
         if not torch.compiler.is_compiling() and self._looks and images.is_floating_point():
             self._looks -= 1
             largest = _largest(images)
@@ -235,9 +244,8 @@ class Model(nn.Module):
         return images
 
     def _with_shape(self, images: Tensor) -> Tensor:
-        """The images as (B, C, H, W), after a check of their channels, size and device."""
         images = check_images(images, channels=self.in_chans)
-        if images.shape[1] != self.in_chans:
+        if self.in_chans not in (None, images.shape[1]):
             last = images.shape[3] == self.in_chans
             advice = "; the channels come first: pass images.permute(0, 3, 1, 2)" if last else ""
             raise ValueError(
@@ -259,22 +267,16 @@ class Model(nn.Module):
                 f'pass {name}.to("{weight.device}")'
             )
 
-    def _checked_sampled(self, sampled: Tensor, prepared: Any) -> Tensor:
-        """The pixels of `run_sampled`, after a check of their shape."""
-        return self._checked(sampled)
-
-    def _floating(self, images: Tensor) -> Tensor:
-        """The images in floating point: uint8 images are normalized, others stay as they are."""
-        return images if images.dtype != torch.uint8 else self._normalized(images)
-
-    def _normalized(self, images: Tensor) -> Tensor:
-        weight = next(self.parameters(), None)
-        dtype = torch.float32 if weight is None else weight.dtype
-        exact = torch.promote_types(dtype, torch.float32)
-        assert self.mean is not None and self.std is not None
-        mean = per_channel("mean", self.mean, images.shape[1])
-        std = per_channel("std", self.std, images.shape[1])
-        return normalized(images, mean, std, exact).to(dtype)
+    def _check_dtype(self, images: Tensor) -> None:
+        """TypeError unless images are uint8, have the model's dtype, or autocast converts them."""
+        if images.dtype in (torch.uint8, self.dtype):
+            return
+        autocast = torch.is_autocast_enabled(images.device.type)
+        if not autocast or torch.float64 in (images.dtype, self.dtype):
+            raise TypeError(
+                f"images must be uint8 or {self.dtype}, the dtype of the weights, "
+                f"got {images.dtype}"
+            )
 
     def no_weight_decay(self) -> set[str]:
         """Names of the parameters without weight decay, in addition to biases and norms."""
@@ -304,7 +306,7 @@ class Model(nn.Module):
         few percent of the work. The gradients stay the same, bit for bit.
         """
         for module in self.modules():
-            if isinstance(module, (Block, Mlp, WindowAttention)):
+            if isinstance(module, Block):
                 module.grad_checkpointing = enable
 
 
@@ -335,30 +337,3 @@ def init_by_width(module: nn.Module) -> None:
         nn.init.trunc_normal_(module.weight, std=module.in_features**-0.5)
         if module.bias is not None:
             nn.init.zeros_(module.bias)
-
-
-def feature_info(plans: Sequence[StagePlan], embed_dim: int, patch: Pair) -> FeatureInfo:
-    """The sizes of stages. A token of the first one spans `patch`; the width doubles per stage."""
-    infos = FeatureInfo()
-    for plan in plans:
-        merged = zip(patch, plans[0].map_size, plan.map_size, strict=True)
-        infos.append(
-            dict(
-                num_chs=embed_dim * 2**plan.index,
-                reduction=max(span * before // after for span, before, after in merged),
-                module=f"stages.{plan.index}",
-                map_size=plan.map_size,
-            )
-        )
-    return infos
-
-
-def take_indices(count: int, indices: int | Sequence[int] | None) -> list[int]:
-    """Numbers of the chosen ones of `count` stages: the last ones for an int, all for None."""
-    if isinstance(indices, int):
-        chosen: Sequence[int] = range(count)[-indices:] if 0 < indices <= count else ()
-    else:
-        chosen = range(count) if indices is None else indices
-    if not chosen or not all(-count <= i < count for i in chosen):
-        raise ValueError(f"indices must name some of {count} stages, got {indices}")
-    return [i % count for i in chosen]

@@ -2,20 +2,17 @@
 
 from collections.abc import Sequence
 from itertools import pairwise
-from typing import Any
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from darswin.layers.embed import check_dtype
-from darswin.layers.polar import check_count
-from darswin.lens.pixels import pixel_rays, ray_channels
-from darswin.models.base import FeatureInfo
+from darswin.models.features import FeatureInfo
 from darswin.models.pixel import RAYS, PixelModel, PixelTask, with_rays
 from darswin.models.registry import Presets, register_model
-from darswin.models.stages import Pair
 from darswin.ops.checks import per_channel
+from darswin.views import PlainView, Prepared
+from darswin.views.base import PerChannel, check_count
 
 # About as many parameters as "darswin_unet_a" of the same size.
 _SIZES: Presets = dict(
@@ -62,6 +59,8 @@ class ConvUnet(PixelModel):
         rays as channels are those of CAM-Convs, CVPR 2019, in another parametrization.
     """
 
+    stages = ()
+
     def __init__(
         self,
         num_classes: int = 10,
@@ -71,14 +70,15 @@ class ConvUnet(PixelModel):
         widths: Sequence[int] = (15, 30, 60, 120),
         rays: bool = True,
         typical_distance: float = 10.0,
-        mean: float | Sequence[float] = 0.0,
-        std: float | Sequence[float] = 1.0,
+        mean: PerChannel = 0.0,
+        std: PerChannel = 1.0,
     ):
         super().__init__(task, typical_distance)
         if min(widths, default=0) < 1:
             raise ValueError(f"widths must be at least 1, for at least one level, got {widths}")
-        self.in_chans, self.uses_lens = in_chans, rays
-        self.mean, self.std = per_channel("mean", mean, in_chans), per_channel("std", std, in_chans)
+        self.in_chans, self.reads_rays = in_chans, rays
+        mean, std = per_channel("mean", mean, in_chans), per_channel("std", std, in_chans)
+        self.view = PlainView(None, mean=mean, std=std)
         self.feature_info = FeatureInfo(
             dict(num_chs=width, reduction=2**level, module=f"down.{level}", map_size=None)
             for level, width in enumerate(widths)
@@ -96,21 +96,10 @@ class ConvUnet(PixelModel):
             first_conv="down.0.0", classifier=f"{task}_head.proj",
         )  # fmt: skip
 
-    def _prepare(self, lens: Any, size: Pair) -> Tensor | None:
-        """The viewing directions of the pixels, (N, 3, H, W)."""
-        return ray_channels(*pixel_rays(lens, size)) if self.uses_lens else None
-
-    def _sample(self, images: Tensor, prepared: Tensor | None) -> Tensor:
-        return self._floating(images)
-
-    def _run_sampled(self, sampled: Tensor, prepared: Tensor | None, images: Tensor | None) -> Any:
-        return self._run(sampled, prepared)
-
-    def _run(self, images: Tensor, prepared: Tensor | None) -> Tensor:
-        check_dtype(images, next(self.parameters()).dtype)
-        if prepared is not None:
-            check_count(prepared.shape[0], images)
-        x = with_rays(self._floating(images), prepared)
+    def forward_network(self, x: Tensor, prepared: Prepared, images: Tensor | None) -> Tensor:
+        if prepared.rays is not None:
+            check_count(len(prepared.rays), x)
+        x = with_rays(x, prepared.rays)
         x = x.contiguous(memory_format=torch.channels_last)
         maps: list[Tensor] = []
         for level, block in enumerate(self.down):

@@ -1,14 +1,14 @@
 """Creating models by name, with the type of each name."""
 
 from collections.abc import Sequence
-from typing import Any, Literal, overload
+from typing import Literal, overload
 
 from darswin.models.conv_unet import ConvUnet
 from darswin.models.darswin import DarSwin
 from darswin.models.dat import DAT
 from darswin.models.encoder import Encoder, FeatureMaps, Format
 from darswin.models.pixel import PixelModel, PixelTask
-from darswin.models.registry import model_class, no_weights, preset
+from darswin.models.registry import make, model_class, no_weights
 from darswin.models.swin import Swin
 from darswin.models.unet import Unet
 
@@ -35,21 +35,23 @@ ConvUnetName = Literal["conv_unet_small", "conv_unet_tiny", "conv_unet_micro", "
 
 @overload
 def create_model(
-    name: DarSwinName, *, features_only: Literal[False] = ..., **options: Any
+    name: DarSwinName, *, features_only: Literal[False] = ..., **options: object
 ) -> DarSwin: ...
 @overload
-def create_model(name: DATName, *, features_only: Literal[False] = ..., **options: Any) -> DAT: ...
+def create_model(
+    name: DATName, *, features_only: Literal[False] = ..., **options: object
+) -> DAT: ...
 @overload
 def create_model(
-    name: SwinName, *, features_only: Literal[False] = ..., **options: Any
+    name: SwinName, *, features_only: Literal[False] = ..., **options: object
 ) -> Swin: ...
 @overload
 def create_model(
-    name: UnetName, *, features_only: Literal[False] = ..., **options: Any
+    name: UnetName, *, features_only: Literal[False] = ..., **options: object
 ) -> Unet: ...
 @overload
 def create_model(
-    name: ConvUnetName, *, features_only: Literal[False] = ..., **options: Any
+    name: ConvUnetName, *, features_only: Literal[False] = ..., **options: object
 ) -> ConvUnet: ...
 @overload
 def create_model(
@@ -58,15 +60,15 @@ def create_model(
     features_only: Literal[True],
     out_indices: int | Sequence[int] | None = ...,
     output_fmt: Format | None = ...,
-    **options: Any,
+    **options: object,
 ) -> FeatureMaps: ...
 @overload
 def create_model(
-    name: str, *, task: PixelTask, features_only: Literal[False] = ..., **options: Any
+    name: str, *, task: PixelTask, features_only: Literal[False] = ..., **options: object
 ) -> PixelModel: ...
 @overload
 def create_model(
-    name: str, *, features_only: Literal[False] = ..., **options: Any
+    name: str, *, features_only: Literal[False] = ..., **options: object
 ) -> Encoder | PixelModel: ...
 @overload
 def create_model(
@@ -75,7 +77,7 @@ def create_model(
     features_only: bool,
     out_indices: int | Sequence[int] | None = ...,
     output_fmt: Format | None = ...,
-    **options: Any,
+    **options: object,
 ) -> Encoder | PixelModel | FeatureMaps: ...
 
 
@@ -86,8 +88,8 @@ def create_model(
     out_indices: int | Sequence[int] | None = None,
     output_fmt: Format | None = None,
     pretrained: bool = False,
-    **options: Any,
-) -> Any:
+    **options: object,
+) -> Encoder | PixelModel | FeatureMaps:
     """A new model: an `Encoder`, which classifies images, or a `Unet`, which predicts per pixel.
 
     Args:
@@ -102,10 +104,11 @@ def create_model(
     """
     if not features_only and (out_indices is not None or output_fmt is not None):
         raise ValueError("out_indices and output_fmt need features_only=True")
-    kind = model_class(name)
+    model_class(name)  # which knows the name, or raises an error
     if pretrained:
         raise no_weights(name)
-    model = kind(**(preset(name) | options))
+    model = make(name, **options)
+    assert isinstance(model, Encoder | PixelModel)
     model.pretrained_cfg["architecture"] = name
     if not features_only:
         return model

@@ -1,22 +1,21 @@
 """DarSwin: an image encoder in the polar coordinates of a calibrated lens."""
 
-import dataclasses
 from collections.abc import Sequence
-from typing import Any, Literal
+from typing import Literal
 
-import torch
-from torch import Tensor, nn
+from torch import nn
 
+from darswin.layers.attention import PolarWindowAttention
 from darswin.layers.embed import PolarPatchEmbed
-from darswin.layers.polar import PolarGrid, PolarGridSpec, check_count
-from darswin.layers.position_bias import PositionBias, ring_angles
-from darswin.layers.transformer import PolarWindowAttention
-from darswin.lens import Lens
-from darswin.models.encoder import Encoder, Prepared
+from darswin.layers.position_bias import PositionBias
+from darswin.lens.spacing import Spacing
+from darswin.models.encoder import Encoder
 from darswin.models.registry import Presets, register_model
-from darswin.models.stages import Pair, StagePlan, plan_stages
-from darswin.ops import polar_sample
-from darswin.ops.checks import check_tensor
+from darswin.models.stages import StageSizes, stage_sizes
+from darswin.ops.checks import per_channel
+from darswin.views import Pair, PolarView
+from darswin.views.base import PerChannel
+from darswin.views.polar import Placement
 
 # Models of the same size have the same number of tokens.
 PRESETS: Presets = dict(micro=dict(samples=(6, 6)), nano=dict(rings=8, sectors=32, samples=(4, 4)))
@@ -33,19 +32,18 @@ class DarSwin(Encoder):
     because R and A belong to the model.
 
     Args:
-        arguments: num_classes, in_chans, embed_dim, depths and num_heads, as in `Encoder`.
-        jitter: how far the sample points move at random in training, in [0, 1]; 0 turns it off.
+        num_classes, in_chans, embed_dim, depths, num_heads, mlp_ratio, drop_path_rate: the
+            arguments of `Encoder`.
+        rings, sectors, samples, spacing, sample_spacing, placement, theta_max, jitter, mean, std:
+            the arguments of `PolarView`. With "radius" for both spacings the model does not use the
+            projection curve. The biases "angular_relative" and "angular" count θ_max/R from ring to
+            ring for every spacing; with a spacing other than "theta" these angles are nominal.
         variant: "A" has windows and merging along azimuth, "RA" along radius and azimuth.
         window: (M_r, M_φ) on maps that are large enough; None means (1, 16) for A, (4, 4) for RA.
         merges: (m_r, m_φ) before each stage but the first; None means (1, 4) for A, (2, 2) for RA.
         position_bias: "angular_relative", or one of the ablations "angular" and "polar".
         harmonics: the number of harmonics of these two ablations.
         periodic_bias: see `AngularRelativeBias`.
-        options: the settings of `PolarGridSpec`, such as `rings`, `sectors`, `samples`, `spacing`
-            and `theta_max`, and the other arguments of `Encoder`. With "radius" for both spacings
-            the model does not use the projection curve. The biases "angular_relative" and
-            "angular" count θ_max/R from ring to ring for every spacing; with a spacing other than
-            "theta" these angles are nominal.
 
     Rotation:
         Turning a square image by 90° about the principal point turns the maps by a quarter of their
@@ -63,11 +61,25 @@ class DarSwin(Encoder):
     Source: DarSwin, ICCV 2023.
     """
 
-    patch_embed: PolarPatchEmbed
+    view: PolarView
 
     def __init__(
         self,
-        *arguments: Any,
+        num_classes: int = 1000,
+        in_chans: int = 3,
+        embed_dim: int = 96,
+        depths: Sequence[int] = (2, 2, 18, 2),
+        num_heads: Sequence[int] = (3, 6, 12, 24),
+        *,
+        mlp_ratio: float = 4.0,
+        drop_path_rate: float = 0.2,
+        rings: int = 16,
+        sectors: int = 64,
+        samples: Pair = (10, 10),
+        spacing: Spacing = "theta",
+        sample_spacing: Spacing | None = None,
+        placement: Placement = "centers",
+        theta_max: float | None = None,
         jitter: float = 1.0,
         variant: Literal["A", "RA"] = "A",
         window: Pair | None = None,
@@ -75,61 +87,33 @@ class DarSwin(Encoder):
         position_bias: PositionBias = "angular_relative",
         harmonics: int = 16,
         periodic_bias: bool = False,
-        **options: Any,
+        mean: PerChannel = 0.0,
+        std: PerChannel = 1.0,
     ):
-        names = [field.name for field in dataclasses.fields(PolarGridSpec)]
-        self.spec = PolarGridSpec(**{name: options.pop(name) for name in names if name in options})
-        super().__init__(*arguments, **options)
+        super().__init__(
+            num_classes, in_chans, embed_dim, depths, num_heads, mlp_ratio, drop_path_rate
+        )
         if variant not in ("A", "RA"):
             raise ValueError(f"variant must be 'A' or 'RA', got {variant!r}")
-        window = window or ((1, 16) if variant == "A" else (4, 4))
-        rings, sectors = self.spec.rings, self.spec.sectors
-        plans = plan_stages(rings, sectors, len(self.depths), variant, window, merges)
         self.position_bias, self.harmonics = position_bias, harmonics
         self.periodic_bias = periodic_bias
-        self.patch_embed = PolarPatchEmbed(
-            self.spec,
-            in_chans=self.in_chans,
-            embed_dim=self.embed_dim,
-            jitter=jitter,
-            mean=self.mean,
-            std=self.std,
-        )
-        self._finish(plans, self.spec.samples)
+        self.view = PolarView(
+            rings, sectors, samples, spacing=spacing, sample_spacing=sample_spacing,
+            placement=placement, theta_max=theta_max, jitter=jitter,
+            mean=per_channel("mean", mean, in_chans), std=per_channel("std", std, in_chans),
+        )  # fmt: skip
+        values = self.view.samples[0] * self.view.samples[1] * in_chans
+        self.patch_embed = PolarPatchEmbed(values, embed_dim)
+        window = window or ((1, 16) if variant == "A" else (4, 4))
+        sizes = stage_sizes(*self.view.map_size, len(depths), variant, window, merges)
+        self._finish(sizes, self.view.samples)
 
-    def attention(self, dim: int, heads: int, plan: StagePlan, block: int) -> nn.Module:
+    def attention(self, dim: int, heads: int, sizes: StageSizes, block: int) -> nn.Module:
         return PolarWindowAttention(
             dim,
             heads,
-            **plan.windows(block),
+            **sizes.windows(block),
             position_bias=self.position_bias,
             harmonics=self.harmonics,
             periodic_bias=self.periodic_bias,
         )
-
-    def _prepare(self, lens: Lens, size: Pair) -> Prepared:
-        grid, last = self.spec.grid(lens, size), self.spec.last_angle(lens)
-        rings = [plan.map_size[0] for plan in self.plans]
-        return Prepared(grid, [(ring_angles(last, grid, r, self.position_bias),) for r in rings])
-
-    def embed(self, images: Tensor, points: PolarGrid | None) -> Tensor:
-        if points is None:
-            return self.patch_embed(images, None)
-        check_count(points.radii.shape[0], images)
-        if images.dtype == torch.uint8 and next(self.parameters()).dtype == torch.float64:
-            images = self._floating(images)  # the operator would normalize in float32
-        return self.patch_embed(images, points)
-
-    def _sample(self, images: Tensor, prepared: Prepared) -> Tensor:
-        check_count(prepared.points.radii.shape[0], images)
-        return polar_sample(**self.patch_embed.sample.arguments(images, prepared.points))
-
-    def _checked_sampled(self, sampled: Tensor, prepared: Prepared) -> Tensor:
-        values = self.spec.samples[0] * self.spec.samples[1] * self.in_chans
-        shape = (None, self.spec.rings, self.spec.sectors, values)
-        check_tensor(
-            "sampled", sampled, (torch.float32, torch.float64, torch.bfloat16),
-            "(B, R, A, S_r·S_φ·C) = (any, {}, {}, {})", shape,
-        )  # fmt: skip
-        check_count(prepared.points.radii.shape[0], sampled)
-        return sampled

@@ -1,7 +1,6 @@
 """DAT, the Deformable Attention Transformer of CVPR 2022: a baseline of the paper."""
 
 from collections.abc import Sequence
-from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -10,11 +9,14 @@ from torch import Tensor, nn
 from darswin.layers.embed import PatchProjection
 from darswin.layers.linear import Linear
 from darswin.layers.position_bias import RelativeTable
-from darswin.layers.transformer import WindowAttention, check_heads
+from darswin.layers.attention import WindowAttention, check_heads
+from darswin.lens.spacing import Spacing
 from darswin.models.registry import register_model
-from darswin.models.stages import Pair, StagePlan
+from darswin.models.stages import StageSizes
 from darswin.models.swin import Swin
 from darswin.ops.checks import tensor_there
+from darswin.views import Pair
+from darswin.views.base import PerChannel
 
 
 class DeformableAttention(nn.Module):
@@ -53,8 +55,8 @@ class DeformableAttention(nn.Module):
         """(B, H, W, D) → (B·G, D/G, H, W)."""
         return x.unflatten(3, (self.groups, -1)).permute(0, 3, 4, 1, 2).flatten(0, 1)
 
-    def forward(self, x: Tensor) -> Tensor:
-        """(B, H, W, D) → the same shape."""
+    def forward(self, x: Tensor, table: Tensor) -> Tensor:
+        """(B, H, W, D) and the result of `position_bias` → the same shape as x."""
         batch, height, width, dim = x.shape
         tokens = height * width
         q = self.q(x)
@@ -70,7 +72,7 @@ class DeformableAttention(nn.Module):
         k, v = self.kv(sampled).chunk(2, 2)
 
         reach = (pixels.flatten(0, 1)[:, None] - places.flatten(1, 2)[:, None]) / 2
-        table = self.position_bias().unflatten(1, (self.groups, -1))
+        table = table.unflatten(1, (self.groups, -1))
         table = table.expand(batch, -1, -1, -1, -1).flatten(0, 1)
         bias = F.grid_sample(table, reach.flip(-1), align_corners=True)  # (B·G, heads/G, N, N)
         bias = bias.reshape(batch, self.num_heads, tokens, tokens)
@@ -105,7 +107,9 @@ class DAT(Swin):
     """The Deformable Attention Transformer: Swin with deformable attention in some blocks.
 
     Args:
-        arguments, depths, options: the arguments of `Swin`.
+        num_classes, in_chans, embed_dim, depths, num_heads, mlp_ratio, drop_path_rate, image_size,
+            patch_size, window, view, max_fov, spacing, theta_max, mean, std: the arguments of
+            `Swin`.
         blocks: a string for each stage with the kinds of its blocks, which repeats: "L" has window
             attention, "S" has shifted windows, "D" has deformable attention.
         groups: for each stage, the number of groups of heads in deformable attention. The heads of
@@ -121,12 +125,26 @@ class DAT(Swin):
 
     def __init__(
         self,
-        *arguments: Any,
+        num_classes: int = 1000,
+        in_chans: int = 3,
+        embed_dim: int = 96,
         depths: Sequence[int] = (2, 2, 18, 2),
+        num_heads: Sequence[int] = (3, 6, 12, 24),
+        *,
+        mlp_ratio: float = 4.0,
+        drop_path_rate: float = 0.2,
+        image_size: int | Pair = 64,
+        patch_size: int = 2,
+        window: Pair = (4, 4),
         blocks: Sequence[str] = ("LS", "LS", "LD", "LD"),
         groups: Sequence[int] = (1, 1, 3, 6),
         offset_range: float = 2.0,
-        **options: Any,
+        view: str = "none",
+        max_fov: float | None = None,
+        spacing: Spacing | None = None,
+        theta_max: float | None = None,
+        mean: PerChannel = 0.0,
+        std: PerChannel = 1.0,
     ):
         if not len(blocks) == len(groups) == len(depths):
             raise ValueError(
@@ -136,23 +154,30 @@ class DAT(Swin):
         if not all(blocks) or not set("".join(blocks)) <= set("LSD"):
             raise ValueError(f"blocks must be of the kinds 'L', 'S' and 'D', got {blocks}")
         self.blocks, self.groups, self.offset_range = blocks, groups, offset_range
-        super().__init__(*arguments, depths=depths, **options)
+        super().__init__(
+            num_classes, in_chans, embed_dim, depths, num_heads, mlp_ratio=mlp_ratio,
+            drop_path_rate=drop_path_rate, image_size=image_size, patch_size=patch_size,
+            window=window, view=view, max_fov=max_fov, spacing=spacing, theta_max=theta_max,
+            mean=mean, std=std,
+        )  # fmt: skip
 
     def downsample(self, dim: int, merge: Pair) -> nn.Module:
         return PatchProjection(dim, 2 * dim, 2, bias=False)
 
-    def attention(self, dim: int, heads: int, plan: StagePlan, block: int) -> nn.Module:
-        kinds = self.blocks[plan.index]
+    def attention(self, dim: int, heads: int, sizes: StageSizes, block: int) -> nn.Module:
+        kinds = self.blocks[sizes.index]
         kind = kinds[block % len(kinds)]
         if kind == "D":
             return DeformableAttention(
                 dim,
                 heads,
-                map_size=plan.map_size,
-                groups=self.groups[plan.index],
-                kernel=2 * (len(self.blocks) - plan.index) + 1,  # 9, 7, 5, 3
+                map_size=sizes.map_size,
+                groups=self.groups[sizes.index],
+                kernel=2 * (len(self.blocks) - sizes.index) + 1,  # 9, 7, 5, 3
                 offset_range=self.offset_range,
             )
-        rows, columns = plan.window
+        rows, columns = sizes.window
         shift = ((rows + 1) // 2, (columns + 1) // 2) if kind == "S" else (0, 0)
-        return WindowAttention(dim, heads, map_size=plan.map_size, window=plan.window, shift=shift)
+        return WindowAttention(
+            dim, heads, map_size=sizes.map_size, window=sizes.window, shift=shift
+        )

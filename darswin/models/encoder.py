@@ -2,36 +2,26 @@
 
 from collections.abc import Callable, Sequence
 from itertools import chain
-from typing import Any, Literal, NamedTuple
+from typing import Literal
 
 from torch import Tensor, nn
 
 from darswin.layers.linear import Linear
 from darswin.layers.transformer import Block, PatchMerging, Stage
 from darswin.lens import Lens
-from darswin.models.base import FeatureInfo, Model, feature_info, init_weights, take_indices
-from darswin.models.stages import Pair, StagePlan
-from darswin.ops.checks import per_channel
+from darswin.models.base import Model, init_weights
+from darswin.models.features import FeatureInfo, feature_info, take_indices
+from darswin.models.stages import StageSizes
+from darswin.views import Pair, Prepared
 
 Format = Literal["NHWC", "NCHW"]
 
 
-class Prepared(NamedTuple):
-    """The result of an encoder's `prepare`."""
-
-    # The points at which the images are sampled: a `PolarGrid`, or pixels (N, H, W, 2). None means
-    # that the encoder takes the images as they are, or that they are sampled already.
-    points: Any
-    # For each stage, the tensors from which it computes its position biases.
-    positions: Sequence[Sequence[Tensor | None]]
-
-
-class Encoder(Model):
+class Encoder(Model[Tensor]):
     """The base class of the classifiers.
 
-    A subclass makes `patch_embed` and then calls `_finish`. It defines `attention`, `embed`,
-    `_sample` and, if it uses its lens, `_prepare`. Maps are channels last: polar maps have the
-    shape (B, R, A, D), other maps (B, H, W, D).
+    A subclass makes `view` and `patch_embed`, calls `_finish`, and defines `attention`. Maps are channels
+    last: polar maps have the shape (B, R, A, D), other maps (B, H, W, D).
 
     Args:
         num_classes: the number of classes; 0 leaves out the head.
@@ -41,31 +31,28 @@ class Encoder(Model):
         num_heads: the number of attention heads of each stage.
         mlp_ratio: the hidden width of the MLPs, divided by D.
         drop_path_rate: the drop path rate of the last block; it rises linearly from 0.
-        mean, std: normalization of uint8 images, `(pixel/255 - mean) / std`; images in floating
-            point are not normalized.
 
     Attributes:
         num_features, head_hidden_size: the width D of the last map.
-        plans: the sizes of the stages.
+        sizes: the sizes of the stages.
     """
 
+    in_chans: int
     num_features: int
     patch_embed: nn.Module
-    plans: Sequence[StagePlan]
+    sizes: Sequence[StageSizes]
+    stages: nn.ModuleList
     head: nn.Module
 
     def __init__(
         self,
-        num_classes: int = 1000,
-        in_chans: int = 3,
-        embed_dim: int = 96,
-        depths: Sequence[int] = (2, 2, 18, 2),
-        num_heads: Sequence[int] = (3, 6, 12, 24),
-        *,
-        mlp_ratio: float = 4.0,
-        drop_path_rate: float = 0.2,
-        mean: float | Sequence[float] = 0.0,
-        std: float | Sequence[float] = 1.0,
+        num_classes: int,
+        in_chans: int,
+        embed_dim: int,
+        depths: Sequence[int],
+        num_heads: Sequence[int],
+        mlp_ratio: float,
+        drop_path_rate: float,
     ):
         super().__init__()
         if len(depths) != len(num_heads) or not depths:
@@ -83,12 +70,11 @@ class Encoder(Model):
         self.num_classes, self.in_chans, self.embed_dim = num_classes, in_chans, embed_dim
         self.depths, self.num_heads = depths, num_heads
         self.mlp_ratio, self.drop_path_rate = mlp_ratio, drop_path_rate
-        self.mean, self.std = per_channel("mean", mean, in_chans), per_channel("std", std, in_chans)
 
-    def _finish(self, plans: Sequence[StagePlan], patch: Pair) -> None:
+    def _finish(self, sizes: Sequence[StageSizes], patch: Pair) -> None:
         """Makes the stages, the norm and the head; initialises all layers; describes the model."""
-        self.plans = plans
-        self.feature_info = feature_info(plans, self.embed_dim, patch)
+        self.sizes = sizes
+        self.feature_info = feature_info(sizes, self.embed_dim, patch)
         self.num_features = self.feature_info.channels(-1)
         self.stages = self.make_stages(self.depths, self.downsample)
         self.norm: nn.Module = nn.LayerNorm(self.num_features)
@@ -109,19 +95,19 @@ class Encoder(Model):
     def make_stages(
         self, depths: Sequence[int], downsample: Callable[[int, Pair], nn.Module]
     ) -> nn.ModuleList:
-        """The first `len(depths)` stages of the plans, with these numbers of blocks.
+        """Stages of the first `len(depths)` sizes, with these numbers of blocks.
 
         The width doubles with every stage, and stochastic depth rises linearly with every block.
         """
         stages = nn.ModuleList()
         before, last = 0, max(sum(depths) - 1, 1)
-        for plan, depth in zip(self.plans, depths, strict=False):
-            dim, heads = self.embed_dim * 2**plan.index, self.num_heads[plan.index]
-            merging = downsample(dim // 2, plan.merge) if plan.merge else nn.Identity()
+        for sizes, depth in zip(self.sizes, depths, strict=False):
+            dim, heads = self.embed_dim * 2**sizes.index, self.num_heads[sizes.index]
+            merging = downsample(dim // 2, sizes.merge) if sizes.merge else nn.Identity()
             blocks = [
                 Block(
                     dim,
-                    self.attention(dim, heads, plan, block),
+                    self.attention(dim, heads, sizes, block),
                     mlp_ratio=self.mlp_ratio,
                     drop_path=self.drop_path_rate * (before + block) / last,
                 )
@@ -131,7 +117,7 @@ class Encoder(Model):
             before += depth
         return stages
 
-    def attention(self, dim: int, heads: int, plan: StagePlan, block: int) -> nn.Module:
+    def attention(self, dim: int, heads: int, sizes: StageSizes, block: int) -> nn.Module:
         """A new attention layer for a block of a stage, in the encoder or in a Unet's decoder."""
         raise NotImplementedError
 
@@ -163,37 +149,30 @@ class Encoder(Model):
         else:
             self.head = nn.Identity()
 
-    def _prepare(self, lens: Any, size: Pair) -> Prepared:
-        return Prepared(None, [()] * len(self.stages))
+    def maps(
+        self, x: Tensor, tables: Sequence[Sequence[Tensor]], count: int | None = None
+    ) -> list[Tensor]:
+        """The maps after each of the first `count` stages, or after all.
 
-    def _points(self, prepared: Prepared) -> Any:
-        return prepared.points
-
-    def embed(self, images: Tensor, points: Any) -> Tensor:
-        """Images (B, C, H, W), sampled at the `points` of `prepare` → the first map.
-
-        Without points, the images are the result of `sample`.
+        Args:
+            x: what the view sees.
+            tables: the position biases of the stages, `Prepared.tables`.
         """
-        raise NotImplementedError
-
-    def maps(self, images: Tensor, prepared: Prepared, count: int | None = None) -> list[Tensor]:
-        """The maps after each of the first `count` stages, or after all, for checked images."""
-        x = self.embed(images, prepared.points)
+        x = self.patch_embed(x)
         maps = []
-        for stage, positions in zip(list(self.stages)[:count], prepared.positions, strict=False):
-            x = stage(x, *positions)
+        for stage, of_stage in zip(list(self.stages)[:count], tables, strict=False):
+            x = stage(x, of_stage)
             maps.append(x)
         return maps
 
-    def _run(self, images: Tensor, prepared: Prepared) -> Tensor:
-        return self.forward_head(self.norm(self.maps(images, prepared)[-1]))
-
-    def _run_sampled(self, sampled: Tensor, prepared: Prepared, images: Tensor | None) -> Any:
-        return self._run(sampled, prepared._replace(points=None))
+    def forward_network(self, x: Tensor, prepared: Prepared, images: Tensor | None) -> Tensor:
+        return self.forward_head(self.norm(self.maps(x, prepared.tables)[-1]))
 
     def forward_features(self, images: Tensor, lens: Lens | None = None) -> Tensor:
         """Images (B, C, H, W) and their lenses (B or 1) → the last map after the norm."""
-        return self.norm(self.maps(*self._checked_and_prepared(images, lens))[-1])
+        images, prepared = self._checked_and_prepared(images, lens)
+        x = self.view.see(images, prepared, self.dtype)
+        return self.norm(self.maps(x, prepared.tables)[-1])
 
     def forward_head(self, features: Tensor, pre_logits: bool = False) -> Tensor:
         """Features (B, R, A, D) → logits (B, num_classes), or the mean feature (B, D)."""
@@ -230,8 +209,9 @@ class Encoder(Model):
         """
         taken = take_indices(len(self.stages), indices)
         _check_format(output_fmt)
-        ready = self._checked_and_prepared(images, lens)
-        maps = self.maps(*ready, count=max(taken) + 1 if stop_early else None)
+        images, prepared = self._checked_and_prepared(images, lens)
+        x = self.view.see(images, prepared, self.dtype)
+        maps = self.maps(x, prepared.tables, count=max(taken) + 1 if stop_early else None)
         final = maps[-1]
         if len(maps) == len(self.stages) and (norm or not intermediates_only):
             final = self.norm(final)
@@ -258,7 +238,7 @@ class Encoder(Model):
         taken = take_indices(len(self.stages), indices)
         end = max(taken) + 1
         shorter = end < len(self.stages)
-        self.plans, self.stages = self.plans[:end], self.stages[:end]
+        self.sizes, self.stages = self.sizes[:end], self.stages[:end]
         self.feature_info = FeatureInfo(self.feature_info[:end])
         self.num_features = self.feature_info.channels(-1)
         if prune_norm or shorter:
@@ -268,7 +248,7 @@ class Encoder(Model):
         return taken
 
 
-class FeatureMaps(Model):
+class FeatureMaps(Model[list[Tensor]]):
     """A backbone: the maps of the chosen stages of an encoder.
 
     `create_model(name, features_only=True, out_indices=…)` makes one, as in timm. A call
@@ -295,10 +275,8 @@ class FeatureMaps(Model):
         taken = sorted(set(take_indices(len(encoder.stages), out_indices)))
         encoder.prune_intermediate_layers(taken, prune_norm=True)
         self.encoder, self.out_indices, self.output_fmt = encoder, tuple(taken), output_fmt
-        self.image_size, self.square_images = encoder.image_size, encoder.square_images
-        self.uses_lens = encoder.uses_lens
+        self.view, self.image_size = encoder.view, encoder.image_size
         self.in_chans, self.num_classes = encoder.in_chans, 0
-        self.mean, self.std = encoder.mean, encoder.std
         self.feature_info = FeatureInfo(
             dict(encoder.feature_info[i], module=f"encoder.{encoder.feature_info[i]['module']}")
             for i in taken
@@ -307,23 +285,14 @@ class FeatureMaps(Model):
             num_classes=0, first_conv=f"encoder.{encoder.pretrained_cfg['first_conv']}"
         )
 
-    def _prepare(self, lens: Any, size: Pair) -> Prepared:
-        return self.encoder._prepare(lens, size)
+    @property
+    def stages(self) -> nn.ModuleList:  # type: ignore[override]
+        """The stages of the encoder."""
+        return self.encoder.stages
 
-    def _run(self, images: Tensor, prepared: Prepared) -> list[Tensor]:
-        return _chosen(self.encoder.maps(images, prepared), self.out_indices, self.output_fmt)
-
-    def _sample(self, images: Tensor, prepared: Prepared) -> Tensor:
-        return self.encoder._sample(images, prepared)
-
-    def _points(self, prepared: Prepared) -> Any:
-        return prepared.points
-
-    def _run_sampled(self, sampled: Tensor, prepared: Prepared, images: Tensor | None) -> Any:
-        return self._run(sampled, prepared._replace(points=None))
-
-    def _checked_sampled(self, sampled: Tensor, prepared: Prepared) -> Tensor:
-        return self.encoder._checked_sampled(sampled, prepared)
+    def forward_network(self, x: Tensor, prepared: Prepared, images: Tensor | None) -> list[Tensor]:
+        maps = self.encoder.maps(x, prepared.tables)
+        return _chosen(maps, self.out_indices, self.output_fmt)
 
 
 def _check_format(output_fmt: str) -> None:

@@ -85,7 +85,7 @@ class DistanceHead(PixelHead):
         return f"{super().extra_repr()}, typical_distance={self.typical_distance}"
 
 
-class PixelModel(Model):
+class PixelModel(Model[Tensor]):
     """The base of `Unet` and `ConvUnet`: a model whose head predicts every pixel.
 
     A subclass makes the rest of the network and then calls `_make_head`.
@@ -96,6 +96,7 @@ class PixelModel(Model):
     """
 
     task: PixelTask
+    in_chans: int
 
     def __init__(self, task: PixelTask, typical_distance: float):
         super().__init__()

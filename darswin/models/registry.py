@@ -16,29 +16,39 @@ _SIZES: dict[str, dict[str, Any]] = dict(
     # For tests and demos: three stages on 32×32 images train in a minute on two cores.
     nano=dict(embed_dim=24, depths=(1, 2, 1), num_heads=(1, 2, 4), drop_path_rate=0.0),
 )
-_MODELS: dict[str, tuple[type[Model], dict[str, Any]]] = {}
+# Name → the class, the function or class that makes it, and its options.
+_MODELS: dict[str, tuple[type[Model], Callable[..., Model], dict[str, Any]]] = {}
 _WEIGHTS = Path(__file__).with_name("weights")
 
 Presets = Mapping[str, Mapping[str, Any]]
-_Class = TypeVar("_Class", bound=type[Model])
+_Make = TypeVar("_Make", bound=Callable[..., Model])
 
 
 def register_model(
-    family: str, *, presets: Presets, sizes: Presets = _SIZES, **options: Any
-) -> Callable[[_Class], _Class]:
+    family: str,
+    *,
+    presets: Presets,
+    sizes: Presets = _SIZES,
+    kind: type[Model] | None = None,
+    **options: Any,
+) -> Callable[[_Make], _Make]:
     """Registers the decorated class in four sizes: `FAMILY_small`, `FAMILY_tiny` and so on.
 
     Args:
         presets: options for single sizes.
         sizes: the four sizes, if they are not those of the transformers.
+        kind: the class of the models, if a function is decorated that makes them.
         options: options for all sizes. They include `image_size` if the model takes images of a
             single size.
     """
 
-    def register(model: _Class) -> _Class:
+    def register(make: _Make) -> _Make:
+        model = make if kind is None else kind
+        assert isinstance(model, type)
         for size, common in sizes.items():
-            _MODELS[f"{family}_{size}"] = model, {**common, **options, **presets.get(size, {})}
-        return model
+            settings = {**common, **options, **presets.get(size, {})}
+            _MODELS[f"{family}_{size}"] = model, make, settings
+        return make
 
     return register
 
@@ -66,7 +76,12 @@ def nearest(name: str, names: Sequence[str]) -> str:
 def preset(name: str) -> dict[str, Any]:
     """The options that the name of a model stands for; ValueError for an unknown name."""
     model_class(name)
-    return dict(_MODELS[name][1])
+    return dict(_MODELS[name][2])
+
+
+def make(name: str, **options: object) -> Model:
+    """A new model with this name, with these options in place of those of `preset`."""
+    return _MODELS[name][1](**(preset(name) | options))
 
 
 def has_image_size(name: str) -> bool:

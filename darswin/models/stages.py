@@ -5,12 +5,11 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from darswin.ops.checks import check_pair
-
-Pair = tuple[int, int]
+from darswin.views import Pair
 
 
 @dataclass(frozen=True)
-class StagePlan:
+class StageSizes:
     """The sizes of a stage. Its odd blocks have the shift; the merging is its first layer."""
 
     index: int
@@ -25,14 +24,14 @@ class StagePlan:
         return dict(map_size=self.map_size, window=self.window, shift=shift)
 
 
-def plan_stages(
+def stage_sizes(
     rings: int,
     sectors: int,
     count: int,
     variant: Literal["A", "RA"],
     window: Pair,
     merges: Sequence[Pair] | None = None,
-) -> list[StagePlan]:
+) -> list[StageSizes]:
     """The sizes of all stages; ValueError if a window or a merging does not divide its map.
 
     If the map is shorter than the window along one axis, the window becomes longer along the other
@@ -46,7 +45,7 @@ def plan_stages(
         raise ValueError(
             f"merges must have one entry for each stage but the first, {count - 1}, got {merges}"
         )
-    plans: list[StagePlan] = []
+    stages: list[StageSizes] = []
     size, merge = (rings, sectors), None
     for stage in range(count):
         if stage > 0:
@@ -59,8 +58,8 @@ def plan_stages(
                 f"stage {stage + 1}: window {fitted} must divide the map, {size}; "
                 "choose other sizes"
             )
-        plans.append(StagePlan(stage, size, fitted, _shift(size, fitted, variant), merge))
-    return plans
+        stages.append(StageSizes(stage, size, fitted, _shift(size, fitted, variant), merge))
+    return stages
 
 
 def _merging(size: Pair, choices: Sequence[Pair], stage: int) -> Pair:

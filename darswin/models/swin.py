@@ -1,15 +1,18 @@
 """Swin, the paper's baseline, on the images themselves or on views through their lenses."""
 
-from typing import Any
+from collections.abc import Sequence
 
-from torch import Tensor, nn
+from torch import nn
 
-from darswin.layers.embed import PatchProjection
-from darswin.layers.transformer import WindowAttention
-from darswin.models.encoder import Encoder, Prepared
+from darswin.layers.attention import WindowAttention
+from darswin.layers.embed import PatchEmbed
+from darswin.lens.spacing import Spacing
+from darswin.models.encoder import Encoder
 from darswin.models.registry import Presets, register_model
-from darswin.models.stages import Pair, StagePlan, plan_stages
-from darswin.models.views import ViewName, make_view
+from darswin.models.stages import StageSizes, stage_sizes
+from darswin.ops.checks import per_channel
+from darswin.views import Pair, make_view
+from darswin.views.base import PerChannel
 
 _PRESETS: Presets = dict(nano=dict(image_size=32))
 
@@ -20,13 +23,18 @@ class Swin(Encoder):
     """The Swin Transformer, on images of a single size.
 
     Args:
-        arguments, options: the arguments of `Encoder`.
+        num_classes, in_chans, embed_dim, depths, num_heads, mlp_ratio, drop_path_rate: the
+            arguments of `Encoder`.
         image_size: (H, W) in pixels, or the side of a square.
         patch_size: the side of a patch, in pixels.
         window: (rows, columns) on maps that are large enough.
-        view: "none" takes the images as they are and ignores the lens. "perspective" (with the
-            option `max_fov`) and "square" (with `spacing` and `theta_max`) resample the images to a
-            view of this size through the lens; see `PerspectiveView` and `SquareView`.
+        view: the name of a view whose pixels the network sees, one of `list_views()`. "none" takes
+            the images as they are and ignores the lens. The others resample the images to a view of
+            this size through the lens: "perspective" with the option `max_fov`, "square" with
+            `spacing` and `theta_max`.
+        max_fov, spacing, theta_max: options of the view; None means the view's own default.
+        mean, std: normalization of uint8 images, `(pixel/255 - mean) / std`; images in floating
+            point are not normalized.
 
     Raises:
         ValueError: an unknown option, or sizes that do not divide; in forward, images of another
@@ -41,38 +49,41 @@ class Swin(Encoder):
 
     def __init__(
         self,
-        *arguments: Any,
+        num_classes: int = 1000,
+        in_chans: int = 3,
+        embed_dim: int = 96,
+        depths: Sequence[int] = (2, 2, 18, 2),
+        num_heads: Sequence[int] = (3, 6, 12, 24),
+        *,
+        mlp_ratio: float = 4.0,
+        drop_path_rate: float = 0.2,
         image_size: int | Pair = 64,
         patch_size: int = 2,
         window: Pair = (4, 4),
-        view: ViewName = "none",
-        **options: Any,
+        view: str = "none",
+        max_fov: float | None = None,
+        spacing: Spacing | None = None,
+        theta_max: float | None = None,
+        mean: PerChannel = 0.0,
+        std: PerChannel = 1.0,
     ):
-        made = make_view(view, image_size, options)
-        super().__init__(*arguments, **options)
-        self.view, self.image_size, self.uses_lens = made, made.size, made.uses_lens
-        height, width = made.size
-        self.square_images = height == width
+        super().__init__(
+            num_classes, in_chans, embed_dim, depths, num_heads, mlp_ratio, drop_path_rate
+        )
+        height, width = (image_size,) * 2 if isinstance(image_size, int) else image_size
+        self.image_size = height, width
+        self.view = make_view(
+            view, self.image_size, max_fov=max_fov, spacing=spacing, theta_max=theta_max,
+            mean=per_channel("mean", mean, in_chans), std=per_channel("std", std, in_chans),
+        )  # fmt: skip
         if patch_size < 1 or any(side < 1 or side % patch_size for side in (height, width)):
             raise ValueError(
                 f"patch_size must divide image_size = {self.image_size}, got {patch_size}"
             )
         rows, columns = height // patch_size, width // patch_size
-        self.patch_embed = PatchProjection(self.in_chans, self.embed_dim, patch_size)
-        plans = plan_stages(rows, columns, len(self.depths), "RA", window)
-        self._finish(plans, (patch_size, patch_size))
+        self.patch_embed = PatchEmbed(in_chans, embed_dim, patch_size)
+        sizes = stage_sizes(rows, columns, len(depths), "RA", window)
+        self._finish(sizes, (patch_size, patch_size))
 
-    def attention(self, dim: int, heads: int, plan: StagePlan, block: int) -> nn.Module:
-        return WindowAttention(dim, heads, **plan.windows(block))
-
-    def _prepare(self, lens: Any, size: Pair) -> Prepared:
-        return super()._prepare(lens, size)._replace(points=self.view.image_points(lens, size))
-
-    def embed(self, images: Tensor, points: Tensor | None) -> Tensor:
-        return self.patch_embed(self._to_view(images, points).permute(0, 2, 3, 1))
-
-    def _sample(self, images: Tensor, prepared: Prepared) -> Tensor:
-        return self._to_view(images, prepared.points)
-
-    def _to_view(self, images: Tensor, points: Tensor | None) -> Tensor:
-        return self.view.to_view(self._floating(images), points)
+    def attention(self, dim: int, heads: int, sizes: StageSizes, block: int) -> nn.Module:
+        return WindowAttention(dim, heads, **sizes.windows(block))

@@ -1,0 +1,116 @@
+"""Any network that takes square images, or other pixels, behind any lens."""
+
+from collections.abc import Iterable
+from typing import Any, Literal
+
+import torch
+from torch import Tensor, nn
+from torch.utils import _pytree as pytree
+
+from darswin.lens.spacing import Spacing
+from darswin.models.base import Model
+from darswin.ops.checks import as_int, per_channel
+from darswin.views import Pair, Prepared, View, make_view
+from darswin.views.base import PerChannel
+
+
+class LensAdapter(Model[Any]):
+    """Wraps any network of images so that it works with any lens.
+
+    The network runs on a view of the image: by default on the image disc, resampled to a square by
+    the concentric map. Results with 4 dimensions, (B, K, H', W') for any size, are resampled to the
+    pixels of the images, (B, K, H, W), and pixels that no ray reaches get 0. Other results, such as
+    logits of classes, are returned as they are. Lists, tuples and dicts of results may be nested.
+
+    In the square, the network sees equal steps of θ at equal distances from the centre, whatever
+    the lens is. It may come from timm, from segmentation_models_pytorch or from you, trained or
+    not. The adapter is called `adapter(images, lens)`. It gives images in floating point to the
+    network as they are.
+
+    Args:
+        network: a module that takes images (B, C, H', W').
+        size: (H', W') of the view in pixels, or the side of a square. A `View` has its own size.
+        spacing, theta_max: options of the view; None means the view's own default. See
+            `SquareView`.
+        view: the name of a view, one of `list_views()`; or a `View`, with its own options.
+        max_fov: an option of the view "perspective"; see `PerspectiveView`.
+        mean, std: the normalization of uint8 images that the network expects, `(pixel/255 - mean) /
+            std`, one number or one for each channel. None refuses uint8 images.
+        output: "pixels" resamples results with 4 dimensions as described; "view" returns all
+            results as the network made them, in the view.
+
+    Raises:
+        ValueError: the size is below 1, an option of the view is wrong, the output is unknown, or
+            mean and std do not fit together.
+        TypeError: in forward, images of uint8 without mean and std.
+
+    Source: the concentric map of Shirley and Chiu, JGT 1997.
+    """
+
+    stages = ()
+    in_chans: None = None
+
+    def __init__(
+        self,
+        network: nn.Module,
+        size: int | Pair | None = None,
+        spacing: Spacing | None = None,
+        theta_max: float | None = None,
+        *,
+        view: str | View = "square",
+        max_fov: float | None = None,
+        mean: PerChannel | None = None,
+        std: PerChannel | None = None,
+        output: Literal["pixels", "view"] = "pixels",
+    ):
+        super().__init__()
+        if output not in ("pixels", "view"):
+            raise ValueError(f"output must be 'pixels' or 'view', got {output!r}")
+        options = dict(spacing=spacing, theta_max=theta_max, max_fov=max_fov)
+        if isinstance(view, View):
+            given = dict(options, size=size, mean=mean, std=std)
+            if wrong := [name for name, value in given.items() if value is not None]:
+                raise ValueError(f"a View has its own {' and '.join(wrong)}: leave them out")
+            if not view.in_pixels:
+                raise ValueError(f"the network needs a view of pixels, got {view}")
+            self.view = view
+        else:
+            self.view = make_view(view, _pair(size), mean=mean, std=std, **options)
+            if mean is not None and std is not None:
+                channels = max(len(tuple(v)) if isinstance(v, Iterable) else 1 for v in (mean, std))
+                per_channel("mean", mean, channels), per_channel("std", std, channels)
+        self.network, self.output = network, output
+        self.goes_back = output == "pixels"
+        if self.mean is None:
+            self._looks = 0  # the network may expect any values
+
+    def forward_network(self, x: Tensor, prepared: Prepared, images: Tensor | None) -> Any:
+        results = self.network(x)
+        if self.output == "view":
+            return results
+
+        def to_images(out: Any) -> Any:
+            has_pixels = isinstance(out, Tensor) and out.dim() == 4
+            return self.view.back(out, prepared) if has_pixels else out
+
+        return pytree.tree_map(to_images, results)
+
+    def _check_dtype(self, images: Tensor) -> None:
+        # The network may take other types of floating point than those of its weights.
+        taken = (torch.uint8,) if self.mean is not None else ()
+        if not (images.is_floating_point() or images.dtype in taken):
+            hint = "" if taken else "; with mean and std, an adapter takes uint8 too"
+            raise TypeError(f"images must be in floating point, got {images.dtype}{hint}")
+
+    def _check_device(self, name: str, images: Tensor) -> None:
+        """No check: the network may move its images itself."""
+
+    def extra_repr(self) -> str:
+        return f"output={self.output!r}"
+
+
+def _pair(size: int | Pair | None) -> Pair:
+    sides = size if isinstance(size, tuple | list) else (size, size)
+    if len(sides) != 2 or any((as_int(side) or 0) < 1 for side in sides):
+        raise ValueError(f"size must be an int of at least 1, or (H', W'), got {size!r}")
+    return int(sides[0]), int(sides[1])

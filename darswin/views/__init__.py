@@ -1,0 +1,32 @@
+"""What a network sees of a picture through a lens: one file for each view, registered by name."""
+
+from darswin.views.base import (
+    Pair,
+    PixelGrid,
+    PolarGrid,
+    Prepared,
+    View,
+    list_views,
+    make_view,
+    register_view,
+)
+from darswin.views.perspective import PerspectiveView
+from darswin.views.plain import PlainView
+from darswin.views.polar import PolarView, polar_grid
+from darswin.views.square import SquareView
+
+__all__ = [
+    "Pair",
+    "PerspectiveView",
+    "PixelGrid",
+    "PlainView",
+    "PolarGrid",
+    "PolarView",
+    "Prepared",
+    "SquareView",
+    "View",
+    "list_views",
+    "make_view",
+    "polar_grid",
+    "register_view",
+]

@@ -1,0 +1,337 @@
+"""The seam between lenses and networks: what a view is, and views by name."""
+
+import inspect
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple, TypeVar
+
+import torch
+from torch import Tensor, nn
+
+from darswin.lens import Lens
+from darswin.lens.pixels import OUTSIDE, ray_channels, sample_at
+from darswin.ops.checks import (
+    FRAME_CHANNELS,
+    channels_first,
+    check_has_batch,
+    per_channel,
+    readable,
+    tensor_there,
+)
+from darswin.ops.reference import normalized
+
+Pair = tuple[int, int]
+PerChannel = float | Sequence[float]
+
+
+class PolarGrid(NamedTuple):
+    """The points at which `polar_sample` reads the images of N lenses, and the ring borders.
+
+    Shapes: radii (N, R·S_r) px, azimuths (A·S_φ,) rad, center (N or 1, 2) px, borders (N, R+1) px,
+    last (N,) rad, the angle at the end of the last ring; for general lenses also affine
+    (N or 1, 2, 2) and offsets (N or 1, 2, R·S_r, A·S_φ) px.
+    """
+
+    radii: Tensor
+    azimuths: Tensor
+    center: Tensor
+    borders: Tensor
+    last: Tensor
+    affine: Tensor | None = None
+    offsets: Tensor | None = None
+
+
+class PixelGrid(NamedTuple):
+    """The arguments of `polar_to_image` that resample a polar map to the pixels of the images.
+
+    Shapes: radii of the ring centres (N, R) px; r_max (N,) px; for radial lenses center
+    (N or 1, 2) px and affine (N, 2, 2), for general lenses points (N, H, W, 2) px; for a single
+    lens also plan (1, H, 3, W).
+    """
+
+    radii: Tensor
+    r_max: Tensor
+    center: Tensor | None = None
+    affine: Tensor | None = None
+    points: Tensor | None = None
+    plan: Tensor | None = None
+
+
+class Prepared(NamedTuple):
+    """Everything of N lenses that a view and a network need, for images of one size.
+
+    Attributes:
+        size: (H, W) of the images.
+        points: the points at which the view reads the images: a `PolarGrid`, or pixels
+            (N, H', W', 2). None means that the view is the images.
+        back: the points of the view that the pixels of the images show: a `PixelGrid`, or pixels
+            (N, H, W, 2). None means that the view is the images, or that the way back was not asked
+            for.
+        rays: the viewing directions of the pixels that a dense network predicts, (N, 3, h, w): of
+            the pixels of the view, or of the images if the view has no pixels. 0 where no ray lands.
+        tokens: for each map, the positions of its tokens, (N or 1, H', W', `View.coordinates`).
+        tables: for each stage of a network, the position biases of its blocks; a view has none.
+    """
+
+    size: Pair
+    points: PolarGrid | Tensor | None
+    back: PixelGrid | Tensor | None = None
+    rays: Tensor | None = None
+    tokens: Sequence[Tensor] = ()
+    tables: Sequence[Sequence[Tensor]] = ()
+
+
+class View(nn.Module):
+    """What a network sees of images through their lenses: pixels, or the tokens of a polar map.
+
+    A view alone knows images and lenses. `view(images, lens)` is what the network sees. It has
+    three steps of its own: `prepare`, `see` and `back`.
+
+    Args:
+        mean, std: normalization of uint8 images, `(pixel/255 - mean) / std`, one number or one for
+            each channel. None refuses uint8 images. Images in floating point are not normalized.
+
+    Attributes:
+        uses_lens: False if the view ignores its lens, which may then be None.
+        in_pixels: True if the network sees pixels (B, C, H', W'), False for tokens (B, R, A, S).
+        coordinates: the number of coordinates of a token's position.
+    """
+
+    uses_lens = True
+    in_pixels = True
+    coordinates = 2
+
+    def __init__(self, mean: PerChannel | None = 0.0, std: PerChannel | None = 1.0):
+        super().__init__()
+        if (mean is None) != (std is None):
+            raise ValueError(f"mean and std must be given together, got {mean} and {std}")
+        self.mean, self.std = mean, std
+
+    def prepare(
+        self,
+        lens: Lens | None,
+        size: Pair,
+        *,
+        back: bool | Pair = True,
+        rays: bool = True,
+        maps: Sequence[Pair] = (),
+    ) -> Prepared:
+        """Everything that depends on the lens but not on the pixels.
+
+        Args:
+            lens: N lenses, or None if the view ignores its lens.
+            size: (H, W) of the images.
+            back: whether `Prepared.back` is computed; or the size of the maps that go back, if it is
+                another one than the size of what the network sees.
+            rays: whether `Prepared.rays` is computed.
+            maps: the sizes of the maps for `Prepared.tokens`.
+        """
+        raise NotImplementedError
+
+    def see(self, images: Tensor, prepared: Prepared, dtype: torch.dtype = torch.float32) -> Tensor:
+        """Images (B, C, H, W) → what the network sees of them, in floating point.
+
+        Args:
+            prepared: the result of `prepare` for B lenses or one.
+            dtype: of the result for images of uint8; polar tokens are at least float32.
+        """
+        raise NotImplementedError
+
+    def back(self, maps: Tensor, prepared: Prepared) -> Tensor:
+        """A map of the network → the pixels of the images, (B, K, H, W); 0 where no ray lands.
+
+        Args:
+            maps: (B, K, H', W') if the view is `in_pixels`, else (B, R, A, K).
+        """
+        raise NotImplementedError
+
+    def check_seen(self, seen: Tensor, prepared: Prepared, channels: int | None) -> Tensor:
+        """The result of `see` for images with C channels; TypeError or ValueError otherwise."""
+        raise NotImplementedError
+
+    def forward(self, images: Tensor, lens: Lens | None = None) -> Tensor:
+        """Images (B, C, H, W) or (B, H, W, C), and their lenses (B or 1) → what the network sees."""
+        images = check_images(images)
+        height, width = images.shape[2:]
+        if self.uses_lens:
+            check_lens(lens, (height, width))
+        prepared = self.prepare(lens, (height, width), back=False, rays=False)
+        return self.see(images, prepared)
+
+    def floating(self, images: Tensor, dtype: torch.dtype) -> Tensor:
+        """The images in floating point: uint8 images are normalized, others stay as they are."""
+        return self.normalized(images, dtype) if images.dtype == torch.uint8 else images
+
+    def normalized(self, images: Tensor, dtype: torch.dtype) -> Tensor:
+        """`(image - mean) / std` for each channel, in `dtype`; uint8 images are divided by 255."""
+        if self.mean is None or self.std is None:
+            raise TypeError(
+                f"images must be in floating point, got {images.dtype}: without mean and std, they "
+                "cannot be normalized"
+            )
+        exact = torch.promote_types(dtype, torch.float32)
+        mean = per_channel("mean", self.mean, images.shape[1])
+        std = per_channel("std", self.std, images.shape[1])
+        return normalized(images, mean, std, exact).to(dtype)
+
+
+class PixelView(View):
+    """A view whose pixels are pixels of the images. A subclass says which: three maps of points.
+
+    Args:
+        size: (H', W') of the view; None for the size of the images.
+    """
+
+    def __init__(
+        self, size: Pair | None, *, mean: PerChannel | None = 0.0, std: PerChannel | None = 1.0
+    ):
+        super().__init__(mean, std)
+        self.size = size
+
+    def image_points(self, lens: Any, size: Pair) -> Tensor | None:
+        """The points of images of (H, W) that the pixels of the view show, (N, H', W', 2) px."""
+        raise NotImplementedError
+
+    def view_points(self, lens: Any, size: Pair) -> Tensor | None:
+        """The points of the view that the pixels of images of (H, W) show, (N, H, W, 2) px."""
+        raise NotImplementedError
+
+    def pixel_rays(self, lens: Any, size: Pair) -> tuple[Tensor, Tensor]:
+        """The rays of the pixels of the view, as `darswin.lens.pixels.pixel_rays` returns them."""
+        raise NotImplementedError
+
+    def prepare(
+        self,
+        lens: Lens | None,
+        size: Pair,
+        *,
+        back: bool | Pair = True,
+        rays: bool = True,
+        maps: Sequence[Pair] = (),
+    ) -> Prepared:
+        return Prepared(
+            size,
+            self.image_points(lens, size),
+            self.view_points(lens, size) if back else None,
+            ray_channels(*self.pixel_rays(lens, size)) if rays else None,
+            [_centers(of_map) for of_map in maps],
+        )
+
+    def see(self, images: Tensor, prepared: Prepared, dtype: torch.dtype = torch.float32) -> Tensor:
+        images = self.floating(images, dtype)
+        if prepared.points is None:
+            return images
+        assert isinstance(prepared.points, Tensor)
+        check_count(len(prepared.points), images)
+        return sample_at(images, prepared.points)
+
+    def back(self, maps: Tensor, prepared: Prepared) -> Tensor:
+        assert isinstance(prepared.back, Tensor) and self.size is not None
+        points, size = prepared.back, tuple(maps.shape[2:])
+        if size != self.size:  # the outermost pixels of a coarser map extend to the edges
+            there, scale = (
+                tensor_there(sides[::-1], points)
+                for sides in (size, [of / to for of, to in zip(size, self.size, strict=True)])
+            )
+            inside = torch.minimum(((points + 0.5) * scale - 0.5).clamp(min=0), there - 1)
+            points = torch.where(points == OUTSIDE, OUTSIDE, inside)
+        return sample_at(maps, points)
+
+    def check_seen(self, seen: Tensor, prepared: Prepared, channels: int | None) -> Tensor:
+        seen = check_images(seen, channels=channels)
+        if prepared.points is not None:
+            check_count(len(prepared.points), seen)
+        expected = self.size or prepared.size
+        if seen.shape[2:] != expected:
+            raise ValueError(
+                f"sampled must have the size of the view, (H, W) = {expected}, "
+                f"got {tuple(seen.shape[2:])}"
+            )
+        return seen
+
+
+def _centers(size: Pair) -> Tensor:
+    """The centres of the tokens of a map, (1, H', W', 2): x and y in [-1, 1]."""
+    y, x = ((2 * torch.arange(side) + 1) / side - 1 for side in size)
+    return torch.stack(torch.meshgrid(x, y, indexing="xy"), -1)[None]
+
+
+def check_images(
+    images: Tensor, channels_last: bool | None = None, channels: int | None = None
+) -> Tensor:
+    """The images as (B, C, H, W); TypeError or ValueError if that fails, see `channels_first`."""
+    if not isinstance(images, Tensor):
+        raise TypeError(f"images must be a tensor, got {type(images).__name__}")
+    check_has_batch("images", images, channels_last, channels)
+    return channels_first("images", images, channels_last, channels)
+
+
+def check_lens(lens: Lens | None, size: Pair) -> Lens:
+    """Returns the lens if it is one for images of (H, W); its size is checked if `readable`."""
+    if not isinstance(lens, Lens):
+        raise TypeError(f"lens must be a darswin.lens.Lens, got {type(lens).__name__}")
+    if lens.image_size is None or not readable(lens.image_size):
+        return lens
+    for other in lens.image_size.unique(dim=0).tolist():
+        if tuple(other) != size:
+            advice = f"if the image was resized, use lens.resized({size})"
+            if size[0] == other[1] and size[1] in FRAME_CHANNELS:
+                advice = "the channels come first: pass images.permute(0, 3, 1, 2)"
+            raise ValueError(
+                f"the lens belongs to images of (H, W) = {tuple(round(s) for s in other)}, got "
+                f"images of {size}; {advice}"
+            )
+    return lens
+
+
+def check_count(lenses: int, images: Tensor) -> None:
+    """ValueError unless there is one lens for each image or one for all."""
+    if lenses not in (1, images.shape[0]):
+        raise ValueError(
+            f"there must be one lens, or one for each of the {images.shape[0]} images, got {lenses}"
+        )
+
+
+_VIEWS: dict[str, Callable[..., View]] = {}
+_Make = TypeVar("_Make", bound=Callable[..., View])
+
+
+def register_view(name: str) -> Callable[[_Make], _Make]:
+    """Registers the decorated function or class: `make(size, **options)` is the view of that name."""
+
+    def register(make: _Make) -> _Make:
+        _VIEWS[name] = make
+        return make
+
+    return register
+
+
+def list_views() -> list[str]:
+    """The names of all views that `make_view` can make."""
+    return sorted(_VIEWS)
+
+
+def make_view(
+    name: str,
+    size: Pair,
+    *,
+    mean: PerChannel | None = 0.0,
+    std: PerChannel | None = 1.0,
+    **options: Any,
+) -> View:
+    """The view with this name, of (H', W').
+
+    Args:
+        mean, std: the arguments of `View`.
+        options: the other arguments of the view. None stands for the default of an argument.
+
+    Raises:
+        ValueError: the name is unknown, or the view has no such option.
+    """
+    if name not in _VIEWS:
+        raise ValueError(f"view must be one of {tuple(list_views())}, got {name!r}")
+    given = {option: value for option, value in options.items() if value is not None}
+    try:
+        inspect.signature(_VIEWS[name]).bind(size, **given)
+    except TypeError as error:
+        raise ValueError(f"the view {name!r} has no such option: {error}") from error
+    return _VIEWS[name](size, mean=mean, std=std, **given)

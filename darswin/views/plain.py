@@ -1,0 +1,35 @@
+"""The images themselves."""
+
+from typing import Any
+
+import torch.nn.functional as F
+from torch import Tensor
+
+from darswin.lens import pixels
+from darswin.views.base import Pair, PixelView, Prepared, register_view
+
+
+@register_view("none")
+class PlainView(PixelView):
+    """The images themselves: the network is not told their lens.
+
+    Args:
+        size: (H, W) of the images; None for any size.
+        mean, std: the arguments of `View`.
+    """
+
+    uses_lens = False
+
+    def image_points(self, lens: Any, size: Pair) -> None:
+        return None
+
+    def view_points(self, lens: Any, size: Pair) -> None:
+        return None
+
+    def pixel_rays(self, lens: Any, size: Pair) -> tuple[Tensor, Tensor]:
+        return pixels.pixel_rays(lens, size)
+
+    def back(self, maps: Tensor, prepared: Prepared) -> Tensor:
+        if maps.shape[2:] == prepared.size:
+            return maps
+        return F.interpolate(maps, prepared.size, mode="bilinear", align_corners=False)

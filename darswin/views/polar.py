@@ -1,0 +1,364 @@
+"""The polar view of DarSwin: rings and sectors of a lens's image, the samples in them, and the way
+back from a polar map to pixels.
+
+Rings and samples are equal steps of a *spacing*; see `darswin.lens.spacing`.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import Any, Literal, get_args
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from darswin.lens import Lens
+from darswin.lens.pixels import pixel_rays, ray_channels
+from darswin.lens.solve import direction_of, vector_of
+from darswin.lens.spacing import (
+    SPACINGS,
+    Spacing,
+    change_spacing,
+    check_fixed_theta_max,
+    check_tan,
+    span,
+    to_theta,
+)
+from darswin.ops import polar_sample, polar_to_image, polar_to_image_plan
+from darswin.ops.checks import as_int, check_jitter, check_layout, check_tensor
+from darswin.views.base import (
+    Pair,
+    PerChannel,
+    PixelGrid,
+    PolarGrid,
+    Prepared,
+    View,
+    check_count,
+    check_images,
+    register_view,
+)
+
+Layout = Literal["tokens", "image"]
+Placement = Literal["centers", "edges"]
+PLACEMENTS = get_args(Placement)
+
+
+class PolarView(View):
+    """Samples images on the polar grid of their lenses: R rings × A sectors, S_r × S_φ samples in
+    each.
+
+    `view(images, lens)` is the samples, by the operator `polar_sample`.
+
+    Convention:
+        Ring 0 is the innermost and ring R-1 ends at θ_max. Sector a covers azimuths from 2πa/A to
+        2π(a+1)/A; azimuth 0 points right, π/2 down.
+
+    Args:
+        rings: R. sectors: A. samples: (S_r, S_φ). The defaults are those of the paper.
+        spacing: the quantity that increases equally from ring border to ring border.
+        sample_spacing: the quantity that increases equally from sample to sample inside a ring;
+            None means `spacing`.
+        placement: "centers" puts the samples at the centres of equal cells; "edges" puts them from
+            border to border, both included.
+        theta_max: θ at the end of the last ring, rad, in (0, π), for every lens; None means θ_max
+            of each lens. With a fixed angle, things of one angular size have one size on the map,
+            whatever the lens. Samples beyond θ_max of a lens are zero. The spacings must be
+            "theta".
+        jitter: how far a sample may move in training, in cells, in [0, 1]. The seed of each call
+            comes from torch's generator.
+        layout: "tokens" returns (B, R, A, S_r·S_φ·C), "image" returns (B, C, R·S_r, A·S_φ).
+        mean, std: the arguments of `View`.
+
+    Raises:
+        ValueError: an option is unknown or out of range, a size is below 1, "edges" has one sample
+            along an axis, or theta_max has another spacing than "theta"; in the methods, the images
+            and the lenses do not fit, or the spacing is "tan" and a lens has θ_max ≥ 90°.
+
+    Source: DarSwin, ICCV 2023, sec. 4.2 and 4.3.
+    """
+
+    coordinates = 3  # the viewing direction of a token
+
+    def __init__(
+        self,
+        rings: int = 16,
+        sectors: int = 64,
+        samples: Pair = (10, 10),
+        *,
+        spacing: Spacing = "theta",
+        sample_spacing: Spacing | None = None,
+        placement: Placement = "centers",
+        theta_max: float | None = None,
+        jitter: float = 0.0,
+        layout: Layout = "tokens",
+        mean: PerChannel | None = 0.0,
+        std: PerChannel | None = 1.0,
+    ):
+        super().__init__(mean, std)
+        for name, value in (("rings", rings), ("sectors", sectors)):
+            if (as_int(value) or 0) < 1:
+                raise ValueError(f"{name} must be an int of at least 1, got {value!r}")
+        if len(samples) != 2 or any((as_int(s) or 0) < 1 for s in samples):
+            raise ValueError(f"samples must be (S_r, S_φ), ints of at least 1, got {samples!r}")
+        # NumPy's ints become Python's.
+        self.rings, self.sectors = int(rings), int(sectors)
+        self.samples = int(samples[0]), int(samples[1])
+        self.spacing, self.sample_spacing = spacing, sample_spacing
+        for name, choice in (("spacing", spacing), ("sample_spacing", self.inner_spacing)):
+            if choice not in SPACINGS:
+                raise ValueError(f"{name} must be one of {SPACINGS}, got {choice!r}")
+        if placement not in PLACEMENTS:
+            raise ValueError(f"placement must be one of {PLACEMENTS}, got {placement!r}")
+        if placement == "edges" and min(samples) < 2:
+            raise ValueError(f"placement='edges' needs 2 or more samples per axis, got {samples!r}")
+        if theta_max is not None:
+            check_fixed_theta_max(theta_max, spacing, self.inner_spacing)
+        check_layout(layout)
+        self.placement, self.theta_max, self.layout = placement, theta_max, layout
+        self.jitter = check_jitter(jitter)
+        self.in_pixels = layout == "image"
+
+    def prepare(
+        self,
+        lens: Any,
+        size: Pair,
+        *,
+        back: bool | Pair = True,
+        rays: bool = True,
+        maps: Sequence[Pair] = (),
+    ) -> Prepared:
+        return Prepared(
+            size,
+            self.grid(lens, size),
+            self.pixel_grid(lens, size, self._split(back)) if back else None,
+            self._ray_channels(lens, size) if rays else None,
+            [self.token_rays(lens, of_map) for of_map in maps],
+        )
+
+    def see(self, images: Tensor, prepared: Prepared, dtype: torch.dtype = torch.float32) -> Tensor:
+        assert isinstance(prepared.points, PolarGrid)
+        check_count(prepared.points.radii.shape[0], images)
+        if dtype == torch.float64:
+            images = self.floating(images, dtype)  # the operator would normalize in float32
+        return polar_sample(**self.arguments(images, prepared.points), layout=self.layout)
+
+    def arguments(self, images: Tensor, grid: PolarGrid) -> dict[str, Any]:
+        """The arguments with which `polar_sample` reads images (B, C, H, W) on a grid."""
+        dtype = torch.float64 if images.dtype == torch.float64 else torch.float32
+        radii, azimuths, center, _, _, affine, offsets = (
+            None if t is None else t.to(images.device, dtype) for t in grid
+        )
+        jitter = self.jitter if self.training else 0.0
+        # The seed is a tensor, so that compiled training does not specialise on its value.
+        seed = torch.randint(2**62, ()) if jitter else 0
+        return dict(
+            image=images, radii=radii, azimuths=azimuths, center=center, affine=affine,
+            offsets=offsets, samples=self.samples, jitter=jitter, seed=seed, mean=self.mean,
+            std=self.std, channels_last=False,
+        )  # fmt: skip
+
+    def back(self, maps: Tensor, prepared: Prepared) -> Tensor:
+        assert isinstance(prepared.back, PixelGrid)
+        *lens, plan = prepared.back
+        if self.in_pixels:
+            rings, sectors = self.map_size
+            if maps.shape[2:] != (rings, sectors):
+                maps = F.interpolate(maps, (rings, sectors), mode="bilinear", align_corners=False)
+            maps = maps.permute(0, 2, 3, 1)
+        dtype = torch.float64 if maps.dtype == torch.float64 else torch.float32
+        radii, r_max, center, affine, points = (
+            None if tensor is None else tensor.to(maps.device, dtype) for tensor in lens
+        )
+        if plan is not None and (plan.device, plan.dtype) != (maps.device, dtype):
+            plan = None
+        assert radii is not None
+        pixels = polar_to_image(
+            maps, radii, center, prepared.size,
+            affine=affine, points=points, r_max=r_max, plan=plan, layout="tokens",
+        )  # fmt: skip
+        return pixels.permute(0, 3, 1, 2)
+
+    def check_seen(self, seen: Tensor, prepared: Prepared, channels: int | None) -> Tensor:
+        assert isinstance(prepared.points, PolarGrid)
+        if self.in_pixels:
+            seen = check_images(seen, channels=channels)
+        else:
+            assert channels is not None
+            values = self.samples[0] * self.samples[1] * channels
+            check_tensor(
+                "sampled", seen, (torch.float32, torch.float64, torch.bfloat16),
+                "(B, R, A, S_r·S_φ·C) = (any, {}, {}, {})",
+                (None, self.rings, self.sectors, values),
+            )  # fmt: skip
+        check_count(prepared.points.radii.shape[0], seen)
+        return seen
+
+    @property
+    def map_size(self) -> Pair:
+        """The size of what the network sees: (R, A), or (R·S_r, A·S_φ) for an image."""
+        if not self.in_pixels:
+            return self.rings, self.sectors
+        return self.rings * self.samples[0], self.sectors * self.samples[1]
+
+    def _split(self, back: bool | Pair) -> int:
+        """The number of rings, per ring here, of the maps that go back."""
+        rings = self.map_size[0] if isinstance(back, bool) else back[0]
+        return rings // self.rings
+
+    def _ray_channels(self, lens: Lens, size: Pair) -> Tensor:
+        if self.in_pixels:
+            return self.token_rays(lens, self.map_size).permute(0, 3, 1, 2)
+        return ray_channels(*pixel_rays(lens, size))
+
+    @property
+    def inner_spacing(self) -> Spacing:
+        """`sample_spacing`, or `spacing` if that is None."""
+        return self.spacing if self.sample_spacing is None else self.sample_spacing
+
+    def grid(self, lens: Lens, image_size: tuple[int, int]) -> PolarGrid:
+        """The grid of N lenses. A lens without principal point gets the centre of (H, W)."""
+        steps_r, steps_phi = (_steps(s, self.placement, lens.theta_max) for s in self.samples)
+        borders, points = self._rings(lens, self.inner_spacing, steps_r)
+        sector = torch.arange(self.sectors, dtype=borders.dtype, device=borders.device)[:, None]
+        azimuths = (sector + steps_phi).flatten() * (2 * math.pi / self.sectors)
+        radii, offsets = self._radii(lens, points, self.inner_spacing), None
+        if not lens.is_radial:
+            theta = to_theta(lens, points, self.inner_spacing)
+            if self.theta_max is not None:
+                theta = torch.minimum(theta, lens.theta_max[:, None])
+            offsets = _offsets(lens, theta, azimuths)
+        if self.theta_max is not None:
+            radii = torch.where(points > lens.theta_max[:, None], torch.nan, radii)
+        return PolarGrid(
+            radii,
+            azimuths,
+            lens.center_in(image_size),
+            self._radii(lens, borders, self.spacing),
+            self.last_angle(lens),
+            lens.affine,
+            offsets,
+        )
+
+    def pixel_grid(self, lens: Lens, image_size: tuple[int, int], split: int = 1) -> PixelGrid:
+        """The way back to images of (H, W) from a polar map with `split` rings per ring here."""
+        steps = _steps(split, "centers", lens.theta_max)
+        _, centers = self._rings(lens, self.inner_spacing, steps)
+        radii, r_max = self._radii(lens, centers, self.inner_spacing), lens.r_max
+        if self.theta_max is not None:
+            end = lens.theta_max.clamp(max=self.theta_max)
+            r_max = lens.project(end[:, None])[:, 0]
+        if lens.is_radial:
+            grid = PixelGrid(radii, r_max, lens.center_in(image_size), lens.affine)
+        else:
+            theta, direction = pixel_rays(lens, image_size)
+            seen = ~theta.isnan()  # NaN would spread to the gradients
+            flat = lens.project(torch.where(seen, theta, 0.0))[..., None] * direction
+            points = torch.where(seen[..., None], flat, torch.nan)
+            grid = PixelGrid(radii, r_max, points=points)
+        # Plans of many lenses would take much memory. A graph has no plan, and must not ask for the
+        # number of lenses, which may vary.
+        if torch.compiler.is_compiling() or len(lens) != 1:
+            return grid
+        of_map = radii.new_empty((1, radii.shape[1], self.sectors * split, 0))
+        plan = polar_to_image_plan(
+            of_map, radii, grid.center, image_size,
+            affine=grid.affine, points=grid.points, r_max=grid.r_max,
+        )  # fmt: skip
+        return grid._replace(plan=plan)
+
+    def token_rays(self, lens: Lens, map_size: Pair | None = None) -> Tensor:
+        """The viewing directions of the tokens of a map: unit vectors (x, y, z), (N, R, A, 3).
+
+        A map of another size than (R, A) has rings of its own, equal steps of the spacing too.
+
+        x points right, y down and z forward. The ray of a token goes through the centre of its ring
+        and its sector on the radial curve; other distortions of the lens are ignored.
+        """
+        rings, sectors = map_size or (self.rings, self.sectors)
+        _, centers = self._rings(lens, self.spacing, _steps(1, "centers", lens.theta_max), rings)
+        theta = change_spacing(lens, centers, self.spacing, "theta")[..., None]
+        sector = torch.arange(sectors, dtype=theta.dtype, device=theta.device)
+        azimuth = (sector + 0.5) * (2 * math.pi / sectors)
+        return vector_of(theta.expand(-1, -1, sectors), direction_of(azimuth))
+
+    def border_angles(self, lens: Lens) -> Tensor:
+        """θ of the ring borders, (N, R+1) rad."""
+        borders, _ = self._rings(lens, self.spacing, lens.theta_max.new_zeros(1))
+        return to_theta(lens, borders, self.spacing)
+
+    def last_angle(self, lens: Lens) -> Tensor:
+        """θ at the end of the last ring, (N,) rad."""
+        last = lens.theta_max
+        return last if self.theta_max is None else torch.full_like(last, self.theta_max)
+
+    def _radii(self, lens: Lens, values: Tensor, spacing: Spacing) -> Tensor:
+        """r at values of a spacing, px. Beyond θ_max of a lens, r rises in proportion to θ."""
+        if self.theta_max is None:
+            return change_spacing(lens, values, spacing, "radius")
+        last = lens.theta_max[:, None]
+        beyond = (values - last).clamp(min=0) * (lens.r_max[:, None] / last)
+        return lens.project(torch.minimum(values, last)) + beyond
+
+    def _rings(
+        self, lens: Lens, inner: Spacing, steps: Tensor, rings: int | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """The ring borders (N, R+1) in units of `spacing`, and points inside the rings,
+        (N, R·len(steps)) in units of `inner`. `steps` are fractions of a ring."""
+        if "tan" in (self.spacing, inner):
+            check_tan(lens)
+        fractions = torch.linspace(
+            0, 1, (rings or self.rings) + 1, dtype=steps.dtype, device=steps.device
+        )
+        first, last = span(lens, self.spacing)
+        if self.theta_max is not None:
+            last = self.last_angle(lens)[:, None]
+        borders = first + (last - first) * fractions
+        edges = change_spacing(lens, borders, self.spacing, inner)
+        begin, end = edges[:, :-1, None], edges[:, 1:, None]
+        return borders, (begin + (end - begin) * steps).flatten(1)
+
+    def extra_repr(self) -> str:
+        return (
+            f"rings={self.rings}, sectors={self.sectors}, samples={self.samples}, "
+            f"spacing={self.spacing!r}, sample_spacing={self.sample_spacing!r}, "
+            f"placement={self.placement!r}, theta_max={self.theta_max}, jitter={self.jitter}, "
+            f"layout={self.layout!r}"
+        )
+
+
+@register_view("polar")
+def polar_image(size: Pair, **options: Any) -> PolarView:
+    """The polar view as an image with a row for each ring, from the centre to θ_max.
+
+    Args:
+        size: (R, A). options: the other arguments of `PolarView`.
+    """
+    return PolarView(*size, samples=(1, 1), layout="image", **options)
+
+
+def polar_grid(lens: Lens, image_size: tuple[int, int], **settings: Any) -> PolarGrid:
+    """Cuts the image of each lens into rings × sectors and places samples in each.
+
+    Args:
+        lens: N lenses.
+        image_size: (H, W); its centre is the principal point of a lens that has none.
+        settings: the arguments of `PolarView`.
+
+    Raises:
+        ValueError: a setting is wrong, or the spacing is "tan" and a lens has θ_max ≥ 90°.
+    """
+    return PolarView(**settings).grid(lens, image_size)
+
+
+def _steps(count: int, placement: Placement, like: Tensor) -> Tensor:
+    """The positions of the samples of a cell, as fractions of the cell."""
+    steps = torch.arange(count, dtype=like.dtype, device=like.device)
+    return steps / (count - 1) if placement == "edges" else (steps + 0.5) / count
+
+
+def _offsets(lens: Lens, theta: Tensor, azimuths: Tensor) -> Tensor:
+    """The offset of each point from the radial curve of the lens, (N, 2, N_r, N_a) px."""
+    theta = theta[:, :, None].expand(-1, -1, len(azimuths))
+    direction = direction_of(azimuths)
+    offsets = lens.offset(theta, direction.expand(*theta.shape, 2))
+    return lens.through_affine(offsets).permute(0, 3, 1, 2)
