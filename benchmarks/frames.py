@@ -21,9 +21,9 @@ from peers import run_suite
 
 from darswin.bench.timing import OURS, Case, Timing, measure
 from darswin.frames import Sampler, plan
-from darswin.layers.polar import PolarSample
 from darswin.lens import Equidistant
 from darswin.ops import polar_sample
+from darswin.views import PolarView
 
 FLOAT_MAPS, FIXED_MAPS = "cv2.remap, float maps", "cv2.remap, fixed-point maps"
 MEAN, STD = (0.45, 0.46, 0.41), (0.22, 0.23, 0.22)
@@ -60,7 +60,7 @@ def frames(size: tuple[int, int], rings: int, sectors: int, seconds: float) -> l
     rng = np.random.default_rng(0)
     frame = cv2.GaussianBlur(rng.integers(0, 256, (*size, 3), dtype=np.uint8), (0, 0), 2)
     lens = Equidistant.from_fov(math.radians(180), min(size) / 2 - 1)
-    layer = PolarSample(rings, sectors, (4, 4), layout="image", mean=MEAN, std=STD).eval()
+    layer = PolarView(rings, sectors, (4, 4), layout="image", mean=MEAN, std=STD).eval()
     image = plan(layer, lens, size)
     sampler = Sampler(plan(layer, lens, size, output="tokens"))
     places = np.stack((image.columns + image.right, image.rows + image.lower), -1)

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from darswin import compat, frames, lens, models, ops
     from darswin.deploy.optimize import optimize
-    from darswin.views import PolarGrid, PolarSample, polar_grid
     from darswin.layers.attention import PolarWindowAttention
     from darswin.models import DarSwin, create_model, list_models, load_model
+    from darswin.views import PolarGrid, PolarSample, PolarView, polar_grid
 
     __version__: str
 
@@ -20,6 +20,7 @@ __all__ = [
     "DarSwin",
     "PolarGrid",
     "PolarSample",
+    "PolarView",
     "PolarWindowAttention",
     "compat",
     "create_model",
@@ -38,6 +39,7 @@ _MODULES = {
     "DarSwin": "darswin.models",
     "PolarGrid": "darswin.views",
     "PolarSample": "darswin.views",
+    "PolarView": "darswin.views",
     "PolarWindowAttention": "darswin.layers.attention",
     "create_model": "darswin.models",
     "list_models": "darswin.models",

@@ -16,7 +16,7 @@ import torch
 from matplotlib.figure import Figure
 from PIL import Image
 
-from darswin import PolarSample
+from darswin import PolarView
 from darswin.lens import Polynomial
 from darswin.utils.files import replace_file
 from darswin.viz.plot import TEXT, draw_grid, draw_lens, draw_polar, page_figure, save_figure
@@ -73,7 +73,7 @@ def row(lens: Polynomial, y: int, width: int) -> np.ndarray:
 
 def draw_polar_image(image: np.ndarray, lens: Polynomial) -> Figure:
     """The first picture of the README: the rings of the lens, and the polar image."""
-    sampler = PolarSample(rings=8, sectors=32, samples=(20, 20))
+    sampler = PolarView(rings=8, sectors=32, samples=(20, 20))
     figure = page_figure(2.9)
     left, right = figure.subplots(1, 2, width_ratios=(1, 1.1))
     draw_grid(image, lens, sampler, samples=False, axes=left)
@@ -92,7 +92,7 @@ def main() -> None:
     calibration = dict(zip(("k1", "k2", "k3", "k4"), COEFFICIENTS, strict=True)) | OFFSETS
     replace_file(EXAMPLES / "front.json", json.dumps({"intrinsic": calibration}, indent=2) + "\n")
     view = perspective((604, 800), math.radians(110))
-    sampler = PolarSample(rings=16, sectors=64, samples=(10, 10))
+    sampler = PolarView(rings=16, sectors=64, samples=(10, 10))
     figure = draw_lens(image, front_lens(), sampler, view, "perspective view, 110° across")
     save_figure(figure, DOCS / "lens.png", colors=256)
     save_figure(draw_polar_image(image, front_lens()), DOCS / "polar.png", colors=256)

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from darswin import PolarSample
+from darswin import PolarView
 from darswin.data import SphericalLenses, WideAngle, open_source
 from darswin.lens import Lens, Spherical
 from darswin.lens.pixels import pixel_angles
@@ -49,8 +49,8 @@ def lens_of(xi: float, size: int) -> Lens:
     return Spherical.from_fov(xi, math.radians(175), size / 2)
 
 
-def grid_of(samples: int) -> PolarSample:
-    return PolarSample(rings=16, sectors=64, samples=(samples, samples))
+def grid_of(samples: int) -> PolarView:
+    return PolarView(rings=16, sectors=64, samples=(samples, samples))
 
 
 def share_read(size: int, samples: int, xi: float) -> float:

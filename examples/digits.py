@@ -29,10 +29,10 @@ from tqdm import tqdm
 from darswin import create_model, lens
 from darswin.data import LEVELS, warp_map
 from darswin.data.warping import remap
-from darswin.layers.polar import PolarSample
 from darswin.models import ModelCard, save_model
 from darswin.models.encoder import Encoder
 from darswin.utils.files import replace_file
+from darswin.views import PolarView
 from darswin.viz.plot import TEXT, draw_accuracy, draw_grid, page_figure, save_figure
 
 FOV = math.radians(165)
@@ -111,7 +111,7 @@ def save(path: Path, model: Encoder, scan: np.ndarray) -> None:
     lens.save(sized, path.with_suffix(".json"))
 
 
-def draw(table: dict[str, list[list[float]]], scan: np.ndarray, sampler: PolarSample) -> Figure:
+def draw(table: dict[str, list[list[float]]], scan: np.ndarray, sampler: PolarView) -> Figure:
     """Plots accuracy against ξ, and beside it a digit through two lenses with their patches."""
     figure = page_figure(4.2)
     panels = figure.subplot_mosaic("ab;ac", width_ratios=(2.7, 1))
@@ -165,7 +165,7 @@ def main() -> None:
     for name, rows in table.items():
         print(name.ljust(24) + "".join(f"{value:7.1f}" for value in np.mean(rows, 0)))
     model_name, options = MODELS["DarSwin-A"]
-    sampler = create_model(model_name, **options).patch_embed.sample
+    sampler = create_model(model_name, **options).view
     three = unseen[digits.target[unseen] == 3][0]
     save_figure(draw(table, scans[three], sampler), args.out / "accuracy.png", colors=256)
     record = json.dumps(dict(xi=XI, accuracy=table), indent=1)

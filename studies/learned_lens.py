@@ -181,7 +181,7 @@ def descend(
     )
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, steps)
     path = [start]
-    model.patch_embed.sample.train()  # jitter smooths the loss
+    model.view.train()  # jitter smooths the loss
     for _ in range(steps):
         batch = torch.randperm(len(images))[:BATCH]
         found = losses(model, images[batch], labels[batch], lens_of(values | unknown), usual)
@@ -193,7 +193,7 @@ def descend(
             for name, value in unknown.items():
                 value.clamp_(*BOUNDS[name])
         path.append({name: value.item() for name, value in unknown.items()})
-    model.patch_embed.sample.eval()
+    model.view.eval()
     return path
 
 

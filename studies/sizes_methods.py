@@ -1,6 +1,7 @@
 """The methods of the sizes study: what a network sees of a picture and of its lens."""
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -10,8 +11,10 @@ from torch import Tensor, nn
 
 from darswin import create_model
 from darswin.lens import Lens
-from darswin.lens.pixels import as_map, sample_at
-from darswin.models.views import LensAdapter, PerspectiveView, PlainView, SquareView
+from darswin.lens.pixels import as_map
+from darswin.models import LensAdapter
+from darswin.views import PerspectiveView, SquareView, View
+from darswin.views.base import PixelView
 
 WIDEST = math.radians(96)  # the θ_max of grids with absolute θ, more than that of every test lens
 MEAN, STD = 0.5, 0.25  # of the pixels, for the networks
@@ -59,14 +62,14 @@ METHODS = {
 }
 
 
-class Equirectangular(PlainView):
+class Equirectangular(PixelView):
     """Azimuth and elevation about the optical axis, up to ±`WIDEST`, in equal steps.
 
     The resolution is the same for all lenses, as in Depth Any Camera (CVPR 2025). The view is 0
     where a lens sees nothing.
     """
 
-    uses_lens = True
+    size: tuple[int, int]
 
     def image_points(self, lens: Lens, size: tuple[int, int]) -> Tensor:
         like = lens.theta_max
@@ -89,9 +92,6 @@ class Equirectangular(PlainView):
         sides = torch.tensor(self.size[::-1], dtype=angles.dtype)
         return as_map(((angles / WIDEST + 1) * sides - 1) / 2)
 
-    def to_images(self, x: Tensor, view_points: Tensor) -> Tensor:
-        return sample_at(x, view_points)
-
 
 def pixel_directions(lens: Lens, size: tuple[int, int]) -> Tensor:
     """The viewing directions (x, y, z) of the pixels, (N, H, W, 3); NaN where no ray lands."""
@@ -100,7 +100,7 @@ def pixel_directions(lens: Lens, size: tuple[int, int]) -> Tensor:
     return lens.unproject_points(pixels[None], size)
 
 
-VIEWS: dict[str, type[PlainView]] = {
+VIEWS: dict[str, Callable[..., View]] = {
     "square": SquareView,
     "perspective": PerspectiveView,
     "equirectangular": Equirectangular,
@@ -120,8 +120,8 @@ class Measurer(nn.Module):
         )  # fmt: skip
         if method.view:
             side = round(method.scale * SIZE)
-            self.network = LensAdapter(self.network, side)
-            self.network.view = VIEWS[method.view]((side, side), **edge)
+            view = VIEWS[method.view]((side, side), **edge, mean=None, std=None)
+            self.network = LensAdapter(self.network, view=view)
 
     def forward(self, images: Tensor, lens: Lens) -> Tensor:
         x = (images.permute(0, 3, 1, 2) / 255 - MEAN) / STD

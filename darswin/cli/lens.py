@@ -9,12 +9,12 @@ import darswin.lens
 from darswin.cli.arguments import check_option, check_out
 from darswin.cli.undistort import undistort
 from darswin.cli.views import View, check_view, view_of, view_rays
-from darswin.layers.polar import PolarSample
 from darswin.lens.base import Lens
 from darswin.lens.files.load import Calibration, reach
 from darswin.lens.files.opencv import Coefficients
 from darswin.lens.orientation import in_upright_picture, stored_size
 from darswin.lens.spacing import Spacing
+from darswin.views import PolarView
 from darswin.viz.report import describe
 
 Format = Literal["darswin", "opencv", "colmap", "kalibr"]
@@ -67,7 +67,7 @@ def show(
     file, theta_max = _calibration(calib, theta_max_deg, stored, coefficients)
     lens = file.lens(camera, theta_max, stored, torch.float64)
     lens = in_upright_picture(lens, size, orientation)
-    sampler = PolarSample(rings, sectors, samples, spacing=spacing)
+    sampler = PolarView(rings, sectors, samples, spacing=spacing)
     fov_deg, view_size = view_of(lens, size, view, fov_deg, VIEW_SIDE)
     rays = view_rays(view, view_size, fov_deg, yaw_deg, pitch_deg)
     title = f"{view} view, {fov_deg:.4g}° across\nyaw {yaw_deg:.4g}°, pitch {pitch_deg:.4g}°"

@@ -10,21 +10,21 @@ import dataclasses
 import math
 import warnings
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from darswin.compat.checkpoint import Source, count_blocks, load_as
-from darswin.layers.polar import PolarGrid, PolarGridSpec
-from darswin.layers.transformer import PolarWindowAttention
+from darswin.layers.attention import PolarWindowAttention
+from darswin.layers.position_bias import PositionBias
 from darswin.lens import Lens, Number, Spherical
 from darswin.lens.parameter import Parameter
 from darswin.lens.spacing import check_tan
 from darswin.models.darswin import DarSwin
-from darswin.models.encoder import Prepared
-from darswin.models.stages import Pair, StagePlan
+from darswin.models.stages import StageSizes
 from darswin.ops.reference import ranks
+from darswin.views import Pair, PolarGrid, PolarView
+from darswin.views.base import PerChannel
 
 
 class OfficialPolynomial(Lens, register=False):
@@ -80,76 +80,95 @@ class OfficialPolynomial(Lens, register=False):
 class OfficialDarSwin(DarSwin):
     """The authors' released DarSwin-A. `OfficialDarSwin(num_classes)` has the sizes of the paper.
 
-    The arguments are those of `DarSwin`. spacing, sample_spacing, placement and jitter have fixed
-    values here.
+    The arguments are those of `DarSwin`. spacing, sample_spacing, placement, jitter, variant and
+    merges have fixed values here.
 
     Raises:
-        ValueError: an option is wrong for `DarSwin`, or it is variant "RA" or `merges`, which the
-            released code does not have; in forward, the images are not square, or a lens is not
-            radial.
+        ValueError: an option is wrong for `DarSwin`; in forward, the images are not square, or a
+            lens is not radial.
     """
 
     square_images = True
 
-    def __init__(self, *arguments: Any, **options: Any):
-        if options.get("variant", "A") != "A" or options.get("merges") is not None:
-            raise ValueError("the released DarSwin has only variant 'A' and no option merges")
-        grid = dict(spacing="tan", sample_spacing="tan", placement="edges", jitter=0.0)
-        self._window = options.get("window") or (1, 16)
-        super().__init__(*arguments, **(options | grid))
+    def __init__(
+        self,
+        num_classes: int = 1000,
+        in_chans: int = 3,
+        embed_dim: int = 96,
+        depths: Sequence[int] = (2, 2, 18, 2),
+        num_heads: Sequence[int] = (3, 6, 12, 24),
+        *,
+        mlp_ratio: float = 4.0,
+        drop_path_rate: float = 0.2,
+        rings: int = 16,
+        sectors: int = 64,
+        samples: Pair = (10, 10),
+        window: Pair = (1, 16),
+        position_bias: PositionBias = "angular_relative",
+        harmonics: int = 16,
+        mean: PerChannel = 0.0,
+        std: PerChannel = 1.0,
+    ):
+        self._window = window
+        super().__init__(
+            num_classes, in_chans, embed_dim, depths, num_heads, mlp_ratio=mlp_ratio,
+            drop_path_rate=drop_path_rate, rings=rings, sectors=sectors, samples=samples,
+            spacing="tan", placement="edges", jitter=0.0, window=window,
+            position_bias=position_bias, harmonics=harmonics, mean=mean, std=std,
+        )  # fmt: skip
+        view = self.view
+        self.view = OfficialView(
+            view.rings, view.sectors, view.samples, spacing="tan", placement="edges",
+            mean=view.mean, std=view.std,
+        )  # fmt: skip
 
-    def _finish(self, plans: Sequence[StagePlan], patch: Pair) -> None:
-        super()._finish([_with_shift(plan, self._window) for plan in plans], patch)
+    def _finish(self, sizes: Sequence[StageSizes], patch: Pair) -> None:
+        super()._finish([_with_shift(of_stage, self._window) for of_stage in sizes], patch)
 
-    def attention(self, dim: int, heads: int, plan: StagePlan, block: int) -> nn.Module:
-        return PolarWindowAttention(
+    def attention(self, dim: int, heads: int, sizes: StageSizes, block: int) -> nn.Module:
+        return OfficialAttention(
             dim,
             heads,
-            **plan.windows(block),
+            **sizes.windows(block),
             periodic=(False, False),
             position_bias=self.position_bias,
             harmonics=self.harmonics,
             # The released code has M_φ rows of coefficients if the window is the whole map.
-            periodic_bias=plan.window == plan.map_size,
+            periodic_bias=sizes.window == sizes.map_size,
         )
 
-    def _prepare(self, lens: Lens, size: Pair) -> Prepared:
-        grid = _grid(lens, size, self.spec)
-        # The angles of the bias are equal steps up to tan θ_max of image 0.
-        last = _last_angle(lens[:1])[:, None]
-        rings = [plan.map_size[0] for plan in self.plans]
-        return Prepared(grid, [(last * _inclusive(count, lens.theta_max),) for count in rings])
 
-    # In the released code x points down and y to the right.
+class OfficialAttention(PolarWindowAttention):
+    """The attention of the released code, whose angles are equal steps up to tan θ_max."""
 
-    def embed(self, images: Tensor, points: PolarGrid | None) -> Tensor:
-        return super().embed(images if points is None else images.transpose(2, 3), points)
-
-    def _sample(self, images: Tensor, prepared: Prepared) -> Tensor:
-        return super()._sample(images.transpose(2, 3), prepared)
-
-    def _points(self, prepared: Prepared) -> Any:
-        raise ValueError("OfficialDarSwin samples the transposed image, which no plan does")
+    def angles(self, grid: PolarGrid) -> Tensor:
+        return grid.last[:, None] * _inclusive(self.map_size[0], grid.last)
 
 
-def _with_shift(plan: StagePlan, window: Pair) -> StagePlan:
+class OfficialView(PolarView):
+    """The grid of the released code: in each step as there, with its rounding."""
+
+    def grid(self, lens: Lens, image_size: Pair) -> PolarGrid:
+        return _grid(lens, image_size, self)
+
+
+def _with_shift(sizes: StageSizes, window: Pair) -> StageSizes:
     """A stage's sizes with the shift of the released code."""
     shift = (window[0], window[1] // 4)
-    if plan.map_size[1] < 4:
+    if sizes.map_size[1] < 4:
         shift = shift[::-1]
     # A shift by whole windows of one token, or once around the map, moves nothing.
     along_r, along_phi = (
         s % size if w > 1 else 0
-        for s, size, w in zip(shift, plan.map_size, plan.window, strict=True)
+        for s, size, w in zip(shift, sizes.map_size, sizes.window, strict=True)
     )
-    return dataclasses.replace(plan, shift=(along_r, along_phi))
+    return dataclasses.replace(sizes, shift=(along_r, along_phi))
 
 
-# The grid is that of the transposed image, because azimuth 0 points down. Near 90° the rounding of
-# float32 tangents moves samples by 1e-4 px. This code therefore follows the released code step by
-# step. Even so, the samples vary by as much with the maths library (MKL differs between CPUs).
-def _grid(lens: Lens, image_size: Pair, spec: PolarGridSpec) -> PolarGrid:
-    """The grid of the released code, instead of `PolarGridSpec.grid`."""
+# Near 90° the rounding of float32 tangents moves samples by 1e-4 px. This code therefore follows
+# the released code step by step. Even so, the samples vary by as much with the maths library (MKL
+# differs between CPUs).
+def _grid(lens: Lens, image_size: Pair, view: PolarView) -> PolarGrid:
     height, width = image_size
     if height != width:
         raise ValueError(f"OfficialDarSwin needs square images, got (H, W) = {image_size}")
@@ -157,8 +176,8 @@ def _grid(lens: Lens, image_size: Pair, spec: PolarGridSpec) -> PolarGrid:
         raise ValueError(f"OfficialDarSwin needs radial lenses without affine, got {lens!r}")
     like = lens.theta_max
     lens = lens.replace(theta_max=like[:1].expand(lens.count))
-    along_r, along_phi = (_inclusive(count - 1, like) for count in spec.samples)
-    ends = _last_angle(lens)[:, None] * _inclusive(spec.rings, like)
+    along_r, along_phi = (_inclusive(count - 1, like) for count in view.samples)
+    ends = _last_angle(lens)[:, None] * _inclusive(view.rings, like)
     if isinstance(lens, OfficialPolynomial):
         borders = lens.project(ends)
         radii = _between(borders[:, :-1], borders[:, 1:], along_r)
@@ -168,13 +187,17 @@ def _grid(lens: Lens, image_size: Pair, spec: PolarGridSpec) -> PolarGrid:
         inner, outer = borders[:, :-1], borders[:, :-1] + borders.diff(dim=1)
         tangents = _between(_tangent(lens, inner), _tangent(lens, outer), along_r)
         radii = _radius(lens, tangents)
-    step = (torch.tensor(2 * math.pi, dtype=like.dtype) / spec.sectors).item()
+    step = (torch.tensor(2 * math.pi, dtype=like.dtype) / view.sectors).item()
     # The range ends half a step early, so that rounding cannot add one more azimuth.
-    start = torch.arange(0, (spec.sectors - 0.5) * step, step, dtype=like.dtype, device=like.device)
+    start = torch.arange(0, (view.sectors - 0.5) * step, step, dtype=like.dtype, device=like.device)
     azimuths = _between(start, step + start, along_phi)
     scale = (height - 1) / 2 / (height // 2)
-    center = lens.center_in(image_size).flip(1)
-    return PolarGrid(radii * scale, azimuths, center, borders * scale)
+    # In the released code x points down and y to the right.
+    swapped = torch.eye(2, dtype=like.dtype, device=like.device).flip(0)[None]
+    # The angles of the bias are equal steps up to tan θ_max of image 0.
+    last = _last_angle(lens[:1])
+    center = lens.center_in(image_size)
+    return PolarGrid(radii * scale, azimuths, center, borders * scale, last, affine=swapped)
 
 
 def _inclusive(count: int, like: Tensor) -> Tensor:
@@ -236,7 +259,7 @@ def load_official(source: Source, **options) -> DarSwin:
     def convert(key: str, value: Tensor, model: DarSwin) -> tuple[str, Tensor]:
         if key == "patch_embed.mlp.weight":
             # Columns (C, S_r, S_φ) → (S_r, S_φ, C).
-            value = value.unflatten(1, (model.in_chans, *model.spec.samples))
+            value = value.unflatten(1, (model.in_chans, *model.view.samples))
             value = value.permute(0, 2, 3, 1).flatten(1)
         return _renamed(key), value
 

@@ -36,8 +36,8 @@ except ImportError as error:
 if TYPE_CHECKING:
     import torch
 
-    from darswin.layers.polar import PolarGrid
     from darswin.lens import Lens
+    from darswin.views import PolarGrid
 
 __all__ = ["Plan", "Sampler", "plan"]
 

@@ -1,16 +1,16 @@
 """The points at which models, layers and views read an image."""
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 
-from darswin.layers.polar import PolarGrid, PolarSample, check_lens
 from darswin.lens import Lens
 from darswin.lens.pixels import as_map
 from darswin.models.base import Model
-from darswin.models.stages import Pair
+from darswin.views import Pair, PolarGrid, PolarView, View
+from darswin.views.base import check_lens
 
 
 class Reading(NamedTuple):
@@ -36,23 +36,17 @@ def reading(sample: nn.Module | Tensor, lens: Lens, size: Pair) -> Reading:
             raise ValueError(f"rays must have shape (H, W, 3), got {tuple(sample.shape)}")
         exact = lens.to(torch.float64).project_points(sample[None].double().cpu(), size)
         return Reading(as_map(exact)[0], "uint8", None, None, 0.0, 1.0)
-    if isinstance(sample, PolarSample):
-        grid, samples = sample.grid(lens, size), sample.spec.samples
-        return Reading(grid, sample.layout, samples, None, sample.mean, sample.std)
-    if not isinstance(sample, Model):
+    view = sample.view if isinstance(sample, Model) else sample
+    if not isinstance(view, View):
         raise TypeError(
-            "sample must be a model of darswin, a PolarSample or rays (H, W, 3), "
+            "sample must be a model or a view of darswin, or rays (H, W, 3), "
             f"got {type(sample).__name__}"
         )
-    points = sample._points(sample.prepare(lens, size))
+    channels = sample.in_chans if isinstance(sample, Model) else None
+    points = view.prepare(lens, size, back=False, rays=False).points
     if points is None:
         raise ValueError("the model takes images as they are: it needs no plan")
-    # An adapter may know neither the channels nor the normalization of its network.
-    frames = (getattr(sample, name, None) for name in ("in_chans", "mean", "std"))
-    if isinstance(points, PolarGrid):
-        return Reading(points, "tokens", _spec(sample).samples, *frames)
-    return Reading(points[0], "image", None, *frames)
-
-
-def _spec(model: Any) -> Any:
-    return model.spec if hasattr(model, "spec") else _spec(model.encoder)
+    if isinstance(view, PolarView):
+        return Reading(points, view.layout, view.samples, channels, view.mean, view.std)
+    assert isinstance(points, Tensor)
+    return Reading(points[0], "image", None, channels, view.mean, view.std)

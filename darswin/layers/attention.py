@@ -1,4 +1,4 @@
-"""Attention in the windows of a map, with a position bias of offsets (Swin) or of angles (DarSwin)."""
+"""Attention in the windows of a map, with a position bias of offsets or angles between tokens."""
 
 from collections.abc import Callable
 from functools import partial

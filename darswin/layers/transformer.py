@@ -5,12 +5,12 @@ the shape (B, H, W, D).
 """
 
 from collections.abc import Iterable, Sequence
+from typing import Any
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from darswin.layers.attention import WindowAttention
 from darswin.layers.checkpointing import checkpointed
 from darswin.layers.linear import Linear
 from darswin.layers.position_bias import RelativeBias, joined_coefficients
@@ -130,7 +130,7 @@ class Stage(nn.Module):
         Args:
             points: the `Prepared.points` of the view.
         """
-        attentions = [block.attn for block in self.blocks]
+        attentions: list[Any] = [block.attn for block in self.blocks]
         biases = [attn.position_bias for attn in attentions]
         relative = [bias for bias in biases if isinstance(bias, RelativeBias)]
         if not relative:

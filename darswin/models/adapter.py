@@ -110,7 +110,7 @@ class LensAdapter(Model[Any]):
 
 
 def _pair(size: int | Pair | None) -> Pair:
-    sides = size if isinstance(size, tuple | list) else (size, size)
-    if len(sides) != 2 or any((as_int(side) or 0) < 1 for side in sides):
+    sides = [as_int(side) or 0 for side in (size if isinstance(size, tuple) else (size, size))]
+    if len(sides) != 2 or min(sides) < 1:
         raise ValueError(f"size must be an int of at least 1, or (H', W'), got {size!r}")
-    return int(sides[0]), int(sides[1])
+    return sides[0], sides[1]

@@ -26,11 +26,11 @@ LARGEST_NORMALIZED = 20
 class Model(nn.Module, Generic[Result]):
     """The base class of all models: a view and a network.
 
-    They are called `model(images, lens)` and have timm's methods. A call checks the images, computes
-    `prepare(lens, size)`, and runs the network on what the view sees. If your lens stays the same,
-    call `prepare` once and then `run(images, prepared)` for each batch: the results are the same.
-    `run_sampled` starts later, at the result of `sample`: pixels that were sampled elsewhere, such
-    as on a camera. A subclass makes a `view`, and defines `forward_network`.
+    All models are called `model(images, lens)` and have timm's methods. A call checks the images,
+    computes `prepare(lens, size)`, and runs the network on what the view sees. If your lens stays
+    the same, call `prepare` once and then `run(images, prepared)` for each batch: the results are
+    the same. `run_sampled` starts later, at the result of `sample`: pixels that were sampled
+    elsewhere, such as on a camera. A subclass makes a `view`, and defines `forward_network`.
 
     Attributes:
         view: what the network sees of the images through their lenses.

@@ -1,7 +1,7 @@
 """Creating models by name, with the type of each name."""
 
 from collections.abc import Sequence
-from typing import Literal, overload
+from typing import Any, Literal, overload
 
 from darswin.models.conv_unet import ConvUnet
 from darswin.models.darswin import DarSwin
@@ -35,23 +35,21 @@ ConvUnetName = Literal["conv_unet_small", "conv_unet_tiny", "conv_unet_micro", "
 
 @overload
 def create_model(
-    name: DarSwinName, *, features_only: Literal[False] = ..., **options: object
+    name: DarSwinName, *, features_only: Literal[False] = ..., **options: Any
 ) -> DarSwin: ...
 @overload
-def create_model(
-    name: DATName, *, features_only: Literal[False] = ..., **options: object
-) -> DAT: ...
+def create_model(name: DATName, *, features_only: Literal[False] = ..., **options: Any) -> DAT: ...
 @overload
 def create_model(
-    name: SwinName, *, features_only: Literal[False] = ..., **options: object
+    name: SwinName, *, features_only: Literal[False] = ..., **options: Any
 ) -> Swin: ...
 @overload
 def create_model(
-    name: UnetName, *, features_only: Literal[False] = ..., **options: object
+    name: UnetName, *, features_only: Literal[False] = ..., **options: Any
 ) -> Unet: ...
 @overload
 def create_model(
-    name: ConvUnetName, *, features_only: Literal[False] = ..., **options: object
+    name: ConvUnetName, *, features_only: Literal[False] = ..., **options: Any
 ) -> ConvUnet: ...
 @overload
 def create_model(
@@ -60,15 +58,15 @@ def create_model(
     features_only: Literal[True],
     out_indices: int | Sequence[int] | None = ...,
     output_fmt: Format | None = ...,
-    **options: object,
+    **options: Any,
 ) -> FeatureMaps: ...
 @overload
 def create_model(
-    name: str, *, task: PixelTask, features_only: Literal[False] = ..., **options: object
+    name: str, *, task: PixelTask, features_only: Literal[False] = ..., **options: Any
 ) -> PixelModel: ...
 @overload
 def create_model(
-    name: str, *, features_only: Literal[False] = ..., **options: object
+    name: str, *, features_only: Literal[False] = ..., **options: Any
 ) -> Encoder | PixelModel: ...
 @overload
 def create_model(
@@ -77,7 +75,7 @@ def create_model(
     features_only: bool,
     out_indices: int | Sequence[int] | None = ...,
     output_fmt: Format | None = ...,
-    **options: object,
+    **options: Any,
 ) -> Encoder | PixelModel | FeatureMaps: ...
 
 
@@ -88,7 +86,7 @@ def create_model(
     out_indices: int | Sequence[int] | None = None,
     output_fmt: Format | None = None,
     pretrained: bool = False,
-    **options: object,
+    **options: Any,
 ) -> Encoder | PixelModel | FeatureMaps:
     """A new model: an `Encoder`, which classifies images, or a `Unet`, which predicts per pixel.
 

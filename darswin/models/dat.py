@@ -6,10 +6,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from darswin.layers.attention import WindowAttention, check_heads
 from darswin.layers.embed import PatchProjection
 from darswin.layers.linear import Linear
 from darswin.layers.position_bias import RelativeTable
-from darswin.layers.attention import WindowAttention, check_heads
 from darswin.lens.spacing import Spacing
 from darswin.models.registry import register_model
 from darswin.models.stages import StageSizes

@@ -20,8 +20,8 @@ Format = Literal["NHWC", "NCHW"]
 class Encoder(Model[Tensor]):
     """The base class of the classifiers.
 
-    A subclass makes `view` and `patch_embed`, calls `_finish`, and defines `attention`. Maps are channels
-    last: polar maps have the shape (B, R, A, D), other maps (B, H, W, D).
+    A subclass makes `view` and `patch_embed`, calls `_finish`, and defines `attention`. Maps are
+    channels last: polar maps have the shape (B, R, A, D), other maps (B, H, W, D).
 
     Args:
         num_classes: the number of classes; 0 leaves out the head.
@@ -41,7 +41,7 @@ class Encoder(Model[Tensor]):
     num_features: int
     patch_embed: nn.Module
     sizes: Sequence[StageSizes]
-    stages: nn.ModuleList
+    stages: nn.ModuleList  # type: ignore[assignment]
     head: nn.Module
 
     def __init__(

@@ -82,7 +82,7 @@ class Decoder(nn.Module):
         self.expand = PatchExpand(dim, dim, (EXPANSION, EXPANSION))
 
     def forward(self, maps: Sequence[Tensor], tables: Sequence[Sequence[Tensor]]) -> Tensor:
-        """The encoder's maps, and the position biases of the decoder's stages → (B, 4·R, 4·A, D)."""
+        """The encoder's maps, and the position biases of the stages → (B, 4·R, 4·A, D)."""
         x = maps[-1]
         steps = zip(self.joins, self.stages, maps[:-1], tables, strict=True)
         for join, stage, skip, of_stage in reversed(list(steps)):

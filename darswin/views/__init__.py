@@ -12,7 +12,7 @@ from darswin.views.base import (
 )
 from darswin.views.perspective import PerspectiveView
 from darswin.views.plain import PlainView
-from darswin.views.polar import PolarView, polar_grid
+from darswin.views.polar import PolarSample, PolarView, polar_grid
 from darswin.views.square import SquareView
 
 __all__ = [
@@ -21,6 +21,7 @@ __all__ = [
     "PixelGrid",
     "PlainView",
     "PolarGrid",
+    "PolarSample",
     "PolarView",
     "Prepared",
     "SquareView",

@@ -67,7 +67,8 @@ class Prepared(NamedTuple):
             (N, H, W, 2). None means that the view is the images, or that the way back was not asked
             for.
         rays: the viewing directions of the pixels that a dense network predicts, (N, 3, h, w): of
-            the pixels of the view, or of the images if the view has no pixels. 0 where no ray lands.
+            the pixels of the view, or of the images if the view has no pixels; 0 where no ray
+            lands.
         tokens: for each map, the positions of its tokens, (N or 1, H', W', `View.coordinates`).
         tables: for each stage of a network, the position biases of its blocks; a view has none.
     """
@@ -120,8 +121,8 @@ class View(nn.Module):
         Args:
             lens: N lenses, or None if the view ignores its lens.
             size: (H, W) of the images.
-            back: whether `Prepared.back` is computed; or the size of the maps that go back, if it is
-                another one than the size of what the network sees.
+            back: whether `Prepared.back` is computed; or the size of the maps that go back, if they
+                are not of the size of what the network sees.
             rays: whether `Prepared.rays` is computed.
             maps: the sizes of the maps for `Prepared.tokens`.
         """
@@ -149,7 +150,7 @@ class View(nn.Module):
         raise NotImplementedError
 
     def forward(self, images: Tensor, lens: Lens | None = None) -> Tensor:
-        """Images (B, C, H, W) or (B, H, W, C), and their lenses (B or 1) → what the network sees."""
+        """Images (B, C, H, W) or (B, H, W, C) and lenses (B or 1) → what the network sees."""
         images = check_images(images)
         height, width = images.shape[2:]
         if self.uses_lens:
@@ -296,7 +297,7 @@ _Make = TypeVar("_Make", bound=Callable[..., View])
 
 
 def register_view(name: str) -> Callable[[_Make], _Make]:
-    """Registers the decorated function or class: `make(size, **options)` is the view of that name."""
+    """Registers the decorated class or function, which makes the view: `make(size, **options)`."""
 
     def register(make: _Make) -> _Make:
         _VIEWS[name] = make

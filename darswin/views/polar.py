@@ -326,6 +326,9 @@ class PolarView(View):
         )
 
 
+PolarSample = PolarView  # its name before the views
+
+
 @register_view("polar")
 def polar_image(size: Pair, **options: Any) -> PolarView:
     """The polar view as an image with a row for each ring, from the centre to θ_max.

@@ -25,11 +25,11 @@ from matplotlib.ticker import MaxNLocator
 from PIL import Image
 from torch import Tensor
 
-from darswin.layers.polar import PolarGrid, PolarSample
 from darswin.lens import Lens
 from darswin.lens.pixels import OUTSIDE
 from darswin.ops import polar_sample
 from darswin.utils.files import replace_file
+from darswin.views import PolarGrid, PolarView
 from darswin.viz.report import SIDES, beyond_lens, pixels_per_degree
 from darswin.viz.views import undistort, view_map
 
@@ -102,12 +102,12 @@ def save_figure(figure: Figure, path: str | os.PathLike, *, colors: int | None =
 
 
 def draw_grid(
-    image: np.ndarray, lens: Lens, sampler: PolarSample, *, samples: bool = True, axes: Axes
+    image: np.ndarray, lens: Lens, sampler: PolarView, *, samples: bool = True, axes: Axes
 ) -> None:
     """Draws an image with the borders of its polar patches and the sample points.
 
     Affine, tangential and thin-prism terms of the lens deform the rings. The sampler of a model is
-    `model.patch_embed.sample`.
+    `model.view`.
     """
     lens, grid = _grid(lens, sampler, image)
     _show(axes, image)
@@ -117,7 +117,7 @@ def draw_grid(
     axes.set(xlim=(-0.5, image.shape[1] - 0.5), ylim=(image.shape[0] - 0.5, -0.5))
 
 
-def draw_samples(image: np.ndarray, lens: Lens, sampler: PolarSample, *, axes: Axes) -> None:
+def draw_samples(image: np.ndarray, lens: Lens, sampler: PolarView, *, axes: Axes) -> None:
     """Draws the grid on a tenth of the image, enlarged. The part lies half way between the centre
     and the upper right end of the lens, if the image reaches there."""
     lens, grid = _grid(lens, sampler, image)
@@ -133,16 +133,16 @@ def draw_samples(image: np.ndarray, lens: Lens, sampler: PolarSample, *, axes: A
 def _draw_borders(
     axes: Axes,
     lens: Lens,
-    sampler: PolarSample,
+    sampler: PolarView,
     size: tuple[int, int],
     widths: tuple[float, float],
 ) -> None:
     """Draws rings and sectors with an outline, which keeps them visible on bright pictures."""
     # Rings beyond θ_max of the lens, of a fixed theta_max, are drawn at its rim.
-    rings = sampler.spec.border_angles(lens)[0].clamp(max=lens.theta_max)[:, None]
+    rings = sampler.border_angles(lens)[0].clamp(max=lens.theta_max)[:, None]
     around = torch.linspace(0, 2 * math.pi, 361)
     outwards = torch.linspace(rings.min(), rings.max(), 65)
-    sectors = torch.arange(sampler.spec.sectors)[:, None] * (2 * math.pi / sampler.spec.sectors)
+    sectors = torch.arange(sampler.sectors)[:, None] * (2 * math.pi / sampler.sectors)
     for theta, azimuth, width in zip((rings, outwards), (around, sectors), widths, strict=True):
         lines = lens.project_rays(theta, azimuth, size).numpy()
         effects = _outline(width, "black")
@@ -161,7 +161,7 @@ def _outline(width: float, colour: str) -> list[AbstractPathEffect]:
     return [Stroke(linewidth=width + 0.8, foreground=colour, alpha=0.6), Normal()]
 
 
-def draw_polar(image: np.ndarray, lens: Lens, sampler: PolarSample, *, axes: Axes) -> None:
+def draw_polar(image: np.ndarray, lens: Lens, sampler: PolarView, *, axes: Axes) -> None:
     """Draws the polar image, without jitter: rows are radii, columns are azimuths."""
     lens, grid = _grid(lens, sampler, image)
     pixels = torch.from_numpy(np.atleast_3d(image)).permute(2, 0, 1)[None].float()
@@ -174,9 +174,9 @@ def draw_polar(image: np.ndarray, lens: Lens, sampler: PolarSample, *, axes: Axe
     _show(axes, np.stack(colours, -1) / scale, outside, extent=(0, 360, rows, 0), aspect="auto")
     sides = ("right", "below", "left", "above", "right")
     axes.set_xticks(range(0, 361, 90), [f"{90 * k}°\n{side}" for k, side in enumerate(sides)])
-    step = -(-sampler.spec.rings // 8)  # at most nine labels
-    angles = torch.rad2deg(sampler.spec.border_angles(lens)[0])[::step].tolist()
-    axes.set_yticks([k * step * sampler.spec.samples[0] for k in range(len(angles))],
+    step = -(-sampler.rings // 8)  # at most nine labels
+    angles = torch.rad2deg(sampler.border_angles(lens)[0])[::step].tolist()
+    axes.set_yticks([k * step * sampler.samples[0] for k in range(len(angles))],
                     [f"{angle:.0f}°" for angle in angles])  # fmt: skip
     axes.set(xlabel=_label("azimuth φ", outside), ylabel="incident angle θ")
 
@@ -273,13 +273,13 @@ def _draw_sides(axes: Axes, lens: Lens, image_size: tuple[int, int]) -> None:
 
 
 def draw_lens(
-    image: np.ndarray, lens: Lens, sampler: PolarSample, view: Tensor, title: str = "undistorted"
+    image: np.ndarray, lens: Lens, sampler: PolarView, view: Tensor, title: str = "undistorted"
 ) -> Figure:
     """Draws a lens: partition, sample points, a view, polar image, projection curve.
 
     Args:
         image: (H, W) or (H, W, 3), uint8 or floats in [0, 1]. lens: one, of the image.
-        sampler: how it is cut and sampled, as `model.patch_embed.sample`.
+        sampler: how it is cut and sampled, as `model.view`.
         view: (H, W, 3), the rays of the view. title: of the view.
 
     Raises:
@@ -303,8 +303,8 @@ def draw_lens(
     draw_view(image, lens, view, axes=panels["view"])
     draw_polar(image, lens, sampler, axes=panels["polar"])
     draw_curve(lens, image.shape[:2], axes=panels["curve"])
-    (rows, columns), rings, sectors = sampler.spec.samples, sampler.spec.rings, sampler.spec.sectors
-    equal = SPACING_SYMBOLS[sampler.spec.spacing]
+    (rows, columns), rings, sectors = sampler.samples, sampler.rings, sampler.sectors
+    equal = SPACING_SYMBOLS[sampler.spacing]
     titles = {
         "partition": f"{rings} rings × {sectors} sectors,\nequal steps of {equal}",
         "samples": f"{rows} × {columns} samples\nin each, enlarged",
@@ -360,7 +360,7 @@ def _one(lens: Lens) -> Lens:
     return lens.detach().to("cpu", torch.float64)
 
 
-def _grid(lens: Lens, sampler: PolarSample, image: np.ndarray) -> tuple[Lens, PolarGrid]:
+def _grid(lens: Lens, sampler: PolarView, image: np.ndarray) -> tuple[Lens, PolarGrid]:
     lens = _one(lens)
     return lens, sampler.grid(lens, image.shape[:2])
 

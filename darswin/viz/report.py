@@ -6,10 +6,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from darswin.layers.polar import polar_grid
 from darswin.lens.base import Lens
 from darswin.lens.solve import direction_of
 from darswin.lens.spacing import SPACINGS, Spacing
+from darswin.views import polar_grid
 
 __all__ = ["describe"]
 

@@ -119,5 +119,5 @@ def test_official_polynomial():
 
 @pytest.mark.parametrize("option", [dict(variant="RA"), dict(merges=((1, 4), (4, 1)))])
 def test_options_that_the_released_code_does_not_have(option):
-    with pytest.raises(ValueError, match="only variant 'A' and no option merges"):
+    with pytest.raises(TypeError, match=next(iter(option))):
         OfficialDarSwin(**option)
