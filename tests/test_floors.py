@@ -15,8 +15,11 @@ FLOORS = (
     ("train",),
     ("frames",),
     ("compat", "deploy"),
-    ("models", "viz"),
-    ("data", "layers"),
+    ("models",),
+    ("viz",),
+    ("layers",),
+    ("views",),
+    ("data",),
     ("lens",),
     ("ops", "utils"),
 )

@@ -20,16 +20,16 @@ from lens_examples import RANDOM, random_lens
 from darswin import create_model, frames, list_models
 from darswin.compat import OfficialDarSwin
 from darswin.frames import _frames
-from darswin.layers.polar import PolarSample
 from darswin.lens import Equidistant, Polynomial
 from darswin.models import LensAdapter
 from darswin.models.encoder import Encoder
 from darswin.models.registry import model_class
+from darswin.views import PolarView
 from darswin.viz.views import perspective
 
 
 def layer(rings=4, sectors=8, samples=(2, 3), layout="tokens", mean=MEAN, std=STD, **options):
-    return PolarSample(rings, sectors, samples, layout=layout, mean=mean, std=std, **options).eval()
+    return PolarView(rings, sectors, samples, layout=layout, mean=mean, std=std, **options).eval()
 
 
 def in_layout(frame, kind):

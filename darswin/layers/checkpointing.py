@@ -2,7 +2,7 @@
 
 import contextlib
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -10,11 +10,8 @@ from torch import Tensor, nn
 
 from darswin.layers.attention import WindowAttention
 
-if TYPE_CHECKING:
-    from darswin.layers.transformer import Block
 
-
-def checkpointed(block: "Block", x: Tensor, table: Tensor) -> Tensor:
+def checkpointed(block: Any, x: Tensor, table: Tensor) -> Tensor:
     """`Block.forward`, whose backward recomputes the norms, the GELU and the window attention.
 
     They are a few percent of the work. The gradients stay the same, bit for bit.

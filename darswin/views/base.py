@@ -149,9 +149,16 @@ class View(nn.Module):
         """The result of `see` for images with C channels; TypeError or ValueError otherwise."""
         raise NotImplementedError
 
-    def forward(self, images: Tensor, lens: Lens | None = None) -> Tensor:
-        """Images (B, C, H, W) or (B, H, W, C) and lenses (B or 1) → what the network sees."""
-        images = check_images(images)
+    def forward(
+        self, images: Tensor, lens: Lens | None = None, channels_last: bool | None = None
+    ) -> Tensor:
+        """Images and their lenses (B or 1) → what the network sees.
+
+        Args:
+            images: (B, C, H, W) or (B, H, W, C).
+            channels_last: the layout of the images; see `polar_sample`.
+        """
+        images = check_images(images, channels_last)
         height, width = images.shape[2:]
         if self.uses_lens:
             check_lens(lens, (height, width))
@@ -214,7 +221,7 @@ class PixelView(View):
             self.image_points(lens, size),
             self.view_points(lens, size) if back else None,
             ray_channels(*self.pixel_rays(lens, size)) if rays else None,
-            [_centers(of_map) for of_map in maps],
+            [_centers(of_map, lens) for of_map in maps],
         )
 
     def see(self, images: Tensor, prepared: Prepared, dtype: torch.dtype = torch.float32) -> Tensor:
@@ -250,9 +257,10 @@ class PixelView(View):
         return seen
 
 
-def _centers(size: Pair) -> Tensor:
+def _centers(size: Pair, lens: Lens | None) -> Tensor:
     """The centres of the tokens of a map, (1, H', W', 2): x and y in [-1, 1]."""
-    y, x = ((2 * torch.arange(side) + 1) / side - 1 for side in size)
+    device = None if lens is None else lens.theta_max.device
+    y, x = ((2 * torch.arange(side, device=device) + 1) / side - 1 for side in size)
     return torch.stack(torch.meshgrid(x, y, indexing="xy"), -1)[None]
 
 

@@ -5,10 +5,10 @@ import pytest
 import torch
 
 from darswin import polar_grid
-from darswin.layers.polar import PolarGridSpec
 from darswin.layers.position_bias import AngularRelativeBias, FourierBias, ring_angles
 from darswin.lens import Spherical
 from darswin.lens.spacing import Spacing
+from darswin.views import PolarView
 
 LENS = Spherical.from_fov([0.2, 0.9], 2.6, 16.0)
 
@@ -66,5 +66,5 @@ def test_the_angles_of_the_bias_do_not_follow_the_spacing(spacing):
     grid = polar_grid(LENS, (32, 32), **options)
     angles = ring_angles(LENS.theta_max, grid, 8, "angular")
     torch.testing.assert_close(angles, LENS.theta_max[:, None] * torch.linspace(0, 1, 9))
-    borders = PolarGridSpec(**options).border_angles(LENS)
+    borders = PolarView(**options).border_angles(LENS)
     assert torch.allclose(angles, borders, atol=1e-4) == (spacing == "theta")

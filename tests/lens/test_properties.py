@@ -8,9 +8,9 @@ import hypothesis.strategies as st
 import torch
 from lens_examples import RANGES, f64, first_coefficients
 
-from darswin.layers.polar import PLACEMENTS, polar_grid
 from darswin.lens import MODELS, cat, from_dict, to_dict
 from darswin.lens.spacing import SPACINGS
+from darswin.views.polar import PLACEMENTS, polar_grid
 
 
 def rows(draw, low, high, count, width):

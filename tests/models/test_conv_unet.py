@@ -25,7 +25,7 @@ def test_the_lens_enters_as_three_channels():
     lens = Spherical.from_fov([0.2, 0.9], math.radians(165), 16.0)
     model, blind = (network("conv_unet_nano", rays=rays) for rays in (True, False))
     images = torch.rand(2, 3, 33, 35)
-    rays = model.prepare(lens, (33, 35))
+    rays = model.prepare(lens, (33, 35)).rays
     assert rays.shape == (2, 3, 33, 35)
     x, y = torch.meshgrid(torch.arange(35.0), torch.arange(33.0), indexing="xy")
     way = torch.stack((x - 17, y - 16))  # from the principal point

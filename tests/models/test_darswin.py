@@ -8,7 +8,7 @@ import torch
 from darswin import create_model
 from darswin.data import at_size
 from darswin.lens import Equidistant, KannalaBrandt, Spherical
-from darswin.models.stages import plan_stages
+from darswin.models.stages import stage_sizes
 
 LENS = Spherical.from_fov([0.2, 0.9], 2.6, 16.0)
 
@@ -47,7 +47,7 @@ def images(batch=2, height=32, width=32):
     ],
 )  # fmt: skip
 def test_stage_plans(arguments, first, expected):
-    plans = plan_stages(*arguments)[first:]
+    plans = stage_sizes(*arguments)[first:]
     assert [(p.map_size, p.window, p.shift) for p in plans] == expected
     assert [plans[0].windows(block)["shift"] for block in range(3)] == [
         (0, 0), plans[0].shift, (0, 0)
@@ -65,7 +65,7 @@ def test_stage_plans(arguments, first, expected):
 )
 def test_sizes_that_do_not_divide(arguments, message):
     with pytest.raises(ValueError, match=message):
-        plan_stages(*arguments)
+        stage_sizes(*arguments)
 
 
 EVEN = dict(periodic_bias=True)

@@ -5,9 +5,8 @@ import torch
 import torch.nn.functional as F
 
 from darswin import create_model
-from darswin.layers.polar import PolarGrid
 from darswin.lens import KannalaBrandt, Mei, Spherical
-from darswin.models.encoder import Prepared
+from darswin.views import PolarGrid
 
 f64 = torch.float64
 CIRCLE = 14.7  # px, the radius of the image circle
@@ -41,14 +40,20 @@ def make_lens(kind, **values):
     return lens.with_theta_max(lens.unproject(CIRCLE))
 
 
-def without_sampling(points, positions):
+def whole(prepared):
+    return prepared
+
+
+def without_sampling(prepared):
     """The gradients of the lens come through the bias alone."""
-    return Prepared(PolarGrid(*(None if t is None else t.detach() for t in points)), positions)
+    points = PolarGrid(*(None if t is None else t.detach() for t in prepared.points))
+    return prepared._replace(points=points)
 
 
-def without_bias(points, positions):
+def without_bias(prepared):
     """The gradients of the lens come through the samples alone."""
-    return Prepared(points, [[t.detach() for t in of_stage] for of_stage in positions])
+    tables = [[t.detach() for t in of_stage] for of_stage in prepared.tables]
+    return prepared._replace(tables=tables)
 
 
 @pytest.mark.parametrize("kind", LENSES)
@@ -56,24 +61,27 @@ def test_gradients_are_those_of_finite_differences_and_of_their_two_parts(model,
     images, labels = torch.randn(3, 2, 32, 32, dtype=f64), torch.tensor([0, 3, 4])
     values = leaves(LENSES[kind])
 
-    def loss(*parameters, part=Prepared):
+    def loss(*parameters, part=whole):
         lens = make_lens(kind, **dict(zip(values, parameters, strict=True)))
-        prepared = part(*model.prepare(lens, (32, 32)))
+        prepared = part(model.prepare(lens, (32, 32)))
         return 100 * F.cross_entropy(model.run(images, prepared), labels)
 
     assert torch.autograd.gradcheck(loss, tuple(values.values()), rtol=1e-4, atol=1e-6)
-    whole, samples, bias = (
+    of_both, samples, bias = (
         torch.autograd.grad(
             loss(*values.values(), part=part), list(values.values()), materialize_grads=True
         )
-        for part in (Prepared, without_bias, without_sampling)
+        for part in (whole, without_bias, without_sampling)
     )
-    for name, *gradients in zip(values, whole, samples, bias, strict=True):
+    for name, *gradients in zip(values, of_both, samples, bias, strict=True):
         torch.testing.assert_close(gradients[1] + gradients[2], gradients[0], rtol=1e-9, atol=1e-12)
         assert (gradients[0] != 0).all() and (gradients[1] != 0).all(), name
         # The bias depends on angles alone, so it has no gradient for the principal point.
         assert ((gradients[2] == 0) if name == "center" else (gradients[2] != 0)).all(), name
     # With a fixed θ_max, the bias is a constant.
     known = Spherical.from_fov(values["focal"] / 20, torch.tensor([2.6], dtype=f64), CIRCLE)
-    points, positions = model.prepare(known, (32, 32))
-    assert points.radii.requires_grad and not any(t.requires_grad for (t,) in positions)
+    model.requires_grad_(False)
+    prepared = model.prepare(known, (32, 32))
+    assert prepared.points.radii.requires_grad
+    assert not any(table.requires_grad for tables in prepared.tables for table in tables)
+    model.requires_grad_(True)

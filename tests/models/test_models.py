@@ -18,9 +18,9 @@ from darswin import create_model, list_models, optimize
 from darswin.layers.linear import autotune_results
 from darswin.lens import KannalaBrandt, Polynomial, Spherical, cat
 from darswin.models import ModelCard, load_model, registry, save_model
-from darswin.models.base import take_indices
 from darswin.models.conv_unet import ConvUnet
 from darswin.models.encoder import Encoder
+from darswin.models.features import take_indices
 from darswin.models.registry import has_image_size, model_class
 from darswin.ops import use_reference
 

@@ -8,7 +8,7 @@ import torch
 import torch.nn.functional as F
 
 from darswin import create_model
-from darswin.layers.transformer import WindowAttention
+from darswin.layers.attention import WindowAttention
 from darswin.models.dat import DeformableAttention
 
 
@@ -83,4 +83,4 @@ def test_deformable_attention_as_written_out():
                 for y, x in places[head * groups // heads]
             ]
             out[row, column, part] = (logits + torch.cat(bias)).softmax(0) @ v[:, part]
-    torch.testing.assert_close(layer(x)[0], layer.proj(out))
+    torch.testing.assert_close(layer(x, layer.position_bias())[0], layer.proj(out))

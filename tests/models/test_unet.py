@@ -8,12 +8,12 @@ import torch.nn.functional as F
 from helpers import network
 
 from darswin import create_model, polar_grid
-from darswin.layers.polar import PolarGridSpec
 from darswin.layers.transformer import PatchMerging
 from darswin.lens import KannalaBrandt, Mei, Polynomial, Spherical
 from darswin.models.pixel import DistanceHead, PixelHead
 from darswin.models.unet import PatchExpand, SkipJoin
 from darswin.ops import polar_to_image
+from darswin.views import PolarView
 
 f64 = torch.float64
 NANO = dict(depths=(1, 2, 1))  # of the classifiers of that size
@@ -29,7 +29,7 @@ def test_the_decoders_rings_are_those_of_the_grid(spacing):
     """The decoder has 4 rings per ring of the grid: their centres are samples of a 4 × 4 grid."""
     lens = Spherical.from_fov([0.1, 0.9], 2.6, 32.0)
     model = create_model("darswin_unet_ra_nano", spacing=spacing, sample_spacing="radius")
-    back, _ = model.view.view_points(lens, (64, 64))
+    back = model.prepare(lens, (64, 64)).back
     grid = polar_grid(lens, (64, 64), rings=16, sectors=64, samples=(4, 4), spacing=spacing,
                       sample_spacing="radius")  # fmt: skip
     torch.testing.assert_close(back.radii, grid.radii)
@@ -43,11 +43,10 @@ def test_the_decoders_rings_are_those_of_the_grid(spacing):
 def test_prepare_keeps_a_plan_for_a_single_lens(dtype):
     # A plan in float32 is not for a model in float64.
     model, size = network("darswin_unet_a_nano").to(dtype), (32, 32)
-    assert model.prepare(WIDE[[0, 0]], size).view_points[0].plan is None
+    assert model.prepare(WIDE[[0, 0]], size).back.plan is None
     prepared = model.prepare(WIDE, size)
-    grid, rays = prepared.view_points
-    assert grid.plan.shape == (1, 32, 3, 32)
-    without = prepared._replace(view_points=(grid._replace(plan=None), rays))
+    assert prepared.back.plan.shape == (1, 32, 3, 32)
+    without = prepared._replace(back=prepared.back._replace(plan=None))
     images = torch.rand(2, 3, 32, 32, dtype=dtype)
     assert torch.equal(model.run(images, prepared), model.run(images, without))
 
@@ -58,7 +57,7 @@ def test_prepare_keeps_a_plan_for_a_single_lens(dtype):
 def test_what_the_rays_show_comes_back_to_their_pixels(lens, spacing):
     """A function of (θ, φ) on the polar map becomes the same function of each pixel's ray."""
     lens, size = lens.to(f64), (60, 66)
-    back = PolarGridSpec(32, 128, (1, 1), spacing).pixel_grid(lens, size, split=4)
+    back = PolarView(32, 128, (1, 1), spacing=spacing).pixel_grid(lens, size, split=4)
     theta = lens.unproject(back.radii)[0][:, None]
     azimuth = 2 * math.pi * (torch.arange(512, dtype=f64) + 0.5) / 512
 
@@ -136,8 +135,9 @@ def test_a_lens_is_learned_through_the_way_back(kind, values):
 
         def loss(*parameters, whole=whole):
             lens = made(*parameters)
-            back = prepared._replace(view_points=model.view.view_points(lens, size))
-            logits = model.run(images, model.prepare(lens, size) if whole else back)
+            back = model.prepare(lens, size)
+            back = back if whole else prepared._replace(back=back.back, tokens=back.tokens)
+            logits = model.run(images, back)
             return (F.cross_entropy(logits, labels, reduction="none") * weights).mean() * 100
 
         assert all((g != 0).all() for g in torch.autograd.grad(loss(*leaves), leaves))
@@ -249,7 +249,5 @@ def test_its_encoder_starts_from_a_trained_classifier(classifier, unet, options)
     maps = trained.forward_intermediates(x, lens, intermediates_only=True)
     trained.reset_classifier(0)
     model.encoder.load_state_dict(trained.state_dict())
-    if "undis" in classifier:  # the unet makes the view
-        x = model.view.to_view(x, model.view.image_points(lens, (32, 32)))
     got = model.encoder.forward_intermediates(x, lens, intermediates_only=True)
     assert all(torch.equal(a, b) for a, b in zip(got, maps, strict=True))

@@ -9,7 +9,8 @@ from cases import assert_same_bits_on_any_number_of_threads
 from torch import nn
 
 from darswin.deploy.packed import PackedBlocks, norm_parameters, packed_weights
-from darswin.layers.transformer import Block, WindowAttention
+from darswin.layers.attention import WindowAttention
+from darswin.layers.transformer import Block
 from darswin.ops import use_reference
 
 _norm, _linear = torch.ops.darswin._norm, torch.ops.darswin._linear

@@ -20,7 +20,7 @@ from darswin.lens import (
 from darswin.lens.concentric import square_to_disc
 from darswin.lens.pixels import reproject
 from darswin.models import LensAdapter
-from darswin.models.views import PlainView
+from darswin.views import PlainView
 
 LENSES = Spherical.from_fov([0.2, 0.9], 2.6, 24.0)
 GENERAL = KannalaBrandt(
@@ -165,7 +165,7 @@ def test_double_precision_and_half():
 
 def test_wrong_arguments_of_an_adapter():
     for size in (0, -1, 2.5, "8"):
-        with pytest.raises(ValueError, match="size must be an int of at least 1, got"):
+        with pytest.raises(ValueError, match=r"size must be an int of at least 1, or .*, got"):
             LensAdapter(nn.Identity(), size)
     with pytest.raises(ValueError, match=r"spacing must be one of .*, got 'r'"):
         LensAdapter(nn.Identity(), 8, "r")
@@ -202,7 +202,7 @@ def undistorted(picture, lens, **options):
     model = create_model("swin_undis_nano", in_chans=1, image_size=side, **options).eval()
     model.patch_embed.register_forward_pre_hook(lambda _, given: seen.append(given[0]))
     model(picture, lens)
-    return seen[0].permute(0, 3, 1, 2)
+    return seen[0]
 
 
 @pytest.mark.parametrize("xi", [0.0, 0.4, 0.9])
@@ -253,12 +253,13 @@ def of_the_same_weights(model, name, **options):
 @torch.no_grad()
 def test_a_map_coarser_than_the_image_is_resized():
     model = network("swin_unet_nano", image_size=(128, 64), patch_size=8, skip_width=0)
-    maps = model.encoder.forward_intermediates(torch.randn(2, 3, 128, 64), intermediates_only=True)
-    x = model.segmentation_head.proj(model.decoder(maps, [(), ()]))
+    images, prepared = torch.randn(2, 3, 128, 64), model.prepare(None, (128, 64))
+    maps = model.encoder.forward_intermediates(images, norm=True, intermediates_only=True)
+    maps = model._with_places(maps, prepared.tokens)
+    x = model.segmentation_head.proj(model.decoder(maps, prepared.tables[3:]))
     assert x.shape == (2, 64, 32, 5)
-    got = model.view.to_pixels(x, None, (128, 64))
-    x = x.permute(0, 3, 1, 2)
-    torch.testing.assert_close(got, F.interpolate(x, (128, 64), mode="bilinear"))
+    expected = F.interpolate(x.permute(0, 3, 1, 2), (128, 64), mode="bilinear")
+    torch.testing.assert_close(model(images), expected)
 
 
 @torch.no_grad()
@@ -347,13 +348,13 @@ def test_the_head_reads_the_rays_of_its_pixels(name, options, rays_of):
 )
 def test_distances_read_rays_where_there_are_a_lens_and_convolutions(name, options, rays):
     model = network(name, **options)
-    assert model.rays == rays == (model.prepare(WIDE, (64, 64)).rays is not None)
+    assert model.reads_rays == rays == (model.prepare(WIDE, (64, 64)).rays is not None)
     if model.head.skip_width:
         assert model.head.stem.in_channels == (6 if rays else 3)
 
 
 def test_tokens_of_a_picture_are_at_the_middles_of_equal_parts():
-    (places,) = PlainView((64, 64)).token_places([(2, 4)], None, torch.zeros(()))
+    (places,) = PlainView((64, 64)).prepare(None, (64, 64), rays=False, maps=[(2, 4)]).tokens
     x, y = torch.tensor([-0.75, -0.25, 0.25, 0.75]), torch.tensor([-0.5, 0.5])
     expected = torch.stack(torch.meshgrid(x, y, indexing="xy"), -1)
     torch.testing.assert_close(places, expected[None])

@@ -1,4 +1,4 @@
-"""The polar grid, its samples, and their embedding."""
+"""The polar view: its grid, its samples, and their embedding."""
 
 import math
 
@@ -8,11 +8,11 @@ import torch.nn.functional as F
 from helpers import CAMERAS
 
 from darswin.layers.embed import PolarPatchEmbed
-from darswin.layers.polar import PolarGridSpec, PolarSample, polar_grid
 from darswin.lens import Mei, Perspective, Polynomial, Spherical, cat
 from darswin.lens.pixels import pixel_rays
 from darswin.lens.spacing import SPACINGS
-from darswin.ops import polar_embed, polar_sample, polar_to_image
+from darswin.ops import polar_sample, polar_to_image
+from darswin.views import PolarView, polar_grid
 
 f64 = torch.float64
 SIZES = dict(rings=16, sectors=64, samples=(10, 10))
@@ -142,7 +142,7 @@ def test_gradients_reach_the_lens(spacing, sample_spacing):
 )
 def test_wrong_settings(change, message):
     with pytest.raises(ValueError, match=message):
-        PolarSample(**(SIZES | change))
+        PolarView(**(SIZES | change))
 
 
 def camera(**aside):
@@ -186,7 +186,7 @@ def test_a_fixed_theta_max_is_the_end_of_the_grid_for_every_lens(lens):
         size = tuple(int(side) for side in lens.image_size[0])
     sizes = dict(rings=8, sectors=12, samples=(3, 2))
     # A lens that sees more.
-    spec, usual = (PolarGridSpec(**sizes, theta_max=t) for t in (0.7 * end, None))
+    spec, usual = (PolarView(**sizes, theta_max=t) for t in (0.7 * end, None))
     cut = lens.with_theta_max(0.7 * end)
     for made in ("grid", "pixel_grid"):
         found, expected = (getattr(s, made)(a, size) for s, a in ((spec, lens), (usual, cut)))
@@ -196,7 +196,7 @@ def test_a_fixed_theta_max_is_the_end_of_the_grid_for_every_lens(lens):
             else:  # `cut` has no points beyond its θ_max
                 torch.testing.assert_close(a[~b.isnan()], b[~b.isnan()])
     # A lens that sees less: no points beyond its θ_max, and the ring of a pixel is that of its θ.
-    spec = PolarGridSpec(**sizes, theta_max=1.5 * end)
+    spec = PolarView(**sizes, theta_max=1.5 * end)
     theta = (torch.arange(24, dtype=f64) + 0.5) / 24 * 1.5 * end
     grid = spec.grid(lens, size)
     assert torch.equal(grid.radii.isnan()[0], theta > end)
@@ -218,7 +218,7 @@ def test_a_fixed_theta_max_is_the_end_of_the_grid_for_every_lens(lens):
 @pytest.mark.parametrize("spacing", ["theta", "g", "radius"])
 def test_tokens_look_where_the_middle_of_their_patch_does(spacing):
     lens = Polynomial([16.0, 0.4, -0.1, 0.05], 2.0, [30.0, 35.0]).to(f64)
-    rays = PolarGridSpec(4, 8, (1, 1), spacing).token_rays(lens)
+    rays = PolarView(4, 8, (1, 1), spacing=spacing).token_rays(lens)
     grid = polar_grid(lens, (64, 64), rings=4, sectors=8, samples=(1, 1), spacing=spacing)
     x, y = (grid.radii[0, :, None] * wave(grid.azimuths) for wave in (torch.cos, torch.sin))
     pixels = torch.stack((x, y), -1) + grid.center[0]
@@ -232,7 +232,7 @@ LENSES = Spherical.from_fov([0.2, 0.9], 2.6, 16.0)
 
 def test_polar_sample_replaces_grid_sample_on_a_polar_grid():
     images = torch.randn(2, 3, 32, 33)
-    sample = PolarSample(4, 8, (3, 2), spacing="tan", layout="image")
+    sample = PolarView(4, 8, (3, 2), spacing="tan", layout="image")
     grid = polar_grid(LENSES, (32, 33), rings=4, sectors=8, samples=(3, 2), spacing="tan")
     x = grid.center[:, 0, None, None] + grid.radii[:, :, None] * torch.cos(grid.azimuths)
     y = grid.center[:, 1, None, None] + grid.radii[:, :, None] * torch.sin(grid.azimuths)
@@ -246,24 +246,24 @@ def test_polar_sample_replaces_grid_sample_on_a_polar_grid():
 def test_the_operators_take_all_of_a_grid():
     images = torch.randn(2, 3, 32, 33, dtype=torch.float64)
     affine, offsets = torch.eye(2) + 0.3 * torch.randn(2, 2, 2), torch.randn(1, 2, 12, 16)
-    spec = PolarGridSpec(4, 8, (3, 2))
-    grid = spec.grid(LENSES, (32, 33))._replace(affine=affine, offsets=offsets)
-    radii, azimuths, center, _, affine, offsets = (t.double() for t in grid)
+    grid = PolarView(4, 8, (3, 2)).grid(LENSES, (32, 33))
+    grid = grid._replace(affine=affine, offsets=offsets)
+    radii, azimuths, center, _, _, affine, offsets = (t.double() for t in grid)
     options = dict(samples=(3, 2), affine=affine, offsets=offsets)
     for layout in ({}, dict(layout="tokens"), dict(layout="image")):  # tokens by default in both
-        sample = PolarSample(4, 8, (3, 2), **layout)
+        sample = PolarView(4, 8, (3, 2), **layout)
         sample.grid = lambda lens, size: grid
         expected = polar_sample(images, radii, azimuths, center, **options, **layout)
         assert torch.equal(sample(images, LENSES), expected)
-    embed = PolarPatchEmbed(spec).double()
-    weights = embed.proj.weight, embed.proj.bias
-    tokens = polar_embed(images, radii, azimuths, center, *weights, **options)
-    assert torch.equal(embed(images, grid), embed.norm(tokens))
+    embed = PolarPatchEmbed(18, 5).double()
+    tokens = polar_sample(images, radii, azimuths, center, **options)
+    expected = embed.norm(F.linear(tokens, embed.proj.weight, embed.proj.bias))
+    assert torch.equal(embed(tokens), expected)
 
 
 def test_it_jitters_only_in_training_and_by_torchs_generator():
     images = torch.randn(2, 3, 32, 32)
-    sample = PolarSample(4, 8, (3, 2), jitter=1.0).eval()
+    sample = PolarView(4, 8, (3, 2), jitter=1.0).eval()
     assert torch.equal(sample(images, LENSES), sample(images, LENSES))
     sample.train()
     torch.manual_seed(3)
@@ -279,7 +279,7 @@ def test_it_jitters_only_in_training_and_by_torchs_generator():
 def test_uint8_images(shape, given, last):
     images = torch.randint(256, shape, dtype=torch.uint8)
     planes = images.permute(0, 3, 1, 2) if last else images
-    sample = PolarSample(4, 8, (3, 2), mean=0.4, std=0.2)
+    sample = PolarView(4, 8, (3, 2), mean=0.4, std=0.2)
     expected = sample((planes / 255 - 0.4) / 0.2, LENSES)
     torch.testing.assert_close(sample(images, LENSES, given), expected, rtol=1e-4, atol=1e-4)
 
@@ -289,7 +289,7 @@ def test_uint8_images(shape, given, last):
     "lens", [*CAMERAS, cat([CAMERAS[1].replace(tangential=None), CAMERAS[0]])[:1]]
 )
 def test_a_calibrated_camera_compiles(lens):
-    sample = PolarSample(8, 32, (2, 2))
+    sample = PolarView(8, 32, (2, 2))
     images, lens = torch.rand(1, 3, 96, 128), lens.resized((96, 128))
     compiled = torch.compile(sample, fullgraph=True, backend="aot_eager")
     torch.testing.assert_close(compiled(images, lens), sample(images, lens))
@@ -309,4 +309,4 @@ def test_a_calibrated_camera_compiles(lens):
 )
 def test_images_and_lenses_that_do_not_fit(images, lens, last, error, message):
     with pytest.raises(error, match=message):
-        PolarSample(4, 8, (2, 2))(images, lens, last)
+        PolarView(4, 8, (2, 2))(images, lens, last)
