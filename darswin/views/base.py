@@ -245,15 +245,9 @@ class PixelView(View):
         return sample_at(maps, points)
 
     def check_seen(self, seen: Tensor, prepared: Prepared, channels: int | None) -> Tensor:
-        seen = check_images(seen, channels=channels)
+        seen = check_seen_images(seen, self.size or prepared.size, channels)
         if prepared.points is not None:
             check_count(len(prepared.points), seen)
-        expected = self.size or prepared.size
-        if seen.shape[2:] != expected:
-            raise ValueError(
-                f"sampled must have the size of the view, (H, W) = {expected}, "
-                f"got {tuple(seen.shape[2:])}"
-            )
         return seen
 
 
@@ -272,6 +266,18 @@ def check_images(
         raise TypeError(f"images must be a tensor, got {type(images).__name__}")
     check_has_batch("images", images, channels_last, channels)
     return channels_first("images", images, channels_last, channels)
+
+
+def check_seen_images(seen: Tensor, size: Pair, channels: int | None) -> Tensor:
+    """What a view of (H, W) pixels sees, as (B, C, H, W); TypeError or ValueError otherwise."""
+    seen = check_images(seen, channels=channels)
+    if channels not in (None, seen.shape[1]):
+        raise ValueError(f"sampled must have {channels} channels, got {seen.shape[1]}")
+    if seen.shape[2:] != size:
+        raise ValueError(
+            f"sampled must have the size of the view, (H, W) = {size}, got {tuple(seen.shape[2:])}"
+        )
+    return seen
 
 
 def check_lens(lens: Lens | None, size: Pair) -> Lens:

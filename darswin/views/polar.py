@@ -34,7 +34,7 @@ from darswin.views.base import (
     Prepared,
     View,
     check_count,
-    check_images,
+    check_seen_images,
     register_view,
 )
 
@@ -138,8 +138,9 @@ class PolarView(View):
     def see(self, images: Tensor, prepared: Prepared, dtype: torch.dtype = torch.float32) -> Tensor:
         assert isinstance(prepared.points, PolarGrid)
         check_count(prepared.points.radii.shape[0], images)
-        if dtype == torch.float64:
-            images = self.floating(images, dtype)  # the operator would normalize in float32
+        # The operator would normalize in float32, and it needs a mean.
+        if dtype == torch.float64 or self.mean is None:
+            images = self.floating(images, dtype)
         return polar_sample(**self.arguments(images, prepared.points), layout=self.layout)
 
     def arguments(self, images: Tensor, grid: PolarGrid) -> dict[str, Any]:
@@ -153,8 +154,9 @@ class PolarView(View):
         seed = torch.randint(2**62, ()) if jitter else 0
         return dict(
             image=images, radii=radii, azimuths=azimuths, center=center, affine=affine,
-            offsets=offsets, samples=self.samples, jitter=jitter, seed=seed, mean=self.mean,
-            std=self.std, channels_last=False,
+            offsets=offsets, samples=self.samples, jitter=jitter, seed=seed,
+            mean=0.0 if self.mean is None else self.mean, std=1.0 if self.std is None else self.std,
+            channels_last=False,
         )  # fmt: skip
 
     def back(self, maps: Tensor, prepared: Prepared) -> Tensor:
@@ -181,7 +183,7 @@ class PolarView(View):
     def check_seen(self, seen: Tensor, prepared: Prepared, channels: int | None) -> Tensor:
         assert isinstance(prepared.points, PolarGrid)
         if self.in_pixels:
-            seen = check_images(seen, channels=channels)
+            seen = check_seen_images(seen, self.map_size, channels)
         else:
             assert channels is not None
             values = self.samples[0] * self.samples[1] * channels

@@ -1,0 +1,180 @@
+"""What holds for every view that is registered, and for the ways to make one."""
+
+import pytest
+import torch
+import torch.nn.functional as F
+from torch import nn
+
+from darswin.lens import Equidistant, KannalaBrandt, Polynomial, Spherical
+from darswin.models import LensAdapter, Swin
+from darswin.views import PolarView, View, list_views, make_view, register_view
+from darswin.views.base import _VIEWS
+
+LENSES = {
+    "two": Spherical.from_fov([0.2, 0.9], 2.6, 24.0),
+    "beyond 90°": Polynomial([13.0, 0.4], 2.0, [26.0, 22.0]),
+    "general": KannalaBrandt(
+        14.0, [0.01], 1.5, center=[24.0, 25.0], affine=[[1.0, 0.1], [0.0, 1.1]],
+        tangential=[0.02, 0.01],
+    ),
+}  # fmt: skip
+SIZE = (48, 52)
+every_view = pytest.mark.parametrize("name", list_views())
+every_lens = pytest.mark.parametrize("lens", LENSES.values(), ids=LENSES)
+
+
+def smooth():
+    x, y = torch.meshgrid(torch.arange(52.0), torch.arange(48.0), indexing="xy")
+    return torch.stack((torch.sin(x / 12), torch.cos(y / 12), torch.sin((x + y) / 16)))[None]
+
+
+def angles(lens):
+    """θ of the pixels of the images, (N, H, W)."""
+    x, y = torch.meshgrid(torch.arange(52.0), torch.arange(48.0), indexing="xy")
+    return lens.unproject_pixels(torch.stack((x, y), -1)[None], SIZE)[0]
+
+
+@torch.no_grad()
+@every_view
+@every_lens
+def test_what_is_seen_comes_back_also_from_coarser_maps(name, lens):
+    view, images = make_view(name, (192, 192)), smooth().expand(lens.count, -1, -1, -1)
+    prepared = view.prepare(lens, SIZE)
+    seen = view.see(images, prepared)
+    assert seen.shape == ((lens.count, 3, 192, 192) if view.uses_lens else images.shape)
+    assert torch.equal(seen, view(images, lens))
+    theta = angles(lens)
+    # A perspective view ends before 90°, and the picture cuts the views near its border.
+    inner = (theta < lens.theta_max[:, None, None].clamp(max=1.4) * 0.9)[:, None]
+    inner = inner.expand_as(images) & F.pad(torch.ones(40, 44), (4,) * 4).bool()
+    assert inner.float().mean() > 0.2
+    back = view.back(seen, prepared)
+    assert back.shape == images.shape and (back - images).abs()[inner].max() < 0.1
+    coarse = view.back(F.avg_pool2d(seen, 2), prepared)
+    assert coarse.shape == images.shape and (coarse - images).abs()[inner].mean() < 0.05
+    beyond = ~lens.sees(theta)[:, None].expand_as(images)
+    if view.uses_lens and beyond.any():
+        assert not back[beyond].any() and not coarse[beyond].any()
+
+
+@torch.no_grad()
+@every_view
+@every_lens
+def test_the_rays_of_the_views_pixels_land_where_the_view_reads(name, lens):
+    view = make_view(name, (24, 24) if name != "none" else SIZE)
+    prepared = view.prepare(lens, SIZE)
+    rays = prepared.rays.movedim(1, -1)
+    landed = rays.norm(dim=-1) > 0.5
+    torch.testing.assert_close(rays[landed].norm(dim=-1), torch.ones(int(landed.sum())))
+    points = lens.project_points(rays.expand(lens.count, -1, -1, -1), SIZE)
+    # Each pixel is marked with its own x and y, so that a view of it shows where it was read.
+    x, y = torch.meshgrid(torch.arange(52.0), torch.arange(48.0), indexing="xy")
+    marked = torch.stack((x, y))[None].expand(lens.count, -1, -1, -1)
+    seen = view.see(marked, prepared).movedim(1, -1)
+    inside = landed & (points > 0).all(-1) & (points < points.new_tensor([51.0, 47.0])).all(-1)
+    assert inside.float().mean() > 0.3
+    # The ray of a token is that of the radial curve; other distortions of the lens are ignored.
+    radial = lens.is_radial and lens.affine is None
+    if radial or not isinstance(view, PolarView):
+        torch.testing.assert_close(seen[inside], points[inside], rtol=0, atol=2e-3)
+
+
+@every_view
+def test_gradients_reach_images_and_lens(name):
+    focal = torch.tensor([14.0], requires_grad=True)
+    images = torch.randn(2, 3, *SIZE, requires_grad=True)
+    view = make_view(name, (16, 16))
+    prepared = view.prepare(Equidistant(focal, 1.5), SIZE)
+    view.back(view.see(images, prepared), prepared).square().sum().backward()
+    assert images.grad.isfinite().all() and images.grad.any()
+    if view.uses_lens:
+        assert focal.grad.isfinite().all() and focal.grad.all()
+
+
+@torch.no_grad()
+@every_view
+def test_frames_of_uint8_are_normalized(name):
+    view = make_view(name, SIZE if name == "none" else (16, 16), mean=(0.4, 0.5, 0.6), std=0.25)
+    frames = torch.randint(256, (2, *SIZE, 3), dtype=torch.uint8)
+    planes = (
+        frames.permute(0, 3, 1, 2) / 255 - torch.tensor([0.4, 0.5, 0.6])[:, None, None]
+    ) / 0.25
+    lens = LENSES["two"]
+    torch.testing.assert_close(view(frames, lens), view(planes, lens), rtol=1e-4, atol=1e-4)
+    exact = view.see(frames.permute(0, 3, 1, 2), view.prepare(lens, SIZE), torch.float64)
+    assert exact.dtype == torch.float64
+    torch.testing.assert_close(exact.float(), view(planes, lens), rtol=1e-4, atol=1e-4)
+    refuses = make_view(name, (16, 16), mean=None, std=None)
+    with pytest.raises((TypeError, ValueError), match="mean"):
+        refuses(frames, lens)
+
+
+@torch.no_grad()
+@every_view
+def test_an_adapter_and_a_swin_see_every_view(name):
+    lens, images = LENSES["two"], torch.rand(2, 3, *SIZE)
+    for given in (dict(size=SIZE if name == "none" else 32, view=name),
+                  dict(view=make_view(name, SIZE if name == "none" else (32, 32)))):  # fmt: skip
+        adapter = LensAdapter(nn.Conv2d(3, 5, 3, padding=1), **given)
+        prepared = adapter.prepare(lens, SIZE)
+        result = adapter(images, lens)
+        assert result.shape == (2, 5, *SIZE)
+        sampled = adapter.sample(images, prepared)
+        assert torch.equal(sampled, adapter.view(images, lens))
+        assert torch.equal(adapter.run_sampled(sampled, prepared), result)
+        assert adapter.uses_lens == (name != "none")
+    model = Swin(4, depths=(1, 1), num_heads=(1, 2), embed_dim=8, image_size=32, view=name).eval()
+    assert model(images[..., :32, :32], Equidistant(14.0, 1.2)).shape == (2, 4)
+
+
+def test_a_view_of_ones_own_has_a_name():
+    @register_view("tall polar")
+    def tall(size, **options):
+        return PolarView(*size, samples=(2, 1), layout="image", **options)
+
+    try:
+        adapter = LensAdapter(nn.Identity(), (16, 8), view="tall polar")
+        assert adapter.view.map_size == (32, 8)
+        assert adapter(torch.rand(1, 3, *SIZE), LENSES["beyond 90°"]).shape == (1, 3, *SIZE)
+    finally:
+        del _VIEWS["tall polar"]
+
+
+@pytest.mark.parametrize(
+    ("make", "kind", "message"),
+    [
+        (lambda: make_view("round", (8, 8)), ValueError, "view must be one of .*, got 'round'"),
+        (lambda: make_view("none", (8, 8), max_fov=1.0), ValueError, "'none' has no .*'max_fov'"),
+        (lambda: make_view("square", (8, 9)), ValueError, r"must be square, got \(8, 9\)"),
+        (lambda: make_view("square", (8, 8), mean=0.5, std=None), ValueError, "given together"),
+        (lambda: make_view("perspective", (8, 8), max_fov=100.0), ValueError, r"\(0, π\), got 100"),
+        (lambda: LensAdapter(nn.Identity()), ValueError, "size must be .*, got None"),
+        (lambda: LensAdapter(nn.Identity(), (8, 8, 8)), ValueError, r"size must be .*\(8, 8, 8\)"),
+        (lambda: LensAdapter(nn.Identity(), 8, view="round"), ValueError, "view must be one of"),
+        (lambda: LensAdapter(nn.Identity(), view=PolarView()), ValueError, "a view of pixels"),
+        (lambda: LensAdapter(nn.Identity(), 8, view=make_view("none", (8, 8))), ValueError,
+         "has its own size"),
+        (lambda: LensAdapter(nn.Identity(), view=make_view("none", (8, 8)), spacing="g", mean=0.0),
+         ValueError, "has its own spacing and mean"),
+        (lambda: LensAdapter(nn.Identity(), 8, output="maps"), ValueError, "output must be"),
+        (lambda: View().prepare(None, (8, 8)), NotImplementedError, ""),
+    ],
+)  # fmt: skip
+def test_wrong_views_are_explained(make, kind, message):
+    with pytest.raises(kind, match=message):
+        make()
+
+
+@pytest.mark.parametrize("name", sorted(set(list_views()) - {"none"}))
+def test_views_refuse_other_lenses_and_pixels_of_another_size(name):
+    view = make_view(name, (16, 16))
+    lens, images = LENSES["two"], torch.rand(3, 3, *SIZE)
+    with pytest.raises(ValueError, match="each of the 3 images, got 2"):
+        view(images, lens)
+    with pytest.raises(TypeError, match=r"lens must be a darswin\.lens\.Lens, got NoneType"):
+        view(images)
+    prepared = view.prepare(lens, SIZE)
+    with pytest.raises(ValueError, match="each of the 3 images, got 2"):
+        view.check_seen(torch.rand(3, 3, 16, 16), prepared, 3)
+    with pytest.raises(ValueError, match=r"\(H, W\) = \(16, 16\), got \(16, 17\)"):
+        view.check_seen(torch.rand(2, 3, 16, 17), prepared, 3)
