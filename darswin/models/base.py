@@ -14,7 +14,7 @@ from darswin.models.features import FeatureInfo
 from darswin.ops._library import transformed
 from darswin.ops.checks import readable
 from darswin.views import Pair, Prepared, View
-from darswin.views.base import PerChannel, check_images, check_lens
+from darswin.views.base import PerChannel, check_images
 
 Result = TypeVar("Result", covariant=True)
 
@@ -94,8 +94,6 @@ class Model(nn.Module, Generic[Result]):
             TypeError: the lens is missing, and the model uses one.
             ValueError: the lens belongs to images of another size.
         """
-        if self.uses_lens:
-            check_lens(lens, size)
         prepared = self.view.prepare(
             lens, size, back=self.goes_back, rays=self.reads_rays, maps=self.token_maps
         )

@@ -125,6 +125,10 @@ class View(nn.Module):
                 are not of the size of what the network sees.
             rays: whether `Prepared.rays` is computed.
             maps: the sizes of the maps for `Prepared.tokens`.
+
+        Raises:
+            TypeError: the lens is missing, and the view uses one or the rays are asked for.
+            ValueError: the lens belongs to images of another size.
         """
         raise NotImplementedError
 
@@ -160,8 +164,6 @@ class View(nn.Module):
         """
         images = check_images(images, channels_last)
         height, width = images.shape[2:]
-        if self.uses_lens:
-            check_lens(lens, (height, width))
         prepared = self.prepare(lens, (height, width), back=False, rays=False)
         return self.see(images, prepared)
 
@@ -216,6 +218,8 @@ class PixelView(View):
         rays: bool = True,
         maps: Sequence[Pair] = (),
     ) -> Prepared:
+        if self.uses_lens or rays:
+            check_lens(lens, size)
         return Prepared(
             size,
             self.image_points(lens, size),

@@ -34,6 +34,7 @@ from darswin.views.base import (
     Prepared,
     View,
     check_count,
+    check_lens,
     check_seen_images,
     register_view,
 )
@@ -120,13 +121,14 @@ class PolarView(View):
 
     def prepare(
         self,
-        lens: Any,
+        lens: Lens | None,
         size: Pair,
         *,
         back: bool | Pair = True,
         rays: bool = True,
         maps: Sequence[Pair] = (),
     ) -> Prepared:
+        lens = check_lens(lens, size)
         return Prepared(
             size,
             self.grid(lens, size),
