@@ -9,8 +9,6 @@ from torch import Tensor
 from torch._ops import OpOverload
 from torch.autograd import forward_ad
 
-from darswin.ops import triton
-
 _reference = False
 _PLAIN = (Tensor, torch.nn.Parameter)
 # Operator → the function that records its gradient in eager mode.
@@ -38,25 +36,12 @@ def reference_in_use() -> bool:
     return _reference
 
 
-def has_kernels(tensor: Tensor) -> bool:
-    """True if operators on `tensor` run the GPU kernels, provided these support the arguments."""
-    # An exported graph consists of torch's own operations, so that it runs without this package.
-    usable = triton.INSTALLED and not _reference and not torch.compiler.is_exporting()
-    return usable and tensor.device.type == "cuda" and _is_known_gpu(tensor.device.index)
-
-
 def _constant(function: Callable[..., bool]) -> Callable[..., bool]:
     """Lets Dynamo call a function while it traces and build the result into the graph."""
     # torch.compiler.assume_constant_result sets the same mark, but it imports Dynamo, which takes
     # as long as importing torch.
     function._dynamo_marked_constant = True  # type: ignore[attr-defined]
     return function
-
-
-@_constant
-def _is_known_gpu(index: int) -> bool:
-    """True for NVIDIA GPUs from the A100 on. AMD GPUs also have the device type "cuda"."""
-    return torch.version.hip is None and torch.cuda.get_device_capability(index) >= (8, 0)
 
 
 @_constant  # before torch 2.12 Dynamo cannot trace the call inside
@@ -70,18 +55,6 @@ def autocast_dtype(tensor: Tensor) -> torch.dtype | None:
     if not _has_autocast(device) or not torch.is_autocast_enabled(device):
         return None
     return torch.get_autocast_dtype(device)
-
-
-def without_float16(tensor: Tensor) -> Tensor:
-    """Converts a float16 tensor to float32 under autocast: the operators lack float16."""
-    half = isinstance(tensor, Tensor) and tensor.dtype == torch.float16
-    return tensor.float() if half and autocast_dtype(tensor) is not None else tensor
-
-
-def narrow_types(tensor: Tensor) -> tuple[torch.dtype, ...]:
-    """The 16-bit dtypes that an operator with float16 kernels accepts for this tensor."""
-    kernels = isinstance(tensor, Tensor) and has_kernels(tensor)
-    return (torch.bfloat16, torch.float16) if kernels else (torch.bfloat16,)
 
 
 def output_bfloat16(image: Tensor) -> bool:
@@ -99,20 +72,15 @@ def autocast_off(device: str) -> contextlib.AbstractContextManager:
     return torch.autocast(device, enabled=False)
 
 
-def run(
-    operator: OpOverload,
-    reference: Callable[..., Tensor],
-    kernel_takes: Callable[..., bool],
-    *arguments: Any,
-) -> Tensor:
-    """Runs an operator on checked arguments: compiled code on the CPU, a kernel on a GPU if
-    `kernel_takes` accepts them, otherwise the reference. A `Sampling` is passed field by field."""
+def run(operator: OpOverload, reference: Callable[..., Tensor], *arguments: Any) -> Tensor:
+    """Runs an operator on checked arguments: compiled code on the CPU, otherwise the reference. A
+    `Sampling` is passed field by field."""
     first, *others = arguments
     flat = [*first, *others] if isinstance(first, tuple) else arguments
     first = flat[0]
     if not _reference:
         refuse_other_derivatives(f"darswin.{reference.__name__}", flat)
-        if first.device.type == "cpu" or (has_kernels(first) and kernel_takes(*arguments)):
+        if first.device.type == "cpu":
             return call(operator, flat)
     with autocast_off(first.device.type):
         return reference(*arguments)

@@ -50,14 +50,6 @@ class Sampling(NamedTuple):
         rings = self.radii.shape[1] // self.samples[0]
         return self.image.shape[0], rings, self.azimuths.shape[0] // self.samples[1]
 
-    def kernel_takes(self, *others: object) -> bool:
-        """True if the GPU kernels support it. They do not support float64, uint8 images of more
-        than 16 channels, or about 2³¹ samples or pixels per image."""
-        image = self.image
-        frames = image.dtype == torch.uint8 and image.shape[1] > 16
-        counts = self.radii.shape[1] * self.azimuths.shape[0], image.shape[2] * image.shape[3]
-        return image.dtype != torch.float64 and not frames and max(counts) < 2**31 - 2**16
-
     def new_output(self, shape: tuple[int, ...]) -> Tensor:
         """An empty tensor of the output's dtype."""
         return self.radii.new_empty(shape, dtype=torch.bfloat16 if self.bfloat16 else None)
@@ -78,7 +70,6 @@ def checked_sampling(
     channels_last: bool | None,
 ) -> Sampling:
     """Checks the arguments of the public functions. Raises TypeError or ValueError."""
-    image = _library.without_float16(image)
     pixels = (*DTYPES, torch.bfloat16, torch.uint8)
     if isinstance(image, Tensor):
         check_has_batch("image", image, channels_last)

@@ -97,9 +97,7 @@ def polar_sample(
         out = _library.attempt(_SAMPLE, (*sampling, tokens))
         if out is not None:
             return out
-    return _library.run(
-        _SAMPLE, reference.polar_sample, Sampling.kernel_takes, checked_sampling(*given), tokens
-    )
+    return _library.run(_SAMPLE, reference.polar_sample, checked_sampling(*given), tokens)
 
 
 @torch.library.register_fake("darswin::polar_sample")
@@ -173,9 +171,7 @@ def polar_embed(
     check_tensor("weight", weight, dtypes, form, (None, size), like=image)
     if bias is not None:
         check_tensor("bias", bias, dtypes, "(D,) = ({},)", (weight.shape[0],), like=image)
-    return _library.run(
-        _EMBED, reference.polar_embed, Sampling.kernel_takes, sampling, weight, bias
-    )
+    return _library.run(_EMBED, reference.polar_embed, sampling, weight, bias)
 
 
 @torch.library.register_fake("darswin::polar_embed")

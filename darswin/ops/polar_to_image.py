@@ -37,8 +37,7 @@ def polar_to_image(
         points right, π/2 down. Sector a has its middle at 2π(a + ½)/A, as in `polar_grid`.
 
     Args:
-        x: (B, R, A, D), float32, float64 or bfloat16. float16 is supported where
-            `darswin.ops.triton` has kernels; elsewhere only under autocast, as float32.
+        x: (B, R, A, D), float32, float64 or bfloat16.
         radii: (B or 1, R) px, of the rings' centres: finite, at least 0, rising. All tensors from
             here on are float64 if x is float64, else float32.
         center: (B or 1, 2) px, x then y; None if `points` are given.
@@ -75,9 +74,9 @@ def polar_to_image(
         out = _library.attempt(_TO_IMAGE, given)
         if out is not None:
             return out
-    x = _checked(x, radii, center, affine, points, r_max, plan, size)
+    _check(x, radii, center, affine, points, r_max, plan, size)
     return _library.run(
-        _TO_IMAGE, reference.polar_to_image, _kernel_takes,
+        _TO_IMAGE, reference.polar_to_image,
         x, radii, center, affine, points, r_max, size, tokens, plan,
     )  # fmt: skip
 
@@ -112,8 +111,8 @@ def polar_to_image_plan(
         return None
     size = check_pair("size", size, lowest=0)
     r_max = _as_tensor(r_max, radii)
-    x = _checked(x, radii, center, affine, points, r_max, None, size)
-    if x.device.type != "cpu" or x.dtype == torch.float16:
+    _check(x, radii, center, affine, points, r_max, None, size)
+    if x.device.type != "cpu":
         return None
     with torch.no_grad():
         return _library.call(_PLAN, (x, radii, center, affine, points, r_max, size))
@@ -125,12 +124,10 @@ def _as_tensor(r_max: Tensor | float | None, radii: Tensor) -> Tensor | None:
     return radii.new_full((1,), float(r_max)) if isinstance(radii, Tensor) else None
 
 
-def _checked(x, radii, center, affine, points, r_max, plan, size) -> Tensor:
-    """x in a type that the operators take, after a check of all arguments."""
+def _check(x, radii, center, affine, points, r_max, plan, size) -> None:
+    """Raises TypeError or ValueError unless the arguments fit."""
     height, width = size
-    narrow = _library.narrow_types(x)
-    x = x if torch.float16 in narrow else _library.without_float16(x)
-    check_tensor("x", x, (*DTYPES, *narrow), "(B, R, A, D)", (None,) * 4)
+    check_tensor("x", x, (*DTYPES, torch.bfloat16), "(B, R, A, D)", (None,) * 4)
     rings, sectors = x.shape[1:3]
     if rings == 0 or sectors == 0:
         raise ValueError(f"x must have rings and sectors, got {tuple(x.shape)}")
@@ -148,13 +145,6 @@ def _checked(x, radii, center, affine, points, r_max, plan, size) -> Tensor:
         if tensor is not None or name == "radii":
             check_tensor(name, tensor, (real,), form, (x.shape[0], *shape), (1, *shape), like=x)
     check_rising("radii", radii)
-    return x
-
-
-def _kernel_takes(x, radii, center, affine, points, r_max, size, tokens, plan) -> bool:
-    """True if the GPU kernel supports it: neither float64 nor 2³¹ pixels or tokens per image."""
-    most = max(size[0] * size[1], x.shape[1] * x.shape[2])
-    return x.dtype != torch.float64 and most < 2**31 - 2**16
 
 
 @torch.library.register_fake("darswin::polar_to_image")

@@ -102,8 +102,8 @@ def test_strides_do_not_matter(name, kind):
 
 
 @small_cases
-def test_gradients_may_arrive_expanded(name, device):
-    made = SMALL[name]().to(device)
+def test_gradients_may_arrive_expanded(name):
+    made = SMALL[name]()
     leaves = {name: t.requires_grad_() for name, t in made.inputs.items()}
     # The gradient of a sum arrives with stride 0.
     from_sum = torch.autograd.grad(made.run(**leaves).sum(), leaves.values())
@@ -113,8 +113,8 @@ def test_gradients_may_arrive_expanded(name, device):
 
 
 @small_cases
-def test_only_the_gradients_asked_for(name, device):
-    made = SMALL[name]().to(device)
+def test_only_the_gradients_asked_for(name):
+    made = SMALL[name]()
     every = results(made)
     for one in made.inputs:
         assert_equal_results(results(made, only=[one]), {one: every[one]})
@@ -262,17 +262,20 @@ def test_autocast(name, reference):
         assert autocast(**SMALL[name](dtype=f64).inputs).dtype == f64 or samples
 
 
-@references
+@pytest.mark.parametrize("autocast", [False, True])
+@pytest.mark.parametrize("where", ["cpu", "meta", "reference"])
 @pytest.mark.parametrize("name", ["polar_sample, circular", "window_attention", "polar_to_image"])
-def test_float16_is_float32_under_autocast(name, reference):
+def test_float16_is_refused_on_every_device(name, where, autocast):
     made = SMALL[name]()
     first, values = next(iter(made.inputs.items()))
-    half, wide = (made.replace(**{first: v}) for v in (values.half(), values.half().float()))
-    with use_reference(reference):
-        with torch.autocast("cpu", dtype=torch.float16):
-            assert torch.equal(half.run(**half.inputs), wide.run(**wide.inputs))
-        with pytest.raises(TypeError, match=r"bfloat16.*, got torch.float16"):
-            half.run(**half.inputs)
+    half = made.replace(**{first: values.half()})
+    half = half.to(torch.device("meta")) if where == "meta" else half
+    with (
+        use_reference(where == "reference"),
+        torch.autocast("cpu", dtype=torch.float16, enabled=autocast),
+        pytest.raises(TypeError, match=f"{first} must be .*bfloat16.*, got torch.float16"),
+    ):
+        half.run(**half.inputs)
 
 
 @references

@@ -1,28 +1,23 @@
 """The choice of an operator's code, the derivatives that it lacks, and NumPy's numbers."""
 
-import contextlib
 import functools
-import subprocess
 import sys
 from unittest import mock
 
 import numpy as np
 import pytest
 import torch
-from cases import SMALL, attention, bf16, f32, f64, polar_map, sampling
-from torch._subclasses import FakeTensorMode
+from cases import SMALL, attention, f32, f64
 from torch.autograd import forward_ad
 from torch.func import vmap
 
 from darswin import ops
 from darswin.ops import (
-    _library,
     polar_embed,
     polar_sample,
     polar_to_image,
     reference,
     reference_in_use,
-    triton,
     use_reference,
     window_attention,
 )
@@ -84,87 +79,6 @@ def test_use_reference_reaches_every_public_operator(name, monkeypatch):
         assert reference_in_use()
         run(x)
     assert spy.call_count == 1 and not reference_in_use()
-
-
-def on_kernels(make, dtype=f32, installed=True, capability=(8, 0), **options):
-    """True if a call with fake tensors on a CUDA device runs a kernel."""
-    with (
-        mock.patch.object(triton, "INSTALLED", installed),
-        mock.patch.object(torch.cuda, "get_device_capability", return_value=capability),
-        mock.patch.object(_library, "call") as call,
-        contextlib.ExitStack() as stack,
-        FakeTensorMode(),
-    ):
-        twins = [
-            stack.enter_context(mock.patch.object(reference, name, autospec=True)) for name in CALLS
-        ]
-        made = make(dtype=f64 if dtype == f64 else f32, **options)
-        first = next(iter(made.inputs))
-        for tensors in (made.inputs, made.settings):
-            for name, t in tensors.items():
-                if isinstance(t, torch.Tensor):
-                    wanted = dtype if name == first else t.dtype
-                    tensors[name] = torch.empty(t.shape, dtype=wanted, device="cuda")
-        made.run(**made.inputs)
-    assert call.called != any(twin.called for twin in twins)
-    return call.called
-
-
-embedding = functools.partial(sampling, features=5)
-BY_KERNELS = [
-    (attention, dict()), (attention, dict(dtype=bf16)), (attention, dict(dtype=torch.float16)),
-    (attention, dict(rings=8, window=(8, 8))), (attention, dict(window=(1, 1), head_dim=1)),
-    (attention, dict(sectors=16, window=(2, 16), head_dim=64)),
-    *((make, dict(channels_last=False) | options) for make in (sampling, embedding) for options in (
-        dict(jitter=1.0), dict(dtype=bf16), dict(dtype=torch.uint8), dict(channels=300),
-        dict(dtype=torch.uint8, channels=16))),
-    (polar_map, dict()), (polar_map, dict(dtype=torch.float16)),
-]  # fmt: skip
-BY_THE_REFERENCE = [
-    (attention, dict(rings=5, sectors=13, window=(5, 13), head_dim=16)),
-    (attention, dict(rings=8, window=(8, 8), head_dim=33)),
-    (attention, dict(window=(1, 1), head_dim=65)), (attention, dict(dtype=f64)),
-    *((make, dict(channels_last=False) | options) for make in (sampling, embedding) for options in (
-        dict(dtype=torch.uint8, channels=17), dict(dtype=f64), dict(size=(50_000, 50_000)))),
-    (polar_map, dict(size=(50_000, 50_000))), (polar_map, dict(dtype=f64)),
-]  # fmt: skip
-
-
-@pytest.mark.parametrize(("make", "options"), BY_KERNELS)
-def test_a_cuda_device_runs_the_kernels(make, options):
-    assert on_kernels(make, **options)
-    if options.get("dtype") == torch.float16:
-        return
-    assert not on_kernels(make, installed=False, **options)
-    assert not on_kernels(make, capability=(7, 5), **options)
-    with use_reference():
-        assert not on_kernels(make, **options)
-    with mock.patch.object(torch.compiler, "is_exporting", return_value=True):
-        assert not on_kernels(make, **options)  # an exported graph runs without this package
-
-
-@pytest.mark.parametrize(("make", "options"), BY_THE_REFERENCE)
-def test_the_reference_runs_what_the_kernels_do_not_take(make, options):
-    assert not on_kernels(make, **options)
-
-
-@pytest.mark.parametrize("make", [attention, polar_map])
-def test_without_kernels_there_is_no_float16(make):
-    with pytest.raises(TypeError, match=r"got torch.float16"):
-        on_kernels(make, torch.float16, installed=False)
-
-
-@pytest.mark.slow
-def test_the_kernels_are_imported_by_the_first_call_alone():
-    code = (
-        "import sys, torch, darswin\n"
-        "from darswin.ops import triton\n"
-        "assert not any(name.startswith('darswin.ops.triton.') for name in sys.modules)\n"
-        "for name in triton.LAUNCHERS:\n"
-        "    there = torch._C._dispatch_has_kernel_for_dispatch_key(f'darswin::{name}', 'CUDA')\n"
-        "    assert there == triton.INSTALLED\n"
-    )
-    subprocess.run([sys.executable, "-c", code], check=True)
 
 
 # -- derivatives -----------------------------------------------------------------------------------
