@@ -65,19 +65,10 @@ def polar_to_image(
     """
     size = check_pair("size", size, lowest=0)
     check_layout(layout)
-    tokens = layout == "tokens"
-    r_max = _as_tensor(r_max, radii)
-    if _library.may_attempt() and _library.plain(
-        x, radii, *(t for t in (center, affine, points, r_max, plan) if t is not None)
-    ):
-        given = (x, radii, center, affine, points, r_max, size, tokens, plan)
-        out = _library.attempt(_TO_IMAGE, given)
-        if out is not None:
-            return out
-    _check(x, radii, center, affine, points, r_max, plan, size)
-    return _library.run(
-        _TO_IMAGE, reference.polar_to_image,
-        x, radii, center, affine, points, r_max, size, tokens, plan,
+    r_max, tokens = _as_tensor(r_max, radii), layout == "tokens"
+    return _library.call(
+        _TO_IMAGE, _check, reference.polar_to_image,
+        (x, radii, center, affine, points, r_max, size, tokens, plan),
     )  # fmt: skip
 
 
@@ -107,15 +98,14 @@ def polar_to_image_plan(
         (B or 1, H, 3, W), or None where `polar_to_image` uses no plan: on devices other than the
         CPU, within `use_reference`, and while a graph is compiled, exported or traced.
     """
-    if _library.reference_in_use() or not _library.eager():
+    if torch.compiler.is_compiling() or torch.jit.is_tracing() or _library.transformed():
         return None
     size = check_pair("size", size, lowest=0)
-    r_max = _as_tensor(r_max, radii)
-    _check(x, radii, center, affine, points, r_max, None, size)
-    if x.device.type != "cpu":
-        return None
     with torch.no_grad():
-        return _library.call(_PLAN, (x, radii, center, affine, points, r_max, size))
+        return _library.call(
+            _PLAN, _check, lambda *arguments: None,
+            (x, radii, center, affine, points, _as_tensor(r_max, radii), size),
+        )  # fmt: skip
 
 
 def _as_tensor(r_max: Tensor | float | None, radii: Tensor) -> Tensor | None:
@@ -124,8 +114,8 @@ def _as_tensor(r_max: Tensor | float | None, radii: Tensor) -> Tensor | None:
     return radii.new_full((1,), float(r_max)) if isinstance(radii, Tensor) else None
 
 
-def _check(x, radii, center, affine, points, r_max, plan, size) -> None:
-    """Raises TypeError or ValueError unless the arguments fit."""
+def _check(x, radii, center, affine, points, r_max, size, tokens=False, plan=None) -> None:
+    """Raises TypeError or ValueError unless the arguments of an operator fit."""
     height, width = size
     check_tensor("x", x, (*DTYPES, torch.bfloat16), "(B, R, A, D)", (None,) * 4)
     rings, sectors = x.shape[1:3]
@@ -149,6 +139,7 @@ def _check(x, radii, center, affine, points, r_max, plan, size) -> None:
 
 @torch.library.register_fake("darswin::polar_to_image")
 def _fake(x, radii, center, affine, points, r_max, size, tokens, plan):
+    _check(x, radii, center, affine, points, r_max, size, tokens, plan)
     (batch, _, _, channels), (height, width) = x.shape, size
     return x.new_empty(
         (batch, height, width, channels) if tokens else (batch, channels, height, width)
@@ -157,6 +148,7 @@ def _fake(x, radii, center, affine, points, r_max, size, tokens, plan):
 
 @torch.library.register_fake("darswin::_polar_to_image_plan")
 def _fake_plan(x, radii, center, affine, points, r_max, size):
+    _check(x, radii, center, affine, points, r_max, size)
     lens = (radii, center, affine, points, r_max)
     shared = all(t is None or t.shape[0] == 1 for t in lens)
     return radii.new_empty((1 if shared else x.shape[0], size[0], 3, size[1]))

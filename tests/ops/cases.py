@@ -5,13 +5,12 @@ import functools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from unittest import mock
 
 import torch
 from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from darswin.ops import (
-    _library,
     polar_embed,
     polar_sample,
     polar_to_image,
@@ -162,18 +161,24 @@ def elsewhere(tensor: Tensor, kind: str) -> Tensor:
     return tensor.permute(back).contiguous().permute(back)
 
 
+class Calls(TorchDispatchMode):
+    """A context that notes the calls of the public operators and their backwards."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.calls: list[tuple[torch._ops.OpOverload, list]] = []
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        if func.namespace == "darswin" and not func.name().startswith("darswin::_"):
+            self.calls.append((func, list(args)))
+        return func(*args, **(kwargs or {}))
+
+
 def raw_calls(case: Case) -> list[tuple[torch._ops.OpOverload, list]]:
     """The compiled operator and its backward, each with its arguments in this case."""
-    calls, call = [], _library.call
-
-    def spy(operator, arguments):
-        if not operator.name().startswith("darswin::_"):
-            calls.append((operator, list(arguments)))
-        return call(operator, arguments)
-
-    with mock.patch.object(_library, "call", spy), torch.enable_grad():
+    with Calls() as found, torch.enable_grad():
         results(case)
-    return calls
+    return found.calls
 
 
 # -- calls -----------------------------------------------------------------------------------------

@@ -141,9 +141,10 @@ def test_opcheck(name, dtype):
     first = next(iter(made.inputs))
     made = made.replace(**{first: made.inputs[first].to(dtype)})
     (operator, arguments), (backward, of_backward) = raw_calls(made)
+    assert sum(torch.is_tensor(a) and a.requires_grad for a in arguments) == len(made.inputs)
     for wanted in (False, True):
         given = [
-            a.detach().requires_grad_(wanted) if any(a is t for t in made.inputs.values()) else a
+            a.detach().requires_grad_(wanted) if torch.is_tensor(a) and a.requires_grad else a
             for a in arguments
         ]
         torch.library.opcheck(operator, given)

@@ -1,6 +1,7 @@
 """The choice of an operator's code, the derivatives that it lacks, and NumPy's numbers."""
 
 import functools
+import os
 import sys
 from unittest import mock
 
@@ -112,10 +113,12 @@ def test_derivatives_that_there_are_not_are_refused(name, kind):
 
 
 @compiles
-@pytest.mark.parametrize("fullgraph", [False, True])
-@forward_modes
+@pytest.mark.parametrize(
+    ("kind", "fullgraph"),
+    [*((kind, True) for kind in DERIVATIVES), ("forward mode", False), ("jvp", False)],
+)
 @operators
-def test_a_compiled_function_refuses_forward_mode(name, kind, fullgraph):
+def test_a_compiled_function_refuses_them_too(name, kind, fullgraph):
     run, x = CALLS[name]
     compiled = torch.compile(
         lambda x: DERIVATIVES[kind](lambda x: run(x * 2), x), fullgraph=fullgraph, backend="eager"
@@ -211,7 +214,7 @@ def test_a_call_takes_few_python_calls(name, recording):
     calls = []
 
     def count(frame, event, argument):
-        if event == "call":
+        if event == "call" and f"{os.sep}darswin{os.sep}ops{os.sep}" in frame.f_code.co_filename:
             calls.append(frame.f_code.co_name)
 
     run(x)
@@ -220,8 +223,8 @@ def test_a_call_takes_few_python_calls(name, recording):
         run(x)
     finally:
         sys.setprofile(None)
-    assert len(calls) < (50 if recording else 30), calls
-    assert not any(called.startswith("check_tensor") for called in calls)
+    assert len(calls) <= (10 if recording else 7), calls
+    assert "check_tensor" not in calls
 
 
 @pytest.mark.filterwarnings("ignore")  # torch.jit is deprecated, and warns about every shape
