@@ -224,17 +224,34 @@ def test_export(name):
     assert torch.equal(program.module()(other), made.run(**other))
 
 
+def on_meta(made):
+    """The case on another device."""
+    made = made.to(torch.device("meta"))
+    if "azimuths" in made.settings:
+        made.settings["azimuths"] = made.settings["azimuths"].to("meta")
+    return made
+
+
 @small_cases
 def test_other_devices_run_the_reference(name):
     made = SMALL[name]()
-    out = made.run(**made.inputs)
-    there = made.to(torch.device("meta"))
-    if "azimuths" in there.settings:
-        there.settings["azimuths"] = there.settings["azimuths"].to("meta")
-    with torch.library._scoped_library("darswin", "FRAGMENT"):
-        found = there.run(**{n: t.requires_grad_() for n, t in there.inputs.items()})
+    out, there = made.run(**made.inputs), on_meta(made)
+    found = there.run(**{n: t.requires_grad_() for n, t in there.inputs.items()})
     assert found.shape == out.shape and found.dtype == out.dtype and found.device.type == "meta"
-    assert "darswin" not in str(found.grad_fn) and "Generated" not in type(found.grad_fn).__name__
+    assert f"{name.split(',')[0]}Backward" not in type(found.grad_fn).__name__
+
+
+@pytest.mark.slow
+@pytest.mark.unsanitized
+@small_cases
+def test_the_reference_compiles(name):
+    torch._dynamo.reset()
+    made = SMALL[name]()
+    run, expected = made.run, results(made, is_reference=True)
+    made.run = torch.compile(run, fullgraph=True, backend="aot_eager")
+    assert_equal_results(results(made, is_reference=True), expected, 1e-5)
+    there = on_meta(made)
+    assert there.run(**there.inputs).shape == expected["out"].shape
 
 
 # -- types -----------------------------------------------------------------------------------------
