@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/installed
 
-.PHONY: help build demo test test-all test-triton test-gpu test-lowest test-isa test-asan fuzz kills mutants lint format bench bench-gpu study study-int8 learned-lens worlds study-dense study-sizes tables docs sdist wheels repair published-wheels test-torch aarch64 test-aarch64 clean
+.PHONY: help build demo test test-all test-lowest test-isa test-asan fuzz kills mutants lint format bench study study-int8 learned-lens worlds study-dense study-sizes tables docs sdist wheels repair published-wheels test-torch aarch64 test-aarch64 clean
 
 help:  ## print this list
 	@grep -E '^[a-z0-9-]+:.*##' Makefile | sed -E 's/:.*## /\t/' | expand -t 18
@@ -33,23 +33,6 @@ test: build  ## run the fast tests: values, gradients, errors
 
 test-all: build  ## run all tests, also those that compile graphs, start processes, train or run the docs
 	$(PYTEST)
-
-# Triton is installed in its own folder, so that all other tests run without it.
-TRITON := .triton
-TRITON_VERSION := 3.9.0
-
-$(TRITON)/$(TRITON_VERSION): $(STAMP)
-	rm -rf $(TRITON)
-	$(BIN)/pip install -q --no-deps --target $(TRITON) triton==$(TRITON_VERSION)
-	@touch $@
-
-test-triton: build $(TRITON)/$(TRITON_VERSION)  ## test the kernels for GPUs without a GPU: interpreted, and compiled
-	TRITON_INTERPRET=1 PYTHONPATH=$(CURDIR)/$(TRITON) $(PYTEST) -q tests/gpu
-	PYTHONPATH=$(CURDIR):$(CURDIR)/$(TRITON) $(BIN)/python tests/gpu/compile_kernels.py
-
-# torch's builds for CUDA contain Triton. Without a device, the tests are skipped with a message.
-test-gpu: build  ## test the kernels and models on a CUDA device
-	$(BIN)/python -m pytest -q -rs tests/gpu
 
 # All requirements in pyproject.toml except torch, at their lowest versions.
 LOWEST := .venv-lowest
@@ -120,9 +103,6 @@ bench: build  ## time the operators against alternatives, and training; run noth
 	$(BIN)/python benchmarks/frames.py --out benchmarks/results
 	$(BIN)/python benchmarks/training.py --out benchmarks/results
 	$(BIN)/python -m darswin bench --out benchmarks/results
-
-bench-gpu: build  ## time the operators and a model on a CUDA device
-	$(BIN)/python benchmarks/gpu.py
 
 study: build  ## run the paper's experiments on a small scale (one hour; can be interrupted)
 	$(BIN)/python studies/study.py

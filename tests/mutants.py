@@ -40,7 +40,6 @@ TESTS = {
     "darswin/data": ["data", "train"],
     "darswin/train": ["train"],
 }
-WITHOUT = ("darswin/ops/triton",)  # these kernels have tests of their own, `make test-triton`
 
 
 class Mutant(NamedTuple):
@@ -154,8 +153,6 @@ def draw(folders: list[str], count: int, seed: int) -> list[Mutant]:
     tracked = subprocess.check_output(["git", "ls-files", *folders], cwd=ROOT, text=True).split()
     mutants: list[Mutant] = []
     for path in sorted(tracked):
-        if path.startswith(WITHOUT):
-            continue
         if path.endswith(".py"):
             mutants.extend(python_mutants(path))
         elif path.endswith((".h", ".cpp")):

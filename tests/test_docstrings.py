@@ -7,13 +7,11 @@ from collections.abc import Iterator
 from functools import cached_property
 
 import darswin
-from darswin.ops import triton
 
 MODULES = [
     importlib.import_module(found.name)
     for found in pkgutil.walk_packages(darswin.__path__, "darswin.")
     if not found.name.endswith(("__main__", "libdarswin"))
-    and (triton.INSTALLED or not found.name.startswith("darswin.ops.triton."))
 ]
 
 

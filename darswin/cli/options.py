@@ -198,7 +198,7 @@ TRAINER = {
     "trainer.max_steps": "the number of steps, in place of epochs; -1 sets no limit",
     "trainer.max_time": "the time limit of the training, as DD:HH:MM:SS",
     "trainer.accelerator": "cpu, gpu or auto",
-    "trainer.precision": "32-true, bf16-mixed or 16-mixed",
+    "trainer.precision": "32-true or bf16-mixed",
     "trainer.accumulate_grad_batches": "the number of batches in one optimizer step",
     "trainer.gradient_clip_val": "the largest norm of the gradients; null sets no limit",
     "trainer.limit_train_batches": "the number of batches in an epoch, or a fraction of them",

@@ -1,20 +1,17 @@
 """The operators.
 
-On the CPU they run compiled code, and on CUDA devices Triton kernels if triton is installed. On
-other devices, and within `use_reference`, they run the PyTorch reference.
+On the CPU they run compiled code. On other devices, and within `use_reference`, they run the
+PyTorch reference.
 
 They use as many threads as torch. A process that is forked after such a call must not call them
 with several threads: use `spawn`, or `torch.set_num_threads(1)` in the child.
 """
 
-from darswin.ops import triton
 from darswin.ops._library import reference_in_use, use_reference
 from darswin.ops._module import cpu_capability
 from darswin.ops.polar_sample import polar_embed, polar_sample
 from darswin.ops.polar_to_image import polar_to_image, polar_to_image_plan
 from darswin.ops.window_attention import window_attention
-
-triton.register()
 
 __all__ = [
     "cpu_capability",

@@ -1,7 +1,7 @@
-"""Chooses the code that an operator runs, compiled or reference, and defines its derivatives."""
+"""Runs an operator, compiled or as its reference, and defines its derivatives."""
 
 import contextlib
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import torch
@@ -9,12 +9,9 @@ from torch import Tensor
 from torch._ops import OpOverload
 from torch.autograd import forward_ad
 
-from darswin.ops import triton
-
+transformed = torch._C._are_functorch_transforms_active  # True within a transform of torch.func
+_LIBRARY = torch.library.Library("darswin", "IMPL")
 _reference = False
-_PLAIN = (Tensor, torch.nn.Parameter)
-# Operator → the function that records its gradient in eager mode.
-_recorders: dict[OpOverload, type[torch.autograd.Function]] = {}
 
 
 @contextlib.contextmanager
@@ -38,180 +35,155 @@ def reference_in_use() -> bool:
     return _reference
 
 
-def has_kernels(tensor: Tensor) -> bool:
-    """True if operators on `tensor` run the GPU kernels, provided these support the arguments."""
-    # An exported graph consists of torch's own operations, so that it runs without this package.
-    usable = triton.INSTALLED and not _reference and not torch.compiler.is_exporting()
-    return usable and tensor.device.type == "cuda" and _is_known_gpu(tensor.device.index)
-
-
-def _constant(function: Callable[..., bool]) -> Callable[..., bool]:
-    """Lets Dynamo call a function while it traces and build the result into the graph."""
-    # torch.compiler.assume_constant_result sets the same mark, but it imports Dynamo, which takes
-    # as long as importing torch.
-    function._dynamo_marked_constant = True  # type: ignore[attr-defined]
-    return function
-
-
-@_constant
-def _is_known_gpu(index: int) -> bool:
-    """True for NVIDIA GPUs from the A100 on. AMD GPUs also have the device type "cuda"."""
-    return torch.version.hip is None and torch.cuda.get_device_capability(index) >= (8, 0)
-
-
-@_constant  # before torch 2.12 Dynamo cannot trace the call inside
 def _has_autocast(device: str) -> bool:
     return torch.amp.is_autocast_available(device)
 
 
+# Dynamo calls the function and builds the result into the graph. Before torch 2.12 it cannot trace
+# the call inside. torch.compiler.assume_constant_result sets the same mark, but it imports Dynamo,
+# which takes as long as importing torch.
+_has_autocast._dynamo_marked_constant = True  # type: ignore[attr-defined]
+
+
 def autocast_dtype(tensor: Tensor) -> torch.dtype | None:
     """The dtype of autocast on the tensor's device, or None if autocast is off."""
-    device = tensor.device.type
-    if not _has_autocast(device) or not torch.is_autocast_enabled(device):
+    device = "cpu" if tensor.is_cpu else tensor.device.type
+    if not (device == "cpu" or _has_autocast(device)) or not torch.is_autocast_enabled(device):
         return None
     return torch.get_autocast_dtype(device)
 
 
-def without_float16(tensor: Tensor) -> Tensor:
-    """Converts a float16 tensor to float32 under autocast: the operators lack float16."""
-    half = isinstance(tensor, Tensor) and tensor.dtype == torch.float16
-    return tensor.float() if half and autocast_dtype(tensor) is not None else tensor
-
-
-def narrow_types(tensor: Tensor) -> tuple[torch.dtype, ...]:
-    """The 16-bit dtypes that an operator with float16 kernels accepts for this tensor."""
-    kernels = isinstance(tensor, Tensor) and has_kernels(tensor)
-    return (torch.bfloat16, torch.float16) if kernels else (torch.bfloat16,)
-
-
-def output_bfloat16(image: Tensor) -> bool:
-    """True if an operator on `image` returns bfloat16, due to the image's dtype or autocast."""
-    if image.dtype == torch.float64:
-        return False
-    return image.dtype == torch.bfloat16 or autocast_dtype(image) == torch.bfloat16
-
-
-def autocast_off(device: str) -> contextlib.AbstractContextManager:
-    """A context in which autocast does not change the arithmetic of a reference."""
-    # Where autocast is off, no context: in an exported graph it would become a graph of its own.
-    if not _has_autocast(device) or not torch.is_autocast_enabled(device):
-        return contextlib.nullcontext()
-    return torch.autocast(device, enabled=False)
-
-
-def run(
+def call(
     operator: OpOverload,
-    reference: Callable[..., Tensor],
-    kernel_takes: Callable[..., bool],
-    *arguments: Any,
-) -> Tensor:
-    """Runs an operator on checked arguments: compiled code on the CPU, a kernel on a GPU if
-    `kernel_takes` accepts them, otherwise the reference. A `Sampling` is passed field by field."""
-    first, *others = arguments
-    flat = [*first, *others] if isinstance(first, tuple) else arguments
-    first = flat[0]
-    if not _reference:
-        refuse_other_derivatives(f"darswin.{reference.__name__}", flat)
-        if first.device.type == "cpu" or (has_kernels(first) and kernel_takes(*arguments)):
-            return call(operator, flat)
-    with autocast_off(first.device.type):
+    explain: Callable[..., None],
+    reference: Callable[..., Any],
+    arguments: Sequence[Any],
+) -> Any:
+    """The only way to an operator: compiled code on the CPU, elsewhere the reference.
+
+    `explain(*arguments)` raises TypeError or ValueError if an argument does not fit. The compiled
+    code refuses the same arguments, but gives no readable reason. The check takes longer than a
+    small call, so it runs only after a refusal. It runs first for the reference and while a graph
+    is compiled. The fakes of the operators call it too.
+    """
+    first = arguments[0]
+    compiled = isinstance(first, Tensor) and first.is_cpu and not _reference
+    if compiled and not torch.compiler.is_compiling():
+        try:
+            return operator(*arguments)
+        except RuntimeError:
+            try:
+                explain(*arguments)
+            except (TypeError, ValueError) as reason:
+                raise reason from None
+            raise
+    explain(*arguments)
+    if compiled:
+        return operator(*arguments)
+    # Autocast would change the arithmetic of the reference. Where it is off, there is no context:
+    # in an exported graph it would become a graph of its own.
+    if autocast_dtype(first) is None:
+        return reference(*arguments)
+    with torch.autocast(first.device.type, enabled=False):
         return reference(*arguments)
 
 
-def attempt(operator: OpOverload, arguments: Sequence[Any]) -> Any:
-    """The operator's result, or None if it refuses the arguments. It does not explain why."""
-    try:
-        return call(operator, arguments)
-    except RuntimeError:
-        return None
+# -- derivatives -----------------------------------------------------------------------------------
 
 
-def may_attempt() -> bool:
-    """True if plain tensors may go to the compiled operator unchecked: no special mode is on."""
-    return not (
-        _reference
-        or not eager()
-        or forward_ad._current_level >= 0
-        or torch.is_autocast_enabled("cpu")
-    )
+def register_gradients(
+    name: str, groups: dict[int, int], fake: Callable[..., tuple[Tensor, ...]] | None = None
+) -> None:
+    """Registers the autograd of an operator, and `fake` or a default as the fake of its backward.
+
+    `groups` maps the index of each argument that has a gradient to its group, in the order of the
+    results of backward. The backward operator takes the operator's first arguments, the gradient
+    of the output, and a bool for each group: whether a gradient of this group is wanted. A
+    backward operator without these bools computes all gradients.
+    """
+    operators = torch.ops.darswin
+    backward = getattr(operators, f"{name}_backward").default
+    names = [argument.name for argument in backward._schema.arguments]
+    taken = names.index("grad_out")
+    bools = len(names) - taken - 1
+
+    def gradients(ctx, grad_out):
+        tensors, needs = ctx.saved_tensors, ctx.needs_input_grad
+        inputs = [o if t is None else t for t, o in zip(tensors, ctx.others, strict=True)]
+        wanted = [any(needs[i] for i, of in groups.items() if of == k) for k in range(bools)]
+        results = [None] * len(inputs)
+        found = backward(*inputs[:taken], grad_out, *wanted)
+        for index, gradient in zip(groups, found, strict=True):
+            if needs[index]:
+                results[index] = gradient.to(inputs[index].dtype)
+        return tuple(results)
+
+    def second_derivative(ctx, *grads):
+        raise NotImplementedError(
+            f"darswin::{name} has no second derivative; run it within "
+            "darswin.ops.use_reference() for one"
+        )
+
+    def fake_backward(*arguments):
+        return empty_gradients(arguments, groups, arguments[taken + 1 :])
+
+    _register_autograd(getattr(operators, name).default, f"darswin.{name}", gradients)
+    _register_autograd(backward, f"{name}'s backward", second_derivative)
+    torch.library.register_fake(f"darswin::{name}_backward", fake or fake_backward)
 
 
-def plain(*tensors: Any) -> bool:
-    """True if all are tensors on the CPU and none is of a subclass of Tensor or Parameter."""
-    for tensor in tensors:  # all() with a generator takes twice as long
-        if type(tensor) not in _PLAIN:
-            return False
-        if not tensor.is_cpu:
-            return False
-    return True
+def _register_autograd(operator: OpOverload, title: str, gradients: Callable) -> None:
+    """Makes autograd record the operator; `gradients(ctx, *grads)` is its derivative.
 
+    The dispatcher calls `differentiable` in every mode: eager, compiled, exported and traced.
+    torch.library.register_autograd would do the same, but it would take 40 µs more to record a
+    gradient. It would also ignore forward-mode AD.
+    """
+    kinds = [str(argument.type) for argument in operator._schema.arguments]
+    tensors = [index for index, kind in enumerate(kinds) if "Tensor" in kind]
 
-def call(operator: OpOverload, arguments: Sequence[Any]) -> Any:
-    """Calls the operator and skips the autograd of torch.library where it is not needed: that
-    takes 9 µs without a gradient and 100 µs to record one."""
-    if not eager():
-        return operator(*arguments)
-    if torch.is_grad_enabled():
-        recorder = _recorders.get(operator)
-        if recorder is None:
+    def record(ctx, *arguments):
+        ctx.save_for_backward(*[x if isinstance(x, Tensor) else None for x in arguments])
+        ctx.others = [None if isinstance(x, Tensor) else x for x in arguments]
+        with torch._C._AutoDispatchBelowAutograd():
             return operator(*arguments)
-        for value in arguments:
-            if isinstance(value, Tensor) and value.requires_grad:
-                return recorder.apply(*arguments)
-    with torch._C._AutoDispatchBelowAutograd():
-        return operator(*arguments)
+
+    methods = {"forward": staticmethod(record), "backward": staticmethod(gradients)}
+    name = operator._schema.name.removeprefix("darswin::")
+    recorder = type(name, (torch.autograd.Function,), methods)
+
+    def differentiable(*arguments):
+        if forward_ad._current_level >= 0 or transformed():
+            _refuse_other_derivatives(title, arguments)
+        if torch.is_grad_enabled():
+            for index in tensors:
+                if arguments[index] is not None and arguments[index].requires_grad:
+                    return recorder.apply(*arguments)
+        with torch._C._AutoDispatchBelowAutograd():
+            return operator(*arguments)
+
+    _LIBRARY.impl(name, differentiable, "Autograd")
 
 
-def eager() -> bool:
-    """True in eager mode: no graph is being compiled, exported or traced, and no transform of
-    torch.func is active."""
-    return not (torch.compiler.is_compiling() or transformed() or torch._C._is_tracing())
-
-
-def transformed() -> bool:
-    """True within a transform of torch.func."""
-    return torch._C._functorch.peek_interpreter_stack() is not None
-
-
-def refuse_other_derivatives(operator: object, tensors: Iterable[object]) -> None:
+def _refuse_other_derivatives(title: str, arguments: Sequence[Any]) -> None:
     """Raises NotImplementedError if forward-mode AD or torch.func differentiates a tensor.
 
     Otherwise forward-mode AD would silently give zeros, and torch.func would raise an error about
     the internals of autograd.
     """
-    # While a graph is compiled, torch.func.grad fails by itself.
-    forward = forward_ad._current_level >= 0
-    functional = not torch.compiler.is_compiling() and transformed()
-    if not forward and not functional:
-        return
-    for tensor in tensors:
-        if not isinstance(tensor, Tensor):
+    for value in arguments:
+        if not isinstance(value, Tensor):
             continue
-        tracked, tensor = _unwrapped(tensor) if functional else (False, tensor)
-        if tracked:
-            mode = "torch.func derivatives"
-        elif forward and forward_ad.unpack_dual(tensor).tangent is not None:
+        if forward_ad.unpack_dual(value).tangent is not None:
             mode = "forward-mode derivatives"
+        elif transformed() and value.requires_grad:
+            mode = "torch.func derivatives"
         else:
             continue
-        message = (
-            f"{operator} has no {mode}, only backward(); run it within "
+        raise NotImplementedError(
+            f"{title} has no {mode}, only backward(); run it within "
             "darswin.ops.use_reference() for them"
         )
-        if torch.compiler.is_dynamo_compiling():
-            # After an exception Dynamo would compile the parts of the function without tangents.
-            with torch._dynamo.error_on_graph_break(True):
-                torch._dynamo.graph_break(message)
-        raise NotImplementedError(message)
-
-
-def _unwrapped(tensor: Tensor) -> tuple[bool, Tensor]:
-    """True if torch.func differentiates with respect to the tensor; and the wrapped tensor."""
-    functorch, tracked = torch._C._functorch, False
-    while functorch.is_functorch_wrapped_tensor(tensor):
-        tracked |= functorch.is_gradtrackingtensor(tensor)
-        tensor = functorch.get_unwrapped(tensor)
-    return tracked, tensor
 
 
 def empty_gradients(
@@ -226,57 +198,3 @@ def empty_gradients(
         shape = (0,) if value is None or not (wanted[group] if wanted else True) else value.shape
         gradients.append(like.new_empty(shape))
     return tuple(gradients)
-
-
-def register_gradients(
-    name: str, groups: dict[int, int], fake: Callable[..., tuple[Tensor, ...]] | None = None
-) -> None:
-    """Registers the autograd of an operator, and `fake` or a default as the fake of its backward.
-
-    `groups` maps the index of each argument that has a gradient to its group, in the order of the
-    results of backward. The backward operator takes the operator's first arguments, the gradient
-    of the output, and a bool for each group: whether a gradient of this group is wanted. A
-    backward operator without these bools computes all gradients.
-    """
-    backward = getattr(torch.ops.darswin, f"{name}_backward").default
-    names = [argument.name for argument in backward._schema.arguments]
-    taken = names.index("grad_out")
-    bools = len(names) - taken - 1
-
-    def fake_backward(*arguments):
-        return empty_gradients(arguments, groups, arguments[taken + 1 :])
-
-    operator = getattr(torch.ops.darswin, name).default
-
-    def setup_context(ctx, inputs, output):
-        ctx.save_for_backward(*[x if isinstance(x, Tensor) else None for x in inputs])
-        ctx.others = [None if isinstance(x, Tensor) else x for x in inputs]
-
-    def record(ctx, *inputs):
-        setup_context(ctx, inputs, None)
-        with torch._C._AutoDispatchBelowAutograd():
-            return operator(*inputs)
-
-    def gradients(ctx, grad_out):
-        refuse_other_derivatives(f"{name}'s backward", (grad_out,))
-        tensors, needs = ctx.saved_tensors, ctx.needs_input_grad
-        inputs = [o if t is None else t for t, o in zip(tensors, ctx.others, strict=True)]
-        wanted = [any(needs[i] for i, of in groups.items() if of == k) for k in range(bools)]
-        results = [None] * len(inputs)
-        found = call(backward, [*inputs[:taken], grad_out, *wanted])
-        for index, gradient in zip(groups, found, strict=True):
-            if needs[index]:
-                results[index] = gradient.to(inputs[index].dtype)
-        return tuple(results)
-
-    def second_derivative(ctx, *grads):
-        raise NotImplementedError(
-            f"darswin::{name} has no second derivative; run it within "
-            "darswin.ops.use_reference() for one"
-        )
-
-    torch.library.register_fake(f"darswin::{name}_backward", fake or fake_backward)
-    torch.library.register_autograd(f"darswin::{name}", gradients, setup_context=setup_context)
-    torch.library.register_autograd(f"darswin::{name}_backward", second_derivative)
-    methods = {"forward": staticmethod(record), "backward": staticmethod(gradients)}
-    _recorders[operator] = type(name, (torch.autograd.Function,), methods)

@@ -98,7 +98,9 @@ def check_pair(name: str, value: Sequence[int], lowest: int) -> tuple[int, int]:
     """The pair, checked: raises TypeError or ValueError unless it is two ints ≥ `lowest`."""
     if not isinstance(value, (tuple, list, torch.Size)) or len(value) != 2:
         raise TypeError(f"{name} must be a pair of ints, got {value!r}")
-    first, second = as_int(value[0]), as_int(value[1])
+    first, second = value
+    if type(first) is not int or type(second) is not int:
+        first, second = as_int(first), as_int(second)
     if first is None or second is None:
         raise TypeError(f"{name} must be a pair of ints, got {value!r}")
     if first < lowest or second < lowest:

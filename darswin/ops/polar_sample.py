@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from darswin.ops import _library, reference
-from darswin.ops._sampling import GRADIENTS, Sampling, checked_sampling, unchecked_sampling
+from darswin.ops._sampling import GRADIENTS, Sampling, as_sampling, check_sampling
 from darswin.ops.checks import check_layout, check_tensor
 
 _SAMPLE = torch.ops.darswin.polar_sample.default
@@ -87,23 +87,22 @@ def polar_sample(
 
     Source: DarSwin, ICCV 2023, sec. 4.3.
     """
-    given = (
+    check_layout(layout)
+    sampling = as_sampling(
         image, radii, azimuths, center, affine, offsets, jitter, seed, samples, mean, std,
         channels_last,
     )  # fmt: skip
-    check_layout(layout)
-    sampling, tokens = unchecked_sampling(*given), layout == "tokens"
-    if sampling is not None:
-        out = _library.attempt(_SAMPLE, (*sampling, tokens))
-        if out is not None:
-            return out
-    return _library.run(
-        _SAMPLE, reference.polar_sample, Sampling.kernel_takes, checked_sampling(*given), tokens
-    )
+    return _library.call(_SAMPLE, check_sampling, _reference, (*sampling, layout == "tokens"))
+
+
+def _reference(*arguments):
+    *fields, tokens = arguments
+    return reference.polar_sample(Sampling(*fields), tokens)
 
 
 @torch.library.register_fake("darswin::polar_sample")
 def _fake(*arguments):
+    check_sampling(*arguments)
     *fields, tokens = arguments
     sampling = Sampling(*fields)
     if tokens:
@@ -156,16 +155,17 @@ def polar_embed(
 
     Source: DarSwin, ICCV 2023, sec. 4.3.
     """
-    given = (
+    sampling = as_sampling(
         image, radii, azimuths, center, affine, offsets, jitter, seed, samples, mean, std,
         channels_last,
     )  # fmt: skip
-    sampling = unchecked_sampling(*given)
-    if sampling is not None and _library.plain(weight) and (bias is None or _library.plain(bias)):
-        out = _library.attempt(_EMBED, (*sampling, weight, bias))
-        if out is not None:
-            return out
-    sampling = checked_sampling(*given)
+    return _library.call(_EMBED, _check_embed, _reference_embed, (*sampling, weight, bias))
+
+
+def _check_embed(*arguments) -> None:
+    check_sampling(*arguments)
+    *fields, weight, bias = arguments
+    sampling = Sampling(*fields)
     image, size = sampling.image, sampling.token_size()
     double = image.dtype == torch.float64
     dtypes = (torch.float64,) if double else (torch.float32, torch.bfloat16)
@@ -173,13 +173,16 @@ def polar_embed(
     check_tensor("weight", weight, dtypes, form, (None, size), like=image)
     if bias is not None:
         check_tensor("bias", bias, dtypes, "(D,) = ({},)", (weight.shape[0],), like=image)
-    return _library.run(
-        _EMBED, reference.polar_embed, Sampling.kernel_takes, sampling, weight, bias
-    )
+
+
+def _reference_embed(*arguments):
+    *fields, weight, bias = arguments
+    return reference.polar_embed(Sampling(*fields), weight, bias)
 
 
 @torch.library.register_fake("darswin::polar_embed")
 def _fake_embed(*arguments):
+    _check_embed(*arguments)
     *fields, weight, _bias = arguments
     sampling = Sampling(*fields)
     return sampling.new_output((*sampling.map_size(), weight.shape[0]))

@@ -37,8 +37,7 @@ def polar_to_image(
         points right, π/2 down. Sector a has its middle at 2π(a + ½)/A, as in `polar_grid`.
 
     Args:
-        x: (B, R, A, D), float32, float64 or bfloat16. float16 is supported where
-            `darswin.ops.triton` has kernels; elsewhere only under autocast, as float32.
+        x: (B, R, A, D), float32, float64 or bfloat16.
         radii: (B or 1, R) px, of the rings' centres: finite, at least 0, rising. All tensors from
             here on are float64 if x is float64, else float32.
         center: (B or 1, 2) px, x then y; None if `points` are given.
@@ -66,19 +65,10 @@ def polar_to_image(
     """
     size = check_pair("size", size, lowest=0)
     check_layout(layout)
-    tokens = layout == "tokens"
-    r_max = _as_tensor(r_max, radii)
-    if _library.may_attempt() and _library.plain(
-        x, radii, *(t for t in (center, affine, points, r_max, plan) if t is not None)
-    ):
-        given = (x, radii, center, affine, points, r_max, size, tokens, plan)
-        out = _library.attempt(_TO_IMAGE, given)
-        if out is not None:
-            return out
-    x = _checked(x, radii, center, affine, points, r_max, plan, size)
-    return _library.run(
-        _TO_IMAGE, reference.polar_to_image, _kernel_takes,
-        x, radii, center, affine, points, r_max, size, tokens, plan,
+    r_max, tokens = _as_tensor(r_max, radii), layout == "tokens"
+    return _library.call(
+        _TO_IMAGE, _check, reference.polar_to_image,
+        (x, radii, center, affine, points, r_max, size, tokens, plan),
     )  # fmt: skip
 
 
@@ -108,15 +98,14 @@ def polar_to_image_plan(
         (B or 1, H, 3, W), or None where `polar_to_image` uses no plan: on devices other than the
         CPU, within `use_reference`, and while a graph is compiled, exported or traced.
     """
-    if _library.reference_in_use() or not _library.eager():
+    if torch.compiler.is_compiling() or torch.jit.is_tracing() or _library.transformed():
         return None
     size = check_pair("size", size, lowest=0)
-    r_max = _as_tensor(r_max, radii)
-    x = _checked(x, radii, center, affine, points, r_max, None, size)
-    if x.device.type != "cpu" or x.dtype == torch.float16:
-        return None
     with torch.no_grad():
-        return _library.call(_PLAN, (x, radii, center, affine, points, r_max, size))
+        return _library.call(
+            _PLAN, _check, lambda *arguments: None,
+            (x, radii, center, affine, points, _as_tensor(r_max, radii), size),
+        )  # fmt: skip
 
 
 def _as_tensor(r_max: Tensor | float | None, radii: Tensor) -> Tensor | None:
@@ -125,12 +114,10 @@ def _as_tensor(r_max: Tensor | float | None, radii: Tensor) -> Tensor | None:
     return radii.new_full((1,), float(r_max)) if isinstance(radii, Tensor) else None
 
 
-def _checked(x, radii, center, affine, points, r_max, plan, size) -> Tensor:
-    """x in a type that the operators take, after a check of all arguments."""
+def _check(x, radii, center, affine, points, r_max, size, tokens=False, plan=None) -> None:
+    """Raises TypeError or ValueError unless the arguments of an operator fit."""
     height, width = size
-    narrow = _library.narrow_types(x)
-    x = x if torch.float16 in narrow else _library.without_float16(x)
-    check_tensor("x", x, (*DTYPES, *narrow), "(B, R, A, D)", (None,) * 4)
+    check_tensor("x", x, (*DTYPES, torch.bfloat16), "(B, R, A, D)", (None,) * 4)
     rings, sectors = x.shape[1:3]
     if rings == 0 or sectors == 0:
         raise ValueError(f"x must have rings and sectors, got {tuple(x.shape)}")
@@ -148,17 +135,11 @@ def _checked(x, radii, center, affine, points, r_max, plan, size) -> Tensor:
         if tensor is not None or name == "radii":
             check_tensor(name, tensor, (real,), form, (x.shape[0], *shape), (1, *shape), like=x)
     check_rising("radii", radii)
-    return x
-
-
-def _kernel_takes(x, radii, center, affine, points, r_max, size, tokens, plan) -> bool:
-    """True if the GPU kernel supports it: neither float64 nor 2³¹ pixels or tokens per image."""
-    most = max(size[0] * size[1], x.shape[1] * x.shape[2])
-    return x.dtype != torch.float64 and most < 2**31 - 2**16
 
 
 @torch.library.register_fake("darswin::polar_to_image")
 def _fake(x, radii, center, affine, points, r_max, size, tokens, plan):
+    _check(x, radii, center, affine, points, r_max, size, tokens, plan)
     (batch, _, _, channels), (height, width) = x.shape, size
     return x.new_empty(
         (batch, height, width, channels) if tokens else (batch, channels, height, width)
@@ -167,6 +148,7 @@ def _fake(x, radii, center, affine, points, r_max, size, tokens, plan):
 
 @torch.library.register_fake("darswin::_polar_to_image_plan")
 def _fake_plan(x, radii, center, affine, points, r_max, size):
+    _check(x, radii, center, affine, points, r_max, size)
     lens = (radii, center, affine, points, r_max)
     shared = all(t is None or t.shape[0] == 1 for t in lens)
     return radii.new_empty((1 if shared else x.shape[0], size[0], 3, size[1]))

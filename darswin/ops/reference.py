@@ -1,7 +1,7 @@
 """The operators in plain PyTorch.
 
 These functions define the operators, and the tests compare with them. They run within
-`use_reference` and on devices without kernels. Each has the name and the parameters of its
+`use_reference` and on devices other than the CPU. Each has the name and the parameters of its
 operator. The arguments are already checked, and those of a sampling are one `Sampling`.
 """
 

@@ -1,7 +1,5 @@
 """window_attention: attention in the windows of a polar map. Public function, fake and autograd."""
 
-import math
-
 import torch
 from torch import Tensor
 
@@ -28,10 +26,9 @@ def window_attention(
 
     Args:
         qkv: (B, R, A, 3, heads, d), float32, float64 or bfloat16. bfloat16 is computed in float32,
-            and the result and the gradient of qkv are rounded once. float16 is supported where
-            `darswin.ops.triton` has kernels; elsewhere only under autocast, as float32.
+            and the result and the gradient of qkv are rounded once.
         bias: (B or 1, heads, 2·M_r-1, 2·M_φ-1): entry [Δr+M_r-1, Δφ+M_φ-1], Δ = query - key. It has
-            the dtype of qkv. For a 16-bit qkv it may be float32, and is used in float32.
+            the dtype of qkv. For a bfloat16 qkv it may be float32, and is used in float32.
         window: (M_r, M_φ), which divides (R, A).
         shift: (s_r, s_φ), 0 ≤ s_r < R and 0 ≤ s_φ < A.
         periodic: two bools, True if the map wraps around along (radius, azimuth). A plain Swin map
@@ -55,51 +52,39 @@ def window_attention(
     shift = check_pair("shift", shift, lowest=0)
     if not isinstance(periodic, (tuple, list)) or len(periodic) != 2:
         raise TypeError(f"periodic must be a pair of bools, got {periodic!r}")
-    wrap = tuple(int(bool(p)) for p in periodic)  # torch.jit.trace rejects lists of bools
-    if _library.may_attempt() and _library.plain(qkv, bias) and bias.dtype != torch.bfloat16:
-        sizes = qkv.shape
-        if len(sizes) == 6 and sizes[5] > 0:
-            scaled = sizes[5] ** -0.5 if scale is None else float(scale)
-            out = _library.attempt(_ATTENTION, (qkv, bias, window, shift, wrap, scaled))
-            if out is not None:
-                return out
-    narrow = _library.narrow_types(qkv)
-    if torch.float16 not in narrow:
-        qkv, bias = _library.without_float16(qkv), _library.without_float16(bias)
+    # torch.jit.trace rejects lists of bools.
+    wrap = int(bool(periodic[0])), int(bool(periodic[1]))
+    if not isinstance(qkv, Tensor) or qkv.dim() != 6 or qkv.shape[5] == 0:
+        _check(qkv, bias, window, shift)
+    # The bias of a bfloat16 qkv is used in float32; autocast may have narrowed it.
+    if isinstance(bias, Tensor) and bias.dtype == torch.bfloat16:
+        narrow = qkv.dtype == torch.bfloat16 or _library.autocast_dtype(qkv) is not None
+        bias = bias.float() if narrow else bias
+    scale = qkv.shape[5] ** -0.5 if scale is None else float(scale)
+    arguments = (qkv, bias, window, shift, wrap, scale)
+    return _library.call(_ATTENTION, _check, reference.window_attention, arguments)
+
+
+def _check(qkv, bias, window, shift, *others) -> None:
+    """Raises TypeError or ValueError unless the arguments of the operator fit."""
     shape = (None, None, None, 3, None, None)
-    check_tensor("qkv", qkv, (*DTYPES, *narrow), "(B, R, A, 3, heads, d)", shape)
+    check_tensor("qkv", qkv, (*DTYPES, torch.bfloat16), "(B, R, A, 3, heads, d)", shape)
     batch, rings, sectors, _, heads, head_dim = qkv.shape
     if rings == 0 or sectors == 0 or head_dim == 0:
         raise ValueError(f"qkv must have rings, sectors and a head dim, got {tuple(qkv.shape)}")
     if rings % window[0] or sectors % window[1]:
-        raise ValueError(f"window must divide (R, A) = ({rings}, {sectors}), got {window}")
+        raise ValueError(f"window must divide (R, A) = ({rings}, {sectors}), got {tuple(window)}")
     if shift[0] >= rings or shift[1] >= sectors:
-        raise ValueError(f"shift must lie inside (R, A) = ({rings}, {sectors}), got {shift}")
-    # The bias of a 16-bit qkv is used in float32; autocast may have narrowed it.
-    half = qkv.dtype in narrow
-    if isinstance(bias, Tensor) and bias.dtype in narrow:
-        bias = bias.float() if half or _library.autocast_dtype(qkv) is not None else bias
-    real = torch.float32 if half else qkv.dtype
+        raise ValueError(f"shift must lie inside (R, A) = ({rings}, {sectors}), got {tuple(shift)}")
+    real = torch.float32 if qkv.dtype == torch.bfloat16 else qkv.dtype
     table = (heads, 2 * window[0] - 1, 2 * window[1] - 1)
     form = "(B or 1, heads, 2·M_r-1, 2·M_φ-1) = ({} or 1, {}, {}, {})"
     check_tensor("bias", bias, (real,), form, (batch, *table), (1, *table), like=qkv)
-    scale = head_dim**-0.5 if scale is None else float(scale)
-    return _library.run(
-        _ATTENTION, reference.window_attention, _kernel_takes,
-        qkv, bias, window, shift, wrap, scale,
-    )  # fmt: skip
-
-
-def _kernel_takes(qkv: Tensor, bias: Tensor, window: tuple[int, int], *others: object) -> bool:
-    """True if the GPU kernel supports it: the pairs of a window's tokens, and their queries, keys
-    and values, must fit in the registers of one program."""
-    tokens, head_dim = math.prod(window), qkv.shape[5]
-    dims = 64 if tokens <= 32 else 32
-    return bias.dtype == torch.float32 and tokens <= 64 and head_dim <= dims
 
 
 @torch.library.register_fake("darswin::window_attention")
 def _fake(qkv, bias, window, shift, periodic, scale):
+    _check(qkv, bias, window, shift)
     batch, rings, sectors, _, heads, head_dim = qkv.shape
     return qkv.new_empty((batch, rings, sectors, heads * head_dim))
 

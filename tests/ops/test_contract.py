@@ -102,8 +102,8 @@ def test_strides_do_not_matter(name, kind):
 
 
 @small_cases
-def test_gradients_may_arrive_expanded(name, device):
-    made = SMALL[name]().to(device)
+def test_gradients_may_arrive_expanded(name):
+    made = SMALL[name]()
     leaves = {name: t.requires_grad_() for name, t in made.inputs.items()}
     # The gradient of a sum arrives with stride 0.
     from_sum = torch.autograd.grad(made.run(**leaves).sum(), leaves.values())
@@ -113,8 +113,8 @@ def test_gradients_may_arrive_expanded(name, device):
 
 
 @small_cases
-def test_only_the_gradients_asked_for(name, device):
-    made = SMALL[name]().to(device)
+def test_only_the_gradients_asked_for(name):
+    made = SMALL[name]()
     every = results(made)
     for one in made.inputs:
         assert_equal_results(results(made, only=[one]), {one: every[one]})
@@ -141,9 +141,10 @@ def test_opcheck(name, dtype):
     first = next(iter(made.inputs))
     made = made.replace(**{first: made.inputs[first].to(dtype)})
     (operator, arguments), (backward, of_backward) = raw_calls(made)
+    assert sum(torch.is_tensor(a) and a.requires_grad for a in arguments) == len(made.inputs)
     for wanted in (False, True):
         given = [
-            a.detach().requires_grad_(wanted) if any(a is t for t in made.inputs.values()) else a
+            a.detach().requires_grad_(wanted) if torch.is_tensor(a) and a.requires_grad else a
             for a in arguments
         ]
         torch.library.opcheck(operator, given)
@@ -223,17 +224,34 @@ def test_export(name):
     assert torch.equal(program.module()(other), made.run(**other))
 
 
+def on_meta(made):
+    """The case on another device."""
+    made = made.to(torch.device("meta"))
+    if "azimuths" in made.settings:
+        made.settings["azimuths"] = made.settings["azimuths"].to("meta")
+    return made
+
+
 @small_cases
 def test_other_devices_run_the_reference(name):
     made = SMALL[name]()
-    out = made.run(**made.inputs)
-    there = made.to(torch.device("meta"))
-    if "azimuths" in there.settings:
-        there.settings["azimuths"] = there.settings["azimuths"].to("meta")
-    with torch.library._scoped_library("darswin", "FRAGMENT"):
-        found = there.run(**{n: t.requires_grad_() for n, t in there.inputs.items()})
+    out, there = made.run(**made.inputs), on_meta(made)
+    found = there.run(**{n: t.requires_grad_() for n, t in there.inputs.items()})
     assert found.shape == out.shape and found.dtype == out.dtype and found.device.type == "meta"
-    assert "darswin" not in str(found.grad_fn) and "Generated" not in type(found.grad_fn).__name__
+    assert f"{name.split(',')[0]}Backward" not in type(found.grad_fn).__name__
+
+
+@pytest.mark.slow
+@pytest.mark.unsanitized
+@small_cases
+def test_the_reference_compiles(name):
+    torch._dynamo.reset()
+    made = SMALL[name]()
+    run, expected = made.run, results(made, is_reference=True)
+    made.run = torch.compile(run, fullgraph=True, backend="aot_eager")
+    assert_equal_results(results(made, is_reference=True), expected, 1e-5)
+    there = on_meta(made)
+    assert there.run(**there.inputs).shape == expected["out"].shape
 
 
 # -- types -----------------------------------------------------------------------------------------
@@ -262,17 +280,20 @@ def test_autocast(name, reference):
         assert autocast(**SMALL[name](dtype=f64).inputs).dtype == f64 or samples
 
 
-@references
+@pytest.mark.parametrize("autocast", [False, True])
+@pytest.mark.parametrize("where", ["cpu", "meta", "reference"])
 @pytest.mark.parametrize("name", ["polar_sample, circular", "window_attention", "polar_to_image"])
-def test_float16_is_float32_under_autocast(name, reference):
+def test_float16_is_refused_on_every_device(name, where, autocast):
     made = SMALL[name]()
     first, values = next(iter(made.inputs.items()))
-    half, wide = (made.replace(**{first: v}) for v in (values.half(), values.half().float()))
-    with use_reference(reference):
-        with torch.autocast("cpu", dtype=torch.float16):
-            assert torch.equal(half.run(**half.inputs), wide.run(**wide.inputs))
-        with pytest.raises(TypeError, match=r"bfloat16.*, got torch.float16"):
-            half.run(**half.inputs)
+    half = made.replace(**{first: values.half()})
+    half = half.to(torch.device("meta")) if where == "meta" else half
+    with (
+        use_reference(where == "reference"),
+        torch.autocast("cpu", dtype=torch.float16, enabled=autocast),
+        pytest.raises(TypeError, match=f"{first} must be .*bfloat16.*, got torch.float16"),
+    ):
+        half.run(**half.inputs)
 
 
 @references

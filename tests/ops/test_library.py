@@ -1,28 +1,24 @@
 """The choice of an operator's code, the derivatives that it lacks, and NumPy's numbers."""
 
-import contextlib
 import functools
-import subprocess
+import os
 import sys
 from unittest import mock
 
 import numpy as np
 import pytest
 import torch
-from cases import SMALL, attention, bf16, f32, f64, polar_map, sampling
-from torch._subclasses import FakeTensorMode
+from cases import SMALL, attention, f32, f64
 from torch.autograd import forward_ad
 from torch.func import vmap
 
 from darswin import ops
 from darswin.ops import (
-    _library,
     polar_embed,
     polar_sample,
     polar_to_image,
     reference,
     reference_in_use,
-    triton,
     use_reference,
     window_attention,
 )
@@ -86,87 +82,6 @@ def test_use_reference_reaches_every_public_operator(name, monkeypatch):
     assert spy.call_count == 1 and not reference_in_use()
 
 
-def on_kernels(make, dtype=f32, installed=True, capability=(8, 0), **options):
-    """True if a call with fake tensors on a CUDA device runs a kernel."""
-    with (
-        mock.patch.object(triton, "INSTALLED", installed),
-        mock.patch.object(torch.cuda, "get_device_capability", return_value=capability),
-        mock.patch.object(_library, "call") as call,
-        contextlib.ExitStack() as stack,
-        FakeTensorMode(),
-    ):
-        twins = [
-            stack.enter_context(mock.patch.object(reference, name, autospec=True)) for name in CALLS
-        ]
-        made = make(dtype=f64 if dtype == f64 else f32, **options)
-        first = next(iter(made.inputs))
-        for tensors in (made.inputs, made.settings):
-            for name, t in tensors.items():
-                if isinstance(t, torch.Tensor):
-                    wanted = dtype if name == first else t.dtype
-                    tensors[name] = torch.empty(t.shape, dtype=wanted, device="cuda")
-        made.run(**made.inputs)
-    assert call.called != any(twin.called for twin in twins)
-    return call.called
-
-
-embedding = functools.partial(sampling, features=5)
-BY_KERNELS = [
-    (attention, dict()), (attention, dict(dtype=bf16)), (attention, dict(dtype=torch.float16)),
-    (attention, dict(rings=8, window=(8, 8))), (attention, dict(window=(1, 1), head_dim=1)),
-    (attention, dict(sectors=16, window=(2, 16), head_dim=64)),
-    *((make, dict(channels_last=False) | options) for make in (sampling, embedding) for options in (
-        dict(jitter=1.0), dict(dtype=bf16), dict(dtype=torch.uint8), dict(channels=300),
-        dict(dtype=torch.uint8, channels=16))),
-    (polar_map, dict()), (polar_map, dict(dtype=torch.float16)),
-]  # fmt: skip
-BY_THE_REFERENCE = [
-    (attention, dict(rings=5, sectors=13, window=(5, 13), head_dim=16)),
-    (attention, dict(rings=8, window=(8, 8), head_dim=33)),
-    (attention, dict(window=(1, 1), head_dim=65)), (attention, dict(dtype=f64)),
-    *((make, dict(channels_last=False) | options) for make in (sampling, embedding) for options in (
-        dict(dtype=torch.uint8, channels=17), dict(dtype=f64), dict(size=(50_000, 50_000)))),
-    (polar_map, dict(size=(50_000, 50_000))), (polar_map, dict(dtype=f64)),
-]  # fmt: skip
-
-
-@pytest.mark.parametrize(("make", "options"), BY_KERNELS)
-def test_a_cuda_device_runs_the_kernels(make, options):
-    assert on_kernels(make, **options)
-    if options.get("dtype") == torch.float16:
-        return
-    assert not on_kernels(make, installed=False, **options)
-    assert not on_kernels(make, capability=(7, 5), **options)
-    with use_reference():
-        assert not on_kernels(make, **options)
-    with mock.patch.object(torch.compiler, "is_exporting", return_value=True):
-        assert not on_kernels(make, **options)  # an exported graph runs without this package
-
-
-@pytest.mark.parametrize(("make", "options"), BY_THE_REFERENCE)
-def test_the_reference_runs_what_the_kernels_do_not_take(make, options):
-    assert not on_kernels(make, **options)
-
-
-@pytest.mark.parametrize("make", [attention, polar_map])
-def test_without_kernels_there_is_no_float16(make):
-    with pytest.raises(TypeError, match=r"got torch.float16"):
-        on_kernels(make, torch.float16, installed=False)
-
-
-@pytest.mark.slow
-def test_the_kernels_are_imported_by_the_first_call_alone():
-    code = (
-        "import sys, torch, darswin\n"
-        "from darswin.ops import triton\n"
-        "assert not any(name.startswith('darswin.ops.triton.') for name in sys.modules)\n"
-        "for name in triton.LAUNCHERS:\n"
-        "    there = torch._C._dispatch_has_kernel_for_dispatch_key(f'darswin::{name}', 'CUDA')\n"
-        "    assert there == triton.INSTALLED\n"
-    )
-    subprocess.run([sys.executable, "-c", code], check=True)
-
-
 # -- derivatives -----------------------------------------------------------------------------------
 
 
@@ -198,10 +113,12 @@ def test_derivatives_that_there_are_not_are_refused(name, kind):
 
 
 @compiles
-@pytest.mark.parametrize("fullgraph", [False, True])
-@forward_modes
+@pytest.mark.parametrize(
+    ("kind", "fullgraph"),
+    [*((kind, True) for kind in DERIVATIVES), ("forward mode", False), ("jvp", False)],
+)
 @operators
-def test_a_compiled_function_refuses_forward_mode(name, kind, fullgraph):
+def test_a_compiled_function_refuses_them_too(name, kind, fullgraph):
     run, x = CALLS[name]
     compiled = torch.compile(
         lambda x: DERIVATIVES[kind](lambda x: run(x * 2), x), fullgraph=fullgraph, backend="eager"
@@ -236,8 +153,9 @@ def test_a_compiled_function_may_map_over_the_operator(name):
 def test_transforms_of_other_tensors_are_allowed(name):
     run, x = CALLS[name]
     scale = torch.ones(())
-    grad = torch.func.grad(lambda scale: (scale * run(x)).sum())(scale)
-    torch.testing.assert_close(grad, run(x).sum())
+    for factor in (1, 2):  # torch.func wraps the result of x * 2, but does not differentiate it
+        grad = torch.func.grad(lambda scale, f=factor: (scale * run(x * f)).sum())(scale)
+        torch.testing.assert_close(grad, run(x * factor).sum())
     assert torch.equal(vmap(run)(x[None])[0], run(x))
     with torch.no_grad():
         assert torch.equal(vmap(run)(x[None])[0], run(x))
@@ -297,7 +215,7 @@ def test_a_call_takes_few_python_calls(name, recording):
     calls = []
 
     def count(frame, event, argument):
-        if event == "call":
+        if event == "call" and f"{os.sep}darswin{os.sep}ops{os.sep}" in frame.f_code.co_filename:
             calls.append(frame.f_code.co_name)
 
     run(x)
@@ -306,8 +224,8 @@ def test_a_call_takes_few_python_calls(name, recording):
         run(x)
     finally:
         sys.setprofile(None)
-    assert len(calls) < (50 if recording else 30), calls
-    assert not any(called.startswith("check_tensor") for called in calls)
+    assert len(calls) <= (10 if recording else 7), calls
+    assert "check_tensor" not in calls
 
 
 @pytest.mark.filterwarnings("ignore")  # torch.jit is deprecated, and warns about every shape
