@@ -170,8 +170,7 @@ def test_an_adapter_gets_what_it_samples_itself():
 
 
 def test_no_default_stands_in_for_a_missing_normalization():
-    adapter = LensAdapter(torch.nn.Identity(), 32)
-    adapter.mean = adapter.std = None  # it says nothing about its network
+    adapter = LensAdapter(torch.nn.Identity(), 32)  # it says nothing about its network
     for known in ({}, dict(mean=MEAN), dict(std=STD)):
         with pytest.raises(ValueError, match="does not say how frames are normalised"):
             frames.plan(adapter, ROUND, (64, 64), **known)
