@@ -369,11 +369,16 @@ def test_wrong_plans_are_explained(arguments, options, error, words):
         frames.plan(*arguments, **options)
 
 
-def test_the_released_model_has_no_plan():
-    model = OfficialDarSwin(embed_dim=24, depths=(1, 1), num_heads=(1, 2), samples=(4, 4))
-    lens = Polynomial([10.0], 1.5)
-    with pytest.raises(ValueError, match="transposed"):
-        frames.plan(model, lens, (64, 64))
+@torch.no_grad()
+def test_the_released_model_has_a_plan_too():
+    model = OfficialDarSwin(
+        embed_dim=24, depths=(1, 1), num_heads=(1, 2), samples=(4, 4), mean=0.4, std=0.2
+    ).eval()
+    lens, frame = Polynomial([10.0], 1.5), random_frame(64, 64, 3)
+    found = frames.Sampler(frames.plan(model, lens, (64, 64)))(frame)[None]
+    images = torch.from_numpy(frame).permute(2, 0, 1)[None]
+    expected = model.sample(images, model.prepare(lens, (64, 64)))
+    np.testing.assert_allclose(found, expected.numpy(), rtol=1e-4, atol=1e-4)
 
 
 PLAN = frames.plan(layer(), ROUND, (50, 60))
