@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from functools import partial
+from typing import Any
 
 from torch import Tensor, nn
 
@@ -63,7 +64,8 @@ class WindowAttention(nn.Module):
 
     def forward(self, x: Tensor, table: Tensor) -> Tensor:
         """(B, R, A, D) and the result of `position_bias` → the same shape as x."""
-        return self.proj(self.attend(self.queries_keys_values(x), table))
+        qkv = self.queries_keys_values(x)
+        return self.proj(window_attention(qkv, table, **self.windows()))
 
     def queries_keys_values(self, x: Tensor) -> Tensor:
         """(B, R, A, D) → (B, R, A, 3, heads, d)."""
@@ -73,11 +75,9 @@ class WindowAttention(nn.Module):
         # Sizes in words: with -1, a map of no images would be ambiguous.
         return self.qkv(x).reshape(batch, rings, sectors, 3, self.num_heads, dim // self.num_heads)
 
-    def attend(self, qkv: Tensor, table: Tensor) -> Tensor:
-        """Queries, keys and values (B, R, A, 3, heads, d) and the bias → (B, R, A, D)."""
-        return window_attention(
-            qkv, table, window=self.window, shift=self.shift, periodic=self.periodic
-        )
+    def windows(self) -> dict[str, Any]:
+        """The options of the operator `window_attention`."""
+        return dict(window=self.window, shift=self.shift, periodic=self.periodic)
 
     def extra_repr(self) -> str:
         return (

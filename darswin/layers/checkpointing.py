@@ -2,6 +2,7 @@
 
 import contextlib
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import torch
@@ -9,6 +10,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from darswin.layers.attention import WindowAttention
+from darswin.ops import window_attention
 
 
 def checkpointed(block: Any, x: Tensor, table: Tensor) -> Tensor:
@@ -32,9 +34,9 @@ def checkpointed(block: Any, x: Tensor, table: Tensor) -> Tensor:
 def _attention(attn: nn.Module, x: Tensor, table: Tensor) -> Tensor:
     if not isinstance(attn, WindowAttention):
         return attn(x, table)
-    qkv = attn.queries_keys_values(x)
-    out = attn.attend(qkv, table)
-    with recomputed(out, attn.attend, qkv, table):
+    qkv, attend = attn.queries_keys_values(x), partial(window_attention, **attn.windows())
+    out = attend(qkv, table)
+    with recomputed(out, attend, qkv, table):
         return attn.proj(out)
 
 
