@@ -155,10 +155,11 @@ def test_a_stage_is_attention_and_mlps_behind_residuals(drop_path):
 @pytest.mark.parametrize("position_bias", ["angular_relative", "angular"])
 def test_tables_that_are_made_at_once_and_their_gradients(position_bias):
     stage, last = stage_of(position_bias=position_bias), ANGLES[:, -1:].clone().requires_grad_()
-    angles = last * torch.linspace(0, 1, 5)
     biases = [block.attn.position_bias for block in stage.blocks]
     results = []
-    for tables in ([bias(angles) for bias in biases], stage.tables(grid_of(angles))):
+    for joined in (False, True):
+        angles = last * torch.linspace(0, 1, 5)
+        tables = stage.tables(grid_of(angles)) if joined else [bias(angles) for bias in biases]
         loss = sum(((k + 2) * table).sin().sum() for k, table in enumerate(tables))
         leaves = [last, *(p for bias in biases for p in bias.parameters())]
         results.append([*tables, *torch.autograd.grad(loss, leaves)])
