@@ -17,11 +17,11 @@ from torch.utils import _pytree as pytree
 from darswin.layers.quantized import quantized_layers, with_unsigned_weights
 from darswin.lens import Lens
 from darswin.models.base import Model
-from darswin.models.stages import Pair
 from darswin.ops import use_reference
 from darswin.utils.extras import lack
 from darswin.utils.progress import Progress
 from darswin.utils.quiet import quiet_export
+from darswin.views import Pair
 
 __all__ = ["export_onnx", "export_package", "export_program"]
 
@@ -70,7 +70,7 @@ class _OfTensors(nn.Module):
         if self.any_strides:
             pixels = tuple(map(_in_order, pixels))
             tensors = {name: _in_order(tensor) for name, tensor in tensors.items()}
-        prepared = self._prepare(tensors) if tensors else self.prepared
+        prepared: Any = self._prepare(tensors) if tensors else self.prepared
         first, *others = pixels
         if not isinstance(self.model, Model):
             return self.model(first, prepared)

@@ -4,55 +4,30 @@ In float32 all blocks of a stage are one C++ operator, and in int8 too, if the C
 Otherwise oneDNN computes the products, and each residual is added by the norm that follows it.
 """
 
-import contextlib
 import copy
 import warnings
-from collections.abc import Callable, Iterable, Sequence
-from typing import Any, Literal, TypeVar
+from collections.abc import Iterable, Sequence
+from functools import cache
+from typing import Any, Literal, NoReturn, Self, TypeVar
 
 import torch
 from torch import Tensor, nn
-from torch.nn.utils.fusion import fuse_conv_bn_eval
 
-from darswin.deploy.packed import (
-    PackedBlocks,
-    PackedLinear,
-    PackedNorm,
-    PackedQuantizedLinear,
-    fastest_dtype,
-    has_own_int8,
-    packed,
-    packed_attention,
-    packed_merging,
-    packed_norm,
-    taken,
-)
+from darswin.deploy.fast import fast
+from darswin.deploy.packed import fastest_dtype
 from darswin.deploy.quantize import quantize_model
-from darswin.layers.embed import PolarPatchEmbed
 from darswin.layers.linear import onednn_lack
-from darswin.layers.position_bias import RelativeBias, joined_coefficients
-from darswin.layers.quantized import (
-    Quantization,
-    QuantizedLinear,
-    quantized_layers,
-    without_quantized_layers,
-)
-from darswin.layers.transformer import Block, PatchMerging, Stage, Tables, WindowAttention
+from darswin.layers.quantized import quantized_layers, without_quantized_layers
 from darswin.lens import Lens
 from darswin.models.base import Model
-from darswin.models.conv_unet import ConvBlock, ConvUnet
 from darswin.models.encoder import Encoder, FeatureMaps
-from darswin.models.pixel import PixelHead, PixelModel
-from darswin.models.stages import Pair
-from darswin.models.unet import PatchExpand, SkipJoin, Unet
+from darswin.models.pixel import PixelModel
+from darswin.views import Pair, Prepared
 
 __all__ = ["optimize"]
 
 Net = TypeVar("Net", bound=Model)
 DTYPES = (torch.float32, torch.bfloat16, torch.int8)
-# A stage processes a large batch in parts. A part is so small that the tensors between two products
-# stay below this size: in the caches, and in memory that the allocator reuses.
-CACHED_BYTES = 16 * 2**20
 
 
 def optimize(
@@ -107,13 +82,12 @@ def optimize(
         raise ValueError(f"a quantized model or a calibration needs dtype=torch.int8, got {dtype}")
     if dtype == torch.bfloat16 and (lack := onednn_lack(dtype)) is not None:
         warnings.warn(f"optimize uses torch's own products, which are slower: {lack}", stacklevel=2)
-    optimized = copy.deepcopy(model).eval().requires_grad_(False)
-    for module in list(optimized.modules()):
-        _pack(module, dtype)
-    optimized.prepare = _with_tables(optimized, lens)  # type: ignore[assignment]
-    for module in optimized.modules():
-        if isinstance(module, Model):
-            _restrict(module)
+    optimized = copy.deepcopy(model).eval().requires_grad_(False).float()
+    fast(optimized, dtype)
+    for part in optimized.modules():
+        if isinstance(part, Model):  # an encoder may be part of another model
+            part.__class__ = _optimized_class(type(part))
+            vars(part).update(dtype=model.dtype, fixed_lens=lens, known={})
     return optimized
 
 
@@ -129,7 +103,7 @@ def _quantized(model: Net, calibration: Iterable[Sequence] | None) -> Net:
 def _check(model: nn.Module, dtype: torch.dtype | str, lens: Lens | None) -> None:
     if not isinstance(model, (Encoder, PixelModel, FeatureMaps)):
         raise TypeError(f"model must be a model of create_model, got {type(model).__name__}")
-    if "prepare" in vars(model):
+    if isinstance(model, Optimized):
         raise TypeError("model must be a model of create_model, got an optimized model")
     if lens is not None and (not isinstance(lens, Lens) or len(lens) != 1):
         raise ValueError(f"lens must be one lens, got {lens!r}")
@@ -144,181 +118,48 @@ def _check(model: nn.Module, dtype: torch.dtype | str, lens: Lens | None) -> Non
         )
 
 
-class InDtype(nn.Module):
-    """Runs a module, under autocast for bfloat16, converts its result to `dtype` and norms it."""
+class Optimized(Model[Any]):
+    """What an optimized model does in another way than its model. Its class inherits from both."""
 
-    def __init__(
-        self, module: nn.Module, dtype: torch.dtype, norm: Callable[[Tensor], Tensor] | None = None
-    ):
-        super().__init__()
-        self.module, self.dtype, self.norm = module, dtype, norm
+    dtype = torch.float32  # of the original weights
+    fixed_lens: Lens | None = None
+    known: dict[Pair, Prepared]  # the result of `prepare` for the fixed lens and each size
 
-    def forward(self, *arguments, **options) -> Tensor:
-        narrow = self.dtype == torch.bfloat16
-        autocast: Any = contextlib.nullcontext()
-        if narrow or torch.is_autocast_enabled("cpu"):
-            autocast = torch.autocast("cpu", torch.bfloat16, enabled=narrow)
-        with autocast:
-            result = self.module(*arguments, **options).to(self.dtype)
-        if torch.is_grad_enabled() and result.requires_grad:
-            raise RuntimeError(
-                "an optimized model has no gradients, but its images or its lens require one: call "
-                "it under torch.no_grad(), or use the original model"
-            )
-        return result if self.norm is None else self.norm(result)
-
-
-def _pack(module: nn.Module, dtype: torch.dtype) -> None:
-    """Replaces the layers of one module by packed ones, or converts them to `dtype`."""
-    if isinstance(module, Encoder):
-        _pack_norm(module, dtype)
-        embed, norm = module.patch_embed, None
-        is_float = next(embed.parameters()).dtype == torch.float32
-        if dtype == torch.float32 and is_float and isinstance(embed, PolarPatchEmbed):
-            norm = packed_norm(embed.norm, dtype)
-            _replace(embed, norm=nn.Identity())
-        module.patch_embed = InDtype(embed, dtype, norm)
-        if isinstance(embed, PolarPatchEmbed):
-            module.patch_embed.sample = embed.sample  # for `Model.sample`
-        if isinstance(module.head, nn.Linear):  # else an identity
-            _replace(module, head=PackedLinear(module.head, dtype))
-    elif isinstance(module, Stage):
-        _pack_stage(module, dtype)
-    elif isinstance(module, PatchMerging):
-        if _has_kernels(module, dtype):
-            merging = packed_merging(module.norm, module.reduction)
-            return _replace(module, reduction=merging, norm=lambda x: x)
-        reduction = packed(module.reduction, dtype)
-        _replace(module, reduction=reduction)
-        _pack_norm(module, dtype, taken(reduction))
-    elif isinstance(module, ConvBlock):
-        layers: Any = module
-        for conv in (0, 3):
-            fused = fuse_conv_bn_eval(layers[conv], layers[conv + 1])
-            layers[conv], layers[conv + 1] = InDtype(fused, dtype), nn.Identity()
-    elif isinstance(module, (PatchExpand, SkipJoin, PixelHead)):
-        for name, layer in list(module.named_children()):
-            if isinstance(layer, nn.LayerNorm):
-                layer.to(dtype)
-            elif isinstance(layer, (nn.Linear, QuantizedLinear)):
-                _replace(module, **{name: PackedLinear(layer, dtype)})
-            elif isinstance(layer, nn.Conv2d):
-                module.add_module(name, InDtype(layer, dtype))
-
-
-def _has_kernels(module: nn.Module, dtype: torch.dtype) -> bool:
-    """True if our own kernels compute the products of a module."""
-    return dtype == torch.float32 and (not quantized_layers(module) or has_own_int8())
-
-
-def _pack_stage(stage: Stage, dtype: torch.dtype) -> None:
-    if not isinstance(stage.downsample, (PatchMerging, nn.Identity)):
-        stage.downsample = InDtype(stage.downsample, dtype)
-    blocks: list[Any] = list(stage.blocks)
-    if not blocks:
-        return
-    attentions = [block.attn for block in blocks]
-    fc1 = blocks[0].mlp.fc1
-    widest = max(3, -(-fc1.out_features // fc1.in_features))  # queries, keys, values; or the MLP
-    stage.most_numbers = max(CACHED_BYTES // (widest * dtype.itemsize), 1)
-    in_windows = all(isinstance(attn, WindowAttention) for attn in attentions)
-    for mlp in (block.mlp for block in blocks):
-        if isinstance(mlp.fc1, QuantizedLinear) != isinstance(mlp.fc2, QuantizedLinear):
-            raise ValueError("both products of an MLP must be quantized, or none")
-    if in_windows and _has_kernels(stage.blocks, dtype):
-        _replace(stage, _run=PackedBlocks(blocks))
-        for block in blocks:
-            _replace(block, norm1=None, norm2=None, mlp=None)
-            _replace(block.attn, qkv=None, proj=None)
-    else:
-        stage.add = Tensor.add_
-        for block in blocks:
-            _pack_block(block, dtype)
-    biases = [a.position_bias for a in attentions if isinstance(a, WindowAttention)]
-    relative = [bias for bias in biases if isinstance(bias, RelativeBias)]
-    if relative:
-        joined = joined_coefficients(relative)
-        stage.coefficients = {name: rows.float() for name, rows in joined.items()}
-
-
-def _pack_block(block: Block, dtype: torch.dtype) -> None:
-    attn, mlp = block.attn, block.mlp
-    quantization = None
-    if isinstance(attn, WindowAttention):
-        qkv, proj = packed(attn.qkv, dtype), packed(attn.proj, dtype)
-        quantization = taken(qkv)
-        _replace(attn, qkv=qkv, proj=proj, attend=packed_attention(attn, taken(proj)))
-    else:
-        block.attn = InDtype(attn, dtype)
-    fc1: PackedLinear | PackedQuantizedLinear
-    fc2 = packed(mlp.fc2, dtype)
-    if isinstance(mlp.fc1, QuantizedLinear):
-        fc1 = PackedQuantizedLinear(mlp.fc1, gelu=taken(fc2))
-    else:
-        fc1 = PackedLinear(mlp.fc1, dtype, gelu=True)
-    _replace(mlp, fc1=fc1, fc2=fc2, activation=None)
-    norm1 = PackedNorm(block.norm1, dtype, quantization)
-    norm2 = PackedNorm(block.norm2, dtype, taken(fc1))
-    _replace(block, norm1=norm1, norm2=norm2, mlp=mlp.forward)
-
-
-def _pack_norm(module: Any, dtype: torch.dtype, quantization: Quantization | None = None) -> None:
-    if isinstance(module.norm, nn.LayerNorm):  # else an identity
-        _replace(module, norm=packed_norm(module.norm, dtype, quantization))
-
-
-def _replace(module: nn.Module, **layers: Any) -> None:
-    """Replaces submodules and methods by plain functions."""
-    for name, layer in layers.items():
-        module._modules.pop(name, None)
-        setattr(module, name, layer)
-
-
-def _with_tables(model: Model, fixed_lens: Lens | None) -> Callable[[Lens | None, Pair], Any]:
-    """A `prepare` that returns the position biases themselves. With a fixed lens it takes no lens,
-    and computes once for each image size."""
-    prepare, known = model.prepare, dict[Pair, Any]()
-
-    def with_tables(lens: Lens | None, size: Pair) -> Any:
-        if fixed_lens is None:
-            return _tables(model, prepare(lens, size))
+    def prepare(self, lens: Lens | None, size: Pair) -> Prepared:
+        if self.fixed_lens is None:
+            return super().prepare(lens, size)
         if lens is not None:
             raise ValueError("this model was optimized for a fixed lens: call it without a lens")
-        if size not in known:
-            known[size] = _tables(model, prepare(fixed_lens, size))
-        return known[size]
+        if size not in self.known:
+            self.known[size] = super().prepare(self.fixed_lens, size)
+        return self.known[size]
 
-    return with_tables
+    def _check_device(self, name: str, images: Tensor) -> None:
+        if not images.is_cpu:
+            raise ValueError(f"{name} must be on the CPU, as the model is, got {images.device}")
+
+    def train(self, mode: bool = True) -> Self:
+        if mode:
+            _refuse("trained: train the original model")
+        return self
+
+    def state_dict(self, *arguments: Any, **options: Any) -> Any:
+        _refuse("saved: save the original model")
+
+    def prune_intermediate_layers(self, *arguments: Any, **options: Any) -> Any:
+        _refuse("pruned: prune the original model, then optimize it")
+
+    def reset_classifier(self, num_classes: int) -> None:
+        _refuse("given a new head: give it to the original model, then optimize it")
+
+    def __reduce_ex__(self, protocol: Any) -> Any:
+        _refuse("copied or pickled: copy the original model, then optimize the copy")
 
 
-def _tables(model: Any, prepared: Any) -> Any:
-    if isinstance(model, FeatureMaps):
-        return _tables(model.encoder, prepared)
-    if isinstance(model, ConvUnet):
-        return prepared
-    if isinstance(model, Unet):
-        prepared = prepared._replace(encoder=_tables(model.encoder, prepared.encoder))
-        model = model.decoder
-    found = []
-    for stage, positions in zip(model.stages, prepared.positions, strict=True):
-        tables = stage.tables(*positions)
-        found.append((Tables(None if t is None else t.contiguous() for t in tables),))
-    return prepared._replace(positions=found)
+def _refuse(action: str) -> NoReturn:
+    raise TypeError(f"an optimized model cannot be {action}")
 
 
-def _restrict(model: Model) -> None:
-    """Replaces the methods that packed weights do not support by errors."""
-
-    def refuse(message: str) -> Callable:
-        def raise_error(*_arguments, **_options):
-            raise TypeError(f"an optimized model cannot be {message}")
-
-        return raise_error
-
-    not_trained = refuse("trained: train the original model")
-    model.__dict__.update(
-        train=lambda mode=True: not_trained() if mode else model,
-        state_dict=refuse("saved: save the original model"),
-        prune_intermediate_layers=refuse("pruned: prune the original model, then optimize it"),
-        __reduce_ex__=refuse("copied or pickled: copy the original model, then optimize the copy"),
-    )
+@cache
+def _optimized_class(kind: type) -> type:
+    return type(f"Optimized{kind.__name__}", (Optimized, kind), {})

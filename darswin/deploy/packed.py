@@ -1,8 +1,9 @@
-"""Layers with packed weights, which `darswin.optimize` uses in place of a model's layers.
+"""Layers by the libraries that compute them fastest: our own operators, and oneDNN.
 
 They are plain callables: a module would take a microsecond more for each call.
 """
 
+import contextlib
 from collections.abc import Callable, Sequence
 from functools import cache, partial
 from typing import Any
@@ -11,12 +12,16 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from darswin.layers.attention import WindowAttention
 from darswin.layers.linear import best_seconds, onednn_lack
-from darswin.layers.quantized import Quantization, QuantizedLinear
-from darswin.layers.transformer import WindowAttention
+from darswin.layers.quantized import Quantization, QuantizedLinear, quantized_layers
 from darswin.ops import cpu_capability
 
 __all__ = ["fastest_dtype"]
+
+Layer = Callable[[Tensor], Tensor]
+# The map of a stage, which may change in place, and the position biases of its blocks → the map.
+Blocks = Callable[[Tensor, Sequence[Tensor]], Tensor]
 
 _OPS = torch.ops.darswin
 _CPU = torch._C.DispatchKeySet(torch._C.DispatchKey.CPU)
@@ -33,44 +38,6 @@ _NORM = _operator("_norm")
 _LINEAR = _operator("_linear")
 _BLOCKS = _operator("_blocks_")
 _PANEL, _UNIT = 48, 16  # as in csrc/linear.h
-
-
-class PackedLinear:
-    """A linear layer in float32 or bfloat16, with a GELU after it if asked."""
-
-    def __init__(self, linear: object, dtype: torch.dtype, *, gelu: bool = False):
-        if not isinstance(linear, nn.Linear):
-            raise ValueError(f"this layer must be a linear one, got {type(linear).__name__}")
-        self._product: Callable[[Tensor], Tensor]
-        if dtype == torch.float32:
-            weights, columns = packed_weights(linear), linear.out_features
-            self._product = lambda x: _LINEAR(x, weights, columns, gelu)
-            return
-        # Tensors that are no parameters: in oneDNN's layout they can be neither moved nor saved.
-        weight, bias = (
-            None if t is None else t.detach().to(dtype, copy=True)
-            for t in (linear.weight, linear.bias)
-        )
-        if onednn_lack(dtype) is None:
-            self._product = onednn_linear(weight, bias, gelu=gelu)
-        elif gelu:
-            self._product = lambda x: F.gelu(F.linear(x, weight, bias))
-        else:
-            self._product = lambda x: F.linear(x, weight, bias)
-
-    def __call__(self, x: Tensor) -> Tensor:
-        """(..., D) → (..., D')."""
-        return self._product(x)
-
-
-def onednn_linear(
-    weight: Tensor | None, bias: Tensor | None, *, gelu: bool = False
-) -> Callable[[Tensor], Tensor]:
-    """A linear layer by oneDNN, which keeps the weight in its own layout."""
-    packed = torch.ops.mkldnn._reorder_linear_weight(weight)
-    product = torch.ops.mkldnn._linear_pointwise.default
-    after: tuple = ("gelu", [], "none") if gelu else ("none", [], "")
-    return lambda x: product(x, packed, bias, *after)
 
 
 def has_own_int8() -> bool:
@@ -107,126 +74,229 @@ def norm_parameters(norm: nn.LayerNorm) -> Tensor:
     return torch.stack((norm.weight, norm.bias)).detach().float()
 
 
-def packed_merging(norm: Any, reduction: Any) -> Callable[[Tensor], Tensor]:
-    """The norm and the linear layer of a merging, as one operator."""
-    weights, columns = packed_weights(reduction), reduction.out_features
-    parameters = norm_parameters(norm)
-    return lambda x: _LINEAR(x, weights, columns, False, parameters, norm.eps)
+def packed_blocks(blocks: Sequence[Any]) -> tuple[list[Tensor], list[int], int, int, float]:
+    """The blocks of a stage as arguments of `_blocks_`: all but the map and the position biases."""
+    parameters: list[Tensor] = []
+    windows: list[int] = []
+    for block in blocks:
+        attn, mlp = block.attn, block.mlp
+        parameters += [
+            norm_parameters(block.norm1),
+            packed_weights(attn.qkv),
+            packed_weights(attn.proj),
+            norm_parameters(block.norm2),
+            packed_weights(mlp.fc1),
+            packed_weights(mlp.fc2),
+        ]
+        windows += [*attn.window, *attn.shift, *attn.periodic]
+    return parameters, windows, attn.num_heads, mlp.fc1.out_features, block.norm1.eps
 
 
-class PackedBlocks:
-    """The blocks of a stage as one operator, in float32 or with 8-bit products. It replaces
-    `Stage._run`."""
+class Own:
+    """Our own operators, in float32 and, if `has_own_int8`, of quantized layers."""
 
-    def __init__(self, blocks: Sequence[Any]):
-        self._parameters: list[Tensor] = []
-        self._windows: list[int] = []
-        for block in blocks:
-            attn, mlp = block.attn, block.mlp
-            self._parameters += [
-                norm_parameters(block.norm1),
-                packed_weights(attn.qkv),
-                packed_weights(attn.proj),
-                norm_parameters(block.norm2),
-                packed_weights(mlp.fc1),
-                packed_weights(mlp.fc2),
-            ]
-            self._windows += [*attn.window, *attn.shift, *attn.periodic]
-        self._sizes = (blocks[0].attn.num_heads, blocks[0].mlp.fc1.out_features)
-        self._eps = blocks[0].norm1.eps
+    def linear(self, layer: Any, norm: Any = None, *, gelu: bool = False) -> Layer:
+        """A linear layer, behind a norm or before a GELU if asked."""
+        given: tuple = (packed_weights(layer), layer.out_features, gelu)
+        if norm is not None:
+            given = (*given, norm_parameters(norm), norm.eps)
+        return lambda x: _LINEAR(x, *given)
 
-    def __call__(self, x: Tensor, tables: Sequence[Tensor]) -> Tensor:
-        """The map of the stage, which changes in place, and the position biases of the blocks."""
-        x = x.contiguous()
-        _BLOCKS(x, self._parameters, tables, self._windows, *self._sizes, self._eps)
-        return x
-
-
-class PackedQuantizedLinear:
-    """A quantized linear layer: (..., D), uint8 of the quantization `activation` → (..., D').
-
-    The result is float32, or the GELU of it as uint8 of the quantization `gelu`.
-    """
-
-    def __init__(self, layer: QuantizedLinear, gelu: Quantization | None = None):
-        self.out_features = layer.out_features
-        self.activation = layer.activation
-        weight = torch.ops.onednn.qlinear_prepack(layer.weight.cpu(), None)
-        zero_points = torch.zeros(self.out_features, dtype=torch.int64)
-        scales = layer.weight_scale.detach().clone()
-        self._dtype = torch.float32 if gelu is None else torch.uint8
-        result: tuple = (1.0, 0, torch.float32, "none", [], "none")
-        if gelu is not None:
-            result = (*gelu, torch.uint8, "gelu", [], "none")
-        self._given = (*self.activation, weight, scales, zero_points, layer.bias, *result)
-        self._product = torch.ops.onednn.qlinear_pointwise.default
-
-    def __call__(self, q: Tensor) -> Tensor:
-        if not q.numel():  # oneDNN gives another shape
-            return q.new_empty((*q.shape[:-1], self.out_features), dtype=self._dtype)
-        return self._product(q, *self._given)
-
-
-Product = PackedLinear | PackedQuantizedLinear
-
-
-def packed(layer: object, dtype: torch.dtype) -> Product:
-    """The packed form of a linear layer, which may be quantized."""
-    if isinstance(layer, QuantizedLinear):
-        return PackedQuantizedLinear(layer)
-    return PackedLinear(layer, dtype)
-
-
-def taken(product: object) -> Quantization | None:
-    """The quantization of a product's input; None for a product without one."""
-    return product.activation if isinstance(product, PackedQuantizedLinear) else None
-
-
-def packed_norm(
-    norm: nn.LayerNorm, dtype: torch.dtype, quantization: Quantization | None = None
-) -> Callable[[Tensor], Tensor]:
-    """A layer norm in `dtype`. Its result is uint8 if a quantization is given."""
-    if dtype == torch.float32 and quantization is None:
+    def norm(self, norm: nn.LayerNorm) -> Layer:
+        """A layer norm."""
         parameters = norm_parameters(norm)
         return lambda x: _NORM(x, parameters, norm.eps)
-    weight, bias = norm_parameters(norm)
-    if quantization is not None:
-        given = (weight, bias, norm.eps, *quantization)
-        return lambda x: _ADD_NORM_QUANTIZED(x.contiguous(), None, *given)
-    return lambda x: torch.layer_norm(x, norm.normalized_shape, weight, bias, norm.eps)
+
+    def blocks(self, blocks: Sequence[Any]) -> Blocks:
+        """The blocks of a stage: one operator, if all of them have window attention."""
+        if not blocks or not all(_has_windows(block.attn) for block in blocks):
+            return OneDNN(torch.float32).blocks(blocks)
+        parameters, *given = packed_blocks(blocks)
+
+        def run(x: Tensor, tables: Sequence[Tensor]) -> Tensor:
+            x = x.contiguous()
+            _BLOCKS(x, parameters, tables, *given)
+            return x
+
+        return run
 
 
-class PackedNorm:
-    """`AddNorm` as one operator. Its norm is uint8 if a quantization is given."""
+class OneDNN(Own):
+    """oneDNN's products in bfloat16 and of quantized layers, and our own in float32.
 
-    def __init__(self, norm: object, dtype: torch.dtype, quantization: Quantization | None = None):
-        assert isinstance(norm, nn.LayerNorm)
-        self.norm = packed_norm(norm, dtype, quantization)
-        self._given = (*norm_parameters(norm), norm.eps)
-        self.quantization = quantization
+    Each layer is an operator, but a sum and the norm of it are one. Without oneDNN, torch computes
+    the products in bfloat16.
+    """
 
-    def __call__(self, x: Tensor, branch: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """As `AddNorm`. The sum overwrites x, and the norm may overwrite `branch`."""
-        x = x.contiguous()
-        if branch is None:
-            return x, self.norm(x)
-        branch = branch.contiguous()
-        if self.quantization is not None:
-            return x, _ADD_NORM_QUANTIZED(x, branch, *self._given, *self.quantization)
-        _ADD_NORM(x, branch, *self._given)
-        return x, branch
+    def __init__(self, dtype: torch.dtype):
+        self.dtype = dtype
+
+    def linear(
+        self,
+        layer: Any,
+        norm: Any = None,
+        *,
+        gelu: bool = False,
+        result: Quantization | None = None,
+    ) -> Layer:
+        """As `Own.linear`. A quantized layer without a norm takes uint8 of its quantization. With a
+        quantization for the result, that is uint8 too."""
+        taken = taken_by(layer)
+        if taken is not None:
+            product = _quantized_product(layer, result)
+        elif self.dtype == torch.float32:
+            return super().linear(layer, norm, gelu=gelu)
+        else:
+            product = _product(layer, self.dtype, gelu)
+        if norm is None:
+            return product
+        normed = self.norm(norm, taken)
+        return lambda x: product(normed(x))
+
+    def norm(self, norm: nn.LayerNorm, quantization: Quantization | None = None) -> Layer:
+        """A layer norm. Its result is uint8 if a quantization is given."""
+        weight, bias = norm_parameters(norm)
+        if quantization is not None:
+            given = (weight, bias, norm.eps, *quantization)
+            return lambda x: _ADD_NORM_QUANTIZED(x.contiguous(), None, *given)
+        if self.dtype == torch.float32:
+            return super().norm(norm)
+        return lambda x: torch.layer_norm(x, norm.normalized_shape, weight, bias, norm.eps)
+
+    def blocks(self, blocks: Sequence[Any]) -> Blocks:
+        """The blocks of a stage, layer by layer. The next norm adds the branch of the last one."""
+        layers = [
+            (
+                self._add_norm(block.norm1, taken_by(block.attn, "qkv")),
+                self._attention(block.attn),
+                self._add_norm(block.norm2, taken_by(block.mlp, "fc1")),
+                self.linear(block.mlp.fc1, gelu=True, result=taken_by(block.mlp, "fc2")),
+                self.linear(block.mlp.fc2),
+            )
+            for block in blocks
+        ]
+
+        def run(x: Tensor, tables: Sequence[Tensor]) -> Tensor:
+            branch = None
+            for (norm1, attn, norm2, fc1, fc2), table in zip(layers, tables, strict=True):
+                x, y = norm1(x, branch)
+                x, y = norm2(x, attn(y, table))
+                branch = fc2(fc1(y))
+            return x if branch is None else x.add_(branch)
+
+        return run
+
+    def _add_norm(
+        self, norm: nn.LayerNorm, quantization: Quantization | None
+    ) -> Callable[[Tensor, Tensor | None], tuple[Tensor, Tensor]]:
+        """The residual and a branch to add, or None → their sum, and the norm of the sum.
+
+        The sum overwrites the residual, and the norm may overwrite the branch.
+        """
+        alone, given = self.norm(norm, quantization), (*norm_parameters(norm), norm.eps)
+
+        def run(x: Tensor, branch: Tensor | None) -> tuple[Tensor, Tensor]:
+            x = x.contiguous()
+            if branch is None:
+                return x, alone(x)
+            branch = branch.contiguous()
+            if quantization is not None:
+                return x, _ADD_NORM_QUANTIZED(x, branch, *given, *quantization)
+            _ADD_NORM(x, branch, *given)
+            return x, branch
+
+        return run
+
+    def _attention(self, attn: Any) -> Callable[[Tensor, Tensor], Tensor]:
+        """Window attention without its checks, which cannot fail here; other kinds by torch."""
+        if not _has_windows(attn):
+            return InDtype(attn, self.dtype)
+        qkv, proj = self.linear(attn.qkv), self.linear(attn.proj)
+        sizes = (3, attn.num_heads, attn.dim // attn.num_heads)
+        attend = _OPS.window_attention.default
+        given: tuple = (attn.window, attn.shift, attn.periodic, sizes[2] ** -0.5)
+        if (quantization := taken_by(attn, "proj")) is not None:
+            attend, given = _OPS._window_attention_quantized.default, (*given, *quantization)
+        return lambda x, table: proj(attend(qkv(x).unflatten(-1, sizes), table, *given))
 
 
-def packed_attention(
-    attn: WindowAttention, quantization: Quantization | None
-) -> Callable[[Tensor, Tensor], Tensor]:
-    """`attn.attend` without its checks, which cannot fail here. It returns uint8 if quantized."""
-    head_dim = attn.dim // attn.num_heads
-    settings = (attn.window, attn.shift, attn.periodic, head_dim**-0.5)
-    if quantization is None:
-        return lambda qkv, bias: _OPS.window_attention.default(qkv, bias, *settings)
-    operator = _OPS._window_attention_quantized.default
-    return lambda qkv, bias: operator(qkv, bias, *settings, *quantization)
+def library(layer: nn.Module, dtype: torch.dtype) -> Own:
+    """The library that computes a layer, or a part of a model, fastest here."""
+    own = dtype == torch.float32 and (not quantized_layers(layer) or has_own_int8())
+    return Own() if own else OneDNN(dtype)
+
+
+def taken_by(module: nn.Module, name: str = "") -> Quantization | None:
+    """The quantization of what the layer with this name takes; None if it is not quantized."""
+    return quantized_layers(module).get(name)
+
+
+def _has_windows(attn: nn.Module) -> bool:
+    return isinstance(attn, WindowAttention)
+
+
+def _product(linear: Any, dtype: torch.dtype, gelu: bool) -> Layer:
+    """A linear layer in `dtype`, by oneDNN if it can."""
+    # Tensors that are no parameters: in oneDNN's layout they can be neither moved nor saved.
+    weight: Tensor = linear.weight.detach().to(dtype, copy=True)
+    bias = None if linear.bias is None else linear.bias.detach().to(dtype, copy=True)
+    if onednn_lack(dtype) is None:
+        return onednn_linear(weight, bias, gelu=gelu)
+    if gelu:
+        return lambda x: F.gelu(F.linear(x, weight, bias))
+    return lambda x: F.linear(x, weight, bias)
+
+
+def onednn_linear(weight: Tensor, bias: Tensor | None, *, gelu: bool = False) -> Layer:
+    """A linear layer by oneDNN, which keeps the weight in its own layout."""
+    packed = torch.ops.mkldnn._reorder_linear_weight(weight)
+    product = torch.ops.mkldnn._linear_pointwise.default
+    after: tuple = ("gelu", [], "none") if gelu else ("none", [], "")
+    return lambda x: product(x, packed, bias, *after)
+
+
+def _quantized_product(layer: QuantizedLinear, result: Quantization | None) -> Layer:
+    """A quantized layer by oneDNN: float32, or its GELU as uint8 of the quantization `result`."""
+    columns, dtype = layer.out_features, torch.float32 if result is None else torch.uint8
+    weight = torch.ops.onednn.qlinear_prepack(layer.weight.cpu(), None)
+    zero_points = torch.zeros(columns, dtype=torch.int64)
+    scales = layer.weight_scale.detach().clone()
+    after: tuple = (*(result or (1.0, 0)), dtype, "none" if result is None else "gelu", [], "none")
+    given = (*layer.activation, weight, scales, zero_points, layer.bias, *after)
+    product = torch.ops.onednn.qlinear_pointwise.default
+
+    def run(q: Tensor) -> Tensor:
+        if not q.numel():  # oneDNN gives another shape
+            return q.new_empty((*q.shape[:-1], columns), dtype=dtype)
+        return product(q, *given)
+
+    return run
+
+
+class InDtype(nn.Module):
+    """Runs a module by torch, under autocast for bfloat16; inputs and results are in `dtype`."""
+
+    def __init__(self, module: nn.Module, dtype: torch.dtype):
+        super().__init__()
+        self.module, self.dtype = module, dtype
+
+    def forward(self, x: Tensor, *others: Tensor) -> Tensor:
+        refuse_gradients(x)
+        narrow = self.dtype == torch.bfloat16
+        autocast: Any = contextlib.nullcontext()
+        if narrow or torch.is_autocast_enabled("cpu"):
+            autocast = torch.autocast("cpu", torch.bfloat16, enabled=narrow)
+        with autocast:
+            return self.module(x.to(self.dtype), *others).to(self.dtype)
+
+
+def refuse_gradients(x: Tensor) -> None:
+    """RuntimeError if what the network sees requires a gradient."""
+    if torch.is_grad_enabled() and x.requires_grad:
+        raise RuntimeError(
+            "an optimized model has no gradients, but its images or its lens require one: call it "
+            "under torch.no_grad(), or use the original model"
+        )
 
 
 @cache
@@ -243,7 +313,7 @@ def fastest_dtype() -> torch.dtype:
     x = torch.ones(512, 384)
     linear = nn.utils.skip_init(nn.Linear, 384, 1536)  # which draws no random numbers
     nn.init.ones_(linear.weight)
-    runs = {d: partial(PackedLinear(linear, d), x.to(d)) for d in dtypes}
+    runs = {d: partial(library(linear, d).linear(linear), x.to(d)) for d in dtypes}
     with torch.inference_mode():
         seconds = best_seconds(runs, turns=9)
     return min(seconds, key=seconds.__getitem__)

@@ -9,6 +9,7 @@ from typing import Generic, TypeVar
 import torch
 from torch import Tensor, nn
 
+from darswin.layers.attention import WindowAttention
 from darswin.layers.quantized import (
     Quantization,
     dequantize,
@@ -16,7 +17,7 @@ from darswin.layers.quantized import (
     quantized_layers,
     with_quantized_layers,
 )
-from darswin.layers.transformer import Block, PatchMerging, WindowAttention
+from darswin.layers.transformer import Block, PatchMerging
 from darswin.lens import Lens
 from darswin.models.base import Model
 from darswin.utils.progress import Progress

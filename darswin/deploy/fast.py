@@ -1,0 +1,152 @@
+"""The layers of optimized models, made from the layers of a model."""
+
+from collections.abc import Callable, Sequence
+from functools import partial, singledispatch
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.nn.utils.fusion import fuse_conv_bn_eval
+
+from darswin.deploy.packed import InDtype, Layer, Own, library, refuse_gradients
+from darswin.layers.embed import PatchProjection, PolarPatchEmbed
+from darswin.layers.position_bias import RelativeBias, joined_coefficients
+from darswin.layers.quantized import QuantizedLinear, quantized_layers
+from darswin.layers.transformer import PatchMerging, Stage
+from darswin.models.conv_unet import ConvBlock
+from darswin.models.unet import Unet
+from darswin.views import PolarGrid
+
+# A stage processes a large batch in parts. A part is so small that the tensors between two products
+# stay below this size: in the caches, and in memory that the allocator reuses.
+CACHED_BYTES = 16 * 2**20
+
+
+@singledispatch
+def fast(layer: nn.Module, dtype: torch.dtype) -> nn.Module:
+    """The layer that takes the place of another one. A kind of layer that is not registered here
+    stays, with fast layers in it."""
+    for name, part in layer.named_children():
+        layer.add_module(name, fast(part, dtype))
+    return layer
+
+
+@fast.register
+def _(unet: Unet, dtype: torch.dtype) -> nn.Module:
+    for part in (unet.encoder, unet.decoder, unet.head):  # the places of tokens stay in float32
+        fast(part, dtype)
+    return unet
+
+
+class FastLayer(nn.Module):
+    """A layer of a `library`."""
+
+    def __init__(self, layer: Layer):
+        super().__init__()
+        self.layer = layer
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.layer(x)
+
+
+@fast.register
+def _(linear: nn.Linear, dtype: torch.dtype) -> nn.Module:
+    return FastLayer(library(linear, dtype).linear(linear))
+
+
+@fast.register
+def _(layer: QuantizedLinear, dtype: torch.dtype) -> nn.Module:
+    raise ValueError(f"this layer must be a linear one, got {type(layer).__name__}")
+
+
+@fast.register
+def _(norm: nn.LayerNorm, dtype: torch.dtype) -> nn.Module:
+    return FastLayer(library(norm, dtype).norm(norm))
+
+
+@fast.register(PatchProjection)
+@fast.register(nn.Conv2d)
+def _(layer: nn.Module, dtype: torch.dtype) -> nn.Module:
+    return InDtype(layer, dtype)
+
+
+@fast.register
+def _(block: ConvBlock, dtype: torch.dtype) -> nn.Module:
+    layers: list[Any] = list(block)
+    convs = (fuse_conv_bn_eval(*layers[k : k + 2]) for k in (0, 3))
+    return nn.Sequential(*(part for conv in convs for part in (InDtype(conv, dtype), layers[2])))
+
+
+@fast.register(PolarPatchEmbed)
+class FastEmbed(nn.Module):
+    """The embedding of samples, in float32."""
+
+    def __init__(self, embed: PolarPatchEmbed, dtype: torch.dtype):
+        super().__init__()
+        self.proj, self.norm = Own().linear(embed.proj), Own().norm(embed.norm)
+        self.dtype = dtype
+
+    def forward(self, x: Tensor) -> Tensor:
+        refuse_gradients(x)
+        return self.norm(self.proj(x.float())).to(self.dtype)
+
+
+@fast.register(PatchMerging)
+class FastMerging(PatchMerging):
+    """The merging of tokens, with the norm and the product of a library."""
+
+    def __init__(self, merging: PatchMerging, dtype: torch.dtype):
+        nn.Module.__init__(self)
+        self.merge = merging.merge
+        self.product = library(merging, dtype).linear(merging.reduction, merging.norm)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.product(self.joined(x))
+
+
+@fast.register(Stage)
+class FastStage(nn.Module):
+    """A stage whose blocks a library computes, in parts if the batch is large."""
+
+    def __init__(self, stage: Stage, dtype: torch.dtype):
+        super().__init__()
+        self.downsample = fast(stage.downsample, dtype)
+        blocks: list[Any] = list(stage.blocks)
+        if any(len(quantized_layers(block.mlp)) == 1 for block in blocks):
+            raise ValueError("both products of an MLP must be quantized, or none")
+        self.blocks = library(stage.blocks, dtype).blocks(blocks)
+        layers = [block.mlp.fc1 for block in blocks]
+        # The widest tokens are queries, keys and values, or those within the MLP.
+        widest = max([3, *(-(-layer.out_features // layer.in_features) for layer in layers)])
+        self.most_numbers = max(CACHED_BYTES // (widest * dtype.itemsize), 1)
+        biases = [block.attn.position_bias for block in blocks]
+        relative = [bias for bias in biases if isinstance(bias, RelativeBias)]
+        self.heads = [bias.heads for bias in relative]
+        if relative:
+            self.table: Callable[[Tensor], Tensor] = partial(relative[0].table, **joined_coefficients(relative))
+            self.angles = blocks[0].attn.to("meta").angles  # which needs no weights
+        else:
+            self.constant = [bias().contiguous() for bias in biases]
+
+    def tables(self, points: PolarGrid | Tensor | None) -> Sequence[Tensor]:
+        """As `Stage.tables`, contiguous."""
+        if not self.heads:
+            return self.constant
+        tables = self.table(self.angles(points)).split(self.heads, 1)
+        return [table.contiguous() for table in tables]
+
+    def forward(self, x: Tensor, tables: Sequence[Tensor]) -> Tensor:
+        x = self.downsample(x)
+        if x.numel() <= self.most_numbers:
+            return self.blocks(x, tables)
+        count = min(-(-x.numel() // self.most_numbers), len(x))
+        x = x.contiguous()
+        parts = zip(x.tensor_split(count), *(_split(t, count) for t in tables), strict=True)
+        for part, *of_part in parts:
+            self.blocks(part, of_part)  # in place
+        return x
+
+
+def _split(table: Tensor, count: int) -> Sequence[Tensor]:
+    """The table for each part of the images. A table for all images serves every part."""
+    return [table] * count if len(table) == 1 else table.tensor_split(count)
