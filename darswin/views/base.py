@@ -344,7 +344,8 @@ def make_view(
         options: the other arguments of the view. None stands for the default of an argument.
 
     Raises:
-        ValueError: the name is unknown, or the view has no such option.
+        ValueError: the name is unknown.
+        TypeError: the view has no such option.
     """
     if name not in _VIEWS:
         raise ValueError(f"view must be one of {tuple(list_views())}, got {name!r}")
@@ -352,5 +353,5 @@ def make_view(
     try:
         inspect.signature(_VIEWS[name]).bind(size, **given)
     except TypeError as error:
-        raise ValueError(f"the view {name!r} has no such option: {error}") from error
+        raise TypeError(f"the view {name!r} has no such option: {error}") from error
     return _VIEWS[name](size, mean=mean, std=std, **given)

@@ -244,7 +244,7 @@ def test_any_command_line_ends_with_an_answer_or_a_sentence(
 
     def draw(image, lens, sampler, rays, title):
         assert rays.shape[0] * rays.shape[1] <= 800**2 and len(title) < 100
-        assert sampler.spec.rings * sampler.spec.sectors * math.prod(sampler.spec.samples) <= 2**22
+        assert sampler.rings * sampler.sectors * math.prod(sampler.samples) <= 2**22
 
     code, out, err = 0, io.StringIO(), io.StringIO()
     with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(out):

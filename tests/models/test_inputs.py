@@ -88,7 +88,7 @@ def test_normalize_refuses_what_it_cannot_take():
         model.normalize(frames.numpy())
     with pytest.raises(ValueError, match="must have 3 channels, got 2"):
         model.normalize(torch.rand(2, 2, 8, 8))
-    with pytest.raises(ValueError, match="normalize needs an adapter with mean and std"):
+    with pytest.raises(ValueError, match="normalize needs a model with mean and std"):
         adapter().normalize(torch.rand(2, 3, 8, 8))
     assert model.normalize(torch.rand(0, 3, 8, 8)).shape == (0, 3, 8, 8)
     image = torch.rand(1, 3, 8, 8, requires_grad=True)
@@ -283,6 +283,6 @@ def test_an_adapter_can_leave_its_results_in_the_view():
     assert [tuple(mask.shape) for mask in pixels["masks"]] == [(2, 3, 40, 48)] * 2
     # The way back of the other adapter brings the map to the pixels.
     back = LensAdapter(nn.Identity(), 32)
-    again = back.run_sampled(out["masks"][0], back.prepare(lens, (40, 48)))
+    again = back.view.back(out["masks"][0], back.prepare(lens, (40, 48)))
     torch.testing.assert_close(again, pixels["masks"][0])
     assert "output='view'" in repr(model)

@@ -467,7 +467,7 @@ def test_a_model_is_registered_in_four_sizes(monkeypatch):
     @registry.register_model("ours", presets=dict(nano=dict(embed_dim=8)), variant="A")
     class Ours(Encoder):
         def __init__(self, **options):
-            super().__init__()
+            super().__init__(2, 3, 8, (1,), (1,), 4.0, 0.0)
             self.options = options
 
     names = [f"ours_{size}" for size in ("micro", "nano", "small", "tiny")]
@@ -552,7 +552,7 @@ def test_what_a_model_tells_of_its_stages_is_what_they_give(name):
     assert model.num_features == model.head_hidden_size == info.channels(-1)
     # The size of a map is that of the images, or of the sampling grid, divided by the reduction.
     whole = model.image_size or [
-        count * s for count, s in zip(info[0]["map_size"], model.spec.samples, strict=True)
+        count * s for count, s in zip(info[0]["map_size"], model.view.samples, strict=True)
     ]
     for (rows, columns), reduction in zip(info.get("map_size"), info.reduction(), strict=True):
         assert max(whole[0] // rows, whole[1] // columns) == reduction

@@ -144,7 +144,7 @@ def test_a_view_of_ones_own_has_a_name():
     ("make", "kind", "message"),
     [
         (lambda: make_view("round", (8, 8)), ValueError, "view must be one of .*, got 'round'"),
-        (lambda: make_view("none", (8, 8), max_fov=1.0), ValueError, "'none' has no .*'max_fov'"),
+        (lambda: make_view("none", (8, 8), max_fov=1.0), TypeError, "'none' has no .*'max_fov'"),
         (lambda: make_view("square", (8, 9)), ValueError, r"must be square, got \(8, 9\)"),
         (lambda: make_view("square", (8, 8), mean=0.5, std=None), ValueError, "given together"),
         (lambda: make_view("perspective", (8, 8), max_fov=100.0), ValueError, r"\(0, π\), got 100"),
