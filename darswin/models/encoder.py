@@ -46,13 +46,13 @@ class Encoder(Model[Tensor]):
 
     def __init__(
         self,
-        num_classes: int,
-        in_chans: int,
-        embed_dim: int,
-        depths: Sequence[int],
-        num_heads: Sequence[int],
-        mlp_ratio: float,
-        drop_path_rate: float,
+        num_classes: int = 1000,
+        in_chans: int = 3,
+        embed_dim: int = 96,
+        depths: Sequence[int] = (2, 2, 18, 2),
+        num_heads: Sequence[int] = (3, 6, 12, 24),
+        mlp_ratio: float = 4.0,
+        drop_path_rate: float = 0.2,
     ):
         super().__init__()
         if len(depths) != len(num_heads) or not depths:

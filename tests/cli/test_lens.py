@@ -89,7 +89,7 @@ def test_misuse_is_refused_before_any_work(folder, capsys, monkeypatch, options,
     def work(*arguments, **options):
         raise AssertionError("it was refused too late")
 
-    monkeypatch.setattr(cli, "PolarSample", work)
+    monkeypatch.setattr(cli, "PolarView", work)
     picture = folder / "front.png"
     line = refusal(capsys, "lens", "show", folder / "front.json", picture, *options)
     assert line.startswith("darswin") and re.search(said, line)

@@ -467,7 +467,7 @@ def test_a_model_is_registered_in_four_sizes(monkeypatch):
     @registry.register_model("ours", presets=dict(nano=dict(embed_dim=8)), variant="A")
     class Ours(Encoder):
         def __init__(self, **options):
-            super().__init__(2, 3, 8, (1,), (1,), 4.0, 0.0)
+            super().__init__()
             self.options = options
 
     names = [f"ours_{size}" for size in ("micro", "nano", "small", "tiny")]
