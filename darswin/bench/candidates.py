@@ -12,9 +12,8 @@ from torch import Tensor
 
 from darswin.bench import timing
 from darswin.deploy.optimize import optimize
-from darswin.deploy.packed import has_own_int8, onednn_linear, packed, packed_weights
+from darswin.deploy.packed import OneDNN, Own, has_own_int8, library, onednn_linear
 from darswin.deploy.quantize import quantize_model
-from darswin.layers.embed import PolarPatchEmbed
 from darswin.layers.linear import Linear, best_seconds, onednn_lack
 from darswin.layers.quantized import QuantizedLinear, quantize
 from darswin.lens import Lens, Spherical
@@ -132,14 +131,14 @@ def _libraries(layer: Any, dtype: torch.dtype) -> dict[str, Callable[[Tensor], T
     """One linear layer by each library that computes it, in `dtype` or as it is quantized."""
     libraries: dict[str, Callable[[Tensor], Tensor]]
     if isinstance(layer, QuantizedLinear):
-        libraries = {"onednn": packed(layer, dtype)}
+        libraries = {"onednn": OneDNN(dtype).linear(layer)}
         if has_own_int8():
-            weights, columns = packed_weights(layer), layer.out_features
-            libraries["darswin"] = lambda q: torch.ops.darswin._linear(q, weights, columns, False)
+            libraries["darswin"] = Own().linear(layer)
         return libraries
     weight = layer.weight.detach().to(dtype)
     bias = None if layer.bias is None else layer.bias.detach().to(dtype)
-    libraries = {"darswin": packed(layer, dtype), "torch": lambda x: F.linear(x, weight, bias)}
+    ours = library(layer, dtype).linear(layer)
+    libraries = {"darswin": ours, "torch": lambda x: F.linear(x, weight, bias)}
     if onednn_lack(dtype) is None:
         libraries["onednn"] = onednn_linear(weight, bias)
     return libraries
@@ -150,12 +149,9 @@ def products_of(model: Model, images: Tensor, lens: Lens) -> list[tuple[Any, int
     found: list[tuple[Any, int]] = []
 
     def hook(layer: Any, _inputs: tuple[Tensor], output: Tensor) -> None:
-        # The linear layer of a polar embedding is not called: `polar_embed` takes its weight.
-        linear = layer.proj if isinstance(layer, PolarPatchEmbed) else layer
-        found.append((linear, output.numel() // linear.out_features))
+        found.append((layer, output.numel() // layer.out_features))
 
-    kinds = (Linear, QuantizedLinear, PolarPatchEmbed)
-    layers = [layer for layer in model.modules() if isinstance(layer, kinds)]
+    layers = [layer for layer in model.modules() if isinstance(layer, (Linear, QuantizedLinear))]
     handles = [layer.register_forward_hook(hook) for layer in layers]
     with torch.no_grad():
         model(images, lens)

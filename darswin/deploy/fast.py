@@ -123,7 +123,9 @@ class FastStage(nn.Module):
         relative = [bias for bias in biases if isinstance(bias, RelativeBias)]
         self.heads = [bias.heads for bias in relative]
         if relative:
-            self.table: Callable[[Tensor], Tensor] = partial(relative[0].table, **joined_coefficients(relative))
+            self.table: Callable[[Tensor], Tensor] = partial(
+                relative[0].table, **joined_coefficients(relative)
+            )
             self.angles = blocks[0].attn.to("meta").angles  # which needs no weights
         else:
             self.constant = [bias().contiguous() for bias in biases]

@@ -7,7 +7,6 @@ Otherwise oneDNN computes the products, and each residual is added by the norm t
 import copy
 import warnings
 from collections.abc import Iterable, Sequence
-from functools import cache
 from typing import Any, Literal, NoReturn, Self, TypeVar
 
 import torch
@@ -86,7 +85,8 @@ def optimize(
     fast(optimized, dtype)
     for part in optimized.modules():
         if isinstance(part, Model):  # an encoder may be part of another model
-            part.__class__ = _optimized_class(type(part))
+            kind = type(part)
+            part.__class__ = type(f"Optimized{kind.__name__}", (Optimized, kind), {})
             vars(part).update(dtype=model.dtype, fixed_lens=lens, known={})
     return optimized
 
@@ -158,8 +158,3 @@ class Optimized(Model[Any]):
 
 def _refuse(action: str) -> NoReturn:
     raise TypeError(f"an optimized model cannot be {action}")
-
-
-@cache
-def _optimized_class(kind: type) -> type:
-    return type(f"Optimized{kind.__name__}", (Optimized, kind), {})

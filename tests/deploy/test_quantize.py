@@ -98,8 +98,8 @@ def test_calibration_and_quantized_models_come_to_the_same():
 def test_without_own_kernels_onednn_computes_the_same(monkeypatch):
     quantized, seen = quantize_model(network(), [batch()]), batch()
     want = optimize(quantized, torch.int8)(*seen)
-    monkeypatch.setattr("darswin.deploy.optimize.has_own_int8", lambda: False)
-    monkeypatch.setattr("darswin.deploy.optimize.PackedBlocks", None)
+    monkeypatch.setattr("darswin.deploy.packed.has_own_int8", lambda: False)
+    monkeypatch.setattr("darswin.deploy.packed.packed_blocks", None)
     assert relative_error(optimize(quantized, torch.int8)(*seen), want) < 0.005
 
 

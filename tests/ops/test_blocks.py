@@ -8,7 +8,7 @@ import torch.nn.functional as F
 from cases import assert_same_bits_on_any_number_of_threads
 from torch import nn
 
-from darswin.deploy.packed import PackedBlocks, norm_parameters, packed_weights
+from darswin.deploy.packed import Own, norm_parameters, packed_blocks, packed_weights
 from darswin.layers.attention import WindowAttention
 from darswin.layers.transformer import Block
 from darswin.ops import use_reference
@@ -130,10 +130,9 @@ every_stage = pytest.mark.parametrize(
 
 
 def run(blocks, x):
-    branch = None
     for block in blocks:
-        x, branch = block(x, branch, None)
-    return x + branch
+        x = block(x, block.attn.position_bias())
+    return x
 
 
 @pytest.mark.parametrize("batch", [0, 1, 3])
@@ -144,7 +143,7 @@ def test_blocks_are_those_of_the_layers(batch, sizes):
     x = torch.randn(batch, *map_size, dim)
     tables = [block.attn.position_bias().contiguous() for block in blocks]
     own = run(blocks, x)
-    got = PackedBlocks(blocks)(x.clone(), tables)
+    got = Own().blocks(blocks)(x.clone(), tables)
     with use_reference():
         want = run(blocks.double(), x.double())
     assert got.shape == want.shape
@@ -157,7 +156,7 @@ def test_same_bits_on_any_number_of_threads():
     blocks, linear = stage(dim=48, map_size=(16, 32)), layer(700, 500)
     x, rows = torch.randn(4, 16, 32, 48), torch.randn(100, 700)
     tables = [block.attn.position_bias().contiguous() for block in blocks]
-    packed, weights = PackedBlocks(blocks), packed_weights(linear)
+    packed, weights = Own().blocks(blocks), packed_weights(linear)
     assert_same_bits_on_any_number_of_threads(
         lambda: dict(
             blocks=packed(x.clone(), tables), linear=_linear(rows, weights, 500, True),
@@ -181,16 +180,18 @@ def test_wrong_arguments():
             _linear(x, packed, columns, False)
 
     blocks = stage(depth=1)
-    packed, table = PackedBlocks(blocks), blocks[0].attn.position_bias().contiguous()
+    table = blocks[0].attn.position_bias().contiguous()
+    parameters, windows, heads, mlp_dim, eps = packed_blocks(blocks)
+    assert (heads, mlp_dim, eps) == (3, 60, 1e-5)
     given = dict(
-        x=torch.zeros(1, 8, 16, 24), parameters=packed._parameters, tables=[table],
-        windows=packed._windows, heads=3, mlp_dim=60, eps=1e-5,
+        x=torch.zeros(1, 8, 16, 24), parameters=parameters, tables=[table], windows=windows,
+        heads=heads, mlp_dim=mlp_dim, eps=eps,
     )  # fmt: skip
     torch.ops.darswin._blocks_(*given.values())
     for change in (
         dict(x=torch.zeros(1, 8, 16, 20)), dict(x=torch.zeros(8, 16, 24)),
         dict(x=torch.zeros(1, 16, 8, 24).transpose(1, 2)), dict(x=torch.zeros(1, 8, 12, 24)),
-        dict(parameters=packed._parameters[:5]), dict(tables=[]), dict(tables=[table[:, :2]]),
+        dict(parameters=parameters[:5]), dict(tables=[]), dict(tables=[table[:, :2]]),
         dict(windows=[4, 8, 0, 0, 0]), dict(windows=[4, 7, 0, 0, 0, 1]), dict(heads=0),
         dict(windows=[4, 8, 0, 16, 0, 1]), dict(heads=5), dict(mlp_dim=2**61), dict(mlp_dim=59),
         dict(mlp_dim=0),

@@ -9,12 +9,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from test_blocks import every_stage, stage
 
-from darswin.deploy.packed import (
-    PackedBlocks,
-    PackedQuantizedLinear,
-    norm_parameters,
-    packed_weights,
-)
+from darswin.deploy.packed import OneDNN, Own, norm_parameters, packed_weights
 from darswin.layers.linear import onednn_lack
 from darswin.layers.quantized import QuantizedLinear, quantize, with_quantized_layers
 from darswin.ops import _module, cpu_capability
@@ -68,7 +63,7 @@ def test_bits_are_those_of_onednn(size, bias):
         linear.bias = torch.randn(columns)
     q = tokens(2, rows, depth)
     got = OPS._linear(q, packed_weights(linear), columns, False)
-    assert torch.equal(got, PackedQuantizedLinear(linear)(q))
+    assert torch.equal(got, OneDNN(torch.float32).linear(linear)(q))
 
 
 @needs_kernel
@@ -121,14 +116,14 @@ def step_by_step(blocks, tables, x):
 def test_blocks_are_those_of_the_layers(batch, names, sizes):
     blocks, tables = quantized_stage(names, **sizes)
     x = torch.randn(batch, *blocks[0].attn.map_size, blocks[0].attn.dim)
-    got = PackedBlocks(blocks)(x.clone(), tables)
+    got = Own().blocks(blocks)(x.clone(), tables)
     assert torch.equal(got, step_by_step(blocks, tables, x) if batch else x)
 
 
 @needs_kernel
 def test_same_bits_on_any_number_of_threads():
     blocks, tables = quantized_stage(dim=48, map_size=(16, 32))
-    packed, x = PackedBlocks(blocks), torch.randn(4, 16, 32, 48)
+    packed, x = Own().blocks(blocks), torch.randn(4, 16, 32, 48)
     weights, rows = packed_weights(layer(701, 500)), tokens(100, 701)
     assert_same_bits_on_any_number_of_threads(
         lambda: dict(
@@ -143,9 +138,9 @@ def test_same_bits_on_any_number_of_threads():
 def test_numbers_that_are_not_finite_stay_in_their_windows():
     blocks, tables = quantized_stage(depth=1)
     x = torch.randn(1, 8, 16, 24)
-    clean = PackedBlocks(blocks)(x.clone(), tables)
+    clean = Own().blocks(blocks)(x.clone(), tables)
     x[0, 0, 0, 3] = math.nan
-    got = PackedBlocks(blocks)(x, tables)
+    got = Own().blocks(blocks)(x, tables)
     assert torch.equal(got[:, 4:], clean[:, 4:]) and torch.equal(got[:, :, 8:], clean[:, :, 8:])
 
 
