@@ -136,8 +136,9 @@ def _register_autograd(operator: OpOverload, title: str, gradients: Callable) ->
     """Makes autograd record the operator; `gradients(ctx, *grads)` is its derivative.
 
     The dispatcher calls `differentiable` in every mode: eager, compiled, exported and traced.
-    torch.library.register_autograd would do the same, but it would take 40 µs more to record a
-    gradient. It would also ignore forward-mode AD.
+    torch.library.register_autograd would do the same, but it takes 10 to 40 µs more to record a
+    gradient, and gives zeros for forward-mode AD. A call of a public function takes 4 to 8 µs more
+    than the compiled code alone, and 13 to 20 µs more if a gradient is recorded.
     """
     kinds = [str(argument.type) for argument in operator._schema.arguments]
     tensors = [index for index, kind in enumerate(kinds) if "Tensor" in kind]

@@ -72,7 +72,7 @@ def as_sampling(
     """The arguments of a public function as those of its operator. Raises TypeError, ValueError or
     NotImplementedError for what the operator does not see; `check_sampling` explains the rest."""
     if not isinstance(image, Tensor) or image.dim() != 4:
-        _check_image(image, channels_last)
+        _check_image(image, channels_last)  # raises
     if isinstance(azimuths, Tensor) and azimuths.requires_grad and torch.is_grad_enabled():
         _refuse_gradient_of_azimuths()
     dtype, frames = image.dtype, image.dtype == torch.uint8

@@ -55,7 +55,7 @@ def window_attention(
     # torch.jit.trace rejects lists of bools.
     wrap = int(bool(periodic[0])), int(bool(periodic[1]))
     if not isinstance(qkv, Tensor) or qkv.dim() != 6 or qkv.shape[5] == 0:
-        _check(qkv, bias, window, shift)
+        _check(qkv, bias, window, shift)  # raises: the scale comes from the head dim
     # The bias of a bfloat16 qkv is used in float32; autocast may have narrowed it.
     if isinstance(bias, Tensor) and bias.dtype == torch.bfloat16:
         narrow = qkv.dtype == torch.bfloat16 or _library.autocast_dtype(qkv) is not None

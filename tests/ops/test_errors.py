@@ -37,6 +37,7 @@ SAMPLING = [
     (dict(radii=zeros(3, 6)), ValueError, r"radii must have shape .*\(2 or 1, any\)"),
     (dict(radii=zeros(2, 7), offsets=None), ValueError, DIVIDE),
     (dict(radii=None), TypeError, "radii must be a tensor, got NoneType"),
+    (dict(radii=1.5), TypeError, "radii must be a tensor, got float"),
     (dict(azimuths=zeros(1, 8)), ValueError, r"azimuths must have shape \(A·S_φ,\)"),
     (dict(azimuths=zeros(9), offsets=None), ValueError, "must divide"),
     (dict(center=zeros(2, 3)), ValueError, "center must have shape"),
@@ -55,6 +56,7 @@ SAMPLING = [
     (dict(jitter=-0.1), ValueError, r"jitter must be in \[0, 1\]"),
     (dict(jitter=math.nan), ValueError, r"jitter must be in \[0, 1\]"),
     (dict(jitter="much"), TypeError, "jitter must be a float"),
+    (dict(jitter=torch.tensor(0.0)), TypeError, "jitter must be a float, got .*Tensor"),
     *((dict(jitter=0.5, seed=bad), TypeError, "seed must be an int")
       for bad in (1.5, np.float64(2), True, "2", None)),
     (dict(jitter=0.5, seed=2**63), ValueError, "seed must fit 64 bits"),
@@ -82,11 +84,15 @@ WRONG = {
         (dict(qkv=None), TypeError, "qkv must be a tensor, got NoneType"),
         (dict(qkv=zeros(2, 4, 8, 30)), ValueError, r"3, heads, d\), got \(2, 4, 8, 30\)"),
         (dict(qkv=zeros(2, 4, 8, 3, 2, 0)), ValueError, "head dim"),
+        (dict(qkv=zeros(2, 4, 8, 3, 2, 0), scale=1.0), ValueError, "head dim"),
         (dict(qkv=zeros(2, 0, 8, 3, 2, 5)), ValueError, "rings"),
         (dict(qkv=zeros(2, 4, 0, 3, 2, 5)), ValueError, "sectors"),
         (dict(qkv=zeros(2, 4, 8, 3, 2, 5).long()), TypeError, "float32, float64 or bfloat16"),
         (dict(bias=zeros(1, 2, 3, 7).double()), TypeError, "bias must be float32, got"),
+        (dict(bias=zeros(1, 2, 3, 7).bfloat16()), TypeError, "bias must be float32, got"),
+        (dict(bias=zeros(1, 2, 3, 7, device="meta")), ValueError, "bias must be on the same"),
         (dict(bias=zeros(3, 2, 3, 7)), ValueError, "bias must have shape"),
+        (dict(window=(True, 4)), TypeError, "window must be a pair of ints"),
         (dict(bias=zeros(1, 2, 2, 7)), ValueError, "bias must have shape"),
         (dict(window=(3, 4)), ValueError, r"divide \(R, A\) = \(4, 8\), got \(3, 4\)"),
         (dict(window=(2, 3)), ValueError, "window must divide"),
@@ -116,6 +122,8 @@ WRONG = {
         (dict(center=None, points=ones(1, 4, 4, 2)), ValueError, r"\(1 or 1, 4, 5, 2\)"),
         (dict(affine=ones(1, 2, 3)), ValueError, "affine must have shape"),
         (dict(size=(4, -1)), ValueError, "size must be at least 0"),
+        (dict(size=(True, 4)), TypeError, "size must be a pair of ints"),
+        (dict(center=ones(1, 2, device="meta")), ValueError, "center must be on the same device"),
         (dict(r_max=ones(3)), ValueError, r"r_max must have shape \(B or 1,\)"),
         (dict(plan=ones(1, 4, 5, 3)), ValueError, r"plan must have shape .* 4, 3, 5\)"),
         (dict(plan=ones(1, 4, 3, 5).double()), TypeError, "plan must be float32"),
@@ -141,9 +149,11 @@ def test_errors_name_what_was_expected(name, reference):
 def test_fake_tensors_are_checked_too(name):
     """Their operators compute nothing, so they would not notice wrong arguments."""
     operator, valid = VALID[name]
-    of_values = ("finite, at least 0, and rise", "and rise", "at least 0", "finite")
+    # Fake tensors have no values, and torch makes a tensor of a number.
+    others = ("finite, at least 0, and rise", "and rise", "at least 0", "finite",
+              "radii must be a tensor, got float")  # fmt: skip
     for change, error, message in WRONG[name]:
-        if message in of_values:  # fake tensors have none
+        if message in others:
             continue
         with FakeTensorMode(allow_non_fake_inputs=True) as mode:
             fake = {
