@@ -34,7 +34,8 @@ def checkpointed(block: Any, x: Tensor, table: Tensor) -> Tensor:
 def _attention(attn: nn.Module, x: Tensor, table: Tensor) -> Tensor:
     if not isinstance(attn, WindowAttention):
         return attn(x, table)
-    qkv, attend = attn.queries_keys_values(x), partial(window_attention, **attn.windows())
+    attend: Callable[..., Tensor] = partial(window_attention, **attn.windows())
+    qkv = attn.queries_keys_values(x)
     out = attend(qkv, table)
     with recomputed(out, attend, qkv, table):
         return attn.proj(out)

@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from darswin.models.views import LensAdapter
 from lens_examples import ASIDE, example
 
 from darswin import create_model
@@ -9,7 +10,6 @@ from darswin.compat import OfficialDarSwin
 from darswin.deploy.export import export_onnx, export_package, export_program
 from darswin.lens import MODELS as LENS_MODELS
 from darswin.lens import distorted, solve
-from darswin.models.views import LensAdapter
 
 SIDE = 16
 ONE = dict(embed_dim=8, depths=(1,), num_heads=(1,))
