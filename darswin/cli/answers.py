@@ -302,13 +302,13 @@ def claim_folder(out: str | None, record: str = ANSWERS) -> Path:
     """The folder for the pictures of a command: new, empty, or from an earlier run of the command,
     which left the file `record` there."""
     if out is None:
-        raise ValueError("missing `out`: this model writes pictures; give a folder for them")
+        raise ValueError("missing --out: this model writes pictures; give a folder for them")
     folder = Path(out)
     if folder.exists() and not folder.is_dir():
-        raise ValueError(f"`out` must be a folder for the pictures, but {out} is a file")
+        raise ValueError(f"--out must be a folder for the pictures, but {out} is a file")
     if folder.is_dir() and not _is_ours(folder / record) and any(folder.iterdir()):
         raise ValueError(
-            f"`out` {out} holds other files: give a new or an empty folder, or one of an earlier "
+            f"--out {out} holds other files: give a new or an empty folder, or one of an earlier "
             "run of this command, whose files are replaced"
         )
     replace_file(folder / record, "[]")

@@ -15,6 +15,7 @@ from lightning.pytorch.plugins.io import TorchCheckpointIO
 
 from darswin.models.saving import ModelCard, save_model
 from darswin.utils.files import replace_file
+from darswin.utils.parameters import naming
 from darswin.utils.unpickle import read_pickle
 
 # -- checkpoints ------------------------------------------------------------------------------
@@ -140,7 +141,7 @@ class SafeCheckpointIO(TorchCheckpointIO):
         except ValueError as error:
             others = sorted(set(Path(path).parent.glob("*.ckpt")) - {Path(path)})
             hint = f"; `ckpt_path` {others[0]} starts from the other one" if others else ""
-            raise ValueError(f"{error}{hint}") from error
+            raise naming(ValueError(f"{error}{hint}"), "ckpt_path") from error
         if not isinstance(checkpoint, dict) or "darswin" not in checkpoint:
             raise ValueError(f"{path} is not a checkpoint of `darswin fit`: it names no model")
         return checkpoint
@@ -245,24 +246,27 @@ CHANGEABLE = {
 }
 
 
-def check_changes(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
-    """A line for each option that changes on resume; ValueError for options that cannot change."""
+def check_changes(before: Mapping[str, Any], now: Mapping[str, Any]) -> dict[str, str]:
+    """Each option that changes on resume, and its change in words; ValueError for options that
+    cannot change."""
     before, now = _options(before), _options(now)
     changes = {
-        name: f"`{name}` {now[name]!r} in place of {before.get(name)!r}"
+        name: f"{now[name]!r} in place of {before.get(name)!r}"
         for name in now
         # An older run may lack an option; the option is no change if it is off now.
         if now[name] != before.get(name) and (name in before or now[name])
     }
     refused = [
-        text
-        for name, text in changes.items()
+        name
+        for name in changes
         if name not in CHANGEABLE
         and (not name.startswith("trainer.") or name == "trainer.accumulate_grad_batches")
     ]
     if refused:
-        raise ValueError(f"a resumed run cannot change these options: {'; '.join(refused)}")
-    return list(changes.values())
+        each = "; ".join(f"`{name}` {changes[name]}" for name in refused)
+        text = f"a resumed run cannot change these options: {each}"
+        raise naming(ValueError(text), *refused)
+    return changes
 
 
 def _options(config: Mapping[str, Any]) -> dict[str, Any]:

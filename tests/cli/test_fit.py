@@ -35,7 +35,7 @@ def scenes(tmp_path_factory):
     ("options", "message"),
     [
         # Of this program, of the data, the model and the trainer: each by its flag.
-        ("--data.batch_size 0", "--data.batch_size must be at least 1 and --data.workers at least"),
+        ("--data.batch_size 0", "--data.batch_size must be at least 1, got 0"),
         ("--data.holdout 0", "none of its own; set --trainer.limit_val_batches 0 to train without"),
         ("--data.train_lenses low --data.lens {}", "--data.train_lenses warps pictures through"),
         ("--data.test_lenses=low --data.lens {}", "--data.test_lenses warps pictures through"),
@@ -62,7 +62,7 @@ def scenes(tmp_path_factory):
         ("--model darswin_a_small", "darswin_a_small is none; type --model.name darswin_a_small; "),
         (
             "--model=darswin_a_small",
-            "error: --model takes a file of options, and darswin_a_small is",
+            "darswin: --model takes a file of options, and darswin_a_small is",
         ),
         ("--data photos", "type --data.path photos; `darswin fit --help` lists the options"),
         ("--trainer 3", "--trainer takes a file of options, and 3 is none; `darswin fit"),

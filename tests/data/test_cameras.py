@@ -73,7 +73,7 @@ def test_coefficients_that_the_file_does_not_name(root):
             Calibrations(listed(root, {".": entry}), root),
             Calibrations(None, root, coefficients=model, files={root / "a/0.png": file}),
         ):
-            same(lenses.lens_of(root / "a/0.png", (960, 1280)), load(file, model=model))
+            same(lenses.lens_of(root / "a/0.png", (960, 1280)), load(file, coefficients=model))
 
 
 def test_a_lens_as_json(root):

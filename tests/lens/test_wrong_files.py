@@ -65,7 +65,7 @@ CHANGED = {
          "none camera does not use the numbers of cam0.distortion_coeffs"),
     ),
     "ros_fisheye.yaml": (
-        ("equidistant", "magic", "got 'magic'; else choose with model="),
+        ("equidistant", "magic", "got 'magic'; else choose with `coefficients` one of fisheye"),
         ("0.007163902584170265]", "0.009, 0.1]", "got 5"),
     ),
     "opencv_fisheye.yaml": (
@@ -128,16 +128,17 @@ TEXTS = (
     ("a: [1, 2", "not valid YAML: line 1: expected"), ("a: 1\n---\nb: 1", "not valid YAML"),
     ("a: \x00", "it is not valid YAML"), ('a: "\\UFFFFFFFF"', "it is not valid YAML"),
     # The choice of the camera.
-    (TUMVI, "several cameras, choose one with camera=: 'cam0', 'cam1'"),
+    (TUMVI, "several cameras, choose one with `camera`: 'cam0', 'cam1'"),
     *((TUMVI, "one of 'cam0', 'cam1', or its number", dict(camera=camera))
       for camera in ("cam2", 2, "2", -1, 1.5)),
-    *((COLMAP, "camera must be one of '1', '2', '5', '7', got", dict(camera=camera))
+    *((COLMAP, "`camera` must be one of '1', '2', '5', '7', got", dict(camera=camera))
       for camera in ("0", "3", 3, "-1", "4", True, 1.0)),
     # The choice of the model.
     (opencv(D=D[:4]), "the coefficients of D " + OPEN),
-    (opencv(D=D[:4]), "xi is missing", dict(model="omnidir")),
-    (opencv(D=D[:4]), "model must be one of fisheye, pinhole, omnidir", dict(model="x")),
-    (file_text("woodscape.json"), "the file names the models", dict(model="fisheye")),
+    (opencv(D=D[:4]), "xi is missing", dict(coefficients="omnidir")),
+    (opencv(D=D[:4]), "`coefficients` must be one of fisheye, pinhole, omnidir",
+     dict(coefficients="x")),
+    (file_text("woodscape.json"), "the file names the models", dict(coefficients="fisheye")),
     (flat("k1", "k2"), "the coefficients of k1, k2 " + OPEN),
     (flat(), "a camera without coefficients " + OPEN),
     (flat("k1", "k2", "k3", "k4", model="pinhole"), "the pinhole model's denominator is"),
@@ -157,7 +158,7 @@ TEXTS = (
     (message(roi=(-1, 0, 10, 9)), "roi.x_offset must be a whole number of pixels"),
     (message(roi=(0, 0, "a", 9)), "roi.width must be a whole number"),
     # Coefficients that are missing or have an unknown name are never ignored.
-    *((text, said, dict(model=model)) for model in (None, "pinhole") for text, said in (
+    *((text, said, dict(coefficients=model)) for model in (None, "pinhole") for text, said in (
         (opencv(distortion_model="plumb_bob", lens=D), "D is missing"),
         (opencv(fisheye_model=1), "write D: [] if the camera has none"),
         (opencv(xi=1.2), "distortion_coefficients or D is missing"),

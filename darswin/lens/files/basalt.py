@@ -33,7 +33,7 @@ class Basalt(Format):
         calibration = content.get("value0") if isinstance(content, Mapping) else None
         return isinstance(calibration, Mapping) and "intrinsics" in calibration
 
-    def cameras(self, file: Fields, model: str | None) -> Cameras:
+    def cameras(self, file: Fields, coefficients: str | None) -> Cameras:
         calibration = file.section("value0")
         entries = calibration.sections("intrinsics")
         sizes: list[Size] = [None] * len(entries)

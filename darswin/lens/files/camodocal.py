@@ -49,7 +49,7 @@ class CamOdoCal(Format):
         sections = [key for key in SECTIONS if _is_section(content.get(key))]
         return len(sections) + ("model_type" in content) > 1
 
-    def cameras(self, file: Fields, model: str | None) -> Cameras:
+    def cameras(self, file: Fields, coefficients: str | None) -> Cameras:
         name = file.text("camera_name") if "camera_name" in file else "camera"
         return {name: partial(_camera, file)}
 
@@ -69,7 +69,7 @@ class OCamCalib(Format):
         counts = count == str(len(words)) and is_number(words[0]) and len(content) > 3
         return counts or [len(row) for row in content[-3:]] == [2, 3, 2]
 
-    def cameras(self, file: list[list[str]], model: str | None) -> Cameras:
+    def cameras(self, file: list[list[str]], coefficients: str | None) -> Cameras:
         return {"camera": partial(_camera_of_rows, file)}
 
 

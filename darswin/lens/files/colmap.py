@@ -69,7 +69,7 @@ class Colmap(Format):
             or (row[1].isupper() and len(row) > 3 and all(map(is_number, row[2:4])))
         )
 
-    def cameras(self, file: list[list[str]], model: str | None) -> Cameras:
+    def cameras(self, file: list[list[str]], coefficients: str | None) -> Cameras:
         found: Cameras = {}
         for row in file:
             if row[0] in found:

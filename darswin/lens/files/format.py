@@ -12,6 +12,7 @@ from darswin.lens.base import MODELS, Lens
 from darswin.lens.distorted import DistortedLens
 from darswin.lens.files.content import Content
 from darswin.lens.frame import Size
+from darswin.utils.parameters import naming
 
 # For `from_dict`. A cropped image's may have "sensor" besides: the crop's x and y in the image of
 # the whole sensor, and the height and width of that image, px.
@@ -56,7 +57,7 @@ class Format:
     origin = 0.0  # x and y of the upper left pixel's center in the file; we use 0
     keys: str  # what its files hold, for errors
     is_table = False  # True if its files are lines of words
-    takes_model = False  # True if the argument `model` of `load` may name the coefficients' model
+    takes_coefficients = False  # True if `coefficients` of `load` may name their model
     holds = ""  # the lenses that `write` supports, for errors
     needs_size = False  # True if a written camera must have an image_size
 
@@ -65,7 +66,7 @@ class Format:
         make a format: it needs several, as in `has_several`."""
         raise NotImplementedError
 
-    def cameras(self, file: Any, model: str | None) -> Cameras:
+    def cameras(self, file: Any, coefficients: str | None) -> Cameras:
         """The cameras of a file; `file` is its `Fields`, or the rows of a table."""
         raise NotImplementedError
 
@@ -76,10 +77,11 @@ class Format:
             raise ValueError(f"{self.name} files need the lens's image_size, but it has none")
         text = None if camera is None else self._text(camera, suffix)
         if text is None:
-            raise ValueError(
+            text = (
                 f"{self.name} files cannot hold this {type(lens).__name__} lens exactly. They hold "
                 f"{self.holds}. darswin.lens.fit finds the closest lens of another `model`"
             )
+            raise naming(ValueError(text), "model")
         return text
 
     def _text(self, camera: Intrinsics, suffix: str) -> str | None:

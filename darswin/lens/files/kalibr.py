@@ -62,7 +62,7 @@ class Kalibr(Format):
             )
         )
 
-    def cameras(self, file: Fields, model: str | None) -> Cameras:
+    def cameras(self, file: Fields, coefficients: str | None) -> Cameras:
         if _is_alone(file.entries):
             return {"camera": partial(_camera, file)}
         # An entry that lacks its model counts too: reading it must fail, not find another camera.

@@ -44,7 +44,7 @@ class Nerfstudio(Format):
         first = frames[0] if isinstance(frames, list) and frames else None
         return has_several([*content, *(first if isinstance(first, Mapping) else ())], MARKS)
 
-    def cameras(self, file: Fields, model: str | None) -> Cameras:
+    def cameras(self, file: Fields, coefficients: str | None) -> Cameras:
         frames = file.get("frames", "a list of mappings") if "frames" in file else []
         if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):
             raise ValueError(f"frames must be a list of mappings, got {short(frames)}")

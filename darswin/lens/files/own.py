@@ -35,7 +35,7 @@ class Own(Format):
         known = (*model.parameters, *model.optional, *model.common, *ANGLES, *IN_DEGREES)
         return not others or not others.isdisjoint(known)
 
-    def cameras(self, file: Fields, model: str | None) -> Cameras:
+    def cameras(self, file: Fields, coefficients: str | None) -> Cameras:
         return {"lens": lambda: _lens(file)}
 
     def write(self, lens: Lens, suffix: str) -> str:

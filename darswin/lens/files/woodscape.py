@@ -24,7 +24,7 @@ class WoodScape(Format):
         intrinsic = content.get("intrinsic") if isinstance(content, Mapping) else None
         return isinstance(intrinsic, Mapping) and has_several(intrinsic, MARKS)
 
-    def cameras(self, file: Fields, model: str | None) -> Cameras:
+    def cameras(self, file: Fields, coefficients: str | None) -> Cameras:
         return {file.text("name") if "name" in file else "camera": lambda: _camera(file)}
 
 
