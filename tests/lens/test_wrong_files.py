@@ -131,7 +131,7 @@ TEXTS = (
     (TUMVI, "several cameras, choose one with `camera`: 'cam0', 'cam1'"),
     *((TUMVI, "one of 'cam0', 'cam1', or its number", dict(camera=camera))
       for camera in ("cam2", 2, "2", -1, 1.5)),
-    *((COLMAP, "`camera` must be one of '1', '2', '5', '7', got", dict(camera=camera))
+    *((COLMAP, "camera must be one of '1', '2', '5', '7', got", dict(camera=camera))
       for camera in ("0", "3", 3, "-1", "4", True, 1.0)),
     # The choice of the model.
     (opencv(D=D[:4]), "the coefficients of D " + OPEN),

@@ -183,7 +183,7 @@ class Calibration:
                 if number.isdecimal() and len(number) <= 9 and int(number) < len(names):
                     return names[int(number)]
                 shown += ", or its number"
-            raise naming(ValueError(f"`camera` must be one of {shown}, got {camera!r}"), "camera")
+            raise ValueError(f"camera must be one of {shown}, got {camera!r}")
 
     def lens(
         self,
