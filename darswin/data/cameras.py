@@ -230,7 +230,7 @@ def _entries(path: Path, root: Path) -> Mapping[str, Any] | None:
         content = read_json(path)
     except ValueError:  # the reader of calibrations says what is wrong
         return None
-    if not isinstance(content, dict) or any(f.fits(content) for f in FORMATS):
+    if not isinstance(content, dict) or any(f.recognizes(content) for f in FORMATS):
         return None
     return content if path.name == "lenses.json" or _are_cameras(content, path, root) else None
 

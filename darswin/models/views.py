@@ -13,7 +13,7 @@ from torch.utils import _pytree as pytree
 
 from darswin.layers.polar import PixelGrid, PolarGridSpec, check_count, check_images
 from darswin.lens import Lens
-from darswin.lens.concentric import read_square, square_places, square_rays, square_view
+from darswin.lens.concentric import read_square, square_points, square_rays, square_view
 from darswin.lens.pixels import perspective_view, pixel_rays, reprojection, sample_at
 from darswin.lens.spacing import SPACINGS, Spacing, check_fixed_theta_max
 from darswin.models.base import Model
@@ -131,7 +131,7 @@ class SquareView(PlainView):
         return square_view(lens, size, self.size[0], self.spacing, self.theta_max)
 
     def view_points(self, lens: Lens, size: Pair) -> Tensor:
-        return square_places(lens, size, self.spacing, self.theta_max)
+        return square_points(lens, size, self.spacing, self.theta_max)
 
     def rays(self, lens: Lens, size: Pair) -> tuple[Tensor, Tensor]:
         return square_rays(lens, self.size[0], self.spacing, self.theta_max)

@@ -92,10 +92,10 @@ def test_the_order_of_entries_does_not_change_the_format(path):
         assert path.suffix in (".md", ".txt", ".bin", ".xml", ".npz")
         return
     content = parse(path.read_text())
-    first = next(format for format in FORMATS if format.fits(content))
+    first = next(format for format in FORMATS if format.recognizes(content))
     reverse = dict(reversed(content.items()))
-    assert next(format for format in FORMATS if format.fits(reverse)) is first
-    fitting = {format.name for format in FORMATS if format.fits(content)} - {first.name}
+    assert next(format for format in FORMATS if format.recognizes(reverse)) is first
+    fitting = {format.name for format in FORMATS if format.recognizes(content)} - {first.name}
     assert fitting <= {"OpenCV"}  # which reads messages of ROS too
 
 

@@ -42,7 +42,7 @@ class CamOdoCal(Format):
     name = "KITTI-360 or CamOdoCal"
     keys = "model_type and projection_parameters"
 
-    def fits(self, content: Content) -> bool:
+    def recognizes(self, content: Content) -> bool:
         if not isinstance(content, Mapping):
             return False
         # OpenCV's files may have a model_type, and distortion_parameters that are a matrix.
@@ -61,7 +61,7 @@ class OCamCalib(Format):
     keys = "5 lines of numbers, as calib_results.txt"
     is_table = True
 
-    def fits(self, content: Content) -> bool:
+    def recognizes(self, content: Content) -> bool:
         """True if the first of several lines counts its numbers, or the last three have 2, 3, 2."""
         if not isinstance(content, list):
             return False

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 from darswin.lens.base import MODELS, Lens
 from darswin.lens.distorted import DistortedLens
 from darswin.lens.files.content import Content
-from darswin.lens.frame import Size
+from darswin.lens.image import Size
 from darswin.utils.parameters import naming
 
 # For `from_dict`. A cropped image's may have "sensor" besides: the crop's x and y in the image of
@@ -38,7 +38,7 @@ class Intrinsics(NamedTuple):
     values: dict[str, float]
     size: Any  # (H, W), or None
 
-    def fits(self, model: type[Lens], names: str) -> bool:
+    def has_only(self, model: type[Lens], names: str) -> bool:
         """True if the model is the same and `names` include all values but focal lengths and
         principal point; that is, skew too."""
         others = self.values.keys() - {"fx", "fy", "cx", "cy"}
@@ -50,7 +50,7 @@ class Intrinsics(NamedTuple):
 
 
 class Format:
-    """Base of the formats. A class sets `name` and `keys`, and defines `fits` and `cameras`.
+    """Base of the formats. A class sets `name` and `keys`, and defines `recognizes` and `cameras`.
     Formats that are written also set `holds` and define `_text`."""
 
     name: str  # for errors
@@ -61,7 +61,7 @@ class Format:
     holds = ""  # the lenses that `write` supports, for errors
     needs_size = False  # True if a written camera must have an image_size
 
-    def fits(self, content: Content) -> bool:
+    def recognizes(self, content: Content) -> bool:
         """True if a file's content is in this format. One common entry, such as "frames", does not
         make a format: it needs several, as in `has_several`."""
         raise NotImplementedError
@@ -123,12 +123,12 @@ def in_image(
     parameters: Mapping[str, Any],
 ) -> Description:
     """The description of a camera from its class, its place in the image and its parameters."""
-    frame: Description = {"center": list(center)}
+    common: Description = {"center": list(center)}
     if affine is not None:
-        frame["affine"] = affine
+        common["affine"] = affine
     if size is not None:
-        frame["image_size"] = list(size)
-    return {"model": model.__name__, **parameters, **frame}
+        common["image_size"] = list(size)
+    return {"model": model.__name__, **parameters, **common}
 
 
 def intrinsics_of(lens: Lens, origin: float) -> Intrinsics | None:

@@ -24,7 +24,7 @@ from darswin.lens.files.nerfstudio import Nerfstudio
 from darswin.lens.files.own import Own
 from darswin.lens.files.unknown import unknown
 from darswin.lens.files.woodscape import WoodScape
-from darswin.lens.frame import Size
+from darswin.lens.image import Size
 from darswin.lens.plausible import ImplausibleLens, doubts
 from darswin.utils.files import replace_file
 from darswin.utils.parameters import check, naming
@@ -286,7 +286,7 @@ class Calibration:
 
 
 def _format_of(content: Content) -> Format:
-    found = next((format for format in FORMATS if format.fits(content)), None)
+    found = next((format for format in FORMATS if format.recognizes(content)), None)
     if found is None:
         known = ", ".join(format.name for format in FORMATS)
         reason = unknown(content, FORMATS)

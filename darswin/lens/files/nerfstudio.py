@@ -37,7 +37,7 @@ class Nerfstudio(Format):
     origin = 0.5
     keys = "fl_x, fl_y, cx, cy and frames"
 
-    def fits(self, content: Content) -> bool:
+    def recognizes(self, content: Content) -> bool:
         if not isinstance(content, Mapping):
             return False
         frames = content.get("frames")

@@ -28,7 +28,7 @@ from darswin.lens.files.fields import (
 )
 from darswin.lens.files.format import Cameras, Description, Format, Intrinsics, describe
 from darswin.lens.files.message import in_message
-from darswin.lens.frame import Size
+from darswin.lens.image import Size
 from darswin.lens.plausible import NEAR, off_middle, swap_fits
 from darswin.utils.parameters import naming
 
@@ -77,7 +77,7 @@ class OpenCV(Format):
         "only), Spherical and Mei (2 radial, tangential)"
     )
 
-    def fits(self, content: Content) -> bool:
+    def recognizes(self, content: Content) -> bool:
         if not isinstance(content, Mapping):
             return False
         # Many files have a K or M. It counts if it is a matrix, or a list beside other entries.
@@ -106,7 +106,7 @@ class OpenCV(Format):
         kind = next((kind for kind in MODELS if ORDERS[kind][0] is camera.model), "pinhole")
         order = ORDERS[kind][1].removesuffix(" tilt1 tilt2")
         skew = "" if kind == "pinhole" else "skew"  # cv2.projectPoints leaves it out
-        if not camera.fits(ORDERS[kind][0], f"{order} xi {skew}"):
+        if not camera.has_only(ORDERS[kind][0], f"{order} xi {skew}"):
             return None
         if kind == "pinhole" and not any(camera.listed("d1 d2 d3 s1 s2 s3 s4")):
             order = "k1 k2 p1 p2 k3"
@@ -133,8 +133,8 @@ class Ros(OpenCV):
     name = "ROS camera_info"
     keys = "k, d and distortion_model"
 
-    def fits(self, content: Content) -> bool:
-        return super().fits(content) and "distortion_model" in content
+    def recognizes(self, content: Content) -> bool:
+        return super().recognizes(content) and "distortion_model" in content
 
 
 class ByName(Format):
@@ -144,7 +144,7 @@ class ByName(Format):
     keys = "fx, fy, cx, cy, k1, …"
     takes_coefficients = True
 
-    def fits(self, content: Content) -> bool:
+    def recognizes(self, content: Content) -> bool:
         if not isinstance(content, Mapping):
             return False
         names = {plain_name(name): value for name, value in content.items()}

@@ -24,7 +24,7 @@ class Own(Format):
     name = "darswin"
     keys = "model"
 
-    def fits(self, content: Content) -> bool:
+    def recognizes(self, content: Content) -> bool:
         if not isinstance(content, Mapping):
             return False
         name = content.get("model")

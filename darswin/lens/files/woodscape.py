@@ -20,7 +20,7 @@ class WoodScape(Format):
     origin = 0.5
     keys = "intrinsic with poly_order, k1, k2, …"
 
-    def fits(self, content: Content) -> bool:
+    def recognizes(self, content: Content) -> bool:
         intrinsic = content.get("intrinsic") if isinstance(content, Mapping) else None
         return isinstance(intrinsic, Mapping) and has_several(intrinsic, MARKS)
 
