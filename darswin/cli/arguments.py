@@ -1,7 +1,6 @@
 """Functions as commands: their parameters are the arguments, their docstrings are the help."""
 
 import argparse
-import difflib
 import inspect
 import json
 import os
@@ -12,6 +11,8 @@ from collections.abc import Callable, Collection, Iterable, Sequence
 from typing import Any, Literal, NoReturn
 
 import yaml
+
+from darswin.utils.nearest import nearest
 
 _NUMBERS = re.compile(r"[\s\[\](),.+\-eE\d]*\d[\s\[\](),.+\-eE\d]*")
 _WORDS = {int: "a whole number", float: "a number"}
@@ -36,7 +37,7 @@ def with_nearest(message: str, *names: Collection[str]) -> str:
         same = [name for name in names[-1] if name.startswith(f"{group}.")]
         for part in (same, *names):
             by_last = {name.rpartition(".")[2].lstrip("-"): name for name in part}
-            if near := difflib.get_close_matches(last.lstrip("-"), by_last, 1, 0.7):
+            if near := nearest(last.lstrip("-"), by_last, alike=0.7):
                 found.append(by_last[near[0]])
                 break
     return f"{message}; the nearest option is {', '.join(found)}" if found else message

@@ -14,6 +14,7 @@ from typing import NamedTuple
 from darswin.cli import options
 from darswin.cli.arguments import run_command
 from darswin.utils.extras import lack
+from darswin.utils.nearest import did_you_mean
 from darswin.utils.parameters import with_flags
 from darswin.utils.processes import die_with_first_process
 
@@ -89,7 +90,8 @@ def main(argv: list[str] | None = None) -> None:
     elif name in COMMANDS:
         command = COMMANDS[name]
     else:
-        raise misuse(f"there is no command {name!r}; the commands are {', '.join(COMMANDS)}")
+        meant = did_you_mean(name, COMMANDS)
+        raise misuse(f"there is no command {name!r}{meant} The commands are {', '.join(COMMANDS)}")
     if (without := lack("train", command.needs)) is not None:
         raise SystemExit(f"darswin {name}: {without}")
     warnings.showwarning = _one_line(warnings.showwarning, command)

@@ -10,6 +10,7 @@ from typing import Any, get_args
 import yaml
 
 from darswin.cli.arguments import Parser, with_nearest
+from darswin.utils.nearest import did_you_mean
 from darswin.utils.tasks import Task
 from darswin.utils.text import read_text
 
@@ -92,7 +93,9 @@ def _config_file(name: str) -> Path:
     if Path(name).exists():
         return Path(name)
     if not preset.exists():
-        raise ValueError(f"{name} is neither a file nor a preset; the presets are {presets()}")
+        meant = did_you_mean(name, [path.stem for path in _presets()])
+        text = f"{name} is neither a file nor a preset{meant} The presets are {presets()}"
+        raise ValueError(text)
     return preset
 
 

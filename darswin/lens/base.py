@@ -12,6 +12,7 @@ from torch import Tensor
 from darswin.lens.image import LensInImage, Size
 from darswin.lens.parameter import Number
 from darswin.lens.solve import direction_of, inverse, length_of, vector_of
+from darswin.utils.nearest import did_you_mean
 
 # A lens ends this far (rad) before the angle at which r stops rising or becomes infinite, where r
 # does not determine θ.
@@ -312,7 +313,7 @@ def from_dict(description: Mapping[str, Any], image_size: Size = None) -> Lens:
             return _from_degrees(arguments, in_degrees, angle, image_size)
     name = arguments.pop("model", None)
     if not isinstance(name, str) or name not in MODELS:
-        raise ValueError(f'a lens\'s "model" must be one of {sorted(MODELS)}, got {name!r}')
+        raise ValueError(unknown_model(name))
     make: Callable[..., Lens] = MODELS[name]
     if "fov" in arguments and hasattr(make, "from_fov"):
         size = image_size or arguments.get("image_size")
@@ -323,6 +324,12 @@ def from_dict(description: Mapping[str, Any], image_size: Size = None) -> Lens:
         return make(**arguments)
     except TypeError as error:
         raise ValueError(f"a {name} lens cannot be made from {arguments}: {error}") from error
+
+
+def unknown_model(name: object) -> str:
+    """What to say of a name that is not in `MODELS`, with the name that was probably meant."""
+    meant, models = did_you_mean(str(name), MODELS), ", ".join(sorted(MODELS))
+    return f"unknown lens model {repr(name)[:80]}{meant} The models are {models}"
 
 
 def _from_degrees(arguments: dict[str, Any], in_degrees: str, angle: str, image_size: Size) -> Lens:

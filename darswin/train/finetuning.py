@@ -10,7 +10,7 @@ from darswin.layers.quantized import without_quantized_layers
 from darswin.models.base import Model
 from darswin.models.encoder import Encoder
 from darswin.models.pixel import PixelModel
-from darswin.models.registry import list_models, model_class, nearest, preset
+from darswin.models.registry import list_models, model_class, nearest_models, preset
 from darswin.models.saving import ModelCard, load_model, model_of_run
 from darswin.models.unet import Unet
 from darswin.utils.parameters import check, naming
@@ -53,7 +53,9 @@ def check_name(name: str, task: Task) -> None:
     """ValueError for an unknown model, or a model for another task."""
     model_class(name)
     if name not in models_for(task):
-        text = f"`name` {name} is no model for `task` {task}; {nearest(name, models_for(task))}"
+        text = (
+            f"`name` {name} is no model for `task` {task}{nearest_models(name, models_for(task))}"
+        )
         raise naming(ValueError(text), "name", "task")
 
 

@@ -66,7 +66,10 @@ def scenes(tmp_path_factory):
         ),
         ("--data photos", "type --data.path photos; `darswin fit --help` lists the options"),
         ("--trainer 3", "--trainer takes a file of options, and 3 is none; `darswin fit"),
-        ("--config minute", "the presets are few, iccv2023, iccv2023_paper, minutes, scenes_min"),
+        (
+            "--config minute",
+            "did you mean minutes? The presets are few, iccv2023, iccv2023_paper, min",
+        ),
     ],
 )
 def test_wrong_options_are_named_in_one_line(capsys, tmp_path, options, message):

@@ -290,7 +290,7 @@ def _format_of(content: Content) -> Format:
     if found is None:
         known = ", ".join(format.name for format in FORMATS)
         reason = unknown(content, FORMATS)
-        raise ValueError(f"unknown format: it must be in one of the formats {known}; {reason}")
+        raise ValueError(f"unknown format: {reason}. The formats are {known}")
     return found
 
 
