@@ -124,6 +124,7 @@ class RunData(LightningDataModule):
         self.seed = seed
         self._sources: dict[Split, Any] = {}
         self.datasets: list[Samples] = []
+        self.left_out: dict[Split, int] = {}  # broken pictures that `check` found in each split
         self._loader: ResumableLoader | None = None
         self._progress: dict[str, Any] = {}
         self._said_cut_off = False
@@ -241,7 +242,8 @@ class RunData(LightningDataModule):
 
     def check(self, splits: Sequence[Split]) -> None:
         """Raises one error for all files of these splits that a training could not use."""
-        check_files({f"the pictures of {split!r}": self.dataset(split) for split in splits})
+        found = check_files({f"the pictures of {split!r}": self.dataset(split) for split in splits})
+        self.left_out = dict(zip(splits, found.values(), strict=True))
 
     def train_dataloader(self) -> ResumableLoader:
         """The batches of the training split, in an order that can be resumed."""

@@ -3,6 +3,7 @@
 import csv
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -435,7 +436,10 @@ def test_skipped_pictures_are_counted(tmp_path, capsys):
     message = error(capsys, "fit", "--run", tmp_path / "a", *start)
     assert "cannot read" in message and "--data.skip_broken true" in message
     fit(tmp_path / "b", *start, "--data.skip_broken", "true")
-    assert "6 pictures could not be read" in capsys.readouterr().out
+    said = capsys.readouterr()
+    assert "6 pictures could not be read" in said.out
+    counts = re.search(r"; (\d+) training and (\d+) validation pictures", said.err).groups()
+    assert sum(map(int, counts)) == 30 - 3 - 6  # without those of the test set
 
 
 def test_targets_that_nothing_can_be_learned_from(scenes, tmp_path, capsys):
