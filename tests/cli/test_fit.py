@@ -94,6 +94,10 @@ def test_wrong_options_of_scenes_are_named(capsys, tmp_path, scenes, options, me
 
 def test_what_is_missing_is_named_as_people_type_it(capsys, tmp_path):
     assert "required: --data.path, --run" in error(capsys, "fit", "--config", "minutes")
+    message = error(capsys, "fit", *DIGITS, "--run")
+    assert (
+        message == "darswin fit: argument --run: expected one argument; see `darswin fit --help`\n"
+    )
     (tmp_path / "c.yaml").write_text("model: {speed: 3}")
     message = error(capsys, "fit", "--run", tmp_path, *DIGITS, "--config", tmp_path / "c.yaml")
     assert "no option '--model.speed'" in message
