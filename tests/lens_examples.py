@@ -36,9 +36,9 @@ f64 = torch.float64
 FILES = Path(__file__).parent / "lens" / "files"
 
 
-def loads(text: str, model: str | None = None, **options) -> Lens:
+def loads(text: str, coefficients: str | None = None, **options) -> Lens:
     """The lens in the text of a calibration file."""
-    return Calibration(text, "in a string", model).lens(**options)
+    return Calibration(text, "in a string", coefficients).lens(**options)
 
 
 def file_text(name: str) -> str:

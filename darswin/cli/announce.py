@@ -28,14 +28,17 @@ class Announce(Callback):
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         assert isinstance(pl_module, Task)
+        if not trainer.is_global_zero:
+            return  # only the first process has checked the files
         parameters = sum(p.numel() for p in pl_module.net.parameters())
         name, loaders = pl_module.card.model, trainer.val_dataloaders
-        held = f" and {len(loaders.dataset)} validation" if loaders else ""
+        left_out = pl_module.data.left_out
         pictures: Any = trainer.train_dataloader
+        count = len(pictures.dataset) - left_out["train"]
+        held = f" and {len(loaders.dataset) - left_out['val']} validation" if loaders else ""
         say(
-            f"{name} with {parameters:,} parameters; {len(pictures.dataset):,} "
-            f"training{held} pictures; {pl_module.steps_per_epoch:,} steps an epoch, "
-            f"{pl_module.steps:,} in all"
+            f"{name} with {parameters:,} parameters; {count:,} training{held} pictures; "
+            f"{pl_module.steps_per_epoch:,} steps an epoch, {pl_module.steps:,} in all"
         )
         if pl_module.weights is None and trainer.global_step == 0:
             for line in shortfalls(pl_module):

@@ -86,7 +86,7 @@ class Answers:
         """Warns once if the model does not see whole pictures."""
         if self._warned:
             return
-        lost = cut_off(picture_size(lens), lens, fit_of(self.model, self.card))
+        lost = cut_off(picture_size(lens), lens, framing_of(self.model, self.card))
         if lost is None:
             return
         self._warned = True
@@ -167,7 +167,7 @@ class PixelAnswers(Answers):
         self.out, self.names = out, names
 
     def _full_size(self, lens: Lens) -> FullSize:
-        return FullSize(lens, self.card.size, fit_of(self.model, self.card))
+        return FullSize(lens, self.card.size, framing_of(self.model, self.card))
 
     def _run(self, images: Tensor, prepared: Any) -> Tensor:
         return self.model.run(images, prepared)
@@ -254,11 +254,11 @@ def fast(model: Net, card: ModelCard) -> Net:
 
 def resized(net: Model, card: ModelCard, image: np.ndarray, lens: Lens) -> tuple[Tensor, Lens]:
     """A picture at the size of training, (1, C, H, W) uint8, with the lens of its pixels."""
-    image, lens = at_size(image, lens, card.size, fit_of(net, card))
+    image, lens = at_size(image, lens, card.size, framing_of(net, card))
     return torch.from_numpy(image[None]).permute(0, 3, 1, 2).contiguous(), lens
 
 
-def fit_of(net: Model, card: ModelCard) -> Framing:
+def framing_of(net: Model, card: ModelCard) -> Framing:
     """The framing of the model's training; models that take only squares crop."""
     return "crop" if net.square_images and card.fit == "whole" else card.fit
 
@@ -293,8 +293,8 @@ def file_names(paths: Sequence[str], files: Sequence[tuple[str, bool]]) -> dict[
 
 def relative_names(paths: Sequence[str], files: Sequence[tuple[str, bool]]) -> dict[str, str]:
     """The paths of pictures and videos relative to the common folder of all arguments."""
-    places = [os.path.abspath(p if os.path.isdir(p) else os.path.dirname(p) or ".") for p in paths]
-    root = os.path.commonpath(places)
+    folders = [os.path.abspath(p if os.path.isdir(p) else os.path.dirname(p) or ".") for p in paths]
+    root = os.path.commonpath(folders)
     return {name: os.path.relpath(os.path.abspath(name), root) for name, _ in files}
 
 
@@ -302,13 +302,13 @@ def claim_folder(out: str | None, record: str = ANSWERS) -> Path:
     """The folder for the pictures of a command: new, empty, or from an earlier run of the command,
     which left the file `record` there."""
     if out is None:
-        raise ValueError("missing `out`: this model writes pictures; give a folder for them")
+        raise ValueError("missing --out: this model writes pictures; give a folder for them")
     folder = Path(out)
     if folder.exists() and not folder.is_dir():
-        raise ValueError(f"`out` must be a folder for the pictures, but {out} is a file")
+        raise ValueError(f"--out must be a folder for the pictures, but {out} is a file")
     if folder.is_dir() and not _is_ours(folder / record) and any(folder.iterdir()):
         raise ValueError(
-            f"`out` {out} holds other files: give a new or an empty folder, or one of an earlier "
+            f"--out {out} holds other files: give a new or an empty folder, or one of an earlier "
             "run of this command, whose files are replaced"
         )
     replace_file(folder / record, "[]")

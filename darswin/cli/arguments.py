@@ -12,6 +12,8 @@ from typing import Any, Literal, NoReturn
 
 import yaml
 
+from darswin.utils.nearest import nearest
+
 _NUMBERS = re.compile(r"[\s\[\](),.+\-eE\d]*\d[\s\[\](),.+\-eE\d]*")
 _WORDS = {int: "a whole number", float: "a number"}
 
@@ -20,8 +22,25 @@ class Parser(argparse.ArgumentParser):
     """A parser that ends the program with one sentence and exit code 2."""
 
     def error(self, message: str) -> NoReturn:
-        message = " ".join(message.split())
+        message = with_nearest(" ".join(message.split()), self._option_string_actions)
         self.exit(2, f"{self.prog}: {message}; see `{self.prog} --help`\n")
+
+
+def with_nearest(message: str, *names: Collection[str]) -> str:
+    """A parser's message. If it is about unknown options, it gets the options that were probably
+    meant: each from the same group, or else from the first of `names` that holds a similar one."""
+    if not message.startswith("unrecognized arguments: "):
+        return message
+    found = []
+    for word in (word.partition("=")[0] for word in message.split() if word.startswith("--")):
+        group, _, last = word.rpartition(".")
+        same = [name for name in names[-1] if name.startswith(f"{group}.")]
+        for part in (same, *names):
+            by_last = {name.rpartition(".")[2].lstrip("-"): name for name in part}
+            if near := nearest(last.lstrip("-"), by_last, alike=0.7):
+                found.append(by_last[near[0]])
+                break
+    return f"{message}; the nearest option is {', '.join(found)}" if found else message
 
 
 def run_command(commands: Callable | dict[str, Callable], argv: list[str], prog: str) -> None:
@@ -71,19 +90,13 @@ def run_command(commands: Callable | dict[str, Callable], argv: list[str], prog:
     commands(**given)
 
 
-def check_option(name: str, value: object, ok: bool, range_: str) -> None:
-    """Raises ValueError, which names the option, its range and its value, unless `ok`."""
-    if not ok:
-        raise ValueError(f"`{name}` must be {range_}, got {str(value)[:40]}")
-
-
 def check_out(out: str | None, inputs: Iterable[str]) -> None:
     """Raises ValueError if writing `out` would replace one of the files that a command reads."""
     if out is None or not os.path.exists(out):
         return
     for name in inputs:
         if os.path.exists(name) and os.path.samefile(name, out) and os.path.isfile(out):
-            raise ValueError(f"`out` {out} would replace {name}, which this command reads")
+            raise ValueError(f"--out {out} would replace {name}, which this command reads")
 
 
 def _summary(function: Callable) -> str:

@@ -13,6 +13,7 @@ from darswin.bench.timing import MATMULS, OURS, REFERENCE, TURNS, Case, Timing, 
 from darswin.layers import linear
 from darswin.models.registry import model_class
 from darswin.utils.malloc import keep_freed_memory
+from darswin.utils.parameters import check
 
 DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16}
 INT8 = {"int8": torch.int8}  # inference, where the CPU has it
@@ -47,12 +48,10 @@ def bench(
     """
     model_class(model)  # check everything before the work
     for name, count in (("size", size), *(("batches", b) for b in (*batches, *compiled))):
-        if not 1 <= count <= MOST:
-            raise ValueError(f"`{name}` must be from 1 to {MOST}, got {count}")
+        check(name, count, 1 <= count <= MOST, f"from 1 to {MOST}")
     if not batches:
-        raise ValueError("`batches` must have at least one number")
-    if not 0 < seconds < float("inf"):
-        raise ValueError(f"`seconds` must be above 0, got {seconds}")
+        raise ValueError("--batches must have at least one number")
+    check("seconds", seconds, 0 < seconds < float("inf"), "above 0")
     keep_freed_memory()
     out.mkdir(parents=True, exist_ok=True)
     head = machine()

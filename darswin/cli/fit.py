@@ -43,7 +43,7 @@ from darswin.cli.options import (
     format_help,
     last_of,
     presets,
-    with_nearest,
+    with_nearest_of_run,
 )
 from darswin.data.lens_distributions import parse_sweep
 from darswin.data.splits import SPLITS
@@ -60,6 +60,7 @@ from darswin.train.runs import (
 from darswin.train.tasks import TASKS
 from darswin.utils.files import locked, remove_partial_files, replace_file
 from darswin.utils.malloc import keep_freed_memory
+from darswin.utils.parameters import check
 from darswin.utils.processes import end_with_failed_process
 from darswin.utils.tasks import Task
 
@@ -116,8 +117,9 @@ def run(argv: list[str], task: Task) -> None:
             if not (lack or isinstance(error, MemoryError | torch.OutOfMemoryError)):
                 raise
             raise MemoryError(
-                "not enough memory: a smaller `batch_size` or model, or `grad_checkpointing` true, "
-                f"needs less ({str(error).strip().splitlines()[-1]})"
+                "not enough memory: a smaller --data.batch_size or model, or "
+                "--model.grad_checkpointing true, needs less "
+                f"({str(error).strip().splitlines()[-1]})"
             ) from error
 
 
@@ -148,7 +150,7 @@ class RunParser(LightningArgumentParser):
         if not self.exit_on_error:
             super().error(message, ex)
         names = [name for action in parser._actions for name in action.option_strings]
-        message = with_nearest(message, names)
+        message = with_nearest_of_run(message, names)
         self.exit(2, f"error: {message}; `{command} --help` lists the options\n")
 
 
@@ -208,9 +210,9 @@ class RunCLI(LightningCLI):
         if config.devices is not None:
             config.trainer.devices = config.devices
         if config.trainer.overfit_batches:
-            raise ValueError("`overfit_batches` shuffles otherwise: take `limit`")
-        if (steps := config.checkpoint_steps) < 1:
-            raise ValueError(f"`checkpoint_steps` must be at least 1, got {steps}")
+            raise ValueError("--trainer.overfit_batches shuffles otherwise: take --data.limit")
+        steps = config.checkpoint_steps
+        check("checkpoint_steps", steps, steps >= 1, "at least 1")
         if self.subcommand != "fit":
             config.ckpt_path = config.ckpt_path or str(model_of_run(self.folder, ".ckpt"))
             return
@@ -225,8 +227,9 @@ class RunCLI(LightningCLI):
                     group[name] = value
         if config.resume and last_of(self.folder).exists():
             before = yaml.safe_load((self.folder / "config.yaml").read_text())
-            for change in check_changes(before, yaml.safe_load(self._recorded(config))):
-                say(re.sub("`(.*?)`", r"--\1", change))
+            now = yaml.safe_load(self._recorded(config))
+            for name, change in check_changes(before, now).items():
+                say(f"--{name} {change}")
 
     def _check_lenses(self, config) -> None:
         """ValueError for lenses to warp to, typed beside those that took the pictures."""

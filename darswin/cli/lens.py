@@ -6,7 +6,7 @@ from typing import Literal
 import torch
 
 import darswin.lens
-from darswin.cli.arguments import check_option, check_out
+from darswin.cli.arguments import check_out
 from darswin.cli.undistort import undistort
 from darswin.cli.views import View, check_view, view_of, view_rays
 from darswin.lens.base import Lens
@@ -14,6 +14,7 @@ from darswin.lens.files.load import Calibration, reach
 from darswin.lens.files.opencv import Coefficients
 from darswin.lens.orientation import in_upright_picture, stored_size
 from darswin.lens.spacing import Spacing
+from darswin.utils.parameters import check
 from darswin.views import PolarView
 from darswin.viz.report import describe
 
@@ -113,7 +114,7 @@ def info(
         lens, doubt = file.judged(camera, theta_max, image_size, torch.float64)
         if lens.image_size is None:
             raise ValueError(
-                f"{calib} lacks the size of its images: give `image_size`, their height and width, "
+                f"{calib} lacks the size of its images: give --image_size, their height and width, "
                 "e.g. 960,1280"
             )
         if len(file.names) > 1:
@@ -186,10 +187,10 @@ def crop(
         format: the format of the new file, as for `darswin lens convert`.
     """
     if box is None and size is None:
-        raise ValueError("missing `box` or `size`: give the part to keep, or the new size, or both")
+        raise ValueError("missing --box or --size: give the part to keep, or the new size, or both")
     for name, sides in (("box", (box or ())[2:]), ("size", size or ())):
         for side in sides:
-            check_option(name, side, 1 <= side <= 10**6, _SIDES)
+            check(name, side, 1 <= side <= 10**6, _SIDES)
     check_out(out, (calib,))
     file, theta_max = _calibration(calib, theta_max_deg, image_size, coefficients)
     lens, note = file.lens(camera, theta_max, image_size, torch.float64), ""
@@ -209,7 +210,7 @@ def _check_box(box: tuple[int, int, int, int], lens: Lens) -> str:
     rows, columns = (round(side) for side in lens.image_size[0].tolist())
     meets = -height < top < rows and -width < left < columns
     picture = f"the picture of {columns} × {rows} px (W × H)"
-    check_option("box", box, meets, f"a part of {picture}")
+    check("box", box, meets, f"a part of {picture}")
     inside = min(top, left) >= 0 and top + height <= rows and left + width <= columns
     return "" if inside else f"; the box extends beyond {picture}, which means padding"
 
@@ -233,10 +234,10 @@ def _calibration(
 ) -> tuple[Calibration, float | None]:
     """The file, and θ_max in radians; ValueError for an option out of its range."""
     for side in image_size or ():
-        check_option("image_size", side, 1 <= side <= 10**6, _SIDES)
+        check("image_size", side, 1 <= side <= 10**6, _SIDES)
     if theta_max_deg is not None:
         in_range = 0 < theta_max_deg <= 180
-        check_option("theta_max_deg", theta_max_deg, in_range, "above 0° and at most 180°")
+        check("theta_max_deg", theta_max_deg, in_range, "above 0° and at most 180°")
     file = Calibration.read(calib, coefficients)
     return file, None if theta_max_deg is None else math.radians(theta_max_deg)
 
@@ -245,10 +246,10 @@ def _check_partition(rings: int, sectors: int, samples: tuple[int, int] = (1, 1)
     """ValueError for numbers beyond the limits, before memory is allocated."""
     given = (("rings", rings), ("sectors", sectors), *(("samples", count) for count in samples))
     for name, value in given:
-        check_option(name, value, 1 <= value <= MOST[name], f"from 1 to {MOST[name]}")
+        check(name, value, 1 <= value <= MOST[name], f"from 1 to {MOST[name]}")
     if (total := rings * sectors * math.prod(samples)) > MOST_SAMPLES:
         raise ValueError(
-            f"`rings` × `sectors` × `samples` must be at most {MOST_SAMPLES} samples, got {total}"
+            f"--rings × --sectors × --samples must be at most {MOST_SAMPLES} samples, got {total}"
         )
 
 

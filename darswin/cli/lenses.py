@@ -26,7 +26,7 @@ def given_lenses(
         root = "." if is_json(lens) else Path(lens).parent
         return dict.fromkeys(files, Calibrations(lens, root, camera, coefficients))
     if camera is not None:
-        raise ValueError(f"`camera` {camera} chooses a camera of a file, but {lens} is a folder")
+        raise ValueError(f"--camera {camera} chooses a camera of a file, but {lens} is a folder")
     own = {Path(file): Path(lens, f"{Path(file).stem}.json") for file in files}
     there = {file: calibration for file, calibration in own.items() if calibration.is_file()}
     if not there:
@@ -46,7 +46,7 @@ def lenses_of_run(
     Raises:
         ValueError: the run has no lens, or not for all files.
     """
-    missing = "missing `lens`: give the camera's calibration file"
+    missing = "missing --lens: give the camera's calibration file"
     config = Path(run) / "config.yaml"
     if not config.is_file():
         raise ValueError(f"{missing}, because {run} has no config.yaml, which would name one")

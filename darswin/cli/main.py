@@ -4,7 +4,6 @@ import codecs
 import contextlib
 import json
 import os
-import re
 import sys
 import warnings
 from collections.abc import Callable, Mapping
@@ -15,6 +14,8 @@ from typing import NamedTuple
 from darswin.cli import options
 from darswin.cli.arguments import run_command
 from darswin.utils.extras import lack
+from darswin.utils.nearest import did_you_mean
+from darswin.utils.parameters import with_flags
 from darswin.utils.processes import die_with_first_process
 
 PACKAGE = Path(__file__).parents[1]
@@ -26,6 +27,10 @@ class Command(NamedTuple):
     text: str  # its help
     needs: tuple[str, ...]  # modules of the extra `train`
     function: str  # or a dict of functions; imported only when called, because that takes seconds
+
+    def flag_of(self, parameter: str) -> str:
+        """The flag of a parameter that an error of the library carries."""
+        return options.flag_of(parameter) if self.function == RUN else f"--{parameter}"
 
 
 TRAIN = (
@@ -85,7 +90,8 @@ def main(argv: list[str] | None = None) -> None:
     elif name in COMMANDS:
         command = COMMANDS[name]
     else:
-        raise misuse(f"there is no command {name!r}; the commands are {', '.join(COMMANDS)}")
+        meant = did_you_mean(name, COMMANDS)
+        raise misuse(f"there is no command {name!r}{meant} The commands are {', '.join(COMMANDS)}")
     if (without := lack("train", command.needs)) is not None:
         raise SystemExit(f"darswin {name}: {without}")
     warnings.showwarning = _one_line(warnings.showwarning, command)
@@ -100,12 +106,13 @@ def main(argv: list[str] | None = None) -> None:
     except BrokenPipeError:  # `darswin lens info … | head` stops reading early
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except (OSError, ValueError, FloatingPointError, MemoryError) as error:
+        message = with_flags(error, command.flag_of)
         # A worker process puts its traceback into the message; only the last line is the error.
-        message = str(error).strip().splitlines()[-1] if "Traceback" in str(error) else str(error)
+        if "Traceback" in message:
+            message = message.strip().splitlines()[-1]
         broken = "BrokenImageError" in f"{type(error).__name__}{message}"
         if broken and command.function == RUN:
-            message += " (to leave such files out, set `skip_broken` true)"
-        message = with_flags(message, command)
+            message += " (to leave such files out, set --data.skip_broken true)"
         if isinstance(error, FloatingPointError):
             raise SystemExit(f"darswin: {message}") from error
         raise misuse(message) from error
@@ -116,22 +123,6 @@ def print_help() -> None:
     print("usage: darswin COMMAND [OPTIONS]\n")
     print("\n".join(f"  {name:<10}{command.text}" for name, command in COMMANDS.items()))
     print("\n`darswin COMMAND --help` lists its options.")
-
-
-def with_flags(message: str, command: Command) -> str:
-    """The message of an error with flags in place of the names of parameters.
-
-    The library writes a parameter as `name`, and darswin.lens as name=. The parameter `model` of
-    darswin.lens is called `coefficients` on the command line.
-    """
-    flag_of = options.flag_of if command.function == RUN else "--{}".format
-    names = {"camera": "camera", "model": "coefficients"}
-    message = re.sub(
-        r"\b(camera|model)=([\"']?)",
-        lambda m: flag_of(names[m[1]]) + (f" {m[2]}" if m[2] else ""),
-        message,
-    )
-    return re.sub(r"`([\w.]+)`", lambda m: flag_of(m[1]), message)
 
 
 def misuse(message: str) -> SystemExit:
@@ -183,6 +174,6 @@ def _one_line(show: Callable[..., None], command: Command) -> Callable[..., None
                 show(message, category, file, *where, **options)
         elif str(message) not in shown:
             shown.add(str(message))
-            print(f"darswin: {with_flags(str(message), command)}", file=sys.stderr)
+            print(f"darswin: {with_flags(message, command.flag_of)}", file=sys.stderr)
 
     return show_once

@@ -1,9 +1,7 @@
 """The options of `fit`, `validate` and `test`: presets, the folder of the run, and the help."""
 
 import argparse
-import difflib
 import inspect
-import re
 import textwrap
 from collections.abc import Collection, Iterable
 from pathlib import Path
@@ -11,11 +9,15 @@ from typing import Any, get_args
 
 import yaml
 
+from darswin.cli.arguments import Parser, with_nearest
+from darswin.utils.nearest import did_you_mean
 from darswin.utils.tasks import Task
 from darswin.utils.text import read_text
 
 PRESETS = Path(__file__).parent.parent / "train" / "presets"
 FIRST_TASK: Task = "classification"  # unless a run names another one
+# Options that take a file of a group's options, and the option that was probably meant.
+FILES = {"data": "--data.path", "model": "--model.name", "trainer": ""}
 
 
 def complete(argv: list[str]) -> tuple[list[str], Task]:
@@ -24,13 +26,14 @@ def complete(argv: list[str]) -> tuple[list[str], Task]:
     `test`, `validate` and `fit --resume` begin with the configuration of the run, so that they need
     no other option. Errors that are found here come before the slow imports of the parser.
     """
-    scan = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    scan = Parser(prog=f"darswin {argv[0]}", add_help=False, allow_abbrev=False)
     scan.add_argument("-c", "--config", action="append", default=[])
     scan.add_argument("--run")
     scan.add_argument("--resume", action="store_true")
     scan.add_argument("--task")
     scan.add_argument("--data.path", dest="path")
     given, others = scan.parse_known_args(argv[1:])
+    _check_files(argv)
     contents = {file: content_of(file) for file in map(_config_file, given.config)}
     before = None
     if given.run:
@@ -49,14 +52,14 @@ def complete(argv: list[str]) -> tuple[list[str], Task]:
     said = [before, *(content.get("task") for content in contents.values()), given.task]
     task = next((task for task in reversed(said) if task is not None), FIRST_TASK)
     if task not in get_args(Task):
-        raise ValueError(f"`task` must be one of {', '.join(get_args(Task))}, got {task!r}")
+        raise ValueError(f"--task must be one of {', '.join(get_args(Task))}, got {task!r}")
     if before not in (None, task):
-        raise ValueError(f"{given.run} is a run of `task` {before}, not of {task}")
+        raise ValueError(f"{given.run} is a run of --task {before}, not of {task}")
     for file in contents:
         if file.parent == PRESETS and task not in (fitting := _tasks_of(contents[file])):
             others_fit = [p.stem for p in _presets() if task in _tasks_of(content_of(p))]
             raise ValueError(
-                f"the preset {file.stem} is for `task` {' or '.join(fitting)}, not for {task}, "
+                f"the preset {file.stem} is for --task {' or '.join(fitting)}, not for {task}, "
                 f"which has {', '.join(others_fit)}"
             )
     if given.task:
@@ -70,12 +73,29 @@ def complete(argv: list[str]) -> tuple[list[str], Task]:
     return [argv[0], *(f"--config={file}" for file in contents), *others], task
 
 
+def _check_files(argv: list[str]) -> None:
+    """ValueError for a value that is no file of a group's options."""
+    scan = Parser(prog=f"darswin {argv[0]}", add_help=False, allow_abbrev=False)
+    for group in FILES:
+        scan.add_argument(f"--{group}", default=[], action="append")
+    for group, values in vars(scan.parse_known_args(argv[1:])[0]).items():
+        for value in values:
+            if not Path(value).is_file() and not value.lstrip().startswith("{"):
+                meant = FILES[group] and f"; type {FILES[group]} {value}"
+                raise ValueError(
+                    f"--{group} takes a file of options, and {value} is none{meant}; "
+                    f"`darswin {argv[0]} --help` lists the options"
+                )
+
+
 def _config_file(name: str) -> Path:
     preset = PRESETS / f"{name}.yaml"
     if Path(name).exists():
         return Path(name)
     if not preset.exists():
-        raise ValueError(f"{name} is neither a file nor a preset; the presets are {presets()}")
+        meant = did_you_mean(name, [path.stem for path in _presets()])
+        text = f"{name} is neither a file nor a preset{meant} The presets are {presets()}"
+        raise ValueError(text)
     return preset
 
 
@@ -119,13 +139,13 @@ def check_folder(run: Path) -> None:
     if not run.is_file():
         return
     if run.suffix == ".ckpt":
-        use = "`ckpt_path` takes a checkpoint"
+        use = "--ckpt_path takes a checkpoint"
     else:
-        use = "`model.weights` takes a model to start from, `darswin predict --model` one to use"
+        use = "--model.weights takes a model to start from, `darswin predict --model` one to use"
     above = run.parent.parent
     hint = f"; this one belongs to the run {above}" if (above / "config.yaml").exists() else ""
     raise ValueError(
-        f"`run` names the folder in which `darswin fit` keeps all of a training, but {run} is a "
+        f"--run names the folder in which `darswin fit` keeps all of a training, but {run} is a "
         f"file{hint}. {use}"
     )
 
@@ -134,12 +154,12 @@ def check_free(folder: Path) -> None:
     """FileExistsError for a folder that holds a run."""
     if last_of(folder).exists():
         raise FileExistsError(
-            f"{folder} holds a run already: continue it with `resume`, or choose another folder"
+            f"{folder} holds a run already: continue it with --resume, or choose another folder"
         )
 
 
 def flag_of(name: str) -> str:
-    """The flag of a parameter, whose name comes from an error of the library."""
+    """The flag of a parameter of `fit` that an error of the library carries."""
     if name in RUN or "." in name:
         return f"--{name}"
     from lightning.pytorch import Trainer  # takes seconds
@@ -154,28 +174,10 @@ def flag_of(name: str) -> str:
     return f"--model.{name}"
 
 
-_FIRST = {"data": "data.path", "model": "model.name"}
-
-
-def with_nearest(message: str, names: Collection[str]) -> str:
-    """The parser's message, with the option of `names` that was probably meant."""
-    group = re.match(r"--(data|model|trainer): Unable to load config '(.*?)'", message)
-    if group:
-        start, value = group.groups()
-        meant = f"; type --{_FIRST[start]} {value}" if start in _FIRST else ""
-        return f"--{start} takes a file of options, and {value} is none{meant}"
-    if not message.startswith("unrecognized arguments"):
-        return message
-    found = []
-    for word in re.findall(r"(?<!\S)--([\w.]+)", message):
-        group_of_word, _, last = word.rpartition(".")
-        shown = [n for n in names if not n.startswith("--trainer.") or n[2:] in TRAINER]
-        for part in ([n for n in names if n.startswith(f"--{group_of_word}.")], shown, names):
-            by_last = {n.rpartition(".")[2].lstrip("-"): n for n in part}
-            if near := difflib.get_close_matches(last, by_last, 1, 0.7):
-                found.append(by_last[near[0]])
-                break
-    return f"{message}; the nearest option is {', '.join(found)}" if found else message
+def with_nearest_of_run(message: str, names: Collection[str]) -> str:
+    """`with_nearest`, which names options of the trainer that the help leaves out only at last."""
+    shown = [n for n in names if not n.startswith("--trainer.") or n[2:] in TRAINER]
+    return with_nearest(message, shown, names)
 
 
 # -- help: our own options first, then the important ones of Lightning's trainer ---------------

@@ -23,6 +23,7 @@ from darswin.models.registry import list_pretrained, pretrained_file
 from darswin.models.saving import ModelCard, NoCardError, load_model, model_file, model_of_run
 from darswin.utils.files import check_is_file, replace_file
 from darswin.utils.image import BrokenImageError, read_oriented
+from darswin.utils.parameters import check, with_flags
 from darswin.utils.tasks import Task
 from darswin.utils.tensor_files import read_metadata
 from darswin.utils.video import is_video, read_frames
@@ -80,22 +81,21 @@ def predict(
         weights = Path(model_file(model))
     else:
         raise ValueError(
-            "give either `run`, the folder of a run, or `model`, a safetensors file or one of "
+            "give either --run, the folder of a run, or --model, a safetensors file or one of "
             + ", ".join(list_pretrained())
         )
     for name, value in (("top", top), ("every", every)):
-        if value < 1:
-            raise ValueError(f"`{name}` must be at least 1, got {value}")
+        check(name, value, value >= 1, "at least 1")
     if not paths and lens is None and model in list_pretrained():
         paths, lens = [str(pretrained_file(model, "png"))], str(pretrained_file(model, "json"))
     if not paths:
         raise ValueError("missing pictures or videos: give files or folders")
     if lens is None and run is None:
-        raise ValueError("missing `lens`: give the camera's calibration file")
+        raise ValueError("missing --lens: give the camera's calibration file")
     check_paths(paths)
     net, card = trained_model(weights)
     if task not in (None, card.task):
-        raise ValueError(f"`task` is {task}, but {weights} is a model for {card.task}")
+        raise ValueError(f"--task is {task}, but {weights} is a model for {card.task}")
     files = pictures_and_videos(paths, leave_out=None if card.task == "classification" else out)
     names = [file.name for file in files]
     check_out(out, [*names, str(weights), *([] if lens is None else [lens])])
@@ -121,7 +121,7 @@ def predict(
                     taken_with = _lens(lenses, file.name, image, orientation)
                     answers.add({"image": file.name}, image, taken_with)
             except BrokenImageError as error:
-                bad.append(str(error))
+                bad.append(with_flags(error))
     finally:  # keep the predictions so far
         try:
             answers.flush()

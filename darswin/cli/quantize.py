@@ -19,6 +19,7 @@ from darswin.models.base import Model
 from darswin.models.saving import load_model, model_of_run, save_model
 from darswin.train.data import RunData
 from darswin.train.tasks import TASKS
+from darswin.utils.parameters import check
 from darswin.utils.progress import Progress
 
 BATCH = 16
@@ -47,8 +48,7 @@ def quantize(
         out: the safetensors file to write. The default is checkpoints/best.int8.safetensors in the
             folder of the run.
     """
-    if pictures < 1:
-        raise ValueError(f"`pictures` must be at least 1, got {pictures}")
+    check("pictures", pictures, pictures >= 1, "at least 1")
     check_folder(Path(run))
     weights = model_of_run(run)
     check_out(out, [str(weights)])

@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import torch
 
 import darswin.lens
-from darswin.cli.arguments import check_option
 from darswin.cli.views import View, check_view, view_of, view_rays
 from darswin.lens import Lens, Perspective
 from darswin.lens.files.load import reach
 from darswin.lens.files.opencv import Coefficients
 from darswin.utils.files import replace_file
+from darswin.utils.parameters import check, with_flags
 
 if TYPE_CHECKING:
     import numpy as np
@@ -75,21 +75,21 @@ def undistort(
     check_view(view, fov_deg, yaw_deg, pitch_deg)
     if theta_max_deg is not None:
         in_range = 0 < theta_max_deg <= 180
-        check_option("theta_max_deg", theta_max_deg, in_range, "above 0° and at most 180°")
+        check("theta_max_deg", theta_max_deg, in_range, "above 0° and at most 180°")
     if size is not None:
         fits = min(size) >= 2 and math.prod(size) <= MOST_PIXELS
-        check_option("size", size, fits, f"at least 2,2 and at most {MOST_PIXELS} px in all")
-        check_option("size", size, view != "square" or size[0] == size[1], "square for this view")
+        check("size", size, fits, f"at least 2,2 and at most {MOST_PIXELS} px in all")
+        check("size", size, view != "square" or size[0] == size[1], "square for this view")
     if not paths:
         raise ValueError("missing pictures or videos: give files or folders")
     check_paths(paths)
     if inside := [path for path in paths if is_below(path, out)]:
-        raise ValueError(f"`out` must be a folder without the originals, but has {inside[0]}")
+        raise ValueError(f"--out must be a folder without the originals, but has {inside[0]}")
     root = "." if is_json(calib) else Path(calib).parent
     calibrations = Calibrations(calib, root, camera, coefficients)
     files = pictures_and_videos(paths, leave_out=out)
     if not files:
-        raise ValueError(f"no pictures or videos in {', '.join(paths)}, apart from those of `out`")
+        raise ValueError(f"no pictures or videos in {', '.join(paths)}, apart from those of --out")
     folder = claim_folder(out, RECORD)
     (folder / LENS).unlink(missing_ok=True)
     views = _Views(calibrations, view, fov_deg, size, yaw_deg, pitch_deg, theta_max_deg)
@@ -104,7 +104,7 @@ def undistort(
                     target, lens = undistort_file(file.name, folder / names[file.name], views, bad)
                     written[target.relative_to(folder).as_posix()] = lens
                 except (BrokenImageError, ValueError) as error:
-                    bad.append(str(error))
+                    bad.append(with_flags(error))
                 progress.done += 1
     finally:
         replace_file(folder / RECORD, json.dumps([*written], indent=1, ensure_ascii=False))
@@ -213,7 +213,7 @@ def _video(name: str, target: Path, views: _Views, bad: list[str]) -> tuple[Path
         except BrokenImageError as error:
             if not cameras:
                 raise
-            bad.append(str(error))
+            bad.append(with_flags(error))
 
     if target.suffix.lower() not in video.WRITTEN:
         target = target.with_name(f"{target.name}.mp4")

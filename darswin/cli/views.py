@@ -7,8 +7,8 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from darswin.cli.arguments import check_option
 from darswin.lens.base import Lens
+from darswin.utils.parameters import check
 from darswin.viz.report import sides
 
 View = Literal["perspective", "cylindrical", "equirectangular", "square"]
@@ -21,14 +21,14 @@ class NarrowView(UserWarning):
 def check_view(view: View, fov_deg: float | None, yaw_deg: float, pitch_deg: float) -> None:
     """ValueError for an option of a view that is out of its range."""
     for name, angle in (("yaw_deg", yaw_deg), ("pitch_deg", pitch_deg)):
-        check_option(name, angle, -360 <= angle <= 360, "from -360° to 360°")
+        check(name, angle, -360 <= angle <= 360, "from -360° to 360°")
     if fov_deg is not None:
         flat = view == "perspective"
         most = "below 180°" if flat else "at most 360°"
         in_range = 0 < fov_deg < 180 if flat else 0 < fov_deg <= 360
-        check_option("fov_deg", fov_deg, in_range, f"above 0° and {most} for a {view} view")
+        check("fov_deg", fov_deg, in_range, f"above 0° and {most} for a {view} view")
         if fov_deg <= 2 * math.pi:
-            text = f"`fov_deg` {fov_deg:g} is a narrow view; {fov_deg:g} rad would be "
+            text = f"--fov_deg {fov_deg:g} is a narrow view; {fov_deg:g} rad would be "
             warnings.warn(f"{text}{math.degrees(fov_deg):.4g}°", NarrowView, stacklevel=2)
 
 
@@ -51,7 +51,7 @@ def view_of(
         if not fov_deg > 0:
             raise ValueError(
                 "the picture shows nothing in the row of the lens's principal point: choose the "
-                "view with `fov_deg` and `yaw_deg`"
+                "view with --fov_deg and --yaw_deg"
             )
     aspect = {
         "perspective": size[0] / size[1],

@@ -14,6 +14,7 @@ from darswin.lens.curves import as_curves, form_of
 from darswin.lens.files.load import FORMATS, Calibration
 from darswin.lens.orientation import in_upright_picture, stored_size
 from darswin.utils.files import check_is_file
+from darswin.utils.parameters import naming
 from darswin.utils.text import is_json_file, parse_json, read_json, to_text
 
 _ALL = PurePosixPath(".")
@@ -186,20 +187,22 @@ def _places(
     """The cameras of folders and pictures; arguments as for `Calibrations`."""
     name = "of the lens" if is_json(lens) else str(lens)
     if _NUMBER.fullmatch(str(lens)) and not os.path.exists(str(lens)):
-        raise ValueError(
+        text = (
             f"`lens` {lens} is a number, but must be a calibration file, or a lens as JSON: for an "
             'ordinary picture {"model": "Perspective", "fov_deg": 60}, for a fisheye '
             '{"model": "Equidistant", "fov_deg": 170}, each with its own field of view'
         )
+        raise naming(ValueError(text), "lens")
     entries = None if is_json(lens) else _entries(Path(lens), root)
     if entries is None:
         return {_ALL: PictureCamera(str(lens), camera, name, coefficients)}
     options = {"camera": camera, "coefficients": coefficients}
     if given := {key: value for key, value in options.items() if value is not None}:
-        raise ValueError(
+        text = (
             f"`{next(iter(given))}` is for one calibration file, but {lens} lists several: write "
             f'{{"file": …, {json.dumps(given)[1:]} there'
         )
+        raise naming(ValueError(text), *given)
     if not entries:
         raise ValueError(f"{lens} must list the lenses of the pictures, but is empty")
     cameras: dict[PurePosixPath, PictureCamera] = {}
@@ -227,7 +230,7 @@ def _entries(path: Path, root: Path) -> Mapping[str, Any] | None:
         content = read_json(path)
     except ValueError:  # the reader of calibrations says what is wrong
         return None
-    if not isinstance(content, dict) or any(f.fits(content) for f in FORMATS):
+    if not isinstance(content, dict) or any(f.recognizes(content) for f in FORMATS):
         return None
     return content if path.name == "lenses.json" or _are_cameras(content, path, root) else None
 

@@ -21,6 +21,7 @@ from darswin.data.splits import (
     taken_from,
     warn_left_out,
 )
+from darswin.utils.parameters import naming
 from darswin.utils.video import SUFFIXES as VIDEOS
 
 SUFFIXES = frozenset((
@@ -57,10 +58,11 @@ def open_folder(
     for part, (folder, paths) in given.items():
         if unknown := sorted(set(_classes(paths)) - set(classes)):
             reason = "the list of classes lacks" if names else "the training split lacks"
-            raise ValueError(
+            text = (
                 f"the {part!r} split in {folder} holds pictures of the classes {some(unknown)}, "
                 f"but {reason} them: move them away, or list the classes to use in `classes`"
             )
+            raise naming(ValueError(text), "classes")
     part, held_out = taken_from(split, given)
     folder, paths = given[part]
     if not paths:
@@ -138,10 +140,11 @@ def _split_folders(root: Path, names: list[str] | None) -> dict[Split, Path] | N
     if others and all(any(map(_is_picture, _entries(f)[1])) for f in named.values()):
         return None
     shown = " and ".join(str(folder) for folder in named.values())
-    raise ValueError(
+    text = (
         f"{shown} may be splits or classes: {LOOKED_FOR}. If they are classes, list all classes in "
         "`classes`"
     )
+    raise naming(ValueError(text), "classes")
 
 
 def _pictures(folder: Path, names: list[str] | None, seen: dict[str, str], whole: bool) -> Pictures:
@@ -155,10 +158,11 @@ def _pictures(folder: Path, names: list[str] | None, seen: dict[str, str], whole
         read = [file for file in files if _suffix(file) in SUFFIXES]
         unread = [file for file in files if _suffix(file) in OTHER_SUFFIXES]
         if unread and not read:
-            raise ValueError(
+            text = (
                 f"{by_name[name]} holds no picture that darswin can read, but {_kinds(unread)}: "
                 "convert them, or list the classes to use in `classes`"
             )
+            raise naming(ValueError(text), "classes")
         if not read and not (whole and names):  # a listed class must have pictures
             kind = "files, but no pictures" if files else "no pictures"
             end = "it is not a class" if whole else "left out"

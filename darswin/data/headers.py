@@ -13,7 +13,7 @@ _READ = 8  # pictures that are read whole
 _AT_ONCE = 1024  # files that wait for a thread
 
 
-def check_files(parts: Mapping[str, Samples]) -> None:
+def check_files(parts: Mapping[str, Samples]) -> dict[str, int]:
     """Raises one error for all pictures, targets and lenses that `samples[i]` would refuse, as far
     as the headers of the files tell.
 
@@ -24,10 +24,15 @@ def check_files(parts: Mapping[str, Samples]) -> None:
     Args:
         parts: the samples by names for the signs of life.
 
+    Returns:
+        The number of broken files of each part, as far as they are known: with `skip_broken` they
+        are left out.
+
     Raises:
         BrokenImageError: only broken files. ValueError: also files that do not fit each other.
     """
-    faults = [fault for what, samples in parts.items() for fault in _faults(samples, what)]
+    found = {what: _faults(samples, what) for what, samples in parts.items()}
+    faults = [fault for what in parts for fault in found[what] if _counts(parts[what], fault)]
     if len(faults) == 1:
         raise faults[0]
     if faults:
@@ -40,10 +45,11 @@ def check_files(parts: Mapping[str, Samples]) -> None:
             lines.append(f"and {len(faults) - SHOWN} more")
         broken = all(isinstance(fault, BrokenImageError) for fault in faults)
         raise (BrokenImageError if broken else ValueError)("\n  ".join(lines))
+    return {what: len(left_out) for what, left_out in found.items()}
 
 
 def _faults(samples: Samples, what: str) -> list[Exception]:
-    """The errors of samples that cannot be used."""
+    """The errors of samples that cannot be used or are left out."""
     count = len(samples)
     faults: list[Exception] = []
     with (
@@ -54,7 +60,9 @@ def _faults(samples: Samples, what: str) -> list[Exception]:
         warnings.filterwarnings("ignore", module=r"PIL\.")
         some = range(0, count, -(-count // _READ) or 1)
         read = {k: _fault(samples, k, None) for k in some}
-        hidden = any(read[k] and not _fault(samples, k, _headers(samples, k)) for k in some)
+        hidden = any(
+            _counts(samples, read[k]) and not _fault(samples, k, _headers(samples, k)) for k in some
+        )
         for start in range(0, count, _AT_ONCE):
             part = range(start, min(start + _AT_ONCE, count))
             found = pool.map(lambda k: None if hidden else _headers(samples, k), part)
@@ -71,11 +79,14 @@ def _fault(
     """The error of a sample that cannot be used; None for `headers` reads its files whole."""
     try:
         samples.check(index, headers)
-    except BrokenImageError as error:
-        return None if samples.skip_broken else error
-    except ValueError as error:
+    except (BrokenImageError, ValueError) as error:
         return error
     return None
+
+
+def _counts(samples: Samples, fault: Exception | None) -> bool:
+    """True for an error, unless it is about a broken file that is left out."""
+    return fault is not None and not (samples.skip_broken and isinstance(fault, BrokenImageError))
 
 
 def _headers(samples: Samples, index: int) -> Sequence[Header] | None:

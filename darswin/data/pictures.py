@@ -22,6 +22,7 @@ from darswin.utils.image import (
     read_oriented,
     with_channels,
 )
+from darswin.utils.parameters import naming
 
 _LOOKED_AT = 32  # pictures whose headers tell the form of all
 
@@ -166,7 +167,8 @@ def open_source(
     root = Path(path)
     in_memory = str(path) == "digits" or _idx_file(root, "train-images-idx3-ubyte") is not None
     if in_memory and splits is not None:
-        raise ValueError(f"`splits` is for folders of images, but {path} is none")
+        text = f"`splits` is for folders of images, but {path} is none"
+        raise naming(ValueError(text), "splits")
     if not in_memory and not root.is_dir():
         raise FileNotFoundError(f"no folder {root}")
     source: Source
@@ -179,9 +181,10 @@ def open_source(
         label = {name: k for k, name in enumerate(names)}
         source = ImageFiles(folder, [(p, label[class_of(p)]) for p in paths], names)
     if not len(source):
-        raise FileNotFoundError(
+        text = (
             f"no images for the {split!r} split of {path}: `holdout` {holdout:g} leaves none for it"
         )
+        raise naming(FileNotFoundError(text), "holdout")
     source.channels = channels or source.form().channels
     return source
 

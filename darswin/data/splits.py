@@ -12,6 +12,7 @@ from typing import Any, ClassVar, Literal, Self, get_args
 
 import numpy as np
 
+from darswin.utils.parameters import check, naming
 from darswin.utils.text import is_json_file, read_json, read_text
 
 Split = Literal["train", "val", "test"]
@@ -34,10 +35,8 @@ def warn_left_out(text: str) -> None:
 
 def check_split(split: str, allowed: tuple[str, ...], holdout: float) -> None:
     """ValueError for an unknown split or a share out of range."""
-    if split not in allowed:
-        raise ValueError(f"`split` must be one of {allowed}, got {split!r}")
-    if not 0 <= holdout < 0.5:
-        raise ValueError(f"`holdout` must be in [0, 0.5), got {holdout}")
+    check("split", repr(split), split in allowed, f"one of {allowed}")
+    check("holdout", holdout, 0 <= holdout < 0.5, "in [0, 0.5)")
 
 
 def taken_from(split: Split, given: Collection[Split]) -> tuple[Split, list[Split]]:
@@ -73,10 +72,11 @@ def part_of_split(
     chosen = hold_out([label(key) for key in keys], keys, holdout, held_out)[split]
     kept = {keys[k] for k in chosen}
     if not kept:
-        raise FileNotFoundError(
+        text = (
             f"no pictures for the {split!r} split in {where}: `holdout` {holdout:g} of "
             f"{len(keys)} {'groups' if group else 'pictures'} leaves none"
         )
+        raise naming(FileNotFoundError(text), "holdout")
     return [path for path in paths if groups[path] in kept]
 
 
@@ -109,8 +109,7 @@ class Limited:
 
     def limited(self, count: int) -> Self:
         """At most `count` pictures, chosen by a fixed shuffle; ValueError for a count below 1."""
-        if count < 1:
-            raise ValueError(f"`limit` must be at least 1, got {count}")
+        check("limit", count, count >= 1, "at least 1")
         arrays = {name: getattr(self, name) for name in self.PER_PICTURE}
         total = len(arrays[self.PER_PICTURE[0]])
         chosen = np.sort(np.random.default_rng(0).permutation(total)[:count])

@@ -12,6 +12,7 @@ from darswin.data.scenes.targets import IGNORE
 from darswin.lens import Lens
 from darswin.lens.orientation import rotated, upright
 from darswin.lens.pixels import pixel_angles, reprojection
+from darswin.utils.parameters import check
 
 # Ways to give a picture the size of a model: "crop" cuts the longer side, "stretch" squashes it,
 # "whole" keeps the aspect ratio and resizes the shorter side.
@@ -100,8 +101,7 @@ class RandomTurns:
     rotate_deg: float = 0.0
 
     def __post_init__(self) -> None:
-        if not 0 <= self.rotate_deg <= 180:
-            raise ValueError(f"`rotate_deg` must be in [0, 180], got {self.rotate_deg}")
+        check("rotate_deg", self.rotate_deg, 0 <= self.rotate_deg <= 180, "in [0, 180]")
 
     def draw(self, rng: np.random.Generator) -> Turn:
         """A random turn."""

@@ -9,9 +9,10 @@ from typing import Any, ClassVar, Self
 import torch
 from torch import Tensor
 
-from darswin.lens.frame import ImageFrame, Size
+from darswin.lens.image import LensInImage, Size
 from darswin.lens.parameter import Number
 from darswin.lens.solve import direction_of, inverse, length_of, vector_of
+from darswin.utils.nearest import did_you_mean
 
 # A lens ends this far (rad) before the angle at which r stops rising or becomes infinite, where r
 # does not determine θ.
@@ -24,7 +25,7 @@ IN_DEGREES = {"fov_deg": "fov", "theta_max_deg": "theta_max"}
 MODELS: dict[str, type["Lens"]] = {}
 
 
-class Lens(ImageFrame):
+class Lens(LensInImage):
     """Base of all lenses. A class declares each `Parameter` and defines `theta_limit`, `project`.
 
     A ray at incident angle θ and azimuth φ lands at
@@ -209,11 +210,11 @@ class Lens(ImageFrame):
         Pixels are (N or 1, ..., 2) px; for a single lens (..., 2). image_size: (H, W). Returns θ
         and φ, (N, ...) rad. θ is NaN where no ray lands.
         """
-        theta, direction = self.rays(pixels, image_size)
+        theta, direction = self.theta_and_direction(pixels, image_size)
         return theta, torch.atan2(direction[..., 1], direction[..., 0])
 
     def project_points(self, points: Tensor, image_size: Size = None) -> Tensor:
-        """Pixels at which points (x, y, z) of the camera's frame are seen.
+        """Pixels at which points (x, y, z) in camera coordinates are seen.
 
         Args:
             points: (N or 1, ..., 3), for a single lens (..., 3), in any unit of length: x to the
@@ -237,9 +238,9 @@ class Lens(ImageFrame):
     def unproject_points(self, pixels: Tensor, image_size: Size = None) -> Tensor:
         """Unit vectors (x, y, z), (N, ..., 3), towards the points seen at pixels: the inverse of
         `project_points`. NaN where no ray lands. Arguments: see `unproject_pixels`."""
-        return vector_of(*self.rays(pixels, image_size))
+        return vector_of(*self.theta_and_direction(pixels, image_size))
 
-    def rays(self, pixels: Tensor, image_size: Size = None) -> tuple[Tensor, Tensor]:
+    def theta_and_direction(self, pixels: Tensor, image_size: Size = None) -> tuple[Tensor, Tensor]:
         """`unproject_pixels` with (cos φ, sin φ), (N, ..., 2), in place of φ. At the principal
         point this is (0, 0) and has a gradient."""
         flat = self.from_pixels(pixels, image_size)
@@ -256,7 +257,7 @@ class Lens(ImageFrame):
 
     def pixels(self, theta: Tensor, direction: Tensor, image_size: Size = None) -> Tensor:
         """`project_rays` with (cos φ, sin φ), (N or 1, ..., 2), in place of φ: the inverse of
-        `rays`. θ must be at most θ_max; `seen_pixels` takes any θ."""
+        `theta_and_direction`. θ must be at most θ_max; `seen_pixels` takes any θ."""
         return self.to_pixels(self._flat(theta, direction), image_size)
 
     def seen_pixels(self, theta: Tensor, direction: Tensor, image_size: Size = None) -> Tensor:
@@ -281,7 +282,7 @@ class Lens(ImageFrame):
         right, below = (width - 0.5).expand_as(cx), (height - 0.5).expand_as(cy)
         pixels = torch.stack((low, cy, cx, low, right, cy, cx, below), 1).unflatten(1, (4, 2))
         whole = self.with_theta_max(None)
-        theta = whole.rays(pixels, image_size)[0]
+        theta = whole.theta_and_direction(pixels, image_size)[0]
         return torch.where(theta.isnan(), whole.theta_max[:, None], theta)
 
     def _rotated_terms(self, turn: Tensor) -> dict[str, Tensor]:
@@ -312,7 +313,7 @@ def from_dict(description: Mapping[str, Any], image_size: Size = None) -> Lens:
             return _from_degrees(arguments, in_degrees, angle, image_size)
     name = arguments.pop("model", None)
     if not isinstance(name, str) or name not in MODELS:
-        raise ValueError(f'a lens\'s "model" must be one of {sorted(MODELS)}, got {name!r}')
+        raise ValueError(unknown_model(name))
     make: Callable[..., Lens] = MODELS[name]
     if "fov" in arguments and hasattr(make, "from_fov"):
         size = image_size or arguments.get("image_size")
@@ -323,6 +324,12 @@ def from_dict(description: Mapping[str, Any], image_size: Size = None) -> Lens:
         return make(**arguments)
     except TypeError as error:
         raise ValueError(f"a {name} lens cannot be made from {arguments}: {error}") from error
+
+
+def unknown_model(name: object) -> str:
+    """What to say of a name that is not in `MODELS`, with the name that was probably meant."""
+    meant, models = did_you_mean(str(name), MODELS), ", ".join(sorted(MODELS))
+    return f"unknown lens model {repr(name)[:80]}{meant} The models are {models}"
 
 
 def _from_degrees(arguments: dict[str, Any], in_degrees: str, angle: str, image_size: Size) -> Lens:

@@ -1,6 +1,6 @@
 """The concentric map from the image disc of any lens to a square. It keeps ratios of areas.
 
-Places in the square are (a, b) in [-1, 1]², a to the right and b down. The middle is the optical
+Points in the square are (a, b) in [-1, 1]², a to the right and b down. The middle is the optical
 axis, the edge is θ_max, and nested squares are circles of equal θ, evenly spaced in a `Spacing`.
 With a fixed `theta_max`, the edge is at this angle for every lens, in equal steps of θ.
 
@@ -18,14 +18,14 @@ from darswin.lens.spacing import Spacing, span, to_spacing, to_theta
 from darswin.ops.checks import tensor_there
 
 
-def square_to_disc(places: Tensor) -> tuple[Tensor, Tensor]:
-    """The disc's radius (...), in [0, 1], and (cos φ, sin φ) at places (..., 2) of the square. The
+def square_to_disc(points: Tensor) -> tuple[Tensor, Tensor]:
+    """The disc's radius (...), in [0, 1], and (cos φ, sin φ) at points (..., 2) of the square. The
     direction is (1, 0) in the middle."""
-    a, b = places.unbind(-1)
+    a, b = points.unbind(-1)
     wide = a.abs() >= b.abs()
     long, short = torch.where(wide, a, b), torch.where(wide, b, a)
     turn = math.pi / 4 * short / torch.where(long == 0, 1, long)
-    sign = torch.where(long < 0, -1.0, 1.0).to(places.dtype)
+    sign = torch.where(long < 0, -1.0, 1.0).to(points.dtype)
     along, aside = sign * torch.cos(turn), sign * torch.sin(turn)
     direction = torch.where(wide, along, aside), torch.where(wide, aside, along)
     return long.abs(), torch.stack(direction, -1)
@@ -39,8 +39,8 @@ def disc_to_square(radius: Tensor, direction: Tensor) -> Tensor:
     turn = torch.atan(short / torch.where(long == 0, 1, long))
     edge = torch.where(long < 0, -radius, radius)
     other = edge * turn * (4 / math.pi)
-    places = torch.where(wide, edge, other), torch.where(wide, other, edge)
-    return torch.stack(places, -1)
+    points = torch.where(wide, edge, other), torch.where(wide, other, edge)
+    return torch.stack(points, -1)
 
 
 def square_rays(
@@ -50,8 +50,8 @@ def square_rays(
     (1, S, S, 2). With a fixed `theta_max`, θ is NaN beyond θ_max of the lens."""
     like = lens.theta_max
     steps = (2 * torch.arange(size, dtype=like.dtype, device=like.device) + 1) / size - 1
-    places = torch.stack(torch.meshgrid(steps, steps, indexing="xy"), -1)
-    radius, direction = square_to_disc(places)
+    points = torch.stack(torch.meshgrid(steps, steps, indexing="xy"), -1)
+    radius, direction = square_to_disc(points)
     if theta_max is not None:
         theta = (theta_max * radius)[None]
         return torch.where(lens.sees(theta), theta, torch.nan), direction[None]
@@ -66,7 +66,7 @@ def square_view(
     spacing: Spacing,
     theta_max: float | None = None,
 ) -> Tensor:
-    """(N, S, S, 2) px: the places in images of (H, W) of the pixels of a square with `size` S.
+    """(N, S, S, 2) px: the points in images of (H, W) of the pixels of a square with `size` S.
 
     With a fixed `theta_max`, they are `OUTSIDE` beyond θ_max of the lens.
     """
@@ -76,31 +76,31 @@ def square_view(
     return lens.pixels(theta, direction, image_size)
 
 
-def square_places(
+def square_points(
     lens: Lens, image_size: tuple[int, int], spacing: Spacing, theta_max: float | None = None
 ) -> Tensor:
-    """(N, H, W, 2): the places in the square of the images' pixels; `OUTSIDE` where no ray of
+    """(N, H, W, 2): the points in the square of the images' pixels; `OUTSIDE` where no ray of
     [0, θ_max] lands, also of a fixed `theta_max`."""
     theta, direction = pixel_rays(lens, image_size)
     seen = ~theta.isnan()  # NaN must not reach the gradients
     if theta_max is not None:
         seen = seen & (theta <= theta_max)
-        places = disc_to_square(torch.where(seen, theta / theta_max, 0.0), direction)
-        return torch.where(seen[..., None], places, OUTSIDE)
+        points = disc_to_square(torch.where(seen, theta / theta_max, 0.0), direction)
+        return torch.where(seen[..., None], points, OUTSIDE)
     first, last = (end[:, :, None] for end in span(lens, spacing))
     value = to_spacing(lens, torch.where(seen, theta, 0.0), spacing)
     radius = ((value - first) / (last - first)).clamp(max=1)
-    places = disc_to_square(radius, direction)
-    return torch.where(seen[..., None], places, OUTSIDE)
+    points = disc_to_square(radius, direction)
+    return torch.where(seen[..., None], points, OUTSIDE)
 
 
-def read_square(square: Tensor, places: Tensor) -> Tensor:
-    """Samples squares (B, C, S, S) at places (B or 1, H, W, 2), bilinearly: (B, C, H, W).
+def read_square(square: Tensor, points: Tensor) -> Tensor:
+    """Samples squares (B, C, S, S) at points (B or 1, H, W, 2), bilinearly: (B, C, H, W).
 
     The outermost pixels extend to the square's edge. `OUTSIDE` gives 0.
     """
     height, width = square.shape[2:]
-    size = tensor_there((width, height), places)
-    pixels = ((places + 1) * size - 1) / 2
+    size = tensor_there((width, height), points)
+    pixels = ((points + 1) * size - 1) / 2
     inside = torch.minimum(pixels.clamp(min=0), size - 1)
-    return sample_at(square, torch.where(places == OUTSIDE, OUTSIDE, inside))
+    return sample_at(square, torch.where(points == OUTSIDE, OUTSIDE, inside))

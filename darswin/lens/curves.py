@@ -151,8 +151,8 @@ def as_curves(lens: Lens, count: int = 512) -> Tabulated:
     _check_start(radii)
     radii = torch.cat((torch.zeros_like(radii[:, :1]), radii[:, 1:]), 1)
     slopes = torch.minimum(slopes.clamp(min=0), _steepest(angles, radii))
-    frame = {name: getattr(lens, name) for name in lens.common}
-    return Tabulated._from_tensors({"angles": angles, "radii": radii, "slopes": slopes} | frame)
+    common = {name: getattr(lens, name) for name in lens.common}
+    return Tabulated._from_tensors({"angles": angles, "radii": radii, "slopes": slopes} | common)
 
 
 def _check_start(radii: Tensor) -> None:

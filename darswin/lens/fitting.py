@@ -8,7 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from darswin.lens.base import MODELS, Lens
+from darswin.lens.base import MODELS, Lens, unknown_model
 from darswin.lens.curves import Tabulated, as_curves, cat
 from darswin.lens.polynomial import PolynomialLens
 from darswin.lens.solve import direction_of
@@ -45,7 +45,7 @@ def fit(model: str | type[Lens], lens: Lens, *, terms: int | None = None) -> Fit
     """
     if isinstance(model, str):
         if model not in MODELS:
-            raise ValueError(f"model must be one of {sorted(MODELS)}, got {model!r}")
+            raise ValueError(unknown_model(model))
         model = MODELS[model]
     if not isinstance(model, type) or not issubclass(model, Lens):
         raise TypeError(f"model must be a lens class or its name, got {model!r}")

@@ -84,8 +84,8 @@ class Arguments:
     """The arguments of a constructor: required, optional by place, and optional by name."""
 
     def __init__(self, required: Sequence[str], optional: Sequence[str], by_name: Sequence[str]):
-        self.places, self.required = (*required, *optional), {*required}
-        self.known = {*self.places, *by_name}
+        self.positional, self.required = (*required, *optional), {*required}
+        self.known = {*self.positional, *by_name}
         kind = inspect.Parameter
         self.signature = inspect.Signature(
             [
@@ -99,7 +99,7 @@ class Arguments:
         self, function: str, arguments: Sequence[Any], named: dict[str, Any]
     ) -> dict[str, Any]:
         """The values that are not None, by name; TypeError for wrong arguments."""
-        given = dict(zip(self.places, arguments, strict=False)) | named
+        given = dict(zip(self.positional, arguments, strict=False)) | named
         all_bound = len(given) == len(arguments) + len(named)
         if not (all_bound and self.required <= given.keys() <= self.known):
             try:

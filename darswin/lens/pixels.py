@@ -28,7 +28,7 @@ def pixel_rays(lens: Lens, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
     like = lens.theta_max
     rows, columns = (torch.arange(side, dtype=like.dtype, device=like.device) for side in size)
     pixels = torch.stack(torch.meshgrid(columns, rows, indexing="xy"), -1)
-    theta, direction = lens.rays(pixels[None], size)
+    theta, direction = lens.theta_and_direction(pixels[None], size)
     return torch.where(lens.sees(theta), theta, torch.nan), direction
 
 
@@ -171,9 +171,9 @@ def sample_at(images: Tensor, pixels: Tensor) -> Tensor:
     exact = torch.promote_types(images.dtype, torch.float32)  # bfloat16 has no half pixels
     there = pixels.to(images.device, exact)
     # -1 and 1 are the image's edges, half a pixel beyond the centres of its outermost pixels.
-    places = (2 * there + 1) / tensor_there((width, height), there) - 1
-    places = places.expand(images.shape[0], -1, -1, -1)
-    view = F.grid_sample(images.to(exact), places, padding_mode="zeros", align_corners=False)
+    points = (2 * there + 1) / tensor_there((width, height), there) - 1
+    points = points.expand(images.shape[0], -1, -1, -1)
+    view = F.grid_sample(images.to(exact), points, padding_mode="zeros", align_corners=False)
     return view.to(images.dtype)
 
 

@@ -79,7 +79,7 @@ def newton(
     part = torch.ones_like(missed)
     shrinks = readable(point)  # otherwise shapes must not depend on values
     if shrinks:
-        found, places = point.clone(), torch.arange(len(point))
+        found, indices = point.clone(), torch.arange(len(point))
     for _ in range(rounds):
         trial = point - part[..., None] * step
         error, slope = function(trial) - goal, slopes(trial)
@@ -90,13 +90,13 @@ def newton(
         part = torch.where(better, (2 * part).clamp(max=1), part / 4)
         if not shrinks:
             continue
-        found[places] = point
+        found[indices] = point
         going = missed > 16 * torch.finfo(goal.dtype).eps * (1 + length_of(goal))
         going &= part > 1e-6
         if not going.any():
             return found
-        places, goal, point, step, missed, part = (
-            x[going] for x in (places, goal, point, step, missed, part)
+        indices, goal, point, step, missed, part = (
+            x[going] for x in (indices, goal, point, step, missed, part)
         )
     return found if shrinks else point
 

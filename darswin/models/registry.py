@@ -1,12 +1,12 @@
 """Models by name. Each model's file registers its class in four sizes. The folder `weights` has the
 trained models that come with darswin."""
 
-import difflib
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 from darswin.models.base import Model
+from darswin.utils.nearest import did_you_mean
 
 _SMALL = dict(embed_dim=96, depths=(2, 2, 18, 2), num_heads=(3, 6, 12, 24), drop_path_rate=0.2)
 _SIZES: dict[str, dict[str, Any]] = dict(
@@ -63,14 +63,13 @@ def model_class(name: str) -> type[Model]:
     if name in list_pretrained():
         raise ValueError(f"{name!r} is a trained model: load_model({name!r}) loads it")
     if name not in _MODELS:
-        raise ValueError(f"unknown model {name!r}; {nearest(name, list_models())}")
+        raise ValueError(f"unknown model {name!r}{nearest_models(name, list_models())}")
     return _MODELS[name][0]
 
 
-def nearest(name: str, names: Sequence[str]) -> str:
-    """A sentence that suggests the two names that are most like the given one."""
-    alike = difflib.get_close_matches(name.lower(), names, 2, 0)
-    return f"did you mean {' or '.join(alike)}? `darswin models` lists all names"
+def nearest_models(name: str, names: Sequence[str]) -> str:
+    """The end of a sentence, which suggests the two names that are most like the given one."""
+    return f"{did_you_mean(name, names, 2, 0)} `darswin models` lists all names"
 
 
 def preset(name: str) -> dict[str, Any]:

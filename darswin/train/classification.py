@@ -14,6 +14,7 @@ from torchmetrics.classification import MulticlassAccuracy
 from darswin.data.augment import Mixing, partners_share
 from darswin.data.lens_distributions import SphericalLenses, parse_lenses
 from darswin.train.task import Batch, Task, finite_loss
+from darswin.utils.parameters import check
 from darswin.viz.plot import draw_accuracy, page_figure
 
 __all__ = ["Classification"]
@@ -57,8 +58,7 @@ class Classification(Task):
         **common: Any,
     ):
         super().__init__(name, options, **common)
-        if not 0 <= label_smoothing < 1:
-            raise ValueError(f"`label_smoothing` must be in [0, 1), got {label_smoothing}")
+        check("label_smoothing", label_smoothing, 0 <= label_smoothing < 1, "in [0, 1)")
         self.label_smoothing = label_smoothing
         self.mixing = Mixing(mixup, cutmix, mix_p)
 

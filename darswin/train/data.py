@@ -23,6 +23,7 @@ from darswin.data.warping import CutOff, Framing, RandomTurns
 from darswin.data.wide_angle import PAPER_FOV, WideAngle
 from darswin.lens.files.opencv import Coefficients
 from darswin.train.runs import ignore_signals
+from darswin.utils.parameters import check, naming
 
 __all__ = ["RunData", "WideAngleData"]
 
@@ -106,11 +107,8 @@ class RunData(LightningDataModule):
         skip_broken: bool = False,
     ):
         super().__init__()
-        if batch_size < 1 or workers < 0:
-            raise ValueError(
-                "`batch_size` must be at least 1 and `workers` at least 0, got "
-                f"{batch_size} and {workers}"
-            )
+        check("batch_size", batch_size, batch_size >= 1, "at least 1")
+        check("workers", workers, workers >= 0, "at least 0")
         self.path, self._lens = path, lens
         self._camera, self._coefficients = camera, coefficients
         self._size, self._channels, self._mean, self._std = size, channels, mean, std
@@ -126,6 +124,7 @@ class RunData(LightningDataModule):
         self.seed = seed
         self._sources: dict[Split, Any] = {}
         self.datasets: list[Samples] = []
+        self.left_out: dict[Split, int] = {}  # broken pictures that `check` found in each split
         self._loader: ResumableLoader | None = None
         self._progress: dict[str, Any] = {}
         self._said_cut_off = False
@@ -149,10 +148,11 @@ class RunData(LightningDataModule):
             except FileNotFoundError as error:
                 if split == "train" or self._opening["holdout"]:
                     raise
-                raise ValueError(
+                text = (
                     f"`holdout` 0 leaves no pictures for {split!r}, and {self.path} has none of "
                     "its own; set `limit_val_batches` 0 to train without validation"
-                ) from error
+                )
+                raise naming(ValueError(text), "holdout", "limit_val_batches") from error
         return self._sources[split]
 
     @property
@@ -182,7 +182,8 @@ class RunData(LightningDataModule):
     ) -> list[float]:
         values = list(given or (colour if self.channels == 3 else [grey]))
         if len(values) != self.channels:
-            raise ValueError(f"`{name}` must have {self.channels} values, got {values}")
+            text = f"`{name}` must have {self.channels} values, got {values}"
+            raise naming(ValueError(text), name)
         return values
 
     @property
@@ -211,9 +212,8 @@ class RunData(LightningDataModule):
         self.datasets.append(dataset)
         if not self._said_cut_off and not self._place["rank"] and (lost := dataset.cut_off()):
             self._said_cut_off = True
-            warnings.warn(
-                f"`fit` crop cuts off {lost}; `fit` stretch keeps it", CutOff, stacklevel=2
-            )
+            said = CutOff(f"`fit` crop cuts off {lost}; `fit` stretch keeps it")
+            warnings.warn(naming(said, "fit"), stacklevel=2)
         return dataset
 
     def broken(self) -> int:
@@ -242,7 +242,8 @@ class RunData(LightningDataModule):
 
     def check(self, splits: Sequence[Split]) -> None:
         """Raises one error for all files of these splits that a training could not use."""
-        check_files({f"the pictures of {split!r}": self.dataset(split) for split in splits})
+        found = check_files({f"the pictures of {split!r}": self.dataset(split) for split in splits})
+        self.left_out = dict(zip(splits, found.values(), strict=True))
 
     def train_dataloader(self) -> ResumableLoader:
         """The batches of the training split, in an order that can be resumed."""
@@ -332,7 +333,8 @@ class WideAngleData(RunData):
         super().__init__(path, **common)
         for name, value in (("camera", self._camera), ("coefficients", self._coefficients)):
             if value is not None and self._lens is None:
-                raise ValueError(f"`{name}` {value} needs a calibration: give `lens`")
+                text = f"`{name}` {value} needs a calibration: give `lens`"
+                raise naming(ValueError(text), name, "lens")
         self.train_lenses = parse_lenses(train_lenses)
         self._test_lenses = parse_sweep(test_lenses)
         self._warping: dict[str, Any] = dict(

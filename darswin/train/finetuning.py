@@ -10,9 +10,10 @@ from darswin.layers.quantized import without_quantized_layers
 from darswin.models.base import Model
 from darswin.models.encoder import Encoder
 from darswin.models.pixel import PixelModel
-from darswin.models.registry import list_models, model_class, nearest, preset
+from darswin.models.registry import list_models, model_class, nearest_models, preset
 from darswin.models.saving import ModelCard, load_model, model_of_run
 from darswin.models.unet import Unet
+from darswin.utils.parameters import check, naming
 from darswin.utils.tasks import Task
 
 # Options of a model that follow from the data.
@@ -52,9 +53,10 @@ def check_name(name: str, task: Task) -> None:
     """ValueError for an unknown model, or a model for another task."""
     model_class(name)
     if name not in models_for(task):
-        raise ValueError(
-            f"`name` {name} is no model for `task` {task}; {nearest(name, models_for(task))}"
+        text = (
+            f"`name` {name} is no model for `task` {task}{nearest_models(name, models_for(task))}"
         )
+        raise naming(ValueError(text), "name", "task")
 
 
 def settle(
@@ -64,10 +66,11 @@ def settle(
     gives options that are None; ValueError if others disagree with it."""
 
     def refuse(option: str, value: Any, theirs: Any) -> ValueError:
-        return ValueError(
+        text = (
             f"`{option}` {value} disagrees with `weights` {weights}, whose model has {theirs}: "
             "leave the option out, or set it to null if a preset sets it"
         )
+        return naming(ValueError(text), option, "weights")
 
     name = name_from(card, task)
     if model["name"] not in (None, name):
@@ -132,10 +135,8 @@ def frozen_parts(net: Encoder | PixelModel, stages: int) -> list[nn.Module]:
     the head if these are all stages."""
     net = net.encoder if isinstance(net, Unet) else net
     of_encoder = getattr(net, "stages", ())
-    if not 0 <= stages <= len(of_encoder):
-        raise ValueError(
-            f"`freeze_stages` must be from 0 to the model's {len(of_encoder)} stages, got {stages}"
-        )
+    allowed = f"from 0 to the model's {len(of_encoder)} stages"
+    check("freeze_stages", stages, 0 <= stages <= len(of_encoder), allowed)
     if not stages:
         return []
     trained = {"head", "stages"} | ({"norm"} if stages < len(of_encoder) else set())

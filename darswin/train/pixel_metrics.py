@@ -13,6 +13,8 @@ import torch
 from torch import Tensor
 from torchmetrics import Metric
 
+from darswin.utils.parameters import check
+
 BY_AREA = "_sr"  # the ending of scores that are weighted by solid angle, in steradians
 # δ1, δ2, δ3: the larger of two distances is less than this many times the other.
 _RATIOS = (1.25, 1.25**2, 1.25**3)
@@ -24,10 +26,8 @@ class Zones:
 
     def __init__(self, borders: Sequence[float]):
         inner = [0.0, *map(float, borders), 180.0]
-        if any(not a < b for a, b in pairwise(inner)):
-            raise ValueError(
-                f"`zones` must be increasing angles between 0 and 180 degrees, got {list(borders)}"
-            )
+        rising = all(a < b for a, b in pairwise(inner))
+        check("zones", list(borders), rising, "increasing angles between 0 and 180 degrees")
         self.borders = inner[1:-1]
 
     def __len__(self) -> int:

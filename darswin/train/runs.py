@@ -15,6 +15,7 @@ from lightning.pytorch.plugins.io import TorchCheckpointIO
 
 from darswin.models.saving import ModelCard, save_model
 from darswin.utils.files import replace_file
+from darswin.utils.parameters import naming
 from darswin.utils.unpickle import read_pickle
 
 # -- checkpoints ------------------------------------------------------------------------------
@@ -140,7 +141,7 @@ class SafeCheckpointIO(TorchCheckpointIO):
         except ValueError as error:
             others = sorted(set(Path(path).parent.glob("*.ckpt")) - {Path(path)})
             hint = f"; `ckpt_path` {others[0]} starts from the other one" if others else ""
-            raise ValueError(f"{error}{hint}") from error
+            raise naming(ValueError(f"{error}{hint}"), "ckpt_path") from error
         if not isinstance(checkpoint, dict) or "darswin" not in checkpoint:
             raise ValueError(f"{path} is not a checkpoint of `darswin fit`: it names no model")
         return checkpoint
@@ -226,43 +227,35 @@ def _say_no_lost_connection(error: Any) -> None:
 
 # -- options that change when a run goes on ---------------------------------------------------
 
-# A change takes effect at the checkpoint. Options of the trainer may change as well, except for
-# accumulate_grad_batches, which is part of the size of a step.
-CHANGEABLE = {
-    *("checkpoint_steps", "weights_only"),
-    *(f"model.{rate}_rate" for rate in ("learning", "warmup", "final")),
-    *("model.warmup_epochs", "model.reference_batch", "model.weight_decay"),
-    *("model.label_smoothing", "model.mixup", "model.cutmix", "model.mix_p"),
-    *("model.loss", "model.class_weights", "model.solid_angle_weights", "model.zones"),
-    *("model.matmul_backend", "model.grad_checkpointing"),
-    *("data.path", "data.classes", "data.splits", "data.label_map", "data.skip_broken"),
-    *("data.lens", "data.camera", "data.coefficients"),
-    *("data.batch_size", "data.workers"),
-    *("data.train_lenses", "data.test_lenses", "data.pair_lenses"),
-    *("data.render", "data.fit", "data.picture_size", "data.randaugment", "data.erasing"),
-    *("data.flip", "data.rotate_deg", "data.crop", "data.lens_augmentation"),
-    *("data.test_paths", "data.max_distance"),
+# A change takes effect at the checkpoint, and is said. These options may not change: they decide on
+# the network, the groups of its parameters, its images, the size of a step, or which pictures and
+# labels count. A new option may change unless it is listed here. Otherwise no older run could go
+# on, because it lacks the option. So that nobody forgets to list one that matters, a test has a
+# table of all options, and fails for an option that is not in it.
+FIXED = {
+    *("task", "seed_everything", "trainer.accumulate_grad_batches"),
+    *("model.name", "model.options", "model.weights", "model.freeze_stages"),
+    *("model.decay_position_bias", "model.ignore_index"),
+    *("data.size", "data.channels", "data.mean", "data.std", "data.fov_deg"),
+    *("data.limit", "data.holdout"),
 }
 
 
-def check_changes(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
-    """A line for each option that changes on resume; ValueError for options that cannot change."""
+def check_changes(before: Mapping[str, Any], now: Mapping[str, Any]) -> dict[str, str]:
+    """Each option that changes on resume, and its change in words; ValueError for options that
+    cannot change."""
     before, now = _options(before), _options(now)
     changes = {
-        name: f"`{name}` {now[name]!r} in place of {before.get(name)!r}"
+        name: f"{now[name]!r} in place of {before.get(name)!r}"
         for name in now
         # An older run may lack an option; the option is no change if it is off now.
         if now[name] != before.get(name) and (name in before or now[name])
     }
-    refused = [
-        text
-        for name, text in changes.items()
-        if name not in CHANGEABLE
-        and (not name.startswith("trainer.") or name == "trainer.accumulate_grad_batches")
-    ]
-    if refused:
-        raise ValueError(f"a resumed run cannot change these options: {'; '.join(refused)}")
-    return list(changes.values())
+    if refused := [name for name in changes if name in FIXED]:
+        each = "; ".join(f"`{name}` {changes[name]}" for name in refused)
+        text = f"a resumed run cannot change these options: {each}"
+        raise naming(ValueError(text), *refused)
+    return changes
 
 
 def _options(config: Mapping[str, Any]) -> dict[str, Any]:

@@ -14,6 +14,7 @@ from darswin.data.scenes.targets import Target
 from darswin.data.splits import Split
 from darswin.train.data import RunData
 from darswin.train.task import Batch
+from darswin.utils.parameters import check
 
 __all__ = ["DistanceData", "LabelData", "SceneData"]
 
@@ -133,8 +134,8 @@ class DistanceData(SceneData):
 
     def __init__(self, path: str, *, max_distance: float | None = None, **common: Any):
         super().__init__(path, **common)
-        if max_distance is not None and not 0 < max_distance < math.inf:
-            raise ValueError(f"`max_distance` must be above 0, got {max_distance}")
+        if max_distance is not None:
+            check("max_distance", max_distance, 0 < max_distance < math.inf, "above 0")
         self.max_distance = max_distance
 
     def on_after_batch_transfer(self, batch: Batch, dataloader_idx: int) -> Batch:

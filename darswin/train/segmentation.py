@@ -19,6 +19,7 @@ from darswin.train.pixel_metrics import (
     none_of_nan,
 )
 from darswin.train.pixel_task import PixelTask
+from darswin.utils.parameters import check, naming
 
 __all__ = ["Distance", "Segmentation"]
 
@@ -64,14 +65,11 @@ class Segmentation(PixelTask):
         **common: Any,
     ):
         super().__init__(name, options, **common)
-        if not 0 <= label_smoothing < 1:
-            raise ValueError(f"`label_smoothing` must be in [0, 1), got {label_smoothing}")
-        if class_weights is not None and not (
-            all(0 <= weight < math.inf for weight in class_weights) and any(class_weights)
-        ):
-            raise ValueError(
-                f"`class_weights` must be finite, at least 0, and not all 0, got {class_weights}"
-            )
+        check("label_smoothing", label_smoothing, 0 <= label_smoothing < 1, "in [0, 1)")
+        if class_weights is not None:
+            positive = all(0 <= w < math.inf for w in class_weights) and any(class_weights)
+            allowed = "finite, at least 0, and not all 0"
+            check("class_weights", class_weights, positive, allowed)
         self.loss, self.class_weights = loss, class_weights
         self.ignore_index = None if ignore_index == IGNORE else ignore_index
         self.label_smoothing = label_smoothing
@@ -80,15 +78,14 @@ class Segmentation(PixelTask):
         classes = self._two_classes()
         count = len(classes)
         if self.class_weights is not None and len(self.class_weights) != count:
-            raise ValueError(
+            text = (
                 f"`class_weights` must have one value for each of the {count} classes "
                 f"{', '.join(classes)}, got {len(self.class_weights)}"
             )
-        if self.ignore_index is not None and not 0 <= self.ignore_index < count:
-            raise ValueError(
-                f"`ignore_index` must be the id of a class, 0 to {count - 1}, or {IGNORE}, got "
-                f"{self.ignore_index}"
-            )
+            raise naming(ValueError(text), "class_weights")
+        if (ignored := self.ignore_index) is not None:
+            allowed = f"the id of a class, 0 to {count - 1}, or {IGNORE}"
+            check("ignore_index", ignored, 0 <= ignored < count, allowed)
         return dict(task="segmentation", num_classes=count)
 
     def _sums(self, zones: int) -> LabelSums:
@@ -124,10 +121,11 @@ class Segmentation(PixelTask):
             return
         text = f"no pixel of {images} has a label of {some(absent)}"
         if len(learned) - len(absent) < 2:
-            raise ValueError(
-                f"{text}, so only one class is left to learn. {IGNORE} means unlabelled: store a "
-                "mask of 0 and 255 as the ids 0 and 1, or give a `label_map`"
+            text += (
+                f", so only one class is left to learn. {IGNORE} means unlabelled: store a mask of "
+                "0 and 255 as the ids 0 and 1, or give a `label_map`"
             )
+            raise naming(ValueError(text), "label_map")
         if not self.global_rank:
             warnings.warn(f"{text}, which cannot be learned", AbsentClass, stacklevel=2)
 
@@ -195,8 +193,9 @@ class Distance(PixelTask):
     def _check_targets(self, found: list[bool], images: str, whole: bool) -> None:
         if not any(found):
             most = self.data.max_distance
-            raise ValueError(
+            text = (
                 f"none of the pixels of {images} has a known distance: all are 0 or not finite"
                 + (f", or above `max_distance` {most:g} m" if most is not None else "")
                 + "; a PNG must hold metres × 256 in 16 bits, a .npy file metres"
             )
+            raise naming(ValueError(text), "max_distance")

@@ -30,6 +30,7 @@ from darswin.train.finetuning import (
     start_from,
     weights_file,
 )
+from darswin.utils.parameters import check, naming
 from darswin.utils.tasks import Task as TaskName
 
 __all__ = ["Task"]
@@ -101,9 +102,8 @@ class Task(LightningModule):
     ):
         super().__init__()
         if freeze_stages and weights is None:
-            raise ValueError(
-                f"`freeze_stages` {freeze_stages} needs a trained model: give `weights`"
-            )
+            text = f"`freeze_stages` {freeze_stages} needs a trained model: give `weights`"
+            raise naming(ValueError(text), "freeze_stages", "weights")
         if name is None and weights is not None:
             card = read_card(weights_file(weights))
             name = name_from(card, self.task)
@@ -118,9 +118,10 @@ class Task(LightningModule):
             warmup_epochs=warmup_epochs,
         )  # fmt: skip
         for option, value in (positive | others).items():
-            if not 0 <= value < math.inf or (value == 0 and option in positive):
-                least = "above 0" if option in positive else "at least 0"
-                raise ValueError(f"`{option}` must be {least}, got {value}")
+            if option in positive:
+                check(option, value, 0 < value < math.inf, "above 0")
+            else:
+                check(option, value, 0 <= value < math.inf, "at least 0")
         self.rates = dict(peak=learning_rate, warmup=warmup_rate, final=final_rate)
         self.warmup_epochs, self.reference_batch = warmup_epochs, reference_batch
         self.weight_decay, self.decay_position_bias = weight_decay, decay_position_bias
@@ -145,7 +146,8 @@ class Task(LightningModule):
         if has_image_size(self.name):
             options["image_size"] = data.size
         if taken := sorted(options.keys() & self.options.keys()):
-            raise ValueError(f"`options` cannot set {', '.join(taken)}: the data set it")
+            text = f"`options` cannot set {', '.join(taken)}: the data set it"
+            raise naming(ValueError(text), "options")
         options |= self.options
         self.card = ModelCard(
             self.name, options, data.classes, data.size, data.fov, data.frame_fit,
@@ -161,7 +163,8 @@ class Task(LightningModule):
             given = f"`size` {data.size}"
             if self.options:
                 given += f" and `options` {self.options}"
-            raise ValueError(f"cannot make {self.name} with {given}: {error}") from error
+            text = f"cannot make {self.name} with {given}: {error}"
+            raise naming(ValueError(text), "size", "options") from error
         if self.weights is not None and self.trainer.training:
             start_from(self.net, data.classes, self.weights)
         self._freeze()
@@ -214,15 +217,15 @@ class Task(LightningModule):
         trainer.fit_loop.setup_data()  # with max_steps alone, Lightning has not yet
         steps = trainer.estimated_stepping_batches
         if not math.isfinite(steps):
-            raise ValueError(
-                "the learning rate's cosine needs an end: set `max_epochs` or `max_steps`"
-            )
+            text = "the learning rate's cosine needs an end: set `max_epochs` or `max_steps`"
+            raise naming(ValueError(text), "max_epochs", "max_steps")
         if self._steps_there not in (None, self.steps_per_epoch):
-            raise ValueError(
+            text = (
                 f"this run began with {self._steps_there} steps per epoch and cannot go on with "
                 f"{self.steps_per_epoch}: keep the number of pictures, `batch_size`, `devices` and "
                 "`limit_train_batches`"
             )
+            raise naming(ValueError(text), "batch_size", "devices", "limit_train_batches")
         self.steps = int(steps)
         rates = {name: rate * scale for name, rate in self.rates.items()}
         warmup_steps = self.warmup_epochs * self.steps_per_epoch
@@ -251,9 +254,7 @@ class Task(LightningModule):
         for tensors in (checkpoint["state_dict"], *moments):
             if not all(tensor.isfinite().all() for tensor in tensors.values()):
                 step = self.trainer.global_step
-                raise FloatingPointError(
-                    f"the weights are not finite after step {step}: {self._advice()}"
-                )
+                raise self._diverged(f"the weights are not finite after step {step}")
         checkpoint["darswin"] = asdict(self.card)
         checkpoint["steps_per_epoch"] = self.steps_per_epoch
 
@@ -288,9 +289,8 @@ class Task(LightningModule):
         every = self.trainer.log_every_n_steps  # type: ignore[attr-defined]  # Lightning adds it
         checked = readable(loss) or (self.trainer.global_step + 1) % max(every, 1) == 0
         if checked and not torch.isfinite(loss):
-            raise FloatingPointError(
-                f"the loss is {loss.item()} in epoch {self.current_epoch}, batch {batch_idx}: "
-                f"{self._advice()}"
+            raise self._diverged(
+                f"the loss is {loss.item()} in epoch {self.current_epoch}, batch {batch_idx}"
             )
         self.log("train/loss", loss, prog_bar=True, batch_size=len(batch[0]), sync_dist=True)
         # A tensor on the device, because Lightning would copy a number there.
@@ -301,20 +301,22 @@ class Task(LightningModule):
         """The loss of a batch; `rng` is the same in all processes."""
         raise NotImplementedError
 
-    def _advice(self) -> str:
-        return (
-            f"go on with `resume` and a `learning_rate` below {self.rates['peak']:g}; if the last "
-            "checkpoint has diverged too, add `ckpt_path` with best.ckpt, or start again"
+    def _diverged(self, what: str) -> FloatingPointError:
+        text = (
+            f"{what}: go on with `resume` and a `learning_rate` below {self.rates['peak']:g}; if "
+            "the last checkpoint has diverged too, add `ckpt_path` with best.ckpt, or start again"
         )
+        return naming(FloatingPointError(text), "resume", "learning_rate", "ckpt_path")
 
 
 def finite_loss(loss: float, name: str) -> float:
     """The loss of a test set; FloatingPointError if it is not finite."""
     if not math.isfinite(loss):
-        raise FloatingPointError(
+        text = (
             f"the loss on {name} is {loss}: the weights are not finite, or training diverged; "
             "try another checkpoint with `ckpt_path`"
         )
+        raise naming(FloatingPointError(text), "ckpt_path")
     return loss
 
 

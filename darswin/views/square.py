@@ -3,7 +3,7 @@
 from torch import Tensor
 
 from darswin.lens import Lens
-from darswin.lens.concentric import read_square, square_places, square_rays, square_view
+from darswin.lens.concentric import read_square, square_points, square_rays, square_view
 from darswin.lens.spacing import SPACINGS, Spacing, check_fixed_theta_max
 from darswin.views.base import Pair, PerChannel, PixelView, Prepared, register_view
 
@@ -52,7 +52,7 @@ class SquareView(PixelView):
         return square_view(lens, size, self.size[0], self.spacing, self.theta_max)
 
     def view_points(self, lens: Lens, size: Pair) -> Tensor:
-        return square_places(lens, size, self.spacing, self.theta_max)
+        return square_points(lens, size, self.spacing, self.theta_max)
 
     def pixel_rays(self, lens: Lens, size: Pair) -> tuple[Tensor, Tensor]:
         return square_rays(lens, self.size[0], self.spacing, self.theta_max)

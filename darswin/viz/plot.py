@@ -113,7 +113,7 @@ def draw_grid(
     _show(axes, image)
     _draw_borders(axes, lens, sampler, image.shape[:2], (0.6, 0.3))
     if samples:
-        axes.plot(*_sample_places(lens, grid, image.shape[:2]), "r.", ms=0.6, alpha=0.5)
+        axes.plot(*_sample_pixels(lens, grid, image.shape[:2]), "r.", ms=0.6, alpha=0.5)
     axes.set(xlim=(-0.5, image.shape[1] - 0.5), ylim=(image.shape[0] - 0.5, -0.5))
 
 
@@ -124,7 +124,7 @@ def draw_samples(image: np.ndarray, lens: Lens, sampler: PolarView, *, axes: Axe
     left, top, width, height = _enlarged(image, lens)
     _show(axes, image)
     _draw_borders(axes, lens, sampler, image.shape[:2], (1.2, 1.2))
-    x, y = _sample_places(lens, grid, image.shape[:2])
+    x, y = _sample_pixels(lens, grid, image.shape[:2])
     inside = (x > left) & (x < left + width) & (y > top) & (y < top + height)
     axes.plot(x[inside], y[inside], "r.", ms=1.5, path_effects=_outline(0.3, "white"))
     axes.set(xlim=(left, left + width), ylim=(top + height, top))
@@ -150,7 +150,7 @@ def _draw_borders(
         axes.add_collection(collection, autolim=False)
 
 
-def _sample_places(lens: Lens, grid: PolarGrid, size: tuple[int, int]) -> Tensor:
+def _sample_pixels(lens: Lens, grid: PolarGrid, size: tuple[int, int]) -> Tensor:
     """The x and y of the sample points, (2, n) px."""
     theta = lens.unproject(grid.radii[0])[:, None]
     return lens.project_rays(theta, grid.azimuths, size).flatten(0, 1).T
@@ -191,8 +191,8 @@ def draw_view(image: np.ndarray, lens: Lens, rays: Tensor, *, axes: Axes) -> Non
     _show(axes, undistort(image, lens, rays), beyond | outside)
     lines = ((axes.xaxis, _middle(rays), 1), (axes.yaxis, _middle(rays.transpose(0, 1)), -1))
     for axis, line, sign in lines:
-        places, degrees = _angle_ticks(line, max(2, 5 * len(line) // max(rays.shape[:2])))
-        axis.set_ticks(places, [f"{sign * angle + 0:g}°" for angle in degrees])
+        positions, degrees = _angle_ticks(line, max(2, 5 * len(line) // max(rays.shape[:2])))
+        axis.set_ticks(positions, [f"{sign * angle + 0:g}°" for angle in degrees])
     axes.set(xlabel=_label("degrees from the view's middle", outside, beyond))
 
 
@@ -204,20 +204,20 @@ def _middle(rays: Tensor) -> Tensor:
 
 
 def _angle_ticks(line: Tensor, most: int) -> tuple[np.ndarray, np.ndarray]:
-    """The places of ticks on a line of rays (n, 3), and their round angles from the middle in
+    """The positions of ticks on a line of rays (n, 3), and their round angles from the middle in
     degrees; at most `most` steps."""
     seen = line.any(-1).numpy()
     half = (len(line) - 1) / 2
     middle = torch.nn.functional.normalize(line[math.floor(half)] + line[math.ceil(half)], dim=0)
     apart = torch.linalg.cross(line, middle.expand_as(line)).norm(dim=-1)
-    places = np.arange(len(line))
-    degrees = torch.rad2deg(torch.atan2(apart, line @ middle)).numpy() * np.sign(places - half)
-    places, degrees = places[seen], degrees[seen]
+    positions = np.arange(len(line))
+    degrees = torch.rad2deg(torch.atan2(apart, line @ middle)).numpy() * np.sign(positions - half)
+    positions, degrees = positions[seen], degrees[seen]
     if len(degrees) < 2 or not (np.diff(degrees) > 0).all():
-        return places[:0], degrees[:0]  # the directions along the line do not rise
+        return positions[:0], degrees[:0]  # the directions along the line do not rise
     ticks = MaxNLocator(most, steps=[1, 1.5, 2, 3, 5, 6, 10]).tick_values(*degrees[[0, -1]])
     ticks = ticks[(ticks >= degrees[0]) & (ticks <= degrees[-1])]
-    return np.interp(ticks, degrees, places), ticks
+    return np.interp(ticks, degrees, positions), ticks
 
 
 def _label(text: str, outside: np.ndarray, beyond: np.ndarray | None = None) -> str:
@@ -296,10 +296,10 @@ def draw_lens(
     draw_grid(image, lens, sampler, samples=False, axes=panels["partition"])
     draw_samples(image, lens, sampler, axes=panels["samples"])
     left, top, width, height = _enlarged(image, lens)
-    frame = Rectangle(
+    border = Rectangle(
         (left, top), width, height, fill=False, color="red", path_effects=_outline(1.5, "white")
     )
-    panels["partition"].add_patch(frame)
+    panels["partition"].add_patch(border)
     draw_view(image, lens, view, axes=panels["view"])
     draw_polar(image, lens, sampler, axes=panels["polar"])
     draw_curve(lens, image.shape[:2], axes=panels["curve"])

@@ -161,7 +161,7 @@ def _view(lens: Lens, image_size: tuple[int, int]) -> list[tuple[str, str]]:
 def _corners(lens: Lens, image_size: tuple[int, int]) -> str:
     height, width = image_size
     pixels = torch.tensor([[x, y] for y in (-0.5, height - 0.5) for x in (-0.5, width - 0.5)])
-    widest = lens.with_theta_max(None).rays(pixels, image_size)[0].tolist()
+    widest = lens.with_theta_max(None).theta_and_direction(pixels, image_size)[0].tolist()
     if math.isnan(sum(widest)):
         return "the lens ends before the corners"
     return f"{_degrees(max(widest[0] + widest[3], widest[1] + widest[2]))} between the corners"

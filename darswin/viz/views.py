@@ -5,9 +5,9 @@ A view consists of the rays of its pixels, (H, W, 3), of any length and directio
 them with OpenCV. One perspective view cannot hold a lens of 190°; `yaw` and `pitch` turn the view.
 
 Convention:
-    Camera frame: x to the right, y down, z forward along the optical axis. A ray (x, y, z) has
-    θ = atan2(√(x² + y²), z) and φ = atan2(y, x). Pixel centres are integers, and the middle of a
-    view is the middle of its pixels, ((W-1)/2, (H-1)/2). yaw > 0 looks to the right and pitch > 0
+    Camera coordinates: x to the right, y down, z forward along the optical axis. A ray (x, y, z)
+    has θ = atan2(√(x² + y²), z) and φ = atan2(y, x). Pixel centres are integers, and the middle of
+    a view is the middle of its pixels, ((W-1)/2, (H-1)/2). yaw > 0 looks to the right and pitch > 0
     up; the view is pitched first, so that yaw turns it around the camera's y axis and keeps the
     horizon level.
     `fov` is the horizontal field of view between the outer edges of a row's outermost pixels; the

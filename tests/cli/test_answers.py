@@ -286,7 +286,7 @@ def test_nothing_but_its_own_is_replaced(tmp_path):
     (tmp_path / "in/p.png").touch()
     (tmp_path / "list").mkdir()
     (tmp_path / "list/predictions.json").write_text('{"mine": 1}')
-    for out, said in ((None, "missing `out`"), ("in", "holds other files"),
+    for out, said in ((None, "missing --out"), ("in", "holds other files"),
                       ("in/p.png", "is a file"), ("list", "holds other files")):  # fmt: skip
         with pytest.raises(ValueError, match=said):
             claim_folder(out and str(tmp_path / out))

@@ -116,7 +116,8 @@ def test_wrong_arguments_are_one_sentence(capsys, typed, said):
         (["bench", "--seconds", "nan"], "--seconds must be above 0, got nan"),
         (["bench", "--model", "swan"], "unknown model 'swan'"),
         (["bench", "--out", __file__], "File exists"),
-        (["train"], "no command 'train'; the commands are fit, "),
+        (["train"], "no command 'train'. The commands are fit, "),
+        (["lents"], "no command 'lents'; did you mean lens? The commands are fit, "),
     ],
 )
 def test_misuse_ends_with_a_sentence_before_any_work(capsys, monkeypatch, argv, said):

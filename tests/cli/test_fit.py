@@ -35,7 +35,7 @@ def scenes(tmp_path_factory):
     ("options", "message"),
     [
         # Of this program, of the data, the model and the trainer: each by its flag.
-        ("--data.batch_size 0", "--data.batch_size must be at least 1 and --data.workers at least"),
+        ("--data.batch_size 0", "--data.batch_size must be at least 1, got 0"),
         ("--data.holdout 0", "none of its own; set --trainer.limit_val_batches 0 to train without"),
         ("--data.train_lenses low --data.lens {}", "--data.train_lenses warps pictures through"),
         ("--data.test_lenses=low --data.lens {}", "--data.test_lenses warps pictures through"),
@@ -62,11 +62,14 @@ def scenes(tmp_path_factory):
         ("--model darswin_a_small", "darswin_a_small is none; type --model.name darswin_a_small; "),
         (
             "--model=darswin_a_small",
-            "error: --model takes a file of options, and darswin_a_small is",
+            "darswin: --model takes a file of options, and darswin_a_small is",
         ),
         ("--data photos", "type --data.path photos; `darswin fit --help` lists the options"),
         ("--trainer 3", "--trainer takes a file of options, and 3 is none; `darswin fit"),
-        ("--config minute", "the presets are few, iccv2023, iccv2023_paper, minutes, scenes_min"),
+        (
+            "--config minute",
+            "did you mean minutes? The presets are few, iccv2023, iccv2023_paper, min",
+        ),
     ],
 )
 def test_wrong_options_are_named_in_one_line(capsys, tmp_path, options, message):
@@ -91,6 +94,10 @@ def test_wrong_options_of_scenes_are_named(capsys, tmp_path, scenes, options, me
 
 def test_what_is_missing_is_named_as_people_type_it(capsys, tmp_path):
     assert "required: --data.path, --run" in error(capsys, "fit", "--config", "minutes")
+    message = error(capsys, "fit", *DIGITS, "--run")
+    assert (
+        message == "darswin fit: argument --run: expected one argument; see `darswin fit --help`\n"
+    )
     (tmp_path / "c.yaml").write_text("model: {speed: 3}")
     message = error(capsys, "fit", "--run", tmp_path, *DIGITS, "--config", tmp_path / "c.yaml")
     assert "no option '--model.speed'" in message
@@ -204,7 +211,9 @@ def test_all_broken_files_are_named_before_the_training(capsys, tmp_path):
 
 def test_each_split_is_checked_once(tmp_path, monkeypatch):
     checked = []
-    monkeypatch.setattr(data, "check_files", checked.extend)
+    monkeypatch.setattr(
+        data, "check_files", lambda parts: checked.extend(parts) or dict.fromkeys(parts, 0)
+    )
     options = [*DIGITS, "--trainer.max_steps", "1", "--data.limit", "48"]
     fit(tmp_path / "a", *options, "--trainer.limit_val_batches", "1")
     assert checked == ["the pictures of 'train'", "the pictures of 'val'"]

@@ -263,3 +263,43 @@ def test_any_command_line_ends_with_an_answer_or_a_sentence(
         assert out.getvalue() and said == 0
     else:
         assert code == 2 and said == 1
+
+
+def test_errors_show_names_of_files_as_they_are(tmp_path, capsys):
+    """Names in a path are no parameters, even if they look like them."""
+    folder = tmp_path / "camera=front" / "model='x' `camera` `image_size`"
+    folder.mkdir(parents=True)
+    (folder / "two.yaml").write_text((FILES / "kalibr_tumvi.yaml").read_text())
+    for command, said in (("lens info", "no such file"), ("fit --run r --data.path", "no folder")):
+        path = folder / "none.json"
+        with pytest.raises(SystemExit):
+            main([*command.split(), str(path)])
+        shown = capsys.readouterr().err
+        assert said in shown and str(path) in shown
+    with pytest.raises(SystemExit):
+        main(["lens", "crop", str(folder / "two.yaml"), str(tmp_path / "o"), "--size", "9,9"])
+    shown = capsys.readouterr().err
+    assert "choose one with --camera: 'cam0'" in shown and "camera=front" in shown
+
+
+@pytest.mark.parametrize(
+    ("command", "said"),
+    [
+        (
+            "lens info front.json --coeficients x",
+            "the nearest option is --coefficients; see `darswin",
+        ),
+        (
+            "lens undistort front.json x --out o --yaw_degree 3",
+            "the nearest option is --yaw_deg; see",
+        ),
+        ("predict x.png --calib_lenses x --evry 2", "the nearest option is --every; see"),
+        ("predict x.png --lenz x --evry=2", "the nearest option is --lens, --every; see"),
+        ("quantize --run r --tolerence 2", "the nearest option is --tolerance; see"),
+        ("bench --zzzzzz 2", "unrecognized arguments: --zzzzzz 2; see `darswin bench --help`"),
+    ],
+)
+def test_misspelt_options_are_answered_with_the_nearest(capsys, command, said):
+    with pytest.raises(SystemExit):
+        main(command.split())
+    assert said in capsys.readouterr().err

@@ -117,7 +117,7 @@ def test_the_most_probable_classes(run, capsys):
         ("p.png --run . --lens L --task distance", r"--task is distance, but .*best\.safe"),
         ("checkpoints --run . --lens L", "no pictures or videos in checkpoints"),
         ("p.png --run . --lens cameras.txt", "choose one with --camera: '1', '2'"),
-        ("p.png --run . --lens kd.json", 'give --coefficients "fisheye" or --coefficients "pin'),
+        ("p.png --run . --lens kd.json", 'give --coefficients "fisheye" or "pinhole"'),
         ("p.png --run . --lens checkpoints", r"no calibration in .*: checkpoints/p\.json"),
         ("p.png --run . --lens checkpoints --camera 1", "--camera 1 chooses a camera of a file"),
     ],
@@ -139,7 +139,7 @@ def test_the_lenses_of_files(run, monkeypatch):
     (run / "lenses.json").write_text(json.dumps({"own/2.png": "lens.json", ".": CIRCLE}))
     camera = load(run / "cameras.txt", camera="2", image_size=SIZE)
     save(camera, run / "lens.json")
-    pinhole = load(run / "kd.json", model="pinhole")
+    pinhole = load(run / "kd.json", coefficients="pinhole")
     circle = from_dict(CIRCLE | {"center": [47.5, 31.5], "image_size": list(SIZE)})
     monkeypatch.chdir(run / "own")
     for options, expected in (

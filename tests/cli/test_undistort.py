@@ -343,7 +343,7 @@ def test_crop_writes_the_lens_of_cropped_pictures(folder, capsys, options, expec
     main(["lens", "crop", calib, str(new), *options, "--coefficients=fisheye"])
     assert "KannalaBrandt" in capsys.readouterr().out
     exact = dict(dtype=torch.float64)
-    lens = expected(lenses.load(calib, model="fisheye", **exact))
+    lens = expected(lenses.load(calib, coefficients="fisheye", **exact))
     found = lenses.load(new, theta_max=lens.theta_max.item(), **exact)
     assert torch.equal(found.image_size, lens.image_size)
     theta = torch.linspace(0, 1, 9, dtype=torch.float64)

@@ -126,7 +126,10 @@ def test_all_faults_are_listed_at_once(tmp_path):
     with pytest.raises(ValueError, match=r"13 of 20 .*\n(.*\n){10}  and 3 more$") as error:
         check_files({"photos": calibrated})
     assert "the calibration is for 40×30" in str(error.value)
-    *_, calibrated = of_photos(source, skip_broken=True)
+    *others, calibrated = of_photos(source, skip_broken=True)
+    assert check_files({str(k): part for k, part in enumerate(others)}) == {
+        str(k): 11 for k in range(len(others))
+    }
     with pytest.raises(ValueError, match="2 of 20 pictures cannot be used"):
         check_files({"photos": calibrated})
 

@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from darswin.models.views import LensAdapter
+from darswin.models import LensAdapter
 from lens_examples import ASIDE, example
 
 from darswin import create_model

@@ -54,7 +54,7 @@ def draw_lens() -> Figure:
 
 
 def draw_demo() -> Figure:
-    sampler = create_model("darswin_a_nano", spacing="tan").patch_embed.sample
+    sampler = create_model("darswin_a_nano", spacing="tan").view
     accuracy = record("docs/accuracy.json")["accuracy"]
     return digits.draw(accuracy, np.zeros((8, 8), np.float32), sampler)
 

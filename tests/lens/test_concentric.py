@@ -8,7 +8,7 @@ from darswin.lens import Equidistant, Perspective, Polynomial, Spherical
 from darswin.lens.concentric import (
     disc_to_square,
     read_square,
-    square_places,
+    square_points,
     square_to_disc,
     square_view,
 )
@@ -51,7 +51,7 @@ def test_it_is_the_published_map_and_back(count):
     radius, direction = square_to_disc(places)
     assert torch.allclose(direction.norm(dim=-1), torch.ones((), dtype=f64))
     torch.testing.assert_close(disc_to_square(radius, direction), places)
-    middle = disc_to_square(torch.zeros(1), torch.zeros(1, 2))  # the direction that `rays` returns
+    middle = disc_to_square(torch.zeros(1), torch.zeros(1, 2))  # the direction that lenses return
     assert torch.equal(middle, torch.zeros(1, 2))
 
 
@@ -103,7 +103,7 @@ def test_there_and_back(name, spacing):
     lens, size = EXAMPLES[name]
     if spacing == "tan":
         lens = lens.with_theta_max(1.3)
-    places = square_places(lens, size, spacing)
+    places = square_points(lens, size, spacing)
     beyond = (places == OUTSIDE).all(-1)
     theta, azimuth = lens.unproject_pixels(
         torch.stack(torch.meshgrid(*(torch.arange(s, dtype=f64) for s in size[::-1]),
@@ -122,7 +122,7 @@ def test_there_and_back(name, spacing):
 
 def test_tan_ends_before_90_degrees():
     for function in (lambda lens: square_view(lens, (8, 8), 8, "tan"),
-                     lambda lens: square_places(lens, (8, 8), "tan")):  # fmt: skip
+                     lambda lens: square_points(lens, (8, 8), "tan")):  # fmt: skip
         with pytest.raises(ValueError, match="spacing='tan' needs lenses with θ_max below 90°"):
             function(Equidistant(4.0, 1.6))
         assert function(Perspective(4.0, 1.2)).isfinite().all()

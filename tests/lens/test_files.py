@@ -120,7 +120,7 @@ def test_opencv_fisheye(tmp_path, suffix, alpha):
 def test_opencv_pinhole(tmp_path, suffix, d):
     path = write(tmp_path / f"c.{suffix}", camera_matrix=K, distortion_coefficients=d,
                  image_width=1280, image_height=960)  # fmt: skip
-    lens = load(path, model="pinhole", dtype=f64)
+    lens = load(path, coefficients="pinhole", dtype=f64)
     assert_pinhole(lens, d)
     assert lens.is_radial == (not any(d[2:4]) and not any(d[8:]))
     if not any(d):
@@ -356,9 +356,9 @@ DIVIDED = dict(radial=[0.2, 0.05, 0.003], denominator=[0.25, 0.04, 0.002])
          dict(model="Equidistant", focal=300.0)),
         # The choice of the model.
         (opencv(D=[], fisheye=0), {}, dict(model="Perspective")),
-        (opencv(), dict(model="fisheye"), dict(model="Equidistant")),
-        (fisheye_or_pinhole(), dict(model="fisheye"), KB),
-        (fisheye_or_pinhole(), dict(model="pinhole"), PINHOLE),
+        (opencv(), dict(coefficients="fisheye"), dict(model="Equidistant")),
+        (fisheye_or_pinhole(), dict(coefficients="fisheye"), KB),
+        (fisheye_or_pinhole(), dict(coefficients="pinhole"), PINHOLE),
         (fisheye_or_pinhole(fisheye_model=1), {}, KB),
         (fisheye_or_pinhole(fisheye_model=0), {}, PINHOLE),
         (fisheye_or_pinhole(distortion_model="equidistant"), {}, KB),
@@ -399,9 +399,9 @@ def test_arrays_of_numpy(save, tmp_path):
     described = to_dict(load(path, dtype=f64))
     assert described | PLUMB == described
     save(path, cameraMatrix=np.array(K), distCoeffs=np.array(FISHEYE)[:, None])
-    assert load(path, model="fisheye", dtype=f64).radial.tolist() == [FISHEYE]
+    assert load(path, coefficients="fisheye", dtype=f64).radial.tolist() == [FISHEYE]
     save(path, K=K, D=np.array(PLUMB_BOB, dtype=object))
-    with pytest.raises(ValueError, match="a camera without coefficients"):
+    with pytest.raises(ValueError, match=r"D must be 0 or 4 or .*dtype', 'object'"):
         load(path)
 
 

@@ -78,7 +78,7 @@ def test_a_batch_in_its_own_precision():
 def test_what_cannot_be_fitted():
     with pytest.raises(ValueError, match=r"no Perspective lens was found that reaches 95\.00°"):
         fit("Perspective", FRONT)
-    with pytest.raises(ValueError, match="model must be one of"):
+    with pytest.raises(ValueError, match="unknown lens model"):
         fit("Fisheye", FRONT)
     with pytest.raises(TypeError, match="model must be a lens class"):
         fit(3, FRONT)

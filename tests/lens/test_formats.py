@@ -5,6 +5,7 @@ import gzip
 import io
 import json
 import lzma
+import re
 import tarfile
 import zipfile
 
@@ -17,11 +18,11 @@ from PIL import Image
 from videos import write_video
 
 from darswin.cli.main import main
-from darswin.lens import MODELS, load
+from darswin.lens import MODELS, fit, from_dict, load
 from darswin.lens.files.content import parse
 from darswin.lens.files.load import FORMATS, Calibration
 
-UNKNOWN = "^calibration in a string: unknown format: it must be in one of the formats darswin, Wood"
+UNKNOWN = r"^calibration in a string: unknown format: it.*\. The formats are darswin, WoodScape"
 MATRIX_OF_4 = "1 0 0 0.5\n0 1 0 0\n0 0 1 2\n0 0 0 1\n"
 # Files of other programs, which have an entry or the notation of a known format.
 OTHERS = {
@@ -57,8 +58,8 @@ def test_one_entry_is_no_format(name):
     with pytest.raises(ValueError, match=UNKNOWN) as error:
         loads(OTHERS[name])
     said = str(error.value)
-    assert "; its entries are " in said or "; it is a table of " in said
-    assert '"model" must be' not in said or name == "options"
+    assert ": its entries are " in said or ": it is a table of " in said
+    assert "unknown lens model" not in said or name == "options"
     assert len(said) < 900 and "appears twice" not in said
 
 
@@ -92,10 +93,10 @@ def test_the_order_of_entries_does_not_change_the_format(path):
         assert path.suffix in (".md", ".txt", ".bin", ".xml", ".npz")
         return
     content = parse(path.read_text())
-    first = next(format for format in FORMATS if format.fits(content))
+    first = next(format for format in FORMATS if format.recognizes(content))
     reverse = dict(reversed(content.items()))
-    assert next(format for format in FORMATS if format.fits(reverse)) is first
-    fitting = {format.name for format in FORMATS if format.fits(content)} - {first.name}
+    assert next(format for format in FORMATS if format.recognizes(reverse)) is first
+    fitting = {format.name for format in FORMATS if format.recognizes(content)} - {first.name}
     assert fitting <= {"OpenCV"}  # which reads messages of ROS too
 
 
@@ -132,7 +133,26 @@ def test_names_of_entries_that_are_unknown(text, found, expected):
         loads(text)
     said = str(error.value)
     assert f"its entries are {found}, but expected are, for example, {expected}" in said, said
-    assert '"model" must be' not in said
+    assert "unknown lens model" not in said
+
+
+@pytest.mark.parametrize(
+    ("text", "program", "other"),
+    [
+        ("<calibration><projection>fisheye</projection><width>9</width><f>3</f><cx>1</cx><k1>0</k1>"
+         "<k2>0</k2></calibration>", "Metashape", "OpenCV"),
+        (OTHERS["Metashape"], "Metashape", "OpenCV"),
+        (json.dumps(dict(sfm_data_version="0.3", root_path="/x", views=[], intrinsics=[],
+                         extrinsics=[], structure=[])), "OpenMVG", "COLMAP"),
+        (json.dumps(dict(version=["1"], views=[], intrinsics=[], poses=[])), "Meshroom", "COLMAP"),
+    ],
+)  # fmt: skip
+def test_files_of_other_programs_are_known(text, program, other):
+    with pytest.raises(ValueError, match=UNKNOWN) as error:
+        loads(text)
+    said = str(error.value)
+    assert f", as in files of {program}: let it write the cameras for {other}. The" in said
+    assert "expected are" not in said
 
 
 @pytest.mark.parametrize(
@@ -145,7 +165,14 @@ def test_an_unknown_model_gets_the_nearest_name(given, nearest):
         loads(json.dumps(dict(model=given, focal=300)))
     said = str(error.value)
     assert all(name in said for name in MODELS)
-    assert said.endswith(f"got '{given}': is it {nearest}?" if nearest else f"got '{given}'")
+    meant = f"; did you mean {nearest}? The models" if nearest else ". The models"
+    assert f"in a darswin file, unknown lens model '{given}'{meant}" in said
+    for make in (
+        lambda: from_dict(dict(model=given, focal=300)),
+        lambda: fit(given, load(FILES / "ours.json")),
+    ):
+        with pytest.raises(ValueError, match=re.escape(f"unknown lens model '{given}'{meant}")):
+            make()
 
 
 # -- files that are no calibrations ---------------------------------------------------------------

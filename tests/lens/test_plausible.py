@@ -267,4 +267,4 @@ def test_the_command_line_says_what_looks_wrong(tmp_path, capsys):
 def test_arrays_in_mm(tmp_path):
     path = tmp_path / "calib.npz"
     np.savez(path, K=np.diag([1.3, 1.3, 1.0]), D=np.array(FISHEYE), shape=(960, 1280))
-    assert "far from the middle" in warned(lambda: load(path, model="fisheye"))[0]
+    assert "far from the middle" in warned(lambda: load(path, coefficients="fisheye"))[0]

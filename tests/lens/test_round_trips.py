@@ -148,7 +148,7 @@ def test_a_pixel_outside_the_circle_has_no_ray_and_no_gradient():
     values = [OMNIDIR.xi.clone().requires_grad_(), OMNIDIR.tangential.clone().requires_grad_()]
     moved = OMNIDIR.replace(xi=values[0], tangential=values[1])
     pixels = double(0, 0, 300, 100, 5000, 0, 1e200, -3, math.nan, 1).view(5, 2)
-    theta, _ = moved.rays(pixels, (1, 1))
+    theta, _ = moved.theta_and_direction(pixels, (1, 1))
     assert theta.isnan().tolist() == [False, False, True, True, True]
     torch.where(theta.isnan(), 0.0, theta).sum().backward(retain_graph=True)
     assert all(value.grad.isfinite().all() and value.grad.any() for value in values)

@@ -186,7 +186,7 @@ def test_arrays_of_numpy_in_either_order(ratio, turned, shift, tmp_path):
         dict(shape=array.shape[:2]), dict(shape=array.shape[1::-1]), dict(size=array.shape),
     ):  # fmt: skip
         np.savez(path, K=k, D=np.array(FISHEYE), **entry)
-        assert load(path, model="fisheye").image_size.tolist() == [[height, width]], entry
+        assert load(path, coefficients="fisheye").image_size.tolist() == [[height, width]], entry
 
 
 @pytest.mark.parametrize(

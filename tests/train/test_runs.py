@@ -3,6 +3,7 @@
 import csv
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -30,12 +31,15 @@ from runs import (
 from scenes import CLASSES, write_plain
 from train.conftest import METRES
 
+from darswin.cli.fit import RunCLI
 from darswin.cli.main import main
 from darswin.cli.predict import predict
 from darswin.data import open_source
 from darswin.lens import from_dict
 from darswin.models.saving import load_model
+from darswin.train.runs import _options, check_changes
 from darswin.train.task import learning_rate
+from darswin.train.tasks import TASKS
 from darswin.utils.files import locked
 
 EQUIDISTANT = {"model": "Equidistant", "focal": 45.0, "theta_max": 1.5, "image_size": [121, 160]}
@@ -190,6 +194,52 @@ def test_a_refused_resume_changes_nothing(begun, capsys, options, message):
     before = files(begun)
     assert message in error(capsys, "fit", "--run", begun, "--resume", *options)
     assert files(begun) == before
+
+
+# All options of `fit` but the trainer's: those that may change on resume, and those that may not.
+# A new option belongs to one of them, and to `FIXED` of darswin/train/runs.py if it may not change.
+MAY_CHANGE = {
+    "": "checkpoint_steps weights_only",
+    "model.": """learning_rate warmup_rate final_rate warmup_epochs reference_batch weight_decay
+        label_smoothing mixup cutmix mix_p loss class_weights solid_angle_weights zones
+        matmul_backend grad_checkpointing""",
+    "data.": """path classes splits label_map skip_broken lens camera coefficients batch_size
+        workers train_lenses test_lenses pair_lenses render fit picture_size randaugment erasing
+        flip rotate_deg crop lens_augmentation test_paths max_distance""",
+}
+MAY_NOT = {
+    "": "task seed_everything",
+    "model.": "name options weights freeze_stages decay_position_bias ignore_index",
+    "data.": "channels fov_deg holdout limit mean size std",
+    "trainer.": "accumulate_grad_batches",
+}
+
+
+def test_what_may_change_on_resume(monkeypatch):
+    found = {}
+
+    def options_of(self):
+        found.update(_options(yaml.safe_load(self._recorded(self.config["fit"]))))
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(RunCLI, "before_instantiate_classes", options_of)
+    for task in TASKS:
+        with pytest.raises(KeyboardInterrupt):
+            fit("r", "--data.path", "digits", "--task", task)
+    may, may_not = (
+        {f"{group}{name}" for group, names in table.items() for name in names.split()}
+        for table in (MAY_CHANGE, MAY_NOT)
+    )
+    may |= {name for name in found if name.startswith("trainer.")} - may_not
+    assert found.keys() == may | may_not and not may & may_not
+    for name in found:
+        group, _, option = name.rpartition(".")
+        before, now = ({group: {option: k}} if group else {option: k} for k in (1, 2))
+        if name in may:
+            assert check_changes(before, now)[name] == "2 in place of 1"
+        else:
+            with pytest.raises(ValueError, match=f"cannot change these options: `{name}` 2 in "):
+                check_changes(before, now)
 
 
 def test_rates_and_decay_change_on_resume(begun, capsys):
@@ -386,7 +436,10 @@ def test_skipped_pictures_are_counted(tmp_path, capsys):
     message = error(capsys, "fit", "--run", tmp_path / "a", *start)
     assert "cannot read" in message and "--data.skip_broken true" in message
     fit(tmp_path / "b", *start, "--data.skip_broken", "true")
-    assert "6 pictures could not be read" in capsys.readouterr().out
+    said = capsys.readouterr()
+    assert "6 pictures could not be read" in said.out
+    counts = re.search(r"; (\d+) training and (\d+) validation pictures", said.err).groups()
+    assert sum(map(int, counts)) == 30 - 3 - 6  # without those of the test set
 
 
 def test_targets_that_nothing_can_be_learned_from(scenes, tmp_path, capsys):

@@ -20,11 +20,10 @@ from darswin.data.warping import CutOff
 from darswin.models.saving import ModelCard
 from darswin.train.classification import Classification, ClassMetrics
 from darswin.train.data import WideAngleData
-from darswin.train.runs import CHANGEABLE, BestCheckpoint, check_changes
+from darswin.train.runs import BestCheckpoint, check_changes
 from darswin.train.scene_data import DistanceData, LabelData
 from darswin.train.segmentation import Segmentation
 from darswin.train.task import Schedule, parameter_groups
-from darswin.train.tasks import TASKS
 
 # -- optimiser --------------------------------------------------------------------------------
 
@@ -222,10 +221,10 @@ def test_a_checkpoint_of_another_model_is_refused():
 def test_changes_are_named():
     before = {"data": {"size": 32, "workers": 1}, "trainer": {"devices": 1}, "run": "a"}
     now = {"data": {"size": 32, "workers": 2}, "trainer": {"devices": 2}, "run": "b"}
-    assert check_changes(before, before) == []
-    assert check_changes(before, now) == [
-        "`data.workers` 2 in place of 1", "`trainer.devices` 2 in place of 1",
-    ]  # fmt: skip
+    assert check_changes(before, before) == {}
+    assert check_changes(before, now) == {
+        "data.workers": "2 in place of 1", "trainer.devices": "2 in place of 1",
+    }  # fmt: skip
     for name, value in (("data.size", 64), ("trainer.accumulate_grad_batches", 4),
                         ("model.name", "b"), ("data.limit", 9)):  # fmt: skip
         group, _, option = name.partition(".")
@@ -235,21 +234,12 @@ def test_changes_are_named():
         ):
             check_changes(before, changed)
     # Of before there were tasks.
-    assert check_changes({}, {"task": "classification"}) == []
+    assert check_changes({}, {"task": "classification"}) == {}
     with pytest.raises(ValueError, match="`task` 'distance' in place of 'classification'"):
         check_changes({}, {"task": "distance"})
     assert (
-        check_changes({"data": {}}, {"data": {"crop": None}, "model": {"freeze_stages": 0}}) == []
+        check_changes({"data": {}}, {"data": {"crop": None}, "model": {"freeze_stages": 0}}) == {}
     )
-
-
-def test_what_may_change_is_an_option():
-    for name in CHANGEABLE - {"checkpoint_steps", "weights_only"}:
-        group, _, option = name.partition(".")
-        kinds = [kind.data if group == "data" else kind.module for kind in TASKS.values()]
-        codes = [part.__init__.__code__.co_varnames for kind in kinds for part in kind.__mro__[:-1]
-                 if part.__module__.startswith("darswin.")]  # fmt: skip
-        assert any(option in names for names in codes), name
 
 
 @pytest.mark.parametrize("kind", [Classification, Segmentation])
@@ -275,7 +265,7 @@ def test_one_class_is_not_enough(kind):
         (lambda: Classification(warmup_epochs=torch.inf), "`warmup_epochs` must be at least 0"),
         (lambda: Classification(freeze_stages=1), "`freeze_stages` 1 .*: give `weights`"),
         (lambda: WideAngleData("digits", batch_size=0), "`batch_size` must be at least 1"),
-        (lambda: WideAngleData("digits", workers=-1), "`workers` at least 0, got 128 and -1"),
+        (lambda: WideAngleData("digits", workers=-1), "`workers` must be at least 0, got -1"),
         (lambda: WideAngleData("digits", camera="7"), "`camera` 7 needs a calibration: give"),
         (lambda: WideAngleData("digits", coefficients="pinhole"), "`coefficients` pinhole needs"),
         (lambda: WideAngleData("digits", mean=[0.5, 0.5]).mean, "`mean` must have 1 values"),

@@ -17,6 +17,7 @@ from darswin.data.scenes.woodscape import (
     open_woodscape,
 )
 from darswin.data.splits import check_split
+from darswin.utils.parameters import check
 
 # The first reader that recognizes a path opens it.
 READERS = (
@@ -89,8 +90,7 @@ def open_scenes(
     check_split(split, get_args(ScenesSplit), holdout)
     if target not in get_args(Target):
         raise ValueError(f"target must be one of {get_args(Target)}, got {target!r}")
-    if channels not in (1, 3, None):
-        raise ValueError(f"`channels` must be 1, 3 or None, got {channels}")
+    check("channels", channels, channels in (1, 3, None), "1, 3 or None")
     root = Path(path)
     if not root.is_dir():
         raise FileNotFoundError(f"no folder {root}")

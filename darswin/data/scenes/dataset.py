@@ -14,6 +14,7 @@ from darswin.data.scenes.targets import IGNORE
 from darswin.data.warping import Crop, picture_size, taken_part
 from darswin.lens import Lens
 from darswin.utils.image import Header
+from darswin.utils.parameters import check
 
 
 class SceneSamples(Samples):
@@ -35,8 +36,8 @@ class SceneSamples(Samples):
     """
 
     def __init__(self, scenes: Scenes, *, crop: float | None = None, **options: Any):
-        if crop is not None and not 0 < crop <= 1:
-            raise ValueError(f"`crop` must be a share in (0, 1], got {crop}")
+        if crop is not None:
+            check("crop", crop, 0 < crop <= 1, "a share in (0, 1]")
         super().__init__(scenes, **options)
         self.scenes, self.crop = scenes, crop
 

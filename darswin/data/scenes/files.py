@@ -19,6 +19,7 @@ from darswin.data.splits import (
     taken_from,
     warn_left_out,
 )
+from darswin.utils.parameters import naming
 
 Pairs = dict[str, tuple[str, str]]  # stem: (picture, target), relative to a folder
 ScenesSplit = Literal["train", "val", "test", "all"]
@@ -53,14 +54,16 @@ class Options:
         """The lens that the caller gave, or else that of a calibration file in `root`."""
         lens = self.lens or calibration_in(root)
         if lens is None:
-            raise FileNotFoundError(f"no lens.json in {root}: add the calibration, or give `lens`")
+            text = f"no lens.json in {root}: add the calibration, or give `lens`"
+            raise naming(FileNotFoundError(text), "lens")
         return Calibrations(lens, root, self.camera, self.coefficients)
 
     def own_lenses(self, files: Mapping[Path, Path]) -> Calibrations:
         """The lenses of pictures with a calibration each, for which the caller gave no lens."""
         for name, value in (("camera", self.camera), ("coefficients", self.coefficients)):
             if value is not None:
-                raise ValueError(f"`{name}` {value} needs a calibration: give `lens` too")
+                text = f"`{name}` {value} needs a calibration: give `lens` too"
+                raise naming(ValueError(text), name, "lens")
         return Calibrations(None, files=files)
 
     def labels(
@@ -162,7 +165,8 @@ def lenses_beside(
     there = {file: file.is_file() for file in set(files.values())}
     for picture, file in files.items():
         if not there[file]:
-            raise FileNotFoundError(f"no lens for {picture}: add {file}, or give `lens`")
+            text = f"no lens for {picture}: add {file}, or give `lens`"
+            raise naming(FileNotFoundError(text), "lens")
     return options.own_lenses(files)
 
 
@@ -237,10 +241,11 @@ def pair(
         warn_left_out(f"{len(alone)} files of {what} have no picture, {some(alone)}: left out")
     chosen = choose(found)
     if missing := [pictures[stem] for stem in chosen if stem not in targets]:
-        raise FileNotFoundError(
+        text = (
             f"no {what} for {len(missing)} of {len(chosen)} pictures, {some(missing)}: add them, "
             "move the pictures away, or list the other pictures in `splits`"
         )
+        raise naming(FileNotFoundError(text), "splits")
     return {
         stem: (os.path.relpath(pictures[stem], root), os.path.relpath(targets[stem], root))
         for stem in chosen

@@ -18,6 +18,7 @@ from darswin.data.scenes.files import (
 from darswin.data.scenes.scene import NO_CLASSES, Classes, Scenes, read_palette
 from darswin.data.scenes.targets import SUFFIXES, read_distance, read_labels
 from darswin.data.splits import Split, split_folders
+from darswin.utils.parameters import naming
 
 FORM = (
     "darswin looks for images/STEM.png (also jpg, bmp, webp, tif, ppm) with labels/STEM.png or "
@@ -69,9 +70,8 @@ def _lenses(root: Path, folder: Path, pairs: Pairs, options: Options) -> Calibra
     shared = calibration_in(folder, root)
     if shared is None:
         has = f"{folder / 'lenses' / missing[0]}.json" if own else f"lens.json in {folder}"
-        raise FileNotFoundError(
-            f"no lens for {folder / pairs[missing[0]][0]}: add {has}, or give `lens`"
-        )
+        text = f"no lens for {folder / pairs[missing[0]][0]}: add {has}, or give `lens`"
+        raise naming(FileNotFoundError(text), "lens")
     return Calibrations(shared, shared.parent, options.camera, options.coefficients, files=files)
 
 
@@ -80,11 +80,12 @@ def _classes(folder: Path, root: Path) -> Classes:
     for place in dict.fromkeys((folder, root)):
         if (place / "classes.json").is_file():
             return read_palette(place / "classes.json")
-    raise FileNotFoundError(
+    text = (
         f"no classes.json in {root}: name the classes of the ids 0, 1, … there, for example "
         '{"names": ["road", "car"], "colors": [[128, 64, 128], [0, 0, 142]]}, or give `classes`. '
         'A `label_map` names them too, for example {"0": "background", "255": "car"} for masks'
     )
+    raise naming(FileNotFoundError(text), "classes", "label_map")
 
 
 def _split_folders(root: Path) -> dict[Split, Path]:

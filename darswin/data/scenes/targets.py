@@ -12,6 +12,7 @@ from PIL import Image, UnidentifiedImageError
 
 from darswin.data.splits import some
 from darswin.utils.image import BrokenImageError, Header, decoded, file_content, read_header
+from darswin.utils.parameters import naming
 
 IGNORE = 255  # the label of an unlabelled pixel
 PER_METRE = 256  # the scale of distances in a PNG of 16 bits
@@ -44,14 +45,16 @@ def read_labels(path: Path, classes: int, class_of: Mapping[int, int] | None = N
         told = f"the {classes} classes have the ids 0 to {classes - 1}"
         if class_of is not None:
             told = f"the known ids are {some(sorted(known))}"
-        raise ValueError(
+        text = (
             f"{path} holds the ids {some(wrong)}, but {told}; {IGNORE} means unlabelled, and "
             "`label_map` maps other ids to classes or to null"
         )
+        raise naming(ValueError(text), "label_map")
     if classes == 2 and class_of is None and ids == [0, IGNORE]:
         _tell_once(
             f"{path.parent} holds masks of 0 and {IGNORE}, but {IGNORE} means unlabelled: if it is "
-            f'a class here, give a `label_map`, {{"0": 0, "{IGNORE}": 1}}'
+            f'a class here, give a `label_map`, {{"0": 0, "{IGNORE}": 1}}',
+            "label_map",
         )
     return table[labels]
 
@@ -114,8 +117,8 @@ def _greys_or_numbers(labels: np.ndarray, palette: np.ndarray, path: Path) -> np
 
 
 @cache
-def _tell_once(text: str) -> None:
-    warnings.warn(text, OddLabels, stacklevel=3)
+def _tell_once(text: str, *parameters: str) -> None:
+    warnings.warn(naming(OddLabels(text), *parameters), stacklevel=3)
 
 
 def read_distance(path: Path, far: float | None = None) -> np.ndarray:

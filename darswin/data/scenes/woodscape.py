@@ -25,6 +25,7 @@ from darswin.data.scenes.files import Options, Pairs, lenses_beside, pair, pictu
 from darswin.data.scenes.scene import NO_CLASSES, Classes, Scenes, as_classes
 from darswin.data.scenes.targets import read_distance, read_labels
 from darswin.data.splits import Split
+from darswin.utils.parameters import naming
 from darswin.utils.text import read_json
 
 NAMES = ["void", "road", "lanemarks", "curb", "person", "rider", "vehicles", "bicycle",
@@ -145,7 +146,8 @@ def _lenses(root: Path, pairs: Pairs, options: Options) -> Calibrations:
     places = _unnested(root / "calibration"), root / "calibration_data" / "calibration"
     folder = next((place for place in places if place.is_dir()), None)
     if folder is None:
-        raise FileNotFoundError(f"no folder {places[0]} or {places[1]}: give `lens`")
+        text = f"no folder {places[0]} or {places[1]}: give `lens`"
+        raise naming(FileNotFoundError(text), "lens")
     found = stems(folder, (".json",))
 
     def calibration_of(stem: str) -> str:

@@ -8,8 +8,8 @@ from darswin.lens.distorted import BrownConrady, KannalaBrandt
 from darswin.lens.files.content import Content
 from darswin.lens.files.fields import Fields, short, to_sides
 from darswin.lens.files.format import Cameras, Description, Format, describe
-from darswin.lens.frame import Size
 from darswin.lens.ideal import FieldOfView
+from darswin.lens.image import Size
 from darswin.lens.sphere import DoubleSphere, EnhancedUnified
 
 MODELS: dict[str, tuple[type[Lens], str]] = {
@@ -29,11 +29,11 @@ class Basalt(Format):
     name = "basalt"
     keys = "value0 with intrinsics and resolution"
 
-    def fits(self, content: Content) -> bool:
+    def recognizes(self, content: Content) -> bool:
         calibration = content.get("value0") if isinstance(content, Mapping) else None
         return isinstance(calibration, Mapping) and "intrinsics" in calibration
 
-    def cameras(self, file: Fields, model: str | None) -> Cameras:
+    def cameras(self, file: Fields, coefficients: str | None) -> Cameras:
         calibration = file.section("value0")
         entries = calibration.sections("intrinsics")
         sizes: list[Size] = [None] * len(entries)

@@ -42,14 +42,14 @@ class CamOdoCal(Format):
     name = "KITTI-360 or CamOdoCal"
     keys = "model_type and projection_parameters"
 
-    def fits(self, content: Content) -> bool:
+    def recognizes(self, content: Content) -> bool:
         if not isinstance(content, Mapping):
             return False
         # OpenCV's files may have a model_type, and distortion_parameters that are a matrix.
         sections = [key for key in SECTIONS if _is_section(content.get(key))]
         return len(sections) + ("model_type" in content) > 1
 
-    def cameras(self, file: Fields, model: str | None) -> Cameras:
+    def cameras(self, file: Fields, coefficients: str | None) -> Cameras:
         name = file.text("camera_name") if "camera_name" in file else "camera"
         return {name: partial(_camera, file)}
 
@@ -61,7 +61,7 @@ class OCamCalib(Format):
     keys = "5 lines of numbers, as calib_results.txt"
     is_table = True
 
-    def fits(self, content: Content) -> bool:
+    def recognizes(self, content: Content) -> bool:
         """True if the first of several lines counts its numbers, or the last three have 2, 3, 2."""
         if not isinstance(content, list):
             return False
@@ -69,7 +69,7 @@ class OCamCalib(Format):
         counts = count == str(len(words)) and is_number(words[0]) and len(content) > 3
         return counts or [len(row) for row in content[-3:]] == [2, 3, 2]
 
-    def cameras(self, file: list[list[str]], model: str | None) -> Cameras:
+    def cameras(self, file: list[list[str]], coefficients: str | None) -> Cameras:
         return {"camera": partial(_camera_of_rows, file)}
 
 

@@ -62,14 +62,14 @@ class Colmap(Format):
         "KannalaBrandt (4 radial), Fisheye624 (6 radial), FieldOfView and EnhancedUnified"
     )
 
-    def fits(self, content: Content) -> bool:
+    def recognizes(self, content: Content) -> bool:
         row = content[0] if isinstance(content, list) else []
         return len(row) > 1 and (
             row[1] in MODELS
             or (row[1].isupper() and len(row) > 3 and all(map(is_number, row[2:4])))
         )
 
-    def cameras(self, file: list[list[str]], model: str | None) -> Cameras:
+    def cameras(self, file: list[list[str]], coefficients: str | None) -> Cameras:
         found: Cameras = {}
         for row in file:
             if row[0] in found:
@@ -84,7 +84,7 @@ class Colmap(Format):
             values["division"] = values.pop("beta") / -4
             del values["alpha"]
         camera = camera._replace(values=values)
-        name = next((name for name in WRITTEN if camera.fits(*MODELS[name])), None)
+        name = next((name for name in WRITTEN if camera.has_only(*MODELS[name])), None)
         if name is None:
             return None
         numbers = " ".join(map(repr, camera.listed(MODELS[name][1])))

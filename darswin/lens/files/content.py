@@ -1,7 +1,6 @@
 """The content of a YAML, JSON, XML, .npz or plain text file. Nothing in a file is executed, and
 large files end in an error instead of a long wait."""
 
-import contextlib
 import io
 import json
 import os
@@ -83,7 +82,8 @@ def decoded(data: bytes) -> str:
 
 
 def _from_npz(data: bytes) -> str:
-    """Skips large arrays, and arrays of objects, which would have to be unpickled."""
+    """Skips large arrays. Arrays of objects, which would have to be unpickled, become a text that
+    says so, for the error about an entry that should hold numbers."""
     arrays: dict[str, Any] = {}
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
@@ -91,10 +91,14 @@ def _from_npz(data: bytes) -> str:
                 raise _NoArraysError
             small = [entry for entry in archive.infolist() if entry.file_size <= MAX_ARRAY]
             for entry in small[:MAX_ARRAYS]:
-                array = io.BytesIO(archive.read(entry))
-                with contextlib.suppress(ValueError):
-                    name = entry.filename.removesuffix(".npy")
-                    arrays[name] = np.load(array, allow_pickle=False).tolist()
+                array, name = io.BytesIO(archive.read(entry)), entry.filename
+                if not name.endswith(".npy"):
+                    continue
+                try:
+                    value = np.load(array, allow_pickle=False).tolist()
+                except ValueError:
+                    value = "dtype object"
+                arrays[name.removesuffix(".npy")] = value
         return json.dumps(arrays)
     except _NoArraysError as error:
         raise ValueError(f"it is a zip archive, {_WANTED}") from error

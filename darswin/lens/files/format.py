@@ -11,7 +11,8 @@ from typing import Any, NamedTuple
 from darswin.lens.base import MODELS, Lens
 from darswin.lens.distorted import DistortedLens
 from darswin.lens.files.content import Content
-from darswin.lens.frame import Size
+from darswin.lens.image import Size
+from darswin.utils.parameters import naming
 
 # For `from_dict`. A cropped image's may have "sensor" besides: the crop's x and y in the image of
 # the whole sensor, and the height and width of that image, px.
@@ -37,7 +38,7 @@ class Intrinsics(NamedTuple):
     values: dict[str, float]
     size: Any  # (H, W), or None
 
-    def fits(self, model: type[Lens], names: str) -> bool:
+    def has_only(self, model: type[Lens], names: str) -> bool:
         """True if the model is the same and `names` include all values but focal lengths and
         principal point; that is, skew too."""
         others = self.values.keys() - {"fx", "fy", "cx", "cy"}
@@ -49,23 +50,23 @@ class Intrinsics(NamedTuple):
 
 
 class Format:
-    """Base of the formats. A class sets `name` and `keys`, and defines `fits` and `cameras`.
+    """Base of the formats. A class sets `name` and `keys`, and defines `recognizes` and `cameras`.
     Formats that are written also set `holds` and define `_text`."""
 
     name: str  # for errors
     origin = 0.0  # x and y of the upper left pixel's center in the file; we use 0
     keys: str  # what its files hold, for errors
     is_table = False  # True if its files are lines of words
-    takes_model = False  # True if the argument `model` of `load` may name the coefficients' model
+    takes_coefficients = False  # True if `coefficients` of `load` may name their model
     holds = ""  # the lenses that `write` supports, for errors
     needs_size = False  # True if a written camera must have an image_size
 
-    def fits(self, content: Content) -> bool:
+    def recognizes(self, content: Content) -> bool:
         """True if a file's content is in this format. One common entry, such as "frames", does not
         make a format: it needs several, as in `has_several`."""
         raise NotImplementedError
 
-    def cameras(self, file: Any, model: str | None) -> Cameras:
+    def cameras(self, file: Any, coefficients: str | None) -> Cameras:
         """The cameras of a file; `file` is its `Fields`, or the rows of a table."""
         raise NotImplementedError
 
@@ -76,10 +77,11 @@ class Format:
             raise ValueError(f"{self.name} files need the lens's image_size, but it has none")
         text = None if camera is None else self._text(camera, suffix)
         if text is None:
-            raise ValueError(
+            text = (
                 f"{self.name} files cannot hold this {type(lens).__name__} lens exactly. They hold "
                 f"{self.holds}. darswin.lens.fit finds the closest lens of another `model`"
             )
+            raise naming(ValueError(text), "model")
         return text
 
     def _text(self, camera: Intrinsics, suffix: str) -> str | None:
@@ -121,12 +123,12 @@ def in_image(
     parameters: Mapping[str, Any],
 ) -> Description:
     """The description of a camera from its class, its place in the image and its parameters."""
-    frame: Description = {"center": list(center)}
+    common: Description = {"center": list(center)}
     if affine is not None:
-        frame["affine"] = affine
+        common["affine"] = affine
     if size is not None:
-        frame["image_size"] = list(size)
-    return {"model": model.__name__, **parameters, **frame}
+        common["image_size"] = list(size)
+    return {"model": model.__name__, **parameters, **common}
 
 
 def intrinsics_of(lens: Lens, origin: float) -> Intrinsics | None:

@@ -53,7 +53,7 @@ class Kalibr(Format):
         "DoubleSphere and EnhancedUnified"
     )
 
-    def fits(self, content: Content) -> bool:
+    def recognizes(self, content: Content) -> bool:
         return isinstance(content, Mapping) and (
             _is_alone(content)
             or any(
@@ -62,7 +62,7 @@ class Kalibr(Format):
             )
         )
 
-    def cameras(self, file: Fields, model: str | None) -> Cameras:
+    def cameras(self, file: Fields, coefficients: str | None) -> Cameras:
         if _is_alone(file.entries):
             return {"camera": partial(_camera, file)}
         # An entry that lacks its model counts too: reading it must fail, not find another camera.
@@ -75,7 +75,7 @@ class Kalibr(Format):
     def _text(self, camera: Intrinsics, suffix: str) -> str | None:
         height, width = camera.size
         found = [
-            key for key, (of, *names) in MODELS.items() if camera.fits(of, " ".join(names))
+            key for key, (of, *names) in MODELS.items() if camera.has_only(of, " ".join(names))
         ]  # fmt: skip
         if not found or camera.values.get("beta", 1) < 0:
             return None

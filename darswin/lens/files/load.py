@@ -24,9 +24,10 @@ from darswin.lens.files.nerfstudio import Nerfstudio
 from darswin.lens.files.own import Own
 from darswin.lens.files.unknown import unknown
 from darswin.lens.files.woodscape import WoodScape
-from darswin.lens.frame import Size
+from darswin.lens.image import Size
 from darswin.lens.plausible import ImplausibleLens, doubts
 from darswin.utils.files import replace_file
+from darswin.utils.parameters import check, naming
 
 # Rays must not land further out than this, px, as a pinhole's do near 90°.
 MAX_RADIUS = 1e6
@@ -49,7 +50,7 @@ def load(
     camera: str | int | None = None,
     theta_max: float | None = None,
     image_size: Size = None,
-    model: str | None = None,
+    coefficients: str | None = None,
     dtype: torch.dtype | None = None,
 ) -> Lens:
     """Reads the lens of a calibration file; its pixel centres are integers, whatever the file's.
@@ -66,8 +67,8 @@ def load(
             although the image's corners may see more; or `theta_limit` if the image size is
             unknown.
         image_size: (H, W) px, used if the file has no image size.
-        model: "fisheye", "pinhole" or "omnidir", the model of the coefficients in an OpenCV or ROS
-            file that does not name it.
+        coefficients: "fisheye", "pinhole" or "omnidir", the model of the coefficients in an OpenCV
+            or ROS file that does not name it.
         dtype: of the lens; None means torch's default.
 
     Warns:
@@ -78,7 +79,7 @@ def load(
             or a theta_max beyond the limit. The message names the file.
         OSError: the file cannot be opened.
     """
-    return Calibration.read(path, model).lens(camera, theta_max, image_size, dtype)
+    return Calibration.read(path, coefficients).lens(camera, theta_max, image_size, dtype)
 
 
 def load_all(
@@ -86,11 +87,11 @@ def load_all(
     *,
     theta_max: float | None = None,
     image_size: Size = None,
-    model: str | None = None,
+    coefficients: str | None = None,
     dtype: torch.dtype | None = None,
 ) -> dict[str, Lens]:
     """Reads all cameras of a calibration file, by name. Arguments, warnings, errors: see `load`."""
-    return Calibration.read(path, model).lenses(theta_max, image_size, dtype)
+    return Calibration.read(path, coefficients).lenses(theta_max, image_size, dtype)
 
 
 def save(lens: Lens, path: str | os.PathLike, format: str | None = None) -> str:
@@ -124,26 +125,32 @@ def save(lens: Lens, path: str | os.PathLike, format: str | None = None) -> str:
 class Calibration:
     """A parsed calibration file: its format and its cameras, which are read on demand."""
 
-    def __init__(self, text: str, name: str, model: str | None = None):
+    def __init__(self, text: str, name: str, coefficients: str | None = None):
         self.what = f"calibration {name}"  # for errors
         with self._about():
             content = parse(text)
             self.format = _format_of(content)
         self.what = f"{self.format.name} {self.what}"
         with self._about():
-            if model is not None and not self.format.takes_model:
-                raise ValueError(f"the file names the models, but model={model!r} was given")
-            if model not in (None, *opencv.MODELS):
-                raise ValueError(f"model must be one of {', '.join(opencv.MODELS)}, got {model!r}")
+            if coefficients is not None:
+                if not self.format.takes_coefficients:
+                    text = (
+                        f"the file names the models, but `coefficients` {coefficients!r} was given"
+                    )
+                    raise naming(ValueError(text), "coefficients")
+                known = coefficients in opencv.MODELS
+                check(
+                    "coefficients", repr(coefficients), known, f"one of {', '.join(opencv.MODELS)}"
+                )
             fields = content if isinstance(content, list) else Fields(content)
-            self._cameras = self.format.cameras(fields, model)
+            self._cameras = self.format.cameras(fields, coefficients)
             self.names = list(self._cameras)
             if not 1 <= len(self.names) <= MAX_CAMERAS:
                 raise ValueError(f"it must have 1 to {MAX_CAMERAS} cameras, got {len(self.names)}")
 
     @classmethod
-    def read(cls, path: str | os.PathLike, model: str | None = None) -> Self:
-        """Reads the file at a path; `model` is that of `load`."""
+    def read(cls, path: str | os.PathLike, coefficients: str | None = None) -> Self:
+        """Reads the file at a path; `coefficients` is that of `load`."""
         name = os.fspath(path)
         try:
             data = read_bytes(path)
@@ -153,7 +160,7 @@ class Calibration:
             raise FileNotFoundError(f"calibration {name}: there is no such file") from error
         except ValueError as error:
             raise ValueError(f"calibration {name}: {error}") from error
-        return cls(text, name, model)
+        return cls(text, name, coefficients)
 
     def has_several(self) -> bool:
         """True if its cameras are not all the same."""
@@ -166,16 +173,17 @@ class Calibration:
         with self._about():
             if camera is None:
                 if self.has_several():
-                    raise ValueError(f"it has several cameras, choose one with camera=: {shown}")
+                    text = f"it has several cameras, choose one with `camera`: {shown}"
+                    raise naming(ValueError(text), "camera")
                 return names[0]
             if str(camera) in self._cameras:
                 return str(camera)
-            if any(name.isdecimal() for name in names):  # then a number is never an index
-                raise ValueError(f"camera must be one of {shown}, got {camera!r}")
-            number = str(camera) if type(camera) in (str, int) else ""
-            if number.isdecimal() and len(number) <= 9 and int(number) < len(names):
-                return names[int(number)]
-            raise ValueError(f"camera must be one of {shown}, or its number, got {camera!r}")
+            if not any(name.isdecimal() for name in names):  # else a number is never an index
+                number = str(camera) if type(camera) in (str, int) else ""
+                if number.isdecimal() and len(number) <= 9 and int(number) < len(names):
+                    return names[int(number)]
+                shown += ", or its number"
+            raise ValueError(f"camera must be one of {shown}, got {camera!r}")
 
     def lens(
         self,
@@ -278,11 +286,11 @@ class Calibration:
 
 
 def _format_of(content: Content) -> Format:
-    found = next((format for format in FORMATS if format.fits(content)), None)
+    found = next((format for format in FORMATS if format.recognizes(content)), None)
     if found is None:
         known = ", ".join(format.name for format in FORMATS)
         reason = unknown(content, FORMATS)
-        raise ValueError(f"unknown format: it must be in one of the formats {known}; {reason}")
+        raise ValueError(f"unknown format: {reason}. The formats are {known}")
     return found
 
 

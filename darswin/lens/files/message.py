@@ -3,7 +3,7 @@
 import math
 
 from darswin.lens.files.fields import Fields, to_side
-from darswin.lens.frame import Size
+from darswin.lens.image import Size
 
 
 def in_message(

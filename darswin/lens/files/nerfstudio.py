@@ -37,14 +37,14 @@ class Nerfstudio(Format):
     origin = 0.5
     keys = "fl_x, fl_y, cx, cy and frames"
 
-    def fits(self, content: Content) -> bool:
+    def recognizes(self, content: Content) -> bool:
         if not isinstance(content, Mapping):
             return False
         frames = content.get("frames")
         first = frames[0] if isinstance(frames, list) and frames else None
         return has_several([*content, *(first if isinstance(first, Mapping) else ())], MARKS)
 
-    def cameras(self, file: Fields, model: str | None) -> Cameras:
+    def cameras(self, file: Fields, coefficients: str | None) -> Cameras:
         frames = file.get("frames", "a list of mappings") if "frames" in file else []
         if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):
             raise ValueError(f"frames must be a list of mappings, got {short(frames)}")

@@ -28,8 +28,9 @@ from darswin.lens.files.fields import (
 )
 from darswin.lens.files.format import Cameras, Description, Format, Intrinsics, describe
 from darswin.lens.files.message import in_message
-from darswin.lens.frame import Size
+from darswin.lens.image import Size
 from darswin.lens.plausible import NEAR, off_middle, swap_fits
+from darswin.utils.parameters import naming
 
 Coefficients = Literal["fisheye", "pinhole", "omnidir"]
 MODELS: tuple[Coefficients, ...] = get_args(Coefficients)
@@ -70,13 +71,13 @@ class OpenCV(Format):
 
     name = "OpenCV"
     keys = "camera_matrix and distortion_coefficients"
-    takes_model = True
+    takes_coefficients = True
     holds = (
         "Perspective and BrownConrady (3 radial, no skew), Equidistant and KannalaBrandt (4 radial "
         "only), Spherical and Mei (2 radial, tangential)"
     )
 
-    def fits(self, content: Content) -> bool:
+    def recognizes(self, content: Content) -> bool:
         if not isinstance(content, Mapping):
             return False
         # Many files have a K or M. It counts if it is a matrix, or a list beside other entries.
@@ -91,8 +92,8 @@ class OpenCV(Format):
             for end in ("", *SUFFIXES)
         )
 
-    def cameras(self, file: Fields, model: str | None) -> Cameras:
-        reader = _Reader(file, model)
+    def cameras(self, file: Fields, coefficients: str | None) -> Cameras:
+        reader = _Reader(file, coefficients)
         suffixes = [suffix for suffix in SUFFIXES if reader.find(MATRIX, suffix) is not None]
         if reader.find(MATRIX) is not None:
             suffixes = [""]
@@ -105,7 +106,7 @@ class OpenCV(Format):
         kind = next((kind for kind in MODELS if ORDERS[kind][0] is camera.model), "pinhole")
         order = ORDERS[kind][1].removesuffix(" tilt1 tilt2")
         skew = "" if kind == "pinhole" else "skew"  # cv2.projectPoints leaves it out
-        if not camera.fits(ORDERS[kind][0], f"{order} xi {skew}"):
+        if not camera.has_only(ORDERS[kind][0], f"{order} xi {skew}"):
             return None
         if kind == "pinhole" and not any(camera.listed("d1 d2 d3 s1 s2 s3 s4")):
             order = "k1 k2 p1 p2 k3"
@@ -132,8 +133,8 @@ class Ros(OpenCV):
     name = "ROS camera_info"
     keys = "k, d and distortion_model"
 
-    def fits(self, content: Content) -> bool:
-        return super().fits(content) and "distortion_model" in content
+    def recognizes(self, content: Content) -> bool:
+        return super().recognizes(content) and "distortion_model" in content
 
 
 class ByName(Format):
@@ -141,9 +142,9 @@ class ByName(Format):
 
     name = "intrinsics by name"
     keys = "fx, fy, cx, cy, k1, …"
-    takes_model = True
+    takes_coefficients = True
 
-    def fits(self, content: Content) -> bool:
+    def recognizes(self, content: Content) -> bool:
         if not isinstance(content, Mapping):
             return False
         names = {plain_name(name): value for name, value in content.items()}
@@ -151,22 +152,22 @@ class ByName(Format):
             isinstance(names.get(matrix), (list, Mapping)) for matrix in MATRIX
         )
 
-    def cameras(self, file: Fields, model: str | None) -> Cameras:
-        reader = _Reader(file, model)
+    def cameras(self, file: Fields, coefficients: str | None) -> Cameras:
+        reader = _Reader(file, coefficients)
         if reader.coefficients("") is None or any(
             re.fullmatch(r"[kps]\d|skew", n) for n in reader.names
         ):
             return {"camera": reader.camera_by_name}
         fx, fy, cx, cy = (file.number(reader.names[name]) for name in PLANE)
-        matrix = {"camera_matrix": [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]}
-        return {"camera": partial(_Reader(Fields({**file.entries, **matrix}), model).camera, "")}
+        whole = {**file.entries, "camera_matrix": [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]}
+        return {"camera": partial(_Reader(Fields(whole), coefficients).camera, "")}
 
 
 class _Reader:
     """A file whose entries have various names, and the model that the user named."""
 
-    def __init__(self, file: Fields, model: str | None):
-        self.file, self.model = file, model
+    def __init__(self, file: Fields, given: str | None):
+        self.file, self.given = file, given
         # Of two names that `plain_name` makes equal, the first counts if they agree.
         seen: dict[str, str] = {}
         for name, value in file.entries.items():
@@ -219,7 +220,7 @@ class _Reader:
         xi = self.find(("xi",), suffix)
         kind = self.kind(name, coefficients, xi)
         says = xi is not None or self.find(SAYS_FISHEYE + SAYS_MODEL) is not None
-        if name is None and (says or self.model is None):
+        if name is None and (says or self.given is None):
             raise ValueError(
                 "distortion_coefficients or D is missing; write D: [] if the camera has none. The "
                 f"file's entries are {listed(self.file.entries)}"
@@ -284,32 +285,31 @@ class _Reader:
         self, name: str | None, coefficients: list[float], xi: str | None, only: str | None = None
     ) -> str:
         """One of `MODELS`: the user's, the file's, or the only one with such coefficients."""
-        if self.model is not None:
-            return self.model
-        flag = self.find(SAYS_FISHEYE)
-        if flag is not None:
+        if self.given is not None:
+            return self.given
+        if (flag := self.find(SAYS_FISHEYE)) is not None:
             return "fisheye" if to_flag(self.file.entries[flag], flag) else "pinhole"
-        entry = self.find(SAYS_MODEL)
-        if entry is not None:
+        if (entry := self.find(SAYS_MODEL)) is not None:
             word = plain_name(self.file.text(entry))
             found = next((kind for kind, words in WORDS.items() if word in words), None)
             if found is None:
                 known = ", ".join(sorted(word for words in WORDS.values() for word in words))
-                given = short(self.file.entries[entry])
-                raise ValueError(
-                    f"{entry} must be one of {known}, got {given}; else choose with model= one of "
-                    f"{', '.join(MODELS)}"
+                text = (
+                    f"{entry} must be one of {known}, got {short(self.file.entries[entry])}; else "
+                    f"choose with `coefficients` one of {', '.join(MODELS)}"
                 )
+                raise naming(ValueError(text), "coefficients")
             return found
         if xi is not None:
             return "omnidir"
         if only is not None or len(coefficients) > 4:
             return only or "pinhole"
         what = f"the coefficients of {name}" if coefficients else "a camera without coefficients"
-        raise ValueError(
+        text = (
             f"{what} may belong to cv2.fisheye (k1 to k4) or to a pinhole (k1, k2, p1, p2): give "
-            'model="fisheye" or model="pinhole", or write fisheye_model: 1 or 0 into the file'
+            '`coefficients` "fisheye" or "pinhole", or write fisheye_model: 1 or 0 into the file'
         )
+        raise naming(ValueError(text), "coefficients")
 
     def matrix(self, name: str, counts: tuple[int, ...], least: int | None = None) -> list[float]:
         """The numbers of a matrix: a mapping with `data`, a list, a list of rows or a number. The

@@ -24,7 +24,7 @@ class Own(Format):
     name = "darswin"
     keys = "model"
 
-    def fits(self, content: Content) -> bool:
+    def recognizes(self, content: Content) -> bool:
         if not isinstance(content, Mapping):
             return False
         name = content.get("model")
@@ -35,7 +35,7 @@ class Own(Format):
         known = (*model.parameters, *model.optional, *model.common, *ANGLES, *IN_DEGREES)
         return not others or not others.isdisjoint(known)
 
-    def cameras(self, file: Fields, model: str | None) -> Cameras:
+    def cameras(self, file: Fields, coefficients: str | None) -> Cameras:
         return {"lens": lambda: _lens(file)}
 
     def write(self, lens: Lens, suffix: str) -> str:

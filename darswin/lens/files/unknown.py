@@ -1,16 +1,22 @@
 """What to say of a file that is no calibration of a known format."""
 
-import difflib
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 
-from darswin.lens.base import MODELS
+from darswin.lens.base import unknown_model
 from darswin.lens.files.content import Content
-from darswin.lens.files.fields import listed, short
+from darswin.lens.files.fields import listed
 from darswin.lens.files.format import Format
+from darswin.utils.nearest import nearest
 
-ALIKE = 0.75  # the similarity of two names, of at most 1
 _MOST = 20  # entries that are compared
+# Other programs, entries that their files have, and the program whose format they can write.
+PROGRAMS = (
+    ("Metashape", {"projection", "f"}, "OpenCV"),
+    ("Metashape", {"chunk"}, "OpenCV"),
+    ("OpenMVG", {"sfm_data_version", "intrinsics"}, "COLMAP"),
+    ("Meshroom", {"views", "intrinsics", "poses"}, "COLMAP"),
+)
 
 
 def unknown(content: Content, formats: Sequence[Format]) -> str:
@@ -18,28 +24,20 @@ def unknown(content: Content, formats: Sequence[Format]) -> str:
     if isinstance(content, list):
         tables = " or ".join(format.keys for format in formats if format.is_table)
         return f"it is a table of {len(content)} lines, but a table must have {tables}"
-    given = content.get("model")
     found = f"its entries are {listed(content) or 'none'}"
+    for program, entries, other in PROGRAMS:
+        if entries <= content.keys():
+            return f"{found}, as in files of {program}: let it write the cameras for {other}"
+    given = content.get("model")
     if isinstance(given, str):
-        nearest = _nearest(given, MODELS)
-        return (
-            f'{found}; in a darswin file, "model" must be one of {", ".join(sorted(MODELS))}, got '
-            f"{short(given)}{f': is it {nearest}?' if nearest else ''}"
-        )
-    names = [str(name)[:64] for name in list(content)[:_MOST]]
+        return f"{found}; in a darswin file, {unknown_model(given)}"
+    names = [str(name) for name in list(content)[:_MOST]]
     keys = {format.name: format.keys for format in formats if not format.is_table}
 
     def score(format: str) -> int:
         words = re.findall(r"\w+", keys[format])
-        return sum(_nearest(name, words) is not None for name in names)
+        return sum(bool(nearest(name, words)) for name in names)
 
     best = max(keys, key=score)
     expected = keys[best] if score(best) else f'{keys["OpenCV"]}, or a "model" of darswin'
     return f"{found}, but expected are, for example, {expected}"
-
-
-def _nearest(given: str, known: Iterable[str]) -> str | None:
-    """The known name that is most like the given one, if any is."""
-    names = {name.lower(): name for name in known}
-    found = difflib.get_close_matches(given[:64].lower(), names, 1, ALIKE)
-    return names[found[0]] if found else None

@@ -20,11 +20,11 @@ class WoodScape(Format):
     origin = 0.5
     keys = "intrinsic with poly_order, k1, k2, …"
 
-    def fits(self, content: Content) -> bool:
+    def recognizes(self, content: Content) -> bool:
         intrinsic = content.get("intrinsic") if isinstance(content, Mapping) else None
         return isinstance(intrinsic, Mapping) and has_several(intrinsic, MARKS)
 
-    def cameras(self, file: Fields, model: str | None) -> Cameras:
+    def cameras(self, file: Fields, coefficients: str | None) -> Cameras:
         return {file.text("name") if "name" in file else "camera": lambda: _camera(file)}
 
 

@@ -606,7 +606,7 @@ def test_a_camera_of_the_calibration_beside_the_pictures(tmp_path):
     (tmp_path / "lens.json").unlink()
     shutil.copy(WOODSCAPE.parent / "kalibr_fov.yaml", tmp_path / "lens.yaml")
     with pytest.raises(
-        ValueError, match=r"lens\.yaml: it has several cameras, choose one with camera="
+        ValueError, match=r"lens\.yaml: it has several cameras, choose one with `camera`"
     ):
         open_scenes(tmp_path, "all", "labels")
     lenses = [open_scenes(tmp_path, "all", "labels", camera=f"cam{k}").lenses for k in range(2)]

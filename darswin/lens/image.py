@@ -15,7 +15,7 @@ from darswin.ops.checks import tensor_there
 Size = tuple[int, int] | None  # (H, W) px
 
 
-class ImageFrame(LensBatch):
+class LensInImage(LensBatch):
     """Lenses in their images: maps points around the principal point to pixels, and back."""
 
     theta_max = Parameter(low=0, open=True, optional=True, by_place=True, angle=True)

@@ -1,0 +1,21 @@
+"""The known names that are most like a given one, for errors."""
+
+import difflib
+from collections.abc import Iterable
+
+LONGEST = 64  # characters that are compared
+
+
+def nearest(given: str, names: Iterable[str], count: int = 1, alike: float = 0.75) -> list[str]:
+    """At most `count` of the names, the most similar first. Their similarity, of at most 1, is
+    `alike` or more; capitals and small letters are the same."""
+    known = {name.lower(): name for name in names}
+    found = difflib.get_close_matches(given[:LONGEST].lower(), known, count, alike)
+    return [known[name] for name in found]
+
+
+def did_you_mean(given: str, names: Iterable[str], count: int = 1, alike: float = 0.75) -> str:
+    """The end of a sentence about an unknown name: "; did you mean Mei?", or "." if no name is
+    similar. Arguments: see `nearest`."""
+    found = nearest(given, names, count, alike)
+    return f"; did you mean {' or '.join(found)}?" if found else "."
