@@ -2,7 +2,6 @@
 
 import pytest
 import torch
-from darswin.models import LensAdapter
 from lens_examples import ASIDE, example
 
 from darswin import create_model
@@ -10,6 +9,7 @@ from darswin.compat import OfficialDarSwin
 from darswin.deploy.export import export_onnx, export_package, export_program
 from darswin.lens import MODELS as LENS_MODELS
 from darswin.lens import distorted, solve
+from darswin.models import LensAdapter
 
 SIDE = 16
 ONE = dict(embed_dim=8, depths=(1,), num_heads=(1,))
