@@ -8,6 +8,7 @@ from typing import Generic, TypeVar
 
 import torch
 from torch import Tensor, nn
+from torch.utils import _pytree as pytree
 
 from darswin.layers.attention import WindowAttention
 from darswin.layers.quantized import (
@@ -17,7 +18,7 @@ from darswin.layers.quantized import (
     quantized_layers,
     with_quantized_layers,
 )
-from darswin.layers.transformer import Block, PatchMerging
+from darswin.layers.transformer import Mlp, PatchMerging
 from darswin.lens import Lens
 from darswin.models.base import Model
 from darswin.utils.progress import Progress
@@ -27,6 +28,12 @@ __all__ = ["quantize_model", "sensitivities"]
 Net = TypeVar("Net", bound=Model)
 Batches = Sequence[tuple[Tensor, Lens | None]]
 
+# The linear layers that may be quantized, of each kind of layer. Those of a tuple go together.
+_QUANTIZED: dict[type[nn.Module], dict[str, tuple[str, ...]]] = {
+    WindowAttention: {".qkv": (".qkv",), ".proj": (".proj",)},
+    Mlp: {"": (".fc1", ".fc2")},
+    PatchMerging: {".reduction": (".reduction",)},
+}
 # Numbers of an activation that are drawn at random from each batch to choose its range.
 _KEPT = 2**15
 # A range covers one of these shares of the whole range.
@@ -181,12 +188,9 @@ def _parts(model: nn.Module, keep: Collection[str]) -> dict[str, list[str]]:
         raise ValueError(f"keep: the model has no module named {', '.join(unknown)}")
     parts: dict[str, list[str]] = {}
     for name, module in model.named_modules():
-        if isinstance(module, Block):
-            parts[f"{name}.mlp"] = [f"{name}.mlp.fc1", f"{name}.mlp.fc2"]
-        elif isinstance(module, WindowAttention):
-            parts |= {f"{name}.{layer}": [f"{name}.{layer}"] for layer in ("qkv", "proj")}
-        elif isinstance(module, PatchMerging):
-            parts[f"{name}.reduction"] = [f"{name}.reduction"]
+        for kind in type(module).__mro__:
+            for part, layers in _QUANTIZED.get(kind, {}).items():
+                parts[name + part] = [name + layer for layer in layers]
     kept = tuple(f"{name}." for name in keep)
     return {
         part: names
@@ -203,7 +207,7 @@ def _results(model: Model, batches: Batches) -> Iterator[Tensor]:
         for images, lens in batches:
             with torch.inference_mode():
                 result = model(images, lens)
-                maps = [result] if isinstance(result, Tensor) else result
+                maps = pytree.tree_leaves(result)
                 flat = torch.cat([one.float().flatten(1) for one in maps], 1)
             yield flat
     finally:

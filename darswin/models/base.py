@@ -2,6 +2,7 @@
 
 import warnings
 from collections.abc import Iterable, Sequence
+from functools import partial
 from typing import Any, Generic, TypeVar
 
 import torch
@@ -317,21 +318,19 @@ def _largest(images: Tensor) -> float:
     return float(images.detach().float().numpy().max())  # NumPy's work is in no graph
 
 
-def init_weights(module: nn.Module) -> None:
-    """Initialises a linear layer as the Swin Transformer does, and leaves other layers alone."""
-    if isinstance(module, nn.Linear):
-        nn.init.trunc_normal_(module.weight, std=0.02)
-        if module.bias is not None:
-            nn.init.zeros_(module.bias)
+def init_weights(module: nn.Module, std: float | None = 0.02) -> None:
+    """Initialises a linear layer, and leaves other layers alone.
 
-
-def init_by_width(module: nn.Module) -> None:
-    """Initialises a linear layer so that it keeps the scale of its inputs (LeCun's rule).
-
-    The Swin Transformer's standard deviation of 0.02 suits 2,500 inputs. Layers with 24 to 768
-    inputs then start with small results, and dense models learn much more slowly.
+    Args:
+        std: the standard deviation of the weights, by default that of the Swin Transformer. None
+            keeps the scale of the inputs (LeCun's rule).
     """
     if isinstance(module, nn.Linear):
-        nn.init.trunc_normal_(module.weight, std=module.in_features**-0.5)
+        nn.init.trunc_normal_(module.weight, std=module.in_features**-0.5 if std is None else std)
         if module.bias is not None:
             nn.init.zeros_(module.bias)
+
+
+# For dense models. The standard deviation of 0.02 suits 2,500 inputs. Layers with 24 to 768 inputs
+# then start with small results, and dense models learn much more slowly.
+init_by_width = partial(init_weights, std=None)

@@ -141,7 +141,5 @@ class PixelModel(Model[Tensor]):
             self.num_classes = num_classes
             head = PixelHead(channels=num_classes, **options)
         head.apply(init_by_width)
-        for layer in head.children():
-            if isinstance(layer, Linear):
-                layer.matmul_backend = self.matmul_backend
         self.add_module(f"{self.task}_head", head.to(like).train(self.training))
+        self.set_matmul_backend(self.matmul_backend)

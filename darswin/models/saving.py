@@ -175,7 +175,7 @@ def _parsed(entry: str) -> ModelCard:
         values = json.loads(entry)
     except ValueError as error:
         raise ValueError(f"its model card is no JSON: {error}") from error
-    if not isinstance(values, dict) or "model" not in values:
+    if type(values) is not dict or "model" not in values:
         raise ValueError(f'its model card must be an object with a "model", got {short(values)}')
     # Older files lack some fields.
     known = {name: values[name] for name in _FIELDS if name in values}
@@ -203,16 +203,15 @@ def _created(card: ModelCard, weights: Mapping[str, Tensor]) -> Encoder | PixelM
 
 
 def _is_number(value: Any, least: float = -math.inf, most: float = math.inf) -> bool:
-    number = isinstance(value, (int, float)) and not isinstance(value, bool)
-    return number and math.isfinite(value) and least <= value <= most
+    return type(value) in (int, float) and math.isfinite(value) and least <= value <= most
 
 
 def _is_whole(value: Any, least: int, most: float = math.inf) -> bool:
-    return isinstance(value, int) and _is_number(value, least, most)
+    return type(value) is int and _is_number(value, least, most)
 
 
 def _are(kind: Callable[[Any], bool], values: Any) -> bool:
-    return isinstance(values, list) and all(map(kind, values))
+    return type(values) is list and all(map(kind, values))
 
 
 def _is_color(value: Any) -> bool:
@@ -223,19 +222,20 @@ def _is_quantization(value: Any) -> bool:
     return _are(_is_number, value) and len(value) == 2 and value[0] > 0
 
 
-# For each field of a card as JSON: a check of its value, and the expected value in words.
+# For each field of a card: a check of its value, and the expected value in words. Values from JSON
+# have exactly Python's types, and True is no number.
 _FIELDS: dict[str, tuple[Callable[[Any], bool], str]] = {
-    "model": (lambda value: isinstance(value, str), "the name of a model"),
-    "options": (lambda value: isinstance(value, dict), "an object"),
+    "model": (lambda value: type(value) is str, "the name of a model"),
+    "options": (lambda value: type(value) is dict, "an object"),
     "classes": (
-        lambda value: _are(lambda name: isinstance(name, str), value), "a list of names"),
+        lambda value: _are(lambda name: type(name) is str, value), "a list of names"),
     "size": (lambda value: _is_whole(value, 1), "a whole number above 0"),
     "fov": (lambda value: _is_number(value, 0, 2 * math.pi), "an angle in rad, 0 to 2π"),
     "fit": (lambda value: value in get_args(Fit), f"one of {get_args(Fit)}"),
     "task": (lambda value: value in get_args(Task), f"one of {get_args(Task)}"),
     "colors": (lambda value: _are(_is_color, value), "a list of three numbers, 0 to 255, each"),
     "quantized": (
-        lambda value: isinstance(value, dict) and all(map(_is_quantization, value.values())),
+        lambda value: type(value) is dict and all(map(_is_quantization, value.values())),
         "an object with a scale above 0 and a zero point for each layer"),
 }  # fmt: skip
 

@@ -12,6 +12,7 @@ from helpers import network, relative_error
 from darswin import optimize
 from darswin.layers.position_bias import RelativeBias
 from darswin.lens import Spherical
+from darswin.models.base import Model
 
 LENSES = Spherical.from_fov([0.2, 0.9], math.radians(160), 16.0)
 
@@ -111,6 +112,28 @@ def test_what_cannot_be_optimized():
             optimize(wrong, **options)
 
 
+@torch.no_grad()
+@pytest.mark.parametrize("weights", [torch.float64, torch.bfloat16])
+@pytest.mark.parametrize("name", ["darswin_a_nano", "swin_nano", "dat_nano", "swin_unet_nano",
+                                  "darswin_unet_a_nano", "conv_unet_nano"])  # fmt: skip
+def test_weights_of_any_dtype(name, weights):
+    model = network(name, mean=0.5, std=0.25).to(weights)
+    side = model.image_size or (32, 32)
+    frames = torch.randint(256, (2, 3, *side), dtype=torch.uint8)
+    lens = Spherical.from_fov([0.2, 0.9], math.radians(160), side[0] / 2)
+    want = model.double()(frames, lens)
+    model.to(weights)  # without loss: the weights were of this dtype before
+    exact = 1e-5 if weights == torch.float64 else 0.02  # images take the dtype of the weights
+    for dtype, tolerance in ((torch.float32, exact), (torch.bfloat16, 0.05)):
+        fast = optimize(model, dtype)
+        assert fast.dtype == weights
+        for images in (frames, model.normalize(frames)):
+            got = fast(images, lens)
+            assert got.dtype == dtype and relative_error(got, want) < tolerance
+        with pytest.raises(TypeError, match=f"images must be uint8 or {weights}"):
+            fast(torch.rand(2, 3, *side), lens)
+
+
 @pytest.mark.parametrize("name", ["darswin_a_nano", "darswin_unet_a_nano"])
 def test_what_an_optimized_model_does_not_do(name):
     model = network(name, jitter=1.0, drop_path_rate=0.5)
@@ -124,11 +147,39 @@ def test_what_an_optimized_model_does_not_do(name):
             (lambda model: model.state_dict(), "save the original model"),
             (lambda model: model.train(), "train the original model"),
             (lambda model: model.prune_intermediate_layers(), "prune the original model"),
+            (lambda model: model.reset_classifier(3), "cannot be given a new head"),
         ):
             with pytest.raises(TypeError, match=message):
                 action(fast)
+        for part in fast.modules():  # an encoder too, within another model
+            if isinstance(part, Model):
+                with pytest.raises(TypeError, match="save the original model"):
+                    part.state_dict()
+        with pytest.raises(ValueError, match="must be on the CPU, as the model is, got meta"):
+            fast(images.to("meta"), *arguments)
         leaf = images.clone().requires_grad_()
         with pytest.raises(RuntimeError, match="has no gradients, but its images or its lens"):
             fast(leaf, *arguments)
         with torch.no_grad():
             assert torch.equal(fast.eval()(leaf, *arguments), expected)
+
+
+@pytest.mark.parametrize("name", ["darswin_a_nano", "swin_undis_nano", "darswin_unet_a_nano",
+                                  "swin_unet_adapted_nano", "conv_unet_nano"])  # fmt: skip
+def test_a_lens_with_gradients_is_refused(name):
+    fast = optimize(network(name, task="distance") if "unet" in name else network(name))
+    images = torch.randn(1, 3, *(fast.image_size or (32, 32)))
+    lens = Spherical.from_fov(0.4, 2.6, images.shape[2] / 2)
+    learned = lens.replace(focal=lens.focal.clone().requires_grad_())
+    with pytest.raises(RuntimeError, match="has no gradients, but its images or its lens"):
+        fast(images, learned)
+    with torch.no_grad():
+        assert torch.equal(fast(images, learned), fast(images, lens))
+
+
+@pytest.mark.parametrize("name", ["darswin_a_nano", "dat_nano", "swin_unet_nano"])
+def test_it_is_a_model_of_the_same_class(name):
+    model = network(name)
+    fast = optimize(model)
+    assert isinstance(fast, type(model)) and not isinstance(model, type(fast))
+    assert fast.pretrained_cfg == model.pretrained_cfg and not fast.training
