@@ -18,10 +18,10 @@ struct PolarSampleArgs {
   Pixel pixel;
   int64_t channels, height, width;
   int64_t image_stride[4];
-  bool packed;            // samples come from a packed copy of the image in the cache
+  bool packed;            // samples come from a packed copy of the image, else directly from it
   bool gathers;           // pixels are read by gathers
-  const T* pixel_scale;   // (C,): a pixel p of type u8 has the value p * scale + offset
-  const T* pixel_offset;  // (C,)
+  const T* pixel_scale;   // (C,), followed by three zeros: a pixel p of type u8 has the value
+  const T* pixel_offset;  // p * scale + offset; the same
   const T* radii;         // (B or 1, num_radii) px
   int64_t radii_stride, num_radii;
   const double* cosines;   // (num_azimuths,), followed by one readable register
@@ -111,19 +111,6 @@ struct PolarEmbedKernels {
 };
 
 namespace {
-
-// Returns the number of values in the kernels' packed image. It is a double, because it may not fit
-// 64 bits.
-inline double packed_values(int64_t height, int64_t width, int64_t channels) {
-  return static_cast<double>(height + 3) * static_cast<double>(width + 3) *
-         static_cast<double>((channels + 3) / 4 * 4);
-}
-
-// Returns whether an image is packed: if its copy takes so few bytes that it stays in the
-// second-level cache, and if it has few pixels for each point.
-inline bool worth_packing(double bytes, double pixels, double points) {
-  return bytes <= 3 << 19 && pixels <= 4 * points;
-}
 
 // The steps by which jitter moves a point from radius i. The radius becomes radii[i] + shift *
 // (radii[above] - radii[below]). A negative shift uses entry 0 of both arrays, other shifts use

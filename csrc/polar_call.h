@@ -22,6 +22,9 @@ struct Sampling {
   bool bfloat16;  // the type of the output
 };
 
+// An image is packed if its copy takes at most this many bytes, so that it stays in the
+// second-level cache, and if it has at most this many pixels for each point.
+constexpr double kPackedBytes = 3 << 19, kPackedPixels = 4;
 // Up to this size (1 MB of float32), CPUs that are not from Intel read gray images faster by
 // gathers.
 constexpr int64_t kGatheredPixels = 1 << 18;
@@ -238,6 +241,7 @@ struct PolarCall {
       scale.push_back(static_cast<T>(1 / (255 * given.std[c])));
       offset.push_back(static_cast<T>(-given.mean[c] / given.std[c]));
     }
+    scale.resize(channels + 3), offset.resize(channels + 3);
     args.pixel_scale = scale.data();
     args.pixel_offset = offset.data();
   }
@@ -263,7 +267,9 @@ struct PolarCall {
     const double pixels = static_cast<double>(args.height) * static_cast<double>(args.width);
     const double points =
         static_cast<double>(args.num_radii) * static_cast<double>(args.num_azimuths);
-    args.packed = worth_packing(packed_values() * sizeof(T), pixels, points);
+    // A packed image of 8 bits needs a channel for its coverage.
+    args.packed = packed_values() * sizeof(T) <= kPackedBytes && pixels <= kPackedPixels * points &&
+                  (args.pixel != Pixel::u8 || args.channels < 4);
     const bool gray = args.channels == 1;
     const bool possible = current_tier() == Tier::avx512 && !args.packed &&
                           args.pixel == Pixel::f32 && args.image_stride[3] == 1 &&
@@ -272,8 +278,11 @@ struct PolarCall {
     args.gathers = possible && (gathers == Gathers::by_cpu ? faster : gathers == Gathers::always);
   }
 
+  // Returns the number of values in the kernels' packed image. It is a double, because it may not
+  // fit 64 bits.
   double packed_values() const {
-    return darswin::packed_values(args.height, args.width, args.channels);
+    return static_cast<double>(args.height + 3) * static_cast<double>(args.width + 3) *
+           static_cast<double>(round_up(args.channels, 4));
   }
 
   // Adds up the sums of each row of points into the gradients of radii, center and affine.

@@ -350,7 +350,7 @@ def polar_map(
 
 # -- named cases -----------------------------------------------------------------------------------
 
-NEAR = dict(size=(31, 33), rows=40, columns=64)
+PACKED = dict(size=(31, 33), rows=40, columns=64)
 # For many tokens per block, and for tokens of a single row.
 FEW = dict(size=(40, 42), rows=8, batch=1)
 SAMPLING = {
@@ -368,17 +368,17 @@ SAMPLING = {
     "no points": dict(rows=0),
     "no channels": dict(channels=0),
     # Cases for which csrc/kernels takes different paths.
-    "cells": NEAR | dict(samples=(10, 8)),
-    "cells, one channel": NEAR | dict(columns=63, channels=1, samples=(8, 3)),
-    "cells, two channels": NEAR | dict(channels=2, samples=(4, 4)),
-    "cells, four channels": NEAR | dict(channels=4, batch=1, samples=(4, 4)),
-    "packed, six channels": NEAR | dict(channels=6, samples=(4, 4)),
+    "cells": PACKED | dict(samples=(10, 8)),
+    "cells, one channel": PACKED | dict(columns=63, channels=1, samples=(8, 3)),
+    "cells, two channels": PACKED | dict(channels=2, samples=(4, 4)),
+    "cells, four channels": PACKED | dict(channels=4, batch=1, samples=(4, 4)),
+    "packed, six channels": PACKED | dict(channels=6, samples=(4, 4)),
     "packed, 64 channels": dict(size=(16, 17), rows=20, columns=32, channels=64, batch=1,
                                 samples=(4, 4)),
     "packed, large": dict(size=(200, 180), rows=80, columns=160, batch=1, samples=(8, 8)),
-    "in place": dict(size=(200, 180), rows=8, columns=16, samples=(4, 4)),
-    "in place, large": dict(size=(400, 390), rows=20, columns=16, batch=1, samples=(4, 4)),
-    "in place, shared": dict(size=(90, 80), rows=8, columns=15, shared=True, samples=(4, 5)),
+    "direct": dict(size=(200, 180), rows=8, columns=16, samples=(4, 4)),
+    "direct, large": dict(size=(400, 390), rows=20, columns=16, batch=1, samples=(4, 4)),
+    "direct, shared": dict(size=(90, 80), rows=8, columns=15, shared=True, samples=(4, 5)),
     "many tokens": dict(size=(31, 33), rows=80, columns=640, batch=1, samples=(10, 10)),
     "long rows": dict(size=(31, 33), rows=2, columns=3001, batch=1, samples=(1, 3001)),
     "two points a token": FEW | dict(columns=600, samples=(1, 2)),
@@ -401,7 +401,7 @@ EMBEDDING = {
     "odd": dict(size=(31, 33), rows=9, columns=21, samples=(3, 3), features=37, channels=2),
     "many features": dict(rows=12, columns=25, samples=(4, 5), features=200),
     "deep": dict(rows=36, columns=36, samples=(12, 12), features=50, channels=4),
-    "six channels": NEAR | dict(samples=(4, 4), channels=6, features=48),
+    "six channels": PACKED | dict(samples=(4, 4), channels=6, features=48),
     "large image": dict(size=(300, 302), rows=8, columns=20, samples=(4, 5), features=20),
     "shared lens": dict(batch=5, shared=True, samples=(2, 2), features=20),
     "empty batch": dict(batch=0, features=20),

@@ -93,11 +93,31 @@ def test_sizes_beyond_two_to_the_31():
     assert out.flatten().tolist() == [1.0, 1.0, 0.0]
 
 
+@pytest.mark.parametrize("channels", [1, 2, 3, 4, 5])
+@pytest.mark.parametrize("dtype", [f32, f64, torch.bfloat16, torch.uint8], ids=str)
+def test_a_sample_does_not_depend_on_other_points_or_pixels(dtype, channels):
+    """Many points are read from a packed copy and few directly, with the same bits."""
+    case = sampling(2, channels, (33, 40), 24, 60, (1, 60), layout="image", mean=0.3, std=0.2,
+                    channels_last=False).to(f64 if dtype == f64 else f32)  # fmt: skip
+    image, radii, center = case.inputs.values()
+    image = (100 + 40 * image).clamp(0, 255).to(dtype)
+    out = case.run(image, radii, center)
+    assert out.any() and not out.all()  # some points lie outside
+    for i in range(radii.shape[1]):
+        assert torch.equal(case.run(image, radii[:, i : i + 1], center), out[:, :, i : i + 1])
+    one = torch.zeros_like(image, dtype=radii.dtype)
+    one[..., 9, 12] = 1
+    touched = case.run(one, radii, center) != 0
+    image[..., 9, 12] = 255 if dtype == torch.uint8 else math.inf
+    changed = case.run(image, radii, center) != out
+    assert touched.any() and torch.equal(changed, touched)
+
+
 # -- NaN and infinity ------------------------------------------------------------------------------
 
 
 @jitters
-@pytest.mark.parametrize("rows", [1, 3])  # a far image, and a near one, which is packed
+@pytest.mark.parametrize("rows", [1, 3])  # an image that is read directly, and a packed one
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
 def test_points_at_nan_or_infinity_sample_nothing(bad, rows, jitter, device):
     # Another input is bad in each image, and one azimuth is bad in all images.
@@ -304,7 +324,7 @@ def test_one_graph_for_uint8_images_of_any_size(last):
     [(9, 6, 12), (40, 8, 1031), (40, 1, 2500), (700, 12, 90), (9, 7, 1)],
 )
 def test_the_patch_does_not_matter_to_an_image(size, rows, columns):
-    """Covers near and far images, rows longer than a block, and rows of prime length."""
+    """Covers packed images and others, rows longer than a block, and rows of prime length."""
     arguments = grid((size, size), rows, columns)
     options = dict(layout="image", jitter=1.0, seed=3)
     sampled = [
@@ -338,9 +358,9 @@ def test_a_token_longer_than_a_block_ends_where_it_ends(channels, dtype, columns
 @pytest.mark.parametrize("dtype", [f32, torch.bfloat16, torch.uint8])
 @pytest.mark.parametrize("samples", [(4, 5), (3, 2), (1, 1), (6, 40)])
 @pytest.mark.parametrize("channels", [1, 2, 3, 4, 5])
-def test_the_layout_of_a_far_image_does_not_matter(channels, samples, dtype):
+def test_the_layout_of_an_image_that_is_read_directly_does_not_matter(channels, samples, dtype):
     """Compares planes, pixels with adjacent channels, both with gaps, and transposed planes."""
-    size = 150  # a far image has more than four pixels for each of the 24 x 120 points
+    size = 150  # read directly: more than four pixels for each of the 24 x 120 points
     image = (torch.rand(2, channels, size, size) * 255).to(dtype)
     radii = torch.stack((torch.linspace(0, 75, 24), torch.linspace(10, 90, 24)))
     lens = (radii, torch.linspace(0, 6.2, 120), torch.full((1, 2), 74.5))
