@@ -79,10 +79,6 @@ FACT const char* darswin_tiers() {
 // Runs the operators on another tier from now on. Returns false if that tier is not offered.
 FACT bool darswin_set_tier(const char* name) { return darswin::set_tier(name); }
 
-// Reads far images without gathers (0), with them (1), or in the way that is faster on this CPU
-// (2).
-FACT void darswin_set_gathers(int way) { darswin::gathers = static_cast<darswin::Gathers>(way); }
-
 // The compiler, the C++ standard, the OpenMP version and the torch ABI of this build, as JSON.
 FACT const char* darswin_build_info() {
   static const std::string info =

@@ -274,8 +274,7 @@ struct PolarCall {
     const bool possible = current_tier() == Tier::avx512 && !args.packed &&
                           args.pixel == Pixel::f32 && args.image_stride[3] == 1 &&
                           (gray || args.channels == 3);
-    const bool faster = cpu_is_intel() || (gray && pixels <= kGatheredPixels);
-    args.gathers = possible && (gathers == Gathers::by_cpu ? faster : gathers == Gathers::always);
+    args.gathers = possible && (cpu_is_intel() || (gray && pixels <= kGatheredPixels));
   }
 
   // Returns the number of values in the kernels' packed image. It is a double, because it may not
