@@ -9,7 +9,7 @@
 #include "dispatch.h"
 #include "parallel.h"
 
-// The arguments that polar_sample and polar_embed share. Their order is that of the fields of
+// The arguments that polar_sample and its backward share. Their order is that of the fields of
 // struct Sampling (polar_call.h) and of darswin.ops._sampling.Sampling.
 #define SAMPLING                                                                                  \
   "Tensor image, Tensor radii, Tensor azimuths, Tensor center, Tensor? affine, Tensor? offsets, " \
@@ -25,10 +25,6 @@ STABLE_TORCH_LIBRARY(darswin, m) {
   m.def("polar_sample_backward(" SAMPLING
         ", bool tokens, Tensor grad_out, bool image_grad, bool lens_grad, bool offsets_grad) -> "
         "(Tensor, Tensor, Tensor, Tensor, Tensor)");
-  m.def("polar_embed(" SAMPLING ", Tensor weight, Tensor? bias) -> Tensor");
-  m.def("polar_embed_backward(" SAMPLING
-        ", Tensor weight, Tensor grad_out, bool image_grad, bool lens_grad, bool offsets_grad, "
-        "bool weight_grad) -> (Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor)");
   m.def(
       "window_attention(Tensor qkv, Tensor bias, int[] window, int[] shift, int[] periodic, "
       "float scale) -> Tensor");

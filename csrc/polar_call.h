@@ -1,4 +1,4 @@
-// One call of polar_sample or polar_embed: checks its arguments and lays them out for the kernels.
+// One call of polar_sample: checks its arguments and lays them out for the kernels.
 #pragma once
 
 #include <numeric>
@@ -13,7 +13,7 @@
 
 namespace darswin {
 
-// The arguments that polar_sample and polar_embed share, in the order of their schemas.
+// The arguments that polar_sample and its backward share, in the order of their schemas.
 struct Sampling {
   Tensor image, radii, azimuths, center;
   MaybeTensor affine, offsets, jitter, seed;
@@ -53,11 +53,6 @@ T single(const Tensor& tensor, ScalarType type, const char* what) {
                   "polar_sample: ", what, " must be one number on the CPU");
   return *pointer<T>(tensor);
 }
-
-// The gradients that backward should compute. Radii, center and affine share one flag.
-struct PolarWanted {
-  bool image, lens, offsets;
-};
 
 // The gradients of the sampling. Unwanted gradients are empty tensors.
 struct PolarGradients {
@@ -163,12 +158,12 @@ struct PolarCall {
     return grad;
   }
 
-  // Computes the wanted gradients from args.grad_out.
-  PolarGradients backward(const PolarWanted& wanted) {
+  // Computes the wanted gradients from args.grad_out. Radii, center and affine share one flag.
+  PolarGradients backward(bool image_grad, bool lens_grad, bool offsets_grad) {
     const int64_t images = sampled_images();
     const auto& kernel = kernels<PolarSampleKernels<T>>();
     PolarGradients grads = no_gradients();
-    if (wanted.image) {
+    if (image_grad) {
       grads.image = new_image_gradient();
       args.bands = count_bands();
       if (images > 0 && grads.image.numel() > 0) {
@@ -177,8 +172,8 @@ struct PolarCall {
                          [&](auto... range) { kernel.backward_image(args, range...); });
       }
     }
-    const bool to_offsets = wanted.offsets && offsets;
-    if (!wanted.lens && !to_offsets) return grads;
+    const bool to_offsets = offsets_grad && offsets;
+    if (!lens_grad && !to_offsets) return grads;
     if (to_offsets) {
       grads.offsets = new_zeros(*offsets, offsets->sizes());
       args.grad_offsets = mutable_pointer<T>(grads.offsets);
@@ -199,7 +194,7 @@ struct PolarCall {
     };
     run_with_scratch(images * rings() / sharing, threads_for(microseconds()),
                      kernel.scratch(args, PolarPass::backward_lens), rings_of_images);
-    if (wanted.lens) fold_lens(sums, grads);
+    if (lens_grad) fold_lens(sums, grads);
     return grads;
   }
 

@@ -52,7 +52,7 @@ auto backward(PolarCall<T>& call, bool tokens, Tensor grad, bool image_grad, boo
   choose_layout(call.args, tokens);
   grad = checked_gradient(grad, output_sizes(call), call.output_type(), "polar_sample");
   call.args.grad_out = grad.const_data_ptr();
-  return call.backward({image_grad, lens_grad, offsets_grad}).tuple();
+  return call.backward(image_grad, lens_grad, offsets_grad).tuple();
 }
 
 using Forward = Listed<forward<float>, forward<double>>;

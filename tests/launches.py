@@ -20,7 +20,6 @@ _FREE = {
 }  # fmt: skip
 # Our operators that launch several kernels; tests/gpu/test_launches.py counts the launches.
 _SEVERAL = {
-    "darswin::polar_embed": 2, "darswin::polar_embed_backward": 3,
     "darswin::window_attention_backward": 3,
 }  # fmt: skip
 

@@ -45,9 +45,7 @@ void backward_image(const PolarSampleArgs<T>& a, int64_t begin, int64_t end, voi
     const int64_t b = item / a.bands;
     Scatter<T> scatter(a, b, item % a.bands, scratch);
     for (int64_t ring = 0; ring < a.num_radii / a.samples_r; ++ring) {
-      scatter.ring(ring, [&](int64_t n, T* to) {
-        read_row(a, a.grad_out, output_row(a, b, ring * a.samples_r + n), to);
-      });
+      scatter.ring(ring);
     }
     scatter.finish();
   }
@@ -86,7 +84,7 @@ void backward_lens(const PolarSampleArgs<T>& a, int64_t begin, int64_t end, void
     T* grad_offsets = a.grad_offsets == nullptr
                           ? nullptr
                           : a.grad_offsets + b * a.offsets_stride + i * a.num_azimuths;
-    read_row(a, a.grad_out, output_row(a, b, i), grads);
+    read_row(a, output_row(a, b, i), grads);
     for (int64_t j = 0; j < a.num_azimuths; j += kBlock) {
       const int64_t count = smaller(kBlock, a.num_azimuths - j);
       locate(a, b, i, j, count, points.random, [&](int64_t k, const Points& p) {

@@ -50,11 +50,10 @@ class Scatter {
     for (int64_t e = first_kept() * layout.row; e < end_kept() * layout.row; ++e) sums[e] = 0;
   }
 
-  // Adds the gradients of a ring. read(n, to) writes the gradients of its radius n as
-  // (num_azimuths, C).
-  template <typename Read>
-  void ring(int64_t ring, Read read) {
+  // Adds the gradients of a ring.
+  void ring(int64_t ring) {
     const int64_t first = ring * a.samples_r;
+    const auto read = [&](int64_t n, T* to) { read_row(a, output_row(a, image, first + n), to); };
     if (keep == kDirect) {
       bool any = false;
       for (int64_t n = 0; n < a.samples_r; ++n) any |= touches(first + n);

@@ -14,7 +14,6 @@ from darswin.bench import timing
 from darswin.deploy.optimize import optimize
 from darswin.deploy.packed import has_own_int8, onednn_linear, packed, packed_weights
 from darswin.deploy.quantize import quantize_model
-from darswin.layers.embed import PolarPatchEmbed
 from darswin.layers.linear import Linear, best_seconds, onednn_lack
 from darswin.layers.quantized import QuantizedLinear, quantize
 from darswin.lens import Lens, Spherical
@@ -150,12 +149,9 @@ def products_of(model: Model, images: Tensor, lens: Lens) -> list[tuple[Any, int
     found: list[tuple[Any, int]] = []
 
     def hook(layer: Any, _inputs: tuple[Tensor], output: Tensor) -> None:
-        # The linear layer of a polar embedding is not called: `polar_embed` takes its weight.
-        linear = layer.proj if isinstance(layer, PolarPatchEmbed) else layer
-        found.append((linear, output.numel() // linear.out_features))
+        found.append((layer, output.numel() // layer.out_features))
 
-    kinds = (Linear, QuantizedLinear, PolarPatchEmbed)
-    layers = [layer for layer in model.modules() if isinstance(layer, kinds)]
+    layers = [layer for layer in model.modules() if isinstance(layer, (Linear, QuantizedLinear))]
     handles = [layer.register_forward_hook(hook) for layer in layers]
     with torch.no_grad():
         model(images, lens)

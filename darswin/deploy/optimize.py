@@ -16,6 +16,7 @@ from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from darswin.deploy.packed import (
     PackedBlocks,
+    PackedEmbed,
     PackedLinear,
     PackedNorm,
     PackedQuantizedLinear,
@@ -145,13 +146,11 @@ def _check(model: nn.Module, dtype: torch.dtype | str, lens: Lens | None) -> Non
 
 
 class InDtype(nn.Module):
-    """Runs a module, under autocast for bfloat16, converts its result to `dtype` and norms it."""
+    """Runs a module, under autocast for bfloat16, and converts its result to `dtype`."""
 
-    def __init__(
-        self, module: nn.Module, dtype: torch.dtype, norm: Callable[[Tensor], Tensor] | None = None
-    ):
+    def __init__(self, module: nn.Module, dtype: torch.dtype):
         super().__init__()
-        self.module, self.dtype, self.norm = module, dtype, norm
+        self.module, self.dtype = module, dtype
 
     def forward(self, *arguments, **options) -> Tensor:
         narrow = self.dtype == torch.bfloat16
@@ -165,20 +164,19 @@ class InDtype(nn.Module):
                 "an optimized model has no gradients, but its images or its lens require one: call "
                 "it under torch.no_grad(), or use the original model"
             )
-        return result if self.norm is None else self.norm(result)
+        return result
 
 
 def _pack(module: nn.Module, dtype: torch.dtype) -> None:
     """Replaces the layers of one module by packed ones, or converts them to `dtype`."""
     if isinstance(module, Encoder):
         _pack_norm(module, dtype)
-        embed, norm = module.patch_embed, None
+        embed: Any = module.patch_embed
         is_float = next(embed.parameters()).dtype == torch.float32
-        if dtype == torch.float32 and is_float and isinstance(embed, PolarPatchEmbed):
-            norm = packed_norm(embed.norm, dtype)
-            _replace(embed, norm=nn.Identity())
-        module.patch_embed = InDtype(embed, dtype, norm)
-        if isinstance(embed, PolarPatchEmbed):
+        if is_float and isinstance(embed, PolarPatchEmbed):
+            embed = PackedEmbed(embed, dtype)
+        module.patch_embed = InDtype(embed, dtype)
+        if isinstance(embed, (PolarPatchEmbed, PackedEmbed)):
             module.patch_embed.sample = embed.sample  # for `Model.sample`
         if isinstance(module.head, nn.Linear):  # else an identity
             _replace(module, head=PackedLinear(module.head, dtype))

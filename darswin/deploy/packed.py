@@ -11,7 +11,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from darswin.layers.embed import PolarPatchEmbed, patch_samples
 from darswin.layers.linear import best_seconds, onednn_lack
+from darswin.layers.polar import PolarGrid
 from darswin.layers.quantized import Quantization, QuantizedLinear
 from darswin.layers.transformer import WindowAttention
 from darswin.ops import cpu_capability
@@ -194,6 +196,20 @@ def packed_norm(
         given = (weight, bias, norm.eps, *quantization)
         return lambda x: _ADD_NORM_QUANTIZED(x.contiguous(), None, *given)
     return lambda x: torch.layer_norm(x, norm.normalized_shape, weight, bias, norm.eps)
+
+
+class PackedEmbed(nn.Module):
+    """`PolarPatchEmbed` with packed layers."""
+
+    def __init__(self, embed: PolarPatchEmbed, dtype: torch.dtype):
+        super().__init__()
+        self.sample, self._dtype = embed.sample, dtype
+        self._product = PackedLinear(embed.proj, dtype)
+        self._norm = packed_norm(embed.norm, dtype)
+
+    def forward(self, images: Tensor, grid: PolarGrid | None) -> Tensor:
+        samples = patch_samples(self.sample, images, grid, self._dtype)
+        return self._norm(self._product(samples))
 
 
 class PackedNorm:

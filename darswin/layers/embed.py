@@ -7,7 +7,7 @@ from torch import Tensor, nn
 
 from darswin.layers.linear import Linear
 from darswin.layers.polar import PolarGrid, PolarGridSpec, PolarSample
-from darswin.ops import polar_embed
+from darswin.ops import polar_sample
 
 
 def check_dtype(images: Tensor, dtype: torch.dtype) -> None:
@@ -51,11 +51,18 @@ class PolarPatchEmbed(nn.Module):
 
         Without a grid, the images are samples (B, R, A, S_r·S_φ·C) of any floating-point dtype.
         """
-        weight, bias = self.proj.weight, self.proj.bias
-        if grid is None:
-            return self.norm(self.proj(images.to(weight.dtype)))
-        check_dtype(images, weight.dtype)
-        tokens = polar_embed(**self.sample.arguments(images, grid), weight=weight, bias=bias)
-        if weight.dtype == torch.bfloat16:
-            tokens = tokens.bfloat16()  # tokens of uint8 images are float32
-        return self.norm(tokens)
+        samples = patch_samples(self.sample, images, grid, self.proj.weight.dtype)
+        return self.norm(self.proj(samples))
+
+
+def patch_samples(
+    sample: PolarSample, images: Tensor, grid: PolarGrid | None, dtype: torch.dtype
+) -> Tensor:
+    """The samples (B, R, A, S_r·S_φ·C) for a product with weights of `dtype`; images and grid as in
+    `PolarPatchEmbed.forward`."""
+    if grid is None:
+        return images.to(dtype)
+    check_dtype(images, dtype)
+    samples = polar_sample(**sample.arguments(images, grid))
+    # Samples of uint8 images are float32. Autocast converts them itself.
+    return samples if torch.is_autocast_enabled(images.device.type) else samples.to(dtype)

@@ -43,14 +43,10 @@ f64 = torch.float64
 LARGE = ("one window of 1024", "windows without tables of pairs", "several chunks of windows")
 OF_POINTS = ("plain", "shared lens", "one ring, one sector", "one point", "odd rows", "one pixel",
              "thin image", "empty batch", "no points", "no channels")  # fmt: skip
-OF_TOKENS = ("no bias", "one token", "empty batch", "no rings", "no channels")
 KERNELS = {
     f"{operator}: {name}": CASES[operator, name]
     for operator, names in {
         "polar_sample": [f"{name}, {kind}" for name in OF_POINTS for kind in ("jitter", "general")],
-        "polar_embed": [
-            f"{name}, {kind}" for name in OF_TOKENS for kind in ("circular", "general")
-        ],
         "window_attention": [name for name in ATTENTION if name not in LARGE],
         "polar_to_image": list(MAPS),
     }.items()
@@ -89,8 +85,7 @@ def test_two_runs_give_the_same_bits(name, device):
 def test_strides_do_not_matter(name, device):
     made = SMALL[name]().to(device)
     turned = {name: elsewhere(t, "turned") for name, t in made.inputs.items()}
-    tolerance = 1e-6 if "weight" in turned else 0  # torch's matrix products depend on strides
-    assert_equal_results(results(made.replace(**turned)), results(made), tolerance)
+    assert_equal_results(results(made.replace(**turned)), results(made))
 
 
 @small_cases
@@ -107,11 +102,11 @@ def test_opcheck(name, device):
 @pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
 @pytest.mark.parametrize(
     "name",
-    ["polar_sample", "polar_embed, circular", "window_attention", "polar_to_image", "odd windows"],
+    ["polar_sample", "window_attention", "polar_to_image", "odd windows"],
 )
 def test_types_of_16_bits_are_float32_rounded_once(name, dtype, device):
-    if name.startswith(("polar_sample", "polar_embed")) and dtype == torch.float16:
-        pytest.skip("these take no float16")
+    if name == "polar_sample" and dtype == torch.float16:
+        pytest.skip("it takes no float16")
     wide = SMALL[name]() if name in SMALL else attention(1, 3, 14, 2, 5, (3, 7), 1, shift=(2, 5))
     wide = wide.to(device)
     first = next(iter(wide.inputs))

@@ -29,7 +29,7 @@ GENERAL = dict(affine=meta(2, 2, 2), offsets=meta(2, 2, 160, 640), jitter=1.0, s
 # A shifted stage 3 of darswin_a_small: qkv, bias and settings.
 STAGE = meta(2, 16, 4, 3, 3, 32), meta(2, 3, 7, 7), (4, 4), (2, 0), (False, True), 0.2
 MAP = meta(2, 64, 256, 16), meta(1, 64), meta(1, 2), None, None, meta(1), (64, 64)
-SAMPLES, TOKENS = meta(2, 16, 64, 300), meta(2, 16, 64, 96)
+SAMPLES = meta(2, 16, 64, 300)
 LAUNCHES = {
     **{f"samples, {name}, tokens {tokens}": ("polar_sample", (*case, tokens), ["_forward"])
        for name, case in dict(plain=sampling(), jitter=sampling(jitter=1.0),
@@ -38,14 +38,6 @@ LAUNCHES = {
     "an image's gradient": (
         "polar_sample_backward", (*sampling(), True, SAMPLES, True, False, False),
         ["_backward", "_finish", "aten::linalg_vector_norm", "aten::zeros"],
-    ),
-    "embedding": ("polar_embed", (*sampling(**GENERAL), meta(96, 300), None),
-                  ["_forward", "aten::mm"]),
-    "embedding with bias": ("polar_embed", (*sampling(**GENERAL), meta(96, 300), meta(96)),
-                            ["_forward", "aten::addmm"]),
-    "the layer's gradient": (  # backward computes the samples again
-        "polar_embed_backward", (*sampling(), meta(96, 300), TOKENS, False, False, False, True),
-        ["_forward", "aten::mm", "aten::sum.dim_IntList"],
     ),
     "attention": ("window_attention", STAGE, ["_forward"]),
     "attention, a strided bias": (

@@ -12,7 +12,7 @@ from darswin.layers.polar import PolarGridSpec, PolarSample, polar_grid
 from darswin.lens import Mei, Perspective, Polynomial, Spherical, cat
 from darswin.lens.pixels import pixel_rays
 from darswin.lens.spacing import SPACINGS
-from darswin.ops import polar_embed, polar_sample, polar_to_image
+from darswin.ops import polar_sample, polar_to_image
 
 f64 = torch.float64
 SIZES = dict(rings=16, sectors=64, samples=(10, 10))
@@ -256,9 +256,23 @@ def test_the_operators_take_all_of_a_grid():
         expected = polar_sample(images, radii, azimuths, center, **options, **layout)
         assert torch.equal(sample(images, LENSES), expected)
     embed = PolarPatchEmbed(spec).double()
-    weights = embed.proj.weight, embed.proj.bias
-    tokens = polar_embed(images, radii, azimuths, center, *weights, **options)
-    assert torch.equal(embed(images, grid), embed.norm(tokens))
+    samples = polar_sample(images, radii, azimuths, center, **options)
+    assert torch.equal(embed(images, grid), embed.norm(embed.proj(samples)))
+
+
+def test_samples_of_uint8_images_get_the_dtype_of_the_weights():
+    spec, frames = PolarGridSpec(4, 8, (3, 2)), torch.randint(256, (2, 3, 32, 33)).byte()
+    grid, embed = spec.grid(LENSES, (32, 33)), PolarPatchEmbed(spec)
+    wide, taken = embed(frames, grid), []
+    embed.proj.register_forward_pre_hook(lambda _, inputs: taken.append(inputs[0].dtype))
+    for dtype in (torch.bfloat16, torch.float64, torch.float32):
+        found = embed.to(dtype)(frames, grid)
+        assert taken.pop() == found.dtype == dtype
+        torch.testing.assert_close(found.float(), wide, rtol=0.05, atol=0.05)
+    with torch.autocast("cpu", torch.bfloat16):
+        found = embed(frames, grid)
+    assert taken.pop() == torch.bfloat16
+    torch.testing.assert_close(found.float(), wide, rtol=0.05, atol=0.05)
 
 
 def test_it_jitters_only_in_training_and_by_torchs_generator():

@@ -135,4 +135,4 @@ def test_launches_of_darswin_a_small_with_kernels():
     # A stage computes the position biases of all its blocks at once.
     assert forward["aten::sin"] <= 11 and forward["aten::cat"] <= 40, forward
     blocks = sum(len(stage.blocks) for stage in model.stages)
-    assert forward["darswin::window_attention"] == blocks and forward["darswin::polar_embed"] == 2
+    assert forward["darswin::window_attention"] == blocks and forward["darswin::polar_sample"] == 1

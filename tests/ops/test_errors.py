@@ -8,7 +8,7 @@ import torch
 from cases import SMALL, raw_calls
 from torch._subclasses import FakeTensorMode
 
-from darswin.ops import polar_embed, polar_sample, polar_to_image, use_reference, window_attention
+from darswin.ops import polar_sample, polar_to_image, use_reference, window_attention
 
 zeros, ones = torch.zeros, torch.ones
 GRID = dict(
@@ -17,7 +17,6 @@ GRID = dict(
 )  # fmt: skip
 VALID = {
     "polar_sample": (polar_sample, GRID),
-    "polar_embed": (polar_embed, GRID | dict(weight=ones(20, 36), bias=ones(20))),
     "window_attention": (
         window_attention, dict(qkv=ones(2, 4, 8, 3, 2, 5), bias=ones(1, 2, 3, 7), window=(2, 4)),
     ),
@@ -28,55 +27,60 @@ VALID = {
 }  # fmt: skip
 DIVIDE = r"must divide .* \(7, 8\), got \(3, 4\)"
 OFFSETS = r"\(B or 1, 2, R·S_r, A·S_φ\) = \(2 or 1, 2, 6, 8\), got \(2, 6, 8\)"
-SAMPLING = [
-    (dict(image="no"), TypeError, "image must be a tensor, got str"),
-    (dict(image=zeros(2, 3, 17)), ValueError, r"\(B, C, H, W\), got \(2, 3, 17\)"),
-    (dict(image=zeros(2, 3, 17, 23).int()), TypeError, "image must be float32"),
-    (dict(radii=zeros(2, 6).double()), TypeError, "radii must be float32, got torch.float64"),
-    (dict(radii=zeros(2, 6, device="meta")), ValueError, "radii must be on the same"),
-    (dict(radii=zeros(3, 6)), ValueError, r"radii must have shape .*\(2 or 1, any\)"),
-    (dict(radii=zeros(2, 7), offsets=None), ValueError, DIVIDE),
-    (dict(radii=None), TypeError, "radii must be a tensor, got NoneType"),
-    (dict(azimuths=zeros(1, 8)), ValueError, r"azimuths must have shape \(A·S_φ,\)"),
-    (dict(azimuths=zeros(9), offsets=None), ValueError, "must divide"),
-    (dict(center=zeros(2, 3)), ValueError, "center must have shape"),
-    (dict(affine=torch.eye(2)), ValueError, r"1, 2, 2\) = \(2 or 1, 2, 2\), got \(2, 2\)"),
-    (dict(affine=zeros(2, 2, 2).double()), TypeError, "affine must be float32"),
-    (dict(offsets=zeros(2, 6, 8)), ValueError, OFFSETS),
-    (dict(offsets=zeros(2, 2, 8, 6)), ValueError, "offsets must have shape"),
-    (dict(offsets=zeros(2, 2, 6, 8).long()), TypeError, "offsets must be float32"),
-    (dict(samples=(0, 4)), ValueError, "samples must be at least 1"),
-    (dict(samples=(3, 0)), ValueError, "samples must be at least 1"),
-    (dict(samples=3), TypeError, "samples must be a pair of ints, got 3"),
-    (dict(samples=(3, 4, 1)), TypeError, "samples must be a pair of ints"),
-    *((dict(samples=(bad, 4)), TypeError, "samples must be a pair of ints")
-      for bad in (3.0, np.float64(3), True, torch.tensor(3), "3", None)),
-    (dict(jitter=1.5), ValueError, r"jitter must be in \[0, 1\], got 1.5"),
-    (dict(jitter=-0.1), ValueError, r"jitter must be in \[0, 1\]"),
-    (dict(jitter=math.nan), ValueError, r"jitter must be in \[0, 1\]"),
-    (dict(jitter="much"), TypeError, "jitter must be a float"),
-    *((dict(jitter=0.5, seed=bad), TypeError, "seed must be an int")
-      for bad in (1.5, np.float64(2), True, "2", None)),
-    (dict(jitter=0.5, seed=2**63), ValueError, "seed must fit 64 bits"),
-    (dict(jitter=0.5, seed=-(2**63) - 1), ValueError, "seed must fit 64 bits"),
-    (dict(jitter=0.5, seed=zeros(1).long()), ValueError, "0-dim int64 tensor"),
-    (dict(jitter=0.5, seed=torch.tensor(1.0)), ValueError, "0-dim int64 tensor"),
-    (dict(image=zeros(2, 1, 17, 3).byte()), ValueError, r"1, 3 or 4 channels .* both"),
-    (dict(image=zeros(2, 3, 17, 3).byte()), ValueError, r"both .* \(2, 3, 17, 3\): pass"),
-    (dict(image=zeros(2, 4, 4, 4).byte()), ValueError, "pass channels_last=True for"),
-    (dict(image=zeros(2, 12, 17, 23).byte()), ValueError, r"neither .* \(2, 12, 17, 23"),
-    (dict(channels_last=1), TypeError, "channels_last must be True, False or None, got 1"),
-    (dict(image=zeros(2, 3, 17, 23).byte(), mean=(0.1, 0.2)), ValueError,
-     r"mean must be one number or one per channel \(3\), got \(0.1, 0.2\)"),
-    (dict(image=zeros(2, 3, 17, 23).byte(), std=0.0), ValueError, "std must be positive, got 0.0"),
-]  # fmt: skip
 WRONG = {
-    "polar_sample": [*SAMPLING, (dict(layout="planes"), ValueError, "layout must be one of")],
-    "polar_embed": [
-        *SAMPLING,
-        (dict(weight=zeros(20, 37)), ValueError, r"weight must have shape .*\(any, 36\)"),
-        (dict(weight=zeros(20, 36).double()), TypeError, "weight must be float32 or bfloat16"),
-        (dict(bias=zeros(21)), ValueError, r"bias must have shape \(D,\) = \(20,\), got"),
+    "polar_sample": [
+        (dict(image="no"), TypeError, "image must be a tensor, got str"),
+        (dict(image=zeros(2, 3, 17)), ValueError, r"\(B, C, H, W\), got \(2, 3, 17\)"),
+        (dict(image=zeros(2, 3, 17, 23).int()), TypeError, "image must be float32"),
+        (dict(radii=zeros(2, 6).double()), TypeError, "radii must be float32, got torch.float64"),
+        (dict(radii=zeros(2, 6, device="meta")), ValueError, "radii must be on the same"),
+        (dict(radii=zeros(3, 6)), ValueError, r"radii must have shape .*\(2 or 1, any\)"),
+        (dict(radii=zeros(2, 7), offsets=None), ValueError, DIVIDE),
+        (dict(radii=None), TypeError, "radii must be a tensor, got NoneType"),
+        (dict(azimuths=zeros(1, 8)), ValueError, r"azimuths must have shape \(A·S_φ,\)"),
+        (dict(azimuths=zeros(9), offsets=None), ValueError, "must divide"),
+        (dict(center=zeros(2, 3)), ValueError, "center must have shape"),
+        (dict(affine=torch.eye(2)), ValueError, r"1, 2, 2\) = \(2 or 1, 2, 2\), got \(2, 2\)"),
+        (dict(affine=zeros(2, 2, 2).double()), TypeError, "affine must be float32"),
+        (dict(offsets=zeros(2, 6, 8)), ValueError, OFFSETS),
+        (dict(offsets=zeros(2, 2, 8, 6)), ValueError, "offsets must have shape"),
+        (dict(offsets=zeros(2, 2, 6, 8).long()), TypeError, "offsets must be float32"),
+        (dict(samples=(0, 4)), ValueError, "samples must be at least 1"),
+        (dict(samples=(3, 0)), ValueError, "samples must be at least 1"),
+        (dict(samples=3), TypeError, "samples must be a pair of ints, got 3"),
+        (dict(samples=(3, 4, 1)), TypeError, "samples must be a pair of ints"),
+        *(
+            (dict(samples=(bad, 4)), TypeError, "samples must be a pair of ints")
+            for bad in (3.0, np.float64(3), True, torch.tensor(3), "3", None)
+        ),
+        (dict(jitter=1.5), ValueError, r"jitter must be in \[0, 1\], got 1.5"),
+        (dict(jitter=-0.1), ValueError, r"jitter must be in \[0, 1\]"),
+        (dict(jitter=math.nan), ValueError, r"jitter must be in \[0, 1\]"),
+        (dict(jitter="much"), TypeError, "jitter must be a float"),
+        *(
+            (dict(jitter=0.5, seed=bad), TypeError, "seed must be an int")
+            for bad in (1.5, np.float64(2), True, "2", None)
+        ),
+        (dict(jitter=0.5, seed=2**63), ValueError, "seed must fit 64 bits"),
+        (dict(jitter=0.5, seed=-(2**63) - 1), ValueError, "seed must fit 64 bits"),
+        (dict(jitter=0.5, seed=zeros(1).long()), ValueError, "0-dim int64 tensor"),
+        (dict(jitter=0.5, seed=torch.tensor(1.0)), ValueError, "0-dim int64 tensor"),
+        (dict(image=zeros(2, 1, 17, 3).byte()), ValueError, r"1, 3 or 4 channels .* both"),
+        (dict(image=zeros(2, 3, 17, 3).byte()), ValueError, r"both .* \(2, 3, 17, 3\): pass"),
+        (dict(image=zeros(2, 4, 4, 4).byte()), ValueError, "pass channels_last=True for"),
+        (dict(image=zeros(2, 12, 17, 23).byte()), ValueError, r"neither .* \(2, 12, 17, 23"),
+        (dict(channels_last=1), TypeError, "channels_last must be True, False or None, got 1"),
+        (
+            dict(image=zeros(2, 3, 17, 23).byte(), mean=(0.1, 0.2)),
+            ValueError,
+            r"mean must be one number or one per channel \(3\), got \(0.1, 0.2\)",
+        ),
+        (
+            dict(image=zeros(2, 3, 17, 23).byte(), std=0.0),
+            ValueError,
+            "std must be positive, got 0.0",
+        ),
+        (dict(layout="planes"), ValueError, "layout must be one of"),
     ],
     "window_attention": [
         (dict(qkv=None), TypeError, "qkv must be a tensor, got NoneType"),
@@ -156,23 +160,18 @@ def test_a_radius_of_zero_is_allowed():
 
 # -- past the public functions ---------------------------------------------------------------------
 
-SAMPLING_RAW = {
-    "image": [zeros(3), zeros(1, 3, 7, 8), zeros(2, 3, 7, 8).double()],
-    "radii": [zeros(3, 4), zeros(2, 4).double()],
-    "center": [zeros(1, 1), zeros(3, 2)],
-    "affine": [zeros(2, 2), zeros(3, 2, 2), zeros(2, 2, 2).double(), torch.tensor(1.0)],
-    "offsets": [zeros(2, 1, 4, 6), zeros(2, 2, 3, 6), zeros(2, 2, 4, 5), zeros(3, 2, 4, 6),
-                zeros(2, 2, 4, 6).double()],
-    "samples": [(0, 3), (2, 4), (3, 3), (2,)],
-    "jitter": [torch.tensor(0.5), *(torch.tensor(bad, dtype=torch.float64)
-                                    for bad in (1e300, -0.1, 1.5, math.nan, math.inf))],
-    "seed": [None, torch.tensor(1.0)],
-}  # fmt: skip
 RAW = {
-    "polar_sample": SAMPLING_RAW,
-    "polar_embed": SAMPLING_RAW | {
-        "weight": [zeros(3, 17), zeros(18), zeros(3, 18).double()],
-        "bias": [zeros(2)],
+    "polar_sample": {
+        "image": [zeros(3), zeros(1, 3, 7, 8), zeros(2, 3, 7, 8).double()],
+        "radii": [zeros(3, 4), zeros(2, 4).double()],
+        "center": [zeros(1, 1), zeros(3, 2)],
+        "affine": [zeros(2, 2), zeros(3, 2, 2), zeros(2, 2, 2).double(), torch.tensor(1.0)],
+        "offsets": [zeros(2, 1, 4, 6), zeros(2, 2, 3, 6), zeros(2, 2, 4, 5), zeros(3, 2, 4, 6),
+                    zeros(2, 2, 4, 6).double()],
+        "samples": [(0, 3), (2, 4), (3, 3), (2,)],
+        "jitter": [torch.tensor(0.5), *(torch.tensor(bad, dtype=torch.float64)
+                                        for bad in (1e300, -0.1, 1.5, math.nan, math.inf))],
+        "seed": [None, torch.tensor(1.0)],
     },
     "window_attention": {
         "qkv": [zeros(3)], "bias": [zeros(1, 2, 3, 3), zeros(3, 2, 3, 7)],

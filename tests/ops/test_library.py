@@ -17,7 +17,6 @@ from torch.func import vmap
 from darswin import ops
 from darswin.ops import (
     _library,
-    polar_embed,
     polar_sample,
     polar_to_image,
     reference,
@@ -27,7 +26,7 @@ from darswin.ops import (
     window_attention,
 )
 
-image, radii, center, weight = SMALL["polar_embed, circular"]().inputs.values()
+image, radii, center = SMALL["polar_sample, circular"]().inputs.values()
 azimuths, samples = torch.linspace(0, 6, 6), (2, 3)
 qkv, bias = attention().inputs.values()
 ring_centers, middle = radii[:1], center[:1]
@@ -35,9 +34,6 @@ ring_centers, middle = radii[:1], center[:1]
 # For each operator, a function of one tensor and this tensor.
 CALLS = {
     "polar_sample": (lambda x: polar_sample(x, radii, azimuths, center, samples=samples), image),
-    "polar_embed": (
-        lambda x: polar_embed(image, radii, azimuths, center, x, samples=samples), weight,
-    ),
     "polar_to_image": (
         lambda x: polar_to_image(x, ring_centers, middle, (7, 8)), torch.randn(2, 4, 8, 3),
     ),
@@ -110,12 +106,11 @@ def on_kernels(make, dtype=f32, installed=True, capability=(8, 0), **options):
     return call.called
 
 
-embedding = functools.partial(sampling, features=5)
 BY_KERNELS = [
     (attention, dict()), (attention, dict(dtype=bf16)), (attention, dict(dtype=torch.float16)),
     (attention, dict(rings=8, window=(8, 8))), (attention, dict(window=(1, 1), head_dim=1)),
     (attention, dict(sectors=16, window=(2, 16), head_dim=64)),
-    *((make, dict(channels_last=False) | options) for make in (sampling, embedding) for options in (
+    *((sampling, dict(channels_last=False) | options) for options in (
         dict(jitter=1.0), dict(dtype=bf16), dict(dtype=torch.uint8), dict(channels=300),
         dict(dtype=torch.uint8, channels=16))),
     (polar_map, dict()), (polar_map, dict(dtype=torch.float16)),
@@ -124,7 +119,7 @@ BY_THE_REFERENCE = [
     (attention, dict(rings=5, sectors=13, window=(5, 13), head_dim=16)),
     (attention, dict(rings=8, window=(8, 8), head_dim=33)),
     (attention, dict(window=(1, 1), head_dim=65)), (attention, dict(dtype=f64)),
-    *((make, dict(channels_last=False) | options) for make in (sampling, embedding) for options in (
+    *((sampling, dict(channels_last=False) | options) for options in (
         dict(dtype=torch.uint8, channels=17), dict(dtype=f64), dict(size=(50_000, 50_000)))),
     (polar_map, dict(size=(50_000, 50_000))), (polar_map, dict(dtype=f64)),
 ]  # fmt: skip
@@ -256,31 +251,27 @@ def test_backward_has_none_of_them_either(name):
 # -- only the reference has a gradient for azimuths ------------------------------------------------
 
 
-def of_azimuths(embed, jitter, dtype=f32):
+def of_azimuths(jitter, dtype=f32):
     """The sampling as a function of its azimuths."""
-    pixels, *lens, layer = (t.to(dtype) for t in (image, radii, center, weight))
+    pixels, *lens = (t.to(dtype) for t in (image, radii, center))
     options = dict(samples=samples, jitter=jitter, seed=3)
-    if embed:
-        return lambda angles: polar_embed(pixels, lens[0], angles, lens[1], layer, **options)
     return lambda angles: polar_sample(pixels, lens[0], angles, lens[1], **options)
 
 
-@pytest.mark.parametrize("embed", [False, True])
-def test_azimuths_that_require_a_gradient_are_refused(embed):
-    run, wanted = of_azimuths(embed, 0.5), azimuths.clone().requires_grad_()
+def test_azimuths_that_require_a_gradient_are_refused():
+    run, wanted = of_azimuths(0.5), azimuths.clone().requires_grad_()
     with pytest.raises(NotImplementedError, match="azimuths require a gradient"):
         run(wanted)
     with torch.no_grad():
         assert torch.equal(run(wanted), run(azimuths))
     with use_reference():
-        run = of_azimuths(embed, 0.5, f64)
+        run = of_azimuths(0.5, f64)
         assert torch.autograd.gradcheck(run, azimuths.double().requires_grad_())
 
 
 @compiles
-@pytest.mark.parametrize("embed", [False, True])
-def test_a_compiled_function_refuses_azimuths_that_require_a_gradient(embed):
-    compiled = torch.compile(of_azimuths(embed, 0.5), backend="eager")
+def test_a_compiled_function_refuses_azimuths_that_require_a_gradient():
+    compiled = torch.compile(of_azimuths(0.5), backend="eager")
     with pytest.raises(NotImplementedError, match="azimuths require a gradient"):
         compiled(azimuths.clone().requires_grad_())
 

@@ -28,7 +28,6 @@ INSTALLED = importlib.util.find_spec("triton") is not None
 # Operator → the module in this package that launches it and its backward.
 _MODULES = {
     "polar_sample": "polar_sample",
-    "polar_embed": "polar_sample",
     "polar_to_image": "polar_to_image",
     "window_attention": "window_attention",
 }

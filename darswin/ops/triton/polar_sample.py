@@ -14,8 +14,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from darswin.ops import reference
-from darswin.ops._library import autocast_off, empty_gradients
+from darswin.ops._library import empty_gradients
 from darswin.ops._sampling import GRADIENTS, Sampling
 from darswin.ops.triton import fixed_point
 from darswin.ops.triton.fixed_point import like, near_one
@@ -257,31 +256,3 @@ def _fold(sampling: Sampling, sums: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         if affine is None
         else like(of_affine.view(-1, 2, 2), affine),
     )
-
-
-def _samples(sampling: Sampling) -> Tensor:
-    """The samples as a matrix (B·R·A, S_r·S_φ·C), so that torch fuses the bias into the product."""
-    return polar_sample(*sampling._replace(bfloat16=False), True).flatten(0, 2)
-
-
-def polar_embed(*arguments: Any) -> Tensor:
-    """`darswin::polar_embed`."""
-    *fields, weight, bias = arguments
-    sampling = Sampling(*fields)
-    with autocast_off(weight.device.type):
-        out = reference.embedded(_samples(sampling), sampling, weight, bias)
-    return out.view(*sampling.map_size(), len(weight))
-
-
-def polar_embed_backward(*arguments: Any) -> tuple[Tensor, ...]:
-    """`darswin::polar_embed_backward`."""
-    *fields, weight, grad_out, image_grad, lens_grad, offsets_grad, weight_grad = arguments
-    sampling, wanted = Sampling(*fields), (image_grad, lens_grad, offsets_grad)
-    with autocast_off(weight.device.type):
-        grad = grad_out.float().flatten(0, 2)
-        gradients = empty_gradients(sampling, GRADIENTS, wanted)
-        if any(wanted):
-            gradients = polar_sample_backward(*sampling, True, grad @ weight.float(), *wanted)
-        if not weight_grad:
-            return *gradients, grad.new_empty((0,)), grad.new_empty((0,))
-        return *gradients, grad.t() @ _samples(sampling), grad.sum(0)
