@@ -19,7 +19,7 @@ from torch.nn.attention.flex_attention import flex_attention
 
 from darswin.bench.candidates import lens_of, network
 from darswin.bench.timing import OURS
-from darswin.ops import polar_embed, polar_sample, polar_to_image, use_reference, window_attention
+from darswin.ops import polar_sample, polar_to_image, use_reference, window_attention
 
 CASES = ("A stage 1", "A stage 3", "RA stage 1", "Swin 8x8")
 Runs = dict[str, Callable[..., Tensor]]
@@ -133,15 +133,13 @@ def bench_attention(batch: int, device: torch.device) -> None:
 def bench_sampling(batch: int, device: torch.device) -> None:
     """Sampling, compared with F.grid_sample on a prepared mesh and the permute to tokens."""
     for size in (64, 256):
-        runs, embeds, inputs = sampling_runs(size, batch, device)
+        runs, images = sampling_runs(size, batch, device)
         peer, case = {"F.grid_sample + permute": 4}, f"{size}×{size}, batch {batch}"
-        compare(f"polar_sample, {case}", runs, inputs[:1], peer, {})
-        compare(f"polar_embed, {case}", embeds, inputs, {}, {})
+        compare(f"polar_sample, {case}", runs, [images], peer, {})
 
 
-def sampling_runs(size: int, batch: int, device: torch.device) -> tuple[Runs, Runs, list[Tensor]]:
-    """The candidates for polar_sample, functions of images; those for polar_embed, functions of
-    images, weight and bias; and the inputs."""
+def sampling_runs(size: int, batch: int, device: torch.device) -> tuple[Runs, Tensor]:
+    """The candidates, functions of images, and the images."""
     images, grid, mesh, _ = sampling.sampling_case(size, batch)
     arguments = [t.to(device) for t in (grid.radii, grid.azimuths, grid.center)]
     mesh = mesh.to(device)
@@ -152,19 +150,7 @@ def sampling_runs(size: int, batch: int, device: torch.device) -> tuple[Runs, Ru
     def peer(image: Tensor) -> Tensor:
         return sampling.to_tokens(F.grid_sample(image, mesh, align_corners=True))
 
-    def embed(image: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
-        return polar_embed(image, *arguments, weight, bias, samples=(10, 10))
-
-    def embed_peer(image: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
-        return F.linear(peer(image), weight, bias)
-
-    name = "F.grid_sample + permute"
-    inputs = [images, torch.randn(96, 300) / 300**0.5, torch.randn(96)]
-    return (
-        {OURS: ours, name: peer},
-        {OURS: embed, f"{name} + F.linear": embed_peer},
-        [tensor.to(device) for tensor in inputs],
-    )
+    return {OURS: ours, "F.grid_sample + permute": peer}, images.to(device)
 
 
 def bench_to_image(device: torch.device) -> None:

@@ -43,6 +43,9 @@ STABLE_TORCH_LIBRARY(darswin, m) {
   m.def(
       "_window_attention_quantized(Tensor qkv, Tensor bias, int[] window, int[] shift, "
       "int[] periodic, float scale, float out_scale, int zero_point) -> Tensor");
+  m.def(
+      "_pack_linear(Tensor weight, Tensor? bias, Tensor? weight_scale=None, float scale=1.0, "
+      "int zero_point=0) -> Tensor");
   m.def("_norm(Tensor x, Tensor parameters, float eps) -> Tensor");
   m.def(
       "_linear(Tensor x, Tensor packed, int columns, bool gelu, Tensor? norm=None, "

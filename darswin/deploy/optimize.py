@@ -8,6 +8,7 @@ import contextlib
 import copy
 import warnings
 from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from typing import Any, Literal, TypeVar
 
 import torch
@@ -16,7 +17,6 @@ from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from darswin.deploy.packed import (
     PackedBlocks,
-    PackedEmbed,
     PackedLinear,
     PackedNorm,
     PackedQuantizedLinear,
@@ -29,7 +29,7 @@ from darswin.deploy.packed import (
     taken,
 )
 from darswin.deploy.quantize import quantize_model
-from darswin.layers.embed import PolarPatchEmbed
+from darswin.layers.embed import PolarPatchEmbed, patch_samples
 from darswin.layers.linear import onednn_lack
 from darswin.layers.position_bias import RelativeBias, joined_coefficients
 from darswin.layers.quantized import (
@@ -146,11 +146,17 @@ def _check(model: nn.Module, dtype: torch.dtype | str, lens: Lens | None) -> Non
 
 
 class InDtype(nn.Module):
-    """Runs a module, under autocast for bfloat16, and converts its result to `dtype`."""
+    """Runs a module, under autocast for bfloat16, converts its result to `dtype`, and runs `then`
+    on it."""
 
-    def __init__(self, module: nn.Module, dtype: torch.dtype):
+    def __init__(
+        self,
+        module: Callable[..., Tensor],
+        dtype: torch.dtype,
+        then: Callable[[Tensor], Tensor] | None = None,
+    ):
         super().__init__()
-        self.module, self.dtype = module, dtype
+        self.module, self.dtype, self.then = module, dtype, then
 
     def forward(self, *arguments, **options) -> Tensor:
         narrow = self.dtype == torch.bfloat16
@@ -164,20 +170,19 @@ class InDtype(nn.Module):
                 "an optimized model has no gradients, but its images or its lens require one: call "
                 "it under torch.no_grad(), or use the original model"
             )
-        return result
+        return result if self.then is None else self.then(result)
 
 
 def _pack(module: nn.Module, dtype: torch.dtype) -> None:
     """Replaces the layers of one module by packed ones, or converts them to `dtype`."""
     if isinstance(module, Encoder):
         _pack_norm(module, dtype)
-        embed: Any = module.patch_embed
-        is_float = next(embed.parameters()).dtype == torch.float32
-        if is_float and isinstance(embed, PolarPatchEmbed):
-            embed = PackedEmbed(embed, dtype)
-        module.patch_embed = InDtype(embed, dtype)
-        if isinstance(embed, (PolarPatchEmbed, PackedEmbed)):
+        embed = module.patch_embed
+        if isinstance(embed, PolarPatchEmbed):
+            module.patch_embed = _packed_embed(embed, dtype)
             module.patch_embed.sample = embed.sample  # for `Model.sample`
+        else:
+            module.patch_embed = InDtype(embed, dtype)
         if isinstance(module.head, nn.Linear):  # else an identity
             _replace(module, head=PackedLinear(module.head, dtype))
     elif isinstance(module, Stage):
@@ -202,6 +207,14 @@ def _pack(module: nn.Module, dtype: torch.dtype) -> None:
                 _replace(module, **{name: PackedLinear(layer, dtype)})
             elif isinstance(layer, nn.Conv2d):
                 module.add_module(name, InDtype(layer, dtype))
+
+
+def _packed_embed(embed: PolarPatchEmbed, dtype: torch.dtype) -> InDtype:
+    if embed.proj.weight.dtype != torch.float32:
+        return InDtype(embed, dtype)
+    product, norm = PackedLinear(embed.proj, dtype), packed_norm(embed.norm, dtype)
+    samples = partial(patch_samples, embed.sample, dtype=dtype)
+    return InDtype(samples, dtype, lambda x: norm(product(x)))
 
 
 def _has_kernels(module: nn.Module, dtype: torch.dtype) -> bool:
