@@ -127,7 +127,8 @@ struct PlacedPoints {
       locate(a, b, i, j, count, random,
              [&](int64_t k, const Points& p) { place<inside>(a, strides, p, first + k, direct); });
     };
-    !columns&& inside(a, b, i) ? put.template operator()<true>() : put.template operator()<false>();
+    const bool known = !columns && inside(a, b, i);
+    known ? put.template operator()<true>() : put.template operator()<false>();
   }
 
   // Returns whether all four pixels around each point of a radius are known to be in the image.

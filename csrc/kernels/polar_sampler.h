@@ -191,7 +191,7 @@ class Sampler {
       });
       image_in_hand = b;
     }
-    ring_inside = true;
+    ring_inside = a.packed && a.pixel == Pixel::u8;  // not needed otherwise
     for (int64_t n = 0; n < a.samples_r && ring_inside; ++n) {
       ring_inside = points.inside(a, b, ring * a.samples_r + n);
     }

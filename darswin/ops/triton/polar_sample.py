@@ -1,9 +1,8 @@
-"""polar_sample and polar_embed on CUDA devices: forward and backward.
+"""polar_sample on CUDA devices: forward and backward.
 
 Forward is one launch, in which each program computes a block of samples in the order of the output.
 In backward, each program handles one radius of one image, and the image's gradient is a sum of
-integers (`fixed_point`). The linear layer of polar_embed is a matrix product of torch with float32
-samples, which backward computes again.
+integers (`fixed_point`).
 """
 
 from typing import Any
