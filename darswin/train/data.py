@@ -188,7 +188,7 @@ class RunData(LightningDataModule):
     @property
     def _form(self) -> dict[str, Any]:
         return dict(
-            size=self.size, framing=self.framing, mean=self.mean, std=self.std, seed=self.seed,
+            size=self.size, fit=self.fit, mean=self.mean, std=self.std, seed=self.seed,
             skip_broken=self._skip_broken,
         )  # fmt: skip
 

@@ -11,6 +11,7 @@ import torch
 
 from darswin.data.cameras import Calibrations
 from darswin.data.pictures import Form, form_of
+from darswin.data.sample import Sample
 from darswin.data.scenes.targets import (
     IGNORE,
     Target,
@@ -23,18 +24,6 @@ from darswin.data.splits import Limited, read_classes, some
 from darswin.lens import Lens
 from darswin.utils.image import Header, read_header, read_oriented
 from darswin.utils.text import is_json_file, read_json
-
-
-class Scene(NamedTuple):
-    """A picture with a label or a distance for each of its pixels.
-
-    Attributes: image: (H, W, C) uint8; target: (H, W), uint8 ids with `IGNORE`, or float32 metres
-    along the ray with 0 for unknown; lens: one lens, with a center and this image_size.
-    """
-
-    image: np.ndarray
-    target: np.ndarray
-    lens: Lens
 
 
 class Classes(NamedTuple):
@@ -101,7 +90,7 @@ class Scenes(Limited):
     def __len__(self) -> int:
         return len(self._pictures)
 
-    def __getitem__(self, index: int) -> Scene:
+    def __getitem__(self, index: int) -> Sample:
         """The scene; BrokenImageError or ValueError for files that are broken or do not fit."""
         image, orientation = read_oriented(self.file(index), self.channels)
         target = self.read(self.target_file(index))
@@ -112,7 +101,7 @@ class Scenes(Limited):
         kept = slice(rows, size[0] - rows)
         image, target = image[kept], target[kept]
         self.unknown[index] = int(np.count_nonzero(target == nothing_of(target)))
-        return Scene(image, target, self._trimmed(lens))
+        return Sample(image, target, self._trimmed(lens))
 
     def headers(self, index: int) -> list[Header]:
         """The headers of the picture and of its target."""
