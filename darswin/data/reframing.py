@@ -21,6 +21,7 @@ from darswin.data.warping import Part, area_resized, picture_size, remap, size_o
 from darswin.lens import Lens
 from darswin.lens.orientation import rotated, upright
 from darswin.lens.pixels import OUTSIDE
+from darswin.lens.solve import direction_of
 from darswin.utils.tasks import Fit
 
 # An image is read at up to this many points per pixel and axis, and at this distance, in pixels of
@@ -109,11 +110,11 @@ class Reframing:
     def target(self, target: np.ndarray) -> np.ndarray:
         """The new values (H', W') of the pixels of a target (H, W); unknown beyond θ_max."""
         centres = (np.arange(k) + _aside(k) / self._scale for k in self.size)
-        places = np.rint(self._places(*centres))
-        inside = ((places >= 0) & (places < target.shape[::-1])).all(-1)  # NaN is not
-        found = np.full(inside.shape, nothing_of(target), target.dtype)
-        x, y = places[inside].astype(np.intp).T
-        found[inside] = target[y, x]
+        x, y = np.moveaxis(np.rint(self._places(*centres)), -1, 0)
+        height, width = target.shape
+        inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)  # NaN is not
+        found = np.full(self.size, nothing_of(target), target.dtype)
+        found[inside] = target[y[inside].astype(np.intp), x[inside].astype(np.intp)]
         return found
 
     def _places(self, y: np.ndarray, x: np.ndarray) -> np.ndarray:
@@ -218,15 +219,22 @@ def _resized(matrix: np.ndarray, before: tuple[int, int], after: tuple[int, int]
 
 
 def _unseen(lens: Lens) -> np.ndarray:
-    """True for pixels (H, W) beyond θ_max, which lands on a curve around the principal point."""
-    exact = lens.to(torch.float64)
-    azimuth = torch.linspace(-torch.pi, torch.pi, _AZIMUTHS, dtype=torch.float64)[None]
-    center = exact.center_in()
-    x, y = (exact.project_rays(exact.theta_max[:, None], azimuth) - center)[0].T.numpy()
-    edge = np.arctan2(y, x), np.hypot(x, y)
-    height, width = picture_size(lens)
-    x, y = np.arange(width) - center[0, 0].item(), np.arange(height)[:, None] - center[0, 1].item()
-    return np.hypot(x, y) > _ROUNDING * np.interp(np.arctan2(y, x), *edge, period=2 * np.pi)
+    """True for pixels (H, W) beyond θ_max."""
+    u, v = _flat(lens, *map(np.arange, picture_size(lens)))
+    radius = np.sqrt(u * u + v * v)
+    if lens.is_radial:
+        return radius > _ROUNDING * lens.r_max.item()
+    # θ_max lands on a curve around the principal point.
+    azimuth = torch.linspace(-torch.pi, torch.pi, _AZIMUTHS)[None]
+    ray = direction_of(azimuth)
+    last = lens.theta_max[:, None].expand_as(azimuth)
+    x, y = (lens.r_max * ray + lens.offset(last, ray))[0].numpy().T
+    edge = _ROUNDING * np.sqrt(x * x + y * y)
+    unseen = radius > edge.max()
+    near = ~unseen & (radius > edge.min())
+    last = np.interp(np.arctan2(v[near], u[near]), np.arctan2(y, x), edge, period=2 * np.pi)
+    unseen[near] = radius[near] > last
+    return unseen
 
 
 # -- through another lens ---------------------------------------------------------------------
@@ -262,42 +270,43 @@ class Warped(Reframing):
     def _places(self, y: np.ndarray, x: np.ndarray) -> np.ndarray:
         if not self._new.is_radial:
             return super()._places(y, x)
-        center, affine = self._new.center_in()[0].numpy(), self._new._affine()[0].numpy()
-        x, y = (x - center[0]).astype(np.float32), (y - center[1]).astype(np.float32)[:, None]
-        back = self._turn.T @ np.linalg.inv(affine)
-        u, v = (a * x + b * y for a, b in back.tolist())
-        radius = np.sqrt(u * u + v * v)
         last, ratios, angles = self._curves
-        place = radius * ((_RADII - 1) / last)
-        index = np.minimum(place, _RADII - 1).astype(np.intp)
-        place -= index
-        ratio = _at(ratios, index, place)
-        if self._old.is_radial:
-            u *= ratio
-            v *= ratio
-        else:
-            theta = torch.from_numpy(_at(angles, index, place))
+        u, v = _flat(self._new, y, x, self._turn.T)
+        radius = np.sqrt(u * u + v * v)
+        share = radius * ((_RADII - 1) / last)
+        index = np.minimum(share, _RADII - 1).astype(np.intp)
+        share -= index
+        ratio = ratios[0].take(index) + ratios[1].take(index) * share
+        if angles is not None:
+            theta = torch.from_numpy(angles[0].take(index) + angles[1].take(index) * share)
             ray = torch.from_numpy(np.stack((u, v), -1) / np.maximum(radius, _NUDGE)[..., None])
             offset = self._old.to(torch.float32).offset(theta[None], ray[None])[0].numpy()
-            u, v = u * ratio + offset[..., 0], v * ratio + offset[..., 1]
+        u, v = u * ratio, v * ratio
+        if angles is not None:
+            u, v = u + offset[..., 0], v + offset[..., 1]
+        center, affine = _frame(self._old)
         places = np.empty((*radius.shape, 2), np.float32)
-        center, affine = self._old.center_in()[0].tolist(), self._old._affine()[0].tolist()
-        for k, (a, b) in enumerate(affine):
+        for k, (a, b) in enumerate(affine.tolist()):
             np.add(a * u + b * v, center[k], out=places[..., k])
         return places
 
     @cached_property
-    def _curves(self) -> tuple[float, np.ndarray, np.ndarray]:
+    def _curves(self) -> tuple[float, np.ndarray, np.ndarray | None]:
         """The radius of the last ray that both lenses see in the new picture; and at equally spaced
-        radii up to it, the radius in the old picture as a multiple, and θ: values and steps to the
-        next value, (2, K). They are computed once, because an image has many more radii."""
+        radii up to it, the radius in the old picture as a multiple, and θ if the old lens is not
+        radial: values and the steps between them, (2, K).
+
+        They are computed once, because an image has many more radii. The last value is NaN.
+        """
         last = torch.minimum(self._old.theta_max, self._new.theta_max)
         theta = torch.linspace(0, 1, _RADII, dtype=torch.float64)[None] * last
         new, old = (lens.project(theta)[0].numpy() for lens in (self._new, self._old))
         radii = np.linspace(0, new[-1], _RADII)
-        ratios = np.interp(radii, new, old) / np.maximum(radii, new[1] / _RADII)
+        ratios = np.interp(radii, new, old)
+        ratios[1:] /= radii[1:]
         ratios[0] = old[1] / new[1]
-        return radii[-1], _table(ratios), _table(np.interp(radii, new, theta[0].numpy()))
+        angles = None if self._old.is_radial else np.interp(radii, new, theta[0].numpy())
+        return new[-1].item(), _table(ratios), None if angles is None else _table(angles)
 
 
 def _seen_by(lens: Lens, own: Lens, points: np.ndarray, turn: np.ndarray) -> np.ndarray:
@@ -308,15 +317,8 @@ def _seen_by(lens: Lens, own: Lens, points: np.ndarray, turn: np.ndarray) -> np.
 
 
 def _table(values: np.ndarray) -> np.ndarray:
-    """Values and the steps between them, (2, K) float32; the last value is NaN."""
-    table = np.stack((values, np.diff(values, append=np.nan))).astype(np.float32)
-    table[0, -1] = np.nan
-    return table
-
-
-def _at(table: np.ndarray, index: np.ndarray, share: np.ndarray) -> np.ndarray:
-    """The values between those of a table."""
-    return table[0].take(index) + table[1].take(index) * share
+    values[-1] = np.nan
+    return np.stack((values, np.diff(values, append=np.nan))).astype(np.float32)
 
 
 # -- points in pixels -------------------------------------------------------------------------
@@ -336,3 +338,18 @@ def _aside(size: int) -> np.ndarray:
     """
     sign = (-1.0) ** np.arange(size // 2)
     return _NUDGE * np.concatenate((-sign, np.zeros(size % 2), sign[::-1]))
+
+
+def _flat(lens: Lens, y: np.ndarray, x: np.ndarray, turn: np.ndarray | None = None) -> list:
+    """The points (u, v) around the principal point, before `affine` and after a turn, of the pixels
+    at y (H,) and x (W,): two arrays (H, W) float32."""
+    (cx, cy), affine = _frame(lens)
+    x, y = (x - cx).astype(np.float32), (y - cy).astype(np.float32)[:, None]
+    back = np.linalg.inv(affine)
+    return [a * x + b * y for a, b in (back if turn is None else turn @ back).tolist()]
+
+
+def _frame(lens: Lens) -> tuple[list[float], np.ndarray]:
+    """The principal point and `affine` of a lens."""
+    affine = np.eye(2) if lens.affine is None else lens.affine[0].numpy()
+    return lens.center_in()[0].tolist(), affine
