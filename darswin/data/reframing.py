@@ -252,15 +252,14 @@ class Warped(Reframing):
     def __init__(
         self, own: Lens, lens: Lens, turn: Turn = STILL, render: tuple[int, int] | None = None
     ):
-        self._old, self._new = own.to(torch.float64), lens.to(torch.float64)
-        self._turn = turn.matrix
-        super().__init__(lens, (self._old.r_max / self._new.r_max).item(), render)
+        self._own, self._turn = own, turn.matrix
+        super().__init__(lens, (own.r_max / lens.r_max).item(), render)
 
     def to_new(self, points: np.ndarray) -> np.ndarray:
-        return _seen_by(self._new, self._old, points, self._turn)
+        return _seen_by(self.lens, self._own, points, self._turn)
 
     def to_old(self, points: np.ndarray) -> np.ndarray:
-        return _seen_by(self._old, self._new, points, self._turn.T)
+        return _seen_by(self._own, self.lens, points, self._turn.T)
 
     def image(self, image: np.ndarray) -> np.ndarray:
         places = self._places(*map(_centres, self.size, self._render))
@@ -268,24 +267,27 @@ class Warped(Reframing):
         return area_resized(remap(image, places), self.size)
 
     def _places(self, y: np.ndarray, x: np.ndarray) -> np.ndarray:
-        if not self._new.is_radial:
+        if not self.lens.is_radial:
             return super()._places(y, x)
         last, ratios, angles = self._curves
-        u, v = _flat(self._new, y, x, self._turn.T)
+        u, v = _flat(self.lens, y, x, self._turn.T)
         radius = np.sqrt(u * u + v * v)
         share = radius * ((_RADII - 1) / last)
-        index = np.minimum(share, _RADII - 1).astype(np.intp)
-        share -= index
-        ratio = ratios[0].take(index) + ratios[1].take(index) * share
+        whole = np.floor(share)
+        share -= whole
+        index = whole.astype(np.intp)
+
+        def at(table: np.ndarray) -> np.ndarray:
+            return table[0].take(index, mode="clip") + table[1].take(index, mode="clip") * share
+
+        places, ratio = np.empty((*radius.shape, 2), np.float32), at(ratios)
+        offset = np.zeros(2, np.float32)
         if angles is not None:
-            theta = torch.from_numpy(angles[0].take(index) + angles[1].take(index) * share)
-            ray = torch.from_numpy(np.stack((u, v), -1) / np.maximum(radius, _NUDGE)[..., None])
-            offset = self._old.to(torch.float32).offset(theta[None], ray[None])[0].numpy()
-        u, v = u * ratio, v * ratio
-        if angles is not None:
-            u, v = u + offset[..., 0], v + offset[..., 1]
-        center, affine = _frame(self._old)
-        places = np.empty((*radius.shape, 2), np.float32)
+            ray = np.stack((u, v), -1) / np.maximum(radius, _NUDGE)[..., None]
+            rays = torch.from_numpy(at(angles))[None], torch.from_numpy(ray)[None]
+            offset = self._own.offset(*rays)[0].numpy()
+        u, v = u * ratio + offset[..., 0], v * ratio + offset[..., 1]
+        center, affine = _frame(self._own)
         for k, (a, b) in enumerate(affine.tolist()):
             np.add(a * u + b * v, center[k], out=places[..., k])
         return places
@@ -298,27 +300,30 @@ class Warped(Reframing):
 
         They are computed once, because an image has many more radii. The last value is NaN.
         """
-        last = torch.minimum(self._old.theta_max, self._new.theta_max)
-        theta = torch.linspace(0, 1, _RADII, dtype=torch.float64)[None] * last
-        new, old = (lens.project(theta)[0].numpy() for lens in (self._new, self._old))
+        last = torch.minimum(self._own.theta_max, self.lens.theta_max)
+        theta = torch.linspace(0, 1, _RADII)[None] * last
+        new, old = (lens.project(theta)[0].numpy() for lens in (self.lens, self._own))
         radii = np.linspace(0, new[-1], _RADII)
         ratios = np.interp(radii, new, old)
         ratios[1:] /= radii[1:]
         ratios[0] = old[1] / new[1]
-        angles = None if self._old.is_radial else np.interp(radii, new, theta[0].numpy())
+        angles = None if self._own.is_radial else np.interp(radii, new, theta[0].numpy())
         return new[-1].item(), _table(ratios), None if angles is None else _table(angles)
 
 
 def _seen_by(lens: Lens, own: Lens, points: np.ndarray, turn: np.ndarray) -> np.ndarray:
     """The pixels (..., 2) of `lens` for those of `own`, by their rays after a turn."""
+    lens, own = lens.to(torch.float64), own.to(torch.float64)
     theta, direction = own.rays(torch.from_numpy(np.asarray(points, np.float64))[None])
     theta = torch.where(own.sees(theta), theta, torch.nan)
     return lens.seen_pixels(theta, direction @ torch.from_numpy(turn.T))[0].numpy()
 
 
 def _table(values: np.ndarray) -> np.ndarray:
-    values[-1] = np.nan
-    return np.stack((values, np.diff(values, append=np.nan))).astype(np.float32)
+    table = np.full((2, len(values)), np.nan, np.float32)
+    table[0, :-1] = values[:-1]
+    np.subtract(values[1:], values[:-1], out=table[1, :-1], casting="same_kind")
+    return table
 
 
 # -- points in pixels -------------------------------------------------------------------------

@@ -111,7 +111,8 @@ class Samples(Dataset):
         rng = self._random(draw.epoch, draw.picture, 0)
         if self.augment:
             image = self.augment(image, rng)
-        image = (image.transpose(2, 0, 1) * np.float32(1 / 255) - self.mean) / self.std
+        image = np.ascontiguousarray(image.transpose(2, 0, 1)) * np.float32(1 / 255)
+        image = (image - self.mean) / self.std
         if self.erase:
             image = self.erase(image, rng)
         if isinstance(target, np.ndarray):
